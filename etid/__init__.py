@@ -1,0 +1,1 @@
+"""Circuit identification from electro-tactile stimulation recordings."""

@@ -1,0 +1,122 @@
+"""Circuits: elements, series and parallel connection, the skin, and the driver.
+
+A circuit is a frozen module with named parameters and one method, `impedance()`, built from `resistor`, `capacitor`,
+`series` and `parallel`. Everything else (filter, fit, covariance, printing with units) follows from these lines.
+"""
+
+import abc
+import dataclasses
+from typing import Any, Self
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Complex, Float
+
+from etid.filtering import StateSpace
+from etid.transfer import Rational, delay_variable, frequency_variable
+
+SYMBOLS = {"ohm": "Ω", "farad": "F"}
+DISPLAY = {"ohm": (1e3, "kΩ"), "farad": (1e-9, "nF")}  # scaled units exist only in print
+
+
+def parameter(unit: str, *, typical: float) -> Any:
+    """Declare a positive circuit parameter.
+
+    Args:
+        unit: `"ohm"` or `"farad"`.
+        typical: Magnitude to expect, in SI; a fit may start there.
+    """
+    if unit not in SYMBOLS:
+        raise ValueError(f"unit {unit!r} is not known; use one of {sorted(SYMBOLS)}")
+    return eqx.field(
+        default=typical, converter=jnp.asarray, metadata={"unit": unit, "typical": typical}
+    )
+
+
+def resistor(r: Float[Array, ""] | float) -> Rational:
+    """Impedance of a resistor, Z = R [Ω]."""
+    return Rational(jnp.stack([jnp.asarray(r)]), jnp.ones(1))
+
+
+def capacitor(c: Float[Array, ""] | float) -> Rational:
+    """Impedance of a capacitor, Z = 1 / (s C) [Ω]."""
+    c = jnp.asarray(c)
+    return Rational(jnp.ones(1), jnp.stack([jnp.zeros_like(c), c]))
+
+
+def series(*impedances: Rational) -> Rational:
+    """Series connection, Z = Z₁ + Z₂ + …"""
+    total = impedances[0]
+    for z in impedances[1:]:
+        total = total.add(z)
+    return total
+
+
+def parallel(*impedances: Rational) -> Rational:
+    """Parallel connection, 1/Z = 1/Z₁ + 1/Z₂ + …"""
+    return series(*(z.reciprocal() for z in impedances)).reciprocal()
+
+
+class AbstractCircuit(eqx.Module):
+    """A passive two-terminal circuit with positive parameters."""
+
+    @abc.abstractmethod
+    def impedance(self) -> Rational:
+        """Impedance [Ω] as a rational function of s [rad/s]."""
+
+    @classmethod
+    def names(cls) -> tuple[str, ...]:
+        """Parameter names, in the order of `log_values`."""
+        return tuple(f.name for f in dataclasses.fields(cls))
+
+    @classmethod
+    def units(cls) -> dict[str, str]:
+        """Unit of each parameter."""
+        return {f.name: f.metadata["unit"] for f in dataclasses.fields(cls)}
+
+    def response(self, frequency: Float[Array, "..."]) -> Complex[Array, "..."]:
+        """Impedance [Ω] at real frequencies [Hz]."""
+        return self.impedance()(frequency_variable(jnp.asarray(frequency)))
+
+    def values(self) -> Float[Array, " parameter"]:
+        """Parameters in SI units."""
+        return jnp.stack([getattr(self, name) for name in self.names()], axis=-1)
+
+    def log_values(self) -> Float[Array, " parameter"]:
+        """Natural logarithms of the parameters in SI units."""
+        return jnp.log(self.values())
+
+    def with_log_values(self, log_values: Float[Array, " parameter"]) -> Self:
+        """The same circuit with other parameters."""
+        values = jnp.exp(log_values)
+        return type(self)(**{name: values[..., i] for i, name in enumerate(self.names())})
+
+
+class SkinRC(AbstractCircuit):
+    """Skin as a series resistor and one relaxation, Z = R_s + R_p / (1 + s R_p C_p) (paper, eq. 7).
+
+    Equal to eq. 7, Z_bio(s) = ((R_s + R_p) + R_s R_p C_p s) / (1 + R_p C_p s).
+    """
+
+    r_s: Float[Array, "..."] = parameter("ohm", typical=20e3)
+    r_p: Float[Array, "..."] = parameter("ohm", typical=100e3)
+    c_p: Float[Array, "..."] = parameter("farad", typical=0.3e-9)
+
+    def impedance(self) -> Rational:
+        """Impedance of eq. 7."""
+        return series(resistor(self.r_s), parallel(resistor(self.r_p), capacitor(self.c_p)))
+
+    @property
+    def f_c(self) -> Float[Array, "..."]:
+        """Corner frequency 1 / (2π R_p C_p) [Hz]."""
+        return 1 / (2 * jnp.pi * self.r_p * self.c_p)
+
+
+class Resistor(AbstractCircuit):
+    """One resistor, Z = R: the paper's Table I loads."""
+
+    r: Float[Array, "..."] = parameter("ohm", typical=100e3)
+
+    def impedance(self) -> Rational:
+        """Impedance R."""
+        return resistor(self.r)

@@ -1,0 +1,128 @@
+"""The driver: its source impedance in continuous time, and the loaded terminal voltage.
+
+    V_th(t) --[Z_th]--+-- V_out        V_out = V_th · Z_L / (Z_L + Z_th)
+                    [Z_L]
+
+Z_th is kept in *modal* form, a sum of second-order sections with log-frequency and log-damping. Polynomial coefficients
+of the same impedance have Jacobian condition numbers of 1e4…1e7, the modal ones 50…100; every value of the parameters
+is a stable impedance; and a pair of poles passes from complex to real without a change of branch.
+"""
+
+from typing import Self
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Complex, Float
+
+from etid.filtering import StateSpace
+from etid.transfer import Rational, frequency_variable
+
+
+class SourceImpedance(eqx.Module):
+    """Order-n rational Z_th(s) in modal form.
+
+    Z_th = R + Σ_k (g_k + h_k s/ω_k) / (1 + 2 ζ_k s/ω_k + (s/ω_k)²) + [n odd] g_0 / (1 + s/ω_0)
+
+    R, g, h are in ohm and may have either sign; ω [rad/s] and ζ are positive and stored as logarithms. ζ > 1 is a pair
+    of real poles. Order n has ⌊n/2⌋ sections.
+    """
+
+    resistance: Float[Array, ""]
+    log_omega: Float[Array, " section"]
+    log_zeta: Float[Array, " section"]
+    gain: Float[Array, " section"]
+    slope: Float[Array, " section"]
+    log_omega_real: Float[Array, " odd"]
+    gain_real: Float[Array, " odd"]
+
+    @property
+    def order(self) -> int:
+        """Number of poles."""
+        return 2 * self.log_omega.shape[0] + self.log_omega_real.shape[0]
+
+    def response(self, frequency: Float[Array, "..."]) -> Complex[Array, "..."]:
+        """Impedance [Ω] at real frequencies [Hz]."""
+        s = frequency_variable(jnp.asarray(frequency))[..., None]
+        x = s / jnp.exp(self.log_omega)
+        sections = (self.gain + self.slope * x) / (1 + 2 * jnp.exp(self.log_zeta) * x + x**2)
+        real = self.gain_real / (1 + s / jnp.exp(self.log_omega_real))
+        return self.resistance + sections.sum(-1) + real.sum(-1)
+
+    def state_space(self) -> StateSpace:
+        """Realisation from current [A] to voltage drop [V], one balanced 2x2 block per section."""
+        order = self.order
+        pairs = self.log_omega.shape[0]
+        omega, zeta = jnp.exp(self.log_omega), jnp.exp(self.log_zeta)
+        A = jnp.zeros((order, order), omega.dtype)
+        i = jnp.arange(pairs) * 2
+        A = A.at[i, i + 1].set(omega).at[i + 1, i].set(-omega)
+        A = A.at[i + 1, i + 1].set(-2 * zeta * omega)
+        rate = jnp.exp(self.log_omega_real)
+        j = jnp.arange(2 * pairs, order)
+        A = A.at[j, j].set(-rate)
+        B = jnp.zeros((order, 1), omega.dtype).at[i + 1, 0].set(omega).at[j, 0].set(rate)
+        C = jnp.zeros(order, omega.dtype).at[i].set(self.gain).at[i + 1].set(self.slope)
+        C = C.at[j].set(self.gain_real)
+        return StateSpace(A, B, C, self.resistance[None])
+
+
+def realise(impedance: Rational, rate: float) -> StateSpace:
+    """Realise a load impedance, current [A] to voltage [V].
+
+    Args:
+        impedance: Proper rational function of s [rad/s].
+        rate: Typical rate [1/s] by which the states are scaled; any value gives the same impedance.
+    """
+    order = impedance.den.shape[0] - 1
+    if impedance.num.shape[0] > order + 1:
+        raise ValueError(
+            "the load's impedance grows without bound at high frequency (an inductor in series?); "
+            "a load must stay finite: put a resistor in parallel"
+        )
+    scale = jnp.array([rate**k for k in range(order + 1)])
+    num = jnp.pad(impedance.num, (0, order + 1 - impedance.num.shape[0])) * scale
+    den = impedance.den * scale
+    num, den = num / den[-1], den / den[-1]
+    direct = num[-1]
+    A = jnp.eye(order, k=1).at[order - 1 :, :].set(-den[:-1]) if order else jnp.zeros((0, 0))
+    B = jnp.eye(order, 1, k=1 - order) if order else jnp.zeros((0, 1))
+    return StateSpace(rate * A, rate * B, num[:-1] - direct * den[:-1], direct[None])
+
+
+def loaded(source: SourceImpedance, load: Rational, rate: float) -> StateSpace:
+    """The system V_th → V_out with `load` at the terminal, in continuous time.
+
+    The current i = (V_th − C₁x₁ − C₂x₂) / (D₁ + D₂) drives both impedances, x₁ the source's states, x₂ the load's.
+    """
+    z1, z2 = source.state_space(), realise(load, rate)
+    total = z1.D[0] + z2.D[0]
+    drop = jnp.concatenate([z1.C, z2.C])
+    B = jnp.concatenate([z1.B, z2.B]) / total
+    n1, n2 = z1.C.shape[0], z2.C.shape[0]
+    A = jnp.block([[z1.A, jnp.zeros((n1, n2))], [jnp.zeros((n2, n1)), z2.A]]) - B * drop
+    share = z2.D[0] / total
+    C = jnp.concatenate([jnp.zeros(n1), z2.C]) - share * drop
+    return StateSpace(A, B, C, share[None])
+
+
+class Driver(eqx.Module):
+    """An identified driver: Z_th as a discrete filter and, once refined, in continuous time.
+
+    Attributes:
+        b: Numerator α₀ … of the discrete Z_th (paper, eq. 4) [Ω].
+        a: Denominator 1, β₁ … of the discrete Z_th.
+        sample_rate: Rate of the discrete filter [Hz].
+        source: Continuous Z_th, valid at any sample rate; None if the driver comes from Steiglitz-McBride.
+        cov: Covariance of the parameters of `source`, flattened in field order.
+    """
+
+    b: Float[Array, " b"]
+    a: Float[Array, " a"]
+    sample_rate: float = eqx.field(static=True)
+    source: SourceImpedance | None = None
+    cov: Float[Array, "parameter parameter"] | None = None
+
+    @property
+    def order(self) -> int:
+        """Number of poles."""
+        return self.a.shape[0] - 1

@@ -1,0 +1,181 @@
+"""Differentiable discrete-time filters: `lfilter`, and continuous-time systems driven by band-limited samples.
+
+Everything here is one recursion,
+
+    x[n+1] = A x[n] + B u[n],      y[n] = C x[n] + D u[n],
+
+evaluated in blocks of `BLOCK` samples: inside a block the response is a lower triangular Toeplitz matrix product,
+between blocks a scan carries the state. That is 30-100 times fewer sequential steps than a scan over samples, and it
+differentiates in both modes.
+
+**Band-limited hold.** A continuous-time system sampled at fs is usually discretised as if its input were constant,
+linear or Tustin-warped between samples; at 200 kHz Tustin alone biases the skin's C_p by 9 %. Here the input between
+two samples is the band-limited interpolation of its neighbours (a Kaiser-windowed sinc), written as a polynomial
+
+    v((n + τ) / fs) = Σ_k c_k[n] τ^k,      0 ≤ τ ≤ 1,
+
+whose coefficients depend on the data alone. The state then advances exactly,
+
+    x[n+1] = e^{A/fs} x[n] + Σ_k Γ_k c_k[n],      Γ_k = ∫ e^{A (1−τ)/fs} B τ^k dτ / fs,
+
+with all Γ_k from one matrix exponential (Van Loan 1978).
+"""
+
+import functools
+import math
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+BLOCK = 32  # samples; the Toeplitz product grows with it, the scan shrinks
+TAPS = 24  # samples of the interpolation kernel on each side of an interval
+DEGREE = 7  # of the interpolating polynomial inside one interval
+
+
+class StateSpace(eqx.Module):
+    """A linear system; continuous or discrete is said by the function that takes it."""
+
+    A: Float[Array, "state state"]
+    B: Float[Array, "state input"]
+    C: Float[Array, " state"]
+    D: Float[Array, " input"]
+
+
+def simulate(
+    system: StateSpace, u: Float[Array, "time input"], x0: Float[Array, " state"]
+) -> tuple[Float[Array, " time"], Float[Array, " state"]]:
+    """Run the discrete recursion x[n+1] = A x[n] + B u[n], y[n] = C x[n] + D u[n].
+
+    Args:
+        system: Discrete-time system.
+        u: Inputs.
+        x0: State before the first sample.
+
+    Returns:
+        The output and the state after the last sample.
+    """
+    time, inputs = u.shape
+    states = x0.shape[0]
+    blocks, rest = divmod(time, BLOCK)
+    A, B, C, D = system.A, system.B, system.C, system.D
+
+    powers = jnp.eye(states, dtype=A.dtype)[None]  # A^0 … A^BLOCK by doubling
+    top = A
+    while powers.shape[0] < BLOCK:
+        powers = jnp.concatenate([powers, powers @ top])
+        top = top @ top
+    observed = jnp.einsum("s,ksr->kr", C, powers)  # C A^k
+    impulse = jnp.concatenate([D[None], observed[:-1] @ B])  # h[0] = D, h[k] = C A^{k-1} B
+    lag = np.arange(BLOCK)[:, None] - np.arange(BLOCK)[None, :]
+    toeplitz = jnp.where((lag >= 0)[..., None], impulse[np.maximum(lag, 0)], 0.0)
+    reach = jnp.einsum("ksr,ri->ksi", powers[::-1], B)  # A^{BLOCK-1-k} B
+
+    whole = u[: blocks * BLOCK].reshape(blocks, BLOCK, inputs)
+    forced = jnp.einsum("ijm,bjm->bi", toeplitz, whole)
+    kicks = jnp.einsum("jsm,bjm->bs", reach, whole)
+
+    def advance(x, kick):
+        return top @ x + kick, x
+
+    x, starts = jax.lax.scan(advance, x0, kicks)
+    y = (forced + starts @ observed.T).reshape(-1)
+    if rest:
+        tail = u[blocks * BLOCK :]
+        y_tail = jnp.einsum("ijm,jm->i", toeplitz[:rest, :rest], tail) + observed[:rest] @ x
+        y = jnp.concatenate([y, y_tail])
+        x = powers[rest] @ x + jnp.einsum("jsm,jm->s", reach[BLOCK - rest :], tail)
+    return y, x
+
+
+def companion(b: Float[Array, " b"], a: Float[Array, " a"]) -> StateSpace:
+    """Transposed direct form II of B(z⁻¹)/A(z⁻¹): its state is the `zi` of `scipy.signal.lfilter`."""
+    order = max(b.shape[0], a.shape[0]) - 1
+    b = jnp.pad(b, (0, order + 1 - b.shape[0])) / a[0]
+    a = jnp.pad(a, (0, order + 1 - a.shape[0])) / a[0]
+    shift = jnp.eye(order, k=1, dtype=a.dtype)
+    first = jnp.eye(1, order, dtype=a.dtype)
+    return StateSpace(
+        A=shift - a[1:, None] * first,
+        B=(b[1:] - a[1:] * b[0])[:, None],
+        C=first[0],
+        D=b[:1],
+    )
+
+
+def lfilter(
+    b: Float[Array, " b"],
+    a: Float[Array, " a"],
+    x: Float[Array, " time"],
+    zi: Float[Array, " order"] | None = None,
+) -> tuple[Float[Array, " time"], Float[Array, " order"]]:
+    """Filter `x` by the difference equation of `scipy.signal.lfilter`.
+
+    a[0] y[n] = b[0] x[n] + … + b[M] x[n−M] − a[1] y[n−1] − … − a[N] y[n−N]
+
+    Args:
+        b: Numerator coefficients in powers of z⁻¹.
+        a: Denominator coefficients in powers of z⁻¹, `a[0] ≠ 0`.
+        x: Input.
+        zi: Initial state, as SciPy defines it; zero if not given.
+
+    Returns:
+        The output and the final state.
+    """
+    if max(b.shape[0], a.shape[0]) == 1:
+        return b[0] / a[0] * x, jnp.zeros(0, x.dtype)
+    system = companion(b, a)
+    zi = jnp.zeros(system.C.shape[0], x.dtype) if zi is None else zi
+    return simulate(system, x[:, None], zi)
+
+
+@functools.cache
+def _interpolation_kernel() -> np.ndarray:
+    """Coefficients (2·TAPS, DEGREE+1) of the polynomials in τ that weigh the neighbours n−TAPS+1 … n+TAPS."""
+    nodes = 0.5 - 0.5 * np.cos(np.pi * (np.arange(4 * DEGREE) + 0.5) / (4 * DEGREE))
+    distance = nodes[:, None] - np.arange(-TAPS + 1, TAPS + 1)[None, :]
+    window = np.i0(10.0 * np.sqrt(np.maximum(0.0, 1 - (distance / TAPS) ** 2))) / np.i0(10.0)
+    values = np.sinc(distance) * window
+    return np.polynomial.polynomial.polyfit(nodes, values, DEGREE).T
+
+
+def band_limited(v: Float[Array, " time"]) -> Float[Array, "interval degree"]:
+    """Polynomial coefficients of the band-limited interpolation of `v` in every interval.
+
+    Row i belongs to the interval that starts at sample `TAPS − 1 + i`; the first is the earliest interval, the last the
+    latest one, with all its `2·TAPS` neighbours inside the record (`time − 2·TAPS + 1` rows).
+    """
+    kernel = jnp.asarray(_interpolation_kernel(), v.dtype)
+    rows = v.shape[0] - 2 * TAPS + 1
+    neighbours = jnp.stack([jax.lax.slice_in_dim(v, j, j + rows) for j in range(2 * TAPS)])
+    return jnp.einsum("jt,jk->tk", neighbours, kernel)
+
+
+def hold(system: StateSpace, sample_rate: float) -> StateSpace:
+    """Discretise a single-input continuous system for inputs given by `band_limited`.
+
+    Args:
+        system: Continuous-time system with one input.
+        sample_rate: Sampling rate [Hz].
+
+    Returns:
+        Discrete system whose inputs are the polynomial coefficients of one interval.
+    """
+    states = system.A.shape[0]
+    size = states + DEGREE + 1
+    augmented = jnp.zeros((size, size), system.A.dtype)
+    augmented = augmented.at[:states, :states].set(system.A / sample_rate)
+    augmented = augmented.at[:states, states].set(system.B[:, 0] / sample_rate)
+    chain = np.arange(states, size - 1)
+    augmented = augmented.at[chain, chain + 1].set(1.0)
+    exponential = jax.scipy.linalg.expm(augmented, max_squarings=32)
+    factorials = jnp.array([math.factorial(k) for k in range(DEGREE + 1)], system.A.dtype)
+    feedthrough = jnp.zeros(DEGREE + 1, system.A.dtype).at[0].set(system.D[0])
+    return StateSpace(
+        A=exponential[:states, :states],
+        B=exponential[:states, states:] * factorials,
+        C=system.C,
+        D=feedthrough,
+    )

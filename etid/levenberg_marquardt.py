@@ -1,0 +1,192 @@
+"""Levenberg-Marquardt on normal equations, built from optimistix parts.
+
+`optimistix.LevenbergMarquardt` carries the residual and its Jacobian in the solver's state. Under `vmap` a step of one lane
+selects between two copies of that state for all lanes, which costs about twelve times the step itself when the
+residual has thousands of samples. Here the state holds the objective, its gradient and the p×p Gauss-Newton matrix only:
+`optimistix.DampedNewtonDescent` solves the damped step, `optimistix.ClassicalTrustRegion` accepts it and sets the damping.
+
+Three things make the method scale-free:
+
+- **Marquardt scaling.** The step is solved in z = D y, D² = diag(JᵀJ) (the largest seen, as in Moré 1978), so that multiplying a parameter by a constant
+  changes no iterate.
+- **Stopping on an angle.** The relative offset of Bates & Watts (1981), the sine of the angle between the residual and
+  the tangent plane, has neither the unit of the residual nor of a parameter. Times √(samples) it is the distance to the
+  minimum in standard errors. A step too small to move the parameters is *not* convergence: a solver that cannot move must
+  not report success.
+- **A trial step whose residual is not finite is rejected**, as if its objective were infinite.
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import lineax as lx
+import optimistix as optx
+from jaxtyping import Array, Bool, Float, Int, PyTree
+
+INITIAL_DAMPING = 1e-2  # relative to the unit diagonal of the scaled Gauss-Newton matrix
+RIDGE = 1e-13  # of the scaled matrix, for directions that double precision cannot resolve
+STALLED_STEP = 1e-15  # a relative step that no longer changes the parameters in double precision
+
+
+class NormalEquations(eqx.Module):
+    """Objective ½|r|², gradient Jᵀr and Gauss-Newton matrix JᵀJ of a residual r."""
+
+    objective: Float[Array, ""]
+    gradient: Float[Array, " parameter"]
+    matrix: Float[Array, "parameter parameter"]
+
+
+def normal_equations(
+    residual: Callable[[Float[Array, " parameter"]], Float[Array, " sample"]],
+    y: Float[Array, " parameter"],
+) -> NormalEquations:
+    """Evaluate the normal equations of `residual` at `y`, by forward differentiation."""
+
+    def twice(y):
+        r = residual(y)
+        return r, r
+
+    jacobian, r = jax.jacfwd(twice, has_aux=True)(y)
+    objective = 0.5 * jnp.dot(r, r)
+    return NormalEquations(
+        jnp.where(jnp.isfinite(objective), objective, jnp.inf),
+        jacobian.T @ r,
+        jacobian.T @ jacobian,
+    )
+
+
+class _State(eqx.Module):
+    first_step: Bool[Array, ""]
+    y_eval: Float[Array, " parameter"]
+    accepted: NormalEquations
+    scale: Float[Array, " parameter"]
+    search_state: Any
+    terminate: Bool[Array, ""]
+    result: optx.RESULTS
+    accepted_steps: Int[Array, ""]
+
+
+def _select(pred, new: PyTree, old: PyTree) -> PyTree:
+    return jax.tree.map(lambda a, b: jnp.where(pred, a, b), new, old)
+
+
+class LevenbergMarquardt(optx.AbstractLeastSquaresSolver):
+    """Levenberg-Marquardt for `optimistix.least_squares`, with O(p²) state.
+
+    The residual function takes and returns one-dimensional arrays.
+
+    Attributes:
+        rtol: Stop when the relative offset, |Q₁ᵀ r| / |r| with Q₁ a basis of the range of J, is below this.
+        atol: Stop when the remaining Gauss-Newton step, scaled, is below this times the scaled parameters
+            (problems without noise, where the residual itself vanishes).
+        ftol: Stop when an accepted step reduces |r|² by less than this part, and promised no more: along a valley whose floor
+            is flat within rounding, as of a superfluous pole, the two criteria above are never met.
+        norm: Norm of the scaled step and parameters.
+    """
+
+    rtol: float = 1e-6
+    atol: float = 1e-12
+    ftol: float = 1e-8
+    norm: Callable[[PyTree], Array] = optx.two_norm
+    descent: optx.DampedNewtonDescent = optx.DampedNewtonDescent(linear_solver=lx.Cholesky())
+    search: optx.ClassicalTrustRegion = optx.ClassicalTrustRegion(
+        high_cutoff=0.75, high_constant=10.0, low_constant=0.1
+    )
+
+    def init(self, fn, y, args, options, f_struct, aux_struct, tags) -> _State:
+        """Set up an empty state; the first step evaluates `y` itself."""
+        del fn, args, options, f_struct, aux_struct, tags
+        p = y.shape[0]
+        zero = NormalEquations(
+            jnp.zeros((), y.dtype), jnp.zeros_like(y), jnp.zeros((p, p), y.dtype)
+        )
+        return _State(
+            first_step=jnp.array(True),
+            y_eval=y,
+            accepted=zero,
+            scale=jnp.zeros_like(y),
+            search_state=self.search.init(y, self._info(zero)),
+            terminate=jnp.array(False),
+            result=optx.RESULTS.successful,
+            accepted_steps=jnp.array(0),
+        )
+
+    def _info(self, equations: NormalEquations):
+        hessian = lx.MatrixLinearOperator(equations.matrix, lx.positive_semidefinite_tag)
+        return optx.FunctionInfo.EvalGradHessian(equations.objective, equations.gradient, hessian)
+
+    def step(self, fn, y, args, options, state: _State, tags):
+        """Evaluate the trial point, accept or reject it, and propose the next."""
+        del options, tags
+        trial = normal_equations(lambda y: fn(y, args)[0], state.y_eval)
+        step_size, accept, _, search_state = self.search.step(
+            state.first_step,
+            y,
+            state.y_eval,
+            self._info(state.accepted),
+            self._info(trial),
+            state.search_state,
+        )
+        accept = accept & jnp.isfinite(trial.objective) | state.first_step
+        tried = state.y_eval - y
+        promised = -self.search.predict_reduction(tried, self._info(state.accepted))
+        reduced = state.accepted.objective - trial.objective
+        negligible = jnp.maximum(jnp.abs(reduced), promised) <= self.ftol * trial.objective
+        negligible = negligible & accept & ~state.first_step
+        accepted = _select(accept, trial, state.accepted)
+        y = jnp.where(accept, state.y_eval, y)
+        diagonal = jnp.sqrt(jnp.diagonal(accepted.matrix))
+        scale = jnp.maximum(state.scale, diagonal)
+        safe = jnp.where(scale > 0, scale, 1.0)
+
+        # The step is solved in z = D y with damping relative to INITIAL_DAMPING.
+        scaled = NormalEquations(
+            accepted.objective,
+            accepted.gradient / safe / INITIAL_DAMPING,
+            accepted.matrix / safe[:, None] / safe[None, :] / INITIAL_DAMPING,
+        )
+        descent_state = self.descent.init(y, self._info(scaled))
+        descent_state = self.descent.query(y, self._info(scaled), descent_state)
+        # A factorisation that fails proposes a step that is not finite; the next trial rejects it and raises the damping.
+        proposed, _ = self.descent.step(step_size, descent_state)
+
+        size = self.norm(safe * y)
+        ridge = RIDGE * jnp.eye(y.shape[0], dtype=y.dtype)
+        newton = jnp.linalg.solve(
+            accepted.matrix / safe[:, None] / safe[None, :] + ridge, accepted.gradient / safe
+        )
+        offset = jnp.dot(newton, accepted.gradient / safe)  # |Q₁ᵀ r|²
+        converged = offset <= self.rtol**2 * 2 * accepted.objective
+        converged = converged | negligible | (self.norm(newton) <= self.atol * size)
+        stalled = (self.norm(safe * tried) <= STALLED_STEP * size) & ~state.first_step
+        finite = jnp.isfinite(accepted.objective)
+        terminate = converged | stalled | ~finite
+        failed = ~finite | (stalled & ~converged)
+        result = optx.RESULTS.where(
+            failed, optx.RESULTS.nonlinear_divergence, optx.RESULTS.successful
+        )
+        state = _State(
+            first_step=jnp.array(False),
+            y_eval=y + proposed / safe,
+            accepted=accepted,
+            scale=scale,
+            search_state=search_state,
+            terminate=terminate,
+            result=result,
+            accepted_steps=state.accepted_steps + jnp.where(accept, 1, 0),
+        )
+        return y, state, None
+
+    def terminate(self, fn, y, args, options, state: _State, tags):
+        """Whether to stop, and the verdict so far."""
+        del fn, y, args, options, tags
+        return state.terminate, state.result
+
+    def postprocess(self, fn, y, aux, args, options, state: _State, tags, result):
+        """Return the normal equations at the solution as statistics: the covariance needs them."""
+        del fn, args, options, tags, result
+        stats = {"normal_equations": state.accepted, "accepted_steps": state.accepted_steps}
+        return y, aux, stats

@@ -1,0 +1,34 @@
+"""White noise of a record, estimated from the record itself.
+
+High-order differences annihilate the smooth part of a pulse response and keep white noise, whose standard deviation follows
+from the median of their magnitude (Donoho & Johnstone 1994 use the finest wavelet coefficients the same way). The median
+ignores the few per cent of samples at the edges. A converter adds its own floor, resolution/√12.
+"""
+
+import math
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+ORDER = (
+    6  # differences; the ringing at a quarter of the rate is still smooth to them after the edges
+)
+MEDIAN_TO_SIGMA = 1.482602218505602  # of |x| for a normal x
+
+
+def noise_std(
+    v: Float[Array, " time"], resolution: Float[Array, ""] | float = 0.0
+) -> Float[Array, ""]:
+    """Standard deviation of the white noise in `v`, in the unit of `v`.
+
+    Args:
+        v: A record.
+        resolution: Step of the converter; 0 if it is not known.
+    """
+    gain = math.sqrt(sum(math.comb(ORDER, k) ** 2 for k in range(ORDER + 1)))
+    weights = np.array([(-1.0) ** k * math.comb(ORDER, k) / gain for k in range(ORDER + 1)])
+    rows = v.shape[0] - ORDER
+    differences = sum(weights[k] * v[k : k + rows] for k in range(ORDER + 1))
+    sigma = MEDIAN_TO_SIGMA * jnp.median(jnp.abs(differences))
+    return jnp.maximum(sigma, resolution / math.sqrt(12.0))

@@ -1,0 +1,601 @@
+"""Recordings of a stimulation experiment in memory, and a study of many of them.
+
+A recording is two voltages on one clock: `v_th`, the driver's unloaded output, and `v_out`, its
+output with a load.  Samples stay as the instrument stored them; their SI values are
+`conversion * stored + offset`, as in NWB's TimeSeries, so integer converter codes lose nothing and
+the size of a quantisation step stays known.
+"""
+
+import abc
+import dataclasses
+import difflib
+import math
+from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping
+from types import MappingProxyType
+from typing import Any, SupportsFloat
+
+import numpy as np
+import numpy.typing as npt
+from jaxtyping import Float
+
+SIGNALS = ("v_th", "v_out", "current")
+
+
+class RecordingError(ValueError):
+    """Something is wrong with a recording or its file; says where, what, and what to do.
+
+    Attributes:
+        message: What was found and what was expected.
+        file: Path of the file; empty for a recording in memory.
+        path: HDF5 path of the recording inside the file.
+        field: Name of the attribute, dataset or argument.
+        remedy: What to do about it.
+    """
+
+    def __init__(
+        self, message: str, *, file: str = "", path: str = "", field: str = "", remedy: str = ""
+    ) -> None:
+        super().__init__(message)
+        self.message = message
+        self.file = file
+        self.path = path
+        self.field = field
+        self.remedy = remedy
+
+    def __str__(self) -> str:
+        place = ", ".join(
+            part for part in (self.file, repr(self.path) if self.path else "", self.field) if part
+        )
+        text = f"{place}: {self.message}" if place else self.message
+        return f"{text}. {self.remedy}." if self.remedy else f"{text}."
+
+    def __reduce__(self) -> tuple:
+        # exceptions pickle by their positional arguments alone; workers send these across processes
+        return (_rebuild_error, (self.message, self.file, self.path, self.field, self.remedy))
+
+    def located(self, *, file: str = "", path: str = "", field: str = "") -> "RecordingError":
+        """The same error with the parts of its place that it did not know yet."""
+        return RecordingError(
+            self.message,
+            file=self.file or file,
+            path=self.path or path,
+            field=field
+            if not self.field
+            else f"{field}.{self.field}"
+            if field in SIGNALS
+            else self.field,
+            remedy=self.remedy,
+        )
+
+
+def _rebuild_error(message: str, file: str, path: str, field: str, remedy: str) -> RecordingError:
+    return RecordingError(message, file=file, path=path, field=field, remedy=remedy)
+
+
+def _real(field: str, value: object) -> float:
+    """A finite real number, or an error; text and booleans are no numbers."""
+    number = isinstance(value, int | float | np.integer | np.floating) or (
+        getattr(value, "shape", None) == () and getattr(value, "dtype", np.dtype("O")).kind in "iuf"
+    )
+    if not number or isinstance(value, bool) or not math.isfinite(float(value)):  # type: ignore[arg-type]  # checked on this line
+        raise RecordingError(f"is {value!r}, must be a finite real number", field=field)
+    return float(value)  # type: ignore[arg-type]  # checked above
+
+
+def _positive(field: str, value: object, unit: str) -> float:
+    number = _real(field, value)
+    if number <= 0:
+        raise RecordingError(f"is {number:g} {unit}, must be > 0", field=field)
+    return number
+
+
+def _text(field: str, value: object) -> str:
+    """A label as text; integers become their decimal digits."""
+    if isinstance(value, int | np.integer) and not isinstance(value, bool):
+        value = int(value)
+    elif not isinstance(value, str):
+        raise RecordingError(f"is {value!r}, must be text or an integer", field=field)
+    text = str(value)
+    if "\0" in text or any("\ud800" <= character <= "\udfff" for character in text):
+        raise RecordingError(f"{text!r} cannot be stored as UTF-8 text", field=field)
+    return text
+
+
+def tidy_path(path: str) -> str:
+    """An HDF5 path without leading and trailing slashes; refuses what cannot be a recording's."""
+    tidy = _text("path", path).strip("/")
+    parts = tidy.split("/") if tidy else []
+    if any(part in ("", ".", "..", *SIGNALS) for part in parts):
+        raise RecordingError(
+            f"{path!r} cannot be the path of a recording: no part of it may be empty, '.', '..' "
+            f"or one of the names {', '.join(SIGNALS)}",
+            field="path",
+            remedy="Use a path such as 's01/dry/03'",
+        )
+    return tidy
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Samples:
+    """One record as its instrument stored it.
+
+    value = conversion · stored + offset                    (NWB, TimeSeries)
+
+    Attributes:
+        stored: Integer converter codes or real numbers, in their own dtype; read-only.
+        conversion: SI units per stored unit.
+        offset: Value of a stored zero, in the SI unit.
+    """
+
+    stored: npt.NDArray
+    conversion: float = 1.0
+    offset: float = 0.0
+
+    def __init__(
+        self,
+        stored: npt.ArrayLike,
+        conversion: SupportsFloat = 1.0,
+        offset: SupportsFloat = 0.0,
+    ) -> None:
+        array = np.asarray(stored)
+        if array.dtype.kind not in "iuf" or array.dtype.itemsize > 8:
+            raise RecordingError(
+                f"has dtype {array.dtype}, must be integers or real numbers of at most 64 bits"
+            )
+        if array.flags.writeable:  # a copy, because the caller may go on writing to the original
+            array = array.copy()
+            array.flags.writeable = False
+        scale = _real("conversion", conversion)
+        if scale == 0:
+            raise RecordingError("is 0, every sample would be equal", field="conversion")
+        object.__setattr__(self, "stored", array)
+        object.__setattr__(self, "conversion", scale)
+        object.__setattr__(self, "offset", _real("offset", offset))
+
+    @property
+    def values(self) -> Float[np.ndarray, "..."]:
+        """The samples in SI units [V or A], read-only."""
+        if self.conversion == 1 and self.offset == 0 and self.stored.dtype == np.float64:
+            return self.stored
+        values = self.stored.astype(np.float64)
+        values *= self.conversion
+        values += self.offset
+        values.flags.writeable = False
+        return values
+
+    @property
+    def resolution(self) -> float | None:
+        """Size of one converter step in SI units [V or A]; None for samples that are not codes."""
+        return abs(self.conversion) if self.stored.dtype.kind in "iu" else None
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Metadata:
+    """Everything about a recording but its samples.
+
+    Attributes:
+        path: HDF5 path inside a study, such as `s01/dry/03`.
+        sample_rate: Samples per second [Hz].
+        pulse_rate: Stimulation pulses per second [Hz].
+        r_load: Known resistor of a calibration [ohm]; None for an unknown load.
+        subject: Who.
+        condition: Which state of the skin, or which circuit.
+        electrode: Which electrode of the display.
+        trial: Which repetition.
+        calibration: Paths of the calibration recordings that belong to this one.
+        adc_range: Terminal voltages at which the converter saturates [V].
+    """
+
+    path: str = ""
+    sample_rate: float
+    pulse_rate: float
+    r_load: float | None = None
+    subject: str = ""
+    condition: str = ""
+    electrode: str = ""
+    trial: str = ""
+    calibration: tuple[str, ...] = ()
+    adc_range: tuple[float, float] | None = None
+
+    def __post_init__(self) -> None:
+        if self.pulse_rate >= self.sample_rate / 2:
+            raise RecordingError(
+                f"is {self.pulse_rate:g} Hz, must be below half the sample rate of "
+                f"{self.sample_rate:g} Hz",
+                field="pulse_rate",
+            )
+        if self.r_load is not None and self.calibration:
+            raise RecordingError(
+                "a recording with a known resistor (r_load) is a calibration and has none itself",
+                field="calibration",
+            )
+        if self.adc_range is not None and not self.adc_range[0] < self.adc_range[1]:
+            raise RecordingError(
+                f"is {self.adc_range}, must be two increasing voltages", field="adc_range"
+            )
+
+    @property
+    def kind(self) -> str:
+        """`calibration` or `loaded`."""
+        return "loaded" if self.r_load is None else "calibration"
+
+
+def metadata_from(**fields: Any) -> Metadata:
+    """Metadata from unchecked values; the one place where their types are settled."""
+    tidy: dict[str, Any] = {name: _text(name, fields.get(name, "")) for name in _LABELS}
+    tidy["path"] = tidy_path(fields.get("path", ""))
+    tidy["sample_rate"] = _positive("sample_rate", fields["sample_rate"], "Hz")
+    tidy["pulse_rate"] = _positive("pulse_rate", fields["pulse_rate"], "Hz")
+    if fields.get("r_load") is not None:
+        tidy["r_load"] = _positive("r_load", fields["r_load"], "ohm")
+    calibration = fields.get("calibration", ())
+    paths = (calibration,) if isinstance(calibration, str) else calibration
+    tidy["calibration"] = tuple(tidy_path(path) for path in paths)
+    if fields.get("adc_range") is not None:
+        limits = tuple(fields["adc_range"])
+        if len(limits) != 2:
+            raise RecordingError(f"is {limits}, must be two increasing voltages", field="adc_range")
+        tidy["adc_range"] = (_real("adc_range", limits[0]), _real("adc_range", limits[1]))
+    return Metadata(**tidy)
+
+
+_LABELS = ("subject", "condition", "electrode", "trial")
+
+
+@dataclasses.dataclass(frozen=True, eq=False, repr=False, init=False)
+class Recording:
+    """Unloaded and loaded output of a driver on one clock.  Immutable; equal only to itself.
+
+    Args:
+        v_th: Unloaded output [V], real numbers or `Samples`.
+        v_out: Output with the load [V], real numbers or `Samples`.
+        sample_rate: Samples per second [Hz].
+        pulse_rate: Stimulation pulses per second [Hz].
+        r_load: Known resistor [ohm]; given, the recording is a calibration.
+        current: Measured current through the load [A], optional.
+        subject: Who.
+        condition: Which state of the skin, or which circuit.
+        electrode: Which electrode of the display.
+        trial: Which repetition.
+        calibration: Path or paths of the calibration recordings that belong to this one.
+        adc_range: Terminal voltages at which the converter saturates [V], optional.
+        path: HDF5 path inside a study.
+
+    Raises:
+        RecordingError: A mistake that can be seen without looking at the values of the samples.
+            NaN samples are no such mistake.
+    """
+
+    samples: Mapping[str, Samples]
+    metadata: Metadata
+    sample_rate: float
+    pulse_rate: float
+    r_load: float | None
+    subject: str
+    condition: str
+    electrode: str
+    trial: str
+    calibration: tuple[str, ...]
+    adc_range: tuple[float, float] | None
+    path: str
+
+    def __init__(
+        self,
+        v_th: npt.ArrayLike | Samples,
+        v_out: npt.ArrayLike | Samples,
+        *,
+        sample_rate: SupportsFloat,
+        pulse_rate: SupportsFloat,
+        r_load: SupportsFloat | None = None,
+        current: npt.ArrayLike | Samples | None = None,
+        subject: str | int = "",
+        condition: str | int = "",
+        electrode: str | int = "",
+        trial: str | int = "",
+        calibration: str | Iterable[str] = (),
+        adc_range: Iterable[SupportsFloat] | None = None,
+        path: str = "",
+    ) -> None:
+        try:
+            samples = {"v_th": _samples("v_th", v_th), "v_out": _samples("v_out", v_out)}
+            if current is not None:
+                samples["current"] = _samples("current", current)
+            lengths = {name: record.stored.size for name, record in samples.items()}
+            if len(set(lengths.values())) > 1:
+                found = ", ".join(f"{name} {length}" for name, length in lengths.items())
+                raise RecordingError(
+                    f"numbers of samples differ: {found}",
+                    remedy="Cut the records to the same stretch of time",
+                )
+            metadata = metadata_from(
+                sample_rate=sample_rate,
+                pulse_rate=pulse_rate,
+                r_load=r_load,
+                subject=subject,
+                condition=condition,
+                electrode=electrode,
+                trial=trial,
+                calibration=calibration,
+                adc_range=adc_range,
+                path=path,
+            )
+        except RecordingError as error:
+            raise error.located(path=path) from None
+        object.__setattr__(self, "samples", MappingProxyType(samples))
+        object.__setattr__(self, "metadata", metadata)
+        for field in dataclasses.fields(Metadata):
+            object.__setattr__(self, field.name, getattr(metadata, field.name))
+
+    @property
+    def v_th(self) -> Float[np.ndarray, " time"]:
+        """Unloaded output [V]."""
+        return self.samples["v_th"].values
+
+    @property
+    def v_out(self) -> Float[np.ndarray, " time"]:
+        """Output with the load [V]."""
+        return self.samples["v_out"].values
+
+    @property
+    def current(self) -> Float[np.ndarray, " time"] | None:
+        """Measured current through the load [A], if there is one."""
+        return self.samples["current"].values if "current" in self.samples else None
+
+    @property
+    def duration(self) -> float:
+        """Length of the records [s]."""
+        return self.samples["v_out"].stored.size / self.sample_rate
+
+    @property
+    def periods(self) -> float:
+        """Length of the records in pulse periods; seldom a whole number."""
+        return self.duration * self.pulse_rate
+
+    @property
+    def time(self) -> Float[np.ndarray, " time"]:
+        """Time of each sample after the first [s]."""
+        return np.arange(self.samples["v_out"].stored.size) / self.sample_rate
+
+    @property
+    def is_calibration(self) -> bool:
+        """Whether the load is a known resistor."""
+        return self.r_load is not None
+
+    def replace(self, **changes: Any) -> "Recording":
+        """A copy with some of the constructor's arguments changed."""
+        return Recording(**{**self.samples, **vars(self.metadata), **changes})
+
+    def __repr__(self) -> str:
+        load = "loaded" if self.r_load is None else f"calibration with {self.r_load:g} ohm"
+        labels = " ".join(f"{name}={value!r}" for name in _LABELS if (value := getattr(self, name)))
+        size = self.samples["v_out"].stored.size
+        return (
+            f"<Recording {self.path!r}: {load}, {size} samples at {self.sample_rate:g} Hz, "
+            f"{self.periods:.4g} periods of {self.pulse_rate:g} Hz{', ' if labels else ''}{labels}>"
+        )
+
+
+def _samples(name: str, record: npt.ArrayLike | Samples) -> Samples:
+    """One record of a recording, checked for its shape and dtype."""
+    try:
+        samples = record if isinstance(record, Samples) else Samples(record)
+    except RecordingError as error:
+        raise error.located(field=name) from None
+    if not isinstance(record, Samples) and samples.stored.dtype.kind in "iu":
+        raise RecordingError(
+            f"holds integers ({samples.stored.dtype}) without a scale",
+            field=name,
+            remedy="Wrap converter codes in Samples(codes, conversion=volts_per_code); "
+            "turn numbers that are volts into floats",
+        )
+    if samples.stored.ndim != 1 or samples.stored.size == 0:
+        raise RecordingError(
+            f"has shape {samples.stored.shape}, must be (time,) with at least one sample",
+            field=name,
+            remedy="Make one Recording per trial",
+        )
+    return samples
+
+
+class AbstractSource(abc.ABC):
+    """What a study holds: metadata now, a `Recording` when asked for."""
+
+    @property
+    @abc.abstractmethod
+    def metadata(self) -> Metadata:
+        """All fields but the samples."""
+
+    @property
+    @abc.abstractmethod
+    def layout(self) -> Hashable:
+        """Names, dtypes, lengths and scales; recordings of equal layout fit in one stack."""
+
+    @property
+    @abc.abstractmethod
+    def unloaded(self) -> Hashable:
+        """Identity of `v_th`: equal for recordings that share one unloaded record."""
+
+    @abc.abstractmethod
+    def load(self) -> Recording:
+        """The recording with its samples."""
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class _InMemory(AbstractSource):
+    """A recording that needs no loading."""
+
+    recording: Recording
+
+    @property
+    def metadata(self) -> Metadata:
+        return self.recording.metadata
+
+    @property
+    def layout(self) -> Hashable:
+        return tuple(
+            (name, record.stored.dtype.str, record.stored.size, record.conversion, record.offset)
+            for name, record in self.recording.samples.items()
+        )
+
+    @property
+    def unloaded(self) -> Hashable:
+        return id(self.recording.samples["v_th"])
+
+    def load(self) -> Recording:
+        return self.recording
+
+
+class Study(Mapping[str, Recording]):
+    """Recordings by path, in order; those of a file are loaded when they are accessed.
+
+    Build one with `Study.from_recordings` or `etid.read`.  A study that comes from a file holds it
+    open: use `with`, or `close()`.
+
+    Attributes:
+        file: Path of the file it comes from; empty in memory.
+        problems: Recordings of the file that cannot be read, by path; accessing one raises it.
+    """
+
+    def __init__(
+        self,
+        sources: Mapping[str, AbstractSource],
+        *,
+        problems: Mapping[str, RecordingError] | None = None,
+        file: str = "",
+        close: Callable[[], None] | None = None,
+    ) -> None:
+        self._sources = dict(sources)
+        self._close = close
+        self.problems: dict[str, RecordingError] = dict(problems or {})
+        self.file = file
+
+    @classmethod
+    def from_recordings(cls, recordings: Iterable[Recording]) -> "Study":
+        """A study in memory; recordings without a path become `loaded/0`, `loaded/1`, ….
+
+        Raises:
+            RecordingError: Two recordings have the same path, or one lies inside another.
+        """
+        sources: dict[str, AbstractSource] = {}
+        unnamed = {"loaded": 0, "calibration": 0}
+        for recording in recordings:
+            kind = recording.metadata.kind
+            if not recording.path:
+                recording = recording.replace(path=f"{kind}/{unnamed[kind]}")
+                unnamed[kind] += 1
+            if recording.path in sources:
+                raise RecordingError(
+                    "two recordings have this path",
+                    path=recording.path,
+                    remedy="Give each recording a path of its own",
+                )
+            sources[recording.path] = _InMemory(recording)
+        for path in sources:
+            outer = path.rpartition("/")[0]
+            while outer:
+                if outer in sources:
+                    raise RecordingError(
+                        f"lies inside another recording, {outer!r}",
+                        path=path,
+                        remedy="Give it a path beside the other",
+                    )
+                outer = outer.rpartition("/")[0]
+        return cls(sources)
+
+    def __getitem__(self, path: str) -> Recording:
+        return self.source(path).load()
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._sources)
+
+    def __len__(self) -> int:
+        return len(self._sources)
+
+    def __contains__(self, path: object) -> bool:
+        return isinstance(path, str) and path.strip("/") in self._sources
+
+    def __eq__(self, other: object) -> bool:
+        return self is other  # a Mapping would load and compare every sample
+
+    def __hash__(self) -> int:
+        return id(self)
+
+    def source(self, path: str) -> AbstractSource:
+        """What the study holds at a path, without its samples."""
+        tidy = path.strip("/")
+        if tidy in self._sources:
+            return self._sources[tidy]
+        if (tidy or "/") in self.problems:
+            raise self.problems[tidy or "/"]
+        rows = [name for name in self._sources if name.startswith(f"{tidy}/")]
+        if rows:
+            raise KeyError(
+                f"{path!r} is a group of {len(rows)} recordings: {rows[0]!r} … {rows[-1]!r}"
+            )
+        near = difflib.get_close_matches(tidy, self._sources, n=3)
+        known = ", ".join(repr(name) for name in near or list(self._sources)[:3])
+        raise KeyError(f"no recording {path!r}; this study has {len(self)}, such as {known}")
+
+    def metadata(self, path: str) -> Metadata:
+        """All fields of a recording but its samples, which are not read."""
+        return self.source(path).metadata
+
+    def recordings(self) -> Iterator[Recording]:
+        """The recordings one after the other, each loaded when its turn comes."""
+        return (source.load() for source in self._sources.values())
+
+    def where(
+        self,
+        *,
+        subject: str | int | None = None,
+        condition: str | int | None = None,
+        electrode: str | int | None = None,
+        trial: str | int | None = None,
+    ) -> "Study":
+        """The recordings whose labels equal those given; no samples are read."""
+        given = zip(_LABELS, (subject, condition, electrode, trial), strict=True)
+        wanted = {name: _text(name, value) for name, value in given if value is not None}
+        return self._part(
+            lambda metadata: all(getattr(metadata, name) == text for name, text in wanted.items())
+        )
+
+    @property
+    def calibrations(self) -> "Study":
+        """The recordings with a known resistor."""
+        return self._part(lambda metadata: metadata.kind == "calibration")
+
+    @property
+    def loaded(self) -> "Study":
+        """The recordings with an unknown load."""
+        return self._part(lambda metadata: metadata.kind == "loaded")
+
+    def _part(self, belongs: Callable[[Metadata], bool]) -> "Study":
+        chosen = {
+            path: source for path, source in self._sources.items() if belongs(source.metadata)
+        }
+        return Study(chosen, problems=self.problems, file=self.file, close=self._close)
+
+    def write(self, path: Any) -> None:
+        """Write the study to an HDF5 file; see `etid.hdf5.write`."""
+        from etid import hdf5  # at the top it would be a circle: that module builds studies
+
+        hdf5.write(self, path)
+
+    def close(self) -> None:
+        """Close the file that the study, and every part of it, reads from."""
+        if self._close is not None:
+            self._close()
+
+    def __enter__(self) -> "Study":
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        self.close()
+
+    def __repr__(self) -> str:
+        place = f" {self.file!r}" if self.file else ""
+        bad = f", {len(self.problems)} that cannot be read" if self.problems else ""
+        calibrations = sum(s.metadata.kind == "calibration" for s in self._sources.values())
+        return (
+            f"<Study{place}: {calibrations} calibrations, {len(self) - calibrations} loaded{bad}>"
+        )

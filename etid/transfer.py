@@ -1,0 +1,130 @@
+"""Rational functions: evaluation, product, sum, discretisation, poles, stability.
+
+Coefficients are stored in *ascending* powers of the variable. In z⁻¹ this is SciPy's order of `b` and `a`; in s it is
+the reverse of `scipy.signal`. Polynomials are multiplied with shifts, not with `jnp.convolve`: under `vmap` the
+latter becomes a grouped convolution over all lanes, in which one NaN lane poisons the others.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Complex, Float, Inexact
+
+
+def multiply_polynomials(p: Float[Array, " p"], q: Float[Array, " q"]) -> Float[Array, " pq"]:
+    """Multiply two polynomials given by ascending coefficients."""
+    length = p.shape[0] + q.shape[0] - 1
+    return sum(
+        (jnp.pad(p[i] * q, (i, length - i - q.shape[0])) for i in range(p.shape[0])),
+        start=jnp.zeros(length, jnp.result_type(p, q)),
+    )
+
+
+def add_polynomials(p: Float[Array, " p"], q: Float[Array, " q"]) -> Float[Array, " pq"]:
+    """Add two polynomials given by ascending coefficients."""
+    length = max(p.shape[0], q.shape[0])
+    return jnp.pad(p, (0, length - p.shape[0])) + jnp.pad(q, (0, length - q.shape[0]))
+
+
+class Rational(eqx.Module):
+    """A ratio of polynomials, `(num[0] + num[1] x + …) / (den[0] + den[1] x + …)`.
+
+    The variable x is s [rad/s] for impedances in continuous time and z⁻¹ for discrete filters.
+    """
+
+    num: Float[Array, " num"]
+    den: Float[Array, " den"]
+
+    def __call__(self, x: Inexact[Array, "..."]) -> Complex[Array, "..."]:
+        """Evaluate at `x`."""
+        x = jnp.asarray(x) + 0j
+        return jnp.polyval(self.num[::-1] + 0j, x) / jnp.polyval(self.den[::-1] + 0j, x)
+
+    def add(self, other: "Rational") -> "Rational":
+        """The sum `self + other`."""
+        return Rational(
+            add_polynomials(
+                multiply_polynomials(self.num, other.den),
+                multiply_polynomials(other.num, self.den),
+            ),
+            multiply_polynomials(self.den, other.den),
+        )
+
+    def multiply(self, other: "Rational") -> "Rational":
+        """The product `self · other`."""
+        return Rational(
+            multiply_polynomials(self.num, other.num), multiply_polynomials(self.den, other.den)
+        )
+
+    def reciprocal(self) -> "Rational":
+        """The reciprocal `1 / self`."""
+        return Rational(self.den, self.num)
+
+
+def tustin(continuous: Rational, sample_rate: float) -> Rational:
+    """Discretise by the bilinear transform, s = 2 fs (1 − z⁻¹) / (1 + z⁻¹).
+
+    Args:
+        continuous: Rational function of s [rad/s].
+        sample_rate: Sampling rate fs [Hz].
+
+    Returns:
+        Rational function of z⁻¹ with `den[0] = 1`.
+    """
+    order = max(continuous.num.shape[0], continuous.den.shape[0]) - 1
+
+    def substitute(p):
+        total = jnp.zeros(order + 1, p.dtype)
+        for k in range(p.shape[0]):
+            term = jnp.ones(1, p.dtype)
+            for i in range(order):
+                sign = -1.0 if i < k else 1.0
+                term = multiply_polynomials(term, jnp.array([1.0, sign], p.dtype))
+            total = total + p[k] * (2 * sample_rate) ** k * term
+        return total
+
+    num, den = substitute(continuous.num), substitute(continuous.den)
+    return Rational(num / den[0], den / den[0])
+
+
+def frequency_variable(frequency: Float[Array, "..."]) -> Complex[Array, "..."]:
+    """The variable s = j 2π f [rad/s] at real frequencies [Hz]."""
+    return 2j * jnp.pi * frequency
+
+
+def delay_variable(frequency: Float[Array, "..."], sample_rate: float) -> Complex[Array, "..."]:
+    """The variable z⁻¹ = exp(−j 2π f / fs) at real frequencies [Hz]."""
+    return jnp.exp(-2j * jnp.pi * frequency / sample_rate)
+
+
+def poles(a: Float[Array, " order1"]) -> Complex[Array, " order"]:
+    """Poles in z of 1 / (a[0] + a[1] z⁻¹ + …)."""
+    return jnp.roots(a, strip_zeros=False)
+
+
+def is_stable(a: Float[Array, " order1"]) -> Bool[Array, ""]:
+    """Whether all poles of 1 / (a[0] + a[1] z⁻¹ + …) lie inside the unit circle.
+
+    Schur-Cohn step-down recursion (Oppenheim & Schafer, *Discrete-Time Signal Processing*, lattice filters): stable if
+    and only if every reflection coefficient is smaller than one in magnitude. No eigenvalues are needed, so it runs on
+    every backend. NaN coefficients are not stable.
+    """
+    a = a / a[0]
+    stable = jnp.array(True)
+    for order in range(a.shape[0] - 1, 0, -1):
+        k = a[order]
+        stable = stable & (jnp.abs(k) < 1)
+        a = (a[:order] - k * a[order:0:-1]) / (1 - k**2)
+    return stable
+
+
+def reflect_poles(a: Float[Array, " order1"]) -> Float[Array, " order1"]:
+    """Reflect poles outside the unit circle to their inverse conjugates; |A(e^{jω})| keeps its shape."""
+    roots = poles(a)
+    outside = jnp.abs(roots) > 1
+    inside = jnp.where(outside, 1 / jnp.conj(jnp.where(outside, roots, 2.0)), roots)
+    coefficients = jnp.ones(1, inside.dtype)
+    for i in range(inside.shape[0]):
+        shifted = jnp.pad(coefficients, (1, 0)) * -inside[i]
+        coefficients = jnp.pad(coefficients, (0, 1)) + shifted
+    return jax.lax.stop_gradient(coefficients.real)

@@ -1,0 +1,32 @@
+"""Session-wide settings: float64 on, no silent promotion, seeded keys, reference data or a visible skip."""
+
+import pathlib
+
+import jax
+import pytest
+
+jax.config.update("jax_enable_x64", True)
+jax.config.update("jax_numpy_rank_promotion", "raise")
+jax.config.update("jax_numpy_dtype_promotion", "strict")
+
+REFERENCE_DATA = pathlib.Path(__file__).parents[2] / "shared" / "data"
+
+
+@pytest.fixture
+def getkey():
+    """A fresh seeded key at every call."""
+    keys = iter(jax.random.split(jax.random.key(20260101), 1000))
+    return lambda: next(keys)
+
+
+@pytest.fixture(scope="session")
+def reference_data():
+    """Path of a folder of the reference data set; the test is skipped, visibly, where it is absent."""
+
+    def folder(name):
+        path = REFERENCE_DATA / name
+        if not path.exists():
+            pytest.skip(f"reference data {name!r} not found at {path}")
+        return path
+
+    return folder

@@ -1,0 +1,213 @@
+import pickle
+
+import numpy as np
+import pytest
+
+from etid.recording import Recording, RecordingError, Samples, Study
+
+RATES = {"sample_rate": 200e3, "pulse_rate": 60.0}
+
+
+def recording(length=100, **fields):
+    ramp = np.arange(length, dtype=float)
+    return Recording(**{"v_th": ramp, "v_out": ramp / 2, **RATES, **fields})
+
+
+def study():
+    return Study.from_recordings(
+        [
+            recording(path="calibration/98k8", r_load=98.8e3),
+            recording(path="s01/dry/0", subject="s01", condition="dry", trial=0),
+            recording(path="s01/dry/1", subject="s01", condition="dry", trial=1),
+            recording(path="s02/damp", subject="s02", condition="damp", electrode="E17"),
+        ]
+    )
+
+
+def test_values_follow_the_conversion_of_nwb():
+    samples = Samples(np.array([-2, 0, 3], "i2"), conversion=0.5, offset=1.0)
+    assert samples.stored.dtype == np.int16
+    assert samples.values.tolist() == [0.0, 1.0, 2.5]
+    assert samples.values.dtype == np.float64
+
+
+def test_resolution_is_one_step_of_codes_and_unknown_for_real_numbers():
+    assert Samples(np.array([1, 2]), conversion=-0.25).resolution == 0.25
+    assert Samples(np.array([1.0, 2.0]), conversion=-0.25).resolution is None
+
+
+def test_samples_do_not_change_with_the_array_they_were_made_from():
+    volts = np.zeros(3)
+    samples = Samples(volts)
+    volts[0] = 1.0
+    assert samples.values.tolist() == [0.0, 0.0, 0.0]
+
+
+@pytest.mark.parametrize("array", ["stored", "values"])
+def test_samples_cannot_be_written_to(array):
+    with pytest.raises(ValueError, match="read-only"):
+        getattr(Samples(np.zeros(3, "i2"), 0.1), array)[0] = 1
+
+
+def test_a_recording_cannot_be_assigned_to():
+    with pytest.raises(AttributeError):
+        recording().r_load = 1.0
+    with pytest.raises(TypeError):
+        recording().samples["v_th"] = Samples(np.zeros(3))
+
+
+def test_times_of_a_recording():
+    one = recording(length=10_000)
+    assert one.duration == 0.05
+    assert one.periods == 3.0
+    np.testing.assert_array_equal(one.time[:2], [0.0, 1 / 200e3])
+    assert one.time.shape == one.v_th.shape == one.v_out.shape
+
+
+def test_optional_current():
+    assert recording().current is None
+    np.testing.assert_array_equal(recording(current=np.ones(100)).current, np.ones(100))
+
+
+def test_labels_become_text_and_one_calibration_a_tuple():
+    one = recording(trial=np.int64(3), subject=7, calibration="/calibration/98k8")
+    assert (one.trial, one.subject, one.calibration) == ("3", "7", ("calibration/98k8",))
+    assert not one.is_calibration
+    assert recording(r_load=98.8e3).is_calibration
+
+
+def test_recordings_are_equal_only_to_themselves():
+    one = recording()
+    assert one == one  # noqa: PLR0124  # the point of the test
+    assert one != recording()
+    assert len({one, recording()}) == 2
+
+
+def test_replace_changes_what_is_named_and_keeps_the_samples():
+    one = recording(trial=1, current=np.ones(100))
+    other = one.replace(v_out=np.zeros(100), path="a/b")
+    assert other.samples["v_th"] is one.samples["v_th"]
+    assert (other.trial, other.path, other.v_out.any()) == ("1", "a/b", False)
+    assert other.current is not None
+
+
+def test_nan_samples_are_left_to_the_preflight():
+    assert np.isnan(recording(v_out=np.full(100, np.nan)).v_out).all()
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        ({"v_out": np.zeros(99)}, "numbers of samples differ: v_th 100, v_out 99"),
+        ({"current": np.zeros(99)}, "current 99"),
+        ({"v_th": np.zeros((2, 50))}, r"v_th: has shape \(2, 50\), must be \(time,\)"),
+        ({"v_th": np.zeros(0), "v_out": np.zeros(0)}, "at least one sample"),
+        ({"v_th": np.zeros(100, complex)}, "v_th: has dtype complex128"),
+        ({"v_th": np.zeros(100, bool)}, "v_th: has dtype bool"),
+        ({"v_th": np.array(["a"] * 100)}, "v_th: has dtype <U1"),
+        (
+            {"v_out": np.zeros(100, "i2")},
+            r"v_out: holds integers .*Wrap converter codes in Samples",
+        ),
+        ({"sample_rate": 0}, "sample_rate: is 0 Hz, must be > 0"),
+        ({"sample_rate": float("nan")}, "sample_rate: is nan, must be a finite"),
+        ({"pulse_rate": -60.0}, "pulse_rate: is -60 Hz"),
+        ({"pulse_rate": float("inf")}, "pulse_rate: is inf"),
+        ({"pulse_rate": 100e3}, "pulse_rate: is 100000 Hz, must be below half the sample rate"),
+        ({"r_load": 0.0}, "r_load: is 0 ohm"),
+        ({"r_load": float("inf")}, "r_load: is inf"),
+        ({"adc_range": (1.0, -1.0)}, "adc_range: .*increasing"),
+        ({"adc_range": (1.0,)}, "adc_range: .*two"),
+        ({"adc_range": (0.0, float("nan"))}, "adc_range: is nan"),
+        ({"r_load": 1e3, "calibration": "c"}, "calibration: .*has none itself"),
+        ({"subject": "a\0b"}, "subject: .*UTF-8"),
+        ({"path": "a//b"}, "path: .*cannot be the path"),
+        ({"path": "a/v_th"}, "path: .*cannot be the path"),
+    ],
+)
+def test_static_mistakes_are_named(fields, message):
+    with pytest.raises(ValueError, match=message):
+        recording(**fields)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ((np.zeros(3), 0.0), "conversion: is 0"),
+        ((np.zeros(3), 1.0, float("inf")), "offset: is inf"),
+    ],
+)
+def test_a_scale_that_loses_the_samples_is_refused(arguments, message):
+    with pytest.raises(RecordingError, match=message):
+        Samples(*arguments)
+
+
+def test_repr_is_one_line_that_says_what_it_is():
+    text = repr(recording(path="a/b", length=10_000, subject="s01", r_load=98.8e3))
+    assert text == (
+        "<Recording 'a/b': calibration with 98800 ohm, 10000 samples at 200000 Hz, "
+        "3 periods of 60 Hz, subject='s01'>"
+    )
+
+
+def test_an_error_says_where_what_and_what_to_do_and_survives_pickling():
+    error = RecordingError(
+        "is 0 Hz", file="a.h5", path="s01", field="sample_rate", remedy="Mend it"
+    )
+    assert str(error) == "a.h5, 's01', sample_rate: is 0 Hz. Mend it."
+    copy = pickle.loads(pickle.dumps(error))
+    assert (str(copy), copy.file, copy.path, copy.field, copy.remedy) == (
+        str(error),
+        "a.h5",
+        "s01",
+        "sample_rate",
+        "Mend it",
+    )
+
+
+def test_a_study_is_an_ordered_mapping_of_paths():
+    paths = ["calibration/98k8", "s01/dry/0", "s01/dry/1", "s02/damp"]
+    assert list(study()) == [one.path for one in study().recordings()] == paths
+    assert len(study()) == 4
+    assert "/s02/damp/" in study()
+    assert "s02" not in study()
+    assert study()["/s02/damp"].electrode == "E17"
+    assert repr(study()) == "<Study: 1 calibrations, 3 loaded>"
+
+
+def test_where_selects_by_labels_and_keeps_the_order():
+    assert list(study().where(subject="s01")) == ["s01/dry/0", "s01/dry/1"]
+    assert list(study().where(subject="s01", trial=1)) == ["s01/dry/1"]
+    assert list(study().where(condition="damp", electrode="E17")) == ["s02/damp"]
+    assert list(study().where(subject="s03")) == []
+    assert list(study().where()) == list(study())
+
+
+def test_calibrations_and_loaded_part_a_study():
+    assert list(study().calibrations) == ["calibration/98k8"]
+    assert list(study().loaded) == ["s01/dry/0", "s01/dry/1", "s02/damp"]
+
+
+def test_a_group_of_trials_is_no_recording_and_the_error_says_what_is():
+    with pytest.raises(KeyError, match=r"group of 2 recordings: 's01/dry/0' … 's01/dry/1'"):
+        study()["s01/dry"]
+
+
+def test_an_unknown_path_is_answered_with_near_ones():
+    with pytest.raises(KeyError, match=r"no recording 's02/dump'.*'s02/damp'"):
+        study()["s02/dump"]
+    with pytest.raises(KeyError, match=r"no recording 'x'; this study has 0"):
+        Study.from_recordings([])["x"]
+
+
+def test_recordings_without_a_path_are_numbered_by_kind():
+    unnamed = [recording(), recording(r_load=1e3), recording()]
+    assert list(Study.from_recordings(unnamed)) == ["loaded/0", "calibration/0", "loaded/1"]
+
+
+@pytest.mark.parametrize(
+    ("paths", "message"), [(["a", "a"], "two recordings"), (["a", "a/b/c"], "inside another")]
+)
+def test_paths_that_cannot_share_a_file_are_refused(paths, message):
+    with pytest.raises(RecordingError, match=message):
+        Study.from_recordings([recording(path=path) for path in paths])

@@ -1,0 +1,92 @@
+import json
+import pathlib
+
+import h5py
+import numpy as np
+import pytest
+
+from etid import hdf5, schema
+
+FOLDER = pathlib.Path(__file__).parents[1] / "data_schema"
+
+
+@pytest.mark.parametrize("name", ["recording-1.json", "README.md"])
+def test_the_committed_schema_is_what_the_table_gives(name, tmp_path):
+    schema.write(tmp_path)
+    remedy = "run: python -m etid.schema data_schema"
+    assert (tmp_path / name).read_text("utf-8") == (FOLDER / name).read_text("utf-8"), remedy
+
+
+def test_the_json_lists_every_field_once_with_its_unit():
+    table = json.loads((FOLDER / "recording-1.json").read_text("utf-8"))
+    places = [(field["place"], field["name"]) for field in table["fields"]]
+    assert len(set(places)) == len(places) == len(schema.FIELDS)
+    assert table["schema"], table["schema_version"] == ("etid/recording", "1.0")
+    units = {field["name"]: field["unit"] for field in table["fields"]}
+    assert units["sample_rate"] == units["pulse_rate"] == "hertz"
+    assert (units["v_out"], units["current"], units["r_load"]) == ("volt", "ampere", "ohm")
+
+
+def test_the_example_of_the_readme_runs_and_is_read(tmp_path, monkeypatch):
+    text = (FOLDER / "README.md").read_text("utf-8")
+    example = text.split("```python\n")[1].split("```")[0]
+    monkeypatch.chdir(tmp_path)
+    exec(compile(example, "README.md", "exec"), {})
+    assert hdf5.check("study.h5") == []
+    with hdf5.read("study.h5") as study:
+        assert list(study) == ["calibration/98k8", "s01/dry/0", "s01/dry/1", "s01/dry/2"]
+        assert study["s01/dry/2"].trial == "2"
+        assert study["s01/dry/2"].samples["v_th"].stored.dtype == np.int16
+        # a code of 9000 of 20 V / 2^16, behind a scale of 0.0535
+        expected = 9000 * 20 / 65536 / 0.0535
+        assert study["s01/dry/2"].v_th.max() == pytest.approx(expected, rel=1e-15)
+
+
+def test_every_example_of_the_table_is_valid_for_its_own_field():
+    for field in schema.FIELDS:
+        if field.type != "samples":
+            assert field.parse(field.example) not in (None, ""), field.name
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "message"),
+    [
+        ("sample_rate", "200 kHz", "is text '200 kHz', must be a number"),
+        ("sample_rate", True, "is True, must be a number"),
+        ("sample_rate", 1j, "must be a number"),
+        ("sample_rate", [1.0, 2.0], "has shape"),
+        ("sample_rate", [], "is empty"),
+        ("sample_rate", h5py.Empty("f"), "is empty"),
+        ("kind", "skin", "is 'skin'"),
+        ("kind", 3, "is 3, must be text"),
+        ("subject", 1.5, "must be text or an integer"),
+        ("subject", b"\xff", "not UTF-8"),
+        ("trial", [[1, 2]], "has shape"),
+        ("adc_range", [1.0, 2.0, 3.0], "has 3 elements, must have 2"),
+        ("calibration", np.zeros(2, "i4,i4"), "compound"),
+    ],
+)
+def test_an_attribute_of_the_wrong_kind_is_refused(name, value, message):
+    with pytest.raises(ValueError, match=message):
+        schema.at("group attribute")[name].parse(value)
+
+
+def test_texts_of_every_hdf5_kind_are_read_alike():
+    field = schema.at("group attribute")["calibration"]
+    for value in ("a", b"a", np.bytes_(b"a"), np.array(["a"], object), np.array([b"a"])):
+        assert field.parse(value) == ("a",)
+
+
+@pytest.mark.parametrize(
+    ("version", "problem"),
+    [
+        ("1.0", None),
+        ("1.17", None),
+        ("2.0", "is 2.0"),
+        ("1", "major.minor"),
+        ("new", "major.minor"),
+    ],
+)
+def test_minor_versions_are_read_and_major_ones_refused(version, problem):
+    found = schema.version_problem(version)
+    assert found is None if problem is None else problem in found
