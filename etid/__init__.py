@@ -1,1 +1,41 @@
-"""Circuit identification from electro-tactile stimulation recordings."""
+"""Circuit identification from electro-tactile stimulation recordings.
+
+```python
+import jax
+jax.config.update("jax_enable_x64", True)
+import etid
+
+driver = etid.identify_driver(calibration)          # a known resistor in place of the skin
+fit = etid.identify_skin(recording, driver)
+print(fit)
+```
+"""
+
+from etid import scenes as scenes
+from etid.batch import identify_skins as identify_skins
+from etid.batch import identify_study as identify_study
+from etid.circuits import AbstractCircuit as AbstractCircuit
+from etid.circuits import Resistor as Resistor
+from etid.circuits import SkinRC as SkinRC
+from etid.circuits import capacitor as capacitor
+from etid.circuits import parallel as parallel
+from etid.circuits import parameter as parameter
+from etid.circuits import resistor as resistor
+from etid.circuits import series as series
+from etid.driver import Driver as Driver
+from etid.hdf5 import check as check
+from etid.hdf5 import read as read
+from etid.identify import identify_driver as identify_driver
+from etid.identify import identify_skin as identify_skin
+from etid.identify import predict as predict
+from etid.importing import import_file as import_file
+from etid.recording import Recording as Recording
+from etid.recording import RecordingError as RecordingError
+from etid.recording import Samples as Samples
+from etid.recording import Study as Study
+from etid.results import Fit as Fit
+from etid.results import Fits as Fits
+from etid.results import IdentificationError as IdentificationError
+from etid.verdicts import RESULTS as RESULTS
+
+__version__ = "0.1.0"

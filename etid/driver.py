@@ -8,32 +8,34 @@ of the same impedance have Jacobian condition numbers of 1e4…1e7, the modal on
 is a stable impedance; and a pair of poles passes from complex to real without a change of branch.
 """
 
-from typing import Self
-
 import equinox as eqx
+import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Complex, Float
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, Complex, Float, Int
 
 from etid.filtering import StateSpace
-from etid.transfer import Rational, frequency_variable
+from etid.transfer import Rational, delay_variable, frequency_variable
+from etid.verdicts import RESULTS, message, verdict_names
 
 
 class SourceImpedance(eqx.Module):
     """Order-n rational Z_th(s) in modal form.
 
-    Z_th = R + Σ_k (g_k + h_k s/ω_k) / (1 + 2 ζ_k s/ω_k + (s/ω_k)²) + [n odd] g_0 / (1 + s/ω_0)
+    Z_th = R + Σ_k (g_k + h_k s/ω_k) / (1 + 2 ζ_k s/ω_k + (s/ω_k)²) + Σ_j g_j / (1 + s/ω_j)
 
-    R, g, h are in ohm and may have either sign; ω [rad/s] and ζ are positive and stored as logarithms. ζ > 1 is a pair
-    of real poles. Order n has ⌊n/2⌋ sections.
+    g, h are in ohm and may have either sign; R [Ω], ω [rad/s] and ζ are positive and stored as logarithms: with
+    R < 0 the driver could not be loaded with a capacitor. ζ > 1 is a pair of real poles. Order n has ⌊(n−1)/2⌋ sections,
+    because a transformer always has one slow real pole, its magnetising inductance.
     """
 
-    resistance: Float[Array, ""]
+    log_resistance: Float[Array, ""]
     log_omega: Float[Array, " section"]
     log_zeta: Float[Array, " section"]
     gain: Float[Array, " section"]
     slope: Float[Array, " section"]
-    log_omega_real: Float[Array, " odd"]
-    gain_real: Float[Array, " odd"]
+    log_omega_real: Float[Array, " real"]
+    gain_real: Float[Array, " real"]
 
     @property
     def order(self) -> int:
@@ -46,7 +48,7 @@ class SourceImpedance(eqx.Module):
         x = s / jnp.exp(self.log_omega)
         sections = (self.gain + self.slope * x) / (1 + 2 * jnp.exp(self.log_zeta) * x + x**2)
         real = self.gain_real / (1 + s / jnp.exp(self.log_omega_real))
-        return self.resistance + sections.sum(-1) + real.sum(-1)
+        return jnp.exp(self.log_resistance) + sections.sum(-1) + real.sum(-1)
 
     def state_space(self) -> StateSpace:
         """Realisation from current [A] to voltage drop [V], one balanced 2x2 block per section."""
@@ -63,7 +65,7 @@ class SourceImpedance(eqx.Module):
         B = jnp.zeros((order, 1), omega.dtype).at[i + 1, 0].set(omega).at[j, 0].set(rate)
         C = jnp.zeros(order, omega.dtype).at[i].set(self.gain).at[i + 1].set(self.slope)
         C = C.at[j].set(self.gain_real)
-        return StateSpace(A, B, C, self.resistance[None])
+        return StateSpace(A, B, C, jnp.exp(self.log_resistance)[None])
 
 
 def realise(impedance: Rational, rate: float) -> StateSpace:
@@ -108,21 +110,63 @@ def loaded(source: SourceImpedance, load: Rational, rate: float) -> StateSpace:
 class Driver(eqx.Module):
     """An identified driver: Z_th as a discrete filter and, once refined, in continuous time.
 
+    Only ratios to Z_th are observable: the tolerance of the calibration resistor passes 1:1 into
+    every resistance identified with this driver.
+
     Attributes:
-        b: Numerator α₀ … of the discrete Z_th (paper, eq. 4) [Ω].
+        b: Numerator α₀ … of the discrete Z_th by Steiglitz-McBride (paper, eq. 4) [Ω].
         a: Denominator 1, β₁ … of the discrete Z_th.
         sample_rate: Rate of the discrete filter [Hz].
-        source: Continuous Z_th, valid at any sample rate; None if the driver comes from Steiglitz-McBride.
+        source: Continuous Z_th, valid at any sample rate; None if the method gives none.
         cov: Covariance of the parameters of `source`, flattened in field order.
+        rrse: Largest root relative squared error over the calibrations (paper, eq. 3).
+        chi2: Residual over expected variance per degree of freedom: 1 if the model is right.
+        result: Verdict.
+        steps: Iterations of the solver.
+        method: Name of the estimator.
     """
 
     b: Float[Array, " b"]
     a: Float[Array, " a"]
-    sample_rate: float = eqx.field(static=True)
-    source: SourceImpedance | None = None
-    cov: Float[Array, "parameter parameter"] | None = None
+    sample_rate: float
+    source: SourceImpedance | None
+    cov: Float[Array, "parameter parameter"] | None
+    rrse: Float[Array, ""]
+    chi2: Float[Array, ""]
+    result: RESULTS
+    steps: Int[Array, ""]
+    method: str = eqx.field(static=True)
 
     @property
     def order(self) -> int:
         """Number of poles."""
         return self.a.shape[0] - 1
+
+    @property
+    def verdict(self) -> str:
+        """Name of the verdict."""
+        return verdict_names(self.result).item()
+
+    def response(self, frequency: Float[Array, "..."]) -> Complex[Array, "..."]:
+        """Source impedance [Ω] at real frequencies [Hz]; of the refined model where there is one."""
+        if self.source is not None:
+            return self.source.response(frequency)
+        z = delay_variable(jnp.asarray(frequency), self.sample_rate)
+        return Rational(self.b, self.a)(z)
+
+    def response_stderr(self, frequency: Float[Array, " frequency"]) -> Float[Array, " frequency"]:
+        """Standard error of |Z_th| [Ω]; NaN if the method gives no covariance."""
+        if self.source is None or self.cov is None:
+            return jnp.full_like(frequency, jnp.nan)
+        vector, unflatten = ravel_pytree(self.source)
+        slope = jax.jacfwd(lambda p: jnp.abs(unflatten(p).response(frequency)))(vector)
+        return jnp.sqrt(jnp.einsum("fi,ij,fj->f", slope, self.cov, slope))
+
+    def __str__(self) -> str:
+        z = complex(self.response(jnp.array(1e3)))
+        text = f"Driver of order {self.order}: {self.verdict} in {int(self.steps)} steps ({self.method})"
+        text += f", RRSE {100 * float(self.rrse):.3g} %, chi2 {float(self.chi2):.3g}\n"
+        text += f"  Z_th at 1 kHz {z.real / 1e3:.4g} {z.imag / 1e3:+.4g}j kΩ"
+        if self.verdict != "successful":
+            text += "\n  " + message(self.verdict)
+        return text

@@ -144,7 +144,7 @@ def _check_root(file: h5py.File, name: str) -> None:
                 hint = f", did you mean {field.name} by {near}?" if near else ""
                 raise RecordingError(f"is missing{hint}", remedy=remedy)
             try:
-                found[field.name] = field.parse(file.attrs[field.name])
+                found[field.name] = field.parse(_attribute(file.attrs, field.name))
             except ValueError as error:
                 raise RecordingError(str(error), remedy=remedy) from None
     problem = schema.version_problem(found["schema_version"])
@@ -169,6 +169,17 @@ def _translated(file: str, path: str = "", field: str = "") -> Iterator[None]:
             field=field,
             remedy="The file is damaged or was not closed: copy or record it again",
         ) from error
+
+
+def _attribute(attributes: h5py.AttributeManager, name: str) -> Any:
+    """The value of an attribute, whose type is looked at first.
+
+    A sequence of variable length is in no schema; made from a damaged text, it crashes the library.
+    """
+    dtype = attributes.get_id(name).dtype
+    if h5py.check_vlen_dtype(dtype) not in (None, str, bytes):
+        raise TypeError("it is a sequence of variable length")
+    return attributes[name]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -299,10 +310,9 @@ class _Scan:
                 remedy = "Store each recording once"
                 return self._report(path, "", f"is the same group as {first!r}", remedy)
             self._seen[address] = path
-            kind = group.attrs.get("kind")
-            near = None if "kind" in group.attrs else schema.near_miss("kind", group.attrs)
+            near = "kind" in group.attrs or schema.near_miss("kind", group.attrs)
             names = sorted(group, key=_natural)
-            if kind is not None or near or "v_out" in names:
+            if near or "v_out" in names:
                 return self._inspect(group, path, names)
             for name in names:
                 child = f"{path}/{name}".lstrip("/")
@@ -319,7 +329,7 @@ class _Scan:
                 remedy="Copy the data into the file",
             )
         if isinstance(link, h5py.SoftLink):
-            if name not in group:
+            if group.get(name) is None:
                 raise RecordingError(
                     f"is a dangling link to {link.path!r}", remedy="Remove or mend it"
                 )
@@ -409,7 +419,7 @@ class _Scan:
             if name not in known:
                 continue
             try:
-                value = attributes[name]
+                value = _attribute(attributes, name)
             except LIBRARY_ERRORS as error:
                 self._report(path, f"{of}{name}", f"cannot be read ({error})", "Write it again")
                 continue
@@ -426,7 +436,7 @@ class _Scan:
         remedy = "Copy the samples into the file"
         if isinstance(link, h5py.ExternalLink):
             raise RecordingError(f"is a link to another file, {link.filename!r}", remedy=remedy)
-        if field.name not in group:
+        if group.get(field.name) is None:
             target = getattr(link, "path", "")
             raise RecordingError(f"is a dangling link to {target!r}", remedy="Mend the link")
         dataset = group[field.name]
@@ -545,9 +555,10 @@ def write(study: Study, path: str | os.PathLike[str]) -> None:
     target = pathlib.Path(name)
     partial = target.with_name(f".{target.name}.{secrets.token_hex(4)}.partial")
     try:
-        # v108: attributes of more than 64 kB, the trial labels of a large stack, need it
+        # v108 has checksums over all but the samples, and room for the labels of large stacks
         with h5py.File(partial, "x", libver=("v108", "latest")) as file:
-            file.attrs.update({"schema": schema.NAME, "schema_version": schema.VERSION})
+            _write_attribute(file, "schema", schema.NAME)
+            _write_attribute(file, "schema_version", schema.VERSION)
             for group, members in _stacks(study).items():
                 _write_group(file, group, [study.source(member) for member in members])
         os.replace(partial, target)
@@ -596,13 +607,8 @@ def _write_group(file: h5py.File, path: str, sources: list[AbstractSource]) -> N
     labels["trial"] = [source.metadata.trial for source in sources] if stacked else labels["trial"]
     for name in schema.at("group attribute"):
         value = labels[name]
-        if value is None or len(np.atleast_1d(value)) == 0 or not any(np.atleast_1d(value) != ""):
-            continue
-        text = isinstance(np.ravel(value)[0], str)
-        dtype = h5py.string_dtype() if text else None
-        group.attrs.create(
-            name, value if not isinstance(value, tuple) else list(value), dtype=dtype
-        )
+        if value not in (None, "", ()) and any(item != "" for item in np.ravel(value)):
+            _write_attribute(group, name, value)
     datasets: dict[str, h5py.Dataset] = {}
     for row, source in enumerate(sources):
         for name, samples in source.load().samples.items():
@@ -611,11 +617,27 @@ def _write_group(file: h5py.File, path: str, sources: list[AbstractSource]) -> N
                 shape = samples.stored.shape if single else (len(sources), samples.stored.size)
                 dataset = group.create_dataset(name, shape, samples.stored.dtype)
                 unit = schema.at("dataset")[name].unit
-                dataset.attrs.update(
-                    {"unit": unit, "conversion": samples.conversion, "offset": samples.offset}
-                )
+                scale = {"conversion": samples.conversion, "offset": samples.offset}
+                for attribute, value in {"unit": unit, **scale}.items():
+                    _write_attribute(dataset, attribute, value)
                 datasets[name] = dataset
             if not single:
                 datasets[name][row] = samples.stored
             elif row == 0:
                 datasets[name][...] = samples.stored
+
+
+def _write_attribute(owner: h5py.Group | h5py.Dataset, name: str, value: Any) -> None:
+    """Write a number or text, or several.
+
+    Text has a fixed length: the library keeps text of variable length in a heap that no checksum
+    protects, and reads it through pointers that a damaged byte can turn against the process.
+    """
+    items = np.ravel(value)
+    if not isinstance(items[0], str):
+        owner.attrs[name] = value
+        return
+    encoded = [item.encode("utf-8") for item in items]
+    dtype = h5py.string_dtype("utf-8", max(1, *map(len, encoded)))
+    data = np.array(encoded, dtype)
+    owner.attrs.create(name, data[0] if isinstance(value, str) else data, dtype=dtype)

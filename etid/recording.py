@@ -18,6 +18,7 @@ import numpy as np
 import numpy.typing as npt
 from jaxtyping import Float
 
+Label = str | int | np.integer
 SIGNALS = ("v_th", "v_out", "current")
 
 
@@ -288,10 +289,10 @@ class Recording:
         pulse_rate: SupportsFloat,
         r_load: SupportsFloat | None = None,
         current: npt.ArrayLike | Samples | None = None,
-        subject: str | int = "",
-        condition: str | int = "",
-        electrode: str | int = "",
-        trial: str | int = "",
+        subject: Label = "",
+        condition: Label = "",
+        electrode: Label = "",
+        trial: Label = "",
         calibration: str | Iterable[str] = (),
         adc_range: Iterable[SupportsFloat] | None = None,
         path: str = "",
@@ -547,10 +548,10 @@ class Study(Mapping[str, Recording]):
     def where(
         self,
         *,
-        subject: str | int | None = None,
-        condition: str | int | None = None,
-        electrode: str | int | None = None,
-        trial: str | int | None = None,
+        subject: Label | None = None,
+        condition: Label | None = None,
+        electrode: Label | None = None,
+        trial: Label | None = None,
     ) -> "Study":
         """The recordings whose labels equal those given; no samples are read."""
         given = zip(_LABELS, (subject, condition, electrode, trial), strict=True)

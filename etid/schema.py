@@ -369,7 +369,9 @@ study.h5                     schema="etid/recording", schema_version="1.0"
 ```python
 {EXAMPLE}```
 
-`etid check study.h5` says what is wrong with a file, field by field.
+`etid check study.h5` says what is wrong with a file, field by field. `example.h5` is a file with a
+calibration and a stack of three trials; `python data_schema/make_example.py data_schema/example.h5`
+made it.
 """
 
 _RULES = """\

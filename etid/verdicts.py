@@ -1,56 +1,90 @@
 """Verdicts: how an identification ended, in words, for every lane.
 
-`RESULTS` extends `optimistix.RESULTS`. A member is an integer under `jit` and prints as its message: the cause, then what to do.
+`RESULTS` extends `optimistix.RESULTS`. A member is an integer under `jit` and prints as its message:
+the cause, then what to do.
 """
 
+import jax
+import numpy as np
 import optimistix as optx
 
 
 class RESULTS(optx.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]  # equinox enumerations extend by inheritance
-    """How one identification ended. `successful` is the only good one."""
+    """How one identification ended. `successful` is the only good one.
 
-    max_steps_reached = (
-        "The iteration did not settle within its steps; the best iterate is reported. "
-        "Raise `max_steps`, average more periods, or use method='output_error'."
-    )
+    Three members come from optimistix and lineax: `successful`, `max_steps_reached` (the iteration
+    did not settle) and `nonfinite` (inf or NaN appeared during the fit).
+    """
+
     stalled = (
         "The solver can no longer change the parameters although it is not at a minimum. "
-        "The model does not fit this recording, or the start was too far: check load and units."
+        "The model does not fit this recording: check the load and the units."
     )
     unstable = (
         "The identified filters are unstable with this load, so the voltage cannot be predicted. "
-        "Use method='output_error', which keeps the source impedance stable."
+        "Use method='output_error', or repeat the calibration with less noise."
     )
     nonphysical = (
         "An element is negative or not a number, or the source impedance is not passive. "
-        "The record is too noisy for this method or v_th, v_out and r_load do not belong together."
+        "The record is too noisy for this method, the trigger moved between the records, or "
+        "v_th, v_out and r_load do not belong together."
     )
     insensitive = (
         "The recording does not determine a parameter: its standard error exceeds its value. "
-        "Record more periods or a steeper pulse, or fit a simpler circuit."
+        "Record more periods, reduce the noise, or fit a simpler circuit."
     )
     misfit = (
         "The prediction misses the recording by far more than its noise (chi2). The circuit is "
         "wrong, the trigger moved between the records, or the signal drifted or clipped."
     )
-    flat = (
-        "A record carries no signal above its noise. Check the electrode contact and the channel."
+    biased = (
+        "The estimate is more than four standard errors away from the output-error minimum of its own "
+        "model, as Steiglitz-McBride is with noise. Use method='output_error'."
     )
-    saturated = (
-        "The converter clipped. Lower the gain or the range of the stimulus and record again."
-    )
+    flat = "A record carries no signal above its noise. Check the contact and the channel."
+    saturated = "The converter clipped. Lower the gain or the stimulus and record again."
     nonfinite_samples = "A record contains NaN or infinite samples. Cut them out or record again."
-    too_short = "The record is too short to identify anything. Record at least one whole pulse and 200 samples."
-    not_periodic = (
-        "The record does not repeat at its pulse_rate, or holds less than two periods of it. "
-        "Correct pulse_rate, record more periods, or use a time-domain method."
-    )
+    too_short = "The record is too short to identify anything. Record a whole pulse and its tail."
     misaligned = (
-        "v_out is larger than v_th: the two records are swapped, or not aligned in time. "
-        "Swap them, or align them on the pulse's edge."
+        "v_out carries more power than v_th, or is not aligned with it in time. "
+        "Swap the two records, or align them on the edge of the pulse."
     )
     unreadable = "The recording could not be read from its file; `etid check` says why."
     driver_failed = (
         "The driver this fit rests on was not identified successfully; its own verdict says why. "
         "Repeat the calibration before trusting the elements."
     )
+
+
+# lineax' own text advises an argument that etid does not have.
+_MESSAGES = {
+    "max_steps_reached": (
+        "The iteration did not settle; its best iterate is reported. "
+        "Average more periods, or use method='output_error'."
+    ),
+}
+_NAMES = {int(item._value): name for name, item in RESULTS._name_to_item.items()}
+
+
+def verdict(name: str) -> RESULTS:
+    """The verdict of this name."""
+    return RESULTS._name_to_item[name]
+
+
+def verdict_names(result: RESULTS) -> np.ndarray:
+    """Names of the verdicts of all lanes, as an array of strings with the lanes' shape."""
+    values = np.asarray(result._value)
+    return np.vectorize(_NAMES.__getitem__, otypes=[object])(values).astype(str)
+
+
+def verdicts_of(names: np.ndarray) -> RESULTS:
+    """The verdicts of many lanes from their names; the inverse of `verdict_names`."""
+    item = RESULTS.successful
+    values = [int(verdict(str(name))._value) for name in np.ravel(names)]
+    leaves, tree = jax.tree.flatten(item)
+    return jax.tree.unflatten(tree, [np.reshape(values, np.shape(names)).astype(leaves[0].dtype)])
+
+
+def message(name: str) -> str:
+    """What a verdict means and what to do; empty for `successful`."""
+    return _MESSAGES.get(name, RESULTS[RESULTS._name_to_item[name]])

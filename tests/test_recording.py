@@ -78,7 +78,7 @@ def test_labels_become_text_and_one_calibration_a_tuple():
 
 def test_recordings_are_equal_only_to_themselves():
     one = recording()
-    assert one == one  # noqa: PLR0124  # the point of the test
+    assert one == one
     assert one != recording()
     assert len({one, recording()}) == 2
 

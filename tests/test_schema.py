@@ -21,7 +21,7 @@ def test_the_json_lists_every_field_once_with_its_unit():
     table = json.loads((FOLDER / "recording-1.json").read_text("utf-8"))
     places = [(field["place"], field["name"]) for field in table["fields"]]
     assert len(set(places)) == len(places) == len(schema.FIELDS)
-    assert table["schema"], table["schema_version"] == ("etid/recording", "1.0")
+    assert (table["schema"], table["schema_version"]) == ("etid/recording", "1.0")
     units = {field["name"]: field["unit"] for field in table["fields"]}
     assert units["sample_rate"] == units["pulse_rate"] == "hertz"
     assert (units["v_out"], units["current"], units["r_load"]) == ("volt", "ampere", "ohm")

@@ -1,0 +1,261 @@
+"""Many recordings: lanes in chunks of one compiled function, and whole studies from HDF5.
+
+Recordings of one length share a compiled function. A chunk is one call of it: `CHUNK` lanes, of which `LANES` run side by side
+(`vmap`) and the others after them, so that memory is bounded and one slow lane delays its neighbours only. What is wrong with
+a recording costs that recording alone: it gets a verdict and a note.
+"""
+
+import dataclasses
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from tqdm import tqdm
+
+from etid.circuits import AbstractCircuit, SkinRC
+from etid.driver import Driver
+from etid.identify import (
+    Method,
+    arrays,
+    check_driver,
+    check_method,
+    failed_fit,
+    identify_driver,
+    skin_lane,
+)
+from etid.preflight import preflight
+from etid.recording import Metadata, Recording, RecordingError, Study
+from etid.results import LABELS, Fit, Fits, IdentificationError
+from etid.verdicts import message
+
+CHUNK = 32  # lanes of one call: the last chunk is filled up, so a study compiles once per length
+LANES = 4  # lanes side by side; more of them wait for the slowest
+
+
+@eqx.filter_jit
+def _chunk(samples: Any, driver: Driver, circuit: AbstractCircuit, method: Method) -> Fit:
+    return jax.lax.map(
+        lambda lane: skin_lane(lane, driver, circuit, method), samples, batch_size=LANES
+    )
+
+
+def _labels(metadata: Sequence[Metadata]) -> dict[str, np.ndarray]:
+    return {name: np.array([getattr(m, name) for m in metadata], dtype=str) for name in LABELS}
+
+
+def _stack(fits: Sequence[Fit]) -> Fit:
+    return jax.tree.map(lambda *leaves: np.stack([np.asarray(leaf) for leaf in leaves]), *fits)
+
+
+class _Queue:
+    """Recordings of one length and driver, waiting to fill a chunk."""
+
+    def __init__(self, driver: Driver, circuit: AbstractCircuit, method: Method):
+        self.driver, self.circuit, self.method = driver, circuit, method
+        self.rows: list[int] = []
+        self.lanes: list[tuple[np.ndarray, ...]] = []
+
+    def add(self, row: int, recording: Recording) -> None:
+        self.rows.append(row)
+        self.lanes.append(arrays(recording))
+
+    def run(self) -> Iterable[tuple[int, Fit]]:
+        """Fit what is waiting."""
+        full = CHUNK if len(self.lanes) > LANES else LANES
+        filled = self.lanes + [self.lanes[-1]] * (full - len(self.lanes))
+        samples = tuple(jnp.asarray(np.stack(column)) for column in zip(*filled, strict=True))
+        fits = jax.device_get(_chunk(samples, self.driver, self.circuit, self.method))
+        for lane, row in enumerate(self.rows):
+            yield row, jax.tree.map(lambda leaf, lane=lane: leaf[lane], fits)
+        self.rows, self.lanes = [], []
+
+
+def _identify(
+    count: int,
+    load: Callable[[int], tuple[Recording, Driver]],
+    circuit: AbstractCircuit,
+    method: Method,
+    progress: bool,
+) -> tuple[list[Fit], list[str]]:
+    """Fit `count` recordings; `load(row)` may raise RecordingError or IdentificationError for its row."""
+    fits: dict[int, Fit] = {}
+    notes = [""] * count
+    queues: dict[tuple[int, int], _Queue] = {}
+
+    def fail(row, name, note):
+        fits[row] = failed_fit(name, circuit, method)
+        notes[row] = note
+
+    with tqdm(total=count, unit="fit", disable=not progress) as bar:
+
+        def run(queue):
+            for row, fit in queue.run():
+                fits[row] = fit
+                notes[row] = message(fit.verdict)
+                bar.update()
+
+        for row in range(count):
+            try:
+                recording, driver = load(row)
+                check_driver(driver, method, recording.sample_rate)
+            except (RecordingError, ValueError) as error:
+                fail(row, "unreadable", str(error))
+            except IdentificationError as error:
+                fail(row, "driver_failed", str(error))
+            else:
+                name = preflight(recording)
+                if name is None:
+                    key = (id(driver), recording.v_th.size)
+                    queue = queues.setdefault(key, _Queue(driver, circuit, method))
+                    queue.add(row, recording)
+                    if len(queue.rows) == CHUNK:
+                        run(queue)
+                    continue
+                fail(row, name, message(name))
+            bar.update()
+        for queue in queues.values():
+            if queue.rows:
+                run(queue)
+    return [fits[row] for row in range(count)], notes
+
+
+def identify_skins(
+    recordings: Iterable[Recording] | Study,
+    driver: Driver,
+    *,
+    circuit: AbstractCircuit | None = None,
+    method: Method = "output_error",
+    progress: bool = False,
+) -> Fits:
+    """Identify many recordings made with one driver.
+
+    Args:
+        recordings: Recordings, or a study of loaded ones; of any lengths and sample rates.
+        driver: Identified driver.
+        circuit: As in `identify_skin`.
+        method: As in `identify_skin`.
+        progress: Show a progress bar.
+
+    Returns:
+        One fit per recording, in their order; none is left without a verdict.
+
+    Raises:
+        ValueError: No recording, or method and circuit do not go together.
+    """
+    circuit = SkinRC() if circuit is None else circuit
+    check_method(method, circuit)
+    if isinstance(recordings, Study):
+        study, paths = recordings, list(recordings)
+        metadata = [_metadata(study, path) for path in paths]
+        fits, notes = _identify(
+            len(paths), lambda row: (study[paths[row]], driver), circuit, method, progress
+        )
+    else:
+        records = list(recordings)
+        metadata = [record.metadata for record in records]
+        fits, notes = _identify(
+            len(records), lambda row: (records[row], driver), circuit, method, progress
+        )
+    if not fits:
+        raise ValueError("there is no recording to identify")
+    return Fits(_stack(fits), _labels(metadata), np.array(notes, dtype=str))
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class StudyFits:
+    """What `identify_study` returns.
+
+    Attributes:
+        fits: One fit per loaded recording.
+        drivers: The drivers, by the paths of their calibrations.
+        failures: Why a driver could not be identified, by the paths of its calibrations.
+    """
+
+    fits: Fits
+    drivers: Mapping[tuple[str, ...], Driver]
+    failures: Mapping[tuple[str, ...], str]
+
+
+def identify_study(
+    study: Study,
+    *,
+    order: int = 5,
+    circuit: AbstractCircuit | None = None,
+    method: Method = "output_error",
+    progress: bool = False,
+) -> StudyFits:
+    """Identify every driver of a study from its calibrations, then every loaded recording.
+
+    A recording that names no calibration belongs to the only one in the study; if there are several, it
+    gets the verdict `unreadable` rather than a guess.
+
+    Args:
+        study: Calibrations and loaded recordings.
+        order: As in `identify_driver`.
+        circuit: As in `identify_skin`.
+        method: As in `identify_skin`.
+        progress: Show a progress bar.
+    """
+    circuit = SkinRC() if circuit is None else circuit
+    check_method(method, circuit)
+    loaded = [path for path in study if _kind(study, path) != "calibration"]
+    calibrations = [path for path in study if _kind(study, path) == "calibration"]
+    drivers: dict[tuple[str, ...], Driver] = {}
+    failures: dict[tuple[str, ...], str] = {}
+
+    def driver_of(recording: Recording) -> Driver:
+        names = recording.calibration or tuple(calibrations)
+        if not recording.calibration and len(calibrations) != 1:
+            raise RecordingError(
+                f"names no calibration and the study has {len(calibrations)}",
+                path=recording.path,
+                field="calibration",
+                remedy="Write the path of its calibration into the attribute 'calibration'",
+            )
+        if names not in drivers and names not in failures:
+            try:
+                records = [study[name] for name in names]
+                drivers[names] = identify_driver(records, order=order, method=method, throw=False)
+            except (IdentificationError, ValueError, KeyError) as error:
+                failures[names] = str(error)
+        if names in failures:
+            raise IdentificationError(failures[names], None)
+        return drivers[names]
+
+    def load(row: int) -> tuple[Recording, Driver]:
+        recording = study[loaded[row]]
+        return recording, driver_of(recording)
+
+    fits, notes = _identify(len(loaded), load, circuit, method, progress)
+    if not fits:
+        raise ValueError("the study has no loaded recording")
+    metadata = [_metadata(study, path) for path in loaded]
+    table = Fits(_stack(fits), _labels(metadata), np.array(notes, dtype=str))
+    return StudyFits(table, drivers, failures)
+
+
+def _kind(study: Study, path: str) -> str:
+    try:
+        return study.metadata(path).kind
+    except RecordingError:
+        return "unreadable"
+
+
+def _metadata(study: Study, path: str) -> Any:
+    """Labels of a recording, of which only the path is known if it cannot be read."""
+    try:
+        return study.metadata(path)
+    except RecordingError:
+        return _Unreadable(path)
+
+
+@dataclasses.dataclass(frozen=True)
+class _Unreadable:
+    path: str
+    subject: str = ""
+    condition: str = ""
+    electrode: str = ""
+    trial: str = ""

@@ -1,0 +1,325 @@
+"""One lane: samples in, judged estimate out. The same functions serve one recording and a batch.
+
+Every estimate passes through a judge, so that none leaves without a verdict. Among several applicable verdicts the
+most fundamental is reported: a loop that cannot be simulated, then elements that are no circuit, then a solver that
+did not settle, then a model that misses the data, then parameters that the data do not determine.
+"""
+
+from collections.abc import Callable
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from etid import output_error, steiglitz_mcbride
+from etid.circuits import AbstractCircuit, SkinRC
+from etid.driver import Driver, SourceImpedance
+from etid.filtering import lfilter
+from etid.levenberg_marquardt import normal_equations
+from etid.noise import noise_std
+from etid.results import Fit, rrse
+from etid.transfer import Rational, poles
+from etid.verdicts import RESULTS
+
+MISFIT_CHI2 = 1.5  # the noise is known from the record to about 5 %, chi2 therefore to 10 %
+MISFIT_RRSE = (
+    1e-3  # of the signal; what converters and transformers leave unexplained at their best
+)
+BIASED = 16.0  # squared standard errors between an estimate and the minimum of its own model
+PASSIVE = 2.0  # standard errors by which Re Z_th may be negative
+BAND = np.linspace(0.0003, 0.4, 400)  # of the sample rate, where a source must be passive
+LEVELS = (1.0, 0.125, 0.5, 2.0, 8.0)  # impedance levels at which a circuit is started
+IMPULSE = 512  # samples of a discrete model's impulse response
+UNWANTED = 1e3  # added to the cost of a start that did not settle; any cost is smaller
+
+
+class Measurement(eqx.Module):
+    """One pair of records with the noise of each.
+
+    Attributes:
+        v_th: Unloaded voltage [V].
+        v_out: Loaded voltage [V].
+        sigma_th: Noise of `v_th` [V].
+        sigma_out: Noise of `v_out` [V].
+        sample_rate: Sampling rate [Hz].
+    """
+
+    v_th: Float[Array, "*lane time"]
+    v_out: Float[Array, "*lane time"]
+    sigma_th: Float[Array, "*lane"]
+    sigma_out: Float[Array, "*lane"]
+    sample_rate: Float[Array, "*lane"]
+
+
+def measure(
+    v_th: Float[Array, " time"],
+    v_out: Float[Array, " time"],
+    resolution_th: Float[Array, ""],
+    resolution_out: Float[Array, ""],
+    sample_rate: Float[Array, ""],
+) -> Measurement:
+    """Estimate the noise of both records; `resolution` is the converter's step [V], 0 if not known."""
+    return Measurement(
+        v_th,
+        v_out,
+        noise_std(v_th, resolution_th),
+        noise_std(v_out, resolution_out),
+        sample_rate,
+    )
+
+
+def _prepare(m: Measurement) -> output_error.Records:
+    return output_error.prepare(m.v_th, m.v_out, m.sigma_th, m.sigma_out, m.sample_rate)
+
+
+def _verdict(*conditions: tuple[Bool[Array, ""], RESULTS]) -> RESULTS:
+    """The first verdict whose condition holds, else successful."""
+    result = RESULTS.successful
+    for condition, verdict in reversed(conditions):
+        result = RESULTS.where(condition, verdict, result)
+    return result
+
+
+def _misses(chi2: Float[Array, ""], error: Float[Array, ""]) -> Bool[Array, ""]:
+    """Whether the residual exceeds the noise both in standard deviations and in volts."""
+    excess = error * jnp.sqrt(jnp.maximum(1 - 1 / chi2, 0.0))
+    return (chi2 > MISFIT_CHI2) & (excess > MISFIT_RRSE)
+
+
+# --- Steiglitz-McBride ---------------------------------------------------------------------------
+
+
+def _score(
+    m: Measurement,
+    coefficients: Float[Array, " n"],
+    predict: Callable[[Float[Array, " n"], Float[Array, " time"]], Float[Array, " time"]],
+) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    """χ² of a discrete model and its squared distance, in standard errors, to the nearest minimum (score test)."""
+    impulse = jnp.zeros(IMPULSE).at[0].set(1.0)
+
+    def scaled(c):
+        h = predict(c, impulse)
+        s = m.sigma_out**2 + m.sigma_th**2 * jnp.sum(h**2)
+        return (predict(c, m.v_th) - m.v_out) / jnp.sqrt(s)
+
+    equations = normal_equations(scaled, coefficients)
+    scale = jnp.sqrt(jnp.diagonal(equations.matrix))
+    scale = jnp.where(scale > 0, scale, 1.0)
+    ridge = 1e-12 * jnp.eye(scale.size)
+    gradient = equations.gradient / scale
+    newton = jnp.linalg.solve(equations.matrix / scale[:, None] / scale + ridge, gradient)
+    return 2 * equations.objective / m.v_th.size, jnp.dot(newton, gradient)
+
+
+def skin_by_steiglitz_mcbride(m: Measurement, driver: Driver, iterations: int) -> Fit:
+    """The paper's estimate of SkinRC (eqs. 8-12); `iterations` 1 is equation error."""
+    z_th = Rational(driver.b, driver.a)
+    best = steiglitz_mcbride.skin_filter(m.v_th, m.v_out, z_th, iterations)
+    circuit = steiglitz_mcbride.skin_elements(best.filter, m.sample_rate)
+    free = best.filter.num.size
+
+    def predict(c, v):
+        load = Rational(c[:free], jnp.concatenate([jnp.ones(1), c[free:]]))
+        return steiglitz_mcbride.terminal_voltage(z_th, load, v)[0]
+
+    chi2, distance = _score(m, jnp.concatenate([best.filter.num, best.filter.den[1:]]), predict)
+    values = circuit.values()
+    unstable = ~jnp.isfinite(best.rrse)
+    nothing = jnp.full((values.size, values.size), jnp.nan)
+    return Fit(
+        circuit=circuit,
+        cov=nothing,
+        shared_cov=nothing,
+        rrse=best.rrse,
+        chi2=jnp.where(unstable, jnp.inf, chi2),
+        result=_verdict(
+            (unstable, RESULTS.unstable),
+            (~jnp.all(values > 0), RESULTS.nonphysical),
+            ((iterations > 1) & ~best.converged, RESULTS.max_steps_reached),
+            (_misses(chi2, best.rrse), RESULTS.misfit),
+            (distance > BIASED, RESULTS.biased),
+        ),
+        steps=best.iteration,
+        method="steiglitz_mcbride" if iterations > 1 else "equation_error",
+    )
+
+
+def driver_by_steiglitz_mcbride(
+    m: Measurement, r_load: Float[Array, " record"], order: int, iterations: int
+) -> Driver:
+    """The paper's estimate of Z_th (eqs. 4-6) from stacked measurements; `iterations` 1 is equation error."""
+    best = steiglitz_mcbride.driver_filter(m.v_th, m.v_out, r_load, order, iterations)
+    free = best.filter.num.size
+
+    def score(m, r):
+        def predict(c, v):
+            z_th = Rational(c[:free], jnp.concatenate([jnp.ones(1), c[free:]]))
+            return steiglitz_mcbride.terminal_voltage(z_th, Rational(r[None], jnp.ones(1)), v)[0]
+
+        return _score(m, jnp.concatenate([best.filter.num, best.filter.den[1:]]), predict)
+
+    chi2, distance = jax.vmap(score)(m, r_load)
+    chi2 = chi2.max()
+    unstable = ~jnp.isfinite(best.rrse) | ~best.stable
+    return Driver(
+        b=best.filter.num,
+        a=best.filter.den,
+        sample_rate=m.sample_rate[0],
+        source=None,
+        cov=None,
+        rrse=best.rrse,
+        chi2=jnp.where(jnp.isfinite(best.rrse), chi2, jnp.inf),
+        result=_verdict(
+            (unstable, RESULTS.unstable),
+            ((iterations > 1) & ~best.converged, RESULTS.max_steps_reached),
+            (_misses(chi2, best.rrse), RESULTS.misfit),
+            (distance.max() > BIASED, RESULTS.biased),
+        ),
+        steps=best.iteration,
+        method="steiglitz_mcbride" if iterations > 1 else "equation_error",
+    )
+
+
+# --- Output error --------------------------------------------------------------------------------
+
+
+def skin_by_output_error(m: Measurement, driver: Driver, circuit: AbstractCircuit) -> Fit:
+    """Refine from the best of several impedance levels and, for SkinRC, the paper's estimate."""
+    source, source_cov = driver.source, driver.cov
+    if source is None or source_cov is None:
+        raise ValueError("output error needs a driver identified by output error")
+    typical = circuit.log_values()
+    is_ohm = jnp.array([unit == "ohm" for unit in circuit.units().values()])
+    sign = jnp.where(is_ohm, 1.0, -1.0)
+    starts = [typical + np.log(level) * sign for level in LEVELS]
+    if isinstance(circuit, SkinRC):
+        baseline = skin_by_steiglitz_mcbride(m, driver, steiglitz_mcbride.ITERATIONS)
+        values = baseline.circuit.values()
+        usable = jnp.all(values > 0) & jnp.isfinite(values).all()
+        starts.append(jnp.where(usable, jnp.log(jnp.where(usable, values, 1.0)), typical))
+    fitted, estimate = output_error.fit_circuit(
+        _prepare(m), source, source_cov, circuit.with_log_values(jnp.stack(starts))
+    )
+    values = fitted.values()
+    errors = jnp.sqrt(jnp.diagonal(estimate.cov))  # of the logarithms, so relative ones
+    settled = RESULTS.promote(estimate.result) == RESULTS.successful
+    diverged = RESULTS.promote(estimate.result) == RESULTS.nonlinear_divergence
+    return Fit(
+        circuit=fitted,
+        cov=estimate.cov * jnp.outer(values, values),
+        shared_cov=estimate.shared_cov * jnp.outer(values, values),
+        rrse=estimate.rrse,
+        chi2=estimate.chi2,
+        result=_verdict(
+            (~jnp.isfinite(estimate.chi2), RESULTS.unstable),
+            (~jnp.isfinite(values).all(), RESULTS.nonphysical),
+            (diverged, RESULTS.stalled),
+            (~settled, RESULTS.max_steps_reached),
+            (_misses(estimate.chi2, estimate.rrse), RESULTS.misfit),
+            (~jnp.all(errors < 1), RESULTS.insensitive),
+            (driver.result != RESULTS.successful, RESULTS.driver_failed),
+        ),
+        steps=estimate.steps,
+        method="output_error",
+    )
+
+
+def source_starts(
+    baseline: Float[Array, " a"],
+    order: int,
+    sample_rate: Float[Array, ""],
+    r_load: Float[Array, ""],
+) -> SourceImpedance:
+    """Starts for Z_th, stacked: three generic ones, and one with the resonances of the discrete baseline.
+
+    Every start has one slow real pole and sections at the given frequencies and damping ratios; all gains are of the
+    size of a tenth of the known resistor.
+    """
+    sections = (order - 1) // 2
+    reals = order - 2 * sections
+    turn = 2 * jnp.pi * sample_rate
+    generic = [[(0.1, 0.3), (0.5, 1.5)], [(0.25, 0.3), (0.5, 1.5)], [(0.1, 0.3), (0.25, 0.3)]]
+    far = (0.5, 1.5)  # further sections start overdamped at the edge of what was sampled
+
+    def start(pairs):
+        pairs = (pairs + [far] * sections)[:sections]
+        omega = (
+            jnp.stack([jnp.asarray(w) * jnp.ones(()) for w, _ in pairs]) if pairs else jnp.ones(0)
+        )
+        zeta = (
+            jnp.stack([jnp.asarray(z) * jnp.ones(()) for _, z in pairs]) if pairs else jnp.ones(0)
+        )
+        slow = jnp.array([3e-4] + [0.5] * (reals - 1))
+        small = 0.1 * r_load
+        return SourceImpedance(
+            log_resistance=jnp.log(0.05 * small),
+            log_omega=jnp.log(omega * turn),
+            log_zeta=jnp.log(zeta),
+            gain=jnp.full(sections, small),
+            slope=jnp.full(sections, small),
+            log_omega_real=jnp.log(slow * turn),
+            gain_real=jnp.full(reals, -0.5 * small),
+        )
+
+    starts = [start(pairs) for pairs in generic]
+    if sections:
+        s = jnp.log(poles(baseline))  # s / fs of the discrete poles
+        # Resonances are the poles well inside the band; the least damped comes first.
+        resonant = (s.imag > 0.05) & (s.imag < 0.9 * jnp.pi) & (s.real < 0)
+        damping = jnp.where(resonant, -s.real / jnp.abs(s), jnp.inf)
+        found = jnp.argsort(damping)[0]
+        usable = jnp.isfinite(damping[found])
+        omega = jnp.where(usable, jnp.abs(s[found]) / (2 * jnp.pi), 0.1)
+        zeta = jnp.where(usable, damping[found], 0.3)
+        starts.append(start([(omega, zeta)]))
+    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *starts)
+
+
+def driver_by_output_error(m: Measurement, r_load: Float[Array, " record"], order: int) -> Driver:
+    """Refine Z_th from several starts and keep the best that settled."""
+    baseline = driver_by_steiglitz_mcbride(m, r_load, order, steiglitz_mcbride.ITERATIONS)
+    records = jax.vmap(_prepare)(m)
+    starts = source_starts(baseline.a, order, m.sample_rate[0], r_load.mean())
+    # One start after the other: side by side they would all run as long as the slowest, and slower.
+    sources, estimates = jax.lax.map(
+        lambda start: output_error.fit_source(records, r_load, start), starts
+    )
+    frequency = jnp.asarray(BAND) * m.sample_rate[0]
+
+    def resistance(source, cov):
+        vector, unflatten = jax.flatten_util.ravel_pytree(source)
+        slope = jax.jacfwd(lambda p: unflatten(p).response(frequency).real)(vector)
+        error = jnp.sqrt(jnp.maximum(jnp.einsum("fi,ij,fj->f", slope, cov, slope), 0.0))
+        return jnp.min(source.response(frequency).real + PASSIVE * error)
+
+    passive = jax.vmap(resistance)(sources, estimates.cov) >= 0
+    settled = RESULTS.promote(estimates.result) == RESULTS.successful
+    finite = jnp.isfinite(estimates.chi2)
+    # Starts that settled on a passive circuit come first. Between them log s + chi2 decides, not chi2 alone, which a noisy
+    # record can lower by a spurious resonance that raises s.
+    log_s = jnp.log(estimates.rrse**2 / estimates.chi2)
+    cost = jnp.where(finite, estimates.chi2 + log_s, jnp.inf)
+    cost = cost + jnp.where(settled, 0.0, UNWANTED) + jnp.where(passive, 0.0, UNWANTED)
+    chosen = jnp.argmin(jnp.where(finite, cost, jnp.inf))
+    source, estimate = jax.tree.map(lambda leaf: leaf[chosen], (sources, estimates))
+    diverged = RESULTS.promote(estimate.result) == RESULTS.nonlinear_divergence
+    return Driver(
+        b=baseline.b,
+        a=baseline.a,
+        sample_rate=m.sample_rate[0],
+        source=source,
+        cov=estimate.cov,
+        rrse=estimate.rrse,
+        chi2=estimate.chi2,
+        result=_verdict(
+            (~finite[chosen], RESULTS.unstable),
+            (~passive[chosen], RESULTS.nonphysical),
+            (diverged, RESULTS.stalled),
+            (~settled[chosen], RESULTS.max_steps_reached),
+            (_misses(estimate.chi2, estimate.rrse), RESULTS.misfit),
+        ),
+        steps=estimate.steps,
+        method="output_error",
+    )

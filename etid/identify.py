@@ -1,0 +1,220 @@
+"""Identify a driver from calibrations and a skin from a recording: pre-flight, baseline, refinement, verdict."""
+
+from collections.abc import Sequence
+from typing import Any, Literal
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from etid import estimation, output_error, steiglitz_mcbride
+from etid.circuits import AbstractCircuit, Resistor, SkinRC
+from etid.driver import Driver
+from etid.filtering import TAPS
+from etid.precision import require_float64
+from etid.preflight import preflight, resolution
+from etid.recording import Recording
+from etid.results import Fit, IdentificationError
+from etid.verdicts import message, verdict
+
+Method = Literal["output_error", "steiglitz_mcbride", "equation_error"]
+METHODS: tuple[Method, ...] = ("output_error", "steiglitz_mcbride", "equation_error")
+
+
+def _iterations(method: Method) -> int:
+    return 1 if method == "equation_error" else steiglitz_mcbride.ITERATIONS
+
+
+def check_method(method: str, circuit: AbstractCircuit | None = None) -> None:
+    require_float64()
+    if method not in METHODS:
+        raise ValueError(f"method {method!r} is not known; use one of {', '.join(METHODS)}")
+    if method != "output_error" and circuit is not None and not isinstance(circuit, SkinRC):
+        raise ValueError(
+            f"method {method!r} identifies SkinRC only, not {type(circuit).__name__}; "
+            "use method='output_error'"
+        )
+
+
+def check_driver(driver: Driver, method: Method, sample_rate: float) -> None:
+    """Raise ValueError if `driver` cannot serve `method` at `sample_rate` [Hz]."""
+    if method == "output_error" and driver.source is None:
+        raise ValueError(
+            f"this driver was identified by {driver.method}, which gives no continuous source "
+            "impedance; identify it with method='output_error'"
+        )
+    if method != "output_error" and not np.isclose(float(driver.sample_rate), sample_rate):
+        raise ValueError(
+            f"{method} needs recording and calibration at one sample rate, but the recording has "
+            f"{sample_rate:g} Hz and the driver {float(driver.sample_rate):g} Hz; use method='output_error'"
+        )
+
+
+def arrays(recording: Recording) -> tuple[np.ndarray, ...]:
+    """What a lane needs of a recording: both voltages, both resolutions, the sample rate."""
+    return (
+        recording.v_th,
+        recording.v_out,
+        np.asarray(resolution(recording, "v_th")),
+        np.asarray(resolution(recording, "v_out")),
+        np.asarray(recording.sample_rate),
+    )
+
+
+@eqx.filter_jit
+def _driver(samples: Any, r_load: Float[Array, " record"], order: int, method: Method) -> Driver:
+    m = jax.vmap(estimation.measure)(*samples)
+    if method == "output_error":
+        return estimation.driver_by_output_error(m, r_load, order)
+    return estimation.driver_by_steiglitz_mcbride(m, r_load, order, _iterations(method))
+
+
+def skin_lane(samples: Any, driver: Driver, circuit: AbstractCircuit, method: Method) -> Fit:
+    """Identify one lane; differentiable code, to be jitted and batched by the caller."""
+    m = estimation.measure(*samples)
+    if method == "output_error":
+        return estimation.skin_by_output_error(m, driver, circuit)
+    return estimation.skin_by_steiglitz_mcbride(m, driver, _iterations(method))
+
+
+_skin = eqx.filter_jit(skin_lane)
+
+
+def identify_driver(
+    calibrations: Recording | Sequence[Recording],
+    *,
+    order: int = 5,
+    method: Method = "output_error",
+    throw: bool = True,
+) -> Driver:
+    """Identify the source impedance Z_th from one or several records with known resistors.
+
+    Args:
+        calibrations: Recordings with `r_load`, of one length and sample rate.
+        order: Number of poles of Z_th (the paper uses 5).
+        method: `"output_error"`, or the paper's `"steiglitz_mcbride"`, or its first iteration
+            `"equation_error"`.
+        throw: Raise if the verdict is not successful.
+
+    Returns:
+        The driver, with its verdict.
+
+    Raises:
+        ValueError: No calibration, one without `r_load`, different lengths, or order below 2.
+        IdentificationError: The verdict is not successful and `throw` is set.
+    """
+    check_method(method)
+    records = [calibrations] if isinstance(calibrations, Recording) else list(calibrations)
+    if not records:
+        raise ValueError(
+            "no calibration given; a driver needs at least one record with a known r_load"
+        )
+    for record in records:
+        if record.r_load is None:
+            raise ValueError(
+                f"recording {record.path!r} has no r_load; a calibration needs its resistor [ohm]"
+            )
+    if order < 2:
+        raise ValueError(f"order is {order}; a source impedance needs at least order 2")
+    sizes = {(record.v_th.size, record.sample_rate) for record in records}
+    if len(sizes) > 1:
+        raise ValueError(
+            f"calibrations differ in (samples, sample rate): {sorted(sizes)}; cut them to one length"
+        )
+    for record in records:
+        name = preflight(record)
+        if name is not None:
+            text = f"calibration {record.path!r}: {name}. {message(name)}"
+            raise IdentificationError(text, None)
+    samples = tuple(
+        jnp.asarray(np.stack(column)) for column in zip(*map(arrays, records), strict=True)
+    )
+    r_load = jnp.asarray([record.r_load for record in records])
+    driver = _driver(samples, r_load, order, method)
+    if throw and driver.verdict != "successful":
+        raise IdentificationError(f"driver: {driver.verdict}. {message(driver.verdict)}", driver)
+    return driver
+
+
+def failed_fit(name: str, circuit: AbstractCircuit, method: Method) -> Fit:
+    """A fit without numbers, for a recording that was stopped before it."""
+    size = len(circuit.names())
+    nan = np.full((size, size), np.nan)
+    empty = circuit.with_log_values(jnp.full(size, jnp.nan))
+    scalar = np.asarray(np.nan)
+    return Fit(empty, nan, nan, scalar, scalar, verdict(name), np.asarray(0), method)
+
+
+def identify_skin(
+    recording: Recording,
+    driver: Driver,
+    *,
+    circuit: AbstractCircuit | None = None,
+    method: Method = "output_error",
+    throw: bool = True,
+) -> Fit:
+    """Identify what is connected to the driver in one recording.
+
+    Args:
+        recording: Unloaded and loaded voltage.
+        driver: Identified driver.
+        circuit: Structure of the load and its typical values; `SkinRC` if not given.
+        method: As in `identify_driver`.
+        throw: Raise if the verdict is not successful.
+
+    Returns:
+        Elements, standard errors and verdict.
+
+    Raises:
+        ValueError: The driver cannot serve this method, or the method this circuit.
+        IdentificationError: The verdict is not successful and `throw` is set.
+    """
+    circuit = SkinRC() if circuit is None else circuit
+    check_method(method, circuit)
+    check_driver(driver, method, recording.sample_rate)
+    name = preflight(recording)
+    if name is not None:
+        fit = failed_fit(name, circuit, method)
+    else:
+        fit = _skin(tuple(map(jnp.asarray, arrays(recording))), driver, circuit, method)
+    if throw and fit.verdict != "successful":
+        text = f"recording {recording.path!r}: {fit.verdict}. {message(fit.verdict)}"
+        raise IdentificationError(text, fit)
+    return fit
+
+
+@eqx.filter_jit
+def _fitted(samples: Any, driver: Driver, circuit: AbstractCircuit) -> Float[Array, " interval"]:
+    m = estimation.measure(*samples)
+    records = output_error.prepare(m.v_th, m.v_out, m.sigma_th, m.sigma_out, m.sample_rate)
+    assert driver.source is not None  # check_driver
+    return output_error.fitted_voltage(records, driver.source, circuit.impedance())
+
+
+def predict(
+    recording: Recording, driver: Driver, circuit: AbstractCircuit | None = None
+) -> Float[np.ndarray, " time"]:
+    """Predict the terminal voltage [V] of a recording, for plots and residuals.
+
+    The state at the start of the record and an offset are fitted to `recording.v_out`.
+
+    Args:
+        recording: Unloaded and loaded voltage.
+        driver: Driver identified by output error.
+        circuit: The load; the known resistor of a calibration if not given.
+
+    Returns:
+        Predicted voltage; NaN at both edges, where the interpolation lacks neighbours.
+    """
+    require_float64()
+    if circuit is None:
+        if recording.r_load is None:
+            raise ValueError("give the circuit: this recording has no known resistor")
+        circuit = Resistor(recording.r_load)
+    check_driver(driver, "output_error", recording.sample_rate)
+    inner = np.asarray(_fitted(tuple(map(jnp.asarray, arrays(recording))), driver, circuit))
+    predicted = np.full(recording.v_out.size, np.nan)
+    predicted[TAPS - 1 : TAPS - 1 + inner.size] = inner
+    return predicted

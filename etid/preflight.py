@@ -1,0 +1,81 @@
+"""Pre-flight: what can be seen to be wrong with a recording before anything is fitted."""
+
+import numpy as np
+from jaxtyping import Float
+
+from etid.filtering import TAPS
+from etid.noise import noise_std
+from etid.recording import Recording
+
+SHORTEST = 4 * TAPS + 104  # samples: the interpolation's edges and a hundred and some to fit
+FLAT = (
+    8.0  # standard deviations of the noise that a signal must exceed, peak to peak, beyond chance
+)
+RAIL = 3  # equal extreme samples in a row that a noisy or sloping signal does not produce
+JUMP = 8.0  # converter steps by which a clipped signal enters and leaves its rail
+POWER = 1.01  # of v_out over v_th; a passive load takes power, and gains match better than this
+SHIFT = 50e-6  # [s] that a load may delay v_out; R_th C_p is below 10 µs
+
+
+def preflight(recording: Recording) -> str | None:
+    """Name the verdict that forbids a fit, or None.
+
+    Verdicts: `too_short`, `nonfinite_samples`, `flat`, `saturated`, `misaligned`.
+    """
+    v_th, v_out = recording.v_th, recording.v_out
+    if v_th.size < SHORTEST:
+        return "too_short"
+    if not (np.isfinite(v_th).all() and np.isfinite(v_out).all()):
+        return "nonfinite_samples"
+    if any(_is_flat(recording, name) for name in ("v_th", "v_out")):
+        return "flat"
+    if any(_is_saturated(recording, name) for name in ("v_th", "v_out")):
+        return "saturated"
+    if _is_misaligned(v_th, v_out, recording.sample_rate):
+        return "misaligned"
+    return None
+
+
+def resolution(recording: Recording, name: str) -> float:
+    """Converter step [V] of one record, 0 if it is not known."""
+    return recording.samples[name].resolution or 0.0
+
+
+def _is_flat(recording: Recording, name: str) -> bool:
+    v = getattr(recording, name)
+    sigma = float(noise_std(v, resolution(recording, name)))
+    return bool(np.ptp(v) <= FLAT * sigma or np.ptp(v) == 0)
+
+
+def _is_saturated(recording: Recording, name: str) -> bool:
+    """Samples at the converter's rails, or a flat top that the signal enters and leaves in jumps."""
+    v = getattr(recording, name)
+    step = resolution(recording, name)
+    if recording.adc_range is not None:
+        low, high = recording.adc_range
+        return bool((v <= low + step / 2).any() or (v >= high - step / 2).any())
+    for extreme in (v.max(), v.min()):
+        at_rail = v == extreme
+        edges = np.flatnonzero(np.diff(np.concatenate([[0], at_rail.astype(np.int8), [0]])))
+        for start, stop in edges.reshape(-1, 2):
+            inside = start > 0 and stop < v.size
+            if stop - start < RAIL or not inside:
+                continue
+            floor = step if step > 0 else np.ptp(v) / 2**16
+            jump = min(abs(v[start - 1] - extreme), abs(v[stop] - extreme))
+            if jump > JUMP * floor:
+                return True
+    return False
+
+
+def _is_misaligned(
+    v_th: Float[np.ndarray, " time"], v_out: Float[np.ndarray, " time"], sample_rate: float
+) -> bool:
+    x, y = v_th - v_th.mean(), v_out - v_out.mean()
+    if y @ y > POWER * (x @ x):
+        return True
+    size = 2 * x.size
+    correlation = np.fft.irfft(np.fft.rfft(y, size) * np.conj(np.fft.rfft(x, size)), size)
+    lag = int(np.argmax(correlation))
+    lag = lag - size if lag > size // 2 else lag
+    return abs(lag) > max(1.0, SHIFT * sample_rate)
