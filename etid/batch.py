@@ -1,8 +1,9 @@
 """Many recordings: lanes in chunks of one compiled function, and whole studies from HDF5.
 
-Recordings of one length share a compiled function. A chunk is one call of it: `CHUNK` lanes, of which `LANES` run side by side
-(`vmap`) and the others after them, so that memory is bounded and one slow lane delays its neighbours only. What is wrong with
-a recording costs that recording alone: it gets a verdict and a note.
+Recordings of one length share a compiled function. A chunk is one call of it: `CHUNK` lanes, of
+which `LANES` run side by side (`vmap`) and the others after them, so that memory is bounded and one
+slow lane delays its neighbours only. What is wrong with a recording costs that recording alone: it
+gets a verdict and a note.
 """
 
 import dataclasses
@@ -80,7 +81,7 @@ def _identify(
     method: Method,
     progress: bool,
 ) -> tuple[list[Fit], list[str]]:
-    """Fit `count` recordings; `load(row)` may raise RecordingError or IdentificationError for its row."""
+    """Fit `count` recordings; what `load(row)` raises becomes the verdict of its row."""
     fits: dict[int, Fit] = {}
     notes = [""] * count
     queues: dict[tuple[int, int], _Queue] = {}
@@ -189,8 +190,8 @@ def identify_study(
 ) -> StudyFits:
     """Identify every driver of a study from its calibrations, then every loaded recording.
 
-    A recording that names no calibration belongs to the only one in the study; if there are several, it
-    gets the verdict `unreadable` rather than a guess.
+    A recording that names no calibration belongs to the only one in the study; if there are
+    several, it gets the verdict `unreadable` rather than a guess.
 
     Args:
         study: Calibrations and loaded recordings.

@@ -1,7 +1,8 @@
 """Circuits: elements, series and parallel connection, the skin, and the driver.
 
-A circuit is a frozen module with named parameters and one method, `impedance()`, built from `resistor`, `capacitor`,
-`series` and `parallel`. Everything else (filter, fit, covariance, printing with units) follows from these lines.
+A circuit is a frozen module with named parameters and one method, `impedance()`, built from
+`resistor`, `capacitor`, `series` and `parallel`. Everything else (filter, fit, covariance, printing
+with units) follows from these lines.
 """
 
 import abc

@@ -3,9 +3,10 @@
     V_th(t) --[Z_th]--+-- V_out        V_out = V_th · Z_L / (Z_L + Z_th)
                     [Z_L]
 
-Z_th is kept in *modal* form, a sum of second-order sections with log-frequency and log-damping. Polynomial coefficients
-of the same impedance have Jacobian condition numbers of 1e4…1e7, the modal ones 50…100; every value of the parameters
-is a stable impedance; and a pair of poles passes from complex to real without a change of branch.
+Z_th is kept in *modal* form, a sum of second-order sections with log-frequency and log-damping.
+Polynomial coefficients of the same impedance have Jacobian condition numbers of 1e4…1e7, the modal
+ones 50…100; every value of the parameters is a stable impedance; and a pair of poles passes from
+complex to real without a change of branch.
 """
 
 import equinox as eqx
@@ -24,9 +25,10 @@ class SourceImpedance(eqx.Module):
 
     Z_th = R + Σ_k (g_k + h_k s/ω_k) / (1 + 2 ζ_k s/ω_k + (s/ω_k)²) + Σ_j g_j / (1 + s/ω_j)
 
-    g, h are in ohm and may have either sign; R [Ω], ω [rad/s] and ζ are positive and stored as logarithms: with
-    R < 0 the driver could not be loaded with a capacitor. ζ > 1 is a pair of real poles. Order n has ⌊(n−1)/2⌋ sections,
-    because a transformer always has one slow real pole, its magnetising inductance.
+    g, h are in ohm and may have either sign; R [Ω], ω [rad/s] and ζ are positive and stored as
+    logarithms: with R < 0 the driver could not be loaded with a capacitor. ζ > 1 is a pair of real
+    poles. Order n has ⌊(n−1)/2⌋ sections, because a transformer always has one slow real pole, its
+    magnetising inductance.
     """
 
     log_resistance: Float[Array, ""]
@@ -94,7 +96,8 @@ def realise(impedance: Rational, rate: float) -> StateSpace:
 def loaded(source: SourceImpedance, load: Rational, rate: float) -> StateSpace:
     """The system V_th → V_out with `load` at the terminal, in continuous time.
 
-    The current i = (V_th − C₁x₁ − C₂x₂) / (D₁ + D₂) drives both impedances, x₁ the source's states, x₂ the load's.
+    The current i = (V_th − C₁x₁ − C₂x₂) / (D₁ + D₂) drives both impedances, x₁ the source's states,
+    x₂ the load's.
     """
     z1, z2 = source.state_space(), realise(load, rate)
     total = z1.D[0] + z2.D[0]
@@ -148,7 +151,7 @@ class Driver(eqx.Module):
         return verdict_names(self.result).item()
 
     def response(self, frequency: Float[Array, "..."]) -> Complex[Array, "..."]:
-        """Source impedance [Ω] at real frequencies [Hz]; of the refined model where there is one."""
+        """Source impedance [Ω] at real frequencies [Hz], refined where there is a refinement."""
         if self.source is not None:
             return self.source.response(frequency)
         z = delay_variable(jnp.asarray(frequency), self.sample_rate)
@@ -164,8 +167,10 @@ class Driver(eqx.Module):
 
     def __str__(self) -> str:
         z = complex(self.response(jnp.array(1e3)))
-        text = f"Driver of order {self.order}: {self.verdict} in {int(self.steps)} steps ({self.method})"
-        text += f", RRSE {100 * float(self.rrse):.3g} %, chi2 {float(self.chi2):.3g}\n"
+        text = f"Driver of order {self.order}: {self.verdict} in {int(self.steps)} steps"
+        text += (
+            f" ({self.method}), RRSE {100 * float(self.rrse):.3g} %, chi2 {float(self.chi2):.3g}\n"
+        )
         text += f"  Z_th at 1 kHz {z.real / 1e3:.4g} {z.imag / 1e3:+.4g}j kΩ"
         if self.verdict != "successful":
             text += "\n  " + message(self.verdict)

@@ -1,8 +1,9 @@
 """One lane: samples in, judged estimate out. The same functions serve one recording and a batch.
 
-Every estimate passes through a judge, so that none leaves without a verdict. Among several applicable verdicts the
-most fundamental is reported: a loop that cannot be simulated, then elements that are no circuit, then a solver that
-did not settle, then a model that misses the data, then parameters that the data do not determine.
+Every estimate passes through a judge, so that none leaves without a verdict. Among several
+applicable verdicts the most fundamental is reported: a loop that cannot be simulated, then elements
+that are no circuit, then a solver that did not settle, then a model that misses the data, then
+parameters that the data do not determine.
 """
 
 from collections.abc import Callable
@@ -16,10 +17,9 @@ from jaxtyping import Array, Bool, Float
 from etid import output_error, steiglitz_mcbride
 from etid.circuits import AbstractCircuit, SkinRC
 from etid.driver import Driver, SourceImpedance
-from etid.filtering import lfilter
 from etid.levenberg_marquardt import normal_equations
 from etid.noise import noise_std
-from etid.results import Fit, rrse
+from etid.results import Fit
 from etid.transfer import Rational, poles
 from etid.verdicts import RESULTS
 
@@ -60,7 +60,7 @@ def measure(
     resolution_out: Float[Array, ""],
     sample_rate: Float[Array, ""],
 ) -> Measurement:
-    """Estimate the noise of both records; `resolution` is the converter's step [V], 0 if not known."""
+    """Estimate the noise of both records; a `resolution` is the converter's step [V] or 0."""
     return Measurement(
         v_th,
         v_out,
@@ -96,7 +96,7 @@ def _score(
     coefficients: Float[Array, " n"],
     predict: Callable[[Float[Array, " n"], Float[Array, " time"]], Float[Array, " time"]],
 ) -> tuple[Float[Array, ""], Float[Array, ""]]:
-    """χ² of a discrete model and its squared distance, in standard errors, to the nearest minimum (score test)."""
+    """χ² of a discrete model, and its squared distance to the minimum in standard errors."""
     impulse = jnp.zeros(IMPULSE).at[0].set(1.0)
 
     def scaled(c):
@@ -149,7 +149,7 @@ def skin_by_steiglitz_mcbride(m: Measurement, driver: Driver, iterations: int) -
 def driver_by_steiglitz_mcbride(
     m: Measurement, r_load: Float[Array, " record"], order: int, iterations: int
 ) -> Driver:
-    """The paper's estimate of Z_th (eqs. 4-6) from stacked measurements; `iterations` 1 is equation error."""
+    """The paper's estimate of Z_th (eqs. 4-6); `iterations` 1 is equation error."""
     best = steiglitz_mcbride.driver_filter(m.v_th, m.v_out, r_load, order, iterations)
     free = best.filter.num.size
 
@@ -232,10 +232,10 @@ def source_starts(
     sample_rate: Float[Array, ""],
     r_load: Float[Array, ""],
 ) -> SourceImpedance:
-    """Starts for Z_th, stacked: three generic ones, and one with the resonances of the discrete baseline.
+    """Starts for Z_th, stacked: three generic ones, and one with the baseline's resonance.
 
-    Every start has one slow real pole and sections at the given frequencies and damping ratios; all gains are of the
-    size of a tenth of the known resistor.
+    Every start has one slow real pole and sections at the given frequencies and damping ratios; all
+    gains are of the size of a tenth of the known resistor.
     """
     sections = (order - 1) // 2
     reals = order - 2 * sections
@@ -297,7 +297,8 @@ def driver_by_output_error(m: Measurement, r_load: Float[Array, " record"], orde
     passive = jax.vmap(resistance)(sources, estimates.cov) >= 0
     settled = RESULTS.promote(estimates.result) == RESULTS.successful
     finite = jnp.isfinite(estimates.chi2)
-    # Starts that settled on a passive circuit come first. Between them log s + chi2 decides, not chi2 alone, which a noisy
+    # Starts that settled on a passive circuit come first. Between them log s + chi2 decides, not
+    # chi2 alone, which a noisy
     # record can lower by a spurious resonance that raises s.
     log_s = jnp.log(estimates.rrse**2 / estimates.chi2)
     cost = jnp.where(finite, estimates.chi2 + log_s, jnp.inf)

@@ -1,16 +1,18 @@
-"""Differentiable discrete-time filters: `lfilter`, and continuous-time systems driven by band-limited samples.
+"""Differentiable discrete-time filters: `lfilter`, and continuous-time systems driven by
+band-limited samples.
 
 Everything here is one recursion,
 
     x[n+1] = A x[n] + B u[n],      y[n] = C x[n] + D u[n],
 
-evaluated in blocks of `BLOCK` samples: inside a block the response is a lower triangular Toeplitz matrix product,
-between blocks a scan carries the state. That is 30-100 times fewer sequential steps than a scan over samples, and it
-differentiates in both modes.
+evaluated in blocks of `BLOCK` samples: inside a block the response is a lower triangular Toeplitz
+matrix product, between blocks a scan carries the state. That is 30-100 times fewer sequential steps
+than a scan over samples, and it differentiates in both modes.
 
-**Band-limited hold.** A continuous-time system sampled at fs is usually discretised as if its input were constant,
-linear or Tustin-warped between samples; at 200 kHz Tustin alone biases the skin's C_p by 9 %. Here the input between
-two samples is the band-limited interpolation of its neighbours (a Kaiser-windowed sinc), written as a polynomial
+**Band-limited hold.** A continuous-time system sampled at fs is usually discretised as if its input
+were constant, linear or Tustin-warped between samples; at 200 kHz Tustin alone biases the skin's
+C_p by 9 %. Here the input between two samples is the band-limited interpolation of its neighbours
+(a Kaiser-windowed sinc), written as a polynomial
 
     v((n + τ) / fs) = Σ_k c_k[n] τ^k,      0 ≤ τ ≤ 1,
 
@@ -144,8 +146,9 @@ def _interpolation_kernel() -> np.ndarray:
 def band_limited(v: Float[Array, " time"]) -> Float[Array, "interval degree"]:
     """Polynomial coefficients of the band-limited interpolation of `v` in every interval.
 
-    Row i belongs to the interval that starts at sample `TAPS − 1 + i`; the first is the earliest interval, the last the
-    latest one, with all its `2·TAPS` neighbours inside the record (`time − 2·TAPS + 1` rows).
+    Row i belongs to the interval that starts at sample `TAPS − 1 + i`; the first is the earliest
+    interval, the last the latest one, with all its `2·TAPS` neighbours inside the record (`time −
+    2·TAPS + 1` rows).
     """
     kernel = jnp.asarray(_interpolation_kernel(), v.dtype)
     rows = v.shape[0] - 2 * TAPS + 1

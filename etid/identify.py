@@ -1,4 +1,4 @@
-"""Identify a driver from calibrations and a skin from a recording: pre-flight, baseline, refinement, verdict."""
+"""Identify a driver and a skin: pre-flight, baseline, refinement, verdict."""
 
 from collections.abc import Sequence
 from typing import Any, Literal
@@ -28,6 +28,7 @@ def _iterations(method: Method) -> int:
 
 
 def check_method(method: str, circuit: AbstractCircuit | None = None) -> None:
+    """Raise ValueError unless the method exists and can identify this circuit."""
     require_float64()
     if method not in METHODS:
         raise ValueError(f"method {method!r} is not known; use one of {', '.join(METHODS)}")
@@ -48,7 +49,8 @@ def check_driver(driver: Driver, method: Method, sample_rate: float) -> None:
     if method != "output_error" and not np.isclose(float(driver.sample_rate), sample_rate):
         raise ValueError(
             f"{method} needs recording and calibration at one sample rate, but the recording has "
-            f"{sample_rate:g} Hz and the driver {float(driver.sample_rate):g} Hz; use method='output_error'"
+            f"{sample_rate:g} Hz and the driver {float(driver.sample_rate):g} Hz; "
+            "use method='output_error'"
         )
 
 
@@ -121,7 +123,8 @@ def identify_driver(
     sizes = {(record.v_th.size, record.sample_rate) for record in records}
     if len(sizes) > 1:
         raise ValueError(
-            f"calibrations differ in (samples, sample rate): {sorted(sizes)}; cut them to one length"
+            f"calibrations differ in (samples, sample rate): {sorted(sizes)}; "
+            "cut them to one length"
         )
     for record in records:
         name = preflight(record)

@@ -1,18 +1,21 @@
 """Levenberg-Marquardt on normal equations, built from optimistix parts.
 
-`optimistix.LevenbergMarquardt` carries the residual and its Jacobian in the solver's state. Under `vmap` a step of one lane
-selects between two copies of that state for all lanes, which costs about twelve times the step itself when the
-residual has thousands of samples. Here the state holds the objective, its gradient and the p×p Gauss-Newton matrix only:
-`optimistix.DampedNewtonDescent` solves the damped step, `optimistix.ClassicalTrustRegion` accepts it and sets the damping.
+`optimistix.LevenbergMarquardt` carries the residual and its Jacobian in the solver's state. Under
+`vmap` a step of one lane selects between two copies of that state for all lanes, which costs about
+twelve times the step itself when the residual has thousands of samples. Here the state holds the
+objective, its gradient and the p×p Gauss-Newton matrix only: `optimistix.DampedNewtonDescent`
+solves the damped step, `optimistix.ClassicalTrustRegion` accepts it and sets the damping.
 
 Three things make the method scale-free:
 
-- **Marquardt scaling.** The step is solved in z = D y, D² = diag(JᵀJ) (the largest seen, as in Moré 1978), so that multiplying a parameter by a constant
+- **Marquardt scaling.** The step is solved in z = D y, D² = diag(JᵀJ) (the largest seen, as in Moré
+1978), so that multiplying a parameter by a constant
   changes no iterate.
-- **Stopping on an angle.** The relative offset of Bates & Watts (1981), the sine of the angle between the residual and
-  the tangent plane, has neither the unit of the residual nor of a parameter. Times √(samples) it is the distance to the
-  minimum in standard errors. A step too small to move the parameters is *not* convergence: a solver that cannot move must
-  not report success.
+- **Stopping on an angle.** The relative offset of Bates & Watts (1981), the sine of the angle
+between the residual and
+  the tangent plane, has neither the unit of the residual nor of a parameter. Times √(samples) it is
+  the distance to the minimum in standard errors. A step too small to move the parameters is *not*
+  convergence: a solver that cannot move must not report success.
 - **A trial step whose residual is not finite is rejected**, as if its objective were infinite.
 """
 
@@ -79,11 +82,13 @@ class LevenbergMarquardt(optx.AbstractLeastSquaresSolver):
     The residual function takes and returns one-dimensional arrays.
 
     Attributes:
-        rtol: Stop when the relative offset, |Q₁ᵀ r| / |r| with Q₁ a basis of the range of J, is below this.
-        atol: Stop when the remaining Gauss-Newton step, scaled, is below this times the scaled parameters
-            (problems without noise, where the residual itself vanishes).
-        ftol: Stop when an accepted step reduces |r|² by less than this part, and promised no more: along a valley whose floor
-            is flat within rounding, as of a superfluous pole, the two criteria above are never met.
+        rtol: Stop when the relative offset, |Q₁ᵀ r| / |r| with Q₁ a basis of the range of J, is
+            below this.
+        atol: Stop when the remaining Gauss-Newton step, scaled, is below this times the scaled
+            parameters (problems without noise, where the residual itself vanishes).
+        ftol: Stop when an accepted step reduces |r|² by less than this part, and promised no more:
+            along a valley whose floor is flat within rounding, as of a superfluous pole, the two
+            criteria above are never met.
         norm: Norm of the scaled step and parameters.
     """
 
@@ -150,7 +155,8 @@ class LevenbergMarquardt(optx.AbstractLeastSquaresSolver):
         )
         descent_state = self.descent.init(y, self._info(scaled))
         descent_state = self.descent.query(y, self._info(scaled), descent_state)
-        # A factorisation that fails proposes a step that is not finite; the next trial rejects it and raises the damping.
+        # A factorisation that fails proposes a step that is not finite; the next trial rejects it
+        # and raises the damping.
         proposed, _ = self.descent.step(step_size, descent_state)
 
         size = self.norm(safe * y)

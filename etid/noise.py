@@ -1,8 +1,9 @@
 """White noise of a record, estimated from the record itself.
 
-High-order differences annihilate the smooth part of a pulse response and keep white noise, whose standard deviation follows
-from the median of their magnitude (Donoho & Johnstone 1994 use the finest wavelet coefficients the same way). The median
-ignores the few per cent of samples at the edges. A converter adds its own floor, resolution/√12.
+High-order differences annihilate the smooth part of a pulse response and keep white noise, whose
+standard deviation follows from the median of their magnitude (Donoho & Johnstone 1994 use the
+finest wavelet coefficients the same way). The median ignores the few per cent of samples at the
+edges. A converter adds its own floor, resolution/√12.
 """
 
 import math

@@ -1,24 +1,27 @@
 """Output error: Levenberg-Marquardt on the simulated terminal voltage.
 
-V_out is predicted from the recorded V_th through the loaded driver, a continuous-time system run exactly for band-limited samples
-(`etid.filtering`), so that discretisation costs no accuracy at the recorder's own rate. The parameters are the logarithms of the circuit
-elements or the modal parameters of Z_th; the state at the start of the record and an offset of V_out are nuisances.
+V_out is predicted from the recorded V_th through the loaded driver, a continuous-time system run
+exactly for band-limited samples (`etid.filtering`), so that discretisation costs no accuracy at the
+recorder's own rate. The parameters are the logarithms of the circuit elements or the modal
+parameters of Z_th; the state at the start of the record and an offset of V_out are nuisances.
 
-**Noise on both records.** The residual r = V_out_predicted − V_out contains the noise of V_out and the noise of V_th filtered by the
-loaded driver G. For white noise its variance is
+**Noise on both records.** The residual r = V_out_predicted − V_out contains the noise of V_out and
+the noise of V_th filtered by the loaded driver G. For white noise its variance is
 
     s(θ) = σ_out² + σ_th² Σ h²,      h the impulse response of G,
 
-and minimising Σ r²/s(θ) is consistent, because E Σ r² = |noise-free misfit|² + N s(θ); minimising Σ r² alone is not (at 30 dB it
-drives Z_th to −90 kΩ). χ² = Σ r²/s per degree of freedom is 1 when the model is right.
+and minimising Σ r²/s(θ) is consistent, because E Σ r² = |noise-free misfit|² + N s(θ); minimising Σ
+r² alone is not (at 30 dB it drives Z_th to −90 kΩ). χ² = Σ r²/s per degree of freedom is 1 when the
+model is right.
 
-**Covariance.** r is coloured (G filters the noise of V_th), and the recorded noise inflates JᵀJ. Both are accounted for,
+**Covariance.** r is coloured (G filters the noise of V_th), and the recorded noise inflates JᵀJ.
+Both are accounted for,
 
     cov = H⁻¹ (Jᵀ Σ J) H⁻¹,      Σ = (σ_out² I + σ_th² G Gᵀ)/s,
     H   = JᵀJ − N (σ_th² Σ ∂h ∂hᵀ/s − ∂s ∂sᵀ/(4 s²)),
 
-H being the curvature of the *expected* objective, and a skin adds what it inherits from its driver, K cov(Z_th) Kᵀ with K = −H⁻¹ ∂²/∂θ∂Z_th.
-If χ² > 1 the covariance is multiplied by it.
+H being the curvature of the *expected* objective, and a skin adds what it inherits from its driver,
+K cov(Z_th) Kᵀ with K = −H⁻¹ ∂²/∂θ∂Z_th. If χ² > 1 the covariance is multiplied by it.
 """
 
 import math
@@ -103,7 +106,7 @@ def impulse_response(system: StateSpace) -> Float[Array, " lag"]:
 
 
 def residual_variance(records: Records, h: Float[Array, " lag"]) -> Float[Array, ""]:
-    """s = σ_out² + σ_th² Σ h² [V²]."""
+    """Variance s = σ_out² + σ_th² Σ h² of the residual [V²]."""
     return records.sigma_out**2 + records.sigma_th**2 * jnp.sum(h**2)
 
 
@@ -127,7 +130,8 @@ class Estimate(eqx.Module):
         rrse: Root relative squared error of V_out, the largest over the records.
         result: Verdict of the solver.
         steps: Trial steps of the solver.
-        shared_cov: The part of `cov` that comes from the driver, common to all skins identified with it.
+        shared_cov: The part of `cov` that comes from the driver, common to all skins identified
+            with it.
     """
 
     parameters: Float[Array, " parameter"]
@@ -141,7 +145,7 @@ class Estimate(eqx.Module):
 
 
 def _inverse(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
-    """Inverse of a symmetric matrix in its own scaling, without the directions that carry no information."""
+    """Inverse of a symmetric matrix, without the directions that carry no information."""
     scale = jnp.sqrt(jnp.maximum(jnp.diagonal(matrix), 0.0))
     scale = jnp.where(scale > 0, scale, 1.0)
     values, vectors = jnp.linalg.eigh(matrix / scale[:, None] / scale[None, :])
@@ -164,7 +168,6 @@ def _curvature(records: Records, model: Any, q: Float[Array, " n"]) -> _Curvatur
         source, load, _ = model(q)
         return impulse_response(loaded_filter(source, load, records.sample_rate))
 
-    source, load, nuisance = model(q)
     h = response(q)
     s = residual_variance(records, h)
     jacobian = jax.jacfwd(lambda q: scaled_residual(records, *model(q)))(q)
@@ -173,15 +176,15 @@ def _curvature(records: Records, model: Any, q: Float[Array, " n"]) -> _Curvatur
     samples = jacobian.shape[0]
     noise = records.sigma_th**2 * slope.T @ slope / s
     noise = noise - jnp.outer(s_slope, s_slope) / (4 * s**2)
-    system = loaded_filter(source, load, records.sample_rate)
-
-    def through(v):
-        return simulate(system, band_limited(v), jnp.zeros_like(nuisance[:-1]))[0]
-
-    _, adjoint = jax.vjp(through, records.v_th)
-    coloured = jax.vmap(lambda column: adjoint(column)[0], in_axes=1, out_axes=1)(jacobian)
+    # ‖Gᵀ J‖² by Parseval; J is padded, so that the filter does not wrap around.
+    size = 2 ** math.ceil(math.log2(samples + IMPULSE))
+    weight = jnp.full(size // 2 + 1, 2.0 / size).at[0].set(1.0 / size).at[-1].set(1.0 / size)
+    weight = weight * jnp.abs(jnp.fft.rfft(h, size)) ** 2
+    spectrum = jnp.fft.rfft(jacobian, size, axis=0)
+    real, imaginary = spectrum.real, spectrum.imag
+    coloured = real.T @ (weight[:, None] * real) + imaginary.T @ (weight[:, None] * imaginary)
     information = jacobian.T @ jacobian
-    score = records.sigma_out**2 * information + records.sigma_th**2 * coloured.T @ coloured
+    score = records.sigma_out**2 * information + records.sigma_th**2 * coloured
     return _Curvature(information - samples * noise, score / s)
 
 
@@ -199,13 +202,15 @@ def _eliminate(curvature: _Curvature, kept: int) -> _Curvature:
 def prior(start: SourceImpedance, sample_rate: Float[Array, ""], r_load: Float[Array, ""]):
     """Weak prior of the modal parameters, as additional residuals.
 
-    A pole that a noisy recording cannot determine would otherwise run away, to Q = ∞ for instance, and take the solver with it. At
-    60 dB a recording carries 1e4 and more times the information of this prior; what it allows (one standard deviation)
-    is a damping ratio of 0.7 within a factor of e^1.5, frequencies within e^3 of half the Nyquist
-    frequency (slow real poles: e^3 of 1/500 of it), impedances up to 10 times the known resistor.
+    A pole that a noisy recording cannot determine would otherwise run away, to Q = ∞ for instance,
+    and take the solver with it. At 60 dB a recording carries 1e4 and more times the information of
+    this prior; what it allows (one standard deviation) is a damping ratio of 0.7 within a factor of
+    e^1.5, frequencies within e^3 of half the Nyquist frequency (slow real poles: e^3 of 1/500 of
+    it), impedances up to 10 times the known resistor.
 
-    A transformer is passive, so Re Z_th ≥ 0 at all frequencies, inside the recorded band and above it; otherwise some skin would make
-    the loaded driver oscillate. Each frequency where it is not adds Re Z_th / (10⁻³ R_L).
+    A transformer is passive, so Re Z_th ≥ 0 at all frequencies, inside the recorded band and above
+    it; otherwise some skin would make the loaded driver oscillate. Each frequency where it is not
+    adds Re Z_th / (10⁻³ R_L).
     """
     half = 0.5 * jnp.pi * sample_rate
     wide = 10 * r_load
@@ -312,7 +317,8 @@ def fit_circuit(
         records: One recording.
         source: Known Z_th.
         source_cov: Covariance of its flattened parameters.
-        starts: Candidate starts, stacked along a leading axis; the one that predicts best is refined.
+        starts: Candidate starts, stacked along a leading axis; the one that predicts best is
+            refined.
 
     Returns:
         The circuit and the estimate, whose parameters are the logarithms of the elements.

@@ -48,7 +48,7 @@ def _is_flat(recording: Recording, name: str) -> bool:
 
 
 def _is_saturated(recording: Recording, name: str) -> bool:
-    """Samples at the converter's rails, or a flat top that the signal enters and leaves in jumps."""
+    """Samples at the converter's rails, or a flat top entered and left in jumps."""
     v = getattr(recording, name)
     step = resolution(recording, name)
     if recording.adc_range is not None:

@@ -23,8 +23,8 @@ LABELS = ("path", "subject", "condition", "electrode", "trial")
 def rrse(predicted: Float[Array, " time"], measured: Float[Array, " time"]) -> Float[Array, ""]:
     """Root relative squared error, sqrt(Σ (V − W)² / Σ (W − mean W)²)   (paper, eq. 3).
 
-    It does not see circuit error: 2.73 % is as common with a right C_p as with one that is 85 % off. Judge by χ² and
-    standard errors.
+    It does not see circuit error: 2.73 % is as common with a right C_p as with one that is 85 %
+    off. Judge by χ² and standard errors.
     """
     return jnp.sqrt(
         jnp.sum((predicted - measured) ** 2) / jnp.sum((measured - jnp.mean(measured)) ** 2)
@@ -48,8 +48,9 @@ class Fit(eqx.Module):
 
     Attributes:
         circuit: Identified elements in SI units.
-        cov: Covariance of the elements, SI units; NaN where a method gives none. It does not contain
-            the tolerance of the calibration resistor, which passes 1:1 into every resistance.
+        cov: Covariance of the elements, SI units; NaN where a method gives none. It does not
+            contain the tolerance of the calibration resistor, which passes 1:1 into every
+            resistance.
         shared_cov: The part of `cov` due to the driver, common to all fits made with it: a spread
             between trials never shows it.
         rrse: Root relative squared error of V_out (paper, eq. 3).
@@ -189,8 +190,9 @@ class Fits:
     def summary(self, *by: str) -> list[dict[str, Any]]:
         """Medians of the successful fits and counts, per group of labels.
 
-        Per element: `NAME` the median, `NAME_spread` the standard deviation between the recordings, and `NAME_stderr` the median
-        standard error: two different numbers, of which the first contains what varies between trials.
+        Per element: `NAME` the median, `NAME_spread` the standard deviation between the recordings,
+        and `NAME_stderr` the median standard error: two different numbers, of which the first
+        contains what varies between trials.
         """
         keys = [tuple(str(self.labels[name][i]) for name in by) for i in range(len(self))]
         rows = []

@@ -1,17 +1,19 @@
 """The paper's baseline: Steiglitz-McBride on the discrete filters, eqs. (1)-(12).
 
-Both stages identify a rational filter N/D with X N/D = W. The output error W − X N/D is made linear in (N, D) by prefiltering
-both records with the denominator of the iteration before (Steiglitz & McBride 1965),
+Both stages identify a rational filter N/D with X N/D = W. The output error W − X N/D is made linear
+in (N, D) by prefiltering both records with the denominator of the iteration before (Steiglitz &
+McBride 1965),
 
-    minimise  ∮ |X N_i/D_{i−1} − W D_i/D_{i−1}|² dz/z,      D_{−1} = 1                               (1), (2)
+    minimise  ∮ |X N_i/D_{i−1} − W D_i/D_{i−1}|² dz/z,      D_{−1} = 1          (1), (2)
 
 Iteration 0 alone is the *equation error* estimate. Driver and skin differ in their X and W only:
 
-    driver:  X = V_out,          W = R_L (V_th − V_out),   N/D = Z_th                                (5), (6)
-    skin:    X = V_th − V_out,   W = Z_th V_out,           N/D = Z_bio                               (8), (9)
+    driver:  X = V_out,          W = R_L (V_th − V_out),   N/D = Z_th      (5), (6)
+    skin:    X = V_th − V_out,   W = Z_th V_out,           N/D = Z_bio     (8), (9)
 
-The iteration does not settle on most recordings and its fixed point is biased by noise, because X and W share the noise of
-V_out. What is returned is the iterate whose *simulated* terminal voltage fits best (RRSE, eq. 3), with its verdict.
+The iteration does not settle on most recordings and its fixed point is biased by noise, because X
+and W share the noise of V_out. What is returned is the iterate whose *simulated* terminal voltage
+fits best (RRSE, eq. 3), with its verdict.
 """
 
 from collections.abc import Callable
@@ -76,7 +78,8 @@ def iterate(
         w: Output records W.
         zeros: Order of N.
         poles: Order of D.
-        assess: RRSE of the voltage that a candidate predicts, and whether its closed loop is stable.
+        assess: RRSE of the voltage that a candidate predicts, and whether its closed loop is
+            stable.
         iterations: How many; 1 is equation error.
     """
     one = jnp.ones(1, x.dtype)
@@ -102,9 +105,11 @@ def iterate(
         change = jnp.linalg.norm(candidate.den - previous) / jnp.linalg.norm(candidate.den)
         stable = is_stable(candidate.den)
         current = Iterate(candidate, error, iteration, change < SETTLED, stable, closed_loop_stable)
-        better = (error < best.rrse) | (iteration == 0)
+        # As long as none can be simulated, the latest is the best there is.
+        better = (error < best.rrse) | ~jnp.isfinite(best.rrse)
         best = jax.tree.map(lambda new, old: jnp.where(better, new, old), current, best)
-        # A prefilter must be stable to be run at all; reflecting its poles keeps its magnitude response.
+        # A prefilter must be stable to be run at all; reflecting its poles keeps its magnitude
+        # response.
         reflected = reflect_poles(jnp.where(jnp.isfinite(candidate.den), candidate.den, prefilter))
         return (best, jnp.where(stable, candidate.den, reflected), candidate.den), change
 
@@ -124,9 +129,10 @@ def iterate(
 def terminal_voltage(
     z_th: Rational, z_load: Rational, v_th: Float[Array, " time"]
 ) -> tuple[Float[Array, " time"], Bool[Array, ""]]:
-    """Predict V_out = V_th · Z_L / (Z_L + Z_th) with discrete filters, and say whether the loop is stable.
+    """Predict V_out = V_th · Z_L / (Z_L + Z_th), and say whether that loop is stable.
 
-    The closed loop is N_L D_th / (N_L D_th + N_th D_L): a stable Z_th can still give an unstable one.
+    The closed loop is N_L D_th / (N_L D_th + N_th D_L): a stable Z_th can still give an unstable
+    one.
     """
     forward = multiply_polynomials(z_load.num, z_th.den)
     denominator = add_polynomials(forward, multiply_polynomials(z_th.num, z_load.den))
@@ -144,13 +150,14 @@ def driver_filter(
 ) -> Iterate:
     """Identify the discrete Z_th from records with known resistors (paper, eqs. 4-6).
 
-    Z_th = (α₀ + … + α₄ z⁻⁴) / (1 + β₁ z⁻¹ + … + β₅ z⁻⁵)                                              (4)
+    Z_th = (α₀ + … + α₄ z⁻⁴) / (1 + β₁ z⁻¹ + … + β₅ z⁻⁵)                (4)
 
     Args:
         v_th: Unloaded voltages [V].
         v_out: Voltages [V] with the resistors.
         r_load: The resistors [Ω].
         order: Number of poles; the numerator has one order less.
+        iterations: How many; 1 is equation error.
     """
 
     def assess(candidate):
@@ -179,6 +186,7 @@ def skin_filter(
         v_th: Unloaded voltage [V].
         v_out: Voltage [V] with the skin as load.
         z_th: Discrete source impedance, a rational function of z⁻¹.
+        iterations: How many; 1 is equation error.
     """
 
     def assess(candidate):
@@ -193,10 +201,11 @@ def skin_filter(
 def skin_elements(z_bio: Rational, sample_rate: float, *, as_printed: bool = False) -> SkinRC:
     """Elements of the first-order discrete Z_bio under the bilinear map (paper, eqs. 10-12).
 
-    R_s = Z(∞),   R_p = Z(0) − R_s,   C_p from |Z(j/(R_p C_p))| = √((R_s+R_p)² + R_s²) / √2          (10)-(12)
+    R_s = Z(∞),   R_p = Z(0) − R_s,   C_p from |Z(j/(R_p C_p))| = √((R_s+R_p)² + R_s²) / √2
 
-    The paper prints the last magnitude as (2 R_s + R_p)/√2, which overestimates C_p (by 38 % for dry skin, 88 % for damp) and has no
-    root for R_s/R_p > 1/√2. Elements come out negative or NaN where the filter is no circuit; nothing is repaired.
+    The paper prints the last magnitude as (2 R_s + R_p)/√2, which overestimates C_p (by 38 % for
+    dry skin, 88 % for damp) and has no root for R_s/R_p > 1/√2. Elements come out negative or NaN
+    where the filter is no circuit; nothing is repaired.
 
     Args:
         z_bio: Discrete impedance, a rational function of z⁻¹.
@@ -211,7 +220,8 @@ def skin_elements(z_bio: Rational, sample_rate: float, *, as_printed: bool = Fal
     c_p = tau / r_p
     if as_printed:
         magnitude = (2 * r_s + r_p) / jnp.sqrt(2.0)
-        # |Z(jω)|² = (total² + r_s² x²) / (1 + x²) with x = ω R_p C_p; the paper takes 1/ω for R_p C_p.
+        # |Z(jω)|² = (total² + r_s² x²) / (1 + x²) with x = ω R_p C_p; the paper takes 1/ω for R_p
+        # C_p.
         x = jnp.sqrt((total**2 - magnitude**2) / (magnitude**2 - r_s**2))
         c_p = c_p / x
     return SkinRC(r_s, r_p, c_p)

@@ -1,8 +1,9 @@
 """Rational functions: evaluation, product, sum, discretisation, poles, stability.
 
-Coefficients are stored in *ascending* powers of the variable. In z⁻¹ this is SciPy's order of `b` and `a`; in s it is
-the reverse of `scipy.signal`. Polynomials are multiplied with shifts, not with `jnp.convolve`: under `vmap` the
-latter becomes a grouped convolution over all lanes, in which one NaN lane poisons the others.
+Coefficients are stored in *ascending* powers of the variable. In z⁻¹ this is SciPy's order of `b`
+and `a`; in s it is the reverse of `scipy.signal`. Polynomials are multiplied with shifts, not with
+`jnp.convolve`: under `vmap` the latter becomes a grouped convolution over all lanes, in which one
+NaN lane poisons the others.
 """
 
 import equinox as eqx
@@ -105,9 +106,9 @@ def poles(a: Float[Array, " order1"]) -> Complex[Array, " order"]:
 def is_stable(a: Float[Array, " order1"]) -> Bool[Array, ""]:
     """Whether all poles of 1 / (a[0] + a[1] z⁻¹ + …) lie inside the unit circle.
 
-    Schur-Cohn step-down recursion (Oppenheim & Schafer, *Discrete-Time Signal Processing*, lattice filters): stable if
-    and only if every reflection coefficient is smaller than one in magnitude. No eigenvalues are needed, so it runs on
-    every backend. NaN coefficients are not stable.
+    Schur-Cohn step-down recursion (Oppenheim & Schafer, *Discrete-Time Signal Processing*, lattice
+    filters): stable if and only if every reflection coefficient is smaller than one in magnitude.
+    No eigenvalues are needed, so it runs on every backend. NaN coefficients are not stable.
     """
     a = a / a[0]
     stable = jnp.array(True)

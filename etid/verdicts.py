@@ -1,7 +1,7 @@
 """Verdicts: how an identification ended, in words, for every lane.
 
-`RESULTS` extends `optimistix.RESULTS`. A member is an integer under `jit` and prints as its message:
-the cause, then what to do.
+`RESULTS` extends `optimistix.RESULTS`. A member is an integer under `jit` and prints as its
+message: the cause, then what to do.
 """
 
 import jax
@@ -38,8 +38,8 @@ class RESULTS(optx.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]  # equi
         "wrong, the trigger moved between the records, or the signal drifted or clipped."
     )
     biased = (
-        "The estimate is more than four standard errors away from the output-error minimum of its own "
-        "model, as Steiglitz-McBride is with noise. Use method='output_error'."
+        "The estimate is more than four standard errors away from the output-error minimum of "
+        "its own model, as Steiglitz-McBride is with noise. Use method='output_error'."
     )
     flat = "A record carries no signal above its noise. Check the contact and the channel."
     saturated = "The converter clipped. Lower the gain or the stimulus and record again."

@@ -1,0 +1,37 @@
+"""Entry point: `python -m benchmarks NAME`."""
+
+import argparse
+import pathlib
+
+import jax
+
+
+def main() -> None:
+    """Run one benchmark."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks", description=__doc__)
+    names = parser.add_subparsers(dest="name", required=True)
+
+    spice = names.add_parser(
+        "spice", help="bias and spread against truth and bound, per SPICE scene"
+    )
+    spice.add_argument("--data", type=pathlib.Path, default=pathlib.Path("../shared/data"))
+    spice.add_argument("--scene", action="append", help="only this scene; may be repeated")
+    spice.add_argument("-o", "--output", type=pathlib.Path, default=None, help="CSV to write")
+
+    timing = names.add_parser("timing", help="import time, first call, warm fit, batch, all apart")
+    timing.add_argument("--lanes", type=int, default=98)
+
+    arguments = parser.parse_args()
+    jax.config.update("jax_enable_x64", True)
+    if arguments.name == "spice":
+        from benchmarks.spice import run as run_spice
+
+        run_spice(arguments.data / "spice_recordings", arguments.scene, arguments.output)
+    else:
+        from benchmarks.timing import run as run_timing
+
+        run_timing(arguments.lanes)
+
+
+if __name__ == "__main__":
+    main()

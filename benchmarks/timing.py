@@ -1,0 +1,66 @@
+"""Import, first call and warm time of one fit and of a batch: medians, compilation apart."""
+
+import functools
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import numpy as np
+
+import etid
+from etid.identify import METHODS
+
+REPEATS = 7
+
+
+def _import_time(module: str) -> float:
+    """Wall time [s] of importing a module in a fresh interpreter, median of 3."""
+    code = f"import time; t = time.perf_counter(); {module}; print(time.perf_counter() - t)"
+    runs = [
+        float(
+            subprocess.run(
+                [sys.executable, "-c", code], capture_output=True, check=True, text=True
+            ).stdout
+        )
+        for _ in range(3)
+    ]
+    return float(np.median(runs))
+
+
+def _time(call: Callable[[], Any], repeats: int) -> tuple[float, float]:
+    """Wall time [s] of the first call and the median of the next ones."""
+    runs = []
+    for _ in range(repeats + 1):
+        start = time.perf_counter()
+        jax.block_until_ready(call())
+        runs.append(time.perf_counter() - start)
+    return runs[0], float(np.median(runs[1:]))
+
+
+def run(lanes: int) -> None:
+    """Print the table."""
+    base = _import_time("import jax, optimistix")
+    own = _import_time("import etid")
+    print(f"import jax + optimistix      {base:8.2f} s")
+    print(f"import etid                  {own:8.2f} s   ratio {own / base:.2f}")
+    study = etid.scenes.paper_dry().simulate(seed=0)
+    calibration = next(iter(study.calibrations.recordings()))
+    recordings = list(study.loaded.recordings())
+    many = (recordings * (lanes // len(recordings) + 1))[:lanes]
+    first, warm = _time(lambda: etid.identify_driver(calibration, throw=False), 3)
+    print(f"driver, first call           {first:8.2f} s   warm {warm:.3f} s")
+    driver = etid.identify_driver(calibration, throw=False)
+    for method in METHODS:
+        fit = functools.partial(
+            etid.identify_skin, recordings[0], driver, method=method, throw=False
+        )
+        first, warm = _time(fit, REPEATS)
+        print(f"skin {method:<18} first {first:8.2f} s   warm {1e3 * warm:.1f} ms")
+        fits = functools.partial(etid.identify_skins, many, driver, method=method)
+        first, warm = _time(lambda fits=fits: fits().chi2, 3)
+        print(
+            f"  batch of {lanes:<12} first {first:8.2f} s   warm {1e3 * warm / lanes:.1f} ms per fit"
+        )
