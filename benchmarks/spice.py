@@ -15,12 +15,12 @@ import numpy as np
 
 import etid
 from etid.circuits import AbstractCircuit
-from etid.identify import METHODS
+from etid.identify import METHODS, Method
 
 ELEMENTS = {"r_s": "Rs", "r_p": "Rp", "c_p": "Cp", "r": "R"}
 
 
-def fit_scene(source: pathlib.Path, truth: dict, method: str) -> list[dict]:
+def fit_scene(source: pathlib.Path, truth: dict, method: Method) -> list[dict]:
     """One row per element: bias, spread, bound, reported standard error, all relative, in %."""
     trials = truth["trials"]
     is_resistor = "R" in trials[0]["elements"]

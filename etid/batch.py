@@ -55,7 +55,9 @@ class _Queue:
     """Recordings of one length and driver, waiting to fill a chunk."""
 
     def __init__(self, driver: Driver, circuit: AbstractCircuit, method: Method):
-        self.driver, self.circuit, self.method = driver, circuit, method
+        self.driver = driver
+        self.circuit = circuit
+        self.method: Method = method
         self.rows: list[int] = []
         self.lanes: list[tuple[np.ndarray, ...]] = []
 

@@ -11,12 +11,15 @@ from typing import Any, Self
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Complex, Float
 
-from etid.filtering import StateSpace
-from etid.transfer import Rational, delay_variable, frequency_variable
+from etid.transfer import Rational, frequency_variable
 
-SYMBOLS = {"ohm": "Ω", "farad": "F"}
+# What a parameter may hold: one value, or a batch of them.
+Quantity = Float[Array, "..."] | Float[np.ndarray, "..."] | float
+Ohm = Quantity
+Farad = Quantity
 DISPLAY = {"ohm": (1e3, "kΩ"), "farad": (1e-9, "nF")}  # scaled units exist only in print
 
 
@@ -27,26 +30,26 @@ def parameter(unit: str, *, typical: float) -> Any:
         unit: `"ohm"` or `"farad"`.
         typical: Magnitude to expect, in SI; a fit may start there.
     """
-    if unit not in SYMBOLS:
-        raise ValueError(f"unit {unit!r} is not known; use one of {sorted(SYMBOLS)}")
+    if unit not in DISPLAY:
+        raise ValueError(f"unit {unit!r} is not known; use one of {sorted(DISPLAY)}")
     return eqx.field(
         default=typical, converter=jnp.asarray, metadata={"unit": unit, "typical": typical}
     )
 
 
-def resistor(r: Float[Array, ""] | float) -> Rational:
+def resistor(r: Ohm) -> Rational:
     """Impedance of a resistor, Z = R [Ω]."""
     return Rational(jnp.stack([jnp.asarray(r)]), jnp.ones(1))
 
 
-def capacitor(c: Float[Array, ""] | float) -> Rational:
+def capacitor(c: Farad) -> Rational:
     """Impedance of a capacitor, Z = 1 / (s C) [Ω]."""
     c = jnp.asarray(c)
     return Rational(jnp.ones(1), jnp.stack([jnp.zeros_like(c), c]))
 
 
 def series(*impedances: Rational) -> Rational:
-    """Series connection, Z = Z₁ + Z₂ + …"""
+    """Series connection, Z = Z₁ + Z₂ + …."""
     total = impedances[0]
     for z in impedances[1:]:
         total = total.add(z)
@@ -54,7 +57,7 @@ def series(*impedances: Rational) -> Rational:
 
 
 def parallel(*impedances: Rational) -> Rational:
-    """Parallel connection, 1/Z = 1/Z₁ + 1/Z₂ + …"""
+    """Parallel connection, 1/Z = 1/Z₁ + 1/Z₂ + …."""
     return series(*(z.reciprocal() for z in impedances)).reciprocal()
 
 
@@ -99,9 +102,9 @@ class SkinRC(AbstractCircuit):
     Equal to eq. 7, Z_bio(s) = ((R_s + R_p) + R_s R_p C_p s) / (1 + R_p C_p s).
     """
 
-    r_s: Float[Array, "..."] = parameter("ohm", typical=20e3)
-    r_p: Float[Array, "..."] = parameter("ohm", typical=100e3)
-    c_p: Float[Array, "..."] = parameter("farad", typical=0.3e-9)
+    r_s: Ohm = parameter("ohm", typical=20e3)
+    r_p: Ohm = parameter("ohm", typical=100e3)
+    c_p: Farad = parameter("farad", typical=0.3e-9)
 
     def impedance(self) -> Rational:
         """Impedance of eq. 7."""
@@ -110,13 +113,13 @@ class SkinRC(AbstractCircuit):
     @property
     def f_c(self) -> Float[Array, "..."]:
         """Corner frequency 1 / (2π R_p C_p) [Hz]."""
-        return 1 / (2 * jnp.pi * self.r_p * self.c_p)
+        return 1 / (2 * jnp.pi * jnp.asarray(self.r_p * self.c_p))
 
 
 class Resistor(AbstractCircuit):
     """One resistor, Z = R: the paper's Table I loads."""
 
-    r: Float[Array, "..."] = parameter("ohm", typical=100e3)
+    r: Ohm = parameter("ohm", typical=100e3)
 
     def impedance(self) -> Rational:
         """Impedance R."""

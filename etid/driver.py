@@ -70,7 +70,7 @@ class SourceImpedance(eqx.Module):
         return StateSpace(A, B, C, jnp.exp(self.log_resistance)[None])
 
 
-def realise(impedance: Rational, rate: float) -> StateSpace:
+def realise(impedance: Rational, rate: float | Float[Array, ""]) -> StateSpace:
     """Realise a load impedance, current [A] to voltage [V].
 
     Args:
@@ -93,7 +93,7 @@ def realise(impedance: Rational, rate: float) -> StateSpace:
     return StateSpace(rate * A, rate * B, num[:-1] - direct * den[:-1], direct[None])
 
 
-def loaded(source: SourceImpedance, load: Rational, rate: float) -> StateSpace:
+def loaded(source: SourceImpedance, load: Rational, rate: float | Float[Array, ""]) -> StateSpace:
     """The system V_th → V_out with `load` at the terminal, in continuous time.
 
     The current i = (V_th − C₁x₁ − C₂x₂) / (D₁ + D₂) drives both impedances, x₁ the source's states,
@@ -131,7 +131,7 @@ class Driver(eqx.Module):
 
     b: Float[Array, " b"]
     a: Float[Array, " a"]
-    sample_rate: float
+    sample_rate: float | Float[Array, ""]
     source: SourceImpedance | None
     cov: Float[Array, "parameter parameter"] | None
     rrse: Float[Array, ""]

@@ -12,6 +12,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float
 
 from etid import output_error, steiglitz_mcbride
@@ -21,8 +22,11 @@ from etid.levenberg_marquardt import normal_equations
 from etid.noise import noise_std
 from etid.results import Fit
 from etid.transfer import Rational, poles
-from etid.verdicts import RESULTS
+from etid.verdicts import RESULTS, verdict
 
+# Members inherited from lineax, of which the type checker thinks they are not ours.
+SUCCESSFUL = verdict("successful")
+MAX_STEPS_REACHED = verdict("max_steps_reached")
 MISFIT_CHI2 = 1.5  # the noise is known from the record to about 5 %, chi2 therefore to 10 %
 MISFIT_RRSE = (
     1e-3  # of the signal; what converters and transformers leave unexplained at their best
@@ -76,9 +80,9 @@ def _prepare(m: Measurement) -> output_error.Records:
 
 def _verdict(*conditions: tuple[Bool[Array, ""], RESULTS]) -> RESULTS:
     """The first verdict whose condition holds, else successful."""
-    result = RESULTS.successful
-    for condition, verdict in reversed(conditions):
-        result = RESULTS.where(condition, verdict, result)
+    result = SUCCESSFUL
+    for condition, item in reversed(conditions):
+        result = RESULTS.where(condition, item, result)
     return result
 
 
@@ -137,7 +141,7 @@ def skin_by_steiglitz_mcbride(m: Measurement, driver: Driver, iterations: int) -
         result=_verdict(
             (unstable, RESULTS.unstable),
             (~jnp.all(values > 0), RESULTS.nonphysical),
-            ((iterations > 1) & ~best.converged, RESULTS.max_steps_reached),
+            ((iterations > 1) & ~best.converged, MAX_STEPS_REACHED),
             (_misses(chi2, best.rrse), RESULTS.misfit),
             (distance > BIASED, RESULTS.biased),
         ),
@@ -173,7 +177,7 @@ def driver_by_steiglitz_mcbride(
         chi2=jnp.where(jnp.isfinite(best.rrse), chi2, jnp.inf),
         result=_verdict(
             (unstable, RESULTS.unstable),
-            ((iterations > 1) & ~best.converged, RESULTS.max_steps_reached),
+            ((iterations > 1) & ~best.converged, MAX_STEPS_REACHED),
             (_misses(chi2, best.rrse), RESULTS.misfit),
             (distance.max() > BIASED, RESULTS.biased),
         ),
@@ -216,10 +220,10 @@ def skin_by_output_error(m: Measurement, driver: Driver, circuit: AbstractCircui
             (~jnp.isfinite(estimate.chi2), RESULTS.unstable),
             (~jnp.isfinite(values).all(), RESULTS.nonphysical),
             (diverged, RESULTS.stalled),
-            (~settled, RESULTS.max_steps_reached),
+            (~settled, MAX_STEPS_REACHED),
             (_misses(estimate.chi2, estimate.rrse), RESULTS.misfit),
             (~jnp.all(errors < 1), RESULTS.insensitive),
-            (driver.result != RESULTS.successful, RESULTS.driver_failed),
+            (driver.result != SUCCESSFUL, RESULTS.driver_failed),
         ),
         steps=estimate.steps,
         method="output_error",
@@ -289,7 +293,7 @@ def driver_by_output_error(m: Measurement, r_load: Float[Array, " record"], orde
     frequency = jnp.asarray(BAND) * m.sample_rate[0]
 
     def resistance(source, cov):
-        vector, unflatten = jax.flatten_util.ravel_pytree(source)
+        vector, unflatten = ravel_pytree(source)
         slope = jax.jacfwd(lambda p: unflatten(p).response(frequency).real)(vector)
         error = jnp.sqrt(jnp.maximum(jnp.einsum("fi,ij,fj->f", slope, cov, slope), 0.0))
         return jnp.min(source.response(frequency).real + PASSIVE * error)
@@ -318,7 +322,7 @@ def driver_by_output_error(m: Measurement, r_load: Float[Array, " record"], orde
             (~finite[chosen], RESULTS.unstable),
             (~passive[chosen], RESULTS.nonphysical),
             (diverged, RESULTS.stalled),
-            (~settled[chosen], RESULTS.max_steps_reached),
+            (~settled[chosen], MAX_STEPS_REACHED),
             (_misses(estimate.chi2, estimate.rrse), RESULTS.misfit),
         ),
         steps=estimate.steps,

@@ -1,5 +1,4 @@
-"""Differentiable discrete-time filters: `lfilter`, and continuous-time systems driven by
-band-limited samples.
+"""Differentiable discrete-time filters, and continuous systems driven by band-limited samples.
 
 Everything here is one recursion,
 
@@ -93,7 +92,7 @@ def simulate(
 
 
 def companion(b: Float[Array, " b"], a: Float[Array, " a"]) -> StateSpace:
-    """Transposed direct form II of B(z⁻¹)/A(z⁻¹): its state is the `zi` of `scipy.signal.lfilter`."""
+    """Transposed direct form II of B(z⁻¹)/A(z⁻¹); its state is SciPy's `zi`."""
     order = max(b.shape[0], a.shape[0]) - 1
     b = jnp.pad(b, (0, order + 1 - b.shape[0])) / a[0]
     a = jnp.pad(a, (0, order + 1 - a.shape[0])) / a[0]
@@ -135,7 +134,7 @@ def lfilter(
 
 @functools.cache
 def _interpolation_kernel() -> np.ndarray:
-    """Coefficients (2·TAPS, DEGREE+1) of the polynomials in τ that weigh the neighbours n−TAPS+1 … n+TAPS."""
+    """Polynomials in τ, (2·TAPS, DEGREE+1), that weigh the neighbours n−TAPS+1 … n+TAPS."""
     nodes = 0.5 - 0.5 * np.cos(np.pi * (np.arange(4 * DEGREE) + 0.5) / (4 * DEGREE))
     distance = nodes[:, None] - np.arange(-TAPS + 1, TAPS + 1)[None, :]
     window = np.i0(10.0 * np.sqrt(np.maximum(0.0, 1 - (distance / TAPS) ** 2))) / np.i0(10.0)
@@ -156,7 +155,7 @@ def band_limited(v: Float[Array, " time"]) -> Float[Array, "interval degree"]:
     return jnp.einsum("jt,jk->tk", neighbours, kernel)
 
 
-def hold(system: StateSpace, sample_rate: float) -> StateSpace:
+def hold(system: StateSpace, sample_rate: float | Float[Array, ""]) -> StateSpace:
     """Discretise a single-input continuous system for inputs given by `band_limited`.
 
     Args:

@@ -61,12 +61,12 @@ class Fit(eqx.Module):
     """
 
     circuit: AbstractCircuit
-    cov: Float[Array, "*lane parameter parameter"]
-    shared_cov: Float[Array, "*lane parameter parameter"]
-    rrse: Float[Array, "*lane"]
-    chi2: Float[Array, "*lane"]
+    cov: Float[Array | np.ndarray, "*lane parameter parameter"]
+    shared_cov: Float[Array | np.ndarray, "*lane parameter parameter"]
+    rrse: Float[Array | np.ndarray, "*lane"]
+    chi2: Float[Array | np.ndarray, "*lane"]
     result: RESULTS
-    steps: Int[Array, "*lane"]
+    steps: Int[Array | np.ndarray, "*lane"]
     method: str = eqx.field(static=True)
 
     @property

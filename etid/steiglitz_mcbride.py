@@ -198,7 +198,9 @@ def skin_filter(
     return iterate((v_th - v_out)[None], w[None], 1, 1, assess, iterations)
 
 
-def skin_elements(z_bio: Rational, sample_rate: float, *, as_printed: bool = False) -> SkinRC:
+def skin_elements(
+    z_bio: Rational, sample_rate: float | Float[Array, ""], *, as_printed: bool = False
+) -> SkinRC:
     """Elements of the first-order discrete Z_bio under the bilinear map (paper, eqs. 10-12).
 
     R_s = Z(∞),   R_p = Z(0) − R_s,   C_p from |Z(j/(R_p C_p))| = √((R_s+R_p)² + R_s²) / √2

@@ -93,7 +93,9 @@ def frequency_variable(frequency: Float[Array, "..."]) -> Complex[Array, "..."]:
     return 2j * jnp.pi * frequency
 
 
-def delay_variable(frequency: Float[Array, "..."], sample_rate: float) -> Complex[Array, "..."]:
+def delay_variable(
+    frequency: Float[Array, "..."], sample_rate: float | Float[Array, ""]
+) -> Complex[Array, "..."]:
     """The variable z⁻¹ = exp(−j 2π f / fs) at real frequencies [Hz]."""
     return jnp.exp(-2j * jnp.pi * frequency / sample_rate)
 
@@ -120,7 +122,7 @@ def is_stable(a: Float[Array, " order1"]) -> Bool[Array, ""]:
 
 
 def reflect_poles(a: Float[Array, " order1"]) -> Float[Array, " order1"]:
-    """Reflect poles outside the unit circle to their inverse conjugates; |A(e^{jω})| keeps its shape."""
+    """Reflect poles outside the unit circle; the shape of |A(e^{jω})| stays."""
     roots = poles(a)
     outside = jnp.abs(roots) > 1
     inside = jnp.where(outside, 1 / jnp.conj(jnp.where(outside, roots, 2.0)), roots)
