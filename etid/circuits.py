@@ -7,7 +7,7 @@ with units) follows from these lines.
 
 import abc
 import dataclasses
-from typing import Any, Self
+from typing import Any, TypeVar
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -20,6 +20,7 @@ from etid.transfer import Rational, frequency_variable
 Quantity = Float[Array, "..."] | Float[np.ndarray, "..."] | float
 Ohm = Quantity
 Farad = Quantity
+Circuit = TypeVar("Circuit", bound="AbstractCircuit")
 DISPLAY = {"ohm": (1e3, "kΩ"), "farad": (1e-9, "nF")}  # scaled units exist only in print
 
 
@@ -82,15 +83,15 @@ class AbstractCircuit(eqx.Module):
         """Impedance [Ω] at real frequencies [Hz]."""
         return self.impedance()(frequency_variable(jnp.asarray(frequency)))
 
-    def values(self) -> Float[Array, " parameter"]:
+    def values(self) -> Float[Array, "*lane parameter"]:
         """Parameters in SI units."""
         return jnp.stack([getattr(self, name) for name in self.names()], axis=-1)
 
-    def log_values(self) -> Float[Array, " parameter"]:
+    def log_values(self) -> Float[Array, "*lane parameter"]:
         """Natural logarithms of the parameters in SI units."""
         return jnp.log(self.values())
 
-    def with_log_values(self, log_values: Float[Array, " parameter"]) -> Self:
+    def with_log_values(self: Circuit, log_values: Float[Array, "*lane parameter"]) -> Circuit:
         """The same circuit with other parameters."""
         values = jnp.exp(log_values)
         return type(self)(**{name: values[..., i] for i, name in enumerate(self.names())})

@@ -16,7 +16,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Complex, Float, Int
 
 from etid.filtering import StateSpace
-from etid.transfer import Rational, delay_variable, frequency_variable
+from etid.transfer import Rational, as_complex, delay_variable, frequency_variable
 from etid.verdicts import RESULTS, message, verdict_names
 
 
@@ -47,10 +47,16 @@ class SourceImpedance(eqx.Module):
     def response(self, frequency: Float[Array, "..."]) -> Complex[Array, "..."]:
         """Impedance [Ω] at real frequencies [Hz]."""
         s = frequency_variable(jnp.asarray(frequency))[..., None]
-        x = s / jnp.exp(self.log_omega)
-        sections = (self.gain + self.slope * x) / (1 + 2 * jnp.exp(self.log_zeta) * x + x**2)
-        real = self.gain_real / (1 + s / jnp.exp(self.log_omega_real))
-        return jnp.exp(self.log_resistance) + sections.sum(-1) + real.sum(-1)
+        lead = (1,) * (s.ndim - 1)
+
+        def along(parameter):  # one section or pole per column
+            return as_complex(parameter).reshape(*lead, -1)
+
+        x = s / along(jnp.exp(self.log_omega))
+        damping = 2 * along(jnp.exp(self.log_zeta))
+        sections = (along(self.gain) + along(self.slope) * x) / (1 + damping * x + x**2)
+        real = along(self.gain_real) / (1 + s / along(jnp.exp(self.log_omega_real)))
+        return as_complex(jnp.exp(self.log_resistance)) + sections.sum(-1) + real.sum(-1)
 
     def state_space(self) -> StateSpace:
         """Realisation from current [A] to voltage drop [V], one balanced 2x2 block per section."""
@@ -104,7 +110,7 @@ def loaded(source: SourceImpedance, load: Rational, rate: float | Float[Array, "
     drop = jnp.concatenate([z1.C, z2.C])
     B = jnp.concatenate([z1.B, z2.B]) / total
     n1, n2 = z1.C.shape[0], z2.C.shape[0]
-    A = jnp.block([[z1.A, jnp.zeros((n1, n2))], [jnp.zeros((n2, n1)), z2.A]]) - B * drop
+    A = jnp.block([[z1.A, jnp.zeros((n1, n2))], [jnp.zeros((n2, n1)), z2.A]]) - B * drop[None, :]
     share = z2.D[0] / total
     C = jnp.concatenate([jnp.zeros(n1), z2.C]) - share * drop
     return StateSpace(A, B, C, share[None])

@@ -113,7 +113,7 @@ def _score(
     scale = jnp.where(scale > 0, scale, 1.0)
     ridge = 1e-12 * jnp.eye(scale.size)
     gradient = equations.gradient / scale
-    newton = jnp.linalg.solve(equations.matrix / scale[:, None] / scale + ridge, gradient)
+    newton = jnp.linalg.solve(equations.matrix / scale[:, None] / scale[None, :] + ridge, gradient)
     return 2 * equations.objective / m.v_th.size, jnp.dot(newton, gradient)
 
 
@@ -197,7 +197,7 @@ def skin_by_output_error(m: Measurement, driver: Driver, circuit: AbstractCircui
     typical = circuit.log_values()
     is_ohm = jnp.array([unit == "ohm" for unit in circuit.units().values()])
     sign = jnp.where(is_ohm, 1.0, -1.0)
-    starts = [typical + np.log(level) * sign for level in LEVELS]
+    starts = [typical + float(np.log(level)) * sign for level in LEVELS]
     if isinstance(circuit, SkinRC):
         baseline = skin_by_steiglitz_mcbride(m, driver, steiglitz_mcbride.ITERATIONS)
         values = baseline.circuit.values()

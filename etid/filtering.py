@@ -177,7 +177,7 @@ def hold(system: StateSpace, sample_rate: float | Float[Array, ""]) -> StateSpac
     feedthrough = jnp.zeros(DEGREE + 1, system.A.dtype).at[0].set(system.D[0])
     return StateSpace(
         A=exponential[:states, :states],
-        B=exponential[:states, states:] * factorials,
+        B=exponential[:states, states:] * factorials[None, :],
         C=system.C,
         D=feedthrough,
     )

@@ -151,7 +151,7 @@ def _inverse(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
     values, vectors = jnp.linalg.eigh(matrix / scale[:, None] / scale[None, :])
     kept = values > EIGENVALUE_FLOOR
     inverse = jnp.where(kept, 1 / jnp.where(kept, values, 1.0), 0.0)
-    return (vectors * inverse) @ vectors.T / scale[:, None] / scale[None, :]
+    return (vectors * inverse[None, :]) @ vectors.T / scale[:, None] / scale[None, :]
 
 
 class _Curvature(eqx.Module):

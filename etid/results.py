@@ -4,7 +4,7 @@ import dataclasses
 import importlib.metadata
 import os
 from collections.abc import Mapping
-from typing import Any, Self
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -135,7 +135,7 @@ class Fits:
     def __getitem__(self, index: int) -> Fit:
         return jax.tree.map(lambda leaf: leaf[index], self.fit)
 
-    def take(self, index: np.ndarray) -> Self:
+    def take(self, index: np.ndarray) -> "Fits":
         """The fits selected by an index or boolean array."""
         return type(self)(
             jax.tree.map(lambda leaf: np.asarray(leaf)[index], self.fit),
@@ -143,14 +143,14 @@ class Fits:
             self.notes[index],
         )
 
-    def where(self, **labels: str) -> Self:
+    def where(self, **labels: str) -> "Fits":
         """The fits whose labels equal the given ones, as in `where(condition="dry")`."""
         chosen = np.ones(len(self), bool)
         for name, value in labels.items():
             chosen &= self.labels[name] == value
         return self.take(chosen)
 
-    def successful(self) -> Self:
+    def successful(self) -> "Fits":
         """The fits whose verdict is `successful`."""
         return self.take(self.verdicts == "successful")
 
@@ -241,7 +241,7 @@ class Fits:
     @classmethod
     def read(
         cls, path: str | os.PathLike[str], circuit: type[AbstractCircuit] | None = None
-    ) -> Self:
+    ) -> "Fits":
         """Read a file written by `write`.
 
         Args:

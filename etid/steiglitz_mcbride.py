@@ -92,7 +92,7 @@ def iterate(
         ).reshape(-1, zeros + 1 + poles)
         length = jnp.linalg.norm(columns, axis=0)
         length = jnp.where(length > 0, length, 1.0)
-        q, r = jnp.linalg.qr(columns / length)
+        q, r = jnp.linalg.qr(columns / length[None, :])
         coefficients = jax.scipy.linalg.solve_triangular(r, q.T @ wf.reshape(-1)) / length
         return Rational(
             coefficients[: zeros + 1], jnp.concatenate([one, coefficients[zeros + 1 :]])

@@ -27,6 +27,11 @@ def add_polynomials(p: Float[Array, " p"], q: Float[Array, " q"]) -> Float[Array
     return jnp.pad(p, (0, length - p.shape[0])) + jnp.pad(q, (0, length - q.shape[0]))
 
 
+def as_complex(x: Inexact[Array, "..."]) -> Complex[Array, "..."]:
+    """The same numbers with a complex type; JAX can be told to promote nothing by itself."""
+    return x if jnp.iscomplexobj(x) else jax.lax.complex(x, jnp.zeros_like(x))
+
+
 class Rational(eqx.Module):
     """A ratio of polynomials, `(num[0] + num[1] x + …) / (den[0] + den[1] x + …)`.
 
@@ -38,8 +43,9 @@ class Rational(eqx.Module):
 
     def __call__(self, x: Inexact[Array, "..."]) -> Complex[Array, "..."]:
         """Evaluate at `x`."""
-        x = jnp.asarray(x) + 0j
-        return jnp.polyval(self.num[::-1] + 0j, x) / jnp.polyval(self.den[::-1] + 0j, x)
+        x = as_complex(jnp.asarray(x))
+        num, den = as_complex(self.num), as_complex(self.den)
+        return jnp.polyval(num[::-1], x) / jnp.polyval(den[::-1], x)
 
     def add(self, other: "Rational") -> "Rational":
         """The sum `self + other`."""
@@ -90,14 +96,14 @@ def tustin(continuous: Rational, sample_rate: float) -> Rational:
 
 def frequency_variable(frequency: Float[Array, "..."]) -> Complex[Array, "..."]:
     """The variable s = j 2π f [rad/s] at real frequencies [Hz]."""
-    return 2j * jnp.pi * frequency
+    return jax.lax.complex(jnp.zeros_like(frequency), 2 * jnp.pi * frequency)
 
 
 def delay_variable(
     frequency: Float[Array, "..."], sample_rate: float | Float[Array, ""]
 ) -> Complex[Array, "..."]:
     """The variable z⁻¹ = exp(−j 2π f / fs) at real frequencies [Hz]."""
-    return jnp.exp(-2j * jnp.pi * frequency / sample_rate)
+    return jnp.exp(-frequency_variable(frequency / sample_rate))
 
 
 def poles(a: Float[Array, " order1"]) -> Complex[Array, " order"]:

@@ -30,7 +30,7 @@ def getkey():
 
 @pytest.fixture(scope="session")
 def reference_data():
-    """Path of a folder of the reference data set; the test is skipped, visibly, where it is absent."""
+    """Path of a folder of the reference data; where it is absent the test is skipped, visibly."""
 
     def folder(name):
         path = REFERENCE_DATA / name
