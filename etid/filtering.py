@@ -33,6 +33,7 @@ from jaxtyping import Array, Float
 
 BLOCK = 32  # samples; the Toeplitz product grows with it, the scan shrinks
 TAPS = 24  # samples of the interpolation kernel on each side of an interval
+CUTOFF = 0.35  # of the sample rate, of the interpolation
 DEGREE = 7  # of the interpolating polynomial inside one interval
 
 
@@ -138,7 +139,7 @@ def _interpolation_kernel() -> np.ndarray:
     nodes = 0.5 - 0.5 * np.cos(np.pi * (np.arange(4 * DEGREE) + 0.5) / (4 * DEGREE))
     distance = nodes[:, None] - np.arange(-TAPS + 1, TAPS + 1)[None, :]
     window = np.i0(10.0 * np.sqrt(np.maximum(0.0, 1 - (distance / TAPS) ** 2))) / np.i0(10.0)
-    values = np.sinc(distance) * window
+    values = 2 * CUTOFF * np.sinc(2 * CUTOFF * distance) * window
     return np.polynomial.polynomial.polyfit(nodes, values, DEGREE).T
 
 

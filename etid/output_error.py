@@ -8,7 +8,9 @@ parameters of Z_th; the state at the start of the record and an offset of V_out 
 **Noise on both records.** The residual r = V_out_predicted − V_out contains the noise of V_out and
 the noise of V_th filtered by the loaded driver G. For white noise its variance is
 
-    s(θ) = σ_out² + σ_th² Σ h²,      h the impulse response of G,
+    s(θ) = σ_out² Σ k² + σ_th² Σ h²,
+
+k being the impulse response of the interpolation, h that of G after it,
 
 and minimising Σ r²/s(θ) is consistent, because E Σ r² = |noise-free misfit|² + N s(θ); minimising Σ
 r² alone is not (at 30 dB it drives Z_th to −90 kΩ). χ² = Σ r²/s per degree of freedom is 1 when the
@@ -17,7 +19,7 @@ model is right.
 **Covariance.** r is coloured (G filters the noise of V_th), and the recorded noise inflates JᵀJ.
 Both are accounted for,
 
-    cov = H⁻¹ (Jᵀ Σ J) H⁻¹,      Σ = (σ_out² I + σ_th² G Gᵀ)/s,
+    cov = H⁻¹ (Jᵀ Σ J) H⁻¹,      Σ = (σ_out² K Kᵀ + σ_th² G Gᵀ)/s,
     H   = JᵀJ − N (σ_th² Σ ∂h ∂hᵀ/s − ∂s ∂sᵀ/(4 s²)),
 
 H being the curvature of the *expected* objective, and a skin adds what it inherits from its driver,
@@ -56,8 +58,7 @@ class Records(eqx.Module):
 
     Attributes:
         hold: Polynomial coefficients of the band-limited V_th.
-        v_out: Measured voltage [V] at the start of each interval.
-        v_th: Unloaded voltage [V], whole record.
+        v_out: Measured voltage [V] at the start of each interval, filtered like V_th.
         sigma_th: Noise of V_th [V].
         sigma_out: Noise of V_out [V].
         sample_rate: Sampling rate [Hz].
@@ -65,7 +66,6 @@ class Records(eqx.Module):
 
     hold: Float[Array, "interval degree"]
     v_out: Float[Array, " interval"]
-    v_th: Float[Array, " time"]
     sigma_th: Float[Array, ""]
     sigma_out: Float[Array, ""]
     sample_rate: Float[Array, ""]
@@ -79,10 +79,7 @@ def prepare(
     sample_rate: Float[Array, ""],
 ) -> Records:
     """Interpolate V_th once; the edges, where its neighbours are missing, are left out."""
-    interpolated = band_limited(v_th)
-    first = TAPS - 1
-    measured = v_out[first : first + interpolated.shape[0]]
-    return Records(interpolated, measured, v_th, sigma_th, sigma_out, sample_rate)
+    return Records(band_limited(v_th), band_limited(v_out)[:, 0], sigma_th, sigma_out, sample_rate)
 
 
 def loaded_filter(
@@ -101,13 +98,18 @@ def predict(
 
 def impulse_response(system: StateSpace) -> Float[Array, " lag"]:
     """Response h of the loaded driver to one sample of V_th, interpolation included."""
-    impulse = jnp.zeros(IMPULSE + 2 * TAPS).at[2 * TAPS].set(1.0)
-    return simulate(system, band_limited(impulse), jnp.zeros_like(system.C))[0]
+    return simulate(system, _impulse(), jnp.zeros_like(system.C))[0]
+
+
+def _impulse() -> Float[Array, "lag degree"]:
+    """One sample of noise, interpolated."""
+    return band_limited(jnp.zeros(IMPULSE + 2 * TAPS).at[2 * TAPS].set(1.0))
 
 
 def residual_variance(records: Records, h: Float[Array, " lag"]) -> Float[Array, ""]:
-    """Variance s = σ_out² + σ_th² Σ h² of the residual [V²]."""
-    return records.sigma_out**2 + records.sigma_th**2 * jnp.sum(h**2)
+    """Variance s = σ_out² Σ k² + σ_th² Σ h² of the residual [V²]."""
+    k = _impulse()[:, 0]
+    return records.sigma_out**2 * jnp.sum(k**2) + records.sigma_th**2 * jnp.sum(h**2)
 
 
 def scaled_residual(
@@ -176,15 +178,15 @@ def _curvature(records: Records, model: Any, q: Float[Array, " n"]) -> _Curvatur
     samples = jacobian.shape[0]
     noise = records.sigma_th**2 * slope.T @ slope / s
     noise = noise - jnp.outer(s_slope, s_slope) / (4 * s**2)
-    # ‖Gᵀ J‖² by Parseval; J is padded, so that the filter does not wrap around.
+    # Jᵀ Σ J by Parseval; J is padded, so that the filters do not wrap around.
     size = 2 ** math.ceil(math.log2(samples + IMPULSE))
     weight = jnp.full(size // 2 + 1, 2.0 / size).at[0].set(1.0 / size).at[-1].set(1.0 / size)
-    weight = weight * jnp.abs(jnp.fft.rfft(h, size)) ** 2
+    power_out = records.sigma_out**2 * jnp.abs(jnp.fft.rfft(_impulse()[:, 0], size)) ** 2
+    weight = weight * (power_out + records.sigma_th**2 * jnp.abs(jnp.fft.rfft(h, size)) ** 2)
     spectrum = jnp.fft.rfft(jacobian, size, axis=0)
     real, imaginary = spectrum.real, spectrum.imag
-    coloured = real.T @ (weight[:, None] * real) + imaginary.T @ (weight[:, None] * imaginary)
+    score = real.T @ (weight[:, None] * real) + imaginary.T @ (weight[:, None] * imaginary)
     information = jacobian.T @ jacobian
-    score = records.sigma_out**2 * information + records.sigma_th**2 * coloured
     return _Curvature(information - samples * noise, score / s)
 
 
