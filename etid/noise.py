@@ -19,7 +19,7 @@ MEDIAN_TO_SIGMA = 1.482602218505602  # of |x| for a normal x
 
 
 def noise_std(
-    v: Float[Array, " time"], resolution: Float[Array, ""] | float = 0.0
+    v: Float[Array | np.ndarray, " time"], resolution: Float[Array, ""] | float = 0.0
 ) -> Float[Array, ""]:
     """Standard deviation of the white noise in `v`, in the unit of `v`.
 

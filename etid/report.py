@@ -5,6 +5,7 @@ import dataclasses
 import html
 import os
 import pathlib
+import textwrap
 from collections.abc import Sequence
 
 _STYLE = """
@@ -88,7 +89,8 @@ class Section:
     figures: tuple[tuple[str, pathlib.Path], ...] = ()
 
     def __str__(self) -> str:
-        parts = [self.heading, "=" * len(self.heading), self.text, *map(str, self.tables)]
+        text = textwrap.fill(self.text, 100)
+        parts = [self.heading, "=" * len(self.heading), text, *map(str, self.tables)]
         return "\n".join(filter(None, parts))
 
     def html(self) -> str:

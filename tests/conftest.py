@@ -5,10 +5,15 @@ import pathlib
 
 import jax
 import pytest
+from hypothesis import settings
 
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_rank_promotion", "raise")
 jax.config.update("jax_numpy_dtype_promotion", "strict")
+
+# Compilation makes first examples slow, and a failure must be the same one tomorrow.
+settings.register_profile("etid", deadline=None, derandomize=True, max_examples=40)
+settings.load_profile("etid")
 
 REFERENCE_DATA = pathlib.Path(__file__).parents[2] / "shared" / "data"
 

@@ -49,10 +49,9 @@ def test_impedance_is_drawn_in_kilohms_and_degrees():
 def test_elements_show_every_fit_and_failures_hollow():
     values = jnp.array([[10e3, 20e3, 30e3], [90e3, 80e3, 70e3], [1e-9, 2e-9, 3e-9]])
     cov = np.tile(np.diag([1e6, 1e6, 1e-20]), (3, 1, 1))
-    fit = Fit(
-        SkinRC(*values), cov, 0 * cov, np.ones(3), np.ones(3),
-        verdicts_of(np.array(["successful", "successful", "misfit"])), np.ones(3, int), "output_error",
-    )  # fmt: skip
+    verdicts = verdicts_of(np.array(["successful", "successful", "misfit"]))
+    one = np.ones(3)
+    fit = Fit(SkinRC(*values), cov, 0 * cov, one, one, verdicts, np.ones(3, int), "output_error")
     labels = {name: np.array(["a", "a", "b"]) for name in ("path", "subject", "electrode", "trial")}
     labels["condition"] = np.array(["dry", "damp", "dry"])
     figure = plotting.plot_elements(Fits(fit, labels, np.array([""] * 3)))

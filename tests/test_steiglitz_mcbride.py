@@ -1,0 +1,149 @@
+import functools
+import json
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.signal
+
+from etid import SkinRC
+from etid.steiglitz_mcbride import (
+    driver_filter,
+    iterate,
+    skin_elements,
+    skin_filter,
+    terminal_voltage,
+)
+from etid.transfer import Rational, delay_variable, tustin
+
+FS = 200e3
+DRY = SkinRC(33.4e3, 186e3, 0.12e-9)
+DAMP = SkinRC(6.1e3, 17.4e3, 0.66e-9)
+
+
+@pytest.fixture(scope="module")
+def published(reference_data):
+    return json.loads(reference_data("peer_cases.json").read_text())["steiglitz_mcbride"]["cases"]
+
+
+def impulse_fit(h, zeros, poles, iterations):
+    """Model an impulse response, as `stmcb` does; the error of the simulated response decides."""
+    impulse = jnp.zeros(h.size).at[0].set(1.0)
+
+    def assess(candidate):
+        simulated = jnp.asarray(0.0) + jax.jit(simulate)(candidate)
+        return jnp.linalg.norm(simulated - h) / jnp.linalg.norm(h), jnp.array(True)
+
+    def simulate(candidate):
+        from etid.filtering import lfilter
+
+        return lfilter(candidate.num, candidate.den, impulse)[0]
+
+    run = functools.partial(iterate, zeros=zeros, poles=poles, assess=assess, iterations=iterations)
+    return jax.jit(run)(impulse[None], jnp.asarray(h)[None])
+
+
+def test_exact_data_give_back_the_filter(published):
+    case = published[0]
+    h = scipy.signal.lfilter(case["b"], case["a"], np.eye(case["n"])[0])
+    best = impulse_fit(h, *case["orders"], 8)
+    np.testing.assert_allclose(best.filter.num, case["b"], atol=case["tol"])
+    np.testing.assert_allclose(best.filter.den, case["a"], atol=case["tol"])
+    assert bool(best.stable)
+
+
+def test_a_superfluous_zero_vanishes(published):
+    case = published[1]
+    h = scipy.signal.lfilter(case["b"], case["a"], np.eye(case["n"])[0])
+    best = impulse_fit(h, *case["orders"], case["iters"])
+    assert abs(float(best.filter.num[3])) < 1e-12
+
+
+def test_reduction_of_a_butterworth_filter(published):
+    case = published[2]
+    b, a = scipy.signal.butter(6, 0.2)
+    h = scipy.signal.lfilter(b, a, np.eye(case["n"])[0])
+    best = impulse_fit(h, *case["orders"], 10)
+    # The reference is printed to 6 digits; the best iterate may be better than its fixed point.
+    assert float(best.rrse) <= case["sm_rel_err"] * (1 + 1e-6)
+    assert float(best.rrse) >= case["lm_output_error_optimum_rel_err"] * (1 - 1e-6)
+    np.testing.assert_allclose(best.filter.den, case["sm_fixed_point_a"], atol=2e-2)
+
+
+@pytest.fixture(scope="module")
+def exact():
+    """A pulse through a discrete driver with a resistor and with a bilinear skin, without noise."""
+    pulse = np.zeros(3000)
+    pulse[100:233] = 50.0
+    pulse[1500:1633] = 50.0
+    b, a = scipy.signal.butter(2, 0.3)
+    v_th = jnp.asarray(scipy.signal.lfilter(b, a, pulse))
+    den = np.poly([0.97, 0.6 * np.exp(0.8j), 0.6 * np.exp(-0.8j)]).real
+    z_th = Rational(jnp.array([4e3, -3.5e3, 1.2e3]), jnp.asarray(den))
+    r = 98.8e3
+    v_ref, stable = terminal_voltage(z_th, Rational(jnp.array([r]), jnp.ones(1)), v_th)
+    assert bool(stable)
+    z_bio = tustin(DAMP.impedance(), FS)
+    v_out, stable = terminal_voltage(z_th, z_bio, v_th)
+    assert bool(stable)
+    return v_th, v_ref, r, z_th, v_out
+
+
+def test_driver_and_skin_are_exact_on_discrete_data(exact):
+    """Eqs. (5)-(6), then (8)-(12), on data that obey the discrete model to the last digit."""
+    v_th, v_ref, r, z_th, v_out = exact
+    best = jax.jit(functools.partial(driver_filter, order=3))(
+        v_th[None], v_ref[None], jnp.array([r])
+    )
+    z = delay_variable(jnp.linspace(0.0, 0.5, 30), 1.0)
+    # The regression squares nothing (QR), so errors are rounding times a condition near 1e6.
+    np.testing.assert_allclose(best.filter(z), z_th(z), rtol=1e-7)
+    assert float(best.rrse) < 1e-10
+    skin = jax.jit(skin_filter)(v_th, v_out, z_th)
+    elements = skin_elements(skin.filter, FS)
+    np.testing.assert_allclose(elements.values(), DAMP.values(), rtol=1e-7)
+    assert bool(skin.converged)
+    assert bool(skin.closed_loop_stable)
+
+
+@pytest.mark.parametrize("circuit", [DRY, DAMP])
+def test_elements_satisfy_equations_10_to_12(circuit):
+    """Evaluate the printed definitions on Z(s) itself, not on the algebra of the implementation."""
+    z_bio = tustin(circuit.impedance(), FS)
+    elements = skin_elements(z_bio, FS)
+    np.testing.assert_allclose(elements.values(), circuit.values(), rtol=1e-10)
+
+    def z(s):
+        return complex(circuit.impedance()(jnp.asarray(s, dtype=complex)))
+
+    r_s, r_p, c_p = (float(x) for x in elements.values())
+    assert abs(z(1e15) - r_s) < 1e-3 * r_s  # eq. (10)
+    assert abs(z(0.0) - r_s - r_p) < 1e-9 * r_p  # eq. (11)
+    magnitude = np.sqrt((r_s + r_p) ** 2 + r_s**2) / np.sqrt(2)
+    assert abs(abs(z(1j / (r_p * c_p))) - magnitude) < 1e-9 * magnitude  # eq. (12)
+
+
+def test_the_magnitude_as_printed_costs_what_it_costs():
+    excess = []
+    for circuit in (DRY, DAMP):
+        printed = skin_elements(tustin(circuit.impedance(), FS), FS, as_printed=True)
+        excess.append(float(printed.c_p / circuit.c_p) - 1)
+        omega = 1 / float(printed.r_p * printed.c_p)
+        z = complex(circuit.impedance()(jnp.asarray(1j * omega)))
+        expected = (2 * float(circuit.r_s) + float(circuit.r_p)) / np.sqrt(2)
+        np.testing.assert_allclose(abs(z), expected, rtol=1e-9)
+    np.testing.assert_allclose(excess, [0.38, 0.88], atol=0.01)
+
+
+def test_the_magnitude_as_printed_may_have_no_root():
+    circuit = SkinRC(80e3, 100e3, 0.1e-9)  # R_s / R_p > 1/√2
+    printed = skin_elements(tustin(circuit.impedance(), FS), FS, as_printed=True)
+    assert np.isnan(float(printed.c_p))
+
+
+def test_an_unstable_loop_is_reported_not_simulated():
+    v_th = jnp.ones(200)
+    unstable = Rational(jnp.array([-1.5, 0.0]), jnp.array([1.0, 0.0]))
+    _, stable = terminal_voltage(unstable, Rational(jnp.array([1.0, -0.9]), jnp.ones(1)), v_th)
+    assert not bool(stable)
