@@ -134,23 +134,30 @@ def lfilter(
 
 
 @functools.cache
-def _interpolation_kernel() -> np.ndarray:
+def _interpolation_kernel(cutoff: float) -> np.ndarray:
     """Polynomials in τ, (2·TAPS, DEGREE+1), that weigh the neighbours n−TAPS+1 … n+TAPS."""
     nodes = 0.5 - 0.5 * np.cos(np.pi * (np.arange(4 * DEGREE) + 0.5) / (4 * DEGREE))
     distance = nodes[:, None] - np.arange(-TAPS + 1, TAPS + 1)[None, :]
     window = np.i0(10.0 * np.sqrt(np.maximum(0.0, 1 - (distance / TAPS) ** 2))) / np.i0(10.0)
-    values = 2 * CUTOFF * np.sinc(2 * CUTOFF * distance) * window
+    values = 2 * cutoff * np.sinc(2 * cutoff * distance) * window
     return np.polynomial.polynomial.polyfit(nodes, values, DEGREE).T
 
 
-def band_limited(v: Float[Array, " time"]) -> Float[Array, "interval degree"]:
+def band_limited(
+    v: Float[Array, " time"], cutoff: float = CUTOFF
+) -> Float[Array, "interval degree"]:
     """Polynomial coefficients of the band-limited interpolation of `v` in every interval.
 
     Row i belongs to the interval that starts at sample `TAPS − 1 + i`; the first is the earliest
     interval, the last the latest one, with all its `2·TAPS` neighbours inside the record (`time −
     2·TAPS + 1` rows).
+
+    Args:
+        v: Samples.
+        cutoff: Of the interpolation, in units of the sample rate. Fits use the default, which
+            keeps out what an imperfect anti-alias filter has folded below half the rate.
     """
-    kernel = jnp.asarray(_interpolation_kernel(), v.dtype)
+    kernel = jnp.asarray(_interpolation_kernel(cutoff), v.dtype)
     rows = v.shape[0] - 2 * TAPS + 1
     neighbours = jnp.stack([jax.lax.slice_in_dim(v, j, j + rows) for j in range(2 * TAPS)])
     return jnp.einsum("jt,jk->tk", neighbours, kernel)

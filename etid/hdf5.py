@@ -468,7 +468,7 @@ class _Scan:
         try:
             Samples(np.zeros(1, dataset.dtype), *scale)
         except RecordingError as error:
-            raise error.located(field=field.name) from None
+            raise RecordingError(error.message, field=f"{of}{error.field}") from None
         return _Header(shape, dataset.dtype, *scale)
 
     def _block(self, path: str, found: dict[str, Any], headers: dict[str, _Header]) -> _Block:

@@ -191,7 +191,9 @@ def identify_skin(
 @eqx.filter_jit
 def _fitted(samples: Any, driver: Driver, circuit: AbstractCircuit) -> Float[Array, " interval"]:
     m = estimation.measure(*samples)
-    records = output_error.prepare(m.v_th, m.v_out, m.sigma_th, m.sigma_out, m.sample_rate)
+    records = output_error.prepare(
+        m.v_th, m.v_out, m.sigma_th, m.sigma_out, m.sample_rate, cutoff=0.5
+    )  # the whole band, as it was recorded
     assert driver.source is not None  # check_driver
     return output_error.fitted_voltage(records, driver.source, circuit.impedance())
 

@@ -9,13 +9,11 @@ solves the damped step, `optimistix.ClassicalTrustRegion` accepts it and sets th
 Three things make the method scale-free:
 
 - **Marquardt scaling.** The step is solved in z = D y, D² = diag(JᵀJ) (the largest seen, as in Moré
-1978), so that multiplying a parameter by a constant
-  changes no iterate.
+  1978), so that multiplying a parameter by a constant changes no iterate.
 - **Stopping on an angle.** The relative offset of Bates & Watts (1981), the sine of the angle
-between the residual and
-  the tangent plane, has neither the unit of the residual nor of a parameter. Times √(samples) it is
-  the distance to the minimum in standard errors. A step too small to move the parameters is *not*
-  convergence: a solver that cannot move must not report success.
+  between the residual and the tangent plane, has neither the unit of the residual nor of a
+  parameter. Times √(samples) it is the distance to the minimum in standard errors. A step too small
+  to move the parameters is *not* convergence: a solver that cannot move must not report success.
 - **A trial step whose residual is not finite is rejected**, as if its objective were infinite.
 """
 
@@ -31,6 +29,7 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 
 INITIAL_DAMPING = 1e-2  # relative to the unit diagonal of the scaled Gauss-Newton matrix
 RIDGE = 1e-13  # of the scaled matrix, for directions that double precision cannot resolve
+ROUNDING = 4.0  # units of ε that the model's own arithmetic loses
 STALLED_STEP = 1e-15  # a relative step that no longer changes the parameters in double precision
 
 
@@ -97,8 +96,11 @@ class LevenbergMarquardt(optx.AbstractLeastSquaresSolver):
     ftol: float = 1e-8
     norm: Callable[[PyTree], Array] = optx.two_norm
     descent: optx.DampedNewtonDescent = optx.DampedNewtonDescent(linear_solver=lx.Cholesky())
+    # MINPACK's threshold, and constants whose powers differ: with 10 and 1/10 the damping returns to
+    # the value that was just rejected, over and over, and a curved valley costs three times the
+    # steps.
     search: optx.ClassicalTrustRegion = optx.ClassicalTrustRegion(
-        high_cutoff=0.75, high_constant=10.0, low_constant=0.1
+        high_cutoff=0.75, high_constant=5.0, low_constant=0.25
     )
 
     def init(self, fn, y, args, options, f_struct, aux_struct, tags) -> _State:
@@ -165,7 +167,13 @@ class LevenbergMarquardt(optx.AbstractLeastSquaresSolver):
             accepted.matrix / safe[:, None] / safe[None, :] + ridge, accepted.gradient / safe
         )
         offset = jnp.dot(newton, accepted.gradient / safe)  # |Q₁ᵀ r|²
-        converged = offset <= self.rtol**2 * 2 * accepted.objective
+        squares = 2 * accepted.objective
+        converged = offset <= self.rtol**2 * squares
+        # Rounding in the residual is ε times the model, which is about |J y|: a reduction of |r|²
+        # below |r| times that cannot be seen, and the rejection of a step then means nothing.
+        model = self.norm(diagonal * y)
+        unseen = offset <= ROUNDING * jnp.finfo(y.dtype).eps * jnp.sqrt(squares) * model
+        converged = converged | (unseen & ~accept)
         converged = converged | negligible | (self.norm(newton) <= self.atol * size)
         stalled = (self.norm(safe * tried) <= STALLED_STEP * size) & ~state.first_step
         finite = jnp.isfinite(accepted.objective)

@@ -39,7 +39,7 @@ from jaxtyping import Array, Float, Int
 
 from etid.circuits import AbstractCircuit, resistor
 from etid.driver import SourceImpedance, loaded
-from etid.filtering import TAPS, StateSpace, band_limited, hold, simulate
+from etid.filtering import CUTOFF, TAPS, StateSpace, band_limited, hold, simulate
 from etid.levenberg_marquardt import LevenbergMarquardt
 from etid.results import rrse
 from etid.transfer import Rational
@@ -77,9 +77,11 @@ def prepare(
     sigma_th: Float[Array, ""],
     sigma_out: Float[Array, ""],
     sample_rate: Float[Array, ""],
+    cutoff: float = CUTOFF,
 ) -> Records:
     """Interpolate V_th once; the edges, where its neighbours are missing, are left out."""
-    return Records(band_limited(v_th), band_limited(v_out)[:, 0], sigma_th, sigma_out, sample_rate)
+    held, measured = band_limited(v_th, cutoff), band_limited(v_out, cutoff)[:, 0]
+    return Records(held, measured, sigma_th, sigma_out, sample_rate)
 
 
 def loaded_filter(
@@ -146,13 +148,17 @@ class Estimate(eqx.Module):
     shared_cov: Float[Array, "parameter parameter"]
 
 
-def _inverse(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
-    """Inverse of a symmetric matrix, without the directions that carry no information."""
+def _inverse(matrix: Float[Array, "n n"], *, drop: bool = False) -> Float[Array, "n n"]:
+    """Inverse of a symmetric matrix, in its own scaling.
+
+    Directions without information keep an enormous variance, or with `drop` none: nuisances that
+    the data do not determine have no effect either.
+    """
     scale = jnp.sqrt(jnp.maximum(jnp.diagonal(matrix), 0.0))
     scale = jnp.where(scale > 0, scale, 1.0)
     values, vectors = jnp.linalg.eigh(matrix / scale[:, None] / scale[None, :])
-    kept = values > EIGENVALUE_FLOOR
-    inverse = jnp.where(kept, 1 / jnp.where(kept, values, 1.0), 0.0)
+    inverse = 1 / jnp.maximum(values, EIGENVALUE_FLOOR)
+    inverse = jnp.where(values > EIGENVALUE_FLOOR, inverse, 0.0 if drop else inverse)
     return (vectors * inverse[None, :]) @ vectors.T / scale[:, None] / scale[None, :]
 
 
@@ -193,7 +199,7 @@ def _curvature(records: Records, model: Any, q: Float[Array, " n"]) -> _Curvatur
 def _eliminate(curvature: _Curvature, kept: int) -> _Curvature:
     """Project out the nuisances of one record, which no other record shares."""
     h, m = curvature.expected, curvature.score
-    k = -_inverse(h[kept:, kept:]) @ h[kept:, :kept]
+    k = -_inverse(h[kept:, kept:], drop=True) @ h[kept:, :kept]
     reduced = h[:kept, :kept] + h[:kept, kept:] @ k
     score = (
         m[:kept, :kept] + m[:kept, kept:] @ k + k.T @ m[kept:, :kept] + k.T @ m[kept:, kept:] @ k

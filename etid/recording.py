@@ -60,11 +60,7 @@ class RecordingError(ValueError):
             self.message,
             file=self.file or file,
             path=self.path or path,
-            field=field
-            if not self.field
-            else f"{field}.{self.field}"
-            if field in SIGNALS
-            else self.field,
+            field=self.field or field,
             remedy=self.remedy,
         )
 

@@ -390,6 +390,9 @@ _RULES = """\
   absent field (`samplerate`): that is reported, not guessed.
 - A recording that breaks a rule is left out and listed in `Study.problems`; the others are read.
 - Text is UTF-8. An array of one element counts as a scalar.
+- etid writes text of a fixed length and opens files with `libver="v108"`: all but the samples is
+  then under checksums, and damage is an error. Text of variable length, h5py's default, is read
+  too, but no checksum protects it: damage inside it can hang the HDF5 library itself.
 - A file of a newer minor version is read, one of another major version is refused.
 
 What etid writes is the same layout: recordings `g/0 … g/T-1` that differ in nothing but samples and

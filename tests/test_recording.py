@@ -51,9 +51,9 @@ def test_samples_cannot_be_written_to(array):
 
 def test_a_recording_cannot_be_assigned_to():
     with pytest.raises(AttributeError):
-        recording().r_load = 1.0
+        recording().r_load = 1.0  # type: ignore[misc]  # what must fail
     with pytest.raises(TypeError):
-        recording().samples["v_th"] = Samples(np.zeros(3))
+        recording().samples["v_th"] = Samples(np.zeros(3))  # type: ignore[index]  # what must fail
 
 
 def test_times_of_a_recording():

@@ -1,0 +1,220 @@
+"""The command line: what it prints, what it writes, how it ends."""
+
+import json
+import subprocess
+import sys
+
+import h5py
+import numpy as np
+import pytest
+
+import etid
+from etid import cli
+
+DONE, WRONG_DATA, WRONG_USAGE = 0, 1, 2
+
+
+@pytest.fixture
+def run(capsys):
+    """Run a command; its status, and its lines on stdout and stderr."""
+
+    def run(*arguments):
+        try:
+            status = cli.main([str(argument) for argument in arguments])
+        except SystemExit as stop:
+            status = stop.code
+        captured = capsys.readouterr()
+        return status, captured.out.splitlines(), captured.err.splitlines()
+
+    return run
+
+
+@pytest.fixture
+def study_file(tmp_path):
+    """A calibration, three good dry trials, and one with NaN."""
+    scene = etid.scenes.paper_dry(bits=None)
+    recordings = list(scene.simulate(seed=5).recordings())[:5]
+    v_out = recordings[2].v_out.copy()
+    v_out[100] = np.nan
+    recordings[2] = recordings[2].replace(v_out=v_out)
+    path = tmp_path / "study.h5"
+    etid.Study.from_recordings(recordings).write(path)
+    return path
+
+
+def test_simulate_writes_a_study_and_its_truth_and_the_seed_decides(run, tmp_path):
+    files = [tmp_path / name for name in ("a.h5", "b.h5", "c.h5")]
+    for file, seed in zip(files, (1, 1, 2), strict=True):
+        options = ("--snr-db", 50, "--jitter", 1e-7, "--seed", seed, "--truth", tmp_path / "t.json")
+        assert run("simulate", "paper_dry", "-o", file, *options) == (DONE, [], [])
+    records = []
+    for file in files:
+        with etid.read(file) as study:
+            assert len(study) == 11
+            records.append(study["typical/dry/03"].v_out)
+    assert np.array_equal(records[0], records[1])
+    assert not np.array_equal(records[0], records[2])
+    truth = json.loads((tmp_path / "t.json").read_text())
+    assert truth["typical/dry/03"] == {"r_s": 33.4e3, "r_p": 186e3, "c_p": 0.12e-9}
+
+
+def test_simulate_passes_noise_and_delay_on(run, tmp_path):
+    for name, options in {
+        "clean": ("--snr-db", "inf"),
+        "noise": ("--snr-db", 30),
+        "delay": ("--snr-db", "inf", "--jitter", 1e-6),
+    }.items():
+        assert run("simulate", "paper_calibration", "-o", tmp_path / f"{name}.h5", *options)[0] == 0
+    v = {name: etid.read(tmp_path / f"{name}.h5")["calibration/98k8"].v_th
+         for name in ("clean", "noise", "delay")}  # fmt: skip
+    quiet = slice(1000, 3000)  # between two pulses: noise is seen there, a delay is not
+    assert np.std(np.diff(v["noise"][quiet])) > 10 * np.std(np.diff(v["clean"][quiet]))
+    assert np.std(np.diff(v["delay"][quiet])) < 2 * np.std(np.diff(v["clean"][quiet]))
+    assert np.abs(v["delay"] - v["clean"]).max() > 1.0  # at the edges of 50 V
+
+
+def test_check_counts_the_recordings_of_a_good_file(run, tmp_path):
+    file = tmp_path / "study.h5"
+    etid.scenes.paper_dry().simulate(seed=0).write(file)
+    assert run("check", file) == (DONE, [f"{file}: 11 recordings, nothing wrong"], [])
+
+
+def test_check_names_every_wrong_field(run, study_file):
+    with h5py.File(study_file, "a") as file:
+        file["calibration/98k8/v_th"].attrs["unit"] = "millivolt"
+        file["typical/dry/01"].attrs["sample_rate"] = 0.0
+        del file["typical/dry/03/v_out"]
+    status, printed, _ = run("check", study_file)
+    assert status == WRONG_DATA
+    for path, field in (
+        ("calibration/98k8", "v_th.unit"),
+        ("typical/dry/01", "sample_rate"),
+        ("typical/dry/02", "v_out"),  # the NaN
+        ("typical/dry/03", "v_out"),
+    ):
+        assert any(path in line and field in line for line in printed), (path, field)
+
+
+def test_import_turns_a_table_into_a_file_that_check_accepts(run, tmp_path):
+    table = tmp_path / "table.csv"
+    values = np.random.default_rng(0).normal(size=(500, 2))
+    np.savetxt(table, values, delimiter=",", header="open,skin", comments="")
+    target = tmp_path / "study.h5"
+    arguments = ("--v-th", "open", "--v-out", "skin", "--sample-rate", 2e5, "--pulse-rate", 60)
+    more = ("--scale", 0.0535, "--subject", "s01", "--condition", "dry")
+    assert run("import", table, target, *arguments, *more) == (DONE, [], [])
+    assert run("check", target)[0] == DONE
+    with etid.read(target) as study:
+        recording = study["loaded/0"]
+    assert (recording.subject, recording.condition) == ("s01", "dry")
+    np.testing.assert_allclose(recording.v_out, values[:, 1] / 0.0535, rtol=1e-12)
+
+
+def test_fit_writes_all_fits_and_one_bad_recording_costs_itself(run, study_file, tmp_path):
+    with h5py.File(study_file, "a") as file:
+        file.create_group("typical/dry/99").attrs.update(kind="loaded")  # cannot be read
+    target = tmp_path / "fits.h5"
+    status, printed, complaints = run("fit", study_file, "-o", target)
+    assert (status, complaints) == (DONE, [])
+    assert printed[0] == "4 recordings by output_error: 3 successful, 1 nonfinite_samples"
+    assert printed[1].startswith("driver calibration/98k8: order 5, successful, RRSE ")
+    heads, row = printed[4], printed[5]
+    assert heads.split() == "subject condition fits r_s [kΩ] r_p [kΩ] c_p [nF]".split()
+    assert row.split()[:3] == ["typical", "dry", "3/4"]
+    r_s, spread, error = (float(word.strip("(;)")) for word in row.split()[3:6])
+    assert abs(r_s - 33.4) < 5 * error  # five standard errors: 1 in 10⁶ by chance
+    assert 0 <= spread < 5 * error < r_s
+    assert "without success: 2 recordings" in printed
+    assert any(line.startswith("typical/dry/99: not read. ") for line in printed)
+    assert any(line.startswith("typical/dry/02: nonfinite_samples. ") for line in printed)
+    fits = etid.Fits.read(target)
+    assert fits.labels["path"].tolist() == [f"typical/dry/{i:02d}" for i in range(1, 5)]
+    assert fits.counts() == {"successful": 3, "nonfinite_samples": 1}
+
+
+def test_fit_passes_method_and_order_on(run, study_file, tmp_path):
+    target = tmp_path / "fits.h5"
+    _, printed, _ = run("fit", study_file, "-o", target, "--method", "equation_error", "--order", 3)
+    assert " by equation_error: " in printed[0]
+    assert printed[1].startswith("driver calibration/98k8: order 3, ")
+    assert etid.Fits.read(target).fit.method == "equation_error"
+
+
+def test_fit_without_any_success_says_so_and_lists_twenty_at_most(run, tmp_path):
+    study = etid.scenes.paper_built().simulate(seed=0)
+    file, target = tmp_path / "study.h5", tmp_path / "fits.h5"
+    study.write(file)
+    status, printed, _ = run("fit", file, "-o", target, "--order", 1)  # no driver has order 1
+    assert status == WRONG_DATA
+    assert printed[0] == "23 recordings by output_error: 23 driver_failed"
+    assert printed[1].startswith("driver calibration/98k8: order is 1")
+    assert sum(line.startswith("built/") for line in printed) == 20
+    assert printed[-1].startswith("and 3 more")
+    assert len(etid.Fits.read(target)) == 23
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (("fit", "absent.h5", "-o", "fits.h5"), "absent.h5: there is no such file"),
+        (("fit", "garbage.h5", "-o", "fits.h5"), "garbage.h5: is not an HDF5 file"),
+        (("fit", "study.h5", "-o", "absent/fits.h5"), "absent/fits.h5: there is no folder"),
+        (("fit", "calibration.h5", "-o", "fits.h5"), "no loaded recording"),
+        (("import", "absent.csv", "out.h5"), "absent.csv: there is no such file"),
+        (("import", "table.csv", "out.h5"), "v_th: is not given"),
+        (("simulate", "paper_dry", "-o", "absent/study.h5"), "cannot be written"),
+        (("simulate", "paper_dry", "-o", "s.h5", "--jitter", "-1"), "must not be negative"),
+    ],
+)
+def test_an_error_is_one_line_without_a_traceback(
+    run, study_file, tmp_path, monkeypatch, arguments, words
+):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "garbage.h5").write_bytes(b"no HDF5")
+    (tmp_path / "table.csv").write_text("open,skin\n1,2\n")
+    etid.scenes.paper_calibration().simulate(seed=0).write(tmp_path / "calibration.h5")
+    status, printed, complaints = run(*arguments)
+    assert (status, printed, len(complaints)) == (WRONG_DATA, [], 1)
+    assert complaints[0].startswith("etid: error: ")
+    assert words in complaints[0]
+
+
+def test_check_of_a_missing_file_is_wrong_data(run, tmp_path):
+    status, printed, _ = run("check", tmp_path / "absent.h5")
+    assert status == WRONG_DATA
+    assert len(printed) == 1
+
+
+@pytest.mark.parametrize("command", ["fit", "import"])
+def test_the_file_that_is_read_is_never_replaced(run, study_file, command):
+    before = study_file.read_bytes()
+    target = ("-o", study_file) if command == "fit" else (study_file,)
+    status, _, complaints = run(command, study_file, *target)
+    assert status == WRONG_USAGE
+    assert "would replace the file that is read" in complaints[-1]
+    assert study_file.read_bytes() == before
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [(), ("nonsense",), ("fit", "study.h5"), ("simulate", "nonsense", "-o", "x.h5"),
+     ("fit", "a.h5", "-o", "b.h5", "--method", "guessing")],
+)  # fmt: skip
+def test_wrong_usage_ends_with_2(run, arguments):
+    status, printed, complaints = run(*arguments)
+    assert (status, printed) == (WRONG_USAGE, [])
+    assert complaints
+
+
+def test_the_program_starts_in_float64_and_knows_its_version(tmp_path):
+    """In a process of its own: this one has float64 switched on already."""
+    command = [sys.executable, "-m", "etid.cli"]
+    version = subprocess.run([*command, "--version"], capture_output=True, text=True, check=True)
+    assert version.stdout == f"etid {etid.__version__}\n"
+    study, fits = tmp_path / "study.h5", tmp_path / "fits.h5"
+    etid.scenes.paper_built().simulate(seed=0).write(study)
+    arguments = [*command, "fit", study, "-o", fits, "--order", "1"]
+    ended = subprocess.run(arguments, capture_output=True, text=True, check=False)
+    assert ended.returncode == WRONG_DATA
+    assert "float64" not in ended.stdout + ended.stderr
+    assert ended.stderr == ""  # no progress bar where there is no terminal

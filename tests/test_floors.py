@@ -1,0 +1,100 @@
+"""The house: imports go down, importing does nothing else."""
+
+import ast
+import pathlib
+import subprocess
+import sys
+
+import pytest
+
+import etid
+
+PACKAGE = pathlib.Path(etid.__file__).parent
+FLOORS = {
+    "filtering": 0,
+    "noise": 0,
+    "precision": 0,
+    "tables": 0,
+    "transfer": 0,
+    "verdicts": 0,
+    "schema": 0,
+    "circuits": 1,
+    "recording": 1,
+    "driver": 2,
+    "results": 2,
+    "hdf5": 2,
+    "preflight": 2,
+    "levenberg_marquardt": 2,
+    "importing": 3,
+    "transformer": 2,
+    "scenes": 3,
+    "steiglitz_mcbride": 3,
+    "output_error": 3,
+    "estimation": 4,
+    "identify": 5,
+    "batch": 6,
+    "plotting": 6,
+    "report": 7,
+    "demo": 8,
+    "cli": 9,
+    "__main__": 10,
+    "__init__": 10,
+}
+# `Study.write` is the one door upwards: a study is written by the module that also builds studies.
+DOORS = {("recording", "hdf5")}
+
+
+def imports_of(path):
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.ImportFrom) and node.module == "etid":
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom) and (node.module or "").startswith("etid."):
+            yield node.module.removeprefix("etid.")
+        elif isinstance(node, ast.Import):
+            yield from (
+                alias.name.removeprefix("etid.")
+                for alias in node.names
+                if alias.name.startswith("etid.")
+            )
+
+
+@pytest.mark.parametrize("path", sorted(PACKAGE.glob("*.py")), ids=lambda path: path.stem)
+def test_imports_go_down(path):
+    assert path.stem in FLOORS, f"give {path.name} a floor"
+    for name in imports_of(path):
+        if name == "__version__":
+            continue
+        assert name in FLOORS, f"{path.name} imports {name}, which is no module of etid"
+        if (path.stem, name) not in DOORS:
+            assert FLOORS[name] < FLOORS[path.stem], f"{path.name} imports {name} from above"
+
+
+def run(code, **environment):
+    return subprocess.run(
+        [sys.executable, "-W", "error", "-c", code], capture_output=True, text=True, check=False
+    )
+
+
+def test_importing_prints_nothing_and_changes_no_setting():
+    code = """
+import jax
+before = dict(jax.config.values)
+import sys, etid
+assert dict(jax.config.values) == before
+assert not {"matplotlib", "pandas", "jaxopt"} & set(sys.modules), "imported too much"
+"""
+    done = run(code)
+    assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
+
+
+def test_float32_is_refused_with_the_line_to_add():
+    code = """
+import numpy as np, etid
+v = np.ones(1000)
+cal = etid.Recording(v, v, sample_rate=2e5, pulse_rate=60.0, r_load=1e5)
+etid.identify_driver(cal)
+"""
+    done = run(code)
+    assert done.returncode == 1
+    assert 'jax.config.update("jax_enable_x64", True)' in done.stderr
+    assert done.stderr.strip().splitlines()[-1].startswith("or set the environment variable")

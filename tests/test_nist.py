@@ -1,0 +1,173 @@
+"""The 27 certified nonlinear regressions of NIST's StRD, both starts, with their standard errors."""
+
+import dataclasses
+import re
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+import optimistix as optx
+
+from etid.levenberg_marquardt import LevenbergMarquardt
+
+
+def misra1a(b, x):
+    return b[0] * (1 - jnp.exp(-b[1] * x))
+
+
+def misra1b(b, x):
+    return b[0] * (1 - (1 + b[1] * x / 2) ** -2)
+
+
+def misra1c(b, x):
+    return b[0] * (1 - (1 + 2 * b[1] * x) ** -0.5)
+
+
+def misra1d(b, x):
+    return b[0] * b[1] * x / (1 + b[1] * x)
+
+
+def chwirut(b, x):
+    return jnp.exp(-b[0] * x) / (b[1] + b[2] * x)
+
+
+def danwood(b, x):
+    return b[0] * x ** b[1]
+
+
+def lanczos(b, x):
+    return b[0] * jnp.exp(-b[1] * x) + b[2] * jnp.exp(-b[3] * x) + b[4] * jnp.exp(-b[5] * x)
+
+
+def gauss(b, x):
+    first = b[2] * jnp.exp(-(((x - b[3]) / b[4]) ** 2))
+    second = b[5] * jnp.exp(-(((x - b[6]) / b[7]) ** 2))
+    return b[0] * jnp.exp(-b[1] * x) + first + second
+
+
+def enso(b, x):
+    def cycle(period, cosine, sine):
+        return cosine * jnp.cos(2 * jnp.pi * x / period) + sine * jnp.sin(2 * jnp.pi * x / period)
+
+    return b[0] + cycle(12.0, b[1], b[2]) + cycle(b[3], b[4], b[5]) + cycle(b[6], b[7], b[8])
+
+
+def kirby2(b, x):
+    return (b[0] + b[1] * x + b[2] * x**2) / (1 + b[3] * x + b[4] * x**2)
+
+
+def cubic_ratio(b, x):
+    numerator = b[0] + b[1] * x + b[2] * x**2 + b[3] * x**3
+    return numerator / (1 + b[4] * x + b[5] * x**2 + b[6] * x**3)
+
+
+def mgh09(b, x):
+    return b[0] * (x**2 + x * b[1]) / (x**2 + x * b[2] + b[3])
+
+
+def mgh10(b, x):
+    return b[0] * jnp.exp(b[1] / (x + b[2]))
+
+
+def mgh17(b, x):
+    return b[0] + b[1] * jnp.exp(-x * b[3]) + b[2] * jnp.exp(-x * b[4])
+
+
+def nelson(b, x):  # of log[y]
+    return b[0] - b[1] * x[0] * jnp.exp(-b[2] * x[1])
+
+
+def rat42(b, x):
+    return b[0] / (1 + jnp.exp(b[1] - b[2] * x))
+
+
+def rat43(b, x):
+    return b[0] / (1 + jnp.exp(b[1] - b[2] * x)) ** (1 / b[3])
+
+
+def roszman1(b, x):
+    return b[0] - b[1] * x - jnp.arctan(b[2] / (x - b[3])) / jnp.pi
+
+
+def eckerle4(b, x):
+    return b[0] / b[1] * jnp.exp(-0.5 * ((x - b[2]) / b[1]) ** 2)
+
+
+def bennett5(b, x):
+    return b[0] * (b[1] + x) ** (-1 / b[2])
+
+
+MODELS = {
+    "Bennett5": bennett5,
+    "BoxBOD": misra1a,
+    "Chwirut1": chwirut,
+    "Chwirut2": chwirut,
+    "DanWood": danwood,
+    "ENSO": enso,
+    "Eckerle4": eckerle4,
+    "Gauss1": gauss,
+    "Gauss2": gauss,
+    "Gauss3": gauss,
+    "Hahn1": cubic_ratio,
+    "Kirby2": kirby2,
+    "Lanczos1": lanczos,
+    "Lanczos2": lanczos,
+    "Lanczos3": lanczos,
+    "MGH09": mgh09,
+    "MGH10": mgh10,
+    "MGH17": mgh17,
+    "Misra1a": misra1a,
+    "Misra1b": misra1b,
+    "Misra1c": misra1c,
+    "Misra1d": misra1d,
+    "Nelson": nelson,
+    "Rat42": rat42,
+    "Rat43": rat43,
+    "Roszman1": roszman1,
+    "Thurber": cubic_ratio,
+}
+
+
+@dataclasses.dataclass
+class Problem:
+    starts: np.ndarray
+    certified: np.ndarray
+    stderr: np.ndarray
+    rss: float
+    x: np.ndarray
+    y: np.ndarray
+
+
+def read(path):
+    """A certified problem; the rows of its tables are found by their form, as NIST prints them."""
+    text = path.read_text()
+    rows = re.findall(r"^\s*b\d\s*=\s*(\S+)\s+(\S+)\s+(\S+)\s+(\S+)\s*$", text, re.MULTILINE)
+    table = np.array(rows, dtype=float)
+    rss = float(re.search(r"Residual Sum of Squares:\s*(\S+)", text).group(1))
+    first, last = re.search(r"Data\s+\(lines\s+(\d+)\s+to\s+(\d+)\)", text).groups()
+    lines = text.splitlines()[int(first) - 1 : int(last)]
+    data = np.array([line.split() for line in lines], dtype=float).T
+    count = int(re.search(r"Number of Observations:\s*(\d+)", text).group(1))
+    assert data.shape[1] == count
+    y, x = data[0], data[1:]
+    if path.stem == "Nelson":
+        y = np.log(y)
+    return Problem(table[:, :2].T, table[:, 2], table[:, 3], rss, x if len(x) > 1 else x[0], y)
+
+
+# The certified values have 11 digits, so the solver goes on until rounding stops it.
+SOLVER = LevenbergMarquardt(rtol=1e-7, atol=1e-12, ftol=0.0)
+
+
+@eqx.filter_jit
+def fit(model, x, y, start):
+    solution = optx.least_squares(
+        lambda b, _: model(b, x) - y, SOLVER, start, max_steps=2000, throw=False
+    )
+    return solution.value, solution.stats, solution.result
+
+
+def matching_digits(found, certified):
+    """The smallest log relative error, as NIST counts digits; 11 is all that is certified."""
+    relative = np.abs(np.asarray(found) - certified) / np.abs(certified)
+    return float(np.nan_to_num(-np.log10(np.maximum(relative, 1e-11)), nan=-99.0).min())

@@ -1,0 +1,170 @@
+"""Every verdict is produced here, and none is silent."""
+
+import numpy as np
+import pytest
+
+import etid
+from etid.scenes import Scene, Trial
+from etid.transformer import ResistorLoad, SkinLoad
+from etid.verdicts import RESULTS, message, verdict, verdict_names, verdicts_of
+
+LENGTH = 3334
+DRY = SkinLoad(r_s=33.4e3, r_p=186e3, c_p=0.12e-9)
+
+
+def simulate(load=DRY, seed=0, **options):
+    scene = Scene(
+        trials=(Trial("loaded/0", load),),
+        calibration=(Trial("calibration/98k8", ResistorLoad(98.8e3)),),
+        **({"samples": LENGTH} | options),
+    )
+    return scene.simulate(seed=seed)
+
+
+@pytest.fixture(scope="module")
+def study():
+    return simulate(seed=21)
+
+
+@pytest.fixture(scope="module")
+def driver(study):
+    return etid.identify_driver(study["calibration/98k8"])
+
+
+def verdict_of(recording, driver, **options):
+    fit = etid.identify_skin(recording, driver, throw=False, **options)
+    if fit.verdict != "successful":
+        with pytest.raises(etid.IdentificationError, match=fit.verdict) as raised:
+            etid.identify_skin(recording, driver, **options)
+        assert raised.value.outcome.verdict == fit.verdict
+    return fit.verdict
+
+
+def test_successful(study, driver):
+    assert verdict_of(study["loaded/0"], driver) == "successful"
+    assert message("successful") == ""
+
+
+def test_flat(study, driver):
+    recording = study["loaded/0"]
+    flat = recording.replace(v_out=np.zeros(LENGTH))
+    assert verdict_of(flat, driver) == "flat"
+    noise = np.random.default_rng(0).normal(size=LENGTH)
+    assert verdict_of(recording.replace(v_out=noise), driver) == "flat"
+
+
+def test_saturated(study, driver):
+    clipped = simulate(full_scale=2.6)["loaded/0"]
+    assert verdict_of(clipped, driver) == "saturated"
+    # The same without knowledge of the converter's range: the flat top itself tells.
+    unknown = study["loaded/0"].replace(
+        v_out=np.minimum(study["loaded/0"].v_out, 40.0), adc_range=None
+    )
+    assert verdict_of(unknown, driver) == "saturated"
+
+
+def test_nonfinite_samples(study, driver):
+    for bad in (np.nan, np.inf):
+        v = study["loaded/0"].v_th.copy()
+        v[7] = bad
+        assert verdict_of(study["loaded/0"].replace(v_th=v), driver) == "nonfinite_samples"
+
+
+def test_too_short(study, driver):
+    recording = study["loaded/0"]
+    short = recording.replace(v_th=recording.v_th[:150], v_out=recording.v_out[:150])
+    assert verdict_of(short, driver) == "too_short"
+
+
+def test_misaligned(study, driver):
+    recording = study["loaded/0"]
+    swapped = recording.replace(v_th=recording.v_out, v_out=recording.v_th)
+    assert verdict_of(swapped, driver) == "misaligned"
+    shifted = recording.replace(v_out=np.roll(recording.v_out, 60))
+    assert verdict_of(shifted, driver) == "misaligned"
+
+
+def test_insensitive(driver):
+    """A resistor has no R_p and no C_p to find."""
+    resistor = simulate(ResistorLoad(21.62e3))["loaded/0"]
+    assert verdict_of(resistor, driver) in ("insensitive", "max_steps_reached")
+    names = set()
+    for seed in range(4):
+        recording = simulate(ResistorLoad(55.2e3), seed=seed)["loaded/0"]
+        names.add(verdict_of(recording, driver))
+    assert "insensitive" in names
+    assert "successful" not in names
+
+
+def test_misfit(driver):
+    """A trigger that moved between the two records, which the model does not contain."""
+    late = simulate(trigger_jitter_rms=1e-6, seed=5)["loaded/0"]
+    assert verdict_of(late, driver) == "misfit"
+
+
+def test_nonphysical_and_driver_failed():
+    """A calibration whose resistor is written down ten times too small fits no passive driver."""
+    study = simulate(trigger_jitter_rms=2e-6, seed=3)
+    driver = etid.identify_driver(study["calibration/98k8"], throw=False)
+    assert driver.verdict in ("nonphysical", "misfit")
+    with pytest.raises(etid.IdentificationError, match=f"driver: {driver.verdict}"):
+        etid.identify_driver(study["calibration/98k8"])
+    good = simulate(seed=1)["loaded/0"]
+    assert verdict_of(good, driver) != "successful"
+
+
+def test_driver_failed_when_the_calibration_is_refused(study):
+    broken = etid.Study.from_recordings(
+        [
+            study["calibration/98k8"].replace(v_out=np.zeros(LENGTH)),
+            study["loaded/0"],
+        ]
+    )
+    result = etid.identify_study(broken)
+    assert result.fits.counts() == {"driver_failed": 1}
+    assert "flat" in result.fits.notes[0]
+    assert not result.drivers
+    assert list(result.failures) == [("calibration/98k8",)]
+
+
+def test_unreadable_without_a_calibration(study):
+    other = study["calibration/98k8"].replace(path="calibration/other")
+    lost = study["loaded/0"].replace(calibration=())
+    result = etid.identify_study(
+        etid.Study.from_recordings([study["calibration/98k8"], other, lost])
+    )
+    assert result.fits.counts() == {"unreadable": 1}
+    assert "names no calibration" in result.fits.notes[0]
+
+
+@pytest.fixture(scope="module")
+def baselines():
+    """The paper's method from quiet to noisy: its verdicts, driver and skin."""
+    found = set()
+    for snr_db in (30.0, 45.0, 60.0):
+        study = simulate(snr_db=snr_db, seed=2)
+        driver = etid.identify_driver(
+            study["calibration/98k8"], method="steiglitz_mcbride", throw=False
+        )
+        found.add(driver.verdict)
+        for method in ("steiglitz_mcbride", "equation_error"):
+            fit = etid.identify_skin(study["loaded/0"], driver, method=method, throw=False)
+            found.add(fit.verdict)
+    return found
+
+
+def test_the_papers_method_says_how_it_fails(baselines):
+    assert {"max_steps_reached", "unstable", "biased"} & baselines
+    assert "successful" not in baselines
+    assert baselines <= {"max_steps_reached", "unstable", "biased", "misfit", "nonphysical"}
+
+
+def test_names_and_values_are_inverse():
+    names = np.array([["flat", "successful"], ["misfit", "biased"]])
+    np.testing.assert_array_equal(verdict_names(verdicts_of(names)), names)
+    assert verdict_names(verdict("unstable")).item() == "unstable"
+
+
+@pytest.mark.parametrize("name", sorted(RESULTS._name_to_item))
+def test_every_failure_says_what_it_is(name):
+    assert (name == "successful") == (message(name) == "")
