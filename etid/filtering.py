@@ -34,6 +34,7 @@ from jaxtyping import Array, Float
 BLOCK = 32  # samples; the Toeplitz product grows with it, the scan shrinks
 TAPS = 24  # samples of the interpolation kernel on each side of an interval
 CUTOFF = 0.35  # of the sample rate, of the interpolation
+SHIFT_DEGREE = 10  # of the polynomials of `shiftable`, over twice the width
 DEGREE = 7  # of the interpolating polynomial inside one interval
 
 
@@ -134,13 +135,14 @@ def lfilter(
 
 
 @functools.cache
-def _interpolation_kernel(cutoff: float) -> np.ndarray:
-    """Polynomials in τ, (2·TAPS, DEGREE+1), that weigh the neighbours n−TAPS+1 … n+TAPS."""
-    nodes = 0.5 - 0.5 * np.cos(np.pi * (np.arange(4 * DEGREE) + 0.5) / (4 * DEGREE))
+def _interpolation_kernel(cutoff: float, earliest: float, degree: int) -> np.ndarray:
+    """Polynomials in τ on [earliest, 1] that weigh the neighbours n−TAPS+1 … n+TAPS."""
+    chebyshev = -np.cos(np.pi * (np.arange(4 * degree) + 0.5) / (4 * degree))
+    nodes = earliest + (1 - earliest) * (chebyshev + 1) / 2
     distance = nodes[:, None] - np.arange(-TAPS + 1, TAPS + 1)[None, :]
     window = np.i0(10.0 * np.sqrt(np.maximum(0.0, 1 - (distance / TAPS) ** 2))) / np.i0(10.0)
     values = 2 * cutoff * np.sinc(2 * cutoff * distance) * window
-    return np.polynomial.polynomial.polyfit(nodes, values, DEGREE).T
+    return np.polynomial.polynomial.polyfit(nodes, values, degree).T
 
 
 def band_limited(
@@ -157,7 +159,21 @@ def band_limited(
         cutoff: Of the interpolation, in units of the sample rate. Fits use the default, which
             keeps out what an imperfect anti-alias filter has folded below half the rate.
     """
-    kernel = jnp.asarray(_interpolation_kernel(cutoff), v.dtype)
+    return _interpolate(v, _interpolation_kernel(cutoff, 0.0, DEGREE))
+
+
+def shiftable(v: Float[Array, " time"], cutoff: float = CUTOFF) -> Float[Array, "interval degree"]:
+    """The samples as functions of a delay: v((n + τ) / fs) = Σ_k c_k[n] τ^k for −1 ≤ τ ≤ 1.
+
+    Args:
+        v: Samples.
+        cutoff: As in `band_limited`, whose rows these are too.
+    """
+    return _interpolate(v, _interpolation_kernel(cutoff, -1.0, SHIFT_DEGREE))
+
+
+def _interpolate(v: Float[Array, " time"], weights: np.ndarray) -> Float[Array, "interval degree"]:
+    kernel = jnp.asarray(weights, v.dtype)
     rows = v.shape[0] - 2 * TAPS + 1
     neighbours = jnp.stack([jax.lax.slice_in_dim(v, j, j + rows) for j in range(2 * TAPS)])
     return jnp.einsum("jt,jk->tk", neighbours, kernel)

@@ -96,9 +96,8 @@ class LevenbergMarquardt(optx.AbstractLeastSquaresSolver):
     ftol: float = 1e-8
     norm: Callable[[PyTree], Array] = optx.two_norm
     descent: optx.DampedNewtonDescent = optx.DampedNewtonDescent(linear_solver=lx.Cholesky())
-    # MINPACK's threshold, and constants whose powers differ: with 10 and 1/10 the damping returns to
-    # the value that was just rejected, over and over, and a curved valley costs three times the
-    # steps.
+    # MINPACK's threshold, and constants whose powers differ: with 10 and 1/10 the damping returns
+    # over and over to the value just rejected, and a curved valley costs three times the steps.
     search: optx.ClassicalTrustRegion = optx.ClassicalTrustRegion(
         high_cutoff=0.75, high_constant=5.0, low_constant=0.25
     )

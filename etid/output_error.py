@@ -3,7 +3,8 @@
 V_out is predicted from the recorded V_th through the loaded driver, a continuous-time system run
 exactly for band-limited samples (`etid.filtering`), so that discretisation costs no accuracy at the
 recorder's own rate. The parameters are the logarithms of the circuit elements or the modal
-parameters of Z_th; the state at the start of the record and an offset of V_out are nuisances.
+parameters of Z_th; the state at the start of the record, an offset of V_out and its trigger delay
+are nuisances.
 
 **Noise on both records.** The residual r = V_out_predicted − V_out contains the noise of V_out and
 the noise of V_th filtered by the loaded driver G. For white noise its variance is
@@ -39,7 +40,7 @@ from jaxtyping import Array, Float, Int
 
 from etid.circuits import AbstractCircuit, resistor
 from etid.driver import SourceImpedance, loaded
-from etid.filtering import CUTOFF, TAPS, StateSpace, band_limited, hold, simulate
+from etid.filtering import CUTOFF, TAPS, StateSpace, band_limited, hold, shiftable, simulate
 from etid.levenberg_marquardt import LevenbergMarquardt
 from etid.results import rrse
 from etid.transfer import Rational
@@ -47,6 +48,7 @@ from etid.transfer import Rational
 MAX_STEPS = 500
 IMPULSE = 256  # samples of the impulse response whose squares are summed
 PASSIVE_BAND = np.geomspace(1e-4, 10.0, 128)  # of the sample rate
+DELAY_WIDTH = 0.5  # [samples] of the weak prior of a delay; one sample is as far as it may go
 SOLVER = LevenbergMarquardt(rtol=1e-5, ftol=1e-6)  # 1e-3 standard errors at 10 000 samples
 EIGENVALUE_FLOOR = (
     1e-12  # of the scaled curvature; directions below carry no information in double precision
@@ -58,14 +60,14 @@ class Records(eqx.Module):
 
     Attributes:
         hold: Polynomial coefficients of the band-limited V_th.
-        v_out: Measured voltage [V] at the start of each interval, filtered like V_th.
+        v_out: Measured voltage [V] as polynomials of a delay, filtered like V_th.
         sigma_th: Noise of V_th [V].
         sigma_out: Noise of V_out [V].
         sample_rate: Sampling rate [Hz].
     """
 
     hold: Float[Array, "interval degree"]
-    v_out: Float[Array, " interval"]
+    v_out: Float[Array, "interval shift"]
     sigma_th: Float[Array, ""]
     sigma_out: Float[Array, ""]
     sample_rate: Float[Array, ""]
@@ -80,8 +82,8 @@ def prepare(
     cutoff: float = CUTOFF,
 ) -> Records:
     """Interpolate V_th once; the edges, where its neighbours are missing, are left out."""
-    held, measured = band_limited(v_th, cutoff), band_limited(v_out, cutoff)[:, 0]
-    return Records(held, measured, sigma_th, sigma_out, sample_rate)
+    held, delayed = band_limited(v_th, cutoff), shiftable(v_out, cutoff)
+    return Records(held, delayed, sigma_th, sigma_out, sample_rate)
 
 
 def loaded_filter(
@@ -94,8 +96,17 @@ def loaded_filter(
 def predict(
     system: StateSpace, records: Records, nuisance: Float[Array, " nuisance"]
 ) -> Float[Array, " interval"]:
-    """Terminal voltage [V]; `nuisance` is the initial state followed by the offset [V]."""
-    return simulate(system, records.hold, nuisance[:-1])[0] + nuisance[-1]
+    """Terminal voltage [V]; `nuisance` is the initial state, the offset [V] and the delay."""
+    return simulate(system, records.hold, nuisance[:-2])[0] + nuisance[-2]
+
+
+def measured(records: Records, nuisance: Float[Array, " nuisance"]) -> Float[Array, " interval"]:
+    """Measured voltage [V] at the instants of V_th; it was sampled `nuisance[-1]` samples late.
+
+    50 ns between the triggers of two records are 0.01 samples, and spread R_s by 8 %.
+    """
+    powers = records.v_out.shape[1]
+    return records.v_out @ (-nuisance[-1]) ** jnp.arange(powers)
 
 
 def impulse_response(system: StateSpace) -> Float[Array, " lag"]:
@@ -120,7 +131,7 @@ def scaled_residual(
     """(Predicted − measured) / √s."""
     system = loaded_filter(source, load, records.sample_rate)
     s = residual_variance(records, impulse_response(system))
-    return (predict(system, records, nuisance) - records.v_out) / jnp.sqrt(s)
+    return (predict(system, records, nuisance) - measured(records, nuisance)) / jnp.sqrt(s)
 
 
 class Estimate(eqx.Module):
@@ -128,7 +139,7 @@ class Estimate(eqx.Module):
 
     Attributes:
         parameters: Estimated parameters.
-        nuisance: Initial state and offset of each record.
+        nuisance: Initial state, offset [V] and delay [samples] of each record.
         cov: Covariance of `parameters`.
         chi2: Σ r²/s per degree of freedom.
         rrse: Root relative squared error of V_out, the largest over the records.
@@ -193,7 +204,8 @@ def _curvature(records: Records, model: Any, q: Float[Array, " n"]) -> _Curvatur
     real, imaginary = spectrum.real, spectrum.imag
     score = real.T @ (weight[:, None] * real) + imaginary.T @ (weight[:, None] * imaginary)
     information = jacobian.T @ jacobian
-    return _Curvature(information - samples * noise, score / s)
+    expected = (information - samples * noise).at[-1, -1].add(1 / DELAY_WIDTH**2)
+    return _Curvature(expected, score / s)
 
 
 def _eliminate(curvature: _Curvature, kept: int) -> _Curvature:
@@ -268,7 +280,7 @@ def fit_source(
         Z_th and the estimate, whose parameters are `start` flattened.
     """
     start_vector, unflatten = ravel_pytree(start)
-    kept, count, states = start_vector.shape[0], r_load.shape[0], start.order + 1
+    kept, count, states = start_vector.shape[0], r_load.shape[0], start.order + 2
 
     def one(record, r, parameters, nuisance):
         return scaled_residual(record, unflatten(parameters), resistor(r), nuisance)
@@ -278,7 +290,8 @@ def fit_source(
     def residual(q, _):
         nuisance = q[kept:].reshape(count, states)
         parts = jax.vmap(one, in_axes=(0, 0, None, 0))(records, r_load, q[:kept], nuisance)
-        return jnp.concatenate([parts.reshape(-1), regularise(q[:kept])])
+        late = nuisance[:, -1] / DELAY_WIDTH
+        return jnp.concatenate([parts.reshape(-1), regularise(q[:kept]), late])
 
     q0 = jnp.concatenate([start_vector, jnp.zeros(count * states)])
     solution = optx.least_squares(residual, SOLVER, q0, max_steps=MAX_STEPS, throw=False)
@@ -293,12 +306,16 @@ def fit_source(
 
     def error(record, r, nuisance):
         system = loaded_filter(unflatten(q[:kept]), resistor(r), record.sample_rate)
-        return rrse(predict(system, record, nuisance), record.v_out)
+        return rrse(predict(system, record, nuisance), measured(record, nuisance))
 
     parts = jax.vmap(curvature)(records, r_load, nuisance)
     weak = jax.jacfwd(regularise)(q[:kept])
     inverse = _inverse(parts.expected.sum(0) + weak.T @ weak)
-    chi2 = 2 * solution.stats["normal_equations"].objective / (records.v_out.size - q.shape[0])
+    chi2 = (
+        2
+        * solution.stats["normal_equations"].objective
+        / (math.prod(records.hold.shape[:-1]) - q.shape[0])
+    )
     cov = inverse @ parts.score.sum(0) @ inverse * jnp.maximum(chi2, 1.0)
     estimate = Estimate(
         q[:kept],
@@ -339,9 +356,10 @@ def fit_circuit(
 
     def residual(q, _):
         load = circuit.with_log_values(q[:kept]).impedance()
-        return scaled_residual(records, source, load, q[kept:])
+        scaled = scaled_residual(records, source, load, q[kept:])
+        return jnp.append(scaled, q[-1] / DELAY_WIDTH)
 
-    q0 = jnp.concatenate([candidates, jnp.zeros((candidates.shape[0], states + 1))], axis=-1)
+    q0 = jnp.concatenate([candidates, jnp.zeros((candidates.shape[0], states + 2))], axis=-1)
     objectives = jax.lax.map(lambda q: jnp.sum(residual(q, None) ** 2), q0)
     best = jnp.argmin(jnp.where(jnp.isfinite(objectives), objectives, jnp.inf))
     solution = optx.least_squares(residual, SOLVER, q0[best], max_steps=MAX_STEPS, throw=False)
@@ -359,7 +377,11 @@ def fit_circuit(
     curvature = _curvature(records, model, jnp.concatenate([q[:kept], source_vector, q[kept:]]))
     curvature = _eliminate(curvature, both)
     inverse = _inverse(curvature.expected[:kept, :kept])
-    chi2 = 2 * solution.stats["normal_equations"].objective / (records.v_out.size - q.shape[0])
+    chi2 = (
+        2
+        * solution.stats["normal_equations"].objective
+        / (math.prod(records.hold.shape[:-1]) - q.shape[0])
+    )
     inflation = jnp.maximum(chi2, 1.0)
     inherited = -inverse @ curvature.expected[:kept, kept:]
     shared = inherited @ source_cov @ inherited.T
@@ -371,7 +393,7 @@ def fit_circuit(
         q[None, kept:],
         cov,
         chi2,
-        rrse(predict(system, records, q[kept:]), records.v_out),
+        rrse(predict(system, records, q[kept:]), measured(records, q[kept:])),
         solution.result,
         solution.stats["num_steps"],
         shared,
@@ -382,9 +404,14 @@ def fit_circuit(
 def fitted_voltage(
     records: Records, source: SourceImpedance, load: Rational
 ) -> Float[Array, " interval"]:
-    """Terminal voltage [V] with `load`, its initial state and offset fitted to the measured one."""
+    """Terminal voltage [V] with `load`; initial state, offset and delay fitted to the record."""
     system = loaded_filter(source, load, records.sample_rate)
-    zero = jnp.zeros(system.C.shape[0] + 1)
-    basis = jax.jacfwd(lambda nuisance: predict(system, records, nuisance))(zero)  # linear
-    forced = predict(system, records, zero)
-    return forced + basis @ jnp.linalg.lstsq(basis, records.v_out - forced)[0]
+    nuisance = jnp.zeros(system.C.shape[0] + 2)
+
+    def residual(nuisance):
+        return predict(system, records, nuisance) - measured(records, nuisance)
+
+    for _ in range(3):  # linear but for the delay, which is a small fraction of a sample
+        basis = jax.jacfwd(residual)(nuisance)
+        nuisance = nuisance - jnp.linalg.lstsq(basis, residual(nuisance))[0]
+    return residual(nuisance) + records.v_out[:, 0]

@@ -3,12 +3,13 @@
 import html.parser
 import re
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import etid
 from etid import demo, report
-from etid.verdicts import verdicts_of
+from etid.verdicts import verdict, verdicts_of
 
 EXCESS = 1.1  # of every identified element over the true one
 
@@ -85,8 +86,8 @@ def outcome():
     skins = [path for path in truth if "r_s" in truth[path]]
     resistors = [path for path in truth if path.startswith("resistors/")]
     driver = etid.Driver(
-        b=np.ones(2), a=np.ones(2), sample_rate=2e5, source=None, cov=None, rrse=np.array(0.1),
-        chi2=np.array(1.0), result=etid.RESULTS.successful, steps=np.array(1), method="by hand",
+        b=jnp.ones(2), a=jnp.ones(2), sample_rate=2e5, source=None, cov=None, rrse=jnp.array(0.1),
+        chi2=jnp.array(1.0), result=verdict("successful"), steps=jnp.array(1), method="by hand",
     )  # fmt: skip
     return demo.Outcome(
         "quiet",
