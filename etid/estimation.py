@@ -92,6 +92,11 @@ def _misses(chi2: Float[Array, ""], error: Float[Array, ""]) -> Bool[Array, ""]:
     return (chi2 > MISFIT_CHI2) & (excess > MISFIT_RRSE)
 
 
+def _too_late(estimate: output_error.Estimate) -> Bool[Array, ""]:
+    """Whether a trigger delay lies outside the one sample for which it is modelled."""
+    return jnp.any(jnp.abs(estimate.nuisance[:, -1]) > 1)
+
+
 # --- Steiglitz-McBride ---------------------------------------------------------------------------
 
 
@@ -221,7 +226,7 @@ def skin_by_output_error(m: Measurement, driver: Driver, circuit: AbstractCircui
             (~jnp.isfinite(values).all(), RESULTS.nonphysical),
             (diverged, RESULTS.stalled),
             (~settled, MAX_STEPS_REACHED),
-            (_misses(estimate.chi2, estimate.rrse), RESULTS.misfit),
+            (_misses(estimate.chi2, estimate.rrse) | _too_late(estimate), RESULTS.misfit),
             (~jnp.all(errors < 1), RESULTS.insensitive),
             (driver.result != SUCCESSFUL, RESULTS.driver_failed),
         ),
@@ -323,7 +328,7 @@ def driver_by_output_error(m: Measurement, r_load: Float[Array, " record"], orde
             (~passive[chosen], RESULTS.nonphysical),
             (diverged, RESULTS.stalled),
             (~settled[chosen], MAX_STEPS_REACHED),
-            (_misses(estimate.chi2, estimate.rrse), RESULTS.misfit),
+            (_misses(estimate.chi2, estimate.rrse) | _too_late(estimate), RESULTS.misfit),
         ),
         steps=estimate.steps,
         method="output_error",

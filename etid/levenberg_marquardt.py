@@ -14,7 +14,8 @@ Three things make the method scale-free:
   between the residual and the tangent plane, has neither the unit of the residual nor of a
   parameter. Times √(samples) it is the distance to the minimum in standard errors. A step too small
   to move the parameters is *not* convergence: a solver that cannot move must not report success.
-- **A trial step whose residual is not finite is rejected**, as if its objective were infinite.
+- **A trial step whose residual or slope is not finite is rejected**, as if its objective were
+  infinite.
 """
 
 from collections.abc import Callable
@@ -52,11 +53,11 @@ def normal_equations(
         return r, r
 
     jacobian, r = jax.jacfwd(twice, has_aux=True)(y)
-    objective = 0.5 * jnp.dot(r, r)
+    objective, gradient = 0.5 * jnp.dot(r, r), jacobian.T @ r
+    # A slope that is not finite is as bad as such a value: nothing could follow from this point.
+    finite = jnp.isfinite(objective) & jnp.isfinite(gradient).all()
     return NormalEquations(
-        jnp.where(jnp.isfinite(objective), objective, jnp.inf),
-        jacobian.T @ r,
-        jacobian.T @ jacobian,
+        jnp.where(finite, objective, jnp.inf), gradient, jacobian.T @ jacobian
     )
 
 

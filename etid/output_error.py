@@ -105,8 +105,11 @@ def measured(records: Records, nuisance: Float[Array, " nuisance"]) -> Float[Arr
 
     50 ns between the triggers of two records are 0.01 samples, and spread R_s by 8 %.
     """
-    powers = records.v_out.shape[1]
-    return records.v_out @ (-nuisance[-1]) ** jnp.arange(powers)
+    late = -nuisance[-1]
+    value = records.v_out[:, -1]
+    for k in range(records.v_out.shape[1] - 2, -1, -1):  # Horner
+        value = value * late + records.v_out[:, k]
+    return value
 
 
 def impulse_response(system: StateSpace) -> Float[Array, " lag"]:

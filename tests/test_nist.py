@@ -7,6 +7,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
+import pytest
 
 from etid.levenberg_marquardt import LevenbergMarquardt
 

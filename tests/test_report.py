@@ -105,9 +105,11 @@ def test_demo_tables_show_the_error_that_was_made(outcome):
         rows = demo.table_fingertips([outcome], truth, condition).rows
         ours = [row for row in rows if row[0] == "quiet"]
         assert len(ours) == len(rows) - len(ours) == 3
+        good = outcome.skins.verdicts[outcome.skins.labels["condition"] == condition]
+        counted = f"{(good == 'successful').sum()}/60"  # ten trials and ten subjects of five
         for row in ours:
             assert (row[4], row[5], row[7], row[8], row[9]) == (
-                "10.00", "0.00", "10.00", "10.00", "30/60",
+                "10.00", "0.00", "10.00", "10.00", counted,
             )  # fmt: skip
     built = demo.table_4([outcome], truth).rows[1]
     assert built[2:] == ("10.00 / 0.00",) * 3 + ("5.00", "12/23")

@@ -1,0 +1,146 @@
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.signal
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from jax.flatten_util import ravel_pytree
+
+from etid import Resistor, SkinRC, capacitor, parallel, resistor, series
+from etid.driver import SourceImpedance, loaded, realise
+from etid.transfer import Rational, frequency_variable
+
+FREQUENCY = jnp.geomspace(10.0, 1e6, 25)
+S = np.asarray(frequency_variable(FREQUENCY))
+RATE = 2e5  # [1/s]
+
+# State matrices are of order 1e6 and solved at 60 rad/s: their condition, 1e5, times ε.
+SOLVED = 1e-9
+
+SOURCE = SourceImpedance(
+    log_resistance=jnp.log(600.0),
+    log_omega=jnp.log(jnp.array([3.0e5, 1.5e6])),
+    log_zeta=jnp.log(jnp.array([0.25, 1.2])),
+    gain=jnp.array([9e3, 2e3]),
+    slope=jnp.array([1.2e4, 500.0]),
+    log_omega_real=jnp.log(jnp.array([300.0])),
+    gain_real=jnp.array([-5e3]),
+)
+LAYERS = series(
+    resistor(20e3),
+    parallel(resistor(80e3), capacitor(0.2e-9)),
+    parallel(resistor(40e3), capacitor(2e-9)),
+)
+LOADS = {
+    "skin": SkinRC(33.4e3, 186e3, 0.12e-9).impedance(),
+    "resistor": Resistor(98.8e3).impedance(),
+    "two layers": LAYERS,
+    "no series resistor": parallel(resistor(80e3), capacitor(0.2e-9)),
+}
+
+
+def transfer_of(system):
+    """C (s − A)⁻¹ B + D by numpy."""
+    eye = np.eye(system.A.shape[0])
+    A, B = np.asarray(system.A), np.asarray(system.B)[:, 0]
+    columns = [np.linalg.solve(s * eye - A, B) for s in S]
+    return np.array(columns) @ np.asarray(system.C) + float(system.D[0])
+
+
+def test_source_impedance_is_its_formula():
+    expected = 600.0 - 5e3 / (1 + S / 300.0)
+    for w, zeta, g, h in ((3e5, 0.25, 9e3, 1.2e4), (1.5e6, 1.2, 2e3, 500.0)):
+        expected = expected + (g + h * S / w) / (1 + 2 * zeta * S / w + (S / w) ** 2)
+    np.testing.assert_allclose(SOURCE.response(FREQUENCY), expected, rtol=1e-12)
+    np.testing.assert_allclose(transfer_of(SOURCE.state_space()), expected, rtol=SOLVED)
+    assert SOURCE.order == 5
+
+
+@pytest.mark.parametrize("shape", [(), (3,), (2, 3)])
+def test_response_keeps_the_shape_of_the_frequencies(shape):
+    frequency = jnp.full(shape, 1e4)
+    z = SOURCE.response(frequency)
+    assert z.shape == shape
+    np.testing.assert_allclose(z, SOURCE.response(jnp.array(1e4)), rtol=1e-13)
+
+
+@settings(max_examples=20)
+@given(st.lists(st.floats(-3, 3), min_size=11, max_size=11))
+def test_every_value_of_the_parameters_is_stable(shifts):
+    vector, unflatten = ravel_pytree(SOURCE)
+    source = unflatten(vector * jnp.asarray([*shifts]) / 3 + 1)
+    poles = np.linalg.eigvals(np.asarray(source.state_space().A))
+    assert poles.real.max() < 0
+
+
+def test_poles_pass_from_complex_to_real_smoothly():
+    def impedance(log_zeta):
+        z = SourceImpedance(*[jnp.atleast_1d(v) for v in (0.0, 0.0, log_zeta, 1.0, 0.5, 0.0, 0.0)])
+        return jnp.abs(z.response(jnp.array(0.2))).sum()
+
+    jet = [jax.jit(jax.grad(impedance))(jnp.array(d)) for d in (-1e-9, 0.0, 1e-9)]
+    assert np.ptp(np.array(jet)) < 1e-8
+    assert np.isfinite(jet).all()
+
+
+@pytest.mark.parametrize("name", LOADS)
+def test_realisations_have_the_right_response(name):
+    load = LOADS[name]
+    z = np.asarray(load(jnp.asarray(S)))
+    np.testing.assert_allclose(transfer_of(realise(load, RATE)), z, rtol=SOLVED)
+    expected = z / (z + np.asarray(SOURCE.response(FREQUENCY)))
+    system = loaded(SOURCE, load, RATE)
+    np.testing.assert_allclose(transfer_of(system), expected, rtol=10 * SOLVED)
+    # A passive driver and a passive load cannot oscillate.
+    assert np.linalg.eigvals(np.asarray(system.A)).real.max() < 0
+
+
+def test_realisation_equals_scipy():
+    num, den = np.asarray(LAYERS.num)[::-1], np.asarray(LAYERS.den)[::-1]
+    _, expected = scipy.signal.freqs(num, den, S.imag)
+    np.testing.assert_allclose(transfer_of(realise(LAYERS, RATE)), expected, rtol=SOLVED)
+
+
+@pytest.mark.parametrize("rate", [1e3, 1e7])
+def test_the_scaling_rate_changes_no_impedance(rate):
+    expected = transfer_of(loaded(SOURCE, LAYERS, RATE))
+    np.testing.assert_allclose(transfer_of(loaded(SOURCE, LAYERS, rate)), expected, rtol=1e-6)
+
+
+def test_only_ratios_to_the_source_are_observable():
+    larger = SourceImpedance(
+        SOURCE.log_resistance + jnp.log(3.0),
+        SOURCE.log_omega,
+        SOURCE.log_zeta,
+        3 * SOURCE.gain,
+        3 * SOURCE.slope,
+        SOURCE.log_omega_real,
+        3 * SOURCE.gain_real,
+    )
+    load = SkinRC(3 * 33.4e3, 3 * 186e3, 0.12e-9 / 3).impedance()
+    expected = transfer_of(loaded(SOURCE, LOADS["skin"], RATE))
+    np.testing.assert_allclose(transfer_of(loaded(larger, load, RATE)), expected, rtol=SOLVED)
+
+
+def test_the_loaded_system_differentiates_under_vmap():
+    def gain(log_values, s):
+        system = loaded(SOURCE, SkinRC().with_log_values(log_values).impedance(), RATE)
+        a = jnp.linalg.inv(jax.lax.complex(-system.A, jnp.imag(s) * jnp.eye(6)))
+        h = jax.lax.complex(system.C, jnp.zeros(6)) @ a
+        h = h @ jax.lax.complex(system.B[:, 0], jnp.zeros(6))
+        return jnp.abs(h + jax.lax.complex(system.D[0], jnp.zeros(())))
+
+    def formula(log_values, s):
+        z = SkinRC().with_log_values(log_values).impedance()(s)
+        return jnp.abs(z / (z + SOURCE.response(jnp.imag(s) / (2 * jnp.pi))))
+
+    at = (SkinRC(33.4e3, 186e3, 0.12e-9).log_values(), jnp.asarray(S))
+    found = jax.jit(jax.vmap(jax.grad(gain), (None, 0)))(*at)
+    expected = jax.jit(jax.vmap(jax.grad(formula), (None, 0)))(*at)
+    np.testing.assert_allclose(found, expected, atol=1e-8)
+
+
+def test_a_load_without_bound_is_refused():
+    with pytest.raises(ValueError, match="grows without bound"):
+        realise(Rational(jnp.array([0.0, 1e-3]), jnp.ones(1)), RATE)

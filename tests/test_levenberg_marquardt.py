@@ -1,0 +1,230 @@
+import warnings
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optimistix as optx
+import pytest
+import scipy.optimize
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from etid.levenberg_marquardt import LevenbergMarquardt
+
+TIME = np.linspace(0.0, 5.0, 60)
+TRUTH = np.array([3.0, 1.7, 0.8])
+START = jnp.array([1.0, 0.3, 0.0])
+rng = np.random.default_rng(7)
+DATA = TRUTH[0] * np.exp(-TRUTH[1] * TIME) + TRUTH[2] + 0.05 * rng.normal(size=TIME.size)
+
+# Two minimisers stopped at a relative offset of 1e-7 differ by some 1e-7 √60 standard errors.
+AGREE = 1e-5
+TIGHT = LevenbergMarquardt(rtol=1e-7, ftol=0.0)
+
+
+def decay(y, data=DATA, xp=jnp):
+    """An exponential with an offset: one state of a circuit."""
+    return y[0] * xp.exp(-y[1] * xp.asarray(TIME)) + y[2] - data
+
+
+def rosenbrock(y, xp=jnp):
+    return xp.stack([10 * (y[1] - y[0] ** 2), 1 - y[0]])
+
+
+def powell(y, xp=jnp):
+    """Moré, Garbow & Hillstrom no. 13; singular at its zero."""
+    return xp.stack(
+        [
+            y[0] + 10 * y[1],
+            np.sqrt(5.0) * (y[2] - y[3]),
+            (y[1] - 2 * y[2]) ** 2,
+            np.sqrt(10.0) * (y[0] - y[3]) ** 2,
+        ]
+    )
+
+
+@eqx.filter_jit
+def solve(residual, start, args=None, solver=TIGHT, max_steps=200):
+    def fn(y, args):
+        return residual(y) if args is None else residual(y, args)
+
+    return optx.least_squares(fn, solver, start, args, max_steps=max_steps, throw=False)
+
+
+@pytest.mark.parametrize(
+    ("residual", "start"),
+    [
+        (decay, [1.0, 0.3, 0.0]),
+        (rosenbrock, [-1.2, 1.0]),
+        (powell, [3.0, -1.0, 0.0, 1.0]),
+    ],
+)
+def test_minimum_is_that_of_scipy(residual, start):
+    expected = scipy.optimize.least_squares(
+        lambda y: residual(y, xp=np), start, method="lm", xtol=1e-15, ftol=1e-15, gtol=1e-15
+    )
+    solution = solve(residual, jnp.array(start))
+    assert solution.result == optx.RESULTS.successful
+    # At Powell's zero the Jacobian loses two ranks; there the fourth root of rounding is the limit.
+    atol = 1e-3 if residual is powell else AGREE
+    np.testing.assert_allclose(solution.value, expected.x, atol=atol)
+    objective = float(solution.stats["normal_equations"].objective)
+    assert objective <= expected.cost * (1 + 1e-10) + 1e-12
+
+
+def test_minimum_is_that_of_jaxopt():
+    with warnings.catch_warnings():
+        # jaxopt is no longer maintained and says so when it is imported.
+        warnings.simplefilter("ignore", DeprecationWarning)
+        import jaxopt
+    with jax.numpy_dtype_promotion("standard"):  # it multiplies truth values by floats
+        peer = jaxopt.LevenbergMarquardt(decay, tol=1e-10, maxiter=200, xtol=1e-12, gtol=1e-12)
+        expected = peer.run(START).params
+    np.testing.assert_allclose(solve(decay, START).value, expected, atol=AGREE)
+
+
+def test_statistics_are_the_normal_equations_at_the_solution():
+    solution = solve(decay, START)
+    equations = solution.stats["normal_equations"]
+    r, jacobian = decay(solution.value), jax.jacfwd(decay)(solution.value)
+    np.testing.assert_allclose(equations.objective, 0.5 * r @ r, rtol=1e-12)
+    np.testing.assert_allclose(equations.matrix, jacobian.T @ jacobian, rtol=1e-12)
+    # |Q₁ᵀ r| ≤ rtol |r|, computed independently
+    q, _ = np.linalg.qr(jacobian)
+    assert np.linalg.norm(q.T @ r) <= 1e-7 * np.linalg.norm(r) * (1 + 1e-6)
+
+
+def linear(y, args):
+    return args[:, :3] @ y - args[:, 3]
+
+
+@settings(max_examples=15)
+@given(st.integers(0, 10**6))
+def test_linear_problems_take_a_handful_of_steps(seed):
+    generator = np.random.default_rng(seed)
+    design, target = generator.normal(size=(30, 3)), generator.normal(size=30)
+    args = jnp.asarray(np.column_stack([design, target]))
+    solution = solve(linear, jnp.array([5.0, -4.0, 3.0]), args)
+    exact = np.linalg.lstsq(design, target)[0]
+    np.testing.assert_allclose(solution.value, exact, atol=AGREE)
+    # Damping starts at 1e-2 and falls fivefold a step, so linear problems gain 2, 3, 4 … digits.
+    assert int(solution.stats["num_steps"]) <= 8
+
+
+def scaled_decay(y, unit):
+    return unit * decay(y)
+
+
+@pytest.mark.parametrize("unit", [1e-6, 1e6])
+def test_the_unit_of_the_residual_changes_nothing(unit):
+    """A solver with absolute tolerances calls residuals of 1e-6 converged and does not move."""
+    plain = solve(decay, START)
+    scaled = solve(scaled_decay, START, jnp.array(unit))
+    assert int(scaled.stats["num_steps"]) == int(plain.stats["num_steps"])
+    np.testing.assert_allclose(scaled.value, plain.value, rtol=1e-9)
+    assert np.abs(scaled.value - START).max() > 0.5
+
+
+def test_the_units_of_the_parameters_change_nothing():
+    units = jnp.array([1e-9, 1e5, 1e3])  # farad and ohm next to each other
+    plain = solve(decay, START)
+    scaled = solve(lambda y, u: decay(y * u), START / units, units)
+    assert int(scaled.stats["num_steps"]) == int(plain.stats["num_steps"])
+    np.testing.assert_allclose(scaled.value * units, plain.value, rtol=1e-9)
+
+
+def test_a_step_into_nan_is_rejected_and_the_fit_goes_on():
+    """The Newton step leaves the domain of the square root."""
+
+    def residual(y):
+        return jnp.sqrt(y) * jnp.array([1.0, 1.0]) - jnp.array([0.01, 0.02])
+
+    start = jnp.array([1.0])
+    newton = start - jnp.linalg.lstsq(jax.jacfwd(residual)(start), residual(start))[0]
+    assert bool(jnp.isnan(residual(newton)).any())  # else this tests nothing
+    solution = solve(residual, start)
+    assert solution.result == optx.RESULTS.successful
+    np.testing.assert_allclose(solution.value, [0.015**2], rtol=1e-5)
+    assert int(solution.stats["accepted_steps"]) < int(solution.stats["num_steps"])
+
+
+def test_nan_at_the_start_is_a_verdict():
+    solution = solve(lambda y: jnp.log(y) * jnp.ones(4), jnp.array([-1.0]))
+    assert solution.result == optx.RESULTS.nonlinear_divergence
+    assert int(solution.stats["num_steps"]) < 5
+
+
+def test_an_infinite_slope_at_the_start_is_a_verdict():
+    solution = solve(lambda y: jnp.sqrt(y) + jnp.arange(1.0, 5.0), jnp.array([0.0]))
+    assert solution.result == optx.RESULTS.nonlinear_divergence
+
+
+def test_a_solver_that_cannot_move_does_not_report_success():
+    """Away from one point the residual is NaN, so that every trial step is rejected."""
+
+    def residual(y):
+        r = decay(y)
+        return jnp.where(jnp.all(y == START), r, jnp.nan)
+
+    solution = solve(residual, START)
+    assert solution.result != optx.RESULTS.successful
+    np.testing.assert_array_equal(solution.value, START)
+
+
+def test_too_few_steps_are_a_verdict():
+    assert solve(decay, START, max_steps=3).result == optx.RESULTS.nonlinear_max_steps_reached
+
+
+def test_a_parameter_without_effect_stays_where_it_was():
+    solution = solve(lambda y: decay(y[:3]), jnp.append(START, 4.0))
+    assert solution.result == optx.RESULTS.successful
+    assert float(solution.value[3]) == 4.0
+    np.testing.assert_allclose(solution.value[:3], solve(decay, START).value, atol=AGREE)
+
+
+@pytest.fixture(scope="module")
+def lanes():
+    generator = np.random.default_rng(11)
+    amplitude, rate = generator.uniform(1, 5, 6), generator.uniform(0.5, 3, 6)
+    clean = amplitude[:, None] * np.exp(-rate[:, None] * TIME) + 0.5
+    data = jnp.asarray(clean + 0.05 * generator.normal(size=clean.shape))
+    return jax.jit(jax.vmap(lambda d: solve(decay, START, d).value)), data
+
+
+def test_lanes_equal_a_loop(lanes):
+    run, data = lanes
+    loop = jnp.stack([solve(decay, START, d).value for d in data])
+    np.testing.assert_allclose(run(data), loop, atol=AGREE)
+
+
+def test_lanes_do_not_see_each_other(lanes):
+    run, data = lanes
+    values = run(data)
+    poisoned = run(data.at[2, 5].set(jnp.nan))
+    others = np.array([0, 1, 3, 4, 5])
+    np.testing.assert_array_equal(poisoned[others], values[others])
+    np.testing.assert_array_equal(poisoned[2], START)  # left where it was, not sent anywhere
+    order = np.array([4, 2, 0, 5, 1, 3])
+    np.testing.assert_array_equal(run(data[order]), values[order])
+
+
+def test_jit_equals_eager():
+    with jax.disable_jit():
+        eager = optx.least_squares(lambda y, _: decay(y), TIGHT, START, throw=False)
+    np.testing.assert_allclose(eager.value, solve(decay, START).value, rtol=1e-9)
+
+
+def test_the_solution_differentiates_with_respect_to_the_data():
+    """By the implicit function theorem; the parameters react to each sample as differences say."""
+
+    @jax.jit
+    def rate(data):
+        solver = LevenbergMarquardt(rtol=1e-8, ftol=0.0)
+        return optx.least_squares(decay, solver, START, data, max_steps=100, throw=False).value[1]
+
+    gradient = jax.jit(jax.grad(rate))(jnp.asarray(DATA))
+    direction = np.random.default_rng(3).normal(size=TIME.size)
+    step = 1e-4  # differences: step² of the third derivative; the fits' own 1e-8 over the step
+    numeric = (rate(DATA + step * direction) - rate(DATA - step * direction)) / (2 * step)
+    np.testing.assert_allclose(gradient @ direction, numeric, rtol=1e-3)
