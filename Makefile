@@ -13,7 +13,7 @@ demo: .venv/package
 	$(BIN)/python -m etid.demo demo/
 
 test: .venv/tools
-	$(BIN)/python -m pytest --numprocesses auto
+	$(BIN)/python -m pytest --numprocesses auto --dist loadfile
 
 lint: .venv/tools
 	$(BIN)/ruff check

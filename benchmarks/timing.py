@@ -61,6 +61,5 @@ def run(lanes: int) -> None:
         print(f"skin {method:<18} first {first:8.2f} s   warm {1e3 * warm:.1f} ms")
         fits = functools.partial(etid.identify_skins, many, driver, method=method)
         first, warm = _time(lambda fits=fits: fits().chi2, 3)
-        print(
-            f"  batch of {lanes:<12} first {first:8.2f} s   warm {1e3 * warm / lanes:.1f} ms per fit"
-        )
+        each = 1e3 * warm / lanes
+        print(f"  batch of {lanes:<12} first {first:8.2f} s   warm {each:.1f} ms per fit")

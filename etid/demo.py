@@ -322,8 +322,8 @@ def main(argv: Sequence[str] | None = None) -> None:
         Section(
             "Verdicts",
             "The last columns: how often the truth lies within two standard errors (se) of a "
-            "successful fit. A trigger delay is not fitted yet: where noise hides it from the "
-            "verdict, it is missing in the standard errors.",
+            "successful fit. All fits of a study share the error of its driver, so they are right "
+            "or wrong together.",
             (table_verdicts(outcomes, truth),),
         ),
     ]

@@ -56,9 +56,7 @@ def normal_equations(
     objective, gradient = 0.5 * jnp.dot(r, r), jacobian.T @ r
     # A slope that is not finite is as bad as such a value: nothing could follow from this point.
     finite = jnp.isfinite(objective) & jnp.isfinite(gradient).all()
-    return NormalEquations(
-        jnp.where(finite, objective, jnp.inf), gradient, jacobian.T @ jacobian
-    )
+    return NormalEquations(jnp.where(finite, objective, jnp.inf), gradient, jacobian.T @ jacobian)
 
 
 class _State(eqx.Module):

@@ -227,9 +227,12 @@ def prior(start: SourceImpedance, sample_rate: Float[Array, ""], r_load: Float[A
 
     A pole that a noisy recording cannot determine would otherwise run away, to Q = ∞ for instance,
     and take the solver with it. At 60 dB a recording carries 1e4 and more times the information of
-    this prior; what it allows (one standard deviation) is a damping ratio of 0.7 within a factor of
-    e^1.5, frequencies within e^3 of half the Nyquist frequency (slow real poles: e^3 of 1/500 of
-    it), impedances up to 10 times the known resistor.
+    this prior. What it allows (one standard deviation) is, for the first section, the resonance, a
+    frequency within e^3 of half the Nyquist frequency and a damping ratio of 0.7 within e^1.5; for
+    further ones an overdamped tail above the band, 1.5 times the Nyquist frequency within e^1.5 and
+    1.5 within e^0.5: a second sharp resonance beside the first is what noise makes when the trigger
+    delay is fitted too. Slow real poles lie within e^3 of 1/500 of half the Nyquist frequency, and
+    impedances below 10 times the known resistor.
 
     A transformer is passive, so Re Z_th ≥ 0 at all frequencies, inside the recorded band and above
     it; otherwise some skin would make the loaded driver oscillate. Each frequency where it is not
@@ -238,10 +241,11 @@ def prior(start: SourceImpedance, sample_rate: Float[Array, ""], r_load: Float[A
     half = 0.5 * jnp.pi * sample_rate
     wide = 10 * r_load
     pairs, reals = start.log_omega.shape[0], start.log_omega_real.shape[0]
+    first = jnp.zeros(pairs).at[:1].set(1.0)
     centre = SourceImpedance(
         log_resistance=jnp.log(0.01 * r_load),
-        log_omega=jnp.full(pairs, jnp.log(half)),
-        log_zeta=jnp.full(pairs, math.log(0.7)),
+        log_omega=jnp.log(half) + (1 - first) * math.log(3.0),
+        log_zeta=first * math.log(0.7) + (1 - first) * math.log(1.5),
         gain=jnp.zeros(pairs),
         slope=jnp.zeros(pairs),
         log_omega_real=jnp.full(reals, jnp.log(half)).at[0].add(-math.log(500.0)),
@@ -249,8 +253,8 @@ def prior(start: SourceImpedance, sample_rate: Float[Array, ""], r_load: Float[A
     )
     width = SourceImpedance(
         log_resistance=jnp.array(3.0),
-        log_omega=jnp.full(pairs, 3.0),
-        log_zeta=jnp.full(pairs, 1.5),
+        log_omega=1.5 + 1.5 * first,
+        log_zeta=0.5 + first,
         gain=jnp.full(pairs, wide),
         slope=jnp.full(pairs, wide),
         log_omega_real=jnp.full(reals, 3.0),

@@ -2,7 +2,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-import scipy.signal
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from jax.flatten_util import ravel_pytree
@@ -39,6 +38,8 @@ LOADS = {
     "no series resistor": parallel(resistor(80e3), capacitor(0.2e-9)),
 }
 
+respond = jax.jit(SourceImpedance.response)
+
 
 def transfer_of(system):
     """C (s − A)⁻¹ B + D by numpy."""
@@ -52,7 +53,7 @@ def test_source_impedance_is_its_formula():
     expected = 600.0 - 5e3 / (1 + S / 300.0)
     for w, zeta, g, h in ((3e5, 0.25, 9e3, 1.2e4), (1.5e6, 1.2, 2e3, 500.0)):
         expected = expected + (g + h * S / w) / (1 + 2 * zeta * S / w + (S / w) ** 2)
-    np.testing.assert_allclose(SOURCE.response(FREQUENCY), expected, rtol=1e-12)
+    np.testing.assert_allclose(respond(SOURCE, FREQUENCY), expected, rtol=1e-12)
     np.testing.assert_allclose(transfer_of(SOURCE.state_space()), expected, rtol=SOLVED)
     assert SOURCE.order == 5
 
@@ -60,26 +61,29 @@ def test_source_impedance_is_its_formula():
 @pytest.mark.parametrize("shape", [(), (3,), (2, 3)])
 def test_response_keeps_the_shape_of_the_frequencies(shape):
     frequency = jnp.full(shape, 1e4)
-    z = SOURCE.response(frequency)
+    z = respond(SOURCE, frequency)
     assert z.shape == shape
-    np.testing.assert_allclose(z, SOURCE.response(jnp.array(1e4)), rtol=1e-13)
+    np.testing.assert_allclose(z, respond(SOURCE, jnp.array(1e4)), rtol=1e-13)
 
 
 @settings(max_examples=20)
 @given(st.lists(st.floats(-3, 3), min_size=11, max_size=11))
 def test_every_value_of_the_parameters_is_stable(shifts):
     vector, unflatten = ravel_pytree(SOURCE)
-    source = unflatten(vector * jnp.asarray([*shifts]) / 3 + 1)
+    source = unflatten(vector + jnp.asarray(shifts))
     poles = np.linalg.eigvals(np.asarray(source.state_space().A))
     assert poles.real.max() < 0
 
 
-def test_poles_pass_from_complex_to_real_smoothly():
-    def impedance(log_zeta):
-        z = SourceImpedance(*[jnp.atleast_1d(v) for v in (0.0, 0.0, log_zeta, 1.0, 0.5, 0.0, 0.0)])
-        return jnp.abs(z.response(jnp.array(0.2))).sum()
+def one_section(log_zeta):
+    none = jnp.zeros(0)
+    one, half = jnp.ones(1), jnp.full(1, 0.5)
+    return SourceImpedance(jnp.zeros(()), 0 * one, log_zeta * one, one, half, none, none)
 
-    jet = [jax.jit(jax.grad(impedance))(jnp.array(d)) for d in (-1e-9, 0.0, 1e-9)]
+
+def test_poles_pass_from_complex_to_real_smoothly():
+    slope = jax.jit(jax.grad(lambda d: jnp.abs(one_section(d).response(jnp.array(0.2)))))
+    jet = [slope(jnp.array(d)) for d in (-1e-9, 0.0, 1e-9)]  # ζ = 1 is a double pole
     assert np.ptp(np.array(jet)) < 1e-8
     assert np.isfinite(jet).all()
 
@@ -89,16 +93,16 @@ def test_realisations_have_the_right_response(name):
     load = LOADS[name]
     z = np.asarray(load(jnp.asarray(S)))
     np.testing.assert_allclose(transfer_of(realise(load, RATE)), z, rtol=SOLVED)
-    expected = z / (z + np.asarray(SOURCE.response(FREQUENCY)))
+    expected = z / (z + np.asarray(respond(SOURCE, FREQUENCY)))
     system = loaded(SOURCE, load, RATE)
     np.testing.assert_allclose(transfer_of(system), expected, rtol=10 * SOLVED)
     # A passive driver and a passive load cannot oscillate.
     assert np.linalg.eigvals(np.asarray(system.A)).real.max() < 0
 
 
-def test_realisation_equals_scipy():
+def test_realisation_equals_its_polynomials():
     num, den = np.asarray(LAYERS.num)[::-1], np.asarray(LAYERS.den)[::-1]
-    _, expected = scipy.signal.freqs(num, den, S.imag)
+    expected = np.polyval(num, S) / np.polyval(den, S)
     np.testing.assert_allclose(transfer_of(realise(LAYERS, RATE)), expected, rtol=SOLVED)
 
 

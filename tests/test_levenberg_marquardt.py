@@ -210,8 +210,7 @@ def test_lanes_do_not_see_each_other(lanes):
 
 
 def test_jit_equals_eager():
-    with jax.disable_jit():
-        eager = optx.least_squares(lambda y, _: decay(y), TIGHT, START, throw=False)
+    eager = optx.least_squares(lambda y, _: decay(y), TIGHT, START, throw=False)
     np.testing.assert_allclose(eager.value, solve(decay, START).value, rtol=1e-9)
 
 

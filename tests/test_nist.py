@@ -1,4 +1,4 @@
-"""The 27 certified nonlinear regressions of NIST's StRD, both starts, with their standard errors."""
+"""The 27 certified nonlinear regressions of NIST's StRD, from both starts, standard errors too."""
 
 import dataclasses
 import re
@@ -139,16 +139,22 @@ class Problem:
     y: np.ndarray
 
 
+def find(pattern, text):
+    match = re.search(pattern, text)
+    assert match is not None, pattern
+    return match.groups()
+
+
 def read(path):
     """A certified problem; the rows of its tables are found by their form, as NIST prints them."""
     text = path.read_text()
     rows = re.findall(r"^\s*b\d\s*=\s*(\S+)\s+(\S+)\s+(\S+)\s+(\S+)\s*$", text, re.MULTILINE)
     table = np.array(rows, dtype=float)
-    rss = float(re.search(r"Residual Sum of Squares:\s*(\S+)", text).group(1))
-    first, last = re.search(r"Data\s+\(lines\s+(\d+)\s+to\s+(\d+)\)", text).groups()
+    rss = float(find(r"Residual Sum of Squares:\s*(\S+)", text)[0])
+    first, last = find(r"Data\s+\(lines\s+(\d+)\s+to\s+(\d+)\)", text)
     lines = text.splitlines()[int(first) - 1 : int(last)]
     data = np.array([line.split() for line in lines], dtype=float).T
-    count = int(re.search(r"Number of Observations:\s*(\d+)", text).group(1))
+    count = int(find(r"Number of Observations:\s*(\d+)", text)[0])
     assert data.shape[1] == count
     y, x = data[0], data[1:]
     if path.stem == "Nelson":

@@ -4,6 +4,8 @@ The circuit is that of the skin, measured the other way round and by somebody el
 maker states R_p = 500 MΩ within 1 % and C_p = 33 pF within 10 %.
 """
 
+from typing import Any
+
 import equinox as eqx
 import h5py
 import jax.numpy as jnp
@@ -23,8 +25,9 @@ RATE = 1e4  # [1/s], typical of the filter
 PICO = 1e-12  # of an ampere
 STEP = 10e-3  # [V]
 
-# Four poles of Bessel's filter, −3 dB at 1 rad/s, in ascending powers of s.
-NUM, DEN = (p[::-1] for p in scipy.signal.bessel(4, 1.0, analog=True, norm="mag"))
+# Four poles of Bessel's filter, −3 dB at 1 rad/s, in descending powers of s.
+BESSEL: Any = scipy.signal.bessel(4, 1.0, analog=True, norm="mag")
+NUM, DEN = BESSEL
 
 # What a manual would suggest for a patched cell and its amplifier; each is wrong by 1.5 to 5 times.
 # Series, membrane, capacitance, corner of the recorder [Hz], delay [samples], holding current [pA].
@@ -35,8 +38,8 @@ START = (SkinRC(30e6, 150e6, 100e-12), 3000.0, 0.5, 0.0)
 def recorded(reference_data):
     with h5py.File(reference_data("patch_clamp_model_cell") / "model_vc_step.h5") as file:
         assert file.attrs["sampling_rate_hz"] == SAMPLE_RATE
-        current = file["current_pA"][:].astype(float)
-        command = file["command_mV"][0].astype(float)
+        current = np.asarray(file["current_pA"], dtype=float)
+        command = np.asarray(file["command_mV"], dtype=float)[0]
     steps = np.flatnonzero(np.diff(command)) + 1
     assert list(np.diff(command)[steps - 1]) == [-1e3 * STEP, 1e3 * STEP]
     # The floor comes from the scatter between sweeps, which knows no model.
@@ -49,7 +52,7 @@ def predicted_current(parameters, steps, time):
     circuit = SkinRC(1.0, 1.0, 1.0).with_log_values(parameters[:3])
     omega = 2 * jnp.pi * jnp.exp(parameters[3])
     scale = omega ** -jnp.arange(5.0)
-    bessel = Rational(jnp.asarray(NUM.copy()), jnp.asarray(DEN.copy()) * scale)
+    bessel = Rational(jnp.asarray(NUM), jnp.asarray(DEN[::-1].copy()) * scale)
     system = realise(circuit.impedance().reciprocal().multiply(bessel), RATE)
     # The first column of `hold` is the response to a constant. A step that comes `delay` after a
     # sample acts for the rest of that interval, then for whole ones.

@@ -2,7 +2,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy.signal
-from hypothesis import given, settings
+from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from etid.transfer import (
@@ -17,14 +17,22 @@ from etid.transfer import (
     tustin,
 )
 
-coefficients = st.lists(st.floats(-10, 10), min_size=1, max_size=6)
+
+def coefficients(size):  # few sizes, because every new shape is compiled
+    return st.lists(st.floats(-10, 10), min_size=size, max_size=size)
 
 
-@given(coefficients, coefficients)
-def test_polynomials_equal_numpy(p, q):
-    product = multiply_polynomials(jnp.array(p), jnp.array(q))
+multiply, add = jax.jit(multiply_polynomials), jax.jit(add_polynomials)
+
+
+@given(
+    st.sampled_from([(1, 4), (3, 3), (6, 2)]).flatmap(lambda n: st.tuples(*map(coefficients, n)))
+)
+def test_polynomials_equal_numpy(pair):
+    p, q = pair
+    product = multiply(jnp.array(p), jnp.array(q))
     np.testing.assert_allclose(product, np.convolve(p, q), atol=1e-10)
-    total = add_polynomials(jnp.array(p), jnp.array(q))
+    total = add(jnp.array(p), jnp.array(q))
     expected = np.polyval(p[::-1], 0.7) + np.polyval(q[::-1], 0.7)
     np.testing.assert_allclose(np.polyval(total[::-1], 0.7), expected, atol=1e-10)
 
@@ -40,17 +48,36 @@ def test_sum_product_and_reciprocal_are_pointwise():
     f = Rational(jnp.array([1.0, 2.0]), jnp.array([3.0, 0.5]))
     g = Rational(jnp.array([2.0]), jnp.array([1.0, 1.0, 4.0]))
     x = jnp.array([0.3 + 0.1j, -1.0 + 2.0j])
-    np.testing.assert_allclose(f.add(g)(x), f(x) + g(x), rtol=1e-13)
-    np.testing.assert_allclose(f.multiply(g)(x), f(x) * g(x), rtol=1e-13)
+    np.testing.assert_allclose(f.add(g)(x), np.asarray(f(x)) + np.asarray(g(x)), rtol=1e-13)
+    np.testing.assert_allclose(f.multiply(g)(x), np.asarray(f(x)) * np.asarray(g(x)), rtol=1e-13)
     np.testing.assert_allclose(f.reciprocal()(x), 1 / f(x), rtol=1e-13)
 
 
 def test_tustin_equals_scipy_bilinear():
     num, den = np.array([2.0e5, 3.0, 1e-5]), np.array([1.0, 2e-5, 4e-10])
     discrete = tustin(Rational(jnp.array(num), jnp.array(den)), 200e3)
-    b, a = scipy.signal.bilinear(num[::-1], den[::-1], 200e3)
+    b, a = map(np.asarray, scipy.signal.bilinear(num[::-1], den[::-1], 200e3))
     np.testing.assert_allclose(discrete.num, b, rtol=1e-10)
     np.testing.assert_allclose(discrete.den, a, rtol=1e-10)
+
+
+bilinear = jax.jit(lambda continuous: tustin(continuous, 1.0))
+
+
+@settings(max_examples=20)
+@given(coefficients(4), st.floats(0.01, 0.49))
+def test_tustin_is_the_continuous_function_at_the_warped_frequency(num, frequency):
+    continuous = Rational(jnp.array(num), jnp.array([1.0, 0.3, 0.2]))
+    discrete = bilinear(continuous)
+    assert float(discrete.den[0]) == 1.0
+    warped = 2 * np.tan(np.pi * frequency)  # s = 2 fs tanh(s / 2 fs) on the imaginary axis
+    z = delay_variable(jnp.array(frequency), 1.0)
+    expected = complex(continuous(jnp.array(1j * warped)))
+    # The substitution expands (1 ± z⁻¹)³; the numerator may cancel to a small part of its terms.
+    size = sum(abs(c) * warped**k for k, c in enumerate(num)) / abs(
+        1 + 0.3j * warped - 0.2 * warped**2
+    )
+    assert abs(complex(discrete(z)) - expected) <= 1e-12 * size
 
 
 def test_variables_on_the_frequency_axis():
@@ -59,15 +86,23 @@ def test_variables_on_the_frequency_axis():
     np.testing.assert_allclose(delay_variable(frequency, 200e3), [1, -1j], atol=1e-15)
 
 
+stable = jax.jit(is_stable)
+
+
 @settings(max_examples=60)
-@given(st.lists(st.floats(-1.5, 1.5), min_size=1, max_size=4), st.floats(0.2, 1.6), st.floats(0, 3))
+@given(
+    st.sampled_from([1, 4]).flatmap(
+        lambda n: st.lists(st.floats(-1.5, 1.5), min_size=n, max_size=n)
+    ),
+    st.floats(0.2, 1.6),
+    st.floats(0, 3),
+)
 def test_stability_agrees_with_the_roots(real, radius, angle):
     roots = [*real, radius * np.exp(1j * angle), radius * np.exp(-1j * angle)]
     magnitude = np.abs(roots)
-    if np.any(np.abs(magnitude - 1) < 1e-3):
-        return  # on the circle rounding decides, and both answers are right
+    assume(np.all(np.abs(magnitude - 1) > 1e-3))  # on the circle rounding decides
     a = jnp.array(np.poly(roots).real)
-    assert bool(is_stable(a)) == bool((magnitude < 1).all())
+    assert bool(stable(a)) == bool((magnitude < 1).all())
 
 
 def test_nan_is_not_stable():
