@@ -48,7 +48,7 @@ def imports_of(path):
     for node in ast.walk(ast.parse(path.read_text())):
         if isinstance(node, ast.ImportFrom) and node.module == "etid":
             yield from (alias.name for alias in node.names)
-        elif isinstance(node, ast.ImportFrom) and (node.module or "").startswith("etid."):
+        elif isinstance(node, ast.ImportFrom) and node.module and node.module.startswith("etid."):
             yield node.module.removeprefix("etid.")
         elif isinstance(node, ast.Import):
             yield from (

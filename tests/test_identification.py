@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 import etid
+from etid import identify
 from etid.scenes import Scene, Trial
 from etid.transformer import ResistorLoad, SkinLoad
 
@@ -189,7 +190,7 @@ def test_a_circuit_of_ones_own_is_identified(driver):
     resistors = scene(trials=(Trial("r/21k62", ResistorLoad(21.62e3)),)).simulate(seed=9)
     recording = next(iter(resistors.loaded.recordings()))
     fit = etid.identify_skin(recording, driver, circuit=etid.Resistor())
-    assert abs(float(fit.circuit.r) - 21.62e3) < SIGMAS * float(fit.stderr.r)
+    assert abs(float(fit.circuit.values()[0]) - 21.62e3) < SIGMAS * float(fit.stderr.values()[0])
     with pytest.raises(ValueError, match="identifies SkinRC only"):
         etid.identify_skin(recording, driver, circuit=etid.Resistor(), method="equation_error")
 
@@ -231,10 +232,18 @@ def test_fits_are_a_table(fits):
     assert single.verdict == "successful"
 
 
-def test_a_chunk_compiles_once_per_length(study, driver):
-    from etid.batch import _chunk
+def test_a_chunk_compiles_once_per_length(study, driver, monkeypatch):
+    from etid import batch
 
-    before = _chunk._cached._cache_size()
-    etid.identify_skins(list(study.loaded.recordings())[:5], driver)
-    etid.identify_skins(list(study.loaded.recordings())[1:6], driver)
-    assert _chunk._cached._cache_size() - before <= 1
+    traces = []
+
+    def counted(*arguments):
+        traces.append(arguments)
+        return identify.skin_lane(*arguments)
+
+    monkeypatch.setattr(batch, "skin_lane", counted)
+    other = etid.SkinRC(10e3, 50e3, 1e-9)  # typical values are data, not structure
+    records = list(study.loaded.recordings())
+    etid.identify_skins(records[:5], driver)
+    etid.identify_skins(records[1:6], driver, circuit=other)
+    assert len(traces) <= 1

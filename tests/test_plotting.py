@@ -20,10 +20,10 @@ def test_fit_shows_measured_predicted_and_residual_in_display_units(recording):
     upper, lower = figure.axes
     assert upper.get_ylabel() == "voltage [V]"
     assert lower.get_ylabel() == "residual [mV]"
-    drawn = lower.lines[-1].get_ydata()
+    drawn = np.asarray(lower.lines[-1].get_ydata())
     np.testing.assert_allclose(drawn[np.isfinite(drawn)], 20.0, atol=1e-9)
     # One pulse is shown, not the record: its edge must lie inside.
-    shown = upper.lines[1].get_ydata()
+    shown = np.asarray(upper.lines[1].get_ydata())
     assert shown.size < 0.1 * recording.v_out.size
     assert np.ptp(shown) > 0.8 * np.ptp(recording.v_out)
 
@@ -40,9 +40,9 @@ def test_impedance_is_drawn_in_kilohms_and_degrees():
     figure = plotting.plot_impedance({"skin": circuit}, stderr=stderr)
     magnitude, phase = figure.axes
     z = np.asarray(circuit.response(jnp.asarray(frequency)))
-    np.testing.assert_allclose(magnitude.lines[0].get_xdata(), frequency / 1e3)
-    np.testing.assert_allclose(magnitude.lines[0].get_ydata(), np.abs(z) / 1e3)
-    np.testing.assert_allclose(phase.lines[0].get_ydata(), np.degrees(np.angle(z)))
+    np.testing.assert_allclose(np.asarray(magnitude.lines[0].get_xdata()), frequency / 1e3)
+    np.testing.assert_allclose(np.asarray(magnitude.lines[0].get_ydata()), np.abs(z) / 1e3)
+    np.testing.assert_allclose(np.asarray(phase.lines[0].get_ydata()), np.degrees(np.angle(z)))
     assert len(magnitude.collections) == 1
 
 
@@ -64,7 +64,7 @@ def test_elements_show_every_fit_and_failures_hollow():
 
 def test_recording_shows_the_whole_record(recording):
     figure = plotting.plot_recording(recording)
-    np.testing.assert_allclose(figure.axes[0].lines[0].get_ydata(), recording.v_th)
+    np.testing.assert_allclose(np.asarray(figure.axes[0].lines[0].get_ydata()), recording.v_th)
     assert figure.axes[0].get_xlabel() == "time [ms]"
 
 

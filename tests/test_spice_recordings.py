@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 import etid
+from etid.identify import Method
 
 ELEMENTS = {"r_s": "Rs", "r_p": "Rp", "c_p": "Cp", "r": "R"}
 # Of the rounding to 16 bits alone the standard error is 0.2 % of C_p, the largest; discretisation
@@ -29,7 +30,7 @@ def spice(reference_data, tmp_path_factory):
     work = tmp_path_factory.mktemp("spice")
 
     @functools.cache
-    def fitted(name, method="output_error"):
+    def fitted(name, method: Method = "output_error"):
         file = work / f"{name}.h5"
         if not file.exists():
             etid.import_file(folder / f"{name}.npz", file)

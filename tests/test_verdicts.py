@@ -1,5 +1,7 @@
 """Every verdict is produced here, and none is silent."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -12,11 +14,12 @@ LENGTH = 3334
 DRY = SkinLoad(r_s=33.4e3, r_p=186e3, c_p=0.12e-9)
 
 
-def simulate(load=DRY, seed=0, **options):
+def simulate(load: Any = DRY, seed=0, samples=LENGTH, **options):
     scene = Scene(
         trials=(Trial("loaded/0", load),),
         calibration=(Trial("calibration/98k8", ResistorLoad(98.8e3)),),
-        **({"samples": LENGTH} | options),
+        samples=samples,
+        **options,
     )
     return scene.simulate(seed=seed)
 

@@ -1,0 +1,111 @@
+"""Pre-flight refuses what is broken, and nothing else. No fit is made here."""
+
+import json
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+import etid
+from etid.preflight import SHORTEST, preflight
+from etid.scenes import PRESETS, Scene, Trial
+from etid.transformer import ResistorLoad, SkinLoad
+
+LENGTH = 3334
+DAMP = SkinLoad(r_s=6.1e3, r_p=17.4e3, c_p=0.66e-9)
+
+
+def simulate(load: Any = DAMP, seed=0, samples=LENGTH, **options):
+    scene = Scene((Trial("loaded", load),), samples=samples, **options)
+    return scene.simulate(seed=seed)["loaded"]
+
+
+@pytest.fixture(scope="module")
+def recording():
+    return simulate()
+
+
+@pytest.mark.parametrize("name", sorted(PRESETS))
+@pytest.mark.parametrize("snr_db", [None, 60.0, 30.0])
+def test_every_paper_recording_passes(name, snr_db):
+    study = PRESETS[name](samples=LENGTH, snr_db=snr_db).simulate(seed=0)
+    assert {path: preflight(r) for path, r in study.items() if preflight(r)} == {}
+
+
+@pytest.mark.parametrize("bits", [8, 10, 12, 16, None])
+@pytest.mark.parametrize("sample_rate", [100e3, 200e3, 500e3, 1e6])
+def test_coarse_converters_and_every_rate_pass(bits, sample_rate):
+    """The top of a pulse falls on few codes of a coarse converter, and is no clipping."""
+    for snr_db in (None, 60.0):
+        one = simulate(bits=bits, sample_rate=sample_rate, samples=8334, snr_db=snr_db)
+        assert preflight(one) is None
+        assert preflight(one.replace(adc_range=None)) is None
+
+
+@given(
+    r_s=st.floats(1e3, 100e3),
+    r_p=st.floats(10e3, 1e6),
+    c_p=st.floats(30e-12, 2e-9),
+    jitter=st.sampled_from([0.0, 1e-6]),
+    seed=st.integers(0, 99),
+)
+def test_any_skin_passes(r_s, r_p, c_p, jitter, seed):
+    """Wider than the paper's ten subjects, dry and damp, with a sloppy trigger."""
+    one = simulate(SkinLoad(r_s, r_p, c_p), seed, trigger_jitter_rms=jitter)
+    assert preflight(one) is None
+
+
+@pytest.mark.parametrize("r", [1e3, 21.62e3, 555e3, 1e9])
+def test_any_resistor_passes(r):
+    assert preflight(simulate(ResistorLoad(r))) is None
+
+
+def test_reference_recordings_pass_but_the_clipped_ones(reference_data, tmp_path):
+    folder = reference_data("spice_recordings")
+    refused = {}
+    for name in json.loads((folder / "truth.json").read_text())["scenes"]:
+        etid.import_file(folder / f"{name}.npz", tmp_path / f"{name}.h5")
+        with etid.read(tmp_path / f"{name}.h5") as study:
+            names = {preflight(study[path]) for path in study} - {None}
+        if names:
+            refused[name] = names
+    assert refused == {"clipped_dry": {"saturated"}}
+
+
+@pytest.mark.parametrize("which", ["v_th", "v_out"])
+@pytest.mark.parametrize(
+    ("change", "name"),
+    [
+        (lambda v: np.full_like(v, 3.0), "flat"),
+        (lambda v: np.random.default_rng(1).normal(size=v.size), "flat"),
+        (lambda v: np.where(np.arange(v.size) == 5, np.nan, v), "nonfinite_samples"),
+        (lambda v: np.where(np.arange(v.size) == 5, -np.inf, v), "nonfinite_samples"),
+        (lambda v: np.minimum(v, 0.7 * v.max()), "saturated"),
+        (lambda v: np.roll(v, 40), "misaligned"),  # 200 µs
+        (lambda v: -v, "misaligned"),
+    ],
+)  # fmt: skip
+def test_what_is_broken_is_named(recording, which, change, name):
+    broken = recording.replace(**{which: change(getattr(recording, which))}, adc_range=None)
+    assert preflight(broken) == name
+
+
+def test_a_single_sample_at_the_known_rail_is_saturated(recording):
+    v = recording.v_out
+    assert preflight(recording.replace(v_out=v, adc_range=(-200.0, v.max()))) == "saturated"
+    assert preflight(recording.replace(v_out=v, adc_range=(v.min(), 200.0))) == "saturated"
+    assert preflight(recording.replace(v_out=v, adc_range=(-200.0, 200.0))) is None
+
+
+def test_swapped_records_are_misaligned(recording):
+    swapped = recording.replace(v_th=recording.v_out, v_out=recording.v_th)
+    assert preflight(swapped) == "misaligned"
+
+
+def test_the_shortest_record_is_named_before_anything_else():
+    one = simulate(samples=SHORTEST)
+    assert preflight(one) is None
+    nothing = np.full(SHORTEST - 1, np.nan)
+    assert preflight(one.replace(v_th=nothing, v_out=nothing)) == "too_short"
