@@ -20,8 +20,8 @@ LOADS = {
 }
 REPETITIONS = 200
 NORMAL_95 = 1.959964  # half-width of a 95 % interval in standard errors
-# Standard errors: an estimate that is not linear in the data is biased at high noise. A third of one
-# lowers the coverage from 95 to 93.7 %.
+# Standard errors: an estimate that is not linear in the data is biased at high noise. A third of
+# one lowers the coverage from 95 to 93.7 %.
 BIAS = 1 / 3
 LIMIT = 3.0  # standard deviations of a fraction or of a standard deviation of 200 draws
 

@@ -1,0 +1,256 @@
+"""Batches: chunks, lengths, rates and drivers mixed; every recording gets its own answer."""
+
+import h5py
+import jax
+import numpy as np
+import pytest
+
+import etid
+from etid import batch
+from etid.scenes import Scene, Trial
+from etid.transformer import ResistorLoad, SkinLoad
+
+LENGTH = 3334
+DRY = SkinLoad(r_s=33.4e3, r_p=186e3, c_p=0.12e-9)
+TRUTH = np.array([33.4e3, 186e3, 0.12e-9])
+SIGMAS = 5.0  # one in 2 million for a normal error, which the coverage test measures
+MANY = batch.CHUNK + 5
+
+
+def simulate(count=1, calibrations=1, seed=0, **options):
+    scene = Scene(
+        tuple(Trial(f"s01/dry/{i}", DRY, subject="s01", condition="dry") for i in range(count)),
+        tuple(Trial(f"calibration/{i}", ResistorLoad(98.8e3)) for i in range(calibrations)),
+        **({"samples": LENGTH} | options),
+    )
+    return scene.simulate(seed=seed)
+
+
+@pytest.fixture(scope="module")
+def study():
+    return simulate(MANY, seed=41)
+
+
+@pytest.fixture(scope="module")
+def driver(study):
+    return etid.identify_driver(study["calibration/0"])
+
+
+@pytest.fixture(scope="module")
+def fits(study, driver):
+    return etid.identify_skins(study.loaded, driver)
+
+
+def rows(fits, paths):
+    order = fits.labels["path"].tolist()
+    return fits.take(np.array([order.index(path) for path in paths]))
+
+
+def assert_same(one, other):
+    for a, b in zip(jax.tree.leaves(one.fit), jax.tree.leaves(other.fit), strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+def test_more_than_a_chunk_keeps_the_order(study, fits):
+    assert fits.labels["path"].tolist() == list(study.loaded)
+    assert fits.counts() == {"successful": MANY}
+    error = np.asarray(fits.circuit.values()) - TRUTH
+    assert (np.abs(error) < SIGMAS * np.asarray(fits.stderr.values())).all()
+
+
+def test_neither_chunk_nor_lane_changes_a_bit(study, driver, fits):
+    """Reversed, every recording sits in another lane of another chunk, next to other lanes."""
+    paths = list(study.loaded)[::-1]
+    again = etid.identify_skins([study[path] for path in paths], driver)
+    assert_same(again, rows(fits, paths))
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, 1e30])
+def test_a_bad_recording_changes_no_bit_of_its_neighbours(study, driver, fits, bad):
+    paths = list(study.loaded)[:6]
+    records = [study[path] for path in paths]
+    volts = records[2].v_out.copy()
+    volts[1000] = bad
+    records[2] = records[2].replace(v_out=volts, adc_range=None)
+    broken = etid.identify_skins(records, driver)
+    assert broken.verdicts[2] != "successful"
+    others = np.arange(6) != 2
+    assert_same(broken.take(others), rows(fits, np.array(paths)[others].tolist()))
+
+
+def test_a_recording_that_cannot_be_fitted_changes_no_bit_of_its_neighbours(study, driver, fits):
+    """It passes the pre-flight, so it sits in a lane beside the others and runs much longer."""
+    paths = list(study.loaded)[:6]
+    records = [study[path] for path in paths]
+    unrelated = np.roll(records[2].v_th, 3) * 0.5
+    records[2] = records[2].replace(v_out=unrelated, adc_range=None)
+    broken = etid.identify_skins(records, driver)
+    assert broken.verdicts[2] not in ("successful", "misaligned")
+    others = np.arange(6) != 2
+    assert_same(broken.take(others), rows(fits, np.array(paths)[others].tolist()))
+
+
+def test_lengths_and_rates_may_be_mixed(study, driver):
+    recording = study["s01/dry/0"]
+    slow = simulate(sample_rate=150e3, seed=3)["s01/dry/0"].replace(path="slow")
+    short = recording.replace(
+        v_th=recording.v_th[:1500], v_out=recording.v_out[:1500], path="short"
+    )
+    fits = etid.identify_skins([short, recording, slow], driver)
+    assert fits.labels["path"].tolist() == ["short", "s01/dry/0", "slow"]
+    assert fits.counts() == {"successful": 3}
+    error = np.asarray(fits.circuit.values()) - TRUTH
+    assert (np.abs(error) < SIGMAS * np.asarray(fits.stderr.values())).all()
+
+
+def test_one_function_per_length_serves_all_drivers(study, driver):
+    """A second driver, other recordings and another number of them: nothing is traced again."""
+    other = etid.identify_driver(simulate(seed=5)["calibration/0"])
+    records = [study[path] for path in list(study.loaded)[:9]]
+    etid.identify_skins(records, driver)
+    before = batch._chunk._cached._cache_size()
+    etid.identify_skins(records[:7], other)
+    assert batch._chunk._cached._cache_size() == before
+
+
+def test_a_failed_driver_costs_its_own_recordings():
+    study = simulate(4, calibrations=2, seed=6)
+    records = [
+        study["calibration/0"],
+        study["calibration/1"].replace(v_out=np.zeros(LENGTH)),
+        *(
+            study[path].replace(calibration=f"calibration/{i % 2}")
+            for i, path in enumerate(study.loaded)
+        ),
+    ]
+    result = etid.identify_study(etid.Study.from_recordings(records))
+    assert result.fits.verdicts.tolist() == ["successful", "driver_failed"] * 2
+    assert list(result.drivers) == [("calibration/0",)]
+    assert list(result.failures) == [("calibration/1",)]
+    for note in result.fits.notes[1::2]:
+        assert "'calibration/1': flat" in note
+    assert result.fits.notes[0] == ""
+
+
+def test_a_driver_without_success_is_kept_and_marks_its_fits(study):
+    """Not refused before the fit, so there are numbers; but none of them may be trusted."""
+    calibration = study["calibration/0"]
+    early = calibration.replace(v_out=np.roll(calibration.v_out, -3), adc_range=None)
+    records = [early, *(study[path] for path in list(study.loaded)[:2])]
+    result = etid.identify_study(etid.Study.from_recordings(records))
+    assert next(iter(result.drivers.values())).verdict != "successful"
+    assert "successful" not in result.fits.counts()
+    assert all(result.fits.notes)
+
+
+@pytest.mark.parametrize("named", ["nowhere", "s01/dry/1"])
+def test_a_calibration_that_is_none_is_named(study, named):
+    """It does not exist, or has no known resistor."""
+    records = [study[path] for path in ("calibration/0", "s01/dry/0", "s01/dry/1")]
+    records[1] = records[1].replace(calibration=named)
+    result = etid.identify_study(etid.Study.from_recordings(records))
+    assert result.fits.verdicts.tolist() == ["driver_failed", "successful"]
+    assert named in result.fits.notes[0]
+
+
+def test_without_a_name_there_must_be_one_calibration_only():
+    study = simulate(2, calibrations=2, seed=7)
+    records = [study[path].replace(calibration=()) for path in study]
+    result = etid.identify_study(etid.Study.from_recordings(records))
+    assert result.fits.counts() == {"unreadable": 2}
+    assert all("names no calibration and the study has 2" in note for note in result.fits.notes)
+
+
+def test_a_study_from_a_file_gives_the_same_bits(study, tmp_path):
+    part = etid.Study.from_recordings(
+        [study[path] for path in ("calibration/0", "s01/dry/0", "s01/dry/1")]
+    )
+    part.write(tmp_path / "study.h5")
+    with etid.read(tmp_path / "study.h5") as again:
+        from_file = etid.identify_study(again).fits
+    in_memory = etid.identify_study(part).fits
+    assert sorted(from_file.labels["path"]) == sorted(in_memory.labels["path"])
+    assert_same(from_file, rows(in_memory, from_file.labels["path"].tolist()))
+
+
+def test_progress_is_shown_only_on_request(study, driver, capsys):
+    records = [study["s01/dry/0"], study["s01/dry/1"].replace(v_out=np.zeros(LENGTH))]
+    etid.identify_skins(records, driver)
+    assert capsys.readouterr() == ("", "")
+    etid.identify_skins(records, driver, progress=True)
+    printed = capsys.readouterr()
+    assert printed.out == ""
+    assert "2/2" in printed.err
+
+
+# The table of fits
+
+
+@pytest.fixture(scope="module")
+def mixed(study, driver):
+    """Two fits and two failures of two subjects."""
+    records = [study[f"s01/dry/{i}"] for i in range(4)]
+    records[1] = records[1].replace(v_out=np.zeros(LENGTH))
+    records[3] = records[3].replace(v_out=np.zeros(LENGTH), subject="s02")
+    return etid.identify_skins(iter(records), driver)
+
+
+def test_failures_are_rows_without_numbers(mixed):
+    table = mixed.table()
+    assert {len(column) for column in table.values()} == {4}
+    failed = table["verdict"] == "flat"
+    assert failed.tolist() == [False, True, False, True]
+    for name in ("r_s", "r_p", "c_p", "r_s_stderr", "rrse", "chi2"):
+        assert (np.isnan(table[name]) == failed).all()
+    assert all(table["note"][failed])
+    assert not any(table["note"][~failed])
+    assert mixed.counts() == {"flat": 2, "successful": 2}
+    assert len(mixed.successful()) == 2
+
+
+def test_a_group_without_success_is_counted_and_has_no_median(mixed):
+    first, second = mixed.summary("subject")
+    assert (first["subject"], first["fits"], first["successful"]) == ("s01", 3, 2)
+    assert (second["subject"], second["fits"], second["successful"]) == ("s02", 1, 0)
+    assert np.isnan(second["r_p"])
+    good = mixed.successful()
+    np.testing.assert_allclose(first["r_p"], np.mean(np.asarray(good.circuit.r_p)))
+    np.testing.assert_allclose(first["r_p_spread"], np.std(np.asarray(good.circuit.r_p), ddof=1))
+    np.testing.assert_allclose(first["r_p_stderr"], np.mean(np.asarray(good.stderr.r_p)))
+    assert "2 successful" in str(mixed)
+    assert "0/1" in str(mixed)
+
+
+def test_labels_select(mixed):
+    assert mixed.where(subject="s02").labels["path"].tolist() == ["s01/dry/3"]
+    assert len(mixed.where(subject="s01", condition="damp")) == 0
+
+
+def test_failures_survive_a_file_with_units(mixed, tmp_path):
+    file = tmp_path / "fits.h5"
+    mixed.write(file)
+    again = etid.Fits.read(file)
+    assert again.verdicts.tolist() == mixed.verdicts.tolist()
+    for name, column in mixed.table().items():
+        np.testing.assert_array_equal(again.table()[name], column)
+    np.testing.assert_array_equal(again.fit.shared_cov, mixed.fit.shared_cov)
+    with h5py.File(file) as content:
+        assert content["c_p"].attrs["unit"] == "farad"
+        assert content["r_s_stderr"].attrs["unit"] == "ohm"
+        assert content.attrs["method"] == "output_error"
+        assert content.attrs["etid_version"] == etid.__version__
+
+
+def test_a_file_of_another_circuit_asks_for_it(mixed, tmp_path):
+    file = tmp_path / "fits.h5"
+    mixed.write(file)
+    with pytest.raises(ValueError, match="'SkinRC'; pass that class"):
+        etid.Fits.read(file, circuit=etid.Resistor)
+    with h5py.File(file, "r+") as content:
+        content.attrs["circuit"] = "SkinTwoLayer"
+    with pytest.raises(ValueError, match="'SkinTwoLayer'; pass that class"):
+        etid.Fits.read(file)
+    with h5py.File(file, "r+") as content:
+        content.attrs["schema"] = "etid/recording"
+    with pytest.raises(ValueError, match="attribute schema is 'etid/recording'"):
+        etid.Fits.read(file)
