@@ -35,6 +35,7 @@ BIASED = 16.0  # squared standard errors between an estimate and the minimum of 
 PASSIVE = 2.0  # standard errors by which Re Z_th may be negative
 BAND = np.linspace(0.0003, 0.4, 400)  # of the sample rate, where a source must be passive
 LEVELS = (1.0, 0.125, 0.5, 2.0, 8.0)  # impedance levels at which a circuit is started
+RIPPLE = 1e-5  # of the signal, left by the interpolation: no recording is better known than that
 IMPULSE = 512  # samples of a discrete model's impulse response
 UNWANTED = 1e3  # added to the cost of a start that did not settle; any cost is smaller
 
@@ -65,11 +66,12 @@ def measure(
     sample_rate: Float[Array, ""],
 ) -> Measurement:
     """Estimate the noise of both records; a `resolution` is the converter's step [V] or 0."""
+    floor_th, floor_out = RIPPLE * jnp.ptp(v_th), RIPPLE * jnp.ptp(v_out)
     return Measurement(
         v_th,
         v_out,
-        noise_std(v_th, resolution_th),
-        noise_std(v_out, resolution_out),
+        jnp.maximum(noise_std(v_th, resolution_th), floor_th),
+        jnp.maximum(noise_std(v_out, resolution_out), floor_out),
         sample_rate,
     )
 

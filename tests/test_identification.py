@@ -74,12 +74,13 @@ def test_skins_are_right_within_their_errors(fits):
     assert (np.abs(np.asarray(fits.chi2) - 1) < 0.25).all()
 
 
-def test_without_noise_the_bias_is_below_two_parts_in_a_thousand():
-    clean = scene(snr_db=None, bits=None).simulate(seed=0)
+def test_with_rounding_alone_the_bias_is_below_half_a_per_cent():
+    """One period with its trigger delay fitted; three reach 0.2 % in test_spice_recordings."""
+    clean = scene(snr_db=None).simulate(seed=0)
     driver = etid.identify_driver(clean["calibration/98k8"])
     fits = etid.identify_skins(clean.loaded, driver)
     for i, path in enumerate(fits.labels["path"]):
-        assert (np.abs(elements(fits)[i] / truth(path) - 1) < 2e-3).all()
+        assert (np.abs(elements(fits)[i] / truth(path) - 1) < 5e-3).all()
 
 
 def test_one_recording_equals_its_lane_of_a_batch(study, driver, fits):

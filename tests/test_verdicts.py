@@ -1,11 +1,14 @@
 """Every verdict is produced here, and none is silent."""
 
+from collections import Counter
 from typing import Any
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import etid
+from etid.circuits import Ohm
 from etid.scenes import Scene, Trial
 from etid.transformer import ResistorLoad, SkinLoad
 from etid.verdicts import RESULTS, message, verdict, verdict_names, verdicts_of
@@ -147,24 +150,47 @@ def test_unreadable_without_a_calibration(study):
 
 @pytest.fixture(scope="module")
 def baselines():
-    """The paper's method from quiet to noisy: its verdicts, driver and skin."""
-    found = set()
-    for snr_db in (30.0, 45.0, 60.0):
-        study = simulate(snr_db=snr_db, seed=2)
-        driver = etid.identify_driver(
-            study["calibration/98k8"], method="steiglitz_mcbride", throw=False
-        )
-        found.add(driver.verdict)
-        for method in ("steiglitz_mcbride", "equation_error"):
-            fit = etid.identify_skin(study["loaded/0"], driver, method=method, throw=False)
-            found.add(fit.verdict)
+    """The paper's method from quiet to noisy: how often its drivers and skins end how."""
+    found = Counter()
+    for snr_db in (None, 60.0, 40.0, 30.0):
+        for seed in range(3):
+            study = simulate(snr_db=snr_db, seed=seed)
+            driver = etid.identify_driver(
+                study["calibration/98k8"], method="steiglitz_mcbride", throw=False
+            )
+            found[driver.verdict] += 1
+            for method in ("steiglitz_mcbride", "equation_error"):
+                found[verdict_of(study["loaded/0"], driver, method=method)] += 1
     return found
 
 
-def test_the_papers_method_says_how_it_fails(baselines):
-    assert {"max_steps_reached", "unstable", "biased"} & baselines
-    assert "successful" not in baselines
-    assert baselines <= {"max_steps_reached", "unstable", "biased", "misfit", "nonphysical"}
+@pytest.mark.parametrize("name", ["max_steps_reached", "unstable", "biased", "misfit"])
+def test_the_papers_method_says_how_it_fails(baselines, name):
+    assert baselines[name] > 0
+
+
+def test_the_papers_method_is_never_successful_here(baselines):
+    """Without noise its loop is unstable, with noise its R_s is far off."""
+    assert baselines["successful"] == 0
+    assert baselines.total() == 36
+
+
+class Wall(etid.AbstractCircuit):
+    """No model of anything: below `LEVEL` it jumps, so that every step down is a wrong one."""
+
+    r: Ohm = etid.parameter("ohm", typical=100e3)
+
+    def impedance(self):
+        return etid.resistor(jnp.where(self.r >= LEVEL, self.r, 1e9))
+
+
+LEVEL = float(jnp.exp(jnp.log(100e3)))  # where its fit starts, rounded as the fit rounds it
+
+
+def test_stalled(driver):
+    """The slope says down, and no step is small enough: that is no convergence."""
+    recording = simulate(ResistorLoad(50e3))["loaded/0"]
+    assert verdict_of(recording, driver, circuit=Wall()) == "stalled"
 
 
 def test_names_and_values_are_inverse():
