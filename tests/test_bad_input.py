@@ -1,5 +1,7 @@
 """One study with everything that can be wrong in it: each mistake costs its own recording."""
 
+from typing import Any
+
 import h5py
 import numpy as np
 import pytest
@@ -222,11 +224,12 @@ def test_an_order_below_two_is_refused(calibration, order):
 
 
 def test_an_unknown_method_is_refused_everywhere(study, calibration, driver):
+    unknown: Any = "guess"
     for call in (
-        lambda: etid.identify_driver(calibration, method="guess"),
-        lambda: etid.identify_skin(study["s01/good"], driver, method="guess"),
-        lambda: etid.identify_skins([study["s01/good"]], driver, method="guess"),
-        lambda: etid.identify_study(study, method="guess"),
+        lambda: etid.identify_driver(calibration, method=unknown),
+        lambda: etid.identify_skin(study["s01/good"], driver, method=unknown),
+        lambda: etid.identify_skins([study["s01/good"]], driver, method=unknown),
+        lambda: etid.identify_study(study, method=unknown),
     ):
         with pytest.raises(Exception, match="guess"):  # the type checker of the tests comes first
             call()
