@@ -118,15 +118,17 @@ def test_scaling_all_voltages_changes_nothing(study, driver):
     np.testing.assert_allclose(again.circuit.values(), fit.circuit.values(), rtol=1e-6)
 
 
-def test_ten_times_the_noise_gives_ten_times_the_error(study):
+def test_ten_decibels_of_noise_give_the_root_of_ten_in_the_errors():
+    """Noisy enough that what one period leaves undetermined (delay, C_p) is noise's doing."""
     errors = []
-    for snr_db in (70.0, 50.0):
+    for snr_db in (55.0, 45.0):
         noisy = scene(snr_db=snr_db, bits=None).simulate(seed=5)
-        driver = etid.identify_driver(noisy["calibration/98k8"], throw=False)
+        driver = etid.identify_driver(noisy["calibration/98k8"])
         fits = etid.identify_skins(noisy.loaded, driver)
         errors.append(np.asarray(fits.stderr.values()) / elements(fits))
-    ratio = np.median(errors[1] / errors[0])
-    assert 7 < ratio < 13  # the noise estimate itself scatters by some per cent
+    ratio = np.median(errors[1] / errors[0], axis=0)
+    # Estimated noise and a fresh driver at each level scatter by some 10 % together.
+    assert (np.abs(ratio / np.sqrt(10) - 1) < 0.3).all()
 
 
 def test_a_driver_serves_another_sample_rate(study):
