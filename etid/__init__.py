@@ -32,10 +32,10 @@ from etid.importing import import_file as import_file
 from etid.recording import Recording as Recording
 from etid.recording import RecordingError as RecordingError
 from etid.recording import Samples as Samples
-from etid.recording import Study as Study
 from etid.results import Fit as Fit
 from etid.results import Fits as Fits
 from etid.results import IdentificationError as IdentificationError
+from etid.study import Study as Study
 from etid.verdicts import RESULTS as RESULTS
 
 __version__ = "0.1.0"

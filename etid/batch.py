@@ -28,8 +28,9 @@ from etid.identify import (
     skin_lane,
 )
 from etid.preflight import preflight
-from etid.recording import Metadata, Recording, RecordingError, Study
+from etid.recording import Metadata, Recording, RecordingError
 from etid.results import LABELS, Fit, Fits, IdentificationError
+from etid.study import Study
 from etid.verdicts import message
 
 CHUNK = 32  # lanes of one call: the last chunk is filled up, so a study compiles once per length
@@ -151,7 +152,7 @@ def identify_skins(
     circuit = SkinRC() if circuit is None else circuit
     check_method(method, circuit)
     if isinstance(recordings, Study):
-        study, paths = recordings, list(recordings)
+        study, paths = recordings, [*recordings, *recordings.problems]
         metadata = [_metadata(study, path) for path in paths]
         fits, notes = _identify(
             len(paths), lambda row: (study[paths[row]], driver), circuit, method, progress
@@ -193,7 +194,8 @@ def identify_study(
     """Identify every driver of a study from its calibrations, then every loaded recording.
 
     A recording that names no calibration belongs to the only one in the study; if there are
-    several, it gets the verdict `unreadable` rather than a guess.
+    several, it gets the verdict `unreadable` rather than a guess. What cannot be read at all,
+    `study.problems`, comes last and has that verdict too.
 
     Args:
         study: Calibrations and loaded recordings.
@@ -204,8 +206,8 @@ def identify_study(
     """
     circuit = SkinRC() if circuit is None else circuit
     check_method(method, circuit)
-    loaded = [path for path in study if _kind(study, path) != "calibration"]
-    calibrations = [path for path in study if _kind(study, path) == "calibration"]
+    calibrations = list(study.calibrations)
+    loaded = [*study.loaded, *study.problems]
     drivers: dict[tuple[str, ...], Driver] = {}
     failures: dict[tuple[str, ...], str] = {}
 
@@ -238,13 +240,6 @@ def identify_study(
     metadata = [_metadata(study, path) for path in loaded]
     table = Fits(_stack(fits), _labels(metadata), np.array(notes, dtype=str))
     return StudyFits(table, drivers, failures)
-
-
-def _kind(study: Study, path: str) -> str:
-    try:
-        return study.metadata(path).kind
-    except RecordingError:
-        return "unreadable"
 
 
 def _metadata(study: Study, path: str) -> Any:

@@ -146,13 +146,12 @@ def _fit(arguments: argparse.Namespace) -> int:
             method=arguments.method,
             progress=sys.stderr.isatty(),
         )
-        unread = {path: str(problem) for path, problem in study.problems.items()}
     outcome.fits.write(arguments.target)
-    print(_summary(outcome, unread))
+    print(_summary(outcome))
     return DONE if "successful" in outcome.fits.counts() else WRONG_DATA
 
 
-def _summary(outcome: StudyFits, unread: dict[str, str]) -> str:
+def _summary(outcome: StudyFits) -> str:
     """What a batch came to: verdicts, drivers, medians, and what went wrong where."""
     fits = outcome.fits
     verdicts = ", ".join(f"{count} {name}" for name, count in fits.counts().items())
@@ -172,7 +171,6 @@ def _summary(outcome: StudyFits, unread: dict[str, str]) -> str:
         ]
     failed = np.flatnonzero(fits.verdicts != "successful")
     wrong = [f"{fits.labels['path'][i]}: {fits.verdicts[i]}. {fits.notes[i]}" for i in failed]
-    wrong = [f"{path}: not read. {text}" for path, text in unread.items()] + wrong
     if wrong:
         lines += ["", f"without success: {len(wrong)} recordings"]
         lines += [" ".join(line.split()) for line in wrong[:_SHOWN]]

@@ -116,6 +116,19 @@ def loaded(source: SourceImpedance, load: Rational, rate: float | Float[Array, "
     return StateSpace(A, B, C, share[None])
 
 
+class Calibration(eqx.Module):
+    """What a skin must know of the calibration, besides Z_th and its covariance.
+
+    Attributes:
+        r_load: Known resistor [Ω].
+        delay_std: Standard deviation [s] of its trigger delay. Only records with different
+            resistors tell that delay from a fast pole of Z_th; one resistor leaves it open.
+    """
+
+    r_load: Float[Array, ""]
+    delay_std: Float[Array, ""]
+
+
 class Driver(eqx.Module):
     """An identified driver: Z_th as a discrete filter and, once refined, in continuous time.
 
@@ -128,6 +141,7 @@ class Driver(eqx.Module):
         sample_rate: Rate of the discrete filter [Hz].
         source: Continuous Z_th, valid at any sample rate; None if the method gives none.
         cov: Covariance of the parameters of `source`, flattened in field order.
+        calibration: The known resistor and how far its delay is in doubt.
         rrse: Largest root relative squared error over the calibrations (paper, eq. 3).
         chi2: Residual over expected variance per degree of freedom: 1 if the model is right.
         result: Verdict.
@@ -140,6 +154,7 @@ class Driver(eqx.Module):
     sample_rate: float | Float[Array, ""]
     source: SourceImpedance | None
     cov: Float[Array, "parameter parameter"] | None
+    calibration: Calibration | None
     rrse: Float[Array, ""]
     chi2: Float[Array, ""]
     result: RESULTS

@@ -15,7 +15,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float
 
-from etid import output_error, steiglitz_mcbride
+from etid import output_error, prediction, steiglitz_mcbride
 from etid.circuits import AbstractCircuit, SkinRC
 from etid.driver import Driver, SourceImpedance
 from etid.levenberg_marquardt import normal_equations
@@ -76,8 +76,8 @@ def measure(
     )
 
 
-def _prepare(m: Measurement) -> output_error.Records:
-    return output_error.prepare(m.v_th, m.v_out, m.sigma_th, m.sigma_out, m.sample_rate)
+def _prepare(m: Measurement) -> prediction.Records:
+    return prediction.prepare(m.v_th, m.v_out, m.sigma_th, m.sigma_out, m.sample_rate)
 
 
 def _verdict(*conditions: tuple[Bool[Array, ""], RESULTS]) -> RESULTS:
@@ -180,6 +180,7 @@ def driver_by_steiglitz_mcbride(
         sample_rate=m.sample_rate[0],
         source=None,
         cov=None,
+        calibration=None,
         rrse=best.rrse,
         chi2=jnp.where(jnp.isfinite(best.rrse), chi2, jnp.inf),
         result=_verdict(
@@ -198,8 +199,8 @@ def driver_by_steiglitz_mcbride(
 
 def skin_by_output_error(m: Measurement, driver: Driver, circuit: AbstractCircuit) -> Fit:
     """Refine from the best of several impedance levels and, for SkinRC, the paper's estimate."""
-    source, source_cov = driver.source, driver.cov
-    if source is None or source_cov is None:
+    source, source_cov, calibration = driver.source, driver.cov, driver.calibration
+    if source is None or source_cov is None or calibration is None:
         raise ValueError("output error needs a driver identified by output error")
     typical = circuit.log_values()
     is_ohm = jnp.array([unit == "ohm" for unit in circuit.units().values()])
@@ -211,7 +212,7 @@ def skin_by_output_error(m: Measurement, driver: Driver, circuit: AbstractCircui
         usable = jnp.all(values > 0) & jnp.isfinite(values).all()
         starts.append(jnp.where(usable, jnp.log(jnp.where(usable, values, 1.0)), typical))
     fitted, estimate = output_error.fit_circuit(
-        _prepare(m), source, source_cov, circuit.with_log_values(jnp.stack(starts))
+        _prepare(m), source, source_cov, calibration, circuit.with_log_values(jnp.stack(starts))
     )
     values = fitted.values()
     errors = jnp.sqrt(jnp.diagonal(estimate.cov))  # of the logarithms, so relative ones
@@ -294,7 +295,7 @@ def driver_by_output_error(m: Measurement, r_load: Float[Array, " record"], orde
     records = jax.vmap(_prepare)(m)
     starts = source_starts(baseline.a, order, m.sample_rate[0], r_load.mean())
     # One start after the other: side by side they would all run as long as the slowest, and slower.
-    sources, estimates = jax.lax.map(
+    sources, estimates, calibrations = jax.lax.map(
         lambda start: output_error.fit_source(records, r_load, start), starts
     )
     frequency = jnp.asarray(BAND) * m.sample_rate[0]
@@ -315,7 +316,9 @@ def driver_by_output_error(m: Measurement, r_load: Float[Array, " record"], orde
     cost = jnp.where(finite, estimates.chi2 + log_s, jnp.inf)
     cost = cost + jnp.where(settled, 0.0, UNWANTED) + jnp.where(passive, 0.0, UNWANTED)
     chosen = jnp.argmin(jnp.where(finite, cost, jnp.inf))
-    source, estimate = jax.tree.map(lambda leaf: leaf[chosen], (sources, estimates))
+    source, estimate, calibration = jax.tree.map(
+        lambda leaf: leaf[chosen], (sources, estimates, calibrations)
+    )
     diverged = RESULTS.promote(estimate.result) == RESULTS.nonlinear_divergence
     return Driver(
         b=baseline.b,
@@ -323,6 +326,7 @@ def driver_by_output_error(m: Measurement, r_load: Float[Array, " record"], orde
         sample_rate=m.sample_rate[0],
         source=source,
         cov=estimate.cov,
+        calibration=calibration,
         rrse=estimate.rrse,
         chi2=estimate.chi2,
         result=_verdict(

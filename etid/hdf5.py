@@ -1,51 +1,19 @@
-"""Studies in HDF5 files: `read`, `write`, and `check`, which says all that is wrong with a file.
+"""Studies in HDF5 files: `read`, and `check`, which says all that is wrong with a file.
 
-The layout is that of `etid.schema`.  Opening a file reads attributes and the headers of datasets
-only; samples are read when a recording is accessed.  Trouble with the whole file is raised, trouble
+The layout is that of `etid.schema`. Opening a file reads attributes and the headers of datasets
+only; samples are read when a recording is accessed. Trouble with the whole file is raised, trouble
 with one recording is put aside in `Study.problems`.
 """
 
-import contextlib
-import dataclasses
 import os
 import pathlib
-import re
-import secrets
-import weakref
-from collections.abc import Callable, Hashable, Iterator
-from typing import Any
 
 import h5py
-import numpy as np
-from h5py import h5o  # type: ignore[attr-defined]  # compiled, without stubs
 
 from etid import schema
-from etid.recording import (
-    SIGNALS,
-    AbstractSource,
-    Metadata,
-    Recording,
-    RecordingError,
-    Samples,
-    Study,
-    metadata_from,
-    tidy_path,
-)
-
-# What h5py raises, depending on where in a damaged file the HDF5 library gives up.
-LIBRARY_ERRORS = (
-    OSError,
-    RuntimeError,
-    ValueError,
-    TypeError,
-    KeyError,
-    AttributeError,
-    OverflowError,
-    MemoryError,
-)
-
-
-_NAMES = {field.name for field in schema.FIELDS}
+from etid.recording import RecordingError
+from etid.scan import Scan, attribute, translated
+from etid.study import Study
 
 
 def read(path: str | os.PathLike[str]) -> Study:
@@ -63,15 +31,14 @@ def read(path: str | os.PathLike[str]) -> Study:
     name = os.fspath(path)
     file = _open(name)
     try:
-        scan = _Scan(file, name)
+        scan = Scan(file, name)
     except BaseException:
         file.close()
         raise
     first: dict[str, RecordingError] = {}
     for problem in scan.problems:
         first.setdefault(problem.path, problem)
-    sources = {row.metadata.path: row for block in scan.blocks.values() for row in block.rows()}
-    return Study(sources, problems=first, file=name, close=file.close)
+    return Study(scan.sources(), problems=first, file=name, close=file.close)
 
 
 def check(path: str | os.PathLike[str]) -> list[RecordingError]:
@@ -86,32 +53,11 @@ def check(path: str | os.PathLike[str]) -> list[RecordingError]:
     name = os.fspath(path)
     try:
         with _open(name) as file:
-            scan = _Scan(file, name)
-            for block in scan.blocks.values():
-                for row in block.rows():
-                    scan.problems.extend(_bad_samples(row))
+            scan = Scan(file, name)
+            scan.check_samples()
     except RecordingError as problem:
         return [problem]
     return scan.problems
-
-
-def _bad_samples(row: "_Row") -> list[RecordingError]:
-    try:
-        records = row.load().samples.items()
-    except RecordingError as problem:
-        return [problem]
-    counts = {name: int(np.sum(~np.isfinite(record.stored))) for name, record in records}
-    return [
-        RecordingError(
-            f"{count} of {row.block.headers[name].length} samples are not finite",
-            file=row.block.name,
-            path=row.metadata.path,
-            field=name,
-            remedy="Record again, or expect a verdict instead of a fit",
-        )
-        for name, count in counts.items()
-        if count
-    ]
 
 
 def _open(name: str) -> h5py.File:
@@ -124,7 +70,7 @@ def _open(name: str) -> h5py.File:
             file=name,
             remedy="Turn other formats into the schema with `etid import`",
         )
-    with _translated(name):
+    with translated(name):
         file = h5py.File(name, "r")
     try:
         _check_root(file, name)
@@ -138,13 +84,13 @@ def _check_root(file: h5py.File, name: str) -> None:
     found: dict[str, str] = {}
     for field in schema.at("file attribute").values():
         remedy = f"The file needs the attributes schema={schema.NAME!r} and schema_version"
-        with _translated(name, field=field.name):
+        with translated(name, field=field.name):
             if field.name not in file.attrs:
                 near = schema.near_miss(field.name, file.attrs)
                 hint = f", did you mean {field.name} by {near}?" if near else ""
                 raise RecordingError(f"is missing{hint}", remedy=remedy)
             try:
-                found[field.name] = field.parse(_attribute(file.attrs, field.name))
+                found[field.name] = field.parse(attribute(file.attrs, field.name))
             except ValueError as error:
                 raise RecordingError(str(error), remedy=remedy) from None
     problem = schema.version_problem(found["schema_version"])
@@ -152,492 +98,3 @@ def _check_root(file: h5py.File, name: str) -> None:
         raise RecordingError(
             problem, file=name, field="schema_version", remedy="Read it with the etid that wrote it"
         )
-
-
-@contextlib.contextmanager
-def _translated(file: str, path: str = "", field: str = "") -> Iterator[None]:
-    """Errors of the HDF5 library as errors of a recording; ours keep their text."""
-    try:
-        yield
-    except RecordingError as error:
-        raise error.located(file=file, path=path, field=field) from None
-    except LIBRARY_ERRORS as error:
-        raise RecordingError(
-            f"the HDF5 library cannot read it ({type(error).__name__}: {error})",
-            file=file,
-            path=path,
-            field=field,
-            remedy="The file is damaged or was not closed: copy or record it again",
-        ) from error
-
-
-def _attribute(attributes: h5py.AttributeManager, name: str) -> Any:
-    """The value of an attribute, whose type is looked at first.
-
-    A sequence of variable length is in no schema; made from a damaged text, it crashes the library.
-    """
-    dtype = attributes.get_id(name).dtype
-    if h5py.check_vlen_dtype(dtype) not in (None, str, bytes):
-        raise TypeError("it is a sequence of variable length")
-    return attributes[name]
-
-
-@dataclasses.dataclass(frozen=True)
-class _Header:
-    """What is known of a dataset without reading its samples."""
-
-    shape: tuple[int, ...]
-    dtype: np.dtype
-    conversion: float
-    offset: float
-
-    @property
-    def length(self) -> int:
-        return self.shape[-1]
-
-    @property
-    def stacked(self) -> bool:
-        return len(self.shape) == 2
-
-
-@dataclasses.dataclass(eq=False)
-class _Block:
-    """A recording group of the file: one recording, or a stack of trials."""
-
-    file: h5py.File
-    name: str
-    metadata: Metadata
-    trials: tuple[str, ...] | None
-    headers: dict[str, _Header]
-    shared: Callable[[], Samples | None] = lambda: None
-    datasets: dict[str, h5py.Dataset] = dataclasses.field(default_factory=dict)
-
-    def rows(self) -> "Iterator[_Row]":
-        count = self.headers["v_out"].shape[0] if self.headers["v_out"].stacked else None
-        return (_Row(self, row) for row in ([None] if count is None else range(count)))
-
-    def samples(self, name: str, row: int | None) -> Samples:
-        header = self.headers[name]
-        common = row is not None and not header.stacked
-        kept = self.shared() if common else None
-        if kept is not None:
-            return kept
-        with _translated(self.name, self.metadata.path, name):
-            if not self.file:
-                raise RecordingError("the file is closed", remedy="Read it again, or use `with`")
-            dataset = self.datasets.get(name) or self.file[f"{self.metadata.path}/{name}"]
-            assert isinstance(dataset, h5py.Dataset)  # the scan has seen it
-            if header.stacked:  # opening costs as much as reading a row
-                self.datasets[name] = dataset
-            stored = dataset[row] if header.stacked else dataset[()]
-            stored.flags.writeable = False
-            samples = Samples(stored, header.conversion, header.offset)
-        if common:  # kept as long as some recording of the stack is in use
-            self.shared = weakref.ref(samples)
-        return samples
-
-
-@dataclasses.dataclass(frozen=True, eq=False)
-class _Row(AbstractSource):
-    """One recording of a file."""
-
-    block: _Block
-    row: int | None
-
-    @property
-    def metadata(self) -> Metadata:
-        common = self.block.metadata
-        if self.row is None:
-            return common
-        trial = self.block.trials[self.row] if self.block.trials else ""
-        return dataclasses.replace(common, path=f"{common.path}/{self.row}", trial=trial)
-
-    @property
-    def layout(self) -> Hashable:
-        return tuple(
-            (name, header.dtype.str, header.length, header.conversion, header.offset)
-            for name, header in self.block.headers.items()
-        )
-
-    @property
-    def unloaded(self) -> Hashable:
-        common = not self.block.headers["v_th"].stacked
-        return (id(self.block), None if common else self.row)
-
-    def load(self) -> Recording:
-        records: dict[str, Any] = {
-            name: self.block.samples(name, self.row) for name in self.block.headers
-        }
-        return Recording(**records, **vars(self.metadata))
-
-
-class _Scan:
-    """One walk through a file: its recording groups, and what is wrong with the others."""
-
-    def __init__(self, file: h5py.File, name: str) -> None:
-        self.file = file
-        self.name = name
-        self.blocks: dict[str, _Block] = {}
-        self.problems: list[RecordingError] = []
-        self._kinds: dict[str, str] = {}
-        self._seen: dict[int, str] = {}
-        self._walk(file, "")
-        for path, block in self.blocks.items():
-            for calibration in block.metadata.calibration:
-                self._check_calibration(path, calibration)
-        wrong = {problem.path for problem in self.problems}
-        self.blocks = {path: block for path, block in self.blocks.items() if path not in wrong}
-
-    def _report(self, path: str, field: str, message: str, remedy: str = "") -> None:
-        self.problems.append(
-            RecordingError(message, file=self.name, path=path or "/", field=field, remedy=remedy)
-        )
-
-    @contextlib.contextmanager
-    def _reported(self, path: str, field: str = "") -> Iterator[None]:
-        """Put an error aside and go on."""
-        try:
-            with _translated(self.name, path or "/", field):
-                yield
-        except RecordingError as problem:
-            self.problems.append(problem)
-
-    def _walk(self, group: h5py.Group, path: str) -> None:
-        with self._reported(path):
-            address = h5o.get_info(group.id).addr
-            if address in self._seen:
-                first = self._seen[address] or "/"
-                remedy = "Store each recording once"
-                return self._report(path, "", f"is the same group as {first!r}", remedy)
-            self._seen[address] = path
-            near = "kind" in group.attrs or schema.near_miss("kind", group.attrs)
-            names = sorted(group, key=_natural)
-            if near or "v_out" in names:
-                return self._inspect(group, path, names)
-            for name in names:
-                child = f"{path}/{name}".lstrip("/")
-                with self._reported(child):
-                    self._enter(group, name, child)
-        return None
-
-    def _enter(self, group: h5py.Group, name: str, path: str) -> None:
-        """Walk on into a member of an ordinary group."""
-        link = group.get(name, getlink=True)
-        if isinstance(link, h5py.ExternalLink):
-            raise RecordingError(
-                f"is a link to another file, {link.filename!r}",
-                remedy="Copy the data into the file",
-            )
-        if isinstance(link, h5py.SoftLink):
-            if group.get(name) is None:
-                raise RecordingError(
-                    f"is a dangling link to {link.path!r}", remedy="Remove or mend it"
-                )
-            if isinstance(group[name], h5py.Group):
-                raise RecordingError(
-                    f"is a soft link to the group {link.path!r}", remedy="Remove the link"
-                )
-            return
-        member = group[name]
-        if isinstance(member, h5py.Group):
-            self._walk(member, path)
-        elif name in schema.at("dataset"):
-            raise RecordingError(
-                "is a dataset outside of a recording group",
-                remedy="Give its group the attribute kind and a dataset v_out",
-            )
-        elif isinstance(member, h5py.Dataset) and "kind" in member.attrs:
-            raise RecordingError(
-                "is a dataset with the attribute kind, where a group is expected",
-                remedy="Make it a group with the datasets v_th and v_out",
-            )
-
-    def _inspect(self, group: h5py.Group, path: str, names: list[str]) -> None:
-        """Check a recording group against the schema, field by field."""
-        before = len(self.problems)
-        if not path:
-            remedy = "Put the recording into a group of its own"
-            return self._report(path, "kind", "the root of a file cannot be a recording", remedy)
-        with self._reported(path, "path"):
-            tidy_path(path)
-        present = list(group.attrs)
-        found = self._attributes(group.attrs, schema.at("group attribute"), path, "")
-        kind = found.get("kind", "")
-        self._kinds[path] = kind
-        for field in schema.at("group attribute").values():
-            if field.required in ("always", kind) and field.name not in present:
-                self._missing(path, field)
-            if kind and field.forbidden == kind and field.name in present:
-                remedy = "Remove it, or change the kind"
-                self._report(path, field.name, f"a {kind} recording must not have it", remedy)
-        allowed = {
-            name: field
-            for name, field in schema.at("group attribute").items()
-            if not kind or field.forbidden != kind
-        }
-        self._near_misses(present, allowed, path, "")
-        headers: dict[str, _Header] = {}
-        for field in schema.at("dataset").values():
-            with self._reported(path, field.name):
-                if field.name in names:
-                    headers[field.name] = self._header(group, field, path)
-                elif field.required == "always":
-                    self._missing(path, field)
-        self._near_misses(names, schema.at("dataset"), path, "")
-        for name in set(names) - set(SIGNALS):
-            if isinstance(group.get(name, getlink=True), h5py.HardLink):
-                member = group[name]
-                if isinstance(member, h5py.Group) and "kind" in member.attrs:
-                    remedy = "Put it beside the other"
-                    self._report(
-                        f"{path}/{name}", "", f"lies inside the recording {path!r}", remedy
-                    )
-        if len(self.problems) == before:
-            with self._reported(path):
-                self.blocks[path] = self._block(path, found, headers)
-        return None
-
-    def _missing(self, path: str, field: schema.Field) -> None:
-        self._report(path, field.name, "is missing", f"Add {field.expects}")
-
-    def _near_misses(
-        self, names: list[str], known: dict[str, schema.Field], path: str, of: str
-    ) -> None:
-        absent = [name for name in known if name not in names]
-        for name in names:
-            near = None if name in _NAMES else schema.near_miss(name, absent)
-            if near:
-                message = f"is not in the schema, did you mean {near}?"
-                self._report(path, f"{of}{name}", message, "Rename it")
-
-    def _attributes(
-        self, attributes: Any, known: dict[str, schema.Field], path: str, of: str
-    ) -> dict[str, Any]:
-        """The attributes that are in the schema, parsed; those that cannot be are reported."""
-        found: dict[str, Any] = {}
-        for name in attributes:
-            if name not in known:
-                continue
-            try:
-                value = _attribute(attributes, name)
-            except LIBRARY_ERRORS as error:
-                self._report(path, f"{of}{name}", f"cannot be read ({error})", "Write it again")
-                continue
-            try:
-                found[name] = known[name].parse(value)
-            except ValueError as error:
-                remedy = f"The schema wants {known[name].expects}"
-                self._report(path, f"{of}{name}", str(error), remedy)
-        return found
-
-    def _header(self, group: h5py.Group, field: schema.Field, path: str) -> _Header:
-        """Shape, dtype and scale of a dataset that lies in this file."""
-        link = group.get(field.name, getlink=True)
-        remedy = "Copy the samples into the file"
-        if isinstance(link, h5py.ExternalLink):
-            raise RecordingError(f"is a link to another file, {link.filename!r}", remedy=remedy)
-        if group.get(field.name) is None:
-            target = getattr(link, "path", "")
-            raise RecordingError(f"is a dangling link to {target!r}", remedy="Mend the link")
-        dataset = group[field.name]
-        if not isinstance(dataset, h5py.Dataset):
-            what = "group" if isinstance(dataset, h5py.Group) else "datatype"
-            raise RecordingError(f"is a {what}", remedy=f"Add {field.expects} as a dataset")
-        here = h5o.get_info(self.file.id).fileno
-        if h5o.get_info(dataset.id).fileno != here or dataset.external or dataset.is_virtual:
-            raise RecordingError("its samples lie in another file", remedy=remedy)
-        if dataset.dtype.kind not in "iuf" or dataset.dtype.itemsize > 8:
-            raise RecordingError(
-                f"has dtype {dataset.dtype}",
-                remedy="Store integers or real numbers, at most 64 bit",
-            )
-        shape = dataset.shape
-        if shape is None or len(shape) not in (1, 2) or 0 in shape:
-            what = "is empty" if shape is None or 0 in shape else f"has shape {shape}"
-            raise RecordingError(what, remedy=f"The schema wants {field.expects}")
-        before = len(self.problems)
-        known, of = schema.at("dataset attribute"), f"{field.name}."
-        found = self._attributes(dataset.attrs, known, path, of)
-        self._near_misses(list(dataset.attrs), known, path, of)
-        if len(self.problems) == before and found.get("unit") != field.unit:
-            what = f"is {found['unit']!r}" if "unit" in found else "is missing"
-            raise RecordingError(
-                what, field=f"{field.name}.unit", remedy=f"It must be {field.unit!r}"
-            )
-        scale = found.get("conversion", 1.0), found.get("offset", 0.0)
-        try:
-            Samples(np.zeros(1, dataset.dtype), *scale)
-        except RecordingError as error:
-            raise RecordingError(error.message, field=f"{of}{error.field}") from None
-        return _Header(shape, dataset.dtype, *scale)
-
-    def _block(self, path: str, found: dict[str, Any], headers: dict[str, _Header]) -> _Block:
-        """What a group holds, once each field is right by itself."""
-        shapes = {name: header.shape for name, header in headers.items()}
-        out = shapes["v_out"]
-        if shapes["v_th"] not in (out, out[-1:]) or shapes.get("current", out) != out:
-            found_shapes = ", ".join(f"{name} {shape}" for name, shape in shapes.items())
-            raise RecordingError(
-                f"shapes do not fit each other: {found_shapes}",
-                remedy="The schema wants (time,) or (trial, time); only v_th may be (time,) beside "
-                "a stacked v_out",
-            )
-        stacked = len(out) == 2
-        if stacked and found["kind"] == "calibration":
-            raise RecordingError(
-                f"holds {out[0]} stacked calibrations",
-                field="v_out",
-                remedy="Write one group per calibration",
-            )
-        trials = found.pop("trial", None)
-        trials = (trials,) if isinstance(trials, str) else trials
-        if trials is not None and len(trials) != (out[0] if stacked else 1):
-            wanted = f"{out[0]} labels, one per row" if stacked else "one label"
-            raise RecordingError(
-                f"has {len(trials)} labels", field="trial", remedy=f"Write {wanted}"
-            )
-        found.pop("kind")
-        if not stacked and trials:
-            found["trial"] = trials[0]
-        metadata = metadata_from(**found, path=path)
-        for trial in trials or ():
-            metadata_from(**{**found, "trial": trial})  # for its check of the text
-        return _Block(self.file, self.name, metadata, trials if stacked else None, headers)
-
-    def _check_calibration(self, path: str, calibration: str) -> None:
-        kind = self._kinds.get(calibration)
-        if kind == "calibration":
-            return
-        what = "is not in the file" if kind is None else f"is a {kind or 'broken'} recording"
-        remedy = "Name the HDF5 path of a group with kind='calibration'"
-        self._report(path, "calibration", f"{calibration!r} {what}", remedy)
-
-
-def _natural(name: str) -> list[tuple[int, str]]:
-    """Sorting key: digits count as numbers."""
-    parts = re.split(r"([0-9]+)", name)
-    return [(int(part), "") if part.isdecimal() else (-1, part) for part in parts]
-
-
-def write(study: Study, path: str | os.PathLike[str]) -> None:
-    """Write a study to a file, whole or not at all.
-
-    Recordings `g/0 … g/T-1`, at least two and all that lie below `g`, become one stacked group `g`
-    if they are loaded and agree in everything but samples and trial; if they also share one
-    `v_th`, it is stored once.  Every other recording becomes a group of its own.  Reading the file
-    gives the same paths, stored integers and metadata.
-
-    Args:
-        study: What to write; one recording at a time is in memory.
-        path: The file; one that exists is replaced at the end.
-
-    Raises:
-        RecordingError: The study holds recordings that cannot be read, names calibrations that it
-            does not hold, or the file cannot be written.
-    """
-    name = os.fspath(path)
-    if study.problems:
-        raise RecordingError(
-            f"{len(study.problems)} recordings of the study cannot be read",
-            file=study.file,
-            remedy="Leave them out with Study.from_recordings(study.recordings())",
-        )
-    for own in study:
-        metadata = study.metadata(own)
-        for calibration in metadata.calibration:
-            if calibration not in study or study.metadata(calibration).kind != "calibration":
-                raise RecordingError(
-                    f"{calibration!r} is not a calibration of the study",
-                    path=own,
-                    field="calibration",
-                    remedy="Add that recording, or remove the path with recording.replace",
-                )
-    target = pathlib.Path(name)
-    partial = target.with_name(f".{target.name}.{secrets.token_hex(4)}.partial")
-    try:
-        # v108 has checksums over all but the samples, and room for the labels of large stacks
-        with h5py.File(partial, "x", libver=("v108", "latest")) as file:
-            _write_attribute(file, "schema", schema.NAME)
-            _write_attribute(file, "schema_version", schema.VERSION)
-            for group, members in _stacks(study).items():
-                _write_group(file, group, [study.source(member) for member in members])
-        os.replace(partial, target)
-    except OSError as error:
-        raise RecordingError(
-            f"cannot be written ({error})", file=name, remedy="Check folder, rights and disk space"
-        ) from error
-    finally:
-        partial.unlink(missing_ok=True)
-
-
-def _stacks(study: Study) -> dict[str, list[str]]:
-    """Which group of the file holds which recordings."""
-    below: dict[str, int] = {}  # recordings anywhere below a path
-    children: dict[str, list[str]] = {}
-    for path in study:
-        children.setdefault(path.rpartition("/")[0], []).append(path)
-        outer = path
-        while outer := outer.rpartition("/")[0]:
-            below[outer] = below.get(outer, 0) + 1
-    groups: dict[str, list[str]] = {}
-    for parent, paths in children.items():
-        rows = [f"{parent}/{row}" for row in range(len(paths))]
-        whole = parent and len(paths) > 1 and below[parent] == len(paths)
-        if whole and set(rows) == set(paths) and _alike([study.source(row) for row in rows]):
-            groups[parent] = rows
-        else:
-            groups.update({path: [path] for path in paths})
-    return groups
-
-
-def _alike(sources: list[AbstractSource]) -> bool:
-    def common(source: AbstractSource) -> Hashable:
-        return dataclasses.replace(source.metadata, path="", trial=""), source.layout
-
-    first = common(sources[0])
-    loaded = sources[0].metadata.kind == "loaded"
-    return loaded and all(common(source) == first for source in sources[1:])
-
-
-def _write_group(file: h5py.File, path: str, sources: list[AbstractSource]) -> None:
-    stacked = len(sources) > 1
-    once = stacked and len({source.unloaded for source in sources}) == 1
-    group = file.create_group(path)
-    labels = vars(sources[0].metadata) | {"kind": sources[0].metadata.kind}
-    labels["trial"] = [source.metadata.trial for source in sources] if stacked else labels["trial"]
-    for name in schema.at("group attribute"):
-        value = labels[name]
-        if value not in (None, "", ()) and any(item != "" for item in np.ravel(value)):
-            _write_attribute(group, name, value)
-    datasets: dict[str, h5py.Dataset] = {}
-    for row, source in enumerate(sources):
-        for name, samples in source.load().samples.items():
-            single = not stacked or (once and name == "v_th")
-            if row == 0:
-                shape = samples.stored.shape if single else (len(sources), samples.stored.size)
-                dataset = group.create_dataset(name, shape, samples.stored.dtype)
-                unit = schema.at("dataset")[name].unit
-                scale = {"conversion": samples.conversion, "offset": samples.offset}
-                for attribute, value in {"unit": unit, **scale}.items():
-                    _write_attribute(dataset, attribute, value)
-                datasets[name] = dataset
-            if not single:
-                datasets[name][row] = samples.stored
-            elif row == 0:
-                datasets[name][...] = samples.stored
-
-
-def _write_attribute(owner: h5py.Group | h5py.Dataset, name: str, value: Any) -> None:
-    """Write a number or text, or several.
-
-    Text has a fixed length: the library keeps text of variable length in a heap that no checksum
-    protects, and reads it through pointers that a damaged byte can turn against the process.
-    """
-    items = np.ravel(value)
-    if not isinstance(items[0], str):
-        owner.attrs[name] = value
-        return
-    encoded = [item.encode("utf-8") for item in items]
-    dtype = h5py.string_dtype("utf-8", max(1, *map(len, encoded)))
-    data = np.array(encoded, dtype)
-    owner.attrs.create(name, data[0] if isinstance(value, str) else data, dtype=dtype)

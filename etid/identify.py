@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from etid import estimation, output_error, steiglitz_mcbride
+from etid import estimation, output_error, prediction, steiglitz_mcbride
 from etid.circuits import AbstractCircuit, Resistor, SkinRC
 from etid.driver import Driver
 from etid.filtering import TAPS
@@ -191,11 +191,13 @@ def identify_skin(
 @eqx.filter_jit
 def _fitted(samples: Any, driver: Driver, circuit: AbstractCircuit) -> Float[Array, " interval"]:
     m = estimation.measure(*samples)
-    records = output_error.prepare(
+    records = prediction.prepare(
         m.v_th, m.v_out, m.sigma_th, m.sigma_out, m.sample_rate, cutoff=0.5
     )  # the whole band, as it was recorded
-    assert driver.source is not None  # check_driver
-    return output_error.fitted_voltage(records, driver.source, circuit.impedance())
+    assert driver.source is not None
+    assert driver.calibration is not None
+    r_load = driver.calibration.r_load
+    return output_error.fitted_voltage(records, driver.source, r_load, circuit.impedance())
 
 
 def predict(

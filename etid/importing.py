@@ -16,10 +16,11 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from etid import hdf5
-from etid.recording import Recording, RecordingError, Samples, Study
+from etid.recording import Recording, RecordingError, Samples
+from etid.scan import LIBRARY_ERRORS
+from etid.study import Study
 
-_READ_ERRORS = (*hdf5.LIBRARY_ERRORS, EOFError, zipfile.BadZipFile, zlib.error, csv.Error)
+_READ_ERRORS = (*LIBRARY_ERRORS, EOFError, zipfile.BadZipFile, zlib.error, csv.Error)
 
 # Largest distance of a time stamp from a uniform grid, in sample periods: more than the rounding of
 # a printed time, less than a lost or doubled sample (1).
@@ -98,7 +99,7 @@ def import_file(
                     "is not given, and is not guessed",
                     file=file,
                     field=name,
-                    remedy=f"Pass {name}={hint}",
+                    remedy=f"Give {name}, on the command line --{name.replace('_', '-')}{hint}",
                 )
         if (time is None) == (sample_rate is None):
             raise RecordingError(
@@ -117,7 +118,7 @@ def import_file(
             file=file,
             remedy="Export it as .csv, .mat or .npz, or write the schema with h5py",
         )
-    hdf5.write(Study.from_recordings(recordings), target)
+    Study.from_recordings(recordings).write(target)
 
 
 @contextlib.contextmanager

@@ -1,34 +1,18 @@
 """Output error: Levenberg-Marquardt on the simulated terminal voltage.
 
-V_out is predicted from the recorded V_th through the loaded driver, a continuous-time system run
-exactly for band-limited samples (`etid.filtering`), so that discretisation costs no accuracy at the
-recorder's own rate. The parameters are the logarithms of the circuit elements or the modal
-parameters of Z_th; the state at the start of the record, an offset of V_out and its trigger delay
-are nuisances.
+The parameters are the logarithms of the circuit elements or the modal parameters of Z_th;
+`etid.prediction` makes the residual, `etid.information` the covariance. A skin adds what it
+inherits from its driver, K cov(Z_th) Kᵀ with K = −H⁻¹ ∂²/∂θ∂Z_th. If χ² > 1 the covariance is
+multiplied by it.
 
-**Noise on both records.** The residual r = V_out_predicted − V_out contains the noise of V_out and
-the noise of V_th filtered by the loaded driver G. For white noise its variance is
-
-    s(θ) = σ_out² Σ k² + σ_th² Σ h²,
-
-k being the impulse response of the interpolation, h that of G after it,
-
-and minimising Σ r²/s(θ) is consistent, because E Σ r² = |noise-free misfit|² + N s(θ); minimising Σ
-r² alone is not (at 30 dB it drives Z_th to −90 kΩ). χ² = Σ r²/s per degree of freedom is 1 when the
-model is right.
-
-**Covariance.** r is coloured (G filters the noise of V_th), and the recorded noise inflates JᵀJ.
-Both are accounted for,
-
-    cov = H⁻¹ (Jᵀ Σ J) H⁻¹,      Σ = (σ_out² K Kᵀ + σ_th² G Gᵀ)/s,
-    H   = JᵀJ − N (σ_th² Σ ∂h ∂hᵀ/s − ∂s ∂sᵀ/(4 s²)),
-
-H being the curvature of the *expected* objective, and a skin adds what it inherits from its driver,
-K cov(Z_th) Kᵀ with K = −H⁻¹ ∂²/∂θ∂Z_th. If χ² > 1 the covariance is multiplied by it.
+**The calibration's own delay.** A calibration that was triggered τ late looks, to first order in
+τ, exactly like one in time with Z_th + sτ (R_L + Z_th) for Z_th: what a recorded band shows of a
+fast pole of Z_th and what it shows of a delay are the same, so one known resistor cannot tell them
+apart. 10 ns cost 3 % in C_p. A skin's record does show τ, by the excess impedance of
+`late_calibration`. It is therefore fitted with every skin.
 """
 
 import math
-from typing import Any
 
 import equinox as eqx
 import jax
@@ -39,102 +23,30 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, Int
 
 from etid.circuits import AbstractCircuit, resistor
-from etid.driver import SourceImpedance, loaded
-from etid.filtering import CUTOFF, TAPS, StateSpace, band_limited, hold, shiftable, simulate
+from etid.driver import Calibration, SourceImpedance, loaded
+from etid.information import curvature, eliminate, inverse
 from etid.levenberg_marquardt import LevenbergMarquardt
+from etid.prediction import (
+    IMPULSE,
+    Late,
+    Records,
+    impulse_response,
+    late_calibration,
+    loaded_filter,
+    measured,
+    predict,
+    scaled_residual,
+)
 from etid.results import rrse
 from etid.transfer import Rational
 
 MAX_STEPS = 500
-IMPULSE = 256  # samples of the impulse response whose squares are summed
+PASSES = 3  # of a skin's fit
 PASSIVE_BAND = np.geomspace(1e-4, 10.0, 128)  # of the sample rate
 DELAY_WIDTH = 0.5  # [samples] of the weak prior of a delay; one sample is as far as it may go
+KNOWN_DELAY = 1e-9  # [samples] by which several different resistors leave it in doubt, or so
+SAME_LOAD = 0.01  # resistors closer than this do not resolve the delay of their records
 SOLVER = LevenbergMarquardt(rtol=1e-5, ftol=1e-6)  # 1e-3 standard errors at 10 000 samples
-EIGENVALUE_FLOOR = (
-    1e-12  # of the scaled curvature; directions below carry no information in double precision
-)
-
-
-class Records(eqx.Module):
-    """What one fit sees of a recording: the interpolated V_th, the measured V_out, and their noise.
-
-    Attributes:
-        hold: Polynomial coefficients of the band-limited V_th.
-        v_out: Measured voltage [V] as polynomials of a delay, filtered like V_th.
-        sigma_th: Noise of V_th [V].
-        sigma_out: Noise of V_out [V].
-        sample_rate: Sampling rate [Hz].
-    """
-
-    hold: Float[Array, "interval degree"]
-    v_out: Float[Array, "interval shift"]
-    sigma_th: Float[Array, ""]
-    sigma_out: Float[Array, ""]
-    sample_rate: Float[Array, ""]
-
-
-def prepare(
-    v_th: Float[Array, " time"],
-    v_out: Float[Array, " time"],
-    sigma_th: Float[Array, ""],
-    sigma_out: Float[Array, ""],
-    sample_rate: Float[Array, ""],
-    cutoff: float = CUTOFF,
-) -> Records:
-    """Interpolate V_th once; the edges, where its neighbours are missing, are left out."""
-    held, delayed = band_limited(v_th, cutoff), shiftable(v_out, cutoff)
-    return Records(held, delayed, sigma_th, sigma_out, sample_rate)
-
-
-def loaded_filter(
-    source: SourceImpedance, load: Rational, sample_rate: Float[Array, ""]
-) -> StateSpace:
-    """Discrete filter from the interpolated V_th to V_out."""
-    return hold(loaded(source, load, sample_rate), sample_rate)
-
-
-def predict(
-    system: StateSpace, records: Records, nuisance: Float[Array, " nuisance"]
-) -> Float[Array, " interval"]:
-    """Terminal voltage [V]; `nuisance` is the initial state, the offset [V] and the delay."""
-    return simulate(system, records.hold, nuisance[:-2])[0] + nuisance[-2]
-
-
-def measured(records: Records, nuisance: Float[Array, " nuisance"]) -> Float[Array, " interval"]:
-    """Measured voltage [V] at the instants of V_th; it was sampled `nuisance[-1]` samples late.
-
-    50 ns between the triggers of two records are 0.01 samples, and spread R_s by 8 %.
-    """
-    late = -nuisance[-1]
-    value = records.v_out[:, -1]
-    for k in range(records.v_out.shape[1] - 2, -1, -1):  # Horner
-        value = value * late + records.v_out[:, k]
-    return value
-
-
-def impulse_response(system: StateSpace) -> Float[Array, " lag"]:
-    """Response h of the loaded driver to one sample of V_th, interpolation included."""
-    return simulate(system, _impulse(), jnp.zeros_like(system.C))[0]
-
-
-def _impulse() -> Float[Array, "lag degree"]:
-    """One sample of noise, interpolated."""
-    return band_limited(jnp.zeros(IMPULSE + 2 * TAPS).at[2 * TAPS].set(1.0))
-
-
-def residual_variance(records: Records, h: Float[Array, " lag"]) -> Float[Array, ""]:
-    """Variance s = σ_out² Σ k² + σ_th² Σ h² of the residual [V²]."""
-    k = _impulse()[:, 0]
-    return records.sigma_out**2 * jnp.sum(k**2) + records.sigma_th**2 * jnp.sum(h**2)
-
-
-def scaled_residual(
-    records: Records, source: SourceImpedance, load: Rational, nuisance: Float[Array, " nuisance"]
-) -> Float[Array, " interval"]:
-    """(Predicted − measured) / √s."""
-    system = loaded_filter(source, load, records.sample_rate)
-    s = residual_variance(records, impulse_response(system))
-    return (predict(system, records, nuisance) - measured(records, nuisance)) / jnp.sqrt(s)
 
 
 class Estimate(eqx.Module):
@@ -160,66 +72,6 @@ class Estimate(eqx.Module):
     result: optx.RESULTS
     steps: Int[Array, ""]
     shared_cov: Float[Array, "parameter parameter"]
-
-
-def _inverse(matrix: Float[Array, "n n"], *, drop: bool = False) -> Float[Array, "n n"]:
-    """Inverse of a symmetric matrix, in its own scaling.
-
-    Directions without information keep an enormous variance, or with `drop` none: nuisances that
-    the data do not determine have no effect either.
-    """
-    scale = jnp.sqrt(jnp.maximum(jnp.diagonal(matrix), 0.0))
-    scale = jnp.where(scale > 0, scale, 1.0)
-    values, vectors = jnp.linalg.eigh(matrix / scale[:, None] / scale[None, :])
-    inverse = 1 / jnp.maximum(values, EIGENVALUE_FLOOR)
-    inverse = jnp.where(values > EIGENVALUE_FLOOR, inverse, 0.0 if drop else inverse)
-    return (vectors * inverse[None, :]) @ vectors.T / scale[:, None] / scale[None, :]
-
-
-class _Curvature(eqx.Module):
-    """H and Jᵀ Σ J of one record, over (parameters, nuisance)."""
-
-    expected: Float[Array, "n n"]
-    score: Float[Array, "n n"]
-
-
-def _curvature(records: Records, model: Any, q: Float[Array, " n"]) -> _Curvature:
-    """Evaluate H and JᵀΣJ; `model(q)` returns the source, the load and the nuisance."""
-
-    def response(q):
-        source, load, _ = model(q)
-        return impulse_response(loaded_filter(source, load, records.sample_rate))
-
-    h = response(q)
-    s = residual_variance(records, h)
-    jacobian = jax.jacfwd(lambda q: scaled_residual(records, *model(q)))(q)
-    slope = jax.jacfwd(response)(q)
-    s_slope = 2 * records.sigma_th**2 * h @ slope
-    samples = jacobian.shape[0]
-    noise = records.sigma_th**2 * slope.T @ slope / s
-    noise = noise - jnp.outer(s_slope, s_slope) / (4 * s**2)
-    # Jᵀ Σ J by Parseval; J is padded, so that the filters do not wrap around.
-    size = 2 ** math.ceil(math.log2(samples + IMPULSE))
-    weight = jnp.full(size // 2 + 1, 2.0 / size).at[0].set(1.0 / size).at[-1].set(1.0 / size)
-    power_out = records.sigma_out**2 * jnp.abs(jnp.fft.rfft(_impulse()[:, 0], size)) ** 2
-    weight = weight * (power_out + records.sigma_th**2 * jnp.abs(jnp.fft.rfft(h, size)) ** 2)
-    spectrum = jnp.fft.rfft(jacobian, size, axis=0)
-    real, imaginary = spectrum.real, spectrum.imag
-    score = real.T @ (weight[:, None] * real) + imaginary.T @ (weight[:, None] * imaginary)
-    information = jacobian.T @ jacobian
-    expected = (information - samples * noise).at[-1, -1].add(1 / DELAY_WIDTH**2)
-    return _Curvature(expected, score / s)
-
-
-def _eliminate(curvature: _Curvature, kept: int) -> _Curvature:
-    """Project out the nuisances of one record, which no other record shares."""
-    h, m = curvature.expected, curvature.score
-    k = -_inverse(h[kept:, kept:], drop=True) @ h[kept:, :kept]
-    reduced = h[:kept, :kept] + h[:kept, kept:] @ k
-    score = (
-        m[:kept, :kept] + m[:kept, kept:] @ k + k.T @ m[kept:, :kept] + k.T @ m[kept:, kept:] @ k
-    )
-    return _Curvature(reduced, score)
 
 
 def prior(start: SourceImpedance, sample_rate: Float[Array, ""], r_load: Float[Array, ""]):
@@ -275,7 +127,7 @@ def fit_source(
     records: Records,
     r_load: Float[Array, " record"],
     start: SourceImpedance,
-) -> tuple[SourceImpedance, Estimate]:
+) -> tuple[SourceImpedance, Estimate, Calibration]:
     """Identify Z_th from one or several records with known resistors.
 
     Args:
@@ -284,7 +136,7 @@ def fit_source(
         start: Initial Z_th; its structure is the order.
 
     Returns:
-        Z_th and the estimate, whose parameters are `start` flattened.
+        Z_th, the estimate, whose parameters are `start` flattened, and what else is in doubt.
     """
     start_vector, unflatten = ravel_pytree(start)
     kept, count, states = start_vector.shape[0], r_load.shape[0], start.order + 2
@@ -305,25 +157,37 @@ def fit_source(
     q = solution.value
     nuisance = q[kept:].reshape(count, states)
 
-    def curvature(record, r, nuisance):
-        def model(p):
-            return unflatten(p[:kept]), resistor(r), p[kept:]
-
-        return _eliminate(_curvature(record, model, jnp.concatenate([q[:kept], nuisance])), kept)
-
-    def error(record, r, nuisance):
-        system = loaded_filter(unflatten(q[:kept]), resistor(r), record.sample_rate)
-        return rrse(predict(system, record, nuisance), measured(record, nuisance))
-
-    parts = jax.vmap(curvature)(records, r_load, nuisance)
+    states = nuisance.shape[1]
+    precision = jnp.zeros(kept + states).at[-1].set(1 / DELAY_WIDTH**2)
     weak = jax.jacfwd(regularise)(q[:kept])
-    inverse = _inverse(parts.expected.sum(0) + weak.T @ weak)
     chi2 = (
         2
         * solution.stats["normal_equations"].objective
         / (math.prod(records.hold.shape[:-1]) - q.shape[0])
     )
-    cov = inverse @ parts.score.sum(0) @ inverse * jnp.maximum(chi2, 1.0)
+
+    def at_minimum(record, r, nuisance):
+        def residual(p):
+            return one(record, r, p[:kept], p[kept:])
+
+        def response(p):
+            load = resistor(r)
+            return impulse_response(loaded_filter(unflatten(p[:kept]), load, record.sample_rate))
+
+        at = jnp.concatenate([q[:kept], nuisance])
+        return curvature(record, residual, response, at, precision)
+
+    def error(record, r, nuisance):
+        system = loaded_filter(unflatten(q[:kept]), resistor(r), record.sample_rate)
+        return rrse(predict(system, record, nuisance), measured(record, nuisance))
+
+    parts = jax.vmap(at_minimum)(records, r_load, nuisance)
+    parts = jax.vmap(lambda part: eliminate(part, kept))(parts)
+    bread = inverse(parts.expected.sum(0) + weak.T @ weak)
+    cov = bread @ parts.score.sum(0) @ bread * jnp.maximum(chi2, 1.0)
+    # Records with one and the same resistor share the ambiguity of the delay, others resolve it.
+    same = jnp.ptp(r_load) < SAME_LOAD * r_load.mean()
+    delay_std = jnp.where(same, DELAY_WIDTH, KNOWN_DELAY) / records.sample_rate[0]
     estimate = Estimate(
         q[:kept],
         nuisance,
@@ -334,13 +198,14 @@ def fit_source(
         solution.stats["num_steps"],
         jnp.zeros_like(cov),
     )
-    return unflatten(q[:kept]), estimate
+    return unflatten(q[:kept]), estimate, Calibration(r_load[0], delay_std)
 
 
 def fit_circuit(
     records: Records,
     source: SourceImpedance,
     source_cov: Float[Array, "m m"],
+    calibration: Calibration,
     starts: AbstractCircuit,
 ) -> tuple[AbstractCircuit, Estimate]:
     """Identify the load of one recording.
@@ -349,6 +214,7 @@ def fit_circuit(
         records: One recording.
         source: Known Z_th.
         source_cov: Covariance of its flattened parameters.
+        calibration: What else is in doubt.
         starts: Candidate starts, stacked along a leading axis; the one that predicts best is
             refined.
 
@@ -357,68 +223,92 @@ def fit_circuit(
     """
     source_vector, unflatten = ravel_pytree(source)
     candidates = starts.log_values()
-    kept = candidates.shape[-1]
+    kept, sources = candidates.shape[-1], source_vector.shape[0]
     circuit = jax.tree.map(lambda leaf: leaf[0], starts)
     states = jax.eval_shape(lambda: loaded(source, circuit.impedance(), 1.0).C).shape[0]
+    delay_std = calibration.delay_std * records.sample_rate  # [samples]
 
-    def residual(q, _):
-        load = circuit.with_log_values(q[:kept]).impedance()
-        scaled = scaled_residual(records, source, load, q[kept:])
-        return jnp.append(scaled, q[-1] / DELAY_WIDTH)
+    def load(q):
+        return circuit.with_log_values(q[:kept]).impedance()
 
-    q0 = jnp.concatenate([candidates, jnp.zeros((candidates.shape[0], states + 2))], axis=-1)
-    objectives = jax.lax.map(lambda q: jnp.sum(residual(q, None) ** 2), q0)
-    best = jnp.argmin(jnp.where(jnp.isfinite(objectives), objectives, jnp.inf))
-    solution = optx.least_squares(residual, SOLVER, q0[best], max_steps=MAX_STEPS, throw=False)
-    q = solution.value
+    # q holds the elements, the nuisances of the record, and the delay of the calibration, by which
+    # voltage and impulse response change linearly.
+    def residual(q, late):
+        change = jax.tree.map(lambda leaf: q[-1] * leaf, late)
+        scaled = scaled_residual(records, source, load(q), q[kept:-1], change)
+        return jnp.concatenate([scaled, q[-2:] / jnp.stack([DELAY_WIDTH, delay_std])])
 
-    def model(p):  # (elements, source, nuisance)
-        load = circuit.with_log_values(p[:kept]).impedance()
-        return (
-            unflatten(p[kept : kept + source_vector.shape[0]]),
-            load,
-            p[kept + source_vector.shape[0] :],
+    def refine(carry, _):
+        q, late = carry
+        solution = optx.least_squares(
+            residual, SOLVER, q, args=late, max_steps=MAX_STEPS, throw=False
         )
+        q = solution.value
+        late = late_calibration(records, source, load(q), calibration.r_load)
+        equations = solution.stats["normal_equations"]
+        return (q, late), (equations.objective, solution.result, solution.stats["num_steps"])
 
-    both = kept + source_vector.shape[0]
-    curvature = _curvature(records, model, jnp.concatenate([q[:kept], source_vector, q[kept:]]))
-    curvature = _eliminate(curvature, both)
-    inverse = _inverse(curvature.expected[:kept, :kept])
-    chi2 = (
-        2
-        * solution.stats["normal_equations"].objective
-        / (math.prod(records.hold.shape[:-1]) - q.shape[0])
-    )
-    inflation = jnp.maximum(chi2, 1.0)
-    inherited = -inverse @ curvature.expected[:kept, kept:]
+    nothing = Late(jnp.zeros(records.hold.shape[0]), jnp.zeros(IMPULSE + 1))
+    q0 = jnp.concatenate([candidates, jnp.zeros((candidates.shape[0], states + 3))], axis=-1)
+    objectives = jax.lax.map(lambda q: jnp.sum(residual(q, nothing) ** 2), q0)
+    best = jnp.argmin(jnp.where(jnp.isfinite(objectives), objectives, jnp.inf))
+    # First with the calibration in time, then with its delay; one loop, so that one solver is
+    # compiled.
+    (q, late), outcomes = jax.lax.scan(refine, (q0[best], nothing), length=PASSES)
+    objective, result, steps = outcomes
+    result = jax.tree.map(lambda leaf: leaf[-1], result)
+
+    # Curvature over elements, delay of the calibration, source and nuisances, in this order.
+    both = kept + 1 + sources
+    at = jnp.concatenate([q[:kept], q[-1:], source_vector, q[kept:-1]])
+
+    def of_all(p):
+        z_th = unflatten(p[kept + 1 : both])
+        change = jax.tree.map(lambda leaf: p[kept] * leaf, late)
+        return scaled_residual(records, z_th, load(p), p[both:], change)
+
+    def response(p):
+        z_th = unflatten(p[kept + 1 : both])
+        h = impulse_response(loaded_filter(z_th, load(p), records.sample_rate))
+        return h + p[kept] * late.h
+
+    precision = jnp.zeros_like(at).at[kept].set(1 / delay_std**2).at[-1].set(1 / DELAY_WIDTH**2)
+    full = eliminate(curvature(records, of_all, response, at, precision), both)
+    own = inverse(full.expected[: kept + 1, : kept + 1])
+    chi2 = 2 * objective[-1] / (records.hold.shape[0] - q.shape[0])
+    inherited = (-own @ full.expected[: kept + 1, kept + 1 :])[:kept]
     shared = inherited @ source_cov @ inherited.T
-    load = circuit.with_log_values(q[:kept]).impedance()
-    system = loaded_filter(source, load, records.sample_rate)
-    cov = inverse @ curvature.score[:kept, :kept] @ inverse * inflation + shared
+    cov = (own @ full.score[: kept + 1, : kept + 1] @ own)[:kept, :kept]
+    system = loaded_filter(source, load(q), records.sample_rate)
+    predicted = predict(system, records, q[kept:-1]) + q[-1] * late.v_out
     estimate = Estimate(
         q[:kept],
-        q[None, kept:],
-        cov,
+        q[None, kept:-1],
+        cov * jnp.maximum(chi2, 1.0) + shared,
         chi2,
-        rrse(predict(system, records, q[kept:]), measured(records, q[kept:])),
-        solution.result,
-        solution.stats["num_steps"],
+        rrse(predicted, measured(records, q[kept:-1])),
+        result,
+        steps.sum(),
         shared,
     )
     return circuit.with_log_values(q[:kept]), estimate
 
 
 def fitted_voltage(
-    records: Records, source: SourceImpedance, load: Rational
+    records: Records, source: SourceImpedance, r_load: Float[Array, ""], load: Rational
 ) -> Float[Array, " interval"]:
-    """Terminal voltage [V] with `load`; initial state, offset and delay fitted to the record."""
-    system = loaded_filter(source, load, records.sample_rate)
-    nuisance = jnp.zeros(system.C.shape[0] + 2)
+    """Terminal voltage [V] with `load`, as far as a record tells.
 
-    def residual(nuisance):
-        return predict(system, records, nuisance) - measured(records, nuisance)
+    Initial state, offset, delay and the delay of the calibration with `r_load` [Ω] are fitted.
+    """
+    system = loaded_filter(source, load, records.sample_rate)
+    late = late_calibration(records, source, load, r_load)
+    q = jnp.zeros(system.C.shape[0] + 3)
+
+    def residual(q):
+        return predict(system, records, q[:-1]) + q[-1] * late.v_out - measured(records, q[:-1])
 
     for _ in range(3):  # linear but for the delay, which is a small fraction of a sample
-        basis = jax.jacfwd(residual)(nuisance)
-        nuisance = nuisance - jnp.linalg.lstsq(basis, residual(nuisance))[0]
-    return residual(nuisance) + records.v_out[:, 0]
+        basis = jax.jacfwd(residual)(q)
+        q = q - jnp.linalg.lstsq(basis, residual(q))[0]
+    return residual(q) + records.v_out[:, 0]

@@ -1,4 +1,4 @@
-"""Recordings of a stimulation experiment in memory, and a study of many of them.
+"""Recordings of a stimulation experiment in memory.
 
 A recording is two voltages on one clock: `v_th`, the driver's unloaded output, and `v_out`, its
 output with a load.  Samples stay as the instrument stored them; their SI values are
@@ -8,9 +8,8 @@ the size of a quantisation step stays known.
 
 import abc
 import dataclasses
-import difflib
 import math
-from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping
+from collections.abc import Hashable, Iterable, Mapping
 from types import MappingProxyType
 from typing import Any, SupportsFloat
 
@@ -86,21 +85,21 @@ def _positive(field: str, value: object, unit: str) -> float:
     return number
 
 
-def _text(field: str, value: object) -> str:
+def text(field: str, value: object) -> str:
     """A label as text; integers become their decimal digits."""
     if isinstance(value, int | np.integer) and not isinstance(value, bool):
         value = int(value)
     elif not isinstance(value, str):
         raise RecordingError(f"is {value!r}, must be text or an integer", field=field)
-    text = str(value)
-    if "\0" in text or any("\ud800" <= character <= "\udfff" for character in text):
-        raise RecordingError(f"{text!r} cannot be stored as UTF-8 text", field=field)
-    return text
+    label = str(value)
+    if "\0" in label or any("\ud800" <= character <= "\udfff" for character in label):
+        raise RecordingError(f"{label!r} cannot be stored as UTF-8 text", field=field)
+    return label
 
 
 def tidy_path(path: str) -> str:
     """An HDF5 path without leading and trailing slashes; refuses what cannot be a recording's."""
-    tidy = _text("path", path).strip("/")
+    tidy = text("path", path).strip("/")
     parts = tidy.split("/") if tidy else []
     if any(part in ("", ".", "..", *SIGNALS) for part in parts):
         raise RecordingError(
@@ -219,7 +218,7 @@ class Metadata:
 
 def metadata_from(**fields: Any) -> Metadata:
     """Metadata from unchecked values; the one place where their types are settled."""
-    tidy: dict[str, Any] = {name: _text(name, fields.get(name, "")) for name in _LABELS}
+    tidy: dict[str, Any] = {name: text(name, fields.get(name, "")) for name in LABELS}
     tidy["path"] = tidy_path(fields.get("path", ""))
     tidy["sample_rate"] = _positive("sample_rate", fields["sample_rate"], "Hz")
     tidy["pulse_rate"] = _positive("pulse_rate", fields["pulse_rate"], "Hz")
@@ -236,7 +235,7 @@ def metadata_from(**fields: Any) -> Metadata:
     return Metadata(**tidy)
 
 
-_LABELS = ("subject", "condition", "electrode", "trial")
+LABELS = ("subject", "condition", "electrode", "trial")
 
 
 @dataclasses.dataclass(frozen=True, eq=False, repr=False, init=False)
@@ -364,7 +363,7 @@ class Recording:
 
     def __repr__(self) -> str:
         load = "loaded" if self.r_load is None else f"calibration with {self.r_load:g} ohm"
-        labels = " ".join(f"{name}={value!r}" for name in _LABELS if (value := getattr(self, name)))
+        labels = " ".join(f"{name}={value!r}" for name in LABELS if (value := getattr(self, name)))
         size = self.samples["v_out"].stored.size
         return (
             f"<Recording {self.path!r}: {load}, {size} samples at {self.sample_rate:g} Hz, "
@@ -415,184 +414,3 @@ class AbstractSource(abc.ABC):
     @abc.abstractmethod
     def load(self) -> Recording:
         """The recording with its samples."""
-
-
-@dataclasses.dataclass(frozen=True, eq=False)
-class _InMemory(AbstractSource):
-    """A recording that needs no loading."""
-
-    recording: Recording
-
-    @property
-    def metadata(self) -> Metadata:
-        return self.recording.metadata
-
-    @property
-    def layout(self) -> Hashable:
-        return tuple(
-            (name, record.stored.dtype.str, record.stored.size, record.conversion, record.offset)
-            for name, record in self.recording.samples.items()
-        )
-
-    @property
-    def unloaded(self) -> Hashable:
-        return id(self.recording.samples["v_th"])
-
-    def load(self) -> Recording:
-        return self.recording
-
-
-class Study(Mapping[str, Recording]):
-    """Recordings by path, in order; those of a file are loaded when they are accessed.
-
-    Build one with `Study.from_recordings` or `etid.read`.  A study that comes from a file holds it
-    open: use `with`, or `close()`.
-
-    Attributes:
-        file: Path of the file it comes from; empty in memory.
-        problems: Recordings of the file that cannot be read, by path; accessing one raises it.
-    """
-
-    def __init__(
-        self,
-        sources: Mapping[str, AbstractSource],
-        *,
-        problems: Mapping[str, RecordingError] | None = None,
-        file: str = "",
-        close: Callable[[], None] | None = None,
-    ) -> None:
-        self._sources = dict(sources)
-        self._close = close
-        self.problems: dict[str, RecordingError] = dict(problems or {})
-        self.file = file
-
-    @classmethod
-    def from_recordings(cls, recordings: Iterable[Recording]) -> "Study":
-        """A study in memory; recordings without a path become `loaded/0`, `loaded/1`, ….
-
-        Raises:
-            RecordingError: Two recordings have the same path, or one lies inside another.
-        """
-        sources: dict[str, AbstractSource] = {}
-        unnamed = {"loaded": 0, "calibration": 0}
-        for recording in recordings:
-            kind = recording.metadata.kind
-            if not recording.path:
-                recording = recording.replace(path=f"{kind}/{unnamed[kind]}")
-                unnamed[kind] += 1
-            if recording.path in sources:
-                raise RecordingError(
-                    "two recordings have this path",
-                    path=recording.path,
-                    remedy="Give each recording a path of its own",
-                )
-            sources[recording.path] = _InMemory(recording)
-        for path in sources:
-            outer = path.rpartition("/")[0]
-            while outer:
-                if outer in sources:
-                    raise RecordingError(
-                        f"lies inside another recording, {outer!r}",
-                        path=path,
-                        remedy="Give it a path beside the other",
-                    )
-                outer = outer.rpartition("/")[0]
-        return cls(sources)
-
-    def __getitem__(self, path: str) -> Recording:
-        return self.source(path).load()
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self._sources)
-
-    def __len__(self) -> int:
-        return len(self._sources)
-
-    def __contains__(self, path: object) -> bool:
-        return isinstance(path, str) and path.strip("/") in self._sources
-
-    def __eq__(self, other: object) -> bool:
-        return self is other  # a Mapping would load and compare every sample
-
-    def __hash__(self) -> int:
-        return id(self)
-
-    def source(self, path: str) -> AbstractSource:
-        """What the study holds at a path, without its samples."""
-        tidy = path.strip("/")
-        if tidy in self._sources:
-            return self._sources[tidy]
-        if (tidy or "/") in self.problems:
-            raise self.problems[tidy or "/"]
-        rows = [name for name in self._sources if name.startswith(f"{tidy}/")]
-        if rows:
-            raise KeyError(
-                f"{path!r} is a group of {len(rows)} recordings: {rows[0]!r} … {rows[-1]!r}"
-            )
-        near = difflib.get_close_matches(tidy, self._sources, n=3)
-        known = ", ".join(repr(name) for name in near or list(self._sources)[:3])
-        raise KeyError(f"no recording {path!r}; this study has {len(self)}, such as {known}")
-
-    def metadata(self, path: str) -> Metadata:
-        """All fields of a recording but its samples, which are not read."""
-        return self.source(path).metadata
-
-    def recordings(self) -> Iterator[Recording]:
-        """The recordings one after the other, each loaded when its turn comes."""
-        return (source.load() for source in self._sources.values())
-
-    def where(
-        self,
-        *,
-        subject: Label | None = None,
-        condition: Label | None = None,
-        electrode: Label | None = None,
-        trial: Label | None = None,
-    ) -> "Study":
-        """The recordings whose labels equal those given; no samples are read."""
-        given = zip(_LABELS, (subject, condition, electrode, trial), strict=True)
-        wanted = {name: _text(name, value) for name, value in given if value is not None}
-        return self._part(
-            lambda metadata: all(getattr(metadata, name) == text for name, text in wanted.items())
-        )
-
-    @property
-    def calibrations(self) -> "Study":
-        """The recordings with a known resistor."""
-        return self._part(lambda metadata: metadata.kind == "calibration")
-
-    @property
-    def loaded(self) -> "Study":
-        """The recordings with an unknown load."""
-        return self._part(lambda metadata: metadata.kind == "loaded")
-
-    def _part(self, belongs: Callable[[Metadata], bool]) -> "Study":
-        chosen = {
-            path: source for path, source in self._sources.items() if belongs(source.metadata)
-        }
-        return Study(chosen, problems=self.problems, file=self.file, close=self._close)
-
-    def write(self, path: Any) -> None:
-        """Write the study to an HDF5 file; see `etid.hdf5.write`."""
-        from etid import hdf5  # at the top it would be a circle: that module builds studies
-
-        hdf5.write(self, path)
-
-    def close(self) -> None:
-        """Close the file that the study, and every part of it, reads from."""
-        if self._close is not None:
-            self._close()
-
-    def __enter__(self) -> "Study":
-        return self
-
-    def __exit__(self, *exception: object) -> None:
-        self.close()
-
-    def __repr__(self) -> str:
-        place = f" {self.file!r}" if self.file else ""
-        bad = f", {len(self.problems)} that cannot be read" if self.problems else ""
-        calibrations = sum(s.metadata.kind == "calibration" for s in self._sources.values())
-        return (
-            f"<Study{place}: {calibrations} calibrations, {len(self) - calibrations} loaded{bad}>"
-        )

@@ -23,7 +23,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Complex, Float
 
-from etid.recording import Recording, Samples, Study, tidy_path
+from etid.recording import Recording, Samples, tidy_path
+from etid.study import Study
 from etid.transformer import (
     Impedance,
     OpenLoad,

@@ -116,7 +116,8 @@ def test_fit_writes_all_fits_and_one_bad_recording_costs_itself(run, study_file,
     target = tmp_path / "fits.h5"
     status, printed, complaints = run("fit", study_file, "-o", target)
     assert (status, complaints) == (DONE, [])
-    assert printed[0] == "4 recordings by output_error: 3 successful, 1 nonfinite_samples"
+    verdicts = "3 successful, 1 nonfinite_samples, 1 unreadable"
+    assert printed[0] == f"5 recordings by output_error: {verdicts}"
     assert printed[1].startswith("driver calibration/98k8: order 5, successful, RRSE ")
     heads, row = printed[4], printed[5]
     assert heads.split() == "subject condition fits r_s [kΩ] r_p [kΩ] c_p [nF]".split()
@@ -125,11 +126,12 @@ def test_fit_writes_all_fits_and_one_bad_recording_costs_itself(run, study_file,
     assert abs(r_s - 33.4) < 5 * error  # five standard errors: 1 in 10⁶ by chance
     assert 0 <= spread < 5 * error < r_s
     assert "without success: 2 recordings" in printed
-    assert any(line.startswith("typical/dry/99: not read. ") for line in printed)
+    assert any(line.startswith("typical/dry/99: unreadable: ") for line in printed)
     assert any(line.startswith("typical/dry/02: nonfinite_samples. ") for line in printed)
     fits = etid.Fits.read(target)
-    assert fits.labels["path"].tolist() == [f"typical/dry/{i:02d}" for i in range(1, 5)]
-    assert fits.counts() == {"successful": 3, "nonfinite_samples": 1}
+    assert fits.labels["path"].tolist() == [f"typical/dry/{i:02d}" for i in (1, 2, 3, 4, 99)]
+    assert fits.counts() == {"successful": 3, "nonfinite_samples": 1, "unreadable": 1}
+    assert "typical/dry/99" in fits.notes[-1]
 
 
 def test_fit_passes_method_and_order_on(run, study_file, tmp_path):

@@ -10,7 +10,8 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from etid import hdf5
-from etid.recording import SIGNALS, Recording, RecordingError, Samples, Study
+from etid.recording import SIGNALS, Recording, RecordingError, Samples
+from etid.study import Study
 
 FOLDER = pathlib.Path(__file__).parents[1] / "data_schema"
 RATES = {"sample_rate": 200e3, "pulse_rate": 60.0}

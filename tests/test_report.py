@@ -86,8 +86,9 @@ def outcome():
     skins = [path for path in truth if "r_s" in truth[path]]
     resistors = [path for path in truth if path.startswith("resistors/")]
     driver = etid.Driver(
-        b=jnp.ones(2), a=jnp.ones(2), sample_rate=2e5, source=None, cov=None, rrse=jnp.array(0.1),
-        chi2=jnp.array(1.0), result=verdict("successful"), steps=jnp.array(1), method="by hand",
+        b=jnp.ones(2), a=jnp.ones(2), sample_rate=2e5, source=None, cov=None, calibration=None,
+        rrse=jnp.array(0.1), chi2=jnp.array(1.0), result=verdict("successful"), steps=jnp.array(1),
+        method="by hand",
     )  # fmt: skip
     return demo.Outcome(
         "quiet",

@@ -1,0 +1,92 @@
+"""What the records tell about the parameters: curvature and covariance.
+
+The residual r of `etid.prediction` is coloured (G filters the noise of V_th), and the recorded
+noise inflates JᵀJ. Both are accounted for,
+
+    cov = H⁻¹ (Jᵀ Σ J) H⁻¹,      Σ = (σ_out² K Kᵀ + σ_th² G Gᵀ)/s,
+    H   = JᵀJ − N ((σ_th² Σ ∂h ∂hᵀ + σ_out² Σ ∂k ∂kᵀ)/s − ∂s ∂sᵀ/(4 s²)),
+
+H being the curvature of the *expected* objective.
+"""
+
+import math
+from collections.abc import Callable
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from etid.prediction import IMPULSE, Records, impulse, measured_impulse, residual_variance
+
+EIGENVALUE_FLOOR = 1e-12  # of the scaled curvature; below it double precision sees nothing
+
+
+def inverse(matrix: Float[Array, "n n"], *, drop: bool = False) -> Float[Array, "n n"]:
+    """Inverse of a symmetric matrix, in its own scaling.
+
+    Directions without information keep an enormous variance, or with `drop` none: nuisances that
+    the data do not determine have no effect either.
+    """
+    scale = jnp.sqrt(jnp.maximum(jnp.diagonal(matrix), 0.0))
+    scale = jnp.where(scale > 0, scale, 1.0)
+    values, vectors = jnp.linalg.eigh(matrix / scale[:, None] / scale[None, :])
+    weight = 1 / jnp.maximum(values, EIGENVALUE_FLOOR)
+    weight = jnp.where(values > EIGENVALUE_FLOOR, weight, 0.0 if drop else weight)
+    return (vectors * weight[None, :]) @ vectors.T / scale[:, None] / scale[None, :]
+
+
+class Curvature(eqx.Module):
+    """H and Jᵀ Σ J of one record, over (parameters, nuisance)."""
+
+    expected: Float[Array, "n n"]
+    score: Float[Array, "n n"]
+
+
+def curvature(
+    records: Records,
+    residual: Callable[[Float[Array, " n"]], Float[Array, " interval"]],
+    response: Callable[[Float[Array, " n"]], Float[Array, " lag"]],
+    q: Float[Array, " n"],
+    precision: Float[Array, " n"],
+) -> Curvature:
+    """Evaluate H and JᵀΣJ.
+
+    Args:
+        records: One recording.
+        residual: Scaled residual at q.
+        response: Impulse response of the loaded driver at q.
+        q: Parameters at the minimum; the last is the record's delay [samples].
+        precision: Of independent priors of q, which count as curvature.
+    """
+    h = response(q)
+    s = residual_variance(records, h)
+    jacobian = jax.jacfwd(residual)(q)
+    slope = jax.jacfwd(response)(q)
+    s_slope = 2 * records.sigma_th**2 * h @ slope
+    samples = jacobian.shape[0]
+    noise = records.sigma_th**2 * slope.T @ slope / s
+    noise = noise - jnp.outer(s_slope, s_slope) / (4 * s**2)
+    k_slope = measured_impulse()[:, 1]
+    noise = noise.at[-1, -1].add(records.sigma_out**2 * jnp.sum(k_slope**2) / s)
+    # Jᵀ Σ J by Parseval; J is padded, so that the filters do not wrap around.
+    size = 2 ** math.ceil(math.log2(samples + IMPULSE))
+    weight = jnp.full(size // 2 + 1, 2.0 / size).at[0].set(1.0 / size).at[-1].set(1.0 / size)
+    power_out = records.sigma_out**2 * jnp.abs(jnp.fft.rfft(impulse()[:, 0], size)) ** 2
+    weight = weight * (power_out + records.sigma_th**2 * jnp.abs(jnp.fft.rfft(h, size)) ** 2)
+    spectrum = jnp.fft.rfft(jacobian, size, axis=0)
+    real, imaginary = spectrum.real, spectrum.imag
+    score = real.T @ (weight[:, None] * real) + imaginary.T @ (weight[:, None] * imaginary)
+    information = jacobian.T @ jacobian
+    return Curvature(information - samples * noise + jnp.diag(precision), score / s)
+
+
+def eliminate(of: Curvature, kept: int) -> Curvature:
+    """Project out all but the first `kept` parameters: nuisances, which no other record shares."""
+    h, m = of.expected, of.score
+    k = -inverse(h[kept:, kept:], drop=True) @ h[kept:, :kept]
+    reduced = h[:kept, :kept] + h[:kept, kept:] @ k
+    score = (
+        m[:kept, :kept] + m[:kept, kept:] @ k + k.T @ m[kept:, :kept] + k.T @ m[kept:, kept:] @ k
+    )
+    return Curvature(reduced, score)
