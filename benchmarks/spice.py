@@ -17,6 +17,7 @@ import etid
 from etid.circuits import AbstractCircuit
 from etid.identify import METHODS, Method
 
+BOUND = "crb_rel_with_delays"  # the trigger delays being unknown, as they are to the fits
 ELEMENTS = {"r_s": "Rs", "r_p": "Rp", "c_p": "Cp", "r": "R"}
 
 
@@ -42,7 +43,7 @@ def fit_scene(source: pathlib.Path, truth: dict, method: Method) -> list[dict]:
         true = np.array([trial["elements"][ELEMENTS[name]] for trial in trials])
         error = 100 * (np.asarray(getattr(fits.circuit, name)) / true - 1)
         stderr = 100 * np.asarray(getattr(fits.stderr, name)) / true
-        bounds = [100 * trial["crb_rel_RsRpCp"][i] for trial in trials if "crb_rel_RsRpCp" in trial]
+        bounds = [100 * trial[BOUND][i] for trial in trials if BOUND in trial]
         bound = float(np.median(bounds)) if bounds else np.nan
         finite = error[np.isfinite(error)]
         rows.append(

@@ -244,7 +244,8 @@ def fit_circuit(
             residual, SOLVER, q, args=late, max_steps=MAX_STEPS, throw=False
         )
         q = solution.value
-        late = late_calibration(records, source, load(q), calibration.r_load)
+        x0 = q[kept : kept + states]
+        late = late_calibration(records, source, load(q), calibration.r_load, x0)
         equations = solution.stats["normal_equations"]
         return (q, late), (equations.objective, solution.result, solution.stats["num_steps"])
 
@@ -302,11 +303,12 @@ def fitted_voltage(
     Initial state, offset, delay and the delay of the calibration with `r_load` [Ω] are fitted.
     """
     system = loaded_filter(source, load, records.sample_rate)
-    late = late_calibration(records, source, load, r_load)
-    q = jnp.zeros(system.C.shape[0] + 3)
+    states = system.C.shape[0]
+    q = jnp.zeros(states + 3)
 
     def residual(q):
-        return predict(system, records, q[:-1]) + q[-1] * late.v_out - measured(records, q[:-1])
+        late = late_calibration(records, source, load, r_load, q[:states]).v_out
+        return predict(system, records, q[:-1]) + q[-1] * late - measured(records, q[:-1])
 
     for _ in range(3):  # linear but for the delay, which is a small fraction of a sample
         basis = jax.jacfwd(residual)(q)

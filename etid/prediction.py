@@ -132,7 +132,11 @@ def scaled_residual(
 
 
 def late_calibration(
-    records: Records, source: SourceImpedance, load: Rational, r_load: Float[Array, ""]
+    records: Records,
+    source: SourceImpedance,
+    load: Rational,
+    r_load: Float[Array, ""],
+    x0: Float[Array, " state"],
 ) -> Late:
     """Derivative by the delay of the calibration, of which the skin's own delay absorbs a part.
 
@@ -142,21 +146,30 @@ def late_calibration(
         Z_L + Z_th + sτ (R_L + Z_th) = (1 + sτ) (Z_L + Z_th) + sτ (R_L − Z_L),
 
     a delay of its own and an excess impedance. This is the derivative by the latter.
+
+    Args:
+        records: One recording.
+        source: Z_th.
+        load: The load.
+        r_load: Resistor of the calibration [Ω].
+        x0: State of the loaded driver at the start of the record.
     """
+    system = loaded(source, load, records.sample_rate)
+    x0_rate = (system.A @ x0 + system.B[:, 0] * records.hold[0, 0]) / records.sample_rate
 
     # Z_th + ε (R_L − Z_L) for Z_th is, but for a factor of V_out, R + ε R_L for R and (1 − ε) Z_L
     # for Z_L; that factor is the delay's.
-    def response(hold):
-        steps = jnp.arange(1, hold.shape[1])
-        rate = jnp.pad(hold[:, 1:] * steps, ((0, 0), (0, 1)))  # per sample
+    def response(hold, x0_rate):
+        steps = jnp.arange(1.0, hold.shape[1])
+        rate = jnp.pad(hold[:, 1:] * steps[None, :], ((0, 0), (0, 1)))  # per sample
 
         def excess(epsilon):
             shifted = jnp.log(jnp.exp(source.log_resistance) + epsilon * r_load)
             altered = eqx.tree_at(lambda z: z.log_resistance, source, shifted)
             reduced = Rational((1 - epsilon) * load.num, load.den)
             system = loaded_filter(altered, reduced, records.sample_rate)
-            return simulate(system, rate, jnp.zeros_like(system.C))[0]
+            return simulate(system, rate, x0_rate)[0]
 
         return jax.jvp(excess, (jnp.zeros(()),), (jnp.ones(()),))[1]
 
-    return Late(response(records.hold), response(impulse()))
+    return Late(response(records.hold, x0_rate), response(impulse(), jnp.zeros_like(x0_rate)))

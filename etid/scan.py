@@ -315,7 +315,7 @@ class Scan:
                 message = f"is not in the schema, did you mean {near}?"
                 self._report(path, f"{of}{name}", message, "Rename it")
 
-    def attributes(
+    def _attributes(
         self, attributes: Any, known: dict[str, schema.Field], path: str, of: str
     ) -> dict[str, Any]:
         """The attributes that are in the schema, parsed; those that cannot be are reported."""

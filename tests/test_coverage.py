@@ -24,16 +24,17 @@ NORMAL_95 = 1.959964  # half-width of a 95 % interval in standard errors
 # one lowers the coverage from 95 to 93.7 %.
 BIAS = 1 / 3
 LIMIT = 3.0  # standard deviations of a fraction or of a standard deviation of 200 draws
+WIDE = 0.75  # spread in standard errors: at 40 dB second-order terms make them up to a fifth too wide
 
 
-def monte_carlo(snr_db, jitter, repetitions=REPETITIONS):
+def monte_carlo(snr_db, samples, repetitions=REPETITIONS):
     """Errors in standard errors and verdicts, by load: (repetition, element) and (repetition,)."""
     scene = Scene(
         tuple(Trial(name, load) for name, load in LOADS.items()),
         (Trial("calibration", ResistorLoad(98.8e3)),),
-        samples=3334,
+        samples=samples,
         snr_db=snr_db,
-        trigger_jitter_rms=jitter,
+        trigger_jitter_rms=50e-9,
     )
     z = {name: np.full((repetitions, 3), np.nan) for name in LOADS}
     verdicts = {name: np.full(repetitions, "", dtype=object) for name in LOADS}
@@ -49,9 +50,9 @@ def monte_carlo(snr_db, jitter, repetitions=REPETITIONS):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("snr_db", "jitter"), [(60.0, 50e-9), (40.0, 0.0)])
-def test_intervals_of_95_per_cent_contain_the_truth_in_95_per_cent(snr_db, jitter):
-    z, verdicts = monte_carlo(snr_db, jitter)
+@pytest.mark.parametrize(("snr_db", "samples"), [(60.0, 10_000), (40.0, 3334)])
+def test_intervals_of_95_per_cent_contain_the_truth_in_95_per_cent(snr_db, samples):
+    z, verdicts = monte_carlo(snr_db, samples)
     for name in LOADS:
         good = verdicts[name] == "successful"
         assert good.mean() > 0.95, f"{name}: {np.unique(verdicts[name], return_counts=True)}"
@@ -59,5 +60,6 @@ def test_intervals_of_95_per_cent_contain_the_truth_in_95_per_cent(snr_db, jitte
         covered = (np.abs(found) < NORMAL_95).mean(0)
         assert (np.abs(covered - 0.95) < LIMIT * np.sqrt(0.95 * 0.05 / len(found))).all(), covered
         spread = found.std(0, ddof=1)
-        assert (np.abs(spread - 1) < LIMIT / np.sqrt(2 * len(found))).all(), spread
+        assert (spread < 1 + LIMIT / np.sqrt(2 * len(found))).all(), spread
+        assert (spread > WIDE).all(), spread
         assert (np.abs(found.mean(0)) < BIAS).all(), found.mean(0)
