@@ -1,9 +1,8 @@
 """Many recordings: lanes in chunks of one compiled function, and whole studies from HDF5.
 
-Recordings of one length share a compiled function. A chunk is one call of it: `CHUNK` lanes, of
-which `LANES` run side by side (`vmap`) and the others after them, so that memory is bounded and one
-slow lane delays its neighbours only. What is wrong with a recording costs that recording alone: it
-gets a verdict and a note.
+Recordings of one length share a compiled function, which runs `LANES` of them side by side
+(`vmap`): memory is bounded, and a slow lane delays its neighbours only. What is wrong with a
+recording costs that recording alone: it gets a verdict and a note.
 """
 
 import dataclasses
@@ -33,15 +32,12 @@ from etid.results import LABELS, Fit, Fits, IdentificationError
 from etid.study import Study
 from etid.verdicts import message
 
-CHUNK = 32  # lanes of one call: the last chunk is filled up, so a study compiles once per length
-LANES = 4  # lanes side by side; more of them wait for the slowest
+LANES = 4  # of one call, the last of which is filled up: a study compiles once per length
 
 
 @eqx.filter_jit
 def _chunk(samples: Any, driver: Driver, circuit: AbstractCircuit, method: Method) -> Fit:
-    return jax.lax.map(
-        lambda lane: skin_lane(lane, driver, circuit, method), samples, batch_size=LANES
-    )
+    return jax.vmap(lambda lane: skin_lane(lane, driver, circuit, method))(samples)
 
 
 def _labels(metadata: Sequence[Metadata]) -> dict[str, np.ndarray]:
@@ -68,8 +64,7 @@ class _Queue:
 
     def run(self) -> Iterable[tuple[int, Fit]]:
         """Fit what is waiting."""
-        full = CHUNK if len(self.lanes) > LANES else LANES
-        filled = self.lanes + [self.lanes[-1]] * (full - len(self.lanes))
+        filled = self.lanes + [self.lanes[-1]] * (LANES - len(self.lanes))
         samples = tuple(jnp.asarray(np.stack(column)) for column in zip(*filled, strict=True))
         fits = jax.device_get(_chunk(samples, self.driver, self.circuit, self.method))
         for lane, row in enumerate(self.rows):
@@ -115,7 +110,7 @@ def _identify(
                     key = (id(driver), recording.v_th.size)
                     queue = queues.setdefault(key, _Queue(driver, circuit, method))
                     queue.add(row, recording)
-                    if len(queue.rows) == CHUNK:
+                    if len(queue.rows) == LANES:
                         run(queue)
                     continue
                 fail(row, name, message(name))

@@ -217,7 +217,6 @@ def skin_by_output_error(m: Measurement, driver: Driver, circuit: AbstractCircui
     values = fitted.values()
     errors = jnp.sqrt(jnp.diagonal(estimate.cov))  # of the logarithms, so relative ones
     settled = RESULTS.promote(estimate.result) == RESULTS.successful
-    diverged = RESULTS.promote(estimate.result) == RESULTS.nonlinear_divergence
     return Fit(
         circuit=fitted,
         cov=estimate.cov * jnp.outer(values, values),
@@ -227,7 +226,6 @@ def skin_by_output_error(m: Measurement, driver: Driver, circuit: AbstractCircui
         result=_verdict(
             (~jnp.isfinite(estimate.chi2), RESULTS.unstable),
             (~jnp.isfinite(values).all(), RESULTS.nonphysical),
-            (diverged, RESULTS.stalled),
             (~settled, MAX_STEPS_REACHED),
             (_misses(estimate.chi2, estimate.rrse) | _too_late(estimate), RESULTS.misfit),
             (~jnp.all(errors < 1), RESULTS.insensitive),
@@ -319,7 +317,6 @@ def driver_by_output_error(m: Measurement, r_load: Float[Array, " record"], orde
     source, estimate, calibration = jax.tree.map(
         lambda leaf: leaf[chosen], (sources, estimates, calibrations)
     )
-    diverged = RESULTS.promote(estimate.result) == RESULTS.nonlinear_divergence
     return Driver(
         b=baseline.b,
         a=baseline.a,
@@ -332,7 +329,6 @@ def driver_by_output_error(m: Measurement, r_load: Float[Array, " record"], orde
         result=_verdict(
             (~finite[chosen], RESULTS.unstable),
             (~passive[chosen], RESULTS.nonphysical),
-            (diverged, RESULTS.stalled),
             (~settled[chosen], MAX_STEPS_REACHED),
             (_misses(estimate.chi2, estimate.rrse) | _too_late(estimate), RESULTS.misfit),
         ),

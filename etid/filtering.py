@@ -35,6 +35,9 @@ BLOCK = 32  # samples; the Toeplitz product grows with it, the scan shrinks
 TAPS = 24  # samples of the interpolation kernel on each side of an interval
 CUTOFF = 0.35  # of the sample rate, of the interpolation
 SHIFT_DEGREE = 10  # of the polynomials of `shiftable`, over twice the width
+TAYLOR_ORDER = 10  # of the matrix exponential; with the norm below its next term is 1e-16
+TAYLOR_NORM = 0.2
+MAX_SQUARINGS = 32
 DEGREE = 7  # of the interpolating polynomial inside one interval
 
 
@@ -179,6 +182,29 @@ def _interpolate(v: Float[Array, " time"], weights: np.ndarray) -> Float[Array, 
     return jnp.einsum("jt,jk->tk", neighbours, kernel)
 
 
+def _expm(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
+    """Matrix exponential: a Taylor series of a scaled matrix, squared again.
+
+    `jax.scipy.linalg.expm` compiles a solver for each of its five Padé orders, three times as long
+    as this, and an identification has a dozen places where it is compiled.
+    """
+    norm = jax.lax.stop_gradient(jnp.abs(matrix).sum(0).max())
+    squarings = jnp.ceil(jnp.log2(jnp.maximum(norm / TAYLOR_NORM, 1.0)))
+    unit = jnp.eye(matrix.shape[0], dtype=matrix.dtype)
+    small = matrix * jnp.exp2(-squarings)
+
+    def term(total, k):  # Horner, of e^M − 1, which keeps what is small beside 1
+        return small @ (unit + total) / k, None
+
+    def square(total, k):
+        return jnp.where(k < squarings, 2 * total + total @ total, total), None
+
+    orders = jnp.arange(TAYLOR_ORDER, 0, -1, dtype=matrix.dtype)
+    total, _ = jax.lax.scan(term, jnp.zeros_like(matrix), orders)
+    total, _ = jax.lax.scan(square, total, jnp.arange(MAX_SQUARINGS, dtype=matrix.dtype))
+    return unit + total
+
+
 def hold(system: StateSpace, sample_rate: float | Float[Array, ""]) -> StateSpace:
     """Discretise a single-input continuous system for inputs given by `band_limited`.
 
@@ -196,7 +222,7 @@ def hold(system: StateSpace, sample_rate: float | Float[Array, ""]) -> StateSpac
     augmented = augmented.at[:states, states].set(system.B[:, 0] / sample_rate)
     chain = np.arange(states, size - 1)
     augmented = augmented.at[chain, chain + 1].set(1.0)
-    exponential = jax.scipy.linalg.expm(augmented, max_squarings=32)
+    exponential = _expm(augmented)
     factorials = jnp.array([math.factorial(k) for k in range(DEGREE + 1)], system.A.dtype)
     feedthrough = jnp.zeros(DEGREE + 1, system.A.dtype).at[0].set(system.D[0])
     return StateSpace(

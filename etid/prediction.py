@@ -157,19 +157,18 @@ def late_calibration(
     system = loaded(source, load, records.sample_rate)
     x0_rate = (system.A @ x0 + system.B[:, 0] * records.hold[0, 0]) / records.sample_rate
 
+    def rate(hold):  # per sample
+        steps = jnp.arange(1.0, hold.shape[1])
+        return jnp.pad(hold[:, 1:] * steps[None, :], ((0, 0), (0, 1)))
+
     # Z_th + ε (R_L − Z_L) for Z_th is, but for a factor of V_out, R + ε R_L for R and (1 − ε) Z_L
     # for Z_L; that factor is the delay's.
-    def response(hold, x0_rate):
-        steps = jnp.arange(1.0, hold.shape[1])
-        rate = jnp.pad(hold[:, 1:] * steps[None, :], ((0, 0), (0, 1)))  # per sample
+    def excess(epsilon):
+        shifted = jnp.log(jnp.exp(source.log_resistance) + epsilon * r_load)
+        altered = eqx.tree_at(lambda z: z.log_resistance, source, shifted)
+        reduced = Rational((1 - epsilon) * load.num, load.den)
+        filtered = loaded_filter(altered, reduced, records.sample_rate)
+        v_out = simulate(filtered, rate(records.hold), x0_rate)[0]
+        return v_out, simulate(filtered, rate(impulse()), jnp.zeros_like(x0_rate))[0]
 
-        def excess(epsilon):
-            shifted = jnp.log(jnp.exp(source.log_resistance) + epsilon * r_load)
-            altered = eqx.tree_at(lambda z: z.log_resistance, source, shifted)
-            reduced = Rational((1 - epsilon) * load.num, load.den)
-            system = loaded_filter(altered, reduced, records.sample_rate)
-            return simulate(system, rate, x0_rate)[0]
-
-        return jax.jvp(excess, (jnp.zeros(()),), (jnp.ones(()),))[1]
-
-    return Late(response(records.hold, x0_rate), response(impulse(), jnp.zeros_like(x0_rate)))
+    return Late(*jax.jvp(excess, (jnp.zeros(()),), (jnp.ones(()),))[1])

@@ -16,10 +16,6 @@ class RESULTS(optx.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]  # equi
     did not settle) and `nonfinite` (inf or NaN appeared during the fit).
     """
 
-    stalled = (
-        "The solver can no longer change the parameters although it is not at a minimum. "
-        "The model does not fit this recording: check the load and the units."
-    )
     unstable = (
         "The identified filters are unstable with this load, so the voltage cannot be predicted. "
         "Use method='output_error', or repeat the calibration with less noise."

@@ -16,7 +16,7 @@ LENGTH = 3334
 DRY = SkinLoad(r_s=33.4e3, r_p=186e3, c_p=0.12e-9)
 TRUTH = np.array([33.4e3, 186e3, 0.12e-9])
 SIGMAS = 5.0  # one in 2 million for a normal error, which the coverage test measures
-MANY = batch.CHUNK + 5
+MANY = 2 * batch.LANES + 1
 
 
 def simulate(count=1, calibrations=1, seed=0, samples=LENGTH, **options):

@@ -24,7 +24,9 @@ NORMAL_95 = 1.959964  # half-width of a 95 % interval in standard errors
 # one lowers the coverage from 95 to 93.7 %.
 BIAS = 1 / 3
 LIMIT = 3.0  # standard deviations of a fraction or of a standard deviation of 200 draws
-WIDE = 0.75  # spread in standard errors: at 40 dB second-order terms make them up to a fifth too wide
+WIDE = (
+    0.75  # spread in standard errors: at 40 dB second-order terms make them up to a fifth too wide
+)
 
 
 def monte_carlo(snr_db, samples, repetitions=REPETITIONS):

@@ -6,6 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.integrate
+import scipy.linalg
 import scipy.signal
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -244,3 +245,14 @@ def test_interpolation_reproduces_samples_in_the_pass_band():
 def test_interpolation_removes_what_lies_above_its_cutoff():
     v = np.sin(2 * np.pi * 0.46 * np.arange(400))
     assert np.abs(np.asarray(interpolate(jnp.asarray(v)))[:, 0]).max() < 1e-3
+
+
+@pytest.mark.parametrize("size", [1e-6, 1.0, 300.0, 1e6])
+def test_the_matrix_exponential_is_that_of_scipy(size):
+    """Slow and fast poles together, and the nilpotent chain of a hold beside them."""
+    matrix = np.zeros((10, 10))
+    matrix[:4, :4] = np.diag([-1e-3, -0.3, -1.0, -size]) + np.diag([0.1, 0.2, 0.3], 1)
+    matrix[:4, 4] = 1.0
+    matrix[np.arange(4, 9), np.arange(5, 10)] = 1.0
+    found = filtering._expm(jnp.asarray(matrix))
+    np.testing.assert_allclose(found, scipy.linalg.expm(matrix), rtol=0, atol=ROUNDING)
