@@ -21,12 +21,29 @@ def main() -> None:
     timing = names.add_parser("timing", help="import time, first call, warm fit, batch, all apart")
     timing.add_argument("--lanes", type=int, default=98)
 
+    coverage = names.add_parser("coverage", help="Monte Carlo of errors, bias and intervals")
+    coverage.add_argument("--snr-db", type=float, default=60.0)
+    coverage.add_argument("--samples", type=int, default=10_000)
+    coverage.add_argument("--repetitions", type=int, default=200)
+    coverage.add_argument("--jitter", type=float, default=50e-9, help="rms trigger delay [s]")
+    coverage.add_argument("--resistors", type=float, nargs="+", default=[98.8e3], help="[ohm]")
+
     arguments = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
     if arguments.name == "spice":
         from benchmarks.spice import run as run_spice
 
         run_spice(arguments.data / "spice_recordings", arguments.scene, arguments.output)
+    elif arguments.name == "coverage":
+        from benchmarks.coverage import run as run_coverage
+
+        run_coverage(
+            arguments.snr_db,
+            arguments.samples,
+            arguments.repetitions,
+            arguments.resistors,
+            arguments.jitter,
+        )
     else:
         from benchmarks.timing import run as run_timing
 

@@ -183,6 +183,8 @@ def _medians(outcome: StudyFits) -> Table:
     units = outcome.fits.circuit.units()
     rows = []
     for group in outcome.fits.summary("subject", "condition"):
+        if not (group["subject"] or group["condition"] or group["successful"]):
+            continue  # what could not be read has no labels
         row = [group["subject"], group["condition"], f"{group['successful']}/{group['fits']}"]
         for name, unit in units.items():
             numbers = (
