@@ -126,7 +126,7 @@ def test_fit_writes_all_fits_and_one_bad_recording_costs_itself(run, study_file,
     assert abs(r_s - 33.4) < 5 * error  # five standard errors: 1 in 10⁶ by chance
     assert 0 <= spread < 5 * error < r_s
     assert "without success: 2 recordings" in printed
-    assert any(line.startswith("typical/dry/99: unreadable: ") for line in printed)
+    assert any(line.startswith("typical/dry/99: unreadable. ") for line in printed)
     assert any(line.startswith("typical/dry/02: nonfinite_samples. ") for line in printed)
     fits = etid.Fits.read(target)
     assert fits.labels["path"].tolist() == [f"typical/dry/{i:02d}" for i in (1, 2, 3, 4, 99)]
