@@ -40,7 +40,18 @@ def _chunk(samples: Any, driver: Driver, circuit: AbstractCircuit, method: Metho
     return jax.vmap(lambda lane: skin_lane(lane, driver, circuit, method))(samples)
 
 
-def _labels(metadata: Sequence[Metadata]) -> dict[str, np.ndarray]:
+@dataclasses.dataclass(frozen=True)
+class _Unreadable:
+    """Labels of a recording of which only the path is known."""
+
+    path: str
+    subject: str = ""
+    condition: str = ""
+    electrode: str = ""
+    trial: str = ""
+
+
+def _labels(metadata: Sequence[Metadata | _Unreadable]) -> dict[str, np.ndarray]:
     return {name: np.array([getattr(m, name) for m in metadata], dtype=str) for name in LABELS}
 
 
@@ -237,18 +248,8 @@ def identify_study(
     return StudyFits(table, drivers, failures)
 
 
-def _metadata(study: Study, path: str) -> Any:
-    """Labels of a recording, of which only the path is known if it cannot be read."""
+def _metadata(study: Study, path: str) -> Metadata | _Unreadable:
     try:
         return study.metadata(path)
     except RecordingError:
         return _Unreadable(path)
-
-
-@dataclasses.dataclass(frozen=True)
-class _Unreadable:
-    path: str
-    subject: str = ""
-    condition: str = ""
-    electrode: str = ""
-    trial: str = ""
