@@ -5,6 +5,8 @@ import pathlib
 
 import jax
 
+from etid.identify import METHODS
+
 
 def main() -> None:
     """Run one benchmark."""
@@ -16,6 +18,7 @@ def main() -> None:
     )
     spice.add_argument("--data", type=pathlib.Path, default=pathlib.Path("../shared/data"))
     spice.add_argument("--scene", action="append", help="only this scene; may be repeated")
+    spice.add_argument("--method", action="append", choices=METHODS, help="only this; repeatable")
     spice.add_argument("-o", "--output", type=pathlib.Path, default=None, help="CSV to write")
 
     timing = names.add_parser("timing", help="import time, first call, warm fit, batch, all apart")
@@ -27,13 +30,16 @@ def main() -> None:
     coverage.add_argument("--repetitions", type=int, default=200)
     coverage.add_argument("--jitter", type=float, default=50e-9, help="rms trigger delay [s]")
     coverage.add_argument("--resistors", type=float, nargs="+", default=[98.8e3], help="[ohm]")
+    coverage.add_argument("--method", choices=METHODS, default=METHODS[0])
 
     arguments = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
     if arguments.name == "spice":
         from benchmarks.spice import run as run_spice
 
-        run_spice(arguments.data / "spice_recordings", arguments.scene, arguments.output)
+        run_spice(
+            arguments.data / "spice_recordings", arguments.scene, arguments.method, arguments.output
+        )
     elif arguments.name == "coverage":
         from benchmarks.coverage import run as run_coverage
 
@@ -43,6 +49,7 @@ def main() -> None:
             arguments.repetitions,
             arguments.resistors,
             arguments.jitter,
+            arguments.method,
         )
     else:
         from benchmarks.timing import run as run_timing

@@ -12,6 +12,7 @@ import numpy as np
 from tqdm import tqdm
 
 import etid
+from etid.identify import Method
 from etid.scenes import Scene, Trial
 from etid.transformer import ResistorLoad, SkinLoad
 
@@ -53,6 +54,7 @@ def monte_carlo(
     repetitions: int,
     resistors: Sequence[float] = (98.8e3,),
     jitter: float = 50e-9,
+    method: Method = "output_error",
     progress: bool = False,
 ) -> dict[str, Draws]:
     """Identify fresh recordings of each of `LOADS`."""
@@ -67,9 +69,11 @@ def monte_carlo(
     rows: dict[str, list] = {name: [] for name in LOADS}
     for seed in tqdm(range(repetitions), disable=not progress):
         study = scene.simulate(seed=seed)
-        driver = etid.identify_driver([study[trial.path] for trial in known], throw=False)
+        driver = etid.identify_driver(
+            [study[trial.path] for trial in known], method=method, throw=False
+        )
         for name, load in LOADS.items():
-            fit = etid.identify_skin(study[name], driver, throw=False)
+            fit = etid.identify_skin(study[name], driver, method=method, throw=False)
             truth = np.array(dataclasses.astuple(load))
             error = np.asarray(fit.circuit.values()) / truth - 1
             rows[name].append((error, np.asarray(fit.stderr.values()) / truth, fit.verdict))
@@ -80,11 +84,16 @@ def monte_carlo(
 
 
 def run(
-    snr_db: float, samples: int, repetitions: int, resistors: Sequence[float], jitter: float
+    snr_db: float,
+    samples: int,
+    repetitions: int,
+    resistors: Sequence[float],
+    jitter: float,
+    method: Method,
 ) -> None:
     """Print one line per load and element."""
-    draws = monte_carlo(snr_db, samples, repetitions, resistors, jitter, progress=True)
-    print(f"{snr_db:g} dB, {samples} samples, {len(resistors)} calibrations")
+    draws = monte_carlo(snr_db, samples, repetitions, resistors, jitter, method, progress=True)
+    print(f"{snr_db:g} dB, {samples} samples, {len(resistors)} calibrations, {method}")
     print("load  element     bias % spread %     sd %  covered  mean z")
     for name, of in draws.items():
         for i, element in enumerate(("r_s", "r_p", "c_p")):

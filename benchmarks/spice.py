@@ -15,7 +15,7 @@ import numpy as np
 
 import etid
 from etid.circuits import AbstractCircuit
-from etid.identify import METHODS, Method
+from etid.identify import CONTINUOUS, METHODS, Method
 
 BOUND = "crb_rel_with_delays"  # the trigger delays being unknown, as they are to the fits
 ELEMENTS = {"r_s": "Rs", "r_p": "Rp", "c_p": "Cp", "r": "R"}
@@ -26,7 +26,7 @@ def fit_scene(source: pathlib.Path, truth: dict, method: Method) -> list[dict]:
     trials = truth["trials"]
     is_resistor = "R" in trials[0]["elements"]
     circuit: AbstractCircuit = etid.Resistor() if is_resistor else etid.SkinRC()
-    if is_resistor and method != "output_error":
+    if is_resistor and method not in CONTINUOUS:
         return []  # the paper's method is written for the skin
     with tempfile.TemporaryDirectory() as folder:
         study_file = pathlib.Path(folder) / "study.h5"
@@ -74,24 +74,29 @@ def fit_scene(source: pathlib.Path, truth: dict, method: Method) -> list[dict]:
     return rows
 
 
-def run(folder: pathlib.Path, scenes: list[str] | None, output: pathlib.Path | None) -> None:
+def run(
+    folder: pathlib.Path,
+    scenes: list[str] | None,
+    methods: list[Method] | None,
+    output: pathlib.Path | None,
+) -> None:
     """Fit the scenes, print the table, write it as CSV."""
     if not folder.exists():
         raise SystemExit(f"no SPICE recordings at {folder}; pass their parent folder with --data")
     truth = json.loads((folder / "truth.json").read_text())["scenes"]
     table: list[dict] = []
-    head = f"{'scene':<19}{'method':<18}{'element':<8}{'bias %':>9}{'spread %':>9}{'rms %':>9}"
+    head = f"{'scene':<19}{'method':<20}{'element':<8}{'bias %':>9}{'spread %':>9}{'rms %':>9}"
     head += f"{'bound %':>9}{'sd %':>9}{'chi2':>9}  silent  driver; verdicts"
     print(head)
     for name in scenes or truth:
-        for method in METHODS:
+        for method in methods or METHODS:
             for row in fit_scene(folder / f"{name}.npz", truth[name], method):
                 table.append(row)
                 numbers = "".join(
                     f"{row[key]:9.3g}" for key in ("bias", "spread", "rms", "bound", "sd", "chi2")
                 )
                 print(
-                    f"{row['scene']:<19}{row['method']:<18}{row['element']:<8}{numbers}"
+                    f"{row['scene']:<19}{row['method']:<20}{row['element']:<8}{numbers}"
                     f"{row['silent']:>8}  {row['driver']}; {row['verdicts']}",
                     flush=True,
                 )

@@ -22,9 +22,11 @@ from etid.identify import (
     arrays,
     check_driver,
     check_method,
+    choose_for,
     failed_fit,
     identify_driver,
     skin_lane,
+    window,
 )
 from etid.preflight import preflight
 from etid.recording import Metadata, Recording, RecordingError
@@ -36,8 +38,14 @@ LANES = 4  # of one call, the last of which is filled up: a study compiles once 
 
 
 @eqx.filter_jit
-def _chunk(samples: Any, driver: Driver, circuit: AbstractCircuit, method: Method) -> Fit:
-    return jax.vmap(lambda lane: skin_lane(lane, driver, circuit, method))(samples)
+def _chunk(
+    samples: Any,
+    driver: Driver,
+    circuit: AbstractCircuit,
+    method: Method,
+    window: tuple[int, int] | None,
+) -> Fit:
+    return jax.vmap(lambda lane: skin_lane(lane, driver, circuit, method, window))(samples)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -59,11 +67,25 @@ def _stack(fits: Sequence[Fit]) -> Fit:
     return jax.tree.map(lambda *leaves: np.stack([np.asarray(leaf) for leaf in leaves]), *fits)
 
 
-class _Queue:
-    """Recordings of one length and driver, waiting to fill a chunk."""
+def _of_one_method(fits: Sequence[Fit], used: Sequence[str], otherwise: str) -> list[Fit]:
+    """The same with one name: a batch has one, "mixed" if several were used."""
+    name = used[0] if len(set(used)) == 1 else "mixed" if used else otherwise
+    arrays = [jax.tree.map(np.asarray, fit) for fit in fits]
+    return [dataclasses.replace(fit, method=name) for fit in arrays]
 
-    def __init__(self, driver: Driver, circuit: AbstractCircuit, method: Method):
+
+class _Queue:
+    """Recordings of one length, window and driver, waiting to fill a chunk."""
+
+    def __init__(
+        self,
+        driver: Driver,
+        circuit: AbstractCircuit,
+        method: Method,
+        window: tuple[int, int] | None,
+    ):
         self.driver = driver
+        self.window = window
         self.circuit = circuit
         self.method: Method = method
         self.rows: list[int] = []
@@ -77,7 +99,7 @@ class _Queue:
         """Fit what is waiting."""
         filled = self.lanes + [self.lanes[-1]] * (LANES - len(self.lanes))
         samples = tuple(jnp.asarray(np.stack(column)) for column in zip(*filled, strict=True))
-        fits = jax.device_get(_chunk(samples, self.driver, self.circuit, self.method))
+        fits = jax.device_get(_chunk(samples, self.driver, self.circuit, self.method, self.window))
         for lane, row in enumerate(self.rows):
             yield row, jax.tree.map(lambda leaf, lane=lane: leaf[lane], fits)
         self.rows, self.lanes = [], []
@@ -87,16 +109,17 @@ def _identify(
     count: int,
     load: Callable[[int], tuple[Recording, Driver]],
     circuit: AbstractCircuit,
-    method: Method,
+    given: Method | None,
     progress: bool,
 ) -> tuple[list[Fit], list[str]]:
     """Fit `count` recordings; what `load(row)` raises becomes the verdict of its row."""
     fits: dict[int, Fit] = {}
     notes = [""] * count
-    queues: dict[tuple[int, int], _Queue] = {}
+    used: list[str] = []
+    queues: dict[tuple[int, int, Method, tuple[int, int] | None], _Queue] = {}
 
     def fail(row, name, note):
-        fits[row] = failed_fit(name, circuit, method)
+        fits[row] = failed_fit(name, circuit, given or "maximum_likelihood")
         notes[row] = note
 
     with tqdm(total=count, unit="fit", disable=not progress) as bar:
@@ -104,22 +127,28 @@ def _identify(
         def run(queue):
             for row, fit in queue.run():
                 fits[row] = fit
+                used.append(fit.method)
                 notes[row] = message(fit.verdict)
                 bar.update()
 
         for row in range(count):
             try:
                 recording, driver = load(row)
+                name = preflight(recording)
+                method = given or "output_error"
+                if name is None:
+                    method = choose_for(given, recording, driver)
                 check_driver(driver, method, recording.sample_rate)
             except (RecordingError, ValueError) as error:
                 fail(row, "unreadable", str(error))
             except IdentificationError as error:
                 fail(row, "driver_failed", str(error))
             else:
-                name = preflight(recording)
+                name = name or preflight(recording, periodic=method == "maximum_likelihood")
                 if name is None:
-                    key = (id(driver), recording.v_th.size)
-                    queue = queues.setdefault(key, _Queue(driver, circuit, method))
+                    part = window(recording, method)
+                    key = (id(driver), recording.v_th.size, method, part)
+                    queue = queues.setdefault(key, _Queue(driver, circuit, method, part))
                     queue.add(row, recording)
                     if len(queue.rows) == LANES:
                         run(queue)
@@ -129,7 +158,8 @@ def _identify(
         for queue in queues.values():
             if queue.rows:
                 run(queue)
-    return [fits[row] for row in range(count)], notes
+    ordered = [fits[row] for row in range(count)]
+    return _of_one_method(ordered, used, given or "maximum_likelihood"), notes
 
 
 def identify_skins(
@@ -137,7 +167,7 @@ def identify_skins(
     driver: Driver,
     *,
     circuit: AbstractCircuit | None = None,
-    method: Method = "output_error",
+    method: Method | None = None,
     progress: bool = False,
 ) -> Fits:
     """Identify many recordings made with one driver.
@@ -150,7 +180,8 @@ def identify_skins(
         progress: Show a progress bar.
 
     Returns:
-        One fit per recording, in their order; none is left without a verdict.
+        One fit per recording, in their order; none is left without a verdict. The method is "mixed"
+        if some had to be identified by another than the others.
 
     Raises:
         ValueError: No recording, or method and circuit do not go together.
@@ -194,7 +225,7 @@ def identify_study(
     *,
     order: int = 5,
     circuit: AbstractCircuit | None = None,
-    method: Method = "output_error",
+    method: Method | None = None,
     progress: bool = False,
 ) -> StudyFits:
     """Identify every driver of a study from its calibrations, then every loaded recording.

@@ -101,7 +101,9 @@ def _parser() -> argparse.ArgumentParser:
     command.add_argument("source", type=pathlib.Path, metavar="FILE")
     command.add_argument("-o", dest="target", type=pathlib.Path, required=True, metavar="FITS")
     command.add_argument(
-        "--method", choices=METHODS, default=METHODS[0], help="default %(default)s"
+        "--method",
+        choices=METHODS,
+        help="default maximum_likelihood, and output_error where a record holds no whole period",
     )
     command.add_argument("--order", type=int, default=5, help="poles of the driver, default 5")
     command.set_defaults(run=_fit)

@@ -31,7 +31,7 @@ LABORATORIES: Mapping[str, Mapping[str, float]] = {
     "quiet": {"snr_db": 60.0},
     "noisy": {"snr_db": 40.0, "trigger_jitter_rms": 200e-9},
 }
-_METHODS: tuple[Method, ...] = ("output_error", "steiglitz_mcbride")
+_METHODS: tuple[Method, ...] = ("maximum_likelihood", "steiglitz_mcbride")
 _SEED = 0
 _CALIBRATION = "calibration/98k8"
 _ORDER = ("r_p", "c_p", "r_s")  # as the paper's tables have them
@@ -91,7 +91,7 @@ def identify(laboratory: str, study: etid.Study, method: Method) -> Outcome:
     driver = etid.identify_driver(study[_CALIBRATION], method=method, throw=False)
     resistors = study.where(condition="resistors")
     skins = [study[path] for path in study.loaded if path not in resistors]
-    circuit = etid.Resistor() if method == "output_error" else etid.SkinRC()
+    circuit = etid.Resistor() if method == "maximum_likelihood" else etid.SkinRC()
     return Outcome(
         laboratory,
         method,
@@ -289,7 +289,7 @@ def main(argv: Sequence[str] | None = None) -> None:
             for method in _METHODS:
                 print(f"{laboratory}: {len(study)} recordings by {method} …", file=sys.stderr)
                 outcome = identify(laboratory, study, method)
-                ending = "" if method == "output_error" else f"_{method}"
+                ending = "" if method == "maximum_likelihood" else f"_{method}"
                 outcome.skins.write(place / f"fits{ending}.h5")
                 outcome.resistors.write(place / f"resistors{ending}.h5")
                 outcomes.append(outcome)

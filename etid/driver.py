@@ -16,6 +16,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Complex, Float, Int
 
 from etid.filtering import StateSpace
+from etid.spectra import Spectrum
 from etid.transfer import Rational, as_complex, delay_variable, frequency_variable
 from etid.verdicts import RESULTS, message, verdict_names
 
@@ -117,16 +118,20 @@ def loaded(source: SourceImpedance, load: Rational, rate: float | Float[Array, "
 
 
 class Calibration(eqx.Module):
-    """What a skin must know of the calibration, besides Z_th and its covariance.
+    """What a skin must know of the calibrations, besides Z_th and its covariance.
 
     Attributes:
-        r_load: Known resistor [Ω].
-        delay_std: Standard deviation [s] of its trigger delay. Only records with different
+        r_load: Known resistors [Ω].
+        delay_std: Standard deviation [s] of their common trigger delay. Only records with different
             resistors tell that delay from a fast pole of Z_th; one resistor leaves it open.
+        delay: Their trigger delays as identified [samples].
+        spectra: Their harmonics, stacked along a leading axis; None if the method uses none.
     """
 
-    r_load: Float[Array, ""]
+    r_load: Float[Array, " record"]
     delay_std: Float[Array, ""]
+    delay: Float[Array, " record"]
+    spectra: Spectrum | None
 
 
 class Driver(eqx.Module):
@@ -141,7 +146,7 @@ class Driver(eqx.Module):
         sample_rate: Rate of the discrete filter [Hz].
         source: Continuous Z_th, valid at any sample rate; None if the method gives none.
         cov: Covariance of the parameters of `source`, flattened in field order.
-        calibration: The known resistor and how far its delay is in doubt.
+        calibration: What skins need of the calibrations.
         rrse: Largest root relative squared error over the calibrations (paper, eq. 3).
         chi2: Residual over expected variance per degree of freedom: 1 if the model is right.
         result: Verdict.

@@ -8,19 +8,19 @@ parameters that the data do not determine.
 
 from collections.abc import Callable
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float
 
-from etid import output_error, prediction, steiglitz_mcbride
+from etid import maximum_likelihood, output_error, prediction, steiglitz_mcbride
 from etid.circuits import AbstractCircuit, SkinRC
 from etid.driver import Driver, SourceImpedance
 from etid.levenberg_marquardt import normal_equations
-from etid.noise import noise_std
+from etid.measurement import Measurement
 from etid.results import Fit
+from etid.spectra import Spectrum, spectrum
 from etid.transfer import Rational, poles
 from etid.verdicts import RESULTS, verdict
 
@@ -35,45 +35,8 @@ BIASED = 16.0  # squared standard errors between an estimate and the minimum of 
 PASSIVE = 2.0  # standard errors by which Re Z_th may be negative
 BAND = np.linspace(0.0003, 0.4, 400)  # of the sample rate, where a source must be passive
 LEVELS = (1.0, 0.125, 0.5, 2.0, 8.0)  # impedance levels at which a circuit is started
-RIPPLE = 1e-5  # of the signal, left by the interpolation: no recording is better known than that
 IMPULSE = 512  # samples of a discrete model's impulse response
 UNWANTED = 1e3  # added to the cost of a start that did not settle; any cost is smaller
-
-
-class Measurement(eqx.Module):
-    """One pair of records with the noise of each.
-
-    Attributes:
-        v_th: Unloaded voltage [V].
-        v_out: Loaded voltage [V].
-        sigma_th: Noise of `v_th` [V].
-        sigma_out: Noise of `v_out` [V].
-        sample_rate: Sampling rate [Hz].
-    """
-
-    v_th: Float[Array, "*lane time"]
-    v_out: Float[Array, "*lane time"]
-    sigma_th: Float[Array, "*lane"]
-    sigma_out: Float[Array, "*lane"]
-    sample_rate: Float[Array, "*lane"]
-
-
-def measure(
-    v_th: Float[Array, " time"],
-    v_out: Float[Array, " time"],
-    resolution_th: Float[Array, ""],
-    resolution_out: Float[Array, ""],
-    sample_rate: Float[Array, ""],
-) -> Measurement:
-    """Estimate the noise of both records; a `resolution` is the converter's step [V] or 0."""
-    floor_th, floor_out = RIPPLE * jnp.ptp(v_th), RIPPLE * jnp.ptp(v_out)
-    return Measurement(
-        v_th,
-        v_out,
-        jnp.maximum(noise_std(v_th, resolution_th), floor_th),
-        jnp.maximum(noise_std(v_out, resolution_out), floor_out),
-        sample_rate,
-    )
 
 
 def _prepare(m: Measurement) -> prediction.Records:
@@ -194,14 +157,11 @@ def driver_by_steiglitz_mcbride(
     )
 
 
-# --- Output error --------------------------------------------------------------------------------
+# --- Output error and maximum likelihood ---------------------------------------------------------
 
 
-def skin_by_output_error(m: Measurement, driver: Driver, circuit: AbstractCircuit) -> Fit:
-    """Refine from the best of several impedance levels and, for SkinRC, the paper's estimate."""
-    source, source_cov, calibration = driver.source, driver.cov, driver.calibration
-    if source is None or source_cov is None or calibration is None:
-        raise ValueError("output error needs a driver identified by output error")
+def _skin_starts(m: Measurement, driver: Driver, circuit: AbstractCircuit) -> AbstractCircuit:
+    """Several impedance levels and, for SkinRC, the paper's estimate, stacked."""
     typical = circuit.log_values()
     is_ohm = jnp.array([unit == "ohm" for unit in circuit.units().values()])
     sign = jnp.where(is_ohm, 1.0, -1.0)
@@ -211,9 +171,38 @@ def skin_by_output_error(m: Measurement, driver: Driver, circuit: AbstractCircui
         values = baseline.circuit.values()
         usable = jnp.all(values > 0) & jnp.isfinite(values).all()
         starts.append(jnp.where(usable, jnp.log(jnp.where(usable, values, 1.0)), typical))
-    fitted, estimate = output_error.fit_circuit(
-        _prepare(m), source, source_cov, calibration, circuit.with_log_values(jnp.stack(starts))
-    )
+    return circuit.with_log_values(jnp.stack(starts))
+
+
+def _spectrum(m: Measurement, window: tuple[int, int]) -> Spectrum:
+    return spectrum(m.v_th, m.v_out, m.sigma_th, m.sigma_out, m.sample_rate, *window)
+
+
+def skin_by_refinement(
+    m: Measurement, driver: Driver, circuit: AbstractCircuit, window: tuple[int, int] | None
+) -> Fit:
+    """Refine from the best of several starts.
+
+    Args:
+        m: One recording.
+        driver: Its driver, with a continuous source impedance.
+        circuit: Structure and typical values.
+        window: Periods and samples of `spectra.whole_periods`, for maximum likelihood; None for
+            output error.
+    """
+    source, source_cov, calibration = driver.source, driver.cov, driver.calibration
+    if source is None or source_cov is None or calibration is None:
+        raise ValueError("the driver has no continuous source impedance")
+    starts = _skin_starts(m, driver, circuit)
+    if window is None:
+        fitted, estimate = output_error.fit_circuit(
+            _prepare(m), source, source_cov, calibration, starts
+        )
+    else:
+        rate = jnp.asarray(driver.sample_rate)
+        fitted, estimate = maximum_likelihood.fit_circuit(
+            _spectrum(m, window), m.sample_rate, calibration, rate, source, starts
+        )
     values = fitted.values()
     errors = jnp.sqrt(jnp.diagonal(estimate.cov))  # of the logarithms, so relative ones
     settled = RESULTS.promote(estimate.result) == RESULTS.successful
@@ -232,7 +221,7 @@ def skin_by_output_error(m: Measurement, driver: Driver, circuit: AbstractCircui
             (driver.result != SUCCESSFUL, RESULTS.driver_failed),
         ),
         steps=estimate.steps,
-        method="output_error",
+        method="output_error" if window is None else "maximum_likelihood",
     )
 
 
@@ -287,15 +276,32 @@ def source_starts(
     return jax.tree.map(lambda *leaves: jnp.stack(leaves), *starts)
 
 
-def driver_by_output_error(m: Measurement, r_load: Float[Array, " record"], order: int) -> Driver:
-    """Refine Z_th from several starts and keep the best that settled."""
+def driver_by_refinement(
+    m: Measurement, r_load: Float[Array, " record"], order: int, window: tuple[int, int] | None
+) -> Driver:
+    """Refine Z_th from several starts and keep the best that settled.
+
+    Args:
+        m: Calibrations, stacked along a leading axis.
+        r_load: Their resistors [Ω].
+        order: Number of poles.
+        window: As in `skin_by_refinement`.
+    """
     baseline = driver_by_steiglitz_mcbride(m, r_load, order, steiglitz_mcbride.ITERATIONS)
-    records = jax.vmap(_prepare)(m)
     starts = source_starts(baseline.a, order, m.sample_rate[0], r_load.mean())
+    if window is None:
+        records = jax.vmap(_prepare)(m)
+
+        def fit(start):
+            return output_error.fit_source(records, r_load, start)
+    else:
+        spectra = jax.vmap(lambda m: _spectrum(m, window))(m)
+
+        def fit(start):
+            return maximum_likelihood.fit_source(spectra, r_load, m.sample_rate[0], start)
+
     # One start after the other: side by side they would all run as long as the slowest, and slower.
-    sources, estimates, calibrations = jax.lax.map(
-        lambda start: output_error.fit_source(records, r_load, start), starts
-    )
+    sources, estimates, calibrations = jax.lax.map(fit, starts)
     frequency = jnp.asarray(BAND) * m.sample_rate[0]
 
     def resistance(source, cov):
@@ -333,5 +339,5 @@ def driver_by_output_error(m: Measurement, r_load: Float[Array, " record"], orde
             (_misses(estimate.chi2, estimate.rrse) | _too_late(estimate), RESULTS.misfit),
         ),
         steps=estimate.steps,
-        method="output_error",
+        method="output_error" if window is None else "maximum_likelihood",
     )

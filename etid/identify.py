@@ -13,40 +13,83 @@ from etid import estimation, output_error, prediction, steiglitz_mcbride
 from etid.circuits import AbstractCircuit, Resistor, SkinRC
 from etid.driver import Driver
 from etid.filtering import TAPS
+from etid.measurement import measure
 from etid.precision import require_float64
-from etid.preflight import preflight, resolution
+from etid.preflight import is_periodic, preflight, resolution
 from etid.recording import Recording
 from etid.results import Fit, IdentificationError
+from etid.spectra import separates_aliases, whole_periods
 from etid.verdicts import message, verdict
 
-Method = Literal["output_error", "steiglitz_mcbride", "equation_error"]
-METHODS: tuple[Method, ...] = ("output_error", "steiglitz_mcbride", "equation_error")
+Method = Literal["maximum_likelihood", "output_error", "steiglitz_mcbride", "equation_error"]
+METHODS: tuple[Method, ...] = (
+    "maximum_likelihood",
+    "output_error",
+    "steiglitz_mcbride",
+    "equation_error",
+)
+CONTINUOUS = METHODS[:2]  # those that identify a continuous source impedance
 
 
 def _iterations(method: Method) -> int:
     return 1 if method == "equation_error" else steiglitz_mcbride.ITERATIONS
 
 
-def check_method(method: str, circuit: AbstractCircuit | None = None) -> None:
+def check_method(method: str | None, circuit: AbstractCircuit | None = None) -> None:
     """Raise ValueError unless the method exists and can identify this circuit."""
     require_float64()
+    if method is None:
+        return
     if method not in METHODS:
         raise ValueError(f"method {method!r} is not known; use one of {', '.join(METHODS)}")
-    if method != "output_error" and circuit is not None and not isinstance(circuit, SkinRC):
+    if method not in CONTINUOUS and circuit is not None and not isinstance(circuit, SkinRC):
         raise ValueError(
             f"method {method!r} identifies SkinRC only, not {type(circuit).__name__}; "
-            "use method='output_error'"
+            "use method='maximum_likelihood'"
         )
+
+
+def has_harmonics(driver: Driver) -> bool:
+    """Whether maximum likelihood can use this driver."""
+    return driver.calibration is not None and driver.calibration.spectra is not None
+
+
+def choose(method: Method | None, recordings: Sequence[Recording]) -> Method:
+    """The method given, or else maximum likelihood if all records hold several whole periods.
+
+    Where aliases cannot be told from harmonics, as in a single period, it would be biased by more
+    than its errors say.
+    """
+    if method is not None:
+        return method
+    for recording in recordings:
+        rates = recording.sample_rate, recording.pulse_rate
+        part = whole_periods(recording.v_out.size, *rates)
+        if not separates_aliases(*part) or not is_periodic(recording):
+            return "output_error"
+    return "maximum_likelihood"
+
+
+def choose_for(method: Method | None, recording: Recording, driver: Driver) -> Method:
+    """As `choose`, for a load that is identified with `driver`."""
+    if method is None and not has_harmonics(driver):
+        return "output_error"
+    return choose(method, [recording])
 
 
 def check_driver(driver: Driver, method: Method, sample_rate: float) -> None:
     """Raise ValueError if `driver` cannot serve `method` at `sample_rate` [Hz]."""
-    if method == "output_error" and driver.source is None:
+    if method in CONTINUOUS and driver.source is None:
         raise ValueError(
             f"this driver was identified by {driver.method}, which gives no continuous source "
-            "impedance; identify it with method='output_error'"
+            f"impedance; identify it with method={method!r}"
         )
-    if method != "output_error" and not np.isclose(float(driver.sample_rate), sample_rate):
+    if method == "maximum_likelihood" and not has_harmonics(driver):
+        raise ValueError(
+            f"this driver was identified by {driver.method}, which keeps no harmonics of its "
+            "calibrations; identify it with method='maximum_likelihood'"
+        )
+    if method not in CONTINUOUS and not np.isclose(float(driver.sample_rate), sample_rate):
         raise ValueError(
             f"{method} needs recording and calibration at one sample rate, but the recording has "
             f"{sample_rate:g} Hz and the driver {float(driver.sample_rate):g} Hz; "
@@ -65,19 +108,38 @@ def arrays(recording: Recording) -> tuple[np.ndarray, ...]:
     )
 
 
+def window(recording: Recording, method: Method) -> tuple[int, int] | None:
+    """Whole periods and their samples, for the method that needs them."""
+    if method != "maximum_likelihood":
+        return None
+    return whole_periods(recording.v_out.size, recording.sample_rate, recording.pulse_rate)
+
+
 @eqx.filter_jit
-def _driver(samples: Any, r_load: Float[Array, " record"], order: int, method: Method) -> Driver:
-    m = jax.vmap(estimation.measure)(*samples)
-    if method == "output_error":
-        return estimation.driver_by_output_error(m, r_load, order)
+def _driver(
+    samples: Any,
+    r_load: Float[Array, " record"],
+    order: int,
+    method: Method,
+    window: tuple[int, int] | None,
+) -> Driver:
+    m = jax.vmap(measure)(*samples)
+    if method in CONTINUOUS:
+        return estimation.driver_by_refinement(m, r_load, order, window)
     return estimation.driver_by_steiglitz_mcbride(m, r_load, order, _iterations(method))
 
 
-def skin_lane(samples: Any, driver: Driver, circuit: AbstractCircuit, method: Method) -> Fit:
+def skin_lane(
+    samples: Any,
+    driver: Driver,
+    circuit: AbstractCircuit,
+    method: Method,
+    window: tuple[int, int] | None,
+) -> Fit:
     """Identify one lane; differentiable code, to be jitted and batched by the caller."""
-    m = estimation.measure(*samples)
-    if method == "output_error":
-        return estimation.skin_by_output_error(m, driver, circuit)
+    m = measure(*samples)
+    if method in CONTINUOUS:
+        return estimation.skin_by_refinement(m, driver, circuit, window)
     return estimation.skin_by_steiglitz_mcbride(m, driver, _iterations(method))
 
 
@@ -88,7 +150,7 @@ def identify_driver(
     calibrations: Recording | Sequence[Recording],
     *,
     order: int = 5,
-    method: Method = "output_error",
+    method: Method | None = None,
     throw: bool = True,
 ) -> Driver:
     """Identify the source impedance Z_th from one or several records with known resistors.
@@ -96,8 +158,9 @@ def identify_driver(
     Args:
         calibrations: Recordings with `r_load`, of one length and sample rate.
         order: Number of poles of Z_th (the paper uses 5).
-        method: `"output_error"`, or the paper's `"steiglitz_mcbride"`, or its first iteration
-            `"equation_error"`.
+        method: `"maximum_likelihood"`, for records of several whole pulse periods, or
+            `"output_error"`, or the paper's `"steiglitz_mcbride"`, or its first iteration
+            `"equation_error"`. If not given, the first where the record allows it, else the second.
         throw: Raise if the verdict is not successful.
 
     Returns:
@@ -120,22 +183,23 @@ def identify_driver(
             )
     if order < 2:
         raise ValueError(f"order is {order}; a source impedance needs at least order 2")
-    sizes = {(record.v_th.size, record.sample_rate) for record in records}
+    sizes = {(record.v_th.size, record.sample_rate, record.pulse_rate) for record in records}
     if len(sizes) > 1:
         raise ValueError(
-            f"calibrations differ in (samples, sample rate): {sorted(sizes)}; "
+            f"calibrations differ in (samples, sample rate, pulse rate): {sorted(sizes)}; "
             "cut them to one length"
         )
     for record in records:
-        name = preflight(record)
+        name = preflight(record, periodic=method == "maximum_likelihood")
         if name is not None:
             text = f"calibration {record.path!r}: {name}. {message(name)}"
             raise IdentificationError(text, None)
+    method = choose(method, records)
     samples = tuple(
         jnp.asarray(np.stack(column)) for column in zip(*map(arrays, records), strict=True)
     )
     r_load = jnp.asarray([record.r_load for record in records])
-    driver = _driver(samples, r_load, order, method)
+    driver = _driver(samples, r_load, order, method, window(records[0], method))
     if throw and driver.verdict != "successful":
         raise IdentificationError(f"driver: {driver.verdict}. {message(driver.verdict)}", driver)
     return driver
@@ -155,7 +219,7 @@ def identify_skin(
     driver: Driver,
     *,
     circuit: AbstractCircuit | None = None,
-    method: Method = "output_error",
+    method: Method | None = None,
     throw: bool = True,
 ) -> Fit:
     """Identify what is connected to the driver in one recording.
@@ -176,12 +240,15 @@ def identify_skin(
     """
     circuit = SkinRC() if circuit is None else circuit
     check_method(method, circuit)
-    check_driver(driver, method, recording.sample_rate)
     name = preflight(recording)
+    method = choose_for(method, recording, driver) if name is None else method or "output_error"
+    check_driver(driver, method, recording.sample_rate)
+    name = preflight(recording, periodic=method == "maximum_likelihood")
     if name is not None:
         fit = failed_fit(name, circuit, method)
     else:
-        fit = _skin(tuple(map(jnp.asarray, arrays(recording))), driver, circuit, method)
+        samples = tuple(map(jnp.asarray, arrays(recording)))
+        fit = _skin(samples, driver, circuit, method, window(recording, method))
     if throw and fit.verdict != "successful":
         text = f"recording {recording.path!r}: {fit.verdict}. {message(fit.verdict)}"
         raise IdentificationError(text, fit)
@@ -190,13 +257,13 @@ def identify_skin(
 
 @eqx.filter_jit
 def _fitted(samples: Any, driver: Driver, circuit: AbstractCircuit) -> Float[Array, " interval"]:
-    m = estimation.measure(*samples)
+    m = measure(*samples)
     records = prediction.prepare(
         m.v_th, m.v_out, m.sigma_th, m.sigma_out, m.sample_rate, cutoff=0.5
     )  # the whole band, as it was recorded
     assert driver.source is not None
     assert driver.calibration is not None
-    r_load = driver.calibration.r_load
+    r_load = driver.calibration.r_load[0]
     return output_error.fitted_voltage(records, driver.source, r_load, circuit.impedance())
 
 

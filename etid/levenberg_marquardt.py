@@ -31,6 +31,7 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 INITIAL_DAMPING = 1e-2  # relative to the unit diagonal of the scaled Gauss-Newton matrix
 RIDGE = 1e-13  # of the scaled matrix, for directions that double precision cannot resolve
 ROUNDING = 4.0  # units of ε that the model's own arithmetic loses
+IDLE_STEPS = 3  # in a row; the steps grow fivefold from one to the next
 STALLED_STEP = 1e-15  # a relative step that no longer changes the parameters in double precision
 
 
@@ -68,6 +69,7 @@ class _State(eqx.Module):
     terminate: Bool[Array, ""]
     result: optx.RESULTS
     accepted_steps: Int[Array, ""]
+    idle: Int[Array, ""]
 
 
 def _select(pred, new: PyTree, old: PyTree) -> PyTree:
@@ -84,9 +86,9 @@ class LevenbergMarquardt(optx.AbstractLeastSquaresSolver):
             below this.
         atol: Stop when the remaining Gauss-Newton step, scaled, is below this times the scaled
             parameters (problems without noise, where the residual itself vanishes).
-        ftol: Stop when an accepted step reduces |r|² by less than this part, and promised no more:
-            along a valley whose floor is flat within rounding, as of a superfluous pole, the two
-            criteria above are never met.
+        ftol: Stop when several accepted steps in a row each reduce |r|² by less than this part, and
+            promised no more: along a valley whose floor is flat within rounding, as of a
+            superfluous pole, the two criteria above are never met.
         norm: Norm of the scaled step and parameters.
     """
 
@@ -117,6 +119,7 @@ class LevenbergMarquardt(optx.AbstractLeastSquaresSolver):
             terminate=jnp.array(False),
             result=optx.RESULTS.successful,
             accepted_steps=jnp.array(0),
+            idle=jnp.array(0),
         )
 
     def _info(self, equations: NormalEquations):
@@ -140,7 +143,9 @@ class LevenbergMarquardt(optx.AbstractLeastSquaresSolver):
         promised = -self.search.predict_reduction(tried, self._info(state.accepted))
         reduced = state.accepted.objective - trial.objective
         negligible = jnp.maximum(jnp.abs(reduced), promised) <= self.ftol * trial.objective
-        negligible = negligible & accept & ~state.first_step
+        # Once is no sign of it: after a rejection, a step is as short as its reduction is small.
+        idle = jnp.where(negligible & ~state.first_step, state.idle + 1, 0)
+        idle = jnp.where(accept, idle, state.idle)
         accepted = _select(accept, trial, state.accepted)
         y = jnp.where(accept, state.y_eval, y)
         diagonal = jnp.sqrt(jnp.diagonal(accepted.matrix))
@@ -172,7 +177,7 @@ class LevenbergMarquardt(optx.AbstractLeastSquaresSolver):
         model = self.norm(diagonal * y)
         unseen = offset <= ROUNDING * jnp.finfo(y.dtype).eps * jnp.sqrt(squares) * model
         converged = converged | (unseen & ~accept)
-        converged = converged | negligible | (self.norm(newton) <= self.atol * size)
+        converged = converged | (idle >= IDLE_STEPS) | (self.norm(newton) <= self.atol * size)
         stalled = (self.norm(safe * tried) <= STALLED_STEP * size) & ~state.first_step
         finite = jnp.isfinite(accepted.objective)
         terminate = converged | stalled | ~finite
@@ -189,6 +194,7 @@ class LevenbergMarquardt(optx.AbstractLeastSquaresSolver):
             terminate=terminate,
             result=result,
             accepted_steps=state.accepted_steps + jnp.where(accept, 1, 0),
+            idle=idle,
         )
         return y, state, None
 

@@ -123,6 +123,15 @@ def prior(start: SourceImpedance, sample_rate: Float[Array, ""], r_load: Float[A
     return regularise
 
 
+def delay_std(r_load: Float[Array, " record"]) -> Float[Array, ""]:
+    """Standard deviation [samples] to which calibrations with these resistors know their delay.
+
+    Records with one and the same resistor share its ambiguity, others resolve it.
+    """
+    same = jnp.ptp(r_load) < SAME_LOAD * r_load.mean()
+    return jnp.where(same, DELAY_WIDTH, KNOWN_DELAY)
+
+
 def fit_source(
     records: Records,
     r_load: Float[Array, " record"],
@@ -185,9 +194,6 @@ def fit_source(
     parts = jax.vmap(lambda part: eliminate(part, kept))(parts)
     bread = inverse(parts.expected.sum(0) + weak.T @ weak)
     cov = bread @ parts.score.sum(0) @ bread * jnp.maximum(chi2, 1.0)
-    # Records with one and the same resistor share the ambiguity of the delay, others resolve it.
-    same = jnp.ptp(r_load) < SAME_LOAD * r_load.mean()
-    delay_std = jnp.where(same, DELAY_WIDTH, KNOWN_DELAY) / records.sample_rate[0]
     estimate = Estimate(
         q[:kept],
         nuisance,
@@ -198,7 +204,11 @@ def fit_source(
         solution.stats["num_steps"],
         jnp.zeros_like(cov),
     )
-    return unflatten(q[:kept]), estimate, Calibration(r_load[0], delay_std)
+    return (
+        unflatten(q[:kept]),
+        estimate,
+        Calibration(r_load, delay_std(r_load) / records.sample_rate[0], nuisance[:, -1], None),
+    )
 
 
 def fit_circuit(
@@ -226,7 +236,7 @@ def fit_circuit(
     kept, sources = candidates.shape[-1], source_vector.shape[0]
     circuit = jax.tree.map(lambda leaf: leaf[0], starts)
     states = jax.eval_shape(lambda: loaded(source, circuit.impedance(), 1.0).C).shape[0]
-    delay_std = calibration.delay_std * records.sample_rate  # [samples]
+    late_std = calibration.delay_std * records.sample_rate  # [samples]
 
     def load(q):
         return circuit.with_log_values(q[:kept]).impedance()
@@ -236,7 +246,7 @@ def fit_circuit(
     def residual(q, late):
         change = jax.tree.map(lambda leaf: q[-1] * leaf, late)
         scaled = scaled_residual(records, source, load(q), q[kept:-1], change)
-        return jnp.concatenate([scaled, q[-2:] / jnp.stack([DELAY_WIDTH, delay_std])])
+        return jnp.concatenate([scaled, q[-2:] / jnp.stack([DELAY_WIDTH, late_std])])
 
     def refine(carry, _):
         q, late = carry
@@ -245,7 +255,7 @@ def fit_circuit(
         )
         q = solution.value
         x0 = q[kept : kept + states]
-        late = late_calibration(records, source, load(q), calibration.r_load, x0)
+        late = late_calibration(records, source, load(q), calibration.r_load[0], x0)
         equations = solution.stats["normal_equations"]
         return (q, late), (equations.objective, solution.result, solution.stats["num_steps"])
 
@@ -273,7 +283,7 @@ def fit_circuit(
         h = impulse_response(loaded_filter(z_th, load(p), records.sample_rate))
         return h + p[kept] * late.h
 
-    precision = jnp.zeros_like(at).at[kept].set(1 / delay_std**2).at[-1].set(1 / DELAY_WIDTH**2)
+    precision = jnp.zeros_like(at).at[kept].set(1 / late_std**2).at[-1].set(1 / DELAY_WIDTH**2)
     full = eliminate(curvature(records, of_all, response, at, precision), both)
     own = inverse(full.expected[: kept + 1, : kept + 1])
     chi2 = 2 * objective[-1] / (records.hold.shape[0] - q.shape[0])

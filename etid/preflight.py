@@ -4,8 +4,10 @@ import numpy as np
 from jaxtyping import Float
 
 from etid.filtering import TAPS
+from etid.measurement import RIPPLE
 from etid.noise import noise_std
 from etid.recording import Recording
+from etid.spectra import whole_periods
 
 SHORTEST = 4 * TAPS + 104  # samples: the interpolation's edges and a hundred and some to fit
 FLAT = (
@@ -14,13 +16,19 @@ FLAT = (
 RAIL = 3  # equal extreme samples in a row that a noisy or sloping signal does not produce
 JUMP = 8.0  # converter steps by which a clipped signal enters and leaves its rail
 POWER = 1.01  # of v_out over v_th; a passive load takes power, and gains match better than this
+SEAM = 3  # samples on both sides of the joint between two periods
+STEP = 4.0  # standard deviations of the noise by which they may differ there
 SHIFT = 50e-6  # [s] that a load may delay v_out; R_th C_p is below 10 µs
 
 
-def preflight(recording: Recording) -> str | None:
+def preflight(recording: Recording, *, periodic: bool = False) -> str | None:
     """Name the verdict that forbids a fit, or None.
 
-    Verdicts: `too_short`, `nonfinite_samples`, `flat`, `saturated`, `misaligned`.
+    Verdicts: `too_short`, `nonfinite_samples`, `flat`, `saturated`, `misaligned`, `not_periodic`.
+
+    Args:
+        recording: Unloaded and loaded voltage.
+        periodic: Whether whole pulse periods are needed.
     """
     v_th, v_out = recording.v_th, recording.v_out
     if v_th.size < SHORTEST:
@@ -33,7 +41,29 @@ def preflight(recording: Recording) -> str | None:
         return "saturated"
     if _is_misaligned(v_th, v_out, recording.sample_rate):
         return "misaligned"
+    if periodic and not is_periodic(recording):
+        return "not_periodic"
     return None
+
+
+def is_periodic(recording: Recording) -> bool:
+    """Whether the record holds whole pulse periods, each like the other where they are joined.
+
+    Periods are a whole number of samples long to within half a sample, which matters where the
+    signal is steep at the joint.
+    """
+    rates = recording.sample_rate, recording.pulse_rate
+    periods, samples = whole_periods(recording.v_out.size, *rates)
+    if periods == 0:
+        return False
+    rest = abs(periods * rates[0] / rates[1] - samples)
+    for name in ("v_th", "v_out"):
+        v = getattr(recording, name)
+        joint = np.concatenate([v[samples - SEAM : samples], v[:SEAM]])
+        sigma = float(noise_std(v, resolution(recording, name)))
+        if rest * np.abs(np.diff(joint)).max() > STEP * max(sigma, RIPPLE * np.ptp(v)):
+            return False
+    return True
 
 
 def resolution(recording: Recording, name: str) -> float:

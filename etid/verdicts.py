@@ -45,6 +45,10 @@ class RESULTS(optx.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]  # equi
         "v_out carries more power than v_th, or is not aligned with it in time. "
         "Swap the two records, or align them on the edge of the pulse."
     )
+    not_periodic = (
+        "The record holds no whole pulse period, or begins in the middle of an edge. "
+        "Record a whole number of periods, or use method='output_error'."
+    )
     unreadable = "The recording could not be read from its file; `etid check` says why."
     driver_failed = (
         "The driver this fit rests on was not identified successfully; its own verdict says why. "

@@ -211,7 +211,7 @@ def test_a_calibration_that_is_none_is_refused(calibration, change, message):
 
 def test_calibrations_must_be_alike(calibration):
     shorter = calibration.replace(v_th=calibration.v_th[:2000], v_out=calibration.v_out[:2000])
-    with pytest.raises(ValueError, match=r"differ in \(samples, sample rate\)"):
+    with pytest.raises(ValueError, match=r"differ in \(samples, sample rate, pulse rate\)"):
         etid.identify_driver([calibration, shorter])
     with pytest.raises(ValueError, match="no calibration given"):
         etid.identify_driver([])

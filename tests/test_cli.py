@@ -117,7 +117,7 @@ def test_fit_writes_all_fits_and_one_bad_recording_costs_itself(run, study_file,
     status, printed, complaints = run("fit", study_file, "-o", target)
     assert (status, complaints) == (DONE, [])
     verdicts = "3 successful, 1 nonfinite_samples, 1 unreadable"
-    assert printed[0] == f"5 recordings by output_error: {verdicts}"
+    assert printed[0] == f"5 recordings by maximum_likelihood: {verdicts}"
     assert printed[1].startswith("driver calibration/98k8: order 5, successful, RRSE ")
     heads, row = printed[4], printed[5]
     assert heads.split() == "subject condition fits r_s [kΩ] r_p [kΩ] c_p [nF]".split()
@@ -148,7 +148,7 @@ def test_fit_without_any_success_says_so_and_lists_twenty_at_most(run, tmp_path)
     study.write(file)
     status, printed, _ = run("fit", file, "-o", target, "--order", 1)  # no driver has order 1
     assert status == WRONG_DATA
-    assert printed[0] == "23 recordings by output_error: 23 driver_failed"
+    assert printed[0] == "23 recordings by maximum_likelihood: 23 driver_failed"
     assert printed[1].startswith("driver calibration/98k8: order is 1")
     assert sum(line.startswith("built/") for line in printed) == 20
     assert printed[-1].startswith("and 3 more")

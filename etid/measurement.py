@@ -1,0 +1,45 @@
+"""Two voltages with the noise of each: what every estimator starts from."""
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from etid.noise import noise_std
+
+RIPPLE = 1e-5  # of the signal, left by the interpolation: no recording is better known than that
+
+
+class Measurement(eqx.Module):
+    """One pair of records with the noise of each.
+
+    Attributes:
+        v_th: Unloaded voltage [V].
+        v_out: Loaded voltage [V].
+        sigma_th: Noise of `v_th` [V].
+        sigma_out: Noise of `v_out` [V].
+        sample_rate: Sampling rate [Hz].
+    """
+
+    v_th: Float[Array, "*lane time"]
+    v_out: Float[Array, "*lane time"]
+    sigma_th: Float[Array, "*lane"]
+    sigma_out: Float[Array, "*lane"]
+    sample_rate: Float[Array, "*lane"]
+
+
+def measure(
+    v_th: Float[Array, " time"],
+    v_out: Float[Array, " time"],
+    resolution_th: Float[Array, ""],
+    resolution_out: Float[Array, ""],
+    sample_rate: Float[Array, ""],
+) -> Measurement:
+    """Estimate the noise of both records; a `resolution` is the converter's step [V] or 0."""
+    floor_th, floor_out = RIPPLE * jnp.ptp(v_th), RIPPLE * jnp.ptp(v_out)
+    return Measurement(
+        v_th,
+        v_out,
+        jnp.maximum(noise_std(v_th, resolution_th), floor_th),
+        jnp.maximum(noise_std(v_out, resolution_out), floor_out),
+        sample_rate,
+    )

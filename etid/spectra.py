@@ -1,0 +1,115 @@
+"""Harmonics of the pulse rate: synchronous averaging and a Fourier transform in one.
+
+A record of P periods is cut to the M samples nearest to a whole number of them; the discrete
+Fourier transform at every P-th bin, f_k = k P fs/M, averages the periods. M need not be a multiple
+of P, nor the clock be exact: a linear system at rest again at both ends of the window obeys
+Y(f) = G(f) X(f) at any frequency. What has aliased, k f0 − fs, falls into the bins between those of
+the harmonics, unless a period is a whole number of samples or there is but one; then the upper part
+of the band, where anti-alias filters are imperfect, is left out.
+"""
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Complex, Float
+
+SELECTION = 10.0  # mean power over `WINDOW` harmonics, in variances of a coefficient
+WINDOW = 25
+ALIASED = 0.35  # of the sample rate, above which aliases must be told from harmonics by frequency
+DRIFT_DEGREE = 3  # of the polynomial by which the mean may drift
+
+
+class Spectrum(eqx.Module):
+    """Fourier coefficients [V] of both records at the harmonics.
+
+    Attributes:
+        frequency: Harmonics of the pulse rate [Hz].
+        x: Coefficients of V_th.
+        y: Coefficients of V_out.
+        variance_x: E|noise|² of one coefficient of `x` [V²].
+        variance_y: The same of `y`.
+        selected: Harmonics that stand out of the noise; the others are left out of a fit.
+    """
+
+    frequency: Float[Array, "*lane harmonic"]
+    x: Complex[Array, "*lane harmonic"]
+    y: Complex[Array, "*lane harmonic"]
+    variance_x: Float[Array, "*lane"]
+    variance_y: Float[Array, "*lane"]
+    selected: Bool[Array, "*lane harmonic"]
+
+
+def whole_periods(samples: int, sample_rate: float, pulse_rate: float) -> tuple[int, int]:
+    """How many whole periods a record holds, and the samples nearest to them.
+
+    The last period may lack half a sample: 3333 samples are one period of 60 Hz at 200 kHz.
+
+    Returns:
+        Number of periods, 0 if there is none, and number of samples.
+    """
+    periods = int((samples + 0.5) * pulse_rate / sample_rate)
+    return periods, min(samples, round(periods * sample_rate / pulse_rate))
+
+
+def separates_aliases(periods: int, samples: int) -> bool:
+    """Whether what has aliased falls between the bins of the harmonics."""
+    return periods > 1 and samples % periods != 0
+
+
+def harmonics(
+    v: Float[Array | np.ndarray, " time"], periods: int, samples: int
+) -> Complex[Array, " harmonic"]:
+    """Fourier coefficients (1/M) Σ v[n] e^(−j2πkPn/M) for k = 1 … below half the sample rate.
+
+    A drift of the mean from period to period is taken out first.
+    """
+    kept = jnp.asarray(v)[:samples]
+    coefficients = jnp.fft.rfft(kept - _drift(kept, periods)) / samples
+    return coefficients[periods : (samples + 1) // 2 : periods]
+
+
+def _drift(v: Float[Array, " time"], periods: int) -> Float[Array, " time"]:
+    """Polynomial through the means of the periods."""
+    samples = v.shape[0]
+    basis = np.vander(np.linspace(-1, 1, samples), min(periods, DRIFT_DEGREE + 1), increasing=True)
+    # Part of each sample in each period, whose ends fall between samples.
+    ends = np.arange(periods + 1) * (samples / periods)
+    start = np.arange(samples)
+    inside = np.minimum(start + 1, ends[1:, None]) - np.maximum(start, ends[:-1, None])
+    share = np.maximum(inside, 0.0) * (periods / samples)
+    project = np.linalg.pinv(share @ basis)
+    return jnp.asarray(basis) @ (jnp.asarray(project) @ (jnp.asarray(share) @ v))
+
+
+def spectrum(
+    v_th: Float[Array, " time"],
+    v_out: Float[Array, " time"],
+    sigma_th: Float[Array, ""],
+    sigma_out: Float[Array, ""],
+    sample_rate: Float[Array, ""],
+    periods: int,
+    samples: int,
+) -> Spectrum:
+    """Harmonics of both records, their noise and their choice.
+
+    Args:
+        v_th: Unloaded voltage [V].
+        v_out: Loaded voltage [V].
+        sigma_th: Noise of a sample of `v_th` [V], white.
+        sigma_out: The same of `v_out`.
+        sample_rate: Sampling rate [Hz].
+        periods: From `whole_periods`.
+        samples: From `whole_periods`.
+    """
+    x, y = harmonics(v_th, periods, samples), harmonics(v_out, periods, samples)
+    variance_x, variance_y = sigma_th**2 / samples, sigma_out**2 / samples
+    frequency = jnp.arange(1.0, x.shape[0] + 1) * (periods * sample_rate / samples)
+    # The choice must not depend on single harmonics: that would favour those with lucky noise.
+    box = jnp.ones(WINDOW) / WINDOW
+    power_x = jnp.convolve(jnp.abs(x) ** 2, box, mode="same") / variance_x
+    power_y = jnp.convolve(jnp.abs(y) ** 2, box, mode="same") / variance_y
+    out = (jnp.minimum(power_x, power_y) < SELECTION) & (jnp.arange(x.shape[0]) >= WINDOW)
+    selected = jnp.cumsum(out) == 0  # up to the first that does not stand out
+    if not separates_aliases(periods, samples):
+        selected = selected & (frequency < ALIASED * sample_rate)
+    return Spectrum(frequency, x, y, variance_x, variance_y, selected)

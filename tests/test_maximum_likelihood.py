@@ -1,0 +1,115 @@
+"""Maximum likelihood on the harmonics: exact without noise, joint with its calibrations."""
+
+import dataclasses
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import etid
+from etid import maximum_likelihood
+from etid.circuits import SkinRC, resistor
+from etid.scenes import Scene, Trial
+from etid.transformer import ResistorLoad, SkinLoad
+
+DRY = SkinLoad(r_s=33.4e3, r_p=186e3, c_p=0.12e-9)
+SAMPLES = 10_000
+SIGMAS = 5.0  # one in 2 million for a normal error
+
+
+def simulate(trials=1, resistors=(98.8e3,), samples=SAMPLES, seed=0, **options):
+    return Scene(
+        tuple(Trial(f"loaded/{i}", DRY) for i in range(trials)),
+        tuple(Trial(f"calibration/{i}", ResistorLoad(r)) for i, r in enumerate(resistors)),
+        samples=samples,
+        **options,
+    ).simulate(seed=seed)
+
+
+@pytest.fixture(scope="module")
+def study():
+    return simulate(4, snr_db=60.0, trigger_jitter_rms=500e-9, seed=3)
+
+
+@pytest.fixture(scope="module")
+def driver(study):
+    return etid.identify_driver(study["calibration/0"])
+
+
+def error(fit):
+    return np.asarray(fit.circuit.values()) - dataclasses.astuple(DRY)
+
+
+def test_whole_periods_are_identified_by_maximum_likelihood(driver):
+    assert driver.method == "maximum_likelihood"
+    assert driver.verdict == "successful"
+
+
+def test_trigger_delays_of_a_tenth_of_a_sample_leave_every_trial_within_its_error(study, driver):
+    fits = etid.identify_skins(study.loaded, driver)
+    assert fits.counts() == {"successful": 4}
+    wrong = np.asarray(fits.circuit.values()) - np.array(dataclasses.astuple(DRY))
+    assert (np.abs(wrong) < SIGMAS * np.asarray(fits.stderr.values())).all()
+    # In units of the elements: 500 ns would otherwise spread R_s by 93 %.
+    assert (np.abs(wrong) / np.array(dataclasses.astuple(DRY)) < 0.02).all()
+
+
+def test_the_gain_is_that_of_the_divider(driver):
+    frequency = jnp.array([60.0, 5e3, 60e3])
+    g = maximum_likelihood.gain(driver.source, resistor(jnp.asarray(98.8e3)), frequency)
+    expected = 98.8e3 / (98.8e3 + np.asarray(driver.response(frequency)))
+    np.testing.assert_allclose(g, expected, rtol=1e-12)
+
+
+def test_a_skin_tells_more_of_its_elements_with_its_calibration_than_after_it(study, driver):
+    """Joint estimation uses what the skin's record says about Z_th: no error may grow by it."""
+    joint = etid.identify_skin(study["loaded/0"], driver)
+    after = etid.identify_skin(study["loaded/0"], driver, method="output_error")
+    assert after.method == "output_error"
+    assert (np.asarray(joint.stderr.values()) < np.asarray(after.stderr.values())).all()
+
+
+def test_a_driver_by_output_error_keeps_no_harmonics_and_says_so(study):
+    other = etid.identify_driver(study["calibration/0"], method="output_error")
+    assert etid.identify_skin(study["loaded/0"], other).method == "output_error"
+    with pytest.raises(ValueError, match="keeps no harmonics"):
+        etid.identify_skin(study["loaded/0"], other, method="maximum_likelihood")
+
+
+def test_a_record_without_a_whole_period_is_told_so_or_goes_to_output_error(study, driver):
+    record = study["loaded/0"]
+    short = record.replace(v_th=record.v_th[:2500], v_out=record.v_out[:2500])
+    with pytest.raises(etid.IdentificationError, match="not_periodic"):
+        etid.identify_skin(short, driver, method="maximum_likelihood")
+    fit = etid.identify_skin(short, driver)
+    assert fit.method == "output_error"
+    assert (np.abs(error(fit)) < SIGMAS * np.asarray(fit.stderr.values())).all()
+
+
+def test_a_period_cut_in_the_middle_of_an_edge_is_not_periodic(study):
+    record = study["calibration/0"]
+    steep = int(np.argmax(np.abs(np.diff(record.v_th))))
+    part = slice(steep, steep + 3333)
+    with pytest.raises(etid.IdentificationError, match="not_periodic"):
+        etid.identify_driver(
+            record.replace(v_th=record.v_th[part], v_out=record.v_out[part]),
+            method="maximum_likelihood",
+        )
+
+
+def test_a_batch_of_both_kinds_is_mixed_and_each_is_right(study, driver):
+    record = study["loaded/1"]
+    short = record.replace(v_th=record.v_th[:2500], v_out=record.v_out[:2500])
+    fits = etid.identify_skins([record, short], driver)
+    assert fits.fit.method == "mixed"
+    assert fits.counts() == {"successful": 2}
+
+
+def test_a_circuit_far_from_its_typical_values_is_found():
+    """Fits never start at the truth: three decades of impedance around it."""
+    study = simulate(snr_db=70.0, seed=9)
+    driver = etid.identify_driver(study["calibration/0"])
+    for factor in (1 / 30, 30.0):
+        start = SkinRC(r_s=20e3 * factor, r_p=300e3 * factor, c_p=0.2e-9 / factor)
+        fit = etid.identify_skin(study["loaded/0"], driver, circuit=start)
+        assert (np.abs(error(fit)) < SIGMAS * np.asarray(fit.stderr.values())).all()

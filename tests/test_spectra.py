@@ -1,0 +1,71 @@
+"""Harmonics: exact for periodic records, whatever the number of samples in a period."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from etid import spectra
+from etid.spectra import harmonics, whole_periods
+
+spectrum = jax.jit(spectra.spectrum, static_argnums=(5, 6))
+RATE, PULSE = 200e3, 60.0
+
+
+@pytest.mark.parametrize(
+    ("samples", "expected"),
+    [
+        (10_000, (3, 10_000)),
+        (3333, (1, 3333)),  # 0.9999 of a period: a third of a sample is missing
+        (12_333, (3, 10_000)),  # 3.7 periods
+        (3332, (0, 0)),
+        (600, (0, 0)),  # one pulse
+    ],
+)
+def test_whole_periods(samples, expected):
+    assert whole_periods(samples, RATE, PULSE) == expected
+
+
+def test_harmonics_are_those_of_the_signal_and_a_drift_is_not_in_them():
+    periods, samples = 3, 10_000
+    time = np.arange(samples) / RATE
+    order, level, phase = np.array([1, 7, 300, 1600]), np.array([5.0, 2.0, 0.3, 0.01]), 0.4
+    waves = level[:, None] * np.cos(2 * np.pi * PULSE * order[:, None] * time + phase)
+    ramp = np.linspace(-1, 1, samples)
+    found = harmonics(waves.sum(0) + 3.0 + 0.2 * ramp**2, periods, samples)
+    expected = np.zeros(found.shape, complex)
+    expected[order - 1] = level / 2 * np.exp(1j * phase)
+    # The means of the periods fix a parabola; where a period ends between two samples they are off
+    # by what the signal bends there.
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize("periods", [1, 3])
+def test_the_variance_of_a_coefficient_is_that_of_its_noise(periods):
+    samples, sigma = round(periods * RATE / PULSE), 0.3
+    rng = np.random.default_rng(5)
+    draws = np.stack(
+        [harmonics(rng.normal(0, sigma, samples), periods, samples) for _ in range(40)]
+    )
+    # 40 · 1666 coefficients: their mean square is known to 1/sqrt(66 640), of which this is 4.
+    np.testing.assert_allclose(np.mean(np.abs(draws) ** 2) * samples / sigma**2, 1, rtol=0.016)
+
+
+def test_harmonics_are_chosen_up_to_the_first_that_drown_in_noise():
+    periods, samples = 3, 10_000
+    time = np.arange(samples) / RATE
+    wave = np.sum([np.cos(2 * np.pi * PULSE * k * time) for k in range(1, 201)], axis=0)
+    v = jnp.asarray(wave + np.random.default_rng(1).normal(0, 1.0, samples))
+    one = jnp.asarray(1.0)
+    found = spectrum(v, v, one, one, jnp.asarray(RATE), periods, samples)
+    # The window of 25 reaches beyond the last wave by half of it.
+    assert 200 <= int(found.selected.sum()) <= 215
+    assert bool(found.selected[:200].all())
+
+
+def test_one_period_cannot_tell_aliases_and_leaves_the_upper_band_out():
+    v = jnp.asarray(np.where(np.arange(3333) < 133, 50.0, 0.0))
+    small = jnp.asarray(1e-6)
+    found = spectrum(v, v, small, small, jnp.asarray(RATE), 1, 3333)
+    last = float(found.frequency[found.selected].max())
+    assert abs(last - spectra.ALIASED * RATE) < PULSE * 1.001
