@@ -94,7 +94,7 @@ def run(
     """Print one line per load and element."""
     draws = monte_carlo(snr_db, samples, repetitions, resistors, jitter, method, progress=True)
     print(f"{snr_db:g} dB, {samples} samples, {len(resistors)} calibrations, {method}")
-    print("load  element     bias % spread %     sd %  covered  mean z")
+    print("load  element     bias % spread %     sd %  covered  mean z  max |z|")
     for name, of in draws.items():
         for i, element in enumerate(("r_s", "r_p", "c_p")):
             good = of.verdicts == "successful"
@@ -102,7 +102,7 @@ def run(
                 f"{name:<6}{element:<9}{100 * of.error[good, i].mean():9.3f}"
                 f"{100 * of.error[good, i].std(ddof=1):9.3f}"
                 f"{100 * np.median(of.stderr[good, i]):9.3f}"
-                f"{of.covered[i]:9.3f}{of.z[:, i].mean():8.2f}"
+                f"{of.covered[i]:9.3f}{of.z[:, i].mean():8.2f}{np.abs(of.z[:, i]).max():9.1f}"
             )
         names, counts = np.unique(of.verdicts, return_counts=True)
         print(" ", ", ".join(f"{c} {n}" for n, c in zip(names, counts, strict=True)))

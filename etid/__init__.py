@@ -28,6 +28,7 @@ from etid.hdf5 import read as read
 from etid.identify import identify_driver as identify_driver
 from etid.identify import identify_skin as identify_skin
 from etid.identify import predict as predict
+from etid.impedance import identify_impedance as identify_impedance
 from etid.importing import import_file as import_file
 from etid.recording import Recording as Recording
 from etid.recording import RecordingError as RecordingError

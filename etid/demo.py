@@ -70,7 +70,7 @@ class Outcome:
         method: Name of the estimator.
         driver: The driver.
         skins: Everything but the test resistors.
-        resistors: The test resistors, as one resistor by output error. Steiglitz-McBride
+        resistors: The test resistors, as one resistor by maximum likelihood. Steiglitz-McBride
             identifies eq. 7 only; the resistance is then Z(0) = R_s + R_p.
     """
 
@@ -331,7 +331,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     for section in sections:
         print(f"\n{section}")
     page = folder / "index.html"
-    sections.append(Section("Figures", "Quiet records, by output error.", figures=drawn))
+    sections.append(Section("Figures", "Quiet records, by maximum likelihood.", figures=drawn))
     write_page(page, "The paper's experiments, simulated and identified", _READING, sections)
     print(f"\nTables and figures: {page.resolve()}")
 

@@ -14,9 +14,16 @@ WIDE = 0.75  # spread in standard errors: second-order terms make them a fifth t
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("snr_db", "samples"), [(60.0, 10_000), (40.0, 3334)])
-def test_intervals_of_95_per_cent_contain_the_truth_in_95_per_cent(snr_db, samples):
-    draws = monte_carlo(snr_db, samples, REPETITIONS)
+@pytest.mark.parametrize(
+    ("method", "snr_db", "samples"),
+    [
+        ("maximum_likelihood", 60.0, 10_000),
+        ("output_error", 60.0, 10_000),
+        ("output_error", 40.0, 3334),
+    ],
+)
+def test_intervals_of_95_per_cent_contain_the_truth_in_95_per_cent(method, snr_db, samples):
+    draws = monte_carlo(snr_db, samples, REPETITIONS, method=method)
     for name in LOADS:
         of = draws[name]
         good = of.verdicts == "successful"

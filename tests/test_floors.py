@@ -36,6 +36,7 @@ FLOORS = {
     "importing": 4,
     "scenes": 4,
     "information": 4,
+    "impedance": 5,
     "output_error": 5,
     "maximum_likelihood": 6,
     "estimation": 7,

@@ -1,0 +1,85 @@
+"""Circuits from measured impedance: soldered ones, and simulated ones with known noise."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import etid
+
+# Fitted without weights by impedance.py's makers and by others (SOURCE.txt of the data).
+PUBLISHED = {
+    "Circuit1_EIS_1": (29.14, 46.65, 10.43e-6),
+    "Circuit2_EIS_1": (150.3, 502.5, 31.13e-9),
+}
+DRY = etid.SkinRC(r_s=33.4e3, r_p=186e3, c_p=0.12e-9)
+
+
+def zplot(path):
+    """Frequency and impedance of a ZPlot file."""
+    lines = path.read_text(errors="replace").splitlines()
+    start = next(i for i, line in enumerate(lines) if line.strip() == "End Comments") + 1
+    table = np.array([line.split("\t") for line in lines[start:] if line.strip()], float)
+    return table[:, 0], table[:, 4] + 1j * table[:, 5]
+
+
+@pytest.mark.parametrize("name", PUBLISHED)
+def test_soldered_circuits_are_those_published(reference_data, name):
+    frequency, z = zplot(reference_data("dummy_circuits_eis") / f"{name}.z")
+    fit = etid.identify_impedance(frequency, z)
+    # DESIGN's half per cent: the digits of the published values and the choice of points.
+    np.testing.assert_allclose(fit.circuit.values(), PUBLISHED[name], rtol=5e-3)
+    assert float(fit.rrse) < 0.004  # as published, 0.30 to 0.38 %
+
+
+def measured(circuit, sigma, seed):
+    rng = np.random.default_rng(seed)
+    frequency = np.geomspace(10, 1e6, 50)
+    z = np.asarray(circuit.response(jnp.asarray(frequency)))
+    return frequency, z + sigma * (rng.normal(size=50) + 1j * rng.normal(size=50))
+
+
+def test_errors_are_those_of_the_noise():
+    """Of 200 draws: 95 % coverage within 3 standard deviations, and χ² of 1."""
+    inside, chi2 = [], []
+    for seed in range(200):
+        fit = etid.identify_impedance(*measured(DRY, 300.0, seed), stderr=300.0)
+        error = np.asarray(fit.circuit.values()) - np.asarray(DRY.values())
+        inside.append(np.abs(error) < 1.96 * np.asarray(fit.stderr.values()))
+        chi2.append(float(fit.chi2))
+    assert (np.abs(np.mean(inside, 0) - 0.95) < 3 * np.sqrt(0.95 * 0.05 / 200)).all()
+    assert abs(np.mean(chi2) - 1) < 3 * np.sqrt(2 / 97 / 200)
+
+
+@pytest.mark.parametrize("scale", [1e-4, 1.0, 1e3])
+def test_any_size_is_found_from_the_typical_values(scale):
+    circuit = etid.SkinRC(r_s=33.4e3 * scale, r_p=186e3 * scale, c_p=1e-9 / scale)
+    fit = etid.identify_impedance(*measured(circuit, 10.0 * scale, 1), stderr=10.0 * scale)
+    np.testing.assert_allclose(fit.circuit.values(), circuit.values(), rtol=0.01)
+
+
+def test_another_circuit_is_a_misfit():
+    frequency, z = measured(DRY, 100.0, 2)
+    z = z + 50e3 / (1 + 2j * np.pi * frequency * 50e3 * 1e-8)
+    with pytest.raises(etid.IdentificationError, match="misfit"):
+        etid.identify_impedance(frequency, z, stderr=100.0)
+
+
+def test_what_the_data_do_not_show_is_insensitive():
+    frequency, z = measured(DRY, 2e3, 3)
+    high = frequency > 3e5  # far above the corner: no R_p
+    fit = etid.identify_impedance(frequency[high], z[high], stderr=2e3, throw=False)
+    assert fit.verdict == "insensitive"
+
+
+@pytest.mark.parametrize(
+    ("frequency", "z", "text"),
+    [
+        ([1.0, 2.0, 3.0], [1.0, 2.0], "shape"),
+        ([0.0, 2.0, 3.0], [1.0, 2.0, 3.0], "frequency must be"),
+        ([1.0, 2.0, 3.0], [1.0, np.nan, 3.0], "1 impedances are not finite"),
+        ([1.0], [1.0], "cannot determine 3 elements"),
+    ],
+)
+def test_bad_input_is_named(frequency, z, text):
+    with pytest.raises(ValueError, match=text):
+        etid.identify_impedance(frequency, z)
