@@ -190,7 +190,7 @@ LEVEL = float(jnp.exp(jnp.log(100e3)))  # where its fit starts, rounded as the f
 def test_a_solver_that_cannot_move_reports_no_success(driver):
     """The slope says down, and no step is small enough: that is no convergence."""
     recording = simulate(ResistorLoad(50e3))["loaded/0"]
-    assert verdict_of(recording, driver, circuit=Wall()) == "misfit"
+    assert verdict_of(recording, driver, circuit=Wall()) == "max_steps_reached"
 
 
 def test_names_and_values_are_inverse():
