@@ -35,6 +35,18 @@ def gain(
     return z_load / (z_load + source.response(frequency))
 
 
+def delayed_gain(
+    spectrum: Spectrum,
+    source: SourceImpedance,
+    load: Rational,
+    delay: Float[Array, ""],
+    sample_rate: Float[Array, ""],
+) -> Complex[Array, " harmonic"]:
+    """G e^(−jωτ) at the harmonics, for a delay in samples."""
+    turn = -frequency_variable(spectrum.frequency) * as_complex(delay / sample_rate)
+    return gain(source, load, spectrum.frequency) * jnp.exp(turn)
+
+
 def residual(
     spectrum: Spectrum,
     source: SourceImpedance,
@@ -51,11 +63,10 @@ def residual(
         delay: τ [samples].
         sample_rate: Sampling rate [Hz].
     """
-    g = gain(source, load, spectrum.frequency)
-    turn = jnp.exp(-frequency_variable(spectrum.frequency) * as_complex(delay / sample_rate))
+    g = delayed_gain(spectrum, source, load, delay, sample_rate)
     variance = spectrum.variance_y + jnp.abs(g) ** 2 * spectrum.variance_x
     weight = jnp.where(spectrum.selected, jnp.sqrt(2 / variance), 0.0)
-    difference = (spectrum.y - g * turn * spectrum.x) * as_complex(weight)
+    difference = (spectrum.y - g * spectrum.x) * as_complex(weight)
     return jnp.concatenate([difference.real, difference.imag])
 
 
@@ -70,8 +81,7 @@ def _denoised(
 
     The Jacobian at these has the noise of neither record, which would count as information.
     """
-    g = gain(source, load, spectrum.frequency)
-    g = g * jnp.exp(-frequency_variable(spectrum.frequency) * as_complex(delay / sample_rate))
+    g = delayed_gain(spectrum, source, load, delay, sample_rate)
     variance = spectrum.variance_y + jnp.abs(g) ** 2 * spectrum.variance_x
     share = jnp.conj(g) * as_complex(spectrum.variance_x / variance)
     x = spectrum.x + share * (spectrum.y - g * spectrum.x)
@@ -86,8 +96,7 @@ def _rrse(
     sample_rate: Float[Array, ""],
 ) -> Float[Array, ""]:
     """Root relative squared error of Y; without the mean, it is that of V_out (paper, eq. 3)."""
-    g = gain(source, load, spectrum.frequency)
-    g = g * jnp.exp(-frequency_variable(spectrum.frequency) * as_complex(delay / sample_rate))
+    g = delayed_gain(spectrum, source, load, delay, sample_rate)
     missed = jnp.sum(jnp.abs(spectrum.y - g * spectrum.x) ** 2)
     return jnp.sqrt(missed / jnp.sum(jnp.abs(spectrum.y) ** 2))
 
