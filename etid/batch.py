@@ -20,15 +20,13 @@ from etid.driver import Driver
 from etid.identify import (
     Method,
     arrays,
-    check_driver,
     check_method,
-    choose_for,
     failed_fit,
     identify_driver,
+    plan,
     skin_lane,
     window,
 )
-from etid.preflight import preflight
 from etid.recording import Metadata, Recording, RecordingError
 from etid.results import LABELS, Fit, Fits, IdentificationError
 from etid.study import Study
@@ -64,7 +62,7 @@ def _labels(metadata: Sequence[Metadata | _Unreadable]) -> dict[str, np.ndarray]
 
 
 def _stack(fits: Sequence[Fit]) -> Fit:
-    return jax.tree.map(lambda *leaves: np.stack([np.asarray(leaf) for leaf in leaves]), *fits)
+    return jax.tree.map(lambda *leaves: np.stack(leaves), *fits)
 
 
 def _of_one_method(fits: Sequence[Fit], used: Sequence[str], otherwise: str) -> list[Fit]:
@@ -134,17 +132,12 @@ def _identify(
         for row in range(count):
             try:
                 recording, driver = load(row)
-                name = preflight(recording)
-                method = given or "output_error"
-                if name is None:
-                    method = choose_for(given, recording, driver)
-                check_driver(driver, method, recording.sample_rate)
+                method, name = plan(given, recording, driver)
             except (RecordingError, ValueError) as error:
                 fail(row, "unreadable", str(error))
             except IdentificationError as error:
                 fail(row, "driver_failed", str(error))
             else:
-                name = name or preflight(recording, periodic=method == "maximum_likelihood")
                 if name is None:
                     part = window(recording, method)
                     key = (id(driver), recording.v_th.size, method, part)

@@ -103,7 +103,7 @@ def _parser() -> argparse.ArgumentParser:
     command.add_argument(
         "--method",
         choices=METHODS,
-        help="default maximum_likelihood, and output_error where a record holds no whole period",
+        help="default maximum_likelihood where the record allows it, else output_error",
     )
     command.add_argument("--order", type=int, default=5, help="poles of the driver, default 5")
     command.set_defaults(run=_fit)

@@ -22,7 +22,7 @@ from etid.measurement import Measurement
 from etid.results import Fit
 from etid.spectra import Spectrum, spectrum
 from etid.transfer import Rational, poles
-from etid.verdicts import RESULTS, verdict
+from etid.verdicts import RESULTS, first_verdict, verdict
 
 # Members inherited from lineax, of which the type checker thinks they are not ours.
 SUCCESSFUL = verdict("successful")
@@ -37,18 +37,6 @@ BAND = np.linspace(0.0003, 0.4, 400)  # of the sample rate, where a source must 
 LEVELS = (1.0, 0.125, 0.5, 2.0, 8.0)  # impedance levels at which a circuit is started
 IMPULSE = 512  # samples of a discrete model's impulse response
 UNWANTED = 1e3  # added to the cost of a start that did not settle; any cost is smaller
-
-
-def _prepare(m: Measurement) -> prediction.Records:
-    return prediction.prepare(m.v_th, m.v_out, m.sigma_th, m.sigma_out, m.sample_rate)
-
-
-def _verdict(*conditions: tuple[Bool[Array, ""], RESULTS]) -> RESULTS:
-    """The first verdict whose condition holds, else successful."""
-    result = SUCCESSFUL
-    for condition, item in reversed(conditions):
-        result = RESULTS.where(condition, item, result)
-    return result
 
 
 def _misses(chi2: Float[Array, ""], error: Float[Array, ""]) -> Bool[Array, ""]:
@@ -108,7 +96,7 @@ def skin_by_steiglitz_mcbride(m: Measurement, driver: Driver, iterations: int) -
         shared_cov=nothing,
         rrse=best.rrse,
         chi2=jnp.where(unstable, jnp.inf, chi2),
-        result=_verdict(
+        result=first_verdict(
             (unstable, RESULTS.unstable),
             (~jnp.all(values > 0), RESULTS.nonphysical),
             ((iterations > 1) & ~best.converged, MAX_STEPS_REACHED),
@@ -146,7 +134,7 @@ def driver_by_steiglitz_mcbride(
         calibration=None,
         rrse=best.rrse,
         chi2=jnp.where(jnp.isfinite(best.rrse), chi2, jnp.inf),
-        result=_verdict(
+        result=first_verdict(
             (unstable, RESULTS.unstable),
             ((iterations > 1) & ~best.converged, MAX_STEPS_REACHED),
             (_misses(chi2, best.rrse), RESULTS.misfit),
@@ -196,7 +184,7 @@ def skin_by_refinement(
     starts = _skin_starts(m, driver, circuit)
     if window is None:
         fitted, estimate = output_error.fit_circuit(
-            _prepare(m), source, source_cov, calibration, starts
+            prediction.prepare(m), source, source_cov, calibration, starts
         )
     else:
         rate = jnp.asarray(driver.sample_rate)
@@ -212,7 +200,7 @@ def skin_by_refinement(
         shared_cov=estimate.shared_cov * jnp.outer(values, values),
         rrse=estimate.rrse,
         chi2=estimate.chi2,
-        result=_verdict(
+        result=first_verdict(
             (~jnp.isfinite(estimate.chi2), RESULTS.unstable),
             (~jnp.isfinite(values).all(), RESULTS.nonphysical),
             (~settled, MAX_STEPS_REACHED),
@@ -290,7 +278,7 @@ def driver_by_refinement(
     baseline = driver_by_steiglitz_mcbride(m, r_load, order, steiglitz_mcbride.ITERATIONS)
     starts = source_starts(baseline.a, order, m.sample_rate[0], r_load.mean())
     if window is None:
-        records = jax.vmap(_prepare)(m)
+        records = jax.vmap(prediction.prepare)(m)
 
         def fit(start):
             return output_error.fit_source(records, r_load, start)
@@ -332,7 +320,7 @@ def driver_by_refinement(
         calibration=calibration,
         rrse=estimate.rrse,
         chi2=estimate.chi2,
-        result=_verdict(
+        result=first_verdict(
             (~finite[chosen], RESULTS.unstable),
             (~passive[chosen], RESULTS.nonphysical),
             (~settled[chosen], MAX_STEPS_REACHED),

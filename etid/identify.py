@@ -70,11 +70,26 @@ def choose(method: Method | None, recordings: Sequence[Recording]) -> Method:
     return "maximum_likelihood"
 
 
-def choose_for(method: Method | None, recording: Recording, driver: Driver) -> Method:
+def _choose_for(method: Method | None, recording: Recording, driver: Driver) -> Method:
     """As `choose`, for a load that is identified with `driver`."""
     if method is None and not has_harmonics(driver):
         return "output_error"
     return choose(method, [recording])
+
+
+def plan(given: Method | None, recording: Recording, driver: Driver) -> tuple[Method, str | None]:
+    """The method for a load, and the verdict that forbids to fit it, if there is one.
+
+    Raises:
+        ValueError: The driver cannot serve the method.
+    """
+    name = preflight(recording, periodic=given == "maximum_likelihood")
+    if name is None:
+        method = _choose_for(given, recording, driver)
+    else:
+        method = given or "output_error"
+    check_driver(driver, method, recording.sample_rate)
+    return method, name
 
 
 def check_driver(driver: Driver, method: Method, sample_rate: float) -> None:
@@ -240,15 +255,12 @@ def identify_skin(
     """
     circuit = SkinRC() if circuit is None else circuit
     check_method(method, circuit)
-    name = preflight(recording)
-    method = choose_for(method, recording, driver) if name is None else method or "output_error"
-    check_driver(driver, method, recording.sample_rate)
-    name = preflight(recording, periodic=method == "maximum_likelihood")
+    chosen, name = plan(method, recording, driver)
     if name is not None:
-        fit = failed_fit(name, circuit, method)
+        fit = failed_fit(name, circuit, chosen)
     else:
         samples = tuple(map(jnp.asarray, arrays(recording)))
-        fit = _skin(samples, driver, circuit, method, window(recording, method))
+        fit = _skin(samples, driver, circuit, chosen, window(recording, chosen))
     if throw and fit.verdict != "successful":
         text = f"recording {recording.path!r}: {fit.verdict}. {message(fit.verdict)}"
         raise IdentificationError(text, fit)
@@ -257,10 +269,7 @@ def identify_skin(
 
 @eqx.filter_jit
 def _fitted(samples: Any, driver: Driver, circuit: AbstractCircuit) -> Float[Array, " interval"]:
-    m = measure(*samples)
-    records = prediction.prepare(
-        m.v_th, m.v_out, m.sigma_th, m.sigma_out, m.sample_rate, cutoff=0.5
-    )  # the whole band, as it was recorded
+    records = prediction.prepare(measure(*samples), cutoff=0.5)  # the band as it was recorded
     assert driver.source is not None
     assert driver.calibration is not None
     r_load = driver.calibration.r_load[0]
@@ -276,7 +285,7 @@ def predict(
 
     Args:
         recording: Unloaded and loaded voltage.
-        driver: Driver identified by output error.
+        driver: Driver with a continuous source impedance.
         circuit: The load; the known resistor of a calibration if not given.
 
     Returns:

@@ -9,7 +9,6 @@ frequencies that spans the data.
 """
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 import numpy.typing as npt
@@ -18,10 +17,10 @@ from jaxtyping import Array, Complex, Float
 
 from etid.circuits import AbstractCircuit, SkinRC
 from etid.information import inverse
-from etid.levenberg_marquardt import LevenbergMarquardt
+from etid.levenberg_marquardt import LevenbergMarquardt, best_start
 from etid.precision import require_float64
-from etid.results import Fit, IdentificationError
-from etid.verdicts import RESULTS, message, verdict
+from etid.results import Fit, IdentificationError, complex_rrse
+from etid.verdicts import RESULTS, first_verdict, message, verdict
 
 MAX_STEPS = 500
 MISFIT_CHI2 = 1.5  # a standard error of a measured impedance is seldom known to better than 20 %
@@ -53,8 +52,7 @@ def _fit(
     level, faster = jnp.meshgrid(size + jnp.log(jnp.asarray(LEVELS)), jnp.log(corners / corner))
     level, faster = level.reshape(-1, 1), faster.reshape(-1, 1)
     starts = typical[None, :] + jnp.where(is_ohm[None, :], level, -level - faster)
-    objectives = jax.vmap(lambda q: jnp.sum(residual(q, None) ** 2))(starts)
-    q0 = starts[jnp.argmin(jnp.where(jnp.isfinite(objectives), objectives, jnp.inf))]
+    q0 = best_start(lambda q: residual(q, None), starts)
     solution = optx.least_squares(residual, SOLVER, q0, max_steps=MAX_STEPS, throw=False)
     q = solution.value
     equations = solution.stats["normal_equations"]
@@ -63,23 +61,19 @@ def _fit(
     cov = inverse(equations.matrix) * scale
     fitted = circuit.with_log_values(q)
     values = fitted.values()
-    missed = jnp.sum(jnp.abs(fitted.response(frequency) - z) ** 2)
-    result = verdict("successful")
-    conditions = {
-        "insensitive": ~(jnp.sqrt(jnp.diagonal(cov)) < 1).all(),
-        "misfit": (chi2 > MISFIT_CHI2) & known,
-        "max_steps_reached": RESULTS.promote(solution.result) != verdict("successful"),
-        "nonphysical": ~jnp.isfinite(values).all(),
-    }
-    for name, condition in conditions.items():  # the most fundamental last
-        result = RESULTS.where(condition, verdict(name), result)
+    settled = RESULTS.promote(solution.result) == verdict("successful")
     return Fit(
         circuit=fitted,
         cov=cov * jnp.outer(values, values),
         shared_cov=jnp.zeros_like(cov),
-        rrse=jnp.sqrt(missed / jnp.sum(jnp.abs(z) ** 2)),
+        rrse=complex_rrse(fitted.response(frequency), z),
         chi2=chi2 if known else jnp.asarray(jnp.nan),
-        result=result,
+        result=first_verdict(
+            (~jnp.isfinite(values).all(), RESULTS.nonphysical),
+            (~settled, verdict("max_steps_reached")),
+            ((chi2 > MISFIT_CHI2) & known, RESULTS.misfit),
+            (~(jnp.sqrt(jnp.diagonal(cov)) < 1).all(), RESULTS.insensitive),
+        ),
         steps=solution.stats["num_steps"],
         method="impedance",
     )

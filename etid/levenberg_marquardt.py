@@ -60,6 +60,15 @@ def normal_equations(
     return NormalEquations(jnp.where(finite, objective, jnp.inf), gradient, jacobian.T @ jacobian)
 
 
+def best_start(
+    residual: Callable[[Float[Array, " parameter"]], Float[Array, " sample"]],
+    starts: Float[Array, "start parameter"],
+) -> Float[Array, " parameter"]:
+    """The start with the smallest finite Σ r²."""
+    objectives = jax.lax.map(lambda y: jnp.sum(residual(y) ** 2), starts)
+    return starts[jnp.argmin(jnp.where(jnp.isfinite(objectives), objectives, jnp.inf))]
+
+
 class _State(eqx.Module):
     first_step: Bool[Array, ""]
     y_eval: Float[Array, " parameter"]

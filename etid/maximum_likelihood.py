@@ -22,7 +22,9 @@ from jaxtyping import Array, Complex, Float
 from etid.circuits import AbstractCircuit, resistor
 from etid.driver import Calibration, SourceImpedance
 from etid.information import inverse
+from etid.levenberg_marquardt import best_start
 from etid.output_error import DELAY_WIDTH, MAX_STEPS, SOLVER, Estimate, delay_std, prior
+from etid.results import complex_rrse
 from etid.spectra import Spectrum
 from etid.transfer import Rational, as_complex, frequency_variable
 
@@ -36,69 +38,49 @@ def gain(
 
 
 def delayed_gain(
-    spectrum: Spectrum,
     source: SourceImpedance,
     load: Rational,
+    frequency: Float[Array, " harmonic"],
     delay: Float[Array, ""],
-    sample_rate: Float[Array, ""],
 ) -> Complex[Array, " harmonic"]:
-    """G e^(−jωτ) at the harmonics, for a delay in samples."""
-    turn = -frequency_variable(spectrum.frequency) * as_complex(delay / sample_rate)
-    return gain(source, load, spectrum.frequency) * jnp.exp(turn)
+    """G e^(−jωτ), for a delay τ in seconds."""
+    turn = -frequency_variable(frequency) * as_complex(delay)
+    return gain(source, load, frequency) * jnp.exp(turn)
 
 
-def residual(
-    spectrum: Spectrum,
-    source: SourceImpedance,
-    load: Rational,
-    delay: Float[Array, ""],
-    sample_rate: Float[Array, ""],
-) -> Float[Array, " part"]:
-    """Real and imaginary parts of (Y − G e^(−jωτ) X), scaled to unit variance; 0 if not selected.
+def _variance(spectrum: Spectrum, g: Complex[Array, " harmonic"]) -> Float[Array, " harmonic"]:
+    """E|Y − g X|² of the noise."""
+    return spectrum.variance_y + jnp.abs(g) ** 2 * spectrum.variance_x
 
-    Args:
-        spectrum: Harmonics of one recording.
-        source: Z_th.
-        load: Z_L.
-        delay: τ [samples].
-        sample_rate: Sampling rate [Hz].
-    """
-    g = delayed_gain(spectrum, source, load, delay, sample_rate)
-    variance = spectrum.variance_y + jnp.abs(g) ** 2 * spectrum.variance_x
-    weight = jnp.where(spectrum.selected, jnp.sqrt(2 / variance), 0.0)
+
+def residual(spectrum: Spectrum, g: Complex[Array, " harmonic"]) -> Float[Array, " part"]:
+    """Real and imaginary parts of Y − g X, scaled to unit variance; 0 if not selected."""
+    weight = jnp.where(spectrum.selected, jnp.sqrt(2 / _variance(spectrum, g)), 0.0)
     difference = (spectrum.y - g * spectrum.x) * as_complex(weight)
     return jnp.concatenate([difference.real, difference.imag])
 
 
-def _denoised(
-    spectrum: Spectrum,
-    source: SourceImpedance,
-    load: Rational,
-    delay: Float[Array, ""],
-    sample_rate: Float[Array, ""],
-) -> Spectrum:
-    """The same with X by its maximum-likelihood estimate and Y = G X.
+def _denoised(spectrum: Spectrum, g: Complex[Array, " harmonic"]) -> Spectrum:
+    """The same with X by its maximum-likelihood estimate and Y = g X.
 
     The Jacobian at these has the noise of neither record, which would count as information.
     """
-    g = delayed_gain(spectrum, source, load, delay, sample_rate)
-    variance = spectrum.variance_y + jnp.abs(g) ** 2 * spectrum.variance_x
-    share = jnp.conj(g) * as_complex(spectrum.variance_x / variance)
+    share = jnp.conj(g) * as_complex(spectrum.variance_x / _variance(spectrum, g))
     x = spectrum.x + share * (spectrum.y - g * spectrum.x)
     return eqx.tree_at(lambda s: (s.x, s.y), spectrum, (x, g * x))
 
 
-def _rrse(
-    spectrum: Spectrum,
+def _calibration_gains(
+    spectra: Spectrum,
     source: SourceImpedance,
-    load: Rational,
-    delay: Float[Array, ""],
+    r_load: Float[Array, " record"],
+    delay: Float[Array, " record"],
     sample_rate: Float[Array, ""],
-) -> Float[Array, ""]:
-    """Root relative squared error of Y; without the mean, it is that of V_out (paper, eq. 3)."""
-    g = delayed_gain(spectrum, source, load, delay, sample_rate)
-    missed = jnp.sum(jnp.abs(spectrum.y - g * spectrum.x) ** 2)
-    return jnp.sqrt(missed / jnp.sum(jnp.abs(spectrum.y) ** 2))
+) -> Complex[Array, "record harmonic"]:
+    """Delayed gains of all calibrations, for delays in samples."""
+    return jax.vmap(lambda f, r, d: delayed_gain(source, resistor(r), f, d))(
+        spectra.frequency, r_load, delay / sample_rate
+    )
 
 
 def fit_source(
@@ -122,11 +104,11 @@ def fit_source(
     kept, count = start_vector.shape[0], r_load.shape[0]
     regularise = prior(start, sample_rate, r_load.mean())
 
-    def of_all(q, spectra):
-        def one(spectrum, r, delay):
-            return residual(spectrum, unflatten(q[:kept]), resistor(r), delay, sample_rate)
+    def gains(q):
+        return _calibration_gains(spectra, unflatten(q[:kept]), r_load, q[kept:], sample_rate)
 
-        parts = jax.vmap(one)(spectra, r_load, q[kept:])
+    def of_all(q, spectra):
+        parts = jax.vmap(residual)(spectra, gains(q))
         return jnp.concatenate([parts.reshape(-1), regularise(q[:kept]), q[kept:] / DELAY_WIDTH])
 
     q0 = jnp.concatenate([start_vector, jnp.zeros(count)])
@@ -134,17 +116,11 @@ def fit_source(
         of_all, SOLVER, q0, args=spectra, max_steps=MAX_STEPS, throw=False
     )
     q = solution.value
-    z_th = unflatten(q[:kept])
-    clean = jax.vmap(lambda s, r, d: _denoised(s, z_th, resistor(r), d, sample_rate))(
-        spectra, r_load, q[kept:]
-    )
-    jacobian = jax.jacfwd(of_all)(q, clean)
+    jacobian = jax.jacfwd(of_all)(q, jax.vmap(_denoised)(spectra, gains(q)))
     freedom = 2 * jnp.sum(spectra.selected, dtype=q.dtype) - q.shape[0]
     chi2 = 2 * solution.stats["normal_equations"].objective / freedom
     cov = inverse(jacobian.T @ jacobian)[:kept, :kept] * jnp.maximum(chi2, 1.0)
-    errors = jax.vmap(lambda s, r, d: _rrse(s, z_th, resistor(r), d, sample_rate))(
-        spectra, r_load, q[kept:]
-    )
+    errors = jax.vmap(complex_rrse)(gains(q) * spectra.x, spectra.y)
     estimate = Estimate(
         q[:kept],
         q[kept:, None],
@@ -155,7 +131,8 @@ def fit_source(
         solution.stats["num_steps"],
         jnp.zeros_like(cov),
     )
-    return z_th, estimate, Calibration(r_load, delay_std(r_load) / sample_rate, q[kept:], spectra)
+    calibration = Calibration(r_load, delay_std(r_load) / sample_rate, q[kept:], spectra)
+    return unflatten(q[:kept]), estimate, calibration
 
 
 def fit_circuit(
@@ -184,24 +161,26 @@ def fit_circuit(
     candidates = starts.log_values()
     kept, sources = candidates.shape[-1], source_vector.shape[0]
     circuit = jax.tree.map(lambda leaf: leaf[0], starts)
-    r_load = calibration.r_load
+    references, r_load = calibration.spectra, calibration.r_load
+    assert references is not None  # check_driver
     regularise = prior(source, rate, r_load.mean())
     both = kept + 1 + sources
 
     # q holds the elements, the delay, Z_th, and the delays of the calibrations.
-    def own(q, spectrum):
+    def own_gain(q):
         load = circuit.with_log_values(q[:kept]).impedance()
         z_th = unflatten(q[kept + 1 : both])
-        parts = residual(spectrum, z_th, load, q[kept], sample_rate)
-        return jnp.append(parts, q[kept] / DELAY_WIDTH)
+        return delayed_gain(z_th, load, spectrum.frequency, q[kept] / sample_rate)
+
+    def common_gains(q):
+        z_th = unflatten(q[kept + 1 : both])
+        return _calibration_gains(references, z_th, r_load, q[both:], rate)
+
+    def own(q, spectrum):
+        return jnp.append(residual(spectrum, own_gain(q)), q[kept] / DELAY_WIDTH)
 
     def common(q, spectra):
-        z_th = unflatten(q[kept + 1 : both])
-
-        def one(spectrum, r, delay):
-            return residual(spectrum, z_th, resistor(r), delay, rate)
-
-        parts = jax.vmap(one)(spectra, r_load, q[both:]).reshape(-1)
+        parts = jax.vmap(residual)(spectra, common_gains(q)).reshape(-1)
         weak = regularise(q[kept + 1 : both])
         return jnp.concatenate([parts, weak, q[both:] / DELAY_WIDTH])
 
@@ -212,8 +191,7 @@ def fit_circuit(
         return jnp.concatenate([candidate, jnp.zeros(1), source_vector, calibration.delay])
 
     q0 = jax.vmap(at)(candidates)
-    objectives = jax.lax.map(lambda q: jnp.sum(own(q, spectrum) ** 2), q0)
-    best = q0[jnp.argmin(jnp.where(jnp.isfinite(objectives), objectives, jnp.inf))]
+    best = best_start(lambda q: own(q, spectrum), q0)
     # First with Z_th as it is: from a start far away, a joint fit would bend Z_th to meet it.
     alone = optx.least_squares(
         lambda p, spectrum: own(best.at[: kept + 1].set(p), spectrum),
@@ -227,19 +205,14 @@ def fit_circuit(
         of_all,
         SOLVER,
         best.at[: kept + 1].set(alone.value),
-        args=(spectrum, calibration.spectra),
+        args=(spectrum, references),
         max_steps=MAX_STEPS,
         throw=False,
     )
     q = solution.value
-    load = circuit.with_log_values(q[:kept]).impedance()
-    z_th = unflatten(q[kept + 1 : both])
-    clean = _denoised(spectrum, z_th, load, q[kept], sample_rate)
-    clean_calibrations = jax.vmap(lambda s, r, d: _denoised(s, z_th, resistor(r), d, rate))(
-        calibration.spectra, r_load, q[both:]
-    )
-    j_own = jax.jacfwd(own)(q, clean)
-    j_common = jax.jacfwd(common)(q, clean_calibrations)
+    g = own_gain(q)
+    j_own = jax.jacfwd(own)(q, _denoised(spectrum, g))
+    j_common = jax.jacfwd(common)(q, jax.vmap(_denoised)(references, common_gains(q)))
     influence = inverse(j_own.T @ j_own + j_common.T @ j_common)[:kept]
     chi2 = jnp.sum(own(q, spectrum) ** 2) / (
         2 * jnp.sum(spectrum.selected, dtype=q.dtype) - kept - 1
@@ -251,7 +224,7 @@ def fit_circuit(
         q[None, kept : kept + 1],
         private * jnp.maximum(chi2, 1.0) + shared,
         chi2,
-        _rrse(spectrum, z_th, load, q[kept], sample_rate),
+        complex_rrse(g * spectrum.x, spectrum.y),
         solution.result,
         solution.stats["num_steps"],
         shared,

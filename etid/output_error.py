@@ -25,7 +25,7 @@ from jaxtyping import Array, Float, Int
 from etid.circuits import AbstractCircuit, resistor
 from etid.driver import Calibration, SourceImpedance, loaded
 from etid.information import curvature, eliminate, inverse
-from etid.levenberg_marquardt import LevenbergMarquardt
+from etid.levenberg_marquardt import LevenbergMarquardt, best_start
 from etid.prediction import (
     IMPULSE,
     Late,
@@ -261,11 +261,10 @@ def fit_circuit(
 
     nothing = Late(jnp.zeros(records.hold.shape[0]), jnp.zeros(IMPULSE + 1))
     q0 = jnp.concatenate([candidates, jnp.zeros((candidates.shape[0], states + 3))], axis=-1)
-    objectives = jax.lax.map(lambda q: jnp.sum(residual(q, nothing) ** 2), q0)
-    best = jnp.argmin(jnp.where(jnp.isfinite(objectives), objectives, jnp.inf))
+    best = best_start(lambda q: residual(q, nothing), q0)
     # First with the calibration in time, then with its delay; one loop, so that one solver is
     # compiled.
-    (q, late), outcomes = jax.lax.scan(refine, (q0[best], nothing), length=PASSES)
+    (q, late), outcomes = jax.lax.scan(refine, (best, nothing), length=PASSES)
     objective, result, steps = outcomes
     result = jax.tree.map(lambda leaf: leaf[-1], result)
 

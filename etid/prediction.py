@@ -21,6 +21,7 @@ from jaxtyping import Array, Float
 
 from etid.driver import SourceImpedance, loaded
 from etid.filtering import CUTOFF, TAPS, StateSpace, band_limited, hold, shiftable, simulate
+from etid.measurement import Measurement
 from etid.transfer import Rational
 
 IMPULSE = 256  # samples of the impulse response whose squares are summed
@@ -44,17 +45,10 @@ class Records(eqx.Module):
     sample_rate: Float[Array, ""]
 
 
-def prepare(
-    v_th: Float[Array, " time"],
-    v_out: Float[Array, " time"],
-    sigma_th: Float[Array, ""],
-    sigma_out: Float[Array, ""],
-    sample_rate: Float[Array, ""],
-    cutoff: float = CUTOFF,
-) -> Records:
+def prepare(m: Measurement, cutoff: float = CUTOFF) -> Records:
     """Interpolate V_th once; the edges, where its neighbours are missing, are left out."""
-    held, delayed = band_limited(v_th, cutoff), shiftable(v_out, cutoff)
-    return Records(held, delayed, sigma_th, sigma_out, sample_rate)
+    held, delayed = band_limited(m.v_th, cutoff), shiftable(m.v_out, cutoff)
+    return Records(held, delayed, m.sigma_th, m.sigma_out, m.sample_rate)
 
 
 def loaded_filter(

@@ -10,7 +10,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Complex, Float, Int
 
 from etid.circuits import DISPLAY, AbstractCircuit, Resistor, SkinRC
 from etid.tables import read_table, write_table
@@ -29,6 +29,14 @@ def rrse(predicted: Float[Array, " time"], measured: Float[Array, " time"]) -> F
     return jnp.sqrt(
         jnp.sum((predicted - measured) ** 2) / jnp.sum((measured - jnp.mean(measured)) ** 2)
     )
+
+
+def complex_rrse(
+    predicted: Complex[Array, " value"], measured: Complex[Array, " value"]
+) -> Float[Array, ""]:
+    """RRSE of harmonics or impedances, from which no mean is to be taken."""
+    missed = jnp.sum(jnp.abs(measured - predicted) ** 2)
+    return jnp.sqrt(missed / jnp.sum(jnp.abs(measured) ** 2))
 
 
 class IdentificationError(RuntimeError):

@@ -71,14 +71,17 @@ def harmonics(
 def _drift(v: Float[Array, " time"], periods: int) -> Float[Array, " time"]:
     """Polynomial through the means of the periods."""
     samples = v.shape[0]
-    basis = np.vander(np.linspace(-1, 1, samples), min(periods, DRIFT_DEGREE + 1), increasing=True)
-    # Part of each sample in each period, whose ends fall between samples.
+    basis = jnp.vander(
+        jnp.linspace(-1, 1, samples), min(periods, DRIFT_DEGREE + 1), increasing=True
+    )
+    columns = jnp.concatenate([basis, v[:, None]], axis=1)
+    # Means from the running sum, at ends of periods that fall between samples.
     ends = np.arange(periods + 1) * (samples / periods)
-    start = np.arange(samples)
-    inside = np.minimum(start + 1, ends[1:, None]) - np.maximum(start, ends[:-1, None])
-    share = np.maximum(inside, 0.0) * (periods / samples)
-    project = np.linalg.pinv(share @ basis)
-    return jnp.asarray(basis) @ (jnp.asarray(project) @ (jnp.asarray(share) @ v))
+    whole = np.minimum(ends.astype(int), samples - 1)
+    running = jnp.cumsum(columns, axis=0) - columns
+    sums = running[whole] + (ends - whole)[:, None] * columns[whole]
+    means = jnp.diff(sums, axis=0) * (periods / samples)
+    return basis @ (jnp.linalg.pinv(means[:, :-1]) @ means[:, -1])
 
 
 def spectrum(

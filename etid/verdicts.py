@@ -7,6 +7,7 @@ message: the cause, then what to do.
 import jax
 import numpy as np
 import optimistix as optx
+from jaxtyping import Array, Bool
 
 
 class RESULTS(optx.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]  # equinox enumerations extend by inheritance
@@ -69,6 +70,14 @@ _NAMES = {int(item._value): name for name, item in RESULTS._name_to_item.items()
 def verdict(name: str) -> RESULTS:
     """The verdict of this name."""
     return RESULTS._name_to_item[name]
+
+
+def first_verdict(*conditions: tuple[Bool[Array, ""], RESULTS]) -> RESULTS:
+    """The first verdict whose condition holds, else successful."""
+    result = verdict("successful")
+    for condition, item in reversed(conditions):
+        result = RESULTS.where(condition, item, result)
+    return result
 
 
 def verdict_names(result: RESULTS) -> np.ndarray:
