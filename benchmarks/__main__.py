@@ -30,7 +30,10 @@ def main() -> None:
     coverage.add_argument("--repetitions", type=int, default=200)
     coverage.add_argument("--jitter", type=float, default=50e-9, help="rms trigger delay [s]")
     coverage.add_argument("--resistors", type=float, nargs="+", default=[98.8e3], help="[ohm]")
-    coverage.add_argument("--method", choices=METHODS, default=METHODS[0])
+    coverage.add_argument("--shared", action="store_true", help="one unloaded record for all")
+    coverage.add_argument("--method", choices=METHODS, help="default: that of the records")
+    coverage.add_argument("--spice", metavar="SCENE", help="draw this SPICE recording afresh")
+    coverage.add_argument("--data", type=pathlib.Path, default=pathlib.Path("../shared/data"))
 
     arguments = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
@@ -41,16 +44,20 @@ def main() -> None:
             arguments.data / "spice_recordings", arguments.scene, arguments.method, arguments.output
         )
     elif arguments.name == "coverage":
-        from benchmarks.coverage import run as run_coverage
+        from benchmarks import coverage as benchmark
 
-        run_coverage(
-            arguments.snr_db,
-            arguments.samples,
-            arguments.repetitions,
-            arguments.resistors,
-            arguments.jitter,
-            arguments.method,
-        )
+        if arguments.spice is not None:
+            folder = arguments.data / "spice_recordings"
+            drawn = benchmark.spice_scene(folder, arguments.spice)
+        else:
+            drawn = benchmark.scene(
+                arguments.snr_db,
+                arguments.samples,
+                arguments.resistors,
+                arguments.jitter,
+                arguments.shared,
+            )
+        benchmark.run(drawn, arguments.repetitions, arguments.method)
     else:
         from benchmarks.timing import run as run_timing
 

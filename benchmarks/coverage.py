@@ -6,12 +6,15 @@ would not be independent draws.
 """
 
 import dataclasses
+import json
+import pathlib
 from collections.abc import Sequence
 
 import numpy as np
 from tqdm import tqdm
 
 import etid
+from benchmarks.spice import scene_of
 from etid.identify import Method
 from etid.scenes import Scene, Trial
 from etid.transformer import ResistorLoad, SkinLoad
@@ -20,6 +23,7 @@ LOADS = {
     "dry": SkinLoad(r_s=33.4e3, r_p=186e3, c_p=0.12e-9),
     "damp": SkinLoad(r_s=6.1e3, r_p=17.4e3, c_p=0.66e-9),
 }
+SILENT = 5.0  # standard errors by which a successful fit may not be wrong
 NORMAL_95 = 1.959964  # half-width of a 95 % interval in standard errors
 
 
@@ -48,61 +52,75 @@ class Draws:
         return (np.abs(self.z) < NORMAL_95).mean(0)
 
 
-def monte_carlo(
+def scene(
     snr_db: float,
     samples: int,
-    repetitions: int,
     resistors: Sequence[float] = (98.8e3,),
     jitter: float = 50e-9,
-    method: Method = "output_error",
-    progress: bool = False,
-) -> dict[str, Draws]:
-    """Identify fresh recordings of each of `LOADS`."""
-    known = [Trial(f"calibration/{i}", ResistorLoad(r)) for i, r in enumerate(resistors)]
-    scene = Scene(
+    shared_v_th: bool = False,
+) -> Scene:
+    """A dry and a damp fingertip behind the default transformer."""
+    return Scene(
         tuple(Trial(name, load) for name, load in LOADS.items()),
-        tuple(known),
+        tuple(Trial(f"calibration/{i}", ResistorLoad(r)) for i, r in enumerate(resistors)),
         samples=samples,
         snr_db=snr_db,
         trigger_jitter_rms=jitter,
+        shared_v_th=shared_v_th,
     )
-    rows: dict[str, list] = {name: [] for name in LOADS}
+
+
+def spice_scene(folder: pathlib.Path, name: str) -> Scene:
+    """The circuit of a SPICE recording with its first trial, to be drawn afresh."""
+    truth = json.loads((folder / "truth.json").read_text())["scenes"][name]
+    whole = scene_of(truth)
+    return dataclasses.replace(whole, trials=whole.trials[:1])
+
+
+def monte_carlo(
+    scene: Scene, repetitions: int, method: Method | None, progress: bool = False
+) -> dict[str, Draws]:
+    """Identify fresh recordings of each trial of `scene`."""
+    rows: dict[str, list] = {trial.path: [] for trial in scene.trials}
     for seed in tqdm(range(repetitions), disable=not progress):
         study = scene.simulate(seed=seed)
-        driver = etid.identify_driver(
-            [study[trial.path] for trial in known], method=method, throw=False
-        )
-        for name, load in LOADS.items():
-            fit = etid.identify_skin(study[name], driver, method=method, throw=False)
-            truth = np.array(dataclasses.astuple(load))
+        try:
+            driver = etid.identify_driver(
+                [study[trial.path] for trial in scene.calibration], method=method, throw=False
+            )
+        except etid.IdentificationError:  # a calibration that pre-flight refuses
+            for name in rows:
+                rows[name].append((np.full(3, np.nan), np.full(3, np.nan), "driver_failed"))
+            continue
+        for trial in scene.trials:
+            fit = etid.identify_skin(study[trial.path], driver, method=method, throw=False)
+            truth = np.array(list(scene.truth()[trial.path].values()))
             error = np.asarray(fit.circuit.values()) / truth - 1
-            rows[name].append((error, np.asarray(fit.stderr.values()) / truth, fit.verdict))
+            rows[trial.path].append((error, np.asarray(fit.stderr.values()) / truth, fit.verdict))
     return {
         name: Draws(*(np.array(column) for column in zip(*found, strict=True)))
         for name, found in rows.items()
     }
 
 
-def run(
-    snr_db: float,
-    samples: int,
-    repetitions: int,
-    resistors: Sequence[float],
-    jitter: float,
-    method: Method,
-) -> None:
-    """Print one line per load and element."""
-    draws = monte_carlo(snr_db, samples, repetitions, resistors, jitter, method, progress=True)
-    print(f"{snr_db:g} dB, {samples} samples, {len(resistors)} calibrations, {method}")
-    print("load  element     bias % spread %     sd %  covered  mean z  max |z|")
+def run(scene: Scene, repetitions: int, method: Method | None) -> None:
+    """Print one line per load and element; efficiency is bound² / mean squared error."""
+    draws = monte_carlo(scene, repetitions, method, progress=True)
+    bounds = etid.bound(scene)
+    print("load      element   bias %  spread %      sd %   bound %  efficiency  covered  max |z|")
     for name, of in draws.items():
-        for i, element in enumerate(("r_s", "r_p", "c_p")):
-            good = of.verdicts == "successful"
-            print(
-                f"{name:<6}{element:<9}{100 * of.error[good, i].mean():9.3f}"
-                f"{100 * of.error[good, i].std(ddof=1):9.3f}"
-                f"{100 * np.median(of.stderr[good, i]):9.3f}"
-                f"{of.covered[i]:9.3f}{of.z[:, i].mean():8.2f}{np.abs(of.z[:, i]).max():9.1f}"
-            )
+        good = of.verdicts == "successful"
         names, counts = np.unique(of.verdicts, return_counts=True)
-        print(" ", ", ".join(f"{c} {n}" for n, c in zip(names, counts, strict=True)))
+        verdicts = ", ".join(f"{c} {n}" for n, c in zip(names, counts, strict=True))
+        for i, (element, limit) in enumerate(bounds[name].relative.items()):
+            if not good.any():
+                break
+            error = of.error[good, i]
+            print(
+                f"{name:<10}{element:<6}{100 * error.mean():10.3f}{100 * error.std(ddof=1):10.3f}"
+                f"{100 * np.median(of.stderr[good, i]):10.3f}{100 * limit:10.3f}"
+                f"{limit**2 / np.mean(error**2):12.2f}{of.covered[i]:9.3f}"
+                f"{np.abs(of.z[:, i]).max():9.1f}"
+            )
+        silent = np.abs(of.z).max(axis=1, initial=0.0) > SILENT
+        print(f"{name:<10}{verdicts}; successful and wrong by {SILENT:g} sd: {silent.sum()}")

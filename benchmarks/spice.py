@@ -16,9 +16,56 @@ import numpy as np
 import etid
 from etid.circuits import AbstractCircuit
 from etid.identify import CONTINUOUS, METHODS, Method
+from etid.scenes import Scene, Trial
+from etid.transformer import ResistorLoad, SkinLoad, TransformerDriver
 
 BOUND = "crb_rel_with_delays"  # the trigger delays being unknown, as they are to the fits
 ELEMENTS = {"r_s": "Rs", "r_p": "Rp", "c_p": "Cp", "r": "R"}
+# Names of the transformer's parts in `truth.json`.
+PARTS = {
+    "Vp": "amplitude",
+    "tr": "edge",
+    "td": "lead_in",
+    "Rsrc": "r_source",
+    "Cpri": "c_primary",
+    "Rpw": "r_primary",
+    "Llp": "l_primary",
+    "Lm": "l_magnetising",
+    "Rcore": "r_core",
+    "n": "turns",
+    "Rsw": "r_secondary",
+    "Lls": "l_secondary",
+    "Csec": "c_secondary",
+    "Cww": "c_winding",
+    "Rprot": "r_protection",
+    "Ccab": "c_cable",
+    "Rmeas": "r_divider",
+    "Cmeas": "c_divider",
+}
+
+
+def scene_of(truth: dict) -> Scene:
+    """The scene of which one SPICE recording is a draw; one unloaded record for all its trials."""
+    trials = []
+    for i, trial in enumerate(truth["trials"]):
+        values = {name: trial["elements"].get(key) for name, key in ELEMENTS.items()}
+        if values["r"] is not None:
+            load: SkinLoad | ResistorLoad = ResistorLoad(values["r"])
+        else:
+            load = SkinLoad(values["r_s"], values["r_p"], values["c_p"])
+        trials.append(Trial(f"loaded/{i}", load))
+    return Scene(
+        tuple(trials),
+        tuple(Trial(f"calibration/{i}", ResistorLoad(r)) for i, r in enumerate(truth["R_ref"])),
+        TransformerDriver(**{PARTS[name]: value for name, value in truth["circuit"].items()}),
+        sample_rate=truth["fs"],
+        samples=truth["samples"],
+        snr_db=None if truth["snr_db"] is None else float(truth["snr_db"]),
+        trigger_jitter_rms=truth["trigger_jitter_rms"],
+        offset_rms=truth["offset_rms"],
+        full_scale=truth["full_scale"],
+        shared_v_th=True,
+    )
 
 
 def fit_scene(source: pathlib.Path, truth: dict, method: Method) -> list[dict]:

@@ -14,6 +14,8 @@ print(fit)
 from etid import scenes as scenes
 from etid.batch import identify_skins as identify_skins
 from etid.batch import identify_study as identify_study
+from etid.bounds import Bound as Bound
+from etid.bounds import bound as bound
 from etid.circuits import AbstractCircuit as AbstractCircuit
 from etid.circuits import Resistor as Resistor
 from etid.circuits import SkinRC as SkinRC

@@ -10,14 +10,20 @@ of which the unknown true X has been eliminated. σ² are the variances of one c
 
 A skin is identified *jointly* with the calibrations of its driver: what a skin's record says about
 Z_th, and about the delay of a calibration that one known resistor leaves open, is used.
+
+**One unloaded record for several loaded ones** is one noise in all of them, and they all tell of
+the same X. Record by record, X and σ_x² are then replaced by what the earlier ones with the same X
+leave of them (`_learn`, one step of a Kalman filter): the likelihood of all, in independent terms.
 """
+
+from collections.abc import Sequence
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import optimistix as optx
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Array, Complex, Float
+from jaxtyping import Array, Bool, Complex, Float
 
 from etid.circuits import AbstractCircuit, resistor
 from etid.driver import Calibration, SourceImpedance
@@ -60,14 +66,71 @@ def residual(spectrum: Spectrum, g: Complex[Array, " harmonic"]) -> Float[Array,
     return jnp.concatenate([difference.real, difference.imag])
 
 
-def _denoised(spectrum: Spectrum, g: Complex[Array, " harmonic"]) -> Spectrum:
-    """The same with X by its maximum-likelihood estimate and Y = g X.
+def _learn(
+    spectrum: Spectrum,
+    other: Spectrum,
+    g: Complex[Array, " harmonic"],
+    same: Bool[Array, ""] | bool = True,
+) -> Spectrum:
+    """What is known of the X of `spectrum` after Y = `g` X of another record, if X is the same."""
+    total = other.variance_y + jnp.abs(g) ** 2 * spectrum.variance_x
+    used = other.selected & same
+    share = jnp.where(used, spectrum.variance_x / total, 0.0)
+    x = spectrum.x + jnp.conj(g) * as_complex(share) * (other.y - g * spectrum.x)
+    variance = jnp.where(used, share * other.variance_y, spectrum.variance_x)
+    return eqx.tree_at(lambda s: (s.x, s.variance_x), spectrum, (x, variance))
 
-    The Jacobian at these has the noise of neither record, which would count as information.
+
+def _same_unloaded(one: Spectrum, other: Spectrum) -> Bool[Array, ""] | bool:
+    """Whether two recordings have one and the same unloaded record."""
+    if one is other:
+        return True
+    if one.x.shape != other.x.shape:
+        return False
+    return jnp.all(one.x == other.x)
+
+
+def _as_list(spectra: Spectrum) -> list[Spectrum]:
+    return [jax.tree.map(lambda leaf, i=i: leaf[i], spectra) for i in range(spectra.x.shape[0])]
+
+
+def informed(
+    spectra: Sequence[Spectrum], gains: Sequence[Complex[Array, " harmonic"]]
+) -> list[Spectrum]:
+    """Each recording with what the earlier ones with its unloaded record tell of its X."""
+    known = list(spectra)
+    for i in range(len(known)):
+        for j in range(i):
+            same = _same_unloaded(spectra[i], spectra[j])
+            if same is not False:
+                known[i] = _learn(known[i], spectra[j], gains[j], same)
+    return known
+
+
+def _denoised(
+    spectra: Sequence[Spectrum], gains: Sequence[Complex[Array, " harmonic"]]
+) -> list[Spectrum]:
+    """The same with X by its maximum-likelihood estimate from all recordings, and Y = G X.
+
+    The Jacobian at these has the noise of no record, which would count as information.
     """
-    share = jnp.conj(g) * as_complex(spectrum.variance_x / _variance(spectrum, g))
-    x = spectrum.x + share * (spectrum.y - g * spectrum.x)
-    return eqx.tree_at(lambda s: (s.x, s.y), spectrum, (x, g * x))
+    found = []
+    for one, g in zip(spectra, gains, strict=True):
+        known = one
+        for other, other_gain in zip(spectra, gains, strict=True):
+            same = _same_unloaded(one, other)
+            if same is not False:
+                known = _learn(known, other, other_gain, same)
+        found.append(eqx.tree_at(lambda s: (s.x, s.y), one, (known.x, g * known.x)))
+    return found
+
+
+def residuals(
+    spectra: Sequence[Spectrum], gains: Sequence[Complex[Array, " harmonic"]]
+) -> list[Float[Array, " part"]]:
+    """`residual` of each recording, all of them independent."""
+    known = informed(spectra, gains)
+    return [residual(s, g) for s, g in zip(known, gains, strict=True)]
 
 
 def _calibration_gains(
@@ -76,11 +139,12 @@ def _calibration_gains(
     r_load: Float[Array, " record"],
     delay: Float[Array, " record"],
     sample_rate: Float[Array, ""],
-) -> Complex[Array, "record harmonic"]:
+) -> list[Complex[Array, " harmonic"]]:
     """Delayed gains of all calibrations, for delays in samples."""
-    return jax.vmap(lambda f, r, d: delayed_gain(source, resistor(r), f, d))(
+    gains = jax.vmap(lambda f, r, d: delayed_gain(source, resistor(r), f, d))(
         spectra.frequency, r_load, delay / sample_rate
     )
+    return list(gains)
 
 
 def fit_source(
@@ -107,20 +171,21 @@ def fit_source(
     def gains(q):
         return _calibration_gains(spectra, unflatten(q[:kept]), r_load, q[kept:], sample_rate)
 
-    def of_all(q, spectra):
-        parts = jax.vmap(residual)(spectra, gains(q))
-        return jnp.concatenate([parts.reshape(-1), regularise(q[:kept]), q[kept:] / DELAY_WIDTH])
+    def of_all(q, records):
+        weak = [regularise(q[:kept]), q[kept:] / DELAY_WIDTH]
+        return jnp.concatenate(residuals(records, gains(q)) + weak)
 
+    records = _as_list(spectra)
     q0 = jnp.concatenate([start_vector, jnp.zeros(count)])
     solution = optx.least_squares(
-        of_all, SOLVER, q0, args=spectra, max_steps=MAX_STEPS, throw=False
+        of_all, SOLVER, q0, args=records, max_steps=MAX_STEPS, throw=False
     )
     q = solution.value
-    jacobian = jax.jacfwd(of_all)(q, jax.vmap(_denoised)(spectra, gains(q)))
+    jacobian = jax.jacfwd(of_all)(q, _denoised(records, gains(q)))
     freedom = 2 * jnp.sum(spectra.selected, dtype=q.dtype) - q.shape[0]
     chi2 = 2 * solution.stats["normal_equations"].objective / freedom
     cov = inverse(jacobian.T @ jacobian)[:kept, :kept] * jnp.maximum(chi2, 1.0)
-    errors = jax.vmap(complex_rrse)(gains(q) * spectra.x, spectra.y)
+    errors = jnp.stack([complex_rrse(g * s.x, s.y) for s, g in zip(records, gains(q), strict=True)])
     estimate = Estimate(
         q[:kept],
         q[kept:, None],
@@ -163,6 +228,7 @@ def fit_circuit(
     circuit = jax.tree.map(lambda leaf: leaf[0], starts)
     references, r_load = calibration.spectra, calibration.r_load
     assert references is not None  # check_driver
+    records = [*_as_list(references), spectrum]
     regularise = prior(source, rate, r_load.mean())
     both = kept + 1 + sources
 
@@ -176,16 +242,16 @@ def fit_circuit(
         z_th = unflatten(q[kept + 1 : both])
         return _calibration_gains(references, z_th, r_load, q[both:], rate)
 
+    def priors(q):
+        weak = regularise(q[kept + 1 : both])
+        return jnp.concatenate([q[kept : kept + 1] / DELAY_WIDTH, weak, q[both:] / DELAY_WIDTH])
+
+    def of_all(q, records):
+        parts = residuals(records, [*common_gains(q), own_gain(q)])
+        return jnp.concatenate([*parts, priors(q)])
+
     def own(q, spectrum):
         return jnp.append(residual(spectrum, own_gain(q)), q[kept] / DELAY_WIDTH)
-
-    def common(q, spectra):
-        parts = jax.vmap(residual)(spectra, common_gains(q)).reshape(-1)
-        weak = regularise(q[kept + 1 : both])
-        return jnp.concatenate([parts, weak, q[both:] / DELAY_WIDTH])
-
-    def of_all(q, spectra):
-        return jnp.concatenate([own(q, spectra[0]), common(q, spectra[1])])
 
     def at(candidate):
         return jnp.concatenate([candidate, jnp.zeros(1), source_vector, calibration.delay])
@@ -205,24 +271,32 @@ def fit_circuit(
         of_all,
         SOLVER,
         best.at[: kept + 1].set(alone.value),
-        args=(spectrum, references),
+        args=records,
         max_steps=MAX_STEPS,
         throw=False,
     )
     q = solution.value
     g = own_gain(q)
-    j_own = jax.jacfwd(own)(q, _denoised(spectrum, g))
-    j_common = jax.jacfwd(common)(q, jax.vmap(_denoised)(references, common_gains(q)))
-    influence = inverse(j_own.T @ j_own + j_common.T @ j_common)[:kept]
-    chi2 = jnp.sum(own(q, spectrum) ** 2) / (
-        2 * jnp.sum(spectrum.selected, dtype=q.dtype) - kept - 1
-    )
-    shared = influence @ (j_common.T @ j_common) @ influence.T
-    private = influence @ (j_own.T @ j_own) @ influence.T
+    gains = [*common_gains(q), g]
+    jacobian = jax.jacfwd(of_all)(q, _denoised(records, gains))
+    influence = inverse(jacobian.T @ jacobian)[:kept]
+    # What is the trial's own among the noise of its terms: all, or that of V_out if V_th is shared.
+    known = informed(records, gains)[-1]
+    part = spectrum.variance_y / _variance(known, g)
+    part = jnp.where(jnp.any(known.variance_x != spectrum.variance_x), part, 1.0)
+    size = 2 * part.size
+    first = sum(2 * s.x.size for s in records[:-1])
+    private = jnp.zeros(jacobian.shape[0]).at[first : first + size].set(jnp.tile(part, 2))
+    private = private.at[first + size].set(1.0)  # the prior of its delay
+    by_term = influence @ jacobian.T
+    own_cov = (by_term * private[None, :]) @ by_term.T
+    shared = (by_term * (1 - private)[None, :]) @ by_term.T
+    freedom = 2 * jnp.sum(spectrum.selected, dtype=q.dtype) - kept - 1
+    chi2 = jnp.sum(residual(known, g) ** 2) / freedom
     return circuit.with_log_values(q[:kept]), Estimate(
         q[:kept],
         q[None, kept : kept + 1],
-        private * jnp.maximum(chi2, 1.0) + shared,
+        own_cov * jnp.maximum(chi2, 1.0) + shared,
         chi2,
         complex_rrse(g * spectrum.x, spectrum.y),
         solution.result,

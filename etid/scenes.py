@@ -7,7 +7,8 @@ by name. Their keywords are the fields of `Scene`: noise, jitter, window, conver
 frozen description; `Scene.simulate` makes the records, `Scene.truth` tells what is behind them.
 
 Every trial has an unloaded record v_th of its own, as in the paper: it is recorded at another pulse
-than v_out, with its own noise, trigger delay and offset. The chain from circuit to file is
+than v_out, with its own noise, trigger delay and offset; or all share one. The chain from circuit
+to file is
 
     exact periodic waveform → anti-alias filter → sampling at start + delay + n / sample_rate
     → · scale → + offset + white noise → rounding to a code, clipped at the full scale.
@@ -66,6 +67,23 @@ class Trial:
 
 
 @dataclasses.dataclass(frozen=True)
+class Waveform:
+    """Harmonics of a scene without noise, and the noise.
+
+    Attributes:
+        f: Harmonics of the pulse rate [Hz], far beyond half the sample rate.
+        v_th: Fourier coefficients of the unloaded voltage after the anti-alias filter [V].
+        z_th: Source impedance [ohm].
+        sigma: Standard deviation of a sample, noise and rounding together [V].
+    """
+
+    f: Float[np.ndarray, " f"]
+    v_th: Complex[np.ndarray, " f"]
+    z_th: Complex[np.ndarray, " f"]
+    sigma: float
+
+
+@dataclasses.dataclass(frozen=True)
 class Scene:
     """A set of recordings with one driver.
 
@@ -85,6 +103,7 @@ class Scene:
         trigger_jitter_rms: Standard deviation of the delay of every single record [s]. A positive
             delay samples late.
         offset_rms: Standard deviation of the offset of every single record [V at the converter].
+        shared_v_th: Whether all trials and calibrations share one unloaded record, and its noise.
         full_scale: The converter clips at ± this voltage [V at the converter].
         bits: Resolution of the converter; None stores unrounded volts at the converter.
         scale: Volts at the converter per volt at the terminal.
@@ -102,6 +121,7 @@ class Scene:
     snr_db: float | None = 60.0
     trigger_jitter_rms: float = 0.0
     offset_rms: float = 0.0
+    shared_v_th: bool = False
     full_scale: float = 10.0
     bits: int | None = 16
     scale: float = 0.0535
@@ -150,16 +170,7 @@ class Scene:
         Returns:
             One recording per calibration and trial.
         """
-        sampler = Sampler(
-            self.sample_rate,
-            self.pulse_rate * (1 + 1e-6 * self.pulse_rate_ppm),
-            self.antialias * self.sample_rate,
-        )
-        v_th = sampler.pulse_rate * self.driver.v_th_spectrum(sampler.f)
-        z_th = self.driver.z_th(sampler.f)
-        sigma = 0.0
-        if self.snr_db is not None:
-            sigma = self.scale * sampler.rms(v_th) * 10 ** (-self.snr_db / 20)
+        sampler, v_th, z_th, sigma = self._exact()
         resistances = {
             trial.path: trial.load.r
             for trial in self.calibration
@@ -168,13 +179,15 @@ class Scene:
         step, lowest, highest = self._converter()
 
         recordings = []
+        common = np.random.default_rng([seed, *b"v_th"])
+        unloaded = self._convert(sampler, v_th, sigma, common) if self.shared_v_th else None
         for trial in self.calibration + self.trials:
             draws = np.random.default_rng([seed, *trial.path.encode()]).spawn(2)
             r_load = resistances.get(trial.path)
             v_out = v_th * loading(_impedance(trial, sampler.f), z_th)
             recordings.append(
                 Recording(
-                    self._convert(sampler, v_th, sigma, draws[0]),
+                    unloaded or self._convert(sampler, v_th, sigma, draws[0]),
                     self._convert(sampler, v_out, sigma, draws[1]),
                     sample_rate=self.sample_rate,
                     pulse_rate=self.pulse_rate,
@@ -189,6 +202,26 @@ class Scene:
                 )
             )
         return Study.from_recordings(recordings)
+
+    def waveform(self) -> "Waveform":
+        """What the records hold at the harmonics of the pulse rate."""
+        sampler, v_th, z_th, sigma = self._exact()
+        step = self._converter()[0] if self.bits is not None else 0.0
+        total = math.hypot(sigma, step / math.sqrt(12)) / self.scale
+        return Waveform(sampler.f, v_th * sampler.antialias, z_th, total)
+
+    def _exact(self) -> tuple[Sampler, np.ndarray, np.ndarray, float]:
+        """Sampler, Fourier coefficients of V_th [V], Z_th [ohm] and noise [V at the converter]."""
+        sampler = Sampler(
+            self.sample_rate,
+            self.pulse_rate * (1 + 1e-6 * self.pulse_rate_ppm),
+            self.antialias * self.sample_rate,
+        )
+        v_th = sampler.pulse_rate * self.driver.v_th_spectrum(sampler.f)
+        sigma = 0.0
+        if self.snr_db is not None:
+            sigma = self.scale * sampler.rms(v_th) * 10 ** (-self.snr_db / 20)
+        return sampler, v_th, self.driver.z_th(sampler.f), sigma
 
     def _converter(self) -> tuple[float, float, float]:
         """Volts at the converter per stored unit, and the lowest and highest stored value."""

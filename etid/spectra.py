@@ -26,7 +26,7 @@ class Spectrum(eqx.Module):
         frequency: Harmonics of the pulse rate [Hz].
         x: Coefficients of V_th.
         y: Coefficients of V_out.
-        variance_x: E|noise|² of one coefficient of `x` [V²].
+        variance_x: E|noise|² of each coefficient of `x` [V²].
         variance_y: The same of `y`.
         selected: Harmonics that stand out of the noise; the others are left out of a fit.
     """
@@ -34,8 +34,8 @@ class Spectrum(eqx.Module):
     frequency: Float[Array, "*lane harmonic"]
     x: Complex[Array, "*lane harmonic"]
     y: Complex[Array, "*lane harmonic"]
-    variance_x: Float[Array, "*lane"]
-    variance_y: Float[Array, "*lane"]
+    variance_x: Float[Array, "*lane harmonic"]
+    variance_y: Float[Array, "*lane harmonic"]
     selected: Bool[Array, "*lane harmonic"]
 
 
@@ -105,7 +105,8 @@ def spectrum(
         samples: From `whole_periods`.
     """
     x, y = harmonics(v_th, periods, samples), harmonics(v_out, periods, samples)
-    variance_x, variance_y = sigma_th**2 / samples, sigma_out**2 / samples
+    variance_x = jnp.full(x.shape, sigma_th**2 / samples)
+    variance_y = jnp.full(y.shape, sigma_out**2 / samples)
     frequency = jnp.arange(1.0, x.shape[0] + 1) * (periods * sample_rate / samples)
     # The choice must not depend on single harmonics: that would favour those with lucky noise.
     box = jnp.ones(WINDOW) / WINDOW

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from benchmarks.coverage import LOADS, monte_carlo
+from benchmarks.coverage import LOADS, monte_carlo, scene
 
 REPETITIONS = 200  # a driver costs a second
 # Standard errors: an estimate that is not linear in the data is biased at high noise. A third of
@@ -15,15 +15,16 @@ WIDE = 0.75  # spread in standard errors: second-order terms make them a fifth t
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("method", "snr_db", "samples"),
+    ("method", "snr_db", "samples", "shared"),
     [
-        ("maximum_likelihood", 60.0, 10_000),
-        ("output_error", 60.0, 10_000),
-        ("output_error", 40.0, 3334),
+        ("maximum_likelihood", 60.0, 10_000, False),
+        ("maximum_likelihood", 60.0, 10_000, True),
+        ("output_error", 60.0, 10_000, False),
+        ("output_error", 40.0, 3334, False),
     ],
 )
-def test_intervals_of_95_per_cent_contain_the_truth_in_95_per_cent(method, snr_db, samples):
-    draws = monte_carlo(snr_db, samples, REPETITIONS, method=method)
+def test_intervals_of_95_per_cent_contain_the_truth_in_95_per_cent(method, snr_db, samples, shared):
+    draws = monte_carlo(scene(snr_db, samples, shared_v_th=shared), REPETITIONS, method)
     for name in LOADS:
         of = draws[name]
         good = of.verdicts == "successful"

@@ -36,6 +36,7 @@ FLOORS = {
     "importing": 4,
     "scenes": 4,
     "information": 4,
+    "bounds": 5,
     "impedance": 5,
     "output_error": 5,
     "maximum_likelihood": 6,

@@ -1,0 +1,81 @@
+"""The Cramer-Rao bound of a scene: equal to an independent one, and what follows from it."""
+
+import json
+
+import numpy as np
+import pytest
+
+import etid
+from benchmarks.spice import BOUND, scene_of
+from etid.scenes import Scene, Trial
+from etid.transformer import ResistorLoad, SkinLoad
+
+DRY = SkinLoad(r_s=33.4e3, r_p=186e3, c_p=0.12e-9)
+KNOWN = (Trial("calibration/0", ResistorLoad(98.8e3)),)
+INDEPENDENT = 1e-6  # two programs, one formula; they differ in the rounding of the noise
+
+
+def relative(load=DRY, *, calibration=KNOWN, delays=True, known_driver=False, **settings):
+    scene = Scene((Trial("a", load),), calibration, **settings)
+    bounds = etid.bound(scene, delays=delays, known_driver=known_driver)
+    return np.array(list(bounds["a"].relative.values()))
+
+
+def test_the_bound_is_that_of_the_spice_recordings(reference_data):
+    """`truth.json` comes from a program of its own, with one unloaded record for all."""
+    scenes = json.loads((reference_data("spice_recordings") / "truth.json").read_text())["scenes"]
+    compared = 0
+    for truth in scenes.values():
+        if BOUND not in truth["trials"][0]:
+            continue
+        scene = scene_of(truth)
+        for key, delays in ((BOUND, True), ("crb_rel_RsRpCp", False)):
+            bounds = etid.bound(scene, delays=delays)
+            for name, trial in zip(bounds, truth["trials"], strict=True):
+                found = list(bounds[name].relative.values())  # R_s, R_p, C_p, as there
+                assert found == pytest.approx(trial[key], rel=INDEPENDENT)
+                compared += len(found)
+    assert compared > 500
+
+
+def test_three_times_the_samples_or_ten_decibels_less_noise_scale_every_error():
+    base = relative(bits=None)
+    np.testing.assert_allclose(relative(bits=None, samples=30_000), base / np.sqrt(3), rtol=1e-9)
+    np.testing.assert_allclose(relative(bits=None, snr_db=70.0), base / np.sqrt(10), rtol=1e-9)
+
+
+def test_what_is_known_makes_every_error_smaller():
+    unknown = relative()
+    assert (relative(delays=False) < unknown).all()
+    assert (relative(known_driver=True) < unknown).all()
+    assert (relative(shared_v_th=True) < unknown).all()
+    two = (*KNOWN, Trial("calibration/1", ResistorLoad(21.62e3)))
+    assert (relative(calibration=two) < unknown).all()
+
+
+def test_an_element_that_is_not_determined_is_named():
+    scene = Scene((Trial("a", SkinLoad(30.0, 186e3, 0.12e-9)),), KNOWN, snr_db=40.0)
+    bound = etid.bound(scene)["a"]
+    assert bound.undetermined == ("r_s",)
+    assert "do not determine r_s" in str(bound)
+    assert "do not determine" not in str(etid.bound(etid.scenes.paper_dry())["typical/dry/01"])
+
+
+def test_a_resistor_has_a_bound_too_in_ohm():
+    scene = Scene((Trial("a", ResistorLoad(55.2e3)),), KNOWN)
+    bound = etid.bound(scene)["a"]
+    assert bound.stderr["r"] == pytest.approx(bound.relative["r"] * 55.2e3)
+    assert 1e-5 < bound.relative["r"] < 1e-3
+
+
+@pytest.mark.parametrize(
+    ("scene", "text"),
+    [
+        (Scene((Trial("a", lambda f: 1e5 + 0j * f),), KNOWN), "'a'.*no elements"),
+        (Scene((Trial("a", DRY),), KNOWN, snr_db=None, bits=None), "neither noise"),
+        (Scene((Trial("a", DRY),)), "no calibration"),
+    ],
+)
+def test_a_scene_without_a_bound_is_told_why(scene, text):
+    with pytest.raises(ValueError, match=text):
+        etid.bound(scene)
