@@ -18,7 +18,9 @@ def main() -> None:
     )
     spice.add_argument("--data", type=pathlib.Path, default=pathlib.Path("../shared/data"))
     spice.add_argument("--scene", action="append", help="only this scene; may be repeated")
-    spice.add_argument("--method", action="append", choices=METHODS, help="only this; repeatable")
+    spice.add_argument(
+        "--method", action="append", choices=(*METHODS, "joint"), help="only this; repeatable"
+    )
     spice.add_argument("-o", "--output", type=pathlib.Path, default=None, help="CSV to write")
 
     timing = names.add_parser("timing", help="import time, first call, warm fit, batch, all apart")

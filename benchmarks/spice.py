@@ -10,6 +10,7 @@ import json
 import pathlib
 import tempfile
 from collections import Counter
+from typing import cast
 
 import numpy as np
 
@@ -68,18 +69,25 @@ def scene_of(truth: dict) -> Scene:
     )
 
 
-def fit_scene(source: pathlib.Path, truth: dict, method: Method) -> list[dict]:
+JOINT = "joint"
+ESTIMATORS: tuple[str, ...] = (*METHODS, JOINT)
+
+
+def fit_scene(source: pathlib.Path, truth: dict, method: str) -> list[dict]:
     """One row per element: bias, spread, bound, reported standard error, all relative, in %."""
     trials = truth["trials"]
     is_resistor = "R" in trials[0]["elements"]
     circuit: AbstractCircuit = etid.Resistor() if is_resistor else etid.SkinRC()
-    if is_resistor and method not in CONTINUOUS:
+    if is_resistor and method not in (*CONTINUOUS, JOINT):
         return []  # the paper's method is written for the skin
     with tempfile.TemporaryDirectory() as folder:
         study_file = pathlib.Path(folder) / "study.h5"
         etid.import_file(source, study_file)
         with etid.read(study_file) as study:
-            result = etid.identify_study(study, circuit=circuit, method=method)
+            if method == JOINT:
+                result = etid.identify_jointly(study, circuit=circuit)
+            else:
+                result = etid.identify_study(study, circuit=circuit, method=cast(Method, method))
     fits = result.fits
     order = np.argsort([int(path.rsplit("/", 1)[1]) for path in fits.labels["path"]])
     fits = fits.take(order)
@@ -124,7 +132,7 @@ def fit_scene(source: pathlib.Path, truth: dict, method: Method) -> list[dict]:
 def run(
     folder: pathlib.Path,
     scenes: list[str] | None,
-    methods: list[Method] | None,
+    methods: list[str] | None,
     output: pathlib.Path | None,
 ) -> None:
     """Fit the scenes, print the table, write it as CSV."""
@@ -136,7 +144,7 @@ def run(
     head += f"{'bound %':>9}{'sd %':>9}{'chi2':>9}  silent  driver; verdicts"
     print(head)
     for name in scenes or truth:
-        for method in methods or METHODS:
+        for method in methods or ESTIMATORS:
             for row in fit_scene(folder / f"{name}.npz", truth[name], method):
                 table.append(row)
                 numbers = "".join(

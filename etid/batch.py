@@ -236,40 +236,71 @@ def identify_study(
     """
     circuit = SkinRC() if circuit is None else circuit
     check_method(method, circuit)
-    calibrations = list(study.calibrations)
     loaded = [*study.loaded, *study.problems]
-    drivers: dict[tuple[str, ...], Driver] = {}
-    failures: dict[tuple[str, ...], str] = {}
+    drivers = Drivers(study, order, method)
 
-    def driver_of(recording: Recording) -> Driver:
-        names = recording.calibration or tuple(calibrations)
-        if not recording.calibration and len(calibrations) != 1:
+    def load(row: int) -> tuple[Recording, Driver]:
+        recording = study[loaded[row]]
+        return recording, drivers.found[drivers.of(recording)]
+
+    fits, notes = _identify(len(loaded), load, circuit, method, progress)
+    return StudyFits(table(study, loaded, fits, notes), drivers.found, drivers.failures)
+
+
+def table(study: Study, paths: Sequence[str], fits: Sequence[Fit], notes: Sequence[str]) -> Fits:
+    """The fits of these recordings of a study, with their labels.
+
+    Raises:
+        ValueError: There is none.
+    """
+    if not fits:
+        raise ValueError("the study has no loaded recording")
+    metadata = [_metadata(study, path) for path in paths]
+    return Fits(_stack(fits), _labels(metadata), np.array(notes, dtype=str))
+
+
+class Drivers:
+    """The drivers of a study, each identified when its first recording asks for it.
+
+    Attributes:
+        found: The drivers, by the paths of their calibrations.
+        failures: Why a driver could not be identified, by the paths of its calibrations.
+    """
+
+    def __init__(self, study: Study, order: int, method: Method | None):
+        self.study = study
+        self.order = order
+        self.method: Method | None = method
+        self.calibrations = tuple(study.calibrations)
+        self.found: dict[tuple[str, ...], Driver] = {}
+        self.failures: dict[tuple[str, ...], str] = {}
+
+    def of(self, recording: Recording) -> tuple[str, ...]:
+        """Paths of the calibrations of a recording, whose driver is in `found` then.
+
+        Raises:
+            RecordingError: The recording does not say which of several it is.
+            IdentificationError: The driver could not be identified.
+        """
+        names = recording.calibration or self.calibrations
+        if not recording.calibration and len(self.calibrations) != 1:
             raise RecordingError(
-                f"names no calibration and the study has {len(calibrations)}",
+                f"names no calibration and the study has {len(self.calibrations)}",
                 path=recording.path,
                 field="calibration",
                 remedy="Write the path of its calibration into the attribute 'calibration'",
             )
-        if names not in drivers and names not in failures:
+        if names not in self.found and names not in self.failures:
             try:
-                records = [study[name] for name in names]
-                drivers[names] = identify_driver(records, order=order, method=method, throw=False)
+                records = [self.study[name] for name in names]
+                self.found[names] = identify_driver(
+                    records, order=self.order, method=self.method, throw=False
+                )
             except (IdentificationError, ValueError, KeyError) as error:
-                failures[names] = str(error)
-        if names in failures:
-            raise IdentificationError(failures[names], None)
-        return drivers[names]
-
-    def load(row: int) -> tuple[Recording, Driver]:
-        recording = study[loaded[row]]
-        return recording, driver_of(recording)
-
-    fits, notes = _identify(len(loaded), load, circuit, method, progress)
-    if not fits:
-        raise ValueError("the study has no loaded recording")
-    metadata = [_metadata(study, path) for path in loaded]
-    table = Fits(_stack(fits), _labels(metadata), np.array(notes, dtype=str))
-    return StudyFits(table, drivers, failures)
+                self.failures[names] = str(error)
+        if names in self.failures:
+            raise IdentificationError(self.failures[names], None)
+        return names
 
 
 def _metadata(study: Study, path: str) -> Metadata | _Unreadable:

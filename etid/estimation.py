@@ -31,6 +31,9 @@ MISFIT_CHI2 = 1.5  # the noise is known from the record to about 5 %, chi2 there
 MISFIT_RRSE = (
     1e-3  # of the signal; what converters and transformers leave unexplained at their best
 )
+# Growth of the calibrations' sum of squares in a joint fit. It is chi-squared with as many degrees
+# of freedom as Z_th and the delays have parameters at most: 12 exceed this once in ten thousand.
+STRAINED = 39.0
 BIASED = 16.0  # squared standard errors between an estimate and the minimum of its own model
 PASSIVE = 2.0  # standard errors by which Re Z_th may be negative
 BAND = np.linspace(0.0003, 0.4, 400)  # of the sample rate, where a source must be passive
@@ -39,7 +42,7 @@ IMPULSE = 512  # samples of a discrete model's impulse response
 UNWANTED = 1e3  # added to the cost of a start that did not settle; any cost is smaller
 
 
-def _misses(chi2: Float[Array, ""], error: Float[Array, ""]) -> Bool[Array, ""]:
+def misses(chi2: Float[Array, ""], error: Float[Array, ""]) -> Bool[Array, ""]:
     """Whether the residual exceeds the noise both in standard deviations and in volts."""
     excess = error * jnp.sqrt(jnp.maximum(1 - 1 / chi2, 0.0))
     return (chi2 > MISFIT_CHI2) & (excess > MISFIT_RRSE)
@@ -100,7 +103,7 @@ def skin_by_steiglitz_mcbride(m: Measurement, driver: Driver, iterations: int) -
             (unstable, RESULTS.unstable),
             (~jnp.all(values > 0), RESULTS.nonphysical),
             ((iterations > 1) & ~best.converged, MAX_STEPS_REACHED),
-            (_misses(chi2, best.rrse), RESULTS.misfit),
+            (misses(chi2, best.rrse), RESULTS.misfit),
             (distance > BIASED, RESULTS.biased),
         ),
         steps=best.iteration,
@@ -137,7 +140,7 @@ def driver_by_steiglitz_mcbride(
         result=first_verdict(
             (unstable, RESULTS.unstable),
             ((iterations > 1) & ~best.converged, MAX_STEPS_REACHED),
-            (_misses(chi2, best.rrse), RESULTS.misfit),
+            (misses(chi2, best.rrse), RESULTS.misfit),
             (distance.max() > BIASED, RESULTS.biased),
         ),
         steps=best.iteration,
@@ -148,7 +151,7 @@ def driver_by_steiglitz_mcbride(
 # --- Output error and maximum likelihood ---------------------------------------------------------
 
 
-def _skin_starts(m: Measurement, driver: Driver, circuit: AbstractCircuit) -> AbstractCircuit:
+def skin_starts(m: Measurement, driver: Driver, circuit: AbstractCircuit) -> AbstractCircuit:
     """Several impedance levels and, for SkinRC, the paper's estimate, stacked."""
     typical = circuit.log_values()
     is_ohm = jnp.array([unit == "ohm" for unit in circuit.units().values()])
@@ -162,7 +165,8 @@ def _skin_starts(m: Measurement, driver: Driver, circuit: AbstractCircuit) -> Ab
     return circuit.with_log_values(jnp.stack(starts))
 
 
-def _spectrum(m: Measurement, window: tuple[int, int]) -> Spectrum:
+def spectrum_of(m: Measurement, window: tuple[int, int]) -> Spectrum:
+    """Harmonics of one recording in a window of `spectra.whole_periods`."""
     return spectrum(m.v_th, m.v_out, m.sigma_th, m.sigma_out, m.sample_rate, *window)
 
 
@@ -181,16 +185,34 @@ def skin_by_refinement(
     source, source_cov, calibration = driver.source, driver.cov, driver.calibration
     if source is None or source_cov is None or calibration is None:
         raise ValueError("the driver has no continuous source impedance")
-    starts = _skin_starts(m, driver, circuit)
+    starts = skin_starts(m, driver, circuit)
     if window is None:
-        fitted, estimate = output_error.fit_circuit(
+        _, estimate = output_error.fit_circuit(
             prediction.prepare(m), source, source_cov, calibration, starts
         )
     else:
-        rate = jnp.asarray(driver.sample_rate)
-        fitted, estimate = maximum_likelihood.fit_circuit(
-            _spectrum(m, window), m.sample_rate, calibration, rate, source, starts
+        model = maximum_likelihood.Joint(
+            circuit, source, calibration, jnp.asarray(driver.sample_rate)
         )
+        estimate = maximum_likelihood.fit_circuit(
+            model, spectrum_of(m, window), m.sample_rate, starts.log_values()
+        )
+    method = "output_error" if window is None else "maximum_likelihood"
+    return judged(estimate, circuit, driver.result, method)
+
+
+def judged(
+    estimate: output_error.Estimate, circuit: AbstractCircuit, driver_result: RESULTS, method: str
+) -> Fit:
+    """The fit of an estimate, with its verdict.
+
+    Args:
+        estimate: Its parameters are the logarithms of the elements.
+        circuit: Structure of the load.
+        driver_result: Verdict of the driver.
+        method: Name of the estimator.
+    """
+    fitted = circuit.with_log_values(estimate.parameters)
     values = fitted.values()
     errors = jnp.sqrt(jnp.diagonal(estimate.cov))  # of the logarithms, so relative ones
     settled = RESULTS.promote(estimate.result) == RESULTS.successful
@@ -204,12 +226,13 @@ def skin_by_refinement(
             (~jnp.isfinite(estimate.chi2), RESULTS.unstable),
             (~jnp.isfinite(values).all(), RESULTS.nonphysical),
             (~settled, MAX_STEPS_REACHED),
-            (_misses(estimate.chi2, estimate.rrse) | _too_late(estimate), RESULTS.misfit),
+            (misses(estimate.chi2, estimate.rrse) | _too_late(estimate), RESULTS.misfit),
+            (estimate.strain > STRAINED, RESULTS.inconsistent),
             (~jnp.all(errors < 1), RESULTS.insensitive),
-            (driver.result != SUCCESSFUL, RESULTS.driver_failed),
+            (driver_result != SUCCESSFUL, RESULTS.driver_failed),
         ),
         steps=estimate.steps,
-        method="output_error" if window is None else "maximum_likelihood",
+        method=method,
     )
 
 
@@ -283,7 +306,7 @@ def driver_by_refinement(
         def fit(start):
             return output_error.fit_source(records, r_load, start)
     else:
-        spectra = jax.vmap(lambda m: _spectrum(m, window))(m)
+        spectra = jax.vmap(lambda m: spectrum_of(m, window))(m)
 
         def fit(start):
             return maximum_likelihood.fit_source(spectra, r_load, m.sample_rate[0], start)
@@ -324,7 +347,7 @@ def driver_by_refinement(
             (~finite[chosen], RESULTS.unstable),
             (~passive[chosen], RESULTS.nonphysical),
             (~settled[chosen], MAX_STEPS_REACHED),
-            (_misses(estimate.chi2, estimate.rrse) | _too_late(estimate), RESULTS.misfit),
+            (misses(estimate.chi2, estimate.rrse) | _too_late(estimate), RESULTS.misfit),
         ),
         steps=estimate.steps,
         method="output_error" if window is None else "maximum_likelihood",

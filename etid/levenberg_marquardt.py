@@ -99,6 +99,8 @@ class LevenbergMarquardt(optx.AbstractLeastSquaresSolver):
             promised no more: along a valley whose floor is flat within rounding, as of a
             superfluous pole, the two criteria above are never met.
         norm: Norm of the scaled step and parameters.
+        equations: Evaluates the normal equations of the residual function at a point. A function
+            that returns `NormalEquations` itself needs `lambda fn, y: fn(y)`.
     """
 
     rtol: float = 1e-6
@@ -111,6 +113,7 @@ class LevenbergMarquardt(optx.AbstractLeastSquaresSolver):
     search: optx.ClassicalTrustRegion = optx.ClassicalTrustRegion(
         high_cutoff=0.75, high_constant=5.0, low_constant=0.25
     )
+    equations: Callable[[Callable, Array], NormalEquations] = normal_equations
 
     def init(self, fn, y, args, options, f_struct, aux_struct, tags) -> _State:
         """Set up an empty state; the first step evaluates `y` itself."""
@@ -138,7 +141,7 @@ class LevenbergMarquardt(optx.AbstractLeastSquaresSolver):
     def step(self, fn, y, args, options, state: _State, tags):
         """Evaluate the trial point, accept or reject it, and propose the next."""
         del options, tags
-        trial = normal_equations(lambda y: fn(y, args)[0], state.y_eval)
+        trial = self.equations(lambda y: fn(y, args)[0], state.y_eval)
         step_size, accept, _, search_state = self.search.step(
             state.first_step,
             y,

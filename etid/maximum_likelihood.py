@@ -31,7 +31,7 @@ from etid.information import inverse
 from etid.levenberg_marquardt import best_start
 from etid.output_error import DELAY_WIDTH, MAX_STEPS, SOLVER, Estimate, delay_std, prior
 from etid.results import complex_rrse
-from etid.spectra import Spectrum
+from etid.spectra import Spectrum, signal_share
 from etid.transfer import Rational, as_complex, frequency_variable
 
 
@@ -95,42 +95,47 @@ def _as_list(spectra: Spectrum) -> list[Spectrum]:
 
 
 def informed(
-    spectra: Sequence[Spectrum], gains: Sequence[Complex[Array, " harmonic"]]
-) -> list[Spectrum]:
-    """Each recording with what the earlier ones with its unloaded record tell of its X."""
-    known = list(spectra)
-    for i in range(len(known)):
-        for j in range(i):
-            same = _same_unloaded(spectra[i], spectra[j])
-            if same is not False:
-                known[i] = _learn(known[i], spectra[j], gains[j], same)
+    spectrum: Spectrum,
+    others: Sequence[Spectrum],
+    gains: Sequence[Complex[Array, " harmonic"]],
+) -> Spectrum:
+    """A recording with what others of the same unloaded record tell of its X."""
+    known = spectrum
+    for other, g in zip(others, gains, strict=True):
+        same = _same_unloaded(spectrum, other)
+        if same is not False:
+            known = _learn(known, other, g, same)
     return known
 
 
-def _denoised(
+def denoised(
     spectra: Sequence[Spectrum], gains: Sequence[Complex[Array, " harmonic"]]
-) -> list[Spectrum]:
+) -> tuple[list[Spectrum], list[Float[Array, " part"]]]:
     """The same with X by its maximum-likelihood estimate from all recordings, and Y = G X.
 
-    The Jacobian at these has the noise of no record, which would count as information.
+    The Jacobian J there has no noise of the residual, which would count as information. What is
+    left in it of the noise of X makes the score noisier but is no information either, so that
+
+        cov = H⁻¹ (Jᵀ J) H⁻¹,      H = Jᵀ W J,
+
+    W being the share of signal in the power of X, which is returned for every residual.
     """
-    found = []
+    found, shares = [], []
     for one, g in zip(spectra, gains, strict=True):
-        known = one
-        for other, other_gain in zip(spectra, gains, strict=True):
-            same = _same_unloaded(one, other)
-            if same is not False:
-                known = _learn(known, other, other_gain, same)
+        known = informed(one, spectra, gains)
         found.append(eqx.tree_at(lambda s: (s.x, s.y), one, (known.x, g * known.x)))
-    return found
+        shares.append(jnp.tile(signal_share(known.x, known.variance_x), 2))
+    return found, shares
 
 
 def residuals(
     spectra: Sequence[Spectrum], gains: Sequence[Complex[Array, " harmonic"]]
 ) -> list[Float[Array, " part"]]:
-    """`residual` of each recording, all of them independent."""
-    known = informed(spectra, gains)
-    return [residual(s, g) for s, g in zip(known, gains, strict=True)]
+    """`residual` of each recording given those before it: all are independent."""
+    return [
+        residual(informed(one, spectra[:i], gains[:i]), g)
+        for i, (one, g) in enumerate(zip(spectra, gains, strict=True))
+    ]
 
 
 def _calibration_gains(
@@ -181,10 +186,13 @@ def fit_source(
         of_all, SOLVER, q0, args=records, max_steps=MAX_STEPS, throw=False
     )
     q = solution.value
-    jacobian = jax.jacfwd(of_all)(q, _denoised(records, gains(q)))
+    clean, shares = denoised(records, gains(q))
+    jacobian = jax.jacfwd(of_all)(q, clean)
+    weight = jnp.concatenate([*shares, jnp.ones(jacobian.shape[0] - 2 * spectra.x.size)])
+    by_term = inverse((jacobian.T * weight[None, :]) @ jacobian) @ jacobian.T
     freedom = 2 * jnp.sum(spectra.selected, dtype=q.dtype) - q.shape[0]
     chi2 = 2 * solution.stats["normal_equations"].objective / freedom
-    cov = inverse(jacobian.T @ jacobian)[:kept, :kept] * jnp.maximum(chi2, 1.0)
+    cov = (by_term @ by_term.T)[:kept, :kept] * jnp.maximum(chi2, 1.0)
     errors = jnp.stack([complex_rrse(g * s.x, s.y) for s, g in zip(records, gains(q), strict=True)])
     estimate = Estimate(
         q[:kept],
@@ -195,111 +203,203 @@ def fit_source(
         solution.result,
         solution.stats["num_steps"],
         jnp.zeros_like(cov),
+        jnp.zeros(()),
     )
     calibration = Calibration(r_load, delay_std(r_load) / sample_rate, q[kept:], spectra)
     return unflatten(q[:kept]), estimate, calibration
 
 
-def fit_circuit(
+class Joint(eqx.Module):
+    """The likelihood of loads and of the calibrations of their driver, term by term.
+
+    Everywhere `common` are the parameters of Z_th and the delays of the calibrations, `own` the
+    logarithms of a load's elements and its delay; delays are in samples.
+
+    Attributes:
+        circuit: Structure of the loads.
+        source: Z_th as identified from the calibrations.
+        calibration: The calibrations, with their harmonics.
+        rate: Their sampling rate [Hz].
+    """
+
+    circuit: AbstractCircuit
+    source: SourceImpedance
+    calibration: Calibration
+    rate: Float[Array, ""]
+
+    @property
+    def sources(self) -> int:
+        """Number of parameters of Z_th."""
+        return ravel_pytree(self.source)[0].shape[0]
+
+    @property
+    def records(self) -> list[Spectrum]:
+        """The calibrations one by one."""
+        assert self.calibration.spectra is not None  # check_driver
+        return _as_list(self.calibration.spectra)
+
+    def start(self) -> Float[Array, " common"]:
+        """The common parameters as the calibrations alone have them."""
+        return jnp.concatenate([ravel_pytree(self.source)[0], self.calibration.delay])
+
+    def z_th(self, common: Float[Array, " common"]) -> SourceImpedance:
+        """Z_th of the common parameters."""
+        return ravel_pytree(self.source)[1](common[: self.sources])
+
+    def known_gains(self, common: Float[Array, " common"]) -> list[Complex[Array, " harmonic"]]:
+        """Gains with the known resistors."""
+        spectra = self.calibration.spectra
+        assert spectra is not None
+        delay = common[self.sources :]
+        return _calibration_gains(
+            spectra, self.z_th(common), self.calibration.r_load, delay, self.rate
+        )
+
+    def gain(
+        self,
+        own: Float[Array, " own"],
+        common: Float[Array, " common"],
+        spectrum: Spectrum,
+        sample_rate: Float[Array, ""],
+    ) -> Complex[Array, " harmonic"]:
+        """Gain with a load."""
+        load = self.circuit.with_log_values(own[:-1]).impedance()
+        return delayed_gain(self.z_th(common), load, spectrum.frequency, own[-1] / sample_rate)
+
+    def of_calibrations(
+        self, common: Float[Array, " common"], records: Sequence[Spectrum]
+    ) -> Float[Array, " term"]:
+        """Terms of the calibrations and of the weak prior."""
+        regularise = prior(self.source, self.rate, self.calibration.r_load.mean())
+        parts = residuals(records, self.known_gains(common))
+        weak = [regularise(common[: self.sources]), common[self.sources :] / DELAY_WIDTH]
+        return jnp.concatenate(parts + weak)
+
+    def of_load(
+        self,
+        own: Float[Array, " own"],
+        common: Float[Array, " common"],
+        spectrum: Spectrum,
+        sample_rate: Float[Array, ""],
+        records: Sequence[Spectrum],
+    ) -> Float[Array, " term"]:
+        """Terms of one recording, given the calibrations; the last is the prior of its delay."""
+        known = informed(spectrum, records, self.known_gains(common))
+        part = residual(known, self.gain(own, common, spectrum, sample_rate))
+        return jnp.append(part, own[-1] / DELAY_WIDTH)
+
+    def strain(self, common: Float[Array, " common"]) -> Float[Array, ""]:
+        """By how much Σ r² of the calibrations has grown from what they alone have.
+
+        About as much as there are common parameters, if loads and calibrations agree on them.
+        """
+        alone = jnp.sum(self.of_calibrations(self.start(), self.records) ** 2)
+        freedom = sum(2 * jnp.sum(s.selected, dtype=alone.dtype) for s in self.records)
+        now = jnp.sum(self.of_calibrations(common, self.records) ** 2)
+        return (now - alone) / jnp.maximum(alone / freedom, 1.0)
+
+
+def fit_load(
+    model: Joint,
     spectrum: Spectrum,
     sample_rate: Float[Array, ""],
-    calibration: Calibration,
-    rate: Float[Array, ""],
-    source: SourceImpedance,
-    starts: AbstractCircuit,
-) -> tuple[AbstractCircuit, Estimate]:
+    candidates: Float[Array, "start element"],
+) -> tuple[Float[Array, " own"], optx.RESULTS, Float[Array, ""], Float[Array, ""]]:
+    """Identify the load of one recording with Z_th as the calibrations have it.
+
+    Args:
+        model: Calibrations and kind of circuit.
+        spectrum: The recording.
+        sample_rate: Its sampling rate [Hz].
+        candidates: Logarithms of elements to start from; the start that predicts best is refined.
+
+    Returns:
+        Elements and delay, how the solver ended, χ² per degree of freedom, and RRSE.
+    """
+    records, common = model.records, model.start()
+
+    def terms(own, spectrum):
+        return model.of_load(own, common, spectrum, sample_rate, records)
+
+    starts = jnp.pad(candidates, ((0, 0), (0, 1)))
+    best = best_start(lambda own: terms(own, spectrum), starts)
+    solution = optx.least_squares(
+        terms, SOLVER, best, args=spectrum, max_steps=MAX_STEPS, throw=False
+    )
+    own = solution.value
+    squares = 2 * solution.stats["normal_equations"].objective
+    chi2 = squares / (2 * jnp.sum(spectrum.selected, dtype=own.dtype) - own.shape[0])
+    g = model.gain(own, common, spectrum, sample_rate)
+    return own, solution.result, chi2, complex_rrse(g * spectrum.x, spectrum.y)
+
+
+def fit_circuit(
+    model: Joint,
+    spectrum: Spectrum,
+    sample_rate: Float[Array, ""],
+    candidates: Float[Array, "start element"],
+) -> Estimate:
     """Identify the load of one recording, jointly with the calibrations of its driver.
 
     Args:
-        spectrum: One recording.
+        model: Calibrations and kind of circuit.
+        spectrum: The recording.
         sample_rate: Its sampling rate [Hz].
-        calibration: The driver's, with their harmonics.
-        rate: Their sampling rate [Hz].
-        source: Z_th as identified from them.
-        starts: Candidate starts, stacked along a leading axis; the one that predicts best is
-            refined.
+        candidates: As in `fit_load`.
 
     Returns:
-        The circuit and the estimate, whose parameters are the logarithms of the elements.
+        The estimate, whose parameters are the logarithms of the elements.
     """
-    source_vector, unflatten = ravel_pytree(source)
-    candidates = starts.log_values()
-    kept, sources = candidates.shape[-1], source_vector.shape[0]
-    circuit = jax.tree.map(lambda leaf: leaf[0], starts)
-    references, r_load = calibration.spectra, calibration.r_load
-    assert references is not None  # check_driver
-    records = [*_as_list(references), spectrum]
-    regularise = prior(source, rate, r_load.mean())
-    both = kept + 1 + sources
-
-    # q holds the elements, the delay, Z_th, and the delays of the calibrations.
-    def own_gain(q):
-        load = circuit.with_log_values(q[:kept]).impedance()
-        z_th = unflatten(q[kept + 1 : both])
-        return delayed_gain(z_th, load, spectrum.frequency, q[kept] / sample_rate)
-
-    def common_gains(q):
-        z_th = unflatten(q[kept + 1 : both])
-        return _calibration_gains(references, z_th, r_load, q[both:], rate)
-
-    def priors(q):
-        weak = regularise(q[kept + 1 : both])
-        return jnp.concatenate([q[kept : kept + 1] / DELAY_WIDTH, weak, q[both:] / DELAY_WIDTH])
-
-    def of_all(q, records):
-        parts = residuals(records, [*common_gains(q), own_gain(q)])
-        return jnp.concatenate([*parts, priors(q)])
-
-    def own(q, spectrum):
-        return jnp.append(residual(spectrum, own_gain(q)), q[kept] / DELAY_WIDTH)
-
-    def at(candidate):
-        return jnp.concatenate([candidate, jnp.zeros(1), source_vector, calibration.delay])
-
-    q0 = jax.vmap(at)(candidates)
-    best = best_start(lambda q: own(q, spectrum), q0)
     # First with Z_th as it is: from a start far away, a joint fit would bend Z_th to meet it.
-    alone = optx.least_squares(
-        lambda p, spectrum: own(best.at[: kept + 1].set(p), spectrum),
-        SOLVER,
-        best[: kept + 1],
-        args=spectrum,
-        max_steps=MAX_STEPS,
-        throw=False,
-    )
+    alone, *_ = fit_load(model, spectrum, sample_rate, candidates)
+    split = alone.shape[0]
+
+    def terms(q, records):
+        own, common = q[:split], q[split:]
+        of_load = model.of_load(own, common, records[-1], sample_rate, records[:-1])
+        return jnp.concatenate([of_load, model.of_calibrations(common, records[:-1])])
+
     solution = optx.least_squares(
-        of_all,
+        terms,
         SOLVER,
-        best.at[: kept + 1].set(alone.value),
-        args=records,
+        jnp.concatenate([alone, model.start()]),
+        args=[*model.records, spectrum],
         max_steps=MAX_STEPS,
         throw=False,
     )
-    q = solution.value
-    g = own_gain(q)
-    gains = [*common_gains(q), g]
-    jacobian = jax.jacfwd(of_all)(q, _denoised(records, gains))
-    influence = inverse(jacobian.T @ jacobian)[:kept]
+    own, common = solution.value[:split], solution.value[split:]
+    g = model.gain(own, common, spectrum, sample_rate)
+    gains = [*model.known_gains(common), g]
+    clean, shares = denoised([*model.records, spectrum], gains)
+    jacobian = jax.jacfwd(terms)(solution.value, clean)
+    weight = jnp.concatenate([shares[-1], jnp.ones(1), *shares[:-1]])
+    weight = jnp.pad(weight, (0, jacobian.shape[0] - weight.size), constant_values=1.0)  # priors
+    by_term = inverse((jacobian.T * weight[None, :]) @ jacobian)[: split - 1] @ jacobian.T
     # What is the trial's own among the noise of its terms: all, or that of V_out if V_th is shared.
-    known = informed(records, gains)[-1]
-    part = spectrum.variance_y / _variance(known, g)
-    part = jnp.where(jnp.any(known.variance_x != spectrum.variance_x), part, 1.0)
-    size = 2 * part.size
-    first = sum(2 * s.x.size for s in records[:-1])
-    private = jnp.zeros(jacobian.shape[0]).at[first : first + size].set(jnp.tile(part, 2))
-    private = private.at[first + size].set(1.0)  # the prior of its delay
-    by_term = influence @ jacobian.T
+    known = informed(spectrum, model.records, gains[:-1])
+    part = jnp.where(
+        jnp.any(known.variance_x != spectrum.variance_x),
+        spectrum.variance_y / _variance(known, g),
+        1.0,
+    )
+    private = (
+        jnp.zeros(by_term.shape[1])
+        .at[: 2 * part.size + 1]
+        .set(jnp.concatenate([part, part, jnp.ones(1)]))
+    )
     own_cov = (by_term * private[None, :]) @ by_term.T
     shared = (by_term * (1 - private)[None, :]) @ by_term.T
-    freedom = 2 * jnp.sum(spectrum.selected, dtype=q.dtype) - kept - 1
-    chi2 = jnp.sum(residual(known, g) ** 2) / freedom
-    return circuit.with_log_values(q[:kept]), Estimate(
-        q[:kept],
-        q[None, kept : kept + 1],
+    chi2 = jnp.sum(residual(known, g) ** 2) / (
+        2 * jnp.sum(spectrum.selected, dtype=g.real.dtype) - split
+    )
+    return Estimate(
+        own[:-1],
+        own[None, -1:],
         own_cov * jnp.maximum(chi2, 1.0) + shared,
         chi2,
         complex_rrse(g * spectrum.x, spectrum.y),
         solution.result,
         solution.stats["num_steps"],
         shared,
+        model.strain(common),
     )

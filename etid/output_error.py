@@ -62,6 +62,7 @@ class Estimate(eqx.Module):
         steps: Trial steps of the solver.
         shared_cov: The part of `cov` that comes from the driver, common to all skins identified
             with it.
+        strain: By how much the calibrations' own Σ r² grew in a joint fit; 0 without one.
     """
 
     parameters: Float[Array, " parameter"]
@@ -72,6 +73,7 @@ class Estimate(eqx.Module):
     result: optx.RESULTS
     steps: Int[Array, ""]
     shared_cov: Float[Array, "parameter parameter"]
+    strain: Float[Array, ""]
 
 
 def prior(start: SourceImpedance, sample_rate: Float[Array, ""], r_load: Float[Array, ""]):
@@ -203,6 +205,7 @@ def fit_source(
         solution.result,
         solution.stats["num_steps"],
         jnp.zeros_like(cov),
+        jnp.zeros(()),
     )
     return (
         unflatten(q[:kept]),
@@ -300,6 +303,7 @@ def fit_circuit(
         result,
         steps.sum(),
         shared,
+        jnp.zeros(()),
     )
     return circuit.with_log_values(q[:kept]), estimate
 

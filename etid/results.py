@@ -199,8 +199,10 @@ class Fits:
         """Medians of the successful fits and counts, per group of labels.
 
         Per element: `NAME` the median, `NAME_spread` the standard deviation between the recordings,
-        and `NAME_stderr` the median standard error: two different numbers, of which the first
-        contains what varies between trials.
+        `NAME_stderr` the median standard error, and its two parts: `NAME_own`, the noise of the
+        recording, which the spread contains, and `NAME_shared`, which no spread shows because all
+        recordings with one driver have it in common. What really varies between the recordings is
+        `NAME_between`, sqrt(spread² − own²), or 0.
         """
         keys = [tuple(str(self.labels[name][i]) for name in by) for i in range(len(self))]
         rows = []
@@ -209,12 +211,18 @@ class Fits:
             good = group.successful()
             row: dict[str, Any] = dict(zip(by, key, strict=True))
             row |= {"fits": len(group), "successful": len(good)}
-            for name in self.circuit.names():
+            for i, name in enumerate(self.circuit.names()):
                 values = np.asarray(getattr(good.circuit, name))
                 errors = np.asarray(getattr(good.stderr, name))
                 row[name] = float(np.median(values)) if values.size else np.nan
                 row[f"{name}_spread"] = float(np.std(values, ddof=1)) if values.size > 1 else np.nan
                 row[f"{name}_stderr"] = float(np.median(errors)) if values.size else np.nan
+                total, common = good.cov[:, i, i], good.fit.shared_cov[:, i, i]
+                own = np.sqrt(np.maximum(total - common, 0.0))
+                row[f"{name}_own"] = float(np.median(own)) if values.size else np.nan
+                row[f"{name}_shared"] = float(np.median(np.sqrt(common))) if values.size else np.nan
+                excess = row[f"{name}_spread"] ** 2 - row[f"{name}_own"] ** 2
+                row[f"{name}_between"] = float(np.sqrt(np.maximum(excess, 0.0)))
             rows.append(row)
         return rows
 

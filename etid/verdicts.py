@@ -34,6 +34,10 @@ class RESULTS(optx.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]  # equi
         "The prediction misses the recording by far more than its noise (chi2). The circuit is "
         "wrong, the trigger moved between the records, or the signal drifted or clipped."
     )
+    inconsistent = (
+        "The recording and the calibrations contradict each other about the source impedance. "
+        "The driver changed in between, or r_load is not what it is said to be."
+    )
     biased = (
         "The estimate is more than four standard errors away from the output-error minimum of "
         "its own model, as Steiglitz-McBride is with noise. Use method='output_error'."

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from etid import spectra
-from etid.spectra import harmonics, whole_periods
+from etid.spectra import harmonics, signal_share, whole_periods
 
 spectrum = jax.jit(spectra.spectrum, static_argnums=(5, 6))
 RATE, PULSE = 200e3, 60.0
@@ -51,16 +51,16 @@ def test_the_variance_of_a_coefficient_is_that_of_its_noise(periods):
     np.testing.assert_allclose(np.mean(np.abs(draws) ** 2) * samples / sigma**2, 1, rtol=0.016)
 
 
-def test_harmonics_are_chosen_up_to_the_first_that_drown_in_noise():
-    periods, samples = 3, 10_000
-    time = np.arange(samples) / RATE
-    wave = np.sum([np.cos(2 * np.pi * PULSE * k * time) for k in range(1, 201)], axis=0)
-    v = jnp.asarray(wave + np.random.default_rng(1).normal(0, 1.0, samples))
-    one = jnp.asarray(1.0)
-    found = spectrum(v, v, one, one, jnp.asarray(RATE), periods, samples)
-    # The window of 25 reaches beyond the last wave by half of it.
-    assert 200 <= int(found.selected.sum()) <= 215
-    assert bool(found.selected[:200].all())
+def test_the_share_of_signal_is_one_above_the_noise_half_at_it_and_nearly_zero_below():
+    rng = np.random.default_rng(1)
+    variance = 2.0
+    noise = rng.normal(0, 1.0, 3000) + 1j * rng.normal(0, 1.0, 3000)  # E|noise|² = 2
+    amplitude = np.repeat([1e4, np.sqrt(variance), 0.0], 1000)
+    share = np.asarray(signal_share(jnp.asarray(amplitude + noise), jnp.full(3000, variance)))
+    # Away from the seams; a mean over 25 powers is known to 20 %.
+    assert (share[:900] > 0.999).all()
+    assert abs(share[1050:1950].mean() - 0.5) < 0.05
+    assert share[2050:].mean() < 0.1
 
 
 def test_one_period_cannot_tell_aliases_and_leaves_the_upper_band_out():

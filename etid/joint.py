@@ -1,0 +1,190 @@
+"""A whole study in one fit: one source impedance, and every trial its own load and trigger delay.
+
+Fitted one by one, trials share the error of the driver, and no spread between them shows it. Fitted
+together they determine the driver better than its calibration does, and the standard errors of the
+result tell what is a trial's own from what all trials have in common.
+"""
+
+import dataclasses
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+from tqdm import tqdm
+
+from etid import arrowhead, estimation
+from etid.batch import LANES, Drivers, StudyFits, table
+from etid.circuits import AbstractCircuit, SkinRC
+from etid.driver import Driver
+from etid.identify import arrays, failed_fit, plan, window
+from etid.maximum_likelihood import Joint, fit_load
+from etid.measurement import measure
+from etid.precision import require_float64
+from etid.recording import Recording, RecordingError
+from etid.results import Fit, IdentificationError
+from etid.study import Study
+from etid.verdicts import RESULTS, message
+
+METHOD = "joint"
+
+
+@eqx.filter_jit
+def _alone(samples: Any, model: Joint, driver: Driver, window: tuple[int, int]) -> arrowhead.Loads:
+    """Loads identified one by one with Z_th as it is, where a joint fit may start."""
+
+    def one(lane):
+        m = measure(*lane)
+        spectrum = estimation.spectrum_of(m, window)
+        starts = estimation.skin_starts(m, driver, model.circuit).log_values()
+        own, result, chi2, error = fit_load(model, spectrum, m.sample_rate, starts)
+        settled = RESULTS.promote(result) == RESULTS.successful
+        good = settled & jnp.isfinite(chi2) & ~estimation.misses(chi2, error)
+        return arrowhead.Loads(spectrum, m.sample_rate, own, good)
+
+    return jax.vmap(one)(samples)
+
+
+@eqx.filter_jit
+def _together(
+    model: Joint, groups: list[arrowhead.Loads], driver: Driver, tolerance: Array
+) -> tuple[list[Fit], Driver]:
+    common, cov, estimates = arrowhead.fit(model, groups)
+    # All impedances are measured in units of the known resistor.
+    sign = [1.0 if unit == "ohm" else -1.0 for unit in model.circuit.units().values()]
+    scale = tolerance**2 * jnp.outer(jnp.array(sign), jnp.array(sign))
+
+    def fit(estimate):
+        with_scale = dataclasses.replace(
+            estimate, cov=estimate.cov + scale, shared_cov=estimate.shared_cov + scale
+        )
+        return estimation.judged(with_scale, model.circuit, driver.result, METHOD)
+
+    split = model.sources
+    better = eqx.tree_at(
+        lambda d: (d.source, d.cov, d.calibration.delay, d.result),
+        driver,
+        (
+            model.z_th(common),
+            cov[:split, :split],
+            common[split:],
+            RESULTS.where(
+                estimates[0].strain[0] > estimation.STRAINED, RESULTS.inconsistent, driver.result
+            ),
+        ),
+    )
+    return [jax.vmap(fit)(estimate) for estimate in estimates], better
+
+
+class _Waiting:
+    """Recordings of one length with one driver."""
+
+    def __init__(self, driver: Driver, model: Joint, window: tuple[int, int]):
+        self.driver, self.model, self.window = driver, model, window
+        self.rows: list[int] = []
+        self.lanes: list[tuple[np.ndarray, ...]] = []
+        self.chunks: list[arrowhead.Loads] = []
+
+    def add(self, row: int, recording: Recording) -> None:
+        self.rows.append(row)
+        self.lanes.append(arrays(recording))
+        if len(self.lanes) == LANES:
+            self.run()
+
+    def run(self) -> None:
+        count = len(self.lanes)
+        if count == 0:
+            return
+        filled = self.lanes + [self.lanes[-1]] * (LANES - count)
+        samples = tuple(jnp.asarray(np.stack(column)) for column in zip(*filled, strict=True))
+        loads = jax.device_get(_alone(samples, self.model, self.driver, self.window))
+        self.chunks.append(jax.tree.map(lambda leaf: leaf[:count], loads))
+        self.lanes = []
+
+    def loads(self) -> arrowhead.Loads:
+        self.run()
+        return jax.tree.map(lambda *parts: np.concatenate(parts), *self.chunks)
+
+
+def identify_jointly(
+    study: Study,
+    *,
+    order: int = 5,
+    circuit: AbstractCircuit | None = None,
+    r_load_tolerance: float = 0.0,
+    progress: bool = False,
+) -> StudyFits:
+    """Identify every driver of a study together with all recordings made with it.
+
+    By maximum likelihood, for records of several whole pulse periods; its cost is linear in their
+    number. A recording that no circuit of this kind explains does not take part in the driver.
+
+    Args:
+        study: Calibrations and loaded recordings.
+        order: Number of poles of Z_th.
+        circuit: Structure of the loads and its typical values; `SkinRC` if not given.
+        r_load_tolerance: Relative standard deviation of the known resistors, which no record can
+            tell; it passes 1:1 into every resistance and, inversely, into every capacitance.
+        progress: Show a progress bar.
+
+    Returns:
+        One fit per recording, and the drivers as all records together determine them. In the fits,
+        `shared_cov` holds what all recordings with one driver have in common: the error of Z_th and
+        `r_load_tolerance`; the rest of `cov` is each recording's own.
+    """
+    require_float64()
+    circuit = SkinRC() if circuit is None else circuit
+    drivers = Drivers(study, order, "maximum_likelihood")
+    paths = [*study.loaded, *study.problems]
+    fits: dict[int, Fit] = {}
+    notes = [""] * len(paths)
+    waiting: dict[tuple[str, ...], dict[Any, _Waiting]] = {}
+
+    def fail(row, name, note):
+        fits[row] = dataclasses.replace(
+            jax.tree.map(np.asarray, failed_fit(name, circuit, "maximum_likelihood")),
+            method=METHOD,
+        )
+        notes[row] = note
+
+    for row in tqdm(range(len(paths)), unit="recording", disable=not progress):
+        try:
+            recording = study[paths[row]]
+            names = drivers.of(recording)
+            _, name = plan("maximum_likelihood", recording, drivers.found[names])
+        except (RecordingError, ValueError) as error:
+            fail(row, "unreadable", str(error))
+        except IdentificationError as error:
+            fail(row, "driver_failed", str(error))
+        else:
+            if name is not None:
+                fail(row, name, message(name))
+                continue
+            part = window(recording, "maximum_likelihood")
+            assert part is not None  # by that method
+            driver = drivers.found[names]
+            lengths = waiting.setdefault(names, {})
+            key = recording.v_th.size, part
+            if key not in lengths:
+                lengths[key] = _Waiting(driver, _model(circuit, driver), part)
+            lengths[key].add(row, recording)
+    for names, lengths in tqdm(waiting.items(), unit="driver", disable=not progress):
+        driver = drivers.found[names]
+        groups = [group.loads() for group in lengths.values()]
+        tolerance = jnp.asarray(r_load_tolerance, dtype=float)
+        found, better = _together(_model(circuit, driver), groups, driver, tolerance)
+        drivers.found[names] = dataclasses.replace(better, method=METHOD)
+        for group, fit in zip(lengths.values(), jax.device_get(found), strict=True):
+            for lane, row in enumerate(group.rows):
+                fits[row] = jax.tree.map(lambda leaf, lane=lane: leaf[lane], fit)
+                notes[row] = message(fits[row].verdict)
+    ordered = [fits[row] for row in range(len(paths))]
+    return StudyFits(table(study, paths, ordered, notes), drivers.found, drivers.failures)
+
+
+def _model(circuit: AbstractCircuit, driver: Driver) -> Joint:
+    assert driver.source is not None  # by maximum likelihood
+    assert driver.calibration is not None
+    return Joint(circuit, driver.source, driver.calibration, jnp.asarray(driver.sample_rate))

@@ -1,0 +1,109 @@
+"""One fit of a whole study: what is shared is told from what is each trial's own."""
+
+import dataclasses
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import etid
+from etid.scenes import Scene, Trial
+from etid.study import Study
+from etid.transformer import ResistorLoad, SkinLoad, TransformerDriver
+
+DRY = SkinLoad(r_s=33.4e3, r_p=186e3, c_p=0.12e-9)
+TRUTH = np.array(dataclasses.astuple(DRY))
+KNOWN = (Trial("calibration/0", ResistorLoad(98.8e3)),)
+TRIALS = tuple(Trial(f"loaded/{i}", DRY, condition="dry") for i in range(6))
+SIGMAS = 5.0  # one in 2 million for a normal error
+
+
+def two_relaxations(f):
+    s = 2j * np.pi * f
+    return 20e3 + 1e5 / (1 + s * 1e5 * 0.12e-9) + 6e4 / (1 + s * 6e4 * 3e-9)
+
+
+@pytest.fixture(scope="module")
+def study():
+    scene = Scene(
+        (*TRIALS, Trial("odd", two_relaxations, condition="odd")),
+        KNOWN,
+        trigger_jitter_rms=50e-9,
+    )
+    made = scene.simulate(seed=3)
+    bad = made["loaded/0"]
+    short = bad.replace(v_th=bad.v_th[:2500], v_out=bad.v_out[:2500], path="short")
+    broken = bad.replace(v_out=np.where(np.arange(bad.v_out.size) == 7, np.nan, bad.v_out))
+    return Study.from_recordings(
+        [*made.recordings(), short, broken.replace(path="broken", condition="broken")]
+    )
+
+
+@pytest.fixture(scope="module")
+def outcome(study):
+    return etid.identify_jointly(study)
+
+
+def test_every_recording_has_its_verdict_and_a_bad_one_costs_itself_alone(study, outcome):
+    verdicts = dict(zip(outcome.fits.labels["path"], outcome.fits.verdicts, strict=True))
+    assert [verdicts[trial.path] for trial in TRIALS] == ["successful"] * len(TRIALS)
+    assert verdicts["odd"] == "misfit"
+    assert verdicts["short"] == "not_periodic"
+    assert verdicts["broken"] == "nonfinite_samples"
+    assert set(verdicts) == set(study.loaded)
+    assert outcome.fits.fit.method == "joint"
+
+
+def test_elements_are_within_their_errors_and_spread_by_their_own_part(outcome):
+    fits = outcome.fits.where(condition="dry").successful()
+    error = np.asarray(fits.circuit.values()) - TRUTH
+    assert (np.abs(error) < SIGMAS * np.asarray(fits.stderr.values())).all()
+    own = np.sqrt(np.diagonal(fits.cov - fits.fit.shared_cov, axis1=1, axis2=2))
+    shared = np.sqrt(np.diagonal(fits.fit.shared_cov, axis1=1, axis2=2))
+    assert (own > 0).all()
+    assert (shared > 0).all()
+    # Deviations from the mean over own errors: chi-squared, 5 degrees of freedom, for each element.
+    # These limits are exceeded once in ten thousand.
+    scaled = ((error - error.mean(0)) / own) ** 2
+    assert (scaled.sum(0) > 0.08).all()
+    assert (scaled.sum(0) < 25.7).all()
+
+
+def test_together_the_trials_know_the_driver_better_than_its_calibration(study, outcome):
+    alone = etid.identify_driver(study["calibration/0"])
+    (together,) = outcome.drivers.values()
+    assert together.verdict == "successful"
+    frequency = jnp.array([3e3, 60e3, 80e3])
+    assert (together.response_stderr(frequency) < alone.response_stderr(frequency)).all()
+
+
+def test_the_tolerance_of_the_resistor_is_shared_and_passes_one_to_one(study, outcome):
+    doubtful = etid.identify_jointly(study, r_load_tolerance=0.01).fits.where(condition="dry")
+    fits = outcome.fits.where(condition="dry")
+    values = np.asarray(fits.circuit.values())
+    for cov, before in (
+        (doubtful.cov, fits.cov),
+        (doubtful.fit.shared_cov, fits.fit.shared_cov),
+    ):
+        grown = (cov - before) / values[:, :, None] / values[:, None, :]
+        sign = np.array([1, 1, -1])  # a resistor that is larger makes the capacitor smaller
+        np.testing.assert_allclose(grown[0], 1e-4 * np.outer(sign, sign), rtol=1e-6)
+
+
+def test_the_summary_tells_what_varies_from_what_is_shared(outcome):
+    row = next(r for r in outcome.fits.summary("condition") if r["condition"] == "dry")
+    for name in ("r_s", "r_p", "c_p"):
+        total = np.hypot(row[f"{name}_own"], row[f"{name}_shared"])
+        assert row[f"{name}_stderr"] == pytest.approx(total, rel=0.02)  # medians of equal trials
+        assert row[f"{name}_between"] < 3 * row[f"{name}_own"]  # the loads are all the same
+
+
+def test_a_driver_that_changed_after_its_calibration_is_no_success(study):
+    """R_p would be 5 % wrong at chi-squared 1."""
+    changed = TransformerDriver(r_protection=1.1 * TransformerDriver().r_protection)
+    other = Scene((), KNOWN, changed).simulate(seed=2)
+    records = [study[path] for path in study if path != "calibration/0"]
+    mixed = etid.identify_jointly(Study.from_recordings([*other.recordings(), *records]))
+    assert "successful" not in mixed.fits.counts()
+    assert "inconsistent" in mixed.fits.counts()
+    assert {d.verdict for d in mixed.drivers.values()} == {"inconsistent"}
