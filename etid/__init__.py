@@ -28,6 +28,7 @@ from etid.driver import Driver as Driver
 from etid.hdf5 import check as check
 from etid.hdf5 import read as read
 from etid.identify import identify_driver as identify_driver
+from etid.identify import identify_samples as identify_samples
 from etid.identify import identify_skin as identify_skin
 from etid.identify import predict as predict
 from etid.impedance import identify_impedance as identify_impedance

@@ -15,6 +15,7 @@ jax.config.update("jax_numpy_dtype_promotion", "strict")
 settings.register_profile("etid", deadline=None, derandomize=True, max_examples=40)
 settings.load_profile("etid")
 
+MAPPINGS = 30_000  # half of what Linux allows; one test file needs a few thousand
 REFERENCE_DATA = pathlib.Path(__file__).parents[2] / "shared" / "data"
 
 
@@ -24,6 +25,19 @@ def pytest_configure():
     if worker is not None and hasattr(os, "sched_setaffinity"):
         cores = sorted(os.sched_getaffinity(0))
         os.sched_setaffinity(0, {cores[int(worker.removeprefix("gw")) % len(cores)]})
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _room_for_executables():
+    """Forget what was compiled before the process runs out of memory mappings.
+
+    XLA maps memory for every executable. Linux allows a process 65 530 mappings, and beyond them
+    the compiler crashes: one process would, that runs all the tests.
+    """
+    yield
+    maps = pathlib.Path("/proc/self/maps")
+    if maps.exists() and maps.read_text().count("\n") > MAPPINGS:
+        jax.clear_caches()
 
 
 @pytest.fixture
