@@ -28,11 +28,13 @@ from jaxtyping import Array, Bool, Complex, Float
 from etid.circuits import AbstractCircuit, resistor
 from etid.driver import Calibration, SourceImpedance
 from etid.information import inverse
-from etid.levenberg_marquardt import best_start
-from etid.output_error import DELAY_WIDTH, MAX_STEPS, SOLVER, Estimate, delay_std, prior
+from etid.levenberg_marquardt import LevenbergMarquardt, best_start
+from etid.output_error import DELAY_WIDTH, MAX_STEPS, Estimate, delay_std, prior
 from etid.results import complex_rrse
 from etid.spectra import Spectrum, signal_share
 from etid.transfer import Rational, as_complex, frequency_variable
+
+SOLVER = LevenbergMarquardt(rtol=1e-5, ftol=1e-6, geodesic=True)
 
 
 def gain(
