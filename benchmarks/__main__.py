@@ -37,6 +37,8 @@ def main() -> None:
     coverage.add_argument("--spice", metavar="SCENE", help="draw this SPICE recording afresh")
     coverage.add_argument("--data", type=pathlib.Path, default=pathlib.Path("../shared/data"))
 
+    names.add_parser("design", help="the pulse width and rate that determine R_s best")
+
     arguments = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
     if arguments.name == "spice":
@@ -60,6 +62,10 @@ def main() -> None:
                 arguments.shared,
             )
         benchmark.run(drawn, arguments.repetitions, arguments.method)
+    elif arguments.name == "design":
+        from benchmarks.design import run as run_design
+
+        run_design()
     else:
         from benchmarks.timing import run as run_timing
 

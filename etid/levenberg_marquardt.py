@@ -114,8 +114,8 @@ class LevenbergMarquardt(optx.AbstractLeastSquaresSolver):
             promised no more: along a valley whose floor is flat within rounding, as of a
             superfluous pole, the two criteria above are never met.
         norm: Norm of the scaled step and parameters.
-        geodesic: Bend each step along the model's curvature, by its second derivative (Transtrum and
-            Sethna 2012, arXiv:1201.5885): curved valleys take a fraction of the steps, and each
+        geodesic: Bend each step along the model's curvature, by its second derivative (Transtrum
+            and Sethna 2012, arXiv:1201.5885): curved valleys take a fraction of the steps, and each
             costs a third more.
         equations: Evaluates the normal equations of the residual function at a point. A function
             that returns `NormalEquations` itself needs `lambda fn, y: fn(y)`.

@@ -29,12 +29,13 @@ from etid.circuits import AbstractCircuit, resistor
 from etid.driver import Calibration, SourceImpedance
 from etid.information import inverse
 from etid.levenberg_marquardt import LevenbergMarquardt, best_start
-from etid.output_error import DELAY_WIDTH, MAX_STEPS, Estimate, delay_std, prior
+from etid.output_error import DELAY_WIDTH, MAX_STEPS, SOLVER, Estimate, delay_std, prior
 from etid.results import complex_rrse
 from etid.spectra import Spectrum, signal_share
 from etid.transfer import Rational, as_complex, frequency_variable
 
-SOLVER = LevenbergMarquardt(rtol=1e-5, ftol=1e-6, geodesic=True)
+# Z_th and a delay bend each other's valley; a load alone has none.
+CURVED = LevenbergMarquardt(rtol=SOLVER.rtol, ftol=SOLVER.ftol, geodesic=True)
 
 
 def gain(
@@ -185,7 +186,7 @@ def fit_source(
     records = _as_list(spectra)
     q0 = jnp.concatenate([start_vector, jnp.zeros(count)])
     solution = optx.least_squares(
-        of_all, SOLVER, q0, args=records, max_steps=MAX_STEPS, throw=False
+        of_all, CURVED, q0, args=records, max_steps=MAX_STEPS, throw=False
     )
     q = solution.value
     clean, shares = denoised(records, gains(q))
@@ -363,7 +364,7 @@ def fit_circuit(
 
     solution = optx.least_squares(
         terms,
-        SOLVER,
+        CURVED,
         jnp.concatenate([alone, model.start()]),
         args=[*model.records, spectrum],
         max_steps=MAX_STEPS,

@@ -19,8 +19,14 @@ MAPPINGS = 30_000  # half of what Linux allows; one test file needs a few thousa
 REFERENCE_DATA = pathlib.Path(__file__).parents[2] / "shared" / "data"
 
 
-def pytest_configure():
-    """Give each parallel worker a core of its own: XLA's threads slow each other down sixfold."""
+def pytest_configure(config):
+    """Share what is compiled between the workers, and give each a core of its own.
+
+    Compilation is most of the time of the tests. On one core XLA's threads do not slow each other
+    down sixfold.
+    """
+    os.environ["JAX_COMPILATION_CACHE_DIR"] = str(config.cache.mkdir("xla"))  # for notebooks
+    jax.config.update("jax_compilation_cache_dir", os.environ["JAX_COMPILATION_CACHE_DIR"])
     worker = os.environ.get("PYTEST_XDIST_WORKER")
     if worker is not None and hasattr(os, "sched_setaffinity"):
         cores = sorted(os.sched_getaffinity(0))
