@@ -33,7 +33,10 @@ def main() -> None:
     coverage.add_argument("--jitter", type=float, default=50e-9, help="rms trigger delay [s]")
     coverage.add_argument("--resistors", type=float, nargs="+", default=[98.8e3], help="[ohm]")
     coverage.add_argument("--shared", action="store_true", help="one unloaded record for all")
-    coverage.add_argument("--method", choices=METHODS, help="default: that of the records")
+    coverage.add_argument(
+        "--method", choices=(*METHODS, "joint"), help="default: that of the records"
+    )
+    coverage.add_argument("--more", type=int, default=0, help="further trials, for a joint fit")
     coverage.add_argument("--spice", metavar="SCENE", help="draw this SPICE recording afresh")
     coverage.add_argument("--data", type=pathlib.Path, default=pathlib.Path("../shared/data"))
 
@@ -60,6 +63,7 @@ def main() -> None:
                 arguments.resistors,
                 arguments.jitter,
                 arguments.shared,
+                arguments.more,
             )
         benchmark.run(drawn, arguments.repetitions, arguments.method)
     elif arguments.name == "design":

@@ -9,6 +9,7 @@ import dataclasses
 import json
 import pathlib
 from collections.abc import Sequence
+from typing import cast
 
 import numpy as np
 from tqdm import tqdm
@@ -24,6 +25,8 @@ LOADS = {
     "damp": SkinLoad(r_s=6.1e3, r_p=17.4e3, c_p=0.66e-9),
 }
 SILENT = 5.0  # standard errors by which a successful fit may not be wrong
+MORE = "more"  # trials that take part in a joint fit, but share its errors and are not counted
+JOINT = "joint"
 NORMAL_95 = 1.959964  # half-width of a 95 % interval in standard errors
 
 
@@ -58,10 +61,13 @@ def scene(
     resistors: Sequence[float] = (98.8e3,),
     jitter: float = 50e-9,
     shared_v_th: bool = False,
+    more: int = 0,
 ) -> Scene:
-    """A dry and a damp fingertip behind the default transformer."""
+    """A dry and a damp fingertip behind the default transformer, and `more` trials of each."""
+    trials = [Trial(name, load) for name, load in LOADS.items()]
+    trials += [Trial(f"{MORE}/{n}{i}", load) for n, load in LOADS.items() for i in range(more)]
     return Scene(
-        tuple(Trial(name, load) for name, load in LOADS.items()),
+        tuple(trials),
         tuple(Trial(f"calibration/{i}", ResistorLoad(r)) for i, r in enumerate(resistors)),
         samples=samples,
         snr_db=snr_db,
@@ -78,32 +84,46 @@ def spice_scene(folder: pathlib.Path, name: str) -> Scene:
 
 
 def monte_carlo(
-    scene: Scene, repetitions: int, method: Method | None, progress: bool = False
+    scene: Scene, repetitions: int, method: str | None, progress: bool = False
 ) -> dict[str, Draws]:
     """Identify fresh recordings of each trial of `scene`."""
-    rows: dict[str, list] = {trial.path: [] for trial in scene.trials}
+    counted = [trial.path for trial in scene.trials if not trial.path.startswith(MORE)]
+    rows: dict[str, list] = {path: [] for path in counted}
     for seed in tqdm(range(repetitions), disable=not progress):
-        study = scene.simulate(seed=seed)
-        try:
-            driver = etid.identify_driver(
-                [study[trial.path] for trial in scene.calibration], method=method, throw=False
-            )
-        except etid.IdentificationError:  # a calibration that pre-flight refuses
-            for name in rows:
-                rows[name].append((np.full(3, np.nan), np.full(3, np.nan), "driver_failed"))
-            continue
-        for trial in scene.trials:
-            fit = etid.identify_skin(study[trial.path], driver, method=method, throw=False)
-            truth = np.array(list(scene.truth()[trial.path].values()))
+        fits = _identify(scene.simulate(seed=seed), counted, method)
+        for path in counted:
+            truth = np.array(list(scene.truth()[path].values()))
+            fit = fits.get(path)
+            if fit is None:  # a calibration that pre-flight refuses
+                nothing = np.full(truth.size, np.nan)
+                rows[path].append((nothing, nothing, "driver_failed"))
+                continue
             error = np.asarray(fit.circuit.values()) / truth - 1
-            rows[trial.path].append((error, np.asarray(fit.stderr.values()) / truth, fit.verdict))
+            rows[path].append((error, np.asarray(fit.stderr.values()) / truth, fit.verdict))
     return {
         name: Draws(*(np.array(column) for column in zip(*found, strict=True)))
         for name, found in rows.items()
     }
 
 
-def run(scene: Scene, repetitions: int, method: Method | None) -> None:
+def _identify(study: etid.Study, paths: Sequence[str], method: str | None) -> dict[str, etid.Fit]:
+    """Fits by path; none if there is no driver."""
+    if method == JOINT:
+        fits = etid.identify_jointly(study).fits
+        found = list(fits.labels["path"])
+        return {path: fits[found.index(path)] for path in paths}
+    given = cast(Method | None, method)
+    calibrations = list(study.calibrations.recordings())
+    try:
+        driver = etid.identify_driver(calibrations, method=given, throw=False)
+    except etid.IdentificationError:
+        return {}
+    return {
+        path: etid.identify_skin(study[path], driver, method=given, throw=False) for path in paths
+    }
+
+
+def run(scene: Scene, repetitions: int, method: str | None) -> None:
     """Print one line per load and element; efficiency is bound² / mean squared error."""
     draws = monte_carlo(scene, repetitions, method, progress=True)
     bounds = etid.bound(scene)

@@ -106,6 +106,11 @@ def _parser() -> argparse.ArgumentParser:
         help="default maximum_likelihood where the record allows it, else output_error",
     )
     command.add_argument("--order", type=int, default=5, help="poles of the driver, default 5")
+    command.add_argument(
+        "--joint",
+        action="store_true",
+        help="one fit for all recordings of a driver, by maximum likelihood",
+    )
     command.set_defaults(run=_fit)
     return parser
 
@@ -141,13 +146,16 @@ def _check(arguments: argparse.Namespace) -> int:
 def _fit(arguments: argparse.Namespace) -> int:
     if not arguments.target.absolute().parent.is_dir():  # known before hours of fitting
         raise ValueError(f"{arguments.target}: there is no folder to write it to")
+    if arguments.joint and arguments.method not in (None, "maximum_likelihood"):
+        raise ValueError(f"--joint is by maximum likelihood, not by {arguments.method}")
+    progress = sys.stderr.isatty()
     with etid.read(arguments.source) as study:
-        outcome = etid.identify_study(
-            study,
-            order=arguments.order,
-            method=arguments.method,
-            progress=sys.stderr.isatty(),
-        )
+        if arguments.joint:
+            outcome = etid.identify_jointly(study, order=arguments.order, progress=progress)
+        else:
+            outcome = etid.identify_study(
+                study, order=arguments.order, method=arguments.method, progress=progress
+            )
     outcome.fits.write(arguments.target)
     print(_summary(outcome))
     return DONE if "successful" in outcome.fits.counts() else WRONG_DATA

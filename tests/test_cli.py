@@ -134,6 +134,24 @@ def test_fit_writes_all_fits_and_one_bad_recording_costs_itself(run, study_file,
     assert "typical/dry/99" in fits.notes[-1]
 
 
+def test_fit_joint_fits_all_recordings_together(run, study_file, tmp_path, monkeypatch):
+    asked = {}
+
+    def jointly(study, **options):
+        asked.update(options)
+        return etid.identify_study(study, method="equation_error")
+
+    monkeypatch.setattr(etid, "identify_jointly", jointly)
+    status, printed, _ = run("fit", study_file, "-o", tmp_path / "f.h5", "--joint", "--order", 4)
+    assert asked["order"] == 4
+    assert len(printed) > 1
+    assert status in (DONE, WRONG_DATA)  # equation error has no success to report
+    options = ("--joint", "--method", "output_error")
+    status, _, complaints = run("fit", study_file, "-o", tmp_path / "f.h5", *options)
+    assert status == WRONG_DATA
+    assert "--joint is by maximum likelihood" in complaints[0]
+
+
 def test_fit_passes_method_and_order_on(run, study_file, tmp_path):
     target = tmp_path / "fits.h5"
     _, printed, _ = run("fit", study_file, "-o", target, "--method", "equation_error", "--order", 3)
