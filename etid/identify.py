@@ -15,7 +15,7 @@ from etid.driver import Driver
 from etid.filtering import TAPS
 from etid.measurement import measure
 from etid.precision import require_float64
-from etid.preflight import is_periodic, preflight, resolution
+from etid.preflight import is_periodic, preflight, recorded_periods, resolution
 from etid.recording import Recording
 from etid.results import Fit, IdentificationError
 from etid.spectra import separates_aliases, whole_periods
@@ -63,9 +63,7 @@ def choose(method: Method | None, recordings: Sequence[Recording]) -> Method:
     if method is not None:
         return method
     for recording in recordings:
-        rates = recording.sample_rate, recording.pulse_rate
-        part = whole_periods(recording.v_out.size, *rates)
-        if not separates_aliases(*part) or not is_periodic(recording):
+        if not separates_aliases(*recorded_periods(recording)) or not is_periodic(recording):
             return "output_error"
     return "maximum_likelihood"
 
@@ -127,7 +125,7 @@ def window(recording: Recording, method: Method) -> tuple[int, int] | None:
     """Whole periods and their samples, for the method that needs them."""
     if method != "maximum_likelihood":
         return None
-    return whole_periods(recording.v_out.size, recording.sample_rate, recording.pulse_rate)
+    return recorded_periods(recording)
 
 
 @eqx.filter_jit

@@ -29,6 +29,10 @@ from etid.study import Study
 from etid.verdicts import RESULTS, message
 
 METHOD = "joint"
+SINGLE = (
+    "The record or its calibration does not hold several whole pulse periods, which a joint fit "
+    "needs. Record more, or identify it on its own."
+)
 
 
 @eqx.filter_jit
@@ -136,7 +140,7 @@ def identify_jointly(
     """
     require_float64()
     circuit = SkinRC() if circuit is None else circuit
-    drivers = Drivers(study, order, "maximum_likelihood")
+    drivers = Drivers(study, order, None)
     paths = [*study.loaded, *study.problems]
     fits: dict[int, Fit] = {}
     notes = [""] * len(paths)
@@ -153,17 +157,19 @@ def identify_jointly(
         try:
             recording = study[paths[row]]
             names = drivers.of(recording)
-            _, name = plan("maximum_likelihood", recording, drivers.found[names])
+            method, name = plan(None, recording, drivers.found[names])
         except (RecordingError, ValueError) as error:
             fail(row, "unreadable", str(error))
         except IdentificationError as error:
             fail(row, "driver_failed", str(error))
         else:
+            part = window(recording, method)
             if name is not None:
                 fail(row, name, message(name))
                 continue
-            part = window(recording, "maximum_likelihood")
-            assert part is not None  # by that method
+            if part is None:
+                fail(row, "not_periodic", SINGLE)
+                continue
             driver = drivers.found[names]
             lengths = waiting.setdefault(names, {})
             key = recording.v_th.size, part

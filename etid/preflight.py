@@ -7,7 +7,7 @@ from etid.filtering import TAPS
 from etid.measurement import RIPPLE
 from etid.noise import noise_std
 from etid.recording import Recording
-from etid.spectra import whole_periods
+from etid.spectra import counted_pulse_rate, whole_periods
 
 SHORTEST = 4 * TAPS + 104  # samples: the interpolation's edges and a hundred and some to fit
 FLAT = (
@@ -46,17 +46,23 @@ def preflight(recording: Recording, *, periodic: bool = False) -> str | None:
     return None
 
 
+def recorded_periods(recording: Recording) -> tuple[int, int]:
+    """How many whole periods a recording holds by its own clock, and how many samples they are."""
+    counted = counted_pulse_rate(recording.v_th, recording.sample_rate, recording.pulse_rate)
+    return whole_periods(recording.v_out.size, recording.sample_rate, counted)
+
+
 def is_periodic(recording: Recording) -> bool:
     """Whether the record holds whole pulse periods, each like the other where they are joined.
 
     Periods are a whole number of samples long to within half a sample, which matters where the
     signal is steep at the joint.
     """
-    rates = recording.sample_rate, recording.pulse_rate
-    periods, samples = whole_periods(recording.v_out.size, *rates)
+    periods, samples = recorded_periods(recording)
     if periods == 0:
         return False
-    rest = abs(periods * rates[0] / rates[1] - samples)
+    rest = abs(periods * recording.sample_rate / recording.pulse_rate - samples)
+    rest = min(rest, 0.5)  # a clock that is off has been counted
     for name in ("v_th", "v_out"):
         v = getattr(recording, name)
         joint = np.concatenate([v[samples - SEAM : samples], v[:SEAM]])
