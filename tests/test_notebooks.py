@@ -63,14 +63,16 @@ def test_notebook_runs_from_top_to_bottom_and_shows_its_figures(path, tmp_path, 
     assert not warned
 
 
-def test_readme_example_prints_what_the_readme_says(capsys):
+def test_readme_examples_print_what_the_readme_says(capsys):
     """Digits may differ between machines; words, units and the number of numbers may not."""
     text = (ROOT / "README.md").read_text(encoding="utf-8")
-    code, printed = re.findall(r"```(?:python|text)\n(.*?)```", text, flags=re.DOTALL)[:2]
-    exec(compile(code, "README.md", "exec"), {})
-    shown = capsys.readouterr().out
+    blocks = re.findall(r"```(?:python|text)\n(.*?)```", text, flags=re.DOTALL)
+    names: dict = {}
 
     def structure(lines):
         return [NUMBER.sub("#", line).split() for line in lines.strip().splitlines()]
 
-    assert structure(shown) == structure(printed)
+    assert len(blocks) == 4
+    for code, printed in zip(blocks[::2], blocks[1::2], strict=True):
+        exec(compile(code, "README.md", "exec"), names)
+        assert structure(capsys.readouterr().out) == structure(printed)
