@@ -24,7 +24,8 @@ from jaxtyping import Array, Bool, Float
 
 from etid.information import inverse
 from etid.levenberg_marquardt import LevenbergMarquardt, NormalEquations, normal_equations
-from etid.maximum_likelihood import Joint, denoised
+from etid.likelihood import denoised
+from etid.maximum_likelihood import Joint
 from etid.output_error import MAX_STEPS, SOLVER, Estimate
 from etid.results import complex_rrse
 from etid.spectra import Spectrum

@@ -1,19 +1,8 @@
-"""Maximum likelihood on the harmonics of the pulse rate, with noise on both records.
+"""Maximum likelihood on the harmonics of the pulse rate: the driver, and a skin.
 
-In the periodic steady state Y = G e^(−jωτ) X holds exactly at every harmonic, with continuous R_s,
-R_p, C_p and Z_th(s): nothing is discretised, no initial state is unknown, and the likelihood is
-(Pintelon and Schoukens, System Identification, 2012, ch. 9)
-
-    Σ_k |Y_k − G_k e^(−jω_k τ) X_k|² / (σ_y² + |G_k|² σ_x²),      G = Z_L / (Z_L + Z_th),
-
-of which the unknown true X has been eliminated. σ² are the variances of one coefficient.
-
-A skin is identified *jointly* with the calibrations of its driver: what a skin's record says about
-Z_th, and about the delay of a calibration that one known resistor leaves open, is used.
-
-**One unloaded record for several loaded ones** is one noise in all of them, and they all tell of
-the same X. Record by record, X and σ_x² are then replaced by what the earlier ones with the same X
-leave of them (`_learn`, one step of a Kalman filter): the likelihood of all, in independent terms.
+The terms are those of `etid.likelihood`. A skin is identified *jointly* with the calibrations of
+its driver: what a skin's record says about Z_th, and about the delay of a calibration that one
+known resistor leaves open, is used. `etid.arrowhead` does the same for many skins at once.
 """
 
 from collections.abc import Sequence
@@ -23,122 +12,27 @@ import jax
 import jax.numpy as jnp
 import optimistix as optx
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Array, Bool, Complex, Float
+from jaxtyping import Array, Complex, Float
 
 from etid.circuits import AbstractCircuit, resistor
 from etid.driver import Calibration, SourceImpedance
 from etid.information import inverse
 from etid.levenberg_marquardt import LevenbergMarquardt, best_start
+from etid.likelihood import (
+    as_list,
+    delayed_gain,
+    denoised,
+    informed,
+    residual,
+    residuals,
+    variance,
+)
 from etid.output_error import DELAY_WIDTH, MAX_STEPS, SOLVER, Estimate, delay_std, prior
 from etid.results import complex_rrse
-from etid.spectra import Spectrum, signal_share
-from etid.transfer import Rational, as_complex, frequency_variable
+from etid.spectra import Spectrum
 
 # Z_th and a delay bend each other's valley; a load alone has none.
 CURVED = LevenbergMarquardt(rtol=SOLVER.rtol, ftol=SOLVER.ftol, geodesic=True)
-
-
-def gain(
-    source: SourceImpedance, load: Rational, frequency: Float[Array, " harmonic"]
-) -> Complex[Array, " harmonic"]:
-    """G = Z_L / (Z_L + Z_th)."""
-    z_load = load(frequency_variable(frequency))
-    return z_load / (z_load + source.response(frequency))
-
-
-def delayed_gain(
-    source: SourceImpedance,
-    load: Rational,
-    frequency: Float[Array, " harmonic"],
-    delay: Float[Array, ""],
-) -> Complex[Array, " harmonic"]:
-    """G e^(−jωτ), for a delay τ in seconds."""
-    turn = -frequency_variable(frequency) * as_complex(delay)
-    return gain(source, load, frequency) * jnp.exp(turn)
-
-
-def _variance(spectrum: Spectrum, g: Complex[Array, " harmonic"]) -> Float[Array, " harmonic"]:
-    """E|Y − g X|² of the noise."""
-    return spectrum.variance_y + jnp.abs(g) ** 2 * spectrum.variance_x
-
-
-def residual(spectrum: Spectrum, g: Complex[Array, " harmonic"]) -> Float[Array, " part"]:
-    """Real and imaginary parts of Y − g X, scaled to unit variance; 0 if not selected."""
-    weight = jnp.where(spectrum.selected, jnp.sqrt(2 / _variance(spectrum, g)), 0.0)
-    difference = (spectrum.y - g * spectrum.x) * as_complex(weight)
-    return jnp.concatenate([difference.real, difference.imag])
-
-
-def _learn(
-    spectrum: Spectrum,
-    other: Spectrum,
-    g: Complex[Array, " harmonic"],
-    same: Bool[Array, ""] | bool = True,
-) -> Spectrum:
-    """What is known of the X of `spectrum` after Y = `g` X of another record, if X is the same."""
-    total = other.variance_y + jnp.abs(g) ** 2 * spectrum.variance_x
-    used = other.selected & same
-    share = jnp.where(used, spectrum.variance_x / total, 0.0)
-    x = spectrum.x + jnp.conj(g) * as_complex(share) * (other.y - g * spectrum.x)
-    variance = jnp.where(used, share * other.variance_y, spectrum.variance_x)
-    return eqx.tree_at(lambda s: (s.x, s.variance_x), spectrum, (x, variance))
-
-
-def _same_unloaded(one: Spectrum, other: Spectrum) -> Bool[Array, ""] | bool:
-    """Whether two recordings have one and the same unloaded record."""
-    if one is other:
-        return True
-    if one.x.shape != other.x.shape:
-        return False
-    return jnp.all(one.x == other.x)
-
-
-def _as_list(spectra: Spectrum) -> list[Spectrum]:
-    return [jax.tree.map(lambda leaf, i=i: leaf[i], spectra) for i in range(spectra.x.shape[0])]
-
-
-def informed(
-    spectrum: Spectrum,
-    others: Sequence[Spectrum],
-    gains: Sequence[Complex[Array, " harmonic"]],
-) -> Spectrum:
-    """A recording with what others of the same unloaded record tell of its X."""
-    known = spectrum
-    for other, g in zip(others, gains, strict=True):
-        same = _same_unloaded(spectrum, other)
-        if same is not False:
-            known = _learn(known, other, g, same)
-    return known
-
-
-def denoised(
-    spectra: Sequence[Spectrum], gains: Sequence[Complex[Array, " harmonic"]]
-) -> tuple[list[Spectrum], list[Float[Array, " part"]]]:
-    """The same with X by its maximum-likelihood estimate from all recordings, and Y = G X.
-
-    The Jacobian J there has no noise of the residual, which would count as information. What is
-    left in it of the noise of X makes the score noisier but is no information either, so that
-
-        cov = H⁻¹ (Jᵀ J) H⁻¹,      H = Jᵀ W J,
-
-    W being the share of signal in the power of X, which is returned for every residual.
-    """
-    found, shares = [], []
-    for one, g in zip(spectra, gains, strict=True):
-        known = informed(one, spectra, gains)
-        found.append(eqx.tree_at(lambda s: (s.x, s.y), one, (known.x, g * known.x)))
-        shares.append(jnp.tile(signal_share(known.x, known.variance_x), 2))
-    return found, shares
-
-
-def residuals(
-    spectra: Sequence[Spectrum], gains: Sequence[Complex[Array, " harmonic"]]
-) -> list[Float[Array, " part"]]:
-    """`residual` of each recording given those before it: all are independent."""
-    return [
-        residual(informed(one, spectra[:i], gains[:i]), g)
-        for i, (one, g) in enumerate(zip(spectra, gains, strict=True))
-    ]
 
 
 def _calibration_gains(
@@ -183,7 +77,7 @@ def fit_source(
         weak = [regularise(q[:kept]), q[kept:] / DELAY_WIDTH]
         return jnp.concatenate(residuals(records, gains(q)) + weak)
 
-    records = _as_list(spectra)
+    records = as_list(spectra)
     q0 = jnp.concatenate([start_vector, jnp.zeros(count)])
     solution = optx.least_squares(
         of_all, CURVED, q0, args=records, max_steps=MAX_STEPS, throw=False
@@ -239,7 +133,7 @@ class Joint(eqx.Module):
     def records(self) -> list[Spectrum]:
         """The calibrations one by one."""
         assert self.calibration.spectra is not None  # check_driver
-        return _as_list(self.calibration.spectra)
+        return as_list(self.calibration.spectra)
 
     def start(self) -> Float[Array, " common"]:
         """The common parameters as the calibrations alone have them."""
@@ -382,7 +276,7 @@ def fit_circuit(
     known = informed(spectrum, model.records, gains[:-1])
     part = jnp.where(
         jnp.any(known.variance_x != spectrum.variance_x),
-        spectrum.variance_y / _variance(known, g),
+        spectrum.variance_y / variance(known, g),
         1.0,
     )
     private = (

@@ -28,6 +28,7 @@ FLOORS = {
     "writing": 2,
     "levenberg_marquardt": 2,
     "transformer": 2,
+    "likelihood": 3,
     "preflight": 3,
     "study": 3,
     "prediction": 3,

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import etid
-from etid import maximum_likelihood
+from etid import likelihood
 from etid.circuits import SkinRC, resistor
 from etid.scenes import Scene, Trial
 from etid.transformer import ResistorLoad, SkinLoad
@@ -56,7 +56,7 @@ def test_trigger_delays_of_a_tenth_of_a_sample_leave_every_trial_within_its_erro
 
 def test_the_gain_is_that_of_the_divider(driver):
     frequency = jnp.array([60.0, 5e3, 60e3])
-    g = maximum_likelihood.gain(driver.source, resistor(jnp.asarray(98.8e3)), frequency)
+    g = likelihood.gain(driver.source, resistor(jnp.asarray(98.8e3)), frequency)
     expected = 98.8e3 / (98.8e3 + np.asarray(driver.response(frequency)))
     np.testing.assert_allclose(g, expected, rtol=1e-12)
 
