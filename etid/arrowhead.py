@@ -14,6 +14,7 @@ its matrix (Golub and Pereyra 1973; Pintelon and Schoukens 2012, ch. 9).
 """
 
 import dataclasses
+import math
 from collections.abc import Callable, Sequence
 
 import equinox as eqx
@@ -31,9 +32,7 @@ from etid.results import complex_rrse
 from etid.spectra import Spectrum
 
 SIDE_BY_SIDE = 8  # loads of one vectorised step
-OUTER = LevenbergMarquardt(
-    rtol=SOLVER.rtol, ftol=SOLVER.ftol, equations=lambda profile, common: profile(common)
-)
+NEAR = 0.05  # standard errors of the common parameters from their minimum
 
 
 class Loads(eqx.Module):
@@ -156,7 +155,15 @@ def fit(
             total = jax.tree.map(lambda a, b: a + b.sum(0), total, parts)
         return total
 
-    solution = optx.least_squares(profile, OUTER, start, max_steps=MAX_STEPS, throw=False)
+    # The sum of squares grows with the number of loads, what can be seen in it does not.
+    terms = sum(2 * loads.spectrum.x.size for loads in groups)
+    count = sum(loads.sample_rate.shape[0] for loads in groups)
+    solver = LevenbergMarquardt(
+        rtol=NEAR / math.sqrt(terms),
+        ftol=SOLVER.ftol / (1 + count),
+        equations=lambda profile, common: profile(common),
+    )
+    solution = optx.least_squares(profile, solver, start, max_steps=MAX_STEPS, throw=False)
     common = solution.value
     known_gains = model.known_gains(common)
 
