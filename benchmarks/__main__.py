@@ -5,7 +5,7 @@ import pathlib
 
 import jax
 
-from etid.identify import METHODS
+from benchmarks.spice import ESTIMATORS
 
 
 def main() -> None:
@@ -19,7 +19,7 @@ def main() -> None:
     spice.add_argument("--data", type=pathlib.Path, default=pathlib.Path("../shared/data"))
     spice.add_argument("--scene", action="append", help="only this scene; may be repeated")
     spice.add_argument(
-        "--method", action="append", choices=(*METHODS, "joint"), help="only this; repeatable"
+        "--method", action="append", choices=ESTIMATORS, help="only this; repeatable"
     )
     spice.add_argument("-o", "--output", type=pathlib.Path, default=None, help="CSV to write")
 
@@ -33,9 +33,7 @@ def main() -> None:
     coverage.add_argument("--jitter", type=float, default=50e-9, help="rms trigger delay [s]")
     coverage.add_argument("--resistors", type=float, nargs="+", default=[98.8e3], help="[ohm]")
     coverage.add_argument("--shared", action="store_true", help="one unloaded record for all")
-    coverage.add_argument(
-        "--method", choices=(*METHODS, "joint"), help="default: that of the records"
-    )
+    coverage.add_argument("--method", choices=ESTIMATORS, help="default: that of the records")
     coverage.add_argument("--more", type=int, default=0, help="further trials, for a joint fit")
     coverage.add_argument("--spice", metavar="SCENE", help="draw this SPICE recording afresh")
     coverage.add_argument("--data", type=pathlib.Path, default=pathlib.Path("../shared/data"))

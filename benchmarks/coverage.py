@@ -15,7 +15,7 @@ import numpy as np
 from tqdm import tqdm
 
 import etid
-from benchmarks.spice import scene_of
+from benchmarks.spice import JOINT, scene_of
 from etid.identify import Method
 from etid.scenes import Scene, Trial
 from etid.transformer import ResistorLoad, SkinLoad
@@ -26,7 +26,6 @@ LOADS = {
 }
 SILENT = 5.0  # standard errors by which a successful fit may not be wrong
 MORE = "more"  # trials that take part in a joint fit, but share its errors and are not counted
-JOINT = "joint"
 NORMAL_95 = 1.959964  # half-width of a 95 % interval in standard errors
 
 

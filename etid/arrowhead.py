@@ -23,9 +23,9 @@ import jax.numpy as jnp
 import optimistix as optx
 from jaxtyping import Array, Bool, Float
 
-from etid.information import inverse
+from etid.information import Curvature, eliminate, inverse
 from etid.levenberg_marquardt import LevenbergMarquardt, NormalEquations, normal_equations
-from etid.likelihood import denoised
+from etid.likelihood import denoised, weights
 from etid.maximum_likelihood import Joint
 from etid.output_error import MAX_STEPS, SOLVER, Estimate
 from etid.results import complex_rrse
@@ -51,41 +51,30 @@ class Loads(eqx.Module):
     used: Bool[Array, "*load"]
 
 
-class _Information(eqx.Module):
-    """Curvature H and covariance of the score of a number of terms, as in `denoised`."""
-
-    curvature: Float[Array, "n n"]
-    score: Float[Array, "n n"]
-
-    def without(self, p: int) -> "_Eliminated":
-        """Eliminate the first `p` parameters."""
-        inverse_own = inverse(self.curvature[:p, :p])
-        slope = -inverse_own @ self.curvature[:p, p:]
-        basis = jnp.concatenate([slope, jnp.eye(slope.shape[1])])
-        rest = _Information(
-            self.curvature[p:, p:] + self.curvature[p:, :p] @ slope, basis.T @ self.score @ basis
-        )
-        return _Eliminated(rest, inverse_own @ self.score[:p, :p] @ inverse_own, slope)
-
-
 class _Eliminated(eqx.Module):
     """What one load tells of `common`; its own covariance at a given `common`; and its slope."""
 
-    rest: _Information
+    rest: Curvature
     cov: Float[Array, "own own"]
     slope: Float[Array, "own common"]
 
 
-def _information(
+def _curvature(
     terms: Callable[[Float[Array, " n"]], Float[Array, " term"]],
     q: Float[Array, " n"],
     shares: Sequence[Float[Array, " part"]],
-) -> _Information:
-    """Evaluate at denoised records; terms after those of the harmonics are priors."""
+) -> Curvature:
+    """H and Jᵀ J of `likelihood.denoised`, at denoised records."""
     jacobian = jax.jacfwd(terms)(q)
-    weight = jnp.concatenate(list(shares))
-    weight = jnp.pad(weight, (0, jacobian.shape[0] - weight.size), constant_values=1.0)
-    return _Information((jacobian.T * weight[None, :]) @ jacobian, jacobian.T @ jacobian)
+    weight = weights(shares, jacobian.shape[0])
+    return Curvature((jacobian.T * weight[None, :]) @ jacobian, jacobian.T @ jacobian)
+
+
+def _without_own(of: Curvature, common: int) -> _Eliminated:
+    """Eliminate a load's own parameters, which come after the `common` ones."""
+    bread = inverse(of.expected[common:, common:])
+    slope = -bread @ of.expected[common:, :common]
+    return _Eliminated(eliminate(of, common), bread @ of.score[common:, common:] @ bread, slope)
 
 
 def _reduce(
@@ -165,16 +154,16 @@ def fit(
     )
     solution = optx.least_squares(profile, solver, start, max_steps=MAX_STEPS, throw=False)
     common = solution.value
-    known_gains = model.known_gains(common)
+    known_gains, strain = model.known_gains(common), model.strain(common)
 
     def at_minimum(load, slope):
         own, result = refit(load, common, load.own + slope @ (common - start))
         p = own.shape[0]
         g = model.gain(own, common, load.spectrum, load.sample_rate)
         (*known, spectrum), shares = denoised([*records, load.spectrum], [*known_gains, g])
-        information = _information(
-            lambda q: model.of_load(q[:p], q[p:], spectrum, load.sample_rate, known),
-            jnp.concatenate([own, common]),
+        curvature = _curvature(
+            lambda q: model.of_load(q[-p:], q[:-p], spectrum, load.sample_rate, known),
+            jnp.concatenate([common, own]),
             shares[-1:],
         )
         terms = model.of_load(own, common, load.spectrum, load.sample_rate, records)[:-1]
@@ -189,12 +178,12 @@ def fit(
             optx.RESULTS.where(result == optx.RESULTS.successful, solution.result, result),
             solution.stats["num_steps"],
             nothing,
-            model.strain(common),
+            strain,
         )
-        return estimate, information.without(p)
+        return estimate, _without_own(curvature, common.shape[0])
 
     clean, shares = denoised(records, known_gains)
-    total = _information(lambda c: model.of_calibrations(c, clean), common, shares)
+    total = _curvature(lambda c: model.of_calibrations(c, clean), common, shares)
     found = [over(at_minimum, loads, slope) for loads, slope in zip(groups, slopes, strict=True)]
     for loads, (_, parts) in zip(groups, found, strict=True):
         used = jax.tree.map(
@@ -202,7 +191,7 @@ def fit(
             parts.rest,
         )
         total = jax.tree.map(jnp.add, total, used)
-    bread = inverse(total.curvature)
+    bread = inverse(total.expected)
     cov = bread @ total.score @ bread
 
     def with_errors(estimate, eliminated):

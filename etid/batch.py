@@ -6,6 +6,7 @@ recording costs that recording alone: it gets a verdict and a note.
 """
 
 import dataclasses
+import functools
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
@@ -13,6 +14,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array
 from tqdm import tqdm
 
 from etid.circuits import AbstractCircuit, SkinRC
@@ -72,6 +74,41 @@ def _of_one_method(fits: Sequence[Fit], used: Sequence[str], otherwise: str) -> 
     return [dataclasses.replace(fit, method=name) for fit in arrays]
 
 
+class Refusal(Exception):
+    """Why a recording cannot be fitted: the name of its verdict, and a note."""
+
+    def __init__(self, name: str, note: str = ""):
+        super().__init__(name)
+        self.name = name
+        self.note = note or message(name)
+
+
+def planned(
+    load: Callable[[], tuple[Recording, Driver]], given: Method | None
+) -> tuple[Recording, Driver, Method]:
+    """Load a recording and its driver, and choose its method.
+
+    Raises:
+        Refusal: Any of it failed, or pre-flight forbids a fit.
+    """
+    try:
+        recording, driver = load()
+        method, name = plan(given, recording, driver)
+    except (RecordingError, ValueError) as error:
+        raise Refusal("unreadable", str(error)) from error
+    except IdentificationError as error:
+        raise Refusal("driver_failed", str(error)) from error
+    if name is not None:
+        raise Refusal(name)
+    return recording, driver, method
+
+
+def stacked(lanes: Sequence[tuple[np.ndarray, ...]]) -> tuple[Array, ...]:
+    """Samples of a chunk; the last lane fills it up."""
+    filled = [*lanes, *[lanes[-1]] * (LANES - len(lanes))]
+    return tuple(jnp.asarray(np.stack(column)) for column in zip(*filled, strict=True))
+
+
 class _Queue:
     """Recordings of one length, window and driver, waiting to fill a chunk."""
 
@@ -95,8 +132,7 @@ class _Queue:
 
     def run(self) -> Iterable[tuple[int, Fit]]:
         """Fit what is waiting."""
-        filled = self.lanes + [self.lanes[-1]] * (LANES - len(self.lanes))
-        samples = tuple(jnp.asarray(np.stack(column)) for column in zip(*filled, strict=True))
+        samples = stacked(self.lanes)
         fits = jax.device_get(_chunk(samples, self.driver, self.circuit, self.method, self.window))
         for lane, row in enumerate(self.rows):
             yield row, jax.tree.map(lambda leaf, lane=lane: leaf[lane], fits)
@@ -116,10 +152,6 @@ def _identify(
     used: list[str] = []
     queues: dict[tuple[int, int, Method, tuple[int, int] | None], _Queue] = {}
 
-    def fail(row, name, note):
-        fits[row] = failed_fit(name, circuit, given or "maximum_likelihood")
-        notes[row] = note
-
     with tqdm(total=count, unit="fit", disable=not progress) as bar:
 
         def run(queue):
@@ -131,23 +163,18 @@ def _identify(
 
         for row in range(count):
             try:
-                recording, driver = load(row)
-                method, name = plan(given, recording, driver)
-            except (RecordingError, ValueError) as error:
-                fail(row, "unreadable", str(error))
-            except IdentificationError as error:
-                fail(row, "driver_failed", str(error))
-            else:
-                if name is None:
-                    part = window(recording, method)
-                    key = (id(driver), recording.v_th.size, method, part)
-                    queue = queues.setdefault(key, _Queue(driver, circuit, method, part))
-                    queue.add(row, recording)
-                    if len(queue.rows) == LANES:
-                        run(queue)
-                    continue
-                fail(row, name, message(name))
-            bar.update()
+                recording, driver, method = planned(functools.partial(load, row), given)
+            except Refusal as refusal:
+                fits[row] = failed_fit(refusal.name, circuit, given or "maximum_likelihood")
+                notes[row] = refusal.note
+                bar.update()
+                continue
+            part = window(recording, method)
+            key = (id(driver), recording.v_th.size, method, part)
+            queue = queues.setdefault(key, _Queue(driver, circuit, method, part))
+            queue.add(row, recording)
+            if len(queue.rows) == LANES:
+                run(queue)
         for queue in queues.values():
             if queue.rows:
                 run(queue)

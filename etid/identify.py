@@ -218,7 +218,7 @@ def identify_driver(
     return driver
 
 
-def failed_fit(name: str, circuit: AbstractCircuit, method: Method) -> Fit:
+def failed_fit(name: str, circuit: AbstractCircuit, method: str) -> Fit:
     """A fit without numbers, for a recording that was stopped before it."""
     size = len(circuit.names())
     nan = np.full((size, size), np.nan)

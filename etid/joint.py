@@ -6,6 +6,7 @@ result tell what is a trial's own from what all trials have in common.
 """
 
 import dataclasses
+import functools
 from typing import Any
 
 import equinox as eqx
@@ -16,15 +17,15 @@ from jaxtyping import Array
 from tqdm import tqdm
 
 from etid import arrowhead, estimation
-from etid.batch import LANES, Drivers, StudyFits, table
+from etid.batch import LANES, Drivers, Refusal, StudyFits, planned, stacked, table
 from etid.circuits import AbstractCircuit, SkinRC
 from etid.driver import Driver
-from etid.identify import arrays, failed_fit, plan, window
+from etid.identify import arrays, failed_fit, window
 from etid.maximum_likelihood import Joint, fit_load
 from etid.measurement import measure
 from etid.precision import require_float64
-from etid.recording import Recording, RecordingError
-from etid.results import Fit, IdentificationError
+from etid.recording import Recording
+from etid.results import Fit
 from etid.study import Study
 from etid.verdicts import RESULTS, message
 
@@ -101,9 +102,7 @@ class _Waiting:
         count = len(self.lanes)
         if count == 0:
             return
-        filled = self.lanes + [self.lanes[-1]] * (LANES - count)
-        samples = tuple(jnp.asarray(np.stack(column)) for column in zip(*filled, strict=True))
-        loads = jax.device_get(_alone(samples, self.model, self.driver, self.window))
+        loads = jax.device_get(_alone(stacked(self.lanes), self.model, self.driver, self.window))
         self.chunks.append(jax.tree.map(lambda leaf: leaf[:count], loads))
         self.lanes = []
 
@@ -146,36 +145,25 @@ def identify_jointly(
     notes = [""] * len(paths)
     waiting: dict[tuple[str, ...], dict[Any, _Waiting]] = {}
 
-    def fail(row, name, note):
-        fits[row] = dataclasses.replace(
-            jax.tree.map(np.asarray, failed_fit(name, circuit, "maximum_likelihood")),
-            method=METHOD,
-        )
-        notes[row] = note
+    def load(row):
+        recording = study[paths[row]]
+        return recording, drivers.found[drivers.of(recording)]
 
     for row in tqdm(range(len(paths)), unit="recording", disable=not progress):
         try:
-            recording = study[paths[row]]
-            names = drivers.of(recording)
-            method, name = plan(None, recording, drivers.found[names])
-        except (RecordingError, ValueError) as error:
-            fail(row, "unreadable", str(error))
-        except IdentificationError as error:
-            fail(row, "driver_failed", str(error))
-        else:
+            recording, driver, method = planned(functools.partial(load, row), None)
             part = window(recording, method)
-            if name is not None:
-                fail(row, name, message(name))
-                continue
             if part is None:
-                fail(row, "not_periodic", SINGLE)
-                continue
-            driver = drivers.found[names]
-            lengths = waiting.setdefault(names, {})
-            key = recording.v_th.size, part
-            if key not in lengths:
-                lengths[key] = _Waiting(driver, _model(circuit, driver), part)
-            lengths[key].add(row, recording)
+                raise Refusal("not_periodic", SINGLE)
+        except Refusal as refusal:
+            fits[row] = failed_fit(refusal.name, circuit, METHOD)
+            notes[row] = refusal.note
+            continue
+        lengths = waiting.setdefault(drivers.of(recording), {})
+        key = recording.v_th.size, part
+        if key not in lengths:
+            lengths[key] = _Waiting(driver, _model(circuit, driver), part)
+        lengths[key].add(row, recording)
     for names, lengths in tqdm(waiting.items(), unit="driver", disable=not progress):
         driver = drivers.found[names]
         groups = [group.loads() for group in lengths.values()]

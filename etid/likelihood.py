@@ -60,7 +60,7 @@ def _learn(
     spectrum: Spectrum,
     other: Spectrum,
     g: Complex[Array, " harmonic"],
-    same: Bool[Array, ""] | bool = True,
+    same: Bool[Array, ""] | bool,
 ) -> Spectrum:
     """What is known of the X of `spectrum` after Y = `g` X of another record, if X is the same."""
     total = other.variance_y + jnp.abs(g) ** 2 * spectrum.variance_x
@@ -117,6 +117,12 @@ def denoised(
         found.append(eqx.tree_at(lambda s: (s.x, s.y), one, (known.x, g * known.x)))
         shares.append(jnp.tile(signal_share(known.x, known.variance_x), 2))
     return found, shares
+
+
+def weights(shares: Sequence[Float[Array, "_"]], terms: int) -> Float[Array, " term"]:
+    """W of `denoised` for all terms: the shares of the first, and 1 for the priors after them."""
+    weight = jnp.concatenate(list(shares))
+    return jnp.pad(weight, (0, terms - weight.size), constant_values=1.0)
 
 
 def residuals(

@@ -26,6 +26,7 @@ from etid.likelihood import (
     residual,
     residuals,
     variance,
+    weights,
 )
 from etid.output_error import DELAY_WIDTH, MAX_STEPS, SOLVER, Estimate, delay_std, prior
 from etid.results import complex_rrse
@@ -85,7 +86,7 @@ def fit_source(
     q = solution.value
     clean, shares = denoised(records, gains(q))
     jacobian = jax.jacfwd(of_all)(q, clean)
-    weight = jnp.concatenate([*shares, jnp.ones(jacobian.shape[0] - 2 * spectra.x.size)])
+    weight = weights(shares, jacobian.shape[0])
     by_term = inverse((jacobian.T * weight[None, :]) @ jacobian) @ jacobian.T
     freedom = 2 * jnp.sum(spectra.selected, dtype=q.dtype) - q.shape[0]
     chi2 = 2 * solution.stats["normal_equations"].objective / freedom
@@ -269,8 +270,7 @@ def fit_circuit(
     gains = [*model.known_gains(common), g]
     clean, shares = denoised([*model.records, spectrum], gains)
     jacobian = jax.jacfwd(terms)(solution.value, clean)
-    weight = jnp.concatenate([shares[-1], jnp.ones(1), *shares[:-1]])
-    weight = jnp.pad(weight, (0, jacobian.shape[0] - weight.size), constant_values=1.0)  # priors
+    weight = weights([shares[-1], jnp.ones(1), *shares[:-1]], jacobian.shape[0])
     by_term = inverse((jacobian.T * weight[None, :]) @ jacobian)[: split - 1] @ jacobian.T
     # What is the trial's own among the noise of its terms: all, or that of V_out if V_th is shared.
     known = informed(spectrum, model.records, gains[:-1])
