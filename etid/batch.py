@@ -19,6 +19,7 @@ from tqdm import tqdm
 
 from etid.circuits import AbstractCircuit, SkinRC
 from etid.driver import Driver
+from etid.estimation import Window
 from etid.identify import (
     Method,
     arrays,
@@ -43,7 +44,7 @@ def _chunk(
     driver: Driver,
     circuit: AbstractCircuit,
     method: Method,
-    window: tuple[int, int] | None,
+    window: Window | None,
 ) -> Fit:
     return jax.vmap(lambda lane: skin_lane(lane, driver, circuit, method, window))(samples)
 
@@ -117,7 +118,7 @@ class _Queue:
         driver: Driver,
         circuit: AbstractCircuit,
         method: Method,
-        window: tuple[int, int] | None,
+        window: Window | None,
     ):
         self.driver = driver
         self.window = window
@@ -150,7 +151,7 @@ def _identify(
     fits: dict[int, Fit] = {}
     notes = [""] * count
     used: list[str] = []
-    queues: dict[tuple[int, int, Method, tuple[int, int] | None], _Queue] = {}
+    queues: dict[tuple[int, int, Method, Window | None], _Queue] = {}
 
     with tqdm(total=count, unit="fit", disable=not progress) as bar:
 
@@ -169,7 +170,7 @@ def _identify(
                 notes[row] = refusal.note
                 bar.update()
                 continue
-            part = window(recording, method)
+            part = window(recording, method, driver)
             key = (id(driver), recording.v_th.size, method, part)
             queue = queues.setdefault(key, _Queue(driver, circuit, method, part))
             queue.add(row, recording)

@@ -12,12 +12,13 @@ complex to real without a change of branch.
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Complex, Float, Int
 
 from etid.filtering import StateSpace
 from etid.spectra import Spectrum
-from etid.transfer import Rational, as_complex, delay_variable, frequency_variable
+from etid.transfer import Rational, as_complex, delay_variable, frequency_variable, reciprocal
 from etid.verdicts import RESULTS, message, verdict_names
 
 
@@ -47,17 +48,17 @@ class SourceImpedance(eqx.Module):
 
     def response(self, frequency: Float[Array, "..."]) -> Complex[Array, "..."]:
         """Impedance [Ω] at real frequencies [Hz]."""
-        s = frequency_variable(jnp.asarray(frequency))[..., None]
-        lead = (1,) * (s.ndim - 1)
-
-        def along(parameter):  # one section or pole per column
-            return as_complex(parameter).reshape(*lead, -1)
-
-        x = s / along(jnp.exp(self.log_omega))
-        damping = 2 * along(jnp.exp(self.log_zeta))
-        sections = (along(self.gain) + along(self.slope) * x) / (1 + damping * x + x**2)
-        real = along(self.gain_real) / (1 + s / along(jnp.exp(self.log_omega_real)))
-        return as_complex(jnp.exp(self.log_resistance)) + sections.sum(-1) + real.sum(-1)
+        s = frequency_variable(jnp.asarray(frequency))
+        z = as_complex(jnp.exp(self.log_resistance))
+        for k in range(self.log_omega.shape[0]):
+            x = s * as_complex(jnp.exp(-self.log_omega[k]))
+            damping = as_complex(2 * jnp.exp(self.log_zeta[k]))
+            gain = as_complex(self.gain[k]) + as_complex(self.slope[k]) * x
+            z = z + gain * reciprocal(1 + (damping + x) * x)
+        for j in range(self.log_omega_real.shape[0]):
+            x = s * as_complex(jnp.exp(-self.log_omega_real[j]))
+            z = z + as_complex(self.gain_real[j]) * reciprocal(1 + x)
+        return z
 
     def state_space(self) -> StateSpace:
         """Realisation from current [A] to voltage drop [V], one balanced 2x2 block per section."""
@@ -126,12 +127,15 @@ class Calibration(eqx.Module):
             resistors tell that delay from a fast pole of Z_th; one resistor leaves it open.
         delay: Their trigger delays as identified [samples].
         spectra: Their harmonics, stacked along a leading axis; None if the method uses none.
+        unloaded: Checksums of their unloaded records; None if not known. A load whose checksum is
+            none of them needs no search for what it shares with them, which doubles its cost.
     """
 
     r_load: Float[Array, " record"]
     delay_std: Float[Array, ""]
     delay: Float[Array, " record"]
     spectra: Spectrum | None
+    unloaded: Int[np.ndarray, " record"] | None = None
 
 
 class Driver(eqx.Module):

@@ -7,6 +7,7 @@ parameters that the data do not determine.
 """
 
 from collections.abc import Callable
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -64,7 +65,7 @@ def _score(
     """χ² of a discrete model, and its squared distance to the minimum in standard errors."""
     impulse = jnp.zeros(IMPULSE).at[0].set(1.0)
 
-    def scaled(c):
+    def scaled(c, _):
         h = predict(c, impulse)
         s = m.sigma_out**2 + m.sigma_th**2 * jnp.sum(h**2)
         return (predict(c, m.v_th) - m.v_out) / jnp.sqrt(s)
@@ -165,13 +166,29 @@ def skin_starts(m: Measurement, driver: Driver, circuit: AbstractCircuit) -> Abs
     return circuit.with_log_values(jnp.stack(starts))
 
 
-def spectrum_of(m: Measurement, window: tuple[int, int]) -> Spectrum:
-    """Harmonics of one recording in a window of `spectra.whole_periods`."""
-    return spectrum(m.v_th, m.v_out, m.sigma_th, m.sigma_out, m.sample_rate, *window)
+class Window(NamedTuple):
+    """What maximum likelihood must know of a record before it is compiled.
+
+    Attributes:
+        periods: Whole periods (`spectra.whole_periods`).
+        samples: The samples nearest to them.
+        shared: Whether the unloaded record may be that of a calibration.
+    """
+
+    periods: int
+    samples: int
+    shared: bool
+
+
+def spectrum_of(m: Measurement, window: Window) -> Spectrum:
+    """Harmonics of one recording."""
+    return spectrum(
+        m.v_th, m.v_out, m.sigma_th, m.sigma_out, m.sample_rate, window.periods, window.samples
+    )
 
 
 def skin_by_refinement(
-    m: Measurement, driver: Driver, circuit: AbstractCircuit, window: tuple[int, int] | None
+    m: Measurement, driver: Driver, circuit: AbstractCircuit, window: Window | None
 ) -> Fit:
     """Refine from the best of several starts.
 
@@ -179,8 +196,7 @@ def skin_by_refinement(
         m: One recording.
         driver: Its driver, with a continuous source impedance.
         circuit: Structure and typical values.
-        window: Periods and samples of `spectra.whole_periods`, for maximum likelihood; None for
-            output error.
+        window: For maximum likelihood; None for output error.
     """
     source, source_cov, calibration = driver.source, driver.cov, driver.calibration
     if source is None or source_cov is None or calibration is None:
@@ -192,7 +208,7 @@ def skin_by_refinement(
         )
     else:
         model = maximum_likelihood.Joint(
-            circuit, source, calibration, jnp.asarray(driver.sample_rate)
+            circuit, source, calibration, jnp.asarray(driver.sample_rate), window.shared
         )
         estimate = maximum_likelihood.fit_circuit(
             model, spectrum_of(m, window), m.sample_rate, starts.log_values()
@@ -288,7 +304,7 @@ def source_starts(
 
 
 def driver_by_refinement(
-    m: Measurement, r_load: Float[Array, " record"], order: int, window: tuple[int, int] | None
+    m: Measurement, r_load: Float[Array, " record"], order: int, window: Window | None
 ) -> Driver:
     """Refine Z_th from several starts and keep the best that settled.
 

@@ -1,5 +1,7 @@
 """Identify a driver and a skin: pre-flight, baseline, refinement, verdict."""
 
+import dataclasses
+import zlib
 from collections.abc import Sequence
 from typing import Any, Literal
 
@@ -12,6 +14,7 @@ from jaxtyping import Array, Float
 from etid import estimation, output_error, prediction, steiglitz_mcbride
 from etid.circuits import AbstractCircuit, Resistor, SkinRC
 from etid.driver import Driver
+from etid.estimation import Window
 from etid.filtering import TAPS
 from etid.measurement import measure
 from etid.precision import require_float64
@@ -121,11 +124,18 @@ def arrays(recording: Recording) -> tuple[np.ndarray, ...]:
     )
 
 
-def window(recording: Recording, method: Method) -> tuple[int, int] | None:
-    """Whole periods and their samples, for the method that needs them."""
+def _checksum(recording: Recording) -> int:
+    return zlib.crc32(recording.v_th.tobytes())
+
+
+def window(recording: Recording, method: Method, driver: Driver | None = None) -> Window | None:
+    """What the method must know of a record before it is compiled."""
     if method != "maximum_likelihood":
         return None
-    return recorded_periods(recording)
+    calibration = None if driver is None else driver.calibration
+    known = None if calibration is None else calibration.unloaded
+    shared = known is None or _checksum(recording) in known
+    return Window(*recorded_periods(recording), shared)
 
 
 @eqx.filter_jit
@@ -134,7 +144,7 @@ def _driver(
     r_load: Float[Array, " record"],
     order: int,
     method: Method,
-    window: tuple[int, int] | None,
+    window: Window | None,
 ) -> Driver:
     m = jax.vmap(measure)(*samples)
     if method in CONTINUOUS:
@@ -147,7 +157,7 @@ def skin_lane(
     driver: Driver,
     circuit: AbstractCircuit,
     method: Method,
-    window: tuple[int, int] | None,
+    window: Window | None,
 ) -> Fit:
     """Identify one lane; differentiable code, to be jitted and batched by the caller."""
     m = measure(*samples)
@@ -213,6 +223,10 @@ def identify_driver(
     )
     r_load = jnp.asarray([record.r_load for record in records])
     driver = _driver(samples, r_load, order, method, window(records[0], method))
+    if driver.calibration is not None:
+        unloaded = np.array([_checksum(record) for record in records])
+        calibration = dataclasses.replace(driver.calibration, unloaded=unloaded)
+        driver = dataclasses.replace(driver, calibration=calibration)
     if throw and driver.verdict != "successful":
         raise IdentificationError(f"driver: {driver.verdict}. {message(driver.verdict)}", driver)
     return driver
@@ -258,7 +272,7 @@ def identify_skin(
         fit = failed_fit(name, circuit, chosen)
     else:
         samples = tuple(map(jnp.asarray, arrays(recording)))
-        fit = _skin(samples, driver, circuit, chosen, window(recording, chosen))
+        fit = _skin(samples, driver, circuit, chosen, window(recording, chosen, driver))
     if throw and fit.verdict != "successful":
         text = f"recording {recording.path!r}: {fit.verdict}. {message(fit.verdict)}"
         raise IdentificationError(text, fit)
@@ -310,7 +324,11 @@ def identify_samples(
     rate = jnp.asarray(sample_rate, dtype=v_out.dtype)
     samples = (v_th, v_out, step, step, rate)
     return skin_lane(
-        samples, driver, circuit, method, periods if method == "maximum_likelihood" else None
+        samples,
+        driver,
+        circuit,
+        method,
+        Window(*periods, True) if method == "maximum_likelihood" else None,
     )
 
 

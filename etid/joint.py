@@ -16,10 +16,11 @@ import numpy as np
 from jaxtyping import Array
 from tqdm import tqdm
 
-from etid import arrowhead, estimation
+from etid import estimation, shared_driver
 from etid.batch import LANES, Drivers, Refusal, StudyFits, planned, stacked, table
 from etid.circuits import AbstractCircuit, SkinRC
 from etid.driver import Driver
+from etid.estimation import Window
 from etid.identify import arrays, failed_fit, window
 from etid.maximum_likelihood import Joint, fit_load
 from etid.measurement import measure
@@ -37,7 +38,7 @@ SINGLE = (
 
 
 @eqx.filter_jit
-def _alone(samples: Any, model: Joint, driver: Driver, window: tuple[int, int]) -> arrowhead.Loads:
+def _alone(samples: Any, model: Joint, driver: Driver, window: Window) -> shared_driver.Loads:
     """Loads identified one by one with Z_th as it is, where a joint fit may start."""
 
     def one(lane):
@@ -47,16 +48,16 @@ def _alone(samples: Any, model: Joint, driver: Driver, window: tuple[int, int]) 
         own, result, chi2, error = fit_load(model, spectrum, m.sample_rate, starts)
         settled = RESULTS.promote(result) == RESULTS.successful
         good = settled & jnp.isfinite(chi2) & ~estimation.misses(chi2, error)
-        return arrowhead.Loads(spectrum, m.sample_rate, own, good)
+        return shared_driver.Loads(spectrum, m.sample_rate, own, good)
 
     return jax.vmap(one)(samples)
 
 
 @eqx.filter_jit
 def _together(
-    model: Joint, groups: list[arrowhead.Loads], driver: Driver, tolerance: Array
+    model: Joint, groups: list[shared_driver.Loads], driver: Driver, tolerance: Array
 ) -> tuple[list[Fit], Driver]:
-    common, cov, estimates = arrowhead.fit(model, groups)
+    common, cov, estimates = shared_driver.fit(model, groups)
     # All impedances are measured in units of the known resistor.
     sign = [1.0 if unit == "ohm" else -1.0 for unit in model.circuit.units().values()]
     scale = tolerance**2 * jnp.outer(jnp.array(sign), jnp.array(sign))
@@ -86,11 +87,11 @@ def _together(
 class _Waiting:
     """Recordings of one length with one driver."""
 
-    def __init__(self, driver: Driver, model: Joint, window: tuple[int, int]):
+    def __init__(self, driver: Driver, model: Joint, window: Window):
         self.driver, self.model, self.window = driver, model, window
         self.rows: list[int] = []
         self.lanes: list[tuple[np.ndarray, ...]] = []
-        self.chunks: list[arrowhead.Loads] = []
+        self.chunks: list[shared_driver.Loads] = []
 
     def add(self, row: int, recording: Recording) -> None:
         self.rows.append(row)
@@ -106,7 +107,7 @@ class _Waiting:
         self.chunks.append(jax.tree.map(lambda leaf: leaf[:count], loads))
         self.lanes = []
 
-    def loads(self) -> arrowhead.Loads:
+    def loads(self) -> shared_driver.Loads:
         self.run()
         return jax.tree.map(lambda *parts: np.concatenate(parts), *self.chunks)
 
@@ -152,7 +153,7 @@ def identify_jointly(
     for row in tqdm(range(len(paths)), unit="recording", disable=not progress):
         try:
             recording, driver, method = planned(functools.partial(load, row), None)
-            part = window(recording, method)
+            part = window(recording, method, driver)
             if part is None:
                 raise Refusal("not_periodic", SINGLE)
         except Refusal as refusal:
@@ -162,13 +163,14 @@ def identify_jointly(
         lengths = waiting.setdefault(drivers.of(recording), {})
         key = recording.v_th.size, part
         if key not in lengths:
-            lengths[key] = _Waiting(driver, _model(circuit, driver), part)
+            lengths[key] = _Waiting(driver, _model(circuit, driver, part.shared), part)
         lengths[key].add(row, recording)
     for names, lengths in tqdm(waiting.items(), unit="driver", disable=not progress):
         driver = drivers.found[names]
         groups = [group.loads() for group in lengths.values()]
+        shared = any(group.window.shared for group in lengths.values())
         tolerance = jnp.asarray(r_load_tolerance, dtype=float)
-        found, better = _together(_model(circuit, driver), groups, driver, tolerance)
+        found, better = _together(_model(circuit, driver, shared), groups, driver, tolerance)
         drivers.found[names] = dataclasses.replace(better, method=METHOD)
         for group, fit in zip(lengths.values(), jax.device_get(found), strict=True):
             for lane, row in enumerate(group.rows):
@@ -178,7 +180,9 @@ def identify_jointly(
     return StudyFits(table(study, paths, ordered, notes), drivers.found, drivers.failures)
 
 
-def _model(circuit: AbstractCircuit, driver: Driver) -> Joint:
+def _model(circuit: AbstractCircuit, driver: Driver, shared: bool) -> Joint:
     assert driver.source is not None  # by maximum likelihood
     assert driver.calibration is not None
-    return Joint(circuit, driver.source, driver.calibration, jnp.asarray(driver.sample_rate))
+    return Joint(
+        circuit, driver.source, driver.calibration, jnp.asarray(driver.sample_rate), shared
+    )

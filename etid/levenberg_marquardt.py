@@ -4,7 +4,9 @@
 `vmap` a step of one lane selects between two copies of that state for all lanes, which costs about
 twelve times the step itself when the residual has thousands of samples. Here the state holds the
 objective, its gradient and the p×p Gauss-Newton matrix only: `optimistix.DampedNewtonDescent`
-solves the damped step, `optimistix.ClassicalTrustRegion` accepts it and sets the damping.
+solves the damped step, `optimistix.ClassicalTrustRegion` accepts it and sets the damping. Where the
+matrix has a structure worth keeping (`etid.arrowhead`), its equations and its descent take their
+places.
 
 Three things make the method scale-free:
 
@@ -18,6 +20,7 @@ Three things make the method scale-free:
   infinite.
 """
 
+import abc
 from collections.abc import Callable
 from typing import Any
 
@@ -36,22 +39,55 @@ ACCELERATION = 0.75  # of the step, that its second order may be (Transtrum and 
 STALLED_STEP = 1e-15  # a relative step that no longer changes the parameters in double precision
 
 
-class NormalEquations(eqx.Module):
-    """Objective ½|r|², gradient Jᵀr and Gauss-Newton matrix JᵀJ of a residual r."""
+class AbstractNormalEquations(eqx.Module):
+    """Objective ½|r|², gradient Jᵀr and Gauss-Newton matrix JᵀJ of a residual r, however stored."""
+
+    objective: eqx.AbstractVar[Float[Array, ""]]
+    gradient: eqx.AbstractVar[Float[Array, " parameter"]]
+
+    @abc.abstractmethod
+    def diagonal(self) -> Float[Array, " parameter"]:
+        """Diagonal of JᵀJ."""
+
+    @abc.abstractmethod
+    def scaled(self, by: Float[Array, " parameter"]) -> "AbstractNormalEquations":
+        """The same in the parameters z = `by` · y."""
+
+    @abc.abstractmethod
+    def hessian(self) -> lx.AbstractLinearOperator:
+        """JᵀJ, for the descent and the search of optimistix."""
+
+
+class NormalEquations(AbstractNormalEquations):
+    """Normal equations with JᵀJ as one matrix."""
 
     objective: Float[Array, ""]
     gradient: Float[Array, " parameter"]
     matrix: Float[Array, "parameter parameter"]
 
+    def diagonal(self) -> Float[Array, " parameter"]:
+        """Diagonal of JᵀJ."""
+        return jnp.diagonal(self.matrix)
+
+    def scaled(self, by: Float[Array, " parameter"]) -> "NormalEquations":
+        """The same in the parameters z = `by` · y."""
+        matrix = self.matrix / by[:, None] / by[None, :]
+        return NormalEquations(self.objective, self.gradient / by, matrix)
+
+    def hessian(self) -> lx.AbstractLinearOperator:
+        """JᵀJ as an operator."""
+        return lx.MatrixLinearOperator(self.matrix, lx.positive_semidefinite_tag)
+
 
 def normal_equations(
-    residual: Callable[[Float[Array, " parameter"]], Float[Array, " sample"]],
+    residual: Callable[[Float[Array, " parameter"], Any], Float[Array, " sample"]],
     y: Float[Array, " parameter"],
+    args: Any = None,
 ) -> NormalEquations:
-    """Evaluate the normal equations of `residual` at `y`, by forward differentiation."""
+    """Evaluate the normal equations of `residual(y, args)`, by forward differentiation."""
 
     def twice(y):
-        r = residual(y)
+        r = residual(y, args)
         return r, r
 
     jacobian, r = jax.jacfwd(twice, has_aux=True)(y)
@@ -70,30 +106,39 @@ def best_start(
     return starts[jnp.argmin(jnp.where(jnp.isfinite(objectives), objectives, jnp.inf))]
 
 
-def _second_order(
-    residual: Callable[[Float[Array, " parameter"]], Float[Array, " sample"]],
+def second_order(
+    residual: Callable[[Float[Array, " parameter"], Any], Float[Array, " sample"]],
     y: Float[Array, " parameter"],
     step: Float[Array, " parameter"],
+    args: Any = None,
 ) -> Float[Array, " parameter"]:
     """Jᵀ r″, r″ the second derivative of the residual along the step."""
 
-    def along(y):
-        return jax.jvp(residual, (y,), (step,))[1]
+    def value(y):
+        return residual(y, args)
 
-    _, pullback = jax.vjp(residual, y)
+    def along(y):
+        return jax.jvp(value, (y,), (step,))[1]
+
+    _, pullback = jax.vjp(value, y)
     return pullback(jax.jvp(along, (y,), (step,))[1])[0]
 
 
 class _State(eqx.Module):
     first_step: Bool[Array, ""]
     y_eval: Float[Array, " parameter"]
-    accepted: NormalEquations
+    accepted: AbstractNormalEquations
     scale: Float[Array, " parameter"]
     search_state: Any
     terminate: Bool[Array, ""]
     result: optx.RESULTS
     accepted_steps: Int[Array, ""]
     idle: Int[Array, ""]
+
+
+def _value(fn):
+    """`fn` without its auxiliary output."""
+    return lambda y, args: fn(y, args)[0]
 
 
 def _select(pred, new: PyTree, old: PyTree) -> PyTree:
@@ -117,30 +162,32 @@ class LevenbergMarquardt(optx.AbstractLeastSquaresSolver):
         geodesic: Bend each step along the model's curvature, by its second derivative (Transtrum
             and Sethna 2012, arXiv:1201.5885): curved valleys take a fraction of the steps, and each
             costs a third more.
-        equations: Evaluates the normal equations of the residual function at a point. A function
-            that returns `NormalEquations` itself needs `lambda fn, y: fn(y)`.
+        descent: Solves the damped step.
+        search: Accepts it and sets the damping.
+        equations: Evaluates the normal equations of `fn(y, args)`. With a descent that knows their
+            kind, a problem of many parameters can keep its structure.
+        second_order: Evaluates Jᵀ r″ of `fn(y, args)`.
     """
 
     rtol: float = 1e-6
     atol: float = 1e-12
     ftol: float = 1e-8
     norm: Callable[[PyTree], Array] = optx.two_norm
-    descent: optx.DampedNewtonDescent = optx.DampedNewtonDescent(linear_solver=lx.Cholesky())
+    descent: optx.AbstractDescent = optx.DampedNewtonDescent(linear_solver=lx.Cholesky())
     # MINPACK's threshold, and constants whose powers differ: with 10 and 1/10 the damping returns
     # over and over to the value just rejected, and a curved valley costs three times the steps.
     search: optx.ClassicalTrustRegion = optx.ClassicalTrustRegion(
         high_cutoff=0.75, high_constant=5.0, low_constant=0.25
     )
     geodesic: bool = False
-    equations: Callable[[Callable, Array], NormalEquations] = normal_equations
+    equations: Callable[[Callable, Array, Any], AbstractNormalEquations] = normal_equations
+    second_order: Callable[[Callable, Array, Array, Any], Array] = second_order
 
     def init(self, fn, y, args, options, f_struct, aux_struct, tags) -> _State:
         """Set up an empty state; the first step evaluates `y` itself."""
-        del fn, args, options, f_struct, aux_struct, tags
-        p = y.shape[0]
-        zero = NormalEquations(
-            jnp.zeros((), y.dtype), jnp.zeros_like(y), jnp.zeros((p, p), y.dtype)
-        )
+        del options, f_struct, aux_struct, tags
+        shapes = jax.eval_shape(lambda: self.equations(_value(fn), y, args))
+        zero = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
         return _State(
             first_step=jnp.array(True),
             y_eval=y,
@@ -153,14 +200,15 @@ class LevenbergMarquardt(optx.AbstractLeastSquaresSolver):
             idle=jnp.array(0),
         )
 
-    def _info(self, equations: NormalEquations):
-        hessian = lx.MatrixLinearOperator(equations.matrix, lx.positive_semidefinite_tag)
-        return optx.FunctionInfo.EvalGradHessian(equations.objective, equations.gradient, hessian)
+    def _info(self, equations: AbstractNormalEquations):
+        return optx.FunctionInfo.EvalGradHessian(
+            equations.objective, equations.gradient, equations.hessian()
+        )
 
     def step(self, fn, y, args, options, state: _State, tags):
         """Evaluate the trial point, accept or reject it, and propose the next."""
         del options, tags
-        trial = self.equations(lambda y: fn(y, args)[0], state.y_eval)
+        trial = self.equations(_value(fn), state.y_eval, args)
         step_size, accept, _, search_state = self.search.step(
             state.first_step,
             y,
@@ -179,35 +227,30 @@ class LevenbergMarquardt(optx.AbstractLeastSquaresSolver):
         idle = jnp.where(accept, idle, state.idle)
         accepted = _select(accept, trial, state.accepted)
         y = jnp.where(accept, state.y_eval, y)
-        diagonal = jnp.sqrt(jnp.diagonal(accepted.matrix))
+        diagonal = jnp.sqrt(accepted.diagonal())
         scale = jnp.maximum(state.scale, diagonal)
         safe = jnp.where(scale > 0, scale, 1.0)
 
-        # The step is solved in z = D y with damping relative to INITIAL_DAMPING.
-        scaled = NormalEquations(
-            accepted.objective,
-            accepted.gradient / safe / INITIAL_DAMPING,
-            accepted.matrix / safe[:, None] / safe[None, :] / INITIAL_DAMPING,
-        )
-        descent_state = self.descent.init(y, self._info(scaled))
-        descent_state = self.descent.query(y, self._info(scaled), descent_state)
+        # The step is solved in z = D y; a descent takes the damping as 1 / step_size.
+        scaled = accepted.scaled(safe)
+        info = self._info(scaled)
+        descent_state = self.descent.query(y, info, self.descent.init(y, info))
         # A factorisation that fails proposes a step that is not finite; the next trial rejects it
         # and raises the damping.
-        proposed, _ = self.descent.step(step_size, descent_state)
+        proposed, _ = self.descent.step(step_size / INITIAL_DAMPING, descent_state)
         if self.geodesic:
-            bent = _second_order(lambda y: fn(y, args)[0], y, proposed / safe) / safe
-            scaled = NormalEquations(scaled.objective, bent / INITIAL_DAMPING, scaled.matrix)
-            descent_state = self.descent.query(y, self._info(scaled), descent_state)
-            turned, _ = self.descent.step(step_size, descent_state)
+            bent = self.second_order(_value(fn), y, proposed / safe, args) / safe
+            bent = eqx.tree_at(lambda e: e.gradient, scaled, bent)
+            turned, _ = self.descent.step(
+                step_size / INITIAL_DAMPING,
+                self.descent.query(y, self._info(bent), descent_state),
+            )
             small = 2 * self.norm(turned) <= ACCELERATION * self.norm(proposed)
             proposed = proposed + jnp.where(small, 0.5 * turned, 0.0)
 
         size = self.norm(safe * y)
-        ridge = RIDGE * jnp.eye(y.shape[0], dtype=y.dtype)
-        newton = jnp.linalg.solve(
-            accepted.matrix / safe[:, None] / safe[None, :] + ridge, accepted.gradient / safe
-        )
-        offset = jnp.dot(newton, accepted.gradient / safe)  # |Q₁ᵀ r|²
+        newton, _ = self.descent.step(jnp.asarray(1 / RIDGE, y.dtype), descent_state)
+        offset = -jnp.dot(newton, scaled.gradient)  # |Q₁ᵀ r|²
         squares = 2 * accepted.objective
         converged = offset <= self.rtol**2 * squares
         # Rounding in the residual is ε times the model, which is about |J y|: a reduction of |r|²

@@ -22,7 +22,7 @@ from jaxtyping import Array, Bool, Complex, Float
 
 from etid.driver import SourceImpedance
 from etid.spectra import Spectrum, signal_share
-from etid.transfer import Rational, as_complex, frequency_variable
+from etid.transfer import Rational, as_complex, frequency_variable, power, reciprocal
 
 
 def gain(
@@ -30,7 +30,7 @@ def gain(
 ) -> Complex[Array, " harmonic"]:
     """G = Z_L / (Z_L + Z_th)."""
     z_load = load(frequency_variable(frequency))
-    return z_load / (z_load + source.response(frequency))
+    return z_load * reciprocal(z_load + source.response(frequency))
 
 
 def delayed_gain(
@@ -40,13 +40,13 @@ def delayed_gain(
     delay: Float[Array, ""],
 ) -> Complex[Array, " harmonic"]:
     """G e^(−jωτ), for a delay τ in seconds."""
-    turn = -frequency_variable(frequency) * as_complex(delay)
-    return gain(source, load, frequency) * jnp.exp(turn)
+    turn = -2 * jnp.pi * frequency * delay
+    return gain(source, load, frequency) * jax.lax.complex(jnp.cos(turn), jnp.sin(turn))
 
 
 def variance(spectrum: Spectrum, g: Complex[Array, " harmonic"]) -> Float[Array, " harmonic"]:
     """E|Y − g X|² of the noise."""
-    return spectrum.variance_y + jnp.abs(g) ** 2 * spectrum.variance_x
+    return spectrum.variance_y + power(g) * spectrum.variance_x
 
 
 def residual(spectrum: Spectrum, g: Complex[Array, " harmonic"]) -> Float[Array, " part"]:
@@ -63,7 +63,7 @@ def _learn(
     same: Bool[Array, ""] | bool,
 ) -> Spectrum:
     """What is known of the X of `spectrum` after Y = `g` X of another record, if X is the same."""
-    total = other.variance_y + jnp.abs(g) ** 2 * spectrum.variance_x
+    total = other.variance_y + power(g) * spectrum.variance_x
     used = other.selected & same
     share = jnp.where(used, spectrum.variance_x / total, 0.0)
     x = spectrum.x + jnp.conj(g) * as_complex(share) * (other.y - g * spectrum.x)

@@ -2,7 +2,7 @@
 
 The terms are those of `etid.likelihood`. A skin is identified *jointly* with the calibrations of
 its driver: what a skin's record says about Z_th, and about the delay of a calibration that one
-known resistor leaves open, is used. `etid.arrowhead` does the same for many skins at once.
+known resistor leaves open, is used. `etid.shared_driver` does the same for many skins at once.
 """
 
 from collections.abc import Sequence
@@ -118,12 +118,14 @@ class Joint(eqx.Module):
         source: Z_th as identified from the calibrations.
         calibration: The calibrations, with their harmonics.
         rate: Their sampling rate [Hz].
+        shared: Whether a load's unloaded record may be that of a calibration.
     """
 
     circuit: AbstractCircuit
     source: SourceImpedance
     calibration: Calibration
     rate: Float[Array, ""]
+    shared: bool = eqx.field(static=True)
 
     @property
     def sources(self) -> int:
@@ -182,9 +184,15 @@ class Joint(eqx.Module):
         records: Sequence[Spectrum],
     ) -> Float[Array, " term"]:
         """Terms of one recording, given the calibrations; the last is the prior of its delay."""
-        known = informed(spectrum, records, self.known_gains(common))
+        known = self.informed(spectrum, common, records)
         part = residual(known, self.gain(own, common, spectrum, sample_rate))
         return jnp.append(part, own[-1] / DELAY_WIDTH)
+
+    def informed(
+        self, spectrum: Spectrum, common: Float[Array, " common"], records: Sequence[Spectrum]
+    ) -> Spectrum:
+        """A recording with what the calibrations tell of its X."""
+        return informed(spectrum, records, self.known_gains(common)) if self.shared else spectrum
 
     def strain(self, common: Float[Array, " common"]) -> Float[Array, ""]:
         """By how much Σ r² of the calibrations has grown from what they alone have.
@@ -273,7 +281,7 @@ def fit_circuit(
     weight = weights([shares[-1], jnp.ones(1), *shares[:-1]], jacobian.shape[0])
     by_term = inverse((jacobian.T * weight[None, :]) @ jacobian)[: split - 1] @ jacobian.T
     # What is the trial's own among the noise of its terms: all, or that of V_out if V_th is shared.
-    known = informed(spectrum, model.records, gains[:-1])
+    known = model.informed(spectrum, common, model.records)
     part = jnp.where(
         jnp.any(known.variance_x != spectrum.variance_x),
         spectrum.variance_y / variance(known, g),

@@ -9,6 +9,7 @@ of the band, where anti-alias filters are imperfect, is left out.
 """
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Complex, Float
@@ -117,13 +118,21 @@ def _drift(v: Float[Array, " time"], periods: int) -> Float[Array, " time"]:
     return basis @ (jnp.linalg.pinv(means[:, :-1]) @ means[:, -1])
 
 
+def _local_sum(values: Float[Array, " harmonic"]) -> Float[Array, " harmonic"]:
+    """Sum over `WINDOW` harmonics around each.
+
+    Not `jnp.convolve`: under `vmap` that becomes one convolution of all lanes, in which a NaN
+    poisons the others, and whose compiled code has read beyond its input.
+    """
+    size = min(WINDOW, values.shape[0])
+    return jax.lax.reduce_window(values, 0.0, jax.lax.add, (size,), (1,), "SAME")
+
+
 def signal_share(
     coefficients: Complex[Array, " harmonic"], variance: Float[Array, " harmonic"]
 ) -> Float[Array, " harmonic"]:
     """Part of the power of noisy coefficients that is signal, locally averaged; 0 to 1."""
-    box = jnp.ones(min(WINDOW, coefficients.shape[0]))
-    power = jnp.convolve(jnp.abs(coefficients) ** 2, box, mode="same")
-    noise = jnp.convolve(variance, box, mode="same")
+    power, noise = _local_sum(jnp.abs(coefficients) ** 2), _local_sum(variance)
     return jnp.clip(1 - noise / jnp.where(power > 0, power, 1.0), 0.0, 1.0)
 
 

@@ -166,8 +166,9 @@ def read(path):
 SOLVER = LevenbergMarquardt(rtol=1e-7, atol=1e-12, ftol=0.0)
 
 # A relative offset of 1e-7 is a distance of 1e-7 √n standard errors, or 6 digits where a parameter
-# is no larger than its standard error (Nelson); a damped last step may cost half a digit of these.
-DIGITS = 6.0
+# is no larger than its standard error (Nelson); a damped last step may cost half a digit of these,
+# and so does rounding where the residual is 1e-5 of the data (Lanczos3).
+DIGITS = 5.5
 STDERR_DIGITS = 4.0
 
 # The residuals of Lanczos1 are 1e-13 of its data: rounding alone is 1e-3 of them.

@@ -108,3 +108,17 @@ def test_one_period_cannot_tell_aliases_and_leaves_the_upper_band_out():
     found = spectrum(v, v, small, small, jnp.asarray(RATE), 1, 3333)
     last = float(found.frequency[found.selected].max())
     assert abs(last - spectra.ALIASED * RATE) < PULSE * 1.001
+
+
+def test_the_share_of_signal_of_one_lane_does_not_depend_on_the_others():
+    generator = np.random.default_rng(5)
+    coefficients = jnp.asarray(generator.normal(size=(7, 1666)) + 1j)
+    variance = jnp.ones((7, 1666))
+    together = jax.jit(jax.vmap(signal_share))(coefficients.at[3].set(jnp.nan), variance)
+    for lane in (0, 2, 4, 6):
+        alone = signal_share(coefficients[lane], variance[lane])
+        power, noise = np.abs(coefficients[lane]) ** 2, np.ones(1666)
+        box = np.ones(25)
+        share = 1 - np.convolve(noise, box, "same") / np.convolve(power, box, "same")
+        np.testing.assert_allclose(alone, np.clip(share, 0, 1), rtol=1e-12)
+        np.testing.assert_array_equal(together[lane], alone)
