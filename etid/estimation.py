@@ -6,6 +6,7 @@ that are no circuit, then a solver that did not settle, then a model that misses
 parameters that the data do not determine.
 """
 
+import dataclasses
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -15,7 +16,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float
 
-from etid import maximum_likelihood, output_error, prediction, steiglitz_mcbride
+from etid import maximum_likelihood, non_parametric, output_error, prediction, steiglitz_mcbride
 from etid.circuits import AbstractCircuit, SkinRC
 from etid.driver import Driver, SourceImpedance
 from etid.levenberg_marquardt import normal_equations
@@ -36,6 +37,9 @@ MISFIT_RRSE = (
 # of freedom as Z_th and the delays have parameters at most: 12 exceed this once in ten thousand.
 STRAINED = 39.0
 BIASED = 16.0  # squared standard errors between an estimate and the minimum of its own model
+CORRECTED = (
+    2.0  # standard errors of bias that may be corrected; what it leaves is below half of one
+)
 PASSIVE = 2.0  # standard errors by which Re Z_th may be negative
 BAND = np.linspace(0.0003, 0.4, 400)  # of the sample rate, where a source must be passive
 LEVELS = (1.0, 0.125, 0.5, 2.0, 8.0)  # impedance levels at which a circuit is started
@@ -167,17 +171,19 @@ def skin_starts(m: Measurement, driver: Driver, circuit: AbstractCircuit) -> Abs
 
 
 class Window(NamedTuple):
-    """What maximum likelihood must know of a record before it is compiled.
+    """What a method on harmonics must know of a record before it is compiled.
 
     Attributes:
         periods: Whole periods (`spectra.whole_periods`).
         samples: The samples nearest to them.
         shared: Whether the unloaded record may be that of a calibration.
+        parametric: Whether Z_th is what was identified, or the harmonics of the calibrations.
     """
 
     periods: int
     samples: int
     shared: bool
+    parametric: bool = True
 
 
 def spectrum_of(m: Measurement, window: Window) -> Spectrum:
@@ -196,7 +202,7 @@ def skin_by_refinement(
         m: One recording.
         driver: Its driver, with a continuous source impedance.
         circuit: Structure and typical values.
-        window: For maximum likelihood; None for output error.
+        window: For methods on harmonics; None for output error.
     """
     source, source_cov, calibration = driver.source, driver.cov, driver.calibration
     if source is None or source_cov is None or calibration is None:
@@ -206,15 +212,28 @@ def skin_by_refinement(
         _, estimate = output_error.fit_circuit(
             prediction.prepare(m), source, source_cov, calibration, starts
         )
-    else:
-        model = maximum_likelihood.Joint(
-            circuit, source, calibration, jnp.asarray(driver.sample_rate), window.shared
+        return judged(estimate, circuit, driver.result, "output_error")
+    if not window.parametric:
+        estimate, bias = non_parametric.fit_circuit(
+            circuit,
+            calibration,
+            jnp.asarray(driver.sample_rate),
+            spectrum_of(m, window),
+            m.sample_rate,
+            starts.log_values(),
         )
-        estimate = maximum_likelihood.fit_circuit(
-            model, spectrum_of(m, window), m.sample_rate, starts.log_values()
-        )
-    method = "output_error" if window is None else "maximum_likelihood"
-    return judged(estimate, circuit, driver.result, method)
+        # It needs the harmonics of the driver, whether or not a model of them was found.
+        fit = judged(estimate, circuit, SUCCESSFUL, "non_parametric")
+        far = jnp.any(jnp.abs(bias) > CORRECTED * jnp.sqrt(jnp.diagonal(estimate.cov)))
+        result = RESULTS.where(far & (fit.result == SUCCESSFUL), RESULTS.biased, fit.result)
+        return dataclasses.replace(fit, result=result)
+    model = maximum_likelihood.Joint(
+        circuit, source, calibration, jnp.asarray(driver.sample_rate), window.shared
+    )
+    estimate = maximum_likelihood.fit_circuit(
+        model, spectrum_of(m, window), m.sample_rate, starts.log_values()
+    )
+    return judged(estimate, circuit, driver.result, "maximum_likelihood")
 
 
 def judged(
@@ -244,7 +263,8 @@ def judged(
             (~settled, MAX_STEPS_REACHED),
             (misses(estimate.chi2, estimate.rrse) | _too_late(estimate), RESULTS.misfit),
             (estimate.strain > STRAINED, RESULTS.inconsistent),
-            (~jnp.all(errors < 1), RESULTS.insensitive),
+            # None of 0: that is an element without any effect.
+            (~jnp.all((errors > 0) & (errors < 1)), RESULTS.insensitive),
             (driver_result != SUCCESSFUL, RESULTS.driver_failed),
         ),
         steps=estimate.steps,

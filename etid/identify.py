@@ -24,14 +24,19 @@ from etid.results import Fit, IdentificationError
 from etid.spectra import separates_aliases, whole_periods
 from etid.verdicts import message, verdict
 
-Method = Literal["maximum_likelihood", "output_error", "steiglitz_mcbride", "equation_error"]
+Method = Literal[
+    "maximum_likelihood", "non_parametric", "output_error", "steiglitz_mcbride", "equation_error"
+]
 METHODS: tuple[Method, ...] = (
     "maximum_likelihood",
+    "non_parametric",
     "output_error",
     "steiglitz_mcbride",
     "equation_error",
 )
-CONTINUOUS = METHODS[:2]  # those that identify a continuous source impedance
+HARMONIC = METHODS[:2]  # those on the harmonics of whole pulse periods
+SAME_PULSE_RATE = 1e-3  # part by which rates may differ: Z_th is smooth
+CONTINUOUS = METHODS[:3]  # those that identify a continuous source impedance
 
 
 def _iterations(method: Method) -> int:
@@ -84,13 +89,26 @@ def plan(given: Method | None, recording: Recording, driver: Driver) -> tuple[Me
     Raises:
         ValueError: The driver cannot serve the method.
     """
-    name = preflight(recording, periodic=given == "maximum_likelihood")
+    name = preflight(recording, periodic=given in HARMONIC)
     if name is None:
         method = _choose_for(given, recording, driver)
     else:
         method = given or "output_error"
     check_driver(driver, method, recording.sample_rate)
+    if method == "non_parametric":
+        _check_pulse_rate(driver, recording)
     return method, name
+
+
+def _check_pulse_rate(driver: Driver, recording: Recording) -> None:
+    assert driver.calibration is not None  # check_driver
+    assert driver.calibration.spectra is not None
+    known = float(driver.calibration.spectra.frequency[0, 0])
+    if not np.isclose(recording.pulse_rate, known, rtol=SAME_PULSE_RATE):
+        raise ValueError(
+            f"non_parametric knows Z_th at harmonics of {known:.6g} Hz only, but the recording has "
+            f"{recording.pulse_rate:.6g} Hz; use method='maximum_likelihood'"
+        )
 
 
 def check_driver(driver: Driver, method: Method, sample_rate: float) -> None:
@@ -100,7 +118,7 @@ def check_driver(driver: Driver, method: Method, sample_rate: float) -> None:
             f"this driver was identified by {driver.method}, which gives no continuous source "
             f"impedance; identify it with method={method!r}"
         )
-    if method == "maximum_likelihood" and not has_harmonics(driver):
+    if method in HARMONIC and not has_harmonics(driver):
         raise ValueError(
             f"this driver was identified by {driver.method}, which keeps no harmonics of its "
             "calibrations; identify it with method='maximum_likelihood'"
@@ -124,18 +142,19 @@ def arrays(recording: Recording) -> tuple[np.ndarray, ...]:
     )
 
 
-def _checksum(recording: Recording) -> int:
+def checksum(recording: Recording) -> int:
+    """What tells an unloaded record from others."""
     return zlib.crc32(recording.v_th.tobytes())
 
 
 def window(recording: Recording, method: Method, driver: Driver | None = None) -> Window | None:
     """What the method must know of a record before it is compiled."""
-    if method != "maximum_likelihood":
+    if method not in HARMONIC:
         return None
     calibration = None if driver is None else driver.calibration
     known = None if calibration is None else calibration.unloaded
-    shared = known is None or _checksum(recording) in known
-    return Window(*recorded_periods(recording), shared)
+    shared = known is None or checksum(recording) in known
+    return Window(*recorded_periods(recording), shared, method != "non_parametric")
 
 
 @eqx.filter_jit
@@ -213,7 +232,7 @@ def identify_driver(
             "cut them to one length"
         )
     for record in records:
-        name = preflight(record, periodic=method == "maximum_likelihood")
+        name = preflight(record, periodic=method in HARMONIC)
         if name is not None:
             text = f"calibration {record.path!r}: {name}. {message(name)}"
             raise IdentificationError(text, None)
@@ -224,7 +243,7 @@ def identify_driver(
     r_load = jnp.asarray([record.r_load for record in records])
     driver = _driver(samples, r_load, order, method, window(records[0], method))
     if driver.calibration is not None:
-        unloaded = np.array([_checksum(record) for record in records])
+        unloaded = np.array([checksum(record) for record in records])
         calibration = dataclasses.replace(driver.calibration, unloaded=unloaded)
         driver = dataclasses.replace(driver, calibration=calibration)
     if throw and driver.verdict != "successful":
@@ -318,7 +337,7 @@ def identify_samples(
         fit_for = has_harmonics(driver) and separates_aliases(*periods)
         method = "maximum_likelihood" if fit_for else "output_error"
     check_driver(driver, method, sample_rate)
-    if method == "maximum_likelihood" and periods[0] == 0:
+    if method in HARMONIC and periods[0] == 0:
         raise ValueError(f"{v_out.shape[0]} samples hold no whole pulse period")
     step = jnp.asarray(resolution, dtype=v_out.dtype)
     rate = jnp.asarray(sample_rate, dtype=v_out.dtype)
@@ -328,7 +347,7 @@ def identify_samples(
         driver,
         circuit,
         method,
-        Window(*periods, True) if method == "maximum_likelihood" else None,
+        Window(*periods, True, method != "non_parametric") if method in HARMONIC else None,
     )
 
 

@@ -7,6 +7,7 @@ result tell what is a trial's own from what all trials have in common.
 
 import dataclasses
 import functools
+from collections import Counter
 from typing import Any
 
 import equinox as eqx
@@ -21,12 +22,13 @@ from etid.batch import LANES, Drivers, Refusal, StudyFits, planned, stacked, tab
 from etid.circuits import AbstractCircuit, SkinRC
 from etid.driver import Driver
 from etid.estimation import Window
-from etid.identify import arrays, failed_fit, window
+from etid.identify import arrays, checksum, failed_fit, window
 from etid.maximum_likelihood import Joint, fit_load
 from etid.measurement import measure
 from etid.precision import require_float64
 from etid.recording import Recording
 from etid.results import Fit
+from etid.shared_terms import Loads
 from etid.study import Study
 from etid.verdicts import RESULTS, message
 
@@ -38,7 +40,7 @@ SINGLE = (
 
 
 @eqx.filter_jit
-def _alone(samples: Any, model: Joint, driver: Driver, window: Window) -> shared_driver.Loads:
+def _alone(samples: Any, model: Joint, driver: Driver, window: Window) -> Loads:
     """Loads identified one by one with Z_th as it is, where a joint fit may start."""
 
     def one(lane):
@@ -48,16 +50,20 @@ def _alone(samples: Any, model: Joint, driver: Driver, window: Window) -> shared
         own, result, chi2, error = fit_load(model, spectrum, m.sample_rate, starts)
         settled = RESULTS.promote(result) == RESULTS.successful
         good = settled & jnp.isfinite(chi2) & ~estimation.misses(chi2, error)
-        return shared_driver.Loads(spectrum, m.sample_rate, own, good)
+        return Loads(spectrum, m.sample_rate, own, good, jnp.array(-1))
 
     return jax.vmap(one)(samples)
 
 
 @eqx.filter_jit
 def _together(
-    model: Joint, groups: list[shared_driver.Loads], driver: Driver, tolerance: Array
+    model: Joint,
+    groups: list[Loads],
+    several: tuple[int, ...],
+    driver: Driver,
+    tolerance: Array,
 ) -> tuple[list[Fit], Driver]:
-    common, cov, estimates = shared_driver.fit(model, groups)
+    common, cov, estimates = shared_driver.fit(model, groups, several)
     # All impedances are measured in units of the known resistor.
     sign = [1.0 if unit == "ohm" else -1.0 for unit in model.circuit.units().values()]
     scale = tolerance**2 * jnp.outer(jnp.array(sign), jnp.array(sign))
@@ -91,10 +97,12 @@ class _Waiting:
         self.driver, self.model, self.window = driver, model, window
         self.rows: list[int] = []
         self.lanes: list[tuple[np.ndarray, ...]] = []
-        self.chunks: list[shared_driver.Loads] = []
+        self.chunks: list[Loads] = []
+        self.unloaded: list[int] = []
 
     def add(self, row: int, recording: Recording) -> None:
         self.rows.append(row)
+        self.unloaded.append(checksum(recording))
         self.lanes.append(arrays(recording))
         if len(self.lanes) == LANES:
             self.run()
@@ -107,9 +115,16 @@ class _Waiting:
         self.chunks.append(jax.tree.map(lambda leaf: leaf[:count], loads))
         self.lanes = []
 
-    def loads(self) -> shared_driver.Loads:
+    def several(self) -> list[int]:
+        """Checksums of the unloaded records that several recordings have."""
+        return [key for key, count in Counter(self.unloaded).items() if count > 1]
+
+    def loads(self) -> Loads:
         self.run()
-        return jax.tree.map(lambda *parts: np.concatenate(parts), *self.chunks)
+        loads = jax.tree.map(lambda *parts: np.concatenate(parts), *self.chunks)
+        number = {key: i for i, key in enumerate(self.several())}
+        unloaded = np.array([number.get(key, -1) for key in self.unloaded])
+        return eqx.tree_at(lambda of: of.unloaded, loads, unloaded)
 
 
 def identify_jointly(
@@ -168,9 +183,11 @@ def identify_jointly(
     for names, lengths in tqdm(waiting.items(), unit="driver", disable=not progress):
         driver = drivers.found[names]
         groups = [group.loads() for group in lengths.values()]
+        several = tuple(len(group.several()) for group in lengths.values())
         shared = any(group.window.shared for group in lengths.values())
         tolerance = jnp.asarray(r_load_tolerance, dtype=float)
-        found, better = _together(_model(circuit, driver, shared), groups, driver, tolerance)
+        model = _model(circuit, driver, shared)
+        found, better = _together(model, groups, several, driver, tolerance)
         drivers.found[names] = dataclasses.replace(better, method=METHOD)
         for group, fit in zip(lengths.values(), jax.device_get(found), strict=True):
             for lane, row in enumerate(group.rows):

@@ -71,7 +71,7 @@ def _learn(
     return eqx.tree_at(lambda s: (s.x, s.variance_x), spectrum, (x, variance))
 
 
-def _same_unloaded(one: Spectrum, other: Spectrum) -> Bool[Array, ""] | bool:
+def same_unloaded(one: Spectrum, other: Spectrum) -> Bool[Array, ""] | bool:
     """Whether two recordings have one and the same unloaded record."""
     if one is other:
         return True
@@ -93,7 +93,7 @@ def informed(
     """A recording with what others of the same unloaded record tell of its X."""
     known = spectrum
     for other, g in zip(others, gains, strict=True):
-        same = _same_unloaded(spectrum, other)
+        same = same_unloaded(spectrum, other)
         if same is not False:
             known = _learn(known, other, g, same)
     return known

@@ -39,8 +39,9 @@ class RESULTS(optx.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]  # equi
         "The driver changed in between, or r_load is not what it is said to be."
     )
     biased = (
-        "The estimate is more than four standard errors away from the output-error minimum of "
-        "its own model, as Steiglitz-McBride is with noise. Use method='output_error'."
+        "Noise has shifted the estimate by several standard errors: Steiglitz-McBride from the "
+        "minimum of its own model, a non-parametric fit from what it would be without noise. Use "
+        "the default method."
     )
     flat = "A record carries no signal above its noise. Check the contact and the channel."
     saturated = "The converter clipped. Lower the gain or the stimulus and record again."

@@ -20,12 +20,15 @@ WIDE = 0.75  # spread in standard errors: second-order terms make them a fifth t
         ("maximum_likelihood", 60.0, 10_000, False),
         ("maximum_likelihood", 60.0, 10_000, True),
         ("joint", 60.0, 10_000, False),
+        ("joint", 60.0, 10_000, True),
+        ("non_parametric", 60.0, 10_000, False),
+        ("non_parametric", 60.0, 10_000, True),
         ("output_error", 60.0, 10_000, False),
         ("output_error", 40.0, 3334, False),
     ],
 )
 def test_intervals_of_95_per_cent_contain_the_truth_in_95_per_cent(method, snr_db, samples, shared):
-    more = 3 if method == "joint" else 0
+    more = 10 if method == "joint" else 0
     draws = monte_carlo(scene(snr_db, samples, shared_v_th=shared, more=more), REPETITIONS, method)
     for name in LOADS:
         of = draws[name]

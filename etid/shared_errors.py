@@ -1,0 +1,209 @@
+"""Standard errors of many loads with one driver: each load's own, and what all have in common.
+
+    cov = H⁻¹ (Jᵀ J) H⁻¹
+
+of `etid.likelihood`, without the own parameters for `common`; a load inherits K cov Kᵀ with its
+slope K = −A⁻¹ B.
+
+**One unloaded record in several loads** is one noise of X in all of them. The fit takes them as
+independent, its errors do not: what unit noise in X does to the terms of every load is followed
+through to `common` and to each load, and adds up before it is squared.
+"""
+
+from collections.abc import Sequence
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import optimistix as optx
+from jaxtyping import Array, Float
+
+from etid.information import Curvature, eliminate, inverse
+from etid.likelihood import denoised, variance, weights
+from etid.output_error import Estimate
+from etid.results import complex_rrse
+from etid.shared_terms import DriverStudy, Loads, over
+
+
+class _Eliminated(eqx.Module):
+    """A load without its own parameters.
+
+    Attributes:
+        rest: What it tells of `common`.
+        cov: Covariance of its own parameters at a given `common`.
+        slope: How its minimum depends on `common`.
+        bread: Inverse of its own curvature.
+    """
+
+    rest: Curvature
+    cov: Float[Array, "own own"]
+    slope: Float[Array, "own common"]
+    bread: Float[Array, "own own"]
+
+
+def _curvature(
+    jacobian: Float[Array, "term n"], shares: Sequence[Float[Array, " part"]]
+) -> Curvature:
+    """H and Jᵀ J of `likelihood.denoised`, at denoised records."""
+    weight = weights(shares, jacobian.shape[0])
+    return Curvature((jacobian.T * weight[None, :]) @ jacobian, jacobian.T @ jacobian)
+
+
+def _without_own(of: Curvature, common: int) -> _Eliminated:
+    """Eliminate a load's own parameters, which come after the `common` ones."""
+    bread = inverse(of.expected[common:, common:])
+    slope = -bread @ of.expected[common:, :common]
+    cov = bread @ of.score[common:, common:] @ bread
+    return _Eliminated(eliminate(of, common), cov, slope, bread)
+
+
+def estimates(
+    study: DriverStudy,
+    common: Float[Array, " common"],
+    fitted: Sequence[tuple[Float[Array, "load own"], optx.RESULTS]],
+    several: Sequence[int],
+    solution: optx.Solution,
+) -> tuple[Float[Array, "common common"], list[Estimate]]:
+    """Covariance of `common`, and the estimates of each group with theirs.
+
+    Args:
+        study: Calibrations and loads.
+        common: Common parameters at the minimum.
+        fitted: Own parameters of each group at the minimum, and how their solvers ended.
+        several: In each group, how many unloaded records several loads have.
+        solution: How the joint solver ended.
+    """
+    groups, model = study.groups, study.model
+    owns = [own for own, _ in fitted]
+    found = [
+        over(lambda load, own: _eliminated(study, load, common, own), loads, own)
+        for loads, own in zip(groups, owns, strict=True)
+    ]
+    clean, shares = denoised(model.records, model.known_gains(common))
+    total = _curvature(jax.jacfwd(lambda c: model.of_calibrations(c, clean))(common), shares)
+    for loads, eliminated in zip(groups, found, strict=True):
+        used = jax.tree.map(
+            lambda leaf, loads=loads: jnp.where(loads.used[:, None, None], leaf, 0.0).sum(0),
+            eliminated.rest,
+        )
+        total = jax.tree.map(jnp.add, total, used)
+    bread = inverse(total.expected)
+    lanes = list(zip(groups, owns, found, several, strict=True))
+    sums = [_sums(study, common, *lane) for lane in lanes]
+    score = total.score + sum((more for _, more in sums), start=jnp.zeros_like(total.score))
+    cov = bread @ score @ bread
+
+    strain = model.strain(common)
+    judged = []
+    for (loads, own, eliminated, records), (sums_of, _), (_, results) in zip(
+        lanes, sums, fitted, strict=True
+    ):
+
+        def one(load, own, eliminated, result, records=records, sums_of=sums_of):
+            chi2, rrse = _misfit(study, load, common, own)
+            shared = eliminated.slope @ cov @ eliminated.slope.T
+            private = eliminated.cov
+            if records:
+                by_x, cross = _by_x(study, common, load, own, eliminated, sums_of)
+                cross = cross @ bread @ eliminated.slope.T
+                shared = shared + by_x + cross + cross.T
+                private = private - by_x
+            whole = private * jnp.maximum(chi2, 1.0) + shared
+            return Estimate(
+                own[:-1],
+                own[None, -1:],
+                whole[:-1, :-1],
+                chi2,
+                rrse,
+                optx.RESULTS.where(result == optx.RESULTS.successful, solution.result, result),
+                solution.stats["num_steps"],
+                shared[:-1, :-1],
+                strain,
+            )
+
+        judged.append(over(one, loads, own, eliminated, results))
+    return cov, judged
+
+
+def _misfit(study: DriverStudy, load: Loads, common, own):
+    """χ² and RRSE of a load."""
+    squares = jnp.sum(study.of_load(load, common, own)[:-1] ** 2)
+    freedom = 2 * jnp.sum(load.spectrum.selected, dtype=own.dtype) - own.shape[0]
+    g = study.model.gain(own, common, load.spectrum, load.sample_rate)
+    return squares / freedom, complex_rrse(g * load.spectrum.x, load.spectrum.y)
+
+
+def _jacobian(study: DriverStudy, load: Loads, common, own):
+    """Derivatives of a load's denoised terms by (common, own), and the shares of signal."""
+    model, c = study.model, common.shape[0]
+    gains = [
+        *model.known_gains(common),
+        model.gain(own, common, load.spectrum, load.sample_rate),
+    ]
+    (*known, spectrum), shares = denoised([*model.records, load.spectrum], gains)
+    jacobian = jax.jacfwd(lambda q: model.of_load(q[c:], q[:c], spectrum, load.sample_rate, known))(
+        jnp.concatenate([common, own])
+    )
+    return jacobian, shares[-1]
+
+
+def _eliminated(study: DriverStudy, load: Loads, common, own) -> _Eliminated:
+    jacobian, share = _jacobian(study, load, common, own)
+    return _without_own(_curvature(jacobian, [share]), common.shape[0])
+
+
+# --- Loads with one unloaded record --------------------------------------------------------------
+#
+# The noise of V_th is one noise in all of them. They are fitted as if it were not; but their errors
+# are those of correlated terms: the part of a term that is noise of X, two unit numbers for each
+# harmonic, is followed through to `common` and to every load.
+
+
+def _influence(study: DriverStudy, common, load: Loads, own, eliminated: _Eliminated):
+    """What unit noise in the parts of X adds to the score of `common`, and to the load's own."""
+    jacobian, _ = _jacobian(study, load, common, own)
+    known = study.model.informed(load.spectrum, common, study.model.records)
+    g = study.model.gain(own, common, load.spectrum, load.sample_rate)
+    size = jnp.where(known.selected, jnp.sqrt(known.variance_x / variance(known, g)), 0.0)
+    re, im = g.real * size, g.imag * size
+    real, imaginary = jacobian[: g.size], jacobian[g.size : 2 * g.size]
+    by_x = jnp.concatenate(
+        [
+            re[:, None] * real + im[:, None] * imaginary,
+            re[:, None] * imaginary - im[:, None] * real,
+        ]
+    )
+    c = common.shape[0]
+    return by_x[:, :c] + by_x[:, c:] @ eliminated.slope, by_x[:, c:] @ eliminated.bread
+
+
+def _sums(study: DriverStudy, common, loads: Loads, owns, found: _Eliminated, records: int):
+    """What each shared record adds to the score of `common` over its loads, and so to its cov."""
+    c = common.shape[0]
+    start = (jnp.zeros((records, 2 * loads.spectrum.x.shape[1], c)), jnp.zeros((c, c)))
+    if not records:
+        return start
+
+    def add(carry, lane):
+        load, own, eliminated = lane
+        sums, alone = carry
+        mine, _ = _influence(study, common, load, own, eliminated)
+        mine = jnp.where(load.used & (load.unloaded >= 0), mine, 0.0)
+        return (sums.at[load.unloaded].add(mine), alone + mine.T @ mine), None
+
+    (sums, alone), _ = jax.lax.scan(add, start, (loads, owns, found))
+    return sums, jnp.einsum("rxc,rxd->cd", sums, sums) - alone
+
+
+def _by_x(study: DriverStudy, common, load: Loads, own, eliminated: _Eliminated, sums):
+    """What a shared X adds to the covariance of a load's own parameters.
+
+    And their covariance with what it adds to the score of `common` by the other loads.
+    """
+    mine, of_own = _influence(study, common, load, own, eliminated)
+    others = sums[load.unloaded] - jnp.where(load.used, mine, 0.0)
+    several = load.unloaded >= 0
+    return (
+        jnp.where(several, of_own.T @ of_own, 0.0),
+        jnp.where(several, of_own.T @ others, 0.0),
+    )
