@@ -56,6 +56,11 @@ def _total(values: list[Array]) -> Array:
     return sum(values[1:], start=values[0])
 
 
+def _root(x: Float[Array, " harmonic"]) -> Float[Array, " harmonic"]:
+    """√x, whose derivative is 0 at 0."""
+    return jnp.where(x > 0, jnp.sqrt(jnp.where(x > 0, x, 1.0)), 0.0)
+
+
 class _Measured(eqx.Module):
     """Z_th at the harmonics, and where its errors come from.
 
@@ -109,7 +114,7 @@ class _Model(eqx.Module):
             mean,
             [as_complex(p) * slope for p, slope in zip(parts, by_x, strict=True)],
             _total([p**2 * variance for p, variance in zip(parts, by_y, strict=True)]),
-            [(one - mean) * as_complex(jnp.sqrt(2 * w)) for one, w in zip(z, weights, strict=True)],
+            [(one - mean) * as_complex(_root(2 * w)) for one, w in zip(z, weights, strict=True)],
         )
 
     def _variance(self, q, records, y, of: _Measured):
