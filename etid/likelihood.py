@@ -21,8 +21,10 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Complex, Float
 
 from etid.driver import SourceImpedance
-from etid.spectra import Spectrum, signal_share
+from etid.spectra import Spectrum, local_sum, signal_share
 from etid.transfer import Rational, as_complex, frequency_variable, power, reciprocal
+
+SURE = 4.0  # standard deviations of a local variance
 
 
 def gain(
@@ -123,6 +125,25 @@ def weights(shares: Sequence[Float[Array, "_"]], terms: int) -> Float[Array, " t
     """W of `denoised` for all terms: the shares of the first, and 1 for the priors after them."""
     weight = jnp.concatenate(list(shares))
     return jnp.pad(weight, (0, terms - weight.size), constant_values=1.0)
+
+
+def excess(
+    part: Float[Array, " part"], selected: Bool[Array, " harmonic"]
+) -> Float[Array, " part"]:
+    """Variance of a residual in units of what was expected, 1 or more, around each harmonic.
+
+    Noise is taken as white when it is weighed, but it may be coloured, and a model is never exact.
+    The covariance (Jᵀ C J for Jᵀ J, White 1980) is made with the variance that the residual has:
+    over `spectra.WINDOW` harmonics where that is surely larger than the mean over all.
+    """
+    count = selected.size
+    power = part[:count] ** 2 + part[count:] ** 2
+    of = jnp.where(selected, 2.0, 0.0)
+    overall = jnp.maximum(jnp.sum(power) / jnp.maximum(jnp.sum(of), 1.0), 1.0)
+    freedom = jnp.maximum(local_sum(of), 1.0)
+    local = local_sum(power) / freedom
+    sure = local > overall * (1 + SURE * jnp.sqrt(2 / freedom))
+    return jnp.tile(jnp.where(sure, local, overall), 2)
 
 
 def residuals(

@@ -22,6 +22,7 @@ from etid.likelihood import (
     as_list,
     delayed_gain,
     denoised,
+    excess,
     informed,
     residual,
     residuals,
@@ -90,7 +91,10 @@ def fit_source(
     by_term = inverse((jacobian.T * weight[None, :]) @ jacobian) @ jacobian.T
     freedom = 2 * jnp.sum(spectra.selected, dtype=q.dtype) - q.shape[0]
     chi2 = 2 * solution.stats["normal_equations"].objective / freedom
-    cov = (by_term @ by_term.T)[:kept, :kept] * jnp.maximum(chi2, 1.0)
+    parts = residuals(records, gains(q))
+    of_noise = [excess(r, s.selected) for r, s in zip(parts, records, strict=True)]
+    noise = weights(of_noise, by_term.shape[1])
+    cov = ((by_term * noise[None, :]) @ by_term.T)[:kept, :kept]
     errors = jnp.stack([complex_rrse(g * s.x, s.y) for s, g in zip(records, gains(q), strict=True)])
     estimate = Estimate(
         q[:kept],
@@ -197,12 +201,14 @@ class Joint(eqx.Module):
     def strain(self, common: Float[Array, " common"]) -> Float[Array, ""]:
         """By how much Σ r² of the calibrations has grown from what they alone have.
 
-        About as much as there are common parameters, if loads and calibrations agree on them.
+        About as much as there are common parameters, if loads and calibrations agree on them; r in
+        standard deviations that the noise of the calibrations has.
         """
-        alone = jnp.sum(self.of_calibrations(self.start(), self.records) ** 2)
-        freedom = sum(2 * jnp.sum(s.selected, dtype=alone.dtype) for s in self.records)
-        now = jnp.sum(self.of_calibrations(common, self.records) ** 2)
-        return (now - alone) / jnp.maximum(alone / freedom, 1.0)
+        records, start = self.records, self.start()
+        parts = residuals(records, self.known_gains(start))
+        alone, now = (self.of_calibrations(c, records) for c in (start, common))
+        noise = [excess(r, s.selected) for r, s in zip(parts, records, strict=True)]
+        return jnp.sum((now**2 - alone**2) / weights(noise, now.size))
 
 
 def fit_load(
@@ -292,15 +298,19 @@ def fit_circuit(
         .at[: 2 * part.size + 1]
         .set(jnp.concatenate([part, part, jnp.ones(1)]))
     )
-    own_cov = (by_term * private[None, :]) @ by_term.T
-    shared = (by_term * (1 - private)[None, :]) @ by_term.T
+    parts = [residual(known, g), *residuals(model.records, gains[:-1])]
+    of_noise = [
+        excess(r, s.selected) for r, s in zip(parts, [spectrum, *model.records], strict=True)
+    ]
+    noise = weights([of_noise[0], jnp.ones(1), *of_noise[1:]], by_term.shape[1])
+    shared = (by_term * ((1 - private) * noise)[None, :]) @ by_term.T
     chi2 = jnp.sum(residual(known, g) ** 2) / (
         2 * jnp.sum(spectrum.selected, dtype=g.real.dtype) - split
     )
     return Estimate(
         own[:-1],
         own[None, -1:],
-        own_cov * jnp.maximum(chi2, 1.0) + shared,
+        (by_term * noise[None, :]) @ by_term.T,
         chi2,
         complex_rrse(g * spectrum.x, spectrum.y),
         solution.result,

@@ -24,7 +24,7 @@ from etid.circuits import AbstractCircuit
 from etid.driver import Calibration
 from etid.information import inverse
 from etid.levenberg_marquardt import best_start
-from etid.likelihood import as_list, same_unloaded
+from etid.likelihood import as_list, excess, same_unloaded
 from etid.output_error import DELAY_WIDTH, MAX_STEPS, SOLVER, Estimate
 from etid.results import complex_rrse
 from etid.spectra import Spectrum, signal_share
@@ -216,12 +216,14 @@ def fit_circuit(
     part = model.private(q, clean)
     rest = jacobian.shape[0] - 2 * count - len(known)
     weights = jnp.concatenate([part, part, jnp.zeros(len(known)), jnp.ones(1), jnp.zeros(rest - 1)])
-    own_cov = (by_term * weights[None, :]) @ by_term.T
-    shared = (by_term * (1 - weights)[None, :]) @ by_term.T
+    noise = excess(model.terms(q, records)[: 2 * count], selected)
+    noise = jnp.concatenate([noise, jnp.ones(rest + len(known))])
+    own_cov = (by_term * (weights * noise)[None, :]) @ by_term.T
+    shared = (by_term * ((1 - weights) * noise)[None, :]) @ by_term.T
     return Estimate(
         (q - bias)[:elements],
         q[None, -1:],
-        own_cov * jnp.maximum(chi2, 1.0) + shared,
+        own_cov + shared,
         chi2,
         complex_rrse(
             jnp.where(selected, clean[-1].y, 0.0), jnp.where(selected, records[-1].y, 0.0)

@@ -1,6 +1,6 @@
 """Standard errors of many loads with one driver: each load's own, and what all have in common.
 
-    cov = H⁻¹ (Jᵀ J) H⁻¹
+    cov = H⁻¹ (Jᵀ C J) H⁻¹
 
 of `etid.likelihood`, without the own parameters for `common`; a load inherits K cov Kᵀ with its
 slope K = −A⁻¹ B.
@@ -19,7 +19,7 @@ import optimistix as optx
 from jaxtyping import Array, Float
 
 from etid.information import Curvature, eliminate, inverse
-from etid.likelihood import denoised, variance, weights
+from etid.likelihood import denoised, excess, residuals, variance, weights
 from etid.output_error import Estimate
 from etid.results import complex_rrse
 from etid.shared_terms import DriverStudy, Loads, over
@@ -42,11 +42,15 @@ class _Eliminated(eqx.Module):
 
 
 def _curvature(
-    jacobian: Float[Array, "term n"], shares: Sequence[Float[Array, " part"]]
+    jacobian: Float[Array, "term n"],
+    shares: Sequence[Float[Array, "_"]],
+    noise: Sequence[Float[Array, "_"]],
 ) -> Curvature:
-    """H and Jᵀ J of `likelihood.denoised`, at denoised records."""
-    weight = weights(shares, jacobian.shape[0])
-    return Curvature((jacobian.T * weight[None, :]) @ jacobian, jacobian.T @ jacobian)
+    """H and Jᵀ C J of `likelihood.denoised` and `likelihood.excess`, at denoised records."""
+    weight, excess = (weights(of, jacobian.shape[0]) for of in (shares, noise))
+    return Curvature(
+        (jacobian.T * weight[None, :]) @ jacobian, (jacobian.T * excess[None, :]) @ jacobian
+    )
 
 
 def _without_own(of: Curvature, common: int) -> _Eliminated:
@@ -80,7 +84,10 @@ def estimates(
         for loads, own in zip(groups, owns, strict=True)
     ]
     clean, shares = denoised(model.records, model.known_gains(common))
-    total = _curvature(jax.jacfwd(lambda c: model.of_calibrations(c, clean))(common), shares)
+    parts = residuals(model.records, model.known_gains(common))
+    noise = [excess(r, s.selected) for r, s in zip(parts, model.records, strict=True)]
+    jacobian = jax.jacfwd(lambda c: model.of_calibrations(c, clean))(common)
+    total = _curvature(jacobian, shares, noise)
     for loads, eliminated in zip(groups, found, strict=True):
         used = jax.tree.map(
             lambda leaf, loads=loads: jnp.where(loads.used[:, None, None], leaf, 0.0).sum(0),
@@ -108,7 +115,7 @@ def estimates(
                 cross = cross @ bread @ eliminated.slope.T
                 shared = shared + by_x + cross + cross.T
                 private = private - by_x
-            whole = private * jnp.maximum(chi2, 1.0) + shared
+            whole = private + shared
             return Estimate(
                 own[:-1],
                 own[None, -1:],
@@ -149,7 +156,8 @@ def _jacobian(study: DriverStudy, load: Loads, common, own):
 
 def _eliminated(study: DriverStudy, load: Loads, common, own) -> _Eliminated:
     jacobian, share = _jacobian(study, load, common, own)
-    return _without_own(_curvature(jacobian, [share]), common.shape[0])
+    noise = excess(study.of_load(load, common, own)[:-1], load.spectrum.selected)
+    return _without_own(_curvature(jacobian, [share], [noise]), common.shape[0])
 
 
 # --- Loads with one unloaded record --------------------------------------------------------------

@@ -118,7 +118,7 @@ def _drift(v: Float[Array, " time"], periods: int) -> Float[Array, " time"]:
     return basis @ (jnp.linalg.pinv(means[:, :-1]) @ means[:, -1])
 
 
-def _local_sum(values: Float[Array, " harmonic"]) -> Float[Array, " harmonic"]:
+def local_sum(values: Float[Array, " harmonic"]) -> Float[Array, " harmonic"]:
     """Sum over `WINDOW` harmonics around each.
 
     Not `jnp.convolve`: under `vmap` that becomes one convolution of all lanes, in which a NaN
@@ -132,7 +132,7 @@ def signal_share(
     coefficients: Complex[Array, " harmonic"], variance: Float[Array, " harmonic"]
 ) -> Float[Array, " harmonic"]:
     """Part of the power of noisy coefficients that is signal, locally averaged; 0 to 1."""
-    power, noise = _local_sum(jnp.abs(coefficients) ** 2), _local_sum(variance)
+    power, noise = local_sum(jnp.abs(coefficients) ** 2), local_sum(variance)
     return jnp.clip(1 - noise / jnp.where(power > 0, power, 1.0), 0.0, 1.0)
 
 
