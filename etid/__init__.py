@@ -40,6 +40,7 @@ from etid.recording import Samples as Samples
 from etid.results import Fit as Fit
 from etid.results import Fits as Fits
 from etid.results import IdentificationError as IdentificationError
+from etid.streaming import fit_file as fit_file
 from etid.study import Study as Study
 from etid.verdicts import RESULTS as RESULTS
 

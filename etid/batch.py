@@ -264,15 +264,32 @@ def identify_study(
     """
     circuit = SkinRC() if circuit is None else circuit
     check_method(method, circuit)
-    loaded = [*study.loaded, *study.problems]
     drivers = Drivers(study, order, method)
+    fits = identify_part(study, to_identify(study), drivers, circuit, method, progress)
+    return StudyFits(fits, drivers.found, drivers.failures)
+
+
+def to_identify(study: Study) -> list[str]:
+    """Paths of all loaded recordings, and of what cannot be read."""
+    return [*study.loaded, *study.problems]
+
+
+def identify_part(
+    study: Study,
+    paths: Sequence[str],
+    drivers: "Drivers",
+    circuit: AbstractCircuit,
+    method: Method | None,
+    progress: bool = False,
+) -> Fits:
+    """Identify some recordings of a study, with its drivers."""
 
     def load(row: int) -> tuple[Recording, Driver]:
-        recording = study[loaded[row]]
+        recording = study[paths[row]]
         return recording, drivers.found[drivers.of(recording)]
 
-    fits, notes = _identify(len(loaded), load, circuit, method, progress)
-    return StudyFits(table(study, loaded, fits, notes), drivers.found, drivers.failures)
+    fits, notes = _identify(len(paths), load, circuit, method, progress)
+    return table(study, paths, fits, notes)
 
 
 def table(study: Study, paths: Sequence[str], fits: Sequence[Fit], notes: Sequence[str]) -> Fits:

@@ -5,11 +5,13 @@ command itself is wrong. What is wrong is one line on stderr, never a traceback.
 """
 
 import argparse
+import concurrent.futures
+import contextlib
 import json
 import math
 import pathlib
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import jax
 import numpy as np
@@ -19,6 +21,7 @@ from etid.batch import StudyFits
 from etid.circuits import DISPLAY
 from etid.identify import METHODS
 from etid.report import Table
+from etid.streaming import processes
 
 DONE, WRONG_DATA = 0, 1  # argparse exits with 2 by itself
 _SHOWN = 20  # recordings without success that are listed one by one
@@ -111,6 +114,16 @@ def _parser() -> argparse.ArgumentParser:
         action="store_true",
         help="one fit for all recordings of a driver, by maximum likelihood",
     )
+    command.add_argument(
+        "--resume", action="store_true", help="go on where a run that was killed has stopped"
+    )
+    where = command.add_mutually_exclusive_group()
+    where.add_argument(
+        "--workers", type=int, metavar="N", help="processes of this machine, a core each"
+    )
+    where.add_argument(
+        "--dask", metavar="ADDRESS", help="scheduler of a cluster that sees the file (etid[dask])"
+    )
     command.set_defaults(run=_fit)
     return parser
 
@@ -149,16 +162,41 @@ def _fit(arguments: argparse.Namespace) -> int:
     if arguments.joint and arguments.method not in (None, "maximum_likelihood"):
         raise ValueError(f"--joint is by maximum likelihood, not by {arguments.method}")
     progress = sys.stderr.isatty()
-    with etid.read(arguments.source) as study:
-        if arguments.joint:
+    if arguments.joint:
+        if arguments.resume or arguments.workers or arguments.dask:
+            raise ValueError("--joint is one fit: it has no --resume, --workers or --dask")
+        with etid.read(arguments.source) as study:
             outcome = etid.identify_jointly(study, order=arguments.order, progress=progress)
-        else:
-            outcome = etid.identify_study(
-                study, order=arguments.order, method=arguments.method, progress=progress
+        outcome.fits.write(arguments.target)
+    else:
+        with _executor(arguments) as executor:
+            outcome = etid.fit_file(
+                arguments.source,
+                arguments.target,
+                order=arguments.order,
+                method=arguments.method,
+                resume=arguments.resume,
+                executor=executor,
+                progress=progress,
             )
-    outcome.fits.write(arguments.target)
     print(_summary(outcome))
     return DONE if "successful" in outcome.fits.counts() else WRONG_DATA
+
+
+@contextlib.contextmanager
+def _executor(arguments: argparse.Namespace) -> Iterator[concurrent.futures.Executor | None]:
+    if arguments.dask:
+        try:
+            import distributed
+        except ImportError as error:
+            raise ValueError("--dask needs distributed: pip install 'etid[dask]'") from error
+        with distributed.Client(arguments.dask) as client:
+            yield client.get_executor()
+    elif arguments.workers:
+        with processes(arguments.workers) as executor:
+            yield executor
+    else:
+        yield None
 
 
 def _summary(outcome: StudyFits) -> str:

@@ -18,7 +18,7 @@ from jaxtyping import Array
 from tqdm import tqdm
 
 from etid import estimation, shared_driver
-from etid.batch import LANES, Drivers, Refusal, StudyFits, planned, stacked, table
+from etid.batch import LANES, Drivers, Refusal, StudyFits, planned, stacked, table, to_identify
 from etid.circuits import AbstractCircuit, SkinRC
 from etid.driver import Driver
 from etid.estimation import Window
@@ -156,7 +156,7 @@ def identify_jointly(
     require_float64()
     circuit = SkinRC() if circuit is None else circuit
     drivers = Drivers(study, order, None)
-    paths = [*study.loaded, *study.problems]
+    paths = to_identify(study)
     fits: dict[int, Fit] = {}
     notes = [""] * len(paths)
     waiting: dict[tuple[str, ...], dict[Any, _Waiting]] = {}

@@ -3,7 +3,7 @@
 import dataclasses
 import importlib.metadata
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import equinox as eqx
@@ -149,6 +149,18 @@ class Fits:
             jax.tree.map(lambda leaf: np.asarray(leaf)[index], self.fit),
             {name: column[index] for name, column in self.labels.items()},
             self.notes[index],
+        )
+
+    @classmethod
+    def concatenate(cls, parts: Sequence["Fits"]) -> "Fits":
+        """One table of several, whose method is "mixed" if theirs differ."""
+        methods = {part.fit.method for part in parts}
+        method = methods.pop() if len(methods) == 1 else "mixed"
+        fits = [dataclasses.replace(part.fit, method=method) for part in parts]
+        return cls(
+            jax.tree.map(lambda *leaves: np.concatenate(leaves), *fits),
+            {name: np.concatenate([part.labels[name] for part in parts]) for name in LABELS},
+            np.concatenate([part.notes for part in parts]),
         )
 
     def where(self, **labels: str) -> "Fits":

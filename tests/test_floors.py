@@ -51,6 +51,7 @@ FLOORS = {
     "batch": 9,
     "plotting": 9,
     "joint": 10,
+    "streaming": 10,
     "report": 10,
     "demo": 11,
     "cli": 12,

@@ -126,7 +126,7 @@ def test_coloured_noise_makes_the_errors_larger_where_it_is_strong():
 
     def hum(v):
         noise = scipy.signal.lfilter([1], [1, -0.98], generator.normal(size=v.size + 2000))[2000:]
-        return v + 1e-3 * np.std(v) * noise / np.std(noise)
+        return v + 1e-3 * np.std(v) * np.asarray(noise) / np.std(noise)
 
     records = {
         p: quiet[p].replace(v_th=hum(quiet[p].v_th), v_out=hum(quiet[p].v_out)) for p in quiet

@@ -1,0 +1,195 @@
+"""A file of any size, identified in parts: memory is bounded, and what is done stays done.
+
+The recordings of a file are cut, in their order, into parts of `PART`. Each part is fitted by
+`identify_study` and written, whole or not at all, into a folder beside the result; in the end all
+parts become one file. A run that was killed has lost the part it was at: `resume` goes on with the
+next, and ends with the same numbers, because parts are cut and fitted alike each time.
+
+Parts are independent, so that any `concurrent.futures.Executor` can spread them: processes of this
+machine (`workers`), or a cluster (`dask.distributed.Client.get_executor()`).
+"""
+
+import concurrent.futures
+import contextlib
+import functools
+import hashlib
+import importlib.metadata
+import json
+import multiprocessing
+import os
+import pathlib
+import shutil
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Any
+
+import jax
+from tqdm import tqdm
+
+from etid.batch import Drivers, StudyFits, identify_part, to_identify
+from etid.circuits import AbstractCircuit, SkinRC
+from etid.hdf5 import read
+from etid.identify import Method, check_method
+from etid.results import Fits
+from etid.study import Study
+
+PART = 256  # recordings, some seconds of work: what a killed run may lose
+
+
+class ResumeError(ValueError):
+    """A run was interrupted, or what it has left does not belong to this one."""
+
+
+@functools.cache
+def _opened(source: str, stamp: int, order: int, method: Method | None) -> tuple[Study, Drivers]:
+    """A file and its drivers, once per process."""
+    del stamp
+    study = read(source)
+    return study, Drivers(study, order, method)
+
+
+def _fit(
+    source: str,
+    stamp: int,
+    order: int,
+    method: Method | None,
+    circuit: AbstractCircuit,
+    size: int,
+    number: int,
+) -> StudyFits:
+    """Fit one part; runs in any process that sees the file."""
+    with jax.enable_x64(True):  # of a worker: the caller's own was checked
+        study, drivers = _opened(source, stamp, order, method)
+        paths = to_identify(study)[number * size : (number + 1) * size]
+        fits = identify_part(study, paths, drivers, circuit, method)
+    return StudyFits(fits, dict(drivers.found), dict(drivers.failures))
+
+
+def _pin(cores: Any) -> None:
+    """Give this process a core of its own: sharing them costs XLA more than it gains."""
+    if hasattr(os, "sched_setaffinity"):
+        os.sched_setaffinity(0, {cores.get()})
+
+
+@contextlib.contextmanager
+def processes(workers: int) -> Iterator[concurrent.futures.Executor]:
+    """An executor of as many processes of this machine, each on a core of its own."""
+    context = multiprocessing.get_context("spawn")
+    available = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else [0]
+    cores = context.Queue()
+    for worker in range(workers):
+        cores.put(available[worker % len(available)])
+    with concurrent.futures.ProcessPoolExecutor(
+        workers, mp_context=context, initializer=_pin, initargs=(cores,)
+    ) as executor:
+        yield executor
+
+
+class _Parts:
+    """The folder of parts beside a result."""
+
+    def __init__(self, target: pathlib.Path, run: Mapping[str, Any], resume: bool):
+        self.folder = target.with_name(target.name + ".parts")
+        described = self.folder / "run.json"
+        if self.folder.exists() and not resume:
+            shutil.rmtree(self.folder)
+        self.folder.mkdir(exist_ok=True)
+        if described.exists():
+            before = json.loads(described.read_text("utf-8"))
+            changed = sorted(name for name in run if before.get(name) != run[name])
+            if changed:
+                raise ResumeError(
+                    f"{self.folder}: was begun with another {' and '.join(changed)}; "
+                    "leave out resume to begin anew"
+                )
+        partial = described.with_suffix(".partial")
+        partial.write_text(json.dumps(run), "utf-8")
+        partial.replace(described)
+
+    def path(self, number: int) -> pathlib.Path:
+        """File of one part."""
+        return self.folder / f"{number:06d}.h5"
+
+
+def fit_file(
+    source: str | os.PathLike[str],
+    target: str | os.PathLike[str],
+    *,
+    order: int = 5,
+    circuit: AbstractCircuit | None = None,
+    method: Method | None = None,
+    resume: bool = False,
+    executor: concurrent.futures.Executor | None = None,
+    progress: bool = False,
+) -> StudyFits:
+    """Identify all drivers and recordings of a file of any size.
+
+    Args:
+        source: File of recordings; every process of `executor` must see it under this name.
+        target: File of fits to write. Until it is complete, its parts are in `target.parts`.
+        order: As in `identify_driver`.
+        circuit: As in `identify_skin`.
+        method: As in `identify_skin`.
+        resume: Keep the parts of an earlier run that did not end.
+        executor: Where parts are fitted; in this process if not given.
+        progress: Show a progress bar.
+
+    Returns:
+        As `identify_study`; the drivers are those of the parts that this run has fitted.
+
+    Raises:
+        ResumeError: The earlier run had other settings, or the source has changed since.
+        RecordingError: The source as a whole is missing, damaged or of another schema.
+        ValueError: The source has no loaded recording.
+    """
+    circuit = SkinRC() if circuit is None else circuit
+    check_method(method, circuit)
+    source, target = os.path.abspath(source), pathlib.Path(target)
+    with read(source) as study:
+        count = len(to_identify(study))
+    if not count:
+        raise ValueError("the study has no loaded recording")
+    numbers = range((count + PART - 1) // PART)
+    stamp = os.stat(source).st_mtime_ns
+    run = {
+        "source": source,
+        "source date": stamp,
+        "version": importlib.metadata.version("etid"),
+        "order": order,
+        "method": method,
+        "circuit": hashlib.sha256(repr(circuit).encode()).hexdigest(),
+        "size of a part": PART,
+    }
+    parts = _Parts(target, run, resume)
+    left = [number for number in numbers if not parts.path(number).exists()]
+    task = functools.partial(_fit, source, stamp, order, method, circuit, PART)
+    drivers, failures = {}, {}
+    done = min(count, (len(numbers) - len(left)) * PART)
+    with tqdm(total=count, initial=done, unit="fit", disable=not progress) as bar:
+        for number, found in _results(task, left, executor):
+            found.fits.write(parts.path(number))
+            drivers |= found.drivers
+            failures |= found.failures
+            bar.update(len(found.fits))
+    kind = type(circuit)
+    fits = Fits.concatenate([Fits.read(parts.path(number), kind) for number in numbers])
+    fits.write(target)
+    shutil.rmtree(parts.folder)
+    return StudyFits(fits, drivers, failures)
+
+
+def _results(
+    task: Callable[[int], StudyFits],
+    numbers: Sequence[int],
+    executor: concurrent.futures.Executor | None,
+) -> Iterator[tuple[int, StudyFits]]:
+    """The parts as they are finished."""
+    if executor is None:
+        for number in numbers:
+            yield number, task(number)
+        return
+    futures = {executor.submit(task, number): number for number in numbers}
+    try:
+        for future in concurrent.futures.as_completed(futures):
+            yield futures.pop(future), future.result()
+    except concurrent.futures.BrokenExecutor as error:
+        raise ResumeError("a worker was lost; what is done is kept, go on with resume") from error

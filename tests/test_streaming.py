@@ -1,0 +1,192 @@
+"""A file in parts: killed, resumed, spread over processes and a cluster, the result is the same."""
+
+import concurrent.futures
+import contextlib
+import os
+import pathlib
+import signal
+import subprocess
+import sys
+import time
+
+import h5py
+import numpy as np
+import pytest
+
+import etid
+from etid import streaming
+from etid.scenes import Scene, Trial
+from etid.streaming import ResumeError, fit_file, processes
+from etid.transformer import ResistorLoad, SkinLoad
+
+# The paper's method: what is tested is the parts, not the fits, and it compiles fastest.
+METHOD = "equation_error"
+PART = 4
+COUNT = 14  # three whole parts and a half
+
+
+@pytest.fixture(scope="module")
+def source(tmp_path_factory):
+    trials = tuple(
+        Trial(f"loaded/{i}", SkinLoad(r_s=33.4e3 + 1e3 * i, r_p=186e3, c_p=0.12e-9))
+        for i in range(COUNT)
+    )
+    scene = Scene(trials, (Trial("calibration/0", ResistorLoad(98.8e3)),), samples=2000)
+    file = tmp_path_factory.mktemp("streaming") / "study.h5"
+    scene.simulate(seed=1).write(file)
+    return file
+
+
+@pytest.fixture(autouse=True)
+def _small_parts(monkeypatch):
+    monkeypatch.setattr(streaming, "PART", PART)
+
+
+@pytest.fixture(scope="module")
+def whole(source):
+    with etid.read(source) as study:
+        return etid.identify_study(study, method=METHOD).fits
+
+
+def same(file: pathlib.Path, expected: etid.Fits) -> None:
+    """All columns of a file, bit for bit."""
+    expected.write(file.with_name("expected.h5"))
+    with h5py.File(file) as found, h5py.File(file.with_name("expected.h5")) as wanted:
+        assert set(found) == set(wanted)
+        assert dict(found.attrs).keys() == dict(wanted.attrs).keys()
+        for name in wanted:
+            np.testing.assert_array_equal(np.asarray(found[name]), np.asarray(wanted[name]), name)
+
+
+def test_parts_are_the_whole(source, whole, tmp_path):
+    target = tmp_path / "fits.h5"
+    outcome = fit_file(source, target, method=METHOD)
+    same(target, whole)
+    assert len(outcome.fits) == COUNT
+    assert set(outcome.drivers) == {("calibration/0",)}
+    assert [p.name for p in tmp_path.iterdir() if "parts" in p.name] == []
+
+
+def test_an_interrupted_run_goes_on_where_it_was(source, whole, tmp_path, monkeypatch):
+    """Three interruptions, and no part is fitted twice but the one it was at."""
+    target = tmp_path / "fits.h5"
+    fitted, real = [], streaming.identify_part
+
+    def interrupted(study, paths, *rest):
+        fitted.append(paths[0])
+        if len(fitted) in (2, 4, 5):
+            raise KeyboardInterrupt
+        return real(study, paths, *rest)
+
+    monkeypatch.setattr(streaming, "identify_part", interrupted)
+    for attempt in range(3):
+        with pytest.raises(KeyboardInterrupt):
+            fit_file(source, target, method=METHOD, resume=attempt > 0)
+        assert not target.exists()
+    fit_file(source, target, method=METHOD, resume=True)
+    firsts = [f"loaded/{PART * number}" for number in (0, 1, 1, 2, 2, 2, 3)]
+    assert fitted == firsts
+    same(target, whole)
+
+
+def test_a_run_of_other_settings_is_not_resumed(source, tmp_path, monkeypatch):
+    target = tmp_path / "fits.h5"
+
+    def fail(*_):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patched:
+        patched.setattr(streaming, "identify_part", fail)
+        with pytest.raises(KeyboardInterrupt):
+            fit_file(source, target, method=METHOD, order=4)
+    with pytest.raises(ResumeError, match="another order"):
+        fit_file(source, target, method=METHOD, resume=True)
+    os.utime(source)
+    with pytest.raises(ResumeError, match="another source date"):
+        fit_file(source, target, method=METHOD, order=4, resume=True)
+    fit_file(source, target, method=METHOD, order=4)  # anew
+    assert etid.Fits.read(target).counts()
+
+
+RUN = """
+import sys, jax
+jax.config.update("jax_enable_x64", True)
+from etid import streaming
+streaming.PART = int(sys.argv[3])
+streaming.fit_file(sys.argv[1], sys.argv[2], method=sys.argv[4], resume=len(sys.argv) > 5)
+"""
+
+
+@pytest.mark.slow
+def test_kill_minus_nine_three_times(source, whole, tmp_path):
+    target = tmp_path / "fits.h5"
+    parts = tmp_path / "fits.h5.parts"
+    command = [sys.executable, "-c", RUN, str(source), str(target), str(PART), METHOD]
+    for wanted in (1, 2, 3):
+        with subprocess.Popen([*command, "resume"]) as process:
+            deadline = time.monotonic() + 120
+            while len(list(parts.glob("*.h5"))) < wanted and time.monotonic() < deadline:
+                time.sleep(0.001)
+            process.send_signal(signal.SIGKILL)
+        assert len(list(parts.glob("*.h5"))) >= wanted
+    subprocess.run([*command, "resume"], check=True)
+    same(target, whole)
+
+
+@pytest.mark.slow
+def test_processes_give_the_same(source, whole, tmp_path):
+    target = tmp_path / "fits.h5"
+    with processes(2) as executor:
+        fit_file(source, target, method=METHOD, executor=executor)
+    same(target, whole)
+
+
+def test_a_lost_worker_keeps_what_is_done(source, tmp_path):
+    class Broken(concurrent.futures.Executor):
+        def submit(self, fn, /, *args, **kwargs):
+            future = concurrent.futures.Future()
+            if args == (2,):
+                future.set_exception(concurrent.futures.BrokenExecutor("killed"))
+            else:
+                future.set_result(fn(*args))
+            return future
+
+    target = tmp_path / "fits.h5"
+    with pytest.raises(ResumeError, match="go on with resume"):
+        fit_file(source, target, method=METHOD, executor=Broken())
+    fit_file(source, target, method=METHOD, resume=True)
+    assert len(etid.Fits.read(target)) == COUNT
+
+
+@pytest.mark.slow
+def test_a_cluster_gives_the_same_though_a_worker_is_killed(source, whole, tmp_path):
+    """A real scheduler and two worker processes, of which one is killed while it works."""
+    distributed = pytest.importorskip("distributed")
+    target = tmp_path / "fits.h5"
+    with (
+        distributed.LocalCluster(
+            n_workers=2, threads_per_worker=1, processes=True, dashboard_address=None
+        ) as cluster,
+        distributed.Client(cluster) as client,
+    ):
+        # Both are armed; the first that fits a part dies of it.
+        client.run(_arm, tmp_path / "died")
+        before = set(client.run(os.getpid).values())
+        fit_file(source, target, method=METHOD, executor=client.get_executor(retries=5))
+        client.wait_for_workers(2, timeout=60)
+        assert len(before - set(client.run(os.getpid).values())) == 1
+    assert (tmp_path / "died").exists()
+    same(target, whole)
+
+
+def _arm(marker: pathlib.Path) -> None:
+    """Make this process kill itself at its first part, if no other has done so."""
+    real = streaming.identify_part
+
+    def deadly(*arguments):
+        with contextlib.suppress(FileExistsError):
+            marker.touch(exist_ok=False)
+            os.kill(os.getpid(), signal.SIGKILL)
+        return real(*arguments)
+
+    streaming.identify_part = deadly
