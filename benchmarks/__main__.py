@@ -2,6 +2,7 @@
 
 import argparse
 import pathlib
+import sys
 
 import jax
 
@@ -38,6 +39,9 @@ def main() -> None:
     coverage.add_argument("--spice", metavar="SCENE", help="draw this SPICE recording afresh")
     coverage.add_argument("--data", type=pathlib.Path, default=pathlib.Path("../shared/data"))
 
+    speed = names.add_parser("speed", help="ratios against what one would use instead")
+    speed.add_argument("--quick", action="store_true", help="few lanes, few repetitions")
+
     names.add_parser("design", help="the pulse width and rate that determine R_s best")
 
     arguments = parser.parse_args()
@@ -64,6 +68,11 @@ def main() -> None:
                 arguments.more,
             )
         benchmark.run(drawn, arguments.repetitions, arguments.method)
+    elif arguments.name == "speed":
+        from benchmarks import speed as ratios
+
+        ratios.pin()
+        sys.exit(0 if ratios.run(arguments.quick) else 1)
     elif arguments.name == "design":
         from benchmarks.design import run as run_design
 

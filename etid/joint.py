@@ -18,7 +18,17 @@ from jaxtyping import Array
 from tqdm import tqdm
 
 from etid import estimation, shared_driver
-from etid.batch import LANES, Drivers, Refusal, StudyFits, planned, stacked, table, to_identify
+from etid.batch import (
+    LANES,
+    Drivers,
+    Refusal,
+    StudyFits,
+    each,
+    planned,
+    stacked,
+    table,
+    to_identify,
+)
 from etid.circuits import AbstractCircuit, SkinRC
 from etid.driver import Driver
 from etid.estimation import Window
@@ -52,7 +62,7 @@ def _alone(samples: Any, model: Joint, driver: Driver, window: Window) -> Loads:
         good = settled & jnp.isfinite(chi2) & ~estimation.misses(chi2, error)
         return Loads(spectrum, m.sample_rate, own, good, jnp.array(-1))
 
-    return jax.vmap(one)(samples)
+    return each(one, samples)
 
 
 @eqx.filter_jit
