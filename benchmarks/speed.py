@@ -9,7 +9,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import equinox as eqx
 import jax
@@ -34,7 +34,7 @@ from etid.transformer import ResistorLoad, SkinLoad
 
 SAMPLES = 33_330  # ten pulse periods at 200 kHz
 LOAD = SkinLoad(r_s=33.4e3, r_p=186e3, c_p=0.12e-9)
-ORDER_6: Any = scipy.signal.butter(6, 0.3)
+B, A = cast(tuple[np.ndarray, np.ndarray], scipy.signal.butter(6, 0.3))
 START = np.log([20e3, 100e3, 0.3e-9])  # typical values, a factor of two from the truth
 
 
@@ -92,8 +92,8 @@ def _filters(repeats: int) -> list[Line]:
     """One pass, gradient and normal equations of a filter of order 6 over ten periods."""
     generator = np.random.default_rng(0)
     x = generator.normal(size=SAMPLES)
-    reference = median_time(lambda: scipy.signal.lfilter(*ORDER_6, x), repeats)
-    data, b, a = jnp.asarray(x), *map(jnp.asarray, ORDER_6)
+    reference = median_time(lambda: scipy.signal.lfilter(B, A, x), repeats)
+    data, b, a = map(jnp.asarray, (x, B, A))
     forward = jax.jit(lambda b: lfilter(b, a, data)[0])
     gradient = jax.jit(jax.grad(lambda b: jnp.sum(lfilter(b, a, data)[0] ** 2)))
 
@@ -171,14 +171,13 @@ def _solvers(lanes: int, repeats: int) -> list[Line]:
     value = jax.jit(lambda own: terms(own, first))
     slope = jax.jit(jax.jacfwd(lambda own: terms(own, first)))
 
-    def slope_of(q) -> Any:
-        return np.asarray(slope(q))
+    by_slope: Any = lambda q: np.asarray(slope(q))  # noqa: E731 - SciPy's stubs want a name
 
     def by_scipy():
         return scipy.optimize.least_squares(
             lambda q: np.asarray(value(q)),
             np.asarray(start),
-            jac=slope_of,
+            jac=by_slope,
             method="lm",
             x_scale="jac",
         )
@@ -206,7 +205,7 @@ def _raw_to_fit(lanes: int, repeats: int) -> list[Line]:
         return each(one, samples)
 
     record = np.asarray(problem.lanes[0][0])
-    reference = median_time(lambda: scipy.signal.lfilter(*ORDER_6, record), repeats)
+    reference = median_time(lambda: scipy.signal.lfilter(B, A, record), repeats)
     ours = median_time(lambda: fit(problem.lanes).circuit.values(), repeats) / lanes
     return [_costs(f"raw to fit / scipy lfilter, {lanes} lanes", ours, reference, 0.5)]
 
