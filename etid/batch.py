@@ -36,7 +36,7 @@ from etid.results import LABELS, Fit, Fits, IdentificationError
 from etid.study import Study
 from etid.verdicts import message
 
-LANES = 8  # of one call, the last of which is filled up: a study compiles once per length
+LANES = 4  # of one call, the last of which is filled up: a study compiles once per length
 
 
 @eqx.filter_jit

@@ -104,7 +104,7 @@ def test_a_run_of_other_settings_is_not_resumed(source, tmp_path, monkeypatch):
     os.utime(source)
     with pytest.raises(ResumeError, match="another source date"):
         fit_file(source, target, method=METHOD, order=4, resume=True)
-    fit_file(source, target, method=METHOD, order=4)  # anew
+    fit_file(source, target, method=METHOD)  # anew
     assert etid.Fits.read(target).counts()
 
 
