@@ -98,6 +98,14 @@ def normal_equations(
     return NormalEquations(jnp.where(finite, objective, jnp.inf), gradient, jacobian.T @ jacobian)
 
 
+def empty(y: Float[Array, " parameter"], args: Any = None) -> NormalEquations:
+    """Normal equations of zeros."""
+    del args
+    return NormalEquations(
+        jnp.zeros((), y.dtype), jnp.zeros_like(y), jnp.zeros((y.size, y.size), y.dtype)
+    )
+
+
 def best_start(
     residual: Callable[[Float[Array, " parameter"]], Float[Array, " sample"]],
     starts: Float[Array, "start parameter"],
@@ -118,7 +126,7 @@ def second_order(
     def value(y):
         return residual(y, args)
 
-    # By differences, which the solver may be content with: nested derivatives compile twice as long.
+    # By differences, which are good enough for a step: nested derivatives compile twice as long.
     ends = jax.vmap(value)(y[None, :] + DIFFERENCE * jnp.array([[1.0], [-1.0]]) * step[None, :])
     middle, pullback = jax.vjp(value, y)
     return pullback((ends.sum(0) - 2 * middle) / DIFFERENCE**2)[0]
@@ -167,6 +175,7 @@ class LevenbergMarquardt(optx.AbstractLeastSquaresSolver):
         equations: Evaluates the normal equations of `fn(y, args)`. With a descent that knows their
             kind, a problem of many parameters can keep its structure.
         second_order: Evaluates Jᵀ r″ of `fn(y, args)`.
+        empty: Makes normal equations of zeros, for parameters and `args`.
     """
 
     rtol: float = 1e-6
@@ -182,12 +191,12 @@ class LevenbergMarquardt(optx.AbstractLeastSquaresSolver):
     geodesic: bool = False
     equations: Callable[[Callable, Array, Any], AbstractNormalEquations] = normal_equations
     second_order: Callable[[Callable, Array, Array, Any], Array] = second_order
+    empty: Callable[[Array, Any], AbstractNormalEquations] = empty
 
     def init(self, fn, y, args, options, f_struct, aux_struct, tags) -> _State:
         """Set up an empty state; the first step evaluates `y` itself."""
-        del options, f_struct, aux_struct, tags
-        shapes = jax.eval_shape(lambda: self.equations(_value(fn), y, args))
-        zero = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
+        del fn, options, f_struct, aux_struct, tags
+        zero = self.empty(y, args)
         return _State(
             first_step=jnp.array(True),
             y_eval=y,

@@ -47,6 +47,11 @@ def _equations(_, y: Float[Array, " parameter"], study: DriverStudy) -> Arrowhea
     )
 
 
+def _empty(y: Float[Array, " parameter"], study: DriverStudy) -> ArrowheadEquations:
+    shapes = jax.eval_shape(lambda: _equations(None, y, study))
+    return jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
+
+
 def _second_order(_, y, step, study: DriverStudy) -> Float[Array, " parameter"]:
     """Jᵀ r″ of a study, load by load."""
     (common, parts), (towards, steps) = study.split(y), study.split(step)
@@ -92,6 +97,7 @@ def fit(
         descent=EliminationDescent(),
         equations=_equations,
         second_order=_second_order,
+        empty=_empty,
     )
     solution = optx.least_squares(
         lambda y, study: study(y), solver, study.start(), study, max_steps=MAX_STEPS, throw=False

@@ -62,6 +62,7 @@ def test_the_gain_is_that_of_the_divider(driver):
     np.testing.assert_allclose(g, expected, rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_a_skin_tells_more_of_its_elements_with_its_calibration_than_after_it(study, driver):
     """Joint estimation uses what the skin's record says about Z_th: no error may grow by it."""
     joint = etid.identify_skin(study["loaded/0"], driver)

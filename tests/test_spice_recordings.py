@@ -56,8 +56,17 @@ def errors(result, true):
     )
 
 
-@pytest.mark.parametrize("method", SKIN_BIAS)
-@pytest.mark.parametrize("name", ["clean_dry", "clean_damp", "clean_resistors"])
+@pytest.mark.parametrize(
+    ("name", "method"),
+    [
+        ("clean_dry", "maximum_likelihood"),
+        ("clean_damp", "maximum_likelihood"),
+        ("clean_resistors", "maximum_likelihood"),
+        ("clean_dry", "output_error"),
+        ("clean_damp", "output_error"),
+        pytest.param("clean_resistors", "output_error", marks=pytest.mark.slow),
+    ],
+)
 def test_without_noise_the_elements_are_those_of_the_netlist(spice, name, method):
     result, true = spice(name, method)
     assert set(result.fits.verdicts) == {"successful"}, (result.failures, result.fits.counts())
