@@ -131,6 +131,7 @@ def test_ten_decibels_of_noise_give_the_root_of_ten_in_the_errors():
     assert (np.abs(ratio / np.sqrt(10) - 1) < 0.3).all()
 
 
+@pytest.mark.slow
 def test_a_driver_serves_another_sample_rate(study):
     fast = scene(sample_rate=500e3, samples=8334).simulate(seed=2)
     driver = etid.identify_driver(fast["calibration/98k8"])

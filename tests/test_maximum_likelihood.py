@@ -99,6 +99,7 @@ def test_a_period_cut_in_the_middle_of_an_edge_is_not_periodic(study):
         )
 
 
+@pytest.mark.slow
 def test_a_batch_of_both_kinds_is_mixed_and_each_is_right(study, driver):
     record = study["loaded/1"]
     short = record.replace(v_th=record.v_th[:2500], v_out=record.v_out[:2500])

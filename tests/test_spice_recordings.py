@@ -62,8 +62,9 @@ def errors(result, true):
         ("clean_dry", "maximum_likelihood"),
         ("clean_damp", "maximum_likelihood"),
         ("clean_resistors", "maximum_likelihood"),
-        ("clean_dry", "output_error"),
-        ("clean_damp", "output_error"),
+        # One pulse, below, is by output error too; these compile for a minute.
+        pytest.param("clean_dry", "output_error", marks=pytest.mark.slow),
+        pytest.param("clean_damp", "output_error", marks=pytest.mark.slow),
         pytest.param("clean_resistors", "output_error", marks=pytest.mark.slow),
     ],
 )
