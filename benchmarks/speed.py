@@ -7,7 +7,6 @@ import os
 import subprocess
 import sys
 import tempfile
-import time
 from collections.abc import Callable
 from typing import Any, NamedTuple, cast
 
@@ -20,6 +19,7 @@ import scipy.optimize
 import scipy.signal
 
 import etid
+from benchmarks.timing import first_and_warm, import_time
 from etid import estimation
 from etid.batch import each
 from etid.circuits import SkinRC
@@ -71,13 +71,7 @@ def pin() -> None:
 
 def median_time(call: Callable[[], Any], repeats: int) -> float:
     """Median wall time [s] after a first call."""
-    jax.block_until_ready(call())
-    times = []
-    for _ in range(repeats):
-        start = time.perf_counter()
-        jax.block_until_ready(call())
-        times.append(time.perf_counter() - start)
-    return float(np.median(times))
+    return first_and_warm(call, repeats)[1]
 
 
 def _costs(name: str, ours: float, theirs: float, target: float) -> Line:
@@ -223,16 +217,10 @@ print(time.perf_counter() - begin)
 
 
 def _imports() -> Line:
-    def seconds(module):
-        code = f"import time; t = time.perf_counter(); {module}; print(time.perf_counter() - t)"
-        command = [sys.executable, "-c", code]
-        runs = [subprocess.run(command, capture_output=True, check=True).stdout for _ in range(3)]
-        return float(np.median([float(run) for run in runs]))
-
     return _costs(
         "import etid / import jax, optimistix",
-        seconds("import etid"),
-        seconds("import jax, optimistix"),
+        import_time("import etid"),
+        import_time("import jax, optimistix"),
         1.3,
     )
 

@@ -16,7 +16,7 @@ from etid.identify import METHODS
 REPEATS = 7
 
 
-def _import_time(module: str) -> float:
+def import_time(module: str) -> float:
     """Wall time [s] of importing a module in a fresh interpreter, median of 3."""
     code = f"import time; t = time.perf_counter(); {module}; print(time.perf_counter() - t)"
     runs = [
@@ -30,7 +30,7 @@ def _import_time(module: str) -> float:
     return float(np.median(runs))
 
 
-def _time(call: Callable[[], Any], repeats: int) -> tuple[float, float]:
+def first_and_warm(call: Callable[[], Any], repeats: int) -> tuple[float, float]:
     """Wall time [s] of the first call and the median of the next ones."""
     runs = []
     for _ in range(repeats + 1):
@@ -42,24 +42,24 @@ def _time(call: Callable[[], Any], repeats: int) -> tuple[float, float]:
 
 def run(lanes: int) -> None:
     """Print the table."""
-    base = _import_time("import jax, optimistix")
-    own = _import_time("import etid")
+    base = import_time("import jax, optimistix")
+    own = import_time("import etid")
     print(f"import jax + optimistix      {base:8.2f} s")
     print(f"import etid                  {own:8.2f} s   ratio {own / base:.2f}")
     study = etid.scenes.paper_dry().simulate(seed=0)
     calibration = next(iter(study.calibrations.recordings()))
     recordings = list(study.loaded.recordings())
     many = (recordings * (lanes // len(recordings) + 1))[:lanes]
-    first, warm = _time(lambda: etid.identify_driver(calibration, throw=False), 3)
+    first, warm = first_and_warm(lambda: etid.identify_driver(calibration, throw=False), 3)
     print(f"driver, first call           {first:8.2f} s   warm {warm:.3f} s")
     driver = etid.identify_driver(calibration, throw=False)
     for method in METHODS:
         fit = functools.partial(
             etid.identify_skin, recordings[0], driver, method=method, throw=False
         )
-        first, warm = _time(fit, REPEATS)
+        first, warm = first_and_warm(fit, REPEATS)
         print(f"skin {method:<18} first {first:8.2f} s   warm {1e3 * warm:.1f} ms")
         fits = functools.partial(etid.identify_skins, many, driver, method=method)
-        first, warm = _time(lambda fits=fits: fits().chi2, 3)
+        first, warm = first_and_warm(lambda fits=fits: fits().chi2, 3)
         each = 1e3 * warm / lanes
         print(f"  batch of {lanes:<12} first {first:8.2f} s   warm {each:.1f} ms per fit")

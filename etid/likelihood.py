@@ -22,7 +22,7 @@ from jaxtyping import Array, Bool, Complex, Float
 
 from etid.driver import SourceImpedance
 from etid.spectra import Spectrum, local_sum, signal_share
-from etid.transfer import Rational, as_complex, frequency_variable, power, reciprocal
+from etid.transfer import Rational, as_complex, delayed, frequency_variable, power, reciprocal
 
 SURE = 4.0  # standard deviations of a local variance
 
@@ -42,8 +42,7 @@ def delayed_gain(
     delay: Float[Array, ""],
 ) -> Complex[Array, " harmonic"]:
     """G e^(−jωτ), for a delay τ in seconds."""
-    turn = -2 * jnp.pi * frequency * delay
-    return gain(source, load, frequency) * jax.lax.complex(jnp.cos(turn), jnp.sin(turn))
+    return delayed(gain(source, load, frequency), frequency, delay)
 
 
 def variance(spectrum: Spectrum, g: Complex[Array, " harmonic"]) -> Float[Array, " harmonic"]:

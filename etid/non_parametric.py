@@ -28,22 +28,11 @@ from etid.likelihood import as_list, excess, same_unloaded
 from etid.output_error import DELAY_WIDTH, MAX_STEPS, SOLVER, Estimate
 from etid.results import complex_rrse
 from etid.spectra import Spectrum, signal_share
-from etid.transfer import as_complex, frequency_variable, power, reciprocal
+from etid.transfer import as_complex, delayed, frequency_variable, power, reciprocal
 
 CLEAR = 0.97  # share of signal in the power of a calibration's Y, 15 dB
 PAIRS = 4  # of draws by which bias is estimated
 SEED = 1994
-
-
-def _advanced(
-    y: Complex[Array, " harmonic"],
-    frequency: Float[Array, " harmonic"],
-    delay: Float[Array, ""],
-    rate: Float[Array, ""],
-) -> Complex[Array, " harmonic"]:
-    """Coefficients of a record as if triggered `delay` samples earlier."""
-    turn = 2 * jnp.pi * frequency * (delay / rate)
-    return y * jax.lax.complex(jnp.cos(turn), jnp.sin(turn))
 
 
 def _clear(calibrations: list[Spectrum]) -> Bool[Array, "calibration harmonic"]:
@@ -98,7 +87,7 @@ class _Model(eqx.Module):
         z, by_x, by_y, weights = [], [], [], []
         late = q[-self.r_load.size - 1 : -1]
         for r, delay, s, clear in zip(self.r_load, late, records[:-1], self.clear, strict=True):
-            inverse_y = reciprocal(_advanced(s.y, s.frequency, delay, self.calibration_rate))
+            inverse_y = reciprocal(delayed(s.y, s.frequency, -delay / self.calibration_rate))
             slope = as_complex(r) * inverse_y
             one = slope * s.x - as_complex(r)
             variance = power(slope * s.x * inverse_y) * s.variance_y
@@ -134,7 +123,7 @@ class _Model(eqx.Module):
 
     def _in_time(self, q, records):
         spectrum = records[-1]
-        return _advanced(spectrum.y, spectrum.frequency, q[-1], self.sample_rate)
+        return delayed(spectrum.y, spectrum.frequency, -q[-1] / self.sample_rate)
 
     def terms(self, q: Float[Array, " q"], records: list[Spectrum]) -> Float[Array, " term"]:
         """Scaled e, the weak priors of the delays, and what calibrations say of each other's."""
@@ -154,7 +143,7 @@ class _Model(eqx.Module):
         spectrum, of = records[-1], self.z_th(q, records)
         load = self.load(q, spectrum.frequency)
         g = load * reciprocal(load + of.z)
-        y = _advanced(g * spectrum.x, spectrum.frequency, -q[-1], self.sample_rate)
+        y = delayed(g * spectrum.x, spectrum.frequency, q[-1] / self.sample_rate)
         return [*records[:-1], eqx.tree_at(lambda s: s.y, spectrum, y)]
 
     def private(self, q: Float[Array, " q"], records: list[Spectrum]) -> Float[Array, " harmonic"]:

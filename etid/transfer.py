@@ -113,6 +113,14 @@ def frequency_variable(frequency: Float[Array, "..."]) -> Complex[Array, "..."]:
     return jax.lax.complex(jnp.zeros_like(frequency), 2 * jnp.pi * frequency)
 
 
+def delayed(
+    value: Complex[Array, "..."], frequency: Float[Array, "..."], delay: Float[Array, ""]
+) -> Complex[Array, "..."]:
+    """`value` · e^(−j 2π f τ) at real frequencies [Hz], for a delay τ [s]."""
+    turn = -2 * jnp.pi * frequency * delay
+    return value * jax.lax.complex(jnp.cos(turn), jnp.sin(turn))
+
+
 def delay_variable(
     frequency: Float[Array, "..."], sample_rate: float | Float[Array, ""]
 ) -> Complex[Array, "..."]:
