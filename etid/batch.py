@@ -8,7 +8,7 @@ with a recording costs that recording alone: it gets a verdict and a note.
 
 import dataclasses
 import functools
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 import equinox as eqx
@@ -20,34 +20,35 @@ from tqdm import tqdm
 
 from etid.circuits import AbstractCircuit, SkinRC
 from etid.driver import Driver
-from etid.estimation import Window
+from etid.given_driver import GivenDriver
 from etid.identify import (
     Method,
-    arrays,
     check_method,
     failed_fit,
     identify_driver,
+    is_shared,
+    known_driver,
+    lane,
     plan,
     skin_lane,
-    window,
 )
 from etid.recording import Metadata, Recording, RecordingError
 from etid.results import LABELS, Fit, Fits, IdentificationError
 from etid.study import Study
 from etid.verdicts import message
 
-LANES = 4  # of one call, the last of which is filled up: a study compiles once per length
+LANES = 16  # of one call, the last of which is filled up: a study compiles once per length
 
 
 @eqx.filter_jit
 def _chunk(
-    samples: Any,
+    lanes: Any,
     driver: Driver,
+    known: GivenDriver | None,
     circuit: AbstractCircuit,
     method: Method,
-    window: Window | None,
 ) -> Fit:
-    return each(lambda lane: skin_lane(lane, driver, circuit, method, window), samples)
+    return each(lambda lane: skin_lane(lane, driver, known, circuit, method), lanes)
 
 
 def each(fit: Callable[[Any], Any], lanes: Any) -> Any:
@@ -117,33 +118,34 @@ def stacked(lanes: Sequence[tuple[np.ndarray, ...]]) -> tuple[Array, ...]:
 
 
 class _Queue:
-    """Recordings of one length, window and driver, waiting to fill a chunk."""
+    """Recordings that one compiled function takes, with one driver, waiting to fill a chunk."""
 
     def __init__(
         self,
         driver: Driver,
+        known: GivenDriver | None,
         circuit: AbstractCircuit,
         method: Method,
-        window: Window | None,
     ):
         self.driver = driver
-        self.window = window
+        self.known = known
         self.circuit = circuit
         self.method: Method = method
         self.rows: list[int] = []
         self.lanes: list[tuple[np.ndarray, ...]] = []
 
-    def add(self, row: int, recording: Recording) -> None:
-        self.rows.append(row)
-        self.lanes.append(arrays(recording))
-
     def run(self) -> Iterable[tuple[int, Fit]]:
         """Fit what is waiting."""
-        samples = stacked(self.lanes)
-        fits = jax.device_get(_chunk(samples, self.driver, self.circuit, self.method, self.window))
-        for lane, row in enumerate(self.rows):
-            yield row, jax.tree.map(lambda leaf, lane=lane: leaf[lane], fits)
+        lanes = stacked(self.lanes)
+        fits = jax.device_get(_chunk(lanes, self.driver, self.known, self.circuit, self.method))
+        yield from zip(self.rows, unstacked(fits), strict=False)  # the last one fills it up
         self.rows, self.lanes = [], []
+
+
+def unstacked(fits: Fit) -> Iterator[Fit]:
+    """The fits of a chunk one by one."""
+    leaves, structure = jax.tree.flatten(fits)
+    return (jax.tree.unflatten(structure, one) for one in zip(*leaves, strict=True))
 
 
 def _identify(
@@ -157,7 +159,7 @@ def _identify(
     fits: dict[int, Fit] = {}
     notes = [""] * count
     used: list[str] = []
-    queues: dict[tuple[int, int, Method, Window | None], _Queue] = {}
+    queues: dict[tuple[int, Method, int, bool, float, float], _Queue] = {}
 
     with tqdm(total=count, unit="fit", disable=not progress) as bar:
 
@@ -176,10 +178,15 @@ def _identify(
                 notes[row] = refusal.note
                 bar.update()
                 continue
-            part = window(recording, method, driver)
-            key = (id(driver), recording.v_th.size, method, part)
-            queue = queues.setdefault(key, _Queue(driver, circuit, method, part))
-            queue.add(row, recording)
+            waiting, shared = lane(recording, method), is_shared(recording, driver)
+            rates = recording.sample_rate, recording.pulse_rate
+            key = (id(driver), method, waiting[0].size, shared, *rates)
+            if key not in queues:
+                known = known_driver(waiting, driver, method, shared)
+                queues[key] = _Queue(driver, known, circuit, method)
+            queue = queues[key]
+            queue.rows.append(row)
+            queue.lanes.append(waiting)
             if len(queue.rows) == LANES:
                 run(queue)
         for queue in queues.values():

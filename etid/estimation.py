@@ -14,11 +14,20 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Complex, Float
 
-from etid import maximum_likelihood, non_parametric, output_error, prediction, steiglitz_mcbride
+from etid import (
+    given_driver,
+    harmonic_steiglitz_mcbride,
+    maximum_likelihood,
+    non_parametric,
+    output_error,
+    prediction,
+    steiglitz_mcbride,
+)
 from etid.circuits import AbstractCircuit, SkinRC
 from etid.driver import Driver, SourceImpedance
+from etid.given_driver import GivenDriver
 from etid.levenberg_marquardt import normal_equations
 from etid.measurement import Measurement
 from etid.results import Fit
@@ -156,84 +165,133 @@ def driver_by_steiglitz_mcbride(
 # --- Output error and maximum likelihood ---------------------------------------------------------
 
 
-def skin_starts(m: Measurement, driver: Driver, circuit: AbstractCircuit) -> AbstractCircuit:
-    """Several impedance levels and, for SkinRC, the paper's estimate, stacked."""
+def _starts(
+    circuit: AbstractCircuit, baseline: AbstractCircuit | None
+) -> Float[Array, "start element"]:
+    """Logarithms of elements: several impedance levels, and a simpler estimate of them."""
     typical = circuit.log_values()
     is_ohm = jnp.array([unit == "ohm" for unit in circuit.units().values()])
     sign = jnp.where(is_ohm, 1.0, -1.0)
     starts = [typical + float(np.log(level)) * sign for level in LEVELS]
-    if isinstance(circuit, SkinRC):
-        baseline = skin_by_steiglitz_mcbride(m, driver, steiglitz_mcbride.ITERATIONS)
-        values = baseline.circuit.values()
+    if baseline is not None:
+        values = baseline.values()
         usable = jnp.all(values > 0) & jnp.isfinite(values).all()
         starts.append(jnp.where(usable, jnp.log(jnp.where(usable, values, 1.0)), typical))
-    return circuit.with_log_values(jnp.stack(starts))
+    return jnp.stack(starts)
 
 
 class Window(NamedTuple):
-    """What a method on harmonics must know of a record before it is compiled.
+    """Which part of a record holds whole periods (`spectra.whole_periods`).
 
     Attributes:
-        periods: Whole periods (`spectra.whole_periods`).
+        periods: Their number.
         samples: The samples nearest to them.
-        shared: Whether the unloaded record may be that of a calibration.
-        parametric: Whether Z_th is what was identified, or the harmonics of the calibrations.
     """
 
     periods: int
     samples: int
-    shared: bool
-    parametric: bool = True
 
 
 def spectrum_of(m: Measurement, window: Window) -> Spectrum:
     """Harmonics of one recording."""
-    return spectrum(
-        m.v_th, m.v_out, m.sigma_th, m.sigma_out, m.sample_rate, window.periods, window.samples
-    )
+    fields = spectrum(m.v_th, m.v_out, m.sigma_th, m.sigma_out, m.sample_rate, *window)
+    return Spectrum(*map(jnp.asarray, fields))
 
 
-def skin_by_refinement(
-    m: Measurement, driver: Driver, circuit: AbstractCircuit, window: Window | None
-) -> Fit:
+def skin_by_output_error(m: Measurement, driver: Driver, circuit: AbstractCircuit) -> Fit:
     """Refine from the best of several starts.
 
     Args:
         m: One recording.
         driver: Its driver, with a continuous source impedance.
         circuit: Structure and typical values.
-        window: For methods on harmonics; None for output error.
     """
     source, source_cov, calibration = driver.source, driver.cov, driver.calibration
-    if source is None or source_cov is None or calibration is None:
-        raise ValueError("the driver has no continuous source impedance")
-    starts = skin_starts(m, driver, circuit)
-    if window is None:
-        _, estimate = output_error.fit_circuit(
-            prediction.prepare(m), source, source_cov, calibration, starts
-        )
-        return judged(estimate, circuit, driver.result, "output_error")
-    if not window.parametric:
-        estimate, bias = non_parametric.fit_circuit(
-            circuit,
-            calibration,
-            jnp.asarray(driver.sample_rate),
-            spectrum_of(m, window),
-            m.sample_rate,
-            starts.log_values(),
-        )
-        # It needs the harmonics of the driver, whether or not a model of them was found.
-        fit = judged(estimate, circuit, SUCCESSFUL, "non_parametric")
-        far = jnp.any(jnp.abs(bias) > CORRECTED * jnp.sqrt(jnp.diagonal(estimate.cov)))
-        result = RESULTS.where(far & (fit.result == SUCCESSFUL), RESULTS.biased, fit.result)
-        return dataclasses.replace(fit, result=result)
-    model = maximum_likelihood.Joint(
-        circuit, source, calibration, jnp.asarray(driver.sample_rate), window.shared
+    assert source is not None  # check_driver
+    assert source_cov is not None
+    assert calibration is not None
+    baseline = None
+    if isinstance(circuit, SkinRC):
+        baseline = skin_by_steiglitz_mcbride(m, driver, steiglitz_mcbride.ITERATIONS).circuit
+    starts = circuit.with_log_values(_starts(circuit, baseline))
+    _, estimate = output_error.fit_circuit(
+        prediction.prepare(m), source, source_cov, calibration, starts
     )
-    estimate = maximum_likelihood.fit_circuit(
-        model, spectrum_of(m, window), m.sample_rate, starts.log_values()
+    return judged(estimate, circuit, driver.result, "output_error")
+
+
+def calibrations_of(driver: Driver) -> maximum_likelihood.Calibrations:
+    """The likelihood of the calibrations of a driver that was identified on their harmonics."""
+    assert driver.source is not None  # check_driver
+    assert driver.calibration is not None
+    return maximum_likelihood.Calibrations(
+        driver.source, driver.calibration, jnp.asarray(driver.sample_rate)
     )
+
+
+def given(driver: Driver, frequency: Float[Array, " harmonic"], shared: bool) -> GivenDriver:
+    """What `skin_by_maximum_likelihood` needs of a driver, the same for all its loads.
+
+    Args:
+        driver: The driver.
+        frequency: Harmonics of the loads [Hz].
+        shared: Whether the unloaded record of a load may be that of a calibration.
+    """
+    return given_driver.given(calibrations_of(driver), frequency, shared)
+
+
+def harmonic_starts(
+    spectrum: Spectrum, z_th: Complex[Array, " harmonic"], circuit: AbstractCircuit
+) -> Float[Array, "start element"]:
+    """Logarithms of elements from which a fit on harmonics may start.
+
+    Args:
+        spectrum: One recording.
+        z_th: Source impedance there [Ω].
+        circuit: Structure and typical values.
+    """
+    if not isinstance(circuit, SkinRC):
+        return _starts(circuit, None)
+    return _starts(circuit, harmonic_steiglitz_mcbride.fit_skin(spectrum, z_th).circuit)
+
+
+def skin_by_maximum_likelihood(
+    spectrum: Spectrum,
+    sample_rate: Float[Array, ""],
+    driver: Driver,
+    known: GivenDriver,
+    circuit: AbstractCircuit,
+) -> Fit:
+    """Refine from the best of several starts, jointly with what the driver leaves open.
+
+    Args:
+        spectrum: One recording.
+        sample_rate: Its sampling rate [Hz].
+        driver: Its driver.
+        known: What its calibrations tell.
+        circuit: Structure and typical values.
+    """
+    starts = harmonic_starts(spectrum, known.z_th(jnp.zeros_like(known.loaded)), circuit)
+    estimate = given_driver.fit_circuit(known, circuit, spectrum, sample_rate, starts)
     return judged(estimate, circuit, driver.result, "maximum_likelihood")
+
+
+def skin_by_non_parametric(
+    spectrum: Spectrum, sample_rate: Float[Array, ""], driver: Driver, circuit: AbstractCircuit
+) -> Fit:
+    """The same with Z_th as the calibrations show it at each harmonic."""
+    source, calibration = driver.source, driver.calibration
+    assert source is not None  # check_driver
+    assert calibration is not None
+    starts = harmonic_starts(spectrum, source.response(spectrum.frequency), circuit)
+    estimate, bias = non_parametric.fit_circuit(
+        circuit, calibration, jnp.asarray(driver.sample_rate), spectrum, sample_rate, starts
+    )
+    # It needs the harmonics of the driver, whether or not a model of them was found.
+    fit = judged(estimate, circuit, SUCCESSFUL, "non_parametric")
+    far = jnp.any(jnp.abs(bias) > CORRECTED * jnp.sqrt(jnp.diagonal(estimate.cov)))
+    result = RESULTS.where(far & (fit.result == SUCCESSFUL), RESULTS.biased, fit.result)
+    return dataclasses.replace(fit, result=result)
 
 
 def judged(
@@ -332,7 +390,7 @@ def driver_by_refinement(
         m: Calibrations, stacked along a leading axis.
         r_load: Their resistors [Ω].
         order: Number of poles.
-        window: As in `skin_by_refinement`.
+        window: For maximum likelihood; None for output error.
     """
     baseline = driver_by_steiglitz_mcbride(m, r_load, order, steiglitz_mcbride.ITERATIONS)
     starts = source_starts(baseline.a, order, m.sample_rate[0], r_load.mean())

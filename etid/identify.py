@@ -16,12 +16,13 @@ from etid.circuits import AbstractCircuit, Resistor, SkinRC
 from etid.driver import Driver
 from etid.estimation import Window
 from etid.filtering import TAPS
-from etid.measurement import measure
+from etid.given_driver import GivenDriver
+from etid.measurement import measure, noise
 from etid.precision import require_float64
 from etid.preflight import is_periodic, preflight, recorded_periods, resolution
 from etid.recording import Recording
 from etid.results import Fit, IdentificationError
-from etid.spectra import separates_aliases, whole_periods
+from etid.spectra import Spectrum, separates_aliases, spectrum, whole_periods
 from etid.verdicts import message, verdict
 
 Method = Literal[
@@ -132,7 +133,7 @@ def check_driver(driver: Driver, method: Method, sample_rate: float) -> None:
 
 
 def arrays(recording: Recording) -> tuple[np.ndarray, ...]:
-    """What a lane needs of a recording: both voltages, both resolutions, the sample rate."""
+    """Both voltages, both resolutions, and the sample rate."""
     return (
         recording.v_th,
         recording.v_out,
@@ -142,19 +143,33 @@ def arrays(recording: Recording) -> tuple[np.ndarray, ...]:
     )
 
 
+def lane(recording: Recording, method: Method) -> tuple[np.ndarray, ...]:
+    """What is fitted of a recording: its harmonics and their noise, or its samples.
+
+    The harmonics are evaluated without JAX, which would compile for every length of a record.
+    """
+    if method not in HARMONIC:
+        return arrays(recording)
+    v_th, v_out, step_th, step_out, rate = arrays(recording)
+    sigma_th, sigma_out = noise(v_th, step_th), noise(v_out, step_out)
+    periods = recorded_periods(recording)
+    fields = spectrum(v_th, v_out, sigma_th, sigma_out, rate, *periods)
+    return *map(np.asarray, fields), rate
+
+
 def checksum(recording: Recording) -> int:
     """What tells an unloaded record from others."""
     return zlib.crc32(recording.v_th.tobytes())
 
 
-def window(recording: Recording, method: Method, driver: Driver | None = None) -> Window | None:
-    """What the method must know of a record before it is compiled."""
-    if method not in HARMONIC:
-        return None
-    calibration = None if driver is None else driver.calibration
-    known = None if calibration is None else calibration.unloaded
-    shared = known is None or checksum(recording) in known
-    return Window(*recorded_periods(recording), shared, method != "non_parametric")
+def is_shared(recording: Recording, driver: Driver) -> bool:
+    """Whether the unloaded record of a recording may be that of a calibration."""
+    known = None if driver.calibration is None else driver.calibration.unloaded
+    return known is None or checksum(recording) in known
+
+
+def _window(recording: Recording, method: Method) -> Window | None:
+    return Window(*recorded_periods(recording)) if method in HARMONIC else None
 
 
 @eqx.filter_jit
@@ -171,18 +186,38 @@ def _driver(
     return estimation.driver_by_steiglitz_mcbride(m, r_load, order, _iterations(method))
 
 
+@eqx.filter_jit
+def given(driver: Driver, frequency: Float[Array, " harmonic"], shared: bool) -> GivenDriver:
+    """What all loads of a driver need to know of it for maximum likelihood."""
+    return estimation.given(driver, frequency, shared)
+
+
+def known_driver(
+    lane: tuple[np.ndarray, ...], driver: Driver, method: Method, shared: bool
+) -> GivenDriver | None:
+    """`given`, if the method needs it, for this lane and all with harmonics like it."""
+    if method != "maximum_likelihood":
+        return None
+    return given(driver, jnp.asarray(lane[0]), shared)
+
+
 def skin_lane(
-    samples: Any,
+    lane: Any,
     driver: Driver,
+    known: GivenDriver | None,
     circuit: AbstractCircuit,
     method: Method,
-    window: Window | None,
 ) -> Fit:
     """Identify one lane; differentiable code, to be jitted and batched by the caller."""
-    m = measure(*samples)
-    if method in CONTINUOUS:
-        return estimation.skin_by_refinement(m, driver, circuit, window)
-    return estimation.skin_by_steiglitz_mcbride(m, driver, _iterations(method))
+    if method not in HARMONIC:
+        m = measure(*lane)
+        if method == "output_error":
+            return estimation.skin_by_output_error(m, driver, circuit)
+        return estimation.skin_by_steiglitz_mcbride(m, driver, _iterations(method))
+    *fields, rate = lane
+    if known is None:
+        return estimation.skin_by_non_parametric(Spectrum(*fields), rate, driver, circuit)
+    return estimation.skin_by_maximum_likelihood(Spectrum(*fields), rate, driver, known, circuit)
 
 
 _skin = eqx.filter_jit(skin_lane)
@@ -241,7 +276,7 @@ def identify_driver(
         jnp.asarray(np.stack(column)) for column in zip(*map(arrays, records), strict=True)
     )
     r_load = jnp.asarray([record.r_load for record in records])
-    driver = _driver(samples, r_load, order, method, window(records[0], method))
+    driver = _driver(samples, r_load, order, method, _window(records[0], method))
     if driver.calibration is not None:
         unloaded = np.array([checksum(record) for record in records])
         calibration = dataclasses.replace(driver.calibration, unloaded=unloaded)
@@ -290,8 +325,9 @@ def identify_skin(
     if name is not None:
         fit = failed_fit(name, circuit, chosen)
     else:
-        samples = tuple(map(jnp.asarray, arrays(recording)))
-        fit = _skin(samples, driver, circuit, chosen, window(recording, chosen, driver))
+        one = lane(recording, chosen)
+        known = known_driver(one, driver, chosen, is_shared(recording, driver))
+        fit = _skin(tuple(map(jnp.asarray, one)), driver, known, circuit, chosen)
     if throw and fit.verdict != "successful":
         text = f"recording {recording.path!r}: {fit.verdict}. {message(fit.verdict)}"
         raise IdentificationError(text, fit)
@@ -341,14 +377,13 @@ def identify_samples(
         raise ValueError(f"{v_out.shape[0]} samples hold no whole pulse period")
     step = jnp.asarray(resolution, dtype=v_out.dtype)
     rate = jnp.asarray(sample_rate, dtype=v_out.dtype)
-    samples = (v_th, v_out, step, step, rate)
-    return skin_lane(
-        samples,
-        driver,
-        circuit,
-        method,
-        Window(*periods, True, method != "non_parametric") if method in HARMONIC else None,
-    )
+    samples, known = (v_th, v_out, step, step, rate), None
+    if method in HARMONIC:
+        found = estimation.spectrum_of(measure(*samples), Window(*periods))
+        samples = (*jax.tree.leaves(found), rate)
+        if method == "maximum_likelihood":
+            known = estimation.given(driver, found.frequency, True)
+    return skin_lane(samples, driver, known, circuit, method)
 
 
 @eqx.filter_jit

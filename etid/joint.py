@@ -28,17 +28,17 @@ from etid.batch import (
     stacked,
     table,
     to_identify,
+    unstacked,
 )
 from etid.circuits import AbstractCircuit, SkinRC
 from etid.driver import Driver
-from etid.estimation import Window
-from etid.identify import arrays, checksum, failed_fit, window
+from etid.identify import HARMONIC, checksum, failed_fit, is_shared, lane
 from etid.maximum_likelihood import Joint, fit_load
-from etid.measurement import measure
 from etid.precision import require_float64
 from etid.recording import Recording
 from etid.results import Fit
 from etid.shared_terms import Loads
+from etid.spectra import Spectrum
 from etid.study import Study
 from etid.verdicts import RESULTS, message
 
@@ -50,19 +50,20 @@ SINGLE = (
 
 
 @eqx.filter_jit
-def _alone(samples: Any, model: Joint, driver: Driver, window: Window) -> Loads:
+def _alone(lanes: Any, model: Joint) -> Loads:
     """Loads identified one by one with Z_th as it is, where a joint fit may start."""
 
     def one(lane):
-        m = measure(*lane)
-        spectrum = estimation.spectrum_of(m, window)
-        starts = estimation.skin_starts(m, driver, model.circuit).log_values()
-        own, result, chi2, error = fit_load(model, spectrum, m.sample_rate, starts)
+        *fields, sample_rate = lane
+        spectrum = Spectrum(*fields)
+        z_th = model.calibrations.source.response(spectrum.frequency)
+        starts = estimation.harmonic_starts(spectrum, z_th, model.circuit)
+        own, result, chi2, error = fit_load(model, spectrum, sample_rate, starts)
         settled = RESULTS.promote(result) == RESULTS.successful
         good = settled & jnp.isfinite(chi2) & ~estimation.misses(chi2, error)
-        return Loads(spectrum, m.sample_rate, own, good, jnp.array(-1))
+        return Loads(spectrum, sample_rate, own, good, jnp.array(-1))
 
-    return each(one, samples)
+    return each(one, lanes)
 
 
 @eqx.filter_jit
@@ -84,12 +85,12 @@ def _together(
         )
         return estimation.judged(with_scale, model.circuit, driver.result, METHOD)
 
-    split = model.sources
+    split = model.calibrations.sources
     better = eqx.tree_at(
         lambda d: (d.source, d.cov, d.calibration.delay, d.result),
         driver,
         (
-            model.z_th(common),
+            model.calibrations.z_th(common),
             cov[:split, :split],
             common[split:],
             RESULTS.where(
@@ -101,10 +102,10 @@ def _together(
 
 
 class _Waiting:
-    """Recordings of one length with one driver."""
+    """Recordings with equally many harmonics and one driver."""
 
-    def __init__(self, driver: Driver, model: Joint, window: Window):
-        self.driver, self.model, self.window = driver, model, window
+    def __init__(self, model: Joint):
+        self.model = model
         self.rows: list[int] = []
         self.lanes: list[tuple[np.ndarray, ...]] = []
         self.chunks: list[Loads] = []
@@ -113,7 +114,7 @@ class _Waiting:
     def add(self, row: int, recording: Recording) -> None:
         self.rows.append(row)
         self.unloaded.append(checksum(recording))
-        self.lanes.append(arrays(recording))
+        self.lanes.append(lane(recording, "maximum_likelihood"))
         if len(self.lanes) == LANES:
             self.run()
 
@@ -121,7 +122,7 @@ class _Waiting:
         count = len(self.lanes)
         if count == 0:
             return
-        loads = jax.device_get(_alone(stacked(self.lanes), self.model, self.driver, self.window))
+        loads = jax.device_get(_alone(stacked(self.lanes), self.model))
         self.chunks.append(jax.tree.map(lambda leaf: leaf[:count], loads))
         self.lanes = []
 
@@ -178,38 +179,34 @@ def identify_jointly(
     for row in tqdm(range(len(paths)), unit="recording", disable=not progress):
         try:
             recording, driver, method = planned(functools.partial(load, row), None)
-            part = window(recording, method, driver)
-            if part is None:
+            if method not in HARMONIC:
                 raise Refusal("not_periodic", SINGLE)
         except Refusal as refusal:
             fits[row] = failed_fit(refusal.name, circuit, METHOD)
             notes[row] = refusal.note
             continue
         lengths = waiting.setdefault(drivers.of(recording), {})
-        key = recording.v_th.size, part
+        shared = is_shared(recording, driver)
+        key = recording.v_th.size, shared
         if key not in lengths:
-            lengths[key] = _Waiting(driver, _model(circuit, driver, part.shared), part)
+            lengths[key] = _Waiting(_model(circuit, driver, shared))
         lengths[key].add(row, recording)
     for names, lengths in tqdm(waiting.items(), unit="driver", disable=not progress):
         driver = drivers.found[names]
         groups = [group.loads() for group in lengths.values()]
         several = tuple(len(group.several()) for group in lengths.values())
-        shared = any(group.window.shared for group in lengths.values())
+        shared = any(group.model.shared for group in lengths.values())
         tolerance = jnp.asarray(r_load_tolerance, dtype=float)
         model = _model(circuit, driver, shared)
         found, better = _together(model, groups, several, driver, tolerance)
         drivers.found[names] = dataclasses.replace(better, method=METHOD)
         for group, fit in zip(lengths.values(), jax.device_get(found), strict=True):
-            for lane, row in enumerate(group.rows):
-                fits[row] = jax.tree.map(lambda leaf, lane=lane: leaf[lane], fit)
-                notes[row] = message(fits[row].verdict)
+            for row, one in zip(group.rows, unstacked(fit), strict=True):
+                fits[row] = one
+                notes[row] = message(one.verdict)
     ordered = [fits[row] for row in range(len(paths))]
     return StudyFits(table(study, paths, ordered, notes), drivers.found, drivers.failures)
 
 
 def _model(circuit: AbstractCircuit, driver: Driver, shared: bool) -> Joint:
-    assert driver.source is not None  # by maximum likelihood
-    assert driver.calibration is not None
-    return Joint(
-        circuit, driver.source, driver.calibration, jnp.asarray(driver.sample_rate), shared
-    )
+    return Joint(circuit, estimation.calibrations_of(driver), shared)

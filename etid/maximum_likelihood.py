@@ -26,7 +26,6 @@ from etid.likelihood import (
     informed,
     residual,
     residuals,
-    variance,
     weights,
 )
 from etid.output_error import DELAY_WIDTH, MAX_STEPS, SOLVER, Estimate, delay_std, prior
@@ -37,7 +36,7 @@ from etid.spectra import Spectrum
 CURVED = LevenbergMarquardt(rtol=SOLVER.rtol, ftol=SOLVER.ftol, geodesic=True)
 
 
-def _calibration_gains(
+def _gains(
     spectra: Spectrum,
     source: SourceImpedance,
     r_load: Float[Array, " record"],
@@ -73,7 +72,7 @@ def fit_source(
     regularise = prior(start, sample_rate, r_load.mean())
 
     def gains(q):
-        return _calibration_gains(spectra, unflatten(q[:kept]), r_load, q[kept:], sample_rate)
+        return _gains(spectra, unflatten(q[:kept]), r_load, q[kept:], sample_rate)
 
     def of_all(q, records):
         weak = [regularise(q[:kept]), q[kept:] / DELAY_WIDTH]
@@ -111,25 +110,20 @@ def fit_source(
     return unflatten(q[:kept]), estimate, calibration
 
 
-class Joint(eqx.Module):
-    """The likelihood of loads and of the calibrations of their driver, term by term.
+class Calibrations(eqx.Module):
+    """The likelihood of the calibrations of a driver.
 
-    Everywhere `common` are the parameters of Z_th and the delays of the calibrations, `own` the
-    logarithms of a load's elements and its delay; delays are in samples.
+    Everywhere `common` are the parameters of Z_th and the delays of the calibrations in samples.
 
     Attributes:
-        circuit: Structure of the loads.
         source: Z_th as identified from the calibrations.
         calibration: The calibrations, with their harmonics.
         rate: Their sampling rate [Hz].
-        shared: Whether a load's unloaded record may be that of a calibration.
     """
 
-    circuit: AbstractCircuit
     source: SourceImpedance
     calibration: Calibration
     rate: Float[Array, ""]
-    shared: bool = eqx.field(static=True)
 
     @property
     def sources(self) -> int:
@@ -150,14 +144,49 @@ class Joint(eqx.Module):
         """Z_th of the common parameters."""
         return ravel_pytree(self.source)[1](common[: self.sources])
 
-    def known_gains(self, common: Float[Array, " common"]) -> list[Complex[Array, " harmonic"]]:
+    def gains(self, common: Float[Array, " common"]) -> list[Complex[Array, " harmonic"]]:
         """Gains with the known resistors."""
         spectra = self.calibration.spectra
         assert spectra is not None
         delay = common[self.sources :]
-        return _calibration_gains(
-            spectra, self.z_th(common), self.calibration.r_load, delay, self.rate
-        )
+        return _gains(spectra, self.z_th(common), self.calibration.r_load, delay, self.rate)
+
+    def terms(
+        self, common: Float[Array, " common"], records: Sequence[Spectrum]
+    ) -> Float[Array, " term"]:
+        """Terms of the calibrations and of the weak prior."""
+        regularise = prior(self.source, self.rate, self.calibration.r_load.mean())
+        parts = residuals(records, self.gains(common))
+        weak = [regularise(common[: self.sources]), common[self.sources :] / DELAY_WIDTH]
+        return jnp.concatenate(parts + weak)
+
+    def strain(self, common: Float[Array, " common"]) -> Float[Array, ""]:
+        """By how much Σ r² of the calibrations has grown from what they alone have.
+
+        About as much as there are common parameters, if loads and calibrations agree on them; r in
+        standard deviations that the noise of the calibrations has.
+        """
+        records, start = self.records, self.start()
+        parts = residuals(records, self.gains(start))
+        alone, now = (self.terms(c, records) for c in (start, common))
+        noise = [excess(r, s.selected) for r, s in zip(parts, records, strict=True)]
+        return jnp.sum((now**2 - alone**2) / weights(noise, now.size))
+
+
+class Joint(eqx.Module):
+    """The likelihood of loads and of the calibrations of their driver, term by term.
+
+    `own` are the logarithms of a load's elements and its delay in samples.
+
+    Attributes:
+        circuit: Structure of the loads.
+        calibrations: Those of their driver.
+        shared: Whether a load's unloaded record may be that of a calibration.
+    """
+
+    circuit: AbstractCircuit
+    calibrations: Calibrations
+    shared: bool = eqx.field(static=True)
 
     def gain(
         self,
@@ -168,16 +197,9 @@ class Joint(eqx.Module):
     ) -> Complex[Array, " harmonic"]:
         """Gain with a load."""
         load = self.circuit.with_log_values(own[:-1]).impedance()
-        return delayed_gain(self.z_th(common), load, spectrum.frequency, own[-1] / sample_rate)
-
-    def of_calibrations(
-        self, common: Float[Array, " common"], records: Sequence[Spectrum]
-    ) -> Float[Array, " term"]:
-        """Terms of the calibrations and of the weak prior."""
-        regularise = prior(self.source, self.rate, self.calibration.r_load.mean())
-        parts = residuals(records, self.known_gains(common))
-        weak = [regularise(common[: self.sources]), common[self.sources :] / DELAY_WIDTH]
-        return jnp.concatenate(parts + weak)
+        return delayed_gain(
+            self.calibrations.z_th(common), load, spectrum.frequency, own[-1] / sample_rate
+        )
 
     def of_load(
         self,
@@ -196,19 +218,11 @@ class Joint(eqx.Module):
         self, spectrum: Spectrum, common: Float[Array, " common"], records: Sequence[Spectrum]
     ) -> Spectrum:
         """A recording with what the calibrations tell of its X."""
-        return informed(spectrum, records, self.known_gains(common)) if self.shared else spectrum
-
-    def strain(self, common: Float[Array, " common"]) -> Float[Array, ""]:
-        """By how much Σ r² of the calibrations has grown from what they alone have.
-
-        About as much as there are common parameters, if loads and calibrations agree on them; r in
-        standard deviations that the noise of the calibrations has.
-        """
-        records, start = self.records, self.start()
-        parts = residuals(records, self.known_gains(start))
-        alone, now = (self.of_calibrations(c, records) for c in (start, common))
-        noise = [excess(r, s.selected) for r, s in zip(parts, records, strict=True)]
-        return jnp.sum((now**2 - alone**2) / weights(noise, now.size))
+        return (
+            informed(spectrum, records, self.calibrations.gains(common))
+            if self.shared
+            else spectrum
+        )
 
 
 def fit_load(
@@ -228,7 +242,7 @@ def fit_load(
     Returns:
         Elements and delay, how the solver ended, χ² per degree of freedom, and RRSE.
     """
-    records, common = model.records, model.start()
+    records, common = model.calibrations.records, model.calibrations.start()
 
     def terms(own, spectrum):
         return model.of_load(own, common, spectrum, sample_rate, records)
@@ -243,78 +257,3 @@ def fit_load(
     chi2 = squares / (2 * jnp.sum(spectrum.selected, dtype=own.dtype) - own.shape[0])
     g = model.gain(own, common, spectrum, sample_rate)
     return own, solution.result, chi2, complex_rrse(g * spectrum.x, spectrum.y)
-
-
-def fit_circuit(
-    model: Joint,
-    spectrum: Spectrum,
-    sample_rate: Float[Array, ""],
-    candidates: Float[Array, "start element"],
-) -> Estimate:
-    """Identify the load of one recording, jointly with the calibrations of its driver.
-
-    Args:
-        model: Calibrations and kind of circuit.
-        spectrum: The recording.
-        sample_rate: Its sampling rate [Hz].
-        candidates: As in `fit_load`.
-
-    Returns:
-        The estimate, whose parameters are the logarithms of the elements.
-    """
-    # First with Z_th as it is: from a start far away, a joint fit would bend Z_th to meet it.
-    alone, *_ = fit_load(model, spectrum, sample_rate, candidates)
-    split = alone.shape[0]
-
-    def terms(q, records):
-        own, common = q[:split], q[split:]
-        of_load = model.of_load(own, common, records[-1], sample_rate, records[:-1])
-        return jnp.concatenate([of_load, model.of_calibrations(common, records[:-1])])
-
-    solution = optx.least_squares(
-        terms,
-        CURVED,
-        jnp.concatenate([alone, model.start()]),
-        args=[*model.records, spectrum],
-        max_steps=MAX_STEPS,
-        throw=False,
-    )
-    own, common = solution.value[:split], solution.value[split:]
-    g = model.gain(own, common, spectrum, sample_rate)
-    gains = [*model.known_gains(common), g]
-    clean, shares = denoised([*model.records, spectrum], gains)
-    jacobian = jax.jacfwd(terms)(solution.value, clean)
-    weight = weights([shares[-1], jnp.ones(1), *shares[:-1]], jacobian.shape[0])
-    by_term = inverse((jacobian.T * weight[None, :]) @ jacobian)[: split - 1] @ jacobian.T
-    # What is the trial's own among the noise of its terms: all, or that of V_out if V_th is shared.
-    known = model.informed(spectrum, common, model.records)
-    part = jnp.where(
-        jnp.any(known.variance_x != spectrum.variance_x),
-        spectrum.variance_y / variance(known, g),
-        1.0,
-    )
-    private = (
-        jnp.zeros(by_term.shape[1])
-        .at[: 2 * part.size + 1]
-        .set(jnp.concatenate([part, part, jnp.ones(1)]))
-    )
-    parts = [residual(known, g), *residuals(model.records, gains[:-1])]
-    of_noise = [
-        excess(r, s.selected) for r, s in zip(parts, [spectrum, *model.records], strict=True)
-    ]
-    noise = weights([of_noise[0], jnp.ones(1), *of_noise[1:]], by_term.shape[1])
-    shared = (by_term * ((1 - private) * noise)[None, :]) @ by_term.T
-    chi2 = jnp.sum(residual(known, g) ** 2) / (
-        2 * jnp.sum(spectrum.selected, dtype=g.real.dtype) - split
-    )
-    return Estimate(
-        own[:-1],
-        own[None, -1:],
-        (by_term * noise[None, :]) @ by_term.T,
-        chi2,
-        complex_rrse(g * spectrum.x, spectrum.y),
-        solution.result,
-        solution.stats["num_steps"],
-        shared,
-        model.strain(common),
-    )

@@ -2,9 +2,11 @@
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from etid.noise import noise_std
+from etid.spectra import namespace
 
 RIPPLE = 1e-5  # of the signal, left by the interpolation: no recording is better known than that
 
@@ -35,11 +37,13 @@ def measure(
     sample_rate: Float[Array, ""],
 ) -> Measurement:
     """Estimate the noise of both records; a `resolution` is the converter's step [V] or 0."""
-    floor_th, floor_out = RIPPLE * jnp.ptp(v_th), RIPPLE * jnp.ptp(v_out)
-    return Measurement(
-        v_th,
-        v_out,
-        jnp.maximum(noise_std(v_th, resolution_th), floor_th),
-        jnp.maximum(noise_std(v_out, resolution_out), floor_out),
-        sample_rate,
-    )
+    sigma_th, sigma_out = noise(v_th, resolution_th), noise(v_out, resolution_out)
+    return Measurement(v_th, v_out, jnp.asarray(sigma_th), jnp.asarray(sigma_out), sample_rate)
+
+
+def noise(
+    v: Float[Array | np.ndarray, " time"], resolution: Float[Array | np.ndarray, ""]
+) -> Float[Array | np.ndarray, ""]:
+    """Standard deviation of the noise of a record, as far as it is trusted, in its unit."""
+    of = namespace(v)
+    return of.asarray(of.maximum(noise_std(v, resolution), RIPPLE * of.ptp(v)))

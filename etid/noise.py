@@ -39,8 +39,9 @@ def _median(x: Float[Array, " sample"]) -> Float[Array, ""]:
 
 
 def noise_std(
-    v: Float[Array | np.ndarray, " time"], resolution: Float[Array, ""] | float = 0.0
-) -> Float[Array, ""]:
+    v: Float[Array | np.ndarray, " time"],
+    resolution: Float[Array | np.ndarray, ""] | float = 0.0,
+) -> Float[Array | np.ndarray, ""]:
     """Standard deviation of the white noise in `v`, in the unit of `v`.
 
     Args:
@@ -51,8 +52,7 @@ def noise_std(
     weights = np.array([(-1.0) ** k * math.comb(ORDER, k) / gain for k in range(ORDER + 1)])
     rows = v.shape[0] - ORDER
     differences = sum(weights[k] * v[k : k + rows] for k in range(ORDER + 1))
+    floor = resolution / math.sqrt(12.0)
     if isinstance(v, np.ndarray):  # nothing to be compiled
-        sigma = jnp.asarray(MEDIAN_TO_SIGMA * np.median(np.abs(differences)))
-    else:
-        sigma = MEDIAN_TO_SIGMA * _median(jnp.abs(differences))
-    return jnp.maximum(sigma, resolution / math.sqrt(12.0))
+        return np.asarray(max(MEDIAN_TO_SIGMA * np.median(np.abs(differences)), floor))
+    return jnp.maximum(MEDIAN_TO_SIGMA * _median(jnp.abs(differences)), floor)

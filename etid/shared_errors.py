@@ -83,10 +83,10 @@ def estimates(
         over(lambda load, own: _eliminated(study, load, common, own), loads, own)
         for loads, own in zip(groups, owns, strict=True)
     ]
-    clean, shares = denoised(model.records, model.known_gains(common))
-    parts = residuals(model.records, model.known_gains(common))
-    noise = [excess(r, s.selected) for r, s in zip(parts, model.records, strict=True)]
-    jacobian = jax.jacfwd(lambda c: model.of_calibrations(c, clean))(common)
+    clean, shares = denoised(model.calibrations.records, model.calibrations.gains(common))
+    parts = residuals(model.calibrations.records, model.calibrations.gains(common))
+    noise = [excess(r, s.selected) for r, s in zip(parts, model.calibrations.records, strict=True)]
+    jacobian = jax.jacfwd(lambda c: model.calibrations.terms(c, clean))(common)
     total = _curvature(jacobian, shares, noise)
     for loads, eliminated in zip(groups, found, strict=True):
         used = jax.tree.map(
@@ -100,7 +100,7 @@ def estimates(
     score = total.score + sum((more for _, more in sums), start=jnp.zeros_like(total.score))
     cov = bread @ score @ bread
 
-    strain = model.strain(common)
+    strain = model.calibrations.strain(common)
     judged = []
     for (loads, own, eliminated, records), (sums_of, _), (_, results) in zip(
         lanes, sums, fitted, strict=True
@@ -144,10 +144,10 @@ def _jacobian(study: DriverStudy, load: Loads, common, own):
     """Derivatives of a load's denoised terms by (common, own), and the shares of signal."""
     model, c = study.model, common.shape[0]
     gains = [
-        *model.known_gains(common),
+        *model.calibrations.gains(common),
         model.gain(own, common, load.spectrum, load.sample_rate),
     ]
-    (*known, spectrum), shares = denoised([*model.records, load.spectrum], gains)
+    (*known, spectrum), shares = denoised([*model.calibrations.records, load.spectrum], gains)
     jacobian = jax.jacfwd(lambda q: model.of_load(q[c:], q[:c], spectrum, load.sample_rate, known))(
         jnp.concatenate([common, own])
     )
@@ -170,7 +170,7 @@ def _eliminated(study: DriverStudy, load: Loads, common, own) -> _Eliminated:
 def _influence(study: DriverStudy, common, load: Loads, own, eliminated: _Eliminated):
     """What unit noise in the parts of X adds to the score of `common`, and to the load's own."""
     jacobian, _ = _jacobian(study, load, common, own)
-    known = study.model.informed(load.spectrum, common, study.model.records)
+    known = study.model.informed(load.spectrum, common, study.model.calibrations.records)
     g = study.model.gain(own, common, load.spectrum, load.sample_rate)
     size = jnp.where(known.selected, jnp.sqrt(known.variance_x / variance(known, g)), 0.0)
     re, im = g.real * size, g.imag * size

@@ -59,17 +59,17 @@ class DriverStudy(eqx.Module):
         self, load: Loads, common: Float[Array, " common"], own: Float[Array, " own"]
     ) -> Float[Array, " term"]:
         """Terms of one load."""
-        records = self.model.records
+        records = self.model.calibrations.records
         return self.model.of_load(own, common, load.spectrum, load.sample_rate, records)
 
     def of_calibrations(self, common: Float[Array, " common"]) -> Float[Array, " term"]:
         """Terms of the calibrations."""
-        return self.model.of_calibrations(common, self.model.records)
+        return self.model.calibrations.terms(common, self.model.calibrations.records)
 
     def start(self) -> Float[Array, " parameter"]:
         """The driver of the calibrations, and each load identified alone."""
         own = jnp.concatenate([loads.own for loads in self.groups])
-        return join(self.model.start(), own)
+        return join(self.model.calibrations.start(), own)
 
     def split(
         self, y: Float[Array, " parameter"]

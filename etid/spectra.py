@@ -8,6 +8,10 @@ the harmonics, unless a period is a whole number of samples or there is but one;
 of the band, where anti-alias filters are imperfect, is left out.
 """
 
+import functools
+import math
+from types import ModuleType
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -18,6 +22,8 @@ WINDOW = 25  # harmonics over which power is averaged
 ALIASED = 0.35  # of the sample rate, above which aliases must be told from harmonics by frequency
 CLOCK = 3e-4  # by which a clock may be off
 DRIFT_DEGREE = 3  # of the polynomial by which the mean may drift
+ROOM = 64  # harmonics: records of all lengths have as many, a multiple of this
+ABSENT = 1e-6  # standard deviations, coefficients and noise of harmonics that only fill it
 
 
 class Spectrum(eqx.Module):
@@ -92,30 +98,44 @@ def separates_aliases(periods: int, samples: int) -> bool:
 
 def harmonics(
     v: Float[Array | np.ndarray, " time"], periods: int, samples: int
-) -> Complex[Array, " harmonic"]:
+) -> Complex[Array | np.ndarray, " harmonic"]:
     """Fourier coefficients (1/M) Σ v[n] e^(−j2πkPn/M) for k = 1 … below half the sample rate.
 
     A drift of the mean from period to period is taken out first.
     """
-    kept = jnp.asarray(v)[:samples]
-    coefficients = jnp.fft.rfft(kept - _drift(kept, periods)) / samples
-    return coefficients[periods : (samples + 1) // 2 : periods]
+    of = namespace(v)
+    coefficients = of.fft.rfft(v[:samples]) / samples
+    basis, fit = _drift(periods, samples)
+    # The transform is linear: that of the drift is known but for its few coefficients.
+    drift = fit @ _sums(v[:samples], periods)
+    at_harmonics = coefficients[periods : (samples + 1) // 2 : periods]
+    return at_harmonics - drift.astype(at_harmonics.dtype) @ basis
 
 
-def _drift(v: Float[Array, " time"], periods: int) -> Float[Array, " time"]:
-    """Polynomial through the means of the periods."""
-    samples = v.shape[0]
-    basis = jnp.vander(
-        jnp.linspace(-1, 1, samples), min(periods, DRIFT_DEGREE + 1), increasing=True
-    )
-    columns = jnp.concatenate([basis, v[:, None]], axis=1)
-    # Means from the running sum, at ends of periods that fall between samples.
+def namespace(v: Array | np.ndarray) -> ModuleType:
+    """NumPy for its own arrays, of whose many shapes none is compiled then; JAX for all others."""
+    return np if isinstance(v, np.ndarray) else jnp
+
+
+def _sums(v: Array | np.ndarray, periods: int) -> Array | np.ndarray:
+    """Sums over the periods, whose ends may fall between samples; along the first axis."""
+    of, samples = namespace(v), v.shape[0]
     ends = np.arange(periods + 1) * (samples / periods)
     whole = np.minimum(ends.astype(int), samples - 1)
-    running = jnp.cumsum(columns, axis=0) - columns
-    sums = running[whole] + (ends - whole)[:, None] * columns[whole]
-    means = jnp.diff(sums, axis=0) * (periods / samples)
-    return basis @ (jnp.linalg.pinv(means[:, :-1]) @ means[:, -1])
+    rest = (ends - whole).reshape(-1, *[1] * (v.ndim - 1))
+    running = of.cumsum(v, axis=0) - v
+    return of.diff(running[whole] + rest * v[whole], axis=0)
+
+
+@functools.lru_cache(maxsize=64)
+def _drift(
+    periods: int, samples: int
+) -> tuple[Complex[np.ndarray, "degree harmonic"], Float[np.ndarray, "degree period"]]:
+    """Transforms of the powers of time, and their coefficients by the sums of a record."""
+    powers = np.vander(np.linspace(-1, 1, samples), min(periods, DRIFT_DEGREE + 1), increasing=True)
+    transforms = np.fft.rfft(powers, axis=0) / samples
+    fit = np.linalg.pinv(np.asarray(_sums(powers, periods)))
+    return transforms[periods : (samples + 1) // 2 : periods].T, fit
 
 
 def local_sum(values: Float[Array, " harmonic"]) -> Float[Array, " harmonic"]:
@@ -137,18 +157,19 @@ def signal_share(
 
 
 def spectrum(
-    v_th: Float[Array, " time"],
-    v_out: Float[Array, " time"],
-    sigma_th: Float[Array, ""],
-    sigma_out: Float[Array, ""],
-    sample_rate: Float[Array, ""],
+    v_th: Float[Array | np.ndarray, " time"],
+    v_out: Float[Array | np.ndarray, " time"],
+    sigma_th: Float[Array | np.ndarray, ""],
+    sigma_out: Float[Array | np.ndarray, ""],
+    sample_rate: Float[Array | np.ndarray, ""],
     periods: int,
     samples: int,
-) -> Spectrum:
-    """Harmonics of both records and their noise.
+) -> tuple[Array | np.ndarray, ...]:
+    """Harmonics of both records and their noise: the fields of a `Spectrum`.
 
     Harmonics that noise hides are not left out: the likelihood knows what they are worth, and any
-    choice by their power costs more at 24 to 40 dB than they disturb.
+    choice by their power costs more at 24 to 40 dB than they disturb. After the last there are some
+    that are not selected and hold next to nothing, so that records of most lengths have as many.
 
     Args:
         v_th: Unloaded voltage [V].
@@ -159,10 +180,21 @@ def spectrum(
         periods: From `whole_periods`.
         samples: From `whole_periods`.
     """
+    of = namespace(v_out)
     x, y = harmonics(v_th, periods, samples), harmonics(v_out, periods, samples)
-    variance_x = jnp.full(x.shape, sigma_th**2 / samples)
-    variance_y = jnp.full(y.shape, sigma_out**2 / samples)
-    frequency = jnp.arange(1.0, x.shape[0] + 1) * (periods * sample_rate / samples)
+    count = x.shape[0]
+    room = -count % ROOM
+    number = np.arange(1.0, count + room + 1)
+    frequency = number * (periods * sample_rate / samples)
+
+    def filled(coefficients, sigma):
+        noise = sigma / math.sqrt(samples)
+        scale = of.where(number <= count, noise, ABSENT * noise)
+        absent = scale[count:].astype(coefficients.dtype)
+        return of.concatenate([coefficients, absent]), scale**2
+
+    x, variance_x = filled(x, sigma_th)
+    y, variance_y = filled(y, sigma_out)
     highest = 0.5 if separates_aliases(periods, samples) else ALIASED
-    selected = frequency < highest * sample_rate
-    return Spectrum(frequency, x, y, variance_x, variance_y, selected)
+    selected = (frequency < highest * sample_rate) & (number <= count)
+    return frequency, x, y, variance_x, variance_y, selected

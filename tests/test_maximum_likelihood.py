@@ -8,7 +8,7 @@ import pytest
 import scipy.signal
 
 import etid
-from etid import likelihood
+from etid import batch, identify, likelihood
 from etid.circuits import SkinRC, resistor
 from etid.scenes import Scene, Trial
 from etid.transformer import ResistorLoad, SkinLoad
@@ -106,6 +106,27 @@ def test_a_batch_of_both_kinds_is_mixed_and_each_is_right(study, driver):
     fits = etid.identify_skins([record, short], driver)
     assert fits.fit.method == "mixed"
     assert fits.counts() == {"successful": 2}
+
+
+def test_a_study_of_ragged_lengths_compiles_once(study, driver, monkeypatch):
+    """What is compiled takes harmonics, of which records of all lengths have as many."""
+    traced = []
+
+    def counted(*arguments):
+        traced.append(arguments)
+        return identify.skin_lane(*arguments)
+
+    monkeypatch.setattr(batch, "skin_lane", counted)
+    records = [
+        record.replace(v_th=record.v_th[:size], v_out=record.v_out[:size])
+        for record in study.loaded.recordings()
+        for size in range(6_667, 10_000, 417)
+    ]
+    fits = etid.identify_skins(records, driver)
+    assert fits.counts() == {"successful": len(records)}
+    wrong = np.asarray(fits.circuit.values()) - np.array(dataclasses.astuple(DRY))
+    assert (np.abs(wrong) < SIGMAS * np.asarray(fits.stderr.values())).all()
+    assert len(traced) <= 1  # none, if an earlier test has
 
 
 def test_a_circuit_far_from_its_typical_values_is_found():

@@ -7,7 +7,13 @@ import pytest
 
 from etid import spectra
 from etid.scenes import Scene, Trial
-from etid.spectra import counted_pulse_rate, harmonics, signal_share, whole_periods
+from etid.spectra import (
+    Spectrum,
+    counted_pulse_rate,
+    harmonics,
+    signal_share,
+    whole_periods,
+)
 from etid.transformer import ResistorLoad
 
 spectrum = jax.jit(spectra.spectrum, static_argnums=(5, 6))
@@ -102,10 +108,25 @@ def test_harmonics_of_a_long_record_survive_a_clock_that_is_off():
     assert part_left(PULSE) < 0.3
 
 
+@pytest.mark.parametrize(("periods", "samples"), [(1, 3333), (3, 10_000), (2, 6667)])
+def test_numpy_and_jax_see_the_same_harmonics(periods, samples):
+    generator = np.random.default_rng(8)
+    v, w = np.cumsum(generator.normal(size=(2, samples)), axis=1)
+    scalars = [np.asarray(s) for s in (0.1, 0.2, RATE)]
+    host = spectra.spectrum(v, w, *scalars, periods, samples)
+    traced = spectrum(jnp.asarray(v), jnp.asarray(w), *map(jnp.asarray, scalars), periods, samples)
+    for one, other in zip(host, traced, strict=True):
+        assert isinstance(one, np.ndarray)
+        assert one.size % spectra.ROOM == 0
+        np.testing.assert_allclose(one, other, rtol=1e-11, atol=1e-13)
+    np.testing.assert_array_equal(host[-1][:100], True)
+    assert not host[-1][(samples + 1) // (2 * periods) :].any()
+
+
 def test_one_period_cannot_tell_aliases_and_leaves_the_upper_band_out():
     v = jnp.asarray(np.where(np.arange(3333) < 133, 50.0, 0.0))
     small = jnp.asarray(1e-6)
-    found = spectrum(v, v, small, small, jnp.asarray(RATE), 1, 3333)
+    found = Spectrum(*spectrum(v, v, small, small, jnp.asarray(RATE), 1, 3333))
     last = float(found.frequency[found.selected].max())
     assert abs(last - spectra.ALIASED * RATE) < PULSE * 1.001
 
