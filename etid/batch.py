@@ -13,7 +13,6 @@ from typing import Any
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 from tqdm import tqdm
@@ -31,6 +30,7 @@ from etid.identify import (
     lane,
     plan,
     skin_lane,
+    stacked,
 )
 from etid.recording import Metadata, Recording, RecordingError
 from etid.results import LABELS, Fit, Fits, IdentificationError
@@ -111,10 +111,9 @@ def planned(
     return recording, driver, method
 
 
-def stacked(lanes: Sequence[tuple[np.ndarray, ...]]) -> tuple[Array, ...]:
-    """Samples of a chunk; the last lane fills it up."""
-    filled = [*lanes, *[lanes[-1]] * (LANES - len(lanes))]
-    return tuple(jnp.asarray(np.stack(column)) for column in zip(*filled, strict=True))
+def filled(lanes: Sequence[tuple[np.ndarray, ...]]) -> tuple[Array, ...]:
+    """A chunk; the last lane fills it up."""
+    return stacked([*lanes, *[lanes[-1]] * (LANES - len(lanes))])
 
 
 class _Queue:
@@ -136,7 +135,7 @@ class _Queue:
 
     def run(self) -> Iterable[tuple[int, Fit]]:
         """Fit what is waiting."""
-        lanes = stacked(self.lanes)
+        lanes = filled(self.lanes)
         fits = jax.device_get(_chunk(lanes, self.driver, self.known, self.circuit, self.method))
         yield from zip(self.rows, unstacked(fits), strict=False)  # the last one fills it up
         self.rows, self.lanes = [], []

@@ -8,7 +8,6 @@ parameters that the data do not determine.
 
 import dataclasses
 from collections.abc import Callable
-from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -31,7 +30,7 @@ from etid.given_driver import GivenDriver
 from etid.levenberg_marquardt import normal_equations
 from etid.measurement import Measurement
 from etid.results import Fit
-from etid.spectra import Spectrum, spectrum
+from etid.spectra import Spectrum
 from etid.transfer import Rational, poles
 from etid.verdicts import RESULTS, first_verdict, verdict
 
@@ -178,24 +177,6 @@ def _starts(
         usable = jnp.all(values > 0) & jnp.isfinite(values).all()
         starts.append(jnp.where(usable, jnp.log(jnp.where(usable, values, 1.0)), typical))
     return jnp.stack(starts)
-
-
-class Window(NamedTuple):
-    """Which part of a record holds whole periods (`spectra.whole_periods`).
-
-    Attributes:
-        periods: Their number.
-        samples: The samples nearest to them.
-    """
-
-    periods: int
-    samples: int
-
-
-def spectrum_of(m: Measurement, window: Window) -> Spectrum:
-    """Harmonics of one recording."""
-    fields = spectrum(m.v_th, m.v_out, m.sigma_th, m.sigma_out, m.sample_rate, *window)
-    return Spectrum(*map(jnp.asarray, fields))
 
 
 def skin_by_output_error(m: Measurement, driver: Driver, circuit: AbstractCircuit) -> Fit:
@@ -382,7 +363,7 @@ def source_starts(
 
 
 def driver_by_refinement(
-    m: Measurement, r_load: Float[Array, " record"], order: int, window: Window | None
+    m: Measurement, r_load: Float[Array, " record"], order: int, spectra: Spectrum | None
 ) -> Driver:
     """Refine Z_th from several starts and keep the best that settled.
 
@@ -390,17 +371,16 @@ def driver_by_refinement(
         m: Calibrations, stacked along a leading axis.
         r_load: Their resistors [Ω].
         order: Number of poles.
-        window: For maximum likelihood; None for output error.
+        spectra: Their harmonics, for maximum likelihood; None for output error.
     """
     baseline = driver_by_steiglitz_mcbride(m, r_load, order, steiglitz_mcbride.ITERATIONS)
     starts = source_starts(baseline.a, order, m.sample_rate[0], r_load.mean())
-    if window is None:
+    if spectra is None:
         records = jax.vmap(prediction.prepare)(m)
 
         def fit(start):
             return output_error.fit_source(records, r_load, start)
     else:
-        spectra = jax.vmap(lambda m: spectrum_of(m, window))(m)
 
         def fit(start):
             return maximum_likelihood.fit_source(spectra, r_load, m.sample_rate[0], start)
@@ -444,5 +424,5 @@ def driver_by_refinement(
             (misses(estimate.chi2, estimate.rrse) | _too_late(estimate), RESULTS.misfit),
         ),
         steps=estimate.steps,
-        method="output_error" if window is None else "maximum_likelihood",
+        method="output_error" if spectra is None else "maximum_likelihood",
     )

@@ -14,7 +14,6 @@ from jaxtyping import Array, Float
 from etid import estimation, output_error, prediction, steiglitz_mcbride
 from etid.circuits import AbstractCircuit, Resistor, SkinRC
 from etid.driver import Driver
-from etid.estimation import Window
 from etid.filtering import TAPS
 from etid.given_driver import GivenDriver
 from etid.measurement import measure, noise
@@ -157,6 +156,11 @@ def lane(recording: Recording, method: Method) -> tuple[np.ndarray, ...]:
     return *map(np.asarray, fields), rate
 
 
+def stacked(lanes: Sequence[tuple[np.ndarray, ...]]) -> tuple[Array, ...]:
+    """Lanes of equal shapes along a leading axis."""
+    return tuple(jnp.asarray(np.stack(column)) for column in zip(*lanes, strict=True))
+
+
 def checksum(recording: Recording) -> int:
     """What tells an unloaded record from others."""
     return zlib.crc32(recording.v_th.tobytes())
@@ -168,21 +172,17 @@ def is_shared(recording: Recording, driver: Driver) -> bool:
     return known is None or checksum(recording) in known
 
 
-def _window(recording: Recording, method: Method) -> Window | None:
-    return Window(*recorded_periods(recording)) if method in HARMONIC else None
-
-
 @eqx.filter_jit
 def _driver(
     samples: Any,
     r_load: Float[Array, " record"],
     order: int,
     method: Method,
-    window: Window | None,
+    spectra: Spectrum | None,
 ) -> Driver:
     m = jax.vmap(measure)(*samples)
     if method in CONTINUOUS:
-        return estimation.driver_by_refinement(m, r_load, order, window)
+        return estimation.driver_by_refinement(m, r_load, order, spectra)
     return estimation.driver_by_steiglitz_mcbride(m, r_load, order, _iterations(method))
 
 
@@ -272,11 +272,12 @@ def identify_driver(
             text = f"calibration {record.path!r}: {name}. {message(name)}"
             raise IdentificationError(text, None)
     method = choose(method, records)
-    samples = tuple(
-        jnp.asarray(np.stack(column)) for column in zip(*map(arrays, records), strict=True)
-    )
     r_load = jnp.asarray([record.r_load for record in records])
-    driver = _driver(samples, r_load, order, method, _window(records[0], method))
+    spectra = None
+    if method in HARMONIC:
+        *fields, _ = stacked([lane(record, method) for record in records])
+        spectra = Spectrum(*fields)
+    driver = _driver(stacked(list(map(arrays, records))), r_load, order, method, spectra)
     if driver.calibration is not None:
         unloaded = np.array([checksum(record) for record in records])
         calibration = dataclasses.replace(driver.calibration, unloaded=unloaded)
@@ -379,10 +380,11 @@ def identify_samples(
     rate = jnp.asarray(sample_rate, dtype=v_out.dtype)
     samples, known = (v_th, v_out, step, step, rate), None
     if method in HARMONIC:
-        found = estimation.spectrum_of(measure(*samples), Window(*periods))
-        samples = (*jax.tree.leaves(found), rate)
+        sigma_th, sigma_out = noise(v_th, step), noise(v_out, step)
+        fields = spectrum(v_th, v_out, sigma_th, sigma_out, rate, *periods)
+        samples = (*map(jnp.asarray, fields), rate)
         if method == "maximum_likelihood":
-            known = estimation.given(driver, found.frequency, True)
+            known = estimation.given(driver, samples[0], True)
     return skin_lane(samples, driver, known, circuit, method)
 
 

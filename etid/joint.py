@@ -24,8 +24,8 @@ from etid.batch import (
     Refusal,
     StudyFits,
     each,
+    filled,
     planned,
-    stacked,
     table,
     to_identify,
     unstacked,
@@ -122,7 +122,7 @@ class _Waiting:
         count = len(self.lanes)
         if count == 0:
             return
-        loads = jax.device_get(_alone(stacked(self.lanes), self.model))
+        loads = jax.device_get(_alone(filled(self.lanes), self.model))
         self.chunks.append(jax.tree.map(lambda leaf: leaf[:count], loads))
         self.lanes = []
 

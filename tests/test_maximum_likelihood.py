@@ -108,6 +108,18 @@ def test_a_batch_of_both_kinds_is_mixed_and_each_is_right(study, driver):
     assert fits.counts() == {"successful": 2}
 
 
+def test_one_unloaded_record_for_calibration_and_trial_tells_of_its_voltage_twice():
+    """As much as the bound of such a scene says, a fifth more of R_p than with two."""
+    trials, known = (Trial("a", DRY),), (Trial("c", ResistorLoad(98.8e3)),)
+    scene = Scene(trials, known, samples=SAMPLES, snr_db=60.0, shared_v_th=True)
+    study = scene.simulate(seed=2)
+    fit = etid.identify_skin(study["a"], etid.identify_driver(study["c"]))
+    bound = etid.bound(scene)["a"]
+    found = np.asarray(fit.stderr.r_p) / bound.stderr["r_p"]
+    np.testing.assert_allclose(found, 1.0, atol=0.1)  # without it 1.2
+    assert (np.abs(error(fit)) < SIGMAS * np.asarray(fit.stderr.values())).all()
+
+
 def test_a_study_of_ragged_lengths_compiles_once(study, driver, monkeypatch):
     """What is compiled takes harmonics, of which records of all lengths have as many."""
     traced = []
