@@ -5,7 +5,6 @@ import zlib
 from collections.abc import Sequence
 from typing import Any, Literal
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -22,6 +21,7 @@ from etid.preflight import is_periodic, preflight, recorded_periods, resolution
 from etid.recording import Recording
 from etid.results import Fit, IdentificationError
 from etid.spectra import separates_aliases, whole_periods
+from etid.traces import stored_jit
 from etid.verdicts import message, verdict
 
 Method = Literal[
@@ -157,7 +157,7 @@ def window(recording: Recording, method: Method, driver: Driver | None = None) -
     return Window(*recorded_periods(recording), shared, method != "non_parametric")
 
 
-@eqx.filter_jit
+@stored_jit
 def _driver(
     samples: Any,
     r_load: Float[Array, " record"],
@@ -185,7 +185,7 @@ def skin_lane(
     return estimation.skin_by_steiglitz_mcbride(m, driver, _iterations(method))
 
 
-_skin = eqx.filter_jit(skin_lane)
+_skin = stored_jit(skin_lane)
 
 
 def identify_driver(
@@ -351,7 +351,7 @@ def identify_samples(
     )
 
 
-@eqx.filter_jit
+@stored_jit
 def _fitted(samples: Any, driver: Driver, circuit: AbstractCircuit) -> Float[Array, " interval"]:
     records = prediction.prepare(measure(*samples), cutoff=0.5)  # the band as it was recorded
     assert driver.source is not None

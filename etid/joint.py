@@ -40,6 +40,7 @@ from etid.recording import Recording
 from etid.results import Fit
 from etid.shared_terms import Loads
 from etid.study import Study
+from etid.traces import stored_jit
 from etid.verdicts import RESULTS, message
 
 METHOD = "joint"
@@ -49,7 +50,7 @@ SINGLE = (
 )
 
 
-@eqx.filter_jit
+@stored_jit
 def _alone(samples: Any, model: Joint, driver: Driver, window: Window) -> Loads:
     """Loads identified one by one with Z_th as it is, where a joint fit may start."""
 
@@ -65,7 +66,7 @@ def _alone(samples: Any, model: Joint, driver: Driver, window: Window) -> Loads:
     return each(one, samples)
 
 
-@eqx.filter_jit
+@stored_jit
 def _together(
     model: Joint,
     groups: list[Loads],
