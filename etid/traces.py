@@ -10,14 +10,15 @@ Files are written whole or not at all; one that is damaged counts as absent. The
 a folder as you would trust the compilation cache itself, whose executables run as they are.
 """
 
+import contextlib
 import dataclasses
 import functools
 import hashlib
 import os
 import pathlib
 import pickle
+import secrets
 import sys
-import tempfile
 import time
 import types
 import zlib
@@ -27,6 +28,7 @@ from typing import Any, ParamSpec, TypeVar
 import equinox as eqx
 import jax
 import jax.core
+import jax.export
 import jaxlib
 import lineax
 import numpy as np
@@ -189,17 +191,16 @@ def _write(path: pathlib.Path, content: bytes) -> None:
     """Write a file whole or not at all: several processes may write the same one."""
     packed = zlib.compress(content, 1)
     checksum = hashlib.sha256(path.name.encode() + packed).digest()
+    partial = path.with_name(f".{path.name}.{secrets.token_hex(4)}.partial")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        handle, name = tempfile.mkstemp(dir=path.parent)
+        partial.write_bytes(checksum + packed)
+        os.replace(partial, path)
     except OSError:
-        return  # a folder that is read only still serves those that can be read
-    try:
-        with os.fdopen(handle, "wb") as file:
-            file.write(checksum + packed)
-        os.replace(name, path)
-    except OSError:
-        pathlib.Path(name).unlink(missing_ok=True)
+        pass  # a folder that cannot be written still serves those who read it
+    finally:
+        with contextlib.suppress(OSError):
+            partial.unlink(missing_ok=True)
 
 
 # --- Key -----------------------------------------------------------------------------------------
@@ -273,7 +274,7 @@ def _constants(module: types.ModuleType, seen: set[str]) -> Iterator[tuple[str, 
         if isinstance(value, types.ModuleType):
             home = value.__name__
         elif isinstance(value, type | types.FunctionType):
-            home = value.__module__
+            home = str(value.__module__)
             yield f"{module.__name__}.{name}", f"{home}.{value.__qualname__}"
             origin = home.partition(".")[0]
             known = origin in KNOWN or origin in sys.stdlib_module_names
@@ -307,7 +308,7 @@ def _described(node: Any, by_value: bool = False) -> Any:
         content = hashlib.sha256(np.asarray(node).tobytes()).hexdigest() if by_value else ""
         return "array", node.shape, str(node.dtype), _is_weak(node), content
     if isinstance(node, type | types.FunctionType):
-        if node.__module__.partition(".")[0] not in KNOWN or "<lambda>" in node.__qualname__:
+        if str(node.__module__).partition(".")[0] not in KNOWN or "<lambda>" in node.__qualname__:
             raise _Unknown(node)
         return f"{node.__module__}.{node.__qualname__}"
     if isinstance(node, tuple | list):
