@@ -11,7 +11,6 @@ import functools
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
-import equinox as eqx
 import jax
 import numpy as np
 from jaxtyping import Array
@@ -35,12 +34,13 @@ from etid.identify import (
 from etid.recording import Metadata, Recording, RecordingError
 from etid.results import LABELS, Fit, Fits, IdentificationError
 from etid.study import Study
+from etid.traces import stored_jit
 from etid.verdicts import message
 
 LANES = 16  # of one call, the last of which is filled up: a study compiles once per length
 
 
-@eqx.filter_jit
+@stored_jit
 def _chunk(
     lanes: Any,
     driver: Driver,

@@ -5,7 +5,6 @@ import zlib
 from collections.abc import Sequence
 from typing import Any, Literal
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -22,6 +21,7 @@ from etid.preflight import is_periodic, preflight, recorded_periods, resolution
 from etid.recording import Recording
 from etid.results import Fit, IdentificationError
 from etid.spectra import Spectrum, separates_aliases, spectrum, whole_periods
+from etid.traces import stored_jit
 from etid.verdicts import message, verdict
 
 Method = Literal[
@@ -172,7 +172,7 @@ def is_shared(recording: Recording, driver: Driver) -> bool:
     return known is None or checksum(recording) in known
 
 
-@eqx.filter_jit
+@stored_jit
 def _driver(
     samples: Any,
     r_load: Float[Array, " record"],
@@ -186,7 +186,7 @@ def _driver(
     return estimation.driver_by_steiglitz_mcbride(m, r_load, order, _iterations(method))
 
 
-@eqx.filter_jit
+@stored_jit
 def given(driver: Driver, frequency: Float[Array, " harmonic"], shared: bool) -> GivenDriver:
     """What all loads of a driver need to know of it for maximum likelihood."""
     return estimation.given(driver, frequency, shared)
@@ -220,7 +220,7 @@ def skin_lane(
     return estimation.skin_by_maximum_likelihood(Spectrum(*fields), rate, driver, known, circuit)
 
 
-_skin = eqx.filter_jit(skin_lane)
+_skin = stored_jit(skin_lane)
 
 
 def identify_driver(
@@ -388,7 +388,7 @@ def identify_samples(
     return skin_lane(samples, driver, known, circuit, method)
 
 
-@eqx.filter_jit
+@stored_jit
 def _fitted(samples: Any, driver: Driver, circuit: AbstractCircuit) -> Float[Array, " interval"]:
     records = prediction.prepare(measure(*samples), cutoff=0.5)  # the band as it was recorded
     assert driver.source is not None

@@ -8,7 +8,6 @@ over the logarithms of the elements, from the best of a grid of impedance levels
 frequencies that spans the data.
 """
 
-import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import numpy.typing as npt
@@ -20,6 +19,7 @@ from etid.information import inverse
 from etid.levenberg_marquardt import LevenbergMarquardt, best_start
 from etid.precision import require_float64
 from etid.results import Fit, IdentificationError, complex_rrse
+from etid.traces import stored_jit
 from etid.verdicts import RESULTS, first_verdict, message, verdict
 
 MAX_STEPS = 500
@@ -29,7 +29,7 @@ CORNERS = 9  # per grid, between the lowest and the highest frequency
 SOLVER = LevenbergMarquardt()
 
 
-@eqx.filter_jit
+@stored_jit
 def _fit(
     frequency: Float[Array, " frequency"],
     z: Complex[Array, " frequency"],

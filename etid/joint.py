@@ -40,6 +40,7 @@ from etid.results import Fit
 from etid.shared_terms import Loads
 from etid.spectra import Spectrum
 from etid.study import Study
+from etid.traces import stored_jit
 from etid.verdicts import RESULTS, message
 
 METHOD = "joint"
@@ -49,7 +50,7 @@ SINGLE = (
 )
 
 
-@eqx.filter_jit
+@stored_jit
 def _alone(lanes: Any, model: Joint) -> Loads:
     """Loads identified one by one with Z_th as it is, where a joint fit may start."""
 
@@ -66,7 +67,7 @@ def _alone(lanes: Any, model: Joint) -> Loads:
     return each(one, lanes)
 
 
-@eqx.filter_jit
+@stored_jit
 def _together(
     model: Joint,
     groups: list[Loads],

@@ -15,6 +15,7 @@ FLOORS = {
     "noise": 0,
     "precision": 0,
     "tables": 0,
+    "traces": 0,
     "spectra": 0,
     "transfer": 0,
     "verdicts": 0,

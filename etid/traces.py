@@ -1,0 +1,321 @@
+"""Traced functions kept on disk, so that a process need not trace what another one has.
+
+JAX's persistent compilation cache keeps what XLA makes, but its key is the traced and lowered
+program: every process traces its first fit anew, for seconds. Where that cache has a folder, here
+the lowered program (`jax.export`) is kept in it as well, in a file named by all that determines it:
+etid's source files and module constants, the versions of what it is built on, JAX's settings, the
+platform, and of the arguments the structure, the static parts, and the shapes and types of arrays.
+
+Files are written whole or not at all; one that is damaged counts as absent. They are pickles: trust
+a folder as you would trust the compilation cache itself, whose executables run as they are.
+"""
+
+import contextlib
+import dataclasses
+import functools
+import hashlib
+import os
+import pathlib
+import pickle
+import secrets
+import sys
+import time
+import types
+import zlib
+from collections.abc import Callable, Iterator
+from typing import Any, ParamSpec, TypeVar
+
+import equinox as eqx
+import jax
+import jax.core
+import jax.export
+import jaxlib
+import lineax
+import numpy as np
+import optimistix as optx
+import scipy
+
+Parameters = ParamSpec("Parameters")
+Result = TypeVar("Result")
+
+# Packages whose code the key knows: etid by its source files, all others by their versions.
+KNOWN = {"etid", "builtins", "equinox", "jax", "jaxlib", "lineax", "numpy", "optimistix", "scipy"}
+FOLDER = "etid"  # inside that of the compilation cache
+LOADED = time.time()
+# Settings of JAX that change no program.
+UNRELATED = ("jax_compilation_cache", "jax_persistent_cache", "jax_log", "jax_dump", "jax_explain")
+
+
+def stored_jit(function: Callable[Parameters, Result]) -> Callable[Parameters, Result]:
+    """`equinox.filter_jit`, of which the traced function is kept in JAX's compilation cache.
+
+    Without a folder for that cache (`JAX_COMPILATION_CACHE_DIR`) it is `equinox.filter_jit` and
+    nothing else. The same holds under transformations (`jax.grad`, `jax.vmap`, `jax.jit`), which
+    need the function itself; for what `jax.export` cannot hold; with settings that take a function
+    apart (`jax_disable_jit`, `jax_debug_nans`); and for arguments of classes that are defined
+    elsewhere, such as a circuit of one's own, whose code is in no key.
+    """
+    plain = eqx.filter_jit(function)
+
+    @eqx.filter_jit
+    @functools.wraps(function)
+    def kept(*args, **kwargs):  # executed once for each trace
+        found = _trace(function, args, kwargs)
+        if found is None:
+            return function(*args, **kwargs)
+        exported, shell = found
+        return _filled(shell, exported.call(*_arrays((args, kwargs))))
+
+    @functools.wraps(function)
+    def call(*args: Parameters.args, **kwargs: Parameters.kwargs) -> Result:
+        usable = _folder() is not None and _on_device(_arrays((args, kwargs)))
+        return (kept if usable else plain)(*args, **kwargs)
+
+    return call
+
+
+def _folder() -> pathlib.Path | None:
+    """Where traces are kept; None if they are not."""
+    config: Any = jax.config  # its attributes come into being at run time
+    folder = config.jax_compilation_cache_dir
+    takes_apart = config.jax_disable_jit or config.jax_debug_nans or config.jax_debug_infs
+    # What is exported is for the default device.
+    elsewhere = config.jax_default_device is not None
+    if not folder or "://" in folder or takes_apart or elsewhere:
+        return None
+    return pathlib.Path(folder, FOLDER) if config.jax_enable_compilation_cache else None
+
+
+def _arrays(tree: Any) -> list[Any]:
+    return [leaf for leaf in jax.tree.leaves(tree) if eqx.is_array(leaf)]
+
+
+def _on_device(arrays: list[Any]) -> bool:
+    """Whether arrays hold numbers, each on one device of the default kind."""
+    platform = jax.default_backend()
+    for array in arrays:
+        if isinstance(array, jax.core.Tracer):
+            return False
+        if isinstance(array, jax.Array):
+            devices = array.sharding.device_set
+            if len(devices) > 1 or next(iter(devices)).platform != platform:
+                return False
+    return True
+
+
+@dataclasses.dataclass(frozen=True)
+class _Slot:
+    """Place of an array in the result of an exported function."""
+
+    index: int
+
+
+def _filled(shell: Any, arrays: Any) -> Any:
+    leaves, tree = jax.tree.flatten(shell)
+    return tree.unflatten(
+        [arrays[leaf.index] if isinstance(leaf, _Slot) else leaf for leaf in leaves]
+    )
+
+
+def _trace(function: Callable, args: tuple, kwargs: dict) -> tuple[jax.export.Exported, Any] | None:
+    """The exported function and the shell of its result; None if that cannot be had."""
+    folder = _folder()
+    try:
+        key = _key(function, args, kwargs)
+    except _Unknown:
+        return None
+    if folder is None or key is None:
+        return None
+    path = folder / f"{function.__name__}-{key}"
+    found = _read(path)
+    if found is not None:
+        return found
+    try:
+        found = _export(function, args, kwargs)
+        content = pickle.dumps(found)
+    # Of any kind: a callback or a custom call that no file can hold, a result that has no name. The
+    # function is traced in the ordinary way then, and if the fault is its own, raises it there.
+    except Exception:
+        return None
+    _write(path, content)
+    return found
+
+
+def _export(function: Callable, args: tuple, kwargs: dict) -> tuple[jax.export.Exported, Any]:
+    leaves, tree = jax.tree.flatten((args, kwargs))
+    places = [i for i, leaf in enumerate(leaves) if eqx.is_array(leaf)]
+    shells = []
+
+    def flat(*arrays):
+        filled = list(leaves)
+        for place, array in zip(places, arrays, strict=True):
+            filled[place] = array
+        args, kwargs = tree.unflatten(filled)
+        found, structure = jax.tree.flatten(function(*args, **kwargs))
+        dynamic = [i for i, leaf in enumerate(found) if eqx.is_array(leaf)]
+        slots = {i: _Slot(index) for index, i in enumerate(dynamic)}
+        shells.append(structure.unflatten([slots.get(i, leaf) for i, leaf in enumerate(found)]))
+        return [found[i] for i in dynamic]
+
+    flat.__name__ = flat.__qualname__ = function.__name__
+    shapes = [
+        jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, weak_type=_is_weak(leaf))
+        for leaf in map(leaves.__getitem__, places)
+    ]
+    exported = jax.export.export(jax.jit(flat))(*shapes)
+    # How to differentiate it is a function of Python, and it is not differentiated.
+    return dataclasses.replace(exported, _get_vjp=None), shells[0]
+
+
+def _is_weak(array: Any) -> bool:
+    return getattr(array, "weak_type", False)
+
+
+# --- Files ---------------------------------------------------------------------------------------
+
+
+def _read(path: pathlib.Path) -> Any:
+    """What a file holds; None if it is not there or not whole."""
+    try:
+        content = path.read_bytes()
+        checksum, packed = content[:32], content[32:]
+        if hashlib.sha256(path.name.encode() + packed).digest() != checksum:
+            return None
+        return pickle.loads(zlib.decompress(packed))
+    # Any kind of exception comes out of a pickle that was made for something else.
+    except Exception:
+        return None
+
+
+def _write(path: pathlib.Path, content: bytes) -> None:
+    """Write a file whole or not at all: several processes may write the same one."""
+    packed = zlib.compress(content, 1)
+    checksum = hashlib.sha256(path.name.encode() + packed).digest()
+    partial = path.with_name(f".{path.name}.{secrets.token_hex(4)}.partial")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        partial.write_bytes(checksum + packed)
+        os.replace(partial, path)
+    except OSError:
+        pass  # a folder that cannot be written still serves those who read it
+    finally:
+        with contextlib.suppress(OSError):
+            partial.unlink(missing_ok=True)
+
+
+# --- Key -----------------------------------------------------------------------------------------
+
+
+class _Unknown(Exception):
+    """Something whose code or value is in no key."""
+
+
+def _key(function: Callable, args: tuple, kwargs: dict) -> str | None:
+    sources = _sources()
+    if sources is None:
+        return None
+    parts = (
+        sources,
+        _platform(),
+        _settings(),
+        _described(function),
+        list(_constants(sys.modules[function.__module__], set())),
+        _described((args, kwargs)),
+    )
+    return hashlib.sha256(repr(parts).encode()).hexdigest()
+
+
+@functools.cache
+def _sources() -> str | None:
+    """Digest of etid's files; None if they may not be what this process has loaded."""
+    digest = hashlib.sha256()
+    paths = sorted(pathlib.Path(__file__).parent.glob("*.py"))
+    try:
+        if not paths or max(path.stat().st_mtime for path in paths) > LOADED:
+            return None
+        for path in paths:
+            digest.update(path.name.encode() + b"\0" + path.read_bytes())
+    except OSError:
+        return None
+    return digest.hexdigest()
+
+
+@functools.cache
+def _platform() -> tuple[str, ...]:
+    packages = (jax, jaxlib, eqx, optx, lineax, np, scipy)
+    device = jax.devices()[0]
+    return (
+        sys.version,
+        *(package.__version__ for package in packages),
+        f"{jax.device_count()} {device.platform} {device.device_kind}",
+    )
+
+
+def _settings() -> list[str]:
+    """Settings of JAX and equinox, which may change a program."""
+    values = jax.config.values
+    return [os.environ.get("EQX_ON_ERROR", "")] + [
+        f"{name}={getattr(jax.config, name, values[name])}"  # the attribute knows of contexts
+        for name in sorted(values)
+        if not name.startswith(UNRELATED)
+    ]
+
+
+def _constants(module: types.ModuleType, seen: set[str]) -> Iterator[tuple[str, Any]]:
+    """The constants of a module and of those of etid that it uses: someone may have set them.
+
+    Raises:
+        _Unknown: A function was replaced by one from elsewhere.
+    """
+    seen.add(module.__name__)
+    for name, value in sorted(vars(module).items()):
+        if name.startswith("__"):
+            continue
+        if isinstance(value, types.ModuleType):
+            home = value.__name__
+        elif isinstance(value, type | types.FunctionType):
+            home = str(value.__module__)
+            yield f"{module.__name__}.{name}", f"{home}.{value.__qualname__}"
+            origin = home.partition(".")[0]
+            known = origin in KNOWN or origin in sys.stdlib_module_names
+            if isinstance(value, types.FunctionType) and not known:
+                raise _Unknown(name)
+        else:
+            home = ""
+            try:
+                yield f"{module.__name__}.{name}", _described(value, by_value=True)
+            except _Unknown:
+                pass  # types, loggers and the like
+        if home.startswith("etid.") and home not in (*seen, __name__) and home in sys.modules:
+            yield from _constants(sys.modules[home], seen)
+
+
+def _described(node: Any, by_value: bool = False) -> Any:
+    """A value in words that are the same in every process.
+
+    Args:
+        node: Arguments of a function, or a constant.
+        by_value: Whether the numbers in an array matter, or its type only.
+
+    Raises:
+        _Unknown: It contains something of a class or function from elsewhere.
+    """
+    kind = type(node)
+    inner = functools.partial(_described, by_value=by_value)
+    if node is None or kind in (bool, int, float, complex, str, bytes):
+        return kind.__name__, repr(node)
+    if eqx.is_array(node):
+        content = hashlib.sha256(np.asarray(node).tobytes()).hexdigest() if by_value else ""
+        return "array", node.shape, str(node.dtype), _is_weak(node), content
+    if isinstance(node, type | types.FunctionType):
+        if str(node.__module__).partition(".")[0] not in KNOWN or "<lambda>" in node.__qualname__:
+            raise _Unknown(node)
+        return f"{node.__module__}.{node.__qualname__}"
+    if isinstance(node, tuple | list):
+        return inner(kind), [inner(item) for item in node]
+    if isinstance(node, dict):
+        return inner(kind), [(inner(name), inner(item)) for name, item in node.items()]
+    if dataclasses.is_dataclass(node):
+        fields = [(f.name, getattr(node, f.name, None)) for f in dataclasses.fields(node)]
+        return inner(kind), [(name, inner(item)) for name, item in fields]
+    raise _Unknown(node)
