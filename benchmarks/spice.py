@@ -16,7 +16,7 @@ import numpy as np
 
 import etid
 from etid.circuits import AbstractCircuit
-from etid.identify import CONTINUOUS, METHODS, Method
+from etid.identify import METHODS, REFINED, Method
 from etid.scenes import Scene, Trial
 from etid.transformer import ResistorLoad, SkinLoad, TransformerDriver
 
@@ -78,8 +78,8 @@ def fit_scene(source: pathlib.Path, truth: dict, method: str) -> list[dict]:
     trials = truth["trials"]
     is_resistor = "R" in trials[0]["elements"]
     circuit: AbstractCircuit = etid.Resistor() if is_resistor else etid.SkinRC()
-    if is_resistor and method not in (*CONTINUOUS, JOINT):
-        return []  # the paper's method is written for the skin
+    if is_resistor and method not in (*REFINED, JOINT):
+        return []  # Steiglitz-McBride is written for the skin
     with tempfile.TemporaryDirectory() as folder:
         study_file = pathlib.Path(folder) / "study.h5"
         etid.import_file(source, study_file)

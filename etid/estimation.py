@@ -16,10 +16,19 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float
 
-from etid import maximum_likelihood, non_parametric, output_error, prediction, steiglitz_mcbride
+from etid import (
+    harmonic_steiglitz_mcbride,
+    maximum_likelihood,
+    non_parametric,
+    output_error,
+    prediction,
+    steiglitz_mcbride,
+)
 from etid.circuits import AbstractCircuit, SkinRC
 from etid.driver import Driver, SourceImpedance
-from etid.levenberg_marquardt import normal_equations
+from etid.information import inverse
+from etid.levenberg_marquardt import NormalEquations, normal_equations
+from etid.likelihood import delayed_gain, residual
 from etid.measurement import Measurement
 from etid.results import Fit
 from etid.spectra import Spectrum, spectrum
@@ -43,6 +52,7 @@ CORRECTED = (
 PASSIVE = 2.0  # standard errors by which Re Z_th may be negative
 BAND = np.linspace(0.0003, 0.4, 400)  # of the sample rate, where a source must be passive
 LEVELS = (1.0, 0.125, 0.5, 2.0, 8.0)  # impedance levels at which a circuit is started
+START_STEPS = 8  # of Steiglitz-McBride on harmonics, which settles in three to eight
 IMPULSE = 512  # samples of a discrete model's impulse response
 UNWANTED = 1e3  # added to the cost of a start that did not settle; any cost is smaller
 
@@ -75,12 +85,17 @@ def _score(
         return (predict(c, m.v_th) - m.v_out) / jnp.sqrt(s)
 
     equations = normal_equations(scaled, coefficients)
+    return 2 * equations.objective / m.v_th.size, _distance(equations)
+
+
+def _distance(equations: NormalEquations) -> Float[Array, ""]:
+    """Squared distance to the minimum in standard errors."""
     scale = jnp.sqrt(jnp.diagonal(equations.matrix))
     scale = jnp.where(scale > 0, scale, 1.0)
     ridge = 1e-12 * jnp.eye(scale.size)
     gradient = equations.gradient / scale
     newton = jnp.linalg.solve(equations.matrix / scale[:, None] / scale[None, :] + ridge, gradient)
-    return 2 * equations.objective / m.v_th.size, jnp.dot(newton, gradient)
+    return jnp.dot(newton, gradient)
 
 
 def skin_by_steiglitz_mcbride(m: Measurement, driver: Driver, iterations: int) -> Fit:
@@ -113,6 +128,47 @@ def skin_by_steiglitz_mcbride(m: Measurement, driver: Driver, iterations: int) -
         ),
         steps=best.iteration,
         method="steiglitz_mcbride" if iterations > 1 else "equation_error",
+    )
+
+
+def skin_by_harmonic_steiglitz_mcbride(m: Measurement, driver: Driver, window: "Window") -> Fit:
+    """SkinRC by Steiglitz-McBride on the harmonics, judged by the likelihood with Z_th as it is."""
+    source = driver.source
+    assert source is not None  # check_driver
+    spectrum = spectrum_of(m, window)
+    best = harmonic_steiglitz_mcbride.fit_skin(spectrum, source.response(spectrum.frequency))
+    values = best.circuit.values()
+    late = best.delay * m.sample_rate
+    physical = jnp.isfinite(best.rrse)  # or else any likelihood will do
+    elements = jnp.where(physical, values, SkinRC().values())
+
+    def terms(q, spectrum):
+        load = best.circuit.with_log_values(q[:-1]).impedance()
+        delay = q[-1] / m.sample_rate
+        return residual(spectrum, delayed_gain(source, load, spectrum.frequency, delay))
+
+    equations = normal_equations(terms, jnp.append(jnp.log(elements), late), spectrum)
+    freedom = 2 * jnp.sum(spectrum.selected, dtype=values.dtype) - values.size
+    chi2 = 2 * equations.objective / freedom
+    variance = jnp.diagonal(inverse(equations.matrix))[:-1]  # of the logarithms
+    nothing = jnp.full((values.size, values.size), jnp.nan)
+    return Fit(
+        circuit=best.circuit,
+        cov=nothing,
+        shared_cov=nothing,
+        rrse=best.rrse,
+        chi2=jnp.where(physical, chi2, jnp.inf),
+        result=first_verdict(
+            (~best.stable, RESULTS.unstable),
+            (~physical, RESULTS.nonphysical),
+            (~best.converged, MAX_STEPS_REACHED),
+            (misses(chi2, best.rrse) | (jnp.abs(late) > 1), RESULTS.misfit),
+            (~(_distance(equations) <= BIASED), RESULTS.biased),
+            (~jnp.all((variance > 0) & (variance < 1)), RESULTS.insensitive),
+            (driver.result != SUCCESSFUL, RESULTS.driver_failed),
+        ),
+        steps=best.iteration,
+        method="harmonic_steiglitz_mcbride",
     )
 
 
@@ -156,15 +212,28 @@ def driver_by_steiglitz_mcbride(
 # --- Output error and maximum likelihood ---------------------------------------------------------
 
 
-def skin_starts(m: Measurement, driver: Driver, circuit: AbstractCircuit) -> AbstractCircuit:
-    """Several impedance levels and, for SkinRC, the paper's estimate, stacked."""
+def skin_starts(
+    m: Measurement, driver: Driver, circuit: AbstractCircuit, spectrum: Spectrum | None
+) -> AbstractCircuit:
+    """Several impedance levels and, for SkinRC, a Steiglitz-McBride estimate, stacked.
+
+    Args:
+        m: One recording.
+        driver: Its driver.
+        circuit: Structure and typical values.
+        spectrum: Harmonics of the recording, for methods that use them.
+    """
     typical = circuit.log_values()
     is_ohm = jnp.array([unit == "ohm" for unit in circuit.units().values()])
     sign = jnp.where(is_ohm, 1.0, -1.0)
     starts = [typical + float(np.log(level)) * sign for level in LEVELS]
     if isinstance(circuit, SkinRC):
-        baseline = skin_by_steiglitz_mcbride(m, driver, steiglitz_mcbride.ITERATIONS)
-        values = baseline.circuit.values()
+        if spectrum is None:
+            baseline = skin_by_steiglitz_mcbride(m, driver, steiglitz_mcbride.ITERATIONS).circuit
+        else:
+            z_th = driver.response(spectrum.frequency)
+            baseline = harmonic_steiglitz_mcbride.fit_skin(spectrum, z_th, START_STEPS).circuit
+        values = baseline.values()
         usable = jnp.all(values > 0) & jnp.isfinite(values).all()
         starts.append(jnp.where(usable, jnp.log(jnp.where(usable, values, 1.0)), typical))
     return circuit.with_log_values(jnp.stack(starts))
@@ -207,8 +276,9 @@ def skin_by_refinement(
     source, source_cov, calibration = driver.source, driver.cov, driver.calibration
     if source is None or source_cov is None or calibration is None:
         raise ValueError("the driver has no continuous source impedance")
-    starts = skin_starts(m, driver, circuit)
-    if window is None:
+    spectrum = None if window is None else spectrum_of(m, window)
+    starts = skin_starts(m, driver, circuit, spectrum)
+    if window is None or spectrum is None:
         _, estimate = output_error.fit_circuit(
             prediction.prepare(m), source, source_cov, calibration, starts
         )
@@ -218,7 +288,7 @@ def skin_by_refinement(
             circuit,
             calibration,
             jnp.asarray(driver.sample_rate),
-            spectrum_of(m, window),
+            spectrum,
             m.sample_rate,
             starts.log_values(),
         )
@@ -230,9 +300,7 @@ def skin_by_refinement(
     model = maximum_likelihood.Joint(
         circuit, source, calibration, jnp.asarray(driver.sample_rate), window.shared
     )
-    estimate = maximum_likelihood.fit_circuit(
-        model, spectrum_of(m, window), m.sample_rate, starts.log_values()
-    )
+    estimate = maximum_likelihood.fit_circuit(model, spectrum, m.sample_rate, starts.log_values())
     return judged(estimate, circuit, driver.result, "maximum_likelihood")
 
 

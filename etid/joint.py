@@ -56,7 +56,7 @@ def _alone(samples: Any, model: Joint, driver: Driver, window: Window) -> Loads:
     def one(lane):
         m = measure(*lane)
         spectrum = estimation.spectrum_of(m, window)
-        starts = estimation.skin_starts(m, driver, model.circuit).log_values()
+        starts = estimation.skin_starts(m, driver, model.circuit, spectrum).log_values()
         own, result, chi2, error = fit_load(model, spectrum, m.sample_rate, starts)
         settled = RESULTS.promote(result) == RESULTS.successful
         good = settled & jnp.isfinite(chi2) & ~estimation.misses(chi2, error)

@@ -37,6 +37,7 @@ FLOORS = {
     "hdf5": 4,
     "importing": 4,
     "scenes": 4,
+    "harmonic_steiglitz_mcbride": 4,
     "information": 4,
     "bounds": 5,
     "impedance": 5,
