@@ -140,7 +140,7 @@ def run(
         raise SystemExit(f"no SPICE recordings at {folder}; pass their parent folder with --data")
     truth = json.loads((folder / "truth.json").read_text())["scenes"]
     table: list[dict] = []
-    head = f"{'scene':<19}{'method':<20}{'element':<8}{'bias %':>9}{'spread %':>9}{'rms %':>9}"
+    head = f"{'scene':<19}{'method':<28}{'element':<8}{'bias %':>9}{'spread %':>9}{'rms %':>9}"
     head += f"{'bound %':>9}{'sd %':>9}{'chi2':>9}  silent  driver; verdicts"
     print(head)
     for name in scenes or truth:
@@ -151,7 +151,7 @@ def run(
                     f"{row[key]:9.3g}" for key in ("bias", "spread", "rms", "bound", "sd", "chi2")
                 )
                 print(
-                    f"{row['scene']:<19}{row['method']:<20}{row['element']:<8}{numbers}"
+                    f"{row['scene']:<19}{row['method']:<28}{row['element']:<8}{numbers}"
                     f"{row['silent']:>8}  {row['driver']}; {row['verdicts']}",
                     flush=True,
                 )
