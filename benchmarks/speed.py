@@ -3,6 +3,7 @@
 Each line is a ratio of medians with its target; a missed target makes the command end with 1.
 """
 
+import dataclasses
 import os
 import subprocess
 import sys
@@ -24,18 +25,21 @@ from etid import estimation
 from etid.batch import each
 from etid.circuits import SkinRC
 from etid.filtering import lfilter
+from etid.harmonic_steiglitz_mcbride import fit_skin
 from etid.identify import arrays, skin_lane, window
 from etid.levenberg_marquardt import normal_equations
 from etid.likelihood import residual
 from etid.maximum_likelihood import MAX_STEPS, SOLVER, Joint
 from etid.measurement import measure
 from etid.scenes import Scene, Trial
+from etid.steiglitz_mcbride import ITERATIONS
 from etid.transformer import ResistorLoad, SkinLoad
 
 SAMPLES = 33_330  # ten pulse periods at 200 kHz
 LOAD = SkinLoad(r_s=33.4e3, r_p=186e3, c_p=0.12e-9)
 B, A = cast(tuple[np.ndarray, np.ndarray], scipy.signal.butter(6, 0.3))
 WARM = 3  # processes that find what another one has compiled
+TRUTH = dataclasses.astuple(LOAD)
 START = np.log([20e3, 100e3, 0.3e-9])  # typical values, a factor of two from the truth
 
 
@@ -205,6 +209,54 @@ def _raw_to_fit(lanes: int, repeats: int) -> list[Line]:
     return [_costs(f"raw to fit / scipy lfilter, {lanes} lanes", ours, reference, 0.5)]
 
 
+def _by_lfilter(x: np.ndarray, w: np.ndarray, iterations: int) -> np.ndarray:
+    """Eqs. (1), (2) for a filter of order 1, with SciPy and NumPy: b₀, b₁, a₁."""
+    found, prefilter = np.zeros(3), np.array([1.0, 0.0])
+    for _ in range(iterations):
+        xf, wf = (np.asarray(scipy.signal.lfilter([1.0], prefilter, v)) for v in (x, w))
+        columns = np.stack([xf[1:], xf[:-1], -wf[:-1]], axis=1)
+        found = np.linalg.lstsq(columns, wf[1:])[0]
+        prefilter[1] = found[2] if abs(found[2]) < 1 else 1 / found[2]  # reflected if unstable
+    return found
+
+
+def _steiglitz_mcbride(lanes: int, repeats: int) -> list[Line]:
+    """Twenty iterations on the harmonics against as many on the samples of a recording.
+
+    The second line adds what makes harmonics and their noise of the samples.
+    """
+    problem = _problem(SAMPLES, lanes)
+    source = problem.driver.source
+    assert source is not None
+
+    def project(lane):
+        return estimation.spectrum_of(measure(*lane), problem.window)
+
+    def fit(spectrum):
+        return fit_skin(spectrum, source.response(spectrum.frequency), ITERATIONS).circuit.values()
+
+    iterate = jax.jit(lambda spectra: each(fit, spectra))
+    whole = jax.jit(lambda samples: each(lambda lane: fit(project(lane)), samples))
+    spectra = jax.jit(lambda samples: each(project, samples))(problem.lanes)
+    np.testing.assert_allclose(np.median(iterate(spectra), axis=0), TRUTH, rtol=0.05)
+
+    v_th, v_out = (np.asarray(column[0]) for column in problem.lanes[:2])
+    b, a = np.asarray(problem.driver.b), np.asarray(problem.driver.a)
+
+    def by_lfilter():
+        w = np.asarray(scipy.signal.lfilter(b, a, v_out))
+        return _by_lfilter(v_th - v_out, w, ITERATIONS)
+
+    theirs = median_time(by_lfilter, repeats)
+    return [
+        _gains(name, median_time(ours, repeats) / lanes, theirs, 15.0)
+        for name, ours in (
+            (f"lfilter, lstsq SM / harmonic SM, {lanes} lanes", lambda: iterate(spectra)),
+            ("lfilter, lstsq SM / the same from samples", lambda: whole(problem.lanes)),
+        )
+    ]
+
+
 _WARM = """
 import time, jax
 jax.config.update("jax_enable_x64", True)
@@ -253,6 +305,7 @@ def run(quick: bool) -> bool:
         *_filters(5 * repeats),
         *_solvers(lanes, repeats),
         *_raw_to_fit(lanes, 1 if quick else 3),
+        *_steiglitz_mcbride(lanes, repeats),
     ]
     print(f"{'':<44}{'ours ms':>10}{'theirs ms':>11}{'ratio':>8}   target")
     for line in lines:

@@ -16,7 +16,7 @@ import numpy as np
 
 import etid
 from etid.circuits import AbstractCircuit
-from etid.identify import CONTINUOUS, METHODS, Method
+from etid.identify import METHODS, REFINED, Method
 from etid.scenes import Scene, Trial
 from etid.transformer import ResistorLoad, SkinLoad, TransformerDriver
 
@@ -78,8 +78,8 @@ def fit_scene(source: pathlib.Path, truth: dict, method: str) -> list[dict]:
     trials = truth["trials"]
     is_resistor = "R" in trials[0]["elements"]
     circuit: AbstractCircuit = etid.Resistor() if is_resistor else etid.SkinRC()
-    if is_resistor and method not in (*CONTINUOUS, JOINT):
-        return []  # the paper's method is written for the skin
+    if is_resistor and method not in (*REFINED, JOINT):
+        return []  # Steiglitz-McBride is written for the skin
     with tempfile.TemporaryDirectory() as folder:
         study_file = pathlib.Path(folder) / "study.h5"
         etid.import_file(source, study_file)
@@ -140,7 +140,7 @@ def run(
         raise SystemExit(f"no SPICE recordings at {folder}; pass their parent folder with --data")
     truth = json.loads((folder / "truth.json").read_text())["scenes"]
     table: list[dict] = []
-    head = f"{'scene':<19}{'method':<20}{'element':<8}{'bias %':>9}{'spread %':>9}{'rms %':>9}"
+    head = f"{'scene':<19}{'method':<28}{'element':<8}{'bias %':>9}{'spread %':>9}{'rms %':>9}"
     head += f"{'bound %':>9}{'sd %':>9}{'chi2':>9}  silent  driver; verdicts"
     print(head)
     for name in scenes or truth:
@@ -151,7 +151,7 @@ def run(
                     f"{row[key]:9.3g}" for key in ("bias", "spread", "rms", "bound", "sd", "chi2")
                 )
                 print(
-                    f"{row['scene']:<19}{row['method']:<20}{row['element']:<8}{numbers}"
+                    f"{row['scene']:<19}{row['method']:<28}{row['element']:<8}{numbers}"
                     f"{row['silent']:>8}  {row['driver']}; {row['verdicts']}",
                     flush=True,
                 )

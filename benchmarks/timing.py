@@ -58,8 +58,8 @@ def run(lanes: int) -> None:
             etid.identify_skin, recordings[0], driver, method=method, throw=False
         )
         first, warm = first_and_warm(fit, REPEATS)
-        print(f"skin {method:<18} first {first:8.2f} s   warm {1e3 * warm:.1f} ms")
+        print(f"skin {method:<27} first {first:8.2f} s   warm {1e3 * warm:.1f} ms")
         fits = functools.partial(etid.identify_skins, many, driver, method=method)
         first, warm = first_and_warm(lambda fits=fits: fits().chi2, 3)
         each = 1e3 * warm / lanes
-        print(f"  batch of {lanes:<12} first {first:8.2f} s   warm {each:.1f} ms per fit")
+        print(f"  batch of {lanes:<21} first {first:8.2f} s   warm {each:.1f} ms per fit")

@@ -1,19 +1,12 @@
-"""One lane: samples in, judged estimate out. The same functions serve one recording and a batch.
-
-Every estimate passes through a judge, so that none leaves without a verdict. Among several
-applicable verdicts the most fundamental is reported: a loop that cannot be simulated, then elements
-that are no circuit, then a solver that did not settle, then a model that misses the data, then
-parameters that the data do not determine.
-"""
+"""Refinement: samples or harmonics in, judged estimate out; for one recording and for a batch."""
 
 import dataclasses
-from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Array, Bool, Complex, Float
+from jaxtyping import Array, Complex, Float
 
 from etid import (
     given_driver,
@@ -22,146 +15,28 @@ from etid import (
     non_parametric,
     output_error,
     prediction,
+    single_load,
     steiglitz_mcbride,
 )
+from etid.baseline import driver_by_steiglitz_mcbride, skin_by_steiglitz_mcbride
 from etid.circuits import AbstractCircuit, SkinRC
 from etid.driver import Driver, SourceImpedance
 from etid.given_driver import GivenDriver
-from etid.levenberg_marquardt import normal_equations
+from etid.judging import MAX_STEPS_REACHED, SUCCESSFUL, judged, misses, too_late
 from etid.measurement import Measurement
 from etid.results import Fit
 from etid.spectra import Spectrum
-from etid.transfer import Rational, poles
-from etid.verdicts import RESULTS, first_verdict, verdict
+from etid.transfer import poles
+from etid.verdicts import RESULTS, first_verdict
 
-# Members inherited from lineax, of which the type checker thinks they are not ours.
-SUCCESSFUL = verdict("successful")
-MAX_STEPS_REACHED = verdict("max_steps_reached")
-MISFIT_CHI2 = 1.5  # the noise is known from the record to about 5 %, chi2 therefore to 10 %
-MISFIT_RRSE = (
-    1e-3  # of the signal; what converters and transformers leave unexplained at their best
-)
-# Growth of the calibrations' sum of squares in a joint fit. It is chi-squared with as many degrees
-# of freedom as Z_th and the delays have parameters at most: 12 exceed this once in ten thousand.
-STRAINED = 39.0
-BIASED = 16.0  # squared standard errors between an estimate and the minimum of its own model
 CORRECTED = (
     2.0  # standard errors of bias that may be corrected; what it leaves is below half of one
 )
 PASSIVE = 2.0  # standard errors by which Re Z_th may be negative
 BAND = np.linspace(0.0003, 0.4, 400)  # of the sample rate, where a source must be passive
 LEVELS = (1.0, 0.125, 0.5, 2.0, 8.0)  # impedance levels at which a circuit is started
-IMPULSE = 512  # samples of a discrete model's impulse response
+START_STEPS = 8  # of Steiglitz-McBride on harmonics, which settles in three to eight
 UNWANTED = 1e3  # added to the cost of a start that did not settle; any cost is smaller
-
-
-def misses(chi2: Float[Array, ""], error: Float[Array, ""]) -> Bool[Array, ""]:
-    """Whether the residual exceeds the noise both in standard deviations and in volts."""
-    excess = error * jnp.sqrt(jnp.maximum(1 - 1 / chi2, 0.0))
-    return (chi2 > MISFIT_CHI2) & (excess > MISFIT_RRSE)
-
-
-def _too_late(estimate: output_error.Estimate) -> Bool[Array, ""]:
-    """Whether a trigger delay lies outside the one sample for which it is modelled."""
-    return jnp.any(jnp.abs(estimate.nuisance[:, -1]) > 1)
-
-
-# --- Steiglitz-McBride ---------------------------------------------------------------------------
-
-
-def _score(
-    m: Measurement,
-    coefficients: Float[Array, " n"],
-    predict: Callable[[Float[Array, " n"], Float[Array, " time"]], Float[Array, " time"]],
-) -> tuple[Float[Array, ""], Float[Array, ""]]:
-    """χ² of a discrete model, and its squared distance to the minimum in standard errors."""
-    impulse = jnp.zeros(IMPULSE).at[0].set(1.0)
-
-    def scaled(c, _):
-        h = predict(c, impulse)
-        s = m.sigma_out**2 + m.sigma_th**2 * jnp.sum(h**2)
-        return (predict(c, m.v_th) - m.v_out) / jnp.sqrt(s)
-
-    equations = normal_equations(scaled, coefficients)
-    scale = jnp.sqrt(jnp.diagonal(equations.matrix))
-    scale = jnp.where(scale > 0, scale, 1.0)
-    ridge = 1e-12 * jnp.eye(scale.size)
-    gradient = equations.gradient / scale
-    newton = jnp.linalg.solve(equations.matrix / scale[:, None] / scale[None, :] + ridge, gradient)
-    return 2 * equations.objective / m.v_th.size, jnp.dot(newton, gradient)
-
-
-def skin_by_steiglitz_mcbride(m: Measurement, driver: Driver, iterations: int) -> Fit:
-    """The paper's estimate of SkinRC (eqs. 8-12); `iterations` 1 is equation error."""
-    z_th = Rational(driver.b, driver.a)
-    best = steiglitz_mcbride.skin_filter(m.v_th, m.v_out, z_th, iterations)
-    circuit = steiglitz_mcbride.skin_elements(best.filter, m.sample_rate)
-    free = best.filter.num.size
-
-    def predict(c, v):
-        load = Rational(c[:free], jnp.concatenate([jnp.ones(1), c[free:]]))
-        return steiglitz_mcbride.terminal_voltage(z_th, load, v)[0]
-
-    chi2, distance = _score(m, jnp.concatenate([best.filter.num, best.filter.den[1:]]), predict)
-    values = circuit.values()
-    unstable = ~jnp.isfinite(best.rrse)
-    nothing = jnp.full((values.size, values.size), jnp.nan)
-    return Fit(
-        circuit=circuit,
-        cov=nothing,
-        shared_cov=nothing,
-        rrse=best.rrse,
-        chi2=jnp.where(unstable, jnp.inf, chi2),
-        result=first_verdict(
-            (unstable, RESULTS.unstable),
-            (~jnp.all(values > 0), RESULTS.nonphysical),
-            ((iterations > 1) & ~best.converged, MAX_STEPS_REACHED),
-            (misses(chi2, best.rrse), RESULTS.misfit),
-            (distance > BIASED, RESULTS.biased),
-        ),
-        steps=best.iteration,
-        method="steiglitz_mcbride" if iterations > 1 else "equation_error",
-    )
-
-
-def driver_by_steiglitz_mcbride(
-    m: Measurement, r_load: Float[Array, " record"], order: int, iterations: int
-) -> Driver:
-    """The paper's estimate of Z_th (eqs. 4-6); `iterations` 1 is equation error."""
-    best = steiglitz_mcbride.driver_filter(m.v_th, m.v_out, r_load, order, iterations)
-    free = best.filter.num.size
-
-    def score(m, r):
-        def predict(c, v):
-            z_th = Rational(c[:free], jnp.concatenate([jnp.ones(1), c[free:]]))
-            return steiglitz_mcbride.terminal_voltage(z_th, Rational(r[None], jnp.ones(1)), v)[0]
-
-        return _score(m, jnp.concatenate([best.filter.num, best.filter.den[1:]]), predict)
-
-    chi2, distance = jax.vmap(score)(m, r_load)
-    chi2 = chi2.max()
-    unstable = ~jnp.isfinite(best.rrse) | ~best.stable
-    return Driver(
-        b=best.filter.num,
-        a=best.filter.den,
-        sample_rate=m.sample_rate[0],
-        source=None,
-        cov=None,
-        calibration=None,
-        rrse=best.rrse,
-        chi2=jnp.where(jnp.isfinite(best.rrse), chi2, jnp.inf),
-        result=first_verdict(
-            (unstable, RESULTS.unstable),
-            ((iterations > 1) & ~best.converged, MAX_STEPS_REACHED),
-            (misses(chi2, best.rrse), RESULTS.misfit),
-            (distance.max() > BIASED, RESULTS.biased),
-        ),
-        steps=best.iteration,
-        method="steiglitz_mcbride" if iterations > 1 else "equation_error",
-    )
-
-
-# --- Output error and maximum likelihood ---------------------------------------------------------
 
 
 def _starts(
@@ -222,18 +97,25 @@ def given(driver: Driver, frequency: Float[Array, " harmonic"], shared: bool) ->
 
 
 def harmonic_starts(
-    spectrum: Spectrum, z_th: Complex[Array, " harmonic"], circuit: AbstractCircuit
-) -> Float[Array, "start element"]:
-    """Logarithms of elements from which a fit on harmonics may start.
+    spectrum: Spectrum,
+    sample_rate: Float[Array, ""],
+    z_th: Complex[Array, " harmonic"],
+    circuit: AbstractCircuit,
+) -> Float[Array, "start own"]:
+    """Logarithms of elements, and delays in samples, from which a fit on harmonics may start.
 
     Args:
         spectrum: One recording.
+        sample_rate: Its sampling rate [Hz].
         z_th: Source impedance there [Ω].
         circuit: Structure and typical values.
     """
     if not isinstance(circuit, SkinRC):
-        return _starts(circuit, None)
-    return _starts(circuit, harmonic_steiglitz_mcbride.fit_skin(spectrum, z_th).circuit)
+        return jnp.pad(_starts(circuit, None), ((0, 0), (0, 1)))
+    baseline = harmonic_steiglitz_mcbride.fit_skin(spectrum, z_th, START_STEPS)
+    starts = _starts(circuit, baseline.circuit)
+    delays = jnp.zeros(starts.shape[0]).at[-1].set(baseline.delay * sample_rate)
+    return jnp.concatenate([starts, delays[:, None]], axis=1)
 
 
 def skin_by_maximum_likelihood(
@@ -252,8 +134,10 @@ def skin_by_maximum_likelihood(
         known: What its calibrations tell.
         circuit: Structure and typical values.
     """
-    starts = harmonic_starts(spectrum, known.z_th(jnp.zeros_like(known.loaded)), circuit)
-    estimate = given_driver.fit_circuit(known, circuit, spectrum, sample_rate, starts)
+    starts = harmonic_starts(
+        spectrum, sample_rate, known.z_th(jnp.zeros_like(known.loaded)), circuit
+    )
+    estimate = single_load.fit_circuit(known, circuit, spectrum, sample_rate, starts)
     return judged(estimate, circuit, driver.result, "maximum_likelihood")
 
 
@@ -264,7 +148,7 @@ def skin_by_non_parametric(
     source, calibration = driver.source, driver.calibration
     assert source is not None  # check_driver
     assert calibration is not None
-    starts = harmonic_starts(spectrum, source.response(spectrum.frequency), circuit)
+    starts = harmonic_starts(spectrum, sample_rate, source.response(spectrum.frequency), circuit)
     estimate, bias = non_parametric.fit_circuit(
         circuit, calibration, jnp.asarray(driver.sample_rate), spectrum, sample_rate, starts
     )
@@ -273,42 +157,6 @@ def skin_by_non_parametric(
     far = jnp.any(jnp.abs(bias) > CORRECTED * jnp.sqrt(jnp.diagonal(estimate.cov)))
     result = RESULTS.where(far & (fit.result == SUCCESSFUL), RESULTS.biased, fit.result)
     return dataclasses.replace(fit, result=result)
-
-
-def judged(
-    estimate: output_error.Estimate, circuit: AbstractCircuit, driver_result: RESULTS, method: str
-) -> Fit:
-    """The fit of an estimate, with its verdict.
-
-    Args:
-        estimate: Its parameters are the logarithms of the elements.
-        circuit: Structure of the load.
-        driver_result: Verdict of the driver.
-        method: Name of the estimator.
-    """
-    fitted = circuit.with_log_values(estimate.parameters)
-    values = fitted.values()
-    errors = jnp.sqrt(jnp.diagonal(estimate.cov))  # of the logarithms, so relative ones
-    settled = RESULTS.promote(estimate.result) == RESULTS.successful
-    return Fit(
-        circuit=fitted,
-        cov=estimate.cov * jnp.outer(values, values),
-        shared_cov=estimate.shared_cov * jnp.outer(values, values),
-        rrse=estimate.rrse,
-        chi2=estimate.chi2,
-        result=first_verdict(
-            (~jnp.isfinite(estimate.chi2), RESULTS.unstable),
-            (~jnp.isfinite(values).all(), RESULTS.nonphysical),
-            (~settled, MAX_STEPS_REACHED),
-            (misses(estimate.chi2, estimate.rrse) | _too_late(estimate), RESULTS.misfit),
-            (estimate.strain > STRAINED, RESULTS.inconsistent),
-            # None of 0: that is an element without any effect.
-            (~jnp.all((errors > 0) & (errors < 1)), RESULTS.insensitive),
-            (driver_result != SUCCESSFUL, RESULTS.driver_failed),
-        ),
-        steps=estimate.steps,
-        method=method,
-    )
 
 
 def source_starts(
@@ -421,7 +269,7 @@ def driver_by_refinement(
             (~finite[chosen], RESULTS.unstable),
             (~passive[chosen], RESULTS.nonphysical),
             (~settled[chosen], MAX_STEPS_REACHED),
-            (misses(estimate.chi2, estimate.rrse) | _too_late(estimate), RESULTS.misfit),
+            (misses(estimate.chi2, estimate.rrse) | too_late(estimate), RESULTS.misfit),
         ),
         steps=estimate.steps,
         method="output_error" if spectra is None else "maximum_likelihood",

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from etid import estimation, output_error, prediction, steiglitz_mcbride
+from etid import baseline, estimation, output_error, prediction, steiglitz_mcbride
 from etid.circuits import AbstractCircuit, Resistor, SkinRC
 from etid.driver import Driver
 from etid.filtering import TAPS
@@ -25,18 +25,26 @@ from etid.traces import stored_jit
 from etid.verdicts import message, verdict
 
 Method = Literal[
-    "maximum_likelihood", "non_parametric", "output_error", "steiglitz_mcbride", "equation_error"
+    "maximum_likelihood",
+    "non_parametric",
+    "output_error",
+    "harmonic_steiglitz_mcbride",
+    "steiglitz_mcbride",
+    "equation_error",
 ]
 METHODS: tuple[Method, ...] = (
     "maximum_likelihood",
     "non_parametric",
     "output_error",
+    "harmonic_steiglitz_mcbride",
     "steiglitz_mcbride",
     "equation_error",
 )
-HARMONIC = METHODS[:2]  # those on the harmonics of whole pulse periods
+CALIBRATED = METHODS[:2]  # those that use the harmonics of the calibrations
+REFINED = METHODS[:3]  # those for any circuit
+CONTINUOUS = METHODS[:4]  # those that use a continuous source impedance
+HARMONIC = (*CALIBRATED, METHODS[3])  # those on the harmonics of whole pulse periods
 SAME_PULSE_RATE = 1e-3  # part by which rates may differ: Z_th is smooth
-CONTINUOUS = METHODS[:3]  # those that identify a continuous source impedance
 
 
 def _iterations(method: Method) -> int:
@@ -50,7 +58,7 @@ def check_method(method: str | None, circuit: AbstractCircuit | None = None) -> 
         return
     if method not in METHODS:
         raise ValueError(f"method {method!r} is not known; use one of {', '.join(METHODS)}")
-    if method not in CONTINUOUS and circuit is not None and not isinstance(circuit, SkinRC):
+    if method not in REFINED and circuit is not None and not isinstance(circuit, SkinRC):
         raise ValueError(
             f"method {method!r} identifies SkinRC only, not {type(circuit).__name__}; "
             "use method='maximum_likelihood'"
@@ -118,7 +126,7 @@ def check_driver(driver: Driver, method: Method, sample_rate: float) -> None:
             f"this driver was identified by {driver.method}, which gives no continuous source "
             f"impedance; identify it with method={method!r}"
         )
-    if method in HARMONIC and not has_harmonics(driver):
+    if method in CALIBRATED and not has_harmonics(driver):
         raise ValueError(
             f"this driver was identified by {driver.method}, which keeps no harmonics of its "
             "calibrations; identify it with method='maximum_likelihood'"
@@ -183,7 +191,7 @@ def _driver(
     m = jax.vmap(measure)(*samples)
     if method in CONTINUOUS:
         return estimation.driver_by_refinement(m, r_load, order, spectra)
-    return estimation.driver_by_steiglitz_mcbride(m, r_load, order, _iterations(method))
+    return baseline.driver_by_steiglitz_mcbride(m, r_load, order, _iterations(method))
 
 
 @stored_jit
@@ -213,11 +221,14 @@ def skin_lane(
         m = measure(*lane)
         if method == "output_error":
             return estimation.skin_by_output_error(m, driver, circuit)
-        return estimation.skin_by_steiglitz_mcbride(m, driver, _iterations(method))
+        return baseline.skin_by_steiglitz_mcbride(m, driver, _iterations(method))
     *fields, rate = lane
+    spectrum = Spectrum(*fields)
+    if method == "harmonic_steiglitz_mcbride":
+        return baseline.skin_by_harmonic_steiglitz_mcbride(spectrum, rate, driver)
     if known is None:
-        return estimation.skin_by_non_parametric(Spectrum(*fields), rate, driver, circuit)
-    return estimation.skin_by_maximum_likelihood(Spectrum(*fields), rate, driver, known, circuit)
+        return estimation.skin_by_non_parametric(spectrum, rate, driver, circuit)
+    return estimation.skin_by_maximum_likelihood(spectrum, rate, driver, known, circuit)
 
 
 _skin = stored_jit(skin_lane)
@@ -310,7 +321,8 @@ def identify_skin(
         recording: Unloaded and loaded voltage.
         driver: Identified driver.
         circuit: Structure of the load and its typical values; `SkinRC` if not given.
-        method: As in `identify_driver`.
+        method: As in `identify_driver`, or `"non_parametric"` or `"harmonic_steiglitz_mcbride"`,
+            whose drivers are those of maximum likelihood.
         throw: Raise if the verdict is not successful.
 
     Returns:

@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Array
 from tqdm import tqdm
 
-from etid import estimation, shared_driver
+from etid import estimation, judging, shared_driver
 from etid.batch import (
     LANES,
     Drivers,
@@ -58,10 +58,10 @@ def _alone(lanes: Any, model: Joint) -> Loads:
         *fields, sample_rate = lane
         spectrum = Spectrum(*fields)
         z_th = model.calibrations.source.response(spectrum.frequency)
-        starts = estimation.harmonic_starts(spectrum, z_th, model.circuit)
+        starts = estimation.harmonic_starts(spectrum, sample_rate, z_th, model.circuit)
         own, result, chi2, error = fit_load(model, spectrum, sample_rate, starts)
         settled = RESULTS.promote(result) == RESULTS.successful
-        good = settled & jnp.isfinite(chi2) & ~estimation.misses(chi2, error)
+        good = settled & jnp.isfinite(chi2) & ~judging.misses(chi2, error)
         return Loads(spectrum, sample_rate, own, good, jnp.array(-1))
 
     return each(one, lanes)
@@ -84,7 +84,7 @@ def _together(
         with_scale = dataclasses.replace(
             estimate, cov=estimate.cov + scale, shared_cov=estimate.shared_cov + scale
         )
-        return estimation.judged(with_scale, model.circuit, driver.result, METHOD)
+        return judging.judged(with_scale, model.circuit, driver.result, METHOD)
 
     split = model.calibrations.sources
     better = eqx.tree_at(
@@ -95,7 +95,7 @@ def _together(
             cov[:split, :split],
             common[split:],
             RESULTS.where(
-                estimates[0].strain[0] > estimation.STRAINED, RESULTS.inconsistent, driver.result
+                estimates[0].strain[0] > judging.STRAINED, RESULTS.inconsistent, driver.result
             ),
         ),
     )

@@ -229,7 +229,7 @@ def fit_load(
     model: Joint,
     spectrum: Spectrum,
     sample_rate: Float[Array, ""],
-    candidates: Float[Array, "start element"],
+    candidates: Float[Array, "start own"],
 ) -> tuple[Float[Array, " own"], optx.RESULTS, Float[Array, ""], Float[Array, ""]]:
     """Identify the load of one recording with Z_th as the calibrations have it.
 
@@ -237,7 +237,8 @@ def fit_load(
         model: Calibrations and kind of circuit.
         spectrum: The recording.
         sample_rate: Its sampling rate [Hz].
-        candidates: Logarithms of elements to start from; the start that predicts best is refined.
+        candidates: Logarithms of elements, and delays in samples, to start from; the start that
+            predicts best is refined.
 
     Returns:
         Elements and delay, how the solver ended, χ² per degree of freedom, and RRSE.
@@ -247,8 +248,7 @@ def fit_load(
     def terms(own, spectrum):
         return model.of_load(own, common, spectrum, sample_rate, records)
 
-    starts = jnp.pad(candidates, ((0, 0), (0, 1)))
-    best = best_start(lambda own: terms(own, spectrum), starts)
+    best = best_start(lambda own: terms(own, spectrum), candidates)
     solution = optx.least_squares(
         terms, SOLVER, best, args=spectrum, max_steps=MAX_STEPS, throw=False
     )

@@ -159,7 +159,7 @@ def fit_circuit(
     calibration_rate: Float[Array, ""],
     spectrum: Spectrum,
     sample_rate: Float[Array, ""],
-    candidates: Float[Array, "start element"],
+    candidates: Float[Array, "start own"],
 ) -> tuple[Estimate, Float[Array, " element"]]:
     """Identify the load of one recording by the harmonics of the calibrations of its driver.
 
@@ -169,23 +169,23 @@ def fit_circuit(
         calibration_rate: Their sampling rate [Hz].
         spectrum: The recording.
         sample_rate: Its sampling rate [Hz].
-        candidates: Logarithms of elements to start from; the start that predicts best is refined.
+        candidates: Logarithms of elements, and delays in samples, to start from; the start that
+            predicts best is refined.
 
     Returns:
         The estimate, whose parameters are the logarithms of the elements, and the bias that has
         been subtracted from them.
     """
     assert calibration.spectra is not None  # check_driver
-    known, elements = as_list(calibration.spectra), candidates.shape[1]
+    known, elements = as_list(calibration.spectra), candidates.shape[1] - 1
     count = min(spectrum.x.size, known[0].x.size)
     records = [jax.tree.map(lambda leaf: leaf[:count], s) for s in (*known, spectrum)]
     clear = _clear(records[:-1])
     selected = clear.any(0) & records[-1].selected
     model = _Model(circuit, calibration.r_load, calibration_rate, sample_rate, clear, selected)
 
-    delays = jnp.concatenate([calibration.delay, jnp.zeros(1)])
-    late = jnp.broadcast_to(delays, (candidates.shape[0], delays.size))
-    starts = jnp.concatenate([candidates, late], axis=1)
+    late = jnp.broadcast_to(calibration.delay, (candidates.shape[0], calibration.delay.size))
+    starts = jnp.concatenate([candidates[:, :-1], late, candidates[:, -1:]], axis=1)
     best = best_start(lambda q: model.terms(q, records), starts)
 
     def solve(records, start):

@@ -126,6 +126,21 @@ def test_gradients_forward_reverse_and_finite_differences_agree(getkey):
     assert distance < 1e-7
 
 
+def test_second_derivatives_agree_with_differences_of_the_first(getkey):
+    """The recursion between blocks brings its own rule of differentiation."""
+    x = jax.random.normal(getkey(), (3 * BLOCK,))
+
+    def loss(p):
+        return jnp.sum(jnp.sin(lfilter(jnp.ones(1), jnp.append(jnp.ones(1), p), x)[0]))
+
+    p = jnp.array([-0.9])
+    slope = jax.jit(jax.grad(loss))
+    step = 1e-5  # error step² of the fourth derivative
+    numeric = (slope(p + step) - slope(p - step)) / (2 * step)
+    for second in (jax.jacfwd(jax.grad(loss)), jax.grad(lambda p: jax.jacfwd(loss)(p)[0])):
+        np.testing.assert_allclose(jax.jit(second)(p).ravel(), numeric, rtol=1e-7)
+
+
 SOURCE = SourceImpedance(
     log_resistance=jnp.log(600.0),
     log_omega=jnp.log(jnp.array([3.0e5, 1.5e6])),

@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 
 import etid
-from etid import given_driver
+from etid import single_load
 from etid.scenes import Scene, Trial
 from etid.transformer import ResistorLoad, SkinLoad
 
 # Minima to ten digits: a difference of two of them is to be compared.
-EXACT = dataclasses.replace(given_driver.TOGETHER, rtol=1e-10, ftol=1e-15)
+EXACT = dataclasses.replace(single_load.TOGETHER, rtol=1e-10, ftol=1e-15)
 STEP = 1e-3  # of a disturbance that is small itself: the curvature costs its square
 # Differences of minima along the flat direction of the driver repeat to some 1e-9 of an element.
 REPEATED = 1e-8
@@ -22,7 +22,7 @@ REPEATED = 1e-8
 
 def derivative(load, circuit, order, monkeypatch):
     """Elements at a step to either side, and their derivative by a disturbance and by r_load."""
-    monkeypatch.setattr(given_driver, "TOGETHER", EXACT)
+    monkeypatch.setattr(single_load, "TOGETHER", EXACT)
     known = (Trial("c", ResistorLoad(98.8e3)),)
     scene = Scene((Trial("a", load),), known, sample_rate=40e3, samples=2000)
     study = scene.simulate(seed=1)

@@ -115,7 +115,7 @@ def test_one_unloaded_record_for_calibration_and_trial_tells_of_its_voltage_twic
     study = scene.simulate(seed=2)
     fit = etid.identify_skin(study["a"], etid.identify_driver(study["c"]))
     bound = etid.bound(scene)["a"]
-    found = np.asarray(fit.stderr.r_p) / bound.stderr["r_p"]
+    found = np.asarray(fit.stderr.values())[1] / bound.stderr["r_p"]
     np.testing.assert_allclose(found, 1.0, atol=0.1)  # without it 1.2
     assert (np.abs(error(fit)) < SIGMAS * np.asarray(fit.stderr.values())).all()
 

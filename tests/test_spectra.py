@@ -113,8 +113,9 @@ def test_numpy_and_jax_see_the_same_harmonics(periods, samples):
     generator = np.random.default_rng(8)
     v, w = np.cumsum(generator.normal(size=(2, samples)), axis=1)
     scalars = [np.asarray(s) for s in (0.1, 0.2, RATE)]
-    host = spectra.spectrum(v, w, *scalars, periods, samples)
-    traced = spectrum(jnp.asarray(v), jnp.asarray(w), *map(jnp.asarray, scalars), periods, samples)
+    size = periods, samples
+    host = spectra.spectrum(v, w, scalars[0], scalars[1], scalars[2], *size)
+    traced = spectrum(jnp.asarray(v), jnp.asarray(w), *map(jnp.asarray, scalars), *size)
     for one, other in zip(host, traced, strict=True):
         assert isinstance(one, np.ndarray)
         assert one.size % spectra.ROOM == 0

@@ -1,0 +1,166 @@
+"""Steiglitz-McBride, in time as the paper has it and on harmonics, with verdicts.
+
+These estimates have no covariance. Where they would be believed wrongly they are judged by the
+minimum of the model that they stop short of: they are `biased` if it is far.
+"""
+
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from etid import harmonic_steiglitz_mcbride, steiglitz_mcbride
+from etid.circuits import SkinRC
+from etid.driver import Driver
+from etid.information import inverse
+from etid.judging import MAX_STEPS_REACHED, SUCCESSFUL, misses
+from etid.levenberg_marquardt import NormalEquations, normal_equations
+from etid.likelihood import delayed_gain, residual
+from etid.measurement import Measurement
+from etid.results import Fit
+from etid.spectra import Spectrum
+from etid.transfer import Rational
+from etid.verdicts import RESULTS, first_verdict
+
+BIASED = 16.0  # squared standard errors between an estimate and the minimum of its own model
+IMPULSE = 512  # samples of a discrete model's impulse response
+
+
+def _score(
+    m: Measurement,
+    coefficients: Float[Array, " n"],
+    predict: Callable[[Float[Array, " n"], Float[Array, " time"]], Float[Array, " time"]],
+) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    """χ² of a discrete model, and its squared distance to the minimum in standard errors."""
+    impulse = jnp.zeros(IMPULSE).at[0].set(1.0)
+
+    def scaled(c, _):
+        h = predict(c, impulse)
+        s = m.sigma_out**2 + m.sigma_th**2 * jnp.sum(h**2)
+        return (predict(c, m.v_th) - m.v_out) / jnp.sqrt(s)
+
+    equations = normal_equations(scaled, coefficients)
+    return 2 * equations.objective / m.v_th.size, _distance(equations)
+
+
+def _distance(equations: NormalEquations) -> Float[Array, ""]:
+    """Squared distance to the minimum in standard errors."""
+    scale = jnp.sqrt(jnp.diagonal(equations.matrix))
+    scale = jnp.where(scale > 0, scale, 1.0)
+    ridge = 1e-12 * jnp.eye(scale.size)
+    gradient = equations.gradient / scale
+    newton = jnp.linalg.solve(equations.matrix / scale[:, None] / scale[None, :] + ridge, gradient)
+    return jnp.dot(newton, gradient)
+
+
+def skin_by_steiglitz_mcbride(m: Measurement, driver: Driver, iterations: int) -> Fit:
+    """The paper's estimate of SkinRC (eqs. 8-12); `iterations` 1 is equation error."""
+    z_th = Rational(driver.b, driver.a)
+    best = steiglitz_mcbride.skin_filter(m.v_th, m.v_out, z_th, iterations)
+    circuit = steiglitz_mcbride.skin_elements(best.filter, m.sample_rate)
+    free = best.filter.num.size
+
+    def predict(c, v):
+        load = Rational(c[:free], jnp.concatenate([jnp.ones(1), c[free:]]))
+        return steiglitz_mcbride.terminal_voltage(z_th, load, v)[0]
+
+    chi2, distance = _score(m, jnp.concatenate([best.filter.num, best.filter.den[1:]]), predict)
+    values = circuit.values()
+    unstable = ~jnp.isfinite(best.rrse)
+    nothing = jnp.full((values.size, values.size), jnp.nan)
+    return Fit(
+        circuit=circuit,
+        cov=nothing,
+        shared_cov=nothing,
+        rrse=best.rrse,
+        chi2=jnp.where(unstable, jnp.inf, chi2),
+        result=first_verdict(
+            (unstable, RESULTS.unstable),
+            (~jnp.all(values > 0), RESULTS.nonphysical),
+            ((iterations > 1) & ~best.converged, MAX_STEPS_REACHED),
+            (misses(chi2, best.rrse), RESULTS.misfit),
+            (distance > BIASED, RESULTS.biased),
+        ),
+        steps=best.iteration,
+        method="steiglitz_mcbride" if iterations > 1 else "equation_error",
+    )
+
+
+def skin_by_harmonic_steiglitz_mcbride(
+    spectrum: Spectrum, sample_rate: Float[Array, ""], driver: Driver
+) -> Fit:
+    """SkinRC by Steiglitz-McBride on the harmonics, judged by the likelihood with Z_th as it is."""
+    source = driver.source
+    assert source is not None  # check_driver
+    best = harmonic_steiglitz_mcbride.fit_skin(spectrum, source.response(spectrum.frequency))
+    values = best.circuit.values()
+    late = best.delay * sample_rate
+    physical = jnp.isfinite(best.rrse)  # or else any likelihood will do
+    elements = jnp.where(physical, values, SkinRC().values())
+
+    def terms(q, spectrum):
+        load = best.circuit.with_log_values(q[:-1]).impedance()
+        delay = q[-1] / sample_rate
+        return residual(spectrum, delayed_gain(source, load, spectrum.frequency, delay))
+
+    equations = normal_equations(terms, jnp.append(jnp.log(elements), late), spectrum)
+    freedom = 2 * jnp.sum(spectrum.selected, dtype=values.dtype) - values.size
+    chi2 = 2 * equations.objective / freedom
+    variance = jnp.diagonal(inverse(equations.matrix))[:-1]  # of the logarithms
+    nothing = jnp.full((values.size, values.size), jnp.nan)
+    return Fit(
+        circuit=best.circuit,
+        cov=nothing,
+        shared_cov=nothing,
+        rrse=best.rrse,
+        chi2=jnp.where(physical, chi2, jnp.inf),
+        result=first_verdict(
+            (~best.stable, RESULTS.unstable),
+            (~physical, RESULTS.nonphysical),
+            (~best.converged, MAX_STEPS_REACHED),
+            (misses(chi2, best.rrse) | (jnp.abs(late) > 1), RESULTS.misfit),
+            (~(_distance(equations) <= BIASED), RESULTS.biased),
+            (~jnp.all((variance > 0) & (variance < 1)), RESULTS.insensitive),
+            (driver.result != SUCCESSFUL, RESULTS.driver_failed),
+        ),
+        steps=best.iteration,
+        method="harmonic_steiglitz_mcbride",
+    )
+
+
+def driver_by_steiglitz_mcbride(
+    m: Measurement, r_load: Float[Array, " record"], order: int, iterations: int
+) -> Driver:
+    """The paper's estimate of Z_th (eqs. 4-6); `iterations` 1 is equation error."""
+    best = steiglitz_mcbride.driver_filter(m.v_th, m.v_out, r_load, order, iterations)
+    free = best.filter.num.size
+
+    def score(m, r):
+        def predict(c, v):
+            z_th = Rational(c[:free], jnp.concatenate([jnp.ones(1), c[free:]]))
+            return steiglitz_mcbride.terminal_voltage(z_th, Rational(r[None], jnp.ones(1)), v)[0]
+
+        return _score(m, jnp.concatenate([best.filter.num, best.filter.den[1:]]), predict)
+
+    chi2, distance = jax.vmap(score)(m, r_load)
+    chi2 = chi2.max()
+    unstable = ~jnp.isfinite(best.rrse) | ~best.stable
+    return Driver(
+        b=best.filter.num,
+        a=best.filter.den,
+        sample_rate=m.sample_rate[0],
+        source=None,
+        cov=None,
+        calibration=None,
+        rrse=best.rrse,
+        chi2=jnp.where(jnp.isfinite(best.rrse), chi2, jnp.inf),
+        result=first_verdict(
+            (unstable, RESULTS.unstable),
+            ((iterations > 1) & ~best.converged, MAX_STEPS_REACHED),
+            (misses(chi2, best.rrse), RESULTS.misfit),
+            (distance.max() > BIASED, RESULTS.biased),
+        ),
+        steps=best.iteration,
+        method="steiglitz_mcbride" if iterations > 1 else "equation_error",
+    )

@@ -1,0 +1,300 @@
+"""One load, given what the calibrations of its driver tell: terms, derivatives, and the fit.
+
+The likelihood is that of `etid.likelihood` with the z of `etid.given_driver` for the parameters of
+Z_th. All parameters act on a harmonic through three numbers, Z_L, the delay's turn and W, and so do
+the derivatives: they are taken of those, and combined.
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import optimistix as optx
+from jaxtyping import Array, Complex, Float
+
+from etid.circuits import AbstractCircuit
+from etid.given_driver import GivenDriver, combined
+from etid.information import inverse
+from etid.levenberg_marquardt import LevenbergMarquardt, NormalEquations, best_start
+from etid.likelihood import denoised, excess, residual, variance
+from etid.output_error import DELAY_WIDTH, MAX_STEPS, SOLVER, Estimate
+from etid.results import complex_rrse
+from etid.spectra import ROOM, Spectrum
+from etid.transfer import as_complex, frequency_variable, reciprocal
+
+
+def _apart(evaluate: Callable[[Array], Any], q: Float[Array, " q"]) -> Any:
+    """`evaluate(q)`, kept in memory; not a number if `q` is none.
+
+    XLA repeats what it takes to make one number in every loop that reads it, here a dozen times.
+    What a branch returns is computed once.
+    """
+    shapes = jax.eval_shape(evaluate, q)
+
+    def nothing(_):
+        return jax.tree.map(lambda of: jnp.full(of.shape, jnp.nan, of.dtype), shapes)
+
+    return jax.lax.cond(jnp.isfinite(q).all(), lambda q: evaluate(q), nothing, q)
+
+
+class _Slopes(NamedTuple):
+    """How the residual of a recording changes, harmonic by harmonic.
+
+    Attributes:
+        part: The residual.
+        own: Derivative of the gain by the elements and the delay.
+        by_g: Derivatives of the residual by real and imaginary part of the gain.
+        by_w: The same by W.
+        by_x: The same by X; None if no z moves it.
+    """
+
+    part: Float[Array, " part"]
+    own: Complex[Array, "own harmonic"]
+    by_g: tuple[Array, Array]
+    by_w: tuple[Array, Array]
+    by_x: tuple[Array, Array] | None
+
+
+class _Load(eqx.Module):
+    """One recording, with all that its terms depend on.
+
+    The parameters are its `own`, logarithms of the elements and the delay [samples], and after them
+    z, if it is not z₀.
+    """
+
+    driver: GivenDriver
+    circuit: AbstractCircuit
+    spectrum: Spectrum
+    x_slope: Complex[Array, "z harmonic"] | None
+    sample_rate: Float[Array, ""]
+
+    @property
+    def owned(self) -> int:
+        """Number of own parameters."""
+        return len(self.circuit.names()) + 1
+
+    def split(self, q: Float[Array, " q"]) -> tuple[Float[Array, " own"], Float[Array, " z"]]:
+        """`own` and z."""
+        return q[: self.owned], q[self.owned :] if q.size > self.owned else self.driver.mean
+
+    def load(self, own: Float[Array, " own"]) -> Complex[Array, " harmonic"]:
+        """Z_L."""
+        s = frequency_variable(self.spectrum.frequency)
+        return self.circuit.with_log_values(own[:-1]).impedance()(s)
+
+    def turns(self, own: Float[Array, " own"]) -> Complex[Array, " harmonic"]:
+        """e^(−jωτ), from as many cosines as there are factors of the number of harmonics."""
+        f = self.spectrum.frequency
+        angle = 2 * jnp.pi * f[0] * own[-1] / self.sample_rate
+        one, other = (
+            jax.lax.complex(jnp.cos(angle * k), -jnp.sin(angle * k))
+            for k in (jnp.arange(1.0, ROOM + 1), jnp.arange(0.0, f.size, ROOM))
+        )
+        return (other[:, None] * one[None, :]).ravel()
+
+    def divided(
+        self, load: Complex[Array, " harmonic"], w: Complex[Array, " harmonic"]
+    ) -> Complex[Array, " harmonic"]:
+        """Z_L / (Z_L + Z_th) where the driver has W = W₀ + `w`."""
+        return load * reciprocal(load + self.driver.z_th(w))
+
+    def at(self, z: Float[Array, " z"]) -> tuple[Complex[Array, " harmonic"], Spectrum]:
+        """W − W₀, and the recording with the X that calibrations leave."""
+        off = jnp.log(self.spectrum.frequency[0] / self.driver.frequency[0])
+        w = as_complex(off) * self.driver.w_slope + combined(z, self.driver.slope)
+        if self.x_slope is None:
+            return w, self.spectrum
+        x = self.spectrum.x + combined(z, self.x_slope)
+        return w, eqx.tree_at(lambda s: s.x, self.spectrum, x)
+
+    def predicted(self, q: Float[Array, " q"]) -> tuple[Complex[Array, " harmonic"], Spectrum]:
+        """Gain, and the recording with the X that calibrations leave."""
+        own, z = self.split(q)
+        w, spectrum = self.at(z)
+        return self.divided(self.load(own), w) * self.turns(own), spectrum
+
+    def __call__(self, q: Float[Array, " q"]) -> Float[Array, " term"]:
+        """Terms of the recording, of its delay and of z."""
+        g, spectrum = _apart(self.predicted, q)
+        prior = 1 / self.widths(q)
+        return jnp.concatenate([residual(spectrum, g), (prior * (q - self.centre(q)))])
+
+    def centre(self, q: Float[Array, " q"]) -> Float[Array, " q"]:
+        """What is expected of the parameters before this recording."""
+        return jnp.concatenate([jnp.zeros(self.owned), self.driver.mean])[: q.size]
+
+    def widths(self, q: Float[Array, " q"]) -> Float[Array, " q"]:
+        """Standard deviations of that."""
+        return (
+            jnp.ones(q.size).at[: self.owned - 1].set(jnp.inf).at[self.owned - 1].set(DELAY_WIDTH)
+        )
+
+    def slopes(self, q: Float[Array, " q"]) -> _Slopes:
+        """Derivatives at each harmonic.
+
+        The parameters move the gain by Z_L, the delay or W, whose complex derivatives do for all: a
+        fifth of the time that it takes to push each parameter through all of it.
+        """
+        own, z = self.split(q)
+        w, spectrum = self.at(z)
+
+        def unit(v):
+            return jnp.ones_like(v)
+
+        def of_load(_):
+            elements = jnp.eye(own.size)[:-1]
+            by_element = jax.vmap(lambda v: jax.jvp(self.load, (own,), (v,))[1])(elements)
+            return self.load(own), by_element, self.turns(own)
+
+        load, by_element, turns = _apart(of_load, q)
+
+        def of_gain(_):
+            divided, by_load = jax.jvp(lambda at: self.divided(at, w), (load,), (unit(load),))
+            by_w = jax.jvp(lambda at: self.divided(load, at), (w,), (unit(w),))[1]
+            return divided, by_load * turns, by_w * turns
+
+        divided, by_load, turned = _apart(of_gain, q)
+        by_delay = jax.jvp(self.turns, (own,), (jnp.zeros(own.size).at[-1].set(1.0),))[1]
+        slopes = jnp.concatenate([by_load[None, :] * by_element, (divided * by_delay)[None, :]])
+
+        def by(real, imaginary, function):
+            at = (real, imaginary)
+            zero = jnp.zeros_like(real)
+            first = jax.jvp(function, at, (unit(real), zero))[1]
+            return first.reshape(2, -1), jax.jvp(function, at, (zero, unit(real)))[1].reshape(2, -1)
+
+        g = divided * turns
+
+        def of_g(_):
+            by_g = by(g.real, g.imag, lambda a, b: residual(spectrum, jax.lax.complex(a, b)))
+            if self.x_slope is None:
+                return residual(spectrum, g), by_g, None
+
+            def moved(a, b):
+                there = eqx.tree_at(lambda s: s.x, spectrum, jax.lax.complex(a, b))
+                return residual(there, g)
+
+            return residual(spectrum, g), by_g, by(spectrum.x.real, spectrum.x.imag, moved)
+
+        part, (real, imaginary), by_x = _apart(of_g, q)
+        by_w = (
+            real * turned.real[None, :] + imaginary * turned.imag[None, :],
+            imaginary * turned.real[None, :] - real * turned.imag[None, :],
+        )
+        return _Slopes(part, slopes, (real, imaginary), by_w, by_x)
+
+    def jacobian(
+        self, q: Float[Array, " q"]
+    ) -> tuple[Float[Array, " part"], Float[Array, "q part"]]:
+        """Residual of the recording alone and, transposed, its Jacobian."""
+        part, own, by_g, by_w, by_x = _apart(self.slopes, q)
+        rows = _chained(own, by_g)
+        if q.size == self.owned:
+            return part, rows
+        others = _chained(self.driver.slope, by_w)
+        if by_x is not None and self.x_slope is not None:
+            others = others + _chained(self.x_slope, by_x)
+        return part, jnp.concatenate([rows, others])
+
+
+def _chained(slope: Complex[Array, "q harmonic"], by: tuple[Array, Array]) -> Array:
+    """Derivatives of a residual by those of its real and imaginary argument."""
+    return jax.lax.map(
+        lambda row: (row.real[None, :] * by[0] + row.imag[None, :] * by[1]).ravel(), slope
+    )
+
+
+def _equations(_, q: Float[Array, " q"], load: _Load) -> NormalEquations:
+    """Normal equations of a load."""
+    part, jacobian = load.jacobian(q)
+    prior = 1 / load.widths(q)
+    rest = prior * (q - load.centre(q))
+    objective = 0.5 * (jnp.dot(part, part) + jnp.dot(rest, rest))
+    gradient = jacobian @ part + prior * rest
+    finite = jnp.isfinite(objective) & jnp.isfinite(gradient).all()
+    return NormalEquations(
+        jnp.where(finite, objective, jnp.inf),
+        gradient,
+        jacobian @ jacobian.T + jnp.diag(prior**2),
+    )
+
+
+# Half a standard error of 3000 terms.
+ROUGHLY = LevenbergMarquardt(rtol=1e-2, ftol=1e-3, equations=_equations)
+TOGETHER = LevenbergMarquardt(rtol=SOLVER.rtol, ftol=SOLVER.ftol, equations=_equations)
+
+
+def fit_circuit(
+    driver: GivenDriver,
+    circuit: AbstractCircuit,
+    spectrum: Spectrum,
+    sample_rate: Float[Array, ""],
+    candidates: Float[Array, "start own"],
+) -> Estimate:
+    """Identify the load of one recording.
+
+    Args:
+        driver: What the calibrations tell, at the harmonics of the recording.
+        circuit: Structure of the load.
+        spectrum: The recording.
+        sample_rate: Its sampling rate [Hz].
+        candidates: Logarithms of elements, and delays in samples, to start from; the start that
+            predicts best is refined.
+
+    Returns:
+        The estimate, whose parameters are the logarithms of the elements.
+    """
+    known, x_slope = driver.informed(spectrum)
+    load = _Load(driver, circuit, known, x_slope, sample_rate)
+
+    def solve(solver, start):
+        return optx.least_squares(
+            lambda q, load: load(q), solver, start, args=load, max_steps=MAX_STEPS, throw=False
+        )
+
+    # First with Z_th as it is: from a start far away, a joint fit would bend Z_th to meet it.
+    alone = solve(ROUGHLY, best_start(load, candidates)).value
+    solution = solve(TOGETHER, jnp.concatenate([alone, driver.mean]))
+    q = solution.value
+    own, z = load.split(q)
+    g, known = load.predicted(q)
+    part = residual(known, g)
+
+    # The Jacobian where it has no noise, which would count as information.
+    [clean], [share] = denoised([known], [g])
+    clean = _Load(driver, circuit, clean, x_slope, sample_rate)
+    if x_slope is not None:  # X is that of this z already
+        clean = eqx.tree_at(
+            lambda of: of.spectrum.x, clean, clean.spectrum.x - combined(z, x_slope)
+        )
+    jacobian = clean.jacobian(q)[1]
+    prior = 1 / load.widths(q) ** 2
+    information = inverse((jacobian * share[None, :]) @ jacobian.T + jnp.diag(prior))
+    elements = information[: own.size - 1]
+    by_term = elements @ jacobian
+    noise = excess(part, spectrum.selected)
+    # What is the trial's own of the noise: all, or that of V_out if V_th is shared.
+    private = jnp.where(
+        jnp.any(known.variance_x != spectrum.variance_x),
+        spectrum.variance_y / variance(known, g),
+        1.0,
+    )
+    private = jnp.tile(private, 2)
+    of_delay = jnp.outer(elements[:, own.size - 1], elements[:, own.size - 1]) / DELAY_WIDTH**2
+    of_driver = elements[:, own.size :] @ driver.cov @ elements[:, own.size :].T
+    shared = of_driver + (by_term * ((1 - private) * noise)[None, :]) @ by_term.T
+    change = z - driver.mean
+    return Estimate(
+        own[:-1],
+        own[None, -1:],
+        (by_term * (private * noise)[None, :]) @ by_term.T + of_delay + shared,
+        jnp.sum(part**2) / (2 * jnp.sum(spectrum.selected, dtype=own.dtype) - own.size),
+        complex_rrse(g * spectrum.x, spectrum.y),
+        solution.result,
+        solution.stats["num_steps"],
+        shared,
+        # By how much Σ r² of the calibrations has grown.
+        jnp.dot(change, jnp.linalg.solve(driver.cov, change)),
+    )
