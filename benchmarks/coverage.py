@@ -16,7 +16,7 @@ from tqdm import tqdm
 
 import etid
 from benchmarks.spice import JOINT, scene_of
-from etid.identify import Method
+from etid.methods import Method
 from etid.scenes import Scene, Trial
 from etid.transformer import ResistorLoad, SkinLoad
 

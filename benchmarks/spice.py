@@ -16,7 +16,7 @@ import numpy as np
 
 import etid
 from etid.circuits import AbstractCircuit
-from etid.identify import METHODS, REFINED, Method
+from etid.methods import METHODS, REFINED, Method
 from etid.scenes import Scene, Trial
 from etid.transformer import ResistorLoad, SkinLoad, TransformerDriver
 

@@ -11,7 +11,7 @@ import jax
 import numpy as np
 
 import etid
-from etid.identify import METHODS
+from etid.methods import METHODS
 
 REPEATS = 7
 

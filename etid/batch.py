@@ -19,18 +19,10 @@ from tqdm import tqdm
 from etid.circuits import AbstractCircuit, SkinRC
 from etid.driver import Driver
 from etid.given_driver import GivenDriver
-from etid.identify import (
-    Method,
-    check_method,
-    failed_fit,
-    identify_driver,
-    is_shared,
-    known_driver,
-    lane,
-    plan,
-    skin_lane,
-    stacked,
-)
+from etid.identify import failed_fit, identify_driver
+from etid.lanes import is_shared, known_driver, lane, skin_lane, stacked
+from etid.methods import Method, check_method, plan
+from etid.preflight import Inspected
 from etid.recording import Metadata, Recording, RecordingError
 from etid.results import LABELS, Fit, Fits, IdentificationError
 from etid.study import Study
@@ -93,7 +85,7 @@ class Refusal(Exception):
 
 def planned(
     load: Callable[[], tuple[Recording, Driver]], given: Method | None
-) -> tuple[Recording, Driver, Method]:
+) -> tuple[Inspected, Driver, Method]:
     """Load a recording and its driver, and choose its method.
 
     Raises:
@@ -101,14 +93,15 @@ def planned(
     """
     try:
         recording, driver = load()
-        method, name = plan(given, recording, driver)
+        seen = Inspected(recording)
+        method, name = plan(given, seen, driver)
     except (RecordingError, ValueError) as error:
         raise Refusal("unreadable", str(error)) from error
     except IdentificationError as error:
         raise Refusal("driver_failed", str(error)) from error
     if name is not None:
         raise Refusal(name)
-    return recording, driver, method
+    return seen, driver, method
 
 
 def filled(lanes: Sequence[tuple[np.ndarray, ...]]) -> tuple[Array, ...]:
@@ -171,14 +164,14 @@ def _identify(
 
         for row in range(count):
             try:
-                recording, driver, method = planned(functools.partial(load, row), given)
+                seen, driver, method = planned(functools.partial(load, row), given)
             except Refusal as refusal:
                 fits[row] = failed_fit(refusal.name, circuit, given or "maximum_likelihood")
                 notes[row] = refusal.note
                 bar.update()
                 continue
-            waiting, shared = lane(recording, method), is_shared(recording, driver)
-            rates = recording.sample_rate, recording.pulse_rate
+            waiting, shared = lane(seen, method), is_shared(seen, driver)
+            rates = seen.recording.sample_rate, seen.recording.pulse_rate
             key = (id(driver), method, waiting[0].size, shared, *rates)
             if key not in queues:
                 known = known_driver(waiting, driver, method, shared)

@@ -19,7 +19,7 @@ import numpy as np
 import etid
 from etid.batch import StudyFits
 from etid.circuits import DISPLAY
-from etid.identify import METHODS
+from etid.methods import METHODS
 from etid.report import Table
 from etid.streaming import processes
 

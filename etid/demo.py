@@ -24,7 +24,7 @@ from jaxtyping import Float
 import etid
 from etid import plotting
 from etid.circuits import DISPLAY, Quantity
-from etid.identify import Method
+from etid.methods import Method
 from etid.report import Section, Table, write_page
 
 LABORATORIES: Mapping[str, Mapping[str, float]] = {

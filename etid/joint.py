@@ -32,10 +32,12 @@ from etid.batch import (
 )
 from etid.circuits import AbstractCircuit, SkinRC
 from etid.driver import Driver
-from etid.identify import HARMONIC, checksum, failed_fit, is_shared, lane
+from etid.identify import failed_fit
+from etid.lanes import checksum, is_shared, lane
 from etid.maximum_likelihood import Joint, fit_load
+from etid.methods import HARMONIC
 from etid.precision import require_float64
-from etid.recording import Recording
+from etid.preflight import Inspected
 from etid.results import Fit
 from etid.shared_terms import Loads
 from etid.spectra import Spectrum
@@ -112,10 +114,10 @@ class _Waiting:
         self.chunks: list[Loads] = []
         self.unloaded: list[int] = []
 
-    def add(self, row: int, recording: Recording) -> None:
+    def add(self, row: int, seen: Inspected) -> None:
         self.rows.append(row)
-        self.unloaded.append(checksum(recording))
-        self.lanes.append(lane(recording, "maximum_likelihood"))
+        self.unloaded.append(checksum(seen))
+        self.lanes.append(lane(seen, "maximum_likelihood"))
         if len(self.lanes) == LANES:
             self.run()
 
@@ -179,19 +181,19 @@ def identify_jointly(
 
     for row in tqdm(range(len(paths)), unit="recording", disable=not progress):
         try:
-            recording, driver, method = planned(functools.partial(load, row), None)
+            seen, driver, method = planned(functools.partial(load, row), None)
             if method not in HARMONIC:
                 raise Refusal("not_periodic", SINGLE)
         except Refusal as refusal:
             fits[row] = failed_fit(refusal.name, circuit, METHOD)
             notes[row] = refusal.note
             continue
-        lengths = waiting.setdefault(drivers.of(recording), {})
-        shared = is_shared(recording, driver)
-        key = recording.v_th.size, shared
+        lengths = waiting.setdefault(drivers.of(seen.recording), {})
+        shared = is_shared(seen, driver)
+        key = seen.v_th.size, shared
         if key not in lengths:
             lengths[key] = _Waiting(_model(circuit, driver, shared))
-        lengths[key].add(row, recording)
+        lengths[key].add(row, seen)
     for names, lengths in tqdm(waiting.items(), unit="driver", disable=not progress):
         driver = drivers.found[names]
         groups = [group.loads() for group in lengths.values()]

@@ -44,6 +44,13 @@ def measure(
 def noise(
     v: Float[Array | np.ndarray, " time"], resolution: Float[Array | np.ndarray, ""]
 ) -> Float[Array | np.ndarray, ""]:
-    """Standard deviation of the noise of a record, as far as it is trusted, in its unit."""
+    """Standard deviation of the noise of a record, `trusted`, in its unit."""
+    return trusted(v, noise_std(v, resolution))
+
+
+def trusted(
+    v: Float[Array | np.ndarray, " time"], sigma: Float[Array | np.ndarray, ""]
+) -> Float[Array | np.ndarray, ""]:
+    """Noise of a record that is taken as not smaller than what the interpolation leaves."""
     of = namespace(v)
-    return of.asarray(of.maximum(noise_std(v, resolution), RIPPLE * of.ptp(v)))
+    return of.asarray(of.maximum(sigma, RIPPLE * of.ptp(v)))

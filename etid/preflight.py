@@ -1,10 +1,12 @@
 """Pre-flight: what can be seen to be wrong with a recording before anything is fitted."""
 
+import functools
+
 import numpy as np
 from jaxtyping import Float
 
 from etid.filtering import TAPS
-from etid.measurement import RIPPLE
+from etid.measurement import trusted
 from etid.noise import noise_std
 from etid.recording import Recording
 from etid.spectra import counted_pulse_rate, whole_periods
@@ -21,72 +23,103 @@ STEP = 4.0  # standard deviations of the noise by which they may differ there
 SHIFT = 50e-6  # [s] that a load may delay v_out; R_th C_p is below 10 µs
 
 
-def preflight(recording: Recording, *, periodic: bool = False) -> str | None:
+class Inspected:
+    """A recording, and what can be said of it without a model: everything once, when asked.
+
+    Attributes:
+        recording: The recording.
+    """
+
+    def __init__(self, recording: Recording):
+        self.recording = recording
+
+    @functools.cached_property
+    def v_th(self) -> Float[np.ndarray, " time"]:
+        """Unloaded voltage [V]."""
+        return self.recording.v_th
+
+    @functools.cached_property
+    def v_out(self) -> Float[np.ndarray, " time"]:
+        """Loaded voltage [V]."""
+        return self.recording.v_out
+
+    @property
+    def step_th(self) -> float:
+        """Converter step [V] of `v_th`, 0 if it is not known."""
+        return self.recording.samples["v_th"].resolution or 0.0
+
+    @property
+    def step_out(self) -> float:
+        """The same of `v_out`."""
+        return self.recording.samples["v_out"].resolution or 0.0
+
+    @functools.cached_property
+    def sigma_th(self) -> Float[np.ndarray, ""]:
+        """Noise of a sample of `v_th` [V]."""
+        return np.asarray(noise_std(self.v_th, self.step_th))
+
+    @functools.cached_property
+    def sigma_out(self) -> Float[np.ndarray, ""]:
+        """The same of `v_out`."""
+        return np.asarray(noise_std(self.v_out, self.step_out))
+
+    @functools.cached_property
+    def periods(self) -> tuple[int, int]:
+        """How many whole periods it holds by its own clock, and how many samples they are."""
+        of = self.recording
+        counted = counted_pulse_rate(self.v_th, of.sample_rate, of.pulse_rate)
+        return whole_periods(self.v_out.size, of.sample_rate, counted)
+
+    @functools.cached_property
+    def is_periodic(self) -> bool:
+        """Whether it holds whole pulse periods, each like the other where they are joined.
+
+        Periods are a whole number of samples long to within half a sample, which matters where the
+        signal is steep at the joint.
+        """
+        (periods, samples), of = self.periods, self.recording
+        if periods == 0:
+            return False
+        rest = abs(periods * of.sample_rate / of.pulse_rate - samples)
+        rest = min(rest, 0.5)  # a clock that is off has been counted
+        for v, sigma in ((self.v_th, self.sigma_th), (self.v_out, self.sigma_out)):
+            joint = np.concatenate([v[samples - SEAM : samples], v[:SEAM]])
+            if rest * np.abs(np.diff(joint)).max() > STEP * trusted(v, sigma):
+                return False
+        return True
+
+
+def preflight(seen: Inspected, *, periodic: bool = False) -> str | None:
     """Name the verdict that forbids a fit, or None.
 
     Verdicts: `too_short`, `nonfinite_samples`, `flat`, `saturated`, `misaligned`, `not_periodic`.
 
     Args:
-        recording: Unloaded and loaded voltage.
+        seen: Unloaded and loaded voltage.
         periodic: Whether whole pulse periods are needed.
     """
-    v_th, v_out = recording.v_th, recording.v_out
+    v_th, v_out, of = seen.v_th, seen.v_out, seen.recording
     if v_th.size < SHORTEST:
         return "too_short"
     if not (np.isfinite(v_th).all() and np.isfinite(v_out).all()):
         return "nonfinite_samples"
-    if any(_is_flat(recording, name) for name in ("v_th", "v_out")):
+    if _is_flat(v_th, seen.sigma_th) or _is_flat(v_out, seen.sigma_out):
         return "flat"
-    if any(_is_saturated(recording, name) for name in ("v_th", "v_out")):
+    if _is_saturated(v_th, seen.step_th, of) or _is_saturated(v_out, seen.step_out, of):
         return "saturated"
-    if _is_misaligned(v_th, v_out, recording.sample_rate):
+    if _is_misaligned(v_th, v_out, of.sample_rate):
         return "misaligned"
-    if periodic and not is_periodic(recording):
+    if periodic and not seen.is_periodic:
         return "not_periodic"
     return None
 
 
-def recorded_periods(recording: Recording) -> tuple[int, int]:
-    """How many whole periods a recording holds by its own clock, and how many samples they are."""
-    counted = counted_pulse_rate(recording.v_th, recording.sample_rate, recording.pulse_rate)
-    return whole_periods(recording.v_out.size, recording.sample_rate, counted)
-
-
-def is_periodic(recording: Recording) -> bool:
-    """Whether the record holds whole pulse periods, each like the other where they are joined.
-
-    Periods are a whole number of samples long to within half a sample, which matters where the
-    signal is steep at the joint.
-    """
-    periods, samples = recorded_periods(recording)
-    if periods == 0:
-        return False
-    rest = abs(periods * recording.sample_rate / recording.pulse_rate - samples)
-    rest = min(rest, 0.5)  # a clock that is off has been counted
-    for name in ("v_th", "v_out"):
-        v = getattr(recording, name)
-        joint = np.concatenate([v[samples - SEAM : samples], v[:SEAM]])
-        sigma = float(noise_std(v, resolution(recording, name)))
-        if rest * np.abs(np.diff(joint)).max() > STEP * max(sigma, RIPPLE * np.ptp(v)):
-            return False
-    return True
-
-
-def resolution(recording: Recording, name: str) -> float:
-    """Converter step [V] of one record, 0 if it is not known."""
-    return recording.samples[name].resolution or 0.0
-
-
-def _is_flat(recording: Recording, name: str) -> bool:
-    v = getattr(recording, name)
-    sigma = float(noise_std(v, resolution(recording, name)))
+def _is_flat(v: Float[np.ndarray, " time"], sigma: Float[np.ndarray, ""]) -> bool:
     return bool(np.ptp(v) <= FLAT * sigma or np.ptp(v) == 0)
 
 
-def _is_saturated(recording: Recording, name: str) -> bool:
+def _is_saturated(v: Float[np.ndarray, " time"], step: float, recording: Recording) -> bool:
     """Samples at the converter's rails, or a flat top entered and left in jumps."""
-    v = getattr(recording, name)
-    step = resolution(recording, name)
     if recording.adc_range is not None:
         low, high = recording.adc_range
         return bool((v <= low + step / 2).any() or (v >= high - step / 2).any())

@@ -28,7 +28,7 @@ from tqdm import tqdm
 from etid.batch import Drivers, StudyFits, identify_part, to_identify
 from etid.circuits import AbstractCircuit, SkinRC
 from etid.hdf5 import read
-from etid.identify import Method, check_method
+from etid.methods import Method, check_method
 from etid.results import Fits
 from etid.study import Study
 

@@ -8,7 +8,7 @@ import pytest
 import scipy.signal
 
 import etid
-from etid import batch, identify, likelihood
+from etid import batch, lanes, likelihood
 from etid.circuits import SkinRC, resistor
 from etid.scenes import Scene, Trial
 from etid.transformer import ResistorLoad, SkinLoad
@@ -126,7 +126,7 @@ def test_a_study_of_ragged_lengths_compiles_once(study, driver, monkeypatch):
 
     def counted(*arguments):
         traced.append(arguments)
-        return identify.skin_lane(*arguments)
+        return lanes.skin_lane(*arguments)
 
     monkeypatch.setattr(batch, "skin_lane", counted)
     records = [

@@ -9,12 +9,17 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import etid
-from etid.preflight import SHORTEST, preflight
+from etid.preflight import SHORTEST, Inspected
+from etid.preflight import preflight as of_inspected
 from etid.scenes import PRESETS, Scene, Trial
 from etid.transformer import ResistorLoad, SkinLoad
 
 LENGTH = 3334
 DAMP = SkinLoad(r_s=6.1e3, r_p=17.4e3, c_p=0.66e-9)
+
+
+def preflight(recording):
+    return of_inspected(Inspected(recording))
 
 
 def simulate(load: Any = DAMP, seed=0, samples=LENGTH, **options):

@@ -1,0 +1,115 @@
+"""What of a recording is fitted, and the functions that are compiled for it.
+
+A lane is a tuple of arrays: the harmonics of a recording, or its samples. The same functions serve
+one recording and a batch.
+"""
+
+import zlib
+from collections.abc import Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from etid import baseline, estimation
+from etid.circuits import AbstractCircuit
+from etid.driver import Driver
+from etid.given_driver import GivenDriver
+from etid.measurement import measure, trusted
+from etid.methods import CONTINUOUS, HARMONIC, Method, iterations
+from etid.preflight import Inspected
+from etid.results import Fit
+from etid.spectra import Spectrum, spectrum
+from etid.traces import stored_jit
+
+
+def arrays(seen: Inspected) -> tuple[np.ndarray, ...]:
+    """Both voltages, both resolutions, and the sample rate."""
+    steps = np.asarray(seen.step_th), np.asarray(seen.step_out)
+    return seen.v_th, seen.v_out, *steps, np.asarray(seen.recording.sample_rate)
+
+
+def lane(seen: Inspected, method: Method) -> tuple[np.ndarray, ...]:
+    """What is fitted of a recording: its harmonics and their noise, or its samples.
+
+    The harmonics are evaluated without JAX, which would compile for every length of a record.
+    """
+    if method not in HARMONIC:
+        return arrays(seen)
+    rate = np.asarray(seen.recording.sample_rate)
+    sigmas = trusted(seen.v_th, seen.sigma_th), trusted(seen.v_out, seen.sigma_out)
+    fields = spectrum(seen.v_th, seen.v_out, *sigmas, rate, *seen.periods)
+    return *map(np.asarray, fields), rate
+
+
+def stacked(lanes: Sequence[tuple[np.ndarray, ...]]) -> tuple[Array, ...]:
+    """Lanes of equal shapes along a leading axis."""
+    return tuple(jnp.asarray(np.stack(column)) for column in zip(*lanes, strict=True))
+
+
+def checksum(seen: Inspected) -> int:
+    """What tells an unloaded record from others."""
+    return zlib.crc32(seen.v_th.tobytes())
+
+
+def is_shared(seen: Inspected, driver: Driver) -> bool:
+    """Whether the unloaded record of a recording may be that of a calibration."""
+    known = None if driver.calibration is None else driver.calibration.unloaded
+    return known is None or checksum(seen) in known
+
+
+@stored_jit
+def driver_of(
+    samples: Any,
+    r_load: Float[Array, " record"],
+    order: int,
+    method: Method,
+    spectra: Spectrum | None,
+) -> Driver:
+    """Identify a driver; `spectra` are the harmonics of its calibrations, if they are needed."""
+    m = jax.vmap(measure)(*samples)
+    if method in CONTINUOUS:
+        return estimation.driver_by_refinement(m, r_load, order, spectra)
+    return baseline.driver_by_steiglitz_mcbride(m, r_load, order, iterations(method))
+
+
+@stored_jit
+def given(driver: Driver, frequency: Float[Array, " harmonic"], shared: bool) -> GivenDriver:
+    """What all loads of a driver need to know of it for maximum likelihood."""
+    return estimation.given(driver, frequency, shared)
+
+
+def known_driver(
+    lane: tuple[np.ndarray, ...], driver: Driver, method: Method, shared: bool
+) -> GivenDriver | None:
+    """`given`, if the method needs it, for this lane and all with harmonics like it."""
+    if method != "maximum_likelihood":
+        return None
+    return given(driver, jnp.asarray(lane[0]), shared)
+
+
+def skin_lane(
+    lane: Any,
+    driver: Driver,
+    known: GivenDriver | None,
+    circuit: AbstractCircuit,
+    method: Method,
+) -> Fit:
+    """Identify one lane; differentiable code, to be jitted and batched by the caller."""
+    if method not in HARMONIC:
+        m = measure(*lane)
+        if method == "output_error":
+            return estimation.skin_by_output_error(m, driver, circuit)
+        return baseline.skin_by_steiglitz_mcbride(m, driver, iterations(method))
+    *fields, rate = lane
+    spectrum = Spectrum(*fields)
+    if method == "harmonic_steiglitz_mcbride":
+        return baseline.skin_by_harmonic_steiglitz_mcbride(spectrum, rate, driver)
+    if known is None:
+        return estimation.skin_by_non_parametric(spectrum, rate, driver, circuit)
+    return estimation.skin_by_maximum_likelihood(spectrum, rate, driver, known, circuit)
+
+
+skin = stored_jit(skin_lane)
