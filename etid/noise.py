@@ -49,10 +49,9 @@ def noise_std(
         resolution: Step of the converter; 0 if it is not known.
     """
     gain = math.sqrt(sum(math.comb(ORDER, k) ** 2 for k in range(ORDER + 1)))
-    weights = np.array([(-1.0) ** k * math.comb(ORDER, k) / gain for k in range(ORDER + 1)])
-    rows = v.shape[0] - ORDER
-    differences = sum(weights[k] * v[k : k + rows] for k in range(ORDER + 1))
     floor = resolution / math.sqrt(12.0)
     if isinstance(v, np.ndarray):  # nothing to be compiled
-        return np.asarray(max(MEDIAN_TO_SIGMA * np.median(np.abs(differences)), floor))
-    return jnp.maximum(MEDIAN_TO_SIGMA * _median(jnp.abs(differences)), floor)
+        size = np.abs(np.diff(v, ORDER))
+        return np.asarray(max(MEDIAN_TO_SIGMA / gain * np.median(size), floor))
+    size = jnp.abs(jnp.diff(v, ORDER))
+    return jnp.maximum(MEDIAN_TO_SIGMA / gain * _median(size), floor)

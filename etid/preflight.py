@@ -1,8 +1,10 @@
 """Pre-flight: what can be seen to be wrong with a recording before anything is fitted."""
 
 import functools
+import math
 
 import numpy as np
+import scipy.fft
 from jaxtyping import Float
 
 from etid.filtering import TAPS
@@ -20,6 +22,7 @@ JUMP = 8.0  # converter steps by which a clipped signal enters and leaves its ra
 POWER = 1.01  # of v_out over v_th; a passive load takes power, and gains match better than this
 SEAM = 3  # samples on both sides of the joint between two periods
 STEP = 4.0  # standard deviations of the noise by which they may differ there
+PERIODS = 2  # that are looked at for it
 SHIFT = 50e-6  # [s] that a load may delay v_out; R_th C_p is below 10 µs
 
 
@@ -107,7 +110,7 @@ def preflight(seen: Inspected, *, periodic: bool = False) -> str | None:
         return "flat"
     if _is_saturated(v_th, seen.step_th, of) or _is_saturated(v_out, seen.step_out, of):
         return "saturated"
-    if _is_misaligned(v_th, v_out, of.sample_rate):
+    if _is_misaligned(v_th, v_out, of):
         return "misaligned"
     if periodic and not seen.is_periodic:
         return "not_periodic"
@@ -138,13 +141,14 @@ def _is_saturated(v: Float[np.ndarray, " time"], step: float, recording: Recordi
 
 
 def _is_misaligned(
-    v_th: Float[np.ndarray, " time"], v_out: Float[np.ndarray, " time"], sample_rate: float
+    v_th: Float[np.ndarray, " time"], v_out: Float[np.ndarray, " time"], of: Recording
 ) -> bool:
-    x, y = v_th - v_th.mean(), v_out - v_out.mean()
-    if y @ y > POWER * (x @ x):
+    if np.var(v_out) > POWER * np.var(v_th):
         return True
-    size = 2 * x.size
+    few = math.ceil(PERIODS * of.sample_rate / of.pulse_rate)
+    x, y = v_th[:few] - v_th[:few].mean(), v_out[:few] - v_out[:few].mean()
+    size = scipy.fft.next_fast_len(2 * x.size, real=True)
     correlation = np.fft.irfft(np.fft.rfft(y, size) * np.conj(np.fft.rfft(x, size)), size)
     lag = int(np.argmax(correlation))
     lag = lag - size if lag > size // 2 else lag
-    return abs(lag) > max(1.0, SHIFT * sample_rate)
+    return abs(lag) > max(1.0, SHIFT * of.sample_rate)
