@@ -2,12 +2,15 @@
 
 Recordings of one length share a compiled function, which takes `LANES` of them, so that memory is
 bounded. On a processor they run one after the other: side by side (`vmap`) all would take the steps
-of the slowest, which costs half as much again. Accelerators run them side by side. What is wrong
-with a recording costs that recording alone: it gets a verdict and a note.
+of the slowest, which costs half as much again. Accelerators run them side by side. While a chunk is
+fitted, a thread reads the recordings of the next. What is wrong with a recording costs that
+recording alone: it gets a verdict and a note.
 """
 
+import contextlib
 import dataclasses
 import functools
+import threading
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
@@ -31,12 +34,14 @@ from etid.identify import (
     skin_lane,
     window,
 )
+from etid.prefetch import prefetch
 from etid.recording import Metadata, Recording, RecordingError
 from etid.results import LABELS, Fit, Fits, IdentificationError
 from etid.study import Study
 from etid.verdicts import message
 
 LANES = 4  # of one call, the last of which is filled up: a study compiles once per length
+AHEAD = 2 * LANES  # recordings that are read, and looked at, before their turn
 
 
 @eqx.filter_jit
@@ -159,7 +164,14 @@ def _identify(
     used: list[str] = []
     queues: dict[tuple[int, int, Method, Window | None], _Queue] = {}
 
-    with tqdm(total=count, unit="fit", disable=not progress) as bar:
+    def prepare(row):
+        with jax.enable_x64(True):  # of the thread that reads: the caller's own was checked
+            return planned(functools.partial(load, row), given)
+
+    with (
+        tqdm(total=count, unit="fit", disable=not progress) as bar,
+        contextlib.closing(prefetch(prepare, count, AHEAD)) as recordings,
+    ):
 
         def run(queue):
             for row, fit in queue.run():
@@ -168,9 +180,9 @@ def _identify(
                 notes[row] = message(fit.verdict)
                 bar.update()
 
-        for row in range(count):
+        for row, prepared in enumerate(recordings):
             try:
-                recording, driver, method = planned(functools.partial(load, row), given)
+                recording, driver, method = prepared()
             except Refusal as refusal:
                 fits[row] = failed_fit(refusal.name, circuit, given or "maximum_likelihood")
                 notes[row] = refusal.note
@@ -325,6 +337,7 @@ class Drivers:
         self.calibrations = tuple(study.calibrations)
         self.found: dict[tuple[str, ...], Driver] = {}
         self.failures: dict[tuple[str, ...], str] = {}
+        self._one_at_a_time = threading.Lock()
 
     def of(self, recording: Recording) -> tuple[str, ...]:
         """Paths of the calibrations of a recording, whose driver is in `found` then.
@@ -341,17 +354,21 @@ class Drivers:
                 field="calibration",
                 remedy="Write the path of its calibration into the attribute 'calibration'",
             )
-        if names not in self.found and names not in self.failures:
-            try:
-                records = [self.study[name] for name in names]
-                self.found[names] = identify_driver(
-                    records, order=self.order, method=self.method, throw=False
-                )
-            except (IdentificationError, ValueError, KeyError) as error:
-                self.failures[names] = str(error)
+        with self._one_at_a_time:
+            if names not in self.found and names not in self.failures:
+                self._identify(names)
         if names in self.failures:
             raise IdentificationError(self.failures[names], None)
         return names
+
+    def _identify(self, names: tuple[str, ...]) -> None:
+        try:
+            records = [self.study[name] for name in names]
+            self.found[names] = identify_driver(
+                records, order=self.order, method=self.method, throw=False
+            )
+        except (IdentificationError, ValueError, KeyError) as error:
+            self.failures[names] = str(error)
 
 
 def _metadata(study: Study, path: str) -> Metadata | _Unreadable:
