@@ -45,6 +45,10 @@ def main() -> None:
 
     speed = names.add_parser("speed", help="ratios against what one would use instead")
     speed.add_argument("--quick", action="store_true", help="few lanes, few repetitions")
+    speed.add_argument(
+        "--lanes", type=int, nargs="+", default=[], help="of the table of peers; no cell left out"
+    )
+    speed.add_argument("-o", "--output", type=pathlib.Path, default=None, help="CSV of that table")
 
     scale = names.add_parser("scale", help="one large file: wall time, memory, kill and resume")
     scale.add_argument("--quick", action="store_true", help="400 recordings, the fastest method")
@@ -89,7 +93,7 @@ def main() -> None:
         from benchmarks import speed as ratios
 
         ratios.pin()
-        sys.exit(0 if ratios.run(arguments.quick) else 1)
+        sys.exit(0 if ratios.run(arguments.quick, arguments.lanes, arguments.output) else 1)
     elif arguments.name == "scale":
         from benchmarks import scale as benchmark_of_scale
 

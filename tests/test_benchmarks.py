@@ -3,12 +3,15 @@
 import csv
 
 import h5py
+import jax
 import numpy as np
 import pytest
+import scipy.signal
 
 import etid
-from benchmarks import scale
+from benchmarks import peers, scale
 from benchmarks.large_file import LAYOUTS, SAMPLES, large_file
+from benchmarks.problem import problem
 from benchmarks.provenance import write_csv
 
 FEW = 12  # recordings
@@ -67,3 +70,55 @@ def test_scale_measures_everything_and_a_killed_run_loses_nothing(tmp_path):
     assert resumed.passed
     assert resumed.parts == 10
     assert resumed.killed_at == sorted(resumed.killed_at)
+
+
+def test_steiglitz_mcbride_in_numpy_recovers_a_filter_without_noise():
+    """Z = N/D between the voltages of a divider with a source of 2 ohm."""
+    num, den = np.array([3.0, -1.0]), np.array([1.0, -0.7])
+    v_out = np.random.default_rng(5).normal(size=500)
+    current = scipy.signal.lfilter(den, num, v_out)
+    found = peers.numpy_steiglitz_mcbride(
+        v_out + 2 * current, v_out, np.array([2.0]), np.array([1.0]), 3
+    )
+    # X = 2 i and W = 2 v_out, so that N/D = Z; the recursion starts at rest, as lfilter does.
+    np.testing.assert_allclose(found[0], num, rtol=1e-10)
+    np.testing.assert_allclose(found[1], den, rtol=1e-10)
+
+
+@pytest.fixture(scope="module")
+def short_problem():
+    return problem(2000, 2, sample_rate=40e3)
+
+
+@pytest.mark.slow
+def test_scipy_and_we_do_the_same_before_the_fit(short_problem):
+    """Filter, normal equations, Steiglitz-McBride: rounding of a condition of 1e4 apart."""
+    every = np.arange(2)
+    for stage in (peers._equations(short_problem), peers._steiglitz_mcbride(short_problem)):
+        ours, theirs = (np.stack(stage.by[name](every)) for name in ("ours", "scipy"))
+        np.testing.assert_allclose(ours, theirs, rtol=1e-8)
+
+
+@pytest.mark.slow
+def test_all_solvers_find_the_same_minimum(short_problem):
+    several = peers.spectra(short_problem)
+    by, every = peers.solvers(short_problem, several), np.arange(2)
+    with jax.numpy_rank_promotion("allow"), jax.numpy_dtype_promotion("standard"):  # jaxopt's
+        found = {name: np.stack(run(every)) for name, run in by.items()}
+    for name in peers.NAMES[1:]:
+        # A fraction of a standard error of the logarithms, which are above 1e-3.
+        np.testing.assert_allclose(found[name], found["ours"], atol=1e-4, err_msg=name)
+
+
+@pytest.mark.slow
+def test_every_stage_is_timed_and_what_takes_too_long_is_left_out(short_problem, monkeypatch):
+    monkeypatch.setattr(peers, "problem", lambda samples, lanes: short_problem)
+    with jax.numpy_rank_promotion("allow"), jax.numpy_dtype_promotion("standard"):  # jaxopt's
+        table = peers.show(peers.rows(2, (1, 3), 1, np.inf))
+    assert len(table) == 2 * 6
+    assert all(row["ours"] > 0 for row in table)
+    assert [row["jaxopt"] is not None for row in table] == [False] * 6 + [True] * 4 + [False] * 2
+    monkeypatch.setattr(peers, "stages", lambda p: [peers._filter(p)])
+    once, never = peers.rows(2, (1, 3), 1, 0.0)
+    assert once["ours"] > 0
+    assert never["ours"] is None
