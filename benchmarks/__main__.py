@@ -63,6 +63,12 @@ def main() -> None:
     )
     scale.add_argument("-o", "--output", type=pathlib.Path, default=None, help="CSV to write")
 
+    curves = names.add_parser("curves", help="cost against samples, lanes and workers")
+    curves.add_argument("--quick", action="store_true", help="small numbers only")
+    curves.add_argument(
+        "--folder", type=pathlib.Path, default=pathlib.Path(), help="of curves.csv and curves.svg"
+    )
+
     names.add_parser("design", help="the pulse width and rate that determine R_s best")
 
     arguments = parser.parse_args()
@@ -101,6 +107,10 @@ def main() -> None:
             arguments.folder, arguments.recordings, arguments.method, arguments.quick
         )
         sys.exit(0 if benchmark_of_scale.run(chosen, arguments.output) else 1)
+    elif arguments.name == "curves":
+        from benchmarks import curves as benchmark_of_curves
+
+        benchmark_of_curves.run(arguments.quick, arguments.folder)
     elif arguments.name == "design":
         from benchmarks.design import run as run_design
 

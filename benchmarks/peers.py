@@ -172,7 +172,7 @@ def spectra(ten_periods: Problem) -> Any:
     )(ten_periods.lanes)
 
 
-def _one_fit(ten_periods: Problem) -> dict[str, Callable[[Any], Float[Array, " own"]]]:
+def one_fit(ten_periods: Problem) -> dict[str, Callable[[Any], Float[Array, " own"]]]:
     """Elements and delay of one spectrum, by each solver in JAX."""
     terms, start = ten_periods.terms(), jnp.asarray(START)
     with warnings.catch_warnings():
@@ -223,7 +223,7 @@ def _scipy_fit(ten_periods: Problem) -> Callable[[Any], np.ndarray]:
 
 def solvers(ten_periods: Problem, several: Any) -> dict[str, Run]:
     """One fit per spectrum, Z_th known, by every solver."""
-    by = _one_fit(ten_periods)
+    by = one_fit(ten_periods)
     return {
         "ours": _each(by["ours"], several),
         "scipy": _looped(_scipy_fit(ten_periods), several),
@@ -234,7 +234,7 @@ def solvers(ten_periods: Problem, several: Any) -> dict[str, Run]:
 
 def _raw_to_fit(ten_periods: Problem) -> Stage:
     """The same from the samples on."""
-    by, lanes = _one_fit(ten_periods), ten_periods.lanes
+    by, lanes = one_fit(ten_periods), ten_periods.lanes
 
     def transform(lane):
         return estimation.spectrum_of(measure(*lane), ten_periods.window)

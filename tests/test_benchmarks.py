@@ -9,7 +9,7 @@ import pytest
 import scipy.signal
 
 import etid
-from benchmarks import peers, scale
+from benchmarks import curves, peers, scale
 from benchmarks.large_file import LAYOUTS, SAMPLES, large_file
 from benchmarks.problem import problem
 from benchmarks.provenance import write_csv
@@ -122,3 +122,30 @@ def test_every_stage_is_timed_and_what_takes_too_long_is_left_out(short_problem,
     once, never = peers.rows(2, (1, 3), 1, 0.0)
     assert once["ours"] > 0
     assert never["ours"] is None
+
+
+def test_slopes_are_those_between_neighbours_of_a_curve():
+    times = {"line": (1.0, 10.0, 100.0), "bend": (1.0, 1.0, 10.0)}
+    rows = [
+        {"against": "samples", "what": what, "number": 10**power, "seconds": seconds[power]}
+        for power in range(3)
+        for what, seconds in times.items()
+    ]
+    found = list(curves.with_slopes(rows))
+    slopes = {what: [row["slope"] for row in found if row["what"] == what] for what in times}
+    np.testing.assert_allclose(slopes["line"], [np.nan, 1.0, 1.0])
+    np.testing.assert_allclose(slopes["bend"], [np.nan, 0.0, 1.0], atol=1e-12)
+    assert [row["what"] for row in found if row["bent"]] == ["bend"]
+
+
+@pytest.mark.slow
+def test_curves_are_measured_and_drawn(tmp_path, monkeypatch):
+    monkeypatch.setattr(curves, "LANES", (1, 2))
+    monkeypatch.setattr(curves, "SAMPLES", (1_000,))
+    monkeypatch.setattr(curves, "pin", lambda: None)  # it would be for all tests to come
+    curves.run(quick=True, folder=tmp_path)
+    with (tmp_path / "curves.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert {row["against"] for row in rows} == {"samples", "lanes", "workers"}
+    assert all(float(row["seconds"]) > 0 for row in rows)
+    assert (tmp_path / "curves.svg").read_text().startswith("<?xml")
