@@ -3,10 +3,14 @@
 import argparse
 import pathlib
 import sys
+import tempfile
 
 import jax
 
 from benchmarks.spice import ESTIMATORS
+from etid.methods import METHODS
+
+FILES = pathlib.Path(tempfile.gettempdir()) / "etid-scale"
 
 
 def main() -> None:
@@ -41,6 +45,29 @@ def main() -> None:
 
     speed = names.add_parser("speed", help="ratios against what one would use instead")
     speed.add_argument("--quick", action="store_true", help="few lanes, few repetitions")
+    speed.add_argument(
+        "--lanes", type=int, nargs="+", default=[], help="of the table of peers; no cell left out"
+    )
+    speed.add_argument("-o", "--output", type=pathlib.Path, default=None, help="CSV of that table")
+
+    scale = names.add_parser("scale", help="one large file: wall time, memory, kill and resume")
+    scale.add_argument("--quick", action="store_true", help="400 recordings, the fastest method")
+    scale.add_argument("--recordings", type=int, default=100_000)
+    scale.add_argument("--folder", type=pathlib.Path, default=FILES, help="of the files it makes")
+    scale.add_argument(
+        "--method",
+        nargs="+",
+        choices=("default", *METHODS),
+        default=["default", "equation_error"],
+        help="the last is run in all layouts, and killed",
+    )
+    scale.add_argument("-o", "--output", type=pathlib.Path, default=None, help="CSV to write")
+
+    curves = names.add_parser("curves", help="cost against samples, lanes and workers")
+    curves.add_argument("--quick", action="store_true", help="small numbers only")
+    curves.add_argument(
+        "--folder", type=pathlib.Path, default=pathlib.Path(), help="of curves.csv and curves.svg"
+    )
 
     names.add_parser("design", help="the pulse width and rate that determine R_s best")
 
@@ -72,7 +99,18 @@ def main() -> None:
         from benchmarks import speed as ratios
 
         ratios.pin()
-        sys.exit(0 if ratios.run(arguments.quick) else 1)
+        sys.exit(0 if ratios.run(arguments.quick, arguments.lanes, arguments.output) else 1)
+    elif arguments.name == "scale":
+        from benchmarks import scale as benchmark_of_scale
+
+        chosen = benchmark_of_scale.plan(
+            arguments.folder, arguments.recordings, arguments.method, arguments.quick
+        )
+        sys.exit(0 if benchmark_of_scale.run(chosen, arguments.output) else 1)
+    elif arguments.name == "curves":
+        from benchmarks import curves as benchmark_of_curves
+
+        benchmark_of_curves.run(arguments.quick, arguments.folder)
     elif arguments.name == "design":
         from benchmarks.design import run as run_design
 

@@ -2,12 +2,15 @@
 
 Recordings of one length share a compiled function, which takes `LANES` of them, so that memory is
 bounded. On a processor they run one after the other: side by side (`vmap`) all would take the steps
-of the slowest, which costs half as much again. Accelerators run them side by side. What is wrong
-with a recording costs that recording alone: it gets a verdict and a note.
+of the slowest, which costs half as much again. Accelerators run them side by side. While a chunk is
+fitted, a thread reads the recordings of the next. What is wrong with a recording costs that
+recording alone: it gets a verdict and a note.
 """
 
+import contextlib
 import dataclasses
 import functools
+import threading
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
@@ -22,6 +25,7 @@ from etid.given_driver import GivenDriver
 from etid.identify import failed_fit, identify_driver
 from etid.lanes import is_shared, known_driver, lane, skin_lane, stacked
 from etid.methods import Method, check_method, plan
+from etid.prefetch import prefetch
 from etid.preflight import Inspected
 from etid.recording import Metadata, Recording, RecordingError
 from etid.results import LABELS, Fit, Fits, IdentificationError
@@ -30,6 +34,7 @@ from etid.traces import stored_jit
 from etid.verdicts import message
 
 LANES = 16  # of one call, the last of which is filled up: a study compiles once per length
+AHEAD = 2 * LANES  # recordings that are read, and looked at, before their turn
 
 
 @stored_jit
@@ -151,9 +156,22 @@ def _identify(
     fits: dict[int, Fit] = {}
     notes = [""] * count
     used: list[str] = []
-    queues: dict[tuple[int, Method, int, bool, float, float], _Queue] = {}
+    queues: dict[tuple, _Queue] = {}
 
-    with tqdm(total=count, unit="fit", disable=not progress) as bar:
+    def prepare(row):
+        seen, driver, method = planned(functools.partial(load, row), given)
+        rates = seen.recording.sample_rate, seen.recording.pulse_rate
+        waiting, shared = lane(seen, method), is_shared(seen, driver)
+        return driver, waiting, method, shared, (id(driver), method, waiting[0].size, shared, rates)
+
+    def read(row):
+        with jax.enable_x64(True):  # of the thread that reads: the caller's own was checked
+            return prepare(row)
+
+    with (
+        tqdm(total=count, unit="fit", disable=not progress) as bar,
+        contextlib.closing(prefetch(read, count, AHEAD)) as recordings,
+    ):
 
         def run(queue):
             for row, fit in queue.run():
@@ -162,17 +180,14 @@ def _identify(
                 notes[row] = message(fit.verdict)
                 bar.update()
 
-        for row in range(count):
+        for row, prepared in enumerate(recordings):
             try:
-                seen, driver, method = planned(functools.partial(load, row), given)
+                driver, waiting, method, shared, key = prepared()
             except Refusal as refusal:
                 fits[row] = failed_fit(refusal.name, circuit, given or "maximum_likelihood")
                 notes[row] = refusal.note
                 bar.update()
                 continue
-            waiting, shared = lane(seen, method), is_shared(seen, driver)
-            rates = seen.recording.sample_rate, seen.recording.pulse_rate
-            key = (id(driver), method, waiting[0].size, shared, *rates)
             if key not in queues:
                 known = known_driver(waiting, driver, method, shared)
                 queues[key] = _Queue(driver, known, circuit, method)
@@ -324,6 +339,7 @@ class Drivers:
         self.calibrations = tuple(study.calibrations)
         self.found: dict[tuple[str, ...], Driver] = {}
         self.failures: dict[tuple[str, ...], str] = {}
+        self._one_at_a_time = threading.Lock()
 
     def of(self, recording: Recording) -> tuple[str, ...]:
         """Paths of the calibrations of a recording, whose driver is in `found` then.
@@ -340,17 +356,21 @@ class Drivers:
                 field="calibration",
                 remedy="Write the path of its calibration into the attribute 'calibration'",
             )
-        if names not in self.found and names not in self.failures:
-            try:
-                records = [self.study[name] for name in names]
-                self.found[names] = identify_driver(
-                    records, order=self.order, method=self.method, throw=False
-                )
-            except (IdentificationError, ValueError, KeyError) as error:
-                self.failures[names] = str(error)
+        with self._one_at_a_time:
+            if names not in self.found and names not in self.failures:
+                self._identify(names)
         if names in self.failures:
             raise IdentificationError(self.failures[names], None)
         return names
+
+    def _identify(self, names: tuple[str, ...]) -> None:
+        try:
+            records = [self.study[name] for name in names]
+            self.found[names] = identify_driver(
+                records, order=self.order, method=self.method, throw=False
+            )
+        except (IdentificationError, ValueError, KeyError) as error:
+            self.failures[names] = str(error)
 
 
 def _metadata(study: Study, path: str) -> Metadata | _Unreadable:

@@ -57,7 +57,7 @@ class _Slopes(NamedTuple):
     by_x: tuple[Array, Array] | None
 
 
-class _Load(eqx.Module):
+class Load(eqx.Module):
     """One recording, with all that its terms depend on.
 
     The parameters are its `own`, logarithms of the elements and the delay [samples], and after them
@@ -206,7 +206,7 @@ def _chained(slope: Complex[Array, "q harmonic"], by: tuple[Array, Array]) -> Ar
     )
 
 
-def _equations(_, q: Float[Array, " q"], load: _Load) -> NormalEquations:
+def _equations(_, q: Float[Array, " q"], load: Load) -> NormalEquations:
     """Normal equations of a load."""
     part, jacobian = load.jacobian(q)
     prior = 1 / load.widths(q)
@@ -247,7 +247,7 @@ def fit_circuit(
         The estimate, whose parameters are the logarithms of the elements.
     """
     known, x_slope = driver.informed(spectrum)
-    load = _Load(driver, circuit, known, x_slope, sample_rate)
+    load = Load(driver, circuit, known, x_slope, sample_rate)
 
     def solve(solver, start):
         return optx.least_squares(
@@ -264,7 +264,7 @@ def fit_circuit(
 
     # The Jacobian where it has no noise, which would count as information.
     [clean], [share] = denoised([known], [g])
-    clean = _Load(driver, circuit, clean, x_slope, sample_rate)
+    clean = Load(driver, circuit, clean, x_slope, sample_rate)
     if x_slope is not None:  # X is that of this z already
         clean = eqx.tree_at(
             lambda of: of.spectrum.x, clean, clean.spectrum.x - combined(z, x_slope)

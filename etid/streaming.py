@@ -20,7 +20,7 @@ import os
 import pathlib
 import shutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 from tqdm import tqdm
@@ -39,15 +39,43 @@ class ResumeError(ValueError):
     """A run was interrupted, or what it has left does not belong to this one."""
 
 
-@functools.cache
-def _opened(source: str, stamp: int, order: int, method: Method | None) -> tuple[Study, Drivers]:
-    """A file and its drivers, once per process."""
-    del stamp
+class _Opened(NamedTuple):
+    """A file in use.
+
+    Attributes:
+        study: Its recordings.
+        paths: Those to identify, in order.
+        drivers: Its drivers, as far as they were asked for.
+    """
+
+    study: Study
+    paths: list[str]
+    drivers: Drivers
+
+
+def _open(source: str, order: int, method: Method | None) -> _Opened:
     study = read(source)
-    return study, Drivers(study, order, method)
+    return _Opened(study, to_identify(study), Drivers(study, order, method))
+
+
+@functools.cache
+def _kept_open(source: str, stamp: int, order: int, method: Method | None) -> _Opened:
+    """The same, once per process and as long as that lives: parts come one by one."""
+    del stamp
+    return _open(source, order, method)
 
 
 def _fit(
+    opened: _Opened, circuit: AbstractCircuit, method: Method | None, size: int, number: int
+) -> StudyFits:
+    """Fit one part."""
+    study, paths, drivers = opened
+    part = paths[number * size : (number + 1) * size]
+    fits = identify_part(study, part, drivers, circuit, method)
+    return StudyFits(fits, dict(drivers.found), dict(drivers.failures))
+
+
+def _fit_elsewhere(
     source: str,
     stamp: int,
     order: int,
@@ -56,12 +84,9 @@ def _fit(
     size: int,
     number: int,
 ) -> StudyFits:
-    """Fit one part; runs in any process that sees the file."""
+    """Fit one part in any process that sees the file."""
     with jax.enable_x64(True):  # of a worker: the caller's own was checked
-        study, drivers = _opened(source, stamp, order, method)
-        paths = to_identify(study)[number * size : (number + 1) * size]
-        fits = identify_part(study, paths, drivers, circuit, method)
-    return StudyFits(fits, dict(drivers.found), dict(drivers.failures))
+        return _fit(_kept_open(source, stamp, order, method), circuit, method, size, number)
 
 
 def _pin(cores: Any) -> None:
@@ -144,32 +169,35 @@ def fit_file(
     circuit = SkinRC() if circuit is None else circuit
     check_method(method, circuit)
     source, target = os.path.abspath(source), pathlib.Path(target)
-    with read(source) as study:
-        count = len(to_identify(study))
-    if not count:
-        raise ValueError("the study has no loaded recording")
-    numbers = range((count + PART - 1) // PART)
-    stamp = os.stat(source).st_mtime_ns
-    run = {
-        "source": source,
-        "source date": stamp,
-        "version": importlib.metadata.version("etid"),
-        "order": order,
-        "method": method,
-        "circuit": hashlib.sha256(repr(circuit).encode()).hexdigest(),
-        "size of a part": PART,
-    }
-    parts = _Parts(target, run, resume)
-    left = [number for number in numbers if not parts.path(number).exists()]
-    task = functools.partial(_fit, source, stamp, order, method, circuit, PART)
-    drivers, failures = {}, {}
-    done = min(count, (len(numbers) - len(left)) * PART)
-    with tqdm(total=count, initial=done, unit="fit", disable=not progress) as bar:
-        for number, found in _results(task, left, executor):
-            found.fits.write(parts.path(number))
-            drivers |= found.drivers
-            failures |= found.failures
-            bar.update(len(found.fits))
+    opened = _open(source, order, method)
+    with opened.study:
+        count = len(opened.paths)
+        if not count:
+            raise ValueError("the study has no loaded recording")
+        numbers = range((count + PART - 1) // PART)
+        stamp = os.stat(source).st_mtime_ns
+        run = {
+            "source": source,
+            "source date": stamp,
+            "version": importlib.metadata.version("etid"),
+            "order": order,
+            "method": method,
+            "circuit": hashlib.sha256(repr(circuit).encode()).hexdigest(),
+            "size of a part": PART,
+        }
+        parts = _Parts(target, run, resume)
+        left = [number for number in numbers if not parts.path(number).exists()]
+        task = functools.partial(_fit, opened, circuit, method, PART)
+        if executor is not None:
+            task = functools.partial(_fit_elsewhere, source, stamp, order, method, circuit, PART)
+        drivers, failures = {}, {}
+        done = min(count, (len(numbers) - len(left)) * PART)
+        with tqdm(total=count, initial=done, unit="fit", disable=not progress) as bar:
+            for number, found in _results(task, left, executor):
+                found.fits.write(parts.path(number))
+                drivers |= found.drivers
+                failures |= found.failures
+                bar.update(len(found.fits))
     kind = type(circuit)
     fits = Fits.concatenate([Fits.read(parts.path(number), kind) for number in numbers])
     fits.write(target)

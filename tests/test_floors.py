@@ -14,6 +14,7 @@ FLOORS = {
     "filtering": 0,
     "noise": 0,
     "precision": 0,
+    "prefetch": 0,
     "tables": 0,
     "traces": 0,
     "spectra": 0,

@@ -67,6 +67,20 @@ def test_parts_are_the_whole(source, whole, tmp_path):
     assert [p.name for p in tmp_path.iterdir() if "parts" in p.name] == []
 
 
+def test_the_file_is_read_once_and_closed(source, tmp_path, monkeypatch):
+    studies, real = [], streaming.read
+
+    def counted(path):
+        studies.append(real(path))
+        return studies[-1]
+
+    monkeypatch.setattr(streaming, "read", counted)
+    fit_file(source, tmp_path / "fits.h5", method=METHOD)
+    (study,) = studies
+    with pytest.raises(etid.RecordingError, match="closed"):
+        study["loaded/0"]
+
+
 def test_an_interrupted_run_goes_on_where_it_was(source, whole, tmp_path, monkeypatch):
     """Three interruptions, and no part is fitted twice but the one it was at."""
     target = tmp_path / "fits.h5"

@@ -1,0 +1,203 @@
+"""Cost against the number of samples, of lanes and of workers; a table and a figure.
+
+What has no workers runs on one core, as `speed` does. A slope is that of the straight line
+between two neighbours on logarithmic axes: 1 where cost is in proportion, 0 where it is constant.
+"""
+
+import functools
+import pathlib
+import tempfile
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import matplotlib as mpl
+import numpy as np
+import scipy.signal
+from matplotlib.figure import Figure
+
+import etid
+from benchmarks import peers, scale
+from benchmarks.large_file import large_file
+from benchmarks.problem import START, Problem, harmonics, problem, problem_of, terms
+from benchmarks.provenance import write_csv
+from benchmarks.speed import pin
+from benchmarks.timing import first_and_warm
+from etid.filtering import lfilter
+from etid.levenberg_marquardt import normal_equations
+from etid.methods import Method
+from etid.single_load import TOGETHER
+
+SAMPLES = (1_000, 3_000, 10_000, 30_000, 100_000, 300_000, 1_000_000)
+LANES = (1, 4, 16, 64, 256, 1_024, 10_000, 100_000)
+WORKERS = (1, 2)
+LIMIT = 20.0  # [s] of one call; longer ones end their curve
+ENOUGH = 0.5  # [s] of calls of which the median is taken
+PERIODS = 3
+PULSE_RATE = 60.0  # [Hz]
+NOISE = 1e-3  # of the effective value
+BENT = 0.25  # change of slope that is marked in the table
+RECORDINGS = 2_000  # for the workers
+DASHES = ("-", "--", "-.", ":", (0, (5, 1)), (0, (1, 1)))
+MARKS = "osD^vx"
+
+
+def seconds(call: Callable[[], Any]) -> float:
+    """Median time of a call after a first one, of as many as need not take long."""
+    once = first_and_warm(call, 1)[1]
+    repeats = int(min(20, ENOUGH / max(once, 1e-9)))
+    return first_and_warm(call, repeats)[1] if repeats > 1 else once
+
+
+def calls(one: Problem) -> dict[str, Callable[[], Any]]:
+    """What is measured against the number of samples, of a single record."""
+    first = jax.tree.map(lambda leaf: leaf[0], one.lanes)
+    v = jnp.asarray(one.records[0].v_th)
+    b, a, start = jnp.asarray(peers.B), jnp.asarray(peers.A), jnp.asarray(START)
+    forward = jax.jit(lambda b, v: lfilter(b, a, v)[0])
+    gradient = jax.jit(jax.grad(lambda b, v: jnp.sum(lfilter(b, a, v)[0] ** 2)))
+
+    def three(q, v):
+        return lfilter(b, a.at[1:4].add(q), v)[0]
+
+    equations = jax.jit(lambda q, v: normal_equations(three, q, v))
+    harmonic = jax.jit(lambda q, first: TOGETHER.equations(terms, q, one.load(first)))
+    refine = jax.jit(peers.one_fit(one)["ours"])
+    return {
+        "filter": lambda: forward(b, v),
+        "gradient of the filter": lambda: gradient(b, v),
+        "normal equations of the filter": lambda: equations(jnp.zeros(3), v),
+        "harmonics and noise": lambda: harmonics(one.records[0]),
+        "normal equations of the harmonics": lambda: harmonic(start, first),
+        "LM fit on the harmonics": lambda: refine(first),
+    }
+
+
+def stretched(one: Problem, size: int) -> Problem:
+    """The first trial with its three periods sampled `size` times, and with new noise.
+
+    Interpolated, because simulating a million samples takes minutes.
+    """
+    rate = (size - 0.5) * PULSE_RATE / PERIODS  # half a sample short of a whole number
+    draws, first = np.random.default_rng(size), one.records[0]
+    v_th, v_out = (
+        np.asarray(scipy.signal.resample(v, size)) + NOISE * np.std(v) * draws.standard_normal(size)
+        for v in (first.v_th, first.v_out)
+    )
+    record = etid.Recording(v_th, v_out, sample_rate=rate, pulse_rate=PULSE_RATE, path="stretched")
+    return problem_of(etid.Study.from_recordings([record]), one.driver)
+
+
+def against_samples(sizes: Sequence[int]) -> Iterable[dict[str, Any]]:
+    """Seconds per record; the records hold three pulse periods, at ever higher rates."""
+    base = problem(10_000, 1)
+    for size in sizes:
+        for name, call in calls(stretched(base, size)).items():
+            yield {"against": "samples", "what": name, "number": size, "seconds": seconds(call)}
+
+
+def against_lanes(counts: Sequence[int]) -> Iterable[dict[str, Any]]:
+    """Seconds per lane of a batch, from recordings in memory to fits."""
+    records = problem(5_000, 16, 100e3)
+    loaded, given = records.records, records.driver
+    drivers: dict[Method, etid.Driver] = {
+        "maximum_likelihood": given,
+        "equation_error": etid.identify_driver(
+            records.study["calibration/0"], method="equation_error", throw=False
+        ),
+    }
+    for method, driver in drivers.items():
+        each = 0.0
+        for count in counts:
+            if each * count > LIMIT:
+                break
+            many = (loaded * (count // len(loaded) + 1))[:count]
+            fit = functools.partial(etid.identify_skins, many, driver, method=method)
+            each = seconds(lambda fit=fit: fit().chi2) / count
+            yield {"against": "lanes", "what": method, "number": count, "seconds": each}
+
+
+def against_workers(folder: pathlib.Path, recordings: int) -> Iterable[dict[str, Any]]:
+    """Seconds per recording of a file, by processes with a core each."""
+    part = max(1, recordings // 16)
+    plan = scale.Plan(folder, recordings, part, (), None)
+    large_file(folder, recordings, "contiguous")
+    for method in (None, "equation_error"):
+        for workers in WORKERS:
+            found = scale.measured(folder, scale.fit_job(plan, "contiguous", method, workers))
+            name = method or "maximum_likelihood"
+            each = found["seconds"] / recordings
+            yield {"against": "workers", "what": name, "number": workers, "seconds": each}
+
+
+def with_slopes(rows: Iterable[dict[str, Any]]) -> Iterable[dict[str, Any]]:
+    """The same with the slope from the row before of the same curve, NaN at its begin."""
+    before: dict[tuple[str, str], dict[str, Any]] = {}
+    for row in rows:
+        last = before.get((row["against"], row["what"]))
+        slope, bent = np.nan, False
+        if last is not None:
+            run = np.log(row["number"] / last["number"])
+            slope = float(np.log(row["seconds"] / last["seconds"]) / run)
+            bent = bool(abs(slope - last["slope"]) > BENT)
+        before[row["against"], row["what"]] = row = {**row, "slope": slope, "bent": bent}
+        yield row
+
+
+def draw(rows: Sequence[dict[str, Any]], path: pathlib.Path) -> None:
+    """One panel per number, legible without colours."""
+    figure = Figure(figsize=(11, 4.2), layout="constrained")
+    titles = {
+        "samples": ("samples of a record", "seconds per record"),
+        "lanes": ("recordings in a batch", "seconds per recording"),
+        "workers": ("worker processes", "seconds per recording of a file"),
+    }
+    for axes, (against, (across, up)) in zip(figure.subplots(1, 3), titles.items(), strict=True):
+        of = [row for row in rows if row["against"] == against]
+        for style, name in enumerate(dict.fromkeys(row["what"] for row in of)):
+            curve = [row for row in of if row["what"] == name]
+            axes.loglog(
+                [row["number"] for row in curve],
+                [row["seconds"] for row in curve],
+                color="black",
+                linestyle=DASHES[style],
+                marker=MARKS[style],
+                markersize=4,
+                linewidth=1,
+                label=name,
+            )
+        if against == "workers":
+            axes.set_xticks(WORKERS, labels=map(str, WORKERS), minor=False)
+            axes.minorticks_off()
+        axes.set(xlabel=across, ylabel=up)
+        axes.grid(color="0.9")
+        axes.legend(fontsize=7, frameon=False)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with mpl.rc_context({"svg.hashsalt": "etid"}):  # the same numbers, the same file
+        figure.savefig(path, metadata={"Date": None} if path.suffix == ".svg" else None)
+
+
+def _all(quick: bool) -> Iterable[dict[str, Any]]:
+    # Workers come first: once this process has a core, its children have no other.
+    with tempfile.TemporaryDirectory() as files:
+        yield from against_workers(pathlib.Path(files), 64 if quick else RECORDINGS)
+    pin()
+    yield from against_samples(SAMPLES[:3] if quick else SAMPLES)
+    yield from against_lanes(LANES[:3] if quick else LANES)
+
+
+def run(quick: bool, folder: pathlib.Path) -> None:
+    """Measure, print, and write `curves.csv` and `curves.svg` into `folder`."""
+    print(f"{'against':<9}{'what':<36}{'number':>9}{'ms each':>12}{'slope':>8}")
+    table = []
+    for row in with_slopes(_all(quick)):
+        table.append(row)
+        bends = "  bends" if row["bent"] else ""
+        print(
+            f"{row['against']:<9}{row['what']:<36}{row['number']:>9}"
+            f"{1e3 * row['seconds']:12.4f}{row['slope']:8.2f}{bends}",
+            flush=True,
+        )
+    write_csv(folder / "curves.csv", table)
+    draw(table, folder / "curves.svg")

@@ -1,0 +1,107 @@
+"""One measurement in a process of its own, whose peak memory is the measurement's.
+
+`python -m benchmarks.one_run JOB` with a JSON object; prints another.
+"""
+
+import contextlib
+import json
+import pathlib
+import resource
+import sys
+import time
+from typing import Any
+
+import h5py
+import jax
+
+import etid
+from etid import streaming
+
+
+def by_h5py(file: str, whole_stacks: bool) -> int:
+    """Read all samples with h5py alone, one recording after the other or a stack at once."""
+    count = 0
+    with h5py.File(file) as opened:
+
+        def visit(_: str, item: Any) -> None:
+            nonlocal count
+            if not isinstance(item, h5py.Dataset):
+                return
+            if item.ndim == 1 or whole_stacks:
+                item[()]
+            else:
+                for row in range(item.shape[0]):
+                    item[row]
+            count += len(item) if item.ndim == 2 else 1
+
+        opened.visititems(visit)
+    return count // 2
+
+
+def by_etid(file: str) -> int:
+    """Load all recordings."""
+    with etid.read(file) as study:
+        return sum(1 for _ in study.recordings())
+
+
+def fit(job: dict[str, Any]) -> dict[str, Any]:
+    """Fit a file; the same with a small one before, so that compilation is apart."""
+    arguments: dict[str, Any] = {"method": job["method"]}
+    with contextlib.ExitStack() as stack:
+        if job["workers"] > 1:
+            arguments["executor"] = stack.enter_context(streaming.processes(job["workers"]))
+        start = 0.0
+        if job["warm"]:
+            target = pathlib.Path(job["target"]).with_suffix(".warm.h5")
+            streaming.PART = job["warm_part"]
+            _, start = _timed(lambda: streaming.fit_file(job["warm"], target, **arguments))
+            target.unlink()
+        streaming.PART = job["part"]
+        if job["log"]:
+            _log_parts(job["log"])
+        call = lambda: streaming.fit_file(  # noqa: E731 - used once, below
+            job["file"], job["target"], resume=job["resume"], **arguments
+        )
+        outcome, seconds = _timed(call)
+    return {"start": start, "seconds": seconds, "verdicts": outcome.fits.counts()}
+
+
+def _log_parts(log: str) -> None:
+    """Note each part when it is begun."""
+    real = streaming.identify_part
+
+    def logged(study, paths, *rest):
+        with open(log, "a") as file:
+            file.write(f"{paths[0]}\n")
+        return real(study, paths, *rest)
+
+    streaming.identify_part = logged
+
+
+def _timed(call: Any) -> tuple[Any, float]:
+    begin = time.perf_counter()
+    found = call()
+    return found, time.perf_counter() - begin
+
+
+def main(job: dict[str, Any]) -> dict[str, Any]:
+    """Do the job; seconds, and peak memory [B] of this process and of the largest child."""
+    if job["what"] == "fit":
+        found = fit(job)
+    else:
+        call = {
+            "h5py": lambda: by_h5py(job["file"], False),
+            "h5py, whole stacks": lambda: by_h5py(job["file"], True),
+            "etid": lambda: by_etid(job["file"]),
+        }[job["what"]]
+        found = {"seconds": _timed(call)[1]}
+    own, children = (
+        1024 * resource.getrusage(who).ru_maxrss
+        for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)
+    )
+    return {**found, "memory": own, "worker_memory": children}
+
+
+if __name__ == "__main__":
+    jax.config.update("jax_enable_x64", True)
+    print(json.dumps(main(json.loads(sys.argv[1]))))

@@ -1,0 +1,315 @@
+"""Every stage of a fit, and what others take for it: SciPy, stock optimistix, jaxopt.
+
+All get the same residual and the same start. The two solvers in JAX, which have no filters, run as
+their users run them, `vmap` over lanes, `SIDE_BY_SIDE` at a time. SciPy goes from lane to lane with
+residual and Jacobian in NumPy, and is measured on a few of them.
+"""
+
+import importlib
+import warnings
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import Any, NamedTuple, cast
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optimistix as optx
+import scipy.optimize
+import scipy.signal
+from jaxtyping import Array, Float
+
+import etid
+from benchmarks.problem import SAMPLES, START, ByNumPy, Problem, harmonics, problem, terms
+from benchmarks.timing import first_and_warm
+from etid import steiglitz_mcbride
+from etid.batch import each
+from etid.filtering import lfilter
+from etid.harmonic_steiglitz_mcbride import fit_skin
+from etid.levenberg_marquardt import normal_equations
+from etid.output_error import MAX_STEPS
+from etid.single_load import TOGETHER
+from etid.spectra import Spectrum
+from etid.transfer import Rational
+
+LANES = (1, 98, 1024, 10_000)
+SIDE_BY_SIDE = 98
+BY_SCIPY = 8  # lanes
+LIMIT = 20.0  # [s] of one call; what will take longer is left out unless asked for
+NAMES = ("ours", "scipy", "optimistix", "jaxopt")
+B, A = cast(tuple[np.ndarray, np.ndarray], scipy.signal.butter(6, 0.3))
+
+Run = Callable[[np.ndarray], Any]  # lanes by their numbers
+
+
+class Stage(NamedTuple):
+    """One stage, by whom it can be done."""
+
+    name: str
+    by: Mapping[str, Run]
+
+
+def _each(one: Callable[[Any], Any], data: Any) -> Run:
+    """Lanes one after the other on a processor, as etid does."""
+
+    @jax.jit
+    def run(data, index):
+        return each(lambda i: one(jax.tree.map(lambda leaf: leaf[i], data)), index)
+
+    return lambda index: run(data, jnp.asarray(index))
+
+
+def _vmapped(one: Callable[[Any], Any], data: Any) -> Run:
+    """Lanes side by side."""
+
+    @jax.jit
+    def run(data, index):
+        lanes = jax.tree.map(lambda leaf: leaf[index], data)
+        if index.shape[0] <= SIDE_BY_SIDE:
+            return jax.vmap(one)(lanes)
+        return jax.lax.map(one, lanes, batch_size=SIDE_BY_SIDE)
+
+    return lambda index: run(data, jnp.asarray(index))
+
+
+def _looped(one: Callable[[Any], Any], data: Any) -> Run:
+    """Lanes in a Python loop, those few that SciPy is measured on."""
+
+    def lane(i):
+        return one(jax.tree.map(lambda leaf: leaf[i], data))
+
+    return lambda index: [lane(i) for i in index[:BY_SCIPY]]
+
+
+def stages(ten_periods: Problem) -> list[Stage]:
+    """All stages of a problem."""
+    return [
+        _filter(ten_periods),
+        _equations(ten_periods),
+        _steiglitz_mcbride(ten_periods),
+        Stage("SM iteration on harmonics", {"ours": harmonic_steiglitz_mcbride(ten_periods, 1)}),
+        Stage("LM fit", solvers(ten_periods)),
+        _raw_to_fit(ten_periods),
+        Stage("samples to judged joint fit", {"ours": judged(ten_periods)}),
+    ]
+
+
+def _filter(ten_periods: Problem) -> Stage:
+    x, b, a = jnp.asarray(ten_periods.samples()[0]), jnp.asarray(B), jnp.asarray(A)
+    return Stage(
+        "filter of order 6",
+        {
+            "ours": _each(lambda v: lfilter(b, a, v)[0][-1], x),
+            "scipy": _looped(lambda v: scipy.signal.lfilter(B, A, v), np.asarray(x)),
+        },
+    )
+
+
+def _equations(ten_periods: Problem) -> Stage:
+    x, b, a = jnp.asarray(ten_periods.samples()[0]), jnp.asarray(B), jnp.asarray(A)
+
+    def ours(v):
+        of = normal_equations(lambda q, _: lfilter(b, a.at[1:4].add(q), v)[0], jnp.zeros(3))
+        return of.matrix
+
+    def by_scipy(v):
+        y = scipy.signal.lfilter(B, A, v)
+        slope = -np.asarray(scipy.signal.lfilter([1.0], A, y))  # dy/da_k = −z⁻ᵏ y / A
+        columns = np.stack([np.r_[np.zeros(k), slope[:-k]] for k in (1, 2, 3)], axis=1)
+        return columns.T @ columns
+
+    return Stage(
+        "normal equations of 3", {"ours": _each(ours, x), "scipy": _looped(by_scipy, np.asarray(x))}
+    )
+
+
+def numpy_steiglitz_mcbride(
+    v_th: np.ndarray, v_out: np.ndarray, b: np.ndarray, a: np.ndarray, iterations: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """N and D of the skin (paper, eqs. 1, 8, 9), as one would write it with NumPy and SciPy."""
+    x, w = v_th - v_out, scipy.signal.lfilter(b, a, v_out)
+    den = np.array([1.0])
+    num = den
+    for _ in range(iterations):
+        xf, wf = scipy.signal.lfilter([1.0], den, x), scipy.signal.lfilter([1.0], den, w)
+        columns = np.stack([xf, np.r_[0.0, xf[:-1]], -np.r_[0.0, wf[:-1]]], axis=1)
+        found = np.linalg.lstsq(columns, wf)[0]
+        num, den = found[:2], np.array([1.0, found[2]])
+    return num, den
+
+
+def _steiglitz_mcbride(ten_periods: Problem) -> Stage:
+    """The first iteration, without what ours does to judge it; on harmonics at the side."""
+    v_th, v_out = ten_periods.samples()
+    driver = ten_periods.driver
+    z_th = Rational(driver.b, driver.a)
+    b, a = np.asarray(driver.b), np.asarray(driver.a)
+
+    def ours(records):
+        w = lfilter(z_th.num, z_th.den, records[1])[0]
+        x = records[0] - records[1]
+
+        def unjudged(_):
+            return jnp.zeros(()), jnp.array(True)
+
+        return steiglitz_mcbride.iterate(x[None], w[None], 1, 1, unjudged, 1).filter.num
+
+    def by_scipy(records):
+        return numpy_steiglitz_mcbride(records[0], records[1], b, a, 1)[0]
+
+    return Stage(
+        "Steiglitz-McBride iteration",
+        {
+            "ours": _each(ours, (jnp.asarray(v_th), jnp.asarray(v_out))),
+            "scipy": _looped(by_scipy, (v_th, v_out)),
+        },
+    )
+
+
+def harmonic_steiglitz_mcbride(ten_periods: Problem, iterations: int) -> Run:
+    """Our Steiglitz-McBride on the harmonics."""
+    known = ten_periods.known
+    z_th = known.z_th(jnp.zeros_like(known.loaded))
+
+    def ours(one):
+        return fit_skin(Spectrum(*one[:-1]), z_th, iterations).circuit.values()
+
+    return _each(ours, ten_periods.lanes)
+
+
+def one_fit(ten_periods: Problem) -> dict[str, Callable[[Any], Float[Array, " own"]]]:
+    """Elements and delay of one lane, by each solver in JAX."""
+    start = jnp.asarray(START)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # it is no longer maintained, and says so when imported
+        jaxopt = importlib.import_module("jaxopt")
+
+    def by(solver):
+        return lambda one: (
+            optx.least_squares(
+                terms,
+                solver,
+                start,
+                args=ten_periods.load(one),
+                max_steps=MAX_STEPS,
+                throw=False,
+            ).value
+        )
+
+    rival = jaxopt.LevenbergMarquardt(
+        terms,
+        maxiter=MAX_STEPS,
+        stop_criterion="madsen-nielsen",
+        xtol=1e-8,
+        gtol=1e-8,
+        solver="cholesky",
+        materialize_jac=True,
+    )
+    return {
+        "ours": by(TOGETHER),
+        "optimistix": by(optx.LevenbergMarquardt(rtol=1e-8, atol=1e-8)),
+        "jaxopt": lambda one: rival.run(start, ten_periods.load(one)).params,
+    }
+
+
+def minpack(value: Callable, slope: Any) -> np.ndarray:
+    """The same by MINPACK."""
+    return scipy.optimize.least_squares(value, START, jac=slope, method="lm", x_scale="jac").x
+
+
+def _scipy_fit(ten_periods: Problem) -> Callable[[Any], np.ndarray]:
+    def fit(one):
+        by = ByNumPy(ten_periods.load(one))
+        slope: Any = by.jacobian
+        return minpack(by.terms, slope)
+
+    return fit
+
+
+def compiled_scipy_fit(ten_periods: Problem) -> Callable[[Any], np.ndarray]:
+    """By MINPACK with our compiled terms, and a Jacobian by forward differentiation."""
+    value, slope = jax.jit(terms), jax.jit(jax.jacfwd(terms))
+
+    def fit(one):
+        load = ten_periods.load(one)
+        return minpack(
+            lambda q: np.asarray(value(q, load)),
+            lambda q: np.asarray(slope(q, load)),
+        )
+
+    return fit
+
+
+def solvers(ten_periods: Problem) -> dict[str, Run]:
+    """One fit per lane, Z_th known, by every solver."""
+    by, lanes = one_fit(ten_periods), ten_periods.lanes
+    return {
+        "ours": _each(by["ours"], lanes),
+        "scipy": _looped(_scipy_fit(ten_periods), lanes),
+        "optimistix": _vmapped(by["optimistix"], lanes),
+        "jaxopt": _vmapped(by["jaxopt"], lanes),
+    }
+
+
+def _raw_to_fit(ten_periods: Problem) -> Stage:
+    """The same from the samples on, whose harmonics are made alike for all."""
+    found = solvers(ten_periods)
+
+    def after_harmonics(name: str) -> Run:
+        def run(index):
+            done = index[:BY_SCIPY] if name == "scipy" else index
+            for i in done:
+                harmonics(ten_periods.records[i])
+            return found[name](index)
+
+        return run
+
+    return Stage("samples to fit", {name: after_harmonics(name) for name in found})
+
+
+def judged(ten_periods: Problem) -> Run:
+    """What etid does by default: jointly with the calibration, with errors and a verdict."""
+
+    def run(index):
+        records = [ten_periods.records[i] for i in index]
+        return etid.identify_skins(records, ten_periods.driver).fit.chi2
+
+    return run
+
+
+def rows(
+    distinct: int, lanes: Sequence[int], repeats: int, limit: float
+) -> Iterable[dict[str, Any]]:
+    """Milliseconds per lane, one row per stage and number of lanes; more lanes repeat the distinct.
+
+    Args:
+        distinct: How many lanes differ.
+        lanes: Numbers of lanes.
+        repeats: Of each measurement, after a first call.
+        limit: Longest call [s] that is made.
+    """
+    for stage in stages(problem(SAMPLES, distinct)):
+        known: dict[str, float] = {}
+        for count in lanes:
+            index = np.arange(count) % distinct
+            row: dict[str, Any] = {"stage": stage.name, "lanes": count}
+            for name in NAMES:
+                run = stage.by.get(name)
+                done = min(count, BY_SCIPY) if name == "scipy" else count
+                if run is None or known.get(name, 0.0) * done > limit:
+                    row[name] = None
+                    continue
+                times = first_and_warm(lambda run=run, index=index: run(index), repeats)
+                known[name] = times[1] / done
+                row[name] = 1e3 * known[name]
+            yield row
+
+
+def show(table: Iterable[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Print rows as they come."""
+    print(f"{'ms per lane':<30}{'lanes':>7}" + "".join(f"{name:>12}" for name in NAMES))
+    shown = []
+    for row in table:
+        cells = (f"{row[name]:12.3f}" if row[name] is not None else f"{'-':>12}" for name in NAMES)
+        print(f"{row['stage']:<30}{row['lanes']:>7}" + "".join(cells), flush=True)
+        shown.append(row)
+    return shown

@@ -1,0 +1,52 @@
+"""Where numbers come from: commit, machine and versions, beside every row of a CSV."""
+
+import csv
+import importlib.metadata
+import os
+import pathlib
+import platform
+import subprocess
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+ROOT = pathlib.Path(__file__).parents[1]
+PACKAGES = ("etid", "jax", "jaxlib", "equinox", "optimistix", "numpy", "scipy", "h5py")
+
+
+def provenance() -> dict[str, str]:
+    """Commit, machine and versions."""
+    return {
+        "commit": _commit(),
+        "machine": f"{_processor()}, {os.cpu_count()} cores, {platform.system()}",
+        "python": platform.python_version(),
+        **{name: importlib.metadata.version(name) for name in PACKAGES},
+    }
+
+
+def _commit() -> str:
+    """The commit, with a + if the working tree differs from it."""
+    command = ["git", "describe", "--always", "--abbrev=12", "--dirty=+", "--exclude=*"]
+    try:
+        done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True)
+    except (OSError, subprocess.CalledProcessError):
+        return "unknown"
+    return done.stdout.strip()
+
+
+def _processor() -> str:
+    described = pathlib.Path("/proc/cpuinfo")
+    if described.exists():
+        for line in described.read_text().splitlines():
+            if line.startswith("model name"):
+                return line.partition(":")[2].strip()
+    return platform.processor() or platform.machine()
+
+
+def write_csv(path: pathlib.Path, rows: Sequence[Mapping[str, Any]]) -> None:
+    """Write rows, each with `provenance`."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    source = provenance()
+    with path.open("w", newline="") as file:
+        writer = csv.DictWriter(file, fieldnames=[*rows[0], *source])
+        writer.writeheader()
+        writer.writerows({**row, **source} for row in rows)

@@ -1,0 +1,161 @@
+"""The benchmarks themselves: what they measure on, and that each runs and says what it should."""
+
+import csv
+
+import h5py
+import jax
+import numpy as np
+import pytest
+import scipy.signal
+
+import etid
+from benchmarks import curves, peers, scale
+from benchmarks.large_file import LAYOUTS, SAMPLES, large_file
+from benchmarks.problem import START, ByNumPy, problem
+from benchmarks.provenance import write_csv
+
+FEW = 12  # recordings
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_a_large_file_follows_the_schema_and_is_made_once(layout, tmp_path):
+    path = large_file(tmp_path, FEW, layout)
+    assert etid.check(path) == []
+    with etid.read(path) as study:
+        assert len(study.loaded) == FEW
+        assert len(study.calibrations) == 1
+        first, second = (study[f"s0000/skin/{row}"] for row in (0, 1))
+    assert first.v_out.size == SAMPLES
+    assert round(first.periods, 6) == 3
+    assert (first.v_out != second.v_out).any()
+    before = path.stat().st_mtime_ns
+    assert large_file(tmp_path, FEW, layout).stat().st_mtime_ns == before
+
+
+def test_the_layouts_hold_the_same_samples(tmp_path):
+    stacks = []
+    for layout in LAYOUTS:
+        with h5py.File(large_file(tmp_path, FEW, layout)) as file:
+            stacks.append(np.asarray(file["s0000/skin/v_out"]))
+    np.testing.assert_array_equal(stacks[0], stacks[1])
+    np.testing.assert_array_equal(stacks[0], stacks[2])
+
+
+def test_files_are_compared_bit_by_bit(tmp_path):
+    one, other = tmp_path / "one.h5", tmp_path / "other.h5"
+    for path, last in (one, 2.0), (other, np.nextafter(2.0, 3.0)):
+        with h5py.File(path, "w") as file:
+            file["x"] = [np.nan, last]
+            file["note"] = ["a text", "another"]
+    assert scale._same(one, one)
+    assert not scale._same(one, other)
+
+
+def test_a_table_says_where_it_comes_from(tmp_path):
+    write_csv(tmp_path / "deep" / "table.csv", [{"what": "a, b", "seconds": 1.5}])
+    with (tmp_path / "deep" / "table.csv").open() as file:
+        (row,) = csv.DictReader(file)
+    assert (row["what"], row["seconds"], row["etid"]) == ("a, b", "1.5", etid.__version__)
+    assert row["commit"]
+    assert row["machine"]
+
+
+@pytest.mark.slow
+def test_scale_measures_everything_and_a_killed_run_loses_nothing(tmp_path):
+    plan = scale.Plan(tmp_path, 60, 6, ("equation_error",), "equation_error")
+    rows = list(scale.rows(plan))
+    assert len(rows) == 3 * 3 + 4  # three ways to read three layouts, fitted by 1, 2, 1, 1 process
+    assert all(row["seconds"] > 0 and row["memory_mb"] > 0 for row in rows)
+    resumed = scale.resume(plan)
+    assert resumed.passed
+    assert resumed.parts == 10
+    assert resumed.killed_at == sorted(resumed.killed_at)
+
+
+def test_steiglitz_mcbride_in_numpy_recovers_a_filter_without_noise():
+    """Z = N/D between the voltages of a divider with a source of 2 ohm."""
+    num, den = np.array([3.0, -1.0]), np.array([1.0, -0.7])
+    v_out = np.random.default_rng(5).normal(size=500)
+    current = scipy.signal.lfilter(den, num, v_out)
+    found = peers.numpy_steiglitz_mcbride(
+        v_out + 2 * current, v_out, np.array([2.0]), np.array([1.0]), 3
+    )
+    # X = 2 i and W = 2 v_out, so that N/D = Z; the recursion starts at rest, as lfilter does.
+    np.testing.assert_allclose(found[0], num, rtol=1e-10)
+    np.testing.assert_allclose(found[1], den, rtol=1e-10)
+
+
+@pytest.fixture(scope="module")
+def short_problem():
+    return problem(2000, 2, sample_rate=40e3)
+
+
+@pytest.mark.slow
+def test_scipy_and_we_do_the_same_before_the_fit(short_problem):
+    """Filter, normal equations, Steiglitz-McBride: rounding of a condition of 1e4 apart."""
+    every = np.arange(2)
+    for stage in (peers._equations(short_problem), peers._steiglitz_mcbride(short_problem)):
+        ours, theirs = (np.stack(stage.by[name](every)) for name in ("ours", "scipy"))
+        np.testing.assert_allclose(ours, theirs, rtol=1e-8)
+
+
+def test_numpy_writes_the_same_terms(short_problem):
+    load = short_problem.load(jax.tree.map(lambda leaf: leaf[0], short_problem.lanes))
+    by, q = ByNumPy(load), START + 0.01
+    used = np.concatenate([np.tile(np.asarray(load.spectrum.selected), 2), [True]])
+    np.testing.assert_allclose(
+        by.terms(q), np.asarray(load(jax.numpy.asarray(q)))[used], rtol=1e-6, atol=1e-9
+    )
+    slope = np.asarray(jax.jacfwd(load)(jax.numpy.asarray(q)))[used]
+    np.testing.assert_allclose(by.jacobian(q), slope, rtol=1e-6, atol=1e-6 * np.abs(slope).max())
+
+
+@pytest.mark.slow
+def test_all_solvers_find_the_same_minimum(short_problem):
+    by, every = peers.solvers(short_problem), np.arange(2)
+    with jax.numpy_rank_promotion("allow"), jax.numpy_dtype_promotion("standard"):  # jaxopt's
+        found = {name: np.stack(run(every)) for name, run in by.items()}
+    for name in peers.NAMES[1:]:
+        # A fraction of a standard error of the logarithms, which are above 1e-3.
+        np.testing.assert_allclose(found[name], found["ours"], atol=1e-4, err_msg=name)
+
+
+@pytest.mark.slow
+def test_every_stage_is_timed_and_what_takes_too_long_is_left_out(short_problem, monkeypatch):
+    monkeypatch.setattr(peers, "problem", lambda samples, lanes: short_problem)
+    with jax.numpy_rank_promotion("allow"), jax.numpy_dtype_promotion("standard"):  # jaxopt's
+        table = peers.show(peers.rows(2, (1, 3), 1, np.inf))
+    assert len(table) == 2 * 7
+    assert all(row["ours"] > 0 for row in table)
+    assert [row["jaxopt"] is not None for row in table] == [False] * 8 + [True] * 4 + [False] * 2
+    monkeypatch.setattr(peers, "stages", lambda p: [peers._filter(p)])
+    once, never = peers.rows(2, (1, 3), 1, 0.0)
+    assert once["ours"] > 0
+    assert never["ours"] is None
+
+
+def test_slopes_are_those_between_neighbours_of_a_curve():
+    times = {"line": (1.0, 10.0, 100.0), "bend": (1.0, 1.0, 10.0)}
+    rows = [
+        {"against": "samples", "what": what, "number": 10**power, "seconds": seconds[power]}
+        for power in range(3)
+        for what, seconds in times.items()
+    ]
+    found = list(curves.with_slopes(rows))
+    slopes = {what: [row["slope"] for row in found if row["what"] == what] for what in times}
+    np.testing.assert_allclose(slopes["line"], [np.nan, 1.0, 1.0])
+    np.testing.assert_allclose(slopes["bend"], [np.nan, 0.0, 1.0], atol=1e-12)
+    assert [row["what"] for row in found if row["bent"]] == ["bend"]
+
+
+@pytest.mark.slow
+def test_curves_are_measured_and_drawn(tmp_path, monkeypatch):
+    monkeypatch.setattr(curves, "LANES", (1, 2))
+    monkeypatch.setattr(curves, "SAMPLES", (1_000,))
+    monkeypatch.setattr(curves, "pin", lambda: None)  # it would be for all tests to come
+    curves.run(quick=True, folder=tmp_path)
+    with (tmp_path / "curves.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert {row["against"] for row in rows} == {"samples", "lanes", "workers"}
+    assert all(float(row["seconds"]) > 0 for row in rows)
+    assert (tmp_path / "curves.svg").read_text().startswith("<?xml")
