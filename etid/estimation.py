@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Array, Complex, Float
+from jaxtyping import Array, Complex, Float, Int
 
 from etid import (
     given_driver,
@@ -54,11 +54,14 @@ def _starts(
     return jnp.stack(starts)
 
 
-def skin_by_output_error(m: Measurement, driver: Driver, circuit: AbstractCircuit) -> Fit:
+def skin_by_output_error(
+    m: Measurement, samples: Int[Array, ""], driver: Driver, circuit: AbstractCircuit
+) -> Fit:
     """Refine from the best of several starts.
 
     Args:
         m: One recording.
+        samples: How many of its first samples were recorded.
         driver: Its driver, with a continuous source impedance.
         circuit: Structure and typical values.
     """
@@ -71,7 +74,7 @@ def skin_by_output_error(m: Measurement, driver: Driver, circuit: AbstractCircui
         baseline = skin_by_steiglitz_mcbride(m, driver, steiglitz_mcbride.ITERATIONS).circuit
     starts = circuit.with_log_values(_starts(circuit, baseline))
     _, estimate = output_error.fit_circuit(
-        prediction.prepare(m), source, source_cov, calibration, starts
+        prediction.prepare(m, samples=samples), source, source_cov, calibration, starts
     )
     return judged(estimate, circuit, driver.result, "output_error")
 

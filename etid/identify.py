@@ -193,8 +193,10 @@ def identify_samples(
     step = jnp.asarray(resolution, dtype=v_out.dtype)
     rate = jnp.asarray(sample_rate, dtype=v_out.dtype)
     samples, known = (v_th, v_out, step, step, rate), None
+    sigma_th, sigma_out = noise(v_th, step), noise(v_out, step)
+    if method == "output_error":
+        samples = (v_th, v_out, sigma_th, sigma_out, rate, jnp.asarray(v_out.shape[0]))
     if method in HARMONIC:
-        sigma_th, sigma_out = noise(v_th, step), noise(v_out, step)
         fields = spectrum(v_th, v_out, sigma_th, sigma_out, rate, *periods)
         samples = (*map(jnp.asarray, fields), rate)
         if method == "maximum_likelihood":

@@ -64,13 +64,13 @@ def curvature(
     jacobian = jax.jacfwd(residual)(q)
     slope = jax.jacfwd(response)(q)
     s_slope = 2 * records.sigma_th**2 * h @ slope
-    samples = jacobian.shape[0]
+    samples, rows = records.intervals, jacobian.shape[0]
     noise = records.sigma_th**2 * slope.T @ slope / s
     noise = noise - jnp.outer(s_slope, s_slope) / (4 * s**2)
     k_slope = measured_impulse()[:, 1]
     noise = noise.at[-1, -1].add(records.sigma_out**2 * jnp.sum(k_slope**2) / s)
     # Jᵀ Σ J by Parseval; J is padded, so that the filters do not wrap around.
-    size = 2 ** math.ceil(math.log2(samples + IMPULSE))
+    size = 2 ** math.ceil(math.log2(rows + IMPULSE))
     weight = jnp.full(size // 2 + 1, 2.0 / size).at[0].set(1.0 / size).at[-1].set(1.0 / size)
     power_out = records.sigma_out**2 * jnp.abs(jnp.fft.rfft(impulse()[:, 0], size)) ** 2
     weight = weight * (power_out + records.sigma_th**2 * jnp.abs(jnp.fft.rfft(h, size)) ** 2)

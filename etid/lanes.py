@@ -4,6 +4,7 @@ A lane is a tuple of arrays: the harmonics of a recording, or its samples. The s
 one recording and a batch.
 """
 
+import math
 import zlib
 from collections.abc import Sequence
 from typing import Any
@@ -17,12 +18,14 @@ from etid import baseline, estimation
 from etid.circuits import AbstractCircuit
 from etid.driver import Driver
 from etid.given_driver import GivenDriver
-from etid.measurement import measure, trusted
+from etid.measurement import Measurement, measure, trusted
 from etid.methods import CONTINUOUS, HARMONIC, Method, iterations
 from etid.preflight import Inspected
 from etid.results import Fit
 from etid.spectra import Spectrum, spectrum
 from etid.traces import stored_jit
+
+STEPS = 4  # lengths in an octave: the longest filling is a fifth
 
 
 def arrays(seen: Inspected) -> tuple[np.ndarray, ...]:
@@ -34,14 +37,21 @@ def arrays(seen: Inspected) -> tuple[np.ndarray, ...]:
 def lane(seen: Inspected, method: Method) -> tuple[np.ndarray, ...]:
     """What is fitted of a recording: its harmonics and their noise, or its samples.
 
-    The harmonics are evaluated without JAX, which would compile for every length of a record.
+    Without JAX, which would compile for every length of a record: there are as many harmonics for
+    all lengths, and samples are filled up to one of few lengths.
     """
-    if method not in HARMONIC:
-        return arrays(seen)
     rate = np.asarray(seen.recording.sample_rate)
-    sigmas = trusted(seen.v_th, seen.sigma_th), trusted(seen.v_out, seen.sigma_out)
-    fields = spectrum(seen.v_th, seen.v_out, *sigmas, rate, *seen.periods)
-    return *map(np.asarray, fields), rate
+    sigma_th = np.asarray(trusted(seen.v_th, seen.sigma_th))
+    sigma_out = np.asarray(trusted(seen.v_out, seen.sigma_out))
+    if method in HARMONIC:
+        fields = spectrum(seen.v_th, seen.v_out, sigma_th, sigma_out, rate, *seen.periods)
+        return *map(np.asarray, fields), rate
+    if method == "output_error":
+        size = seen.v_th.size
+        room = math.ceil(2 ** (math.ceil(STEPS * math.log2(size)) / STEPS)) - size
+        filled = (np.pad(v, (0, room)) for v in (seen.v_th, seen.v_out))
+        return *filled, sigma_th, sigma_out, rate, np.asarray(size)
+    return arrays(seen)
 
 
 def stacked(lanes: Sequence[tuple[np.ndarray, ...]]) -> tuple[Array, ...]:
@@ -98,10 +108,11 @@ def skin_lane(
     method: Method,
 ) -> Fit:
     """Identify one lane; differentiable code, to be jitted and batched by the caller."""
+    if method == "output_error":
+        *fields, samples = lane
+        return estimation.skin_by_output_error(Measurement(*fields), samples, driver, circuit)
     if method not in HARMONIC:
         m = measure(*lane)
-        if method == "output_error":
-            return estimation.skin_by_output_error(m, driver, circuit)
         return baseline.skin_by_steiglitz_mcbride(m, driver, iterations(method))
     *fields, rate = lane
     spectrum = Spectrum(*fields)

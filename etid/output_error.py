@@ -288,18 +288,20 @@ def fit_circuit(
     precision = jnp.zeros_like(at).at[kept].set(1 / late_std**2).at[-1].set(1 / DELAY_WIDTH**2)
     full = eliminate(curvature(records, of_all, response, at, precision), both)
     own = inverse(full.expected[: kept + 1, : kept + 1])
-    chi2 = 2 * objective[-1] / (records.hold.shape[0] - q.shape[0])
+    chi2 = 2 * objective[-1] / (records.intervals - q.shape[0])
     inherited = (-own @ full.expected[: kept + 1, kept + 1 :])[:kept]
     shared = inherited @ source_cov @ inherited.T
     cov = (own @ full.score[: kept + 1, : kept + 1] @ own)[:kept, :kept]
     system = loaded_filter(source, load(q), records.sample_rate)
     predicted = predict(system, records, q[kept:-1]) + q[-1] * late.v_out
+    seen, used = measured(records, q[kept:-1]), records.used > 0
+    mean = jnp.sum(seen * records.used) / records.intervals
     estimate = Estimate(
         q[:kept],
         q[None, kept:-1],
         cov * jnp.maximum(chi2, 1.0) + shared,
         chi2,
-        rrse(predicted, measured(records, q[kept:-1])),
+        rrse(jnp.where(used, predicted, mean), jnp.where(used, seen, mean)),
         result,
         steps.sum(),
         shared,

@@ -17,7 +17,7 @@ it drives Z_th to −90 kΩ).
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from etid.driver import SourceImpedance, loaded
 from etid.filtering import CUTOFF, TAPS, StateSpace, band_limited, hold, shiftable, simulate
@@ -36,6 +36,7 @@ class Records(eqx.Module):
         sigma_th: Noise of V_th [V].
         sigma_out: Noise of V_out [V].
         sample_rate: Sampling rate [Hz].
+        used: 1 where there is a record, 0 for what only fills it up to a common length.
     """
 
     hold: Float[Array, "interval degree"]
@@ -43,12 +44,29 @@ class Records(eqx.Module):
     sigma_th: Float[Array, ""]
     sigma_out: Float[Array, ""]
     sample_rate: Float[Array, ""]
+    used: Float[Array, " interval"]
+
+    @property
+    def intervals(self) -> Float[Array, ""]:
+        """Number of those that are used."""
+        return self.used.sum()
 
 
-def prepare(m: Measurement, cutoff: float = CUTOFF) -> Records:
-    """Interpolate V_th once; the edges, where its neighbours are missing, are left out."""
+def prepare(
+    m: Measurement, cutoff: float = CUTOFF, samples: Int[Array, ""] | int | None = None
+) -> Records:
+    """Interpolate V_th once; the edges, where its neighbours are missing, are left out.
+
+    Args:
+        m: One recording.
+        cutoff: As in `filtering.band_limited`.
+        samples: How many at the beginning are the recording; all if not given.
+    """
     held, delayed = band_limited(m.v_th, cutoff), shiftable(m.v_out, cutoff)
-    return Records(held, delayed, m.sigma_th, m.sigma_out, m.sample_rate)
+    rows = jnp.arange(held.shape[0])
+    last = held.shape[0] if samples is None else samples - 2 * TAPS + 1
+    used = (rows < last).astype(held.dtype)
+    return Records(held, delayed, m.sigma_th, m.sigma_out, m.sample_rate, used)
 
 
 def loaded_filter(
@@ -122,7 +140,8 @@ def scaled_residual(
     predicted, h = predict(system, records, nuisance), impulse_response(system)
     if change is not None:
         predicted, h = predicted + change.v_out, h + change.h
-    return (predicted - measured(records, nuisance)) / jnp.sqrt(residual_variance(records, h))
+    scale = records.used / jnp.sqrt(residual_variance(records, h))
+    return (predicted - measured(records, nuisance)) * scale
 
 
 def late_calibration(

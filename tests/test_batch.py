@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 import etid
-from etid import batch
+from etid import batch, lanes
+from etid.preflight import Inspected
 from etid.scenes import Scene, Trial
 from etid.transformer import ResistorLoad, SkinLoad
 
@@ -102,6 +103,40 @@ def test_lengths_and_rates_may_be_mixed(study, driver):
     assert fits.counts() == {"successful": 3}
     error = np.asarray(fits.circuit.values()) - TRUTH
     assert (np.abs(error) < SIGMAS * np.asarray(fits.stderr.values())).all()
+
+
+def test_a_study_of_ragged_lengths_compiles_for_few(study, driver, monkeypatch):
+    traced = []
+
+    def counted(*arguments):
+        traced.append(arguments)
+        return lanes.skin_lane(*arguments)
+
+    monkeypatch.setattr(batch, "skin_lane", counted)
+    records = [
+        record.replace(v_th=record.v_th[:size], v_out=record.v_out[:size])
+        for record, size in zip(study.loaded.recordings(), range(2900, LENGTH, 14), strict=False)
+    ]
+    fits = etid.identify_skins(records, driver)
+    assert len({record.v_th.size for record in records}) == MANY
+    assert fits.fit.method == "output_error"
+    assert fits.counts() == {"successful": MANY}
+    error = np.asarray(fits.circuit.values()) - TRUTH
+    assert (np.abs(error) < SIGMAS * np.asarray(fits.stderr.values())).all()
+    assert len(traced) <= 1  # none, if an earlier test has
+
+
+def test_what_fills_a_record_up_changes_no_digit(study, driver):
+    """The same samples in a longer lane."""
+    recording = study["s01/dry/0"]
+    *fields, samples = map(jax.numpy.asarray, lanes.lane(Inspected(recording), "output_error"))
+    fit = lanes.skin_lane((*fields, samples), driver, None, etid.SkinRC(), "output_error")
+    longer = [jax.numpy.pad(v, (0, 555)) for v in fields[:2]]
+    again = lanes.skin_lane(
+        (*longer, *fields[2:], samples), driver, None, etid.SkinRC(), "output_error"
+    )
+    for one, other in zip(jax.tree.leaves(fit), jax.tree.leaves(again), strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-5)  # of solvers that stop at 1e-3 errors
 
 
 def test_one_function_per_length_serves_all_drivers(study, driver, monkeypatch):
