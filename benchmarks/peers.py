@@ -53,7 +53,7 @@ def _each(one: Callable[[Any], Any], data: Any) -> Run:
 
     @jax.jit
     def run(data, index):
-        return each(lambda i: one(jax.tree.map(lambda leaf: leaf[i], data)), index)
+        return each(lambda i: one(jax.tree.map(lambda leaf: leaf[i], data)), index, index.size)
 
     return lambda index: run(data, jnp.asarray(index))
 

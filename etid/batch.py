@@ -15,8 +15,9 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
+from jaxtyping import Array, Int
 from tqdm import tqdm
 
 from etid.circuits import AbstractCircuit, SkinRC
@@ -33,24 +34,39 @@ from etid.study import Study
 from etid.traces import stored_jit
 from etid.verdicts import message
 
-LANES = 16  # of one call, the last of which is filled up: a study compiles once per length
+LANES = 16  # of one call, the last of which is filled up
 AHEAD = 2 * LANES  # recordings that are read, and looked at, before their turn
 
 
 @stored_jit
 def _chunk(
     lanes: Any,
+    count: Int[Array, ""],
     driver: Driver,
     known: GivenDriver | None,
     circuit: AbstractCircuit,
     method: Method,
 ) -> Fit:
-    return each(lambda lane: skin_lane(lane, driver, known, circuit, method), lanes)
+    return each(lambda lane: skin_lane(lane, driver, known, circuit, method), lanes, count)
 
 
-def each(fit: Callable[[Any], Any], lanes: Any) -> Any:
-    """`fit` of every lane, side by side where that is faster."""
-    return jax.lax.map(fit, lanes) if jax.default_backend() == "cpu" else jax.vmap(fit)(lanes)
+def each(fit: Callable[[Any], Any], lanes: Any, count: int | Int[Array, ""]) -> Any:
+    """`fit` of the first `count` lanes, side by side where that is faster; of the others, zeros."""
+    if jax.default_backend() != "cpu":
+        return jax.vmap(fit)(lanes)
+    once = jax.jit(fit)  # traced once, for its shapes and for its use
+    first = jax.tree.map(lambda leaf: leaf[0], lanes)
+    shapes = jax.eval_shape(once, first)
+
+    def nothing(_):
+        return jax.tree.map(lambda of: jnp.zeros(of.shape, of.dtype), shapes)
+
+    def one(numbered):
+        number, lane = numbered
+        return jax.lax.cond(number < count, once, nothing, lane)
+
+    size = jax.tree.leaves(lanes)[0].shape[0]
+    return jax.lax.map(one, (jnp.arange(size), lanes))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -110,7 +126,7 @@ def planned(
 
 
 def filled(lanes: Sequence[tuple[np.ndarray, ...]]) -> tuple[Array, ...]:
-    """A chunk; the last lane fills it up."""
+    """A chunk, filled up by the last lane."""
     return stacked([*lanes, *[lanes[-1]] * (LANES - len(lanes))])
 
 
@@ -133,9 +149,10 @@ class _Queue:
 
     def run(self) -> Iterable[tuple[int, Fit]]:
         """Fit what is waiting."""
-        lanes = filled(self.lanes)
-        fits = jax.device_get(_chunk(lanes, self.driver, self.known, self.circuit, self.method))
-        yield from zip(self.rows, unstacked(fits), strict=False)  # the last one fills it up
+        lanes, count = filled(self.lanes), jnp.asarray(len(self.lanes))
+        of = self.driver, self.known, self.circuit, self.method
+        fits = jax.device_get(_chunk(lanes, count, *of))
+        yield from zip(self.rows, unstacked(fits), strict=False)  # what fills it up is left out
         self.rows, self.lanes = [], []
 
 

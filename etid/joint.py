@@ -14,7 +14,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
+from jaxtyping import Array, Int
 from tqdm import tqdm
 
 from etid import estimation, judging, shared_driver
@@ -53,7 +53,7 @@ SINGLE = (
 
 
 @stored_jit
-def _alone(lanes: Any, model: Joint) -> Loads:
+def _alone(lanes: Any, count: Int[Array, ""], model: Joint) -> Loads:
     """Loads identified one by one with Z_th as it is, where a joint fit may start."""
 
     def one(lane):
@@ -66,7 +66,7 @@ def _alone(lanes: Any, model: Joint) -> Loads:
         good = settled & jnp.isfinite(chi2) & ~judging.misses(chi2, error)
         return Loads(spectrum, sample_rate, own, good, jnp.array(-1))
 
-    return each(one, lanes)
+    return each(one, lanes, count)
 
 
 @stored_jit
@@ -125,7 +125,7 @@ class _Waiting:
         count = len(self.lanes)
         if count == 0:
             return
-        loads = jax.device_get(_alone(filled(self.lanes), self.model))
+        loads = jax.device_get(_alone(filled(self.lanes), jnp.asarray(count), self.model))
         self.chunks.append(jax.tree.map(lambda leaf: leaf[:count], loads))
         self.lanes = []
 

@@ -4,7 +4,6 @@ import functools
 import math
 
 import numpy as np
-import scipy.fft
 from jaxtyping import Float
 
 from etid.filtering import TAPS
@@ -147,7 +146,7 @@ def _is_misaligned(
         return True
     few = math.ceil(PERIODS * of.sample_rate / of.pulse_rate)
     x, y = v_th[:few] - v_th[:few].mean(), v_out[:few] - v_out[:few].mean()
-    size = scipy.fft.next_fast_len(2 * x.size, real=True) or 2 * x.size
+    size = 1 << (2 * x.size - 1).bit_length()
     correlation = np.fft.irfft(np.fft.rfft(y, size) * np.conj(np.fft.rfft(x, size)), size)
     lag = int(np.argmax(correlation))
     lag = lag - size if lag > size // 2 else lag

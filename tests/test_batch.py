@@ -115,7 +115,7 @@ def test_a_study_of_ragged_lengths_compiles_for_few(study, driver, monkeypatch):
     monkeypatch.setattr(batch, "skin_lane", counted)
     records = [
         record.replace(v_th=record.v_th[:size], v_out=record.v_out[:size])
-        for record, size in zip(study.loaded.recordings(), range(2900, LENGTH, 14), strict=False)
+        for record, size in zip(study.loaded.recordings(), range(2900, LENGTH, 13), strict=False)
     ]
     fits = etid.identify_skins(records, driver)
     assert len({record.v_th.size for record in records}) == MANY

@@ -296,5 +296,5 @@ def test_fits_of_another_process_have_the_same_bits(tmp_path):
     cache = {"JAX_COMPILATION_CACHE_DIR": str(tmp_path / "cache")}
     without = run("without")
     assert run("cold", **cache) == without
-    assert len(files(tmp_path / "cache" / traces.FOLDER)) == 4
+    assert len(files(tmp_path / "cache" / traces.FOLDER)) == 5
     assert run("warm", "warm", **cache) == without
