@@ -17,6 +17,8 @@ again, which would cost ten times as much, and end within 0.1 standard errors of
 (`etid.shared_driver` does so, for many loads at once).
 """
 
+from typing import NamedTuple
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -35,6 +37,18 @@ from etid.spectra import Spectrum
 from etid.transfer import as_complex, reciprocal
 
 RIDGE = 1e-12  # of the scaled curvature; below it double precision sees nothing
+
+
+class UnloadedSlopes(NamedTuple):
+    """Derivatives by z of what calibrations tell of the X of a load.
+
+    Attributes:
+        x: Of X.
+        log_variance: Of the logarithm of its variance.
+    """
+
+    x: Complex[Array, "z harmonic"]
+    log_variance: Float[Array, "z harmonic"]
 
 
 class GivenDriver(eqx.Module):
@@ -74,19 +88,21 @@ class GivenDriver(eqx.Module):
             self.resistance
         )
 
-    def informed(self, spectrum: Spectrum) -> tuple[Spectrum, Complex[Array, "z harmonic"] | None]:
-        """A recording with what the calibrations tell of its X at z = 0, and ∂X/∂z."""
+    def informed(self, spectrum: Spectrum) -> tuple[Spectrum, UnloadedSlopes | None]:
+        """A recording with what the calibrations tell of its X at z = 0, and how z moves that."""
         if self.records is None or self.gains is None or self.gain_slopes is None:
             return spectrum, None
         records = as_list(self.records)
 
-        def x(gains):
-            return informed(spectrum, records, list(gains)).x
+        def unloaded(gains):
+            known = informed(spectrum, records, list(gains))
+            return known.x, jnp.log(known.variance_x)
 
         def slope(direction):
-            return jax.jvp(x, (self.gains,), (direction,))[1]
+            return jax.jvp(unloaded, (self.gains,), (direction,))[1]
 
-        return informed(spectrum, records, list(self.gains)), jax.vmap(slope)(self.gain_slopes)
+        found = informed(spectrum, records, list(self.gains))
+        return found, UnloadedSlopes(*jax.vmap(slope)(self.gain_slopes))
 
 
 def given(
@@ -115,6 +131,21 @@ def given(
     of_noise = [excess(r, s.selected) for r, s in zip(parts, records, strict=True)]
     whitened = jacobian @ root
     noise = weights(of_noise, whitened.shape[0])
+    mean = -root.T @ pullback(value)[0]
+    cov = (whitened.T * noise[None, :]) @ whitened
+    return around(calibrations, c, root, frequency, shared, mean, cov)
+
+
+def around(
+    calibrations: Calibrations,
+    c: Float[Array, " common"],
+    directions: Float[Array, "common z"],
+    frequency: Float[Array, " harmonic"],
+    shared: bool,
+    mean: Float[Array, " z"],
+    cov: Float[Array, "z z"],
+) -> GivenDriver:
+    """A driver around the common parameters c, z counting along `directions`; else as `given`."""
     resistance = calibrations.calibration.r_load.mean()
 
     def loaded(c, frequency):
@@ -127,7 +158,7 @@ def given(
         return jnp.stack(calibrations.gains(c))
 
     def along(function):
-        return jax.vmap(lambda v: jax.jvp(function, (c,), (v,))[1])(root.T)
+        return jax.vmap(lambda v: jax.jvp(function, (c,), (v,))[1])(directions.T)
 
     return GivenDriver(
         frequency,
@@ -135,8 +166,8 @@ def given(
         jax.jvp(lambda f: w(c, f), (frequency,), (frequency,))[1],
         along(lambda c: w(c, frequency)),
         resistance,
-        -root.T @ pullback(value)[0],
-        (whitened.T * noise[None, :]) @ whitened,
+        mean,
+        cov,
         calibrations.calibration.spectra if shared else None,
         of_known(c) if shared else None,
         along(of_known) if shared else None,

@@ -75,6 +75,16 @@ class NormalEquations(AbstractNormalEquations):
         matrix = self.matrix / by[:, None] / by[None, :]
         return NormalEquations(self.objective, self.gradient / by, matrix)
 
+    def finite(self) -> "NormalEquations":
+        """The same, with an infinite objective where value or slope are not finite.
+
+        A slope that is not finite is as bad as such a value: nothing could follow from this point.
+        """
+        finite = jnp.isfinite(self.objective) & jnp.isfinite(self.gradient).all()
+        return NormalEquations(
+            jnp.where(finite, self.objective, jnp.inf), self.gradient, self.matrix
+        )
+
     def hessian(self) -> lx.AbstractLinearOperator:
         """JᵀJ as an operator."""
         return lx.MatrixLinearOperator(self.matrix, lx.positive_semidefinite_tag)
@@ -92,10 +102,7 @@ def normal_equations(
         return r, r
 
     jacobian, r = jax.jacfwd(twice, has_aux=True)(y)
-    objective, gradient = 0.5 * jnp.dot(r, r), jacobian.T @ r
-    # A slope that is not finite is as bad as such a value: nothing could follow from this point.
-    finite = jnp.isfinite(objective) & jnp.isfinite(gradient).all()
-    return NormalEquations(jnp.where(finite, objective, jnp.inf), gradient, jacobian.T @ jacobian)
+    return NormalEquations(0.5 * jnp.dot(r, r), jacobian.T @ r, jacobian.T @ jacobian).finite()
 
 
 def empty(y: Float[Array, " parameter"], args: Any = None) -> NormalEquations:

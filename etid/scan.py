@@ -5,6 +5,7 @@ Attributes and the headers of datasets are read; samples are not, until a record
 
 import contextlib
 import dataclasses
+import functools
 import re
 import weakref
 from collections.abc import Callable, Hashable, Iterator
@@ -25,6 +26,8 @@ from etid.recording import (
     metadata_from,
     tidy_path,
 )
+
+OPEN = 8  # datasets of stacks that stay open
 
 # What h5py raises, depending on where in a damaged file the HDF5 library gives up.
 LIBRARY_ERRORS = (
@@ -92,12 +95,12 @@ class _Block:
     """A recording group of the file: one recording, or a stack of trials."""
 
     file: h5py.File
+    opened: Callable[[str], h5py.Dataset]
     name: str
     metadata: Metadata
     trials: tuple[str, ...] | None
     headers: dict[str, _Header]
     shared: Callable[[], Samples | None] = lambda: None
-    datasets: dict[str, h5py.Dataset] = dataclasses.field(default_factory=dict)
 
     def rows(self) -> "Iterator[_Row]":
         count = self.headers["v_out"].shape[0] if self.headers["v_out"].stacked else None
@@ -112,10 +115,9 @@ class _Block:
         with translated(self.name, self.metadata.path, name):
             if not self.file:
                 raise RecordingError("the file is closed", remedy="Read it again, or use `with`")
-            dataset = self.datasets.get(name) or self.file[f"{self.metadata.path}/{name}"]
+            path = f"{self.metadata.path}/{name}"
+            dataset = self.opened(path) if header.stacked else self.file[path]
             assert isinstance(dataset, h5py.Dataset)  # the scan has seen it
-            if header.stacked:  # opening costs as much as reading a row
-                self.datasets[name] = dataset
             stored = dataset[row] if header.stacked else dataset[()]
             stored.flags.writeable = False
             samples = Samples(stored, header.conversion, header.offset)
@@ -164,6 +166,8 @@ class Scan:
     def __init__(self, file: h5py.File, name: str) -> None:
         self.file = file
         self.name = name
+        # Opening a stack costs as much as reading a row, but each holds megabytes of its chunks.
+        self.opened = functools.lru_cache(OPEN)(file.__getitem__)
         self.blocks: dict[str, _Block] = {}
         self.problems: list[RecordingError] = []
         self._kinds: dict[str, str] = {}
@@ -407,7 +411,9 @@ class Scan:
         metadata = metadata_from(**found, path=path)
         for trial in trials or ():
             metadata_from(**{**found, "trial": trial})  # for its check of the text
-        return _Block(self.file, self.name, metadata, trials if stacked else None, headers)
+        return _Block(
+            self.file, self.opened, self.name, metadata, trials if stacked else None, headers
+        )
 
     def _check_calibration(self, path: str, calibration: str) -> None:
         kind = self._kinds.get(calibration)

@@ -5,7 +5,8 @@ Identification, 2012, ch. 9), of which a few loads at a time are evaluated side 
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -13,36 +14,77 @@ import optimistix as optx
 from jaxtyping import Array, Float
 
 from etid.arrowhead import Arrowhead, ArrowheadEquations, EliminationDescent, join
-from etid.levenberg_marquardt import LevenbergMarquardt, normal_equations, second_order
+from etid.given_driver import GivenDriver, around
+from etid.levenberg_marquardt import (
+    DIFFERENCE,
+    LevenbergMarquardt,
+    NormalEquations,
+    normal_equations,
+    second_order,
+)
 from etid.maximum_likelihood import Joint
-from etid.output_error import MAX_STEPS, SOLVER, Estimate
+from etid.output_error import DELAY_WIDTH, MAX_STEPS, SOLVER, Estimate
 from etid.shared_errors import estimates
 from etid.shared_terms import DriverStudy, Loads, over
+from etid.single_load import Load
 
 NEAR = 0.05  # standard errors of all parameters together from their minimum
+
+
+def _around(
+    study: DriverStudy, common: Float[Array, " common"], loads: Loads, slopes: bool = True
+) -> GivenDriver:
+    """The driver with these parameters, and how they move it, for a group of loads."""
+    model, frequency = study.model, loads.spectrum.frequency[0]
+    unit = jnp.eye(common.size)[:, : common.size if slopes else 0]
+    zero = jnp.zeros(unit.shape[1])
+    return around(model.calibrations, common, unit, frequency, model.shared, zero, jnp.diag(zero))
+
+
+def _lane(study: DriverStudy, driver: GivenDriver, load: Loads) -> Load:
+    spectrum, unloaded = driver.informed(load.spectrum)
+    return Load(driver, study.model.circuit, spectrum, unloaded, load.sample_rate)
+
+
+def _in_turn(one: Callable, *lanes: Any) -> Any:
+    """`one` over the leading axis of `lanes`: `Load` is made for one at a time on a processor."""
+    if jax.default_backend() == "cpu":
+        return jax.lax.map(lambda lane: one(*lane), lanes)
+    return over(one, *lanes)
 
 
 def _equations(_, y: Float[Array, " parameter"], study: DriverStudy) -> ArrowheadEquations:
     """Normal equations of a study, load by load."""
     common, parts = study.split(y)
-    c = common.size
 
-    def one(load, own):
-        found = normal_equations(
-            lambda q, _: study.of_load(load, q[:c], q[c:]), jnp.concatenate([common, own])
-        )
-        return jax.tree.map(lambda leaf: jnp.where(load.used, leaf, 0.0), found)
+    def of_group(loads, owns):
+        driver = _around(study, common, loads)
 
-    found = [over(one, loads, own) for loads, own in zip(study.groups, parts, strict=True)]
+        def one(load, own):
+            lane = _lane(study, driver, load)
+            part, jacobian = lane.jacobian(jnp.concatenate([own, driver.mean]))
+            late = own[-1] / DELAY_WIDTH
+            slope = jnp.zeros(jacobian.shape[0]).at[own.size - 1].set(1 / DELAY_WIDTH)
+            found = NormalEquations(
+                0.5 * (jnp.dot(part, part) + late**2),
+                jacobian @ part + late * slope,
+                jacobian @ jacobian.T + jnp.outer(slope, slope),
+            ).finite()
+            return jax.tree.map(lambda leaf: jnp.where(load.used, leaf, 0.0), found)
+
+        return _in_turn(one, loads, owns)
+
+    found = [of_group(*group) for group in zip(study.groups, parts, strict=True)]
     loads = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *found)
     known = normal_equations(lambda q, _: study.of_calibrations(q), common)
+    o = parts[0].shape[1]
     return ArrowheadEquations(
         known.objective + loads.objective.sum(),
-        join(known.gradient + loads.gradient[:, :c].sum(0), loads.gradient[:, c:]),
+        join(known.gradient + loads.gradient[:, o:].sum(0), loads.gradient[:, :o]),
         Arrowhead(
-            known.matrix + loads.matrix[:, :c, :c].sum(0),
-            loads.matrix[:, c:, :c],
-            loads.matrix[:, c:, c:],
+            known.matrix + loads.matrix[:, o:, o:].sum(0),
+            loads.matrix[:, :o, o:],
+            loads.matrix[:, :o, :o],
         ),
     )
 
@@ -53,22 +95,30 @@ def _empty(y: Float[Array, " parameter"], study: DriverStudy) -> ArrowheadEquati
 
 
 def _second_order(_, y, step, study: DriverStudy) -> Float[Array, " parameter"]:
-    """Jᵀ r″ of a study, load by load."""
+    """Jᵀ r″ of a study, load by load; r″ by differences, as `levenberg_marquardt.second_order`."""
     (common, parts), (towards, steps) = study.split(y), study.split(step)
-    c = common.size
 
-    def one(load, own, step):
-        bent = second_order(
-            lambda q, _: study.of_load(load, q[:c], q[c:]),
-            jnp.concatenate([common, own]),
-            jnp.concatenate([towards, step]),
-        )
-        return jnp.where(load.used, bent, 0.0)
+    def of_group(loads, owns, steps):
+        driver = _around(study, common, loads)
+        ends = [
+            (h, _around(study, common + h * towards, loads, slopes=False))
+            for h in (DIFFERENCE, -DIFFERENCE)
+        ]
 
-    found = [over(one, *lanes) for lanes in zip(study.groups, parts, steps, strict=True)]
-    loads = jnp.concatenate(found)
+        def one(load, own, step):
+            lane = _lane(study, driver, load)
+            _, jacobian = lane.jacobian(jnp.concatenate([own, driver.mean]))
+            count = jacobian.shape[1]  # of the terms that are not linear
+            bent = sum(_lane(study, end, load)(own + h * step)[:count] for h, end in ends)
+            bent = (bent - 2 * lane(own)[:count]) / DIFFERENCE**2
+            return jnp.where(load.used, jacobian @ bent, 0.0)
+
+        return _in_turn(one, loads, owns, steps)
+
+    found = [of_group(*group) for group in zip(study.groups, parts, steps, strict=True)]
+    loads, o = jnp.concatenate(found), parts[0].shape[1]
     known = second_order(lambda q, _: study.of_calibrations(q), common, towards)
-    return join(known + loads[:, :c].sum(0), loads[:, c:])
+    return join(known + loads[:, o:].sum(0), loads[:, :o])
 
 
 def fit(

@@ -15,7 +15,7 @@ import optimistix as optx
 from jaxtyping import Array, Complex, Float
 
 from etid.circuits import AbstractCircuit
-from etid.given_driver import GivenDriver, combined
+from etid.given_driver import GivenDriver, UnloadedSlopes, combined
 from etid.information import inverse
 from etid.levenberg_marquardt import LevenbergMarquardt, NormalEquations, best_start
 from etid.likelihood import denoised, excess, residual, variance
@@ -48,6 +48,7 @@ class _Slopes(NamedTuple):
         by_g: Derivatives of the residual by real and imaginary part of the gain.
         by_w: The same by W.
         by_x: The same by X; None if no z moves it.
+        by_variance: Derivative by the logarithm of its variance.
     """
 
     part: Float[Array, " part"]
@@ -55,6 +56,7 @@ class _Slopes(NamedTuple):
     by_g: tuple[Array, Array]
     by_w: tuple[Array, Array]
     by_x: tuple[Array, Array] | None
+    by_variance: Array | None
 
 
 class Load(eqx.Module):
@@ -67,7 +69,7 @@ class Load(eqx.Module):
     driver: GivenDriver
     circuit: AbstractCircuit
     spectrum: Spectrum
-    x_slope: Complex[Array, "z harmonic"] | None
+    unloaded: UnloadedSlopes | None
     sample_rate: Float[Array, ""]
 
     @property
@@ -104,10 +106,11 @@ class Load(eqx.Module):
         """W − W₀, and the recording with the X that calibrations leave."""
         off = jnp.log(self.spectrum.frequency[0] / self.driver.frequency[0])
         w = as_complex(off) * self.driver.w_slope + combined(z, self.driver.slope)
-        if self.x_slope is None:
+        if self.unloaded is None:
             return w, self.spectrum
-        x = self.spectrum.x + combined(z, self.x_slope)
-        return w, eqx.tree_at(lambda s: s.x, self.spectrum, x)
+        x = self.spectrum.x + combined(z, self.unloaded.x)
+        variance = self.spectrum.variance_x * jnp.exp(z @ self.unloaded.log_variance)
+        return w, eqx.tree_at(lambda s: (s.x, s.variance_x), self.spectrum, (x, variance))
 
     def predicted(self, q: Float[Array, " q"]) -> tuple[Complex[Array, " harmonic"], Spectrum]:
         """Gain, and the recording with the X that calibrations leave."""
@@ -169,33 +172,42 @@ class Load(eqx.Module):
 
         def of_g(_):
             by_g = by(g.real, g.imag, lambda a, b: residual(spectrum, jax.lax.complex(a, b)))
-            if self.x_slope is None:
-                return residual(spectrum, g), by_g, None
+            if self.unloaded is None:
+                return residual(spectrum, g), by_g, None, None
 
             def moved(a, b):
                 there = eqx.tree_at(lambda s: s.x, spectrum, jax.lax.complex(a, b))
                 return residual(there, g)
 
-            return residual(spectrum, g), by_g, by(spectrum.x.real, spectrum.x.imag, moved)
+            def wider(log):
+                variance = spectrum.variance_x * jnp.exp(log)
+                return residual(eqx.tree_at(lambda s: s.variance_x, spectrum, variance), g)
 
-        part, (real, imaginary), by_x = _apart(of_g, q)
+            zero = jnp.zeros_like(spectrum.variance_x)
+            by_variance = jax.jvp(wider, (zero,), (unit(zero),))[1].reshape(2, -1)
+            by_x = by(spectrum.x.real, spectrum.x.imag, moved)
+            return residual(spectrum, g), by_g, by_x, by_variance
+
+        part, (real, imaginary), by_x, by_variance = _apart(of_g, q)
         by_w = (
             real * turned.real[None, :] + imaginary * turned.imag[None, :],
             imaginary * turned.real[None, :] - real * turned.imag[None, :],
         )
-        return _Slopes(part, slopes, (real, imaginary), by_w, by_x)
+        return _Slopes(part, slopes, (real, imaginary), by_w, by_x, by_variance)
 
     def jacobian(
         self, q: Float[Array, " q"]
     ) -> tuple[Float[Array, " part"], Float[Array, "q part"]]:
         """Residual of the recording alone and, transposed, its Jacobian."""
-        part, own, by_g, by_w, by_x = _apart(self.slopes, q)
+        part, own, by_g, by_w, by_x, by_variance = _apart(self.slopes, q)
         rows = _chained(own, by_g)
         if q.size == self.owned:
             return part, rows
         others = _chained(self.driver.slope, by_w)
-        if by_x is not None and self.x_slope is not None:
-            others = others + _chained(self.x_slope, by_x)
+        if self.unloaded is not None and by_x is not None and by_variance is not None:
+            others = others + _chained(self.unloaded.x, by_x)
+            wider = self.unloaded.log_variance[:, None, :] * by_variance[None]
+            others = others + wider.reshape(others.shape)
         return part, jnp.concatenate([rows, others])
 
 
@@ -211,14 +223,11 @@ def _equations(_, q: Float[Array, " q"], load: Load) -> NormalEquations:
     part, jacobian = load.jacobian(q)
     prior = 1 / load.widths(q)
     rest = prior * (q - load.centre(q))
-    objective = 0.5 * (jnp.dot(part, part) + jnp.dot(rest, rest))
-    gradient = jacobian @ part + prior * rest
-    finite = jnp.isfinite(objective) & jnp.isfinite(gradient).all()
     return NormalEquations(
-        jnp.where(finite, objective, jnp.inf),
-        gradient,
+        0.5 * (jnp.dot(part, part) + jnp.dot(rest, rest)),
+        jacobian @ part + prior * rest,
         jacobian @ jacobian.T + jnp.diag(prior**2),
-    )
+    ).finite()
 
 
 # Half a standard error of 3000 terms.
@@ -246,8 +255,8 @@ def fit_circuit(
     Returns:
         The estimate, whose parameters are the logarithms of the elements.
     """
-    known, x_slope = driver.informed(spectrum)
-    load = Load(driver, circuit, known, x_slope, sample_rate)
+    known, unloaded = driver.informed(spectrum)
+    load = Load(driver, circuit, known, unloaded, sample_rate)
 
     def solve(solver, start):
         return optx.least_squares(
@@ -264,11 +273,10 @@ def fit_circuit(
 
     # The Jacobian where it has no noise, which would count as information.
     [clean], [share] = denoised([known], [g])
-    clean = Load(driver, circuit, clean, x_slope, sample_rate)
-    if x_slope is not None:  # X is that of this z already
-        clean = eqx.tree_at(
-            lambda of: of.spectrum.x, clean, clean.spectrum.x - combined(z, x_slope)
-        )
+    if unloaded is not None:  # X is that of this z already
+        x = clean.x - combined(z, unloaded.x)
+        clean = eqx.tree_at(lambda s: (s.x, s.variance_x), clean, (x, load.spectrum.variance_x))
+    clean = Load(driver, circuit, clean, unloaded, sample_rate)
     jacobian = clean.jacobian(q)[1]
     prior = 1 / load.widths(q) ** 2
     information = inverse((jacobian * share[None, :]) @ jacobian.T + jnp.diag(prior))

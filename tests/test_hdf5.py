@@ -9,7 +9,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from etid import hdf5
+from etid import hdf5, scan
 from etid.recording import SIGNALS, Recording, RecordingError, Samples
 from etid.study import Study
 
@@ -595,6 +595,21 @@ def test_trials_that_differ_in_samples_and_label_alone_are_stacked(shared, tmp_p
         study = hdf5.read(target)  # a study of a file is written alike
         assert contents(study) == contents(Study.from_recordings(trials(12, shared)))
     study.close()
+
+
+def test_few_stacks_stay_open_however_many_are_read(tmp_path):
+    """HDF5 keeps megabytes of chunks for each open one."""
+    many = [
+        recording.replace(path=f"{stack}/{i}")
+        for stack in range(3 * scan.OPEN)
+        for i, recording in enumerate(trials(2, False))
+    ]
+    target = tmp_path / "many.h5"
+    Study.from_recordings(many).write(target)
+    with hdf5.read(target) as study:
+        assert contents(study) == contents(Study.from_recordings(many))
+        # The file itself, and what stays open in it.
+        assert h5py.h5f.get_obj_count(h5py.h5f.OBJ_ALL, h5py.h5f.OBJ_DATASET) <= scan.OPEN
 
 
 @pytest.mark.parametrize(
