@@ -95,7 +95,7 @@ class _Block:
     """A recording group of the file: one recording, or a stack of trials."""
 
     file: h5py.File
-    opened: Callable[[str], h5py.Dataset]
+    opened: Callable[[str], Any]
     name: str
     metadata: Metadata
     trials: tuple[str, ...] | None
