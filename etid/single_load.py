@@ -230,6 +230,7 @@ def _equations(_, q: Float[Array, " q"], load: Load) -> NormalEquations:
     ).finite()
 
 
+NEAR = 4.0  # χ² of a start beside which there is no need to look at others
 # Half a standard error of 3000 terms.
 ROUGHLY = LevenbergMarquardt(rtol=1e-2, ftol=1e-3, equations=_equations)
 TOGETHER = LevenbergMarquardt(rtol=SOLVER.rtol, ftol=SOLVER.ftol, equations=_equations)
@@ -249,8 +250,8 @@ def fit_circuit(
         circuit: Structure of the load.
         spectrum: The recording.
         sample_rate: Its sampling rate [Hz].
-        candidates: Logarithms of elements, and delays in samples, to start from; the start that
-            predicts best is refined.
+        candidates: Logarithms of elements, and delays in samples, to start from, the likeliest
+            last; the start that predicts best is refined.
 
     Returns:
         The estimate, whose parameters are the logarithms of the elements.
@@ -264,7 +265,10 @@ def fit_circuit(
         )
 
     # First with Z_th as it is: from a start far away, a joint fit would bend Z_th to meet it.
-    alone = solve(ROUGHLY, best_start(load, candidates)).value
+    likely = candidates[-1]
+    near = jnp.sum(load(likely) ** 2) < NEAR * 2 * jnp.sum(spectrum.selected, dtype=likely.dtype)
+    start = jax.lax.cond(near, lambda: likely, lambda: best_start(load, candidates))
+    alone = solve(ROUGHLY, start).value
     solution = solve(TOGETHER, jnp.concatenate([alone, driver.mean]))
     q = solution.value
     own, z = load.split(q)

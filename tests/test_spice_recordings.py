@@ -68,10 +68,18 @@ def errors(result, true):
         pytest.param("clean_resistors", "output_error", marks=pytest.mark.slow),
     ],
 )
-def test_without_noise_the_elements_are_those_of_the_netlist(spice, name, method):
+def test_without_noise_the_elements_are_those_of_the_netlist(spice, reference_data, name, method):
     result, true = spice(name, method)
     assert set(result.fits.verdicts) == {"successful"}, (result.failures, result.fits.counts())
-    limit = RESISTOR_BIAS if name == "clean_resistors" else SKIN_BIAS[method]
+    limit = RESISTOR_BIAS
+    if name != "clean_resistors":
+        # What is left is rounding to 16 bits, of which a record is one draw: it scatters by the
+        # bound, up to 0.06 %.
+        folder = reference_data("spice_recordings")
+        of_scene = json.loads((folder / "truth.json").read_text())["scenes"][name]
+        limit = SKIN_BIAS[method] + np.array(
+            [trial["crb_rel_with_delays"] for trial in of_scene["trials"]]
+        )
     assert (np.abs(errors(result, true)[0]) < limit).all()
 
 
