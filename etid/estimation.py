@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Array, Complex, Float, Int
+from jaxtyping import Array, Bool, Complex, Float, Int
 
 from etid import (
     given_driver,
@@ -140,8 +140,15 @@ def skin_by_maximum_likelihood(
     starts = harmonic_starts(
         spectrum, sample_rate, known.z_th(jnp.zeros_like(known.loaded)), circuit
     )
-    estimate = single_load.fit_circuit(known, circuit, spectrum, sample_rate, starts)
-    return judged(estimate, circuit, driver.result, "maximum_likelihood")
+    estimate, far = single_load.fit_circuit(known, circuit, spectrum, sample_rate, starts)
+    fit = judged(estimate, circuit, driver.result, "maximum_likelihood")
+    return _unless(fit, far, RESULTS.driver_unclear)
+
+
+def _unless(fit: Fit, bad: Bool[Array, ""], result: RESULTS) -> Fit:
+    """The same with another verdict, if it would be successful and should not."""
+    wrong = bad & (fit.result == SUCCESSFUL)
+    return dataclasses.replace(fit, result=RESULTS.where(wrong, result, fit.result))
 
 
 def skin_by_non_parametric(
@@ -158,8 +165,7 @@ def skin_by_non_parametric(
     # It needs the harmonics of the driver, whether or not a model of them was found.
     fit = judged(estimate, circuit, SUCCESSFUL, "non_parametric")
     far = jnp.any(jnp.abs(bias) > CORRECTED * jnp.sqrt(jnp.diagonal(estimate.cov)))
-    result = RESULTS.where(far & (fit.result == SUCCESSFUL), RESULTS.biased, fit.result)
-    return dataclasses.replace(fit, result=result)
+    return _unless(fit, far, RESULTS.biased)
 
 
 def source_starts(

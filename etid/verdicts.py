@@ -38,6 +38,11 @@ class RESULTS(optx.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]  # equi
         "The recording and the calibrations contradict each other about the source impedance. "
         "The driver changed in between, or r_load is not what it is said to be."
     )
+    driver_unclear = (
+        "The calibrations are so noisy that this recording moves the source impedance further than "
+        "they can be followed. Repeat them with less noise, more periods or a second resistor, or "
+        "identify all recordings together with identify_jointly."
+    )
     biased = (
         "Noise has shifted the estimate by several standard errors: Steiglitz-McBride from the "
         "minimum of its own model, a non-parametric fit from what it would be without noise. Use "

@@ -120,6 +120,26 @@ def test_one_unloaded_record_for_calibration_and_trial_tells_of_its_voltage_twic
     assert (np.abs(error(fit)) < SIGMAS * np.asarray(fit.stderr.values())).all()
 
 
+def test_a_driver_that_is_followed_too_far_is_no_success():
+    """At 24 dB a calibration leaves much of Z_th open; of 120 fits these two went beyond it."""
+    damp = SkinLoad(r_s=6.1e3, r_p=17.4e3, c_p=0.66e-9)
+    truth = np.array(dataclasses.astuple(damp))
+    trials = tuple(Trial(f"loaded/{i}", damp) for i in range(2))
+    known = (Trial("calibration/0", ResistorLoad(98.8e3)),)
+    scene = Scene(trials, known, samples=SAMPLES, snr_db=24.0, trigger_jitter_rms=50e-9)
+    verdicts = []
+    for seed in (1, 19, 20):
+        study = scene.simulate(seed=seed)
+        driver = etid.identify_driver(study["calibration/0"], throw=False)
+        fits = etid.identify_skins(study.loaded, driver)
+        error = np.abs(np.asarray(fits.circuit.values()) - truth)
+        good = fits.verdicts == "successful"
+        assert (error[good] < SIGMAS * np.asarray(fits.stderr.values())[good]).all()
+        verdicts += fits.verdicts.tolist()
+    assert verdicts.count("driver_unclear") == 2
+    assert "successful" in verdicts
+
+
 def test_a_study_of_ragged_lengths_compiles_once(study, driver, monkeypatch):
     """What is compiled takes harmonics, of which records of all lengths have as many."""
     traced = []
