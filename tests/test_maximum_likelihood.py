@@ -125,12 +125,12 @@ def test_a_driver_that_is_followed_too_far_is_no_success():
     damp = SkinLoad(r_s=6.1e3, r_p=17.4e3, c_p=0.66e-9)
     truth = np.array(dataclasses.astuple(damp))
     trials = tuple(Trial(f"loaded/{i}", damp) for i in range(2))
-    known = (Trial("calibration/0", ResistorLoad(98.8e3)),)
+    known = (Trial("c", ResistorLoad(98.8e3)),)
     scene = Scene(trials, known, samples=SAMPLES, snr_db=24.0, trigger_jitter_rms=50e-9)
     verdicts = []
     for seed in (1, 19, 20):
         study = scene.simulate(seed=seed)
-        driver = etid.identify_driver(study["calibration/0"], throw=False)
+        driver = etid.identify_driver(study["c"], throw=False)
         fits = etid.identify_skins(study.loaded, driver)
         error = np.abs(np.asarray(fits.circuit.values()) - truth)
         good = fits.verdicts == "successful"
