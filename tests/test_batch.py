@@ -92,6 +92,7 @@ def test_a_recording_that_cannot_be_fitted_changes_no_bit_of_its_neighbours(stud
     assert_same(broken.take(others), rows(fits, np.array(paths)[others].tolist()))
 
 
+@pytest.mark.slow
 def test_lengths_and_rates_may_be_mixed(study, driver):
     recording = study["s01/dry/0"]
     slow = simulate(sample_rate=150e3, seed=3)["s01/dry/0"].replace(path="slow")

@@ -71,6 +71,7 @@ def test_a_skin_tells_more_of_its_elements_with_its_calibration_than_after_it(st
     assert (np.asarray(joint.stderr.values()) < np.asarray(after.stderr.values())).all()
 
 
+@pytest.mark.slow
 def test_a_driver_by_output_error_keeps_no_harmonics_and_says_so(study):
     other = etid.identify_driver(study["calibration/0"], method="output_error")
     assert etid.identify_skin(study["loaded/0"], other).method == "output_error"

@@ -83,6 +83,7 @@ def test_without_noise_the_elements_are_those_of_the_netlist(spice, reference_da
     assert (np.abs(errors(result, true)[0]) < limit).all()
 
 
+@pytest.mark.slow
 def test_whole_periods_are_identified_by_maximum_likelihood_and_one_pulse_by_output_error(spice):
     assert spice("clean_dry")[0].fits.fit.method == "maximum_likelihood"
     result, true = spice("one_pulse_dry")  # 600 samples of a period of 3333
