@@ -175,15 +175,12 @@ def _identify(
     used: list[str] = []
     queues: dict[tuple, _Queue] = {}
 
-    def prepare(row):
-        seen, driver, method = planned(functools.partial(load, row), given)
+    def read(row):
+        with jax.enable_x64(True):  # of the thread that reads: the caller's own was checked
+            seen, driver, method = planned(functools.partial(load, row), given)
         rates = seen.recording.sample_rate, seen.recording.pulse_rate
         waiting, shared = lane(seen, method), is_shared(seen, driver)
         return driver, waiting, method, shared, (id(driver), method, waiting[0].size, shared, rates)
-
-    def read(row):
-        with jax.enable_x64(True):  # of the thread that reads: the caller's own was checked
-            return prepare(row)
 
     with (
         tqdm(total=count, unit="fit", disable=not progress) as bar,

@@ -2,7 +2,7 @@
 
 What the calibrations know is a normal distribution of the common parameters c, of Z_th and of their
 delays, around the minimum of their likelihood. In modal parameters the distribution is far from
-normal: a fast pole hides behind a delay along a curved valley. At the harmonics it is, for
+normal: a fast pole hides behind a delay along a curved valley. At the harmonics it nearly is, for
 
     W = log(Z_th + R)
 
@@ -13,8 +13,9 @@ is what a calibration with R shows, log (R X / Y), but for −jωτ, linear in i
 H the curvature of the likelihood of the calibrations, and z₀ the step that is left to its minimum.
 A load is identified *jointly* with the z: what its record says about Z_th, and about the delay that
 one known resistor leaves open, is used. The terms of the calibrations themselves are not evaluated
-again, which would cost ten times as much, and end within 0.1 standard errors of the same elements
-(`etid.shared_driver` does so, for many loads at once).
+again, which would cost ten times as much. Both estimates are as good against truth, but not the
+same: they may differ by a standard error along the direction that one known resistor leaves open
+(`etid.shared_driver` has the terms themselves, for many loads at once).
 """
 
 from typing import NamedTuple

@@ -27,8 +27,6 @@ that b₀ and b₁ are eliminated one by one, and a₁ and τ remain. A pole in 
 no reflection: |1 + jωa₁| does not know the sign of a₁.
 """
 
-import math
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -38,7 +36,7 @@ from etid.circuits import SkinRC
 from etid.results import complex_rrse
 from etid.spectra import Spectrum
 from etid.steiglitz_mcbride import ITERATIONS, SETTLED
-from etid.transfer import as_complex, power, reciprocal
+from etid.transfer import as_complex, power, reciprocal, turns
 
 RATE = 3e4  # of a skin's relaxation [rad/s], in units of which the coefficients are near 1
 
@@ -61,18 +59,6 @@ class Iterate(eqx.Module):
     iteration: Int[Array, ""]
     converged: Bool[Array, ""]
     stable: Bool[Array, ""]
-
-
-def _turn(cycles: Float[Array, ""], count: int) -> Complex[Array, " harmonic"]:
-    """e^{j2πkc} for k = 1 … count, as products of few: a sine costs as much as all the rest."""
-    side = math.isqrt(count) + 1
-    fine = 2 * jnp.pi * cycles * jnp.arange(1.0, side + 1)
-    coarse = 2 * jnp.pi * cycles * side * jnp.arange(1.0 * side)
-    left = jnp.stack([jnp.cos(coarse), jnp.sin(coarse)], axis=1)
-    c, s = jnp.cos(fine), jnp.sin(fine)
-    # A matrix product, or XLA would put the sines back into the loop over all harmonics.
-    real, imaginary = left @ jnp.stack([c, -s]), left @ jnp.stack([s, c])
-    return jax.lax.complex(real.reshape(-1)[:count], imaginary.reshape(-1)[:count])
 
 
 def fit_skin(
@@ -132,7 +118,7 @@ def fit_skin(
         r_p = b0 - r_s
         circuit = SkinRC(r_s, r_p, a1 / RATE / r_p)
         n, total = loaded(q)
-        turn = _turn(tau / RATE * spectrum.frequency[0], omega.size)
+        turn = turns(tau / RATE * spectrum.frequency[0], omega.size)
         predicted = n * reciprocal(total) * spectrum.x * jnp.conj(turn)
         error = complex_rrse(jnp.where(used, predicted, 0.0), measured)
         error = jnp.where((circuit.values() > 0).all() & jnp.isfinite(error), error, jnp.inf)

@@ -1,7 +1,7 @@
 """The estimators, and which of them can identify what."""
 
 from collections.abc import Sequence
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
 
@@ -21,14 +21,7 @@ Method = Literal[
     "steiglitz_mcbride",
     "equation_error",
 ]
-METHODS: tuple[Method, ...] = (
-    "maximum_likelihood",
-    "non_parametric",
-    "output_error",
-    "harmonic_steiglitz_mcbride",
-    "steiglitz_mcbride",
-    "equation_error",
-)
+METHODS: tuple[Method, ...] = get_args(Method)
 CALIBRATED = METHODS[:2]  # those that use the harmonics of the calibrations
 REFINED = METHODS[:3]  # those for any circuit
 CONTINUOUS = METHODS[:4]  # those that use a continuous source impedance

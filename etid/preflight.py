@@ -21,8 +21,8 @@ JUMP = 8.0  # converter steps by which a clipped signal enters and leaves its ra
 POWER = 1.01  # of v_out over v_th; a passive load takes power, and gains match better than this
 SEAM = 3  # samples on both sides of the joint between two periods
 STEP = 4.0  # standard deviations of the noise by which they may differ there
-PERIODS = 2  # that are looked at for it
 SHIFT = 50e-6  # [s] that a load may delay v_out; R_th C_p is below 10 µs
+PERIODS = 2  # in which such a shift is looked for
 
 
 class Inspected:

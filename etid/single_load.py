@@ -21,8 +21,8 @@ from etid.levenberg_marquardt import LevenbergMarquardt, NormalEquations, best_s
 from etid.likelihood import denoised, excess, residual, variance
 from etid.output_error import DELAY_WIDTH, MAX_STEPS, SOLVER, Estimate
 from etid.results import complex_rrse
-from etid.spectra import ROOM, Spectrum
-from etid.transfer import as_complex, frequency_variable, reciprocal
+from etid.spectra import Spectrum
+from etid.transfer import as_complex, frequency_variable, reciprocal, turns
 
 
 def _apart(evaluate: Callable[[Array], Any], q: Float[Array, " q"]) -> Any:
@@ -87,14 +87,9 @@ class Load(eqx.Module):
         return self.circuit.with_log_values(own[:-1]).impedance()(s)
 
     def turns(self, own: Float[Array, " own"]) -> Complex[Array, " harmonic"]:
-        """e^(−jωτ), from as many cosines as there are factors of the number of harmonics."""
+        """e^(−jωτ)."""
         f = self.spectrum.frequency
-        angle = 2 * jnp.pi * f[0] * own[-1] / self.sample_rate
-        one, other = (
-            jax.lax.complex(jnp.cos(angle * k), -jnp.sin(angle * k))
-            for k in (jnp.arange(1.0, ROOM + 1), jnp.arange(0.0, f.size, ROOM))
-        )
-        return (other[:, None] * one[None, :]).ravel()
+        return turns(-f[0] * own[-1] / self.sample_rate, f.size)
 
     def divided(
         self, load: Complex[Array, " harmonic"], w: Complex[Array, " harmonic"]

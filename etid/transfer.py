@@ -6,6 +6,8 @@ and `a`; in s it is the reverse of `scipy.signal`. Polynomials are multiplied wi
 NaN lane poisons the others.
 """
 
+import math
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -119,6 +121,18 @@ def delayed(
     """`value` · e^(−j 2π f τ) at real frequencies [Hz], for a delay τ [s]."""
     turn = -2 * jnp.pi * frequency * delay
     return value * jax.lax.complex(jnp.cos(turn), jnp.sin(turn))
+
+
+def turns(cycles: Float[Array, ""], count: int) -> Complex[Array, " harmonic"]:
+    """e^{j2πkc} for k = 1 … count, as products of few: a sine costs as much as all the rest."""
+    side = math.isqrt(count) + 1
+    fine = 2 * jnp.pi * cycles * jnp.arange(1.0, side + 1)
+    coarse = 2 * jnp.pi * cycles * side * jnp.arange(1.0 * side)
+    left = jnp.stack([jnp.cos(coarse), jnp.sin(coarse)], axis=1)
+    c, s = jnp.cos(fine), jnp.sin(fine)
+    # A matrix product, or XLA would put the sines back into the loop over all harmonics.
+    real, imaginary = left @ jnp.stack([c, -s]), left @ jnp.stack([s, c])
+    return jax.lax.complex(real.reshape(-1)[:count], imaginary.reshape(-1)[:count])
 
 
 def delay_variable(
