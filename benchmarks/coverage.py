@@ -5,6 +5,7 @@ damp trial, and identifies a driver of its own: trials that share a driver share
 would not be independent draws.
 """
 
+import argparse
 import dataclasses
 import json
 import pathlib
@@ -15,15 +16,12 @@ import numpy as np
 from tqdm import tqdm
 
 import etid
-from benchmarks.spice import JOINT, scene_of
+from benchmarks.ladder import LOADS
+from benchmarks.spice import ESTIMATORS, FOLDER, JOINT, add_data, scene_of
 from etid.methods import Method
 from etid.scenes import Scene, Trial
-from etid.transformer import ResistorLoad, SkinLoad
+from etid.transformer import ResistorLoad
 
-LOADS = {
-    "dry": SkinLoad(r_s=33.4e3, r_p=186e3, c_p=0.12e-9),
-    "damp": SkinLoad(r_s=6.1e3, r_p=17.4e3, c_p=0.66e-9),
-}
 SILENT = 5.0  # standard errors by which a successful fit may not be wrong
 MORE = "more"  # trials that take part in a joint fit, but share its errors and are not counted
 NORMAL_95 = 1.959964  # half-width of a 95 % interval in standard errors
@@ -143,3 +141,34 @@ def run(scene: Scene, repetitions: int, method: str | None) -> None:
             )
         silent = np.abs(of.z).max(axis=1, initial=0.0) > SILENT
         print(f"{name:<10}{verdicts}; successful and wrong by {SILENT:g} sd: {silent.sum()}")
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """What is drawn, and what identifies it."""
+    parser.add_argument("--snr-db", type=float, default=60.0)
+    parser.add_argument("--samples", type=int, default=10_000)
+    parser.add_argument("--repetitions", type=int, default=200)
+    parser.add_argument("--jitter", type=float, default=50e-9, help="rms trigger delay [s]")
+    parser.add_argument("--resistors", type=float, nargs="+", default=[98.8e3], help="[ohm]")
+    parser.add_argument("--shared", action="store_true", help="one unloaded record for all")
+    parser.add_argument("--method", choices=ESTIMATORS, help="default: that of the records")
+    parser.add_argument("--more", type=int, default=0, help="further trials, for a joint fit")
+    parser.add_argument("--spice", metavar="SCENE", help="draw this SPICE recording afresh")
+    add_data(parser)
+
+
+def main(arguments: argparse.Namespace) -> bool:
+    """Run the command."""
+    if arguments.spice is not None:
+        drawn = spice_scene(arguments.data / FOLDER, arguments.spice)
+    else:
+        drawn = scene(
+            arguments.snr_db,
+            arguments.samples,
+            arguments.resistors,
+            arguments.jitter,
+            arguments.shared,
+            arguments.more,
+        )
+    run(drawn, arguments.repetitions, arguments.method)
+    return True

@@ -4,6 +4,7 @@ What has no workers runs on one core, as `speed` does. A slope is that of the st
 between two neighbours on logarithmic axes: 1 where cost is in proportion, 0 where it is constant.
 """
 
+import argparse
 import functools
 import pathlib
 import tempfile
@@ -12,13 +13,11 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-import matplotlib as mpl
 import numpy as np
 import scipy.signal
-from matplotlib.figure import Figure
 
 import etid
-from benchmarks import peers, scale
+from benchmarks import charts, peers, scale
 from benchmarks.large_file import large_file
 from benchmarks.problem import START, Problem, harmonics, problem, problem_of, terms
 from benchmarks.provenance import write_csv
@@ -39,8 +38,6 @@ PULSE_RATE = 60.0  # [Hz]
 NOISE = 1e-3  # of the effective value
 BENT = 0.25  # change of slope that is marked in the table
 RECORDINGS = 2_000  # for the workers
-DASHES = ("-", "--", "-.", ":", (0, (5, 1)), (0, (1, 1)))
-MARKS = "osD^vx"
 
 
 def seconds(call: Callable[[], Any]) -> float:
@@ -147,22 +144,22 @@ def with_slopes(rows: Iterable[dict[str, Any]]) -> Iterable[dict[str, Any]]:
 
 def draw(rows: Sequence[dict[str, Any]], path: pathlib.Path) -> None:
     """One panel per number, legible without colours."""
-    figure = Figure(figsize=(11, 4.2), layout="constrained")
     titles = {
         "samples": ("samples of a record", "seconds per record"),
         "lanes": ("recordings in a batch", "seconds per recording"),
         "workers": ("worker processes", "seconds per recording of a file"),
     }
-    for axes, (against, (across, up)) in zip(figure.subplots(1, 3), titles.items(), strict=True):
+    figure, panels = charts.new(1, 3, (11, 4.2))
+    for axes, (against, (across, up)) in zip(panels[0], titles.items(), strict=True):
         of = [row for row in rows if row["against"] == against]
         for style, name in enumerate(dict.fromkeys(row["what"] for row in of)):
             curve = [row for row in of if row["what"] == name]
             axes.loglog(
                 [row["number"] for row in curve],
                 [row["seconds"] for row in curve],
-                color="black",
-                linestyle=DASHES[style],
-                marker=MARKS[style],
+                color=charts.INK,
+                linestyle=charts.DASHES[style],
+                marker=charts.MARKS[style],
                 markersize=4,
                 linewidth=1,
                 label=name,
@@ -171,11 +168,8 @@ def draw(rows: Sequence[dict[str, Any]], path: pathlib.Path) -> None:
             axes.set_xticks(WORKERS, labels=map(str, WORKERS), minor=False)
             axes.minorticks_off()
         axes.set(xlabel=across, ylabel=up)
-        axes.grid(color="0.9")
         axes.legend(fontsize=7, frameon=False)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with mpl.rc_context({"svg.hashsalt": "etid"}):  # the same numbers, the same file
-        figure.savefig(path, metadata={"Date": None} if path.suffix == ".svg" else None)
+    charts.save(figure, path)
 
 
 def _all(quick: bool) -> Iterable[dict[str, Any]]:
@@ -201,3 +195,17 @@ def run(quick: bool, folder: pathlib.Path) -> None:
         )
     write_csv(folder / "curves.csv", table)
     draw(table, folder / "curves.svg")
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Size of the run."""
+    parser.add_argument("--quick", action="store_true", help="small numbers only")
+    parser.add_argument(
+        "--folder", type=pathlib.Path, default=pathlib.Path(), help="of curves.csv and curves.svg"
+    )
+
+
+def main(arguments: argparse.Namespace) -> bool:
+    """Run the command."""
+    run(arguments.quick, arguments.folder)
+    return True

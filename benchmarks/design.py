@@ -4,13 +4,14 @@ Peak voltage, charge per second and the length of the record are the same for al
 width and rate is that of the paper's pulse, 667 µs at 60 Hz.
 """
 
+import argparse
 import dataclasses
 
 import numpy as np
 import scipy.optimize
 
 import etid
-from benchmarks.coverage import LOADS
+from benchmarks.ladder import LOADS
 from etid.scenes import Scene, Trial
 from etid.transformer import ResistorLoad, TransformerDriver
 
@@ -64,3 +65,15 @@ def run() -> None:
             f"  best for r_s: {rate:.0f} Hz, {1e6 * DUTY / rate:.0f} us: {100 * best.fun:.3f} %, "
             f"{gain:.2f} times better than 60 Hz"
         )
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """None."""
+    del parser
+
+
+def main(arguments: argparse.Namespace) -> bool:
+    """Run the command."""
+    del arguments
+    run()
+    return True

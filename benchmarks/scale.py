@@ -4,6 +4,7 @@ Every measurement runs in a process of its own. The file lies in the page cache,
 reading; reading alone is h5py, recording after recording. Compilation is in no time but `start`.
 """
 
+import argparse
 import collections
 import contextlib
 import json
@@ -12,6 +13,7 @@ import pathlib
 import signal
 import subprocess
 import sys
+import tempfile
 import time
 from collections.abc import Iterable, Sequence
 from typing import Any, NamedTuple
@@ -22,7 +24,9 @@ import numpy as np
 from benchmarks.large_file import LAYOUTS, large_file
 from benchmarks.provenance import ROOT, write_csv
 from etid import streaming
+from etid.methods import METHODS
 
+FILES = pathlib.Path(tempfile.gettempdir()) / "etid-scale"
 WITHIN = 2.0  # reading and fitting, of reading alone
 MEMORY = 1.5e9  # [B]
 KILLS = 3
@@ -228,3 +232,24 @@ def run(plan: Plan, output: pathlib.Path | None) -> bool:
     small = most <= MEMORY / 1e6
     print(f"peak memory {most:.0f} MB <= {MEMORY / 1e6:.0f}: {'met' if small else 'missed'}")
     return not slow and small and resumed.passed
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Size of the file, and how it is fitted."""
+    parser.add_argument("--quick", action="store_true", help="400 recordings, the fastest method")
+    parser.add_argument("--recordings", type=int, default=100_000)
+    parser.add_argument("--folder", type=pathlib.Path, default=FILES, help="of the files it makes")
+    parser.add_argument(
+        "--method",
+        nargs="+",
+        choices=("default", *METHODS),
+        default=["default", "equation_error"],
+        help="the last is run in all layouts, and killed",
+    )
+    parser.add_argument("-o", "--output", type=pathlib.Path, default=None, help="CSV to write")
+
+
+def main(arguments: argparse.Namespace) -> bool:
+    """Run the command; whether every target is met."""
+    chosen = plan(arguments.folder, arguments.recordings, arguments.method, arguments.quick)
+    return run(chosen, arguments.output)

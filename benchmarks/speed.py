@@ -3,6 +3,7 @@
 Each line is a ratio of medians with its target; a missed target makes the command end with 1.
 """
 
+import argparse
 import dataclasses
 import math
 import os
@@ -214,3 +215,18 @@ def run(quick: bool, asked: Sequence[int], output: pathlib.Path | None) -> bool:
     if output is not None:
         write_csv(output, table)
     return all(line.met for line in lines)
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Size of the run."""
+    parser.add_argument("--quick", action="store_true", help="few lanes, few repetitions")
+    parser.add_argument(
+        "--lanes", type=int, nargs="+", default=[], help="of the table of peers; no cell left out"
+    )
+    parser.add_argument("-o", "--output", type=pathlib.Path, help="CSV of that table")
+
+
+def main(arguments: argparse.Namespace) -> bool:
+    """Run the command; whether every target is met."""
+    pin()
+    return run(arguments.quick, arguments.lanes, arguments.output)

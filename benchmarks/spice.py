@@ -5,6 +5,7 @@ whatever their verdict: a verdict must not flatter the numbers. `sd` is the medi
 that the method itself reports.
 """
 
+import argparse
 import csv
 import json
 import pathlib
@@ -20,6 +21,7 @@ from etid.methods import METHODS, REFINED, Method
 from etid.scenes import Scene, Trial
 from etid.transformer import ResistorLoad, SkinLoad, TransformerDriver
 
+FOLDER = "spice_recordings"  # in the folder of all data
 BOUND = "crb_rel_with_delays"  # the trigger delays being unknown, as they are to the fits
 ELEMENTS = {"r_s": "Rs", "r_p": "Rp", "c_p": "Cp", "r": "R"}
 # Names of the transformer's parts in `truth.json`.
@@ -129,6 +131,16 @@ def fit_scene(source: pathlib.Path, truth: dict, method: str) -> list[dict]:
     return rows
 
 
+def add_data(parser: argparse.ArgumentParser) -> None:
+    """Where recordings with known truth are."""
+    parser.add_argument(
+        "--data",
+        type=pathlib.Path,
+        default=pathlib.Path("../shared/data"),
+        help=f"folder that has {FOLDER}/",
+    )
+
+
 def run(
     folder: pathlib.Path,
     scenes: list[str] | None,
@@ -161,3 +173,19 @@ def run(
             writer = csv.DictWriter(file, fieldnames=list(table[0]))
             writer.writeheader()
             writer.writerows(table)
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Scenes, methods, where the recordings are."""
+    add_data(parser)
+    parser.add_argument("--scene", action="append", help="only this scene; may be repeated")
+    parser.add_argument(
+        "--method", action="append", choices=ESTIMATORS, help="only this; repeatable"
+    )
+    parser.add_argument("-o", "--output", type=pathlib.Path, default=None, help="CSV to write")
+
+
+def main(arguments: argparse.Namespace) -> bool:
+    """Run the command."""
+    run(arguments.data / FOLDER, arguments.scene, arguments.method, arguments.output)
+    return True

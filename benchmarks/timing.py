@@ -1,5 +1,6 @@
 """Import, first call and warm time of one fit and of a batch: medians, compilation apart."""
 
+import argparse
 import functools
 import subprocess
 import sys
@@ -63,3 +64,14 @@ def run(lanes: int) -> None:
         first, warm = first_and_warm(lambda fits=fits: fits().chi2, 3)
         each = 1e3 * warm / lanes
         print(f"  batch of {lanes:<21} first {first:8.2f} s   warm {each:.1f} ms per fit")
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Lanes of the batch."""
+    parser.add_argument("--lanes", type=int, default=98)
+
+
+def main(arguments: argparse.Namespace) -> bool:
+    """Run the command."""
+    run(arguments.lanes)
+    return True

@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from benchmarks.coverage import LOADS, monte_carlo, scene
+from benchmarks.coverage import monte_carlo, scene
+from benchmarks.ladder import LOADS
 
 REPETITIONS = 200  # a driver costs a second
 # Standard errors: an estimate that is not linear in the data is biased at high noise. A third of

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 import etid
-from benchmarks.coverage import LOADS, scene
+from benchmarks.coverage import scene
+from benchmarks.ladder import LOADS
 
 RESISTORS = (98.8e3, 21.62e3)
 SIGMAS = 5.0  # one in 2 million for a normal error

@@ -1,0 +1,45 @@
+"""The ladder of scenes on which estimators are compared: one calibration and one trial each.
+
+Every rung differs from the middle one, 60 dB, three periods at 200 kHz, trigger delays of 50 ns, in
+one thing.
+"""
+
+from collections.abc import Mapping
+from typing import Any
+
+from etid.scenes import Scene, Trial
+from etid.transformer import ResistorLoad, SkinLoad
+
+LOADS = {
+    "dry": SkinLoad(r_s=33.4e3, r_p=186e3, c_p=0.12e-9),
+    "damp": SkinLoad(r_s=6.1e3, r_p=17.4e3, c_p=0.66e-9),
+}
+TRIAL = "skin/01"
+CALIBRATION = "calibration/98k8"
+SNR_DB = (80, 60, 40, 30, 20)
+PERIODS = {1: 3_334, 10: 33_334, 30: 100_000}  # samples at 200 kHz
+SAMPLE_RATES = {"100 kHz": 100e3, "500 kHz": 500e3, "1 MHz": 1e6}
+JITTER = {"no delays": 0.0, "delays of 500 ns": 500e-9}
+
+
+def rung(load: str, **settings: Any) -> Scene:
+    """One scene; `settings` as `Scene` takes them, in place of those of the middle rung."""
+    middle = {"snr_db": 60.0, "samples": 10_000, "trigger_jitter_rms": 50e-9}
+    return Scene(
+        (Trial(TRIAL, LOADS[load]),),
+        (Trial(CALIBRATION, ResistorLoad(98.8e3)),),
+        **{**middle, **settings},
+    )
+
+
+def ladder() -> Mapping[str, Scene]:
+    """All rungs by name."""
+    rungs = {f"{load}, {snr} dB": rung(load, snr_db=float(snr)) for load in LOADS for snr in SNR_DB}
+    for count, samples in PERIODS.items():
+        rungs[f"dry, {count} period{'s' if count > 1 else ''}"] = rung("dry", samples=samples)
+    for name, rate in SAMPLE_RATES.items():
+        samples = round(3 * rate / 60.0)
+        rungs[f"dry, {name}"] = rung("dry", sample_rate=rate, samples=samples)
+    for name, jitter in JITTER.items():
+        rungs[f"dry, {name}"] = rung("dry", trigger_jitter_rms=jitter)
+    return rungs
