@@ -17,6 +17,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Complex, Float
+from scipy.fft import next_fast_len
 
 WINDOW = 25  # harmonics over which power is averaged
 ALIASED = 0.35  # of the sample rate, above which aliases must be told from harmonics by frequency
@@ -86,8 +87,9 @@ def counted_pulse_rate(
     early = v[begin + reach : begin + one - reach]
     late = v[begin + span : begin + span + one]
     mean = v[:one].mean()
-    product = np.fft.rfft(late - mean, 2 * one) * np.conj(np.fft.rfft(early - mean, 2 * one))
-    lag = int(np.argmax(np.fft.irfft(product, 2 * one)[: 2 * reach + 1])) - reach
+    size = next_fast_len(2 * one, real=True)
+    product = np.fft.rfft(late - mean, size) * np.conj(np.fft.rfft(early - mean, size))
+    lag = int(np.argmax(np.fft.irfft(product, size)[: 2 * reach + 1])) - reach
     return pulse_rate if abs(lag) < 2 else pulse_rate * span / (span + lag)
 
 
@@ -103,12 +105,15 @@ def harmonics(
 
     A drift of the mean from period to period is taken out first.
     """
-    of = namespace(v)
-    coefficients = of.fft.rfft(v[:samples]) / samples
+    # Bins that all are a multiple of a part of M are those of the sum of that many parts.
+    parts = math.gcd(periods, samples)
+    folded = v[:samples].reshape(parts, -1).sum(0)
+    coefficients = namespace(v).fft.rfft(folded) / samples
     basis, fit = _drift(periods, samples)
     # The transform is linear: that of the drift is known but for its few coefficients.
     drift = fit @ _sums(v[:samples], periods)
-    at_harmonics = coefficients[periods : (samples + 1) // 2 : periods]
+    step = periods // parts
+    at_harmonics = coefficients[step : (folded.size + 1) // 2 : step]
     return at_harmonics - drift.astype(at_harmonics.dtype) @ basis
 
 
@@ -123,8 +128,8 @@ def _sums(v: Array | np.ndarray, periods: int) -> Array | np.ndarray:
     ends = np.arange(periods + 1) * (samples / periods)
     whole = np.minimum(ends.astype(int), samples - 1)
     rest = (ends - whole).reshape(-1, *[1] * (v.ndim - 1))
-    running = of.cumsum(v, axis=0) - v
-    return of.diff(running[whole] + rest * v[whole], axis=0)
+    between = of.add.reduceat(v, whole, axis=0)[:-1]
+    return between + of.diff(rest * v[whole], axis=0)
 
 
 @functools.lru_cache(maxsize=64)
