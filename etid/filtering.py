@@ -20,6 +20,10 @@ whose coefficients depend on the data alone. The state then advances exactly,
     x[n+1] = e^{A/fs} x[n] + Σ_k Γ_k c_k[n],      Γ_k = ∫ e^{A (1−τ)/fs} B τ^k dτ / fs,
 
 with all Γ_k from one matrix exponential (Van Loan 1978).
+
+**Precision.** Driver and skin in modal blocks keep 3e-16 of the peak at 200 kHz to 2 MHz in double
+precision and 3e-7 in single, in which they may be simulated. The same system as a quotient of
+polynomials keeps 1e-5 in double precision at 2 MHz, and overflows in single from 1 MHz on.
 """
 
 import functools
