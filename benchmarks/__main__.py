@@ -6,7 +6,7 @@ import sys
 
 import jax
 
-NAMES = ("spice", "coverage", "design", "timing", "speed", "curves", "scale")
+NAMES = ("spice", "coverage", "design", "timing", "speed", "curves", "scale", "speed_accuracy")
 
 
 def main() -> None:

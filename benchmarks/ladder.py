@@ -4,10 +4,11 @@ Every rung differs from the middle one, 60 dB, three periods at 200 kHz, trigger
 one thing.
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 from etid.scenes import Scene, Trial
+from etid.study import Study
 from etid.transformer import ResistorLoad, SkinLoad
 
 LOADS = {
@@ -19,6 +20,7 @@ CALIBRATION = "calibration/98k8"
 SNR_DB = (80, 60, 40, 30, 20)
 PERIODS = {1: 3_334, 10: 33_334, 30: 100_000}  # samples at 200 kHz
 SAMPLE_RATES = {"100 kHz": 100e3, "500 kHz": 500e3, "1 MHz": 1e6}
+SOURCES: Mapping[str, Callable[[Scene, int], Study]] = {"simulated": Scene.simulate}
 JITTER = {"no delays": 0.0, "delays of 500 ns": 500e-9}
 
 

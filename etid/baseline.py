@@ -1,7 +1,7 @@
 """Steiglitz-McBride, in time as the paper has it and on harmonics, with verdicts.
 
-These estimates have no covariance. Where they would be believed wrongly they are judged by the
-minimum of the model that they stop short of: they are `biased` if it is far.
+Those in time have no covariance. Where they would be believed wrongly all are judged by the minimum
+of the model that they stop short of: they are `biased` if it is far.
 """
 
 from collections.abc import Callable
@@ -13,10 +13,9 @@ from jaxtyping import Array, Float
 from etid import harmonic_steiglitz_mcbride, steiglitz_mcbride
 from etid.circuits import SkinRC
 from etid.driver import Driver
-from etid.information import inverse
 from etid.judging import MAX_STEPS_REACHED, SUCCESSFUL, misses
 from etid.levenberg_marquardt import NormalEquations, normal_equations
-from etid.likelihood import delayed_gain, residual
+from etid.likelihood import delayed_gain, excess, residual
 from etid.measurement import Measurement
 from etid.results import Fit
 from etid.spectra import Spectrum
@@ -91,8 +90,9 @@ def skin_by_harmonic_steiglitz_mcbride(
     spectrum: Spectrum, sample_rate: Float[Array, ""], driver: Driver
 ) -> Fit:
     """SkinRC by Steiglitz-McBride on the harmonics, judged by the likelihood with Z_th as it is."""
-    source = driver.source
+    source, source_cov = driver.source, driver.cov
     assert source is not None  # check_driver
+    assert source_cov is not None
     best = harmonic_steiglitz_mcbride.fit_skin(spectrum, source.response(spectrum.frequency))
     values = best.circuit.values()
     late = best.delay * sample_rate
@@ -104,15 +104,17 @@ def skin_by_harmonic_steiglitz_mcbride(
         delay = q[-1] / sample_rate
         return residual(spectrum, delayed_gain(source, load, spectrum.frequency, delay))
 
-    equations = normal_equations(terms, jnp.append(jnp.log(elements), late), spectrum)
+    at = jnp.append(jnp.log(elements), late)
+    equations = normal_equations(terms, at, spectrum)
     freedom = 2 * jnp.sum(spectrum.selected, dtype=values.dtype) - values.size
     chi2 = 2 * equations.objective / freedom
-    variance = jnp.diagonal(inverse(equations.matrix))[:-1]  # of the logarithms
-    nothing = jnp.full((values.size, values.size), jnp.nan)
+    noise = excess(terms(at, spectrum), spectrum.selected)[: spectrum.x.size]
+    own, shared = harmonic_steiglitz_mcbride.covariance(spectrum, noise, source, source_cov, best)
+    variance = jnp.diagonal(own + shared)  # of the logarithms
     return Fit(
         circuit=best.circuit,
-        cov=nothing,
-        shared_cov=nothing,
+        cov=(own + shared) * jnp.outer(values, values),
+        shared_cov=shared * jnp.outer(values, values),
         rrse=best.rrse,
         chi2=jnp.where(physical, chi2, jnp.inf),
         result=first_verdict(

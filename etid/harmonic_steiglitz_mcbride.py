@@ -25,14 +25,22 @@ and y, which are Z_th of a₁ and N + Z_th D of τ, the normal equations consist
 and ⟨Re Z_th v⟩, ⟨ω Im Z_th v⟩, 0 and −⟨ω Im k*Z_th y*y⟩ on the right. X and jωX are orthogonal, so
 that b₀ and b₁ are eliminated one by one, and a₁ and τ remain. A pole in the right half-plane needs
 no reflection: |1 + jωa₁| does not know the sign of a₁.
+
+**The covariance** is that of a fixed point q = Φ(q, X, Y, Z_th), whose differential is
+
+    dq = (1 − ∂Φ/∂q)⁻¹ (∂Φ/∂X dX + ∂Φ/∂Y dY + ∂Φ/∂Z_th dZ_th).
 """
+
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Complex, Float, Int
 
 from etid.circuits import SkinRC
+from etid.driver import SourceImpedance
 from etid.results import complex_rrse
 from etid.spectra import Spectrum
 from etid.steiglitz_mcbride import ITERATIONS, SETTLED
@@ -61,33 +69,28 @@ class Iterate(eqx.Module):
     stable: Bool[Array, ""]
 
 
-def fit_skin(
-    spectrum: Spectrum, z_th: Complex[Array, " harmonic"], iterations: int = ITERATIONS
-) -> Iterate:
-    """Identify the continuous first-order Z_bio and a delay from harmonics (paper, eqs. 7-9).
+class _Products(NamedTuple):
+    """What the sums are made of, at each harmonic."""
 
-    Args:
-        spectrum: Harmonics of a recording.
-        z_th: Source impedance at them [Ω].
-        iterations: How many.
-    """
-    omega = 2 * jnp.pi / RATE * spectrum.frequency
-    used = spectrum.selected
-    xx = power(spectrum.x) - spectrum.variance_x
-    yy = power(spectrum.y) - spectrum.variance_y
-    xy = jnp.conj(spectrum.x) * spectrum.y
-    measured = jnp.where(used, spectrum.y, 0.0)
+    omega: Float[Array, " harmonic"]
+    used: Bool[Array, " harmonic"]
+    xx: Float[Array, " harmonic"]
+    yy: Float[Array, " harmonic"]
+    xy: Complex[Array, " harmonic"]
+    z_th: Complex[Array, " harmonic"]
 
-    def loaded(q: Float[Array, " coefficient"]):
+    def loaded(self, q: Float[Array, " coefficient"]):
         """N and N + Z_th D."""
         b0, b1, a1, _ = q
-        n = jax.lax.complex(jnp.full_like(omega, b0), b1 * omega)
-        return n, n + z_th * jax.lax.complex(jnp.ones_like(omega), a1 * omega)
+        n = jax.lax.complex(jnp.full_like(self.omega, b0), b1 * self.omega)
+        d = jax.lax.complex(jnp.ones_like(self.omega), a1 * self.omega)
+        return n, n + self.z_th * d
 
-    def solve(q: Float[Array, " coefficient"], turn: Complex[Array, " harmonic"]):
+    def solve(self, q: Float[Array, " coefficient"], turn: Complex[Array, " harmonic"]):
         """b₀, b₁, a₁ and τ of the next iteration."""
+        omega, used, xx, yy, xy, z_th = self
         v = xy * turn - as_complex(yy)
-        k = loaded(q)[1]
+        k = self.loaded(q)[1]
         zv, kv = z_th * v, k * v
         square = omega**2
         both = xx - yy - 2 * v.real  # |x − y|²
@@ -110,15 +113,50 @@ def fit_skin(
         b0, b1 = (h0 - z0 * a1 - k0 * change) / p0, (z0 - z1 * a1 - k1 * change) / p2
         return jnp.stack([b0, b1, a1, q[3] + change])
 
+
+def _products(spectrum: Spectrum, z_th: Complex[Array, " harmonic"]) -> _Products:
+    return _Products(
+        2 * jnp.pi / RATE * spectrum.frequency,
+        spectrum.selected,
+        power(spectrum.x) - spectrum.variance_x,
+        power(spectrum.y) - spectrum.variance_y,
+        jnp.conj(spectrum.x) * spectrum.y,
+        z_th,
+    )
+
+
+def _turn(q: Float[Array, " coefficient"], frequency: Float[Array, " harmonic"]):
+    return turns(q[3] / RATE * frequency[0], frequency.size)
+
+
+def _elements(q: Float[Array, " coefficient"]) -> SkinRC:
+    b0, b1, a1, _ = q
+    r_s = b1 / a1
+    r_p = b0 - r_s
+    return SkinRC(r_s, r_p, a1 / RATE / r_p)
+
+
+def fit_skin(
+    spectrum: Spectrum, z_th: Complex[Array, " harmonic"], iterations: int = ITERATIONS
+) -> Iterate:
+    """Identify the continuous first-order Z_bio and a delay from harmonics (paper, eqs. 7-9).
+
+    Args:
+        spectrum: Harmonics of a recording.
+        z_th: Source impedance at them [Ω].
+        iterations: How many.
+    """
+    of = _products(spectrum, z_th)
+    used = spectrum.selected
+    measured = jnp.where(used, spectrum.y, 0.0)
+
     def step(carry, iteration):
         best, previous, turn = carry
-        q = solve(previous, turn)
-        b0, b1, a1, tau = q
-        r_s = b1 / a1
-        r_p = b0 - r_s
-        circuit = SkinRC(r_s, r_p, a1 / RATE / r_p)
-        n, total = loaded(q)
-        turn = turns(tau / RATE * spectrum.frequency[0], omega.size)
+        q = of.solve(previous, turn)
+        a1, tau = q[2:]
+        circuit = _elements(q)
+        n, total = of.loaded(q)
+        turn = _turn(q, spectrum.frequency)
         predicted = n * reciprocal(total) * spectrum.x * jnp.conj(turn)
         error = complex_rrse(jnp.where(used, predicted, 0.0), measured)
         error = jnp.where((circuit.values() > 0).all() & jnp.isfinite(error), error, jnp.inf)
@@ -139,3 +177,49 @@ def fit_skin(
     none = jnp.ones_like(z_th)
     (best, *_), converged = jax.lax.scan(step, (nothing, start, none), jnp.arange(iterations))
     return eqx.tree_at(lambda b: b.converged, best, converged[-1])
+
+
+def covariance(
+    spectrum: Spectrum,
+    noise: Float[Array, " harmonic"],
+    source: SourceImpedance,
+    source_cov: Float[Array, "parameter parameter"],
+    best: Iterate,
+) -> tuple[Float[Array, "element element"], Float[Array, "element element"]]:
+    """Covariance of the logarithms of the elements, to first order in the noise.
+
+    Args:
+        spectrum: The recording.
+        noise: Variance of its noise in units of what it says.
+        source: Source impedance with which it was identified.
+        source_cov: Covariance of its flattened parameters.
+        best: The estimate, settled.
+
+    Returns:
+        That of both records' noise, and that of the source's.
+    """
+    of = best.circuit
+    a1 = RATE * of.r_p * of.c_p
+    q = jnp.stack([of.r_s + of.r_p, of.r_s * a1, a1, RATE * best.delay])
+    parameters, unflatten = ravel_pytree(source)
+
+    def following(q, x, y, parameters):
+        there = eqx.tree_at(lambda s: (s.x, s.y), spectrum, (as_one(x), as_one(y)))
+        z_th = unflatten(parameters).response(spectrum.frequency)
+        return _products(there, z_th).solve(q, _turn(q, spectrum.frequency))
+
+    def as_one(parts):
+        return jax.lax.complex(parts[0], parts[1])
+
+    x, y = (jnp.stack([v.real, v.imag]) for v in (spectrum.x, spectrum.y))
+    by_q = jax.jacfwd(following)(q, x, y, parameters)
+    by_element = jax.jacfwd(lambda q: jnp.log(_elements(q).values()))(q)
+    rows = jnp.linalg.solve((jnp.eye(q.size) - by_q).T, by_element.T).T
+    _, pullback = jax.vjp(lambda *data: following(q, *data), x, y, parameters)
+    by_x, by_y, by_source = jax.vmap(pullback)(rows)
+
+    def of_noise(slope, variance):  # half of it in each of both parts
+        return jnp.einsum("ipk,jpk,k->ij", slope, slope, variance / 2)
+
+    own = of_noise(by_x, noise * spectrum.variance_x) + of_noise(by_y, noise * spectrum.variance_y)
+    return own, by_source @ source_cov @ by_source.T

@@ -1,0 +1,216 @@
+"""Our estimators, alone and in a batch, on the same draws, and what scores them and the rivals."""
+
+import time
+from collections.abc import Callable, Iterable
+from typing import Any, NamedTuple, cast
+
+import jax
+import numpy as np
+from jaxtyping import Bool, Float
+
+import etid
+from benchmarks.ladder import CALIBRATION, TRIAL
+from etid.methods import HARMONIC, METHODS, Method
+from etid.scenes import Scene
+
+DEFAULT = "default"
+OURS = (DEFAULT, *METHODS)
+BATCH = 32  # recordings of a timed batch
+FAR = 5.0  # standard deviations of the bound, and own standard errors
+OFF = 0.2
+FEWEST = 4  # draws, however long they take
+
+
+class Draws(NamedTuple):
+    """One scene, drawn several times, each with a calibration of its own.
+
+    Attributes:
+        name: Of the scene.
+        studies: The draws.
+        truth: Elements of the trial, SI.
+        bound: Cramer-Rao bound of their relative standard errors.
+    """
+
+    name: str
+    studies: list[etid.Study]
+    truth: Float[np.ndarray, " element"]
+    bound: Float[np.ndarray, " element"]
+
+
+class Result(NamedTuple):
+    """What an estimator made of all draws of a scene.
+
+    Attributes:
+        estimator: Its name.
+        mode: `alone`, one recording a call; `batched`; or `rival`.
+        elements: Estimates, NaN where there is none.
+        successful: Whether the estimator called them so.
+        stderr: Standard errors it reports; NaN where it has none.
+        seconds: Of one skin, its driver known: median, compilation apart.
+        first_seconds: Of the first call.
+        driver_seconds: Of one driver, median.
+        missing: Why there is nothing, if so.
+    """
+
+    estimator: str
+    mode: str
+    elements: Float[np.ndarray, "draw element"]
+    successful: Bool[np.ndarray, " draw"]
+    stderr: Float[np.ndarray, "draw element"]
+    seconds: float
+    first_seconds: float
+    driver_seconds: float
+    missing: str = ""
+
+
+def draw(
+    name: str, scene: Scene, repetitions: int, source: Callable[[Scene, int], etid.Study]
+) -> Draws:
+    """Record a scene with one seed after the other, from 0 on."""
+    return Draws(
+        name,
+        [source(scene, seed) for seed in range(repetitions)],
+        np.array(list(scene.truth()[TRIAL].values())),
+        np.array(list(etid.bound(scene)[TRIAL].relative.values())),
+    )
+
+
+class Drivers:
+    """Drivers of the draws; methods that use the same have it identified once."""
+
+    def __init__(self, draws: Draws):
+        self.draws = draws
+        self.known: dict[tuple[str | None, int], etid.Driver | None] = {}
+        self.times: dict[str | None, list[float]] = {}
+
+    def of(self, method: Method | None, number: int) -> etid.Driver | None:
+        """The driver of one draw, if there is one."""
+        shared = _shared(method)
+        if (shared, number) not in self.known:
+            begin = time.perf_counter()
+            self.known[shared, number] = self._identify(shared, number)
+            self.times.setdefault(shared, []).append(time.perf_counter() - begin)
+        return self.known[shared, number]
+
+    def seconds(self, method: Method | None) -> float:
+        """Median time of one, but for the first."""
+        times = self.times.get(_shared(method), [])
+        return float(np.median(times[1:])) if times[1:] else np.nan
+
+    def _identify(self, method: Method | None, number: int) -> etid.Driver | None:
+        calibration = self.draws.studies[number][CALIBRATION]
+        try:
+            return etid.identify_driver(calibration, method=method, throw=False)
+        except etid.IdentificationError:
+            return None
+
+
+def _shared(method: Method | None) -> Method | None:
+    return "maximum_likelihood" if method in HARMONIC else method
+
+
+def ours(draws: Draws, drivers: Drivers, name: str, budget: float) -> Iterable[Result]:
+    """One of our estimators, alone and batched.
+
+    Args:
+        draws: The recordings.
+        drivers: Their drivers.
+        name: Of the estimator.
+        budget: Time [s] after which the other draws are left out, but for `FEWEST`.
+    """
+    method = None if name == DEFAULT else cast(Method, name)
+    rows: list[tuple[np.ndarray, bool, np.ndarray]] = []
+    usable, times = [], []
+    nothing = np.full(draws.truth.size, np.nan)
+    begin = np.inf
+    for number, study in enumerate(draws.studies):
+        if len(rows) >= FEWEST and time.perf_counter() - begin > budget:
+            break
+        driver = drivers.of(method, number)
+        if driver is None:
+            rows.append((nothing, False, nothing))
+            continue
+        usable.append((study[TRIAL], driver))
+        for _ in range(1 if times else 2):  # the first compiles
+            seconds, fit = _timed(
+                lambda driver=driver, study=study: etid.identify_skin(
+                    study[TRIAL], driver, method=method, throw=False
+                )
+            )
+            times.append(seconds)
+        rows.append((fit.circuit.values(), fit.verdict == "successful", fit.stderr.values()))
+        begin = min(begin, time.perf_counter())
+    elements, successful, stderr = (np.array(column) for column in zip(*rows, strict=True))
+    first, seconds = (times[0], float(np.median(times[1:]))) if times else (np.nan, np.nan)
+    driver_seconds = drivers.seconds(method)
+    alone = Result(name, "alone", elements, successful, stderr, seconds, first, driver_seconds, "")
+    yield alone
+    if usable:
+        # One driver for all: it is the time that is measured.
+        known = usable[0][1]
+        count = max(1, min(BATCH, round(budget / 3 / seconds)))
+        batch = [usable[i % len(usable)][0] for i in range(count)]
+        several = [
+            _timed(lambda: etid.identify_skins(batch, known, method=method))[0] for _ in range(3)
+        ]
+        each = float(np.median(several[1:])) / count
+        yield alone._replace(mode="batched", seconds=each, first_seconds=several[0])
+
+
+def _timed(call: Callable[[], Any]) -> tuple[float, Any]:
+    begin = time.perf_counter()
+    found = jax.block_until_ready(call())
+    return time.perf_counter() - begin, found
+
+
+class Score(NamedTuple):
+    """How an estimator did in a scene.
+
+    Attributes:
+        each: Root mean square of the errors of the elements over their bounds, per draw; infinite
+            without an answer.
+        error: Its median; that of an efficient estimator of three elements is 0.89.
+        error_of: Median error of each element over its bound.
+        none: Part of the draws without an answer.
+        said: Part with an answer that the estimator itself does not call successful.
+        wrong: Part with an element that is off by more than five bounds or 20 %.
+        silent: Part that is wrong, called successful, and not within five of the standard errors
+            that the estimator reports.
+    """
+
+    each: Float[np.ndarray, " draw"]
+    error: float
+    error_of: tuple[float, ...]
+    none: float
+    said: float
+    wrong: float
+    silent: float
+
+
+def score(draws: Draws, result: Result) -> Score:
+    """Compare answers with the truth."""
+    relative = np.abs(result.elements / draws.truth - 1)
+    answered = np.isfinite(relative).all(1)
+    in_bounds = relative / draws.bound
+    each = np.where(answered, np.sqrt(np.mean(in_bounds**2, axis=1)), np.inf)
+    off = (in_bounds > FAR) | (relative > OFF)
+    wrong = answered & off.any(1)
+    covered = relative <= FAR * np.nan_to_num(result.stderr / draws.truth)
+    silent = answered & result.successful & (off & ~covered).any(1)
+    with np.errstate(invalid="ignore"):
+        error_of = np.median(np.where(answered[:, None], in_bounds, np.inf), axis=0)
+    return Score(
+        each,
+        float(np.median(each)),
+        tuple(map(float, error_of)),
+        float(np.mean(~answered)),
+        float(np.mean(answered & ~result.successful)),
+        float(np.mean(wrong)),
+        float(np.mean(silent)),
+    )
+
+
+def theirs(draws: Draws, budget: float) -> Iterable[Result]:
+    """All rivals."""
+    del draws, budget
+    return ()

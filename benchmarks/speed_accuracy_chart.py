@@ -1,0 +1,107 @@
+"""Error against time, one panel per scene, told apart by letters rather than colours."""
+
+import pathlib
+import textwrap
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from adjustText import adjust_text
+from matplotlib.axes import Axes
+
+from benchmarks import charts
+
+# What stands in a panel for each estimator; a rival stands there with a short name of its own.
+LETTERS = {
+    "default": "etid",
+    "maximum_likelihood": "ML",
+    "non_parametric": "NP",
+    "output_error": "OE",
+    "harmonic_steiglitz_mcbride": "HSM",
+    "steiglitz_mcbride": "SM",
+    "equation_error": "EE",
+}
+COLUMNS = 3
+WORST = 1e3  # bounds; what is further off stands here, with an arrow
+OFTEN = 0.5  # part of the draws in which an estimator disowns its answer, or has none
+
+
+def short(name: str) -> str:
+    """What stands in a panel for an estimator."""
+    return LETTERS.get(name, name)
+
+
+def chart(rows: Sequence[Mapping[str, Any]], path: pathlib.Path) -> None:
+    """Draw all scenes of a table."""
+    names = list(dict.fromkeys(row["scene"] for row in rows))
+    down = -(-len(names) // COLUMNS)
+    figure, axes = charts.new(
+        down, min(COLUMNS, len(names)), (11.5, 3.4 * down + 0.9), sharex=True, sharey=True
+    )
+    for panel, name in zip(axes.flat, names, strict=False):
+        _panel(panel, [row for row in rows if row["scene"] == name])
+        panel.set_title(name, fontsize=10)
+    for panel in axes.flat[len(names) :]:
+        panel.set_visible(False)
+    for panel in axes[:, 0]:
+        panel.set_ylabel("median error / Cramer-Rao bound")
+    for panel in axes[-1]:
+        panel.set_xlabel("time per skin [ms]")
+    key = ", ".join(f"{letters} {name}" for name, letters in LETTERS.items())
+    figure.supxlabel(
+        "\n".join(
+            textwrap.wrap(
+                f"etid is the default; {key}; other names are rivals. Filled: ours, its line from "
+                "one recording a call to a batch. (In brackets): says itself that most answers are "
+                "not good. Dashed: what nothing beats in both. Grey: where an efficient estimator "
+                "is.",
+                150,
+            )
+        ),
+        fontsize=8,
+    )
+    charts.save(figure, path)
+
+
+def _panel(axes: Axes, rows: Sequence[Mapping[str, Any]]) -> None:
+    axes.set(xscale="log", yscale="log")
+    axes.axhline(0.89, color="0.7", linewidth=3, zorder=0)
+    texts, absent = [], []
+    for name in dict.fromkeys(row["estimator"] for row in rows):
+        of = {row["mode"]: row for row in rows if row["estimator"] == name}
+        best = of.get("batched") or next(iter(of.values()))
+        if not np.isfinite(best["error"]):
+            absent.append(short(name))
+            continue
+        error = min(best["error"], WORST)
+        theirs = best["mode"] == "rival"
+        if "alone" in of and "batched" in of:
+            axes.plot(
+                [of["alone"]["ms"], best["ms"]], [error, error], color=charts.INK, linewidth=0.8
+            )
+        axes.plot(
+            best["ms"],
+            error,
+            marker="^" if best["error"] > WORST else "o",
+            color=charts.INK,
+            markerfacecolor="white" if theirs else charts.INK,
+            markersize=8 if name == "default" else 5,
+        )
+        letters = f"({short(name)})" if best["said"] > OFTEN else short(name)
+        weight = "bold" if name == "default" else "normal"
+        texts.append(axes.text(best["ms"], error, letters, fontsize=7.5, fontweight=weight))
+    front = sorted((row["ms"], min(row["error"], WORST)) for row in rows if row["on_front"])
+    if front:
+        axes.step(*zip(*front, strict=True), where="post", color="0.4", linestyle="--", zorder=1)
+    if absent:
+        note = "no answer: " + ", ".join(absent)
+        axes.text(
+            0.98,
+            0.98,
+            "\n".join(textwrap.wrap(note, 44)),
+            transform=axes.transAxes,
+            ha="right",
+            va="top",
+            fontsize=7,
+        )
+    adjust_text(texts, ax=axes, arrowprops={"arrowstyle": "-", "color": "0.6", "linewidth": 0.5})
