@@ -29,6 +29,9 @@ no reflection: |1 + jωa₁| does not know the sign of a₁.
 **The covariance** is that of a fixed point q = Φ(q, X, Y, Z_th), whose differential is
 
     dq = (1 − ∂Φ/∂q)⁻¹ (∂Φ/∂X dX + ∂Φ/∂Y dY + ∂Φ/∂Z_th dZ_th).
+
+All three are taken as independent. Where a calibration has the same unloaded record, what it did to
+Z_th and does to the skin partly cancels, and the standard errors are a quarter too wide.
 """
 
 from typing import NamedTuple
