@@ -1,19 +1,23 @@
 # Everything runs in .venv, with the versions of constraints.txt.
 #   make demo    simulate the paper's experiments, identify them, print the tables: demo/index.html
 #   make test    the ordinary tests
+#   make ranking the benchmarks in short: which estimator is better, and is any wrong silently
 #   make lint    style;  make types    static types;  make clean    remove what was made
 
 PYTHON ?= python3
 BIN := .venv/bin
 INSTALL := $(BIN)/python -m pip install --quiet --constraint constraints.txt
 
-.PHONY: demo test lint types clean
+.PHONY: demo test ranking lint types clean
 
 demo: .venv/package
 	$(BIN)/python -m etid.demo demo/
 
 test: .venv/tools
 	$(BIN)/python -m pytest --numprocesses auto --dist loadfile
+
+ranking: .venv/tools
+	$(BIN)/python -m benchmarks speed_accuracy --quick --folder results/quick
 
 lint: .venv/tools
 	$(BIN)/ruff check
@@ -33,5 +37,5 @@ types: .venv/tools
 	touch $@
 
 clean:
-	rm -rf .venv demo dist build .pytest_cache .ruff_cache .hypothesis .coverage*
+	rm -rf .venv demo results dist build .pytest_cache .ruff_cache .hypothesis .coverage*
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -10,6 +10,7 @@ from adjustText import adjust_text
 from matplotlib.axes import Axes
 
 from benchmarks import charts
+from etid.methods import METHODS
 
 # What stands in a panel for each estimator; a rival stands there with a short name of its own.
 LETTERS = {
@@ -67,7 +68,10 @@ def _panel(axes: Axes, rows: Sequence[Mapping[str, Any]]) -> None:
     axes.set(xscale="log", yscale="log")
     axes.axhline(0.89, color="0.7", linewidth=3, zorder=0)
     texts, absent = [], []
+    same = {row["error"] for row in rows if row["estimator"] == "default"}
     for name in dict.fromkeys(row["estimator"] for row in rows):
+        if name != "default" and name in METHODS and {r["error"] for r in rows if r["estimator"] == name} <= same:
+            continue  # what the default has chosen
         of = {row["mode"]: row for row in rows if row["estimator"] == name}
         best = of.get("batched") or next(iter(of.values()))
         if not np.isfinite(best["error"]):
