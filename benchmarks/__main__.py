@@ -6,7 +6,17 @@ import sys
 
 import jax
 
-NAMES = ("spice", "coverage", "design", "timing", "speed", "curves", "scale", "speed_accuracy")
+NAMES = (
+    "spice",
+    "coverage",
+    "design",
+    "timing",
+    "speed",
+    "curves",
+    "scale",
+    "speed_accuracy",
+    "which",
+)
 
 
 def main() -> None:

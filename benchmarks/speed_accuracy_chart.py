@@ -70,7 +70,11 @@ def _panel(axes: Axes, rows: Sequence[Mapping[str, Any]]) -> None:
     texts, absent = [], []
     same = {row["error"] for row in rows if row["estimator"] == "default"}
     for name in dict.fromkeys(row["estimator"] for row in rows):
-        if name != "default" and name in METHODS and {r["error"] for r in rows if r["estimator"] == name} <= same:
+        if (
+            name != "default"
+            and name in METHODS
+            and {r["error"] for r in rows if r["estimator"] == name} <= same
+        ):
             continue  # what the default has chosen
         of = {row["mode"]: row for row in rows if row["estimator"] == name}
         best = of.get("batched") or next(iter(of.values()))

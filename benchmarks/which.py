@@ -1,0 +1,103 @@
+"""Which estimator when: the table of the README, made from the results of `speed_accuracy`."""
+
+import argparse
+import csv
+import pathlib
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from benchmarks.provenance import ROOT
+from benchmarks.speed_accuracy import FILE, RESULTS
+from etid.methods import METHODS
+
+README = ROOT / "README.md"
+BEGIN, END = "<!-- python -m benchmarks which -->\n", "<!-- end -->\n"
+AS_GOOD = 1.25  # times the smallest error, that an estimator may have to be used for its speed
+TRUSTED = 0.5  # part of the draws that have an answer which the estimator itself stands by
+
+
+def read(path: pathlib.Path) -> list[dict[str, Any]]:
+    """Rows of our estimators in batches, with numbers as numbers."""
+    with path.open() as file:
+        rows = [row for row in csv.DictReader(file) if row["mode"] != "rival"]
+    numbers = ("error", "none", "said", "wrong", "silent", "ms")
+    return [{**row, **{name: float(row[name]) for name in numbers}} for row in rows]
+
+
+def table(rows: Sequence[Mapping[str, Any]]) -> str:
+    """Markdown: a row for each scene with the error of each estimator, and which to use."""
+    methods = [method for method in METHODS if any(r["estimator"] == method for r in rows)]
+    lines = [
+        "| recording | " + " | ".join(name.replace("_", " ") for name in methods) + " | use |",
+        "|---" * (len(methods) + 2) + "|",
+    ]
+    for scene in dict.fromkeys(row["scene"] for row in rows):
+        of = {row["estimator"]: row for row in rows if row["scene"] == scene}
+        use = best(list(of.values()))
+        cells = [_cell(of.get(method), method == use) for method in methods]
+        name = use.replace("_", " ") if use else "none of them"
+        lines.append(f"| {scene} | " + " | ".join(cells) + f" | {name} |")
+    times = [_median_ms([r for r in rows if r["estimator"] == method]) for method in methods]
+    lines.append("| *ms, in a batch* | " + " | ".join(times) + " | |")
+    return "\n".join(lines) + "\n"
+
+
+def best(rows: Sequence[Mapping[str, Any]]) -> str | None:
+    """The fastest of those that are trusted and as good as the most accurate."""
+    trusted = [
+        row
+        for row in rows
+        if row["estimator"] in METHODS and _trusted(row) and np.isfinite(row["error"])
+    ]
+    if not trusted:
+        return None
+    limit = AS_GOOD * min(row["error"] for row in trusted)
+    good = [row for row in trusted if row["error"] <= limit]
+    return min(good, key=lambda row: row["ms"])["estimator"]
+
+
+def _trusted(row: Mapping[str, Any]) -> bool:
+    return row["none"] + row["said"] <= 1 - TRUSTED and row["silent"] == 0
+
+
+def _cell(row: Mapping[str, Any] | None, used: bool) -> str:
+    if row is None or not np.isfinite(row["error"]):
+        return "-"
+    text = f"{row['error']:.2g}" if row["error"] < 100 else f"{row['error']:.0f}"
+    text = f"({text})" if row["none"] + row["said"] > 1 - TRUSTED else text
+    text += " silent" if row["silent"] > 0 else ""
+    return f"**{text}**" if used else text
+
+
+def _median_ms(rows: Sequence[Mapping[str, Any]]) -> str:
+    found = [row["ms"] for row in rows if row["mode"] == "batched" and np.isfinite(row["ms"])]
+    return f"{np.median(found):.2g}" if found else "-"
+
+
+def inserted(text: str, made: str) -> str:
+    """A page with the table between its marks.
+
+    Raises:
+        ValueError: The page has no marks.
+    """
+    head, begin, rest = text.partition(BEGIN)
+    _, end, tail = rest.partition(END)
+    if not (begin and end):
+        raise ValueError(f"no {BEGIN.strip()!r} … {END.strip()!r} to put the table between")
+    return head + begin + made + end + tail
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Where results and page are."""
+    parser.add_argument("--results", type=pathlib.Path, default=RESULTS / FILE)
+    parser.add_argument("--readme", type=pathlib.Path, default=README)
+
+
+def main(arguments: argparse.Namespace) -> bool:
+    """Print the table and put it into the page."""
+    made = table(read(arguments.results))
+    print(made)
+    arguments.readme.write_text(inserted(arguments.readme.read_text(), made))
+    return True
