@@ -118,7 +118,7 @@ def ours(draws: Draws, drivers: Drivers, name: str, budget: float) -> Iterable[R
         name: Of the estimator.
         budget: Time [s] after which the other draws are left out, but for `FEWEST`.
     """
-    method = None if name == DEFAULT else cast(Method, name)
+    method: Method | None = None if name == DEFAULT else cast(Method, name)
     rows: list[tuple[np.ndarray, bool, np.ndarray]] = []
     usable, times = [], []
     nothing = np.full(draws.truth.size, np.nan)
@@ -131,13 +131,14 @@ def ours(draws: Draws, drivers: Drivers, name: str, budget: float) -> Iterable[R
             rows.append((nothing, False, nothing))
             continue
         usable.append((study[TRIAL], driver))
-        for _ in range(1 if times else 2):  # the first compiles
-            seconds, fit = _timed(
-                lambda driver=driver, study=study: etid.identify_skin(
-                    study[TRIAL], driver, method=method, throw=False
-                )
-            )
-            times.append(seconds)
+
+        def identify(record: etid.Recording = study[TRIAL], driver: etid.Driver = driver):
+            return etid.identify_skin(record, driver, method=method, throw=False)
+
+        if not times:
+            times.append(_timed(identify)[0])  # it compiles
+        seconds, fit = _timed(identify)
+        times.append(seconds)
         rows.append((fit.circuit.values(), fit.verdict == "successful", fit.stderr.values()))
         begin = min(begin, time.perf_counter())
     elements, successful, stderr = (np.array(column) for column in zip(*rows, strict=True))
@@ -150,9 +151,11 @@ def ours(draws: Draws, drivers: Drivers, name: str, budget: float) -> Iterable[R
         known = usable[0][1]
         count = max(1, min(BATCH, round(budget / 3 / seconds)))
         batch = [usable[i % len(usable)][0] for i in range(count)]
-        several = [
-            _timed(lambda: etid.identify_skins(batch, known, method=method))[0] for _ in range(3)
-        ]
+
+        def identify_all():
+            return etid.identify_skins(batch, known, method=method)
+
+        several = [_timed(identify_all)[0] for _ in range(3)]
         each = float(np.median(several[1:])) / count
         yield alone._replace(mode="batched", seconds=each, first_seconds=several[0])
 
@@ -190,13 +193,13 @@ class Score(NamedTuple):
 def score(draws: Draws, result: Result) -> Score:
     """Compare answers with the truth."""
     relative = np.abs(result.elements / draws.truth - 1)
-    answered = np.isfinite(relative).all(1)
+    answered = np.asarray(np.isfinite(relative).all(1))
     in_bounds = relative / draws.bound
     each = np.where(answered, np.sqrt(np.mean(in_bounds**2, axis=1)), np.inf)
-    off = (in_bounds > FAR) | (relative > OFF)
-    wrong = answered & off.any(1)
+    off = np.asarray((in_bounds > FAR) | (relative > OFF))
+    wrong = answered & np.any(off, axis=1)
     covered = relative <= FAR * np.nan_to_num(result.stderr / draws.truth)
-    silent = answered & result.successful & (off & ~covered).any(1)
+    silent = answered & result.successful & np.any(off & ~covered, axis=1)
     with np.errstate(invalid="ignore"):
         error_of = np.median(np.where(answered[:, None], in_bounds, np.inf), axis=0)
     return Score(
