@@ -9,7 +9,6 @@ published size on the built circuit. The paper does not say what its noise was; 
 """
 
 import argparse
-import dataclasses
 import json
 import pathlib
 import sys
@@ -19,39 +18,32 @@ from typing import Any
 
 import jax
 import numpy as np
-from jaxtyping import Float
 
 import etid
 from etid import plotting
-from etid.circuits import DISPLAY, Quantity
-from etid.methods import Method
+from etid.circuits import DISPLAY
+from etid.experiments import (
+    CALIBRATION,
+    FINGERTIPS,
+    METHODS,
+    ORDER,
+    RRSE,
+    TABLE_1,
+    TABLE_4,
+    Outcome,
+    Truth,
+    errors,
+    fingertips,
+    identify,
+    resistor_errors,
+)
 from etid.report import Section, Table, write_page
 
 LABORATORIES: Mapping[str, Mapping[str, float]] = {
     "quiet": {"snr_db": 60.0},
     "noisy": {"snr_db": 40.0, "trigger_jitter_rms": 200e-9},
 }
-_METHODS: tuple[Method, ...] = ("maximum_likelihood", "steiglitz_mcbride")
 _SEED = 0
-_CALIBRATION = "calibration/98k8"
-_ORDER = ("r_p", "c_p", "r_s")  # as the paper's tables have them
-
-# What the paper reports: Table I [%], Tables II and III (a typical fingertip, ten subjects) [SI],
-# Table IV (mean error, scatter between 23 trials) [%].
-_TABLE_1 = {21.62e3: 4.26, 55.20e3: 0.42, 216.6e3: 9.6, 328.9e3: 12.2, 555.0e3: 0.25}
-_FINGERTIPS = {
-    "dry": {
-        "r_p": (186e3, 194e3, 616e3),
-        "c_p": (0.12e-9, 45e-12, 165e-12),
-        "r_s": (33.4e3, 19e3, 69.8e3),
-    },
-    "damp": {
-        "r_p": (17.4e3, 20.2e3, 165e3),
-        "c_p": (0.66e-9, 160e-12, 845e-12),
-        "r_s": (6.1e3, 3.9e3, 19.8e3),
-    },
-}
-_TABLE_4 = {"r_p": (2.46, 17.5), "c_p": (10.4, 26.9), "r_s": (15.5, 43.2)}
 _READING = (
     "Rows and columns named paper are what the paper measured; all other numbers come from "
     "simulated recordings, whose elements are known. Quiet records have 60 dB and no trigger "
@@ -59,50 +51,6 @@ _READING = (
     "paper says. Every estimate enters the tables, whatever its verdict; `successful` counts the "
     "good ones."
 )
-
-
-@dataclasses.dataclass(frozen=True, eq=False)
-class Outcome:
-    """One study identified by one method.
-
-    Attributes:
-        laboratory: Who made the study.
-        method: Name of the estimator.
-        driver: The driver.
-        skins: Everything but the test resistors.
-        resistors: The test resistors, as one resistor by maximum likelihood. Steiglitz-McBride
-            identifies eq. 7 only; the resistance is then Z(0) = R_s + R_p.
-    """
-
-    laboratory: str
-    method: Method
-    driver: etid.Driver
-    skins: etid.Fits
-    resistors: etid.Fits
-
-    @property
-    def names(self) -> tuple[str, str]:
-        """First two cells of its rows."""
-        return self.laboratory, self.method
-
-
-def identify(laboratory: str, study: etid.Study, method: Method) -> Outcome:
-    """Identify the driver, the test resistors as resistors, everything else as skin."""
-    driver = etid.identify_driver(study[_CALIBRATION], method=method, throw=False)
-    resistors = study.where(condition="resistors")
-    skins = [study[path] for path in study.loaded if path not in resistors]
-    circuit = etid.Resistor() if method == "maximum_likelihood" else etid.SkinRC()
-    return Outcome(
-        laboratory,
-        method,
-        driver,
-        etid.identify_skins(skins, driver, method=method, progress=sys.stderr.isatty()),
-        etid.identify_skins(resistors, driver, circuit=circuit, method=method),
-    )
-
-
-def _percent(value: Quantity, truth: float) -> Float[np.ndarray, "..."]:
-    return 100 * (np.asarray(value) / truth - 1)
 
 
 def _number(value: float | np.floating) -> str:
@@ -117,51 +65,37 @@ def _successes(fits: etid.Fits) -> str:
 def table_1(outcomes: Sequence[Outcome]) -> Table:
     """Errors of the five test resistors [%]."""
     heads = tuple(f"{name} {outcome.method}" for outcome in outcomes for name in outcome.names[:1])
-    rows = []
-    for r, paper in _TABLE_1.items():
-        row = [f"{r / 1e3:g}", f"{paper:g}"]
-        for outcome in outcomes:
-            path = f"resistors/{etid.scenes.resistor_label(r)}"
-            circuit = outcome.resistors.where(path=path).circuit
-            value = circuit.r if isinstance(circuit, etid.Resistor) else circuit.r_s + circuit.r_p
-            row.append(_number(_percent(value, r).item()))
-        rows.append(tuple(row))
-    return Table(("R [kΩ]", "paper", *heads), tuple(rows))
+    found = [resistor_errors(outcome) for outcome in outcomes]
+    rows = tuple(
+        (f"{r / 1e3:g}", f"{paper:g}", *(_number(errors_of[r]) for errors_of in found))
+        for r, paper in TABLE_1.items()
+    )
+    return Table(("R [kΩ]", "paper", *heads), rows)
 
 
-def table_fingertips(
-    outcomes: Sequence[Outcome], truth: Mapping[str, Mapping[str, float]], condition: str
-) -> Table:
+def table_fingertips(outcomes: Sequence[Outcome], truth: Truth, condition: str) -> Table:
     """A typical fingertip and ten subjects, identified and true: Table II (dry), III (damp)."""
     rows = []
     units = etid.SkinRC.units()
-    for name in _ORDER:
+    for name in ORDER:
         scale, symbol = DISPLAY[units[name]]
-        typical, *limits = (value / scale for value in _FINGERTIPS[condition][name])
+        typical, *limits = (value / scale for value in FINGERTIPS[condition][name])
         label = f"{name} [{symbol}]"
         span = "{:.3g} to {:.3g}".format
         rows.append(("paper", "", label, f"{typical:.3g}", "", "", span(*limits), "", "", ""))
         for outcome in outcomes:
             skins = outcome.skins.where(condition=condition)
-            one = skins.where(subject="typical")
-            known = truth[str(one.labels["path"][0])][name]
-            values = getattr(one.circuit, name)
-            many = skins.take(skins.labels["subject"] != "typical")
-            subjects = sorted(set(many.labels["subject"].tolist()))
-            trials = [many.where(subject=subject) for subject in subjects]
-            medians = np.array([np.median(getattr(fits.circuit, name)) for fits in trials])
-            actual = np.array([truth[str(fits.labels["path"][0])][name] for fits in trials])
-            errors = 100 * np.abs(medians / actual - 1)
+            found = fingertips(skins, truth, name)
             rows.append(
                 (
                     *outcome.names,
                     label,
-                    f"{np.median(values) / scale:.4g}",
-                    _number(np.median(_percent(values, known))),
-                    _number(np.std(_percent(values, known), ddof=1)),
-                    span(medians.min() / scale, medians.max() / scale),
-                    _number(np.median(errors)),
-                    _number(errors.max()),
+                    f"{found.typical / scale:.4g}",
+                    _number(found.error),
+                    _number(found.spread),
+                    span(found.lowest / scale, found.highest / scale),
+                    _number(found.subject_error),
+                    _number(found.worst),
                     _successes(skins),
                 )
             )
@@ -182,37 +116,37 @@ def table_fingertips(
     )
 
 
-def table_4(outcomes: Sequence[Outcome], truth: Mapping[str, Mapping[str, float]]) -> Table:
+def table_4(outcomes: Sequence[Outcome], truth: Truth) -> Table:
     """The built circuit: error of the mean and scatter of 23 trials [%]."""
-    paper = (f"{error:g} / {scatter:g}" for error, scatter in (_TABLE_4[name] for name in _ORDER))
-    rows = [("paper", "", *paper, "4 to 13", "")]
+    paper = (f"{error:g} / {scatter:g}" for error, scatter in (TABLE_4[name] for name in ORDER))
+    rows = [("paper", "", *paper, "{} to {}".format(*RRSE), "")]
     for outcome in outcomes:
         built = outcome.skins.where(condition="built")
-        known = truth[str(built.labels["path"][0])]
-        cells = []
-        for name in _ORDER:
-            errors = _percent(getattr(built.circuit, name), known[name])
-            cells.append(f"{_number(np.mean(errors))} / {_number(np.std(errors, ddof=1))}")
+        found = errors(built, truth)
+        cells = [
+            f"{_number(np.mean(found[name]))} / {_number(np.std(found[name], ddof=1))}"
+            for name in ORDER
+        ]
         quality = _number(100 * float(np.median(built.rrse)))
         rows.append((*outcome.names, *cells, quality, _successes(built)))
-    heads = tuple(f"{name} [%]" for name in _ORDER)
+    heads = tuple(f"{name} [%]" for name in ORDER)
     return Table(("records", "method", *heads, "RRSE [%]", "successful"), tuple(rows))
 
 
-def table_verdicts(outcomes: Sequence[Outcome], truth: Mapping[str, Mapping[str, float]]) -> Table:
+def table_verdicts(outcomes: Sequence[Outcome], truth: Truth) -> Table:
     """How the identifications ended, and whether the successful ones are as good as they say."""
     rows = []
     for outcome in outcomes:
         verdicts = ", ".join(f"{count} {name}" for name, count in outcome.skins.counts().items())
         good = outcome.skins.successful()
         cells = [*outcome.names, outcome.driver.verdict, verdicts]
-        for name in _ORDER:
+        for name in ORDER:
             known = np.array([truth[str(path)][name] for path in good.labels["path"]])
             error = np.abs(np.asarray(getattr(good.circuit, name)) - known)
             inside = error <= 2 * np.asarray(getattr(good.stderr, name))
             cells.append(f"{100 * inside.mean():.0f} %" if len(good) else "")
         rows.append(tuple(cells))
-    heads = tuple(f"{name} ± 2 se" for name in _ORDER)
+    heads = tuple(f"{name} ± 2 se" for name in ORDER)
     return Table(("records", "method", "driver", "skins and built circuit", *heads), tuple(rows))
 
 
@@ -231,13 +165,13 @@ def figures(
             plotting.save(figure, folder / f"{name}{suffix}")
         drawn.append((caption, folder / f"{name}.svg"))
 
-    known = study[_CALIBRATION]
+    known = study[CALIBRATION]
     draw(
         "pulse_calibration",
         "Calibration with 98.8 kΩ: measured, predicted, residual (paper, figure 7)",
         lambda: plotting.plot_fit(known, etid.predict(known, driver)),
     )
-    for condition in _FINGERTIPS:
+    for condition in FINGERTIPS:
         path = f"typical/{condition}/01"
         row = outcome.skins.labels["path"].tolist().index(path)
         circuits[condition] = outcome.skins[row].circuit
@@ -286,9 +220,9 @@ def main(argv: Sequence[str] | None = None) -> None:
         scene = etid.scenes.paper(**settings)
         scene.simulate(_SEED).write(place / "study.h5")
         with etid.read(place / "study.h5") as study:
-            for method in _METHODS:
+            for method in METHODS:
                 print(f"{laboratory}: {len(study)} recordings by {method} …", file=sys.stderr)
-                outcome = identify(laboratory, study, method)
+                outcome = identify(laboratory, study, method, progress=sys.stderr.isatty())
                 ending = "" if method == "maximum_likelihood" else f"_{method}"
                 outcome.skins.write(place / f"fits{ending}.h5")
                 outcome.resistors.write(place / f"resistors{ending}.h5")

@@ -170,7 +170,30 @@ class Scene:
         Returns:
             One recording per calibration and trial.
         """
-        sampler, v_th, z_th, sigma = self._exact()
+        _, v_th, z_th, _ = self._exact()
+        return self.record(seed, lambda trial, f: v_th * loading(_impedance(trial, f), z_th))
+
+    def record(
+        self,
+        seed: int,
+        voltage: Callable[[Trial, Float[np.ndarray, " f"]], Complex[np.ndarray, " f"]],
+    ) -> Study:
+        """Record terminal voltages that come from elsewhere, such as a circuit simulator.
+
+        Noise, delays and offsets are those of `simulate` at the same seed: what differs between the
+        two studies is the voltage alone.
+
+        Args:
+            seed: Seed of noise, delays and offsets.
+            voltage: Fourier coefficients [V] of the terminal voltage of a trial at the harmonics
+                [Hz] of the true pulse rate, before the anti-alias filter. It is asked for the
+                unloaded voltage as well, by a trial whose load is open.
+
+        Returns:
+            One recording per calibration and trial.
+        """
+        sampler, _, _, sigma = self._exact()
+        v_th = voltage(Trial("unloaded", OpenLoad()), sampler.f)
         resistances = {
             trial.path: trial.load.r
             for trial in self.calibration
@@ -184,7 +207,7 @@ class Scene:
         for trial in self.calibration + self.trials:
             draws = np.random.default_rng([seed, *trial.path.encode()]).spawn(2)
             r_load = resistances.get(trial.path)
-            v_out = v_th * loading(_impedance(trial, sampler.f), z_th)
+            v_out = voltage(trial, sampler.f)
             recordings.append(
                 Recording(
                     unloaded or self._convert(sampler, v_th, sigma, draws[0]),

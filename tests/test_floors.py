@@ -61,6 +61,7 @@ FLOORS = {
     "plotting": 12,
     "joint": 13,
     "streaming": 13,
+    "experiments": 13,
     "report": 13,
     "demo": 14,
     "cli": 15,

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import etid
-from etid import demo, report
+from etid import demo, experiments, report
 from etid.verdicts import verdict, verdicts_of
 
 EXCESS = 1.1  # of every identified element over the true one
@@ -90,7 +90,7 @@ def outcome():
         rrse=jnp.array(0.1), chi2=jnp.array(1.0), result=verdict("successful"), steps=jnp.array(1),
         method="by hand",
     )  # fmt: skip
-    return demo.Outcome(
+    return experiments.Outcome(
         "quiet",
         "output_error",
         driver,

@@ -1,0 +1,237 @@
+"""An independent referee: the transformer of a scene solved by ngspice, step by step in time.
+
+`record(scene, seed)` stands in for `scene.simulate(seed)`. The waveform comes from ngspice (Debian
+package `ngspice`), the recorder is the scene's own: anti-alias filter, clock, delays, noise and
+converter, with the same draws. The two studies differ by the simulator alone.
+
+One run per circuit and load, kept in memory and in `CACHE`, serves all draws of noise. ngspice
+chooses its own steps, which RELTOL bounds. For the default circuit the deviation from
+`Scene.waveform`, relative to the peak, after the anti-alias filter of 80 kHz, and what it does to
+R_s, R_p and C_p of a dry and a damp fingertip at 60 dB (converter without rounding) are at most
+
+    RELTOL       deviation   elements   steps per period   one run
+    1e-6         8e-5        0.054 %    10 000             0.3 s
+    1e-7         3e-5        0.014 %    12 000             0.4 s
+    1e-8         6e-6        0.003 %    19 000             0.5 s
+    1e-9         1e-6        ngspice gives up on one load in ten ("timestep too small")
+
+A 16-bit converter rounds a few of a hundred samples to the other code, which moves the elements by
+a tenth of their standard errors at 60 dB, for this reason alone.
+"""
+
+import functools
+import hashlib
+import io
+import math
+import os
+import pathlib
+import shutil
+import subprocess
+import tempfile
+
+import numpy as np
+import scipy.interpolate
+from jaxtyping import Complex, Float
+
+import etid
+from benchmarks.provenance import ROOT
+from benchmarks.spice import PARTS
+from etid.scenes import Scene, Trial
+from etid.transformer import Impedance, OpenLoad, ResistorLoad, SkinLoad, TransformerDriver
+
+CACHE = ROOT / "results" / "ngspice"
+RELTOL = 1e-8
+LONGEST_STEP = 2e-6  # [s]
+SETTLING = 0.1  # [s] before the recorded periods; the slowest time constant is 4 ms
+SETTLED = 1e-5  # largest difference between the last two periods, relative to the peak
+FINE = 8  # points of the interpolated period per period of the highest harmonic asked for
+
+# Parts by their name in `PARTS`, from the source to the terminal o, with the nodes they connect.
+NODES = {
+    "Rsrc": "source p",
+    "Cpri": "p 0",
+    "Rpw": "p a",
+    "Llp": "a m",
+    "Lm": "m 0",
+    "Rcore": "m 0",
+    "Rsw": "w b",
+    "Lls": "b s",
+    "Csec": "s 0",
+    "Cww": "p s",
+    "Rprot": "s o",
+    "Ccab": "o 0",
+    "Rmeas": "o 0",
+    "Cmeas": "o 0",
+}
+
+
+class NgspiceError(RuntimeError):
+    """ngspice is absent, or could not solve a circuit; says what to do."""
+
+
+def netlist(driver: TransformerDriver, load: Impedance, pulse_rate: float) -> str:
+    """The circuit of `etid.transformer` with its load, and a run into its steady state.
+
+    The windings are an ideal transformer 1:n between m and w, with the leakage, magnetising and
+    loss elements of each side around it.
+
+    Args:
+        driver: The pulse transformer.
+        load: Open, a resistor, or skin.
+        pulse_rate: Pulses per second [Hz].
+
+    Raises:
+        ValueError: ngspice cannot have this load or this pulse.
+    """
+    if not 0 < driver.edge < driver.width:
+        raise ValueError(
+            f"edge is {driver.edge:g} s, width {driver.width:g} s; ngspice needs 0 < edge < width"
+        )
+    period = 1 / pulse_rate
+    pulse = (0.0, driver.amplitude, driver.lead_in, driver.edge, driver.edge)
+    settled = math.ceil(SETTLING * pulse_rate) * period
+    run = (LONGEST_STEP, settled + 2 * period, settled - 2 * LONGEST_STEP, LONGEST_STEP)
+    lines = [
+        "Pulse transformer of etid.transformer with a load at node o",
+        f"Vp source 0 PULSE({_text(*pulse, driver.width - driver.edge, period)})",
+        *(f"{name} {nodes} {_text(getattr(driver, PARTS[name]))}" for name, nodes in NODES.items()),
+        "* ideal transformer: w has n times the voltage of m, m carries n times the current of w",
+        f"En turn 0 m 0 {_text(driver.turns)}",
+        "Vi turn w 0",
+        f"Fn m 0 Vi {_text(driver.turns)}",
+        *_load(load),
+        f".options method=trap trtol=1 reltol={RELTOL!r} abstol=1e-12 vntol=1e-9 chgtol=1e-11",
+        ".save v(o)",
+        f".tran {_text(*run)}",
+        ".end",
+    ]
+    return "\n".join(lines) + "\n"
+
+
+def _load(load: Impedance) -> list[str]:
+    if isinstance(load, OpenLoad):
+        return ["* no load"]
+    if isinstance(load, ResistorLoad):
+        return ["* known resistor", f"R o 0 {_text(load.r)}"]
+    if isinstance(load, SkinLoad):
+        parts = (f"Rs o x {_text(load.r_s)}", f"Rp x 0 {_text(load.r_p)}")
+        return ["* skin", *parts, f"Cp x 0 {_text(load.c_p)}"]
+    raise ValueError(
+        f"ngspice has no netlist for the load {load!r}; use OpenLoad, ResistorLoad or SkinLoad"
+    )
+
+
+def _text(*numbers: float) -> str:
+    """All digits; numpy's numbers as well would be written with their type."""
+    return " ".join(repr(float(number)) for number in numbers)
+
+
+def record(scene: Scene, seed: int) -> etid.Study:
+    """Make the recordings of a scene from waveforms of ngspice.
+
+    Args:
+        scene: Driver, loads and recorder.
+        seed: Seed of noise, delays and offsets, with the draws of `scene.simulate(seed)`.
+
+    Raises:
+        NgspiceError: ngspice is not installed or failed.
+        ValueError: ngspice cannot have a load or the pulse of the scene.
+    """
+
+    def voltage(trial: Trial, f: Float[np.ndarray, " f"]) -> Complex[np.ndarray, " f"]:
+        pulse_rate = float(f[0])
+        return harmonics(netlist(scene.driver, trial.load, pulse_rate), pulse_rate, f.size)
+
+    return scene.record(seed, voltage)
+
+
+@functools.lru_cache(maxsize=256)
+def harmonics(netlist: str, pulse_rate: float, count: int) -> Complex[np.ndarray, " count"]:
+    """Fourier coefficients [V] of the steady state at the first `count` harmonics.
+
+    The steps of ngspice are uneven: a cubic spline through them is sampled evenly.
+
+    Args:
+        netlist: What ngspice solves.
+        pulse_rate: Pulses per second [Hz].
+        count: Number of harmonics.
+
+    Raises:
+        NgspiceError: As `solve`; or the last two periods differ, so that this is no steady state.
+    """
+    time, v = solve(netlist)
+    period = 1 / pulse_rate
+    points = FINE * count
+    last = time[-1] - period + period * np.arange(points) / points
+    spline = scipy.interpolate.CubicSpline(time, v)
+    wave = spline(last)
+    change = np.abs(wave - spline(last - period)).max() / np.abs(wave).max()
+    if change > SETTLED:
+        raise NgspiceError(
+            f"the last two periods differ by {change:.1e} of the peak after {SETTLING:g} s; "
+            "raise benchmarks.ngspice.SETTLING"
+        )
+    return np.fft.rfft(wave)[1 : count + 1] / points
+
+
+def solve(netlist: str) -> tuple[Float[np.ndarray, " step"], Float[np.ndarray, " step"]]:
+    """Times [s] and the voltage at node o [V] at the steps of ngspice, from `CACHE` if known.
+
+    Raises:
+        NgspiceError: ngspice is not installed or failed.
+    """
+    name = hashlib.sha256(f"{_version()}\n{netlist}".encode()).hexdigest()[:32]
+    kept = CACHE / f"{name}.npy"
+    if kept.exists():
+        time, v = np.load(kept)
+        return time, v
+    with tempfile.TemporaryDirectory() as folder:
+        circuit, raw = pathlib.Path(folder, "circuit.cir"), pathlib.Path(folder, "out.raw")
+        circuit.write_text(netlist)
+        said = _ngspice("-b", "-n", "-r", str(raw), str(circuit))
+        if not raw.exists():
+            raise NgspiceError(f"ngspice wrote no waveform; it says:\n{said}")
+        time, v = waveform(raw.read_bytes())
+    CACHE.mkdir(parents=True, exist_ok=True)
+    partial = kept.with_suffix(f".{os.getpid()}")
+    with partial.open("wb") as file:
+        np.save(file, np.stack([time, v]))
+    partial.replace(kept)
+    return time, v
+
+
+def waveform(raw: bytes) -> tuple[Float[np.ndarray, " step"], Float[np.ndarray, " step"]]:
+    """Time [s] and the one voltage [V] of a binary raw file of ngspice.
+
+    Raises:
+        NgspiceError: It is no such file, or not whole.
+    """
+    head, mark, body = raw.partition(b"Binary:\n")
+    fields = dict(
+        line.split(":", 1) for line in io.StringIO(head.decode(errors="replace")) if ":" in line
+    )
+    points, variables = (int(fields.get(name, "0")) for name in ("No. Points", "No. Variables"))
+    if not mark or variables != 2 or points < 2 or len(body) < 16 * points:
+        raise NgspiceError(
+            f"the raw file has {points} points of {variables} variables in {len(body)} bytes; "
+            "expected two variables, time and v(o)"
+        )
+    time, v = np.frombuffer(body, count=2 * points).reshape(points, 2).T
+    return time, v
+
+
+@functools.cache
+def _version() -> str:
+    return next((line for line in _ngspice("--version").splitlines() if "ngspice-" in line), "")
+
+
+def _ngspice(*arguments: str) -> str:
+    """Run ngspice and return what it says."""
+    program = shutil.which("ngspice")
+    if program is None:
+        raise NgspiceError("ngspice is not installed; on Debian: apt-get install ngspice")
+    done = subprocess.run([program, *arguments], capture_output=True, text=True, check=False)
+    said = done.stdout + done.stderr
+    if done.returncode != 0:
+        raise NgspiceError(f"ngspice ended with {done.returncode}; it says:\n{said}")
+    return said
