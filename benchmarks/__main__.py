@@ -16,6 +16,7 @@ NAMES = (
     "scale",
     "speed_accuracy",
     "which",
+    "paper",
 )
 
 

@@ -13,7 +13,7 @@ import json
 import pathlib
 import sys
 import textwrap
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
@@ -25,6 +25,7 @@ from etid.circuits import DISPLAY
 from etid.experiments import (
     CALIBRATION,
     FINGERTIPS,
+    LABORATORIES,
     METHODS,
     ORDER,
     RRSE,
@@ -39,10 +40,6 @@ from etid.experiments import (
 )
 from etid.report import Section, Table, write_page
 
-LABORATORIES: Mapping[str, Mapping[str, float]] = {
-    "quiet": {"snr_db": 60.0},
-    "noisy": {"snr_db": 40.0, "trigger_jitter_rms": 200e-9},
-}
 _SEED = 0
 _READING = (
     "Rows and columns named paper are what the paper measured; all other numbers come from "

@@ -321,11 +321,15 @@ def fitted_voltage(
     states = system.C.shape[0]
     q = jnp.zeros(states + 3)
 
-    def residual(q):
-        late = late_calibration(records, source, load, r_load, q[:states]).v_out
+    def residual(q, late):
         return predict(system, records, q[:-1]) + q[-1] * late - measured(records, q[:-1])
 
-    for _ in range(3):  # linear but for the delay, which is a small fraction of a sample
-        basis = jax.jacfwd(residual)(q)
-        q = q - jnp.linalg.lstsq(basis, residual(q))[0]
-    return residual(q) + records.v_out[:, 0]
+    # Linear but for the delay, which is a small fraction of a sample, and for the state in `late`,
+    # which is that of the step before: a state that decays within a sample multiplied by the delay
+    # of the calibration would leave the first sample at any voltage.
+    late = jnp.zeros_like(records.v_out[:, 0])
+    for _ in range(3):
+        late = late_calibration(records, source, load, r_load, q[:states]).v_out
+        basis = jax.jacfwd(residual)(q, late)
+        q = q - jnp.linalg.lstsq(basis, residual(q, late))[0]
+    return residual(q, late) + records.v_out[:, 0]

@@ -50,8 +50,8 @@ def _figure(
     return figure, axes
 
 
-def _pulse(recording: Recording) -> slice:
-    """Samples around the first edge whose surroundings lie inside the record."""
+def pulse(recording: Recording) -> slice:
+    """Samples around the first edge whose surroundings lie inside the record: one pulse."""
     v = recording.v_th
     steep = np.abs(np.diff(v))
     before = int(BEFORE * recording.sample_rate)
@@ -66,7 +66,7 @@ def plot_recording(recording: Recording) -> Figure:
     """Unloaded and loaded voltage: the whole record, and one pulse."""
     figure, axes = _figure(1, 2, (9.0, 3.0))
     milliseconds = 1e3 * recording.time
-    for axis, part in ((axes[0, 0], slice(None)), (axes[0, 1], _pulse(recording))):
+    for axis, part in ((axes[0, 0], slice(None)), (axes[0, 1], pulse(recording))):
         axis.plot(milliseconds[part], recording.v_th[part], color=INK, lw=0.9, label="V_th")
         axis.plot(
             milliseconds[part], recording.v_out[part], "--", color=BLUE, lw=0.9, label="V_out"
@@ -96,11 +96,26 @@ def plot_fit(
             f"predicted has shape {predicted.shape}, the recording {recording.v_out.shape}"
         )
     figure, axes = _figure(2, 1, (6.0, 4.5), sharex=True, gridspec_kw={"height_ratios": [3, 1.2]})
-    part = _pulse(recording)
+    draw_fit(axes[0, 0], axes[1, 0], recording, predicted)
+    figure.suptitle(title or recording.path)
+    return figure
+
+
+def draw_fit(
+    upper: Axes, lower: Axes, recording: Recording, predicted: Float[np.ndarray, " time"]
+) -> None:
+    """What `plot_fit` shows, on the axes of another figure.
+
+    Args:
+        upper: Axes of the pulse.
+        lower: Axes of the residual.
+        recording: What was measured.
+        predicted: Terminal voltage [V]; NaN where there is no prediction.
+    """
+    part = pulse(recording)
     milliseconds = 1e3 * recording.time[part]
     known = np.isfinite(predicted)
     error = float(rrse(jnp.asarray(predicted[known]), jnp.asarray(recording.v_out[known])))
-    upper, lower = axes[:, 0]
     upper.plot(milliseconds, recording.v_th[part], ":", color="0.55", lw=1.0, label="V_th")
     upper.plot(milliseconds, recording.v_out[part], color=INK, lw=1.4, label="V_out measured")
     upper.plot(
@@ -113,8 +128,6 @@ def plot_fit(
     lower.axhline(0.0, color="0.6", lw=0.6)
     lower.plot(milliseconds, residual[part], color=BLUE, lw=0.8)
     lower.set(xlabel="time [ms]", ylabel="residual [mV]")
-    figure.suptitle(title or recording.path)
-    return figure
 
 
 def plot_impedance(

@@ -1,0 +1,205 @@
+"""The paper's tables as tidy rows: one per laboratory, method and element, beside what it prints.
+
+Errors, spreads and scatters are in per cent, elements in SI units. A fit without a circuit (an
+estimate that is negative or complex) enters no statistics; `circuits` of `fits` do.
+"""
+
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+import etid
+from etid import experiments
+from etid.circuits import DISPLAY
+from etid.experiments import ORDER, Outcome, Truth
+from etid.report import Table
+
+Row = dict[str, Any]
+Groups = Mapping[tuple[str, str], Sequence[Outcome]]
+"""The studies of each laboratory and method."""
+
+
+def with_circuit(fits: etid.Fits) -> etid.Fits:
+    """The fits that found a circuit."""
+    values = np.array([getattr(fits.circuit, name) for name in fits.circuit.names()])
+    return fits.take(np.isfinite(values).all(axis=0))
+
+
+def _sd(values: np.ndarray) -> float:
+    return float(np.std(values, ddof=1)) if values.size > 1 else np.nan
+
+
+def _mean(values: Iterable[float]) -> float:
+    finite = [value for value in values if np.isfinite(value)]
+    return float(np.mean(finite)) if finite else np.nan
+
+
+def table_1(groups: Groups) -> list[Row]:
+    """Errors of five known resistors, over the studies."""
+    rows = []
+    for (laboratory, method), outcomes in groups.items():
+        found = [experiments.resistor_errors(outcome) for outcome in outcomes]
+        for r, paper in experiments.TABLE_1.items():
+            every = np.array([of[r] for of in found])
+            some = every[np.isfinite(every)]
+            rows.append(
+                {
+                    "laboratory": laboratory,
+                    "method": method,
+                    "r": r,
+                    "paper_error": paper,
+                    "error": _mean(some),
+                    "spread": _sd(some),
+                    "rms": float(np.sqrt(_mean(some**2))),
+                    "circuits": some.size,
+                    "fits": every.size,
+                }
+            )
+    return rows
+
+
+def table_fingertips(groups: Groups, truth: Truth, condition: str) -> list[Row]:
+    """Table II (dry) or III (damp); means over the studies of `experiments.Fingertips`."""
+    rows = []
+    for (laboratory, method), outcomes in groups.items():
+        every = [outcome.skins.where(condition=condition) for outcome in outcomes]
+        some = [fits for fits in map(with_circuit, every) if _is_complete(fits, every[0])]
+        for name in ORDER:
+            typical, lowest, highest = experiments.FINGERTIPS[condition][name]
+            found = [vars(experiments.fingertips(fits, truth, name)) for fits in some]
+            fields = experiments.Fingertips.__dataclass_fields__
+            rows.append(
+                {
+                    "laboratory": laboratory,
+                    "method": method,
+                    "element": name,
+                    "paper_typical": typical,
+                    "paper_lowest": lowest,
+                    "paper_highest": highest,
+                    **{field: _mean(of[field] for of in found) for field in fields},
+                    "successful": sum(len(fits.successful()) for fits in every),
+                    "circuits": sum(len(with_circuit(fits)) for fits in every),
+                    "fits": sum(map(len, every)),
+                }
+            )
+    return rows
+
+
+def _is_complete(fits: etid.Fits, every: etid.Fits) -> bool:
+    """Whether every subject has a circuit left, and the typical fingertip a spread."""
+    counts = dict(zip(*np.unique(fits.labels["subject"], return_counts=True), strict=True))
+    return counts.keys() == set(every.labels["subject"]) and counts["typical"] > 1
+
+
+def table_4(groups: Groups, truth: Truth) -> list[Row]:
+    """The built circuit: mean error and scatter of the trials of a study.
+
+    `error` is the mean over all studies, `between` the standard deviation of the studies' means,
+    which is the error of their calibrations; `scatter` that of the trials within a study.
+    `stderr` is the standard error of a study's mean as the fits tell it: what they share, and the
+    mean of what they do not.
+    """
+    rows = []
+    for (laboratory, method), outcomes in groups.items():
+        every = [outcome.skins.where(condition="built") for outcome in outcomes]
+        some = [fits for fits in map(with_circuit, every) if len(fits) > 1]
+        for i, name in enumerate(etid.SkinRC.names()):
+            found = [experiments.errors(fits, truth)[name] for fits in some]
+            means = np.array([errors.mean() for errors in found])
+            paper_error, paper_scatter = experiments.TABLE_4[name]
+            rows.append(
+                {
+                    "laboratory": laboratory,
+                    "method": method,
+                    "element": name,
+                    "paper_error": paper_error,
+                    "paper_scatter": paper_scatter,
+                    "error": _mean(means),
+                    "between": _sd(means),
+                    "scatter": float(np.sqrt(_mean(errors.var(ddof=1) for errors in found))),
+                    "stderr": _mean(_stderr_of_mean(fits, truth, i) for fits in some),
+                    "rrse": 100 * float(np.median([np.median(fits.rrse) for fits in every])),
+                    "successful": sum(len(fits.successful()) for fits in every),
+                    "circuits": sum(len(with_circuit(fits)) for fits in every),
+                    "fits": sum(map(len, every)),
+                    "studies": len(some),
+                }
+            )
+    return sorted(rows, key=lambda row: ORDER.index(row["element"]))
+
+
+def _stderr_of_mean(fits: etid.Fits, truth: Truth, i: int) -> float:
+    """Standard error of the mean of element i over trials with one driver [%]."""
+    known = truth[str(fits.labels["path"][0])][etid.SkinRC.names()[i]]
+    total, shared = (np.asarray(cov)[:, i, i].mean() for cov in (fits.cov, fits.fit.shared_cov))
+    return float(100 / known * np.sqrt(shared + (total - shared) / len(fits)))
+
+
+def _number(value: float) -> str:
+    """Two decimals, readable also where an estimate has run away."""
+    return f"{value:.2f}" if abs(value) < 1e4 else f"{value:.3g}"
+
+
+def show_1(rows: Sequence[Row]) -> Table:
+    """Table I for the terminal: mean error ± spread between studies."""
+    names = list(dict.fromkeys((row["laboratory"], row["method"]) for row in rows))
+    resistances = experiments.TABLE_1
+    lines = [("paper", "", *(f"{error:g}" for error in resistances.values()), "")]
+    for name in names:
+        of = [row for row in rows if (row["laboratory"], row["method"]) == name]
+        cells = (
+            _number(row["error"]) + (f" ± {_number(row['spread'])}" if row["circuits"] > 1 else "")
+            for row in of
+        )
+        circuits, fits = (sum(row[key] for row in of) for key in ("circuits", "fits"))
+        lines.append((*name, *cells, f"{circuits}/{fits}"))
+    heads = (f"{r / 1e3:g} kΩ" for r in resistances)
+    return Table(("records", "method", *heads, "circuits"), tuple(lines))
+
+
+def show_fingertips(rows: Sequence[Row]) -> Table:
+    """Table II or III for the terminal."""
+    lines = []
+    for name in ORDER:
+        of = [row for row in rows if row["element"] == name]
+        scale, symbol = DISPLAY[etid.SkinRC.units()[name]]
+        span = "{:.3g} to {:.3g}".format
+        paper = (of[0][f"paper_{key}"] / scale for key in ("typical", "lowest", "highest"))
+        first, *limits = paper
+        label = f"{name} [{symbol}]"
+        lines.append((label, "paper", "", f"{first:.3g}", "", "", span(*limits), "", "", "", ""))
+        lines += [
+            (
+                label,
+                row["laboratory"],
+                row["method"],
+                f"{row['typical'] / scale:.4g}",
+                *(_number(row[key]) for key in ("error", "spread")),
+                span(row["lowest"] / scale, row["highest"] / scale),
+                *(_number(row[key]) for key in ("subject_error", "worst")),
+                *(f"{row[key]}/{row['fits']}" for key in ("circuits", "successful")),
+            )
+            for row in of
+        ]
+    heads = ("element", "records", "method", "typical", "error", "spread", "subjects", "error")
+    return Table((*heads, "worst", "circuits", "successful"), tuple(lines))
+
+
+def show_4(rows: Sequence[Row]) -> Table:
+    """Table IV for the terminal: mean error / scatter within a study, and between studies."""
+    names = list(dict.fromkeys((row["laboratory"], row["method"]) for row in rows))
+    paper = (f"±{error:g} / {scatter:g}" for error, scatter in experiments.TABLE_4.values())
+    lines = [("paper", "", *paper, "{} to {}".format(*experiments.RRSE), "", "")]
+    for name in names:
+        of = {row["element"]: row for row in rows if (row["laboratory"], row["method"]) == name}
+        cells = (
+            f"{_number(of[e]['error'])} / {_number(of[e]['scatter'])}"
+            + (f" ({_number(of[e]['between'])})" if of[e]["studies"] > 1 else "")
+            for e in ORDER
+        )
+        row = of[ORDER[0]]
+        counts = (f"{row[key]}/{row['fits']}" for key in ("circuits", "successful"))
+        lines.append((*name, *cells, _number(row["rrse"]), *counts))
+    heads = (f"{name} [%]" for name in ORDER)
+    return Table(("records", "method", *heads, "RRSE [%]", "circuits", "successful"), tuple(lines))
