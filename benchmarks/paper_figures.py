@@ -88,7 +88,6 @@ def pulses(study: etid.Study, path: pathlib.Path) -> None:
     axes[0, 1].set(xlabel="time [ms]", title="one pulse, V_out")
     axes[0, 1].legend(frameon=False, fontsize=8)
     charts.save(figure, path)
-    __import__("os").environ.get("PNG") and charts.save(figure, path.with_suffix(".png"))
 
 
 def driver(study: etid.Study, found: etid.Driver, path: pathlib.Path) -> None:
@@ -103,7 +102,6 @@ def driver(study: etid.Study, found: etid.Driver, path: pathlib.Path) -> None:
         kind = "calibration" if record.r_load else "not in the calibration"
         column[0].set_title(f"{r / 1e3:g} kΩ, {kind}", fontsize=10)
     charts.save(figure, path)
-    __import__("os").environ.get("PNG") and charts.save(figure, path.with_suffix(".png"))
 
 
 def fingertip(
@@ -132,7 +130,6 @@ def fingertip(
     _bode(*axes[:, 2], impedances)
     axes[0, 2].set_title(f"impedance, {_settings(NOISY)}", fontsize=9)
     charts.save(figure, path)
-    __import__("os").environ.get("PNG") and charts.save(figure, path.with_suffix(".png"))
 
 
 def _settings(laboratory: str) -> str:
@@ -178,7 +175,6 @@ def subjects(first: Mapping[tuple[str, str], Outcome], truth: Truth, path: pathl
         column[-1].set_xlabel("subject")
     _legend_above(figure, axes[0, 0])
     charts.save(figure, path)
-    __import__("os").environ.get("PNG") and charts.save(figure, path.with_suffix(".png"))
 
 
 def _elements_of(
@@ -250,4 +246,3 @@ def causes(rows: Sequence[Row], path: pathlib.Path) -> None:
     axes[0, 0].invert_yaxis()
     _legend_above(figure, axes[0, 0])
     charts.save(figure, path)
-    __import__("os").environ.get("PNG") and charts.save(figure, path.with_suffix(".png"))
