@@ -194,6 +194,19 @@ def test_prediction_equals_the_record_within_noise(study, driver):
         etid.predict(recording, driver)
 
 
+def test_prediction_holds_from_the_first_sample_behind_a_late_calibration():
+    """Its delay times a state that decays within a sample once left that sample at 300 V."""
+    late = scene(snr_db=40.0, trigger_jitter_rms=200e-9).simulate(seed=1)
+    driver = etid.identify_driver(late["calibration/98k8"])
+    for path in ("s01/damp/0", "s01/damp/1", "s01/damp/2"):
+        recording = late[path]
+        fit = etid.identify_skin(recording, driver, throw=False)
+        residual = etid.predict(recording, driver, fit.circuit) - recording.v_out
+        # 1 % of V_th in each of two records, of which damp skin leaves two thirds
+        assert np.nanstd(residual) < 0.03 * np.std(recording.v_out)
+        assert np.nanmax(np.abs(residual)) < 0.1 * np.ptp(recording.v_out)
+
+
 def test_a_circuit_of_ones_own_is_identified(driver):
     resistors = scene(trials=(Trial("r/21k62", ResistorLoad(21.62e3)),)).simulate(seed=9)
     recording = next(iter(resistors.loaded.recordings()))

@@ -1,5 +1,8 @@
 """Tables and pages, and the arithmetic of the demo's tables."""
 
+import argparse
+import csv
+import dataclasses
 import html.parser
 import re
 
@@ -8,6 +11,7 @@ import numpy as np
 import pytest
 
 import etid
+from benchmarks import paper, paper_tables
 from etid import demo, experiments, report
 from etid.verdicts import verdict, verdicts_of
 
@@ -60,12 +64,12 @@ def test_page_is_whole_escaped_and_needs_no_other_file(tmp_path):
     assert "href" not in page
 
 
-def _fits(circuit, paths, elements):
-    """Fits of which every element is `EXCESS` times the true one, half successful."""
+def _fits(circuit, paths, elements, excess):
+    """Fits of which every element is `excess` times the true one, half successful."""
     study = etid.scenes.paper()
     labels = {trial.path: trial for trial in study.trials}
     values = {
-        name: np.array([EXCESS * element[name] for element in elements]) for name in circuit.names()
+        name: np.array([excess * element[name] for element in elements]) for name in circuit.names()
     }
     size, count = len(values), len(paths)
     cov = np.zeros((count, size, size))
@@ -80,8 +84,7 @@ def _fits(circuit, paths, elements):
     return etid.Fits(fit, columns, np.full(count, ""))
 
 
-@pytest.fixture
-def outcome():
+def _outcome(excess):
     truth = etid.scenes.paper().truth()
     skins = [path for path in truth if "r_s" in truth[path]]
     resistors = [path for path in truth if path.startswith("resistors/")]
@@ -94,9 +97,14 @@ def outcome():
         "quiet",
         "output_error",
         driver,
-        _fits(etid.SkinRC, skins, [truth[path] for path in skins]),
-        _fits(etid.Resistor, resistors, [truth[path] for path in resistors]),
+        _fits(etid.SkinRC, skins, [truth[path] for path in skins], excess),
+        _fits(etid.Resistor, resistors, [truth[path] for path in resistors], excess),
     )
+
+
+@pytest.fixture
+def outcome():
+    return _outcome(EXCESS)
 
 
 def test_demo_tables_show_the_error_that_was_made(outcome):
@@ -116,3 +124,119 @@ def test_demo_tables_show_the_error_that_was_made(outcome):
     assert built[2:] == ("10.00 / 0.00",) * 3 + ("5.00", "12/23")
     verdicts = demo.table_verdicts([outcome], truth).rows[0]
     assert verdicts[2:] == ("successful", "72 successful, 71 misfit", *("100 %",) * 3)
+
+
+# --- the paper's tables by cause (benchmarks/paper.py) --------------------------------------------
+
+
+@pytest.fixture
+def groups(outcome):
+    """Two studies whose elements are 10 and 30 % too large."""
+    return {("good", "output_error"): [outcome, _outcome(1.3)]}
+
+
+def test_tables_tell_errors_of_studies_from_scatter_of_trials(groups):
+    truth = etid.scenes.paper().truth()
+    between = np.sqrt(200.0)  # standard deviation of 10 and 30
+    for row in paper_tables.table_1(groups):
+        assert (row["circuits"], row["fits"]) == (2, 2)
+        found = [row[name] for name in ("error", "spread", "rms")]
+        np.testing.assert_allclose(found, [20.0, between, np.sqrt(500.0)])
+    rows = paper_tables.table_4(groups, truth)
+    assert [row["element"] for row in rows] == ["r_p", "c_p", "r_s"]
+    for row in rows:
+        assert (row["circuits"], row["successful"], row["studies"]) == (46, 24, 2)
+        found = [row[name] for name in ("error", "between", "scatter", "rrse")]
+        np.testing.assert_allclose(found, [20.0, between, 0.0, 5.0], atol=1e-9)
+        # every fit has an error of 100 %, nothing is shared, and a study has 23 trials
+        assert row["stderr"] == pytest.approx(100 * 1.2 / np.sqrt(23))
+    for condition in ("dry", "damp"):
+        for row in paper_tables.table_fingertips(groups, truth, condition):
+            found = [row[name] for name in ("error", "spread", "subject_error", "worst")]
+            np.testing.assert_allclose(found, [20.0, 0.0, 20.0, 20.0], atol=1e-9)
+            assert row["paper_typical"] == experiments.FINGERTIPS[condition][row["element"]][0]
+
+
+def _without(fits, rows):
+    """The same fits, of which some found no circuit."""
+    values = {name: np.array(getattr(fits.circuit, name)) for name in fits.circuit.names()}
+    for column in values.values():
+        column[rows] = np.nan
+    circuit = type(fits.circuit)(**values)
+    return dataclasses.replace(fits, fit=dataclasses.replace(fits.fit, circuit=circuit))
+
+
+def test_fits_without_a_circuit_are_counted_and_left_out(outcome):
+    truth = etid.scenes.paper().truth()
+    lost = np.isin(outcome.skins.labels["path"], ["built/01", "typical/dry/01"])
+    lost |= outcome.skins.labels["subject"] == "s05"
+    some = dataclasses.replace(outcome, skins=_without(outcome.skins, lost))
+    groups = {("good", "output_error"): [some]}
+    for row in paper_tables.table_4(groups, truth):
+        assert (row["circuits"], row["fits"]) == (22, 23)
+        assert row["error"] == pytest.approx(10.0)
+    for row in paper_tables.table_fingertips(groups, truth, "dry"):
+        assert (row["circuits"], row["fits"]) == (54, 60)
+        assert np.isnan(row["error"])  # a subject has none left: this study says nothing of ten
+
+
+def test_tables_by_cause_print_the_paper_first(groups):
+    truth = etid.scenes.paper().truth()
+    first = paper_tables.show_1(paper_tables.table_1(groups))
+    assert first.rows[0] == ("paper", "", "4.26", "0.42", "9.6", "12.2", "0.25", "")
+    assert first.rows[1] == ("good", "output_error", *("20.00 ± 14.14",) * 5, "10/10")
+    fourth = paper_tables.show_4(paper_tables.table_4(groups, truth))
+    assert fourth.rows[0][2:6] == ("±2.46 / 17.5", "±10.4 / 26.9", "±15.5 / 43.2", "4 to 13")
+    assert fourth.rows[1][2:] == (*("20.00 / 0.00 (14.14)",) * 3, "5.00", "46/46", "24/46")
+    second = paper_tables.show_fingertips(paper_tables.table_fingertips(groups, truth, "dry"))
+    assert second.rows[0][3] == "186"
+    assert second.rows[1][0:2] == ("r_p [kΩ]", "good")
+
+
+def test_each_cause_is_one_change_of_the_good_laboratory():
+    good, both = paper.LABORATORIES["good"], paper.LABORATORIES["both"]
+    default = {"trigger_jitter_rms": 0.0, **good}
+    for name, settings in paper.LABORATORIES.items():
+        changed = [key for key, value in {**default, **settings}.items() if value != default[key]]
+        assert len(changed) == {"good": 0, "both": 2}.get(name, 1)
+    alone = [paper.LABORATORIES[name] for name in ("noise 40 dB", "delays 200 ns")]
+    assert {**alone[1], **alone[0]} == both
+
+
+def test_a_quick_study_has_some_of_everything():
+    few, whole = paper.scene_of("both", True), paper.scene_of("both", False)
+    assert len(few.trials) < len(whole.trials) / 4
+    assert {trial.condition for trial in few.trials} == {t.condition for t in whole.trials}
+    paths = {trial.path for trial in few.trials}
+    assert {"resistors/555k", "typical/damp/01", "s03/dry/03"} <= paths
+    assert "s04/dry/01" not in paths
+
+
+def test_what_is_missed_is_said(groups):
+    truth = etid.scenes.paper().truth()
+    same = {
+        ("good", paper.DEFAULT): groups["good", "output_error"],
+        (paper.OWN_NOISE, paper.DEFAULT): groups["good", "output_error"],
+    }
+    first, fourth = paper_tables.table_1(same), paper_tables.table_4(same, truth)
+    assert [met for _, met in paper.check(first, fourth)] == [False, True, True, True]
+    for row in fourth:
+        row["stderr"] /= 10.0
+    found = paper.check(first, fourth)
+    assert [met for _, met in found] == [False] * 4
+    assert "r_p is off by 20.00 %" in found[1][0]
+
+
+@pytest.mark.slow
+def test_the_papers_tables_and_figures_are_made(tmp_path, capsys):
+    parser = argparse.ArgumentParser()
+    paper.add_arguments(parser)
+    assert paper.main(parser.parse_args(["--quick", "--folder", str(tmp_path)]))
+    for number in (1, 2, 3, 4):
+        with (tmp_path / f"table_{number}.csv").open() as file:
+            rows = list(csv.DictReader(file))
+        assert {row["laboratory"] for row in rows} == set(paper.LABORATORIES)
+        assert {row["source"] for row in rows} == {"simulated"}
+    for name in ("figure_3", "figure_7", "figure_8", "figure_9", "figure_10", "table_4"):
+        assert (tmp_path / f"{name}.svg").read_text().startswith("<?xml")
+    assert "white noise alone shifts all trials by -28" in capsys.readouterr().out
