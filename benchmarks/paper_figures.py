@@ -21,6 +21,7 @@ from collections.abc import Mapping, Sequence
 import jax.numpy as jnp
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.axis import Axis
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullFormatter
 
@@ -95,12 +96,12 @@ def driver(study: etid.Study, found: etid.Driver, path: pathlib.Path) -> None:
     figure, axes = charts.new(2, 3, (12, 4.6), gridspec_kw=HEIGHTS, sharex="col")
     known = experiments.TABLE_1
     resistances = {etid.scenes.resistor_label(r): r for r in known}
-    for column, of in zip(axes.T, (CALIBRATION, *RESISTORS), strict=True):
+    for (upper, lower), of in zip(axes.T, (CALIBRATION, *RESISTORS), strict=True):
         record = study[of]
         r = record.r_load or resistances[of.rpartition("/")[2]]
-        plotting.draw_fit(*column, record, etid.predict(record, found, etid.Resistor(r)))
+        plotting.draw_fit(upper, lower, record, etid.predict(record, found, etid.Resistor(r)))
         kind = "calibration" if record.r_load else "not in the calibration"
-        column[0].set_title(f"{r / 1e3:g} kΩ, {kind}", fontsize=10)
+        upper.set_title(f"{r / 1e3:g} kΩ, {kind}", fontsize=10)
     charts.save(figure, path)
 
 
@@ -114,20 +115,20 @@ def fingertip(
     """Figures 8 and 9: a fingertip as the default method finds it, and its impedance."""
     figure, axes = charts.new(2, 3, (12.5, 4.8), gridspec_kw=HEIGHTS)
     name = f"typical/{condition}/01"
-    for column, laboratory in zip(axes.T, (GOOD, NOISY), strict=False):
+    for (upper, lower), laboratory in zip(axes.T[:2], (GOOD, NOISY), strict=True):
         record, outcome = shown[laboratory][name], first[laboratory, OURS]
         skin = outcome.skins.where(path=name)[0].circuit
-        plotting.draw_fit(*column, record, etid.predict(record, outcome.driver, skin))
-        column[0].sharex(column[1])
-        column[0].tick_params(labelbottom=False)
-        column[0].set_title(f"{condition}, {_settings(laboratory)}\n{_elements(skin)}", fontsize=9)
-    impedances = {"truth": etid.SkinRC(**truth[name])}
+        plotting.draw_fit(upper, lower, record, etid.predict(record, outcome.driver, skin))
+        upper.sharex(lower)
+        upper.tick_params(labelbottom=False)
+        upper.set_title(f"{condition}, {_settings(laboratory)}\n{_elements(skin)}", fontsize=9)
+    impedances: dict[str, plotting.HasResponse] = {"truth": etid.SkinRC(**truth[name])}
     for method, label in LABELS.items():
         fits = with_circuit(first[NOISY, method].skins.where(path=name))
         if len(fits):
             impedances[label] = fits[0].circuit
     impedances["Z_th"] = first[NOISY, OURS].driver
-    _bode(*axes[:, 2], impedances)
+    _bode(axes[0, 2], axes[1, 2], impedances)
     axes[0, 2].set_title(f"impedance, {_settings(NOISY)}", fontsize=9)
     charts.save(figure, path)
 
@@ -154,9 +155,18 @@ def _bode(magnitude: Axes, phase: Axes, impedances: Mapping[str, plotting.HasRes
         magnitude.loglog(f / 1e3, np.abs(z) / 1e3, label=label, **style)
         phase.semilogx(f / 1e3, np.degrees(np.angle(z)), **style)
     magnitude.set(ylabel="|Z| [kΩ]")
+    _one_two_five(magnitude.yaxis)
+    phase.xaxis.set_major_formatter("{x:g}")
     magnitude.tick_params(labelbottom=False)
     magnitude.legend(frameon=False, fontsize=8)
     phase.set(xlabel="frequency [kHz]", ylabel="phase [deg]")
+
+
+def _one_two_five(axis: Axis) -> None:
+    """Numbers of a logarithmic axis that may span less than a decade."""
+    axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    axis.set_major_formatter("{x:g}")
+    axis.set_minor_formatter(NullFormatter())
 
 
 def _legend_above(figure: Figure, axes: Axes) -> None:
@@ -172,7 +182,7 @@ def subjects(first: Mapping[tuple[str, str], Outcome], truth: Truth, path: pathl
         for axis, name in zip(column, ORDER, strict=True):
             _elements_of(axis, first, truth, condition, name)
         column[0].set_title(f"{condition}, {_settings(NOISY)}", fontsize=10)
-        column[-1].set_xlabel("subject")
+        column[-1].set_xlabel("subject; typ.: the typical fingertip")
     _legend_above(figure, axes[0, 0])
     charts.save(figure, path)
 
@@ -209,12 +219,12 @@ def _elements_of(
             known = [truth[of][name] / scale for of in first_paths]
             span = np.arange(len(order))
             axis.hlines(known, span - 0.42, span + 0.42, color=charts.INK, lw=1.2, label="truth")
-            axis.set_xticks(span, [label.removeprefix("s") for label in order])
+            axis.set_xticks(
+                span, [label.removeprefix("s").replace("typical", "typ.") for label in order]
+            )
     axis.set_yscale("log")
     axis.set_ylim(low, high)
-    axis.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
-    axis.yaxis.set_major_formatter("{x:g}")
-    axis.yaxis.set_minor_formatter(NullFormatter())
+    _one_two_five(axis.yaxis)
     axis.set_ylabel(f"{name} [{symbol}]")
     if outside:
         axis.text(0.99, 0.97, "\n".join(outside), transform=axis.transAxes, ha="right", va="top",

@@ -13,7 +13,7 @@ import etid
 from etid import experiments
 from etid.circuits import DISPLAY
 from etid.experiments import ORDER, Outcome, Truth
-from etid.report import Table
+from etid.report import Table, number
 
 Row = dict[str, Any]
 Groups = Mapping[tuple[str, str], Sequence[Outcome]]
@@ -23,7 +23,7 @@ Groups = Mapping[tuple[str, str], Sequence[Outcome]]
 def with_circuit(fits: etid.Fits) -> etid.Fits:
     """The fits that found a circuit."""
     values = np.array([getattr(fits.circuit, name) for name in fits.circuit.names()])
-    return fits.take(np.isfinite(values).all(axis=0))
+    return fits.take(np.asarray(np.isfinite(values).all(axis=0)))
 
 
 def _sd(values: np.ndarray) -> float:
@@ -136,20 +136,17 @@ def _stderr_of_mean(fits: etid.Fits, truth: Truth, i: int) -> float:
     return float(100 / known * np.sqrt(shared + (total - shared) / len(fits)))
 
 
-def _number(value: float) -> str:
-    """Two decimals, readable also where an estimate has run away."""
-    return f"{value:.2f}" if abs(value) < 1e4 else f"{value:.3g}"
-
-
 def show_1(rows: Sequence[Row]) -> Table:
     """Table I for the terminal: mean error ± spread between studies."""
     names = list(dict.fromkeys((row["laboratory"], row["method"]) for row in rows))
     resistances = experiments.TABLE_1
-    lines = [("paper", "", *(f"{error:g}" for error in resistances.values()), "")]
+    lines: list[tuple[str, ...]] = [
+        ("paper", "", *(f"{error:g}" for error in resistances.values()), "")
+    ]
     for name in names:
         of = [row for row in rows if (row["laboratory"], row["method"]) == name]
         cells = (
-            _number(row["error"]) + (f" ± {_number(row['spread'])}" if row["circuits"] > 1 else "")
+            number(row["error"]) + (f" ± {number(row['spread'])}" if row["circuits"] > 1 else "")
             for row in of
         )
         circuits, fits = (sum(row[key] for row in of) for key in ("circuits", "fits"))
@@ -160,7 +157,7 @@ def show_1(rows: Sequence[Row]) -> Table:
 
 def show_fingertips(rows: Sequence[Row]) -> Table:
     """Table II or III for the terminal."""
-    lines = []
+    lines: list[tuple[str, ...]] = []
     for name in ORDER:
         of = [row for row in rows if row["element"] == name]
         scale, symbol = DISPLAY[etid.SkinRC.units()[name]]
@@ -175,9 +172,9 @@ def show_fingertips(rows: Sequence[Row]) -> Table:
                 row["laboratory"],
                 row["method"],
                 f"{row['typical'] / scale:.4g}",
-                *(_number(row[key]) for key in ("error", "spread")),
+                *(number(row[key]) for key in ("error", "spread")),
                 span(row["lowest"] / scale, row["highest"] / scale),
-                *(_number(row[key]) for key in ("subject_error", "worst")),
+                *(number(row[key]) for key in ("subject_error", "worst")),
                 *(f"{row[key]}/{row['fits']}" for key in ("circuits", "successful")),
             )
             for row in of
@@ -190,16 +187,18 @@ def show_4(rows: Sequence[Row]) -> Table:
     """Table IV for the terminal: mean error / scatter within a study, and between studies."""
     names = list(dict.fromkeys((row["laboratory"], row["method"]) for row in rows))
     paper = (f"±{error:g} / {scatter:g}" for error, scatter in experiments.TABLE_4.values())
-    lines = [("paper", "", *paper, "{} to {}".format(*experiments.RRSE), "", "")]
+    lines: list[tuple[str, ...]] = [
+        ("paper", "", *paper, "{} to {}".format(*experiments.RRSE), "", "")
+    ]
     for name in names:
         of = {row["element"]: row for row in rows if (row["laboratory"], row["method"]) == name}
         cells = (
-            f"{_number(of[e]['error'])} / {_number(of[e]['scatter'])}"
-            + (f" ({_number(of[e]['between'])})" if of[e]["studies"] > 1 else "")
+            f"{number(of[e]['error'])} / {number(of[e]['scatter'])}"
+            + (f" ({number(of[e]['between'])})" if of[e]["studies"] > 1 else "")
             for e in ORDER
         )
         row = of[ORDER[0]]
         counts = (f"{row[key]}/{row['fits']}" for key in ("circuits", "successful"))
-        lines.append((*name, *cells, _number(row["rrse"]), *counts))
+        lines.append((*name, *cells, number(row["rrse"]), *counts))
     heads = (f"{name} [%]" for name in ORDER)
     return Table(("records", "method", *heads, "RRSE [%]", "circuits", "successful"), tuple(lines))

@@ -38,7 +38,7 @@ from etid.experiments import (
     identify,
     resistor_errors,
 )
-from etid.report import Section, Table, write_page
+from etid.report import Section, Table, number, write_page
 
 _SEED = 0
 _READING = (
@@ -50,11 +50,6 @@ _READING = (
 )
 
 
-def _number(value: float | np.floating) -> str:
-    """Two decimals, readable also where an estimate has run away."""
-    return f"{value:.2f}" if abs(value) < 1e4 else f"{value:.3g}"
-
-
 def _successes(fits: etid.Fits) -> str:
     return f"{len(fits.successful())}/{len(fits)}"
 
@@ -64,7 +59,7 @@ def table_1(outcomes: Sequence[Outcome]) -> Table:
     heads = tuple(f"{name} {outcome.method}" for outcome in outcomes for name in outcome.names[:1])
     found = [resistor_errors(outcome) for outcome in outcomes]
     rows = tuple(
-        (f"{r / 1e3:g}", f"{paper:g}", *(_number(errors_of[r]) for errors_of in found))
+        (f"{r / 1e3:g}", f"{paper:g}", *(number(errors_of[r]) for errors_of in found))
         for r, paper in TABLE_1.items()
     )
     return Table(("R [kΩ]", "paper", *heads), rows)
@@ -88,11 +83,11 @@ def table_fingertips(outcomes: Sequence[Outcome], truth: Truth, condition: str) 
                     *outcome.names,
                     label,
                     f"{found.typical / scale:.4g}",
-                    _number(found.error),
-                    _number(found.spread),
+                    number(found.error),
+                    number(found.spread),
                     span(found.lowest / scale, found.highest / scale),
-                    _number(found.subject_error),
-                    _number(found.worst),
+                    number(found.subject_error),
+                    number(found.worst),
                     _successes(skins),
                 )
             )
@@ -121,10 +116,10 @@ def table_4(outcomes: Sequence[Outcome], truth: Truth) -> Table:
         built = outcome.skins.where(condition="built")
         found = errors(built, truth)
         cells = [
-            f"{_number(np.mean(found[name]))} / {_number(np.std(found[name], ddof=1))}"
+            f"{number(np.mean(found[name]))} / {number(np.std(found[name], ddof=1))}"
             for name in ORDER
         ]
-        quality = _number(100 * float(np.median(built.rrse)))
+        quality = number(100 * float(np.median(built.rrse)))
         rows.append((*outcome.names, *cells, quality, _successes(built)))
     heads = tuple(f"{name} [%]" for name in ORDER)
     return Table(("records", "method", *heads, "RRSE [%]", "successful"), tuple(rows))

@@ -8,6 +8,8 @@ import pathlib
 import textwrap
 from collections.abc import Sequence
 
+import numpy as np
+
 _STYLE = """
 :root { color-scheme: light dark; --line: #8886; --soft: #8882; }
 body { font: 16px/1.5 system-ui, sans-serif; max-width: 76rem; margin: 2rem auto; padding: 0 1rem; }
@@ -70,6 +72,11 @@ class Table:
     def _is_text(self, column: int) -> bool:
         """Whether a column holds words, which are set to the left."""
         return all(row[column][:1].isalpha() for row in self.rows if row[column])
+
+
+def number(value: float | np.floating) -> str:
+    """Two decimals, readable also where an estimate has run away."""
+    return f"{value:.2f}" if abs(value) < 1e4 else f"{value:.3g}"
 
 
 @dataclasses.dataclass(frozen=True)
