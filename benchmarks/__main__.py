@@ -6,6 +6,8 @@ import sys
 
 import jax
 
+from benchmarks.ngspice import NgspiceError
+
 NAMES = (
     "spice",
     "coverage",
@@ -36,7 +38,10 @@ def main() -> None:
         module.add_arguments(command)
         command.set_defaults(main=module.main)
     arguments = parser.parse_args()
-    sys.exit(0 if arguments.main(arguments) else 1)
+    try:
+        sys.exit(0 if arguments.main(arguments) else 1)
+    except NgspiceError as error:
+        sys.exit(str(error))
 
 
 if __name__ == "__main__":

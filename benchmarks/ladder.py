@@ -7,6 +7,7 @@ one thing.
 from collections.abc import Callable, Mapping
 from typing import Any
 
+from benchmarks import ngspice
 from etid.scenes import Scene, Trial
 from etid.study import Study
 from etid.transformer import ResistorLoad, SkinLoad
@@ -20,7 +21,10 @@ CALIBRATION = "calibration/98k8"
 SNR_DB = (80, 60, 40, 30, 20)
 PERIODS = {1: 3_334, 10: 33_334, 30: 100_000}  # samples at 200 kHz
 SAMPLE_RATES = {"100 kHz": 100e3, "500 kHz": 500e3, "1 MHz": 1e6}
-SOURCES: Mapping[str, Callable[[Scene, int], Study]] = {"simulated": Scene.simulate}
+SOURCES: Mapping[str, Callable[[Scene, int], Study]] = {
+    "simulated": Scene.simulate,
+    "spice": ngspice.record,
+}
 JITTER = {"no delays": 0.0, "delays of 500 ns": 500e-9}
 
 

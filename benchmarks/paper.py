@@ -19,7 +19,8 @@ from collections.abc import Mapping, Sequence
 from tqdm import tqdm
 
 import etid
-from benchmarks import ngspice, paper_figures, paper_tables
+from benchmarks import paper_figures, paper_tables
+from benchmarks.ladder import SOURCES
 from benchmarks.paper_tables import Groups, Row
 from benchmarks.provenance import write_csv
 from etid.experiments import LABORATORIES as ENDS
@@ -35,7 +36,6 @@ LABORATORIES: Mapping[str, Mapping[str, float]] = {
     "both": ENDS["noisy"],
 }
 DEFAULT, THEIRS = METHODS
-SOURCES = {"simulated": Scene.simulate, "spice": ngspice.record}
 STUDIES = 4
 FEW = {"01", "02", "03"}  # trials of a quick run, and the last digits of its subjects
 RESISTOR_LIMIT = 0.1  # [%]
@@ -169,7 +169,4 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def main(arguments: argparse.Namespace) -> bool:
     """Run the command."""
-    try:
-        return run(arguments.folder, arguments.source, arguments.quick)
-    except ngspice.NgspiceError as error:
-        raise SystemExit(str(error)) from error
+    return run(arguments.folder, arguments.source, arguments.quick)
