@@ -1,0 +1,505 @@
+"""On-line: the loads at all electrodes of a display, identified anew with every pulse.
+
+    tracker = etid.Tracker.of(driver, unloaded, electrodes=98)
+    state = tracker.start()
+    for v_out in pulses:  # (electrode, sample), one period each
+        state = tracker.update(state, v_out)
+    print(tracker.read(state))
+
+An extended Kalman filter in information form, iterated at each pulse (Bell and Cathey 1993). For one
+electrode, with ϑ the logarithms of its elements, Λ their information and Ĝ the gains of `etid.bands`,
+
+    Λ⁻ = (Λ⁻¹ + q² 1)⁻¹                                              (a random walk of the skin)
+    minimise  |ϑ − ϑ⁻|²_Λ⁻ + Σ w |Ĝ e^(jωτ) − G(ϑ) − e^(j2πτ) A Ḡ_a(ϑ)|² / σ²   over ϑ and τ
+    Λ  = Λ⁻ + H_ϑϑ − H_ϑτ H_τϑ / H_ττ,                               H = JᵀJ
+
+where A Ḡ_a is what aliases.
+
+**The delay τ is taken as drawn anew at each pulse.** That is right if a trigger starts each window,
+and if the converter runs freely, where windows begin up to half a sample beside the pulse. A delay
+that all pulses share would be known better, but nothing else: the information on ϑ is the same sum.
+
+**A pulse that does not fit** changes nothing but the verdict. After several in a row, or if the
+pulses have long disagreed with the intervals, the electrode starts again, from generic values.
+
+Z_th stays as the calibrations have it: that many electrodes tell of it too is not used. Its error is
+that of no noise, and no number of pulses lessens it: it is `shared_cov`, with the noise of the
+unloaded record. Calibrate with two resistors, or an unknown delay of the calibration is error of C_p.
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Complex, Float, Int
+
+from etid.bands import Bands, cut, unloaded_bands
+from etid.circuits import AbstractCircuit, SkinRC
+from etid.driver import Driver
+from etid.estimation import circuit_starts
+from etid.given_driver import GivenDriver, combined
+from etid.information import inverse
+from etid.judging import MAX_STEPS_REACHED, SUCCESSFUL, misses
+from etid.lanes import given
+from etid.methods import check_driver
+from etid.output_error import DELAY_WIDTH
+from etid.precision import require_float64
+from etid.preflight import Inspected, preflight
+from etid.recording import Recording
+from etid.results import LABELS, Fit, Fits, IdentificationError
+from etid.traces import stored_jit
+from etid.transfer import as_complex, frequency_variable, power, reciprocal
+from etid.verdicts import RESULTS, first_verdict, message, verdicts_of
+
+STEPS = 2  # at one pulse, and one without a trial
+DAMPING, LOWER, RAISE = 1e-3, 0.1, 10.0  # of the first step, after a good one, after a bad one
+SETTLED = 0.1  # standard errors of a pulse from the minimum
+DELAYS = np.linspace(-1.5, 1.5, 31)  # [samples] one of a trigger, half a one of a window
+COARSE = DELAYS[::3]  # for starts
+FLAT = 4.0  # times the power that noise alone has
+PATIENCE = 5  # pulses that do not fit, in a row, after which an electrode starts again
+MEMORY = 30  # pulses over which their disagreement with the intervals is averaged
+STRAINED = 2.0  # of 1 expected; its standard deviation is 0.15
+
+
+class _Equations(NamedTuple):
+    """Normal equations of a pulse, and of what was known before it.
+
+    Attributes:
+        objective: Σ r² of both.
+        squares: Σ r² of the pulse.
+        gradient: Jᵀr of both.
+        curvature: JᵀJ of the pulse.
+        matrix: JᵀJ of both.
+    """
+
+    objective: Float[Array, ""]
+    squares: Float[Array, ""]
+    gradient: Float[Array, " own"]
+    curvature: Float[Array, "own own"]
+    matrix: Float[Array, "own own"]
+
+
+def _inverse(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
+    """Inverse of a positive definite matrix of a few rows, all lanes at once.
+
+    By Gauss and Jordan: a call of LAPACK for each lane costs twenty times as much.
+    """
+    scale = jnp.sqrt(jnp.diagonal(matrix))
+    size = matrix.shape[0]
+    work = jnp.concatenate([matrix / scale[:, None] / scale[None, :], jnp.eye(size)], axis=1)
+    for i in range(size):
+        row = work[i] / work[i, i]
+        work = (work - work[:, i][:, None] * row[None, :]).at[i].set(row)
+    return work[:, size:] / scale[:, None] / scale[None, :]
+
+
+def _minimum(
+    equations: Callable[[Float[Array, " own"]], _Equations], start: Float[Array, " own"]
+) -> tuple[Float[Array, " own"], _Equations, Float[Array, ""]]:
+    """Levenberg and Marquardt's method, as many steps for every lane and pulse.
+
+    Returns:
+        The minimum, the last equations before it, and by how much Σ r² was to fall from there.
+    """
+    at, best, damping = start, equations(start), jnp.asarray(DAMPING)
+    for _ in range(STEPS):
+        step = _inverse(best.matrix + damping * jnp.diag(jnp.diagonal(best.matrix)))
+        trial = at - step @ best.gradient
+        found = equations(trial)
+        better = found.objective <= best.objective
+        at = jnp.where(better, trial, at)
+        best = jax.tree.map(lambda new, old, better=better: jnp.where(better, new, old), found, best)
+        damping = damping * jnp.where(better, LOWER, RAISE)
+    step = _inverse(best.matrix) @ best.gradient
+    return at - step, best, jnp.dot(step, best.gradient)
+
+
+class _Pulse(eqx.Module):
+    """What is minimised for one electrode at one pulse."""
+
+    tracker: "Tracker"
+    gain: Complex[Array, " band"]
+    variance: Float[Array, ""]
+    centre: Float[Array, " element"]
+    information: Float[Array, "element element"]
+
+    def linearised(
+        self, q: Float[Array, " own"]
+    ) -> tuple[Float[Array, " part"], Float[Array, "own part"]]:
+        """Residual, real and imaginary parts in standard deviations, and its Jacobian, transposed."""
+        of = self.tracker
+        weight = as_complex(jnp.sqrt(of.bands.weight / self.variance))
+        model, slope = of.model(q[:-1], q[-1])
+        by_delay = model * jax.lax.complex(jnp.zeros_like(of.turn), of.turn)
+        residual = weight * (self.gain * _unit(of.turn * q[-1]) - model)
+        rows = weight[None, :] * jnp.concatenate([-slope, by_delay[None, :]])
+        return (
+            jnp.concatenate([residual.real, residual.imag]),
+            jnp.concatenate([rows.real, rows.imag], axis=1),
+        )
+
+
+    def equations(self, q: Float[Array, " own"]) -> _Equations:
+        """Normal equations."""
+        part, jacobian = self.linearised(q)
+        off = q[:-1] - self.centre
+        pull = jnp.append(self.information @ off, q[-1] / DELAY_WIDTH**2)
+        squares = jnp.dot(part, part)
+        curvature = jacobian @ jacobian.T
+        prior = jnp.pad(self.information, (0, 1)).at[-1, -1].set(1 / DELAY_WIDTH**2)
+        return _Equations(
+            squares + jnp.dot(pull, jnp.append(off, q[-1])),
+            squares,
+            jacobian @ part + pull,
+            curvature,
+            curvature + prior,
+        )
+
+
+def _unit(angle: Float[Array, "..."]) -> Complex[Array, "..."]:
+    """e^(j angle)."""
+    return jax.lax.complex(jnp.cos(angle), jnp.sin(angle))
+
+
+class TrackerState(eqx.Module):
+    """What is known of every electrode.
+
+    Attributes:
+        own: Logarithms of its elements [SI], and the delay of the last pulse [samples].
+        information: Inverse covariance of the elements' logarithms, 0 before the first good pulse.
+        pulses: Number of pulses that these rest on.
+        missed: Pulses in a row that did not fit.
+        strain: Squared disagreement of pulses with their predictions, in units of its variance.
+        variance: E|noise|² of a Fourier coefficient of the last pulse [V²].
+        chi2: Of the last pulse.
+        rrse: Of the last pulse.
+        result: Verdict on the last pulse.
+    """
+
+    own: Float[Array, "lane own"]
+    information: Float[Array, "lane element element"]
+    pulses: Int[Array, " lane"]
+    missed: Int[Array, " lane"]
+    strain: Float[Array, " lane"]
+    variance: Float[Array, " lane"]
+    chi2: Float[Array, " lane"]
+    rrse: Float[Array, " lane"]
+    result: RESULTS
+
+
+class Tracker(eqx.Module):
+    """Identifies all electrodes of a display with every pulse. Make one with `Tracker.of`.
+
+    Attributes:
+        circuit: Structure of the loads, and where to start.
+        bands: The unloaded pulse.
+        known: What the calibrations tell of Z_th at the bands.
+        source_alias: Z_th where aliases come from [Ω].
+        turn: Turn of the gain by a delay of one sample.
+        change: Random walk of the elements' logarithms [1/√pulse].
+        adc_range: Voltages at which the converter saturates [V].
+        driver_result: Verdict of the driver.
+        electrodes: Number of electrodes.
+        period: Length of a period in samples.
+    """
+
+    circuit: AbstractCircuit
+    bands: Bands
+    known: GivenDriver
+    source: Complex[Array, " band"]
+    source_alias: Complex[Array, " band"]
+    turn: Float[Array, " band"]
+    change: Float[Array, ""]
+    adc_range: Float[Array, " 2"]
+    driver_result: RESULTS
+    electrodes: int = eqx.field(static=True)
+    period: float = eqx.field(static=True)
+
+    @classmethod
+    def of(
+        cls,
+        driver: Driver,
+        unloaded: Recording,
+        *,
+        electrodes: int,
+        circuit: AbstractCircuit | None = None,
+        change: float = 0.0,
+    ) -> "Tracker":
+        """Prepare to track.
+
+        Args:
+            driver: Identified driver, by maximum likelihood.
+            unloaded: A recording whose `v_th` is the unloaded voltage, such as the calibration.
+                Several periods, which tell what aliases. Its rates are those of the pulses.
+            electrodes: Number of electrodes.
+            circuit: Structure of the load and its typical values; `SkinRC` if not given.
+            change: By how much the elements may change, as standard deviation of the random walk
+                of their logarithms per pulse [1/√pulse]; 0 for skin that does not.
+
+        Raises:
+            ValueError: The driver has no harmonics of its calibrations, or a number is out of range.
+            IdentificationError: The recording is of no use; the message says why.
+        """
+        require_float64()
+        check_driver(driver, "maximum_likelihood", unloaded.sample_rate)
+        if electrodes < 1:
+            raise ValueError(f"electrodes is {electrodes}; a display has at least one")
+        if not (np.isfinite(change) and change >= 0):
+            raise ValueError(f"change is {change}; it must be finite and not negative")
+        seen = Inspected(unloaded)
+        name = preflight(seen, periodic=True)
+        if name is not None:
+            text = f"unloaded recording {unloaded.path!r}: {name}. {message(name)}"
+            raise IdentificationError(text, None)
+        periods, samples = seen.periods
+        period = samples / periods
+        rate = unloaded.sample_rate
+        bands = unloaded_bands(seen.v_th, float(seen.sigma_th), rate, period)
+        known = given(driver, bands.frequency, False)
+        assert driver.source is not None  # check_driver
+        low, high = unloaded.adc_range or (-np.inf, np.inf)
+        half = seen.step_th / 2
+        return cls(
+            circuit=SkinRC() if circuit is None else circuit,
+            bands=bands,
+            known=known,
+            source=known.z_th(combined(known.mean, known.slope)),
+            source_alias=driver.source.response(rate - bands.frequency),
+            turn=2 * jnp.pi * bands.frequency / rate,
+            change=jnp.asarray(float(change)),
+            adc_range=jnp.array([low + half, high - half]),
+            driver_result=driver.result,
+            electrodes=electrodes,
+            period=period,
+        )
+
+    def start(self) -> TrackerState:
+        """The state before the first pulse: nothing is known."""
+        lanes, elements = self.electrodes, len(self.circuit.names())
+        typical = jnp.append(self.circuit.log_values(), 0.0)
+        nan = jnp.full(lanes, jnp.nan)
+        return TrackerState(
+            own=jnp.broadcast_to(typical[None, :], (lanes, elements + 1)),
+            information=jnp.zeros((lanes, elements, elements)),
+            pulses=jnp.zeros(lanes, int),
+            missed=jnp.zeros(lanes, int),
+            strain=jnp.zeros(lanes),
+            variance=nan,
+            chi2=nan,
+            rrse=nan,
+            result=jax.tree.map(jnp.asarray, verdicts_of(np.full(lanes, "too_short"))),
+        )
+
+    def pulses(self, v_out: Float[np.ndarray, "*lane time"]) -> Float[np.ndarray, "pulse *lane sample"]:
+        """Cut records that begin between two pulses into windows of one pulse each.
+
+        Args:
+            v_out: Loaded voltages [V].
+        """
+        return cut(v_out, self.period)
+
+    def update(
+        self, state: TrackerState, v_out: Float[Array | np.ndarray, "lane sample"]
+    ) -> TrackerState:
+        """What is known after one more pulse.
+
+        Args:
+            state: What was known before it.
+            v_out: Loaded voltage of one period at every electrode [V], from between two pulses on.
+
+        Raises:
+            ValueError: Not one window for each electrode, of one period.
+        """
+        expected = (self.electrodes, self.bands.samples)
+        if np.shape(v_out) != expected:
+            raise ValueError(
+                f"v_out has shape {np.shape(v_out)}; one period at each electrode is "
+                f"(electrode, sample) = {expected} (Tracker.pulses cuts longer records)"
+            )
+        return _updated(self, state, jnp.asarray(v_out, dtype=float))
+
+    def read(self, state: TrackerState) -> Fits:
+        """Elements, standard errors, χ² of the last pulse and verdict of every electrode.
+
+        `steps` is the number of pulses that the elements rest on, `shared_cov` what no number of
+        pulses lessens. Where the last pulse did not fit, elements are those before it.
+
+        Args:
+            state: What is known.
+        """
+        fit = jax.tree.map(np.asarray, _judged(self, state))
+        labels = {name: np.full(self.electrodes, "", dtype=str) for name in LABELS}
+        labels["electrode"] = np.array([str(number) for number in range(self.electrodes)])
+        labels["path"] = np.array([f"electrode/{number}" for number in range(self.electrodes)])
+        notes = np.array([message(name) for name in fit.verdict])
+        return Fits(fit, labels, notes)
+
+    def model(
+        self, logs: Float[Array, " element"], delay: Float[Array, ""]
+    ) -> tuple[Complex[Array, " band"], Complex[Array, "element band"]]:
+        """What Ĝ e^(jωτ) should be, and its derivative by the elements."""
+        f, rate = self.bands.frequency, self.bands.sample_rate
+
+        def load(logs):
+            return self.circuit.with_log_values(logs).impedance()(frequency_variable(f))
+
+        z = load(logs)
+        by_element = jax.vmap(lambda v: jax.jvp(load, (logs,), (v,))[1])(jnp.eye(logs.size))
+        admittance = reciprocal(z + self.source)
+        above = self.circuit.with_log_values(logs).impedance()(frequency_variable(rate - f))
+        aliased = jnp.conj(above * reciprocal(above + self.source_alias)) * self.bands.alias
+        slope = by_element * (self.source * admittance * admittance)[None, :]
+        return z * admittance + aliased * _unit(2 * jnp.pi * delay), slope
+
+    def best_delay(
+        self, gain: Complex[Array, " band"], expected: Complex[Array, " band"], delays: np.ndarray
+    ) -> tuple[Float[Array, ""], Float[Array, ""]]:
+        """The delay by which `gain` comes next to what is expected, and how far it is from that."""
+        turned = jnp.asarray(delays)[:, None] * self.turn[None, :]
+        product = as_complex(self.bands.weight) * jnp.conj(expected) * gain
+        agreement = jnp.cos(turned) @ product.real - jnp.sin(turned) @ product.imag
+        best = jnp.argmax(agreement)
+        distance = jnp.sum(self.bands.weight * power(expected)) - 2 * agreement[best]
+        return jnp.asarray(delays)[best], distance
+
+
+def _electrode(
+    tracker: Tracker,
+    state: TrackerState,
+    gain: Complex[Array, " band"],
+    variance: Float[Array, ""],
+    bad: RESULTS,
+    starts: Float[Array, "start element"],
+) -> TrackerState:
+    """One electrode at one pulse; `bad` is the verdict on its samples."""
+    logs, elements = state.own[:-1], state.own.size - 1
+    running = state.pulses > 0
+    lost = _inverse(jnp.eye(elements) + tracker.change**2 * state.information)
+    lost = state.information @ lost @ state.information
+    information = state.information - tracker.change**2 * lost
+
+    def candidate(start):
+        return tracker.best_delay(gain, tracker.model(start, jnp.zeros(()))[0], COARSE)
+
+    delay, distance = tracker.best_delay(gain, tracker.model(logs, jnp.zeros(()))[0], DELAYS)
+    delays, distances = jax.vmap(candidate)(starts)
+    best = jnp.argmin(distances)
+    elsewhere = ~running & ~(distance <= distances[best])
+    start = jnp.where(elsewhere, starts[best], logs)
+    start = jnp.append(start, jnp.where(elsewhere, delays[best], delay))
+    pulse = _Pulse(tracker, gain, variance, logs, information)
+    own, at, decrement = _minimum(pulse.equations, start)
+    bands = tracker.bands
+    selected = bands.weight > 0
+    chi2 = at.squares / (2 * jnp.sum(selected, dtype=at.squares.dtype) - own.size)
+    signal = jnp.sum(bands.weight * power(gain)) / variance
+    rrse = jnp.sqrt(at.squares / signal)
+    by_delay = at.curvature[:-1, -1]
+    told = at.curvature[:-1, :-1] - jnp.outer(by_delay, by_delay) / at.curvature[-1, -1]
+    spread = _inverse(told)
+
+    # What the pulse alone would have: χ² of its distance from what was expected, per element.
+    off = own[:-1] - logs
+    pull = information @ off
+    surprise = (jnp.dot(off, pull) + jnp.dot(pull, spread @ pull)) / elements
+    share = 1 / jnp.clip(state.pulses, 1, MEMORY)
+    strain = state.strain + (surprise - state.strain) * share
+    strained = running & (state.pulses >= MEMORY) & (strain > STRAINED)
+
+    settled = decrement < SETTLED**2
+    determined = running | jnp.all(jnp.diagonal(spread) < 1)
+    result = first_verdict(
+        (bad != SUCCESSFUL, bad),
+        (~jnp.isfinite(own).all(), RESULTS.nonphysical),
+        (~settled, MAX_STEPS_REACHED),
+        (misses(chi2, rrse) | (jnp.abs(own[-1]) > DELAYS[-1]) | strained, RESULTS.misfit),
+        (~determined, RESULTS.insensitive),
+    )
+    good = result == SUCCESSFUL
+    missed = jnp.where(good, 0, state.missed + 1)
+    again = running & ((missed >= PATIENCE) | strained)
+    kept = good | ~running & jnp.isfinite(own).all() & (bad == SUCCESSFUL)
+    return TrackerState(
+        own=jnp.where(kept, own, state.own),
+        information=jnp.where(
+            again, 0.0, jnp.where(good, information + told, information)
+        ),
+        pulses=jnp.where(again, 0, state.pulses + good),
+        missed=missed,
+        strain=jnp.where(again, 0.0, jnp.where(good & running, strain, state.strain)),
+        variance=variance,
+        chi2=chi2,
+        rrse=rrse,
+        result=result,
+    )
+
+
+@stored_jit
+def _updated(tracker: Tracker, state: TrackerState, v_out: Float[Array, "lane sample"]) -> TrackerState:
+    finite = jnp.isfinite(v_out).all(axis=1)
+    low, high = tracker.adc_range
+    clipped = ((v_out <= low) | (v_out >= high)).any(axis=1)
+    bands = tracker.bands
+    gains = bands.measure(jnp.where(finite[:, None], v_out, 0.0))
+    signal = power(gains.gain) @ bands.weight / gains.variance
+    flat = signal < FLAT * 2 * jnp.sum(bands.weight > 0, dtype=float)
+    bad = jax.vmap(
+        lambda finite, clipped, flat: first_verdict(
+            (~finite, RESULTS.nonfinite_samples), (clipped, RESULTS.saturated), (flat, RESULTS.flat)
+        )
+    )(finite, clipped, flat)
+    starts = circuit_starts(tracker.circuit, None)
+    return jax.vmap(lambda *of: _electrode(tracker, *of, starts))(
+        state, gains.gain, gains.variance, bad
+    )
+
+
+@stored_jit
+def _judged(tracker: Tracker, state: TrackerState) -> Fit:
+    return jax.vmap(lambda of: _fit(tracker, of))(state)
+
+
+def _fit(tracker: Tracker, state: TrackerState) -> Fit:
+    """The fit of one electrode."""
+    known, bands, logs = tracker.known, tracker.bands, state.own[:-1]
+    elements = logs.size
+    model, _ = tracker.model(logs, state.own[-1])
+    pulse = _Pulse(
+        tracker, jnp.zeros_like(model), state.variance, logs, jnp.zeros((elements, elements))
+    )
+    _, jacobian = pulse.linearised(state.own)
+    by_term = inverse(jacobian @ jacobian.T)[:elements] @ jacobian
+    # Z_th + R = e^W, so that ∂G/∂W = −Z_L (Z_th + R) / (Z_L + Z_th)².
+    z = tracker.circuit.with_log_values(logs).response(bands.frequency)
+    admittance = reciprocal(z + tracker.source)
+    weight = jnp.sqrt(bands.weight / state.variance)
+    loaded = tracker.source + as_complex(known.resistance)
+    by_w = as_complex(weight) * z * loaded * admittance * admittance
+    by_z = by_w[None, :] * known.slope
+    of_z = by_term @ jnp.concatenate([by_z.real, by_z.imag], axis=1).T
+    # The noise of X is in every pulse the same: G times it.
+    of_x = jnp.tile(power(model) * bands.variance_x / state.variance, 2)
+    shared = of_z @ known.cov @ of_z.T + (by_term * of_x[None, :]) @ by_term.T
+    cov = inverse(state.information) + shared
+    relative = jnp.sqrt(jnp.diagonal(cov))
+    fitted = tracker.circuit.with_log_values(logs)
+    scale = jnp.outer(fitted.values(), fitted.values())
+    known_at_all = state.pulses > 0
+    return Fit(
+        circuit=fitted,
+        cov=jnp.where(known_at_all, cov * scale, jnp.nan),
+        shared_cov=jnp.where(known_at_all, shared * scale, jnp.nan),
+        rrse=state.rrse,
+        chi2=state.chi2,
+        result=first_verdict(
+            (state.result != SUCCESSFUL, state.result),
+            (~jnp.all(relative < 1), RESULTS.insensitive),
+            (tracker.driver_result != SUCCESSFUL, RESULTS.driver_failed),
+        ),
+        steps=state.pulses,
+        method="online",
+    )
