@@ -4,7 +4,7 @@ One period is cut out as the M samples nearest to it, and M samples are no whole
 not be: where windows begin and end in the quiet between two pulses, Y(f) = G(f) X(f) holds at any
 frequency. They are filled with that quiet level up to a length whose Fourier transform is cheap.
 
-**A band** is a few neighbouring bins k, a thirty-second of their frequency at most, over which a
+**A band** is a few neighbouring bins k, a sixteenth of their frequency at most, over which a
 gain is nearly linear. All that a pulse tells of it is
 
     Ĝ = Σ X̄_k Y_k / Σ (|X_k|² − σ_x²)    at    f = Σ |X_k|² f_k / Σ |X_k|²,
@@ -31,14 +31,16 @@ from etid.measurement import RIPPLE
 from etid.spectra import ALIASED
 from etid.transfer import as_complex, power
 
-RELATIVE = 32  # bins of a band's frequency for each of its own
-WIDEST = 8  # bins; over more of them a delay of one sample turns the gain by too much
+RELATIVE = 16  # bins of a band's frequency for each of its own
+WIDEST = 16  # bins
 QUIET = 256  # part of a window, at each of its ends, that tells the level between two pulses
 PRESENT = 0.5  # part of a band's power in X that must not be noise
 DIVERSE = 0.9  # |mean e^(−j2πφ)| from which on sampling phases are too much alike
 
 
-def cut(v: Float[np.ndarray, "*lane time"], period: float) -> Float[np.ndarray, "pulse *lane sample"]:
+def cut(
+    v: Float[np.ndarray, "*lane time"], period: float
+) -> Float[np.ndarray, "pulse *lane sample"]:
     """Windows of one pulse each from a longer record.
 
     Args:
@@ -90,6 +92,7 @@ class Bands(eqx.Module):
         signal: The same without noise; as it is where there is little else.
         weight: Σ of the squares of Ĝ − G is to be weighed with it, by the variance of V_out [V²].
         width: Σ |X|² offset²; 0 for a band of one bin.
+        spread: Variance of the frequency within a band, as an angle per sample [rad²].
         alias: Σ X̄(f) X(f − fs) / Σ |X|²: what aliases, per gain at fs − f; 0 where it is not known.
         floor: Variance that no coefficient of V_out is trusted to have less of [V²].
         sample_rate: [Hz].
@@ -106,6 +109,7 @@ class Bands(eqx.Module):
     signal: Float[Array, " band"]
     weight: Float[Array, " band"]
     width: Float[Array, " band"]
+    spread: Float[Array, " band"]
     alias: Complex[Array, " band"]
     floor: Float[Array, ""]
     sample_rate: float = eqx.field(static=True)
@@ -132,7 +136,7 @@ class Bands(eqx.Module):
         explained = explained + power(slope) / jnp.where(wide, self.width, 1.0)[None, :]
         rest = jnp.where(wide[None, :], self.summed(power(y)) - explained, 0.0)
         freedom = sum((width - 2) * count for _, width, count in self.groups if width > 1)
-        variance = jnp.maximum(rest.sum(-1) / freedom, self.floor)
+        variance = jnp.maximum(rest.sum(-1) / max(freedom, 1), self.floor)
         return Gains(level / as_complex(self.signal)[None, :], variance)
 
 
@@ -178,7 +182,10 @@ def unloaded_bands(
     x, aliased = found[0], found[1] if len(found) > 1 else np.zeros(bins)
 
     number = np.arange(1.0, bins + 1)
-    of = [(np.arange(first, first + width * count).reshape(count, width) - 1) for first, width, count in groups]
+    of = [
+        (np.arange(first, first + width * count).reshape(count, width) - 1)
+        for first, width, count in groups
+    ]
 
     def summed(values):
         return np.concatenate([values[index].sum(-1) for index in of])
@@ -187,6 +194,7 @@ def unloaded_bands(
     strength = summed(np.abs(x) ** 2)
     centre = summed(np.abs(x) ** 2 * number) / strength
     offset = number - np.repeat(centre, wide)
+    width = np.where(wide > 1, summed(np.abs(x) ** 2 * offset**2), 0.0)
     signal = strength - wide * variance
     present = signal > PRESENT * strength
     return Bands(
@@ -197,7 +205,8 @@ def unloaded_bands(
         strength=jnp.asarray(strength),
         signal=jnp.asarray(np.where(present, signal, strength)),
         weight=jnp.asarray(np.where(present, 2 * signal**2 / strength, 0.0)),
-        width=jnp.asarray(np.where(wide > 1, summed(np.abs(x) ** 2 * offset**2), 0.0)),
+        width=jnp.asarray(width),
+        spread=jnp.asarray(width / strength * (2 * np.pi / size) ** 2),
         alias=jnp.asarray(summed(x.conj() * aliased) / strength),
         floor=jnp.asarray(samples * (RIPPLE * np.ptp(v_th)) ** 2),
         sample_rate=sample_rate,

@@ -54,11 +54,10 @@ from etid.traces import stored_jit
 from etid.transfer import as_complex, frequency_variable, power, reciprocal
 from etid.verdicts import RESULTS, first_verdict, message, verdicts_of
 
-STEPS = 2  # at one pulse, and one without a trial
-DAMPING, LOWER, RAISE = 1e-3, 0.1, 10.0  # of the first step, after a good one, after a bad one
-SETTLED = 0.1  # standard errors of a pulse from the minimum
-DELAYS = np.linspace(-1.5, 1.5, 31)  # [samples] one of a trigger, half a one of a window
-COARSE = DELAYS[::3]  # for starts
+DAMPING, LOWER, RAISE = 1e-2, 0.1, 8.0  # of the first step, after a good one, after a bad one
+SETTLED = 1.0  # standard errors of a pulse from the minimum, before the last step
+STEP = 0.1  # [samples]
+DELAYS = STEP * np.arange(-15, 16)  # [samples] one of a trigger, half a one of a window
 FLAT = 4.0  # times the power that noise alone has
 PATIENCE = 5  # pulses that do not fit, in a row, after which an electrode starts again
 MEMORY = 30  # pulses over which their disagreement with the intervals is averaged
@@ -98,24 +97,27 @@ def _inverse(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
 
 
 def _minimum(
-    equations: Callable[[Float[Array, " own"]], _Equations], start: Float[Array, " own"]
-) -> tuple[Float[Array, " own"], _Equations, Float[Array, ""]]:
-    """Levenberg and Marquardt's method, as many steps for every lane and pulse.
+    equations: Callable[[Float[Array, " own"]], _Equations],
+    start: Float[Array, " own"],
+    damping: Float[Array, ""],
+) -> tuple[Float[Array, " own"], _Equations, Float[Array, ""], Float[Array, ""]]:
+    """A step of Levenberg and Marquardt's and, where that was the last but one, one of Newton's.
 
     Returns:
-        The minimum, the last equations before it, and by how much Σ r² was to fall from there.
+        The minimum, or what was reached of the way to it; the last equations; by how much Σ r² was to
+        fall from there; and the damping with which to go on.
     """
-    at, best, damping = start, equations(start), jnp.asarray(DAMPING)
-    for _ in range(STEPS):
-        step = _inverse(best.matrix + damping * jnp.diag(jnp.diagonal(best.matrix)))
-        trial = at - step @ best.gradient
-        found = equations(trial)
-        better = found.objective <= best.objective
-        at = jnp.where(better, trial, at)
-        best = jax.tree.map(lambda new, old, better=better: jnp.where(better, new, old), found, best)
-        damping = damping * jnp.where(better, LOWER, RAISE)
-    step = _inverse(best.matrix) @ best.gradient
-    return at - step, best, jnp.dot(step, best.gradient)
+    before = equations(start)
+    matrix = before.matrix + damping * jnp.diag(jnp.diagonal(before.matrix))
+    trial = start - _inverse(matrix) @ before.gradient
+    after = equations(trial)
+    better = after.objective <= before.objective
+    own = jnp.where(better, trial, start)
+    at = jax.tree.map(lambda new, old: jnp.where(better, new, old), after, before)
+    step = _inverse(at.matrix) @ at.gradient
+    decrement = jnp.dot(step, at.gradient)
+    own = jnp.where(decrement < SETTLED**2, own - step, own)
+    return own, at, decrement, damping * jnp.where(better, LOWER, RAISE)
 
 
 class _Pulse(eqx.Module):
@@ -127,34 +129,29 @@ class _Pulse(eqx.Module):
     centre: Float[Array, " element"]
     information: Float[Array, "element element"]
 
-    def linearised(
-        self, q: Float[Array, " own"]
-    ) -> tuple[Float[Array, " part"], Float[Array, "own part"]]:
-        """Residual, real and imaginary parts in standard deviations, and its Jacobian, transposed."""
+    def terms(self, q: Float[Array, " own"]) -> Float[Array, "own1 part"]:
+        """Derivatives of the residual and, last, the residual, in standard deviations."""
         of = self.tracker
         weight = as_complex(jnp.sqrt(of.bands.weight / self.variance))
         model, slope = of.model(q[:-1], q[-1])
+        # By the delay it is jω Ĝ e^(jωτ), of which the noise is left out: it would be information.
         by_delay = model * jax.lax.complex(jnp.zeros_like(of.turn), of.turn)
-        residual = weight * (self.gain * _unit(of.turn * q[-1]) - model)
-        rows = weight[None, :] * jnp.concatenate([-slope, by_delay[None, :]])
-        return (
-            jnp.concatenate([residual.real, residual.imag]),
-            jnp.concatenate([rows.real, rows.imag], axis=1),
-        )
-
+        residual = self.gain * of.turned(q[-1]) - model
+        rows = jnp.concatenate([-slope, by_delay[None, :], residual[None, :]]) * weight[None, :]
+        return jnp.concatenate([rows.real, rows.imag], axis=1)
 
     def equations(self, q: Float[Array, " own"]) -> _Equations:
         """Normal equations."""
-        part, jacobian = self.linearised(q)
+        terms = self.terms(q)
+        products = terms @ terms.T
         off = q[:-1] - self.centre
         pull = jnp.append(self.information @ off, q[-1] / DELAY_WIDTH**2)
-        squares = jnp.dot(part, part)
-        curvature = jacobian @ jacobian.T
+        squares, curvature = products[-1, -1], products[:-1, :-1]
         prior = jnp.pad(self.information, (0, 1)).at[-1, -1].set(1 / DELAY_WIDTH**2)
         return _Equations(
             squares + jnp.dot(pull, jnp.append(off, q[-1])),
             squares,
-            jacobian @ part + pull,
+            products[:-1, -1] + pull,
             curvature,
             curvature + prior,
         )
@@ -173,6 +170,7 @@ class TrackerState(eqx.Module):
         information: Inverse covariance of the elements' logarithms, 0 before the first good pulse.
         pulses: Number of pulses that these rest on.
         missed: Pulses in a row that did not fit.
+        damping: Of the next step.
         strain: Squared disagreement of pulses with their predictions, in units of its variance.
         variance: E|noise|² of a Fourier coefficient of the last pulse [V²].
         chi2: Of the last pulse.
@@ -184,6 +182,7 @@ class TrackerState(eqx.Module):
     information: Float[Array, "lane element element"]
     pulses: Int[Array, " lane"]
     missed: Int[Array, " lane"]
+    damping: Float[Array, " lane"]
     strain: Float[Array, " lane"]
     variance: Float[Array, " lane"]
     chi2: Float[Array, " lane"]
@@ -199,7 +198,8 @@ class Tracker(eqx.Module):
         bands: The unloaded pulse.
         known: What the calibrations tell of Z_th at the bands.
         source_alias: Z_th where aliases come from [Ω].
-        turn: Turn of the gain by a delay of one sample.
+        turn: Turn of the gain by a delay of one sample [rad].
+        turns: e^(jωτ) for each of `DELAYS`.
         change: Random walk of the elements' logarithms [1/√pulse].
         adc_range: Voltages at which the converter saturates [V].
         driver_result: Verdict of the driver.
@@ -213,6 +213,7 @@ class Tracker(eqx.Module):
     source: Complex[Array, " band"]
     source_alias: Complex[Array, " band"]
     turn: Float[Array, " band"]
+    turns: Complex[Array, "delay band"]
     change: Float[Array, ""]
     adc_range: Float[Array, " 2"]
     driver_result: RESULTS
@@ -263,13 +264,15 @@ class Tracker(eqx.Module):
         assert driver.source is not None  # check_driver
         low, high = unloaded.adc_range or (-np.inf, np.inf)
         half = seen.step_th / 2
+        turn = 2 * jnp.pi * bands.frequency / rate
         return cls(
             circuit=SkinRC() if circuit is None else circuit,
             bands=bands,
             known=known,
             source=known.z_th(combined(known.mean, known.slope)),
             source_alias=driver.source.response(rate - bands.frequency),
-            turn=2 * jnp.pi * bands.frequency / rate,
+            turn=turn,
+            turns=_unit(jnp.asarray(DELAYS)[:, None] * turn[None, :]),
             change=jnp.asarray(float(change)),
             adc_range=jnp.array([low + half, high - half]),
             driver_result=driver.result,
@@ -287,6 +290,7 @@ class Tracker(eqx.Module):
             information=jnp.zeros((lanes, elements, elements)),
             pulses=jnp.zeros(lanes, int),
             missed=jnp.zeros(lanes, int),
+            damping=jnp.full(lanes, DAMPING),
             strain=jnp.zeros(lanes),
             variance=nan,
             chi2=nan,
@@ -294,7 +298,9 @@ class Tracker(eqx.Module):
             result=jax.tree.map(jnp.asarray, verdicts_of(np.full(lanes, "too_short"))),
         )
 
-    def pulses(self, v_out: Float[np.ndarray, "*lane time"]) -> Float[np.ndarray, "pulse *lane sample"]:
+    def pulses(
+        self, v_out: Float[np.ndarray, "*lane time"]
+    ) -> Float[np.ndarray, "pulse *lane sample"]:
         """Cut records that begin between two pulses into windows of one pulse each.
 
         Args:
@@ -353,18 +359,48 @@ class Tracker(eqx.Module):
         above = self.circuit.with_log_values(logs).impedance()(frequency_variable(rate - f))
         aliased = jnp.conj(above * reciprocal(above + self.source_alias)) * self.bands.alias
         slope = by_element * (self.source * admittance * admittance)[None, :]
-        return z * admittance + aliased * _unit(2 * jnp.pi * delay), slope
+        # Within a band the turn of a delay is not quite linear.
+        blurred = as_complex(1 - 0.5 * delay**2 * self.bands.spread)
+        return (z * admittance + aliased * _unit(2 * jnp.pi * delay)) * blurred, slope
 
-    def best_delay(
-        self, gain: Complex[Array, " band"], expected: Complex[Array, " band"], delays: np.ndarray
-    ) -> tuple[Float[Array, ""], Float[Array, ""]]:
-        """The delay by which `gain` comes next to what is expected, and how far it is from that."""
-        turned = jnp.asarray(delays)[:, None] * self.turn[None, :]
+    def turned(self, delay: Float[Array, ""]) -> Complex[Array, " band"]:
+        """e^(jωτ), from a table and its Taylor series: a sine costs as much as all the rest."""
+        near = jnp.clip(jnp.round((delay - DELAYS[0]) / STEP), 0, DELAYS.size - 1).astype(int)
+        angle = (delay - jnp.asarray(DELAYS)[near]) * self.turn
+        square = angle * angle
+        cosine = 1 - square / 2 * (1 - square / 12 * (1 - square / 30))
+        sine = angle * (1 - square / 6 * (1 - square / 20 * (1 - square / 42)))
+        return self.turns[near] * jax.lax.complex(cosine, sine)
+
+    def distances(
+        self, gain: Complex[Array, " band"], expected: Complex[Array, " band"]
+    ) -> Float[Array, " delay"]:
+        """How far `gain` is from what is expected, for each delay of `DELAYS`."""
         product = as_complex(self.bands.weight) * jnp.conj(expected) * gain
-        agreement = jnp.cos(turned) @ product.real - jnp.sin(turned) @ product.imag
-        best = jnp.argmax(agreement)
-        distance = jnp.sum(self.bands.weight * power(expected)) - 2 * agreement[best]
-        return jnp.asarray(delays)[best], distance
+        parts = jnp.concatenate([product.real, -product.imag])
+        turns = jnp.concatenate([self.turns.real, self.turns.imag], axis=1)
+        return jnp.sum(self.bands.weight * power(expected)) - 2 * turns @ parts
+
+    def undelayed(self, logs: Float[Array, " element"]) -> Complex[Array, " band"]:
+        """The gain without a delay."""
+        z = self.circuit.with_log_values(logs).response(self.bands.frequency)
+        return z * reciprocal(z + self.source)
+
+
+def _nearest(
+    tracker: Tracker, gain: Complex[Array, " band"], logs: Float[Array, "start element"]
+) -> tuple[Float[Array, " own"], Float[Array, ""]]:
+    """Which of several elements, with which delay, comes next to a gain, and how near."""
+    distances = jax.vmap(lambda one: tracker.distances(gain, tracker.undelayed(one)))(logs)
+    best = jnp.argmin(distances)
+    start, at = best // DELAYS.size, best % DELAYS.size
+    # A parabola through the distances beside it: a tenth of a sample is a hundred standard errors.
+    around = distances[start, jnp.clip(at, 1, DELAYS.size - 2) + jnp.arange(-1, 2)]
+    curved = around[0] - 2 * around[1] + around[2]
+    delay = DELAYS[0] + STEP * (at + 0.5 * (around[0] - around[2]) / curved)
+    inside = (at > 0) & (at < DELAYS.size - 1) & (curved > 0)
+    delay = jnp.where(inside, delay, jnp.asarray(DELAYS)[at])
+    return jnp.append(logs[start], delay), distances.reshape(-1)[best]
 
 
 def _electrode(
@@ -373,7 +409,8 @@ def _electrode(
     gain: Complex[Array, " band"],
     variance: Float[Array, ""],
     bad: RESULTS,
-    starts: Float[Array, "start element"],
+    elsewhere: Float[Array, " own"],
+    distance: Float[Array, ""],
 ) -> TrackerState:
     """One electrode at one pulse; `bad` is the verdict on its samples."""
     logs, elements = state.own[:-1], state.own.size - 1
@@ -382,17 +419,12 @@ def _electrode(
     lost = state.information @ lost @ state.information
     information = state.information - tracker.change**2 * lost
 
-    def candidate(start):
-        return tracker.best_delay(gain, tracker.model(start, jnp.zeros(()))[0], COARSE)
-
-    delay, distance = tracker.best_delay(gain, tracker.model(logs, jnp.zeros(()))[0], DELAYS)
-    delays, distances = jax.vmap(candidate)(starts)
-    best = jnp.argmin(distances)
-    elsewhere = ~running & ~(distance <= distances[best])
-    start = jnp.where(elsewhere, starts[best], logs)
-    start = jnp.append(start, jnp.where(elsewhere, delays[best], delay))
+    start, own_distance = _nearest(tracker, gain, logs[None, :])
+    away = ~running & ~(own_distance <= distance)
+    start = jnp.where(away, elsewhere, start)
+    damping = jnp.where(away, DAMPING, state.damping)
     pulse = _Pulse(tracker, gain, variance, logs, information)
-    own, at, decrement = _minimum(pulse.equations, start)
+    own, at, decrement, damping = _minimum(pulse.equations, start, damping)
     bands = tracker.bands
     selected = bands.weight > 0
     chi2 = at.squares / (2 * jnp.sum(selected, dtype=at.squares.dtype) - own.size)
@@ -425,11 +457,10 @@ def _electrode(
     kept = good | ~running & jnp.isfinite(own).all() & (bad == SUCCESSFUL)
     return TrackerState(
         own=jnp.where(kept, own, state.own),
-        information=jnp.where(
-            again, 0.0, jnp.where(good, information + told, information)
-        ),
+        information=jnp.where(again, 0.0, jnp.where(good, information + told, information)),
         pulses=jnp.where(again, 0, state.pulses + good),
         missed=missed,
+        damping=jnp.where(again | ~jnp.isfinite(damping), DAMPING, jnp.where(good, 0.0, damping)),
         strain=jnp.where(again, 0.0, jnp.where(good & running, strain, state.strain)),
         variance=variance,
         chi2=chi2,
@@ -439,7 +470,9 @@ def _electrode(
 
 
 @stored_jit
-def _updated(tracker: Tracker, state: TrackerState, v_out: Float[Array, "lane sample"]) -> TrackerState:
+def _updated(
+    tracker: Tracker, state: TrackerState, v_out: Float[Array, "lane sample"]
+) -> TrackerState:
     finite = jnp.isfinite(v_out).all(axis=1)
     low, high = tracker.adc_range
     clipped = ((v_out <= low) | (v_out >= high)).any(axis=1)
@@ -453,9 +486,14 @@ def _updated(tracker: Tracker, state: TrackerState, v_out: Float[Array, "lane sa
         )
     )(finite, clipped, flat)
     starts = circuit_starts(tracker.circuit, None)
-    return jax.vmap(lambda *of: _electrode(tracker, *of, starts))(
-        state, gains.gain, gains.variance, bad
+    lanes, own = state.own.shape
+    elsewhere = jax.lax.cond(
+        (state.pulses == 0).any(),
+        jax.vmap(lambda gain: _nearest(tracker, gain, starts)),
+        lambda _: (jnp.zeros((lanes, own)), jnp.full(lanes, jnp.inf)),
+        gains.gain,
     )
+    return jax.vmap(lambda *of: _electrode(tracker, *of))(state, *gains, bad, *elsewhere)
 
 
 @stored_jit
@@ -471,7 +509,7 @@ def _fit(tracker: Tracker, state: TrackerState) -> Fit:
     pulse = _Pulse(
         tracker, jnp.zeros_like(model), state.variance, logs, jnp.zeros((elements, elements))
     )
-    _, jacobian = pulse.linearised(state.own)
+    jacobian = pulse.terms(state.own)[:-1]
     by_term = inverse(jacobian @ jacobian.T)[:elements] @ jacobian
     # Z_th + R = e^W, so that ∂G/∂W = −Z_L (Z_th + R) / (Z_L + Z_th)².
     z = tracker.circuit.with_log_values(logs).response(bands.frequency)
