@@ -92,7 +92,10 @@ class Bands(eqx.Module):
         signal: The same without noise; as it is where there is little else.
         weight: Σ of the squares of Ĝ − G is to be weighed with it, by the variance of V_out [V²].
         width: Σ |X|² offset²; 0 for a band of one bin.
-        spread: Variance of the frequency within a band, as an angle per sample [rad²].
+        bent: By how much the mean over a band of a function of frequency differs from the function
+            at its centre, by its values in the band before, itself and the next one.
+        turned: By how much it differs for a delay of one sample, by the same values, divided by −j.
+        spread: The same by the square of a delay, divided by −½ [rad²].
         alias: Σ X̄(f) X(f − fs) / Σ |X|²: what aliases, per gain at fs − f; 0 where it is not known.
         floor: Variance that no coefficient of V_out is trusted to have less of [V²].
         sample_rate: [Hz].
@@ -109,6 +112,8 @@ class Bands(eqx.Module):
     signal: Float[Array, " band"]
     weight: Float[Array, " band"]
     width: Float[Array, " band"]
+    bent: Float[Array, "3 band"]
+    turned: Float[Array, "3 band"]
     spread: Float[Array, " band"]
     alias: Complex[Array, " band"]
     floor: Float[Array, ""]
@@ -124,6 +129,18 @@ class Bands(eqx.Module):
             part = values[..., first - 1 : first - 1 + width * count]
             sums.append(part.reshape(*part.shape[:-1], count, width).sum(-1))
         return jnp.concatenate(sums, axis=-1)
+
+    def departure(
+        self, gain: Complex[Array, " band"], delay: Float[Array, ""]
+    ) -> Complex[Array, " band"]:
+        """How the mean over a band of a delayed gain, turned back, departs from that at its centre.
+
+        ½ s² (G″ − 2jτ G′ − τ² G), s² the variance of the frequency within the band.
+        """
+        ends = jnp.concatenate([gain[:1], gain, gain[-1:]])
+        values = jnp.stack([ends[:-2], gain, ends[2:]])
+        factor = jax.lax.complex(self.bent, -delay * self.turned)
+        return jnp.sum(factor * values, axis=0) - as_complex(0.5 * delay**2 * self.spread) * gain
 
     def measure(self, v_out: Float[Array, "lane sample"]) -> Gains:
         """Gains and noise of one pulse at all electrodes."""
@@ -147,6 +164,17 @@ def _transform(v: Array, size: int, bins: int) -> Array:
     level = (v[..., :edge].mean(-1) + v[..., -edge:].mean(-1)) / 2
     filling = jnp.broadcast_to(level[..., None], (*v.shape[:-1], size - samples))
     return jnp.fft.rfft(jnp.concatenate([v, filling], axis=-1))[..., 1 : bins + 1]
+
+
+def _slopes(
+    x: Float[np.ndarray, " band"],
+) -> tuple[Float[np.ndarray, "3 band"], Float[np.ndarray, "3 band"]]:
+    """First and second derivative by values at the point before, at x and at the next; 0 at ends."""
+    before, after = np.diff(x)[:-1], np.diff(x)[1:]
+    both = before + after
+    first = [-after / before / both, (after - before) / before / after, before / after / both]
+    second = [2 / before / both, -2 / before / after, 2 / after / both]
+    return np.pad(first, ((0, 0), (1, 1))), np.pad(second, ((0, 0), (1, 1)))
 
 
 def unloaded_bands(
@@ -194,9 +222,12 @@ def unloaded_bands(
     strength = summed(np.abs(x) ** 2)
     centre = summed(np.abs(x) ** 2 * number) / strength
     offset = number - np.repeat(centre, wide)
+    angle = 2 * np.pi * centre / size
     width = np.where(wide > 1, summed(np.abs(x) ** 2 * offset**2), 0.0)
     signal = strength - wide * variance
     present = signal > PRESENT * strength
+    spread = width / strength * (2 * np.pi / size) ** 2
+    first, second = _slopes(angle)
     return Bands(
         x=jnp.asarray(x),
         variance_x=jnp.asarray(variance),
@@ -206,7 +237,9 @@ def unloaded_bands(
         signal=jnp.asarray(np.where(present, signal, strength)),
         weight=jnp.asarray(np.where(present, 2 * signal**2 / strength, 0.0)),
         width=jnp.asarray(width),
-        spread=jnp.asarray(width / strength * (2 * np.pi / size) ** 2),
+        bent=jnp.asarray(0.5 * spread * second),
+        turned=jnp.asarray(spread * first),
+        spread=jnp.asarray(spread),
         alias=jnp.asarray(summed(x.conj() * aliased) / strength),
         floor=jnp.asarray(samples * (RIPPLE * np.ptp(v_th)) ** 2),
         sample_rate=sample_rate,

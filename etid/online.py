@@ -10,10 +10,10 @@ An extended Kalman filter in information form, iterated at each pulse (Bell and 
 electrode, with ϑ the logarithms of its elements, Λ their information and Ĝ the gains of `etid.bands`,
 
     Λ⁻ = (Λ⁻¹ + q² 1)⁻¹                                              (a random walk of the skin)
-    minimise  |ϑ − ϑ⁻|²_Λ⁻ + Σ w |Ĝ e^(jωτ) − G(ϑ) − e^(j2πτ) A Ḡ_a(ϑ)|² / σ²   over ϑ and τ
+    minimise  |ϑ − ϑ⁻|²_Λ⁻ + Σ w |Ĝ e^(jωτ) − G(ϑ)|² / σ²   over ϑ and τ
     Λ  = Λ⁻ + H_ϑϑ − H_ϑτ H_τϑ / H_ττ,                               H = JᵀJ
 
-where A Ḡ_a is what aliases.
+What of Ĝ is aliases, and what a band makes of a curved G, are taken out of it as ϑ⁻ has them.
 
 **The delay τ is taken as drawn anew at each pulse.** That is right if a trigger starts each window,
 and if the converter runs freely, where windows begin up to half a sample beside the pulse. A delay
@@ -50,6 +50,7 @@ from etid.precision import require_float64
 from etid.preflight import Inspected, preflight
 from etid.recording import Recording
 from etid.results import LABELS, Fit, Fits, IdentificationError
+from etid.spectra import counted_pulse_rate
 from etid.traces import stored_jit
 from etid.transfer import as_complex, frequency_variable, power, reciprocal
 from etid.verdicts import RESULTS, first_verdict, message, verdicts_of
@@ -133,7 +134,7 @@ class _Pulse(eqx.Module):
         """Derivatives of the residual and, last, the residual, in standard deviations."""
         of = self.tracker
         weight = as_complex(jnp.sqrt(of.bands.weight / self.variance))
-        model, slope = of.model(q[:-1], q[-1])
+        model, slope = of.gain(q[:-1])
         # By the delay it is jω Ĝ e^(jωτ), of which the noise is left out: it would be information.
         by_delay = model * jax.lax.complex(jnp.zeros_like(of.turn), of.turn)
         residual = self.gain * of.turned(q[-1]) - model
@@ -256,9 +257,8 @@ class Tracker(eqx.Module):
         if name is not None:
             text = f"unloaded recording {unloaded.path!r}: {name}. {message(name)}"
             raise IdentificationError(text, None)
-        periods, samples = seen.periods
-        period = samples / periods
         rate = unloaded.sample_rate
+        period = rate / counted_pulse_rate(seen.v_th, rate, unloaded.pulse_rate)
         bands = unloaded_bands(seen.v_th, float(seen.sigma_th), rate, period)
         known = given(driver, bands.frequency, False)
         assert driver.source is not None  # check_driver
@@ -344,24 +344,27 @@ class Tracker(eqx.Module):
         notes = np.array([message(name) for name in fit.verdict])
         return Fits(fit, labels, notes)
 
-    def model(
-        self, logs: Float[Array, " element"], delay: Float[Array, ""]
+    def gain(
+        self, logs: Float[Array, " element"]
     ) -> tuple[Complex[Array, " band"], Complex[Array, "element band"]]:
-        """What Ĝ e^(jωτ) should be, and its derivative by the elements."""
-        f, rate = self.bands.frequency, self.bands.sample_rate
+        """G and its derivative by the elements."""
 
         def load(logs):
-            return self.circuit.with_log_values(logs).impedance()(frequency_variable(f))
+            return self.circuit.with_log_values(logs).response(self.bands.frequency)
 
         z = load(logs)
         by_element = jax.vmap(lambda v: jax.jvp(load, (logs,), (v,))[1])(jnp.eye(logs.size))
         admittance = reciprocal(z + self.source)
-        above = self.circuit.with_log_values(logs).impedance()(frequency_variable(rate - f))
+        return z * admittance, by_element * (self.source * admittance * admittance)[None, :]
+
+    def departure(self, own: Float[Array, " own"]) -> Complex[Array, " band"]:
+        """What Ĝ holds besides G e^(−jωτ): aliases, and what a band makes of a curve."""
+        load, delay = self.circuit.with_log_values(own[:-1]), own[-1]
+        above = load.response(self.bands.sample_rate - self.bands.frequency)
         aliased = jnp.conj(above * reciprocal(above + self.source_alias)) * self.bands.alias
-        slope = by_element * (self.source * admittance * admittance)[None, :]
-        # Within a band the turn of a delay is not quite linear.
-        blurred = as_complex(1 - 0.5 * delay**2 * self.bands.spread)
-        return (z * admittance + aliased * _unit(2 * jnp.pi * delay)) * blurred, slope
+        departure = aliased * _unit(2 * jnp.pi * delay)
+        departure = departure + self.bands.departure(self.undelayed(own[:-1]), delay)
+        return departure * jnp.conj(self.turned(delay))
 
     def turned(self, delay: Float[Array, ""]) -> Complex[Array, " band"]:
         """e^(jωτ), from a table and its Taylor series: a sine costs as much as all the rest."""
@@ -423,6 +426,7 @@ def _electrode(
     away = ~running & ~(own_distance <= distance)
     start = jnp.where(away, elsewhere, start)
     damping = jnp.where(away, DAMPING, state.damping)
+    gain = gain - tracker.departure(start)
     pulse = _Pulse(tracker, gain, variance, logs, information)
     own, at, decrement, damping = _minimum(pulse.equations, start, damping)
     bands = tracker.bands
@@ -469,13 +473,13 @@ def _electrode(
     )
 
 
-@stored_jit
+@eqx.filter_jit  # not `stored_jit`, whose care costs a tenth of a tick at every call
 def _updated(
     tracker: Tracker, state: TrackerState, v_out: Float[Array, "lane sample"]
 ) -> TrackerState:
-    finite = jnp.isfinite(v_out).all(axis=1)
-    low, high = tracker.adc_range
-    clipped = ((v_out <= low) | (v_out >= high)).any(axis=1)
+    lowest, highest = v_out.min(axis=1), v_out.max(axis=1)  # not a number if one sample is none
+    finite = jnp.isfinite(lowest) & jnp.isfinite(highest)
+    clipped = (lowest <= tracker.adc_range[0]) | (highest >= tracker.adc_range[1])
     bands = tracker.bands
     gains = bands.measure(jnp.where(finite[:, None], v_out, 0.0))
     signal = power(gains.gain) @ bands.weight / gains.variance
@@ -505,7 +509,7 @@ def _fit(tracker: Tracker, state: TrackerState) -> Fit:
     """The fit of one electrode."""
     known, bands, logs = tracker.known, tracker.bands, state.own[:-1]
     elements = logs.size
-    model, _ = tracker.model(logs, state.own[-1])
+    model = tracker.undelayed(logs)
     pulse = _Pulse(
         tracker, jnp.zeros_like(model), state.variance, logs, jnp.zeros((elements, elements))
     )
