@@ -52,7 +52,7 @@ from etid.recording import Recording
 from etid.results import LABELS, Fit, Fits, IdentificationError
 from etid.spectra import counted_pulse_rate
 from etid.traces import stored_jit
-from etid.transfer import as_complex, frequency_variable, power, reciprocal
+from etid.transfer import as_complex, power, reciprocal
 from etid.verdicts import RESULTS, first_verdict, message, verdicts_of
 
 DAMPING, LOWER, RAISE = 1e-2, 0.1, 8.0  # of the first step, after a good one, after a bad one
@@ -179,15 +179,15 @@ class TrackerState(eqx.Module):
         result: Verdict on the last pulse.
     """
 
-    own: Float[Array, "lane own"]
-    information: Float[Array, "lane element element"]
-    pulses: Int[Array, " lane"]
-    missed: Int[Array, " lane"]
-    damping: Float[Array, " lane"]
-    strain: Float[Array, " lane"]
-    variance: Float[Array, " lane"]
-    chi2: Float[Array, " lane"]
-    rrse: Float[Array, " lane"]
+    own: Float[Array, "*lane own"]
+    information: Float[Array, "*lane element element"]
+    pulses: Int[Array, "*lane"]
+    missed: Int[Array, "*lane"]
+    damping: Float[Array, "*lane"]
+    strain: Float[Array, "*lane"]
+    variance: Float[Array, "*lane"]
+    chi2: Float[Array, "*lane"]
+    rrse: Float[Array, "*lane"]
     result: RESULTS
 
 
@@ -400,7 +400,7 @@ def _nearest(
     # A parabola through the distances beside it: a tenth of a sample is a hundred standard errors.
     around = distances[start, jnp.clip(at, 1, DELAYS.size - 2) + jnp.arange(-1, 2)]
     curved = around[0] - 2 * around[1] + around[2]
-    delay = DELAYS[0] + STEP * (at + 0.5 * (around[0] - around[2]) / curved)
+    delay = DELAYS[0] + STEP * (at.astype(around.dtype) + 0.5 * (around[0] - around[2]) / curved)
     inside = (at > 0) & (at < DELAYS.size - 1) & (curved > 0)
     delay = jnp.where(inside, delay, jnp.asarray(DELAYS)[at])
     return jnp.append(logs[start], delay), distances.reshape(-1)[best]
@@ -442,7 +442,7 @@ def _electrode(
     off = own[:-1] - logs
     pull = information @ off
     surprise = (jnp.dot(off, pull) + jnp.dot(pull, spread @ pull)) / elements
-    share = 1 / jnp.clip(state.pulses, 1, MEMORY)
+    share = 1 / jnp.clip(state.pulses, 1, MEMORY).astype(surprise.dtype)
     strain = state.strain + (surprise - state.strain) * share
     strained = running & (state.pulses >= MEMORY) & (strain > STRAINED)
 
@@ -462,9 +462,9 @@ def _electrode(
     return TrackerState(
         own=jnp.where(kept, own, state.own),
         information=jnp.where(again, 0.0, jnp.where(good, information + told, information)),
-        pulses=jnp.where(again, 0, state.pulses + good),
+        pulses=jnp.where(again, 0, state.pulses + jnp.where(good, 1, 0)),
         missed=missed,
-        damping=jnp.where(again | ~jnp.isfinite(damping), DAMPING, jnp.where(good, 0.0, damping)),
+        damping=jnp.where(again, DAMPING, jnp.where(good, 0.0, damping)).astype(own.dtype),
         strain=jnp.where(again, 0.0, jnp.where(good & running, strain, state.strain)),
         variance=variance,
         chi2=chi2,

@@ -58,6 +58,8 @@ FLOORS = {
     "shared_driver": 9,
     "identify": 11,
     "batch": 12,
+    "bands": 3,
+    "online": 12,
     "plotting": 12,
     "joint": 13,
     "streaming": 13,
