@@ -1,8 +1,10 @@
 """From the samples of one pulse to the gain in bands of frequency.
 
-One period is cut out as the M samples nearest to it, and M samples are no whole period. They need
-not be: where windows begin and end in the quiet between two pulses, Y(f) = G(f) X(f) holds at any
-frequency. They are filled with that quiet level up to a length whose Fourier transform is cheap.
+One period is cut out as the samples nearest to it, less the few that make its Fourier transform
+dear. Where windows begin and end in the quiet between two pulses, Y(f) = G(f) X(f) holds at their
+frequencies too, although they are not quite harmonics: at 60 Hz, 200 kHz and 3332 samples it biases
+an element by less than a twentieth of what the noise of 100 pulses at 60 dB leaves. The tail between
+pulses is not quite at rest: 3360 samples, the missing ones filled in, would bias it by 1.5 times that.
 
 **A band** is a few neighbouring bins k, a sixteenth of their frequency at most, over which a
 gain is nearly linear. All that a pulse tells of it is
@@ -12,9 +14,10 @@ gain is nearly linear. All that a pulse tells of it is
 and what a straight line through the band leaves of Y is its noise, without a model of the load. A
 fifth of the numbers is left to be fitted, without a loss.
 
-**What has aliased**, X(f − fs), cannot be told from X(f) in one period. But periods that are no whole
-number of samples are sampled at different phases φ [samples], each showing X(f) + e^(−j2πφ) X(f − fs):
-an unloaded record of several periods tells them apart, and with them what aliases in a load.
+**What has aliased**, X(f − fs), cannot be told from X(f) in one period. But periods that are no
+whole number of samples are sampled at different phases φ [samples], and show
+X(f) + e^(−j2πφ) X(f − fs): an unloaded record of several periods tells them apart, and with them
+what aliases in a load.
 """
 
 import math
@@ -24,7 +27,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import scipy.fft
 from jaxtyping import Array, Complex, Float
 
 from etid.measurement import RIPPLE
@@ -33,7 +35,7 @@ from etid.transfer import as_complex, power
 
 RELATIVE = 16  # bins of a band's frequency for each of its own
 WIDEST = 16  # bins
-QUIET = 256  # part of a window, at each of its ends, that tells the level between two pulses
+REACH = 1e-3  # of a period, that its transform may leave out
 PRESENT = 0.5  # part of a band's power in X that must not be noise
 DIVERSE = 0.9  # |mean e^(−j2πφ)| from which on sampling phases are too much alike
 
@@ -158,12 +160,23 @@ class Bands(eqx.Module):
 
 
 def _transform(v: Array, size: int, bins: int) -> Array:
-    """Fourier coefficients from bin 1 on, of a window filled up with the level at its ends."""
-    samples = v.shape[-1]
-    edge = max(samples // QUIET, 1)
-    level = (v[..., :edge].mean(-1) + v[..., -edge:].mean(-1)) / 2
-    filling = jnp.broadcast_to(level[..., None], (*v.shape[:-1], size - samples))
-    return jnp.fft.rfft(jnp.concatenate([v, filling], axis=-1))[..., 1 : bins + 1]
+    """Fourier coefficients from bin 1 on."""
+    return jnp.fft.rfft(v[..., :size])[..., 1 : bins + 1]
+
+
+def _cheap_size(samples: int) -> int:
+    """A length next to a period whose largest prime factor is small."""
+
+    def largest(size):
+        factor = 2
+        while factor * factor <= size:
+            if size % factor == 0:
+                size //= factor
+            else:
+                factor += 1
+        return size
+
+    return min(range(samples, samples - round(REACH * samples) - 1, -1), key=largest)
 
 
 def _slopes(
@@ -193,7 +206,7 @@ def unloaded_bands(
     """
     windows = cut(v_th, period)
     samples = windows.shape[-1]
-    size = int(scipy.fft.next_fast_len(samples, real=True))
+    size = _cheap_size(samples)
     bins = int(ALIASED * size)
     groups = _groups(bins)
     bins = sum(width * count for _, width, count in groups)
@@ -206,7 +219,7 @@ def unloaded_bands(
         design = design[:, :1]
     found = np.linalg.pinv(design) @ y
     share = np.linalg.inv(design.conj().T @ design)[0, 0].real
-    variance = share * samples * sigma_th**2
+    variance = share * size * sigma_th**2
     x, aliased = found[0], found[1] if len(found) > 1 else np.zeros(bins)
 
     number = np.arange(1.0, bins + 1)
@@ -241,7 +254,7 @@ def unloaded_bands(
         turned=jnp.asarray(spread * first),
         spread=jnp.asarray(spread),
         alias=jnp.asarray(summed(x.conj() * aliased) / strength),
-        floor=jnp.asarray(samples * (RIPPLE * np.ptp(v_th)) ** 2),
+        floor=jnp.asarray(size * (RIPPLE * np.ptp(v_th)) ** 2),
         sample_rate=sample_rate,
         samples=samples,
         size=size,

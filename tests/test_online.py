@@ -14,7 +14,7 @@ from etid.lanes import lane
 from etid.online import MEMORY, PATIENCE, Tracker
 from etid.preflight import Inspected
 from etid.scenes import Scene, Trial
-from etid.spectra import Spectrum
+from etid.spectra import ALIASED, Spectrum
 from etid.transformer import ResistorLoad, SkinLoad, loading
 
 DRY = SkinLoad(r_s=33.4e3, r_p=186e3, c_p=0.12e-9)
@@ -75,10 +75,6 @@ def own_stderr(fits):
     return np.sqrt(own) / np.asarray(fits.circuit.values())
 
 
-def lane_bits(state, lanes):
-    return [np.asarray(leaf)[np.asarray(lanes)] for leaf in jax.tree.leaves(state)]
-
-
 def test_constant_skin_is_found_within_its_standard_errors_from_the_second_tenth_of_a_second_on():
     study = scene(40, trigger_jitter_rms=500e-9).simulate(seed=5)
     tracker = tracker_of(2)
@@ -127,30 +123,62 @@ def test_skin_of_all_kinds_is_found_from_typical_values():
     assert (np.abs(z) < 5).all()
 
 
-def test_without_noise_it_is_what_a_batch_fit_of_many_periods_is():
-    """To a tenth of what the noise of 100 pulses at 60 dB leaves, after 10 and after 12 pulses."""
+@functools.cache
+def explained():
+    """Ten periods of loads of the driver *as identified*, with its tracker: no error but noise.
+
+    The trigger of the records is 0.3 µs late.
+    """
     driver, _ = calibrated()
-    study = quiet()
-    tracker = Tracker.of(driver, study["cal/0"], electrodes=2)
-    pulses = tracker.pulses(loaded(study))
-    hundred = own_stderr(reference_of_noise()) / 10
-    expected = np.array([batch(driver, study[name]) for name in LOADS])
-    state = followed(tracker, pulses[:9])
-    for v_out in pulses[9:]:
-        state = tracker.update(state, v_out)
-        found = np.asarray(tracker.read(state).circuit.values())
-        assert (np.abs(found / expected - 1) < 0.1 * hundred).all()
+    source = driver.source
+    assert source is not None
+    tracker = Tracker.of(driver, quiet()["cal/0"], electrodes=2)
+    tracker = dataclasses.replace(tracker, source=source.response(tracker.bands.frequency))
+    sampler, v_th, *_ = scene(1)._exact()
+    z_th = np.asarray(source.response(jnp.asarray(sampler.f)))
+    v_out = [v_th * loading(load(sampler.f), z_th) for load in LOADS.values()]
+    return tracker, np.stack([sampler.sample(v, 33_340, 0.3e-6) for v in v_out])
 
 
-def reference_of_noise():
-    """A fit whose intervals are those of one pulse at 60 dB."""
-    tracker = tracker_of(2)
-    pulses = with_noise(tracker.pulses(loaded(quiet())), seed=4)
-    state = followed(tracker, pulses)
-    used = np.asarray(state.pulses, dtype=float)[:, None, None]
-    return tracker.read(
-        dataclasses.replace(state, information=state.information / jnp.asarray(used))
+def anew(state):
+    """A state that knows where to start and nothing else."""
+    nothing = jnp.zeros_like(state.information)
+    return dataclasses.replace(
+        state, information=nothing, pulses=jnp.ones_like(state.pulses), strain=0 * state.strain
     )
+
+
+def test_without_noise_it_is_biased_by_less_than_a_tenth_of_the_noise_of_100_pulses_at_60_db():
+    tracker, v_out = explained()
+    pulses = tracker.pulses(v_out)
+    start = anew(followed(tracker, with_noise(pulses[:8], seed=4)))
+    with_the_noise = tracker.update(start, with_noise(pulses, seed=5)[8])
+    hundred = own_stderr(tracker.read(with_the_noise)) / 10
+    state = anew(followed(tracker, pulses[:8]))
+    for v_out in pulses:
+        state = tracker.update(state, v_out)
+    found = np.asarray(tracker.read(state).circuit.values())
+    assert (np.abs(found / TRUTH - 1) < 0.1 * hundred).all(), (found / TRUTH - 1) / hundred
+
+
+SAME = 0.2  # standard errors: both weigh the noise of V_th, but not in the same way
+
+
+def test_after_some_pulses_it_is_what_a_batch_fit_of_these_periods_is():
+    """With the same Z_th, and the harmonics of the same band."""
+    tracker, v_out = explained()
+    driver, _ = calibrated()
+    v_out = with_noise(v_out, seed=6)
+    pulses = tracker.pulses(v_out)
+    state = followed(tracker, pulses)
+    fits = tracker.read(functools.reduce(tracker.update, pulses, anew(state)))
+    assert list(fits.verdicts) == ["successful"] * 2
+    unloaded = quiet()["cal/0"].v_th
+    for number, one in enumerate(v_out):
+        size = one.size
+        record = etid.Recording(unloaded[:size], one, sample_rate=RATE, pulse_rate=PULSES)
+        apart = np.asarray(fits.circuit.values())[number] / batch(driver, record) - 1
+        assert (np.abs(apart) < SAME * own_stderr(fits)[number]).all(), apart
 
 
 def batch(driver, recording):
@@ -158,42 +186,30 @@ def batch(driver, recording):
     *fields, rate = map(jnp.asarray, lane(Inspected(recording), "maximum_likelihood"))
     model = maximum_likelihood.Joint(etid.SkinRC(), estimation.calibrations_of(driver), False)
     spectrum = Spectrum(*fields)
+    selected = spectrum.selected & (spectrum.frequency < ALIASED * RATE)
+    spectrum = dataclasses.replace(spectrum, selected=selected)
     z_th = driver.response(spectrum.frequency)
     starts = estimation.harmonic_starts(spectrum, rate, z_th, etid.SkinRC())
     own, *_ = maximum_likelihood.fit_load(model, spectrum, rate, starts)
     return np.exp(np.asarray(own[:-1]))
 
 
-def test_after_some_pulses_it_is_what_a_batch_fit_of_these_periods_is():
-    """To a third of the noise's standard error: the pulses of the start are not counted."""
-    driver, calibrations = calibrated()
-    study = scene(30, trigger_jitter_rms=50e-9).simulate(seed=6)
-    unloaded = study["dry"]
-    tracker = Tracker.of(driver, unloaded, electrodes=1)
-    fits = tracker.read(followed(tracker, tracker.pulses(unloaded.v_out[None, :])))
-    assert fits.verdicts == ["successful"]
-    apart = np.asarray(fits.circuit.values())[0] / batch(driver, unloaded) - 1
-    assert (np.abs(apart) < own_stderr(fits)[0] / 3).all(), apart / own_stderr(fits)[0]
-
-
-def test_a_lane_without_numbers_changes_no_bit_of_the_others_and_nor_does_their_order():
-    tracker = tracker_of(4)
-    pulses = with_noise(np.tile(tracker.pulses(loaded(quiet()))[:8], (1, 2, 1)), seed=1)
+def test_a_lane_without_numbers_changes_no_bit_of_the_other_and_nor_does_their_order():
+    tracker = tracker_of(2)
+    pulses = with_noise(tracker.pulses(loaded(quiet()))[:8], seed=1)
     ill = pulses.copy()
-    ill[:, 1] = np.nan
-    ill[3:, 2, 100] = np.inf
+    ill[:4, 1] = np.nan
+    ill[4:, 1, 100] = np.inf
     good, bad = followed(tracker, pulses), followed(tracker, ill)
-    assert list(tracker.read(bad).verdicts[1:3]) == ["nonfinite_samples"] * 2
-    for one, other in zip(lane_bits(good, [0, 3]), lane_bits(bad, [0, 3]), strict=True):
-        np.testing.assert_array_equal(one, other)
+    assert list(tracker.read(bad).verdicts) == ["successful", "nonfinite_samples"]
+    for one, other in zip(jax.tree.leaves(good), jax.tree.leaves(bad), strict=True):
+        np.testing.assert_array_equal(one[0], other[0])
     turned = followed(tracker, pulses[:, ::-1])
-    for one, other in zip(
-        lane_bits(good, [0, 1, 2, 3]), lane_bits(turned, [3, 2, 1, 0]), strict=True
-    ):
-        np.testing.assert_array_equal(one, other)
+    for one, other in zip(jax.tree.leaves(good), jax.tree.leaves(turned), strict=True):
+        np.testing.assert_array_equal(one, other[::-1])
 
 
-HIGHEST = 60.0  # [V] at which the converter of these pulses ends
+HIGHEST = 100.0  # [V] at which the converter of these pulses ends
 TROUBLES = {
     "lifted": {"misfit", "max_steps_reached", "insensitive"},
     "turned over": {"misfit", "max_steps_reached", "insensitive", "nonphysical"},
@@ -214,7 +230,7 @@ def test_an_electrode_in_trouble_says_so_at_once_and_recovers(trouble):
         "lifted": with_noise(tracker.pulses(quiet()["dry"].v_th), seed=3),
         "turned over": -bad,
         "not a number": np.full_like(bad, np.nan),
-        "clipped": np.minimum(2 * bad, HIGHEST),
+        "clipped": np.minimum(4 * bad, HIGHEST),
         "unplugged": 1e-4 * with_noise(np.zeros_like(bad), seed=3),
     }[trouble]
     state = tracker.start()
@@ -302,8 +318,8 @@ def test_drifting_skin_is_followed_and_its_intervals_hold_it():
 
 def test_skin_that_drifts_though_it_should_not_is_no_lasting_success():
     """A tenth of a standard error of one pulse per pulse, of which constant skin knows nothing."""
-    tracker = tracker_of(1)
-    truth = TRUTH[:1] * np.exp(1e-3 * np.arange(3 * MEMORY))[:, None, None]
+    tracker = tracker_of(2)
+    truth = TRUTH * np.exp(1e-3 * np.arange(3 * MEMORY))[:, None, None]
     state, verdicts = tracker.start(), []
     for v_out in drifting(tracker, truth, seed=1):
         state = tracker.update(state, v_out)
