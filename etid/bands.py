@@ -64,7 +64,7 @@ def _groups(bins: int) -> tuple[tuple[int, int, int], ...]:
     for doubling in range(int(math.log2(WIDEST)) + 1):
         width = 2**doubling
         end = bins if width == WIDEST else min(bins, 2 * RELATIVE * width - 1)
-        count = (end - first + 1) // width
+        count = math.ceil((end - first + 1) / width)
         groups.append((first, width, count))
         first += width * count
     return tuple(group for group in groups if group[2] > 0)

@@ -173,12 +173,15 @@ def test_after_some_pulses_it_is_what_a_batch_fit_of_these_periods_is():
     state = followed(tracker, pulses)
     fits = tracker.read(functools.reduce(tracker.update, pulses, anew(state)))
     assert list(fits.verdicts) == ["successful"] * 2
+    assert (fits.fit.steps == len(pulses) + 1).all()
     unloaded = quiet()["cal/0"].v_th
     for number, one in enumerate(v_out):
         size = one.size
         record = etid.Recording(unloaded[:size], one, sample_rate=RATE, pulse_rate=PULSES)
         apart = np.asarray(fits.circuit.values())[number] / batch(driver, record) - 1
-        assert (np.abs(apart) < SAME * own_stderr(fits)[number]).all(), apart
+        assert (np.abs(apart) < SAME * own_stderr(fits)[number]).all(), (
+            apart / own_stderr(fits)[number]
+        )
 
 
 def batch(driver, recording):
