@@ -14,6 +14,7 @@ NAMES = (
     "speed",
     "curves",
     "scale",
+    "online",
     "speed_accuracy",
     "which",
 )

@@ -36,20 +36,18 @@ def main(arguments: argparse.Namespace) -> bool:
     state, seconds = tracker.start(), []
     for number in tqdm(range(WARM + arguments.ticks)):
         v_out = pulses[number % len(pulses)]
-        begin = time.perf_counter()
+        begin = time.perf_counter(), time.process_time()
         state = jax.block_until_ready(tracker.update(state, v_out))
-        seconds.append(time.perf_counter() - begin)
+        seconds.append((time.perf_counter() - begin[0], time.process_time() - begin[1]))
     period = tracker.period / tracker.bands.sample_rate
-    ratios = np.array(seconds[WARM:]) / period
+    ratios, busy = np.array(seconds[WARM:]).T / period
     print(f"{arguments.electrodes} electrodes, {len(ratios)} ticks: {tracker.read(state).counts()}")
-    print(f"{'':<8}{'ms':>8}{'of the period':>16}   target")
-    for name, ratio in (
-        ("median", np.median(ratios)),
-        ("p99", np.percentile(ratios, 99)),
-        ("worst", ratios.max()),
-    ):
+    # The processor's own time is less where other programs take turns on that core.
+    print(f"{'':<8}{'ms':>8}{'of the period':>16}{'processor':>12}   target")
+    for name, percent in (("median", 50), ("p99", 99), ("worst", 100)):
+        ratio, own = np.percentile(ratios, percent), np.percentile(busy, percent)
         target = f"   <= {TARGET:.0%}" if name == "p99" else ""
-        print(f"{name:<8}{1e3 * period * ratio:8.2f}{ratio:16.1%}{target}")
+        print(f"{name:<8}{1e3 * period * ratio:8.2f}{ratio:16.1%}{own:12.1%}{target}")
     return bool(np.percentile(ratios, 99) <= TARGET)
 
 

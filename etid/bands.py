@@ -2,9 +2,9 @@
 
 One period is cut out as the samples nearest to it, less the few that make its Fourier transform
 dear. Where windows begin and end in the quiet between two pulses, Y(f) = G(f) X(f) holds at their
-frequencies too, although they are not quite harmonics: at 60 Hz, 200 kHz and 3332 samples it biases
-an element by less than a twentieth of what the noise of 100 pulses at 60 dB leaves. The tail between
-pulses is not quite at rest: 3360 samples, the missing ones filled in, would bias it by 1.5 times that.
+frequencies too, although they are not quite harmonics: 3332 samples for a period of 3333⅓ bias an
+element by less than a tenth of what the noise of 100 pulses at 60 dB leaves. The tail between two
+pulses is not at rest: 3360 samples, those that are missing filled in, biased it by 1.5 times that.
 
 **A band** is a few neighbouring bins k, a sixteenth of their frequency at most, over which a
 gain is nearly linear. All that a pulse tells of it is
@@ -182,7 +182,7 @@ def _cheap_size(samples: int) -> int:
 def _slopes(
     x: Float[np.ndarray, " band"],
 ) -> tuple[Float[np.ndarray, "3 band"], Float[np.ndarray, "3 band"]]:
-    """First and second derivative by values at the point before, at x and at the next; 0 at ends."""
+    """First and second derivative by the values before, at and after each point; 0 at the ends."""
     before, after = np.diff(x)[:-1], np.diff(x)[1:]
     both = before + after
     first = [-after / before / both, (after - before) / before / after, before / after / both]

@@ -6,8 +6,9 @@
         state = tracker.update(state, v_out)
     print(tracker.read(state))
 
-An extended Kalman filter in information form, iterated at each pulse (Bell and Cathey 1993). For one
-electrode, with ϑ the logarithms of its elements, Λ their information and Ĝ the gains of `etid.bands`,
+An extended Kalman filter in information form, iterated at each pulse (Bell and Cathey 1993). For
+one electrode, with ϑ the logarithms of its elements, Λ their information and Ĝ the gains of
+`etid.bands`,
 
     Λ⁻ = (Λ⁻¹ + q² 1)⁻¹                                              (a random walk of the skin)
     minimise  |ϑ − ϑ⁻|²_Λ⁻ + Σ w |Ĝ e^(jωτ) − G(ϑ)|² / σ²   over ϑ and τ
@@ -19,12 +20,15 @@ What of Ĝ is aliases, and what a band makes of a curved G, are taken out of it 
 and if the converter runs freely, where windows begin up to half a sample beside the pulse. A delay
 that all pulses share would be known better, but nothing else: the information on ϑ is the same sum.
 
-**A pulse that does not fit** changes nothing but the verdict. After several in a row, or if the
-pulses have long disagreed with the intervals, the electrode starts again, from generic values.
+**Every pulse takes the same time**: one step of Levenberg and Marquardt's, from the likeliest delay.
+An electrode that starts does so from generic values, and is there after three to eight pulses.
 
-Z_th stays as the calibrations have it: that many electrodes tell of it too is not used. Its error is
-that of no noise, and no number of pulses lessens it: it is `shared_cov`, with the noise of the
-unloaded record. Calibrate with two resistors, or an unknown delay of the calibration is error of C_p.
+**A pulse that does not fit** changes nothing but the verdict. After several in a row, or if the
+pulses have long disagreed with the intervals, the electrode starts again.
+
+Z_th stays as the calibrations have it: what the pulses tell of it is not used. No number of pulses
+lessens its error, nor that by the noise of the unloaded record: both are `shared_cov`. Calibrate
+with two resistors, or the delay that one leaves open is an error of C_p, of one per cent or two.
 """
 
 from collections.abc import Callable
@@ -105,8 +109,8 @@ def _minimum(
     """A step of Levenberg and Marquardt's and, where that was the last but one, one of Newton's.
 
     Returns:
-        The minimum, or what was reached of the way to it; the last equations; by how much Σ r² was to
-        fall from there; and the damping with which to go on.
+        The minimum, or what was reached of the way to it; the last equations; by how much Σ r² was
+        to fall from there; and the damping with which to go on.
     """
     before = equations(start)
     matrix = before.matrix + damping * jnp.diag(jnp.diagonal(before.matrix))
@@ -243,7 +247,7 @@ class Tracker(eqx.Module):
                 of their logarithms per pulse [1/√pulse]; 0 for skin that does not.
 
         Raises:
-            ValueError: The driver has no harmonics of its calibrations, or a number is out of range.
+            ValueError: The driver has no harmonics of its calibrations, or a number is too small.
             IdentificationError: The recording is of no use; the message says why.
         """
         require_float64()

@@ -1,4 +1,4 @@
-"""On-line identification: pulse by pulse to the truth, with intervals that hold it, lane by lane."""
+"""On-line identification: pulse by pulse to the truth, with true intervals, lane by lane."""
 
 import dataclasses
 import functools
