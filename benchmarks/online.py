@@ -39,7 +39,7 @@ def main(arguments: argparse.Namespace) -> bool:
         begin = time.perf_counter(), time.process_time()
         state = jax.block_until_ready(tracker.update(state, v_out))
         seconds.append((time.perf_counter() - begin[0], time.process_time() - begin[1]))
-    period = tracker.period / tracker.bands.sample_rate
+    period = tracker.period / tracker.model.bands.sample_rate
     ratios, busy = np.array(seconds[WARM:]).T / period
     print(f"{arguments.electrodes} electrodes, {len(ratios)} ticks: {tracker.read(state).counts()}")
     # The processor's own time is less where other programs take turns on that core.

@@ -20,8 +20,8 @@ What of Ĝ is aliases, and what a band makes of a curved G, are taken out of it 
 and if the converter runs freely, where windows begin up to half a sample beside the pulse. A delay
 that all pulses share would be known better, but nothing else: the information on ϑ is the same sum.
 
-**Every pulse takes the same time**: one step of Levenberg and Marquardt's, from the likeliest delay.
-An electrode that starts does so from generic values, and is there after three to eight pulses.
+**Every pulse takes the same time**: one step of Levenberg and Marquardt's, from the likeliest
+delay. An electrode that starts does so from generic values, and takes three to eight pulses.
 
 **A pulse that does not fit** changes nothing but the verdict. After several in a row, or if the
 pulses have long disagreed with the intervals, the electrode starts again.
@@ -31,16 +31,13 @@ lessens its error, nor that by the noise of the unloaded record: both are `share
 with two resistors, or the delay that one leaves open is an error of C_p, of one per cent or two.
 """
 
-from collections.abc import Callable
-from typing import NamedTuple
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float, Int
 
-from etid.bands import Bands, cut, unloaded_bands
+from etid.bands import cut, unloaded_bands
 from etid.circuits import AbstractCircuit, SkinRC
 from etid.driver import Driver
 from etid.estimation import circuit_starts
@@ -49,9 +46,9 @@ from etid.information import inverse
 from etid.judging import MAX_STEPS_REACHED, SUCCESSFUL, misses
 from etid.lanes import given
 from etid.methods import check_driver
-from etid.output_error import DELAY_WIDTH
 from etid.precision import require_float64
 from etid.preflight import Inspected, preflight
+from etid.pulse import DAMPING, DELAYS, SETTLED, GainModel, Pulse, inverse_of_few, minimum, nearest
 from etid.recording import Recording
 from etid.results import LABELS, Fit, Fits, IdentificationError
 from etid.spectra import counted_pulse_rate
@@ -59,112 +56,10 @@ from etid.traces import stored_jit
 from etid.transfer import as_complex, power, reciprocal
 from etid.verdicts import RESULTS, first_verdict, message, verdicts_of
 
-DAMPING, LOWER, RAISE = 1e-2, 0.1, 8.0  # of the first step, after a good one, after a bad one
-SETTLED = 1.0  # standard errors of a pulse from the minimum, before the last step
-STEP = 0.1  # [samples]
-DELAYS = STEP * np.arange(-15, 16)  # [samples] one of a trigger, half a one of a window
 FLAT = 4.0  # times the power that noise alone has
 PATIENCE = 5  # pulses that do not fit, in a row, after which an electrode starts again
 MEMORY = 30  # pulses over which their disagreement with the intervals is averaged
 STRAINED = 2.0  # of 1 expected; its standard deviation is 0.15
-
-
-class _Equations(NamedTuple):
-    """Normal equations of a pulse, and of what was known before it.
-
-    Attributes:
-        objective: Σ r² of both.
-        squares: Σ r² of the pulse.
-        gradient: Jᵀr of both.
-        curvature: JᵀJ of the pulse.
-        matrix: JᵀJ of both.
-    """
-
-    objective: Float[Array, ""]
-    squares: Float[Array, ""]
-    gradient: Float[Array, " own"]
-    curvature: Float[Array, "own own"]
-    matrix: Float[Array, "own own"]
-
-
-def _inverse(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
-    """Inverse of a positive definite matrix of a few rows, all lanes at once.
-
-    By Gauss and Jordan: a call of LAPACK for each lane costs twenty times as much.
-    """
-    scale = jnp.sqrt(jnp.diagonal(matrix))
-    size = matrix.shape[0]
-    work = jnp.concatenate([matrix / scale[:, None] / scale[None, :], jnp.eye(size)], axis=1)
-    for i in range(size):
-        row = work[i] / work[i, i]
-        work = (work - work[:, i][:, None] * row[None, :]).at[i].set(row)
-    return work[:, size:] / scale[:, None] / scale[None, :]
-
-
-def _minimum(
-    equations: Callable[[Float[Array, " own"]], _Equations],
-    start: Float[Array, " own"],
-    damping: Float[Array, ""],
-) -> tuple[Float[Array, " own"], _Equations, Float[Array, ""], Float[Array, ""]]:
-    """A step of Levenberg and Marquardt's and, where that was the last but one, one of Newton's.
-
-    Returns:
-        The minimum, or what was reached of the way to it; the last equations; by how much Σ r² was
-        to fall from there; and the damping with which to go on.
-    """
-    before = equations(start)
-    matrix = before.matrix + damping * jnp.diag(jnp.diagonal(before.matrix))
-    trial = start - _inverse(matrix) @ before.gradient
-    after = equations(trial)
-    better = after.objective <= before.objective
-    own = jnp.where(better, trial, start)
-    at = jax.tree.map(lambda new, old: jnp.where(better, new, old), after, before)
-    step = _inverse(at.matrix) @ at.gradient
-    decrement = jnp.dot(step, at.gradient)
-    own = jnp.where(decrement < SETTLED**2, own - step, own)
-    return own, at, decrement, damping * jnp.where(better, LOWER, RAISE)
-
-
-class _Pulse(eqx.Module):
-    """What is minimised for one electrode at one pulse."""
-
-    tracker: "Tracker"
-    gain: Complex[Array, " band"]
-    variance: Float[Array, ""]
-    centre: Float[Array, " element"]
-    information: Float[Array, "element element"]
-
-    def terms(self, q: Float[Array, " own"]) -> Float[Array, "own1 part"]:
-        """Derivatives of the residual and, last, the residual, in standard deviations."""
-        of = self.tracker
-        weight = as_complex(jnp.sqrt(of.bands.weight / self.variance))
-        model, slope = of.gain(q[:-1])
-        # By the delay it is jω Ĝ e^(jωτ), of which the noise is left out: it would be information.
-        by_delay = model * jax.lax.complex(jnp.zeros_like(of.turn), of.turn)
-        residual = self.gain * of.turned(q[-1]) - model
-        rows = jnp.concatenate([-slope, by_delay[None, :], residual[None, :]]) * weight[None, :]
-        return jnp.concatenate([rows.real, rows.imag], axis=1)
-
-    def equations(self, q: Float[Array, " own"]) -> _Equations:
-        """Normal equations."""
-        terms = self.terms(q)
-        products = terms @ terms.T
-        off = q[:-1] - self.centre
-        pull = jnp.append(self.information @ off, q[-1] / DELAY_WIDTH**2)
-        squares, curvature = products[-1, -1], products[:-1, :-1]
-        prior = jnp.pad(self.information, (0, 1)).at[-1, -1].set(1 / DELAY_WIDTH**2)
-        return _Equations(
-            squares + jnp.dot(pull, jnp.append(off, q[-1])),
-            squares,
-            products[:-1, -1] + pull,
-            curvature,
-            curvature + prior,
-        )
-
-
-def _unit(angle: Float[Array, "..."]) -> Complex[Array, "..."]:
-    """e^(j angle)."""
-    return jax.lax.complex(jnp.cos(angle), jnp.sin(angle))
 
 
 class TrackerState(eqx.Module):
@@ -199,12 +94,8 @@ class Tracker(eqx.Module):
     """Identifies all electrodes of a display with every pulse. Make one with `Tracker.of`.
 
     Attributes:
-        circuit: Structure of the loads, and where to start.
-        bands: The unloaded pulse.
+        model: What pulses should be.
         known: What the calibrations tell of Z_th at the bands.
-        source_alias: Z_th where aliases come from [Ω].
-        turn: Turn of the gain by a delay of one sample [rad].
-        turns: e^(jωτ) for each of `DELAYS`.
         change: Random walk of the elements' logarithms [1/√pulse].
         adc_range: Voltages at which the converter saturates [V].
         driver_result: Verdict of the driver.
@@ -212,13 +103,8 @@ class Tracker(eqx.Module):
         period: Length of a period in samples.
     """
 
-    circuit: AbstractCircuit
-    bands: Bands
+    model: GainModel
     known: GivenDriver
-    source: Complex[Array, " band"]
-    source_alias: Complex[Array, " band"]
-    turn: Float[Array, " band"]
-    turns: Complex[Array, "delay band"]
     change: Float[Array, ""]
     adc_range: Float[Array, " 2"]
     driver_result: RESULTS
@@ -268,15 +154,15 @@ class Tracker(eqx.Module):
         assert driver.source is not None  # check_driver
         low, high = unloaded.adc_range or (-np.inf, np.inf)
         half = seen.step_th / 2
-        turn = 2 * jnp.pi * bands.frequency / rate
+        model = GainModel.of(
+            SkinRC() if circuit is None else circuit,
+            bands,
+            known.z_th(combined(known.mean, known.slope)),
+            driver.source.response(rate - bands.frequency),
+        )
         return cls(
-            circuit=SkinRC() if circuit is None else circuit,
-            bands=bands,
+            model=model,
             known=known,
-            source=known.z_th(combined(known.mean, known.slope)),
-            source_alias=driver.source.response(rate - bands.frequency),
-            turn=turn,
-            turns=_unit(jnp.asarray(DELAYS)[:, None] * turn[None, :]),
             change=jnp.asarray(float(change)),
             adc_range=jnp.array([low + half, high - half]),
             driver_result=driver.result,
@@ -286,8 +172,8 @@ class Tracker(eqx.Module):
 
     def start(self) -> TrackerState:
         """The state before the first pulse: nothing is known."""
-        lanes, elements = self.electrodes, len(self.circuit.names())
-        typical = jnp.append(self.circuit.log_values(), 0.0)
+        lanes, elements = self.electrodes, len(self.model.circuit.names())
+        typical = jnp.append(self.model.circuit.log_values(), 0.0)
         nan = jnp.full(lanes, jnp.nan)
         return TrackerState(
             own=jnp.broadcast_to(typical[None, :], (lanes, elements + 1)),
@@ -324,7 +210,7 @@ class Tracker(eqx.Module):
         Raises:
             ValueError: Not one window for each electrode, of one period.
         """
-        expected = (self.electrodes, self.bands.samples)
+        expected = (self.electrodes, self.model.bands.samples)
         if np.shape(v_out) != expected:
             raise ValueError(
                 f"v_out has shape {np.shape(v_out)}; one period at each electrode is "
@@ -348,67 +234,6 @@ class Tracker(eqx.Module):
         notes = np.array([message(name) for name in fit.verdict])
         return Fits(fit, labels, notes)
 
-    def gain(
-        self, logs: Float[Array, " element"]
-    ) -> tuple[Complex[Array, " band"], Complex[Array, "element band"]]:
-        """G and its derivative by the elements."""
-
-        def load(logs):
-            return self.circuit.with_log_values(logs).response(self.bands.frequency)
-
-        z = load(logs)
-        by_element = jax.vmap(lambda v: jax.jvp(load, (logs,), (v,))[1])(jnp.eye(logs.size))
-        admittance = reciprocal(z + self.source)
-        return z * admittance, by_element * (self.source * admittance * admittance)[None, :]
-
-    def departure(self, own: Float[Array, " own"]) -> Complex[Array, " band"]:
-        """What Ĝ holds besides G e^(−jωτ): aliases, and what a band makes of a curve."""
-        load, delay = self.circuit.with_log_values(own[:-1]), own[-1]
-        above = load.response(self.bands.sample_rate - self.bands.frequency)
-        aliased = jnp.conj(above * reciprocal(above + self.source_alias)) * self.bands.alias
-        departure = aliased * _unit(2 * jnp.pi * delay)
-        departure = departure + self.bands.departure(self.undelayed(own[:-1]), delay)
-        return departure * jnp.conj(self.turned(delay))
-
-    def turned(self, delay: Float[Array, ""]) -> Complex[Array, " band"]:
-        """e^(jωτ), from a table and its Taylor series: a sine costs as much as all the rest."""
-        near = jnp.clip(jnp.round((delay - DELAYS[0]) / STEP), 0, DELAYS.size - 1).astype(int)
-        angle = (delay - jnp.asarray(DELAYS)[near]) * self.turn
-        square = angle * angle
-        cosine = 1 - square / 2 * (1 - square / 12 * (1 - square / 30))
-        sine = angle * (1 - square / 6 * (1 - square / 20 * (1 - square / 42)))
-        return self.turns[near] * jax.lax.complex(cosine, sine)
-
-    def distances(
-        self, gain: Complex[Array, " band"], expected: Complex[Array, " band"]
-    ) -> Float[Array, " delay"]:
-        """How far `gain` is from what is expected, for each delay of `DELAYS`."""
-        product = as_complex(self.bands.weight) * jnp.conj(expected) * gain
-        parts = jnp.concatenate([product.real, -product.imag])
-        turns = jnp.concatenate([self.turns.real, self.turns.imag], axis=1)
-        return jnp.sum(self.bands.weight * power(expected)) - 2 * turns @ parts
-
-    def undelayed(self, logs: Float[Array, " element"]) -> Complex[Array, " band"]:
-        """The gain without a delay."""
-        z = self.circuit.with_log_values(logs).response(self.bands.frequency)
-        return z * reciprocal(z + self.source)
-
-
-def _nearest(
-    tracker: Tracker, gain: Complex[Array, " band"], logs: Float[Array, "start element"]
-) -> tuple[Float[Array, " own"], Float[Array, ""]]:
-    """Which of several elements, with which delay, comes next to a gain, and how near."""
-    distances = jax.vmap(lambda one: tracker.distances(gain, tracker.undelayed(one)))(logs)
-    best = jnp.argmin(distances)
-    start, at = best // DELAYS.size, best % DELAYS.size
-    # A parabola through the distances beside it: a tenth of a sample is a hundred standard errors.
-    around = distances[start, jnp.clip(at, 1, DELAYS.size - 2) + jnp.arange(-1, 2)]
-    curved = around[0] - 2 * around[1] + around[2]
-    delay = DELAYS[0] + STEP * (at.astype(around.dtype) + 0.5 * (around[0] - around[2]) / curved)
-    inside = (at > 0) & (at < DELAYS.size - 1) & (curved > 0)
-    delay = jnp.where(inside, delay, jnp.asarray(DELAYS)[at])
-    return jnp.append(logs[start], delay), distances.reshape(-1)[best]
-
 
 def _electrode(
     tracker: Tracker,
@@ -422,25 +247,25 @@ def _electrode(
     """One electrode at one pulse; `bad` is the verdict on its samples."""
     logs, elements = state.own[:-1], state.own.size - 1
     running = state.pulses > 0
-    lost = _inverse(jnp.eye(elements) + tracker.change**2 * state.information)
+    lost = inverse_of_few(jnp.eye(elements) + tracker.change**2 * state.information)
     lost = state.information @ lost @ state.information
     information = state.information - tracker.change**2 * lost
 
-    start, own_distance = _nearest(tracker, gain, logs[None, :])
+    start, own_distance = nearest(tracker.model, gain, logs[None, :])
     away = ~running & ~(own_distance <= distance)
     start = jnp.where(away, elsewhere, start)
     damping = jnp.where(away, DAMPING, state.damping)
-    gain = gain - tracker.departure(start)
-    pulse = _Pulse(tracker, gain, variance, logs, information)
-    own, at, decrement, damping = _minimum(pulse.equations, start, damping)
-    bands = tracker.bands
+    gain = gain - tracker.model.departure(start)
+    pulse = Pulse(tracker.model, gain, variance, logs, information)
+    own, at, decrement, damping = minimum(pulse.equations, start, damping)
+    bands = tracker.model.bands
     selected = bands.weight > 0
     chi2 = at.squares / (2 * jnp.sum(selected, dtype=at.squares.dtype) - own.size)
     signal = jnp.sum(bands.weight * power(gain)) / variance
     rrse = jnp.sqrt(at.squares / signal)
     by_delay = at.curvature[:-1, -1]
     told = at.curvature[:-1, :-1] - jnp.outer(by_delay, by_delay) / at.curvature[-1, -1]
-    spread = _inverse(told)
+    spread = inverse_of_few(told)
 
     # What the pulse alone would have: χ² of its distance from what was expected, per element.
     off = own[:-1] - logs
@@ -484,7 +309,7 @@ def _updated(
     lowest, highest = v_out.min(axis=1), v_out.max(axis=1)  # not a number if one sample is none
     finite = jnp.isfinite(lowest) & jnp.isfinite(highest)
     clipped = (lowest <= tracker.adc_range[0]) | (highest >= tracker.adc_range[1])
-    bands = tracker.bands
+    bands = tracker.model.bands
     gains = bands.measure(jnp.where(finite[:, None], v_out, 0.0))
     signal = power(gains.gain) @ bands.weight / gains.variance
     flat = signal < FLAT * 2 * jnp.sum(bands.weight > 0, dtype=float)
@@ -493,11 +318,11 @@ def _updated(
             (~finite, RESULTS.nonfinite_samples), (clipped, RESULTS.saturated), (flat, RESULTS.flat)
         )
     )(finite, clipped, flat)
-    starts = circuit_starts(tracker.circuit, None)
+    starts = circuit_starts(tracker.model.circuit, None)
     lanes, own = state.own.shape
     elsewhere = jax.lax.cond(
         (state.pulses == 0).any(),
-        jax.vmap(lambda gain: _nearest(tracker, gain, starts)),
+        jax.vmap(lambda gain: nearest(tracker.model, gain, starts)),
         lambda _: (jnp.zeros((lanes, own)), jnp.full(lanes, jnp.inf)),
         gains.gain,
     )
@@ -511,19 +336,19 @@ def _judged(tracker: Tracker, state: TrackerState) -> Fit:
 
 def _fit(tracker: Tracker, state: TrackerState) -> Fit:
     """The fit of one electrode."""
-    known, bands, logs = tracker.known, tracker.bands, state.own[:-1]
+    known, bands, logs = tracker.known, tracker.model.bands, state.own[:-1]
     elements = logs.size
-    model = tracker.undelayed(logs)
-    pulse = _Pulse(
-        tracker, jnp.zeros_like(model), state.variance, logs, jnp.zeros((elements, elements))
+    model = tracker.model.undelayed(logs)
+    pulse = Pulse(
+        tracker.model, jnp.zeros_like(model), state.variance, logs, jnp.zeros((elements, elements))
     )
     jacobian = pulse.terms(state.own)[:-1]
     by_term = inverse(jacobian @ jacobian.T)[:elements] @ jacobian
     # Z_th + R = e^W, so that ∂G/∂W = −Z_L (Z_th + R) / (Z_L + Z_th)².
-    z = tracker.circuit.with_log_values(logs).response(bands.frequency)
-    admittance = reciprocal(z + tracker.source)
+    z = tracker.model.circuit.with_log_values(logs).response(bands.frequency)
+    admittance = reciprocal(z + tracker.model.source)
     weight = jnp.sqrt(bands.weight / state.variance)
-    loaded = tracker.source + as_complex(known.resistance)
+    loaded = tracker.model.source + as_complex(known.resistance)
     by_w = as_complex(weight) * z * loaded * admittance * admittance
     by_z = by_w[None, :] * known.slope
     of_z = by_term @ jnp.concatenate([by_z.real, by_z.imag], axis=1).T
@@ -532,7 +357,7 @@ def _fit(tracker: Tracker, state: TrackerState) -> Fit:
     shared = of_z @ known.cov @ of_z.T + (by_term * of_x[None, :]) @ by_term.T
     cov = inverse(state.information) + shared
     relative = jnp.sqrt(jnp.diagonal(cov))
-    fitted = tracker.circuit.with_log_values(logs)
+    fitted = tracker.model.circuit.with_log_values(logs)
     scale = jnp.outer(fitted.values(), fitted.values())
     known_at_all = state.pulses > 0
     return Fit(

@@ -59,6 +59,7 @@ FLOORS = {
     "identify": 11,
     "batch": 12,
     "bands": 3,
+    "pulse": 6,
     "online": 12,
     "plotting": 12,
     "joint": 13,

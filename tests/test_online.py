@@ -80,8 +80,8 @@ def test_constant_skin_is_found_within_its_standard_errors_from_the_second_tenth
     tracker = tracker_of(2)
     pulses = tracker.pulses(loaded(study))
     state = tracker.start()
-    assert set(tracker.read(state).verdicts) == {"too_short"}
-    widths = []
+    fits, widths = tracker.read(state), []
+    assert set(fits.verdicts) == {"too_short"}
     for number, v_out in enumerate(pulses):
         state = tracker.update(state, v_out)
         fits = tracker.read(state)
@@ -133,7 +133,9 @@ def explained():
     source = driver.source
     assert source is not None
     tracker = Tracker.of(driver, quiet()["cal/0"], electrodes=2)
-    tracker = dataclasses.replace(tracker, source=source.response(tracker.bands.frequency))
+    model = tracker.model
+    model = dataclasses.replace(model, source=source.response(model.bands.frequency))
+    tracker = dataclasses.replace(tracker, model=model)
     sampler, v_th, *_ = scene(1)._exact()
     z_th = np.asarray(source.response(jnp.asarray(sampler.f)))
     v_out = [v_th * loading(load(sampler.f), z_th) for load in LOADS.values()]
