@@ -21,8 +21,8 @@ and if the converter runs freely, where windows begin up to half a sample beside
 that all pulses share would be known better, but nothing else: the information on ϑ is the same sum.
 
 **Every pulse takes the same time**: one step of Levenberg and Marquardt's, from the likeliest
-delay. An electrode that starts does so from generic values: of 96 kinds of skin, up to a factor of
-3 away, two thirds were found after 5 pulses and all after 30.
+delay, and a look at generic values while an electrode starts. From these, of 96 kinds of skin up to
+a factor of 3 away, two thirds were found after 5 pulses and all after 30.
 
 **A pulse that does not fit** changes nothing but the verdict. After several in a row, or if the
 pulses have long disagreed with the intervals, the electrode starts again.
