@@ -16,6 +16,7 @@ NAMES = (
     "speed",
     "curves",
     "scale",
+    "online",
     "speed_accuracy",
     "which",
     "paper",

@@ -39,7 +39,7 @@ START_STEPS = 8  # of Steiglitz-McBride on harmonics, which settles in three to 
 UNWANTED = 1e3  # added to the cost of a start that did not settle; any cost is smaller
 
 
-def _starts(
+def circuit_starts(
     circuit: AbstractCircuit, baseline: AbstractCircuit | None
 ) -> Float[Array, "start element"]:
     """Logarithms of elements: several impedance levels, and a simpler estimate of them."""
@@ -72,7 +72,7 @@ def skin_by_output_error(
     baseline = None
     if isinstance(circuit, SkinRC):
         baseline = skin_by_steiglitz_mcbride(m, driver, steiglitz_mcbride.ITERATIONS).circuit
-    starts = circuit.with_log_values(_starts(circuit, baseline))
+    starts = circuit.with_log_values(circuit_starts(circuit, baseline))
     _, estimate = output_error.fit_circuit(
         prediction.prepare(m, samples=samples), source, source_cov, calibration, starts
     )
@@ -114,9 +114,9 @@ def harmonic_starts(
         circuit: Structure and typical values.
     """
     if not isinstance(circuit, SkinRC):
-        return jnp.pad(_starts(circuit, None), ((0, 0), (0, 1)))
+        return jnp.pad(circuit_starts(circuit, None), ((0, 0), (0, 1)))
     baseline = harmonic_steiglitz_mcbride.fit_skin(spectrum, z_th, START_STEPS)
-    starts = _starts(circuit, baseline.circuit)
+    starts = circuit_starts(circuit, baseline.circuit)
     delays = jnp.zeros(starts.shape[0]).at[-1].set(baseline.delay * sample_rate)
     return jnp.concatenate([starts, delays[:, None]], axis=1)
 

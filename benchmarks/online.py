@@ -1,0 +1,70 @@
+"""On-line tick: all electrodes of a display identified anew with every pulse, against its period.
+
+One pinned core, samples in ordinary arrays, as many pulses as asked for after a warm-up. The pulses
+differ in noise, trigger delay and sampling phase. A missed target makes the command end with 1.
+"""
+
+import argparse
+import time
+
+import jax
+import numpy as np
+from tqdm import tqdm
+
+import etid
+from benchmarks.speed import pin
+from etid.scenes import Scene, Trial
+from etid.transformer import ResistorLoad, SkinLoad
+
+LOADS = (SkinLoad(r_s=33.4e3, r_p=186e3, c_p=0.12e-9), SkinLoad(r_s=6.1e3, r_p=17.4e3, c_p=0.66e-9))
+TARGET = 0.15  # of the time between two pulses, which 99 % of the ticks must keep to
+WARM = 50  # ticks before the first that counts: compilation, and the start of every electrode
+KINDS = 60  # different pulses, over and over
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """What is timed."""
+    parser.add_argument("--electrodes", type=int, default=98)
+    parser.add_argument("--ticks", type=int, default=2000)
+    parser.add_argument("--lifted", type=int, default=0, help="electrodes that touch nothing")
+
+
+def main(arguments: argparse.Namespace) -> bool:
+    """Print the times; whether the target is met."""
+    pin()
+    tracker, pulses = _problem(arguments.electrodes, arguments.lifted)
+    state, seconds = tracker.start(), []
+    for number in tqdm(range(WARM + arguments.ticks)):
+        v_out = pulses[number % len(pulses)]
+        begin = time.perf_counter(), time.process_time()
+        state = jax.block_until_ready(tracker.update(state, v_out))
+        seconds.append((time.perf_counter() - begin[0], time.process_time() - begin[1]))
+    period = tracker.period / tracker.model.bands.sample_rate
+    ratios, busy = np.array(seconds[WARM:]).T / period
+    print(f"{arguments.electrodes} electrodes, {len(ratios)} ticks: {tracker.read(state).counts()}")
+    # The processor's own time is less where other programs take turns on that core.
+    print(f"{'':<8}{'ms':>8}{'of the period':>16}{'processor':>12}   target")
+    for name, percent in (("median", 50), ("p99", 99), ("worst", 100)):
+        ratio, own = np.percentile(ratios, percent), np.percentile(busy, percent)
+        target = f"   <= {TARGET:.0%}" if name == "p99" else ""
+        print(f"{name:<8}{1e3 * period * ratio:8.2f}{ratio:16.1%}{own:12.1%}{target}")
+    return bool(np.percentile(ratios, 99) <= TARGET)
+
+
+def _problem(electrodes: int, lifted: int) -> tuple[etid.Tracker, np.ndarray]:
+    """A tracker, and pulses for it (pulse, electrode, sample)."""
+    trials = tuple(Trial(f"loaded/{i}", LOADS[i % len(LOADS)]) for i in range(electrodes))
+    resistors = (98.8e3, 21.62e3)
+    calibration = tuple(Trial(f"calibration/{i}", ResistorLoad(r)) for i, r in enumerate(resistors))
+    whole = Scene(trials, calibration, trigger_jitter_rms=50e-9)
+    study = whole.simulate(seed=0)
+    calibrations = list(study.calibrations.recordings())
+    driver = etid.identify_driver(calibrations)
+    tracker = etid.Tracker.of(driver, calibrations[0], electrodes=electrodes, change=1e-3)
+    records = list(study.loaded.recordings())
+    v_out = np.stack([r.v_th if i < lifted else r.v_out for i, r in enumerate(records)])
+    three = tracker.pulses(v_out)
+    noise = np.random.default_rng(1).standard_normal((KINDS // 3, 3, 1, three.shape[-1]))
+    # As much noise again as the records have; the same at all electrodes, which time does not know.
+    many = three[None] + 0.01 * noise
+    return tracker, many.reshape(-1, *three.shape[1:])

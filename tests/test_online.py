@@ -1,0 +1,399 @@
+"""On-line identification: pulse by pulse to the truth, with true intervals, lane by lane."""
+
+import dataclasses
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import etid
+from etid import bands, estimation, maximum_likelihood
+from etid.lanes import lane
+from etid.online import MEMORY, PATIENCE, Tracker
+from etid.preflight import Inspected
+from etid.scenes import Scene, Trial
+from etid.spectra import ALIASED, Spectrum
+from etid.transformer import ResistorLoad, SkinLoad, loading
+
+DRY = SkinLoad(r_s=33.4e3, r_p=186e3, c_p=0.12e-9)
+DAMP = SkinLoad(r_s=6.1e3, r_p=17.4e3, c_p=0.66e-9)
+LOADS = {"dry": DRY, "damp": DAMP}
+TRUTH = np.array([dataclasses.astuple(load) for load in LOADS.values()])
+RATE, PULSES = 200e3, 60.0
+PERIOD = RATE / PULSES
+NOISE = 0.00968  # [V] of a sample at 60 dB
+NORMAL_95 = 1.959964
+
+
+def scene(periods, **settings):
+    calibration = [Trial(f"cal/{i}", ResistorLoad(r)) for i, r in enumerate((98.8e3, 21.62e3))]
+    trials = [Trial(name, load) for name, load in LOADS.items()]
+    samples = int(np.ceil(periods * PERIOD))
+    return Scene(tuple(trials), tuple(calibration), samples=samples, **settings)
+
+
+@functools.cache
+def calibrated(seed=0):
+    """A driver from two resistors at 60 dB, and its study, whose unloaded records are used too."""
+    study = scene(3, trigger_jitter_rms=50e-9).simulate(seed=seed)
+    return etid.identify_driver(list(study.calibrations.recordings())), study
+
+
+@functools.cache
+def quiet():
+    """Recordings without noise, whose trigger is 0.3 µs late."""
+    whole = scene(12, snr_db=None, bits=None)
+    return dataclasses.replace(whole, start=0.3e-6).simulate(seed=0)
+
+
+@functools.cache
+def tracker_of(electrodes, change=0.0, seed=0):
+    driver, study = calibrated(seed)
+    return Tracker.of(driver, study["cal/0"], electrodes=electrodes, change=change)
+
+
+def loaded(study):
+    return np.stack([study[name].v_out for name in LOADS])
+
+
+def with_noise(pulses, seed):
+    return pulses + NOISE * np.random.default_rng(seed).standard_normal(pulses.shape)
+
+
+def followed(tracker, pulses):
+    state = tracker.start()
+    for v_out in pulses:
+        state = tracker.update(state, v_out)
+    return state
+
+
+def own_stderr(fits):
+    """Relative standard errors by the noise of the pulses alone."""
+    own = np.diagonal(fits.cov - fits.fit.shared_cov, axis1=1, axis2=2)
+    return np.sqrt(own) / np.asarray(fits.circuit.values())
+
+
+def test_constant_skin_is_found_within_its_standard_errors_from_the_second_tenth_of_a_second_on():
+    study = scene(40, trigger_jitter_rms=500e-9).simulate(seed=5)
+    tracker = tracker_of(2)
+    pulses = tracker.pulses(loaded(study))
+    state = tracker.start()
+    fits, widths = tracker.read(state), []
+    assert set(fits.verdicts) == {"too_short"}
+    for number, v_out in enumerate(pulses):
+        state = tracker.update(state, v_out)
+        fits = tracker.read(state)
+        if number >= 9:
+            assert set(fits.verdicts) == {"successful"}
+            z = (np.asarray(fits.circuit.values()) - TRUTH) / np.asarray(fits.stderr.values())
+            assert (np.abs(z) < 4).all()  # of 186 dependent ones, seeded
+            widths.append(own_stderr(fits))
+    assert (fits.fit.steps >= len(pulses) - 5).all()
+    # The noise of the pulses averages out; the error of the driver does not.
+    gain = np.sqrt((fits.fit.steps - 30) / fits.fit.steps)
+    np.testing.assert_allclose(widths[-1], widths[-31] * gain[:, None], rtol=0.1)
+    assert (np.diagonal(fits.fit.shared_cov, axis1=1, axis2=2) > 0).all()
+
+
+FACTOR = 3.0  # of every element from the values where the tracker starts
+
+
+@pytest.mark.slow
+def test_skin_of_all_kinds_is_found_from_typical_values():
+    """In the ranges of Tables II and III, and a factor of 3 from where it starts: in 40 pulses."""
+    rng = np.random.default_rng(8)
+    typical = np.asarray(etid.SkinRC().values())
+    far = typical * FACTOR ** rng.choice([-1.0, 1.0], (48, 3))
+    low, high = np.array([[19e3, 194e3, 45e-12], [69.8e3, 616e3, 165e-12]])
+    dry = np.exp(rng.uniform(np.log(low), np.log(high), (24, 3)))
+    low, high = np.array([[3.9e3, 20.2e3, 160e-12], [19.8e3, 165e3, 845e-12]])
+    damp = np.exp(rng.uniform(np.log(low), np.log(high), (24, 3)))
+    truth = np.concatenate([far, dry, damp])
+    trials = tuple(Trial(f"{i}", SkinLoad(*values)) for i, values in enumerate(truth))
+    whole = dataclasses.replace(scene(40, trigger_jitter_rms=500e-9), trials=trials)
+    study = whole.simulate(seed=2)
+    tracker = tracker_of(len(truth))
+    pulses = tracker.pulses(np.stack([study[trial.path].v_out for trial in trials]))
+    fits = tracker.read(followed(tracker, pulses))
+    z = (np.asarray(fits.circuit.values()) - truth) / np.asarray(fits.stderr.values())
+    good = fits.verdicts == "successful"
+    assert good.all(), fits.counts()
+    assert (np.abs(z) < 5).all()
+
+
+@functools.cache
+def explained():
+    """Ten periods of loads of the driver *as identified*, with its tracker: no error but noise.
+
+    The trigger of the records is 0.3 µs late.
+    """
+    driver, _ = calibrated()
+    source = driver.source
+    assert source is not None
+    tracker = Tracker.of(driver, quiet()["cal/0"], electrodes=2)
+    model = tracker.model
+    model = dataclasses.replace(model, source=source.response(model.bands.frequency))
+    tracker = dataclasses.replace(tracker, model=model)
+    sampler, v_th, *_ = scene(1)._exact()
+    z_th = np.asarray(source.response(jnp.asarray(sampler.f)))
+    v_out = [v_th * loading(load(sampler.f), z_th) for load in LOADS.values()]
+    return tracker, np.stack([sampler.sample(v, 33_340, 0.3e-6) for v in v_out])
+
+
+def anew(state):
+    """A state that knows where to start and nothing else."""
+    nothing = jnp.zeros_like(state.information)
+    return dataclasses.replace(
+        state, information=nothing, pulses=jnp.ones_like(state.pulses), strain=0 * state.strain
+    )
+
+
+def test_without_noise_it_is_biased_by_less_than_a_tenth_of_the_noise_of_100_pulses_at_60_db():
+    tracker, v_out = explained()
+    pulses = tracker.pulses(v_out)
+    start = anew(followed(tracker, with_noise(pulses[:8], seed=4)))
+    with_the_noise = tracker.update(start, with_noise(pulses, seed=5)[8])
+    hundred = own_stderr(tracker.read(with_the_noise)) / 10
+    state = anew(followed(tracker, pulses[:8]))
+    for v_out in pulses:
+        state = tracker.update(state, v_out)
+    found = np.asarray(tracker.read(state).circuit.values())
+    assert (np.abs(found / TRUTH - 1) < 0.1 * hundred).all(), (found / TRUTH - 1) / hundred
+
+
+SAME = 0.2  # standard errors: both weigh the noise of V_th, but not in the same way
+
+
+def test_after_some_pulses_it_is_what_a_batch_fit_of_these_periods_is():
+    """With the same Z_th, and the harmonics of the same band."""
+    tracker, v_out = explained()
+    driver, _ = calibrated()
+    v_out = with_noise(v_out, seed=6)
+    pulses = tracker.pulses(v_out)
+    state = followed(tracker, pulses)
+    fits = tracker.read(functools.reduce(tracker.update, pulses, anew(state)))
+    assert list(fits.verdicts) == ["successful"] * 2
+    assert (fits.fit.steps == len(pulses) + 1).all()
+    unloaded = quiet()["cal/0"].v_th
+    for number, one in enumerate(v_out):
+        size = one.size
+        record = etid.Recording(unloaded[:size], one, sample_rate=RATE, pulse_rate=PULSES)
+        apart = np.asarray(fits.circuit.values())[number] / batch(driver, record) - 1
+        assert (np.abs(apart) < SAME * own_stderr(fits)[number]).all(), (
+            apart / own_stderr(fits)[number]
+        )
+
+
+def batch(driver, recording):
+    """Elements by maximum likelihood from the harmonics of a whole record, with the same Z_th."""
+    *fields, rate = map(jnp.asarray, lane(Inspected(recording), "maximum_likelihood"))
+    model = maximum_likelihood.Joint(etid.SkinRC(), estimation.calibrations_of(driver), False)
+    spectrum = Spectrum(*fields)
+    selected = spectrum.selected & (spectrum.frequency < ALIASED * RATE)
+    spectrum = dataclasses.replace(spectrum, selected=selected)
+    z_th = driver.response(spectrum.frequency)
+    starts = estimation.harmonic_starts(spectrum, rate, z_th, etid.SkinRC())
+    own, *_ = maximum_likelihood.fit_load(model, spectrum, rate, starts)
+    return np.exp(np.asarray(own[:-1]))
+
+
+def test_a_lane_without_numbers_changes_no_bit_of_the_other_and_nor_does_their_order():
+    tracker = tracker_of(2)
+    pulses = with_noise(tracker.pulses(loaded(quiet()))[:8], seed=1)
+    ill = pulses.copy()
+    ill[:4, 1] = np.nan
+    ill[4:, 1, 100] = np.inf
+    good, bad = followed(tracker, pulses), followed(tracker, ill)
+    assert list(tracker.read(bad).verdicts) == ["successful", "nonfinite_samples"]
+    for one, other in zip(jax.tree.leaves(good), jax.tree.leaves(bad), strict=True):
+        np.testing.assert_array_equal(one[0], other[0])
+    turned = followed(tracker, pulses[:, ::-1])
+    for one, other in zip(jax.tree.leaves(good), jax.tree.leaves(turned), strict=True):
+        np.testing.assert_array_equal(one, other[::-1])
+
+
+HIGHEST = 100.0  # [V] at which the converter of these pulses ends
+TROUBLES = {
+    "lifted": {"misfit", "max_steps_reached", "insensitive"},
+    "turned over": {"misfit", "max_steps_reached", "insensitive", "nonphysical"},
+    "not a number": {"nonfinite_samples"},
+    "clipped": {"saturated"},
+    "unplugged": {"flat"},
+}
+
+
+@pytest.mark.parametrize("trouble", TROUBLES)
+def test_an_electrode_in_trouble_says_so_at_once_and_recovers(trouble):
+    tracker = dataclasses.replace(tracker_of(2), adc_range=jnp.array([-HIGHEST, HIGHEST]))
+    clean = np.tile(tracker.pulses(loaded(quiet())), (3, 1, 1))
+    pulses = with_noise(clean, seed=2)
+    first, last = 12, 24
+    bad = pulses[first:last, 0]
+    bad[:] = {
+        "lifted": with_noise(tracker.pulses(quiet()["dry"].v_th), seed=3),
+        "turned over": -bad,
+        "not a number": np.full_like(bad, np.nan),
+        "clipped": np.minimum(4 * bad, HIGHEST),
+        "unplugged": 1e-4 * with_noise(np.zeros_like(bad), seed=3),
+    }[trouble]
+    state = tracker.start()
+    for number, v_out in enumerate(pulses):
+        state = tracker.update(state, v_out)
+        verdict = tracker.read(state).verdicts[0]
+        if first <= number < last:
+            assert verdict in TROUBLES[trouble], (number, verdict)
+        if number == first - 1:
+            assert verdict == "successful"
+    fits = tracker.read(state)
+    assert list(fits.verdicts) == ["successful"] * 2
+    z = (np.asarray(fits.circuit.values()) - TRUTH) / np.asarray(fits.stderr.values())
+    assert (np.abs(z) < 4).all()
+    assert fits.fit.steps[1] >= len(pulses) - 6  # the other one noticed nothing
+
+
+def test_skin_that_jumps_is_found_again():
+    tracker = tracker_of(2)
+    pulses = with_noise(np.tile(tracker.pulses(loaded(quiet())), (3, 1, 1)), seed=2)
+    pulses[15:] = pulses[15:, ::-1].copy()
+    state = followed(tracker, pulses[:15])
+    for v_out in pulses[15 : 15 + PATIENCE]:
+        state = tracker.update(state, v_out)
+        assert set(tracker.read(state).verdicts) <= {"misfit", "max_steps_reached"}
+    for v_out in pulses[15 + PATIENCE :]:
+        state = tracker.update(state, v_out)
+    fits = tracker.read(state)
+    assert set(fits.verdicts) == {"successful"}
+    z = (np.asarray(fits.circuit.values()) - TRUTH[::-1]) / np.asarray(fits.stderr.values())
+    assert (np.abs(z) < 4).all()
+
+
+def drifting(tracker, truth, seed):
+    """Pulses of elements (pulse, electrode, element), each as if they did not change during it."""
+    whole = scene(3)
+    sampler, v_th, z_th, _ = whole._exact()
+    rng = np.random.default_rng(seed)
+    phases = [round(p * PERIOD) / RATE - p / PULSES for p in range(3)]
+    for number, electrodes in enumerate(truth):
+        delay = phases[number % 3] + 50e-9 * rng.standard_normal()
+        v_out = [
+            sampler.sample(v_th * loading(SkinLoad(*one)(sampler.f), z_th), 3333, delay)
+            for one in electrodes
+        ]
+        yield np.stack(v_out) + NOISE * rng.standard_normal((len(electrodes), 3333))
+
+
+def walk(change, pulses, electrodes, seed):
+    steps = change * np.random.default_rng(seed).standard_normal((pulses, electrodes, 3))
+    return TRUTH[0] * np.exp(np.cumsum(steps, axis=0))
+
+
+CHANGE = 2e-3  # [1/√pulse], about what one pulse tells at 60 dB
+
+
+def z_of_walk(electrodes, pulses, seed):
+    """Errors of tracked logarithms in standard errors of the noise, without those of the driver."""
+    driver, _ = calibrated(seed % 3)
+    tracker = Tracker.of(driver, quiet()["cal/0"], electrodes=electrodes, change=CHANGE)
+    truth = walk(CHANGE, pulses, electrodes, seed)
+    state, z = tracker.start(), []
+    still = np.log(batch(driver, quiet()["dry"]) / TRUTH[0])  # what the driver's error makes of it
+    for number, v_out in enumerate(drifting(tracker, truth, seed)):
+        state = tracker.update(state, v_out)
+        if number >= 15 and number % 5 == 0:
+            fits = tracker.read(state)
+            good = fits.verdicts == "successful"
+            error = np.log(np.asarray(fits.circuit.values()) / truth[number]) - still
+            z.append((error / own_stderr(fits))[good])
+    return np.concatenate(z)
+
+
+def held(z):
+    return (np.abs(z) < NORMAL_95).mean(axis=0)
+
+
+def test_drifting_skin_is_followed_and_its_intervals_hold_it():
+    z = z_of_walk(electrodes=16, pulses=41, seed=0)
+    assert len(z) >= 90  # of 96
+    # Five pulses apart the errors are nearly independent: three deviations of 96 draws.
+    assert (np.abs(held(z) - 0.95) < 3 * np.sqrt(0.95 * 0.05 / len(z))).all(), held(z)
+    assert (z.std(axis=0) > 0.75).all(), z.std(axis=0)
+
+
+def test_skin_that_drifts_though_it_should_not_is_no_lasting_success():
+    """A tenth of a standard error of one pulse per pulse, of which constant skin knows nothing."""
+    tracker = tracker_of(2)
+    truth = TRUTH * np.exp(1e-3 * np.arange(3 * MEMORY))[:, None, None]
+    state, verdicts = tracker.start(), []
+    for v_out in drifting(tracker, truth, seed=1):
+        state = tracker.update(state, v_out)
+        verdicts.append(str(tracker.read(state).verdicts[0]))
+    assert "misfit" in verdicts
+
+
+def coverage(seeds, electrodes, pulses):
+    """Errors in standard errors, noise and driver together: a driver of its own for each seed."""
+    z = []
+    for seed in range(seeds):
+        driver, study = calibrated(seed)
+        tracker = Tracker.of(driver, study["cal/0"], electrodes=2 * electrodes)
+        clean = np.tile(tracker.pulses(loaded(quiet()))[:pulses], (1, electrodes, 1))
+        fits = tracker.read(followed(tracker, with_noise(clean, seed + 100)))
+        values, stderr = np.asarray(fits.circuit.values()), np.asarray(fits.stderr.values())
+        found = (values - np.tile(TRUTH, (electrodes, 1))) / stderr
+        z.append(found[fits.verdicts == "successful"])
+    return np.concatenate(z)
+
+
+@pytest.mark.slow
+def test_intervals_of_95_per_cent_contain_the_truth_in_95_per_cent():
+    """Noise and driver; the two loads of one driver share its error, drivers are independent."""
+    seeds = 100
+    z = coverage(seeds, 1, 12)
+    assert len(z) > 0.98 * 2 * seeds
+    # One deviation as of half as many draws: loads of one driver err alike.
+    assert (np.abs(held(z) - 0.95) < 3 * np.sqrt(0.95 * 0.05 / seeds)).all(), held(z)
+    assert (np.abs(z) < 5).all()
+
+
+@pytest.mark.slow
+def test_intervals_of_drifting_skin_contain_it_in_95_per_cent():
+    z = np.concatenate([z_of_walk(electrodes=32, pulses=101, seed=seed) for seed in range(3)])
+    assert (np.abs(held(z) - 0.95) < 3 * np.sqrt(0.95 * 0.05 / len(z)) + 0.01).all(), held(z)
+
+
+def test_windows_are_those_next_to_each_period():
+    v = np.arange(40.0)
+    np.testing.assert_array_equal(bands.cut(v, 10.0)[:, 0], [0, 10, 20, 30])
+    np.testing.assert_array_equal(bands.cut(v, 10.4)[:, 0], [0, 10, 21])
+    assert bands.cut(v[None, :9], 10.0).shape == (0, 1, 10)
+
+
+def test_a_circuit_of_ones_own_is_tracked():
+    driver, study = calibrated()
+    tracker = Tracker.of(driver, study["cal/0"], electrodes=1, circuit=etid.Resistor())
+    pulses = tracker.pulses(study["cal/1"].v_out[None, :])
+    fits = tracker.read(followed(tracker, np.tile(pulses, (3, 1, 1))))
+    assert list(fits.verdicts) == ["successful"]
+    np.testing.assert_allclose(fits.circuit.r, 21.62e3, rtol=5e-3)
+
+
+def test_what_cannot_be_tracked_is_refused_with_a_reason():
+    driver, study = calibrated()
+    unloaded = study["cal/0"]
+    tracker = tracker_of(2)
+    with pytest.raises(ValueError, match=r"shape \(2, 3334\).* \(2, 3333\)"):
+        tracker.update(tracker.start(), np.zeros((2, 3334)))
+    with pytest.raises(ValueError, match="electrodes is 0"):
+        Tracker.of(driver, unloaded, electrodes=0)
+    with pytest.raises(ValueError, match="change is -1"):
+        Tracker.of(driver, unloaded, electrodes=1, change=-1.0)
+    plain = dataclasses.replace(driver, calibration=None)
+    with pytest.raises(ValueError, match="harmonics"):
+        Tracker.of(plain, unloaded, electrodes=1)
+    half = etid.Recording(
+        unloaded.v_th[:1500], unloaded.v_out[:1500], sample_rate=RATE, pulse_rate=PULSES
+    )
+    with pytest.raises(etid.IdentificationError, match="not_periodic"):
+        Tracker.of(driver, half, electrodes=1)
