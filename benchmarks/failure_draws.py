@@ -1,0 +1,236 @@
+"""Draws of a cell: what each method answers, and what that is: wrong, silent, unstable.
+
+An element is *wrong* if it is off by more than five standard deviations of its Cramer-Rao bound,
+or by more than 20 %. It is wrong *silently* if the verdict is `successful` and five of its own
+standard errors do not cover the truth either; a method that gives none covers nothing. Any other
+verdict of the fit, and a calibration or record that pre-flight refuses, is a method that says so.
+What a fit says counts, not what its driver said: a batch has the fits only.
+
+Where the bound of an element exceeds 4 %, five sd are more than 20 %: it is wrong sometimes in any
+answer, and silent only if its own standard errors are wrong too. Where it exceeds 10 % nothing is
+asked of it.
+
+For skin that is not one RC the truth is the limits of its impedance at low and high frequency, and
+the bound that of one RC with them.
+"""
+
+import dataclasses
+import zlib
+from collections.abc import Iterator, Sequence
+
+import jax
+import numpy as np
+from jaxtyping import Bool, Float
+
+import etid
+from benchmarks.failure_axes import Cell
+from etid.circuits import SkinRC
+from etid.methods import HARMONIC, METHODS, Method, choose
+from etid.preflight import Inspected
+from etid.scenes import Scene
+from etid.transfer import is_stable
+from etid.transformer import SkinLoad
+
+DEFAULT = "default"
+NAMES = (DEFAULT, *METHODS)
+ELEMENTS = SkinRC.names()
+FAR = 5.0  # standard deviations of the bound, and own standard errors
+OFF = 0.2
+DETERMINED = 0.1  # bound of an element for which it must not be wrong silently
+NOT_CONVERGED = ("max_steps_reached", "nonfinite")
+
+
+@dataclasses.dataclass(frozen=True)
+class Effort:
+    """How much is drawn of a cell.
+
+    Attributes:
+        drivers: Calibrations, each with trials of its own.
+        trials: Behind each.
+    """
+
+    drivers: int
+    trials: int
+
+
+@dataclasses.dataclass(frozen=True)
+class Answer:
+    """One method's answer to one trial; arrays are (element,), relative to the true elements.
+
+    Attributes:
+        method: Its name, or `default`.
+        seed: Of the scene.
+        path: Of the trial.
+        verdict: Name of the verdict.
+        error: Estimate / truth − 1; NaN without an answer, or where there is no truth.
+        stderr: Standard error, NaN where there is none.
+        bound: Cramer-Rao bound, NaN where the element is not determined at all.
+        chi2: Of the fit.
+        unstable: Whether a filter of the driver has a pole outside the unit circle, or the verdict
+            is `unstable`.
+        unsettled: Whether the iteration for the driver or the skin did not converge.
+    """
+
+    method: str
+    seed: int
+    path: str
+    verdict: str
+    error: Float[np.ndarray, " element"]
+    stderr: Float[np.ndarray, " element"]
+    bound: Float[np.ndarray, " element"]
+    chi2: float = np.nan
+    unstable: bool = False
+    unsettled: bool = False
+
+    @property
+    def successful(self) -> bool:
+        """Whether it claims to be right."""
+        return self.verdict == "successful"
+
+    @property
+    def refused(self) -> bool:
+        """Whether there is no answer."""
+        return bool(np.isnan(self.error).all())
+
+    @property
+    def wrong_elements(self) -> Bool[np.ndarray, " element"]:
+        """More than five sd of the bound or 20 % off."""
+        off = np.abs(self.error)
+        return (off > FAR * self.bound) | (off > OFF)
+
+    @property
+    def silent_elements(self) -> Bool[np.ndarray, " element"]:
+        """Wrong, called successful, and not covered by the standard errors."""
+        covered = np.abs(self.error) <= FAR * self.stderr
+        return self.wrong_elements & ~covered & self.successful
+
+    @property
+    def wrong(self) -> bool:
+        """Whether an element is wrong."""
+        return bool(self.wrong_elements.any())
+
+    @property
+    def silent(self) -> bool:
+        """Whether an element is wrong silently."""
+        return bool(self.silent_elements.any())
+
+    @property
+    def target(self) -> bool:
+        """Whether an element must not be wrong silently."""
+        return bool((self.bound <= DETERMINED).any())
+
+    @property
+    def missed(self) -> bool:
+        """Whether an element is that must not be."""
+        return bool((self.silent_elements & (self.bound <= DETERMINED)).any())
+
+
+def elements(load: object) -> SkinLoad:
+    """The true elements of a load."""
+    return load if isinstance(load, SkinLoad) else load.elements
+
+
+def bounds(scene: Scene) -> dict[str, Float[np.ndarray, " element"]]:
+    """Relative bounds of the elements by path; NaN where an element does not exist."""
+
+    def one_rc(load):
+        of = elements(load)
+        typical = load.skin.c_p if np.isnan(of.c_p) else of.c_p
+        return dataclasses.replace(of, c_p=typical)
+
+    trials = tuple(dataclasses.replace(t, load=one_rc(t.load)) for t in scene.trials)
+    found = etid.bound(dataclasses.replace(scene, trials=trials))
+    exist = {t.path: np.array(dataclasses.astuple(elements(t.load))) for t in scene.trials}
+    return {
+        path: np.where(np.isnan(exist[path]), np.nan, list(of.relative.values()))
+        for path, of in found.items()
+    }
+
+
+class Draw:
+    """The recordings of one seed, and drivers from their calibrations, each identified once."""
+
+    def __init__(self, cell: Cell, seed: int):
+        self.cell = cell
+        self.seed = seed
+        study = cell.scene.simulate(seed)
+        change = cell.change
+        rng = np.random.default_rng([seed, *b"change"])
+        records = study.recordings()
+        every = list(records if change is None else (change(r, rng) for r in records))
+        self.calibrations = [r for r in every if r.is_calibration]
+        self.trials = [r for r in every if not r.is_calibration]
+        self._drivers: dict[Method, etid.Driver | None] = {}
+
+    def driver(self, method: Method | None) -> etid.Driver | None:
+        """The driver for a method; None if pre-flight refuses the calibration.
+
+        All methods on the harmonics use that of maximum likelihood, and the default method is one
+        of the others.
+        """
+        chosen = choose(method, [Inspected(record) for record in self.calibrations])
+        kind = "maximum_likelihood" if chosen in HARMONIC else chosen
+        if kind not in self._drivers:
+            try:
+                self._drivers[kind] = etid.identify_driver(
+                    self.calibrations, order=self.cell.order, method=kind, throw=False
+                )
+            except etid.IdentificationError:
+                self._drivers[kind] = None
+        return self._drivers[kind]
+
+    def answers(
+        self, name: str, trials: int, limits: dict[str, Float[np.ndarray, " element"]]
+    ) -> Iterator[Answer]:
+        """What a method says of the first trials."""
+        method = None if name == DEFAULT else name
+        records, driver = self.trials[:trials], self.driver(method)
+        nothing = np.full(len(ELEMENTS), np.nan)
+        if driver is None:
+            for record in records:
+                bound = limits[record.path]
+                yield Answer(name, self.seed, record.path, "driver_failed", nothing, nothing, bound)
+            return
+        truths = {t.path: elements(t.load) for t in self.cell.scene.trials}
+        discrete = driver.source is None and not bool(is_stable(driver.a))
+        fits = etid.identify_skins(records, driver, method=method)
+        for number, record in enumerate(records):
+            fit, path = fits[number], record.path
+            truth = np.array(dataclasses.astuple(truths[path]))
+            said = (fit.verdict, driver.verdict)
+            yield Answer(
+                name,
+                self.seed,
+                path,
+                fit.verdict,
+                np.asarray(fit.circuit.values()) / truth - 1,
+                np.asarray(fit.stderr.values()) / truth,
+                limits[path],
+                float(fit.chi2),
+                discrete or "unstable" in said,
+                any(word in NOT_CONVERGED for word in said),
+            )
+
+
+def seeds(cell: Cell, count: int) -> Iterator[int]:
+    """Seeds of a cell, which no other cell has: their draws are to be independent."""
+    first = zlib.crc32(f"{cell.chart}/{cell.row}/{cell.column}".encode())
+    return (first + number for number in range(count))
+
+
+def answers(cell: Cell, efforts: dict[str, Effort]) -> list[Answer]:
+    """All answers in a cell, by the methods of `efforts`."""
+    with jax.enable_x64(True):  # of a worker process
+        limits = bounds(cell.scene)
+        found: list[Answer] = []
+        for number, seed in enumerate(seeds(cell, max(e.drivers for e in efforts.values()))):
+            drawn = Draw(cell, seed)
+            for name, effort in efforts.items():
+                if number < effort.drivers:
+                    found += drawn.answers(name, effort.trials, limits)
+    return found
+
+
+def chunk(cells: Sequence[Cell], efforts: Sequence[dict[str, Effort]]) -> list[list[Answer]]:
+    """The same for several cells."""
+    return [answers(cell, effort) for cell, effort in zip(cells, efforts, strict=True)]
