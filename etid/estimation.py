@@ -140,9 +140,9 @@ def skin_by_maximum_likelihood(
     starts = harmonic_starts(
         spectrum, sample_rate, known.z_th(jnp.zeros_like(known.loaded)), circuit
     )
-    estimate, far = single_load.fit_circuit(known, circuit, spectrum, sample_rate, starts)
+    estimate, far, other = single_load.fit_circuit(known, circuit, spectrum, sample_rate, starts)
     fit = judged(estimate, circuit, driver.result, "maximum_likelihood")
-    return _unless(fit, far, RESULTS.driver_unclear)
+    return _unless(_unless(fit, far, RESULTS.driver_unclear), other, RESULTS.misfit)
 
 
 def _unless(fit: Fit, bad: Bool[Array, ""], result: RESULTS) -> Fit:

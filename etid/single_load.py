@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import optimistix as optx
 from jaxtyping import Array, Bool, Complex, Float
 
+from etid import dispersion
 from etid.circuits import AbstractCircuit
 from etid.given_driver import GivenDriver, UnloadedSlopes, combined
 from etid.information import inverse
@@ -190,6 +191,16 @@ class Load(eqx.Module):
         )
         return _Slopes(part, slopes, (real, imaginary), by_w, by_x, by_variance)
 
+    def by_dispersion(self, q: Float[Array, " q"]) -> Float[Array, " part"]:
+        """Derivative of the residual of the recording by the exponent α of `etid.dispersion`."""
+        own, z = self.split(q)
+        w, spectrum = self.at(z)
+        impedance = self.circuit.with_log_values(own[:-1]).impedance()
+        of_load = dispersion.slope(impedance, frequency_variable(spectrum.frequency))
+        divided, change = jax.jvp(lambda at: self.divided(at, w), of_load[:1], of_load[1:])
+        turns = self.turns(own)
+        return jax.jvp(lambda g: residual(spectrum, g), (divided * turns,), (change * turns,))[1]
+
     def jacobian(
         self, q: Float[Array, " q"]
     ) -> tuple[Float[Array, " part"], Float[Array, "q part"]]:
@@ -240,7 +251,7 @@ def fit_circuit(
     spectrum: Spectrum,
     sample_rate: Float[Array, ""],
     candidates: Float[Array, "start own"],
-) -> tuple[Estimate, Bool[Array, ""]]:
+) -> tuple[Estimate, Bool[Array, ""], Bool[Array, ""]]:
     """Identify the load of one recording.
 
     Args:
@@ -252,8 +263,9 @@ def fit_circuit(
             last; the start that predicts best is refined.
 
     Returns:
-        The estimate, whose parameters are the logarithms of the elements; and whether W went so far
-        from W₀ that the linear distribution of it means nothing.
+        The estimate, whose parameters are the logarithms of the elements; whether W went so far
+        from W₀ that the linear distribution of it means nothing; and whether the load is seen to be
+        another circuit.
     """
     known, unloaded = driver.informed(spectrum)
     load = Load(driver, circuit, known, unloaded, sample_rate)
@@ -287,6 +299,16 @@ def fit_circuit(
     elements = information[: own.size - 1]
     by_term = elements @ jacobian
     noise = excess(part, spectrum.selected)
+    other = dispersion.is_seen(
+        clean.by_dispersion(q),
+        jacobian,
+        part,
+        prior * (q - load.centre(q)),
+        jax.scipy.linalg.block_diag(jnp.diag(prior[: own.size]), driver.cov),
+        information,
+        share,
+        noise,
+    )
     # What is the trial's own of the noise: all, or that of V_out if V_th is shared.
     private = jnp.where(
         jnp.any(known.variance_x != spectrum.variance_x),
@@ -310,4 +332,4 @@ def fit_circuit(
         # By how much Σ r² of the calibrations has grown.
         jnp.dot(change, jnp.linalg.solve(driver.cov, change)),
     )
-    return estimate, moved > FAR
+    return estimate, moved > FAR, other

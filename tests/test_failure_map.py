@@ -62,6 +62,8 @@ def test_without_a_failure_the_drivers_count():
         (answer((0, -0.25, 0), bound=0.3), True, True, False),  # nothing is asked of it
         (answer((0, -0.25, 0), bound=np.nan), True, True, False),
         (answer((0, 0.25, np.nan), bound=(0.05, 0.2, np.nan)), True, True, False),
+        (answer((0.15, 0, 0), exact=False), False, False, False),
+        (answer((0.25, 0, 0), exact=False), True, True, True),
         (answer((-1.5, 0, 0), stderr=np.nan, verdict="nonphysical"), True, False, False),
         (answer(NOTHING, verdict="driver_failed"), False, False, False),
     ],

@@ -22,6 +22,7 @@ FLOORS = {
     "verdicts": 0,
     "schema": 0,
     "circuits": 1,
+    "dispersion": 1,
     "recording": 1,
     "driver": 2,
     "results": 2,

@@ -1,0 +1,57 @@
+"""Is a load the circuit that is fitted? A score test against constant phases.
+
+Skin that is not one RC has a relaxation that is spread over time constants. The most common
+description is Cole's (1940), which puts (jω)^α in the place of jω, and α = 1 is the circuit itself.
+There the impedance changes with α by
+
+    ∂Z/∂α = s ln s dZ/ds,
+
+and Rao's score test asks whether the residual r goes with it: with d the derivative of r by α less
+what the other parameters can do, z = d·r / σ(d·r) is normal if the circuit is right. It sees what
+χ² over all harmonics does not: at 40 dB and α = 0.9, which costs R_s a quarter of its value, χ² is
+1.1 and z above 10. A second relaxation shows in it nearly as well.
+"""
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Complex, Float
+
+from etid.transfer import Rational
+
+SEEN = 4.0  # standard deviations, by which one fit in 16 000 is off by chance
+
+
+def slope(
+    impedance: Rational, s: Complex[Array, " harmonic"]
+) -> tuple[Complex[Array, " harmonic"], Complex[Array, " harmonic"]]:
+    """Z and ∂Z/∂α [Ω] at s [rad/s]."""
+    return jax.jvp(impedance, (s,), (s * jnp.log(s),))
+
+
+def is_seen(
+    row: Float[Array, " term"],
+    jacobian: Float[Array, "q term"],
+    residual: Float[Array, " term"],
+    rest: Float[Array, " q"],
+    spread: Float[Array, "q q"],
+    covariance: Float[Array, "q q"],
+    share: Float[Array, " term"],
+    noise: Float[Array, " term"],
+) -> Bool[Array, ""]:
+    """Whether α differs from 1.
+
+    Args:
+        row: Derivative of the residual by α.
+        jacobian: The same by the parameters.
+        residual: In standard deviations.
+        rest: Gradient of the priors.
+        spread: Covariance of that.
+        covariance: Inverse of the information.
+        share: Weights of the terms in the information.
+        noise: Variance of each residual.
+    """
+    others = covariance @ (jacobian @ (share * row))
+    direction = row - others @ jacobian
+    score = row @ residual - others @ (jacobian @ residual + rest)
+    variance = jnp.sum(noise * direction**2) + others @ spread @ others
+    return score**2 > SEEN**2 * variance
