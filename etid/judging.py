@@ -20,9 +20,6 @@ MISFIT_CHI2 = 1.5  # the noise is known from the record to about 5 %, chi2 there
 MISFIT_RRSE = (
     1e-3  # of the signal; what converters and transformers leave unexplained at their best
 )
-# Relative standard error. The noise counts as 1e-5 of the signal at least, and a million samples
-# average it to 1e-8: what seems known better than this has no effect that doubles could hold.
-NO_EFFECT = 1e-10
 # Growth of the calibrations' sum of squares in a joint fit. It is chi-squared with as many degrees
 # of freedom as Z_th and the delays have parameters at most: 12 exceed this once in ten thousand.
 STRAINED = 39.0
@@ -66,7 +63,8 @@ def judged(
             (~settled, MAX_STEPS_REACHED),
             (misses(estimate.chi2, estimate.rrse) | too_late(estimate), RESULTS.misfit),
             (estimate.strain > STRAINED, RESULTS.inconsistent),
-            (~jnp.all((errors > NO_EFFECT) & (errors < 1)), RESULTS.insensitive),
+            # None of 0: that is an element without any effect.
+            (~jnp.all((errors > 0) & (errors < 1)), RESULTS.insensitive),
             (driver_result != SUCCESSFUL, RESULTS.driver_failed),
         ),
         steps=estimate.steps,

@@ -319,11 +319,14 @@ def fit_circuit(
     of_delay = jnp.outer(elements[:, own.size - 1], elements[:, own.size - 1]) / DELAY_WIDTH**2
     of_driver = elements[:, own.size :] @ driver.cov @ elements[:, own.size :].T
     shared = of_driver + (by_term * ((1 - private) * noise)[None, :]) @ by_term.T
+    # Of an element without any effect a product of matrices keeps but rounding errors.
+    unknown = jnp.diagonal(elements)
+    unknown = jnp.diag(jnp.where(unknown > 1, unknown, 0.0))
     change = z - driver.mean
     estimate = Estimate(
         own[:-1],
         own[None, -1:],
-        (by_term * (private * noise)[None, :]) @ by_term.T + of_delay + shared,
+        (by_term * (private * noise)[None, :]) @ by_term.T + of_delay + shared + unknown,
         jnp.sum(part**2) / (2 * jnp.sum(spectrum.selected, dtype=own.dtype) - own.size),
         complex_rrse(g * spectrum.x, spectrum.y),
         solution.result,
