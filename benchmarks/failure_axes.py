@@ -81,8 +81,8 @@ class TwoLayers:
     def __call__(self, f: Float[np.ndarray, " f"]) -> Complex[np.ndarray, " f"]:
         """Impedance [ohm] at frequencies f [Hz]."""
         s, of = 2j * np.pi * f, self.skin
-        fast, slow = ((1 - self.share) * of.r_p, of.r_p * of.c_p), (self.share * of.r_p, self.slow)
-        return of.r_s + sum(r / (1 + s * tau) for r, tau in (fast, slow))
+        fast = (1 - self.share) * of.r_p / (1 + s * of.r_p * of.c_p)
+        return of.r_s + fast + self.share * of.r_p / (1 + s * self.slow)
 
     @property
     def slow(self) -> float:

@@ -39,12 +39,12 @@ def clopper_pearson(events: float, trials: float) -> tuple[float, float]:
     return float(low), float(high)
 
 
-def rate(events: Sequence[bool], drivers: Sequence[Any]) -> Rate:
+def rate(events: Sequence[bool], drivers: Iterable[int]) -> Rate:
     """Rate of events in trials, given the driver of each; NaN without trials."""
     if not events:
         return Rate(np.nan, np.nan, np.nan)
     happened = np.asarray(events, float)
-    _, of = np.unique(np.asarray(drivers), return_inverse=True)
+    _, of = np.unique(np.asarray(list(drivers)), return_inverse=True)
     p, trials, clusters = float(happened.mean()), happened.size, int(of.max()) + 1
     rest = np.bincount(of, happened - p)
     variance = np.sum(rest**2) / trials**2 * clusters / max(clusters - 1, 1)

@@ -18,19 +18,20 @@ is wrong by 20 % only.
 import dataclasses
 import zlib
 from collections.abc import Iterator, Sequence
+from typing import cast
 
 import jax
 import numpy as np
 from jaxtyping import Bool, Float
 
 import etid
-from benchmarks.failure_axes import Cell
+from benchmarks.failure_axes import Cell, Cole, TwoLayers
 from etid.circuits import SkinRC
 from etid.methods import HARMONIC, METHODS, Method, choose
 from etid.preflight import Inspected
 from etid.scenes import Scene
 from etid.transfer import is_stable
-from etid.transformer import SkinLoad
+from etid.transformer import Impedance, SkinLoad
 
 DEFAULT = "default"
 NAMES = (DEFAULT, *METHODS)
@@ -128,18 +129,19 @@ class Answer:
         return bool((self.silent_elements & (self.bound <= DETERMINED)).any())
 
 
-def elements(load: object) -> SkinLoad:
-    """The true elements of a load."""
-    return load if isinstance(load, SkinLoad) else load.elements
+def elements(load: Impedance) -> SkinLoad:
+    """The true elements of a load of these scenes."""
+    if isinstance(load, TwoLayers | Cole):
+        return load.elements
+    assert isinstance(load, SkinLoad)
+    return load
 
 
 def bounds(scene: Scene) -> dict[str, Float[np.ndarray, " element"]]:
     """Relative bounds of the elements by path; NaN where an element does not exist."""
 
-    def one_rc(load):
-        of = elements(load)
-        typical = load.skin.c_p if np.isnan(of.c_p) else of.c_p
-        return dataclasses.replace(of, c_p=typical)
+    def one_rc(load: Impedance) -> SkinLoad:
+        return load.skin if isinstance(load, Cole) else elements(load)
 
     trials = tuple(dataclasses.replace(t, load=one_rc(t.load)) for t in scene.trials)
     found = etid.bound(dataclasses.replace(scene, trials=trials))
@@ -186,7 +188,7 @@ class Draw:
         self, name: str, trials: int, limits: dict[str, Float[np.ndarray, " element"]]
     ) -> Iterator[Answer]:
         """What a method says of the first trials."""
-        method = None if name == DEFAULT else name
+        method = None if name == DEFAULT else cast(Method, name)
         records, driver = self.trials[:trials], self.driver(method)
         nothing = np.full(len(ELEMENTS), np.nan)
         if driver is None:

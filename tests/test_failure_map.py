@@ -2,6 +2,7 @@
 
 import csv
 import itertools
+from typing import Any
 
 import numpy as np
 import pytest
@@ -16,15 +17,10 @@ from benchmarks.ladder import LOADS
 NOTHING = np.full(3, np.nan)
 
 
-def answer(error=(0.0, 0.0, 0.0), stderr=0.01, bound=0.01, verdict="successful", **more):
-    spread = (np.broadcast_to(np.asarray(x, float), 3) for x in (stderr, bound))
-    place = {"method": "default", "seed": 0, "path": "dry/00", **more}
-    return Answer(
-        verdict=verdict,
-        error=np.asarray(error, float),
-        **place,
-        **dict(zip(("stderr", "bound"), spread, strict=True)),
-    )
+def answer(error: Any = 0.0, stderr: Any = 0.01, bound: Any = 0.01, **more: Any) -> Answer:
+    of = (np.broadcast_to(np.asarray(x, float), 3) for x in (error, stderr, bound))
+    place = {"method": "default", "seed": 0, "path": "dry/00", "verdict": "successful"}
+    return Answer(**{**place, **dict(zip(("error", "stderr", "bound"), of, strict=True)), **more})
 
 
 @pytest.mark.parametrize(("events", "trials"), [(0, 7), (1, 40), (20, 40), (7, 7)])
@@ -192,7 +188,7 @@ def test_more_samples_get_fewer_drivers():
 
 @pytest.mark.slow
 def test_a_skin_without_a_visible_capacitor_is_insensitive():
-    """Without noise enough to see C_p the fit takes it to 1e-190 F, at which it has no effect."""
+    """Where noise hides C_p a fit may take it to 1e-190 F, and its derivative underflows."""
     place = ("SNR and skin / driver impedance", "20 dB", "30")
     [cell] = [cell for cell in cells() if (cell.chart, cell.row, cell.column) == place]
     found = answers(cell, {"default": Effort(1, 5)})
