@@ -121,8 +121,8 @@ class Cole:
 
 
 NOT_ONE_RC = {
-    "two layers, 5 %": functools.partial(TwoLayers, share=0.05),
-    "two layers, 30 %": functools.partial(TwoLayers, share=0.3),
+    "layers, 5 %": functools.partial(TwoLayers, share=0.05),
+    "layers, 30 %": functools.partial(TwoLayers, share=0.3),
     "Cole, 0.98": functools.partial(Cole, alpha=0.98),
     "Cole, 0.9": functools.partial(Cole, alpha=0.9),
     "Cole, 0.8": functools.partial(Cole, alpha=0.8),

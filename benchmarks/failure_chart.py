@@ -42,7 +42,7 @@ def _panel(
             j, i - lower, f"{100 * failed:.0f}", ha="center", va="center", color=ink, fontsize=8
         )
         if row["silent"] > 0:
-            text = f"{SILENT} {100 * row['silent']:.2g}"
+            text = f"{SILENT} {100 * row['silent']:.{0 if row['silent'] > 0.01 else 1}f}"
             axes.text(
                 j, i + 0.24, text, ha="center", va="center", color=ink, fontsize=7, weight="bold"
             )
