@@ -16,16 +16,18 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Complex, Float
 
-from etid.transfer import Rational
+from etid.transfer import Rational, frequency_variable
 
 SEEN = 4.0  # standard deviations, by which one fit in 16 000 is off by chance
 
 
 def slope(
-    impedance: Rational, s: Complex[Array, " harmonic"]
+    impedance: Rational, frequency: Float[Array, " harmonic"]
 ) -> tuple[Complex[Array, " harmonic"], Complex[Array, " harmonic"]]:
-    """Z and ∂Z/∂α [Ω] at s [rad/s]."""
-    return jax.jvp(impedance, (s,), (s * jnp.log(s),))
+    """Z and ∂Z/∂α [Ω] at real frequencies [Hz]."""
+    s = frequency_variable(frequency)
+    log_s = jax.lax.complex(jnp.log(s.imag), jnp.full_like(frequency, jnp.pi / 2))
+    return jax.jvp(impedance, (s,), (s * log_s,))
 
 
 def is_seen(

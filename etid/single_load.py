@@ -196,7 +196,7 @@ class Load(eqx.Module):
         own, z = self.split(q)
         w, spectrum = self.at(z)
         impedance = self.circuit.with_log_values(own[:-1]).impedance()
-        of_load = dispersion.slope(impedance, frequency_variable(spectrum.frequency))
+        of_load = dispersion.slope(impedance, spectrum.frequency)
         divided, change = jax.jvp(lambda at: self.divided(at, w), of_load[:1], of_load[1:])
         turns = self.turns(own)
         return jax.jvp(lambda g: residual(spectrum, g), (divided * turns,), (change * turns,))[1]
@@ -300,7 +300,7 @@ def fit_circuit(
     by_term = elements @ jacobian
     noise = excess(part, spectrum.selected)
     other = dispersion.is_seen(
-        clean.by_dispersion(q),
+        _apart(clean.by_dispersion, q),
         jacobian,
         part,
         prior * (q - load.centre(q)),

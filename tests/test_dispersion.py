@@ -23,7 +23,7 @@ def test_the_slope_is_that_of_a_constant_phase():
         return skin.r_s + skin.r_p / (1 + s**alpha * skin.r_p * skin.c_p)
 
     circuit = etid.SkinRC(skin.r_s, skin.r_p, skin.c_p)
-    z, slope = dispersion.slope(circuit.impedance(), jnp.asarray(s))
+    z, slope = dispersion.slope(circuit.impedance(), jnp.asarray(f))
     np.testing.assert_allclose(z, spread(1.0), rtol=1e-12)
     expected = (spread(1 + step) - spread(1 - step)) / (2 * step)
     np.testing.assert_allclose(slope, expected, rtol=1e-7)  # step², and rounding over step
