@@ -48,6 +48,14 @@ def test_what_counts_is_the_residual_along_what_the_parameters_cannot_do(z, expe
     assert seen(z * along + anything, row, jacobian) == expected
 
 
+def test_a_spread_that_hardly_matters_is_none():
+    """However well it is determined: a driver that is not quite right looks like that."""
+    rng = np.random.default_rng(6)
+    jacobian, row = rng.normal(size=(3, 50)), 1e4 * rng.normal(size=50)
+    assert not seen(0.009 * row, row, jacobian)
+    assert seen(0.011 * row, row, jacobian)
+
+
 def test_a_load_without_a_capacitor_has_no_phase_to_be_constant():
     rng = np.random.default_rng(5)
     assert not seen(rng.normal(size=50), np.zeros(50), rng.normal(size=(3, 50)))
