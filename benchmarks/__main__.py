@@ -20,6 +20,7 @@ NAMES = (
     "speed_accuracy",
     "which",
     "paper",
+    "rivals",
 )
 
 

@@ -1,0 +1,270 @@
+"""What one would use instead of etid: other packages on the same recordings.
+
+Each rival is a module beside this one, written as a user of its package would write it, and run by
+`worker` in an environment of its own, of which as many are made as pins clash. A rival that cannot
+be installed or run is a row that says why.
+
+    python -m benchmarks rivals              installs all, and runs each where it should work
+    python -m benchmarks rivals scipy_harmonics jaxopt_lm
+
+Nothing but the standard library, NumPy and tqdm is imported here: those environments have no etid.
+"""
+
+import argparse
+import dataclasses
+import json
+import os
+import pathlib
+import shutil
+import subprocess
+import sys
+import tempfile
+import venv
+from collections.abc import Iterable, Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+
+ROOT = pathlib.Path(__file__).parents[2]
+ENVIRONMENTS = ROOT / ".rivals"
+ONE_THREAD = {
+    name: "1"
+    for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
+}
+
+
+class Rival(NamedTuple):
+    """One estimator of another package.
+
+    Attributes:
+        name: As tables and charts show it.
+        environment: Of `.rivals/`, made from the requirements of that name beside this file.
+        package: Whose version is shown.
+        setting: How it is set, in a line.
+        works: A scene in which it should work, of `SCENES`.
+        program: What must be on the path besides, by its Debian packages.
+    """
+
+    name: str
+    environment: str
+    package: str
+    setting: str
+    works: str
+    program: Mapping[str, str] = {}
+
+
+SCENES: Mapping[str, Mapping[str, Any]] = {  # settings of `benchmarks.ladder.rung`, all dry skin
+    "60 dB, delays": {},
+    "80 dB": {"snr_db": 80.0, "trigger_jitter_rms": 0.0},
+    "1 MHz, no noise": {
+        "sample_rate": 1e6,
+        "samples": 50_000,
+        "snr_db": None,
+        "bits": None,
+        "trigger_jitter_rms": 0.0,
+    },
+}
+
+RIVALS: Mapping[str, Rival] = {  # by module
+    "scipy_harmonics": Rival(
+        "SciPy least_squares, harmonics",
+        "common",
+        "scipy",
+        "MINPACK, logarithms, errors in both records, delays fitted",
+        "60 dB, delays",
+    ),
+    "lmfit_leastsq": Rival(
+        "lmfit leastsq",
+        "common",
+        "lmfit",
+        "the same residuals",
+        "60 dB, delays",
+    ),
+    "optimistix_lm": Rival(
+        "optimistix LM",
+        "common",
+        "optimistix",
+        "the same residuals, compiled, tolerances 1e-8",
+        "60 dB, delays",
+    ),
+    "jaxopt_lm": Rival(
+        "jaxopt LM",
+        "common",
+        "jaxopt",
+        "the same residuals, compiled, Cholesky, tolerances 1e-8",
+        "60 dB, delays",
+    ),
+    "impedance_py": Rival(
+        "FFT, impedance.py",
+        "common",
+        "impedance",
+        "spectrum in kΩ, nF, MHz, weighted by its noise; no delay",
+        "80 dB",
+    ),
+}
+
+
+@dataclasses.dataclass(frozen=True)
+class Outcome:
+    """What a rival found, one row per draw, or why it found nothing.
+
+    Attributes:
+        elements: R_s [ohm], R_p [ohm], C_p [F]; NaN where a draw failed.
+        ok: What the package says of its success.
+        seconds: Of the skin's fit from its records, warm.
+        driver_seconds: Of the driver's fit.
+        first_seconds: Of the first fit of a skin, with what it compiles.
+        versions: By package.
+        errors: Message of each draw, mostly empty.
+        missing: One line that says why there is nothing; empty if there is.
+    """
+
+    elements: np.ndarray = dataclasses.field(default_factory=lambda: np.empty((0, 3)))
+    ok: np.ndarray = dataclasses.field(default_factory=lambda: np.empty(0, bool))
+    seconds: np.ndarray = dataclasses.field(default_factory=lambda: np.empty(0))
+    driver_seconds: np.ndarray = dataclasses.field(default_factory=lambda: np.empty(0))
+    first_seconds: float = np.nan
+    versions: Mapping[str, str] = dataclasses.field(default_factory=dict)
+    errors: tuple[str, ...] = ()
+    missing: str = ""
+
+
+def python_of(environment: str) -> pathlib.Path:
+    """The interpreter of an environment, made or not."""
+    place = ("Scripts", "python.exe") if os.name == "nt" else ("bin", "python")
+    return ENVIRONMENTS.joinpath(environment, *place)
+
+
+def install(names: Iterable[str]) -> dict[str, str]:
+    """Make the environments of some rivals.
+
+    An environment whose requirements have not changed since is left as it is.
+
+    Args:
+        names: Modules of `RIVALS`.
+
+    Returns:
+        By environment why it could not be made; empty where it could.
+    """
+    failed = {}
+    for environment in dict.fromkeys(RIVALS[name].environment for name in names):
+        wanted = pathlib.Path(__file__).with_name(f"{environment}.txt")
+        folder = ENVIRONMENTS / environment
+        made = folder / wanted.name  # a copy of what it was made from
+        if made.exists() and made.read_text() == wanted.read_text():
+            continue
+        venv.create(folder, clear=True, with_pip=True)
+        command = [python_of(environment), "-m", "pip", "install", "--quiet", "-r", wanted]
+        done = subprocess.run(command, capture_output=True, text=True, check=False)
+        if done.returncode == 0:
+            shutil.copy(wanted, made)
+        else:
+            failed[environment] = f"failed to install: {_last_error(done.stderr)}"
+    return failed
+
+
+def run(
+    name: str,
+    problem: Mapping[str, Any],
+    repeats: int,
+    timeout: float,
+    python: pathlib.Path | None = None,
+) -> Outcome:
+    """Run a rival on a problem, on one core, in a process of its own.
+
+    Args:
+        name: Module of `RIVALS`.
+        problem: The arrays that `worker` reads.
+        repeats: Fits of each skin, of which the median time counts.
+        timeout: Longest time for all of it [s].
+        python: The interpreter; that of the rival's environment if not given.
+    """
+    rival = RIVALS[name]
+    python = python or python_of(rival.environment)
+    if not python.exists():
+        return Outcome(missing=f"not installed: python -m benchmarks rivals {name}")
+    for program, packages in rival.program.items():
+        if shutil.which(program) is None:
+            return Outcome(missing=f"{program} not found: apt-get install {packages}")
+    with tempfile.TemporaryDirectory() as folder:
+        given, found = pathlib.Path(folder, "problem.npz"), pathlib.Path(folder, "result.npz")
+        np.savez(given, **problem)
+        command = [python, "-m", "benchmarks.rivals.worker", name, given, found, str(repeats)]
+        try:
+            done = subprocess.run(
+                command,
+                cwd=ROOT,
+                env={**os.environ, **ONE_THREAD},
+                preexec_fn=_pin if hasattr(os, "sched_setaffinity") else None,
+                timeout=timeout,
+                capture_output=True,
+                text=True,
+                check=False,
+            )
+        except subprocess.TimeoutExpired:
+            return Outcome(missing=f"not done after {timeout:g} s")
+        if done.returncode != 0:
+            return Outcome(missing=f"failed: {_last_error(done.stderr)}")
+        with np.load(found) as file:
+            result = {key: file[key] for key in file.files}
+    return Outcome(
+        **{key: result[key] for key in ("elements", "ok", "seconds", "driver_seconds")},
+        first_seconds=float(result["first_seconds"]),
+        versions=json.loads(str(result["versions"])),
+        errors=tuple(json.loads(str(result["errors"]))),
+    )
+
+
+def _pin() -> None:
+    """Keep this process on the first core that it may use."""
+    os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
+
+
+def _last_error(text: str) -> str:
+    """The line that tells most: pip's first complaint, or the end of a traceback."""
+    lines = [line for line in text.splitlines() if line.strip()]
+    complaints = [line for line in lines if line.startswith("ERROR:")]
+    return (complaints[:1] or lines[-1:] or ["no message"])[0]
+
+
+def problem(scene: Any, draws: int, start: Any) -> dict[str, Any]:
+    """A scene drawn several times, for `run`.
+
+    Args:
+        scene: One calibration and one trial, as the rungs of `benchmarks.ladder`.
+        draws: How often, with seeds 0, 1, ….
+        start: Elements to start from, in SI.
+    """
+    records: dict[str, list] = {key: [] for key in ("v_th", "v_out", "ref_th", "ref_out")}
+    (trial,), (calibration,) = scene.trials, scene.calibration
+    for seed in range(draws):
+        study = scene.simulate(seed=seed)
+        for prefix, path in ("v", trial.path), ("ref", calibration.path):
+            records[f"{prefix}_th"].append(study[path].v_th)
+            records[f"{prefix}_out"].append(study[path].v_out)
+    return {
+        **{key: np.stack(of) for key, of in records.items()},
+        "r_ref": np.full(draws, calibration.load.r),
+        "start": np.asarray(start),
+        "fs": scene.sample_rate,
+        "f0": scene.pulse_rate,
+    }
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Which rivals, and how long they may take."""
+    parser.add_argument("rivals", nargs="*", metavar="RIVAL", help=f"of {', '.join(RIVALS)}")
+    parser.add_argument("--draws", type=int, default=3)
+    parser.add_argument("--repeats", type=int, default=5, help="fits of each draw")
+    parser.add_argument("--timeout", type=float, default=600.0, help="for each rival [s]")
+
+
+def main(arguments: argparse.Namespace) -> bool:
+    """Install, run each rival where it should work, print; whether none is missing or wrong."""
+    from benchmarks.rivals import table  # imports etid
+
+    names = arguments.rivals or list(RIVALS)
+    unknown = sorted({*names} - {*RIVALS})
+    if unknown:
+        sys.exit(f"no rivals {', '.join(unknown)}; there are {', '.join(RIVALS)}")
+    return table.show(names, install(names), arguments)

@@ -1,0 +1,71 @@
+"""Runs one rival over a problem: `python -m benchmarks.rivals.worker NAME PROBLEM RESULT REPEATS`.
+
+NAME is a module beside this one, run by the Python of its own environment. It has `driver` and
+`skin` for one record, or `batch` for all of a problem at once. PROBLEM holds `v_th`, `v_out`,
+`ref_th`, `ref_out` (draw, sample) [V], `r_ref` (draw,) [ohm], `start` (3,) in SI, `fs`, `f0` [Hz].
+RESULT gets `elements` (draw, 3) in SI, `ok`, `seconds` and `driver_seconds` (draw,),
+`first_seconds`, and as JSON `versions` by package and `errors`, one message per draw.
+"""
+
+import importlib
+import importlib.metadata
+import json
+import sys
+import time
+import warnings
+
+import numpy as np
+
+
+def results(rival, problem, repeats):
+    """All draws, one after the other; what fails costs its own draw alone."""
+    fs, f0, start = float(problem["fs"]), float(problem["f0"]), problem["start"]
+    draws = len(problem["r_ref"])
+    found = {
+        "elements": np.full((draws, 3), np.nan),
+        "ok": np.zeros(draws, bool),
+        "seconds": np.full(draws, np.nan),
+        "driver_seconds": np.full(draws, np.nan),
+        "first_seconds": np.nan,
+    }
+    errors = [""] * draws
+    for i in range(draws):
+        try:
+            reference = problem["ref_th"][i], problem["ref_out"][i], float(problem["r_ref"][i])
+            begin = time.perf_counter()
+            model = rival.driver(*reference, fs, f0)
+            found["driver_seconds"][i] = time.perf_counter() - begin
+            arguments = (problem["v_th"][i], problem["v_out"][i], model, start, fs, f0)
+            if np.isnan(found["first_seconds"]):
+                found["first_seconds"] = _timed(rival.skin, arguments)[0]
+            runs = [_timed(rival.skin, arguments) for _ in range(repeats)]
+            found["seconds"][i] = np.median([seconds for seconds, _ in runs])
+            elements, found["ok"][i] = runs[-1][1]
+            found["elements"][i] = elements
+        except Exception as error:  # anything a package may raise
+            errors[i] = f"{type(error).__name__}: {error}"
+    return {**found, "errors": json.dumps(errors)}
+
+
+def _timed(call, arguments):
+    begin = time.perf_counter()
+    found = call(*arguments)
+    return time.perf_counter() - begin, found
+
+
+def main(name, problem_path, result_path, repeats):
+    """Run a rival and write what it found."""
+    rival = importlib.import_module(f"benchmarks.rivals.{name}")
+    with np.load(problem_path) as file:
+        problem = dict(file)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of trial steps; what comes of them is judged
+        found = getattr(rival, "batch", lambda *of: results(rival, *of))(problem, repeats)
+    owners = importlib.metadata.packages_distributions()
+    imported = sorted({owner for module in {*sys.modules} & {*owners} for owner in owners[module]})
+    versions = {package: importlib.metadata.version(package) for package in imported}
+    np.savez(result_path, **{"versions": json.dumps(versions), **found})
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:4], int(sys.argv[4]))
