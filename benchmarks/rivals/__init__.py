@@ -55,16 +55,10 @@ class Rival(NamedTuple):
 
 SCENES: Mapping[str, Mapping[str, Any]] = {  # settings of `benchmarks.ladder.rung`, all dry skin
     "60 dB, delays": {},
-    "80 dB": {"snr_db": 80.0, "trigger_jitter_rms": 0.0},
-    "1 MHz, no noise": {
-        "sample_rate": 1e6,
-        "samples": 50_000,
-        "snr_db": None,
-        "bits": None,
-        "trigger_jitter_rms": 0.0,
-    },
+    "80 dB, no delays": {"snr_db": 80.0, "trigger_jitter_rms": 0.0},
 }
 
+_OCTAVE = {"octave-cli": "octave octave-control"}
 RIVALS: Mapping[str, Rival] = {  # by module
     "scipy_harmonics": Rival(
         "SciPy least_squares, harmonics",
@@ -74,11 +68,7 @@ RIVALS: Mapping[str, Rival] = {  # by module
         "60 dB, delays",
     ),
     "lmfit_leastsq": Rival(
-        "lmfit leastsq",
-        "common",
-        "lmfit",
-        "the same residuals",
-        "60 dB, delays",
+        "lmfit leastsq", "common", "lmfit", "the same residuals", "60 dB, delays"
     ),
     "optimistix_lm": Rival(
         "optimistix LM",
@@ -94,12 +84,63 @@ RIVALS: Mapping[str, Rival] = {  # by module
         "the same residuals, compiled, Cholesky, tolerances 1e-8",
         "60 dB, delays",
     ),
+    "scipy_lfilter": Rival(
+        "SciPy least_squares, lfilter",
+        "common",
+        "scipy",
+        "one averaged period of current and voltage at 1 MHz, Tustin, a delay of V_th",
+        "80 dB, no delays",
+    ),
     "impedance_py": Rival(
         "FFT, impedance.py",
         "common",
         "impedance",
         "spectrum in kΩ, nF, MHz, weighted by its noise; no delay",
-        "80 dB",
+        "80 dB, no delays",
+    ),
+    "impedance_fitter": Rival(
+        "FFT, ImpedanceFitter",
+        "impedancefitter",
+        "impedancefitter",
+        "the same spectrum and weights, by the lmfit model it makes",
+        "80 dB, no delays",
+    ),
+    "sippy_oe": Rival(
+        "SIPPY OE",
+        "common",
+        "sippy_unipi",
+        "first order from current to voltage, 1 MHz, the input advanced by a sample; no delay",
+        "80 dB, no delays",
+    ),
+    "fastcan_narx": Rival(
+        "fastcan NARX",
+        "common",
+        "fastcan",
+        "linear, first order, free run, from current to voltage, 1 MHz; no delay",
+        "80 dB, no delays",
+    ),
+    "jax_sysid_linear": Rival(
+        "jax-sysid",
+        "jax_sysid",
+        "jax-sysid",
+        "one state from current to voltage, 1 MHz, L-BFGS without penalties; no delay",
+        "80 dB, no delays",
+    ),
+    "octave_arx": Rival(
+        "Octave arx",
+        "common",
+        "control",
+        "first order from current to voltage, 1 MHz, the input advanced by a sample; no delay",
+        "80 dB, no delays",
+        _OCTAVE,
+    ),
+    "octave_n4sid": Rival(
+        "Octave n4sid",
+        "common",
+        "control",
+        "one state from current to voltage, 1 MHz; no delay",
+        "80 dB, no delays",
+        _OCTAVE,
     ),
 }
 
@@ -195,7 +236,6 @@ def run(
                 command,
                 cwd=ROOT,
                 env={**os.environ, **ONE_THREAD},
-                preexec_fn=_pin if hasattr(os, "sched_setaffinity") else None,
                 timeout=timeout,
                 capture_output=True,
                 text=True,
@@ -213,11 +253,6 @@ def run(
         versions=json.loads(str(result["versions"])),
         errors=tuple(json.loads(str(result["errors"]))),
     )
-
-
-def _pin() -> None:
-    """Keep this process on the first core that it may use."""
-    os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
 
 
 def _last_error(text: str) -> str:

@@ -10,14 +10,11 @@ from impedance.models.circuits import (  # pyright: ignore[reportMissingImports]
     CustomCircuit,
 )
 
-from benchmarks.rivals.records import driver_impedance, harmonics, load_impedance
+from benchmarks.rivals.records import harmonics, load_impedance, measured_driver
 
 MEGA, KILO, NANO = 1e6, 1e3, 1e-9
 
-
-def driver(v_th, v_out, r_load, fs, f0):
-    """Z_th at the harmonics [ohm]."""
-    return driver_impedance(harmonics(v_th, v_out, fs, f0), r_load)
+driver = measured_driver
 
 
 def skin(v_th, v_out, model, start, fs, f0):

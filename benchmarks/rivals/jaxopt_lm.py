@@ -10,37 +10,20 @@ import jax.numpy as jnp
 import jaxopt
 import numpy as np
 
-from benchmarks.rivals.records import (
-    driver_misfit,
-    driver_starts,
-    harmonics,
-    skin_misfit,
-    source_impedance,
-)
+from benchmarks.rivals import harmonic_fit
 
 jax.config.update("jax_enable_x64", True)
 STEPS = 500
 
 
-def driver(v_th, v_out, r_load, fs, f0):
-    """Parameters of Z_th of order 5, and R_L."""
-    of = harmonics(v_th, v_out, fs, f0)
-    fits = [_fit(driver_misfit, start, of) for start in driver_starts(of)]
-    misfits = [float(jnp.sum(driver_misfit(q, *of, numpy=jnp) ** 2)) for q, _ in fits]
-    return fits[int(np.nanargmin(misfits))][0], r_load
-
-
-def skin(v_th, v_out, model, start, fs, f0):
-    """Elements, and whether jaxopt ended before its last step."""
-    q, r_load = model
-    of = harmonics(v_th, v_out, fs, f0)
-    z_th = r_load * source_impedance(np.asarray(q), of.f)
-    q, steps = _fit(skin_misfit, np.append(np.log(start), 0.0), (*of, z_th))
-    return np.exp(np.asarray(q)[:3]), bool(steps < STEPS)
+def fit(misfit, start, arguments):
+    """Minimum, and whether jaxopt ended before its last step."""
+    q, steps = _compiled(misfit, start, arguments)
+    return np.asarray(q), bool(steps < STEPS)
 
 
 @functools.partial(jax.jit, static_argnums=0)
-def _fit(misfit, start, of):
+def _compiled(misfit, start, arguments):
     solver = jaxopt.LevenbergMarquardt(
         lambda q, of: misfit(q, *of, numpy=jnp),
         maxiter=STEPS,
@@ -50,5 +33,9 @@ def _fit(misfit, start, of):
         solver="cholesky",
         materialize_jac=True,
     )
-    found = solver.run(jnp.asarray(start), of)
+    found = solver.run(jnp.asarray(start), arguments)
     return found.params, found.state.iter_num
+
+
+driver = functools.partial(harmonic_fit.driver, fit)
+skin = functools.partial(harmonic_fit.skin, fit)

@@ -10,6 +10,7 @@ RESULT gets `elements` (draw, 3) in SI, `ok`, `seconds` and `driver_seconds` (dr
 import importlib
 import importlib.metadata
 import json
+import os
 import sys
 import time
 import warnings
@@ -54,7 +55,9 @@ def _timed(call, arguments):
 
 
 def main(name, problem_path, result_path, repeats):
-    """Run a rival and write what it found."""
+    """Run a rival on one core and write what it found."""
+    if hasattr(os, "sched_setaffinity"):
+        os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
     rival = importlib.import_module(f"benchmarks.rivals.{name}")
     with np.load(problem_path) as file:
         problem = dict(file)
