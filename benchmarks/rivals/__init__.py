@@ -27,6 +27,7 @@ import numpy as np
 
 ROOT = pathlib.Path(__file__).parents[2]
 ENVIRONMENTS = ROOT / ".rivals"
+REQUIREMENTS = pathlib.Path(__file__).parent
 ONE_THREAD = {
     name: "1"
     for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
@@ -189,7 +190,7 @@ def install(names: Iterable[str]) -> dict[str, str]:
     """
     failed = {}
     for environment in dict.fromkeys(RIVALS[name].environment for name in names):
-        wanted = pathlib.Path(__file__).with_name(f"{environment}.txt")
+        wanted = REQUIREMENTS / f"{environment}.txt"
         folder = ENVIRONMENTS / environment
         made = folder / wanted.name  # a copy of what it was made from
         if made.exists() and made.read_text() == wanted.read_text():

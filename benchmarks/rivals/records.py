@@ -99,9 +99,9 @@ class Period(NamedTuple):
     """One averaged period of what the skin sees, for packages that take an input and an output.
 
     Attributes:
-        current: In units of `unit`⁻¹ volts per ohm, so that it is of order one.
-        voltage: V_out over its largest value.
-        unit: Impedance of 1 [ohm].
+        current: Over its largest value.
+        voltage: Over its largest value.
+        unit: Ratio of these two values, the impedance that is 1 then [ohm].
         fs: Samples per second [Hz].
     """
 

@@ -11,6 +11,8 @@ from scipy.signal import bilinear, lfilter, lfilter_zi
 
 from benchmarks.rivals.records import current_and_voltage, harmonics, measured_driver
 
+CALLS = 1000  # of the residuals
+
 driver = measured_driver
 
 
@@ -26,5 +28,6 @@ def skin(v_th, v_out, model, start, fs, f0):
         predicted, _ = lfilter(b, a, of.current, zi=of.current[0] * lfilter_zi(b, a))
         return predicted - of.voltage
 
-    fit = least_squares(misfit, np.append(np.log(start), 0.0), method="lm", x_scale="jac")
+    q = np.append(np.log(start), 0.0)
+    fit = least_squares(misfit, q, method="lm", x_scale="jac", max_nfev=CALLS)
     return np.exp(fit.x[:3]), fit.success

@@ -37,8 +37,8 @@ def show(names: Sequence[str], failed: Mapping[str, str], arguments: argparse.Na
         else:
             outcome = run(name, problems[rival.works], arguments.repeats, arguments.timeout)
         truth = np.array(list(scenes[rival.works].truth()[TRIAL].values()))
-        line, works = _line(name, outcome, truth)
-        lines.append(line)
+        text, works = line(name, outcome, truth)
+        lines.append(text)
         worked &= works
     print(
         f"{'rival':<32}{'environment':<17}{'version':<10}{'scene':<17}"
@@ -48,7 +48,7 @@ def show(names: Sequence[str], failed: Mapping[str, str], arguments: argparse.Na
     return worked
 
 
-def _line(name: str, outcome: Outcome, truth: np.ndarray) -> tuple[str, bool]:
+def line(name: str, outcome: Outcome, truth: np.ndarray) -> tuple[str, bool]:
     """One rival: median of the absolute errors, and of the times; and whether it works."""
     rival = RIVALS[name]
     version = outcome.versions.get(rival.package, "-")
@@ -63,5 +63,5 @@ def _line(name: str, outcome: Outcome, truth: np.ndarray) -> tuple[str, bool]:
         f"{np.median(outcome.driver_seconds):10.2f}"
     )
     notes = "".join(f"\n    {message}" for message in dict.fromkeys(outcome.errors) if message)
-    line = f"{head}{rival.works:<17}{numbers}{said:>6}{times}\n    {rival.setting}{notes}"
-    return line, bool((errors < WORKS).all() and outcome.ok.all())
+    text = f"{head}{rival.works:<17}{numbers}{said:>6}{times}\n    {rival.setting}{notes}"
+    return text, bool((errors < WORKS).all() and outcome.ok.all())

@@ -71,4 +71,5 @@ def main(name, problem_path, result_path, repeats):
 
 
 if __name__ == "__main__":
-    main(*sys.argv[1:4], int(sys.argv[4]))
+    _, rival_name, problem_file, result_file, count = sys.argv
+    main(rival_name, problem_file, result_file, int(count))
