@@ -105,6 +105,7 @@ for i = 1:draws
     errors{i} = problem.message;
   end
 end
+errors = jsonencode (errors);
 control = pkg ("list", "control"){1}.version;
 octave = version ();
 save ("-v6", paths{2}, "elements", "seconds", "driver_seconds", "first_seconds", "errors", "control", "octave");

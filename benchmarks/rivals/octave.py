@@ -31,9 +31,5 @@ def batch(estimator, problem, repeats):
         "driver_seconds": np.reshape(result["driver_seconds"], draws),
         "first_seconds": result["first_seconds"],
         "versions": json.dumps({name: str(result[name]) for name in ("control", "octave")}),
-        "errors": json.dumps([str(of) if np.size(of) else "" for of in _each(result["errors"])]),
+        "errors": str(result["errors"]),
     }
-
-
-def _each(cells):
-    return np.atleast_1d(np.asarray(cells, object)).tolist()

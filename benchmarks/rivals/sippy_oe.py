@@ -1,5 +1,6 @@
 """SIPPY's output-error model of first order, from current to voltage.
 
+The package is `sippy_unipi`; the one called `sippy` does telephony.
 It lets no input act at once: the input is advanced by a sample. Z_th is that of the calibration's
 harmonics, and the record one averaged period.
 """
