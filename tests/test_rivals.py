@@ -12,7 +12,8 @@ import scipy.signal
 
 from benchmarks import rivals
 from benchmarks.ladder import rung
-from benchmarks.rivals import RIVALS, SCENES, harmonic_fit, problem, records, table
+from benchmarks.rivals import harmonic_fit, problem, records, table
+from benchmarks.rivals.roster import RIVALS, SCENES
 from benchmarks.rivals.table import START
 
 FS, F0 = 100e3, 60.0
@@ -132,7 +133,8 @@ def test_a_late_v_th_is_undone_by_its_delay(f, spectra):
 def test_elements_are_those_that_tustin_made_discrete():
     of = records.Period(np.ones(2), np.ones(2), 1e4, 1e6)
     b, a = scipy.signal.bilinear([R_S * R_P * C_P, R_S + R_P], [R_P * C_P, 1.0], of.fs)
-    np.testing.assert_allclose(records.elements(*b / of.unit, a[1], of), TRUTH, rtol=ROUNDING)
+    b_0, b_1 = b / of.unit
+    np.testing.assert_allclose(records.elements(b_0, b_1, a[1], of), TRUTH, rtol=ROUNDING)
 
 
 def test_residuals_vanish_at_the_truth_and_count_standard_errors(f, spectra):
@@ -253,7 +255,7 @@ def test_an_environment_that_cannot_be_made_says_why(tmp_path, monkeypatch):
 @pytest.mark.slow
 @pytest.mark.parametrize("name", RIVALS)
 def test_every_rival_works_somewhere(name):
-    if not rivals.python_of(RIVALS[name].environment).exists():
+    if not rivals.installed(RIVALS[name].environment):
         pytest.skip(f"its environment is not made: python -m benchmarks rivals {name}")
     outcome = rivals.run(
         name, problem(rung("dry", **SCENES[RIVALS[name].works]), 2, START), 1, 600.0

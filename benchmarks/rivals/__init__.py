@@ -7,7 +7,7 @@ be installed or run is a row that says why.
     python -m benchmarks rivals              installs all, and runs each where it should work
     python -m benchmarks rivals scipy_harmonics jaxopt_lm
 
-Nothing but the standard library, NumPy and tqdm is imported here: those environments have no etid.
+Nothing but the standard library and NumPy is imported here: those environments have no etid.
 """
 
 import argparse
@@ -16,14 +16,17 @@ import json
 import os
 import pathlib
 import shutil
+import signal
 import subprocess
 import sys
 import tempfile
 import venv
 from collections.abc import Iterable, Mapping
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
+
+from benchmarks.rivals.roster import RIVALS
 
 ROOT = pathlib.Path(__file__).parents[2]
 ENVIRONMENTS = ROOT / ".rivals"
@@ -31,118 +34,6 @@ REQUIREMENTS = pathlib.Path(__file__).parent
 ONE_THREAD = {
     name: "1"
     for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
-}
-
-
-class Rival(NamedTuple):
-    """One estimator of another package.
-
-    Attributes:
-        name: As tables and charts show it.
-        environment: Of `.rivals/`, made from the requirements of that name beside this file.
-        package: Whose version is shown.
-        setting: How it is set, in a line.
-        works: A scene in which it should work, of `SCENES`.
-        program: What must be on the path besides, by its Debian packages.
-    """
-
-    name: str
-    environment: str
-    package: str
-    setting: str
-    works: str
-    program: Mapping[str, str] = {}
-
-
-SCENES: Mapping[str, Mapping[str, Any]] = {  # settings of `benchmarks.ladder.rung`, all dry skin
-    "60 dB, delays": {},
-    "80 dB, no delays": {"snr_db": 80.0, "trigger_jitter_rms": 0.0},
-}
-
-_OCTAVE = {"octave-cli": "octave octave-control"}
-RIVALS: Mapping[str, Rival] = {  # by module
-    "scipy_harmonics": Rival(
-        "SciPy least_squares, harmonics",
-        "common",
-        "scipy",
-        "MINPACK, logarithms, errors in both records, delays fitted",
-        "60 dB, delays",
-    ),
-    "lmfit_leastsq": Rival(
-        "lmfit leastsq", "common", "lmfit", "the same residuals", "60 dB, delays"
-    ),
-    "optimistix_lm": Rival(
-        "optimistix LM",
-        "common",
-        "optimistix",
-        "the same residuals, compiled, tolerances 1e-8",
-        "60 dB, delays",
-    ),
-    "jaxopt_lm": Rival(
-        "jaxopt LM",
-        "common",
-        "jaxopt",
-        "the same residuals, compiled, Cholesky, tolerances 1e-8",
-        "60 dB, delays",
-    ),
-    "scipy_lfilter": Rival(
-        "SciPy least_squares, lfilter",
-        "common",
-        "scipy",
-        "one averaged period of current and voltage at 1 MHz, Tustin, a delay of V_th",
-        "80 dB, no delays",
-    ),
-    "impedance_py": Rival(
-        "FFT, impedance.py",
-        "common",
-        "impedance",
-        "spectrum in kΩ, nF, MHz, weighted by its noise; no delay",
-        "80 dB, no delays",
-    ),
-    "impedance_fitter": Rival(
-        "FFT, ImpedanceFitter",
-        "impedancefitter",
-        "impedancefitter",
-        "the same spectrum and weights, by the lmfit model it makes",
-        "80 dB, no delays",
-    ),
-    "sippy_oe": Rival(
-        "SIPPY OE",
-        "common",
-        "sippy_unipi",
-        "first order from current to voltage, 1 MHz, the input advanced by a sample; no delay",
-        "80 dB, no delays",
-    ),
-    "fastcan_narx": Rival(
-        "fastcan NARX",
-        "common",
-        "fastcan",
-        "linear, first order, free run, from current to voltage, 1 MHz; no delay",
-        "80 dB, no delays",
-    ),
-    "jax_sysid_linear": Rival(
-        "jax-sysid",
-        "jax_sysid",
-        "jax-sysid",
-        "one state from current to voltage, 1 MHz, L-BFGS without penalties; no delay",
-        "80 dB, no delays",
-    ),
-    "octave_arx": Rival(
-        "Octave arx",
-        "common",
-        "control",
-        "first order from current to voltage, 1 MHz, the input advanced by a sample; no delay",
-        "80 dB, no delays",
-        _OCTAVE,
-    ),
-    "octave_n4sid": Rival(
-        "Octave n4sid",
-        "common",
-        "control",
-        "one state from current to voltage, 1 MHz; no delay",
-        "80 dB, no delays",
-        _OCTAVE,
-    ),
 }
 
 
@@ -173,8 +64,19 @@ class Outcome:
 
 def python_of(environment: str) -> pathlib.Path:
     """The interpreter of an environment, made or not."""
-    place = ("Scripts", "python.exe") if os.name == "nt" else ("bin", "python")
-    return ENVIRONMENTS.joinpath(environment, *place)
+    return ENVIRONMENTS / environment / "bin" / "python"
+
+
+def installed(environment: str) -> bool:
+    """Whether an environment was made from the requirements as they are now."""
+    wanted, made = _requirements(environment)
+    return made.exists() and made.read_text() == wanted.read_text()
+
+
+def _requirements(environment: str) -> tuple[pathlib.Path, pathlib.Path]:
+    """What an environment is made from, and the copy it gets once it is."""
+    name = f"{environment}.txt"
+    return REQUIREMENTS / name, ENVIRONMENTS / environment / name
 
 
 def install(names: Iterable[str]) -> dict[str, str]:
@@ -190,12 +92,10 @@ def install(names: Iterable[str]) -> dict[str, str]:
     """
     failed = {}
     for environment in dict.fromkeys(RIVALS[name].environment for name in names):
-        wanted = REQUIREMENTS / f"{environment}.txt"
-        folder = ENVIRONMENTS / environment
-        made = folder / wanted.name  # a copy of what it was made from
-        if made.exists() and made.read_text() == wanted.read_text():
+        if installed(environment):
             continue
-        venv.create(folder, clear=True, with_pip=True)
+        wanted, made = _requirements(environment)
+        venv.create(ENVIRONMENTS / environment, clear=True, with_pip=True)
         command = [python_of(environment), "-m", "pip", "install", "--quiet", "-r", wanted]
         done = subprocess.run(command, capture_output=True, text=True, check=False)
         if done.returncode == 0:
@@ -222,8 +122,7 @@ def run(
         python: The interpreter; that of the rival's environment if not given.
     """
     rival = RIVALS[name]
-    python = python or python_of(rival.environment)
-    if not python.exists():
+    if python is None and not installed(rival.environment):
         return Outcome(missing=f"not installed: python -m benchmarks rivals {name}")
     for program, packages in rival.program.items():
         if shutil.which(program) is None:
@@ -231,21 +130,26 @@ def run(
     with tempfile.TemporaryDirectory() as folder:
         given, found = pathlib.Path(folder, "problem.npz"), pathlib.Path(folder, "result.npz")
         np.savez(given, **problem)
-        command = [python, "-m", "benchmarks.rivals.worker", name, given, found, str(repeats)]
+        worker = [python or python_of(rival.environment), "-m", "benchmarks.rivals.worker"]
+        process = subprocess.Popen(
+            [*worker, name, given, found, str(repeats)],
+            cwd=ROOT,
+            env={**os.environ, **ONE_THREAD},
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.PIPE,
+            text=True,
+            start_new_session=True,
+        )
         try:
-            done = subprocess.run(
-                command,
-                cwd=ROOT,
-                env={**os.environ, **ONE_THREAD},
-                timeout=timeout,
-                capture_output=True,
-                text=True,
-                check=False,
-            )
+            _, complaint = process.communicate(timeout=timeout)
         except subprocess.TimeoutExpired:
             return Outcome(missing=f"not done after {timeout:g} s")
-        if done.returncode != 0:
-            return Outcome(missing=f"failed: {_last_error(done.stderr)}")
+        finally:
+            if process.poll() is None:
+                os.killpg(process.pid, signal.SIGKILL)  # with the Octave that it may have started
+                process.communicate()
+        if process.returncode != 0:
+            return Outcome(missing=f"failed: {_last_error(complaint)}")
         with np.load(found) as file:
             result = {key: file[key] for key in file.files}
     return Outcome(

@@ -7,7 +7,8 @@ import numpy as np
 from tqdm import tqdm
 
 from benchmarks.ladder import TRIAL, rung
-from benchmarks.rivals import RIVALS, SCENES, Outcome, problem, run
+from benchmarks.rivals import Outcome, problem, run
+from benchmarks.rivals.roster import RIVALS, SCENES
 
 START = (20e3, 100e3, 0.3e-9)  # of no fingertip in particular
 WORKS = 0.1  # largest relative error of any element of what is said to work
