@@ -133,8 +133,8 @@ def test_a_late_v_th_is_undone_by_its_delay(f, spectra):
 def test_elements_are_those_that_tustin_made_discrete():
     of = records.Period(np.ones(2), np.ones(2), 1e4, 1e6)
     b, a = scipy.signal.bilinear([R_S * R_P * C_P, R_S + R_P], [R_P * C_P, 1.0], of.fs)
-    b_0, b_1 = b / of.unit
-    np.testing.assert_allclose(records.elements(b_0, b_1, a[1], of), TRUTH, rtol=ROUNDING)
+    b_0, b_1, a_1 = (float(of_z) for of_z in (b[0] / of.unit, b[1] / of.unit, a[1]))
+    np.testing.assert_allclose(records.elements(b_0, b_1, a_1, of), TRUTH, rtol=ROUNDING)
 
 
 def test_residuals_vanish_at_the_truth_and_count_standard_errors(f, spectra):
