@@ -37,5 +37,5 @@ types: .venv/tools
 	touch $@
 
 clean:
-	rm -rf .venv demo results dist build .pytest_cache .ruff_cache .hypothesis .coverage*
+	rm -rf .venv .rivals demo results dist build .pytest_cache .ruff_cache .hypothesis .coverage*
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +

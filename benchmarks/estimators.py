@@ -9,7 +9,8 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 import etid
-from benchmarks.ladder import CALIBRATION, TRIAL
+from benchmarks import rivals
+from benchmarks.ladder import CALIBRATION, START, TRIAL
 from etid.methods import HARMONIC, METHODS, Method
 from etid.scenes import Scene
 
@@ -18,6 +19,7 @@ OURS = (DEFAULT, *METHODS)
 BATCH = 32  # recordings of a timed batch
 FAR = 5.0  # standard deviations of the bound, and own standard errors
 OFF = 0.2
+PATIENCE = 30  # budgets that a rival may take for all it has begun
 FEWEST = 4  # draws, however long they take
 
 
@@ -214,6 +216,25 @@ def score(draws: Draws, result: Result) -> Score:
 
 
 def theirs(draws: Draws, budget: float) -> Iterable[Result]:
-    """All rivals."""
-    del draws, budget
-    return ()
+    """All rivals, each in its environment; what is missing is a result that says why."""
+    pairs = [(study[TRIAL], study[CALIBRATION]) for study in draws.studies]
+    given = rivals.problem(pairs, START)
+    for name, rival in rivals.RIVALS.items():
+        outcome = rivals.run(name, given, 1, PATIENCE * budget, budget)
+        if outcome.missing:
+            none, nan = np.full((1, draws.truth.size), np.nan), np.nan
+            said = np.zeros(1, bool)
+            yield Result(rival.name, "rival", none, said, none, nan, nan, nan, outcome.missing)
+            continue
+        times = outcome.seconds[np.isfinite(outcome.seconds)]
+        yield Result(
+            rival.name,
+            "rival",
+            outcome.elements,
+            outcome.ok & np.isfinite(outcome.elements).all(1),
+            np.full(outcome.elements.shape, np.nan),
+            float(np.median(times)) if times.size else np.nan,
+            outcome.first_seconds,
+            float(np.nanmedian(outcome.driver_seconds)),
+            "" if times.size else next(filter(None, outcome.errors), "no answer"),
+        )

@@ -16,6 +16,7 @@ LOADS = {
     "dry": SkinLoad(r_s=33.4e3, r_p=186e3, c_p=0.12e-9),
     "damp": SkinLoad(r_s=6.1e3, r_p=17.4e3, c_p=0.66e-9),
 }
+START = (20e3, 100e3, 0.3e-9)  # elements, in SI, of no fingertip in particular
 TRIAL = "skin/01"
 CALIBRATION = "calibration/98k8"
 SNR_DB = (80, 60, 40, 30, 20)

@@ -1,0 +1,86 @@
+"""Runs one rival: `python -m benchmarks.rivals.worker NAME PROBLEM RESULT REPEATS BUDGET`.
+
+NAME is a module beside this one, run by the Python of its own environment. It has `driver` and
+`skin` for one record, or `batch` for all of a problem at once. PROBLEM holds `v_th`, `v_out`,
+`ref_th`, `ref_out` (draw, sample) [V], `r_ref` (draw,) [ohm], `start` (3,) in SI, `fs`, `f0` [Hz].
+RESULT gets `elements` (draw, 3) in SI, `ok`, `seconds` and `driver_seconds` (draw,),
+`first_seconds`, and as JSON `versions` by package and `errors`, one message per draw. After BUDGET
+seconds no further draw is begun, but for the second; a first fit that took as long is the only one.
+"""
+
+import importlib
+import importlib.metadata
+import json
+import os
+import sys
+import time
+import warnings
+
+import numpy as np
+
+FEWEST = 2  # draws
+
+
+def results(rival, problem, repeats, budget):
+    """All draws, one after the other; what fails costs its own draw alone."""
+    fs, f0, start = float(problem["fs"]), float(problem["f0"]), problem["start"]
+    draws = len(problem["r_ref"])
+    found = {
+        "elements": np.full((draws, 3), np.nan),
+        "ok": np.zeros(draws, bool),
+        "seconds": np.full(draws, np.nan),
+        "driver_seconds": np.full(draws, np.nan),
+        "first_seconds": np.nan,
+    }
+    errors = [""] * draws
+    started = time.perf_counter()
+    for i in range(draws):
+        if i >= FEWEST and time.perf_counter() - started > budget:
+            cut = {key: of[:i] if np.ndim(of) else of for key, of in found.items()}
+            return {**cut, "errors": json.dumps(errors[:i])}
+        try:
+            reference = problem["ref_th"][i], problem["ref_out"][i], float(problem["r_ref"][i])
+            begin = time.perf_counter()
+            model = rival.driver(*reference, fs, f0)
+            found["driver_seconds"][i] = time.perf_counter() - begin
+            arguments = (problem["v_th"][i], problem["v_out"][i], model, start, fs, f0)
+            runs = []
+            if np.isnan(found["first_seconds"]):
+                first = _timed(rival.skin, arguments)
+                found["first_seconds"] = first[0]
+                runs = [first] if first[0] > budget else []
+            runs = runs or [_timed(rival.skin, arguments) for _ in range(repeats)]
+            found["seconds"][i] = np.median([seconds for seconds, _ in runs])
+            elements, found["ok"][i] = runs[-1][1]
+            found["elements"][i] = elements
+        except Exception as error:  # anything a package may raise
+            errors[i] = f"{type(error).__name__}: {error}"
+    return {**found, "errors": json.dumps(errors)}
+
+
+def _timed(call, arguments):
+    begin = time.perf_counter()
+    found = call(*arguments)
+    return time.perf_counter() - begin, found
+
+
+def main(name, problem_path, result_path, repeats, budget):
+    """Run a rival on one core and write what it found."""
+    if hasattr(os, "sched_setaffinity"):
+        os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
+    rival = importlib.import_module(f"benchmarks.rivals.{name}")
+    with np.load(problem_path) as file:
+        problem = dict(file)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of trial steps; what comes of them is judged
+        batch = getattr(rival, "batch", None)  # of which the time is short
+        found = batch(problem, repeats) if batch else results(rival, problem, repeats, budget)
+    owners = importlib.metadata.packages_distributions()
+    imported = sorted({owner for module in {*sys.modules} & {*owners} for owner in owners[module]})
+    versions = {package: importlib.metadata.version(package) for package in imported}
+    np.savez(result_path, **{"versions": json.dumps(versions), **found})
+
+
+if __name__ == "__main__":
+    _, rival_name, problem_file, result_file, count, limit = sys.argv
+    main(rival_name, problem_file, result_file, int(count), float(limit))
