@@ -146,7 +146,9 @@ class Bands(eqx.Module):
 
     def measure(self, v_out: Float[Array, "lane sample"]) -> Gains:
         """Gains and noise of one pulse at all electrodes."""
-        y = _transform(v_out, self.size, self.x.shape[0])
+        # In single precision, which takes two thirds of the time: it loses 2e-8 of the peak, a
+        # five-hundredth of what any record is trusted with.
+        y = _transform(v_out.astype(jnp.float32), self.size, self.x.shape[0]).astype(self.x.dtype)
         product = jnp.conj(self.x)[None, :] * y
         level = self.summed(product)
         slope = self.summed(product * as_complex(self.offset)[None, :])

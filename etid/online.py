@@ -303,7 +303,7 @@ def _electrode(
     )
 
 
-@eqx.filter_jit  # not `stored_jit`, whose care costs a tenth of a tick at every call
+@jax.jit  # not `stored_jit`, nor equinox's, whose care costs a tenth of a tick at every call
 def _updated(
     tracker: Tracker, state: TrackerState, v_out: Float[Array, "lane sample"]
 ) -> TrackerState:

@@ -166,6 +166,7 @@ def test_without_noise_it_is_biased_by_less_than_a_tenth_of_the_noise_of_100_pul
 SAME = 0.2  # standard errors: both weigh the noise of V_th, but not in the same way
 
 
+@pytest.mark.slow
 def test_after_some_pulses_it_is_what_a_batch_fit_of_these_periods_is():
     """With the same Z_th, and the harmonics of the same band."""
     tracker, v_out = explained()
