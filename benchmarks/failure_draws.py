@@ -25,19 +25,16 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 import etid
+from benchmarks.estimators import DEFAULT, FAR, OFF
 from benchmarks.failure_axes import Cell, Cole, TwoLayers
 from etid.circuits import SkinRC
-from etid.methods import HARMONIC, METHODS, Method, choose
+from etid.methods import HARMONIC, Method, choose
 from etid.preflight import Inspected
 from etid.scenes import Scene
 from etid.transfer import is_stable
 from etid.transformer import Impedance, SkinLoad
 
-DEFAULT = "default"
-NAMES = (DEFAULT, *METHODS)
 ELEMENTS = SkinRC.names()
-FAR = 5.0  # standard deviations of the bound, and own standard errors
-OFF = 0.2
 DETERMINED = 0.1  # bound of an element for which it must not be wrong silently
 NOT_CONVERGED = ("max_steps_reached", "nonfinite")
 

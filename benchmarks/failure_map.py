@@ -21,29 +21,30 @@ what takes longer because of a higher sample rate or more periods.
 import argparse
 import collections
 import concurrent.futures
-import contextlib
 import itertools
 import pathlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 from tqdm import tqdm
 
 from benchmarks import failure_chart
+from benchmarks.estimators import DEFAULT, OURS
 from benchmarks.failure_axes import MOST, Cell, cells
 from benchmarks.failure_counts import rates, silent, table
-from benchmarks.failure_draws import DEFAULT, NAMES, Answer, Effort, chunk
-from benchmarks.provenance import write_csv
+from benchmarks.failure_draws import Answer, Effort, chunk
+from benchmarks.provenance import RESULTS, write_csv
 from etid import streaming
 
+RATES, SILENT = "failures.csv", "silent_failures.csv"
 TARGET = 1e-3  # silent failures of the default method
 ALL = 2 * MOST  # trials of a driver
 EFFORTS = {
-    **dict.fromkeys(NAMES, Effort(6, ALL)),
+    **dict.fromkeys(OURS, Effort(6, ALL)),
     "non_parametric": Effort(6, 3),
     "output_error": Effort(1, 3),
 }
-QUICK = {**dict.fromkeys(NAMES, Effort(1, ALL)), "output_error": Effort(1, 2)}
+QUICK = {**dict.fromkeys(OURS, Effort(1, ALL)), "output_error": Effort(1, 2)}
 USUAL = 10_000.0  # samples of three periods at 200 kHz
 CHUNK = 8  # cells of one task
 # Of the quick run: two where all is well for the default method and not for the others, and one
@@ -80,27 +81,22 @@ def tasks(chosen: Sequence[Cell]) -> list[list[int]]:
     return sorted(found, key=lambda of: -sum(chosen[i].scene.samples for i in of))
 
 
-def draws(chosen: Sequence[Cell], usual: dict[str, Effort], workers: int) -> list[list[Answer]]:
-    """All answers in all cells."""
-    found: dict[int, list[Answer]] = {}
+def draws(
+    chosen: Sequence[Cell], usual: dict[str, Effort], workers: int
+) -> Iterator[dict[int, list[Answer]]]:
+    """All answers, cell by cell as they are done, by the number of the cell."""
     efforts = [effort(cell, usual) for cell in chosen]
-    with contextlib.ExitStack() as stack:
-        bar = stack.enter_context(tqdm(total=len(chosen), unit="cell"))
-        if workers == 1:
-            for number in range(len(chosen)):
-                found[number] = chunk([chosen[number]], [efforts[number]])[0]
-                bar.update()
-            return [found[number] for number in range(len(chosen))]
-        executor = stack.enter_context(streaming.processes(workers))
+    if workers == 1:
+        for number, cell in enumerate(chosen):
+            yield {number: chunk([cell], [efforts[number]])[0]}
+        return
+    with streaming.processes(workers) as executor:
         futures = {
             executor.submit(chunk, [chosen[i] for i in of], [efforts[i] for i in of]): of
             for of in tasks(chosen)
         }
         for future in concurrent.futures.as_completed(futures):
-            numbers = futures[future]
-            found |= dict(zip(numbers, future.result(), strict=True))
-            bar.update(len(numbers))
-    return [found[number] for number in range(len(chosen))]
+            yield dict(zip(futures[future], future.result(), strict=True))
 
 
 def verdicts(answers: Sequence[Answer]) -> str:
@@ -150,17 +146,31 @@ def ranked(answers: Sequence[Answer]) -> bool:
     return holds
 
 
+def write(
+    chosen: Sequence[Cell], found: Mapping[int, list[Answer]], folder: pathlib.Path
+) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
+    """Write and return the tables of the cells that are done: rates, and silent failures."""
+    done = sorted(found)
+    of = [chosen[i] for i in done], [found[i] for i in done]
+    rows, failures = table(*of), silent(*of)
+    write_csv(folder / RATES, rows)
+    (folder / SILENT).unlink(missing_ok=True)  # that of an earlier run
+    if failures:
+        write_csv(folder / SILENT, failures)
+    return rows, failures
+
+
 def run(quick: bool, folder: pathlib.Path, workers: int) -> bool:
     """Draw, count, print, and write tables and figures into `folder`."""
     chosen = [c for c in cells() if not quick or (c.chart, c.row, c.column) in FEW]
-    found = draws(chosen, QUICK if quick else EFFORTS, workers)
-    every = list(itertools.chain.from_iterable(found))
-    rows, failures = table(chosen, found), silent(chosen, found)
-    write_csv(folder / "failures.csv", rows)
-    listed = folder / "silent_failures.csv"
-    listed.unlink(missing_ok=True)  # that of an earlier run
-    if failures:
-        write_csv(listed, failures)
+    found: dict[int, list[Answer]] = {}
+    rows, failures = [], []
+    with tqdm(total=len(chosen), unit="cell") as bar:
+        for done in draws(chosen, QUICK if quick else EFFORTS, workers):
+            found |= done
+            rows, failures = write(chosen, found, folder)  # nothing that is done is lost
+            bar.update(len(done))
+    every = [answer for i in sorted(found) for answer in found[i]]
     for number, name in enumerate(dict.fromkeys(row["map"] for row in rows), 1):
         of = [row for row in rows if row["map"] == name]
         failure_chart.draw(of, folder / f"failures_{number}.svg")
@@ -180,7 +190,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--workers", type=int, default=2, help="processes, each on a core of its own"
     )
     parser.add_argument(
-        "--folder", type=pathlib.Path, default=pathlib.Path(), help="of the tables and figures"
+        "--folder", type=pathlib.Path, default=RESULTS, help="of the tables and figures"
     )
 
 

@@ -10,6 +10,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 ROOT = pathlib.Path(__file__).parents[1]
+RESULTS = ROOT / "benchmarks" / "results"  # of the last full run, which the README shows
 PACKAGES = ("etid", "jax", "jaxlib", "equinox", "optimistix", "numpy", "scipy", "h5py")
 
 

@@ -17,15 +17,14 @@ from tqdm import tqdm
 
 from benchmarks.estimators import DEFAULT, OURS, Drivers, Result, Score, draw, ours, score, theirs
 from benchmarks.ladder import SOURCES, ladder
-from benchmarks.provenance import ROOT, write_csv
+from benchmarks.provenance import RESULTS, write_csv
 from benchmarks.speed import pin
 from benchmarks.speed_accuracy_chart import chart
 from etid.circuits import SkinRC
 
-RESULTS = ROOT / "benchmarks" / "results"  # of the last full run, which the README shows
 FILE = "speed_accuracy.csv"
-REPETITIONS = 32
-BUDGET = 8.0  # [s] for one estimator in one scene
+REPETITIONS = 24
+BUDGET = 6.0  # [s] for one estimator in one scene
 SHOWN = ("dry, 80 dB", "dry, 60 dB", "dry, 30 dB", "damp, 60 dB", "damp, 40 dB", "dry, 1 MHz")
 QUICK = ("dry, 60 dB", "damp, 40 dB")
 QUICK_REPETITIONS = 5

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.provenance import ROOT
-from benchmarks.speed_accuracy import FILE, RESULTS
+from benchmarks.provenance import RESULTS, ROOT
+from benchmarks.speed_accuracy import FILE
 from etid.methods import METHODS
 
 README = ROOT / "README.md"
