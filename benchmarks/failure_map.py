@@ -39,11 +39,7 @@ from etid import streaming
 RATES, SILENT = "failures.csv", "silent_failures.csv"
 TARGET = 1e-3  # silent failures of the default method
 ALL = 2 * MOST  # trials of a driver
-EFFORTS = {
-    **dict.fromkeys(OURS, Effort(6, ALL)),
-    "non_parametric": Effort(6, 3),
-    "output_error": Effort(1, 3),
-}
+DRIVERS = 6
 QUICK = {**dict.fromkeys(OURS, Effort(1, ALL)), "output_error": Effort(1, 2)}
 USUAL = 10_000.0  # samples of three periods at 200 kHz
 CHUNK = 8  # cells of one task
@@ -58,12 +54,21 @@ FEW = {
 RANKING = (DEFAULT, "harmonic_steiglitz_mcbride", "steiglitz_mcbride")
 
 
-def effort(cell: Cell, usual: dict[str, Effort]) -> dict[str, Effort]:
+def usual(drivers: int) -> dict[str, Effort]:
+    """What a full run draws of a cell, by method."""
+    return {
+        **dict.fromkeys(OURS, Effort(drivers, ALL)),
+        "non_parametric": Effort(drivers, 3),
+        "output_error": Effort(1, 3),
+    }
+
+
+def effort(cell: Cell, most: dict[str, Effort]) -> dict[str, Effort]:
     """Fewer drivers where there are more samples in a period, or for output error at all."""
     dense = cell.scene.sample_rate / 200e3
     long = cell.scene.samples / USUAL
     found = {}
-    for name, of in usual.items():
+    for name, of in most.items():
         cost = max(1.0, dense, long / 3)
         found[name] = Effort(max(1, round(of.drivers / cost)), of.trials)
     return found
@@ -82,13 +87,14 @@ def tasks(chosen: Sequence[Cell]) -> list[list[int]]:
 
 
 def draws(
-    chosen: Sequence[Cell], usual: dict[str, Effort], workers: int
+    chosen: Sequence[Cell], most: dict[str, Effort], workers: int
 ) -> Iterator[dict[int, list[Answer]]]:
     """All answers, cell by cell as they are done, by the number of the cell."""
-    efforts = [effort(cell, usual) for cell in chosen]
+    efforts = [effort(cell, most) for cell in chosen]
     if workers == 1:
-        for number, cell in enumerate(chosen):
-            yield {number: chunk([cell], [efforts[number]])[0]}
+        for numbers in tasks(chosen):
+            done = chunk([chosen[i] for i in numbers], [efforts[i] for i in numbers])
+            yield dict(zip(numbers, done, strict=True))
         return
     with streaming.processes(workers) as executor:
         futures = {
@@ -160,13 +166,13 @@ def write(
     return rows, failures
 
 
-def run(quick: bool, folder: pathlib.Path, workers: int) -> bool:
+def run(quick: bool, folder: pathlib.Path, workers: int, drivers: int = DRIVERS) -> bool:
     """Draw, count, print, and write tables and figures into `folder`."""
     chosen = [c for c in cells() if not quick or (c.chart, c.row, c.column) in FEW]
     found: dict[int, list[Answer]] = {}
     rows, failures = [], []
     with tqdm(total=len(chosen), unit="cell") as bar:
-        for done in draws(chosen, QUICK if quick else EFFORTS, workers):
+        for done in draws(chosen, QUICK if quick else usual(drivers), workers):
             found |= done
             rows, failures = write(chosen, found, folder)  # nothing that is done is lost
             bar.update(len(done))
@@ -189,6 +195,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--workers", type=int, default=2, help="processes, each on a core of its own"
     )
+    parser.add_argument("--drivers", type=int, default=DRIVERS, help="of a cell, at most")
     parser.add_argument(
         "--folder", type=pathlib.Path, default=RESULTS, help="of the tables and figures"
     )
@@ -196,4 +203,4 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def main(arguments: argparse.Namespace) -> bool:
     """Run the command."""
-    return run(arguments.quick, arguments.folder, arguments.workers)
+    return run(arguments.quick, arguments.folder, arguments.workers, arguments.drivers)

@@ -121,7 +121,7 @@ def ranked(rows: Sequence[Mapping[str, Any]]) -> list[str]:
 
 def _print(rows: Iterable[Mapping[str, Any]]) -> None:
     for row in rows:
-        head = f"{row['scene']:<22}{row['estimator']:<28}{row['mode']:<9}"
+        head = f"{row['scene']:<22}{row['estimator']:<32}{row['mode']:<9}"
         if row["missing"]:
             tqdm.write(f"{head}{row['missing']}")
             continue
@@ -139,7 +139,7 @@ def run(
     """Print and write the table and the charts; whether the ranking holds."""
     heads = ("none %", "said %", "wrong %", "silent %")
     print(
-        f"{'scene':<22}{'estimator':<28}{'mode':<9}draws  x bound"
+        f"{'scene':<22}{'estimator':<32}{'mode':<9}draws  x bound"
         + "".join(f"{head:>8}" for head in heads)
         + f"{'ms':>10}{'first s':>9}{'driver ms':>10}"
     )

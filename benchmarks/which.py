@@ -15,6 +15,7 @@ from etid.methods import METHODS
 README = ROOT / "README.md"
 BEGIN, END = "<!-- python -m benchmarks which -->\n", "<!-- end -->\n"
 AS_GOOD = 1.25  # times the smallest error, that an estimator may have to be used for its speed
+WORTH = 0.5  # of the time that the most accurate one takes, from which on that is a reason
 TRUSTED = 0.5  # part of the draws that have an answer which the estimator itself stands by
 
 
@@ -45,7 +46,7 @@ def table(rows: Sequence[Mapping[str, Any]]) -> str:
 
 
 def best(rows: Sequence[Mapping[str, Any]]) -> str | None:
-    """The fastest of those that are trusted and as good as the most accurate."""
+    """The most accurate of those that are trusted, unless one as good takes half of its time."""
     trusted = [
         row
         for row in rows
@@ -53,9 +54,11 @@ def best(rows: Sequence[Mapping[str, Any]]) -> str | None:
     ]
     if not trusted:
         return None
-    limit = AS_GOOD * min(row["error"] for row in trusted)
-    good = [row for row in trusted if row["error"] <= limit]
-    return min(good, key=lambda row: row["ms"])["estimator"]
+    found = min(trusted, key=lambda row: row["error"])
+    for row in sorted(trusted, key=lambda row: row["ms"]):
+        if row["error"] <= AS_GOOD * found["error"] and row["ms"] <= WORTH * found["ms"]:
+            return row["estimator"]
+    return found["estimator"]
 
 
 def _trusted(row: Mapping[str, Any]) -> bool:

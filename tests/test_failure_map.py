@@ -99,7 +99,7 @@ def test_all_cells_have_places_and_seeds_of_their_own():
     assert len(places) == len(every)
     assert len({cell.chart for cell in every}) == 8
     assert failure_map.FEW < places
-    most = max(effort.drivers for effort in failure_map.EFFORTS.values())
+    most = failure_map.DRIVERS
     used = list(itertools.chain.from_iterable(seeds(cell, most) for cell in every))
     assert len(set(used)) == len(used)
 
