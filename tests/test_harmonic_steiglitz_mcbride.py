@@ -155,7 +155,7 @@ def test_the_covariance_of_the_source_is_followed_through(name):
     slope = (moved[0] - moved[1]) / (2 * step)
     one = jnp.zeros((parameters.size, parameters.size)).at[2, 2].set(1.0)
     best = fit(of, Z_TH, 20)
-    own, shared = covariance(of, jnp.ones_like(FREQUENCY), SOURCE, one, best)
+    own, shared = jax.jit(covariance)(of, jnp.ones_like(FREQUENCY), SOURCE, one, best)
     assert not np.asarray(own).any()
     # Differences of 1e-5 are good to its square, times third derivatives near 1.
     np.testing.assert_allclose(shared, np.outer(slope, slope), rtol=1e-4)

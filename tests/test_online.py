@@ -314,6 +314,7 @@ def held(z):
     return (np.abs(z) < NORMAL_95).mean(axis=0)
 
 
+@pytest.mark.slow
 def test_drifting_skin_is_followed_and_its_intervals_hold_it():
     z = z_of_walk(electrodes=16, pulses=41, seed=0)
     assert len(z) >= 90  # of 96
@@ -371,6 +372,7 @@ def test_windows_are_those_next_to_each_period():
     assert bands.cut(v[None, :9], 10.0).shape == (0, 1, 10)
 
 
+@pytest.mark.slow
 def test_a_circuit_of_ones_own_is_tracked():
     driver, study = calibrated()
     tracker = Tracker.of(driver, study["cal/0"], electrodes=1, circuit=etid.Resistor())
