@@ -236,4 +236,8 @@ def answers(cell: Cell, efforts: dict[str, Effort]) -> list[Answer]:
 
 def chunk(cells: Sequence[Cell], efforts: Sequence[dict[str, Effort]]) -> list[list[Answer]]:
     """The same for several cells."""
-    return [answers(cell, effort) for cell, effort in zip(cells, efforts, strict=True)]
+    found = []
+    for cell, effort in zip(cells, efforts, strict=True):
+        found.append(answers(cell, effort))
+        make_room()
+    return found

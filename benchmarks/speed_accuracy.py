@@ -17,6 +17,7 @@ from tqdm import tqdm
 
 from benchmarks.estimators import DEFAULT, OURS, Drivers, Result, Score, draw, ours, score, theirs
 from benchmarks.ladder import SOURCES, ladder
+from benchmarks.mappings import make_room
 from benchmarks.provenance import RESULTS, write_csv
 from benchmarks.speed import pin
 from benchmarks.speed_accuracy_chart import chart
@@ -149,6 +150,7 @@ def run(
         _print(rows)
         table += rows
         write_csv(folder / FILE, table)  # each scene is kept as it comes
+        make_room()
     chart(table, folder / "speed_accuracy_all.svg")
     shown = [row for row in table if row["scene"] in SHOWN]
     if shown:

@@ -12,7 +12,7 @@ from matplotlib.axes import Axes
 from benchmarks import charts
 from etid.methods import METHODS
 
-# What stands in a panel for each estimator; a rival stands there with a short name of its own.
+# What stands in a panel for each estimator.
 LETTERS = {
     "default": "etid",
     "maximum_likelihood": "ML",
@@ -21,6 +21,17 @@ LETTERS = {
     "harmonic_steiglitz_mcbride": "HSM",
     "steiglitz_mcbride": "SM",
     "equation_error": "EE",
+    "SciPy least_squares, harmonics": "SciPy",
+    "SciPy least_squares, lfilter": "lfilter",
+    "lmfit leastsq": "lmfit",
+    "optimistix LM": "optimistix",
+    "jaxopt LM": "jaxopt",
+    "FFT, impedance.py": "impedance.py",
+    "FFT, ImpedanceFitter": "ImpedanceFitter",
+    "SIPPY OE": "SIPPY",
+    "fastcan NARX": "fastcan",
+    "Octave arx": "arx",
+    "Octave n4sid": "n4sid",
 }
 COLUMNS = 3
 WORST = 1e3  # bounds; what is further off stands here, with an arrow
@@ -48,14 +59,14 @@ def chart(rows: Sequence[Mapping[str, Any]], path: pathlib.Path) -> None:
         panel.set_ylabel("median error / Cramer-Rao bound")
     for panel in axes[-1]:
         panel.set_xlabel("time per skin [ms]")
-    key = ", ".join(f"{letters} {name}" for name, letters in LETTERS.items())
+    key = ", ".join(f"{short(name)} {name.replace('_', ' ')}" for name in METHODS)
     figure.supxlabel(
         "\n".join(
             textwrap.wrap(
-                f"etid is the default; {key}; other names are rivals. Filled: ours, its line from "
-                "one recording a call to a batch. (In brackets): says itself that most answers are "
-                "not good. Dashed: what nothing beats in both. Grey: where an efficient estimator "
-                "is.",
+                f"etid: the default method; {key}, left out where it is the default; open: rivals. "
+                "A line leads from one recording a call to a batch. (In brackets): says itself "
+                "that most of its answers are not good. Dashed: what nothing beats in both. Grey: "
+                "where an efficient estimator is.",
                 150,
             )
         ),

@@ -7,6 +7,8 @@ import jax
 import pytest
 from hypothesis import settings
 
+from benchmarks.mappings import make_room
+
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_rank_promotion", "raise")
 jax.config.update("jax_numpy_dtype_promotion", "strict")
@@ -15,7 +17,6 @@ jax.config.update("jax_numpy_dtype_promotion", "strict")
 settings.register_profile("etid", deadline=None, derandomize=True, max_examples=40)
 settings.load_profile("etid")
 
-MAPPINGS = 30_000  # half of what Linux allows; one test file needs a few thousand
 REFERENCE_DATA = pathlib.Path(__file__).parents[2] / "shared" / "data"
 
 
@@ -35,15 +36,8 @@ def pytest_configure(config):
 
 @pytest.fixture(autouse=True, scope="module")
 def _room_for_executables():
-    """Forget what was compiled before the process runs out of memory mappings.
-
-    XLA maps memory for every executable. Linux allows a process 65 530 mappings, and beyond them
-    the compiler crashes: one process would, that runs all the tests.
-    """
     yield
-    maps = pathlib.Path("/proc/self/maps")
-    if maps.exists() and maps.read_text().count("\n") > MAPPINGS:
-        jax.clear_caches()
+    make_room()
 
 
 @pytest.fixture
