@@ -27,6 +27,7 @@ from jaxtyping import Bool, Float
 import etid
 from benchmarks.estimators import DEFAULT, FAR, OFF
 from benchmarks.failure_axes import Cell, Cole, TwoLayers
+from benchmarks.mappings import make_room
 from etid.circuits import SkinRC
 from etid.methods import HARMONIC, Method, choose
 from etid.preflight import Inspected
