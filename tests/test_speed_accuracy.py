@@ -137,7 +137,7 @@ def test_the_quick_run_ends_well(tmp_path, monkeypatch):
     assert {r["mode"] for r in rows} == {"alone"}
 
 
-def test_the_most_accurate_is_to_be_used_or_what_is_as_good_in_half_the_time():
+def test_the_first_that_is_good_is_to_be_used_or_what_is_as_good_in_half_its_time():
     rows = [
         row("maximum_likelihood", ms=3.0, none=0.0),
         row("harmonic_steiglitz_mcbride", ms=1.4, error=1.2, none=0.0),
