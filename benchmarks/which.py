@@ -47,7 +47,7 @@ def table(rows: Sequence[Mapping[str, Any]]) -> str:
 
 
 def best(rows: Sequence[Mapping[str, Any]]) -> str | None:
-    """The first that is trusted and as good as the best, or one of them that takes half its time."""
+    """The first that is trusted and as good as the best, or one such that takes half its time."""
     trusted = [
         row
         for row in sorted(rows, key=lambda row: OURS.index(row["estimator"]))
