@@ -76,7 +76,7 @@ def _cell(row: Mapping[str, Any] | None, used: bool) -> str:
 
 def _median_ms(rows: Sequence[Mapping[str, Any]]) -> str:
     found = [row["ms"] for row in rows if row["mode"] == "batched" and np.isfinite(row["ms"])]
-    return f"{np.median(found):.2g}" if found else "-"
+    return f"{np.median(found):.3g}" if found else "-"
 
 
 def inserted(text: str, made: str) -> str:

@@ -8,6 +8,7 @@ import pytest
 from benchmarks import speed_accuracy, speed_accuracy_chart, which
 from benchmarks.estimators import Draws, Result, score
 from benchmarks.ladder import CALIBRATION, SOURCES, TRIAL, ladder
+from benchmarks.provenance import RESULTS
 from benchmarks.speed_accuracy import dominators, front, ranked
 
 BOUND = np.array([0.01, 0.01, 0.08])
@@ -154,3 +155,9 @@ def test_the_first_that_is_good_is_to_be_used_or_what_is_as_good_in_half_its_tim
     assert which.inserted(page, made) == f"before\n{which.BEGIN}{made}{which.END}after\n"
     with pytest.raises(ValueError, match="no '<!--"):
         which.inserted("before\n", made)
+
+
+def test_the_readme_has_the_table_of_the_last_results():
+    made = which.table(which.read(RESULTS / speed_accuracy.FILE))
+    page = which.README.read_text()
+    assert which.inserted(page, made) == page, "run python -m benchmarks which"
