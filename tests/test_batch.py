@@ -127,6 +127,7 @@ def test_a_study_of_ragged_lengths_compiles_for_few(study, driver, monkeypatch):
     assert len(traced) <= 1  # none, if an earlier test has
 
 
+@pytest.mark.slow
 def test_what_fills_a_record_up_changes_no_digit(study, driver):
     """The same samples in a longer lane."""
     recording = study["s01/dry/0"]

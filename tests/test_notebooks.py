@@ -72,7 +72,7 @@ def test_readme_examples_print_what_the_readme_says(capsys):
     def structure(lines):
         return [NUMBER.sub("#", line).split() for line in lines.strip().splitlines()]
 
-    assert len(blocks) == 4
+    assert len(blocks) == 6
     for code, printed in zip(blocks[::2], blocks[1::2], strict=True):
         exec(compile(code, "README.md", "exec"), names)
         assert structure(capsys.readouterr().out) == structure(printed)
