@@ -17,7 +17,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Complex, Float
-from scipy.fft import next_fast_len
 
 WINDOW = 25  # harmonics over which power is averaged
 ALIASED = 0.35  # of the sample rate, above which aliases must be told from harmonics by frequency
@@ -87,7 +86,7 @@ def counted_pulse_rate(
     early = v[begin + reach : begin + one - reach]
     late = v[begin + span : begin + span + one]
     mean = v[:one].mean()
-    size = next_fast_len(2 * one, real=True)
+    size = 1 << (2 * one - 1).bit_length()
     product = np.fft.rfft(late - mean, size) * np.conj(np.fft.rfft(early - mean, size))
     lag = int(np.argmax(np.fft.irfft(product, size)[: 2 * reach + 1])) - reach
     return pulse_rate if abs(lag) < 2 else pulse_rate * span / (span + lag)
