@@ -1,7 +1,7 @@
 """Our estimators, alone and in a batch, on the same draws, and what scores them and the rivals."""
 
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any, NamedTuple, cast
 
 import jax
@@ -87,28 +87,35 @@ class Drivers:
 
     def of(self, method: Method | None, number: int) -> etid.Driver | None:
         """The driver of one draw, if there is one."""
-        shared = _shared(method)
-        if (shared, number) not in self.known:
+        kind = shared(method)
+        if (kind, number) not in self.known:
+            calibration = self.draws.studies[number][CALIBRATION]
             begin = time.perf_counter()
-            self.known[shared, number] = self._identify(shared, number)
-            self.times.setdefault(shared, []).append(time.perf_counter() - begin)
-        return self.known[shared, number]
+            self.known[kind, number] = driver_of(calibration, kind)
+            self.times.setdefault(kind, []).append(time.perf_counter() - begin)
+        return self.known[kind, number]
 
     def seconds(self, method: Method | None) -> float:
         """Median time of one, but for the first."""
-        times = self.times.get(_shared(method), [])
+        times = self.times.get(shared(method), [])
         return float(np.median(times[1:])) if times[1:] else np.nan
 
-    def _identify(self, method: Method | None, number: int) -> etid.Driver | None:
-        calibration = self.draws.studies[number][CALIBRATION]
-        try:
-            return etid.identify_driver(calibration, method=method, throw=False)
-        except etid.IdentificationError:
-            return None
 
-
-def _shared(method: Method | None) -> Method | None:
+def shared(method: Method | None) -> Method | None:
+    """The method whose driver a method uses: all on the harmonics that of maximum likelihood."""
     return "maximum_likelihood" if method in HARMONIC else method
+
+
+def driver_of(
+    calibrations: etid.Recording | Sequence[etid.Recording],
+    method: Method | None,
+    order: int = 5,
+) -> etid.Driver | None:
+    """The driver, whatever its verdict; None if pre-flight refuses a calibration."""
+    try:
+        return etid.identify_driver(calibrations, order=order, method=method, throw=False)
+    except etid.IdentificationError:
+        return None
 
 
 def ours(draws: Draws, drivers: Drivers, name: str, budget: float) -> Iterable[Result]:

@@ -25,11 +25,11 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 import etid
-from benchmarks.estimators import DEFAULT, FAR, OFF
+from benchmarks.estimators import DEFAULT, FAR, OFF, driver_of, shared
 from benchmarks.failure_axes import Cell, Cole, TwoLayers
 from benchmarks.mappings import make_room
 from etid.circuits import SkinRC
-from etid.methods import HARMONIC, Method, choose
+from etid.methods import Method, choose
 from etid.preflight import Inspected
 from etid.scenes import Scene
 from etid.transfer import is_stable
@@ -163,7 +163,7 @@ class Draw:
         every = list(records if change is None else (change(r, rng) for r in records))
         self.calibrations = [r for r in every if r.is_calibration]
         self.trials = [r for r in every if not r.is_calibration]
-        self._drivers: dict[Method, etid.Driver | None] = {}
+        self._drivers: dict[Method | None, etid.Driver | None] = {}
 
     def driver(self, method: Method | None) -> etid.Driver | None:
         """The driver for a method; None if pre-flight refuses the calibration.
@@ -172,14 +172,9 @@ class Draw:
         of the others.
         """
         chosen = choose(method, [Inspected(record) for record in self.calibrations])
-        kind = "maximum_likelihood" if chosen in HARMONIC else chosen
+        kind = shared(chosen)
         if kind not in self._drivers:
-            try:
-                self._drivers[kind] = etid.identify_driver(
-                    self.calibrations, order=self.cell.order, method=kind, throw=False
-                )
-            except etid.IdentificationError:
-                self._drivers[kind] = None
+            self._drivers[kind] = driver_of(self.calibrations, kind, self.cell.order)
         return self._drivers[kind]
 
     def answers(
