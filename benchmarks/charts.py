@@ -4,13 +4,12 @@ import pathlib
 from typing import Any
 
 import matplotlib as mpl
-from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from benchmarks.provenance import provenance
+from etid.plotting import INK as INK
+from etid.plotting import new_figure
 
-INK = "#1a1a1a"
 DASHES = ("-", "--", "-.", ":", (0, (5, 1, 1, 1, 1, 1)), (0, (1, 3)))
 MARKS = ("o", "s", "^", "D", "v", "P", "X", "<", ">", "p", "h", "*")
 
@@ -24,19 +23,11 @@ def new(rows: int, columns: int, size: tuple[float, float], **options: Any) -> t
         size: Width and height [inch].
         **options: As `Figure.subplots` takes them.
     """
-    figure = Figure(figsize=size, layout="constrained", facecolor="white")
-    FigureCanvasAgg(figure)
-    axes = figure.subplots(rows, columns, squeeze=False, **options)
+    figure, axes = new_figure(rows, columns, size, **options)
+    figure.set_facecolor("white")
     for axis in axes.flat:
-        plain(axis)
+        axis.set_axisbelow(True)
     return figure, axes
-
-
-def plain(axes: Axes) -> None:
-    """A light grid below the data, no frame above and on the right."""
-    axes.grid(True, color="0.9", linewidth=0.6)
-    axes.set_axisbelow(True)
-    axes.spines[["top", "right"]].set_visible(False)
 
 
 def save(figure: Figure, path: pathlib.Path) -> None:

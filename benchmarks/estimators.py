@@ -199,13 +199,20 @@ class Score(NamedTuple):
     silent: float
 
 
+def is_off(
+    relative: Float[np.ndarray, "*draw element"], bound: Float[np.ndarray, " element"]
+) -> Bool[np.ndarray, "*draw element"]:
+    """Whether relative errors, without sign, are wrong: far by the bound, or far in per cent."""
+    return np.asarray((relative > FAR * bound) | (relative > OFF))
+
+
 def score(draws: Draws, result: Result) -> Score:
     """Compare answers with the truth."""
     relative = np.abs(result.elements / draws.truth - 1)
     answered = np.asarray(np.isfinite(relative).all(1))
     in_bounds = relative / draws.bound
     each = np.where(answered, np.sqrt(np.mean(in_bounds**2, axis=1)), np.inf)
-    off = np.asarray((in_bounds > FAR) | (relative > OFF))
+    off = is_off(relative, draws.bound)
     wrong = answered & np.any(off, axis=1)
     covered = relative <= FAR * np.nan_to_num(result.stderr / draws.truth)
     silent = answered & result.successful & np.any(off & ~covered, axis=1)

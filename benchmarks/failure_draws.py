@@ -25,7 +25,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 import etid
-from benchmarks.estimators import DEFAULT, FAR, OFF, driver_of, shared
+from benchmarks.estimators import DEFAULT, FAR, driver_of, is_off, shared
 from benchmarks.failure_axes import Cell, Cole, TwoLayers
 from benchmarks.mappings import make_room
 from etid.circuits import SkinRC
@@ -97,8 +97,8 @@ class Answer:
     @property
     def wrong_elements(self) -> Bool[np.ndarray, " element"]:
         """More than five sd of the bound or 20 % off."""
-        off = np.abs(self.error)
-        return ((off > FAR * self.bound) & self.exact) | (off > OFF)
+        bound = self.bound if self.exact else np.full_like(self.bound, np.inf)
+        return is_off(np.abs(self.error), bound)
 
     @property
     def silent_elements(self) -> Bool[np.ndarray, " element"]:

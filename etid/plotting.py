@@ -38,9 +38,17 @@ class HasResponse(Protocol):
         ...
 
 
-def _figure(
+def new_figure(
     rows: int, columns: int, size: tuple[float, float], **options: Any
 ) -> tuple[Figure, Any]:
+    """A figure that belongs to no global state, with a light grid, and its axes [row, column].
+
+    Args:
+        rows: Of axes.
+        columns: Of axes.
+        size: Width and height [inch].
+        **options: As `Figure.subplots` takes them.
+    """
     figure = Figure(figsize=size, layout="constrained")
     FigureCanvasAgg(figure)
     axes = figure.subplots(rows, columns, squeeze=False, **options)
@@ -64,7 +72,7 @@ def pulse(recording: Recording) -> slice:
 
 def plot_recording(recording: Recording) -> Figure:
     """Unloaded and loaded voltage: the whole record, and one pulse."""
-    figure, axes = _figure(1, 2, (9.0, 3.0))
+    figure, axes = new_figure(1, 2, (9.0, 3.0))
     milliseconds = 1e3 * recording.time
     for axis, part in ((axes[0, 0], slice(None)), (axes[0, 1], pulse(recording))):
         axis.plot(milliseconds[part], recording.v_th[part], color=INK, lw=0.9, label="V_th")
@@ -95,7 +103,9 @@ def plot_fit(
         raise ValueError(
             f"predicted has shape {predicted.shape}, the recording {recording.v_out.shape}"
         )
-    figure, axes = _figure(2, 1, (6.0, 4.5), sharex=True, gridspec_kw={"height_ratios": [3, 1.2]})
+    figure, axes = new_figure(
+        2, 1, (6.0, 4.5), sharex=True, gridspec_kw={"height_ratios": [3, 1.2]}
+    )
     draw_fit(axes[0, 0], axes[1, 0], recording, predicted)
     figure.suptitle(title or recording.path)
     return figure
@@ -146,7 +156,7 @@ def plot_impedance(
         stderr: Standard error of the magnitude [Ω] at `bode_frequencies(lowest, highest)`, by
             label; a band of two of them is drawn.
     """
-    figure, axes = _figure(2, 1, (6.0, 5.0), sharex=True)
+    figure, axes = new_figure(2, 1, (6.0, 5.0), sharex=True)
     magnitude, phase = axes[:, 0]
     frequency = bode_frequencies(lowest, highest)
     for i, (label, impedance) in enumerate(impedances.items()):
@@ -175,7 +185,7 @@ def bode_frequencies(
 def plot_elements(fits: Fits) -> Figure:
     """Elements of all fits by subject, with standard errors; what did not succeed is hollow."""
     units = fits.circuit.units()
-    figure, axes = _figure(len(units), 1, (7.5, 2.3 * len(units)), sharex=True)
+    figure, axes = new_figure(len(units), 1, (7.5, 2.3 * len(units)), sharex=True)
     good = fits.verdicts == "successful"
     subjects = sorted(set(fits.labels["subject"].tolist()))
     conditions = sorted(set(fits.labels["condition"].tolist()))
