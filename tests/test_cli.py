@@ -10,6 +10,7 @@ import pytest
 
 import etid
 from etid import cli
+from etid.commands import fit
 
 DONE, WRONG_DATA, WRONG_USAGE = 0, 1, 2
 
@@ -141,7 +142,7 @@ def test_fit_joint_fits_all_recordings_together(run, study_file, tmp_path, monke
         asked.update(options)
         return etid.identify_study(study, method="equation_error")
 
-    monkeypatch.setattr(etid, "identify_jointly", jointly)
+    monkeypatch.setattr(fit, "identify_jointly", jointly)
     status, printed, _ = run("fit", study_file, "-o", tmp_path / "f.h5", "--joint", "--order", 4)
     assert asked["order"] == 4
     assert len(printed) > 1

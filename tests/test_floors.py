@@ -68,10 +68,20 @@ FLOORS = {
     "experiments": 13,
     "report": 13,
     "demo": 14,
-    "cli": 15,
-    "__main__": 16,
-    "__init__": 16,
+    "commands": 14,
+    "commands.check": 15,
+    "commands.fit": 15,
+    "commands.importing": 15,
+    "commands.simulate": 15,
+    "cli": 16,
+    "__main__": 17,
+    "__init__": 17,
 }
+
+
+def module_of(path):
+    parts = path.relative_to(PACKAGE).with_suffix("").parts
+    return ".".join(parts[:-1] if len(parts) > 1 and parts[-1] == "__init__" else parts)
 
 
 def imports_of(path):
@@ -79,7 +89,9 @@ def imports_of(path):
         if isinstance(node, ast.ImportFrom) and node.module == "etid":
             yield from (alias.name for alias in node.names)
         elif isinstance(node, ast.ImportFrom) and node.module and node.module.startswith("etid."):
-            yield node.module.removeprefix("etid.")
+            package = node.module.removeprefix("etid.")
+            names = [f"{package}.{alias.name}" for alias in node.names]
+            yield from ((name if name in FLOORS else package) for name in names)
         elif isinstance(node, ast.Import):
             yield from (
                 alias.name.removeprefix("etid.")
@@ -88,14 +100,15 @@ def imports_of(path):
             )
 
 
-@pytest.mark.parametrize("path", sorted(PACKAGE.glob("*.py")), ids=lambda path: path.stem)
+@pytest.mark.parametrize("path", sorted(PACKAGE.rglob("*.py")), ids=module_of)
 def test_imports_go_down(path):
-    assert path.stem in FLOORS, f"give {path.name} a floor"
+    module = module_of(path)
+    assert module in FLOORS, f"give {module} a floor"
     for name in imports_of(path):
         if name == "__version__":
             continue
-        assert name in FLOORS, f"{path.name} imports {name}, which is no module of etid"
-        assert FLOORS[name] < FLOORS[path.stem], f"{path.name} imports {name} from above"
+        assert name in FLOORS, f"{module} imports {name}, which is no module of etid"
+        assert FLOORS[name] < FLOORS[module], f"{module} imports {name} from above"
 
 
 def run(code, **environment):

@@ -1,0 +1,144 @@
+"""Identify drivers and loads of a whole file."""
+
+import argparse
+import concurrent.futures
+import contextlib
+import math
+import pathlib
+import sys
+from collections.abc import Iterator
+
+import numpy as np
+
+from etid import hdf5
+from etid.batch import StudyFits
+from etid.circuits import DISPLAY
+from etid.commands import DONE, WRONG_DATA
+from etid.joint import identify_jointly
+from etid.methods import METHODS
+from etid.report import Table
+from etid.streaming import fit_file, processes
+
+_SHOWN = 20  # recordings without success that are listed one by one
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Files, method, and where to compute."""
+    parser.add_argument("source", type=pathlib.Path, metavar="FILE")
+    parser.add_argument("-o", dest="target", type=pathlib.Path, required=True, metavar="FITS")
+    parser.add_argument(
+        "--method",
+        choices=METHODS,
+        help="default maximum_likelihood where the record allows it, else output_error",
+    )
+    parser.add_argument("--order", type=int, default=5, help="poles of the driver, default 5")
+    parser.add_argument(
+        "--joint",
+        action="store_true",
+        help="one fit for all recordings of a driver, by maximum likelihood",
+    )
+    parser.add_argument(
+        "--resume", action="store_true", help="go on where a run that was killed has stopped"
+    )
+    where = parser.add_mutually_exclusive_group()
+    where.add_argument(
+        "--workers", type=int, metavar="N", help="processes of this machine, a core each"
+    )
+    where.add_argument(
+        "--dask", metavar="ADDRESS", help="scheduler of a cluster that sees the file (etid[dask])"
+    )
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Identify, write the fits and print what they came to."""
+    if not arguments.target.absolute().parent.is_dir():  # known before hours of fitting
+        raise ValueError(f"{arguments.target}: there is no folder to write it to")
+    if arguments.joint and arguments.method not in (None, "maximum_likelihood"):
+        raise ValueError(f"--joint is by maximum likelihood, not by {arguments.method}")
+    progress = sys.stderr.isatty()
+    if arguments.joint:
+        if arguments.resume or arguments.workers or arguments.dask:
+            raise ValueError("--joint is one fit: it has no --resume, --workers or --dask")
+        with hdf5.read(arguments.source) as study:
+            outcome = identify_jointly(study, order=arguments.order, progress=progress)
+        outcome.fits.write(arguments.target)
+    else:
+        with _executor(arguments) as executor:
+            outcome = fit_file(
+                arguments.source,
+                arguments.target,
+                order=arguments.order,
+                method=arguments.method,
+                resume=arguments.resume,
+                executor=executor,
+                progress=progress,
+            )
+    print(_summary(outcome))
+    return DONE if "successful" in outcome.fits.counts() else WRONG_DATA
+
+
+@contextlib.contextmanager
+def _executor(arguments: argparse.Namespace) -> Iterator[concurrent.futures.Executor | None]:
+    if arguments.dask:
+        try:
+            import distributed
+        except ImportError as error:
+            raise ValueError("--dask needs distributed: pip install 'etid[dask]'") from error
+        with distributed.Client(arguments.dask) as client:
+            yield client.get_executor()
+    elif arguments.workers:
+        with processes(arguments.workers) as executor:
+            yield executor
+    else:
+        yield None
+
+
+def _summary(outcome: StudyFits) -> str:
+    """What a batch came to: verdicts, drivers, medians, and what went wrong where."""
+    fits = outcome.fits
+    verdicts = ", ".join(f"{count} {name}" for name, count in fits.counts().items())
+    lines = [f"{len(fits)} recordings by {fits.fit.method}: {verdicts}"]
+    for paths, driver in outcome.drivers.items():
+        text = (
+            f"order {driver.order}, {driver.verdict}, "
+            f"RRSE {100 * float(driver.rrse):.3g} %, chi2 {float(driver.chi2):.3g}"
+        )
+        lines.append(f"driver {', '.join(paths)}: {text}")
+    lines += [f"driver {', '.join(paths)}: {text}" for paths, text in outcome.failures.items()]
+    if "successful" in fits.counts():
+        lines += [
+            "",
+            "medians of the successful fits (spread between recordings; median standard error)",
+            str(_medians(outcome)),
+        ]
+    failed = np.flatnonzero(fits.verdicts != "successful")
+    wrong = [f"{fits.labels['path'][i]}: {fits.verdicts[i]}. {fits.notes[i]}" for i in failed]
+    if wrong:
+        lines += ["", f"without success: {len(wrong)} recordings"]
+        lines += [" ".join(line.split()) for line in wrong[:_SHOWN]]
+    if len(wrong) > _SHOWN:
+        lines.append(f"and {len(wrong) - _SHOWN} more; the file of fits has a note for each fit")
+    return "\n".join(lines)
+
+
+def _medians(outcome: StudyFits) -> Table:
+    units = outcome.fits.circuit.units()
+    rows = []
+    for group in outcome.fits.summary("subject", "condition"):
+        if not (group["subject"] or group["condition"] or group["successful"]):
+            continue  # what could not be read has no labels
+        row = [group["subject"], group["condition"], f"{group['successful']}/{group['fits']}"]
+        for name, unit in units.items():
+            numbers = (
+                group[key] / DISPLAY[unit][0] for key in (name, f"{name}_spread", f"{name}_stderr")
+            )
+            row.append(_cell(*numbers) if group["successful"] else "")
+        rows.append(tuple(row))
+    heads = tuple(f"{name} [{DISPLAY[unit][1]}]" for name, unit in units.items())
+    return Table(("subject", "condition", "fits", *heads), tuple(rows))
+
+
+def _cell(value: float, spread: float, error: float) -> str:
+    """Three numbers in one unit, to two digits of the standard error."""
+    digits = max(0, 1 - math.floor(math.log10(error))) if 0 < error < math.inf else 3
+    return f"{value:.{digits}f} ({spread:.{digits}f}; {error:.{digits}f})"
