@@ -12,6 +12,7 @@ from etid import (
     given_driver,
     harmonic_steiglitz_mcbride,
     maximum_likelihood,
+    missing_pole,
     non_parametric,
     output_error,
     prediction,
@@ -243,7 +244,7 @@ def driver_by_refinement(
             return maximum_likelihood.fit_source(spectra, r_load, m.sample_rate[0], start)
 
     # One start after the other: side by side they would all run as long as the slowest, and slower.
-    sources, estimates, calibrations = jax.lax.map(fit, starts)
+    sources, estimates, known = jax.lax.map(fit, starts)
     frequency = jnp.asarray(BAND) * m.sample_rate[0]
 
     def resistance(source, cov):
@@ -263,8 +264,12 @@ def driver_by_refinement(
     cost = cost + jnp.where(settled, 0.0, UNWANTED) + jnp.where(passive, 0.0, UNWANTED)
     chosen = jnp.argmin(jnp.where(finite, cost, jnp.inf))
     source, estimate, calibration = jax.tree.map(
-        lambda leaf: leaf[chosen], (sources, estimates, calibrations)
+        lambda leaf: leaf[chosen], (sources, estimates, known)
     )
+    lacks = jnp.array(False)
+    if spectra is not None:
+        calibrations = maximum_likelihood.Calibrations(source, calibration, m.sample_rate[0])
+        lacks = missing_pole.is_seen(calibrations)
     return Driver(
         b=baseline.b,
         a=baseline.a,
@@ -279,6 +284,7 @@ def driver_by_refinement(
             (~passive[chosen], RESULTS.nonphysical),
             (~settled[chosen], MAX_STEPS_REACHED),
             (misses(estimate.chi2, estimate.rrse) | too_late(estimate), RESULTS.misfit),
+            (lacks, RESULTS.order_too_low),
         ),
         steps=estimate.steps,
         method="output_error" if spectra is None else "maximum_likelihood",

@@ -35,6 +35,10 @@ class RESULTS(optx.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]  # equi
         "relaxation that is spread over time constants. The circuit is wrong, the trigger moved "
         "between the records, or the signal drifted or clipped."
     )
+    order_too_low = (
+        "The calibrations show a pole of the source impedance that the driver lacks. Raise `order` "
+        "by one or two."
+    )
     inconsistent = (
         "The recording and the calibrations contradict each other about the source impedance. "
         "The driver changed in between, or r_load is not what it is said to be."

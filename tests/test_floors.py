@@ -51,6 +51,7 @@ FLOORS = {
     "non_parametric": 6,
     "baseline": 7,
     "given_driver": 7,
+    "missing_pole": 7,
     "single_load": 8,
     "estimation": 9,
     "lanes": 10,

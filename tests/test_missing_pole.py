@@ -1,0 +1,67 @@
+"""The order of a driver: a pole that is missing shows where chi2 does not, and none is invented."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import etid
+from benchmarks.failure_axes import transformer
+from benchmarks.ladder import CALIBRATION, TRIAL, rung
+from etid import missing_pole
+from etid.driver import SourceImpedance
+from etid.estimation import calibrations_of
+
+
+def source(gain, slope, omega, zeta):
+    one = jnp.ones(1)
+    of = (jnp.log(500.0), jnp.log(omega * one), jnp.log(zeta * one), gain * one, slope * one)
+    return SourceImpedance(*of, jnp.log(2e3 * one), -4e3 * one)
+
+
+def test_sections_are_what_a_source_would_have_more():
+    f = jnp.geomspace(60.0, 1e5, 40)
+    found = missing_pole.sections(f, f[0], f[-1])
+    assert found.shape == (missing_pole.GRID * len(missing_pole.DAMPINGS), 2, f.size)
+    without = source(0.0, 0.0, 1.0, 1.0).response(f)
+    omegas = 2 * np.pi * np.geomspace(20.0, 3e5, missing_pole.GRID)
+    for number in (0, 40, 107):
+        zeta, omega = divmod(number, missing_pole.GRID)
+        of = omegas[omega], missing_pole.DAMPINGS[zeta]
+        for which, gains in enumerate([(1.0, 0.0), (0.0, 1.0)]):
+            expected = source(*gains, *of).response(f) - without
+            # Rounding of 4 kohm against 1 ohm.
+            np.testing.assert_allclose(found[number, which], expected, rtol=1e-9, atol=1e-11)
+
+
+@pytest.fixture(scope="module")
+def identified():
+    """Studies behind a transformer of so many poles, and their driver of a given order."""
+
+    def identified(true, given, seed):
+        study = rung("dry", driver=transformer(true)).simulate(seed)
+        driver = etid.identify_driver(study[CALIBRATION], order=given, throw=False)
+        return study, driver
+
+    return identified
+
+
+def test_a_driver_of_too_low_an_order_says_so_and_its_skins_do(identified):
+    """Where R_s was off by ten standard errors and called successful."""
+    study, driver = identified(6, 3, seed=1)
+    assert float(driver.chi2) < 1.2  # which shows nothing
+    assert driver.verdict == "order_too_low"
+    assert etid.identify_skin(study[TRIAL], driver, throw=False).verdict == "driver_failed"
+    with pytest.raises(etid.IdentificationError, match="Raise `order`"):
+        etid.identify_driver(study[CALIBRATION], order=3)
+
+
+def test_an_order_that_is_high_enough_shows_noise_only(identified):
+    """Squares of two degrees of freedom: mean 2. Neighbouring sections are alike: of 108 some ten
+    tell something of their own, so that the mean over eight draws is known to 0.22."""
+    squares = []
+    for seed in range(8):
+        _, driver = identified(5, 5, seed)
+        assert driver.verdict == "successful"
+        squares.append(np.asarray(missing_pole.squares(calibrations_of(driver))))
+    assert np.nanmax(squares) < missing_pole.SEEN
+    assert abs(np.nanmean(squares) - 2) < 5 * 0.22
