@@ -1,12 +1,10 @@
 """Refinement: samples or harmonics in, judged estimate out; for one recording and for a batch."""
 
-import dataclasses
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Array, Bool, Complex, Float, Int
+from jaxtyping import Array, Complex, Float, Int
 
 from etid import (
     given_driver,
@@ -23,7 +21,7 @@ from etid.baseline import driver_by_steiglitz_mcbride, skin_by_steiglitz_mcbride
 from etid.circuits import AbstractCircuit, SkinRC
 from etid.driver import Driver, SourceImpedance
 from etid.given_driver import GivenDriver
-from etid.judging import MAX_STEPS_REACHED, SUCCESSFUL, judged, misses, too_late
+from etid.judging import MAX_STEPS_REACHED, SUCCESSFUL, judged, misses, too_late, unless
 from etid.measurement import Measurement
 from etid.results import Fit
 from etid.spectra import Spectrum
@@ -143,13 +141,7 @@ def skin_by_maximum_likelihood(
     )
     estimate, far, other = single_load.fit_circuit(known, circuit, spectrum, sample_rate, starts)
     fit = judged(estimate, circuit, driver.result, "maximum_likelihood")
-    return _unless(_unless(fit, far, RESULTS.driver_unclear), other, RESULTS.misfit)
-
-
-def _unless(fit: Fit, bad: Bool[Array, ""], result: RESULTS) -> Fit:
-    """The same with another verdict, if it would be successful and should not."""
-    wrong = bad & (fit.result == SUCCESSFUL)
-    return dataclasses.replace(fit, result=RESULTS.where(wrong, result, fit.result))
+    return unless(unless(fit, far, RESULTS.driver_unclear), other, RESULTS.misfit)
 
 
 def skin_by_non_parametric(
@@ -166,7 +158,7 @@ def skin_by_non_parametric(
     # It needs the harmonics of the driver, whether or not a model of them was found.
     fit = judged(estimate, circuit, SUCCESSFUL, "non_parametric")
     far = jnp.any(jnp.abs(bias) > CORRECTED * jnp.sqrt(jnp.diagonal(estimate.cov)))
-    return _unless(fit, far, RESULTS.biased)
+    return unless(fit, far, RESULTS.biased)
 
 
 def source_starts(

@@ -77,16 +77,18 @@ def _together(
     driver: Driver,
     tolerance: Array,
 ) -> tuple[list[Fit], Driver]:
-    common, cov, estimates = shared_driver.fit(model, groups, several)
+    common, cov, found = shared_driver.fit(model, groups, several)
     # All impedances are measured in units of the known resistor.
     sign = [1.0 if unit == "ohm" else -1.0 for unit in model.circuit.units().values()]
     scale = tolerance**2 * jnp.outer(jnp.array(sign), jnp.array(sign))
 
-    def fit(estimate):
+    def fit(found):
+        estimate, other = found
         with_scale = dataclasses.replace(
             estimate, cov=estimate.cov + scale, shared_cov=estimate.shared_cov + scale
         )
-        return judging.judged(with_scale, model.circuit, driver.result, METHOD)
+        fit = judging.judged(with_scale, model.circuit, driver.result, METHOD)
+        return judging.unless(fit, other, RESULTS.misfit)
 
     split = model.calibrations.sources
     better = eqx.tree_at(
@@ -97,11 +99,11 @@ def _together(
             cov[:split, :split],
             common[split:],
             RESULTS.where(
-                estimates[0].strain[0] > judging.STRAINED, RESULTS.inconsistent, driver.result
+                found[0][0].strain[0] > judging.STRAINED, RESULTS.inconsistent, driver.result
             ),
         ),
     )
-    return [jax.vmap(fit)(estimate) for estimate in estimates], better
+    return [jax.vmap(fit)(of_group) for of_group in found], better
 
 
 class _Waiting:

@@ -5,6 +5,8 @@ then elements that are no circuit, then a solver that did not settle, then a mod
 data, then parameters that the data do not determine.
 """
 
+import dataclasses
+
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
@@ -70,3 +72,9 @@ def judged(
         steps=estimate.steps,
         method=method,
     )
+
+
+def unless(fit: Fit, bad: Bool[Array, ""], result: RESULTS) -> Fit:
+    """The same with another verdict, if it would be successful and should not."""
+    wrong = bad & (fit.result == SUCCESSFUL)
+    return dataclasses.replace(fit, result=RESULTS.where(wrong, result, fit.result))

@@ -11,7 +11,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import optimistix as optx
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from etid.arrowhead import Arrowhead, ArrowheadEquations, EliminationDescent, join
 from etid.given_driver import GivenDriver, around
@@ -123,7 +123,11 @@ def _second_order(_, y, step, study: DriverStudy) -> Float[Array, " parameter"]:
 
 def fit(
     model: Joint, groups: list[Loads], several: Sequence[int]
-) -> tuple[Float[Array, " common"], Float[Array, "common common"], list[Estimate]]:
+) -> tuple[
+    Float[Array, " common"],
+    Float[Array, "common common"],
+    list[tuple[Estimate, Bool[Array, " load"]]],
+]:
     """Identify all loads and their driver.
 
     Args:
@@ -132,9 +136,10 @@ def fit(
         several: In each group, how many unloaded records several loads have.
 
     Returns:
-        Common parameters, their covariance, and the estimates of each group, stacked. In them
-        `shared_cov` is what the uncertainty of `common`, and the noise of an unloaded record that
-        is not the load's alone, add: it is the same in every load.
+        Common parameters, their covariance, and the estimates of each group, stacked, with whether
+        each load is seen to be another circuit. In them `shared_cov` is what the uncertainty of
+        `common`, and the noise of an unloaded record that is not the load's alone, add: it is the
+        same in every load.
     """
     study = DriverStudy(model, groups)
     # The sum of squares grows with the number of loads, what can be seen in it does not.

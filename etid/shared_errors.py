@@ -16,13 +16,15 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import optimistix as optx
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
+from etid import dispersion
 from etid.information import Curvature, eliminate, inverse
-from etid.likelihood import denoised, excess, residuals, variance, weights
+from etid.likelihood import denoised, excess, residual, residuals, variance, weights
 from etid.output_error import Estimate
 from etid.results import complex_rrse
 from etid.shared_terms import DriverStudy, Loads, over
+from etid.transfer import reciprocal
 
 
 class _Eliminated(eqx.Module):
@@ -67,8 +69,10 @@ def estimates(
     fitted: Sequence[tuple[Float[Array, "load own"], optx.RESULTS]],
     several: Sequence[int],
     solution: optx.Solution,
-) -> tuple[Float[Array, "common common"], list[Estimate]]:
-    """Covariance of `common`, and the estimates of each group with theirs.
+) -> tuple[Float[Array, "common common"], list[tuple[Estimate, Bool[Array, " load"]]]]:
+    """Covariance of `common`, and of each group the estimates with theirs.
+
+    And whether a load is seen to be another circuit (`etid.dispersion`).
 
     Args:
         study: Calibrations and loads.
@@ -116,7 +120,7 @@ def estimates(
                 shared = shared + by_x + cross + cross.T
                 private = private - by_x
             whole = private + shared
-            return Estimate(
+            estimate = Estimate(
                 own[:-1],
                 own[None, -1:],
                 whole[:-1, :-1],
@@ -127,6 +131,7 @@ def estimates(
                 shared[:-1, :-1],
                 strain,
             )
+            return estimate, _is_another(study, load, common, own, eliminated, bread, total.score)
 
         judged.append(over(one, loads, own, eliminated, results))
     return cov, judged
@@ -138,6 +143,48 @@ def _misfit(study: DriverStudy, load: Loads, common, own):
     freedom = 2 * jnp.sum(load.spectrum.selected, dtype=own.dtype) - own.shape[0]
     g = study.model.gain(own, common, load.spectrum, load.sample_rate)
     return squares / freedom, complex_rrse(g * load.spectrum.x, load.spectrum.y)
+
+
+def _is_another(
+    study: DriverStudy, load: Loads, common, own, eliminated: _Eliminated, bread, score
+) -> Bool[Array, ""]:
+    """The score test on one load; `bread` and `score` are those of `common` by all terms."""
+    jacobian, share = _jacobian(study, load, common, own)
+    row = _by_dispersion(study, load, common, own)
+    terms = study.of_load(load, common, own)
+    noise = excess(terms[:-1], load.spectrum.selected)
+    slope = eliminated.slope
+    covariance = jnp.block(
+        [
+            [bread, bread @ slope.T],
+            [slope @ bread, eliminated.bread + slope @ bread @ slope.T],
+        ]
+    )
+    spread = jnp.zeros_like(covariance).at[: bread.shape[0], : bread.shape[0]]
+    found = dispersion.is_seen(
+        jnp.pad(row, (0, 1)),  # no phase has an effect on the prior of the delay
+        jacobian.T,
+        terms,
+        -jacobian.T @ terms,  # at the minimum all other terms have the opposite gradient
+        spread.set(score - eliminated.rest.score),
+        covariance,
+        weights([share], terms.size),
+        weights([noise], terms.size),
+    )
+    return found & load.used  # what takes no part has a verdict of its own
+
+
+def _by_dispersion(study: DriverStudy, load: Loads, common, own) -> Float[Array, " part"]:
+    """Derivative of a load's denoised terms by α."""
+    model, f = study.model, load.spectrum.frequency
+    g = model.gain(own, common, load.spectrum, load.sample_rate)
+    z, slope = dispersion.slope(model.circuit.with_log_values(own[:-1]).impedance(), f)
+    z_th = model.calibrations.z_th(common).response(f)
+    of_gain = g * z_th * slope * reciprocal(z * (z + z_th))
+    gains = [*model.calibrations.gains(common), g]
+    (*known, spectrum), _ = denoised([*model.calibrations.records, load.spectrum], gains)
+    informed = model.informed(spectrum, common, known)
+    return jax.jvp(lambda g: residual(informed, g), (g,), (of_gain,))[1]
 
 
 def _jacobian(study: DriverStudy, load: Loads, common, own):

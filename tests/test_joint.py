@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 import etid
+from benchmarks.failure_axes import Cole
 from etid.scenes import Scene, Trial
 from etid.study import Study
 from etid.transformer import ResistorLoad, SkinLoad, TransformerDriver
@@ -52,6 +53,19 @@ def test_every_recording_has_its_verdict_and_a_bad_one_costs_itself_alone(study,
     assert verdicts["broken"] == "nonfinite_samples"
     assert set(verdicts) == set(study.loaded)
     assert outcome.fits.fit.method == "joint"
+
+
+def test_another_skin_is_a_misfit_where_chi2_does_not_show_it():
+    """R_s would be wrong by more than five of its standard errors and called successful."""
+    odd = Trial("odd", Cole(DRY, alpha=0.9), condition="odd")
+    study = Scene((*TRIALS, odd), KNOWN, snr_db=40.0, trigger_jitter_rms=50e-9).simulate(seed=4)
+    fits = etid.identify_jointly(study).fits
+    another = fits.where(path="odd")
+    assert another.counts() == {"misfit": 1}
+    assert another.fit.chi2.item() < 1.5
+    error = another.circuit.r_s.item() - DRY.r_s
+    assert abs(error) > SIGMAS * another.stderr.r_s.item()
+    assert fits.where(condition="dry").counts() == {"successful": len(TRIALS)}
 
 
 def test_elements_are_within_their_errors_and_spread_by_their_own_part(outcome):
