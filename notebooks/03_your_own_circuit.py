@@ -104,6 +104,10 @@ print(layers)
 spread = etid.identify_skin(study["Cole"], driver, circuit=SkinCole())
 print(spread)
 
+# %% [markdown]
+# What rings in the residual at the edges lies near half the sample rate, where the recording holds
+# what has aliased; the fit itself leaves that out.
+
 # %%
 plotting.plot_fit(study["Cole"], etid.predict(study["Cole"], driver, spread.circuit))
 

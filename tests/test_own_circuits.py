@@ -65,6 +65,21 @@ def test_elements_are_found_from_typical_values_nearly_as_well_as_possible(study
     assert (stderr < EFFICIENT * smallest).all()
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("path", ["layers", "spread"])
+def test_intervals_hold_the_truth_as_often_as_they_say(path):
+    """A calibration for each of 100 draws, so that all are independent."""
+    truth, draws = TRIALS[path], 100
+    inside = []
+    for seed in range(draws):
+        drawn = scene().simulate(1000 + seed)
+        known = etid.identify_driver(drawn[CALIBRATION])
+        fit = etid.identify_skin(drawn[path], known, circuit=type(truth)())
+        error = np.asarray(fit.circuit.values() - truth.values())
+        inside.append(np.abs(error) < 1.96 * np.asarray(fit.stderr.values()))
+    assert (np.abs(np.mean(inside, 0) - 0.95) < 3 * np.sqrt(0.95 * 0.05 / draws)).all()
+
+
 def test_simulated_loads_and_their_truth_are_those_of_the_circuit(study):
     assert scene().truth()["spread"] == pytest.approx(
         {"r_s": 33.4e3, "r_p": 186e3, "tau": 22e-6, "alpha": 0.85}, rel=1e-15
