@@ -1,8 +1,8 @@
-"""Circuits: elements, series and parallel connection, the skin, and the driver.
+"""Circuits: named elements with units and typical values, and the skin.
 
 A circuit is a frozen module with named parameters and one method, `impedance()`, built from
-`resistor`, `capacitor`, `series` and `parallel`. Everything else (filter, fit, covariance, printing
-with units) follows from these lines.
+`resistor`, `capacitor`, `constant_phase`, `cole`, `series` and `parallel`. Everything else (filter,
+fit, covariance, printing with units, netlist) follows from these lines.
 """
 
 import abc
@@ -10,25 +10,52 @@ import dataclasses
 from typing import Any, TypeVar
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
-import numpy as np
-from jaxtyping import Array, Complex, Float
+from jaxtyping import Array, Bool, Complex, Float
 
-from etid.transfer import Rational, frequency_variable
+from etid.elements import (
+    AbstractImpedance,
+    Farad,
+    Ohm,
+    capacitor,
+    exponents,
+    parallel,
+    resistor,
+    series,
+)
+from etid.transfer import frequency_variable
 
-# What a parameter may hold: one value, or a batch of them.
-Quantity = Float[Array, "..."] | Float[np.ndarray, "..."] | float
-Ohm = Quantity
-Farad = Quantity
 Circuit = TypeVar("Circuit", bound="AbstractCircuit")
-DISPLAY = {"ohm": (1e3, "kΩ"), "farad": (1e-9, "nF")}  # scaled units exist only in print
+# Scaled units exist only in print.
+DISPLAY = {
+    "ohm": (1e3, "kΩ"),
+    "farad": (1e-9, "nF"),
+    "second": (1e-6, "µs"),
+    "siemens second^alpha": (1e-9, "nS·s^α"),
+    "1": (1.0, ""),
+}
+
+
+# Powers with which a parameter goes with the impedance and with the time scale of its circuit.
+SCALING = {
+    "ohm": (1.0, 0.0),
+    "farad": (-1.0, 1.0),
+    "second": (0.0, 1.0),
+    "siemens second^alpha": (-1.0, 0.8),  # of a common α; only starts of a fit are made with it
+    "1": (0.0, 0.0),
+}
+# Standard errors by which an exponent may exceed 1: of a relaxation of one time constant it does so
+# by chance, in every second fit by less than one, in one of 30 000 by more than four.
+ABOVE_ONE = 4.0
 
 
 def parameter(unit: str, *, typical: float) -> Any:
     """Declare a positive circuit parameter.
 
     Args:
-        unit: `"ohm"` or `"farad"`.
+        unit: `"ohm"`, `"farad"`, `"second"`, `"siemens second^alpha"` for the Q of a constant-phase
+            element, or `"1"` for its exponent.
         typical: Magnitude to expect, in SI; a fit may start there.
     """
     if unit not in DISPLAY:
@@ -38,36 +65,12 @@ def parameter(unit: str, *, typical: float) -> Any:
     )
 
 
-def resistor(r: Ohm) -> Rational:
-    """Impedance of a resistor, Z = R [Ω]."""
-    return Rational(jnp.stack([jnp.asarray(r)]), jnp.ones(1))
-
-
-def capacitor(c: Farad) -> Rational:
-    """Impedance of a capacitor, Z = 1 / (s C) [Ω]."""
-    c = jnp.asarray(c)
-    return Rational(jnp.ones(1), jnp.stack([jnp.zeros_like(c), c]))
-
-
-def series(*impedances: Rational) -> Rational:
-    """Series connection, Z = Z₁ + Z₂ + …."""
-    total = impedances[0]
-    for z in impedances[1:]:
-        total = total.add(z)
-    return total
-
-
-def parallel(*impedances: Rational) -> Rational:
-    """Parallel connection, 1/Z = 1/Z₁ + 1/Z₂ + …."""
-    return series(*(z.reciprocal() for z in impedances)).reciprocal()
-
-
 class AbstractCircuit(eqx.Module):
     """A passive two-terminal circuit with positive parameters."""
 
     @abc.abstractmethod
-    def impedance(self) -> Rational:
-        """Impedance [Ω] as a rational function of s [rad/s]."""
+    def impedance(self) -> AbstractImpedance:
+        """Impedance [Ω] as a function of s [rad/s], built from elements."""
 
     @classmethod
     def names(cls) -> tuple[str, ...]:
@@ -78,6 +81,11 @@ class AbstractCircuit(eqx.Module):
     def units(cls) -> dict[str, str]:
         """Unit of each parameter."""
         return {f.name: f.metadata["unit"] for f in dataclasses.fields(cls)}
+
+    @classmethod
+    def scaling(cls) -> Float[Array, "2 parameter"]:
+        """Powers with which each parameter goes with the impedance and with the time scale."""
+        return jnp.array([SCALING[unit] for unit in cls.units().values()]).T
 
     def response(self, frequency: Float[Array, "..."]) -> Complex[Array, "..."]:
         """Impedance [Ω] at real frequencies [Hz]."""
@@ -96,6 +104,30 @@ class AbstractCircuit(eqx.Module):
         values = jnp.exp(log_values)
         return type(self)(**{name: values[..., i] for i, name in enumerate(self.names())})
 
+    @property
+    def is_rational(self) -> bool:
+        """Whether the impedance is a ratio of polynomials: there is no constant-phase element."""
+        return not exponents(self.impedance())
+
+    def is_too_steep(self, cov: Float[Array, "parameter parameter"]) -> Bool[Array, ""]:
+        """Whether an exponent α exceeds 1 by more than its standard error explains.
+
+        No passive element is steeper than a capacitor.
+
+        Args:
+            cov: Covariance of `log_values`.
+        """
+
+        def alphas(log_values):
+            found = exponents(self.with_log_values(log_values).impedance())
+            return jnp.stack([jnp.asarray(alpha) for alpha in found])
+
+        if self.is_rational:
+            return jnp.array(False)
+        slope = jax.jacfwd(alphas)(self.log_values())
+        error = jnp.sqrt(jnp.diagonal(slope @ cov @ slope.T))
+        return jnp.any(alphas(self.log_values()) - 1 > ABOVE_ONE * error)
+
 
 class SkinRC(AbstractCircuit):
     """Skin as a series resistor and one relaxation, Z = R_s + R_p / (1 + s R_p C_p) (paper, eq. 7).
@@ -107,7 +139,7 @@ class SkinRC(AbstractCircuit):
     r_p: Ohm = parameter("ohm", typical=100e3)
     c_p: Farad = parameter("farad", typical=0.3e-9)
 
-    def impedance(self) -> Rational:
+    def impedance(self) -> AbstractImpedance:
         """Impedance of eq. 7."""
         return series(resistor(self.r_s), parallel(resistor(self.r_p), capacitor(self.c_p)))
 
@@ -122,6 +154,6 @@ class Resistor(AbstractCircuit):
 
     r: Ohm = parameter("ohm", typical=100e3)
 
-    def impedance(self) -> Rational:
+    def impedance(self) -> AbstractImpedance:
         """Impedance R."""
         return resistor(self.r)

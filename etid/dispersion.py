@@ -16,7 +16,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Complex, Float
 
-from etid.transfer import Rational, frequency_variable
+from etid.elements import AbstractImpedance
+from etid.transfer import frequency_variable
 
 SEEN = 4.0  # standard deviations, by which one fit in 16 000 is off by chance
 # By which α must be off as well, which costs R_s a few per cent. A driver of too low an order can
@@ -25,7 +26,7 @@ SPREAD = 0.01
 
 
 def slope(
-    impedance: Rational, frequency: Float[Array, " harmonic"]
+    impedance: AbstractImpedance, frequency: Float[Array, " harmonic"]
 ) -> tuple[Complex[Array, " harmonic"], Complex[Array, " harmonic"]]:
     """Z and ∂Z/∂α [Ω] at real frequencies [Hz]."""
     s = frequency_variable(frequency)

@@ -44,9 +44,8 @@ def circuit_starts(
 ) -> Float[Array, "start element"]:
     """Logarithms of elements: several impedance levels, and a simpler estimate of them."""
     typical = circuit.log_values()
-    is_ohm = jnp.array([unit == "ohm" for unit in circuit.units().values()])
-    sign = jnp.where(is_ohm, 1.0, -1.0)
-    starts = [typical + float(np.log(level)) * sign for level in LEVELS]
+    power, _ = circuit.scaling()
+    starts = [typical + float(np.log(level)) * power for level in LEVELS]
     if baseline is not None:
         values = baseline.values()
         usable = jnp.all(values > 0) & jnp.isfinite(values).all()

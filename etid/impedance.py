@@ -42,16 +42,17 @@ def _fit(
         return jnp.concatenate([difference.real, difference.imag])
 
     # A circuit scaled in impedance by g and in frequency by t has R·g and C/(g t).
-    typical = circuit.log_values()
-    is_ohm = jnp.array([unit == "ohm" for unit in circuit.units().values()])
+    typical, (of_level, of_time) = circuit.log_values(), circuit.scaling()
     size = jnp.log(jnp.median(jnp.abs(z)) / jnp.median(jnp.abs(circuit.response(frequency))))
-    corner = 1 / (2 * jnp.pi * jnp.exp(typical[jnp.argmax(is_ohm)]))
-    farads = jnp.where(is_ohm, jnp.inf, typical).min()
-    corner = jnp.where(is_ohm.all(), 1.0, corner / jnp.exp(farads))  # [Hz], roughly
+    slow = of_time > 0
+    resistance = typical[jnp.argmax(of_level)]
+    times = (typical - of_level * resistance) / jnp.where(slow, of_time, 1.0)
+    shortest = jnp.where(slow, times, jnp.inf).min()
+    corner = jnp.where(slow.any(), 1 / (2 * jnp.pi * jnp.exp(shortest)), 1.0)  # [Hz], roughly
     corners = jnp.exp(jnp.linspace(jnp.log(frequency.min()), jnp.log(frequency.max()), CORNERS))
     level, faster = jnp.meshgrid(size + jnp.log(jnp.asarray(LEVELS)), jnp.log(corners / corner))
     level, faster = level.reshape(-1, 1), faster.reshape(-1, 1)
-    starts = typical[None, :] + jnp.where(is_ohm[None, :], level, -level - faster)
+    starts = typical[None, :] + of_level[None, :] * level - of_time[None, :] * faster
     q0 = best_start(lambda q: residual(q, None), starts)
     solution = optx.least_squares(residual, SOLVER, q0, max_steps=MAX_STEPS, throw=False)
     q = solution.value
@@ -70,6 +71,7 @@ def _fit(
         chi2=chi2 if known else jnp.asarray(jnp.nan),
         result=first_verdict(
             (~jnp.isfinite(values).all(), RESULTS.nonphysical),
+            (fitted.is_too_steep(cov), RESULTS.nonphysical),
             (~settled, verdict("max_steps_reached")),
             ((chi2 > MISFIT_CHI2) & known, RESULTS.misfit),
             (~(jnp.sqrt(jnp.diagonal(cov)) < 1).all(), RESULTS.insensitive),

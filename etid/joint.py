@@ -79,8 +79,8 @@ def _together(
 ) -> tuple[list[Fit], Driver]:
     common, cov, estimates = shared_driver.fit(model, groups, several)
     # All impedances are measured in units of the known resistor.
-    sign = [1.0 if unit == "ohm" else -1.0 for unit in model.circuit.units().values()]
-    scale = tolerance**2 * jnp.outer(jnp.array(sign), jnp.array(sign))
+    power, _ = model.circuit.scaling()
+    scale = tolerance**2 * jnp.outer(power, power)
 
     def fit(estimate):
         with_scale = dataclasses.replace(

@@ -60,6 +60,7 @@ def judged(
         result=first_verdict(
             (~jnp.isfinite(estimate.chi2), RESULTS.unstable),
             (~jnp.isfinite(values).all(), RESULTS.nonphysical),
+            (fitted.is_too_steep(estimate.cov), RESULTS.nonphysical),
             (~settled, MAX_STEPS_REACHED),
             (misses(estimate.chi2, estimate.rrse) | too_late(estimate), RESULTS.misfit),
             (estimate.strain > STRAINED, RESULTS.inconsistent),

@@ -21,15 +21,16 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Complex, Float
 
 from etid.driver import SourceImpedance
+from etid.elements import AbstractImpedance
 from etid.spectra import Spectrum, local_sum, signal_share
-from etid.transfer import Rational, as_complex, delayed, frequency_variable, power, reciprocal
+from etid.transfer import as_complex, delayed, frequency_variable, power, reciprocal
 
 SURE = 4.0  # standard deviations of a local variance
 ROUNDING = 1e-12  # of a record, by which two transforms of the same samples may differ
 
 
 def gain(
-    source: SourceImpedance, load: Rational, frequency: Float[Array, " harmonic"]
+    source: SourceImpedance, load: AbstractImpedance, frequency: Float[Array, " harmonic"]
 ) -> Complex[Array, " harmonic"]:
     """G = Z_L / (Z_L + Z_th)."""
     z_load = load(frequency_variable(frequency))
@@ -38,7 +39,7 @@ def gain(
 
 def delayed_gain(
     source: SourceImpedance,
-    load: Rational,
+    load: AbstractImpedance,
     frequency: Float[Array, " harmonic"],
     delay: Float[Array, ""],
 ) -> Complex[Array, " harmonic"]:

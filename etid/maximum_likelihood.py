@@ -14,8 +14,9 @@ import optimistix as optx
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Complex, Float
 
-from etid.circuits import AbstractCircuit, resistor
+from etid.circuits import AbstractCircuit
 from etid.driver import Calibration, SourceImpedance
+from etid.elements import resistor
 from etid.information import inverse
 from etid.levenberg_marquardt import LevenbergMarquardt, best_start
 from etid.likelihood import (

@@ -22,8 +22,9 @@ import optimistix as optx
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, Int
 
-from etid.circuits import AbstractCircuit, resistor
+from etid.circuits import AbstractCircuit
 from etid.driver import Calibration, SourceImpedance, loaded
+from etid.elements import resistor
 from etid.information import curvature, eliminate, inverse
 from etid.levenberg_marquardt import LevenbergMarquardt, best_start
 from etid.prediction import (
@@ -153,7 +154,7 @@ def fit_source(
     kept, count, states = start_vector.shape[0], r_load.shape[0], start.order + 2
 
     def one(record, r, parameters, nuisance):
-        return scaled_residual(record, unflatten(parameters), resistor(r), nuisance)
+        return scaled_residual(record, unflatten(parameters), resistor(r).rational(), nuisance)
 
     regularise = prior(start, records.sample_rate[0], r_load.mean())
 
@@ -182,14 +183,14 @@ def fit_source(
             return one(record, r, p[:kept], p[kept:])
 
         def response(p):
-            load = resistor(r)
+            load = resistor(r).rational()
             return impulse_response(loaded_filter(unflatten(p[:kept]), load, record.sample_rate))
 
         at = jnp.concatenate([q[:kept], nuisance])
         return curvature(record, residual, response, at, precision)
 
     def error(record, r, nuisance):
-        system = loaded_filter(unflatten(q[:kept]), resistor(r), record.sample_rate)
+        system = loaded_filter(unflatten(q[:kept]), resistor(r).rational(), record.sample_rate)
         return rrse(predict(system, record, nuisance), measured(record, nuisance))
 
     parts = jax.vmap(at_minimum)(records, r_load, nuisance)
@@ -238,11 +239,11 @@ def fit_circuit(
     candidates = starts.log_values()
     kept, sources = candidates.shape[-1], source_vector.shape[0]
     circuit = jax.tree.map(lambda leaf: leaf[0], starts)
-    states = jax.eval_shape(lambda: loaded(source, circuit.impedance(), 1.0).C).shape[0]
+    states = jax.eval_shape(lambda: loaded(source, circuit.impedance().rational(), 1.0).C).shape[0]
     late_std = calibration.delay_std * records.sample_rate  # [samples]
 
     def load(q):
-        return circuit.with_log_values(q[:kept]).impedance()
+        return circuit.with_log_values(q[:kept]).impedance().rational()
 
     # q holds the elements, the nuisances of the record, and the delay of the calibration, by which
     # voltage and impulse response change linearly.

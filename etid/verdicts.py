@@ -22,7 +22,8 @@ class RESULTS(optx.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]  # equi
         "Use method='output_error', or repeat the calibration with less noise."
     )
     nonphysical = (
-        "An element is negative or not a number, or the source impedance is not passive. "
+        "An element is negative or not a number, an exponent exceeds 1 by more than its error, or "
+        "the source impedance is not passive. "
         "The record is too noisy for this method, the trigger moved between the records, or "
         "v_th, v_out and r_load do not belong together."
     )

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from etid import AbstractCircuit, SkinRC, capacitor, parallel, parameter, resistor, series
-from etid.circuits import Farad, Ohm
+from etid.elements import Farad, Ohm
 from etid.transfer import frequency_variable
 
 FREQUENCY = jnp.geomspace(10.0, 1e6, 25)
