@@ -25,7 +25,7 @@ from etid.driver import Driver
 from etid.given_driver import GivenDriver
 from etid.identify import failed_fit, identify_driver
 from etid.lanes import is_shared, known_driver, lane, skin_lane, stacked
-from etid.methods import Method, check_method, plan
+from etid.methods import Method, check_default, check_method, plan
 from etid.prefetch import prefetch
 from etid.preflight import Inspected
 from etid.recording import Metadata, Recording, RecordingError
@@ -178,6 +178,10 @@ def _identify(
     def read(row):
         with jax.enable_x64(True):  # of the thread that reads: the caller's own was checked
             seen, driver, method = planned(functools.partial(load, row), given)
+            try:
+                check_default(method, circuit)
+            except ValueError as error:
+                raise Refusal("not_periodic", str(error)) from error
         rates = seen.recording.sample_rate, seen.recording.pulse_rate
         waiting, shared = lane(seen, method), is_shared(seen, driver)
         return driver, waiting, method, shared, (id(driver), method, waiting[0].size, shared, rates)

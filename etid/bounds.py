@@ -59,10 +59,11 @@ class Bound:
     def __str__(self) -> str:
         lines = [f"{type(self.circuit).__name__} {self.path!r}, smallest standard errors:"]
         units = self.circuit.units()
+        width = max(4, *map(len, units))
         for name, error in self.relative.items():
             scale, symbol = DISPLAY[units[name]]
             value = float(getattr(self.circuit, name)) / scale
-            lines.append(f"  {name:<4}{value:10.4g} {symbol:<3} ± {100 * error:.2g} %")
+            lines.append(f"  {name:<{width}}{value:10.4g} {symbol:<3} ± {100 * error:.2g} %")
         if self.undetermined:
             lines.append(
                 f"  The records do not determine {' and '.join(self.undetermined)}: record more "
@@ -78,7 +79,7 @@ def bound(scene: Scene, *, delays: bool = True, known_driver: bool = False) -> d
     record counts for its length: half a period, for half the information of a whole one.
 
     Args:
-        scene: Driver, loads, noise and converter; trials with resistors or skin.
+        scene: Driver, loads, noise and converter; trials with circuits, resistors or skin.
         delays: Whether the trigger delays of all loaded records are unknown.
         known_driver: Whether Z_th is known exactly, and calibrations are not needed.
 
@@ -113,13 +114,15 @@ def bound(scene: Scene, *, delays: bool = True, known_driver: bool = False) -> d
 
 
 def _circuit(trial: Trial) -> AbstractCircuit:
+    if isinstance(trial.load, AbstractCircuit):
+        return trial.load
     if isinstance(trial.load, SkinLoad):
         return SkinRC(trial.load.r_s, trial.load.r_p, trial.load.c_p)
     if isinstance(trial.load, ResistorLoad):
         return Resistor(trial.load.r)
     raise ValueError(
         f"the load of {trial.path!r} is {trial.load!r}, which has no elements to identify; use a "
-        "SkinLoad or a ResistorLoad"
+        "circuit, a SkinLoad or a ResistorLoad"
     )
 
 

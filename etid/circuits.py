@@ -50,6 +50,12 @@ SCALING = {
 ABOVE_ONE = 4.0
 
 
+def heading(name: str, unit: str) -> str:
+    """Name and scaled unit of a parameter, as in `r_s [kΩ]`."""
+    symbol = DISPLAY[unit][1]
+    return f"{name} [{symbol}]" if symbol else name
+
+
 def parameter(unit: str, *, typical: float) -> Any:
     """Declare a positive circuit parameter.
 

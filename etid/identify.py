@@ -24,7 +24,16 @@ from etid.lanes import (
     stacked,
 )
 from etid.measurement import measure, noise
-from etid.methods import HARMONIC, Method, check_driver, check_method, choose, has_harmonics, plan
+from etid.methods import (
+    HARMONIC,
+    Method,
+    check_default,
+    check_driver,
+    check_method,
+    choose,
+    has_harmonics,
+    plan,
+)
 from etid.precision import require_float64
 from etid.preflight import Inspected, preflight
 from etid.recording import Recording
@@ -140,6 +149,7 @@ def identify_skin(
     if name is not None:
         fit = failed_fit(name, circuit, chosen)
     else:
+        check_default(chosen, circuit)
         one = lane(seen, chosen)
         known = known_driver(one, driver, chosen, is_shared(seen, driver))
         fit = skin(tuple(map(jnp.asarray, one)), driver, known, circuit, chosen)
@@ -187,6 +197,7 @@ def identify_samples(
     if method is None:
         fit_for = has_harmonics(driver) and separates_aliases(*periods)
         method = "maximum_likelihood" if fit_for else "output_error"
+        check_default(method, circuit)
     check_driver(driver, method, sample_rate)
     if method in HARMONIC and periods[0] == 0:
         raise ValueError(f"{v_out.shape[0]} samples hold no whole pulse period")

@@ -46,6 +46,28 @@ def check_method(method: str | None, circuit: AbstractCircuit | None = None) -> 
             f"method {method!r} identifies SkinRC only, not {type(circuit).__name__}; "
             "use method='maximum_likelihood'"
         )
+    if method == "output_error" and circuit is not None and not circuit.is_rational:
+        raise ValueError(
+            f"method 'output_error' needs a ratio of polynomials in s, which {_steep(circuit)}; "
+            "use method='maximum_likelihood'"
+        )
+
+
+def _steep(circuit: AbstractCircuit) -> str:
+    return f"{type(circuit).__name__}, with its constant-phase element, is not"
+
+
+def check_default(method: Method, circuit: AbstractCircuit) -> None:
+    """Raise ValueError if the method that was chosen cannot identify this circuit."""
+    if method == "output_error" and not circuit.is_rational:
+        raise ValueError(
+            "the record holds less than two whole pulse periods or begins in a pulse, or its "
+            "driver was identified without harmonics; the method for it is output_error, which "
+            f"needs a ratio of polynomials in s, and {_steep(circuit)}. Record three periods or "
+            "more and identify the driver with method='maximum_likelihood', or ask for "
+            "method='maximum_likelihood': in a single period its standard errors leave out what "
+            "aliases do"
+        )
 
 
 def has_harmonics(driver: Driver) -> bool:

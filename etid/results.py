@@ -98,11 +98,12 @@ class Fit(eqx.Module):
         head = f"{kind}: {self.verdict} in {int(self.steps)} steps ({self.method})"
         head += f", RRSE {100 * float(self.rrse):.3g} %, chi2 {float(self.chi2):.3g}"
         lines = [head]
+        width = max(4, *map(len, self.circuit.names()))
         for name, unit in self.circuit.units().items():
             scale, symbol = DISPLAY[unit]
             value = float(getattr(self.circuit, name)) / scale
             error = float(getattr(self.stderr, name)) / scale
-            lines.append(f"  {name:<4}{plus_minus(value, error)} {symbol}")
+            lines.append(f"  {name:<{width}}{plus_minus(value, error)} {symbol}".rstrip())
         if self.verdict != "successful":
             lines.append("  " + message(self.verdict))
         return "\n".join(lines)

@@ -21,9 +21,12 @@ from collections.abc import Callable, Mapping
 from types import MappingProxyType
 from typing import Any
 
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Complex, Float
 
+from etid.circuits import AbstractCircuit
+from etid.precision import require_float64
 from etid.recording import Recording, Samples, tidy_path
 from etid.study import Study
 from etid.transformer import (
@@ -43,8 +46,8 @@ class Trial:
 
     Args:
         path: Name of the recording in its study, such as `s01/dry/03`.
-        load: What is connected: a load of this module, or any function from frequencies [Hz] to
-            impedance [ohm].
+        load: What is connected: a load of this module, a circuit, or any function from frequencies
+            [Hz] to impedance [ohm].
         subject: Who.
         condition: State of the skin.
         electrode: Which electrode.
@@ -52,7 +55,7 @@ class Trial:
     """
 
     path: str
-    load: Impedance
+    load: Impedance | AbstractCircuit
     subject: str = ""
     condition: str = ""
     electrode: str = ""
@@ -152,9 +155,7 @@ class Scene:
     def truth(self) -> dict[str, dict[str, float]]:
         """Elements of every load by path, SI; empty for an open circuit or a plain function."""
         return {
-            trial.path: dataclasses.asdict(trial.load)
-            if isinstance(trial.load, OpenLoad | ResistorLoad | SkinLoad)
-            else {}
+            trial.path: _elements(trial.load)
             for trial in self.calibration + self.trials
         }
 
@@ -274,9 +275,20 @@ class Scene:
         return Samples(codes.astype(np.int16 if self.bits <= 16 else np.int32), step / self.scale)
 
 
+def _elements(load: Impedance | AbstractCircuit) -> dict[str, float]:
+    if isinstance(load, AbstractCircuit):
+        return dict(zip(load.names(), load.values().tolist(), strict=True))
+    known = isinstance(load, OpenLoad | ResistorLoad | SkinLoad)
+    return dataclasses.asdict(load) if known else {}
+
+
 def _impedance(trial: Trial, f: Float[np.ndarray, " f"]) -> Complex[np.ndarray, " f"]:
     """The load's impedance, checked because any function may stand there."""
-    z = np.asarray(trial.load(f), complex)
+    if isinstance(trial.load, AbstractCircuit):
+        require_float64()
+        z = np.asarray(trial.load.response(jnp.asarray(f)))
+    else:
+        z = np.asarray(trial.load(f), complex)
     if z.shape != f.shape or np.isnan(z).any():
         raise ValueError(
             f"the load of {trial.path!r} returned shape {z.shape} with {np.isnan(z).sum()} NaN for "
@@ -302,7 +314,7 @@ def _resistors(folder: str, values: tuple[float, ...]) -> tuple[Trial, ...]:
     )
 
 
-def _repeated(folder: str, load: Impedance, count: int, **labels: str) -> tuple[Trial, ...]:
+def _repeated(folder: str, load: SkinLoad, count: int, **labels: str) -> tuple[Trial, ...]:
     return tuple(
         Trial(f"{folder}/{i:02d}", load, trial=f"{i:02d}", **labels) for i in range(1, count + 1)
     )

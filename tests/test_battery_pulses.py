@@ -12,18 +12,17 @@ import optimistix as optx
 import pytest
 import scipy.io
 
-from etid.circuits import (
-    AbstractCircuit,
+from etid.circuits import AbstractCircuit, parameter
+from etid.elements import (
+    AbstractImpedance,
     Farad,
     Ohm,
     capacitor,
     parallel,
-    parameter,
     resistor,
     series,
 )
 from etid.output_error import SOLVER
-from etid.transfer import Rational
 
 MILLI = 1e-3
 DISTURBED = ("SoC7", "Cell2")
@@ -37,7 +36,7 @@ class OneRC(AbstractCircuit):
     r_1: Ohm = parameter("ohm", typical=5e-3)
     c_1: Farad = parameter("farad", typical=1000.0)
 
-    def impedance(self) -> Rational:
+    def impedance(self) -> AbstractImpedance:
         """Series connection."""
         return series(resistor(self.r_0), capacitor(self.c_0), relaxation(self.r_1, self.c_1))
 
@@ -48,7 +47,7 @@ class TwoRC(OneRC):
     r_2: Ohm = parameter("ohm", typical=2e-3)
     c_2: Farad = parameter("farad", typical=300.0)
 
-    def impedance(self) -> Rational:
+    def impedance(self) -> AbstractImpedance:
         """Series connection."""
         return series(OneRC.impedance(self), relaxation(self.r_2, self.c_2))
 

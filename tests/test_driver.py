@@ -32,8 +32,8 @@ LAYERS = series(
     parallel(resistor(40e3), capacitor(2e-9)),
 )
 LOADS = {
-    "skin": SkinRC(33.4e3, 186e3, 0.12e-9).impedance(),
-    "resistor": Resistor(98.8e3).impedance(),
+    "skin": SkinRC(33.4e3, 186e3, 0.12e-9).impedance().rational(),
+    "resistor": Resistor(98.8e3).impedance().rational(),
     "two layers": LAYERS,
     "no series resistor": parallel(resistor(80e3), capacitor(0.2e-9)),
 }
@@ -122,14 +122,14 @@ def test_only_ratios_to_the_source_are_observable():
         SOURCE.log_omega_real,
         3 * SOURCE.gain_real,
     )
-    load = SkinRC(3 * 33.4e3, 3 * 186e3, 0.12e-9 / 3).impedance()
+    load = SkinRC(3 * 33.4e3, 3 * 186e3, 0.12e-9 / 3).impedance().rational()
     expected = transfer_of(loaded(SOURCE, LOADS["skin"], RATE))
     np.testing.assert_allclose(transfer_of(loaded(larger, load, RATE)), expected, rtol=SOLVED)
 
 
 def test_the_loaded_system_differentiates_under_vmap():
     def gain(log_values, s):
-        system = loaded(SOURCE, SkinRC().with_log_values(log_values).impedance(), RATE)
+        system = loaded(SOURCE, SkinRC().with_log_values(log_values).impedance().rational(), RATE)
         a = jnp.linalg.inv(jax.lax.complex(-system.A, jnp.imag(s) * jnp.eye(6)))
         h = jax.lax.complex(system.C, jnp.zeros(6)) @ a
         h = h @ jax.lax.complex(system.B[:, 0], jnp.zeros(6))

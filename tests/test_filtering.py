@@ -178,7 +178,7 @@ def test_held_system_has_the_continuous_frequency_response(sample_rate, cutoff, 
     z = np.asarray(load.response(jnp.asarray(frequency)))
     h = z / (z + np.asarray(SOURCE.response(jnp.asarray(frequency))))
     expected = (phasor * h).real.sum(1)
-    system = held(SOURCE, load.impedance(), sample_rate)
+    system = held(SOURCE, load.impedance().rational(), sample_rate)
     x0 = jnp.zeros_like(system.C)
     y, _ = run(system, interpolate(jnp.asarray(v_th), cutoff), x0)
     # 4000 samples let the slowest mode (300 rad/s, loaded 280) decay at 200 kHz; at 1 MHz it does
@@ -197,10 +197,10 @@ def test_held_system_equals_scipy_on_a_fine_grid():
     fine, width = 64, 8.0
     t = np.arange(600 * fine) / fine
     bump = np.exp(-0.5 * ((t - 150) / width) ** 2)
-    system = loaded(SOURCE, Resistor(98.8e3).impedance(), 200e3)
+    system = loaded(SOURCE, Resistor(98.8e3).impedance().rational(), 200e3)
     matrices = (system.A, system.B, system.C[None], system.D[None])
     _, expected, _ = scipy.signal.lsim(matrices, bump, t / 200e3)
-    discrete = held(SOURCE, Resistor(98.8e3).impedance(), 200e3)
+    discrete = held(SOURCE, Resistor(98.8e3).impedance().rational(), 200e3)
     y, _ = run(discrete, interpolate(jnp.asarray(bump[::fine])), jnp.zeros_like(discrete.C))
     expected = expected[::fine][TAPS - 1 : TAPS - 1 + y.size]
     # `lsim` draws straight lines: (1 / (64 · 8))² / 8 of the bump is 5e-7.
@@ -208,11 +208,11 @@ def test_held_system_equals_scipy_on_a_fine_grid():
 
 
 def test_the_first_input_of_a_hold_is_a_zero_order_hold():
-    system = loaded(SOURCE, SkinRC().impedance(), 200e3)
+    system = loaded(SOURCE, SkinRC().impedance().rational(), 200e3)
     matrices = (system.A, system.B, system.C[None], system.D[None])
     discrete: Any = scipy.signal.cont2discrete(matrices, 1 / 200e3, method="zoh")
     A, B, *_ = discrete
-    found = held(SOURCE, SkinRC().impedance(), 200e3)
+    found = held(SOURCE, SkinRC().impedance().rational(), 200e3)
     np.testing.assert_allclose(found.A, A, atol=1e-11)
     np.testing.assert_allclose(found.B[:, :1], B, atol=1e-11 * np.abs(B).max())
 
@@ -267,7 +267,7 @@ def test_interpolation_removes_what_lies_above_its_cutoff():
 def test_rounding_stays_that_of_the_last_digits(sample_rate, precision):
     """Driver and skin in blocks, against the same recursion with 64 bits of mantissa."""
     system = hold(
-        loaded(SOURCE, SkinRC(33e3, 186e3, 0.12e-9).impedance(), sample_rate), sample_rate
+        loaded(SOURCE, SkinRC(33e3, 186e3, 0.12e-9).impedance().rational(), sample_rate), sample_rate
     )
     v = np.zeros(4000)
     v[200:1500] = 50.0

@@ -9,7 +9,8 @@ import scipy.signal
 
 import etid
 from etid import batch, lanes, likelihood
-from etid.circuits import SkinRC, resistor
+from etid.circuits import SkinRC
+from etid.elements import resistor
 from etid.scenes import Scene, Trial
 from etid.transformer import ResistorLoad, SkinLoad
 

@@ -53,7 +53,7 @@ def predicted_current(parameters, steps, time):
     omega = 2 * jnp.pi * jnp.exp(parameters[3])
     scale = omega ** -jnp.arange(5.0)
     bessel = Rational(jnp.asarray(NUM), jnp.asarray(DEN[::-1].copy()) * scale)
-    system = realise(circuit.impedance().reciprocal().multiply(bessel), RATE)
+    system = realise(circuit.impedance().rational().reciprocal().multiply(bessel), RATE)
     # The first column of `hold` is the response to a constant. A step that comes `delay` after a
     # sample acts for the rest of that interval, then for whole ones.
     whole = hold(system, SAMPLE_RATE)

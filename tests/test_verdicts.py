@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import etid
-from etid.circuits import Ohm
+from etid.elements import Ohm
 from etid.scenes import Scene, Trial
 from etid.transformer import ResistorLoad, SkinLoad
 from etid.verdicts import RESULTS, message, verdict, verdict_names, verdicts_of

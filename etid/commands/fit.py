@@ -12,7 +12,7 @@ import numpy as np
 
 from etid import hdf5
 from etid.batch import StudyFits
-from etid.circuits import DISPLAY
+from etid.circuits import DISPLAY, heading
 from etid.commands import DONE, WRONG_DATA
 from etid.joint import identify_jointly
 from etid.methods import METHODS
@@ -134,7 +134,7 @@ def _medians(outcome: StudyFits) -> Table:
             )
             row.append(_cell(*numbers) if group["successful"] else "")
         rows.append(tuple(row))
-    heads = tuple(f"{name} [{DISPLAY[unit][1]}]" for name, unit in units.items())
+    heads = tuple(heading(name, unit) for name, unit in units.items())
     return Table(("subject", "condition", "fits", *heads), tuple(rows))
 
 
