@@ -36,6 +36,7 @@ from jaxtyping import Complex, Float
 import etid
 from benchmarks.provenance import ROOT
 from benchmarks.spice import PARTS
+from etid.circuits import AbstractCircuit
 from etid.scenes import Scene, Trial
 from etid.transformer import Impedance, OpenLoad, ResistorLoad, SkinLoad, TransformerDriver
 
@@ -69,7 +70,9 @@ class NgspiceError(RuntimeError):
     """ngspice is absent, or could not solve a circuit; says what to do."""
 
 
-def netlist(driver: TransformerDriver, load: Impedance, pulse_rate: float) -> str:
+def netlist(
+    driver: TransformerDriver, load: Impedance | AbstractCircuit, pulse_rate: float
+) -> str:
     """The circuit of `etid.transformer` with its load, and a run into its steady state.
 
     The windings are an ideal transformer 1:n between m and w, with the leakage, magnetising and
@@ -77,7 +80,7 @@ def netlist(driver: TransformerDriver, load: Impedance, pulse_rate: float) -> st
 
     Args:
         driver: The pulse transformer.
-        load: Open, a resistor, or skin.
+        load: Open, a resistor, skin, or a circuit.
         pulse_rate: Pulses per second [Hz].
 
     Raises:
@@ -108,7 +111,7 @@ def netlist(driver: TransformerDriver, load: Impedance, pulse_rate: float) -> st
     return "\n".join(lines) + "\n"
 
 
-def _load(load: Impedance) -> list[str]:
+def _load(load: Impedance | AbstractCircuit) -> list[str]:
     if isinstance(load, OpenLoad):
         return ["* no load"]
     if isinstance(load, ResistorLoad):
@@ -116,8 +119,10 @@ def _load(load: Impedance) -> list[str]:
     if isinstance(load, SkinLoad):
         parts = (f"Rs o x {_text(load.r_s)}", f"Rp x 0 {_text(load.r_p)}")
         return ["* skin", *parts, f"Cp x 0 {_text(load.c_p)}"]
+    if isinstance(load, AbstractCircuit):
+        return [*etid.netlist(load).splitlines(), "X1 o 0 load"]
     raise ValueError(
-        f"ngspice has no netlist for the load {load!r}; use OpenLoad, ResistorLoad or SkinLoad"
+        f"ngspice has no netlist for the load {load!r}; use OpenLoad, ResistorLoad, SkinLoad or a circuit"
     )
 
 

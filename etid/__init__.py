@@ -36,6 +36,8 @@ from etid.identify import predict as predict
 from etid.impedance import identify_impedance as identify_impedance
 from etid.importing import import_file as import_file
 from etid.joint import identify_jointly as identify_jointly
+from etid.netlist import circuit_string as circuit_string
+from etid.netlist import netlist as netlist
 from etid.online import Tracker as Tracker
 from etid.recording import Recording as Recording
 from etid.recording import RecordingError as RecordingError

@@ -34,6 +34,7 @@ from etid.methods import (
     has_harmonics,
     plan,
 )
+from etid.periodic import periodic_voltage
 from etid.precision import require_float64
 from etid.preflight import Inspected, preflight
 from etid.recording import Recording
@@ -237,7 +238,12 @@ def predict(
         circuit: The load; the known resistor of a calibration if not given.
 
     Returns:
-        Predicted voltage; NaN at both edges, where the interpolation lacks neighbours.
+        Predicted voltage; NaN at both edges, where the interpolation lacks neighbours. With a
+        constant-phase element, NaN after the last whole period.
+
+    Raises:
+        ValueError: There is no circuit, the driver cannot serve, or a circuit with a constant-phase
+            element meets a record without a whole period.
     """
     require_float64()
     if circuit is None:
@@ -245,9 +251,36 @@ def predict(
             raise ValueError("give the circuit: this recording has no known resistor")
         circuit = Resistor(recording.r_load)
     check_driver(driver, "output_error", recording.sample_rate)
+    if not circuit.is_rational:
+        return _predict_periods(recording, driver, circuit)
     inner = np.asarray(
         _fitted(tuple(map(jnp.asarray, arrays(Inspected(recording)))), driver, circuit)
     )
     predicted = np.full(recording.v_out.size, np.nan)
     predicted[TAPS - 1 : TAPS - 1 + inner.size] = inner
+    return predicted
+
+
+def _predict_periods(
+    recording: Recording, driver: Driver, circuit: AbstractCircuit
+) -> Float[np.ndarray, " time"]:
+    rate = recording.sample_rate
+    periods, samples = whole_periods(recording.v_out.size, rate, recording.pulse_rate)
+    if periods == 0:
+        raise ValueError(
+            f"recording {recording.path!r} holds no whole pulse period; the voltage at a "
+            f"constant-phase element, as in {type(circuit).__name__}, is predicted for whole ones"
+        )
+    assert driver.source is not None  # check_driver
+    assert driver.calibration is not None
+    frequency = jnp.asarray(np.fft.rfftfreq(samples, 1 / rate)[1:])
+    predicted = np.full(recording.v_out.size, np.nan)
+    predicted[:samples] = periodic_voltage(
+        recording.v_th[:samples],
+        recording.v_out[:samples],
+        rate,
+        np.asarray(driver.source.response(frequency)),
+        np.asarray(circuit.response(frequency)),
+        float(driver.calibration.r_load[0]),
+    )
     return predicted

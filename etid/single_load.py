@@ -192,7 +192,7 @@ class Load(eqx.Module):
         return _Slopes(part, slopes, (real, imaginary), by_w, by_x, by_variance)
 
     def by_dispersion(self, q: Float[Array, " q"]) -> Float[Array, " part"]:
-        """Derivative of the residual of the recording by the exponent α of `etid.dispersion`."""
+        """Derivative of the residual of the recording by α or ε of `etid.dispersion`."""
         own, z = self.split(q)
         w, spectrum = self.at(z)
         impedance = self.circuit.with_log_values(own[:-1]).impedance()

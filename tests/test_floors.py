@@ -38,6 +38,8 @@ FLOORS = {
     "study": 3,
     "prediction": 3,
     "steiglitz_mcbride": 4,
+    "netlist": 3,
+    "periodic": 0,
     "methods": 5,
     "hdf5": 4,
     "importing": 4,
