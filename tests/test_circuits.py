@@ -5,29 +5,24 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from etid import AbstractCircuit, SkinRC, capacitor, parallel, parameter, resistor, series
-from etid.elements import Farad, Ohm
+from benchmarks.skins import SkinCole, SkinTwoLayer
+from etid import (
+    SkinRC,
+    capacitor,
+    cole,
+    constant_phase,
+    parallel,
+    parameter,
+    resistor,
+    series,
+)
+from etid.circuits import heading
 from etid.transfer import frequency_variable
 
 FREQUENCY = jnp.geomspace(10.0, 1e6, 25)
 S = frequency_variable(FREQUENCY)
 ohms = st.floats(1e2, 1e6)
 farads = st.floats(1e-12, 1e-6)
-
-
-class SkinTwoLayer(AbstractCircuit):
-    """Stratum corneum and viable epidermis in series, R(RC)(RC)."""
-
-    r_s: Ohm = parameter("ohm", typical=20e3)
-    r_1: Ohm = parameter("ohm", typical=80e3)
-    c_1: Farad = parameter("farad", typical=0.2e-9)
-    r_2: Ohm = parameter("ohm", typical=40e3)
-    c_2: Farad = parameter("farad", typical=2e-9)
-
-    def impedance(self):
-        first = parallel(resistor(self.r_1), capacitor(self.c_1))
-        second = parallel(resistor(self.r_2), capacitor(self.c_2))
-        return series(resistor(self.r_s), first, second)
 
 
 @given(ohms, ohms, farads)
@@ -87,6 +82,79 @@ def test_a_negative_resistance_is_not_repaired():
 
 def test_corner_frequency_of_the_skin():
     np.testing.assert_allclose(SkinRC(33.4e3, 186e3, 0.12e-9).f_c, 7130.6, rtol=1e-4)
+
+
+@pytest.mark.parametrize("alpha", [0.1, 0.5, 0.85, 1.0])
+def test_constant_phases_are_their_formulas(alpha):
+    s = np.asarray(S)
+    z = constant_phase(2e-9, alpha)(S)
+    np.testing.assert_allclose(z, 1 / (2e-9 * s**alpha), rtol=1e-12)
+    np.testing.assert_allclose(np.angle(z), -alpha * np.pi / 2, rtol=1e-12)
+    spread = 186e3 / (1 + (s * 22e-6) ** alpha)
+    np.testing.assert_allclose(cole(186e3, 22e-6, alpha)(S), spread, rtol=1e-12)
+
+
+def test_an_exponent_of_one_is_a_capacitor():
+    np.testing.assert_allclose(constant_phase(2e-9, 1.0)(S), capacitor(2e-9)(S), rtol=1e-12)
+    np.testing.assert_allclose(
+        SkinCole(33e3, 186e3, 186e3 * 0.12e-9, 1.0).response(FREQUENCY),
+        SkinRC(33e3, 186e3, 0.12e-9).response(FREQUENCY),
+        rtol=1e-12,
+    )
+
+
+def test_trees_are_their_polynomials():
+    for circuit in (SkinRC(), SkinTwoLayer()):
+        tree = circuit.impedance()
+        np.testing.assert_allclose(tree.rational()(S), tree(S), rtol=1e-12)
+        np.testing.assert_allclose(tree.admittance(S), 1 / np.asarray(tree(S)), rtol=1e-12)
+
+
+def test_a_constant_phase_is_no_ratio_of_polynomials():
+    assert SkinTwoLayer().is_rational
+    assert not SkinCole().is_rational
+    with pytest.raises(ValueError, match="no rational function of s; .*maximum_likelihood"):
+        SkinCole().impedance().rational()
+
+
+@pytest.mark.parametrize("alpha", [0.3, 1.0])
+def test_slopes_of_a_constant_phase_are_finite_and_right(alpha):
+    """By the parameters and by s: what a fit, its standard errors and its score test need."""
+    circuit = SkinCole(33e3, 186e3, 22e-6, alpha)
+    logs = circuit.log_values()
+
+    @jax.jit
+    def of_parameters(logs):
+        return circuit.with_log_values(logs).response(FREQUENCY)
+
+    slope = np.asarray(jax.jacfwd(of_parameters)(logs))
+    steps = 1e-5 * jnp.eye(4)
+    numeric = [(of_parameters(logs + d) - of_parameters(logs - d)) / 2e-5 for d in steps]
+    np.testing.assert_allclose(slope, np.stack(numeric, axis=1), rtol=1e-6, atol=1e-4)
+    tree = circuit.impedance()
+    found = np.asarray(jax.jvp(tree, (S,), (S,))[1])
+    scale = 1e-5 * S
+    np.testing.assert_allclose(found, (tree(S + scale) - tree(S - scale)) / 2e-5, rtol=1e-7)
+
+
+def test_an_exponent_is_too_steep_if_its_error_does_not_explain_it():
+    cov = jnp.diag(jnp.array([1e-6, 1e-6, 1e-6, 0.01**2]))
+    for alpha, expected in ((0.9, False), (1.03, False), (1.05, True)):
+        found = SkinCole().with_log_values(SkinCole(20e3, 100e3, 30e-6, alpha).log_values())
+        assert bool(found.is_too_steep(cov)) == expected
+    assert not bool(SkinRC().is_too_steep(jnp.eye(3)))
+
+
+def test_a_connection_of_nothing_is_refused():
+    for connect in (series, parallel):
+        with pytest.raises(ValueError, match="connects nothing"):
+            connect()
+
+
+def test_units_are_scaled_in_print_and_one_has_no_symbol():
+    assert heading("r_s", "ohm") == "r_s [kΩ]"
+    assert heading("tau", "second") == "tau [µs]"
+    assert heading("alpha", "1") == "alpha"
 
 
 def test_unknown_units_are_refused():

@@ -9,6 +9,7 @@ import pytest
 import etid
 from benchmarks.failure_axes import Cole, TwoLayers
 from benchmarks.ladder import CALIBRATION, LOADS, rung
+from benchmarks.skins import SkinCole, SkinTwoLayer
 from etid import dispersion
 from etid.scenes import Trial
 
@@ -26,6 +27,23 @@ def test_the_slope_is_that_of_a_constant_phase():
     z, slope = dispersion.slope(circuit.impedance(), jnp.asarray(f))
     np.testing.assert_allclose(z, spread(1.0), rtol=1e-12)
     expected = (spread(1 + step) - spread(1 - step)) / (2 * step)
+    np.testing.assert_allclose(slope, expected, rtol=1e-7)  # step², and rounding over step
+
+
+def test_the_slope_of_a_spread_relaxation_is_that_of_its_asymmetry():
+    """Against a central difference of ln s + ε ln² (s/s₀) in the place of ln s."""
+    circuit, step = SkinCole(33e3, 186e3, 22e-6, 0.85), 1e-5
+    f = np.geomspace(60.0, 1e5, 30)
+    log_s = np.log(2j * np.pi * f)
+    middle = np.log(2 * np.pi * np.sqrt(60.0 * 1e5))
+
+    def skewed(epsilon):
+        s = np.exp(log_s + epsilon * (log_s - middle) ** 2)
+        return 33e3 + 186e3 / (1 + (s * 22e-6) ** 0.85)
+
+    z, slope = dispersion.slope(circuit.impedance(), jnp.asarray(f))
+    np.testing.assert_allclose(z, skewed(0.0), rtol=1e-12)
+    expected = (skewed(step) - skewed(-step)) / (2 * step)
     np.testing.assert_allclose(slope, expected, rtol=1e-7)  # step², and rounding over step
 
 
@@ -61,11 +79,20 @@ def test_a_load_without_a_capacitor_has_no_phase_to_be_constant():
     assert not seen(rng.normal(size=50), np.zeros(50), rng.normal(size=(3, 50)))
 
 
-def identified(load, snr_db):
+def identified(load, snr_db, circuit=None):
     scene = dataclasses.replace(rung("dry", snr_db=snr_db), trials=(Trial("skin", load),))
     study = scene.simulate(11)
     driver = etid.identify_driver(study[CALIBRATION])
-    return etid.identify_skin(study["skin"], driver, throw=False)
+    return etid.identify_skin(study["skin"], driver, circuit=circuit, throw=False)
+
+
+def test_two_layers_are_no_cole_relaxation_where_chi2_does_not_show_it():
+    """R_s is 10 standard errors off, χ² 1.02."""
+    load = SkinTwoLayer(33.4e3, 150e3, 0.12e-9, 36e3, 5e-9)
+    fit = identified(load, 40.0, SkinCole())
+    assert fit.chi2 < 1.5
+    assert abs(float(fit.circuit.r_s) - 33.4e3) > 5 * float(fit.stderr.r_s)
+    assert fit.verdict == "misfit"
 
 
 @pytest.mark.parametrize("load", [Cole(LOADS["dry"], 0.9), TwoLayers(LOADS["damp"], 0.05)])

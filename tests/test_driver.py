@@ -30,12 +30,12 @@ LAYERS = series(
     resistor(20e3),
     parallel(resistor(80e3), capacitor(0.2e-9)),
     parallel(resistor(40e3), capacitor(2e-9)),
-)
+).rational()
 LOADS = {
     "skin": SkinRC(33.4e3, 186e3, 0.12e-9).impedance().rational(),
     "resistor": Resistor(98.8e3).impedance().rational(),
     "two layers": LAYERS,
-    "no series resistor": parallel(resistor(80e3), capacitor(0.2e-9)),
+    "no series resistor": parallel(resistor(80e3), capacitor(0.2e-9)).rational(),
 }
 
 respond = jax.jit(SourceImpedance.response)

@@ -134,7 +134,7 @@ def test_a_pulse_that_ngspice_would_change_is_refused(edge):
 
 
 def test_a_load_without_a_netlist_is_refused():
-    with pytest.raises(ValueError, match="OpenLoad, ResistorLoad or SkinLoad"):
+    with pytest.raises(ValueError, match="OpenLoad, ResistorLoad, SkinLoad or a circuit"):
         ngspice.netlist(TransformerDriver(), lambda f: f + 0j, RATE)
 
 

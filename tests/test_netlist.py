@@ -1,0 +1,187 @@
+"""Netlists and strings of circuits: read back, solved by other programs, and refused."""
+
+import dataclasses
+import re
+import shutil
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import etid
+from benchmarks import ngspice
+from benchmarks.ladder import CALIBRATION, rung
+from benchmarks.skins import SkinCole, SkinTwoLayer
+from etid.elements import Exponent, Farad, Ohm
+from etid.netlist import BAND, LADDER_ERROR, ladder
+from etid.scenes import Trial
+
+SPREAD = SkinCole(33.4e3, 186e3, 22e-6, 0.85)
+FREQUENCY = np.geomspace(*BAND, 300)
+
+
+class Nested(etid.AbstractCircuit):
+    """Everything in everything, a capacitor before its resistor."""
+
+    r: Ohm = etid.parameter("ohm", typical=10e3)
+    c: Farad = etid.parameter("farad", typical=1e-9)
+    alpha: Exponent = etid.parameter("1", typical=0.7)
+
+    def impedance(self):
+        r, c = etid.resistor(self.r), etid.capacitor(self.c)
+        phase = etid.constant_phase(3e-8, self.alpha)
+        inner = etid.parallel(c, etid.series(r, etid.parallel(phase, r)), c)
+        return etid.series(etid.parallel(inner, r), r)
+
+
+CIRCUITS = [etid.Resistor(98.8e3), etid.SkinRC(), SkinTwoLayer(), SPREAD, Nested()]
+rational = pytest.mark.parametrize("circuit", CIRCUITS[:3], ids=lambda c: type(c).__name__)
+every = pytest.mark.parametrize("circuit", CIRCUITS, ids=lambda c: type(c).__name__)
+
+
+def impedance_of(text, f):
+    """Voltage between the terminals at one ampere, by nodal analysis of the text alone."""
+    head, *rest = [line.split() for line in text.splitlines() if line[0] != "*"]
+    assert head == [".subckt", "load", "plus", "minus"]
+    assert rest[-1] == [".ends", "load"]
+    parts = rest[:-1]
+    assert len({name for name, *_ in parts}) == len(parts)
+    nodes = sorted({node for _, *ends, _ in parts for node in ends} - {"minus"})
+    index = {node: i for i, node in enumerate(nodes)}
+    matrix = np.zeros((f.size, len(index), len(index)), complex)
+    for name, plus, minus, value in parts:
+        y = 1 / float(value) if name[0] == "R" else 2j * np.pi * f * float(value)
+        for one, other in ((plus, minus), (minus, plus)):
+            if one in index:
+                matrix[:, index[one], index[one]] += y
+                if other in index:
+                    matrix[:, index[one], index[other]] -= y
+    drive = np.zeros((len(index), 1))
+    drive[index["plus"]] = 1.0
+    return np.linalg.solve(matrix, drive)[:, index["plus"], 0]
+
+
+@every
+def test_a_netlist_is_its_circuit(circuit):
+    expected = np.asarray(circuit.response(jnp.asarray(FREQUENCY)))
+    found = impedance_of(etid.netlist(circuit), FREQUENCY)
+    # A chain of 34 pairs is solved with a condition of 1e10 of its nodes.
+    tolerance = 1e-9 if circuit.is_rational else LADDER_ERROR
+    np.testing.assert_allclose(found, expected, rtol=tolerance)
+
+
+@pytest.mark.parametrize("band", [BAND, (1e-3, 1e3)])
+@pytest.mark.parametrize("alpha", [0.05, 0.3, 0.5, 0.7, 0.9, 0.99, 1.0])
+def test_a_ladder_is_a_constant_phase_in_its_band(alpha, band):
+    s = 2j * np.pi * np.geomspace(*band, 1000)
+    expected = 1 / (2e-9 * s**alpha)
+    found = np.asarray(ladder(2e-9, alpha, band)(jnp.asarray(s)))
+    assert np.abs(found / expected - 1).max() < LADDER_ERROR
+
+
+def test_a_netlist_says_what_it_is():
+    text = etid.netlist(SPREAD, name="skin_3", band=(10.0, 1e5))
+    lines = text.splitlines()
+    assert lines[0].startswith("* SkinCole")
+    assert "* tau = 2.2e-05" in lines
+    assert "* constant phase as RC pairs, within 0.01 % from 10 Hz to 100000 Hz" in lines
+    assert ".subckt skin_3 plus minus" in lines
+    assert lines[-1] == ".ends skin_3"
+
+
+# --- impedance.py ---------------------------------------------------------------------------------
+
+
+def evaluated(string, values, f):
+    """The notation of impedance.py by Python itself: series are sums, p() is parallel."""
+    s, left = 2j * np.pi * f, iter(values)
+    kinds = {
+        "R": lambda r: r + 0 * s,
+        "C": lambda c: 1 / (s * c),
+        "CPE": lambda q, alpha: 1 / (q * s**alpha),
+    }
+    elements = {}
+    for name in re.findall(r"[A-Z]+\d+", string):
+        assert name not in elements
+        kind = kinds[name.rstrip("0123456789")]
+        elements[name] = kind(*(next(left) for _ in range(kind.__code__.co_argcount)))
+    assert next(left, None) is None
+    names = elements | {"p": lambda *z: 1 / sum(1 / one for one in z)}
+    return eval(string.replace("-", "+"), names)
+
+
+@every
+def test_a_string_is_its_circuit(circuit):
+    expected = np.asarray(circuit.response(jnp.asarray(FREQUENCY)))
+    found = evaluated(*etid.circuit_string(circuit), FREQUENCY)
+    np.testing.assert_allclose(found, expected, rtol=1e-12)
+
+
+def test_strings_look_as_those_of_impedance_py_do():
+    assert etid.circuit_string(etid.SkinRC(1.0, 2.0, 3.0)) == ("R0-p(R1,C1)", [1.0, 2.0, 3.0])
+    assert etid.circuit_string(SkinTwoLayer())[0] == "R0-p(R1,C1)-p(R2,C2)"
+    assert etid.circuit_string(SPREAD)[0] == "R0-p(R1,CPE1)"
+
+
+@every
+def test_impedance_py_reads_it(circuit):
+    circuits = pytest.importorskip(
+        "impedance.models.circuits", reason="impedance.py is not installed", exc_type=ImportError
+    )
+    string, values = etid.circuit_string(circuit)
+    found = circuits.CustomCircuit(string, initial_guess=values).predict(FREQUENCY)
+    expected = np.asarray(circuit.response(jnp.asarray(FREQUENCY)))
+    np.testing.assert_allclose(found, expected, rtol=1e-9)
+
+
+# --- refusals -------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["", "two words", "1st", "a.b", "ä"])
+def test_a_name_that_spice_would_misread_is_refused(name):
+    with pytest.raises(ValueError, match="cannot name a subcircuit"):
+        etid.netlist(etid.SkinRC(), name=name)
+
+
+@pytest.mark.parametrize("band", [(0.0, 1.0), (10.0, 1.0), (1.0, np.inf)])
+def test_a_band_that_is_none_is_refused(band):
+    with pytest.raises(ValueError, match="two rising frequencies"):
+        etid.netlist(SPREAD, band=band)
+
+
+@pytest.mark.parametrize("write", [etid.netlist, etid.circuit_string])
+def test_what_is_no_circuit_is_refused(write):
+    with pytest.raises(ValueError, match="c_p is nan"):
+        write(etid.SkinRC(1.0, 1.0, np.nan))
+    with pytest.raises(ValueError, match="r_s is -1"):
+        write(etid.SkinRC(-1.0, 1.0, 1.0))
+    with pytest.raises(ValueError, match=r"is a batch; give one of them, such as fits\[0\]"):
+        write(etid.SkinRC(np.ones(3), np.ones(3), np.ones(3)))
+
+
+def test_an_exponent_above_one_has_no_passive_network():
+    with pytest.raises(ValueError, match=r"exponent is 1\.02; above 1 there is no passive"):
+        etid.netlist(SkinCole(33e3, 186e3, 22e-6, 1.02))
+
+
+# --- ngspice --------------------------------------------------------------------------------------
+
+
+@pytest.mark.skipif(
+    shutil.which("ngspice") is None, reason="ngspice is not installed; Debian package ngspice"
+)
+@pytest.mark.parametrize("circuit", [SkinTwoLayer(33.4e3, 150e3, 0.12e-9, 36e3, 5e-9), SPREAD])
+def test_the_netlist_of_an_identified_circuit_gives_its_voltage_back(
+    circuit, tmp_path, monkeypatch
+):
+    """From noise-free records of the circuit, through a fit and ngspice, to the same V_out."""
+    monkeypatch.setattr(ngspice, "CACHE", tmp_path)
+    settings = {"snr_db": None, "bits": None, "trigger_jitter_rms": 0.0}
+    scene = dataclasses.replace(rung("dry", **settings), trials=(Trial("skin", circuit),))
+    study = scene.simulate(0)
+    driver = etid.identify_driver(study[CALIBRATION], order=6, throw=False)
+    fit = etid.identify_skin(study["skin"], driver, circuit=type(circuit)(), throw=False)
+    identified = dataclasses.replace(scene, trials=(Trial("skin", fit.circuit),))
+    by_ngspice = ngspice.record(identified, 0)["skin"].v_out
+    measured = study["skin"].v_out
+    assert np.abs(by_ngspice - measured).max() < 1e-3 * np.abs(measured).max()
