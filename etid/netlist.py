@@ -136,8 +136,9 @@ class _Writer:
         elif isinstance(tree, Series):
             for part in tree.parts[:-1]:
                 self.nodes += 1
-                self.write(part, plus, f"n{self.nodes}")
-                plus = f"n{self.nodes}"
+                node = f"n{self.nodes}"
+                self.write(part, plus, node)
+                plus = node
             self.write(tree.parts[-1], plus, minus)
         else:
             [value] = _values(tree)

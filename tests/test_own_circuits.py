@@ -11,6 +11,7 @@ import etid
 from benchmarks.ladder import CALIBRATION, rung
 from benchmarks.skins import SkinCole, SkinTwoLayer
 from etid.elements import Exponent, Ohm, PseudoCapacitance
+from etid.periodic import periodic_voltage
 from etid.scenes import Trial
 
 LAYERS = SkinTwoLayer(33.4e3, 150e3, 0.12e-9, 36e3, 5e-9)
@@ -93,17 +94,29 @@ def test_a_spread_that_is_not_there_is_an_exponent_of_one(study, driver):
     assert abs(float(fit.circuit.r_s) - 33.4e3) < SIGMAS * float(fit.stderr.r_s)
 
 
-def test_a_prediction_by_periods_is_that_of_the_filter(study, driver):
-    """An exponent of one goes by harmonics, its equal with a capacitor through a filter."""
-    spread = SkinCole(DRY.r_s, DRY.r_p, DRY.r_p * DRY.c_p, 1.0)
-    by_periods = etid.predict(study["dry"], driver, spread)
-    by_filter = etid.predict(study["dry"], driver, DRY)
-    both = np.isfinite(by_periods) & np.isfinite(by_filter)
-    noise = 10 ** (-60 / 20) * np.std(study["dry"].v_th)
-    # The filter leaves out the noise of v_th near half the sample rate, the periods keep it.
-    assert np.std((by_periods - by_filter)[both]) < noise
-    rest = (by_periods - study["dry"].v_out)[both]
-    assert np.std(rest) < 1.5 * noise  # of both records
+def test_a_prediction_by_periods_has_the_delays_of_the_record():
+    """Exact impedances, a record 50 ns late, and a calibration 20 ns late."""
+    exact = scene(snr_db=None, bits=None, trigger_jitter_rms=0.0)
+    in_time, rate = exact.simulate(0)["spread"], exact.sample_rate
+    late = dataclasses.replace(exact, start=50e-9).simulate(0)["spread"].v_out
+    f = np.fft.rfftfreq(in_time.v_th.size, 1 / rate)[1:]
+    z_load, z_th = np.asarray(SPREAD.response(jnp.asarray(f))), exact.driver.z_th(f)
+    z_late = z_th + 2j * np.pi * f * 20e-9 * (98.8e3 + z_th)  # of the calibration
+
+    def missed(v_out, z):
+        predicted = periodic_voltage(in_time.v_th, v_out, rate, z, z_load, 98.8e3)
+        return np.std(predicted - v_out) / np.std(v_out)
+
+    aliases = missed(in_time.v_out, z_th)
+    assert aliases < 1e-3
+    for v_out, z in ((late, z_th), (in_time.v_out, z_late), (late, z_late)):
+        assert missed(v_out, z) < 1.2 * aliases  # which a delay turns the other way
+
+
+def test_a_fit_predicts_its_record_down_to_the_noise(study, driver):
+    recording, noise = study["spread"], 10 ** (-60 / 20) * np.std(study["spread"].v_th)
+    rest = etid.predict(recording, driver, SPREAD) - recording.v_out
+    assert np.std(rest) < 1.5 * noise  # both records have it
 
 
 def test_a_fit_prints_its_units():
