@@ -70,9 +70,7 @@ class NgspiceError(RuntimeError):
     """ngspice is absent, or could not solve a circuit; says what to do."""
 
 
-def netlist(
-    driver: TransformerDriver, load: Impedance | AbstractCircuit, pulse_rate: float
-) -> str:
+def netlist(driver: TransformerDriver, load: Impedance | AbstractCircuit, pulse_rate: float) -> str:
     """The circuit of `etid.transformer` with its load, and a run into its steady state.
 
     The windings are an ideal transformer 1:n between m and w, with the leakage, magnetising and

@@ -222,7 +222,9 @@ def _fitted(samples: Any, driver: Driver, circuit: AbstractCircuit) -> Float[Arr
     assert driver.source is not None
     assert driver.calibration is not None
     r_load = driver.calibration.r_load[0]
-    return output_error.fitted_voltage(records, driver.source, r_load, circuit.impedance().rational())
+    return output_error.fitted_voltage(
+        records, driver.source, r_load, circuit.impedance().rational()
+    )
 
 
 def predict(

@@ -67,7 +67,7 @@ def netlist(
         raise ValueError(f"band is {band}; it must be two rising frequencies [Hz] above 0")
     values = _checked(circuit)
     tree = _passive(circuit.impedance(), band)
-    lines = [f"* {type(circuit).__name__} identified by etid, in SI units"]
+    lines = [f"* {type(circuit).__name__}, written by etid, in SI units"]
     lines += [f"* {key} = {value:.6g}" for key, value in values.items()]
     if not circuit.is_rational:
         lines.append(

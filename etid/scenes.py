@@ -154,10 +154,7 @@ class Scene:
 
     def truth(self) -> dict[str, dict[str, float]]:
         """Elements of every load by path, SI; empty for an open circuit or a plain function."""
-        return {
-            trial.path: _elements(trial.load)
-            for trial in self.calibration + self.trials
-        }
+        return {trial.path: _elements(trial.load) for trial in self.calibration + self.trials}
 
     def simulate(self, seed: int) -> Study:
         """Make the recordings.

@@ -267,7 +267,8 @@ def test_interpolation_removes_what_lies_above_its_cutoff():
 def test_rounding_stays_that_of_the_last_digits(sample_rate, precision):
     """Driver and skin in blocks, against the same recursion with 64 bits of mantissa."""
     system = hold(
-        loaded(SOURCE, SkinRC(33e3, 186e3, 0.12e-9).impedance().rational(), sample_rate), sample_rate
+        loaded(SOURCE, SkinRC(33e3, 186e3, 0.12e-9).impedance().rational(), sample_rate),
+        sample_rate,
     )
     v = np.zeros(4000)
     v[200:1500] = 50.0

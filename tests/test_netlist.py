@@ -174,12 +174,17 @@ def test_an_exponent_above_one_has_no_passive_network():
 def test_netlists_of_identified_circuits_give_their_voltages_back(tmp_path, monkeypatch):
     """From records, through a fit and ngspice, to what the records are without their noise."""
     monkeypatch.setattr(ngspice, "CACHE", tmp_path)
-    trials = Trial("layers", SkinTwoLayer(33.4e3, 150e3, 0.12e-9, 36e3, 5e-9)), Trial("cole", SPREAD)
+    trials = (
+        Trial("layers", SkinTwoLayer(33.4e3, 150e3, 0.12e-9, 36e3, 5e-9)),
+        Trial("cole", SPREAD),
+    )
     scene = dataclasses.replace(rung("dry"), trials=trials)
     study = scene.simulate(0)
     driver = etid.identify_driver(study[CALIBRATION])
     found = tuple(
-        Trial(one.path, etid.identify_skin(study[one.path], driver, circuit=type(one.load)()).circuit)
+        Trial(
+            one.path, etid.identify_skin(study[one.path], driver, circuit=type(one.load)()).circuit
+        )
         for one in trials
     )
     exact = {"snr_db": None, "bits": None, "trigger_jitter_rms": 0.0}
