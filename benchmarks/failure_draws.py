@@ -28,7 +28,7 @@ import etid
 from benchmarks.estimators import DEFAULT, FAR, driver_of, is_off, shared
 from benchmarks.failure_axes import Cell, Cole, TwoLayers
 from benchmarks.mappings import make_room
-from etid.circuits import SkinRC
+from etid.circuits import AbstractCircuit, SkinRC
 from etid.methods import Method, choose
 from etid.preflight import Inspected
 from etid.scenes import Scene
@@ -127,7 +127,7 @@ class Answer:
         return bool((self.silent_elements & (self.bound <= DETERMINED)).any())
 
 
-def elements(load: Impedance) -> SkinLoad:
+def elements(load: Impedance | AbstractCircuit) -> SkinLoad:
     """The true elements of a load of these scenes."""
     if isinstance(load, TwoLayers | Cole):
         return load.elements
@@ -138,7 +138,7 @@ def elements(load: Impedance) -> SkinLoad:
 def bounds(scene: Scene) -> dict[str, Float[np.ndarray, " element"]]:
     """Relative bounds of the elements by path; NaN where an element does not exist."""
 
-    def one_rc(load: Impedance) -> SkinLoad:
+    def one_rc(load: Impedance | AbstractCircuit) -> SkinLoad:
         return load.skin if isinstance(load, Cole) else elements(load)
 
     trials = tuple(dataclasses.replace(t, load=one_rc(t.load)) for t in scene.trials)

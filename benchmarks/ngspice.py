@@ -120,7 +120,8 @@ def _load(load: Impedance | AbstractCircuit) -> list[str]:
     if isinstance(load, AbstractCircuit):
         return [*etid.netlist(load).splitlines(), "X1 o 0 load"]
     raise ValueError(
-        f"ngspice has no netlist for the load {load!r}; use OpenLoad, ResistorLoad, SkinLoad or a circuit"
+        f"ngspice has no netlist for the load {load!r}; use OpenLoad, ResistorLoad, SkinLoad or "
+        "a circuit"
     )
 
 

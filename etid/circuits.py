@@ -32,7 +32,7 @@ DISPLAY = {
     "ohm": (1e3, "kΩ"),
     "farad": (1e-9, "nF"),
     "second": (1e-6, "µs"),
-    "siemens second^alpha": (1e-9, "nS·s^α"),
+    "siemens second^alpha": (1e-9, "nS·s^alpha"),
     "1": (1.0, ""),
 }
 

@@ -29,8 +29,8 @@ from etid.elements import AbstractImpedance, exponents
 from etid.transfer import as_complex, frequency_variable
 
 SEEN = 4.0  # standard deviations, by which one fit in 16 000 is off by chance
-# By which α, or ε, must be off as well, which costs R_s a few per cent. A driver of too low an order can
-# imitate 0.002: at 60 dB, behind damp skin, four standard deviations.
+# By which α, or ε, must be off as well, which costs R_s a few per cent. A driver of too low an
+# order can imitate 0.002: at 60 dB, behind damp skin, four standard deviations.
 SPREAD = 0.01
 
 

@@ -170,7 +170,7 @@ def _checked(circuit: AbstractCircuit) -> dict[str, float]:
 def _passive(tree: AbstractImpedance, band: tuple[float, float]) -> AbstractImpedance:
     """The same with resistors and capacitors in the place of constant phases."""
     if isinstance(tree, ConstantPhase):
-        return ladder(*_values(tree), band)
+        return ladder(float(tree.q), float(tree.alpha), band)
     if isinstance(tree, Series):
         return Series(tuple(_passive(part, band) for part in tree.parts))
     if isinstance(tree, Parallel):

@@ -55,8 +55,8 @@ class SkinTwoLayer(etid.AbstractCircuit):
 
 # %% [markdown]
 # Cole (1940) found that the relaxation of membranes is spread over time constants,
-# R / (1 + (jωτ)^α) with α below 1. No filter with a finite number of coefficients has this impedance;
-# at the harmonics of the pulses it is exact.
+# R / (1 + (jωτ)^α) with α below 1. No filter with a finite number of coefficients has this
+# impedance; at the harmonics of the pulses it is exact.
 
 
 # %%
@@ -109,8 +109,8 @@ plotting.plot_fit(study["Cole"], etid.predict(study["Cole"], driver, spread.circ
 
 # %% [markdown]
 # ## Could it be known better?
-# The Cramer-Rao bound of the scene is the smallest standard error of any unbiased estimator that has
-# no model of the driver. A fit, which has one, comes close to it or is a little better.
+# The Cramer-Rao bound of the scene is the smallest standard error of any unbiased estimator that
+# has no model of the driver. A fit, which has one, comes close to it or is a little better.
 
 # %%
 bounds = etid.bound(scene)
@@ -122,8 +122,8 @@ for name, fit in {"two layers": layers, "Cole": spread}.items():
 # %% [markdown]
 # ## Is it the right circuit?
 # **Too small.** With one RC for the skin of two layers, or for Cole's, R_s would be off by 10 and
-# 45 %. The verdict says that the circuit cannot be it: `misfit`; or `inconsistent` where the fit had
-# to bend the impedance of the driver to come near.
+# 45 %. The verdict says that the circuit cannot be it: `misfit`; or `inconsistent` where the fit
+# had to bend the impedance of the driver to come near.
 
 # %%
 small = {

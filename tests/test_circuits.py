@@ -113,7 +113,7 @@ def test_trees_are_their_polynomials():
 def test_a_constant_phase_is_no_ratio_of_polynomials():
     assert SkinTwoLayer().is_rational
     assert not SkinCole().is_rational
-    with pytest.raises(ValueError, match="no rational function of s; .*maximum_likelihood"):
+    with pytest.raises(ValueError, match=r"no rational function of s; .*maximum_likelihood"):
         SkinCole().impedance().rational()
 
 

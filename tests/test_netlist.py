@@ -73,7 +73,8 @@ def test_a_netlist_is_its_circuit(circuit):
 @pytest.mark.parametrize("band", [BAND, (1e-3, 1e3)])
 @pytest.mark.parametrize("alpha", [0.05, 0.3, 0.5, 0.7, 0.9, 0.99, 1.0])
 def test_a_ladder_is_a_constant_phase_in_its_band(alpha, band):
-    s = 2j * np.pi * np.geomspace(*band, 1000)
+    low, high = band
+    s = 2j * np.pi * np.geomspace(low, high, 1000)
     expected = 1 / (2e-9 * s**alpha)
     found = np.asarray(ladder(2e-9, alpha, band)(jnp.asarray(s)))
     assert np.abs(found / expected - 1).max() < LADDER_ERROR
@@ -174,22 +175,18 @@ def test_an_exponent_above_one_has_no_passive_network():
 def test_netlists_of_identified_circuits_give_their_voltages_back(tmp_path, monkeypatch):
     """From records, through a fit and ngspice, to what the records are without their noise."""
     monkeypatch.setattr(ngspice, "CACHE", tmp_path)
-    trials = (
-        Trial("layers", SkinTwoLayer(33.4e3, 150e3, 0.12e-9, 36e3, 5e-9)),
-        Trial("cole", SPREAD),
-    )
+    circuits = {"layers": SkinTwoLayer(33.4e3, 150e3, 0.12e-9, 36e3, 5e-9), "cole": SPREAD}
+    trials = tuple(Trial(path, circuit) for path, circuit in circuits.items())
     scene = dataclasses.replace(rung("dry"), trials=trials)
     study = scene.simulate(0)
     driver = etid.identify_driver(study[CALIBRATION])
     found = tuple(
-        Trial(
-            one.path, etid.identify_skin(study[one.path], driver, circuit=type(one.load)()).circuit
-        )
-        for one in trials
+        Trial(path, etid.identify_skin(study[path], driver, circuit=type(circuit)()).circuit)
+        for path, circuit in circuits.items()
     )
     exact = {"snr_db": None, "bits": None, "trigger_jitter_rms": 0.0}
     true = dataclasses.replace(scene, **exact).simulate(0)
     by_ngspice = ngspice.record(dataclasses.replace(scene, trials=found, **exact), 0)
-    for one in trials:
-        v_out = true[one.path].v_out
-        assert np.abs(by_ngspice[one.path].v_out - v_out).max() < 1e-3 * np.abs(v_out).max()
+    for path in circuits:
+        v_out = true[path].v_out
+        assert np.abs(by_ngspice[path].v_out - v_out).max() < 1e-3 * np.abs(v_out).max()
