@@ -150,7 +150,7 @@ def test_times_that_are_no_clock_are_refused(stamps, message, tmp_path):
         ({"current": "j"}, r"current: there is no 'j'"),
         ({"v_out": None}, "v_out: is not given, and is not guessed"),
         ({"pulse_rate": None}, "pulse_rate: is not given"),
-        ({"scale": None}, "scale: is not given.*1 if the values are volts"),
+        ({"scale": None}, "scale: is not given.*1 if the values are those at the terminal"),
         ({"scale": 0}, "scale: is 0"),
         ({"scale": float("nan")}, "scale: is nan"),
         ({"sample_rate": None}, "one of time and sample_rate"),
@@ -175,7 +175,7 @@ def test_a_wrong_argument_is_explained(changes, message, table, tmp_path):
         ("th,out\n1,2\n3,\n", "cannot be read"),
         ("th,out\n1,2\n3\n", "cannot be read"),
         ("th;out\n1;2\n", "there is no 'th'; the names are 'th;out'"),
-        ("th,out,th\n1,2,3\n", "two columns have the name 'th'"),
+        ("th,out,th\n1,2,3\n", "two channels have the name 'th'"),
         ("th,out\n1,2\n\xff", "cannot be read"),
     ],
 )
