@@ -19,8 +19,10 @@ FLOORS = {
     "traces": 0,
     "spectra": 0,
     "transfer": 0,
+    "units": 0,
     "verdicts": 0,
     "schema": 0,
+    "schema_page": 1,
     "elements": 1,
     "circuits": 2,
     "dispersion": 2,
@@ -42,7 +44,18 @@ FLOORS = {
     "periodic": 0,
     "methods": 5,
     "hdf5": 4,
-    "importing": 4,
+    "channels": 3,
+    "mapping": 4,
+    "formats": 4,
+    "formats.abf": 4,
+    "formats.delimited": 4,
+    "formats.matlab": 4,
+    "formats.npz": 4,
+    "formats.tdms": 4,
+    "imported": 5,
+    "importing": 6,
+    "nwb": 5,
+    "exporting": 6,
     "scenes": 4,
     "information": 4,
     "harmonic_steiglitz_mcbride": 5,
@@ -73,6 +86,7 @@ FLOORS = {
     "demo": 14,
     "commands": 14,
     "commands.check": 15,
+    "commands.exporting": 15,
     "commands.fit": 15,
     "commands.importing": 15,
     "commands.simulate": 15,
@@ -126,7 +140,7 @@ import jax
 before = dict(jax.config.values)
 import sys, etid
 assert dict(jax.config.values) == before
-assert not {"matplotlib", "pandas", "jaxopt"} & set(sys.modules), "imported too much"
+assert not {"matplotlib", "pandas", "jaxopt", "pyarrow", "pynwb"} & set(sys.modules), "too much"
 """
     done = run(code)
     assert (done.returncode, done.stdout, done.stderr) == (0, "", "")

@@ -1,14 +1,13 @@
 import json
 import sys
 
-import h5py
 import numpy as np
 import pytest
-import scipy.io
 
 from etid import hdf5
 from etid.importing import import_file
 from etid.recording import RecordingError
+from tests.lab_files import matlab
 
 TABLE = {"v_th": "th", "v_out": "out", "sample_rate": 200e3, "pulse_rate": 60.0, "scale": 0.0535}
 TH = np.array([0.0, 0.25, 2.5, 2.25, 0.0])
@@ -190,22 +189,6 @@ def test_a_byte_order_mark_and_quoted_names_are_no_obstacle(tmp_path):
     path = tmp_path / "t.csv"
     path.write_text('"th","out"\r\n1,2\r\n3,4\r\n', encoding="utf-8-sig")
     assert imported(path, **TABLE)["loaded/0"].v_out.size == 2
-
-
-def matlab(path, version, **variables):
-    """A MATLAB file; version 7.3 is HDF5 with reversed axes behind a 512-byte header."""
-    if version == 5:
-        scipy.io.savemat(path, variables)
-        return path
-    with h5py.File(path, "w", userblock_size=512) as file:
-        for name, value in variables.items():
-            array = np.atleast_2d(value)
-            file[name] = array.T
-            names = {"f": "double", "i": "int16"}
-            file[name].attrs["MATLAB_class"] = np.bytes_(names[array.dtype.kind])
-    with path.open("r+b") as file:
-        file.write(b"MATLAB 7.3 MAT-file".ljust(124) + b"\x00\x02IM")
-    return path
 
 
 @pytest.mark.parametrize("version", [5, 7.3])
