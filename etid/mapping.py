@@ -100,7 +100,7 @@ def plans(
     if not isinstance(tables, list) or not all(isinstance(table, Mapping) for table in tables):
         raise RecordingError("must be tables", field="recording", remedy="Write [[recording]]")
     common = {key: value for key, value in mapping.items() if key != "recording"}
-    _known(common, (*CHANNELS, *FIELDS, "recording"))
+    _known(common, (*CHANNELS, *FIELDS, "recording" if tables else "path"))
     found: list[Plan] = []
     for table in tables or [{}]:
         said = {**common, **table}

@@ -64,6 +64,7 @@ def opened_table(path: str | os.PathLike[str], kind: str) -> Iterator[h5py.File]
         raise _unreadable(path, error) from error
     with file:
         found = file.attrs.get("schema")
+        found = found.decode() if isinstance(found, bytes) else found
         if found != kind:
             raise ValueError(f"{path}: attribute schema is {found!r}, not {kind!r}")
         yield file
