@@ -45,9 +45,8 @@ def export_fits(source: str | os.PathLike[str], target: str | os.PathLike[str]) 
             f"{os.fspath(target)}: fits are exported as {' or '.join(_WRITERS)}, not {suffix!r}"
         )
     with opened_table(source, SCHEMA) as file, replacing(target) as partial:
-        elements = [
-            name + ending for name in file.attrs["parameters"] for ending in ("", "_stderr")
-        ]
+        parameters: Any = file.attrs["parameters"]
+        elements = [name + ending for name in parameters for ending in ("", "_stderr")]
         columns = {name: _column(file, name) for name in (*LABELS, *elements, *_QUALITY)}
         about = {name: str(file.attrs[name]) for name in ("circuit", "method", "etid_version")}
         _WRITERS[suffix](columns, about, partial)

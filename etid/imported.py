@@ -77,9 +77,9 @@ class Imported:
     signals: Mapping[str, Used]
 
     def __str__(self) -> str:
-        last = f" … {self.paths[-1]}" if len(self.paths) > 1 else ""
+        ends = self.paths if len(self.paths) < 3 else (self.paths[0], self.paths[-1])
         lines = [
-            f"{self.paths[0]}{last}: {self.samples} samples at {self.sample_rate:.9g} Hz "
+            f"{' … '.join(ends)}: {self.samples} samples at {self.sample_rate:.9g} Hz "
             f"({self.rate_by}), pulses at {self.pulse_rate:.9g} Hz"
         ]
         return "\n".join(lines + [f"  {name:<8}{used}" for name, used in self.signals.items()])

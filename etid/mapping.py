@@ -183,14 +183,13 @@ def _signal(name: str, said: Any, common: Any, implied: str) -> Signal:
     scale = _number(f"{name}.scale", said.get("scale"))
     if scale is None and name in ("v_th", "v_out"):
         scale = _number("scale", common)
-    rows = said.get("rows")
-    if isinstance(rows, list) and rows and all(map(_is_row, rows)):
-        rows = tuple(rows)
-    elif rows is not None and not _is_row(rows):
+    rows: Any = said.get("rows")
+    several = isinstance(rows, list) and rows and all(map(_is_row, rows))
+    if not (several or rows is None or _is_row(rows)):
         raise RecordingError(
             f"is {rows!r}, must be one number or several, from 0 on", field=f"{name}.rows"
         )
-    return Signal(said["channel"], unit, scale, rows, implied)
+    return Signal(said["channel"], unit, scale, tuple(rows) if several else rows, implied)
 
 
 def _is_row(row: object) -> bool:

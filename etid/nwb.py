@@ -10,16 +10,19 @@ import pathlib
 from collections.abc import Hashable, Mapping
 from typing import Any
 
+import hdmf.common
 import numpy as np
-from hdmf.common import DynamicTable, VectorData
+import pynwb
 from hdmf.data_utils import GenericDataChunkIterator
-from pynwb import NWBHDF5IO, NWBFile, TimeSeries
-from pynwb.file import Subject
 
 from etid import schema
 from etid.hdf5 import read
 from etid.recording import LABELS, AbstractSource, Layout, RecordingError
 from etid.tables import replacing
+
+# How pynwb declares arguments hides them from a type checker.
+_nwb: Any = pynwb
+_tables: Any = hdmf.common
 
 _LABELS = {
     "path": "path in the etid file",
@@ -54,14 +57,14 @@ def write_nwb(
             raise next(iter(study.problems.values()))
         subjects = {study.metadata(path).subject for path in study}
         only = subjects.pop() if len(subjects) == 1 else ""
-        file = NWBFile(
+        file = _nwb.NWBFile(
             session_description="Recordings of an electro-tactile stimulator's output",
             identifier=hashlib.file_digest(content, "sha256").hexdigest(),
             session_start_time=session_start,
-            subject=Subject(subject_id=only) if only else None,
+            subject=_nwb.file.Subject(subject_id=only) if only else None,
         )
         rows: list[dict[str, Any]] = []
-        shared: dict[Hashable, TimeSeries] = {}
+        shared: dict[Hashable, Any] = {}
         for path in study:
             recording = study.source(path)
             series = _series(path, recording, shared)
@@ -74,12 +77,14 @@ def write_nwb(
             rows.append(_row(recording, {name: each.name for name, each in series.items()}))
         described = _LABELS | _NUMBERS | {key: f"TimeSeries: {_SERIES[key]}" for key in _SERIES}
         columns = [
-            VectorData(name=name, description=text, data=[row[name] for row in rows])
+            _tables.VectorData(name=name, description=text, data=[row[name] for row in rows])
             for name, text in described.items()
         ]
-        table = DynamicTable(name="recordings", description="A line per recording", columns=columns)
+        table = _tables.DynamicTable(
+            name="recordings", description="A line per recording", columns=columns
+        )
         file.add_acquisition(table)
-        with replacing(target) as partial, NWBHDF5IO(partial, "w") as output:
+        with replacing(target) as partial, _nwb.NWBHDF5IO(partial, "w") as output:
             output.write(file)
 
 
@@ -101,14 +106,12 @@ class _Samples(GenericDataChunkIterator):
         return np.dtype(self.record.dtype)
 
 
-def _series(
-    path: str, source: AbstractSource, shared: dict[Hashable, TimeSeries]
-) -> dict[str, TimeSeries]:
+def _series(path: str, source: AbstractSource, shared: dict[Hashable, Any]) -> dict[str, Any]:
     """The records of a recording."""
     series = {}
     for record in source.layout:
         key = source.unloaded if record.name == "v_th" else None
-        series[record.name] = TimeSeries(
+        series[record.name] = _nwb.TimeSeries(
             name=f"{path}/{record.name}".replace("/", ".").replace(":", "."),
             description=_SERIES[record.name],
             data=shared[key] if key in shared else _Samples(source, record),

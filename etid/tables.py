@@ -81,7 +81,8 @@ def read_column(column: h5py.Dataset, rows: Any = ()) -> np.ndarray:
         ValueError: The file is damaged.
     """
     try:
-        return column.asstr()[rows] if h5py.check_string_dtype(column.dtype) else column[rows]
+        text = h5py.check_string_dtype(column.dtype)
+        return np.asarray(column.asstr()[rows] if text else column[rows])
     except OSError as error:
         raise _unreadable(column.file.filename, error) from error
 

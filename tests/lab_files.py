@@ -12,7 +12,7 @@ def tdms(path, channels, **properties):
     with TdmsWriter(path) as writer:
         writer.write_segment(
             [
-                ChannelObject(*name.split("/"), samples, {**properties, **own})
+                ChannelObject(*name.split("/", 1), data=samples, properties={**properties, **own})
                 for name, (samples, own) in channels.items()
             ]
         )

@@ -1,16 +1,19 @@
 """Exported files, read back by the programs they are for."""
 
+import contextlib
 import csv
 import datetime
 import sys
+from collections.abc import Iterator
+from typing import Any
 
 import h5py
 import jax.numpy as jnp
 import numpy as np
 import pandas
+import pynwb
 import pytest
 from pyarrow import parquet
-from pynwb import NWBHDF5IO, validate
 
 import etid
 from etid import cli, exporting
@@ -110,13 +113,21 @@ def test_no_fit_is_an_empty_table(fits, tmp_path):
     assert parquet.read_table(tmp_path / "none.parquet").num_rows == 0
 
 
+@contextlib.contextmanager
+def opened(path) -> Iterator[Any]:
+    """An NWB file as pynwb reads it."""
+    io: Any = pynwb.NWBHDF5IO  # whose arguments and results a type checker cannot see
+    with io(path, "r") as content:
+        yield content.read()
+
+
 @pytest.fixture
 def study_file(tmp_path):
     """A calibration and three trials that share an unloaded record; one more with a current."""
     codes = np.random.default_rng(1).integers(-9000, 9000, size=(5, 400)).astype("i2")
     shared = etid.Samples(codes[0], 0.0057)
-    common = {"sample_rate": 200e3, "pulse_rate": 60.0}
-    skin = {"subject": "s01", "condition": "dry", "calibration": "calibration/98k8"}
+    common: dict[str, Any] = {"sample_rate": 200e3, "pulse_rate": 60.0}
+    skin: dict[str, Any] = {"subject": "s01", "condition": "dry", "calibration": "calibration/98k8"}
     recordings = [
         etid.Recording(shared, etid.Samples(codes[4], 0.0057), r_load=98.8e3, subject="s01",
                        path="calibration/98k8", adc_range=(-186.9, 186.9), **common)
@@ -139,9 +150,8 @@ def study_file(tmp_path):
 def test_nwb_holds_what_was_stored_and_all_that_was_said(study_file, tmp_path):
     target = tmp_path / "study.nwb"
     etid.export_study(study_file, target, session_start=START)
-    assert validate(path=str(target)) == []
-    with NWBHDF5IO(target, "r") as opened, etid.read(study_file) as study:
-        file = opened.read()
+    assert pynwb.validate(path=str(target)) == []
+    with opened(target) as file, etid.read(study_file) as study:
         assert file.session_start_time == START
         assert file.subject.subject_id == "s01"
         table = file.acquisition["recordings"].to_dataframe().set_index("path")
@@ -181,8 +191,7 @@ def test_nwb_of_several_subjects_names_none_for_the_whole_file(study_file, tmp_p
     with h5py.File(study_file, "a") as file:
         file["s01/damp"].attrs["subject"] = "s02"
     etid.export_study(study_file, tmp_path / "study.nwb", session_start=START)
-    with NWBHDF5IO(tmp_path / "study.nwb", "r") as opened:
-        file = opened.read()
+    with opened(tmp_path / "study.nwb") as file:
         assert file.subject is None
         assert set(file.acquisition["recordings"]["subject"][:]) == {"s01", "s02"}
 
@@ -219,7 +228,7 @@ def test_a_missing_package_is_named_with_its_extra(
         monkeypatch.delitem(sys.modules, name)
     monkeypatch.setitem(sys.modules, package, None)
     source, options = file, {}
-    export = etid.export_fits
+    export: Any = etid.export_fits
     if package == "pynwb":
         source, export, options = study_file, etid.export_study, {"session_start": START}
     with pytest.raises(etid.RecordingError, match=rf"needs the package {package}.*'etid\[{extra}"):
@@ -269,5 +278,5 @@ def test_the_command_exports_both(file, study_file, tmp_path):
     start = ("--session-start", "2026-01-31T09:30:00+00:00")
     target = tmp_path / "t.nwb"
     assert cli.main(["export", str(study_file), "-o", str(target), *start]) == 0
-    with NWBHDF5IO(target, "r") as opened:
-        assert opened.read().session_start_time == START
+    with opened(target) as file:
+        assert file.session_start_time == START

@@ -4,6 +4,7 @@ import pathlib
 import re
 import sys
 import tomllib
+from typing import Any
 
 import numpy as np
 import pytest
@@ -21,7 +22,7 @@ V_TH, V_OUT = RNG.normal(size=(2, 1000))
 CODES = RNG.integers(-3000, 3000, size=1000).astype("i2")
 LINE = {"NI_Number_Of_Scales": 1, "NI_Scale[0]_Scale_Type": "Linear",
         "NI_Scale[0]_Linear_Slope": 2e-3, "NI_Scale[0]_Linear_Y_Intercept": 0.5}  # fmt: skip
-GIVEN = {"pulse_rate": 60.0, "scale": 0.0535}
+GIVEN: dict[str, Any] = {"pulse_rate": 60.0, "scale": 0.0535}
 
 
 def imported(source, mapping):
@@ -97,7 +98,8 @@ def test_the_tdms_file_of_the_readme_is_imported_by_its_mapping(tmp_path):
     recordings, used = imported(path, example("TDMS"))
     assert list(recordings) == ["calibration/98k8", "s01/dry"]
     np.testing.assert_allclose(recordings["s01/dry"].v_out, V_TH * 4 / 0.0535, rtol=1e-15)
-    np.testing.assert_allclose(recordings["s01/dry"].current, V_TH * 5 / 100, rtol=1e-15)
+    current = recordings["s01/dry"].samples["current"].values
+    np.testing.assert_allclose(current, V_TH * 5 / 100, rtol=1e-15)
     assert recordings["s01/dry"].sample_rate == 200e3
     assert str(used[1].signals["current"]) == "'s01 dry/shunt' in Volts (file), divided by 100"
 
@@ -109,7 +111,7 @@ def test_the_abf_file_of_the_readme_is_imported_by_its_mapping(tmp_path):
     one = recordings["s01/dry/1"]
     assert (one.trial, one.sample_rate) == ("2", 200e3)  # trials are called by their sweeps
     assert one.samples["v_out"].stored.dtype == np.int16
-    step = one.samples["v_out"].resolution  # codes are cut off, not rounded
+    step = one.samples["v_out"].conversion  # codes are cut off, not rounded
     np.testing.assert_allclose(one.v_out, sweeps[2] * 1e-3 / 0.0535, rtol=0, atol=1.001 * step)
     np.testing.assert_allclose(one.v_th, V_TH * 1e-3 / 0.0535, rtol=0, atol=1.001 * step)
 
@@ -190,7 +192,7 @@ def test_matlab_7_3_needs_no_package_and_cells_and_references_are_no_channels(
     path = matlab(tmp_path / "m.mat", 7.3, **{"#refs#": {"a": V_TH}}, open=V_TH, skin=V_OUT)
     target = tmp_path / "m.h5"
     etid.import_file(path, target, v_th="open", v_out="skin", sample_rate=2e5, **GIVEN)
-    refs = {"v_th": "#refs#.a", "v_out": "skin", "sample_rate": 2e5}
+    refs: dict[str, Any] = {"v_th": "#refs#.a", "v_out": "skin", "sample_rate": 2e5}
     with pytest.raises(RecordingError, match=r"the names are 'open', 'skin'\."):
         etid.import_file(path, target, **refs, **GIVEN)
 

@@ -136,7 +136,8 @@ def test_what_a_mapping_says_is_not_said_by_arguments_too(rig, tmp_path):
 
 def test_a_current_may_be_a_voltage_over_a_known_resistor(run):
     current = 'current = {channel = "rig/shunt", scale = 50.0}\n'
-    np.testing.assert_allclose(run(current + GIVEN)[0]["loaded/0"].current, OUT * 1e-3 / 50)
+    record = run(current + GIVEN)[0]["loaded/0"].samples["current"]
+    np.testing.assert_allclose(record.values, OUT * 1e-3 / 50, rtol=1e-15)
 
 
 def test_arguments_take_a_unit_from_the_file_and_are_in_volts_where_it_names_none(rig, tmp_path):
@@ -209,7 +210,7 @@ def test_rows_choose_sweeps_and_their_labels_may_be_given(run, tmp_path):
     recordings, used = run(text, source)
     assert [one.trial for one in recordings.values()] == ["first", "second"]
     assert used[0].paths == ("s01/dry/0", "s01/dry/1")
-    step = recordings["s01/dry/0"].samples["v_out"].resolution
+    step = recordings["s01/dry/0"].samples["v_out"].conversion
     for one, row in zip(recordings.values(), (3, 1), strict=True):
         np.testing.assert_allclose(one.v_out, sweeps[row], rtol=0, atol=1.001 * step)
         np.testing.assert_allclose(one.v_th, sweeps[0], rtol=0, atol=1.001 * step)

@@ -7,6 +7,7 @@ sweeps are trials.  pyabf itself would read the whole file and round its codes t
 import contextlib
 import pathlib
 from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
 
@@ -25,7 +26,7 @@ def opened(path: pathlib.Path, folder: pathlib.Path) -> Iterator[Contents]:
     except ImportError:
         raise needs("pyabf", "abf", str(path)) from None
 
-    abf = pyabf.ABF(path, loadData=False)
+    abf: Any = pyabf.ABF(path, loadData=False)
     dtype = np.dtype(abf._dtype).newbyteorder("<")
     sweeps, length, count = abf.sweepCount, abf.sweepPointCount, abf.channelCount
     if hasattr(abf, "_synchArraySection") and len(set(abf._synchArraySection.lLength)) > 1:

@@ -14,7 +14,7 @@ import numpy as np
 from etid.channels import Channel, Contents, needs, real
 from etid.recording import RecordingError
 
-_CACHE = 1 << 26  # bytes: MATLAB's chunks hold several trials, which are read one after the other
+_CACHE = 1 << 25  # bytes: MATLAB's chunks hold several trials, which are read one after the other
 
 
 @contextlib.contextmanager
