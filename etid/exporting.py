@@ -1,21 +1,27 @@
-"""Files for other programs: fits as CSV and Parquet tables, recordings as NWB."""
+"""Files for other programs: tables of fits, one identified circuit, recordings as NWB."""
 
 import csv
 import datetime
+import json
 import os
 import pathlib
+import re
 from collections.abc import Iterator
 from typing import Any
 
 import h5py
 import numpy as np
 
-from etid.channels import needs
+from etid.channels import listed, needs
+from etid.circuits import AbstractCircuit
+from etid.netlist import circuit_string, netlist
 from etid.recording import RecordingError
-from etid.results import LABELS, SCHEMA
+from etid.results import LABELS, SCHEMA, Fits
 from etid.tables import opened_table, read_column, replacing
 
 ROWS = 1 << 16  # of fits in memory at once
+
+CIRCUITS = (".cir", ".json")
 
 _QUALITY = ("rrse", "chi2", "steps", "verdict", "note")
 
@@ -71,7 +77,9 @@ def _csv(columns: dict[str, h5py.Dataset], about: dict[str, str], path: pathlib.
     units = {name: column.attrs.get("unit") for name, column in columns.items()}
     with path.open("w", newline="", encoding="utf-8") as text:
         lines = csv.writer(text)
-        lines.writerow(f"{name} [{unit}]" if unit else name for name, unit in units.items())
+        lines.writerow(
+            name if unit in (None, "1") else f"{name} [{unit}]" for name, unit in units.items()
+        )
         for part in _parts(columns):
             lines.writerows(zip(*(column.tolist() for column in part.values()), strict=True))
 
@@ -95,6 +103,64 @@ def _parquet(columns: dict[str, h5py.Dataset], about: dict[str, str], path: path
 
 
 _WRITERS = {".csv": _csv, ".parquet": _parquet}
+
+
+def export_circuit(
+    source: str | os.PathLike[str],
+    target: str | os.PathLike[str],
+    path: str | None = None,
+    *,
+    circuit: type[AbstractCircuit] | None = None,
+) -> None:
+    """Write one identified circuit of a file of fits for other programs.
+
+    - `.cir`: a SPICE subcircuit between `plus` and `minus`, called `load_` and the path of the
+      recording, as in `load_s01_dry_03` (`etid.netlist`).
+    - `.json`: what `CustomCircuit().load(…)` of impedance.py reads; its initial guess is the
+      identified values (`etid.circuit_string`).
+
+    Args:
+        source: File of fits.
+        target: The file to write; one that exists is replaced at the end.
+        path: Path of the recording; not needed if the file has one fit only.
+        circuit: The kind of circuit, if it is not one of etid's own.
+
+    Raises:
+        ValueError: The source is no file of fits or has no such fit, the fit has not been
+            successful, or the target has another suffix.
+    """
+    suffix = pathlib.Path(target).suffix.lower()
+    if suffix not in CIRCUITS:
+        raise ValueError(f"{os.fspath(target)}: a circuit is exported as {' or '.join(CIRCUITS)}")
+    fits = Fits.read(source, circuit)
+    paths = [str(each) for each in fits.labels["path"]]
+    if path is None and len(paths) == 1:
+        path = paths[0]
+    if path is None or path.strip("/") not in paths:
+        said = "say which recording" if path is None else f"there is no fit of {path!r}"
+        raise ValueError(f"{os.fspath(source)}: {said}; the fits are of {listed(paths)}")
+    index = paths.index(path.strip("/"))
+    fit = fits[index]
+    if fit.verdict != "successful":
+        raise ValueError(
+            f"{os.fspath(source)}: the fit of {paths[index]!r} is {fit.verdict}, no circuit to "
+            f"work with. {fits.notes[index]}"
+        )
+    if suffix == ".cir":
+        name = "load_" + re.sub(r"\W", "_", paths[index], flags=re.ASCII)
+        text = f"* {paths[index]}, by {fit.method}\n{netlist(fit.circuit, name=name)}"
+    else:
+        string, values = circuit_string(fit.circuit)
+        content = {
+            "Name": f"{paths[index]}, by etid",
+            "Circuit String": string,
+            "Initial Guess": values,
+            "Constants": {},
+            "Fit": False,  # its "Fit" would come with impedance.py's own standard errors
+        }
+        text = json.dumps(content, indent=1, ensure_ascii=False) + "\n"
+    with replacing(target) as partial:
+        partial.write_text(text, encoding="utf-8")
 
 
 def export_study(

@@ -3,6 +3,8 @@
 import contextlib
 import csv
 import datetime
+import json
+import re
 import sys
 from collections.abc import Iterator
 from typing import Any
@@ -111,6 +113,53 @@ def test_no_fit_is_an_empty_table(fits, tmp_path):
     assert len((tmp_path / "none.csv").read_text("utf-8").splitlines()) == 1
     etid.export_fits(tmp_path / "none.h5", tmp_path / "none.parquet")
     assert parquet.read_table(tmp_path / "none.parquet").num_rows == 0
+
+
+def test_a_netlist_is_that_of_the_identified_circuit(fits, file, tmp_path):
+    target = tmp_path / "skin.cir"
+    etid.export_circuit(file, target, "path 7")
+    lines = target.read_text("utf-8").splitlines()
+    assert lines[0] == "* path 7, by maximum_likelihood"
+    assert lines[1:] == etid.netlist(fits[7].circuit, name="load_path_7").splitlines()
+    assert ".subckt load_path_7 plus minus" in lines
+
+
+def test_a_circuit_of_impedance_py_has_the_identified_values(fits, file, tmp_path):
+    target = tmp_path / "skin.json"
+    etid.export_circuit(file, target, "path 7")
+    content = json.loads(target.read_text("utf-8"))
+    string, values = etid.circuit_string(fits[7].circuit)
+    assert content.pop("Name") == "path 7, by etid"
+    assert content == {
+        "Circuit String": string,
+        "Initial Guess": values,
+        "Constants": {},
+        "Fit": False,
+    }
+    elements = fits[7].circuit
+    expected = [float(value) for value in (elements.r_s, elements.r_p, elements.c_p)]
+    assert (string, values) == ("R0-p(R1,C1)", expected)
+
+
+def test_a_single_fit_needs_no_path(fits, tmp_path):
+    fits.take(np.arange(COUNT) == 3).write(tmp_path / "one.h5")
+    etid.export_circuit(tmp_path / "one.h5", tmp_path / "one.cir")
+    assert ".subckt load_path_3 plus minus" in (tmp_path / "one.cir").read_text("utf-8")
+
+
+@pytest.mark.parametrize(
+    ("path", "words"),
+    [
+        ("path 4", "the fit of 'path 4' is flat, no circuit to work with. is \"flat\", to a"),
+        ("path 99", "there is no fit of 'path 99'; the fits are of 'path 0', 'path 1', "),
+        (None, "say which recording; the fits are of 'path 0', "),
+    ],
+)
+def test_a_circuit_that_is_not_there_or_no_success_is_not_written(path, words, file, tmp_path):
+    for suffix in exporting.CIRCUITS:
+        with pytest.raises(ValueError, match=re.escape(words)):
+            etid.export_circuit(file, tmp_path / f"a{suffix}", path)
+        assert not (tmp_path / f"a{suffix}").exists()
 
 
 @contextlib.contextmanager
@@ -253,6 +302,8 @@ def test_a_missing_package_is_named_with_its_extra(
             ("fits.h5", "-o", "t.csv", "--session-start", "2026-01-31"),
             "--session-start is for .nwb",
         ),
+        (("fits.h5", "-o", "t.csv", "--path", "path 1"), "t.csv: --path is for .cir and .json"),
+        (("fits.h5", "-o", "t.cir"), "say which recording"),
         (("short.h5", "-o", "t.csv"), "the column chi2 is missing"),
         (("absent.h5", "-o", "t.nwb", "--session-start", "2026-01-31T09:30Z"), "no such file"),
     ],
@@ -273,8 +324,10 @@ def test_what_cannot_be_exported_is_one_line(
     assert sorted(tmp_path.iterdir()) == before
 
 
-def test_the_command_exports_both(file, study_file, tmp_path):
+def test_the_command_exports_all(file, study_file, tmp_path):
     assert cli.main(["export", str(file), "-o", str(tmp_path / "t.csv")]) == 0
+    assert cli.main(["export", str(file), "-o", str(tmp_path / "t.cir"), "--path", "path 1"]) == 0
+    assert ".subckt load_path_1" in (tmp_path / "t.cir").read_text("utf-8")
     start = ("--session-start", "2026-01-31T09:30:00+00:00")
     target = tmp_path / "t.nwb"
     assert cli.main(["export", str(study_file), "-o", str(target), *start]) == 0

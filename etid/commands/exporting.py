@@ -1,11 +1,15 @@
-"""Turn fits into a table (.csv, .parquet), or recordings into .nwb."""
+"""Turn fits or recordings into files of other programs.
+
+Fits become a table (.csv, .parquet); one of them, with --path, a SPICE netlist (.cir) or a circuit
+of impedance.py (.json); recordings become .nwb.
+"""
 
 import argparse
 import datetime
 import pathlib
 
 from etid.commands import DONE
-from etid.exporting import export_fits, export_study
+from etid.exporting import CIRCUITS, export_circuit, export_fits, export_study
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -20,6 +24,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="its suffix says what it becomes",
     )
     parser.add_argument(
+        "--path", metavar="RECORDING", help="for .cir and .json: the recording whose fit it is"
+    )
+    parser.add_argument(
         "--session-start",
         type=datetime.datetime.fromisoformat,
         metavar="TIME",
@@ -29,10 +36,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Write one file."""
-    if arguments.target.suffix.lower() == ".nwb":
-        export_study(arguments.source, arguments.target, session_start=arguments.session_start)
-    elif arguments.session_start is not None:
-        raise ValueError(f"{arguments.target}: --session-start is for .nwb")
+    source, target = arguments.source, arguments.target
+    suffix = target.suffix.lower()
+    if arguments.path is not None and suffix not in CIRCUITS:
+        raise ValueError(f"{target}: --path is for {' and '.join(CIRCUITS)}")
+    if arguments.session_start is not None and suffix != ".nwb":
+        raise ValueError(f"{target}: --session-start is for .nwb")
+    if suffix == ".nwb":
+        export_study(source, target, session_start=arguments.session_start)
+    elif suffix in CIRCUITS:
+        export_circuit(source, target, arguments.path)
     else:
-        export_fits(arguments.source, arguments.target)
+        export_fits(source, target)
     return DONE
