@@ -1,4 +1,4 @@
-"""Channels of a file become recordings: units, scales, trials and the rate, each said by someone.
+"""Channels of a file become recordings: units, scales and trials, each said by someone.
 
 Nothing is guessed.  What neither the file nor the mapping says is an error, and so is what they say
 differently.
@@ -22,17 +22,13 @@ from etid.recording import (
     Samples,
     metadata_from,
 )
+from etid.sampling import sample_rate
 from etid.units import Unit
-
-# Largest distance of a time stamp from a uniform grid, in sample periods: more than the rounding of
-# a printed time, less than a lost or doubled sample (1).
-_TIME_TOLERANCE = 0.25
-
-# A crystal is at most this far off: a measured rate may differ so much from the nominal one.
-_CLOCK_TOLERANCE = 1e-4
 
 # A matrix with more trials than samples, each a small part of a pulse period, lies on its side.
 _SHORTEST_STACKED = 0.1
+
+_KINDS = ("loaded", "calibration")  # paths of what has no path of its own
 
 
 @dataclasses.dataclass(frozen=True)
@@ -160,7 +156,7 @@ def sources_of(
         units[name] = _unit(name, signal, channels[name].unit)
     rows = _rows(plan.signals, channels)
     length = channels["v_out"].length
-    rate, rate_by = _rate(plan, channels, units, by)
+    rate, rate_by = sample_rate(plan, channels, units, by)
     common = metadata_from(**{**plan.fields, "sample_rate": rate, "trial": "", "path": plan.path})
     trials = rows["v_out"]
     stacked = len(channels["v_out"].shape) == 2 and not isinstance(plan.signals["v_out"].rows, int)
@@ -195,9 +191,6 @@ def sources_of(
         for name, signal in plan.signals.items()
     }
     return sources, Imported(tuple(sources), length, rate, rate_by, common.pulse_rate, used)
-
-
-_KINDS = ("loaded", "calibration")  # the paths of what has no path of its own
 
 
 def _unit(name: str, signal: Signal, said: str) -> tuple[Unit, str]:
@@ -261,81 +254,3 @@ def _labels(said: Any, trials: list[int], stacked: bool) -> list[Any]:
     if len(labels) != len(trials):
         raise RecordingError(f"has {len(labels)} labels for {len(trials)} trials", field="trial")
     return labels
-
-
-def _rate(
-    plan: Plan, channels: Mapping[str, Channel], units: Mapping[str, tuple[Unit, str]], by: str
-) -> tuple[float, str]:
-    """The sample rate, and who says it."""
-    said = {
-        plan.signals[name].channel: channel.sample_rate
-        for name, channel in channels.items()
-        if channel.sample_rate is not None
-    }
-    if said and not _agree(*said.values()):
-        raise RecordingError(
-            "differs between the channels: "
-            + ", ".join(f"{name!r} {rate:.9g} Hz" for name, rate in said.items()),
-            field="sample_rate",
-        )
-    theirs = next(iter(said.values()), None)
-    ours = plan.fields.get("sample_rate")
-    if ours is None and "time" in channels:
-        signal = plan.signals["time"]
-        with located("", field="time"):
-            ours = _clock(channels["time"], units["time"][0].factor, channels["v_out"].length)
-        by = f"time {signal.channel!r}"
-    if ours is None and theirs is None:
-        raise RecordingError(
-            "is not given, the file does not say it, and it is not guessed: one of time and "
-            "sample_rate is needed",
-            field="sample_rate",
-            remedy="Give the rate, or the channel of the times",
-        )
-    if ours is None or theirs is None:
-        return (theirs, "file") if ours is None else (ours, by)  # type: ignore[return-value]  # one is there
-    if not _agree(ours, theirs):
-        raise RecordingError(
-            f"is {ours:.9g} Hz by the {by}, {theirs:.9g} Hz by the file",
-            field="sample_rate",
-            remedy="Correct the one that is wrong",
-        )
-    return ours, f"{by}; file {theirs:.9g} Hz"
-
-
-def _agree(*rates: float) -> bool:
-    return max(rates) - min(rates) <= _CLOCK_TOLERANCE * max(rates)
-
-
-def _clock(time: Channel, factor: float, length: int) -> float:
-    """Sample rate of uniform time stamps, from the first and the last."""
-    if time.shape != (length,) or length < 2:
-        raise RecordingError(
-            f"has shape {time.shape}, must be ({length},) with at least two times", field="time"
-        )
-
-    def stamps() -> Iterator[np.ndarray]:
-        return (
-            (block.astype(np.float64) * time.conversion + time.offset) * factor
-            for block in time.blocks()
-        )
-
-    first = last = np.nan
-    for number, block in enumerate(stamps()):
-        first, last = (block[0] if number == 0 else first), block[-1]
-    step = (last - first) / (length - 1)
-    if not step > 0:
-        raise RecordingError("does not increase", field="time", remedy="Times are in seconds")
-    start = 0
-    for block in stamps():
-        distance = np.abs(block - (first + step * np.arange(start, start + block.size))) / step
-        worst = int(np.argmax(distance))  # of a NaN, where there is one
-        if not distance[worst] <= _TIME_TOLERANCE:
-            raise RecordingError(
-                f"is not uniform: sample {start + worst} is {distance[worst]:.2g} sample periods "
-                "off",
-                field="time",
-                remedy="Resample outside, or give the sample_rate the instrument was set to",
-            )
-        start += block.size
-    return float(1 / step)

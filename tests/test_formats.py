@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from nptdms import ChannelObject, TdmsWriter
 
 import etid
 from etid import channels, hdf5
@@ -146,6 +147,15 @@ def test_data_that_were_scaled_before_they_were_written_are_not_scaled_again(tmp
 def test_a_temperature_is_no_voltage(tmp_path):
     own = {**LINE, "NI_Scale[0]_Scale_Type": "Thermocouple"}
     refused(rig(tmp_path, v_out=CODES, **own), pair(), r"v_out: 'rig/skin' is scaled by Thermocoup")
+
+
+def test_a_name_that_two_channels_have_is_not_chosen_from(tmp_path):
+    path = tmp_path / "rig.tdms"
+    with TdmsWriter(path) as writer:
+        known = {"unit_string": "V", "wf_increment": 5e-6}
+        parts = ("rig", "open"), ("rig/skin", "left"), ("rig", "skin/left")
+        writer.write_segment([ChannelObject(*part, data=V_TH, properties=known) for part in parts])
+    refused(path, pair(v_out="rig/skin/left"), "two channels have the name 'rig/skin/left'")
 
 
 def test_text_and_empty_channels_cannot_be_records(tmp_path):

@@ -33,6 +33,7 @@ def rig(tmp_path):
             "rig/slow": (OUT, {**known, "wf_increment": 1e-3}),
             "rig/odd": (OUT, {**known, "unit_string": "furlong"}),
             "rig/shunt": (OUT, known),
+            "rig/near": (OUT, {**known, "wf_increment": 5.0001e-6}),
         },
     )
 
@@ -88,6 +89,7 @@ def test_what_the_file_does_not_say_is_said_by_the_mapping(run):
         ('"rig/skin"', '"rig/skin", unit = 3', "v_out.unit: is 3, which is no unit"),
         ("rig/skin", "rig/odd", "v_out.unit: the file says 'furlong' of channel 'rig/odd'"),
         ("rig/skin", "rig/slow", "differs between the channels: .* 'rig/slow' 1000 Hz"),
+        ("rig/skin", "rig/near", "differs between the channels: .* 'rig/near' 199996 Hz"),
         ("scale", "sample_rate = 100e3\nscale", "sample_rate: is 100000 Hz by the mapping, 200000"),
         ("scale", 'sample_rate = "fast"\nscale', "sample_rate: is 'fast', must be a finite number"),
         ("0.0535", "true", "scale: is True, must be a finite number"),

@@ -31,12 +31,13 @@ def opened(path: pathlib.Path, folder: pathlib.Path) -> Iterator[Contents]:
 
     _check_length(path)
     with nptdms.TdmsFile.open(path) as file:
-        found = {
-            f"{group.name}/{channel.name}": channel
+        found = [
+            (f"{group.name}/{channel.name}", channel)
             for group in file.groups()
             for channel in group.channels()
-        }
-        yield Contents(tuple(found), lambda name: _channel(name, found[name]))
+        ]
+        by_name = dict(found)
+        yield Contents(tuple(name for name, _ in found), lambda name: _channel(name, by_name[name]))
 
 
 def _check_length(path: pathlib.Path) -> None:
