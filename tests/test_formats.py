@@ -158,6 +158,13 @@ def test_a_name_that_two_channels_have_is_not_chosen_from(tmp_path):
     refused(path, pair(v_out="rig/skin/left"), "two channels have the name 'rig/skin/left'")
 
 
+def test_text_of_old_instruments_that_is_not_utf_8_is_no_obstacle(tmp_path, capfd):
+    path = rig(tmp_path, comment="Gr????e")
+    path.write_bytes(path.read_bytes().replace(b"Gr????e", b"Gr\xf6\xdfenx"))
+    assert imported(path, pair())[0]["loaded/0"].sample_rate == 200e3
+    assert capfd.readouterr() == ("", "")
+
+
 def test_text_and_empty_channels_cannot_be_records(tmp_path):
     for data, message in ((["a", "b"], "must be an array of real numbers"), ([], "is empty")):
         values = np.array(data, "O") if data else np.zeros(0)

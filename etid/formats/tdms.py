@@ -4,6 +4,7 @@ Channel c of group g is called `g/c`.
 """
 
 import contextlib
+import logging
 import pathlib
 import struct
 from collections.abc import Iterator
@@ -25,12 +26,18 @@ def opened(path: pathlib.Path, folder: pathlib.Path) -> Iterator[Contents]:
     """A TDMS file."""
     del folder
     try:
-        import nptdms  # optional: only labs with instruments of NI need it
+        import nptdms.log  # optional: only labs with instruments of NI need it
     except ImportError:
         raise needs("npTDMS", "tdms", str(path)) from None
 
     _check_length(path)
-    with nptdms.TdmsFile.open(path) as file:
+    console = nptdms.log.log_manager.console_handler
+    with contextlib.ExitStack() as stack:
+        # What it would print on stderr is an error here, or text that is not UTF-8, which is shown.
+        console.addFilter(_silent)
+        stack.callback(console.removeFilter, _silent)
+        # An open file, because it does not close its own when it fails, and may prefer an index.
+        file = stack.enter_context(nptdms.TdmsFile.open(stack.enter_context(path.open("rb"))))
         found = [
             (f"{group.name}/{channel.name}", channel)
             for group in file.groups()
@@ -38,6 +45,10 @@ def opened(path: pathlib.Path, folder: pathlib.Path) -> Iterator[Contents]:
         ]
         by_name = dict(found)
         yield Contents(tuple(name for name, _ in found), lambda name: _channel(name, by_name[name]))
+
+
+def _silent(_: logging.LogRecord) -> bool:
+    return False
 
 
 def _check_length(path: pathlib.Path) -> None:
