@@ -183,13 +183,15 @@ def _signal(name: str, said: Any, common: Any, implied: str) -> Signal:
     scale = _number(f"{name}.scale", said.get("scale"))
     if scale is None and name in ("v_th", "v_out"):
         scale = _number("scale", common)
-    rows: Any = said.get("rows")
-    several = isinstance(rows, list) and rows and all(map(_is_row, rows))
-    if not (several or rows is None or _is_row(rows)):
-        raise RecordingError(
-            f"is {rows!r}, must be one number or several, from 0 on", field=f"{name}.rows"
-        )
-    return Signal(said["channel"], unit, scale, tuple(rows) if several else rows, implied)
+    return Signal(said["channel"], unit, scale, _rows(f"{name}.rows", said.get("rows")), implied)
+
+
+def _rows(field: str, value: Any) -> tuple[int, ...] | int | None:
+    if isinstance(value, list) and value and all(map(_is_row, value)):
+        return tuple(value)
+    if value is None or _is_row(value):
+        return value
+    raise RecordingError(f"is {value!r}, must be one number or several, from 0 on", field=field)
 
 
 def _is_row(row: object) -> bool:

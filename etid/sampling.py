@@ -52,17 +52,17 @@ def sample_rate(
         with located("", field="time"):
             ours = _clock(channels["time"], units["time"][0].factor, channels["v_out"].length)
         by = f"time {signal.channel!r}"
-    if theirs is None and ours is None:
-        raise RecordingError(
-            "is not given, the file does not say it, and it is not guessed: one of time and "
-            "sample_rate is needed",
-            field="sample_rate",
-            remedy="Give the rate, or the channel of the times",
-        )
+    if ours is None:
+        if theirs is None:
+            raise RecordingError(
+                "is not given, the file does not say it, and it is not guessed: one of time and "
+                "sample_rate is needed",
+                field="sample_rate",
+                remedy="Give the rate, or the channel of the times",
+            )
+        return theirs, "file"
     if theirs is None:
         return ours, by
-    if ours is None:
-        return theirs, "file"
     if not _agree(_CLOCK_TOLERANCE, ours, theirs):
         raise RecordingError(
             f"is {ours:.9g} Hz by the {by}, {theirs:.9g} Hz by the file",
