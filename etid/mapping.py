@@ -187,10 +187,12 @@ def _signal(name: str, said: Any, common: Any, implied: str) -> Signal:
 
 
 def _rows(field: str, value: Any) -> tuple[int, ...] | int | None:
+    if value is None:
+        return None
+    if _is_row(value):
+        return int(value)
     if isinstance(value, list) and value and all(map(_is_row, value)):
         return tuple(value)
-    if value is None or _is_row(value):
-        return value
     raise RecordingError(f"is {value!r}, must be one number or several, from 0 on", field=field)
 
 
