@@ -28,10 +28,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--session-start",
-        type=datetime.datetime.fromisoformat,
+        type=moment,
         metavar="TIME",
         help="for .nwb: when the session began, such as 2026-01-31T09:30:00+01:00",
     )
+
+
+def moment(text: str) -> datetime.datetime:
+    """A date and time as ISO 8601 writes it."""
+    return datetime.datetime.fromisoformat(text)
 
 
 def run(arguments: argparse.Namespace) -> int:
