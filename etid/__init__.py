@@ -27,6 +27,9 @@ from etid.elements import constant_phase as constant_phase
 from etid.elements import parallel as parallel
 from etid.elements import resistor as resistor
 from etid.elements import series as series
+from etid.exporting import export_circuit as export_circuit
+from etid.exporting import export_fits as export_fits
+from etid.exporting import export_study as export_study
 from etid.hdf5 import check as check
 from etid.hdf5 import read as read
 from etid.identify import identify_driver as identify_driver

@@ -12,9 +12,15 @@ from collections.abc import Sequence
 import jax
 
 import etid
-from etid.commands import WRONG_DATA, check, fit, importing, simulate
+from etid.commands import WRONG_DATA, check, exporting, fit, importing, simulate
 
-COMMANDS = {"simulate": simulate, "import": importing, "check": check, "fit": fit}
+COMMANDS = {
+    "simulate": simulate,
+    "import": importing,
+    "check": check,
+    "fit": fit,
+    "export": exporting,
+}
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -9,9 +9,9 @@ the size of a quantisation step stays known.
 import abc
 import dataclasses
 import math
-from collections.abc import Hashable, Iterable, Mapping
+from collections.abc import Hashable, Iterable, Iterator, Mapping
 from types import MappingProxyType
-from typing import Any, SupportsFloat
+from typing import Any, NamedTuple, SupportsFloat
 
 import numpy as np
 import numpy.typing as npt
@@ -393,6 +393,16 @@ def _samples(name: str, record: npt.ArrayLike | Samples) -> Samples:
     return samples
 
 
+class Layout(NamedTuple):
+    """One record of a recording without its samples, as in `Samples`."""
+
+    name: str
+    dtype: str
+    length: int
+    conversion: float
+    offset: float
+
+
 class AbstractSource(abc.ABC):
     """What a study holds: metadata now, a `Recording` when asked for."""
 
@@ -403,13 +413,17 @@ class AbstractSource(abc.ABC):
 
     @property
     @abc.abstractmethod
-    def layout(self) -> Hashable:
+    def layout(self) -> tuple[Layout, ...]:
         """Names, dtypes, lengths and scales; recordings of equal layout fit in one stack."""
 
     @property
     @abc.abstractmethod
     def unloaded(self) -> Hashable:
         """Identity of `v_th`: equal for recordings that share one unloaded record."""
+
+    @abc.abstractmethod
+    def blocks(self, name: str) -> Iterator[npt.NDArray]:
+        """The stored samples of one record, in order, as much at a time as memory should hold."""
 
     @abc.abstractmethod
     def load(self) -> Recording:

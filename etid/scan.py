@@ -19,6 +19,7 @@ from etid import schema
 from etid.recording import (
     SIGNALS,
     AbstractSource,
+    Layout,
     Metadata,
     Recording,
     RecordingError,
@@ -142,9 +143,9 @@ class _Row(AbstractSource):
         return dataclasses.replace(common, path=f"{common.path}/{self.row}", trial=trial)
 
     @property
-    def layout(self) -> Hashable:
+    def layout(self) -> tuple[Layout, ...]:
         return tuple(
-            (name, header.dtype.str, header.length, header.conversion, header.offset)
+            Layout(name, header.dtype.str, header.length, header.conversion, header.offset)
             for name, header in self.block.headers.items()
         )
 
@@ -152,6 +153,9 @@ class _Row(AbstractSource):
     def unloaded(self) -> Hashable:
         common = not self.block.headers["v_th"].stacked
         return (id(self.block), None if common else self.row)
+
+    def blocks(self, name: str) -> Iterator[np.ndarray]:
+        yield self.block.samples(name, self.row).stored
 
     def load(self) -> Recording:
         records: dict[str, Any] = {

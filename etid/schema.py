@@ -1,14 +1,12 @@
 """The layout of an etid file, version 1.0: one table, from which everything else is made.
 
-`FIELDS` is what the reader checks a file against, and what `python -m etid.schema data_schema`
+`FIELDS` is what the reader checks a file against, and what `python -m etid.schema_page data_schema`
 turns into `recording-1.json`, for machines, and `README.md`, for people.
 """
 
 import dataclasses
 import difflib
 import json
-import pathlib
-import sys
 from collections.abc import Iterable
 from typing import Any, Literal
 
@@ -322,117 +320,3 @@ def as_json() -> str:
         "fields": [dataclasses.asdict(field) for field in FIELDS],
     }
     return json.dumps(table, indent=2, ensure_ascii=False) + "\n"
-
-
-EXAMPLE = """\
-import h5py
-import numpy as np
-
-pulse = np.tile(np.r_[np.zeros(3200, "i2"), np.full(133, 9000, "i2")], 3)  # three periods
-volts_per_code = 20 / 2**16 / 0.0535  # 20 V over 16 bits, behind a scale of 0.0535
-
-with h5py.File("study.h5", "w") as file:
-    file.attrs.update(schema="etid/recording", schema_version="1.0")
-    known = file.create_group("calibration/98k8")
-    known.attrs.update(kind="calibration", sample_rate=200e3, pulse_rate=60.0, r_load=98.8e3)
-    skin = file.create_group("s01/dry")
-    skin.attrs.update(kind="loaded", sample_rate=200e3, pulse_rate=60.0, subject="s01")
-    skin.attrs.update(condition="dry", calibration="calibration/98k8", trial=[0, 1, 2])
-    for group, loaded in (known, pulse // 2), (skin, np.stack([pulse // 3] * 3)):
-        for name, codes in ("v_th", pulse), ("v_out", loaded):
-            group[name] = codes
-            group[name].attrs.update(unit="volt", conversion=volts_per_code)
-"""
-
-_INTRODUCTION = f"""\
-# Data schema {VERSION}
-
-<!-- made from the table in etid/schema.py by `python -m etid.schema data_schema` -->
-
-An etid file is an HDF5 file with recordings of a stimulator's output: unloaded (`v_th`) and with a
-load (`v_out`), on one clock. Every group, at any depth, with the attribute `kind` is a recording,
-or a stack of trials that differ in nothing but their samples and the label `trial`.
-`recording-1.json` holds the same table for machines.
-
-```
-study.h5                     schema="etid/recording", schema_version="1.0"
-├── calibration/98k8         kind="calibration", r_load=98800, sample_rate=200000, pulse_rate=60
-│   ├── v_th (time,)         unit="volt", conversion=0.0057
-│   └── v_out (time,)        unit="volt", conversion=0.0057
-└── s01/dry                  kind="loaded", subject="s01", calibration="calibration/98k8", …
-    ├── v_th (time,)         one unloaded record for all trials, or (trial, time)
-    └── v_out (trial, time)  read as the recordings s01/dry/0, s01/dry/1, …
-```
-
-## Write one
-
-```python
-{EXAMPLE}```
-
-`etid check study.h5` says what is wrong with a file, field by field. `example.h5` is a file with a
-calibration and a stack of three trials; `python data_schema/make_example.py data_schema/example.h5`
-made it.
-"""
-
-_RULES = """\
-## Reading rules
-
-- The value of a sample is `conversion · stored + offset` in `unit`, as in NWB's TimeSeries. Store
-  converter codes as integers: their step is then known, and nothing is rounded.
-- Row `t` of a stacked group `g` is the recording `g/t`. Rows are trials, columns are time; nothing
-  is transposed. A calibration group holds one recording, and no recording lies inside another.
-- Recordings come in the order of their paths, numbers in them by value: `s2` before `s10`.
-- `v_th`, `v_out` and `current` may be hard or soft links to a dataset of the same file, for example
-  to an unloaded record that several groups share. External links, external storage and virtual
-  datasets are refused: a file is whole. Groups are not reached through soft links.
-- `NaN` is a missing sample. Samples are never complex.
-- Unknown attributes, datasets and groups are ignored, except where the name is nearly that of an
-  absent field (`samplerate`): that is reported, not guessed.
-- A recording that breaks a rule is left out and listed in `Study.problems`; the others are read.
-- Text is UTF-8. An array of one element counts as a scalar.
-- etid writes text of a fixed length and opens files with `libver="v108"`: all but the samples is
-  then under checksums, and damage is an error. Text of variable length, h5py's default, is read
-  too, but no checksum protects it: damage inside it can hang the HDF5 library itself.
-- A file of a newer minor version is read, one of another major version is refused.
-
-What etid writes is the same layout: recordings `g/0 … g/T-1` that differ in nothing but samples and
-trial become one stacked group `g`, every other recording a group of its own.
-"""
-
-
-def as_markdown() -> str:
-    """The table for people."""
-    titles = {
-        "file attribute": "Attributes of the file",
-        "group attribute": "Attributes of a recording's group",
-        "dataset": "Datasets of a recording's group",
-        "dataset attribute": "Attributes of a dataset",
-    }
-    parts = [_INTRODUCTION]
-    for place, title in titles.items():
-        lines = [
-            f"## {title}",
-            "",
-            "| name | type | shape | unit | required | meaning | example |",
-            "|---|---|---|---|---|---|---|",
-        ]
-        for field in at(place).values():  # type: ignore[arg-type]  # keys of titles are places
-            need = field.required + (f", forbidden for {field.forbidden}" * bool(field.forbidden))
-            example = json.dumps(field.example)
-            lines.append(
-                f"| `{field.name}` | {field.type} | {field.shape} | {field.unit} | {need} | "
-                f"{field.description} | `{example}` |"
-            )
-        parts.append("\n".join(lines) + "\n")
-    return "\n".join([*parts, _RULES])
-
-
-def write(folder: str | pathlib.Path) -> None:
-    """Write `recording-1.json` and `README.md` into a folder."""
-    target = pathlib.Path(folder)
-    (target / "recording-1.json").write_text(as_json(), encoding="utf-8")
-    (target / "README.md").write_text(as_markdown(), encoding="utf-8")
-
-
-if __name__ == "__main__":
-    write(sys.argv[1])

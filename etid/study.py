@@ -3,9 +3,20 @@
 import dataclasses
 import difflib
 import os
-from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Hashable, Iterable, Iterator, Mapping
 
-from etid.recording import LABELS, AbstractSource, Label, Metadata, Recording, RecordingError, text
+import numpy.typing as npt
+
+from etid.recording import (
+    LABELS,
+    AbstractSource,
+    Label,
+    Layout,
+    Metadata,
+    Recording,
+    RecordingError,
+    text,
+)
 from etid.writing import write
 
 
@@ -20,9 +31,11 @@ class _InMemory(AbstractSource):
         return self.recording.metadata
 
     @property
-    def layout(self) -> Hashable:
+    def layout(self) -> tuple[Layout, ...]:
         return tuple(
-            (name, record.stored.dtype.str, record.stored.size, record.conversion, record.offset)
+            Layout(
+                name, record.stored.dtype.str, record.stored.size, record.conversion, record.offset
+            )
             for name, record in self.recording.samples.items()
         )
 
@@ -30,8 +43,25 @@ class _InMemory(AbstractSource):
     def unloaded(self) -> Hashable:
         return id(self.recording.samples["v_th"])
 
+    def blocks(self, name: str) -> Iterator[npt.NDArray]:
+        yield self.recording.samples[name].stored
+
     def load(self) -> Recording:
         return self.recording
+
+
+def refuse_nested(paths: Collection[str]) -> None:
+    """Refuse paths of which one lies inside another."""
+    for path in paths:
+        outer = path.rpartition("/")[0]
+        while outer:
+            if outer in paths:
+                raise RecordingError(
+                    f"lies inside another recording, {outer!r}",
+                    path=path,
+                    remedy="Give it a path beside the other",
+                )
+            outer = outer.rpartition("/")[0]
 
 
 class Study(Mapping[str, Recording]):
@@ -79,16 +109,7 @@ class Study(Mapping[str, Recording]):
                     remedy="Give each recording a path of its own",
                 )
             sources[recording.path] = _InMemory(recording)
-        for path in sources:
-            outer = path.rpartition("/")[0]
-            while outer:
-                if outer in sources:
-                    raise RecordingError(
-                        f"lies inside another recording, {outer!r}",
-                        path=path,
-                        remedy="Give it a path beside the other",
-                    )
-                outer = outer.rpartition("/")[0]
+        refuse_nested(sources)
         return cls(sources)
 
     def __getitem__(self, path: str) -> Recording:

@@ -1,12 +1,25 @@
 """Tables in HDF5: named columns with units, written whole or not at all."""
 
+import contextlib
 import os
 import pathlib
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import h5py
 import numpy as np
+
+
+@contextlib.contextmanager
+def replacing(path: str | os.PathLike[str]) -> Iterator[pathlib.Path]:
+    """A name to write to, that becomes the file at the end, if that is reached."""
+    target = pathlib.Path(path)
+    partial = target.with_suffix(f".partial{target.suffix}")  # some writers go by the suffix
+    try:
+        yield partial
+        os.replace(partial, target)
+    finally:
+        partial.unlink(missing_ok=True)
 
 
 def write_table(
@@ -24,20 +37,54 @@ def write_table(
         units: SI units of columns that have one, stored as their attribute `unit`.
         attributes: Attributes of the file.
     """
-    target = pathlib.Path(path)
-    partial = target.with_name(target.name + ".partial")
+    with replacing(path) as partial, h5py.File(partial, "w") as file:
+        file.attrs.update(attributes)
+        for name, column in columns.items():
+            text = np.asarray(column).dtype.kind in "OU"
+            data = np.asarray(column, dtype=h5py.string_dtype()) if text else column
+            dataset = file.create_dataset(name, data=data)
+            if name in units:
+                dataset.attrs["unit"] = units[name]
+
+
+@contextlib.contextmanager
+def opened_table(path: str | os.PathLike[str], kind: str) -> Iterator[h5py.File]:
+    """A file of columns, none of them read yet.
+
+    Args:
+        path: The file.
+        kind: What its attribute `schema` must say.
+
+    Raises:
+        ValueError: The file is missing, no HDF5, or of another kind.
+    """
     try:
-        with h5py.File(partial, "w") as file:
-            file.attrs.update(attributes)
-            for name, column in columns.items():
-                text = np.asarray(column).dtype.kind in "OU"
-                data = np.asarray(column, dtype=h5py.string_dtype()) if text else column
-                dataset = file.create_dataset(name, data=data)
-                if name in units:
-                    dataset.attrs["unit"] = units[name]
-        os.replace(partial, target)
-    finally:
-        partial.unlink(missing_ok=True)
+        file = h5py.File(path, "r")
+    except OSError as error:
+        raise _unreadable(path, error) from error
+    with file:
+        found = file.attrs.get("schema")
+        found = found.decode() if isinstance(found, bytes) else found
+        if found != kind:
+            raise ValueError(f"{path}: attribute schema is {found!r}, not {kind!r}")
+        yield file
+
+
+def _unreadable(path: str | os.PathLike[str], error: OSError) -> ValueError:
+    return ValueError(f"{os.fspath(path)}: cannot be read as HDF5 ({error})")
+
+
+def read_column(column: h5py.Dataset, rows: Any = ()) -> np.ndarray:
+    """Some rows of a column, or all.
+
+    Raises:
+        ValueError: The file is damaged.
+    """
+    try:
+        text = h5py.check_string_dtype(column.dtype)
+        return np.asarray(column.asstr()[rows] if text else column[rows])
+    except OSError as error:
+        raise _unreadable(column.file.filename, error) from error
 
 
 def read_table(
@@ -52,16 +99,5 @@ def read_table(
     Raises:
         ValueError: The file is missing, no HDF5, or of another kind.
     """
-    try:
-        with h5py.File(path, "r") as file:
-            attributes = dict(file.attrs)
-            found = attributes.get("schema")
-            if found != kind:
-                raise ValueError(f"{path}: attribute schema is {found!r}, not {kind!r}")
-            columns = {
-                name: item.asstr()[()] if h5py.check_string_dtype(item.dtype) else item[()]
-                for name, item in file.items()
-            }
-    except OSError as error:
-        raise ValueError(f"{path}: cannot be read as HDF5 ({error})") from error
-    return columns, attributes
+    with opened_table(path, kind) as file:
+        return {name: read_column(item) for name, item in file.items()}, dict(file.attrs)

@@ -17,7 +17,7 @@ from etid.recording import AbstractSource, RecordingError
 def write(sources: Mapping[str, AbstractSource], path: str | os.PathLike[str]) -> None:
     """Write recordings, by path, to a file; `Study.write` says how.
 
-    One recording at a time is in memory.
+    One recording at a time is in memory, or as much of it as its source gives at once.
     """
     name = os.fspath(path)
     for own, source in sources.items():
@@ -88,20 +88,22 @@ def _write_group(file: h5py.File, path: str, sources: list[AbstractSource]) -> N
             _write_attribute(group, name, value)
     datasets: dict[str, h5py.Dataset] = {}
     for row, source in enumerate(sources):
-        for name, samples in source.load().samples.items():
-            single = not stacked or (once and name == "v_th")
+        for record in source.layout:
+            single = not stacked or (once and record.name == "v_th")
             if row == 0:
-                shape = samples.stored.shape if single else (len(sources), samples.stored.size)
-                dataset = group.create_dataset(name, shape, samples.stored.dtype)
-                unit = schema.at("dataset")[name].unit
-                scale = {"conversion": samples.conversion, "offset": samples.offset}
+                shape = (record.length,) if single else (len(sources), record.length)
+                dataset = group.create_dataset(record.name, shape, record.dtype)
+                unit = schema.at("dataset")[record.name].unit
+                scale = {"conversion": record.conversion, "offset": record.offset}
                 for attribute, value in {"unit": unit, **scale}.items():
                     _write_attribute(dataset, attribute, value)
-                datasets[name] = dataset
-            if not single:
-                datasets[name][row] = samples.stored
-            elif row == 0:
-                datasets[name][...] = samples.stored
+                datasets[record.name] = dataset
+            if row == 0 or not single:
+                start = 0
+                for block in source.blocks(record.name):
+                    part = slice(start, start + block.size)
+                    datasets[record.name][part if single else (row, part)] = block
+                    start += block.size
 
 
 def _write_attribute(owner: h5py.Group | h5py.Dataset, name: str, value: Any) -> None:

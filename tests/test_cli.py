@@ -103,7 +103,15 @@ def test_import_turns_a_table_into_a_file_that_check_accepts(run, tmp_path):
     target = tmp_path / "study.h5"
     arguments = ("--v-th", "open", "--v-out", "skin", "--sample-rate", 2e5, "--pulse-rate", 60)
     more = ("--scale", 0.0535, "--subject", "s01", "--condition", "dry")
-    assert run("import", table, target, *arguments, *more) == (DONE, [], [])
+    assert run("import", table, target, *arguments, *more) == (
+        DONE,
+        [
+            "loaded/0: 500 samples at 200000 Hz (command), pulses at 60 Hz",
+            "  v_th    'open' in V (command), divided by 0.0535",
+            "  v_out   'skin' in V (command), divided by 0.0535",
+        ],
+        [],
+    )
     assert run("check", target)[0] == DONE
     with etid.read(target) as study:
         recording = study["loaded/0"]

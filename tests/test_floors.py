@@ -19,8 +19,10 @@ FLOORS = {
     "traces": 0,
     "spectra": 0,
     "transfer": 0,
+    "units": 0,
     "verdicts": 0,
     "schema": 0,
+    "schema_page": 1,
     "elements": 1,
     "circuits": 2,
     "dispersion": 2,
@@ -42,7 +44,19 @@ FLOORS = {
     "periodic": 0,
     "methods": 5,
     "hdf5": 4,
-    "importing": 4,
+    "channels": 3,
+    "mapping": 4,
+    "formats": 4,
+    "formats.abf": 4,
+    "formats.delimited": 4,
+    "formats.matlab": 4,
+    "formats.npz": 4,
+    "formats.tdms": 4,
+    "sampling": 5,
+    "imported": 6,
+    "importing": 7,
+    "nwb": 5,
+    "exporting": 6,
     "scenes": 4,
     "information": 4,
     "harmonic_steiglitz_mcbride": 5,
@@ -74,6 +88,7 @@ FLOORS = {
     "demo": 14,
     "commands": 14,
     "commands.check": 15,
+    "commands.exporting": 15,
     "commands.fit": 15,
     "commands.importing": 15,
     "commands.simulate": 15,
@@ -127,7 +142,7 @@ import jax
 before = dict(jax.config.values)
 import sys, etid
 assert dict(jax.config.values) == before
-assert not {"matplotlib", "pandas", "jaxopt"} & set(sys.modules), "imported too much"
+assert not {"matplotlib", "pandas", "jaxopt", "pyarrow", "pynwb"} & set(sys.modules), "too much"
 """
     done = run(code)
     assert (done.returncode, done.stdout, done.stderr) == (0, "", "")

@@ -1,14 +1,13 @@
 import json
 import sys
 
-import h5py
 import numpy as np
 import pytest
-import scipy.io
 
 from etid import hdf5
 from etid.importing import import_file
 from etid.recording import RecordingError
+from tests.lab_files import matlab
 
 TABLE = {"v_th": "th", "v_out": "out", "sample_rate": 200e3, "pulse_rate": 60.0, "scale": 0.0535}
 TH = np.array([0.0, 0.25, 2.5, 2.25, 0.0])
@@ -150,7 +149,7 @@ def test_times_that_are_no_clock_are_refused(stamps, message, tmp_path):
         ({"current": "j"}, r"current: there is no 'j'"),
         ({"v_out": None}, "v_out: is not given, and is not guessed"),
         ({"pulse_rate": None}, "pulse_rate: is not given"),
-        ({"scale": None}, "scale: is not given.*1 if the values are volts"),
+        ({"scale": None}, "scale: is not given.*1 if the values are those at the terminal"),
         ({"scale": 0}, "scale: is 0"),
         ({"scale": float("nan")}, "scale: is nan"),
         ({"sample_rate": None}, "one of time and sample_rate"),
@@ -175,7 +174,7 @@ def test_a_wrong_argument_is_explained(changes, message, table, tmp_path):
         ("th,out\n1,2\n3,\n", "cannot be read"),
         ("th,out\n1,2\n3\n", "cannot be read"),
         ("th;out\n1;2\n", "there is no 'th'; the names are 'th;out'"),
-        ("th,out,th\n1,2,3\n", "two columns have the name 'th'"),
+        ("th,out,th\n1,2,3\n", "two channels have the name 'th'"),
         ("th,out\n1,2\n\xff", "cannot be read"),
     ],
 )
@@ -190,22 +189,6 @@ def test_a_byte_order_mark_and_quoted_names_are_no_obstacle(tmp_path):
     path = tmp_path / "t.csv"
     path.write_text('"th","out"\r\n1,2\r\n3,4\r\n', encoding="utf-8-sig")
     assert imported(path, **TABLE)["loaded/0"].v_out.size == 2
-
-
-def matlab(path, version, **variables):
-    """A MATLAB file; version 7.3 is HDF5 with reversed axes behind a 512-byte header."""
-    if version == 5:
-        scipy.io.savemat(path, variables)
-        return path
-    with h5py.File(path, "w", userblock_size=512) as file:
-        for name, value in variables.items():
-            array = np.atleast_2d(value)
-            file[name] = array.T
-            names = {"f": "double", "i": "int16"}
-            file[name].attrs["MATLAB_class"] = np.bytes_(names[array.dtype.kind])
-    with path.open("r+b") as file:
-        file.write(b"MATLAB 7.3 MAT-file".ljust(124) + b"\x00\x02IM")
-    return path
 
 
 @pytest.mark.parametrize("version", [5, 7.3])

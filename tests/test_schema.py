@@ -5,15 +5,15 @@ import h5py
 import numpy as np
 import pytest
 
-from etid import hdf5, schema
+from etid import hdf5, schema, schema_page
 
 FOLDER = pathlib.Path(__file__).parents[1] / "data_schema"
 
 
 @pytest.mark.parametrize("name", ["recording-1.json", "README.md"])
 def test_the_committed_schema_is_what_the_table_gives(name, tmp_path):
-    schema.write(tmp_path)
-    remedy = "run: python -m etid.schema data_schema"
+    schema_page.write(tmp_path)
+    remedy = "run: python -m etid.schema_page data_schema"
     assert (tmp_path / name).read_text("utf-8") == (FOLDER / name).read_text("utf-8"), remedy
 
 

@@ -1,4 +1,4 @@
-"""Turn .npz, .csv or .mat into an etid file."""
+"""Turn a file of a lab (.csv, .mat, .tdms, .abf, .npz) into an etid file."""
 
 import argparse
 import pathlib
@@ -8,14 +8,20 @@ from etid.importing import import_file
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Files, and which column is what."""
+    """Files, and which channel is what."""
     parser.add_argument("source", type=pathlib.Path)
     parser.add_argument("target", type=pathlib.Path)
+    parser.add_argument(
+        "--mapping",
+        type=pathlib.Path,
+        metavar="FILE",
+        help="TOML file that says all of this, for several recordings (data_schema/README.md)",
+    )
     for name, text in {
-        "v-th": "column or variable of the unloaded output",
-        "v-out": "column or variable of the output with the load",
-        "current": "column or variable of the current [A]",
-        "time": "column or variable of the time [s], instead of --sample-rate",
+        "v-th": "channel of the unloaded output, in volts unless the file names its unit",
+        "v-out": "channel of the output with the load, likewise",
+        "current": "channel of the current, in amperes unless the file names its unit",
+        "time": "channel of the time, in seconds likewise, instead of --sample-rate",
     }.items():
         parser.add_argument(f"--{name}", metavar="NAME", help=text)
     for name, text in {
@@ -30,8 +36,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Import one file."""
+    """Import one file, and say what was used for what."""
     names = ("v_th", "v_out", "current", "time", "sample_rate", "pulse_rate", "scale", "r_load")
     given = {name: getattr(arguments, name) for name in (*names, "subject", "condition")}
-    import_file(arguments.source, arguments.target, **given)
+    used = import_file(arguments.source, arguments.target, arguments.mapping, **given)
+    print("\n".join(map(str, used)))
     return DONE

@@ -1,0 +1,206 @@
+"""Files for other programs: tables of fits, one identified circuit, recordings as NWB."""
+
+import csv
+import datetime
+import json
+import os
+import pathlib
+import re
+from collections.abc import Iterator
+from typing import Any
+
+import h5py
+import numpy as np
+
+from etid.channels import listed, needs
+from etid.circuits import AbstractCircuit
+from etid.netlist import circuit_string, netlist
+from etid.recording import RecordingError
+from etid.results import LABELS, SCHEMA, Fits
+from etid.tables import opened_table, read_column, replacing
+
+ROWS = 1 << 16  # of fits in memory at once
+
+CIRCUITS = (".cir", ".json")
+
+_QUALITY = ("rrse", "chi2", "steps", "verdict", "note")
+
+
+def export_fits(source: str | os.PathLike[str], target: str | os.PathLike[str]) -> None:
+    """Write the table of a file of fits, `Fits.table()`, for other programs.
+
+    - `.csv`: a line of names, such as `r_s [ohm]` and `r_s_stderr [ohm]`, then a line per fit, in
+      SI units, with all digits. What is not known is `nan`.
+    - `.parquet`: columns of the same names without units. The metadata of a column has its `unit`,
+      those of the file have `circuit`, `method` and `etid_version`. Needs
+      `pip install etid[parquet]`.
+
+    Covariances stay in the file of fits. At most 65536 fits are in memory.
+
+    Args:
+        source: File of fits.
+        target: The file to write; one that exists is replaced at the end.
+
+    Raises:
+        ValueError: The source is no file of fits, or the target has another suffix.
+        RecordingError: pyarrow is not installed.
+    """
+    suffix = pathlib.Path(target).suffix.lower()
+    if suffix not in _WRITERS:
+        raise ValueError(
+            f"{os.fspath(target)}: fits are exported as {' or '.join(_WRITERS)}, not {suffix!r}"
+        )
+    with opened_table(source, SCHEMA) as file, replacing(target) as partial:
+        parameters: Any = file.attrs["parameters"]
+        elements = [name + ending for name in parameters for ending in ("", "_stderr")]
+        columns = {name: _column(file, name) for name in (*LABELS, *elements, *_QUALITY)}
+        about = {name: str(file.attrs[name]) for name in ("circuit", "method", "etid_version")}
+        _WRITERS[suffix](columns, about, partial)
+
+
+def _column(file: h5py.File, name: str) -> h5py.Dataset:
+    column = file.get(name)
+    if not isinstance(column, h5py.Dataset):
+        raise ValueError(f"{file.filename}: the column {name} is missing; fit the recordings again")
+    return column
+
+
+def _parts(columns: dict[str, h5py.Dataset]) -> Iterator[dict[str, np.ndarray]]:
+    """The rows, some at a time."""
+    for start in range(0, len(columns["path"]), ROWS):
+        rows = slice(start, start + ROWS)
+        yield {name: read_column(column, rows) for name, column in columns.items()}
+
+
+def _csv(columns: dict[str, h5py.Dataset], about: dict[str, str], path: pathlib.Path) -> None:
+    del about
+    units = {name: column.attrs.get("unit") for name, column in columns.items()}
+    with path.open("w", newline="", encoding="utf-8") as text:
+        lines = csv.writer(text)
+        lines.writerow(
+            name if unit in (None, "1") else f"{name} [{unit}]" for name, unit in units.items()
+        )
+        for part in _parts(columns):
+            lines.writerows(zip(*(column.tolist() for column in part.values()), strict=True))
+
+
+def _parquet(columns: dict[str, h5py.Dataset], about: dict[str, str], path: pathlib.Path) -> None:
+    try:
+        import pyarrow
+        from pyarrow import parquet
+    except ImportError as error:
+        raise needs("pyarrow", "parquet", str(path)) from error
+    fields = []
+    for name, column in columns.items():
+        text = h5py.check_string_dtype(column.dtype)
+        kind: Any = pyarrow.string() if text else pyarrow.from_numpy_dtype(column.dtype)
+        unit = column.attrs.get("unit")
+        fields.append(pyarrow.field(name, kind, metadata={"unit": unit} if unit else None))
+    schema = pyarrow.schema(fields, metadata=about)
+    with parquet.ParquetWriter(path, schema) as writer:
+        for part in _parts(columns):
+            writer.write_table(pyarrow.table(part, schema=schema))
+
+
+_WRITERS = {".csv": _csv, ".parquet": _parquet}
+
+
+def export_circuit(
+    source: str | os.PathLike[str],
+    target: str | os.PathLike[str],
+    path: str | None = None,
+    *,
+    circuit: type[AbstractCircuit] | None = None,
+) -> None:
+    """Write one identified circuit of a file of fits for other programs.
+
+    - `.cir`: a SPICE subcircuit between `plus` and `minus`, called `load_` and the path of the
+      recording, as in `load_s01_dry_03` (`etid.netlist`).
+    - `.json`: what `CustomCircuit().load(…)` of impedance.py reads; its initial guess is the
+      identified values (`etid.circuit_string`).
+
+    Args:
+        source: File of fits.
+        target: The file to write; one that exists is replaced at the end.
+        path: Path of the recording; not needed if the file has one fit only.
+        circuit: The kind of circuit, if it is not one of etid's own.
+
+    Raises:
+        ValueError: The source is no file of fits or has no such fit, the fit has not been
+            successful, or the target has another suffix.
+    """
+    suffix = pathlib.Path(target).suffix.lower()
+    if suffix not in CIRCUITS:
+        raise ValueError(f"{os.fspath(target)}: a circuit is exported as {' or '.join(CIRCUITS)}")
+    fits = Fits.read(source, circuit)
+    paths = [str(each) for each in fits.labels["path"]]
+    if path is None and len(paths) == 1:
+        path = paths[0]
+    if path is None or path.strip("/") not in paths:
+        said = "say which recording" if path is None else f"there is no fit of {path!r}"
+        raise ValueError(f"{os.fspath(source)}: {said}; the fits are of {listed(paths)}")
+    index = paths.index(path.strip("/"))
+    fit = fits[index]
+    if fit.verdict != "successful":
+        raise ValueError(
+            f"{os.fspath(source)}: the fit of {paths[index]!r} is {fit.verdict}, no circuit to "
+            f"work with. {fits.notes[index]}"
+        )
+    if suffix == ".cir":
+        name = "load_" + re.sub(r"\W", "_", paths[index], flags=re.ASCII)
+        text = f"* {paths[index]}, by {fit.method}\n{netlist(fit.circuit, name=name)}"
+    else:
+        string, values = circuit_string(fit.circuit)
+        content = {
+            "Name": f"{paths[index]}, by etid",
+            "Circuit String": string,
+            "Initial Guess": values,
+            "Constants": {},
+            "Fit": False,  # its "Fit" would come with impedance.py's own standard errors
+        }
+        text = json.dumps(content, indent=1, ensure_ascii=False) + "\n"
+    with replacing(target) as partial:
+        partial.write_text(text, encoding="utf-8")
+
+
+def export_study(
+    source: str | os.PathLike[str],
+    target: str | os.PathLike[str],
+    *,
+    session_start: datetime.datetime | None = None,
+) -> None:
+    """Write a file of recordings as NWB, one TimeSeries per record.
+
+    A TimeSeries in `acquisition` is called `s01.dry.0.v_out` for the record `v_out` of `s01/dry/0`
+    and has its stored samples, `conversion`, `offset`, `unit` and `rate`; an unloaded record that
+    several recordings share is stored once and linked.  The table `recordings` has everything else,
+    a line per recording, with the names of its TimeSeries.  A file of recordings does not say when
+    they began: `starting_time` is 0 for each.
+
+    One record at a time is in memory.  Needs `pip install etid[nwb]`.
+
+    Args:
+        source: File of recordings.
+        target: The file to write, `.nwb`; one that exists is replaced at the end.
+        session_start: When the session began, with its time zone: NWB requires it, and the source
+            does not say it.
+
+    Raises:
+        RecordingError: The source cannot be read, `session_start` is missing, or pynwb is not
+            installed.
+        ValueError: The target is not called `.nwb`.
+    """
+    if pathlib.Path(target).suffix.lower() != ".nwb":
+        raise ValueError(f"{os.fspath(target)}: recordings are exported as .nwb")
+    if session_start is None or session_start.tzinfo is None:
+        raise RecordingError(
+            "is not given with a time zone, and is not guessed: NWB requires it",
+            file=os.fspath(source),
+            field="session_start",
+            remedy="Say when the session began, such as 2026-01-31T09:30:00+01:00",
+        )
+    try:
+        from etid.nwb import write_nwb
+    except ImportError as error:
+        raise needs("pynwb", "nwb", os.fspath(target)) from error
+    write_nwb(source, target, session_start)

@@ -1,0 +1,57 @@
+"""Units of volts, amperes and seconds, as the files of instruments spell them."""
+
+from typing import NamedTuple
+
+_SYMBOLS = {"V": "volt", "A": "ampere", "s": "second"}
+_WORDS = {
+    "volt": "volt",
+    "volts": "volt",
+    "ampere": "ampere",
+    "amperes": "ampere",
+    "amp": "ampere",
+    "amps": "ampere",
+    "second": "second",
+    "seconds": "second",
+    "sec": "second",
+}
+# "M" is left out: "MV" is as likely a millivolt in capitals as a megavolt.
+_PREFIXES = {
+    "": 1.0,
+    "k": 1e3,
+    "m": 1e-3,
+    "u": 1e-6,
+    "\N{MICRO SIGN}": 1e-6,
+    "\N{GREEK SMALL LETTER MU}": 1e-6,
+    "n": 1e-9,
+    "p": 1e-12,
+}
+_LONG = {"": 1.0, "kilo": 1e3, "milli": 1e-3, "micro": 1e-6, "nano": 1e-9, "pico": 1e-12}
+
+UNITS = {f"{prefix}{symbol}": (factor, unit)
+         for symbol, unit in _SYMBOLS.items()
+         for prefix, factor in _PREFIXES.items()}  # fmt: skip
+UNITS |= {f"{prefix}{word}": (factor, unit)
+          for word, unit in _WORDS.items()
+          for prefix, factor in _LONG.items()}  # fmt: skip
+
+
+class Unit(NamedTuple):
+    """A unit that recordings come in.
+
+    Attributes:
+        factor: How many of the SI unit it is.
+        si: `volt`, `ampere` or `second`.
+    """
+
+    factor: float
+    si: str
+
+
+def parse_unit(text: str) -> Unit | None:
+    """The unit that a text means, such as `mV` or `millivolts`; None if it is none of these.
+
+    Symbols are taken as they are written, words in any case.
+    """
+    name = text.strip()
+    found = UNITS.get(name) or UNITS.get(name.lower() if len(name) > 2 else name)
+    return None if found is None else Unit(*found)

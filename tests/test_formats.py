@@ -1,0 +1,373 @@
+"""Files of instruments: what is read is what was written, in volts, and nothing is guessed."""
+
+import pathlib
+import re
+import sys
+import tomllib
+from typing import Any
+
+import numpy as np
+import pytest
+from nptdms import ChannelObject, TdmsWriter
+
+import etid
+from etid import channels, hdf5
+from etid.formats import delimited
+from etid.recording import RecordingError
+from etid.units import UNITS, parse_unit
+from tests.lab_files import abf, matlab, tdms
+
+README = pathlib.Path(__file__).parents[1] / "data_schema" / "README.md"
+RNG = np.random.default_rng(6)
+V_TH, V_OUT = RNG.normal(size=(2, 1000))
+CODES = RNG.integers(-3000, 3000, size=1000).astype("i2")
+LINE = {"NI_Number_Of_Scales": 1, "NI_Scale[0]_Scale_Type": "Linear",
+        "NI_Scale[0]_Linear_Slope": 2e-3, "NI_Scale[0]_Linear_Y_Intercept": 0.5}  # fmt: skip
+GIVEN: dict[str, Any] = {"pulse_rate": 60.0, "scale": 0.0535}
+
+
+def imported(source, mapping):
+    target = source.with_suffix(".h5")
+    used = etid.import_file(source, target, mapping)
+    assert hdf5.check(target) == []
+    with hdf5.read(target) as study:
+        return {path: study[path] for path in study}, used
+
+
+def refused(source, mapping, message):
+    target = source.with_suffix(".h5")
+    with pytest.raises(RecordingError, match=message) as caught:
+        etid.import_file(source, target, mapping)
+    assert source.name in caught.value.file
+    assert [path for path in source.parent.iterdir() if path.suffix in (".h5", ".partial")] == []
+
+
+def pair(v_th="rig/open", v_out="rig/skin", **more):
+    return {**GIVEN, "v_th": {"channel": v_th}, "v_out": {"channel": v_out}, **more}
+
+
+def rig(path, unit="V", interval=5e-6, v_out=V_OUT, **own):
+    signals = {"rig/open": (V_TH, {}), "rig/skin": (v_out, own)}
+    return tdms(path / "rig.tdms", signals, unit_string=unit, wf_increment=interval)
+
+
+# What the README of the schema shows
+
+
+def example(format):
+    """The mapping of one format, as the README has it."""
+    section = README.read_text("utf-8").split(f"### {format}\n")[1].split("\n### ")[0]
+    return tomllib.loads(section.split("```toml\n")[1].split("```")[0])
+
+
+def test_the_csv_of_the_readme_is_imported_by_its_mapping(tmp_path):
+    section = README.read_text("utf-8").split("### CSV\n")[1]
+    path = tmp_path / "scope.csv"
+    path.write_text(section.split("```text\n")[1].split("```")[0], encoding="utf-8")
+    recordings, used = imported(path, example("CSV"))
+    one = recordings["s01/dry"]
+    assert (one.subject, one.condition, one.pulse_rate) == ("s01", "dry", 60.0)
+    assert one.sample_rate == pytest.approx(200e3, rel=1e-12)  # of times with four digits
+    np.testing.assert_allclose(one.v_out, np.array([1.25, 1.75, 1.5]) / 53.5, rtol=1e-15)
+    assert str(used[0]).splitlines() == [
+        "s01/dry: 3 samples at 200000 Hz (time 't'), pulses at 60 Hz",
+        "  v_th    'open' in mV (file), divided by 0.0535",
+        "  v_out   'skin' in mV (file), divided by 0.0535",
+        "  time    't' in ms (file)",
+    ]
+
+
+@pytest.mark.parametrize("version", [5, 7.3])
+def test_the_matlab_file_of_the_readme_is_imported_by_its_mapping(version, tmp_path):
+    trials = np.stack([V_OUT, V_OUT / 2, V_OUT / 3])
+    known, dry = {"open": V_TH, "loaded": V_OUT}, {"open": V_TH, "skin": trials}
+    path = matlab(tmp_path / "session.mat", version, known=known, dry=dry)
+    recordings, _ = imported(path, example("MATLAB"))
+    assert list(recordings) == ["calibration/98k8", "s01/dry/0", "s01/dry/1", "s01/dry/2"]
+    assert recordings["calibration/98k8"].r_load == 98.8e3
+    for trial in range(3):
+        one = recordings[f"s01/dry/{trial}"]
+        assert one.calibration == ("calibration/98k8",)
+        np.testing.assert_allclose(one.v_out, trials[trial] / 0.0535, rtol=1e-15)
+        np.testing.assert_allclose(one.v_th, V_TH / 0.0535, rtol=1e-15)
+
+
+def test_the_tdms_file_of_the_readme_is_imported_by_its_mapping(tmp_path):
+    names = ("known/open", "known/loaded", "s01 dry/open", "s01 dry/skin", "s01 dry/shunt")
+    signals = {name: (V_TH * number, {}) for number, name in enumerate(names, 1)}
+    path = tdms(tmp_path / "s.tdms", signals, unit_string="Volts", wf_increment=5e-6)
+    recordings, used = imported(path, example("TDMS"))
+    assert list(recordings) == ["calibration/98k8", "s01/dry"]
+    np.testing.assert_allclose(recordings["s01/dry"].v_out, V_TH * 4 / 0.0535, rtol=1e-15)
+    current = recordings["s01/dry"].samples["current"].values
+    np.testing.assert_allclose(current, V_TH * 5 / 100, rtol=1e-15)
+    assert recordings["s01/dry"].sample_rate == 200e3
+    assert str(used[1].signals["current"]) == "'s01 dry/shunt' in Volts (file), divided by 100"
+
+
+def test_the_abf_file_of_the_readme_is_imported_by_its_mapping(tmp_path):
+    sweeps = np.stack([V_TH, V_OUT, V_OUT / 2])
+    recordings, _ = imported(abf(tmp_path / "cell.abf", sweeps, unit="mV"), example("ABF"))
+    assert list(recordings) == ["s01/dry/0", "s01/dry/1"]
+    one = recordings["s01/dry/1"]
+    assert (one.trial, one.sample_rate) == ("2", 200e3)  # trials are called by their sweeps
+    assert one.samples["v_out"].stored.dtype == np.int16
+    step = one.samples["v_out"].conversion  # codes are cut off, not rounded
+    np.testing.assert_allclose(one.v_out, sweeps[2] * 1e-3 / 0.0535, rtol=0, atol=1.001 * step)
+    np.testing.assert_allclose(one.v_th, V_TH * 1e-3 / 0.0535, rtol=0, atol=1.001 * step)
+
+
+# TDMS
+
+
+def test_codes_with_a_linear_scaling_stay_codes(tmp_path):
+    recordings, _ = imported(rig(tmp_path, v_out=CODES, **LINE), pair())
+    record = recordings["loaded/0"].samples["v_out"]
+    np.testing.assert_array_equal(record.stored, CODES)
+    assert record.stored.dtype == np.int16
+    volts = (2e-3 * CODES + 0.5) / 0.0535
+    np.testing.assert_allclose(record.values, volts, rtol=0, atol=1e-13)  # of terms of up to 112
+
+
+def test_another_scaling_is_that_of_the_reader(tmp_path):
+    cubic = {"NI_Number_Of_Scales": 1, "NI_Scale[0]_Scale_Type": "Polynomial",
+             "NI_Scale[0]_Polynomial_Coefficients_Size": 3,
+             **{f"NI_Scale[0]_Polynomial_Coefficients[{i}]": c
+                for i, c in enumerate((0.5, 2e-3, 1e-7))}}  # fmt: skip
+    recordings, _ = imported(rig(tmp_path, v_out=CODES, **cubic), pair())
+    volts = 0.5 + 2e-3 * CODES + 1e-7 * CODES.astype(float) ** 2
+    np.testing.assert_allclose(recordings["loaded/0"].v_out, volts / 0.0535, rtol=1e-13)
+
+
+def test_data_that_were_scaled_before_they_were_written_are_not_scaled_again(tmp_path):
+    path = rig(tmp_path, **LINE, NI_Scaling_Status="scaled")
+    np.testing.assert_allclose(imported(path, pair())[0]["loaded/0"].v_out, V_OUT / 0.0535)
+
+
+def test_a_temperature_is_no_voltage(tmp_path):
+    own = {**LINE, "NI_Scale[0]_Scale_Type": "Thermocouple"}
+    refused(rig(tmp_path, v_out=CODES, **own), pair(), r"v_out: 'rig/skin' is scaled by Thermocoup")
+
+
+def test_a_name_that_two_channels_have_is_not_chosen_from(tmp_path):
+    path = tmp_path / "rig.tdms"
+    with TdmsWriter(path) as writer:
+        known = {"unit_string": "V", "wf_increment": 5e-6}
+        parts = ("rig", "open"), ("rig/skin", "left"), ("rig", "skin/left")
+        writer.write_segment([ChannelObject(*part, data=V_TH, properties=known) for part in parts])
+    refused(path, pair(v_out="rig/skin/left"), "two channels have the name 'rig/skin/left'")
+
+
+def test_text_of_old_instruments_that_is_not_utf_8_is_no_obstacle(tmp_path, capfd):
+    path = rig(tmp_path, comment="Gr????e")
+    path.write_bytes(path.read_bytes().replace(b"Gr????e", b"Gr\xf6\xdfenx"))
+    assert imported(path, pair())[0]["loaded/0"].sample_rate == 200e3
+    assert capfd.readouterr() == ("", "")
+
+
+def test_text_and_empty_channels_cannot_be_records(tmp_path):
+    for data, message in ((["a", "b"], "must be an array of real numbers"), ([], "is empty")):
+        values = np.array(data, "O") if data else np.zeros(0)
+        refused(rig(tmp_path, v_out=values), pair(), rf"v_out: 'rig/skin' .*{message}")
+
+
+@pytest.mark.parametrize("cut", [1, 500, 15_900, 16_200])
+def test_a_tdms_file_that_was_cut_off_is_refused_wherever_it_was(cut, tmp_path):
+    path = rig(tmp_path)
+    path.write_bytes(path.read_bytes()[:-cut])
+    refused(path, pair(), "is cut off: the last segment ends at byte")
+
+
+# MATLAB
+
+
+def test_matlab_variables_that_are_no_real_arrays_are_refused_in_both_versions(tmp_path):
+    for version in (5, 7.3):
+        path = matlab(tmp_path / "m.mat", version, open=V_TH, skin=V_OUT * 1j, name="finger")
+        units = {"v_th": {"channel": "open", "unit": "V"}, "sample_rate": 2e5}
+        for name in ("skin", "name"):
+            said = {**GIVEN, **units, "v_out": {"channel": name, "unit": "V"}}
+            refused(path, said, rf"v_out: '{name}' is .*must be an array of real numbers")
+
+
+def test_matlab_says_no_unit_and_no_rate(tmp_path):
+    path = matlab(tmp_path / "m.mat", 7.3, open=V_TH, skin=V_OUT)
+    refused(
+        path, pair("open", "skin", sample_rate=2e5), r"v_th.unit: is not given of channel 'open"
+    )
+    volts = {name: {"channel": channel, "unit": "V"}
+             for name, channel in (("v_th", "open"), ("v_out", "skin"))}  # fmt: skip
+    refused(path, {**GIVEN, **volts}, "sample_rate: is not given.*not guessed")
+    refused(path, {**GIVEN, **volts, "sample_rate": 2e5, "v_out": {"channel": "scin"}},
+            "there is no 'scin'; the names are 'open', 'skin'")  # fmt: skip
+
+
+def test_matlab_7_3_needs_no_package_and_cells_and_references_are_no_channels(
+    tmp_path, monkeypatch
+):
+    monkeypatch.setitem(sys.modules, "pymatreader", None)
+    path = matlab(tmp_path / "m.mat", 7.3, **{"#refs#": {"a": V_TH}}, open=V_TH, skin=V_OUT)
+    target = tmp_path / "m.h5"
+    etid.import_file(path, target, v_th="open", v_out="skin", sample_rate=2e5, **GIVEN)
+    refs: dict[str, Any] = {"v_th": "#refs#.a", "v_out": "skin", "sample_rate": 2e5}
+    with pytest.raises(RecordingError, match=r"the names are 'open', 'skin'\."):
+        etid.import_file(path, target, **refs, **GIVEN)
+
+
+# ABF
+
+
+def test_the_rate_of_an_abf_file_is_not_cut_to_whole_hertz(tmp_path):
+    for rate in (150e3, 200e3, 33_333.0, 1e6 / 7):
+        recordings, _ = imported(
+            abf(tmp_path / "a.abf", np.stack([V_TH, V_OUT]), rate), pair("channel 0", "channel 0")
+        )
+        assert recordings["loaded/0"].sample_rate == pytest.approx(rate, rel=1e-7)  # a float32
+
+
+def test_an_abf_file_that_was_cut_off_is_refused(tmp_path):
+    path = abf(tmp_path / "a.abf", np.stack([V_TH, V_OUT]))
+    whole = path.read_bytes()
+    for cut in (600, len(whole) - 2100, len(whole) - 100):
+        path.write_bytes(whole[:-cut])
+        refused(path, pair("channel 0", "channel 0"), "cut off|cannot be read")
+
+
+def test_a_channel_in_amperes_is_no_voltage(tmp_path):
+    path = abf(tmp_path / "a.abf", np.stack([V_TH, V_OUT]), unit="pA")
+    refused(path, pair("channel 0", "channel 0"), r"v_th.unit: .* is in ampere \(file\)")
+
+
+# CSV
+
+
+@pytest.mark.parametrize(
+    "head",
+    ["open [mV],skin(mV)", "open (mV),skin [millivolts]", "open,skin\n(mV),(mV)\n",
+     "open,skin\nmV,mV", '"open [mV]","skin (mV)"'],
+)  # fmt: skip
+def test_units_of_a_table_may_stand_in_its_first_or_second_line(head, tmp_path):
+    path = tmp_path / "t.csv"
+    path.write_text(f"{head}\n1,2\n3,4\n\n5,6\n", encoding="utf-8")
+    recordings, _ = imported(path, pair("open", "skin", sample_rate=2e5))
+    np.testing.assert_allclose(recordings["loaded/0"].v_out, np.array([2, 4, 6]) / 53.5)
+
+
+def test_a_bracket_that_holds_no_unit_belongs_to_the_name(tmp_path):
+    path = tmp_path / "t.csv"
+    path.write_text("V (left),V (right)\n1,2\n3,4\n", encoding="utf-8")
+    refused(path, pair("V", "V", sample_rate=2e5), r"there is no 'V'; .* 'V \(left\)', 'V \(right")
+
+
+def test_a_table_without_names_is_refused(tmp_path):
+    path = tmp_path / "t.csv"
+    path.write_text("1,2\n3,4\n", encoding="utf-8")
+    refused(path, pair("1", "2", sample_rate=2e5), "the first line holds numbers")
+
+
+def test_columns_that_are_not_asked_for_may_hold_anything(tmp_path):
+    path = tmp_path / "t.csv"
+    path.write_text("note,open [V],skin [V]\nfine,1,2\n,3,4\n", encoding="utf-8")
+    recordings, _ = imported(path, pair("open", "skin", sample_rate=2e5))
+    assert recordings["loaded/0"].v_out.size == 2
+
+
+# Parts
+
+
+@pytest.fixture
+def small_parts(monkeypatch):
+    """Records of a thousand samples are read in 143 parts."""
+    monkeypatch.setattr(channels, "BLOCK", 7)
+    monkeypatch.setattr(delimited, "ROWS", 13)
+
+
+@pytest.mark.parametrize("format", ["csv", "mat", "tdms", "abf"])
+def test_what_is_read_in_parts_is_what_is_read_at_once(format, small_parts, tmp_path):
+    volts = {"v_th": {"channel": "open", "unit": "V"}, "v_out": {"channel": "skin", "unit": "V"}}
+    said = {**GIVEN, **volts, "sample_rate": 2e5}
+    if format == "csv":
+        path = tmp_path / "a.csv"
+        rows = np.column_stack([np.arange(1000) / 2e5, V_TH, V_OUT])
+        np.savetxt(path, rows, "%.17g", ",", header="t [s],open,skin", comments="")
+        del said["sample_rate"]
+        said["time"] = {"channel": "t"}
+    elif format == "mat":
+        path = matlab(tmp_path / "a.mat", 7.3, open=V_TH, skin=np.stack([V_TH, V_OUT]))
+        said["v_out"]["rows"] = 1
+    elif format == "tdms":
+        path, said = rig(tmp_path), pair()
+    else:
+        path = abf(tmp_path / "a.abf", np.stack([V_TH, V_OUT]))
+        said = pair()
+        said["v_th"] = {"channel": "channel 0", "rows": 0}
+        said["v_out"] = {"channel": "channel 0", "rows": 1}
+    recordings, _ = imported(path, said)
+    one = next(iter(recordings.values()))
+    step = one.samples["v_out"].resolution or 0.0
+    np.testing.assert_allclose(one.v_out, V_OUT / 0.0535, rtol=1e-14, atol=1.001 * step)
+    np.testing.assert_allclose(one.v_th, V_TH / 0.0535, rtol=1e-14, atol=1.001 * step)
+    assert one.sample_rate == pytest.approx(200e3, rel=1e-12)
+    assert [path for path in tmp_path.iterdir() if path.suffix not in (f".{format}", ".h5")] == []
+
+
+def test_time_stamps_are_checked_in_every_part(small_parts, tmp_path):
+    path = tmp_path / "t.csv"
+    times = np.arange(1000) / 2e5
+    for wrong in (300, 999):
+        rows = np.column_stack([np.where(np.arange(1000) >= wrong, times + 3e-6, times), V_TH])
+        np.savetxt(path, rows, "%.17g", ",", header="t [s],open [V]", comments="")
+        said = pair("open", "open", time={"channel": "t"})
+        refused(path, said, r"time: is not uniform: sample \d+")
+
+
+def test_a_wrong_number_far_down_a_table_is_found_and_counted(small_parts, tmp_path):
+    path = tmp_path / "t.csv"
+    path.write_text("open [V],skin [V]\n" + "1,2\n" * 100 + "1,?\n", encoding="utf-8")
+    said = pair("open", "skin", sample_rate=2e5)
+    refused(path, said, r"cannot be read .*'\?'.*counted from row 92")
+
+
+# For all
+
+
+@pytest.mark.parametrize(
+    ("name", "package"), [("a.tdms", "npTDMS"), ("a.abf", "pyabf"), ("a.mat", "pymatreader")]
+)
+def test_without_its_reader_a_file_names_what_to_install(name, package, tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, package.lower(), None)
+    (tmp_path / name).write_bytes(b"anything")
+    extra = {"npTDMS": "tdms", "pyabf": "abf", "pymatreader": "matlab"}[package]
+    refused(tmp_path / name, pair(), rf"needs the package {package}.*'etid\[{extra}\]'")
+
+
+@pytest.mark.parametrize("name", ["a.tdms", "a.abf"])
+@pytest.mark.parametrize("content", [b"", b"ABF ", b"ABF2" + bytes(9000), b"TDSm" + bytes(40)])
+def test_a_damaged_file_is_an_error_of_that_file(name, content, tmp_path):
+    (tmp_path / name).write_bytes(content)
+    refused(tmp_path / name, pair(), re.escape(name))
+
+
+def test_nan_samples_are_kept_for_a_verdict(tmp_path):
+    holes = np.where(np.arange(1000) == 5, np.nan, V_OUT)
+    target = tmp_path / "rig.h5"
+    etid.import_file(rig(tmp_path, v_out=holes), target, pair())
+    with etid.read(target) as study:
+        assert np.isnan(study["loaded/0"].v_out).sum() == 1
+    assert [problem.field for problem in etid.check(target)] == ["v_out"]
+
+
+def test_records_of_other_lengths_are_refused(tmp_path):
+    refused(rig(tmp_path, v_out=V_OUT[:-1]), pair(), r"rig/open \(1000,\), rig/skin \(999,\)")
+
+
+def test_units_are_those_of_the_si_and_their_names():
+    for text, factor, unit in (
+        ("V", 1, "volt"), ("mV", 1e-3, "volt"), ("Volts", 1, "volt"), (" uA ", 1e-6, "ampere"),
+        ("\N{MICRO SIGN}s", 1e-6, "second"), ("\N{GREEK SMALL LETTER MU}V", 1e-6, "volt"),
+        ("Milliseconds", 1e-3, "second"), ("pA", 1e-12, "ampere"), ("kV", 1e3, "volt"),
+    ):  # fmt: skip
+        assert parse_unit(text) == (factor, unit), text
+    for text in ("", "MV", "mv", "v", "a", "S", "Ohm", "degC", "V/A", "1"):
+        assert parse_unit(text) is None, text
+    assert len(UNITS) == 3 * 8 + 9 * 6
