@@ -48,12 +48,12 @@ def check_method(method: str | None, circuit: AbstractCircuit | None = None) -> 
         )
     if method == "output_error" and circuit is not None and not circuit.is_rational:
         raise ValueError(
-            f"method 'output_error' needs a ratio of polynomials in s, which {_steep(circuit)}; "
+            f"method 'output_error' needs a ratio of polynomials in s, which {_not_rational(circuit)}; "
             "use method='maximum_likelihood'"
         )
 
 
-def _steep(circuit: AbstractCircuit) -> str:
+def _not_rational(circuit: AbstractCircuit) -> str:
     return f"{type(circuit).__name__}, with its constant-phase element, is not"
 
 
@@ -63,7 +63,7 @@ def check_default(method: Method, circuit: AbstractCircuit) -> None:
         raise ValueError(
             "the record holds less than two whole pulse periods or begins in a pulse, or its "
             "driver was identified without harmonics; the method for it is output_error, which "
-            f"needs a ratio of polynomials in s, and {_steep(circuit)}. Record three periods or "
+            f"needs a ratio of polynomials in s, and {_not_rational(circuit)}. Record three periods or "
             "more and identify the driver with method='maximum_likelihood', or ask for "
             "method='maximum_likelihood': in a single period its standard errors leave out what "
             "aliases do"
