@@ -48,8 +48,8 @@ def check_method(method: str | None, circuit: AbstractCircuit | None = None) -> 
         )
     if method == "output_error" and circuit is not None and not circuit.is_rational:
         raise ValueError(
-            f"method 'output_error' needs a ratio of polynomials in s, which {_not_rational(circuit)}; "
-            "use method='maximum_likelihood'"
+            "method 'output_error' needs a ratio of polynomials in s, which "
+            f"{_not_rational(circuit)}; use method='maximum_likelihood'"
         )
 
 
@@ -63,8 +63,8 @@ def check_default(method: Method, circuit: AbstractCircuit) -> None:
         raise ValueError(
             "the record holds less than two whole pulse periods or begins in a pulse, or its "
             "driver was identified without harmonics; the method for it is output_error, which "
-            f"needs a ratio of polynomials in s, and {_not_rational(circuit)}. Record three periods or "
-            "more and identify the driver with method='maximum_likelihood', or ask for "
+            f"needs a ratio of polynomials in s, and {_not_rational(circuit)}. Record three "
+            "periods or more and identify the driver with method='maximum_likelihood', or ask for "
             "method='maximum_likelihood': in a single period its standard errors leave out what "
             "aliases do"
         )
