@@ -11,7 +11,7 @@ import contextlib
 import dataclasses
 import functools
 import threading
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any
 
 import jax
@@ -30,7 +30,9 @@ from etid.prefetch import prefetch
 from etid.preflight import Inspected
 from etid.recording import Metadata, Recording, RecordingError
 from etid.results import LABELS, Fit, Fits, IdentificationError
+from etid.settings import Settings
 from etid.study import Study
+from etid.study_fits import StudyFits
 from etid.traces import stored_jit
 from etid.verdicts import message
 
@@ -264,21 +266,6 @@ def identify_skins(
     return Fits(_stack(fits), _labels(metadata), np.array(notes, dtype=str))
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
-class StudyFits:
-    """What `identify_study` returns.
-
-    Attributes:
-        fits: One fit per loaded recording.
-        drivers: The drivers, by the paths of their calibrations.
-        failures: Why a driver could not be identified, by the paths of its calibrations.
-    """
-
-    fits: Fits
-    drivers: Mapping[tuple[str, ...], Driver]
-    failures: Mapping[tuple[str, ...], str]
-
-
 def identify_study(
     study: Study,
     *,
@@ -303,8 +290,10 @@ def identify_study(
     circuit = SkinRC() if circuit is None else circuit
     check_method(method, circuit)
     drivers = Drivers(study, order, method)
-    fits = identify_part(study, to_identify(study), drivers, circuit, method, progress)
-    return StudyFits(fits, drivers.found, drivers.failures)
+    paths = to_identify(study)
+    fits = identify_part(study, paths, drivers, circuit, method, progress)
+    settings = Settings.of(study, len(paths), order, method, circuit)
+    return StudyFits(fits, drivers.found, drivers.failures, settings)
 
 
 def to_identify(study: Study) -> list[str]:

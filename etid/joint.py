@@ -22,7 +22,6 @@ from etid.batch import (
     LANES,
     Drivers,
     Refusal,
-    StudyFits,
     each,
     filled,
     planned,
@@ -39,9 +38,11 @@ from etid.methods import HARMONIC
 from etid.precision import require_float64
 from etid.preflight import Inspected
 from etid.results import Fit
+from etid.settings import Settings
 from etid.shared_terms import Loads
 from etid.spectra import Spectrum
 from etid.study import Study
+from etid.study_fits import StudyFits
 from etid.traces import stored_jit
 from etid.verdicts import RESULTS, message
 
@@ -210,7 +211,9 @@ def identify_jointly(
                 fits[row] = one
                 notes[row] = message(one.verdict)
     ordered = [fits[row] for row in range(len(paths))]
-    return StudyFits(table(study, paths, ordered, notes), drivers.found, drivers.failures)
+    fits = table(study, paths, ordered, notes)
+    settings = Settings.of(study, len(paths), order, METHOD, circuit, r_load_tolerance)
+    return StudyFits(fits, drivers.found, drivers.failures, settings)
 
 
 def _model(circuit: AbstractCircuit, driver: Driver, shared: bool) -> Joint:

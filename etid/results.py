@@ -217,26 +217,37 @@ class Fits:
         recordings with one driver have it in common. What really varies between the recordings is
         `NAME_between`, sqrt(spread² − own²), or 0.
         """
-        keys = [tuple(str(self.labels[name][i]) for name in by) for i in range(len(self))]
-        rows = []
-        for key in sorted(set(keys)):
-            group = self.take(np.array([k == key for k in keys]))
-            good = group.successful()
-            row: dict[str, Any] = dict(zip(by, key, strict=True))
-            row |= {"fits": len(group), "successful": len(good)}
-            for i, name in enumerate(self.circuit.names()):
-                values = np.asarray(getattr(good.circuit, name))
-                errors = np.asarray(getattr(good.stderr, name))
-                row[name] = float(np.median(values)) if values.size else np.nan
+        columns = [map(str, self.labels[name].tolist()) for name in by]
+        keys = list(zip(*columns, strict=True)) if by else [()] * len(self)
+        groups = sorted(set(keys))
+        number = {key: i for i, key in enumerate(groups)}
+        place = np.array([number[key] for key in keys], int)
+        good = self.successful()
+        place_good = place[self.verdicts == "successful"]
+        order = np.argsort(place_good, kind="stable")
+        ends = np.searchsorted(place_good[order], np.arange(len(groups) + 1))
+        rows: list[dict[str, Any]] = [
+            dict(zip(by, key, strict=True)) | {"fits": int(count), "successful": int(size)}
+            for key, count, size in zip(
+                groups, np.bincount(place, minlength=len(groups)), np.diff(ends), strict=True
+            )
+        ]
+        for i, name in enumerate(self.circuit.names()):
+            total, common = good.cov[:, i, i], good.fit.shared_cov[:, i, i]
+            parts = {
+                "": np.asarray(getattr(good.circuit, name)),
+                "_stderr": np.asarray(getattr(good.stderr, name)),
+                "_own": np.sqrt(np.maximum(total - common, 0.0)),
+                "_shared": np.sqrt(common),
+            }
+            for row, start, end in zip(rows, ends[:-1], ends[1:], strict=True):
+                chosen = order[start:end]
+                for part, values in parts.items():
+                    row[name + part] = float(np.median(values[chosen])) if end > start else np.nan
+                values = parts[""][chosen]
                 row[f"{name}_spread"] = float(np.std(values, ddof=1)) if values.size > 1 else np.nan
-                row[f"{name}_stderr"] = float(np.median(errors)) if values.size else np.nan
-                total, common = good.cov[:, i, i], good.fit.shared_cov[:, i, i]
-                own = np.sqrt(np.maximum(total - common, 0.0))
-                row[f"{name}_own"] = float(np.median(own)) if values.size else np.nan
-                row[f"{name}_shared"] = float(np.median(np.sqrt(common))) if values.size else np.nan
                 excess = row[f"{name}_spread"] ** 2 - row[f"{name}_own"] ** 2
                 row[f"{name}_between"] = float(np.sqrt(np.maximum(excess, 0.0)))
-            rows.append(row)
         return rows
 
     def __str__(self) -> str:
@@ -252,8 +263,8 @@ class Fits:
             lines.append(text)
         return "\n".join(lines)
 
-    def write(self, path: str | os.PathLike[str]) -> None:
-        """Write the table, the covariances and how they were made to an HDF5 file."""
+    def as_table(self) -> tuple[dict[str, np.ndarray], dict[str, str], dict[str, Any]]:
+        """Columns, their units and the attributes of the file that `write` writes."""
         units = self.circuit.units()
         units |= {f"{name}_stderr": unit for name, unit in units.items()}
         columns = self.table() | {"cov": self.cov, "shared_cov": self.fit.shared_cov}
@@ -265,6 +276,11 @@ class Fits:
             "parameters": list(self.circuit.names()),
             "method": self.fit.method,
         }
+        return columns, units, attributes
+
+    def write(self, path: str | os.PathLike[str]) -> None:
+        """Write the table, the covariances and how they were made to an HDF5 file."""
+        columns, units, attributes = self.as_table()
         write_table(path, columns, units=units, attributes=attributes)
 
     @classmethod
@@ -280,7 +296,17 @@ class Fits:
         Raises:
             ValueError: The file is not a file of fits, or `circuit` is not the one it holds.
         """
-        columns, attributes = read_table(path, SCHEMA)
+        return cls.of_table(*read_table(path, SCHEMA), path, circuit)
+
+    @classmethod
+    def of_table(
+        cls,
+        columns: Mapping[str, np.ndarray],
+        attributes: Mapping[str, Any],
+        path: str | os.PathLike[str],
+        circuit: type[AbstractCircuit] | None,
+    ) -> "Fits":
+        """What `read` makes of the columns and attributes of a file."""
         known = {kind.__name__: kind for kind in (SkinRC, Resistor)}
         kind = circuit or known.get(attributes["circuit"])
         if kind is None or kind.__name__ != attributes["circuit"]:

@@ -11,26 +11,27 @@ machine (`workers`), or a cluster (`dask.distributed.Client.get_executor()`).
 
 import concurrent.futures
 import contextlib
+import dataclasses
 import functools
 import hashlib
-import importlib.metadata
 import json
 import multiprocessing
 import os
 import pathlib
 import shutil
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import jax
 from tqdm import tqdm
 
-from etid.batch import Drivers, StudyFits, identify_part, to_identify
+from etid.batch import Drivers, identify_part, to_identify
 from etid.circuits import AbstractCircuit, SkinRC
 from etid.hdf5 import read
 from etid.methods import Method, check_method
-from etid.results import Fits
+from etid.settings import Settings
 from etid.study import Study
+from etid.study_fits import StudyFits
 
 PART = 256  # recordings, some seconds of work: what a killed run may lose
 
@@ -68,11 +69,16 @@ def _kept_open(source: str, stamp: int, order: int, method: Method | None) -> _O
 def _fit(
     opened: _Opened, circuit: AbstractCircuit, method: Method | None, size: int, number: int
 ) -> StudyFits:
-    """Fit one part."""
+    """Fit one part; its drivers are those that were not known before it."""
     study, paths, drivers = opened
     part = paths[number * size : (number + 1) * size]
+    known = {*drivers.found, *drivers.failures}
     fits = identify_part(study, part, drivers, circuit, method)
-    return StudyFits(fits, dict(drivers.found), dict(drivers.failures))
+    return StudyFits(fits, _others(drivers.found, known), _others(drivers.failures, known))
+
+
+def _others(items: Mapping[Any, Any], known: Collection[Any]) -> dict[Any, Any]:
+    return {key: value for key, value in items.items() if key not in known}
 
 
 def _fit_elsewhere(
@@ -159,7 +165,8 @@ def fit_file(
         progress: Show a progress bar.
 
     Returns:
-        As `identify_study`; the drivers are those of the parts that this run has fitted.
+        As `identify_study`; the drivers of parts that an earlier run has fitted hold no harmonics
+        of their calibrations.
 
     Raises:
         ResumeError: The earlier run had other settings, or the source has changed since.
@@ -176,12 +183,11 @@ def fit_file(
             raise ValueError("the study has no loaded recording")
         numbers = range((count + PART - 1) // PART)
         stamp = os.stat(source).st_mtime_ns
+        settings = Settings.of(opened.study, count, order, method, circuit)
+        described = json.loads(json.dumps(dataclasses.asdict(settings)))  # tuples become lists
         run = {
-            "source": source,
+            **{name.replace("_", " "): value for name, value in described.items()},
             "source date": stamp,
-            "version": importlib.metadata.version("etid"),
-            "order": order,
-            "method": method,
             "circuit": hashlib.sha256(repr(circuit).encode()).hexdigest(),
             "size of a part": PART,
         }
@@ -190,19 +196,19 @@ def fit_file(
         task = functools.partial(_fit, opened, circuit, method, PART)
         if executor is not None:
             task = functools.partial(_fit_elsewhere, source, stamp, order, method, circuit, PART)
-        drivers, failures = {}, {}
+        drivers = {}
         done = min(count, (len(numbers) - len(left)) * PART)
         with tqdm(total=count, initial=done, unit="fit", disable=not progress) as bar:
             for number, found in _results(task, left, executor):
-                found.fits.write(parts.path(number))
+                dataclasses.replace(found, settings=settings).write(parts.path(number))
                 drivers |= found.drivers
-                failures |= found.failures
                 bar.update(len(found.fits))
-    kind = type(circuit)
-    fits = Fits.concatenate([Fits.read(parts.path(number), kind) for number in numbers])
-    fits.write(target)
+    whole = StudyFits.concatenate(
+        StudyFits.read(parts.path(number), type(circuit)) for number in numbers
+    )
+    whole.write(target)
     shutil.rmtree(parts.folder)
-    return StudyFits(fits, drivers, failures)
+    return dataclasses.replace(whole, drivers={**whole.drivers, **drivers})
 
 
 def _results(

@@ -43,6 +43,8 @@ FLOORS = {
     "netlist": 3,
     "periodic": 0,
     "methods": 5,
+    "settings": 4,
+    "study_fits": 5,
     "hdf5": 4,
     "channels": 3,
     "mapping": 4,

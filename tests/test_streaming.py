@@ -17,6 +17,7 @@ import etid
 from etid import streaming
 from etid.scenes import Scene, Trial
 from etid.streaming import ResumeError, fit_file, processes
+from etid.study_fits import StudyFits
 from etid.transformer import ResistorLoad, SkinLoad
 
 # The paper's method: what is tested is the parts, not the fits, and it compiles fastest.
@@ -45,15 +46,17 @@ def _small_parts(monkeypatch):
 @pytest.fixture(scope="module")
 def whole(source):
     with etid.read(source) as study:
-        return etid.identify_study(study, method=METHOD).fits
+        return etid.identify_study(study, method=METHOD)
 
 
-def same(file: pathlib.Path, expected: etid.Fits) -> None:
-    """All columns of a file, bit for bit."""
+def same(file: pathlib.Path, expected: StudyFits) -> None:
+    """All columns and attributes of a file, bit for bit."""
     expected.write(file.with_name("expected.h5"))
     with h5py.File(file) as found, h5py.File(file.with_name("expected.h5")) as wanted:
         assert set(found) == set(wanted)
-        assert dict(found.attrs).keys() == dict(wanted.attrs).keys()
+        assert found.attrs.keys() == wanted.attrs.keys()
+        for name in wanted.attrs:
+            np.testing.assert_array_equal(found.attrs[name], wanted.attrs[name], name)
         for name in wanted:
             np.testing.assert_array_equal(np.asarray(found[name]), np.asarray(wanted[name]), name)
 

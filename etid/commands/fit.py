@@ -11,13 +11,13 @@ from collections.abc import Iterator
 import numpy as np
 
 from etid import hdf5
-from etid.batch import StudyFits
 from etid.circuits import DISPLAY, heading
 from etid.commands import DONE, WRONG_DATA
 from etid.joint import identify_jointly
 from etid.methods import METHODS
 from etid.report import Table
 from etid.streaming import fit_file, processes
+from etid.study_fits import StudyFits
 
 _SHOWN = 20  # recordings without success that are listed one by one
 
@@ -61,7 +61,7 @@ def run(arguments: argparse.Namespace) -> int:
             raise ValueError("--joint is one fit: it has no --resume, --workers or --dask")
         with hdf5.read(arguments.source) as study:
             outcome = identify_jointly(study, order=arguments.order, progress=progress)
-        outcome.fits.write(arguments.target)
+        outcome.write(arguments.target)
     else:
         with _executor(arguments) as executor:
             outcome = fit_file(
