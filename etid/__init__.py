@@ -50,6 +50,8 @@ from etid.results import Fits as Fits
 from etid.results import IdentificationError as IdentificationError
 from etid.streaming import fit_file as fit_file
 from etid.study import Study as Study
+from etid.study_fits import StudyFits as StudyFits
+from etid.study_report import write_report as write_report
 from etid.verdicts import RESULTS as RESULTS
 
 __version__ = "0.1.0"

@@ -12,13 +12,14 @@ from collections.abc import Sequence
 import jax
 
 import etid
-from etid.commands import WRONG_DATA, check, exporting, fit, importing, simulate
+from etid.commands import WRONG_DATA, check, exporting, fit, importing, report, simulate
 
 COMMANDS = {
     "simulate": simulate,
     "import": importing,
     "check": check,
     "fit": fit,
+    "report": report,
     "export": exporting,
 }
 

@@ -38,7 +38,7 @@ from etid.experiments import (
     identify,
     resistor_errors,
 )
-from etid.report import Section, Table, number, write_page
+from etid.report import Picture, Section, Table, number, write_page
 
 _SEED = 0
 _READING = (
@@ -142,9 +142,7 @@ def table_verdicts(outcomes: Sequence[Outcome], truth: Truth) -> Table:
     return Table(("records", "method", "driver", "skins and built circuit", *heads), tuple(rows))
 
 
-def figures(
-    folder: pathlib.Path, study: etid.Study, outcome: Outcome
-) -> tuple[tuple[str, pathlib.Path], ...]:
+def figures(folder: pathlib.Path, study: etid.Study, outcome: Outcome) -> tuple[Picture, ...]:
     """The paper's figures 7 to 9 and the elements of all subjects, as PNG and SVG."""
     folder.mkdir(exist_ok=True)
     driver = outcome.driver
@@ -155,7 +153,7 @@ def figures(
         figure = make()
         for suffix in (".png", ".svg"):
             plotting.save(figure, folder / f"{name}{suffix}")
-        drawn.append((caption, folder / f"{name}.svg"))
+        drawn.append(Picture(caption, (folder / f"{name}.svg").read_bytes()))
 
     known = study[CALIBRATION]
     draw(
@@ -204,7 +202,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     jax.config.update("jax_enable_x64", True)
 
     outcomes: list[Outcome] = []
-    drawn: tuple[tuple[str, pathlib.Path], ...] = ()
+    drawn: tuple[Picture, ...] = ()
     truth = etid.scenes.paper().truth()
     for laboratory, settings in LABORATORIES.items():
         place = folder if laboratory == "quiet" else folder / laboratory
@@ -257,7 +255,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     for section in sections:
         print(f"\n{section}")
     page = folder / "index.html"
-    sections.append(Section("Figures", "Quiet records, by maximum likelihood.", figures=drawn))
+    sections.append(Section("Figures", "Quiet records, by maximum likelihood.", pictures=drawn))
     write_page(page, "The paper's experiments, simulated and identified", _READING, sections)
     print(f"\nTables and figures: {page.resolve()}")
 

@@ -48,20 +48,22 @@ class _Balance(html.parser.HTMLParser):
 
 
 def test_page_is_whole_escaped_and_needs_no_other_file(tmp_path):
-    figure = tmp_path / "figure.svg"
-    figure.write_text("<svg xmlns='http://www.w3.org/2000/svg'/>")
-    section = report.Section(
-        "R < 1", "a & b", (report.Table(("x",), (("<1>",),)),), (("caption <c>", figure),)
-    )
+    picture = report.Picture("caption <c>", b"<svg xmlns='http://www.w3.org/2000/svg'/>", 'a "b"')
+    table = report.Table(("x", "y"), (("<1>", "2"),), (("", 1), ("<g>", 1)), "of <t>")
+    section = report.Section("R < 1", "a & b", (table,), (picture,), "<w>", "@x{<key>}")
     report.write_page(tmp_path / "page.html", "Title <t>", "text", [section])
     page = (tmp_path / "page.html").read_text(encoding="utf-8")
     parser = _Balance()
     parser.feed(page)
     assert parser.open == []
-    for escaped in ("Title &lt;t&gt;", "R &lt; 1", "a &amp; b", "&lt;1&gt;", "caption &lt;c&gt;"):
+    for escaped in (
+        "Title &lt;t&gt;", "R &lt; 1", "a &amp; b", "&lt;1&gt;", "&lt;g&gt;", "of &lt;t&gt;",
+        "caption &lt;c&gt;", "a &quot;b&quot;", "&lt;w&gt;", "@x{&lt;key&gt;}",
+    ):  # fmt: skip
         assert escaped in page
     assert all(source.startswith("data:") for source in re.findall(r'src="([^"]*)"', page))
-    assert "href" not in page
+    assert re.findall(r'href="([^"]*)"', page) == ["#r-1"]
+    assert 'id="r-1"' in page
 
 
 def _fits(circuit, paths, elements, excess):

@@ -1,0 +1,212 @@
+"""Pictures of a whole study, as clear with 100 000 fits as with ten: no mark for each fit.
+
+Every function returns the picture as SVG, which is the same for the same fits.
+"""
+
+import io
+from collections.abc import Mapping, Sequence
+
+import jax.numpy as jnp
+import matplotlib
+import matplotlib.ticker
+import numpy as np
+from jaxtyping import Float
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from etid.circuits import DISPLAY
+from etid.driver import Driver
+from etid.plotting import (
+    COLOURS,
+    STYLES,
+    bode_frequencies,
+    new_figure,
+    plot_elements,
+    plot_impedance,
+)
+from etid.results import Fits
+from etid.study_tables import Components
+
+POINTS = 300  # of a curve
+BINS = 40
+NAMED = 30  # subjects that have their names below an axis
+SERIES = 4  # conditions that are told apart
+QUARTILES, MOST = (0.25, 0.75), (0.05, 0.95)
+MARKS = "osD^"
+
+
+def svg(figure: Figure) -> bytes:
+    """A figure as SVG, without dates and random names."""
+    buffer = io.BytesIO()
+    with matplotlib.rc_context({"svg.hashsalt": "etid"}):
+        figure.savefig(buffer, format="svg", metadata={"Date": None})
+    return buffer.getvalue()
+
+
+def _conditions(fits: Fits) -> list[str]:
+    """The most frequent conditions, which are told apart, in alphabetical order."""
+    names, counts = np.unique(fits.labels["condition"].astype(str), return_counts=True)
+    return sorted(names[np.argsort(-counts, kind="stable")[:SERIES]].tolist())
+
+
+def _positive(values: np.ndarray) -> Float[np.ndarray, " value"]:
+    return np.asarray(values)[np.isfinite(values) & (np.asarray(values) > 0)]
+
+
+def _steps(axis: Axes, values: np.ndarray, series: int, label: str) -> None:
+    """An empirical distribution function of at most `POINTS` points."""
+    p = np.linspace(0.0, 1.0, min(POINTS, max(values.size, 2)))
+    axis.plot(
+        np.quantile(values, p), 100 * p, STYLES[series % 4], color=COLOURS[series % 4], lw=1.3,
+        label=label,
+    )  # fmt: skip
+
+
+def distributions(fits: Fits) -> bytes:
+    """Part of the successful fits below each value, for each element and condition."""
+    good, units = fits.successful(), fits.circuit.units()
+    figure, axes = new_figure(1, len(units), (3.4 * len(units) + 1, 3.0), sharey=True)
+    for axis, (name, unit) in zip(axes[0], units.items(), strict=True):
+        scale, symbol = DISPLAY[unit]
+        for series, condition in enumerate(_conditions(good)):
+            values = _positive(getattr(good.where(condition=condition).circuit, name)) / scale
+            if values.size:
+                _steps(axis, values, series, f"{condition or 'all'} ({values.size})")
+        axis.set(xscale="log", xlabel=f"{name} [{symbol}]")
+        _plain(axis, "x")
+    axes[0, 0].set_ylabel("fits below [%]")
+    axes[0, 0].legend(frameon=False, fontsize=8)
+    return svg(figure)
+
+
+def _plain(axis: Axes, which: str) -> None:
+    """Write 20 and 50 at a logarithmic axis of few decades, not powers of ten."""
+    of = axis.xaxis if which == "x" else axis.yaxis
+    low, high = sorted(of.get_view_interval())
+    if low > 0 and np.log10(high / low) < 3:
+        of.set_major_locator(matplotlib.ticker.LogLocator(subs=(1.0, 2.0, 5.0)))
+        of.set_major_formatter(matplotlib.ticker.FormatStrFormatter("%g"))
+        of.set_minor_formatter(matplotlib.ticker.NullFormatter())
+
+
+def quality(fits: Fits, stderr: np.ndarray) -> bytes:
+    """χ² of all fits, and the largest relative standard error of the successful ones.
+
+    Args:
+        fits: All fits.
+        stderr: Largest relative standard error of each.
+    """
+    figure, axes = new_figure(1, 2, (9.0, 3.0))
+    left, right = axes[0]
+    good = fits.verdicts == "successful"
+    chi2, errors = np.asarray(fits.chi2), 100 * stderr[good]
+    known = _positive(chi2)
+    if known.size:
+        bins = np.geomspace(known.min() / 1.01, known.max() * 1.01, BINS)
+        parts = [_positive(chi2[good]), _positive(chi2[~good])]
+        left.hist(
+            parts, bins=bins.tolist(), stacked=True, color=[COLOURS[0], "white"],
+            edgecolor=COLOURS[0], lw=0.6, hatch=["", "////"], label=["successful", "not"],
+        )  # fmt: skip
+        left.axvline(1.0, color=COLOURS[3], lw=0.8, ls=":")
+        left.legend(frameon=False, fontsize=8)
+    left.set(xscale="log", xlabel="χ² per degree of freedom", ylabel="fits")
+    _plain(left, "x")
+    known = _positive(errors)
+    if known.size:
+        bins = np.geomspace(known.min() / 1.01, known.max() * 1.01, BINS)
+        right.hist(known, bins=bins.tolist(), color=COLOURS[0], edgecolor="white", lw=0.3)
+    right.set(xscale="log", xlabel="largest relative standard error [%]", ylabel="successful fits")
+    _plain(right, "x")
+    return svg(figure)
+
+
+def by_subject(fits: Fits) -> bytes:
+    """Median of each subject, with the middle half and nine tenths of their fits as bars."""
+    good, units = fits.successful(), fits.circuit.units()
+    subjects = sorted(set(map(str, good.labels["subject"])))
+    conditions = _conditions(good)
+    width = min(12.0, max(7.5, 0.35 * len(subjects)))
+    figure, axes = new_figure(len(units), 1, (width, 2.2 * len(units)), sharex=True)
+    number = {subject: i for i, subject in enumerate(subjects)}
+    place = np.array([number[str(subject)] for subject in good.labels["subject"]], int)
+    for axis, (name, unit) in zip(axes[:, 0], units.items(), strict=True):
+        scale, symbol = DISPLAY[unit]
+        values = np.asarray(getattr(good.circuit, name)) / scale
+        for series, condition in enumerate(conditions):
+            chosen = good.labels["condition"] == condition
+            where, found = _quantiles(place[chosen], values[chosen])
+            shift = (series + 0.5) / len(conditions) * 0.8 - 0.4
+            colour = COLOURS[series]
+            thin = 1.0 if len(subjects) <= 2 * NAMED else 0.5
+            axis.vlines(where + shift, found[0], found[4], color=colour, lw=0.8 * thin)
+            axis.vlines(where + shift, found[1], found[3], color=colour, lw=2.6 * thin)
+            axis.plot(
+                where + shift, found[2], MARKS[series], color=colour, ms=4.5 * thin,
+                markerfacecolor="white", label=condition or "all",
+            )  # fmt: skip
+        axis.set(yscale="log", ylabel=f"{name} [{symbol}]")
+        _plain(axis, "y")
+    last = axes[-1, 0]
+    if len(subjects) <= NAMED:
+        names = [_short(subject) or "-" for subject in subjects]
+        turned = sum(map(len, names)) > 10 * width
+        last.set_xticks(range(len(subjects)), names, rotation=90 if turned else 0)
+    last.set_xlabel("subject" if len(subjects) <= NAMED else "number of the subject, by name")
+    axes[0, 0].legend(frameon=False, fontsize=8, ncols=SERIES)
+    return svg(figure)
+
+
+def _short(name: str) -> str:
+    """A name that fits below an axis; a dollar sign would be read as mathematics."""
+    return (name if len(name) <= 16 else name[:15] + "…").replace("$", r"\$")
+
+
+def _quantiles(place: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Places that occur, and five quantiles of the values at each."""
+    order = np.argsort(place, kind="stable")
+    where, starts = np.unique(place[order], return_index=True)
+    levels = (MOST[0], QUARTILES[0], 0.5, QUARTILES[1], MOST[1])
+    found = [np.quantile(part, levels) for part in np.split(values[order], starts[1:])]
+    return where.astype(float), np.array(found).reshape(where.size, 5).T
+
+
+def components(found: Sequence[Components]) -> bytes:
+    """What varies and what is error, beside each other on one scale."""
+    names = list(dict.fromkeys(one.name for one in found))
+    conditions = list(dict.fromkeys(one.condition for one in found))[:SERIES]
+    parts = list(found[0].parts)
+    figure, axes = new_figure(1, len(names), (3.4 * len(names) + 1, 2.6), sharey=True)
+    for axis, name in zip(axes[0], names, strict=True):
+        for series, condition in enumerate(conditions):
+            chosen = [one for one in found if (one.name, one.condition) == (name, condition)]
+            for one in chosen:
+                sizes = 100 * np.array(list(one.parts.values()))
+                shift = 0.15 * (series - (len(conditions) - 1) / 2)
+                shown = np.isfinite(sizes) & (sizes > 0)
+                axis.plot(
+                    sizes[shown], np.arange(len(parts))[shown] + shift, MARKS[series],
+                    color=COLOURS[series], ms=6, label=condition or "all",
+                )  # fmt: skip
+        axis.set(xscale="log", xlabel=f"{name}: part of the median [%]")
+        _plain(axis, "x")
+    axes[0, 0].set_yticks(range(len(parts)), parts)
+    axes[0, 0].set_ylim(len(parts) - 0.5, -0.5)
+    axes[0, 0].legend(frameon=False, fontsize=8)
+    return svg(figure)
+
+
+def each_fit(fits: Fits) -> bytes:
+    """Every fit with its standard error, by subject."""
+    return svg(plot_elements(fits))
+
+
+def drivers(found: Mapping[str, Driver]) -> bytes:
+    """Z_th of some drivers, with bands of two standard errors."""
+    frequency = bode_frequencies()
+    errors = {
+        _short(name): np.asarray(driver.response_stderr(jnp.asarray(frequency)))
+        for name, driver in found.items()
+        if driver.cov is not None
+    }
+    return svg(plot_impedance({_short(n): driver for n, driver in found.items()}, stderr=errors))
