@@ -4,22 +4,18 @@ Numbers in them, thresholds included, are those that the estimators use.
 """
 
 import math
+import pathlib
 
 import numpy as np
 
-from etid import circuits, citations, judging, output_error, steiglitz_mcbride
+from etid import circuits, citations, dispersion, judging, output_error, steiglitz_mcbride
 from etid.baseline import BIASED
-from etid.report import Section
+from etid.report import Section, Table
 from etid.settings import Settings
 from etid.study_fits import StudyFits
 
 _HARMONICS = (
     "At the harmonics of the pulse rate, in the periodic steady state and in continuous time, "
-)
-_REFINED = (
-    " Minima were found by Levenberg-Marquardt, composed of the parts of optimistix (Rader et al., "
-    f"2024), in at most {output_error.MAX_STEPS} steps, from several starts, among them the "
-    "estimate of Steiglitz and McBride (1965)."
 )
 _TEXTS = {
     "maximum_likelihood": "the load was estimated by maximum likelihood with noise on both "
@@ -91,6 +87,7 @@ def methods_section(found: StudyFits) -> Section:
     return Section(
         "Methods",
         "\n\n".join(filter(None, paragraphs)),
+        () if settings is None else (_table(found, settings),),
         warning=warning,
         code=citations.bibtex(cited),
     )
@@ -110,7 +107,7 @@ def _model(found: StudyFits) -> str:
     circuit = fits.circuit
     which = f"{len(fits)} recordings"
     if settings is not None and settings.source:
-        which += f" of {settings.source}"
+        which += f" of {pathlib.Path(settings.source).name}"
     text = f"The {which} were identified with etid as loads of a driver with source impedance Z_th,"
     text += " V_out = V_th Z_L / (Z_L + Z_th). "
     if isinstance(circuit, circuits.SkinRC):
@@ -141,13 +138,15 @@ def _driver(found: StudyFits) -> str:
     if any(driver.source is not None for driver in drivers):
         text += ", stable by its modal parameters"
     count = len(found.drivers) + len(found.failures)
-    text += f". {count} driver{'s were' if count != 1 else ' was'} identified from calibrations"
+    text += ". It was identified from calibrations"
+    if count > 1:
+        text = text.replace("It was identified", f"It was identified for {count} drivers")
     if resistors:
         text += " with known resistors of "
         text += ", ".join(f"{r / 1e3:.6g}" for r in resistors) + " kΩ"
     methods = sorted({driver.method for driver in drivers})
     if methods:
-        text += f" (estimator: {', '.join(methods)})"
+        text += f", by {' or '.join(map(_words, methods))}"
     return text + "."
 
 
@@ -164,12 +163,23 @@ def _estimator(found: StudyFits, used: set[str]) -> str:
         sentence = _TEXTS[method] if method in _IN_TIME else _HARMONICS + _TEXTS[method]
         text += sentence[0].upper() + sentence[1:] + " "
     if used & set(_BY_LEVENBERG_MARQUARDT):
-        text += _REFINED.strip() + " "
+        text += _refined(found.fits.circuit)
     text += (
         "The variances of the noise were estimated from each record by the median of its "
         "differences of sixth order."
     )
     return text
+
+
+def _refined(circuit: circuits.AbstractCircuit) -> str:
+    at = "around the typical elements and, for Z_th"
+    if isinstance(circuit, circuits.SkinRC):
+        at += " and the load alike"
+    return (
+        "Minima were found by Levenberg-Marquardt, composed of the parts of optimistix (Rader et "
+        f"al., 2024), in at most {output_error.MAX_STEPS} steps, from several starts {at}, from "
+        "the estimate of Steiglitz and McBride (1965). "
+    )
 
 
 def _words(method: str) -> str:
@@ -216,8 +226,11 @@ def _verdicts(used: set[str]) -> str:
         f"or an unexplained part of at most {100 * judging.MISFIT_RRSE:g} % of the signal)"
     )
     if used - {"steiglitz_mcbride", "equation_error"}:
+        text += ", the trigger delay is at most one sample, every relative standard error below 1"
+    if "maximum_likelihood" in used:
         text += (
-            ", the trigger delay is at most one sample, every relative standard error is below 1"
+            ", a score test against a relaxation that is spread over time constants finds none (at "
+            f"{dispersion.SEEN:g} standard deviations)"
         )
     if used & {"maximum_likelihood", "joint"}:
         text += (
@@ -239,3 +252,20 @@ def _computed(settings: Settings | None) -> str:
         f"Computed in {settings.precision} by JAX (Bradbury et al., 2018) on {settings.backend}, "
         f"with {', '.join(settings.versions)}."
     )
+
+
+def _table(found: StudyFits, settings: Settings) -> Table:
+    """The settings as the file has them."""
+    rows = {
+        "recordings": settings.source or "in memory",
+        "their file [byte]": str(settings.source_size) if settings.source else "",
+        "method asked for": settings.asked_method or "chosen for each recording",
+        "method of the fits": found.fits.fit.method,
+        "order of Z_th": str(settings.order),
+        "circuit": type(found.fits.circuit).__name__,
+        "tolerance of R_L [%]": f"{100 * settings.r_load_tolerance:g}",
+        "computed with": f"{settings.precision}, {settings.backend}",
+        "versions": ", ".join(settings.versions),
+    }
+    shown = tuple((name, value) for name, value in rows.items() if value)
+    return Table(("setting", "value"), shown, caption="Settings")

@@ -27,15 +27,17 @@ nav ul { list-style: none; padding: 0; display: flex; flex-wrap: wrap; gap: 0.2r
 .wide { overflow-x: auto; margin: 1rem 0; }
 table { border-collapse: collapse; font-size: 0.85rem; font-variant-numeric: tabular-nums; }
 caption { text-align: left; font-weight: 600; padding: 0.3rem 0; }
-th, td { padding: 0.2rem 0.7rem; text-align: right; white-space: nowrap; }
+th, td { padding: 0.2rem 0.55rem; text-align: right; white-space: nowrap; }
+thead th { white-space: normal; }
 thead tr:last-child th { border-bottom: 1px solid var(--line); vertical-align: bottom; }
-thead th[colspan] { text-align: center; }
+thead th[colspan] { text-align: center; border-bottom: 1px solid var(--line); }
 th:first-child, td:first-child, td.text, th.text { text-align: left; }
 td.long { white-space: normal; min-width: 20rem; overflow-wrap: anywhere; }
 tbody tr:nth-child(even) td { background: var(--soft); }
 figure { margin: 1rem 0; } figcaption { font-size: 0.85rem; overflow-wrap: anywhere; }
 img { background: white; border-radius: 4px; max-width: 100%; height: auto; }
-.figures { display: flex; flex-wrap: wrap; gap: 1rem; } .figures figure { flex: 1 1 24rem; }
+.figures { display: flex; flex-wrap: wrap; gap: 1rem; } .figures figure { flex: 1 1 30rem; }
+.figures figure.whole { flex-basis: 100%; }
 pre { font-size: 0.8rem; background: var(--soft); padding: 1rem; white-space: pre-wrap;
   overflow-wrap: anywhere; user-select: all; }
 @media screen and (prefers-color-scheme: dark) {
@@ -49,10 +51,10 @@ pre { font-size: 0.8rem; background: var(--soft); padding: 1rem; white-space: pr
   h1, h2, caption { break-after: avoid; } p { orphans: 3; widows: 3; max-width: none; }
   .wide { overflow: visible; } table { font-size: 6.5pt; } th, td { padding: 0.1rem 0.3rem; }
   td.long { min-width: 0; } pre { font-size: 7pt; }
-  table, figure, pre { break-inside: avoid; } thead { display: table-header-group; }
+  table, figure { break-inside: avoid; } thead { display: table-header-group; }
   tr { break-inside: avoid; } .figures { display: block; }
   .figures figure { display: inline-block; width: 48%; margin: 0.5%; vertical-align: top; }
-  .figures figure:only-child { width: 99%; }
+  .figures figure.whole { width: 99%; }
 }
 """
 _LONG = 60  # characters, above which a cell is broken into lines
@@ -145,18 +147,21 @@ class Picture:
         caption: Below the picture.
         svg: The picture.
         alt: What it shows, for those who cannot see it; the caption if not given.
+        whole: Whether it needs the width of the page, which two others share.
     """
 
     caption: str
     svg: bytes
     alt: str = ""
+    whole: bool = False
 
     def html(self) -> str:
         """The picture as an HTML element."""
         data = base64.b64encode(self.svg).decode("ascii")
         alt = html.escape(self.alt or self.caption)
+        whole = ' class="whole"' if self.whole else ""
         return (
-            f'<figure><img alt="{alt}" src="data:image/svg+xml;base64,{data}">'
+            f'<figure{whole}><img alt="{alt}" src="data:image/svg+xml;base64,{data}">'
             f"<figcaption>{html.escape(self.caption)}</figcaption></figure>"
         )
 

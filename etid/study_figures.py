@@ -89,35 +89,20 @@ def _plain(axis: Axes, which: str) -> None:
         of.set_minor_formatter(matplotlib.ticker.NullFormatter())
 
 
-def quality(fits: Fits, stderr: np.ndarray) -> bytes:
-    """χ² of all fits, and the largest relative standard error of the successful ones.
-
-    Args:
-        fits: All fits.
-        stderr: Largest relative standard error of each.
-    """
-    figure, axes = new_figure(1, 2, (9.0, 3.0))
+def quality(chi2: Float[np.ndarray, " fit"], stderr: Float[np.ndarray, " fit"]) -> bytes:
+    """Histograms of χ² and of the largest relative standard error."""
+    figure, axes = new_figure(1, 2, (10.0, 2.6))
     left, right = axes[0]
-    good = fits.verdicts == "successful"
-    chi2, errors = np.asarray(fits.chi2), 100 * stderr[good]
-    known = _positive(chi2)
-    if known.size:
-        bins = np.geomspace(known.min() / 1.01, known.max() * 1.01, BINS)
-        parts = [_positive(chi2[good]), _positive(chi2[~good])]
-        left.hist(
-            parts, bins=bins.tolist(), stacked=True, color=[COLOURS[0], "white"],
-            edgecolor=COLOURS[0], lw=0.6, hatch=["", "////"], label=["successful", "not"],
-        )  # fmt: skip
-        left.axvline(1.0, color=COLOURS[3], lw=0.8, ls=":")
-        left.legend(frameon=False, fontsize=8)
-    left.set(xscale="log", xlabel="χ² per degree of freedom", ylabel="fits")
-    _plain(left, "x")
-    known = _positive(errors)
-    if known.size:
-        bins = np.geomspace(known.min() / 1.01, known.max() * 1.01, BINS)
-        right.hist(known, bins=bins.tolist(), color=COLOURS[0], edgecolor="white", lw=0.3)
-    right.set(xscale="log", xlabel="largest relative standard error [%]", ylabel="successful fits")
-    _plain(right, "x")
+    left.axvline(1.0, color=COLOURS[3], lw=1.0, ls=":")
+    left.set(xlabel="χ² per degree of freedom", ylabel="fits")
+    right.set(xlabel="largest relative standard error [%]", ylabel="fits")
+    for axis, values in ((left, chi2), (right, 100 * stderr)):
+        known = _positive(values)
+        if known.size:
+            bins = np.geomspace(known.min() / 1.01, known.max() * 1.01, BINS)
+            axis.hist(known, bins=bins.tolist(), color=COLOURS[0], edgecolor="white", lw=0.3)
+        axis.set_xscale("log")
+        _plain(axis, "x")
     return svg(figure)
 
 
@@ -157,9 +142,9 @@ def by_subject(fits: Fits) -> bytes:
     return svg(figure)
 
 
-def _short(name: str) -> str:
-    """A name that fits below an axis; a dollar sign would be read as mathematics."""
-    return (name if len(name) <= 16 else name[:15] + "…").replace("$", r"\$")
+def _short(name: str, length: int = 16) -> str:
+    """A name that fits into a picture, where a dollar sign would be read as mathematics."""
+    return (name if len(name) <= length else name[: length - 1] + "…").replace("$", r"\$")
 
 
 def _quantiles(place: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -205,8 +190,10 @@ def drivers(found: Mapping[str, Driver]) -> bytes:
     """Z_th of some drivers, with bands of two standard errors."""
     frequency = bode_frequencies()
     errors = {
-        _short(name): np.asarray(driver.response_stderr(jnp.asarray(frequency)))
+        _short(name, 60): np.asarray(driver.response_stderr(jnp.asarray(frequency)))
         for name, driver in found.items()
         if driver.cov is not None
     }
-    return svg(plot_impedance({_short(n): driver for n, driver in found.items()}, stderr=errors))
+    return svg(
+        plot_impedance({_short(n, 60): driver for n, driver in found.items()}, stderr=errors)
+    )

@@ -157,6 +157,7 @@ def _elements(fits: Fits, groups: Sequence[Mapping[str, Any]]) -> list[Section]:
             study_figures.distributions(fits),
             f"Distribution functions of {', '.join(units)} by condition; quantiles are in the "
             "table above.",
+            whole=True,
         ),
         Picture(
             f"What varies and what is error, in per cent of the median, for {shown}. Zeros are "
@@ -164,6 +165,7 @@ def _elements(fits: Fits, groups: Sequence[Mapping[str, Any]]) -> list[Section]:
             study_figures.components(found),
             "Between subjects, between recordings, own error and shared error of each element by "
             "condition, on a logarithmic scale; the numbers are in the table above.",
+            whole=True,
         ),
     )
     return [Section("Elements", text, (study_tables.show_components(found, units),), pictures)]
@@ -181,8 +183,8 @@ def _subjects(fits: Fits, groups: Sequence[Mapping[str, Any]]) -> Section:
 
     good = fits.successful()
     text = (
-        "Medians of the successful fits with the median standard error; then, in per cent of the "
-        "median, what really varies between the recordings, their own error and the shared one."
+        "Medians of the successful fits, to two digits of their standard error; and in per cent of "
+        "the median what really varies between the recordings, their own error and the shared one."
     )
     pictures = ()
     if len(good) > FEW:
@@ -191,11 +193,11 @@ def _subjects(fits: Fits, groups: Sequence[Mapping[str, Any]]) -> Section:
             "of them (thin)."
         )
         alt = "Medians and quantiles of each element by subject and condition."
-        pictures = (Picture(caption, study_figures.by_subject(fits), alt),)
+        pictures = (Picture(caption, study_figures.by_subject(fits), alt, whole=True),)
     elif len(good):
         caption = "All fits with their standard errors; hollow without success."
         alt = "Each element of each fit by subject and condition, with standard errors."
-        pictures = (Picture(caption, study_figures.each_fit(fits), alt),)
+        pictures = (Picture(caption, study_figures.each_fit(fits), alt, whole=True),)
     return _grouped("Subjects", text, groups, ("subject", "condition"), fits, pictures)
 
 
@@ -228,34 +230,29 @@ def _grouped(
 def _quality(fits: Fits, stderr: np.ndarray) -> Section:
     from etid import study_figures
 
-    failed = len(fits) - fits.counts().get("successful", 0)
-    without = int((~np.isfinite(fits.chi2)).sum())
-    caption = (
-        "χ² per degree of freedom, 1 (dotted) where the residual is noise, and the standard error "
-        "of the element that is known worst."
-    )
-    if without:
-        caption += f" {without} fits have no χ²."
-    pictures = (
-        Picture(
-            caption,
-            study_figures.quality(fits, stderr),
-            "Histograms of χ² of all fits and of the largest relative standard error of the "
-            "successful ones.",
-        ),
-    )
-    text = f"{failed} fits are without success."
+    good = fits.verdicts == "successful"
+    pictures = ()
+    if good.any():
+        caption = (
+            "Successful fits: χ² per degree of freedom, 1 (dotted) where the residual is noise, "
+            "and the standard error of the element that is known worst."
+        )
+        alt = "Histograms of χ² and of the largest relative standard error."
+        drawn = study_figures.quality(np.asarray(fits.chi2)[good], stderr[good])
+        pictures = (Picture(caption, drawn, alt, whole=True),)
+    failed = int((~good).sum())
+    text = f"{failed} fits are without success." if failed else "All fits are successful."
     if failed > study_tables.BRIEF:
         text += f" The first {study_tables.BRIEF} are listed; the file of fits has all."
     tables = (study_tables.failures(fits),) if failed else ()
-    return Section("Fits without success", text, tables, pictures)
+    return Section("Quality", text, tables, pictures)
 
 
 def _worst(fits: Fits, place: Any) -> Section:
     text = (
-        "Chosen without success first, by as many verdicts as there are and in each by χ²; then "
-        "the successful ones with the largest χ² and with the largest standard error. One pulse of "
-        "each is drawn; the residual is what a right model leaves to noise."
+        "First some without success, of as many verdicts as there are and in each those with the "
+        "largest χ²; then the successful ones with the largest χ² and with the largest standard "
+        "error. One pulse of each is drawn. Where the model is right, the residual is noise."
     )
     pictures, missing = [], []
     for one in choose(fits):

@@ -39,7 +39,7 @@ def element(value: float, error: float, unit: str) -> str:
 def verdicts(fits: Fits) -> Table:
     """How often each verdict occurs, and what it means."""
     rows = tuple(
-        (name, str(count), f"{100 * count / len(fits):.1f}", message(name) or "-")
+        (name, str(count), f"{100 * count / len(fits):.1f}", message(name))
         for name, count in fits.counts().items()
     )
     return Table(("verdict", "recordings", "share [%]", "what it means, what to do"), rows)
@@ -208,12 +208,14 @@ def groups(rows: Sequence[Mapping[str, Any]], by: Sequence[str], units: Mapping[
         line.append(f"{row['successful']}/{row['fits']}")
         for name, unit in units.items():
             median = row[name]
-            line.append(element(median, row[f"{name}_stderr"], unit))
+            line.append(element(median, row[f"{name}_stderr"], unit).partition(" ±")[0])
             line += [significant(100 * row[f"{name}_{k}"] / median) for k in PARTS]
         cells.append(tuple(line))
-    heads = (*by, "successful", *(("median", *PARTS) * len(units)))
-    over = [(f"{name} [{DISPLAY[unit][1]}]; [%]", 1 + len(PARTS)) for name, unit in units.items()]
-    return Table(heads, tuple(cells), (("", len(by) + 1), *over))
+    heads = [*by, "successful"]
+    for unit in units.values():
+        heads += [f"median [{DISPLAY[unit][1]}]", *(f"{part} [%]" for part in PARTS)]
+    over = [(name, 1 + len(PARTS)) for name in units]
+    return Table(tuple(heads), tuple(cells), (("", len(by) + 1), *over))
 
 
 def failures(fits: Fits) -> Table:
@@ -233,4 +235,6 @@ def failures(fits: Fits) -> Table:
             )
         )
     heads = ("recording", "subject", "condition", "verdict", "χ²", "RRSE [%]", "note")
+    if not any(row[-1] for row in rows):
+        return Table(heads[:-1], tuple(row[:-1] for row in rows))
     return Table(heads, tuple(rows))

@@ -16,6 +16,7 @@ from etid.results import Fit, plus_minus
 from etid.study import Study
 from etid.study_figures import svg
 from etid.study_fits import StudyFits
+from etid.study_tables import significant
 
 
 class Recordings:
@@ -110,7 +111,7 @@ class Recordings:
         else:
             figure = plot_fit(recording, predicted)
             alt = f"One pulse of {path}: measured, predicted and residual voltage. {elements}"
-            caption = f"{about} χ² {float(fit.chi2):.3g}, {elements}."
+            caption = f"{about} χ² {significant(float(fit.chi2), 3)}, {elements}."
         return Picture(caption, svg(figure), alt)
 
     def _predict(self, recording: Recording, fit: Fit) -> tuple[np.ndarray | None, str]:

@@ -47,7 +47,7 @@ def choose(fits: Fits) -> list[Worst]:
         for name in fits.counts()
         if name != "successful"
     ]
-    taken = [Worst(row, f"{names[row]}") for row in _in_turn(failing, FAILED)]
+    taken = [Worst(row, "without success") for row in _in_turn(failing, FAILED)]
     good = np.flatnonzero(names == "successful")
     for size, count, reason in (
         (chi2, STRAINED, "largest χ² among the successful"),
