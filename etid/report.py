@@ -32,7 +32,8 @@ thead th { white-space: normal; }
 thead tr:last-child th { border-bottom: 1px solid var(--line); vertical-align: bottom; }
 thead th[colspan] { text-align: center; border-bottom: 1px solid var(--line); }
 th:first-child, td:first-child, td.text, th.text { text-align: left; }
-td.long { white-space: normal; min-width: 20rem; overflow-wrap: anywhere; }
+td.text { white-space: normal; max-width: 14rem; }
+td.long { max-width: none; white-space: normal; min-width: 20rem; overflow-wrap: anywhere; }
 tbody tr:nth-child(even) td { background: var(--soft); }
 figure { margin: 1rem 0; } figcaption { font-size: 0.85rem; overflow-wrap: anywhere; }
 img { background: white; border-radius: 4px; max-width: 100%; height: auto; }
@@ -58,6 +59,7 @@ pre { font-size: 0.8rem; background: var(--soft); padding: 1rem; white-space: pr
 }
 """
 _LONG = 60  # characters, above which a cell is broken into lines
+_MANY = 12  # rows, above which a table stands below the pictures
 
 
 @dataclasses.dataclass(frozen=True)
@@ -175,7 +177,7 @@ class Section:
         text: Paragraphs, with an empty line between them.
         warning: A paragraph that must not be overlooked, above the others.
         tables: Tables below the paragraphs.
-        pictures: Pictures below the tables.
+        pictures: Pictures below the tables; above them if a table is long.
         code: Text to be copied as it is, at the end.
     """
 
@@ -204,10 +206,11 @@ class Section:
             parts.append(f'<p class="warning">{html.escape(self.warning)}</p>')
         paragraphs = filter(None, self.text.split("\n\n"))
         parts += [f"<p>{html.escape(paragraph)}</p>" for paragraph in paragraphs]
-        parts += [table.html() for table in self.tables]
-        if self.pictures:
-            pictures = "\n".join(picture.html() for picture in self.pictures)
-            parts.append(f'<div class="figures">{pictures}</div>')
+        pictures = "\n".join(picture.html() for picture in self.pictures)
+        shown = [f'<div class="figures">{pictures}</div>'] if pictures else []
+        tables = [table.html() for table in self.tables]
+        many = any(len(table.rows) > _MANY for table in self.tables)
+        parts += shown + tables if many else tables + shown
         if self.code:
             parts.append(f"<pre>{html.escape(self.code)}</pre>")
         return "\n".join([*parts, "</section>"])

@@ -29,7 +29,9 @@ from etid.study_tables import Components
 
 POINTS = 300  # of a curve
 BINS = 40
+DECADE = 10.0  # of values, above which an axis is logarithmic
 NAMED = 30  # subjects that have their names below an axis
+CROWD = 120  # subjects that are drawn
 SERIES = 4  # conditions that are told apart
 QUARTILES, MOST = (0.25, 0.75), (0.05, 0.95)
 MARKS = "osD^"
@@ -99,47 +101,63 @@ def quality(chi2: Float[np.ndarray, " fit"], stderr: Float[np.ndarray, " fit"]) 
     for axis, values in ((left, chi2), (right, 100 * stderr)):
         known = _positive(values)
         if known.size:
-            bins = np.geomspace(known.min() / 1.01, known.max() * 1.01, BINS)
-            axis.hist(known, bins=bins.tolist(), color=COLOURS[0], edgecolor="white", lw=0.3)
-        axis.set_xscale("log")
-        _plain(axis, "x")
+            wide = known.max() > DECADE * known.min()
+            space = np.geomspace if wide else np.linspace
+            bins = space(0.99 * known.min(), 1.01 * known.max(), BINS).tolist()
+            axis.hist(known, bins=bins, color=COLOURS[0], edgecolor="white", lw=0.3)
+            if wide:
+                axis.set_xscale("log")
+                _plain(axis, "x")
     return svg(figure)
 
 
 def by_subject(fits: Fits) -> bytes:
-    """Median of each subject, with the middle half and nine tenths of their fits as bars."""
+    """Median of each subject, with the middle half and nine tenths of their fits as bars.
+
+    Of more than `CROWD` subjects some are drawn, evenly spaced in the order of their medians.
+    """
     good, units = fits.successful(), fits.circuit.units()
-    subjects = sorted(set(map(str, good.labels["subject"])))
+    subjects, place = np.unique(good.labels["subject"].astype(str), return_inverse=True)
+    named = subjects.size <= NAMED
     conditions = _conditions(good)
-    width = min(12.0, max(7.5, 0.35 * len(subjects)))
+    width = min(14.0, max(10.0, 0.35 * subjects.size))
     figure, axes = new_figure(len(units), 1, (width, 2.2 * len(units)), sharex=True)
-    number = {subject: i for i, subject in enumerate(subjects)}
-    place = np.array([number[str(subject)] for subject in good.labels["subject"]], int)
+    thin = 1.0 if subjects.size <= 2 * NAMED else 0.5
     for axis, (name, unit) in zip(axes[:, 0], units.items(), strict=True):
         scale, symbol = DISPLAY[unit]
         values = np.asarray(getattr(good.circuit, name)) / scale
         for series, condition in enumerate(conditions):
             chosen = good.labels["condition"] == condition
             where, found = _quantiles(place[chosen], values[chosen])
-            shift = (series + 0.5) / len(conditions) * 0.8 - 0.4
+            if subjects.size > CROWD:
+                where, found = _thinned(found)
+            where = where + (series + 0.5) / len(conditions) * 0.8 - 0.4
             colour = COLOURS[series]
-            thin = 1.0 if len(subjects) <= 2 * NAMED else 0.5
-            axis.vlines(where + shift, found[0], found[4], color=colour, lw=0.8 * thin)
-            axis.vlines(where + shift, found[1], found[3], color=colour, lw=2.6 * thin)
+            axis.vlines(where, found[0], found[4], color=colour, lw=0.8 * thin)
+            axis.vlines(where, found[1], found[3], color=colour, lw=2.6 * thin)
             axis.plot(
-                where + shift, found[2], MARKS[series], color=colour, ms=4.5 * thin,
+                where, found[2], MARKS[series], color=colour, ms=4.5 * thin,
                 markerfacecolor="white", label=condition or "all",
             )  # fmt: skip
         axis.set(yscale="log", ylabel=f"{name} [{symbol}]")
         _plain(axis, "y")
     last = axes[-1, 0]
-    if len(subjects) <= NAMED:
+    if named:
         names = [_short(subject) or "-" for subject in subjects]
         turned = sum(map(len, names)) > 10 * width
-        last.set_xticks(range(len(subjects)), names, rotation=90 if turned else 0)
-    last.set_xlabel("subject" if len(subjects) <= NAMED else "number of the subject, by name")
+        last.set_xticks(range(subjects.size), names, rotation=90 if turned else 0)
+    elif subjects.size > CROWD:
+        last.set_xticks([])
+    last.set_xlabel("subject" if named else "subjects")
     axes[0, 0].legend(frameon=False, fontsize=8, ncols=SERIES)
     return svg(figure)
+
+
+def _thinned(found: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """`CROWD` of the subjects, in the order of their medians."""
+    order = np.argsort(found[2], kind="stable")
+    chosen = order[np.linspace(0, order.size - 1, min(CROWD, order.size)).round().astype(int)]
+    return np.linspace(0.0, CROWD - 1.0, chosen.size), found[:, chosen]
 
 
 def _short(name: str, length: int = 16) -> str:

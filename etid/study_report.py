@@ -156,7 +156,7 @@ def _elements(fits: Fits, groups: Sequence[Mapping[str, Any]]) -> list[Section]:
             f"Part of the successful fits below a value, for {shown} (number of fits).",
             study_figures.distributions(fits),
             f"Distribution functions of {', '.join(units)} by condition; quantiles are in the "
-            "table above.",
+            "table.",
             whole=True,
         ),
         Picture(
@@ -164,7 +164,7 @@ def _elements(fits: Fits, groups: Sequence[Mapping[str, Any]]) -> list[Section]:
             "left out.",
             study_figures.components(found),
             "Between subjects, between recordings, own error and shared error of each element by "
-            "condition, on a logarithmic scale; the numbers are in the table above.",
+            "condition, on a logarithmic scale; the numbers are in the table.",
             whole=True,
         ),
     )
@@ -192,6 +192,12 @@ def _subjects(fits: Fits, groups: Sequence[Mapping[str, Any]]) -> Section:
             "Each subject's median, the middle half of the successful fits (thick) and nine tenths "
             "of them (thin)."
         )
+        count = len({str(group["subject"]) for group in groups})
+        if count > study_figures.CROWD:
+            caption += (
+                f" Of {count} subjects {study_figures.CROWD} are drawn, evenly spaced in the order "
+                "of their medians."
+            )
         alt = "Medians and quantiles of each element by subject and condition."
         pictures = (Picture(caption, study_figures.by_subject(fits), alt, whole=True),)
     elif len(good):

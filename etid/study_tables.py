@@ -8,6 +8,7 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+import jax.numpy as jnp
 import numpy as np
 
 from etid.circuits import DISPLAY
@@ -16,7 +17,7 @@ from etid.report import Table
 from etid.results import Fits, plus_minus
 from etid.verdicts import message
 
-ROWS = 200  # of a table, above which it is cut
+ROWS = 100  # of a table, above which it is cut
 BRIEF = 50  # rows of a table that lists single recordings
 PARTS = ("between", "own", "shared")  # of a spread, as `Fits.summary` has them
 
@@ -85,7 +86,7 @@ def _calibrations(paths: Sequence[str]) -> str:
 
 
 def _at_1_khz(driver: Driver) -> tuple[complex, float]:
-    frequency = np.array([1e3])
+    frequency = jnp.array([1e3])
     z = complex(np.asarray(driver.response(frequency))[0])
     return z, float(np.asarray(driver.response_stderr(frequency))[0])
 

@@ -1,0 +1,406 @@
+"""The report of a study: its numbers, what it leaves out, and the page as a browser sees it."""
+
+import dataclasses
+import html.parser
+import re
+import shutil
+
+import h5py
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from chromium import chromium
+
+import etid
+from etid import citations, cli, methods_section, study_figures, study_tables, worst_fits
+from etid.driver import Calibration, SourceImpedance
+from etid.report import Table
+from etid.scenes import Scene, Trial
+from etid.settings import Settings
+from etid.study_fits import StudyFits
+from etid.transformer import ResistorLoad, SkinLoad
+from etid.verdicts import message, verdict, verdicts_of
+from etid.waveforms import Recordings
+
+EVIL = "<script>document.title='broken'</script>"
+TRUE = {"r_s": 33.4e3, "r_p": 186e3, "c_p": 0.12e-9}
+OWN, SHARED = 0.01, 0.02  # standard errors of all elements of the fits made here, relative
+
+
+def fits_of(values, verdicts, **labels):
+    """Fits by hand, of elements in units of `TRUE`, with errors `OWN` and `SHARED`."""
+    values = np.asarray(values)[:, None] * np.array(list(TRUE.values()))
+    count = len(values)
+    shared, own = (np.einsum("ni,ij->nij", (e * values) ** 2, np.eye(3)) for e in (SHARED, OWN))
+    chi2 = np.where(np.asarray(verdicts) == "misfit", 7.0, 1.0) + 0.01 * np.arange(count)
+    fit = etid.Fit(
+        etid.SkinRC(*values.T), own + shared, shared, np.full(count, 0.02), chi2,
+        verdicts_of(np.asarray(verdicts)), np.full(count, 5), "maximum_likelihood",
+    )  # fmt: skip
+    default = {name: np.full(count, "") for name in ("subject", "condition", "electrode", "trial")}
+    columns = {"path": np.array([f"loaded/{i}" for i in range(count)])} | default
+    return etid.Fits(fit, columns | labels, np.array([message(name) for name in verdicts]))
+
+
+@pytest.fixture(scope="module")
+def driver():
+    """A driver by hand: 12 kΩ, a resonance at 60 kHz and a slow pole."""
+    source = SourceImpedance(
+        *map(jnp.asarray, (np.log(5e3), [np.log(4e5)], [np.log(0.3)], [5e3], [2e3], [6e2], [-3e3]))
+    )
+    source = dataclasses.replace(source, log_omega_real=jnp.log(source.log_omega_real))
+    return etid.Driver(
+        b=jnp.ones(3), a=jnp.ones(4), sample_rate=2e5, source=source, cov=1e-4 * jnp.eye(7),
+        calibration=Calibration(jnp.array([98.8e3]), jnp.array(np.nan), jnp.zeros(1), None),
+        rrse=jnp.array(0.003), chi2=jnp.array(1.1), result=verdict("successful"),
+        steps=jnp.array(9), method="maximum_likelihood",
+    )  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def study_file(tmp_path_factory):
+    trials = tuple(Trial(f"loaded/{i}", SkinLoad(**TRUE)) for i in range(6))
+    scene = Scene(trials, (Trial("calibration/0", ResistorLoad(98.8e3)),), samples=4000)
+    file = tmp_path_factory.mktemp("report") / "study.h5"
+    scene.simulate(seed=1).write(file)
+    return file
+
+
+@pytest.fixture(scope="module")
+def found(study_file, driver):
+    """Six fits of one subject with a bad name and one with a good one."""
+    fits = fits_of(
+        [1.0, 1.1, 0.9, 1.0, 1.3, np.nan],
+        ["successful"] * 4 + ["misfit", "flat"],
+        subject=np.array([EVIL, "s02"] * 3),
+        condition=np.array(["dry & warm"] * 6),
+    )
+    with etid.read(study_file) as study:
+        settings = Settings.of(study, 6, 5, None, etid.SkinRC())
+    drivers = {("calibration/0",): driver}
+    return StudyFits(fits, drivers, {("calibration/1",): "r_load <b>is</b> missing"}, settings)
+
+
+@pytest.fixture(scope="module")
+def page(found, study_file):
+    """The report on these fits."""
+    etid.write_report(found, study_file.with_name("page.html"))
+    return study_file.with_name("page.html")
+
+
+class _Read(html.parser.HTMLParser):
+    """Elements, attributes and text of a page."""
+
+    def __init__(self, page):
+        super().__init__()
+        self.elements, self.attributes, self.text = [], [], ""
+        self.feed(page.read_text(encoding="utf-8"))
+
+    def handle_starttag(self, tag, attrs):
+        self.elements.append(tag)
+        self.attributes += attrs
+
+    def handle_data(self, data):
+        self.text += data
+
+
+def test_names_and_notes_of_a_file_are_text_and_nothing_else(page):
+    seen = _Read(page)
+    assert EVIL in seen.text
+    assert "r_load <b>is</b> missing" in seen.text
+    assert not {"script", "b", "link", "iframe"} & set(seen.elements)
+    assert not [name for name, _ in seen.attributes if name.startswith("on")]
+    targets = [value for name, value in seen.attributes if name in ("src", "href")]
+    assert all(value.startswith(("data:", "#")) for value in targets)
+    anchors = {value for name, value in seen.attributes if name == "id"}
+    assert {value[1:] for value in targets if value.startswith("#")} == anchors
+    assert seen.elements.count("img") == len([n for n, v in seen.attributes if n == "alt" and v])
+
+
+def test_worst_fits_are_drawn_with_what_was_measured(page):
+    text = _Read(page).text
+    assert "loaded/4: misfit (without success). χ² 7.04, r_s 43.4" in text
+    assert "loaded/5: flat (without success). No prediction: no circuit was identified." in text
+    assert "loaded/3: successful (largest χ² among the successful)" in text
+    assert "loaded/0: successful (largest standard error among the successful)" in text
+    assert "not found" not in text
+    assert "has changed" not in text
+
+
+def test_recordings_are_looked_for_where_they_were_and_beside_the_fits(found, study_file, tmp_path):
+    file = tmp_path / "fits.h5"
+
+    def look(given=None, fits=found):
+        place = Recordings(fits, file, given)
+        drawn = place.picture("loaded/4", fits.fits[4], "misfit") is not None
+        place.close()
+        return drawn, place.problem
+
+    assert look() == (True, "")
+    moved = dataclasses.replace(found.settings, source=str(tmp_path / "old" / "study.h5"))
+    elsewhere = dataclasses.replace(found, settings=moved)
+    there, problem = look(fits=elsewhere)
+    assert not there
+    places = f"there is no {moved.source} and {tmp_path / 'study.h5'}"
+    assert problem.startswith(f"The recordings were not found: {places}")
+    shutil.copy(study_file, tmp_path / "study.h5")
+    assert look(fits=elsewhere) == (True, "")
+    with h5py.File(tmp_path / "study.h5", "a") as opened:
+        opened["more"] = np.ones(1000)
+    there, problem = look(fits=elsewhere)
+    assert there
+    assert "has changed since the fits were made" in problem
+    (tmp_path / "study.h5").write_bytes(b"damaged")
+    there, problem = look(fits=elsewhere)
+    assert not there
+    assert "is not an HDF5 file" in problem
+    with pytest.raises(etid.RecordingError, match="no such file"):
+        look(given=tmp_path / "absent.h5")
+    with etid.read(study_file) as study:
+        assert look(given=study, fits=elsewhere) == (True, "")
+
+
+def test_fits_without_settings_are_reported_with_what_they_lack(found, tmp_path):
+    found.fits.write(tmp_path / "fits.h5")  # what an older version wrote
+    assert StudyFits.read(tmp_path / "fits.h5").settings is None
+    etid.write_report(tmp_path / "fits.h5", tmp_path / "page.html")
+    text = _Read(tmp_path / "page.html").text
+    assert "These fits do not say with which driver they were made." in text
+    assert "The fits do not say where their recordings are." in text
+    assert "This file of fits does not say from which recordings" in text
+
+
+def test_a_file_of_fits_gives_back_drivers_and_settings(found, driver, tmp_path):
+    found.write(tmp_path / "fits.h5")
+    again = StudyFits.read(tmp_path / "fits.h5")
+    assert again.settings == found.settings
+    assert again.failures == found.failures
+    (stored,) = again.drivers.values()
+    frequency = jnp.geomspace(60.0, 1e5, 20)
+    for name in ("response", "response_stderr"):
+        expected = np.asarray(getattr(driver, name)(frequency))
+        np.testing.assert_array_equal(np.asarray(getattr(stored, name)(frequency)), expected)
+    assert (stored.verdict, stored.method, stored.order) == ("successful", driver.method, 3)
+    again.write(tmp_path / "again.h5")
+    assert (tmp_path / "again.h5").read_bytes() == (tmp_path / "fits.h5").read_bytes()
+    assert etid.Fits.read(tmp_path / "fits.h5").counts() == found.fits.counts()
+
+
+def test_a_driver_without_a_continuous_impedance_is_kept_as_well(found, driver, tmp_path):
+    plain = dataclasses.replace(driver, source=None, cov=None, calibration=None)
+    of_old = dataclasses.replace(found, drivers={("calibration/0",): plain})
+    of_old.write(tmp_path / "fits.h5")
+    (stored,) = StudyFits.read(tmp_path / "fits.h5").drivers.values()
+    assert (stored.source, stored.cov, stored.calibration) == (None, None, None)
+    place = Recordings(
+        dataclasses.replace(of_old, drivers={("calibration/0",): stored}), None, None
+    )
+    shown = place.picture("loaded/4", found.fits[4], "misfit")
+    place.close()
+    assert "No prediction: this driver was identified by maximum_likelihood, which" in shown.caption
+
+
+# --- numbers --------------------------------------------------------------------------------------
+
+
+def test_spread_of_subjects_and_recordings_and_errors_are_told_apart():
+    factors = np.array([0.5, 1.0, 2.0])  # of three subjects
+    trials = np.array([-0.06, -0.02, 0.02, 0.06])
+    values = (factors[:, None] * (1 + trials)).ravel()
+    fits = fits_of(
+        values, ["successful"] * 12,
+        subject=np.repeat(["a", "b", "c"], 4), condition=np.full(12, "dry"),
+    )  # fmt: skip
+    groups = fits.summary("subject", "condition")
+    for one in study_tables.components(fits, groups):
+        assert (one.subjects, one.successful) == (3, 12)
+        assert one.median == pytest.approx(TRUE[one.name])
+        assert one.between_subjects == pytest.approx(np.std(factors, ddof=1))
+        # The median of four is their mean here, and so is the median of their errors.
+        within = np.sqrt(np.var(trials, ddof=1) - OWN**2)
+        assert one.between_recordings == pytest.approx(within, rel=1e-9)
+        assert (one.own, one.shared) == pytest.approx((OWN, SHARED))
+
+
+def test_one_recording_of_one_subject_tells_no_spread():
+    fits = fits_of([1.0], ["successful"])
+    for one in study_tables.components(fits, fits.summary("subject", "condition")):
+        assert np.isnan([one.between_subjects, one.between_recordings]).all()
+        assert (one.own, one.shared) == pytest.approx((OWN, SHARED))
+    row = study_tables.show_components([one], fits.circuit.units()).rows[0]
+    assert row[6:] == ("", "", "1", "2")
+
+
+def test_summary_is_that_of_each_group_by_itself():
+    rng = np.random.default_rng(0)
+    verdicts = rng.choice(["successful", "misfit"], 200, p=[0.8, 0.2])
+    labels = {name: rng.choice(list("abcd"), 200) for name in ("subject", "condition")}
+    fits = fits_of(rng.lognormal(0.0, 0.3, 200), verdicts, **labels)
+    rows = fits.summary("subject", "condition")
+    assert [(row["subject"], row["condition"]) for row in rows] == sorted(
+        {(str(a), str(b)) for a, b in zip(labels["subject"], labels["condition"], strict=True)}
+    )
+    for row in rows:
+        group = fits.where(subject=row["subject"], condition=row["condition"])
+        (alone,) = group.summary()
+        assert {key: row[key] for key in alone} == alone
+        good = np.asarray(group.circuit.r_p)[group.verdicts == "successful"]
+        assert (row["fits"], row["successful"]) == (len(group), good.size)
+        assert row["r_p"] == np.median(good)
+        assert row["r_p_spread"] == pytest.approx(np.std(good, ddof=1))
+        assert row["r_p_own"] == pytest.approx(OWN * np.median(good))
+
+
+def test_the_worst_are_of_every_verdict_and_of_every_reason():
+    verdicts = ["successful"] * 20 + ["flat"] * 9 + ["misfit"] * 3 + ["saturated"]
+    fits = fits_of(np.linspace(1.0, 2.0, 33), verdicts)
+    cov = fits.cov.copy()
+    cov[5:8] *= 4.0
+    fits = dataclasses.replace(fits, fit=dataclasses.replace(fits.fit, cov=cov))
+    rows = [one.row for one in worst_fits.choose(fits)]
+    assert len(rows) == len(set(rows)) == 12
+    # In turn flat, misfit, saturated, the largest χ² of each first: that grows with the row.
+    assert rows[:6] == [28, 31, 32, 27, 30, 26]
+    assert rows[6:9] == [19, 18, 17]  # the largest χ² among the successful
+    assert sorted(rows[9:]) == [5, 6, 7]  # the largest standard errors
+    assert worst_fits.choose(fits_of([1.0], ["successful"]))[0].row == 0
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [(0.01234, "0.012"), (123.4, "120"), (5.0, "5"), (np.nan, ""), (np.inf, ""), (3e7, "3.0e+07")],
+)
+def test_numbers_are_rounded_to_two_digits(value, text):
+    assert study_tables.significant(value) == text
+
+
+def test_large_studies_are_condensed_and_say_so(tmp_path):
+    count = 4000
+    rng = np.random.default_rng(1)
+    fits = fits_of(
+        rng.lognormal(0.0, 0.3, count), rng.choice(["successful", "misfit"], count, p=[0.9, 0.1]),
+        subject=np.array([f"s{i:04d}" for i in np.arange(count) // 5]),
+        condition=rng.choice(list("abcdefg"), count), electrode=rng.choice(list("xy"), count),
+    )  # fmt: skip
+    etid.write_report(fits, tmp_path / "page.html")
+    assert (tmp_path / "page.html").stat().st_size < 2e6
+    page = _Read(tmp_path / "page.html")
+    groups = len(fits.summary("subject", "condition"))
+    assert f"{study_tables.ROWS} of {groups} groups are shown" in page.text
+    assert f"The first {study_tables.BRIEF} are listed" in page.text
+    assert f"Of {count // 5} subjects {study_figures.CROWD} are drawn" in page.text
+    assert page.elements.count("tr") < 5 * study_tables.ROWS
+    assert "Electrodes" in page.text
+
+
+def test_no_success_at_all_and_no_fit_at_all(tmp_path):
+    etid.write_report(fits_of([np.nan], ["flat"]), tmp_path / "page.html")
+    assert "No fit is successful" in _Read(tmp_path / "page.html").text
+    with pytest.raises(ValueError, match="no fit to report on"):
+        etid.write_report(fits_of(np.ones(0), []), tmp_path / "page.html")
+
+
+def test_groups_of_headings_must_cover_the_table():
+    with pytest.raises(ValueError, match="span 1 columns of 2"):
+        Table(("a", "b"), (), (("x", 1),))
+
+
+# --- methods --------------------------------------------------------------------------------------
+
+CITED = {  # what a reader sees, and the key of the entry that it must have
+    "Pintelon and Schoukens, 2012": "pintelon2012",
+    "Ljung, 1999": "ljung1999",
+    "McBride": "steiglitz1965",
+    "Söderström, 2007": "soderstrom2007",
+    "White, 1980": "white1980",
+    "Rader et al., 2024": "optimistix2024",
+    "Bradbury et al., 2018": "jax2018",
+}
+
+
+@pytest.mark.parametrize("method", [*methods_section._TEXTS, "mixed"])
+def test_methods_cite_what_they_name_and_say_the_settings(found, method):
+    fit = dataclasses.replace(found.fits.fit, method=method)
+    settings = dataclasses.replace(found.settings, order=4, r_load_tolerance=0.001)
+    by = "maximum_likelihood" if method == "mixed" else method
+    drivers = {
+        paths: dataclasses.replace(driver, method=by) for paths, driver in found.drivers.items()
+    }
+    section = methods_section.methods_section(
+        dataclasses.replace(
+            found, fits=dataclasses.replace(found.fits, fit=fit), settings=settings, drivers=drivers
+        )
+    )
+    entries = set(re.findall(r"^@\w+\{(\w+),", section.code, flags=re.MULTILINE))
+    for words, key in CITED.items():
+        assert (words in section.text) <= (key in entries), words
+    named = {key for words, key in CITED.items() if words in section.text}
+    assert entries - named <= {"etid", "fingertip", "steiglitz1965"}
+    assert "rational function of order 4" in section.text
+    assert "98.8 kΩ" in section.text
+    for version in settings.versions:
+        assert version in section.text
+    without_errors = method in ("steiglitz_mcbride", "equation_error")
+    assert ("tolerance of 0.1 %" in section.text) != without_errors
+    assert ("gives no standard errors" in section.text) == without_errors
+
+
+def test_every_entry_is_whole_bibtex():
+    everything = citations.bibtex(citations._ENTRIES)
+    entries = everything.split("\n\n")
+    assert len(entries) == len(citations._ENTRIES)
+    for entry in entries:
+        assert entry.count("{") == entry.count("}")
+        assert re.fullmatch(r"@\w+\{\w+,\n(.+\n)+\}", entry), entry
+    assert f"version = {{{etid.__version__}}}" in everything
+    with pytest.raises(KeyError, match="unknown"):
+        citations.bibtex(["unknown"])
+
+
+# --- command and browser --------------------------------------------------------------------------
+
+
+def test_the_command_writes_beside_the_fits_and_replaces_no_file_that_it_reads(
+    found, study_file, tmp_path, capsys
+):
+    file = tmp_path / "fits.h5"
+    found.write(file)
+    assert cli.main(["report", str(file)]) == 0
+    assert (tmp_path / "fits.html").exists()
+    before = file.read_bytes()
+    for page in (file, study_file):
+        arguments = ["report", str(file), "-o", str(page), "--recordings", str(study_file)]
+        assert cli.main(arguments) == 1
+        assert "would replace a file that is read" in capsys.readouterr().err
+    assert file.read_bytes() == before
+    assert cli.main(["report", str(study_file)]) == 1
+    assert "attribute schema is 'etid/recording'" in capsys.readouterr().err
+
+
+def test_a_browser_shows_the_whole_page_without_complaint(page):
+    with chromium() as browser:
+        browser.open(page)
+        assert browser.complaints == []
+        assert browser.requests == [page.as_uri()]
+        assert browser.evaluate("document.title") == "Report on fits"
+        widths = browser.evaluate("[...document.images].map(i => i.complete ? i.naturalWidth : 0)")
+        assert len(widths) == 11
+        assert min(widths) > 100
+        texts = browser.evaluate("[...document.images].map(i => i.alt)")
+        assert all(texts)
+        # Nothing but a table may be wider than the window.
+        assert browser.evaluate("document.documentElement.scrollWidth <= innerWidth")
+        background = "getComputedStyle(document.documentElement).backgroundColor"
+        inverted = "getComputedStyle(document.images[0]).filter"
+        assert browser.evaluate(background) == "rgb(255, 255, 255)"
+        browser.show(dark=True)
+        assert browser.evaluate(background) == "rgb(26, 26, 26)"
+        assert "invert" in browser.evaluate(inverted)
+        browser.show(dark=True, printed=True)
+        assert browser.evaluate(background) == "rgb(255, 255, 255)"
+        assert browser.evaluate(inverted) == "none"
+        whole = "[...document.querySelectorAll('figure, table')]"
+        breaks = f"{whole}.map(e => getComputedStyle(e).breakInside)"
+        assert set(browser.evaluate(breaks)) == {"avoid"}
+        assert browser.pdf().startswith(b"%PDF")
+        assert browser.complaints == []
