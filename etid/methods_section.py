@@ -256,16 +256,17 @@ def _computed(settings: Settings | None) -> str:
 
 def _table(found: StudyFits, settings: Settings) -> Table:
     """The settings as the file has them."""
+    source = "in memory"
+    if settings.source:
+        source = f"file {settings.source} of {settings.source_size} bytes"
     rows = {
-        "recordings": settings.source or "in memory",
-        "their file [byte]": str(settings.source_size) if settings.source else "",
-        "method asked for": settings.asked_method or "chosen for each recording",
-        "method of the fits": found.fits.fit.method,
-        "order of Z_th": str(settings.order),
+        "recordings": source,
+        "method": f"asked for {settings.asked_method or 'none'}, used {found.fits.fit.method}",
         "circuit": type(found.fits.circuit).__name__,
-        "tolerance of R_L [%]": f"{100 * settings.r_load_tolerance:g}",
-        "computed with": f"{settings.precision}, {settings.backend}",
+        "Z_th": f"order {settings.order}",
+        "R_L": f"standard deviation of {100 * settings.r_load_tolerance:g} %",
+        "computed": f"in {settings.precision} on {settings.backend}",
         "versions": ", ".join(settings.versions),
     }
-    shown = tuple((name, value) for name, value in rows.items() if value)
+    shown = tuple(rows.items())
     return Table(("setting", "value"), shown, caption="Settings")

@@ -99,8 +99,11 @@ class StudyFits:
 def _settings(attributes: Mapping[str, Any]) -> Settings | None:
     if not attributes.keys() >= _SETTINGS:
         return None
-    stored = {name: np.asarray(attributes[name]).tolist() for name in _SETTINGS}
-    return Settings(**{k: tuple(v) if isinstance(v, list) else v for k, v in stored.items()})
+    values: dict[str, Any] = {}
+    for name in _SETTINGS:
+        value = np.asarray(attributes[name]).tolist()
+        values[name] = tuple(value) if isinstance(value, list) else value
+    return Settings(**values)
 
 
 def _lists(module: Any) -> dict[str, Any]:

@@ -149,7 +149,6 @@ def components(fits: Fits, groups: Sequence[Mapping[str, Any]]) -> list[Componen
         for name in fits.circuit.names():
             medians = np.array([group[name] for group in rows])
             values = np.asarray(getattr(chosen.circuit, name))
-            typical = float(np.median(values))
 
             def part(key: str, of=name, rows=rows) -> float:
                 ratios = np.array([group[f"{of}_{key}"] / group[of] for group in rows])
@@ -157,13 +156,22 @@ def components(fits: Fits, groups: Sequence[Mapping[str, Any]]) -> list[Componen
                 return float(np.median(known)) if known.size else math.nan
 
             spread = float(np.std(medians, ddof=1)) if medians.size > 1 else math.nan
+            low, high = np.quantile(values, [0.05, 0.95]).tolist()
             found.append(
                 Components(
-                    condition, name, len(rows), values.size, typical,
-                    *np.quantile(values, [0.05, 0.95]).tolist(),
-                    spread / float(np.median(medians)), *map(part, PARTS),
+                    condition=condition,
+                    name=name,
+                    subjects=len(rows),
+                    successful=values.size,
+                    median=float(np.median(values)),
+                    low=low,
+                    high=high,
+                    between_subjects=spread / float(np.median(medians)),
+                    between_recordings=part("between"),
+                    own=part("own"),
+                    shared=part("shared"),
                 )
-            )  # fmt: skip
+            )
     return found
 
 

@@ -73,6 +73,10 @@ class Page:
         printed = self.call("Page.printToPDF", preferCSSPageSize=True, printBackground=True)
         return base64.b64decode(printed["data"])
 
+    def close(self) -> None:
+        """Close the pipe that Chromium wrote to."""
+        self._receiving.close()
+
     def _next(self) -> dict[str, Any]:
         while b"\0" not in self._rest:
             read = self._receiving.read1()
@@ -120,4 +124,4 @@ def chromium() -> Iterator[Page]:
                 page.call("Browser.close")
                 os.close(sending)
                 process.wait(timeout=20)
-                page._receiving.close()
+                page.close()

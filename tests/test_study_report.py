@@ -197,6 +197,7 @@ def test_a_driver_without_a_continuous_impedance_is_kept_as_well(found, driver, 
     )
     shown = place.picture("loaded/4", found.fits[4], "misfit")
     place.close()
+    assert shown is not None
     assert "No prediction: this driver was identified by maximum_likelihood, which" in shown.caption
 
 
@@ -224,11 +225,12 @@ def test_spread_of_subjects_and_recordings_and_errors_are_told_apart():
 
 def test_one_recording_of_one_subject_tells_no_spread():
     fits = fits_of([1.0], ["successful"])
-    for one in study_tables.components(fits, fits.summary("subject", "condition")):
+    found = study_tables.components(fits, fits.summary("subject", "condition"))
+    for one in found:
         assert np.isnan([one.between_subjects, one.between_recordings]).all()
         assert (one.own, one.shared) == pytest.approx((OWN, SHARED))
-    row = study_tables.show_components([one], fits.circuit.units()).rows[0]
-    assert row[6:] == ("", "", "1", "2")
+    for row in study_tables.show_components(found, fits.circuit.units()).rows:
+        assert row[6:] == ("", "", "1", "2")
 
 
 def test_summary_is_that_of_each_group_by_itself():
