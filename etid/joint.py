@@ -211,9 +211,9 @@ def identify_jointly(
                 fits[row] = one
                 notes[row] = message(one.verdict)
     ordered = [fits[row] for row in range(len(paths))]
-    found = table(study, paths, ordered, notes)
+    outcome = table(study, paths, ordered, notes)
     settings = Settings.of(study, len(paths), order, METHOD, circuit, r_load_tolerance)
-    return StudyFits(found, drivers.found, drivers.failures, settings)
+    return StudyFits(outcome, drivers.found, drivers.failures, settings)
 
 
 def _model(circuit: AbstractCircuit, driver: Driver, shared: bool) -> Joint:

@@ -8,7 +8,15 @@ import pathlib
 
 import numpy as np
 
-from etid import circuits, citations, dispersion, judging, output_error, steiglitz_mcbride
+from etid import (
+    circuits,
+    citations,
+    dispersion,
+    judging,
+    missing_pole,
+    output_error,
+    steiglitz_mcbride,
+)
 from etid.baseline import BIASED
 from etid.report import Section, Table
 from etid.settings import Settings
@@ -75,7 +83,7 @@ def methods_section(found: StudyFits) -> Section:
         _driver(found),
         _estimator(found, used),
         _errors(used, settings),
-        _verdicts(used),
+        _verdicts(used, by_driver),
         _computed(settings),
     ]
     warning = ""
@@ -218,7 +226,7 @@ def _errors(used: set[str], settings: Settings | None) -> str:
     return text
 
 
-def _verdicts(used: set[str]) -> str:
+def _verdicts(used: set[str], by_driver: set[str]) -> str:
     text = (
         "A fit counts as successful if the records passed the checks for flat, clipped, missing "
         "and misplaced samples, the iteration settled, all elements are positive, and the residual "
@@ -227,7 +235,7 @@ def _verdicts(used: set[str]) -> str:
     )
     if used - {"steiglitz_mcbride", "equation_error"}:
         text += ", the trigger delay is at most one sample, every relative standard error below 1"
-    if "maximum_likelihood" in used:
+    if used & {"maximum_likelihood", "joint"}:
         text += (
             ", a score test against a relaxation that is spread over time constants finds none (at "
             f"{dispersion.SEEN:g} standard deviations)"
@@ -242,7 +250,13 @@ def _verdicts(used: set[str]) -> str:
             f", the estimate is within {math.sqrt(BIASED):g} standard errors of the minimum of its "
             "own model"
         )
-    return text + ", and the driver was identified successfully."
+    text += ", and the driver was identified successfully"
+    if by_driver & {"maximum_likelihood", "joint"}:
+        text += (
+            ", for which it has to be passive, and its calibrations must not show one more section "
+            f"of Z_th (score test, χ² of at most {missing_pole.SEEN:g} with two degrees of freedom)"
+        )
+    return text + "."
 
 
 def _computed(settings: Settings | None) -> str:
