@@ -19,7 +19,7 @@ import multiprocessing
 import os
 import pathlib
 import shutil
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -29,6 +29,7 @@ from etid.batch import Drivers, identify_part, to_identify
 from etid.circuits import AbstractCircuit, SkinRC
 from etid.hdf5 import read
 from etid.methods import Method, check_method
+from etid.recording import RecordingError
 from etid.settings import Settings
 from etid.study import Study
 from etid.study_fits import StudyFits
@@ -69,16 +70,17 @@ def _kept_open(source: str, stamp: int, order: int, method: Method | None) -> _O
 def _fit(
     opened: _Opened, circuit: AbstractCircuit, method: Method | None, size: int, number: int
 ) -> StudyFits:
-    """Fit one part; its drivers are those that were not known before it."""
+    """Fit one part; with its own drivers, whatever else this process has identified before."""
     study, paths, drivers = opened
     part = paths[number * size : (number + 1) * size]
-    known = {*drivers.found, *drivers.failures}
     fits = identify_part(study, part, drivers, circuit, method)
-    return StudyFits(fits, _others(drivers.found, known), _others(drivers.failures, known))
-
-
-def _others(items: Mapping[Any, Any], known: Collection[Any]) -> dict[Any, Any]:
-    return {key: value for key, value in items.items() if key not in known}
+    used = set()
+    for path in part:
+        with contextlib.suppress(RecordingError):
+            used.add(study.metadata(path).calibration or drivers.calibrations)
+    found = {names: driver for names, driver in drivers.found.items() if names in used}
+    failures = {names: text for names, text in drivers.failures.items() if names in used}
+    return StudyFits(fits, found, failures)
 
 
 def _fit_elsewhere(

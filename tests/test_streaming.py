@@ -70,6 +70,15 @@ def test_parts_are_the_whole(source, whole, tmp_path):
     assert [p.name for p in tmp_path.iterdir() if "parts" in p.name] == []
 
 
+def test_every_part_has_its_drivers_though_its_process_knew_them_before(source, whole, tmp_path):
+    """The processes of a cluster outlive a run, and with them what they have identified."""
+    for name in ("first.h5", "second.h5"):
+        with concurrent.futures.ThreadPoolExecutor(1) as executor:
+            fit_file(source, tmp_path / name, method=METHOD, executor=executor)
+        same(tmp_path / name, whole)
+        assert set(StudyFits.read(tmp_path / name).drivers) == {("calibration/0",)}
+
+
 def test_the_file_is_read_once_and_closed(source, tmp_path, monkeypatch):
     studies, real = [], streaming.read
 
