@@ -3,6 +3,7 @@
 Every function returns the picture as SVG, which is the same for the same fits.
 """
 
+import dataclasses
 import io
 from collections.abc import Mapping, Sequence
 
@@ -73,7 +74,7 @@ def distributions(fits: Fits) -> bytes:
         for series, condition in enumerate(_conditions(good)):
             values = _positive(getattr(good.where(condition=condition).circuit, name)) / scale
             if values.size:
-                _steps(axis, values, series, f"{condition or 'all'} ({values.size})")
+                _steps(axis, values, series, f"{_short(condition) or 'all'} ({values.size})")
         axis.set(xscale="log", xlabel=f"{name} [{symbol}]")
         _plain(axis, "x")
     axes[0, 0].set_ylabel("fits below [%]")
@@ -137,7 +138,7 @@ def by_subject(fits: Fits) -> bytes:
             axis.vlines(where, found[1], found[3], color=colour, lw=2.6 * thin)
             axis.plot(
                 where, found[2], MARKS[series], color=colour, ms=4.5 * thin,
-                markerfacecolor="white", label=condition or "all",
+                markerfacecolor="white", label=_short(condition) or "all",
             )  # fmt: skip
         axis.set(yscale="log", ylabel=f"{name} [{symbol}]")
         _plain(axis, "y")
@@ -160,9 +161,13 @@ def _thinned(found: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return np.linspace(0.0, CROWD - 1.0, chosen.size), found[:, chosen]
 
 
+def plain(name: str) -> str:
+    """A name for a picture, where dollar signs would be read as mathematics."""
+    return name.replace("$", r"\$")
+
+
 def _short(name: str, length: int = 16) -> str:
-    """A name that fits into a picture, where a dollar sign would be read as mathematics."""
-    return (name if len(name) <= length else name[: length - 1] + "…").replace("$", r"\$")
+    return plain(name if len(name) <= length else name[: length - 1] + "…")
 
 
 def _quantiles(place: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -189,7 +194,7 @@ def components(found: Sequence[Components]) -> bytes:
                 shown = np.isfinite(sizes) & (sizes > 0)
                 axis.plot(
                     sizes[shown], np.arange(len(parts))[shown] + shift, MARKS[series],
-                    color=COLOURS[series], ms=6, label=condition or "all",
+                    color=COLOURS[series], ms=6, label=_short(condition) or "all",
                 )  # fmt: skip
         axis.set(xscale="log", xlabel=f"{name}: part of the median [%]")
         _plain(axis, "x")
@@ -201,7 +206,11 @@ def components(found: Sequence[Components]) -> bytes:
 
 def each_fit(fits: Fits) -> bytes:
     """Every fit with its standard error, by subject."""
-    return svg(plot_elements(fits))
+    labels = {
+        name: np.array([_short(str(label)) for label in fits.labels[name]])
+        for name in ("subject", "condition")
+    }
+    return svg(plot_elements(dataclasses.replace(fits, labels={**fits.labels, **labels})))
 
 
 def drivers(found: Mapping[str, Driver]) -> bytes:

@@ -78,23 +78,23 @@ def write_report(
         ]
     finally:
         place.close()
-    write_page(page, f"Report on {name}", _summary(found, groups), sections)
+    write_page(page, f"Report on {name}", _summary(found), sections)
 
 
 def _same(one: str | os.PathLike[str], other: str | os.PathLike[str]) -> bool:
     return os.path.exists(one) and os.path.exists(other) and os.path.samefile(one, other)
 
 
-def _summary(found: StudyFits, groups: Sequence[Mapping[str, Any]]) -> str:
+def _summary(found: StudyFits) -> str:
     """The study in two sentences."""
     fits, settings = found.fits, found.settings
     good = fits.counts().get("successful", 0)
     source = pathlib.Path(settings.source).name if settings is not None else ""
     text = f"{len(fits)} recordings{f' of {source}' if source else ''}"
-    for label, plural in (("subject", "subjects"), ("condition", "conditions")):
-        names = {str(group[label]) for group in groups} - {""}
-        if names:
-            text += f", {len(names)} {plural if len(names) > 1 else label}"
+    for label in ("subject", "condition", "electrode"):
+        count = len(set(map(str, fits.labels[label])) - {""})
+        if count:
+            text += f", {count} {label}{'s' if count > 1 else ''}"
     method = fits.fit.method.replace("_", " ")
     text += f", identified as {type(fits.circuit).__name__} by {method}. "
     share = f"{100 * good / len(fits):.1f} %"

@@ -14,7 +14,7 @@ from etid.recording import Recording, RecordingError
 from etid.report import Picture
 from etid.results import Fit, plus_minus
 from etid.study import Study
-from etid.study_figures import svg
+from etid.study_figures import plain, svg
 from etid.study_fits import StudyFits
 from etid.study_tables import significant
 
@@ -102,6 +102,7 @@ class Recordings:
         except (RecordingError, KeyError):
             return None
         predicted, why = self._predict(recording, fit)
+        recording = recording.replace(path=plain(path))
         elements = _elements(fit)
         about = f"{path}: {fit.verdict} ({text})."
         if predicted is None:

@@ -22,8 +22,9 @@ from etid.transformer import ResistorLoad, SkinLoad
 from etid.verdicts import message, verdict, verdicts_of
 from etid.waveforms import Recordings
 
-EVIL = "<script>document.title='broken'</script>"
+EVIL = r"<script>document.title='$\broken{$'</script>"
 TRUE = {"r_s": 33.4e3, "r_p": 186e3, "c_p": 0.12e-9}
+PATHS = [*(f"loaded/{i}" for i in range(5)), r"loaded/$\frac$"]
 OWN, SHARED = 0.01, 0.02  # standard errors of all elements of the fits made here, relative
 
 
@@ -59,7 +60,7 @@ def driver():
 
 @pytest.fixture(scope="module")
 def study_file(tmp_path_factory):
-    trials = tuple(Trial(f"loaded/{i}", SkinLoad(**TRUE)) for i in range(6))
+    trials = tuple(Trial(PATHS[i], SkinLoad(**TRUE)) for i in range(6))
     scene = Scene(trials, (Trial("calibration/0", ResistorLoad(98.8e3)),), samples=4000)
     file = tmp_path_factory.mktemp("report") / "study.h5"
     scene.simulate(seed=1).write(file)
@@ -72,8 +73,9 @@ def found(study_file, driver):
     fits = fits_of(
         [1.0, 1.1, 0.9, 1.0, 1.3, np.nan],
         ["successful"] * 4 + ["misfit", "flat"],
+        path=np.array(PATHS),
         subject=np.array([EVIL, "s02"] * 3),
-        condition=np.array(["dry & warm"] * 6),
+        condition=np.array([r"dry & $\hot$"] * 6),
     )
     with etid.read(study_file) as study:
         settings = Settings.of(study, 6, 5, None, etid.SkinRC())
@@ -120,7 +122,7 @@ def test_names_and_notes_of_a_file_are_text_and_nothing_else(page):
 def test_worst_fits_are_drawn_with_what_was_measured(page):
     text = _Read(page).text
     assert "loaded/4: misfit (without success). χ² 7.04, r_s 43.4" in text
-    assert "loaded/5: flat (without success). No prediction: no circuit was identified." in text
+    assert f"{PATHS[5]}: flat (without success). No prediction: no circuit was identified." in text
     assert "loaded/3: successful (largest χ² among the successful)" in text
     assert "loaded/0: successful (largest standard error among the successful)" in text
     assert "not found" not in text
