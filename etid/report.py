@@ -49,7 +49,8 @@ pre { font-size: 0.8rem; background: var(--soft); padding: 1rem; white-space: pr
   @page { size: A4; margin: 12mm; }
   :root { color-scheme: light; }
   body { font-size: 9.5pt; max-width: none; margin: 0; padding: 0; } nav { display: none; }
-  h1, h2, caption { break-after: avoid; } p { orphans: 3; widows: 3; max-width: none; }
+  h1, h2, caption, p:has(+ .figures), p:has(+ .wide) { break-after: avoid; }
+  p { orphans: 3; widows: 3; max-width: none; } figcaption { font-size: 8pt; }
   .wide { overflow: visible; } table { font-size: 7.5pt; } th, td { padding: 0.1rem 0.3rem; }
   td.long { min-width: 0; } pre { font-size: 7pt; }
   table, figure { break-inside: avoid; } thead { display: table-header-group; }
