@@ -26,7 +26,7 @@ from etid.plotting import (
     plot_impedance,
 )
 from etid.results import Fits
-from etid.study_tables import Components
+from etid.study_tables import Components, frequent
 
 POINTS = 300  # of a curve
 BINS = 40
@@ -44,12 +44,6 @@ def svg(figure: Figure) -> bytes:
     with matplotlib.rc_context({"svg.hashsalt": "etid"}):
         figure.savefig(buffer, format="svg", metadata={"Date": None})
     return buffer.getvalue()
-
-
-def _conditions(fits: Fits) -> list[str]:
-    """The most frequent conditions, which are told apart, in alphabetical order."""
-    names, counts = np.unique(fits.labels["condition"].astype(str), return_counts=True)
-    return sorted(names[np.argsort(-counts, kind="stable")[:SERIES]].tolist())
 
 
 def _positive(values: np.ndarray) -> Float[np.ndarray, " value"]:
@@ -71,7 +65,7 @@ def distributions(fits: Fits) -> bytes:
     figure, axes = new_figure(1, len(units), (3.4 * len(units) + 1, 3.0), sharey=True)
     for axis, (name, unit) in zip(axes[0], units.items(), strict=True):
         scale, symbol = DISPLAY[unit]
-        for series, condition in enumerate(_conditions(good)):
+        for series, condition in enumerate(frequent(fits, SERIES)):
             values = _positive(getattr(good.where(condition=condition).circuit, name)) / scale
             if values.size:
                 _steps(axis, values, series, f"{_short(condition) or 'all'} ({values.size})")
@@ -120,7 +114,7 @@ def by_subject(fits: Fits) -> bytes:
     good, units = fits.successful(), fits.circuit.units()
     subjects, place = np.unique(good.labels["subject"].astype(str), return_inverse=True)
     named = subjects.size <= NAMED
-    conditions = _conditions(good)
+    conditions = frequent(fits, SERIES)
     width = min(14.0, max(10.0, 0.35 * subjects.size))
     figure, axes = new_figure(len(units), 1, (width, 2.2 * len(units)), sharex=True)
     thin = 1.0 if subjects.size <= 2 * NAMED else 0.5
@@ -179,10 +173,9 @@ def _quantiles(place: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.nd
     return where.astype(float), np.array(found).reshape(where.size, 5).T
 
 
-def components(found: Sequence[Components]) -> bytes:
+def components(found: Sequence[Components], conditions: Sequence[str]) -> bytes:
     """What varies and what is error, beside each other on one scale."""
     names = list(dict.fromkeys(one.name for one in found))
-    conditions = list(dict.fromkeys(one.condition for one in found))[:SERIES]
     parts = list(found[0].parts)
     figure, axes = new_figure(1, len(names), (3.4 * len(names) + 1, 2.6), sharey=True)
     for axis, name in zip(axes[0], names, strict=True):

@@ -68,8 +68,8 @@ def write_report(
         stderr = relative_stderr(found.fits)
         sections = [
             _verdicts(found.fits),
-            *_drivers(found),
-            *_elements(found.fits, groups),
+            _drivers(found),
+            _elements(found.fits, groups),
             _subjects(found.fits, groups),
             *_electrodes(found.fits),
             _quality(found.fits, stderr),
@@ -106,12 +106,12 @@ def _verdicts(fits: Fits) -> Section:
     return Section("Verdicts", text, (study_tables.verdicts(fits),))
 
 
-def _drivers(found: StudyFits) -> list[Section]:
+def _drivers(found: StudyFits) -> Section:
     from etid import study_figures
 
     if not (found.drivers or found.failures):
         text = "These fits do not say with which driver they were made."
-        return [Section("Drivers", warning=text)]
+        return Section("Drivers", warning=text)
     text = (
         "The source impedance Z_th, identified from calibrations with known resistors R_L. Its "
         "error passes into all fits made with it. χ² is 1 where the model explains a record down "
@@ -131,15 +131,15 @@ def _drivers(found: StudyFits) -> list[Section]:
         alt = f"Bode diagram of Z_th of {', '.join(shown)}."
         pictures = (Picture(caption, study_figures.drivers(shown), alt),)
     table = study_tables.drivers(found.drivers, found.failures)
-    return [Section("Drivers", text, (table,), pictures)]
+    return Section("Drivers", text, (table,), pictures)
 
 
-def _elements(fits: Fits, groups: Sequence[Mapping[str, Any]]) -> list[Section]:
+def _elements(fits: Fits, groups: Sequence[Mapping[str, Any]]) -> Section:
     from etid import study_figures
 
     found = study_tables.components(fits, groups)
     if not found:
-        return [Section("Elements", warning="No fit is successful: there is nothing to average.")]
+        return Section("Elements", warning="No fit is successful: there is nothing to average.")
     units = fits.circuit.units()
     text = (
         "What varies and what is error, apart. Between subjects: standard deviation of their "
@@ -150,7 +150,14 @@ def _elements(fits: Fits, groups: Sequence[Mapping[str, Any]]) -> list[Section]:
         "spread shows it and no number of trials reduces it. An empty cell is what the study "
         "cannot tell."
     )
-    shown = f"up to {study_figures.SERIES} conditions" if _many(fits) else "each condition"
+    conditions = len(set(map(str, fits.labels["condition"])))
+    if conditions > study_tables.CONDITIONS:
+        text += (
+            f" The {study_tables.CONDITIONS} most frequent of {conditions} conditions are shown."
+        )
+    shown = "each condition"
+    if conditions > study_figures.SERIES:
+        shown = f"the {study_figures.SERIES} most frequent conditions"
     pictures = (
         Picture(
             f"Part of the successful fits below a value, for {shown} (number of fits).",
@@ -162,20 +169,13 @@ def _elements(fits: Fits, groups: Sequence[Mapping[str, Any]]) -> list[Section]:
         Picture(
             f"What varies and what is error, in per cent of the median, for {shown}. Zeros are "
             "left out.",
-            study_figures.components(found),
+            study_figures.components(found, study_tables.frequent(fits, study_figures.SERIES)),
             "Between subjects, between recordings, own error and shared error of each element by "
             "condition, on a logarithmic scale; the numbers are in the table.",
             whole=True,
         ),
     )
-    return [Section("Elements", text, (study_tables.show_components(found, units),), pictures)]
-
-
-def _many(fits: Fits) -> bool:
-    """Whether there are more conditions than a picture tells apart."""
-    from etid.study_figures import SERIES
-
-    return len(set(map(str, fits.labels["condition"]))) > SERIES
+    return Section("Elements", text, (study_tables.show_components(found, units),), pictures)
 
 
 def _subjects(fits: Fits, groups: Sequence[Mapping[str, Any]]) -> Section:

@@ -18,6 +18,7 @@ from etid.results import Fits, plus_minus
 from etid.verdicts import message
 
 ROWS = 100  # of a table, above which it is cut
+CONDITIONS = 30  # of a table
 BRIEF = 50  # rows of a table that lists single recordings
 PARTS = ("between", "own", "shared")  # of a spread, as `Fits.summary` has them
 
@@ -55,7 +56,7 @@ def drivers(
         for paths, text in failures.items()
     ]
     chosen = sorted(found.items(), key=lambda item: (item[1].verdict == "successful", item[0]))
-    for paths, driver in chosen[: ROWS - len(rows)]:
+    for paths, driver in chosen[: max(0, ROWS - len(rows))]:
         z, error = _at_1_khz(driver)
         resistors = [] if driver.calibration is None else driver.calibration.r_load.tolist()
         rows.append(
@@ -132,8 +133,14 @@ class Components:
         }
 
 
+def frequent(fits: Fits, count: int) -> list[str]:
+    """The most frequent conditions, in alphabetical order."""
+    names, counts = np.unique(fits.labels["condition"].astype(str), return_counts=True)
+    return sorted(names[np.argsort(-counts, kind="stable")[:count]].tolist())
+
+
 def components(fits: Fits, groups: Sequence[Mapping[str, Any]]) -> list[Components]:
-    """Spread and errors told apart, by condition and element.
+    """Spread and errors told apart, by element and the most frequent `CONDITIONS`.
 
     Args:
         fits: All fits.
@@ -141,7 +148,7 @@ def components(fits: Fits, groups: Sequence[Mapping[str, Any]]) -> list[Componen
     """
     good = fits.successful()
     found = []
-    for condition in sorted({str(group["condition"]) for group in groups}):
+    for condition in frequent(fits, CONDITIONS):
         rows = [g for g in groups if g["condition"] == condition and g["successful"]]
         if not rows:
             continue

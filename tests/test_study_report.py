@@ -304,6 +304,20 @@ def test_no_success_at_all_and_no_fit_at_all(tmp_path):
         etid.write_report(fits_of(np.ones(0), []), tmp_path / "page.html")
 
 
+def test_another_circuit_is_reported_as_itself(tmp_path):
+    one = fits_of([1.0, 1.1], ["successful"] * 2)
+    fit = dataclasses.replace(
+        one.fit, circuit=etid.Resistor(one.circuit.r_p), cov=one.cov[:, 1:2, 1:2],
+        shared_cov=one.fit.shared_cov[:, 1:2, 1:2],
+    )  # fmt: skip
+    etid.write_report(dataclasses.replace(one, fit=fit), tmp_path / "page.html")
+    text = _Read(tmp_path / "page.html").text
+    assert "identified as Resistor" in text
+    assert "The load is one resistor R." in text
+    assert "r [kΩ]" in text
+    assert "r_s" not in text
+
+
 def test_groups_of_headings_must_cover_the_table():
     with pytest.raises(ValueError, match="span 1 columns of 2"):
         Table(("a", "b"), (), (("x", 1),))
