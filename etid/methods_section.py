@@ -126,7 +126,7 @@ def _model(found: StudyFits) -> str:
         text += f"The load is the circuit {type(circuit).__name__}"
     if settings is not None:
         typical = ", ".join(
-            f"{name} {value / circuits.DISPLAY[unit][0]:.4g} {circuits.DISPLAY[unit][1]}"
+            f"{name} {value / circuits.DISPLAY[unit][0]:.4g} {circuits.DISPLAY[unit][1]}".rstrip()
             for (name, unit), value in zip(circuit.units().items(), settings.start, strict=True)
         )
         text += f"; fits started around the typical {typical}"

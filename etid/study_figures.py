@@ -15,7 +15,7 @@ from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from etid.circuits import DISPLAY
+from etid.circuits import DISPLAY, heading
 from etid.driver import Driver
 from etid.plotting import (
     COLOURS,
@@ -64,12 +64,12 @@ def distributions(fits: Fits) -> bytes:
     good, units = fits.successful(), fits.circuit.units()
     figure, axes = new_figure(1, len(units), (3.4 * len(units) + 1, 3.0), sharey=True)
     for axis, (name, unit) in zip(axes[0], units.items(), strict=True):
-        scale, symbol = DISPLAY[unit]
+        scale = DISPLAY[unit][0]
         for series, condition in enumerate(frequent(fits, SERIES)):
             values = _positive(getattr(good.where(condition=condition).circuit, name)) / scale
             if values.size:
                 _steps(axis, values, series, f"{_short(condition) or 'all'} ({values.size})")
-        axis.set(xscale="log", xlabel=f"{name} [{symbol}]")
+        axis.set(xscale="log", xlabel=heading(name, unit))
         _plain(axis, "x")
     axes[0, 0].set_ylabel("fits below [%]")
     axes[0, 0].legend(frameon=False, fontsize=8)
@@ -119,7 +119,7 @@ def by_subject(fits: Fits) -> bytes:
     figure, axes = new_figure(len(units), 1, (width, 2.2 * len(units)), sharex=True)
     thin = 1.0 if subjects.size <= 2 * NAMED else 0.5
     for axis, (name, unit) in zip(axes[:, 0], units.items(), strict=True):
-        scale, symbol = DISPLAY[unit]
+        scale = DISPLAY[unit][0]
         values = np.asarray(getattr(good.circuit, name)) / scale
         for series, condition in enumerate(conditions):
             chosen = good.labels["condition"] == condition
@@ -134,7 +134,7 @@ def by_subject(fits: Fits) -> bytes:
                 where, found[2], MARKS[series], color=colour, ms=4.5 * thin,
                 markerfacecolor="white", label=_short(condition) or "all",
             )  # fmt: skip
-        axis.set(yscale="log", ylabel=f"{name} [{symbol}]")
+        axis.set(yscale="log", ylabel=heading(name, unit))
         _plain(axis, "y")
     last = axes[-1, 0]
     if named:

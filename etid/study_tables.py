@@ -11,7 +11,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from etid.circuits import DISPLAY
+from etid.circuits import DISPLAY, heading
 from etid.driver import Driver
 from etid.report import Table
 from etid.results import Fits, plus_minus
@@ -186,11 +186,11 @@ def show_components(found: Sequence[Components], units: Mapping[str, str]) -> Ta
     """The components as a table."""
     rows = []
     for one in found:
-        scale, symbol = DISPLAY[units[one.name]]
+        scale = DISPLAY[units[one.name]][0]
         rows.append(
             (
                 one.condition or "all",
-                f"{one.name} [{symbol}]",
+                heading(one.name, units[one.name]),
                 str(one.subjects),
                 str(one.successful),
                 significant(one.median / scale, 4),
@@ -229,7 +229,7 @@ def groups(rows: Sequence[Mapping[str, Any]], by: Sequence[str], units: Mapping[
         cells.append(tuple(line))
     heads = [*by, "successful"]
     for unit in units.values():
-        heads += [f"median [{DISPLAY[unit][1]}]", *(f"{part} [%]" for part in PARTS)]
+        heads += [heading("median", unit), *(f"{part} [%]" for part in PARTS)]
     over = [(name, 1 + len(PARTS)) for name in units]
     return Table(tuple(heads), tuple(cells), (("", len(by) + 1), *over))
 

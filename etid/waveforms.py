@@ -144,5 +144,5 @@ def _elements(fit: Fit) -> str:
         scale, symbol = DISPLAY[unit]
         value = float(getattr(fit.circuit, name)) / scale
         error = float(getattr(fit.stderr, name)) / scale
-        parts.append(f"{name} {' '.join(plus_minus(value, error).split())} {symbol}")
+        parts.append(" ".join(f"{name} {plus_minus(value, error)} {symbol}".split()))
     return ", ".join(parts)
