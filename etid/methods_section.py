@@ -154,7 +154,7 @@ def _driver(found: StudyFits) -> str:
         text += ", ".join(f"{r / 1e3:.6g}" for r in resistors) + " kΩ"
     methods = sorted({driver.method for driver in drivers})
     if methods:
-        text += f", by {' or '.join(map(_words, methods))}"
+        text += f", by {' or '.join(map(words, methods))}"
     return text + "."
 
 
@@ -166,7 +166,7 @@ def _estimator(found: StudyFits, used: set[str]) -> str:
             "Maximum likelihood was the method for recordings of several whole pulse periods, "
             "whose harmonics can be told from aliases; output error for all others. "
         )
-        text += "Both occurred. " if len(used) > 1 else f"Here it was {_words(*used)} for all. "
+        text += "Both occurred. " if len(used) > 1 else f"Here it was {words(*used)} for all. "
     for method in sorted(used):
         sentence = _TEXTS[method] if method in _IN_TIME else _HARMONICS + _TEXTS[method]
         text += sentence[0].upper() + sentence[1:] + " "
@@ -190,8 +190,9 @@ def _refined(circuit: circuits.AbstractCircuit) -> str:
     )
 
 
-def _words(method: str) -> str:
-    return method.replace("_", " ")
+def words(method: str) -> str:
+    """The name of an estimator in a sentence."""
+    return "joint maximum likelihood" if method == "joint" else method.replace("_", " ")
 
 
 def _errors(used: set[str], settings: Settings | None) -> str:

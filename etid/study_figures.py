@@ -30,7 +30,8 @@ from etid.study_tables import Components, frequent
 
 POINTS = 300  # of a curve
 BINS = 40
-DECADE = 10.0  # of values, above which an axis is logarithmic
+FAR = 1e6  # between the ends of an axis, above which it has powers of ten
+NARROW = 3.0  # between the largest and the smallest value, above which an axis is logarithmic
 NAMED = 30  # subjects that have their names below an axis
 CROWD = 120  # subjects that are drawn
 SERIES = 4  # conditions that are told apart
@@ -52,10 +53,10 @@ def _positive(values: np.ndarray) -> Float[np.ndarray, " value"]:
 
 def _steps(axis: Axes, values: np.ndarray, series: int, label: str) -> None:
     """An empirical distribution function of at most `POINTS` points."""
-    p = np.linspace(0.0, 1.0, min(POINTS, max(values.size, 2)))
-    axis.plot(
-        np.quantile(values, p), 100 * p, STYLES[series % 4], color=COLOURS[series % 4], lw=1.3,
-        label=label,
+    p = np.linspace(0.0, 1.0, min(POINTS, values.size) + 1)
+    axis.step(
+        np.quantile(values, p, method="inverted_cdf"), 100 * p, STYLES[series % 4],
+        where="post", color=COLOURS[series % 4], lw=1.3, label=label,
     )  # fmt: skip
 
 
@@ -69,19 +70,25 @@ def distributions(fits: Fits) -> bytes:
             values = _positive(getattr(good.where(condition=condition).circuit, name)) / scale
             if values.size:
                 _steps(axis, values, series, f"{_short(condition) or 'all'} ({values.size})")
-        axis.set(xscale="log", xlabel=heading(name, unit))
-        _plain(axis, "x")
+        axis.set(xlabel=heading(name, unit))
+        low, high = axis.dataLim.intervalx
+        if 0 < NARROW * low < high:
+            axis.set_xscale("log")
+            _plain(axis, "x")
+        else:
+            axis.xaxis.set_major_locator(matplotlib.ticker.MaxNLocator(5))
     axes[0, 0].set_ylabel("fits below [%]")
     axes[0, 0].legend(frameon=False, fontsize=8)
     return svg(figure)
 
 
 def _plain(axis: Axes, which: str) -> None:
-    """Write 20 and 50 at a logarithmic axis of few decades, not powers of ten."""
+    """Write 20 and 50 at a logarithmic axis of few decades, 0.1 and 10 at a longer one."""
     of = axis.xaxis if which == "x" else axis.yaxis
     low, high = sorted(of.get_view_interval())
-    if low > 0 and np.log10(high / low) < 3:
-        of.set_major_locator(matplotlib.ticker.LogLocator(subs=(1.0, 2.0, 5.0)))
+    if 0 < low and high < FAR * low:
+        few = high < FAR**0.5 * low
+        of.set_major_locator(matplotlib.ticker.LogLocator(subs=(1.0, 2.0, 5.0) if few else (1.0,)))
         of.set_major_formatter(matplotlib.ticker.FormatStrFormatter("%g"))
         of.set_minor_formatter(matplotlib.ticker.NullFormatter())
 
@@ -96,9 +103,11 @@ def quality(chi2: Float[np.ndarray, " fit"], stderr: Float[np.ndarray, " fit"]) 
     for axis, values in ((left, chi2), (right, 100 * stderr)):
         known = _positive(values)
         if known.size:
-            wide = known.max() > DECADE * known.min()
+            wide = known.max() > NARROW * known.min()
             space = np.geomspace if wide else np.linspace
-            bins = space(0.99 * known.min(), 1.01 * known.max(), BINS).tolist()
+            count = min(BINS, 4 + 2 * round(np.sqrt(known.size)))
+            bins = space(0.99 * known.min(), 1.01 * known.max(), count).tolist()
+            axis.yaxis.set_major_locator(matplotlib.ticker.MaxNLocator("auto", integer=True))
             axis.hist(known, bins=bins, color=COLOURS[0], edgecolor="white", lw=0.3)
             if wide:
                 axis.set_xscale("log")
@@ -190,6 +199,9 @@ def components(found: Sequence[Components], conditions: Sequence[str]) -> bytes:
                     color=COLOURS[series], ms=6, label=_short(condition) or "all",
                 )  # fmt: skip
         axis.set(xscale="log", xlabel=f"{name}: part of the median [%]")
+        low, high = axis.dataLim.intervalx
+        if 0 < low <= high < np.inf:
+            axis.set_xlim(low / NARROW, high * NARROW)
         _plain(axis, "x")
     axes[0, 0].set_yticks(range(len(parts)), parts)
     axes[0, 0].set_ylim(len(parts) - 0.5, -0.5)

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from etid import study_tables
-from etid.methods_section import methods_section
+from etid.methods_section import methods_section, words
 from etid.precision import require_float64
 from etid.report import Picture, Section, write_page
 from etid.results import Fits
@@ -95,8 +95,7 @@ def _summary(found: StudyFits) -> str:
         count = len(set(map(str, fits.labels[label])) - {""})
         if count:
             text += f", {count} {label}{'s' if count > 1 else ''}"
-    method = fits.fit.method.replace("_", " ")
-    text += f", identified as {type(fits.circuit).__name__} by {method}. "
+    text += f", identified as {type(fits.circuit).__name__} by {words(fits.fit.method)}. "
     share = f"{100 * good / len(fits):.1f} %"
     return text + f"{good} fits ({share}) are successful; only these enter medians and spreads."
 
