@@ -12,7 +12,7 @@ import pytest
 from chromium import chromium
 
 import etid
-from etid import citations, cli, methods_section, study_figures, study_tables, worst_fits
+from etid import citations, cli, exporting, methods_section, study_figures, study_tables, worst_fits
 from etid.driver import Calibration, SourceImpedance
 from etid.report import Table
 from etid.scenes import Scene, Trial
@@ -186,6 +186,8 @@ def test_a_file_of_fits_gives_back_drivers_and_settings(found, driver, tmp_path)
     again.write(tmp_path / "again.h5")
     assert (tmp_path / "again.h5").read_bytes() == (tmp_path / "fits.h5").read_bytes()
     assert etid.Fits.read(tmp_path / "fits.h5").counts() == found.fits.counts()
+    exporting.export_fits(tmp_path / "fits.h5", tmp_path / "fits.csv")  # drivers are no column
+    assert len((tmp_path / "fits.csv").read_text().splitlines()) == 1 + len(found.fits)
 
 
 def test_a_driver_without_a_continuous_impedance_is_kept_as_well(found, driver, tmp_path):
