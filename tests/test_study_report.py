@@ -381,10 +381,10 @@ def test_every_entry_is_whole_bibtex():
 
 
 def test_the_command_writes_beside_the_fits_and_replaces_no_file_that_it_reads(
-    found, study_file, tmp_path, capsys
+    study_file, tmp_path, capsys
 ):
     file = tmp_path / "fits.h5"
-    found.write(file)
+    fits_of([np.nan], ["flat"]).write(file)  # the fewest pictures
     assert cli.main(["report", str(file)]) == 0
     assert (tmp_path / "fits.html").exists()
     before = file.read_bytes()
