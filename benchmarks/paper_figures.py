@@ -18,7 +18,6 @@ half of 200 kHz is in the records as aliases, which a prediction cannot tell fro
 import pathlib
 from collections.abc import Mapping, Sequence
 
-import jax.numpy as jnp
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.axis import Axis
@@ -28,9 +27,10 @@ from matplotlib.ticker import LogLocator, NullFormatter
 import etid
 from benchmarks import charts
 from benchmarks.paper_tables import Groups, Row, with_circuit
-from etid import experiments, plotting
+from etid import experiments
 from etid.circuits import DISPLAY
 from etid.experiments import CALIBRATION, METHODS, ORDER, Outcome, Truth
+from etid.plotting.pulses import draw_pulse, pulse
 
 GOOD, NOISY = "good", "both"
 OURS, THEIRS = METHODS
@@ -74,7 +74,7 @@ def pulses(study: etid.Study, path: pathlib.Path) -> None:
     }
     figure, axes = charts.new(1, 2, (9.5, 3.4), gridspec_kw={"width_ratios": [1, 1.6]})
     unloaded = study[CALIBRATION]
-    part = plotting.pulse(unloaded)
+    part = pulse(unloaded)
     milliseconds = 1e3 * unloaded.time
     axes[0, 0].plot(milliseconds, unloaded.v_th, color=charts.INK, lw=0.9)
     axes[0, 0].set(xlabel="time [ms]", ylabel="voltage [V]", title="unloaded, V_th")
@@ -83,7 +83,7 @@ def pulses(study: etid.Study, path: pathlib.Path) -> None:
     )
     for i, (label, of) in enumerate(loads.items()):
         axes[0, 1].plot(
-            milliseconds[part], study[of].v_out[part], color=plotting.COLOURS[i],
+            milliseconds[part], study[of].v_out[part], color=charts.COLOURS[i],
             linestyle=charts.DASHES[i], lw=1.1, label=label,
         )  # fmt: skip
     axes[0, 1].set(xlabel="time [ms]", title="one pulse, V_out")
@@ -99,7 +99,7 @@ def driver(study: etid.Study, found: etid.Driver, path: pathlib.Path) -> None:
     for (upper, lower), of in zip(axes.T, (CALIBRATION, *RESISTORS), strict=True):
         record = study[of]
         r = record.r_load or resistances[of.rpartition("/")[2]]
-        plotting.draw_fit(upper, lower, record, etid.predict(record, found, etid.Resistor(r)))
+        draw_pulse(upper, lower, record, found, etid.Resistor(r))
         kind = "calibration" if record.r_load else "not in the calibration"
         upper.set_title(f"{r / 1e3:g} kΩ, {kind}", fontsize=10)
     charts.save(figure, path)
@@ -118,17 +118,22 @@ def fingertip(
     for (upper, lower), laboratory in zip(axes.T[:2], (GOOD, NOISY), strict=True):
         record, outcome = shown[laboratory][name], first[laboratory, OURS]
         skin = outcome.skins.where(path=name)[0].circuit
-        plotting.draw_fit(upper, lower, record, etid.predict(record, outcome.driver, skin))
+        draw_pulse(upper, lower, record, outcome.driver, skin)
         upper.sharex(lower)
         upper.tick_params(labelbottom=False)
         upper.set_title(f"{condition}, {_settings(laboratory)}\n{_elements(skin)}", fontsize=9)
-    impedances: dict[str, plotting.HasResponse] = {"truth": etid.SkinRC(**truth[name])}
+    impedances: dict[str, etid.AbstractCircuit | etid.Fit | etid.Driver] = {
+        "truth": etid.SkinRC(**truth[name])
+    }
     for method, label in LABELS.items():
         fits = with_circuit(first[NOISY, method].skins.where(path=name))
         if len(fits):
-            impedances[label] = fits[0].circuit
+            impedances[label] = fits[0]
     impedances["Z_th"] = first[NOISY, OURS].driver
-    _bode(axes[0, 2], axes[1, 2], impedances)
+    for axis in etid.plot(impedances, axes=axes[:, 2]):
+        axis.lines[0].set(color="0.6", linewidth=2.4, linestyle="-")  # the truth, below the others
+    axes[0, 2].tick_params(labelbottom=False)
+    axes[0, 2].legend(frameon=False, fontsize=8)
     axes[0, 2].set_title(f"impedance, {_settings(NOISY)}", fontsize=9)
     charts.save(figure, path)
 
@@ -143,23 +148,6 @@ def _elements(skin: etid.AbstractCircuit) -> str:
         scale, symbol = DISPLAY[unit]
         parts.append(f"{name} {float(getattr(skin, name)) / scale:.4g} {symbol}")
     return ", ".join(parts)
-
-
-def _bode(magnitude: Axes, phase: Axes, impedances: Mapping[str, plotting.HasResponse]) -> None:
-    f = plotting.bode_frequencies()
-    for i, (label, impedance) in enumerate(impedances.items()):
-        z = np.asarray(impedance.response(jnp.asarray(f)))
-        style = {"color": "0.6", "lw": 2.4} if label == "truth" else {
-            "color": plotting.COLOURS[i % 4], "linestyle": charts.DASHES[i], "lw": 1.2
-        }  # fmt: skip
-        magnitude.loglog(f / 1e3, np.abs(z) / 1e3, label=label, **style)
-        phase.semilogx(f / 1e3, np.degrees(np.angle(z)), **style)
-    magnitude.set(ylabel="|Z| [kΩ]")
-    _one_two_five(magnitude.yaxis)
-    phase.xaxis.set_major_formatter("{x:g}")
-    magnitude.tick_params(labelbottom=False)
-    magnitude.legend(frameon=False, fontsize=8)
-    phase.set(xlabel="frequency [kHz]", ylabel="phase [deg]")
 
 
 def _one_two_five(axis: Axis) -> None:
@@ -209,7 +197,7 @@ def _elements_of(
         inside = (values > low) & (values < high)
         axis.plot(
             place[inside], values[inside], charts.MARKS[i], ms=4, mew=0.8,
-            color=plotting.COLOURS[i], markerfacecolor="none", label=LABELS[method],
+            color=charts.COLOURS[i], markerfacecolor="none", label=LABELS[method],
         )  # fmt: skip
         if not inside.all():
             outside.append(f"{(~inside).sum()} of {inside.size} by {LABELS[method]} outside")
@@ -248,7 +236,7 @@ def causes(rows: Sequence[Row], path: pathlib.Path) -> None:
             place = np.array([names.index(row["laboratory"]) for row in of]) + 0.3 * (i - 0.5)
             axis.errorbar(
                 [row["error"] for row in of], place, xerr=[row["scatter"] for row in of],
-                fmt=charts.MARKS[i], ms=5, color=plotting.COLOURS[i], lw=1.2, capsize=3,
+                fmt=charts.MARKS[i], ms=5, color=charts.COLOURS[i], lw=1.2, capsize=3,
                 markerfacecolor="none", label=LABELS[method],
             )  # fmt: skip
         axis.set(xlabel=f"{element}: mean error ± scatter of trials [%]")

@@ -42,6 +42,7 @@ from etid.joint import identify_jointly as identify_jointly
 from etid.netlist import circuit_string as circuit_string
 from etid.netlist import netlist as netlist
 from etid.online import Tracker as Tracker
+from etid.plotting import plot as plot
 from etid.recording import Recording as Recording
 from etid.recording import RecordingError as RecordingError
 from etid.recording import Samples as Samples

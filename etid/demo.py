@@ -13,14 +13,13 @@ import json
 import pathlib
 import sys
 import textwrap
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import jax
 import numpy as np
 
 import etid
-from etid import plotting
 from etid.circuits import DISPLAY
 from etid.experiments import (
     CALIBRATION,
@@ -38,6 +37,8 @@ from etid.experiments import (
     identify,
     resistor_errors,
 )
+from etid.plotting import figure_of
+from etid.plotting.style import save
 from etid.report import Picture, Section, Table, number, write_page
 
 _SEED = 0
@@ -145,46 +146,39 @@ def table_verdicts(outcomes: Sequence[Outcome], truth: Truth) -> Table:
 def figures(folder: pathlib.Path, study: etid.Study, outcome: Outcome) -> tuple[Picture, ...]:
     """The paper's figures 7 to 9 and the elements of all subjects, as PNG and SVG."""
     folder.mkdir(exist_ok=True)
-    driver = outcome.driver
-    circuits: dict[str, etid.AbstractCircuit] = {}
-    drawn = []
-
-    def draw(name: str, caption: str, make: Callable[[], Any]) -> None:
-        figure = make()
-        for suffix in (".png", ".svg"):
-            plotting.save(figure, folder / f"{name}{suffix}")
-        drawn.append(Picture(caption, (folder / f"{name}.svg").read_bytes()))
-
-    known = study[CALIBRATION]
-    draw(
-        "pulse_calibration",
-        "Calibration with 98.8 kΩ: measured, predicted, residual (paper, figure 7)",
-        lambda: plotting.plot_fit(known, etid.predict(known, driver)),
-    )
-    for condition in FINGERTIPS:
-        path = f"typical/{condition}/01"
-        row = outcome.skins.labels["path"].tolist().index(path)
-        circuits[condition] = outcome.skins[row].circuit
-        draw(
-            f"pulse_{condition}",
-            f"A {condition} fingertip: measured, predicted, residual (paper, figure 8)",
-            lambda path=path, condition=condition: plotting.plot_fit(
-                study[path], etid.predict(study[path], driver, circuits[condition])
-            ),
-        )
-    draw(
-        "impedance",
-        "Source impedance and the impedances of a dry and a damp fingertip (paper, figure 9)",
-        lambda: plotting.plot_impedance(
-            {"Z_th": driver, **{f"Z_bio, {name}": load for name, load in circuits.items()}}
-        ),
-    )
+    driver, calibration = outcome.driver, study[CALIBRATION]
+    skins = {
+        condition: outcome.skins.where(path=f"typical/{condition}/01")[0]
+        for condition in FINGERTIPS
+    }
     fingertips = outcome.skins.take(outcome.skins.labels["subject"] != "")
-    draw(
-        "elements",
-        "Elements of all trials by subject, with standard errors",
-        lambda: plotting.plot_elements(fingertips),
-    )
+    pictures: dict[str, tuple[str, tuple[Any, ...]]] = {
+        "pulse_calibration": (
+            "Calibration with 98.8 kΩ: measured, predicted, residual (paper, figure 7)",
+            (driver, calibration),
+        ),
+        **{
+            f"pulse_{condition}": (
+                f"A {condition} fingertip: measured, predicted, residual (paper, figure 8)",
+                (skin, study[f"typical/{condition}/01"], driver),
+            )
+            for condition, skin in skins.items()
+        },
+        "impedance": (
+            "Source impedance and the impedances of a dry and a damp fingertip (paper, figure 9)",
+            (
+                {"Z_th": driver}
+                | {f"Z_bio, {condition}": skin for condition, skin in skins.items()},
+            ),
+        ),
+        "elements": ("Elements of all trials by subject, with standard errors", (fingertips,)),
+    }
+    drawn = []
+    for name, (caption, arguments) in pictures.items():
+        figure = figure_of(*arguments)
+        for suffix in (".png", ".svg"):
+            save(figure, folder / f"{name}{suffix}")
+        drawn.append(Picture(caption, (folder / f"{name}.svg").read_bytes()))
     return tuple(drawn)
 
 

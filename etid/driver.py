@@ -10,7 +10,6 @@ complex to real without a change of branch.
 """
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
@@ -19,6 +18,7 @@ from jaxtyping import Array, Complex, Float, Int
 from etid.filtering import StateSpace
 from etid.spectra import Spectrum
 from etid.transfer import Rational, as_complex, delay_variable, frequency_variable, reciprocal
+from etid.uncertainty import log_stderr
 from etid.verdicts import RESULTS, message, verdict_names
 
 
@@ -187,13 +187,18 @@ class Driver(eqx.Module):
         z = delay_variable(jnp.asarray(frequency), self.sample_rate)
         return Rational(self.b, self.a)(z)
 
+    def log_response_stderr(
+        self, frequency: Float[Array, " frequency"]
+    ) -> Float[Array, "2 frequency"]:
+        """Standard errors of ln |Z_th| and of its phase [rad]; NaN if there is no covariance."""
+        if self.source is None or self.cov is None:
+            return jnp.full((2, frequency.size), jnp.nan)
+        values, unflatten = ravel_pytree(self.source)
+        return log_stderr(lambda p: unflatten(p).response(frequency), values, self.cov)
+
     def response_stderr(self, frequency: Float[Array, " frequency"]) -> Float[Array, " frequency"]:
         """Standard error of |Z_th| [Ω]; NaN if the method gives no covariance."""
-        if self.source is None or self.cov is None:
-            return jnp.full_like(frequency, jnp.nan)
-        vector, unflatten = ravel_pytree(self.source)
-        slope = jax.jacfwd(lambda p: jnp.abs(unflatten(p).response(frequency)))(vector)
-        return jnp.sqrt(jnp.einsum("fi,ij,fj->f", slope, self.cov, slope))
+        return jnp.abs(self.response(frequency)) * self.log_response_stderr(frequency)[0]
 
     def __str__(self) -> str:
         z = complex(self.response(jnp.array(1e3)))

@@ -7,7 +7,6 @@ import dataclasses
 import io
 from collections.abc import Mapping, Sequence
 
-import jax.numpy as jnp
 import matplotlib
 import matplotlib.ticker
 import numpy as np
@@ -17,14 +16,8 @@ from matplotlib.figure import Figure
 
 from etid.circuits import DISPLAY, heading
 from etid.driver import Driver
-from etid.plotting import (
-    COLOURS,
-    STYLES,
-    bode_frequencies,
-    new_figure,
-    plot_elements,
-    plot_impedance,
-)
+from etid.plotting import figure_of
+from etid.plotting.style import COLOURS, DASHES, MARKS, new_figure
 from etid.results import Fits
 from etid.study_tables import Components, frequent
 
@@ -36,7 +29,6 @@ NAMED = 30  # subjects that have their names below an axis
 CROWD = 120  # subjects that are drawn
 SERIES = 4  # conditions that are told apart
 QUARTILES, MOST = (0.25, 0.75), (0.05, 0.95)
-MARKS = "osD^"
 
 
 def svg(figure: Figure) -> bytes:
@@ -55,8 +47,8 @@ def _steps(axis: Axes, values: np.ndarray, series: int, label: str) -> None:
     """An empirical distribution function of at most `POINTS` points."""
     p = np.linspace(0.0, 1.0, min(POINTS, values.size) + 1)
     axis.step(
-        np.quantile(values, p, method="inverted_cdf"), 100 * p, STYLES[series % 4],
-        where="post", color=COLOURS[series % 4], lw=1.3, label=label,
+        np.quantile(values, p, method="inverted_cdf"), 100 * p, ls=DASHES[series],
+        where="post", color=COLOURS[series], lw=1.3, label=label,
     )  # fmt: skip
 
 
@@ -215,17 +207,9 @@ def each_fit(fits: Fits) -> bytes:
         name: np.array([_short(str(label)) for label in fits.labels[name]])
         for name in ("subject", "condition")
     }
-    return svg(plot_elements(dataclasses.replace(fits, labels={**fits.labels, **labels})))
+    return svg(figure_of(dataclasses.replace(fits, labels={**fits.labels, **labels})))
 
 
 def drivers(found: Mapping[str, Driver]) -> bytes:
     """Z_th of some drivers, with bands of two standard errors."""
-    frequency = bode_frequencies()
-    errors = {
-        _short(name, 60): np.asarray(driver.response_stderr(jnp.asarray(frequency)))
-        for name, driver in found.items()
-        if driver.cov is not None
-    }
-    return svg(
-        plot_impedance({_short(n, 60): driver for n, driver in found.items()}, stderr=errors)
-    )
+    return svg(figure_of({_short(name, 60): driver for name, driver in found.items()}))

@@ -4,13 +4,13 @@ import os
 import pathlib
 
 import numpy as np
+from matplotlib.figure import Figure
 
 from etid.circuits import DISPLAY
 from etid.driver import Driver
 from etid.hdf5 import read
-from etid.identify import predict
-from etid.plotting import plot_fit, plot_recording
-from etid.recording import Recording, RecordingError
+from etid.plotting import figure_of
+from etid.recording import LABELS, Recording, RecordingError
 from etid.report import Picture
 from etid.results import Fit, plus_minus
 from etid.study import Study
@@ -101,35 +101,32 @@ class Recordings:
             recording = self.study[path]
         except (RecordingError, KeyError):
             return None
-        predicted, why = self._predict(recording, fit)
-        recording = recording.replace(path=plain(path))
+        names = ("path", *LABELS)
+        shown = recording.replace(**{name: plain(getattr(recording, name)) for name in names})
+        figure, why = self._predicted(shown, fit)
         elements = _elements(fit)
         about = f"{path}: {fit.verdict} ({text})."
-        if predicted is None:
-            figure = plot_recording(recording)
-            alt = f"Measured voltages of {path}, whole record and one pulse; no prediction."
+        if why:
+            alt = f"Measured voltages of {path}; no prediction."
             caption = f"{about} No prediction: {why}"
         else:
-            figure = plot_fit(recording, predicted)
             alt = f"One pulse of {path}: measured, predicted and residual voltage. {elements}"
             caption = f"{about} χ² {significant(float(fit.chi2), 3)}, {elements}."
         return Picture(caption, svg(figure), alt)
 
-    def _predict(self, recording: Recording, fit: Fit) -> tuple[np.ndarray | None, str]:
-        """The terminal voltage [V], or why there is none."""
-        values = np.asarray(fit.circuit.values())
-        if not (np.isfinite(values) & (values > 0)).all():
-            return None, "no circuit was identified."
+    def _predicted(self, recording: Recording, fit: Fit) -> tuple[Figure, str]:
+        """One pulse with its prediction; without one, also why."""
         driver = self._driver(recording)
+        values = np.asarray(fit.circuit.values())
         if driver is None:
-            return None, "the fits hold no driver for it."
+            return figure_of(recording), "the fits hold no driver for it."
+        if (values <= 0).any():
+            return figure_of(recording), "an element is not positive."
+        why = "" if np.isfinite(values).all() else "no circuit was identified."
         try:
-            predicted = predict(recording, driver, fit.circuit)
+            return figure_of(fit, recording, driver), why
         except ValueError as error:
-            return None, f"{error}."
-        if not np.isfinite(predicted).any():
-            return None, "the identified circuit is unstable."
-        return predicted, ""
+            return figure_of(recording), f"{error}."
 
     def _driver(self, recording: Recording) -> Driver | None:
         assert self.study is not None

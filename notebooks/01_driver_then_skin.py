@@ -26,7 +26,6 @@ jax.config.update("jax_enable_x64", True)  # before the first array: etid needs 
 import numpy as np
 
 import etid
-from etid import plotting
 
 SEED = 0
 
@@ -44,7 +43,7 @@ study = scene.simulate(SEED)
 study
 
 # %%
-plotting.plot_recording(study["typical/dry/01"])
+axes = etid.plot(study["typical/dry/01"])
 
 # %% [markdown]
 # ## The driver
@@ -58,7 +57,7 @@ driver = etid.identify_driver(calibration, order=5)
 print(driver)
 
 # %%
-plotting.plot_fit(calibration, etid.predict(calibration, driver))
+axes = etid.plot(driver, calibration)
 
 # %% [markdown]
 # ## The skin
@@ -72,15 +71,11 @@ print(fits[0])
 
 # %%
 recording, skin = study["typical/dry/01"], fits.where(path="typical/dry/01")[0]
-plotting.plot_fit(recording, etid.predict(recording, driver, skin.circuit))
+axes = etid.plot(skin, recording, driver)
 
 # %%
-plotting.plot_impedance(
-    {
-        "Z_th": driver,
-        "Z_bio, dry": skin.circuit,
-        "Z_bio, damp": fits.where(condition="damp")[0].circuit,
-    }
+axes = etid.plot(
+    {"Z_th": driver, "Z_bio, dry": skin, "Z_bio, damp": fits.where(condition="damp")[0]}
 )
 
 # %% [markdown]

@@ -26,7 +26,6 @@ jax.config.update("jax_enable_x64", True)  # before the first array: etid needs 
 import numpy as np
 
 import etid
-from etid import plotting
 from etid.elements import Exponent, Farad, Ohm, Second
 
 SEED = 0
@@ -76,7 +75,7 @@ truth = {
     "two layers": SkinTwoLayer(r_s=33.4e3, r_1=150e3, c_1=0.12e-9, r_2=36e3, c_2=5e-9),
     "Cole": SkinCole(r_s=33.4e3, r_p=186e3, tau=22e-6, alpha=0.85),
 }
-plotting.plot_impedance(truth)
+etid.plot(truth)
 
 # %% [markdown]
 # ## Recordings
@@ -109,7 +108,7 @@ print(spread)
 # what has aliased; the fit itself leaves that out.
 
 # %%
-plotting.plot_fit(study["Cole"], etid.predict(study["Cole"], driver, spread.circuit))
+etid.plot(spread, study["Cole"], driver)
 
 # %% [markdown]
 # ## Could it be known better?

@@ -1,88 +1,190 @@
+"""Pictures: each as its image, what its axes say, and what is refused."""
+
+import dataclasses
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from matplotlib.colors import to_hex
+from matplotlib.testing.compare import compare_images
 
-from etid import SkinRC, plotting, scenes
-from etid.results import Fit, Fits
-from etid.verdicts import verdicts_of
+import etid
+from etid.plotting import figure_of
+from etid.plotting.pulses import residual_std
+from etid.plotting.style import RED, new_figure, save
+from tests import pictures
+
+# Root mean square of the differences of grey values, of 255. The same commands give 0; with another
+# release of FreeType letters differ by 1 to 3. A curve that is missing gives 4 and more.
+TOLERANCE = 3.0
+
+
+@pytest.mark.parametrize("name", pictures.PICTURES)
+def test_a_picture_looks_as_it_did(name, tmp_path):
+    """After a change that is meant: `python -m tests.pictures`, and look at what it made."""
+    made = tmp_path / f"{name}.png"
+    pictures.draw(name, made)
+    assert compare_images(str(pictures.BASELINE / f"{name}.png"), str(made), TOLERANCE) is None
+
+
+def test_a_picture_without_a_curve_looks_different(tmp_path):
+    figure = figure_of(*pictures.PICTURES["driver"]())
+    figure.axes[0].lines[0].remove()
+    figure.savefig(tmp_path / "driver.png", dpi=pictures.DPI)
+    baseline = pictures.BASELINE / "driver.png"
+    assert compare_images(str(baseline), str(tmp_path / "driver.png"), TOLERANCE) is not None
 
 
 @pytest.fixture(scope="module")
 def recording():
-    study = scenes.paper_dry().simulate(seed=3)
-    return next(iter(study.loaded.recordings()))
+    return pictures.dry()
 
 
-def test_fit_shows_measured_predicted_and_residual_in_display_units(recording):
-    predicted = recording.v_out + 0.02
-    predicted[:20] = np.nan  # as `etid.predict` leaves the edges
-    figure = plotting.plot_fit(recording, predicted)
-    upper, lower = figure.axes
-    assert upper.get_ylabel() == "voltage [V]"
-    assert lower.get_ylabel() == "residual [mV]"
-    drawn = np.asarray(lower.lines[-1].get_ydata())
-    np.testing.assert_allclose(drawn[np.isfinite(drawn)], 20.0, atol=1e-9)
-    # One pulse is shown, not the record: its edge must lie inside.
-    shown = np.asarray(upper.lines[1].get_ydata())
-    assert shown.size < 0.1 * recording.v_out.size
-    assert np.ptp(shown) > 0.8 * np.ptp(recording.v_out)
+@pytest.fixture(scope="module")
+def driver():
+    return pictures.driver()
 
 
-def test_prediction_of_another_length_is_refused(recording):
-    with pytest.raises(ValueError, match="shape"):
-        plotting.plot_fit(recording, recording.v_out[:-1])
+def test_a_recording_is_shown_whole_and_by_one_pulse(recording):
+    whole, one = figure_of(recording).axes
+    np.testing.assert_array_equal(whole.lines[0].get_ydata(), recording.v_th)
+    np.testing.assert_array_equal(whole.lines[1].get_ydata(), recording.v_out)
+    shown = np.asarray(one.lines[0].get_ydata())
+    assert shown.size < 0.1 * recording.v_th.size
+    assert np.ptp(shown) > 0.8 * np.ptp(recording.v_th)
+    assert {axis.get_xlabel() for axis in (whole, one)} == {"time [ms]"}
+    assert {axis.get_ylabel() for axis in (whole, one)} == {"voltage [V]"}
+    assert "typical/dry/01" in whole.get_title(loc="left")
 
 
-def test_impedance_is_drawn_in_kilohms_and_degrees():
-    circuit = SkinRC(10e3, 90e3, 1e-9)
-    frequency = plotting.bode_frequencies(60.0, 1e5)
-    stderr = {"skin": np.full(frequency.size, 1e3)}
-    figure = plotting.plot_impedance({"skin": circuit}, stderr=stderr)
-    magnitude, phase = figure.axes
-    z = np.asarray(circuit.response(jnp.asarray(frequency)))
-    np.testing.assert_allclose(np.asarray(magnitude.lines[0].get_xdata()), frequency / 1e3)
-    np.testing.assert_allclose(np.asarray(magnitude.lines[0].get_ydata()), np.abs(z) / 1e3)
-    np.testing.assert_allclose(np.asarray(phase.lines[0].get_ydata()), np.degrees(np.angle(z)))
-    assert len(magnitude.collections) == 1
+def test_a_fit_shows_its_residual_in_millivolts_in_a_band_of_two_sigma(recording, driver):
+    fit = pictures.fit()
+    upper, lower = figure_of(fit, recording, driver).axes
+    assert (upper.get_ylabel(), lower.get_ylabel()) == ("voltage [V]", "residual [mV]")
+    predicted, measured = (np.asarray(upper.lines[i].get_ydata()) for i in (2, 1))
+    np.testing.assert_allclose(lower.lines[-1].get_ydata(), 1e3 * (predicted - measured))
+    (band,) = lower.patches
+    bottom, height = band.get_xy()[1], band.get_height()
+    sigma = residual_std(recording, driver, fit.circuit)
+    np.testing.assert_allclose((bottom, height), (-2e3 * sigma, 4e3 * sigma))
+    title = upper.get_title(loc="left")
+    assert "successful" in title
+    assert "r_s 33.40 ± 0.67 kΩ" in title
 
 
-def test_elements_show_every_fit_and_failures_hollow():
-    values = jnp.array([[10e3, 20e3, 30e3], [90e3, 80e3, 70e3], [1e-9, 2e-9, 3e-9]])
-    cov = np.tile(np.diag([1e6, 1e6, 1e-20]), (3, 1, 1))
-    verdicts = verdicts_of(np.array(["successful", "successful", "misfit"]))
-    one = np.ones(3)
-    fit = Fit(SkinRC(*values), cov, 0 * cov, one, one, verdicts, np.ones(3, int), "output_error")
-    labels = {name: np.array(["a", "a", "b"]) for name in ("path", "subject", "electrode", "trial")}
-    labels["condition"] = np.array(["dry", "damp", "dry"])
-    figure = plotting.plot_elements(Fits(fit, labels, np.array([""] * 3)))
-    assert [axis.get_ylabel() for axis in figure.axes] == ["r_s [kΩ]", "r_p [kΩ]", "c_p [nF]"]
-    points = [line for line in figure.axes[0].lines if line.get_marker() in tuple("osD^")]
-    drawn = np.sort(np.concatenate([line.get_ydata() for line in points]))
-    np.testing.assert_allclose(drawn, [10.0, 20.0, 30.0])
-    assert sum(line.get_markerfacecolor() == "none" for line in points) == 1
+def test_the_band_is_that_of_the_noise_of_both_records(driver):
+    """The noise of a record is known from it to some 2 %."""
+    scene = dataclasses.replace(etid.scenes.paper_dry(snr_db=40.0), bits=None)
+    noisy = scene.simulate(seed=8)["typical/dry/02"]
+    clean = dataclasses.replace(scene, snr_db=np.inf).simulate(seed=8)["typical/dry/02"]
+    of_th, of_out = noisy.v_th - clean.v_th, noisy.v_out - clean.v_out
+    f = jnp.asarray(np.fft.rfftfreq(of_th.size, 1 / noisy.sample_rate))
+    z_load, z_th = (np.asarray(z.response(f)) for z in (pictures.SKIN, driver))
+    through = np.fft.irfft(np.fft.rfft(of_th) * z_load / (z_load + z_th), of_th.size)
+    sigma = residual_std(noisy, driver, pictures.SKIN)
+    assert sigma == pytest.approx(np.std(through - of_out), rel=0.06)
 
 
-def test_recording_shows_the_whole_record(recording):
-    figure = plotting.plot_recording(recording)
-    np.testing.assert_allclose(np.asarray(figure.axes[0].lines[0].get_ydata()), recording.v_th)
-    assert figure.axes[0].get_xlabel() == "time [ms]"
+def test_what_did_not_succeed_looks_so(recording, driver):
+    upper, _ = figure_of(pictures.fit("misfit"), recording, driver).axes
+    assert "no success: misfit" in upper.get_title(loc="left")
+    assert to_hex(upper._left_title.get_color()) == RED  # pyright: ignore[reportAttributeAccessIssue]
+    nothing = pictures.SKIN.with_log_values(jnp.full(3, jnp.nan))
+    _, lower = figure_of(pictures.fit("too_short", nothing), recording, driver).axes
+    assert [text.get_text() for text in lower.texts] == ["no elements, nothing predicted"]
+    magnitude, _ = figure_of(pictures.driver("order_too_low")).axes
+    assert "no success: order_too_low" in magnitude.get_title(loc="left")
+
+
+def test_an_impedance_is_in_kilohms_and_degrees_in_a_band_of_two_standard_errors(driver):
+    magnitude, phase = figure_of({"Z_th": driver}).axes
+    kilohertz, size = magnitude.lines[0].get_data()
+    z = np.asarray(driver.response(jnp.asarray(kilohertz) * 1e3))
+    np.testing.assert_allclose(size, np.abs(z) / 1e3)
+    np.testing.assert_allclose(phase.lines[0].get_ydata(), np.degrees(np.angle(z)))
+    assert (magnitude.get_ylabel(), phase.get_ylabel()) == ("|Z| [kΩ]", "phase [deg]")
+    assert phase.get_xlabel() == "frequency [kHz]"
+    (band,) = magnitude.collections
+    relative = np.asarray(driver.response_stderr(jnp.asarray(kilohertz) * 1e3)) / np.abs(z)
+    vertices = band.get_paths()[0].vertices
+    assert vertices is not None
+    top = np.asarray(vertices)[:, 1].max()
+    peak = np.argmax(size * np.exp(2 * relative))
+    assert top == pytest.approx(size[peak] * np.exp(2 * relative[peak]), rel=1e-6)
+    # A circuit without a covariance has no band.
+    assert not figure_of(pictures.SKIN).axes[0].collections
+
+
+def test_fits_are_by_subject_and_failures_hollow():
+    fits = pictures.fits()
+    axes = figure_of(fits).axes
+    assert [axis.get_ylabel() for axis in axes] == ["r_s [kΩ]", "r_p [kΩ]", "c_p [nF]"]
+    points = [line for line in axes[0].lines if len(np.asarray(line.get_ydata()))]
+    by_face = {
+        hollow: np.concatenate(
+            [
+                np.asarray(line.get_ydata())
+                for line in points
+                if (line.get_markerfacecolor() == "white") == hollow
+            ]
+        )
+        for hollow in (True, False)
+    }
+    values = np.asarray(fits.circuit.r_s) / 1e3
+    good = fits.verdicts == "successful"
+    np.testing.assert_allclose(np.sort(by_face[False]), np.sort(values[good]))
+    np.testing.assert_allclose(np.sort(by_face[True]), np.sort(values[~good]))
+    assert [label.get_text() for label in axes[-1].get_xticklabels()] == ["s01", "s02"]
+
+
+def test_a_bound_shows_per_cent_and_what_is_undetermined():
+    (axis,) = figure_of(pictures.bounds()).axes
+    assert axis.get_xlabel() == "smallest relative standard error [%]"
+    assert "1 of 2 recordings leave an element undetermined" in axis.get_title(loc="left")
+    drawn = np.concatenate([line.get_xdata() for line in axis.lines if line.get_marker() != "None"])
+    assert {40.0, 2.0, 300.0} <= set(np.round(drawn, 6))
+    assert len(figure_of(pictures.bounds()["noisy"]).axes) == 1
+
+
+def test_given_axes_are_drawn_on_and_returned(driver):
+    _, axes = new_figure(2, 2, (6.0, 5.0))
+    drawn = etid.plot(driver, axes=axes[:, 1])
+    assert list(drawn) == list(axes[:, 1])
+    assert not axes[0, 0].lines
+    with pytest.raises(ValueError, match="1 Axes; this picture takes 2"):
+        etid.plot(driver, axes=axes[:1, 0])
+
+
+def test_without_axes_it_is_a_figure_of_pyplot_and_figure_of_is_none(recording, monkeypatch):
+    import matplotlib.pyplot as plt
+
+    figure_of(recording)
+    assert plt.get_fignums() == []
+    monkeypatch.setattr(plt, "show", lambda: None)
+    axes = etid.plot(recording)
+    assert plt.figure(plt.get_fignums()[0]) is axes[0].figure
+    plt.close("all")
+
+
+def test_what_cannot_be_drawn_is_refused(recording, driver):
+    with pytest.raises(TypeError, match=r"plot\(fit, recording, driver\)"):
+        figure_of(pictures.fit())
+    with pytest.raises(TypeError, match="no r_load"):
+        figure_of(driver, recording)
+    with pytest.raises(TypeError, match="cannot draw str"):
+        figure_of("recording")
+    with pytest.raises(TypeError, match="a dictionary of nothing"):
+        figure_of({})
 
 
 def test_equal_figures_are_equal_files(recording, tmp_path):
-    figures = [plotting.plot_recording(recording) for _ in range(2)]
+    figures = [figure_of(recording) for _ in range(2)]
     for suffix in (".png", ".svg"):
         files = [tmp_path / f"{i}{suffix}" for i in range(2)]
         for figure, file in zip(figures, files, strict=True):
-            plotting.save(figure, file)
+            save(figure, file)
         if suffix == ".png":
             assert files[0].read_bytes() == files[1].read_bytes()
         assert b"<dc:date>" not in files[0].read_bytes()
     with pytest.raises(ValueError, match=r"\.png or \.svg"):
-        plotting.save(figures[0], tmp_path / "figure.pdf")
-
-
-def test_nothing_is_left_in_pyplot(recording):
-    import matplotlib.pyplot as plt
-
-    plotting.plot_recording(recording)
-    assert plt.get_fignums() == []
+        save(figures[0], tmp_path / "figure.pdf")

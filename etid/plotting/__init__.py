@@ -1,0 +1,144 @@
+"""Pictures for a notebook or a paper: recordings, fits, impedances, studies, bounds.
+
+`plot` is for people, `figure_of` for programs that write files. matplotlib is imported by the first
+picture.
+"""
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any, overload
+
+import numpy as np
+
+from etid.bounds import Bound
+from etid.circuits import AbstractCircuit
+from etid.driver import Driver, SourceImpedance
+from etid.recording import Recording
+from etid.results import Fit, Fits
+
+if TYPE_CHECKING:
+    import matplotlib.axes
+    import matplotlib.figure
+
+    from etid.plotting.style import Canvas
+
+Impedance = Driver | Fit | AbstractCircuit | SourceImpedance
+AnyAxes = np.ndarray | Sequence["matplotlib.axes.Axes"] | None
+
+
+@overload
+def plot(x: Recording, *, axes: AnyAxes = None) -> np.ndarray: ...
+@overload
+def plot(x: Fit, recording: Recording, driver: Driver, *, axes: AnyAxes = None) -> np.ndarray: ...
+@overload
+def plot(x: Driver, recording: Recording, *, axes: AnyAxes = None) -> np.ndarray: ...
+@overload
+def plot(
+    x: Impedance | Mapping[str, Impedance] | Fits | Bound | Mapping[str, Bound],
+    *,
+    axes: AnyAxes = None,
+) -> np.ndarray: ...
+def plot(
+    x: Any,
+    recording: Recording | None = None,
+    driver: Driver | None = None,
+    *,
+    axes: AnyAxes = None,
+) -> np.ndarray:
+    """Draw what etid reads, identifies or predicts.
+
+    | call | shows | axes |
+    |---|---|---|
+    | `plot(recording)` | V_th and V_out [V]: the whole record, and one pulse | 2 |
+    | `plot(fit, recording, driver)` | one pulse measured and predicted [V]; residual [mV] | 2 |
+    | `plot(driver, calibration)` | the same with the calibration's resistor | 2 |
+    | `plot(driver)`, `plot(circuit)` | magnitude [kΩ] and phase [deg] of an impedance | 2 |
+    | `plot({label: driver, fit or circuit})` | several of these in one diagram | 2 |
+    | `plot(fits)` | each element by subject, conditions side by side | one per element |
+    | `plot(etid.bound(scene))` | relative standard errors [%] to expect in each recording | 1 |
+
+    The band around a residual is ±2σ of the noise of both records, σ² = σ_out² + σ_th² mean |G|²,
+    G = Z_L / (Z_L + Z_th): where nothing but noise is left, 95 % lie inside. Bands around
+    impedances are two standard errors, from the covariance of what was identified. What was not
+    identified successfully says so in red, and its points are hollow.
+
+    Args:
+        x: What to draw.
+        recording: What `x` was identified in, for a fit or a driver.
+        driver: What `x` was identified with, for a fit.
+        axes: Where to draw, as many as the table says; if not given, on a new figure of
+            `matplotlib.pyplot`, which a notebook shows.
+
+    Returns:
+        The axes that were drawn on, (axis,), to be worked on further.
+
+    Raises:
+        TypeError: `x` is nothing that etid can draw, or `recording` or `driver` is missing.
+        ValueError: `x` is empty, or `axes` are not as many as the picture has.
+    """
+    from etid.plotting import style
+
+    canvas = style.on_pyplot if axes is None else style.on_axes(axes)
+    return _draw(canvas, x, recording, driver)
+
+
+def figure_of(
+    x: Any, recording: Recording | None = None, driver: Driver | None = None
+) -> "matplotlib.figure.Figure":
+    """What `plot` draws, on a figure that belongs to no global state; arguments as there."""
+    from etid.plotting import style
+
+    def canvas(*layout: Any, **options: Any) -> np.ndarray:
+        return style.new_figure(*layout, **options)[1]
+
+    return _draw(canvas, x, recording, driver)[0].figure
+
+
+def _draw(
+    canvas: "Canvas", x: Any, recording: Recording | None, driver: Driver | None
+) -> np.ndarray:
+    import matplotlib as mpl
+
+    from etid.plotting import elements, impedances, pulses, style
+
+    with mpl.rc_context(style.PAPER):
+        match x, recording, driver:
+            case Fit(), Recording(), Driver():
+                return pulses.draw_fit(canvas, x, recording, driver)
+            case Driver(), Recording(), None:
+                return pulses.draw_calibration(canvas, x, recording)
+            case Fit(), _, _:
+                raise TypeError(
+                    "a fit is drawn with its recording and driver, plot(fit, recording, driver); "
+                    'its impedance alone by plot({"skin": fit})'
+                )
+            case Recording(), None, None:
+                return pulses.draw_recording(canvas, x)
+            case Fits(), None, None:
+                return elements.draw_fits(canvas, x)
+            case Bound(), None, None:
+                return elements.draw_bounds(canvas, [x])
+            case ((Driver() | SourceImpedance()), None, None):
+                return impedances.draw_bode(canvas, {"Z_th": x})
+            case AbstractCircuit(), None, None:
+                return impedances.draw_bode(canvas, {type(x).__name__: x})
+            case dict(), None, None if x and all(isinstance(y, Bound) for y in x.values()):
+                return elements.draw_bounds(canvas, list(x.values()))
+            case dict(), None, None if x and all(isinstance(y, Impedance) for y in x.values()):
+                return impedances.draw_bode(canvas, x)
+    raise TypeError(
+        f"cannot draw {_kinds(x, recording, driver)}; plot takes a Recording, a Fit with its "
+        "recording and driver, a Driver alone or with a calibration, a circuit, Fits, a Bound, or "
+        "a dictionary of bounds, or of drivers, fits and circuits"
+    )
+
+
+def _kinds(*arguments: Any) -> str:
+    """Types of arguments in words, with those of the values of a dictionary."""
+    words = []
+    for x in arguments:
+        if isinstance(x, dict):
+            inside = ", ".join(sorted({type(value).__name__ for value in x.values()}))
+            words.append(f"a dictionary of {inside or 'nothing'}")
+        elif x is not None:
+            words.append(type(x).__name__)
+    return " with ".join(words)

@@ -1,0 +1,146 @@
+"""Elements with their standard errors: those of a study, and those to expect of a scene."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.lines import Line2D
+
+from etid.bounds import Bound
+from etid.circuits import DISPLAY, heading
+from etid.plotting.style import COLOURS, INK, MARKS, RED, Canvas, plain_ticks, titled
+from etid.results import Fits
+
+CROWDED = 60  # letters below an axis, above which they are turned
+UNDETERMINED = 1.0  # relative standard error (see Bound.undetermined)
+
+
+def draw_fits(canvas: Canvas, fits: Fits) -> np.ndarray:
+    """Elements of all fits by subject, with standard errors; what did not succeed is hollow."""
+    if not len(fits):
+        raise ValueError("there are no fits to draw")
+    units = fits.circuit.units()
+    axes = canvas(len(units), 1, (7.5, 0.6 + 2.2 * len(units)), sharex=True).ravel()
+    subjects, place = np.unique(fits.labels["subject"], return_inverse=True)
+    conditions = np.unique(fits.labels["condition"]).tolist()
+    x = _side_by_side(place, fits.labels["condition"], conditions)
+    good = fits.verdicts == "successful"
+    for axis, (name, unit) in zip(axes, units.items(), strict=True):
+        scale = DISPLAY[unit][0]
+        values = np.asarray(getattr(fits.circuit, name)) / scale
+        errors = np.asarray(getattr(fits.stderr, name)) / scale
+        drawable = np.isfinite(values) & (values > 0)
+        for i, condition in enumerate(conditions):
+            of = drawable & (fits.labels["condition"] == condition)
+            _points(axis, x, values, errors, of & good, i, condition, hollow=False)
+            _points(axis, x, values, errors, of & ~good, i, condition, hollow=True)
+        axis.set_yscale("log")
+        plain_ticks(axis.yaxis)
+        shown = drawable
+        if good.any():  # what was not determined may lie decades away
+            low, high = values[good].min() / 2, values[good].max() * 2
+            axis.set_ylim(low, high)
+            shown = drawable & (values > low) & (values < high)
+        if not shown.all():
+            axis.text(
+                0.995, 0.97, f"{(~shown).sum()} without success outside", color=RED, fontsize=8,
+                transform=axis.transAxes, ha="right", va="top",
+            )  # fmt: skip
+        axis.set_ylabel(heading(name, unit))
+    names = [str(subject) or "-" for subject in subjects]
+    turned = sum(map(len, names)) > CROWDED
+    axes[-1].set_xticks(range(len(names)), names, rotation=90 if turned else 0)
+    axes[-1].set_xlabel("subject")
+    _legend(axes[0], conditions, "" if good.all() else "without success")
+    counted = ", ".join(f"{count} {name}" for name, count in fits.counts().items())
+    titled(
+        axes[0], [f"{len(fits)} fits: {counted}; bars: one standard error"], good=bool(good.any())
+    )
+    return axes
+
+
+def _side_by_side(place: np.ndarray, labels: np.ndarray, conditions: Sequence[str]) -> np.ndarray:
+    """Where each fit stands: conditions beside each other, trials of one fanned out."""
+    width = 0.8 / len(conditions)
+    x = place.astype(float)
+    for i, condition in enumerate(conditions):
+        for subject in range(place.max() + 1):
+            rows = np.flatnonzero((labels == condition) & (place == subject))
+            fan = np.linspace(-0.35, 0.35, rows.size) if rows.size > 1 else np.zeros(rows.size)
+            x[rows] += (i + 0.5) * width - 0.4 + fan * width
+    return x
+
+
+def _points(
+    axis: Axes,
+    x: np.ndarray,
+    values: np.ndarray,
+    errors: np.ndarray,
+    rows: np.ndarray,
+    series: int,
+    label: str,
+    *,
+    hollow: bool,
+) -> None:
+    if not rows.any():
+        return
+    error = np.where(np.isfinite(errors[rows]), errors[rows], 0.0)
+    colour = COLOURS[series % len(COLOURS)]
+    axis.errorbar(
+        x[rows], values[rows], error, fmt=MARKS[series % len(MARKS)], ms=4, lw=0.8, color=colour,
+        markerfacecolor="white" if hollow else colour, label=label,
+    )  # fmt: skip
+
+
+def _legend(axis: Axes, series: Sequence[str], hollow: str, *, beside: bool = False) -> None:
+    """One entry for each series, and one for what hollow points mean, if there are any."""
+    handles = [
+        Line2D([], [], ls="", marker=MARKS[i % len(MARKS)], ms=4, color=COLOURS[i % len(COLOURS)],
+               label=name)
+        for i, name in enumerate(series) if name
+    ]  # fmt: skip
+    if hollow:
+        handles.append(
+            Line2D([], [], ls="", marker="o", ms=4, color=INK, mfc="white", label=hollow)
+        )
+    if handles:
+        place = {"loc": "upper left", "bbox_to_anchor": (1, 1)} if beside else {"ncols": 4}
+        axis.legend(handles=handles, frameon=False, fontsize=8, **place)
+
+
+def draw_bounds(canvas: Canvas, bounds: Sequence[Bound]) -> np.ndarray:
+    """Smallest relative standard errors by recording; what is not determined is hollow."""
+    height = 1.3 + 0.22 * len(bounds)
+    (axis,) = axes = canvas(1, 1, (7.5, height)).ravel()
+    names = list(dict.fromkeys(name for one in bounds for name in one.circuit.names()))
+    known = [e for one in bounds for e in one.relative.values() if np.isfinite(e)]
+    edge = 100 * max([UNDETERMINED, *known])  # of what not even a number bounds
+    undetermined = []
+    for i, name in enumerate(names):
+        of = [(row, one) for row, one in enumerate(bounds) if name in one.relative]
+        offset = 0.5 * ((i + 0.5) / len(names) - 0.5)  # equal errors do not hide each other
+        place = np.array([row + offset for row, _ in of])
+        error = 100 * np.array([one.relative[name] for _, one in of])
+        hollow = np.array([name in one.undetermined for _, one in of])
+        colour, mark = COLOURS[i % len(COLOURS)], MARKS[i % len(MARKS)]
+        for part, face in ((~hollow, colour), (hollow, "white")):
+            at = np.where(np.isfinite(error), error, edge)[part]
+            axis.plot(at, place[part], mark, ms=4.5, color=colour, mfc=face)
+        undetermined += [one.path for (_, one), is_hollow in zip(of, hollow, strict=True)
+                         if is_hollow]  # fmt: skip
+    axis.set_xscale("log")
+    if undetermined:
+        axis.axvline(100 * UNDETERMINED, color=RED, lw=0.9, ls="--")
+    axis.xaxis.set_major_formatter("{x:g}")
+    axis.set_xlabel("smallest relative standard error [%]")
+    axis.set_yticks(range(len(bounds)), [one.path or "-" for one in bounds])
+    axis.set_ylim(len(bounds) - 0.5, -0.5)
+    _legend(axis, names, "undetermined" if undetermined else "", beside=True)
+    lines = []
+    if undetermined:
+        lines.append(
+            f"{len(set(undetermined))} of {len(bounds)} recordings leave an element undetermined "
+            "(100 % or more)"
+        )
+    titled(axis, lines, good=not undetermined)
+    return axes

@@ -1,0 +1,96 @@
+"""Impedances over frequency, with what their parameters' covariance leaves open."""
+
+from collections.abc import Mapping
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Complex, Float
+from matplotlib.axes import Axes
+
+from etid.circuits import AbstractCircuit
+from etid.driver import Driver, SourceImpedance
+from etid.plotting.style import COLOURS, DASHES, Canvas, plain_ticks, titled
+from etid.results import Fit
+from etid.uncertainty import log_stderr
+
+LOWEST, HIGHEST = 60.0, 100e3  # [Hz] the paper's pulse rate and half its sample rate
+POINTS = 300
+ROOM = 1.5  # factor between the curves and the frame
+BEYOND = 50.0  # a logarithm of no axis, whose exponential is a number
+
+
+def draw_bode(
+    canvas: Canvas, things: Mapping[str, Driver | Fit | AbstractCircuit | SourceImpedance]
+) -> np.ndarray:
+    """Magnitude and phase of impedances (the paper's figure 9), with two standard errors."""
+    magnitude, phase = axes = canvas(2, 1, (6.0, 5.0), sharex=True).ravel()
+    frequency = jnp.geomspace(LOWEST, HIGHEST, POINTS)
+    kilohertz = np.asarray(frequency) / 1e3
+    sizes, banded, failed = [], False, []
+    for i, (label, thing) in enumerate(things.items()):
+        z = np.asarray(impedance(thing).response(frequency))
+        errors = np.asarray(stderr(thing, frequency))
+        known = bool(np.isfinite(errors).all())
+        if isinstance(thing, Fit | Driver):
+            if thing.verdict != "successful":
+                failed.append(f"{label}: no success: {thing.verdict}")
+            label = label if known else f"{label}, no standard error"
+        colour = COLOURS[i % len(COLOURS)]
+        look = {"color": colour, "linestyle": DASHES[i % len(DASHES)], "lw": 1.3}
+        sizes.append(np.abs(z) / 1e3)
+        angle = np.unwrap(np.angle(z))
+        magnitude.plot(kilohertz, sizes[-1], label=label, **look)
+        phase.plot(kilohertz, np.degrees(angle), label=label, **look)
+        if known:
+            banded = True
+            band = {"color": colour, "alpha": 0.25, "linewidth": 0}
+            factor = np.exp(np.minimum(2 * errors[0], BEYOND))
+            magnitude.fill_between(kilohertz, sizes[-1] / factor, sizes[-1] * factor, **band)
+            turn = 2 * errors[1]
+            phase.fill_between(kilohertz, *np.degrees([angle - turn, angle + turn]), **band)
+    magnitude.set(ylabel="|Z| [kΩ]", xscale="log", yscale="log")
+    phase.set(xlabel="frequency [kHz]", ylabel="phase [deg]", xscale="log")
+    _frame(magnitude, phase, np.concatenate(sizes))
+    magnitude.legend(frameon=False, fontsize=8)
+    titled(magnitude, failed or ["bands: two standard errors" if banded else ""], good=not failed)
+    return axes
+
+
+def _frame(magnitude: Axes, phase: Axes, sizes: Float[np.ndarray, " value"]) -> None:
+    """Limits that show the curves, however wide the bands, and ticks at 1, 2 and 5."""
+    sizes = sizes[np.isfinite(sizes)]
+    if sizes.size:
+        magnitude.set_ylim(sizes.min() / ROOM, sizes.max() * ROOM)
+    low, high = phase.get_ylim()
+    phase.set_ylim(max(low, -180.0), min(high, 180.0))
+    plain_ticks(magnitude.yaxis)
+    phase.xaxis.set_major_formatter("{x:g}")
+
+
+def impedance(
+    thing: Driver | Fit | AbstractCircuit | SourceImpedance,
+) -> Driver | AbstractCircuit | SourceImpedance:
+    """What has a response: of a fit, its circuit."""
+    if not isinstance(thing, Fit):
+        return thing
+    if np.ndim(thing.rrse):
+        raise TypeError(f"this is a batch of {np.shape(thing.rrse)} fits; draw one, fits[i]")
+    return thing.circuit
+
+
+def stderr(
+    thing: Driver | Fit | AbstractCircuit | SourceImpedance,
+    frequency: Float[Array, " frequency"],
+) -> Float[Array, "2 frequency"]:
+    """Standard errors of ln |Z| and of the phase [rad]; NaN where there is no covariance."""
+    if isinstance(thing, Driver):
+        return thing.log_response_stderr(frequency)
+    if isinstance(thing, Fit):
+        kind, names = type(thing.circuit), thing.circuit.names()
+
+        def response(values: Float[Array, " parameter"]) -> Complex[Array, " frequency"]:
+            circuit = kind(**{name: values[i] for i, name in enumerate(names)})
+            return circuit.response(frequency)
+
+        return log_stderr(response, thing.circuit.values(), jnp.asarray(thing.cov))
+    return jnp.full((2, frequency.size), jnp.nan)

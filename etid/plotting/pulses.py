@@ -1,0 +1,163 @@
+"""Recordings in time: a record, one pulse of it, and how well a circuit predicts that pulse."""
+
+import jax.numpy as jnp
+import numpy as np
+from matplotlib.axes import Axes
+
+from etid.circuits import DISPLAY, AbstractCircuit, Resistor
+from etid.driver import Driver
+from etid.identify import predict
+from etid.measurement import noise
+from etid.plotting.style import BLUE, INK, RED, Canvas, titled
+from etid.recording import LABELS, Recording
+from etid.results import Fit, plus_minus, rrse
+from etid.transformer import loading
+
+BEFORE, AFTER = 0.15e-3, 1.2e-3  # [s] shown around the first edge of a pulse
+FREQUENCIES = 2048  # at which |G|² is averaged; its features are wider than 1/1000 of the band
+PAIR = {"sharex": True, "gridspec_kw": {"height_ratios": [3, 1.2]}}  # of pulse and residual
+
+
+def pulse(recording: Recording) -> slice:
+    """Samples around the first edge whose surroundings lie inside the record: one pulse."""
+    step = np.nan_to_num(np.diff(recording.v_th))  # a bad sample hides no edge
+    size = recording.v_th.size
+    before = int(BEFORE * recording.sample_rate)
+    after = int(AFTER * recording.sample_rate)
+    rising = np.flatnonzero((step > 0.5 * np.abs(step).max(initial=0.0)) & (step > 0))
+    inside = rising[(rising >= before) & (rising + after < size)]
+    start = int(inside[0]) if inside.size else int(np.argmax(np.append(np.abs(step), 0.0)))
+    return slice(max(0, start - before), min(size, start + after))
+
+
+def draw_recording(canvas: Canvas, recording: Recording) -> np.ndarray:
+    """Unloaded and loaded voltage: the whole record, and one pulse."""
+    whole, one = axes = canvas(1, 2, (9.0, 3.2)).ravel()
+    milliseconds = 1e3 * recording.time
+    for axis, part in ((whole, slice(None)), (one, pulse(recording))):
+        axis.plot(milliseconds[part], recording.v_th[part], color=INK, lw=0.9, label="V_th")
+        axis.plot(
+            milliseconds[part], recording.v_out[part], "--", color=BLUE, lw=1.1, label="V_out"
+        )
+        axis.set(xlabel="time [ms]", ylabel="voltage [V]")
+    labels = [f"{name} {value}" for name in LABELS if (value := getattr(recording, name))]
+    if recording.r_load is not None:
+        labels.append(f"calibration with {recording.r_load / 1e3:g} kΩ")
+    titled(whole, [recording.path, ", ".join(labels)])
+    titled(one, ["one pulse"])
+    one.legend(frameon=False)
+    return axes
+
+
+def draw_fit(canvas: Canvas, fit: Fit, recording: Recording, driver: Driver) -> np.ndarray:
+    """Measured and predicted pulse with the residual below, under the fit's verdict."""
+    if np.ndim(fit.rrse):
+        raise TypeError(
+            f"this is a batch of {np.shape(fit.rrse)} fits; draw one of them, fits[i], or all, "
+            "plot(fits)"
+        )
+    axes = canvas(2, 1, (6.0, 4.8), **PAIR).ravel()
+    if np.isfinite(np.asarray(fit.circuit.values())).all():
+        draw_pulse(*axes, recording, driver, fit.circuit)
+    else:
+        _unpredicted(*axes, recording)
+    good = fit.verdict == "successful"
+    elements = []
+    for name, unit in fit.circuit.units().items():
+        scale, symbol = DISPLAY[unit]
+        value, error = (float(getattr(x, name)) / scale for x in (fit.circuit, fit.stderr))
+        elements.append(f"{name} {' '.join(plus_minus(value, error).split())} {symbol}")
+    titled(axes[0], [_headline(recording, fit), ",  ".join(elements)], good=good)
+    return axes
+
+
+def draw_calibration(canvas: Canvas, driver: Driver, recording: Recording) -> np.ndarray:
+    """Measured pulse on a known resistor, and what the driver predicts, under its verdict."""
+    if recording.r_load is None:
+        raise TypeError(
+            "a driver is drawn with a calibration, but this recording has no r_load; "
+            "draw the fit of it, plot(fit, recording, driver)"
+        )
+    axes = canvas(2, 1, (6.0, 4.8), **PAIR).ravel()
+    draw_pulse(*axes, recording, driver, Resistor(recording.r_load))
+    lines = [_headline(recording, driver), f"driver of order {driver.order}, "]
+    lines[1] += f"known load {recording.r_load / 1e3:g} kΩ"
+    titled(axes[0], lines, good=driver.verdict == "successful")
+    return axes
+
+
+def _headline(recording: Recording, found: Fit | Driver) -> str:
+    verdict = found.verdict
+    verdict = verdict if verdict == "successful" else f"no success: {verdict}"
+    quality = f"chi2 {float(found.chi2):.3g}" if np.isfinite(float(found.chi2)) else ""
+    where = f"{recording.path}: " if recording.path else ""
+    return where + ", ".join(filter(None, (verdict, quality)))
+
+
+def draw_pulse(
+    upper: Axes, lower: Axes, recording: Recording, driver: Driver, circuit: AbstractCircuit
+) -> None:
+    """One pulse measured and predicted, and the residual within ±2σ of the noise.
+
+    Args:
+        upper: Axes of the pulse.
+        lower: Axes of the residual.
+        recording: What was measured.
+        driver: Driver with a continuous source impedance.
+        circuit: The load.
+    """
+    predicted = predict(recording, driver, circuit)
+    part = _measured(upper, recording)
+    milliseconds = 1e3 * recording.time[part]
+    known = np.isfinite(predicted)
+    error = float(rrse(jnp.asarray(predicted[known]), jnp.asarray(recording.v_out[known])))
+    upper.plot(
+        milliseconds, predicted[part], "--", color=RED, lw=1.2,
+        label=f"predicted, RRSE {100 * error:.2g} %",
+    )  # fmt: skip
+    upper.legend(frameon=False, fontsize=8)
+    sigma = 1e3 * residual_std(recording, driver, circuit)
+    residual = 1e3 * (predicted - recording.v_out)
+    lower.axhspan(-2 * sigma, 2 * sigma, color="0.85", lw=0, label=r"$\pm2\,\sigma$ of the noise")
+    lower.axhline(0.0, color="0.6", lw=0.6)
+    lower.plot(milliseconds, residual[part], color=BLUE, lw=0.8)
+    lower.set(xlabel="time [ms]", ylabel="residual [mV]")
+    lower.legend(frameon=False, fontsize=8)
+
+
+def _measured(upper: Axes, recording: Recording) -> slice:
+    part = pulse(recording)
+    milliseconds = 1e3 * recording.time[part]
+    upper.plot(milliseconds, recording.v_th[part], ":", color="0.55", lw=1.0, label="V_th")
+    upper.plot(milliseconds, recording.v_out[part], color=INK, lw=1.4, label="V_out measured")
+    upper.set(ylabel="voltage [V]")
+    return part
+
+
+def _unpredicted(upper: Axes, lower: Axes, recording: Recording) -> None:
+    _measured(upper, recording)
+    upper.legend(frameon=False, fontsize=8)
+    lower.text(
+        0.5, 0.5, "no elements, nothing predicted", color=RED, transform=lower.transAxes,
+        ha="center", va="center",
+    )  # fmt: skip
+    lower.set(xlabel="time [ms]", ylabel="residual [mV]", yticks=[])
+
+
+def residual_std(recording: Recording, driver: Driver, circuit: AbstractCircuit) -> float:
+    """Standard deviation [V] of predicted − measured where nothing but noise is left.
+
+    The noise of V_th reaches the residual through the loaded driver G = Z_L / (Z_L + Z_th),
+
+        σ² = σ_out² + σ_th² mean |G|²,    the mean from 0 to half the sample rate (Parseval).
+    """
+    half = recording.sample_rate / 2
+    frequency = jnp.asarray((np.arange(FREQUENCIES) + 0.5) * half / FREQUENCIES)
+    z_load, z_th = (np.asarray(z.response(frequency)) for z in (circuit, driver))
+    gain = np.mean(np.abs(loading(z_load, z_th)) ** 2)
+    steps = (recording.samples[name].resolution or 0.0 for name in ("v_th", "v_out"))
+    sigma_th, sigma_out = (
+        float(noise(v, np.asarray(step)))
+        for v, step in zip((recording.v_th, recording.v_out), steps, strict=True)
+    )
+    return float(np.sqrt(sigma_out**2 + sigma_th**2 * gain))

@@ -1,0 +1,133 @@
+"""The public plots of things made by hand, to be compared with images; makes these images anew.
+
+    python -m tests.pictures
+
+writes `tests/baseline/NAME.png`. Look at each before it is committed.
+"""
+
+import dataclasses
+import functools
+import pathlib
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import etid
+from etid.driver import Calibration, Driver, SourceImpedance
+from etid.plotting import figure_of
+from etid.results import Fit, Fits
+from etid.scenes import PRESETS
+from etid.verdicts import verdicts_of
+
+BASELINE = pathlib.Path(__file__).parent / "baseline"
+DPI = 60
+SKIN = etid.SkinRC(33.4e3, 186e3, 0.12e-9)
+RELATIVE = np.array([0.02, 0.005, 0.03])  # standard errors of SKIN
+
+
+@functools.cache
+def study() -> etid.Study:
+    """A calibration and dry trials at 40 dB."""
+    return PRESETS["paper_dry"](snr_db=40.0).simulate(seed=3)
+
+
+def driver(verdict: str = "successful") -> Driver:
+    """About what that calibration gives."""
+    source = SourceImpedance(
+        jnp.array(6.0525),
+        jnp.array([12.6542, 12.87402]),
+        jnp.array([0.04925, -1.4639]),
+        jnp.array([2380.0, 9885.0]),
+        jnp.array([2956.0, 14014.0]),
+        jnp.array([5.531]),
+        jnp.array([-6754.0]),
+    )
+    errors = np.array([0.3, 0.05, 0.02, 0.1, 0.02, 100, 50, 200, 50, 0.02, 50])
+    r_load = jnp.array([98.8e3])
+    return Driver(
+        b=jnp.ones(6),
+        a=jnp.ones(6),
+        sample_rate=200e3,
+        source=source,
+        cov=jnp.diag(jnp.asarray(errors**2)),
+        calibration=Calibration(r_load, jnp.array(2.5e-6), jnp.zeros(1), None),
+        rrse=jnp.array(1e-3),
+        chi2=jnp.array(1.02),
+        result=verdicts_of(np.array(verdict)),
+        steps=jnp.array(12),
+        method="maximum_likelihood",
+    )
+
+
+def fit(verdict: str = "successful", circuit: etid.AbstractCircuit = SKIN) -> Fit:
+    """A fit of one dry trial."""
+    cov = jnp.diag((circuit.values() * RELATIVE) ** 2)
+    of = (jnp.array(1e-3), jnp.array(1.02), verdicts_of(np.array(verdict)), jnp.array(5))
+    return Fit(circuit, cov, 0 * cov, *of, "maximum_likelihood")
+
+
+def fits() -> Fits:
+    """Two subjects, two conditions, three trials; one of them without success, one far away."""
+    rng = np.random.default_rng(1)
+    count = 12
+    spread = np.exp(0.1 * rng.normal(size=(3, count)))
+    dry = np.arange(count) % 6 < 3
+    values = np.where(dry, SKIN.values()[:, None], [[6.1e3], [17.4e3], [0.66e-9]]) * spread
+    values[:, 4] *= 1e3
+    verdicts = np.full(count, "successful", dtype=object)
+    verdicts[[1, 4]] = "misfit", "insensitive"
+    cov = np.stack([np.diag((RELATIVE * one) ** 2) for one in values.T])
+    found = Fit(
+        etid.SkinRC(*jnp.asarray(values)), cov, 0 * cov, np.full(count, 1e-3), np.ones(count),
+        verdicts_of(verdicts), np.full(count, 5), "maximum_likelihood",
+    )  # fmt: skip
+    labels = {
+        "path": np.array([f"recording/{i:02d}" for i in range(count)]),
+        "subject": np.repeat(["s01", "s02"], 6),
+        "condition": np.where(dry, "dry", "damp"),
+        "electrode": np.full(count, ""),
+        "trial": np.array([str(i % 3) for i in range(count)]),
+    }
+    return Fits(found, labels, np.full(count, ""))
+
+
+def bounds() -> dict[str, etid.Bound]:
+    """Of a dry trial at 60 dB, and one whose capacitance is not determined."""
+    one = etid.bound(PRESETS["paper_dry"](snr_db=60.0))["typical/dry/01"]
+    noisy = np.diag(np.square([0.4, 0.02, 3.0]))
+    return {"dry": one, "noisy": dataclasses.replace(one, path="noisy/01", cov=noisy)}
+
+
+def dry() -> etid.Recording:
+    """One dry trial."""
+    return study()["typical/dry/01"]
+
+
+PICTURES: dict[str, Callable[[], tuple]] = {
+    "recording": lambda: (dry(),),
+    "fit": lambda: (fit(), dry(), driver()),
+    "fit_without_success": lambda: (fit("misfit"), dry(), driver()),
+    "calibration": lambda: (driver(), study()["calibration/98k8"]),
+    "driver": lambda: (driver(),),
+    "impedances": lambda: ({"Z_th": driver("order_too_low"), "skin": fit(), "typical": SKIN},),
+    "fits": lambda: (fits(),),
+    "bound": lambda: (bounds(),),
+}
+
+
+def draw(name: str, path: pathlib.Path) -> None:
+    """Write one picture as it is compared."""
+    import matplotlib as mpl
+
+    with mpl.rc_context():
+        mpl.rcdefaults()
+        figure_of(*PICTURES[name]()).savefig(path, dpi=DPI, metadata={"Software": None})
+
+
+if __name__ == "__main__":
+    jax.config.update("jax_enable_x64", True)
+    BASELINE.mkdir(exist_ok=True)
+    for picture in PICTURES:
+        draw(picture, BASELINE / f"{picture}.png")
