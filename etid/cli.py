@@ -123,7 +123,7 @@ class _Completion(argparse.Action):
         parser.exit()
 
 
-def _complete_paths(parser: argparse.ArgumentParser, how: Mapping[str, str]) -> None:
+def _complete_paths(parser: argparse.ArgumentParser, how: Any) -> None:
     """Have every argument that is a path completed as one, in subcommands too."""
     for action in parser._actions:
         if action.type is pathlib.Path:
