@@ -1,6 +1,7 @@
 """The command line: what it prints, what it writes, how it ends."""
 
 import json
+import pathlib
 import re
 import shutil
 import subprocess
@@ -297,6 +298,30 @@ def test_json_of_what_writes_a_file_names_it(run, tmp_path):
     status, printed, _ = run("check", made, "--json")
     wanted = {"command": "check", "status": DONE, "file": str(made), "recordings": 11}
     assert (status, as_json(printed)) == (DONE, {**wanted, "problems": []})
+
+
+def test_keys_of_json_are_those_of_the_guide(run, study_file, tmp_path):
+    page = (pathlib.Path(__file__).parents[1] / "docs" / "command_line.md").read_text("utf-8")
+    rows = dict(re.findall(r"^\| `(\w+)` \| (.*) \|$", page, flags=re.MULTILINE))
+    assert rows.keys() == cli.COMMANDS.keys()
+    table = tmp_path / "t.csv"
+    np.savetxt(table, np.ones((500, 2)), delimiter=",", header="open,skin", comments="")
+    names = ("--v-th", "open", "--v-out", "skin", "--scale", 1)
+    calls = {
+        "simulate": ("paper_dry", "-o", tmp_path / "made.h5"),
+        "check": (study_file,),
+        "import": (table, tmp_path / "i.h5", *names, "--sample-rate", 2e5, "--pulse-rate", 60),
+        "fit": (study_file, "-o", tmp_path / "f.h5", "--method", "equation_error", "--order", 3),
+    }
+    assert calls.keys() == cli.COMMANDS.keys()
+    for command, arguments in calls.items():
+        _, printed, _ = run(command, *arguments, "--json")
+        told = set(re.findall(r"`(\w+)`", rows[command]))
+        found = as_json(printed)
+        assert set(found) - {"command", "status"} <= told, command
+        inner = [item for value in found.values() if isinstance(value, list) for item in value]
+        keys = {key for item in inner if "subject" not in item for key in item}
+        assert keys <= told, command
 
 
 def test_json_of_an_error_is_on_stdout_and_its_line_on_stderr(run):

@@ -47,5 +47,4 @@ def run(arguments: argparse.Namespace) -> Outcome:
         "recordings": sum(len(each.paths) for each in used),
         "imported": [dataclasses.asdict(each) for each in used],
     }
-    return Outcome("
-".join(map(str, used)), data)
+    return Outcome("\n".join(map(str, used)), data)
