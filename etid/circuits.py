@@ -94,7 +94,14 @@ class AbstractCircuit(eqx.Module):
         return jnp.array([SCALING[unit] for unit in cls.units().values()]).T
 
     def response(self, frequency: Float[Array, "..."]) -> Complex[Array, "..."]:
-        """Impedance [Ω] at real frequencies [Hz]."""
+        """Impedance Z(j 2π f).
+
+        Args:
+            frequency: Real frequencies [Hz].
+
+        Returns:
+            Impedance [Ω] at each.
+        """
         return self.impedance()(frequency_variable(jnp.asarray(frequency)))
 
     def values(self) -> Float[Array, "*lane parameter"]:
@@ -106,7 +113,11 @@ class AbstractCircuit(eqx.Module):
         return jnp.log(self.values())
 
     def with_log_values(self: Circuit, log_values: Float[Array, "*lane parameter"]) -> Circuit:
-        """The same circuit with other parameters."""
+        """The same circuit with other parameters.
+
+        Args:
+            log_values: Natural logarithms of the parameters in SI units, in the order of `names`.
+        """
         values = jnp.exp(log_values)
         return type(self)(**{name: values[..., i] for i, name in enumerate(self.names())})
 
