@@ -8,6 +8,7 @@ It needs nothing but what the wheel has brought, and ends with an AssertionError
 import importlib.metadata
 import importlib.resources
 import json
+import os
 import pathlib
 import statistics
 import subprocess
@@ -80,6 +81,7 @@ def main():
     print(f"Python {sys.version.split()[0]}: {versions}")
     in_python()
     with tempfile.TemporaryDirectory() as folder:
+        os.environ["XDG_CACHE_HOME"] = folder  # what commands compile is not to stay
         on_the_command_line(pathlib.Path(folder))
     both, jax_alone = seconds("import etid"), seconds("import jax, optimistix")
     print(f"  import etid {both:.2f} s, of which JAX and optimistix {jax_alone:.2f} s")

@@ -10,6 +10,7 @@ NaN: such numbers are null.
 import argparse
 import json
 import math
+import os
 import pathlib
 import sys
 from collections.abc import Mapping, Sequence
@@ -52,6 +53,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         The exit status.
     """
     jax.config.update("jax_enable_x64", True)
+    _keep_programs()
     commands = parser()
     arguments = commands.parse_args(argv)
     source = getattr(arguments, "source", None)
@@ -131,6 +133,26 @@ def _complete_paths(parser: argparse.ArgumentParser, how: Any) -> None:
         elif isinstance(action, argparse._SubParsersAction):
             for command in action.choices.values():
                 _complete_paths(command, how)
+
+
+def _keep_programs() -> None:
+    """Have JAX keep what it compiles, so that only the first fit of all waits for it.
+
+    Where the user has named a folder (`JAX_COMPILATION_CACHE_DIR`) there, else in the one that
+    programs of this user have for such things.
+    """
+    config: Any = jax.config  # its attributes come into being at run time
+    if config.jax_compilation_cache_dir is not None:
+        return
+    home = os.environ.get("XDG_CACHE_HOME") or pathlib.Path.home() / ".cache"
+    folder = pathlib.Path(home, "etid")
+    try:
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+    except OSError:
+        return  # compiled anew each time
+    if os.access(folder, os.W_OK):
+        jax.config.update("jax_compilation_cache_dir", str(folder))
+        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
 
 
 def _same_file(source: pathlib.Path, target: pathlib.Path) -> bool:

@@ -1,6 +1,7 @@
 """The command line: what it prints, what it writes, how it ends."""
 
 import json
+import os
 import pathlib
 import re
 import shutil
@@ -52,7 +53,11 @@ def test_simulate_writes_a_study_and_its_truth_and_the_seed_decides(run, tmp_pat
     files = [tmp_path / name for name in ("a.h5", "b.h5", "c.h5")]
     for file, seed in zip(files, (1, 1, 2), strict=True):
         options = ("--snr-db", 50, "--jitter", 1e-7, "--seed", seed, "--truth", tmp_path / "t.json")
-        assert run("simulate", "paper_dry", "-o", file, *options) == (DONE, [], [])
+        assert run("simulate", "paper_dry", "-o", file, *options) == (
+            DONE,
+            [f"{file}: 11 recordings"],
+            [],
+        )
     records = []
     for file in files:
         with etid.read(file) as study:
@@ -362,7 +367,10 @@ def test_the_program_starts_in_float64_and_knows_its_version(tmp_path):
     study, fits = tmp_path / "study.h5", tmp_path / "fits.h5"
     etid.scenes.paper_built().simulate(seed=0).write(study)
     arguments = [*command, "fit", study, "-o", fits, "--order", "1"]
-    ended = subprocess.run(arguments, capture_output=True, text=True, check=False)
+    environment = {**os.environ, "XDG_CACHE_HOME": str(tmp_path / "cache")}
+    environment.pop("JAX_COMPILATION_CACHE_DIR", None)
+    ended = subprocess.run(arguments, capture_output=True, text=True, check=False, env=environment)
+    assert any((tmp_path / "cache" / "etid").iterdir())  # for the next process
     assert ended.returncode == WRONG_DATA
     assert "float64" not in ended.stdout + ended.stderr
     assert ended.stderr == ""  # no progress bar where there is no terminal

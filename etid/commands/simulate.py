@@ -31,4 +31,5 @@ def run(arguments: argparse.Namespace) -> Outcome:
     study.write(arguments.target)
     if arguments.truth is not None:
         arguments.truth.write_text(json.dumps(scene.truth(), indent=1) + "\n", encoding="utf-8")
-    return Outcome(data={"target": arguments.target, "recordings": len(study)})
+    text = f"{arguments.target}: {len(study)} recordings"
+    return Outcome(text, {"target": arguments.target, "recordings": len(study)})
