@@ -63,6 +63,12 @@ def parameter(unit: str, *, typical: float) -> Any:
         unit: `"ohm"`, `"farad"`, `"second"`, `"siemens second^alpha"` for the Q of a constant-phase
             element, or `"1"` for its exponent.
         typical: Magnitude to expect, in SI; a fit may start there.
+
+    Returns:
+        A field of a circuit, to stand behind the `=` of its declaration.
+
+    Raises:
+        ValueError: The unit is not known.
     """
     if unit not in DISPLAY:
         raise ValueError(f"unit {unit!r} is not known; use one of {sorted(DISPLAY)}")
@@ -117,6 +123,9 @@ class AbstractCircuit(eqx.Module):
 
         Args:
             log_values: Natural logarithms of the parameters in SI units, in the order of `names`.
+
+        Returns:
+            A circuit of the same kind; this one stays as it is.
         """
         values = jnp.exp(log_values)
         return type(self)(**{name: values[..., i] for i, name in enumerate(self.names())})

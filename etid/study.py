@@ -92,6 +92,12 @@ class Study(Mapping[str, Recording]):
     def from_recordings(cls, recordings: Iterable[Recording]) -> "Study":
         """A study in memory; recordings without a path become `loaded/0`, `loaded/1`, ….
 
+        Args:
+            recordings: Calibrations and loaded recordings.
+
+        Returns:
+            The study, in the order of the recordings.
+
         Raises:
             RecordingError: Two recordings have the same path, or one lies inside another.
         """
