@@ -65,11 +65,11 @@ def main(argv: Sequence[str] | None = None) -> int:
         text = " ".join(str(error).split())
         print(f"etid: error: {text}", file=sys.stderr)
         outcome = Outcome(data={"error": text}, status=WRONG_DATA)
+    text = outcome.text
     if arguments.json:
         data = {"command": arguments.command, "status": outcome.status, **outcome.data}
-        print(json.dumps(_plain(data), ensure_ascii=False, allow_nan=False))
-    elif outcome.text:
-        print(outcome.text)
+        text = json.dumps(_plain(data), ensure_ascii=False, allow_nan=False)
+    _print(text)
     return outcome.status
 
 
@@ -133,6 +133,15 @@ def _complete_paths(parser: argparse.ArgumentParser, how: Any) -> None:
         elif isinstance(action, argparse._SubParsersAction):
             for command in action.choices.values():
                 _complete_paths(command, how)
+
+
+def _print(text: str) -> None:
+    """Print, if there is something; a reader that has gone, such as `head`, is no error."""
+    try:
+        if text:
+            print(text, flush=True)
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # for what Python flushes
 
 
 def _keep_programs() -> None:

@@ -378,6 +378,16 @@ def test_the_program_starts_in_float64_and_knows_its_version(tmp_path):
     assert ended.stderr == ""  # no progress bar where there is no terminal
 
 
+def test_a_reader_that_has_gone_is_no_error(tmp_path):
+    read, write = os.pipe()
+    os.close(read)
+    etid.scenes.paper_calibration().simulate(seed=0).write(tmp_path / "study.h5")
+    command = [sys.executable, "-m", "etid.cli", "check", tmp_path / "study.h5"]
+    done = subprocess.run(command, stdout=write, stderr=subprocess.PIPE, check=False)
+    os.close(write)
+    assert (done.returncode, done.stderr) == (DONE, b"")
+
+
 def test_completion_is_offered_for_every_shell_there_is_one_for(run):
     assert set(cli.SHELLS) == set(shtab.SUPPORTED_SHELLS)
     for shell in cli.SHELLS:
