@@ -317,6 +317,7 @@ def test_keys_of_json_are_those_of_the_guide(run, study_file, tmp_path):
         "check": (study_file,),
         "import": (table, tmp_path / "i.h5", *names, "--sample-rate", 2e5, "--pulse-rate", 60),
         "fit": (study_file, "-o", tmp_path / "f.h5", "--method", "equation_error", "--order", 3),
+        "report": (tmp_path / "f.h5",),
         "export": (tmp_path / "f.h5", "-o", tmp_path / "f.csv"),
     }
     assert calls.keys() == cli.COMMANDS.keys()
@@ -325,7 +326,8 @@ def test_keys_of_json_are_those_of_the_guide(run, study_file, tmp_path):
         told = set(re.findall(r"`(\w+)`", rows[command]))
         found = as_json(printed)
         assert set(found) - {"command", "status"} <= told, command
-        assert set(found) >= {"command", "status", "target" if command != "check" else "file"}
+        written = {"check": "file", "report": "page"}.get(command, "target")
+        assert set(found) >= {"command", "status", written}
         inner = [item for value in found.values() if isinstance(value, list) for item in value]
         keys = {key for item in inner if "subject" not in item for key in item}
         assert keys <= told, command
