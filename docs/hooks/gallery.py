@@ -78,7 +78,7 @@ def _card(file):
     """Title, first sentences and first figure of a notebook."""
     text = file.content_string
     title = re.search(r"^# (.*)$", text, re.MULTILINE)[1]
-    words = re.search(r"\n\n([^*!#`\s<].*?)\n\n", text, re.DOTALL)[1]
+    words = re.search(r"\n\n([^*!#`\s<].*?)(?:\n\n|\Z)", text, re.DOTALL)[1]
     figure = re.search(r"!\[.*?\]\((.*?)\)", text)
     shown = f"\n\n[![{title}](notebooks/{figure[1]})](notebooks/{file.name}.md)" if figure else ""
     return f"## [{title}](notebooks/{file.name}.md)\n\n{' '.join(words.split())}{shown}"
