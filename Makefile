@@ -2,13 +2,20 @@
 #   make demo    simulate the paper's experiments, identify them, print the tables: demo/index.html
 #   make test    the ordinary tests
 #   make ranking the benchmarks in short: which estimator is better, and is any wrong silently
+#   make docs    the site: site/index.html; its notebooks are executed
+#   make wheel-test  the wheel in empty environments: PYTHONS="python3.11 python3.13" DEPENDENCIES=oldest
 #   make lint    style;  make types    static types;  make clean    remove what was made
 
 PYTHON ?= python3
 BIN := .venv/bin
 INSTALL := $(BIN)/python -m pip install --quiet --constraint constraints.txt
 
-.PHONY: demo test ranking lint types clean
+PYTHONS ?= $(PYTHON)
+DEPENDENCIES ?= newest
+# What notebooks compile is kept where the tests keep it.
+COMPILED := JAX_COMPILATION_CACHE_DIR=$(CURDIR)/.pytest_cache/d/xla JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS=0
+
+.PHONY: demo test ranking docs wheel-test lint types clean
 
 demo: .venv/package
 	$(BIN)/python -m etid.demo demo/
@@ -18,6 +25,12 @@ test: .venv/tools
 
 ranking: .venv/tools
 	$(BIN)/python -m benchmarks speed_accuracy --quick --folder results/quick
+
+docs: .venv/docs
+	$(COMPILED) NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build
+
+wheel-test: .venv/tools
+	$(BIN)/python .ci/wheel.py --python $(PYTHONS) --dependencies $(DEPENDENCIES)
 
 lint: .venv/tools
 	$(BIN)/ruff check
@@ -36,6 +49,10 @@ types: .venv/tools
 	$(INSTALL) --group dev
 	touch $@
 
+.venv/docs: .venv/tools
+	$(INSTALL) --group docs
+	touch $@
+
 clean:
-	rm -rf .venv .rivals demo results dist build .pytest_cache .ruff_cache .hypothesis .coverage*
+	rm -rf .venv .rivals demo results site dist build .pytest_cache .ruff_cache .hypothesis .coverage*
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -286,6 +286,12 @@ def identify_study(
         circuit: As in `identify_skin`.
         method: As in `identify_skin`.
         progress: Show a progress bar.
+
+    Returns:
+        One fit per loaded recording, and the drivers.
+
+    Raises:
+        ValueError: No loaded recording, or method and circuit do not go together.
     """
     circuit = SkinRC() if circuit is None else circuit
     check_method(method, circuit)

@@ -63,6 +63,12 @@ def parameter(unit: str, *, typical: float) -> Any:
         unit: `"ohm"`, `"farad"`, `"second"`, `"siemens second^alpha"` for the Q of a constant-phase
             element, or `"1"` for its exponent.
         typical: Magnitude to expect, in SI; a fit may start there.
+
+    Returns:
+        A field of a circuit, to stand behind the `=` of its declaration.
+
+    Raises:
+        ValueError: The unit is not known.
     """
     if unit not in DISPLAY:
         raise ValueError(f"unit {unit!r} is not known; use one of {sorted(DISPLAY)}")
@@ -94,7 +100,14 @@ class AbstractCircuit(eqx.Module):
         return jnp.array([SCALING[unit] for unit in cls.units().values()]).T
 
     def response(self, frequency: Float[Array, "..."]) -> Complex[Array, "..."]:
-        """Impedance [Ω] at real frequencies [Hz]."""
+        """Impedance Z(j 2π f).
+
+        Args:
+            frequency: Real frequencies [Hz].
+
+        Returns:
+            Impedance [Ω] at each.
+        """
         return self.impedance()(frequency_variable(jnp.asarray(frequency)))
 
     def values(self) -> Float[Array, "*lane parameter"]:
@@ -106,7 +119,14 @@ class AbstractCircuit(eqx.Module):
         return jnp.log(self.values())
 
     def with_log_values(self: Circuit, log_values: Float[Array, "*lane parameter"]) -> Circuit:
-        """The same circuit with other parameters."""
+        """The same circuit with other parameters.
+
+        Args:
+            log_values: Natural logarithms of the parameters in SI units, in the order of `names`.
+
+        Returns:
+            A circuit of the same kind; this one stays as it is.
+        """
         values = jnp.exp(log_values)
         return type(self)(**{name: values[..., i] for i, name in enumerate(self.names())})
 

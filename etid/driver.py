@@ -181,7 +181,14 @@ class Driver(eqx.Module):
         return verdict_names(self.result).item()
 
     def response(self, frequency: Float[Array, "..."]) -> Complex[Array, "..."]:
-        """Source impedance [Ω] at real frequencies [Hz], refined where there is a refinement."""
+        """Source impedance Z_th [Ω], in continuous time where the method gives it.
+
+        Args:
+            frequency: Real frequencies [Hz].
+
+        Returns:
+            Z_th(j 2π f) [Ω]; without a continuous form that of the discrete filter (paper, eq. 4).
+        """
         if self.source is not None:
             return self.source.response(frequency)
         z = delay_variable(jnp.asarray(frequency), self.sample_rate)
@@ -197,7 +204,14 @@ class Driver(eqx.Module):
         return log_stderr(lambda p: unflatten(p).response(frequency), values, self.cov)
 
     def response_stderr(self, frequency: Float[Array, " frequency"]) -> Float[Array, " frequency"]:
-        """Standard error of |Z_th| [Ω]; NaN if the method gives no covariance."""
+        """Standard error of the magnitude of Z_th, by the slope of |Z_th| in its parameters.
+
+        Args:
+            frequency: Real frequencies [Hz].
+
+        Returns:
+            Standard errors [Ω]; NaN if the method gives no covariance.
+        """
         return jnp.abs(self.response(frequency)) * self.log_response_stderr(frequency)[0]
 
     def __str__(self) -> str:

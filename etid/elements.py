@@ -154,12 +154,26 @@ def exponents(impedance: AbstractImpedance) -> list[Exponent]:
 
 
 def resistor(r: Ohm) -> Resistance:
-    """Impedance of a resistor, Z = R [Ω]."""
+    """Impedance of a resistor, Z = R [Ω].
+
+    Args:
+        r: R [Ω].
+
+    Returns:
+        An impedance, to be connected with others.
+    """
     return Resistance(r)
 
 
 def capacitor(c: Farad) -> Capacitance:
-    """Impedance of a capacitor, Z = 1 / (s C) [Ω]."""
+    """Impedance of a capacitor, Z = 1 / (s C) [Ω].
+
+    Args:
+        c: C [F].
+
+    Returns:
+        An impedance, to be connected with others.
+    """
     return Capacitance(c)
 
 
@@ -169,6 +183,9 @@ def constant_phase(q: PseudoCapacitance, alpha: Exponent) -> ConstantPhase:
     Args:
         q: Q [S s^α], a capacitance if α = 1.
         alpha: α, above 0 and at most 1.
+
+    Returns:
+        An impedance, to be connected with others.
     """
     return ConstantPhase(q, alpha)
 
@@ -184,18 +201,41 @@ def cole(r: Ohm, tau: Second, alpha: Exponent) -> Parallel:
         r: R [Ω].
         tau: τ [s].
         alpha: α, above 0 and at most 1; 1 is a resistor and a capacitor.
+
+    Returns:
+        An impedance, to be connected with others.
     """
     r, tau, alpha = map(jnp.asarray, (r, tau, alpha))
     return parallel(resistor(r), constant_phase(tau**alpha / r, alpha))
 
 
 def series(*impedances: AbstractImpedance) -> Series:
-    """Series connection, Z = Z₁ + Z₂ + …."""
+    """Series connection, Z = Z₁ + Z₂ + ….
+
+    Args:
+        *impedances: What is connected, at least one.
+
+    Returns:
+        An impedance, to be connected with others.
+
+    Raises:
+        ValueError: There is none.
+    """
     return Series(_connected("series", impedances))
 
 
 def parallel(*impedances: AbstractImpedance) -> Parallel:
-    """Parallel connection, 1/Z = 1/Z₁ + 1/Z₂ + …."""
+    """Parallel connection, 1/Z = 1/Z₁ + 1/Z₂ + ….
+
+    Args:
+        *impedances: What is connected, at least one.
+
+    Returns:
+        An impedance, to be connected with others.
+
+    Raises:
+        ValueError: There is none.
+    """
     return Parallel(_connected("parallel", impedances))
 
 

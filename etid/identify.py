@@ -189,6 +189,9 @@ def identify_samples(
         method: As in `identify_driver`; if not given, maximum likelihood for several whole
             periods, else output error. Whether they begin between pulses is not looked at.
 
+    Returns:
+        Elements, standard errors and verdict, as arrays that JAX can trace.
+
     Raises:
         ValueError: The driver cannot serve this method, or the method this circuit.
     """
@@ -240,7 +243,7 @@ def predict(
         circuit: The load; the known resistor of a calibration if not given.
 
     Returns:
-        Predicted voltage; NaN at both edges, where the interpolation lacks neighbours. With a
+        Predicted voltage [V]; NaN at both edges, where the interpolation lacks neighbours. With a
         constant-phase element, NaN after the last whole period.
 
     Raises:

@@ -169,6 +169,9 @@ def identify_jointly(
         One fit per recording, and the drivers as all records together determine them. In the fits,
         `shared_cov` holds what all recordings with one driver have in common: the error of Z_th and
         `r_load_tolerance`; the rest of `cov` is each recording's own.
+
+    Raises:
+        ValueError: The study has no loaded recording.
     """
     require_float64()
     circuit = SkinRC() if circuit is None else circuit

@@ -55,6 +55,9 @@ def netlist(
         name: Name of the subcircuit.
         band: Lowest and highest frequency [Hz] at which a constant phase has to be right.
 
+    Returns:
+        The text of the subcircuit, elements in SI units.
+
     Raises:
         ValueError: The name or the band is none, the circuit is a batch, or an element is not
             positive or an exponent above 1, so that no such network exists.
@@ -88,6 +91,9 @@ def circuit_string(circuit: AbstractCircuit) -> tuple[str, list[float]]:
 
     Args:
         circuit: One circuit, such as `fit.circuit`.
+
+    Returns:
+        The string, and the values in SI units.
 
     Raises:
         ValueError: The circuit is a batch, or an element is not a positive number.

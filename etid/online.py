@@ -133,6 +133,9 @@ class Tracker(eqx.Module):
             change: By how much the elements may change, as standard deviation of the random walk
                 of their logarithms per pulse [1/√pulse]; 0 for skin that does not.
 
+        Returns:
+            The tracker, which does not change; what is known of the skin is in its states.
+
         Raises:
             ValueError: The driver has no harmonics of its calibrations, or a number is too small.
             IdentificationError: The recording is of no use; the message says why.
@@ -196,6 +199,9 @@ class Tracker(eqx.Module):
 
         Args:
             v_out: Loaded voltages [V].
+
+        Returns:
+            The same voltages [V], window after window; what is left at the end is not in it.
         """
         return cut(v_out, self.period)
 
@@ -207,6 +213,9 @@ class Tracker(eqx.Module):
         Args:
             state: What was known before it.
             v_out: Loaded voltage of one period at every electrode [V], from between two pulses on.
+
+        Returns:
+            What is known after it; the state that was given stays as it is.
 
         Raises:
             ValueError: Not one window for each electrode, of one period.
@@ -227,6 +236,9 @@ class Tracker(eqx.Module):
 
         Args:
             state: What is known.
+
+        Returns:
+            One fit per electrode, in their order, labelled by `electrode`.
         """
         fit = jax.tree.map(np.asarray, _judged(self, state))
         labels = {name: np.full(self.electrodes, "", dtype=str) for name in LABELS}

@@ -358,7 +358,14 @@ class Recording:
         return self.r_load is not None
 
     def replace(self, **changes: Any) -> "Recording":
-        """A copy with some of the constructor's arguments changed."""
+        """A copy with some of the constructor's arguments changed.
+
+        Args:
+            **changes: New values of arguments, as in `replace(condition="damp")`.
+
+        Raises:
+            RecordingError: The new recording would not be a valid one.
+        """
         return Recording(**{**self.samples, **vars(self.metadata), **changes})
 
     def __repr__(self) -> str:

@@ -145,7 +145,14 @@ class Fits:
         return jax.tree.map(lambda leaf: leaf[index], self.fit)
 
     def take(self, index: np.ndarray) -> "Fits":
-        """The fits selected by an index or boolean array."""
+        """The fits selected by an array.
+
+        Args:
+            index: Places of the wanted fits, or for each fit whether it is wanted.
+
+        Returns:
+            Those fits, in this order.
+        """
         return type(self)(
             jax.tree.map(lambda leaf: np.asarray(leaf)[index], self.fit),
             {name: column[index] for name, column in self.labels.items()},
@@ -154,7 +161,14 @@ class Fits:
 
     @classmethod
     def concatenate(cls, parts: Sequence["Fits"]) -> "Fits":
-        """One table of several, whose method is "mixed" if theirs differ."""
+        """One table of several.
+
+        Args:
+            parts: Fits of circuits of one kind.
+
+        Returns:
+            All of them, in this order; the method is "mixed" if theirs differ.
+        """
         methods = {part.fit.method for part in parts}
         method = methods.pop() if len(methods) == 1 else "mixed"
         fits = [dataclasses.replace(part.fit, method=method) for part in parts]
@@ -165,7 +179,14 @@ class Fits:
         )
 
     def where(self, **labels: str) -> "Fits":
-        """The fits whose labels equal the given ones, as in `where(condition="dry")`."""
+        """The fits whose labels equal the given ones, as in `where(condition="dry")`.
+
+        Args:
+            **labels: `path`, `subject`, `condition`, `electrode` or `trial`.
+
+        Returns:
+            Those fits, in their order.
+        """
         chosen = np.ones(len(self), bool)
         for name, value in labels.items():
             chosen &= self.labels[name] == value
@@ -216,6 +237,13 @@ class Fits:
         recording, which the spread contains, and `NAME_shared`, which no spread shows because all
         recordings with one driver have it in common. What really varies between the recordings is
         `NAME_between`, sqrt(spread² − own²), or 0.
+
+        Args:
+            *by: Labels that make the groups; without one all fits are one group.
+
+        Returns:
+            A row for each group, in the order of its labels; numbers in SI units, NaN without any
+            success.
         """
         columns = [map(str, self.labels[name].tolist()) for name in by]
         keys = list(zip(*columns, strict=True)) if by else [()] * len(self)

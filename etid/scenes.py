@@ -334,29 +334,29 @@ _POPULATION_SEED = 10
 
 
 def paper_calibration(**settings: Any) -> Scene:
-    """The reference resistor of 98.8 kΩ alone."""
+    """The reference resistor of 98.8 kΩ alone. Keywords are fields of `Scene`."""
     return Scene((), _CALIBRATION, **settings)
 
 
 def paper_resistors(**settings: Any) -> Scene:
-    """The five test resistors of Table I."""
+    """The five test resistors of Table I. Keywords are fields of `Scene`."""
     return Scene(_RESISTORS, _CALIBRATION, **settings)
 
 
 def paper_built(**settings: Any) -> Scene:
-    """The soldered circuit of Table IV, 23 trials."""
+    """The soldered circuit of Table IV, 23 trials. Keywords are fields of `Scene`."""
     trials = _repeated("built", _BUILT, 23, condition="built")
     return Scene(trials, _CALIBRATION, **settings)
 
 
 def paper_dry(**settings: Any) -> Scene:
-    """The typical dry fingertip of Table II, ten trials."""
+    """The typical dry fingertip of Table II, ten trials. Keywords are fields of `Scene`."""
     trials = _repeated("typical/dry", _DRY, _TYPICAL_TRIALS, subject="typical", condition="dry")
     return Scene(trials, _CALIBRATION, **settings)
 
 
 def paper_damp(**settings: Any) -> Scene:
-    """The typical damp fingertip of Table III, ten trials."""
+    """The typical damp fingertip of Table III, ten trials. Keywords are fields of `Scene`."""
     trials = _repeated("typical/damp", _DAMP, _TYPICAL_TRIALS, subject="typical", condition="damp")
     return Scene(trials, _CALIBRATION, **settings)
 
@@ -366,7 +366,7 @@ def paper_subjects(**settings: Any) -> Scene:
 
     The elements are log-uniform in the ranges of Tables II and III, drawn once for all: the same
     people in every scene. The trials of a subject and condition share their elements, so that any
-    spread between them is the estimator's.
+    spread between them is the estimator's. Keywords are fields of `Scene`.
     """
     rng = np.random.default_rng(_POPULATION_SEED)
     trials: tuple[Trial, ...] = ()
@@ -385,7 +385,7 @@ def paper_subjects(**settings: Any) -> Scene:
 
 
 def paper(**settings: Any) -> Scene:
-    """Everything above in one study, 149 recordings behind one driver."""
+    """Everything above in one study, 149 recordings. Keywords are fields of `Scene`."""
     parts = (paper_resistors, paper_built, paper_dry, paper_damp, paper_subjects)
     trials = tuple(trial for part in parts for trial in part().trials)
     return Scene(trials, _CALIBRATION, **settings)

@@ -92,6 +92,12 @@ class Study(Mapping[str, Recording]):
     def from_recordings(cls, recordings: Iterable[Recording]) -> "Study":
         """A study in memory; recordings without a path become `loaded/0`, `loaded/1`, ….
 
+        Args:
+            recordings: Calibrations and loaded recordings.
+
+        Returns:
+            The study, in the order of the recordings.
+
         Raises:
             RecordingError: Two recordings have the same path, or one lies inside another.
         """
@@ -131,7 +137,12 @@ class Study(Mapping[str, Recording]):
         return id(self)
 
     def source(self, path: str) -> AbstractSource:
-        """What the study holds at a path, without its samples."""
+        """What the study holds at a path, without its samples.
+
+        Raises:
+            RecordingError: The recording at that path cannot be read.
+            KeyError: There is none; the message names those that are near.
+        """
         tidy = path.strip("/")
         if tidy in self._sources:
             return self._sources[tidy]
@@ -147,7 +158,12 @@ class Study(Mapping[str, Recording]):
         raise KeyError(f"no recording {path!r}; this study has {len(self)}, such as {known}")
 
     def metadata(self, path: str) -> Metadata:
-        """All fields of a recording but its samples, which are not read."""
+        """All fields of a recording but its samples, which are not read.
+
+        Raises:
+            RecordingError: The recording at that path cannot be read.
+            KeyError: There is none.
+        """
         return self.source(path).metadata
 
     def recordings(self) -> Iterator[Recording]:
@@ -162,7 +178,17 @@ class Study(Mapping[str, Recording]):
         electrode: Label | None = None,
         trial: Label | None = None,
     ) -> "Study":
-        """The recordings whose labels equal those given; no samples are read."""
+        """The recordings whose labels equal those given; no samples are read.
+
+        Args:
+            subject: Who.
+            condition: Which state of the skin, or which circuit.
+            electrode: Which electrode of the display.
+            trial: Which repetition.
+
+        Returns:
+            A study that reads from the same file.
+        """
         given = zip(LABELS, (subject, condition, electrode, trial), strict=True)
         wanted = {name: text(name, value) for name, value in given if value is not None}
         return self._part(

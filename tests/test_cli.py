@@ -1,12 +1,18 @@
 """The command line: what it prints, what it writes, how it ends."""
 
 import json
+import os
+import pathlib
+import re
+import shutil
 import subprocess
 import sys
 
 import h5py
+import jax
 import numpy as np
 import pytest
+import shtab
 
 import etid
 from etid import cli
@@ -47,7 +53,11 @@ def test_simulate_writes_a_study_and_its_truth_and_the_seed_decides(run, tmp_pat
     files = [tmp_path / name for name in ("a.h5", "b.h5", "c.h5")]
     for file, seed in zip(files, (1, 1, 2), strict=True):
         options = ("--snr-db", 50, "--jitter", 1e-7, "--seed", seed, "--truth", tmp_path / "t.json")
-        assert run("simulate", "paper_dry", "-o", file, *options) == (DONE, [], [])
+        assert run("simulate", "paper_dry", "-o", file, *options) == (
+            DONE,
+            [f"{file}: 11 recordings"],
+            [],
+        )
     records = []
     for file in files:
         with etid.read(file) as study:
@@ -224,10 +234,126 @@ def test_the_file_that_is_read_is_never_replaced(run, study_file, command):
     assert study_file.read_bytes() == before
 
 
+def as_json(printed):
+    """The one object that stands on stdout; NaN and Infinity are no JSON."""
+
+    def refuse(constant):
+        raise AssertionError(f"{constant} is no JSON")
+
+    (line,) = printed
+    return json.loads(line, parse_constant=refuse)
+
+
+def test_json_of_fit_has_what_the_text_has(run, study_file, tmp_path):
+    target = tmp_path / "fits.h5"
+    status, printed, complaints = run("fit", study_file, "-o", target, "--json")
+    assert (status, complaints) == (DONE, [])
+    data = as_json(printed)
+    fits = etid.Fits.read(target)
+    files = {"source": str(study_file), "target": str(target)}
+    assert data.items() >= {"command": "fit", "status": DONE, **files}.items()
+    assert (data["method"], data["recordings"]) == ("maximum_likelihood", 4)
+    assert data["verdicts"] == fits.counts() == {"successful": 3, "nonfinite_samples": 1}
+    (driver,) = data["drivers"]
+    assert driver["calibrations"] == ["calibration/98k8"]
+    assert (driver["verdict"], driver["order"]) == ("successful", 5)
+    assert 0 < driver["rrse"] < 0.01
+    (group,) = data["groups"]
+    assert group == fits.summary("subject", "condition")[0]
+    assert data["units"] == {"r_s": "ohm", "r_p": "ohm", "c_p": "farad"}
+    (failed,) = data["unsuccessful"]
+    assert (failed["path"], failed["verdict"]) == ("typical/dry/02", "nonfinite_samples")
+    assert failed["note"]
+
+
+def test_json_of_a_fit_without_success_has_null_for_what_is_no_number(run, tmp_path):
+    study, target = tmp_path / "study.h5", tmp_path / "fits.h5"
+    etid.scenes.paper_built().simulate(seed=0).write(study)
+    status, printed, _ = run("fit", study, "-o", target, "--order", 1, "--json")
+    data = as_json(printed)
+    assert status == data["status"] == WRONG_DATA
+    assert data["verdicts"] == {"driver_failed": 23}
+    assert len(data["unsuccessful"]) == 23
+    assert data["groups"][0]["r_s"] is None
+    assert data["drivers"][0]["error"].startswith("order is 1")
+
+
+def test_json_of_check_has_a_place_for_every_problem(run, study_file):
+    status, printed, _ = run("check", study_file, "--json")
+    data = as_json(printed)
+    assert status == data["status"] == WRONG_DATA
+    (problem,) = data["problems"]
+    assert (problem["path"], problem["field"]) == ("typical/dry/02", "v_out")
+    assert problem["message"]
+    assert problem["remedy"]
+
+
+def test_json_of_what_writes_a_file_names_it(run, tmp_path):
+    table, made, imported = (tmp_path / name for name in ("t.csv", "made.h5", "imported.h5"))
+    np.savetxt(table, np.ones((500, 2)), delimiter=",", header="open,skin", comments="")
+    status, printed, _ = run("simulate", "paper_dry", "-o", made, "--json")
+    wanted = {"command": "simulate", "status": DONE, "target": str(made), "recordings": 11}
+    assert (status, as_json(printed)) == (DONE, wanted)
+    names = ("--v-th", "open", "--v-out", "skin", "--scale", 1)
+    rates = ("--sample-rate", 2e5, "--pulse-rate", 60)
+    status, printed, _ = run("import", table, imported, *names, *rates, "--json")
+    wanted = {"command": "import", "status": DONE, "target": str(imported), "recordings": 1}
+    assert status == DONE
+    assert as_json(printed).items() >= wanted.items()
+    status, printed, _ = run("check", made, "--json")
+    wanted = {"command": "check", "status": DONE, "file": str(made), "recordings": 11}
+    assert (status, as_json(printed)) == (DONE, {**wanted, "problems": []})
+
+
+def test_keys_of_json_are_those_of_the_guide(run, study_file, tmp_path):
+    page = (pathlib.Path(__file__).parents[1] / "docs" / "command_line.md").read_text("utf-8")
+    rows = dict(re.findall(r"^\| `(\w+)` \| (.*) \|$", page, flags=re.MULTILINE))
+    assert rows.keys() == cli.COMMANDS.keys()
+    table = tmp_path / "t.csv"
+    np.savetxt(table, np.ones((500, 2)), delimiter=",", header="open,skin", comments="")
+    names = ("--v-th", "open", "--v-out", "skin", "--scale", 1)
+    calls = {
+        "simulate": ("paper_dry", "-o", tmp_path / "made.h5"),
+        "check": (study_file,),
+        "import": (table, tmp_path / "i.h5", *names, "--sample-rate", 2e5, "--pulse-rate", 60),
+        "fit": (study_file, "-o", tmp_path / "f.h5", "--method", "equation_error", "--order", 3),
+        "report": (tmp_path / "f.h5",),
+        "export": (tmp_path / "f.h5", "-o", tmp_path / "f.csv"),
+    }
+    assert calls.keys() == cli.COMMANDS.keys()
+    for command, arguments in calls.items():
+        _, printed, _ = run(command, *arguments, "--json")
+        told = set(re.findall(r"`(\w+)`", rows[command]))
+        found = as_json(printed)
+        assert set(found) - {"command", "status"} <= told, command
+        written = {"check": "file", "report": "page"}.get(command, "target")
+        assert set(found) >= {"command", "status", written}
+        inner = [item for value in found.values() if isinstance(value, list) for item in value]
+        keys = {key for item in inner if "subject" not in item for key in item}
+        assert keys <= told, command
+
+
+def test_json_of_an_error_is_on_stdout_and_its_line_on_stderr(run):
+    status, printed, complaints = run("fit", "absent.h5", "-o", "fits.h5", "--json")
+    data = as_json(printed)
+    assert status == data["status"] == WRONG_DATA
+    assert (data["command"], complaints) == ("fit", [f"etid: error: {data['error']}"])
+
+
+@pytest.mark.parametrize("command", cli.COMMANDS)
+def test_every_command_has_a_summary_and_json(run, command):
+    status, printed, complaints = run(command, "--help")
+    assert (status, complaints) == (DONE, [])
+    assert any("--json" in line for line in printed)
+    _, listed, _ = run("--help")
+    assert any(re.match(rf" +{command} +[a-z]", line) for line in listed)
+
+
 @pytest.mark.parametrize(
     "arguments",
     [(), ("nonsense",), ("fit", "study.h5"), ("simulate", "nonsense", "-o", "x.h5"),
-     ("fit", "a.h5", "-o", "b.h5", "--method", "guessing")],
+     ("fit", "a.h5", "-o", "b.h5", "--method", "guessing"), ("--completion", "sh"),
+     ("fit", "--json")],
 )  # fmt: skip
 def test_wrong_usage_ends_with_2(run, arguments):
     status, printed, complaints = run(*arguments)
@@ -239,11 +365,64 @@ def test_the_program_starts_in_float64_and_knows_its_version(tmp_path):
     """In a process of its own: this one has float64 switched on already."""
     command = [sys.executable, "-m", "etid.cli"]
     version = subprocess.run([*command, "--version"], capture_output=True, text=True, check=True)
-    assert version.stdout == f"etid {etid.__version__}\n"
+    backend = jax.default_backend()
+    told = f"etid {etid.__version__}, JAX {jax.__version__}, {backend}, float64\n"
+    assert version.stdout == told
     study, fits = tmp_path / "study.h5", tmp_path / "fits.h5"
     etid.scenes.paper_built().simulate(seed=0).write(study)
     arguments = [*command, "fit", study, "-o", fits, "--order", "1"]
-    ended = subprocess.run(arguments, capture_output=True, text=True, check=False)
+    environment = {**os.environ, "XDG_CACHE_HOME": str(tmp_path / "cache")}
+    environment.pop("JAX_COMPILATION_CACHE_DIR", None)
+    ended = subprocess.run(arguments, capture_output=True, text=True, check=False, env=environment)
+    assert any((tmp_path / "cache" / "etid").iterdir())  # for the next process
     assert ended.returncode == WRONG_DATA
     assert "float64" not in ended.stdout + ended.stderr
     assert ended.stderr == ""  # no progress bar where there is no terminal
+
+
+def test_a_reader_that_has_gone_is_no_error(tmp_path):
+    read, write = os.pipe()
+    os.close(read)
+    etid.scenes.paper_calibration().simulate(seed=0).write(tmp_path / "study.h5")
+    command = [sys.executable, "-m", "etid.cli", "check", tmp_path / "study.h5"]
+    done = subprocess.run(command, stdout=write, stderr=subprocess.PIPE, check=False)
+    os.close(write)
+    assert (done.returncode, done.stderr) == (DONE, b"")
+
+
+def test_completion_is_offered_for_every_shell_there_is_one_for(run):
+    assert set(cli.SHELLS) == set(shtab.SUPPORTED_SHELLS)
+    for shell in cli.SHELLS:
+        status, printed, complaints = run("--completion", shell)
+        assert (status, complaints) == (DONE, [])
+        assert any("snr-db" in line for line in printed)
+
+
+@pytest.mark.parametrize(
+    ("words", "offered"),
+    [
+        (("simul",), ["simulate"]),
+        (("fit", "--meth"), ["--method"]),
+        (("fit", "--method", "output"), ["output_error"]),
+        (("check", "stu"), ["study.h5"]),
+        (("fit", "-o", "stu"), ["study.h5"]),
+    ],
+)
+def test_completion_completes_commands_options_choices_and_files(
+    run, tmp_path, monkeypatch, words, offered
+):
+    bash = shutil.which("bash")
+    if bash is None:
+        pytest.skip("there is no bash")
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "study.h5").touch()
+    _, script, _ = run("--completion", "bash")
+    ask = f"""
+    COMP_WORDS=(etid {" ".join(words)}); COMP_CWORD={len(words)}
+    _shtab_etid etid "${{COMP_WORDS[COMP_CWORD]}}" "${{COMP_WORDS[COMP_CWORD-1]}}"
+    printf '%s\\n' "${{COMPREPLY[@]}}"
+    """
+    done = subprocess.run(
+        [bash, "-c", "\n".join(script) + ask], capture_output=True, text=True, check=True
+    )
+    assert done.stdout.split() == offered

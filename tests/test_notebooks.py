@@ -1,6 +1,7 @@
-"""Notebooks and the README are executed as a reader would execute them."""
+"""Notebooks, the README and the guide are executed as a reader would execute them."""
 
 import contextlib
+import io
 import json
 import pathlib
 import re
@@ -12,6 +13,12 @@ import pytest
 
 ROOT = pathlib.Path(__file__).parents[1]
 NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.py"))
+SLOW = {"derivatives", "joint"}  # compiled for minutes
+PAGES = [
+    pytest.param(path, marks=[pytest.mark.slow] if path.stem in SLOW else [])
+    for path in sorted((ROOT / "docs").glob("*.md"))
+    if "```python" in path.read_text(encoding="utf-8")
+]
 NUMBER = re.compile(r"[-+]?\d+(?:\.\d+)?(?:e[-+]?\d+)?")
 
 
@@ -63,16 +70,48 @@ def test_notebook_runs_from_top_to_bottom_and_shows_its_figures(path, tmp_path, 
     assert not warned
 
 
-def test_readme_examples_print_what_the_readme_says(capsys):
+def blocks_of(path):
+    """Examples of a page with what it says they print; empty where it does not say."""
+    text = path.read_text(encoding="utf-8")
+    pattern = r"```python\n(.*?)```\n(?:\n```text\n(.*?)```)?"
+    return re.findall(pattern, text, flags=re.DOTALL)
+
+
+def structure(lines):
     """Digits may differ between machines; words, units and the number of numbers may not."""
-    text = (ROOT / "README.md").read_text(encoding="utf-8")
-    blocks = re.findall(r"```(?:python|text)\n(.*?)```", text, flags=re.DOTALL)
+    return [NUMBER.sub("#", line).split() for line in lines.strip().splitlines()]
+
+
+def run_page(path, names, capsys):
+    for code, printed in blocks_of(path):
+        exec(compile(code, path.name, "exec"), names)
+        told = capsys.readouterr().out
+        assert structure(told) == structure(printed) or not printed
+
+
+@pytest.fixture(scope="module")
+def after_readme():
+    """Names that the examples of the start page have made."""
     names: dict = {}
-
-    def structure(lines):
-        return [NUMBER.sub("#", line).split() for line in lines.strip().splitlines()]
-
-    assert len(blocks) == 6
-    for code, printed in zip(blocks[::2], blocks[1::2], strict=True):
+    printed = io.StringIO()
+    with contextlib.redirect_stdout(printed):
+        (code, told), *others = blocks_of(ROOT / "README.md")
         exec(compile(code, "README.md", "exec"), names)
-        assert structure(capsys.readouterr().out) == structure(printed)
+    assert not others
+    return names, printed.getvalue(), told
+
+
+def test_readme_example_prints_what_the_readme_says(after_readme):
+    _, printed, told = after_readme
+    assert structure(printed) == structure(told)
+
+
+@pytest.mark.parametrize("path", PAGES, ids=lambda path: path.stem)
+def test_examples_of_a_page_print_what_it_says(path, after_readme, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    run_page(path, dict(after_readme[0]), capsys)
+
+
+def test_every_example_of_the_guide_is_run():
+    text = "".join(path.read_text("utf-8") for path in (ROOT / "docs").glob("*.md"))
+    assert text.count("```python") == sum(len(blocks_of(page.values[0])) for page in PAGES) > 10

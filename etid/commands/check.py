@@ -4,7 +4,7 @@ import argparse
 import pathlib
 
 from etid import hdf5
-from etid.commands import DONE, WRONG_DATA
+from etid.commands import DONE, WRONG_DATA, Outcome
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -12,13 +12,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("file", type=pathlib.Path)
 
 
-def run(arguments: argparse.Namespace) -> int:
-    """Print what is wrong."""
+def run(arguments: argparse.Namespace) -> Outcome:
+    """All that is wrong."""
     problems = hdf5.check(arguments.file)
-    if not problems:
-        with hdf5.read(arguments.file) as study:
-            print(f"{arguments.file}: {len(study)} recordings, nothing wrong")
-        return DONE
-    for problem in problems:
-        print(problem)
-    return WRONG_DATA
+    places = [
+        {"path": each.path, "field": each.field, "message": each.message, "remedy": each.remedy}
+        for each in problems
+    ]
+    data = {"file": arguments.file, "recordings": None, "problems": places}
+    if problems:
+        return Outcome("\n".join(map(str, problems)), data, WRONG_DATA)
+    with hdf5.read(arguments.file) as study:
+        data["recordings"] = len(study)
+    return Outcome(f"{arguments.file}: {data['recordings']} recordings, nothing wrong", data, DONE)

@@ -8,7 +8,7 @@ import argparse
 import datetime
 import pathlib
 
-from etid.commands import DONE
+from etid.commands import Outcome
 from etid.exporting import CIRCUITS, export_circuit, export_fits, export_study
 
 
@@ -39,7 +39,7 @@ def moment(text: str) -> datetime.datetime:
     return datetime.datetime.fromisoformat(text)
 
 
-def run(arguments: argparse.Namespace) -> int:
+def run(arguments: argparse.Namespace) -> Outcome:
     """Write one file."""
     source, target = arguments.source, arguments.target
     suffix = target.suffix.lower()
@@ -53,4 +53,4 @@ def run(arguments: argparse.Namespace) -> int:
         export_circuit(source, target, arguments.path)
     else:
         export_fits(source, target)
-    return DONE
+    return Outcome(data={"source": source, "target": target})

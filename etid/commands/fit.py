@@ -7,12 +7,13 @@ import math
 import pathlib
 import sys
 from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
 
 from etid import hdf5
 from etid.circuits import DISPLAY, heading
-from etid.commands import DONE, WRONG_DATA
+from etid.commands import DONE, WRONG_DATA, Outcome
 from etid.joint import identify_jointly
 from etid.methods import METHODS
 from etid.report import Table
@@ -49,8 +50,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def run(arguments: argparse.Namespace) -> int:
-    """Identify, write the fits and print what they came to."""
+def run(arguments: argparse.Namespace) -> Outcome:
+    """Identify, and write the fits."""
     if not arguments.target.absolute().parent.is_dir():  # known before hours of fitting
         raise ValueError(f"{arguments.target}: there is no folder to write it to")
     if arguments.joint and arguments.method not in (None, "maximum_likelihood"):
@@ -73,8 +74,9 @@ def run(arguments: argparse.Namespace) -> int:
                 executor=executor,
                 progress=progress,
             )
-    print(_summary(outcome))
-    return DONE if "successful" in outcome.fits.counts() else WRONG_DATA
+    status = DONE if "successful" in outcome.fits.counts() else WRONG_DATA
+    files = {"source": arguments.source, "target": arguments.target}
+    return Outcome(_summary(outcome), {**files, **_data(outcome)}, status)
 
 
 @contextlib.contextmanager
@@ -119,6 +121,36 @@ def _summary(outcome: StudyFits) -> str:
     if len(wrong) > _SHOWN:
         lines.append(f"and {len(wrong) - _SHOWN} more; the file of fits has a note for each fit")
     return "\n".join(lines)
+
+
+def _data(outcome: StudyFits) -> dict[str, Any]:
+    """The same for scripts; the numbers of single recordings are in the file of fits."""
+    fits = outcome.fits
+    drivers = [
+        {
+            "calibrations": paths,
+            "verdict": driver.verdict,
+            "order": driver.order,
+            "rrse": driver.rrse,
+            "chi2": driver.chi2,
+        }
+        for paths, driver in outcome.drivers.items()
+    ]
+    drivers += [{"calibrations": paths, "error": text} for paths, text in outcome.failures.items()]
+    labelled = zip(fits.labels["path"], fits.verdicts, fits.notes, strict=True)
+    return {
+        "method": fits.fit.method,
+        "recordings": len(fits),
+        "verdicts": fits.counts(),
+        "drivers": drivers,
+        "units": fits.circuit.units(),
+        "groups": fits.summary("subject", "condition"),
+        "unsuccessful": [
+            {"path": path, "verdict": verdict, "note": note}
+            for path, verdict, note in labelled
+            if verdict != "successful"
+        ],
+    }
 
 
 def _medians(outcome: StudyFits) -> Table:

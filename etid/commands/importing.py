@@ -1,9 +1,10 @@
 """Turn a file of a lab (.csv, .mat, .tdms, .abf, .npz) into an etid file."""
 
 import argparse
+import dataclasses
 import pathlib
 
-from etid.commands import DONE
+from etid.commands import Outcome
 from etid.importing import import_file
 
 
@@ -35,10 +36,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--condition", default="")
 
 
-def run(arguments: argparse.Namespace) -> int:
+def run(arguments: argparse.Namespace) -> Outcome:
     """Import one file, and say what was used for what."""
     names = ("v_th", "v_out", "current", "time", "sample_rate", "pulse_rate", "scale", "r_load")
     given = {name: getattr(arguments, name) for name in (*names, "subject", "condition")}
     used = import_file(arguments.source, arguments.target, arguments.mapping, **given)
-    print("\n".join(map(str, used)))
-    return DONE
+    data = {
+        "source": arguments.source,
+        "target": arguments.target,
+        "recordings": sum(len(each.paths) for each in used),
+        "imported": [dataclasses.asdict(each) for each in used],
+    }
+    return Outcome("\n".join(map(str, used)), data)

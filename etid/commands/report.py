@@ -3,7 +3,7 @@
 import argparse
 import pathlib
 
-from etid.commands import DONE
+from etid.commands import Outcome
 from etid.study_report import write_report
 
 
@@ -21,9 +21,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def run(arguments: argparse.Namespace) -> int:
+def run(arguments: argparse.Namespace) -> Outcome:
     """Write the page and say where it is."""
     page = arguments.page or arguments.fits.with_suffix(".html")
     write_report(arguments.fits, page, recordings=arguments.recordings)
-    print(page)
-    return DONE
+    return Outcome(str(page), {"fits": arguments.fits, "page": page})

@@ -5,7 +5,7 @@ import json
 import pathlib
 
 from etid import scenes
-from etid.commands import DONE
+from etid.commands import Outcome
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -22,12 +22,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def run(arguments: argparse.Namespace) -> int:
+def run(arguments: argparse.Namespace) -> Outcome:
     """Write the study, and the truth where it is wanted."""
     scene = scenes.PRESETS[arguments.preset](
         snr_db=arguments.snr_db, trigger_jitter_rms=arguments.jitter
     )
-    scene.simulate(arguments.seed).write(arguments.target)
+    study = scene.simulate(arguments.seed)
+    study.write(arguments.target)
     if arguments.truth is not None:
         arguments.truth.write_text(json.dumps(scene.truth(), indent=1) + "\n", encoding="utf-8")
-    return DONE
+    text = f"{arguments.target}: {len(study)} recordings"
+    return Outcome(text, {"target": arguments.target, "recordings": len(study)})

@@ -1,0 +1,84 @@
+"""Notebooks as pages: executed from top to bottom when the site is built, with their figures.
+
+What is shown was made by the code that stands above it. Each becomes a page `notebooks/NAME.md`;
+the mark `<!-- gallery -->` lists them with their first figure.
+"""
+
+import functools
+import pathlib
+import re
+import time
+
+import jupytext
+import nbclient
+import nbconvert
+from mkdocs.plugins import event_priority, get_plugin_logger
+from mkdocs.structure.files import File
+
+ROOT = pathlib.Path(__file__).parents[2]
+MARK = "<!-- gallery -->"
+SECONDS = 300  # of one notebook
+
+log = get_plugin_logger("gallery")
+
+
+@functools.cache  # while a site is served, only what was changed is executed again
+def executed(text):
+    """Markdown of an executed notebook, its figures by name, and the time it took [s]."""
+    notebook = jupytext.reads(text, fmt="py:percent")
+    begun = time.perf_counter()
+    nbclient.NotebookClient(notebook, timeout=SECONDS, kernel_name="python3").execute()
+    taken = time.perf_counter() - begun
+    body, resources = nbconvert.MarkdownExporter().from_notebook_node(notebook)
+    return body, resources["outputs"], taken
+
+
+def on_config(config):
+    """Put the notebooks below the gallery."""
+    pages = [f"notebooks/{path.stem}.md" for path in _notebooks()]
+    for entry in config.nav:
+        if entry == {"Notebooks": "gallery.md"}:
+            entry["Notebooks"] = ["gallery.md", *pages]
+    return config
+
+
+@event_priority(50)
+def on_files(files, config):
+    """Execute the notebooks and add their pages and figures."""
+    for path in _notebooks():
+        body, figures, taken = executed(path.read_text("utf-8"))
+        log.info("%s executed in %.0f s", path.name, taken)
+        for name, content in figures.items():
+            place = f"notebooks/{path.stem}_{name}"
+            files.append(File.generated(config, place, content=content))
+            body = body.replace(f"({name})", f"({path.stem}_{name})")
+        note = f"*{taken:.0f} s on the machine that made this page; `notebooks/{path.name}`.*"
+        title, _, rest = body.strip().partition("\n")
+        page = f"{title}\n\n{note}\n{rest}"
+        files.append(File.generated(config, f"notebooks/{path.stem}.md", content=page))
+    return files
+
+
+def on_page_markdown(markdown, page, config, files):
+    """List the notebooks where the gallery has its mark."""
+    if MARK not in markdown:
+        return markdown
+    notebooks = sorted(
+        (each for each in files if re.fullmatch(r"notebooks/[^/]*\.md", each.src_uri)),
+        key=lambda each: each.src_uri,
+    )
+    return markdown.replace(MARK, "\n\n".join(map(_card, notebooks)))
+
+
+def _notebooks():
+    return sorted((ROOT / "notebooks").glob("*.py"))
+
+
+def _card(file):
+    """Title, first sentences and first figure of a notebook."""
+    text = file.content_string
+    title = re.search(r"^# (.*)$", text, re.MULTILINE)[1]
+    words = re.search(r"\n\n([^*!#`\s<].*?)(?:\n\n|\Z)", text, re.DOTALL)[1]
+    figure = re.search(r"!\[.*?\]\((.*?)\)", text)
+    shown = f"\n\n[![{title}](notebooks/{figure[1]})](notebooks/{file.name}.md)" if figure else ""
+    return f"## [{title}](notebooks/{file.name}.md)\n\n{' '.join(words.split())}{shown}"

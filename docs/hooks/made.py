@@ -1,0 +1,66 @@
+"""What pages show of the code is made from the code: `<!-- made: NAME -->` in a page.
+
+Verdicts come from their messages, the command line from its parsers, the reference from the names
+that `etid` exports.
+"""
+
+import ast
+import os
+import pathlib
+import re
+import types
+
+import optimistix as optx
+
+import etid
+from etid import cli, verdicts
+
+MARK = re.compile(r"^<!-- made: (\w+) -->$", re.MULTILINE)
+BORROWED = ("successful", "max_steps_reached", "nonfinite")  # of optimistix, see etid.RESULTS
+
+
+def on_page_markdown(markdown, page, config, files):
+    """Fill the marked places."""
+    return MARK.sub(lambda mark: MADE[mark[1]](), markdown)
+
+
+def table_of_verdicts():
+    """Every verdict that etid gives, and what it says."""
+
+    def names(kind):
+        return list(vars(kind)["_name_to_item"])
+
+    own = [name for name in names(etid.RESULTS) if name not in names(optx.RESULTS)]
+    said = {name: " ".join(verdicts.message(name).split()) for name in (*BORROWED, *own)}
+    said["successful"] = "The model explains the recording down to its noise."
+    rows = [f"| `{name}` | {text} |" for name, text in said.items()]
+    return "\n".join(["| verdict | what it says |", "|---|---|", *rows])
+
+
+def commands():
+    """Help of every command, as the terminal shows it."""
+    os.environ["COLUMNS"] = "90"
+    parser = cli.parser()
+    helps = {"etid": parser.format_help()}
+    for action in parser._actions:
+        if isinstance(action.choices, dict):
+            helps |= {f"etid {name}": one.format_help() for name, one in action.choices.items()}
+    return "\n\n".join(f"### {name}\n\n```text\n{text}```" for name, text in helps.items())
+
+
+def reference():
+    """Every name that `import etid` gives."""
+    tree = ast.parse(pathlib.Path(etid.__file__).read_text("utf-8"))
+    imports = [node for node in tree.body if isinstance(node, ast.ImportFrom)]
+    names = sorted(
+        (each.asname for node in imports for each in node.names if each.asname), key=str.lower
+    )
+    groups = {"Functions": types.FunctionType, "Classes": type, "Modules": types.ModuleType}
+    parts = []
+    for heading, kind in groups.items():
+        parts.append(f"## {heading}")
+        parts += [f"::: etid.{name}" for name in names if isinstance(getattr(etid, name), kind)]
+    return "\n\n".join(parts)
+
+
+MADE = {"verdicts": table_of_verdicts, "commands": commands, "reference": reference}

@@ -1,0 +1,86 @@
+"""Pages that are files of the repository, links as they are there, and nothing from elsewhere.
+
+A page is written once: the README is the start of the site, the folders' READMEs are pages. Links
+are those of the repository, so that they lead somewhere there too; here they are turned into those
+of the site, where `docs/` is the root.
+"""
+
+import html.parser
+import pathlib
+import posixpath
+import re
+
+from mkdocs.exceptions import PluginError
+from mkdocs.structure.files import File
+
+ROOT = pathlib.Path(__file__).parents[2]
+PAGES = (
+    "README.md",
+    "benchmarks/README.md",
+    "data_schema/README.md",
+    "CONTRIBUTING.md",
+    "CHANGELOG.md",
+)
+SHOWN = (
+    "CITATION.cff",
+    "LICENSE",
+    "data_schema/example.h5",
+    "data_schema/recording-1.json",
+    "benchmarks/results/*.svg",
+    "benchmarks/results/*.csv",
+)
+LINK = re.compile(r"(?<=\]\()(?!\w+:|#)([^)#\s]+)")
+FETCHED = {"script": "src", "img": "src", "iframe": "src", "source": "src"}
+
+
+def on_files(files, config):
+    """Add the pages and files of the repository, at their places in it."""
+    paths = [path for pattern in SHOWN for path in sorted(ROOT.glob(pattern))]
+    for name in (*PAGES, *(path.relative_to(ROOT).as_posix() for path in paths)):
+        files.append(File(name, str(ROOT), config.site_dir, config.use_directory_urls))
+    return files
+
+
+def on_page_markdown(markdown, page, config, files):
+    """Turn links of the repository into links of the site."""
+    shown = page.file.src_uri
+    inside = page.file.abs_src_path and pathlib.Path(page.file.abs_src_path).relative_to(ROOT)
+    if not inside:
+        return markdown
+    source, here = inside.parent.as_posix(), posixpath.dirname(shown)
+
+    def moved(link):
+        target = posixpath.normpath(posixpath.join(source, link[1]))
+        target = target.removeprefix("docs/")
+        if target.startswith("notebooks/"):
+            target = target.removesuffix(".py") + ".md"
+        return posixpath.relpath(target, here or ".")
+
+    return LINK.sub(moved, markdown)
+
+
+def on_post_build(config):
+    """Refuse a site that a reader without a network would not see whole."""
+    for path in sorted(pathlib.Path(config.site_dir).rglob("*.html")):
+        reader = _Fetched()
+        reader.feed(path.read_text("utf-8"))
+        if reader.elsewhere:
+            raise PluginError(f"{path.name} fetches {', '.join(sorted(reader.elsewhere))}")
+
+
+class _Fetched(html.parser.HTMLParser):
+    """What a page loads from other hosts; links to them are no such thing."""
+
+    def __init__(self):
+        super().__init__()
+        self.elsewhere = set()
+
+    def handle_starttag(self, tag, attrs):
+        found = dict(attrs)
+        loads = "stylesheet preload icon modulepreload preconnect dns-prefetch".split()
+        name = FETCHED.get(tag)
+        if tag == "link" and set((found.get("rel") or "").split()) & set(loads):
+            name = "href"
+        address = found.get(name) or ""
+        if re.match(r"(\w+:)?//", address):
+            self.elsewhere.add(address)

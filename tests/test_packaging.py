@@ -1,0 +1,76 @@
+"""What is said of the package in several places, and what it ships."""
+
+import importlib.metadata
+import pathlib
+import re
+import tomllib
+
+import pytest
+import yaml
+
+import etid
+
+ROOT = pathlib.Path(__file__).parents[1]
+# Keys of the Citation File Format 1.2.0, of which the first four are required.
+CITATION_KEYS = (
+    "cff-version message title authors abstract commit contact date-released doi identifiers "
+    "keywords license license-url preferred-citation references repository repository-artifact "
+    "repository-code type url version"
+).split()
+
+
+@pytest.fixture(scope="module")
+def citation():
+    return yaml.safe_load((ROOT / "CITATION.cff").read_text("utf-8"))
+
+
+@pytest.fixture(scope="module")
+def project():
+    return tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
+
+
+def test_version_is_the_same_everywhere(citation, project):
+    changelog = (ROOT / "CHANGELOG.md").read_text("utf-8")
+    newest = re.search(r"^## (\S+)", changelog, re.MULTILINE)
+    assert newest is not None
+    said = {
+        "pyproject.toml": project["version"],
+        "CITATION.cff": citation["version"],
+        "CHANGELOG.md": newest[1],
+        "installed": importlib.metadata.version("etid"),
+    }
+    assert said == dict.fromkeys(said, etid.__version__)
+
+
+def test_citation_follows_its_format(citation):
+    assert set(citation) <= set(CITATION_KEYS)
+    assert set(citation) >= set(CITATION_KEYS[:4])
+    assert citation["cff-version"] == "1.2.0"
+    assert citation["type"] in ("software", "dataset")
+    assert all(isinstance(citation[key], str) for key in ("message", "title", "version"))
+    assert all(each.keys() <= {"name", "orcid", "website"} for each in citation["authors"])
+
+
+def test_citation_says_what_the_project_says(citation, project):
+    assert citation["license"] == project["license"]
+    assert citation["keywords"] == project["keywords"]
+    assert [each["name"] for each in citation["authors"]] == [
+        each["name"] for each in project["authors"]
+    ]
+
+
+def test_types_are_shipped(project):
+    assert (ROOT / "etid" / "py.typed").is_file()
+    assert "Typing :: Typed" in project["classifiers"]
+
+
+def test_dependencies_have_lower_bounds_and_exact_versions_in_the_constraints(project):
+    pinned = {
+        line.split("==")[0].lower().replace("_", "-")
+        for line in (ROOT / "constraints.txt").read_text("utf-8").split()
+    }
+    extras = [each for extra in project["optional-dependencies"].values() for each in extra]
+    for requirement in [*project["dependencies"], *extras]:
+        name, bound = requirement.split(">=")
+        assert bound[0].isdigit()
+        assert name.lower() in pinned, f"{name} is not in constraints.txt"
