@@ -10,6 +10,7 @@ from etid.plotting.style import COLOURS as COLOURS
 from etid.plotting.style import DASHES as DASHES
 from etid.plotting.style import INK as INK
 from etid.plotting.style import MARKS as MARKS
+from etid.plotting.style import new_figure as new_figure
 
 
 def save(figure: Figure, path: pathlib.Path) -> None:

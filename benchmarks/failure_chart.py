@@ -70,7 +70,7 @@ def draw(rows: Sequence[Mapping[str, Any]], path: pathlib.Path) -> None:
     methods, down, across = (_labels(rows, name) for name in ("method", "row", "column"))
     count = len(methods) + 1
     high = -(-count // COLUMNS)
-    figure, axes = charts.new(
+    figure, axes = charts.new_figure(
         high, COLUMNS, (COLUMNS * PANEL[0], high * PANEL[1] + 0.8), sharey=True
     )
     panels = list(axes.flat)

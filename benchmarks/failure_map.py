@@ -39,7 +39,7 @@ from etid import streaming
 RATES, SILENT = "failures.csv", "silent_failures.csv"
 TARGET = 1e-3  # silent failures of the default method
 ALL = 2 * MOST  # trials of a driver
-DRIVERS = 6
+DRIVERS = 3  # an hour on two cores
 QUICK = {**dict.fromkeys(OURS, Effort(1, ALL)), "output_error": Effort(1, 2)}
 USUAL = 10_000.0  # samples of three periods at 200 kHz
 CHUNK = 8  # cells of one task

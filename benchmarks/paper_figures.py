@@ -72,7 +72,7 @@ def pulses(study: etid.Study, path: pathlib.Path) -> None:
         "dry fingertip": "typical/dry/01",
         "damp fingertip": "typical/damp/01",
     }
-    figure, axes = charts.new(1, 2, (9.5, 3.4), gridspec_kw={"width_ratios": [1, 1.6]})
+    figure, axes = charts.new_figure(1, 2, (9.5, 3.4), gridspec_kw={"width_ratios": [1, 1.6]})
     unloaded = study[CALIBRATION]
     part = pulse(unloaded)
     milliseconds = 1e3 * unloaded.time
@@ -93,7 +93,7 @@ def pulses(study: etid.Study, path: pathlib.Path) -> None:
 
 def driver(study: etid.Study, found: etid.Driver, path: pathlib.Path) -> None:
     """Figure 7: the calibration, and two resistors that the driver has not seen."""
-    figure, axes = charts.new(2, 3, (12, 4.6), gridspec_kw=HEIGHTS, sharex="col")
+    figure, axes = charts.new_figure(2, 3, (12, 4.6), gridspec_kw=HEIGHTS, sharex="col")
     known = experiments.TABLE_1
     resistances = {etid.scenes.resistor_label(r): r for r in known}
     for (upper, lower), of in zip(axes.T, (CALIBRATION, *RESISTORS), strict=True):
@@ -113,7 +113,7 @@ def fingertip(
     path: pathlib.Path,
 ) -> None:
     """Figures 8 and 9: a fingertip as the default method finds it, and its impedance."""
-    figure, axes = charts.new(2, 3, (12.5, 4.8), gridspec_kw=HEIGHTS)
+    figure, axes = charts.new_figure(2, 3, (12.5, 4.8), gridspec_kw=HEIGHTS)
     name = f"typical/{condition}/01"
     for (upper, lower), laboratory in zip(axes.T[:2], (GOOD, NOISY), strict=True):
         record, outcome = shown[laboratory][name], first[laboratory, OURS]
@@ -165,7 +165,7 @@ def _legend_above(figure: Figure, axes: Axes) -> None:
 
 def subjects(first: Mapping[tuple[str, str], Outcome], truth: Truth, path: pathlib.Path) -> None:
     """Figure 10: true and identified elements of all subjects; the paper's range is grey."""
-    figure, axes = charts.new(len(ORDER), 2, (10.5, 7.5), sharex="col")
+    figure, axes = charts.new_figure(len(ORDER), 2, (10.5, 7.5), sharex="col")
     for column, condition in zip(axes.T, experiments.FINGERTIPS, strict=True):
         for axis, name in zip(column, ORDER, strict=True):
             _elements_of(axis, first, truth, condition, name)
@@ -221,7 +221,7 @@ def _elements_of(
 
 def causes(rows: Sequence[Row], path: pathlib.Path) -> None:
     """Error and scatter by laboratory and element, beside what the paper prints."""
-    figure, axes = charts.new(1, len(ORDER), (11, 3.6), sharey=True)
+    figure, axes = charts.new_figure(1, len(ORDER), (11, 3.6), sharey=True)
     laboratories = list(dict.fromkeys(row["laboratory"] for row in rows))
     names = ["paper", *laboratories]
     for axis, element in zip(axes[0], ORDER, strict=True):

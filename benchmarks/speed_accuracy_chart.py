@@ -47,7 +47,7 @@ def chart(rows: Sequence[Mapping[str, Any]], path: pathlib.Path) -> None:
     """Draw all scenes of a table."""
     names = list(dict.fromkeys(row["scene"] for row in rows))
     down = -(-len(names) // COLUMNS)
-    figure, axes = charts.new(
+    figure, axes = charts.new_figure(
         down, min(COLUMNS, len(names)), (11.5, 3.4 * down + 0.9), sharex=True, sharey=True
     )
     for panel, name in zip(axes.flat, names, strict=False):

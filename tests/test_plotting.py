@@ -6,6 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from matplotlib.colors import to_hex
+from matplotlib.patches import Rectangle
 from matplotlib.testing.compare import compare_images
 
 import etid
@@ -47,8 +48,8 @@ def driver():
 
 def test_a_recording_is_shown_whole_and_by_one_pulse(recording):
     whole, one = figure_of(recording).axes
-    np.testing.assert_array_equal(whole.lines[0].get_ydata(), recording.v_th)
-    np.testing.assert_array_equal(whole.lines[1].get_ydata(), recording.v_out)
+    np.testing.assert_array_equal(np.asarray(whole.lines[0].get_ydata()), recording.v_th)
+    np.testing.assert_array_equal(np.asarray(whole.lines[1].get_ydata()), recording.v_out)
     shown = np.asarray(one.lines[0].get_ydata())
     assert shown.size < 0.1 * recording.v_th.size
     assert np.ptp(shown) > 0.8 * np.ptp(recording.v_th)
@@ -62,8 +63,11 @@ def test_a_fit_shows_its_residual_in_millivolts_in_a_band_of_two_sigma(recording
     upper, lower = figure_of(fit, recording, driver).axes
     assert (upper.get_ylabel(), lower.get_ylabel()) == ("voltage [V]", "residual [mV]")
     predicted, measured = (np.asarray(upper.lines[i].get_ydata()) for i in (2, 1))
-    np.testing.assert_allclose(lower.lines[-1].get_ydata(), 1e3 * (predicted - measured))
+    np.testing.assert_allclose(
+        np.asarray(lower.lines[-1].get_ydata()), 1e3 * (predicted - measured)
+    )
     (band,) = lower.patches
+    assert isinstance(band, Rectangle)
     bottom, height = band.get_xy()[1], band.get_height()
     sigma = residual_std(recording, driver, fit.circuit)
     np.testing.assert_allclose((bottom, height), (-2e3 * sigma, 4e3 * sigma))
@@ -98,10 +102,10 @@ def test_what_did_not_succeed_looks_so(recording, driver):
 
 def test_an_impedance_is_in_kilohms_and_degrees_in_a_band_of_two_standard_errors(driver):
     magnitude, phase = figure_of({"Z_th": driver}).axes
-    kilohertz, size = magnitude.lines[0].get_data()
+    kilohertz, size = (np.asarray(of, float) for of in magnitude.lines[0].get_data())
     z = np.asarray(driver.response(jnp.asarray(kilohertz) * 1e3))
     np.testing.assert_allclose(size, np.abs(z) / 1e3)
-    np.testing.assert_allclose(phase.lines[0].get_ydata(), np.degrees(np.angle(z)))
+    np.testing.assert_allclose(np.asarray(phase.lines[0].get_ydata()), np.degrees(np.angle(z)))
     assert (magnitude.get_ylabel(), phase.get_ylabel()) == ("|Z| [kΩ]", "phase [deg]")
     assert phase.get_xlabel() == "frequency [kHz]"
     (band,) = magnitude.collections

@@ -58,9 +58,9 @@ def draw_fit(canvas: Canvas, fit: Fit, recording: Recording, driver: Driver) -> 
         )
     axes = canvas(2, 1, (6.0, 4.8), **PAIR).ravel()
     if np.isfinite(np.asarray(fit.circuit.values())).all():
-        draw_pulse(*axes, recording, driver, fit.circuit)
+        draw_pulse(axes[0], axes[1], recording, driver, fit.circuit)
     else:
-        _unpredicted(*axes, recording)
+        _unpredicted(axes[0], axes[1], recording)
     good = fit.verdict == "successful"
     elements = []
     for name, unit in fit.circuit.units().items():
@@ -79,7 +79,7 @@ def draw_calibration(canvas: Canvas, driver: Driver, recording: Recording) -> np
             "draw the fit of it, plot(fit, recording, driver)"
         )
     axes = canvas(2, 1, (6.0, 4.8), **PAIR).ravel()
-    draw_pulse(*axes, recording, driver, Resistor(recording.r_load))
+    draw_pulse(axes[0], axes[1], recording, driver, Resistor(recording.r_load))
     lines = [_headline(recording, driver), f"driver of order {driver.order}, "]
     lines[1] += f"known load {recording.r_load / 1e3:g} kΩ"
     titled(axes[0], lines, good=driver.verdict == "successful")

@@ -24,7 +24,7 @@ RED = "#c0392b"
 COLOURS = (BLUE, RED, "#2e7d32", INK)
 DASHES = ("-", "--", "-.", ":", (0, (5, 1, 1, 1, 1, 1)), (0, (1, 3)))
 MARKS = ("o", "s", "^", "D", "v", "P", "X", "<", ">", "p", "h", "*")
-PAPER = {
+PAPER: Any = {
     "figure.facecolor": "white",
     "axes.facecolor": "white",
     "axes.edgecolor": INK,
@@ -99,7 +99,7 @@ def plain_ticks(axis: Axis) -> None:
 
 def titled(axis: Axes, lines: Sequence[str], *, good: bool = True) -> None:
     """Set a title to the left; red and bold over what must not be taken for a result."""
-    look = {"color": INK} if good else {"color": RED, "fontweight": "bold"}
+    look: dict[str, Any] = {"color": INK} if good else {"color": RED, "fontweight": "bold"}
     axis.set_title("\n".join(filter(None, lines)), loc="left", fontsize=9, **look)
 
 
