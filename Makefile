@@ -2,7 +2,8 @@
 #   make demo    simulate the paper's experiments, identify them, print the tables: demo/index.html
 #   make test    the ordinary tests
 #   make ranking the benchmarks in short: which estimator is better, and is any wrong silently
-#   make docs    the site: site/index.html; its notebooks are executed
+#   make notebooks  executes the notebooks: notebooks/*.ipynb, with their figures
+#   make docs    the site: site/index.html; the notebooks are its gallery
 #   make wheel-test  the wheel in empty environments: PYTHONS="python3.11 python3.13" DEPENDENCIES=oldest
 #   make lint    style;  make types    static types;  make clean    remove what was made
 
@@ -15,7 +16,7 @@ DEPENDENCIES ?= newest
 # What notebooks compile is kept where the tests keep it.
 COMPILED := JAX_COMPILATION_CACHE_DIR=$(CURDIR)/.pytest_cache/d/xla JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS=0
 
-.PHONY: demo test ranking docs wheel-test lint types clean
+.PHONY: demo test ranking notebooks docs wheel-test lint types clean
 
 demo: .venv/package
 	$(BIN)/python -m etid.demo demo/
@@ -24,7 +25,11 @@ test: .venv/tools
 	$(BIN)/python -m pytest --numprocesses auto --dist loadfile
 
 ranking: .venv/tools
-	$(BIN)/python -m benchmarks speed_accuracy --quick --folder results/quick
+	$(COMPILED) $(BIN)/python -m benchmarks speed_accuracy --quick --folder results/quick
+	$(COMPILED) $(BIN)/python -m benchmarks failure_map --quick --folder results/quick
+
+notebooks: .venv/tools
+	$(BIN)/python -m pytest tests/test_notebooks.py -m notebook --numprocesses auto
 
 docs: .venv/docs
 	$(COMPILED) NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build

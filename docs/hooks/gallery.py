@@ -1,4 +1,4 @@
-"""Notebooks as pages: executed from top to bottom when the site is built, with their figures.
+"""Notebooks as pages, with their figures: executed by `make notebooks`, or else here.
 
 What is shown was made by the code that stands above it. Each becomes a page `notebooks/NAME.md`;
 the mark `<!-- gallery -->` lists them with their first figure.
@@ -12,6 +12,7 @@ import time
 import jupytext
 import nbclient
 import nbconvert
+import nbformat
 from mkdocs.plugins import event_priority, get_plugin_logger
 from mkdocs.structure.files import File
 
@@ -22,15 +23,24 @@ SECONDS = 300  # of one notebook
 log = get_plugin_logger("gallery")
 
 
-@functools.cache  # while a site is served, only what was changed is executed again
-def executed(text):
+def executed(path):
     """Markdown of an executed notebook, its figures by name, and the time it took [s]."""
+    made = path.with_suffix(".ipynb")
+    if made.exists() and made.stat().st_mtime > path.stat().st_mtime:
+        notebook = nbformat.read(made, as_version=4)
+        taken = notebook.metadata["etid"]["seconds"]
+    else:
+        notebook, taken = _execute(path.read_text("utf-8"))
+    body, resources = nbconvert.MarkdownExporter().from_notebook_node(notebook)
+    return body, resources["outputs"], taken
+
+
+@functools.cache  # while a site is served, only what was changed is executed again
+def _execute(text):
     notebook = jupytext.reads(text, fmt="py:percent")
     begun = time.perf_counter()
     nbclient.NotebookClient(notebook, timeout=SECONDS, kernel_name="python3").execute()
-    taken = time.perf_counter() - begun
-    body, resources = nbconvert.MarkdownExporter().from_notebook_node(notebook)
-    return body, resources["outputs"], taken
+    return notebook, time.perf_counter() - begun
 
 
 def on_config(config):
@@ -46,8 +56,8 @@ def on_config(config):
 def on_files(files, config):
     """Execute the notebooks and add their pages and figures."""
     for path in _notebooks():
-        body, figures, taken = executed(path.read_text("utf-8"))
-        log.info("%s executed in %.0f s", path.name, taken)
+        body, figures, taken = executed(path)
+        log.info("%s: executed in %.0f s", path.name, taken)
         for name, content in figures.items():
             place = f"notebooks/{path.stem}_{name}"
             files.append(File.generated(config, place, content=content))

@@ -1,0 +1,239 @@
+# ---
+# jupyter:
+#   jupytext:
+#     text_representation:
+#       extension: .py
+#       format_name: percent
+#   kernelspec:
+#     display_name: Python 3
+#     language: python
+#     name: python3
+# ---
+
+# %% [markdown]
+# # A batch study
+#
+# At the end you will know how to get from a file with subjects, conditions and trials to a table of
+# fits, and how to tell three things apart that one spread mixes up: how people differ, how trials
+# of one person differ, and what is only measurement. You will also know the fourth, which no spread
+# shows at all.
+
+# %%
+# %matplotlib inline
+import pathlib
+import tempfile
+
+import jax
+
+jax.config.update("jax_enable_x64", True)  # before the first array: etid needs float64
+
+import matplotlib.pyplot as plt
+import numpy as np
+import scipy.stats
+
+import etid
+from etid.scenes import Scene, SkinLoad, Trial, paper_calibration
+
+SEED = 0
+
+# %% [markdown]
+# ## A study whose truth is known
+# Eight subjects, dry and damp, six trials each: 96 recordings with 40 dB, behind one driver.
+# Elements differ between subjects and between trials by log-normal factors. R_s lies deep and is
+# the same in every trial of a subject; R_p and C_p belong to the outer skin and are not. With
+# recordings of your own, the next cell is all that falls away.
+
+# %%
+SUBJECTS, TRIALS = 8, 6
+ELEMENTS = ("r_s", "r_p", "c_p")
+TYPICAL = {"dry": (33.4e3, 186e3, 0.12e-9), "damp": (6.1e3, 17.4e3, 0.66e-9)}
+BETWEEN_SUBJECTS = np.array([0.25, 0.30, 0.20])  # standard deviations of logarithms
+BETWEEN_TRIALS = np.array([0.0, 0.06, 0.03])
+
+rng = np.random.default_rng(SEED)
+trials = []
+for number in range(1, SUBJECTS + 1):
+    person = np.exp(BETWEEN_SUBJECTS * rng.standard_normal(3))
+    for condition, typical in TYPICAL.items():
+        for trial in range(1, TRIALS + 1):
+            elements = typical * person * np.exp(BETWEEN_TRIALS * rng.standard_normal(3))
+            labels = {"subject": f"s{number}", "condition": condition, "trial": str(trial)}
+            trials.append(Trial("/".join(labels.values()), SkinLoad(*elements), **labels))
+scene = Scene(tuple(trials), paper_calibration().calibration, snr_db=40.0)
+study, truth = scene.simulate(SEED), scene.truth()
+
+# %% [markdown]
+# ## From a file to a file
+# In a terminal it is `etid fit study.h5 -o fits.h5`. A file may have any size: it is fitted in
+# parts, and a run that was interrupted goes on with `resume=True`.
+
+# %%
+with tempfile.TemporaryDirectory() as name:
+    folder = pathlib.Path(name)
+    study.write(folder / "study.h5")
+    etid.fit_file(folder / "study.h5", folder / "fits.h5")
+    fits = etid.Fits.read(folder / "fits.h5")
+print(fits)
+
+# %%
+axes = etid.plot(fits)
+
+# %% [markdown]
+# ## What a spread is made of
+# Of each subject's six trials, `summary` gives the standard deviation (`spread`), what noise alone
+# would make of it (`own`), what is left (`between`), and the error that all fits have in common
+# because they have one driver (`shared`). In per cent of R_s:
+
+# %%
+PARTS = ("spread", "own", "between", "shared")
+rows = fits.summary("subject", "condition")
+print("subject  " + "".join(f"{part:>9}" for part in PARTS))
+for row in rows:
+    if row["condition"] == "dry":
+        values = "".join(f"{100 * row[f'r_s_{part}'] / row['r_s']:9.2f}" for part in PARTS)
+        print(f"{row['subject']:<9}" + values)
+
+# %% [markdown]
+# R_s is the same in every trial of a subject here, and yet it spreads by some per cent: that is
+# noise. Six trials are few to tell it, so some subjects seem to vary and some do not. All subjects
+# together tell it well.
+#
+# ## Variance components
+# Let y be the logarithm of an element in trial t of subject s, in one condition:
+#
+# $$y_{st} = \mu + \text{subject}_s + \text{trial}_{st} + \text{noise}_{st} + \text{driver}$$
+#
+# With T trials of each of S subjects, the mean squares within and between subjects are expected to
+# be (Searle, Casella, McCulloch, *Variance Components*, 1992, chapter 3)
+#
+# $$M_\text{within} = \sigma_\text{trial}^2 + \sigma_\text{own}^2, \qquad
+# M_\text{between} = M_\text{within} + T\,\sigma_\text{subject}^2,$$
+#
+# and σ_own is known, because every fit has its own standard error. The driver's error is in neither
+# of them.
+
+
+# %%
+def components(condition, element):
+    """Variances of the logarithm of an element: subjects, trials, noise, driver."""
+    part, i = fits.where(condition=condition), ELEMENTS.index(element)
+    value = np.asarray(getattr(part.circuit, element))
+    shared = np.mean(part.fit.shared_cov[:, i, i] / value**2)
+    own = np.mean(part.cov[:, i, i] / value**2) - shared
+    y = np.log(value).reshape(SUBJECTS, TRIALS)  # a file gives recordings in order of their paths
+    within = y.var(axis=1, ddof=1).mean()
+    between = TRIALS * y.mean(axis=1).var(ddof=1)
+    return np.array([(between - within) / TRIALS, within - own, own, shared])
+
+
+def true_components(condition, element):
+    """The same of the elements that were simulated."""
+    paths = fits.where(condition=condition).labels["path"]
+    y = np.log([truth[path][element] for path in paths]).reshape(SUBJECTS, TRIALS)
+    within = y.var(axis=1, ddof=1).mean()
+    return np.array([y.mean(axis=1).var(ddof=1) - within / TRIALS, within])
+
+
+CASES = [(condition, element) for condition in TYPICAL for element in ELEMENTS]
+found = {case: components(*case) for case in CASES}
+true = {case: true_components(*case) for case in CASES}
+print("standard deviations [%]   subjects (true)     trials (true)     noise   driver")
+for case in CASES:
+    s = 100 * np.sqrt(np.maximum(found[case], 0))
+    t = 100 * np.sqrt(np.maximum(true[case], 0))
+    print(
+        f"{case[0]:>5} {case[1]:<18}{s[0]:10.1f} ({t[0]:.1f})"
+        f"{s[1]:12.2f} ({t[1]:.2f}){s[2]:10.2f}{s[3]:9.2f}"
+    )
+
+# %%
+figure, axes = plt.subplots(1, 2, figsize=(9, 3.2), sharey=True, layout="constrained")
+HATCHES = ("", "///", "...", "xxx")
+for axis, condition in zip(axes, TYPICAL, strict=True):
+    for j, part in enumerate(("subjects", "trials", "noise", "driver")):
+        height = [np.sqrt(max(found[condition, element][j], 0)) for element in ELEMENTS]
+        place = np.arange(3) + 0.2 * j - 0.3
+        axis.bar(
+            place, 100 * np.array(height), 0.18, label=part, hatch=HATCHES[j], fc=f"C{j}", ec="0.2"
+        )
+        if j < 2:
+            height = [np.sqrt(max(true[condition, element][j], 0)) for element in ELEMENTS]
+            axis.plot(place, 100 * np.array(height), "k_", ms=12, label="true" if j else None)
+    axis.set(title=condition, xticks=range(3), xticklabels=ELEMENTS, yscale="log", ylim=(0.3, 60))
+axes[0].set_ylabel("standard deviation [%]")
+axes[1].legend(fontsize=8, ncols=2)
+# %% [markdown]
+# Spreads of R_s between trials are noise and nothing else, and the estimate says so. `between` of
+# `summary` is the same for one subject.
+#
+# ## The error that no spread shows
+# All 96 fits rest on one driver, and its error moves them together. Only because the truth is known
+# here can it be seen: the mean error of 48 fits should be a seventh of the noise, and is not.
+
+# %%
+print("mean error of 48 fits [%]   found   noise of a mean   driver")
+common = {}
+for condition, element in CASES:
+    part = fits.where(condition=condition)
+    value = np.asarray(getattr(part.circuit, element))
+    known = np.array([truth[path][element] for path in part.labels["path"]])
+    noise = np.sqrt(found[condition, element][2] / len(part))
+    driver = np.sqrt(found[condition, element][3])
+    common[condition, element] = np.log(value / known).mean(), noise, driver
+    print(
+        f"{condition:>5} {element:<20}{{:+8.2f}}{{:14.2f}}{{:12.2f}}".format(
+            *100 * np.array(common[condition, element])
+        )
+    )
+
+# %% [markdown]
+# ## What the next study needs
+# The mean over all subjects is as uncertain as its parts make it: σ_subject² / S from people,
+# (σ_trial² + σ_own²) / ST from trials and noise, and the whole of the driver's variance, which no
+# number of subjects or trials reduces. What does reduce it: a longer calibration, one more
+# resistor, or `etid.identify_jointly`. The tolerance of the resistor comes on top.
+
+# %%
+print("standard errors of the means, dry [%]:   r_s     r_p     c_p")
+for subjects, trials_each in ((8, 6), (8, 60), (80, 6)):
+    person, trial, own, shared = np.maximum([found["dry", name] for name in ELEMENTS], 0).T
+    sampled = person / subjects + (trial + own) / (subjects * trials_each)
+    total = 100 * np.sqrt(sampled + shared)
+    print(
+        f"{subjects:>15} subjects, {trials_each:>2} trials:"
+        + "{:8.1f}{:8.1f}{:8.1f}".format(*total)
+    )
+
+# %% [markdown]
+# More trials of the same people are worth nothing here. And eight people tell a spread between
+# people only to within a factor: with S − 1 degrees of freedom, its 95 % interval is
+
+# %%
+QUANTILES = scipy.stats.chi2.ppf([0.025, 0.975], SUBJECTS - 1)
+for element, population in zip(ELEMENTS, BETWEEN_SUBJECTS, strict=True):
+    high, low = 100 * np.sqrt(found["dry", element][0] * (SUBJECTS - 1) / QUANTILES)
+    print(f"{element}: {low:.0f} to {high:.0f} %, drawn from {100 * population:.0f} %")
+
+# %% [markdown]
+# ## What must hold
+# Estimates are compared with the spreads that were really drawn, so that only measurement parts
+# them. With ν = S (T − 1) degrees of freedom the variance of σ_trial² is
+# (2σ_own⁴ + 4σ_own²σ_trial²) / ν, and that of σ_subject² is 4σ_subject² (σ_own² / T +
+# σ_driver²) / (S − 1) at most. Four standard errors: once in 16 000 by chance. With the noise left
+# in, the same test fails.
+
+# %%
+assert fits.counts() == {"successful": SUBJECTS * TRIALS * len(TYPICAL)}
+nu = SUBJECTS * (TRIALS - 1)
+for case in CASES:
+    subject, trial, own, shared = found[case]
+    true_subject, true_trial = true[case]
+    of_trial = np.sqrt((2 * own**2 + 4 * own * true_trial) / nu)
+    of_subject = np.sqrt(4 * true_subject * (own / TRIALS + shared) / (SUBJECTS - 1))
+    assert abs(trial - true_trial) < 4 * of_trial, case
+    assert abs(subject - true_subject) < 4 * of_subject < 0.5 * true_subject, case
+    if true_trial == 0:
+        assert trial + own > 3 * of_trial, case  # the spread as it is: 4.5 are to be expected
+    error, noise, driver = common[case]
+    assert abs(error) < 4 * np.hypot(noise, driver), case
+assert max(abs(error) / noise for error, noise, _ in common.values()) > 5  # no noise, but a driver
