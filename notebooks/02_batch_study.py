@@ -159,7 +159,7 @@ for axis, condition in zip(axes, TYPICAL, strict=True):
         if j < 2:
             height = [np.sqrt(max(true[condition, element][j], 0)) for element in ELEMENTS]
             axis.plot(place, 100 * np.array(height), "k_", ms=12, label="true" if j else None)
-    axis.set(title=condition, xticks=range(3), xticklabels=ELEMENTS, yscale="log", ylim=(0.3, 60))
+    axis.set(title=condition, xticks=range(3), xticklabels=ELEMENTS, yscale="log", ylim=(0.3, 200))
 axes[0].set_ylabel("standard deviation [%]")
 axes[1].legend(fontsize=8, ncols=2)
 # %% [markdown]

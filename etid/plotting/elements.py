@@ -131,7 +131,7 @@ def draw_bounds(canvas: Canvas, bounds: Sequence[Bound]) -> np.ndarray:
     axis.set_xscale("log")
     if undetermined:
         axis.axvline(100 * UNDETERMINED, color=RED, lw=0.9, ls="--")
-    axis.xaxis.set_major_formatter("{x:g}")
+    plain_ticks(axis.xaxis)
     axis.set_xlabel("smallest relative standard error [%]")
     axis.set_yticks(range(len(bounds)), [one.path or "-" for one in bounds])
     axis.set_ylim(len(bounds) - 0.5, -0.5)
