@@ -99,6 +99,7 @@ def test_scipy_and_we_do_the_same_before_the_fit(short_problem):
         np.testing.assert_allclose(ours, theirs, rtol=1e-8)
 
 
+@pytest.mark.slow
 def test_numpy_writes_the_same_terms(short_problem):
     load = short_problem.load(jax.tree.map(lambda leaf: leaf[0], short_problem.lanes))
     by, q = ByNumPy(load), START + 0.01

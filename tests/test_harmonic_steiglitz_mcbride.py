@@ -118,6 +118,7 @@ def test_noise_leaves_no_bias(name):
     assert bool(found.converged.all())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", LOADS)
 def test_the_covariance_is_that_of_many_draws(name):
     """256 of them, each with its own covariance, of which the mean is compared."""

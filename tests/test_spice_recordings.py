@@ -140,6 +140,7 @@ def test_a_clipped_calibration_is_refused_and_costs_its_trials(spice):
     assert np.isnan(np.asarray(result.fits.circuit.values())).all()
 
 
+@pytest.mark.slow
 def test_the_papers_method_says_that_its_noisy_fits_are_none(spice):
     """At 30 dB its R_s is 83 % off: whatever the verdicts are, none may be successful."""
     result, _ = spice("paper_noise_built", method="steiglitz_mcbride")
