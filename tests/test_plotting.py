@@ -94,7 +94,8 @@ def test_what_did_not_succeed_looks_so(recording, driver):
     assert "no success: misfit" in upper.get_title(loc="left")
     assert to_hex(upper._left_title.get_color()) == RED  # pyright: ignore[reportAttributeAccessIssue]
     nothing = pictures.SKIN.with_log_values(jnp.full(3, jnp.nan))
-    _, lower = figure_of(pictures.fit("too_short", nothing), recording, driver).axes
+    upper, lower = figure_of(pictures.fit("too_short", nothing), recording, driver).axes
+    assert "nan" not in upper.get_title(loc="left")
     assert [text.get_text() for text in lower.texts] == ["no elements, nothing predicted"]
     magnitude, _ = figure_of(pictures.driver("order_too_low")).axes
     assert "no success: order_too_low" in magnitude.get_title(loc="left")

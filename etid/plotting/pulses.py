@@ -57,11 +57,12 @@ def draw_fit(canvas: Canvas, fit: Fit, recording: Recording, driver: Driver) -> 
             "plot(fits)"
         )
     axes = canvas(2, 1, (6.0, 4.8), **PAIR).ravel()
-    if np.isfinite(np.asarray(fit.circuit.values())).all():
-        draw_pulse(axes[0], axes[1], recording, driver, fit.circuit)
-    else:
-        _unpredicted(axes[0], axes[1], recording)
     good = fit.verdict == "successful"
+    if not np.isfinite(np.asarray(fit.circuit.values())).all():
+        _unpredicted(axes[0], axes[1], recording)
+        titled(axes[0], [_headline(recording, fit)], good=good)
+        return axes
+    draw_pulse(axes[0], axes[1], recording, driver, fit.circuit)
     elements = []
     for name, unit in fit.circuit.units().items():
         scale, symbol = DISPLAY[unit]
