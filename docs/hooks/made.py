@@ -51,7 +51,7 @@ def commands():
 def reference():
     """Every name that `import etid` gives."""
     tree = ast.parse(pathlib.Path(etid.__file__).read_text("utf-8"))
-    imports = [node for node in tree.body if isinstance(node, ast.ImportFrom)]
+    imports = [node for node in ast.walk(tree) if isinstance(node, ast.ImportFrom)]
     names = sorted(
         (each.asname for node in imports for each in node.names if each.asname), key=str.lower
     )
