@@ -285,6 +285,7 @@ def test_it_needs_a_continuous_source_and_a_skin(driver):
         etid.identify_skin(study["a"], driver, method=METHOD, circuit=etid.Resistor())
 
 
+@pytest.mark.slow
 def test_the_driver_of_a_study_is_that_of_maximum_likelihood():
     result = etid.identify_study(simulate(LOADS["dry"], seed=3), method=METHOD)
     assert [d.method for d in result.drivers.values()] == ["maximum_likelihood"]

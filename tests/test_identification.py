@@ -145,6 +145,7 @@ def test_a_driver_serves_another_sample_rate(study):
 TWO = tuple(Trial(f"calibration/{i}", ResistorLoad(r)) for i, r in enumerate((21.62e3, 98.8e3)))
 
 
+@pytest.mark.slow
 def test_several_calibrations_make_one_driver():
     study = scene(calibration=TWO).simulate(seed=4)
     result = etid.identify_study(study, method="equation_error")
@@ -207,6 +208,7 @@ def test_prediction_holds_from_the_first_sample_behind_a_late_calibration():
         assert np.nanmax(np.abs(residual)) < 0.1 * np.ptp(recording.v_out)
 
 
+@pytest.mark.slow
 def test_a_circuit_of_ones_own_is_identified(driver):
     resistors = scene(trials=(Trial("r/21k62", ResistorLoad(21.62e3)),)).simulate(seed=9)
     recording = next(iter(resistors.loaded.recordings()))

@@ -187,6 +187,7 @@ class Wall(etid.AbstractCircuit):
 LEVEL = float(jnp.exp(jnp.log(100e3)))  # where its fit starts, rounded as the fit rounds it
 
 
+@pytest.mark.slow
 def test_a_solver_that_cannot_move_reports_no_success(driver):
     """The slope says down, and no step is small enough: that is no convergence."""
     recording = simulate(ResistorLoad(50e3))["loaded/0"]
