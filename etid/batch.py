@@ -148,20 +148,31 @@ class _Queue:
         self.method: Method = method
         self.rows: list[int] = []
         self.lanes: list[tuple[np.ndarray, ...]] = []
+        self.remarks: list[np.ndarray] = []
+
+    def add(self, row: int, lane: tuple[np.ndarray, ...], remarks: np.ndarray) -> None:
+        """Let a recording wait."""
+        self.rows.append(row)
+        self.lanes.append(lane)
+        self.remarks.append(remarks)
 
     def run(self) -> Iterable[tuple[int, Fit]]:
         """Fit what is waiting."""
         lanes, count = filled(self.lanes), jnp.asarray(len(self.lanes))
         of = self.driver, self.known, self.circuit, self.method
         fits = jax.device_get(_chunk(lanes, count, *of))
-        yield from zip(self.rows, unstacked(fits), strict=False)  # what fills it up is left out
-        self.rows, self.lanes = [], []
+        # What fills it up is left out.
+        for row, remarks, fit in zip(self.rows, self.remarks, unstacked(fits), strict=False):
+            yield row, dataclasses.replace(fit, remarks=remarks)
+        self.rows, self.lanes, self.remarks = [], [], []
 
 
 def unstacked(fits: Fit) -> Iterator[Fit]:
     """The fits of a chunk one by one."""
     leaves, structure = jax.tree.flatten(fits)
-    return (jax.tree.unflatten(structure, one) for one in zip(*leaves, strict=True))
+    return (
+        jax.tree.unflatten(structure, map(np.asarray, one)) for one in zip(*leaves, strict=True)
+    )
 
 
 def _identify(
@@ -186,7 +197,8 @@ def _identify(
                 raise Refusal("not_periodic", str(error)) from error
         rates = seen.recording.sample_rate, seen.recording.pulse_rate
         waiting, shared = lane(seen, method), is_shared(seen, driver)
-        return driver, waiting, method, shared, (id(driver), method, waiting[0].size, shared, rates)
+        key = id(driver), method, waiting[0].size, shared, rates
+        return driver, waiting, np.asarray(int(seen.remarks)), method, shared, key
 
     with (
         tqdm(total=count, unit="fit", disable=not progress) as bar,
@@ -202,7 +214,7 @@ def _identify(
 
         for row, prepared in enumerate(recordings):
             try:
-                driver, waiting, method, shared, key = prepared()
+                driver, waiting, remarks, method, shared, key = prepared()
             except Refusal as refusal:
                 fits[row] = failed_fit(refusal.name, circuit, given or "maximum_likelihood")
                 notes[row] = refusal.note
@@ -212,8 +224,7 @@ def _identify(
                 known = known_driver(waiting, driver, method, shared)
                 queues[key] = _Queue(driver, known, circuit, method)
             queue = queues[key]
-            queue.rows.append(row)
-            queue.lanes.append(waiting)
+            queue.add(row, waiting, remarks)
             if len(queue.rows) == LANES:
                 run(queue)
         for queue in queues.values():

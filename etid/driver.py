@@ -16,6 +16,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Complex, Float, Int
 
 from etid.filtering import StateSpace
+from etid.remarks import texts
 from etid.spectra import Spectrum
 from etid.transfer import Rational, as_complex, delay_variable, frequency_variable, reciprocal
 from etid.uncertainty import log_stderr
@@ -156,6 +157,7 @@ class Driver(eqx.Module):
         result: Verdict.
         steps: Iterations of the solver.
         method: Name of the estimator.
+        remarks: What was done to the calibrations before, `etid.remarks.Remark` as an integer.
     """
 
     b: Float[Array, " b"]
@@ -169,6 +171,7 @@ class Driver(eqx.Module):
     result: RESULTS
     steps: Int[Array, ""]
     method: str = eqx.field(static=True)
+    remarks: Int[Array | np.ndarray, ""] = eqx.field(default_factory=lambda: np.zeros((), int))
 
     @property
     def order(self) -> int:
@@ -223,4 +226,4 @@ class Driver(eqx.Module):
         text += f"  Z_th at 1 kHz {z.real / 1e3:.4g} {z.imag / 1e3:+.4g}j kΩ"
         if self.verdict != "successful":
             text += "\n  " + message(self.verdict)
-        return text
+        return "\n  ".join([text, *texts(int(self.remarks))])

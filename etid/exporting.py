@@ -23,7 +23,7 @@ ROWS = 1 << 16  # of fits in memory at once
 
 CIRCUITS = (".cir", ".json")
 
-_QUALITY = ("rrse", "chi2", "steps", "verdict", "note")
+_QUALITY = ("rrse", "chi2", "steps", "verdict", "remarks", "note")
 
 
 def export_fits(source: str | os.PathLike[str], target: str | os.PathLike[str]) -> None:

@@ -1,6 +1,8 @@
 """Identify a driver and a skin: pre-flight, baseline, refinement, verdict."""
 
 import dataclasses
+import functools
+import operator
 from collections.abc import Sequence
 from typing import Any
 
@@ -100,6 +102,8 @@ def identify_driver(
         *fields, _ = stacked([lane(one, method) for one in seen])
         spectra = Spectrum(*fields)
     driver = driver_of(stacked(list(map(arrays, seen))), r_load, order, method, spectra)
+    remarks = functools.reduce(operator.or_, (one.remarks for one in seen))
+    driver = dataclasses.replace(driver, remarks=np.asarray(int(remarks)))
     if driver.calibration is not None:
         unloaded = np.array([checksum(one) for one in seen])
         calibration = dataclasses.replace(driver.calibration, unloaded=unloaded)
@@ -115,7 +119,9 @@ def failed_fit(name: str, circuit: AbstractCircuit, method: str) -> Fit:
     nan = np.full((size, size), np.nan)
     empty = circuit.with_log_values(jnp.full(size, jnp.nan))
     scalar = np.asarray(np.nan)
-    return Fit(empty, nan, nan, scalar, scalar, verdict(name), np.asarray(0), method)
+    return Fit(
+        empty, nan, nan, scalar, scalar, verdict(name), np.asarray(0), method, np.zeros((), int)
+    )
 
 
 def identify_skin(
@@ -154,6 +160,7 @@ def identify_skin(
         one = lane(seen, chosen)
         known = known_driver(one, driver, chosen, is_shared(seen, driver))
         fit = skin(tuple(map(jnp.asarray, one)), driver, known, circuit, chosen)
+        fit = dataclasses.replace(fit, remarks=np.asarray(int(seen.remarks)))
     if throw and fit.verdict != "successful":
         text = f"recording {recording.path!r}: {fit.verdict}. {message(fit.verdict)}"
         raise IdentificationError(text, fit)

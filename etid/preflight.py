@@ -10,6 +10,7 @@ from etid.filtering import TAPS
 from etid.measurement import trusted
 from etid.noise import noise_std
 from etid.recording import Recording
+from etid.remarks import Remark
 from etid.spectra import counted_pulse_rate, whole_periods
 
 SHORTEST = 4 * TAPS + 104  # samples: the interpolation's edges and a hundred and some to fit
@@ -64,6 +65,11 @@ class Inspected:
     def sigma_out(self) -> Float[np.ndarray, ""]:
         """The same of `v_out`."""
         return np.asarray(noise_std(self.v_out, self.step_out))
+
+    @property
+    def remarks(self) -> Remark:
+        """What is done to the recording before a fit."""
+        return Remark(0)
 
     @functools.cached_property
     def periods(self) -> tuple[int, int]:

@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Array, Complex, Float, Int
 
 from etid.circuits import DISPLAY, AbstractCircuit, Resistor, SkinRC
+from etid.remarks import remarks_of, texts, words
 from etid.tables import read_table, write_table
 from etid.verdicts import RESULTS, message, verdict_names, verdicts_of
 
@@ -66,6 +67,7 @@ class Fit(eqx.Module):
         result: Verdict.
         steps: Iterations of the solver.
         method: Name of the estimator.
+        remarks: What was done to the recording before the fit, `etid.remarks.Remark` as integers.
     """
 
     circuit: AbstractCircuit
@@ -76,6 +78,7 @@ class Fit(eqx.Module):
     result: RESULTS
     steps: Int[Array | np.ndarray, "*lane"]
     method: str = eqx.field(static=True)
+    remarks: Int[Array | np.ndarray, "*lane"] = eqx.field(default_factory=lambda: np.zeros((), int))
 
     @property
     def stderr(self) -> AbstractCircuit:
@@ -106,6 +109,7 @@ class Fit(eqx.Module):
             lines.append(f"  {name:<{width}}{plus_minus(value, error)} {symbol}".rstrip())
         if self.verdict != "successful":
             lines.append("  " + message(self.verdict))
+        lines += ["  " + text for text in texts(int(self.remarks))]
         return "\n".join(lines)
 
 
@@ -213,6 +217,7 @@ class Fits:
             "chi2": np.asarray(self.chi2),
             "steps": np.asarray(self.fit.steps),
             "verdict": self.verdicts,
+            "remarks": np.array([words(one) for one in np.asarray(self.fit.remarks)], dtype=str),
             "note": self.notes,
         }
         return columns
@@ -298,7 +303,7 @@ class Fits:
         columns = self.table() | {"cov": self.cov, "shared_cov": self.fit.shared_cov}
         attributes = {
             "schema": SCHEMA,
-            "schema_version": "1.0",
+            "schema_version": "1.1",
             "etid_version": importlib.metadata.version("etid"),
             "circuit": type(self.circuit).__name__,
             "parameters": list(self.circuit.names()),
@@ -350,5 +355,9 @@ class Fits:
             result=verdicts_of(columns["verdict"]),
             steps=columns["steps"],
             method=attributes["method"],
+            # Files of schema version 1.0 have no remarks.
+            remarks=np.array([remarks_of(str(one)) for one in columns["remarks"]], int)
+            if "remarks" in columns
+            else np.zeros(len(columns["note"]), int),
         )
         return cls(fit, {name: columns[name] for name in LABELS}, columns["note"])

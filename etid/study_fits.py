@@ -15,6 +15,7 @@ import numpy as np
 
 from etid.circuits import AbstractCircuit
 from etid.driver import Calibration, Driver, SourceImpedance
+from etid.remarks import remarks_of, words
 from etid.results import SCHEMA, Fits
 from etid.settings import Settings
 from etid.tables import read_table, write_table
@@ -120,6 +121,7 @@ def _to_json(paths: tuple[str, ...], driver: Driver) -> str:
             "method": driver.method,
             "verdict": driver.verdict,
             "steps": int(driver.steps),
+            "remarks": words(int(driver.remarks)),
             "rrse": float(driver.rrse),
             "chi2": float(driver.chi2),
             "b": np.asarray(driver.b).tolist(),
@@ -156,4 +158,5 @@ def _from_json(stored: Mapping[str, Any]) -> Driver:
         result=verdicts_of(np.asarray(stored["verdict"])),
         steps=jnp.asarray(stored["steps"]),
         method=stored["method"],
+        remarks=np.asarray(remarks_of(stored.get("remarks", ""))),
     )

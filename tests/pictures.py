@@ -81,7 +81,7 @@ def fits() -> Fits:
     cov = np.stack([np.diag((RELATIVE * one) ** 2) for one in values.T])
     found = Fit(
         etid.SkinRC(*jnp.asarray(values)), cov, 0 * cov, np.full(count, 1e-3), np.ones(count),
-        verdicts_of(verdicts), np.full(count, 5), "maximum_likelihood",
+        verdicts_of(verdicts), np.full(count, 5), "maximum_likelihood", np.zeros(count, int),
     )  # fmt: skip
     labels = {
         "path": np.array([f"recording/{i:02d}" for i in range(count)]),

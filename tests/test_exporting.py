@@ -19,6 +19,7 @@ from pyarrow import parquet
 
 import etid
 from etid import cli, exporting
+from etid.remarks import Remark
 from etid.results import Fit, Fits
 from etid.verdicts import verdicts_of
 
@@ -43,6 +44,7 @@ def fits():
         result=verdicts_of(np.array(["successful"] * 4 + ["flat"] + ["successful"] * (COUNT - 5))),
         steps=np.arange(COUNT),
         method="maximum_likelihood",
+        remarks=np.arange(COUNT) % 2 * int(Remark.mains_hum),
     )
     labels = {name: np.array([f"{name} {i}" for i in range(COUNT)], object)
               for name in ("path", "subject", "condition", "electrode", "trial")}  # fmt: skip

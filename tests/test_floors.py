@@ -14,6 +14,7 @@ FLOORS = {
     "citations": 0,
     "filtering": 0,
     "noise": 0,
+    "remarks": 0,
     "report": 0,
     "precision": 0,
     "prefetch": 0,

@@ -79,7 +79,7 @@ def _fits(circuit, paths, elements, excess):
     verdicts = np.array(["successful", "misfit"] * count)[:count]
     fit = etid.Fit(
         circuit(**values), cov, 0 * cov, np.full(count, 0.05), np.ones(count),
-        verdicts_of(verdicts), np.ones(count, int), "output_error",
+        verdicts_of(verdicts), np.ones(count, int), "output_error", np.zeros(count, int),
     )  # fmt: skip
     names = ("path", "subject", "condition", "electrode", "trial")
     columns = {name: np.array([getattr(labels[path], name) for path in paths]) for name in names}

@@ -37,6 +37,7 @@ def fits_of(values, verdicts, **labels):
     fit = etid.Fit(
         etid.SkinRC(*values.T), own + shared, shared, np.full(count, 0.02), chi2,
         verdicts_of(np.asarray(verdicts)), np.full(count, 5), "maximum_likelihood",
+        np.zeros(count, int),
     )  # fmt: skip
     default = {name: np.full(count, "") for name in ("subject", "condition", "electrode", "trial")}
     columns = {"path": np.array([f"loaded/{i}" for i in range(count)])} | default
