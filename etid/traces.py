@@ -227,14 +227,17 @@ def _key(function: Callable, args: tuple, kwargs: dict) -> str | None:
 
 @functools.cache
 def _sources() -> str | None:
-    """Digest of etid's files; None if they may not be what this process has loaded."""
+    """Digest of all files of the package; None if they may not be what this process has loaded."""
     digest = hashlib.sha256()
-    paths = sorted(pathlib.Path(__file__).parent.glob("*.py"))
+    # The whole package, wherever in it this file is: a program may be traced through any of them.
+    package = pathlib.Path(str(sys.modules[__name__.partition(".")[0]].__file__)).parent
+    paths = sorted(package.rglob("*.py"))
     try:
         if not paths or max(path.stat().st_mtime for path in paths) > LOADED:
             return None
         for path in paths:
-            digest.update(path.name.encode() + b"\0" + path.read_bytes())
+            name = path.relative_to(package).as_posix()
+            digest.update(name.encode() + b"\0" + path.read_bytes() + b"\0")
     except OSError:
         return None
     return digest.hexdigest()

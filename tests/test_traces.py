@@ -2,9 +2,11 @@
 
 import collections
 import pathlib
+import shutil
 import subprocess
 import sys
 import threading
+import time
 from typing import Any
 
 import equinox as eqx
@@ -162,7 +164,7 @@ def test_a_class_from_elsewhere_is_not_stored(folder, monkeypatch):
 
 
 def test_sources_that_changed_after_they_were_loaded_are_in_no_key(folder, monkeypatch):
-    newest = max(path.stat().st_mtime for path in pathlib.Path(traces.__file__).parent.glob("*.py"))
+    newest = max(path.stat().st_mtime for path in pathlib.Path(etid.__file__).parent.rglob("*.py"))
     monkeypatch.setattr(traces, "LOADED", newest + 1)
     assert unpatched() == unpatched()
     assert unpatched() is not None
@@ -170,6 +172,27 @@ def test_sources_that_changed_after_they_were_loaded_are_in_no_key(folder, monke
     monkeypatch.setattr(traces, "_sources", unpatched)
     anew()(X, "a")
     assert not files(folder)
+
+
+def test_a_file_of_any_sub_package_is_in_the_key(tmp_path, monkeypatch):
+    """A program that was traced before an edit, or a move, must not answer after it."""
+    package = tmp_path / "etid"
+    shutil.copytree(
+        pathlib.Path(etid.__file__).parent, package, ignore=shutil.ignore_patterns("__pycache__")
+    )
+    monkeypatch.setattr(etid, "__file__", str(package / "__init__.py"))
+    monkeypatch.setattr(traces, "LOADED", time.time() + 3600)  # what is edited below is older
+    folders = sorted({path.parent for path in package.rglob("*.py")})
+    assert len(folders) > 1
+    keys = [unpatched()]
+    for folder in folders:
+        edited = sorted(folder.glob("*.py"))[0]
+        edited.write_text(edited.read_text("utf-8") + "# edited\n", "utf-8")
+        keys.append(unpatched())
+        edited.rename(edited.with_name("moved.py"))
+        keys.append(unpatched())
+    assert None not in keys
+    assert len(set(keys)) == len(keys)
 
 
 @pytest.mark.parametrize("damage", ["empty", "short", "changed", "foreign", "other", "directory"])
