@@ -110,10 +110,11 @@ def harmonics(
     coefficients = namespace(v).fft.rfft(folded) / samples
     basis, fit = _drift(periods, samples)
     # The transform is linear: that of the drift is known but for its few coefficients.
-    drift = fit @ _sums(v[:samples], periods)
+    # Sums of products, as `@` starts BLAS threads for each recording, which wait for each other.
+    drift = (fit * _sums(v[:samples], periods)[None, :]).sum(1)
     step = periods // parts
     at_harmonics = coefficients[step : (folded.size + 1) // 2 : step]
-    return at_harmonics - drift.astype(at_harmonics.dtype) @ basis
+    return at_harmonics - (drift.astype(at_harmonics.dtype)[:, None] * basis).sum(0)
 
 
 def namespace(v: Array | np.ndarray) -> ModuleType:
@@ -139,7 +140,7 @@ def _drift(
     powers = np.vander(np.linspace(-1, 1, samples), min(periods, DRIFT_DEGREE + 1), increasing=True)
     transforms = np.fft.rfft(powers, axis=0) / samples
     fit = np.linalg.pinv(np.asarray(_sums(powers, periods)))
-    return transforms[periods : (samples + 1) // 2 : periods].T, fit
+    return np.ascontiguousarray(transforms[periods : (samples + 1) // 2 : periods].T), fit
 
 
 def local_sum(values: Float[Array, " harmonic"]) -> Float[Array, " harmonic"]:

@@ -1,5 +1,9 @@
 """Harmonics: exact for periodic records, whatever the number of samples in a period."""
 
+import os
+import subprocess
+import sys
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -144,3 +148,26 @@ def test_the_share_of_signal_of_one_lane_does_not_depend_on_the_others():
         share = 1 - np.convolve(noise, box, "same") / np.convolve(power, box, "same")
         np.testing.assert_allclose(alone, np.clip(share, 0, 1), rtol=1e-12)
         np.testing.assert_array_equal(together[lane], alone)
+
+
+BUSY = """
+import os, time
+os.sched_setaffinity(0, range(os.cpu_count()))  # a test may have been given one core
+import numpy as np
+from etid.spectra import harmonics
+v = np.random.default_rng(0).normal(size=10_000)
+harmonics(v, 3, v.size)
+everyone, own = time.process_time(), time.thread_time()
+for _ in range(200):
+    harmonics(v, 3, v.size)
+own = time.thread_time() - own
+print((time.process_time() - everyone - own) / own)
+"""
+
+
+@pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="needs the cores of Linux")
+@pytest.mark.skipif(os.cpu_count() == 1, reason="one core has one thread")
+def test_harmonics_start_no_threads():
+    run = subprocess.run([sys.executable, "-c", BUSY], capture_output=True, text=True, check=True)
+    # Time of other threads over that of this one. Those of BLAS wait actively: one took 0.5 to 3.
+    assert float(run.stdout) < 0.05
