@@ -11,9 +11,9 @@ import numpy as np
 from etid import (
     circuits,
     citations,
-    dispersion,
     judging,
     missing_pole,
+    other_circuit,
     output_error,
     steiglitz_mcbride,
 )
@@ -238,8 +238,9 @@ def _verdicts(used: set[str], by_driver: set[str]) -> str:
         text += ", the trigger delay is at most one sample, every relative standard error below 1"
     if used & {"maximum_likelihood", "joint"}:
         text += (
-            ", a score test against a relaxation that is spread over time constants finds none (at "
-            f"{dispersion.SEEN:g} standard deviations)"
+            ", score tests against a relaxation that is spread over time constants (at "
+            f"{other_circuit.SEEN_SPREAD:g} standard deviations) and against one more relaxation "
+            f"(at {other_circuit.SEEN_RELAXATION:g}) find none"
         )
     if used & {"maximum_likelihood", "joint"}:
         text += (

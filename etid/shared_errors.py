@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import optimistix as optx
 from jaxtyping import Array, Bool, Float
 
-from etid import dispersion
+from etid import other_circuit
 from etid.information import Curvature, eliminate, inverse
 from etid.likelihood import denoised, excess, residual, residuals, variance, weights
 from etid.output_error import Estimate
@@ -72,7 +72,7 @@ def estimates(
 ) -> tuple[Float[Array, "common common"], list[tuple[Estimate, Bool[Array, " load"]]]]:
     """Covariance of `common`, and of each group the estimates with theirs.
 
-    And whether a load is seen to be another circuit (`etid.dispersion`).
+    And whether a load is seen to be another circuit (`etid.other_circuit`).
 
     Args:
         study: Calibrations and loads.
@@ -150,7 +150,7 @@ def _is_another(
 ) -> Bool[Array, ""]:
     """The score test on one load; `bread` and `score` are those of `common` by all terms."""
     jacobian, share = _jacobian(study, load, common, own)
-    row = _by_dispersion(study, load, common, own)
+    rows = _by_changes(study, load, common, own)
     terms = study.of_load(load, common, own)
     noise = excess(terms[:-1], load.spectrum.selected)
     slope = eliminated.slope
@@ -161,8 +161,8 @@ def _is_another(
         ]
     )
     spread = jnp.zeros_like(covariance).at[: bread.shape[0], : bread.shape[0]]
-    found = dispersion.is_seen(
-        jnp.pad(row, (0, 1)),  # no phase has an effect on the prior of the delay
+    found = other_circuit.scores(
+        jnp.pad(rows, ((0, 0), (0, 1))),  # no change has an effect on the prior of the delay
         jacobian.T,
         terms,
         -jacobian.T @ terms,  # at the minimum all other terms have the opposite gradient
@@ -170,21 +170,26 @@ def _is_another(
         covariance,
         weights([share], terms.size),
         weights([noise], terms.size),
+        slice(common.size, common.size + own.size - 1),
     )
-    return found & load.used  # what takes no part has a verdict of its own
+    return found.seen() & load.used  # what takes no part has a verdict of its own
 
 
-def _by_dispersion(study: DriverStudy, load: Loads, common, own) -> Float[Array, " part"]:
-    """Derivative of a load's denoised terms by α."""
+def _by_changes(study: DriverStudy, load: Loads, common, own) -> Float[Array, "change part"]:
+    """Derivatives of a load's denoised terms by the changes of its circuit."""
     model, f = study.model, load.spectrum.frequency
     g = model.gain(own, common, load.spectrum, load.sample_rate)
-    z, slope = dispersion.slope(model.circuit.with_log_values(own[:-1]).impedance(), f)
+    z, changes = other_circuit.changes(model.circuit.with_log_values(own[:-1]).impedance(), f)
     z_th = model.calibrations.z_th(common).response(f)
-    of_gain = g * z_th * slope * reciprocal(z * (z + z_th))
+    by_z = g * z_th * reciprocal(z * (z + z_th))
     gains = [*model.calibrations.gains(common), g]
     (*known, spectrum), _ = denoised([*model.calibrations.records, load.spectrum], gains)
     informed = model.informed(spectrum, common, known)
-    return jax.jvp(lambda g: residual(informed, g), (g,), (of_gain,))[1]
+
+    def row(change):
+        return jax.jvp(lambda g: residual(informed, g), (g,), (by_z * change,))[1]
+
+    return jax.lax.map(row, changes)
 
 
 def _jacobian(study: DriverStudy, load: Loads, common, own):

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import optimistix as optx
 from jaxtyping import Array, Bool, Complex, Float
 
-from etid import dispersion
+from etid import other_circuit
 from etid.circuits import AbstractCircuit
 from etid.given_driver import GivenDriver, UnloadedSlopes, combined
 from etid.information import inverse
@@ -158,16 +158,10 @@ class Load(eqx.Module):
         by_delay = jax.jvp(self.turns, (own,), (jnp.zeros(own.size).at[-1].set(1.0),))[1]
         slopes = jnp.concatenate([by_load[None, :] * by_element, (divided * by_delay)[None, :]])
 
-        def by(real, imaginary, function):
-            at = (real, imaginary)
-            zero = jnp.zeros_like(real)
-            first = jax.jvp(function, at, (unit(real), zero))[1]
-            return first.reshape(2, -1), jax.jvp(function, at, (zero, unit(real)))[1].reshape(2, -1)
-
         g = divided * turns
 
         def of_g(_):
-            by_g = by(g.real, g.imag, lambda a, b: residual(spectrum, jax.lax.complex(a, b)))
+            by_g = _by_parts(g, lambda a, b: residual(spectrum, jax.lax.complex(a, b)))
             if self.unloaded is None:
                 return residual(spectrum, g), by_g, None, None
 
@@ -181,7 +175,7 @@ class Load(eqx.Module):
 
             zero = jnp.zeros_like(spectrum.variance_x)
             by_variance = jax.jvp(wider, (zero,), (unit(zero),))[1].reshape(2, -1)
-            by_x = by(spectrum.x.real, spectrum.x.imag, moved)
+            by_x = _by_parts(spectrum.x, moved)
             return residual(spectrum, g), by_g, by_x, by_variance
 
         part, (real, imaginary), by_x, by_variance = _apart(of_g, q)
@@ -191,15 +185,16 @@ class Load(eqx.Module):
         )
         return _Slopes(part, slopes, (real, imaginary), by_w, by_x, by_variance)
 
-    def by_dispersion(self, q: Float[Array, " q"]) -> Float[Array, " part"]:
-        """Derivative of the residual of the recording by α or ε of `etid.dispersion`."""
+    def by_changes(self, q: Float[Array, " q"]) -> Float[Array, "change part"]:
+        """Derivatives of the residual of the recording by the changes of `etid.other_circuit`."""
         own, z = self.split(q)
         w, spectrum = self.at(z)
         impedance = self.circuit.with_log_values(own[:-1]).impedance()
-        of_load = dispersion.slope(impedance, spectrum.frequency)
-        divided, change = jax.jvp(lambda at: self.divided(at, w), of_load[:1], of_load[1:])
+        load, changes = other_circuit.changes(impedance, spectrum.frequency)
+        divided, by_load = jax.jvp(lambda at: self.divided(at, w), (load,), (jnp.ones_like(load),))
         turns = self.turns(own)
-        return jax.jvp(lambda g: residual(spectrum, g), (divided * turns,), (change * turns,))[1]
+        by_g = _by_parts(divided * turns, lambda a, b: residual(spectrum, jax.lax.complex(a, b)))
+        return _chained((by_load * turns)[None, :] * changes, by_g)
 
     def jacobian(
         self, q: Float[Array, " q"]
@@ -215,6 +210,16 @@ class Load(eqx.Module):
             wider = self.unloaded.log_variance[:, None, :] * by_variance[None]
             others = others + wider.reshape(others.shape)
         return part, jnp.concatenate([rows, others])
+
+
+def _by_parts(
+    value: Complex[Array, " harmonic"], function: Callable[[Array, Array], Array]
+) -> tuple[Array, Array]:
+    """Derivatives of a residual by the real and the imaginary part of its argument."""
+    at = (value.real, value.imag)
+    one, zero = jnp.ones_like(value.real), jnp.zeros_like(value.real)
+    by_real, by_imaginary = (jax.jvp(function, at, of)[1] for of in ((one, zero), (zero, one)))
+    return by_real.reshape(2, -1), by_imaginary.reshape(2, -1)
 
 
 def _chained(slope: Complex[Array, "q harmonic"], by: tuple[Array, Array]) -> Array:
@@ -299,8 +304,8 @@ def fit_circuit(
     elements = information[: own.size - 1]
     by_term = elements @ jacobian
     noise = excess(part, spectrum.selected)
-    other = dispersion.is_seen(
-        _apart(clean.by_dispersion, q),
+    other = other_circuit.scores(
+        _apart(clean.by_changes, q),
         jacobian,
         part,
         prior * (q - load.centre(q)),
@@ -308,6 +313,7 @@ def fit_circuit(
         information,
         share,
         noise,
+        slice(own.size - 1),
     )
     # What is the trial's own of the noise: all, or that of V_out if V_th is shared.
     private = jnp.where(
@@ -335,4 +341,4 @@ def fit_circuit(
         # By how much Σ r² of the calibrations has grown.
         jnp.dot(change, jnp.linalg.solve(driver.cov, change)),
     )
-    return estimate, moved > FAR, other
+    return estimate, moved > FAR, other.seen()

@@ -32,9 +32,9 @@ class RESULTS(optx.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]  # equi
         "Record more periods, reduce the noise, or fit a simpler circuit."
     )
     misfit = (
-        "The prediction misses the recording by far more than its noise (chi2), or in the way of a "
-        "relaxation that is spread over time constants. The circuit is wrong, the trigger moved "
-        "between the records, or the signal drifted or clipped."
+        "The prediction misses the recording by far more than its noise (chi2), or in the way of "
+        "another relaxation, or of one that is spread over time constants. The circuit is wrong, "
+        "the trigger moved between the records, or the signal drifted or clipped."
     )
     order_too_low = (
         "The calibrations show a pole of the source impedance that the driver lacks. Raise `order` "

@@ -128,7 +128,7 @@ axes = etid.plot(narrow.simulate(SEED)["damp/00"])
 # A relaxation that is spread over time constants (Cole, α = 0.9). The best R_s + R_p ‖ C_p leaves
 # a residual that over the whole record has the size of the noise, χ² is 1.1, and R_s is off by
 # 40 %. What gives it away: Z_th has to bend to make up for it, against the calibration
-# (`inconsistent`), or a test for just this spread sees it (`etid.dispersion`, `misfit`).
+# (`inconsistent`), or a test for just this spread sees it (`etid.other_circuit`, `misfit`).
 
 
 # %%

@@ -29,7 +29,7 @@ FLOORS = {
     "schema_page": 1,
     "elements": 1,
     "circuits": 2,
-    "dispersion": 2,
+    "other_circuit": 2,
     "recording": 1,
     "driver": 2,
     "results": 3,

@@ -1,0 +1,177 @@
+"""Score tests against other circuits: the changes, their statistics, what they see in records."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import etid
+from benchmarks.failure_axes import Cole, TwoLayers
+from benchmarks.ladder import CALIBRATION, LOADS, rung
+from benchmarks.skins import SkinCole, SkinTwoLayer
+from etid import other_circuit
+from etid.circuits import Resistor
+from etid.scenes import Trial
+
+
+def test_the_slope_is_that_of_a_constant_phase():
+    """Against a central difference of (jω)^α in the place of jω."""
+    skin, step = LOADS["dry"], 1e-5
+    f = np.geomspace(60.0, 1e5, 30)
+    s = 2j * np.pi * f
+
+    def spread(alpha):
+        return skin.r_s + skin.r_p / (1 + s**alpha * skin.r_p * skin.c_p)
+
+    circuit = etid.SkinRC(skin.r_s, skin.r_p, skin.c_p)
+    z, (slope, *_) = other_circuit.changes(circuit.impedance(), jnp.asarray(f))
+    np.testing.assert_allclose(z, spread(1.0), rtol=1e-12)
+    expected = (spread(1 + step) - spread(1 - step)) / (2 * step)
+    np.testing.assert_allclose(slope, expected, rtol=1e-7)  # step², and rounding over step
+
+
+def test_the_slope_of_a_spread_relaxation_is_that_of_its_asymmetry():
+    """Against a central difference of ln s + ε ln² (s/s₀) in the place of ln s."""
+    circuit, step = SkinCole(33e3, 186e3, 22e-6, 0.85), 1e-5
+    f = np.geomspace(60.0, 1e5, 30)
+    log_s = np.log(2j * np.pi * f)
+    middle = np.log(2 * np.pi * np.sqrt(60.0 * 1e5))
+
+    def skewed(epsilon):
+        s = np.exp(log_s + epsilon * (log_s - middle) ** 2)
+        return 33e3 + 186e3 / (1 + (s * 22e-6) ** 0.85)
+
+    z, (slope, *_) = other_circuit.changes(circuit.impedance(), jnp.asarray(f))
+    np.testing.assert_allclose(z, skewed(0.0), rtol=1e-12)
+    expected = (skewed(step) - skewed(-step)) / (2 * step)
+    np.testing.assert_allclose(slope, expected, rtol=1e-7)  # step², and rounding over step
+
+
+def test_relaxations_are_in_units_of_the_impedance_at_their_corner():
+    f = np.geomspace(60.0, 1e5, 30)
+    circuit = etid.SkinRC(33e3, 186e3, 0.12e-9)
+    _, (_, *found) = other_circuit.changes(circuit.impedance(), jnp.asarray(f))
+    assert len(found) == other_circuit.GRID
+    corners = np.geomspace(30.0, 2e5, other_circuit.GRID)
+    for corner, change in zip(corners, found, strict=True):
+        level = abs(33e3 + 186e3 / (1 + 2j * np.pi * corner * 186e3 * 0.12e-9))
+        np.testing.assert_allclose(change, level / (1 + 1j * f / corner), rtol=1e-9)
+
+
+def scores(residual, rows, jacobian):
+    """Without priors, in white noise of known size."""
+    q = jacobian.shape[0]
+    covariance = np.linalg.inv(jacobian @ jacobian.T)
+    ones = np.ones(residual.size)
+    return other_circuit.scores(
+        jnp.asarray(rows),
+        jnp.asarray(jacobian),
+        jnp.asarray(residual),
+        jnp.zeros(q),
+        jnp.zeros((q, q)),
+        jnp.asarray(covariance),
+        jnp.asarray(ones),
+        jnp.asarray(ones),
+        slice(q),
+    )
+
+
+NUMBER = {"spread": 0, "relaxation": 3}
+LIMIT = {"spread": other_circuit.SEEN_SPREAD, "relaxation": other_circuit.SEEN_RELAXATION}
+
+
+@pytest.mark.parametrize("change", NUMBER)
+def test_what_counts_is_the_residual_along_what_the_parameters_cannot_do(change):
+    rng = np.random.default_rng(4)
+    jacobian, rows = rng.normal(size=(3, 50)), rng.normal(size=(5, 50))
+    rows += 0.1 * jacobian.sum(0)  # so that a change moves the elements
+    row = rows[NUMBER[change]]
+    rest = row - np.linalg.lstsq(jacobian.T, row, rcond=None)[0] @ jacobian
+    along = rest / np.linalg.norm(rest)
+    anything = rng.normal(size=3) @ jacobian  # a fit that has not quite ended
+    for z in (0.99 * LIMIT[change], 1.01 * LIMIT[change], -1.01 * LIMIT[change]):
+        found = scores(z * along + anything, rows, jacobian)
+        assert float(found.z[NUMBER[change]]) == pytest.approx(z)
+        assert bool(found.seen()) == (abs(z) > LIMIT[change])
+
+
+@pytest.mark.parametrize("change", NUMBER)
+def test_a_change_that_hardly_matters_is_none(change):
+    """However well it is determined: a driver that is not quite right looks like that."""
+    rng = np.random.default_rng(6)
+    jacobian, rows = 1e4 * rng.normal(size=(3, 50)), 1e4 * rng.normal(size=(5, 50))
+    row = rows[NUMBER[change]]
+    others = np.linalg.lstsq(jacobian.T, row, rcond=None)[0]
+    size = {"spread": other_circuit.SPREAD, "relaxation": other_circuit.MOVED / max(abs(others))}
+    alone = np.zeros_like(rows)
+    alone[NUMBER[change]] = row
+    for factor in (0.99, 1.01):
+        found = scores(factor * size[change] * row, alone, jacobian)
+        assert bool(found.seen()) == (factor > 1)
+
+
+def test_a_load_without_a_capacitor_has_no_phase_to_be_constant():
+    rng = np.random.default_rng(5)
+    rows = np.zeros((2, 50))
+    assert not scores(rng.normal(size=50), rows, rng.normal(size=(3, 50))).seen()
+
+
+def test_a_relaxation_that_the_circuit_has_is_none():
+    """What is left of its direction is rounding, whose score would be any number."""
+    f = np.geomspace(60.0, 1e5, 200)
+    tau = 1 / (2 * np.pi * np.geomspace(30.0, 2e5, other_circuit.GRID)[6])
+    circuit = etid.SkinRC(33e3, 186e3, tau / 186e3)
+
+    def real(z):
+        return jnp.concatenate([z.real, z.imag], axis=-1) / 1e3
+
+    def impedance(log_values):
+        return real(circuit.with_log_values(log_values).impedance()(jnp.asarray(2j * np.pi * f)))
+
+    jacobian = jax.jacfwd(impedance)(circuit.log_values()).T
+    rows = real(other_circuit.changes(circuit.impedance(), jnp.asarray(f))[1])
+    z = scores(np.random.default_rng(7).normal(size=400), rows, jacobian).z
+    np.testing.assert_array_equal(np.isnan(z), np.arange(z.size) == 7)
+
+
+def identified(load, snr_db, circuit=None):
+    scene = dataclasses.replace(rung("dry", snr_db=snr_db), trials=(Trial("skin", load),))
+    study = scene.simulate(11)
+    driver = etid.identify_driver(study[CALIBRATION])
+    return etid.identify_skin(study["skin"], driver, circuit=circuit, throw=False)
+
+
+def test_two_layers_are_no_cole_relaxation_where_chi2_does_not_show_it():
+    """R_s is 10 standard errors off, χ² 1.02."""
+    load = SkinTwoLayer(33.4e3, 150e3, 0.12e-9, 36e3, 5e-9)
+    fit = identified(load, 40.0, SkinCole())
+    assert fit.chi2 < 1.5
+    assert abs(fit.circuit.values()[0] - 33.4e3) > 5 * fit.stderr.values()[0]
+    assert fit.verdict == "misfit"
+
+
+@pytest.mark.parametrize("load", [Cole(LOADS["dry"], 0.9), TwoLayers(LOADS["damp"], 0.05)])
+def test_another_skin_is_a_misfit_where_chi2_does_not_show_it(load):
+    """R_s of these is 24 and 10 % off."""
+    fit = identified(load, 40.0)
+    assert fit.chi2 < 1.5
+    assert fit.verdict == "misfit"
+
+
+@pytest.mark.parametrize("snr_db", [40.0, 80.0])
+def test_the_circuit_itself_is_none(snr_db):
+    """At 80 dB too, where a driver of order 5 is not quite that of the scene, of order 6."""
+    assert identified(LOADS["damp"], snr_db).verdict == "successful"
+
+
+def test_a_resistor_fitted_to_skin_is_a_misfit_where_chi2_does_not_show_it():
+    """Without a phase to be spread: only one more relaxation tells. It was called successful."""
+    fit = identified(LOADS["dry"], 20.0, Resistor())
+    assert fit.chi2 < 1.1
+    assert fit.verdict == "misfit"
+
+
+def test_a_resistor_itself_is_none():
+    assert identified(etid.scenes.ResistorLoad(55.2e3), 60.0, Resistor()).verdict == "successful"
