@@ -21,6 +21,7 @@ NAMES = (
     "which",
     "paper",
     "failure_map",
+    "perturbations",
     "rivals",
 )
 

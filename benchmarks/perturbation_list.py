@@ -1,0 +1,200 @@
+"""Every perturbation of the benchmark, by name, and those that nothing can show.
+
+Names: `hum60_0.02V` is a sine at that frequency and amplitude at the converter; `all` means every
+record, `skin` those of skin, `out` the loaded voltage. `rp_linear_0.05` lets R_p fall by that part
+from the first pulse to the last, `step` after half of the record. `driver_X` changes a part of the
+driver between calibration and skin. Delays are in samples of 5 µs. `says` is what the file says and
+is not true.
+"""
+
+import functools
+from collections.abc import Mapping
+
+from benchmarks.disturbances import Hum, Offset, Spike
+from benchmarks.failure_axes import Cole, TwoLayers
+from benchmarks.perturbed_study import (
+    RESISTOR,
+    Change,
+    all_records,
+    both,
+    calibrations,
+    changing,
+    crosstalk,
+    late,
+    leaking,
+    longer,
+    louder,
+    nonlinear,
+    out,
+    parts,
+    pink,
+    pulses,
+    record,
+    second_resistor,
+    skin_for_resistor,
+    skin_is,
+    th,
+    trials,
+)
+from etid.transformer import ResistorLoad
+
+UNDISTURBED: Mapping[str, Change] = {
+    "base": lambda study: study,
+    "base_no_delay": lambda study: all_records(both(delay=0.0))(study),
+    "base_six_periods": longer(),
+    "base_two_resistors": second_resistor(1.0),
+}
+"""Studies in which all is well: hardly any of them may be refused."""
+
+
+def _hum(amplitude: float) -> dict[str, Change]:
+    said = f"{amplitude:g}V"
+    return {
+        f"hum60_{said}_all": all_records(both(added=(Hum(60.0, amplitude),))),
+        f"hum60_{said}_out_skin_only": trials(out(added=(Hum(60.0, amplitude),))),
+        f"hum50_{said}_all": all_records(both(added=(Hum(50.0, amplitude),))),
+    }
+
+
+_LOCKED = Hum(60.0, 0.02, phase=0.2)
+NUISANCES: Mapping[str, Change] = {
+    **_hum(0.002),
+    **_hum(0.02),
+    **_hum(0.1),
+    "hum60h_100mV_all": all_records(both(added=(Hum(60.0, 0.1, (2, 3, 5)),))),
+    "hum60_20mV_phase_locked_th_and_out": all_records(both(added=(_LOCKED,))),
+    "dc_0.5V_all": all_records(both(added=(Offset(0.5),))),
+    "wander1Hz_50mV": all_records(both(added=(Hum(1.0, 0.05),))),
+    "wander1Hz_500mV": all_records(both(added=(Hum(1.0, 0.5),))),
+    "spike_0.5V_5ms_out": trials(out(added=(Spike(0.5, 5e-3),))),
+    "spike_0.1V_5ms_out": trials(out(added=(Spike(0.1, 5e-3),))),
+    "spike_1V_5ms_out": trials(out(added=(Spike(1.0, 5e-3),))),
+    "spike_1V_0.1ms_out": trials(out(added=(Spike(1.0, 1e-4),))),
+    "spike_1V_5ms_out_six_periods": longer(trials(out(added=(Spike(1.0, 5e-3),)))),
+    "spike_0.1V_5ms_th_six_periods": longer(trials(th(added=(Spike(0.1, 5e-3),)))),
+    "crosstalk_1%_neighbour": trials(crosstalk(4e-3)),
+    "crosstalk_1%_unloaded": trials(crosstalk(0.0)),
+    "coloured_noise_1/f": all_records(pink),
+}
+
+CONVERTERS: Mapping[str, Change] = {
+    "bits8_10V": all_records(record(bits=8)),
+    "bits8_4V": all_records(record(bits=8, full_scale=4.0)),
+    "bits8_4V_nonoise": all_records(record(bits=8, full_scale=4.0, sigma=0.0)),
+    "bits8_4V_float": all_records(record(bits=8, full_scale=4.0, codes=False)),
+    "bits10_10V_nonoise_float": all_records(record(bits=10, sigma=0.0, codes=False)),
+    "adc_jitter_500ns": all_records(both(sampling_jitter=500e-9)),
+    "slow_adc_filter_out": all_records(out(lowpass=30e3)),
+    "slow_adc_filter_out_skin_only": trials(out(lowpass=30e3)),
+    "gain_out_+1%_all": all_records(out(gain=1.01)),
+    "gain_out_-1%_all": all_records(out(gain=0.99)),
+    "gain_out_+1%_skin": trials(out(gain=1.01)),
+    "gain_out_-1%_skin": trials(out(gain=0.99)),
+    "gain_-5%_skin": trials(out(gain=0.95)),
+    "polarity_out": all_records(out(gain=-1.0)),
+    "polarity_out_skin_only": trials(out(gain=-1.0)),
+    "polarity_both": all_records(both(gain=-1.0)),
+    "swapped": all_records(record(swapped=True)),
+    "swapped_skin_only": trials(record(swapped=True)),
+}
+
+_MISSING, _DOUBLE = ((0, 1.0), (2, 1.0)), ((0, 1.0), (1, 1.0), (1.5, 1.0), (2, 1.0))
+CLOCKS: Mapping[str, Change] = {
+    "missing_pulse_out": trials(out(**pulses(*_MISSING))),
+    "missing_pulse_both": trials(both(**pulses(*_MISSING))),
+    "double_pulse_out": trials(out(**pulses(*_DOUBLE))),
+    "double_pulse_both": trials(both(**pulses(*_DOUBLE))),
+    "rate_0.1%_all": all_records(both(pulse_rate=60.06)),
+    "rate_100ppm_all": all_records(both(pulse_rate=60.006)),
+    "rate_0.1%_skin_only": trials(both(pulse_rate=60.06)),
+    "rate_1%_all": all_records(both(pulse_rate=60.6)),
+    **{
+        f"delay_{samples:g}_samples_out": all_records(late(samples)) for samples in (1.5, 5.0, 50.0)
+    },
+    **{
+        f"delay_{samples:g}_samples_skin": trials(late(samples))
+        for samples in (0.9, 1.5, 5.0, 50.0, 100.0)
+    },
+    **{
+        f"says_{rate // 1000}kHz": all_records(record(told={"sample_rate": float(rate)}))
+        for rate in (50_000, 100_000, 250_000, 400_000)
+    },
+    "says_100kHz_six_periods": longer(all_records(record(told={"sample_rate": 100e3}))),
+    **{
+        f"says_{rate}Hz": all_records(record(told={"pulse_rate": float(rate)}))
+        for rate in (20, 30, 50, 90, 120, 180)
+    },
+}
+
+SKINS: Mapping[str, Change] = {
+    **{
+        f"{name}_{kind}_{fall:g}": changing(element, fall, kind == "step")
+        for name, element, kind, fall in (
+            ("rp", "r_p", "linear", 0.05),
+            ("rp", "r_p", "step", 0.05),
+            ("rs", "r_s", "linear", 0.05),
+            ("rs", "r_s", "step", 0.05),
+            ("rp", "r_p", "linear", 0.2),
+            ("rp", "r_p", "step", 0.2),
+            ("rs", "r_s", "linear", 0.2),
+            ("rs", "r_s", "step", 0.2),
+            ("cp", "c_p", "linear", 0.05),
+        )
+    },
+    "rp_linear_0.05_six_periods": longer(changing("r_p", 0.05, False, 6)),
+    "rs_step_0.2_six_periods": longer(changing("r_s", 0.2, True, 6)),
+    "Rp_nonlinear_0.2": nonlinear(0.2),
+    "Rp_nonlinear_0.4": nonlinear(0.4),
+    "cole_alpha0.8": skin_is(functools.partial(Cole, alpha=0.8), words=True),
+    "two_rc_mid": skin_is(functools.partial(TwoLayers, share=0.3), words=True),
+    "leak_100Rp": skin_is(leaking),
+}
+
+_ALL_PARTS = ("r_protection", "r_secondary", "l_secondary", "l_magnetising", "r_source")
+DRIVERS: Mapping[str, Change] = {
+    "driver_Rprot_x1.05": trials(parts(r_protection=1.05)),
+    "driver_Rprot_x1.2": trials(parts(r_protection=1.2)),
+    "driver_Rsw_x1.2": trials(parts(r_secondary=1.2)),
+    "driver_Lls_x1.05": trials(parts(l_primary=1.05, l_secondary=1.05)),
+    "driver_Lls_x1.2": trials(parts(l_primary=1.2, l_secondary=1.2)),
+    "driver_Lm_x1.2": trials(parts(l_magnetising=1.2)),
+    "driver_Rsrc_x1.2": trials(parts(r_source=1.2)),
+    "driver_Csec_x1.1": trials(parts(c_secondary=1.1)),
+    "driver_Ccab_x1.1": trials(parts(c_cable=1.1)),
+    "driver_all_5%": trials(parts(**dict.fromkeys(_ALL_PARTS, 1.05))),
+    "driver_Vp_+2%_out_vs_th": trials(louder(1.02)),
+    "driver_Vp_-2%_out_vs_th": trials(louder(0.98)),
+}
+
+CALIBRATIONS: Mapping[str, Change] = {
+    "driver_Rload_wrong_5%": calibrations(out(loads=(ResistorLoad(1.05 * RESISTOR),))),
+    "two_resistors_one_wrong_5%": second_resistor(1.05),
+    "says_98.8ohm": calibrations(record(told={"r_load": RESISTOR / 1000})),
+    "says_1mohm": calibrations(record(told={"r_load": 1e-3})),
+    "says_1Tohm": calibrations(record(told={"r_load": 1e12})),
+    "calibration_v_out_is_v_th": calibrations(record(copied=True)),
+    "calibration_unloaded": calibrations(out(loads=(ResistorLoad(1e15),))),
+    "calibration_is_skin": skin_for_resistor,
+}
+
+PERTURBATIONS: Mapping[str, Change] = {
+    **UNDISTURBED,
+    **NUISANCES,
+    **CONVERTERS,
+    **CLOCKS,
+    **SKINS,
+    **DRIVERS,
+    **CALIBRATIONS,
+}
+
+INVISIBLE: Mapping[str, str] = {
+    "driver_Rload_wrong_5%": (
+        "up to 5 %: one calibration shows ratios to its resistor only; every resistance and 1/C_p "
+        "is wrong by the same 5 %"
+    ),
+    "leak_100Rp": (
+        "up to 1.2 %: R_s + R_p ‖ C_p with a resistor across it has the impedance of another "
+        "R_s + R_p ‖ C_p at every frequency"
+    ),
+}
+"""Perturbations that nothing in the records shows: by how much the elements are wrong, and why."""

@@ -1,0 +1,275 @@
+"""A study in which all is well, and the ways to change it.
+
+`undisturbed` draws a study in which all is well: dry and damp skin, 98.8 kΩ, three periods at
+200 kHz, trigger delays of 50 ns rms, parts of the driver 3 % from those of `TransformerDriver`.
+A `Change` is a function from that study to another; `benchmarks.perturbation_list` has them all.
+"""
+
+import dataclasses
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from benchmarks.disturbances import Leaky, Nonlinear, Pink
+from benchmarks.laboratory import Crosstalk, Output, Record, noise
+from benchmarks.ladder import LOADS
+from etid.transformer import Impedance, ResistorLoad, SkinLoad, TransformerDriver
+
+RESISTOR, SECOND = 98.8e3, 21.62e3  # [ohm]
+DELAY = 50e-9  # [s] rms, of every loaded and unloaded record
+PARTS = 0.03  # standard deviation of the logarithm of every part of a driver
+FIXED = ("amplitude", "width", "edge", "lead_in", "turns")
+PERIODS = 3
+SAMPLE = 5e-6  # [s]
+
+
+@dataclasses.dataclass(frozen=True)
+class Truth:
+    """What is right to say of a skin; arrays are (element,), in SI.
+
+    Attributes:
+        low: Smallest value of each element in the record.
+        high: Largest.
+        moves: Whether it went from the one to the other: an answer that does not say so claims that
+            the elements were what it gives all the time.
+        words: Whether the elements are a matter of words, as of skin that is not one RC: they are
+            wrong by 20 % only.
+    """
+
+    low: Float[np.ndarray, " element"]
+    high: Float[np.ndarray, " element"]
+    moves: bool = False
+    words: bool = False
+
+    @classmethod
+    def of(cls, *skins: SkinLoad, **more: bool) -> "Truth":
+        """The range of several skins."""
+        values = np.array([dataclasses.astuple(skin) for skin in skins])
+        return cls(values.min(0), values.max(0), **more)
+
+
+@dataclasses.dataclass(frozen=True)
+class Study:
+    """The records of a driver.
+
+    Attributes:
+        number: Of the driver.
+        calibrations: With known resistors.
+        trials: With skin.
+        truths: Of the trials, by path.
+    """
+
+    number: int
+    calibrations: tuple[Record, ...]
+    trials: tuple[Record, ...]
+    truths: Mapping[str, Truth]
+
+
+Change = Callable[[Study], Study]
+
+
+def undisturbed(number: int, snr_db: float) -> Study:
+    """The study of one driver.
+
+    Args:
+        number: Of the driver; parts and delays are drawn from it.
+        snr_db: Of every record [dB].
+    """
+    rng = np.random.default_rng([number, *b"driver"])
+    usual = TransformerDriver()
+    parts = {
+        field.name: getattr(usual, field.name) * float(np.exp(PARTS * rng.standard_normal()))
+        for field in dataclasses.fields(usual)
+        if field.name not in FIXED
+    }
+    driver = TransformerDriver(**parts)
+    sigma = noise(driver, 200e3, snr_db)
+
+    def made(path: str, load: Impedance, r_load: float | None = None) -> Record:
+        th, out = (DELAY * rng.standard_normal() for _ in range(2))
+        return Record(
+            path, Output(driver, delay=th), Output(driver, (load,), delay=out), sigma, r_load
+        )
+
+    return Study(
+        number,
+        (made("calibration/98k8", ResistorLoad(RESISTOR), RESISTOR),),
+        tuple(made(name, skin) for name, skin in LOADS.items()),
+        {name: Truth.of(skin) for name, skin in LOADS.items()},
+    )
+
+
+def all_records(change: Callable[[Record], Record]) -> Change:
+    """Change calibrations and trials."""
+
+    def changed(study: Study) -> Study:
+        calibrations = tuple(map(change, study.calibrations))
+        return dataclasses.replace(study, calibrations=calibrations, **_trials(study, change))
+
+    return changed
+
+
+def calibrations(change: Callable[[Record], Record]) -> Change:
+    """Change the calibrations only."""
+    return lambda study: dataclasses.replace(
+        study, calibrations=tuple(map(change, study.calibrations))
+    )
+
+
+def trials(change: Callable[[Record], Record]) -> Change:
+    """Change the records of skin only."""
+    return lambda study: dataclasses.replace(study, **_trials(study, change))
+
+
+def _trials(study: Study, change: Callable[[Record], Record]) -> dict[str, Any]:
+    return {"trials": tuple(map(change, study.trials))}
+
+
+def record(**fields: Any) -> Callable[[Record], Record]:
+    """Change fields of a record."""
+    return lambda of: dataclasses.replace(of, **fields)
+
+
+def both(**fields: Any) -> Callable[[Record], Record]:
+    """Change fields of both voltages."""
+    return lambda of: dataclasses.replace(
+        of, th=dataclasses.replace(of.th, **fields), out=dataclasses.replace(of.out, **fields)
+    )
+
+
+def out(**fields: Any) -> Callable[[Record], Record]:
+    """Change fields of the loaded voltage."""
+    return lambda of: dataclasses.replace(of, out=dataclasses.replace(of.out, **fields))
+
+
+def th(**fields: Any) -> Callable[[Record], Record]:
+    """Change fields of the unloaded voltage."""
+    return lambda of: dataclasses.replace(of, th=dataclasses.replace(of.th, **fields))
+
+
+def late(samples: float) -> Callable[[Record], Record]:
+    """Record the loaded voltage later than the unloaded one."""
+    return lambda of: out(delay=of.out.delay + samples * SAMPLE)(of)
+
+
+def parts(**factors: float) -> Callable[[Record], Record]:
+    """Multiply parts of the driver behind both voltages."""
+
+    def change(of: Record) -> Record:
+        known = of.out.driver
+        new = {name: getattr(known, name) * factor for name, factor in factors.items()}
+        return both(driver=dataclasses.replace(known, **new))(of)
+
+    return change
+
+
+def louder(factor: float) -> Callable[[Record], Record]:
+    """Multiply the amplitude of the driver behind the loaded voltage."""
+
+    def change(of: Record) -> Record:
+        driver = of.out.driver
+        return out(driver=dataclasses.replace(driver, amplitude=factor * driver.amplitude))(of)
+
+    return change
+
+
+def crosstalk(later: float) -> Callable[[Record], Record]:
+    """Let the loaded voltage see 1 % of an unloaded one whose pulse is later by so much [s]."""
+    return lambda of: out(added=(Crosstalk(of.th, 0.01, later),))(of)
+
+
+def skin_is(make: Callable[[SkinLoad], Impedance], **more: bool) -> Change:
+    """Replace the skin by something with the same limits."""
+
+    def change(study: Study) -> Study:
+        def replaced(of: Record) -> Record:
+            return out(loads=(make(LOADS[of.path]),))(of)
+
+        truths = {
+            path: Truth.of(getattr(make(LOADS[path]), "elements", LOADS[path]), **more)
+            for path in study.truths
+        }
+        return dataclasses.replace(trials(replaced)(study), truths=truths)
+
+    return change
+
+
+def changing(element: str, fall: float, steps: bool, periods: int = PERIODS) -> Change:
+    """Let an element fall from pulse to pulse, or in one step after the first half."""
+    place = np.arange(periods) / (periods - 1)
+    lost = fall * (np.where(place >= 0.5, 1.0, 0.0) if steps else place)
+
+    def skins(path: str) -> list[SkinLoad]:
+        at_first = LOADS[path]
+        value = getattr(at_first, element)
+        return [dataclasses.replace(at_first, **{element: value * (1 - part)}) for part in lost]
+
+    def change(study: Study) -> Study:
+        found = trials(lambda of: out(loads=tuple(skins(of.path)))(of))(study)
+        truths = {path: Truth.of(*skins(path), moves=True) for path in study.truths}
+        return dataclasses.replace(found, truths=truths)
+
+    return change
+
+
+def nonlinear(fall: float) -> Change:
+    """Let R_p fall with the voltage; any R_p between the two is right."""
+
+    def change(study: Study) -> Study:
+        found = trials(lambda of: out(voltage=Nonlinear(LOADS[of.path], fall))(of))(study)
+        truths = {
+            path: Truth.of(skin, dataclasses.replace(skin, r_p=(1 - fall) * skin.r_p))
+            for path, skin in LOADS.items()
+        }
+        return dataclasses.replace(found, truths=truths)
+
+    return change
+
+
+def pulses(*places: tuple[float, float]) -> dict[str, Any]:
+    """Fields of a voltage with these pulses in a record of three periods."""
+    return {"pulses": places, "over": PERIODS}
+
+
+def second_resistor(factor: float) -> Change:
+    """Calibrate with a second resistor, which is not what the file says by this factor."""
+
+    def change(study: Study) -> Study:
+        [first] = study.calibrations
+        rng = np.random.default_rng([study.number, *b"second resistor"])
+        second = dataclasses.replace(
+            first,
+            path="calibration/21k62",
+            th=dataclasses.replace(first.th, delay=DELAY * rng.standard_normal()),
+            out=dataclasses.replace(
+                first.out,
+                loads=(ResistorLoad(factor * SECOND),),
+                delay=DELAY * rng.standard_normal(),
+            ),
+            r_load=SECOND,
+        )
+        return dataclasses.replace(study, calibrations=(first, second))
+
+    return change
+
+
+def skin_for_resistor(study: Study) -> Study:
+    """Calibrate with dry skin in the resistor's place."""
+    return calibrations(out(loads=(LOADS["dry"],)))(study)
+
+
+def longer(change: Change = lambda study: study) -> Change:
+    """Record six periods."""
+    return lambda study: change(all_records(record(samples=20_000))(study))
+
+
+def pink(of: Record) -> Record:
+    """Both voltages with 1/f noise of three times the effective value of the white noise."""
+    return both(added=(Pink(3 * of.sigma),))(of)
+
+
+def leaking(skin: SkinLoad) -> Leaky:
+    """Skin with a leak of a hundred times its R_p across it."""
+    return Leaky(skin, 100 * skin.r_p)
