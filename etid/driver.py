@@ -130,6 +130,8 @@ class Calibration(eqx.Module):
         spectra: Their harmonics, stacked along a leading axis; None if the method uses none.
         unloaded: Checksums of their unloaded records; None if not known. A load whose checksum is
             none of them needs no search for what it shares with them, which doubles its cost.
+        mismatch: By how much the logarithm of each known resistor exceeds what the other
+            calibrations say of it, and its standard error; None for one, or if not known.
     """
 
     r_load: Float[Array, " record"]
@@ -137,6 +139,7 @@ class Calibration(eqx.Module):
     delay: Float[Array, " record"]
     spectra: Spectrum | None
     unloaded: Int[np.ndarray, " record"] | None = None
+    mismatch: Float[Array, "2 record"] | None = None
 
 
 class Driver(eqx.Module):
@@ -224,6 +227,18 @@ class Driver(eqx.Module):
             f" ({self.method}), RRSE {100 * float(self.rrse):.3g} %, chi2 {float(self.chi2):.3g}\n"
         )
         text += f"  Z_th at 1 kHz {z.real / 1e3:.4g} {z.imag / 1e3:+.4g}j kΩ"
+        text += self._resistors()
         if self.verdict != "successful":
             text += "\n  " + message(self.verdict)
         return "\n  ".join([text, *texts(int(self.remarks))])
+
+    def _resistors(self) -> str:
+        """What the calibrations say of each other's resistors."""
+        known = self.calibration
+        if known is None or known.mismatch is None:
+            return ""
+        lines = ""
+        for r, off, error in zip(known.r_load, *known.mismatch, strict=True):
+            lines += f"\n  r_load {float(r) / 1e3:.6g} kΩ is {100 * float(np.expm1(off)):+.3g}"
+            lines += f" ± {100 * float(error):.2g} % off what the others say"
+        return lines

@@ -1,5 +1,7 @@
 """Refinement: samples or harmonics in, judged estimate out; for one recording and for a batch."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -14,6 +16,7 @@ from etid import (
     non_parametric,
     output_error,
     prediction,
+    resistors,
     single_load,
     steiglitz_mcbride,
 )
@@ -257,10 +260,17 @@ def driver_by_refinement(
     source, estimate, calibration = jax.tree.map(
         lambda leaf: leaf[chosen], (sources, estimates, known)
     )
-    lacks = jnp.array(False)
+    lacks = wrong = jnp.array(False)
+    terms = jnp.asarray(m.v_out.size, m.v_out.dtype)
     if spectra is not None:
         calibrations = maximum_likelihood.Calibrations(source, calibration, m.sample_rate[0])
         lacks = missing_pole.is_seen(calibrations)
+        terms = 2 * jnp.sum(spectra.selected, dtype=terms.dtype)
+        if r_load.size > 1:
+            off = resistors.mismatch(calibrations)
+            calibration = dataclasses.replace(calibration, mismatch=off)
+    if calibration.mismatch is not None:
+        wrong = resistors.disagree(calibration.mismatch, estimate.chi2, terms)
     return Driver(
         b=baseline.b,
         a=baseline.a,
@@ -272,6 +282,7 @@ def driver_by_refinement(
         chi2=estimate.chi2,
         result=first_verdict(
             (~finite[chosen], RESULTS.unstable),
+            (wrong, RESULTS.resistors_disagree),
             (~passive[chosen], RESULTS.nonphysical),
             (~settled[chosen], MAX_STEPS_REACHED),
             (misses(estimate.chi2, estimate.rrse) | too_late(estimate), RESULTS.misfit),

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from etid import estimation, output_error, prediction
+from etid import estimation, output_error, prediction, resistors
 from etid.circuits import AbstractCircuit, Resistor, SkinRC
 from etid.driver import Driver
 from etid.filtering import TAPS
@@ -45,12 +45,16 @@ from etid.spectra import Spectrum, separates_aliases, spectrum, whole_periods
 from etid.traces import stored_jit
 from etid.verdicts import message, verdict
 
+# |Z_th| [Ω] at 1 kHz: from a microphone's transformer to a tube's.
+PLAUSIBLE = (300.0, 300e3)
+
 
 def identify_driver(
     calibrations: Recording | Sequence[Recording],
     *,
     order: int = 5,
     method: Method | None = None,
+    plausible: tuple[float, float] = PLAUSIBLE,
     throw: bool = True,
 ) -> Driver:
     """Identify the source impedance Z_th from one or several records with known resistors.
@@ -61,6 +65,8 @@ def identify_driver(
         method: `"maximum_likelihood"`, for records of several whole pulse periods, or
             `"output_error"`, or the paper's `"steiglitz_mcbride"`, or its first iteration
             `"equation_error"`. If not given, the first where the record allows it, else the second.
+        plausible: Least and largest |Z_th| [Ω] at 1 kHz that is believed. The range spans a factor
+            of 1000: no driver in it stays in it if `r_load` is given in kΩ.
         throw: Raise if the verdict is not successful.
 
     Returns:
@@ -95,6 +101,13 @@ def identify_driver(
         if name is not None:
             text = f"calibration {one.recording.path!r}: {name}. {message(name)}"
             raise IdentificationError(text, None)
+    rough = [resistors.rough_impedance(one) for one in seen]
+    if max(rough) > resistors.ROUGHLY * min(rough):
+        shown = ", ".join(
+            f"{one.recording.path!r} {z / 1e3:.3g} kohm" for one, z in zip(seen, rough, strict=True)
+        )
+        text = f"calibrations show impedances of about {shown}: resistors_disagree. "
+        raise IdentificationError(text + message("resistors_disagree"), None)
     method = choose(method, seen)
     r_load = jnp.asarray([record.r_load for record in records])
     spectra = None
@@ -108,6 +121,9 @@ def identify_driver(
         unloaded = np.array([checksum(one) for one in seen])
         calibration = dataclasses.replace(driver.calibration, unloaded=unloaded)
         driver = dataclasses.replace(driver, calibration=calibration)
+    size = float(jnp.abs(driver.response(jnp.asarray(1e3))))
+    if np.isfinite(size) and not plausible[0] <= size <= plausible[1]:
+        driver = dataclasses.replace(driver, result=verdict("implausible"))
     if throw and driver.verdict != "successful":
         raise IdentificationError(f"driver: {driver.verdict}. {message(driver.verdict)}", driver)
     return driver

@@ -81,6 +81,33 @@ def curvature(
     return Curvature(information - samples * noise + jnp.diag(precision), score / s)
 
 
+def further(
+    information: Float[Array, "all all"],
+    spread: Float[Array, "all all"],
+    gradient: Float[Array, " all"],
+    kept: int,
+) -> tuple[Float[Array, " further"], Float[Array, " further"]]:
+    """Where each further parameter alone would go from a minimum over the first `kept`.
+
+    One step of Newton from 0, with the first parameters free (Rao's score test has no power but
+    where this step is large against its error).
+
+    Args:
+        information: Expected curvature over all parameters.
+        spread: Covariance of the gradient.
+        gradient: Of the objective.
+        kept: How many parameters are at their minimum.
+
+    Returns:
+        The steps, and their standard errors.
+    """
+    others = information[kept:, :kept] @ inverse(information[:kept, :kept])
+    towards = jnp.concatenate([-others, jnp.eye(information.shape[0] - kept)], axis=1)
+    own = jnp.diagonal(towards @ information[:, kept:])
+    variance = jnp.einsum("ij,jk,ik->i", towards, spread, towards)
+    return -(towards @ gradient) / own, jnp.sqrt(variance) / own
+
+
 def eliminate(of: Curvature, kept: int) -> Curvature:
     """Project out all but the first `kept` parameters: nuisances, which no other record shares."""
     h, m = of.expected, of.score

@@ -25,7 +25,7 @@ from jaxtyping import Array, Float, Int
 from etid.circuits import AbstractCircuit
 from etid.driver import Calibration, SourceImpedance, loaded
 from etid.elements import resistor
-from etid.information import curvature, eliminate, inverse
+from etid.information import curvature, eliminate, further, inverse
 from etid.levenberg_marquardt import LevenbergMarquardt, best_start
 from etid.prediction import (
     IMPULSE,
@@ -170,7 +170,7 @@ def fit_source(
     nuisance = q[kept:].reshape(count, states)
 
     states = nuisance.shape[1]
-    precision = jnp.zeros(kept + states).at[-1].set(1 / DELAY_WIDTH**2)
+    precision = jnp.zeros(kept + 1 + states).at[-1].set(1 / DELAY_WIDTH**2)
     weak = jax.jacfwd(regularise)(q[:kept])
     chi2 = (
         2
@@ -178,25 +178,37 @@ def fit_source(
         / (math.prod(records.hold.shape[:-1]) - q.shape[0])
     )
 
+    # Curvature over source, logarithm of the resistor and nuisances, in this order.
     def at_minimum(record, r, nuisance):
         def residual(p):
-            return one(record, r, p[:kept], p[kept:])
+            return one(record, r * jnp.exp(p[kept]), p[:kept], p[kept + 1 :])
 
         def response(p):
-            load = resistor(r).rational()
+            load = resistor(r * jnp.exp(p[kept])).rational()
             return impulse_response(loaded_filter(unflatten(p[:kept]), load, record.sample_rate))
 
-        at = jnp.concatenate([q[:kept], nuisance])
-        return curvature(record, residual, response, at, precision)
+        at = jnp.concatenate([q[:kept], jnp.zeros(1), nuisance])
+        towards = jnp.zeros_like(at).at[kept].set(1.0)
+        value, slope = jax.jvp(residual, (at,), (towards,))
+        return curvature(record, residual, response, at, precision), jnp.vdot(slope, value)
 
     def error(record, r, nuisance):
         system = loaded_filter(unflatten(q[:kept]), resistor(r).rational(), record.sample_rate)
         return rrse(predict(system, record, nuisance), measured(record, nuisance))
 
-    parts = jax.vmap(at_minimum)(records, r_load, nuisance)
-    parts = jax.vmap(lambda part: eliminate(part, kept))(parts)
-    bread = inverse(parts.expected.sum(0) + weak.T @ weak)
-    cov = bread @ parts.score.sum(0) @ bread * jnp.maximum(chi2, 1.0)
+    parts, by_resistor = jax.vmap(at_minimum)(records, r_load, nuisance)
+    parts = jax.vmap(lambda part: eliminate(part, kept + 1))(parts)
+    information = _arrow(parts.expected, weak.T @ weak)
+    spread = _arrow(parts.score, jnp.zeros((kept, kept)))
+    bread = inverse(information[:kept, :kept])
+    cov = bread @ spread[:kept, :kept] @ bread * jnp.maximum(chi2, 1.0)
+    mismatch = None
+    if count > 1:
+        gradient = jnp.concatenate([jnp.zeros(kept), by_resistor])  # it is at its minimum
+        step, error_of_step = further(information, spread, gradient, kept)
+        # What the worst of the resistors explains is no noise.
+        left = chi2 - jnp.max((step / error_of_step) ** 2) / math.prod(records.hold.shape[:-1])
+        mismatch = jnp.stack([-step, error_of_step * jnp.sqrt(jnp.maximum(left, 1.0))])
     estimate = Estimate(
         q[:kept],
         nuisance,
@@ -211,8 +223,26 @@ def fit_source(
     return (
         unflatten(q[:kept]),
         estimate,
-        Calibration(r_load, delay_std(r_load) / records.sample_rate[0], nuisance[:, -1], None),
+        Calibration(
+            r_load,
+            delay_std(r_load) / records.sample_rate[0],
+            nuisance[:, -1],
+            spectra=None,
+            mismatch=mismatch,
+        ),
     )
+
+
+def _arrow(
+    parts: Float[Array, "record both both"], known: Float[Array, "source source"]
+) -> Float[Array, "all all"]:
+    """Source and all resistors, from source and resistor of each record."""
+    kept, count = known.shape[0], parts.shape[0]
+    total = jnp.zeros((kept + count, kept + count))
+    total = total.at[:kept, :kept].set(parts[:, :kept, :kept].sum(0) + known)
+    total = total.at[:kept, kept:].set(parts[:, :kept, kept].T)
+    total = total.at[kept:, :kept].set(parts[:, :kept, kept])
+    return total.at[jnp.arange(count) + kept, jnp.arange(count) + kept].set(parts[:, kept, kept])
 
 
 def fit_circuit(

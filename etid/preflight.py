@@ -20,6 +20,9 @@ FLAT = (
 RAIL = 3  # equal extreme samples in a row that a noisy or sloping signal does not produce
 JUMP = 8.0  # converter steps by which a clipped signal enters and leaves its rail
 POWER = 1.01  # of v_out over v_th; a passive load takes power, and gains match better than this
+EQUAL = 1e-3  # by which amplitudes may differ if nothing is connected
+SAME = 1.5  # of the variance of the noise, by which they may differ then
+LATE = 5e-3  # of the signal, which a delay of a tenth of a sample leaves of the edges as well
 SEAM = 3  # samples on both sides of the joint between two periods
 STEP = 4.0  # standard deviations of the noise by which they may differ there
 SHIFT = 50e-6  # [s] that a load may delay v_out; R_th C_p is below 10 µs
@@ -100,7 +103,8 @@ class Inspected:
 def preflight(seen: Inspected, *, periodic: bool = False) -> str | None:
     """Name the verdict that forbids a fit, or None.
 
-    Verdicts: `too_short`, `nonfinite_samples`, `flat`, `saturated`, `misaligned`, `not_periodic`.
+    Verdicts: `too_short`, `nonfinite_samples`, `flat`, `saturated`, `unconnected`,
+    `misaligned`, `not_periodic`.
 
     Args:
         seen: Unloaded and loaded voltage.
@@ -115,6 +119,8 @@ def preflight(seen: Inspected, *, periodic: bool = False) -> str | None:
         return "flat"
     if _is_saturated(v_th, seen.step_th, of) or _is_saturated(v_out, seen.step_out, of):
         return "saturated"
+    if _is_unconnected(seen):
+        return "unconnected"
     if _is_misaligned(v_th, v_out, of):
         return "misaligned"
     if periodic and not seen.is_periodic:
@@ -143,6 +149,19 @@ def _is_saturated(v: Float[np.ndarray, " time"], step: float, recording: Recordi
             if jump > JUMP * floor:
                 return True
     return False
+
+
+def _is_unconnected(seen: Inspected) -> bool:
+    """Whether v_out is v_th, but for noise, an offset and a part of a sample of delay."""
+    x, y = seen.v_th - seen.v_th.mean(), seen.v_out - seen.v_out.mean()
+    variance = seen.sigma_th**2 + seen.sigma_out**2
+    power = x @ x - x.size * seen.sigma_th**2
+    if abs((x @ y) / power - 1) > EQUAL + STEP * math.sqrt(variance / power):
+        return False
+    late = np.gradient(x)
+    rest = y - x
+    rest = rest - late * ((late @ rest) / (late @ late))
+    return bool(rest @ rest <= x.size * SAME * variance + LATE**2 * power)
 
 
 def _is_misaligned(

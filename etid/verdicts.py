@@ -40,6 +40,19 @@ class RESULTS(optx.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]  # equi
         "The calibrations show a pole of the source impedance that the driver lacks. Raise `order` "
         "by one or two."
     )
+    resistors_disagree = (
+        "The calibrations with different known resistors show different source impedances. One "
+        "r_load is wrong, or belongs to another record; print the driver to see which may be. "
+        "Measure the resistors, and give every r_load in ohm."
+    )
+    implausible = (
+        "The source impedance at 1 kHz lies outside `plausible`. Is r_load in ohm, and was that "
+        "resistor connected? If the driver really is like this, set `plausible` [ohm]."
+    )
+    unconnected = (
+        "v_out equals v_th to within their noise: nothing is connected that draws a current, or "
+        "both are the same record. Check the contact and the channels."
+    )
     inconsistent = (
         "The recording and the calibrations contradict each other about the source impedance. "
         "The driver changed in between, or r_load is not what it is said to be."

@@ -78,6 +78,7 @@ FLOORS = {
     "methods_section": 8,
     "given_driver": 7,
     "missing_pole": 7,
+    "resistors": 7,
     "single_load": 8,
     "estimation": 9,
     "lanes": 10,

@@ -12,7 +12,7 @@ import etid
 from etid.preflight import SHORTEST, Inspected
 from etid.preflight import preflight as of_inspected
 from etid.scenes import PRESETS, Scene, Trial
-from etid.transformer import ResistorLoad, SkinLoad
+from etid.transformer import OpenLoad, ResistorLoad, SkinLoad
 
 LENGTH = 3334
 DAMP = SkinLoad(r_s=6.1e3, r_p=17.4e3, c_p=0.66e-9)
@@ -62,7 +62,7 @@ def test_any_skin_passes(r_s, r_p, c_p, jitter, seed):
     assert preflight(one) is None
 
 
-@pytest.mark.parametrize("r", [1e3, 21.62e3, 555e3, 1e9])
+@pytest.mark.parametrize("r", [1e3, 21.62e3, 555e3, 10e6])
 def test_any_resistor_passes(r):
     assert preflight(simulate(ResistorLoad(r))) is None
 
@@ -114,3 +114,19 @@ def test_the_shortest_record_is_named_before_anything_else():
     assert preflight(one) is None
     nothing = np.full(SHORTEST - 1, np.nan)
     assert preflight(one.replace(v_th=nothing, v_out=nothing)) == "too_short"
+
+
+@pytest.mark.parametrize("snr_db", [None, 80.0, 60.0, 40.0, 20.0])
+@pytest.mark.parametrize("jitter", [0.0, 50e-9, 500e-9])
+def test_a_record_without_a_load_is_unconnected(snr_db, jitter):
+    options = {"snr_db": snr_db, "trigger_jitter_rms": jitter, "offset_rms": 0.01}
+    assert preflight(simulate(OpenLoad(), **options)) == "unconnected"
+    one = simulate(**options)
+    assert preflight(one.replace(v_out=one.v_th)) == "unconnected"
+
+
+@pytest.mark.parametrize("snr_db", [None, 60.0, 40.0, 20.0])
+def test_a_load_of_megohms_is_connected(snr_db):
+    """It draws a hundredth of what the terminal has: ten and more standard errors at 20 dB."""
+    for r in (200e3, 1e6):
+        assert preflight(simulate(ResistorLoad(r), snr_db=snr_db)) is None

@@ -1,0 +1,67 @@
+"""Known resistors that are wrong: several contradict each other, or none can be meant."""
+
+import numpy as np
+import pytest
+
+import etid
+from etid import resistors
+from etid.preflight import Inspected
+from etid.scenes import Scene, Trial
+from etid.transformer import ResistorLoad
+
+KNOWN = (98.8e3, 216.6e3)
+SIGMAS = 5.0  # one in 2 million for a normal error
+
+
+@pytest.fixture(scope="module")
+def calibrations():
+    trials = tuple(Trial(f"calibration/{i}", ResistorLoad(r)) for i, r in enumerate(KNOWN))
+    study = Scene(calibration=trials, snr_db=60.0).simulate(seed=1)
+    return [study[trial.path] for trial in trials]
+
+
+@pytest.mark.parametrize("method", [None, pytest.param("output_error", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("factor", [1.0, 1.05])
+def test_of_two_resistors_one_that_is_5_percent_wrong_is_seen(calibrations, factor, method):
+    """It made every element wrong by 2 to 4 %, at chi2 5 or 1.5."""
+    first, second = calibrations
+    wrong = first.replace(r_load=factor * KNOWN[0])
+    driver = etid.identify_driver([wrong, second], method=method, throw=False)
+    assert driver.calibration is not None
+    assert driver.calibration.mismatch is not None
+    off, error = np.asarray(driver.calibration.mismatch)
+    # Twice a standard error of 0.03 %; a step of Newton is off by the square of 5 %.
+    assert np.all(error < 0.001)
+    np.testing.assert_allclose(off[0], np.log(factor), atol=SIGMAS * error[0] + (factor - 1) ** 2)
+    np.testing.assert_allclose(off[1], -off[0], rtol=0.2, atol=SIGMAS * error[1])
+    assert driver.verdict == ("successful" if factor == 1 else "resistors_disagree")
+    assert "r_load 216.6 kΩ is " in str(driver)
+
+
+def test_a_resistor_in_kilohm_beside_one_in_ohm_is_seen(calibrations):
+    first, second = calibrations
+    with pytest.raises(etid.IdentificationError, match="resistors_disagree") as raised:
+        etid.identify_driver([first.replace(r_load=98.8), second])
+    assert "'calibration/0' 0.0" in str(raised.value)  # [kohm]: 13 ohm, for 13 kohm
+
+
+@pytest.mark.parametrize("r_load", [98.8, 1e-3, 1e12])
+def test_a_resistor_of_another_unit_makes_an_implausible_driver(calibrations, r_load):
+    """One resistor is as good as another to chi2: what is not believed is the impedance."""
+    calibration = calibrations[0].replace(r_load=r_load)
+    with pytest.raises(etid.IdentificationError, match=r"implausible.*Is r_load in ohm"):
+        etid.identify_driver(calibration)
+    believed = etid.identify_driver(calibration, plausible=(0.0, np.inf))
+    assert believed.verdict == "successful"
+
+
+def test_a_record_without_a_load_is_no_calibration(calibrations):
+    calibration = calibrations[0]
+    with pytest.raises(etid.IdentificationError, match="unconnected"):
+        etid.identify_driver(calibration.replace(v_out=calibration.v_th))
+
+
+def test_rough_impedances_are_within_the_factor_that_is_allowed(calibrations):
+    rough = [resistors.rough_impedance(Inspected(of)) for of in calibrations]
+    assert max(rough) < 1.2 * min(rough)
+    assert 10e3 < min(rough) < 20e3  # |Z_th| is 12.7 kohm at 1 kHz, and rises
