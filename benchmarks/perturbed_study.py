@@ -70,6 +70,23 @@ class Study:
 Change = Callable[[Study], Study]
 
 
+def drawn_driver(number: int, spread: float, usual: TransformerDriver) -> TransformerDriver:
+    """One of many transformers of a kind.
+
+    Args:
+        number: Of the driver; equal numbers are equal drivers.
+        spread: Standard deviation of the logarithm of every part.
+        usual: The medians of the parts, and what all have in common: pulse and turns.
+    """
+    rng = np.random.default_rng([number, *b"driver"])
+    parts = {
+        field.name: getattr(usual, field.name) * float(np.exp(spread * rng.standard_normal()))
+        for field in dataclasses.fields(usual)
+        if field.name not in FIXED
+    }
+    return dataclasses.replace(usual, **parts)
+
+
 def undisturbed(number: int, snr_db: float) -> Study:
     """The study of one driver.
 
@@ -77,14 +94,8 @@ def undisturbed(number: int, snr_db: float) -> Study:
         number: Of the driver; parts and delays are drawn from it.
         snr_db: Of every record [dB].
     """
-    rng = np.random.default_rng([number, *b"driver"])
-    usual = TransformerDriver()
-    parts = {
-        field.name: getattr(usual, field.name) * float(np.exp(PARTS * rng.standard_normal()))
-        for field in dataclasses.fields(usual)
-        if field.name not in FIXED
-    }
-    driver = TransformerDriver(**parts)
+    driver = drawn_driver(number, PARTS, TransformerDriver())
+    rng = np.random.default_rng([number, *b"delays"])
     sigma = noise(driver, 200e3, snr_db)
 
     def made(path: str, load: Impedance, r_load: float | None = None) -> Record:

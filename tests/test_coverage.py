@@ -3,8 +3,10 @@
 import numpy as np
 import pytest
 
-from benchmarks.coverage import monte_carlo, scene
+from benchmarks.coverage import Draws, expected_covered, expected_rms, monte_carlo, scene
 from benchmarks.ladder import LOADS
+from benchmarks.perturbed_study import drawn_driver
+from etid.transformer import TransformerDriver
 
 SUCCESSFUL = 0.9  # Steiglitz-McBride calls one of 20 biased that it need not
 REPETITIONS = 200  # a driver costs a second
@@ -43,3 +45,24 @@ def test_intervals_of_95_per_cent_contain_the_truth_in_95_per_cent(method, snr_d
         assert (spread < 1 + LIMIT / np.sqrt(2 * good.sum())).all(), spread
         assert (spread > WIDE).all(), spread
         assert (np.abs(of.z.mean(0)) < BIAS).all(), of.z.mean(0)
+
+
+def test_ranges_hold_what_right_standard_errors_show():
+    """Of 2000 runs of 200 fits with normal errors 1 % are outside, ± 3 standard deviations."""
+    z = np.random.default_rng(1).standard_normal((2000, 200))
+    of = Draws(z.T, np.ones((200, 2000)), np.full(200, "successful"))
+    for found, (low, high), margin in (
+        (of.rms, expected_rms(200), 0.007),
+        (of.covered, expected_covered(200), 0.01),  # a count is one of few numbers
+    ):
+        outside = np.mean((found < low) | (found > high))
+        assert outside == pytest.approx(0.01, abs=margin)
+
+
+def test_drivers_have_parts_of_their_own_and_one_pulse():
+    usual = TransformerDriver()
+    drawn = [drawn_driver(number, 0.03, usual) for number in range(50)]
+    assert drawn[7] == drawn_driver(7, 0.03, usual)
+    leakage = np.log([of.l_secondary / usual.l_secondary for of in drawn])
+    assert leakage.std() == pytest.approx(0.03, rel=0.3)  # three standard deviations of 50 draws
+    assert {of.turns for of in drawn} == {usual.turns}
