@@ -23,6 +23,7 @@ NAMES = (
     "failure_map",
     "perturbations",
     "rivals",
+    "fuzz",
 )
 
 

@@ -20,7 +20,9 @@ import numpy as np
 from jaxtyping import Array, Int
 from tqdm import tqdm
 
-from etid.circuits import AbstractCircuit, SkinRC
+from etid.arguments import circuit_of, order_of, require
+from etid.arguments import recordings as several
+from etid.circuits import AbstractCircuit
 from etid.driver import Driver
 from etid.given_driver import GivenDriver
 from etid.identify import failed_fit, identify_driver
@@ -258,7 +260,8 @@ def identify_skins(
     Raises:
         ValueError: No recording, or method and circuit do not go together.
     """
-    circuit = SkinRC() if circuit is None else circuit
+    require("driver", driver, Driver)
+    circuit = circuit_of(circuit)
     check_method(method, circuit)
     if isinstance(recordings, Study):
         study, paths = recordings, [*recordings, *recordings.problems]
@@ -267,7 +270,7 @@ def identify_skins(
             len(paths), lambda row: (study[paths[row]], driver), circuit, method, progress
         )
     else:
-        records = list(recordings)
+        records = several("recordings", recordings)
         metadata = [record.metadata for record in records]
         fits, notes = _identify(
             len(records), lambda row: (records[row], driver), circuit, method, progress
@@ -304,7 +307,9 @@ def identify_study(
     Raises:
         ValueError: No loaded recording, or method and circuit do not go together.
     """
-    circuit = SkinRC() if circuit is None else circuit
+    require("study", study, Study)
+    order = order_of(order)
+    circuit = circuit_of(circuit)
     check_method(method, circuit)
     drivers = Drivers(study, order, method)
     paths = to_identify(study)

@@ -19,6 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Complex, Float
 
+from etid.arguments import require
 from etid.circuits import DISPLAY, AbstractCircuit, Resistor, SkinRC
 from etid.information import inverse
 from etid.precision import require_float64
@@ -91,6 +92,9 @@ def bound(scene: Scene, *, delays: bool = True, known_driver: bool = False) -> d
             calibration.
     """
     require_float64()
+    require(
+        "scene", scene, Scene, "Make one with etid.scenes.Scene, or use a preset of etid.scenes"
+    )
     if not (scene.calibration or known_driver):
         raise ValueError("the scene has no calibration; its driver would have to be known")
     waveform = scene.waveform()

@@ -1,10 +1,10 @@
 """The command line: `etid COMMAND`.
 
 Exit status: 0 done, 1 something is wrong with the data or no recording could be identified, 2 the
-command itself is wrong. What is wrong is one line on stderr, never a traceback. With `--json` a
-command prints one JSON object on stdout, whether it ends with 0 or 1; its keys `command`, `status`
-and, if something is wrong with the data, `error` are the same for all. JSON has no infinity and no
-NaN: such numbers are null.
+command itself is wrong, 130 Ctrl-C. What is wrong is one line on stderr, never a traceback. With
+`--json` a command prints one JSON object on stdout, whether it ends with 0 or 1; its keys
+`command`, `status` and, if something is wrong with the data, `error` are the same for all. JSON has
+no infinity and no NaN: such numbers are null.
 """
 
 import argparse
@@ -22,6 +22,7 @@ import numpy as np
 
 import etid
 from etid.commands import (
+    INTERRUPTED,
     WRONG_DATA,
     Outcome,
     check,
@@ -65,6 +66,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         text = " ".join(str(error).split())
         print(f"etid: error: {text}", file=sys.stderr)
         outcome = Outcome(data={"error": text}, status=WRONG_DATA)
+    except KeyboardInterrupt:
+        print(f"etid: interrupted: {_after_interrupt(arguments)}", file=sys.stderr)
+        return INTERRUPTED
     text = outcome.text
     if arguments.json:
         data = {"command": arguments.command, "status": outcome.status, **outcome.data}
@@ -73,12 +77,21 @@ def main(argv: Sequence[str] | None = None) -> int:
     return outcome.status
 
 
+def _after_interrupt(arguments: argparse.Namespace) -> str:
+    """What is left of a command, and how to go on: results are written whole or not at all."""
+    if arguments.run is fit.run:
+        return fit.after_interrupt(arguments)
+    target = getattr(arguments, "target", getattr(arguments, "page", None))
+    return "nothing was changed" if target is None else f"{target} was not written"
+
+
 def parser() -> argparse.ArgumentParser:
     """The arguments of all commands, from which their reference and completion are made."""
     parser = argparse.ArgumentParser(
         prog="etid",
         description="Identify circuits from electro-tactile stimulation recordings.",
-        epilog="Exit status: 0 done, 1 something is wrong with the data, 2 wrong usage.",
+        epilog="Exit status: 0 done, 1 something is wrong with the data, 2 wrong usage, "
+        "130 interrupted.",
     )
     parser.add_argument("--version", action=_Version, help="versions, backend and precision")
     parser.add_argument(

@@ -11,7 +11,8 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from etid import estimation, output_error, prediction, resistors
-from etid.circuits import AbstractCircuit, Resistor, SkinRC
+from etid.arguments import circuit_of, order_of, recordings, require
+from etid.circuits import AbstractCircuit, Resistor
 from etid.driver import Driver
 from etid.filtering import TAPS
 from etid.lanes import (
@@ -77,7 +78,9 @@ def identify_driver(
         IdentificationError: The verdict is not successful and `throw` is set.
     """
     check_method(method)
-    records = [calibrations] if isinstance(calibrations, Recording) else list(calibrations)
+    order = order_of(order)
+    single = isinstance(calibrations, Recording)
+    records = recordings("calibrations", [calibrations] if single else calibrations)
     if not records:
         raise ValueError(
             "no calibration given; a driver needs at least one record with a known r_load"
@@ -165,7 +168,9 @@ def identify_skin(
         ValueError: The driver cannot serve this method, or the method this circuit.
         IdentificationError: The verdict is not successful and `throw` is set.
     """
-    circuit = SkinRC() if circuit is None else circuit
+    require("recording", recording, Recording)
+    require("driver", driver, Driver)
+    circuit = circuit_of(circuit)
     check_method(method, circuit)
     seen = Inspected(recording)
     chosen, name = plan(method, seen, driver)
@@ -218,7 +223,8 @@ def identify_samples(
     Raises:
         ValueError: The driver cannot serve this method, or the method this circuit.
     """
-    circuit = SkinRC() if circuit is None else circuit
+    require("driver", driver, Driver)
+    circuit = circuit_of(circuit)
     check_method(method, circuit)
     periods = whole_periods(v_out.shape[0], sample_rate, pulse_rate)
     if method is None:
@@ -274,7 +280,11 @@ def predict(
             element meets a record without a whole period.
     """
     require_float64()
-    if circuit is None:
+    require("recording", recording, Recording)
+    require("driver", driver, Driver)
+    if circuit is not None:
+        circuit = circuit_of(circuit)
+    else:
         if recording.r_load is None:
             raise ValueError("give the circuit: this recording has no known resistor")
         circuit = Resistor(recording.r_load)

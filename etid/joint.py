@@ -18,6 +18,7 @@ from jaxtyping import Array, Int
 from tqdm import tqdm
 
 from etid import estimation, judging, shared_driver
+from etid.arguments import circuit_of, order_of, require
 from etid.batch import (
     LANES,
     Drivers,
@@ -29,7 +30,7 @@ from etid.batch import (
     to_identify,
     unstacked,
 )
-from etid.circuits import AbstractCircuit, SkinRC
+from etid.circuits import AbstractCircuit
 from etid.driver import Driver
 from etid.identify import failed_fit
 from etid.lanes import checksum, is_shared, lane
@@ -174,7 +175,9 @@ def identify_jointly(
         ValueError: The study has no loaded recording.
     """
     require_float64()
-    circuit = SkinRC() if circuit is None else circuit
+    require("study", study, Study)
+    order = order_of(order)
+    circuit = circuit_of(circuit)
     drivers = Drivers(study, order, None)
     paths = to_identify(study)
     fits: dict[int, Fit] = {}

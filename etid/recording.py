@@ -9,13 +9,15 @@ the size of a quantisation step stays known.
 import abc
 import dataclasses
 import math
-from collections.abc import Hashable, Iterable, Iterator, Mapping
+from collections.abc import Hashable, Iterable, Iterator, Mapping, Sequence
 from types import MappingProxyType
 from typing import Any, NamedTuple, SupportsFloat
 
 import numpy as np
 import numpy.typing as npt
 from jaxtyping import Float
+
+from etid import schema
 
 Label = str | int | np.integer
 SIGNALS = ("v_th", "v_out", "current")
@@ -95,6 +97,23 @@ def text(field: str, value: object) -> str:
     if "\0" in label or any("\ud800" <= character <= "\udfff" for character in label):
         raise RecordingError(f"{label!r} cannot be stored as UTF-8 text", field=field)
     return label
+
+
+def wanted_labels(given: Mapping[str, Any], known: Sequence[str]) -> dict[str, str]:
+    """Labels by which recordings or fits are chosen, as text; those that are None are left out.
+
+    Raises:
+        RecordingError: There is no label of that name, or its value is no label.
+    """
+    for name in given:
+        if name not in known:
+            near = schema.near_miss(name, known)
+            raise RecordingError(
+                f"is no label{f', did you mean {near}?' if near else ''}",
+                field=name,
+                remedy=f"The labels are {', '.join(known)}",
+            )
+    return {name: text(name, value) for name, value in given.items() if value is not None}
 
 
 def tidy_path(path: str) -> str:

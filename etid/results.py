@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Array, Complex, Float, Int
 
 from etid.circuits import DISPLAY, AbstractCircuit, Resistor, SkinRC
+from etid.recording import Label, wanted_labels
 from etid.remarks import remarks_of, texts, words
 from etid.tables import read_table, write_table
 from etid.verdicts import RESULTS, message, verdict_names, verdicts_of
@@ -182,7 +183,7 @@ class Fits:
             np.concatenate([part.notes for part in parts]),
         )
 
-    def where(self, **labels: str) -> "Fits":
+    def where(self, **labels: Label | None) -> "Fits":
         """The fits whose labels equal the given ones, as in `where(condition="dry")`.
 
         Args:
@@ -190,9 +191,12 @@ class Fits:
 
         Returns:
             Those fits, in their order.
+
+        Raises:
+            RecordingError: There is no such label, or its value is neither text nor an integer.
         """
         chosen = np.ones(len(self), bool)
-        for name, value in labels.items():
+        for name, value in wanted_labels(labels, LABELS).items():
             chosen &= self.labels[name] == value
         return self.take(chosen)
 

@@ -19,14 +19,16 @@ import multiprocessing
 import os
 import pathlib
 import shutil
+import signal
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import jax
 from tqdm import tqdm
 
+from etid.arguments import circuit_of, order_of
 from etid.batch import Drivers, identify_part, to_identify
-from etid.circuits import AbstractCircuit, SkinRC
+from etid.circuits import AbstractCircuit
 from etid.hdf5 import read
 from etid.methods import Method, check_method
 from etid.recording import RecordingError
@@ -98,7 +100,11 @@ def _fit_elsewhere(
 
 
 def _pin(cores: Any) -> None:
-    """Give this process a core of its own: sharing them costs XLA more than it gains."""
+    """Give this process a core of its own: sharing them costs XLA more than it gains.
+
+    Ctrl-C reaches it as well as its parent, which says what was kept: it ends without a word.
+    """
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
     if hasattr(os, "sched_setaffinity"):
         os.sched_setaffinity(0, {cores.get()})
 
@@ -121,7 +127,7 @@ class _Parts:
     """The folder of parts beside a result."""
 
     def __init__(self, target: pathlib.Path, run: Mapping[str, Any], resume: bool):
-        self.folder = target.with_name(target.name + ".parts")
+        self.folder = _folder(target)
         described = self.folder / "run.json"
         if self.folder.exists() and not resume:
             shutil.rmtree(self.folder)
@@ -141,6 +147,22 @@ class _Parts:
     def path(self, number: int) -> pathlib.Path:
         """File of one part."""
         return self.folder / f"{number:06d}.h5"
+
+
+def kept(target: str | os.PathLike[str]) -> str:
+    """What a run that did not end has left beside its result, in words; empty if nothing."""
+    folder = _folder(pathlib.Path(target))
+    try:
+        run = json.loads((folder / "run.json").read_text("utf-8"))
+        total, size = int(run["recordings"]), int(run["size of a part"])
+    except (OSError, ValueError, KeyError, TypeError):
+        return ""
+    done = min(total, size * len(list(folder.glob("[0-9]*.h5"))))
+    return f"{done} of {total} recordings are fitted and kept in {folder}" if done else ""
+
+
+def _folder(target: pathlib.Path) -> pathlib.Path:
+    return target.with_name(target.name + ".parts")
 
 
 def fit_file(
@@ -175,7 +197,8 @@ def fit_file(
         RecordingError: The source as a whole is missing, damaged or of another schema.
         ValueError: The source has no loaded recording.
     """
-    circuit = SkinRC() if circuit is None else circuit
+    order = order_of(order)
+    circuit = circuit_of(circuit)
     check_method(method, circuit)
     source, target = os.path.abspath(source), pathlib.Path(target)
     opened = _open(source, order, method)
@@ -229,3 +252,6 @@ def _results(
             yield futures.pop(future), future.result()
     except concurrent.futures.BrokenExecutor as error:
         raise ResumeError("a worker was lost; what is done is kept, go on with resume") from error
+    finally:
+        for future in futures:  # those left if this was interrupted: the executor would end them
+            future.cancel()

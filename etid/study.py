@@ -15,7 +15,7 @@ from etid.recording import (
     Metadata,
     Recording,
     RecordingError,
-    text,
+    wanted_labels,
 )
 from etid.writing import write
 
@@ -190,7 +190,7 @@ class Study(Mapping[str, Recording]):
             A study that reads from the same file.
         """
         given = zip(LABELS, (subject, condition, electrode, trial), strict=True)
-        wanted = {name: text(name, value) for name, value in given if value is not None}
+        wanted = wanted_labels(dict(given), LABELS)
         return self._part(
             lambda metadata: all(getattr(metadata, name) == label for name, label in wanted.items())
         )

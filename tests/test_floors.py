@@ -31,6 +31,7 @@ FLOORS = {
     "circuits": 2,
     "other_circuit": 2,
     "recording": 1,
+    "arguments": 4,
     "driver": 2,
     "results": 3,
     "measurement": 2,

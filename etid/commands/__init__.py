@@ -9,6 +9,7 @@ from collections.abc import Mapping
 from typing import Any
 
 DONE, WRONG_DATA = 0, 1  # argparse exits with 2 by itself
+INTERRUPTED = 130  # what shells give a command that Ctrl-C has ended: 128 + SIGINT
 
 
 @dataclasses.dataclass(frozen=True)

@@ -17,7 +17,7 @@ from etid.commands import DONE, WRONG_DATA, Outcome
 from etid.joint import identify_jointly
 from etid.methods import METHODS
 from etid.report import Table
-from etid.streaming import fit_file, processes
+from etid.streaming import fit_file, kept, processes
 from etid.study_fits import StudyFits
 
 _SHOWN = 20  # recordings without success that are listed one by one
@@ -77,6 +77,14 @@ def run(arguments: argparse.Namespace) -> Outcome:
     status = DONE if "successful" in outcome.fits.counts() else WRONG_DATA
     files = {"source": arguments.source, "target": arguments.target}
     return Outcome(_summary(outcome), {**files, **_data(outcome)}, status)
+
+
+def after_interrupt(arguments: argparse.Namespace) -> str:
+    """What was kept of a fit, and how to go on."""
+    left = "" if arguments.joint else kept(arguments.target)
+    if left:
+        return f"{left}; add --resume to the same command to go on"
+    return f"{arguments.target} was not written, and nothing was kept: run the same command again"
 
 
 @contextlib.contextmanager

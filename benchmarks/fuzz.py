@@ -1,0 +1,229 @@
+"""Damaged files: crashes, hangs, memory and errors that are not etid's own.
+
+Every file is a good one that was damaged as its kind and seed say. Child processes read thousands
+of them each; one that takes longer than `--limit`, dies, or allocates more than a gigabyte is
+counted and named by kind and seed, and `--kind KIND --first SEED --files 1` repeats it. What may
+come out is an answer or one `etid.RecordingError`.
+"""
+
+import argparse
+import collections
+import faulthandler
+import json
+import pathlib
+import resource
+import select
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+import traceback
+import warnings
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+
+import etid
+from benchmarks import specimens
+
+MEMORY = 1 << 30  # bytes that a process may have beside what it has after its imports
+START = 120.0  # seconds until a child has made its good files
+SHARES = {"recordings": 8, "fits": 5, "mapping": 2, "csv": 1, "npz": 1, "matlab": 2,
+          "matlab5": 1, "tdms": 1, "abf": 1}  # fmt: skip
+FINE = ("read", "refused")
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """How many files, of which kind, from which seed on."""
+    parser.add_argument("--files", type=int, default=2000)
+    parser.add_argument("--first", type=int, default=0, help="first seed")
+    parser.add_argument("--kind", choices=SHARES, help="default: all, by turns")
+    parser.add_argument("--limit", type=float, default=5.0, help="seconds for one file")
+    parser.add_argument("--output", type=pathlib.Path, help="JSON file")
+
+
+def main(arguments: argparse.Namespace) -> bool:
+    """Run them; whether nothing crashed, hung, ate memory or raised what is not ours."""
+    started = time.perf_counter()
+    seeds = range(arguments.first, arguments.first + arguments.files)
+    cases = [(arguments.kind or kind_of(seed), seed) for seed in seeds]
+    counts: dict[str, collections.Counter[str]] = collections.defaultdict(collections.Counter)
+    faults: list[dict[str, Any]] = []
+    slowest = largest = 0.0
+    for found in run(cases, arguments.limit):
+        counts[found["kind"]][found["outcome"]] += 1
+        slowest = max(slowest, found["seconds"])
+        largest = max(largest, found["memory"])
+        if found["outcome"] not in FINE:
+            faults.append(found)
+            print(f"{found['kind']} {found['seed']}: {found['outcome']}\n{found['detail']}\n")
+    print(f"{'':<12}{'files':>8}{'read':>8}{'refused':>8}{'faults':>8}")
+    for kind, own in counts.items():
+        wrong = own.total() - own["read"] - own["refused"]
+        print(f"{kind:<12}{own.total():>8}{own['read']:>8}{own['refused']:>8}{wrong:>8}")
+    print(
+        f"{len(faults)} faults in {len(cases)} files; slowest {slowest:.2f} s, "
+        f"peak memory {largest / 2**20:.0f} MB, {time.perf_counter() - started:.0f} s in all"
+    )
+    if arguments.output is not None:
+        content = {"cases": len(cases), "counts": counts, "faults": faults, "slowest": slowest,
+                   "memory": largest}  # fmt: skip
+        arguments.output.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
+    return not faults
+
+
+def kind_of(seed: int) -> str:
+    """Which kind of file a seed is for, if none is asked for."""
+    turns = [kind for kind, share in SHARES.items() for _ in range(share)]
+    return turns[seed % len(turns)]
+
+
+def run(cases: list[tuple[str, int]], limit: float) -> Iterator[dict[str, Any]]:
+    """The outcomes of all cases, from as many child processes as it takes."""
+    left = collections.deque(cases)
+    while left:
+        with _Child() as child:
+            while left and child.alive:
+                kind, seed = left.popleft()
+                yield child.outcome(kind, seed, limit)
+
+
+class _Child:
+    """A process that reads one damaged file after the other."""
+
+    def __enter__(self) -> "_Child":
+        self.folder = tempfile.mkdtemp(prefix="etid-fuzz-")
+        self.errors = tempfile.TemporaryFile("w+")
+        self.process = subprocess.Popen(
+            [sys.executable, "-m", "benchmarks.fuzz", self.folder],
+            stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=self.errors, bufsize=0,
+        )  # fmt: skip
+        self.pending = b""
+        self.alive = self._answer(START) is not None
+        if not self.alive:
+            raise RuntimeError(f"no child process could be started:\n{self._last_words()}")
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.process.kill()
+        self.process.wait()
+        self.errors.close()
+        shutil.rmtree(self.folder, ignore_errors=True)
+
+    def outcome(self, kind: str, seed: int, limit: float) -> dict[str, Any]:
+        """What comes of one file."""
+        found = {"kind": kind, "seed": seed, "seconds": limit, "memory": 0.0, "detail": ""}
+        assert self.process.stdin is not None
+        self.process.stdin.write(json.dumps([kind, seed]).encode() + b"\n")
+        # What a file that has once been damaged takes to be damaged is not the reader's time.
+        began = self._answer(START) is not None
+        answer = self._answer(limit) if began else None
+        if answer is not None:
+            return found | answer
+        self.alive = False
+        hangs = self.process.poll() is None
+        if hangs:
+            self.process.send_signal(signal.SIGUSR1)  # faulthandler says where it is
+            time.sleep(0.3)
+            self.process.kill()
+        status = self.process.wait()
+        outcome = "hang" if hangs else f"crash, status {status}"
+        return found | {"outcome": outcome, "detail": self._last_words()}
+
+    def _answer(self, limit: float) -> dict[str, Any] | None:
+        """The next line; None if there is none in time."""
+        assert self.process.stdout is not None
+        end = time.monotonic() + limit
+        while b"\n" not in self.pending:
+            left = max(0.0, end - time.monotonic())
+            if not select.select([self.process.stdout], [], [], left)[0]:
+                return None
+            more = self.process.stdout.read(1 << 16)
+            if not more:
+                return None
+            self.pending += more
+        line, _, self.pending = self.pending.partition(b"\n")
+        return json.loads(line)
+
+    def _last_words(self) -> str:
+        self.errors.seek(0)
+        return self.errors.read()[-4000:]
+
+
+def damage(path: pathlib.Path, kind: specimens.Kind, seed: int) -> pathlib.Path:
+    """Write a damaged file of this kind and seed into a folder."""
+    rng = np.random.default_rng(seed)
+    name = path / f"{seed}{kind.suffix}"
+    name.write_bytes(kind.good[int(rng.integers(len(kind.good)))])
+    kind.damage(name, rng)
+    return name
+
+
+def judge(path: pathlib.Path, kind: specimens.Kind, seed: int) -> tuple[str, str]:
+    """What comes of reading a file: `read`, `refused`, or what is wrong about it, and the text."""
+    try:
+        kind.use(path, seed)
+    except etid.RecordingError as error:
+        if _of_memory(error):
+            return "memory", "".join(traceback.format_exception(error))
+        # One line that says which file.
+        place = path.name in str(error) or path.stem in str(error)
+        return ("refused", str(error)) if place else ("unnamed", str(error))
+    except BaseException as error:
+        return type(error).__name__, "".join(traceback.format_exception(error)[-12:])
+    return "read", ""
+
+
+def _of_memory(error: BaseException | None) -> bool:
+    """Whether an error goes back to one of memory: without this limit it would be had."""
+    while error is not None:
+        if isinstance(error, MemoryError) or "memory allocation" in str(error):
+            return True
+        error = error.__cause__ or error.__context__
+    return False
+
+
+def _status(name: str) -> int:
+    """A number of /proc/self/status [byte]."""
+    text = pathlib.Path("/proc/self/status").read_text("ascii")
+    return 1024 * int(text.split(f"{name}:")[1].split()[0])
+
+
+def child(folder: pathlib.Path) -> None:
+    """Read cases from stdin, and write what comes of them to stdout."""
+    faulthandler.register(signal.SIGUSR1, all_threads=True)
+    faulthandler.enable()
+    warnings.simplefilter("error")
+    known = specimens.kinds()
+    out = sys.stdout
+    sys.stdout = sys.stderr
+    limit = _status("VmSize") + MEMORY
+    resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
+    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+
+    def say(**content: Any) -> None:
+        print(json.dumps(content), file=out, flush=True)
+
+    say()
+    for line in sys.stdin:
+        name, seed = json.loads(line)
+        kind = known[name]
+        path = damage(folder, kind, seed)
+        say()
+        pathlib.Path("/proc/self/clear_refs").write_text("5", "ascii")  # the peak from here on
+        started = time.perf_counter()
+        outcome, detail = judge(path, kind, seed)
+        seconds = time.perf_counter() - started
+        for left in folder.iterdir():
+            left.unlink()
+        say(outcome=outcome, detail=detail, seconds=seconds, memory=_status("VmHWM"))
+
+
+if __name__ == "__main__":
+    import jax
+
+    jax.config.update("jax_enable_x64", True)
+    child(pathlib.Path(sys.argv[1]))

@@ -1,0 +1,363 @@
+"""Damage files: bytes, the structure of HDF5 files, JSON and TOML. Seeded, and without limits."""
+
+import contextlib
+import io
+import json
+import pathlib
+import zipfile
+from collections.abc import Callable
+from typing import Any
+
+import h5py
+import numpy as np
+
+Rng = np.random.Generator
+
+# Sizes and addresses that break arithmetic.
+_SPECIAL = (0, 1, 2, 255, 2**31 - 1, 2**31, 2**32 - 1, 2**40, 2**62, 2**63 - 1, 2**63, 2**64 - 1)
+_NAMES = ("v_th", "v_out", "current", "kind", "unit", "conversion", "path", "cov", "verdict", "x")
+_BOMB = 1 << 27  # numbers in a dataset that takes a few kilobytes of the file
+
+
+def damaged(data: bytes, rng: Rng) -> bytes:
+    """Flip, overwrite, cut, repeat, move and append bytes, one to four times."""
+    found = bytearray(data)
+    for _ in range(int(rng.integers(1, 5))):
+        if found:
+            _BYTES[rng.integers(len(_BYTES))](found, rng)
+    return bytes(found)
+
+
+def _place(data: bytearray, rng: Rng, longest: int = 1 << 12) -> slice:
+    start = int(rng.integers(len(data)))
+    if rng.random() < 0.5:  # metadata are at the beginning
+        start = int(rng.integers(min(len(data), 4096)))
+    return slice(start, start + int(rng.integers(1, longest)))
+
+
+def _flip(data: bytearray, rng: Rng) -> None:
+    for _ in range(int(rng.integers(1, 9))):
+        data[_place(data, rng).start] ^= 1 << int(rng.integers(8))
+
+
+def _set(data: bytearray, rng: Rng) -> None:
+    for _ in range(int(rng.integers(1, 9))):
+        data[_place(data, rng).start] = int(rng.choice([0, 1, 0x7F, 0x80, 0xFF, 0x20, 0x2C]))
+
+
+def _number(data: bytearray, rng: Rng) -> None:
+    size = int(rng.choice([2, 4, 8]))
+    start = _place(data, rng).start // size * size
+    value = int(rng.choice(np.array(_SPECIAL, dtype=object)))
+    if rng.random() < 0.5:  # an address inside the file, as a link to something else
+        value = int(rng.integers(len(data))) // 8 * 8
+    data[start : start + size] = (value % 256**size).to_bytes(size, "little")
+
+
+def _cut(data: bytearray, rng: Rng) -> None:
+    del data[_place(data, rng).start :]
+
+
+def _delete(data: bytearray, rng: Rng) -> None:
+    del data[_place(data, rng, 64)]
+
+
+def _repeat(data: bytearray, rng: Rng) -> None:
+    place = _place(data, rng, 256)
+    data[place.start : place.start] = data[place]
+
+
+def _move(data: bytearray, rng: Rng) -> None:
+    block = data[_place(data, rng, 512)]
+    start = _place(data, rng).start // 8 * 8
+    data[start : start + len(block)] = block
+
+
+def _zero(data: bytearray, rng: Rng) -> None:
+    place = _place(data, rng)
+    data[place] = bytes(len(data[place]))
+
+
+def _append(data: bytearray, rng: Rng) -> None:
+    data += rng.bytes(int(rng.integers(1, 4096)))
+
+
+_BYTES = (_flip, _set, _number, _number, _cut, _delete, _repeat, _move, _zero, _append)
+
+
+def odd_value(rng: Rng) -> Any:
+    """A value that no attribute or number of a schema should have."""
+    choices: tuple[Any, ...] = (
+        0, -1, 1, 7, 2**62, np.nan, np.inf, -np.inf, 1e308, 1e-308, -0.0, True, 60.0, 2.0e5,
+        "", "x", "volt", "loaded", "calibration", "/", "../..", "a\tb", "Ω", "x" * 5000,
+        np.bytes_(b"\xff\xfe"), [1.0, 2.0], [1, 2, 3], ["a", "b"], np.zeros((2, 2)),
+        np.zeros(7000), 1 + 2j, np.array([(1, 2.0)], dtype=[("a", "i4"), ("b", "f8")]),
+        h5py.Empty("f8"), h5py.Empty("S3"), np.longdouble(1), np.float16(3),
+        np.array([b"s01/dry"]), np.void(b"abc"), np.uint64(2**64 - 1),
+    )  # fmt: skip
+    return choices[int(rng.integers(len(choices)))]
+
+
+def restructure(path: pathlib.Path, rng: Rng) -> None:
+    """Change shapes, types, names, attributes and links of an HDF5 file, one to three times."""
+    with h5py.File(path, "r+") as file:
+        for _ in range(int(rng.integers(1, 4))):
+            # What the library refuses to write is no file to read.
+            with contextlib.suppress(Exception):
+                _STRUCTURE[rng.integers(len(_STRUCTURE))](file, rng)
+
+
+def _any(file: h5py.File, rng: Rng, kind: type) -> Any:
+    found: list[Any] = [file] if kind is not h5py.Dataset else []
+    file.visititems(lambda _, item: found.append(item) if isinstance(item, kind) else None)
+    return found[int(rng.integers(len(found)))]
+
+
+def _replaced(dataset: h5py.Dataset, **made: Any) -> None:
+    """Another dataset of the same name with the same attributes."""
+    parent: Any = dataset.parent
+    name, attributes = dataset.name, dict(dataset.attrs)
+    del parent[name]
+    new = parent.create_dataset(name, **made)
+    new.attrs.update(attributes)
+
+
+def _shape(file: h5py.File, rng: Rng) -> None:
+    dataset = _any(file, rng, h5py.Dataset)
+    size = max(1, int(np.prod(dataset.shape or ())))
+    shapes = [(), (0,), (1,), (size + 1,), (max(1, size - 1),), (size, 1), (1, size), (2, 3, 4),
+              (1,) * 32, (0, size), (size, 0)]  # fmt: skip
+    dtype = dataset.dtype
+    if rng.random() < 0.4:  # declared, but not stored
+        huge = [(2**20,), (2**31,), (2**40,), (2**31, 2**31), (2**40, 100), (10, 2**33), (2**21, 4)]
+        shape = huge[int(rng.integers(len(huge)))]
+        chunks = tuple(min(64, side) for side in shape)
+        return _replaced(dataset, shape=shape, dtype=dtype, chunks=chunks)
+    return _replaced(dataset, shape=shapes[int(rng.integers(len(shapes)))], dtype=dtype)
+
+
+def _dtype(file: h5py.File, rng: Rng) -> None:
+    dataset = _any(file, rng, h5py.Dataset)
+    texts = h5py.string_dtype()
+    kinds: tuple[Any, ...] = (
+        "f2", "f4", ">f8", ">i2", "u1", "i8", "c16", "S5", "V7", texts, np.dtype("longdouble"),
+        h5py.enum_dtype({"a": 1, "b": 2}), h5py.vlen_dtype("f8"), h5py.ref_dtype, "bool",
+        np.dtype([("a", "i4"), ("b", "f8")]), h5py.string_dtype("utf-8", 3), ("f8", (4,)),
+    )  # fmt: skip
+    _replaced(dataset, shape=dataset.shape, dtype=kinds[int(rng.integers(len(kinds)))])
+
+
+def _values(file: h5py.File, rng: Rng) -> None:
+    dataset = _any(file, rng, h5py.Dataset)
+    stored = dataset[()]
+    if np.asarray(stored).dtype.kind in "fiu":
+        odd = rng.choice([0.0, -1.0, 1e-300, 1e308, np.nan, np.inf, -np.inf])
+        if stored.dtype.kind in "iu":
+            odd = rng.choice([0, 1, np.iinfo(stored.dtype).max, np.iinfo(stored.dtype).min])
+        stored[rng.random(stored.shape) < rng.choice([0.1, 1.0])] = odd
+        dataset[...] = stored
+    else:
+        texts = ["", "x", "successful", "mixed", "{}", "[]", '{"calibrations": 1}', "loaded/0"]
+        dataset[int(rng.integers(len(dataset)))] = texts[int(rng.integers(len(texts)))]
+
+
+def _json(file: h5py.File, rng: Rng) -> None:
+    """Change the text of drivers, or of any other dataset of texts."""
+    texts: list[h5py.Dataset] = []
+    file.visititems(
+        lambda _, item: (
+            texts.append(item)
+            if isinstance(item, h5py.Dataset) and h5py.check_string_dtype(item.dtype)
+            else None
+        )
+    )
+    named = [each for each in texts if each.name == "/drivers"] or texts
+    dataset: Any = named[int(rng.integers(len(named)))]
+    row = int(rng.integers(len(dataset)))
+    dataset[row] = damaged_json(dataset.asstr()[row], rng)
+
+
+def damaged_json(text: str, rng: Rng) -> str:
+    """Remove, replace or nest a value of a JSON object, or damage its text."""
+    if rng.random() < 0.3:
+        return damaged(text.encode(), rng).replace(b"\0", b" ").decode("utf-8", "replace")
+    if rng.random() < 0.1:
+        depth = int(rng.choice([10, 1000, 100_000]))
+        return "[" * depth + "]" * depth
+    content = json.loads(text)
+    keys = list(content)
+    key = keys[int(rng.integers(len(keys)))]
+    odd = (None, 0, -1, 2.5, 1e308, True, "x", [], {}, [1.0], [[1.0]], ["a"], {"a": [1]}, 10**30,
+           [[1.0], [2.0, 3.0]], float("nan"), [None], "successful")  # fmt: skip
+    if rng.random() < 0.2:
+        del content[key]
+    else:
+        content[key] = odd[int(rng.integers(len(odd)))]
+    return json.dumps(content)
+
+
+def _remove(file: h5py.File, rng: Rng) -> None:
+    item = _any(file, rng, h5py.Dataset)
+    del item.parent[item.name]
+
+
+def _rename(file: h5py.File, rng: Rng) -> None:
+    item = _any(file, rng, h5py.Dataset if rng.random() < 0.5 else h5py.Group)
+    item.parent.move(item.name, f"{item.parent.name}/{rng.choice(_NAMES)}")
+
+
+def _attribute(file: h5py.File, rng: Rng) -> None:
+    owner = _any(file, rng, h5py.HLObject)
+    names = list(owner.attrs)
+    name = names[int(rng.integers(len(names)))] if names else "kind"
+    what = rng.random()
+    if what < 0.2:
+        del owner.attrs[name]
+    elif what < 0.3:
+        owner.attrs[str(rng.choice(_NAMES))] = owner.attrs[name]
+        del owner.attrs[name]
+    elif what < 0.4:
+        owner.attrs[str(rng.choice(_NAMES))] = odd_value(rng)
+    elif what < 0.5:
+        _odd_type(owner, name, rng)
+    else:
+        del owner.attrs[name]
+        owner.attrs[name] = odd_value(rng)
+
+
+def _odd_type(owner: Any, name: str, rng: Rng) -> None:
+    """An attribute of a type that has no Python value."""
+    del owner.attrs[name]
+    if rng.random() < 0.5:
+        owner.attrs.create(name, np.array([np.arange(3.0)], dtype=object), (1,),
+                           h5py.vlen_dtype("f8"))  # fmt: skip
+    else:
+        owner.attrs.create(name, owner.ref, dtype=h5py.ref_dtype)
+
+
+def _many_attributes(file: h5py.File, rng: Rng) -> None:
+    owner = _any(file, rng, h5py.HLObject)
+    for number in range(int(rng.choice([50, 400]))):
+        owner.attrs[f"extra{number}"] = "x" * int(rng.choice([1, 200]))
+
+
+def _deep(file: h5py.File, rng: Rng) -> None:
+    group = _any(file, rng, h5py.Group)
+    for _ in range(int(rng.choice([3, 40, 1500]))):
+        group = group.create_group("g")
+
+
+def _wide(file: h5py.File, rng: Rng) -> None:
+    group = _any(file, rng, h5py.Group)
+    for number in range(int(rng.choice([20, 1000]))):
+        group.create_group(f"g{number}")
+
+
+def _link(file: h5py.File, rng: Rng) -> None:
+    group, item = _any(file, rng, h5py.Group), _any(file, rng, h5py.HLObject)
+    name = str(rng.choice(_NAMES))
+    if name in group:
+        del group[name]
+    links: tuple[Any, ...] = (
+        item,
+        h5py.SoftLink(item.name),
+        h5py.SoftLink(group.name + "/" + name),  # to itself
+        h5py.SoftLink("/nowhere"),
+        h5py.ExternalLink(file.filename, item.name),
+        h5py.ExternalLink("/dev/zero", "/"),
+        h5py.ExternalLink("/nowhere.h5", "/"),
+    )
+    group[name] = links[int(rng.integers(len(links)))]
+
+
+def _elsewhere(file: h5py.File, rng: Rng) -> None:
+    """Samples that lie in another file, or in another dataset."""
+    dataset = _any(file, rng, h5py.Dataset)
+    shape, dtype = dataset.shape or (4,), dataset.dtype
+    if rng.random() < 0.5:
+        return _replaced(dataset, shape=shape, dtype=dtype, external=[("/dev/zero", 0, 2**40)])
+    attributes = dict(dataset.attrs)
+    parent, name = dataset.parent, dataset.name
+    del parent[name]
+    layout = h5py.VirtualLayout(shape, dtype)
+    layout[...] = h5py.VirtualSource(".", name, shape, dtype)
+    parent.create_virtual_dataset(name, layout).attrs.update(attributes)
+    return None
+
+
+def _bomb(file: h5py.File, rng: Rng) -> None:
+    dataset = _any(file, rng, h5py.Dataset)
+    rows = int(rng.choice([1, 64]))
+    shape = (rows, _BOMB // rows) if rng.random() < 0.5 else (_BOMB,)
+    _replaced(dataset, shape=shape, dtype=dataset.dtype, chunks=True, compression="gzip",
+              fillvalue=1)  # fmt: skip
+
+
+_STRUCTURE: tuple[Callable[[h5py.File, Rng], None], ...] = (
+    _shape, _shape, _dtype, _dtype, _values, _json, _json, _remove, _rename, _attribute, _attribute,
+    _attribute, _many_attributes, _deep, _wide, _link, _link, _elsewhere, _bomb,
+)  # fmt: skip
+
+
+def damaged_npz(data: bytes, rng: Rng) -> bytes:
+    """Replace, remove or misdeclare an array of an archive, whose checksums are right."""
+    if rng.random() < 0.4:
+        return damaged(data, rng)
+    with zipfile.ZipFile(io.BytesIO(data)) as archive:
+        members = {name: archive.read(name) for name in archive.namelist()}
+    name = str(rng.choice(list(members)))
+    what = rng.random()
+    if what < 0.2:
+        del members[name]
+    elif what < 0.5:
+        members[name] = damaged(members[name], rng)
+    elif what < 0.7:
+        shape = ((2**40,), (2**33, 100), (10**9,), (-1,), (3, -4), (2**70,))[int(rng.integers(6))]
+        header = f"{{'descr': '<i2', 'fortran_order': False, 'shape': {shape}, }}\n".encode()
+        members[name] = b"\x93NUMPY\x01\x00" + len(header).to_bytes(2, "little") + header
+    else:
+        buffer = io.BytesIO()
+        odd = odd_value(rng)
+        np.save(buffer, np.zeros(3) if isinstance(odd, h5py.Empty) else np.asarray(odd))
+        members[name] = buffer.getvalue()
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED) as archive:
+        for member, content in members.items():
+            archive.writestr(member, content)
+    return buffer.getvalue()
+
+
+def damaged_text(data: bytes, rng: Rng) -> bytes:
+    """Damage a table or a mapping: its bytes, or its lines."""
+    if rng.random() < 0.5:
+        return damaged(data, rng)
+    lines = data.split(b"\n")
+    place = int(rng.integers(min(len(lines), 12)))
+    odd = (b"", b",,,,", b'"', b"nan,inf,-inf", b"1e999,1,1", b"1,2", b"1,2,3,4", b"\xff\xfe", b"a",
+           b"\0\0", b"1;2;3", b"0x10,1,1", b"9" * 5000, b'"' + b"x" * 200_000)  # fmt: skip
+    lines[place] = odd[int(rng.integers(len(odd)))]
+    return b"\n".join(lines)
+
+
+def damaged_toml(data: bytes, rng: Rng) -> bytes:
+    """The same for a mapping, with deep values, large numbers and values of other types."""
+    if rng.random() < 0.4:
+        return damaged_text(data, rng)
+    lines = data.decode().splitlines()
+    places = [number for number, line in enumerate(lines) if "=" in line]
+    place = places[int(rng.integers(len(places)))]
+    depth = int(rng.choice([3, 300, 30_000]))
+    values = (
+        "[" * depth + "]" * depth, "{a=" * depth + "1" + "}" * depth, "1" + "0" * 400, "1" * 6000,
+        "nan", "inf", "-inf", "-1", "0", "true", "''", "'x'", "[]", "{}", "[1, 2]", "['a', {}]",
+        "1979-05-27T07:32:00Z", "0x" + "f" * 300, "{channel = 3}", "{channel = 'open', rows = [0]}",
+        "{channel = 'open', rows = 99999999999999999999}", '"\\u0000"', "{channel = 'skin'}",
+        "1e400", "1e-320", "'" + "x" * 100_000 + "'",
+    )  # fmt: skip
+    key = lines[place].partition("=")[0]
+    if rng.random() < 0.15:
+        key = ".".join(["a"] * depth)
+    lines[place] = f"{key} = {values[int(rng.integers(len(values)))]}"
+    if rng.random() < 0.1:
+        lines += ["[[recording]]", "path = 'x'"] * int(rng.choice([2, 3000]))
+    return "\n".join(lines).encode()

@@ -1,0 +1,89 @@
+"""Ctrl-C: a real signal to a real process ends in one line that says what was kept, and in 130."""
+
+import signal
+import subprocess
+import sys
+
+import pytest
+
+# The process waits where the signal is to come, after it has said so.
+WAITS = """
+import sys, time
+from benchmarks.specimens import study_fits
+from etid import cli, hdf5, streaming
+
+def wait(*_):
+    print("waiting", flush=True)
+    time.sleep(60)
+
+def fit(opened, circuit, method, size, number):
+    return study_fits() if number == 0 else wait()
+"""
+FIT = f"""{WAITS}
+streaming.PART, streaming._fit = 6, fit
+sys.exit(cli.main(["fit", sys.argv[1], "-o", sys.argv[2]]))
+"""
+CHECK = f"""{WAITS}
+hdf5.Scan.check_samples = wait
+sys.exit(cli.main(["check", sys.argv[1]]))
+"""
+FIRST = f"""{WAITS}
+streaming.read = wait
+sys.exit(cli.main(["fit", sys.argv[1], "-o", sys.argv[2]]))
+"""
+
+
+@pytest.fixture(scope="module")
+def interrupted(tmp_path_factory):
+    """Status, lines on stderr and folder of each process, which run side by side."""
+    from etid.scenes import Scene, Trial
+    from etid.transformer import ResistorLoad, SkinLoad
+
+    folder = tmp_path_factory.mktemp("interrupted")
+    skin = SkinLoad(r_s=33.4e3, r_p=186e3, c_p=0.12e-9)
+    trials = tuple(Trial(f"s01/{i}", skin) for i in range(14))
+    scene = Scene(trials, (Trial("calibration/0", ResistorLoad(98.8e3)),), samples=400)
+    scene.simulate(seed=3).write(folder / "study.h5")
+    started = {
+        name: subprocess.Popen(
+            [sys.executable, "-c", code, folder / "study.h5", folder / f"{name}.h5"],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+        for name, code in {"fit": FIT, "check": CHECK, "first": FIRST}.items()
+    }
+    found = {}
+    for name, process in started.items():
+        assert process.stdout is not None
+        assert process.stdout.readline() == "waiting\n"
+        process.send_signal(signal.SIGINT)
+        _, errors = process.communicate(timeout=60)  # closes its pipes
+        found[name] = process.returncode, errors.splitlines(), folder
+    return found
+
+
+def test_ctrl_c_says_what_was_kept_and_how_to_go_on(interrupted):
+    status, errors, folder = interrupted["fit"]
+    assert (status, errors) == (
+        130,
+        [
+            f"etid: interrupted: 6 of 14 recordings are fitted and kept in {folder}/fit.h5.parts; "
+            "add --resume to the same command to go on"
+        ],
+    )
+    assert (folder / "fit.h5.parts" / "000000.h5").exists()
+
+
+def test_ctrl_c_before_the_first_part_says_that_nothing_was_kept(interrupted):
+    status, errors, folder = interrupted["first"]
+    assert status == 130
+    assert errors == [
+        f"etid: interrupted: {folder}/first.h5 was not written, and nothing was kept: run the same "
+        "command again"
+    ]
+
+
+def test_ctrl_c_in_another_command_says_that_nothing_was_changed(interrupted):
+    status, errors, _ = interrupted["check"]
+    assert (status, errors) == (130, ["etid: interrupted: nothing was changed"])
