@@ -1,6 +1,7 @@
 # Everything runs in .venv, with the versions of constraints.txt.
 #   make demo    simulate the paper's experiments, identify them, print the tables: demo/index.html
 #   make test    the ordinary tests
+#   make slow    the other tests: statistics, and what compiles long
 #   make ranking the benchmarks in short: which estimator is better, and is any wrong silently
 #   make notebooks  executes the notebooks: notebooks/*.ipynb, with their figures
 #   make docs    the site: site/index.html; the notebooks are its gallery
@@ -16,13 +17,16 @@ DEPENDENCIES ?= newest
 # What notebooks compile is kept where the tests keep it.
 COMPILED := JAX_COMPILATION_CACHE_DIR=$(CURDIR)/.pytest_cache/d/xla JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS=0
 
-.PHONY: demo test ranking notebooks docs wheel-test lint types clean
+.PHONY: demo test slow ranking notebooks docs wheel-test lint types clean
 
 demo: .venv/package
 	$(BIN)/python -m etid.demo demo/
 
 test: .venv/tools
 	$(BIN)/python -m pytest --numprocesses auto --dist loadfile
+
+slow: .venv/tools
+	$(BIN)/python -m pytest -m slow --numprocesses auto --dist loadfile
 
 ranking: .venv/tools
 	$(COMPILED) $(BIN)/python -m benchmarks speed_accuracy --quick --folder results/quick

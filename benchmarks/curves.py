@@ -149,7 +149,7 @@ def draw(rows: Sequence[dict[str, Any]], path: pathlib.Path) -> None:
         "lanes": ("recordings in a batch", "seconds per recording"),
         "workers": ("worker processes", "seconds per recording of a file"),
     }
-    figure, panels = charts.new_figure(1, 3, (11, 4.2))
+    figure, panels = charts.new_figure(1, 3, (11.0, 4.2))
     for axes, (against, (across, up)) in zip(panels[0], titles.items(), strict=True):
         of = [row for row in rows if row["against"] == against]
         for style, name in enumerate(dict.fromkeys(row["what"] for row in of)):

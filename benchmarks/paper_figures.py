@@ -93,7 +93,7 @@ def pulses(study: etid.Study, path: pathlib.Path) -> None:
 
 def driver(study: etid.Study, found: etid.Driver, path: pathlib.Path) -> None:
     """Figure 7: the calibration, and two resistors that the driver has not seen."""
-    figure, axes = charts.new_figure(2, 3, (12, 4.6), gridspec_kw=HEIGHTS, sharex="col")
+    figure, axes = charts.new_figure(2, 3, (12.0, 4.6), gridspec_kw=HEIGHTS, sharex="col")
     known = experiments.TABLE_1
     resistances = {etid.scenes.resistor_label(r): r for r in known}
     for (upper, lower), of in zip(axes.T, (CALIBRATION, *RESISTORS), strict=True):
@@ -221,7 +221,7 @@ def _elements_of(
 
 def causes(rows: Sequence[Row], path: pathlib.Path) -> None:
     """Error and scatter by laboratory and element, beside what the paper prints."""
-    figure, axes = charts.new_figure(1, len(ORDER), (11, 3.6), sharey=True)
+    figure, axes = charts.new_figure(1, len(ORDER), (11.0, 3.6), sharey=True)
     laboratories = list(dict.fromkeys(row["laboratory"] for row in rows))
     names = ["paper", *laboratories]
     for axis, element in zip(axes[0], ORDER, strict=True):

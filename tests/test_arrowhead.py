@@ -13,17 +13,21 @@ PROBLEMS, OWN, COMMON = 5, 2, 3
 AGREE = 1e-10  # of numbers of order 1 after a solution with condition numbers below 1e4
 
 
-def terms(own, common, seed):
+RNG = np.random.default_rng(11)
+DESIGNS = jnp.asarray(RNG.normal(size=(PROBLEMS, 7, OWN + COMMON)))
+TARGETS = jnp.asarray(0.1 * RNG.normal(size=(PROBLEMS, 7)))
+
+
+def terms(own, common, number):
     """Those of one problem: nonlinear in both, 7 of them."""
-    key = jax.random.fold_in(jax.random.key(11), seed)
-    design = jax.random.normal(key, (7, OWN + COMMON))
-    target = 0.1 * jax.random.normal(jax.random.fold_in(key, 1), (7,))
-    return jnp.sin(design @ jnp.concatenate([own, common])) + design[:, 0] * own[1] - target
+    design = DESIGNS[number]
+    both = jnp.concatenate([own, common])
+    return jnp.sin(design @ both) + design[:, 0] * own[1] - TARGETS[number]
 
 
 def everything(y, _):
     common, own = split(y, PROBLEMS, OWN)
-    return jnp.concatenate([terms(own[i], common, i) for i in range(PROBLEMS)])
+    return jax.vmap(lambda own, i: terms(own, common, i))(own, jnp.arange(PROBLEMS)).ravel()
 
 
 def structured(_, y, __):
@@ -47,13 +51,18 @@ def structured(_, y, __):
     )
 
 
-@pytest.fixture
+# One program each: line by line, every operation of these would be compiled by itself.
+dense_of = jax.jit(lambda y: normal_equations(everything, y))
+arrow_of = jax.jit(lambda y: structured(None, y, None))
+
+
+@pytest.fixture(scope="module")
 def start():
-    return 0.3 * jax.random.normal(jax.random.key(4), (COMMON + PROBLEMS * OWN,))
+    return jnp.asarray(0.3 * np.random.default_rng(4).normal(size=COMMON + PROBLEMS * OWN))
 
 
 def test_equations_are_those_of_one_matrix(start):
-    dense, arrow = normal_equations(everything, start), structured(None, start, None)
+    dense, arrow = dense_of(start), arrow_of(start)
     by = jnp.arange(1.0, start.size + 1)
     for expected, found in ((dense, arrow), (dense.scaled(by), arrow.scaled(by))):
         assert isinstance(found, ArrowheadEquations)
@@ -66,7 +75,7 @@ def test_equations_are_those_of_one_matrix(start):
 
 @pytest.mark.parametrize("damping", [1e-3, 1.0, 1e3])
 def test_elimination_solves_the_damped_step(start, damping):
-    dense, arrow = normal_equations(everything, start), structured(None, start, None)
+    dense, arrow = dense_of(start), arrow_of(start)
     expected = np.linalg.solve(
         dense.matrix + damping * np.eye(start.size), np.asarray(dense.gradient)
     )
@@ -75,7 +84,7 @@ def test_elimination_solves_the_damped_step(start, damping):
 
 
 def test_a_problem_that_says_nothing_stays_where_it_is(start):
-    arrow = structured(None, start, None)
+    arrow = arrow_of(start)
     silent = jnp.arange(PROBLEMS) == 2
     own = jnp.where(silent[:, None, None], 0.0, arrow.matrix.own)
     coupling = jnp.where(silent[:, None, None], 0.0, arrow.matrix.coupling)
@@ -93,7 +102,9 @@ def test_the_minimum_is_that_of_the_whole_problem(start):
         rtol=1e-9,
         descent=EliminationDescent(),
         equations=structured,
-        empty=lambda y, _: jax.tree.map(jnp.zeros_like, structured(None, y, None)),
+        empty=lambda y, _: jax.tree.map(
+            lambda leaf: jnp.zeros(leaf.shape), jax.eval_shape(structured, None, y, None)
+        ),
     )
     expected = optx.least_squares(everything, whole, start, throw=False)
     found = optx.least_squares(everything, parts, start, throw=False)

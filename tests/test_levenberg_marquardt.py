@@ -10,7 +10,7 @@ import scipy.optimize
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from etid.levenberg_marquardt import LevenbergMarquardt
+from etid.levenberg_marquardt import LevenbergMarquardt, NormalEquations, normal_equations
 
 TIME = np.linspace(0.0, 5.0, 60)
 TRUTH = np.array([3.0, 1.7, 0.8])
@@ -147,6 +147,46 @@ def test_a_step_into_nan_is_rejected_and_the_fit_goes_on():
     assert solution.result == optx.RESULTS.successful
     np.testing.assert_allclose(solution.value, [0.015**2], rtol=1e-5)
     assert int(solution.stats["accepted_steps"]) < int(solution.stats["num_steps"])
+
+
+@pytest.mark.parametrize(
+    ("objective", "slope", "expected"),
+    [(1.0, 2.0, 1.0), (np.nan, 2.0, np.inf), (1.0, np.nan, np.inf), (1.0, np.inf, np.inf)],
+)
+def test_a_value_or_slope_that_is_no_number_counts_as_infinite(objective, slope, expected):
+    gradient = jnp.array([0.0, slope])
+    of = NormalEquations(jnp.asarray(objective), gradient, jnp.eye(2)).finite()
+    assert float(of.objective) == expected
+
+
+class Trusting(optx.ClassicalTrustRegion):
+    """Accepts whatever it is shown."""
+
+    def step(self, first_step, y, y_eval, f_info, f_eval_info, state):
+        size, accept, result, state = super().step(
+            first_step, y, y_eval, f_info, f_eval_info, state
+        )
+        return size, jnp.ones_like(accept), result, state
+
+
+def root(y, args):
+    del args
+    return jnp.sqrt(y) * jnp.array([1.0, 1.0]) - jnp.array([0.01, 0.02])
+
+
+def raw_equations(residual, y, args=None):
+    """The same without a word on what is not finite."""
+    jacobian, r = jax.jacfwd(residual)(y, args), residual(y, args)
+    return NormalEquations(0.5 * r @ r, jacobian.T @ r, jacobian.T @ jacobian)
+
+
+@pytest.mark.parametrize("equations", [normal_equations, raw_equations])
+def test_no_step_into_nan_is_accepted_whatever_the_search_says(equations):
+    search = Trusting(high_cutoff=0.75, high_constant=5.0, low_constant=0.25)
+    solver = LevenbergMarquardt(rtol=1e-7, ftol=0.0, search=search, equations=equations)
+    solution = optx.least_squares(root, solver, jnp.array([1.0]), max_steps=100, throw=False)
+    assert solution.result == optx.RESULTS.successful
+    np.testing.assert_allclose(solution.value, [0.015**2], rtol=1e-5)
 
 
 def test_nan_at_the_start_is_a_verdict():

@@ -1,11 +1,21 @@
 """Z_th as one number for each harmonic: no order, no bias that is not told."""
 
+import dataclasses
+
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import etid
 from benchmarks.coverage import scene
 from benchmarks.ladder import LOADS
+from etid import non_parametric
+from etid.lanes import lane
+from etid.preflight import Inspected
+from etid.spectra import Spectrum
+from etid.transfer import as_complex
+from etid.verdicts import verdict
 
 RESISTORS = (98.8e3, 21.62e3)
 SIGMAS = 5.0  # one in 2 million for a normal error
@@ -17,7 +27,12 @@ def z(fit, name):
 
 
 def coarse_driver(study):
-    return etid.identify_driver(list(study.calibrations.recordings()), order=2, throw=False)
+    """A driver whose Z_th is a third too large, and known to be wrong: only harmonics are used."""
+    driver = etid.identify_driver(list(study.calibrations.recordings()), throw=False)
+    assert driver.source is not None
+    wrong = jax.tree.map(lambda leaf: 1.3 * leaf, (driver.source.gain, driver.source.slope))
+    source = dataclasses.replace(driver.source, gain=wrong[0], slope=wrong[1])
+    return dataclasses.replace(driver, source=source, result=verdict("misfit"))
 
 
 @pytest.fixture(scope="module")
@@ -27,11 +42,10 @@ def study():
 
 @pytest.fixture(scope="module")
 def coarse(study):
-    """A driver whose order is too low for its transformer."""
     return coarse_driver(study)
 
 
-def test_a_load_is_right_whatever_the_order_of_its_driver(study, coarse):
+def test_a_load_is_right_whatever_the_model_of_its_driver(study, coarse):
     assert coarse.verdict == "misfit"
     for name in LOADS:
         fit = etid.identify_skin(study[name], coarse, method="non_parametric")
@@ -62,3 +76,74 @@ def test_other_pulse_rates_than_the_calibration_s_have_no_z_th(study, coarse):
     faster = record.replace(pulse_rate=2 * record.pulse_rate)
     with pytest.raises(ValueError, match="harmonics of 60"):
         etid.identify_skin(faster, coarse, method="non_parametric")
+
+
+# --- its bias ------------------------------------------------------------------------------------
+
+
+def noisy_spectrum(count):
+    """X = 3, Y = −2j."""
+    one = jnp.ones(count)
+    x, y = jax.lax.complex(3 * one, 0 * one), jax.lax.complex(0 * one, -2 * one)
+    return Spectrum(one, x, y, 0.01 * one, 0.04 * one, one > 0)
+
+
+def test_bias_is_what_noise_adds_on_average():
+    """|X + n|² is E|n|² larger on average; a sum of terms that are linear is not."""
+    count = 500
+    spectrum = noisy_spectrum(count)
+
+    def change(records):
+        x, y = records[-1].x, records[-1].y
+        return jnp.stack(
+            [jnp.sum(jnp.abs(x) ** 2 - 9), jnp.sum(jnp.abs(y) ** 2 - 4), jnp.sum(x.real + y.imag)]
+        )
+
+    of_x, of_y, linear = non_parametric._bias(change, [spectrum])
+    # 4 draws of 500 harmonics: 2000 of exponential distribution, whose sum scatters by √2000.
+    scatter = SIGMAS / np.sqrt(count * non_parametric.PAIRS)
+    np.testing.assert_allclose(of_x, 0.01 * count, rtol=scatter)
+    np.testing.assert_allclose(of_y, 0.04 * count, rtol=scatter)
+    np.testing.assert_allclose(linear, 3 * count - 2 * count, rtol=1e-12)
+
+
+def test_one_unloaded_record_has_one_noise():
+    """x − x′ of two recordings with the same unloaded record is without any."""
+    one = noisy_spectrum(50)
+    other = dataclasses.replace(one, x=one.x + as_complex(jnp.ones(50)))
+
+    def apart(records):
+        return jnp.sum(jnp.abs(records[0].x - records[1].x) ** 2)[None]
+
+    assert float(non_parametric._bias(apart, [one, one])[0]) == 0.0
+    assert float(non_parametric._bias(apart, [other, one])[0]) > 50 + 0.005 * 50
+
+
+def test_bias_is_taken_off_the_estimate(study, coarse, monkeypatch):
+    """In the place of a bias the change that a larger Y makes; R alone keeps it cheap."""
+    calibration = coarse.calibration
+    *fields, rate = map(jnp.asarray, lane(Inspected(study["dry"]), "non_parametric"))
+    start = jnp.array([[np.log(150e3), 0.0]])
+
+    @jax.jit
+    def fit(spectrum, larger):
+        def bias(change, records):
+            more = dataclasses.replace(records[-1], y=records[-1].y * larger)
+            return change([*records[:-1], more])
+
+        with monkeypatch.context() as patched:
+            patched.setattr(non_parametric, "_bias", bias)
+            estimate, off = non_parametric.fit_circuit(
+                etid.Resistor(), calibration, coarse.sample_rate, spectrum, rate, start
+            )
+        return estimate.parameters, off
+
+    spectrum = Spectrum(*fields)
+    one = jnp.asarray(1.0 + 0j)
+    plain, nothing = fit(spectrum, one)
+    moved, _ = fit(dataclasses.replace(spectrum, y=spectrum.y * 1.001), one)
+    corrected, off = fit(spectrum, one * 1.001)
+    assert float(abs(nothing[0])) < 1e-6  # a minimum is refound to a thousandth of its error
+    assert float(off[0]) > 1e-3  # more voltage, more resistance
+    np.testing.assert_allclose(off, moved - plain, rtol=1e-2)
+    np.testing.assert_allclose(corrected - plain, -off, rtol=1e-2)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import etid
-from etid import bands, estimation, maximum_likelihood
+from etid import bands, estimation, given_driver, maximum_likelihood
 from etid.lanes import lane
 from etid.online import MEMORY, PATIENCE, Tracker
 from etid.preflight import Inspected
@@ -161,6 +161,56 @@ def test_without_noise_it_is_biased_by_less_than_a_tenth_of_the_noise_of_100_pul
         state = tracker.update(state, v_out)
     found = np.asarray(tracker.read(state).circuit.values())
     assert (np.abs(found / TRUTH - 1) < 0.1 * hundred).all(), (found / TRUTH - 1) / hundred
+
+
+def test_what_is_known_of_skin_fades_as_a_random_walk_says():
+    """(Λ⁻¹ + q² 1)⁻¹ after a pulse that tells nothing; without a walk not a bit of it."""
+    still = tracker_of(2)
+    state = followed(still, with_noise(still.pulses(loaded(quiet()))[:8], seed=4))
+    nothing = np.full((2, 3333), np.nan)
+    known = np.asarray(state.information)
+    np.testing.assert_array_equal(still.update(state, nothing).information, known)
+    walking = dataclasses.replace(still, change=jnp.asarray(0.03))
+    expected = np.linalg.inv(np.linalg.inv(known) + 0.03**2 * np.eye(3))
+    assert (
+        np.diagonal(expected, axis1=1, axis2=2) < 0.9 * np.diagonal(known, axis1=1, axis2=2)
+    ).all()
+    found = walking.update(state, nothing).information
+    np.testing.assert_allclose(found, expected, rtol=1e-6, atol=1e-6 * expected.max())
+
+
+def test_the_error_of_the_driver_is_what_another_z_th_makes_of_the_elements():
+    tracker = tracker_of(2)
+    known, pulses = tracker.known, tracker.pulses(loaded(quiet()))[:6]
+    state = followed(tracker, with_noise(pulses, seed=4))
+    step = 1e-3  # of a standard deviation of Z_th
+
+    def logarithms(z):
+        source = known.z_th(given_driver.combined(known.mean + z, known.slope))
+        other = dataclasses.replace(tracker.model, source=source)
+        other = dataclasses.replace(tracker, model=other)
+        return np.asarray(functools.reduce(other.update, pulses, anew(state)).own)[:, :-1]
+
+    def shared(cov):
+        with_it = dataclasses.replace(tracker, known=dataclasses.replace(known, cov=cov))
+        fits = with_it.read(state)
+        values = np.asarray(fits.circuit.values())
+        return fits.fit.shared_cov / values[:, :, None] / values[:, None, :]
+
+    def slope(z):
+        return (logarithms(step * z) - logarithms(-step * z)) / (2 * step)
+
+    by_z = np.stack([slope(z) for z in np.eye(known.mean.size)], axis=-1)
+    expected = by_z @ np.asarray(known.cov) @ by_z.transpose(0, 2, 1)
+    found = shared(known.cov) - shared(jnp.zeros_like(known.cov))
+    scale = np.sqrt(np.diagonal(expected, axis1=1, axis2=2))
+    # Bands are taken as points where the error is computed, and as bands where it is found.
+    np.testing.assert_allclose(
+        found / scale[:, :, None] / scale[:, None, :],
+        expected / scale[:, :, None] / scale[:, None, :],
+        atol=0.05,
+    )
+    assert (np.diagonal(shared(jnp.zeros_like(known.cov)), axis1=1, axis2=2) > 0).all()  # of X
 
 
 SAME = 0.2  # standard errors: both weigh the noise of V_th, but not in the same way

@@ -171,3 +171,30 @@ def test_harmonics_start_no_threads():
     run = subprocess.run([sys.executable, "-c", BUSY], capture_output=True, text=True, check=True)
     # Time of other threads over that of this one. Those of BLAS wait actively: one took 0.5 to 3.
     assert float(run.stdout) < 0.05
+
+
+@pytest.mark.parametrize(
+    ("samples", "highest"),
+    [
+        (3334, 0.35),  # one period: what has aliased falls on the harmonics
+        (10_000, 0.5),  # between them
+        (20_000, 0.5),
+    ],
+)
+def test_harmonics_that_aliases_reach_are_left_out(samples, highest):
+    v = np.random.default_rng(2).normal(size=samples)
+    sigma = np.asarray(1e-3)
+    of = spectra.spectrum(
+        v, v, sigma, sigma, np.asarray(RATE), *whole_periods(samples, RATE, PULSE)
+    )
+    frequency, selected = of[0], of[-1]
+    used = frequency[np.asarray(selected)]
+    assert used.max() < highest * RATE
+    assert used.max() > highest * RATE - 2 * PULSE
+    assert used.size == round(used.max() / PULSE)  # and none below is
+
+
+def test_aliases_are_told_from_harmonics_where_a_period_is_no_whole_number_of_samples():
+    assert spectra.separates_aliases(3, 10_000)
+    assert not spectra.separates_aliases(1, 3333)
+    assert not spectra.separates_aliases(3, 9_999)

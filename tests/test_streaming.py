@@ -32,7 +32,7 @@ def source(tmp_path_factory):
         Trial(f"loaded/{i}", SkinLoad(r_s=33.4e3 + 1e3 * i, r_p=186e3, c_p=0.12e-9))
         for i in range(COUNT)
     )
-    scene = Scene(trials, (Trial("calibration/0", ResistorLoad(98.8e3)),), samples=2000)
+    scene = Scene(trials, (Trial("calibration/0", ResistorLoad(98.8e3)),), samples=3334)
     file = tmp_path_factory.mktemp("streaming") / "study.h5"
     scene.simulate(seed=1).write(file)
     return file
@@ -115,6 +115,10 @@ def test_an_interrupted_run_goes_on_where_it_was(source, whole, tmp_path, monkey
     same(target, whole)
 
 
+class Same(etid.SkinRC):
+    """Other elements, with the same typical values."""
+
+
 def test_a_run_of_other_settings_is_not_resumed(source, tmp_path, monkeypatch):
     target = tmp_path / "fits.h5"
 
@@ -127,6 +131,9 @@ def test_a_run_of_other_settings_is_not_resumed(source, tmp_path, monkeypatch):
             fit_file(source, target, method=METHOD, order=4)
     with pytest.raises(ResumeError, match="another order"):
         fit_file(source, target, method=METHOD, resume=True)
+    for circuit, what in ((Same(), "circuit"), (etid.SkinRC(r_s=10e3), "start")):
+        with pytest.raises(ResumeError, match=f"another {what};"):
+            fit_file(source, target, method=METHOD, order=4, circuit=circuit, resume=True)
     os.utime(source)
     with pytest.raises(ResumeError, match="another source date"):
         fit_file(source, target, method=METHOD, order=4, resume=True)

@@ -1,0 +1,83 @@
+"""What calibrations tell of a driver: its covariance is that of the noise, by sums written down."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax.flatten_util import ravel_pytree
+
+import etid
+from etid import lanes
+from etid.measurement import noise
+from etid.output_error import DELAY_WIDTH, prior
+from etid.scenes import Scene, Trial
+from etid.spectra import spectrum
+from etid.transformer import ResistorLoad
+
+R_LOAD = 98.8e3
+KNOWN = (Trial("c", ResistorLoad(R_LOAD)),)
+STEP = 1e-5  # of a parameter, relative: differences of numbers of order 1 in double precision
+
+
+@pytest.fixture(scope="module")
+def driver():
+    return etid.identify_driver(Scene((), KNOWN).simulate(seed=3)["c"])
+
+
+def information(driver):
+    """Fisher's, of Z_th and the delay, by differences, the true voltage and the noise alone."""
+    record = Scene((), KNOWN, snr_db=None, bits=None).simulate(seed=3)["c"]
+    noisy = Scene((), KNOWN).simulate(seed=3)["c"]
+    rate, size = record.sample_rate, record.v_th.size
+    zero = np.asarray(0.0)
+    f, x, *_, selected = map(
+        np.asarray, spectrum(record.v_th, record.v_out, zero, zero, np.asarray(rate), 3, size)
+    )
+    sigma_th, sigma_out = (float(noise(v, np.asarray(0.0))) for v in (noisy.v_th, noisy.v_out))
+    parameters, unflatten = ravel_pytree(driver.source)
+    at = np.append(np.asarray(parameters), float(driver.calibration.delay[0]))
+
+    def gain(p):
+        z = np.asarray(unflatten(jnp.asarray(p[:-1])).response(jnp.asarray(f)))
+        return R_LOAD / (R_LOAD + z) * np.exp(-2j * np.pi * f * p[-1] / rate)
+
+    slopes = []
+    for i in range(at.size):
+        step = np.zeros(at.size)
+        step[i] = STEP * max(abs(at[i]), 1.0)
+        slopes.append((gain(at + step) - gain(at - step)) / (2 * step[i]))
+    slopes = np.stack(slopes)
+    variance = (sigma_out**2 + np.abs(gain(at)) ** 2 * sigma_th**2) / size
+    weight = np.where(selected, 2 * np.abs(x) ** 2 / variance, 0.0)
+    told = np.real((slopes * weight) @ slopes.conj().T)
+    weak = jax.jacfwd(prior(driver.source, jnp.asarray(rate), jnp.asarray(R_LOAD)))(parameters)
+    told[:-1, :-1] += np.asarray(weak.T @ weak)
+    told[-1, -1] += 1 / DELAY_WIDTH**2
+    return told
+
+
+def test_the_covariance_of_a_driver_is_the_inverse_of_its_information(driver):
+    """Noise is estimated to 5 %, and what exceeds it widens the errors: no more than a quarter."""
+    told = information(driver)
+    scale = np.sqrt(np.diagonal(told))
+    expected = np.linalg.inv(told / np.outer(scale, scale)) / np.outer(scale, scale)
+    ratio = np.diagonal(driver.cov) / np.diagonal(expected)[:-1]
+    assert (ratio > 0.8).all(), ratio
+    assert (ratio < 1.5).all(), ratio
+
+
+def test_what_a_calibration_tells_is_one_standard_deviation_along_each_direction(driver):
+    """z is scaled by the information, so that its covariance is 1, and its mean next to 0."""
+    frequency = driver.calibration.spectra.frequency[0]
+    known = lanes.given(driver, frequency, False)
+    of = np.linalg.eigvalsh(np.asarray(known.cov))
+    assert of.min() > 0.8, of
+    assert of.max() < 1.6, of
+    # A part of a standard deviation along the floor of the valley that one resistor leaves.
+    assert (np.abs(np.asarray(known.mean)) < 0.3).all()
+    # W is log (Z_th + R), from which Z_th comes back.
+    z = np.asarray(driver.response(frequency))
+    still = known.z_th(jnp.zeros(frequency.size, complex))
+    np.testing.assert_allclose(still, z, rtol=1e-9)
+    moved = known.z_th(jnp.full(frequency.size, 0.1 + 0.05j))
+    np.testing.assert_allclose(moved, (z + R_LOAD) * np.exp(0.1 + 0.05j) - R_LOAD, rtol=1e-6)

@@ -1,0 +1,122 @@
+"""The thresholds between verdicts, on numbers of which it is clear what they are."""
+
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+import optimistix as optx
+import pytest
+
+import etid
+from etid.judging import MISFIT_CHI2, MISFIT_RRSE, SUCCESSFUL, judged, misses, too_late, unless
+from etid.output_error import Estimate
+from etid.verdicts import RESULTS, verdict
+
+
+def estimate(
+    parameters=(10.0, 12.0, -23.0),
+    relative: Any = 0.01,
+    chi2=1.0,
+    rrse=1e-3,
+    delay=0.0,
+    **more: Any,
+):
+    """Of a skin; `relative` are the standard errors."""
+    cov = jnp.diag(jnp.broadcast_to(jnp.asarray(relative), 3) ** 2)
+    of = {"result": optx.RESULTS.successful, "strain": jnp.zeros(())} | more
+    return Estimate(
+        parameters=jnp.asarray(parameters),
+        nuisance=jnp.array([[0.0, delay]]),
+        cov=cov,
+        chi2=jnp.asarray(chi2),
+        rrse=jnp.asarray(rrse),
+        steps=jnp.asarray(5),
+        shared_cov=0.25 * cov,
+        **of,
+    )
+
+
+def name(of, driver=SUCCESSFUL):
+    return judged(of, etid.SkinRC(), driver, "a method").verdict
+
+
+@pytest.mark.parametrize(
+    ("chi2", "error", "expected"),
+    [
+        (1.05 * MISFIT_CHI2, 1e-2, True),
+        (0.95 * MISFIT_CHI2, 1e-2, False),  # chi2 is known to a tenth
+        (100.0, 0.9 * MISFIT_RRSE, False),  # in volts it is what any converter leaves
+        (100.0, 1.1 * MISFIT_RRSE, True),
+        (2.0, 1.3 * MISFIT_RRSE, False),  # half of the squares is noise: √½ of 1.3 is below 1
+        (2.0, 1.5 * MISFIT_RRSE, True),
+        (0.5, 1.0, False),
+    ],
+)
+def test_a_misfit_exceeds_the_noise_in_standard_deviations_and_in_volts(chi2, error, expected):
+    assert bool(misses(jnp.asarray(chi2), jnp.asarray(error))) is expected
+    assert name(estimate(chi2=chi2, rrse=error)) == ("misfit" if expected else "successful")
+
+
+@pytest.mark.parametrize(
+    ("delay", "expected"), [(1.05, True), (-1.05, True), (0.95, False), (-0.95, False)]
+)
+def test_a_trigger_that_is_more_than_a_sample_late_or_early_is_a_misfit(delay, expected):
+    of = estimate(delay=delay)
+    assert bool(too_late(of)) is expected
+    assert name(of) == ("misfit" if expected else "successful")
+
+
+def test_a_delay_of_any_record_counts():
+    of = estimate()
+    several = jnp.array([[1.5, 0.1], [2.0, -3.0]])  # states are no delays
+    assert bool(too_late(Estimate(**{**vars(of), "nuisance": several})))
+    assert not bool(too_late(Estimate(**{**vars(of), "nuisance": several[:1]})))
+
+
+@pytest.mark.parametrize(
+    ("change", "expected"),
+    [
+        ({}, "successful"),
+        ({"chi2": np.nan}, "unstable"),
+        ({"parameters": (10.0, np.nan, -23.0)}, "nonphysical"),
+        ({"result": optx.RESULTS.nonlinear_max_steps_reached}, "max_steps_reached"),
+        ({"strain": jnp.asarray(38.0)}, "successful"),
+        ({"strain": jnp.asarray(40.0)}, "inconsistent"),
+        ({"relative": (0.01, 0.99, 0.01)}, "successful"),
+        ({"relative": (0.01, 0.01, 1.01)}, "insensitive"),
+        ({"relative": (0.0, 0.01, 0.01)}, "insensitive"),  # without any effect
+        ({"relative": (0.01, np.nan, 0.01)}, "insensitive"),
+        # Where noise hides C_p a fit may take it to 1e-190 F, and its derivative underflows.
+        ({"parameters": (10.0, 12.0, -437.0), "relative": (0.01, 0.01, 1e6)}, "insensitive"),
+    ],
+)
+def test_every_reason_has_its_verdict(change, expected):
+    assert name(estimate(**change)) == expected
+
+
+def test_a_failed_driver_comes_last():
+    failed = verdict("nonphysical")
+    assert name(estimate(), failed) == "driver_failed"
+    assert name(estimate(chi2=9.0, rrse=0.1), failed) == "misfit"
+
+
+def test_logarithms_become_elements_and_their_errors():
+    of = estimate(relative=(0.01, 0.02, 0.03))
+    fit = judged(of, etid.SkinRC(), SUCCESSFUL, "a method")
+    values = np.exp([10.0, 12.0, -23.0])
+    np.testing.assert_allclose(fit.circuit.values(), values, rtol=1e-12)
+    np.testing.assert_allclose(fit.stderr.values(), values * [0.01, 0.02, 0.03], rtol=1e-12)
+    np.testing.assert_allclose(fit.shared_cov, 0.25 * fit.cov, rtol=1e-12)
+
+
+@pytest.mark.parametrize("before", ["successful", "misfit"])
+@pytest.mark.parametrize("bad", [True, False])
+def test_a_later_test_overrules_success_only(before, bad):
+    fit = judged(
+        estimate(chi2=1.0 if before == "successful" else 9.0, rrse=0.1),
+        etid.SkinRC(),
+        SUCCESSFUL,
+        "a method",
+    )
+    after = unless(fit, jnp.asarray(bad), RESULTS.biased).verdict
+    assert after == ("biased" if bad and before == "successful" else before)

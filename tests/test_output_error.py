@@ -1,0 +1,155 @@
+"""Output error piece by piece: what is in doubt of a calibration, its derivative, the errors."""
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import etid
+from etid import lanes
+from etid.driver import SourceImpedance
+from etid.elements import resistor
+from etid.information import Curvature, curvature, eliminate, inverse
+from etid.measurement import Measurement
+from etid.output_error import DELAY_WIDTH, KNOWN_DELAY, delay_std
+from etid.prediction import IMPULSE, impulse, late_calibration, measured_impulse, prepare
+from etid.preflight import Inspected
+from etid.scenes import Scene, Trial
+from etid.transformer import ResistorLoad, SkinLoad
+
+RATE = 200e3
+
+
+@pytest.mark.parametrize(
+    ("resistors", "expected"),
+    [
+        ((98.8e3,), DELAY_WIDTH),
+        ((98.8e3, 98.8e3), DELAY_WIDTH),
+        ((98.8e3, 98.9e3), DELAY_WIDTH),
+        ((98.8e3, 21.62e3), KNOWN_DELAY),
+        ((98.8e3, 98.8e3, 55.2e3), KNOWN_DELAY),
+    ],
+)
+def test_only_different_resistors_know_the_delay_of_their_records(resistors, expected):
+    assert float(delay_std(jnp.array(resistors))) == expected
+
+
+def measurement(v_th, v_out=None):
+    zero = jnp.asarray(1e-3)
+    return Measurement(v_th, v_th if v_out is None else v_out, zero, zero, jnp.asarray(RATE))
+
+
+def plain(resistance):
+    """A source that is a resistor; its pole has no effect."""
+    none = jnp.zeros(0)
+    log = jnp.log(jnp.asarray(resistance))
+    return SourceImpedance(log, none, none, none, none, jnp.log(jnp.array([1e4])), jnp.zeros(1))
+
+
+@pytest.mark.parametrize("z_load", [20e3, 300e3])
+def test_a_late_calibration_is_an_excess_impedance_and_a_delay(z_load):
+    """−G sτ ((R_L − Z_L) / (Z_L + R) + 1) of V_th, a sine, all of them resistors.
+
+    The second part is a delay, which is fitted besides.
+    """
+    r_load, r, omega = 98.8e3, 15e3, 0.2
+    records = prepare(measurement(jnp.sin(omega * jnp.arange(400.0))))
+    load = resistor(jnp.asarray(z_load)).rational()
+    late = late_calibration(records, plain(r), load, jnp.asarray(r_load), jnp.zeros(1))
+    v_th = np.asarray(records.hold[:, 0])  # where the interpolation has it
+    slope = omega * np.sqrt(1 - v_th**2) * np.sign(np.gradient(v_th))
+    expected = -z_load / (z_load + r) * ((r_load - z_load) / (z_load + r) + 1) * slope
+    # A sine's root cannot be trusted where it is flat; it is interpolated to a thousandth.
+    steep = np.abs(v_th) < 0.9
+    np.testing.assert_allclose(np.asarray(late.v_out)[steep], expected[steep], rtol=0.02)
+
+
+def test_the_noise_of_a_record_is_no_information():
+    """H = JᵀJ − N (what noise alone puts into it), by sums as they are written down."""
+    records = prepare(measurement(jnp.zeros(600)))
+    records = eqx.tree_at(
+        lambda r: (r.sigma_th, r.sigma_out), records, (jnp.asarray(0.3), jnp.asarray(0.7))
+    )
+    rows = records.hold.shape[0]
+    rng = np.random.default_rng(3)
+    slope, h0 = rng.normal(size=(rows, 3)), rng.normal(size=IMPULSE + 1)
+    of_h = rng.normal(size=(IMPULSE + 1, 3))
+    of_h[:, -1] = 0.0  # a delay does not change the response
+    precision = np.array([0.0, 2.0, 5.0])
+    found = curvature(
+        records,
+        lambda q: jnp.asarray(slope) @ q,
+        lambda q: jnp.asarray(h0) + jnp.asarray(of_h) @ q,
+        jnp.zeros(3),
+        jnp.asarray(precision),
+    )
+    k = np.asarray(impulse())[:, 0]
+    s = 0.7**2 * np.sum(k**2) + 0.3**2 * np.sum(h0**2)
+    of_s = 2 * 0.3**2 * h0 @ of_h
+    noise = 0.3**2 * of_h.T @ of_h / s - np.outer(of_s, of_s) / (4 * s**2)
+    noise[-1, -1] += 0.7**2 * np.sum(np.asarray(measured_impulse())[:, 1] ** 2) / s
+    expected = slope.T @ slope - rows * noise + np.diag(precision)
+    np.testing.assert_allclose(found.expected, expected, rtol=1e-10, atol=1e-8)
+    # The score: residuals that are noise filtered by k and by h.
+    score = np.zeros((3, 3))
+    for sigma, of in ((0.7, k), (0.3, h0)):
+        moved = np.stack([np.correlate(np.pad(c, of.size), of, "valid") for c in slope.T])
+        score += sigma**2 * moved @ moved.T / s
+    np.testing.assert_allclose(found.score, score, rtol=1e-9, atol=1e-9 * np.abs(score).max())
+
+
+def test_nuisances_are_projected_out():
+    rng = np.random.default_rng(4)
+    j, noise = rng.normal(size=(40, 5)), rng.uniform(1, 2, 40)
+    of = Curvature(jnp.asarray(j.T @ j), jnp.asarray((j.T * noise) @ j))
+    found = eliminate(of, 2)
+    full = np.linalg.inv(j.T @ j)
+    np.testing.assert_allclose(np.linalg.inv(found.expected), full[:2, :2], rtol=1e-9)
+    sandwich = full @ ((j.T * noise) @ j) @ full
+    small = np.linalg.inv(found.expected)
+    np.testing.assert_allclose(small @ found.score @ small, sandwich[:2, :2], rtol=1e-9)
+
+
+def test_what_is_not_known_has_an_enormous_variance_or_no_effect():
+    known = np.diag([4.0, 0.0])
+    np.testing.assert_allclose(inverse(jnp.asarray(known))[0, 0], 0.25)
+    assert float(inverse(jnp.asarray(known))[1, 1]) > 1e9
+    assert float(inverse(jnp.asarray(known), drop=True)[1, 1]) == 0.0
+
+
+@pytest.fixture(scope="module")
+def fitted():
+    """A driver from one pulse, and the fit of a skin as a function of the noise it is told."""
+    study = Scene(
+        (Trial("a", SkinLoad(33.4e3, 186e3, 0.12e-9)),),
+        (Trial("c", ResistorLoad(98.8e3)),),
+        samples=3334,
+    ).simulate(seed=11)
+    driver = etid.identify_driver(study["c"])
+
+    def of(scale):
+        lane = list(lanes.lane(Inspected(study["a"]), "output_error"))
+        lane[2:4] = scale * lane[2], scale * lane[3]
+        lane = tuple(map(jnp.asarray, lane))
+        return lanes.skin(lane, driver, None, etid.SkinRC(), "output_error")
+
+    return of
+
+
+def test_if_the_noise_is_larger_than_it_is_said_to_be_the_errors_are_as_large(fitted):
+    """χ² grows as the noise that is assumed falls, and the errors by it remain."""
+    third, tenth = fitted(1 / 3), fitted(1 / 10)
+    assert float(third.chi2) > 5
+    np.testing.assert_allclose(tenth.chi2 / third.chi2, 100 / 9, rtol=1e-3)
+    own = [np.asarray(fit.cov - fit.shared_cov) for fit in (third, tenth)]
+    # The minimum is found to a thousandth of a standard error, of the smaller noise.
+    np.testing.assert_allclose(own[1], own[0], rtol=1e-2)
+    np.testing.assert_allclose(tenth.shared_cov, third.shared_cov, rtol=1e-2)
+
+
+def test_if_the_noise_is_smaller_the_errors_are_what_it_is_said_to_be(fitted):
+    once, twice = fitted(1.5), fitted(3.0)
+    assert float(once.chi2) < 1
+    own = [np.asarray(fit.cov - fit.shared_cov) for fit in (once, twice)]
+    np.testing.assert_allclose(np.diagonal(own[1]), 4 * np.diagonal(own[0]), rtol=0.1)
+    np.testing.assert_allclose(twice.chi2 / once.chi2, 1 / 4, rtol=1e-2)
