@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Array, Complex, Float, Int
+from jaxtyping import Array, Bool, Complex, Float, Int
 
 from etid import (
     given_driver,
@@ -39,6 +39,10 @@ BAND = np.linspace(0.0003, 0.4, 400)  # of the sample rate, where a source must 
 LEVELS = (1.0, 0.125, 0.5, 2.0, 8.0)  # impedance levels at which a circuit is started
 START_STEPS = 8  # of Steiglitz-McBride on harmonics, which settles in three to eight
 UNWANTED = 1e3  # added to the cost of a start that did not settle; any cost is smaller
+# Two sections closer than this in ln ω and ln ζ are one that noise has split: their gains grow
+# against each other along a curved valley, of which the curvature at one place tells nothing. Costs
+# of good starts differ by 0.01.
+SPLIT, BLURRED = 0.1, 1.0
 
 
 def circuit_starts(
@@ -214,6 +218,13 @@ def source_starts(
     return jax.tree.map(lambda *leaves: jnp.stack(leaves), *starts)
 
 
+def is_split(source: SourceImpedance) -> Bool[Array, ""]:
+    """Whether two sections of a source are in one place."""
+    place = jnp.stack([source.log_omega, source.log_zeta])
+    first, second = np.triu_indices(place.shape[1], 1)
+    return jnp.any(jnp.all(jnp.abs(place[:, first] - place[:, second]) < SPLIT, axis=0))
+
+
 def driver_by_refinement(
     m: Measurement, r_load: Float[Array, " record"], order: int, spectra: Spectrum | None
 ) -> Driver:
@@ -256,6 +267,7 @@ def driver_by_refinement(
     log_s = jnp.log(estimates.rrse**2 / estimates.chi2)
     cost = jnp.where(finite, estimates.chi2 + log_s, jnp.inf)
     cost = cost + jnp.where(settled, 0.0, UNWANTED) + jnp.where(passive, 0.0, UNWANTED)
+    cost = cost + jnp.where(jax.vmap(is_split)(sources), BLURRED, 0.0)
     chosen = jnp.argmin(jnp.where(finite, cost, jnp.inf))
     source, estimate, calibration = jax.tree.map(
         lambda leaf: leaf[chosen], (sources, estimates, known)

@@ -8,6 +8,7 @@ from jax.flatten_util import ravel_pytree
 
 from etid import Resistor, SkinRC, capacitor, parallel, resistor, series
 from etid.driver import SourceImpedance, loaded, realise
+from etid.estimation import is_split
 from etid.transfer import Rational, frequency_variable
 
 FREQUENCY = jnp.geomspace(10.0, 1e6, 25)
@@ -148,3 +149,20 @@ def test_the_loaded_system_differentiates_under_vmap():
 def test_a_load_without_bound_is_refused():
     with pytest.raises(ValueError, match="grows without bound"):
         realise(Rational(jnp.array([0.0, 1e-3]), jnp.ones(1)), RATE)
+
+
+@pytest.mark.parametrize(
+    ("omega", "zeta", "split"),
+    [
+        ((3.0e5, 3.02e5), (0.29, 0.28), True),
+        ((3.0e5, 1.5e6), (0.29, 0.28), False),
+        ((3.0e5, 3.02e5), (0.2, 1.2), False),
+        ((3.0e5, 1.5e6, 1.49e6), (0.2, 1.2, 1.2), True),
+        ((3.0e5,), (0.2,), False),
+    ],
+)
+def test_sections_in_one_place_are_one_that_is_split(omega, zeta, split):
+    gain = jnp.ones(len(omega))
+    logs = jnp.log(jnp.array(omega)), jnp.log(jnp.array(zeta))
+    source = SourceImpedance(jnp.zeros(()), *logs, gain, gain, jnp.zeros(1), jnp.ones(1))
+    assert bool(is_split(source)) == split
