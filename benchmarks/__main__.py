@@ -24,6 +24,7 @@ NAMES = (
     "perturbations",
     "rivals",
     "fuzz",
+    "mutation",
 )
 
 

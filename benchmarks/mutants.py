@@ -1,0 +1,160 @@
+"""Changes of a module that its tests should notice, one at a time.
+
+A mutant is one changed expression or statement: another operator, comparison or constant, a dropped
+term, a negated condition, swapped arguments, a deleted statement. Annotations, docstrings, texts,
+`assert`s for the type checker and decorators are left alone: what they change no test should see.
+"""
+
+import ast
+import copy
+import dataclasses
+import random
+from collections.abc import Iterator
+
+ARITHMETIC: dict[type[ast.operator], type[ast.operator]] = {
+    ast.Add: ast.Sub,
+    ast.Sub: ast.Add,
+    ast.Mult: ast.Div,
+    ast.Div: ast.Mult,
+    ast.MatMult: ast.Mult,
+    ast.Pow: ast.Mult,
+    ast.FloorDiv: ast.Mult,
+    ast.Mod: ast.FloorDiv,
+    ast.BitAnd: ast.BitOr,
+    ast.BitOr: ast.BitAnd,
+}
+COMPARISONS: dict[type[ast.cmpop], type[ast.cmpop]] = {
+    ast.Lt: ast.GtE,
+    ast.LtE: ast.Gt,
+    ast.Gt: ast.LtE,
+    ast.GtE: ast.Lt,
+    ast.Eq: ast.NotEq,
+    ast.NotEq: ast.Eq,
+    ast.Is: ast.IsNot,
+    ast.IsNot: ast.Is,
+    ast.In: ast.NotIn,
+    ast.NotIn: ast.In,
+}
+
+
+@dataclasses.dataclass(frozen=True)
+class Mutant:
+    """One change of one module.
+
+    Attributes:
+        path: Of the module, below the root.
+        line: Where it is.
+        kind: What was done.
+        before: The code there.
+        after: What takes its place.
+        span: First and last byte of it.
+    """
+
+    path: str
+    line: int
+    kind: str
+    before: str
+    after: str
+    span: tuple[int, int]
+
+    @property
+    def key(self) -> str:
+        """What tells it from others, also after lines above it have changed."""
+        return f"{self.path}:{self.kind}:{self.before}:{self.after}:{self.line}"
+
+    def applied(self, source: str) -> str:
+        """The module with it."""
+        text = source.encode()
+        return (text[: self.span[0]] + self.after.encode() + text[self.span[1] :]).decode()
+
+
+def _changed(node: ast.AST) -> Iterator[tuple[str, ast.AST]]:
+    """What may stand in the place of a node."""
+    new = copy.deepcopy(node)
+    match new:
+        case ast.BinOp(left=left, right=right, op=op):
+            if isinstance(op, ast.Add | ast.Sub):
+                yield "term dropped", left
+            if type(op) in ARITHMETIC:
+                yield "operator", ast.BinOp(left, ARITHMETIC[type(op)](), right)
+        case ast.Compare(left=left, ops=[op], comparators=of) if type(op) in COMPARISONS:
+            yield "comparison", ast.Compare(left, [COMPARISONS[type(op)]()], of)
+        case ast.BoolOp(op=op, values=values):
+            other = ast.Or() if isinstance(op, ast.And) else ast.And()
+            yield "condition", ast.BoolOp(other, values)
+        case ast.UnaryOp(op=ast.USub() | ast.Not() | ast.Invert(), operand=operand):
+            yield "sign", operand
+        case ast.Constant(value=bool() as value):
+            yield "constant", ast.Constant(not value)
+        case ast.Constant(value=int() as value):
+            yield "constant", ast.Constant(value + 1)
+        case ast.Constant(value=float() as value):
+            yield "constant", ast.Constant(3 * value if value else 1.0)
+        case ast.Call(func=func, args=[first, second, *rest], keywords=keywords) if not (
+            isinstance(first, ast.Starred) or isinstance(second, ast.Starred)
+        ):
+            if ast.dump(first) != ast.dump(second):
+                yield "arguments swapped", ast.Call(func, [second, first, *rest], keywords)
+        case ast.If(test=test):
+            yield "condition negated", ast.UnaryOp(ast.Not(), test)
+        case ast.IfExp(test=test, body=body, orelse=orelse):
+            yield "condition negated", ast.IfExp(test, orelse, body)
+        case ast.AugAssign() | ast.Expr(value=ast.Call()):
+            yield "statement deleted", ast.Pass()
+        case _:
+            pass
+
+
+def _parts(node: ast.AST) -> Iterator[ast.AST]:
+    """Nodes whose change a test should see, from outside in."""
+    yield node
+    for name, value in ast.iter_fields(node):
+        if name in ("annotation", "returns", "decorator_list", "type_params"):
+            continue
+        for part in value if isinstance(value, list) else [value]:
+            silent = isinstance(part, ast.Assert | ast.Raise | ast.Import | ast.ImportFrom)
+            if isinstance(part, ast.AST) and not silent and not isinstance(part, ast.JoinedStr):
+                yield from _parts(part)
+
+
+def mutants(path: str, source: str) -> list[Mutant]:
+    """All mutants of a module, in its order.
+
+    Args:
+        path: Of the module, below the root.
+        source: Its text.
+    """
+    text = source.encode()
+    starts = [0]
+    for line in text.splitlines(keepends=True):
+        starts.append(starts[-1] + len(line))
+    found = []
+    for node in _parts(ast.parse(source)):
+        place = node.test if isinstance(node, ast.If) else node
+        for kind, other in _changed(node):
+            assert isinstance(place, ast.expr | ast.stmt)  # all that is changed has a place
+            assert place.end_lineno is not None
+            assert place.end_col_offset is not None
+            begin = starts[place.lineno - 1] + place.col_offset
+            end = starts[place.end_lineno - 1] + place.end_col_offset
+            after = ast.unparse(ast.fix_missing_locations(other))
+            if isinstance(other, ast.expr):
+                after = f"({after})"
+            before = text[begin:end].decode()
+            found.append(Mutant(path, place.lineno, kind, before, after, (begin, end)))
+    return [one for one in found if _compiles(one.applied(source))]
+
+
+def _compiles(source: str) -> bool:
+    try:
+        ast.parse(source)
+    except SyntaxError:
+        return False
+    return True
+
+
+def drawn(every: list[Mutant], count: int, seed: int) -> list[Mutant]:
+    """As many of them as were asked for, in their order; a larger number holds a smaller one's."""
+    order = list(range(len(every)))
+    random.Random(seed).shuffle(order)
+    return [every[i] for i in sorted(order[:count])]

@@ -1,0 +1,183 @@
+"""Would the tests tell? Bugs are put in, one at a time, and the tests of the files concerned run.
+
+    python -m benchmarks mutation --mutants 40 --modules judging levenberg_marquardt
+
+A mutant that all tests let pass has survived. Some are no bug at all: another start of an
+iteration, a tolerance that nothing depends on; they are counted all the same. Mutants are drawn by
+a seed from a copy of the working tree, and each outcome is kept at once in `mutation.jsonl`: the
+same command goes on where it was interrupted.
+"""
+
+import argparse
+import collections
+import json
+import os
+import pathlib
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
+
+from benchmarks.failure_counts import clopper_pearson
+from benchmarks.mutants import Mutant, drawn, mutants
+from benchmarks.provenance import ROOT
+
+TARGET = 0.1  # part of the mutants that may survive
+COPIED = ("etid", "tests", "benchmarks", "data_schema", "docs", "notebooks", ".ci")
+LIMIT = 300.0  # [s] of a mutant; an endless loop is seen, too
+# What the tests of a module are, the cheapest first.
+TESTS: Mapping[str, Sequence[str]] = {
+    "arrowhead": ("arrowhead",),
+    "bands": ("online",),
+    "given_driver": ("given_driver", "maximum_likelihood"),
+    "information": ("output_error", "identification"),
+    "joint": ("joint",),
+    "judging": ("judging",),
+    "levenberg_marquardt": ("levenberg_marquardt",),
+    "likelihood": ("maximum_likelihood",),
+    "non_parametric": ("non_parametric",),
+    "online": ("online",),
+    "output_error": ("output_error", "identification"),
+    "prediction": ("output_error", "identification"),
+    "results": ("recording", "joint", "identification"),
+    "shared_errors": ("joint",),
+    "single_load": ("maximum_likelihood", "own_circuits"),
+    "spectra": ("spectra",),
+    "streaming": ("streaming",),
+    "tables": ("exporting", "cli"),
+}
+
+
+def copied(root: pathlib.Path, folder: pathlib.Path) -> None:
+    """A working tree to break, with the reference data beside it if there are any."""
+    for path in root.iterdir():
+        if path.is_file() and not path.name.startswith("."):
+            shutil.copy2(path, folder)
+        elif path.name in COPIED:
+            ignored = shutil.ignore_patterns("__pycache__", "results")
+            shutil.copytree(path, folder / path.name, ignore=ignored)
+    shared = root.parent / "shared"
+    if shared.exists():
+        (folder.parent / "shared").symlink_to(shared.resolve())
+
+
+def passes(folder: pathlib.Path, tests: Sequence[str], limit: float) -> bool | None:
+    """Whether the tests pass; None if they take too long."""
+    files = [f"tests/test_{name}.py" for name in tests]
+    # What is compiled for tests without a mutant is found again; what is traced is not kept.
+    options = ("-q", "-x", "-o", f"cache_dir={ROOT / '.pytest_cache'}")
+    command = [sys.executable, "-B", "-m", "pytest", *options, *files]
+    places = {"PYTHONPATH": str(folder), "XDG_CACHE_HOME": str(folder.parent / "cache")}
+    environment = {**os.environ, **places, "PYTHONDONTWRITEBYTECODE": "1"}
+    with subprocess.Popen(
+        command, cwd=folder, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+    ) as process:
+        try:
+            return process.wait(limit) == 0
+        except subprocess.TimeoutExpired:
+            process.kill()
+            return None
+
+
+def outcomes(
+    root: pathlib.Path,
+    tests: Mapping[str, Sequence[str]],
+    chosen: Sequence[Mutant],
+    kept: pathlib.Path,
+    limit: float,
+) -> Iterator[dict[str, Any]]:
+    """One row for each mutant, as they are done; those that are kept already come as they were.
+
+    Args:
+        root: The working tree.
+        tests: Test files of each module.
+        chosen: The mutants.
+        kept: File of what was done before.
+        limit: Time of a mutant [s].
+
+    Raises:
+        SystemExit: The tests fail without any mutant.
+    """
+    before = {}
+    if kept.exists():
+        lines = kept.read_text("utf-8").splitlines()
+        before = {row["key"]: row for row in map(json.loads, lines)}
+    with tempfile.TemporaryDirectory() as place:
+        folder = pathlib.Path(place, "tree")
+        folder.mkdir()
+        copied(root, folder)
+        sound: set[str] = set()
+        for mutant in chosen:
+            if mutant.key in before:
+                yield before[mutant.key]
+                continue
+            name = pathlib.PurePath(mutant.path).stem
+            if name not in sound and passes(folder, tests[name], 10 * limit) is not True:
+                raise SystemExit(f"the tests of {mutant.path} fail without any mutant")
+            sound.add(name)
+            path = folder / mutant.path
+            source = path.read_text("utf-8")
+            path.write_text(mutant.applied(source), "utf-8")
+            begun = time.perf_counter()
+            passed = passes(folder, tests[name], limit)
+            path.write_text(source, "utf-8")
+            row = {
+                "key": mutant.key,
+                "module": name,
+                "place": f"{mutant.path}:{mutant.line}",
+                "kind": mutant.kind,
+                "before": mutant.before,
+                "after": mutant.after,
+                "outcome": {True: "survived", False: "killed", None: "too long"}[passed],
+                "seconds": round(time.perf_counter() - begun, 1),
+            }
+            with kept.open("a", encoding="utf-8") as file:
+                file.write(json.dumps(row) + "\n")
+            yield row
+
+
+def show(rows: Sequence[Mapping[str, Any]]) -> float:
+    """Print what survived, and return the part of all that it is."""
+    modules = collections.defaultdict(list)
+    for row in rows:
+        modules[row["module"]].append(row["outcome"] == "survived")
+    print(f"{'module':<24}{'mutants':>8}{'survived':>10}")
+    for name, survived in sorted(modules.items()):
+        print(f"{name:<24}{len(survived):>8}{sum(survived):>10}")
+    left = [row for row in rows if row["outcome"] == "survived"]
+    low, high = clopper_pearson(len(left), len(rows))
+    share = len(left) / len(rows)
+    print(f"{len(left)} of {len(rows)} survive, {share:.0%} (95 %: {low:.0%} to {high:.0%})")
+    for row in left:
+        code = " ".join(row["before"].split())[:70], " ".join(row["after"].split())[:70]
+        print(f"  {row['place']}: {row['kind']}: {code[0]}  ->  {code[1]}")
+    return share
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Size of the run."""
+    parser.add_argument("--mutants", type=int, default=40, help="how many to draw")
+    parser.add_argument("--modules", nargs="+", choices=TESTS, default=list(TESTS))
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--limit", type=float, default=LIMIT, help="time of a mutant [s]")
+    parser.add_argument(
+        "--output", type=pathlib.Path, default=pathlib.Path("mutation.jsonl"), help="what is done"
+    )
+
+
+def main(arguments: argparse.Namespace) -> bool:
+    """Run the command."""
+    every = []
+    for name in arguments.modules:
+        path = f"etid/{name}.py"
+        every += mutants(path, (ROOT / path).read_text("utf-8"))
+    chosen = drawn(every, arguments.mutants, arguments.seed)
+    print(f"{len(chosen)} of {len(every)} mutants of {len(arguments.modules)} modules")
+    rows = []
+    for row in outcomes(ROOT, TESTS, chosen, arguments.output, arguments.limit):
+        rows.append(row)
+        print(f"{row['place']:<36}{row['kind']:<20}{row['outcome']}", flush=True)
+    return show(rows) <= TARGET
