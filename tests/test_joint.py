@@ -16,6 +16,7 @@ DRY = SkinLoad(r_s=33.4e3, r_p=186e3, c_p=0.12e-9)
 TRUTH = np.array(dataclasses.astuple(DRY))
 KNOWN = (Trial("calibration/0", ResistorLoad(98.8e3)),)
 TRIALS = tuple(Trial(f"loaded/{i}", DRY, condition="dry") for i in range(6))
+TOGETHER = [trial.path for trial in TRIALS[:2]]  # with one unloaded record; each other has its own
 SIGMAS = 5.0  # one in 2 million for a normal error
 
 
@@ -24,14 +25,17 @@ def two_relaxations(f):
     return 20e3 + 1e5 / (1 + s * 1e5 * 0.12e-9) + 6e4 / (1 + s * 6e4 * 3e-9)
 
 
+def simulate(odd, seed, **options):
+    """Trials and calibration; two trials have one unloaded record."""
+    scene = Scene((*TRIALS, odd), KNOWN, trigger_jitter_rms=50e-9, **options)
+    apart = scene.simulate(seed)
+    together = dataclasses.replace(scene, shared_v_th=True).simulate(seed)
+    return Study.from_recordings([(together if p in TOGETHER else apart)[p] for p in apart])
+
+
 @pytest.fixture(scope="module")
 def study():
-    scene = Scene(
-        (*TRIALS, Trial("odd", two_relaxations, condition="odd")),
-        KNOWN,
-        trigger_jitter_rms=50e-9,
-    )
-    made = scene.simulate(seed=3)
+    made = simulate(Trial("odd", two_relaxations, condition="odd"), seed=3)
     bad = made["loaded/0"]
     short = bad.replace(v_th=bad.v_th[:2500], v_out=bad.v_out[:2500], path="short")
     broken = bad.replace(v_out=np.where(np.arange(bad.v_out.size) == 7, np.nan, bad.v_out))
@@ -58,7 +62,7 @@ def test_every_recording_has_its_verdict_and_a_bad_one_costs_itself_alone(study,
 def test_another_skin_is_a_misfit_where_chi2_does_not_show_it():
     """R_s would be wrong by more than five of its standard errors and called successful."""
     odd = Trial("odd", Cole(DRY, alpha=0.9), condition="odd")
-    study = Scene((*TRIALS, odd), KNOWN, snr_db=40.0, trigger_jitter_rms=50e-9).simulate(seed=4)
+    study = simulate(odd, seed=4, snr_db=40.0)
     fits = etid.identify_jointly(study).fits
     another = fits.where(path="odd")
     assert another.counts() == {"misfit": 1}
@@ -81,6 +85,20 @@ def test_elements_are_within_their_errors_and_spread_by_their_own_part(outcome):
     scaled = ((error - error.mean(0)) / own) ** 2
     assert (scaled.sum(0) > 0.08).all()
     assert (scaled.sum(0) < 25.7).all()
+
+
+def test_noise_of_an_unloaded_record_of_several_trials_is_none_of_their_own(outcome):
+    """σ_y² is left of σ_y² + |G|² σ_x², half to three quarters of it; the sum remains."""
+    fits = outcome.fits.where(condition="dry").successful()
+    own = np.diagonal(fits.cov - fits.fit.shared_cov, axis1=1, axis2=2)
+    together = np.isin(fits.labels["path"], TOGETHER)
+    assert together.sum() == 2
+    ratio = own[together] / own[~together].mean(0)
+    assert (ratio > 0.45).all(), ratio
+    assert (ratio < 0.85).all(), ratio
+    whole = np.asarray(fits.stderr.values())
+    alone = whole[~together].mean(0)
+    np.testing.assert_allclose(whole[together] / alone[None, :], np.ones((2, 3)), rtol=0.1)
 
 
 def test_together_the_trials_know_the_driver_better_than_its_calibration(study, outcome):

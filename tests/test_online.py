@@ -401,7 +401,7 @@ def coverage(seeds, electrodes, pulses):
 @pytest.mark.slow
 def test_intervals_of_95_per_cent_contain_the_truth_in_95_per_cent():
     """Noise and driver; the two loads of one driver share its error, drivers are independent."""
-    seeds = 100
+    seeds = 60
     z = coverage(seeds, 1, 12)
     assert len(z) > 0.98 * 2 * seeds
     # One deviation as of half as many draws: loads of one driver err alike.

@@ -65,6 +65,13 @@ def test_elements_are_found_from_typical_values_nearly_as_well_as_possible(study
     assert (stderr < EFFICIENT * smallest).all()
 
 
+@functools.cache
+def calibrated(seed):
+    """A draw and its driver, for all circuits."""
+    drawn = scene().simulate(1000 + seed)
+    return drawn, etid.identify_driver(drawn[CALIBRATION])
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("path", ["layers", "spread"])
 def test_intervals_hold_the_truth_as_often_as_they_say(path):
@@ -72,8 +79,7 @@ def test_intervals_hold_the_truth_as_often_as_they_say(path):
     truth, draws = TRIALS[path], 100
     inside = []
     for seed in range(draws):
-        drawn = scene().simulate(1000 + seed)
-        known = etid.identify_driver(drawn[CALIBRATION])
+        drawn, known = calibrated(seed)
         fit = etid.identify_skin(drawn[path], known, circuit=type(truth)())
         error = np.asarray(fit.circuit.values() - truth.values())
         inside.append(np.abs(error) < 1.96 * np.asarray(fit.stderr.values()))

@@ -61,7 +61,8 @@ def errors(result, true):
     [
         ("clean_dry", "maximum_likelihood"),
         ("clean_damp", "maximum_likelihood"),
-        ("clean_resistors", "maximum_likelihood"),
+        # A circuit and lengths of their own, which compile for long.
+        pytest.param("clean_resistors", "maximum_likelihood", marks=pytest.mark.slow),
         # One pulse, below, is by output error too; these compile for a minute.
         pytest.param("clean_dry", "output_error", marks=pytest.mark.slow),
         pytest.param("clean_damp", "output_error", marks=pytest.mark.slow),
