@@ -90,9 +90,8 @@ def skin_by_harmonic_steiglitz_mcbride(
     spectrum: Spectrum, sample_rate: Float[Array, ""], driver: Driver
 ) -> Fit:
     """SkinRC by Steiglitz-McBride on the harmonics, judged by the likelihood with Z_th as it is."""
-    source, source_cov = driver.source, driver.cov
+    source, source_cov = driver.source, driver.later_cov()
     assert source is not None  # check_driver
-    assert source_cov is not None
     best = harmonic_steiglitz_mcbride.fit_skin(spectrum, source.response(spectrum.frequency))
     values = best.circuit.values()
     late = best.delay * sample_rate

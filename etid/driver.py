@@ -10,6 +10,7 @@ complex to real without a change of branch.
 """
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
@@ -161,6 +162,8 @@ class Driver(eqx.Module):
         steps: Iterations of the solver.
         method: Name of the estimator.
         remarks: What was done to the calibrations before, `etid.remarks.Remark` as an integer.
+        drift: Relative standard deviation by which each parameter of `source` may have changed
+            when a skin is recorded; None if it cannot. `cov` does not contain it.
     """
 
     b: Float[Array, " b"]
@@ -175,6 +178,7 @@ class Driver(eqx.Module):
     steps: Int[Array, ""]
     method: str = eqx.field(static=True)
     remarks: Int[Array | np.ndarray, ""] = eqx.field(default_factory=lambda: np.zeros((), int))
+    drift: Float[Array | np.ndarray, ""] | None = None
 
     @property
     def order(self) -> int:
@@ -185,6 +189,20 @@ class Driver(eqx.Module):
     def verdict(self) -> str:
         """Name of the verdict."""
         return verdict_names(self.result).item()
+
+    def drift_std(self) -> Float[Array, " parameter"]:
+        """Standard deviations of the parameters of `source` that come from `drift` alone."""
+        assert self.source is not None  # check_driver
+        # Frequencies, dampings and R are logarithms: relative already.
+        relative = jax.tree.map(jnp.ones_like, self.source)
+        gains = (self.source.gain, self.source.slope, self.source.gain_real)
+        relative = eqx.tree_at(lambda s: (s.gain, s.slope, s.gain_real), relative, gains)
+        return jnp.abs(ravel_pytree(relative)[0]) * (0.0 if self.drift is None else self.drift)
+
+    def later_cov(self) -> Float[Array, "parameter parameter"]:
+        """Covariance of the parameters of `source` when a skin is recorded."""
+        assert self.cov is not None  # check_driver
+        return self.cov if self.drift is None else self.cov + jnp.diag(self.drift_std() ** 2)
 
     def response(self, frequency: Float[Array, "..."]) -> Complex[Array, "..."]:
         """Source impedance Z_th [Ω], in continuous time where the method gives it.

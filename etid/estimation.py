@@ -70,9 +70,8 @@ def skin_by_output_error(
         driver: Its driver, with a continuous source impedance.
         circuit: Structure and typical values.
     """
-    source, source_cov, calibration = driver.source, driver.cov, driver.calibration
+    source, source_cov, calibration = driver.source, driver.later_cov(), driver.calibration
     assert source is not None  # check_driver
-    assert source_cov is not None
     assert calibration is not None
     baseline = None
     if isinstance(circuit, SkinRC):
@@ -101,7 +100,7 @@ def given(driver: Driver, frequency: Float[Array, " harmonic"], shared: bool) ->
         frequency: Harmonics of the loads [Hz].
         shared: Whether the unloaded record of a load may be that of a calibration.
     """
-    return given_driver.given(calibrations_of(driver), frequency, shared)
+    return given_driver.given(driver, calibrations_of(driver), frequency, shared)
 
 
 def harmonic_starts(
@@ -147,6 +146,8 @@ def skin_by_maximum_likelihood(
     )
     estimate, far, other = single_load.fit_circuit(known, circuit, spectrum, sample_rate, starts)
     fit = judged(estimate, circuit, driver.result, "maximum_likelihood")
+    if known.shape is not None:
+        fit = unless(fit, known.shape.differs(spectrum), RESULTS.inconsistent)
     return unless(unless(fit, far, RESULTS.driver_unclear), other, RESULTS.misfit)
 
 

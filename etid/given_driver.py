@@ -18,6 +18,7 @@ same: they may differ by a standard error along the direction that one known res
 (`etid.shared_driver` has the terms themselves, for many loads at once).
 """
 
+import dataclasses
 from typing import NamedTuple
 
 import equinox as eqx
@@ -25,6 +26,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Complex, Float
 
+from etid.driver import Driver
 from etid.likelihood import (
     as_list,
     denoised,
@@ -36,6 +38,7 @@ from etid.likelihood import (
 from etid.maximum_likelihood import Calibrations
 from etid.spectra import Spectrum
 from etid.transfer import as_complex, reciprocal
+from etid.unloaded import UnloadedShape, shape
 
 RIDGE = 1e-12  # of the scaled curvature; below it double precision sees nothing
 
@@ -67,6 +70,7 @@ class GivenDriver(eqx.Module):
         records: The calibrations, if a load may have the unloaded record of one of them.
         gains: Their gains.
         gain_slopes: The derivatives of these by z.
+        shape: Unloaded voltage of the first calibration; None if loads have other harmonics.
     """
 
     frequency: Float[Array, " harmonic"]
@@ -79,6 +83,7 @@ class GivenDriver(eqx.Module):
     records: Spectrum | None
     gains: Complex[Array, "calibration known"] | None
     gain_slopes: Complex[Array, "z calibration known"] | None
+    shape: UnloadedShape | None = None
 
     def z_th(self, w: Complex[Array, " harmonic"]) -> Complex[Array, " harmonic"]:
         """Z_th [Ω] at W₀ + w."""
@@ -107,12 +112,13 @@ class GivenDriver(eqx.Module):
 
 
 def given(
-    calibrations: Calibrations, frequency: Float[Array, " harmonic"], shared: bool
+    driver: Driver, calibrations: Calibrations, frequency: Float[Array, " harmonic"], shared: bool
 ) -> GivenDriver:
     """What the calibrations tell.
 
     Args:
-        calibrations: The calibrations.
+        driver: The driver.
+        calibrations: Its calibrations.
         frequency: Harmonics of the loads [Hz].
         shared: Whether a load's unloaded record may be that of a calibration.
     """
@@ -134,7 +140,22 @@ def given(
     noise = weights(of_noise, whitened.shape[0])
     mean = -root.T @ pullback(value)[0]
     cov = (whitened.T * noise[None, :]) @ whitened
-    return around(calibrations, c, root, frequency, shared, mean, cov)
+    if driver.drift is None:
+        found = around(calibrations, c, root, frequency, shared, mean, cov)
+    else:
+        # What may have changed since is further z, of which the calibrations know nothing.
+        std = driver.drift_std()
+        changes = jnp.pad(jnp.diag(std), ((0, c.size - std.size), (0, 0)))
+        directions = jnp.concatenate([root, changes], axis=1)
+        mean = jnp.pad(mean, (0, std.size))
+        cov = jax.scipy.linalg.block_diag(cov, jnp.eye(std.size))
+        found = around(calibrations, c, directions, frequency, shared, mean, cov)
+        if found.gain_slopes is not None:
+            gain_slopes = found.gain_slopes.at[c.size :].set(0.0)
+            found = dataclasses.replace(found, gain_slopes=gain_slopes)
+    if records[0].x.shape != frequency.shape:
+        return found
+    return dataclasses.replace(found, shape=shape(records[0], driver.drift))
 
 
 def around(

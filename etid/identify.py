@@ -56,6 +56,7 @@ def identify_driver(
     order: int = 5,
     method: Method | None = None,
     plausible: tuple[float, float] = PLAUSIBLE,
+    driver_drift: float = 0.0,
     throw: bool = True,
 ) -> Driver:
     """Identify the source impedance Z_th from one or several records with known resistors.
@@ -68,6 +69,8 @@ def identify_driver(
             `"equation_error"`. If not given, the first where the record allows it, else the second.
         plausible: Least and largest |Z_th| [Ω] at 1 kHz that is believed. The range spans a factor
             of 1000: no driver in it stays in it if `r_load` is given in kΩ.
+        driver_drift: Relative standard deviation by which each parameter of Z_th may have changed
+            until a skin is recorded. It enters the standard errors of the skins, as `shared_cov`.
         throw: Raise if the verdict is not successful.
 
     Returns:
@@ -90,6 +93,8 @@ def identify_driver(
             raise ValueError(
                 f"recording {record.path!r} has no r_load; a calibration needs its resistor [ohm]"
             )
+    if not 0 <= driver_drift < 1:
+        raise ValueError(f"driver_drift is {driver_drift}; it is a part, such as 0.01")
     if order < 2:
         raise ValueError(f"order is {order}; a source impedance needs at least order 2")
     sizes = {(record.v_th.size, record.sample_rate, record.pulse_rate) for record in records}
@@ -124,6 +129,8 @@ def identify_driver(
         unloaded = np.array([checksum(one) for one in seen])
         calibration = dataclasses.replace(driver.calibration, unloaded=unloaded)
         driver = dataclasses.replace(driver, calibration=calibration)
+    if driver_drift:
+        driver = dataclasses.replace(driver, drift=np.asarray(driver_drift, float))
     size = float(jnp.abs(driver.response(jnp.asarray(1e3))))
     if np.isfinite(size) and not plausible[0] <= size <= plausible[1]:
         driver = dataclasses.replace(driver, result=verdict("implausible"))

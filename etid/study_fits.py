@@ -122,6 +122,7 @@ def _to_json(paths: tuple[str, ...], driver: Driver) -> str:
             "verdict": driver.verdict,
             "steps": int(driver.steps),
             "remarks": words(int(driver.remarks)),
+            "drift": None if driver.drift is None else float(driver.drift),
             "rrse": float(driver.rrse),
             "chi2": float(driver.chi2),
             "b": np.asarray(driver.b).tolist(),
@@ -159,4 +160,5 @@ def _from_json(stored: Mapping[str, Any]) -> Driver:
         steps=jnp.asarray(stored["steps"]),
         method=stored["method"],
         remarks=np.asarray(remarks_of(stored.get("remarks", ""))),
+        drift=array(stored.get("drift")),
     )

@@ -54,8 +54,9 @@ class RESULTS(optx.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]  # equi
         "both are the same record. Check the contact and the channels."
     )
     inconsistent = (
-        "The recording and the calibrations contradict each other about the source impedance. "
-        "The driver changed in between, or r_load is not what it is said to be."
+        "The recording and the calibrations contradict each other about the source impedance, or "
+        "their unloaded voltages differ by more than amplitude and delay. "
+        "The driver changed in between, or r_load is not what it is said to be. Calibrate again."
     )
     driver_unclear = (
         "The calibrations are so noisy that this recording moves the source impedance further than "

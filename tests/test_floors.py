@@ -78,6 +78,7 @@ FLOORS = {
     "baseline": 7,
     "methods_section": 8,
     "given_driver": 7,
+    "unloaded": 4,
     "missing_pole": 7,
     "resistors": 7,
     "single_load": 8,

@@ -1,0 +1,70 @@
+"""Drivers whose Z_th drifts after the calibration: standard errors that hold it are true."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax.flatten_util import ravel_pytree
+
+import etid
+from etid.driver import SourceImpedance
+from etid.scenes import Scene, Trial
+from etid.transformer import OpenLoad, ResistorLoad, SkinLoad, TransformerDriver, loading
+
+DRY = SkinLoad(r_s=33.4e3, r_p=186e3, c_p=0.12e-9)
+DRIFT = 0.01
+FITS = 60
+
+
+@pytest.fixture(scope="module")
+def driver():
+    known = (Trial("calibration/0", ResistorLoad(98.8e3)),)
+    study = Scene((), known, trigger_jitter_rms=50e-9).simulate(seed=1)
+    return etid.identify_driver(study["calibration/0"], driver_drift=DRIFT)
+
+
+def recorded(source: SourceImpedance, number: int):
+    """Dry skin behind this source, driven as usual."""
+    usual = TransformerDriver()
+
+    def voltage(trial, f):
+        v_th = 60 * usual.v_th_spectrum(f)
+        if isinstance(trial.load, OpenLoad):
+            return v_th
+        return v_th * loading(trial.load(f), np.asarray(source.response(jnp.asarray(f))))
+
+    trial = Trial(f"loaded/{number}", DRY)
+    return Scene((trial,), trigger_jitter_rms=50e-9).record(3, voltage)[trial.path]
+
+
+@pytest.mark.slow
+def test_standard_errors_hold_what_the_driver_drifts_by(driver):
+    """Without the drift in them they are a third of the errors, or less."""
+    vector, unflatten = ravel_pytree(driver.source)
+    std, draws = np.asarray(driver.drift_std()), np.random.default_rng(5)
+    sources = [unflatten(vector + std * draws.normal(size=std.size)) for _ in range(FITS)]
+    fits = etid.identify_skins([recorded(s, i) for i, s in enumerate(sources)], driver)
+    # One in 6000 is off by chance; that a driver drifts as it may is no verdict.
+    assert fits.counts() == {"successful": FITS}
+    truth = np.array([DRY.r_s, DRY.r_p, DRY.c_p])
+    scaled = (np.asarray(fits.circuit.values()) - truth) / np.asarray(fits.stderr.values())
+    # 95 % of 60 less three standard deviations; a scatter of sqrt(1/120) around 1, and R_s, R_p
+    # and C_p are seen to be 0.7 to 0.9 here.
+    assert (np.mean(np.abs(scaled) < 1.96, axis=0) > 0.86).all()
+    size = np.sqrt(np.mean(scaled**2, axis=0))
+    assert (size < 1.3).all()
+    assert (size > 0.5).all()
+    shared, total = (
+        np.diagonal(np.asarray(c), axis1=1, axis2=2) for c in (fits.fit.shared_cov, fits.cov)
+    )
+    assert (shared > 0.5 * total).all()
+
+
+@pytest.mark.parametrize("drift", [-0.01, 1.0, np.nan])
+def test_a_drift_is_a_part(drift):
+    with pytest.raises(ValueError, match="driver_drift"):
+        etid.identify_driver([recorded_calibration()], driver_drift=drift)
+
+
+def recorded_calibration():
+    known = (Trial("calibration/0", ResistorLoad(98.8e3)),)
+    return Scene((), known).simulate(seed=1)["calibration/0"]

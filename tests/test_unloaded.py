@@ -1,0 +1,111 @@
+"""A driver that has changed since its calibration shows it in its unloaded voltage."""
+
+import dataclasses
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import etid
+from etid.lanes import lane
+from etid.preflight import Inspected
+from etid.scenes import Scene, Trial
+from etid.spectra import Spectrum
+from etid.transformer import ResistorLoad, SkinLoad, TransformerDriver
+from etid.unloaded import UnloadedShape, shape
+
+USUAL = TransformerDriver()
+DRY = SkinLoad(r_s=33.4e3, r_p=186e3, c_p=0.12e-9)
+of_calibration = jax.jit(shape)
+differs = jax.jit(UnloadedShape.differs)
+
+
+def changed(**factors):
+    return dataclasses.replace(USUAL, **{k: getattr(USUAL, k) * v for k, v in factors.items()})
+
+
+def study(driver=USUAL, seed=0, **options):
+    trials = (Trial("loaded/0", DRY),)
+    known = (Trial("calibration/0", ResistorLoad(98.8e3)),)
+    options = dict[str, Any](trigger_jitter_rms=50e-9, offset_rms=0.01) | options
+    return Scene(trials, known, driver=driver, **options).simulate(seed)
+
+
+def spectrum(recording):
+    *fields, _ = lane(Inspected(recording), "maximum_likelihood")
+    return Spectrum(*map(jnp.asarray, fields))
+
+
+def is_changed(driver, seed=1, snr_db=60.0, **options):
+    calibration = spectrum(study(snr_db=snr_db)["calibration/0"])
+    later = spectrum(study(driver, seed, snr_db=snr_db, **options)["loaded/0"])
+    return bool(differs(of_calibration(calibration), later))
+
+
+PARTS = {
+    "protection": {"r_protection": 1.03},
+    "winding": {"r_secondary": 1.2},
+    "leakage": {"l_primary": 1.05, "l_secondary": 1.05},
+    "magnetising": {"l_magnetising": 1.05},
+    "source": {"r_source": 1.05},
+    "capacitance": {"c_secondary": 1.1},
+    "cable": {"c_cable": 1.1},
+}
+
+
+@pytest.mark.parametrize("part", PARTS)
+def test_a_part_that_has_changed_is_seen(part):
+    assert is_changed(changed(**PARTS[part]))
+
+
+@pytest.mark.parametrize("snr_db", [80.0, 60.0, 40.0, 30.0, 20.0])
+@pytest.mark.parametrize("seed", range(1, 5))
+def test_the_same_driver_is_the_same(snr_db, seed):
+    assert not is_changed(USUAL, seed, snr_db, start=seed * 3.7e-4)
+
+
+@pytest.mark.parametrize(
+    ("name", "driver"),
+    {
+        "louder": changed(amplitude=1.02),
+        "upside down": changed(amplitude=-1.0),
+        "longer": changed(width=1.01),
+        "longer by a half": changed(width=1.5),
+        "twice as long": changed(width=2.0),
+        "slower edge": changed(edge=1.2),
+    }.items(),
+)
+def test_another_pulse_of_the_same_driver_is_no_change(name, driver):
+    assert not is_changed(driver), name
+
+
+def test_other_pulse_rates_are_not_compared():
+    assert not is_changed(changed(l_magnetising=1.2), pulse_rate=60.01)
+
+
+def test_hum_in_the_first_harmonics_is_no_change():
+    calibration = spectrum(study()["calibration/0"])
+    later = study(seed=1)["loaded/0"]
+    t = np.arange(later.v_th.size) / later.sample_rate
+    hum = sum(0.4 * np.sin(2 * np.pi * 60 * k * t + k) for k in (1, 2, 3, 5))
+    disturbed = later.replace(v_th=later.v_th + hum, adc_range=None)
+    assert not bool(differs(of_calibration(calibration), spectrum(disturbed)))
+
+
+def test_a_skin_behind_a_changed_driver_is_inconsistent():
+    """R_p was 63 of its standard errors off, at chi2 1."""
+    driver = etid.identify_driver(study()["calibration/0"])
+    fit = etid.identify_skin(study(seed=1)["loaded/0"], driver)
+    assert fit.verdict == "successful"
+    later = study(changed(r_protection=1.05), seed=1)["loaded/0"]
+    with pytest.raises(etid.IdentificationError, match="inconsistent"):
+        etid.identify_skin(later, driver)
+
+
+def test_a_driver_that_is_known_to_drift_may():
+    calibration = spectrum(study()["calibration/0"])
+    later = spectrum(study(changed(l_magnetising=1.01), seed=1)["loaded/0"])
+    assert bool(differs(of_calibration(calibration), later))
+    assert not bool(differs(of_calibration(calibration, jnp.asarray(0.01)), later))
