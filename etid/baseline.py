@@ -8,18 +8,21 @@ from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, Bool, Float
 
-from etid import harmonic_steiglitz_mcbride, steiglitz_mcbride
+from etid import harmonic_steiglitz_mcbride, other_circuit, steiglitz_mcbride
 from etid.circuits import SkinRC
 from etid.driver import Driver
+from etid.given_driver import RIDGE
+from etid.information import inverse
 from etid.judging import MAX_STEPS_REACHED, SUCCESSFUL, misses
 from etid.levenberg_marquardt import NormalEquations, normal_equations
-from etid.likelihood import delayed_gain, excess, residual
+from etid.likelihood import apart, delayed_gain, denoised, excess, residual, variance
 from etid.measurement import Measurement
 from etid.results import Fit
 from etid.spectra import Spectrum
-from etid.transfer import Rational
+from etid.transfer import Rational, as_complex, frequency_variable, reciprocal, turns
 from etid.verdicts import RESULTS, first_verdict
 
 BIASED = 16.0  # squared standard errors between an estimate and the minimum of its own model
@@ -109,7 +112,9 @@ def skin_by_harmonic_steiglitz_mcbride(
     chi2 = 2 * equations.objective / freedom
     noise = excess(terms(at, spectrum), spectrum.selected)[: spectrum.x.size]
     own, shared = harmonic_steiglitz_mcbride.covariance(spectrum, noise, source, source_cov, best)
-    variance = jnp.diagonal(own + shared)  # of the logarithms
+    errors = jnp.diagonal(own + shared)  # of the logarithms, squared
+    fitted = best.circuit.with_log_values(at[:-1])
+    other = _is_another(spectrum, noise, at, sample_rate, fitted, driver)
     return Fit(
         circuit=best.circuit,
         cov=(own + shared) * jnp.outer(values, values),
@@ -122,12 +127,86 @@ def skin_by_harmonic_steiglitz_mcbride(
             (~best.converged, MAX_STEPS_REACHED),
             (misses(chi2, best.rrse) | (jnp.abs(late) > 1), RESULTS.misfit),
             (~(_distance(equations) <= BIASED), RESULTS.biased),
-            (~jnp.all((variance > 0) & (variance < 1)), RESULTS.insensitive),
+            (~jnp.all((errors > 0) & (errors < 1)), RESULTS.insensitive),
+            (other, RESULTS.misfit),
             (driver.result != SUCCESSFUL, RESULTS.driver_failed),
         ),
         steps=best.iteration,
         method="harmonic_steiglitz_mcbride",
     )
+
+
+def _is_another(
+    spectrum: Spectrum,
+    noise: Float[Array, " harmonic"],
+    own: Float[Array, " own"],
+    sample_rate: Float[Array, ""],
+    circuit: SkinRC,
+    driver: Driver,
+) -> Bool[Array, ""]:
+    """Whether the load is seen to be another circuit, whatever Z_th is within its covariance.
+
+    Args:
+        spectrum: The recording.
+        noise: Variance of its noise in units of what it says.
+        own: Logarithms of the elements, and the delay in samples.
+        sample_rate: Its sampling rate [Hz].
+        circuit: The circuit.
+        driver: Its driver.
+    """
+    assert driver.cov is not None  # check_driver
+    f, elements = spectrum.frequency, own.size - 1
+    s = frequency_variable(f)
+    vector, unflatten = ravel_pytree(driver.source)
+    scale = jnp.sqrt(jnp.diagonal(driver.cov))
+    correlation = driver.cov / scale[:, None] / scale[None, :] + RIDGE * jnp.eye(scale.size)
+    deviations = jax.scipy.linalg.cholesky(correlation, lower=True).T * scale[None, :]
+
+    def along(function, at, directions):
+        return jax.vmap(lambda of: jax.jvp(function, (at,), (of,))[1])(directions)
+
+    def load(log_values):
+        return circuit.with_log_values(log_values).impedance()(s)
+
+    def of_gain(_):
+        """Derivatives of the gain by all parameters and changes."""
+        z_th = unflatten(vector).response(f)
+        z, changes = other_circuit.changes(circuit.impedance(), f)
+        total = reciprocal(z + z_th)
+        g = z * total * turns(-f[0] * own[-1] / sample_rate, f.size)
+        by_load = g * z_th * total * reciprocal(z)
+        by_source = along(lambda p: unflatten(p).response(f), vector, deviations)
+        by_own = [
+            by_load[None, :] * along(load, own[:-1], jnp.eye(elements)),
+            (-g * s * as_complex(1 / sample_rate))[None, :],
+        ]
+        slopes = [*by_own, (-g * total)[None, :] * by_source, by_load[None, :] * changes]
+        return g, jnp.concatenate(slopes)
+
+    g, slopes = apart(of_gain, own)
+
+    def of_residual(_):
+        # At the X that both records tell: the noise of that of one is in the residual as well.
+        [clean], [share] = denoised([spectrum], [g])
+        weight = jnp.where(spectrum.selected, jnp.sqrt(2 / variance(spectrum, g)), 0.0)
+        rows = slopes * (-clean.x * as_complex(weight))[None, :]
+        return jnp.concatenate([rows.real, rows.imag], axis=1), share
+
+    rows, share = apart(of_residual, own)
+    count = own.size + vector.size
+    jacobian = rows[:count]
+    prior = jnp.diag(jnp.pad(jnp.ones(vector.size), (own.size, 0)))
+    return other_circuit.scores(
+        rows[count:],
+        jacobian,
+        residual(spectrum, g),
+        jnp.zeros(count),
+        prior,
+        inverse((jacobian * share[None, :]) @ jacobian.T + prior),
+        share,
+        jnp.tile(noise, 2),
+        slice(elements),
+    ).seen()
 
 
 def driver_by_steiglitz_mcbride(

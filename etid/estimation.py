@@ -159,13 +159,13 @@ def skin_by_non_parametric(
     assert source is not None  # check_driver
     assert calibration is not None
     starts = harmonic_starts(spectrum, sample_rate, source.response(spectrum.frequency), circuit)
-    estimate, bias = non_parametric.fit_circuit(
+    estimate, bias, other = non_parametric.fit_circuit(
         circuit, calibration, jnp.asarray(driver.sample_rate), spectrum, sample_rate, starts
     )
     # It needs the harmonics of the driver, whether or not a model of them was found.
     fit = judged(estimate, circuit, SUCCESSFUL, "non_parametric")
     far = jnp.any(jnp.abs(bias) > CORRECTED * jnp.sqrt(jnp.diagonal(estimate.cov)))
-    return unless(fit, far, RESULTS.biased)
+    return unless(unless(fit, far, RESULTS.biased), other, RESULTS.misfit)
 
 
 def source_starts(

@@ -13,7 +13,8 @@ the same X. Record by record, X and σ_x² are then replaced by what the earlier
 leave of them (`_learn`, one step of a Kalman filter): the likelihood of all, in independent terms.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -155,3 +156,17 @@ def residuals(
         residual(informed(one, spectra[:i], gains[:i]), g)
         for i, (one, g) in enumerate(zip(spectra, gains, strict=True))
     ]
+
+
+def apart(evaluate: Callable[[Array], Any], q: Float[Array, " q"]) -> Any:
+    """`evaluate(q)`, kept in memory; not a number if `q` is none.
+
+    XLA repeats what it takes to make one number in every loop that reads it, here a dozen times.
+    What a branch returns is computed once.
+    """
+    shapes = jax.eval_shape(evaluate, q)
+
+    def nothing(_):
+        return jax.tree.map(lambda of: jnp.full(of.shape, jnp.nan, of.dtype), shapes)
+
+    return jax.lax.cond(jnp.isfinite(q).all(), lambda q: evaluate(q), nothing, q)

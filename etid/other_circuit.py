@@ -29,7 +29,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Complex, Float
 
 from etid.elements import AbstractImpedance, exponents
-from etid.transfer import as_complex, frequency_variable, reciprocal
+from etid.transfer import as_complex, frequency_variable
 
 # Standard deviations. By chance the spread exceeds its own in one fit of 16 000. Of the relaxations
 # the fast ones have 1.2 to 1.3 where 1 is expected (60 dB, order 5 for six poles), so that 5 is 4.
@@ -38,7 +38,7 @@ SEEN_SPREAD, SEEN_RELAXATION = 4.0, 5.0
 # order can imitate 0.002: at 60 dB, behind damp skin, four standard deviations.
 SPREAD = 0.01
 MOVED = 0.02  # of an element, which the relaxation must have cost as well, for the same reason
-GRID = 10  # time constants, two or three in a decade
+GRID = 7  # time constants, two in a decade: a relaxation is wider than that
 BEYOND = 2.0  # by which they exceed the band
 NOTHING = 1e-9  # of a change's power: less is what rounding leaves of one that the circuit can make
 
@@ -55,8 +55,9 @@ def changes(
     z, spread = jax.jvp(impedance, (s,), (s * log_s,))
     corner = 2 * jnp.pi * jnp.geomspace(frequency[0] / BEYOND, frequency[-1] * BEYOND, GRID)
     level = jnp.abs(impedance(jax.lax.complex(jnp.zeros_like(corner), corner)))
-    relaxations = reciprocal(1 + s[None, :] * as_complex(1 / corner)[:, None])
-    return z, jnp.concatenate([spread[None, :], relaxations * as_complex(level)[:, None]])
+    x = s.imag[None, :] * (1 / corner)[:, None]
+    real = level[:, None] / (1 + x**2)
+    return z, jnp.concatenate([spread[None, :], jax.lax.complex(real, -x * real)])
 
 
 class Scores(NamedTuple):
@@ -71,6 +72,12 @@ class Scores(NamedTuple):
     z: Float[Array, " change"]
     size: Float[Array, " change"]
     moved: Float[Array, " change"]
+
+    def less(self, bias: Float[Array, " change"]) -> "Scores":
+        """The same without a bias of z."""
+        z = self.z - bias
+        part = z / self.z
+        return Scores(z, part * self.size, jnp.abs(part) * self.moved)
 
     def seen(self) -> Bool[Array, ""]:
         """Whether the load is another circuit."""
@@ -106,14 +113,13 @@ def scores(
         noise: Variance of each residual.
         elements: Which parameters are the logarithms of the elements.
     """
-    weighted = rows * share[None, :]
-    others = weighted @ jacobian.T @ covariance
+    others = (rows * share[None, :]) @ jacobian.T @ covariance
     directions = rows - others @ jacobian
-    score = rows @ residual - others @ (jacobian @ residual + rest)
-    variance = directions**2 @ noise + jnp.sum((others @ spread) * others, axis=1)
-    curvature = jnp.sum(weighted * directions, axis=1)
-    can = curvature <= NOTHING * jnp.sum(weighted * rows, axis=1)
-    z = jnp.where(can, jnp.nan, score / jnp.sqrt(variance))
+    score = directions @ residual - others @ rest
+    # Products of matrices, which take a fifth of the time of sums.
+    of_priors = jnp.sum((others @ spread) * others, axis=1)
+    variance, curvature = (directions**2 @ jnp.stack([noise, share], axis=1)).T + of_priors[None]
+    can = curvature <= NOTHING * (rows**2 @ share)
     size = score / curvature
     moved = jnp.max(jnp.abs(others[:, elements]), axis=1)
-    return Scores(z, size, jnp.abs(size) * moved)
+    return Scores(jnp.where(can, jnp.nan, score / jnp.sqrt(variance)), size, jnp.abs(size) * moved)

@@ -245,7 +245,8 @@ class Fits:
         `NAME_stderr` the median standard error, and its two parts: `NAME_own`, the noise of the
         recording, which the spread contains, and `NAME_shared`, which no spread shows because all
         recordings with one driver have it in common. What really varies between the recordings is
-        `NAME_between`, sqrt(spread² − own²), or 0.
+        `NAME_between`, sqrt(spread² − mean own²), or 0. The mean is what noise adds to spread², and
+        where some recordings are noisier than others not the square of the median.
 
         Args:
             *by: Labels that make the groups; without one all fits are one group.
@@ -281,9 +282,10 @@ class Fits:
                 chosen = order[start:end]
                 for part, values in parts.items():
                     row[name + part] = float(np.median(values[chosen])) if end > start else np.nan
-                values = parts[""][chosen]
-                row[f"{name}_spread"] = float(np.std(values, ddof=1)) if values.size > 1 else np.nan
-                excess = row[f"{name}_spread"] ** 2 - row[f"{name}_own"] ** 2
+                several, values = chosen.size > 1, parts[""][chosen]
+                row[f"{name}_spread"] = float(np.std(values, ddof=1)) if several else np.nan
+                noise = float(np.mean(parts["_own"][chosen] ** 2)) if several else np.nan
+                excess = row[f"{name}_spread"] ** 2 - noise
                 row[f"{name}_between"] = float(np.sqrt(np.maximum(excess, 0.0)))
         return rows
 

@@ -6,7 +6,7 @@ the derivatives: they are taken of those, and combined.
 """
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -19,25 +19,11 @@ from etid.circuits import AbstractCircuit
 from etid.given_driver import GivenDriver, UnloadedSlopes, combined
 from etid.information import inverse
 from etid.levenberg_marquardt import LevenbergMarquardt, NormalEquations, best_start
-from etid.likelihood import denoised, excess, residual, variance
+from etid.likelihood import apart, denoised, excess, residual, variance
 from etid.output_error import DELAY_WIDTH, MAX_STEPS, SOLVER, Estimate
 from etid.results import complex_rrse
 from etid.spectra import Spectrum
 from etid.transfer import as_complex, frequency_variable, reciprocal, turns
-
-
-def _apart(evaluate: Callable[[Array], Any], q: Float[Array, " q"]) -> Any:
-    """`evaluate(q)`, kept in memory; not a number if `q` is none.
-
-    XLA repeats what it takes to make one number in every loop that reads it, here a dozen times.
-    What a branch returns is computed once.
-    """
-    shapes = jax.eval_shape(evaluate, q)
-
-    def nothing(_):
-        return jax.tree.map(lambda of: jnp.full(of.shape, jnp.nan, of.dtype), shapes)
-
-    return jax.lax.cond(jnp.isfinite(q).all(), lambda q: evaluate(q), nothing, q)
 
 
 class _Slopes(NamedTuple):
@@ -45,7 +31,8 @@ class _Slopes(NamedTuple):
 
     Attributes:
         part: The residual.
-        own: Derivative of the gain by the elements and the delay.
+        by_load: Derivative of the gain by Z_L.
+        own: The same by the elements and the delay.
         by_g: Derivatives of the residual by real and imaginary part of the gain.
         by_w: The same by W.
         by_x: The same by X; None if no z moves it.
@@ -53,6 +40,7 @@ class _Slopes(NamedTuple):
     """
 
     part: Float[Array, " part"]
+    by_load: Complex[Array, " harmonic"]
     own: Complex[Array, "own harmonic"]
     by_g: tuple[Array, Array]
     by_w: tuple[Array, Array]
@@ -116,7 +104,7 @@ class Load(eqx.Module):
 
     def __call__(self, q: Float[Array, " q"]) -> Float[Array, " term"]:
         """Terms of the recording, of its delay and of z."""
-        g, spectrum = _apart(self.predicted, q)
+        g, spectrum = apart(self.predicted, q)
         prior = 1 / self.widths(q)
         return jnp.concatenate([residual(spectrum, g), (prior * (q - self.centre(q)))])
 
@@ -147,14 +135,14 @@ class Load(eqx.Module):
             by_element = jax.vmap(lambda v: jax.jvp(self.load, (own,), (v,))[1])(elements)
             return self.load(own), by_element, self.turns(own)
 
-        load, by_element, turns = _apart(of_load, q)
+        load, by_element, turns = apart(of_load, q)
 
         def of_gain(_):
             divided, by_load = jax.jvp(lambda at: self.divided(at, w), (load,), (unit(load),))
             by_w = jax.jvp(lambda at: self.divided(load, at), (w,), (unit(w),))[1]
             return divided, by_load * turns, by_w * turns
 
-        divided, by_load, turned = _apart(of_gain, q)
+        divided, by_load, turned = apart(of_gain, q)
         by_delay = jax.jvp(self.turns, (own,), (jnp.zeros(own.size).at[-1].set(1.0),))[1]
         slopes = jnp.concatenate([by_load[None, :] * by_element, (divided * by_delay)[None, :]])
 
@@ -178,38 +166,41 @@ class Load(eqx.Module):
             by_x = _by_parts(spectrum.x, moved)
             return residual(spectrum, g), by_g, by_x, by_variance
 
-        part, (real, imaginary), by_x, by_variance = _apart(of_g, q)
-        by_w = (
-            real * turned.real[None, :] + imaginary * turned.imag[None, :],
-            imaginary * turned.real[None, :] - real * turned.imag[None, :],
-        )
-        return _Slopes(part, slopes, (real, imaginary), by_w, by_x, by_variance)
+        part, (real, imaginary), by_x, by_variance = apart(of_g, q)
+        by_w = _turned((real, imaginary), turned)
+        return _Slopes(part, by_load, slopes, (real, imaginary), by_w, by_x, by_variance)
 
-    def by_changes(self, q: Float[Array, " q"]) -> Float[Array, "change part"]:
+    def by_changes(self, q: Float[Array, " q"], slopes: _Slopes) -> Float[Array, "change part"]:
         """Derivatives of the residual of the recording by the changes of `etid.other_circuit`."""
-        own, z = self.split(q)
-        w, spectrum = self.at(z)
-        impedance = self.circuit.with_log_values(own[:-1]).impedance()
-        load, changes = other_circuit.changes(impedance, spectrum.frequency)
-        divided, by_load = jax.jvp(lambda at: self.divided(at, w), (load,), (jnp.ones_like(load),))
-        turns = self.turns(own)
-        by_g = _by_parts(divided * turns, lambda a, b: residual(spectrum, jax.lax.complex(a, b)))
-        return _chained((by_load * turns)[None, :] * changes, by_g)
+        impedance = self.circuit.with_log_values(self.split(q)[0][:-1]).impedance()
+
+        def parts(_):
+            _, changes = other_circuit.changes(impedance, self.spectrum.frequency)
+            return changes, _turned(slopes.by_g, slopes.by_load)
+
+        changes, (real, imaginary) = apart(parts, q)
+        rows = changes.real[:, None] * real[None] + changes.imag[:, None] * imaginary[None]
+        return rows.reshape(changes.shape[0], -1)
 
     def jacobian(
         self, q: Float[Array, " q"]
     ) -> tuple[Float[Array, " part"], Float[Array, "q part"]]:
         """Residual of the recording alone and, transposed, its Jacobian."""
-        part, own, by_g, by_w, by_x, by_variance = _apart(self.slopes, q)
+        slopes = apart(self.slopes, q)
+        return slopes.part, self.chained(q, slopes)
+
+    def chained(self, q: Float[Array, " q"], slopes: _Slopes) -> Float[Array, "q part"]:
+        """Jacobian, transposed."""
+        _, _, own, by_g, by_w, by_x, by_variance = slopes
         rows = _chained(own, by_g)
         if q.size == self.owned:
-            return part, rows
+            return rows
         others = _chained(self.driver.slope, by_w)
         if self.unloaded is not None and by_x is not None and by_variance is not None:
             others = others + _chained(self.unloaded.x, by_x)
             wider = self.unloaded.log_variance[:, None, :] * by_variance[None]
             others = others + wider.reshape(others.shape)
-        return part, jnp.concatenate([rows, others])
+        return jnp.concatenate([rows, others])
 
 
 def _by_parts(
@@ -220,6 +211,15 @@ def _by_parts(
     one, zero = jnp.ones_like(value.real), jnp.zeros_like(value.real)
     by_real, by_imaginary = (jax.jvp(function, at, of)[1] for of in ((one, zero), (zero, one)))
     return by_real.reshape(2, -1), by_imaginary.reshape(2, -1)
+
+
+def _turned(by: tuple[Array, Array], slope: Complex[Array, " harmonic"]) -> tuple[Array, Array]:
+    """Derivatives of a residual by both parts of what its argument depends on with this slope."""
+    real, imaginary = by
+    return (
+        real * slope.real[None, :] + imaginary * slope.imag[None, :],
+        imaginary * slope.real[None, :] - real * slope.imag[None, :],
+    )
 
 
 def _chained(slope: Complex[Array, "q harmonic"], by: tuple[Array, Array]) -> Array:
@@ -298,14 +298,15 @@ def fit_circuit(
         x = clean.x - combined(z, unloaded.x)
         clean = eqx.tree_at(lambda s: (s.x, s.variance_x), clean, (x, load.spectrum.variance_x))
     clean = Load(driver, circuit, clean, unloaded, sample_rate)
-    jacobian = clean.jacobian(q)[1]
+    slopes = apart(clean.slopes, q)
+    jacobian = clean.chained(q, slopes)
     prior = 1 / load.widths(q) ** 2
     information = inverse((jacobian * share[None, :]) @ jacobian.T + jnp.diag(prior))
     elements = information[: own.size - 1]
     by_term = elements @ jacobian
     noise = excess(part, spectrum.selected)
     other = other_circuit.scores(
-        _apart(clean.by_changes, q),
+        clean.by_changes(q, slopes),
         jacobian,
         part,
         prior * (q - load.centre(q)),

@@ -1,5 +1,8 @@
 """Batches: chunks, lengths, rates and drivers mixed; every recording gets its own answer."""
 
+import dataclasses
+
+import equinox as eqx
 import h5py
 import jax
 import numpy as np
@@ -256,6 +259,23 @@ def test_a_group_without_success_is_counted_and_has_no_median(mixed):
     np.testing.assert_allclose(first["r_p_stderr"], np.mean(np.asarray(good.stderr.r_p)))
     assert "2 successful" in str(mixed)
     assert "0/1" in str(mixed)
+
+
+def test_what_varies_is_the_spread_less_the_noise_of_all_recordings(mixed):
+    """Two thirds have 1 % of noise, one third has 10 %, which the median does not show."""
+    rng, count, varies = np.random.default_rng(3), 6000, 0.05
+    noise = np.where(np.arange(count) % 3 < 2, 0.01, 0.1)
+    many = mixed.successful().take(np.zeros(count, int))
+    r_p = 1 + varies * rng.standard_normal(count) + noise * rng.standard_normal(count)
+    cov = np.zeros((count, 3, 3))
+    cov[:, 1, 1] = noise**2
+    fit = eqx.tree_at(
+        lambda f: (f.circuit.r_p, f.cov, f.shared_cov), many.fit, (r_p, cov, np.zeros_like(cov))
+    )
+    [row] = dataclasses.replace(many, fit=fit).summary()
+    assert row["r_p_own"] == pytest.approx(0.01)
+    # The variance of the spread is known to 2 %, three times what varies.
+    assert row["r_p_between"] == pytest.approx(varies, rel=0.15)
 
 
 def test_labels_select(mixed):
