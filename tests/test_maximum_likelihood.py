@@ -8,9 +8,10 @@ import pytest
 import scipy.signal
 
 import etid
-from etid import batch, lanes, likelihood
+from etid import batch, lanes, likelihood, methods
 from etid.circuits import SkinRC
 from etid.elements import resistor
+from etid.preflight import Inspected
 from etid.scenes import Scene, Trial
 from etid.transformer import ResistorLoad, SkinLoad
 
@@ -81,11 +82,20 @@ def test_a_driver_by_output_error_keeps_no_harmonics_and_says_so(study):
         etid.identify_skin(study["loaded/0"], other, method="maximum_likelihood")
 
 
-def test_a_record_without_a_whole_period_is_told_so_or_goes_to_output_error(study, driver):
+@pytest.fixture(scope="module")
+def short(study):
     record = study["loaded/0"]
-    short = record.replace(v_th=record.v_th[:SHORT], v_out=record.v_out[:SHORT])
+    return record.replace(v_th=record.v_th[:SHORT], v_out=record.v_out[:SHORT])
+
+
+def test_a_record_without_a_whole_period_is_told_so_or_goes_to_output_error(short, driver):
     with pytest.raises(etid.IdentificationError, match="not_periodic"):
         etid.identify_skin(short, driver, method="maximum_likelihood")
+    assert methods.plan(None, Inspected(short), driver) == ("output_error", None)
+
+
+@pytest.mark.slow
+def test_output_error_with_a_driver_by_maximum_likelihood_is_right(short, driver):
     fit = etid.identify_skin(short, driver)
     assert fit.method == "output_error"
     assert (np.abs(error(fit)) < SIGMAS * np.asarray(fit.stderr.values())).all()

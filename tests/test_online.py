@@ -415,6 +415,13 @@ def test_intervals_of_drifting_skin_contain_it_in_95_per_cent():
     assert (np.abs(held(z) - 0.95) < 3 * np.sqrt(0.95 * 0.05 / len(z)) + 0.01).all(), held(z)
 
 
+def test_bands_end_where_aliases_begin():
+    of = tracker_of(2).model.bands
+    last = of.x.size / of.size  # of the sample rate
+    assert ALIASED - 2 * bands.WIDEST / of.size < last < ALIASED + bands.WIDEST / of.size
+    assert float(of.frequency[-1]) < ALIASED * RATE
+
+
 def test_windows_are_those_next_to_each_period():
     v = np.arange(40.0)
     np.testing.assert_array_equal(bands.cut(v, 10.0)[:, 0], [0, 10, 20, 30])
