@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterable, Iterator
 import numpy as np
 
 from etid.recording import RecordingError
-from etid.scan import LIBRARY_ERRORS
+from etid.untrusted import LIBRARY_ERRORS
 
 BLOCK = 1 << 20  # samples that are in memory at once, 8 MB of real numbers
 LISTED = 30  # names in an error

@@ -12,18 +12,21 @@ from typing import Any
 import h5py
 import numpy as np
 
+from etid import limits
 from etid.channels import listed, needs
 from etid.circuits import AbstractCircuit
 from etid.netlist import circuit_string, netlist
 from etid.recording import RecordingError
-from etid.results import LABELS, SCHEMA, Fits
-from etid.tables import opened_table, read_column, replacing
+from etid.results import LABELS, SCHEMA, Fit, Fits
+from etid.tables import Table, opened_table, replacing, same_length
+from etid.untrusted import attribute, translated
 
 ROWS = 1 << 16  # of fits in memory at once
 
 CIRCUITS = (".cir", ".json")
 
-_QUALITY = ("rrse", "chi2", "steps", "verdict", "remarks", "note")
+_QUALITY = {"rrse": "number", "chi2": "number", "steps": "integer", "verdict": "text",
+            "remarks": "text", "note": "text"}  # fmt: skip
 
 
 def export_fits(source: str | os.PathLike[str], target: str | os.PathLike[str]) -> None:
@@ -50,41 +53,61 @@ def export_fits(source: str | os.PathLike[str], target: str | os.PathLike[str]) 
         raise ValueError(
             f"{os.fspath(target)}: fits are exported as {' or '.join(_WRITERS)}, not {suffix!r}"
         )
-    with opened_table(source, SCHEMA) as file, replacing(target) as partial:
-        parameters: Any = file.attrs["parameters"]
-        elements = [name + ending for name in parameters for ending in ("", "_stderr")]
-        columns = {name: _column(file, name) for name in (*LABELS, *elements, *_QUALITY)}
-        about = {name: str(file.attrs[name]) for name in ("circuit", "method", "etid_version")}
-        _WRITERS[suffix](columns, about, partial)
+    with opened_table(source, SCHEMA) as table, replacing(target) as partial:
+        columns = _columns(table)
+        about = {name: table.text(name) for name in ("circuit", "method", "etid_version")}
+        _WRITERS[suffix](table, columns, about, partial)
 
 
-def _column(file: h5py.File, name: str) -> h5py.Dataset:
-    column = file.get(name)
-    if not isinstance(column, h5py.Dataset):
-        raise ValueError(f"{file.filename}: the column {name} is missing; fit the recordings again")
-    return column
+def _columns(table: Table) -> dict[str, h5py.Dataset]:
+    """The columns of `Fits.table()`, none of them read yet."""
+    parameters = table.attribute("parameters")
+    names = parameters if isinstance(parameters, list) else [parameters]
+    if not all(isinstance(name, str) for name in names) or len(names) > limits.COLUMNS:
+        raise RecordingError(
+            f"is {parameters!r}, must be names", file=table.name, field="parameters",
+            remedy="Fit the recordings again",
+        )  # fmt: skip
+    elements = [name + ending for name in names for ending in ("", "_stderr")]
+    kinds = dict.fromkeys(LABELS, "text") | dict.fromkeys(elements, "number") | _QUALITY
+    columns = {name: table.column(name, kind) for name, kind in kinds.items()}
+    same_length(table, columns)
+    return columns
 
 
-def _parts(columns: dict[str, h5py.Dataset]) -> Iterator[dict[str, np.ndarray]]:
+def _units(column: h5py.Dataset, table: Table) -> str | None:
+    """The unit of a column."""
+    with translated(table.name, field=str(column.name).strip("/")):
+        unit = attribute(column, "unit") if "unit" in column.attrs else None
+        if not isinstance(unit, str | None):
+            raise RecordingError(f"has the unit {unit!r}", remedy="Fit the recordings again")
+    return unit
+
+
+def _parts(table: Table, columns: dict[str, h5py.Dataset]) -> Iterator[dict[str, np.ndarray]]:
     """The rows, some at a time."""
     for start in range(0, len(columns["path"]), ROWS):
         rows = slice(start, start + ROWS)
-        yield {name: read_column(column, rows) for name, column in columns.items()}
+        yield {name: table.read(column, rows) for name, column in columns.items()}
 
 
-def _csv(columns: dict[str, h5py.Dataset], about: dict[str, str], path: pathlib.Path) -> None:
+def _csv(
+    table: Table, columns: dict[str, h5py.Dataset], about: dict[str, str], path: pathlib.Path
+) -> None:
     del about
-    units = {name: column.attrs.get("unit") for name, column in columns.items()}
+    units = {name: _units(column, table) for name, column in columns.items()}
     with path.open("w", newline="", encoding="utf-8") as text:
         lines = csv.writer(text)
         lines.writerow(
             name if unit in (None, "1") else f"{name} [{unit}]" for name, unit in units.items()
         )
-        for part in _parts(columns):
+        for part in _parts(table, columns):
             lines.writerows(zip(*(column.tolist() for column in part.values()), strict=True))
 
 
-def _parquet(columns: dict[str, h5py.Dataset], about: dict[str, str], path: pathlib.Path) -> None:
+def _parquet(
+    table: Table, columns: dict[str, h5py.Dataset], about: dict[str, str], path: pathlib.Path
+) -> None:
     try:
         import pyarrow
         from pyarrow import parquet
@@ -94,11 +117,11 @@ def _parquet(columns: dict[str, h5py.Dataset], about: dict[str, str], path: path
     for name, column in columns.items():
         text = h5py.check_string_dtype(column.dtype)
         kind: Any = pyarrow.string() if text else pyarrow.from_numpy_dtype(column.dtype)
-        unit = column.attrs.get("unit")
+        unit = _units(column, table)
         fields.append(pyarrow.field(name, kind, metadata={"unit": unit} if unit else None))
     schema = pyarrow.schema(fields, metadata=about)
     with parquet.ParquetWriter(path, schema) as writer:
-        for part in _parts(columns):
+        for part in _parts(table, columns):
             writer.write_table(pyarrow.table(part, schema=schema))
 
 
@@ -138,7 +161,7 @@ def export_circuit(
         path = paths[0]
     if path is None or path.strip("/") not in paths:
         said = "say which recording" if path is None else f"there is no fit of {path!r}"
-        raise ValueError(f"{os.fspath(source)}: {said}; the fits are of {listed(paths)}")
+        raise RecordingError(f"{said}; the fits are of {listed(paths)}", file=os.fspath(source))
     index = paths.index(path.strip("/"))
     fit = fits[index]
     if fit.verdict != "successful":
@@ -146,21 +169,28 @@ def export_circuit(
             f"{os.fspath(source)}: the fit of {paths[index]!r} is {fit.verdict}, no circuit to "
             f"work with. {fits.notes[index]}"
         )
-    if suffix == ".cir":
-        name = "load_" + re.sub(r"\W", "_", paths[index], flags=re.ASCII)
-        text = f"* {paths[index]}, by {fit.method}\n{netlist(fit.circuit, name=name)}"
-    else:
-        string, values = circuit_string(fit.circuit)
-        content = {
-            "Name": f"{paths[index]}, by etid",
-            "Circuit String": string,
-            "Initial Guess": values,
-            "Constants": {},
-            "Fit": False,  # its "Fit" would come with impedance.py's own standard errors
-        }
-        text = json.dumps(content, indent=1, ensure_ascii=False) + "\n"
+    try:
+        text = _written(fit, paths[index], suffix)
+    except ValueError as error:  # an element that is 0, or no number
+        raise RecordingError(str(error), file=os.fspath(source), path=paths[index]) from error
     with replacing(target) as partial:
         partial.write_text(text, encoding="utf-8")
+
+
+def _written(fit: Fit, path: str, suffix: str) -> str:
+    """A circuit in the language of another program."""
+    if suffix == ".cir":
+        name = "load_" + re.sub(r"\W", "_", path, flags=re.ASCII)
+        return f"* {path}, by {fit.method}\n{netlist(fit.circuit, name=name)}"
+    string, values = circuit_string(fit.circuit)
+    content = {
+        "Name": f"{path}, by etid",
+        "Circuit String": string,
+        "Initial Guess": values,
+        "Constants": {},
+        "Fit": False,  # its "Fit" would come with impedance.py's own standard errors
+    }
+    return json.dumps(content, indent=1, ensure_ascii=False) + "\n"
 
 
 def export_study(

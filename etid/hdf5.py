@@ -6,14 +6,14 @@ with one recording is put aside in `Study.problems`.
 """
 
 import os
-import pathlib
 
 import h5py
 
 from etid import schema
 from etid.recording import RecordingError
-from etid.scan import Scan, attribute, translated
+from etid.scan import Scan
 from etid.study import Study
+from etid.untrusted import Attributes, check_file, translated
 
 
 def read(path: str | os.PathLike[str]) -> Study:
@@ -62,35 +62,29 @@ def check(path: str | os.PathLike[str]) -> list[RecordingError]:
 
 def _open(name: str) -> h5py.File:
     """The file, once its root says that it follows the schema."""
-    if not pathlib.Path(name).is_file():
-        raise RecordingError("there is no such file", file=name, remedy="Check the path")
-    if not h5py.is_hdf5(name):
-        raise RecordingError(
-            "is not an HDF5 file, or its head is damaged",
-            file=name,
-            remedy="Turn other formats into the schema with `etid import`",
-        )
+    check_file(name)
     with translated(name):
         file = h5py.File(name, "r")
     try:
-        _check_root(file, name)
+        with Attributes(name) as attributes:
+            _check_root(file, name, attributes)
     except BaseException:
         file.close()
         raise
     return file
 
 
-def _check_root(file: h5py.File, name: str) -> None:
+def _check_root(file: h5py.File, name: str, attributes: Attributes) -> None:
     found: dict[str, str] = {}
     for field in schema.at("file attribute").values():
         remedy = f"The file needs the attributes schema={schema.NAME!r} and schema_version"
         with translated(name, field=field.name):
             if field.name not in file.attrs:
-                near = schema.near_miss(field.name, file.attrs)
+                near = schema.near_miss(field.name, attributes.names(file))
                 hint = f", did you mean {field.name} by {near}?" if near else ""
                 raise RecordingError(f"is missing{hint}", remedy=remedy)
             try:
-                found[field.name] = field.parse(attribute(file.attrs, field.name))
+                found[field.name] = field.parse(attributes.value(file, field.name))
             except ValueError as error:
                 raise RecordingError(str(error), remedy=remedy) from None
     problem = schema.version_problem(found["schema_version"])

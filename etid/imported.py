@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from etid import limits
 from etid.channels import Channel, located
 from etid.mapping import Plan, Signal, unit_of
 from etid.recording import (
@@ -154,6 +155,14 @@ def sources_of(
         with located("", field=name):
             channels[name] = channel(signal.channel)
         units[name] = _unit(name, signal, channels[name].unit)
+    for name, own in channels.items():
+        if own.length > limits.SAMPLES or (len(own.shape) == 2 and own.shape[0] > limits.TRIALS):
+            raise RecordingError(
+                f"channel {own.name!r} has shape {own.shape}, at most {limits.TRIALS} trials of "
+                f"{limits.SAMPLES} samples are read",
+                field=name,
+                remedy="Split it",
+            )
     rows = _rows(plan.signals, channels)
     length = channels["v_out"].length
     rate, rate_by = sample_rate(plan, channels, units, by)

@@ -12,7 +12,7 @@ import tomllib
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from etid import schema
+from etid import limits, schema
 from etid.channels import chosen, listed
 from etid.recording import SIGNALS, RecordingError, tidy_path
 from etid.units import UNITS, Unit, parse_unit
@@ -76,9 +76,16 @@ def read_mapping(path: str | os.PathLike[str]) -> dict[str, Any]:
     file = pathlib.Path(path)
     if not file.is_file():
         raise RecordingError("there is no such mapping", file=str(file), remedy="Check the path")
+    size = file.stat().st_size
+    if size > limits.MAPPING:
+        raise RecordingError(
+            f"has {size} bytes, at most {limits.MAPPING} are read",
+            file=str(file),
+            remedy="Name a mapping, not the data",
+        )
     try:
         return tomllib.loads(file.read_text("utf-8"))
-    except ValueError as error:  # of the syntax or of the encoding
+    except (ValueError, RecursionError) as error:  # of the syntax, the encoding or its depth
         raise RecordingError(f"is not TOML ({error})", file=str(file)) from error
 
 

@@ -18,56 +18,10 @@ import numpy.typing as npt
 from jaxtyping import Float
 
 from etid import schema
+from etid.errors import RecordingError as RecordingError
 
 Label = str | int | np.integer
 SIGNALS = ("v_th", "v_out", "current")
-
-
-class RecordingError(ValueError):
-    """Something is wrong with a recording or its file; says where, what, and what to do.
-
-    Attributes:
-        message: What was found and what was expected.
-        file: Path of the file; empty for a recording in memory.
-        path: HDF5 path of the recording inside the file.
-        field: Name of the attribute, dataset or argument.
-        remedy: What to do about it.
-    """
-
-    def __init__(
-        self, message: str, *, file: str = "", path: str = "", field: str = "", remedy: str = ""
-    ) -> None:
-        super().__init__(message)
-        self.message = message
-        self.file = file
-        self.path = path
-        self.field = field
-        self.remedy = remedy
-
-    def __str__(self) -> str:
-        place = ", ".join(
-            part for part in (self.file, repr(self.path) if self.path else "", self.field) if part
-        )
-        text = f"{place}: {self.message}" if place else self.message
-        return f"{text}. {self.remedy}." if self.remedy else f"{text}."
-
-    def __reduce__(self) -> tuple:
-        # exceptions pickle by their positional arguments alone; workers send these across processes
-        return (_rebuild_error, (self.message, self.file, self.path, self.field, self.remedy))
-
-    def located(self, *, file: str = "", path: str = "", field: str = "") -> "RecordingError":
-        """The same error with the parts of its place that it did not know yet."""
-        return RecordingError(
-            self.message,
-            file=self.file or file,
-            path=self.path or path,
-            field=self.field or field,
-            remedy=self.remedy,
-        )
-
-
-def _rebuild_error(message: str, file: str, path: str, field: str, remedy: str) -> RecordingError:
-    return RecordingError(message, file=file, path=path, field=field, remedy=remedy)
 
 
 def _real(field: str, value: object) -> float:
@@ -173,8 +127,9 @@ class Samples:
         if self.conversion == 1 and self.offset == 0 and self.stored.dtype == np.float64:
             return self.stored
         values = self.stored.astype(np.float64)
-        values *= self.conversion
-        values += self.offset
+        with np.errstate(over="ignore", invalid="ignore"):  # infinite samples have a verdict
+            values *= self.conversion
+            values += self.offset
         values.flags.writeable = False
         return values
 

@@ -13,9 +13,9 @@ import numpy as np
 from jaxtyping import Array, Complex, Float, Int
 
 from etid.circuits import DISPLAY, AbstractCircuit, Resistor, SkinRC
-from etid.recording import Label, wanted_labels
+from etid.recording import Label, RecordingError, wanted_labels
 from etid.remarks import remarks_of, texts, words
-from etid.tables import read_table, write_table
+from etid.tables import Table, opened_table, same_length, write_table
 from etid.verdicts import RESULTS, message, verdict_names, verdicts_of
 
 SCHEMA = "etid/fits"
@@ -276,7 +276,7 @@ class Fits:
                 "": np.asarray(getattr(good.circuit, name)),
                 "_stderr": np.asarray(getattr(good.stderr, name)),
                 "_own": np.sqrt(np.maximum(total - common, 0.0)),
-                "_shared": np.sqrt(common),
+                "_shared": np.sqrt(np.where(common >= 0, common, np.nan)),
             }
             for row, start, end in zip(rows, ends[:-1], ends[1:], strict=True):
                 chosen = order[start:end]
@@ -333,37 +333,73 @@ class Fits:
             circuit: The kind of circuit, if it is not one of etid's own.
 
         Raises:
-            ValueError: The file is not a file of fits, or `circuit` is not the one it holds.
+            RecordingError: The file is not a file of fits, or `circuit` is not the one it holds.
         """
-        return cls.of_table(*read_table(path, SCHEMA), path, circuit)
+        with opened_table(path, SCHEMA) as table:
+            return cls.of_table(table, circuit)
 
     @classmethod
-    def of_table(
-        cls,
-        columns: Mapping[str, np.ndarray],
-        attributes: Mapping[str, Any],
-        path: str | os.PathLike[str],
-        circuit: type[AbstractCircuit] | None,
-    ) -> "Fits":
-        """What `read` makes of the columns and attributes of a file."""
+    def of_table(cls, table: Table, circuit: type[AbstractCircuit] | None) -> "Fits":
+        """What `read` makes of an open file.
+
+        Raises:
+            RecordingError: A column or an attribute is missing, or not what it should be.
+        """
         known = {kind.__name__: kind for kind in (SkinRC, Resistor)}
-        kind = circuit or known.get(attributes["circuit"])
-        if kind is None or kind.__name__ != attributes["circuit"]:
-            raise ValueError(
-                f"{path} holds fits of {attributes['circuit']!r}; pass that class as `circuit`"
+        stored = table.text("circuit")
+        kind = circuit or known.get(stored)
+        if kind is None or kind.__name__ != stored:
+            raise RecordingError(
+                f"{table.name} holds fits of {stored!r}; pass that class as `circuit`",
+                file=table.name,
+                field="circuit",
             )
+        size = len(kind.names())
+        columns = {name: table.column(name, "text") for name in (*LABELS, "verdict", "note")}
+        columns |= {name: table.column(name, "number") for name in (*kind.names(), "rrse", "chi2")}
+        columns["steps"] = table.column("steps", "integer")
+        for name in ("cov", "shared_cov"):
+            columns[name] = table.column(name, "number", (size, size))
+        if "remarks" in table:  # not in files of schema version 1.0
+            columns["remarks"] = table.column("remarks", "text")
+        count = same_length(table, columns)
+        read = {name: table.read(column) for name, column in columns.items()}
+        remarks = _remarks(table, read.get("remarks", np.full(count, "")))
+        numbers = (*kind.names(), "rrse", "chi2", "cov", "shared_cov")
+        real = {name: read[name].astype(float) for name in numbers}
         fit = Fit(
-            circuit=kind(**{name: columns[name] for name in kind.names()}),
-            cov=columns["cov"],
-            shared_cov=columns["shared_cov"],
-            rrse=columns["rrse"],
-            chi2=columns["chi2"],
-            result=verdicts_of(columns["verdict"]),
-            steps=columns["steps"],
-            method=attributes["method"],
-            # Files of schema version 1.0 have no remarks.
-            remarks=np.array([remarks_of(str(one)) for one in columns["remarks"]], int)
-            if "remarks" in columns
-            else np.zeros(len(columns["note"]), int),
+            circuit=kind(**{name: real[name] for name in kind.names()}),
+            cov=real["cov"],
+            shared_cov=real["shared_cov"],
+            rrse=real["rrse"],
+            chi2=real["chi2"],
+            result=_verdicts(table, read["verdict"]),
+            steps=read["steps"],
+            method=table.text("method"),
+            remarks=remarks,
         )
-        return cls(fit, {name: columns[name] for name in LABELS}, columns["note"])
+        return cls(fit, {name: read[name] for name in LABELS}, read["note"])
+
+
+def _verdicts(table: Table, names: np.ndarray) -> RESULTS:
+    try:
+        return verdicts_of(names)
+    except KeyError as error:
+        raise RecordingError(
+            f"{error} is no verdict of this version of etid",
+            file=table.name,
+            field="verdict",
+            remedy="Read it with the etid that wrote it",
+        ) from None
+
+
+def _remarks(table: Table, texts: np.ndarray) -> np.ndarray:
+    try:
+        return np.array([remarks_of(str(one)) for one in texts], int)
+    except ValueError as error:
+        raise RecordingError(
+            str(error),
+            file=table.name,
+            field="remarks",
+            remedy="Read it with the etid that wrote it",
+        ) from None

@@ -15,7 +15,7 @@ import h5py
 import numpy as np
 from h5py import h5o  # type: ignore[attr-defined]  # compiled, without stubs
 
-from etid import schema
+from etid import limits, schema
 from etid.recording import (
     SIGNALS,
     AbstractSource,
@@ -27,50 +27,12 @@ from etid.recording import (
     metadata_from,
     tidy_path,
 )
+from etid.untrusted import LIBRARY_ERRORS, Attributes, check_size, local_link, translated
 
+_DIGITS = 1000  # of a number in a name, above which Python refuses to read it
 OPEN = 8  # datasets of stacks that stay open
 
-# What h5py raises, depending on where in a damaged file the HDF5 library gives up.
-LIBRARY_ERRORS = (
-    OSError,
-    RuntimeError,
-    ValueError,
-    TypeError,
-    KeyError,
-    AttributeError,
-    OverflowError,
-    MemoryError,
-)
-
 _NAMES = {field.name for field in schema.FIELDS}
-
-
-@contextlib.contextmanager
-def translated(file: str, path: str = "", field: str = "") -> Iterator[None]:
-    """Errors of the HDF5 library as errors of a recording; ours keep their text."""
-    try:
-        yield
-    except RecordingError as error:
-        raise error.located(file=file, path=path, field=field) from None
-    except LIBRARY_ERRORS as error:
-        raise RecordingError(
-            f"the HDF5 library cannot read it ({type(error).__name__}: {error})",
-            file=file,
-            path=path,
-            field=field,
-            remedy="The file is damaged or was not closed: copy or record it again",
-        ) from error
-
-
-def attribute(attributes: h5py.AttributeManager, name: str) -> Any:
-    """The value of an attribute, whose type is looked at first.
-
-    A sequence of variable length is in no schema; made from a damaged text, it crashes the library.
-    """
-    dtype = attributes.get_id(name).dtype
-    if h5py.check_vlen_dtype(dtype) not in (None, str, bytes):
-        raise TypeError("it is a sequence of variable length")
-    return attributes[name]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -176,7 +138,8 @@ class Scan:
         self.problems: list[RecordingError] = []
         self._kinds: dict[str, str] = {}
         self._seen: dict[int, str] = {}
-        self._walk(file, "")
+        with Attributes(name) as self._stored:
+            self._walk(file, "")
         for path, block in self.blocks.items():
             for calibration in block.metadata.calibration:
                 self._check_calibration(path, calibration)
@@ -223,7 +186,13 @@ class Scan:
                 remedy = "Store each recording once"
                 return self._report(path, "", f"is the same group as {first!r}", remedy)
             self._seen[address] = path
-            near = "kind" in group.attrs or schema.near_miss("kind", group.attrs)
+            if path.count("/") >= limits.DEPTH:
+                raise RecordingError(
+                    f"lies more than {limits.DEPTH} groups deep",
+                    remedy="Use a path such as 's01/dry/03'",
+                )
+            attributes = self._stored.names(group)
+            near = "kind" in attributes or schema.near_miss("kind", attributes)
             names = sorted(group, key=_natural)
             if near or "v_out" in names:
                 return self._inspect(group, path, names)
@@ -235,12 +204,7 @@ class Scan:
 
     def _enter(self, group: h5py.Group, name: str, path: str) -> None:
         """Walk on into a member of an ordinary group."""
-        link = group.get(name, getlink=True)
-        if isinstance(link, h5py.ExternalLink):
-            raise RecordingError(
-                f"is a link to another file, {link.filename!r}",
-                remedy="Copy the data into the file",
-            )
+        link = local_link(group, name)
         if isinstance(link, h5py.SoftLink):
             if group.get(name) is None:
                 raise RecordingError(
@@ -273,8 +237,8 @@ class Scan:
             return self._report(path, "kind", "the root of a file cannot be a recording", remedy)
         with self._reported(path, "path"):
             tidy_path(path)
-        present = list(group.attrs)
-        found = self._attributes(group.attrs, schema.at("group attribute"), path, "")
+        present = self._stored.names(group)
+        found = self._attributes(group, schema.at("group attribute"), path, "")
         kind = found.get("kind", "")
         self._kinds[path] = kind
         for field in schema.at("group attribute").values():
@@ -324,15 +288,15 @@ class Scan:
                 self._report(path, f"{of}{name}", message, "Rename it")
 
     def _attributes(
-        self, attributes: Any, known: dict[str, schema.Field], path: str, of: str
+        self, owner: h5py.HLObject, known: dict[str, schema.Field], path: str, of: str
     ) -> dict[str, Any]:
         """The attributes that are in the schema, parsed; those that cannot be are reported."""
         found: dict[str, Any] = {}
-        for name in attributes:
+        for name in self._stored.names(owner):
             if name not in known:
                 continue
             try:
-                value = attribute(attributes, name)
+                value = self._stored.value(owner, name)
             except LIBRARY_ERRORS as error:
                 self._report(path, f"{of}{name}", f"cannot be read ({error})", "Write it again")
                 continue
@@ -345,10 +309,8 @@ class Scan:
 
     def _header(self, group: h5py.Group, field: schema.Field, path: str) -> _Header:
         """Shape, dtype and scale of a dataset that lies in this file."""
-        link = group.get(field.name, getlink=True)
+        link = local_link(group, field.name)
         remedy = "Copy the samples into the file"
-        if isinstance(link, h5py.ExternalLink):
-            raise RecordingError(f"is a link to another file, {link.filename!r}", remedy=remedy)
         if group.get(field.name) is None:
             target = getattr(link, "path", "")
             raise RecordingError(f"is a dangling link to {target!r}", remedy="Mend the link")
@@ -368,10 +330,17 @@ class Scan:
         if shape is None or len(shape) not in (1, 2) or 0 in shape:
             what = "is empty" if shape is None or 0 in shape else f"has shape {shape}"
             raise RecordingError(what, remedy=f"The schema wants {field.expects}")
+        if shape[-1] > limits.SAMPLES or (shape[0] > limits.TRIALS and len(shape) == 2):
+            raise RecordingError(
+                f"has shape {shape}, at most {limits.TRIALS} trials of {limits.SAMPLES} samples "
+                "are read",
+                remedy="Split it",
+            )
+        check_size(dataset)
         before = len(self.problems)
         known, of = schema.at("dataset attribute"), f"{field.name}."
-        found = self._attributes(dataset.attrs, known, path, of)
-        self._near_misses(list(dataset.attrs), known, path, of)
+        found = self._attributes(dataset, known, path, of)
+        self._near_misses(self._stored.names(dataset), known, path, of)
         if len(self.problems) == before and found.get("unit") != field.unit:
             what = f"is {found['unit']!r}" if "unit" in found else "is missing"
             raise RecordingError(
@@ -431,4 +400,5 @@ class Scan:
 def _natural(name: str) -> list[tuple[int, str]]:
     """Sorting key: digits count as numbers."""
     parts = re.split(r"([0-9]+)", name)
-    return [(int(part), "") if part.isdecimal() else (-1, part) for part in parts]
+    numbers = (part.isdecimal() and len(part) < _DIGITS for part in parts)
+    return [(int(p), "") if whole else (-1, p) for p, whole in zip(parts, numbers, strict=True)]

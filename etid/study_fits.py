@@ -6,22 +6,28 @@ settings as attributes of the file, and a dataset `drivers` with one line of JSO
 
 import dataclasses
 import json
+import math
 import os
+import reprlib
+import typing
 from collections.abc import Iterable, Mapping
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array
 
 from etid.circuits import AbstractCircuit
 from etid.driver import Calibration, Driver, SourceImpedance
+from etid.recording import RecordingError
 from etid.remarks import remarks_of, words
 from etid.results import SCHEMA, Fits
 from etid.settings import Settings
-from etid.tables import read_table, write_table
+from etid.tables import Table, opened_table, write_table
 from etid.verdicts import verdicts_of
 
-_SETTINGS = {field.name for field in dataclasses.fields(Settings)}
+_SETTINGS = {field.name: field.type for field in dataclasses.fields(Settings)}
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -81,30 +87,67 @@ class StudyFits:
             circuit: The kind of circuit, if it is not one of etid's own.
 
         Raises:
-            ValueError: The file is not a file of fits, or `circuit` is not the one it holds.
+            RecordingError: The file is not a file of fits, or `circuit` is not the one it holds.
         """
-        columns, attributes = read_table(path, SCHEMA)
-        fits = Fits.of_table(columns, attributes, path, circuit)
+        with opened_table(path, SCHEMA) as table:
+            fits = Fits.of_table(table, circuit)
+            lines = table.read(table.column("drivers", "text")) if "drivers" in table else ()
+            settings = _settings(table)
         drivers: dict[tuple[str, ...], Driver] = {}
         failures: dict[tuple[str, ...], str] = {}
-        for line in columns.get("drivers", ()):
-            stored = json.loads(line)
-            paths = tuple(stored["calibrations"])
-            if "failure" in stored:
-                failures[paths] = stored["failure"]
+        for number, line in enumerate(lines):
+            try:
+                paths, found = _of_line(line)
+            except (ValueError, TypeError, KeyError, OverflowError, RecursionError) as error:
+                raise RecordingError(
+                    f"holds a driver that cannot be read ({type(error).__name__}: {error})",
+                    file=os.fspath(path),
+                    field=f"drivers[{number}]",
+                    remedy="Fit the recordings again",
+                ) from error
+            if isinstance(found, Driver):
+                drivers[paths] = found
             else:
-                drivers[paths] = _from_json(stored)
-        return cls(fits, drivers, failures, _settings(attributes))
+                failures[paths] = found
+        return cls(fits, drivers, failures, settings)
 
 
-def _settings(attributes: Mapping[str, Any]) -> Settings | None:
-    if not attributes.keys() >= _SETTINGS:
+def _settings(table: Table) -> Settings | None:
+    if not table.attributes >= _SETTINGS.keys():
         return None
     values: dict[str, Any] = {}
-    for name in _SETTINGS:
-        value = np.asarray(attributes[name]).tolist()
-        values[name] = tuple(value) if isinstance(value, list) else value
+    for name, kind in _SETTINGS.items():
+        value = table.attribute(name)
+        several = typing.get_args(kind)  # of a tuple; a single one is stored as such, or as a list
+        items = value if several and isinstance(value, list) else [value]
+        wanted: Any = several[0] if several else kind
+        known = (int, float) if wanted is float else wanted
+        if not all(isinstance(item, known) and not isinstance(item, bool) for item in items):
+            raise RecordingError(
+                f"is {value!r}, must be {kind}",
+                file=table.name,
+                field=name,
+                remedy="Fit the recordings again",
+            )
+        values[name] = tuple(items) if several else value
     return Settings(**values)
+
+
+def _of_line(line: str) -> tuple[tuple[str, ...], Driver | str]:
+    """Paths of the calibrations, and the driver or why there is none.
+
+    Raises:
+        ValueError, TypeError, KeyError, OverflowError, RecursionError: It is no such line.
+    """
+    stored = json.loads(line)
+    paths = stored["calibrations"]
+    if not isinstance(paths, list) or not all(isinstance(path, str) for path in paths):
+        raise TypeError(f"calibrations is {paths!r}, must be paths")
+    if "failure" not in stored:
+        return tuple(paths), _from_json(stored)
+    if not isinstance(stored["failure"], str):
+        raise TypeError(f"failure is {stored['failure']!r}, must be text")
+    return tuple(paths), stored["failure"]
 
 
 def _lists(module: Any) -> dict[str, Any]:
@@ -138,27 +181,60 @@ def _to_json(paths: tuple[str, ...], driver: Driver) -> str:
 
 
 def _from_json(stored: Mapping[str, Any]) -> Driver:
-    def array(value: Any) -> Any:
-        return None if value is None else jnp.asarray(value, dtype=float)
+    """A driver from what `_to_json` has made of it.
 
+    Raises:
+        ValueError, TypeError, KeyError, OverflowError: It is something else.
+    """
+    if not all(isinstance(stored[name], str) for name in ("method", "verdict")):
+        raise TypeError("method and verdict must be texts")
     source = known = None
     if stored["source"] is not None:
-        source = SourceImpedance(**{name: array(v) for name, v in stored["source"].items()})
+        own = stored["source"]
+        pairs = len(_numbers(own, "log_omega", 1))
+        reals = len(_numbers(own, "log_omega_real", 1))
+        shapes = {
+            "log_resistance": (),
+            **dict.fromkeys(("log_omega", "log_zeta", "gain", "slope"), (pairs,)),
+            **dict.fromkeys(("log_omega_real", "gain_real"), (reals,)),
+        }
+        fields = {name: _numbers(own, name, len(shape), shape) for name, shape in shapes.items()}
+        source = SourceImpedance(**fields)
+    cov = None if stored["cov"] is None else _numbers(stored, "cov", 2)
+    size = None if source is None else sum(leaf.size for leaf in jax.tree.leaves(source))
+    if cov is not None and cov.shape != (size, size):
+        raise ValueError(f"cov has shape {cov.shape}, the driver has {size} parameters")
     if stored["r_load"] is not None:
-        r_load, delay_std = array(stored["r_load"]), array(stored["delay_std"])
-        known = Calibration(r_load, delay_std, array(stored["delay"]), spectra=None)
+        r_load = _numbers(stored, "r_load", 1)
+        delay = _numbers(stored, "delay", 1, r_load.shape)
+        known = Calibration(r_load, _numbers(stored, "delay_std", 0), delay, spectra=None)
+    rate = float(_numbers(stored, "sample_rate", 0))
+    if not 0 < rate < math.inf:
+        raise ValueError(f"sample_rate is {rate}")
     return Driver(
-        b=array(stored["b"]),
-        a=array(stored["a"]),
-        sample_rate=stored["sample_rate"],
+        b=_numbers(stored, "b", 1),
+        a=_numbers(stored, "a", 1),
+        sample_rate=rate,
         source=source,
-        cov=array(stored["cov"]),
+        cov=cov,
         calibration=known,
-        rrse=array(stored["rrse"]),
-        chi2=array(stored["chi2"]),
+        rrse=_numbers(stored, "rrse", 0),
+        chi2=_numbers(stored, "chi2", 0),
         result=verdicts_of(np.asarray(stored["verdict"])),
-        steps=jnp.asarray(stored["steps"]),
+        steps=_numbers(stored, "steps", 0).astype(int),
         method=stored["method"],
         remarks=np.asarray(remarks_of(stored.get("remarks", ""))),
         drift=array(stored.get("drift")),
     )
+
+
+def _numbers(
+    stored: Mapping[str, Any], name: str, dimensions: int, shape: tuple[int, ...] | None = None
+) -> Array:
+    """Numbers of a shape, or of a number of dimensions."""
+    found = np.asarray(stored[name])
+    if found.dtype.kind not in "iuf" or found.ndim != dimensions:
+        raise TypeError(f"{name} is {reprlib.repr(stored[name])}")
+    if shape is not None and found.shape != shape:
+        raise ValueError(f"{name} has shape {found.shape}, must be {shape}")
+    return jnp.asarray(found, dtype=float)

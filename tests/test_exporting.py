@@ -290,9 +290,9 @@ def test_a_missing_package_is_named_with_its_extra(
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (("absent.h5", "-o", "t.csv"), "absent.h5: cannot be read as HDF5"),
-        (("garbage.h5", "-o", "t.csv"), "garbage.h5: cannot be read as HDF5"),
-        (("study.h5", "-o", "t.csv"), "attribute schema is 'etid/recording', not 'etid/fits'"),
+        (("absent.h5", "-o", "t.csv"), "absent.h5: there is no such file"),
+        (("garbage.h5", "-o", "t.csv"), "garbage.h5: is not an HDF5 file"),
+        (("study.h5", "-o", "t.csv"), "schema: is 'etid/recording', not 'etid/fits'"),
         (("fits.h5", "-o", "t.xlsx"), "t.xlsx: fits are exported as .csv or .parquet, not '.xlsx'"),
         (("fits.h5", "-o", "absent/t.csv"), "absent/t"),
         (
@@ -306,7 +306,7 @@ def test_a_missing_package_is_named_with_its_extra(
         ),
         (("fits.h5", "-o", "t.csv", "--path", "path 1"), "t.csv: --path is for .cir and .json"),
         (("fits.h5", "-o", "t.cir"), "say which recording"),
-        (("short.h5", "-o", "t.csv"), "the column chi2 is missing"),
+        (("short.h5", "-o", "t.csv"), "chi2: the column is missing"),
         (("absent.h5", "-o", "t.nwb", "--session-start", "2026-01-31T09:30Z"), "no such file"),
     ],
 )

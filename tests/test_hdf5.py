@@ -405,7 +405,7 @@ def test_a_soft_link_through_an_external_one_is_refused(edit, path, tmp_path):
         file["s01/damp/out"] = h5py.ExternalLink(str(other), "/")
         put("v_out", h5py.SoftLink("/s01/damp/out/v"))(file)
 
-    assert "v_out: its samples lie in another file" in str(hdf5.check(edit(detour))[0])
+    assert "v_out: is a soft link to another file" in str(hdf5.check(edit(detour))[0])
 
 
 def test_what_the_schema_does_not_know_is_ignored(edit):

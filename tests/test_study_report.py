@@ -395,7 +395,7 @@ def test_the_command_writes_beside_the_fits_and_replaces_no_file_that_it_reads(
         assert "would replace a file that is read" in capsys.readouterr().err
     assert file.read_bytes() == before
     assert cli.main(["report", str(study_file)]) == 1
-    assert "attribute schema is 'etid/recording'" in capsys.readouterr().err
+    assert "schema: is 'etid/recording'" in capsys.readouterr().err
 
 
 def test_a_browser_shows_the_whole_page_without_complaint(page):

@@ -10,9 +10,12 @@ from typing import Any
 
 import h5py
 import numpy as np
+from h5py import h5o  # type: ignore[attr-defined]  # compiled, without stubs
 
+from etid import limits
 from etid.channels import Channel, Contents, needs, real
 from etid.recording import RecordingError
+from etid.untrusted import attribute, check_size, guarded, local_link
 
 _CACHE = 1 << 25  # bytes: MATLAB's chunks hold several trials, which are read one after the other
 
@@ -22,7 +25,7 @@ def opened(path: pathlib.Path, folder: pathlib.Path) -> Iterator[Contents]:
     """A MATLAB file of any version."""
     del folder
     if h5py.is_hdf5(path):
-        with h5py.File(path, "r", rdcc_nbytes=_CACHE) as file:
+        with guarded(str(path), rdcc_nbytes=_CACHE) as file:
             yield _hdf5(file)
     else:
         yield _whole(path)
@@ -31,11 +34,21 @@ def opened(path: pathlib.Path, folder: pathlib.Path) -> Iterator[Contents]:
 def _hdf5(file: h5py.File) -> Contents:
     """Version 7.3: HDF5 with reversed axes; what begins with `#` is MATLAB's own."""
     found: dict[str, h5py.Dataset] = {}
+    seen: set[int] = set()  # of links that lead back
 
     def walk(group: h5py.Group, prefix: str) -> None:
-        for name, member in group.items():
+        address = h5o.get_info(group.id).addr
+        if address in seen:
+            return
+        seen.add(address)
+        if prefix.count(".") > limits.DEPTH:
+            raise RecordingError(f"has structures more than {limits.DEPTH} deep")
+        names: Any = list(group)
+        for name in names:
             if name.startswith("#"):
                 continue
+            local_link(group, name)
+            member = group.get(name)
             if isinstance(member, h5py.Group):
                 walk(member, f"{prefix}{name}.")
             elif isinstance(member, h5py.Dataset):
@@ -45,13 +58,14 @@ def _hdf5(file: h5py.File) -> Contents:
 
     def channel(name: str) -> Channel:
         data = found[name]
-        kind = data.attrs.get("MATLAB_class", b"")
+        kind = attribute(data, "MATLAB_class") if "MATLAB_class" in data.attrs else b""
         kind = kind.decode() if isinstance(kind, bytes) else str(kind)
         if kind in ("char", "logical", "cell"):
             raise RecordingError(f"{name!r} is a {kind} array, must be an array of real numbers")
         if "MATLAB_empty" in data.attrs or data.shape is None:
             raise RecordingError(f"{name!r} is empty")
         real(name, data.dtype, data.shape)
+        check_size(data)
         axes = [axis for axis, size in enumerate(data.shape) if size > 1] or [0]
         shape = tuple(data.shape[axis] for axis in reversed(axes))
 

@@ -1,5 +1,6 @@
 """Archives of NumPy with converter codes, which say everything themselves."""
 
+import math
 import pathlib
 import zipfile
 from typing import Any
@@ -7,6 +8,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from etid import limits
 from etid.channels import chosen
 from etid.recording import Recording, RecordingError, Samples
 
@@ -24,6 +26,7 @@ def recordings(path: pathlib.Path, subject: str, condition: str) -> list[Recordi
         keys = ("adc_th", "adc_out", "adc_ref", "R_ref", "fs", "f0", "lsb", "scale")
         for key in keys:
             chosen(archive.files, key, key)
+            _check_size(archive, key)
         held = {key: archive[key] for key in keys}
     th, out, ref, known = (held[key] for key in ("adc_th", "adc_out", "adc_ref", "R_ref"))
     if th.ndim != 2 or th.shape != out.shape or ref.ndim != 2 or known.shape != ref.shape[:1]:
@@ -75,6 +78,27 @@ def recordings(path: pathlib.Path, subject: str, condition: str) -> list[Recordi
         for trial in range(len(out))
     ]
     return calibrations + loaded
+
+
+def _check_size(archive: Any, key: str) -> None:
+    """Refuse an array that declares more than the archive holds, before it is made."""
+    info = archive.zip.getinfo(f"{key}.npy")
+    with archive.zip.open(info) as member:
+        version = np.lib.format.read_magic(member)
+        head = np.lib.format.read_array_header_1_0 if version == (1, 0) else (
+            np.lib.format.read_array_header_2_0
+        )  # fmt: skip
+        shape, _, dtype = head(member)
+        declared = math.prod(shape) * dtype.itemsize + member.tell()
+    if dtype.hasobject:
+        return  # which NumPy refuses
+    unpacked = max(limits.FREE, limits.COMPRESSION * info.compress_size)
+    if declared != info.file_size or declared > unpacked or min(shape, default=1) < 0:
+        raise RecordingError(
+            f"declares {dtype} of shape {shape}, but takes {info.file_size} bytes",
+            field=key,
+            remedy="The file is damaged: copy or write it again",
+        )
 
 
 def _number(array: npt.NDArray, field: str) -> float:
