@@ -4,6 +4,7 @@ import contextlib
 import csv
 import dataclasses
 import struct
+import tokenize
 import zipfile
 import zlib
 from collections.abc import Callable, Iterable, Iterator
@@ -22,9 +23,11 @@ _READ_ERRORS = (
     ArithmeticError,
     AssertionError,
     EOFError,
+    SyntaxError,
     LookupError,
     csv.Error,
     struct.error,
+    tokenize.TokenError,
     zipfile.BadZipFile,
     zlib.error,
 )

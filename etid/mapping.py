@@ -8,6 +8,7 @@ import dataclasses
 import math
 import os
 import pathlib
+import re
 import tomllib
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -84,7 +85,11 @@ def read_mapping(path: str | os.PathLike[str]) -> dict[str, Any]:
             remedy="Name a mapping, not the data",
         )
     try:
-        return tomllib.loads(file.read_text("utf-8"))
+        text = file.read_text("utf-8")
+        if any(part.count(".") > limits.DEPTH for part in re.split(r"[=,\[\]{}\n]", text)):
+            # the time that tomllib takes for one key goes with the square of its length
+            raise ValueError(f"a key has more than {limits.DEPTH} parts")
+        return tomllib.loads(text)
     except (ValueError, RecursionError) as error:  # of the syntax, the encoding or its depth
         raise RecordingError(f"is not TOML ({error})", file=str(file)) from error
 

@@ -230,7 +230,7 @@ def check_size(dataset: h5py.Dataset) -> None:
     if declared <= limits.FREE and trials <= limits.FREE_TRIALS:
         return
     stored = dataset.id.get_storage_size()
-    held = min(stored, os.stat(dataset.file.filename).st_size)
+    held = min(stored, dataset.file.id.get_filesize())
     if declared > limits.COMPRESSION * held or stored > held:
         raise RecordingError(
             f"declares {declared} bytes, {held} of them stored",

@@ -61,6 +61,7 @@ FLOORS = {
     "formats": 4,
     "formats.abf": 4,
     "formats.delimited": 4,
+    "formats.mat5": 3,
     "formats.matlab": 4,
     "formats.npz": 4,
     "formats.tdms": 4,

@@ -14,6 +14,7 @@ from h5py import h5o  # type: ignore[attr-defined]  # compiled, without stubs
 
 from etid import limits
 from etid.channels import Channel, Contents, needs, real
+from etid.formats import mat5
 from etid.recording import RecordingError
 from etid.untrusted import attribute, check_size, guarded, local_link
 
@@ -89,6 +90,7 @@ def _whole(path: pathlib.Path) -> Contents:
         raise needs("pymatreader", "matlab", str(path)) from None
     from scipy.io.matlab import MatReadError
 
+    mat5.check(path)
     try:
         content = _flat(pymatreader.read_mat(path))
     except MatReadError as error:

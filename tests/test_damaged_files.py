@@ -1,0 +1,233 @@
+"""Damaged files end in an answer or in one error of etid's own: no crash, no hang, no memory."""
+
+import re
+
+import h5py
+import numpy as np
+import pytest
+
+import etid
+from benchmarks import fuzz, specimens
+from etid import hdf5, limits, untrusted
+from etid.formats import mat5
+from etid.study_fits import StudyFits
+
+FEW = 4  # files of each kind in the ordinary tests
+MANY = 1000  # files in the slow one
+
+
+@pytest.fixture(scope="module")
+def kinds():
+    return specimens.kinds()
+
+
+@pytest.mark.parametrize("name", fuzz.SHARES)
+def test_a_damaged_file_is_read_or_refused(kinds, name, tmp_path):
+    for seed in range(1, FEW + 1):
+        path = fuzz.damage(tmp_path, kinds[name], seed)
+        assert fuzz.judge(path, kinds[name], seed)[0] in fuzz.FINE, seed
+
+
+@pytest.mark.slow
+def test_a_thousand_damaged_files_neither_crash_nor_hang():
+    cases = [(fuzz.kind_of(seed), seed) for seed in range(MANY)]
+    wrong = [found for found in fuzz.run(cases, 5.0) if found["outcome"] not in fuzz.FINE]
+    assert wrong == []
+
+
+def test_the_benchmark_would_tell_a_foreign_error_from_ours(kinds, tmp_path):
+    def foreign(path, seed):
+        raise KeyError(path)
+
+    def unnamed(path, seed):
+        raise etid.RecordingError("is wrong")
+
+    for use, outcome in (foreign, "KeyError"), (unnamed, "unnamed"):
+        kind = specimens.Kind(".h5", (b"",), kinds["fits"].damage, use)
+        assert fuzz.judge(tmp_path / "a.h5", kind, 0)[0] == outcome
+
+
+# Recordings
+
+
+@pytest.fixture
+def texts(kinds, tmp_path):
+    """A study with texts of variable length, as h5py writes them by itself."""
+    path = tmp_path / "study.h5"
+    path.write_bytes(kinds["recordings"].good[1])
+    return path
+
+
+def test_texts_of_variable_length_are_read_behind_a_guard(texts):
+    assert hdf5.check(texts) == []
+    with etid.read(texts) as study:
+        assert study.metadata("s01/dry/0").calibration == ("calibration/0",)
+
+
+def test_a_heap_whose_objects_go_in_a_circle_is_an_error_and_no_hang(texts):
+    data = bytearray(texts.read_bytes())
+    heap = data.find(b"GCOL\x01")
+    data[heap + 16 : heap + 32] = bytes(16)  # a free object of size 0: the library never ends
+    texts.write_bytes(data)
+    problems = hdf5.check(texts)
+    assert {problem.path for problem in problems} >= {"s02/dry", "calibration/0"}
+    assert "the heap of texts" in problems[0].message
+    with pytest.raises(etid.RecordingError, match="the heap of texts"):
+        with untrusted.guarded(str(texts)) as file:
+            untrusted.attribute(file["s02/dry"], "kind")
+
+
+def declared(texts, shape, chunks):
+    with h5py.File(texts, "r+") as file:
+        attributes = dict(file["s02/dry/v_out"].attrs)
+        del file["s02/dry/v_out"]
+        data = file.create_dataset("s02/dry/v_out", shape, "i2", chunks=chunks)
+        data.attrs.update(attributes)
+
+
+@pytest.mark.parametrize(
+    ("shape", "chunks", "message"),
+    [
+        ((limits.SAMPLES + 1,), (64,), "samples are read"),
+        ((limits.TRIALS + 1, 64), (64, 64), "trials of"),
+        ((limits.FREE,), (64,), "0 of them stored"),
+        ((limits.FREE_TRIALS + 1, 4), (64, 4), "0 of them stored"),
+        ((limits.CHUNK,), (limits.CHUNK,), "samples are read|chunks of"),
+    ],
+)
+def test_what_is_declared_beyond_a_limit_is_refused_before_it_is_read(
+    texts, shape, chunks, message
+):
+    declared(texts, shape, chunks)
+    (problem,) = hdf5.check(texts)
+    assert (problem.path, problem.field) == ("s02/dry", "v_out")
+    assert problem.remedy
+    assert re.search(message, problem.message)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda f: f.create_group("/".join("g" * (limits.DEPTH + 2))), "groups deep"),
+        (lambda f: [f["s01"].attrs.update({f"x{i}": i}) for i in range(limits.ATTRIBUTES + 1)],
+         "attributes, at most"),
+        (lambda f: f.__setitem__("s01/x", h5py.SoftLink("/s01/x")), "in a circle"),
+    ],
+)  # fmt: skip
+def test_depth_counts_and_links_have_limits(texts, change, message):
+    with h5py.File(texts, "r+", libver="latest") as file:
+        change(file)
+    assert any(message in problem.message for problem in hdf5.check(texts))
+
+
+# Files of fits
+
+
+@pytest.fixture
+def fits(tmp_path):
+    path = tmp_path / "fits.h5"
+    specimens.study_fits().write(path)
+    return path
+
+
+def test_a_good_file_of_fits_is_what_was_written(fits):
+    read, written = StudyFits.read(fits), specimens.study_fits()
+    np.testing.assert_array_equal(read.fits.cov, written.fits.cov)
+    assert read.settings == written.settings
+    assert read.failures == written.failures
+    (driver,) = read.drivers.values()
+    assert driver.order == 3
+
+
+def replaced(fits, name, values):
+    with h5py.File(fits, "r+") as file:
+        del file[name]
+        if values is not None:
+            file[name] = values
+
+
+@pytest.mark.parametrize(
+    ("name", "values", "message"),
+    [
+        ("chi2", None, "chi2: the column is missing"),
+        ("chi2", np.zeros(5), "chi2: has 5 rows, path has 6"),
+        ("chi2", np.zeros((6, 2)), r"chi2: has shape \(6, 2\), must be \(fit\)"),
+        ("chi2", ["x"] * 6, "chi2: is text, must be number"),
+        ("steps", np.zeros(6), "steps: is of type float64, must be integer"),
+        ("path", np.zeros(6), "path: is of type float64, must be text"),
+        ("cov", np.zeros((6, 2, 2)), "cov: has shape"),
+        ("verdict", ["fine"] * 6, "verdict: 'fine' is no verdict"),
+        ("drivers", ["{"], r"drivers\[0\]: holds a driver that cannot be read"),
+        ("drivers", ["[" * 10**5], r"drivers\[0\]: holds a driver .*RecursionError"),
+        ("drivers", ['{"calibrations": 1}'], "calibrations is 1, must be paths"),
+    ],
+)
+def test_a_wrong_column_is_one_error_that_names_file_column_and_remedy(fits, name, values, message):
+    replaced(fits, name, values)
+    with pytest.raises(etid.RecordingError, match=message) as caught:
+        StudyFits.read(fits)
+    assert caught.value.file == str(fits)
+    assert caught.value.remedy
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "message"),
+    [
+        ("circuit", 3, "circuit: is 3, must be text"),
+        ("method", None, "method: is missing"),
+        ("order", "five", "order: is 'five', must be"),
+        ("start", "x", "start: is 'x', must be"),
+    ],
+)
+def test_a_wrong_attribute_is_one_error_that_names_it(fits, name, value, message):
+    with h5py.File(fits, "r+") as file:
+        del file.attrs[name]
+        if value is not None:
+            file.attrs[name] = value
+    with pytest.raises(etid.RecordingError, match=message):
+        StudyFits.read(fits)
+
+
+# Files of other formats
+
+
+def test_matlab_that_declares_a_huge_shape_is_refused_at_once(kinds, tmp_path):
+    path = tmp_path / "rig.mat"
+    path.write_bytes(kinds["matlab"].good[0])
+    with h5py.File(path, "r+") as file:
+        del file["skin"]
+        data = file.create_dataset("skin", (2**40, 1), "f8", chunks=(64, 1))
+        data.attrs["MATLAB_class"] = np.bytes_("double")
+    with pytest.raises(etid.RecordingError, match="0 of them stored"):
+        kinds["matlab"].use(path, 0)
+
+
+def test_matlab_5_of_an_unknown_type_is_refused_before_scipy_ends_the_process(kinds, tmp_path):
+    path = tmp_path / "rig.mat"
+    data = bytearray(kinds["matlab5"].good[0])
+    assert data[176] == 9  # a double
+    data[176] = 8
+    path.write_bytes(data)
+    with pytest.raises(etid.RecordingError, match="of type 8, which does not exist"):
+        mat5.check(path)
+
+
+def test_an_archive_that_declares_more_than_it_holds_is_refused(kinds, tmp_path):
+    path = tmp_path / "codes.npz"
+    codes = np.broadcast_to(np.int16(1), (1, 1 + limits.FREE // 2))
+    np.savez_compressed(path, adc_th=codes, adc_out=codes[:, :1], adc_ref=codes[:, :1],
+                        R_ref=1.0, fs=2e5, f0=60.0, lsb=1.0, scale=1.0)  # fmt: skip
+    with pytest.raises(etid.RecordingError, match="adc_th: declares int16 of shape"):
+        etid.import_file(path, tmp_path / "out.h5")
+
+
+@pytest.mark.parametrize(
+    "text", ["v_th = " + "[" * 10**4, ".".join("a" * 30_000) + " = 1", "a = " + "{a=" * 10**4]
+)
+def test_a_deep_mapping_is_refused_at_once(tmp_path, text):
+    path = tmp_path / "deep.toml"
+    path.write_text(text)
+    (tmp_path / "rig.csv").write_text("open,skin\n1,2\n")
+    with pytest.raises(etid.RecordingError, match="is not TOML") as caught:
+        etid.import_file(tmp_path / "rig.csv", tmp_path / "out.h5", path)
+    assert caught.value.file == str(path)
