@@ -224,7 +224,7 @@ def _from_json(stored: Mapping[str, Any]) -> Driver:
         steps=_numbers(stored, "steps", 0).astype(int),
         method=stored["method"],
         remarks=np.asarray(remarks_of(stored.get("remarks", ""))),
-        drift=array(stored.get("drift")),
+        drift=None if stored.get("drift") is None else _numbers(stored, "drift", 0),
     )
 
 
