@@ -193,7 +193,7 @@ INVISIBLE: Mapping[str, str] = {
         "is wrong by the same 5 %"
     ),
     "leak_100Rp": (
-        "up to 1.2 %: R_s + R_p ‖ C_p with a resistor across it has the impedance of another "
+        "up to 1.7 %: R_s + R_p ‖ C_p with a resistor across it has the impedance of another "
         "R_s + R_p ‖ C_p at every frequency"
     ),
 }
