@@ -6,6 +6,7 @@ of the model that they stop short of: they are `biased` if it is far.
 
 from collections.abc import Callable
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
@@ -16,9 +17,17 @@ from etid.circuits import SkinRC
 from etid.driver import Driver
 from etid.given_driver import RIDGE
 from etid.information import inverse
-from etid.judging import MAX_STEPS_REACHED, SUCCESSFUL, misses
+from etid.judging import MAX_STEPS_REACHED, SUCCESSFUL, misses, remarks
 from etid.levenberg_marquardt import NormalEquations, normal_equations
-from etid.likelihood import apart, delayed_gain, denoised, excess, residual, variance
+from etid.likelihood import (
+    apart,
+    delayed_gain,
+    denoised,
+    excess,
+    residual,
+    stands_out,
+    variance,
+)
 from etid.measurement import Measurement
 from etid.results import Fit
 from etid.spectra import Spectrum
@@ -111,6 +120,8 @@ def skin_by_harmonic_steiglitz_mcbride(
     freedom = 2 * jnp.sum(spectrum.selected, dtype=values.dtype) - values.size
     chi2 = 2 * equations.objective / freedom
     noise = excess(terms(at, spectrum), spectrum.selected)[: spectrum.x.size]
+    everywhere = eqx.tree_at(lambda s: s.selected, spectrum, jnp.ones_like(spectrum.selected))
+    square = jnp.sum(terms(at, everywhere).reshape(2, -1) ** 2, 0) / 2
     own, shared = harmonic_steiglitz_mcbride.covariance(spectrum, noise, source, source_cov, best)
     errors = jnp.diagonal(own + shared)  # of the logarithms, squared
     fitted = best.circuit.with_log_values(at[:-1])
@@ -133,6 +144,7 @@ def skin_by_harmonic_steiglitz_mcbride(
         ),
         steps=best.iteration,
         method="harmonic_steiglitz_mcbride",
+        remarks=remarks(stands_out(square, spectrum)),
     )
 
 

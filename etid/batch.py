@@ -26,7 +26,17 @@ from etid.circuits import AbstractCircuit
 from etid.driver import Driver
 from etid.given_driver import GivenDriver
 from etid.identify import failed_fit, identify_driver
-from etid.lanes import is_shared, known_driver, lane, skin_lane, stacked
+from etid.lanes import (
+    is_shared,
+    known_driver,
+    lane,
+    needs_another,
+    of_both,
+    remarked,
+    skin_lane,
+    stacked,
+    without_mains,
+)
 from etid.methods import Method, check_default, check_method, plan
 from etid.prefetch import prefetch
 from etid.preflight import Inspected
@@ -160,13 +170,24 @@ class _Queue:
 
     def run(self) -> Iterable[tuple[int, Fit]]:
         """Fit what is waiting."""
-        lanes, count = filled(self.lanes), jnp.asarray(len(self.lanes))
-        of = self.driver, self.known, self.circuit, self.method
-        fits = jax.device_get(_chunk(lanes, count, *of))
-        # What fills it up is left out.
-        for row, remarks, fit in zip(self.rows, self.remarks, unstacked(fits), strict=False):
-            yield row, dataclasses.replace(fit, remarks=remarks)
+        fits = self._fits(self.lanes)
+        again = {
+            number: few
+            for number, fit in enumerate(fits)
+            if needs_another(fit)
+            and (few := without_mains(self.lanes[number], self.method)) is not None
+        }
+        if again:
+            for number, second in zip(again, self._fits(list(again.values())), strict=True):
+                fits[number] = of_both(fits[number], second)
+        for row, remarks, fit in zip(self.rows, self.remarks, fits, strict=True):
+            yield row, remarked(fit, int(remarks) | int(fit.remarks))
         self.rows, self.lanes, self.remarks = [], [], []
+
+    def _fits(self, lanes: Sequence[tuple[np.ndarray, ...]]) -> list[Fit]:
+        of = self.driver, self.known, self.circuit, self.method
+        fits = jax.device_get(_chunk(filled(lanes), jnp.asarray(len(lanes)), *of))
+        return list(unstacked(fits))[: len(lanes)]  # what fills it up is left out
 
 
 def unstacked(fits: Fit) -> Iterator[Fit]:

@@ -24,7 +24,7 @@ from etid.baseline import driver_by_steiglitz_mcbride, skin_by_steiglitz_mcbride
 from etid.circuits import AbstractCircuit, SkinRC
 from etid.driver import Driver, SourceImpedance
 from etid.given_driver import GivenDriver
-from etid.judging import MAX_STEPS_REACHED, SUCCESSFUL, judged, misses, too_late, unless
+from etid.judging import MAX_STEPS_REACHED, SUCCESSFUL, judged, misses, remarks, too_late, unless
 from etid.measurement import Measurement
 from etid.results import Fit
 from etid.spectra import Spectrum
@@ -302,5 +302,6 @@ def driver_by_refinement(
             (lacks, RESULTS.order_too_low),
         ),
         steps=estimate.steps,
+        remarks=remarks(estimate.hum),
         method="output_error" if spectra is None else "maximum_likelihood",
     )

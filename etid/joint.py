@@ -14,7 +14,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Int
+from jaxtyping import Array, Bool, Int
 from tqdm import tqdm
 
 from etid import estimation, judging, shared_driver
@@ -33,11 +33,12 @@ from etid.batch import (
 from etid.circuits import AbstractCircuit
 from etid.driver import Driver
 from etid.identify import failed_fit
-from etid.lanes import checksum, is_shared, lane
+from etid.lanes import checksum, is_shared, lane, remarked, without_mains
 from etid.maximum_likelihood import Joint, fit_load
 from etid.methods import HARMONIC
 from etid.precision import require_float64
 from etid.preflight import Inspected
+from etid.remarks import Remark
 from etid.results import Fit
 from etid.settings import Settings
 from etid.shared_terms import Loads
@@ -55,18 +56,21 @@ SINGLE = (
 
 
 @stored_jit
-def _alone(lanes: Any, count: Int[Array, ""], model: Joint) -> Loads:
-    """Loads identified one by one with Z_th as it is, where a joint fit may start."""
+def _alone(lanes: Any, count: Int[Array, ""], model: Joint) -> tuple[Loads, Bool[Array, " load"]]:
+    """Loads identified one by one with Z_th as it is, where a joint fit may start.
+
+    And whether each shows mains hum.
+    """
 
     def one(lane):
         *fields, sample_rate = lane
         spectrum = Spectrum(*fields)
         z_th = model.calibrations.source.response(spectrum.frequency)
         starts = estimation.harmonic_starts(spectrum, sample_rate, z_th, model.circuit)
-        own, result, chi2, error = fit_load(model, spectrum, sample_rate, starts)
+        own, result, chi2, error, hum = fit_load(model, spectrum, sample_rate, starts)
         settled = RESULTS.promote(result) == RESULTS.successful
         good = settled & jnp.isfinite(chi2) & ~judging.misses(chi2, error)
-        return Loads(spectrum, sample_rate, own, good, jnp.array(-1))
+        return Loads(spectrum, sample_rate, own, good, jnp.array(-1)), hum
 
     return each(one, lanes, count)
 
@@ -116,22 +120,41 @@ class _Waiting:
         self.rows: list[int] = []
         self.lanes: list[tuple[np.ndarray, ...]] = []
         self.chunks: list[Loads] = []
+        self.remarks: list[int] = []
         self.unloaded: list[int] = []
 
     def add(self, row: int, seen: Inspected) -> None:
         self.rows.append(row)
         self.unloaded.append(checksum(seen))
         self.lanes.append(lane(seen, "maximum_likelihood"))
+        self.remarks.append(int(seen.remarks))
         if len(self.lanes) == LANES:
             self.run()
 
     def run(self) -> None:
-        count = len(self.lanes)
-        if count == 0:
+        if not self.lanes:
             return
-        loads = jax.device_get(_alone(filled(self.lanes), jnp.asarray(count), self.model))
-        self.chunks.append(jax.tree.map(lambda leaf: leaf[:count], loads))
+        first = len(self.rows) - len(self.lanes)
+        loads, hum = self._alone(self.lanes)
+        again = {}
+        for number, one in enumerate(self.lanes):
+            few = without_mains(one, "maximum_likelihood")
+            if few is not None and (hum[number] or not loads.used[number]):
+                again[number] = few
+        if again:
+            others, seen = self._alone(list(again.values()))
+            for row, number in enumerate(again):
+                if others.used[row] and seen[row]:
+                    self.remarks[first + number] |= Remark.mains_hum
+                    for leaf, other in zip(*map(jax.tree.leaves, (loads, others)), strict=True):
+                        leaf[number] = other[row]
+        self.chunks.append(loads)
         self.lanes = []
+
+    def _alone(self, lanes: list[tuple[np.ndarray, ...]]) -> tuple[Loads, np.ndarray]:
+        count = len(lanes)
+        found = jax.device_get(_alone(filled(lanes), jnp.asarray(count), self.model))
+        return jax.tree.map(lambda leaf: leaf[:count].copy(), found)
 
     def several(self) -> list[int]:
         """Checksums of the unloaded records that several recordings have."""
@@ -213,7 +236,9 @@ def identify_jointly(
         found, better = _together(model, groups, several, driver, tolerance)
         drivers.found[names] = dataclasses.replace(better, method=METHOD)
         for group, fit in zip(lengths.values(), jax.device_get(found), strict=True):
-            for row, one in zip(group.rows, unstacked(fit), strict=True):
+            of_group = zip(group.rows, group.remarks, unstacked(fit), strict=True)
+            for row, remarks, one in of_group:
+                one = remarked(one, remarks)
                 fits[row] = one
                 notes[row] = message(one.verdict)
     ordered = [fits[row] for row in range(len(paths))]

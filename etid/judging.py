@@ -8,10 +8,11 @@ data, then parameters that the data do not determine.
 import dataclasses
 
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from etid.circuits import AbstractCircuit
 from etid.output_error import Estimate
+from etid.remarks import Remark
 from etid.results import Fit
 from etid.verdicts import RESULTS, first_verdict, verdict
 
@@ -72,7 +73,13 @@ def judged(
         ),
         steps=estimate.steps,
         method=method,
+        remarks=remarks(estimate.hum),
     )
+
+
+def remarks(hum: Bool[Array, ""]) -> Int[Array, ""]:
+    """The remark of a fit that shows mains hum."""
+    return jnp.where(hum, jnp.array(int(Remark.mains_hum)), 0)
 
 
 def unless(fit: Fit, bad: Bool[Array, ""], result: RESULTS) -> Fit:

@@ -4,27 +4,32 @@ A lane is a tuple of arrays: the harmonics of a recording, or its samples. The s
 one recording and a batch.
 """
 
+import dataclasses
 import math
 import zlib
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from etid import baseline, estimation
+from etid import baseline, estimation, mains, rounding
 from etid.circuits import AbstractCircuit
 from etid.driver import Driver
 from etid.given_driver import GivenDriver
+from etid.judging import MISFIT_CHI2
 from etid.measurement import Measurement, measure, trusted
 from etid.methods import CONTINUOUS, HARMONIC, Method, iterations
 from etid.preflight import Inspected
+from etid.remarks import Remark
 from etid.results import Fit
 from etid.spectra import Spectrum, spectrum
 from etid.traces import stored_jit
+from etid.verdicts import verdict
 
+_Outcome = TypeVar("_Outcome", Fit, Driver)
 STEPS = 4  # lengths in an octave: the longest filling is a fifth
 
 
@@ -45,13 +50,50 @@ def lane(seen: Inspected, method: Method) -> tuple[np.ndarray, ...]:
     sigma_out = np.asarray(trusted(seen.v_out, seen.sigma_out))
     if method in HARMONIC:
         fields = spectrum(seen.v_th, seen.v_out, sigma_th, sigma_out, rate, *seen.periods)
-        return *map(np.asarray, fields), rate
+        frequency, x, y, variance_x, variance_y, selected = map(np.asarray, fields)
+        for v, step, variance in (
+            (seen.recorded_th, seen.coarse_th, variance_x),
+            (seen.recorded_out, seen.coarse_out, variance_y),
+        ):
+            if step > 0:
+                rounded = rounding.variance(v, step, *seen.periods)
+                variance[: rounded.size] = rounded
+        selected = selected & ~seen.covered(frequency)
+        return frequency, x, y, variance_x, variance_y, selected, rate
     if method == "output_error":
         size = seen.v_th.size
         room = math.ceil(2 ** (math.ceil(STEPS * math.log2(size)) / STEPS)) - size
         filled = (np.pad(v, (0, room)) for v in (seen.v_th, seen.v_out))
         return *filled, sigma_th, sigma_out, rate, np.asarray(size)
     return arrays(seen)
+
+
+def without_mains(lane: tuple[np.ndarray, ...], method: Method) -> tuple[np.ndarray, ...] | None:
+    """The same without the harmonics on which mains hum may fall; None if there is none."""
+    if method not in HARMONIC:
+        return None
+    *fields, selected, rate = lane
+    suspect = mains.lines(fields[0])
+    return (*fields, selected & ~suspect, rate) if (selected & suspect).any() else None
+
+
+def needs_another(fit: Fit | Driver) -> bool:
+    """Whether hum is seen in a fit, or it misses the recording, be it for hum or not."""
+    return bool(int(fit.remarks) & Remark.mains_hum) or not fit.chi2 < MISFIT_CHI2
+
+
+def of_both(first: _Outcome, second: _Outcome) -> _Outcome:
+    """A fit, or the `second` without the mains harmonics, if it is good and they show hum."""
+    if second.verdict == "successful" and int(second.remarks) & Remark.mains_hum:
+        return second
+    return dataclasses.replace(first, remarks=np.zeros((), int))
+
+
+def remarked(fit: Fit, remarks: int) -> Fit:
+    """The fit with these remarks; what a coarse converter leaves open is `resolution`."""
+    if remarks & Remark.coarse_converter and fit.verdict == "insensitive":
+        fit = dataclasses.replace(fit, result=verdict("resolution"))
+    return dataclasses.replace(fit, remarks=np.asarray(remarks))
 
 
 def stacked(lanes: Sequence[tuple[np.ndarray, ...]]) -> tuple[Array, ...]:

@@ -23,10 +23,13 @@ from jaxtyping import Array, Bool, Complex, Float
 
 from etid.driver import SourceImpedance
 from etid.elements import AbstractImpedance
+from etid.mains import lines
 from etid.spectra import Spectrum, local_sum, signal_share
 from etid.transfer import as_complex, delayed, frequency_variable, power, reciprocal
 
 SURE = 4.0  # standard deviations of a local variance
+LOW = 128  # harmonics, the first, among which mains hum is looked for
+HUM = 14.4  # of its mean; an exponential exceeds it as rarely as a normal number five σ
 ROUNDING = 1e-12  # of a record, by which two transforms of the same samples may differ
 
 
@@ -58,6 +61,25 @@ def residual(spectrum: Spectrum, g: Complex[Array, " harmonic"]) -> Float[Array,
     weight = jnp.where(spectrum.selected, jnp.sqrt(2 / variance(spectrum, g)), 0.0)
     difference = (spectrum.y - g * spectrum.x) * as_complex(weight)
     return jnp.concatenate([difference.real, difference.imag])
+
+
+def shows_hum(spectrum: Spectrum, g: Complex[Array, " harmonic"]) -> Bool[Array, ""]:
+    """Whether Y − g X shows mains hum: more on a harmonic where it may be than noise explains.
+
+    Noise is what the variances say, or what the other low harmonics show, if that is more. It is
+    looked for among harmonics that are not selected, too.
+    """
+    squares = power(spectrum.y - g * spectrum.x) / variance(spectrum, g)
+    return stands_out(squares, spectrum)
+
+
+def stands_out(squares: Float[Array, " harmonic"], spectrum: Spectrum) -> Bool[Array, ""]:
+    """The same for any residual, whose squares would be 1 on average without hum."""
+    squares, suspect = squares[:LOW], lines(spectrum.frequency[:LOW])
+    others = spectrum.selected[:LOW] & ~suspect
+    count = jnp.maximum(jnp.sum(others, dtype=squares.dtype), 1.0)
+    around = jnp.sum(jnp.where(others, squares, 0.0)) / count
+    return jnp.max(jnp.where(suspect, squares, 0.0)) > HUM * jnp.maximum(around, 1.0)
 
 
 def _learn(

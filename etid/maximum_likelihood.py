@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import optimistix as optx
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Array, Complex, Float
+from jaxtyping import Array, Bool, Complex, Float
 
 from etid.circuits import AbstractCircuit
 from etid.driver import Calibration, SourceImpedance
@@ -27,6 +27,7 @@ from etid.likelihood import (
     informed,
     residual,
     residuals,
+    shows_hum,
     weights,
 )
 from etid.output_error import DELAY_WIDTH, MAX_STEPS, SOLVER, Estimate, delay_std, prior
@@ -95,7 +96,8 @@ def fit_source(
     of_noise = [excess(r, s.selected) for r, s in zip(parts, records, strict=True)]
     noise = weights(of_noise, by_term.shape[1])
     cov = ((by_term * noise[None, :]) @ by_term.T)[:kept, :kept]
-    errors = jnp.stack([complex_rrse(g * s.x, s.y) for s, g in zip(records, gains(q), strict=True)])
+    found = list(zip(records, gains(q), strict=True))
+    errors = jnp.stack([complex_rrse(g * s.x, s.y, s.selected) for s, g in found])
     estimate = Estimate(
         q[:kept],
         q[kept:, None],
@@ -106,6 +108,7 @@ def fit_source(
         solution.stats["num_steps"],
         jnp.zeros_like(cov),
         jnp.zeros(()),
+        jnp.stack([shows_hum(s, g) for s, g in found]).any(),
     )
     calibration = Calibration(r_load, delay_std(r_load) / sample_rate, q[kept:], spectra)
     return unflatten(q[:kept]), estimate, calibration
@@ -231,7 +234,7 @@ def fit_load(
     spectrum: Spectrum,
     sample_rate: Float[Array, ""],
     candidates: Float[Array, "start own"],
-) -> tuple[Float[Array, " own"], optx.RESULTS, Float[Array, ""], Float[Array, ""]]:
+) -> tuple[Float[Array, " own"], optx.RESULTS, Float[Array, ""], Float[Array, ""], Bool[Array, ""]]:
     """Identify the load of one recording with Z_th as the calibrations have it.
 
     Args:
@@ -242,7 +245,8 @@ def fit_load(
             predicts best is refined.
 
     Returns:
-        Elements and delay, how the solver ended, χ² per degree of freedom, and RRSE.
+        Elements and delay, how the solver ended, χ² per degree of freedom, RRSE, and whether mains
+        hum is seen.
     """
     records, common = model.calibrations.records, model.calibrations.start()
 
@@ -257,4 +261,6 @@ def fit_load(
     squares = 2 * solution.stats["normal_equations"].objective
     chi2 = squares / (2 * jnp.sum(spectrum.selected, dtype=own.dtype) - own.shape[0])
     g = model.gain(own, common, spectrum, sample_rate)
-    return own, solution.result, chi2, complex_rrse(g * spectrum.x, spectrum.y)
+    error = complex_rrse(g * spectrum.x, spectrum.y, spectrum.selected)
+    hum = shows_hum(model.informed(spectrum, common, records), g)
+    return own, solution.result, chi2, error, hum

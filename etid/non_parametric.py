@@ -24,7 +24,7 @@ from etid.circuits import AbstractCircuit
 from etid.driver import Calibration
 from etid.information import inverse
 from etid.levenberg_marquardt import best_start
-from etid.likelihood import as_list, denoised, excess, same_unloaded
+from etid.likelihood import as_list, denoised, excess, same_unloaded, stands_out
 from etid.other_circuit import Scores, scores
 from etid.other_circuit import changes as changes_of
 from etid.output_error import DELAY_WIDTH, MAX_STEPS, SOLVER, Estimate
@@ -139,6 +139,13 @@ class _Model(eqx.Module):
             apart = jnp.where(self.selected[None, :], jnp.stack(of.apart), 0.0).ravel()
             parts += [apart.real, apart.imag]
         return jnp.concatenate(parts)
+
+    def squares(self, q: Float[Array, " q"], records: list[Spectrum]) -> Float[Array, " harmonic"]:
+        """|e|² over its variance, also of what is not selected."""
+        y, of = self._in_time(q, records), self.z_th(q, records)
+        load = self.load(q, records[-1].frequency)
+        e = (load + of.z) * y - load * records[-1].x
+        return power(e) / self._variance(q, records, y, of)[0]
 
     def without_noise(self, q: Float[Array, " q"], records: list[Spectrum]) -> list[Spectrum]:
         """The records with Y of the load as all others predict it."""
@@ -268,6 +275,7 @@ def fit_circuit(
             solution.stats["num_steps"],
             shared,
             jnp.zeros(()),
+            stands_out(model.squares(q, records), records[-1]),
         ),
         bias[:elements],
         found.less(of_z).seen(),

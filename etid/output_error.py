@@ -20,7 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from etid.circuits import AbstractCircuit
 from etid.driver import Calibration, SourceImpedance, loaded
@@ -64,6 +64,7 @@ class Estimate(eqx.Module):
         shared_cov: The part of `cov` that comes from the driver, common to all skins identified
             with it.
         strain: By how much the calibrations' own Σ r² grew in a joint fit; 0 without one.
+        hum: Whether mains hum is seen in the residual; a fit in time does not look for it.
     """
 
     parameters: Float[Array, " parameter"]
@@ -75,6 +76,7 @@ class Estimate(eqx.Module):
     steps: Int[Array, ""]
     shared_cov: Float[Array, "parameter parameter"]
     strain: Float[Array, ""]
+    hum: Bool[Array, ""] = eqx.field(default_factory=lambda: jnp.zeros((), bool))
 
 
 def prior(start: SourceImpedance, sample_rate: Float[Array, ""], r_load: Float[Array, ""]):

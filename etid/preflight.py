@@ -4,9 +4,11 @@ import functools
 import math
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
+from etid import rounding
 from etid.filtering import TAPS
+from etid.mains import Hum, separated
 from etid.measurement import trusted
 from etid.noise import noise_std
 from etid.recording import Recording
@@ -41,13 +43,60 @@ class Inspected:
 
     @functools.cached_property
     def v_th(self) -> Float[np.ndarray, " time"]:
-        """Unloaded voltage [V]."""
-        return self.recording.v_th
+        """Unloaded voltage [V], without hum that can be told from the pulses."""
+        return self._without(self.hum_th, self.recorded_th)
 
     @functools.cached_property
     def v_out(self) -> Float[np.ndarray, " time"]:
-        """Loaded voltage [V]."""
+        """Loaded voltage [V], without such hum."""
+        return self._without(self.hum_out, self.recorded_out)
+
+    @functools.cached_property
+    def recorded_th(self) -> Float[np.ndarray, " time"]:
+        """Unloaded voltage as it was recorded [V]."""
+        return self.recording.v_th
+
+    @functools.cached_property
+    def recorded_out(self) -> Float[np.ndarray, " time"]:
+        """The same of the loaded voltage."""
         return self.recording.v_out
+
+    @functools.cached_property
+    def coarse_th(self) -> float:
+        """Converter step [V] of `v_th` if it exceeds the noise, else 0."""
+        return self._coarse(self.recorded_th, self.step_th)
+
+    @functools.cached_property
+    def coarse_out(self) -> float:
+        """The same of `v_out`."""
+        return self._coarse(self.recorded_out, self.step_out)
+
+    def _coarse(self, v: Float[np.ndarray, " time"], told: float) -> float:
+        step = told or rounding.step_of(v)
+        return step if rounding.is_coarse(v, step) else 0.0
+
+    @functools.cached_property
+    def hum_th(self) -> Hum | None:
+        """Hum of `v_th` that was subtracted."""
+        return self._hum(self.recorded_th, self.sigma_th)
+
+    @functools.cached_property
+    def hum_out(self) -> Hum | None:
+        """The same of `v_out`."""
+        return self._hum(self.recorded_out, self.sigma_out)
+
+    def _hum(self, v: Float[np.ndarray, " time"], sigma: Float[np.ndarray, ""]) -> Hum | None:
+        of = self.recording
+        return separated(v, sigma, of.sample_rate, of.pulse_rate, *self.periods)
+
+    def _without(self, hum: Hum | None, v: Float[np.ndarray, " time"]) -> np.ndarray:
+        return v if hum is None else v - hum(v.size, self.recording.sample_rate)
+
+    def covered(self, frequency: Float[np.ndarray, " harmonic"]) -> Bool[np.ndarray, " harmonic"]:
+        """Harmonics that hum covers although it was subtracted."""
+        none = np.zeros(frequency.shape, bool)
+        found = [hum for hum in (self.hum_th, self.hum_out) if hum is not None]
+        return sum((hum.covers(frequency, self.periods[0]) for hum in found), start=none)
 
     @property
     def step_th(self) -> float:
@@ -62,24 +111,27 @@ class Inspected:
     @functools.cached_property
     def sigma_th(self) -> Float[np.ndarray, ""]:
         """Noise of a sample of `v_th` [V]."""
-        return np.asarray(noise_std(self.v_th, self.step_th))
+        return np.asarray(noise_std(self.recorded_th, self.step_th))
 
     @functools.cached_property
     def sigma_out(self) -> Float[np.ndarray, ""]:
         """The same of `v_out`."""
-        return np.asarray(noise_std(self.v_out, self.step_out))
+        return np.asarray(noise_std(self.recorded_out, self.step_out))
 
     @property
     def remarks(self) -> Remark:
         """What is done to the recording before a fit."""
-        return Remark(0)
+        hum = self.hum_th is not None or self.hum_out is not None
+        coarse = self.coarse_th > 0 or self.coarse_out > 0
+        found = Remark.mains_hum if hum else Remark(0)
+        return found | Remark.coarse_converter if coarse else found
 
     @functools.cached_property
     def periods(self) -> tuple[int, int]:
         """How many whole periods it holds by its own clock, and how many samples they are."""
         of = self.recording
-        counted = counted_pulse_rate(self.v_th, of.sample_rate, of.pulse_rate)
-        return whole_periods(self.v_out.size, of.sample_rate, counted)
+        counted = counted_pulse_rate(self.recorded_th, of.sample_rate, of.pulse_rate)
+        return whole_periods(self.recorded_out.size, of.sample_rate, counted)
 
     @functools.cached_property
     def is_periodic(self) -> bool:
@@ -117,7 +169,9 @@ def preflight(seen: Inspected, *, periodic: bool = False) -> str | None:
         return "nonfinite_samples"
     if _is_flat(v_th, seen.sigma_th) or _is_flat(v_out, seen.sigma_out):
         return "flat"
-    if _is_saturated(v_th, seen.step_th, of) or _is_saturated(v_out, seen.step_out, of):
+    if _is_saturated(seen.recorded_th, seen.step_th, of):
+        return "saturated"
+    if _is_saturated(seen.recorded_out, seen.step_out, of):
         return "saturated"
     if _is_unconnected(seen):
         return "unconnected"

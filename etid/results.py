@@ -10,7 +10,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Complex, Float, Int
+from jaxtyping import Array, Bool, Complex, Float, Int
 
 from etid.circuits import DISPLAY, AbstractCircuit, Resistor, SkinRC
 from etid.recording import Label, RecordingError, wanted_labels
@@ -34,11 +34,13 @@ def rrse(predicted: Float[Array, " time"], measured: Float[Array, " time"]) -> F
 
 
 def complex_rrse(
-    predicted: Complex[Array, " value"], measured: Complex[Array, " value"]
+    predicted: Complex[Array, " value"],
+    measured: Complex[Array, " value"],
+    used: Bool[Array, " value"] | bool = True,
 ) -> Float[Array, ""]:
-    """RRSE of harmonics or impedances, from which no mean is to be taken."""
-    missed = jnp.sum(jnp.abs(measured - predicted) ** 2)
-    return jnp.sqrt(missed / jnp.sum(jnp.abs(measured) ** 2))
+    """RRSE of harmonics or impedances that are used, from which no mean is to be taken."""
+    missed = jnp.sum(jnp.where(used, jnp.abs(measured - predicted) ** 2, 0.0))
+    return jnp.sqrt(missed / jnp.sum(jnp.where(used, jnp.abs(measured) ** 2, 0.0)))
 
 
 class IdentificationError(RuntimeError):

@@ -142,7 +142,9 @@ def _misfit(study: DriverStudy, load: Loads, common, own):
     squares = jnp.sum(study.of_load(load, common, own)[:-1] ** 2)
     freedom = 2 * jnp.sum(load.spectrum.selected, dtype=own.dtype) - own.shape[0]
     g = study.model.gain(own, common, load.spectrum, load.sample_rate)
-    return squares / freedom, complex_rrse(g * load.spectrum.x, load.spectrum.y)
+    return squares / freedom, complex_rrse(
+        g * load.spectrum.x, load.spectrum.y, load.spectrum.selected
+    )
 
 
 def _is_another(

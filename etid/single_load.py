@@ -19,7 +19,7 @@ from etid.circuits import AbstractCircuit
 from etid.given_driver import GivenDriver, UnloadedSlopes, combined
 from etid.information import inverse
 from etid.levenberg_marquardt import LevenbergMarquardt, NormalEquations, best_start
-from etid.likelihood import apart, denoised, excess, residual, variance
+from etid.likelihood import apart, denoised, excess, residual, shows_hum, variance
 from etid.output_error import DELAY_WIDTH, MAX_STEPS, SOLVER, Estimate
 from etid.results import complex_rrse
 from etid.spectra import Spectrum
@@ -335,11 +335,12 @@ def fit_circuit(
         own[None, -1:],
         (by_term * (private * noise)[None, :]) @ by_term.T + of_delay + shared + unknown,
         jnp.sum(part**2) / (2 * jnp.sum(spectrum.selected, dtype=own.dtype) - own.size),
-        complex_rrse(g * spectrum.x, spectrum.y),
+        complex_rrse(g * spectrum.x, spectrum.y, spectrum.selected),
         solution.result,
         solution.stats["num_steps"],
         shared,
         # By how much Σ r² of the calibrations has grown.
         jnp.dot(change, jnp.linalg.solve(driver.cov, change)),
+        shows_hum(known, g),
     )
     return estimate, moved > FAR, other.seen()

@@ -31,10 +31,15 @@ class RESULTS(optx.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]  # equi
         "The recording does not determine a parameter: its standard error exceeds its value. "
         "Record more periods, reduce the noise, or fit a simpler circuit."
     )
+    resolution = (
+        "The converter's steps are too coarse: with their rounding error, the standard error of a "
+        "parameter exceeds its value. Use a finer range, more bits, or an amplifier."
+    )
     misfit = (
         "The prediction misses the recording by far more than its noise (chi2), or in the way of "
         "another relaxation, or of one that is spread over time constants. The circuit is wrong, "
-        "the trigger moved between the records, or the signal drifted or clipped."
+        "the trigger moved between the records, the signal drifted or clipped, or output error met "
+        "mains hum."
     )
     order_too_low = (
         "The calibrations show a pole of the source impedance that the driver lacks. Raise `order` "

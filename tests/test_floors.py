@@ -31,6 +31,8 @@ FLOORS = {
     "schema": 0,
     "schema_page": 1,
     "elements": 1,
+    "mains": 1,
+    "rounding": 1,
     "circuits": 2,
     "other_circuit": 2,
     "recording": 1,

@@ -1,0 +1,149 @@
+"""Mains hum costs nothing but the harmonics on which it falls, and a fit says that it was there."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+import etid
+from etid import mains, scenes
+from etid.preflight import Inspected
+from etid.recording import Samples
+from etid.remarks import Remark
+from etid.scenes import Scene
+
+SCALE = Scene().scale
+DRY = scenes.paper_dry()
+
+
+def hummed(recording, frequency, volts, seed=0, signals=("v_th", "v_out")):
+    """A recording with hum [V at the converter] of this frequency and its multiples 2, 3 and 5."""
+    rng = np.random.default_rng(seed)
+    time = np.arange(recording.v_th.size) / recording.sample_rate
+    samples = {"v_th": recording.samples["v_th"], "v_out": recording.samples["v_out"]}
+    for name in signals:
+        of = samples[name]
+        turns = frequency * time + rng.random()
+        added = sum(
+            volts * (1.0 if h == 1 else 0.3) * np.sin(2 * np.pi * (h * turns + rng.random()))
+            for h in (1, 2, 3, 5)
+        )
+        codes = np.rint(of.stored + added / SCALE / of.conversion)
+        samples[name] = Samples(codes.astype(of.stored.dtype), of.conversion, of.offset)
+    fields = {
+        field.name: getattr(recording, field.name)
+        for field in dataclasses.fields(recording.metadata)
+    }
+    return etid.Recording(samples["v_th"], samples["v_out"], **fields)
+
+
+def study_of(**settings):
+    return Scene(DRY.trials[:1], DRY.calibration, **settings).simulate(seed=1)
+
+
+@pytest.fixture(scope="module")
+def records():
+    return tuple(study_of().values())
+
+
+@pytest.fixture(scope="module")
+def quiet(records):
+    driver = etid.identify_driver(records[0])
+    return driver, etid.identify_skin(records[1], driver)
+
+
+def in_errors(fit, other):
+    return np.abs(fit.circuit.values() - other.circuit.values()) / np.sqrt(np.diag(other.cov))
+
+
+def test_lines_are_the_harmonics_on_multiples_of_50_or_60_hz():
+    sixty = np.arange(1, 20) * 60.0
+    np.testing.assert_array_equal(np.flatnonzero(mains.lines(sixty)) + 1, range(1, 8))
+    hundred = np.arange(1, 20) * 100.06
+    np.testing.assert_array_equal(np.flatnonzero(mains.lines(hundred)) + 1, [1, 2, 3])
+    assert not mains.lines(np.array([55.0, 80.0, 1000.0])).any()
+
+
+@pytest.mark.parametrize(
+    ("frequency", "samples"), [(50.0, 10_000), (49.93, 10_000), (59.98, 100_000)]
+)
+def test_hum_between_the_harmonics_is_subtracted(frequency, samples):
+    clean = study_of(samples=samples)["calibration/98k8"]
+    seen = Inspected(hummed(clean, frequency, 0.1))
+    assert seen.remarks == Remark.mains_hum
+    periods, length = seen.periods
+    left = np.fft.rfft((seen.v_out - clean.v_out)[:length]) / length
+    frequencies = np.arange(left.size) / length * clean.sample_rate
+    noise = float(seen.sigma_out) / np.sqrt(length)
+    # What is subtracted is as uncertain as noise beside the hum, and less farther away.
+    far = np.abs(frequencies[:, None] - frequency * np.arange(1, 8)).min(1)
+    far = (far > clean.sample_rate / length) & (np.arange(left.size) % periods == 0)
+    assert np.abs(left[far]).max() < 3 * noise
+    assert np.abs(left[far])[10:].max() < noise
+
+
+@pytest.mark.parametrize("settings", [{}, {"pulse_rate_ppm": 150.0}, {"samples": 16_667}])
+@pytest.mark.parametrize("snr_db", [20.0, 40.0, 80.0])
+def test_no_hum_is_seen_where_there_is_none(settings, snr_db):
+    for recording in study_of(snr_db=snr_db, offset_rms=0.1, **settings).values():
+        assert Inspected(recording).remarks == Remark(0)
+
+
+def test_a_drift_is_no_hum(records):
+    of = records[1]
+    time = np.arange(of.v_th.size) / of.sample_rate
+    fields = {"sample_rate": of.sample_rate, "pulse_rate": of.pulse_rate}
+    drifting = etid.Recording(of.v_th + 5 * np.sin(6 * time), of.v_out * (1 + time), **fields)
+    assert Inspected(drifting).remarks == Remark(0)
+
+
+@pytest.mark.parametrize("frequency", [50.0, 60.0, 59.97])
+def test_elements_are_those_without_hum(records, quiet, frequency):
+    calibration, skin = (hummed(one, frequency, 0.1, seed) for seed, one in enumerate(records))
+    driver = etid.identify_driver(calibration)
+    fit = etid.identify_skin(skin, driver)
+    # What seven of 1 666 harmonics told, of R_p up to a third, moves the estimate by what it is.
+    assert in_errors(fit, quiet[1]).max() < 1
+    assert (np.diag(fit.cov) / np.diag(quiet[1].cov)).max() < 1.6
+    assert int(driver.remarks) == int(fit.remarks) == Remark.mains_hum
+
+
+def test_hum_in_a_batch_costs_the_other_recordings_nothing(records, quiet):
+    driver, fit = quiet
+    loud = hummed(records[1], 60.0, 0.02, signals=("v_out",))
+    fits = etid.identify_skins([records[1], loud, records[1]], driver)
+    np.testing.assert_array_equal(fits.fit.remarks, [0, Remark.mains_hum, 0])
+    assert set(fits.verdicts) == {"successful"}
+    assert (np.asarray(fits.circuit.r_p)[[0, 2]] == np.asarray(fit.circuit.r_p)).all()
+    np.testing.assert_allclose(np.asarray(fits.circuit.r_p)[1], fit.circuit.r_p, rtol=2e-3)
+
+
+def test_hum_does_not_excuse_a_wrong_circuit(records, quiet):
+    loud = hummed(records[1], 60.0, 0.02)
+    fit = etid.identify_skin(loud, quiet[0], circuit=etid.Resistor(), throw=False)
+    assert fit.verdict == "misfit"
+    assert int(fit.remarks) == 0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("method", ["non_parametric", "harmonic_steiglitz_mcbride"])
+def test_other_methods_on_harmonics_leave_hum_out(records, quiet, method):
+    driver, _ = quiet
+    clean = etid.identify_skin(records[1], driver, method=method)
+    fit = etid.identify_skin(hummed(records[1], 60.0, 0.02), driver, method=method)
+    assert int(fit.remarks) == Remark.mains_hum
+    assert in_errors(fit, clean).max() < 1
+
+
+@pytest.mark.slow
+def test_a_joint_fit_leaves_hum_out():
+    study = Scene(DRY.trials[:3], DRY.calibration).simulate(seed=1)
+    loud = [hummed(one, 60.0, 0.02, seed) for seed, one in enumerate(study.values())]
+    found = etid.identify_jointly(etid.Study.from_recordings(loud))
+    assert set(found.fits.verdicts) == {"successful"}
+    np.testing.assert_array_equal(found.fits.fit.remarks, [Remark.mains_hum] * 3)
+    for name in ("r_s", "r_p", "c_p"):
+        off = np.asarray(getattr(found.fits.circuit, name)) - getattr(DRY.trials[0].load, name)
+        error = np.asarray(getattr(found.fits.stderr, name))
+        assert (np.abs(off) < 4 * error).all()  # nine numbers exceed it once in 1 800 draws
+        assert (error < 0.01 * getattr(DRY.trials[0].load, name)).all()

@@ -1,0 +1,94 @@
+"""Coarse converters: their rounding error is weighed as what it is, and the fit says so."""
+
+import numpy as np
+import pytest
+
+import etid
+from etid import rounding, scenes
+from etid.preflight import Inspected
+from etid.remarks import Remark
+from etid.scenes import Scene
+from etid.spectra import harmonics
+
+DRY = scenes.paper_dry()
+
+
+def study_of(**settings):
+    return Scene(DRY.trials[:1], DRY.calibration, **settings).simulate(seed=3)
+
+
+def as_float(recording):
+    return etid.Recording(
+        recording.v_th,
+        recording.v_out,
+        sample_rate=recording.sample_rate,
+        pulse_rate=recording.pulse_rate,
+        r_load=recording.r_load,
+        path=recording.path,
+    )
+
+
+@pytest.mark.parametrize("bits", [8, 10, 12])
+@pytest.mark.parametrize("snr_db", [None, 60.0, 80.0])
+def test_the_step_is_seen_in_the_values(bits, snr_db):
+    recording = study_of(bits=bits, snr_db=snr_db)["calibration/98k8"]
+    step = Inspected(recording).step_out
+    np.testing.assert_allclose(rounding.step_of(recording.v_out), step, rtol=1e-6)
+
+
+@pytest.mark.parametrize("snr_db", [20.0, 60.0, 80.0])
+@pytest.mark.parametrize("bits", [16, None])
+def test_a_fine_converter_is_not_coarse(snr_db, bits):
+    for recording in study_of(bits=bits, snr_db=snr_db).values():
+        assert Inspected(recording).remarks == Remark(0)
+        assert Inspected(as_float(recording)).remarks == Remark(0)
+
+
+def test_noise_below_a_step_is_seen_in_the_codes():
+    rng = np.random.default_rng(1)
+    ramp, step = np.linspace(0.0, 7.0, 20_000), 1.0
+    for sigma in (0.0, 0.1, 0.3):
+        v = np.round(ramp + sigma * rng.standard_normal(ramp.size))
+        # 2 200 and 6 700 changes of the code, known to 2 %; at 0.3 steps the zones in which it
+        # changes begin to overlap, and two changes in one direction are not counted.
+        assert rounding.noise_of(v, step) == pytest.approx(sigma, rel=0.08, abs=0.001)
+
+
+@pytest.mark.parametrize("samples", [10_000, 9999])  # nor does it fold what repeats exactly
+def test_the_size_of_the_rounding_error_is_known_at_each_harmonic(samples):
+    rate = 60.0 * samples / 3
+    rate = 200e3 if samples == 10_000 else rate
+    settings = {"snr_db": None, "full_scale": 4.0, "sample_rate": rate, "samples": samples}
+    exact = study_of(bits=None, **settings)["calibration/98k8"]
+    coarse = study_of(bits=8, **settings)["calibration/98k8"]
+    step = Inspected(coarse).step_out
+    error = np.abs(harmonics(coarse.v_out - exact.v_out, 3, samples)) ** 2
+    known = rounding.variance(coarse.v_out, step, 3, samples)
+    bands = [slice(0, 10), slice(10, 100), slice(100, 1000)]
+    ratio = np.array([error[band].mean() / known[band].mean() for band in bands])
+    # One draw of an error of few independent parts, weighed as at most three times as large.
+    assert (ratio < 2).all()
+    assert (ratio > 0.05).all()
+
+
+def test_too_coarse_a_converter_says_so():
+    study = study_of(bits=5, full_scale=4.0)
+    driver = etid.identify_driver(study["calibration/98k8"], throw=False)
+    fit = etid.identify_skin(study[DRY.trials[0].path], driver, throw=False)
+    assert fit.verdict == "resolution"
+
+
+@pytest.mark.parametrize(
+    ("bits", "full_scale", "snr_db", "codes"),
+    [(8, 10.0, 60.0, True), (8, 4.0, None, True), (10, 10.0, None, False)],
+)
+def test_elements_are_right_within_wider_errors(bits, full_scale, snr_db, codes):
+    study = study_of(bits=bits, full_scale=full_scale, snr_db=snr_db)
+    calibration, skin = (one if codes else as_float(one) for one in study.values())
+    driver = etid.identify_driver(calibration)
+    fit = etid.identify_skin(skin, driver)
+    assert int(driver.remarks) == int(fit.remarks) == Remark.coarse_converter
+    truth = [getattr(DRY.trials[0].load, name) for name in ("r_s", "r_p", "c_p")]
+    errors = np.sqrt(np.diag(fit.cov))
+    assert (np.abs(fit.circuit.values() - np.array(truth)) < 4 * errors).all()
+    assert (errors < 0.4 * np.array(truth)).all()
