@@ -77,7 +77,9 @@ _RULES = """\
 - Text is UTF-8. An array of one element counts as a scalar.
 - etid writes text of a fixed length and opens files with `libver="v108"`: all but the samples is
   then under checksums, and damage is an error. Text of variable length, h5py's default, is read
-  too, but no checksum protects it: damage inside it can hang the HDF5 library itself.
+  too, but no checksum protects it: damage inside it may be read as another text.
+- A record has at most 2^27 samples, a stack 2^21 trials, a path 50 groups; what is declared but not
+  stored is refused (`etid/limits.py`).
 - A file of a newer minor version is read, one of another major version is refused.
 
 What etid writes is the same layout: recordings `g/0 … g/T-1` that differ in nothing but samples and
