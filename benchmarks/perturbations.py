@@ -86,6 +86,14 @@ def met(answers: Sequence[Answer]) -> bool:
     return holds
 
 
+def write(answers: Sequence[Answer], method: str, folder: pathlib.Path) -> None:
+    """Write the table, and the figure of one method, into `folder`."""
+    rows = table(answers, ("perturbation", "snr_db", "path", "method"))
+    write_csv(folder / "perturbations.csv", rows)
+    of_one = [row for row in rows if row["method"] == method]
+    perturbation_chart.draw(of_one, folder / "perturbations.svg")
+
+
 def run(
     names: Sequence[str],
     drivers: int,
@@ -94,18 +102,17 @@ def run(
     folder: pathlib.Path,
     workers: int,
 ) -> bool:
-    """Draw, count, print, and write the table and the figure into `folder`."""
+    """Draw, count and print; write the table and the figure with every driver that is done."""
     answers: list[Answer] = []
+    place = {name: number for number, name in enumerate(names)}
     with tqdm(total=drivers * len(snr_db), unit="driver") as bar:
         for found in draws(names, drivers, snr_db, methods, workers):
             answers += found
+            answers.sort(
+                key=lambda a: (a.snr_db, place[a.perturbation], a.path, a.method, a.number)
+            )
+            write(answers, methods[0], folder)  # nothing that is done is lost
             bar.update()
-    place = {name: number for number, name in enumerate(names)}
-    answers.sort(key=lambda a: (a.snr_db, place[a.perturbation], a.path, a.method, a.number))
-    rows = table(answers, ("perturbation", "snr_db", "path", "method"))
-    write_csv(folder / "perturbations.csv", rows)
-    of_default = [row for row in rows if row["method"] == methods[0]]
-    perturbation_chart.draw(of_default, folder / "perturbations.svg")
     print("\n".join(summary(answers)))
     return met(answers)
 
