@@ -1,6 +1,9 @@
 """Output error piece by piece: what is in doubt of a calibration, its derivative, the errors."""
 
+import dataclasses
+
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -11,7 +14,7 @@ from etid.driver import SourceImpedance
 from etid.elements import resistor
 from etid.information import Curvature, curvature, eliminate, inverse
 from etid.measurement import Measurement
-from etid.output_error import DELAY_WIDTH, KNOWN_DELAY, delay_std
+from etid.output_error import DELAY_WIDTH, KNOWN_DELAY, delay_std, fit_source
 from etid.prediction import IMPULSE, impulse, late_calibration, measured_impulse, prepare
 from etid.preflight import Inspected
 from etid.scenes import Scene, Trial
@@ -153,3 +156,22 @@ def test_if_the_noise_is_smaller_the_errors_are_what_it_is_said_to_be(fitted):
     own = [np.asarray(fit.cov - fit.shared_cov) for fit in (once, twice)]
     np.testing.assert_allclose(np.diagonal(own[1]), 4 * np.diagonal(own[0]), rtol=0.1)
     np.testing.assert_allclose(twice.chi2 / once.chi2, 1 / 4, rtol=1e-2)
+
+
+def test_errors_of_a_driver_that_misses_its_calibration_are_as_large_as_it_does():
+    """One real pole for a transformer: χ² is large; whatever noise is assumed, cov stays."""
+    study = Scene((), (Trial("c", ResistorLoad(98.8e3)),), samples=1200).simulate(seed=11)
+    v_th, v_out = jnp.asarray(study["c"].v_th), jnp.asarray(study["c"].v_out)
+    start = dataclasses.replace(plain(5e3), gain_real=jnp.array([-2e3]))
+
+    @jax.jit
+    def fit(sigma):
+        m = Measurement(v_th[None], v_out[None], sigma[None], sigma[None], jnp.array([RATE]))
+        records = jax.vmap(prepare)(m)
+        _, estimate, _ = fit_source(records, jnp.array([98.8e3]), start)
+        return estimate.chi2, estimate.cov
+
+    (chi2, cov), (larger, same) = fit(jnp.asarray(0.01)), fit(jnp.asarray(0.005))
+    assert float(chi2) > 5
+    np.testing.assert_allclose(larger / chi2, 4, rtol=1e-2)
+    np.testing.assert_allclose(np.diagonal(same), np.diagonal(cov), rtol=0.05)
