@@ -106,7 +106,7 @@ def separated(
         periods: From `etid.spectra.whole_periods`.
         samples: From `etid.spectra.whole_periods`.
     """
-    if periods < 2 or not sigma > 0:
+    if periods < 2 or not sigma > 0 or not np.isfinite(v[:samples]).all():
         return None
     if samples <= PROBED:
         probes, left = _probes(sample_rate, periods, samples)
