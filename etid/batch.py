@@ -307,6 +307,7 @@ def identify_study(
     order: int = 5,
     circuit: AbstractCircuit | None = None,
     method: Method | None = None,
+    driver_drift: float = 0.0,
     progress: bool = False,
 ) -> StudyFits:
     """Identify every driver of a study from its calibrations, then every loaded recording.
@@ -320,6 +321,7 @@ def identify_study(
         order: As in `identify_driver`.
         circuit: As in `identify_skin`.
         method: As in `identify_skin`.
+        driver_drift: As in `identify_driver`.
         progress: Show a progress bar.
 
     Returns:
@@ -332,10 +334,10 @@ def identify_study(
     order = order_of(order)
     circuit = circuit_of(circuit)
     check_method(method, circuit)
-    drivers = Drivers(study, order, method)
+    drivers = Drivers(study, order, method, driver_drift)
     paths = to_identify(study)
     fits = identify_part(study, paths, drivers, circuit, method, progress)
-    settings = Settings.of(study, len(paths), order, method, circuit)
+    settings = Settings.of(study, len(paths), order, method, circuit, driver_drift=driver_drift)
     return StudyFits(fits, drivers.found, drivers.failures, settings)
 
 
@@ -382,8 +384,9 @@ class Drivers:
         failures: Why a driver could not be identified, by the paths of its calibrations.
     """
 
-    def __init__(self, study: Study, order: int, method: Method | None):
+    def __init__(self, study: Study, order: int, method: Method | None, driver_drift: float = 0.0):
         self.study = study
+        self.driver_drift = driver_drift
         self.order = order
         self.method: Method | None = method
         self.calibrations = tuple(study.calibrations)
@@ -417,7 +420,11 @@ class Drivers:
         try:
             records = [self.study[name] for name in names]
             self.found[names] = identify_driver(
-                records, order=self.order, method=self.method, throw=False
+                records,
+                order=self.order,
+                method=self.method,
+                driver_drift=self.driver_drift,
+                throw=False,
             )
         except (IdentificationError, ValueError, KeyError) as error:
             self.failures[names] = str(error)

@@ -279,7 +279,7 @@ def _table(found: StudyFits, settings: Settings) -> Table:
         "recordings": source,
         "method": f"asked for {settings.asked_method or 'none'}, used {found.fits.fit.method}",
         "circuit": type(found.fits.circuit).__name__,
-        "Z_th": f"order {settings.order}",
+        "Z_th": f"order {settings.order}, drift of {100 * settings.driver_drift:g} %",
         "R_L": f"standard deviation of {100 * settings.r_load_tolerance:g} %",
         "computed": f"in {settings.precision} on {settings.backend}",
         "versions": ", ".join(settings.versions),

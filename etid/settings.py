@@ -26,6 +26,7 @@ class Settings:
         start: Typical values of the elements [SI], where fits may start.
         r_load_tolerance: Relative standard deviation of the known resistors that is in the
             standard errors.
+        driver_drift: As in `identify_driver`.
         precision: Floating-point numbers computed with.
         backend: What JAX computed on.
         versions: Packages and their versions, as `"jax 0.10.2"`.
@@ -38,6 +39,7 @@ class Settings:
     order: int
     start: tuple[float, ...]
     r_load_tolerance: float
+    driver_drift: float
     precision: str
     backend: str
     versions: tuple[str, ...]
@@ -51,6 +53,7 @@ class Settings:
         method: str | None,
         circuit: AbstractCircuit,
         r_load_tolerance: float = 0.0,
+        driver_drift: float = 0.0,
     ) -> "Settings":
         """The settings of a run in this process.
 
@@ -61,6 +64,7 @@ class Settings:
             method: As in `identify_skin`.
             circuit: As in `identify_skin`.
             r_load_tolerance: As in `identify_jointly`.
+            driver_drift: As in `identify_driver`.
         """
         source = os.path.abspath(study.file) if study.file else ""
         return cls(
@@ -71,6 +75,7 @@ class Settings:
             order=order,
             start=tuple(np.asarray(circuit.values()).tolist()),
             r_load_tolerance=float(r_load_tolerance),
+            driver_drift=float(driver_drift),
             precision="float64",
             backend=jax.default_backend(),
             versions=tuple(f"{name} {importlib.metadata.version(name)}" for name in PACKAGES),

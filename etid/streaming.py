@@ -57,16 +57,18 @@ class _Opened(NamedTuple):
     drivers: Drivers
 
 
-def _open(source: str, order: int, method: Method | None) -> _Opened:
+def _open(source: str, order: int, method: Method | None, driver_drift: float) -> _Opened:
     study = read(source)
-    return _Opened(study, to_identify(study), Drivers(study, order, method))
+    return _Opened(study, to_identify(study), Drivers(study, order, method, driver_drift))
 
 
 @functools.cache
-def _kept_open(source: str, stamp: int, order: int, method: Method | None) -> _Opened:
+def _kept_open(
+    source: str, stamp: int, order: int, method: Method | None, driver_drift: float
+) -> _Opened:
     """The same, once per process and as long as that lives: parts come one by one."""
     del stamp
-    return _open(source, order, method)
+    return _open(source, order, method, driver_drift)
 
 
 def _fit(
@@ -90,13 +92,16 @@ def _fit_elsewhere(
     stamp: int,
     order: int,
     method: Method | None,
+    driver_drift: float,
     circuit: AbstractCircuit,
     size: int,
     number: int,
 ) -> StudyFits:
     """Fit one part in any process that sees the file."""
     with jax.enable_x64(True):  # of a worker: the caller's own was checked
-        return _fit(_kept_open(source, stamp, order, method), circuit, method, size, number)
+        return _fit(
+            _kept_open(source, stamp, order, method, driver_drift), circuit, method, size, number
+        )
 
 
 def _pin(cores: Any) -> None:
@@ -172,6 +177,7 @@ def fit_file(
     order: int = 5,
     circuit: AbstractCircuit | None = None,
     method: Method | None = None,
+    driver_drift: float = 0.0,
     resume: bool = False,
     executor: concurrent.futures.Executor | None = None,
     progress: bool = False,
@@ -184,6 +190,7 @@ def fit_file(
         order: As in `identify_driver`.
         circuit: As in `identify_skin`.
         method: As in `identify_skin`.
+        driver_drift: As in `identify_driver`.
         resume: Keep the parts of an earlier run that did not end.
         executor: Where parts are fitted; in this process if not given.
         progress: Show a progress bar.
@@ -201,14 +208,16 @@ def fit_file(
     circuit = circuit_of(circuit)
     check_method(method, circuit)
     source, target = os.path.abspath(source), pathlib.Path(target)
-    opened = _open(source, order, method)
+    opened = _open(source, order, method, driver_drift)
     with opened.study:
         count = len(opened.paths)
         if not count:
             raise ValueError("the study has no loaded recording")
         numbers = range((count + PART - 1) // PART)
         stamp = os.stat(source).st_mtime_ns
-        settings = Settings.of(opened.study, count, order, method, circuit)
+        settings = Settings.of(
+            opened.study, count, order, method, circuit, driver_drift=driver_drift
+        )
         described = json.loads(json.dumps(dataclasses.asdict(settings)))  # tuples become lists
         run = {
             **{name.replace("_", " "): value for name, value in described.items()},
@@ -220,7 +229,9 @@ def fit_file(
         left = [number for number in numbers if not parts.path(number).exists()]
         task = functools.partial(_fit, opened, circuit, method, PART)
         if executor is not None:
-            task = functools.partial(_fit_elsewhere, source, stamp, order, method, circuit, PART)
+            task = functools.partial(
+                _fit_elsewhere, source, stamp, order, method, driver_drift, circuit, PART
+            )
         drivers = {}
         done = min(count, (len(numbers) - len(left)) * PART)
         with tqdm(total=count, initial=done, unit="fit", disable=not progress) as bar:

@@ -1,5 +1,7 @@
 """Drivers whose Z_th drifts after the calibration: standard errors that hold it are true."""
 
+from typing import Any
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -68,3 +70,20 @@ def test_a_drift_is_a_part(drift):
 def recorded_calibration():
     known = (Trial("calibration/0", ResistorLoad(98.8e3)),)
     return Scene((), known).simulate(seed=1)["calibration/0"]
+
+
+@pytest.mark.slow
+def test_a_study_and_its_file_pass_the_drift_on(tmp_path):
+    trials = (Trial("loaded/0", DRY),)
+    known = (Trial("calibration/0", ResistorLoad(98.8e3)),)
+    study = Scene(trials, known, samples=3334).simulate(seed=1)
+    study.write(tmp_path / "study.h5")
+    options: dict[str, Any] = {"method": "equation_error", "order": 3, "driver_drift": DRIFT}
+    found = [
+        etid.identify_study(study, **options),
+        etid.fit_file(tmp_path / "study.h5", tmp_path / "fits.h5", **options),
+    ]
+    for one in (*found, etid.StudyFits.read(tmp_path / "fits.h5")):
+        assert one.settings is not None
+        assert one.settings.driver_drift == DRIFT
+        assert [driver.drift for driver in one.drivers.values()] == [DRIFT]

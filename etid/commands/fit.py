@@ -34,6 +34,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--order", type=int, default=5, help="poles of the driver, default 5")
     parser.add_argument(
+        "--driver-drift",
+        type=float,
+        default=0.0,
+        metavar="PART",
+        help="by which Z_th may have changed since its calibration, as 0.01; default 0",
+    )
+    parser.add_argument(
         "--joint",
         action="store_true",
         help="one fit for all recordings of a driver, by maximum likelihood",
@@ -56,6 +63,8 @@ def run(arguments: argparse.Namespace) -> Outcome:
         raise ValueError(f"{arguments.target}: there is no folder to write it to")
     if arguments.joint and arguments.method not in (None, "maximum_likelihood"):
         raise ValueError(f"--joint is by maximum likelihood, not by {arguments.method}")
+    if arguments.joint and arguments.driver_drift:
+        raise ValueError("--joint has no --driver-drift: it identifies the driver as it is")
     progress = sys.stderr.isatty()
     if arguments.joint:
         if arguments.resume or arguments.workers or arguments.dask:
@@ -70,6 +79,7 @@ def run(arguments: argparse.Namespace) -> Outcome:
                 arguments.target,
                 order=arguments.order,
                 method=arguments.method,
+                driver_drift=arguments.driver_drift,
                 resume=arguments.resume,
                 executor=executor,
                 progress=progress,
