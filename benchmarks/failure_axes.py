@@ -1,4 +1,4 @@
-"""Where methods may fail: eight pairs of axes, and the scene of every cell.
+"""Where methods may fail: nine pairs of axes, and the scene of every cell.
 
 Every cell differs from the middle of the ladder, 60 dB, three periods at 200 kHz, delays of 50 ns
 rms, in its row and its column. It has one calibration, and trials with dry and damp skin by turns,
@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Complex, Float
 
 from benchmarks.ladder import LOADS, rung
+from etid.circuits import AbstractCircuit, Resistor
 from etid.recording import Recording, Samples
 from etid.scenes import Scene, Trial
 from etid.transformer import SkinLoad, TransformerDriver
@@ -51,6 +52,7 @@ class Cell:
         scene: What is simulated.
         order: Poles that are given to the driver.
         change: What is done to the records afterwards, if anything.
+        circuit: What is fitted; `SkinRC` if not given.
     """
 
     chart: str
@@ -59,6 +61,7 @@ class Cell:
     scene: Scene
     order: int = 5
     change: Change | None = None
+    circuit: AbstractCircuit | None = None
 
     @property
     def shape(self) -> tuple[float, ...]:
@@ -260,6 +263,8 @@ def cells() -> Iterator[Cell]:
             yield Cell("SNR and trigger delay, rms", row, name, late)
         for name, loads in NOT_ONE_RC.items():
             yield Cell("SNR and skin that is not one RC", row, name, scene(loads, snr_db=db))
+        skin = scene(snr_db=db)
+        yield Cell("SNR and circuit fitted to skin", row, "resistor", skin, circuit=Resistor())
     for true in sorted(LOST):
         behind = scene(driver=transformer(true))
         for order in ORDERS:

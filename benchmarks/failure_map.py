@@ -1,4 +1,4 @@
-"""Where each method fails, and whether it says so: maps over eight pairs of axes.
+"""Where each method fails, and whether it says so: maps over nine pairs of axes.
 
     python -m benchmarks failure_map            # all of it, in two processes
     python -m benchmarks failure_map --quick    # few cells, few draws, and what must hold in them

@@ -28,10 +28,18 @@ MISFIT_RRSE = (
 STRAINED = 39.0
 
 
-def misses(chi2: Float[Array, ""], error: Float[Array, ""]) -> Bool[Array, ""]:
-    """Whether the residual exceeds the noise both in standard deviations and in volts."""
+def misses(
+    chi2: Float[Array, ""], error: Float[Array, ""], least: float = MISFIT_RRSE
+) -> Bool[Array, ""]:
+    """Whether the residual exceeds the noise both in standard deviations and in volts.
+
+    Args:
+        chi2: Of the fit.
+        error: Its RRSE.
+        least: Part of the signal that it may leave unexplained.
+    """
     excess = error * jnp.sqrt(jnp.maximum(1 - 1 / chi2, 0.0))
-    return (chi2 > MISFIT_CHI2) & (excess > MISFIT_RRSE)
+    return (chi2 > MISFIT_CHI2) & (excess > least)
 
 
 def too_late(estimate: Estimate) -> Bool[Array, ""]:

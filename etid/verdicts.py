@@ -70,8 +70,9 @@ class RESULTS(optx.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]  # equi
     )
     biased = (
         "Noise has shifted the estimate by several standard errors: Steiglitz-McBride from the "
-        "minimum of its own model, a non-parametric fit from what it would be without noise. Use "
-        "the default method."
+        "minimum of its own model, a non-parametric fit from what it would be without noise. Or "
+        "the sample rate is too low for the interpolation of output error, which misses the "
+        "recording by more than its noise. Use the default method."
     )
     flat = "A record carries no signal above its noise. Check the contact and the channel."
     saturated = "The converter clipped. Lower the gain or the stimulus and record again."

@@ -8,6 +8,7 @@ import optimistix as optx
 import pytest
 
 import etid
+from etid import estimation
 from etid.judging import MISFIT_CHI2, MISFIT_RRSE, SUCCESSFUL, judged, misses, too_late, unless
 from etid.output_error import Estimate
 from etid.verdicts import RESULTS, verdict
@@ -55,6 +56,15 @@ def name(of, driver=SUCCESSFUL):
 def test_a_misfit_exceeds_the_noise_in_standard_deviations_and_in_volts(chi2, error, expected):
     assert bool(misses(jnp.asarray(chi2), jnp.asarray(error))) is expected
     assert name(estimate(chi2=chi2, rrse=error)) == ("misfit" if expected else "successful")
+
+
+def test_what_a_residual_may_leave_unexplained_depends_on_the_method():
+    """Output error at 100 kHz and 80 dB: R_s was ten standard errors off and called successful."""
+    of = jnp.asarray(4.5), jnp.asarray(6.7e-4)
+    assert not misses(*of)
+    assert misses(*of, estimation.INTERPOLATED)
+    # At 200 kHz, where it is right.
+    assert not misses(jnp.asarray(1.43), jnp.asarray(2.9e-4), estimation.INTERPOLATED)
 
 
 @pytest.mark.parametrize(

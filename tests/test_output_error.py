@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import etid
+from benchmarks.ladder import CALIBRATION, LOADS, TRIAL, rung
 from etid import lanes
 from etid.driver import SourceImpedance
 from etid.elements import resistor
@@ -175,3 +176,13 @@ def test_errors_of_a_driver_that_misses_its_calibration_are_as_large_as_it_does(
     assert float(chi2) > 5
     np.testing.assert_allclose(larger / chi2, 4, rtol=1e-2)
     np.testing.assert_allclose(np.diagonal(same), np.diagonal(cov), rtol=0.05)
+
+
+@pytest.mark.slow
+def test_a_sample_rate_that_is_too_low_for_the_interpolation_is_told():
+    """R_s is eight and more standard errors off at 100 kHz and 80 dB, with a chi2 of 4.5."""
+    study = rung("dry", snr_db=80.0, sample_rate=100e3, samples=5001).simulate(0)
+    driver = etid.identify_driver(study[CALIBRATION], method="output_error")
+    fit = etid.identify_skin(study[TRIAL], driver, method="output_error", throw=False)
+    assert abs(fit.circuit.values()[0] - LOADS["dry"].r_s) > 5 * fit.stderr.values()[0]
+    assert fit.verdict == "biased"
