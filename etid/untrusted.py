@@ -36,6 +36,7 @@ LIBRARY_ERRORS = (
 
 DAMAGED = "The file is damaged or was not closed: copy or record it again"
 
+_PLAIN = 4096  # bytes of a number or text that is read without another look
 _HEAP = b"GCOL\x01\0\0\0"
 _HEAP_HEAD = 16  # bytes: signature, version, size of the collection
 _OBJECT = struct.Struct("<HH4xQ")  # index, reference count, size
@@ -165,13 +166,13 @@ class Attributes:
         Raises:
             RecordingError: There are more than any schema has.
         """
-        count = len(owner.attrs)
-        if count > limits.ATTRIBUTES:
+        names = list(owner.attrs)
+        if len(names) > limits.ATTRIBUTES:
             raise RecordingError(
-                f"has {count} attributes, at most {limits.ATTRIBUTES} are read",
+                f"has {len(names)} attributes, at most {limits.ATTRIBUTES} are read",
                 remedy="Keep what is not in the schema elsewhere",
             )
-        return list(owner.attrs)
+        return names
 
     def value(self, owner: h5py.HLObject, name: str) -> Any:
         """The value of an attribute.
@@ -179,7 +180,12 @@ class Attributes:
         Raises:
             Exception: One of `LIBRARY_ERRORS`: it cannot be read, or is too large.
         """
-        if in_a_heap(owner.attrs.get_id(name).dtype):
+        attributes = owner.attrs
+        stored = attributes.get_id(name)
+        dtype = stored.dtype
+        if not dtype.hasobject and math.prod(stored.shape or ()) * dtype.itemsize <= _PLAIN:
+            return attributes[name]  # as etid writes all of them
+        if in_a_heap(dtype):
             if self._second is None:
                 self._second = self._open.enter_context(guarded(self._path))
             owner = self._second[owner.name]
