@@ -20,12 +20,13 @@ import numpy as np
 from jaxtyping import Array, Int
 from tqdm import tqdm
 
+from etid import changes
 from etid.arguments import circuit_of, order_of, require
 from etid.arguments import recordings as several
 from etid.circuits import AbstractCircuit
 from etid.driver import Driver
 from etid.given_driver import GivenDriver
-from etid.identify import failed_fit, identify_driver
+from etid.identify import failed_fit, identify_driver, note
 from etid.lanes import (
     is_shared,
     known_driver,
@@ -41,6 +42,7 @@ from etid.methods import Method, check_default, check_method, plan
 from etid.prefetch import prefetch
 from etid.preflight import Inspected
 from etid.recording import Metadata, Recording, RecordingError
+from etid.repeats import repeats
 from etid.results import LABELS, Fit, Fits, IdentificationError
 from etid.settings import Settings
 from etid.study import Study
@@ -160,13 +162,13 @@ class _Queue:
         self.method: Method = method
         self.rows: list[int] = []
         self.lanes: list[tuple[np.ndarray, ...]] = []
-        self.remarks: list[np.ndarray] = []
+        self.seen: list[Inspected] = []
 
-    def add(self, row: int, lane: tuple[np.ndarray, ...], remarks: np.ndarray) -> None:
+    def add(self, row: int, lane: tuple[np.ndarray, ...], seen: Inspected) -> None:
         """Let a recording wait."""
         self.rows.append(row)
         self.lanes.append(lane)
-        self.remarks.append(remarks)
+        self.seen.append(seen)
 
     def run(self) -> Iterable[tuple[int, Fit]]:
         """Fit what is waiting."""
@@ -180,9 +182,13 @@ class _Queue:
         if again:
             for number, second in zip(again, self._fits(list(again.values())), strict=True):
                 fits[number] = of_both(fits[number], second)
-        for row, remarks, fit in zip(self.rows, self.remarks, fits, strict=True):
-            yield row, remarked(fit, int(remarks) | int(fit.remarks))
-        self.rows, self.lanes, self.remarks = [], [], []
+        marked = [
+            remarked(fit, int(seen.remarks) | int(fit.remarks))
+            for seen, fit in zip(self.seen, fits, strict=True)
+        ]
+        found = changes.judged(marked, self.driver, repeats(self.seen))
+        yield from zip(self.rows, found, strict=True)
+        self.rows, self.lanes, self.seen = [], [], []
 
     def _fits(self, lanes: Sequence[tuple[np.ndarray, ...]]) -> list[Fit]:
         of = self.driver, self.known, self.circuit, self.method
@@ -221,7 +227,7 @@ def _identify(
         rates = seen.recording.sample_rate, seen.recording.pulse_rate
         waiting, shared = lane(seen, method), is_shared(seen, driver)
         key = id(driver), method, waiting[0].size, shared, rates
-        return driver, waiting, np.asarray(int(seen.remarks)), method, shared, key
+        return driver, waiting, seen, method, shared, key
 
     with (
         tqdm(total=count, unit="fit", disable=not progress) as bar,
@@ -232,12 +238,12 @@ def _identify(
             for row, fit in queue.run():
                 fits[row] = fit
                 used.append(fit.method)
-                notes[row] = message(fit.verdict)
+                notes[row] = note(fit)
                 bar.update()
 
         for row, prepared in enumerate(recordings):
             try:
-                driver, waiting, remarks, method, shared, key = prepared()
+                driver, waiting, seen, method, shared, key = prepared()
             except Refusal as refusal:
                 fits[row] = failed_fit(refusal.name, circuit, given or "maximum_likelihood")
                 notes[row] = refusal.note
@@ -247,7 +253,7 @@ def _identify(
                 known = known_driver(waiting, driver, method, shared)
                 queues[key] = _Queue(driver, known, circuit, method)
             queue = queues[key]
-            queue.add(row, waiting, remarks)
+            queue.add(row, waiting, seen)
             if len(queue.rows) == LANES:
                 run(queue)
         for queue in queues.values():

@@ -69,6 +69,8 @@ def _columns(table: Table) -> dict[str, h5py.Dataset]:
             remedy="Fit the recordings again",
         )  # fmt: skip
     elements = [name + ending for name in names for ending in ("", "_stderr")]
+    changes = (f"{name}_change" for name in (*names, "amplitude"))
+    elements += [name for name in changes if name in table]  # not before schema version 1.2
     kinds = dict.fromkeys(LABELS, "text") | dict.fromkeys(elements, "number") | _QUALITY
     columns = {name: table.column(name, kind) for name, kind in kinds.items()}
     same_length(table, columns)

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from etid import estimation, mains, output_error, prediction, resistors
+from etid import changes, estimation, mains, output_error, prediction, resistors
 from etid.arguments import circuit_of, order_of, recordings, require
 from etid.circuits import AbstractCircuit, Resistor
 from etid.driver import Driver
@@ -45,6 +45,7 @@ from etid.periodic import periodic_voltage
 from etid.precision import require_float64
 from etid.preflight import Inspected, preflight
 from etid.recording import Recording
+from etid.repeats import repeats
 from etid.results import Fit, IdentificationError
 from etid.spectra import Spectrum, separates_aliases, spectrum, whole_periods
 from etid.traces import stored_jit
@@ -141,6 +142,7 @@ def identify_driver(
         driver = dataclasses.replace(driver, calibration=calibration)
     if driver_drift:
         driver = dataclasses.replace(driver, drift=np.asarray(driver_drift, float))
+    driver = changes.driver_judged(driver, r_load, repeats(seen))
     size = float(jnp.abs(driver.response(jnp.asarray(1e3))))
     if np.isfinite(size) and not plausible[0] <= size <= plausible[1]:
         driver = dataclasses.replace(driver, result=verdict("implausible"))
@@ -155,8 +157,10 @@ def failed_fit(name: str, circuit: AbstractCircuit, method: str) -> Fit:
     nan = np.full((size, size), np.nan)
     empty = circuit.with_log_values(jnp.full(size, jnp.nan))
     scalar = np.asarray(np.nan)
+    none = changes.unknown(size)
     return Fit(
-        empty, nan, nan, scalar, scalar, verdict(name), np.asarray(0), method, np.zeros((), int)
+        *(empty, nan, nan, scalar, scalar, verdict(name), np.asarray(0), method),
+        *(np.zeros((), int), none.size, none.stderr),
     )
 
 
@@ -202,10 +206,17 @@ def identify_skin(
         if needs_another(fit) and few is not None:
             fit = of_both(fit, skin(tuple(map(jnp.asarray, few)), driver, known, circuit, chosen))
         fit = remarked(fit, int(seen.remarks) | int(fit.remarks))
+        [fit] = changes.judged([fit], driver, repeats([seen]))
     if throw and fit.verdict != "successful":
-        text = f"recording {recording.path!r}: {fit.verdict}. {message(fit.verdict)}"
+        text = f"recording {recording.path!r}: {fit.verdict}. {note(fit)}"
         raise IdentificationError(text, fit)
     return fit
+
+
+def note(fit: Fit) -> str:
+    """What the verdict of a fit means, and what changed if that is what it says."""
+    text = message(fit.verdict)
+    return f"{text} {fit.changes}" if fit.verdict == "changed" else text
 
 
 def identify_samples(

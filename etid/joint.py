@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Int
 from tqdm import tqdm
 
-from etid import estimation, judging, shared_driver
+from etid import changes, estimation, judging, shared_driver
 from etid.arguments import circuit_of, order_of, require
 from etid.batch import (
     LANES,
@@ -32,13 +32,14 @@ from etid.batch import (
 )
 from etid.circuits import AbstractCircuit
 from etid.driver import Driver
-from etid.identify import failed_fit
+from etid.identify import failed_fit, note
 from etid.lanes import checksum, is_shared, lane, remarked, without_mains
 from etid.maximum_likelihood import Joint, fit_load
 from etid.methods import HARMONIC
 from etid.precision import require_float64
 from etid.preflight import Inspected
 from etid.remarks import Remark
+from etid.repeats import Repeats, repeats
 from etid.results import Fit
 from etid.settings import Settings
 from etid.shared_terms import Loads
@@ -46,7 +47,7 @@ from etid.spectra import Spectrum
 from etid.study import Study
 from etid.study_fits import StudyFits
 from etid.traces import stored_jit
-from etid.verdicts import RESULTS, message
+from etid.verdicts import RESULTS
 
 METHOD = "joint"
 SINGLE = (
@@ -122,10 +123,13 @@ class _Waiting:
         self.chunks: list[Loads] = []
         self.remarks: list[int] = []
         self.unloaded: list[int] = []
+        self.repeats: list[Repeats | None] = []
+        self.seen: list[Inspected] = []  # those of `lanes`
 
     def add(self, row: int, seen: Inspected) -> None:
         self.rows.append(row)
         self.unloaded.append(checksum(seen))
+        self.seen.append(seen)
         self.lanes.append(lane(seen, "maximum_likelihood"))
         self.remarks.append(int(seen.remarks))
         if len(self.lanes) == LANES:
@@ -149,7 +153,8 @@ class _Waiting:
                     for leaf, other in zip(*map(jax.tree.leaves, (loads, others)), strict=True):
                         leaf[number] = other[row]
         self.chunks.append(loads)
-        self.lanes = []
+        self.repeats += repeats(self.seen)
+        self.lanes, self.seen = [], []
 
     def _alone(self, lanes: list[tuple[np.ndarray, ...]]) -> tuple[Loads, np.ndarray]:
         count = len(lanes)
@@ -222,7 +227,7 @@ def identify_jointly(
             continue
         lengths = waiting.setdefault(drivers.of(seen.recording), {})
         shared = is_shared(seen, driver)
-        key = seen.v_th.size, shared
+        key = seen.v_th.size, shared, seen.recording.sample_rate, seen.recording.pulse_rate
         if key not in lengths:
             lengths[key] = _Waiting(_model(circuit, driver, shared))
         lengths[key].add(row, seen)
@@ -236,11 +241,12 @@ def identify_jointly(
         found, better = _together(model, groups, several, driver, tolerance)
         drivers.found[names] = dataclasses.replace(better, method=METHOD)
         for group, fit in zip(lengths.values(), jax.device_get(found), strict=True):
-            of_group = zip(group.rows, group.remarks, unstacked(fit), strict=True)
-            for row, remarks, one in of_group:
-                one = remarked(one, remarks)
+            of_group = zip(group.remarks, unstacked(fit), strict=True)
+            marked = [remarked(one, remarks) for remarks, one in of_group]
+            judged = changes.judged(marked, better, group.repeats)
+            for row, one in zip(group.rows, judged, strict=True):
                 fits[row] = one
-                notes[row] = message(one.verdict)
+                notes[row] = note(one)
     ordered = [fits[row] for row in range(len(paths))]
     outcome = table(study, paths, ordered, notes)
     settings = Settings.of(study, len(paths), order, METHOD, circuit, r_load_tolerance)

@@ -127,11 +127,15 @@ class Inspected:
         return found | Remark.coarse_converter if coarse else found
 
     @functools.cached_property
+    def pulse_rate(self) -> float:
+        """Pulse rate [Hz] by its own clock."""
+        of = self.recording
+        return counted_pulse_rate(self.recorded_th, of.sample_rate, of.pulse_rate)
+
+    @functools.cached_property
     def periods(self) -> tuple[int, int]:
         """How many whole periods it holds by its own clock, and how many samples they are."""
-        of = self.recording
-        counted = counted_pulse_rate(self.recorded_th, of.sample_rate, of.pulse_rate)
-        return whole_periods(self.recorded_out.size, of.sample_rate, counted)
+        return whole_periods(self.recorded_out.size, self.recording.sample_rate, self.pulse_rate)
 
     @functools.cached_property
     def is_periodic(self) -> bool:

@@ -71,6 +71,10 @@ class Fit(eqx.Module):
         steps: Iterations of the solver.
         method: Name of the estimator.
         remarks: What was done to the recording before the fit, `etid.remarks.Remark` as integers.
+        change: Relative change during the record of each element and, last, of the amplitude: from
+            the first to the last period, or by the step that was seen. NaN where the record holds
+            less than two periods, None where it was not asked for.
+        change_stderr: Standard errors of `change`.
     """
 
     circuit: AbstractCircuit
@@ -82,6 +86,8 @@ class Fit(eqx.Module):
     steps: Int[Array | np.ndarray, "*lane"]
     method: str = eqx.field(static=True)
     remarks: Int[Array | np.ndarray, "*lane"] = eqx.field(default_factory=lambda: np.zeros((), int))
+    change: Float[Array | np.ndarray, "*lane moved"] | None = None
+    change_stderr: Float[Array | np.ndarray, "*lane moved"] | None = None
 
     @property
     def stderr(self) -> AbstractCircuit:
@@ -96,6 +102,18 @@ class Fit(eqx.Module):
         """Name of the verdict (an array of names for a batch)."""
         names = verdict_names(self.result)
         return names.item() if names.ndim == 0 else names
+
+    @property
+    def changes(self) -> str:
+        """How each element and the amplitude changed during the record, in words; for one fit."""
+        if self.change is None or self.change_stderr is None:
+            return ""
+        return "During the record: " + ", ".join(
+            f"{name} {100 * float(size):+.2g} ± {100 * float(error):.1g} %"
+            for name, size, error in zip(
+                (*self.circuit.names(), "amplitude"), self.change, self.change_stderr, strict=True
+            )
+        )
 
     def __str__(self) -> str:
         if np.ndim(self.rrse):
@@ -112,6 +130,8 @@ class Fit(eqx.Module):
             lines.append(f"  {name:<{width}}{plus_minus(value, error)} {symbol}".rstrip())
         if self.verdict != "successful":
             lines.append("  " + message(self.verdict))
+        if self.verdict == "changed":
+            lines.append("  " + self.changes)
         lines += ["  " + text for text in texts(int(self.remarks))]
         return "\n".join(lines)
 
@@ -218,6 +238,8 @@ class Fits:
         for name in self.circuit.names():
             columns[name] = np.asarray(getattr(self.circuit, name))
             columns[f"{name}_stderr"] = np.asarray(getattr(self.stderr, name))
+        for i, name in enumerate((*self.circuit.names(), "amplitude")):
+            columns[f"{name}_change"] = self._changes[0][:, i]
         columns |= {
             "rrse": np.asarray(self.rrse),
             "chi2": np.asarray(self.chi2),
@@ -227,6 +249,15 @@ class Fits:
             "note": self.notes,
         }
         return columns
+
+    @property
+    def _changes(self) -> tuple[np.ndarray, np.ndarray]:
+        """Changes during the record and their standard errors; NaN where none was asked for."""
+        nothing = np.full((len(self), len(self.circuit.names()) + 1), np.nan)
+        fit = self.fit
+        if fit.change is None or fit.change_stderr is None:
+            return nothing, nothing
+        return np.asarray(fit.change), np.asarray(fit.change_stderr)
 
     def to_pandas(self) -> Any:
         """The table as a pandas DataFrame.
@@ -309,9 +340,10 @@ class Fits:
         units = self.circuit.units()
         units |= {f"{name}_stderr": unit for name, unit in units.items()}
         columns = self.table() | {"cov": self.cov, "shared_cov": self.fit.shared_cov}
+        columns["change_stderr"] = self._changes[1]
         attributes = {
             "schema": SCHEMA,
-            "schema_version": "1.1",
+            "schema_version": "1.2",
             "etid_version": importlib.metadata.version("etid"),
             "circuit": type(self.circuit).__name__,
             "parameters": list(self.circuit.names()),
@@ -364,6 +396,10 @@ class Fits:
             columns[name] = table.column(name, "number", (size, size))
         if "remarks" in table:  # not in files of schema version 1.0
             columns["remarks"] = table.column("remarks", "text")
+        changes = [f"{name}_change" for name in (*kind.names(), "amplitude")]
+        if "change_stderr" in table:  # not before schema version 1.2
+            columns |= {name: table.column(name, "number") for name in changes}
+            columns["change_stderr"] = table.column("change_stderr", "number", (size + 1,))
         count = same_length(table, columns)
         read = {name: table.read(column) for name, column in columns.items()}
         remarks = _remarks(table, read.get("remarks", np.full(count, "")))
@@ -379,6 +415,7 @@ class Fits:
             steps=read["steps"],
             method=table.text("method"),
             remarks=remarks,
+            **_changes_of(read, changes),
         )
         return cls(fit, {name: read[name] for name in LABELS}, read["note"])
 
@@ -405,3 +442,11 @@ def _remarks(table: Table, texts: np.ndarray) -> np.ndarray:
             field="remarks",
             remedy="Read it with the etid that wrote it",
         ) from None
+
+
+def _changes_of(read: Mapping[str, np.ndarray], names: Sequence[str]) -> dict[str, np.ndarray]:
+    """The changes of a file of fits; none before schema version 1.2."""
+    if "change_stderr" not in read:
+        return {}
+    change = np.stack([read[name].astype(float) for name in names], axis=1)
+    return {"change": change, "change_stderr": read["change_stderr"].astype(float)}

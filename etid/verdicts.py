@@ -41,6 +41,11 @@ class RESULTS(optx.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]  # equi
         "the trigger moved between the records, the signal drifted or clipped, or output error met "
         "mains hum."
     )
+    changed = (
+        "The load or the driver changed during the record: its pulse periods differ by more than "
+        "noise, in the way of an element or of the amplitude. Record shorter, or cut the record to "
+        "a part in which nothing changes."
+    )
     order_too_low = (
         "The calibrations show a pole of the source impedance that the driver lacks. Raise `order` "
         "by one or two."

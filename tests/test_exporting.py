@@ -101,11 +101,11 @@ def test_a_parquet_table_has_its_units_in_the_metadata(fits, file, parts, tmp_pa
 def test_fits_of_a_circuit_of_ones_own_are_exported_without_its_class(file, tmp_path):
     with h5py.File(file, "a") as content:
         content.attrs.update(circuit="Mine", parameters=["r_a"])
-        for ending in ("", "_stderr"):
+        for ending in ("", "_stderr", "_change"):
             content.move(f"r_s{ending}", f"r_a{ending}")
     etid.export_fits(file, tmp_path / "table.csv")
     head = (tmp_path / "table.csv").read_text("utf-8").splitlines()[0]
-    assert "r_a [ohm],r_a_stderr [ohm],rrse" in head
+    assert "r_a [ohm],r_a_stderr [ohm],r_a_change,amplitude_change,rrse" in head
     assert "r_p" not in head
 
 

@@ -39,6 +39,8 @@ FLOORS = {
     "arguments": 4,
     "driver": 2,
     "results": 3,
+    "repeats": 4,
+    "changes": 5,
     "measurement": 2,
     "scan": 2,
     "worst_fits": 5,

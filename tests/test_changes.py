@@ -1,0 +1,209 @@
+"""A load or a driver that changes during its record, between periods: seen, and told by element."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import etid
+from benchmarks.ladder import CALIBRATION, LOADS, TRIAL, rung
+from etid import changes
+from etid.preflight import Inspected
+from etid.repeats import repeats
+from etid.results import Fits
+from etid.scenes import Scene, Trial
+from tests import pictures
+
+NAMES = ("r_s", "r_p", "c_p")
+
+
+def recorded(scene: Scene, loads, seed=1):
+    """A recording whose load is another one in each period."""
+    scenes = [dataclasses.replace(scene, trials=(Trial(TRIAL, load),)) for load in loads]
+    records = [scene.simulate(seed)[TRIAL] for scene in scenes]
+    v_out = records[0].v_out.copy()
+    for number, record in enumerate(records):
+        start = round(number * scene.sample_rate / scene.pulse_rate)
+        v_out[start:] = record.v_out[start:]
+    return records[0].replace(v_out=v_out)
+
+
+def falling(load, name, share, periods=3):
+    """The load in each period, of which one element falls by a share of its value."""
+    value = getattr(load, name)
+    parts = np.linspace(0, share, periods)
+    return [dataclasses.replace(load, **{name: value * (1 - part)}) for part in parts]
+
+
+def change_of(recording, scene, load, allowed=0.0):
+    """The change with the true driver and load, without any fit."""
+    [of] = repeats([Inspected(recording)])
+    assert of is not None
+    z_th = scene.driver.z_th(of.frequency)
+    z = load(of.frequency)
+    by = []
+    for name in NAMES:
+        more = dataclasses.replace(load, **{name: getattr(load, name) * (1 + 1e-6)})
+        by.append((more(of.frequency) - z) / 1e-6 * z_th / (z * (z + z_th)))
+    return changes.found([of], np.array([by]), np.full((1, 3), allowed))[0]
+
+
+@pytest.fixture(scope="module")
+def driver():
+    return etid.identify_driver(rung("dry").simulate(0)[CALIBRATION])
+
+
+def test_slopes_are_those_of_the_gain(driver):
+    """Against central differences."""
+    circuit, step = etid.SkinRC(33.4e3, 186e3, 0.12e-9), 1e-5
+    f = jnp.geomspace(60.0, 5e4, 20)
+    batch = jax.tree.map(lambda leaf: jnp.asarray(leaf)[None], circuit)
+    slopes = np.asarray(changes.log_slopes(batch, driver, f))[0]
+    for i, name in enumerate(NAMES):
+        logs = []
+        for sign in (1, -1):
+            value = getattr(circuit, name) * (1 + sign * step)
+            z = np.asarray(dataclasses.replace(circuit, **{name: value}).response(f))
+            logs.append(np.log(z / (z + np.asarray(driver.response(f)))))
+        expected = (logs[0] - logs[1]) / (2 * step)
+        np.testing.assert_allclose(slopes[i], expected, rtol=1e-6, atol=1e-9)  # step², rounding
+
+
+@pytest.mark.parametrize("load", LOADS)
+@pytest.mark.parametrize("name", NAMES)
+def test_the_element_that_moves_is_named(load, name):
+    scene = rung(load)
+    change = change_of(recorded(scene, falling(LOADS[load], name, 0.1)), scene, LOADS[load])
+    assert change.seen
+    expected = np.array([-0.1 * (one == name) for one in (*NAMES, "amplitude")])
+    # Four standard errors, and what is not linear in a change of 10 %: half its square.
+    assert (np.abs(change.size - expected) < 4 * change.stderr + 0.005).all()
+
+
+def test_a_step_and_a_single_period_are_seen_as_well_as_a_line():
+    scene, skin = rung("dry", samples=33_334), LOADS["dry"]
+    other = dataclasses.replace(skin, r_p=0.9 * skin.r_p)
+    for loads in ([skin] * 6 + [other] * 4, [skin] * 4 + [other] + [skin] * 5):
+        change = change_of(recorded(scene, loads), scene, skin)
+        assert change.seen
+        # The step itself, not its mean slope.
+        assert abs(change.size[1] + 0.1) < 4 * change.stderr[1] + 0.005
+
+
+UNDISTURBED = {
+    "20 dB": {"snr_db": 20.0},
+    "80 dB": {"snr_db": 80.0},
+    "delays": {"snr_db": 80.0, "trigger_jitter_rms": 5e-6},
+    "offset": {"snr_db": 80.0, "offset_rms": 0.1},
+    "12 bits": {"snr_db": 80.0, "bits": 12},
+    "clock": {"snr_db": 80.0, "pulse_rate_ppm": 50.0},
+    "two periods": {"snr_db": 80.0, "samples": 6_667},
+    "ten periods": {"snr_db": 80.0, "samples": 33_334},
+    "100 kHz": {"snr_db": 80.0, "sample_rate": 100e3, "samples": 5_000},
+    "whole samples": {"snr_db": 80.0, "sample_rate": 240e3, "samples": 12_000},
+    "1 MHz": {"snr_db": 80.0, "sample_rate": 1e6, "samples": 50_000},
+    "one V_th": {"snr_db": 80.0, "shared_v_th": True},
+}
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(of, marks=pytest.mark.slow) if of in ("clock", "ten periods") else of
+        for of in UNDISTURBED
+    ],
+)
+def test_what_does_not_change_raises_no_alarm(name):
+    """However little a change would matter."""
+    for load, skin in LOADS.items():
+        scene = rung(load, **UNDISTURBED[name])
+        for seed in range(2):
+            change = change_of(scene.simulate(seed)[TRIAL], scene, skin)
+            assert not change.seen
+            assert (np.abs(change.size) < 6 * change.stderr).all()
+
+
+@pytest.mark.parametrize("frequency", [1.0, 50.0])
+def test_hum_and_wander_are_no_change_of_the_skin(frequency):
+    scene, skin = rung("dry"), LOADS["dry"]
+    recording = scene.simulate(1)[TRIAL]
+    volts = 0.02 / scene.scale * np.sin(2 * np.pi * frequency * recording.time + 1)
+    change = change_of(recording.replace(v_out=recording.v_out + volts), scene, skin, 0.01)
+    assert not change.seen
+
+
+@pytest.mark.slow
+def test_a_clock_that_drifts_is_no_change():
+    scene, skin = rung("dry", samples=100_000, pulse_rate_ppm=200.0), LOADS["dry"]
+    assert not change_of(scene.simulate(2)[TRIAL], scene, skin).seen
+
+
+def test_a_change_that_does_not_matter_is_no_reason_to_refuse():
+    scene, skin = rung("dry", snr_db=80.0), LOADS["dry"]
+    recording = recorded(scene, falling(skin, "r_p", 0.01))
+    assert change_of(recording, scene, skin, 0.001).seen
+    assert not change_of(recording, scene, skin, 0.03).seen
+
+
+@pytest.mark.parametrize(
+    "method",
+    [
+        "maximum_likelihood",
+        *(pytest.param(of, marks=pytest.mark.slow) for of in ("non_parametric", "output_error")),
+    ],
+)
+def test_skin_that_changes_is_refused_and_said(driver, method):
+    """R_p falls by 5 %: its fit would be 25 of its standard errors from either end."""
+    recording = recorded(rung("dry"), falling(LOADS["dry"], "r_p", 0.05))
+    fit = etid.identify_skin(recording, driver, method=method, throw=False)
+    assert fit.verdict == "changed"
+    assert fit.change is not None
+    assert fit.change_stderr is not None
+    assert abs(fit.change[1] + 0.05) < 4 * fit.change_stderr[1]
+    assert f"r_p {100 * fit.change[1]:+.2g} ±" in str(fit)
+    with pytest.raises(etid.IdentificationError, match=r"changed.* r_p -"):
+        etid.identify_skin(recording, driver, method=method)
+
+
+def test_a_batch_says_the_same_as_one_fit(driver):
+    scene = rung("dry")
+    changing = recorded(scene, falling(LOADS["dry"], "r_p", 0.05))
+    fits = etid.identify_skins([scene.simulate(1)[TRIAL], changing], driver)
+    assert fits.verdicts.tolist() == ["successful", "changed"]
+    assert "r_p -" in fits.notes[1]
+    one = etid.identify_skin(changing, driver, throw=False)
+    assert one.change is not None
+    np.testing.assert_allclose(fits.table()["r_p_change"][1], one.change[1], rtol=1e-6)
+
+
+def test_an_amplitude_that_drifts_is_seen_in_either_record(driver):
+    recording = rung("dry").simulate(1)[TRIAL]
+    drift = 1 + 0.01 * recording.time / recording.duration
+    for name in ("v_out", "v_th"):
+        drifting = recording.replace(**{name: getattr(recording, name) * drift})
+        assert etid.identify_skin(drifting, driver, throw=False).verdict == "changed"
+
+
+def test_a_calibration_that_drifts_makes_no_driver():
+    recording = rung("dry").simulate(0)[CALIBRATION]
+    drift = 1 + 0.02 * recording.time / recording.duration
+    drifting = recording.replace(v_out=recording.v_out * drift)
+    assert etid.identify_driver(drifting, throw=False).verdict == "changed"
+
+
+def test_a_record_of_one_period_tells_nothing_of_changes():
+    record = rung("dry", samples=3_334).simulate(1)[TRIAL]
+    assert repeats([Inspected(record)]) == [None]
+
+
+def test_a_file_of_fits_keeps_changes(tmp_path):
+    fits = pictures.fits()
+    size = np.random.default_rng(0).normal(size=(len(fits), 4))
+    fit = dataclasses.replace(fits.fit, change=size, change_stderr=size**2)
+    dataclasses.replace(fits, fit=fit).write(tmp_path / "fits.h5")
+    back = Fits.read(tmp_path / "fits.h5")
+    np.testing.assert_array_equal(back.fit.change, size)
+    np.testing.assert_array_equal(back.fit.change_stderr, size**2)
+    np.testing.assert_array_equal(back.table()["amplitude_change"], size[:, 3])
