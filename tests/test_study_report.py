@@ -223,7 +223,8 @@ def test_spread_of_subjects_and_recordings_and_errors_are_told_apart():
         assert one.median == pytest.approx(TRUE[one.name])
         assert one.between_subjects == pytest.approx(np.std(factors, ddof=1))
         # The median of four is their mean here, and so is the median of their errors.
-        within = np.sqrt(np.var(trials, ddof=1) - OWN**2)
+        # But `between` subtracts the mean of their squares, and they grow with the values.
+        within = np.sqrt(np.var(trials, ddof=1) - OWN**2 * np.mean((1 + trials) ** 2))
         assert one.between_recordings == pytest.approx(within, rel=1e-9)
         assert (one.own, one.shared) == pytest.approx((OWN, SHARED))
 
