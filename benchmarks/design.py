@@ -6,6 +6,7 @@ width and rate is that of the paper's pulse, 667 µs at 60 Hz.
 
 import argparse
 import dataclasses
+from typing import Any
 
 import numpy as np
 import scipy.optimize
@@ -53,7 +54,8 @@ def run() -> None:
             found = error(rate, load)
             text = "".join(f"{100 * value:9.3f}" for value in found.values())
             print(f"  {rate:6.0f} Hz, {1e6 * DUTY / rate:7.1f} us{text}")
-        best = scipy.optimize.minimize_scalar(
+        # SciPy has no types: what is inferred for its result depends on what else is checked.
+        best: Any = scipy.optimize.minimize_scalar(
             lambda log, load=load: error(float(np.exp(log)), load)["r_s"],
             bounds=np.log([RATES[0], RATES[-1]]),
             method="bounded",
