@@ -309,5 +309,5 @@ def test_a_file_of_another_circuit_asks_for_it(mixed, tmp_path):
         etid.Fits.read(file)
     with h5py.File(file, "r+") as content:
         content.attrs["schema"] = "etid/recording"
-    with pytest.raises(ValueError, match="attribute schema is 'etid/recording'"):
+    with pytest.raises(ValueError, match="is 'etid/recording', not 'etid/fits'"):
         etid.Fits.read(file)
