@@ -31,8 +31,10 @@ from etid.lanes import (
     is_shared,
     known_driver,
     lane,
+    late_by,
     needs_another,
     of_both,
+    realigned,
     remarked,
     skin_lane,
     stacked,
@@ -40,7 +42,7 @@ from etid.lanes import (
 )
 from etid.methods import Method, check_default, check_method, plan
 from etid.prefetch import prefetch
-from etid.preflight import Inspected
+from etid.preflight import Inspected, explained
 from etid.recording import Metadata, Recording, RecordingError
 from etid.repeats import repeats
 from etid.results import LABELS, Fit, Fits, IdentificationError
@@ -137,7 +139,7 @@ def planned(
     except IdentificationError as error:
         raise Refusal("driver_failed", str(error)) from error
     if name is not None:
-        raise Refusal(name)
+        raise Refusal(name, explained(seen, name))
     return seen, driver, method
 
 
@@ -163,6 +165,7 @@ class _Queue:
         self.rows: list[int] = []
         self.lanes: list[tuple[np.ndarray, ...]] = []
         self.seen: list[Inspected] = []
+        self.again: set[int] = set()
 
     def add(self, row: int, lane: tuple[np.ndarray, ...], seen: Inspected) -> None:
         """Let a recording wait."""
@@ -170,25 +173,36 @@ class _Queue:
         self.lanes.append(lane)
         self.seen.append(seen)
 
-    def run(self) -> Iterable[tuple[int, Fit]]:
-        """Fit what is waiting."""
-        fits = self._fits(self.lanes)
+    def run(self) -> Iterator[tuple[int, Fit]]:
+        """Fit what is waiting; what has to be aligned anew, once, waits again."""
+        fits, kept = self._fits(self.lanes), []
+        rows, lanes, seen = self.rows, self.lanes, self.seen
+        self.rows, self.lanes, self.seen = [], [], []
+        for number, (row, one) in enumerate(zip(rows, lanes, strict=True)):
+            late = late_by(one, self.method, fits[number], self.driver)
+            if late and row not in self.again:
+                self.again.add(row)
+                seen[number].lag += late
+                self.add(row, realigned(one, self.method, late), seen[number])
+            else:
+                self.again.discard(row)
+                kept.append(number)
         again = {
             number: few
-            for number, fit in enumerate(fits)
-            if needs_another(fit)
-            and (few := without_mains(self.lanes[number], self.method)) is not None
+            for number in kept
+            if needs_another(fits[number])
+            and (few := without_mains(lanes[number], self.method)) is not None
         }
         if again:
             for number, second in zip(again, self._fits(list(again.values())), strict=True):
                 fits[number] = of_both(fits[number], second)
         marked = [
-            remarked(fit, int(seen.remarks) | int(fit.remarks))
-            for seen, fit in zip(self.seen, fits, strict=True)
+            remarked(fits[number], int(seen[number].remarks) | int(fits[number].remarks))
+            for number in kept
         ]
-        found = changes.judged(marked, self.driver, repeats(self.seen))
-        yield from zip(self.rows, found, strict=True)
-        self.rows, self.lanes, self.seen = [], [], []
+        if kept:
+            found = changes.judged(marked, self.driver, repeats([seen[number] for number in kept]))
+            yield from zip([rows[number] for number in kept], found, strict=True)
 
     def _fits(self, lanes: Sequence[tuple[np.ndarray, ...]]) -> list[Fit]:
         of = self.driver, self.known, self.circuit, self.method
@@ -254,10 +268,10 @@ def _identify(
                 queues[key] = _Queue(driver, known, circuit, method)
             queue = queues[key]
             queue.add(row, waiting, seen)
-            if len(queue.rows) == LANES:
+            while len(queue.rows) == LANES:
                 run(queue)
         for queue in queues.values():
-            if queue.rows:
+            while queue.rows:
                 run(queue)
     ordered = [fits[row] for row in range(count)]
     return _of_one_method(ordered, used, given or "maximum_likelihood"), notes

@@ -42,7 +42,9 @@ def read(path: str | os.PathLike[str]) -> Study:
 
 
 def check(path: str | os.PathLike[str]) -> list[RecordingError]:
-    """All that is wrong with a file, field by field, samples that are not finite included.
+    """All that is wrong with a file, field by field.
+
+    Samples that are not finite are, and pulses that are not as far apart as both rates say.
 
     Args:
         path: The file.

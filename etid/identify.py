@@ -22,8 +22,10 @@ from etid.lanes import (
     is_shared,
     known_driver,
     lane,
+    late_by,
     needs_another,
     of_both,
+    realigned,
     remarked,
     skin,
     skin_lane,
@@ -43,7 +45,7 @@ from etid.methods import (
 )
 from etid.periodic import periodic_voltage
 from etid.precision import require_float64
-from etid.preflight import Inspected, preflight
+from etid.preflight import Inspected, explained, preflight
 from etid.recording import Recording
 from etid.repeats import repeats
 from etid.results import Fit, IdentificationError
@@ -112,7 +114,7 @@ def identify_driver(
     for one in seen:
         name = preflight(one, periodic=method in HARMONIC)
         if name is not None:
-            text = f"calibration {one.recording.path!r}: {name}. {message(name)}"
+            text = f"calibration {one.recording.path!r}: {name}. {explained(one, name)}"
             raise IdentificationError(text, None)
     rough = [resistors.rough_impedance(one) for one in seen]
     if max(rough) > resistors.ROUGHLY * min(rough):
@@ -122,18 +124,13 @@ def identify_driver(
         text = f"calibrations show impedances of about {shown}: resistors_disagree. "
         raise IdentificationError(text + message("resistors_disagree"), None)
     method = choose(method, seen)
-    r_load = jnp.asarray([record.r_load for record in records])
-    spectra = None
-    if method in HARMONIC:
-        *fields, _ = stacked([lane(one, method) for one in seen])
-        spectra = Spectrum(*fields)
-    samples = stacked(list(map(arrays, seen)))
-    driver = driver_of(samples, r_load, order, method, spectra)
-    # A driver bends to hum on one harmonic, by a pole there, and then lacks another.
-    if spectra is not None and (needs_another(driver) or driver.verdict != "successful"):
-        few = spectra.selected & ~mains.lines(spectra.frequency)
-        spectra = dataclasses.replace(spectra, selected=few)
-        driver = of_both(driver, driver_of(samples, r_load, order, method, spectra))
+    driver = _driver(seen, order, method)
+    known = driver.calibration
+    late = np.zeros(len(seen)) if known is None else np.asarray(known.delay)
+    if driver.verdict != "successful" and 1 < np.max(np.abs(late)) < np.inf:
+        for one, delay in zip(seen, late, strict=True):
+            one.lag += round(delay)
+        driver = _driver(seen, order, method)
     remarks = functools.reduce(operator.or_, (one.remarks for one in seen))
     driver = dataclasses.replace(driver, remarks=np.asarray(int(remarks) | int(driver.remarks)))
     if driver.calibration is not None:
@@ -142,12 +139,36 @@ def identify_driver(
         driver = dataclasses.replace(driver, calibration=calibration)
     if driver_drift:
         driver = dataclasses.replace(driver, drift=np.asarray(driver_drift, float))
+    r_load = jnp.asarray([record.r_load for record in records])
     driver = changes.driver_judged(driver, r_load, repeats(seen))
     size = float(jnp.abs(driver.response(jnp.asarray(1e3))))
     if np.isfinite(size) and not plausible[0] <= size <= plausible[1]:
         driver = dataclasses.replace(driver, result=verdict("implausible"))
     if throw and driver.verdict != "successful":
         raise IdentificationError(f"driver: {driver.verdict}. {message(driver.verdict)}", driver)
+    return driver
+
+
+def _driver(seen: Sequence[Inspected], order: int, method: Method) -> Driver:
+    """The driver of calibrations that passed the pre-flight, aligned by their lags."""
+    r_load = jnp.asarray([one.recording.r_load for one in seen])
+    if method not in HARMONIC:
+        samples = [arrays(one) for one in seen]
+        size = min(v_th.size for v_th, *_ in samples)
+        cut = [(v_th[:size], v_out[:size], *rest) for v_th, v_out, *rest in samples]
+        return driver_of(stacked(cut), r_load, order, method, None)
+    # Only starts are made from samples: of one length, so that the compiled function serves all.
+    samples = [(one.v_th, np.roll(one.v_out, -one.lag), *arrays(one)[2:]) for one in seen]
+    lanes = [lane(one, method)[:-1] for one in seen]
+    size = min(fields[0].size for fields in lanes)  # a pulse rate that is counted may cost one
+    spectra = Spectrum(*stacked([tuple(field[:size] for field in fields) for fields in lanes]))
+    records = stacked(samples)
+    driver = driver_of(records, r_load, order, method, spectra)
+    # A driver bends to hum on one harmonic, by a pole there, and then lacks another.
+    if needs_another(driver) or driver.verdict != "successful":
+        few = spectra.selected & ~mains.lines(spectra.frequency)
+        spectra = dataclasses.replace(spectra, selected=few)
+        driver = of_both(driver, driver_of(records, r_load, order, method, spectra))
     return driver
 
 
@@ -202,13 +223,19 @@ def identify_skin(
         one = lane(seen, chosen)
         known = known_driver(one, driver, chosen, is_shared(seen, driver))
         fit = skin(tuple(map(jnp.asarray, one)), driver, known, circuit, chosen)
+        late = late_by(one, chosen, fit, driver)
+        if late:
+            seen.lag += late
+            one = realigned(one, chosen, late)
+            fit = skin(tuple(map(jnp.asarray, one)), driver, known, circuit, chosen)
         few = without_mains(one, chosen)
         if needs_another(fit) and few is not None:
             fit = of_both(fit, skin(tuple(map(jnp.asarray, few)), driver, known, circuit, chosen))
         fit = remarked(fit, int(seen.remarks) | int(fit.remarks))
         [fit] = changes.judged([fit], driver, repeats([seen]))
     if throw and fit.verdict != "successful":
-        text = f"recording {recording.path!r}: {fit.verdict}. {note(fit)}"
+        why = explained(seen, "rate_mismatch") if fit.verdict == "rate_mismatch" else note(fit)
+        text = f"recording {recording.path!r}: {fit.verdict}. {why}"
         raise IdentificationError(text, fit)
     return fit
 
@@ -323,11 +350,11 @@ def predict(
     check_driver(driver, "output_error", recording.sample_rate)
     if not circuit.is_rational:
         return _predict_periods(recording, driver, circuit)
-    inner = np.asarray(
-        _fitted(tuple(map(jnp.asarray, arrays(Inspected(recording)))), driver, circuit)
-    )
+    seen = Inspected(recording)
+    inner = np.asarray(_fitted(tuple(map(jnp.asarray, arrays(seen))), driver, circuit))
     predicted = np.full(recording.v_out.size, np.nan)
-    predicted[TAPS - 1 : TAPS - 1 + inner.size] = inner
+    first = TAPS - 1 + max(seen.lag, 0)
+    predicted[first : first + inner.size] = inner
     return predicted
 
 
@@ -335,7 +362,8 @@ def _predict_periods(
     recording: Recording, driver: Driver, circuit: AbstractCircuit
 ) -> Float[np.ndarray, " time"]:
     rate = recording.sample_rate
-    periods, samples = whole_periods(recording.v_out.size, rate, recording.pulse_rate)
+    seen = Inspected(recording)
+    periods, samples = seen.periods
     if periods == 0:
         raise ValueError(
             f"recording {recording.path!r} holds no whole pulse period; the voltage at a "
@@ -345,12 +373,13 @@ def _predict_periods(
     assert driver.calibration is not None
     frequency = jnp.asarray(np.fft.rfftfreq(samples, 1 / rate)[1:])
     predicted = np.full(recording.v_out.size, np.nan)
-    predicted[:samples] = periodic_voltage(
+    aligned = periodic_voltage(
         recording.v_th[:samples],
-        recording.v_out[:samples],
+        np.roll(recording.v_out[:samples], -seen.lag),
         rate,
         np.asarray(driver.source.response(frequency)),
         np.asarray(circuit.response(frequency)),
         float(driver.calibration.r_load[0]),
     )
+    predicted[:samples] = np.roll(aligned, seen.lag)
     return predicted

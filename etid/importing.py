@@ -15,6 +15,7 @@ from etid.formats import abf, delimited, matlab, npz, tdms
 from etid.imported import Imported, Used, sources_of
 from etid.mapping import plans, read_mapping
 from etid.recording import AbstractSource, RecordingError
+from etid.sampling import check_spacing
 from etid.study import Study, refuse_nested
 
 READERS = {
@@ -124,6 +125,9 @@ def import_file(
         for plan in planned:
             with located(file, path=plan.path if len(planned) > 1 else ""):
                 found, made_of = sources_of(plan, contents.channel, file, by)
+            for each in found.values():
+                with located(file):
+                    check_spacing(next(each.blocks("v_th")).astype(float), each.metadata)
             sources |= found
             used.append(made_of)
         refuse_nested(sources)
@@ -142,6 +146,8 @@ def _import_npz(
     with located(str(path)):
         recordings = npz.recordings(path, subject, condition)
         study = Study.from_recordings(recordings)
+        for recording in study.recordings():
+            check_spacing(recording.v_th, recording.metadata)
         study.write(target)
     used = []
     for part, channel in (study.calibrations, "adc_ref"), (study.loaded, "adc_out"):

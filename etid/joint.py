@@ -33,7 +33,7 @@ from etid.batch import (
 from etid.circuits import AbstractCircuit
 from etid.driver import Driver
 from etid.identify import failed_fit, note
-from etid.lanes import checksum, is_shared, lane, remarked, without_mains
+from etid.lanes import checksum, is_shared, lane, realigned, remarked, without_mains
 from etid.maximum_likelihood import Joint, fit_load
 from etid.methods import HARMONIC
 from etid.precision import require_float64
@@ -140,6 +140,14 @@ class _Waiting:
             return
         first = len(self.rows) - len(self.lanes)
         loads, hum = self._alone(self.lanes)
+        late = loads.own[:, -1]
+        late = np.where(np.abs(late) > 1, np.round(late), 0)  # more than a fit allows for
+        if np.any(late) and np.isfinite(late).all():
+            for number, delay in enumerate(late.astype(int)):
+                one = self.lanes[number]
+                self.lanes[number] = realigned(one, "maximum_likelihood", int(delay))
+                self.remarks[first + number] |= Remark.aligned if delay else 0
+            loads, hum = self._alone(self.lanes)
         again = {}
         for number, one in enumerate(self.lanes):
             few = without_mains(one, "maximum_likelihood")

@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from etid import baseline, estimation, mains, rounding
+from etid.alignment import rest, shifted
 from etid.circuits import AbstractCircuit
 from etid.driver import Driver
 from etid.given_driver import GivenDriver
@@ -25,18 +26,19 @@ from etid.methods import CONTINUOUS, HARMONIC, Method, iterations
 from etid.preflight import Inspected
 from etid.remarks import Remark
 from etid.results import Fit
-from etid.spectra import Spectrum, spectrum
+from etid.spectra import ALIASED, Spectrum, spectrum
 from etid.traces import stored_jit
 from etid.verdicts import verdict
 
+LEFT = 0.75  # samples that are worth another fit; the delay that a fit allows for is 0.5
 _Outcome = TypeVar("_Outcome", Fit, Driver)
 STEPS = 4  # lengths in an octave: the longest filling is a fifth
 
 
 def arrays(seen: Inspected) -> tuple[np.ndarray, ...]:
-    """Both voltages, both resolutions, and the sample rate."""
+    """Both voltages, aligned, both resolutions, and the sample rate."""
     steps = np.asarray(seen.step_th), np.asarray(seen.step_out)
-    return seen.v_th, seen.v_out, *steps, np.asarray(seen.recording.sample_rate)
+    return *seen.aligned, *steps, np.asarray(seen.recording.sample_rate)
 
 
 def lane(seen: Inspected, method: Method) -> tuple[np.ndarray, ...]:
@@ -59,13 +61,59 @@ def lane(seen: Inspected, method: Method) -> tuple[np.ndarray, ...]:
                 rounded = rounding.variance(v, step, *seen.periods)
                 variance[: rounded.size] = rounded
         selected = selected & ~seen.covered(frequency)
-        return frequency, x, y, variance_x, variance_y, selected, rate
-    if method == "output_error":
+        one = frequency, x, y, variance_x, variance_y, selected, rate
+    elif method == "output_error":
         size = seen.v_th.size
         room = math.ceil(2 ** (math.ceil(STEPS * math.log2(size)) / STEPS)) - size
         filled = (np.pad(v, (0, room)) for v in (seen.v_th, seen.v_out))
-        return *filled, sigma_th, sigma_out, rate, np.asarray(size)
-    return arrays(seen)
+        one = *filled, sigma_th, sigma_out, rate, np.asarray(size)
+    else:
+        return arrays(seen)
+    return realigned(one, method, seen.lag)
+
+
+def realigned(lane: tuple[np.ndarray, ...], method: Method, late: int) -> tuple[np.ndarray, ...]:
+    """The same, of harmonics or for output error, with a `v_out` that is earlier by whole samples.
+
+    Periodic voltages are turned at each harmonic, e^(jω late / fs); of others the ends that no
+    longer overlap are left out.
+    """
+    if late == 0:
+        return lane
+    if method in HARMONIC:
+        frequency, x, y, *others, rate = lane
+        return frequency, x, y * np.exp(2j * np.pi * late / rate * frequency), *others, rate
+    v_th, v_out, *others, size = lane
+    records = shifted(v_th[: int(size)], v_out[: int(size)], late)
+    room = (0, v_th.size - records[0].size)
+    filled = (np.pad(v, room) for v in records)
+    return *filled, *others, np.asarray(records[0].size)
+
+
+def late_by(lane: tuple[np.ndarray, ...], method: Method, fit: Fit, driver: Driver) -> int:
+    """Whole samples by which a lane is later than what was fitted to it, if that is a misfit.
+
+    A fit that is a sample or more away from the alignment finds the elements, but calls it a
+    misfit: edges that the load smoothes let its record look later than it is.
+    """
+    known = method in HARMONIC or method == "output_error"
+    if fit.verdict != "misfit" or not known or driver.source is None:
+        return 0
+    if method in HARMONIC:
+        frequency, x, y, variance_x, variance_y, selected, rate = lane
+    else:
+        v_th, v_out, _, _, rate, _ = lane
+        frequency = np.fft.rfftfreq(v_th.size, 1 / rate)[1:]
+        x, y = np.fft.rfft(v_th)[1:], np.fft.rfft(v_out)[1:]
+        # Edges, as if both had been differentiated.
+        variance_x = variance_y = frequency**-2.0
+        selected = frequency < ALIASED * rate
+    at = jnp.asarray(frequency)
+    z = np.asarray(fit.circuit.response(at))
+    gain = z / (z + np.asarray(driver.source.response(at)))
+    weight = selected / (variance_y + np.abs(gain) ** 2 * variance_x)
+    late = rest(gain * x, y, weight, 2 * np.pi * frequency / rate)
+    return round(late) if abs(late) > LEFT else 0
 
 
 def without_mains(lane: tuple[np.ndarray, ...], method: Method) -> tuple[np.ndarray, ...] | None:

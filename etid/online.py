@@ -48,11 +48,10 @@ from etid.judging import MAX_STEPS_REACHED, SUCCESSFUL, misses
 from etid.lanes import given
 from etid.methods import check_driver
 from etid.precision import require_float64
-from etid.preflight import Inspected, preflight
+from etid.preflight import Inspected, explained, preflight
 from etid.pulse import DAMPING, DELAYS, SETTLED, GainModel, Pulse, inverse_of_few, minimum, nearest
 from etid.recording import Recording
 from etid.results import LABELS, Fit, Fits, IdentificationError
-from etid.spectra import counted_pulse_rate
 from etid.traces import stored_jit
 from etid.transfer import as_complex, power, reciprocal
 from etid.verdicts import RESULTS, first_verdict, message, verdicts_of
@@ -149,10 +148,10 @@ class Tracker(eqx.Module):
         seen = Inspected(unloaded)
         name = preflight(seen, periodic=True)
         if name is not None:
-            text = f"unloaded recording {unloaded.path!r}: {name}. {message(name)}"
+            text = f"unloaded recording {unloaded.path!r}: {name}. {explained(seen, name)}"
             raise IdentificationError(text, None)
         rate = unloaded.sample_rate
-        period = rate / counted_pulse_rate(seen.v_th, rate, unloaded.pulse_rate)
+        period = rate / seen.train.counted
         bands = unloaded_bands(seen.v_th, float(seen.sigma_th), rate, period)
         known = given(driver, bands.frequency, False)
         assert driver.source is not None  # check_driver

@@ -7,13 +7,16 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from etid import rounding
+from etid.alignment import lag_of, shifted, whole_lag
 from etid.filtering import TAPS
 from etid.mains import Hum, separated
 from etid.measurement import trusted
 from etid.noise import noise_std
+from etid.pulse_train import CLOCK, PulseTrain, find_pulses
 from etid.recording import Recording
 from etid.remarks import Remark
-from etid.spectra import counted_pulse_rate, whole_periods
+from etid.spectra import whole_periods
+from etid.verdicts import message
 
 SHORTEST = 4 * TAPS + 104  # samples: the interpolation's edges and a hundred and some to fit
 FLAT = (
@@ -27,8 +30,6 @@ SAME = 1.5  # of the variance of the noise, by which they may differ then
 LATE = 5e-3  # of the signal, which a delay of a tenth of a sample leaves of the edges as well
 SEAM = 3  # samples on both sides of the joint between two periods
 STEP = 4.0  # standard deviations of the noise by which they may differ there
-SHIFT = 50e-6  # [s] that a load may delay v_out; R_th C_p is below 10 µs
-PERIODS = 2  # in which such a shift is looked for
 
 
 class Inspected:
@@ -123,14 +124,36 @@ class Inspected:
         """What is done to the recording before a fit."""
         hum = self.hum_th is not None or self.hum_out is not None
         coarse = self.coarse_th > 0 or self.coarse_out > 0
+        off = abs(self.train.counted / self.recording.pulse_rate - 1) > CLOCK
         found = Remark.mains_hum if hum else Remark(0)
-        return found | Remark.coarse_converter if coarse else found
+        found |= Remark.coarse_converter if coarse else Remark(0)
+        found |= Remark.aligned if self.lag else Remark(0)
+        return found | (Remark.pulse_rate_counted if off else Remark(0))
+
+    @functools.cached_property
+    def correlated(self) -> float | None:
+        """By how many samples `v_out` is late, up to one more by the load; None if misaligned."""
+        return lag_of(self.v_th, self.v_out, self.train)
+
+    @functools.cached_property
+    def lag(self) -> int:
+        """Whole samples by which `v_out` is late, and by which it is shifted before a fit."""
+        return 0 if self.correlated is None else whole_lag(self.correlated)
+
+    @property
+    def aligned(self) -> tuple[Float[np.ndarray, " overlap"], Float[np.ndarray, " overlap"]]:
+        """Both voltages [V] where they overlap after that shift."""
+        return shifted(self.v_th, self.v_out, self.lag)
+
+    @functools.cached_property
+    def train(self) -> PulseTrain:
+        """The pulses of `v_th`."""
+        return find_pulses(self.recorded_th, self.recording.sample_rate, self.recording.pulse_rate)
 
     @functools.cached_property
     def pulse_rate(self) -> float:
         """Pulse rate [Hz] by its own clock."""
-        of = self.recording
-        return counted_pulse_rate(self.recorded_th, of.sample_rate, of.pulse_rate)
+        return self.train.counted
 
     @functools.cached_property
     def periods(self) -> tuple[int, int]:
@@ -144,11 +167,10 @@ class Inspected:
         Periods are a whole number of samples long to within half a sample, which matters where the
         signal is steep at the joint.
         """
-        (periods, samples), of = self.periods, self.recording
+        periods, samples = self.periods
         if periods == 0:
             return False
-        rest = abs(periods * of.sample_rate / of.pulse_rate - samples)
-        rest = min(rest, 0.5)  # a clock that is off has been counted
+        rest = abs(periods * self.recording.sample_rate / self.train.counted - samples)
         for v, sigma in ((self.v_th, self.sigma_th), (self.v_out, self.sigma_out)):
             joint = np.concatenate([v[samples - SEAM : samples], v[:SEAM]])
             if rest * np.abs(np.diff(joint)).max() > STEP * trusted(v, sigma):
@@ -160,7 +182,7 @@ def preflight(seen: Inspected, *, periodic: bool = False) -> str | None:
     """Name the verdict that forbids a fit, or None.
 
     Verdicts: `too_short`, `nonfinite_samples`, `flat`, `saturated`, `unconnected`,
-    `misaligned`, `not_periodic`.
+    `rate_mismatch`, `misaligned`, `not_periodic`.
 
     Args:
         seen: Unloaded and loaded voltage.
@@ -179,11 +201,19 @@ def preflight(seen: Inspected, *, periodic: bool = False) -> str | None:
         return "saturated"
     if _is_unconnected(seen):
         return "unconnected"
-    if _is_misaligned(v_th, v_out, of):
+    if seen.train.mismatch:
+        return "rate_mismatch"
+    if np.var(v_out) > POWER * np.var(v_th) or seen.correlated is None:
         return "misaligned"
     if periodic and not seen.is_periodic:
         return "not_periodic"
     return None
+
+
+def explained(seen: Inspected, name: str) -> str:
+    """What a verdict of `preflight` means, with the numbers that were found."""
+    found = seen.train.mismatch if name == "rate_mismatch" else ""
+    return f"{found} {message(name)}".strip()
 
 
 def _is_flat(v: Float[np.ndarray, " time"], sigma: Float[np.ndarray, ""]) -> bool:
@@ -211,7 +241,7 @@ def _is_saturated(v: Float[np.ndarray, " time"], step: float, recording: Recordi
 
 def _is_unconnected(seen: Inspected) -> bool:
     """Whether v_out is v_th, but for noise, an offset and a part of a sample of delay."""
-    x, y = seen.v_th - seen.v_th.mean(), seen.v_out - seen.v_out.mean()
+    x, y = (v - v.mean() for v in seen.aligned)
     variance = seen.sigma_th**2 + seen.sigma_out**2
     power = x @ x - x.size * seen.sigma_th**2
     if abs((x @ y) / power - 1) > EQUAL + STEP * math.sqrt(variance / power):
@@ -220,17 +250,3 @@ def _is_unconnected(seen: Inspected) -> bool:
     rest = y - x
     rest = rest - late * ((late @ rest) / (late @ late))
     return bool(rest @ rest <= x.size * SAME * variance + LATE**2 * power)
-
-
-def _is_misaligned(
-    v_th: Float[np.ndarray, " time"], v_out: Float[np.ndarray, " time"], of: Recording
-) -> bool:
-    if np.var(v_out) > POWER * np.var(v_th):
-        return True
-    few = math.ceil(PERIODS * of.sample_rate / of.pulse_rate)
-    x, y = v_th[:few] - v_th[:few].mean(), v_out[:few] - v_out[:few].mean()
-    size = 1 << (2 * x.size - 1).bit_length()
-    correlation = np.fft.irfft(np.fft.rfft(y, size) * np.conj(np.fft.rfft(x, size)), size)
-    lag = int(np.argmax(correlation))
-    lag = lag - size if lag > size // 2 else lag
-    return abs(lag) > max(1.0, SHIFT * of.sample_rate)

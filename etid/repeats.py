@@ -26,7 +26,7 @@ from jaxtyping import Complex, Float
 
 from etid.measurement import RIPPLE
 from etid.preflight import Inspected
-from etid.spectra import CLOCK
+from etid.pulse_train import RATE
 
 BAND = 0.25  # of the sample rate; above it there is more of aliases than of the load
 DEGREE = 6  # of the polynomial: it holds 0.994 of the 0.83 turns of mains hum of 50 Hz
@@ -91,7 +91,7 @@ class Bands(NamedTuple):
 @functools.lru_cache(maxsize=16)
 def bands(sample_rate: float, pulse_rate: float) -> Bands:
     """The bands for a nominal pulse rate, whatever the clock makes of it."""
-    length = int((1 - CLOCK) * sample_rate / pulse_rate)
+    length = int((1 - RATE) * sample_rate / pulse_rate)
     size = _fast(length)
     count = int(BAND * size)
     edges = [*range(min(SINGLE, count))]

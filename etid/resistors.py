@@ -95,7 +95,7 @@ def disagree(
 
 def rough_impedance(calibration: Inspected) -> float:
     """About |Z_th| [Ω], from the amplitudes of both records alone."""
-    x, y = (v - v.mean() for v in (calibration.v_th, calibration.v_out))
+    x, y = (v - v.mean() for v in calibration.aligned)
     r_load = calibration.recording.r_load
     assert r_load is not None  # identify_driver
     return r_load * abs(float(x @ x / (y @ x)) - 1)

@@ -6,7 +6,8 @@ import numpy as np
 
 from etid.channels import Channel, located
 from etid.mapping import Plan
-from etid.recording import RecordingError
+from etid.pulse_train import find_pulses
+from etid.recording import Metadata, RecordingError
 from etid.units import Unit
 
 # Largest distance of a time stamp from a uniform grid, in sample periods: more than the rounding of
@@ -70,6 +71,28 @@ def sample_rate(
             remedy="Correct the one that is wrong",
         )
     return ours, f"{by}; file {theirs:.9g} Hz"
+
+
+def check_spacing(v_th: np.ndarray, metadata: Metadata) -> None:
+    """Compare the distance of the pulses with both rates.
+
+    Args:
+        v_th: The unloaded record or its beginning, in any unit.
+        metadata: Of the recording.
+
+    Raises:
+        RecordingError: The pulses are not as far apart as both rates say.
+    """
+    if not np.isfinite(v_th).all():
+        return
+    train = find_pulses(v_th, metadata.sample_rate, metadata.pulse_rate)
+    if train.mismatch:
+        raise RecordingError(
+            train.mismatch.removesuffix("."),
+            path=metadata.path,
+            field="pulse_rate",
+            remedy="Correct sample_rate or pulse_rate",
+        )
 
 
 def _agree(tolerance: float, *rates: float) -> bool:

@@ -16,6 +16,7 @@ import numpy as np
 from h5py import h5o  # type: ignore[attr-defined]  # compiled, without stubs
 
 from etid import limits, schema
+from etid.pulse_train import find_pulses
 from etid.recording import (
     SIGNALS,
     AbstractSource,
@@ -151,10 +152,11 @@ class Scan:
         return {row.metadata.path: row for block in self.blocks.values() for row in block.rows()}
 
     def check_samples(self) -> None:
-        """Read all samples; those that cannot be read or are not finite become problems."""
+        """Read all samples; what cannot be read, is not finite or denies the rates is a problem."""
         for path, source in self.sources().items():
             with self._reported(path):
-                for name, record in source.load().samples.items():
+                recording = source.load()
+                for name, record in recording.samples.items():
                     count = int(np.sum(~np.isfinite(record.stored)))
                     if count:
                         self._report(
@@ -163,6 +165,10 @@ class Scan:
                             f"{count} of {record.stored.size} samples are not finite",
                             "Record again, or expect a verdict instead of a fit",
                         )
+                train = find_pulses(recording.v_th, recording.sample_rate, recording.pulse_rate)
+                if train.mismatch:
+                    remedy = "Correct sample_rate or pulse_rate"
+                    self._report(path, "pulse_rate", train.mismatch.removesuffix("."), remedy)
 
     def _report(self, path: str, field: str, message: str, remedy: str = "") -> None:
         self.problems.append(

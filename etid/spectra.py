@@ -20,7 +20,6 @@ from jaxtyping import Array, Bool, Complex, Float
 
 WINDOW = 25  # harmonics over which power is averaged
 ALIASED = 0.35  # of the sample rate, above which aliases must be told from harmonics by frequency
-CLOCK = 3e-4  # by which a clock may be off
 DRIFT_DEGREE = 3  # of the polynomial by which the mean may drift
 ROOM = 64  # harmonics: records of all lengths have as many, a multiple of this
 ABSENT = 1e-6  # standard deviations, coefficients and noise of harmonics that only fill it
@@ -56,40 +55,6 @@ def whole_periods(samples: int, sample_rate: float, pulse_rate: float) -> tuple[
     """
     periods = int((samples + 0.5) * pulse_rate / sample_rate)
     return periods, min(samples, round(periods * sample_rate / pulse_rate))
-
-
-def counted_pulse_rate(
-    v: Float[np.ndarray, " time"], sample_rate: float, pulse_rate: float
-) -> float:
-    """Pulse rate as the converter's clock sees it, from one end of a record to the other.
-
-    A clock that is off by 50 ppm moves the last of 30 periods by five samples, by which the
-    harmonics above the 600th would be averaged away. It is counted to the nearest sample, of which
-    those harmonics keep at least 0.7.
-
-    Args:
-        v: A record.
-        sample_rate: Nominal rate of the converter [Hz].
-        pulse_rate: Nominal pulses per second [Hz].
-
-    Returns:
-        The nominal rate, unless the record shows a shift of two samples or more.
-    """
-    periods, _ = whole_periods(v.size, sample_rate, pulse_rate)
-    one = int(sample_rate / pulse_rate)
-    span = round((periods - 2) * sample_rate / pulse_rate)
-    reach = min(round(CLOCK * span), one // 8)
-    if reach < 2:
-        return pulse_rate
-    # Both parts begin half a period after the steepest edge, which is in their middle then.
-    begin = (int(np.argmax(np.abs(np.diff(v[:one])))) + one // 2) % one
-    early = v[begin + reach : begin + one - reach]
-    late = v[begin + span : begin + span + one]
-    mean = v[:one].mean()
-    size = 1 << (2 * one - 1).bit_length()
-    product = np.fft.rfft(late - mean, size) * np.conj(np.fft.rfft(early - mean, size))
-    lag = int(np.argmax(np.fft.irfft(product, size)[: 2 * reach + 1])) - reach
-    return pulse_rate if abs(lag) < 2 else pulse_rate * span / (span + lag)
 
 
 def separates_aliases(periods: int, samples: int) -> bool:

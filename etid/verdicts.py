@@ -87,6 +87,10 @@ class RESULTS(optx.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]  # equi
         "v_out carries more power than v_th, or is not aligned with it in time. "
         "Swap the two records, or align them on the edge of the pulse."
     )
+    rate_mismatch = (
+        "The pulses of v_th are not as far apart as sample_rate and pulse_rate say, and every time "
+        "constant would be wrong by that. Correct the number that is wrong."
+    )
     not_periodic = (
         "The record holds no whole pulse period, or begins in the middle of an edge. "
         "Record a whole number of periods, or use method='output_error'."

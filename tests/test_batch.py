@@ -175,8 +175,9 @@ def test_a_failed_driver_costs_its_own_recordings():
 def test_a_driver_without_success_is_kept_and_marks_its_fits(study):
     """Not refused before the fit, so there are numbers; but none of them may be trusted."""
     calibration = study["calibration/0"]
-    early = calibration.replace(v_out=np.roll(calibration.v_out, -3), adc_range=None)
-    records = [early, *(study[path] for path in list(study.loaded)[:2])]
+    v = calibration.v_out * np.std(calibration.v_th) / np.std(calibration.v_out)
+    more = calibration.replace(v_out=1.004 * v, adc_range=None)  # than without a load
+    records = [more, *(study[path] for path in list(study.loaded)[:2])]
     result = etid.identify_study(etid.Study.from_recordings(records))
     assert next(iter(result.drivers.values())).verdict != "successful"
     assert "successful" not in result.fits.counts()

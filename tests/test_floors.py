@@ -51,6 +51,8 @@ FLOORS = {
     "arrowhead": 3,
     "likelihood": 3,
     "preflight": 3,
+    "pulse_train": 0,
+    "alignment": 1,
     "study": 3,
     "prediction": 3,
     "steiglitz_mcbride": 4,

@@ -258,7 +258,6 @@ def inductor(f):
         (inductor, {}, {"unstable", "nonphysical"}),
         (ResistorLoad(328.9e3), {}, {"insensitive", "biased", "max_steps_reached"}),
         (LOADS["damp"], {"snr_db": None}, {"biased"}),
-        (LOADS["dry"], {"trigger_jitter_rms": 20e-6}, {"misfit", "nonphysical", "unstable"}),
         (
             LOADS["dry"],
             {"snr_db": 5.0},

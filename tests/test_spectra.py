@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 from etid import spectra
+from etid.pulse_train import find_pulses
 from etid.scenes import Scene, Trial
 from etid.spectra import (
     Spectrum,
-    counted_pulse_rate,
     harmonics,
     signal_share,
     whole_periods,
@@ -76,24 +76,6 @@ def test_the_share_of_signal_is_one_above_the_noise_half_at_it_and_nearly_zero_b
     assert share[2050:].mean() < 0.1
 
 
-@pytest.mark.parametrize("ppm", [0.0, 200.0, -200.0])
-@pytest.mark.parametrize("snr_db", [24.0, 60.0])
-def test_a_clock_that_is_off_is_counted(ppm, snr_db):
-    scene = Scene(
-        (Trial("a", ResistorLoad(1e5)),),
-        sample_rate=SLOW,
-        samples=25_200,
-        pulse_rate_ppm=ppm,
-        snr_db=snr_db,
-    )
-    record = scene.simulate(seed=4)["a"]
-    counted = counted_pulse_rate(record.v_th, SLOW, PULSE)
-    # The shift of 28 periods, 23 333 samples, is counted to less than one sample, 43 ppm.
-    assert abs(counted / PULSE - 1 - 1e-6 * ppm) < 43e-6
-    if ppm == 0.0:
-        assert counted == PULSE
-
-
 def test_harmonics_of_a_long_record_survive_a_clock_that_is_off():
     """By the nominal rate, 30 periods at 200 ppm would leave nothing of the 375th."""
     scene = Scene(
@@ -107,8 +89,8 @@ def test_harmonics_of_a_long_record_survive_a_clock_that_is_off():
         found = np.asarray(harmonics(record.v_th, periods, samples))[near]
         return np.sqrt(np.mean(np.abs(found) ** 2) / exact)
 
-    # Two halves of a sample at most, 42 ppm: 0.47 periods of the 375th, of which sinc leaves 0.67.
-    assert part_left(counted_pulse_rate(record.v_th, SLOW, PULSE)) > 0.66
+    # Half a sample at most, 21 ppm: 0.23 periods of the 375th, of which sinc leaves 0.91.
+    assert part_left(find_pulses(record.v_th, SLOW, PULSE).counted) > 0.9
     assert part_left(PULSE) < 0.3
 
 

@@ -86,7 +86,7 @@ def test_misaligned(study, driver):
     recording = study["loaded/0"]
     swapped = recording.replace(v_th=recording.v_out, v_out=recording.v_th)
     assert verdict_of(swapped, driver) == "misaligned"
-    shifted = recording.replace(v_out=np.roll(recording.v_out, 60))
+    shifted = recording.replace(v_out=np.roll(recording.v_out, 600))
     assert verdict_of(shifted, driver) == "misaligned"
 
 
@@ -107,20 +107,15 @@ def test_misfit(driver):
     assert verdict_of(simulate(two_layers)["loaded/0"], driver) == "misfit"
 
 
-def test_a_trigger_that_moved_by_two_samples_is_a_misfit(study, driver):
-    recording = study["loaded/0"]
-    late = recording.replace(v_out=np.roll(recording.v_out, 2), adc_range=None)
-    assert verdict_of(late, driver) == "misfit"
-
-
 def test_nonphysical_and_driver_failed(study):
-    """A response three samples before its cause belongs to no passive driver."""
+    """More at the load than without it, by half a per cent, is the work of no passive driver."""
     calibration = study["calibration/98k8"]
-    early = calibration.replace(v_out=np.roll(calibration.v_out, -3), adc_range=None)
-    driver = etid.identify_driver(early, throw=False)
+    v = calibration.v_out * np.std(calibration.v_th) / np.std(calibration.v_out)
+    more = calibration.replace(v_out=1.004 * v, adc_range=None)
+    driver = etid.identify_driver(more, throw=False)
     assert driver.verdict == "nonphysical"
     with pytest.raises(etid.IdentificationError, match="driver: nonphysical"):
-        etid.identify_driver(early)
+        etid.identify_driver(more)
     assert verdict_of(study["loaded/0"], driver) in ("driver_failed", "misfit")
 
 

@@ -1,0 +1,149 @@
+"""Records of two triggers are aligned by whole samples, before a fit and in it."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+import etid
+from etid import lanes
+from etid.alignment import lag_of, whole_lag
+from etid.preflight import Inspected, preflight
+from etid.pulse_train import find_pulses
+from etid.remarks import Remark
+from etid.scenes import Scene, Trial
+from etid.transformer import ResistorLoad, SkinLoad
+
+PULSE = 60.0
+LOADS = {
+    "dry": SkinLoad(r_s=33.4e3, r_p=186e3, c_p=0.12e-9),
+    "damp": SkinLoad(r_s=6.1e3, r_p=17.4e3, c_p=0.66e-9),
+    "resistor": ResistorLoad(21.62e3),
+}
+SIGMAS = 5.0  # one in 2 million for a normal error
+
+
+def simulate(late=0.0, sample_rate=200e3, seed=0, snr_db: float | None = 60.0, periods=3.0):
+    """Records whose `v_out` is late by so many samples; a pulse begins at 40 % of a period."""
+
+    def study(start):
+        return Scene(
+            tuple(Trial(name, load) for name, load in LOADS.items()),
+            (Trial("98k8", ResistorLoad(98.8e3)),),
+            sample_rate=sample_rate,
+            samples=round(periods * sample_rate / PULSE),
+            start=start,
+            snr_db=snr_db,
+        ).simulate(seed)
+
+    early, other = study(0.010), study(0.010 - late / sample_rate)
+    return {name: early[name].replace(v_out=other[name].samples["v_out"]) for name in early}
+
+
+@pytest.fixture(scope="module")
+def driver():
+    return etid.identify_driver(simulate(seed=5)["98k8"])
+
+
+@pytest.mark.parametrize("sample_rate", [100e3, 200e3, 500e3])
+@pytest.mark.parametrize("late", [0.0, 1.5, 50.3, -300.0])
+def test_the_lag_is_found_to_less_than_a_sample_at_20_db(sample_rate, late):
+    """A damp skin's own delay is 2.5 µs, half of it in the edges: half a sample at 500 kHz."""
+    for name, record in simulate(late, sample_rate, snr_db=20.0, periods=1.0).items():
+        train = find_pulses(record.v_th, sample_rate, PULSE)
+        lag = lag_of(record.v_th, record.v_out, train)
+        assert lag is not None, name
+        assert abs(lag - late) < 1.0, name
+        assert (whole_lag(lag) == 0) == (late == 0.0)
+
+
+def test_a_late_record_without_a_load_is_unconnected():
+    record = simulate(5.0, periods=1.0)["dry"]
+    both = record.replace(v_out=np.roll(record.v_th, 5))
+    assert preflight(Inspected(both)) == "unconnected"
+
+
+def test_opposite_polarity_and_lags_out_of_reach_are_misaligned():
+    record = simulate(periods=1.0)["damp"]
+    assert Inspected(record.replace(v_out=-record.v_out)).correlated is None
+    for late in (450.0, -450.0):
+        assert preflight(Inspected(simulate(late, periods=1.0)["damp"])) == "misaligned"
+
+
+@pytest.mark.parametrize("late", [3, -120])
+def test_what_is_fitted_does_not_depend_on_whole_samples(late):
+    """To the steps of a 16-bit converter: nothing wraps around, and the phases are exact."""
+    there, here = Inspected(simulate(late, snr_db=None)["dry"]), simulate(snr_db=None)["dry"]
+    assert there.lag == late
+    harmonic, right = lanes.lane(there, "maximum_likelihood"), Inspected(here)
+    step = 10 / 2**15 / 0.0535  # rounding of two records, shared by 10 000 samples
+    *_, y, _, _, _, _ = lanes.lane(right, "maximum_likelihood")
+    np.testing.assert_allclose(harmonic[2], y, atol=6 * step / np.sqrt(10_000))
+    v_th, v_out, *_, size = lanes.lane(there, "output_error")
+    assert size == 10_000 - abs(late)
+    begin = max(0, -late)
+    np.testing.assert_array_equal(v_th[:size], here.v_th[begin : begin + size])
+    np.testing.assert_allclose(v_out[:size], here.v_out[begin : begin + size], atol=1.01 * step)
+    assert not v_out[size:].any()
+
+
+def test_elements_are_those_without_the_delay(driver):
+    names = ("dry", "damp", "dry")
+    lates = zip(names, (1.5, -5.0, 300.0), strict=True)
+    records = [simulate(late, seed=8)[name] for name, late in lates]
+    fits = etid.identify_skins(records, driver)
+    assert fits.counts() == {"successful": 3}
+    assert (np.asarray(fits.fit.remarks) == Remark.aligned).all()
+    truth = np.array([dataclasses.astuple(LOADS[name]) for name in names])
+    wrong = np.abs(np.asarray(fits.circuit.values()) - truth)
+    assert (wrong < SIGMAS * np.asarray(fits.stderr.values())).all()
+    # The prediction is that of the record as it is: to its noise, 10 mV, and that of V_th.
+    circuit = etid.SkinRC(*map(float, np.asarray(fits.circuit.values())[0]))
+    off = etid.predict(records[0], driver, circuit) - records[0].v_out
+    assert np.nanstd(off) < 2 * np.sqrt(2) * float(Inspected(records[0]).sigma_out)
+
+
+def test_a_calibration_that_is_late_serves_as_well():
+    late = etid.identify_driver(simulate(-5.0, seed=6)["98k8"])
+    assert late.remarks == Remark.aligned
+    fit = etid.identify_skin(simulate(seed=8)["dry"], late)
+    wrong = np.abs(np.asarray(fit.circuit.values()) - dataclasses.astuple(LOADS["dry"]))
+    assert (wrong < SIGMAS * np.asarray(fit.stderr.values())).all()
+
+
+def test_what_looks_later_than_it_is_is_aligned_again(driver, monkeypatch):
+    """Edges that a load smoothes may be found two samples late: the misfit tells how many."""
+    monkeypatch.setattr("etid.preflight.whole_lag", lambda lag: round(lag) - 2)
+    record = simulate(7.0, seed=8)["dry"]
+    alone = etid.identify_skin(record, driver)
+    fits = etid.identify_skins([record, simulate(0.0, seed=9)["dry"]], driver)
+    assert fits.counts() == {"successful": 2}
+    for fit in (alone.circuit.values(), np.asarray(fits.circuit.values())[0]):
+        wrong = np.abs(np.asarray(fit) - dataclasses.astuple(LOADS["dry"]))
+        assert (wrong < SIGMAS * np.asarray(alone.stderr.values())).all()
+
+
+@pytest.mark.slow
+def test_a_joint_fit_aligns_its_recordings():
+    study, late = simulate(0.0, seed=3), simulate(40.4, seed=4)
+    names = ("dry", "damp")
+    trials = [study[n].replace(path=f"a/{n}") for n in names]
+    trials += [late[n].replace(path=f"b/{n}") for n in names]
+    found = etid.identify_jointly(etid.Study.from_recordings([study["98k8"], *trials]))
+    assert found.fits.counts() == {"successful": 4}
+    truth = np.array([dataclasses.astuple(LOADS[name]) for name in names * 2])
+    wrong = np.abs(np.asarray(found.fits.circuit.values()) - truth)
+    assert (wrong < SIGMAS * np.asarray(found.fits.stderr.values())).all()
+    remarks = np.asarray(found.fits.fit.remarks)
+    np.testing.assert_array_equal(remarks, [0, 0, int(Remark.aligned), int(Remark.aligned)])
+
+
+@pytest.mark.slow
+def test_output_error_aligns_its_recordings():
+    records = simulate(30.2, seed=3, periods=1.5)
+    driver = etid.identify_driver(records["98k8"])
+    assert driver.method == "output_error"
+    for name in ("dry", "damp"):
+        fit = etid.identify_skin(records[name], driver)
+        wrong = np.abs(np.asarray(fit.circuit.values()) - dataclasses.astuple(LOADS[name]))
+        assert (wrong < SIGMAS * np.asarray(fit.stderr.values())).all()

@@ -1,0 +1,117 @@
+"""The distance of the pulses is measured, and compared with what a file says of both rates."""
+
+import numpy as np
+import pytest
+
+import etid
+from etid.preflight import Inspected, explained, preflight
+from etid.pulse_train import CLOCK, find_pulses
+from etid.remarks import Remark
+from etid.scenes import Scene, Trial
+from etid.transformer import ResistorLoad, SkinLoad
+
+DAMP = SkinLoad(r_s=6.1e3, r_p=17.4e3, c_p=0.66e-9)
+PULSE = 60.0
+
+
+def simulate(sample_rate=200e3, periods=3.0, seed=1, **options):
+    scene = Scene(
+        (Trial("a", DAMP),),
+        (Trial("98k8", ResistorLoad(98.8e3)),),
+        sample_rate=sample_rate,
+        samples=int(periods * sample_rate / PULSE) + 1,
+        **options,
+    )
+    return scene.simulate(seed)["a"]
+
+
+@pytest.mark.parametrize("sample_rate", [100e3, 1e6])
+@pytest.mark.parametrize("start", [0.0, 0.5e-3, 10e-3])  # before, in and after a pulse
+def test_pulses_are_found_and_right_rates_pass(sample_rate, start):
+    record = simulate(sample_rate, 4.0, snr_db=20.0, start=start)
+    for periods in (1.0, 1.5, 2.0, 3.0, 4.0):
+        v_th = record.v_th[: int(periods * sample_rate / PULSE) + 1]
+        train = find_pulses(v_th, sample_rate, PULSE)
+        assert train.mismatch == ""
+        assert train.counted == PULSE
+        assert train.edges.size in (int(periods), int(periods) + 1)
+        if train.spacing is not None:
+            # 1 V of noise on edges of 20 V per sample, a fifth of it at 1 MHz: below half a sample.
+            span = train.edges.size - 1
+            assert span * abs(train.spacing - sample_rate / PULSE) < 0.5
+
+
+@pytest.fixture(scope="module", params=[100e3, 200e3, 500e3])
+def noisy(request):
+    return simulate(request.param, 6.0, snr_db=20.0)
+
+
+@pytest.mark.parametrize("periods", [1.5, 2.0, 3.0, 6.0])
+@pytest.mark.parametrize("factor", [1 / 3, 0.5, 0.99, 1.01, 2.0, 3.0])
+def test_a_wrong_rate_is_a_mismatch(noisy, periods, factor):
+    """Half and double distances are no way out; from 1.5 periods on two pulses are there."""
+    rate, size = noisy.sample_rate, int(periods * noisy.sample_rate / PULSE) + 1
+    record = noisy.replace(v_th=noisy.v_th[:size], v_out=noisy.v_out[:size], adc_range=None)
+    for changes in ({"sample_rate": factor * rate}, {"pulse_rate": PULSE / factor}):
+        wrong = record.replace(**changes)
+        assert preflight(Inspected(wrong)) == "rate_mismatch"
+        # Either number explains it, to a sample.
+        text = explained(Inspected(wrong), "rate_mismatch")
+        right = wrong.sample_rate * PULSE / rate, wrong.pulse_rate * rate / PULSE
+        found = [float(part.split(" Hz")[0]) for part in text.split("rate = ")[1:]]
+        np.testing.assert_allclose(found, right[::-1], rtol=2 * PULSE / rate)
+
+
+def test_a_second_pulse_that_is_missing_or_too_many_is_a_mismatch():
+    one = simulate(periods=1.0)
+    assert "one pulse" in find_pulses(one.v_th, 100e3, PULSE).mismatch
+    assert find_pulses(one.v_th, 400e3, PULSE).mismatch == ""  # half a period: nothing to compare
+    assert find_pulses(simulate(periods=1.5).v_th, 600e3, PULSE).mismatch != ""
+
+
+@pytest.mark.parametrize("periods", [3.0, 30.0])
+@pytest.mark.parametrize("ppm", [0.0, 200.0, -1000.0])
+def test_a_clock_that_is_off_is_counted_and_said(periods, ppm):
+    record = simulate(50e3, periods, pulse_rate_ppm=ppm, snr_db=24.0)
+    seen = Inspected(record)
+    counted = seen.train.counted / PULSE - 1
+    # To half a sample from the first pulse to the last, and not if it is less than that.
+    span = (periods - 1) * 50e3 / PULSE
+    assert abs(counted - 1e-6 * ppm) < 0.5 / span
+    assert (counted == 0) == (abs(ppm) * 1e-6 * span < 0.5)
+    assert preflight(seen) is None
+    assert seen.remarks == (Remark.pulse_rate_counted if abs(ppm) * 1e-6 > CLOCK else Remark(0))
+
+
+def test_other_signals_have_no_pulses_to_compare():
+    generator = np.random.default_rng(0)
+    time = np.arange(10_000.0)
+    for v in (generator.normal(size=10_000), time, -time, np.zeros(10_000), np.zeros(0)):
+        train = find_pulses(v, 200e3, PULSE)
+        assert train.spacing is None
+        assert train.mismatch == ""
+        assert train.counted == PULSE
+
+
+def test_identify_says_which_spacing_was_found():
+    record = simulate().replace(sample_rate=100e3, r_load=98.8e3, calibration=())
+    with pytest.raises(etid.IdentificationError, match=r"rate_mismatch.* 3333\.\d+ samples apart"):
+        etid.identify_driver(record)
+
+
+def test_check_and_import_compare_the_rates(tmp_path):
+    record = simulate()
+    wrong = record.replace(sample_rate=100e3, calibration=())
+    etid.Study.from_recordings([wrong]).write(tmp_path / "wrong.h5")
+    [problem] = etid.check(tmp_path / "wrong.h5")
+    assert (problem.path, problem.field) == ("a", "pulse_rate")
+    assert "3333." in str(problem)
+    assert "sample_rate = 200000 Hz" in str(problem)
+    table = np.stack([record.v_th, record.v_out], axis=1)
+    np.savetxt(tmp_path / "a.csv", table, delimiter=",", header="th,out", comments="")
+    names = {"v_th": "th", "v_out": "out", "sample_rate": 200e3, "scale": 1}
+    etid.import_file(tmp_path / "a.csv", tmp_path / "a.h5", pulse_rate=60.0, **names)
+    assert etid.check(tmp_path / "a.h5") == []
+    with pytest.raises(etid.RecordingError, match=r"pulse_rate: .*pulse_rate = 60 Hz"):
+        etid.import_file(tmp_path / "a.csv", tmp_path / "b.h5", pulse_rate=120.0, **names)
+    assert not (tmp_path / "b.h5").exists()
