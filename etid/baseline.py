@@ -32,6 +32,7 @@ from etid.measurement import Measurement
 from etid.results import Fit
 from etid.spectra import Spectrum
 from etid.transfer import Rational, as_complex, frequency_variable, reciprocal, turns
+from etid.unloaded import UnloadedShape
 from etid.verdicts import RESULTS, first_verdict
 
 BIASED = 16.0  # squared standard errors between an estimate and the minimum of its own model
@@ -99,9 +100,16 @@ def skin_by_steiglitz_mcbride(m: Measurement, driver: Driver, iterations: int) -
 
 
 def skin_by_harmonic_steiglitz_mcbride(
-    spectrum: Spectrum, sample_rate: Float[Array, ""], driver: Driver
+    spectrum: Spectrum, sample_rate: Float[Array, ""], driver: Driver, known: UnloadedShape | None
 ) -> Fit:
-    """SkinRC by Steiglitz-McBride on the harmonics, judged by the likelihood with Z_th as it is."""
+    """SkinRC by Steiglitz-McBride on the harmonics, judged by the likelihood with Z_th as it is.
+
+    Args:
+        spectrum: One recording.
+        sample_rate: Its sampling rate [Hz].
+        driver: Its driver.
+        known: The unloaded voltage of its calibration, if it can be compared.
+    """
     source, source_cov = driver.source, driver.later_cov()
     assert source is not None  # check_driver
     best = harmonic_steiglitz_mcbride.fit_skin(spectrum, source.response(spectrum.frequency))
@@ -126,6 +134,7 @@ def skin_by_harmonic_steiglitz_mcbride(
     errors = jnp.diagonal(own + shared)  # of the logarithms, squared
     fitted = best.circuit.with_log_values(at[:-1])
     other = _is_another(spectrum, noise, at, sample_rate, fitted, driver)
+    changed = jnp.array(False) if known is None else known.differs(spectrum)
     return Fit(
         circuit=best.circuit,
         cov=(own + shared) * jnp.outer(values, values),
@@ -139,6 +148,7 @@ def skin_by_harmonic_steiglitz_mcbride(
             (misses(chi2, best.rrse) | (jnp.abs(late) > 1), RESULTS.misfit),
             (~(_distance(equations) <= BIASED), RESULTS.biased),
             (~jnp.all((errors > 0) & (errors < 1)), RESULTS.insensitive),
+            (changed, RESULTS.inconsistent),
             (other, RESULTS.misfit),
             (driver.result != SUCCESSFUL, RESULTS.driver_failed),
         ),

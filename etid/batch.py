@@ -25,9 +25,9 @@ from etid.arguments import circuit_of, order_of, require
 from etid.arguments import recordings as several
 from etid.circuits import AbstractCircuit
 from etid.driver import Driver
-from etid.given_driver import GivenDriver
 from etid.identify import failed_fit, identify_driver, note
 from etid.lanes import (
+    Known,
     is_shared,
     known_driver,
     lane,
@@ -61,7 +61,7 @@ def _chunk(
     lanes: Any,
     count: Int[Array, ""],
     driver: Driver,
-    known: GivenDriver | None,
+    known: Known,
     circuit: AbstractCircuit,
     method: Method,
 ) -> Fit:
@@ -154,7 +154,7 @@ class _Queue:
     def __init__(
         self,
         driver: Driver,
-        known: GivenDriver | None,
+        known: Known,
         circuit: AbstractCircuit,
         method: Method,
     ):

@@ -29,6 +29,7 @@ from etid.measurement import Measurement
 from etid.results import Fit
 from etid.spectra import Spectrum
 from etid.transfer import poles
+from etid.unloaded import UnloadedShape
 from etid.verdicts import RESULTS, first_verdict
 
 CORRECTED = (
@@ -156,9 +157,13 @@ def skin_by_maximum_likelihood(
 
 
 def skin_by_non_parametric(
-    spectrum: Spectrum, sample_rate: Float[Array, ""], driver: Driver, circuit: AbstractCircuit
+    spectrum: Spectrum,
+    sample_rate: Float[Array, ""],
+    driver: Driver,
+    known: UnloadedShape | None,
+    circuit: AbstractCircuit,
 ) -> Fit:
-    """The same with Z_th as the calibrations show it at each harmonic."""
+    """The same with Z_th as the calibrations show it at each harmonic, and their V_th."""
     source, calibration = driver.source, driver.calibration
     assert source is not None  # check_driver
     assert calibration is not None
@@ -168,6 +173,8 @@ def skin_by_non_parametric(
     )
     # It needs the harmonics of the driver, whether or not a model of them was found.
     fit = judged(estimate, circuit, SUCCESSFUL, "non_parametric")
+    if known is not None:
+        fit = unless(fit, known.differs(spectrum), RESULTS.inconsistent)
     far = jnp.any(jnp.abs(bias) > CORRECTED * jnp.sqrt(jnp.diagonal(estimate.cov)))
     return unless(unless(fit, far, RESULTS.biased), other, RESULTS.misfit)
 

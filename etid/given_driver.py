@@ -38,7 +38,7 @@ from etid.likelihood import (
 from etid.maximum_likelihood import Calibrations
 from etid.spectra import Spectrum
 from etid.transfer import as_complex, reciprocal
-from etid.unloaded import UnloadedShape, shape
+from etid.unloaded import UnloadedShape, shape_of
 
 RIDGE = 1e-12  # of the scaled curvature; below it double precision sees nothing
 
@@ -153,9 +153,7 @@ def given(
         if found.gain_slopes is not None:
             gain_slopes = found.gain_slopes.at[c.size :].set(0.0)
             found = dataclasses.replace(found, gain_slopes=gain_slopes)
-    if records[0].x.shape != frequency.shape:
-        return found
-    return dataclasses.replace(found, shape=shape(records[0], driver.drift))
+    return dataclasses.replace(found, shape=shape_of(driver, frequency))
 
 
 def around(

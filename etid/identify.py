@@ -51,6 +51,7 @@ from etid.repeats import repeats
 from etid.results import Fit, IdentificationError
 from etid.spectra import Spectrum, separates_aliases, spectrum, whole_periods
 from etid.traces import stored_jit
+from etid.unloaded import shape_of
 from etid.verdicts import message, verdict
 
 # |Z_th| [Ω] at 1 kHz: from a microphone's transformer to a tube's.
@@ -303,6 +304,8 @@ def identify_samples(
         samples = (*map(jnp.asarray, fields), rate)
         if method == "maximum_likelihood":
             known = estimation.given(driver, samples[0], True)
+        else:
+            known = shape_of(driver, samples[0])
     fit = skin_lane(samples, driver, known, circuit, method)
     return dataclasses.replace(fit, remarks=jnp.zeros_like(fit.remarks))  # nothing is left out
 

@@ -47,7 +47,8 @@ from etid.spectra import Spectrum
 from etid.study import Study
 from etid.study_fits import StudyFits
 from etid.traces import stored_jit
-from etid.verdicts import RESULTS
+from etid.unloaded import shape_of
+from etid.verdicts import RESULTS, verdict
 
 METHOD = "joint"
 SINGLE = (
@@ -57,11 +58,14 @@ SINGLE = (
 
 
 @stored_jit
-def _alone(lanes: Any, count: Int[Array, ""], model: Joint) -> tuple[Loads, Bool[Array, " load"]]:
+def _alone(
+    lanes: Any, count: Int[Array, ""], model: Joint, driver: Driver
+) -> tuple[Loads, Bool[Array, " load"], Bool[Array, " load"]]:
     """Loads identified one by one with Z_th as it is, where a joint fit may start.
 
-    And whether each shows mains hum.
+    And whether each shows mains hum, and that the driver has changed since its calibration.
     """
+    known = shape_of(driver, lanes[0][0])
 
     def one(lane):
         *fields, sample_rate = lane
@@ -71,7 +75,8 @@ def _alone(lanes: Any, count: Int[Array, ""], model: Joint) -> tuple[Loads, Bool
         own, result, chi2, error, hum = fit_load(model, spectrum, sample_rate, starts)
         settled = RESULTS.promote(result) == RESULTS.successful
         good = settled & jnp.isfinite(chi2) & ~judging.misses(chi2, error)
-        return Loads(spectrum, sample_rate, own, good, jnp.array(-1)), hum
+        changed = jnp.array(False) if known is None else known.differs(spectrum)
+        return Loads(spectrum, sample_rate, own, good & ~changed, jnp.array(-1)), hum, changed
 
     return each(one, lanes, count)
 
@@ -116,12 +121,14 @@ def _together(
 class _Waiting:
     """Recordings with equally many harmonics and one driver."""
 
-    def __init__(self, model: Joint):
+    def __init__(self, model: Joint, driver: Driver):
         self.model = model
+        self.driver = driver
         self.rows: list[int] = []
         self.lanes: list[tuple[np.ndarray, ...]] = []
         self.chunks: list[Loads] = []
         self.remarks: list[int] = []
+        self.changed: list[bool] = []  # since the calibration of the driver
         self.unloaded: list[int] = []
         self.repeats: list[Repeats | None] = []
         self.seen: list[Inspected] = []  # those of `lanes`
@@ -139,7 +146,7 @@ class _Waiting:
         if not self.lanes:
             return
         first = len(self.rows) - len(self.lanes)
-        loads, hum = self._alone(self.lanes)
+        loads, hum, changed = self._alone(self.lanes)
         late = loads.own[:, -1]
         late = np.where(np.abs(late) > 1, np.round(late), 0)  # more than a fit allows for
         if np.any(late) and np.isfinite(late).all():
@@ -147,26 +154,28 @@ class _Waiting:
                 one = self.lanes[number]
                 self.lanes[number] = realigned(one, "maximum_likelihood", int(delay))
                 self.remarks[first + number] |= Remark.aligned if delay else 0
-            loads, hum = self._alone(self.lanes)
+            loads, hum, changed = self._alone(self.lanes)
         again = {}
         for number, one in enumerate(self.lanes):
             few = without_mains(one, "maximum_likelihood")
             if few is not None and (hum[number] or not loads.used[number]):
                 again[number] = few
         if again:
-            others, seen = self._alone(list(again.values()))
+            others, seen, _ = self._alone(list(again.values()))
             for row, number in enumerate(again):
                 if others.used[row] and seen[row]:
                     self.remarks[first + number] |= Remark.mains_hum
                     for leaf, other in zip(*map(jax.tree.leaves, (loads, others)), strict=True):
                         leaf[number] = other[row]
         self.chunks.append(loads)
+        self.changed += changed.tolist()
         self.repeats += repeats(self.seen)
         self.lanes, self.seen = [], []
 
-    def _alone(self, lanes: list[tuple[np.ndarray, ...]]) -> tuple[Loads, np.ndarray]:
+    def _alone(self, lanes: list[tuple[np.ndarray, ...]]) -> tuple[Loads, np.ndarray, np.ndarray]:
         count = len(lanes)
-        found = jax.device_get(_alone(filled(lanes), jnp.asarray(count), self.model))
+        of = self.model, self.driver
+        found = jax.device_get(_alone(filled(lanes), jnp.asarray(count), *of))
         return jax.tree.map(lambda leaf: leaf[:count].copy(), found)
 
     def several(self) -> list[int]:
@@ -237,7 +246,7 @@ def identify_jointly(
         shared = is_shared(seen, driver)
         key = seen.v_th.size, shared, seen.recording.sample_rate, seen.recording.pulse_rate
         if key not in lengths:
-            lengths[key] = _Waiting(_model(circuit, driver, shared))
+            lengths[key] = _Waiting(_model(circuit, driver, shared), driver)
         lengths[key].add(row, seen)
     for names, lengths in tqdm(waiting.items(), unit="driver", disable=not progress):
         driver = drivers.found[names]
@@ -247,10 +256,13 @@ def identify_jointly(
         tolerance = jnp.asarray(r_load_tolerance, dtype=float)
         model = _model(circuit, driver, shared)
         found, better = _together(model, groups, several, driver, tolerance)
+        changed = any(any(group.changed) for group in lengths.values())
+        if changed and not any(np.any(loads.used) for loads in groups):
+            better = dataclasses.replace(better, result=verdict("inconsistent"))
         drivers.found[names] = dataclasses.replace(better, method=METHOD)
         for group, fit in zip(lengths.values(), jax.device_get(found), strict=True):
-            of_group = zip(group.remarks, unstacked(fit), strict=True)
-            marked = [remarked(one, remarks) for remarks, one in of_group]
+            of_group = zip(group.remarks, group.changed, unstacked(fit), strict=True)
+            marked = [remarked(_of(one, changed), remarks) for remarks, changed, one in of_group]
             judged = changes.judged(marked, better, group.repeats)
             for row, one in zip(group.rows, judged, strict=True):
                 fits[row] = one
@@ -259,6 +271,12 @@ def identify_jointly(
     outcome = table(study, paths, ordered, notes)
     settings = Settings.of(study, len(paths), order, METHOD, circuit, r_load_tolerance)
     return StudyFits(outcome, drivers.found, drivers.failures, settings)
+
+
+def _of(fit: Fit, changed: bool) -> Fit:
+    """The fit with the verdict of a driver that has changed since its calibration."""
+    explained = changed and fit.verdict in ("successful", "misfit")
+    return dataclasses.replace(fit, result=verdict("inconsistent")) if explained else fit
 
 
 def _model(circuit: AbstractCircuit, driver: Driver, shared: bool) -> Joint:

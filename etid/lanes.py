@@ -28,10 +28,13 @@ from etid.remarks import Remark
 from etid.results import Fit
 from etid.spectra import ALIASED, Spectrum, spectrum
 from etid.traces import stored_jit
+from etid.unloaded import UnloadedShape, shape_of
 from etid.verdicts import verdict
 
 LEFT = 0.75  # samples that are worth another fit; the delay that a fit allows for is 0.5
 _Outcome = TypeVar("_Outcome", Fit, Driver)
+# All that is the same for the loads of one driver: for maximum likelihood, for others on harmonics.
+Known = GivenDriver | UnloadedShape | None
 STEPS = 4  # lengths in an octave: the longest filling is a fifth
 
 
@@ -176,6 +179,12 @@ def driver_of(
 
 
 @stored_jit
+def unloaded(driver: Driver, frequency: Float[Array, " harmonic"]) -> UnloadedShape | None:
+    """The unloaded voltage that loads of a driver must have, for other methods on harmonics."""
+    return shape_of(driver, frequency)
+
+
+@stored_jit
 def given(driver: Driver, frequency: Float[Array, " harmonic"], shared: bool) -> GivenDriver:
     """What all loads of a driver need to know of it for maximum likelihood."""
     return estimation.given(driver, frequency, shared)
@@ -183,17 +192,20 @@ def given(driver: Driver, frequency: Float[Array, " harmonic"], shared: bool) ->
 
 def known_driver(
     lane: tuple[np.ndarray, ...], driver: Driver, method: Method, shared: bool
-) -> GivenDriver | None:
-    """`given`, if the method needs it, for this lane and all with harmonics like it."""
-    if method != "maximum_likelihood":
+) -> Known:
+    """What the method needs to know of a driver, for this lane and all with harmonics like it."""
+    if method not in HARMONIC:
         return None
-    return given(driver, jnp.asarray(lane[0]), shared)
+    frequency = jnp.asarray(lane[0])
+    if method == "maximum_likelihood":
+        return given(driver, frequency, shared)
+    return unloaded(driver, frequency)
 
 
 def skin_lane(
     lane: Any,
     driver: Driver,
-    known: GivenDriver | None,
+    known: Known,
     circuit: AbstractCircuit,
     method: Method,
 ) -> Fit:
@@ -206,11 +218,11 @@ def skin_lane(
         return baseline.skin_by_steiglitz_mcbride(m, driver, iterations(method))
     *fields, rate = lane
     spectrum = Spectrum(*fields)
+    if isinstance(known, GivenDriver):
+        return estimation.skin_by_maximum_likelihood(spectrum, rate, driver, known, circuit)
     if method == "harmonic_steiglitz_mcbride":
-        return baseline.skin_by_harmonic_steiglitz_mcbride(spectrum, rate, driver)
-    if known is None:
-        return estimation.skin_by_non_parametric(spectrum, rate, driver, circuit)
-    return estimation.skin_by_maximum_likelihood(spectrum, rate, driver, known, circuit)
+        return baseline.skin_by_harmonic_steiglitz_mcbride(spectrum, rate, driver, known)
+    return estimation.skin_by_non_parametric(spectrum, rate, driver, known, circuit)
 
 
 skin = stored_jit(skin_lane)

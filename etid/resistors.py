@@ -89,7 +89,9 @@ def disagree(
     """
     off, error = mismatch
     squares = (off / error) ** 2
-    explained = squares > EXPLAINED * (chi2 - 1) * terms
+    # Errors are those of the noise that a resistor leaves, χ² counts in that of the records.
+    left = jnp.maximum(chi2 / (1 + squares / terms), 1.0)
+    explained = squares * left > EXPLAINED * (chi2 - 1) * terms
     return jnp.any((squares > SEEN**2) & (jnp.abs(off) > SIZE) & explained)
 
 

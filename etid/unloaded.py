@@ -20,6 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Complex, Float
 
+from etid.driver import Driver
 from etid.likelihood import excess
 from etid.spectra import Spectrum, signal_share
 from etid.transfer import as_complex, power, turns
@@ -114,3 +115,19 @@ def shape(spectrum: Spectrum, drift: Float[Array | np.ndarray, ""] | None = None
     bias = directions @ (jnp.concatenate([x.real, x.imag]) * jnp.tile(share, 2))
     least = jnp.asarray(SIZE) + DRIFT * (0.0 if drift is None else drift)
     return UnloadedShape(f, x, spectrum.variance_x, directions, bias, least)
+
+
+def shape_of(driver: Driver, frequency: Float[Array, " harmonic"]) -> UnloadedShape | None:
+    """The unloaded voltage of the first calibration of a driver.
+
+    Args:
+        driver: The driver.
+        frequency: Harmonics of the loads [Hz].
+
+    Returns:
+        None if the driver has no harmonics, or others than the loads.
+    """
+    known = None if driver.calibration is None else driver.calibration.spectra
+    if known is None or known.x.shape[1:] != frequency.shape:
+        return None
+    return shape(jax.tree.map(lambda leaf: leaf[0], known), driver.drift)

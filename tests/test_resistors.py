@@ -38,6 +38,19 @@ def test_of_two_resistors_one_that_is_5_percent_wrong_is_seen(calibrations, fact
     assert "r_load 216.6 kΩ is " in str(driver)
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("which", [0, 1])
+def test_in_noise_of_40_db_one_that_is_5_percent_wrong_is_seen(which):
+    """Chi2 is 1.03 or less."""
+    trials = tuple(Trial(f"calibration/{i}", ResistorLoad(r)) for i, r in enumerate(KNOWN))
+    study = Scene(calibration=trials, snr_db=40.0, trigger_jitter_rms=50e-9).simulate(seed=1)
+    records = [study[trial.path] for trial in trials]
+    records[which] = records[which].replace(r_load=1.05 * KNOWN[which])
+    driver = etid.identify_driver(records, throw=False)
+    assert driver.verdict == "resistors_disagree"
+    assert driver.chi2 < 1.5
+
+
 def test_a_resistor_in_kilohm_beside_one_in_ohm_is_seen(calibrations):
     first, second = calibrations
     with pytest.raises(etid.IdentificationError, match="resistors_disagree") as raised:
