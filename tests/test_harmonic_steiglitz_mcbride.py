@@ -261,7 +261,8 @@ def inductor(f):
         (
             LOADS["dry"],
             {"snr_db": 5.0},
-            {"insensitive", "max_steps_reached", "unstable", "nonphysical"},
+            # Dry skin hardly loads the driver: in this noise both records may be the same.
+            {"insensitive", "max_steps_reached", "unstable", "nonphysical", "unconnected"},
         ),
     ],
 )
