@@ -109,7 +109,12 @@ def loaded(source: SourceImpedance, load: Rational, rate: float | Float[Array, "
     The current i = (V_th − C₁x₁ − C₂x₂) / (D₁ + D₂) drives both impedances, x₁ the source's states,
     x₂ the load's.
     """
-    z1, z2 = source.state_space(), realise(load, rate)
+    return connected(source, realise(load, rate))
+
+
+def connected(source: SourceImpedance, z2: StateSpace) -> StateSpace:
+    """The same with a load that is realised, current [A] to voltage [V]."""
+    z1 = source.state_space()
     total = z1.D[0] + z2.D[0]
     drop = jnp.concatenate([z1.C, z2.C])
     B = jnp.concatenate([z1.B, z2.B]) / total

@@ -81,11 +81,12 @@ def skin_by_output_error(
     if isinstance(circuit, SkinRC):
         baseline = skin_by_steiglitz_mcbride(m, driver, steiglitz_mcbride.ITERATIONS).circuit
     starts = circuit.with_log_values(circuit_starts(circuit, baseline))
-    _, estimate = output_error.fit_circuit(
+    _, estimate, other = output_error.fit_circuit(
         prediction.prepare(m, samples=samples), source, source_cov, calibration, starts
     )
     fit = judged(estimate, circuit, driver.result, "output_error")
-    return unless(fit, misses(estimate.chi2, estimate.rrse, INTERPOLATED), RESULTS.biased)
+    fit = unless(fit, misses(estimate.chi2, estimate.rrse, INTERPOLATED), RESULTS.biased)
+    return unless(fit, other, RESULTS.misfit)
 
 
 def calibrations_of(driver: Driver) -> maximum_likelihood.Calibrations:

@@ -15,6 +15,7 @@ from collections.abc import Callable
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from etid.prediction import IMPULSE, Records, impulse, measured_impulse, residual_variance
@@ -43,26 +44,59 @@ class Curvature(eqx.Module):
     score: Float[Array, "n n"]
 
 
-def curvature(
-    records: Records,
+class Slopes(eqx.Module):
+    """A residual, an impulse response, and their Jacobians.
+
+    Attributes:
+        residual: Scaled residual.
+        jacobian: Its derivatives by the parameters.
+        h: Impulse response of the loaded driver.
+        slope: Its derivatives.
+    """
+
+    residual: Float[Array, " interval"]
+    jacobian: Float[Array, "interval n"]
+    h: Float[Array, " lag"]
+    slope: Float[Array, "lag n"]
+
+
+def slopes(
     residual: Callable[[Float[Array, " n"]], Float[Array, " interval"]],
     response: Callable[[Float[Array, " n"]], Float[Array, " lag"]],
     q: Float[Array, " n"],
-    precision: Float[Array, " n"],
-) -> Curvature:
+) -> Slopes:
+    """Evaluate a scaled residual, an impulse response, and their Jacobians at q."""
+    return Slopes(residual(q), jax.jacfwd(residual)(q), response(q), jax.jacfwd(response)(q))
+
+
+def padded_size(rows: int) -> int:
+    """Length of an FFT in which a filter does not wrap around."""
+    return 2 ** math.ceil(math.log2(rows + IMPULSE))
+
+
+def noise_power(records: Records, h: Float[Array, " lag"], size: int) -> Float[Array, " bin"]:
+    """Power [V²] of the residual's noise at each frequency of an FFT, per sample."""
+    power_out = records.sigma_out**2 * jnp.abs(jnp.fft.rfft(impulse()[:, 0], size)) ** 2
+    return power_out + records.sigma_th**2 * jnp.abs(jnp.fft.rfft(h, size)) ** 2
+
+
+def bin_weights(size: int) -> Float[np.ndarray, " bin"]:
+    """By which squares of `rfft` sum to those of the samples (Parseval)."""
+    weight = np.full(size // 2 + 1, 2.0 / size)
+    weight[[0, -1]] = 1.0 / size
+    return weight
+
+
+def curvature(records: Records, at: Slopes, precision: Float[Array, " n"]) -> Curvature:
     """Evaluate H and JᵀΣJ.
 
     Args:
         records: One recording.
-        residual: Scaled residual at q.
-        response: Impulse response of the loaded driver at q.
-        q: Parameters at the minimum; the last is the record's delay [samples].
+        at: Derivatives at the minimum; the last parameter is the record's delay [samples].
         precision: Of independent priors of q, which count as curvature.
     """
-    h = response(q)
+    h, slope, jacobian = at.h, at.slope, at.jacobian
     s = residual_variance(records, h)
-    jacobian = jax.jacfwd(residual)(q)
-    slope = jax.jacfwd(response)(q)
     s_slope = 2 * records.sigma_th**2 * h @ slope
     samples, rows = records.intervals, jacobian.shape[0]
     noise = records.sigma_th**2 * slope.T @ slope / s
@@ -70,10 +104,8 @@ def curvature(
     k_slope = measured_impulse()[:, 1]
     noise = noise.at[-1, -1].add(records.sigma_out**2 * jnp.sum(k_slope**2) / s)
     # Jᵀ Σ J by Parseval; J is padded, so that the filters do not wrap around.
-    size = 2 ** math.ceil(math.log2(rows + IMPULSE))
-    weight = jnp.full(size // 2 + 1, 2.0 / size).at[0].set(1.0 / size).at[-1].set(1.0 / size)
-    power_out = records.sigma_out**2 * jnp.abs(jnp.fft.rfft(impulse()[:, 0], size)) ** 2
-    weight = weight * (power_out + records.sigma_th**2 * jnp.abs(jnp.fft.rfft(h, size)) ** 2)
+    size = padded_size(rows)
+    weight = jnp.asarray(bin_weights(size)) * noise_power(records, h, size)
     spectrum = jnp.fft.rfft(jacobian, size, axis=0)
     real, imaginary = spectrum.real, spectrum.imag
     score = real.T @ (weight[:, None] * real) + imaginary.T @ (weight[:, None] * imaginary)

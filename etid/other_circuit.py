@@ -53,11 +53,18 @@ def changes(
         log_s = log_s - as_complex((log_s.real[0] + log_s.real[-1]) / 2)
         log_s = log_s * log_s
     z, spread = jax.jvp(impedance, (s,), (s * log_s,))
-    corner = 2 * jnp.pi * jnp.geomspace(frequency[0] / BEYOND, frequency[-1] * BEYOND, GRID)
-    level = jnp.abs(impedance(jax.lax.complex(jnp.zeros_like(corner), corner)))
+    corner, level = relaxations(impedance, frequency[0], frequency[-1])
     x = s.imag[None, :] * (1 / corner)[:, None]
     real = level[:, None] / (1 + x**2)
     return z, jnp.concatenate([spread[None, :], jax.lax.complex(real, -x * real)])
+
+
+def relaxations(
+    impedance: AbstractImpedance, lowest: Float[Array, ""], highest: Float[Array, ""]
+) -> tuple[Float[Array, " relaxation"], Float[Array, " relaxation"]]:
+    """1/τ [rad/s] and |Z(j/τ)| [Ω] of the relaxations for a band [Hz]."""
+    corner = 2 * jnp.pi * jnp.geomspace(lowest / BEYOND, highest * BEYOND, GRID)
+    return corner, jnp.abs(impedance(jax.lax.complex(jnp.zeros_like(corner), corner)))
 
 
 class Scores(NamedTuple):
@@ -81,9 +88,12 @@ class Scores(NamedTuple):
 
     def seen(self) -> Bool[Array, ""]:
         """Whether the load is another circuit."""
-        far, size = jnp.abs(self.z), jnp.abs(self.size)
-        spread = (far[0] > SEEN_SPREAD) & (size[0] > SPREAD)
-        return spread | jnp.any((far[1:] > SEEN_RELAXATION) & (self.moved[1:] > MOVED))
+        spread = (jnp.abs(self.z[0]) > SEEN_SPREAD) & (jnp.abs(self.size[0]) > SPREAD)
+        return spread | Scores(self.z[1:], self.size[1:], self.moved[1:]).relaxes()
+
+    def relaxes(self) -> Bool[Array, ""]:
+        """The same of relaxations alone."""
+        return jnp.any((jnp.abs(self.z) > SEEN_RELAXATION) & (self.moved > MOVED))
 
 
 def scores(

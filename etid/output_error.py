@@ -25,8 +25,9 @@ from jaxtyping import Array, Bool, Float, Int
 from etid.circuits import AbstractCircuit
 from etid.driver import Calibration, SourceImpedance, loaded
 from etid.elements import resistor
-from etid.information import curvature, eliminate, further, inverse
+from etid.information import curvature, eliminate, further, inverse, slopes
 from etid.levenberg_marquardt import LevenbergMarquardt, best_start
+from etid.other_in_time import relaxed, score
 from etid.prediction import (
     IMPULSE,
     Late,
@@ -192,7 +193,7 @@ def fit_source(
         at = jnp.concatenate([q[:kept], jnp.zeros(1), nuisance])
         towards = jnp.zeros_like(at).at[kept].set(1.0)
         value, slope = jax.jvp(residual, (at,), (towards,))
-        return curvature(record, residual, response, at, precision), jnp.vdot(slope, value)
+        return curvature(record, slopes(residual, response, at), precision), jnp.vdot(slope, value)
 
     def error(record, r, nuisance):
         system = loaded_filter(unflatten(q[:kept]), resistor(r).rational(), record.sample_rate)
@@ -253,7 +254,7 @@ def fit_circuit(
     source_cov: Float[Array, "m m"],
     calibration: Calibration,
     starts: AbstractCircuit,
-) -> tuple[AbstractCircuit, Estimate]:
+) -> tuple[AbstractCircuit, Estimate, Bool[Array, ""]]:
     """Identify the load of one recording.
 
     Args:
@@ -265,7 +266,8 @@ def fit_circuit(
             refined.
 
     Returns:
-        The circuit and the estimate, whose parameters are the logarithms of the elements.
+        The circuit; the estimate, whose parameters are the logarithms of the elements; and whether
+        the load is seen to be another circuit.
     """
     source_vector, unflatten = ravel_pytree(source)
     candidates = starts.log_values()
@@ -319,7 +321,12 @@ def fit_circuit(
         return h + p[kept] * late.h
 
     precision = jnp.zeros_like(at).at[kept].set(1 / late_std**2).at[-1].set(1 / DELAY_WIDTH**2)
-    full = eliminate(curvature(records, of_all, response, at, precision), both)
+    derivatives = slopes(of_all, response, at)
+    full = eliminate(curvature(records, derivatives, precision), both)
+    change = relaxed(records, source, circuit.with_log_values(q[:kept]).impedance(), q[kept:-1])
+    found = score(
+        records, change, derivatives, source_cov, kept + 1, precision * at, precision, kept
+    )
     own = inverse(full.expected[: kept + 1, : kept + 1])
     chi2 = 2 * objective[-1] / (records.intervals - q.shape[0])
     inherited = (-own @ full.expected[: kept + 1, kept + 1 :])[:kept]
@@ -340,7 +347,7 @@ def fit_circuit(
         shared,
         jnp.zeros(()),
     )
-    return circuit.with_log_values(q[:kept]), estimate
+    return circuit.with_log_values(q[:kept]), estimate, found.relaxes()
 
 
 def fitted_voltage(

@@ -13,7 +13,7 @@ from benchmarks.ladder import CALIBRATION, LOADS, TRIAL, rung
 from etid import lanes
 from etid.driver import SourceImpedance
 from etid.elements import resistor
-from etid.information import Curvature, curvature, eliminate, inverse
+from etid.information import Curvature, Slopes, curvature, eliminate, inverse
 from etid.measurement import Measurement
 from etid.output_error import DELAY_WIDTH, KNOWN_DELAY, delay_std, fit_source
 from etid.prediction import IMPULSE, impulse, late_calibration, measured_impulse, prepare
@@ -80,13 +80,8 @@ def test_the_noise_of_a_record_is_no_information():
     of_h = rng.normal(size=(IMPULSE + 1, 3))
     of_h[:, -1] = 0.0  # a delay does not change the response
     precision = np.array([0.0, 2.0, 5.0])
-    found = curvature(
-        records,
-        lambda q: jnp.asarray(slope) @ q,
-        lambda q: jnp.asarray(h0) + jnp.asarray(of_h) @ q,
-        jnp.zeros(3),
-        jnp.asarray(precision),
-    )
+    at = Slopes(jnp.zeros(rows), *map(jnp.asarray, (slope, h0, of_h)))
+    found = curvature(records, at, jnp.asarray(precision))
     k = np.asarray(impulse())[:, 0]
     s = 0.7**2 * np.sum(k**2) + 0.3**2 * np.sum(h0**2)
     of_s = 2 * 0.3**2 * h0 @ of_h
