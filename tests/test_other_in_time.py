@@ -42,6 +42,7 @@ def records(sigma: float = 1e-3, count: int = 600) -> Records:
     return prepare(Measurement(v_th, 0 * v_th, noise, noise, jnp.asarray(RATE)))
 
 
+@pytest.mark.slow
 def test_slopes_are_those_of_a_load_with_one_more_relaxation():
     """The load as a whole, its relaxation a resistor and a capacitor, made a little larger."""
     of, step = records(), 1e-6
@@ -62,6 +63,7 @@ def test_slopes_are_those_of_a_load_with_one_more_relaxation():
         np.testing.assert_allclose(side.T, (high - low) / (2 * step), atol=1e-7)
 
 
+@pytest.mark.slow
 def test_a_load_without_states_relaxes_too():
     """A resistor; its source is one as well: V_out = R_L / (R_L + R), and i = V_th / (R_L + R)."""
     of = records()
