@@ -7,6 +7,7 @@ import pytest
 
 import etid
 from etid import mains, scenes
+from etid.judging import MISFIT_CHI2
 from etid.preflight import Inspected
 from etid.recording import Samples
 from etid.remarks import Remark
@@ -130,6 +131,29 @@ def test_hum_does_not_excuse_a_wrong_circuit(records, quiet):
     fit = etid.identify_skin(loud, quiet[0], circuit=etid.Resistor(), throw=False)
     assert fit.verdict == "misfit"
     assert int(fit.remarks) == 0
+
+
+def louder(recording, factor):
+    """The recording with this gain of v_out."""
+    of = recording.samples["v_out"]
+    return recording.replace(v_out=Samples(of.stored, factor * of.conversion))
+
+
+def test_a_wrong_gain_is_no_hum(records, quiet):
+    """It is more on the low harmonics than noise explains, as hum is, but on all alike."""
+    fit = etid.identify_skin(louder(records[1], 1.01), quiet[0], throw=False)
+    assert fit.verdict == "inconsistent"
+    assert int(fit.remarks) == 0
+
+
+def test_a_wrong_gain_is_a_misfit_where_chi2_does_not_show_it():
+    """At 40 dB one of 2 % makes R_p wrong by half; its own standard error is 0.17 %."""
+    calibration, skin = study_of(snr_db=40.0).values()
+    driver = etid.identify_driver(calibration)
+    assert etid.identify_skin(skin, driver).verdict == "successful"
+    fit = etid.identify_skin(louder(skin, 1.02), driver, throw=False)
+    assert fit.verdict == "misfit"
+    assert fit.chi2 < MISFIT_CHI2
 
 
 @pytest.mark.slow
