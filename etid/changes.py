@@ -138,14 +138,19 @@ def _changes(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """The parts of a `Change`, for recordings of equally many periods along the first axis."""
     elements, course = slopes.shape[1], courses(of.gain.shape[1])
-    low, whole, right, plain, unit = _equations(of, slopes, course)
+    low, whole, right, plain, unit, total = _equations(of, slopes, course)
     # The share of each course that what has aliased cannot imitate.
     share = 1 - np.abs(np.einsum("cp,lp->lc", course, of.turn.conj())) ** 2
     share = np.where(share > ALIGNED, share, 0.0)[:, :, None, None]
     normal = low[:, None] + share * (whole - low)[:, None]
     tested = elements + 1  # and the amplitude; not the delays
-    theta, cov, square = _solved(normal, right, tested)
-    seen = square.max(1) > threshold(tested, len(course))
+    theta, cov, square, explained = _solved(normal, right, tested)
+    # Coloured noise differs from period to period too, but in no way of an element: what the
+    # parameters leave tells how large it is.
+    freedom = 2 * of.frequency.shape[1] - right.shape[-1]
+    noise = np.maximum(1.0, (total - explained) / freedom)
+    seen = (square / noise).max(1) > threshold(tested, len(course))
+    cov = cov * noise[..., None, None]
     # Without aliases courses do not mix: the likeliest is the one that fits best.
     best = np.where(seen, np.argmax(_solved(whole[:, None], plain, tested)[2], axis=1), 0)
     lane, reach = np.arange(len(best)), np.ptp(course, axis=1)[best][:, None]
@@ -175,7 +180,7 @@ def _equations(
     Returns:
         The matrix of the bands without aliases, and of all; right sides, for each course, without
         what has aliased and with it; and the units of the parameters, whose equations have a
-        diagonal of 1.
+        diagonal of 1; and Σ η² / variance for each course.
     """
     high: np.ndarray = np.greater(of.frequency, CLEAN * of.sample_rate[:, None])
     plain = course @ of.gain
@@ -197,8 +202,9 @@ def _equations(
     weighted = (rows * weight).swapaxes(1, 2)
     below = np.tile(~high, 2)[:, None]
     low, whole = np.where(below, rows, 0.0) @ weighted, rows @ weighted
-    right = _real(np.where(high[:, None], turned, plain)) @ weighted
-    return low, whole, right, _real(plain) @ weighted, unit
+    deviation = _real(np.where(high[:, None], turned, plain))
+    total = (deviation**2 * weight).sum(2)
+    return low, whole, deviation @ weighted, _real(plain) @ weighted, unit, total
 
 
 def _real(values: np.ndarray) -> np.ndarray:
@@ -208,13 +214,18 @@ def _real(values: np.ndarray) -> np.ndarray:
 
 def _solved(
     normal: np.ndarray, right: np.ndarray, tested: int
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The first parameters, their covariance, and their χ², for each recording and course."""
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """For each recording and course: the first parameters, their covariance and their χ².
+
+    And by how much all parameters lower Σ η² / variance.
+    """
     cov = np.linalg.inv(normal + RIDGE * np.eye(right.shape[-1]))
-    theta = (cov @ right[..., None])[..., :tested, :]
-    cov = cov[..., :tested, :tested]
+    theta = cov @ right[..., None]
+    explained = (theta[..., 0] * right).sum(-1)
+    theta, cov = theta[..., :tested, :], cov[..., :tested, :tested]
     square = (theta * np.linalg.solve(cov, theta)).sum((-1, -2))
-    return theta[..., 0], np.broadcast_to(cov, (*theta.shape[:-1], tested)), square
+    cov = np.broadcast_to(cov, (*theta.shape[:-1], tested))
+    return theta[..., 0], cov, square, explained
 
 
 def _uneven(of: Repeats, course: Float[np.ndarray, "course period"]) -> np.ndarray:

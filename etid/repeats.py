@@ -123,54 +123,80 @@ def _fast(length: int) -> int:
 
 
 def repeats(seen: Sequence[Inspected]) -> list[Repeats | None]:
-    """The deviations of the periods of recordings; None for those that hold less than two.
+    """The deviations of the periods of recordings.
+
+    None for those that hold less than two, or whose converter is coarse: its rounding differs
+    between the periods, and is no noise.
 
     In single precision: the noise of a record is a hundred times its rounding errors. Recordings
     of equally many periods are looked at together, for a third of the time.
+
+    Skin that changes during the record looks like hum between the harmonics. Where periods still
+    differ after hum was subtracted, it was not the hum: they are compared as they were recorded.
     """
     found: list[Repeats | None] = [None] * len(seen)
     alike: dict[tuple, list[int]] = {}
     for number, one in enumerate(seen):
-        if one.periods[0] > 1 and one.is_periodic:
+        coarse = one.coarse_th > 0 or one.coarse_out > 0
+        if one.periods[0] > 1 and one.is_periodic and not coarse:
             of = one.recording
             key = one.periods[0], of.sample_rate, of.pulse_rate
             alike.setdefault(key, []).append(number)
-    for (periods, sample_rate, pulse_rate), numbers in alike.items():
+    for numbers in alike.values():
         group = [seen[number] for number in numbers]
-        spacing = np.array([sample_rate / one.pulse_rate for one in group])
-        at = spacing[:, None] * np.arange(periods)
-        known = bands(sample_rate, pulse_rate)
-        sigma = np.array([one.sigma_out for one in group])
-        own = _deviations([one.recorded_out for one in group], at, known, sigma)
-        sigma = np.array([one.sigma_th for one in group])
-        merged = bands(sample_rate / MERGED, pulse_rate)
-        sums = [_merged(one.recorded_th) for one in group]
-        unloaded = _deviations(sums, at / MERGED, merged, sigma * math.sqrt(MERGED))
-        weight = np.where(merged.middle < LOW * merged.middle[-1], 1 / unloaded.variance, 0.0)
-        smooth = _smooth(unloaded.mean, merged)
-        # What a change of the amplitude by 1 makes where polynomials are projected out.
-        unit = 1 - (np.real(smooth.sum(2))[:, :, None] * smooth).sum(1) / unloaded.power
-        total = (weight * _power(unit)).sum(1)
-        along = np.real(unloaded.gain * (weight * np.conj(unit))[:, None, :]).sum(2)
-        amplitude, smooth = along / total[:, None], _smooth(own.mean, known)
-        turn = np.exp(-2j * np.pi * own.late)
-        turn -= turn.mean(1, keepdims=True)
-        size = np.linalg.norm(turn, axis=1, keepdims=True)
-        turn = np.where(size > ALIGNED, turn / np.maximum(size, ALIGNED), 0)
-        frequency = known.middle * (sample_rate / (2 * np.pi))
-        for row, number in enumerate(numbers):
-            found[number] = Repeats(
-                frequency,
-                np.asarray(sample_rate),
-                own.gain[row],
-                own.power[row],
-                smooth[row],
-                own.variance[row],
-                turn[row],
-                amplitude[row],
-                np.asarray(1 / total[row]),
-            )
+        records = [(one.v_th, one.v_out) for one in group]
+        of_group = _of_equal_periods(group, records)
+        for row, one in enumerate(group):
+            hum = one.hum_th is not None or one.hum_out is not None
+            if hum and _differ(of_group[row]):
+                recorded = [(one.recorded_th, one.recorded_out)]
+                (of_group[row],) = _of_equal_periods([one], recorded)
+        for number, of in zip(numbers, of_group, strict=True):
+            found[number] = of
     return found
+
+
+def _differ(of: Repeats) -> bool:
+    """Whether the periods differ by more than noise."""
+    periods, count = of.gain.shape
+    square = (_power(of.gain) / of.variance).sum()
+    freedom = 2 * (periods - 1) * count
+    return bool(square > freedom + SURE * math.sqrt(2 * freedom))
+
+
+def _of_equal_periods(
+    group: Sequence[Inspected], records: Sequence[tuple[np.ndarray, np.ndarray]]
+) -> list[Repeats]:
+    """The deviations of recordings with as many periods and equal rates, from these voltages."""
+    of, (periods, _) = group[0].recording, group[0].periods
+    spacing = np.array([of.sample_rate / one.pulse_rate for one in group])
+    at = spacing[:, None] * np.arange(periods)
+    known = bands(of.sample_rate, of.pulse_rate)
+    sigma = np.array([one.sigma_out for one in group])
+    own = _deviations([v_out for _, v_out in records], at, known, sigma)
+    sigma = np.array([one.sigma_th for one in group])
+    merged = bands(of.sample_rate / MERGED, of.pulse_rate)
+    sums = [_merged(v_th) for v_th, _ in records]
+    unloaded = _deviations(sums, at / MERGED, merged, sigma * math.sqrt(MERGED))
+    weight = np.where(merged.middle < LOW * merged.middle[-1], 1 / unloaded.variance, 0.0)
+    smooth = _smooth(unloaded.mean, merged)
+    # What a change of the amplitude by 1 makes where polynomials are projected out.
+    unit = 1 - (np.real(smooth.sum(2))[:, :, None] * smooth).sum(1) / unloaded.power
+    total = (weight * _power(unit)).sum(1)
+    along = np.real(unloaded.gain * (weight * np.conj(unit))[:, None, :]).sum(2)
+    amplitude, smooth = along / total[:, None], _smooth(own.mean, known)
+    # Coloured noise is in no way of the amplitude: what that leaves tells how large it is.
+    rest = unloaded.gain - amplitude[:, :, None] * unit[:, None, :]
+    freedom = (2 * np.count_nonzero(weight, axis=1) - 1) * (periods - 1)
+    noise = np.maximum(1.0, (weight[:, None, :] * _power(rest)).sum((1, 2)) / freedom)
+    turn = np.exp(-2j * np.pi * own.late)
+    turn -= turn.mean(1, keepdims=True)
+    size = np.linalg.norm(turn, axis=1, keepdims=True)
+    turn = np.where(size > ALIGNED, turn / np.maximum(size, ALIGNED), 0)
+    frequency = known.middle * (of.sample_rate / (2 * np.pi))
+    rate, variance = np.asarray(of.sample_rate), noise / total
+    parts = own.gain, own.power, smooth, own.variance, turn, amplitude, variance
+    return [Repeats(frequency, rate, *of_row) for of_row in zip(*parts, strict=True)]
 
 
 def _smooth(mean: np.ndarray, known: Bands) -> np.ndarray:
@@ -233,7 +259,23 @@ def _deviations(
     freedom = np.maximum(freedom, 1)
     sure = rest > overall * (freedom + SURE * np.sqrt(2 * freedom))
     noise = np.where(sure & (known.number > 1), rest / freedom, overall)
+    single = np.count_nonzero(known.number == 1)
+    if single > 2:
+        low = _noise_of_single(gain[:, :, :single], weight[:, :single])
+        sure = low > overall[:, 0] * (1 + SURE * math.sqrt(2 / ((single - 2) * (periods - 1))))
+        noise[:, :single] = np.where(sure, low, overall[:, 0])[:, None]
     return _Deviations(gain, weight, noise / weight, mean, late)
+
+
+def _noise_of_single(gain: np.ndarray, weight: np.ndarray) -> np.ndarray:
+    """Noise of bands of one harmonic, from second differences between them.
+
+    A change of the load is smooth over the first harmonics, and coloured noise is not.
+    """
+    bend = gain[:, :, :-2] - 2 * gain[:, :, 1:-1] + gain[:, :, 2:]
+    spread = 1 / weight[:, :-2] + 4 / weight[:, 1:-1] + 1 / weight[:, 2:]
+    freedom = 2 * (gain.shape[1] - 1) * bend.shape[2]
+    return (_power(bend) / spread[:, None, :]).sum((1, 2)) / freedom
 
 
 def _power(values: np.ndarray) -> np.ndarray:

@@ -35,7 +35,9 @@ SIZE = 1.5e-4  # of V_th, that must differ as well; pulses are repeated to no be
 DRIFT = 0.2
 OTHER = 0.1  # of V_th, from which on it is another pulse; a part of twice its size does less
 SMOOTH = 1 / 3  # of what the records differ by must be smooth
-SAME_FREQUENCY = 1e-4  # by which pulse rates may differ
+# By which pulse rates may differ: records of other lengths are cut to other whole samples, which
+# moves the zeros of a pulse at its thousandth harmonic by as much as a part that has changed.
+SAME_FREQUENCY = 1e-6
 
 
 class UnloadedShape(NamedTuple):

@@ -97,7 +97,7 @@ UNDISTURBED = {
     "80 dB": {"snr_db": 80.0},
     "delays": {"snr_db": 80.0, "trigger_jitter_rms": 5e-6},
     "offset": {"snr_db": 80.0, "offset_rms": 0.1},
-    "12 bits": {"snr_db": 80.0, "bits": 12},
+    "14 bits": {"snr_db": 80.0, "bits": 14},
     "clock": {"snr_db": 80.0, "pulse_rate_ppm": 50.0},
     "two periods": {"snr_db": 80.0, "samples": 6_667},
     "ten periods": {"snr_db": 80.0, "samples": 33_334},
