@@ -1,5 +1,6 @@
 """Bars of the perturbations: how many answers are right, refused, said to be wrong, or silent."""
 
+import math
 import pathlib
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -16,7 +17,14 @@ FACES: Mapping[Kind, tuple[str, str, str]] = {
     "silent": ("#b3261e", "xxx", "wrong, called successful"),
 }
 WIDTH, LINE = 2.6, 0.15  # [inch] of a panel and of a row
-MARK = " (invisible)"
+
+
+def _mark(name: str) -> str:
+    """What is said of a perturbation that nothing shows."""
+    if name not in INVISIBLE:
+        return ""
+    snr = INVISIBLE[name].snr_db
+    return " (invisible)" if math.isinf(snr) else f" (invisible up to {snr:g} dB)"
 
 
 def draw(rows: Sequence[Mapping[str, Any]], path: pathlib.Path) -> None:
@@ -57,7 +65,7 @@ def draw(rows: Sequence[Mapping[str, Any]], path: pathlib.Path) -> None:
         axis.grid(False)
         axis.tick_params(labelsize=7, length=0)
         axis.set_xlabel("% of answers", fontsize=8)
-    labels = [name + MARK if name in INVISIBLE else name for name in names]
+    labels = [name + _mark(name) for name in names]
     axes.flat[0].set_yticks(range(len(names)), labels)
     axes.flat[0].set_ylim(len(names) - 0.5, -0.5)
     handles, texts = axes.flat[0].get_legend_handles_labels()

@@ -7,7 +7,9 @@ driver between calibration and skin. Delays are in samples of 5 µs. `says` is w
 is not true.
 """
 
+import dataclasses
 import functools
+import math
 from collections.abc import Mapping
 
 from benchmarks.disturbances import Hum, Offset, Spike
@@ -187,14 +189,48 @@ PERTURBATIONS: Mapping[str, Change] = {
     **CALIBRATIONS,
 }
 
-INVISIBLE: Mapping[str, str] = {
-    "driver_Rload_wrong_5%": (
+
+@dataclasses.dataclass(frozen=True)
+class Invisible:
+    """Why a perturbation is not seen.
+
+    Attributes:
+        why: By how much the elements are wrong, and the reason.
+        snr_db: Largest at which it is so [dB].
+    """
+
+    why: str
+    snr_db: float = math.inf
+
+
+_SHOWN = "the best test would see it at %s standard deviations behind dry and %s behind damp skin"
+INVISIBLE: Mapping[str, Invisible] = {
+    "driver_Rload_wrong_5%": Invisible(
         "up to 5 %: one calibration shows ratios to its resistor only; every resistance and 1/C_p "
         "is wrong by the same 5 %"
     ),
-    "leak_100Rp": (
+    "leak_100Rp": Invisible(
         "up to 1.7 %: R_s + R_p ‖ C_p with a resistor across it has the impedance of another "
         "R_s + R_p ‖ C_p at every frequency"
     ),
+    "calibration_is_skin": Invisible(
+        "all: one calibration shows ratios to its load only, and another driver with a resistor "
+        "would give the same records",
+        40.0,
+    ),
+    **{
+        f"gain_out_{sign}1%_all": Invisible("R_p up to 13 %: " + _SHOWN % (3.2, 4.3), 40.0)
+        for sign in "+-"
+    },
+    **{
+        f"driver_Vp_{sign}2%_out_vs_th": Invisible(
+            "R_p of damp skin up to 8 %: the best test would see it at 2.7 standard deviations; "
+            "behind dry skin it is seen",
+            40.0,
+        )
+        for sign in "+-"
+    },
+    "slow_adc_filter_out_skin_only": Invisible("R_s up to 80 %: " + _SHOWN % (4.3, 0.8), 40.0),
+    "driver_Rprot_x1.05": Invisible("R_p up to 4 %: " + _SHOWN % (0.6, 1.3), 40.0),
 }
-"""Perturbations that nothing in the records shows: by how much the elements are wrong, and why."""
+"""Perturbations that nothing in the records shows (`benchmarks.visibility` computes how much)."""

@@ -75,11 +75,14 @@ def summary(answers: Sequence[Answer]) -> Iterator[str]:
 def met(answers: Sequence[Answer]) -> bool:
     """Whether the targets are met by the default method; else says where not."""
     holds = True
-    for row in table([a for a in answers if a.method == DEFAULT], ("perturbation",)):
-        name = row["perturbation"]
-        if row["silent"] and name not in INVISIBLE:
-            print(f"silent: {name}, {row['silent']} of {row['answers']}")
+    of_default = [a for a in answers if a.method == DEFAULT]
+    for row in table(of_default, ("perturbation", "snr_db")):
+        name, snr = row["perturbation"], row["snr_db"]
+        if row["silent"] and not (name in INVISIBLE and snr <= INVISIBLE[name].snr_db):
+            print(f"silent: {name} at {snr:g} dB, {row['silent']} of {row['answers']}")
             holds = False
+    for row in table(of_default, ("perturbation",)):
+        name = row["perturbation"]
         if name in UNDISTURBED and row["refused"] + row["said"] > REFUSED * row["answers"]:
             print(f"refused: {name}, {row['refused'] + row['said']} of {row['answers']}")
             holds = False

@@ -6,7 +6,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from benchmarks import perturbations
+from benchmarks import perturbations, visibility
 from benchmarks.disturbances import Hum, Leaky, Nonlinear, Pink, Spike
 from benchmarks.laboratory import CORNER, SCALE, Output
 from benchmarks.ladder import LOADS
@@ -273,10 +273,12 @@ def test_a_table_counts_and_names_the_worst_silent_answer():
 
 def test_a_silent_answer_misses_the_target_unless_nothing_can_show_it(capsys):
     wrong = answer((0.06, 0, 0))
-    hidden = next(iter(INVISIBLE))
-    assert perturbations.met([dataclasses.replace(wrong, perturbation=hidden)])
+    assert perturbations.met([dataclasses.replace(wrong, perturbation="leak_100Rp")])
     assert not perturbations.met([dataclasses.replace(wrong, perturbation="swapped")])
-    assert "silent: swapped, 1 of 1" in capsys.readouterr().out
+    assert "silent: swapped at 60 dB, 1 of 1" in capsys.readouterr().out
+    noisy = dataclasses.replace(wrong, perturbation="gain_out_+1%_all", snr_db=40.0)
+    assert perturbations.met([noisy])
+    assert not perturbations.met([dataclasses.replace(noisy, snr_db=60.0)])
 
 
 def test_more_than_two_per_cent_of_undisturbed_recordings_refused_misses_the_target():
@@ -297,3 +299,27 @@ def test_a_few_perturbations_are_drawn_counted_and_written(tmp_path):
     assert rows["polarity_out", "damp"]["said"] == "1"
     assert rows["driver_Rload_wrong_5%", "dry"]["silent"] == "1"  # which nothing can show
     assert (tmp_path / "perturbations.svg").read_text().startswith("<?xml")
+
+
+@pytest.mark.parametrize(
+    ("change", "dry", "damp"),
+    [
+        (visibility.gain(0.01, True), 3.2, 4.3),
+        (visibility.gain(0.02, False), 11.8, 2.7),
+        (visibility.lowpass(30e3), 4.3, 0.8),
+        (visibility.series(0.05 * TransformerDriver().r_protection), 0.6, 1.3),
+    ],
+)
+def test_what_is_called_invisible_at_40_db_is_so_by_the_fisher_information(change, dry, damp):
+    """Below the five standard deviations of a test that is not to be wrong about other records."""
+    found = [visibility.deviations(LOADS[name], 40.0, change) for name in ("dry", "damp")]
+    np.testing.assert_allclose(found, [dry, damp], atol=0.05)
+    clear = [visibility.deviations(LOADS[name], 60.0, change) for name in ("dry", "damp")]
+    np.testing.assert_allclose(clear, np.multiply(found, 10), rtol=0.05)  # but for the rounding
+
+
+def test_a_gain_that_is_the_skins_alone_is_seen_by_what_its_own_error_is():
+    """Half the change at half the deviations: ε is a size in units of the change."""
+    whole = visibility.deviations(LOADS["damp"], 40.0, visibility.gain(0.02, False))
+    half = visibility.deviations(LOADS["damp"], 40.0, visibility.gain(0.01, False))
+    assert whole == pytest.approx(2 * half)

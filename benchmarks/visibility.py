@@ -1,0 +1,104 @@
+"""By how many standard deviations the best test could see a change of the records.
+
+The records are those of `etid.bounds`: X_k and Z_th(f_k) are unknown at every harmonic, and so are
+the elements and the delays. A change adds ε ∂Y_k to the loaded voltages, ε = 1 for the change
+itself. What of it those unknowns cannot imitate, over the noise, is the largest number of standard
+deviations by which any test without a bias can see it. A driver of finite order is known better
+than this Z_th where it is smooth: a test that knows its order may see somewhat more.
+"""
+
+import dataclasses
+import math
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Complex, Float
+
+from benchmarks.ladder import rung
+from etid.circuits import SkinRC
+from etid.transformer import SkinLoad, loading
+
+BAND = 0.4  # of the sample rate
+RESISTOR = 98.8e3  # [ohm]
+
+Gain = Complex[np.ndarray, " f"]
+
+
+@dataclasses.dataclass(frozen=True)
+class Records:
+    """What both loaded records hold at the harmonics.
+
+    Attributes:
+        f: Harmonics [Hz].
+        skin: Impedance of the skin [ohm].
+        z_th: Source impedance [ohm].
+        gains: V_out / V_th with the skin and with the resistor.
+    """
+
+    f: Float[np.ndarray, " f"]
+    skin: Gain
+    z_th: Gain
+    gains: tuple[Gain, Gain]
+
+
+Change = Callable[[Records], tuple[Gain, Gain]]
+"""Changes of both gains, with the skin and with the resistor."""
+
+
+def gain(part: float, calibration: bool) -> Change:
+    """V_out larger by this part, with the resistor as well or not."""
+    return lambda of: (part * of.gains[0], part * calibration * of.gains[1])
+
+
+def lowpass(corner: float) -> Change:
+    """A filter of first order before V_out [Hz], with the skin only."""
+    return lambda of: (
+        -of.gains[0] * np.log(1 + 1j * of.f / corner),
+        np.zeros_like(of.gains[1]),
+    )
+
+
+def series(r: float) -> Change:
+    """A resistor in series with the source [ohm], with the skin only."""
+    return lambda of: (-of.gains[0] * r / (of.skin + of.z_th), np.zeros_like(of.gains[1]))
+
+
+def deviations(load: SkinLoad, snr_db: float, change: Change) -> float:
+    """Standard deviations at which the best test sees a change.
+
+    Args:
+        load: The skin.
+        snr_db: Of every record [dB].
+        change: What is added.
+    """
+    scene = rung("dry", snr_db=snr_db)
+    waveform = scene.waveform()
+    inside = waveform.f < BAND * scene.sample_rate
+    f, z_th = waveform.f[inside], waveform.z_th[inside]
+    x = waveform.v_th[inside] * math.sqrt(scene.samples) / waveform.sigma
+    circuit = SkinRC(load.r_s, load.r_p, load.c_p)
+    frequency = jnp.asarray(f)
+    slope = np.asarray(
+        jax.jacfwd(lambda logs: circuit.with_log_values(logs).response(frequency))(
+            circuit.log_values()
+        )
+    )
+    loads = load(f), np.full(f.size, complex(RESISTOR))
+    gains = loading(loads[0], z_th), loading(loads[1], z_th)
+    changed = change(Records(f, loads[0], z_th, gains))
+    # Rows: V_out with the skin and the resistor, then both V_th. Columns of b: both X, and Z_th.
+    own = slope.shape[1]
+    a = np.zeros((f.size, 4, own + 3), complex)
+    b = np.zeros((f.size, 4, 3), complex)
+    for i in range(2):
+        b[:, i, i], b[:, 2 + i, i] = gains[i], 1
+        b[:, i, 2] = -gains[i] * x / (loads[i] + z_th)
+        a[:, i, own + i] = -2j * np.pi * f * 1e-6 * gains[i] * x  # delays in microseconds
+        a[:, i, -1] = changed[i] * x
+    a[:, 0, :own] = (x * z_th / (loads[0] + z_th) ** 2)[:, None] * slope
+    q, _ = np.linalg.qr(b)
+    rest = (a - q @ (np.conj(np.swapaxes(q, 1, 2)) @ a)).reshape(-1, own + 3)
+    information = 2 * np.real(np.conj(rest.T) @ rest)
+    return float(1 / np.sqrt(np.linalg.inv(information)[-1, -1]))
