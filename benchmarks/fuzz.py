@@ -116,6 +116,9 @@ class _Child:
     def __exit__(self, *_: object) -> None:
         self.process.kill()
         self.process.wait()
+        for pipe in (self.process.stdin, self.process.stdout):
+            assert pipe is not None
+            pipe.close()
         self.errors.close()
         shutil.rmtree(self.folder, ignore_errors=True)
 
