@@ -27,6 +27,8 @@ from etid.settings import Settings
 from etid.tables import Table, opened_table, write_table
 from etid.verdicts import verdicts_of
 
+# What a line of JSON that was damaged may raise on its way to a driver.
+_DAMAGED = (ValueError, TypeError, AttributeError, KeyError, OverflowError, RecursionError)
 _SETTINGS = {field.name: field.type for field in dataclasses.fields(Settings)}
 
 
@@ -98,7 +100,7 @@ class StudyFits:
         for number, line in enumerate(lines):
             try:
                 paths, found = _of_line(line)
-            except (ValueError, TypeError, KeyError, OverflowError, RecursionError) as error:
+            except _DAMAGED as error:
                 raise RecordingError(
                     f"holds a driver that cannot be read ({type(error).__name__}: {error})",
                     file=os.fspath(path),
