@@ -66,7 +66,7 @@ def problem_of(study: etid.Study, driver: etid.Driver) -> Problem:
     records = list(study.loaded.recordings())
     lanes = [harmonics(record) for record in records]
     known = known_driver(lanes[0], driver, "maximum_likelihood", False)
-    assert known is not None
+    assert isinstance(known, GivenDriver)
     return Problem(study, driver, records, stacked(lanes), known)
 
 
