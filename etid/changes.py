@@ -39,7 +39,12 @@ from etid.verdicts import verdict
 ALARM = 1e-5  # probability that a record without any change has one
 CLEAN = 0.03  # of the sample rate, below which there are no aliases
 UNEQUAL = 5e-4  # by which amplitudes of V_th may differ: cuts between samples make 1e-4
-EXPLAINED = ("successful", "misfit", "inconsistent")  # verdicts of which a change is the cause
+EXPLAINED = (
+    "successful",
+    "misfit",
+    "inconsistent",
+    "biased",
+)  # verdicts of which a change is the cause
 LANES = 16  # circuits of one call
 RIDGE = 1e-10  # of the diagonal, for elements without effect
 LARGEST = 20.0  # change of a logarithm; one that is not determined can have any
