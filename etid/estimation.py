@@ -173,8 +173,7 @@ def skin_by_non_parametric(
     assert source is not None  # check_driver
     assert calibration is not None
     starts = harmonic_starts(spectrum, sample_rate, source.response(spectrum.frequency), circuit)
-    # The test for another circuit has false alarms behind some drivers: it does not decide here.
-    estimate, bias, _ = non_parametric.fit_circuit(
+    estimate, bias = non_parametric.fit_circuit(
         circuit, calibration, jnp.asarray(driver.sample_rate), spectrum, sample_rate, starts
     )
     # It needs the harmonics of the driver, whether or not a model of them was found.

@@ -24,9 +24,7 @@ from etid.circuits import AbstractCircuit
 from etid.driver import Calibration
 from etid.information import inverse
 from etid.levenberg_marquardt import best_start
-from etid.likelihood import as_list, denoised, excess, same_unloaded, stands_out
-from etid.other_circuit import Scores, scores
-from etid.other_circuit import changes as changes_of
+from etid.likelihood import as_list, excess, same_unloaded, stands_out
 from etid.output_error import DELAY_WIDTH, MAX_STEPS, SOLVER, Estimate
 from etid.results import complex_rrse
 from etid.spectra import Spectrum, signal_share
@@ -155,44 +153,6 @@ class _Model(eqx.Module):
         y = delayed(g * spectrum.x, spectrum.frequency, q[-1] / self.sample_rate)
         return [*records[:-1], eqx.tree_at(lambda s: s.y, spectrum, y)]
 
-    def by_changes(
-        self, q: Float[Array, " q"], records: list[Spectrum]
-    ) -> Float[Array, "change term"]:
-        """Derivatives of the terms by the changes of `etid.other_circuit`, where e is 0.
-
-        At the X that both records of the load tell: the noise of X is in e, and would be in both.
-        """
-        spectrum, of = records[-1], self.z_th(q, records)
-        f = spectrum.frequency
-        elements = q[: q.size - self.r_load.size - 1]
-        impedance = self.circuit.with_log_values(elements).impedance()
-        z, changes = changes_of(impedance, f)
-        g = z * reciprocal(z + of.z)
-        late = delayed(g, f, q[-1] / self.sample_rate)
-        [clean], _ = denoised([spectrum], [late])
-        variance, _ = self._variance(q, records, g * clean.x, of)
-        weight = jnp.where(self.selected, jnp.sqrt(2 / variance), 0.0)
-        e = changes * ((g - 1) * clean.x * as_complex(weight))[None, :]
-        return jnp.concatenate([e.real, e.imag], axis=1)
-
-    def scores(
-        self, q: Float[Array, " q"], records: list[Spectrum], noise: Float[Array, " term"]
-    ) -> Scores:
-        """Scores of other circuits, which noise biases as it does the elements."""
-        jacobian = jax.jacfwd(self.terms)(q, self.without_noise(q, records)).T
-        rows, count = self.by_changes(q, records), noise.size
-        return scores(
-            jnp.pad(rows, ((0, 0), (0, count - rows.shape[1]))),
-            jacobian,
-            self.terms(q, records),
-            jnp.zeros(q.size),  # priors are among the terms
-            jnp.zeros((q.size, q.size)),
-            inverse(jacobian @ jacobian.T),
-            jnp.ones(count),
-            noise,
-            slice(q.size - self.r_load.size - 1),
-        )
-
     def private(self, q: Float[Array, " q"], records: list[Spectrum]) -> Float[Array, " harmonic"]:
         """Part of the variance of e that is the load's own."""
         y, of = self._in_time(q, records), self.z_th(q, records)
@@ -207,7 +167,7 @@ def fit_circuit(
     spectrum: Spectrum,
     sample_rate: Float[Array, ""],
     candidates: Float[Array, "start own"],
-) -> tuple[Estimate, Float[Array, " element"], Bool[Array, ""]]:
+) -> tuple[Estimate, Float[Array, " element"]]:
     """Identify the load of one recording by the harmonics of the calibrations of its driver.
 
     Args:
@@ -220,8 +180,8 @@ def fit_circuit(
             predicts best is refined.
 
     Returns:
-        The estimate, whose parameters are the logarithms of the elements; the bias that has been
-        subtracted from them; and whether the load is seen to be another circuit.
+        The estimate, whose parameters are the logarithms of the elements, and the bias that has
+        been subtracted from them.
     """
     assert calibration.spectra is not None  # check_driver
     known, elements = as_list(calibration.spectra), candidates.shape[1] - 1
@@ -242,6 +202,7 @@ def fit_circuit(
 
     solution = solve(records, best)
     q = solution.value
+    bias = _bias(lambda noisy: solve(noisy, q).value - q, records)
     freedom = 2 * jnp.sum(selected, dtype=q.dtype) - q.size
     chi2 = jnp.sum(model.terms(q, records)[: 2 * count] ** 2) / freedom
     # The Jacobian at Y = G X, without the noise of e, which would count as information.
@@ -253,13 +214,6 @@ def fit_circuit(
     weights = jnp.concatenate([part, part, jnp.zeros(len(known)), jnp.ones(1), jnp.zeros(rest - 1)])
     noise = excess(model.terms(q, records)[: 2 * count], selected)
     noise = jnp.concatenate([noise, jnp.ones(rest + len(known))])
-    found = model.scores(q, records, noise)
-
-    def change(noisy):
-        there = solve(noisy, q).value
-        return jnp.concatenate([there - q, model.scores(there, noisy, noise).z - found.z])
-
-    bias, of_z = jnp.split(_bias(change, records), [q.size])
     own_cov = (by_term * (weights * noise)[None, :]) @ by_term.T
     shared = (by_term * ((1 - weights) * noise)[None, :]) @ by_term.T
     return (
@@ -278,14 +232,13 @@ def fit_circuit(
             stands_out(model.squares(q, records), records[-1]),
         ),
         bias[:elements],
-        found.less(of_z).seen(),
     )
 
 
 def _bias(
     change: Callable[[list[Spectrum]], Float[Array, " number"]], records: list[Spectrum]
 ) -> Float[Array, " number"]:
-    """What the noise of the records adds to parameters and scores on average, to second order.
+    """What the noise of the records adds to the parameters on average, to second order.
 
     By adding it once more, and its negative: the mean of both changes has no first order in it
     (simulation and extrapolation, Cook and Stefanski 1994, with antithetic draws).

@@ -80,12 +80,6 @@ class Scores(NamedTuple):
     size: Float[Array, " change"]
     moved: Float[Array, " change"]
 
-    def less(self, bias: Float[Array, " change"]) -> "Scores":
-        """The same without a bias of z."""
-        z = self.z - bias
-        part = z / self.z
-        return Scores(z, part * self.size, jnp.abs(part) * self.moved)
-
     def seen(self) -> Bool[Array, ""]:
         """Whether the load is another circuit."""
         spread = (jnp.abs(self.z[0]) > SEEN_SPREAD) & (jnp.abs(self.size[0]) > SPREAD)
