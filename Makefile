@@ -20,7 +20,7 @@ COMPILED := JAX_COMPILATION_CACHE_DIR=$(CURDIR)/.pytest_cache/d/xla JAX_PERSISTE
 .PHONY: demo test slow ranking notebooks docs wheel-test lint types clean
 
 demo: .venv/package
-	$(BIN)/python -m etid.demo demo/
+	$(BIN)/python -m etid.paper.demo demo/
 
 test: .venv/tools
 	$(BIN)/python -m pytest --numprocesses auto --dist loadfile
@@ -44,6 +44,7 @@ wheel-test: .venv/tools
 lint: .venv/tools
 	$(BIN)/ruff check
 	$(BIN)/ruff format --check
+	$(BIN)/lint-imports --no-logo
 
 types: .venv/tools
 	$(BIN)/pyright

@@ -24,9 +24,9 @@ import etid
 from benchmarks.ladder import LOADS
 from benchmarks.perturbed_study import drawn_driver
 from benchmarks.spice import ESTIMATORS, FOLDER, JOINT, add_data, scene_of
-from etid.methods import Method
-from etid.scenes import Scene, Trial
-from etid.transformer import ResistorLoad
+from etid.estimators.registry import Method
+from etid.simulation.scenes import Scene, Trial
+from etid.simulation.transformer import ResistorLoad
 
 SILENT = 5.0  # standard errors by which a successful fit may not be wrong
 MORE = "more"  # trials that take part in a joint fit, but share its errors and are not counted

@@ -23,10 +23,10 @@ from benchmarks.problem import START, Problem, harmonics, problem, problem_of, t
 from benchmarks.provenance import write_csv
 from benchmarks.speed import pin
 from benchmarks.timing import first_and_warm
-from etid.filtering import lfilter
-from etid.levenberg_marquardt import normal_equations
-from etid.methods import Method
-from etid.single_load import TOGETHER
+from etid.estimators.maximum_likelihood.load import TOGETHER
+from etid.estimators.registry import Method
+from etid.signals.filtering import lfilter
+from etid.solvers.levenberg_marquardt import normal_equations
 
 SAMPLES = (1_000, 3_000, 10_000, 30_000, 100_000, 300_000, 1_000_000)
 LANES = (1, 4, 16, 64, 256, 1_024, 10_000, 100_000)

@@ -13,8 +13,8 @@ import scipy.optimize
 
 import etid
 from benchmarks.ladder import LOADS
-from etid.scenes import Scene, Trial
-from etid.transformer import ResistorLoad, TransformerDriver
+from etid.simulation.scenes import Scene, Trial
+from etid.simulation.transformer import ResistorLoad, TransformerDriver
 
 DUTY = 0.04  # the paper's
 DURATION = 0.05  # [s] of a record

@@ -6,7 +6,7 @@ import math
 import numpy as np
 from jaxtyping import Complex, Float
 
-from etid.transformer import Impedance, Sampler, SkinLoad, TransformerDriver
+from etid.simulation.transformer import Impedance, Sampler, SkinLoad, TransformerDriver
 
 Volts = Float[np.ndarray, " time"]
 ROUNDS = 60  # of a fixed point that gains a factor of 1.5 at least

@@ -11,8 +11,8 @@ from jaxtyping import Bool, Float
 import etid
 from benchmarks import rivals
 from benchmarks.ladder import CALIBRATION, START, TRIAL
-from etid.methods import HARMONIC, METHODS, Method
-from etid.scenes import Scene
+from etid.estimators.registry import HARMONIC, METHODS, Method
+from etid.simulation.scenes import Scene
 
 DEFAULT = "default"
 OURS = (DEFAULT, *METHODS)

@@ -13,10 +13,10 @@ import numpy as np
 from jaxtyping import Complex, Float
 
 from benchmarks.ladder import LOADS, rung
-from etid.circuits import AbstractCircuit, Resistor
-from etid.recording import Recording, Samples
-from etid.scenes import Scene, Trial
-from etid.transformer import SkinLoad, TransformerDriver
+from etid.circuits.circuit import AbstractCircuit, Resistor
+from etid.recordings.recording import Recording, Samples
+from etid.simulation.scenes import Scene, Trial
+from etid.simulation.transformer import SkinLoad, TransformerDriver
 
 SNR_DB = (20, 30, 40, 60, 80)
 RATIOS = (0.1, 0.3, 1, 3, 10, 30)  # of R_s + R_p to |Z_th| at `RATIO_AT`

@@ -28,12 +28,12 @@ import etid
 from benchmarks.estimators import DEFAULT, FAR, driver_of, is_off, shared
 from benchmarks.failure_axes import Cell, Cole, TwoLayers
 from benchmarks.mappings import make_room
-from etid.circuits import AbstractCircuit, Resistor, SkinRC
-from etid.methods import REFINED, Method, choose
-from etid.preflight import Inspected
-from etid.scenes import Scene
-from etid.transfer import is_stable
-from etid.transformer import Impedance, SkinLoad
+from etid.circuits.circuit import AbstractCircuit, Resistor, SkinRC
+from etid.estimators.registry import REFINED, Method, choose
+from etid.recordings.preflight import Inspected
+from etid.signals.transfer import is_stable
+from etid.simulation.scenes import Scene
+from etid.simulation.transformer import Impedance, SkinLoad
 
 ELEMENTS = SkinRC.names()
 DETERMINED = 0.1  # bound of an element for which it must not be wrong silently

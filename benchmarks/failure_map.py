@@ -34,7 +34,7 @@ from benchmarks.failure_axes import MOST, Cell, cells
 from benchmarks.failure_counts import rates, silent, table
 from benchmarks.failure_draws import Answer, Effort, chunk
 from benchmarks.provenance import RESULTS, write_csv
-from etid import streaming
+from etid.identify import file as streaming
 
 RATES, SILENT = "failures.csv", "silent_failures.csv"
 TARGET = 1e-3  # silent failures of the default method

@@ -2,7 +2,7 @@
 
 `etid.scenes` records a study in which all is well. Here each of the two voltages of a recording is
 an `Output` that can be changed alone, and a `Record` can tell its file what is not true. The
-waveforms are the exact periodic ones of `etid.transformer`:
+waveforms are the exact periodic ones of `etid.simulation.transformer`:
 
     pulses → driver and load → gain → anti-alias filter → sampling → · scale → + added voltages
     + white noise → rounding to a code, clipped at the full scale.
@@ -20,15 +20,9 @@ from typing import Any
 import numpy as np
 from jaxtyping import Complex, Float
 
-from etid.recording import Recording, Samples
-from etid.scenes import Scene
-from etid.transformer import (
-    Impedance,
-    OpenLoad,
-    Sampler,
-    TransformerDriver,
-    loading,
-)
+from etid.recordings.recording import Recording, Samples
+from etid.simulation.scenes import Scene
+from etid.simulation.transformer import Impedance, OpenLoad, Sampler, TransformerDriver, loading
 
 SCALE = Scene().scale  # volts at the converter per volt at the terminal
 CORNER = Scene().antialias  # of the anti-alias filter, relative to the sample rate

@@ -8,9 +8,9 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from benchmarks import ngspice
-from etid.scenes import Scene, Trial
-from etid.study import Study
-from etid.transformer import ResistorLoad, SkinLoad
+from etid.recordings.study import Study
+from etid.simulation.scenes import Scene, Trial
+from etid.simulation.transformer import ResistorLoad, SkinLoad
 
 LOADS = {
     "dry": SkinLoad(r_s=33.4e3, r_p=186e3, c_p=0.12e-9),

@@ -13,7 +13,7 @@ from typing import Any
 import h5py
 import numpy as np
 
-from etid.scenes import Scene, paper_subjects
+from etid.simulation.scenes import Scene, paper_subjects
 
 SAMPLES = 5_000
 SAMPLE_RATE = 100e3  # [Hz], at which they are three periods of 60 Hz

@@ -36,9 +36,15 @@ from jaxtyping import Complex, Float
 import etid
 from benchmarks.provenance import ROOT
 from benchmarks.spice import PARTS
-from etid.circuits import AbstractCircuit
-from etid.scenes import Scene, Trial
-from etid.transformer import Impedance, OpenLoad, ResistorLoad, SkinLoad, TransformerDriver
+from etid.circuits.circuit import AbstractCircuit
+from etid.simulation.scenes import Scene, Trial
+from etid.simulation.transformer import (
+    Impedance,
+    OpenLoad,
+    ResistorLoad,
+    SkinLoad,
+    TransformerDriver,
+)
 
 CACHE = ROOT / "results" / "ngspice"
 RELTOL = 1e-8
@@ -71,7 +77,7 @@ class NgspiceError(RuntimeError):
 
 
 def netlist(driver: TransformerDriver, load: Impedance | AbstractCircuit, pulse_rate: float) -> str:
-    """The circuit of `etid.transformer` with its load, and a run into its steady state.
+    """The circuit of `etid.simulation.transformer` with its load, and a run into its steady state.
 
     The windings are an ideal transformer 1:n between m and w, with the leakage, magnetising and
     loss elements of each side around it.

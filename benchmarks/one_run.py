@@ -15,7 +15,7 @@ import h5py
 import jax
 
 import etid
-from etid import streaming
+from etid.identify import file as streaming
 
 
 def by_h5py(file: str, whole_stacks: bool) -> int:

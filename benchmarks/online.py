@@ -13,8 +13,8 @@ from tqdm import tqdm
 
 import etid
 from benchmarks.speed import pin
-from etid.scenes import Scene, Trial
-from etid.transformer import ResistorLoad, SkinLoad
+from etid.simulation.scenes import Scene, Trial
+from etid.simulation.transformer import ResistorLoad, SkinLoad
 
 LOADS = (SkinLoad(r_s=33.4e3, r_p=186e3, c_p=0.12e-9), SkinLoad(r_s=6.1e3, r_p=17.4e3, c_p=0.66e-9))
 TARGET = 0.15  # of the time between two pulses, which 99 % of the ticks must keep to

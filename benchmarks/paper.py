@@ -23,10 +23,10 @@ from benchmarks import paper_figures, paper_tables
 from benchmarks.ladder import SOURCES
 from benchmarks.paper_tables import Groups, Row
 from benchmarks.provenance import write_csv
-from etid.experiments import LABORATORIES as ENDS
-from etid.experiments import METHODS, Outcome, identify
-from etid.report import Section
-from etid.scenes import Scene, Trial
+from etid.paper.tables import LABORATORIES as ENDS
+from etid.paper.tables import METHODS, Outcome, identify
+from etid.report.html import Section
+from etid.simulation.scenes import Scene, Trial
 
 LABORATORIES: Mapping[str, Mapping[str, float]] = {
     "good": ENDS["quiet"],

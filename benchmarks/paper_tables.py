@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 
 import etid
-from etid import experiments
-from etid.circuits import DISPLAY
-from etid.experiments import ORDER, Outcome, Truth
-from etid.report import Table, number
+from etid.circuits.circuit import DISPLAY
+from etid.paper import tables as experiments
+from etid.paper.tables import ORDER, Outcome, Truth
+from etid.report.html import Table, number
 
 Row = dict[str, Any]
 Groups = Mapping[tuple[str, str], Sequence[Outcome]]

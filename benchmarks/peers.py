@@ -21,15 +21,15 @@ from jaxtyping import Array, Float
 import etid
 from benchmarks.problem import SAMPLES, START, ByNumPy, Problem, harmonics, problem, terms
 from benchmarks.timing import first_and_warm
-from etid import steiglitz_mcbride
-from etid.batch import each
-from etid.filtering import lfilter
-from etid.harmonic_steiglitz_mcbride import fit_skin
-from etid.levenberg_marquardt import normal_equations
-from etid.output_error import MAX_STEPS
-from etid.single_load import TOGETHER
-from etid.spectra import Spectrum
-from etid.transfer import Rational
+from etid.estimators import steiglitz_mcbride
+from etid.estimators.harmonic_steiglitz_mcbride import fit_skin
+from etid.estimators.maximum_likelihood.load import TOGETHER
+from etid.estimators.output_error.fit import MAX_STEPS
+from etid.identify.many import each
+from etid.signals.filtering import lfilter
+from etid.signals.harmonics import Spectrum
+from etid.signals.transfer import Rational
+from etid.solvers.levenberg_marquardt import normal_equations
 
 LANES = (1, 98, 1024, 10_000)
 SIDE_BY_SIDE = 98

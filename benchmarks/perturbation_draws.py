@@ -20,11 +20,11 @@ from benchmarks.ladder import LOADS
 from benchmarks.mappings import make_room
 from benchmarks.perturbation_list import PERTURBATIONS
 from benchmarks.perturbed_study import RESISTOR, Truth, undisturbed
-from etid.methods import Method, choose
-from etid.preflight import Inspected
-from etid.recording import SIGNALS
-from etid.scenes import Scene, Trial
-from etid.transformer import ResistorLoad
+from etid.estimators.registry import Method, choose
+from etid.recordings.preflight import Inspected
+from etid.recordings.recording import SIGNALS
+from etid.simulation.scenes import Scene, Trial
+from etid.simulation.transformer import ResistorLoad
 
 Kind = Literal["right", "refused", "said", "silent"]
 KINDS: tuple[Kind, ...] = ("right", "refused", "said", "silent")

@@ -38,7 +38,7 @@ from benchmarks.perturbed_study import (
     th,
     trials,
 )
-from etid.transformer import ResistorLoad
+from etid.simulation.transformer import ResistorLoad
 
 UNDISTURBED: Mapping[str, Change] = {
     "base": lambda study: study,

@@ -30,7 +30,7 @@ from benchmarks.estimators import DEFAULT, OURS
 from benchmarks.perturbation_draws import Answer, draw, table
 from benchmarks.perturbation_list import INVISIBLE, PERTURBATIONS, UNDISTURBED
 from benchmarks.provenance import RESULTS, write_csv
-from etid import streaming
+from etid.identify import file as streaming
 
 DRIVERS = 10
 SNR_DB = (40.0, 60.0)

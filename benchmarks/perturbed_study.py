@@ -15,7 +15,7 @@ from jaxtyping import Float
 from benchmarks.disturbances import Leaky, Nonlinear, Pink
 from benchmarks.laboratory import Crosstalk, Output, Record, noise
 from benchmarks.ladder import LOADS
-from etid.transformer import Impedance, ResistorLoad, SkinLoad, TransformerDriver
+from etid.simulation.transformer import Impedance, ResistorLoad, SkinLoad, TransformerDriver
 
 RESISTOR, SECOND = 98.8e3, 21.62e3  # [ohm]
 DELAY = 50e-9  # [s] rms, of every loaded and unloaded record

@@ -7,14 +7,14 @@ import numpy as np
 from jaxtyping import Array, Float
 
 import etid
-from etid.circuits import SkinRC
-from etid.given_driver import GivenDriver
-from etid.lanes import known_driver, lane, stacked
-from etid.preflight import Inspected
-from etid.scenes import Scene, Trial
-from etid.single_load import Load
-from etid.spectra import Spectrum
-from etid.transformer import ResistorLoad, SkinLoad
+from etid.circuits.circuit import SkinRC
+from etid.estimators.maximum_likelihood.given_driver import GivenDriver
+from etid.estimators.maximum_likelihood.load import Load
+from etid.identify.lanes import known_driver, lane, stacked
+from etid.recordings.preflight import Inspected
+from etid.signals.harmonics import Spectrum
+from etid.simulation.scenes import Scene, Trial
+from etid.simulation.transformer import ResistorLoad, SkinLoad
 
 SAMPLES = 33_330  # ten pulse periods at 200 kHz
 LOAD = SkinLoad(r_s=33.4e3, r_p=186e3, c_p=0.12e-9)

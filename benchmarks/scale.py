@@ -23,8 +23,8 @@ import numpy as np
 
 from benchmarks.large_file import LAYOUTS, large_file
 from benchmarks.provenance import ROOT, write_csv
-from etid import streaming
-from etid.methods import METHODS
+from etid.estimators.registry import METHODS
+from etid.identify import file as streaming
 
 FILES = pathlib.Path(tempfile.gettempdir()) / "etid-scale"
 WITHIN = 2.0  # reading and fitting, of reading alone

@@ -1,7 +1,7 @@
 """Skin that is not one RC, as circuits: two layers, and a relaxation that is spread."""
 
 from etid import AbstractCircuit, capacitor, cole, parallel, parameter, resistor, series
-from etid.elements import Exponent, Farad, Ohm, Second
+from etid.circuits.elements import Exponent, Farad, Ohm, Second
 
 
 class SkinTwoLayer(AbstractCircuit):

@@ -17,13 +17,13 @@ import etid
 from benchmarks import mutations
 from benchmarks.mutations import Rng
 from etid import cli
-from etid.driver import Calibration, SourceImpedance
-from etid.preflight import Inspected, preflight
-from etid.scenes import Scene, Trial
-from etid.settings import Settings
-from etid.study_fits import StudyFits
-from etid.transformer import ResistorLoad, SkinLoad
-from etid.verdicts import message, verdict, verdicts_of
+from etid.recordings.preflight import Inspected, preflight
+from etid.results.driver import Calibration, SourceImpedance
+from etid.results.provenance import Settings
+from etid.results.study_fits import StudyFits
+from etid.results.verdicts import message, verdict, verdicts_of
+from etid.simulation.scenes import Scene, Trial
+from etid.simulation.transformer import ResistorLoad, SkinLoad
 
 SKIN = {"r_s": 33.4e3, "r_p": 186e3, "c_p": 0.12e-9}
 PAGES = 40  # of so many files of fits one is also drawn, which takes a second

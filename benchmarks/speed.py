@@ -24,9 +24,9 @@ from benchmarks.peers import A, B
 from benchmarks.problem import LOAD, SAMPLES, Problem, harmonics, problem
 from benchmarks.provenance import write_csv
 from benchmarks.timing import first_and_warm, import_time
-from etid.filtering import lfilter
-from etid.levenberg_marquardt import normal_equations
-from etid.steiglitz_mcbride import ITERATIONS
+from etid.estimators.steiglitz_mcbride import ITERATIONS
+from etid.signals.filtering import lfilter
+from etid.solvers.levenberg_marquardt import normal_equations
 
 TRUTH = dataclasses.astuple(LOAD)
 WARM = 3  # processes that find what another one has compiled

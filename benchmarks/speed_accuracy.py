@@ -21,7 +21,7 @@ from benchmarks.mappings import make_room
 from benchmarks.provenance import RESULTS, write_csv
 from benchmarks.speed import pin
 from benchmarks.speed_accuracy_chart import chart
-from etid.circuits import SkinRC
+from etid.circuits.circuit import SkinRC
 
 FILE = "speed_accuracy.csv"
 REPETITIONS = 24

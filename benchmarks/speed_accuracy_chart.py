@@ -10,7 +10,7 @@ from adjustText import adjust_text
 from matplotlib.axes import Axes
 
 from benchmarks import charts
-from etid.methods import METHODS
+from etid.estimators.registry import METHODS
 
 # What stands in a panel for each estimator.
 LETTERS = {

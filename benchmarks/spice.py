@@ -16,10 +16,10 @@ from typing import cast
 import numpy as np
 
 import etid
-from etid.circuits import AbstractCircuit
-from etid.methods import METHODS, REFINED, Method
-from etid.scenes import Scene, Trial
-from etid.transformer import ResistorLoad, SkinLoad, TransformerDriver
+from etid.circuits.circuit import AbstractCircuit
+from etid.estimators.registry import METHODS, REFINED, Method
+from etid.simulation.scenes import Scene, Trial
+from etid.simulation.transformer import ResistorLoad, SkinLoad, TransformerDriver
 
 FOLDER = "spice_recordings"  # in the folder of all data
 BOUND = "crb_rel_with_delays"  # the trigger delays being unknown, as they are to the fits

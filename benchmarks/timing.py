@@ -12,7 +12,7 @@ import jax
 import numpy as np
 
 import etid
-from etid.methods import METHODS
+from etid.estimators.registry import METHODS
 
 REPEATS = 7
 

@@ -1,10 +1,10 @@
 """By how many standard deviations the best test could see a change of the records.
 
-The records are those of `etid.bounds`: X_k and Z_th(f_k) are unknown at every harmonic, and so are
-the elements and the delays. A change adds ε ∂Y_k to the loaded voltages, ε = 1 for the change
-itself. What of it those unknowns cannot imitate, over the noise, is the largest number of standard
-deviations by which any test without a bias can see it. A driver of finite order is known better
-than this Z_th where it is smooth: a test that knows its order may see somewhat more.
+The records are those of `etid.simulation.bound`: X_k and Z_th(f_k) are unknown at every harmonic,
+and so are the elements and the delays. A change adds ε ∂Y_k to the loaded voltages, ε = 1 for the
+change itself. What of it those unknowns cannot imitate, over the noise, is the largest number of
+standard deviations by which any test without a bias can see it. A driver of finite order is known
+better than this Z_th where it is smooth: a test that knows its order may see somewhat more.
 """
 
 import dataclasses
@@ -17,8 +17,8 @@ import numpy as np
 from jaxtyping import Complex, Float
 
 from benchmarks.ladder import rung
-from etid.circuits import SkinRC
-from etid.transformer import SkinLoad, loading
+from etid.circuits.circuit import SkinRC
+from etid.simulation.transformer import SkinLoad, loading
 
 BAND = 0.4  # of the sample rate
 RESISTOR = 98.8e3  # [ohm]

@@ -11,7 +11,7 @@ import numpy as np
 from benchmarks.estimators import OURS
 from benchmarks.provenance import RESULTS, ROOT
 from benchmarks.speed_accuracy import FILE
-from etid.methods import METHODS
+from etid.estimators.registry import METHODS
 
 README = ROOT / "README.md"
 BEGIN, END = "<!-- python -m benchmarks which -->\n", "<!-- end -->\n"

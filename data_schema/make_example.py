@@ -5,8 +5,8 @@ python data_schema/make_example.py data_schema/example.h5
 
 import sys
 
-from etid import scenes
-from etid.transformer import ResistorLoad, SkinLoad
+from etid.simulation import scenes
+from etid.simulation.transformer import ResistorLoad, SkinLoad
 
 
 def main(target: str) -> None:

@@ -32,7 +32,7 @@ import numpy as np
 import scipy.stats
 
 import etid
-from etid.scenes import Scene, SkinLoad, Trial, paper_calibration
+from etid.simulation.scenes import Scene, SkinLoad, Trial, paper_calibration
 
 SEED = 0
 

@@ -26,7 +26,7 @@ jax.config.update("jax_enable_x64", True)  # before the first array: etid needs 
 import numpy as np
 
 import etid
-from etid.elements import Exponent, Farad, Ohm, Second
+from etid.circuits.elements import Exponent, Farad, Ohm, Second
 
 SEED = 0
 

@@ -29,8 +29,8 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import etid
-from etid.scenes import Scene, SkinLoad, Trial
-from etid.transformer import ResistorLoad, TransformerDriver
+from etid.simulation.scenes import Scene, SkinLoad, Trial
+from etid.simulation.transformer import ResistorLoad, TransformerDriver
 
 SEED = 0
 TRIALS = 16
@@ -128,7 +128,8 @@ axes = etid.plot(narrow.simulate(SEED)["damp/00"])
 # A relaxation that is spread over time constants (Cole, α = 0.9). The best R_s + R_p ‖ C_p leaves
 # a residual that over the whole record has the size of the noise, χ² is 1.1, and R_s is off by
 # 40 %. What gives it away: Z_th has to bend to make up for it, against the calibration
-# (`inconsistent`), or a test for just this spread sees it (`etid.other_circuit`, `misfit`).
+# (`inconsistent`), or a test for just this spread sees it
+# (`etid.estimators.score_tests.other_circuit`, `misfit`).
 
 
 # %%

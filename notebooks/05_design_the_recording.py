@@ -29,8 +29,8 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import etid
-from etid.scenes import Scene, Trial
-from etid.transformer import ResistorLoad, SkinLoad, TransformerDriver
+from etid.simulation.scenes import Scene, Trial
+from etid.simulation.transformer import ResistorLoad, SkinLoad, TransformerDriver
 
 SEED = 0
 GOAL = 0.01  # standard error of R_s, relative

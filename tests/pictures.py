@@ -15,11 +15,11 @@ import jax.numpy as jnp
 import numpy as np
 
 import etid
-from etid.driver import Calibration, Driver, SourceImpedance
 from etid.plotting import figure_of
-from etid.results import Fit, Fits
-from etid.scenes import PRESETS
-from etid.verdicts import verdicts_of
+from etid.results.driver import Calibration, Driver, SourceImpedance
+from etid.results.fits import Fit, Fits
+from etid.results.verdicts import verdicts_of
+from etid.simulation.scenes import PRESETS
 
 BASELINE = pathlib.Path(__file__).parent / "baseline"
 DPI = 60

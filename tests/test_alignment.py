@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 
 import etid
-from etid import lanes
-from etid.alignment import lag_of, whole_lag
-from etid.preflight import Inspected, preflight
-from etid.pulse_train import find_pulses
-from etid.remarks import Remark
-from etid.scenes import Scene, Trial
-from etid.transformer import ResistorLoad, SkinLoad
+from etid.identify import lanes
+from etid.recordings.preflight import Inspected, preflight
+from etid.recordings.remarks import Remark
+from etid.signals.alignment import lag_of, whole_lag
+from etid.signals.pulse_train import find_pulses
+from etid.simulation.scenes import Scene, Trial
+from etid.simulation.transformer import ResistorLoad, SkinLoad
 
 PULSE = 60.0
 LOADS = {
@@ -113,7 +113,7 @@ def test_a_calibration_that_is_late_serves_as_well():
 
 def test_what_looks_later_than_it_is_is_aligned_again(driver, monkeypatch):
     """Edges that a load smoothes may be found two samples late: the misfit tells how many."""
-    monkeypatch.setattr("etid.preflight.whole_lag", lambda lag: round(lag) - 2)
+    monkeypatch.setattr("etid.recordings.preflight.whole_lag", lambda lag: round(lag) - 2)
     record = simulate(7.0, seed=8)["dry"]
     alone = etid.identify_skin(record, driver)
     fits = etid.identify_skins([record, simulate(0.0, seed=9)["dry"]], driver)

@@ -8,7 +8,7 @@ import pytest
 
 import etid
 from benchmarks.specimens import study_fits
-from etid import arguments
+from etid.identify import arguments
 
 # The tests' own type checker would come first; a process of its own has none.
 CALLS = """

@@ -6,8 +6,8 @@ import numpy as np
 import optimistix as optx
 import pytest
 
-from etid.arrowhead import Arrowhead, ArrowheadEquations, EliminationDescent, join, split
-from etid.levenberg_marquardt import LevenbergMarquardt, NormalEquations, normal_equations
+from etid.solvers.arrowhead import Arrowhead, ArrowheadEquations, EliminationDescent, join, split
+from etid.solvers.levenberg_marquardt import LevenbergMarquardt, NormalEquations, normal_equations
 
 PROBLEMS, OWN, COMMON = 5, 2, 3
 AGREE = 1e-10  # of numbers of order 1 after a solution with condition numbers below 1e4

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 import etid
-from etid.scenes import Scene, Trial
-from etid.transformer import ResistorLoad, SkinLoad
+from etid.simulation.scenes import Scene, Trial
+from etid.simulation.transformer import ResistorLoad, SkinLoad
 
 LENGTH = 3334
 DRY = SkinLoad(r_s=33.4e3, r_p=186e3, c_p=0.12e-9)

@@ -9,10 +9,11 @@ import numpy as np
 import pytest
 
 import etid
-from etid import batch, lanes
-from etid.preflight import Inspected
-from etid.scenes import Scene, Trial
-from etid.transformer import ResistorLoad, SkinLoad
+from etid.identify import lanes
+from etid.identify import many as batch
+from etid.recordings.preflight import Inspected
+from etid.simulation.scenes import Scene, Trial
+from etid.simulation.transformer import ResistorLoad, SkinLoad
 
 LENGTH = 3334
 DRY = SkinLoad(r_s=33.4e3, r_p=186e3, c_p=0.12e-9)

@@ -12,8 +12,8 @@ import optimistix as optx
 import pytest
 import scipy.io
 
-from etid.circuits import AbstractCircuit, parameter
-from etid.elements import (
+from etid.circuits.circuit import AbstractCircuit, parameter
+from etid.circuits.elements import (
     AbstractImpedance,
     Farad,
     Ohm,
@@ -22,7 +22,7 @@ from etid.elements import (
     resistor,
     series,
 )
-from etid.output_error import SOLVER
+from etid.estimators.output_error.fit import SOLVER
 
 MILLI = 1e-3
 DISTURBED = ("SoC7", "Cell2")

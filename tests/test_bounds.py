@@ -7,8 +7,8 @@ import pytest
 
 import etid
 from benchmarks.spice import BOUND, scene_of
-from etid.scenes import Scene, Trial
-from etid.transformer import ResistorLoad, SkinLoad
+from etid.simulation.scenes import Scene, Trial
+from etid.simulation.transformer import ResistorLoad, SkinLoad
 
 DRY = SkinLoad(r_s=33.4e3, r_p=186e3, c_p=0.12e-9)
 KNOWN = (Trial("calibration/0", ResistorLoad(98.8e3)),)

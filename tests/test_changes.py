@@ -9,11 +9,11 @@ import pytest
 
 import etid
 from benchmarks.ladder import CALIBRATION, LOADS, TRIAL, rung
-from etid import changes
-from etid.preflight import Inspected
-from etid.repeats import repeats
-from etid.results import Fits
-from etid.scenes import Scene, Trial
+from etid.identify import changes
+from etid.recordings.preflight import Inspected
+from etid.recordings.repeats import repeats
+from etid.results.fits import Fits
+from etid.simulation.scenes import Scene, Trial
 from tests import pictures
 
 NAMES = ("r_s", "r_p", "c_p")

@@ -16,8 +16,8 @@ from etid import (
     resistor,
     series,
 )
-from etid.circuits import heading
-from etid.transfer import frequency_variable
+from etid.circuits.circuit import heading
+from etid.signals.transfer import frequency_variable
 
 FREQUENCY = jnp.geomspace(10.0, 1e6, 25)
 S = frequency_variable(FREQUENCY)

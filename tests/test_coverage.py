@@ -13,7 +13,7 @@ from benchmarks.coverage import Draws, expected_covered, expected_rms, monte_car
 from benchmarks.estimators import shared
 from benchmarks.ladder import LOADS
 from benchmarks.perturbed_study import drawn_driver
-from etid.transformer import TransformerDriver
+from etid.simulation.transformer import TransformerDriver
 
 SUCCESSFUL = 0.9  # Steiglitz-McBride calls one of 20 biased that it need not
 # A driver costs half a second on the harmonics, several by output error or with a study.

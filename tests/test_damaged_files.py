@@ -8,9 +8,9 @@ import pytest
 
 import etid
 from benchmarks import fuzz, specimens
-from etid import hdf5, limits, untrusted
-from etid.formats import mat5
-from etid.study_fits import StudyFits
+from etid.files.readers import mat5
+from etid.recordings import hdf5, limits, untrusted
+from etid.results.study_fits import StudyFits
 
 FEW = 4  # files of each kind in the ordinary tests
 MANY = 1000  # files in the slow one

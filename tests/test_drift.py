@@ -11,9 +11,9 @@ from jax.flatten_util import ravel_pytree
 import etid
 from benchmarks.ladder import LOADS
 from benchmarks.perturbed_study import drawn_driver
-from etid.driver import SourceImpedance
-from etid.scenes import Scene, Trial
-from etid.transformer import OpenLoad, ResistorLoad, SkinLoad, TransformerDriver, loading
+from etid.results.driver import SourceImpedance
+from etid.simulation.scenes import Scene, Trial
+from etid.simulation.transformer import OpenLoad, ResistorLoad, SkinLoad, TransformerDriver, loading
 
 DRY = SkinLoad(r_s=33.4e3, r_p=186e3, c_p=0.12e-9)
 DRIFT = 0.01

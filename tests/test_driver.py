@@ -7,9 +7,9 @@ from hypothesis import strategies as st
 from jax.flatten_util import ravel_pytree
 
 from etid import Resistor, SkinRC, capacitor, parallel, resistor, series
-from etid.driver import SourceImpedance, loaded, realise
-from etid.estimation import is_split
-from etid.transfer import Rational, frequency_variable
+from etid.estimators.refinement import is_split
+from etid.results.driver import SourceImpedance, loaded, realise
+from etid.signals.transfer import Rational, frequency_variable
 
 FREQUENCY = jnp.geomspace(10.0, 1e6, 25)
 S = np.asarray(frequency_variable(FREQUENCY))

@@ -18,10 +18,11 @@ import pytest
 from pyarrow import parquet
 
 import etid
-from etid import cli, exporting
-from etid.remarks import Remark
-from etid.results import Fit, Fits
-from etid.verdicts import verdicts_of
+from etid import cli
+from etid.files import exporting
+from etid.recordings.remarks import Remark
+from etid.results.fits import Fit, Fits
+from etid.results.verdicts import verdicts_of
 
 START = datetime.datetime(2026, 1, 31, 9, 30, tzinfo=datetime.UTC)
 COUNT = 23
@@ -275,7 +276,7 @@ def test_when_a_session_began_is_not_guessed(start, study_file, tmp_path):
 def test_a_missing_package_is_named_with_its_extra(
     package, target, extra, file, study_file, tmp_path, monkeypatch
 ):
-    for name in [name for name in sys.modules if name == "etid.nwb"]:
+    for name in [name for name in sys.modules if name == "etid.files.nwb"]:
         monkeypatch.delitem(sys.modules, name)
     monkeypatch.setitem(sys.modules, package, None)
     source, options = file, {}

@@ -11,10 +11,10 @@ import scipy.signal
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from etid import filtering
-from etid.circuits import Resistor, SkinRC
-from etid.driver import SourceImpedance, loaded
-from etid.filtering import BLOCK, CUTOFF, TAPS, StateSpace, band_limited, hold, simulate
+from etid.circuits.circuit import Resistor, SkinRC
+from etid.results.driver import SourceImpedance, loaded
+from etid.signals import filtering
+from etid.signals.filtering import BLOCK, CUTOFF, TAPS, StateSpace, band_limited, hold, simulate
 
 lfilter = jax.jit(filtering.lfilter)
 run = jax.jit(simulate)

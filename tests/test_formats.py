@@ -11,10 +11,11 @@ import pytest
 from nptdms import ChannelObject, TdmsWriter
 
 import etid
-from etid import channels, hdf5
-from etid.formats import delimited
-from etid.recording import RecordingError
-from etid.units import UNITS, parse_unit
+from etid.files import channel as channels
+from etid.files.readers import delimited
+from etid.files.units import UNITS, parse_unit
+from etid.recordings import hdf5
+from etid.recordings.recording import RecordingError
 from tests.lab_files import abf, matlab, tdms
 
 README = pathlib.Path(__file__).parents[1] / "data_schema" / "README.md"

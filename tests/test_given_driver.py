@@ -7,12 +7,12 @@ import pytest
 from jax.flatten_util import ravel_pytree
 
 import etid
-from etid import lanes
-from etid.measurement import noise
-from etid.output_error import DELAY_WIDTH, prior
-from etid.scenes import Scene, Trial
-from etid.spectra import spectrum
-from etid.transformer import ResistorLoad
+from etid.estimators.output_error.fit import DELAY_WIDTH, prior
+from etid.identify import lanes
+from etid.signals.harmonics import spectrum
+from etid.signals.measurement import noise
+from etid.simulation.scenes import Scene, Trial
+from etid.simulation.transformer import ResistorLoad
 
 R_LOAD = 98.8e3
 KNOWN = (Trial("c", ResistorLoad(R_LOAD)),)

@@ -11,9 +11,9 @@ import pytest
 from jaxtyping import Array
 
 import etid
-from etid import single_load
-from etid.scenes import Scene, Trial
-from etid.transformer import ResistorLoad, SkinLoad
+from etid.estimators.maximum_likelihood import load as single_load
+from etid.simulation.scenes import Scene, Trial
+from etid.simulation.transformer import ResistorLoad, SkinLoad
 
 # Minima to ten digits: a difference of two of them is to be compared.
 EXACT = dataclasses.replace(single_load.TOGETHER, rtol=1e-10, ftol=1e-15)

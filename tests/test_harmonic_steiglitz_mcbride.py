@@ -10,15 +10,15 @@ import pytest
 from jax.flatten_util import ravel_pytree
 
 import etid
-from etid.circuits import SkinRC
-from etid.driver import SourceImpedance
-from etid.harmonic_steiglitz_mcbride import covariance, fit_skin
-from etid.noise import noise_std
-from etid.scenes import Scene, Trial
-from etid.spectra import Spectrum, spectrum, whole_periods
-from etid.transfer import delayed
-from etid.transformer import ResistorLoad, SkinLoad
-from etid.verdicts import verdict
+from etid.circuits.circuit import SkinRC
+from etid.estimators.harmonic_steiglitz_mcbride import covariance, fit_skin
+from etid.results.driver import SourceImpedance
+from etid.results.verdicts import verdict
+from etid.signals.harmonics import Spectrum, spectrum, whole_periods
+from etid.signals.noise import noise_std
+from etid.signals.transfer import delayed
+from etid.simulation.scenes import Scene, Trial
+from etid.simulation.transformer import ResistorLoad, SkinLoad
 
 METHOD = "harmonic_steiglitz_mcbride"
 LENGTH = 3334  # of one period, as in other tests

@@ -9,9 +9,10 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from etid import hdf5, scan
-from etid.recording import SIGNALS, Recording, RecordingError, Samples
-from etid.study import Study
+from etid.recordings import contents as scan
+from etid.recordings import hdf5
+from etid.recordings.recording import SIGNALS, Recording, RecordingError, Samples
+from etid.recordings.study import Study
 
 FOLDER = pathlib.Path(__file__).parents[1] / "data_schema"
 RATES = {"sample_rate": 200e3, "pulse_rate": 60.0}

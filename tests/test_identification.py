@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 import etid
-from etid import lanes
-from etid.scenes import Scene, Trial
-from etid.transformer import ResistorLoad, SkinLoad
+from etid.identify import lanes
+from etid.simulation.scenes import Scene, Trial
+from etid.simulation.transformer import ResistorLoad, SkinLoad
 
 LENGTH = 3334
 LOADS = {
@@ -256,7 +256,7 @@ def test_fits_are_a_table(fits):
 
 
 def test_a_chunk_compiles_once_per_length(study, driver, monkeypatch):
-    from etid import batch
+    from etid.identify import many as batch
 
     traces = []
 

@@ -4,9 +4,9 @@ import sys
 import numpy as np
 import pytest
 
-from etid import hdf5
-from etid.importing import import_file
-from etid.recording import RecordingError
+from etid.files.importing import import_file
+from etid.recordings import hdf5
+from etid.recordings.recording import RecordingError
 from tests.lab_files import matlab
 
 TABLE = {"v_th": "th", "v_out": "out", "sample_rate": 200e3, "pulse_rate": 60.0, "scale": 0.0535}

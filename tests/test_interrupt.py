@@ -36,8 +36,8 @@ sys.exit(cli.main(["fit", sys.argv[1], "-o", sys.argv[2]]))
 @pytest.fixture(scope="module")
 def interrupted(tmp_path_factory):
     """Status, lines on stderr and folder of each process, which run side by side."""
-    from etid.scenes import Scene, Trial
-    from etid.transformer import ResistorLoad, SkinLoad
+    from etid.simulation.scenes import Scene, Trial
+    from etid.simulation.transformer import ResistorLoad, SkinLoad
 
     folder = tmp_path_factory.mktemp("interrupted")
     skin = SkinLoad(r_s=33.4e3, r_p=186e3, c_p=0.12e-9)

@@ -8,9 +8,9 @@ import pytest
 
 import etid
 from benchmarks.failure_axes import Cole
-from etid.scenes import Scene, Trial
-from etid.study import Study
-from etid.transformer import ResistorLoad, SkinLoad, TransformerDriver
+from etid.recordings.study import Study
+from etid.simulation.scenes import Scene, Trial
+from etid.simulation.transformer import ResistorLoad, SkinLoad, TransformerDriver
 
 DRY = SkinLoad(r_s=33.4e3, r_p=186e3, c_p=0.12e-9)
 TRUTH = np.array(dataclasses.astuple(DRY))

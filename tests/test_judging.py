@@ -8,10 +8,18 @@ import optimistix as optx
 import pytest
 
 import etid
-from etid import estimation
-from etid.judging import MISFIT_CHI2, MISFIT_RRSE, SUCCESSFUL, judged, misses, too_late, unless
-from etid.output_error import Estimate
-from etid.verdicts import RESULTS, verdict
+from etid.estimators import refinement
+from etid.estimators.judgement import (
+    MISFIT_CHI2,
+    MISFIT_RRSE,
+    SUCCESSFUL,
+    judged,
+    misses,
+    too_late,
+    unless,
+)
+from etid.estimators.output_error.fit import Estimate
+from etid.results.verdicts import RESULTS, verdict
 
 
 def estimate(
@@ -62,9 +70,9 @@ def test_what_a_residual_may_leave_unexplained_depends_on_the_method():
     """Output error at 100 kHz and 80 dB: R_s was ten standard errors off and called successful."""
     of = jnp.asarray(4.5), jnp.asarray(6.7e-4)
     assert not misses(*of)
-    assert misses(*of, estimation.INTERPOLATED)
+    assert misses(*of, refinement.INTERPOLATED)
     # At 200 kHz, where it is right.
-    assert not misses(jnp.asarray(1.43), jnp.asarray(2.9e-4), estimation.INTERPOLATED)
+    assert not misses(jnp.asarray(1.43), jnp.asarray(2.9e-4), refinement.INTERPOLATED)
 
 
 @pytest.mark.parametrize(

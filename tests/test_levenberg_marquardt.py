@@ -10,7 +10,7 @@ import scipy.optimize
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from etid.levenberg_marquardt import LevenbergMarquardt, NormalEquations, normal_equations
+from etid.solvers.levenberg_marquardt import LevenbergMarquardt, NormalEquations, normal_equations
 
 TIME = np.linspace(0.0, 5.0, 60)
 TRUTH = np.array([3.0, 1.7, 0.8])

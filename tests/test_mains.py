@@ -6,12 +6,13 @@ import numpy as np
 import pytest
 
 import etid
-from etid import mains, scenes
-from etid.judging import MISFIT_CHI2
-from etid.preflight import Inspected
-from etid.recording import Samples
-from etid.remarks import Remark
-from etid.scenes import Scene
+from etid.estimators.judgement import MISFIT_CHI2
+from etid.recordings.preflight import Inspected
+from etid.recordings.recording import Samples
+from etid.recordings.remarks import Remark
+from etid.signals import mains
+from etid.simulation import scenes
+from etid.simulation.scenes import Scene
 
 SCALE = Scene().scale
 DRY = scenes.paper_dry()

@@ -7,7 +7,7 @@ import pytest
 
 import etid
 from etid import cli
-from etid.recording import RecordingError
+from etid.recordings.recording import RecordingError
 from tests.lab_files import abf, tdms
 
 COUNT = 800

@@ -8,12 +8,15 @@ import pytest
 import scipy.signal
 
 import etid
-from etid import batch, lanes, likelihood, methods
-from etid.circuits import SkinRC
-from etid.elements import resistor
-from etid.preflight import Inspected
-from etid.scenes import Scene, Trial
-from etid.transformer import ResistorLoad, SkinLoad
+from etid.circuits.circuit import SkinRC
+from etid.circuits.elements import resistor
+from etid.estimators import registry
+from etid.estimators.maximum_likelihood import terms as likelihood
+from etid.identify import lanes
+from etid.identify import many as batch
+from etid.recordings.preflight import Inspected
+from etid.simulation.scenes import Scene, Trial
+from etid.simulation.transformer import ResistorLoad, SkinLoad
 
 DRY = SkinLoad(r_s=33.4e3, r_p=186e3, c_p=0.12e-9)
 SAMPLES = 10_000
@@ -91,7 +94,7 @@ def short(study):
 def test_a_record_without_a_whole_period_is_told_so_or_goes_to_output_error(short, driver):
     with pytest.raises(etid.IdentificationError, match="not_periodic"):
         etid.identify_skin(short, driver, method="maximum_likelihood")
-    assert methods.plan(None, Inspected(short), driver) == ("output_error", None)
+    assert registry.plan(None, Inspected(short), driver) == ("output_error", None)
 
 
 @pytest.mark.slow

@@ -8,9 +8,9 @@ import pytest
 import etid
 from benchmarks.failure_axes import transformer
 from benchmarks.ladder import CALIBRATION, rung
-from etid import missing_pole
-from etid.driver import SourceImpedance
-from etid.estimation import calibrations_of
+from etid.estimators.refinement import calibrations_of
+from etid.estimators.score_tests import missing_pole
+from etid.results.driver import SourceImpedance
 
 
 def source(gain, slope, omega, zeta):

@@ -12,9 +12,9 @@ import etid
 from benchmarks import ngspice
 from benchmarks.ladder import CALIBRATION, rung
 from benchmarks.skins import SkinCole, SkinTwoLayer
-from etid.elements import Exponent, Farad, Ohm
-from etid.netlist import BAND, LADDER_ERROR, ladder
-from etid.scenes import Trial
+from etid.circuits.elements import Exponent, Farad, Ohm
+from etid.circuits.netlist import BAND, LADDER_ERROR, ladder
+from etid.simulation.scenes import Trial
 
 SPREAD = SkinCole(33.4e3, 186e3, 22e-6, 0.85)
 FREQUENCY = np.geomspace(*BAND, 300)

@@ -9,8 +9,8 @@ import pytest
 import etid
 from benchmarks import ladder, ngspice
 from benchmarks.spice import PARTS
-from etid.scenes import Scene, Trial
-from etid.transformer import OpenLoad, ResistorLoad, SkinLoad, TransformerDriver, loading
+from etid.simulation.scenes import Scene, Trial
+from etid.simulation.transformer import OpenLoad, ResistorLoad, SkinLoad, TransformerDriver, loading
 
 DRY = SkinLoad(33.4e3, 186e3, 0.12e-9)
 RATE = 60.0

@@ -9,7 +9,7 @@ import numpy as np
 import optimistix as optx
 import pytest
 
-from etid.levenberg_marquardt import LevenbergMarquardt
+from etid.solvers.levenberg_marquardt import LevenbergMarquardt
 
 
 def misra1a(b, x):

@@ -3,8 +3,8 @@ import numpy as np
 import pytest
 import scipy.signal
 
-from etid import scenes
-from etid.noise import noise_std
+from etid.signals.noise import noise_std
+from etid.simulation import scenes
 
 
 @pytest.mark.parametrize("snr_db", [40.0, 60.0])

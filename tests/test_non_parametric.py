@@ -10,12 +10,12 @@ import pytest
 import etid
 from benchmarks.coverage import scene
 from benchmarks.ladder import LOADS
-from etid import non_parametric
-from etid.lanes import lane
-from etid.preflight import Inspected
-from etid.spectra import Spectrum
-from etid.transfer import as_complex
-from etid.verdicts import verdict
+from etid.estimators import non_parametric
+from etid.identify.lanes import lane
+from etid.recordings.preflight import Inspected
+from etid.results.verdicts import verdict
+from etid.signals.harmonics import Spectrum
+from etid.signals.transfer import as_complex
 
 RESISTORS = (98.8e3, 21.62e3)
 SIGMAS = 5.0  # one in 2 million for a normal error

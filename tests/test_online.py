@@ -9,13 +9,16 @@ import numpy as np
 import pytest
 
 import etid
-from etid import bands, estimation, given_driver, maximum_likelihood
-from etid.lanes import lane
-from etid.online import MEMORY, PATIENCE, Tracker
-from etid.preflight import Inspected
-from etid.scenes import Scene, Trial
-from etid.spectra import ALIASED, Spectrum
-from etid.transformer import ResistorLoad, SkinLoad, loading
+from etid.estimators import refinement
+from etid.estimators.maximum_likelihood import driver as maximum_likelihood
+from etid.estimators.maximum_likelihood import given_driver
+from etid.identify.lanes import lane
+from etid.online import gain_bands
+from etid.online.tracker import MEMORY, PATIENCE, Tracker
+from etid.recordings.preflight import Inspected
+from etid.signals.harmonics import ALIASED, Spectrum
+from etid.simulation.scenes import Scene, Trial
+from etid.simulation.transformer import ResistorLoad, SkinLoad, loading
 
 DRY = SkinLoad(r_s=33.4e3, r_p=186e3, c_p=0.12e-9)
 DAMP = SkinLoad(r_s=6.1e3, r_p=17.4e3, c_p=0.66e-9)
@@ -240,12 +243,12 @@ def test_after_some_pulses_it_is_what_a_batch_fit_of_these_periods_is():
 def batch(driver, recording):
     """Elements by maximum likelihood from the harmonics of a whole record, with the same Z_th."""
     *fields, rate = map(jnp.asarray, lane(Inspected(recording), "maximum_likelihood"))
-    model = maximum_likelihood.Joint(etid.SkinRC(), estimation.calibrations_of(driver), False)
+    model = maximum_likelihood.Joint(etid.SkinRC(), refinement.calibrations_of(driver), False)
     spectrum = Spectrum(*fields)
     selected = spectrum.selected & (spectrum.frequency < ALIASED * RATE)
     spectrum = dataclasses.replace(spectrum, selected=selected)
     z_th = driver.response(spectrum.frequency)
-    starts = estimation.harmonic_starts(spectrum, rate, z_th, etid.SkinRC())
+    starts = refinement.harmonic_starts(spectrum, rate, z_th, etid.SkinRC())
     own, *_ = maximum_likelihood.fit_load(model, spectrum, rate, starts)
     return np.exp(np.asarray(own[:-1]))
 
@@ -418,15 +421,15 @@ def test_intervals_of_drifting_skin_contain_it_in_95_per_cent():
 def test_bands_end_where_aliases_begin():
     of = tracker_of(2).model.bands
     last = of.x.size / of.size  # of the sample rate
-    assert ALIASED - 2 * bands.WIDEST / of.size < last < ALIASED + bands.WIDEST / of.size
+    assert ALIASED - 2 * gain_bands.WIDEST / of.size < last < ALIASED + gain_bands.WIDEST / of.size
     assert float(of.frequency[-1]) < ALIASED * RATE
 
 
 def test_windows_are_those_next_to_each_period():
     v = np.arange(40.0)
-    np.testing.assert_array_equal(bands.cut(v, 10.0)[:, 0], [0, 10, 20, 30])
-    np.testing.assert_array_equal(bands.cut(v, 10.4)[:, 0], [0, 10, 21])
-    assert bands.cut(v[None, :9], 10.0).shape == (0, 1, 10)
+    np.testing.assert_array_equal(gain_bands.cut(v, 10.0)[:, 0], [0, 10, 20, 30])
+    np.testing.assert_array_equal(gain_bands.cut(v, 10.4)[:, 0], [0, 10, 21])
+    assert gain_bands.cut(v[None, :9], 10.0).shape == (0, 1, 10)
 
 
 @pytest.mark.slow

@@ -11,9 +11,9 @@ import etid
 from benchmarks.failure_axes import Cole, TwoLayers
 from benchmarks.ladder import CALIBRATION, LOADS, rung
 from benchmarks.skins import SkinCole, SkinTwoLayer
-from etid import other_circuit
-from etid.circuits import Resistor
-from etid.scenes import Trial
+from etid.circuits.circuit import Resistor
+from etid.estimators.score_tests import other_circuit
+from etid.simulation.scenes import Trial
 
 
 def test_the_slope_is_that_of_a_constant_phase():

@@ -11,13 +11,9 @@ import pytest
 import etid
 from benchmarks.failure_axes import Cole, TwoLayers
 from benchmarks.ladder import CALIBRATION, LOADS, rung
-from etid.driver import SourceImpedance
-from etid.elements import capacitor, parallel, resistor, series
-from etid.information import Slopes
-from etid.measurement import Measurement
-from etid.other_circuit import GRID, relaxations
-from etid.other_in_time import HIGHEST, relaxed, score
-from etid.prediction import (
+from etid.circuits.elements import capacitor, parallel, resistor, series
+from etid.estimators.output_error.information import Slopes
+from etid.estimators.output_error.prediction import (
     Records,
     impulse,
     impulse_response,
@@ -26,7 +22,11 @@ from etid.prediction import (
     prepare,
     residual_variance,
 )
-from etid.scenes import Trial
+from etid.estimators.score_tests.other_circuit import GRID, relaxations
+from etid.estimators.score_tests.other_in_time import HIGHEST, relaxed, score
+from etid.results.driver import SourceImpedance
+from etid.signals.measurement import Measurement
+from etid.simulation.scenes import Trial
 
 RATE = 200e3
 NONE = jnp.zeros(0)

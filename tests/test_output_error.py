@@ -10,16 +10,28 @@ import pytest
 
 import etid
 from benchmarks.ladder import CALIBRATION, LOADS, TRIAL, rung
-from etid import lanes
-from etid.driver import SourceImpedance
-from etid.elements import resistor
-from etid.information import Curvature, Slopes, curvature, eliminate, inverse
-from etid.measurement import Measurement
-from etid.output_error import DELAY_WIDTH, KNOWN_DELAY, delay_std, fit_source
-from etid.prediction import IMPULSE, impulse, late_calibration, measured_impulse, prepare
-from etid.preflight import Inspected
-from etid.scenes import Scene, Trial
-from etid.transformer import ResistorLoad, SkinLoad
+from etid.circuits.elements import resistor
+from etid.estimators.output_error.fit import DELAY_WIDTH, KNOWN_DELAY, delay_std, fit_source
+from etid.estimators.output_error.information import (
+    Curvature,
+    Slopes,
+    curvature,
+    eliminate,
+    inverse,
+)
+from etid.estimators.output_error.prediction import (
+    IMPULSE,
+    impulse,
+    late_calibration,
+    measured_impulse,
+    prepare,
+)
+from etid.identify import lanes
+from etid.recordings.preflight import Inspected
+from etid.results.driver import SourceImpedance
+from etid.signals.measurement import Measurement
+from etid.simulation.scenes import Scene, Trial
+from etid.simulation.transformer import ResistorLoad, SkinLoad
 
 RATE = 200e3
 

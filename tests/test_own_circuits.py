@@ -10,10 +10,10 @@ import pytest
 import etid
 from benchmarks.ladder import CALIBRATION, rung
 from benchmarks.skins import SkinCole, SkinTwoLayer
-from etid.elements import Exponent, Ohm, PseudoCapacitance
-from etid.periodic import periodic_voltage
-from etid.scenes import Trial
-from etid.verdicts import verdict
+from etid.circuits.elements import Exponent, Ohm, PseudoCapacitance
+from etid.identify.steady_state import periodic_voltage
+from etid.results.verdicts import verdict
+from etid.simulation.scenes import Trial
 
 LAYERS = SkinTwoLayer(33.4e3, 150e3, 0.12e-9, 36e3, 5e-9)
 SPREAD = SkinCole(33.4e3, 186e3, 22e-6, 0.85)

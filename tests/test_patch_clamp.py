@@ -14,11 +14,11 @@ import optimistix as optx
 import pytest
 import scipy.signal
 
-from etid.circuits import SkinRC
-from etid.driver import realise
-from etid.filtering import StateSpace, hold, simulate
-from etid.levenberg_marquardt import LevenbergMarquardt
-from etid.transfer import Rational
+from etid.circuits.circuit import SkinRC
+from etid.results.driver import realise
+from etid.signals.filtering import StateSpace, hold, simulate
+from etid.signals.transfer import Rational
+from etid.solvers.levenberg_marquardt import LevenbergMarquardt
 
 SAMPLE_RATE = 20e3  # [Hz]
 RATE = 1e4  # [1/s], typical of the filter

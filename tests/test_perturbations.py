@@ -13,8 +13,8 @@ from benchmarks.ladder import LOADS
 from benchmarks.perturbation_draws import KINDS, Answer, error_of, table
 from benchmarks.perturbation_list import INVISIBLE, PERTURBATIONS, UNDISTURBED
 from benchmarks.perturbed_study import Truth, undisturbed
-from etid.scenes import Scene, Trial
-from etid.transformer import Sampler, SkinLoad, TransformerDriver
+from etid.simulation.scenes import Scene, Trial
+from etid.simulation.transformer import Sampler, SkinLoad, TransformerDriver
 
 RATE, PERIOD = 200e3, 1 / 60.0
 PULSE = slice(0, 3333)  # samples of the first period

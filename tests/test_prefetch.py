@@ -5,10 +5,10 @@ import threading
 import pytest
 
 import etid
-from etid import batch
-from etid.prefetch import prefetch
-from etid.scenes import Scene, Trial
-from etid.transformer import ResistorLoad, SkinLoad
+from etid.identify import many as batch
+from etid.identify.prefetch import prefetch
+from etid.simulation.scenes import Scene, Trial
+from etid.simulation.transformer import ResistorLoad, SkinLoad
 
 WAIT = 10.0  # seconds, of a test that would fail
 

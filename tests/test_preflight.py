@@ -9,10 +9,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import etid
-from etid.preflight import SHORTEST, Inspected
-from etid.preflight import preflight as of_inspected
-from etid.scenes import PRESETS, Scene, Trial
-from etid.transformer import OpenLoad, ResistorLoad, SkinLoad
+from etid.recordings.preflight import SHORTEST, Inspected
+from etid.recordings.preflight import preflight as of_inspected
+from etid.simulation.scenes import PRESETS, Scene, Trial
+from etid.simulation.transformer import OpenLoad, ResistorLoad, SkinLoad
 
 LENGTH = 3334
 DAMP = SkinLoad(r_s=6.1e3, r_p=17.4e3, c_p=0.66e-9)

@@ -4,11 +4,12 @@ import numpy as np
 import pytest
 
 import etid
-from etid.preflight import Inspected, explained, preflight
-from etid.pulse_train import CLOCK, find_pulses
-from etid.remarks import Remark
-from etid.scenes import Scene, Trial
-from etid.transformer import ResistorLoad, SkinLoad
+from etid.identify.lanes import explained
+from etid.recordings.preflight import Inspected, preflight
+from etid.recordings.remarks import Remark
+from etid.signals.pulse_train import CLOCK, find_pulses
+from etid.simulation.scenes import Scene, Trial
+from etid.simulation.transformer import ResistorLoad, SkinLoad
 
 DAMP = SkinLoad(r_s=6.1e3, r_p=17.4e3, c_p=0.66e-9)
 PULSE = 60.0

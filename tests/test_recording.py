@@ -3,8 +3,8 @@ import pickle
 import numpy as np
 import pytest
 
-from etid.recording import Recording, RecordingError, Samples
-from etid.study import Study
+from etid.recordings.recording import Recording, RecordingError, Samples
+from etid.recordings.study import Study
 
 RATES = {"sample_rate": 200e3, "pulse_rate": 60.0}
 

@@ -5,8 +5,8 @@ import dataclasses
 import numpy as np
 import pytest
 
-from etid.remarks import Remark, remarks_of, texts, words
-from etid.results import Fits
+from etid.recordings.remarks import Remark, remarks_of, texts, words
+from etid.results.fits import Fits
 from tests import pictures
 
 BOTH = Remark.mains_hum | Remark.aligned

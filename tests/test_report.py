@@ -12,8 +12,9 @@ import pytest
 
 import etid
 from benchmarks import paper, paper_tables
-from etid import demo, experiments, report
-from etid.verdicts import verdict, verdicts_of
+from etid.paper import demo, tables
+from etid.report import html as report
+from etid.results.verdicts import verdict, verdicts_of
 
 EXCESS = 1.1  # of every identified element over the true one
 
@@ -95,7 +96,7 @@ def _outcome(excess):
         rrse=jnp.array(0.1), chi2=jnp.array(1.0), result=verdict("successful"), steps=jnp.array(1),
         method="by hand",
     )  # fmt: skip
-    return experiments.Outcome(
+    return tables.Outcome(
         "quiet",
         "output_error",
         driver,
@@ -156,7 +157,7 @@ def test_tables_tell_errors_of_studies_from_scatter_of_trials(groups):
         for row in paper_tables.table_fingertips(groups, truth, condition):
             found = [row[name] for name in ("error", "spread", "subject_error", "worst")]
             np.testing.assert_allclose(found, [20.0, 0.0, 20.0, 20.0], atol=1e-9)
-            assert row["paper_typical"] == experiments.FINGERTIPS[condition][row["element"]][0]
+            assert row["paper_typical"] == tables.FINGERTIPS[condition][row["element"]][0]
 
 
 def _without(fits, rows):

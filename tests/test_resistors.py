@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 import etid
-from etid import resistors
-from etid.preflight import Inspected
-from etid.scenes import Scene, Trial
-from etid.transformer import ResistorLoad
+from etid.estimators.score_tests import resistors
+from etid.recordings.preflight import Inspected
+from etid.simulation.scenes import Scene, Trial
+from etid.simulation.transformer import ResistorLoad
 
 KNOWN = (98.8e3, 216.6e3)
 SIGMAS = 5.0  # one in 2 million for a normal error

@@ -4,11 +4,12 @@ import numpy as np
 import pytest
 
 import etid
-from etid import rounding, scenes
-from etid.preflight import Inspected
-from etid.remarks import Remark
-from etid.scenes import Scene
-from etid.spectra import harmonics
+from etid.recordings.preflight import Inspected
+from etid.recordings.remarks import Remark
+from etid.signals import rounding
+from etid.signals.harmonics import harmonics
+from etid.simulation import scenes
+from etid.simulation.scenes import Scene
 
 DRY = scenes.paper_dry()
 

@@ -11,9 +11,9 @@ import scipy.signal
 from hypothesis import given
 from hypothesis import strategies as st
 
-from etid import scenes, transformer
-from etid.scenes import Scene, Trial
-from etid.transformer import OpenLoad, ResistorLoad, Sampler, SkinLoad, TransformerDriver
+from etid.simulation import scenes, transformer
+from etid.simulation.scenes import Scene, Trial
+from etid.simulation.transformer import OpenLoad, ResistorLoad, Sampler, SkinLoad, TransformerDriver
 
 CLEAN: dict[str, Any] = {"snr_db": None, "bits": None}
 DRY = SkinLoad(33.4e3, 186e3, 0.12e-9)

@@ -1,19 +1,20 @@
 import json
 import pathlib
+import runpy
 
 import h5py
 import numpy as np
 import pytest
 
-from etid import hdf5, schema, schema_page
+from etid.recordings import hdf5, schema
 
 FOLDER = pathlib.Path(__file__).parents[1] / "data_schema"
 
 
 @pytest.mark.parametrize("name", ["recording-1.json", "README.md"])
 def test_the_committed_schema_is_what_the_table_gives(name, tmp_path):
-    schema_page.write(tmp_path)
-    remedy = "run: python -m etid.schema_page data_schema"
+    runpy.run_path(str(FOLDER / "make_page.py"))["write"](tmp_path)
+    remedy = "run: python data_schema/make_page.py"
     assert (tmp_path / name).read_text("utf-8") == (FOLDER / name).read_text("utf-8"), remedy
 
 

@@ -9,16 +9,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from etid import spectra
-from etid.pulse_train import find_pulses
-from etid.scenes import Scene, Trial
-from etid.spectra import (
-    Spectrum,
-    harmonics,
-    signal_share,
-    whole_periods,
-)
-from etid.transformer import ResistorLoad
+from etid.signals import harmonics as spectra
+from etid.signals.harmonics import Spectrum, harmonics, signal_share, whole_periods
+from etid.signals.pulse_train import find_pulses
+from etid.simulation.scenes import Scene, Trial
+from etid.simulation.transformer import ResistorLoad
 
 spectrum = jax.jit(spectra.spectrum, static_argnums=(5, 6))
 RATE, PULSE = 200e3, 60.0

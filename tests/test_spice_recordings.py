@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import etid
-from etid.methods import Method
+from etid.estimators.registry import Method
 
 ELEMENTS = {"r_s": "Rs", "r_p": "Rp", "c_p": "Cp", "r": "R"}
 # DESIGN's; discretisation by Tustin's rule would cost 8.8 % of C_p.

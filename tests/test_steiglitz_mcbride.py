@@ -8,15 +8,15 @@ import pytest
 import scipy.signal
 
 from etid import SkinRC
-from etid.filtering import lfilter
-from etid.steiglitz_mcbride import (
+from etid.estimators.steiglitz_mcbride import (
     driver_filter,
     iterate,
     skin_elements,
     skin_filter,
     terminal_voltage,
 )
-from etid.transfer import Rational, delay_variable, tustin
+from etid.signals.filtering import lfilter
+from etid.signals.transfer import Rational, delay_variable, tustin
 
 FS = 200e3
 predict = jax.jit(terminal_voltage)

@@ -14,11 +14,11 @@ import numpy as np
 import pytest
 
 import etid
-from etid import streaming
-from etid.scenes import Scene, Trial
-from etid.streaming import ResumeError, fit_file, processes
-from etid.study_fits import StudyFits
-from etid.transformer import ResistorLoad, SkinLoad
+from etid.identify import file as streaming
+from etid.identify.file import ResumeError, fit_file, processes
+from etid.results.study_fits import StudyFits
+from etid.simulation.scenes import Scene, Trial
+from etid.simulation.transformer import ResistorLoad, SkinLoad
 
 # The paper's method: what is tested is the parts, not the fits, and it compiles fastest.
 METHOD = "equation_error"

@@ -12,15 +12,18 @@ import pytest
 from chromium import chromium
 
 import etid
-from etid import citations, cli, exporting, methods_section, study_figures, study_tables, worst_fits
-from etid.driver import Calibration, SourceImpedance
-from etid.report import Table
-from etid.scenes import Scene, Trial
-from etid.settings import Settings
-from etid.study_fits import StudyFits
-from etid.transformer import ResistorLoad, SkinLoad
-from etid.verdicts import message, verdict, verdicts_of
-from etid.waveforms import Recordings
+from etid import cli
+from etid.files import exporting
+from etid.report import citations, figures, tables, worst_fits
+from etid.report import methods as methods_section
+from etid.report.html import Table
+from etid.report.recordings import Recordings
+from etid.results.driver import Calibration, SourceImpedance
+from etid.results.provenance import Settings
+from etid.results.study_fits import StudyFits
+from etid.results.verdicts import message, verdict, verdicts_of
+from etid.simulation.scenes import Scene, Trial
+from etid.simulation.transformer import ResistorLoad, SkinLoad
 
 EVIL = r"<script>document.title='$\broken{$'</script>"
 TRUE = {"r_s": 33.4e3, "r_p": 186e3, "c_p": 0.12e-9}
@@ -218,7 +221,7 @@ def test_spread_of_subjects_and_recordings_and_errors_are_told_apart():
         subject=np.repeat(["a", "b", "c"], 4), condition=np.full(12, "dry"),
     )  # fmt: skip
     groups = fits.summary("subject", "condition")
-    for one in study_tables.components(fits, groups):
+    for one in tables.components(fits, groups):
         assert (one.subjects, one.successful) == (3, 12)
         assert one.median == pytest.approx(TRUE[one.name])
         assert one.between_subjects == pytest.approx(np.std(factors, ddof=1))
@@ -231,11 +234,11 @@ def test_spread_of_subjects_and_recordings_and_errors_are_told_apart():
 
 def test_one_recording_of_one_subject_tells_no_spread():
     fits = fits_of([1.0], ["successful"])
-    found = study_tables.components(fits, fits.summary("subject", "condition"))
+    found = tables.components(fits, fits.summary("subject", "condition"))
     for one in found:
         assert np.isnan([one.between_subjects, one.between_recordings]).all()
         assert (one.own, one.shared) == pytest.approx((OWN, SHARED))
-    for row in study_tables.show_components(found, fits.circuit.units()).rows:
+    for row in tables.show_components(found, fits.circuit.units()).rows:
         assert row[6:] == ("", "", "1", "2")
 
 
@@ -279,7 +282,7 @@ def test_the_worst_are_of_every_verdict_and_of_every_reason():
     [(0.01234, "0.012"), (123.4, "120"), (5.0, "5"), (np.nan, ""), (np.inf, ""), (3e7, "3.0e+07")],
 )
 def test_numbers_are_rounded_to_two_digits(value, text):
-    assert study_tables.significant(value) == text
+    assert tables.significant(value) == text
 
 
 def test_large_studies_are_condensed_and_say_so(tmp_path):
@@ -294,10 +297,10 @@ def test_large_studies_are_condensed_and_say_so(tmp_path):
     assert (tmp_path / "page.html").stat().st_size < 2e6
     page = _Read(tmp_path / "page.html")
     groups = len(fits.summary("subject", "condition"))
-    assert f"{study_tables.ROWS} of {groups} groups are shown" in page.text
-    assert f"The first {study_tables.BRIEF} are listed" in page.text
-    assert f"Of {count // 5} subjects {study_figures.CROWD} are drawn" in page.text
-    assert page.elements.count("tr") < 5 * study_tables.ROWS
+    assert f"{tables.ROWS} of {groups} groups are shown" in page.text
+    assert f"The first {tables.BRIEF} are listed" in page.text
+    assert f"Of {count // 5} subjects {figures.CROWD} are drawn" in page.text
+    assert page.elements.count("tr") < 5 * tables.ROWS
     assert "Electrodes" in page.text
 
 

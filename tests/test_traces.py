@@ -16,9 +16,9 @@ import numpy as np
 import pytest
 
 import etid
-from etid import traces
-from etid.traces import stored_jit
-from etid.verdicts import RESULTS, first_verdict, verdict
+from etid.identify import compiled as traces
+from etid.identify.compiled import stored_jit
+from etid.results.verdicts import RESULTS, first_verdict, verdict
 
 X = jnp.linspace(1.0, 2.0, 5)
 FACTOR = 2.0

@@ -5,7 +5,7 @@ import scipy.signal
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from etid.transfer import (
+from etid.signals.transfer import (
     Rational,
     add_polynomials,
     delay_variable,

@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 
 import etid
-from etid.lanes import lane
-from etid.preflight import Inspected
-from etid.scenes import Scene, Trial
-from etid.spectra import Spectrum
-from etid.study import Study
-from etid.transformer import ResistorLoad, SkinLoad, TransformerDriver
-from etid.unloaded import UnloadedShape, shape
+from etid.estimators.score_tests.unloaded import UnloadedShape, shape
+from etid.identify.lanes import lane
+from etid.recordings.preflight import Inspected
+from etid.recordings.study import Study
+from etid.signals.harmonics import Spectrum
+from etid.simulation.scenes import Scene, Trial
+from etid.simulation.transformer import ResistorLoad, SkinLoad, TransformerDriver
 
 USUAL = TransformerDriver()
 DRY = SkinLoad(r_s=33.4e3, r_p=186e3, c_p=0.12e-9)

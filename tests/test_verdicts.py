@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 import etid
-from etid.elements import Ohm
-from etid.scenes import Scene, Trial
-from etid.transformer import ResistorLoad, SkinLoad
-from etid.verdicts import RESULTS, message, verdict, verdict_names, verdicts_of
+from etid.circuits.elements import Ohm
+from etid.results.verdicts import RESULTS, message, verdict, verdict_names, verdicts_of
+from etid.simulation.scenes import Scene, Trial
+from etid.simulation.transformer import ResistorLoad, SkinLoad
 
 LENGTH = 3334
 DRY = SkinLoad(r_s=33.4e3, r_p=186e3, c_p=0.12e-9)

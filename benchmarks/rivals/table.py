@@ -10,7 +10,7 @@ import etid
 from benchmarks.ladder import CALIBRATION, START, TRIAL, rung
 from benchmarks.rivals import Outcome, problem, run
 from benchmarks.rivals.roster import RIVALS, SCENES
-from etid.scenes import Scene
+from etid.simulation.scenes import Scene
 
 WORKS = 0.1  # largest relative error of any element of what is said to work
 

@@ -13,7 +13,8 @@ import types
 import optimistix as optx
 
 import etid
-from etid import cli, verdicts
+from etid import cli
+from etid.results import verdicts
 
 MARK = re.compile(r"^<!-- made: (\w+) -->$", re.MULTILINE)
 BORROWED = ("successful", "max_steps_reached", "nonfinite")  # of optimistix, see etid.RESULTS

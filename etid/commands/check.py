@@ -3,8 +3,8 @@
 import argparse
 import pathlib
 
-from etid import hdf5
 from etid.commands import DONE, WRONG_DATA, Outcome
+from etid.recordings import hdf5
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -9,7 +9,7 @@ import datetime
 import pathlib
 
 from etid.commands import Outcome
-from etid.exporting import CIRCUITS, export_circuit, export_fits, export_study
+from etid.files.exporting import CIRCUITS, export_circuit, export_fits, export_study
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -11,14 +11,14 @@ from typing import Any
 
 import numpy as np
 
-from etid import hdf5
-from etid.circuits import DISPLAY, heading
+from etid.circuits.circuit import DISPLAY, heading
 from etid.commands import DONE, WRONG_DATA, Outcome
-from etid.joint import identify_jointly
-from etid.methods import METHODS
-from etid.report import Table
-from etid.streaming import fit_file, kept, processes
-from etid.study_fits import StudyFits
+from etid.estimators.registry import METHODS
+from etid.identify.file import fit_file, kept, processes
+from etid.identify.jointly import identify_jointly
+from etid.recordings import hdf5
+from etid.report.html import Table
+from etid.results.study_fits import StudyFits
 
 _SHOWN = 20  # recordings without success that are listed one by one
 

@@ -5,7 +5,7 @@ import dataclasses
 import pathlib
 
 from etid.commands import Outcome
-from etid.importing import import_file
+from etid.files.importing import import_file
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

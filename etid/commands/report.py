@@ -4,7 +4,7 @@ import argparse
 import pathlib
 
 from etid.commands import Outcome
-from etid.study_report import write_report
+from etid.report.study import write_report
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -4,8 +4,8 @@ import argparse
 import json
 import pathlib
 
-from etid import scenes
 from etid.commands import Outcome
+from etid.simulation import scenes
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING, Any, overload
 
 import numpy as np
 
-from etid.bounds import Bound
-from etid.circuits import AbstractCircuit
-from etid.driver import Driver, SourceImpedance
-from etid.recording import Recording
-from etid.results import Fit, Fits
+from etid.circuits.circuit import AbstractCircuit
+from etid.recordings.recording import Recording
+from etid.results.driver import Driver, SourceImpedance
+from etid.results.fits import Fit, Fits
+from etid.simulation.bound import Bound
 
 if TYPE_CHECKING:
     import matplotlib.axes

@@ -6,10 +6,10 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 
-from etid.bounds import Bound
-from etid.circuits import DISPLAY, heading
+from etid.circuits.circuit import DISPLAY, heading
 from etid.plotting.style import COLOURS, INK, MARKS, RED, Canvas, plain_ticks, titled
-from etid.results import Fits
+from etid.results.fits import Fits
+from etid.simulation.bound import Bound
 
 CROWDED = 60  # letters below an axis, above which they are turned
 UNDETERMINED = 1.0  # relative standard error (see Bound.undetermined)

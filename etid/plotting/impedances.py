@@ -7,11 +7,11 @@ import numpy as np
 from jaxtyping import Array, Complex, Float
 from matplotlib.axes import Axes
 
-from etid.circuits import AbstractCircuit
-from etid.driver import Driver, SourceImpedance
+from etid.circuits.circuit import AbstractCircuit
 from etid.plotting.style import COLOURS, DASHES, Canvas, plain_ticks, titled
-from etid.results import Fit
-from etid.uncertainty import log_stderr
+from etid.results.driver import Driver, SourceImpedance
+from etid.results.fits import Fit
+from etid.solvers.propagation import log_stderr
 
 LOWEST, HIGHEST = 60.0, 100e3  # [Hz] the paper's pulse rate and half its sample rate
 POINTS = 300

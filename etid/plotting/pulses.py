@@ -4,14 +4,14 @@ import jax.numpy as jnp
 import numpy as np
 from matplotlib.axes import Axes
 
-from etid.circuits import DISPLAY, AbstractCircuit, Resistor
-from etid.driver import Driver
-from etid.identify import predict
-from etid.measurement import noise
+from etid.circuits.circuit import DISPLAY, AbstractCircuit, Resistor
+from etid.identify.one import predict
 from etid.plotting.style import BLUE, INK, RED, Canvas, titled
-from etid.recording import LABELS, Recording
-from etid.results import Fit, plus_minus, rrse
-from etid.transformer import loading
+from etid.recordings.recording import LABELS, Recording
+from etid.results.driver import Driver
+from etid.results.fits import Fit, plus_minus, rrse
+from etid.signals.measurement import noise
+from etid.simulation.transformer import loading
 
 BEFORE, AFTER = 0.15e-3, 1.2e-3  # [s] shown around the first edge of a pulse
 FREQUENCIES = 2048  # at which |G|² is averaged; its features are wider than 1/1000 of the band

@@ -1,0 +1,228 @@
+"""Steiglitz-McBride on the harmonics of the pulse rate, for the skin of eq. (7).
+
+In the periodic steady state X N/D = W holds exactly at every harmonic, with X = V_th − V_out, W =
+Z_th V_out and the continuous Z_bio = N/D (paper, eqs. 7-9),
+
+    N = b₀ + b₁ s,      D = 1 + a₁ s,      R_s = b₁/a₁,   R_p = b₀ − R_s,   C_p = a₁/R_p.
+
+Nothing is discretised, and eqs. (1), (2) become sums over harmonics of |X N_i − W D_i|² with the
+weights 1/|D_{i−1}|². Two things are added to them.
+
+**A trigger delay τ** turns V_out by e^{jωτ} = 1 + jωτ + …, which makes it one more linear unknown
+with the coefficient T = −jω V_out (N + Z_th D)_{i−1}; V_out is then turned back by what was found.
+
+**Noise** of V_out is in X and in W, and biases the sums. They contain the records in three products
+only, x*x, y*y and x*y, of which the noise adds its known variance to the first two. With the
+variances subtracted (bias-compensating least squares; Söderström 2007, "Errors-in-variables methods
+in system identification", Automatica 43) what is left of the bias is what they are off.
+
+With v = (x − y)* y, ⟨ ⟩ the weighted sum over all harmonics, and k, l the coefficients without −jω
+and y, which are Z_th of a₁ and N + Z_th D of τ, the normal equations consist of
+
+    ⟨X* X⟩ = ⟨|x − y|²⟩,            ⟨X* k⟩ = ⟨ω Im kv⟩,
+    ⟨k* l⟩ = ⟨ω² Re k*l y*y⟩,   ⟨(jωX)* k⟩ = −⟨ω² Re kv⟩,
+
+and ⟨Re Z_th v⟩, ⟨ω Im Z_th v⟩, 0 and −⟨ω Im k*Z_th y*y⟩ on the right. X and jωX are orthogonal, so
+that b₀ and b₁ are eliminated one by one, and a₁ and τ remain. A pole in the right half-plane needs
+no reflection: |1 + jωa₁| does not know the sign of a₁.
+
+**The covariance** is that of a fixed point q = Φ(q, X, Y, Z_th), whose differential is
+
+    dq = (1 − ∂Φ/∂q)⁻¹ (∂Φ/∂X dX + ∂Φ/∂Y dY + ∂Φ/∂Z_th dZ_th).
+
+All three are taken as independent. Where a calibration has the same unloaded record, what it did to
+Z_th and does to the skin partly cancels, and the standard errors are a quarter too wide.
+"""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, Bool, Complex, Float, Int
+
+from etid.circuits.circuit import SkinRC
+from etid.estimators.steiglitz_mcbride import ITERATIONS, SETTLED
+from etid.results.driver import SourceImpedance
+from etid.results.fits import complex_rrse
+from etid.signals.harmonics import Spectrum
+from etid.signals.transfer import as_complex, power, reciprocal, turns
+
+RATE = 3e4  # of a skin's relaxation [rad/s], in units of which the coefficients are near 1
+
+
+class Iterate(eqx.Module):
+    """The best iterate of a run.
+
+    Attributes:
+        circuit: Its elements, whatever their sign.
+        delay: Trigger delay of V_out [s].
+        rrse: Of the harmonics of V_out it predicts; infinite if an element is not positive.
+        iteration: At which it was found.
+        converged: Whether the *last* iterations settled.
+        stable: Whether the pole of Z_bio lies in the left half-plane.
+    """
+
+    circuit: SkinRC
+    delay: Float[Array, ""]
+    rrse: Float[Array, ""]
+    iteration: Int[Array, ""]
+    converged: Bool[Array, ""]
+    stable: Bool[Array, ""]
+
+
+class _Products(NamedTuple):
+    """What the sums are made of, at each harmonic."""
+
+    omega: Float[Array, " harmonic"]
+    used: Bool[Array, " harmonic"]
+    xx: Float[Array, " harmonic"]
+    yy: Float[Array, " harmonic"]
+    xy: Complex[Array, " harmonic"]
+    z_th: Complex[Array, " harmonic"]
+
+    def loaded(self, q: Float[Array, " coefficient"]):
+        """N and N + Z_th D."""
+        b0, b1, a1, _ = q
+        n = jax.lax.complex(jnp.full_like(self.omega, b0), b1 * self.omega)
+        d = jax.lax.complex(jnp.ones_like(self.omega), a1 * self.omega)
+        return n, n + self.z_th * d
+
+    def solve(self, q: Float[Array, " coefficient"], turn: Complex[Array, " harmonic"]):
+        """b₀, b₁, a₁ and τ of the next iteration."""
+        omega, used, xx, yy, xy, z_th = self
+        v = xy * turn - as_complex(yy)
+        k = self.loaded(q)[1]
+        zv, kv = z_th * v, k * v
+        square = omega**2
+        both = xx - yy - 2 * v.real  # |x − y|²
+        zk = jnp.conj(z_th) * k
+        terms = [both, zv.real, omega * zv.imag, omega * kv.imag]
+        terms += [square * both, -square * zv.real, -square * kv.real]
+        terms += [square * yy * power(z_th), square * yy * zk.real, square * yy * power(k)]
+        terms += [omega * yy * zk.imag]
+        weight = jnp.where(used, 1 / (1 + (omega * q[2]) ** 2), 0.0)
+        p0, h0, z0, k0, p2, z1, k1, zz, kz, kk, hk = jnp.stack(terms) @ weight
+        # Schur complements of b₀ and b₁, whose right sides are h0 and z0.
+        zz, kz, kk = (
+            zz - z0**2 / p0 - z1**2 / p2,
+            kz - z0 * k0 / p0 - z1 * k1 / p2,
+            kk - k0**2 / p0 - k1**2 / p2,
+        )
+        hz, hk = -z0 * h0 / p0 - z1 * z0 / p2, hk - k0 * h0 / p0 - k1 * z0 / p2
+        determinant = zz * kk - kz**2
+        a1, change = (kk * hz - kz * hk) / determinant, (zz * hk - kz * hz) / determinant
+        b0, b1 = (h0 - z0 * a1 - k0 * change) / p0, (z0 - z1 * a1 - k1 * change) / p2
+        return jnp.stack([b0, b1, a1, q[3] + change])
+
+
+def _products(spectrum: Spectrum, z_th: Complex[Array, " harmonic"]) -> _Products:
+    return _Products(
+        2 * jnp.pi / RATE * spectrum.frequency,
+        spectrum.selected,
+        power(spectrum.x) - spectrum.variance_x,
+        power(spectrum.y) - spectrum.variance_y,
+        jnp.conj(spectrum.x) * spectrum.y,
+        z_th,
+    )
+
+
+def _turn(q: Float[Array, " coefficient"], frequency: Float[Array, " harmonic"]):
+    return turns(q[3] / RATE * frequency[0], frequency.size)
+
+
+def _elements(q: Float[Array, " coefficient"]) -> SkinRC:
+    b0, b1, a1, _ = q
+    r_s = b1 / a1
+    r_p = b0 - r_s
+    return SkinRC(r_s, r_p, a1 / RATE / r_p)
+
+
+def fit_skin(
+    spectrum: Spectrum, z_th: Complex[Array, " harmonic"], iterations: int = ITERATIONS
+) -> Iterate:
+    """Identify the continuous first-order Z_bio and a delay from harmonics (paper, eqs. 7-9).
+
+    Args:
+        spectrum: Harmonics of a recording.
+        z_th: Source impedance at them [Ω].
+        iterations: How many.
+    """
+    of = _products(spectrum, z_th)
+    used = spectrum.selected
+    measured = jnp.where(used, spectrum.y, 0.0)
+
+    def step(carry, iteration):
+        best, previous, turn = carry
+        q = of.solve(previous, turn)
+        a1, tau = q[2:]
+        circuit = _elements(q)
+        n, total = of.loaded(q)
+        turn = _turn(q, spectrum.frequency)
+        predicted = n * reciprocal(total) * spectrum.x * jnp.conj(turn)
+        error = complex_rrse(jnp.where(used, predicted, 0.0), measured)
+        error = jnp.where((circuit.values() > 0).all() & jnp.isfinite(error), error, jnp.inf)
+        converged = jnp.abs(q - previous)[2:].max() < SETTLED * jnp.abs(a1)
+        current = Iterate(circuit, tau / RATE, error, iteration, converged, a1 > 0)
+        # As long as none is a circuit, the latest is the best there is.
+        better = (error < best.rrse) | ~jnp.isfinite(best.rrse)
+        best = jax.tree.map(lambda new, old: jnp.where(better, new, old), current, best)
+        return (best, q, turn), converged
+
+    typical = SkinRC()
+    zero = jnp.zeros(())
+    nothing = Iterate(
+        typical, zero, jnp.array(jnp.inf), jnp.array(0), jnp.array(False), jnp.array(False)
+    )
+    b0, a1 = typical.r_s + typical.r_p, RATE * typical.r_p * typical.c_p
+    start = jnp.stack([b0, typical.r_s * a1, a1, zero])
+    none = jnp.ones_like(z_th)
+    (best, *_), converged = jax.lax.scan(step, (nothing, start, none), jnp.arange(iterations))
+    return eqx.tree_at(lambda b: b.converged, best, converged[-1])
+
+
+def covariance(
+    spectrum: Spectrum,
+    noise: Float[Array, " harmonic"],
+    source: SourceImpedance,
+    source_cov: Float[Array, "parameter parameter"],
+    best: Iterate,
+) -> tuple[Float[Array, "element element"], Float[Array, "element element"]]:
+    """Covariance of the logarithms of the elements, to first order in the noise.
+
+    Args:
+        spectrum: The recording.
+        noise: Variance of its noise in units of what it says.
+        source: Source impedance with which it was identified.
+        source_cov: Covariance of its flattened parameters.
+        best: The estimate, settled.
+
+    Returns:
+        That of both records' noise, and that of the source's.
+    """
+    of = best.circuit
+    a1 = RATE * of.r_p * of.c_p
+    q = jnp.stack([of.r_s + of.r_p, of.r_s * a1, a1, RATE * best.delay])
+    parameters, unflatten = ravel_pytree(source)
+
+    def following(q, x, y, parameters):
+        there = eqx.tree_at(lambda s: (s.x, s.y), spectrum, (as_one(x), as_one(y)))
+        z_th = unflatten(parameters).response(spectrum.frequency)
+        return _products(there, z_th).solve(q, _turn(q, spectrum.frequency))
+
+    def as_one(parts):
+        return jax.lax.complex(parts[0], parts[1])
+
+    x, y = (jnp.stack([v.real, v.imag]) for v in (spectrum.x, spectrum.y))
+    by_q = jax.jacfwd(following)(q, x, y, parameters)
+    by_element = jax.jacfwd(lambda q: jnp.log(_elements(q).values()))(q)
+    rows = jnp.linalg.solve((jnp.eye(q.size) - by_q).T, by_element.T).T
+    _, pullback = jax.vjp(lambda *data: following(q, *data), x, y, parameters)
+    by_x, by_y, by_source = jax.vmap(pullback)(rows)
+
+    def of_noise(slope, variance):  # half of it in each of both parts
+        return jnp.einsum("ipk,jpk,k->ij", slope, slope, variance / 2)
+
+    own = of_noise(by_x, noise * spectrum.variance_x) + of_noise(by_y, noise * spectrum.variance_y)
+    return own, by_source @ source_cov @ by_source.T

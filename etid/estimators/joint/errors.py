@@ -1,0 +1,278 @@
+"""Standard errors of many loads with one driver: each load's own, and what all have in common.
+
+    cov = H⁻¹ (Jᵀ C J) H⁻¹
+
+of `etid.estimators.maximum_likelihood.terms`, without the own parameters for `common`; a load
+inherits K cov Kᵀ with its slope K = −A⁻¹ B.
+
+**One unloaded record in several loads** is one noise of X in all of them. The fit takes them as
+independent, its errors do not: what unit noise in X does to the terms of every load is followed
+through to `common` and to each load, and adds up before it is squared.
+"""
+
+from collections.abc import Sequence
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import optimistix as optx
+from jaxtyping import Array, Bool, Float
+
+from etid.estimators.joint.terms import DriverStudy, Loads, over
+from etid.estimators.maximum_likelihood.terms import (
+    denoised,
+    excess,
+    residual,
+    residuals,
+    variance,
+    weights,
+)
+from etid.estimators.output_error.fit import Estimate
+from etid.estimators.output_error.information import Curvature, eliminate, inverse
+from etid.estimators.score_tests import other_circuit
+from etid.results.fits import complex_rrse
+from etid.signals.transfer import reciprocal
+
+
+class _Eliminated(eqx.Module):
+    """A load without its own parameters.
+
+    Attributes:
+        rest: What it tells of `common`.
+        cov: Covariance of its own parameters at a given `common`.
+        slope: How its minimum depends on `common`.
+        bread: Inverse of its own curvature.
+    """
+
+    rest: Curvature
+    cov: Float[Array, "own own"]
+    slope: Float[Array, "own common"]
+    bread: Float[Array, "own own"]
+
+
+def _curvature(
+    jacobian: Float[Array, "term n"],
+    shares: Sequence[Float[Array, "_"]],
+    noise: Sequence[Float[Array, "_"]],
+) -> Curvature:
+    """H and Jᵀ C J of `likelihood.denoised` and `likelihood.excess`, at denoised records."""
+    weight, excess = (weights(of, jacobian.shape[0]) for of in (shares, noise))
+    return Curvature(
+        (jacobian.T * weight[None, :]) @ jacobian, (jacobian.T * excess[None, :]) @ jacobian
+    )
+
+
+def _without_own(of: Curvature, common: int) -> _Eliminated:
+    """Eliminate a load's own parameters, which come after the `common` ones."""
+    bread = inverse(of.expected[common:, common:])
+    slope = -bread @ of.expected[common:, :common]
+    cov = bread @ of.score[common:, common:] @ bread
+    return _Eliminated(eliminate(of, common), cov, slope, bread)
+
+
+def estimates(
+    study: DriverStudy,
+    common: Float[Array, " common"],
+    fitted: Sequence[tuple[Float[Array, "load own"], optx.RESULTS]],
+    several: Sequence[int],
+    solution: optx.Solution,
+) -> tuple[Float[Array, "common common"], list[tuple[Estimate, Bool[Array, " load"]]]]:
+    """Covariance of `common`, and of each group the estimates with theirs.
+
+    And whether a load is seen to be another circuit (`etid.estimators.score_tests.other_circuit`).
+
+    Args:
+        study: Calibrations and loads.
+        common: Common parameters at the minimum.
+        fitted: Own parameters of each group at the minimum, and how their solvers ended.
+        several: In each group, how many unloaded records several loads have.
+        solution: How the joint solver ended.
+    """
+    groups, model = study.groups, study.model
+    owns = [own for own, _ in fitted]
+    found = [
+        over(lambda load, own: _eliminated(study, load, common, own), loads, own)
+        for loads, own in zip(groups, owns, strict=True)
+    ]
+    clean, shares = denoised(model.calibrations.records, model.calibrations.gains(common))
+    parts = residuals(model.calibrations.records, model.calibrations.gains(common))
+    noise = [excess(r, s.selected) for r, s in zip(parts, model.calibrations.records, strict=True)]
+    jacobian = jax.jacfwd(lambda c: model.calibrations.terms(c, clean))(common)
+    total = _curvature(jacobian, shares, noise)
+    for loads, eliminated in zip(groups, found, strict=True):
+        used = jax.tree.map(
+            lambda leaf, loads=loads: jnp.where(loads.used[:, None, None], leaf, 0.0).sum(0),
+            eliminated.rest,
+        )
+        total = jax.tree.map(jnp.add, total, used)
+    bread = inverse(total.expected)
+    lanes = list(zip(groups, owns, found, several, strict=True))
+    sums = [_sums(study, common, *lane) for lane in lanes]
+    score = total.score + sum((more for _, more in sums), start=jnp.zeros_like(total.score))
+    cov = bread @ score @ bread
+
+    strain = model.calibrations.strain(common)
+    judged = []
+    for (loads, own, eliminated, records), (sums_of, _), (_, results) in zip(
+        lanes, sums, fitted, strict=True
+    ):
+
+        def one(load, own, eliminated, result, records=records, sums_of=sums_of):
+            chi2, rrse = _misfit(study, load, common, own)
+            shared = eliminated.slope @ cov @ eliminated.slope.T
+            private = eliminated.cov
+            if records:
+                by_x, cross = _by_x(study, common, load, own, eliminated, sums_of)
+                cross = cross @ bread @ eliminated.slope.T
+                shared = shared + by_x + cross + cross.T
+                private = private - by_x
+            whole = private + shared
+            estimate = Estimate(
+                own[:-1],
+                own[None, -1:],
+                whole[:-1, :-1],
+                chi2,
+                rrse,
+                optx.RESULTS.where(result == optx.RESULTS.successful, solution.result, result),
+                solution.stats["num_steps"],
+                shared[:-1, :-1],
+                strain,
+            )
+            return estimate, _is_another(study, load, common, own, eliminated, bread, total.score)
+
+        judged.append(over(one, loads, own, eliminated, results))
+    return cov, judged
+
+
+def _misfit(study: DriverStudy, load: Loads, common, own):
+    """χ² and RRSE of a load."""
+    squares = jnp.sum(study.of_load(load, common, own)[:-1] ** 2)
+    freedom = 2 * jnp.sum(load.spectrum.selected, dtype=own.dtype) - own.shape[0]
+    g = study.model.gain(own, common, load.spectrum, load.sample_rate)
+    return squares / freedom, complex_rrse(
+        g * load.spectrum.x, load.spectrum.y, load.spectrum.selected
+    )
+
+
+def _is_another(
+    study: DriverStudy, load: Loads, common, own, eliminated: _Eliminated, bread, score
+) -> Bool[Array, ""]:
+    """The score test on one load; `bread` and `score` are those of `common` by all terms."""
+    jacobian, share = _jacobian(study, load, common, own)
+    rows = _by_changes(study, load, common, own)
+    terms = study.of_load(load, common, own)
+    noise = excess(terms[:-1], load.spectrum.selected)
+    slope = eliminated.slope
+    covariance = jnp.block(
+        [
+            [bread, bread @ slope.T],
+            [slope @ bread, eliminated.bread + slope @ bread @ slope.T],
+        ]
+    )
+    spread = jnp.zeros_like(covariance).at[: bread.shape[0], : bread.shape[0]]
+    found = other_circuit.scores(
+        jnp.pad(rows, ((0, 0), (0, 1))),  # no change has an effect on the prior of the delay
+        jacobian.T,
+        terms,
+        -jacobian.T @ terms,  # at the minimum all other terms have the opposite gradient
+        spread.set(score - eliminated.rest.score),
+        covariance,
+        weights([share], terms.size),
+        weights([noise], terms.size),
+        slice(common.size, common.size + own.size - 1),
+    )
+    return found.seen() & load.used  # what takes no part has a verdict of its own
+
+
+def _by_changes(study: DriverStudy, load: Loads, common, own) -> Float[Array, "change part"]:
+    """Derivatives of a load's denoised terms by the changes of its circuit."""
+    model, f = study.model, load.spectrum.frequency
+    g = model.gain(own, common, load.spectrum, load.sample_rate)
+    z, changes = other_circuit.changes(model.circuit.with_log_values(own[:-1]).impedance(), f)
+    z_th = model.calibrations.z_th(common).response(f)
+    by_z = g * z_th * reciprocal(z * (z + z_th))
+    gains = [*model.calibrations.gains(common), g]
+    (*known, spectrum), _ = denoised([*model.calibrations.records, load.spectrum], gains)
+    informed = model.informed(spectrum, common, known)
+
+    def row(change):
+        return jax.jvp(lambda g: residual(informed, g), (g,), (by_z * change,))[1]
+
+    return jax.lax.map(row, changes)
+
+
+def _jacobian(study: DriverStudy, load: Loads, common, own):
+    """Derivatives of a load's denoised terms by (common, own), and the shares of signal."""
+    model, c = study.model, common.shape[0]
+    gains = [
+        *model.calibrations.gains(common),
+        model.gain(own, common, load.spectrum, load.sample_rate),
+    ]
+    (*known, spectrum), shares = denoised([*model.calibrations.records, load.spectrum], gains)
+    jacobian = jax.jacfwd(lambda q: model.of_load(q[c:], q[:c], spectrum, load.sample_rate, known))(
+        jnp.concatenate([common, own])
+    )
+    return jacobian, shares[-1]
+
+
+def _eliminated(study: DriverStudy, load: Loads, common, own) -> _Eliminated:
+    jacobian, share = _jacobian(study, load, common, own)
+    noise = excess(study.of_load(load, common, own)[:-1], load.spectrum.selected)
+    return _without_own(_curvature(jacobian, [share], [noise]), common.shape[0])
+
+
+# --- Loads with one unloaded record --------------------------------------------------------------
+#
+# The noise of V_th is one noise in all of them. They are fitted as if it were not; but their errors
+# are those of correlated terms: the part of a term that is noise of X, two unit numbers for each
+# harmonic, is followed through to `common` and to every load.
+
+
+def _influence(study: DriverStudy, common, load: Loads, own, eliminated: _Eliminated):
+    """What unit noise in the parts of X adds to the score of `common`, and to the load's own."""
+    jacobian, _ = _jacobian(study, load, common, own)
+    known = study.model.informed(load.spectrum, common, study.model.calibrations.records)
+    g = study.model.gain(own, common, load.spectrum, load.sample_rate)
+    size = jnp.where(known.selected, jnp.sqrt(known.variance_x / variance(known, g)), 0.0)
+    re, im = g.real * size, g.imag * size
+    real, imaginary = jacobian[: g.size], jacobian[g.size : 2 * g.size]
+    by_x = jnp.concatenate(
+        [
+            re[:, None] * real + im[:, None] * imaginary,
+            re[:, None] * imaginary - im[:, None] * real,
+        ]
+    )
+    c = common.shape[0]
+    return by_x[:, :c] + by_x[:, c:] @ eliminated.slope, by_x[:, c:] @ eliminated.bread
+
+
+def _sums(study: DriverStudy, common, loads: Loads, owns, found: _Eliminated, records: int):
+    """What each shared record adds to the score of `common` over its loads, and so to its cov."""
+    c = common.shape[0]
+    start = (jnp.zeros((records, 2 * loads.spectrum.x.shape[1], c)), jnp.zeros((c, c)))
+    if not records:
+        return start
+
+    def add(carry, lane):
+        load, own, eliminated = lane
+        sums, alone = carry
+        mine, _ = _influence(study, common, load, own, eliminated)
+        mine = jnp.where(load.used & (load.unloaded >= 0), mine, 0.0)
+        return (sums.at[load.unloaded].add(mine), alone + mine.T @ mine), None
+
+    (sums, alone), _ = jax.lax.scan(add, start, (loads, owns, found))
+    return sums, jnp.einsum("rxc,rxd->cd", sums, sums) - alone
+
+
+def _by_x(study: DriverStudy, common, load: Loads, own, eliminated: _Eliminated, sums):
+    """What a shared X adds to the covariance of a load's own parameters.
+
+    And their covariance with what it adds to the score of `common` by the other loads.
+    """
+    mine, of_own = _influence(study, common, load, own, eliminated)
+    others = sums[load.unloaded] - jnp.where(load.used, mine, 0.0)
+    several = load.unloaded >= 0
+    return (
+        jnp.where(several, of_own.T @ of_own, 0.0),
+        jnp.where(several, of_own.T @ others, 0.0),
+    )

@@ -1,0 +1,179 @@
+"""One driver, many loads: a joint maximum-likelihood fit whose cost is linear in the loads.
+
+The normal equations are an arrowhead (`etid.solvers.arrowhead`; Pintelon and Schoukens, System
+Identification, 2012, ch. 9), of which a few loads at a time are evaluated side by side.
+"""
+
+import math
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import optimistix as optx
+from jaxtyping import Array, Bool, Float
+
+from etid.estimators.joint.errors import estimates
+from etid.estimators.joint.terms import DriverStudy, Loads, over
+from etid.estimators.maximum_likelihood.driver import Joint
+from etid.estimators.maximum_likelihood.given_driver import GivenDriver, around
+from etid.estimators.maximum_likelihood.load import Load
+from etid.estimators.output_error.fit import DELAY_WIDTH, MAX_STEPS, SOLVER, Estimate
+from etid.solvers.arrowhead import Arrowhead, ArrowheadEquations, EliminationDescent, join
+from etid.solvers.levenberg_marquardt import (
+    DIFFERENCE,
+    LevenbergMarquardt,
+    NormalEquations,
+    normal_equations,
+    second_order,
+)
+
+NEAR = 0.05  # standard errors of all parameters together from their minimum
+
+
+def _around(
+    study: DriverStudy, common: Float[Array, " common"], loads: Loads, slopes: bool = True
+) -> GivenDriver:
+    """The driver with these parameters, and how they move it, for a group of loads."""
+    model, frequency = study.model, loads.spectrum.frequency[0]
+    unit = jnp.eye(common.size)[:, : common.size if slopes else 0]
+    zero = jnp.zeros(unit.shape[1])
+    return around(model.calibrations, common, unit, frequency, model.shared, zero, jnp.diag(zero))
+
+
+def _lane(study: DriverStudy, driver: GivenDriver, load: Loads) -> Load:
+    spectrum, unloaded = driver.informed(load.spectrum)
+    return Load(driver, study.model.circuit, spectrum, unloaded, load.sample_rate)
+
+
+def _in_turn(one: Callable, *lanes: Any) -> Any:
+    """`one` over the leading axis of `lanes`: `Load` is made for one at a time on a processor."""
+    if jax.default_backend() == "cpu":
+        return jax.lax.map(lambda lane: one(*lane), lanes)
+    return over(one, *lanes)
+
+
+def _equations(_, y: Float[Array, " parameter"], study: DriverStudy) -> ArrowheadEquations:
+    """Normal equations of a study, load by load."""
+    common, parts = study.split(y)
+
+    def of_group(loads, owns):
+        driver = _around(study, common, loads)
+
+        def one(load, own):
+            lane = _lane(study, driver, load)
+            part, jacobian = lane.jacobian(jnp.concatenate([own, driver.mean]))
+            late = own[-1] / DELAY_WIDTH
+            slope = jnp.zeros(jacobian.shape[0]).at[own.size - 1].set(1 / DELAY_WIDTH)
+            found = NormalEquations(
+                0.5 * (jnp.dot(part, part) + late**2),
+                jacobian @ part + late * slope,
+                jacobian @ jacobian.T + jnp.outer(slope, slope),
+            ).finite()
+            return jax.tree.map(lambda leaf: jnp.where(load.used, leaf, 0.0), found)
+
+        return _in_turn(one, loads, owns)
+
+    found = [of_group(*group) for group in zip(study.groups, parts, strict=True)]
+    loads = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *found)
+    known = normal_equations(lambda q, _: study.of_calibrations(q), common)
+    o = parts[0].shape[1]
+    return ArrowheadEquations(
+        known.objective + loads.objective.sum(),
+        join(known.gradient + loads.gradient[:, o:].sum(0), loads.gradient[:, :o]),
+        Arrowhead(
+            known.matrix + loads.matrix[:, o:, o:].sum(0),
+            loads.matrix[:, :o, o:],
+            loads.matrix[:, :o, :o],
+        ),
+    )
+
+
+def _empty(y: Float[Array, " parameter"], study: DriverStudy) -> ArrowheadEquations:
+    shapes = jax.eval_shape(lambda: _equations(None, y, study))
+    return jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
+
+
+def _second_order(_, y, step, study: DriverStudy) -> Float[Array, " parameter"]:
+    """Jᵀ r″ of a study, load by load; r″ by differences, as `levenberg_marquardt.second_order`."""
+    (common, parts), (towards, steps) = study.split(y), study.split(step)
+
+    def of_group(loads, owns, steps):
+        driver = _around(study, common, loads)
+        ends = [
+            (h, _around(study, common + h * towards, loads, slopes=False))
+            for h in (DIFFERENCE, -DIFFERENCE)
+        ]
+
+        def one(load, own, step):
+            lane = _lane(study, driver, load)
+            _, jacobian = lane.jacobian(jnp.concatenate([own, driver.mean]))
+            count = jacobian.shape[1]  # of the terms that are not linear
+            bent = sum(_lane(study, end, load)(own + h * step)[:count] for h, end in ends)
+            bent = (bent - 2 * lane(own)[:count]) / DIFFERENCE**2
+            return jnp.where(load.used, jacobian @ bent, 0.0)
+
+        return _in_turn(one, loads, owns, steps)
+
+    found = [of_group(*group) for group in zip(study.groups, parts, steps, strict=True)]
+    loads, o = jnp.concatenate(found), parts[0].shape[1]
+    known = second_order(lambda q, _: study.of_calibrations(q), common, towards)
+    return join(known + loads[:, o:].sum(0), loads[:, :o])
+
+
+def fit(
+    model: Joint, groups: list[Loads], several: Sequence[int]
+) -> tuple[
+    Float[Array, " common"],
+    Float[Array, "common common"],
+    list[tuple[Estimate, Bool[Array, " load"]]],
+]:
+    """Identify all loads and their driver.
+
+    Args:
+        model: Calibrations, kind of circuit, and the driver to start from.
+        groups: The recordings, one group for each length.
+        several: In each group, how many unloaded records several loads have.
+
+    Returns:
+        Common parameters, their covariance, and the estimates of each group, stacked, with whether
+        each load is seen to be another circuit. In them `shared_cov` is what the uncertainty of
+        `common`, and the noise of an unloaded record that is not the load's alone, add: it is the
+        same in every load.
+    """
+    study = DriverStudy(model, groups)
+    # The sum of squares grows with the number of loads, what can be seen in it does not.
+    terms = sum(2 * loads.spectrum.x.size for loads in groups)
+    count = sum(loads.sample_rate.shape[0] for loads in groups)
+    solver = LevenbergMarquardt(
+        rtol=NEAR / math.sqrt(terms),
+        ftol=SOLVER.ftol / (1 + count),
+        geodesic=True,
+        descent=EliminationDescent(),
+        equations=_equations,
+        second_order=_second_order,
+        empty=_empty,
+    )
+    solution = optx.least_squares(
+        lambda y, study: study(y), solver, study.start(), study, max_steps=MAX_STEPS, throw=False
+    )
+    common, parts = study.split(solution.value)
+    # The loads that take no part have been waiting for Z_th.
+    refitted = [
+        over(lambda load, own: _refit(study, load, common, own), loads, own)
+        for loads, own in zip(groups, parts, strict=True)
+    ]
+    cov, found = estimates(study, common, refitted, several, solution)
+    return common, cov, found
+
+
+def _refit(study: DriverStudy, load: Loads, common, own):
+    """A load at its minimum with this Z_th, and how its solver ended."""
+    solution = optx.least_squares(
+        lambda own, _: study.of_load(load, common, own),
+        SOLVER,
+        own,
+        max_steps=MAX_STEPS,
+        throw=False,
+    )
+    return solution.value, solution.result

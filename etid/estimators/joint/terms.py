@@ -1,0 +1,87 @@
+"""The terms of one driver and its many loads.
+
+Only Z_th and the delays of the calibrations, `common`, tie the loads together; the elements and
+the delay of each, `own`, appear in its terms alone.
+"""
+
+import itertools
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from etid.estimators.maximum_likelihood.driver import Joint
+from etid.signals.harmonics import Spectrum
+from etid.solvers.arrowhead import join, split
+
+SIDE_BY_SIDE = 8  # loads of one vectorised step
+
+
+class Loads(eqx.Module):
+    """Recordings of one length with one driver, stacked along a leading axis.
+
+    Attributes:
+        spectrum: Their harmonics.
+        sample_rate: Their sampling rates [Hz].
+        own: Elements (logarithms) and delay of each, identified alone.
+        used: Whether the recording takes part; the others are fitted, but tell nothing of Z_th.
+        unloaded: Number of its unloaded record among those that several loads have; −1 if none has
+            the same.
+    """
+
+    spectrum: Spectrum
+    sample_rate: Float[Array, "*load"]
+    own: Float[Array, "*load own"]
+    used: Bool[Array, "*load"]
+    unloaded: Int[Array, "*load"]
+
+
+class DriverStudy(eqx.Module):
+    """All that the fit of a driver and its loads depends on."""
+
+    model: Joint
+    groups: list[Loads]
+
+    def __call__(self, y: Float[Array, " parameter"]) -> list[Float[Array, "..."]]:
+        """Terms of the calibrations, and of each group."""
+        common, parts = self.split(y)
+
+        def one(load, own):
+            return jnp.where(load.used, self.of_load(load, common, own), 0.0)
+
+        loaded = [jax.vmap(one)(loads, own) for loads, own in zip(self.groups, parts, strict=True)]
+        return [self.of_calibrations(common), *loaded]
+
+    def of_load(
+        self, load: Loads, common: Float[Array, " common"], own: Float[Array, " own"]
+    ) -> Float[Array, " term"]:
+        """Terms of one load."""
+        records = self.model.calibrations.records
+        return self.model.of_load(own, common, load.spectrum, load.sample_rate, records)
+
+    def of_calibrations(self, common: Float[Array, " common"]) -> Float[Array, " term"]:
+        """Terms of the calibrations."""
+        return self.model.calibrations.terms(common, self.model.calibrations.records)
+
+    def start(self) -> Float[Array, " parameter"]:
+        """The driver of the calibrations, and each load identified alone."""
+        own = jnp.concatenate([loads.own for loads in self.groups])
+        return join(self.model.calibrations.start(), own)
+
+    def split(
+        self, y: Float[Array, " parameter"]
+    ) -> tuple[Float[Array, " common"], list[Float[Array, "load own"]]]:
+        """Common parameters, and the own ones of each group."""
+        counts = [loads.own.shape[0] for loads in self.groups]
+        common, own = split(y, sum(counts), self.groups[0].own.shape[1])
+        ends = list(itertools.accumulate(counts))
+        return common, jnp.split(own, ends[:-1])
+
+
+def over(one: Callable, *lanes: Any) -> Any:
+    """`one` over the leading axis of `lanes`, a few at a time."""
+    count = jax.tree.leaves(lanes)[0].shape[0]
+    return jax.lax.map(lambda lane: one(*lane), lanes, batch_size=min(SIDE_BY_SIDE, count))

@@ -1,0 +1,194 @@
+"""The likelihood of harmonics, with noise on both records of every recording.
+
+In the periodic steady state Y = G e^(−jωτ) X holds exactly at every harmonic, with continuous R_s,
+R_p, C_p and Z_th(s): nothing is discretised, no initial state is unknown, and the likelihood is
+(Pintelon and Schoukens, System Identification, 2012, ch. 9)
+
+    Σ_k |Y_k − G_k e^(−jω_k τ) X_k|² / (σ_y² + |G_k|² σ_x²),      G = Z_L / (Z_L + Z_th),
+
+of which the unknown true X has been eliminated. σ² are the variances of one coefficient.
+
+**One unloaded record for several loaded ones** is one noise in all of them, and they all tell of
+the same X. Record by record, X and σ_x² are then replaced by what the earlier ones with the same X
+leave of them (`_learn`, one step of a Kalman filter): the likelihood of all, in independent terms.
+"""
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Complex, Float
+
+from etid.circuits.elements import AbstractImpedance
+from etid.results.driver import SourceImpedance
+from etid.signals.harmonics import Spectrum, local_sum, signal_share
+from etid.signals.mains import lines
+from etid.signals.transfer import as_complex, delayed, frequency_variable, power, reciprocal
+
+SURE = 4.0  # standard deviations of a local variance
+LOW = 128  # harmonics, the first, among which mains hum is looked for
+HUM = 14.4  # of its mean; an exponential exceeds it as rarely as a normal number five σ
+ROUNDING = 1e-12  # of a record, by which two transforms of the same samples may differ
+
+
+def gain(
+    source: SourceImpedance, load: AbstractImpedance, frequency: Float[Array, " harmonic"]
+) -> Complex[Array, " harmonic"]:
+    """G = Z_L / (Z_L + Z_th)."""
+    z_load = load(frequency_variable(frequency))
+    return z_load * reciprocal(z_load + source.response(frequency))
+
+
+def delayed_gain(
+    source: SourceImpedance,
+    load: AbstractImpedance,
+    frequency: Float[Array, " harmonic"],
+    delay: Float[Array, ""],
+) -> Complex[Array, " harmonic"]:
+    """G e^(−jωτ), for a delay τ in seconds."""
+    return delayed(gain(source, load, frequency), frequency, delay)
+
+
+def variance(spectrum: Spectrum, g: Complex[Array, " harmonic"]) -> Float[Array, " harmonic"]:
+    """E|Y − g X|² of the noise."""
+    return spectrum.variance_y + power(g) * spectrum.variance_x
+
+
+def residual(spectrum: Spectrum, g: Complex[Array, " harmonic"]) -> Float[Array, " part"]:
+    """Real and imaginary parts of Y − g X, scaled to unit variance; 0 if not selected."""
+    weight = jnp.where(spectrum.selected, jnp.sqrt(2 / variance(spectrum, g)), 0.0)
+    difference = (spectrum.y - g * spectrum.x) * as_complex(weight)
+    return jnp.concatenate([difference.real, difference.imag])
+
+
+def shows_hum(spectrum: Spectrum, g: Complex[Array, " harmonic"]) -> Bool[Array, ""]:
+    """Whether Y − g X shows mains hum: more on a harmonic where it may be than noise explains.
+
+    Noise is what the variances say, or what the other low harmonics show, if that is more. It is
+    looked for among harmonics that are not selected, too.
+    """
+    squares = power(spectrum.y - g * spectrum.x) / variance(spectrum, g)
+    return stands_out(squares, spectrum)
+
+
+def stands_out(squares: Float[Array, " harmonic"], spectrum: Spectrum) -> Bool[Array, ""]:
+    """The same for any residual, whose squares would be 1 on average without hum."""
+    squares, suspect = squares[:LOW], lines(spectrum.frequency[:LOW])
+    others = spectrum.selected[:LOW] & ~suspect
+    count = jnp.maximum(jnp.sum(others, dtype=squares.dtype), 1.0)
+    around = jnp.sum(jnp.where(others, squares, 0.0)) / count
+    return jnp.max(jnp.where(suspect, squares, 0.0)) > HUM * jnp.maximum(around, 1.0)
+
+
+def _learn(
+    spectrum: Spectrum,
+    other: Spectrum,
+    g: Complex[Array, " harmonic"],
+    same: Bool[Array, ""] | bool,
+) -> Spectrum:
+    """What is known of the X of `spectrum` after Y = `g` X of another record, if X is the same."""
+    total = other.variance_y + power(g) * spectrum.variance_x
+    used = other.selected & same
+    share = jnp.where(used, spectrum.variance_x / total, 0.0)
+    x = spectrum.x + jnp.conj(g) * as_complex(share) * (other.y - g * spectrum.x)
+    variance = jnp.where(used, share * other.variance_y, spectrum.variance_x)
+    return eqx.tree_at(lambda s: (s.x, s.variance_x), spectrum, (x, variance))
+
+
+def same_unloaded(one: Spectrum, other: Spectrum) -> Bool[Array, ""] | bool:
+    """Whether two recordings have one and the same unloaded record."""
+    if one is other:
+        return True
+    if one.x.shape != other.x.shape:
+        return False
+    return jnp.sum(power(one.x - other.x)) <= ROUNDING**2 * jnp.sum(power(other.x))
+
+
+def as_list(spectra: Spectrum) -> list[Spectrum]:
+    """Recordings stacked along a leading axis, one by one."""
+    return [jax.tree.map(lambda leaf, i=i: leaf[i], spectra) for i in range(spectra.x.shape[0])]
+
+
+def informed(
+    spectrum: Spectrum,
+    others: Sequence[Spectrum],
+    gains: Sequence[Complex[Array, " harmonic"]],
+) -> Spectrum:
+    """A recording with what others of the same unloaded record tell of its X."""
+    known = spectrum
+    for other, g in zip(others, gains, strict=True):
+        same = same_unloaded(spectrum, other)
+        if same is not False:
+            known = _learn(known, other, g, same)
+    return known
+
+
+def denoised(
+    spectra: Sequence[Spectrum], gains: Sequence[Complex[Array, " harmonic"]]
+) -> tuple[list[Spectrum], list[Float[Array, " part"]]]:
+    """The same with X by its maximum-likelihood estimate from all recordings, and Y = G X.
+
+    The Jacobian J there has no noise of the residual, which would count as information. What is
+    left in it of the noise of X makes the score noisier but is no information either, so that
+
+        cov = H⁻¹ (Jᵀ J) H⁻¹,      H = Jᵀ W J,
+
+    W being the share of signal in the power of X, which is returned for every residual.
+    """
+    found, shares = [], []
+    for one, g in zip(spectra, gains, strict=True):
+        known = informed(one, spectra, gains)
+        found.append(eqx.tree_at(lambda s: (s.x, s.y), one, (known.x, g * known.x)))
+        shares.append(jnp.tile(signal_share(known.x, known.variance_x), 2))
+    return found, shares
+
+
+def weights(shares: Sequence[Float[Array, "_"]], terms: int) -> Float[Array, " term"]:
+    """W of `denoised` for all terms: the shares of the first, and 1 for the priors after them."""
+    weight = jnp.concatenate(list(shares))
+    return jnp.pad(weight, (0, terms - weight.size), constant_values=1.0)
+
+
+def excess(
+    part: Float[Array, " part"], selected: Bool[Array, " harmonic"]
+) -> Float[Array, " part"]:
+    """Variance of a residual in units of what was expected, 1 or more, around each harmonic.
+
+    Noise is taken as white when it is weighed, but it may be coloured, and a model is never exact.
+    The covariance (Jᵀ C J for Jᵀ J, White 1980) is made with the variance that the residual has:
+    over `spectra.WINDOW` harmonics where that is surely larger than the mean over all.
+    """
+    count = selected.size
+    power = part[:count] ** 2 + part[count:] ** 2
+    of = jnp.where(selected, 2.0, 0.0)
+    overall = jnp.maximum(jnp.sum(power) / jnp.maximum(jnp.sum(of), 1.0), 1.0)
+    freedom = jnp.maximum(local_sum(of), 1.0)
+    local = local_sum(power) / freedom
+    sure = local > overall * (1 + SURE * jnp.sqrt(2 / freedom))
+    return jnp.tile(jnp.where(sure, local, overall), 2)
+
+
+def residuals(
+    spectra: Sequence[Spectrum], gains: Sequence[Complex[Array, " harmonic"]]
+) -> list[Float[Array, " part"]]:
+    """`residual` of each recording given those before it: all are independent."""
+    return [
+        residual(informed(one, spectra[:i], gains[:i]), g)
+        for i, (one, g) in enumerate(zip(spectra, gains, strict=True))
+    ]
+
+
+def apart(evaluate: Callable[[Array], Any], q: Float[Array, " q"]) -> Any:
+    """`evaluate(q)`, kept in memory; not a number if `q` is none.
+
+    XLA repeats what it takes to make one number in every loop that reads it, here a dozen times.
+    What a branch returns is computed once.
+    """
+    shapes = jax.eval_shape(evaluate, q)
+
+    def nothing(_):
+        return jax.tree.map(lambda of: jnp.full(of.shape, jnp.nan, of.dtype), shapes)
+
+    return jax.lax.cond(jnp.isfinite(q).all(), lambda q: evaluate(q), nothing, q)

@@ -1,0 +1,273 @@
+"""Maximum likelihood without a model of Z_th: one complex number for each harmonic.
+
+A calibration with R_L says of every harmonic (R_L + Z) Y₁ = R_L X₁, a load Z_L that (Z_L + Z) Y =
+Z_L X. With Z of the first in the second what is left is
+
+    e = (Z_L + Z) Y − Z_L X,      σ_e² = |Z_L + Z|² σ_y² + |Z_L|² σ_x² + |Y|² var Z,
+
+to first order in the noise of Z; delays turn Y and Y₁. Nothing but elements and delays is fitted.
+The estimate is right for a driver of any order, and for one that is no lumped circuit at all.
+
+A ratio of noisy numbers is biased, so only harmonics that a calibration shows clearly are used:
+below 40 dB `etid.estimators.maximum_likelihood.driver` sees more (Pintelon and Schoukens, 2012, ch.
+9 and 10).
+"""
+
+from collections.abc import Callable
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import optimistix as optx
+from jaxtyping import Array, Bool, Complex, Float
+
+from etid.circuits.circuit import AbstractCircuit
+from etid.estimators.maximum_likelihood.terms import as_list, excess, same_unloaded, stands_out
+from etid.estimators.output_error.fit import DELAY_WIDTH, MAX_STEPS, SOLVER, Estimate
+from etid.estimators.output_error.information import inverse
+from etid.results.driver import Calibration
+from etid.results.fits import complex_rrse
+from etid.signals.harmonics import Spectrum, signal_share
+from etid.signals.transfer import as_complex, delayed, frequency_variable, power, reciprocal
+from etid.solvers.levenberg_marquardt import best_start
+
+CLEAR = 0.97  # share of signal in the power of a calibration's Y, 15 dB
+PAIRS = 4  # of draws by which bias is estimated
+SEED = 1994
+
+
+def _clear(calibrations: list[Spectrum]) -> Bool[Array, "calibration harmonic"]:
+    """Harmonics that each calibration shows clearly."""
+    shown = [s.selected & (signal_share(s.y, s.variance_y) > CLEAR) for s in calibrations]
+    return jnp.stack(shown)
+
+
+def _total(values: list[Array]) -> Array:
+    return sum(values[1:], start=values[0])
+
+
+def _root(x: Float[Array, " harmonic"]) -> Float[Array, " harmonic"]:
+    """√x, whose derivative is 0 at 0."""
+    return jnp.where(x > 0, jnp.sqrt(jnp.where(x > 0, x, 1.0)), 0.0)
+
+
+class _Measured(eqx.Module):
+    """Z_th at the harmonics, and where its errors come from.
+
+    Attributes:
+        z: Z_th [Ω].
+        by_x: Its derivative by the X of each calibration.
+        by_y: Its variance from the noise of their Y.
+        apart: How far each calibration is from the mean, in standard deviations.
+    """
+
+    z: Complex[Array, " harmonic"]
+    by_x: list[Complex[Array, " harmonic"]]
+    by_y: Float[Array, " harmonic"]
+    apart: list[Complex[Array, " harmonic"]]
+
+
+class _Model(eqx.Module):
+    """The terms of the calibrations and, last, a load; parameters are elements and delays."""
+
+    circuit: AbstractCircuit
+    r_load: Float[Array, " calibration"]
+    calibration_rate: Float[Array, ""]
+    sample_rate: Float[Array, ""]
+    clear: Bool[Array, "calibration harmonic"]
+    selected: Bool[Array, " harmonic"]
+
+    def load(self, q: Float[Array, " q"], frequency: Float[Array, " harmonic"]):
+        """Z_L."""
+        elements = q[: q.size - self.r_load.size - 1]
+        load = self.circuit.with_log_values(elements).impedance()
+        return load(frequency_variable(frequency))
+
+    def z_th(self, q: Float[Array, " q"], records: list[Spectrum]) -> _Measured:
+        """Mean of what the calibrations say, by their variances."""
+        z, by_x, by_y, weights = [], [], [], []
+        late = q[-self.r_load.size - 1 : -1]
+        for r, delay, s, clear in zip(self.r_load, late, records[:-1], self.clear, strict=True):
+            inverse_y = reciprocal(delayed(s.y, s.frequency, -delay / self.calibration_rate))
+            slope = as_complex(r) * inverse_y
+            one = slope * s.x - as_complex(r)
+            variance = power(slope * s.x * inverse_y) * s.variance_y
+            z.append(one)
+            by_x.append(slope)
+            by_y.append(variance)
+            used = clear | ~self.selected  # of those that are not selected any, but no 0/0
+            weights.append(jnp.where(used, 1 / (variance + power(slope) * s.variance_x), 0.0))
+        total = _total(weights)
+        parts = [w / total for w in weights]
+        mean = _total([as_complex(p) * one for p, one in zip(parts, z, strict=True)])
+        return _Measured(
+            mean,
+            [as_complex(p) * slope for p, slope in zip(parts, by_x, strict=True)],
+            _total([p**2 * variance for p, variance in zip(parts, by_y, strict=True)]),
+            [(one - mean) * as_complex(_root(2 * w)) for one, w in zip(z, weights, strict=True)],
+        )
+
+    def _variance(self, q, records, y, of: _Measured):
+        """Of e, and the part that is the load's own; `y` is its Y in time."""
+        spectrum = records[-1]
+        load = self.load(q, spectrum.frequency)
+        own = power(load + of.z) * spectrum.variance_y
+        rest = power(y) * of.by_y
+        together, shared = -load, jnp.zeros((), dtype=bool)
+        for slope, s in zip(of.by_x, records[:-1], strict=True):
+            same = same_unloaded(spectrum, s)
+            shared = shared | same
+            rest = rest + jnp.where(same, 0.0, power(y * slope) * s.variance_x)
+            together = together + jnp.where(same, y * slope, 0.0)
+        of_x = power(together) * spectrum.variance_x
+        return own + rest + of_x, own + jnp.where(shared, 0.0, of_x)
+
+    def _in_time(self, q, records):
+        spectrum = records[-1]
+        return delayed(spectrum.y, spectrum.frequency, -q[-1] / self.sample_rate)
+
+    def terms(self, q: Float[Array, " q"], records: list[Spectrum]) -> Float[Array, " term"]:
+        """Scaled e, the weak priors of the delays, and what calibrations say of each other's."""
+        y, of = self._in_time(q, records), self.z_th(q, records)
+        load = self.load(q, records[-1].frequency)
+        variance, _ = self._variance(q, records, y, of)
+        weight = jnp.where(self.selected, jnp.sqrt(2 / variance), 0.0)
+        e = ((load + of.z) * y - load * records[-1].x) * as_complex(weight)
+        parts = [e.real, e.imag, q[-self.r_load.size - 1 :] / DELAY_WIDTH]
+        if len(of.apart) > 1:
+            apart = jnp.where(self.selected[None, :], jnp.stack(of.apart), 0.0).ravel()
+            parts += [apart.real, apart.imag]
+        return jnp.concatenate(parts)
+
+    def squares(self, q: Float[Array, " q"], records: list[Spectrum]) -> Float[Array, " harmonic"]:
+        """|e|² over its variance, also of what is not selected."""
+        y, of = self._in_time(q, records), self.z_th(q, records)
+        load = self.load(q, records[-1].frequency)
+        e = (load + of.z) * y - load * records[-1].x
+        return power(e) / self._variance(q, records, y, of)[0]
+
+    def without_noise(self, q: Float[Array, " q"], records: list[Spectrum]) -> list[Spectrum]:
+        """The records with Y of the load as all others predict it."""
+        spectrum, of = records[-1], self.z_th(q, records)
+        load = self.load(q, spectrum.frequency)
+        g = load * reciprocal(load + of.z)
+        y = delayed(g * spectrum.x, spectrum.frequency, q[-1] / self.sample_rate)
+        return [*records[:-1], eqx.tree_at(lambda s: s.y, spectrum, y)]
+
+    def private(self, q: Float[Array, " q"], records: list[Spectrum]) -> Float[Array, " harmonic"]:
+        """Part of the variance of e that is the load's own."""
+        y, of = self._in_time(q, records), self.z_th(q, records)
+        variance, own = self._variance(q, records, y, of)
+        return own / variance
+
+
+def fit_circuit(
+    circuit: AbstractCircuit,
+    calibration: Calibration,
+    calibration_rate: Float[Array, ""],
+    spectrum: Spectrum,
+    sample_rate: Float[Array, ""],
+    candidates: Float[Array, "start own"],
+) -> tuple[Estimate, Float[Array, " element"]]:
+    """Identify the load of one recording by the harmonics of the calibrations of its driver.
+
+    Args:
+        circuit: Structure of the load.
+        calibration: The calibrations, with harmonics of the same pulse rate.
+        calibration_rate: Their sampling rate [Hz].
+        spectrum: The recording.
+        sample_rate: Its sampling rate [Hz].
+        candidates: Logarithms of elements, and delays in samples, to start from; the start that
+            predicts best is refined.
+
+    Returns:
+        The estimate, whose parameters are the logarithms of the elements, and the bias that has
+        been subtracted from them.
+    """
+    assert calibration.spectra is not None  # check_driver
+    known, elements = as_list(calibration.spectra), candidates.shape[1] - 1
+    count = min(spectrum.x.size, known[0].x.size)
+    records = [jax.tree.map(lambda leaf: leaf[:count], s) for s in (*known, spectrum)]
+    clear = _clear(records[:-1])
+    selected = clear.any(0) & records[-1].selected
+    model = _Model(circuit, calibration.r_load, calibration_rate, sample_rate, clear, selected)
+
+    late = jnp.broadcast_to(calibration.delay, (candidates.shape[0], calibration.delay.size))
+    starts = jnp.concatenate([candidates[:, :-1], late, candidates[:, -1:]], axis=1)
+    best = best_start(lambda q: model.terms(q, records), starts)
+
+    def solve(records, start):
+        return optx.least_squares(
+            model.terms, SOLVER, start, args=records, max_steps=MAX_STEPS, throw=False
+        )
+
+    solution = solve(records, best)
+    q = solution.value
+    bias = _bias(lambda noisy: solve(noisy, q).value - q, records)
+    freedom = 2 * jnp.sum(selected, dtype=q.dtype) - q.size
+    chi2 = jnp.sum(model.terms(q, records)[: 2 * count] ** 2) / freedom
+    # The Jacobian at Y = G X, without the noise of e, which would count as information.
+    clean = model.without_noise(q, records)
+    jacobian = jax.jacfwd(model.terms)(q, clean)
+    by_term = inverse(jacobian.T @ jacobian)[:elements] @ jacobian.T
+    part = model.private(q, clean)
+    rest = jacobian.shape[0] - 2 * count - len(known)
+    weights = jnp.concatenate([part, part, jnp.zeros(len(known)), jnp.ones(1), jnp.zeros(rest - 1)])
+    noise = excess(model.terms(q, records)[: 2 * count], selected)
+    noise = jnp.concatenate([noise, jnp.ones(rest + len(known))])
+    own_cov = (by_term * (weights * noise)[None, :]) @ by_term.T
+    shared = (by_term * ((1 - weights) * noise)[None, :]) @ by_term.T
+    return (
+        Estimate(
+            (q - bias)[:elements],
+            q[None, -1:],
+            own_cov + shared,
+            chi2,
+            complex_rrse(
+                jnp.where(selected, clean[-1].y, 0.0), jnp.where(selected, records[-1].y, 0.0)
+            ),
+            solution.result,
+            solution.stats["num_steps"],
+            shared,
+            jnp.zeros(()),
+            stands_out(model.squares(q, records), records[-1]),
+        ),
+        bias[:elements],
+    )
+
+
+def _bias(
+    change: Callable[[list[Spectrum]], Float[Array, " number"]], records: list[Spectrum]
+) -> Float[Array, " number"]:
+    """What the noise of the records adds to the parameters on average, to second order.
+
+    By adding it once more, and its negative: the mean of both changes has no first order in it
+    (simulation and extrapolation, Cook and Stefanski 1994, with antithetic draws).
+    """
+
+    def drawn(key, variance):
+        parts = jax.random.normal(key, (2, variance.size), variance.dtype)
+        noise = parts * jnp.sqrt(variance / 2)[None, :]
+        return jax.lax.complex(noise[0], noise[1])
+
+    def mean_of_pair(key):
+        noises = []
+        last = jax.random.fold_in(key, 0)
+        for i, s in enumerate(records):
+            own = jax.random.fold_in(key, i + 1)
+            same = same_unloaded(s, records[-1])
+            # One unloaded record has one noise.
+            of_x = jnp.where(same, drawn(last, s.variance_x), drawn(own, s.variance_x))
+            noises.append((of_x, drawn(jax.random.fold_in(own, 1), s.variance_y)))
+
+        def refitted(sign):
+            return change(
+                [
+                    eqx.tree_at(lambda s: (s.x, s.y), s, (s.x + sign * a, s.y + sign * b))
+                    for s, (a, b) in zip(records, noises, strict=True)
+                ]
+            )
+
+        return (refitted(as_complex(jnp.ones(()))) + refitted(as_complex(-jnp.ones(())))) / 2
+
+    return jax.lax.map(mean_of_pair, jax.random.split(jax.random.key(SEED), PAIRS)).mean(0)

@@ -1,0 +1,1 @@
+"""Output error: the prediction in time, its fit by Levenberg-Marquardt, and its information."""

@@ -1,0 +1,157 @@
+"""What the records tell about the parameters: curvature and covariance.
+
+The residual r of `etid.estimators.output_error.prediction` is coloured (G filters the noise of
+V_th), and the recorded noise inflates JᵀJ. Both are accounted for,
+
+    cov = H⁻¹ (Jᵀ Σ J) H⁻¹,      Σ = (σ_out² K Kᵀ + σ_th² G Gᵀ)/s,
+    H   = JᵀJ − N ((σ_th² Σ ∂h ∂hᵀ + σ_out² Σ ∂k ∂kᵀ)/s − ∂s ∂sᵀ/(4 s²)),
+
+H being the curvature of the *expected* objective.
+"""
+
+import math
+from collections.abc import Callable
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from etid.estimators.output_error.prediction import (
+    IMPULSE,
+    Records,
+    impulse,
+    measured_impulse,
+    residual_variance,
+)
+
+EIGENVALUE_FLOOR = 1e-12  # of the scaled curvature; below it double precision sees nothing
+
+
+def inverse(matrix: Float[Array, "n n"], *, drop: bool = False) -> Float[Array, "n n"]:
+    """Inverse of a symmetric matrix, in its own scaling.
+
+    Directions without information keep an enormous variance, or with `drop` none: nuisances that
+    the data do not determine have no effect either.
+    """
+    scale = jnp.sqrt(jnp.maximum(jnp.diagonal(matrix), 0.0))
+    scale = jnp.where(scale > 0, scale, 1.0)
+    values, vectors = jnp.linalg.eigh(matrix / scale[:, None] / scale[None, :])
+    weight = 1 / jnp.maximum(values, EIGENVALUE_FLOOR)
+    weight = jnp.where(values > EIGENVALUE_FLOOR, weight, 0.0 if drop else weight)
+    return (vectors * weight[None, :]) @ vectors.T / scale[:, None] / scale[None, :]
+
+
+class Curvature(eqx.Module):
+    """H and Jᵀ Σ J of one record, over (parameters, nuisance)."""
+
+    expected: Float[Array, "n n"]
+    score: Float[Array, "n n"]
+
+
+class Slopes(eqx.Module):
+    """A residual, an impulse response, and their Jacobians.
+
+    Attributes:
+        residual: Scaled residual.
+        jacobian: Its derivatives by the parameters.
+        h: Impulse response of the loaded driver.
+        slope: Its derivatives.
+    """
+
+    residual: Float[Array, " interval"]
+    jacobian: Float[Array, "interval n"]
+    h: Float[Array, " lag"]
+    slope: Float[Array, "lag n"]
+
+
+def slopes(
+    residual: Callable[[Float[Array, " n"]], Float[Array, " interval"]],
+    response: Callable[[Float[Array, " n"]], Float[Array, " lag"]],
+    q: Float[Array, " n"],
+) -> Slopes:
+    """Evaluate a scaled residual, an impulse response, and their Jacobians at q."""
+    return Slopes(residual(q), jax.jacfwd(residual)(q), response(q), jax.jacfwd(response)(q))
+
+
+def padded_size(rows: int) -> int:
+    """Length of an FFT in which a filter does not wrap around."""
+    return 2 ** math.ceil(math.log2(rows + IMPULSE))
+
+
+def noise_power(records: Records, h: Float[Array, " lag"], size: int) -> Float[Array, " bin"]:
+    """Power [V²] of the residual's noise at each frequency of an FFT, per sample."""
+    power_out = records.sigma_out**2 * jnp.abs(jnp.fft.rfft(impulse()[:, 0], size)) ** 2
+    return power_out + records.sigma_th**2 * jnp.abs(jnp.fft.rfft(h, size)) ** 2
+
+
+def bin_weights(size: int) -> Float[np.ndarray, " bin"]:
+    """By which squares of `rfft` sum to those of the samples (Parseval)."""
+    weight = np.full(size // 2 + 1, 2.0 / size)
+    weight[[0, -1]] = 1.0 / size
+    return weight
+
+
+def curvature(records: Records, at: Slopes, precision: Float[Array, " n"]) -> Curvature:
+    """Evaluate H and JᵀΣJ.
+
+    Args:
+        records: One recording.
+        at: Derivatives at the minimum; the last parameter is the record's delay [samples].
+        precision: Of independent priors of q, which count as curvature.
+    """
+    h, slope, jacobian = at.h, at.slope, at.jacobian
+    s = residual_variance(records, h)
+    s_slope = 2 * records.sigma_th**2 * h @ slope
+    samples, rows = records.intervals, jacobian.shape[0]
+    noise = records.sigma_th**2 * slope.T @ slope / s
+    noise = noise - jnp.outer(s_slope, s_slope) / (4 * s**2)
+    k_slope = measured_impulse()[:, 1]
+    noise = noise.at[-1, -1].add(records.sigma_out**2 * jnp.sum(k_slope**2) / s)
+    # Jᵀ Σ J by Parseval; J is padded, so that the filters do not wrap around.
+    size = padded_size(rows)
+    weight = jnp.asarray(bin_weights(size)) * noise_power(records, h, size)
+    spectrum = jnp.fft.rfft(jacobian, size, axis=0)
+    real, imaginary = spectrum.real, spectrum.imag
+    score = real.T @ (weight[:, None] * real) + imaginary.T @ (weight[:, None] * imaginary)
+    information = jacobian.T @ jacobian
+    return Curvature(information - samples * noise + jnp.diag(precision), score / s)
+
+
+def further(
+    information: Float[Array, "all all"],
+    spread: Float[Array, "all all"],
+    gradient: Float[Array, " all"],
+    kept: int,
+) -> tuple[Float[Array, " further"], Float[Array, " further"]]:
+    """Where each further parameter alone would go from a minimum over the first `kept`.
+
+    One step of Newton from 0, with the first parameters free (Rao's score test has no power but
+    where this step is large against its error).
+
+    Args:
+        information: Expected curvature over all parameters.
+        spread: Covariance of the gradient.
+        gradient: Of the objective.
+        kept: How many parameters are at their minimum.
+
+    Returns:
+        The steps, and their standard errors.
+    """
+    others = information[kept:, :kept] @ inverse(information[:kept, :kept])
+    towards = jnp.concatenate([-others, jnp.eye(information.shape[0] - kept)], axis=1)
+    own = jnp.diagonal(towards @ information[:, kept:])
+    variance = jnp.einsum("ij,jk,ik->i", towards, spread, towards)
+    return -(towards @ gradient) / own, jnp.sqrt(variance) / own
+
+
+def eliminate(of: Curvature, kept: int) -> Curvature:
+    """Project out all but the first `kept` parameters: nuisances, which no other record shares."""
+    h, m = of.expected, of.score
+    k = -inverse(h[kept:, kept:], drop=True) @ h[kept:, :kept]
+    reduced = h[:kept, :kept] + h[:kept, kept:] @ k
+    score = (
+        m[:kept, :kept] + m[:kept, kept:] @ k + k.T @ m[kept:, :kept] + k.T @ m[kept:, kept:] @ k
+    )
+    return Curvature(reduced, score)

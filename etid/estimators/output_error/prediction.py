@@ -1,0 +1,187 @@
+"""Terminal voltage predicted from the recorded V_th, and its difference to the recorded V_out.
+
+The loaded driver is a continuous-time system, run exactly for band-limited samples
+(`etid.signals.filtering`), so that discretisation costs no accuracy at the recorder's own rate. The
+state at the start of the record, an offset of V_out and its trigger delay are nuisances.
+
+**Noise on both records.** The residual r = V_out_predicted − V_out contains the noise of V_out and
+the noise of V_th filtered by the loaded driver G. For white noise its variance is
+
+    s(θ) = σ_out² Σ k² + σ_th² Σ h²,
+
+k being the impulse response of the interpolation, h that of G after it. Minimising Σ r²/s(θ) is
+consistent, because E Σ r² = |noise-free misfit|² + N s(θ); minimising Σ r² alone is not (at 30 dB
+it drives Z_th to −90 kΩ).
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from etid.results.driver import SourceImpedance, loaded
+from etid.signals.filtering import CUTOFF, TAPS, StateSpace, band_limited, hold, shiftable, simulate
+from etid.signals.measurement import Measurement
+from etid.signals.transfer import Rational
+
+IMPULSE = 256  # samples of the impulse response whose squares are summed
+
+
+class Records(eqx.Module):
+    """What one fit sees of a recording: the interpolated V_th, the measured V_out, and their noise.
+
+    Attributes:
+        hold: Polynomial coefficients of the band-limited V_th.
+        v_out: Measured voltage [V] as polynomials of a delay, filtered like V_th.
+        sigma_th: Noise of V_th [V].
+        sigma_out: Noise of V_out [V].
+        sample_rate: Sampling rate [Hz].
+        used: 1 where there is a record, 0 for what only fills it up to a common length.
+    """
+
+    hold: Float[Array, "interval degree"]
+    v_out: Float[Array, "interval shift"]
+    sigma_th: Float[Array, ""]
+    sigma_out: Float[Array, ""]
+    sample_rate: Float[Array, ""]
+    used: Float[Array, " interval"]
+
+    @property
+    def intervals(self) -> Float[Array, ""]:
+        """Number of those that are used."""
+        return self.used.sum()
+
+
+def prepare(
+    m: Measurement, cutoff: float = CUTOFF, samples: Int[Array, ""] | int | None = None
+) -> Records:
+    """Interpolate V_th once; the edges, where its neighbours are missing, are left out.
+
+    Args:
+        m: One recording.
+        cutoff: As in `filtering.band_limited`.
+        samples: How many at the beginning are the recording; all if not given.
+    """
+    held, delayed = band_limited(m.v_th, cutoff), shiftable(m.v_out, cutoff)
+    rows = jnp.arange(held.shape[0])
+    last = held.shape[0] if samples is None else samples - 2 * TAPS + 1
+    used = (rows < last).astype(held.dtype)
+    return Records(held, delayed, m.sigma_th, m.sigma_out, m.sample_rate, used)
+
+
+def loaded_filter(
+    source: SourceImpedance, load: Rational, sample_rate: Float[Array, ""]
+) -> StateSpace:
+    """Discrete filter from the interpolated V_th to V_out."""
+    return hold(loaded(source, load, sample_rate), sample_rate)
+
+
+def predict(
+    system: StateSpace, records: Records, nuisance: Float[Array, " nuisance"]
+) -> Float[Array, " interval"]:
+    """Terminal voltage [V]; `nuisance` is the initial state, the offset [V] and the delay."""
+    return simulate(system, records.hold, nuisance[:-2])[0] + nuisance[-2]
+
+
+def measured(records: Records, nuisance: Float[Array, " nuisance"]) -> Float[Array, " interval"]:
+    """Measured voltage [V] at the instants of V_th; it was sampled `nuisance[-1]` samples late.
+
+    50 ns between the triggers of two records are 0.01 samples, and spread R_s by 8 %.
+    """
+    late = -nuisance[-1]
+    value = records.v_out[:, -1]
+    for k in range(records.v_out.shape[1] - 2, -1, -1):  # Horner
+        value = value * late + records.v_out[:, k]
+    return value
+
+
+def impulse_response(system: StateSpace) -> Float[Array, " lag"]:
+    """Response h of the loaded driver to one sample of V_th, interpolation included."""
+    return simulate(system, impulse(), jnp.zeros_like(system.C))[0]
+
+
+def impulse() -> Float[Array, "lag degree"]:
+    """One sample of noise of V_th, interpolated."""
+    return band_limited(jnp.zeros(IMPULSE + 2 * TAPS).at[2 * TAPS].set(1.0))
+
+
+def measured_impulse() -> Float[Array, "lag shift"]:
+    """One sample of noise of V_out, as a function of the delay."""
+    return shiftable(jnp.zeros(IMPULSE + 2 * TAPS).at[2 * TAPS].set(1.0))
+
+
+def residual_variance(records: Records, h: Float[Array, " lag"]) -> Float[Array, ""]:
+    """Variance s = σ_out² Σ k² + σ_th² Σ h² of the residual [V²]."""
+    k = impulse()[:, 0]
+    return records.sigma_out**2 * jnp.sum(k**2) + records.sigma_th**2 * jnp.sum(h**2)
+
+
+class Late(eqx.Module):
+    """What changes per sample by which the calibration was triggered later than assumed.
+
+    Attributes:
+        v_out: Terminal voltage [V].
+        h: Impulse response.
+    """
+
+    v_out: Float[Array, " interval"]
+    h: Float[Array, " lag"]
+
+
+def scaled_residual(
+    records: Records,
+    source: SourceImpedance,
+    load: Rational,
+    nuisance: Float[Array, " nuisance"],
+    change: Late | None = None,
+) -> Float[Array, " interval"]:
+    """(Predicted − measured) / √s; `change` is added to what is predicted."""
+    system = loaded_filter(source, load, records.sample_rate)
+    predicted, h = predict(system, records, nuisance), impulse_response(system)
+    if change is not None:
+        predicted, h = predicted + change.v_out, h + change.h
+    scale = records.used / jnp.sqrt(residual_variance(records, h))
+    return (predicted - measured(records, nuisance)) * scale
+
+
+def late_calibration(
+    records: Records,
+    source: SourceImpedance,
+    load: Rational,
+    r_load: Float[Array, ""],
+    x0: Float[Array, " state"],
+) -> Late:
+    """Derivative by the delay of the calibration, of which the skin's own delay absorbs a part.
+
+    A calibration with R_L that is late by τ yields Z_th + sτ (R_L + Z_th) in place of Z_th: to
+    first order in τ no record with that R_L tells the two apart. A load Z_L is then seen through
+
+        Z_L + Z_th + sτ (R_L + Z_th) = (1 + sτ) (Z_L + Z_th) + sτ (R_L − Z_L),
+
+    a delay of its own and an excess impedance. This is the derivative by the latter.
+
+    Args:
+        records: One recording.
+        source: Z_th.
+        load: The load.
+        r_load: Resistor of the calibration [Ω].
+        x0: State of the loaded driver at the start of the record.
+    """
+    system = loaded(source, load, records.sample_rate)
+    x0_rate = (system.A @ x0 + system.B[:, 0] * records.hold[0, 0]) / records.sample_rate
+
+    def rate(hold):  # per sample
+        steps = jnp.arange(1.0, hold.shape[1])
+        return jnp.pad(hold[:, 1:] * steps[None, :], ((0, 0), (0, 1)))
+
+    # Z_th + ε (R_L − Z_L) for Z_th is, but for a factor of V_out, R + ε R_L for R and (1 − ε) Z_L
+    # for Z_L; that factor is the delay's.
+    def excess(epsilon):
+        shifted = jnp.log(jnp.exp(source.log_resistance) + epsilon * r_load)
+        altered = eqx.tree_at(lambda z: z.log_resistance, source, shifted)
+        reduced = Rational((1 - epsilon) * load.num, load.den)
+        filtered = loaded_filter(altered, reduced, records.sample_rate)
+        v_out = simulate(filtered, rate(records.hold), x0_rate)[0]
+        return v_out, simulate(filtered, rate(impulse()), jnp.zeros_like(x0_rate))[0]
+
+    return Late(*jax.jvp(excess, (jnp.zeros(()),), (jnp.ones(()),))[1])

@@ -1,0 +1,103 @@
+"""Has a driver a pole that its model lacks? A score test on the calibrations.
+
+A Z_th of too low an order can fit a calibration with χ² of 1 and a residual of the size of the
+noise, and still be wrong by 5 %: at 60 dB an order of 3 given for 5 or 6 costs R_s three per cent,
+ten of its standard errors. What it lacks is smooth in frequency, and noise is not. So Rao's score
+test asks for one more section,
+
+    ∂Z_th = (g + h x) / (1 + 2ζx + x²),      x = s/ω,
+
+at g = h = 0, for each ω of a grid that covers the band, and three dampings; a single pole is ζ = 1
+with g = h. The score of g and h, less what the other parameters can do, has two degrees of freedom;
+the largest of all sections decides.
+
+Over the map of failures (`python -m benchmarks failure_map`) it is 15 at most where the order is
+high enough, and 116 or more where a lower one costs an element five of its standard errors.
+"""
+
+from collections.abc import Callable, Sequence
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Complex, Float
+
+from etid.estimators.maximum_likelihood.driver import Calibrations
+from etid.estimators.maximum_likelihood.terms import denoised, excess, residuals, weights
+from etid.estimators.output_error.information import inverse
+from etid.results.driver import Calibration
+from etid.signals.transfer import as_complex, frequency_variable, reciprocal
+
+SEEN = 36.0  # χ² of two degrees of freedom; one of some hundred sections has it once in 10⁶
+DAMPINGS = (0.1, 0.3, 1.0)
+GRID = 36  # frequencies, eight in a decade
+BEYOND = 3.0  # by which they exceed the band, in which a slow or a fast pole still shows
+
+
+def sections(
+    frequency: Float[Array, " harmonic"], lowest: Float[Array, ""], highest: Float[Array, ""]
+) -> Complex[Array, "section 2 harmonic"]:
+    """∂Z_th/∂g and ∂Z_th/∂h of all sections."""
+    omega = 2 * jnp.pi * jnp.geomspace(lowest / BEYOND, highest * BEYOND, GRID)
+    omega, zeta = (of.ravel() for of in jnp.meshgrid(omega, jnp.asarray(DAMPINGS)))
+    x = frequency_variable(frequency)[None, :] * as_complex(1 / omega)[:, None]
+    low = reciprocal(1 + (as_complex(2 * zeta)[:, None] + x) * x)
+    return jnp.stack([low, x * low], axis=1)
+
+
+def is_seen(calibrations: Calibrations) -> Bool[Array, ""]:
+    """Whether the calibrations show one more section.
+
+    Args:
+        calibrations: At the minimum of their likelihood.
+    """
+    return jnp.nanmax(squares(calibrations)) > SEEN  # none where a section has no effect
+
+
+def squares(calibrations: Calibrations) -> Float[Array, " section"]:
+    """Score statistic of each section, χ² with two degrees of freedom if there is none.
+
+    Args:
+        calibrations: At the minimum of their likelihood.
+    """
+    c, records = calibrations.start(), calibrations.records
+    gains = calibrations.gains(c)
+    clean, shares = denoised(records, gains)
+    jacobian = jax.jacfwd(lambda c: calibrations.terms(c, clean))(c)
+    count = jacobian.shape[0]
+    share = weights(shares, count)
+    parts = residuals(records, gains)
+    of_noise = [excess(r, s.selected) for r, s in zip(parts, records, strict=True)]
+    noise = weights(of_noise, count)
+    of_gains = _by_gains(calibrations.calibration, gains, calibrations.z_th(c).response)
+
+    def row(number):
+        slopes = [of[number] for of in of_gains]
+        part = jax.jvp(lambda gains: jnp.concatenate(residuals(clean, gains)), (gains,), (slopes,))
+        return jnp.pad(part[1], (0, count - part[1].size))
+
+    rows = jax.vmap(row)(jnp.arange(of_gains[0].shape[0]))
+    others = (rows * share[None, :]) @ jacobian @ inverse((jacobian.T * share[None, :]) @ jacobian)
+    directions = rows - others @ jacobian.T
+    score = (directions @ calibrations.terms(c, records)).reshape(-1, 2, 1)
+    directions = directions.reshape(-1, 2, count)
+    variance = jnp.einsum("sit,t,sjt->sij", directions, noise, directions)
+    return jnp.sum(score * jnp.linalg.solve(variance, score), axis=(1, 2))
+
+
+def _by_gains(
+    calibration: Calibration,
+    gains: Sequence[Complex[Array, " harmonic"]],
+    z_th: Callable[[Float[Array, " harmonic"]], Complex[Array, " harmonic"]],
+) -> list[Complex[Array, "row harmonic"]]:
+    """Derivatives of the gains, G = R/(R + Z_th), by g and h of all sections."""
+    spectra = calibration.spectra
+    assert spectra is not None  # check_driver
+    lowest = spectra.frequency[0, 0]
+    highest = jnp.max(jnp.where(spectra.selected, spectra.frequency, lowest))
+    found = []
+    for number, (r, g) in enumerate(zip(calibration.r_load, gains, strict=True)):
+        frequency = spectra.frequency[number]
+        of_z = -g * reciprocal(as_complex(r) + z_th(frequency))
+        by_z = sections(frequency, lowest, highest)
+        found.append((by_z * of_z[None, None, :]).reshape(-1, frequency.size))
+    return found

@@ -1,0 +1,229 @@
+"""The paper's baseline: Steiglitz-McBride on the discrete filters, eqs. (1)-(12).
+
+Both stages identify a rational filter N/D with X N/D = W. The output error W − X N/D is made linear
+in (N, D) by prefiltering both records with the denominator of the iteration before (Steiglitz &
+McBride 1965),
+
+    minimise  ∮ |X N_i/D_{i−1} − W D_i/D_{i−1}|² dz/z,      D_{−1} = 1          (1), (2)
+
+Iteration 0 alone is the *equation error* estimate. Driver and skin differ in their X and W only:
+
+    driver:  X = V_out,          W = R_L (V_th − V_out),   N/D = Z_th      (5), (6)
+    skin:    X = V_th − V_out,   W = Z_th V_out,           N/D = Z_bio     (8), (9)
+
+The iteration does not settle on most recordings and its fixed point is biased by noise, because X
+and W share the noise of V_out. What is returned is the iterate whose *simulated* terminal voltage
+fits best (RRSE, eq. 3), with its verdict.
+"""
+
+from collections.abc import Callable
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from etid.circuits.circuit import SkinRC
+from etid.results.fits import rrse
+from etid.signals.filtering import lfilter
+from etid.signals.transfer import (
+    Rational,
+    add_polynomials,
+    is_stable,
+    multiply_polynomials,
+    reflect_poles,
+)
+
+ITERATIONS = 20
+SETTLED = 1e-6  # relative change of the coefficients that counts as convergence
+
+
+class Iterate(eqx.Module):
+    """The best iterate of a Steiglitz-McBride run.
+
+    Attributes:
+        filter: N/D in z⁻¹.
+        rrse: Of the terminal voltage it predicts (eq. 3), infinite if that cannot be simulated.
+        iteration: At which it was found, 0 being equation error.
+        converged: Whether the *last* iterations settled.
+        stable: Whether N/D itself is stable.
+        closed_loop_stable: Whether the driver loaded with this circuit is stable.
+    """
+
+    filter: Rational
+    rrse: Float[Array, ""]
+    iteration: Int[Array, ""]
+    converged: Bool[Array, ""]
+    stable: Bool[Array, ""]
+    closed_loop_stable: Bool[Array, ""]
+
+
+def _delayed(v: Float[Array, "record time"], lags: range) -> Float[Array, "record time lag"]:
+    time = v.shape[-1]
+    return jnp.stack([jnp.pad(v, ((0, 0), (k, 0)))[:, :time] for k in lags], axis=-1)
+
+
+def iterate(
+    x: Float[Array, "record time"],
+    w: Float[Array, "record time"],
+    zeros: int,
+    poles: int,
+    assess: Callable[[Rational], tuple[Float[Array, ""], Bool[Array, ""]]],
+    iterations: int = ITERATIONS,
+) -> Iterate:
+    """Fit N/D with X N/D = W over one or several records (eqs. 1, 2).
+
+    Args:
+        x: Input records X.
+        w: Output records W.
+        zeros: Order of N.
+        poles: Order of D.
+        assess: RRSE of the voltage that a candidate predicts, and whether its closed loop is
+            stable.
+        iterations: How many; 1 is equation error.
+    """
+    one = jnp.ones(1, x.dtype)
+
+    def solve(prefilter):
+        xf = jax.vmap(lambda v: lfilter(one, prefilter, v)[0])(x)
+        wf = jax.vmap(lambda v: lfilter(one, prefilter, v)[0])(w)
+        columns = jnp.concatenate(
+            [_delayed(xf, range(zeros + 1)), -_delayed(wf, range(1, poles + 1))], axis=-1
+        ).reshape(-1, zeros + 1 + poles)
+        length = jnp.linalg.norm(columns, axis=0)
+        length = jnp.where(length > 0, length, 1.0)
+        q, r = jnp.linalg.qr(columns / length[None, :])
+        coefficients = jax.scipy.linalg.solve_triangular(r, q.T @ wf.reshape(-1)) / length
+        return Rational(
+            coefficients[: zeros + 1], jnp.concatenate([one, coefficients[zeros + 1 :]])
+        )
+
+    def step(carry, iteration):
+        best, prefilter, previous = carry
+        candidate = solve(prefilter)
+        error, closed_loop_stable = assess(candidate)
+        change = jnp.linalg.norm(candidate.den - previous) / jnp.linalg.norm(candidate.den)
+        stable = is_stable(candidate.den)
+        current = Iterate(candidate, error, iteration, change < SETTLED, stable, closed_loop_stable)
+        # As long as none can be simulated, the latest is the best there is.
+        better = (error < best.rrse) | ~jnp.isfinite(best.rrse)
+        best = jax.tree.map(lambda new, old: jnp.where(better, new, old), current, best)
+        # A prefilter must be stable to be run at all; reflecting its poles keeps its magnitude
+        # response.
+        reflected = reflect_poles(jnp.where(jnp.isfinite(candidate.den), candidate.den, prefilter))
+        return (best, jnp.where(stable, candidate.den, reflected), candidate.den), change
+
+    nothing = Iterate(
+        Rational(jnp.zeros(zeros + 1, x.dtype), jnp.zeros(poles + 1, x.dtype).at[0].set(1.0)),
+        jnp.array(jnp.inf, x.dtype),
+        jnp.array(0),
+        jnp.array(False),
+        jnp.array(False),
+        jnp.array(False),
+    )
+    start = nothing.filter.den
+    (best, _, _), changes = jax.lax.scan(step, (nothing, start, start), jnp.arange(iterations))
+    return eqx.tree_at(lambda b: b.converged, best, changes[-1] < SETTLED)
+
+
+def terminal_voltage(
+    z_th: Rational, z_load: Rational, v_th: Float[Array, " time"]
+) -> tuple[Float[Array, " time"], Bool[Array, ""]]:
+    """Predict V_out = V_th · Z_L / (Z_L + Z_th), and say whether that loop is stable.
+
+    The closed loop is N_L D_th / (N_L D_th + N_th D_L): a stable Z_th can still give an unstable
+    one.
+    """
+    forward = multiply_polynomials(z_load.num, z_th.den)
+    denominator = add_polynomials(forward, multiply_polynomials(z_th.num, z_load.den))
+    stable = is_stable(denominator)
+    safe = jnp.where(stable, denominator, jnp.zeros_like(denominator).at[0].set(1.0))
+    return lfilter(forward, safe, v_th)[0], stable
+
+
+def driver_filter(
+    v_th: Float[Array, "record time"],
+    v_out: Float[Array, "record time"],
+    r_load: Float[Array, " record"],
+    order: int,
+    iterations: int = ITERATIONS,
+) -> Iterate:
+    """Identify the discrete Z_th from records with known resistors (paper, eqs. 4-6).
+
+    Z_th = (α₀ + … + α₄ z⁻⁴) / (1 + β₁ z⁻¹ + … + β₅ z⁻⁵)                (4)
+
+    Args:
+        v_th: Unloaded voltages [V].
+        v_out: Voltages [V] with the resistors.
+        r_load: The resistors [Ω].
+        order: Number of poles; the numerator has one order less.
+        iterations: How many; 1 is equation error.
+    """
+
+    def assess(candidate):
+        def one(v_th, v_out, r):
+            load = Rational(r[None], jnp.ones(1, r.dtype))
+            predicted, stable = terminal_voltage(candidate, load, v_th)
+            return jnp.where(stable, rrse(predicted, v_out), jnp.inf), stable
+
+        errors, stable = jax.vmap(one)(v_th, v_out, r_load)
+        error = errors.max()
+        return jnp.where(jnp.isfinite(error), error, jnp.inf), stable.all()
+
+    w = r_load[:, None] * (v_th - v_out)
+    return iterate(v_out, w, order - 1, order, assess, iterations)
+
+
+def skin_filter(
+    v_th: Float[Array, " time"],
+    v_out: Float[Array, " time"],
+    z_th: Rational,
+    iterations: int = ITERATIONS,
+) -> Iterate:
+    """Identify the discrete first-order Z_bio (paper, eqs. 7-9).
+
+    Args:
+        v_th: Unloaded voltage [V].
+        v_out: Voltage [V] with the skin as load.
+        z_th: Discrete source impedance, a rational function of z⁻¹.
+        iterations: How many; 1 is equation error.
+    """
+
+    def assess(candidate):
+        predicted, stable = terminal_voltage(z_th, candidate, v_th)
+        error = jnp.where(stable, rrse(predicted, v_out), jnp.inf)
+        return jnp.where(jnp.isfinite(error), error, jnp.inf), stable
+
+    w = lfilter(z_th.num, z_th.den, v_out)[0]
+    return iterate((v_th - v_out)[None], w[None], 1, 1, assess, iterations)
+
+
+def skin_elements(
+    z_bio: Rational, sample_rate: float | Float[Array, ""], *, as_printed: bool = False
+) -> SkinRC:
+    """Elements of the first-order discrete Z_bio under the bilinear map (paper, eqs. 10-12).
+
+    R_s = Z(∞),   R_p = Z(0) − R_s,   C_p from |Z(j/(R_p C_p))| = √((R_s+R_p)² + R_s²) / √2
+
+    The paper prints the last magnitude as (2 R_s + R_p)/√2, which overestimates C_p (by 38 % for
+    dry skin, 88 % for damp) and has no root for R_s/R_p > 1/√2. Elements come out negative or NaN
+    where the filter is no circuit; nothing is repaired.
+
+    Args:
+        z_bio: Discrete impedance, a rational function of z⁻¹.
+        sample_rate: Sampling rate [Hz].
+        as_printed: Use the magnitude as printed in the paper.
+    """
+    n, d = z_bio.num, z_bio.den
+    r_s = (n[0] - n[1]) / (d[0] - d[1])  # s = ∞ is z = −1, eq. (10)
+    total = (n[0] + n[1]) / (d[0] + d[1])  # s = 0 is z = 1, eq. (11)
+    r_p = total - r_s
+    tau = (d[0] - d[1]) / (d[0] + d[1]) / (2 * sample_rate)  # the pole, s = −1/(R_p C_p), eq. (12)
+    c_p = tau / r_p
+    if as_printed:
+        magnitude = (2 * r_s + r_p) / jnp.sqrt(2.0)
+        # |Z(jω)|² = (total² + r_s² x²) / (1 + x²) with x = ω R_p C_p; the paper takes 1/ω for R_p
+        # C_p.
+        x = jnp.sqrt((total**2 - magnitude**2) / (magnitude**2 - r_s**2))
+        c_p = c_p / x
+    return SkinRC(r_s, r_p, c_p)

@@ -1,0 +1,265 @@
+"""Channels of a file become recordings: units, scales and trials, each said by someone.
+
+Nothing is guessed.  What neither the file nor the mapping says is an error, and so is what they say
+differently.
+"""
+
+import dataclasses
+from collections.abc import Callable, Hashable, Iterator, Mapping
+from typing import Any
+
+import numpy as np
+
+from etid.files.channel import Channel, located
+from etid.files.clock import sample_rate
+from etid.files.mapping import Plan, Signal, unit_of
+from etid.files.units import Unit
+from etid.recordings import limits
+from etid.recordings.recording import (
+    SIGNALS,
+    AbstractSource,
+    Layout,
+    Metadata,
+    Recording,
+    RecordingError,
+    Samples,
+    metadata_from,
+)
+
+# A matrix with more trials than samples, each a small part of a pulse period, lies on its side.
+_SHORTEST_STACKED = 0.1
+
+_KINDS = ("loaded", "calibration")  # paths of what has no path of its own
+
+
+@dataclasses.dataclass(frozen=True)
+class Used:
+    """Which channel became a signal, and how its values were understood.
+
+    Attributes:
+        channel: Its name in the file.
+        unit: Of its values.
+        unit_by: Who says so: `file`, `mapping`, both, or the `command`.
+        scale: What the values were divided by.
+    """
+
+    channel: str
+    unit: str
+    unit_by: str
+    scale: float
+
+    def __str__(self) -> str:
+        divided = f", divided by {self.scale:g}" if self.scale != 1 else ""
+        return f"{self.channel!r} in {self.unit} ({self.unit_by}){divided}"
+
+
+@dataclasses.dataclass(frozen=True)
+class Imported:
+    """What one recording, or a stack of trials, was made of.
+
+    Attributes:
+        paths: HDF5 paths of the recordings.
+        samples: How many each has.
+        sample_rate: Samples per second [Hz].
+        rate_by: Who says so: `file`, `mapping`, both, or the `time` channel.
+        pulse_rate: Pulses per second [Hz].
+        signals: The channel of each signal.
+    """
+
+    paths: tuple[str, ...]
+    samples: int
+    sample_rate: float
+    rate_by: str
+    pulse_rate: float
+    signals: Mapping[str, Used]
+
+    def __str__(self) -> str:
+        ends = self.paths if len(self.paths) < 3 else (self.paths[0], self.paths[-1])
+        lines = [
+            f"{' … '.join(ends)}: {self.samples} samples at {self.sample_rate:.9g} Hz "
+            f"({self.rate_by}), pulses at {self.pulse_rate:.9g} Hz"
+        ]
+        return "\n".join(lines + [f"  {name:<8}{used}" for name, used in self.signals.items()])
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class _Record:
+    """One trial of a channel, in SI units."""
+
+    channel: Channel
+    trial: int
+    conversion: float
+    offset: float
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class _Source(AbstractSource):
+    """A recording in a file of another format."""
+
+    file: str
+    described: Metadata
+    records: Mapping[str, _Record]
+
+    @property
+    def metadata(self) -> Metadata:
+        return self.described
+
+    @property
+    def layout(self) -> tuple[Layout, ...]:
+        return tuple(
+            Layout(
+                name,
+                record.channel.dtype.newbyteorder("=").str,
+                record.channel.length,
+                record.conversion,
+                record.offset,
+            )
+            for name, record in self.records.items()
+        )
+
+    @property
+    def unloaded(self) -> Hashable:
+        record = self.records["v_th"]
+        return record.channel.name, record.trial
+
+    def blocks(self, name: str) -> Iterator[np.ndarray]:
+        record = self.records[name]
+        with located(self.file, self.metadata.path, name):
+            yield from record.channel.blocks(record.trial)
+
+    def load(self) -> Recording:
+        records: dict[str, Any] = {
+            name: Samples(np.concatenate(list(self.blocks(name))), record.conversion, record.offset)
+            for name, record in self.records.items()
+        }
+        return Recording(**records, **vars(self.metadata))
+
+
+def sources_of(
+    plan: Plan, channel: Callable[[str], Channel], file: str, by: str
+) -> tuple[dict[str, AbstractSource], Imported]:
+    """The recordings of a plan, by path, and what they are made of.
+
+    Args:
+        plan: What the mapping says.
+        channel: The channel of a name.
+        file: The file, for errors.
+        by: Who says what the plan says.
+
+    Raises:
+        RecordingError: File and plan do not give recordings.
+    """
+    channels: dict[str, Channel] = {}
+    units: dict[str, tuple[Unit, str]] = {}
+    for name, signal in plan.signals.items():
+        with located("", field=name):
+            channels[name] = channel(signal.channel)
+        units[name] = _unit(name, signal, channels[name].unit)
+    for name, own in channels.items():
+        if own.length > limits.SAMPLES or (len(own.shape) == 2 and own.shape[0] > limits.TRIALS):
+            raise RecordingError(
+                f"channel {own.name!r} has shape {own.shape}, at most {limits.TRIALS} trials of "
+                f"{limits.SAMPLES} samples are read",
+                field=name,
+                remedy="Split it",
+            )
+    rows = _rows(plan.signals, channels)
+    length = channels["v_out"].length
+    rate, rate_by = sample_rate(plan, channels, units, by)
+    common = metadata_from(**{**plan.fields, "sample_rate": rate, "trial": "", "path": plan.path})
+    trials = rows["v_out"]
+    stacked = len(channels["v_out"].shape) == 2 and not isinstance(plan.signals["v_out"].rows, int)
+    periods = length * common.pulse_rate / rate
+    if stacked and len(trials) > length and periods < _SHORTEST_STACKED:
+        raise RecordingError(
+            f"{plan.signals['v_out'].channel!r} would be {len(trials)} trials of {length} samples, "
+            f"{periods:.2g} pulse periods each",
+            field="v_out",
+            remedy="Rows are trials and columns are time: transpose the variables",
+        )
+    labels = _labels(plan.fields.get("trial"), trials, stacked)
+    sources: dict[str, AbstractSource] = {}
+    for index, label in enumerate(labels):
+        records = {}
+        for name in SIGNALS:
+            if name in channels:
+                factor = units[name][0].factor / (plan.signals[name].scale or 1.0)
+                own = channels[name]
+                trial = rows[name][index if len(rows[name]) > 1 else 0]
+                records[name] = _Record(own, trial, own.conversion * factor, own.offset * factor)
+        path = f"{plan.path}/{index}" if stacked or plan.path in _KINDS else plan.path
+        metadata = metadata_from(**{**vars(common), "trial": label, "path": path})
+        sources[path] = _Source(file, metadata, records)
+    used = {
+        name: Used(
+            signal.channel,
+            signal.unit or channels[name].unit.strip() or signal.implied,
+            units[name][1],
+            signal.scale or 1.0,
+        )
+        for name, signal in plan.signals.items()
+    }
+    return sources, Imported(tuple(sources), length, rate, rate_by, common.pulse_rate, used)
+
+
+def _unit(name: str, signal: Signal, said: str) -> tuple[Unit, str]:
+    """The unit of a signal, which its meaning allows."""
+    unit, by = unit_of(name, signal, said)
+    wanted = {"time": "second", "current": "ampere"}.get(name, "volt")
+    over_a_shunt = name == "current" and unit.si == "volt" and signal.scale is not None
+    if unit.si != wanted and not over_a_shunt:
+        raise RecordingError(
+            f"channel {signal.channel!r} is in {unit.si} ({by}), must be in {wanted}",
+            field=f"{name}.unit",
+            remedy="Give the current that a voltage stands for a scale, in volts per ampere"
+            if name == "current" and unit.si == "volt"
+            else "Name another channel",
+        )
+    return unit, by
+
+
+def _rows(signals: Mapping[str, Signal], channels: Mapping[str, Channel]) -> dict[str, list[int]]:
+    """The trials of each signal: those of `v_out`, or a single one of `v_th` for all of them."""
+    found: dict[str, list[int]] = {}
+    for name in SIGNALS:
+        if name not in channels:
+            continue
+        shape, rows = channels[name].shape, signals[name].rows
+        count = shape[0] if len(shape) == 2 else 1
+        every = tuple(range(count)) if rows is None else (rows,) if isinstance(rows, int) else rows
+        if max(every) >= count:
+            raise RecordingError(
+                f"names row {max(every)}, channel {signals[name].channel!r} has {count}, from 0 on",
+                field=f"{name}.rows",
+            )
+        found[name] = list(every)
+    trials = len(found["v_out"])
+    length = channels["v_out"].length
+    fits = all(
+        len(channels[name].shape) in (1, 2)
+        and channels[name].length == length
+        and (len(rows) == trials or (name == "v_th" and len(rows) == 1))
+        for name, rows in found.items()
+    )
+    if not fits:
+        shapes = ", ".join(
+            f"{signals[name].channel} {channels[name].shape}"
+            + f" rows {rows}" * (signals[name].rows is not None)
+            for name, rows in found.items()
+        )
+        raise RecordingError(
+            f"shapes do not fit each other: {shapes}",
+            remedy="They must be (time,) or (trial, time); only v_th may be (time,), or one row, "
+            "beside a stacked v_out",
+        )
+    return found
+
+
+def _labels(said: Any, trials: list[int], stacked: bool) -> list[Any]:
+    """The trial label of each recording."""
+    if said is None:
+        return list(trials) if stacked else [""]
+    labels = said if isinstance(said, list) else [said]
+    if len(labels) != len(trials):
+        raise RecordingError(f"has {len(labels)} labels for {len(trials)} trials", field="trial")
+    return labels

@@ -1,0 +1,133 @@
+"""The sample rate of a recording: from the file, from a mapping, or from time stamps."""
+
+from collections.abc import Iterator, Mapping
+
+import numpy as np
+
+from etid.files.channel import Channel, located
+from etid.files.mapping import Plan
+from etid.files.units import Unit
+from etid.recordings.recording import Metadata, RecordingError
+from etid.signals.pulse_train import find_pulses
+
+# Largest distance of a time stamp from a uniform grid, in sample periods: more than the rounding of
+# a printed time, less than a lost or doubled sample (1).
+_TIME_TOLERANCE = 0.25
+
+# A crystal is at most this far off: a measured rate may differ so much from the nominal one.
+_CLOCK_TOLERANCE = 1e-4
+
+# The channels of one clock have one rate, but for the last digits of its reciprocal.
+_ROUNDING = 1e-9
+
+
+def sample_rate(
+    plan: Plan, channels: Mapping[str, Channel], units: Mapping[str, tuple[Unit, str]], by: str
+) -> tuple[float, str]:
+    """The sample rate [Hz] of a recording, and who says it.
+
+    Args:
+        plan: What the mapping says.
+        channels: The channel of each signal.
+        units: Their units, and who says them.
+        by: Who says what the plan says.
+
+    Raises:
+        RecordingError: Nobody says it, two say it differently, or the times are no clock.
+    """
+    said = {
+        plan.signals[name].channel: channel.sample_rate
+        for name, channel in channels.items()
+        if channel.sample_rate is not None
+    }
+    if said and not _agree(_ROUNDING, *said.values()):
+        raise RecordingError(
+            "differs between the channels: "
+            + ", ".join(f"{name!r} {rate:.9g} Hz" for name, rate in said.items()),
+            field="sample_rate",
+        )
+    theirs = next(iter(said.values()), None)
+    ours = plan.fields.get("sample_rate")
+    if ours is None and "time" in channels:
+        signal = plan.signals["time"]
+        with located("", field="time"):
+            ours = _clock(channels["time"], units["time"][0].factor, channels["v_out"].length)
+        by = f"time {signal.channel!r}"
+    if ours is None:
+        if theirs is None:
+            raise RecordingError(
+                "is not given, the file does not say it, and it is not guessed: one of time and "
+                "sample_rate is needed",
+                field="sample_rate",
+                remedy="Give the rate, or the channel of the times",
+            )
+        return theirs, "file"
+    if theirs is None:
+        return ours, by
+    if not _agree(_CLOCK_TOLERANCE, ours, theirs):
+        raise RecordingError(
+            f"is {ours:.9g} Hz by the {by}, {theirs:.9g} Hz by the file",
+            field="sample_rate",
+            remedy="Correct the one that is wrong",
+        )
+    return ours, f"{by}; file {theirs:.9g} Hz"
+
+
+def check_spacing(v_th: np.ndarray, metadata: Metadata) -> None:
+    """Compare the distance of the pulses with both rates.
+
+    Args:
+        v_th: The unloaded record or its beginning, in any unit.
+        metadata: Of the recording.
+
+    Raises:
+        RecordingError: The pulses are not as far apart as both rates say.
+    """
+    if not np.isfinite(v_th).all():
+        return
+    train = find_pulses(v_th, metadata.sample_rate, metadata.pulse_rate)
+    if train.mismatch:
+        raise RecordingError(
+            train.mismatch.removesuffix("."),
+            path=metadata.path,
+            field="pulse_rate",
+            remedy="Correct sample_rate or pulse_rate",
+        )
+
+
+def _agree(tolerance: float, *rates: float) -> bool:
+    return max(rates) - min(rates) <= tolerance * max(rates)
+
+
+def _clock(time: Channel, factor: float, length: int) -> float:
+    """Sample rate of uniform time stamps, from the first and the last."""
+    if time.shape != (length,) or length < 2:
+        raise RecordingError(
+            f"has shape {time.shape}, must be ({length},) with at least two times", field="time"
+        )
+
+    def stamps() -> Iterator[np.ndarray]:
+        return (
+            (block.astype(np.float64) * time.conversion + time.offset) * factor
+            for block in time.blocks()
+        )
+
+    first = last = np.nan
+    for number, block in enumerate(stamps()):
+        first, last = (block[0] if number == 0 else first), block[-1]
+    step = (last - first) / (length - 1)
+    if not step > 0:
+        raise RecordingError("does not increase", field="time", remedy="Times are in seconds")
+    start = 0
+    for block in stamps():
+        distance = np.abs(block - (first + step * np.arange(start, start + block.size))) / step
+        worst = int(np.argmax(distance))  # of a NaN, where there is one
+        if not distance[worst] <= _TIME_TOLERANCE:
+            raise RecordingError(
+                f"is not uniform: sample {start + worst} is {distance[worst]:.2g} sample periods "
+                "off",
+                field="time",
+                remedy="Resample outside, or give the sample_rate the instrument was set to",
+            )
+        start += block.size
+    return float(1 / step)

@@ -1,0 +1,238 @@
+"""Files for other programs: tables of fits, one identified circuit, recordings as NWB."""
+
+import csv
+import datetime
+import json
+import os
+import pathlib
+import re
+from collections.abc import Iterator
+from typing import Any
+
+import h5py
+import numpy as np
+
+from etid.circuits.circuit import AbstractCircuit
+from etid.circuits.netlist import circuit_string, netlist
+from etid.files.channel import listed, needs
+from etid.recordings import limits
+from etid.recordings.recording import RecordingError
+from etid.recordings.untrusted import attribute, translated
+from etid.results.fits import LABELS, SCHEMA, Fit, Fits
+from etid.results.hdf5_table import Table, opened_table, replacing, same_length
+
+ROWS = 1 << 16  # of fits in memory at once
+
+CIRCUITS = (".cir", ".json")
+
+_QUALITY = {"rrse": "number", "chi2": "number", "steps": "integer", "verdict": "text",
+            "remarks": "text", "note": "text"}  # fmt: skip
+
+
+def export_fits(source: str | os.PathLike[str], target: str | os.PathLike[str]) -> None:
+    """Write the table of a file of fits, `Fits.table()`, for other programs.
+
+    - `.csv`: a line of names, such as `r_s [ohm]` and `r_s_stderr [ohm]`, then a line per fit, in
+      SI units, with all digits. What is not known is `nan`.
+    - `.parquet`: columns of the same names without units. The metadata of a column has its `unit`,
+      those of the file have `circuit`, `method` and `etid_version`. Needs
+      `pip install etid[parquet]`.
+
+    Covariances stay in the file of fits. At most 65536 fits are in memory.
+
+    Args:
+        source: File of fits.
+        target: The file to write; one that exists is replaced at the end.
+
+    Raises:
+        ValueError: The source is no file of fits, or the target has another suffix.
+        RecordingError: pyarrow is not installed.
+    """
+    suffix = pathlib.Path(target).suffix.lower()
+    if suffix not in _WRITERS:
+        raise ValueError(
+            f"{os.fspath(target)}: fits are exported as {' or '.join(_WRITERS)}, not {suffix!r}"
+        )
+    with opened_table(source, SCHEMA) as table, replacing(target) as partial:
+        columns = _columns(table)
+        about = {name: table.text(name) for name in ("circuit", "method", "etid_version")}
+        _WRITERS[suffix](table, columns, about, partial)
+
+
+def _columns(table: Table) -> dict[str, h5py.Dataset]:
+    """The columns of `Fits.table()`, none of them read yet."""
+    parameters = table.attribute("parameters")
+    names = parameters if isinstance(parameters, list) else [parameters]
+    if not all(isinstance(name, str) for name in names) or len(names) > limits.COLUMNS:
+        raise RecordingError(
+            f"is {parameters!r}, must be names", file=table.name, field="parameters",
+            remedy="Fit the recordings again",
+        )  # fmt: skip
+    elements = [name + ending for name in names for ending in ("", "_stderr")]
+    changes = (f"{name}_change" for name in (*names, "amplitude"))
+    elements += [name for name in changes if name in table]  # not before schema version 1.2
+    kinds = dict.fromkeys(LABELS, "text") | dict.fromkeys(elements, "number") | _QUALITY
+    columns = {name: table.column(name, kind) for name, kind in kinds.items()}
+    same_length(table, columns)
+    return columns
+
+
+def _units(column: h5py.Dataset, table: Table) -> str | None:
+    """The unit of a column."""
+    with translated(table.name, field=str(column.name).strip("/")):
+        unit = attribute(column, "unit") if "unit" in column.attrs else None
+        if not isinstance(unit, str | None):
+            raise RecordingError(f"has the unit {unit!r}", remedy="Fit the recordings again")
+    return unit
+
+
+def _parts(table: Table, columns: dict[str, h5py.Dataset]) -> Iterator[dict[str, np.ndarray]]:
+    """The rows, some at a time."""
+    for start in range(0, len(columns["path"]), ROWS):
+        rows = slice(start, start + ROWS)
+        yield {name: table.read(column, rows) for name, column in columns.items()}
+
+
+def _csv(
+    table: Table, columns: dict[str, h5py.Dataset], about: dict[str, str], path: pathlib.Path
+) -> None:
+    del about
+    units = {name: _units(column, table) for name, column in columns.items()}
+    with path.open("w", newline="", encoding="utf-8") as text:
+        lines = csv.writer(text)
+        lines.writerow(
+            name if unit in (None, "1") else f"{name} [{unit}]" for name, unit in units.items()
+        )
+        for part in _parts(table, columns):
+            lines.writerows(zip(*(column.tolist() for column in part.values()), strict=True))
+
+
+def _parquet(
+    table: Table, columns: dict[str, h5py.Dataset], about: dict[str, str], path: pathlib.Path
+) -> None:
+    try:
+        import pyarrow
+        from pyarrow import parquet
+    except ImportError as error:
+        raise needs("pyarrow", "parquet", str(path)) from error
+    fields = []
+    for name, column in columns.items():
+        text = h5py.check_string_dtype(column.dtype)
+        kind: Any = pyarrow.string() if text else pyarrow.from_numpy_dtype(column.dtype)
+        unit = _units(column, table)
+        fields.append(pyarrow.field(name, kind, metadata={"unit": unit} if unit else None))
+    schema = pyarrow.schema(fields, metadata=about)
+    with parquet.ParquetWriter(path, schema) as writer:
+        for part in _parts(table, columns):
+            writer.write_table(pyarrow.table(part, schema=schema))
+
+
+_WRITERS = {".csv": _csv, ".parquet": _parquet}
+
+
+def export_circuit(
+    source: str | os.PathLike[str],
+    target: str | os.PathLike[str],
+    path: str | None = None,
+    *,
+    circuit: type[AbstractCircuit] | None = None,
+) -> None:
+    """Write one identified circuit of a file of fits for other programs.
+
+    - `.cir`: a SPICE subcircuit between `plus` and `minus`, called `load_` and the path of the
+      recording, as in `load_s01_dry_03` (`etid.netlist`).
+    - `.json`: what `CustomCircuit().load(…)` of impedance.py reads; its initial guess is the
+      identified values (`etid.circuit_string`).
+
+    Args:
+        source: File of fits.
+        target: The file to write; one that exists is replaced at the end.
+        path: Path of the recording; not needed if the file has one fit only.
+        circuit: The kind of circuit, if it is not one of etid's own.
+
+    Raises:
+        ValueError: The source is no file of fits or has no such fit, the fit has not been
+            successful, or the target has another suffix.
+    """
+    suffix = pathlib.Path(target).suffix.lower()
+    if suffix not in CIRCUITS:
+        raise ValueError(f"{os.fspath(target)}: a circuit is exported as {' or '.join(CIRCUITS)}")
+    fits = Fits.read(source, circuit)
+    paths = [str(each) for each in fits.labels["path"]]
+    if path is None and len(paths) == 1:
+        path = paths[0]
+    if path is None or path.strip("/") not in paths:
+        said = "say which recording" if path is None else f"there is no fit of {path!r}"
+        raise RecordingError(f"{said}; the fits are of {listed(paths)}", file=os.fspath(source))
+    index = paths.index(path.strip("/"))
+    fit = fits[index]
+    if fit.verdict != "successful":
+        raise ValueError(
+            f"{os.fspath(source)}: the fit of {paths[index]!r} is {fit.verdict}, no circuit to "
+            f"work with. {fits.notes[index]}"
+        )
+    try:
+        text = _written(fit, paths[index], suffix)
+    except ValueError as error:  # an element that is 0, or no number
+        raise RecordingError(str(error), file=os.fspath(source), path=paths[index]) from error
+    with replacing(target) as partial:
+        partial.write_text(text, encoding="utf-8")
+
+
+def _written(fit: Fit, path: str, suffix: str) -> str:
+    """A circuit in the language of another program."""
+    if suffix == ".cir":
+        name = "load_" + re.sub(r"\W", "_", path, flags=re.ASCII)
+        return f"* {path}, by {fit.method}\n{netlist(fit.circuit, name=name)}"
+    string, values = circuit_string(fit.circuit)
+    content = {
+        "Name": f"{path}, by etid",
+        "Circuit String": string,
+        "Initial Guess": values,
+        "Constants": {},
+        "Fit": False,  # its "Fit" would come with impedance.py's own standard errors
+    }
+    return json.dumps(content, indent=1, ensure_ascii=False) + "\n"
+
+
+def export_study(
+    source: str | os.PathLike[str],
+    target: str | os.PathLike[str],
+    *,
+    session_start: datetime.datetime | None = None,
+) -> None:
+    """Write a file of recordings as NWB, one TimeSeries per record.
+
+    A TimeSeries in `acquisition` is called `s01.dry.0.v_out` for the record `v_out` of `s01/dry/0`
+    and has its stored samples, `conversion`, `offset`, `unit` and `rate`; an unloaded record that
+    several recordings share is stored once and linked.  The table `recordings` has everything else,
+    a line per recording, with the names of its TimeSeries.  A file of recordings does not say when
+    they began: `starting_time` is 0 for each.
+
+    One record at a time is in memory.  Needs `pip install etid[nwb]`.
+
+    Args:
+        source: File of recordings.
+        target: The file to write, `.nwb`; one that exists is replaced at the end.
+        session_start: When the session began, with its time zone: NWB requires it, and the source
+            does not say it.
+
+    Raises:
+        RecordingError: The source cannot be read, `session_start` is missing, or pynwb is not
+            installed.
+        ValueError: The target is not called `.nwb`.
+    """
+    if pathlib.Path(target).suffix.lower() != ".nwb":
+        raise ValueError(f"{os.fspath(target)}: recordings are exported as .nwb")
+    if session_start is None or session_start.tzinfo is None:
+        raise RecordingError(
+            "is not given with a time zone, and is not guessed: NWB requires it",
+            file=os.fspath(source),
+            field="session_start",
+            remedy="Say when the session began, such as 2026-01-31T09:30:00+01:00",
+        )
+    try:
+        from etid.files.nwb import write_nwb
+    except ImportError as error:
+        raise needs("pynwb", "nwb", os.fspath(target)) from error
+    write_nwb(source, target, session_start)

@@ -1,0 +1,170 @@
+"""Files of other formats become files of recordings.
+
+A reader per format (`etid.files.readers`) names the channels of a file, a mapping
+(`etid.files.mapping`) says which of them is which signal, `etid.files.assemble` makes recordings of
+them, and these are written while they are read.
+"""
+
+import os
+import pathlib
+from collections.abc import Mapping
+from typing import Any
+
+from etid.files.assemble import Imported, Used, sources_of
+from etid.files.channel import located
+from etid.files.clock import check_spacing
+from etid.files.mapping import plans, read_mapping
+from etid.files.readers import abf, delimited, matlab, npz, tdms
+from etid.recordings.recording import AbstractSource, RecordingError
+from etid.recordings.study import Study, refuse_nested
+
+READERS = {
+    ".csv": delimited.opened,
+    ".mat": matlab.opened,
+    ".tdms": tdms.opened,
+    ".abf": abf.opened,
+}
+_IMPLIED = {"v_th": "V", "v_out": "V", "current": "A", "time": "s"}
+
+
+def import_file(
+    source: str | os.PathLike[str],
+    target: str | os.PathLike[str],
+    mapping: str | os.PathLike[str] | Mapping[str, Any] | None = None,
+    *,
+    v_th: str | None = None,
+    v_out: str | None = None,
+    current: str | None = None,
+    time: str | None = None,
+    sample_rate: float | int | None = None,
+    pulse_rate: float | int | None = None,
+    scale: float | int | None = None,
+    r_load: float | int | None = None,
+    subject: str = "",
+    condition: str = "",
+) -> list[Imported]:
+    """Turn a file of another format into an etid file.
+
+    - `.csv`: comma-separated columns with a header line, one trial.
+    - `.mat`: variables of shape (time,) or (trial, time), `a.b` for field b of structure a.
+      MATLAB's files before 7.3 need `pip install etid[matlab]`.
+    - `.tdms`: channels `group/channel` of NI's files; `pip install etid[tdms]`.
+    - `.abf`: ADC channels of Axon's files, sweeps are trials; `pip install etid[abf]`.
+    - `.npz`: converter codes that say everything themselves (`etid.files.readers.npz`); only
+      `subject`
+      and `condition` (default: the file's name) may be given.
+
+    Which channel is which signal is said by a mapping, whose keys data_schema/README.md lists, or,
+    for one recording, by the arguments: a file's units are used where it names them, other values
+    are in volts, amperes and seconds.  The trials of a recording without a path become `loaded/0`,
+    … or, with `r_load`, `calibration/0`, ….
+
+    At most a part of a record is in memory, except of MATLAB files before 7.3 and of `.npz`.
+
+    Args:
+        source: The file to import; its suffix says what it is.
+        target: The etid file to write; one that exists is replaced.
+        mapping: TOML file, or what it would hold; instead of all that follows.
+        v_th: Channel of the unloaded output.
+        v_out: Channel of the output with the load.
+        current: Channel of the current; optional.
+        time: Channel of the time, instead of `sample_rate`.
+        sample_rate: Samples per second [Hz].
+        pulse_rate: Stimulation pulses per second [Hz].
+        scale: Volts at the terminal are the value divided by this; 1 if the values are those at the
+            terminal.
+        r_load: Known resistor [ohm], for calibrations.
+        subject: Who.
+        condition: Which state of the skin, or which circuit.
+
+    Returns:
+        What was used for what.
+
+    Raises:
+        RecordingError: The file cannot be read, or something about it is missing or wrong.
+    """
+    path, folder = pathlib.Path(os.fspath(source)), pathlib.Path(os.fspath(target)).parent
+    file = str(path)
+    if not path.is_file():
+        raise RecordingError("there is no such file", file=file, remedy="Check the path")
+    if not folder.is_dir():
+        raise RecordingError("there is no folder to write it to", file=os.fspath(target))
+    names = {"v_th": v_th, "v_out": v_out, "current": current, "time": time}
+    numbers = {"sample_rate": sample_rate, "pulse_rate": pulse_rate, "scale": scale}
+    labels = {name: value for name, value in (("subject", subject), ("condition", condition))
+              if value}  # fmt: skip
+    given = {**names, **numbers, "r_load": r_load}
+    given = {name: value for name, value in given.items() if value is not None}
+    suffix = path.suffix.lower()
+    if suffix == ".npz":
+        _refuse(given | ({} if mapping is None else {"mapping": mapping}), file,
+                "an npz file of recordings says this itself")  # fmt: skip
+        return _import_npz(path, target, subject, condition or path.stem)
+    if suffix not in READERS:
+        raise RecordingError(
+            f"a file {path.suffix!r} cannot be imported",
+            file=file,
+            remedy=f"Export it as one of {', '.join(READERS)}, or write the schema with h5py",
+        )
+    if mapping is None:
+        said: Mapping[str, Any] = {
+            name: {"channel": value} if name in names else value
+            for name, value in (given | labels).items()
+        }
+        by, place, implied = "command", file, _IMPLIED
+    else:
+        _refuse(given | labels, file, "is for the mapping to say")
+        inside = isinstance(mapping, Mapping)
+        said = mapping if inside else read_mapping(mapping)
+        by, place, implied = "mapping", file if inside else f"{os.fspath(mapping)} of {file}", {}
+    with located(file), READERS[suffix](path, folder) as contents:
+        with located(place):
+            planned = plans(said, contents.names, implied)
+        contents.prepare({each.channel for plan in planned for each in plan.signals.values()})
+        sources: dict[str, AbstractSource] = {}
+        used = []
+        for plan in planned:
+            with located(file, path=plan.path if len(planned) > 1 else ""):
+                found, made_of = sources_of(plan, contents.channel, file, by)
+            for each in found.values():
+                with located(file):
+                    check_spacing(next(each.blocks("v_th")).astype(float), each.metadata)
+            sources |= found
+            used.append(made_of)
+        refuse_nested(sources)
+        Study(sources).write(target)
+    return used
+
+
+def _refuse(given: Mapping[str, Any], file: str, reason: str) -> None:
+    for name in given:
+        raise RecordingError(reason, file=file, field=name, remedy="Leave the argument out")
+
+
+def _import_npz(
+    path: pathlib.Path, target: str | os.PathLike[str], subject: str, condition: str
+) -> list[Imported]:
+    with located(str(path)):
+        recordings = npz.recordings(path, subject, condition)
+        study = Study.from_recordings(recordings)
+        for recording in study.recordings():
+            check_spacing(recording.v_th, recording.metadata)
+        study.write(target)
+    used = []
+    for part, channel in (study.calibrations, "adc_ref"), (study.loaded, "adc_out"):
+        first = next(part.recordings(), None)
+        if first is not None:
+            samples = first.samples["v_out"]
+            unit = f"codes of {samples.conversion:.6g} volt"
+            signals = {"v_th": "adc_th", "v_out": channel}
+            used.append(
+                Imported(
+                    tuple(part),
+                    samples.stored.size,
+                    first.sample_rate,
+                    "file",
+                    first.pulse_rate,
+                    {name: Used(key, unit, "file", 1.0) for name, key in signals.items()},
+                )
+            )
+    return used

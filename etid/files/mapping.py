@@ -1,0 +1,261 @@
+"""Mapping files: which channel of a file is which signal, and how it was recorded.
+
+A mapping is TOML.  Each `[[recording]]` is a recording, or a stack of trials; what is said above
+the first of them is said for all.
+"""
+
+import dataclasses
+import math
+import os
+import pathlib
+import re
+import tomllib
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from etid.files.channel import chosen, listed
+from etid.files.units import UNITS, Unit, parse_unit
+from etid.recordings import limits, schema
+from etid.recordings.recording import SIGNALS, RecordingError, tidy_path
+
+CHANNELS = (*SIGNALS, "time")
+FIELDS = (
+    "sample_rate",
+    "pulse_rate",
+    "scale",
+    "r_load",
+    "subject",
+    "condition",
+    "electrode",
+    "trial",
+    "calibration",
+    "adc_range",
+)
+KEYS = ("channel", "unit", "scale", "rows")  # of a signal
+
+
+@dataclasses.dataclass(frozen=True)
+class Signal:
+    """One signal of a recording.
+
+    Attributes:
+        channel: Name of its channel.
+        unit: Of the channel's values, as the mapping spells it; empty if the file has to say it.
+        scale: Volts of the record per volt at the terminal; for the current volts per ampere.
+        rows: Which trials of the channel; None for all.
+        implied: Its unit where neither mapping nor file name one; empty if that is an error.
+    """
+
+    channel: str
+    unit: str = ""
+    scale: float | None = None
+    rows: tuple[int, ...] | int | None = None
+    implied: str = ""
+
+
+@dataclasses.dataclass(frozen=True)
+class Plan:
+    """One recording, or a stack of trials, of which nothing has been read yet.
+
+    Attributes:
+        path: HDF5 path.
+        signals: `v_th`, `v_out` and, where they are, `current` and `time`.
+        fields: Everything else that is said, but `path` and `scale`.
+    """
+
+    path: str
+    signals: Mapping[str, Signal]
+    fields: Mapping[str, Any]
+
+
+def read_mapping(path: str | os.PathLike[str]) -> dict[str, Any]:
+    """A mapping file as it is.
+
+    Raises:
+        RecordingError: It is missing, or no TOML.
+    """
+    file = pathlib.Path(path)
+    if not file.is_file():
+        raise RecordingError("there is no such mapping", file=str(file), remedy="Check the path")
+    size = file.stat().st_size
+    if size > limits.MAPPING:
+        raise RecordingError(
+            f"has {size} bytes, at most {limits.MAPPING} are read",
+            file=str(file),
+            remedy="Name a mapping, not the data",
+        )
+    try:
+        text = file.read_text("utf-8")
+        if any(part.count(".") > limits.DEPTH for part in re.split(r"[=,\[\]{}\n]", text)):
+            # the time that tomllib takes for one key goes with the square of its length
+            raise ValueError(f"a key has more than {limits.DEPTH} parts")
+        return tomllib.loads(text)
+    except (ValueError, RecursionError) as error:  # of the syntax, the encoding or its depth
+        raise RecordingError(f"is not TOML ({error})", file=str(file)) from error
+
+
+def plans(
+    mapping: Mapping[str, Any], names: Sequence[str], implied: Mapping[str, str]
+) -> list[Plan]:
+    """The recordings that a mapping speaks of.
+
+    Args:
+        mapping: As `read_mapping` returns it.
+        names: The channels of the file, for they are all that can be named.
+        implied: Units of signals where neither mapping nor file name one.
+
+    Raises:
+        RecordingError: Something is missing, unknown, or not of its type.
+    """
+    tables = mapping.get("recording", [])
+    tables = [tables] if isinstance(tables, Mapping) else tables
+    if not isinstance(tables, list) or not all(isinstance(table, Mapping) for table in tables):
+        raise RecordingError("must be tables", field="recording", remedy="Write [[recording]]")
+    common = {key: value for key, value in mapping.items() if key != "recording"}
+    _known(common, (*CHANNELS, *FIELDS, "recording" if tables else "path"))
+    found: list[Plan] = []
+    for table in tables or [{}]:
+        said = {**common, **table}
+        _known(said, (*CHANNELS, *FIELDS, "path"))
+        path = tidy_path(said.get("path", ""))
+        if not path and len(tables) > 1:
+            raise RecordingError(
+                "is not given", field="path", remedy="Give each [[recording]] a path of its own"
+            )
+        path = path or ("loaded" if said.get("r_load") is None else "calibration")
+        if any(plan.path == path for plan in found):
+            raise RecordingError("two recordings have this path", path=path)
+        try:
+            found.append(_plan(path, said, names, implied))
+        except RecordingError as error:
+            raise error.located(path=path if len(tables) > 1 else "") from None
+    return found
+
+
+def _known(said: Mapping[str, Any], keys: Sequence[str], of: str = "") -> None:
+    for key in said:
+        if key not in keys:
+            near = schema.near_miss(key, keys)
+            raise RecordingError(
+                f"is no key of a mapping{f', did you mean {near}?' if near else ''}",
+                field=f"{of}{key}",
+                remedy=f"The keys are {', '.join(keys)}",
+            )
+
+
+def _plan(
+    path: str, said: Mapping[str, Any], names: Sequence[str], implied: Mapping[str, str]
+) -> Plan:
+    for name in ("v_th", "v_out", "pulse_rate"):
+        if name not in said:
+            known = f"; the channels are {listed(names)}" if name != "pulse_rate" else ""
+            raise _missing(name, known)
+    signals = {
+        name: _signal(name, said[name], said.get("scale"), implied.get(name, ""))
+        for name in CHANNELS
+        if name in said
+    }
+    for name, signal in signals.items():
+        chosen(names, signal.channel, name)
+        if signal.scale is None and name in ("v_th", "v_out"):
+            raise _missing("scale", hint="; 1 if the values are those at the terminal")
+    if "time" in said and "sample_rate" in said:
+        raise RecordingError(
+            "is given, and so is time: one of time and sample_rate is needed, not both",
+            field="sample_rate",
+        )
+    for name in ("sample_rate", "pulse_rate", "r_load"):
+        _number(name, said.get(name))
+    fields = {key: said[key] for key in FIELDS if key in said and key != "scale"}
+    return Plan(path, signals, fields)
+
+
+def _missing(name: str, known: str = "", hint: str = "") -> RecordingError:
+    option = name.replace("_", "-")
+    return RecordingError(
+        f"is not given, and is not guessed{known}",
+        field=name,
+        remedy=f"Say it in the mapping, or by --{option}{hint}",
+    )
+
+
+def _signal(name: str, said: Any, common: Any, implied: str) -> Signal:
+    if not isinstance(said, Mapping) or not isinstance(said.get("channel"), str):
+        raise RecordingError(
+            "names no channel", field=name, remedy=f'Write {name} = {{channel = "…", unit = "…"}}'
+        )
+    _known(said, KEYS, f"{name}.")
+    unit = said.get("unit", "")
+    if "unit" in said and (not isinstance(unit, str) or parse_unit(unit) is None):
+        raise RecordingError(
+            f"is {unit!r}, which is no unit of a recording",
+            field=f"{name}.unit",
+            remedy=f"Units are {', '.join(key for key in UNITS if len(key) < 3)} and their names",
+        )
+    scale = _number(f"{name}.scale", said.get("scale"))
+    if scale is None and name in ("v_th", "v_out"):
+        scale = _number("scale", common)
+    return Signal(said["channel"], unit, scale, _rows(f"{name}.rows", said.get("rows")), implied)
+
+
+def _rows(field: str, value: Any) -> tuple[int, ...] | int | None:
+    if value is None:
+        return None
+    if _is_row(value):
+        return int(value)
+    if isinstance(value, list) and value and all(map(_is_row, value)):
+        return tuple(value)
+    raise RecordingError(f"is {value!r}, must be one number or several, from 0 on", field=field)
+
+
+def _is_row(row: object) -> bool:
+    return isinstance(row, int) and not isinstance(row, bool) and row >= 0
+
+
+def _number(field: str, value: Any) -> float | None:
+    if value is None:
+        return None
+    number = isinstance(value, int | float) and not isinstance(value, bool)
+    if not number or not math.isfinite(value) or value == 0:
+        raise RecordingError(f"is {value!r}, must be a finite number and not 0", field=field)
+    return float(value)
+
+
+def unit_of(name: str, signal: Signal, said: str) -> tuple[Unit, str]:
+    """The unit of a channel's values, and who says so.
+
+    Args:
+        name: The signal.
+        signal: What the mapping says of it.
+        said: What the file says.
+
+    Raises:
+        RecordingError: Nobody says it, or file and mapping differ.
+    """
+    field = f"{name}.unit"
+    ours, theirs = parse_unit(signal.unit), parse_unit(said)
+    where = f"of channel {signal.channel!r}"
+    if said and theirs is None:
+        raise RecordingError(
+            f"the file says {said!r} {where}, which is neither volts, amperes nor seconds",
+            field=field,
+            remedy="Correct it in the file",
+        )
+    if ours and theirs and ours != theirs:
+        raise RecordingError(
+            f"the mapping says {signal.unit!r} {where}, the file says {said!r}",
+            field=field,
+            remedy="Correct the one that is wrong",
+        )
+    if ours:
+        return ours, "file and mapping" if theirs else "mapping"
+    if theirs:
+        return theirs, "file"
+    implied = parse_unit(signal.implied)
+    if implied:
+        return implied, "command"
+    raise RecordingError(
+        f"is not given {where}, the file does not say it, and it is not guessed",
+        field=field,
+        remedy=f'Write {name} = {{channel = "{signal.channel}", unit = "…"}}',
+    )

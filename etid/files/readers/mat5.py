@@ -1,0 +1,92 @@
+"""A look at MATLAB's files of version 5 before SciPy reads them.
+
+SciPy trusts them: an element of an unknown type ends the process, and a cell array is made as large
+as it says. Elements follow each other as (type, size, bytes), matrices hold others (MathWorks,
+MAT-File Format, chapter 1).
+"""
+
+import math
+import pathlib
+import struct
+import zlib
+
+from etid.recordings import limits
+from etid.recordings.errors import RecordingError
+
+_HEAD = 128  # bytes
+_MATRIX, _COMPRESSED = 14, 15
+_NUMBERS = {1, 2, 3, 4, 5, 6, 7, 9, 12, 13, 16, 17, 18}  # integers, reals, texts
+_MADE_WHOLE = {1, 2, 3}  # cells, structures, objects: arrays of Python objects
+
+
+def check(path: pathlib.Path) -> None:
+    """Refuse a file whose elements are not what they should be; other versions pass.
+
+    Raises:
+        RecordingError: An element is of no known type, longer than the file, too deep, or declares
+            more than it holds.
+    """
+    data = path.read_bytes()
+    order = {b"IM": "<", b"MI": ">"}.get(data[126:_HEAD])
+    if 0 in data[:4]:
+        return  # version 4
+    if order is None:
+        raise _error("is no MATLAB file of version 5 or 7.3")
+    _walk(memoryview(data)[_HEAD:], order, 0)
+
+
+def _error(message: str) -> RecordingError:
+    return RecordingError(message, remedy="The file is damaged: copy or save it again")
+
+
+def _walk(data: memoryview, order: str, depth: int) -> list[tuple[int, memoryview]]:
+    """The elements one after the other, those inside others too."""
+    if depth > limits.DEPTH:
+        raise _error(f"has variables more than {limits.DEPTH} deep")
+    found: list[tuple[int, memoryview]] = []
+    place = 0
+    while place < len(data):
+        if len(data) - place < 8:
+            raise _error("ends inside an element")
+        kind, size = struct.unpack_from(f"{order}II", data, place)
+        if kind >> 16:  # up to 4 bytes beside type and size
+            kind, size, start, after = kind & 0xFFFF, kind >> 16, place + 4, place + 8
+            if size > 4:
+                raise _error(f"has a short element of {size} bytes")
+        else:
+            start, after = place + 8, place + 8 + size
+            after += 0 if kind == _COMPRESSED else -size % 8
+        if start + size > len(data):
+            raise _error(f"has an element of {size} bytes that ends behind it")
+        body = data[start : start + size]
+        if kind == _COMPRESSED:
+            _walk(_unpacked(body), order, depth + 1)
+        elif kind == _MATRIX:
+            _check_matrix(_walk(body, order, depth + 1), order, size)
+        elif kind not in _NUMBERS:
+            raise _error(f"has an element of type {kind}, which does not exist")
+        found.append((kind, body))
+        place = after
+    return found
+
+
+def _unpacked(body: memoryview) -> memoryview:
+    most = max(limits.FREE, limits.COMPRESSION * len(body))
+    unpacker = zlib.decompressobj()
+    content = unpacker.decompress(body, most)
+    if unpacker.unconsumed_tail:
+        raise _error(f"has a variable of more than {most} bytes in {len(body)}")
+    return memoryview(content)
+
+
+def _check_matrix(parts: list[tuple[int, memoryview]], order: str, size: int) -> None:
+    """Refuse a matrix of more cells than it has room for."""
+    if len(parts) < 2 or len(parts[0][1]) < 4:
+        return  # empty, or nothing that SciPy makes large
+    (flags,) = struct.unpack_from(f"{order}I", parts[0][1])
+    if flags & 0xFF not in _MADE_WHOLE:
+        return
+    count = len(parts[1][1]) // 4
+    shape = struct.unpack_from(f"{order}{count}i", parts[1][1])
+    if min(shape, default=0) < 0 or math.prod(shape) > max(1, size):
+        raise _error(f"has an array of shape {shape} in {size} bytes")

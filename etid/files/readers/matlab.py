@@ -1,0 +1,122 @@
+"""MATLAB's files: version 7.3, which is HDF5, by blocks, and those before it as a whole.
+
+Field b of structure a is the channel `a.b`.  Rows are trials, columns are time.
+"""
+
+import contextlib
+import pathlib
+from collections.abc import Iterator
+from typing import Any
+
+import h5py
+import numpy as np
+from h5py import h5o  # type: ignore[attr-defined]  # compiled, without stubs
+
+from etid.files.channel import Channel, Contents, needs, real
+from etid.files.readers import mat5
+from etid.recordings import limits
+from etid.recordings.recording import RecordingError
+from etid.recordings.untrusted import attribute, check_size, guarded, local_link
+
+_CACHE = 1 << 25  # bytes: MATLAB's chunks hold several trials, which are read one after the other
+
+
+@contextlib.contextmanager
+def opened(path: pathlib.Path, folder: pathlib.Path) -> Iterator[Contents]:
+    """A MATLAB file of any version."""
+    del folder
+    if h5py.is_hdf5(path):
+        with guarded(str(path), rdcc_nbytes=_CACHE) as file:
+            yield _hdf5(file)
+    else:
+        yield _whole(path)
+
+
+def _hdf5(file: h5py.File) -> Contents:
+    """Version 7.3: HDF5 with reversed axes; what begins with `#` is MATLAB's own."""
+    found: dict[str, h5py.Dataset] = {}
+    seen: set[int] = set()  # of links that lead back
+
+    def walk(group: h5py.Group, prefix: str) -> None:
+        address = h5o.get_info(group.id).addr
+        if address in seen:
+            return
+        seen.add(address)
+        if prefix.count(".") > limits.DEPTH:
+            raise RecordingError(f"has structures more than {limits.DEPTH} deep")
+        names: Any = list(group)
+        for name in names:
+            if name.startswith("#"):
+                continue
+            local_link(group, name)
+            member = group.get(name)
+            if isinstance(member, h5py.Group):
+                walk(member, f"{prefix}{name}.")
+            elif isinstance(member, h5py.Dataset):
+                found[f"{prefix}{name}"] = member
+
+    walk(file, "")
+
+    def channel(name: str) -> Channel:
+        data = found[name]
+        kind = attribute(data, "MATLAB_class") if "MATLAB_class" in data.attrs else b""
+        kind = kind.decode() if isinstance(kind, bytes) else str(kind)
+        if kind in ("char", "logical", "cell"):
+            raise RecordingError(f"{name!r} is a {kind} array, must be an array of real numbers")
+        if "MATLAB_empty" in data.attrs or data.shape is None:
+            raise RecordingError(f"{name!r} is empty")
+        real(name, data.dtype, data.shape)
+        check_size(data)
+        axes = [axis for axis, size in enumerate(data.shape) if size > 1] or [0]
+        shape = tuple(data.shape[axis] for axis in reversed(axes))
+
+        def read(trial: int, start: int, stop: int) -> np.ndarray:
+            place: list[int | slice] = [0] * data.ndim
+            place[axes[0]] = slice(start, stop)
+            if len(axes) == 2:
+                place[axes[1]] = trial
+            return data[tuple(place)]
+
+        return Channel(name, shape, data.dtype, read)
+
+    return Contents(tuple(found), channel)
+
+
+def _whole(path: pathlib.Path) -> Contents:
+    """Version 5 and older."""
+    try:
+        import pymatreader  # optional: only labs with MATLAB need it
+    except ImportError:
+        raise needs("pymatreader", "matlab", str(path)) from None
+    from scipy.io.matlab import MatReadError
+
+    mat5.check(path)
+    try:
+        content = _flat(pymatreader.read_mat(path))
+    except MatReadError as error:
+        raise RecordingError(f"cannot be read ({error})") from error
+
+    def channel(name: str) -> Channel:
+        array = content[name]
+        if not isinstance(array, np.ndarray):
+            kind = type(array).__name__
+            raise RecordingError(f"{name!r} is a {kind}, must be an array of real numbers")
+        real(name, array.dtype, array.shape)
+
+        def read(trial: int, start: int, stop: int) -> np.ndarray:
+            return (array if array.ndim == 1 else array[trial])[start:stop]
+
+        return Channel(name, array.shape, array.dtype, read)
+
+    return Contents(tuple(content), channel)
+
+
+def _flat(content: dict[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Variables by name, fields of structures as `structure.field`."""
+    flat: dict[str, Any] = {}
+    for name, value in content.items():
+        if isinstance(value, dict):
+            flat.update(_flat(value, f"{prefix}{name}."))
+        elif not name.startswith("__"):
+            flat[f"{prefix}{name}"] = value
+    return flat

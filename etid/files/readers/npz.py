@@ -1,0 +1,107 @@
+"""Archives of NumPy with converter codes, which say everything themselves."""
+
+import math
+import pathlib
+import zipfile
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from etid.files.channel import chosen
+from etid.recordings import limits
+from etid.recordings.recording import Recording, RecordingError, Samples
+
+
+def recordings(path: pathlib.Path, subject: str, condition: str) -> list[Recording]:
+    """All recordings of an archive.
+
+    `adc_th`, `adc_out` (trial, time) and `adc_ref` (resistor, time) are converter codes; `R_ref`,
+    `fs`, `f0`, `lsb` and `scale` are numbers.  They become `calibration/0`, … and `loaded/0`, …;
+    as there is no unloaded record for the calibrations, they share `adc_th[0]`.
+    """
+    if not zipfile.is_zipfile(path):
+        raise RecordingError("is not an npz file")
+    with np.load(path, allow_pickle=False) as archive:
+        keys = ("adc_th", "adc_out", "adc_ref", "R_ref", "fs", "f0", "lsb", "scale")
+        for key in keys:
+            chosen(archive.files, key, key)
+            _check_size(archive, key)
+        held = {key: archive[key] for key in keys}
+    th, out, ref, known = (held[key] for key in ("adc_th", "adc_out", "adc_ref", "R_ref"))
+    if th.ndim != 2 or th.shape != out.shape or ref.ndim != 2 or known.shape != ref.shape[:1]:
+        found = ", ".join(f"{key} {held[key].shape}" for key in keys[:4])
+        raise RecordingError(
+            f"shapes do not fit each other: {found}",
+            remedy="adc_th and adc_out are (trial, time), adc_ref (resistor, time), "
+            "R_ref (resistor,)",
+        )
+    for key in ("adc_th", "adc_out", "adc_ref"):
+        if held[key].dtype.kind not in "iu" or held[key].dtype != th.dtype:
+            raise RecordingError(
+                f"has dtype {held[key].dtype}, must hold integer codes like the others",
+                field=key,
+            )
+    rate, pulses, step, scale = (_number(held[key], key) for key in keys[4:])
+    if scale == 0:
+        raise RecordingError("is 0", field="scale")
+    conversion = step / scale
+    limits = np.iinfo(th.dtype)
+    common: dict[str, Any] = {
+        "sample_rate": rate,
+        "pulse_rate": pulses,
+        "subject": subject,
+        "condition": condition,
+        "adc_range": (limits.min * conversion, limits.max * conversion),
+    }
+    first = Samples(th[0], conversion)
+    calibrations = [
+        Recording(
+            first,
+            Samples(codes, conversion),
+            r_load=known[index],
+            path=f"calibration/{index}",
+            **common,
+        )
+        for index, codes in enumerate(ref)
+    ]
+    paths = tuple(recording.path for recording in calibrations)
+    loaded = [
+        Recording(
+            Samples(th[trial], conversion),
+            Samples(out[trial], conversion),
+            trial=trial,
+            calibration=paths,
+            path=f"loaded/{trial}",
+            **common,
+        )
+        for trial in range(len(out))
+    ]
+    return calibrations + loaded
+
+
+def _check_size(archive: Any, key: str) -> None:
+    """Refuse an array that declares more than the archive holds, before it is made."""
+    info = archive.zip.getinfo(f"{key}.npy")
+    with archive.zip.open(info) as member:
+        version = np.lib.format.read_magic(member)
+        head = np.lib.format.read_array_header_1_0 if version == (1, 0) else (
+            np.lib.format.read_array_header_2_0
+        )  # fmt: skip
+        shape, _, dtype = head(member)
+        declared = math.prod(shape) * dtype.itemsize + member.tell()
+    if dtype.hasobject:
+        return  # which NumPy refuses
+    unpacked = max(limits.FREE, limits.COMPRESSION * info.compress_size)
+    if declared != info.file_size or declared > unpacked or min(shape, default=1) < 0:
+        raise RecordingError(
+            f"declares {dtype} of shape {shape}, but takes {info.file_size} bytes",
+            field=key,
+            remedy="The file is damaged: copy or write it again",
+        )
+
+
+def _number(array: npt.NDArray, field: str) -> float:
+    if array.size != 1 or array.dtype.kind not in "iuf":
+        raise RecordingError(f"is {array!r}, must be one number", field=field)
+    return float(array.item())

@@ -1,0 +1,114 @@
+"""NI's TDMS files, as LabVIEW and DAQmx write them, read by npTDMS in blocks.
+
+Channel c of group g is called `g/c`.
+"""
+
+import contextlib
+import logging
+import pathlib
+import struct
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+
+from etid.files.channel import Channel, Contents, needs, rate_of, real
+from etid.recordings.recording import RecordingError
+
+# Scalings that make a voltage of a voltage; npTDMS returns raw codes for those it does not know.
+_SCALINGS = {"Linear", "Polynomial", "Table", "Add", "Subtract", "AdvancedAPI"}
+_UNITS = ("unit_string", "NI_UnitDescription")
+_LEAD_IN = struct.Struct("<4slLQQ")  # tag, contents, version, length, length of the description
+
+
+@contextlib.contextmanager
+def opened(path: pathlib.Path, folder: pathlib.Path) -> Iterator[Contents]:
+    """A TDMS file."""
+    del folder
+    try:
+        import nptdms.log  # optional: only labs with instruments of NI need it
+    except ImportError:
+        raise needs("npTDMS", "tdms", str(path)) from None
+
+    _check_length(path)
+    console = nptdms.log.log_manager.console_handler
+    with contextlib.ExitStack() as stack:
+        # What it would print on stderr is an error here, or text that is not UTF-8, which is shown.
+        console.addFilter(_silent)
+        stack.callback(console.removeFilter, _silent)
+        # An open file, because it does not close its own when it fails, and may prefer an index.
+        file = stack.enter_context(nptdms.TdmsFile.open(stack.enter_context(path.open("rb"))))
+        found = [
+            (f"{group.name}/{channel.name}", channel)
+            for group in file.groups()
+            for channel in group.channels()
+        ]
+        by_name = dict(found)
+        yield Contents(tuple(name for name, _ in found), lambda name: _channel(name, by_name[name]))
+
+
+def _silent(_: logging.LogRecord) -> bool:
+    return False
+
+
+def _check_length(path: pathlib.Path) -> None:
+    """Refuse a file that ends inside a segment: npTDMS would read it as far as it goes."""
+    size, position = path.stat().st_size, 0
+    with path.open("rb") as file:
+        while position < size:
+            file.seek(position)
+            lead = file.read(_LEAD_IN.size)
+            tag, contents, _, length, _ = (
+                _LEAD_IN.unpack(lead) if len(lead) == _LEAD_IN.size else (lead[:4], 0, 0, size, 0)
+            )
+            if tag != b"TDSm":
+                raise RecordingError(f"is not a TDMS file: no segment begins at byte {position}")
+            if contents & (1 << 6):  # a segment with its bytes the other way round
+                length = int.from_bytes(lead[12:20], "big")
+            position += _LEAD_IN.size + length
+    if position != size or size == 0:
+        raise RecordingError(
+            f"is cut off: the last segment ends at byte {position}, the file at byte {size}",
+            remedy="Copy it again, or record it again if the program that wrote it has crashed",
+        )
+
+
+def _channel(name: str, channel: Any) -> Channel:
+    own = channel.properties
+    kinds = {value for key, value in own.items() if key.endswith("_Scale_Type")}
+    if not kinds <= _SCALINGS:
+        found = ", ".join(sorted(kinds - _SCALINGS))
+        raise RecordingError(
+            f"{name!r} is scaled by {found}, which gives neither volts nor amperes"
+        )
+    real(name, channel.dtype, (len(channel),))
+    raw = np.dtype(getattr(channel.data_type, "nptype", None) or "V8")
+    codes = raw.kind in "iu"
+    slope, intercept = _line(own) if codes else (1.0, 0.0)
+    scaled = channel.dtype != raw and (slope, intercept) == (1.0, 0.0)
+
+    def read(_: int, start: int, stop: int) -> np.ndarray:
+        return channel.read_data(start, stop - start, scaled=scaled)
+
+    interval = own.get("wf_increment", 0.0)
+    return Channel(
+        name,
+        (len(channel),),
+        channel.dtype if scaled else raw,
+        read,
+        unit=next((str(own[key]) for key in _UNITS if own.get(key)), ""),
+        sample_rate=rate_of(interval, 1e-12) if interval > 0 else None,
+        conversion=slope,
+        offset=intercept,
+    )
+
+
+def _line(properties: dict[str, Any]) -> tuple[float, float]:
+    """Slope and intercept where the scaling of codes is a line; else 1 and 0, and npTDMS scales."""
+    only = int(properties.get("NI_Number_Of_Scales", 0)) == 1
+    if not only or properties.get("NI_Scale[0]_Scale_Type") != "Linear":
+        return 1.0, 0.0
+    if properties.get("NI_Scaling_Status", "unscaled") == "scaled":
+        return 1.0, 0.0
+    line = properties["NI_Scale[0]_Linear_Slope"], properties["NI_Scale[0]_Linear_Y_Intercept"]
+    return float(line[0]), float(line[1])

@@ -1,0 +1,308 @@
+"""Did the load or the driver change during the record? A test, and which element moved.
+
+The harmonics of a record show its mean: skin whose R_p falls by 20 % over the record ends 58 of its
+standard errors away, with χ² of 1. What changes lies between the harmonics.
+`etid.recordings.repeats` measures
+it: the deviation η of the logarithm of the gain, period by period, band by band. A change of the
+elements by θ (of their logarithms) makes
+
+    η = Σ θ_i ∂ ln G/∂ ln q_i + a − jωτ,      ∂ ln G/∂Z_L = Z_th / (Z_L (Z_L + Z_th)),
+
+with a change a of the amplitude, and a drift τ of the clock, which does no harm. Linear least
+squares gives θ and a for each of some courses over the periods: a line, a step after each period,
+one period unlike all others. χ² of θ and a says whether there is such a change.
+
+**Does it matter?** What it moves if nobody knows of it are the elements per period, fitted without
+a. It matters if one of them moves by more than its standard error in the fit: then it was farther
+than half of that from its mean at one end of the record. Where it is less, as in long records of
+little noise behind a driver that is known worse, the fit is as good as it says.
+"""
+
+import dataclasses
+import functools
+import statistics
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Complex, Float
+
+from etid.circuits.circuit import AbstractCircuit, Resistor
+from etid.identify.compiled import stored_jit
+from etid.recordings.repeats import ALIGNED, Repeats
+from etid.results.driver import Driver
+from etid.results.fits import Fit
+from etid.results.verdicts import verdict
+from etid.signals.transfer import frequency_variable, reciprocal
+
+ALARM = 1e-5  # probability that a record without any change has one
+CLEAN = 0.03  # of the sample rate, below which there are no aliases
+UNEQUAL = 5e-4  # by which amplitudes of V_th may differ: cuts between samples make 1e-4
+EXPLAINED = (
+    "successful",
+    "misfit",
+    "inconsistent",
+    "biased",
+)  # verdicts of which a change is the cause
+LANES = 16  # circuits of one call
+RIDGE = 1e-10  # of the diagonal, for elements without effect
+LARGEST = 20.0  # change of a logarithm; one that is not determined can have any
+DRIVER = 2e-3  # by which a change may look like another calibration resistor
+
+
+class Change(NamedTuple):
+    """What changed during a record.
+
+    Attributes:
+        size: Relative change of each element and, last, of the amplitude, over the record.
+        stderr: Standard errors of `size`.
+        seen: Whether there is a change that matters.
+    """
+
+    size: Float[np.ndarray, " moved"]
+    stderr: Float[np.ndarray, " moved"]
+    seen: bool
+
+
+def unknown(count: int) -> Change:
+    """The change of `count` elements where nothing can be said."""
+    nothing = np.full(count + 1, np.nan)
+    return Change(nothing, nothing, False)
+
+
+@stored_jit
+def log_slopes(
+    circuits: AbstractCircuit, driver: Driver, frequency: Float[Array, " band"]
+) -> Complex[Array, "lane element band"]:
+    """∂ ln G/∂ ln q of the elements of circuits along a leading axis."""
+    z_th = driver.response(frequency)
+    s = frequency_variable(frequency)
+
+    def of(circuit):
+        logs = circuit.log_values()
+
+        def z(logs):
+            return circuit.with_log_values(logs).impedance()(s)
+
+        by_element = jax.vmap(lambda way: jax.jvp(z, (logs,), (way,))[1])(jnp.eye(logs.size))
+        load = z(logs)
+        return by_element * (z_th * reciprocal(load * (load + z_th)))[None, :]
+
+    return jax.vmap(of)(circuits)
+
+
+@functools.lru_cache(maxsize=64)
+def courses(periods: int) -> Float[np.ndarray, "course period"]:
+    """How a change may go on over the periods: of length 1, with the mean 0, first the line."""
+    p = np.arange(periods)
+    rows = [p, *(p >= first for first in range(1, periods))]
+    rows += [p == one for one in range(1, periods - 1)]
+    found = np.array(rows, float)[: 1 if periods == 2 else None]
+    found -= found.mean(axis=1, keepdims=True)
+    return found / np.linalg.norm(found, axis=1, keepdims=True)
+
+
+@functools.lru_cache(maxsize=64)
+def threshold(freedom: int, count: int) -> float:
+    """χ² that the largest of `count` exceeds with the probability `ALARM` (Wilson, Hilferty)."""
+    z = statistics.NormalDist().inv_cdf(1 - ALARM / count)
+    return freedom * (1 - 2 / (9 * freedom) + z * (2 / (9 * freedom)) ** 0.5) ** 3
+
+
+def found(
+    repeats: Sequence[Repeats | None],
+    slopes: Complex[np.ndarray, "lane element band"] | None,
+    allowed: Float[np.ndarray, "lane element"],
+) -> list[Change]:
+    """The changes of loads during their records.
+
+    Args:
+        repeats: The periods of each record; None if there are less than two.
+        slopes: ∂ ln G/∂ ln q; None if there are no periods.
+        allowed: Changes of the logarithms of the elements that do not matter.
+    """
+    changes = [unknown(allowed.shape[1])] * len(repeats)
+    if slopes is None:
+        return changes
+    alike: dict[int, list[int]] = {}
+    for lane, of in enumerate(repeats):
+        if of is not None and np.isfinite(slopes[lane]).all():
+            alike.setdefault(len(of.gain), []).append(lane)
+    for lanes in alike.values():
+        group = [of for lane in lanes if (of := repeats[lane]) is not None]
+        of = Repeats(*(np.stack(parts) for parts in zip(*group, strict=True)))
+        moved = _changes(of, slopes[lanes], allowed[lanes])
+        for lane, size, stderr, seen in zip(lanes, *moved, strict=True):
+            changes[lane] = Change(size, stderr, bool(seen))
+    return changes
+
+
+def _changes(
+    of: Repeats, slopes: np.ndarray, allowed: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The parts of a `Change`, for recordings of equally many periods along the first axis."""
+    elements, course = slopes.shape[1], courses(of.gain.shape[1])
+    low, whole, right, plain, unit, total = _equations(of, slopes, course)
+    # The share of each course that what has aliased cannot imitate.
+    share = 1 - np.abs(np.einsum("cp,lp->lc", course, of.turn.conj())) ** 2
+    share = np.where(share > ALIGNED, share, 0.0)[:, :, None, None]
+    normal = low[:, None] + share * (whole - low)[:, None]
+    tested = elements + 1  # and the amplitude; not the delays
+    theta, cov, square, explained = _solved(normal, right, tested)
+    # Coloured noise differs from period to period too, but in no way of an element: what the
+    # parameters leave tells how large it is.
+    freedom = 2 * of.frequency.shape[1] - right.shape[-1]
+    noise = np.maximum(1.0, (total - explained) / freedom)
+    seen = (square / noise).max(1) > threshold(tested, len(course))
+    cov = cov * noise[..., None, None]
+    # Without aliases courses do not mix: the likeliest is the one that fits best.
+    best = np.where(seen, np.argmax(_solved(whole[:, None], plain, tested)[2], axis=1), 0)
+    lane, reach = np.arange(len(best)), np.ptp(course, axis=1)[best][:, None]
+    # What moves the elements if they are fitted without the amplitude.
+    others = np.arange(normal.shape[-1]) != elements
+    normal, right = normal[lane, best][:, others], right[lane, best][:, others]
+    blind = np.linalg.inv(normal[:, :, others] + RIDGE * np.eye(others.sum()))[:, :elements]
+    units = unit[:, :elements]
+    moved = np.abs((blind * right[:, None]).sum(2)) / units * reach
+    by_amplitude = np.abs((blind * normal[:, None, :, elements]).sum(2)) / units
+    uneven = _uneven(of, course)
+    other = by_amplitude * uneven[:, None] * unit[:, elements, None]
+    matters = seen & (moved > allowed).any(1)
+    matters |= (uneven > UNEQUAL) & (other > allowed).any(1)
+    units = unit[:, :tested]
+    log = theta[lane, best] / units * reach
+    factor = np.exp(np.clip(log, -LARGEST, LARGEST))
+    error = np.sqrt(np.diagonal(cov[lane, best], axis1=1, axis2=2)) / units * reach
+    return factor - 1, factor * error, matters
+
+
+def _equations(
+    of: Repeats, slopes: np.ndarray, course: Float[np.ndarray, "course period"]
+) -> tuple[np.ndarray, ...]:
+    """Normal equations of the elements, the amplitude and the delay.
+
+    Returns:
+        The matrix of the bands without aliases, and of all; right sides, for each course, without
+        what has aliased and with it; and the units of the parameters, whose equations have a
+        diagonal of 1; and Σ η² / variance for each course.
+    """
+    high: np.ndarray = np.greater(of.frequency, CLEAN * of.sample_rate[:, None])
+    plain = course @ of.gain
+    turn = of.turn.conj()
+    aliased = (turn[:, :, None] * of.gain).sum(1)
+    turned = plain - (turn @ course.T).conj()[:, :, None] * aliased[:, None]
+    late = -2j * np.pi * of.frequency / of.sample_rate[:, None]
+    # Delays along another course turn into this one where aliases are taken out.
+    cross = np.where(high & np.any(turn, axis=1, keepdims=True), 1j * late, 0)
+    nuisance = np.stack([np.ones_like(late), late, cross], axis=1)
+    rows = np.concatenate([slopes, nuisance], axis=1)
+    # From them, too, polynomials are projected out.
+    smooth = np.real(rows @ of.smooth.conj().swapaxes(1, 2)) @ of.smooth
+    rows = _real(rows - smooth / of.power[:, None])
+    weight = np.tile(1 / of.variance, 2)[:, None]
+    unit = np.sqrt((rows**2 * weight).sum(2))
+    unit = np.where(unit > 0, unit, 1.0)
+    rows = rows / unit[:, :, None]
+    weighted = (rows * weight).swapaxes(1, 2)
+    below = np.tile(~high, 2)[:, None]
+    low, whole = np.where(below, rows, 0.0) @ weighted, rows @ weighted
+    deviation = _real(np.where(high[:, None], turned, plain))
+    total = (deviation**2 * weight).sum(2)
+    return low, whole, deviation @ weighted, _real(plain) @ weighted, unit, total
+
+
+def _real(values: np.ndarray) -> np.ndarray:
+    """Real parts, then imaginary parts."""
+    return np.concatenate([np.real(values), np.imag(values)], axis=-1)
+
+
+def _solved(
+    normal: np.ndarray, right: np.ndarray, tested: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """For each recording and course: the first parameters, their covariance and their χ².
+
+    And by how much all parameters lower Σ η² / variance.
+    """
+    cov = np.linalg.inv(normal + RIDGE * np.eye(right.shape[-1]))
+    theta = cov @ right[..., None]
+    explained = (theta[..., 0] * right).sum(-1)
+    theta, cov = theta[..., :tested, :], cov[..., :tested, :tested]
+    square = (theta * np.linalg.solve(cov, theta)).sum((-1, -2))
+    cov = np.broadcast_to(cov, (*theta.shape[:-1], tested))
+    return theta[..., 0], cov, square, explained
+
+
+def _uneven(of: Repeats, course: Float[np.ndarray, "course period"]) -> np.ndarray:
+    """By how much the amplitude of V_th changes in each recording, where that is seen."""
+    along = np.abs(of.unloaded @ course.T)
+    worst = np.argmax(along, axis=1)
+    largest = along[np.arange(len(worst)), worst]
+    seen = largest**2 > threshold(1, len(course)) * of.unloaded_variance
+    return np.where(seen, largest * np.ptp(course, axis=1)[worst], 0.0)
+
+
+def judged(fits: Sequence[Fit], driver: Driver, repeats: Sequence[Repeats | None]) -> list[Fit]:
+    """Fits with what changed during their records, and the verdict of those where it matters.
+
+    Args:
+        fits: Fits of circuits of one kind.
+        driver: Their driver.
+        repeats: The periods of their records, with equal bands; None where there are less than two.
+    """
+    values = np.array([fit.circuit.values() for fit in fits])
+    variance = np.array([np.diagonal(np.asarray(fit.cov)) for fit in fits])
+    usable = np.isfinite(values) & (values != 0) & (variance >= 0)
+    allowed = np.sqrt(np.where(usable, variance, 0.0)) / np.where(usable, np.abs(values), 1.0)
+    slopes = None
+    frequency = next((of.frequency for of in repeats if of is not None), None)
+    if frequency is not None:
+        parts = [
+            _slopes([fit.circuit for fit in fits[first : first + LANES]], driver, frequency)
+            for first in range(0, len(fits), LANES)
+        ]
+        slopes = np.concatenate(parts)
+    changes = found(repeats, slopes, allowed)
+    return [_with(fit, change) for fit, change in zip(fits, changes, strict=True)]
+
+
+def _slopes(
+    circuits: Sequence[AbstractCircuit], driver: Driver, frequency: Float[np.ndarray, " band"]
+) -> Complex[np.ndarray, "lane element band"]:
+    """`log_slopes` of one circuit, or of some as if they were `LANES`: it is compiled for both."""
+    size = 1 if len(circuits) == 1 else LANES
+    whole = [*circuits, *[circuits[-1]] * (size - len(circuits))]
+    stacked = jax.tree.map(lambda *leaves: jnp.asarray(np.stack(leaves)), *whole)
+    slopes = log_slopes(stacked, driver, jnp.asarray(frequency))
+    return np.asarray(slopes)[: len(circuits)]
+
+
+def _with(fit: Fit, change: Change) -> Fit:
+    bad = change.seen and fit.verdict in EXPLAINED
+    return dataclasses.replace(
+        fit,
+        change=change.size,
+        change_stderr=change.stderr,
+        result=verdict("changed") if bad else fit.result,
+    )
+
+
+def driver_judged(
+    driver: Driver, r_load: Float[Array, " record"], repeats: Sequence[Repeats | None]
+) -> Driver:
+    """A driver, with a verdict if it, or its pulses, changed during one of its calibrations.
+
+    Args:
+        driver: The driver.
+        r_load: The resistors of its calibrations [Ω].
+        repeats: Their periods.
+    """
+    frequency = next((of.frequency for of in repeats if of is not None), None)
+    if frequency is None or driver.verdict != "successful":
+        return driver
+    slopes = np.asarray(log_slopes(Resistor(r_load), driver, jnp.asarray(frequency)))
+    changes = found(repeats, slopes, np.full((len(repeats), 1), DRIVER))
+    if any(change.seen for change in changes):
+        return dataclasses.replace(driver, result=verdict("changed"))
+    return driver

@@ -1,0 +1,268 @@
+"""A file of any size, identified in parts: memory is bounded, and what is done stays done.
+
+The recordings of a file are cut, in their order, into parts of `PART`. Each part is fitted by
+`identify_study` and written, whole or not at all, into a folder beside the result; in the end all
+parts become one file. A run that was killed has lost the part it was at: `resume` goes on with the
+next, and ends with the same numbers, because parts are cut and fitted alike each time.
+
+Parts are independent, so that any `concurrent.futures.Executor` can spread them: processes of this
+machine (`workers`), or a cluster (`dask.distributed.Client.get_executor()`).
+"""
+
+import concurrent.futures
+import contextlib
+import dataclasses
+import functools
+import hashlib
+import json
+import multiprocessing
+import os
+import pathlib
+import shutil
+import signal
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import jax
+from tqdm import tqdm
+
+from etid.circuits.circuit import AbstractCircuit
+from etid.estimators.registry import Method, check_method
+from etid.identify.arguments import circuit_of, order_of
+from etid.identify.many import Drivers, identify_part, to_identify
+from etid.recordings.hdf5 import read
+from etid.recordings.recording import RecordingError
+from etid.recordings.study import Study
+from etid.results.provenance import Settings
+from etid.results.study_fits import StudyFits
+
+PART = 256  # recordings, some seconds of work: what a killed run may lose
+
+
+class ResumeError(ValueError):
+    """A run was interrupted, or what it has left does not belong to this one."""
+
+
+class _Opened(NamedTuple):
+    """A file in use.
+
+    Attributes:
+        study: Its recordings.
+        paths: Those to identify, in order.
+        drivers: Its drivers, as far as they were asked for.
+    """
+
+    study: Study
+    paths: list[str]
+    drivers: Drivers
+
+
+def _open(source: str, order: int, method: Method | None, driver_drift: float) -> _Opened:
+    study = read(source)
+    return _Opened(study, to_identify(study), Drivers(study, order, method, driver_drift))
+
+
+@functools.cache
+def _kept_open(
+    source: str, stamp: int, order: int, method: Method | None, driver_drift: float
+) -> _Opened:
+    """The same, once per process and as long as that lives: parts come one by one."""
+    del stamp
+    return _open(source, order, method, driver_drift)
+
+
+def _fit(
+    opened: _Opened, circuit: AbstractCircuit, method: Method | None, size: int, number: int
+) -> StudyFits:
+    """Fit one part; with its own drivers, whatever else this process has identified before."""
+    study, paths, drivers = opened
+    part = paths[number * size : (number + 1) * size]
+    fits = identify_part(study, part, drivers, circuit, method)
+    used = set()
+    for path in part:
+        with contextlib.suppress(RecordingError):
+            used.add(study.metadata(path).calibration or drivers.calibrations)
+    found = {names: driver for names, driver in drivers.found.items() if names in used}
+    failures = {names: text for names, text in drivers.failures.items() if names in used}
+    return StudyFits(fits, found, failures)
+
+
+def _fit_elsewhere(
+    source: str,
+    stamp: int,
+    order: int,
+    method: Method | None,
+    driver_drift: float,
+    circuit: AbstractCircuit,
+    size: int,
+    number: int,
+) -> StudyFits:
+    """Fit one part in any process that sees the file."""
+    with jax.enable_x64(True):  # of a worker: the caller's own was checked
+        return _fit(
+            _kept_open(source, stamp, order, method, driver_drift), circuit, method, size, number
+        )
+
+
+def _pin(cores: Any) -> None:
+    """Give this process a core of its own: sharing them costs XLA more than it gains.
+
+    Ctrl-C reaches it as well as its parent, which says what was kept: it ends without a word.
+    """
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+    if hasattr(os, "sched_setaffinity"):
+        os.sched_setaffinity(0, {cores.get()})
+
+
+@contextlib.contextmanager
+def processes(workers: int) -> Iterator[concurrent.futures.Executor]:
+    """An executor of as many processes of this machine, each on a core of its own."""
+    context = multiprocessing.get_context("spawn")
+    available = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else [0]
+    cores = context.Queue()
+    for worker in range(workers):
+        cores.put(available[worker % len(available)])
+    with concurrent.futures.ProcessPoolExecutor(
+        workers, mp_context=context, initializer=_pin, initargs=(cores,)
+    ) as executor:
+        yield executor
+
+
+class _Parts:
+    """The folder of parts beside a result."""
+
+    def __init__(self, target: pathlib.Path, run: Mapping[str, Any], resume: bool):
+        self.folder = _folder(target)
+        described = self.folder / "run.json"
+        if self.folder.exists() and not resume:
+            shutil.rmtree(self.folder)
+        self.folder.mkdir(exist_ok=True)
+        if described.exists():
+            before = json.loads(described.read_text("utf-8"))
+            changed = sorted(name for name in run if before.get(name) != run[name])
+            if changed:
+                raise ResumeError(
+                    f"{self.folder}: was begun with another {' and '.join(changed)}; "
+                    "leave out resume to begin anew"
+                )
+        partial = described.with_suffix(".partial")
+        partial.write_text(json.dumps(run), "utf-8")
+        partial.replace(described)
+
+    def path(self, number: int) -> pathlib.Path:
+        """File of one part."""
+        return self.folder / f"{number:06d}.h5"
+
+
+def kept(target: str | os.PathLike[str]) -> str:
+    """What a run that did not end has left beside its result, in words; empty if nothing."""
+    folder = _folder(pathlib.Path(target))
+    try:
+        run = json.loads((folder / "run.json").read_text("utf-8"))
+        total, size = int(run["recordings"]), int(run["size of a part"])
+    except (OSError, ValueError, KeyError, TypeError):
+        return ""
+    done = min(total, size * len(list(folder.glob("[0-9]*.h5"))))
+    return f"{done} of {total} recordings are fitted and kept in {folder}" if done else ""
+
+
+def _folder(target: pathlib.Path) -> pathlib.Path:
+    return target.with_name(target.name + ".parts")
+
+
+def fit_file(
+    source: str | os.PathLike[str],
+    target: str | os.PathLike[str],
+    *,
+    order: int = 5,
+    circuit: AbstractCircuit | None = None,
+    method: Method | None = None,
+    driver_drift: float = 0.0,
+    resume: bool = False,
+    executor: concurrent.futures.Executor | None = None,
+    progress: bool = False,
+) -> StudyFits:
+    """Identify all drivers and recordings of a file of any size.
+
+    Args:
+        source: File of recordings; every process of `executor` must see it under this name.
+        target: File of fits to write. Until it is complete, its parts are in `target.parts`.
+        order: As in `identify_driver`.
+        circuit: As in `identify_skin`.
+        method: As in `identify_skin`.
+        driver_drift: As in `identify_driver`.
+        resume: Keep the parts of an earlier run that did not end.
+        executor: Where parts are fitted; in this process if not given.
+        progress: Show a progress bar.
+
+    Returns:
+        As `identify_study`; the drivers of parts that an earlier run has fitted hold no harmonics
+        of their calibrations.
+
+    Raises:
+        ResumeError: The earlier run had other settings, or the source has changed since.
+        RecordingError: The source as a whole is missing, damaged or of another schema.
+        ValueError: The source has no loaded recording.
+    """
+    order = order_of(order)
+    circuit = circuit_of(circuit)
+    check_method(method, circuit)
+    source, target = os.path.abspath(source), pathlib.Path(target)
+    opened = _open(source, order, method, driver_drift)
+    with opened.study:
+        count = len(opened.paths)
+        if not count:
+            raise ValueError("the study has no loaded recording")
+        numbers = range((count + PART - 1) // PART)
+        stamp = os.stat(source).st_mtime_ns
+        settings = Settings.of(
+            opened.study, count, order, method, circuit, driver_drift=driver_drift
+        )
+        described = json.loads(json.dumps(dataclasses.asdict(settings)))  # tuples become lists
+        run = {
+            **{name.replace("_", " "): value for name, value in described.items()},
+            "source date": stamp,
+            "circuit": hashlib.sha256(repr(circuit).encode()).hexdigest(),
+            "size of a part": PART,
+        }
+        parts = _Parts(target, run, resume)
+        left = [number for number in numbers if not parts.path(number).exists()]
+        task = functools.partial(_fit, opened, circuit, method, PART)
+        if executor is not None:
+            task = functools.partial(
+                _fit_elsewhere, source, stamp, order, method, driver_drift, circuit, PART
+            )
+        drivers = {}
+        done = min(count, (len(numbers) - len(left)) * PART)
+        with tqdm(total=count, initial=done, unit="fit", disable=not progress) as bar:
+            for number, found in _results(task, left, executor):
+                dataclasses.replace(found, settings=settings).write(parts.path(number))
+                drivers |= found.drivers
+                bar.update(len(found.fits))
+    whole = StudyFits.concatenate(
+        StudyFits.read(parts.path(number), type(circuit)) for number in numbers
+    )
+    whole.write(target)
+    shutil.rmtree(parts.folder)
+    return dataclasses.replace(whole, drivers={**whole.drivers, **drivers})
+
+
+def _results(
+    task: Callable[[int], StudyFits],
+    numbers: Sequence[int],
+    executor: concurrent.futures.Executor | None,
+) -> Iterator[tuple[int, StudyFits]]:
+    """The parts as they are finished."""
+    if executor is None:
+        for number in numbers:
+            yield number, task(number)
+        return
+    futures = {executor.submit(task, number): number for number in numbers}
+    try:
+        for future in concurrent.futures.as_completed(futures):
+            yield futures.pop(future), future.result()
+    except concurrent.futures.BrokenExecutor as error:
+        raise ResumeError("a worker was lost; what is done is kept, go on with resume") from error
+    finally:
+        for future in futures:  # those left if this was interrupted: the executor would end them
+            future.cancel()

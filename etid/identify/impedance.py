@@ -1,0 +1,130 @@
+"""Identify a circuit from its measured impedance: frequency, Z, standard error.
+
+Potentiostats and impedance analysers give Z itself, without a driver in between. Minimised is
+
+    Σ_k |Z(jω_k) − Z_k|² / σ_k²
+
+over the logarithms of the elements, from the best of a grid of impedance levels and corner
+frequencies that spans the data.
+"""
+
+import jax.numpy as jnp
+import numpy as np
+import numpy.typing as npt
+import optimistix as optx
+from jaxtyping import Array, Complex, Float
+
+from etid.circuits.circuit import AbstractCircuit, SkinRC
+from etid.estimators.output_error.information import inverse
+from etid.identify.compiled import stored_jit
+from etid.results.fits import Fit, IdentificationError, complex_rrse
+from etid.results.verdicts import RESULTS, first_verdict, message, verdict
+from etid.signals.precision import require_float64
+from etid.solvers.levenberg_marquardt import LevenbergMarquardt, best_start
+
+MAX_STEPS = 500
+MISFIT_CHI2 = 1.5  # a standard error of a measured impedance is seldom known to better than 20 %
+LEVELS = np.geomspace(0.1, 10.0, 5)  # of the impedance around that of the data
+CORNERS = 9  # per grid, between the lowest and the highest frequency
+SOLVER = LevenbergMarquardt()
+
+
+@stored_jit
+def _fit(
+    frequency: Float[Array, " frequency"],
+    z: Complex[Array, " frequency"],
+    sigma: Float[Array, " frequency"],
+    circuit: AbstractCircuit,
+    known: bool,
+) -> Fit:
+    def residual(q, _):
+        difference = (circuit.with_log_values(q).response(frequency) - z) / sigma.astype(z.dtype)
+        return jnp.concatenate([difference.real, difference.imag])
+
+    # A circuit scaled in impedance by g and in frequency by t has R·g and C/(g t).
+    typical, (of_level, of_time) = circuit.log_values(), circuit.scaling()
+    size = jnp.log(jnp.median(jnp.abs(z)) / jnp.median(jnp.abs(circuit.response(frequency))))
+    slow = of_time > 0
+    resistance = typical[jnp.argmax(of_level)]
+    times = (typical - of_level * resistance) / jnp.where(slow, of_time, 1.0)
+    shortest = jnp.where(slow, times, jnp.inf).min()
+    corner = jnp.where(slow.any(), 1 / (2 * jnp.pi * jnp.exp(shortest)), 1.0)  # [Hz], roughly
+    corners = jnp.exp(jnp.linspace(jnp.log(frequency.min()), jnp.log(frequency.max()), CORNERS))
+    level, faster = jnp.meshgrid(size + jnp.log(jnp.asarray(LEVELS)), jnp.log(corners / corner))
+    level, faster = level.reshape(-1, 1), faster.reshape(-1, 1)
+    starts = typical[None, :] + of_level[None, :] * level - of_time[None, :] * faster
+    q0 = best_start(lambda q: residual(q, None), starts)
+    solution = optx.least_squares(residual, SOLVER, q0, max_steps=MAX_STEPS, throw=False)
+    q = solution.value
+    equations = solution.stats["normal_equations"]
+    chi2 = 2 * equations.objective / (2 * z.size - q.size)
+    scale = jnp.maximum(chi2, 1.0) if known else chi2
+    cov = inverse(equations.matrix) * scale
+    fitted = circuit.with_log_values(q)
+    values = fitted.values()
+    settled = RESULTS.promote(solution.result) == verdict("successful")
+    return Fit(
+        circuit=fitted,
+        cov=cov * jnp.outer(values, values),
+        shared_cov=jnp.zeros_like(cov),
+        rrse=complex_rrse(fitted.response(frequency), z),
+        chi2=chi2 if known else jnp.asarray(jnp.nan),
+        result=first_verdict(
+            (~jnp.isfinite(values).all(), RESULTS.nonphysical),
+            (fitted.is_too_steep(cov), RESULTS.nonphysical),
+            (~settled, verdict("max_steps_reached")),
+            ((chi2 > MISFIT_CHI2) & known, RESULTS.misfit),
+            (~(jnp.sqrt(jnp.diagonal(cov)) < 1).all(), RESULTS.insensitive),
+        ),
+        steps=solution.stats["num_steps"],
+        method="impedance",
+    )
+
+
+def identify_impedance(
+    frequency: npt.ArrayLike,
+    impedance: npt.ArrayLike,
+    *,
+    stderr: float | npt.ArrayLike | None = None,
+    circuit: AbstractCircuit | None = None,
+    throw: bool = True,
+) -> Fit:
+    """Identify a circuit from its impedance.
+
+    Args:
+        frequency: Frequencies [Hz], > 0.
+        impedance: Complex impedance [Ω] at each.
+        stderr: Standard error [Ω] of real and imaginary part, one for all or one for each. If not
+            given, it is taken as one for all and estimated from the residual: χ² is then NaN, and
+            nothing can say that the circuit is wrong.
+        circuit: Structure of the circuit; `SkinRC` if not given. Its values matter little.
+        throw: Raise if the verdict is not successful.
+
+    Returns:
+        Elements, standard errors and verdict.
+
+    Raises:
+        ValueError: The arrays do not fit each other, or are not finite and positive where they
+            must be.
+        IdentificationError: The verdict is not successful and `throw` is set.
+    """
+    require_float64()
+    circuit = SkinRC() if circuit is None else circuit
+    f, z = np.asarray(frequency, float), np.asarray(impedance, complex)
+    sigma = np.broadcast_to(np.asarray(1.0 if stderr is None else stderr, float), f.shape)
+    if f.ndim != 1 or z.shape != f.shape:
+        raise ValueError(
+            f"frequency has shape {f.shape} and impedance {z.shape}; both must be (n,)"
+        )
+    if 2 * f.size <= len(circuit.names()):
+        raise ValueError(f"{f.size} impedances cannot determine {len(circuit.names())} elements")
+    for name, values in {"frequency": f, "stderr": sigma}.items():
+        if not (np.isfinite(values).all() and (values > 0).all()):
+            raise ValueError(f"{name} must be finite and > 0 everywhere")
+    if not np.isfinite(z).all():
+        raise ValueError(f"{np.sum(~np.isfinite(z))} impedances are not finite; leave them out")
+    arrays = (jnp.asarray(f), jnp.asarray(z), jnp.asarray(sigma))
+    fit = _fit(*arrays, circuit, stderr is not None)
+    if throw and fit.verdict != "successful":
+        raise IdentificationError(f"impedance: {fit.verdict}. {message(fit.verdict)}", fit)
+    return fit

@@ -1,0 +1,458 @@
+"""Many recordings: lanes in chunks of one compiled function, and whole studies from HDF5.
+
+Recordings of one length share a compiled function, which takes `LANES` of them, so that memory is
+bounded. On a processor they run one after the other: side by side (`vmap`) all would take the steps
+of the slowest, which costs half as much again. Accelerators run them side by side. While a chunk is
+fitted, a thread reads the recordings of the next. What is wrong with a recording costs that
+recording alone: it gets a verdict and a note.
+"""
+
+import contextlib
+import dataclasses
+import functools
+import threading
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Int
+from tqdm import tqdm
+
+from etid.circuits.circuit import AbstractCircuit
+from etid.estimators.registry import Method, check_default, check_method, plan
+from etid.identify import changes
+from etid.identify.arguments import circuit_of, order_of, require
+from etid.identify.arguments import recordings as several
+from etid.identify.compiled import stored_jit
+from etid.identify.lanes import (
+    Known,
+    explained,
+    is_shared,
+    known_driver,
+    lane,
+    late_by,
+    needs_another,
+    of_both,
+    realigned,
+    remarked,
+    skin_lane,
+    stacked,
+    without_mains,
+)
+from etid.identify.one import failed_fit, identify_driver, note
+from etid.identify.prefetch import prefetch
+from etid.recordings.preflight import Inspected
+from etid.recordings.recording import Metadata, Recording, RecordingError
+from etid.recordings.repeats import repeats
+from etid.recordings.study import Study
+from etid.results.driver import Driver
+from etid.results.fits import LABELS, Fit, Fits, IdentificationError
+from etid.results.provenance import Settings
+from etid.results.study_fits import StudyFits
+from etid.results.verdicts import message
+
+LANES = 16  # of one call, the last of which is filled up
+AHEAD = 2 * LANES  # recordings that are read, and looked at, before their turn
+
+
+@stored_jit
+def _chunk(
+    lanes: Any,
+    count: Int[Array, ""],
+    driver: Driver,
+    known: Known,
+    circuit: AbstractCircuit,
+    method: Method,
+) -> Fit:
+    return each(lambda lane: skin_lane(lane, driver, known, circuit, method), lanes, count)
+
+
+def each(fit: Callable[[Any], Any], lanes: Any, count: int | Int[Array, ""]) -> Any:
+    """`fit` of the first `count` lanes, side by side where that is faster; of the others, zeros."""
+    if jax.default_backend() != "cpu":
+        return jax.vmap(fit)(lanes)
+    once = jax.jit(fit)  # traced once, for its shapes and for its use
+    first = jax.tree.map(lambda leaf: leaf[0], lanes)
+    shapes = jax.eval_shape(once, first)
+
+    def nothing(_):
+        return jax.tree.map(lambda of: jnp.zeros(of.shape, of.dtype), shapes)
+
+    def one(numbered):
+        number, lane = numbered
+        return jax.lax.cond(number < count, once, nothing, lane)
+
+    size = jax.tree.leaves(lanes)[0].shape[0]
+    return jax.lax.map(one, (jnp.arange(size), lanes))
+
+
+@dataclasses.dataclass(frozen=True)
+class _Unreadable:
+    """Labels of a recording of which only the path is known."""
+
+    path: str
+    subject: str = ""
+    condition: str = ""
+    electrode: str = ""
+    trial: str = ""
+
+
+def _labels(metadata: Sequence[Metadata | _Unreadable]) -> dict[str, np.ndarray]:
+    return {name: np.array([getattr(m, name) for m in metadata], dtype=str) for name in LABELS}
+
+
+def _stack(fits: Sequence[Fit]) -> Fit:
+    return jax.tree.map(lambda *leaves: np.stack(leaves), *fits)
+
+
+def _of_one_method(fits: Sequence[Fit], used: Sequence[str], otherwise: str) -> list[Fit]:
+    """The same with one name: a batch has one, "mixed" if several were used."""
+    name = used[0] if len(set(used)) == 1 else "mixed" if used else otherwise
+    arrays = [jax.tree.map(np.asarray, fit) for fit in fits]
+    return [dataclasses.replace(fit, method=name) for fit in arrays]
+
+
+class Refusal(Exception):
+    """Why a recording cannot be fitted: the name of its verdict, and a note."""
+
+    def __init__(self, name: str, note: str = ""):
+        super().__init__(name)
+        self.name = name
+        self.note = note or message(name)
+
+
+def planned(
+    load: Callable[[], tuple[Recording, Driver]], given: Method | None
+) -> tuple[Inspected, Driver, Method]:
+    """Load a recording and its driver, and choose its method.
+
+    Raises:
+        Refusal: Any of it failed, or pre-flight forbids a fit.
+    """
+    try:
+        recording, driver = load()
+        seen = Inspected(recording)
+        method, name = plan(given, seen, driver)
+    except (RecordingError, ValueError) as error:
+        raise Refusal("unreadable", str(error)) from error
+    except IdentificationError as error:
+        raise Refusal("driver_failed", str(error)) from error
+    if name is not None:
+        raise Refusal(name, explained(seen, name))
+    return seen, driver, method
+
+
+def filled(lanes: Sequence[tuple[np.ndarray, ...]]) -> tuple[Array, ...]:
+    """A chunk, filled up by the last lane."""
+    return stacked([*lanes, *[lanes[-1]] * (LANES - len(lanes))])
+
+
+class _Queue:
+    """Recordings that one compiled function takes, with one driver, waiting to fill a chunk."""
+
+    def __init__(
+        self,
+        driver: Driver,
+        known: Known,
+        circuit: AbstractCircuit,
+        method: Method,
+    ):
+        self.driver = driver
+        self.known = known
+        self.circuit = circuit
+        self.method: Method = method
+        self.rows: list[int] = []
+        self.lanes: list[tuple[np.ndarray, ...]] = []
+        self.seen: list[Inspected] = []
+        self.again: set[int] = set()
+
+    def add(self, row: int, lane: tuple[np.ndarray, ...], seen: Inspected) -> None:
+        """Let a recording wait."""
+        self.rows.append(row)
+        self.lanes.append(lane)
+        self.seen.append(seen)
+
+    def run(self) -> Iterator[tuple[int, Fit]]:
+        """Fit what is waiting; what has to be aligned anew, once, waits again."""
+        fits, kept = self._fits(self.lanes), []
+        rows, lanes, seen = self.rows, self.lanes, self.seen
+        self.rows, self.lanes, self.seen = [], [], []
+        for number, (row, one) in enumerate(zip(rows, lanes, strict=True)):
+            late = late_by(one, self.method, fits[number], self.driver)
+            if late and row not in self.again:
+                self.again.add(row)
+                seen[number].lag += late
+                self.add(row, realigned(one, self.method, late), seen[number])
+            else:
+                self.again.discard(row)
+                kept.append(number)
+        again = {
+            number: few
+            for number in kept
+            if needs_another(fits[number])
+            and (few := without_mains(lanes[number], self.method)) is not None
+        }
+        if again:
+            for number, second in zip(again, self._fits(list(again.values())), strict=True):
+                fits[number] = of_both(fits[number], second)
+        marked = [
+            remarked(fits[number], int(seen[number].remarks) | int(fits[number].remarks))
+            for number in kept
+        ]
+        if kept:
+            found = changes.judged(marked, self.driver, repeats([seen[number] for number in kept]))
+            yield from zip([rows[number] for number in kept], found, strict=True)
+
+    def _fits(self, lanes: Sequence[tuple[np.ndarray, ...]]) -> list[Fit]:
+        of = self.driver, self.known, self.circuit, self.method
+        fits = jax.device_get(_chunk(filled(lanes), jnp.asarray(len(lanes)), *of))
+        return list(unstacked(fits))[: len(lanes)]  # what fills it up is left out
+
+
+def unstacked(fits: Fit) -> Iterator[Fit]:
+    """The fits of a chunk one by one."""
+    leaves, structure = jax.tree.flatten(fits)
+    return (
+        jax.tree.unflatten(structure, map(np.asarray, one)) for one in zip(*leaves, strict=True)
+    )
+
+
+def _identify(
+    count: int,
+    load: Callable[[int], tuple[Recording, Driver]],
+    circuit: AbstractCircuit,
+    given: Method | None,
+    progress: bool,
+) -> tuple[list[Fit], list[str]]:
+    """Fit `count` recordings; what `load(row)` raises becomes the verdict of its row."""
+    fits: dict[int, Fit] = {}
+    notes = [""] * count
+    used: list[str] = []
+    queues: dict[tuple, _Queue] = {}
+
+    def read(row):
+        with jax.enable_x64(True):  # of the thread that reads: the caller's own was checked
+            seen, driver, method = planned(functools.partial(load, row), given)
+            try:
+                check_default(method, circuit)
+            except ValueError as error:
+                raise Refusal("not_periodic", str(error)) from error
+        rates = seen.recording.sample_rate, seen.recording.pulse_rate
+        waiting, shared = lane(seen, method), is_shared(seen, driver)
+        key = id(driver), method, waiting[0].size, shared, rates
+        return driver, waiting, seen, method, shared, key
+
+    with (
+        tqdm(total=count, unit="fit", disable=not progress) as bar,
+        contextlib.closing(prefetch(read, count, AHEAD)) as recordings,
+    ):
+
+        def run(queue):
+            for row, fit in queue.run():
+                fits[row] = fit
+                used.append(fit.method)
+                notes[row] = note(fit)
+                bar.update()
+
+        for row, prepared in enumerate(recordings):
+            try:
+                driver, waiting, seen, method, shared, key = prepared()
+            except Refusal as refusal:
+                fits[row] = failed_fit(refusal.name, circuit, given or "maximum_likelihood")
+                notes[row] = refusal.note
+                bar.update()
+                continue
+            if key not in queues:
+                known = known_driver(waiting, driver, method, shared)
+                queues[key] = _Queue(driver, known, circuit, method)
+            queue = queues[key]
+            queue.add(row, waiting, seen)
+            while len(queue.rows) == LANES:
+                run(queue)
+        for queue in queues.values():
+            while queue.rows:
+                run(queue)
+    ordered = [fits[row] for row in range(count)]
+    return _of_one_method(ordered, used, given or "maximum_likelihood"), notes
+
+
+def identify_skins(
+    recordings: Iterable[Recording] | Study,
+    driver: Driver,
+    *,
+    circuit: AbstractCircuit | None = None,
+    method: Method | None = None,
+    progress: bool = False,
+) -> Fits:
+    """Identify many recordings made with one driver.
+
+    Args:
+        recordings: Recordings, or a study of loaded ones; of any lengths and sample rates.
+        driver: Identified driver.
+        circuit: As in `identify_skin`.
+        method: As in `identify_skin`.
+        progress: Show a progress bar.
+
+    Returns:
+        One fit per recording, in their order; none is left without a verdict. The method is "mixed"
+        if some had to be identified by another than the others.
+
+    Raises:
+        ValueError: No recording, or method and circuit do not go together.
+    """
+    require("driver", driver, Driver)
+    circuit = circuit_of(circuit)
+    check_method(method, circuit)
+    if isinstance(recordings, Study):
+        study, paths = recordings, [*recordings, *recordings.problems]
+        metadata = [_metadata(study, path) for path in paths]
+        fits, notes = _identify(
+            len(paths), lambda row: (study[paths[row]], driver), circuit, method, progress
+        )
+    else:
+        records = several("recordings", recordings)
+        metadata = [record.metadata for record in records]
+        fits, notes = _identify(
+            len(records), lambda row: (records[row], driver), circuit, method, progress
+        )
+    if not fits:
+        raise ValueError("there is no recording to identify")
+    return Fits(_stack(fits), _labels(metadata), np.array(notes, dtype=str))
+
+
+def identify_study(
+    study: Study,
+    *,
+    order: int = 5,
+    circuit: AbstractCircuit | None = None,
+    method: Method | None = None,
+    driver_drift: float = 0.0,
+    progress: bool = False,
+) -> StudyFits:
+    """Identify every driver of a study from its calibrations, then every loaded recording.
+
+    A recording that names no calibration belongs to the only one in the study; if there are
+    several, it gets the verdict `unreadable` rather than a guess. What cannot be read at all,
+    `study.problems`, comes last and has that verdict too.
+
+    Args:
+        study: Calibrations and loaded recordings.
+        order: As in `identify_driver`.
+        circuit: As in `identify_skin`.
+        method: As in `identify_skin`.
+        driver_drift: As in `identify_driver`.
+        progress: Show a progress bar.
+
+    Returns:
+        One fit per loaded recording, and the drivers.
+
+    Raises:
+        ValueError: No loaded recording, or method and circuit do not go together.
+    """
+    require("study", study, Study)
+    order = order_of(order)
+    circuit = circuit_of(circuit)
+    check_method(method, circuit)
+    drivers = Drivers(study, order, method, driver_drift)
+    paths = to_identify(study)
+    fits = identify_part(study, paths, drivers, circuit, method, progress)
+    settings = Settings.of(study, len(paths), order, method, circuit, driver_drift=driver_drift)
+    return StudyFits(fits, drivers.found, drivers.failures, settings)
+
+
+def to_identify(study: Study) -> list[str]:
+    """Paths of all loaded recordings, and of what cannot be read."""
+    return [*study.loaded, *study.problems]
+
+
+def identify_part(
+    study: Study,
+    paths: Sequence[str],
+    drivers: "Drivers",
+    circuit: AbstractCircuit,
+    method: Method | None,
+    progress: bool = False,
+) -> Fits:
+    """Identify some recordings of a study, with its drivers."""
+
+    def load(row: int) -> tuple[Recording, Driver]:
+        recording = study[paths[row]]
+        return recording, drivers.found[drivers.of(recording)]
+
+    fits, notes = _identify(len(paths), load, circuit, method, progress)
+    return table(study, paths, fits, notes)
+
+
+def table(study: Study, paths: Sequence[str], fits: Sequence[Fit], notes: Sequence[str]) -> Fits:
+    """The fits of these recordings of a study, with their labels.
+
+    Raises:
+        ValueError: There is none.
+    """
+    if not fits:
+        raise ValueError("the study has no loaded recording")
+    metadata = [_metadata(study, path) for path in paths]
+    return Fits(_stack(fits), _labels(metadata), np.array(notes, dtype=str))
+
+
+class Drivers:
+    """The drivers of a study, each identified when its first recording asks for it.
+
+    Attributes:
+        found: The drivers, by the paths of their calibrations.
+        failures: Why a driver could not be identified, by the paths of its calibrations.
+    """
+
+    def __init__(self, study: Study, order: int, method: Method | None, driver_drift: float = 0.0):
+        self.study = study
+        self.driver_drift = driver_drift
+        self.order = order
+        self.method: Method | None = method
+        self.calibrations = tuple(study.calibrations)
+        self.found: dict[tuple[str, ...], Driver] = {}
+        self.failures: dict[tuple[str, ...], str] = {}
+        self._one_at_a_time = threading.Lock()
+
+    def of(self, recording: Recording) -> tuple[str, ...]:
+        """Paths of the calibrations of a recording, whose driver is in `found` then.
+
+        Raises:
+            RecordingError: The recording does not say which of several it is.
+            IdentificationError: The driver could not be identified.
+        """
+        names = recording.calibration or self.calibrations
+        if not recording.calibration and len(self.calibrations) != 1:
+            raise RecordingError(
+                f"names no calibration and the study has {len(self.calibrations)}",
+                path=recording.path,
+                field="calibration",
+                remedy="Write the path of its calibration into the attribute 'calibration'",
+            )
+        with self._one_at_a_time:
+            if names not in self.found and names not in self.failures:
+                self._identify(names)
+        if names in self.failures:
+            raise IdentificationError(self.failures[names], None)
+        return names
+
+    def _identify(self, names: tuple[str, ...]) -> None:
+        try:
+            records = [self.study[name] for name in names]
+            self.found[names] = identify_driver(
+                records,
+                order=self.order,
+                method=self.method,
+                driver_drift=self.driver_drift,
+                throw=False,
+            )
+        except (IdentificationError, ValueError, KeyError) as error:
+            self.failures[names] = str(error)
+
+
+def _metadata(study: Study, path: str) -> Metadata | _Unreadable:
+    try:
+        return study.metadata(path)
+    except RecordingError:
+        return _Unreadable(path)

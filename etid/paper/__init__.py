@@ -1,0 +1,1 @@
+"""The paper's experiments: its published tables, and the demonstration that repeats them."""

@@ -1,0 +1,410 @@
+"""One walk through an HDF5 file: which recordings it holds, and what is wrong with the others.
+
+Attributes and the headers of datasets are read; samples are not, until a recording is loaded.
+"""
+
+import contextlib
+import dataclasses
+import functools
+import re
+import weakref
+from collections.abc import Callable, Hashable, Iterator
+from typing import Any
+
+import h5py
+import numpy as np
+from h5py import h5o  # type: ignore[attr-defined]  # compiled, without stubs
+
+from etid.recordings import limits, schema
+from etid.recordings.recording import (
+    SIGNALS,
+    AbstractSource,
+    Layout,
+    Metadata,
+    Recording,
+    RecordingError,
+    Samples,
+    metadata_from,
+    tidy_path,
+)
+from etid.recordings.untrusted import LIBRARY_ERRORS, Attributes, check_size, local_link, translated
+from etid.signals.pulse_train import find_pulses
+
+_DIGITS = 1000  # of a number in a name, above which Python refuses to read it
+OPEN = 8  # datasets of stacks that stay open
+
+_NAMES = {field.name for field in schema.FIELDS}
+
+
+@dataclasses.dataclass(frozen=True)
+class _Header:
+    """What is known of a dataset without reading its samples."""
+
+    shape: tuple[int, ...]
+    dtype: np.dtype
+    conversion: float
+    offset: float
+
+    @property
+    def length(self) -> int:
+        return self.shape[-1]
+
+    @property
+    def stacked(self) -> bool:
+        return len(self.shape) == 2
+
+
+@dataclasses.dataclass(eq=False)
+class _Block:
+    """A recording group of the file: one recording, or a stack of trials."""
+
+    file: h5py.File
+    opened: Callable[[str], Any]
+    name: str
+    metadata: Metadata
+    trials: tuple[str, ...] | None
+    headers: dict[str, _Header]
+    shared: Callable[[], Samples | None] = lambda: None
+
+    def rows(self) -> "Iterator[_Row]":
+        count = self.headers["v_out"].shape[0] if self.headers["v_out"].stacked else None
+        return (_Row(self, row) for row in ([None] if count is None else range(count)))
+
+    def samples(self, name: str, row: int | None) -> Samples:
+        header = self.headers[name]
+        common = row is not None and not header.stacked
+        kept = self.shared() if common else None
+        if kept is not None:
+            return kept
+        with translated(self.name, self.metadata.path, name):
+            if not self.file:
+                raise RecordingError("the file is closed", remedy="Read it again, or use `with`")
+            path = f"{self.metadata.path}/{name}"
+            dataset = self.opened(path) if header.stacked else self.file[path]
+            assert isinstance(dataset, h5py.Dataset)  # the scan has seen it
+            stored = dataset[row] if header.stacked else dataset[()]
+            stored.flags.writeable = False
+            samples = Samples(stored, header.conversion, header.offset)
+        if common:  # kept as long as some recording of the stack is in use
+            self.shared = weakref.ref(samples)
+        return samples
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class _Row(AbstractSource):
+    """One recording of a file."""
+
+    block: _Block
+    row: int | None
+
+    @property
+    def metadata(self) -> Metadata:
+        common = self.block.metadata
+        if self.row is None:
+            return common
+        trial = self.block.trials[self.row] if self.block.trials else ""
+        return dataclasses.replace(common, path=f"{common.path}/{self.row}", trial=trial)
+
+    @property
+    def layout(self) -> tuple[Layout, ...]:
+        return tuple(
+            Layout(name, header.dtype.str, header.length, header.conversion, header.offset)
+            for name, header in self.block.headers.items()
+        )
+
+    @property
+    def unloaded(self) -> Hashable:
+        common = not self.block.headers["v_th"].stacked
+        return (id(self.block), None if common else self.row)
+
+    def blocks(self, name: str) -> Iterator[np.ndarray]:
+        yield self.block.samples(name, self.row).stored
+
+    def load(self) -> Recording:
+        records: dict[str, Any] = {
+            name: self.block.samples(name, self.row) for name in self.block.headers
+        }
+        return Recording(**records, **vars(self.metadata))
+
+
+class Scan:
+    """One walk through a file: its recording groups, and what is wrong with the others."""
+
+    def __init__(self, file: h5py.File, name: str) -> None:
+        self.file = file
+        self.name = name
+        # Opening a stack costs as much as reading a row, but each holds megabytes of its chunks.
+        self.opened = functools.lru_cache(OPEN)(file.__getitem__)
+        self.blocks: dict[str, _Block] = {}
+        self.problems: list[RecordingError] = []
+        self._kinds: dict[str, str] = {}
+        self._seen: dict[int, str] = {}
+        with Attributes(name) as self._stored:
+            self._walk(file, "")
+        for path, block in self.blocks.items():
+            for calibration in block.metadata.calibration:
+                self._check_calibration(path, calibration)
+        wrong = {problem.path for problem in self.problems}
+        self.blocks = {path: block for path, block in self.blocks.items() if path not in wrong}
+
+    def sources(self) -> dict[str, AbstractSource]:
+        """The recordings that can be read, by path."""
+        return {row.metadata.path: row for block in self.blocks.values() for row in block.rows()}
+
+    def check_samples(self) -> None:
+        """Read all samples; what cannot be read, is not finite or denies the rates is a problem."""
+        for path, source in self.sources().items():
+            with self._reported(path):
+                recording = source.load()
+                for name, record in recording.samples.items():
+                    count = int(np.sum(~np.isfinite(record.stored)))
+                    if count:
+                        self._report(
+                            path,
+                            name,
+                            f"{count} of {record.stored.size} samples are not finite",
+                            "Record again, or expect a verdict instead of a fit",
+                        )
+                train = find_pulses(recording.v_th, recording.sample_rate, recording.pulse_rate)
+                if train.mismatch:
+                    remedy = "Correct sample_rate or pulse_rate"
+                    self._report(path, "pulse_rate", train.mismatch.removesuffix("."), remedy)
+
+    def _report(self, path: str, field: str, message: str, remedy: str = "") -> None:
+        self.problems.append(
+            RecordingError(message, file=self.name, path=path or "/", field=field, remedy=remedy)
+        )
+
+    @contextlib.contextmanager
+    def _reported(self, path: str, field: str = "") -> Iterator[None]:
+        """Put an error aside and go on."""
+        try:
+            with translated(self.name, path or "/", field):
+                yield
+        except RecordingError as problem:
+            self.problems.append(problem)
+
+    def _walk(self, group: h5py.Group, path: str) -> None:
+        with self._reported(path):
+            address = h5o.get_info(group.id).addr
+            if address in self._seen:
+                first = self._seen[address] or "/"
+                remedy = "Store each recording once"
+                return self._report(path, "", f"is the same group as {first!r}", remedy)
+            self._seen[address] = path
+            if path.count("/") >= limits.DEPTH:
+                raise RecordingError(
+                    f"lies more than {limits.DEPTH} groups deep",
+                    remedy="Use a path such as 's01/dry/03'",
+                )
+            attributes = self._stored.names(group)
+            near = "kind" in attributes or schema.near_miss("kind", attributes)
+            names = sorted(group, key=_natural)
+            if near or "v_out" in names:
+                return self._inspect(group, path, names)
+            for name in names:
+                child = f"{path}/{name}".lstrip("/")
+                with self._reported(child):
+                    self._enter(group, name, child)
+        return None
+
+    def _enter(self, group: h5py.Group, name: str, path: str) -> None:
+        """Walk on into a member of an ordinary group."""
+        link = local_link(group, name)
+        if isinstance(link, h5py.SoftLink):
+            if group.get(name) is None:
+                raise RecordingError(
+                    f"is a dangling link to {link.path!r}", remedy="Remove or mend it"
+                )
+            if isinstance(group[name], h5py.Group):
+                raise RecordingError(
+                    f"is a soft link to the group {link.path!r}", remedy="Remove the link"
+                )
+            return
+        member = group[name]
+        if isinstance(member, h5py.Group):
+            self._walk(member, path)
+        elif name in schema.at("dataset"):
+            raise RecordingError(
+                "is a dataset outside of a recording group",
+                remedy="Give its group the attribute kind and a dataset v_out",
+            )
+        elif isinstance(member, h5py.Dataset) and "kind" in member.attrs:
+            raise RecordingError(
+                "is a dataset with the attribute kind, where a group is expected",
+                remedy="Make it a group with the datasets v_th and v_out",
+            )
+
+    def _inspect(self, group: h5py.Group, path: str, names: list[str]) -> None:
+        """Check a recording group against the schema, field by field."""
+        before = len(self.problems)
+        if not path:
+            remedy = "Put the recording into a group of its own"
+            return self._report(path, "kind", "the root of a file cannot be a recording", remedy)
+        with self._reported(path, "path"):
+            tidy_path(path)
+        present = self._stored.names(group)
+        found = self._attributes(group, schema.at("group attribute"), path, "")
+        kind = found.get("kind", "")
+        self._kinds[path] = kind
+        for field in schema.at("group attribute").values():
+            if field.required in ("always", kind) and field.name not in present:
+                self._missing(path, field)
+            if kind and field.forbidden == kind and field.name in present:
+                remedy = "Remove it, or change the kind"
+                self._report(path, field.name, f"a {kind} recording must not have it", remedy)
+        allowed = {
+            name: field
+            for name, field in schema.at("group attribute").items()
+            if not kind or field.forbidden != kind
+        }
+        self._near_misses(present, allowed, path, "")
+        headers: dict[str, _Header] = {}
+        for field in schema.at("dataset").values():
+            with self._reported(path, field.name):
+                if field.name in names:
+                    headers[field.name] = self._header(group, field, path)
+                elif field.required == "always":
+                    self._missing(path, field)
+        self._near_misses(names, schema.at("dataset"), path, "")
+        for name in set(names) - set(SIGNALS):
+            if isinstance(group.get(name, getlink=True), h5py.HardLink):
+                member = group[name]
+                if isinstance(member, h5py.Group) and "kind" in member.attrs:
+                    remedy = "Put it beside the other"
+                    self._report(
+                        f"{path}/{name}", "", f"lies inside the recording {path!r}", remedy
+                    )
+        if len(self.problems) == before:
+            with self._reported(path):
+                self.blocks[path] = self._block(path, found, headers)
+        return None
+
+    def _missing(self, path: str, field: schema.Field) -> None:
+        self._report(path, field.name, "is missing", f"Add {field.expects}")
+
+    def _near_misses(
+        self, names: list[str], known: dict[str, schema.Field], path: str, of: str
+    ) -> None:
+        absent = [name for name in known if name not in names]
+        for name in names:
+            near = None if name in _NAMES else schema.near_miss(name, absent)
+            if near:
+                message = f"is not in the schema, did you mean {near}?"
+                self._report(path, f"{of}{name}", message, "Rename it")
+
+    def _attributes(
+        self, owner: h5py.HLObject, known: dict[str, schema.Field], path: str, of: str
+    ) -> dict[str, Any]:
+        """The attributes that are in the schema, parsed; those that cannot be are reported."""
+        found: dict[str, Any] = {}
+        for name in self._stored.names(owner):
+            if name not in known:
+                continue
+            try:
+                value = self._stored.value(owner, name)
+            except LIBRARY_ERRORS as error:
+                self._report(path, f"{of}{name}", f"cannot be read ({error})", "Write it again")
+                continue
+            try:
+                found[name] = known[name].parse(value)
+            except ValueError as error:
+                remedy = f"The schema wants {known[name].expects}"
+                self._report(path, f"{of}{name}", str(error), remedy)
+        return found
+
+    def _header(self, group: h5py.Group, field: schema.Field, path: str) -> _Header:
+        """Shape, dtype and scale of a dataset that lies in this file."""
+        link = local_link(group, field.name)
+        remedy = "Copy the samples into the file"
+        if group.get(field.name) is None:
+            target = getattr(link, "path", "")
+            raise RecordingError(f"is a dangling link to {target!r}", remedy="Mend the link")
+        dataset = group[field.name]
+        if not isinstance(dataset, h5py.Dataset):
+            what = "group" if isinstance(dataset, h5py.Group) else "datatype"
+            raise RecordingError(f"is a {what}", remedy=f"Add {field.expects} as a dataset")
+        here = h5o.get_info(self.file.id).fileno
+        if h5o.get_info(dataset.id).fileno != here or dataset.external or dataset.is_virtual:
+            raise RecordingError("its samples lie in another file", remedy=remedy)
+        if dataset.dtype.kind not in "iuf" or dataset.dtype.itemsize > 8:
+            raise RecordingError(
+                f"has dtype {dataset.dtype}",
+                remedy="Store integers or real numbers, at most 64 bit",
+            )
+        shape = dataset.shape
+        if shape is None or len(shape) not in (1, 2) or 0 in shape:
+            what = "is empty" if shape is None or 0 in shape else f"has shape {shape}"
+            raise RecordingError(what, remedy=f"The schema wants {field.expects}")
+        if shape[-1] > limits.SAMPLES or (shape[0] > limits.TRIALS and len(shape) == 2):
+            raise RecordingError(
+                f"has shape {shape}, at most {limits.TRIALS} trials of {limits.SAMPLES} samples "
+                "are read",
+                remedy="Split it",
+            )
+        check_size(dataset)
+        before = len(self.problems)
+        known, of = schema.at("dataset attribute"), f"{field.name}."
+        found = self._attributes(dataset, known, path, of)
+        self._near_misses(self._stored.names(dataset), known, path, of)
+        if len(self.problems) == before and found.get("unit") != field.unit:
+            what = f"is {found['unit']!r}" if "unit" in found else "is missing"
+            raise RecordingError(
+                what, field=f"{field.name}.unit", remedy=f"It must be {field.unit!r}"
+            )
+        scale = found.get("conversion", 1.0), found.get("offset", 0.0)
+        try:
+            Samples(np.zeros(1, dataset.dtype), *scale)
+        except RecordingError as error:
+            raise RecordingError(error.message, field=f"{of}{error.field}") from None
+        return _Header(shape, dataset.dtype, *scale)
+
+    def _block(self, path: str, found: dict[str, Any], headers: dict[str, _Header]) -> _Block:
+        """What a group holds, once each field is right by itself."""
+        shapes = {name: header.shape for name, header in headers.items()}
+        out = shapes["v_out"]
+        if shapes["v_th"] not in (out, out[-1:]) or shapes.get("current", out) != out:
+            found_shapes = ", ".join(f"{name} {shape}" for name, shape in shapes.items())
+            raise RecordingError(
+                f"shapes do not fit each other: {found_shapes}",
+                remedy="The schema wants (time,) or (trial, time); only v_th may be (time,) beside "
+                "a stacked v_out",
+            )
+        stacked = len(out) == 2
+        if stacked and found["kind"] == "calibration":
+            raise RecordingError(
+                f"holds {out[0]} stacked calibrations",
+                field="v_out",
+                remedy="Write one group per calibration",
+            )
+        trials = found.pop("trial", None)
+        trials = (trials,) if isinstance(trials, str) else trials
+        if trials is not None and len(trials) != (out[0] if stacked else 1):
+            wanted = f"{out[0]} labels, one per row" if stacked else "one label"
+            raise RecordingError(
+                f"has {len(trials)} labels", field="trial", remedy=f"Write {wanted}"
+            )
+        found.pop("kind")
+        if not stacked and trials:
+            found["trial"] = trials[0]
+        metadata = metadata_from(**found, path=path)
+        for trial in trials or ():
+            metadata_from(**{**found, "trial": trial})  # for its check of the text
+        return _Block(
+            self.file, self.opened, self.name, metadata, trials if stacked else None, headers
+        )
+
+    def _check_calibration(self, path: str, calibration: str) -> None:
+        kind = self._kinds.get(calibration)
+        if kind == "calibration":
+            return
+        what = "is not in the file" if kind is None else f"is a {kind or 'broken'} recording"
+        remedy = "Name the HDF5 path of a group with kind='calibration'"
+        self._report(path, "calibration", f"{calibration!r} {what}", remedy)
+
+
+def _natural(name: str) -> list[tuple[int, str]]:
+    """Sorting key: digits count as numbers."""
+    parts = re.split(r"([0-9]+)", name)
+    numbers = (part.isdecimal() and len(part) < _DIGITS for part in parts)
+    return [(int(p), "") if whole else (-1, p) for p, whole in zip(parts, numbers, strict=True)]

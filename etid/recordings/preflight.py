@@ -1,0 +1,245 @@
+"""Pre-flight: what can be seen to be wrong with a recording before anything is fitted."""
+
+import functools
+import math
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from etid.recordings.recording import Recording
+from etid.recordings.remarks import Remark
+from etid.signals import rounding
+from etid.signals.alignment import lag_of, shifted, whole_lag
+from etid.signals.filtering import TAPS
+from etid.signals.harmonics import whole_periods
+from etid.signals.mains import Hum, separated
+from etid.signals.measurement import trusted
+from etid.signals.noise import noise_std
+from etid.signals.pulse_train import CLOCK, PulseTrain, find_pulses
+
+SHORTEST = 4 * TAPS + 104  # samples: the interpolation's edges and a hundred and some to fit
+FLAT = (
+    8.0  # standard deviations of the noise that a signal must exceed, peak to peak, beyond chance
+)
+RAIL = 3  # equal extreme samples in a row that a noisy or sloping signal does not produce
+JUMP = 8.0  # converter steps by which a clipped signal enters and leaves its rail
+POWER = 1.01  # of v_out over v_th; a passive load takes power, and gains match better than this
+EQUAL = 1e-3  # by which amplitudes may differ if nothing is connected
+SAME = 1.5  # of the variance of the noise, by which they may differ then
+LATE = 5e-3  # of the signal, which a delay of a tenth of a sample leaves of the edges as well
+SEAM = 3  # samples on both sides of the joint between two periods
+STEP = 4.0  # standard deviations of the noise by which they may differ there
+
+
+class Inspected:
+    """A recording, and what can be said of it without a model: everything once, when asked.
+
+    Attributes:
+        recording: The recording.
+    """
+
+    def __init__(self, recording: Recording):
+        self.recording = recording
+
+    @functools.cached_property
+    def v_th(self) -> Float[np.ndarray, " time"]:
+        """Unloaded voltage [V], without hum that can be told from the pulses."""
+        return self._without(self.hum_th, self.recorded_th)
+
+    @functools.cached_property
+    def v_out(self) -> Float[np.ndarray, " time"]:
+        """Loaded voltage [V], without such hum."""
+        return self._without(self.hum_out, self.recorded_out)
+
+    @functools.cached_property
+    def recorded_th(self) -> Float[np.ndarray, " time"]:
+        """Unloaded voltage as it was recorded [V]."""
+        return self.recording.v_th
+
+    @functools.cached_property
+    def recorded_out(self) -> Float[np.ndarray, " time"]:
+        """The same of the loaded voltage."""
+        return self.recording.v_out
+
+    @functools.cached_property
+    def coarse_th(self) -> float:
+        """Converter step [V] of `v_th` if it exceeds the noise, else 0."""
+        return self._coarse(self.recorded_th, self.step_th)
+
+    @functools.cached_property
+    def coarse_out(self) -> float:
+        """The same of `v_out`."""
+        return self._coarse(self.recorded_out, self.step_out)
+
+    def _coarse(self, v: Float[np.ndarray, " time"], told: float) -> float:
+        step = told or rounding.step_of(v)
+        return step if rounding.is_coarse(v, step) else 0.0
+
+    @functools.cached_property
+    def hum_th(self) -> Hum | None:
+        """Hum of `v_th` that was subtracted."""
+        return self._hum(self.recorded_th, self.sigma_th)
+
+    @functools.cached_property
+    def hum_out(self) -> Hum | None:
+        """The same of `v_out`."""
+        return self._hum(self.recorded_out, self.sigma_out)
+
+    def _hum(self, v: Float[np.ndarray, " time"], sigma: Float[np.ndarray, ""]) -> Hum | None:
+        of = self.recording
+        return separated(v, sigma, of.sample_rate, of.pulse_rate, *self.periods)
+
+    def _without(self, hum: Hum | None, v: Float[np.ndarray, " time"]) -> np.ndarray:
+        return v if hum is None else v - hum(v.size, self.recording.sample_rate)
+
+    def covered(self, frequency: Float[np.ndarray, " harmonic"]) -> Bool[np.ndarray, " harmonic"]:
+        """Harmonics that hum covers although it was subtracted."""
+        none = np.zeros(frequency.shape, bool)
+        found = [hum for hum in (self.hum_th, self.hum_out) if hum is not None]
+        return sum((hum.covers(frequency, self.periods[0]) for hum in found), start=none)
+
+    @property
+    def step_th(self) -> float:
+        """Converter step [V] of `v_th`, 0 if it is not known."""
+        return self.recording.samples["v_th"].resolution or 0.0
+
+    @property
+    def step_out(self) -> float:
+        """The same of `v_out`."""
+        return self.recording.samples["v_out"].resolution or 0.0
+
+    @functools.cached_property
+    def sigma_th(self) -> Float[np.ndarray, ""]:
+        """Noise of a sample of `v_th` [V]."""
+        return np.asarray(noise_std(self.recorded_th, self.step_th))
+
+    @functools.cached_property
+    def sigma_out(self) -> Float[np.ndarray, ""]:
+        """The same of `v_out`."""
+        return np.asarray(noise_std(self.recorded_out, self.step_out))
+
+    @property
+    def remarks(self) -> Remark:
+        """What is done to the recording before a fit."""
+        hum = self.hum_th is not None or self.hum_out is not None
+        coarse = self.coarse_th > 0 or self.coarse_out > 0
+        off = abs(self.train.counted / self.recording.pulse_rate - 1) > CLOCK
+        found = Remark.mains_hum if hum else Remark(0)
+        found |= Remark.coarse_converter if coarse else Remark(0)
+        found |= Remark.aligned if self.lag else Remark(0)
+        return found | (Remark.pulse_rate_counted if off else Remark(0))
+
+    @functools.cached_property
+    def correlated(self) -> float | None:
+        """By how many samples `v_out` is late, up to one more by the load; None if misaligned."""
+        return lag_of(self.v_th, self.v_out, self.train)
+
+    @functools.cached_property
+    def lag(self) -> int:
+        """Whole samples by which `v_out` is late, and by which it is shifted before a fit."""
+        return 0 if self.correlated is None else whole_lag(self.correlated)
+
+    @property
+    def aligned(self) -> tuple[Float[np.ndarray, " overlap"], Float[np.ndarray, " overlap"]]:
+        """Both voltages [V] where they overlap after that shift."""
+        return shifted(self.v_th, self.v_out, self.lag)
+
+    @functools.cached_property
+    def train(self) -> PulseTrain:
+        """The pulses of `v_th`."""
+        return find_pulses(self.recorded_th, self.recording.sample_rate, self.recording.pulse_rate)
+
+    @functools.cached_property
+    def pulse_rate(self) -> float:
+        """Pulse rate [Hz] by its own clock."""
+        return self.train.counted
+
+    @functools.cached_property
+    def periods(self) -> tuple[int, int]:
+        """How many whole periods it holds by its own clock, and how many samples they are."""
+        return whole_periods(self.recorded_out.size, self.recording.sample_rate, self.pulse_rate)
+
+    @functools.cached_property
+    def is_periodic(self) -> bool:
+        """Whether it holds whole pulse periods, each like the other where they are joined.
+
+        Periods are a whole number of samples long to within half a sample, which matters where the
+        signal is steep at the joint.
+        """
+        periods, samples = self.periods
+        if periods == 0:
+            return False
+        rest = abs(periods * self.recording.sample_rate / self.train.counted - samples)
+        for v, sigma in ((self.v_th, self.sigma_th), (self.v_out, self.sigma_out)):
+            joint = np.concatenate([v[samples - SEAM : samples], v[:SEAM]])
+            if rest * np.abs(np.diff(joint)).max() > STEP * trusted(v, sigma):
+                return False
+        return True
+
+
+def preflight(seen: Inspected, *, periodic: bool = False) -> str | None:
+    """Name the verdict that forbids a fit, or None.
+
+    Verdicts: `too_short`, `nonfinite_samples`, `flat`, `saturated`, `unconnected`,
+    `rate_mismatch`, `misaligned`, `not_periodic`.
+
+    Args:
+        seen: Unloaded and loaded voltage.
+        periodic: Whether whole pulse periods are needed.
+    """
+    v_th, v_out, of = seen.v_th, seen.v_out, seen.recording
+    if v_th.size < SHORTEST:
+        return "too_short"
+    if not (np.isfinite(v_th).all() and np.isfinite(v_out).all()):
+        return "nonfinite_samples"
+    if _is_flat(v_th, seen.sigma_th) or _is_flat(v_out, seen.sigma_out):
+        return "flat"
+    if _is_saturated(seen.recorded_th, seen.step_th, of):
+        return "saturated"
+    if _is_saturated(seen.recorded_out, seen.step_out, of):
+        return "saturated"
+    if _is_unconnected(seen):
+        return "unconnected"
+    if seen.train.mismatch:
+        return "rate_mismatch"
+    if np.var(v_out) > POWER * np.var(v_th) or seen.correlated is None:
+        return "misaligned"
+    if periodic and not seen.is_periodic:
+        return "not_periodic"
+    return None
+
+
+def _is_flat(v: Float[np.ndarray, " time"], sigma: Float[np.ndarray, ""]) -> bool:
+    return bool(np.ptp(v) <= FLAT * sigma or np.ptp(v) == 0)
+
+
+def _is_saturated(v: Float[np.ndarray, " time"], step: float, recording: Recording) -> bool:
+    """Samples at the converter's rails, or a flat top entered and left in jumps."""
+    if recording.adc_range is not None:
+        low, high = recording.adc_range
+        return bool((v <= low + step / 2).any() or (v >= high - step / 2).any())
+    for extreme in (v.max(), v.min()):
+        at_rail = v == extreme
+        edges = np.flatnonzero(np.diff(np.concatenate([[0], at_rail.astype(np.int8), [0]])))
+        for start, stop in edges.reshape(-1, 2):
+            inside = start > 0 and stop < v.size
+            if stop - start < RAIL or not inside:
+                continue
+            floor = step if step > 0 else np.ptp(v) / 2**16
+            jump = min(abs(v[start - 1] - extreme), abs(v[stop] - extreme))
+            if jump > JUMP * floor:
+                return True
+    return False
+
+
+def _is_unconnected(seen: Inspected) -> bool:
+    """Whether v_out is v_th, but for noise, an offset and a part of a sample of delay."""
+    x, y = (v - v.mean() for v in seen.aligned)
+    variance = seen.sigma_th**2 + seen.sigma_out**2
+    power = x @ x - x.size * seen.sigma_th**2
+    if abs((x @ y) / power - 1) > EQUAL + STEP * math.sqrt(variance / power):
+        return False
+    late = np.gradient(x)
+    rest = y - x
+    rest = rest - late * ((late @ rest) / (late @ late))
+    return bool(rest @ rest <= x.size * SAME * variance + LATE**2 * power)

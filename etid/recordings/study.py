@@ -1,0 +1,254 @@
+"""A study: many recordings by path, in memory or in a file."""
+
+import dataclasses
+import difflib
+import os
+from collections.abc import Callable, Collection, Hashable, Iterable, Iterator, Mapping
+
+import numpy.typing as npt
+
+from etid.recordings.recording import (
+    LABELS,
+    AbstractSource,
+    Label,
+    Layout,
+    Metadata,
+    Recording,
+    RecordingError,
+    wanted_labels,
+)
+from etid.recordings.writing import write
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class _InMemory(AbstractSource):
+    """A recording that needs no loading."""
+
+    recording: Recording
+
+    @property
+    def metadata(self) -> Metadata:
+        return self.recording.metadata
+
+    @property
+    def layout(self) -> tuple[Layout, ...]:
+        return tuple(
+            Layout(
+                name, record.stored.dtype.str, record.stored.size, record.conversion, record.offset
+            )
+            for name, record in self.recording.samples.items()
+        )
+
+    @property
+    def unloaded(self) -> Hashable:
+        return id(self.recording.samples["v_th"])
+
+    def blocks(self, name: str) -> Iterator[npt.NDArray]:
+        yield self.recording.samples[name].stored
+
+    def load(self) -> Recording:
+        return self.recording
+
+
+def refuse_nested(paths: Collection[str]) -> None:
+    """Refuse paths of which one lies inside another."""
+    for path in paths:
+        outer = path.rpartition("/")[0]
+        while outer:
+            if outer in paths:
+                raise RecordingError(
+                    f"lies inside another recording, {outer!r}",
+                    path=path,
+                    remedy="Give it a path beside the other",
+                )
+            outer = outer.rpartition("/")[0]
+
+
+class Study(Mapping[str, Recording]):
+    """Recordings by path, in order; those of a file are loaded when they are accessed.
+
+    Build one with `Study.from_recordings` or `etid.read`.  A study that comes from a file holds it
+    open: use `with`, or `close()`.
+
+    Attributes:
+        file: Path of the file it comes from; empty in memory.
+        problems: Recordings of the file that cannot be read, by path; accessing one raises it.
+    """
+
+    def __init__(
+        self,
+        sources: Mapping[str, AbstractSource],
+        *,
+        problems: Mapping[str, RecordingError] | None = None,
+        file: str = "",
+        close: Callable[[], None] | None = None,
+    ) -> None:
+        self._sources = dict(sources)
+        self._close = close
+        self.problems: dict[str, RecordingError] = dict(problems or {})
+        self.file = file
+
+    @classmethod
+    def from_recordings(cls, recordings: Iterable[Recording]) -> "Study":
+        """A study in memory; recordings without a path become `loaded/0`, `loaded/1`, ….
+
+        Args:
+            recordings: Calibrations and loaded recordings.
+
+        Returns:
+            The study, in the order of the recordings.
+
+        Raises:
+            RecordingError: Two recordings have the same path, or one lies inside another.
+        """
+        sources: dict[str, AbstractSource] = {}
+        unnamed = {"loaded": 0, "calibration": 0}
+        for recording in recordings:
+            kind = recording.metadata.kind
+            if not recording.path:
+                recording = recording.replace(path=f"{kind}/{unnamed[kind]}")
+                unnamed[kind] += 1
+            if recording.path in sources:
+                raise RecordingError(
+                    "two recordings have this path",
+                    path=recording.path,
+                    remedy="Give each recording a path of its own",
+                )
+            sources[recording.path] = _InMemory(recording)
+        refuse_nested(sources)
+        return cls(sources)
+
+    def __getitem__(self, path: str) -> Recording:
+        return self.source(path).load()
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._sources)
+
+    def __len__(self) -> int:
+        return len(self._sources)
+
+    def __contains__(self, path: object) -> bool:
+        return isinstance(path, str) and path.strip("/") in self._sources
+
+    def __eq__(self, other: object) -> bool:
+        return self is other  # a Mapping would load and compare every sample
+
+    def __hash__(self) -> int:
+        return id(self)
+
+    def source(self, path: str) -> AbstractSource:
+        """What the study holds at a path, without its samples.
+
+        Raises:
+            RecordingError: The recording at that path cannot be read.
+            KeyError: There is none; the message names those that are near.
+        """
+        tidy = path.strip("/")
+        if tidy in self._sources:
+            return self._sources[tidy]
+        if (tidy or "/") in self.problems:
+            raise self.problems[tidy or "/"]
+        rows = [name for name in self._sources if name.startswith(f"{tidy}/")]
+        if rows:
+            raise KeyError(
+                f"{path!r} is a group of {len(rows)} recordings: {rows[0]!r} … {rows[-1]!r}"
+            )
+        near = difflib.get_close_matches(tidy, self._sources, n=3)
+        known = ", ".join(repr(name) for name in near or list(self._sources)[:3])
+        raise KeyError(f"no recording {path!r}; this study has {len(self)}, such as {known}")
+
+    def metadata(self, path: str) -> Metadata:
+        """All fields of a recording but its samples, which are not read.
+
+        Raises:
+            RecordingError: The recording at that path cannot be read.
+            KeyError: There is none.
+        """
+        return self.source(path).metadata
+
+    def recordings(self) -> Iterator[Recording]:
+        """The recordings one after the other, each loaded when its turn comes."""
+        return (source.load() for source in self._sources.values())
+
+    def where(
+        self,
+        *,
+        subject: Label | None = None,
+        condition: Label | None = None,
+        electrode: Label | None = None,
+        trial: Label | None = None,
+    ) -> "Study":
+        """The recordings whose labels equal those given; no samples are read.
+
+        Args:
+            subject: Who.
+            condition: Which state of the skin, or which circuit.
+            electrode: Which electrode of the display.
+            trial: Which repetition.
+
+        Returns:
+            A study that reads from the same file.
+        """
+        given = zip(LABELS, (subject, condition, electrode, trial), strict=True)
+        wanted = wanted_labels(dict(given), LABELS)
+        return self._part(
+            lambda metadata: all(getattr(metadata, name) == label for name, label in wanted.items())
+        )
+
+    @property
+    def calibrations(self) -> "Study":
+        """The recordings with a known resistor."""
+        return self._part(lambda metadata: metadata.kind == "calibration")
+
+    @property
+    def loaded(self) -> "Study":
+        """The recordings with an unknown load."""
+        return self._part(lambda metadata: metadata.kind == "loaded")
+
+    def _part(self, belongs: Callable[[Metadata], bool]) -> "Study":
+        chosen = {
+            path: source for path, source in self._sources.items() if belongs(source.metadata)
+        }
+        return Study(chosen, problems=self.problems, file=self.file, close=self._close)
+
+    def write(self, path: str | os.PathLike[str]) -> None:
+        """Write the study to an HDF5 file, whole or not at all.
+
+        Recordings `g/0 … g/T-1`, at least two and all that lie below `g`, become one stacked group
+        `g` if they are loaded and agree in everything but samples and trial; if they also share one
+        `v_th`, it is stored once.  Every other recording becomes a group of its own.  Reading the
+        file gives the same paths, stored integers and metadata.
+
+        Args:
+            path: The file; one that exists is replaced at the end.
+
+        Raises:
+            RecordingError: The study holds recordings that cannot be read, names calibrations that
+                it does not hold, or the file cannot be written.
+        """
+        if self.problems:
+            raise RecordingError(
+                f"{len(self.problems)} recordings of the study cannot be read",
+                file=self.file,
+                remedy="Leave them out with Study.from_recordings(study.recordings())",
+            )
+        write(self._sources, path)
+
+    def close(self) -> None:
+        """Close the file that the study, and every part of it, reads from."""
+        if self._close is not None:
+            self._close()
+
+    def __enter__(self) -> "Study":
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        self.close()
+
+    def __repr__(self) -> str:
+        place = f" {self.file!r}" if self.file else ""
+        bad = f", {len(self.problems)} that cannot be read" if self.problems else ""
+        calibrations = sum(s.metadata.kind == "calibration" for s in self._sources.values())
+        return (
+            f"<Study{place}: {calibrations} calibrations, {len(self) - calibrations} loaded{bad}>"
+        )

@@ -1,0 +1,215 @@
+"""Pictures of a whole study, as clear with 100 000 fits as with ten: no mark for each fit.
+
+Every function returns the picture as SVG, which is the same for the same fits.
+"""
+
+import dataclasses
+import io
+from collections.abc import Mapping, Sequence
+
+import matplotlib
+import matplotlib.ticker
+import numpy as np
+from jaxtyping import Float
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from etid.circuits.circuit import DISPLAY, heading
+from etid.plotting import figure_of
+from etid.plotting.style import COLOURS, DASHES, MARKS, new_figure
+from etid.report.tables import Components, frequent
+from etid.results.driver import Driver
+from etid.results.fits import Fits
+
+POINTS = 300  # of a curve
+BINS = 40
+FAR = 1e6  # between the ends of an axis, above which it has powers of ten
+NARROW = 3.0  # between the largest and the smallest value, above which an axis is logarithmic
+NAMED = 30  # subjects that have their names below an axis
+CROWD = 120  # subjects that are drawn
+SERIES = 4  # conditions that are told apart
+QUARTILES, MOST = (0.25, 0.75), (0.05, 0.95)
+
+
+def svg(figure: Figure) -> bytes:
+    """A figure as SVG, without dates and random names."""
+    buffer = io.BytesIO()
+    with matplotlib.rc_context({"svg.hashsalt": "etid"}):
+        figure.savefig(buffer, format="svg", metadata={"Date": None})
+    return buffer.getvalue()
+
+
+def _positive(values: np.ndarray) -> Float[np.ndarray, " value"]:
+    return np.asarray(values)[np.isfinite(values) & (np.asarray(values) > 0)]
+
+
+def _steps(axis: Axes, values: np.ndarray, series: int, label: str) -> None:
+    """An empirical distribution function of at most `POINTS` points."""
+    p = np.linspace(0.0, 1.0, min(POINTS, values.size) + 1)
+    axis.step(
+        np.quantile(values, p, method="inverted_cdf"), 100 * p, ls=DASHES[series],
+        where="post", color=COLOURS[series], lw=1.3, label=label,
+    )  # fmt: skip
+
+
+def distributions(fits: Fits) -> bytes:
+    """Part of the successful fits below each value, for each element and condition."""
+    good, units = fits.successful(), fits.circuit.units()
+    figure, axes = new_figure(1, len(units), (3.4 * len(units) + 1, 3.0), sharey=True)
+    for axis, (name, unit) in zip(axes[0], units.items(), strict=True):
+        scale = DISPLAY[unit][0]
+        for series, condition in enumerate(frequent(fits, SERIES)):
+            values = _positive(getattr(good.where(condition=condition).circuit, name)) / scale
+            if values.size:
+                _steps(axis, values, series, f"{_short(condition) or 'all'} ({values.size})")
+        axis.set(xlabel=heading(name, unit))
+        low, high = axis.dataLim.intervalx
+        if 0 < NARROW * low < high:
+            axis.set_xscale("log")
+            _plain(axis, "x")
+        else:
+            axis.xaxis.set_major_locator(matplotlib.ticker.MaxNLocator(5))
+    axes[0, 0].set_ylabel("fits below [%]")
+    axes[0, 0].legend(frameon=False, fontsize=8)
+    return svg(figure)
+
+
+def _plain(axis: Axes, which: str) -> None:
+    """Write 20 and 50 at a logarithmic axis of few decades, 0.1 and 10 at a longer one."""
+    of = axis.xaxis if which == "x" else axis.yaxis
+    low, high = sorted(of.get_view_interval())
+    if 0 < low and high < FAR * low:
+        few = high < FAR**0.5 * low
+        of.set_major_locator(matplotlib.ticker.LogLocator(subs=(1.0, 2.0, 5.0) if few else (1.0,)))
+        of.set_major_formatter(matplotlib.ticker.FormatStrFormatter("%g"))
+        of.set_minor_formatter(matplotlib.ticker.NullFormatter())
+
+
+def quality(chi2: Float[np.ndarray, " fit"], stderr: Float[np.ndarray, " fit"]) -> bytes:
+    """Histograms of χ² and of the largest relative standard error."""
+    figure, axes = new_figure(1, 2, (10.0, 2.6))
+    left, right = axes[0]
+    left.axvline(1.0, color=COLOURS[3], lw=1.0, ls=":")
+    left.set(xlabel="χ² per degree of freedom", ylabel="fits")
+    right.set(xlabel="largest relative standard error [%]", ylabel="fits")
+    for axis, values in ((left, chi2), (right, 100 * stderr)):
+        known = _positive(values)
+        if known.size:
+            wide = known.max() > NARROW * known.min()
+            space = np.geomspace if wide else np.linspace
+            count = min(BINS, 4 + 2 * round(np.sqrt(known.size)))
+            bins = space(0.99 * known.min(), 1.01 * known.max(), count).tolist()
+            axis.yaxis.set_major_locator(matplotlib.ticker.MaxNLocator("auto", integer=True))
+            axis.hist(known, bins=bins, color=COLOURS[0], edgecolor="white", lw=0.3)
+            if wide:
+                axis.set_xscale("log")
+                _plain(axis, "x")
+    return svg(figure)
+
+
+def by_subject(fits: Fits) -> bytes:
+    """Median of each subject, with the middle half and nine tenths of their fits as bars.
+
+    Of more than `CROWD` subjects some are drawn, evenly spaced in the order of their medians.
+    """
+    good, units = fits.successful(), fits.circuit.units()
+    subjects, place = np.unique(good.labels["subject"].astype(str), return_inverse=True)
+    named = subjects.size <= NAMED
+    conditions = frequent(fits, SERIES)
+    width = min(14.0, max(10.0, 0.35 * subjects.size))
+    figure, axes = new_figure(len(units), 1, (width, 2.2 * len(units)), sharex=True)
+    thin = 1.0 if subjects.size <= 2 * NAMED else 0.5
+    for axis, (name, unit) in zip(axes[:, 0], units.items(), strict=True):
+        scale = DISPLAY[unit][0]
+        values = np.asarray(getattr(good.circuit, name)) / scale
+        for series, condition in enumerate(conditions):
+            chosen = good.labels["condition"] == condition
+            where, found = _quantiles(place[chosen], values[chosen])
+            if subjects.size > CROWD:
+                where, found = _thinned(found)
+            where = where + (series + 0.5) / len(conditions) * 0.8 - 0.4
+            colour = COLOURS[series]
+            axis.vlines(where, found[0], found[4], color=colour, lw=0.8 * thin)
+            axis.vlines(where, found[1], found[3], color=colour, lw=2.6 * thin)
+            axis.plot(
+                where, found[2], MARKS[series], color=colour, ms=4.5 * thin,
+                markerfacecolor="white", label=_short(condition) or "all",
+            )  # fmt: skip
+        axis.set(yscale="log", ylabel=heading(name, unit))
+        _plain(axis, "y")
+    last = axes[-1, 0]
+    if named:
+        names = [_short(subject) or "-" for subject in subjects]
+        turned = sum(map(len, names)) > 10 * width
+        last.set_xticks(range(subjects.size), names, rotation=90 if turned else 0)
+    elif subjects.size > CROWD:
+        last.set_xticks([])
+    last.set_xlabel("subject" if named else "subjects")
+    axes[0, 0].legend(frameon=False, fontsize=8, ncols=SERIES)
+    return svg(figure)
+
+
+def _thinned(found: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """`CROWD` of the subjects, in the order of their medians."""
+    order = np.argsort(found[2], kind="stable")
+    chosen = order[np.linspace(0, order.size - 1, min(CROWD, order.size)).round().astype(int)]
+    return np.linspace(0.0, CROWD - 1.0, chosen.size), found[:, chosen]
+
+
+def plain(name: str) -> str:
+    """A name for a picture, where dollar signs would be read as mathematics."""
+    return name.replace("$", r"\$")
+
+
+def _short(name: str, length: int = 16) -> str:
+    return plain(name if len(name) <= length else name[: length - 1] + "…")
+
+
+def _quantiles(place: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Places that occur, and five quantiles of the values at each."""
+    order = np.argsort(place, kind="stable")
+    where, starts = np.unique(place[order], return_index=True)
+    levels = (MOST[0], QUARTILES[0], 0.5, QUARTILES[1], MOST[1])
+    found = [np.quantile(part, levels) for part in np.split(values[order], starts[1:])]
+    return where.astype(float), np.array(found).reshape(where.size, 5).T
+
+
+def components(found: Sequence[Components], conditions: Sequence[str]) -> bytes:
+    """What varies and what is error, beside each other on one scale."""
+    names = list(dict.fromkeys(one.name for one in found))
+    parts = list(found[0].parts)
+    figure, axes = new_figure(1, len(names), (3.4 * len(names) + 1, 2.6), sharey=True)
+    for axis, name in zip(axes[0], names, strict=True):
+        for series, condition in enumerate(conditions):
+            chosen = [one for one in found if (one.name, one.condition) == (name, condition)]
+            for one in chosen:
+                sizes = 100 * np.array(list(one.parts.values()))
+                shift = 0.15 * (series - (len(conditions) - 1) / 2)
+                shown = np.isfinite(sizes) & (sizes > 0)
+                axis.plot(
+                    sizes[shown], np.arange(len(parts))[shown] + shift, MARKS[series],
+                    color=COLOURS[series], ms=6, label=_short(condition) or "all",
+                )  # fmt: skip
+        axis.set(xscale="log", xlabel=f"{name}: part of the median [%]")
+        low, high = axis.dataLim.intervalx
+        if 0 < low <= high < np.inf:
+            axis.set_xlim(low / NARROW, high * NARROW)
+        _plain(axis, "x")
+    axes[0, 0].set_yticks(range(len(parts)), parts)
+    axes[0, 0].set_ylim(len(parts) - 0.5, -0.5)
+    axes[0, 0].legend(frameon=False, fontsize=8)
+    return svg(figure)
+
+
+def each_fit(fits: Fits) -> bytes:
+    """Every fit with its standard error, by subject."""
+    labels = {
+        name: np.array([_short(str(label)) for label in fits.labels[name]])
+        for name in ("subject", "condition")
+    }
+    return svg(figure_of(dataclasses.replace(fits, labels={**fits.labels, **labels})))
+
+
+def drivers(found: Mapping[str, Driver]) -> bytes:
+    """Z_th of some drivers, with bands of two standard errors."""
+    return svg(figure_of({_short(name, 60): driver for name, driver in found.items()}))

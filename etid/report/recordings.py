@@ -1,0 +1,145 @@
+"""Waveforms of single fits of a study, if its recordings can be found."""
+
+import os
+import pathlib
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from etid.circuits.circuit import DISPLAY
+from etid.plotting import figure_of
+from etid.recordings.hdf5 import read
+from etid.recordings.recording import LABELS, Recording, RecordingError
+from etid.recordings.study import Study
+from etid.report.figures import plain, svg
+from etid.report.html import Picture
+from etid.report.tables import significant
+from etid.results.driver import Driver
+from etid.results.fits import Fit, plus_minus
+from etid.results.study_fits import StudyFits
+
+
+class Recordings:
+    """The recordings that fits were made from, wherever they are now.
+
+    Attributes:
+        study: The recordings; None if they were not found.
+        problem: What is wrong with them, in words; empty if nothing is.
+    """
+
+    def __init__(
+        self,
+        found: StudyFits,
+        file: pathlib.Path | None,
+        given: str | os.PathLike[str] | Study | None,
+    ):
+        """Look for them.
+
+        Args:
+            found: The fits.
+            file: Their file, beside which the recordings may lie.
+            given: The recordings or their file, if they need not be looked for.
+
+        Raises:
+            RecordingError: `given` is not a file of recordings.
+        """
+        self.study: Study | None = None
+        self.problem = ""
+        self._opened = False
+        self._found = found
+        if isinstance(given, Study):
+            self.study = given
+        elif given is not None:
+            self._open(pathlib.Path(given))
+        else:
+            self._look(file)
+
+    def _open(self, path: pathlib.Path) -> None:
+        self.study, self._opened = read(path), True
+        settings = self._found.settings
+        if settings is not None and settings.source_size not in (0, path.stat().st_size):
+            self.problem = (
+                f"{path} has changed since the fits were made: it had {settings.source_size} bytes "
+                f"and has {path.stat().st_size} now. What is drawn may not be what was identified."
+            )
+
+    def _look(self, file: pathlib.Path | None) -> None:
+        settings = self._found.settings
+        remedy = "Name their file: etid report FITS --recordings FILE."
+        if settings is None or not settings.source:
+            self.problem = f"The fits do not say where their recordings are. {remedy}"
+            return
+        places = [pathlib.Path(settings.source)]
+        if file is not None:
+            places.append(file.absolute().parent / places[0].name)
+        for path in places:
+            if path.is_file():
+                try:
+                    self._open(path)
+                except RecordingError as error:
+                    self.problem = f"{error}. {remedy}"
+                return
+        tried = " and ".join(dict.fromkeys(map(str, places)))
+        self.problem = f"The recordings were not found: there is no {tried}. {remedy}"
+
+    def close(self) -> None:
+        """Close the file, if it was opened here."""
+        if self.study is not None and self._opened:
+            self.study.close()
+
+    def picture(self, path: str, fit: Fit, text: str) -> Picture | None:
+        """One pulse as it was measured and as it is predicted; None if it cannot be read.
+
+        Args:
+            path: Of the recording.
+            fit: What was identified in it.
+            text: Below the picture.
+        """
+        if self.study is None:
+            return None
+        try:
+            recording = self.study[path]
+        except (RecordingError, KeyError):
+            return None
+        names = ("path", *LABELS)
+        shown = recording.replace(**{name: plain(getattr(recording, name)) for name in names})
+        figure, why = self._predicted(shown, fit)
+        elements = _elements(fit)
+        about = f"{path}: {fit.verdict} ({text})."
+        if why:
+            alt = f"Measured voltages of {path}; no prediction."
+            caption = f"{about} No prediction: {why}"
+        else:
+            alt = f"One pulse of {path}: measured, predicted and residual voltage. {elements}"
+            caption = f"{about} χ² {significant(float(fit.chi2), 3)}, {elements}."
+        return Picture(caption, svg(figure), alt)
+
+    def _predicted(self, recording: Recording, fit: Fit) -> tuple[Figure, str]:
+        """One pulse with its prediction; without one, also why."""
+        driver = self._driver(recording)
+        values = np.asarray(fit.circuit.values())
+        if driver is None:
+            return figure_of(recording), "the fits hold no driver for it."
+        if (values <= 0).any():
+            return figure_of(recording), "an element is not positive."
+        why = "" if np.isfinite(values).all() else "no circuit was identified."
+        try:
+            return figure_of(fit, recording, driver), why
+        except ValueError as error:
+            return figure_of(recording), f"{error}."
+
+    def _driver(self, recording: Recording) -> Driver | None:
+        assert self.study is not None
+        names = recording.calibration or tuple(self.study.calibrations)
+        return self._found.drivers.get(names)
+
+
+def _elements(fit: Fit) -> str:
+    """The elements with their standard errors, in words."""
+    parts = []
+    for name, unit in fit.circuit.units().items():
+        scale, symbol = DISPLAY[unit]
+        value = float(getattr(fit.circuit, name)) / scale
+        error = float(getattr(fit.stderr, name)) / scale
+        parts.append(" ".join(f"{name} {plus_minus(value, error)} {symbol}".split()))
+    return ", ".join(parts)

@@ -1,0 +1,272 @@
+"""A study on one page: what was identified, how well, what went wrong, and with which methods.
+
+The page needs no network, prints, and has a few megabytes at most, whatever the number of fits.
+"""
+
+import os
+import pathlib
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from etid.recordings.study import Study
+from etid.report import tables as study_tables
+from etid.report.html import Picture, Section, write_page
+from etid.report.methods import methods_section, words
+from etid.report.worst_fits import choose, relative_stderr
+from etid.results.fits import Fits
+from etid.results.study_fits import StudyFits
+from etid.signals.precision import require_float64
+
+FEW = 300  # fits that are drawn one by one
+DRIVERS = 4  # drawn in one diagram
+
+
+def write_report(
+    fits: str | os.PathLike[str] | StudyFits | Fits,
+    page: str | os.PathLike[str],
+    *,
+    recordings: str | os.PathLike[str] | Study | None = None,
+) -> None:
+    """Write a report on the fits of a study: one HTML page that needs no other file.
+
+    It has the verdicts, the drivers, what varies between subjects and recordings apart from what is
+    error, tables and distributions, the worst fits with their waveforms, and a paragraph on methods
+    with its BibTeX.
+
+    Args:
+        fits: File of fits, or what an identification has returned.
+        page: HTML file to write.
+        recordings: The recordings, of which the worst are drawn. If not given, they are looked for
+            where the fits say that they came from, and beside the file of fits; where they are not
+            found, the report says so.
+
+    Raises:
+        ValueError: `fits` is not a file of fits, or holds none, or `page` would replace it.
+        RecordingError: `recordings` is not a file of recordings.
+    """
+    from etid.report.recordings import Recordings  # matplotlib is imported by the first picture
+
+    require_float64()
+    file = None if isinstance(fits, StudyFits | Fits) else pathlib.Path(fits)
+    if isinstance(fits, StudyFits):
+        found = fits
+    elif isinstance(fits, Fits):
+        found = StudyFits(fits, {}, {})
+    else:
+        found = StudyFits.read(fits)
+    if not len(found.fits):
+        raise ValueError(f"{file or 'fits'}: there is no fit to report on")
+    for read in (file, recordings):
+        if isinstance(read, str | os.PathLike) and _same(read, page):
+            raise ValueError(f"{page} would replace a file that is read; name another page")
+    name = "fits" if file is None else file.name
+    place = Recordings(found, file, recordings)
+    try:
+        groups = found.fits.summary("subject", "condition")
+        stderr = relative_stderr(found.fits)
+        sections = [
+            _verdicts(found.fits),
+            _drivers(found),
+            _elements(found.fits, groups),
+            _subjects(found.fits, groups),
+            *_electrodes(found.fits),
+            _quality(found.fits, stderr),
+            _worst(found.fits, place),
+            methods_section(found),
+        ]
+    finally:
+        place.close()
+    write_page(page, f"Report on {name}", _summary(found), sections)
+
+
+def _same(one: str | os.PathLike[str], other: str | os.PathLike[str]) -> bool:
+    return os.path.exists(one) and os.path.exists(other) and os.path.samefile(one, other)
+
+
+def _summary(found: StudyFits) -> str:
+    """The study in two sentences."""
+    fits, settings = found.fits, found.settings
+    good = fits.counts().get("successful", 0)
+    source = pathlib.Path(settings.source).name if settings is not None else ""
+    text = f"{len(fits)} recordings{f' of {source}' if source else ''}"
+    for label in ("subject", "condition", "electrode"):
+        count = len(set(map(str, fits.labels[label])) - {""})
+        if count:
+            text += f", {count} {label}{'s' if count > 1 else ''}"
+    text += f", identified as {type(fits.circuit).__name__} by {words(fits.fit.method)}. "
+    share = f"{100 * good / len(fits):.1f} %"
+    return text + f"{good} fits ({share}) are successful; only these enter medians and spreads."
+
+
+def _verdicts(fits: Fits) -> Section:
+    text = "Every recording ends in a verdict; successful is the only good one."
+    return Section("Verdicts", text, (study_tables.verdicts(fits),))
+
+
+def _drivers(found: StudyFits) -> Section:
+    from etid.report import figures
+
+    if not (found.drivers or found.failures):
+        text = "These fits do not say with which driver they were made."
+        return Section("Drivers", warning=text)
+    text = (
+        "The source impedance Z_th, identified from calibrations with known resistors R_L. Its "
+        "error passes into all fits made with it. χ² is 1 where the model explains a record down "
+        "to its noise."
+    )
+    count = len(found.drivers) + len(found.failures)
+    if count > study_tables.ROWS:
+        text += f" {study_tables.ROWS} of {count} are shown, those without success first."
+    shown = {", ".join(paths): driver for paths, driver in found.drivers.items()}
+    shown = dict(sorted(shown.items())[:DRIVERS])
+    pictures = ()
+    if shown:
+        caption = "Source impedance"
+        if len(found.drivers) > DRIVERS:
+            caption += f" of the first {DRIVERS} of {len(found.drivers)} drivers"
+        caption += ", with bands of two standard errors where the method has one."
+        alt = f"Bode diagram of Z_th of {', '.join(shown)}."
+        pictures = (Picture(caption, figures.drivers(shown), alt),)
+    table = study_tables.drivers(found.drivers, found.failures)
+    return Section("Drivers", text, (table,), pictures)
+
+
+def _elements(fits: Fits, groups: Sequence[Mapping[str, Any]]) -> Section:
+    from etid.report import figures
+
+    found = study_tables.components(fits, groups)
+    if not found:
+        return Section("Elements", warning="No fit is successful: there is nothing to average.")
+    units = fits.circuit.units()
+    text = (
+        "What varies and what is error, apart. Between subjects: standard deviation of their "
+        "medians. Between recordings: what really varies between the recordings of one subject in "
+        "one condition, sqrt(spread² - own²), the median over subjects; 0 if noise explains all. "
+        "Own error: standard error due to the noise of one recording. Shared error: standard error "
+        "due to the driver, which all recordings with that driver have in common, so that no "
+        "spread shows it and no number of trials reduces it. An empty cell is what the study "
+        "cannot tell."
+    )
+    conditions = len(set(map(str, fits.labels["condition"])))
+    if conditions > study_tables.CONDITIONS:
+        text += (
+            f" The {study_tables.CONDITIONS} most frequent of {conditions} conditions are shown."
+        )
+    shown = "each condition"
+    if conditions > figures.SERIES:
+        shown = f"the {figures.SERIES} most frequent conditions"
+    pictures = (
+        Picture(
+            f"Part of the successful fits below a value, for {shown} (number of fits).",
+            figures.distributions(fits),
+            f"Distribution functions of {', '.join(units)} by condition; quantiles are in the "
+            "table.",
+            whole=True,
+        ),
+        Picture(
+            f"What varies and what is error, in per cent of the median, for {shown}. Zeros are "
+            "left out.",
+            figures.components(found, study_tables.frequent(fits, figures.SERIES)),
+            "Between subjects, between recordings, own error and shared error of each element by "
+            "condition, on a logarithmic scale; the numbers are in the table.",
+            whole=True,
+        ),
+    )
+    return Section("Elements", text, (study_tables.show_components(found, units),), pictures)
+
+
+def _subjects(fits: Fits, groups: Sequence[Mapping[str, Any]]) -> Section:
+    from etid.report import figures
+
+    good = fits.successful()
+    text = (
+        "Medians of the successful fits, to two digits of their standard error; and in per cent of "
+        "the median what really varies between the recordings, their own error and the shared one."
+    )
+    pictures = ()
+    if len(good) > FEW:
+        caption = (
+            "Each subject's median, the middle half of the successful fits (thick) and nine tenths "
+            "of them (thin)."
+        )
+        count = len({str(group["subject"]) for group in groups})
+        if count > figures.CROWD:
+            caption += (
+                f" Of {count} subjects {figures.CROWD} are drawn, evenly spaced in the order "
+                "of their medians."
+            )
+        alt = "Medians and quantiles of each element by subject and condition."
+        pictures = (Picture(caption, figures.by_subject(fits), alt, whole=True),)
+    elif len(good):
+        caption = "All fits with their standard errors; hollow without success."
+        alt = "Each element of each fit by subject and condition, with standard errors."
+        pictures = (Picture(caption, figures.each_fit(fits), alt, whole=True),)
+    return _grouped("Subjects", text, groups, ("subject", "condition"), fits, pictures)
+
+
+def _electrodes(fits: Fits) -> list[Section]:
+    if len(set(map(str, fits.labels["electrode"]))) < 2:
+        return []
+    text = "The same by electrode. Subjects are part of what varies here."
+    rows = fits.summary("electrode", "condition")
+    return [_grouped("Electrodes", text, rows, ("electrode", "condition"), fits, ())]
+
+
+def _grouped(
+    heading: str,
+    text: str,
+    rows: Sequence[Mapping[str, Any]],
+    by: tuple[str, ...],
+    fits: Fits,
+    pictures: tuple[Picture, ...],
+) -> Section:
+    if len(rows) > study_tables.ROWS:
+        call = ", ".join(f'"{name}"' for name in by)
+        text += (
+            f" {study_tables.ROWS} of {len(rows)} groups are shown, those with the largest share "
+            f"of fits without success; etid.Fits.summary({call}) has all."
+        )
+    table = study_tables.groups(rows, by, fits.circuit.units())
+    return Section(heading, text, (table,), pictures)
+
+
+def _quality(fits: Fits, stderr: np.ndarray) -> Section:
+    from etid.report import figures
+
+    good = fits.verdicts == "successful"
+    pictures = ()
+    if good.any():
+        caption = (
+            "Successful fits: χ² per degree of freedom, 1 (dotted) where the residual is noise, "
+            "and the standard error of the element that is known worst."
+        )
+        alt = "Histograms of χ² and of the largest relative standard error."
+        drawn = figures.quality(np.asarray(fits.chi2)[good], stderr[good])
+        pictures = (Picture(caption, drawn, alt, whole=True),)
+    failed = int((~good).sum())
+    text = f"{failed} fits are without success." if failed else "All fits are successful."
+    if failed > study_tables.BRIEF:
+        text += f" The first {study_tables.BRIEF} are listed; the file of fits has all."
+    tables = (study_tables.failures(fits),) if failed else ()
+    return Section("Quality", text, tables, pictures)
+
+
+def _worst(fits: Fits, place: Any) -> Section:
+    text = (
+        "First some without success, of as many verdicts as there are and in each those with the "
+        "largest χ²; then the successful ones with the largest χ² and with the largest standard "
+        "error. One pulse of each is drawn. Where the model is right, the residual is noise."
+    )
+    pictures, missing = [], []
+    for one in choose(fits):
+        path = str(fits.labels["path"][one.row])
+        picture = place.picture(path, fits[one.row], one.reason)
+        if picture is None:
+            missing.append(f"{path} ({one.reason})")
+        else:
+            pictures.append(picture)
+    if missing:
+        text += f"\n\nWithout a waveform, because they cannot be read: {', '.join(missing)}."
+    return Section("Worst fits", text, (), tuple(pictures), warning=place.problem)

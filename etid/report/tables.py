@@ -1,0 +1,256 @@
+"""Tables of a study: verdicts, drivers, elements by group, and where their variance comes from.
+
+They stay readable for any number of fits: a long one is cut to `ROWS`, and says so.
+"""
+
+import dataclasses
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from etid.circuits.circuit import DISPLAY, heading
+from etid.report.html import Table
+from etid.results.driver import Driver
+from etid.results.fits import Fits, plus_minus
+from etid.results.verdicts import message
+
+ROWS = 100  # of a table, above which it is cut
+CONDITIONS = 30  # of a table
+BRIEF = 50  # rows of a table that lists single recordings
+PARTS = ("between", "own", "shared")  # of a spread, as `Fits.summary` has them
+
+
+def significant(value: float, digits: int = 2) -> str:
+    """A number to some significant digits; empty where there is none."""
+    if not math.isfinite(value):
+        return ""
+    if abs(value) >= 1e6 or 0 < abs(value) < 1e-4:
+        return f"{value:.{digits - 1}e}"
+    return np.format_float_positional(value, precision=digits, fractional=False, trim="-")
+
+
+def element(value: float, error: float, unit: str) -> str:
+    """An element with its standard error, both in the unit in which they are printed."""
+    scale = DISPLAY[unit][0]
+    return " ".join(plus_minus(value / scale, error / scale).split()) if value == value else ""
+
+
+def verdicts(fits: Fits) -> Table:
+    """How often each verdict occurs, and what it means."""
+    rows = tuple(
+        (name, str(count), f"{100 * count / len(fits):.1f}", message(name))
+        for name, count in fits.counts().items()
+    )
+    return Table(("verdict", "recordings", "share [%]", "what it means, what to do"), rows)
+
+
+def drivers(
+    found: Mapping[tuple[str, ...], Driver], failures: Mapping[tuple[str, ...], str]
+) -> Table:
+    """All drivers, those that failed first; at most `ROWS`."""
+    rows = [
+        (_calibrations(paths), "", "", "", "failed", "", "", "", text)
+        for paths, text in failures.items()
+    ]
+    chosen = sorted(found.items(), key=lambda item: (item[1].verdict == "successful", item[0]))
+    for paths, driver in chosen[: max(0, ROWS - len(rows))]:
+        z, error = _at_1_khz(driver)
+        resistors = [] if driver.calibration is None else driver.calibration.r_load.tolist()
+        rows.append(
+            (
+                _calibrations(paths),
+                ", ".join(f"{r / 1e3:.6g}" for r in resistors),
+                str(driver.order),
+                driver.method,
+                driver.verdict,
+                significant(100 * float(driver.rrse)),
+                significant(float(driver.chi2), 3),
+                element(abs(z), error, "ohm"),
+                message(driver.verdict),
+            )
+        )
+    heads = (
+        "calibrations", "R_L [kΩ]", "order", "estimator", "verdict", "RRSE [%]", "χ²",
+        "|Z_th| at 1 kHz [kΩ]", "remark",
+    )  # fmt: skip
+    if not any(row[-1] for row in rows):
+        return Table(heads[:-1], tuple(row[:-1] for row in rows))
+    return Table(heads, tuple(rows[:ROWS]))
+
+
+def _calibrations(paths: Sequence[str]) -> str:
+    shown = ", ".join(paths[:4])
+    return shown if len(paths) <= 4 else f"{shown} and {len(paths) - 4} more"
+
+
+def _at_1_khz(driver: Driver) -> tuple[complex, float]:
+    frequency = jnp.array([1e3])
+    z = complex(np.asarray(driver.response(frequency))[0])
+    return z, float(np.asarray(driver.response_stderr(frequency))[0])
+
+
+@dataclasses.dataclass(frozen=True)
+class Components:
+    """Where the variance of one element in one condition comes from, each part over the median.
+
+    Attributes:
+        condition: The condition.
+        name: The element.
+        subjects: How many have a success.
+        successful: Fits.
+        median: Of all [SI].
+        low: Their quantile of 5 % [SI].
+        high: Their quantile of 95 % [SI].
+        between_subjects: Standard deviation of the medians of the subjects.
+        between_recordings: What really varies between the recordings of one subject.
+        own: Standard error due to the noise of a recording.
+        shared: Standard error due to the driver.
+    """
+
+    condition: str
+    name: str
+    subjects: int
+    successful: int
+    median: float
+    low: float
+    high: float
+    between_subjects: float
+    between_recordings: float
+    own: float
+    shared: float
+
+    @property
+    def parts(self) -> dict[str, float]:
+        """The parts by name, NaN where the study cannot tell."""
+        return {
+            "between subjects": self.between_subjects,
+            "between recordings": self.between_recordings,
+            "own error": self.own,
+            "shared error": self.shared,
+        }
+
+
+def frequent(fits: Fits, count: int) -> list[str]:
+    """The most frequent conditions, in alphabetical order."""
+    names, counts = np.unique(fits.labels["condition"].astype(str), return_counts=True)
+    return sorted(names[np.argsort(-counts, kind="stable")[:count]].tolist())
+
+
+def components(fits: Fits, groups: Sequence[Mapping[str, Any]]) -> list[Components]:
+    """Spread and errors told apart, by element and the most frequent `CONDITIONS`.
+
+    Args:
+        fits: All fits.
+        groups: Their `summary("subject", "condition")`.
+    """
+    good = fits.successful()
+    found = []
+    for condition in frequent(fits, CONDITIONS):
+        rows = [g for g in groups if g["condition"] == condition and g["successful"]]
+        if not rows:
+            continue
+        chosen = good.where(condition=condition)
+        for name in fits.circuit.names():
+            medians = np.array([group[name] for group in rows])
+            values = np.asarray(getattr(chosen.circuit, name))
+
+            def part(key: str, of=name, rows=rows) -> float:
+                ratios = np.array([group[f"{of}_{key}"] / group[of] for group in rows])
+                known = ratios[np.isfinite(ratios)]
+                return float(np.median(known)) if known.size else math.nan
+
+            spread = float(np.std(medians, ddof=1)) if medians.size > 1 else math.nan
+            low, high = np.quantile(values, [0.05, 0.95]).tolist()
+            found.append(
+                Components(
+                    condition=condition,
+                    name=name,
+                    subjects=len(rows),
+                    successful=values.size,
+                    median=float(np.median(values)),
+                    low=low,
+                    high=high,
+                    between_subjects=spread / float(np.median(medians)),
+                    between_recordings=part("between"),
+                    own=part("own"),
+                    shared=part("shared"),
+                )
+            )
+    return found
+
+
+def show_components(found: Sequence[Components], units: Mapping[str, str]) -> Table:
+    """The components as a table."""
+    rows = []
+    for one in found:
+        scale = DISPLAY[units[one.name]][0]
+        rows.append(
+            (
+                one.condition or "all",
+                heading(one.name, units[one.name]),
+                str(one.subjects),
+                str(one.successful),
+                significant(one.median / scale, 4),
+                f"{significant(one.low / scale, 3)} to {significant(one.high / scale, 3)}",
+                *(significant(100 * value) for value in one.parts.values()),
+            )
+        )
+    heads = ("condition", "element", "subjects", "successful", "median", "5 % to 95 %")
+    return Table(
+        (*heads, "subjects", "recordings", "own", "shared"),
+        tuple(rows),
+        (("", len(heads)), ("between, of the median [%]", 2), ("standard error [%]", 2)),
+    )
+
+
+def groups(rows: Sequence[Mapping[str, Any]], by: Sequence[str], units: Mapping[str, str]) -> Table:
+    """Medians, spread and errors of each group of a summary.
+
+    Args:
+        rows: From `Fits.summary`; above `ROWS` those with the largest share of failures are shown.
+        by: The labels by which it was made.
+        units: Units of the elements.
+    """
+    shown = list(rows)
+    if len(shown) > ROWS:
+        worst = np.argsort([row["successful"] / row["fits"] for row in shown], kind="stable")
+        shown = [shown[i] for i in sorted(worst[:ROWS])]
+    cells = []
+    for row in shown:
+        line = [str(row[name]) or "-" for name in by]
+        line.append(f"{row['successful']}/{row['fits']}")
+        for name, unit in units.items():
+            median = row[name]
+            line.append(element(median, row[f"{name}_stderr"], unit).partition(" ±")[0])
+            line += [significant(100 * row[f"{name}_{k}"] / median) for k in PARTS]
+        cells.append(tuple(line))
+    heads = [*by, "successful"]
+    for unit in units.values():
+        heads += [heading("median", unit), *(f"{part} [%]" for part in PARTS)]
+    over = [(name, 1 + len(PARTS)) for name in units]
+    return Table(tuple(heads), tuple(cells), (("", len(by) + 1), *over))
+
+
+def failures(fits: Fits) -> Table:
+    """The first recordings without success, at most `BRIEF`."""
+    chosen = np.flatnonzero(fits.verdicts != "successful")[:BRIEF]
+    some = fits.take(chosen)
+    rows = []
+    for i, verdict in enumerate(some.verdicts):
+        note = str(some.notes[i])
+        rows.append(
+            (
+                *(str(some.labels[name][i]) or "-" for name in ("path", "subject", "condition")),
+                str(verdict),
+                significant(float(some.chi2[i]), 3),
+                significant(100 * float(some.rrse[i])),
+                "" if note == message(str(verdict)) else note,
+            )
+        )
+    heads = ("recording", "subject", "condition", "verdict", "χ²", "RRSE [%]", "note")
+    if not any(row[-1] for row in rows):
+        return Table(heads[:-1], tuple(row[:-1] for row in rows))
+    return Table(heads, tuple(rows))

@@ -1,0 +1,72 @@
+"""The fits of a study that are worth a look, and why."""
+
+import dataclasses
+from collections.abc import Iterable
+
+import numpy as np
+
+from etid.results.fits import Fits
+
+FAILED, STRAINED, UNCERTAIN = 6, 3, 3  # how many of each are shown
+
+
+@dataclasses.dataclass(frozen=True)
+class Worst:
+    """One of the worst fits.
+
+    Attributes:
+        row: Its place among the fits.
+        reason: Why it is one of them.
+    """
+
+    row: int
+    reason: str
+
+
+def relative_stderr(fits: Fits) -> np.ndarray:
+    """Largest relative standard error of the elements of each fit; NaN without one."""
+    ratios = [
+        np.asarray(getattr(fits.stderr, name)) / np.abs(np.asarray(getattr(fits.circuit, name)))
+        for name in fits.circuit.names()
+    ]
+    stacked = np.stack(ratios)
+    return np.where(np.isnan(stacked).any(axis=0), np.nan, stacked.max(axis=0))
+
+
+def choose(fits: Fits) -> list[Worst]:
+    """The worst fits: without success, then the largest χ², then the largest standard error.
+
+    Those without success are of as many verdicts as there are, the frequent ones first, so that
+    one cause with many recordings does not hide another. Among those of one verdict, the largest χ²
+    comes first.
+    """
+    names = fits.verdicts
+    chi2 = np.where(np.isfinite(fits.chi2), fits.chi2, -np.inf)
+    failing = [
+        _largest(np.flatnonzero(names == name), chi2)
+        for name in fits.counts()
+        if name != "successful"
+    ]
+    taken = [Worst(row, "without success") for row in _in_turn(failing, FAILED)]
+    good = np.flatnonzero(names == "successful")
+    for size, count, reason in (
+        (chi2, STRAINED, "largest χ² among the successful"),
+        (relative_stderr(fits), UNCERTAIN, "largest standard error among the successful"),
+    ):
+        seen = {one.row for one in taken}
+        known = good[np.isfinite(size[good])]
+        left = [row for row in _largest(known, size) if row not in seen]
+        taken += [Worst(row, reason) for row in left[:count]]
+    return taken
+
+
+def _largest(rows: np.ndarray, size: np.ndarray) -> list[int]:
+    """Rows in falling order of size, those of one size in their order; a few are enough."""
+    order = np.argsort(-size[rows], kind="stable")[: FAILED + STRAINED + UNCERTAIN]
+    return rows[order].tolist()
+
+
+def _in_turn(queues: Iterable[list[int]], count: int) -> list[int]:
+    """The first of each, then the second of each, and so on."""
+    ranked = [(place, i, row) for i, queue in enumerate(queues) for place, row in enumerate(queue)]
+    return [row for _, _, row in sorted(ranked)][:count]

@@ -1,0 +1,274 @@
+"""The driver: its source impedance in continuous time, and the loaded terminal voltage.
+
+    V_th(t) --[Z_th]--+-- V_out        V_out = V_th · Z_L / (Z_L + Z_th)
+                    [Z_L]
+
+Z_th is kept in *modal* form, a sum of second-order sections with log-frequency and log-damping.
+Polynomial coefficients of the same impedance have Jacobian condition numbers of 1e4…1e7, the modal
+ones 50…100; every value of the parameters is a stable impedance; and a pair of poles passes from
+complex to real without a change of branch.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, Complex, Float, Int
+
+from etid.recordings.remarks import texts
+from etid.results.verdicts import RESULTS, message, verdict_names
+from etid.signals.filtering import StateSpace
+from etid.signals.harmonics import Spectrum
+from etid.signals.transfer import (
+    Rational,
+    as_complex,
+    delay_variable,
+    frequency_variable,
+    reciprocal,
+)
+from etid.solvers.propagation import log_stderr
+
+
+class SourceImpedance(eqx.Module):
+    """Order-n rational Z_th(s) in modal form.
+
+    Z_th = R + Σ_k (g_k + h_k s/ω_k) / (1 + 2 ζ_k s/ω_k + (s/ω_k)²) + Σ_j g_j / (1 + s/ω_j)
+
+    g, h are in ohm and may have either sign; R [Ω], ω [rad/s] and ζ are positive and stored as
+    logarithms: with R < 0 the driver could not be loaded with a capacitor. ζ > 1 is a pair of real
+    poles. Order n has ⌊(n−1)/2⌋ sections, because a transformer always has one slow real pole, its
+    magnetising inductance.
+    """
+
+    log_resistance: Float[Array, ""]
+    log_omega: Float[Array, " section"]
+    log_zeta: Float[Array, " section"]
+    gain: Float[Array, " section"]
+    slope: Float[Array, " section"]
+    log_omega_real: Float[Array, " real"]
+    gain_real: Float[Array, " real"]
+
+    @property
+    def order(self) -> int:
+        """Number of poles."""
+        return 2 * self.log_omega.shape[0] + self.log_omega_real.shape[0]
+
+    def response(self, frequency: Float[Array, "..."]) -> Complex[Array, "..."]:
+        """Impedance [Ω] at real frequencies [Hz]."""
+        s = frequency_variable(jnp.asarray(frequency))
+        z = as_complex(jnp.exp(self.log_resistance))
+        for k in range(self.log_omega.shape[0]):
+            x = s * as_complex(jnp.exp(-self.log_omega[k]))
+            damping = as_complex(2 * jnp.exp(self.log_zeta[k]))
+            gain = as_complex(self.gain[k]) + as_complex(self.slope[k]) * x
+            z = z + gain * reciprocal(1 + (damping + x) * x)
+        for j in range(self.log_omega_real.shape[0]):
+            x = s * as_complex(jnp.exp(-self.log_omega_real[j]))
+            z = z + as_complex(self.gain_real[j]) * reciprocal(1 + x)
+        return z
+
+    def state_space(self) -> StateSpace:
+        """Realisation from current [A] to voltage drop [V], one balanced 2x2 block per section."""
+        order = self.order
+        pairs = self.log_omega.shape[0]
+        omega, zeta = jnp.exp(self.log_omega), jnp.exp(self.log_zeta)
+        A = jnp.zeros((order, order), omega.dtype)
+        i = jnp.arange(pairs) * 2
+        A = A.at[i, i + 1].set(omega).at[i + 1, i].set(-omega)
+        A = A.at[i + 1, i + 1].set(-2 * zeta * omega)
+        rate = jnp.exp(self.log_omega_real)
+        j = jnp.arange(2 * pairs, order)
+        A = A.at[j, j].set(-rate)
+        B = jnp.zeros((order, 1), omega.dtype).at[i + 1, 0].set(omega).at[j, 0].set(rate)
+        C = jnp.zeros(order, omega.dtype).at[i].set(self.gain).at[i + 1].set(self.slope)
+        C = C.at[j].set(self.gain_real)
+        return StateSpace(A, B, C, jnp.exp(self.log_resistance)[None])
+
+
+def realise(impedance: Rational, rate: float | Float[Array, ""]) -> StateSpace:
+    """Realise a load impedance, current [A] to voltage [V].
+
+    Args:
+        impedance: Proper rational function of s [rad/s].
+        rate: Typical rate [1/s] by which the states are scaled; any value gives the same impedance.
+    """
+    order = impedance.den.shape[0] - 1
+    if impedance.num.shape[0] > order + 1:
+        raise ValueError(
+            "the load's impedance grows without bound at high frequency (an inductor in series?); "
+            "a load must stay finite: put a resistor in parallel"
+        )
+    scale = jnp.array([rate**k for k in range(order + 1)])
+    num = jnp.pad(impedance.num, (0, order + 1 - impedance.num.shape[0])) * scale
+    den = impedance.den * scale
+    num, den = num / den[-1], den / den[-1]
+    direct = num[-1]
+    A = jnp.eye(order, k=1).at[order - 1 :, :].set(-den[:-1]) if order else jnp.zeros((0, 0))
+    B = jnp.eye(order, 1, k=1 - order) if order else jnp.zeros((0, 1))
+    return StateSpace(rate * A, rate * B, num[:-1] - direct * den[:-1], direct[None])
+
+
+def loaded(source: SourceImpedance, load: Rational, rate: float | Float[Array, ""]) -> StateSpace:
+    """The system V_th → V_out with `load` at the terminal, in continuous time.
+
+    The current i = (V_th − C₁x₁ − C₂x₂) / (D₁ + D₂) drives both impedances, x₁ the source's states,
+    x₂ the load's.
+    """
+    return connected(source, realise(load, rate))
+
+
+def connected(source: SourceImpedance, z2: StateSpace) -> StateSpace:
+    """The same with a load that is realised, current [A] to voltage [V]."""
+    z1 = source.state_space()
+    total = z1.D[0] + z2.D[0]
+    drop = jnp.concatenate([z1.C, z2.C])
+    B = jnp.concatenate([z1.B, z2.B]) / total
+    n1, n2 = z1.C.shape[0], z2.C.shape[0]
+    A = jnp.block([[z1.A, jnp.zeros((n1, n2))], [jnp.zeros((n2, n1)), z2.A]]) - B * drop[None, :]
+    share = z2.D[0] / total
+    C = jnp.concatenate([jnp.zeros(n1), z2.C]) - share * drop
+    return StateSpace(A, B, C, share[None])
+
+
+class Calibration(eqx.Module):
+    """What a skin must know of the calibrations, besides Z_th and its covariance.
+
+    Attributes:
+        r_load: Known resistors [Ω].
+        delay_std: Standard deviation [s] of their common trigger delay. Only records with different
+            resistors tell that delay from a fast pole of Z_th; one resistor leaves it open.
+        delay: Their trigger delays as identified [samples].
+        spectra: Their harmonics, stacked along a leading axis; None if the method uses none.
+        unloaded: Checksums of their unloaded records; None if not known. A load whose checksum is
+            none of them needs no search for what it shares with them, which doubles its cost.
+        mismatch: By how much the logarithm of each known resistor exceeds what the other
+            calibrations say of it, and its standard error; None for one, or if not known.
+    """
+
+    r_load: Float[Array, " record"]
+    delay_std: Float[Array, ""]
+    delay: Float[Array, " record"]
+    spectra: Spectrum | None
+    unloaded: Int[np.ndarray, " record"] | None = None
+    mismatch: Float[Array, "2 record"] | None = None
+
+
+class Driver(eqx.Module):
+    """An identified driver: Z_th as a discrete filter and, once refined, in continuous time.
+
+    Only ratios to Z_th are observable: the tolerance of the calibration resistor passes 1:1 into
+    every resistance identified with this driver.
+
+    Attributes:
+        b: Numerator α₀ … of the discrete Z_th by Steiglitz-McBride (paper, eq. 4) [Ω].
+        a: Denominator 1, β₁ … of the discrete Z_th.
+        sample_rate: Rate of the discrete filter [Hz].
+        source: Continuous Z_th, valid at any sample rate; None if the method gives none.
+        cov: Covariance of the parameters of `source`, flattened in field order.
+        calibration: What skins need of the calibrations.
+        rrse: Largest root relative squared error over the calibrations (paper, eq. 3).
+        chi2: Residual over expected variance per degree of freedom: 1 if the model is right.
+        result: Verdict.
+        steps: Iterations of the solver.
+        method: Name of the estimator.
+        remarks: What was done to the calibrations before, `etid.recordings.remarks.Remark` as an
+            integer.
+        drift: Relative standard deviation by which each parameter of `source` may have changed
+            when a skin is recorded; None if it cannot. `cov` does not contain it.
+    """
+
+    b: Float[Array, " b"]
+    a: Float[Array, " a"]
+    sample_rate: float | Float[Array, ""]
+    source: SourceImpedance | None
+    cov: Float[Array, "parameter parameter"] | None
+    calibration: Calibration | None
+    rrse: Float[Array, ""]
+    chi2: Float[Array, ""]
+    result: RESULTS
+    steps: Int[Array, ""]
+    method: str = eqx.field(static=True)
+    remarks: Int[Array | np.ndarray, ""] = eqx.field(default_factory=lambda: np.zeros((), int))
+    drift: Float[Array | np.ndarray, ""] | None = None
+
+    @property
+    def order(self) -> int:
+        """Number of poles."""
+        return self.a.shape[0] - 1
+
+    @property
+    def verdict(self) -> str:
+        """Name of the verdict."""
+        return verdict_names(self.result).item()
+
+    def drift_std(self) -> Float[Array, " parameter"]:
+        """Standard deviations of the parameters of `source` that come from `drift` alone."""
+        assert self.source is not None  # check_driver
+        # Frequencies, dampings and R are logarithms: relative already.
+        relative = jax.tree.map(jnp.ones_like, self.source)
+        gains = (self.source.gain, self.source.slope, self.source.gain_real)
+        relative = eqx.tree_at(lambda s: (s.gain, s.slope, s.gain_real), relative, gains)
+        return jnp.abs(ravel_pytree(relative)[0]) * (0.0 if self.drift is None else self.drift)
+
+    def later_cov(self) -> Float[Array, "parameter parameter"]:
+        """Covariance of the parameters of `source` when a skin is recorded."""
+        assert self.cov is not None  # check_driver
+        return self.cov if self.drift is None else self.cov + jnp.diag(self.drift_std() ** 2)
+
+    def response(self, frequency: Float[Array, "..."]) -> Complex[Array, "..."]:
+        """Source impedance Z_th [Ω], in continuous time where the method gives it.
+
+        Args:
+            frequency: Real frequencies [Hz].
+
+        Returns:
+            Z_th(j 2π f) [Ω]; without a continuous form that of the discrete filter (paper, eq. 4).
+        """
+        if self.source is not None:
+            return self.source.response(frequency)
+        z = delay_variable(jnp.asarray(frequency), self.sample_rate)
+        return Rational(self.b, self.a)(z)
+
+    def log_response_stderr(
+        self, frequency: Float[Array, " frequency"]
+    ) -> Float[Array, "2 frequency"]:
+        """Standard errors of ln |Z_th| and of its phase [rad]; NaN if there is no covariance."""
+        if self.source is None or self.cov is None:
+            return jnp.full((2, frequency.size), jnp.nan)
+        values, unflatten = ravel_pytree(self.source)
+        return log_stderr(lambda p: unflatten(p).response(frequency), values, self.cov)
+
+    def response_stderr(self, frequency: Float[Array, " frequency"]) -> Float[Array, " frequency"]:
+        """Standard error of the magnitude of Z_th, by the slope of |Z_th| in its parameters.
+
+        Args:
+            frequency: Real frequencies [Hz].
+
+        Returns:
+            Standard errors [Ω]; NaN if the method gives no covariance.
+        """
+        return jnp.abs(self.response(frequency)) * self.log_response_stderr(frequency)[0]
+
+    def __str__(self) -> str:
+        z = complex(self.response(jnp.array(1e3)))
+        text = f"Driver of order {self.order}: {self.verdict} in {int(self.steps)} steps"
+        text += (
+            f" ({self.method}), RRSE {100 * float(self.rrse):.3g} %, chi2 {float(self.chi2):.3g}\n"
+        )
+        text += f"  Z_th at 1 kHz {z.real / 1e3:.4g} {z.imag / 1e3:+.4g}j kΩ"
+        text += self._resistors()
+        if self.verdict != "successful":
+            text += "\n  " + message(self.verdict)
+        return "\n  ".join([text, *texts(int(self.remarks))])
+
+    def _resistors(self) -> str:
+        """What the calibrations say of each other's resistors."""
+        known = self.calibration
+        if known is None or known.mismatch is None:
+            return ""
+        lines = ""
+        for r, off, error in zip(known.r_load, *known.mismatch, strict=True):
+            lines += f"\n  r_load {float(r) / 1e3:.6g} kΩ is {100 * float(np.expm1(off)):+.3g}"
+            lines += f" ± {100 * float(error):.2g} % off what the others say"
+        return lines

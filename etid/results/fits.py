@@ -1,0 +1,453 @@
+"""What an identification returns: one fit, and a table of many."""
+
+import dataclasses
+import importlib.metadata
+import os
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Complex, Float, Int
+
+from etid.circuits.circuit import DISPLAY, AbstractCircuit, Resistor, SkinRC
+from etid.recordings.recording import Label, RecordingError, wanted_labels
+from etid.recordings.remarks import remarks_of, texts, words
+from etid.results.hdf5_table import Table, opened_table, same_length, write_table
+from etid.results.verdicts import RESULTS, message, verdict_names, verdicts_of
+
+SCHEMA = "etid/fits"
+LABELS = ("path", "subject", "condition", "electrode", "trial")
+
+
+def rrse(predicted: Float[Array, " time"], measured: Float[Array, " time"]) -> Float[Array, ""]:
+    """Root relative squared error, sqrt(Σ (V − W)² / Σ (W − mean W)²)   (paper, eq. 3).
+
+    It does not see circuit error: 2.73 % is as common with a right C_p as with one that is 85 %
+    off. Judge by χ² and standard errors.
+    """
+    return jnp.sqrt(
+        jnp.sum((predicted - measured) ** 2) / jnp.sum((measured - jnp.mean(measured)) ** 2)
+    )
+
+
+def complex_rrse(
+    predicted: Complex[Array, " value"],
+    measured: Complex[Array, " value"],
+    used: Bool[Array, " value"] | bool = True,
+) -> Float[Array, ""]:
+    """RRSE of harmonics or impedances that are used, from which no mean is to be taken."""
+    missed = jnp.sum(jnp.where(used, jnp.abs(measured - predicted) ** 2, 0.0))
+    return jnp.sqrt(missed / jnp.sum(jnp.where(used, jnp.abs(measured) ** 2, 0.0)))
+
+
+class IdentificationError(RuntimeError):
+    """An identification did not end successfully.
+
+    Attributes:
+        outcome: The fit or driver as far as it got.
+    """
+
+    def __init__(self, text: str, outcome: Any):
+        super().__init__(text)
+        self.outcome = outcome
+
+
+class Fit(eqx.Module):
+    """One identified circuit, or a batch of them along a leading axis.
+
+    Attributes:
+        circuit: Identified elements in SI units.
+        cov: Covariance of the elements, SI units; NaN where a method gives none. It does not
+            contain the tolerance of the calibration resistor, which passes 1:1 into every
+            resistance.
+        shared_cov: The part of `cov` due to the driver, common to all fits made with it: a spread
+            between trials never shows it.
+        rrse: Root relative squared error of V_out (paper, eq. 3).
+        chi2: Σ residual² / expected variance, per degree of freedom: 1 if the model is right.
+        result: Verdict.
+        steps: Iterations of the solver.
+        method: Name of the estimator.
+        remarks: What was done to the recording before the fit, `etid.recordings.remarks.Remark` as
+            integers.
+        change: Relative change during the record of each element and, last, of the amplitude: from
+            the first to the last period, or by the step that was seen. NaN where the record holds
+            less than two periods, None where it was not asked for.
+        change_stderr: Standard errors of `change`.
+    """
+
+    circuit: AbstractCircuit
+    cov: Float[Array | np.ndarray, "*lane parameter parameter"]
+    shared_cov: Float[Array | np.ndarray, "*lane parameter parameter"]
+    rrse: Float[Array | np.ndarray, "*lane"]
+    chi2: Float[Array | np.ndarray, "*lane"]
+    result: RESULTS
+    steps: Int[Array | np.ndarray, "*lane"]
+    method: str = eqx.field(static=True)
+    remarks: Int[Array | np.ndarray, "*lane"] = eqx.field(default_factory=lambda: np.zeros((), int))
+    change: Float[Array | np.ndarray, "*lane moved"] | None = None
+    change_stderr: Float[Array | np.ndarray, "*lane moved"] | None = None
+
+    @property
+    def stderr(self) -> AbstractCircuit:
+        """Standard errors, in a circuit of the same kind."""
+        variance = jnp.diagonal(jnp.asarray(self.cov), axis1=-2, axis2=-1)
+        values = jnp.sqrt(jnp.where(variance >= 0, variance, jnp.nan))
+        names = self.circuit.names()
+        return type(self.circuit)(**{name: values[..., i] for i, name in enumerate(names)})
+
+    @property
+    def verdict(self) -> Any:
+        """Name of the verdict (an array of names for a batch)."""
+        names = verdict_names(self.result)
+        return names.item() if names.ndim == 0 else names
+
+    @property
+    def changes(self) -> str:
+        """How each element and the amplitude changed during the record, in words; for one fit."""
+        if self.change is None or self.change_stderr is None:
+            return ""
+        return "During the record: " + ", ".join(
+            f"{name} {100 * float(size):+.2g} ± {100 * float(error):.1g} %"
+            for name, size, error in zip(
+                (*self.circuit.names(), "amplitude"), self.change, self.change_stderr, strict=True
+            )
+        )
+
+    def __str__(self) -> str:
+        if np.ndim(self.rrse):
+            return f"{type(self.circuit).__name__} fits, batch of {np.shape(self.rrse)}"
+        kind = type(self.circuit).__name__
+        head = f"{kind}: {self.verdict} in {int(self.steps)} steps ({self.method})"
+        head += f", RRSE {100 * float(self.rrse):.3g} %, chi2 {float(self.chi2):.3g}"
+        lines = [head]
+        width = max(4, *map(len, self.circuit.names()))
+        for name, unit in self.circuit.units().items():
+            scale, symbol = DISPLAY[unit]
+            value = float(getattr(self.circuit, name)) / scale
+            error = float(getattr(self.stderr, name)) / scale
+            lines.append(f"  {name:<{width}}{plus_minus(value, error)} {symbol}".rstrip())
+        if self.verdict != "successful":
+            lines.append("  " + message(self.verdict))
+        if self.verdict == "changed":
+            lines.append("  " + self.changes)
+        lines += ["  " + text for text in texts(int(self.remarks))]
+        return "\n".join(lines)
+
+
+def plus_minus(value: float, error: float) -> str:
+    """A value with its standard error, both to two digits of the error."""
+    if not np.isfinite(error) or error <= 0:
+        return f"{value:10.4g}            "
+    digits = int(np.clip(1 - np.floor(np.log10(error)), 0, 9))
+    return f"{value:10.{digits}f} ± {error:<9.{digits}f}"
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Fits:
+    """Identified circuits of many recordings, in the order of the recordings.
+
+    Attributes:
+        fit: The fits, batched along one leading axis, as numpy arrays.
+        labels: `path`, `subject`, `condition`, `electrode` and `trial` of each recording.
+        notes: What went wrong in words, where something did; else empty.
+    """
+
+    fit: Fit
+    labels: Mapping[str, np.ndarray]
+    notes: np.ndarray
+
+    circuit = property(lambda self: self.fit.circuit, doc="Identified elements, arrays (fit,).")
+    stderr = property(lambda self: self.fit.stderr, doc="Standard errors, arrays (fit,).")
+    cov = property(lambda self: self.fit.cov, doc="Covariances, (fit, parameter, parameter).")
+    rrse = property(lambda self: self.fit.rrse, doc="Root relative squared errors (fit,).")
+    chi2 = property(lambda self: self.fit.chi2, doc="χ² per degree of freedom (fit,).")
+    verdicts = property(lambda self: self.fit.verdict, doc="Names of the verdicts (fit,).")
+
+    def __len__(self) -> int:
+        return len(self.notes)
+
+    def __getitem__(self, index: int) -> Fit:
+        return jax.tree.map(lambda leaf: leaf[index], self.fit)
+
+    def take(self, index: np.ndarray) -> "Fits":
+        """The fits selected by an array.
+
+        Args:
+            index: Places of the wanted fits, or for each fit whether it is wanted.
+
+        Returns:
+            Those fits, in this order.
+        """
+        return type(self)(
+            jax.tree.map(lambda leaf: np.asarray(leaf)[index], self.fit),
+            {name: column[index] for name, column in self.labels.items()},
+            self.notes[index],
+        )
+
+    @classmethod
+    def concatenate(cls, parts: Sequence["Fits"]) -> "Fits":
+        """One table of several.
+
+        Args:
+            parts: Fits of circuits of one kind.
+
+        Returns:
+            All of them, in this order; the method is "mixed" if theirs differ.
+        """
+        methods = {part.fit.method for part in parts}
+        method = methods.pop() if len(methods) == 1 else "mixed"
+        fits = [dataclasses.replace(part.fit, method=method) for part in parts]
+        return cls(
+            jax.tree.map(lambda *leaves: np.concatenate(leaves), *fits),
+            {name: np.concatenate([part.labels[name] for part in parts]) for name in LABELS},
+            np.concatenate([part.notes for part in parts]),
+        )
+
+    def where(self, **labels: Label | None) -> "Fits":
+        """The fits whose labels equal the given ones, as in `where(condition="dry")`.
+
+        Args:
+            **labels: `path`, `subject`, `condition`, `electrode` or `trial`.
+
+        Returns:
+            Those fits, in their order.
+
+        Raises:
+            RecordingError: There is no such label, or its value is neither text nor an integer.
+        """
+        chosen = np.ones(len(self), bool)
+        for name, value in wanted_labels(labels, LABELS).items():
+            chosen &= self.labels[name] == value
+        return self.take(chosen)
+
+    def successful(self) -> "Fits":
+        """The fits whose verdict is `successful`."""
+        return self.take(self.verdicts == "successful")
+
+    def counts(self) -> dict[str, int]:
+        """How often each verdict occurs, most frequent first."""
+        names, counts = np.unique(self.verdicts, return_counts=True)
+        order = np.argsort(-counts, kind="stable")
+        return {str(names[i]): int(counts[i]) for i in order}
+
+    def table(self) -> dict[str, np.ndarray]:
+        """One column per label, element [SI], standard error, quality and verdict."""
+        columns = {name: self.labels[name] for name in LABELS}
+        for name in self.circuit.names():
+            columns[name] = np.asarray(getattr(self.circuit, name))
+            columns[f"{name}_stderr"] = np.asarray(getattr(self.stderr, name))
+        for i, name in enumerate((*self.circuit.names(), "amplitude")):
+            columns[f"{name}_change"] = self._changes[0][:, i]
+        columns |= {
+            "rrse": np.asarray(self.rrse),
+            "chi2": np.asarray(self.chi2),
+            "steps": np.asarray(self.fit.steps),
+            "verdict": self.verdicts,
+            "remarks": np.array([words(one) for one in np.asarray(self.fit.remarks)], dtype=str),
+            "note": self.notes,
+        }
+        return columns
+
+    @property
+    def _changes(self) -> tuple[np.ndarray, np.ndarray]:
+        """Changes during the record and their standard errors; NaN where none was asked for."""
+        nothing = np.full((len(self), len(self.circuit.names()) + 1), np.nan)
+        fit = self.fit
+        if fit.change is None or fit.change_stderr is None:
+            return nothing, nothing
+        return np.asarray(fit.change), np.asarray(fit.change_stderr)
+
+    def to_pandas(self) -> Any:
+        """The table as a pandas DataFrame.
+
+        Raises:
+            ImportError: pandas is not installed.
+        """
+        try:
+            import pandas
+        except ImportError as error:
+            raise ImportError("to_pandas needs pandas: pip install 'etid[table]'") from error
+        return pandas.DataFrame(self.table())
+
+    def summary(self, *by: str) -> list[dict[str, Any]]:
+        """Medians of the successful fits and counts, per group of labels.
+
+        Per element: `NAME` the median, `NAME_spread` the standard deviation between the recordings,
+        `NAME_stderr` the median standard error, and its two parts: `NAME_own`, the noise of the
+        recording, which the spread contains, and `NAME_shared`, which no spread shows because all
+        recordings with one driver have it in common. What really varies between the recordings is
+        `NAME_between`, sqrt(spread² − mean own²), or 0. The mean is what noise adds to spread², and
+        where some recordings are noisier than others not the square of the median.
+
+        Args:
+            *by: Labels that make the groups; without one all fits are one group.
+
+        Returns:
+            A row for each group, in the order of its labels; numbers in SI units, NaN without any
+            success.
+        """
+        columns = [map(str, self.labels[name].tolist()) for name in by]
+        keys = list(zip(*columns, strict=True)) if by else [()] * len(self)
+        groups = sorted(set(keys))
+        number = {key: i for i, key in enumerate(groups)}
+        place = np.array([number[key] for key in keys], int)
+        good = self.successful()
+        place_good = place[self.verdicts == "successful"]
+        order = np.argsort(place_good, kind="stable")
+        ends = np.searchsorted(place_good[order], np.arange(len(groups) + 1))
+        rows: list[dict[str, Any]] = [
+            dict(zip(by, key, strict=True)) | {"fits": int(count), "successful": int(size)}
+            for key, count, size in zip(
+                groups, np.bincount(place, minlength=len(groups)), np.diff(ends), strict=True
+            )
+        ]
+        for i, name in enumerate(self.circuit.names()):
+            total, common = good.cov[:, i, i], good.fit.shared_cov[:, i, i]
+            parts = {
+                "": np.asarray(getattr(good.circuit, name)),
+                "_stderr": np.asarray(getattr(good.stderr, name)),
+                "_own": np.sqrt(np.maximum(total - common, 0.0)),
+                "_shared": np.sqrt(np.where(common >= 0, common, np.nan)),
+            }
+            for row, start, end in zip(rows, ends[:-1], ends[1:], strict=True):
+                chosen = order[start:end]
+                for part, values in parts.items():
+                    row[name + part] = float(np.median(values[chosen])) if end > start else np.nan
+                several, values = chosen.size > 1, parts[""][chosen]
+                row[f"{name}_spread"] = float(np.std(values, ddof=1)) if several else np.nan
+                noise = float(np.mean(parts["_own"][chosen] ** 2)) if several else np.nan
+                excess = row[f"{name}_spread"] ** 2 - noise
+                row[f"{name}_between"] = float(np.sqrt(np.maximum(excess, 0.0)))
+        return rows
+
+    def __str__(self) -> str:
+        verdicts = ", ".join(f"{count} {name}" for name, count in self.counts().items())
+        lines = [f"{len(self)} fits of {type(self.circuit).__name__}: {verdicts}"]
+        units = self.circuit.units()
+        for row in self.summary("subject", "condition"):
+            where = " ".join(filter(None, (row["subject"], row["condition"]))) or "all"
+            text = f"  {where:<20}{row['successful']:>4}/{row['fits']:<4}"
+            for name, unit in units.items():
+                scale, symbol = DISPLAY[unit]
+                text += f"  {name} {row[name] / scale:.4g} {symbol}"
+            lines.append(text)
+        return "\n".join(lines)
+
+    def as_table(self) -> tuple[dict[str, np.ndarray], dict[str, str], dict[str, Any]]:
+        """Columns, their units and the attributes of the file that `write` writes."""
+        units = self.circuit.units()
+        units |= {f"{name}_stderr": unit for name, unit in units.items()}
+        columns = self.table() | {"cov": self.cov, "shared_cov": self.fit.shared_cov}
+        columns["change_stderr"] = self._changes[1]
+        attributes = {
+            "schema": SCHEMA,
+            "schema_version": "1.2",
+            "etid_version": importlib.metadata.version("etid"),
+            "circuit": type(self.circuit).__name__,
+            "parameters": list(self.circuit.names()),
+            "method": self.fit.method,
+        }
+        return columns, units, attributes
+
+    def write(self, path: str | os.PathLike[str]) -> None:
+        """Write the table, the covariances and how they were made to an HDF5 file."""
+        columns, units, attributes = self.as_table()
+        write_table(path, columns, units=units, attributes=attributes)
+
+    @classmethod
+    def read(
+        cls, path: str | os.PathLike[str], circuit: type[AbstractCircuit] | None = None
+    ) -> "Fits":
+        """Read a file written by `write`.
+
+        Args:
+            path: The file.
+            circuit: The kind of circuit, if it is not one of etid's own.
+
+        Raises:
+            RecordingError: The file is not a file of fits, or `circuit` is not the one it holds.
+        """
+        with opened_table(path, SCHEMA) as table:
+            return cls.of_table(table, circuit)
+
+    @classmethod
+    def of_table(cls, table: Table, circuit: type[AbstractCircuit] | None) -> "Fits":
+        """What `read` makes of an open file.
+
+        Raises:
+            RecordingError: A column or an attribute is missing, or not what it should be.
+        """
+        known = {kind.__name__: kind for kind in (SkinRC, Resistor)}
+        stored = table.text("circuit")
+        kind = circuit or known.get(stored)
+        if kind is None or kind.__name__ != stored:
+            raise RecordingError(
+                f"{table.name} holds fits of {stored!r}; pass that class as `circuit`",
+                file=table.name,
+                field="circuit",
+            )
+        size = len(kind.names())
+        columns = {name: table.column(name, "text") for name in (*LABELS, "verdict", "note")}
+        columns |= {name: table.column(name, "number") for name in (*kind.names(), "rrse", "chi2")}
+        columns["steps"] = table.column("steps", "integer")
+        for name in ("cov", "shared_cov"):
+            columns[name] = table.column(name, "number", (size, size))
+        if "remarks" in table:  # not in files of schema version 1.0
+            columns["remarks"] = table.column("remarks", "text")
+        changes = [f"{name}_change" for name in (*kind.names(), "amplitude")]
+        if "change_stderr" in table:  # not before schema version 1.2
+            columns |= {name: table.column(name, "number") for name in changes}
+            columns["change_stderr"] = table.column("change_stderr", "number", (size + 1,))
+        count = same_length(table, columns)
+        read = {name: table.read(column) for name, column in columns.items()}
+        remarks = _remarks(table, read.get("remarks", np.full(count, "")))
+        numbers = (*kind.names(), "rrse", "chi2", "cov", "shared_cov")
+        real = {name: read[name].astype(float) for name in numbers}
+        fit = Fit(
+            circuit=kind(**{name: real[name] for name in kind.names()}),
+            cov=real["cov"],
+            shared_cov=real["shared_cov"],
+            rrse=real["rrse"],
+            chi2=real["chi2"],
+            result=_verdicts(table, read["verdict"]),
+            steps=read["steps"],
+            method=table.text("method"),
+            remarks=remarks,
+            **_changes_of(read, changes),
+        )
+        return cls(fit, {name: read[name] for name in LABELS}, read["note"])
+
+
+def _verdicts(table: Table, names: np.ndarray) -> RESULTS:
+    try:
+        return verdicts_of(names)
+    except KeyError as error:
+        raise RecordingError(
+            f"{error} is no verdict of this version of etid",
+            file=table.name,
+            field="verdict",
+            remedy="Read it with the etid that wrote it",
+        ) from None
+
+
+def _remarks(table: Table, texts: np.ndarray) -> np.ndarray:
+    try:
+        return np.array([remarks_of(str(one)) for one in texts], int)
+    except ValueError as error:
+        raise RecordingError(
+            str(error),
+            file=table.name,
+            field="remarks",
+            remedy="Read it with the etid that wrote it",
+        ) from None
+
+
+def _changes_of(read: Mapping[str, np.ndarray], names: Sequence[str]) -> dict[str, np.ndarray]:
+    """The changes of a file of fits; none before schema version 1.2."""
+    if "change_stderr" not in read:
+        return {}
+    change = np.stack([read[name].astype(float) for name in names], axis=1)
+    return {"change": change, "change_stderr": read["change_stderr"].astype(float)}

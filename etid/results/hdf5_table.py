@@ -1,0 +1,197 @@
+"""Tables in HDF5: named columns with units, written whole or not at all."""
+
+import contextlib
+import os
+import pathlib
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+import h5py
+import numpy as np
+
+from etid.recordings import limits
+from etid.recordings.errors import RecordingError
+from etid.recordings.untrusted import attribute, check_size, guarded, local_link, translated
+
+
+@contextlib.contextmanager
+def replacing(path: str | os.PathLike[str]) -> Iterator[pathlib.Path]:
+    """A name to write to, that becomes the file at the end, if that is reached."""
+    target = pathlib.Path(path)
+    partial = target.with_suffix(f".partial{target.suffix}")  # some writers go by the suffix
+    try:
+        yield partial
+        os.replace(partial, target)
+    finally:
+        partial.unlink(missing_ok=True)
+
+
+def write_table(
+    path: str | os.PathLike[str],
+    columns: Mapping[str, np.ndarray],
+    *,
+    units: Mapping[str, str],
+    attributes: Mapping[str, Any],
+) -> None:
+    """Write columns to an HDF5 file, replacing it only when everything is on disk.
+
+    Args:
+        path: The file.
+        columns: Arrays of one length along their first axis; text is stored as UTF-8.
+        units: SI units of columns that have one, stored as their attribute `unit`.
+        attributes: Attributes of the file.
+    """
+    with replacing(path) as partial, h5py.File(partial, "w") as file:
+        file.attrs.update(attributes)
+        for name, column in columns.items():
+            text = np.asarray(column).dtype.kind in "OU"
+            data = np.asarray(column, dtype=h5py.string_dtype()) if text else column
+            dataset = file.create_dataset(name, data=data)
+            if name in units:
+                dataset.attrs["unit"] = units[name]
+
+
+class Table:
+    """A file of columns, none of them read yet.
+
+    What is wrong with it is one error, which names the file, the column or attribute, and what to
+    do.
+    """
+
+    def __init__(self, file: h5py.File, name: str):
+        self.file = file
+        self.name = name
+
+    def _error(self, field: str, message: str) -> RecordingError:
+        return RecordingError(message, file=self.name, field=field, remedy=_REMEDY)
+
+    def text(self, name: str) -> str:
+        """An attribute that is a text.
+
+        Raises:
+            RecordingError: It is missing, or something else.
+        """
+        value = self.attribute(name)
+        if not isinstance(value, str):
+            raise self._error(name, f"is {value!r}, must be text")
+        return value
+
+    def attribute(self, name: str) -> Any:
+        """An attribute as plain Python: a number, a text, or a list of them.
+
+        Raises:
+            RecordingError: It is missing, cannot be read, or of another type.
+        """
+        with translated(self.name, field=name):
+            if name not in self.file.attrs:
+                raise RecordingError("is missing", remedy=_REMEDY)
+            value = np.asarray(attribute(self.file, name))
+            if value.dtype.kind not in "biufSUO":
+                raise RecordingError(f"has dtype {value.dtype}", remedy=_REMEDY)
+            plain = value.tolist()
+            items = plain if isinstance(plain, list) else [plain]
+            found = [item.decode("utf-8") if isinstance(item, bytes) else item for item in items]
+            if not all(isinstance(item, str | int | float) for item in found):
+                raise RecordingError(f"is {plain!r}, must be numbers or texts", remedy=_REMEDY)
+        return found if isinstance(plain, list) else found[0]
+
+    @property
+    def attributes(self) -> set[str]:
+        """Names of the attributes."""
+        with translated(self.name):
+            return set(self.file.attrs)
+
+    def __contains__(self, name: str) -> bool:
+        with translated(self.name, field=name):
+            return name in self.file
+
+    def column(self, name: str, kind: str, shape: tuple[int, ...] = ()) -> h5py.Dataset:
+        """A column, once its header says that it can be read.
+
+        Args:
+            name: Its name.
+            kind: `text`, `number` or `integer`.
+            shape: Its dimensions behind the first.
+
+        Raises:
+            RecordingError: It is missing, of another kind or shape, or declares too much.
+        """
+        with translated(self.name, field=name):
+            if name not in self.file:
+                raise RecordingError("the column is missing", remedy=_REMEDY)
+            local_link(self.file, name)
+            column = self.file[name]
+            if not isinstance(column, h5py.Dataset):
+                raise RecordingError("is no column", remedy=_REMEDY)
+            if column.shape is None or column.ndim != 1 + len(shape) or column.shape[1:] != shape:
+                wanted = ", ".join(["fit", *map(str, shape)])
+                raise RecordingError(
+                    f"has shape {column.shape}, must be ({wanted})", remedy=_REMEDY
+                )
+            if column.shape[0] > limits.FITS:
+                raise RecordingError(f"has {column.shape[0]} rows, at most {limits.FITS} are read")
+            text = h5py.check_string_dtype(column.dtype) is not None
+            fits = {
+                "text": text,
+                "number": column.dtype.kind in "iuf" and column.dtype.itemsize <= 8,
+                "integer": column.dtype.kind in "iu",
+            }
+            if not fits[kind]:
+                what = "text" if text else f"of type {column.dtype}"
+                raise RecordingError(f"is {what}, must be {kind}", remedy=_REMEDY)
+            check_size(column)
+        return column
+
+    def read(self, column: h5py.Dataset, rows: Any = ()) -> np.ndarray:
+        """Some rows of a column, or all.
+
+        Raises:
+            RecordingError: The file is damaged.
+        """
+        with translated(self.name, field=str(column.name).strip("/")):
+            text = h5py.check_string_dtype(column.dtype)
+            return np.asarray(column.asstr()[rows] if text else column[rows])
+
+
+_REMEDY = "Fit the recordings again"
+
+
+@contextlib.contextmanager
+def opened_table(path: str | os.PathLike[str], kind: str) -> Iterator[Table]:
+    """A file of columns.
+
+    Args:
+        path: The file.
+        kind: What its attribute `schema` must say.
+
+    Raises:
+        RecordingError: The file is missing, no HDF5, or of another kind.
+    """
+    name = os.fspath(path)
+    with guarded(name) as file:
+        table = Table(file, name)
+        found = table.attribute("schema") if "schema" in table.attributes else None
+        if found != kind:
+            raise RecordingError(
+                f"is {found!r}, not {kind!r}", file=name, field="schema", remedy="Name another file"
+            )
+        yield table
+
+
+def same_length(table: Table, columns: Mapping[str, np.ndarray | h5py.Dataset]) -> int:
+    """How many rows all these columns have.
+
+    Raises:
+        RecordingError: They differ.
+    """
+    sizes = {name: column.shape[0] for name, column in columns.items()}
+    first = next(iter(sizes.values()), 0)
+    for name, size in sizes.items():
+        if size != first:
+            raise RecordingError(
+                f"has {size} rows, {next(iter(sizes))} has {first}",
+                file=table.name,
+                field=name,
+                remedy=_REMEDY,
+            )
+    return first

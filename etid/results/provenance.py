@@ -1,0 +1,82 @@
+"""With what fits were made: all that a methods section has to say and a file has to remember."""
+
+import dataclasses
+import importlib.metadata
+import os
+
+import jax
+import numpy as np
+
+from etid.circuits.circuit import AbstractCircuit
+from etid.recordings.study import Study
+
+PACKAGES = ("etid", "jax", "jaxlib", "optimistix", "equinox", "numpy")
+
+
+@dataclasses.dataclass(frozen=True)
+class Settings:
+    """With what fits were made. There is no date in it: equal runs have equal settings.
+
+    Attributes:
+        source: Absolute path of the file of recordings; empty if they were in memory.
+        source_size: Its size [byte], by which another file of that name is told; 0 in memory.
+        recordings: How many there were to identify.
+        asked_method: The method that was asked for; empty if each recording chose its own.
+        order: Number of poles of Z_th.
+        start: Typical values of the elements [SI], where fits may start.
+        r_load_tolerance: Relative standard deviation of the known resistors that is in the
+            standard errors.
+        driver_drift: As in `identify_driver`.
+        precision: Floating-point numbers computed with.
+        backend: What JAX computed on.
+        versions: Packages and their versions, as `"jax 0.10.2"`.
+    """
+
+    source: str
+    source_size: int
+    recordings: int
+    asked_method: str
+    order: int
+    start: tuple[float, ...]
+    r_load_tolerance: float
+    driver_drift: float
+    precision: str
+    backend: str
+    versions: tuple[str, ...]
+
+    @classmethod
+    def of(
+        cls,
+        study: Study,
+        count: int,
+        order: int,
+        method: str | None,
+        circuit: AbstractCircuit,
+        r_load_tolerance: float = 0.0,
+        driver_drift: float = 0.0,
+    ) -> "Settings":
+        """The settings of a run in this process.
+
+        Args:
+            study: Its recordings.
+            count: How many of them are to be identified.
+            order: As in `identify_driver`.
+            method: As in `identify_skin`.
+            circuit: As in `identify_skin`.
+            r_load_tolerance: As in `identify_jointly`.
+            driver_drift: As in `identify_driver`.
+        """
+        source = os.path.abspath(study.file) if study.file else ""
+        return cls(
+            source=source,
+            source_size=os.path.getsize(source) if source else 0,
+            recordings=count,
+            asked_method=method or "",
+            order=order,
+            start=tuple(np.asarray(circuit.values()).tolist()),
+            r_load_tolerance=float(r_load_tolerance),
+            driver_drift=float(driver_drift),
+            precision="float64",
+            backend=jax.default_backend(),
+            versions=tuple(f"{name} {importlib.metadata.version(name)}" for name in PACKAGES),
+        )

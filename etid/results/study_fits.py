@@ -1,0 +1,242 @@
+"""What the identification of a study came to, in memory and in a file of fits.
+
+The file is that of `etid.Fits` with two additions, which readers of fits alone do not notice: the
+settings as attributes of the file, and a dataset `drivers` with one line of JSON for each driver.
+"""
+
+import dataclasses
+import json
+import math
+import os
+import reprlib
+import typing
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from etid.circuits.circuit import AbstractCircuit
+from etid.recordings.recording import RecordingError
+from etid.recordings.remarks import remarks_of, words
+from etid.results.driver import Calibration, Driver, SourceImpedance
+from etid.results.fits import SCHEMA, Fits
+from etid.results.hdf5_table import Table, opened_table, write_table
+from etid.results.provenance import Settings
+from etid.results.verdicts import verdicts_of
+
+# What a line of JSON that was damaged may raise on its way to a driver.
+_DAMAGED = (ValueError, TypeError, AttributeError, KeyError, OverflowError, RecursionError)
+_SETTINGS = {field.name: field.type for field in dataclasses.fields(Settings)}
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class StudyFits:
+    """What `identify_study`, `identify_jointly` and `fit_file` return, and what their file holds.
+
+    Attributes:
+        fits: One fit per loaded recording.
+        drivers: The drivers, by the paths of their calibrations. Those from a file predict and have
+            standard errors, but hold no harmonics of their calibrations: they serve output error,
+            not maximum likelihood.
+        failures: Why a driver could not be identified, by the paths of its calibrations.
+        settings: With what they were made; None if the file does not say.
+    """
+
+    fits: Fits
+    drivers: Mapping[tuple[str, ...], Driver]
+    failures: Mapping[tuple[str, ...], str]
+    settings: Settings | None = None
+
+    @classmethod
+    def concatenate(cls, parts: Iterable["StudyFits"]) -> "StudyFits":
+        """One of several parts of a study, which were made with equal settings."""
+        found = list(parts)
+        drivers = {paths: driver for part in found for paths, driver in part.drivers.items()}
+        failures = {paths: text for part in found for paths, text in part.failures.items()}
+        fits = Fits.concatenate([part.fits for part in found])
+        return cls(fits, drivers, failures, found[0].settings)
+
+    def write(self, path: str | os.PathLike[str]) -> None:
+        """Write the fits, the drivers and the settings to an HDF5 file.
+
+        `etid.Fits.read` and `StudyFits.read` both read it.
+        """
+        columns, units, attributes = self.fits.as_table()
+        lines = [_to_json(paths, driver) for paths, driver in self.drivers.items()]
+        lines += [
+            json.dumps({"calibrations": paths, "failure": text})
+            for paths, text in self.failures.items()
+        ]
+        columns["drivers"] = np.array(sorted(lines), dtype=object)
+        if self.settings is not None:
+            attributes |= {
+                name: list(value) if isinstance(value, tuple) else value
+                for name, value in dataclasses.asdict(self.settings).items()
+            }
+        write_table(path, columns, units=units, attributes=attributes)
+
+    @classmethod
+    def read(
+        cls, path: str | os.PathLike[str], circuit: type[AbstractCircuit] | None = None
+    ) -> "StudyFits":
+        """Read a file of fits; what an older one does not hold is empty.
+
+        Args:
+            path: The file.
+            circuit: The kind of circuit, if it is not one of etid's own.
+
+        Raises:
+            RecordingError: The file is not a file of fits, or `circuit` is not the one it holds.
+        """
+        with opened_table(path, SCHEMA) as table:
+            fits = Fits.of_table(table, circuit)
+            lines = table.read(table.column("drivers", "text")) if "drivers" in table else ()
+            settings = _settings(table)
+        drivers: dict[tuple[str, ...], Driver] = {}
+        failures: dict[tuple[str, ...], str] = {}
+        for number, line in enumerate(lines):
+            try:
+                paths, found = _of_line(line)
+            except _DAMAGED as error:
+                raise RecordingError(
+                    f"holds a driver that cannot be read ({type(error).__name__}: {error})",
+                    file=os.fspath(path),
+                    field=f"drivers[{number}]",
+                    remedy="Fit the recordings again",
+                ) from error
+            if isinstance(found, Driver):
+                drivers[paths] = found
+            else:
+                failures[paths] = found
+        return cls(fits, drivers, failures, settings)
+
+
+def _settings(table: Table) -> Settings | None:
+    if not table.attributes >= _SETTINGS.keys():
+        return None
+    values: dict[str, Any] = {}
+    for name, kind in _SETTINGS.items():
+        value = table.attribute(name)
+        several = typing.get_args(kind)  # of a tuple; a single one is stored as such, or as a list
+        items = value if several and isinstance(value, list) else [value]
+        wanted: Any = several[0] if several else kind
+        known = (int, float) if wanted is float else wanted
+        if not all(isinstance(item, known) and not isinstance(item, bool) for item in items):
+            raise RecordingError(
+                f"is {value!r}, must be {kind}",
+                file=table.name,
+                field=name,
+                remedy="Fit the recordings again",
+            )
+        values[name] = tuple(items) if several else value
+    return Settings(**values)
+
+
+def _of_line(line: str) -> tuple[tuple[str, ...], Driver | str]:
+    """Paths of the calibrations, and the driver or why there is none.
+
+    Raises:
+        ValueError, TypeError, KeyError, OverflowError, RecursionError: It is no such line.
+    """
+    stored = json.loads(line)
+    paths = stored["calibrations"]
+    if not isinstance(paths, list) or not all(isinstance(path, str) for path in paths):
+        raise TypeError(f"calibrations is {paths!r}, must be paths")
+    if "failure" not in stored:
+        return tuple(paths), _from_json(stored)
+    if not isinstance(stored["failure"], str):
+        raise TypeError(f"failure is {stored['failure']!r}, must be text")
+    return tuple(paths), stored["failure"]
+
+
+def _lists(module: Any) -> dict[str, Any]:
+    """The arrays of a module as nested lists."""
+    names = (field.name for field in dataclasses.fields(module))
+    return {name: np.asarray(getattr(module, name)).tolist() for name in names}
+
+
+def _to_json(paths: tuple[str, ...], driver: Driver) -> str:
+    known = driver.calibration
+    return json.dumps(
+        {
+            "calibrations": paths,
+            "method": driver.method,
+            "verdict": driver.verdict,
+            "steps": int(driver.steps),
+            "remarks": words(int(driver.remarks)),
+            "drift": None if driver.drift is None else float(driver.drift),
+            "rrse": float(driver.rrse),
+            "chi2": float(driver.chi2),
+            "b": np.asarray(driver.b).tolist(),
+            "a": np.asarray(driver.a).tolist(),
+            "sample_rate": float(driver.sample_rate),
+            "source": None if driver.source is None else _lists(driver.source),
+            "cov": None if driver.cov is None else np.asarray(driver.cov).tolist(),
+            "r_load": None if known is None else np.asarray(known.r_load).tolist(),
+            "delay": None if known is None else np.asarray(known.delay).tolist(),
+            "delay_std": None if known is None else float(known.delay_std),
+        }
+    )
+
+
+def _from_json(stored: Mapping[str, Any]) -> Driver:
+    """A driver from what `_to_json` has made of it.
+
+    Raises:
+        ValueError, TypeError, KeyError, OverflowError: It is something else.
+    """
+    if not all(isinstance(stored[name], str) for name in ("method", "verdict")):
+        raise TypeError("method and verdict must be texts")
+    source = known = None
+    if stored["source"] is not None:
+        own = stored["source"]
+        pairs = len(_numbers(own, "log_omega", 1))
+        reals = len(_numbers(own, "log_omega_real", 1))
+        shapes = {
+            "log_resistance": (),
+            **dict.fromkeys(("log_omega", "log_zeta", "gain", "slope"), (pairs,)),
+            **dict.fromkeys(("log_omega_real", "gain_real"), (reals,)),
+        }
+        fields = {name: _numbers(own, name, len(shape), shape) for name, shape in shapes.items()}
+        source = SourceImpedance(**fields)
+    cov = None if stored["cov"] is None else _numbers(stored, "cov", 2)
+    size = None if source is None else sum(leaf.size for leaf in jax.tree.leaves(source))
+    if cov is not None and cov.shape != (size, size):
+        raise ValueError(f"cov has shape {cov.shape}, the driver has {size} parameters")
+    if stored["r_load"] is not None:
+        r_load = _numbers(stored, "r_load", 1)
+        delay = _numbers(stored, "delay", 1, r_load.shape)
+        known = Calibration(r_load, _numbers(stored, "delay_std", 0), delay, spectra=None)
+    rate = float(_numbers(stored, "sample_rate", 0))
+    if not 0 < rate < math.inf:
+        raise ValueError(f"sample_rate is {rate}")
+    return Driver(
+        b=_numbers(stored, "b", 1),
+        a=_numbers(stored, "a", 1),
+        sample_rate=rate,
+        source=source,
+        cov=cov,
+        calibration=known,
+        rrse=_numbers(stored, "rrse", 0),
+        chi2=_numbers(stored, "chi2", 0),
+        result=verdicts_of(np.asarray(stored["verdict"])),
+        steps=_numbers(stored, "steps", 0).astype(int),
+        method=stored["method"],
+        remarks=np.asarray(remarks_of(stored.get("remarks", ""))),
+        drift=None if stored.get("drift") is None else _numbers(stored, "drift", 0),
+    )
+
+
+def _numbers(
+    stored: Mapping[str, Any], name: str, dimensions: int, shape: tuple[int, ...] | None = None
+) -> Array:
+    """Numbers of a shape, or of a number of dimensions."""
+    found = np.asarray(stored[name])
+    if found.dtype.kind not in "iuf" or found.ndim != dimensions:
+        raise TypeError(f"{name} is {reprlib.repr(stored[name])}")
+    if shape is not None and found.shape != shape:
+        raise ValueError(f"{name} has shape {found.shape}, must be {shape}")
+    return jnp.asarray(found, dtype=float)

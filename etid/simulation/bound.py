@@ -1,0 +1,170 @@
+"""The Cramer-Rao bound of a scene: how well any unbiased estimator can identify it.
+
+At every harmonic k the records are X_k, Y_k = G_k e^(−jω_k τ) X_k and the same of each calibration,
+G = Z_L / (Z_L + Z_th), all with white noise. X_k and Z_th(f_k) are unknown complex numbers of every
+harmonic, so that the bound holds for a driver of any kind; they are projected out, and what is left
+is the Fisher information of the elements and the trigger delays,
+
+    F = 2 Re Σ_k A_kᴴ (I − B_k B_k⁺) A_k,
+
+A the derivatives by elements and delays, B those by X_k and Z_th(f_k), both over the standard
+deviation of a coefficient (Pintelon and Schoukens, System Identification, 2012, ch. 9 and 16).
+"""
+
+import dataclasses
+import math
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Complex, Float
+
+from etid.circuits.circuit import DISPLAY, AbstractCircuit, Resistor, SkinRC
+from etid.estimators.output_error.information import inverse
+from etid.identify.arguments import require
+from etid.signals.precision import require_float64
+from etid.simulation.scenes import Scene, Trial
+from etid.simulation.transformer import ResistorLoad, SkinLoad, loading
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Bound:
+    """The smallest standard errors with which one trial of a scene can be identified.
+
+    Attributes:
+        path: Path of the trial.
+        circuit: Its true elements, SI.
+        cov: Bound of the covariance of the logarithms of the elements.
+    """
+
+    path: str
+    circuit: AbstractCircuit
+    cov: Float[np.ndarray, "element element"]
+
+    @property
+    def relative(self) -> dict[str, float]:
+        """Bound of the relative standard error of each element."""
+        errors = np.sqrt(np.diagonal(self.cov))
+        return {name: float(e) for name, e in zip(self.circuit.names(), errors, strict=True)}
+
+    @property
+    def stderr(self) -> dict[str, float]:
+        """Bound of the standard error of each element, SI."""
+        return {name: e * float(getattr(self.circuit, name)) for name, e in self.relative.items()}
+
+    @property
+    def undetermined(self) -> tuple[str, ...]:
+        """Elements whose bound exceeds their value."""
+        return tuple(name for name, error in self.relative.items() if not error < 1)
+
+    def __str__(self) -> str:
+        lines = [f"{type(self.circuit).__name__} {self.path!r}, smallest standard errors:"]
+        units = self.circuit.units()
+        width = max(4, *map(len, units))
+        for name, error in self.relative.items():
+            scale, symbol = DISPLAY[units[name]]
+            value = float(getattr(self.circuit, name)) / scale
+            lines.append(f"  {name:<{width}}{value:10.4g} {symbol:<3} ± {100 * error:.2g} %")
+        if self.undetermined:
+            lines.append(
+                f"  The records do not determine {' and '.join(self.undetermined)}: record more "
+                "periods, with less noise or a higher sample rate, or identify a simpler circuit."
+            )
+        return "\n".join(lines)
+
+
+def bound(scene: Scene, *, delays: bool = True, known_driver: bool = False) -> dict[str, Bound]:
+    """Predict, before it is recorded, how well each trial of a scene can be identified.
+
+    Every trial is identified with all calibrations of the scene and without the other trials. A
+    record counts for its length: half a period, for half the information of a whole one.
+
+    Args:
+        scene: Driver, loads, noise and converter; trials with circuits, resistors or skin.
+        delays: Whether the trigger delays of all loaded records are unknown.
+        known_driver: Whether Z_th is known exactly, and calibrations are not needed.
+
+    Returns:
+        The bounds by path.
+
+    Raises:
+        ValueError: A trial's load has no elements, there is neither noise nor a converter, or no
+            calibration.
+    """
+    require_float64()
+    require(
+        "scene", scene, Scene, "Make one with etid.scenes.Scene, or use a preset of etid.scenes"
+    )
+    if not (scene.calibration or known_driver):
+        raise ValueError("the scene has no calibration; its driver would have to be known")
+    waveform = scene.waveform()
+    if waveform.sigma == 0:
+        raise ValueError("the scene has neither noise nor a converter; every bound is zero")
+    inside = waveform.f < scene.sample_rate / 2
+    f, z_th = waveform.f[inside], waveform.z_th[inside]
+    x = waveform.v_th[inside] * math.sqrt(scene.samples) / waveform.sigma
+    known = [] if known_driver else [_circuit(trial) for trial in scene.calibration]
+    found: dict[tuple, Float[np.ndarray, "n n"]] = {}  # trials with the same load share a bound
+    bounds = {}
+    for trial in scene.trials:
+        circuit = _circuit(trial)
+        key = (type(circuit), *np.asarray(circuit.values()))
+        if key not in found:
+            found[key] = _covariance(
+                circuit, known, f, x, z_th, delays, known_driver, scene.shared_v_th
+            )
+        bounds[trial.path] = Bound(trial.path, circuit, found[key])
+    return bounds
+
+
+def _circuit(trial: Trial) -> AbstractCircuit:
+    if isinstance(trial.load, AbstractCircuit):
+        return trial.load
+    if isinstance(trial.load, SkinLoad):
+        return SkinRC(trial.load.r_s, trial.load.r_p, trial.load.c_p)
+    if isinstance(trial.load, ResistorLoad):
+        return Resistor(trial.load.r)
+    raise ValueError(
+        f"the load of {trial.path!r} is {trial.load!r}, which has no elements to identify; use a "
+        "circuit, a SkinLoad or a ResistorLoad"
+    )
+
+
+def _covariance(
+    circuit: AbstractCircuit,
+    known: list[AbstractCircuit],
+    f: Float[np.ndarray, " f"],
+    x: Complex[np.ndarray, " f"],
+    z_th: Complex[np.ndarray, " f"],
+    delays: bool,
+    known_driver: bool,
+    shared_v_th: bool,
+) -> Float[np.ndarray, "element element"]:
+    """Inverse of the information about the elements; x in standard deviations of a coefficient."""
+    loads = [circuit, *known]
+    frequency = jnp.asarray(f)
+    z = [np.asarray(load.response(frequency)) for load in loads]
+    gains = [loading(z_load, z_th) for z_load in z]
+    slope = jax.jacfwd(lambda log: circuit.with_log_values(log).response(frequency))(
+        circuit.log_values()
+    )
+    elements, records = slope.shape[1], len(loads)
+    turn = 2j * np.pi * f * 1e-6  # delays in microseconds
+    # Rows: the loaded records, then the unloaded ones.
+    unloaded = [0] * records if shared_v_th else list(range(records))
+    rows = records + max(unloaded) + 1
+    a = np.zeros((f.size, rows, elements + (records if delays else 0)), complex)
+    b = np.zeros((f.size, rows, rows - records + (0 if known_driver else 1)), complex)
+    for i, (z_load, g) in enumerate(zip(z, gains, strict=True)):
+        b[:, i, unloaded[i]] = g
+        b[:, records + unloaded[i], unloaded[i]] = 1
+        if not known_driver:
+            b[:, i, -1] = -g * x / (z_load + z_th)
+        if delays:
+            a[:, i, elements + i] = -turn * g * x
+    a[:, 0, :elements] = (x * z_th / (z[0] + z_th) ** 2)[:, None] * np.asarray(slope)
+    q, _ = np.linalg.qr(b)
+    rest = a - q @ (np.conj(np.swapaxes(q, 1, 2)) @ a)
+    flat = rest.reshape(-1, a.shape[2])
+    information = 2 * np.real(np.conj(flat.T) @ flat)
+    return np.asarray(inverse(jnp.asarray(information)))[:elements, :elements]

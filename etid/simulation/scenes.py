@@ -1,0 +1,407 @@
+"""Synthetic recordings: a transformer driver, loads, and the imperfections of a laboratory.
+
+    study = etid.scenes.paper(snr_db=60).simulate(seed=0)
+
+Each function named `paper…` returns a `Scene`, one experiment of the paper; `PRESETS` lists them
+by name. Their keywords are the fields of `Scene`: noise, jitter, window, converter. A scene is a
+frozen description; `Scene.simulate` makes the records, `Scene.truth` tells what is behind them.
+
+Every trial has an unloaded record v_th of its own, as in the paper: it is recorded at another pulse
+than v_out, with its own noise, trigger delay and offset; or all share one. The chain from circuit
+to file is
+
+    exact periodic waveform → anti-alias filter → sampling at start + delay + n / sample_rate
+    → · scale → + offset + white noise → rounding to a code, clipped at the full scale.
+"""
+
+import collections
+import dataclasses
+import math
+from collections.abc import Callable, Mapping
+from types import MappingProxyType
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Complex, Float
+
+from etid.circuits.circuit import AbstractCircuit
+from etid.recordings.recording import Recording, Samples, tidy_path
+from etid.recordings.study import Study
+from etid.signals.precision import require_float64
+from etid.simulation.transformer import (
+    Impedance,
+    OpenLoad,
+    ResistorLoad,
+    Sampler,
+    SkinLoad,
+    TransformerDriver,
+    loading,
+)
+
+
+@dataclasses.dataclass(frozen=True)
+class Trial:
+    """One recording to be made.
+
+    Args:
+        path: Name of the recording in its study, such as `s01/dry/03`.
+        load: What is connected: a load of this module, a circuit, or any function from frequencies
+            [Hz] to impedance [ohm].
+        subject: Who.
+        condition: State of the skin.
+        electrode: Which electrode.
+        trial: Which repetition.
+    """
+
+    path: str
+    load: Impedance | AbstractCircuit
+    subject: str = ""
+    condition: str = ""
+    electrode: str = ""
+    trial: str = ""
+
+    def __post_init__(self):
+        if not self.path or tidy_path(self.path) != self.path:
+            raise ValueError(
+                f"{self.path!r} cannot name a trial; use a path without outer slashes, such as "
+                "'s01/dry/03'"
+            )
+
+
+@dataclasses.dataclass(frozen=True)
+class Waveform:
+    """Harmonics of a scene without noise, and the noise.
+
+    Attributes:
+        f: Harmonics of the pulse rate [Hz], far beyond half the sample rate.
+        v_th: Fourier coefficients of the unloaded voltage after the anti-alias filter [V].
+        z_th: Source impedance [ohm].
+        sigma: Standard deviation of a sample, noise and rounding together [V].
+    """
+
+    f: Float[np.ndarray, " f"]
+    v_th: Complex[np.ndarray, " f"]
+    z_th: Complex[np.ndarray, " f"]
+    sigma: float
+
+
+@dataclasses.dataclass(frozen=True)
+class Scene:
+    """A set of recordings with one driver.
+
+    Args:
+        trials: The recordings to identify.
+        calibration: Recordings with known resistors; every trial refers to all of them.
+        driver: The pulse transformer.
+        sample_rate: Samples per second [Hz].
+        pulse_rate: Nominal pulses per second [Hz], as the files will tell it.
+        pulse_rate_ppm: True pulse rate relative to the nominal one, as the converter's clock sees
+            it [1e-6]. The files do not tell it.
+        samples: Length of a record; 10 000 are three periods.
+        start: Time of the first sample after the start of a period [s].
+        antialias: Corner of the 4th-order Butterworth anti-alias filter, relative to `sample_rate`.
+        snr_db: Effective value of the unloaded voltage over one period, after the anti-alias
+            filter, relative to that of the white noise of every record [dB]; None for no noise.
+        trigger_jitter_rms: Standard deviation of the delay of every single record [s]. A positive
+            delay samples late.
+        offset_rms: Standard deviation of the offset of every single record [V at the converter].
+        shared_v_th: Whether all trials and calibrations share one unloaded record, and its noise.
+        full_scale: The converter clips at ± this voltage [V at the converter].
+        bits: Resolution of the converter; None stores unrounded volts at the converter.
+        scale: Volts at the converter per volt at the terminal.
+    """
+
+    trials: tuple[Trial, ...] = ()
+    calibration: tuple[Trial, ...] = ()
+    driver: TransformerDriver = dataclasses.field(default_factory=TransformerDriver)
+    sample_rate: float = 200e3
+    pulse_rate: float = 60.0
+    pulse_rate_ppm: float = 0.0
+    samples: int = 10_000
+    start: float = 0.0
+    antialias: float = 0.4
+    snr_db: float | None = 60.0
+    trigger_jitter_rms: float = 0.0
+    offset_rms: float = 0.0
+    shared_v_th: bool = False
+    full_scale: float = 10.0
+    bits: int | None = 16
+    scale: float = 0.0535
+
+    def __post_init__(self):
+        counts = collections.Counter(trial.path for trial in self.calibration + self.trials)
+        twice = sorted(path for path, count in counts.items() if count > 1)
+        if twice:
+            raise ValueError(f"paths {twice} occur more than once; name each trial differently")
+        for trial in self.calibration:
+            if not isinstance(trial.load, ResistorLoad):
+                raise ValueError(
+                    f"calibration {trial.path!r} has the load {trial.load!r}; a calibration needs "
+                    "a ResistorLoad, move other loads to `trials`"
+                )
+        for name in ("sample_rate", "pulse_rate", "antialias", "full_scale", "scale"):
+            value = getattr(self, name)
+            if not (value > 0 and math.isfinite(value)):
+                raise ValueError(f"{name} is {value}; it must be positive and finite")
+        for name in ("trigger_jitter_rms", "offset_rms"):
+            if not getattr(self, name) >= 0:
+                raise ValueError(f"{name} is {getattr(self, name)}; it must not be negative")
+        if self.samples < 1:
+            raise ValueError(f"samples is {self.samples}; a record has at least one")
+        if self.bits is not None and not 2 <= self.bits <= 32:
+            raise ValueError(f"bits is {self.bits}; a converter has 2 to 32, or None for volts")
+
+    def truth(self) -> dict[str, dict[str, float]]:
+        """Elements of every load by path, SI; empty for an open circuit or a plain function."""
+        return {trial.path: _elements(trial.load) for trial in self.calibration + self.trials}
+
+    def simulate(self, seed: int) -> Study:
+        """Make the recordings.
+
+        The random numbers of a record depend on `seed` and its path only: the same trial in two
+        scenes differs by what the scenes differ in, not by another draw.
+
+        Args:
+            seed: Seed of noise, delays and offsets.
+
+        Returns:
+            One recording per calibration and trial.
+        """
+        _, v_th, z_th, _ = self._exact()
+        return self.record(seed, lambda trial, f: v_th * loading(_impedance(trial, f), z_th))
+
+    def record(
+        self,
+        seed: int,
+        voltage: Callable[[Trial, Float[np.ndarray, " f"]], Complex[np.ndarray, " f"]],
+    ) -> Study:
+        """Record terminal voltages that come from elsewhere, such as a circuit simulator.
+
+        Noise, delays and offsets are those of `simulate` at the same seed: what differs between the
+        two studies is the voltage alone.
+
+        Args:
+            seed: Seed of noise, delays and offsets.
+            voltage: Fourier coefficients [V] of the terminal voltage of a trial at the harmonics
+                [Hz] of the true pulse rate, before the anti-alias filter. It is asked for the
+                unloaded voltage as well, by a trial whose load is open.
+
+        Returns:
+            One recording per calibration and trial.
+        """
+        sampler, _, _, sigma = self._exact()
+        v_th = voltage(Trial("unloaded", OpenLoad()), sampler.f)
+        resistances = {
+            trial.path: trial.load.r
+            for trial in self.calibration
+            if isinstance(trial.load, ResistorLoad)  # __post_init__ holds it; this tells the type
+        }
+        step, lowest, highest = self._converter()
+
+        recordings = []
+        common = np.random.default_rng([seed, *b"v_th"])
+        unloaded = self._convert(sampler, v_th, sigma, common) if self.shared_v_th else None
+        for trial in self.calibration + self.trials:
+            draws = np.random.default_rng([seed, *trial.path.encode()]).spawn(2)
+            r_load = resistances.get(trial.path)
+            v_out = voltage(trial, sampler.f)
+            recordings.append(
+                Recording(
+                    unloaded or self._convert(sampler, v_th, sigma, draws[0]),
+                    self._convert(sampler, v_out, sigma, draws[1]),
+                    sample_rate=self.sample_rate,
+                    pulse_rate=self.pulse_rate,
+                    r_load=r_load,
+                    subject=trial.subject,
+                    condition=trial.condition,
+                    electrode=trial.electrode,
+                    trial=trial.trial,
+                    calibration=tuple(resistances) if r_load is None else (),
+                    adc_range=(lowest * step / self.scale, highest * step / self.scale),
+                    path=trial.path,
+                )
+            )
+        return Study.from_recordings(recordings)
+
+    def waveform(self) -> "Waveform":
+        """What the records hold at the harmonics of the pulse rate."""
+        sampler, v_th, z_th, sigma = self._exact()
+        step = self._converter()[0] if self.bits is not None else 0.0
+        total = math.hypot(sigma, step / math.sqrt(12)) / self.scale
+        return Waveform(sampler.f, v_th * sampler.antialias, z_th, total)
+
+    def _exact(self) -> tuple[Sampler, np.ndarray, np.ndarray, float]:
+        """Sampler, Fourier coefficients of V_th [V], Z_th [ohm] and noise [V at the converter]."""
+        sampler = Sampler(
+            self.sample_rate,
+            self.pulse_rate * (1 + 1e-6 * self.pulse_rate_ppm),
+            self.antialias * self.sample_rate,
+        )
+        v_th = sampler.pulse_rate * self.driver.v_th_spectrum(sampler.f)
+        sigma = 0.0
+        if self.snr_db is not None:
+            sigma = self.scale * sampler.rms(v_th) * 10 ** (-self.snr_db / 20)
+        return sampler, v_th, self.driver.z_th(sampler.f), sigma
+
+    def _converter(self) -> tuple[float, float, float]:
+        """Volts at the converter per stored unit, and the lowest and highest stored value."""
+        if self.bits is None:
+            return 1.0, -self.full_scale, self.full_scale
+        half = 2.0 ** (self.bits - 1)
+        return self.full_scale / half, -half, half - 1
+
+    def _convert(
+        self,
+        sampler: Sampler,
+        coefficients: Complex[np.ndarray, " f"],
+        sigma: float,
+        rng: np.random.Generator,
+    ) -> Samples:
+        """One record as the converter stores it, from Fourier coefficients at the terminal [V]."""
+        # Drawn even where multiplied by 0: scenes with and without an effect stay comparable.
+        delay = self.trigger_jitter_rms * rng.standard_normal()
+        offset = self.offset_rms * rng.standard_normal()
+        noise = sigma * rng.standard_normal(self.samples)
+        volts = self.scale * sampler.sample(coefficients, self.samples, self.start + delay)
+        volts += offset + noise
+        step, lowest, highest = self._converter()
+        if self.bits is None:
+            return Samples(np.clip(volts, lowest, highest), 1 / self.scale)
+        codes = np.clip(np.rint(volts / step), lowest, highest)
+        return Samples(codes.astype(np.int16 if self.bits <= 16 else np.int32), step / self.scale)
+
+
+def _elements(load: Impedance | AbstractCircuit) -> dict[str, float]:
+    if isinstance(load, AbstractCircuit):
+        return dict(zip(load.names(), load.values().tolist(), strict=True))
+    known = isinstance(load, OpenLoad | ResistorLoad | SkinLoad)
+    return dataclasses.asdict(load) if known else {}
+
+
+def _impedance(trial: Trial, f: Float[np.ndarray, " f"]) -> Complex[np.ndarray, " f"]:
+    """The load's impedance, checked because any function may stand there."""
+    if isinstance(trial.load, AbstractCircuit):
+        require_float64()
+        z = np.asarray(trial.load.response(jnp.asarray(f)))
+    else:
+        z = np.asarray(trial.load(f), complex)
+    if z.shape != f.shape or np.isnan(z).any():
+        raise ValueError(
+            f"the load of {trial.path!r} returned shape {z.shape} with {np.isnan(z).sum()} NaN for "
+            f"{f.size} frequencies from {f[0]:g} to {f[-1]:g} Hz; it must return one impedance "
+            "[ohm] for each (infinite where open)"
+        )
+    return z
+
+
+def resistor_label(r: float) -> str:
+    """A resistance as printed on the part: 98800 becomes `98k8`, 555000 becomes `555k`.
+
+    Args:
+        r: Resistance [ohm].
+    """
+    whole, _, decimals = f"{r / 1e3:.12g}".partition(".")
+    return f"{whole}k{decimals}"
+
+
+def _resistors(folder: str, values: tuple[float, ...]) -> tuple[Trial, ...]:
+    return tuple(
+        Trial(f"{folder}/{resistor_label(r)}", ResistorLoad(r), condition=folder) for r in values
+    )
+
+
+def _repeated(folder: str, load: SkinLoad, count: int, **labels: str) -> tuple[Trial, ...]:
+    return tuple(
+        Trial(f"{folder}/{i:02d}", load, trial=f"{i:02d}", **labels) for i in range(1, count + 1)
+    )
+
+
+_CALIBRATION = _resistors("calibration", (98.8e3,))  # the paper's reference resistor
+_RESISTORS = _resistors("resistors", (21.62e3, 55.20e3, 216.6e3, 328.9e3, 555.0e3))  # Table I
+_DRY = SkinLoad(r_s=33.4e3, r_p=186e3, c_p=0.12e-9)  # Table II
+_DAMP = SkinLoad(r_s=6.1e3, r_p=17.4e3, c_p=0.66e-9)  # Table III
+_BUILT = SkinLoad(r_s=32.46e3, r_p=179.8e3, c_p=0.12e-9)  # Table IV
+# What ten subjects spanned, r_s, r_p [ohm], c_p [F]: Table II (dry) and Table III (damp).
+_RANGES = {
+    "dry": ((19e3, 69.8e3), (194e3, 616e3), (45e-12, 165e-12)),
+    "damp": ((3.9e3, 19.8e3), (20.2e3, 165e3), (160e-12, 845e-12)),
+}
+_TYPICAL_TRIALS = 10
+_SUBJECTS = 10
+_SUBJECT_TRIALS = 5
+_POPULATION_SEED = 10
+
+
+def paper_calibration(**settings: Any) -> Scene:
+    """The reference resistor of 98.8 kΩ alone. Keywords are fields of `Scene`."""
+    return Scene((), _CALIBRATION, **settings)
+
+
+def paper_resistors(**settings: Any) -> Scene:
+    """The five test resistors of Table I. Keywords are fields of `Scene`."""
+    return Scene(_RESISTORS, _CALIBRATION, **settings)
+
+
+def paper_built(**settings: Any) -> Scene:
+    """The soldered circuit of Table IV, 23 trials. Keywords are fields of `Scene`."""
+    trials = _repeated("built", _BUILT, 23, condition="built")
+    return Scene(trials, _CALIBRATION, **settings)
+
+
+def paper_dry(**settings: Any) -> Scene:
+    """The typical dry fingertip of Table II, ten trials. Keywords are fields of `Scene`."""
+    trials = _repeated("typical/dry", _DRY, _TYPICAL_TRIALS, subject="typical", condition="dry")
+    return Scene(trials, _CALIBRATION, **settings)
+
+
+def paper_damp(**settings: Any) -> Scene:
+    """The typical damp fingertip of Table III, ten trials. Keywords are fields of `Scene`."""
+    trials = _repeated("typical/damp", _DAMP, _TYPICAL_TRIALS, subject="typical", condition="damp")
+    return Scene(trials, _CALIBRATION, **settings)
+
+
+def paper_subjects(**settings: Any) -> Scene:
+    """Ten subjects, dry and damp, five trials each.
+
+    The elements are log-uniform in the ranges of Tables II and III, drawn once for all: the same
+    people in every scene. The trials of a subject and condition share their elements, so that any
+    spread between them is the estimator's. Keywords are fields of `Scene`.
+    """
+    rng = np.random.default_rng(_POPULATION_SEED)
+    trials: tuple[Trial, ...] = ()
+    for number in range(1, _SUBJECTS + 1):
+        subject = f"s{number:02d}"
+        for condition, ranges in _RANGES.items():
+            r_s, r_p, c_p = (float(np.exp(rng.uniform(*np.log(limits)))) for limits in ranges)
+            trials += _repeated(
+                f"{subject}/{condition}",
+                SkinLoad(r_s, r_p, c_p),
+                _SUBJECT_TRIALS,
+                subject=subject,
+                condition=condition,
+            )
+    return Scene(trials, _CALIBRATION, **settings)
+
+
+def paper(**settings: Any) -> Scene:
+    """Everything above in one study, 149 recordings. Keywords are fields of `Scene`."""
+    parts = (paper_resistors, paper_built, paper_dry, paper_damp, paper_subjects)
+    trials = tuple(trial for part in parts for trial in part().trials)
+    return Scene(trials, _CALIBRATION, **settings)
+
+
+PRESETS: Mapping[str, Callable[..., Scene]] = MappingProxyType(
+    {
+        preset.__name__: preset
+        for preset in (
+            paper_calibration,
+            paper_resistors,
+            paper_built,
+            paper_dry,
+            paper_damp,
+            paper_subjects,
+            paper,
+        )
+    }
+)

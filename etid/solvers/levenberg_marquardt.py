@@ -1,0 +1,307 @@
+"""Levenberg-Marquardt on normal equations, built from optimistix parts.
+
+`optimistix.LevenbergMarquardt` carries the residual and its Jacobian in the solver's state. Under
+`vmap` a step of one lane selects between two copies of that state for all lanes, which costs about
+twelve times the step itself when the residual has thousands of samples. Here the state holds the
+objective, its gradient and the p×p Gauss-Newton matrix only: `optimistix.DampedNewtonDescent`
+solves the damped step, `optimistix.ClassicalTrustRegion` accepts it and sets the damping. Where the
+matrix has a structure worth keeping (`etid.solvers.arrowhead`), its equations and its descent take
+their places.
+
+Three things make the method scale-free:
+
+- **Marquardt scaling.** The step is solved in z = D y, D² = diag(JᵀJ) (the largest seen, as in Moré
+  1978), so that multiplying a parameter by a constant changes no iterate.
+- **Stopping on an angle.** The relative offset of Bates & Watts (1981), the sine of the angle
+  between the residual and the tangent plane, has neither the unit of the residual nor of a
+  parameter. Times √(samples) it is the distance to the minimum in standard errors. A step too small
+  to move the parameters is *not* convergence: a solver that cannot move must not report success.
+- **A trial step whose residual or slope is not finite is rejected**, as if its objective were
+  infinite.
+"""
+
+import abc
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import lineax as lx
+import optimistix as optx
+from jaxtyping import Array, Bool, Float, Int, PyTree
+
+INITIAL_DAMPING = 1e-2  # relative to the unit diagonal of the scaled Gauss-Newton matrix
+RIDGE = 1e-13  # of the scaled matrix, for directions that double precision cannot resolve
+ROUNDING = 4.0  # units of ε that the model's own arithmetic loses
+IDLE_STEPS = 3  # in a row; the steps grow fivefold from one to the next
+ACCELERATION = 0.75  # of the step, that its second order may be (Transtrum and Sethna)
+DIFFERENCE = 0.1  # of the step, at which its second derivative is taken (Transtrum and Sethna)
+STALLED_STEP = 1e-15  # a relative step that no longer changes the parameters in double precision
+
+
+class AbstractNormalEquations(eqx.Module):
+    """Objective ½|r|², gradient Jᵀr and Gauss-Newton matrix JᵀJ of a residual r, however stored."""
+
+    objective: eqx.AbstractVar[Float[Array, ""]]
+    gradient: eqx.AbstractVar[Float[Array, " parameter"]]
+
+    @abc.abstractmethod
+    def diagonal(self) -> Float[Array, " parameter"]:
+        """Diagonal of JᵀJ."""
+
+    @abc.abstractmethod
+    def scaled(self, by: Float[Array, " parameter"]) -> "AbstractNormalEquations":
+        """The same in the parameters z = `by` · y."""
+
+    @abc.abstractmethod
+    def hessian(self) -> lx.AbstractLinearOperator:
+        """JᵀJ, for the descent and the search of optimistix."""
+
+
+class NormalEquations(AbstractNormalEquations):
+    """Normal equations with JᵀJ as one matrix."""
+
+    objective: Float[Array, ""]
+    gradient: Float[Array, " parameter"]
+    matrix: Float[Array, "parameter parameter"]
+
+    def diagonal(self) -> Float[Array, " parameter"]:
+        """Diagonal of JᵀJ."""
+        return jnp.diagonal(self.matrix)
+
+    def scaled(self, by: Float[Array, " parameter"]) -> "NormalEquations":
+        """The same in the parameters z = `by` · y."""
+        matrix = self.matrix / by[:, None] / by[None, :]
+        return NormalEquations(self.objective, self.gradient / by, matrix)
+
+    def finite(self) -> "NormalEquations":
+        """The same, with an infinite objective where value or slope are not finite.
+
+        A slope that is not finite is as bad as such a value: nothing could follow from this point.
+        """
+        finite = jnp.isfinite(self.objective) & jnp.isfinite(self.gradient).all()
+        return NormalEquations(
+            jnp.where(finite, self.objective, jnp.inf), self.gradient, self.matrix
+        )
+
+    def hessian(self) -> lx.AbstractLinearOperator:
+        """JᵀJ as an operator."""
+        return lx.MatrixLinearOperator(self.matrix, lx.positive_semidefinite_tag)
+
+
+def normal_equations(
+    residual: Callable[[Float[Array, " parameter"], Any], Float[Array, " sample"]],
+    y: Float[Array, " parameter"],
+    args: Any = None,
+) -> NormalEquations:
+    """Evaluate the normal equations of `residual(y, args)`, by forward differentiation."""
+
+    def twice(y):
+        r = residual(y, args)
+        return r, r
+
+    jacobian, r = jax.jacfwd(twice, has_aux=True)(y)
+    return NormalEquations(0.5 * jnp.dot(r, r), jacobian.T @ r, jacobian.T @ jacobian).finite()
+
+
+def empty(y: Float[Array, " parameter"], args: Any = None) -> NormalEquations:
+    """Normal equations of zeros."""
+    del args
+    return NormalEquations(
+        jnp.zeros((), y.dtype), jnp.zeros_like(y), jnp.zeros((y.size, y.size), y.dtype)
+    )
+
+
+def best_start(
+    residual: Callable[[Float[Array, " parameter"]], Float[Array, " sample"]],
+    starts: Float[Array, "start parameter"],
+) -> Float[Array, " parameter"]:
+    """The start with the smallest finite Σ r²."""
+    objectives = jax.lax.map(lambda y: jnp.sum(residual(y) ** 2), starts)
+    return starts[jnp.argmin(jnp.where(jnp.isfinite(objectives), objectives, jnp.inf))]
+
+
+def second_order(
+    residual: Callable[[Float[Array, " parameter"], Any], Float[Array, " sample"]],
+    y: Float[Array, " parameter"],
+    step: Float[Array, " parameter"],
+    args: Any = None,
+) -> Float[Array, " parameter"]:
+    """Jᵀ r″, r″ the second derivative of the residual along the step."""
+
+    def value(y):
+        return residual(y, args)
+
+    # By differences, which are good enough for a step: nested derivatives compile twice as long.
+    ends = jax.vmap(value)(y[None, :] + DIFFERENCE * jnp.array([[1.0], [-1.0]]) * step[None, :])
+    middle, pullback = jax.vjp(value, y)
+    return pullback((ends.sum(0) - 2 * middle) / DIFFERENCE**2)[0]
+
+
+class _State(eqx.Module):
+    first_step: Bool[Array, ""]
+    y_eval: Float[Array, " parameter"]
+    accepted: AbstractNormalEquations
+    scale: Float[Array, " parameter"]
+    search_state: Any
+    terminate: Bool[Array, ""]
+    result: optx.RESULTS
+    accepted_steps: Int[Array, ""]
+    idle: Int[Array, ""]
+
+
+def _value(fn):
+    """`fn` without its auxiliary output."""
+    return lambda y, args: fn(y, args)[0]
+
+
+def _select(pred, new: PyTree, old: PyTree) -> PyTree:
+    return jax.tree.map(lambda a, b: jnp.where(pred, a, b), new, old)
+
+
+class LevenbergMarquardt(optx.AbstractLeastSquaresSolver):
+    """Levenberg-Marquardt for `optimistix.least_squares`, with O(p²) state.
+
+    The residual function takes and returns one-dimensional arrays.
+
+    Attributes:
+        rtol: Stop when the relative offset, |Q₁ᵀ r| / |r| with Q₁ a basis of the range of J, is
+            below this.
+        atol: Stop when the remaining Gauss-Newton step, scaled, is below this times the scaled
+            parameters (problems without noise, where the residual itself vanishes).
+        ftol: Stop when several accepted steps in a row each reduce |r|² by less than this part, and
+            promised no more: along a valley whose floor is flat within rounding, as of a
+            superfluous pole, the two criteria above are never met.
+        norm: Norm of the scaled step and parameters.
+        geodesic: Bend each step along the model's curvature, by its second derivative (Transtrum
+            and Sethna 2012, arXiv:1201.5885): curved valleys take a fraction of the steps, and each
+            costs a third more.
+        descent: Solves the damped step.
+        search: Accepts it and sets the damping.
+        equations: Evaluates the normal equations of `fn(y, args)`. With a descent that knows their
+            kind, a problem of many parameters can keep its structure.
+        second_order: Evaluates Jᵀ r″ of `fn(y, args)`.
+        empty: Makes normal equations of zeros, for parameters and `args`.
+    """
+
+    rtol: float = 1e-6
+    atol: float = 1e-12
+    ftol: float = 1e-8
+    norm: Callable[[PyTree], Array] = optx.two_norm
+    descent: optx.AbstractDescent = optx.DampedNewtonDescent(linear_solver=lx.Cholesky())
+    # MINPACK's threshold, and constants whose powers differ: with 10 and 1/10 the damping returns
+    # over and over to the value just rejected, and a curved valley costs three times the steps.
+    search: optx.ClassicalTrustRegion = optx.ClassicalTrustRegion(
+        high_cutoff=0.75, high_constant=5.0, low_constant=0.25
+    )
+    geodesic: bool = False
+    equations: Callable[[Callable, Array, Any], AbstractNormalEquations] = normal_equations
+    second_order: Callable[[Callable, Array, Array, Any], Array] = second_order
+    empty: Callable[[Array, Any], AbstractNormalEquations] = empty
+
+    def init(self, fn, y, args, options, f_struct, aux_struct, tags) -> _State:
+        """Set up an empty state; the first step evaluates `y` itself."""
+        del fn, options, f_struct, aux_struct, tags
+        zero = self.empty(y, args)
+        return _State(
+            first_step=jnp.array(True),
+            y_eval=y,
+            accepted=zero,
+            scale=jnp.zeros_like(y),
+            search_state=self.search.init(y, self._info(zero)),
+            terminate=jnp.array(False),
+            result=optx.RESULTS.successful,
+            accepted_steps=jnp.array(0),
+            idle=jnp.array(0),
+        )
+
+    def _info(self, equations: AbstractNormalEquations):
+        return optx.FunctionInfo.EvalGradHessian(
+            equations.objective, equations.gradient, equations.hessian()
+        )
+
+    def step(self, fn, y, args, options, state: _State, tags):
+        """Evaluate the trial point, accept or reject it, and propose the next."""
+        del options, tags
+        trial = self.equations(_value(fn), state.y_eval, args)
+        step_size, accept, _, search_state = self.search.step(
+            state.first_step,
+            y,
+            state.y_eval,
+            self._info(state.accepted),
+            self._info(trial),
+            state.search_state,
+        )
+        accept = accept & jnp.isfinite(trial.objective) | state.first_step
+        tried = state.y_eval - y
+        promised = -self.search.predict_reduction(tried, self._info(state.accepted))
+        reduced = state.accepted.objective - trial.objective
+        negligible = jnp.maximum(jnp.abs(reduced), promised) <= self.ftol * trial.objective
+        # Once is no sign of it: after a rejection, a step is as short as its reduction is small.
+        idle = jnp.where(negligible & ~state.first_step, state.idle + 1, 0)
+        idle = jnp.where(accept, idle, state.idle)
+        accepted = _select(accept, trial, state.accepted)
+        y = jnp.where(accept, state.y_eval, y)
+        diagonal = jnp.sqrt(accepted.diagonal())
+        scale = jnp.maximum(state.scale, diagonal)
+        safe = jnp.where(scale > 0, scale, 1.0)
+
+        # The step is solved in z = D y; a descent takes the damping as 1 / step_size.
+        scaled = accepted.scaled(safe)
+        info = self._info(scaled)
+        descent_state = self.descent.query(y, info, self.descent.init(y, info))
+        # A factorisation that fails proposes a step that is not finite; the next trial rejects it
+        # and raises the damping.
+        proposed, _ = self.descent.step(step_size / INITIAL_DAMPING, descent_state)
+        if self.geodesic:
+            bent = self.second_order(_value(fn), y, proposed / safe, args) / safe
+            bent = eqx.tree_at(lambda e: e.gradient, scaled, bent)
+            turned, _ = self.descent.step(
+                step_size / INITIAL_DAMPING,
+                self.descent.query(y, self._info(bent), descent_state),
+            )
+            small = 2 * self.norm(turned) <= ACCELERATION * self.norm(proposed)
+            proposed = proposed + jnp.where(small, 0.5 * turned, 0.0)
+
+        size = self.norm(safe * y)
+        newton, _ = self.descent.step(jnp.asarray(1 / RIDGE, y.dtype), descent_state)
+        offset = -jnp.dot(newton, scaled.gradient)  # |Q₁ᵀ r|²
+        squares = 2 * accepted.objective
+        converged = offset <= self.rtol**2 * squares
+        # Rounding in the residual is ε times the model, which is about |J y|: a reduction of |r|²
+        # below |r| times that cannot be seen, and the rejection of a step then means nothing.
+        model = self.norm(diagonal * y)
+        unseen = offset <= ROUNDING * jnp.finfo(y.dtype).eps * jnp.sqrt(squares) * model
+        converged = converged | (unseen & ~accept)
+        converged = converged | (idle >= IDLE_STEPS) | (self.norm(newton) <= self.atol * size)
+        stalled = (self.norm(safe * tried) <= STALLED_STEP * size) & ~state.first_step
+        finite = jnp.isfinite(accepted.objective)
+        terminate = converged | stalled | ~finite
+        failed = ~finite | (stalled & ~converged)
+        result = optx.RESULTS.where(
+            failed, optx.RESULTS.nonlinear_divergence, optx.RESULTS.successful
+        )
+        state = _State(
+            first_step=jnp.array(False),
+            y_eval=y + proposed / safe,
+            accepted=accepted,
+            scale=scale,
+            search_state=search_state,
+            terminate=terminate,
+            result=result,
+            accepted_steps=state.accepted_steps + jnp.where(accept, 1, 0),
+            idle=idle,
+        )
+        return y, state, None
+
+    def terminate(self, fn, y, args, options, state: _State, tags):
+        """Whether to stop, and the verdict so far."""
+        del fn, y, args, options, tags
+        return state.terminate, state.result
+
+    def postprocess(self, fn, y, aux, args, options, state: _State, tags, result):
+        """Return the normal equations at the solution as statistics: the covariance needs them."""
+        del fn, args, options, tags, result
+        stats = {"normal_equations": state.accepted, "accepted_steps": state.accepted_steps}
+        return y, aux, stats

@@ -1,0 +1,45 @@
+"""Importing etid does nothing else, and shows what is public."""
+
+import subprocess
+import sys
+import types
+
+import etid
+
+
+def run(code, **environment):
+    return subprocess.run(
+        [sys.executable, "-W", "error", "-c", code], capture_output=True, text=True, check=False
+    )
+
+
+def test_importing_prints_nothing_and_changes_no_setting():
+    code = """
+import jax
+before = dict(jax.config.values)
+import sys, etid
+assert dict(jax.config.values) == before
+assert not {"matplotlib", "pandas", "jaxopt", "pyarrow", "pynwb"} & set(sys.modules), "too much"
+"""
+    done = run(code)
+    assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
+
+
+def test_float32_is_refused_with_the_line_to_add():
+    code = """
+import numpy as np, etid
+v = np.ones(1000)
+cal = etid.Recording(v, v, sample_rate=2e5, pulse_rate=60.0, r_load=1e5)
+etid.identify_driver(cal)
+"""
+    done = run(code)
+    assert done.returncode == 1
+    assert 'jax.config.update("jax_enable_x64", True)' in done.stderr
+    assert done.stderr.strip().splitlines()[-1].startswith("or set the environment variable")
+
+
+def test_dir_shows_the_public_names_and_no_module():
+    shown = dir(etid)
+    assert shown == sorted(etid.__all__)
+    modules = {name for name in shown if isinstance(getattr(etid, name), types.ModuleType)}
+    assert modules == {"scenes"}  # `etid.scenes.paper_skins()` is how its functions are called
