@@ -27,7 +27,7 @@ from matplotlib.ticker import LogLocator, NullFormatter
 import etid
 from benchmarks import charts
 from benchmarks.paper_tables import Groups, Row, with_circuit
-from etid.circuits.circuit import DISPLAY
+from etid.circuits.display import DISPLAY
 from etid.paper import tables as experiments
 from etid.paper.tables import CALIBRATION, METHODS, ORDER, Outcome, Truth
 from etid.plotting.pulses import draw_pulse, pulse

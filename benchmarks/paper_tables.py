@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 import etid
-from etid.circuits.circuit import DISPLAY
+from etid.circuits.display import DISPLAY
 from etid.paper import tables as experiments
 from etid.paper.tables import ORDER, Outcome, Truth
 from etid.report.html import Table, number

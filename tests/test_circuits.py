@@ -16,7 +16,7 @@ from etid import (
     resistor,
     series,
 )
-from etid.circuits.circuit import heading
+from etid.circuits.display import heading
 from etid.signals.transfer import frequency_variable
 
 FREQUENCY = jnp.geomspace(10.0, 1e6, 25)

@@ -14,6 +14,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Complex, Float
 
+from etid.circuits.display import DISPLAY
 from etid.circuits.elements import (
     AbstractImpedance,
     Farad,
@@ -27,16 +28,6 @@ from etid.circuits.elements import (
 from etid.signals.transfer import frequency_variable
 
 Circuit = TypeVar("Circuit", bound="AbstractCircuit")
-# Scaled units exist only in print.
-DISPLAY = {
-    "ohm": (1e3, "kΩ"),
-    "farad": (1e-9, "nF"),
-    "second": (1e-6, "µs"),
-    "siemens second^alpha": (1e-9, "nS·s^alpha"),
-    "1": (1.0, ""),
-}
-
-
 # Powers with which a parameter goes with the impedance and with the time scale of its circuit.
 SCALING = {
     "ohm": (1.0, 0.0),
@@ -48,12 +39,6 @@ SCALING = {
 # Standard errors by which an exponent may exceed 1: of a relaxation of one time constant it does so
 # by chance, in every second fit by less than one, in one of 30 000 by more than four.
 ABOVE_ONE = 4.0
-
-
-def heading(name: str, unit: str) -> str:
-    """Name and scaled unit of a parameter, as in `r_s [kΩ]`."""
-    symbol = DISPLAY[unit][1]
-    return f"{name} [{symbol}]" if symbol else name
 
 
 def parameter(unit: str, *, typical: float) -> Any:

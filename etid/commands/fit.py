@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from etid.circuits.circuit import DISPLAY, heading
+from etid.circuits.display import DISPLAY, heading
 from etid.commands import DONE, WRONG_DATA, Outcome
 from etid.estimators.registry import METHODS
 from etid.identify.file import fit_file, kept, processes

@@ -20,7 +20,7 @@ import jax
 import numpy as np
 
 import etid
-from etid.circuits.circuit import DISPLAY
+from etid.circuits.display import DISPLAY
 from etid.paper.tables import (
     CALIBRATION,
     FINGERTIPS,

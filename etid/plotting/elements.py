@@ -6,7 +6,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 
-from etid.circuits.circuit import DISPLAY, heading
+from etid.circuits.display import DISPLAY, heading
 from etid.plotting.style import COLOURS, INK, MARKS, RED, Canvas, plain_ticks, titled
 from etid.results.fits import Fits
 from etid.simulation.bound import Bound

@@ -4,12 +4,12 @@ import jax.numpy as jnp
 import numpy as np
 from matplotlib.axes import Axes
 
-from etid.circuits.circuit import DISPLAY, AbstractCircuit, Resistor
+from etid.circuits.circuit import AbstractCircuit, Resistor
 from etid.identify.one import predict
 from etid.plotting.style import BLUE, INK, RED, Canvas, titled
 from etid.recordings.recording import LABELS, Recording
 from etid.results.driver import Driver
-from etid.results.fits import Fit, plus_minus, rrse
+from etid.results.fits import Fit, rrse
 from etid.signals.measurement import noise
 from etid.simulation.transformer import loading
 
@@ -63,12 +63,7 @@ def draw_fit(canvas: Canvas, fit: Fit, recording: Recording, driver: Driver) -> 
         titled(axes[0], [_headline(recording, fit)], good=good)
         return axes
     draw_pulse(axes[0], axes[1], recording, driver, fit.circuit)
-    elements = []
-    for name, unit in fit.circuit.units().items():
-        scale, symbol = DISPLAY[unit]
-        value, error = (float(getattr(x, name)) / scale for x in (fit.circuit, fit.stderr))
-        elements.append(f"{name} {' '.join(plus_minus(value, error).split())} {symbol}")
-    titled(axes[0], [_headline(recording, fit), ",  ".join(elements)], good=good)
+    titled(axes[0], [_headline(recording, fit), ",  ".join(fit.elements)], good=good)
     return axes
 
 

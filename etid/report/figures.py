@@ -14,7 +14,7 @@ from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from etid.circuits.circuit import DISPLAY, heading
+from etid.circuits.display import DISPLAY, heading
 from etid.plotting import figure_of
 from etid.plotting.style import COLOURS, DASHES, MARKS, new_figure
 from etid.report.tables import Components, frequent

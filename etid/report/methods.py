@@ -9,6 +9,7 @@ import pathlib
 import numpy as np
 
 from etid.circuits import circuit as circuits
+from etid.circuits.display import quantity
 from etid.estimators import judgement, steiglitz_mcbride
 from etid.estimators.baseline import BIASED
 from etid.estimators.output_error import fit as output_error
@@ -122,7 +123,7 @@ def _model(found: StudyFits) -> str:
         text += f"The load is the circuit {type(circuit).__name__}"
     if settings is not None:
         typical = ", ".join(
-            f"{name} {value / circuits.DISPLAY[unit][0]:.4g} {circuits.DISPLAY[unit][1]}".rstrip()
+            f"{name} {quantity(value, unit)}"
             for (name, unit), value in zip(circuit.units().items(), settings.start, strict=True)
         )
         text += f"; fits started around the typical {typical}"

@@ -6,7 +6,6 @@ import pathlib
 import numpy as np
 from matplotlib.figure import Figure
 
-from etid.circuits.circuit import DISPLAY
 from etid.plotting import figure_of
 from etid.recordings.hdf5 import read
 from etid.recordings.recording import LABELS, Recording, RecordingError
@@ -15,7 +14,7 @@ from etid.report.figures import plain, svg
 from etid.report.html import Picture
 from etid.report.tables import significant
 from etid.results.driver import Driver
-from etid.results.fits import Fit, plus_minus
+from etid.results.fits import Fit
 from etid.results.study_fits import StudyFits
 
 
@@ -104,7 +103,7 @@ class Recordings:
         names = ("path", *LABELS)
         shown = recording.replace(**{name: plain(getattr(recording, name)) for name in names})
         figure, why = self._predicted(shown, fit)
-        elements = _elements(fit)
+        elements = ", ".join(fit.elements)
         about = f"{path}: {fit.verdict} ({text})."
         if why:
             alt = f"Measured voltages of {path}; no prediction."
@@ -132,14 +131,3 @@ class Recordings:
         assert self.study is not None
         names = recording.calibration or tuple(self.study.calibrations)
         return self._found.drivers.get(names)
-
-
-def _elements(fit: Fit) -> str:
-    """The elements with their standard errors, in words."""
-    parts = []
-    for name, unit in fit.circuit.units().items():
-        scale, symbol = DISPLAY[unit]
-        value = float(getattr(fit.circuit, name)) / scale
-        error = float(getattr(fit.stderr, name)) / scale
-        parts.append(" ".join(f"{name} {plus_minus(value, error)} {symbol}".split()))
-    return ", ".join(parts)

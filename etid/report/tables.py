@@ -11,10 +11,10 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from etid.circuits.circuit import DISPLAY, heading
+from etid.circuits.display import DISPLAY, heading, plus_minus
 from etid.report.html import Table
 from etid.results.driver import Driver
-from etid.results.fits import Fits, plus_minus
+from etid.results.fits import Fits
 from etid.results.verdicts import message
 
 ROWS = 100  # of a table, above which it is cut

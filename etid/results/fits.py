@@ -12,7 +12,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Complex, Float, Int
 
-from etid.circuits.circuit import DISPLAY, AbstractCircuit, Resistor, SkinRC
+from etid.circuits.circuit import AbstractCircuit, Resistor, SkinRC
+from etid.circuits.display import DISPLAY, plus_minus, quantity
 from etid.recordings.recording import Label, RecordingError, wanted_labels
 from etid.recordings.remarks import remarks_of, texts, words
 from etid.results.hdf5_table import Table, opened_table, same_length, write_table
@@ -105,6 +106,19 @@ class Fit(eqx.Module):
         return names.item() if names.ndim == 0 else names
 
     @property
+    def elements(self) -> tuple[str, ...]:
+        """Each element with its standard error and unit, as it is printed; for one fit."""
+        return tuple(
+            f"{name} {quantity(float(value), unit, float(error))}"
+            for (name, unit), value, error in zip(
+                self.circuit.units().items(),
+                self.circuit.values(),
+                self.stderr.values(),
+                strict=True,
+            )
+        )
+
+    @property
     def changes(self) -> str:
         """How each element and the amplitude changed during the record, in words; for one fit."""
         if self.change is None or self.change_stderr is None:
@@ -135,14 +149,6 @@ class Fit(eqx.Module):
             lines.append("  " + self.changes)
         lines += ["  " + text for text in texts(int(self.remarks))]
         return "\n".join(lines)
-
-
-def plus_minus(value: float, error: float) -> str:
-    """A value with its standard error, both to two digits of the error."""
-    if not np.isfinite(error) or error <= 0:
-        return f"{value:10.4g}            "
-    digits = int(np.clip(1 - np.floor(np.log10(error)), 0, 9))
-    return f"{value:10.{digits}f} ± {error:<9.{digits}f}"
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

@@ -19,7 +19,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Complex, Float
 
-from etid.circuits.circuit import DISPLAY, AbstractCircuit, Resistor, SkinRC
+from etid.circuits.circuit import AbstractCircuit, Resistor, SkinRC
+from etid.circuits.display import DISPLAY
 from etid.estimators.output_error.information import inverse
 from etid.identify.arguments import require
 from etid.signals.precision import require_float64

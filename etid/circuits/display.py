@@ -1,0 +1,44 @@
+"""How elements are printed: scaled units, and a value with its standard error.
+
+Inside etid all numbers have SI units. Only text, tables and pictures have the units of this file.
+"""
+
+import numpy as np
+
+# Factor in SI units, and symbol, of the unit in which a parameter is printed.
+DISPLAY = {
+    "ohm": (1e3, "kΩ"),
+    "farad": (1e-9, "nF"),
+    "second": (1e-6, "µs"),
+    "siemens second^alpha": (1e-9, "nS·s^alpha"),
+    "1": (1.0, ""),
+}
+
+
+def heading(name: str, unit: str) -> str:
+    """Name and scaled unit of a parameter, as in `r_s [kΩ]`."""
+    symbol = DISPLAY[unit][1]
+    return f"{name} [{symbol}]" if symbol else name
+
+
+def plus_minus(value: float, error: float) -> str:
+    """A value with its standard error, both to two digits of the error, padded for a column.
+
+    Without an error, the value has four significant digits.
+    """
+    if not np.isfinite(error) or error <= 0:
+        return f"{value:10.4g}            "
+    digits = int(np.clip(1 - np.floor(np.log10(error)), 0, 9))
+    return f"{value:10.{digits}f} ± {error:<9.{digits}f}"
+
+
+def quantity(value: float, unit: str, error: float = np.nan) -> str:
+    """A parameter in its scaled unit, as in `33.40 ± 0.10 kΩ`, or `33.4 kΩ` without an error.
+
+    Args:
+        value: In SI units.
+        unit: The SI unit, one of `DISPLAY`.
+        error: Standard error in SI units; NaN if there is none.
+    """
+    scale, symbol = DISPLAY[unit]
+    return " ".join([*plus_minus(value / scale, error / scale).split(), symbol]).rstrip()
