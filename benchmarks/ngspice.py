@@ -99,7 +99,7 @@ def netlist(driver: TransformerDriver, load: Impedance | AbstractCircuit, pulse_
     settled = math.ceil(SETTLING * pulse_rate) * period
     run = (LONGEST_STEP, settled + 2 * period, settled - 2 * LONGEST_STEP, LONGEST_STEP)
     lines = [
-        "Pulse transformer of etid.transformer with a load at node o",
+        "Pulse transformer of etid.simulation.transformer with a load at node o",
         f"Vp source 0 PULSE({_text(*pulse, driver.width - driver.edge, period)})",
         *(f"{name} {nodes} {_text(getattr(driver, PARTS[name]))}" for name, nodes in NODES.items()),
         "* ideal transformer: w has n times the voltage of m, m carries n times the current of w",

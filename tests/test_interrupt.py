@@ -10,7 +10,9 @@ import pytest
 WAITS = """
 import sys, time
 from benchmarks.specimens import study_fits
-from etid import cli, hdf5, streaming
+from etid import cli
+from etid.identify import file as streaming
+from etid.recordings import hdf5
 
 def wait(*_):
     print("waiting", flush=True)

@@ -131,7 +131,7 @@ BUSY = """
 import os, time
 os.sched_setaffinity(0, range(os.cpu_count()))  # a test may have been given one core
 import numpy as np
-from etid.spectra import harmonics
+from etid.signals.harmonics import harmonics
 v = np.random.default_rng(0).normal(size=10_000)
 harmonics(v, 3, v.size)
 everyone, own = time.process_time(), time.thread_time()

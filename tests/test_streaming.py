@@ -144,7 +144,7 @@ def test_a_run_of_other_settings_is_not_resumed(source, tmp_path, monkeypatch):
 RUN = """
 import sys, jax
 jax.config.update("jax_enable_x64", True)
-from etid import streaming
+from etid.identify import file as streaming
 streaming.PART = int(sys.argv[3])
 streaming.fit_file(sys.argv[1], sys.argv[2], method=sys.argv[4], resume=len(sys.argv) > 5)
 """

@@ -285,7 +285,7 @@ import os, sys, jax
 jax.config.update("jax_enable_x64", True)
 import numpy as np
 import etid
-from etid import traces
+from etid.identify import compiled as traces
 if "warm" in sys.argv:
     traces._export = lambda *arguments: os._exit(3)  # everything is to be found
 study = etid.scenes.paper_dry(snr_db=60.0).simulate(seed=0)

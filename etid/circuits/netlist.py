@@ -159,7 +159,7 @@ def _values(element: AbstractImpedance) -> list[float]:
         return [float(element.c)]
     if isinstance(element, ConstantPhase):
         return [float(element.q), float(element.alpha)]
-    raise TypeError(f"{type(element).__name__} is no element of etid.elements")
+    raise TypeError(f"{type(element).__name__} is no element of etid.circuits.elements")
 
 
 def _checked(circuit: AbstractCircuit) -> dict[str, float]:
