@@ -13,6 +13,7 @@ from typing import Any
 import h5py
 import numpy as np
 
+from etid.recordings.replacing import replacing
 from etid.simulation.scenes import Scene, paper_subjects
 
 SAMPLES = 5_000
@@ -43,14 +44,13 @@ def large_file(folder: pathlib.Path, recordings: int, layout: str) -> pathlib.Pa
     size, free = 4 * SAMPLES * recordings, shutil.disk_usage(folder).free
     if free < 1.2 * size:
         raise SystemExit(f"{path} needs {size / 1e9:.1f} GB, {folder} has {free / 1e9:.1f} GB left")
-    partial = path.with_suffix(".partial")
     scene = paper_subjects(
         sample_rate=SAMPLE_RATE, samples=SAMPLES, snr_db=60.0, trigger_jitter_rms=JITTER
     )
-    dataclasses.replace(scene, trials=()).simulate(SEED).write(partial)  # the calibration
-    with h5py.File(partial, "a", libver="v108") as file:
-        _append(file, scene, recordings, LAYOUTS[layout])
-    partial.replace(path)
+    with replacing(path) as partial:
+        dataclasses.replace(scene, trials=()).simulate(SEED).write(partial)  # the calibration
+        with h5py.File(partial, "a", libver="v108") as file:
+            _append(file, scene, recordings, LAYOUTS[layout])
     return path
 
 

@@ -23,7 +23,6 @@ import functools
 import hashlib
 import io
 import math
-import os
 import pathlib
 import shutil
 import subprocess
@@ -37,6 +36,7 @@ import etid
 from benchmarks.provenance import ROOT
 from benchmarks.spice import PARTS
 from etid.circuits.circuit import AbstractCircuit
+from etid.recordings.replacing import replacing
 from etid.simulation.scenes import Scene, Trial
 from etid.simulation.transformer import (
     Impedance,
@@ -203,10 +203,8 @@ def solve(netlist: str) -> tuple[Float[np.ndarray, " step"], Float[np.ndarray, "
             raise NgspiceError(f"ngspice wrote no waveform; it says:\n{said}")
         time, v = waveform(raw.read_bytes())
     CACHE.mkdir(parents=True, exist_ok=True)
-    partial = kept.with_suffix(f".{os.getpid()}")
-    with partial.open("wb") as file:
-        np.save(file, np.stack([time, v]))
-    partial.replace(kept)
+    with replacing(kept) as partial:
+        np.save(partial, np.stack([time, v]))
     return time, v
 
 

@@ -15,7 +15,6 @@ from jaxtyping import Array, Bool, Float
 from etid.circuits.circuit import SkinRC
 from etid.estimators import harmonic_steiglitz_mcbride, steiglitz_mcbride
 from etid.estimators.judgement import MAX_STEPS_REACHED, SUCCESSFUL, misses, remarks
-from etid.estimators.maximum_likelihood.given_driver import RIDGE
 from etid.estimators.maximum_likelihood.terms import (
     apart,
     delayed_gain,
@@ -25,7 +24,6 @@ from etid.estimators.maximum_likelihood.terms import (
     stands_out,
     variance,
 )
-from etid.estimators.output_error.information import inverse
 from etid.estimators.score_tests import other_circuit
 from etid.estimators.score_tests.unloaded import UnloadedShape
 from etid.results.driver import Driver
@@ -35,6 +33,7 @@ from etid.signals.harmonics import Spectrum
 from etid.signals.measurement import Measurement
 from etid.signals.transfer import Rational, as_complex, frequency_variable, reciprocal, turns
 from etid.solvers.levenberg_marquardt import NormalEquations, normal_equations
+from etid.solvers.matrices import inverse, root
 
 BIASED = 16.0  # squared standard errors between an estimate and the minimum of its own model
 IMPULSE = 512  # samples of a discrete model's impulse response
@@ -59,12 +58,7 @@ def _score(
 
 def _distance(equations: NormalEquations) -> Float[Array, ""]:
     """Squared distance to the minimum in standard errors."""
-    scale = jnp.sqrt(jnp.diagonal(equations.matrix))
-    scale = jnp.where(scale > 0, scale, 1.0)
-    ridge = 1e-12 * jnp.eye(scale.size)
-    gradient = equations.gradient / scale
-    newton = jnp.linalg.solve(equations.matrix / scale[:, None] / scale[None, :] + ridge, gradient)
-    return jnp.dot(newton, gradient)
+    return equations.gradient @ inverse(equations.matrix) @ equations.gradient
 
 
 def skin_by_steiglitz_mcbride(m: Measurement, driver: Driver, iterations: int) -> Fit:
@@ -181,9 +175,7 @@ def _is_another(
     f, elements = spectrum.frequency, own.size - 1
     s = frequency_variable(f)
     vector, unflatten = ravel_pytree(driver.source)
-    scale = jnp.sqrt(jnp.diagonal(driver.cov))
-    correlation = driver.cov / scale[:, None] / scale[None, :] + RIDGE * jnp.eye(scale.size)
-    deviations = jax.scipy.linalg.cholesky(correlation, lower=True).T * scale[None, :]
+    deviations = root(driver.cov).T
 
     def along(function, at, directions):
         return jax.vmap(lambda of: jax.jvp(function, (at,), (of,))[1])(directions)

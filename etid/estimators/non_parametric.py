@@ -24,12 +24,12 @@ from jaxtyping import Array, Bool, Complex, Float
 from etid.circuits.circuit import AbstractCircuit
 from etid.estimators.maximum_likelihood.terms import as_list, excess, same_unloaded, stands_out
 from etid.estimators.output_error.fit import DELAY_WIDTH, MAX_STEPS, SOLVER, Estimate
-from etid.estimators.output_error.information import inverse
 from etid.results.driver import Calibration
 from etid.results.fits import complex_rrse
 from etid.signals.harmonics import Spectrum, signal_share
 from etid.signals.transfer import as_complex, delayed, frequency_variable, power, reciprocal
 from etid.solvers.levenberg_marquardt import best_start
+from etid.solvers.matrices import inverse
 
 CLEAR = 0.97  # share of signal in the power of a calibration's Y, 15 dB
 PAIRS = 4  # of draws by which bias is estimated

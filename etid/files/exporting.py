@@ -17,9 +17,10 @@ from etid.circuits.netlist import circuit_string, netlist
 from etid.files.channel import listed, needs
 from etid.recordings import limits
 from etid.recordings.recording import RecordingError
+from etid.recordings.replacing import replacing
 from etid.recordings.untrusted import attribute, translated
 from etid.results.fits import LABELS, SCHEMA, Fit, Fits
-from etid.results.hdf5_table import Table, opened_table, replacing, same_length
+from etid.results.hdf5_table import Table, opened_table, same_length
 
 ROWS = 1 << 16  # of fits in memory at once
 

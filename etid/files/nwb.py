@@ -18,7 +18,7 @@ from hdmf.data_utils import GenericDataChunkIterator
 from etid.recordings import schema
 from etid.recordings.hdf5 import read
 from etid.recordings.recording import LABELS, AbstractSource, Layout, RecordingError
-from etid.results.hdf5_table import replacing
+from etid.recordings.replacing import replacing
 
 # How pynwb declares arguments hides them from a type checker.
 _nwb: Any = pynwb

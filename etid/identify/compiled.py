@@ -17,7 +17,6 @@ import hashlib
 import os
 import pathlib
 import pickle
-import secrets
 import sys
 import time
 import types
@@ -34,6 +33,9 @@ import lineax
 import numpy as np
 import optimistix as optx
 import scipy
+
+from etid.recordings.errors import RecordingError
+from etid.recordings.replacing import replacing
 
 Parameters = ParamSpec("Parameters")
 Result = TypeVar("Result")
@@ -191,16 +193,11 @@ def _write(path: pathlib.Path, content: bytes) -> None:
     """Write a file whole or not at all: several processes may write the same one."""
     packed = zlib.compress(content, 1)
     checksum = hashlib.sha256(path.name.encode() + packed).digest()
-    partial = path.with_name(f".{path.name}.{secrets.token_hex(4)}.partial")
-    try:
+    # A folder that cannot be written still serves those who read it.
+    with contextlib.suppress(OSError, RecordingError):
         path.parent.mkdir(parents=True, exist_ok=True)
-        partial.write_bytes(checksum + packed)
-        os.replace(partial, path)
-    except OSError:
-        pass  # a folder that cannot be written still serves those who read it
-    finally:
-        with contextlib.suppress(OSError):
-            partial.unlink(missing_ok=True)
+        with replacing(path) as partial:
+            partial.write_bytes(checksum + packed)
 
 
 # --- Key -----------------------------------------------------------------------------------------

@@ -32,6 +32,7 @@ from etid.identify.arguments import circuit_of, order_of
 from etid.identify.many import Drivers, identify_part, to_identify
 from etid.recordings.hdf5 import read
 from etid.recordings.recording import RecordingError
+from etid.recordings.replacing import replacing
 from etid.recordings.study import Study
 from etid.results.provenance import Settings
 from etid.results.study_fits import StudyFits
@@ -145,9 +146,8 @@ class _Parts:
                     f"{self.folder}: was begun with another {' and '.join(changed)}; "
                     "leave out resume to begin anew"
                 )
-        partial = described.with_suffix(".partial")
-        partial.write_text(json.dumps(run), "utf-8")
-        partial.replace(described)
+        with replacing(described) as partial:
+            partial.write_text(json.dumps(run), "utf-8")
 
     def path(self, number: int) -> pathlib.Path:
         """File of one part."""

@@ -15,12 +15,12 @@ import optimistix as optx
 from jaxtyping import Array, Complex, Float
 
 from etid.circuits.circuit import AbstractCircuit, SkinRC
-from etid.estimators.output_error.information import inverse
 from etid.identify.compiled import stored_jit
 from etid.results.fits import Fit, IdentificationError, complex_rrse
 from etid.results.verdicts import RESULTS, first_verdict, message, verdict
 from etid.signals.precision import require_float64
 from etid.solvers.levenberg_marquardt import LevenbergMarquardt, best_start
+from etid.solvers.matrices import inverse
 
 MAX_STEPS = 500
 MISFIT_CHI2 = 1.5  # a standard error of a measured impedance is seldom known to better than 20 %

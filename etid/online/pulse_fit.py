@@ -17,6 +17,7 @@ from etid.circuits.circuit import AbstractCircuit
 from etid.estimators.output_error.fit import DELAY_WIDTH
 from etid.online.gain_bands import Bands
 from etid.signals.transfer import as_complex, power, reciprocal
+from etid.solvers.matrices import inverse_of_few
 
 STEP = 0.1  # [samples]
 DELAYS = STEP * np.arange(-15, 16)  # [samples] one of a trigger, half a one of a window
@@ -139,20 +140,6 @@ class Equations(NamedTuple):
     gradient: Float[Array, " own"]
     curvature: Float[Array, "own own"]
     matrix: Float[Array, "own own"]
-
-
-def inverse_of_few(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
-    """Inverse of a positive definite matrix of a few rows, all lanes at once.
-
-    By Gauss and Jordan: a call of LAPACK for each lane costs twenty times as much.
-    """
-    scale = jnp.sqrt(jnp.diagonal(matrix))
-    size = matrix.shape[0]
-    work = jnp.concatenate([matrix / scale[:, None] / scale[None, :], jnp.eye(size)], axis=1)
-    for i in range(size):
-        row = work[i] / work[i, i]
-        work = (work - work[:, i][:, None] * row[None, :]).at[i].set(row)
-    return work[:, size:] / scale[:, None] / scale[None, :]
 
 
 def minimum(

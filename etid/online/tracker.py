@@ -41,7 +41,6 @@ from jaxtyping import Array, Complex, Float, Int
 from etid.circuits.circuit import AbstractCircuit, SkinRC
 from etid.estimators.judgement import MAX_STEPS_REACHED, SUCCESSFUL, misses
 from etid.estimators.maximum_likelihood.given_driver import GivenDriver, combined
-from etid.estimators.output_error.information import inverse
 from etid.estimators.refinement import circuit_starts
 from etid.estimators.registry import check_driver
 from etid.identify.compiled import stored_jit
@@ -53,7 +52,6 @@ from etid.online.pulse_fit import (
     SETTLED,
     GainModel,
     Pulse,
-    inverse_of_few,
     minimum,
     nearest,
 )
@@ -64,6 +62,7 @@ from etid.results.fits import LABELS, Fit, Fits, IdentificationError
 from etid.results.verdicts import RESULTS, first_verdict, message, verdicts_of
 from etid.signals.precision import require_float64
 from etid.signals.transfer import as_complex, power, reciprocal
+from etid.solvers.matrices import inverse, inverse_of_few
 
 FLAT = 4.0  # times the power that noise alone has
 PATIENCE = 5  # pulses that do not fit, in a row, after which an electrode starts again

@@ -2,8 +2,6 @@
 
 import dataclasses
 import os
-import pathlib
-import secrets
 from collections.abc import Hashable, Mapping
 from typing import Any
 
@@ -12,6 +10,7 @@ import numpy as np
 
 from etid.recordings import schema
 from etid.recordings.recording import AbstractSource, RecordingError
+from etid.recordings.replacing import replacing
 
 
 def write(sources: Mapping[str, AbstractSource], path: str | os.PathLike[str]) -> None:
@@ -19,7 +18,6 @@ def write(sources: Mapping[str, AbstractSource], path: str | os.PathLike[str]) -
 
     One recording at a time is in memory, or as much of it as its source gives at once.
     """
-    name = os.fspath(path)
     for own, source in sources.items():
         for calibration in source.metadata.calibration:
             if calibration not in sources or sources[calibration].metadata.kind != "calibration":
@@ -29,22 +27,13 @@ def write(sources: Mapping[str, AbstractSource], path: str | os.PathLike[str]) -
                     field="calibration",
                     remedy="Add that recording, or remove the path with recording.replace",
                 )
-    target = pathlib.Path(name)
-    partial = target.with_name(f".{target.name}.{secrets.token_hex(4)}.partial")
-    try:
-        # v108 has checksums over all but the samples, and room for the labels of large stacks
-        with h5py.File(partial, "x", libver=("v108", "latest")) as file:
-            _write_attribute(file, "schema", schema.NAME)
-            _write_attribute(file, "schema_version", schema.VERSION)
-            for group, members in _stacks(sources).items():
-                _write_group(file, group, [sources[member] for member in members])
-        os.replace(partial, target)
-    except OSError as error:
-        raise RecordingError(
-            f"cannot be written ({error})", file=name, remedy="Check folder, rights and disk space"
-        ) from error
-    finally:
-        partial.unlink(missing_ok=True)
+    # v108 has checksums over all but the samples, and room for the labels of large stacks
+    libver = ("v108", "latest")
+    with replacing(path) as partial, h5py.File(partial, "x", libver=libver) as file:
+        _write_attribute(file, "schema", schema.NAME)
+        _write_attribute(file, "schema_version", schema.VERSION)
+        for group, members in _stacks(sources).items():
+            _write_group(file, group, [sources[member] for member in members])
 
 
 def _stacks(sources: Mapping[str, AbstractSource]) -> dict[str, list[str]]:

@@ -2,7 +2,6 @@
 
 import contextlib
 import os
-import pathlib
 from collections.abc import Iterator, Mapping
 from typing import Any
 
@@ -11,19 +10,8 @@ import numpy as np
 
 from etid.recordings import limits
 from etid.recordings.errors import RecordingError
+from etid.recordings.replacing import replacing
 from etid.recordings.untrusted import attribute, check_size, guarded, local_link, translated
-
-
-@contextlib.contextmanager
-def replacing(path: str | os.PathLike[str]) -> Iterator[pathlib.Path]:
-    """A name to write to, that becomes the file at the end, if that is reached."""
-    target = pathlib.Path(path)
-    partial = target.with_suffix(f".partial{target.suffix}")  # some writers go by the suffix
-    try:
-        yield partial
-        os.replace(partial, target)
-    finally:
-        partial.unlink(missing_ok=True)
 
 
 def write_table(

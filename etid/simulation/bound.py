@@ -21,11 +21,11 @@ from jaxtyping import Complex, Float
 
 from etid.circuits.circuit import AbstractCircuit, Resistor, SkinRC
 from etid.circuits.display import DISPLAY
-from etid.estimators.output_error.information import inverse
 from etid.identify.arguments import require
 from etid.signals.precision import require_float64
 from etid.simulation.scenes import Scene, Trial
 from etid.simulation.transformer import ResistorLoad, SkinLoad, loading
+from etid.solvers.matrices import inverse
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

@@ -28,10 +28,11 @@ from etid.estimators.maximum_likelihood.terms import (
     weights,
 )
 from etid.estimators.output_error.fit import Estimate
-from etid.estimators.output_error.information import Curvature, eliminate, inverse
+from etid.estimators.output_error.information import Curvature, eliminate
 from etid.estimators.score_tests import other_circuit
 from etid.results.fits import complex_rrse
 from etid.signals.transfer import reciprocal
+from etid.solvers.matrices import inverse
 
 
 class _Eliminated(eqx.Module):

@@ -36,11 +36,11 @@ from etid.estimators.output_error.fit import (
     delay_std,
     prior,
 )
-from etid.estimators.output_error.information import inverse
 from etid.results.driver import Calibration, SourceImpedance
 from etid.results.fits import complex_rrse
 from etid.signals.harmonics import Spectrum
 from etid.solvers.levenberg_marquardt import LevenbergMarquardt, best_start
+from etid.solvers.matrices import inverse
 
 # Z_th and a delay bend each other's valley; a load alone has none.
 CURVED = LevenbergMarquardt(rtol=SOLVER.rtol, ftol=SOLVER.ftol, geodesic=True)

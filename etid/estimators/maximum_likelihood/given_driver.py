@@ -39,8 +39,7 @@ from etid.estimators.score_tests.unloaded import UnloadedShape, shape_of
 from etid.results.driver import Driver
 from etid.signals.harmonics import Spectrum
 from etid.signals.transfer import as_complex, reciprocal
-
-RIDGE = 1e-12  # of the scaled curvature; below it double precision sees nothing
+from etid.solvers.matrices import inverse_root
 
 
 class UnloadedSlopes(NamedTuple):
@@ -128,11 +127,7 @@ def given(
     jacobian = jax.jacfwd(lambda c: calibrations.terms(c, clean))(c)
     weight = weights(shares, jacobian.shape[0])
     curvature = (jacobian.T * weight[None, :]) @ jacobian
-    scale = jnp.sqrt(jnp.diagonal(curvature))
-    scaled = curvature / scale[:, None] / scale[None, :] + RIDGE * jnp.eye(c.size)
-    factor = jax.scipy.linalg.cholesky(scaled, lower=True)
-    # L, the inverse of the transposed factor.
-    root = jax.scipy.linalg.solve_triangular(factor, jnp.diag(1 / scale), lower=True).T
+    root = inverse_root(curvature)
     value, pullback = jax.vjp(lambda c: calibrations.terms(c, records), c)
     parts = residuals(records, gains)
     of_noise = [excess(r, s.selected) for r, s in zip(parts, records, strict=True)]

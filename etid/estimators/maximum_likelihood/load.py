@@ -27,12 +27,12 @@ from etid.estimators.maximum_likelihood.terms import (
     variance,
 )
 from etid.estimators.output_error.fit import DELAY_WIDTH, MAX_STEPS, SOLVER, Estimate
-from etid.estimators.output_error.information import inverse
 from etid.estimators.score_tests import other_circuit
 from etid.results.fits import complex_rrse
 from etid.signals.harmonics import Spectrum
 from etid.signals.transfer import as_complex, frequency_variable, reciprocal, turns
 from etid.solvers.levenberg_marquardt import LevenbergMarquardt, NormalEquations, best_start
+from etid.solvers.matrices import inverse
 
 
 class _Slopes(NamedTuple):

@@ -24,7 +24,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from etid.circuits.circuit import AbstractCircuit
 from etid.circuits.elements import resistor
-from etid.estimators.output_error.information import curvature, eliminate, further, inverse, slopes
+from etid.estimators.output_error.information import curvature, eliminate, further, slopes
 from etid.estimators.output_error.prediction import (
     IMPULSE,
     Late,
@@ -41,6 +41,7 @@ from etid.results.driver import Calibration, SourceImpedance, loaded
 from etid.results.fits import rrse
 from etid.signals.transfer import Rational
 from etid.solvers.levenberg_marquardt import LevenbergMarquardt, best_start
+from etid.solvers.matrices import inverse
 
 MAX_STEPS = 500
 PASSES = 3  # of a skin's fit

@@ -25,22 +25,7 @@ from etid.estimators.output_error.prediction import (
     measured_impulse,
     residual_variance,
 )
-
-EIGENVALUE_FLOOR = 1e-12  # of the scaled curvature; below it double precision sees nothing
-
-
-def inverse(matrix: Float[Array, "n n"], *, drop: bool = False) -> Float[Array, "n n"]:
-    """Inverse of a symmetric matrix, in its own scaling.
-
-    Directions without information keep an enormous variance, or with `drop` none: nuisances that
-    the data do not determine have no effect either.
-    """
-    scale = jnp.sqrt(jnp.maximum(jnp.diagonal(matrix), 0.0))
-    scale = jnp.where(scale > 0, scale, 1.0)
-    values, vectors = jnp.linalg.eigh(matrix / scale[:, None] / scale[None, :])
-    weight = 1 / jnp.maximum(values, EIGENVALUE_FLOOR)
-    weight = jnp.where(values > EIGENVALUE_FLOOR, weight, 0.0 if drop else weight)
-    return (vectors * weight[None, :]) @ vectors.T / scale[:, None] / scale[None, :]
+from etid.solvers.matrices import inverse
 
 
 class Curvature(eqx.Module):

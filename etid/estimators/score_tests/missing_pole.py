@@ -23,9 +23,9 @@ from jaxtyping import Array, Bool, Complex, Float
 
 from etid.estimators.maximum_likelihood.driver import Calibrations
 from etid.estimators.maximum_likelihood.terms import denoised, excess, residuals, weights
-from etid.estimators.output_error.information import inverse
 from etid.results.driver import Calibration
 from etid.signals.transfer import as_complex, frequency_variable, reciprocal
+from etid.solvers.matrices import inverse
 
 SEEN = 36.0  # χ² of two degrees of freedom; one of some hundred sections has it once in 10⁶
 DAMPINGS = (0.1, 0.3, 1.0)

@@ -20,13 +20,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from etid.circuits.elements import AbstractImpedance
-from etid.estimators.output_error.information import (
-    Slopes,
-    bin_weights,
-    inverse,
-    noise_power,
-    padded_size,
-)
+from etid.estimators.output_error.information import Slopes, bin_weights, noise_power, padded_size
 from etid.estimators.output_error.prediction import (
     Records,
     impulse,
@@ -38,6 +32,7 @@ from etid.estimators.score_tests.other_circuit import Scores, relaxations, score
 from etid.results.driver import SourceImpedance, connected, realise
 from etid.signals.filtering import StateSpace, hold
 from etid.signals.transfer import as_complex
+from etid.solvers.matrices import inverse
 
 # Hz. Faster relaxations look like delays and like the driver's fast poles, which at 40 dB are in
 # doubt further than a linear distribution holds: of three damp skins one had z = 13 at 140 kHz.

@@ -15,9 +15,9 @@ from jaxtyping import Array, Bool, Complex, Float
 
 from etid.estimators.maximum_likelihood.driver import Calibrations
 from etid.estimators.maximum_likelihood.terms import denoised, excess, residuals, weights
-from etid.estimators.output_error.information import inverse
 from etid.recordings.preflight import Inspected
 from etid.signals.transfer import as_complex
+from etid.solvers.matrices import inverse
 
 # Standard errors: one calibration in two million is off by chance.
 SEEN = 5.0

@@ -1,0 +1,42 @@
+"""Inverses of matrices whose parameters have very different sizes."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from etid.solvers.matrices import inverse, inverse_of_few, inverse_root, root
+
+# Rounding of an inverse: machine epsilon times the condition of the scaled matrix, below 1e3 here.
+EXACT = 1e-12
+
+
+def covariance(seed=0, size=4):
+    """A covariance whose parameters have sizes from 1e-9 to 1e6, as farads beside ohms."""
+    rng = np.random.default_rng(seed)
+    factor = rng.normal(size=(size, 3 * size))
+    scale = np.logspace(-9, 6, size)
+    return factor @ factor.T * scale[:, None] * scale, scale
+
+
+@pytest.mark.parametrize("function", [inverse, inverse_of_few, lambda m: square(inverse_root(m))])
+def test_an_inverse_is_exact_whatever_the_units_are(function):
+    matrix, scale = covariance()
+    product = np.asarray(function(jnp.asarray(matrix))) @ matrix
+    np.testing.assert_allclose(product * scale[:, None] / scale, np.eye(4), atol=EXACT)
+
+
+def test_a_root_gives_the_matrix():
+    matrix, scale = covariance()
+    found = np.asarray(square(root(jnp.asarray(matrix))))
+    np.testing.assert_allclose(found / scale[:, None] / scale, matrix / scale[:, None] / scale,
+                               rtol=1e-10)  # fmt: skip  # the ridge of 1e-12 times the condition
+
+
+def square(factor):
+    return factor @ factor.T
+
+
+def test_a_direction_without_information_has_an_enormous_variance_or_none():
+    matrix = jnp.diag(jnp.array([4.0, 0.0]))
+    np.testing.assert_allclose(np.diagonal(inverse(matrix)), [0.25, 1e12])
+    np.testing.assert_allclose(np.diagonal(inverse(matrix, drop=True)), [0.25, 0.0])
