@@ -4,9 +4,7 @@ Verdicts come from their messages, the command line from its parsers, the refere
 that `etid` exports.
 """
 
-import ast
 import os
-import pathlib
 import re
 import types
 
@@ -51,11 +49,7 @@ def commands():
 
 def reference():
     """Every name that `import etid` gives."""
-    tree = ast.parse(pathlib.Path(etid.__file__).read_text("utf-8"))
-    imports = [node for node in ast.walk(tree) if isinstance(node, ast.ImportFrom)]
-    names = sorted(
-        (each.asname for node in imports for each in node.names if each.asname), key=str.lower
-    )
+    names = sorted(etid.__all__, key=str.lower)
     groups = {"Functions": types.FunctionType, "Classes": type, "Modules": types.ModuleType}
     parts = []
     for heading, kind in groups.items():
