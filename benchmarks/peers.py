@@ -22,9 +22,9 @@ import etid
 from benchmarks.problem import SAMPLES, START, ByNumPy, Problem, harmonics, problem, terms
 from benchmarks.timing import first_and_warm
 from etid.estimators import steiglitz_mcbride
+from etid.estimators.estimate import MAX_STEPS
 from etid.estimators.harmonic_steiglitz_mcbride import fit_skin
 from etid.estimators.maximum_likelihood.load import TOGETHER
-from etid.estimators.output_error.fit import MAX_STEPS
 from etid.identify.many import each
 from etid.signals.filtering import lfilter
 from etid.signals.harmonics import Spectrum

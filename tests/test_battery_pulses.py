@@ -22,7 +22,7 @@ from etid.circuits.elements import (
     resistor,
     series,
 )
-from etid.estimators.output_error.fit import SOLVER
+from etid.estimators.estimate import SOLVER
 
 MILLI = 1e-3
 DISTURBED = ("SoC7", "Cell2")

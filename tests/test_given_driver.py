@@ -7,7 +7,7 @@ import pytest
 from jax.flatten_util import ravel_pytree
 
 import etid
-from etid.estimators.output_error.fit import DELAY_WIDTH, prior
+from etid.estimators.estimate import DELAY_WIDTH, prior
 from etid.identify import lanes
 from etid.signals.harmonics import spectrum
 from etid.signals.measurement import noise

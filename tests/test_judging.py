@@ -9,6 +9,7 @@ import pytest
 
 import etid
 from etid.estimators import refinement
+from etid.estimators.estimate import Estimate
 from etid.estimators.judgement import (
     MISFIT_CHI2,
     MISFIT_RRSE,
@@ -18,7 +19,6 @@ from etid.estimators.judgement import (
     too_late,
     unless,
 )
-from etid.estimators.output_error.fit import Estimate
 from etid.results.verdicts import RESULTS, verdict
 
 
@@ -35,7 +35,7 @@ def estimate(
     of = {"result": optx.RESULTS.successful, "strain": jnp.zeros(())} | more
     return Estimate(
         parameters=jnp.asarray(parameters),
-        nuisance=jnp.array([[0.0, delay]]),
+        delay_samples=jnp.array([delay]),
         cov=cov,
         chi2=jnp.asarray(chi2),
         rrse=jnp.asarray(rrse),
@@ -86,9 +86,9 @@ def test_a_trigger_that_is_more_than_a_sample_late_or_early_is_a_misfit(delay, e
 
 def test_a_delay_of_any_record_counts():
     of = estimate()
-    several = jnp.array([[1.5, 0.1], [2.0, -3.0]])  # states are no delays
-    assert bool(too_late(Estimate(**{**vars(of), "nuisance": several})))
-    assert not bool(too_late(Estimate(**{**vars(of), "nuisance": several[:1]})))
+    several = jnp.array([0.1, -3.0])
+    assert bool(too_late(Estimate(**{**vars(of), "delay_samples": several})))
+    assert not bool(too_late(Estimate(**{**vars(of), "delay_samples": several[:1]})))
 
 
 @pytest.mark.parametrize(

@@ -11,7 +11,8 @@ import pytest
 import etid
 from benchmarks.ladder import CALIBRATION, LOADS, TRIAL, rung
 from etid.circuits.elements import resistor
-from etid.estimators.output_error.fit import DELAY_WIDTH, KNOWN_DELAY, delay_std, fit_source
+from etid.estimators.estimate import DELAY_WIDTH, KNOWN_DELAY, delay_std
+from etid.estimators.output_error.fit import fit_source
 from etid.estimators.output_error.information import (
     Curvature,
     Slopes,

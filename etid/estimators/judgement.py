@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from etid.circuits.circuit import AbstractCircuit
-from etid.estimators.output_error.fit import Estimate
+from etid.estimators.estimate import Estimate
 from etid.recordings.remarks import Remark
 from etid.results.fits import Fit
 from etid.results.verdicts import RESULTS, first_verdict, verdict
@@ -44,7 +44,7 @@ def misses(
 
 def too_late(estimate: Estimate) -> Bool[Array, ""]:
     """Whether a trigger delay lies outside the one sample for which it is modelled."""
-    return jnp.any(jnp.abs(estimate.nuisance[:, -1]) > 1)
+    return jnp.any(jnp.abs(estimate.delay_samples) > 1)
 
 
 def judged(

@@ -22,8 +22,8 @@ import optimistix as optx
 from jaxtyping import Array, Bool, Complex, Float
 
 from etid.circuits.circuit import AbstractCircuit
+from etid.estimators.estimate import DELAY_WIDTH, MAX_STEPS, SOLVER, Estimate
 from etid.estimators.maximum_likelihood.terms import as_list, excess, same_unloaded, stands_out
-from etid.estimators.output_error.fit import DELAY_WIDTH, MAX_STEPS, SOLVER, Estimate
 from etid.results.driver import Calibration
 from etid.results.fits import complex_rrse
 from etid.signals.harmonics import Spectrum, signal_share
@@ -217,23 +217,20 @@ def fit_circuit(
     noise = jnp.concatenate([noise, jnp.ones(rest + len(known))])
     own_cov = (by_term * (weights * noise)[None, :]) @ by_term.T
     shared = (by_term * ((1 - weights) * noise)[None, :]) @ by_term.T
-    return (
-        Estimate(
-            (q - bias)[:elements],
-            q[None, -1:],
-            own_cov + shared,
-            chi2,
-            complex_rrse(
-                jnp.where(selected, clean[-1].y, 0.0), jnp.where(selected, records[-1].y, 0.0)
-            ),
-            solution.result,
-            solution.stats["num_steps"],
-            shared,
-            jnp.zeros(()),
-            stands_out(model.squares(q, records), records[-1]),
+    estimate = Estimate(
+        parameters=(q - bias)[:elements],
+        delay_samples=q[-1:],
+        cov=own_cov + shared,
+        shared_cov=shared,
+        chi2=chi2,
+        rrse=complex_rrse(
+            jnp.where(selected, clean[-1].y, 0.0), jnp.where(selected, records[-1].y, 0.0)
         ),
-        bias[:elements],
+        result=solution.result,
+        steps=solution.stats["num_steps"],
+        hum=stands_out(model.squares(q, records), records[-1]),
     )
+    return estimate, bias[:elements]
 
 
 def _bias(

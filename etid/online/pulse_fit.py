@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Array, Complex, Float
 
 from etid.circuits.circuit import AbstractCircuit
-from etid.estimators.output_error.fit import DELAY_WIDTH
+from etid.estimators.estimate import DELAY_WIDTH
 from etid.online.gain_bands import Bands
 from etid.signals.transfer import as_complex, power, reciprocal
 from etid.solvers.matrices import inverse_of_few

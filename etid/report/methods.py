@@ -12,7 +12,7 @@ from etid.circuits import circuit as circuits
 from etid.circuits.display import quantity
 from etid.estimators import judgement, steiglitz_mcbride
 from etid.estimators.baseline import BIASED
-from etid.estimators.output_error import fit as output_error
+from etid.estimators.estimate import MAX_STEPS
 from etid.estimators.score_tests import missing_pole, other_circuit
 from etid.report import citations
 from etid.report.html import Section, Table
@@ -182,7 +182,7 @@ def _refined(circuit: circuits.AbstractCircuit) -> str:
         at += " and the load alike"
     return (
         "Minima were found by Levenberg-Marquardt, composed of the parts of optimistix (Rader et "
-        f"al., 2024), in at most {output_error.MAX_STEPS} steps, from several starts {at}, from "
+        f"al., 2024), in at most {MAX_STEPS} steps, from several starts {at}, from "
         "the estimate of Steiglitz and McBride (1965). "
     )
 

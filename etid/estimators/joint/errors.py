@@ -18,6 +18,7 @@ import jax.numpy as jnp
 import optimistix as optx
 from jaxtyping import Array, Bool, Float
 
+from etid.estimators.estimate import Estimate
 from etid.estimators.joint.terms import DriverStudy, Loads, over
 from etid.estimators.maximum_likelihood.terms import (
     denoised,
@@ -27,7 +28,6 @@ from etid.estimators.maximum_likelihood.terms import (
     variance,
     weights,
 )
-from etid.estimators.output_error.fit import Estimate
 from etid.estimators.output_error.information import Curvature, eliminate
 from etid.estimators.score_tests import other_circuit
 from etid.results.fits import complex_rrse
@@ -129,15 +129,17 @@ def estimates(
                 private = private - by_x
             whole = private + shared
             estimate = Estimate(
-                own[:-1],
-                own[None, -1:],
-                whole[:-1, :-1],
-                chi2,
-                rrse,
-                optx.RESULTS.where(result == optx.RESULTS.successful, solution.result, result),
-                solution.stats["num_steps"],
-                shared[:-1, :-1],
-                strain,
+                parameters=own[:-1],
+                delay_samples=own[-1:],
+                cov=whole[:-1, :-1],
+                shared_cov=shared[:-1, :-1],
+                chi2=chi2,
+                rrse=rrse,
+                result=optx.RESULTS.where(
+                    result == optx.RESULTS.successful, solution.result, result
+                ),
+                steps=solution.stats["num_steps"],
+                strain=strain,
             )
             return estimate, _is_another(study, load, common, own, eliminated, bread, total.score)
 

@@ -13,12 +13,12 @@ import jax.numpy as jnp
 import optimistix as optx
 from jaxtyping import Array, Bool, Float
 
+from etid.estimators.estimate import DELAY_WIDTH, MAX_STEPS, SOLVER, Estimate
 from etid.estimators.joint.errors import estimates
 from etid.estimators.joint.terms import DriverStudy, Loads, over
 from etid.estimators.maximum_likelihood.driver import Joint
 from etid.estimators.maximum_likelihood.given_driver import GivenDriver, around
 from etid.estimators.maximum_likelihood.load import Load
-from etid.estimators.output_error.fit import DELAY_WIDTH, MAX_STEPS, SOLVER, Estimate
 from etid.solvers.arrowhead import Arrowhead, ArrowheadEquations, EliminationDescent, join
 from etid.solvers.levenberg_marquardt import (
     DIFFERENCE,

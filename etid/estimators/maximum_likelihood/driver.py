@@ -17,6 +17,14 @@ from jaxtyping import Array, Bool, Complex, Float
 
 from etid.circuits.circuit import AbstractCircuit
 from etid.circuits.elements import resistor
+from etid.estimators.estimate import (
+    DELAY_WIDTH,
+    MAX_STEPS,
+    SOLVER,
+    Estimate,
+    delay_std,
+    prior,
+)
 from etid.estimators.maximum_likelihood.terms import (
     as_list,
     delayed_gain,
@@ -27,14 +35,6 @@ from etid.estimators.maximum_likelihood.terms import (
     residuals,
     shows_hum,
     weights,
-)
-from etid.estimators.output_error.fit import (
-    DELAY_WIDTH,
-    MAX_STEPS,
-    SOLVER,
-    Estimate,
-    delay_std,
-    prior,
 )
 from etid.results.driver import Calibration, SourceImpedance
 from etid.results.fits import complex_rrse
@@ -107,16 +107,15 @@ def fit_source(
     found = list(zip(records, gains(q), strict=True))
     errors = jnp.stack([complex_rrse(g * s.x, s.y, s.selected) for s, g in found])
     estimate = Estimate(
-        q[:kept],
-        q[kept:, None],
-        cov,
-        chi2,
-        errors.max(),
-        solution.result,
-        solution.stats["num_steps"],
-        jnp.zeros_like(cov),
-        jnp.zeros(()),
-        jnp.stack([shows_hum(s, g) for s, g in found]).any(),
+        parameters=q[:kept],
+        delay_samples=q[kept:],
+        cov=cov,
+        shared_cov=jnp.zeros_like(cov),
+        chi2=chi2,
+        rrse=errors.max(),
+        result=solution.result,
+        steps=solution.stats["num_steps"],
+        hum=jnp.stack([shows_hum(s, g) for s, g in found]).any(),
     )
     calibration = Calibration(r_load, delay_std(r_load) / sample_rate, q[kept:], spectra)
     return unflatten(q[:kept]), estimate, calibration

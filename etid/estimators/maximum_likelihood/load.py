@@ -16,6 +16,7 @@ import optimistix as optx
 from jaxtyping import Array, Bool, Complex, Float
 
 from etid.circuits.circuit import AbstractCircuit
+from etid.estimators.estimate import DELAY_WIDTH, MAX_STEPS, SOLVER, Estimate
 from etid.estimators.maximum_likelihood.given_driver import GivenDriver, UnloadedSlopes, combined
 from etid.estimators.maximum_likelihood.terms import (
     apart,
@@ -26,7 +27,6 @@ from etid.estimators.maximum_likelihood.terms import (
     stands_out,
     variance,
 )
-from etid.estimators.output_error.fit import DELAY_WIDTH, MAX_STEPS, SOLVER, Estimate
 from etid.estimators.score_tests import other_circuit
 from etid.results.fits import complex_rrse
 from etid.signals.harmonics import Spectrum
@@ -351,17 +351,18 @@ def fit_circuit(
     unknown = jnp.diagonal(elements)
     unknown = jnp.diag(jnp.where(unknown > 1, unknown, 0.0))
     change = z - driver.mean
+    freedom = 2 * jnp.sum(spectrum.selected, dtype=own.dtype) - own.size
     estimate = Estimate(
-        own[:-1],
-        own[None, -1:],
-        (by_term * (private * noise)[None, :]) @ by_term.T + of_delay + shared + unknown,
-        jnp.sum(part**2) / (2 * jnp.sum(spectrum.selected, dtype=own.dtype) - own.size),
-        complex_rrse(g * spectrum.x, spectrum.y, spectrum.selected),
-        solution.result,
-        solution.stats["num_steps"],
-        shared,
+        parameters=own[:-1],
+        delay_samples=own[-1:],
+        cov=(by_term * (private * noise)[None, :]) @ by_term.T + of_delay + shared + unknown,
+        shared_cov=shared,
+        chi2=jnp.sum(part**2) / freedom,
+        rrse=complex_rrse(g * spectrum.x, spectrum.y, spectrum.selected),
+        result=solution.result,
+        steps=solution.stats["num_steps"],
         # By how much Σ r² of the calibrations has grown.
-        jnp.dot(change, jnp.linalg.solve(driver.cov, change)),
-        shows_hum(known, g) & ~wrong_gain,
+        strain=jnp.dot(change, jnp.linalg.solve(driver.cov, change)),
+        hum=shows_hum(known, g) & ~wrong_gain,
     )
     return estimate, moved > FAR, other.seen()

@@ -14,16 +14,22 @@ apart. 10 ns cost 3 % in C_p. A skin's record does show τ, by the excess impeda
 
 import math
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 import optimistix as optx
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float
 
 from etid.circuits.circuit import AbstractCircuit
 from etid.circuits.elements import resistor
+from etid.estimators.estimate import (
+    DELAY_WIDTH,
+    MAX_STEPS,
+    SOLVER,
+    Estimate,
+    delay_std,
+    prior,
+)
 from etid.estimators.output_error.information import curvature, eliminate, further, slopes
 from etid.estimators.output_error.prediction import (
     IMPULSE,
@@ -40,103 +46,10 @@ from etid.estimators.score_tests.other_in_time import relaxed, score
 from etid.results.driver import Calibration, SourceImpedance, loaded
 from etid.results.fits import rrse
 from etid.signals.transfer import Rational
-from etid.solvers.levenberg_marquardt import LevenbergMarquardt, best_start
+from etid.solvers.levenberg_marquardt import best_start
 from etid.solvers.matrices import inverse
 
-MAX_STEPS = 500
 PASSES = 3  # of a skin's fit
-PASSIVE_BAND = np.geomspace(1e-4, 10.0, 128)  # of the sample rate
-DELAY_WIDTH = 0.5  # [samples] of the weak prior of a delay; one sample is as far as it may go
-KNOWN_DELAY = 1e-9  # [samples] by which several different resistors leave it in doubt, or so
-SAME_LOAD = 0.01  # resistors closer than this do not resolve the delay of their records
-SOLVER = LevenbergMarquardt(rtol=1e-5, ftol=1e-6)  # 1e-3 standard errors at 10 000 samples
-
-
-class Estimate(eqx.Module):
-    """What a fit returns before it is judged.
-
-    Attributes:
-        parameters: Estimated parameters.
-        nuisance: Initial state, offset [V] and delay [samples] of each record.
-        cov: Covariance of `parameters`.
-        chi2: Σ r²/s per degree of freedom.
-        rrse: Root relative squared error of V_out, the largest over the records.
-        result: Verdict of the solver.
-        steps: Trial steps of the solver.
-        shared_cov: The part of `cov` that comes from the driver, common to all skins identified
-            with it.
-        strain: By how much the calibrations' own Σ r² grew in a joint fit; 0 without one.
-        hum: Whether mains hum is seen in the residual; a fit in time does not look for it.
-    """
-
-    parameters: Float[Array, " parameter"]
-    nuisance: Float[Array, "record nuisance"]
-    cov: Float[Array, "parameter parameter"]
-    chi2: Float[Array, ""]
-    rrse: Float[Array, ""]
-    result: optx.RESULTS
-    steps: Int[Array, ""]
-    shared_cov: Float[Array, "parameter parameter"]
-    strain: Float[Array, ""]
-    hum: Bool[Array, ""] = eqx.field(default_factory=lambda: jnp.zeros((), bool))
-
-
-def prior(start: SourceImpedance, sample_rate: Float[Array, ""], r_load: Float[Array, ""]):
-    """Weak prior of the modal parameters, as additional residuals.
-
-    A pole that a noisy recording cannot determine would otherwise run away, to Q = ∞ for instance,
-    and take the solver with it. At 60 dB a recording carries 1e4 and more times the information of
-    this prior. What it allows (one standard deviation) is, for the first section, the resonance, a
-    frequency within e^3 of half the Nyquist frequency and a damping ratio of 0.7 within e^1.5; for
-    further ones an overdamped tail above the band, 1.5 times the Nyquist frequency within e^1.5 and
-    1.5 within e^0.5: a second sharp resonance beside the first is what noise makes when the trigger
-    delay is fitted too. Slow real poles lie within e^3 of 1/500 of half the Nyquist frequency, and
-    impedances below 10 times the known resistor.
-
-    A transformer is passive, so Re Z_th ≥ 0 at all frequencies, inside the recorded band and above
-    it; otherwise some skin would make the loaded driver oscillate. Each frequency where it is not
-    adds Re Z_th / (10⁻³ R_L).
-    """
-    half = 0.5 * jnp.pi * sample_rate
-    wide = 10 * r_load
-    pairs, reals = start.log_omega.shape[0], start.log_omega_real.shape[0]
-    first = jnp.zeros(pairs).at[:1].set(1.0)
-    centre = SourceImpedance(
-        log_resistance=jnp.log(0.01 * r_load),
-        log_omega=jnp.log(half) + (1 - first) * math.log(3.0),
-        log_zeta=first * math.log(0.7) + (1 - first) * math.log(1.5),
-        gain=jnp.zeros(pairs),
-        slope=jnp.zeros(pairs),
-        log_omega_real=jnp.full(reals, jnp.log(half)).at[0].add(-math.log(500.0)),
-        gain_real=jnp.zeros(reals),
-    )
-    width = SourceImpedance(
-        log_resistance=jnp.array(3.0),
-        log_omega=1.5 + 1.5 * first,
-        log_zeta=0.5 + first,
-        gain=jnp.full(pairs, wide),
-        slope=jnp.full(pairs, wide),
-        log_omega_real=jnp.full(reals, 3.0),
-        gain_real=jnp.full(reals, wide),
-    )
-    centre, width = ravel_pytree(centre)[0], ravel_pytree(width)[0]
-    _, unflatten = ravel_pytree(start)
-    frequency = jnp.asarray(PASSIVE_BAND) * sample_rate
-
-    def regularise(parameters):
-        active = jnp.minimum(unflatten(parameters).response(frequency).real, 0.0)
-        return jnp.concatenate([(parameters - centre) / width, active / (1e-3 * r_load)])
-
-    return regularise
-
-
-def delay_std(r_load: Float[Array, " record"]) -> Float[Array, ""]:
-    """Standard deviation [samples] to which calibrations with these resistors know their delay.
-
-    Records with one and the same resistor share its ambiguity, others resolve it.
-    """
-    same = jnp.ptp(r_load) < SAME_LOAD * r_load.mean()
-    return jnp.where(same, DELAY_WIDTH, KNOWN_DELAY)
 
 
 def fit_source(
@@ -214,15 +127,14 @@ def fit_source(
         left = chi2 - jnp.max((step / error_of_step) ** 2) / math.prod(records.hold.shape[:-1])
         mismatch = jnp.stack([-step, error_of_step * jnp.sqrt(jnp.maximum(left, 1.0))])
     estimate = Estimate(
-        q[:kept],
-        nuisance,
-        cov,
-        chi2,
-        jax.vmap(error)(records, r_load, nuisance).max(),
-        solution.result,
-        solution.stats["num_steps"],
-        jnp.zeros_like(cov),
-        jnp.zeros(()),
+        parameters=q[:kept],
+        delay_samples=nuisance[:, -1],
+        cov=cov,
+        shared_cov=jnp.zeros_like(cov),
+        chi2=chi2,
+        rrse=jax.vmap(error)(records, r_load, nuisance).max(),
+        result=solution.result,
+        steps=solution.stats["num_steps"],
     )
     return (
         unflatten(q[:kept]),
@@ -338,15 +250,14 @@ def fit_circuit(
     seen, used = measured(records, q[kept:-1]), records.used > 0
     mean = jnp.sum(seen * records.used) / records.intervals
     estimate = Estimate(
-        q[:kept],
-        q[None, kept:-1],
-        cov * jnp.maximum(chi2, 1.0) + shared,
-        chi2,
-        rrse(jnp.where(used, predicted, mean), jnp.where(used, seen, mean)),
-        result,
-        steps.sum(),
-        shared,
-        jnp.zeros(()),
+        parameters=q[:kept],
+        delay_samples=q[-2:-1],
+        cov=cov * jnp.maximum(chi2, 1.0) + shared,
+        shared_cov=shared,
+        chi2=chi2,
+        rrse=rrse(jnp.where(used, predicted, mean), jnp.where(used, seen, mean)),
+        result=result,
+        steps=steps.sum(),
     )
     return circuit.with_log_values(q[:kept]), estimate, found.relaxes()
 
