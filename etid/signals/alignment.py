@@ -1,7 +1,7 @@
-"""By how many samples the loaded record is later than the unloaded one.
+"""The lag of the loaded record behind the unloaded record.
 
-Two records with a trigger of their own may begin hundreds of samples apart. Whole samples are taken
-out here, before a fit; what is left, half a sample or so, is fitted with the elements.
+Two records with separate triggers may start hundreds of samples apart. This module removes whole
+samples before a fit. The fit then estimates the rest, about half a sample, with the elements.
 """
 
 import math
@@ -11,20 +11,20 @@ from jaxtyping import Complex, Float
 
 from etid.signals.pulse_train import PulseTrain, highest, rise_time, rises
 
-LAGS = 400  # samples by which v_out may be late or early
-PART = 1 / 4  # of a period, by which it may be at most
-AROUND = 1 / 8  # of a period, before and after an edge, that is looked for
-DELAYED = 1.0  # samples that a fit takes as they are: it knows delays of one, and skin delays too
-NEAR = 16  # samples by which a record that was aligned may still be late
-FINE = 0.5  # samples, the grid on which that is looked for
+LAGS = 400  # [samples] largest lag, late or early
+PART = 1 / 4  # largest lag as a fraction of the period
+AROUND = 1 / 8  # fraction of a period before and after an edge that is correlated
+DELAYED = 1.0  # [samples] a fit takes smaller lags as they are: it fits delays, and skin delays too
+NEAR = 16  # [samples] largest lag that an aligned record may still have
+FINE = 0.5  # [samples] grid of the search for that lag
 
 
 def lag_of(
     v_th: Float[np.ndarray, " time"], v_out: Float[np.ndarray, " time"], train: PulseTrain
 ) -> float | None:
-    """By how many samples `v_out` is late, from the edges of one pulse.
+    """Lag of `v_out` behind `v_th`, from the edges of one pulse.
 
-    The load smoothes the edges, by which it is found up to a sample too late.
+    The load smooths the edges. The lag found is therefore up to one sample too large.
 
     Args:
         v_th: Unloaded voltage [V].
@@ -32,7 +32,7 @@ def lag_of(
         train: The pulses of `v_th`.
 
     Returns:
-        The lag [samples]; None if the records are of opposite polarity, or too far apart.
+        The lag [samples]; None if the records have opposite polarity or are too far apart.
     """
     period = train.spacing or train.sample_rate / train.pulse_rate
     rise, edges = rise_time(train.sample_rate), train.edges
@@ -55,21 +55,21 @@ def lag_of(
 
 
 def whole_lag(lag: float) -> int:
-    """Samples by which the records are shifted; none if a fit takes the lag as it is."""
+    """Lag to be removed [samples]; 0 if a fit takes the lag as it is."""
     return 0 if abs(lag) <= DELAYED else round(lag)
 
 
 def shifted(
     v_th: Float[np.ndarray, " time"], v_out: Float[np.ndarray, " time"], late: int
 ) -> tuple[Float[np.ndarray, " overlap"], Float[np.ndarray, " overlap"]]:
-    """Both records where they overlap, `v_out` being late by whole samples."""
+    """Both records, cut to their overlap; `late` is the lag of `v_out` in whole samples."""
     if late < 0:
         return v_th[-late:], v_out[:late]
     return v_th[: v_th.size - late], v_out[late:]
 
 
 def _fast(size: int) -> int:
-    """A size not below, of which the Fourier transform is fast: 2ⁿ, 3 · 2ⁿ or 5 · 2ⁿ."""
+    """Smallest 2ⁿ, 3 · 2ⁿ or 5 · 2ⁿ that is not below `size`: its Fourier transform is fast."""
     return min(part << max(0, math.ceil(math.log2(size / part))) for part in (1, 3, 5))
 
 
@@ -79,13 +79,13 @@ def rest(
     weight: Float[np.ndarray, " frequency"],
     turn: Float[np.ndarray, " frequency"],
 ) -> float:
-    """By how many samples a record is later than its prediction, up to `NEAR`.
+    """Lag of a record behind its prediction [samples], between −`NEAR` and `NEAR`.
 
     Args:
         predicted: Fourier coefficients of the prediction.
-        measured: Those of the record.
-        weight: Of each, such as the reciprocal of its variance.
-        turn: By which one sample turns each [rad].
+        measured: Fourier coefficients of the record.
+        weight: Weight of each coefficient, such as the reciprocal of its variance.
+        turn: Phase by which a delay of one sample turns each coefficient [rad].
     """
     turned = np.conj(predicted) * measured * weight * np.exp(-1j * NEAR * turn)
     step, correlation = np.exp(1j * FINE * turn), []

@@ -1,17 +1,17 @@
 """Differentiable discrete-time filters, and continuous systems driven by band-limited samples.
 
-Everything here is one recursion,
+All functions here evaluate one recursion,
 
     x[n+1] = A x[n] + B u[n],      y[n] = C x[n] + D u[n],
 
-evaluated in blocks of `BLOCK` samples: inside a block the response is a lower triangular Toeplitz
-matrix product, between blocks a scan carries the state. That is 30-100 times fewer sequential steps
-than a scan over samples, and it differentiates in both modes.
+in blocks of `BLOCK` samples. Inside a block the response is a product with a lower triangular
+Toeplitz matrix. Between blocks a scan carries the state. This takes 30-100 times fewer sequential
+steps than a scan over samples, and it can be differentiated in forward and in reverse mode.
 
-**Band-limited hold.** A continuous-time system sampled at fs is usually discretised as if its input
-were constant, linear or Tustin-warped between samples; at 200 kHz Tustin alone biases the skin's
-C_p by 9 %. Here the input between two samples is the band-limited interpolation of its neighbours
-(a Kaiser-windowed sinc), written as a polynomial
+**Band-limited hold.** The usual discretisations of a continuous-time system assume that its input
+is constant, linear or Tustin-warped between samples. At 200 kHz Tustin alone biases the skin's C_p
+by 9 %. Here the input between two samples is the band-limited interpolation of its neighbours (a
+Kaiser-windowed sinc). It is written as a polynomial
 
     v((n + τ) / fs) = Σ_k c_k[n] τ^k,      0 ≤ τ ≤ 1,
 
@@ -21,9 +21,10 @@ whose coefficients depend on the data alone. The state then advances exactly,
 
 with all Γ_k from one matrix exponential (Van Loan 1978).
 
-**Precision.** Driver and skin in modal blocks keep 3e-16 of the peak at 200 kHz to 2 MHz in double
-precision and 3e-7 in single, in which they may be simulated. The same system as a quotient of
-polynomials keeps 1e-5 in double precision at 2 MHz, and overflows in single from 1 MHz on.
+**Precision.** Driver and skin in modal blocks have rounding errors of 3e-16 of the peak in double
+precision at 200 kHz to 2 MHz, and of 3e-7 in single precision. Single precision is therefore enough
+to simulate them. The same system as a quotient of polynomials has rounding errors of 1e-5 in double
+precision at 2 MHz. In single precision it overflows from 1 MHz on.
 """
 
 import functools
@@ -35,18 +36,18 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-BLOCK = 32  # samples; the Toeplitz product grows with it, the scan shrinks
+BLOCK = 32  # samples; a larger block costs more in the Toeplitz product and less in the scan
 TAPS = 24  # samples of the interpolation kernel on each side of an interval
-CUTOFF = 0.35  # of the sample rate, of the interpolation
-SHIFT_DEGREE = 10  # of the polynomials of `shiftable`, over twice the width
-TAYLOR_ORDER = 10  # of the matrix exponential; with the norm below its next term is 1e-16
-TAYLOR_NORM = 0.2
+CUTOFF = 0.35  # cutoff of the interpolation as a fraction of the sample rate
+SHIFT_DEGREE = 10  # degree of the polynomials of `shiftable`, which span two intervals
+TAYLOR_ORDER = 10  # of the matrix exponential; at TAYLOR_NORM the next term is 1e-16
+TAYLOR_NORM = 0.2  # norm to which the matrix is scaled before the Taylor series
 MAX_SQUARINGS = 32
-DEGREE = 7  # of the interpolating polynomial inside one interval
+DEGREE = 7  # degree of the interpolating polynomial inside one interval
 
 
 class StateSpace(eqx.Module):
-    """A linear system; continuous or discrete is said by the function that takes it."""
+    """A linear system; each function that takes one says whether it is continuous or discrete."""
 
     A: Float[Array, "state state"]
     B: Float[Array, "state input"]
@@ -100,10 +101,12 @@ def simulate(
 def _recur(
     a: Float[Array, "state state"], x0: Float[Array, " state"], u: Float[Array, "time state"]
 ) -> tuple[Float[Array, "time state"], Float[Array, " state"]]:
-    """States x[n+1] = a x[n] + u[n] before every step, and after the last."""
+    """States of x[n+1] = a x[n] + u[n] before every step, and the state after the last step."""
 
-    def advance(x, u):
-        # Not `a @ x`: of several x side by side, as of derivatives, XLA makes a call at every step.
+    def advance(
+        x: Float[Array, " state"], u: Float[Array, " state"]
+    ) -> tuple[Float[Array, " state"], Float[Array, " state"]]:
+        # Not `a @ x`: for several x at once, such as derivatives, XLA calls a library each step.
         return jnp.sum(a * x[None, :], axis=1) + u, x
 
     x, states = jax.lax.scan(advance, x0, u)
@@ -114,15 +117,18 @@ def _recur(
 def _carry(
     a: Float[Array, "state state"], x0: Float[Array, " state"], u: Float[Array, "time state"]
 ) -> tuple[Float[Array, "time state"], Float[Array, " state"]]:
-    """`_recur`, whose derivative is the same recursion driven by du + da x.
+    """`_recur` with its own derivative: the same recursion, driven by du + da x.
 
-    JAX's own would form da x step by step, inside its scan, at six times the cost.
+    The derivative that JAX makes forms da x step by step inside its scan. That costs six times as
+    much.
     """
     return _recur(a, x0, u)
 
 
 @_carry.defjvp
-def _carry_jvp(primals, tangents):
+def _carry_jvp(
+    primals: tuple[Array, Array, Array], tangents: tuple[Array, Array, Array]
+) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
     (a, _, _), (da, dx0, du) = primals, tangents
     states, last = _carry(*primals)
     return (states, last), _recur(a, dx0, du + states @ da.T)
@@ -171,7 +177,7 @@ def lfilter(
 
 @functools.cache
 def _interpolation_kernel(cutoff: float, earliest: float, degree: int) -> np.ndarray:
-    """Polynomials in τ on [earliest, 1] that weigh the neighbours n−TAPS+1 … n+TAPS."""
+    """Weights of the neighbours n−TAPS+1 … n+TAPS as polynomials in τ on [earliest, 1]."""
     chebyshev = -np.cos(np.pi * (np.arange(4 * degree) + 0.5) / (4 * degree))
     nodes = earliest + (1 - earliest) * (chebyshev + 1) / 2
     distance = nodes[:, None] - np.arange(-TAPS + 1, TAPS + 1)[None, :]
@@ -185,24 +191,25 @@ def band_limited(
 ) -> Float[Array, "interval degree"]:
     """Polynomial coefficients of the band-limited interpolation of `v` in every interval.
 
-    Row i belongs to the interval that starts at sample `TAPS − 1 + i`; the first is the earliest
-    interval, the last the latest one, with all its `2·TAPS` neighbours inside the record (`time −
-    2·TAPS + 1` rows).
+    Row i belongs to the interval that starts at sample `TAPS − 1 + i`. There is a row for each
+    interval whose `2·TAPS` neighbours all lie inside the record: `time − 2·TAPS + 1` rows.
 
     Args:
         v: Samples.
-        cutoff: Of the interpolation, in units of the sample rate. Fits use the default, which
-            keeps out what an imperfect anti-alias filter has folded below half the rate.
+        cutoff: Cutoff of the interpolation as a fraction of the sample rate. Fits use the default:
+            it excludes the aliases that an imperfect anti-alias filter lets through.
     """
     return _interpolate(v, _interpolation_kernel(cutoff, 0.0, DEGREE))
 
 
 def shiftable(v: Float[Array, " time"], cutoff: float = CUTOFF) -> Float[Array, "interval degree"]:
-    """The samples as functions of a delay: v((n + τ) / fs) = Σ_k c_k[n] τ^k for −1 ≤ τ ≤ 1.
+    """Polynomial coefficients of every sample as a function of a time shift τ.
+
+    v((n + τ) / fs) = Σ_k c_k[n] τ^k for −1 ≤ τ ≤ 1. The rows are those of `band_limited`.
 
     Args:
         v: Samples.
-        cutoff: As in `band_limited`, whose rows these are too.
+        cutoff: As in `band_limited`.
     """
     return _interpolate(v, _interpolation_kernel(cutoff, -1.0, SHIFT_DEGREE))
 
@@ -215,20 +222,21 @@ def _interpolate(v: Float[Array, " time"], weights: np.ndarray) -> Float[Array, 
 
 
 def _expm(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
-    """Matrix exponential: a Taylor series of a scaled matrix, squared again.
+    """Matrix exponential by a Taylor series of the scaled matrix and repeated squaring.
 
-    `jax.scipy.linalg.expm` compiles a solver for each of its five Padé orders, three times as long
-    as this, and an identification has a dozen places where it is compiled.
+    `jax.scipy.linalg.expm` compiles a solver for each of its five Padé orders. It compiles three
+    times as long as this function, and an identification compiles it at a dozen places.
     """
     norm = jax.lax.stop_gradient(jnp.abs(matrix).sum(0).max())
     squarings = jnp.ceil(jnp.log2(jnp.maximum(norm / TAYLOR_NORM, 1.0)))
     unit = jnp.eye(matrix.shape[0], dtype=matrix.dtype)
     small = matrix * jnp.exp2(-squarings)
 
-    def term(total, k):  # Horner, of e^M − 1, which keeps what is small beside 1
+    # Horner's rule for e^M − 1 instead of e^M, so that terms much smaller than 1 are not lost.
+    def term(total: Float[Array, "n n"], k: Float[Array, ""]) -> tuple[Float[Array, "n n"], None]:
         return small @ (unit + total) / k, None
 
-    def square(total, k):
+    def square(total: Float[Array, "n n"], k: Float[Array, ""]) -> tuple[Float[Array, "n n"], None]:
         return jnp.where(k < squarings, 2 * total + total @ total, total), None
 
     orders = jnp.arange(TAYLOR_ORDER, 0, -1, dtype=matrix.dtype)
@@ -245,7 +253,7 @@ def hold(system: StateSpace, sample_rate: float | Float[Array, ""]) -> StateSpac
         sample_rate: Sampling rate [Hz].
 
     Returns:
-        Discrete system whose inputs are the polynomial coefficients of one interval.
+        Discrete system. Its inputs are the polynomial coefficients of one interval.
     """
     states = system.A.shape[0]
     size = states + DEGREE + 1

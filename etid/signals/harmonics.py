@@ -1,11 +1,13 @@
-"""Harmonics of the pulse rate: synchronous averaging and a Fourier transform in one.
+"""Harmonics of the pulse rate: synchronous averaging and a Fourier transform in one step.
 
-A record of P periods is cut to the M samples nearest to a whole number of them; the discrete
-Fourier transform at every P-th bin, f_k = k P fs/M, averages the periods. M need not be a multiple
-of P, nor the clock be exact: a linear system at rest again at both ends of the window obeys
-Y(f) = G(f) X(f) at any frequency. What has aliased, k f0 − fs, falls into the bins between those of
-the harmonics, unless a period is a whole number of samples or there is but one; then the upper part
-of the band, where anti-alias filters are imperfect, is left out.
+A record is cut to P whole periods, to the nearest sample: M samples. The discrete Fourier transform
+at every P-th bin, f_k = k P fs/M, averages the periods. M need not be a multiple of P, and the
+clock need not be exact: a linear system that is at rest at both ends of the window obeys
+Y(f) = G(f) X(f) at any frequency.
+
+Aliases, k f0 − fs, fall into the bins between the harmonics. There are two exceptions: a period of
+a whole number of samples, and a record of one period. Then the upper part of the band is not used,
+because anti-alias filters are imperfect there.
 """
 
 import functools
@@ -19,10 +21,10 @@ import numpy as np
 from jaxtyping import Array, Bool, Complex, Float
 
 WINDOW = 25  # harmonics over which power is averaged
-ALIASED = 0.35  # of the sample rate, above which aliases must be told from harmonics by frequency
-DRIFT_DEGREE = 3  # of the polynomial by which the mean may drift
-ROOM = 64  # harmonics: records of all lengths have as many, a multiple of this
-ABSENT = 1e-6  # standard deviations, coefficients and noise of harmonics that only fill it
+ALIASED = 0.35  # of the sample rate; above, aliases matter unless they fall between the harmonics
+DRIFT_DEGREE = 3  # degree of the polynomial that describes the drift of the mean
+ROOM = 64  # harmonic counts are padded to a multiple of this, so that compiled programs are shared
+ABSENT = 1e-6  # [standard deviations] coefficient and noise of a padded harmonic
 
 
 class Spectrum(eqx.Module):
@@ -33,8 +35,8 @@ class Spectrum(eqx.Module):
         x: Coefficients of V_th.
         y: Coefficients of V_out.
         variance_x: E|noise|² of each coefficient of `x` [V²].
-        variance_y: The same of `y`.
-        selected: Harmonics that are used: all where aliases fall between them.
+        variance_y: E|noise|² of each coefficient of `y` [V²].
+        selected: Harmonics that are used; all of them if aliases fall between them.
     """
 
     frequency: Float[Array, "*lane harmonic"]
@@ -46,19 +48,19 @@ class Spectrum(eqx.Module):
 
 
 def whole_periods(samples: int, sample_rate: float, pulse_rate: float) -> tuple[int, int]:
-    """How many whole periods a record holds, and the samples nearest to them.
+    """Number of whole periods in a record, and their length in samples.
 
     The last period may lack half a sample: 3333 samples are one period of 60 Hz at 200 kHz.
 
     Returns:
-        Number of periods, 0 if there is none, and number of samples.
+        Number of periods (0 if there is none) and number of samples, rounded.
     """
     periods = int((samples + 0.5) * pulse_rate / sample_rate)
     return periods, min(samples, round(periods * sample_rate / pulse_rate))
 
 
 def separates_aliases(periods: int, samples: int) -> bool:
-    """Whether what has aliased falls between the bins of the harmonics."""
+    """Whether aliases fall between the bins of the harmonics."""
     return periods > 1 and samples % periods != 0
 
 
@@ -67,15 +69,17 @@ def harmonics(
 ) -> Complex[Array | np.ndarray, " harmonic"]:
     """Fourier coefficients (1/M) Σ v[n] e^(−j2πkPn/M) for k = 1 … below half the sample rate.
 
-    A drift of the mean from period to period is taken out first.
+    The drift of the mean from period to period is removed.
     """
-    # Bins that all are a multiple of a part of M are those of the sum of that many parts.
+    # Only bins that are multiples of `parts` are needed. They are the bins of the sum of so many
+    # equal parts of the record, which is shorter.
     parts = math.gcd(periods, samples)
     folded = v[:samples].reshape(parts, -1).sum(0)
     coefficients = namespace(v).fft.rfft(folded) / samples
     basis, fit = _drift(periods, samples)
-    # The transform is linear: that of the drift is known but for its few coefficients.
-    # Sums of products, as `@` starts BLAS threads for each recording, which wait for each other.
+    # The transform is linear: the drift needs only the transforms of the powers of time.
+    # Sums of products instead of `@`, which starts BLAS threads for each recording. These threads
+    # wait for each other.
     drift = (fit * _sums(v[:samples], periods)[None, :]).sum(1)
     step = periods // parts
     at_harmonics = coefficients[step : (folded.size + 1) // 2 : step]
@@ -83,12 +87,12 @@ def harmonics(
 
 
 def namespace(v: Array | np.ndarray) -> ModuleType:
-    """NumPy for its own arrays, of whose many shapes none is compiled then; JAX for all others."""
+    """NumPy for NumPy arrays, so that nothing is compiled for each shape; JAX for all others."""
     return np if isinstance(v, np.ndarray) else jnp
 
 
 def _sums(v: Array | np.ndarray, periods: int) -> Array | np.ndarray:
-    """Sums over the periods, whose ends may fall between samples; along the first axis."""
+    """Sum over each period along the first axis; a period may end between two samples."""
     of, samples = namespace(v), v.shape[0]
     ends = np.arange(periods + 1) * (samples / periods)
     whole = np.minimum(ends.astype(int), samples - 1)
@@ -101,7 +105,7 @@ def _sums(v: Array | np.ndarray, periods: int) -> Array | np.ndarray:
 def _drift(
     periods: int, samples: int
 ) -> tuple[Complex[np.ndarray, "degree harmonic"], Float[np.ndarray, "degree period"]]:
-    """Transforms of the powers of time, and their coefficients by the sums of a record."""
+    """Transforms of the powers of time, and the matrix from period sums to coefficients."""
     powers = np.vander(np.linspace(-1, 1, samples), min(periods, DRIFT_DEGREE + 1), increasing=True)
     transforms = np.fft.rfft(powers, axis=0) / samples
     fit = np.linalg.pinv(np.asarray(_sums(powers, periods)))
@@ -109,10 +113,10 @@ def _drift(
 
 
 def local_sum(values: Float[Array, " harmonic"]) -> Float[Array, " harmonic"]:
-    """Sum over `WINDOW` harmonics around each.
+    """Sum over the `WINDOW` harmonics around each harmonic.
 
-    Not `jnp.convolve`: under `vmap` that becomes one convolution of all lanes, in which a NaN
-    poisons the others, and whose compiled code has read beyond its input.
+    Not `jnp.convolve`: under `vmap` it becomes one convolution over all lanes, so that a NaN in
+    one lane spoils the others. Its compiled code has also read beyond its input.
     """
     size = min(WINDOW, values.shape[0])
     return jax.lax.reduce_window(values, 0.0, jax.lax.add, (size,), (1,), "SAME")
@@ -121,7 +125,7 @@ def local_sum(values: Float[Array, " harmonic"]) -> Float[Array, " harmonic"]:
 def signal_share(
     coefficients: Complex[Array, " harmonic"], variance: Float[Array, " harmonic"]
 ) -> Float[Array, " harmonic"]:
-    """Part of the power of noisy coefficients that is signal, locally averaged; 0 to 1."""
+    """Fraction of the power of noisy coefficients that is signal, locally averaged; 0 to 1."""
     power, noise = local_sum(jnp.abs(coefficients) ** 2), local_sum(variance)
     return jnp.clip(1 - noise / jnp.where(power > 0, power, 1.0), 0.0, 1.0)
 
@@ -137,18 +141,19 @@ def spectrum(
 ) -> tuple[Array | np.ndarray, ...]:
     """Harmonics of both records and their noise: the fields of a `Spectrum`.
 
-    Harmonics that noise hides are not left out: the likelihood knows what they are worth, and any
-    choice by their power costs more at 24 to 40 dB than they disturb. After the last there are some
-    that are not selected and hold next to nothing, so that records of most lengths have as many.
+    Harmonics below the noise stay selected: the likelihood weights them correctly. To drop weak
+    harmonics would lose more information at 24 to 40 dB than they disturb. Padded harmonics follow
+    the last harmonic. They are not selected and almost zero; they give records of most lengths the
+    same number of harmonics.
 
     Args:
         v_th: Unloaded voltage [V].
         v_out: Loaded voltage [V].
-        sigma_th: Noise of a sample of `v_th` [V], white.
-        sigma_out: The same of `v_out`.
+        sigma_th: Standard deviation of the white noise of a sample of `v_th` [V].
+        sigma_out: Standard deviation of the white noise of a sample of `v_out` [V].
         sample_rate: Sampling rate [Hz].
-        periods: From `whole_periods`.
-        samples: From `whole_periods`.
+        periods: Number of periods from `whole_periods`.
+        samples: Number of samples from `whole_periods`.
     """
     of = namespace(v_out)
     x, y = harmonics(v_th, periods, samples), harmonics(v_out, periods, samples)
@@ -157,7 +162,9 @@ def spectrum(
     number = np.arange(1.0, count + room + 1)
     frequency = number * (periods * sample_rate / samples)
 
-    def filled(coefficients, sigma):
+    def filled(
+        coefficients: Array | np.ndarray, sigma: Array | np.ndarray
+    ) -> tuple[Array | np.ndarray, Array | np.ndarray]:
         noise = sigma / math.sqrt(samples)
         scale = of.where(number <= count, noise, ABSENT * noise)
         absent = scale[count:].astype(coefficients.dtype)

@@ -1,17 +1,17 @@
-"""Mains hum, of 50 or 60 Hz and multiples.
+"""Mains hum of 50 or 60 Hz and multiples.
 
-Hum that does not fall on a harmonic of the pulse rate, as 50 Hz with pulses of 60 Hz, is seen in
-the bins between the harmonics of a whole record, where pulses leave next to nothing. `separated`
-fits sinusoids
+**Hum between the harmonics of the pulse rate**, such as 50 Hz with pulses of 60 Hz, appears in the
+bins between the harmonics of the whole record. Pulses leave almost nothing in these bins.
+`separated` fits sinusoids
 
     Σ_h Re z_h e^(j 2π h f n/fs),      h = 1 … 7,
 
-to these bins, f being 50 or 60 Hz within 0.2 %, together with a slow drift, and subtracts them from
-the samples.
+and a slow drift to these bins, with f within 0.2 % of 50 or 60 Hz. The sinusoids that it returns
+can be subtracted from the samples.
 
-Where hum falls on a harmonic, as 60 Hz does on the first of 60 Hz pulses, nothing but a model tells
-one from the other: the harmonics on which hum may fall are `lines`, and
-`etid.estimators.maximum_likelihood.terms` sees in the residual of a fit whether there is any.
+**Hum on a harmonic**, such as 60 Hz with pulses of 60 Hz, can be distinguished from the pulses only
+by a model. `lines` marks the harmonics on which hum may fall.
+`etid.estimators.maximum_likelihood.terms` detects it there in the residual of a fit.
 """
 
 import functools
@@ -25,31 +25,31 @@ from jaxtyping import Array, Bool, Complex, Float, Int
 from etid.signals.harmonics import namespace
 
 MAINS = (50.0, 60.0)  # [Hz]
-MULTIPLES = 7  # of them; what comes above is a thousandth of the first in most laboratories
-NEAR = 0.02  # of the mains frequency, by which a harmonic may be off its multiple
-OFF = 2e-3  # by which mains may be off
-BESIDE = 20  # bins on both sides of a multiple in which sinusoids must explain what is there
-DRIFT = 3  # degree of the polynomial that drifts besides
-SEEN = 6.0  # standard deviations of a probe
-SURE = 80.0  # by which χ² must fall; noise and 15 parameters are above it once in 10⁹
-PROBED = 200_000  # samples up to which probes are kept in memory
-MISSED = 0.05  # of what a record that is not quite whole periods long leaves, by `_pulses`
-LEFT = 0.1  # of what the bins have more than noise, that sinusoids may leave
+MULTIPLES = 7  # higher multiples are a thousandth of the first in most laboratories
+NEAR = 0.02  # largest distance of a harmonic from a multiple, relative to the mains frequency
+OFF = 2e-3  # largest relative error of the mains frequency
+BESIDE = 20  # bins on both sides of a multiple that the sinusoids must explain
+DRIFT = 3  # degree of the polynomial that describes the drift
+SEEN = 6.0  # standard deviations of a probe above which sinusoids are fitted
+SURE = 80.0  # required fall of χ²; noise and 15 parameters exceed it once in 10⁹
+PROBED = 200_000  # longest record [samples] whose probes are kept in memory
+MISSED = 0.05  # fraction of the leakage of pulses that `_pulses` may fail to describe
+LEFT = 0.1  # largest fraction of the excess over noise that sinusoids may leave
 
 
 class Hum(NamedTuple):
     """Sinusoids that were found in a record.
 
     Attributes:
-        frequency: Of the mains [Hz].
-        amplitude: z of each multiple [V].
+        frequency: Mains frequency f [Hz].
+        amplitude: Complex amplitude z_h of each multiple [V].
     """
 
     frequency: float
     amplitude: Complex[np.ndarray, " multiple"]
 
     def __call__(self, samples: int, sample_rate: float) -> Float[np.ndarray, " time"]:
-        """Its voltage [V]."""
+        """Voltage of the hum at each sample [V]."""
         turn = np.exp(2j * np.pi * self.frequency / sample_rate * np.arange(samples))
         total, power = np.zeros(samples), np.ones(samples, complex)
         for z in self.amplitude:
@@ -60,9 +60,14 @@ class Hum(NamedTuple):
     def covers(
         self, frequency: Float[np.ndarray, " harmonic"], periods: int
     ) -> Bool[np.ndarray, " harmonic"]:
-        """Harmonics of a record of so many periods that are less than a bin from a multiple.
+        """Whether each harmonic is less than one bin from a multiple of the mains.
 
-        What is subtracted there is not known better than what hum would do.
+        There the fitted sinusoid is as uncertain as the hum itself, so it cannot correct the
+        harmonic.
+
+        Args:
+            frequency: Harmonics [Hz].
+            periods: Number of periods of the record.
         """
         bin_width = frequency[0] / periods
         multiple = np.clip(np.round(frequency / self.frequency), 1, MULTIPLES)
@@ -75,7 +80,7 @@ def lines(
     """Whether mains hum may fall on each harmonic.
 
     Args:
-        frequency: The harmonics [Hz].
+        frequency: Harmonics [Hz].
     """
     of = namespace(frequency)
     found = of.zeros(frequency.shape, bool)
@@ -94,17 +99,17 @@ def separated(
     periods: int,
     samples: int,
 ) -> Hum | None:
-    """Hum that the bins between the harmonics show, if there is any.
+    """Hum in the bins between the harmonics; None if there is none.
 
-    A drift, or pulses that change, fill these bins as well, but not as sinusoids do.
+    A drift or changing pulses also fill these bins, but not in the pattern of sinusoids.
 
     Args:
-        v: A record [V].
-        sigma: Noise of a sample [V].
+        v: Voltage of the record [V].
+        sigma: Standard deviation of the noise of a sample [V].
         sample_rate: Sampling rate [Hz].
         pulse_rate: Nominal pulses per second [Hz].
-        periods: From `etid.signals.harmonics.whole_periods`.
-        samples: From `etid.signals.harmonics.whole_periods`.
+        periods: Number of periods from `etid.signals.harmonics.whole_periods`.
+        samples: Number of samples from `etid.signals.harmonics.whole_periods`.
     """
     if periods < 2 or not sigma > 0 or not np.isfinite(v[:samples]).all():
         return None
@@ -118,13 +123,13 @@ def separated(
 
 
 def _between(bins: Int[np.ndarray, " bin"], periods: int) -> Int[np.ndarray, " between"]:
-    """Those that are no harmonics."""
+    """The bins that are not harmonics, sorted."""
     bins = np.unique(bins)
     return bins[(bins % periods != 0) & (bins > 0)]
 
 
 def _multiples(seconds: float) -> Float[np.ndarray, "mains multiple"]:
-    """In bins of a record of this length."""
+    """Multiples of the mains in units of a bin, for a record of `seconds`."""
     return np.outer(MAINS, np.arange(1, MULTIPLES + 1)) * seconds
 
 
@@ -132,10 +137,14 @@ def _multiples(seconds: float) -> Float[np.ndarray, "mains multiple"]:
 def _probes(
     sample_rate: float, periods: int, samples: int
 ) -> tuple[Float[np.ndarray, "probe time"], float]:
-    """Four mixtures of the bins beside the first three multiples, each with a square sum of 1.
+    """Four probes for hum, and their response to pulses.
 
-    Four products of each record in place of a transform, at a tenth of its cost. And what pulses
-    of a mean of 1 leave in one, if the record is a sample longer than its periods (`_pulses`).
+    A probe is a mixture of the bins beside the first three multiples, with a square sum of 1. Four
+    products per record replace a transform, at a tenth of its cost.
+
+    Returns:
+        The probes, and the response of a probe to pulses of mean 1 if the record is one sample
+        longer than its periods (see `_pulses`).
     """
     places = _multiples(samples / sample_rate)[:, :3].ravel()
     bins = _between(np.concatenate([np.floor(places), np.ceil(places)]).astype(int), periods)
@@ -154,7 +163,7 @@ def _probes(
 def _near(
     sample_rate: float, periods: int, samples: int
 ) -> tuple[Int[np.ndarray, " bin"], Complex[np.ndarray, "bin degree"]]:
-    """Bins near multiples of the mains that are no harmonics, and the powers of time there."""
+    """Bins near multiples of the mains, without harmonics, and the powers of time in these bins."""
     around = np.round(_multiples(samples / sample_rate)).astype(int).ravel()
     near = around[:, None] + np.arange(-BESIDE, BESIDE + 1)[None, :]
     bins = _between(near[near < samples // 2 - periods], periods)
@@ -165,9 +174,10 @@ def _near(
 def _found(
     v: Float[np.ndarray, " time"], sigma: float, sample_rate: float, periods: int
 ) -> Hum | None:
+    """Hum by least squares; None if the sinusoids explain too little of the bins."""
     seconds = v.size / sample_rate
     bins, drifts = _near(sample_rate, periods, v.size)
-    unit = sigma / math.sqrt(2 * v.size)  # of the real and of the imaginary part of a bin
+    unit = sigma / math.sqrt(2 * v.size)  # standard deviation of the real part of a bin
     transform: Complex[np.ndarray, " all"] = np.fft.rfft(v) / v.size / unit
     others = np.concatenate([drifts, _pulses(v, transform, bins, periods)], axis=1)
     others = np.concatenate([np.real(others), np.imag(others)])
@@ -176,7 +186,8 @@ def _found(
     drifting, before = (_rest(others[:, :count], seen) for count in (DRIFT, DRIFT + 2))
     if before - seen.size < max(SURE, MISSED * (drifting - before)):
         return None
-    weak = np.ptp(v) / unit  # width of a prior, as hum on a harmonic leaves its amplitude open
+    # Width of a weak prior: bins between the harmonics do not determine hum on a harmonic.
+    weak = np.ptp(v) / unit
     seen = np.concatenate([seen, np.zeros(2 * MULTIPLES)])
     prior = np.eye(2 * MULTIPLES, 2 * MULTIPLES + others.shape[1])
 
@@ -192,7 +203,8 @@ def _found(
 
     def best(mains: float) -> tuple[float, float]:
         reach = OFF * mains
-        count = 2 * math.ceil(4 * MULTIPLES * seconds * reach) + 3  # quarters of a bin, the highest
+        # The grid moves the highest multiple by a quarter of a bin.
+        count = 2 * math.ceil(4 * MULTIPLES * seconds * reach) + 3
         grid = mains + np.linspace(-reach, reach, count)
         at = int(np.clip(np.argmin([fitted(f)[0] for f in grid]), 1, count - 2))
         found = scipy.optimize.minimize_scalar(
@@ -211,7 +223,7 @@ def _found(
 
 
 def _rest(columns: Float[np.ndarray, "row column"], seen: Float[np.ndarray, " row"]) -> float:
-    """Sum of squares that the columns leave."""
+    """Sum of squares of `seen` after a least-squares fit of the columns."""
     return float(np.sum((seen - columns @ np.linalg.lstsq(columns, seen)[0]) ** 2))
 
 
@@ -221,17 +233,18 @@ def _pulses(
     bins: Int[np.ndarray, " bin"],
     periods: int,
 ) -> Complex[np.ndarray, "bin 2"]:
-    """What pulses leave between their harmonics if the record is not quite P periods long.
+    """Leakage of pulses into the bins between their harmonics, as columns to be fitted.
 
-    If it is ρ samples too short, Σ_p e^(−j 2π m p (1 + ρ/N)/P), the sum over the pulses, is not 0
-    but −j 2π m ρ / (N (w − 1)), w = e^(−j 2π m/P); the transform of one pulse is what the harmonics
-    beside say. Another column, with m, is for what their interpolation misses.
+    Pulses leak if the record is not exactly P periods long. If it is ρ samples too short, the sum
+    over the pulses, Σ_p e^(−j 2π m p (1 + ρ/N)/P), is not 0 but −j 2π m ρ / (N (w − 1)) with
+    w = e^(−j 2π m/P). The first column multiplies it by the transform of one pulse, interpolated
+    between the harmonics. The second column, times m, describes the error of the interpolation.
     """
     one = v.size // periods
     late = int(np.argmax(np.abs(v[:one])))
     known = np.arange(0, bins.max() + periods + 1, periods)
     turned = transform[known] * np.exp(2j * np.pi * known * late / v.size)
-    turned[0] = 0.0  # a transformer passes no mean
+    turned[0] = 0.0  # a transformer passes no direct voltage
     pulse = np.interp(bins, known, turned.real) + 1j * np.interp(bins, known, turned.imag)
     pulse = pulse * np.exp(-2j * np.pi * bins * late / v.size)
     left = -1j * bins * pulse / (np.exp(-2j * np.pi * bins / periods) - 1)
@@ -241,7 +254,7 @@ def _pulses(
 def _wave(
     turns: Float[np.ndarray, "bin multiple"], samples: int
 ) -> Complex[np.ndarray, "bin multiple"]:
-    """Mean of e^(j 2π t n/N), n = 0 … N−1."""
+    """Mean of e^(j 2π t n/N) over n = 0 … N−1."""
     angle = 2 * np.pi * turns
     with np.errstate(invalid="ignore", divide="ignore"):
         mean = np.expm1(1j * angle) / np.expm1(1j * angle / samples) / samples

@@ -1,4 +1,4 @@
-"""etid computes in float64, and says so instead of switching a global on import."""
+"""The check that JAX runs in float64: importing etid never changes this global setting."""
 
 import jax
 
@@ -7,8 +7,7 @@ def require_float64() -> None:
     """Raise unless JAX runs in float64.
 
     Raises:
-        RuntimeError: JAX would silently compute in float32, in which the filters lose 4 to 9
-            digits.
+        RuntimeError: JAX runs in float32. The filters would lose 4 to 9 digits without a warning.
     """
     if not jax.config.read("jax_enable_x64"):
         raise RuntimeError(

@@ -1,6 +1,6 @@
-"""Where the pulses of a record are, and how far apart they are.
+"""Positions of the pulses of a record, and their spacing.
 
-Only NumPy: this is looked at before anything is fitted.
+This module uses NumPy only, because it runs before anything is fitted.
 """
 
 import dataclasses
@@ -8,16 +8,17 @@ import dataclasses
 import numpy as np
 from jaxtyping import Float, Int
 
-COARSE = 512  # samples of a pulse period that are enough to find its pulses
-HALF = 0.5  # of the highest sample, where a pulse begins and ends
-RINGING = 0.02  # of a period; what falls and rises again within it is one pulse
-EVEN = 0.05  # part by which distances of pulses may differ, and still be those of one rate
-RATE = 2e-3  # part by which pulse_rate may be off; more is a wrong number and no clock
-CLOCK = 3e-4  # part by which clocks are off; more is said
-# Samples by which the last pulse is elsewhere, before the rate is counted; at 20 dB noise moves it
-# by 0.2. At 60 dB one sample would let aliases leak, by two standard errors of a dry skin.
+COARSE = 512  # samples per period after averaging; enough to find the pulses
+HALF = 0.5  # a pulse begins and ends at this fraction of the highest sample
+RINGING = 0.02  # of a period; a shorter gap does not split a pulse in two
+EVEN = 0.05  # relative range of the spacings up to which the pulses have one rate
+RATE = 2e-3  # relative error of pulse_rate; a larger one is a wrong number, not an inexact clock
+CLOCK = 3e-4  # relative error of a clock; a larger one is reported
+# [samples] The rate is counted if the last pulse is farther from its nominal place than this. At
+# 20 dB noise moves it by 0.2. At 60 dB and dry skin, one sample would let aliases leak into the
+# harmonics, by two standard errors.
 SHIFTED = 0.5
-EDGE = 5e-6  # [s] over which edges rise at any sample rate
+EDGE = 5e-6  # [s] time over which the rise of edges is measured, at any sample rate
 
 
 @dataclasses.dataclass(frozen=True)
@@ -25,8 +26,8 @@ class PulseTrain:
     """The pulses of a record.
 
     Attributes:
-        edges: First samples of the pulses, or the samples after them, whichever are more.
-        spacing: Distance of the pulses [samples]; None for a single one, or if they are not even.
+        edges: Starts of the pulses, or their ends if there are more ends [samples].
+        spacing: Spacing of the pulses [samples]; None for a single pulse or uneven spacing.
         size: Length of the record [samples].
         sample_rate: Samples per second [Hz], as the recording says.
         pulse_rate: Pulses per second [Hz], as the recording says.
@@ -40,14 +41,14 @@ class PulseTrain:
 
     @property
     def counted(self) -> float:
-        """Pulse rate [Hz] by the clock of the converter.
+        """Pulse rate [Hz] as measured by the clock of the converter.
 
-        A clock that is off by 50 ppm moves the last of 30 periods by five samples, by which the
-        harmonics above the 600th would be averaged away.
+        A clock error of 50 ppm moves the last of 30 periods by five samples. Averaging would then
+        remove the harmonics above the 600th.
 
         Returns:
-            The rate of the recording, unless the last pulse is half a sample away from where it
-            would be, or the rates contradict each other.
+            The nominal rate of the recording if the last pulse is less than half a sample from its
+            nominal place, or if the spacing contradicts the rates; otherwise the counted rate.
         """
         nominal = self.sample_rate / self.pulse_rate
         if self.spacing is None or abs(self.spacing / nominal - 1) > RATE:
@@ -58,7 +59,7 @@ class PulseTrain:
 
     @property
     def mismatch(self) -> str:
-        """How the distance of the pulses contradicts both rates; empty if it does not."""
+        """How the spacing of the pulses contradicts the rates; empty if it does not."""
         rate, pulse_rate = self.sample_rate, self.pulse_rate
         nominal = rate / pulse_rate
         said = f"sample_rate / pulse_rate is {nominal:.6g}"
@@ -83,20 +84,21 @@ class PulseTrain:
 
 
 def _counted(rate: float) -> str:
-    """A rate to the four digits that pulses thousands of samples apart tell."""
+    """A rate with four digits: pulses thousands of samples apart determine no more."""
     return f"{float(f'{rate:.4g}'):.9g}"
 
 
 def find_pulses(v: Float[np.ndarray, " time"], sample_rate: float, pulse_rate: float) -> PulseTrain:
     """Find the pulses of an unloaded record.
 
-    They begin and end where the record, averaged over a five-hundredth of a period, crosses half of
-    its highest value: 25 V of 50 V, which noise at 20 dB, 1 V, hum and drift do not reach.
+    The record is averaged over a five-hundredth of a period. A pulse begins and ends where the
+    average crosses half of its highest value, such as 25 V of 50 V. Noise at 20 dB (1 V), hum and
+    drift do not reach this level.
 
     Args:
-        v: A record.
+        v: Unloaded voltage [V].
         sample_rate: Samples per second [Hz].
-        pulse_rate: Pulses per second [Hz], which may be wrong by an order of magnitude.
+        pulse_rate: Pulses per second [Hz]; may be wrong by an order of magnitude.
     """
     period = sample_rate / pulse_rate
     step = max(1, int(period / COARSE))
@@ -111,7 +113,7 @@ def find_pulses(v: Float[np.ndarray, " time"], sample_rate: float, pulse_rate: f
     apart = max(1.0, RINGING * period / step)
     begins = begins[np.diff(begins, prepend=-np.inf) > apart]
     ends = ends[np.diff(ends, append=np.inf) > apart]
-    # A pulse that is cut by an end of the record has only one of both.
+    # A pulse that is cut by an end of the record has only one edge.
     edges = (begins if begins.size >= ends.size else ends) * step
     whole = begins.size > 0 and ends.size > 0  # a record without both has no pulse
     found = PulseTrain(edges if whole else edges[:0], None, v.size, sample_rate, pulse_rate)
@@ -122,9 +124,9 @@ def find_pulses(v: Float[np.ndarray, " time"], sample_rate: float, pulse_rate: f
 
 
 def _spacing(v: Float[np.ndarray, " time"], found: PulseTrain, step: int) -> float:
-    """Distance of the pulses, from the first to the last, by their edges."""
+    """Spacing of the pulses [samples], from the first and the last edge."""
     first, last = int(found.edges[0]), int(found.edges[-1])
-    off = 2 * step + 2  # by which an edge may be elsewhere
+    off = 2 * step + 2  # [samples] error of the coarse edges
     rise = rise_time(found.sample_rate)
     room = min(first, v.size - last - rise)
     width = min(8 * step + 4 * rise, (last - first) // 4)
@@ -135,24 +137,25 @@ def _spacing(v: Float[np.ndarray, " time"], found: PulseTrain, step: int) -> flo
     where = rises(v[start : last + after + off + rise], rise)
     if where.size < template.size:  # the last edge is at the end of the record
         return (last - first) / (found.edges.size - 1)
-    # Least squares of the difference: the product alone is drawn to where a slow edge is steeper.
+    # Least squares of the difference. The correlation alone is biased towards the steepest part of
+    # a slow edge.
     power = np.convolve(where**2, np.ones(template.size), "valid")
     lag = highest(np.correlate(where, template, "valid") - power / 2)
     return (start + lag - (first - before)) / (found.edges.size - 1)
 
 
 def rise_time(sample_rate: float) -> int:
-    """Samples over which edges rise."""
+    """Number of samples over which the rise of edges is measured."""
     return max(1, round(EDGE * sample_rate))
 
 
 def rises(v: Float[np.ndarray, " time"], rise: int) -> Float[np.ndarray, " sample"]:
-    """By how much it rises; edges stand out of noise and droop at any sample rate."""
+    """Rise of `v` over `rise` samples; edges exceed noise and droop at any sample rate."""
     return v[rise:] - v[:-rise]
 
 
 def highest(correlation: Float[np.ndarray, " lag"]) -> float:
-    """Where it is highest, between samples by a parabola."""
+    """Position of the maximum [samples], interpolated by a parabola."""
     top = int(np.argmax(correlation))
     if not 0 < top < correlation.size - 1:
         return float(top)

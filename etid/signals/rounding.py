@@ -1,10 +1,10 @@
 """The rounding error of a converter whose steps exceed the noise.
 
-Without noise it is no white noise: where a signal is slow it is a saw-tooth, the same in each
-period, and no average over periods makes it smaller. How large it is at each harmonic is what
-rounding does to the waveform, which is known to a fraction of a step: where it is slow, it passes
-from code to code half a step between them. So it is rounded again, with the noise, lifted by
-several parts of a step,
+Without noise, the rounding error is not white. Where the signal is slow, it is a saw-tooth that is
+the same in each period, so averaging over periods does not reduce it. Its size at each harmonic is
+found by rounding the waveform again. The waveform v is known to a fraction of a step: where it is
+slow, it crosses half a step between two codes when the code changes. It is rounded with noise n and
+with several offsets o of a fraction of a step,
 
     E|e_k|² = mean over o of |DFT_k(Q(v + o + n) − v − o)|².
 """
@@ -16,17 +16,17 @@ from jaxtyping import Float
 
 from etid.signals.harmonics import harmonics
 
-COARSE = 2.0  # steps over noise at which 0.7 % of the saw-tooth of rounding is left
-VISIBLE = 1e-3  # of the signal, below which even a saw-tooth is hidden by what else is unknown
-FLICKER = 2 / math.sqrt(math.pi)  # share of samples that change the code, times step over noise
-FEW = 256  # samples in which a converter without noise shows few values
-EQUAL = 1e-3  # of a step, by which steps may differ
-LIFTS = 16  # parts of a step
+COARSE = 2.0  # step over noise; at this ratio 0.7 % of the saw-tooth is left
+VISIBLE = 1e-3  # of the signal; other errors hide the saw-tooth of a smaller step
+FLICKER = 2 / math.sqrt(math.pi)  # fraction of samples that change the code, times step over noise
+FEW = 256  # a converter without noise shows few values in so many samples
+EQUAL = 1e-3  # tolerance for equal steps, relative to a step
+LIFTS = 16  # number of offsets within a step
 SEED = 1948
 
 
 def step_of(v: Float[np.ndarray, " time"]) -> float:
-    """Step of the converter, by the values that a record has; 0 if they are no multiples of one."""
+    """Step of the converter; 0 if the values are not multiples of one step."""
     if np.unique(v[:FEW]).size > FEW // 2:
         return 0.0
     values = np.unique(v)
@@ -40,7 +40,7 @@ def step_of(v: Float[np.ndarray, " time"]) -> float:
 
 
 def noise_of(v: Float[np.ndarray, " time"], step: float) -> float:
-    """Noise of a record by how often its code goes back and forth, if it is below half a step."""
+    """Noise from how often the code goes back and forth; valid for noise below half a step."""
     jumps = np.diff(v)
     jumps = jumps[np.abs(jumps) > step / 2]
     back = (jumps[1:] * jumps[:-1] < 0) & (np.abs(jumps[1:]) < 1.5 * step)
@@ -48,14 +48,14 @@ def noise_of(v: Float[np.ndarray, " time"], step: float) -> float:
 
 
 def is_coarse(v: Float[np.ndarray, " time"], step: float) -> bool:
-    """Whether the rounding error must be weighed as such."""
+    """Whether the rounding error is large and is not white, so that `variance` is needed."""
     return bool(step > VISIBLE * np.ptp(v) and step > COARSE * noise_of(v, step))
 
 
 def variance(
     v: Float[np.ndarray, " time"], step: float, periods: int, samples: int
 ) -> Float[np.ndarray, " harmonic"]:
-    """E|error|² of the harmonics of a record [V²], of rounding and noise together."""
+    """E|error|² of the harmonics of a record [V²], from rounding and noise together."""
     rng = np.random.default_rng(SEED)
     smooth, noise = _before(v, step, rng), noise_of(v, step)
     total = 0.0
@@ -63,17 +63,17 @@ def variance(
         lifted = smooth + lift
         rounded = np.round((lifted + noise * rng.standard_normal(v.size)) / step) * step
         total = total + np.abs(harmonics(rounded - lifted, periods, samples)) ** 2
-    # Elements are read off the edges, where each sample has an error of its own: no less than white
-    # noise of that size, which the periods have in common.
+    # The edges determine the elements, and there the rounding errors of samples are independent.
+    # So the variance is at least that of white noise of this size, common to all periods.
     return np.maximum(np.asarray(total) / LIFTS, (periods * step**2 / 12 + noise**2) / samples)
 
 
 def _before(
     v: Float[np.ndarray, " time"], step: float, rng: np.random.Generator
 ) -> Float[np.ndarray, " time"]:
-    """The waveform before it was rounded: between the changes of the code a line.
+    """The waveform before rounding: straight lines between the changes of the code.
 
-    Where the code changes by more than one, any value that rounds to the code is as good.
+    Where the code changes by more than one, a random value that rounds to the code is used.
     """
     jumps = np.diff(v)
     at = np.flatnonzero(np.abs(jumps) > step / 2)

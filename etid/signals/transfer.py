@@ -2,8 +2,8 @@
 
 Coefficients are stored in *ascending* powers of the variable. In z⁻¹ this is SciPy's order of `b`
 and `a`; in s it is the reverse of `scipy.signal`. Polynomials are multiplied with shifts, not with
-`jnp.convolve`: under `vmap` the latter becomes a grouped convolution over all lanes, in which one
-NaN lane poisons the others.
+`jnp.convolve`: under `vmap` it becomes a grouped convolution over all lanes, so that a NaN in one
+lane spoils the others.
 """
 
 import math
@@ -30,7 +30,7 @@ def add_polynomials(p: Float[Array, " p"], q: Float[Array, " q"]) -> Float[Array
 
 
 def as_complex(x: Inexact[Array, "..."]) -> Complex[Array, "..."]:
-    """The same numbers with a complex type; JAX can be told to promote nothing by itself."""
+    """The same numbers with a complex type; works with JAX's strict type promotion too."""
     return x if jnp.iscomplexobj(x) else jax.lax.complex(x, jnp.zeros_like(x))
 
 
@@ -42,7 +42,7 @@ def power(z: Complex[Array, "..."]) -> Float[Array, "..."]:
 def reciprocal(z: Complex[Array, "..."]) -> Complex[Array, "..."]:
     """1/z, for |z| between 1e-150 and 1e150.
 
-    A complex division guards against overflow, which costs thirty times the division itself.
+    Complex division guards against overflow. The guard costs thirty times the division itself.
     """
     scale = 1 / power(z)
     return jax.lax.complex(z.real * scale, -z.imag * scale)
@@ -96,7 +96,7 @@ def tustin(continuous: Rational, sample_rate: float) -> Rational:
     """
     order = max(continuous.num.shape[0], continuous.den.shape[0]) - 1
 
-    def substitute(p):
+    def substitute(p: Float[Array, " p"]) -> Float[Array, " order1"]:
         total = jnp.zeros(order + 1, p.dtype)
         for k in range(p.shape[0]):
             term = jnp.ones(1, p.dtype)
@@ -124,13 +124,16 @@ def delayed(
 
 
 def turns(cycles: Float[Array, ""], count: int) -> Complex[Array, " harmonic"]:
-    """e^{j2πkc} for k = 1 … count, as products of few: a sine costs as much as all the rest."""
+    """e^{j2πkc} for k = 1 … count, as products of about 2 √count sines and cosines.
+
+    A sine costs as much as the rest of the computation.
+    """
     side = math.isqrt(count) + 1
     fine = 2 * jnp.pi * cycles * jnp.arange(1.0, side + 1)
     coarse = 2 * jnp.pi * cycles * side * jnp.arange(1.0 * side)
     left = jnp.stack([jnp.cos(coarse), jnp.sin(coarse)], axis=1)
     c, s = jnp.cos(fine), jnp.sin(fine)
-    # A matrix product, or XLA would put the sines back into the loop over all harmonics.
+    # A matrix product, because XLA would move sines back into the loop over all harmonics.
     real, imaginary = left @ jnp.stack([c, -s]), left @ jnp.stack([s, c])
     return jax.lax.complex(real.reshape(-1)[:count], imaginary.reshape(-1)[:count])
 
@@ -164,7 +167,7 @@ def is_stable(a: Float[Array, " order1"]) -> Bool[Array, ""]:
 
 
 def reflect_poles(a: Float[Array, " order1"]) -> Float[Array, " order1"]:
-    """Reflect poles outside the unit circle; the shape of |A(e^{jω})| stays."""
+    """Reflect poles outside the unit circle into it; the shape of |A(e^{jω})| stays the same."""
     roots = poles(a)
     outside = jnp.abs(roots) > 1
     inside = jnp.where(outside, 1 / jnp.conj(jnp.where(outside, roots, 2.0)), roots)
