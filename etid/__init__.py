@@ -14,8 +14,17 @@ print(fit)
 import importlib
 from typing import TYPE_CHECKING, Any
 
-from etid.circuits.circuit import AbstractCircuit, Resistor, SkinRC, parameter
-from etid.circuits.elements import capacitor, cole, constant_phase, parallel, resistor, series
+from etid.circuits.circuit import (
+    AbstractCircuit,
+    ParallelRC,
+    Resistor,
+    SkinCole,
+    SkinLayers,
+    SkinRC,
+    parameter,
+)
+from etid.circuits.elements import capacitor, cole, constant_phase, resistor
+from etid.circuits.impedance import parallel, series
 from etid.circuits.netlist import circuit_string, netlist
 from etid.identify.file import fit_file
 from etid.identify.impedance import identify_impedance
@@ -58,10 +67,13 @@ __all__ = [
     "Fit",
     "Fits",
     "IdentificationError",
+    "ParallelRC",
     "Recording",
     "RecordingError",
     "Resistor",
     "Samples",
+    "SkinCole",
+    "SkinLayers",
     "SkinRC",
     "Study",
     "StudyFits",

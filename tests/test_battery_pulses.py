@@ -13,15 +13,8 @@ import pytest
 import scipy.io
 
 from etid.circuits.circuit import AbstractCircuit, parameter
-from etid.circuits.elements import (
-    AbstractImpedance,
-    Farad,
-    Ohm,
-    capacitor,
-    parallel,
-    resistor,
-    series,
-)
+from etid.circuits.elements import Farad, Ohm, capacitor, resistor
+from etid.circuits.impedance import AbstractImpedance, parallel, series
 from etid.estimators.estimate import SOLVER
 
 MILLI = 1e-3

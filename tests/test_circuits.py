@@ -1,3 +1,5 @@
+import re
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -5,8 +7,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from benchmarks.skins import SkinCole, SkinTwoLayer
+import etid
 from etid import (
+    ParallelRC,
+    SkinCole,
+    SkinLayers,
     SkinRC,
     capacitor,
     cole,
@@ -16,6 +21,7 @@ from etid import (
     resistor,
     series,
 )
+from etid.circuits import lookup
 from etid.circuits.display import heading
 from etid.signals.transfer import frequency_variable
 
@@ -49,8 +55,8 @@ def test_passive_circuits_have_no_negative_resistance(r_s, r_p, c_p):
     assert (np.real(z) >= -1e-9 * np.abs(z)).all()
 
 
-def test_a_circuit_of_ones_own_has_everything():
-    circuit = SkinTwoLayer()
+def test_a_circuit_has_everything():
+    circuit = SkinLayers(20e3, 80e3, 0.2e-9, 40e3, 2e-9)
     s = np.asarray(S)
     expected = 20e3 + 80e3 / (1 + s * 80e3 * 0.2e-9) + 40e3 / (1 + s * 40e3 * 2e-9)
     np.testing.assert_allclose(circuit.response(FREQUENCY), expected, rtol=1e-12)
@@ -73,6 +79,40 @@ def test_a_circuit_of_ones_own_has_everything():
     np.testing.assert_allclose(
         slope, numeric, rtol=1e-7, atol=1e-7 * float(magnitude(circuit.log_values()))
     )
+
+
+@pytest.mark.parametrize("kind", lookup.built_in().values())
+def test_the_formula_is_the_impedance(kind):
+    """As a person reads it: what stands beside each other is multiplied, ^ is a power."""
+    product = re.sub(r"(?<=[\w)]) (?=[\w(])", " * ", kind.formula).replace("^", "**")
+    values = dict(zip(kind.names(), kind().values().tolist(), strict=True))
+    expected = eval(product, values | {"s": np.asarray(S)})
+    np.testing.assert_allclose(kind().response(FREQUENCY), expected + 0 * S, rtol=1e-12)
+
+
+def test_the_circuits_of_etid_are_public():
+    assert sorted(lookup.built_in()) == [
+        "ParallelRC",
+        "Resistor",
+        "SkinCole",
+        "SkinLayers",
+        "SkinRC",
+    ]
+    for name, kind in lookup.built_in().items():
+        assert getattr(etid, name) is kind
+        assert lookup.qualified(kind) == f"etid:{name}"
+        assert lookup.remembered(f"etid:{name}") is kind
+
+
+def test_typical_layers_are_the_published_time_constants():
+    """Birlea, Birlea and Culea 2011: 10 to 40 µs and 100 to 200 µs."""
+    layers = SkinLayers()
+    assert 10e-6 < float(layers.r_1 * layers.c_1) < 40e-6
+    assert 100e-6 < float(layers.r_2 * layers.c_2) < 200e-6
+    assert float(layers.r_1 + layers.r_2) == float(SkinRC().r_p)
+    cole = SkinCole()
+    assert float(cole.tau) == pytest.approx(float(SkinRC().r_p * SkinRC().c_p), rel=1e-12)
+    assert float(ParallelRC().r_p * ParallelRC().c_p) == pytest.approx(float(cole.tau), rel=1e-12)
 
 
 def test_a_negative_resistance_is_not_repaired():
@@ -104,14 +144,14 @@ def test_an_exponent_of_one_is_a_capacitor():
 
 
 def test_trees_are_their_polynomials():
-    for circuit in (SkinRC(), SkinTwoLayer()):
+    for circuit in (SkinRC(), SkinLayers()):
         tree = circuit.impedance()
         np.testing.assert_allclose(tree.rational()(S), tree(S), rtol=1e-12)
         np.testing.assert_allclose(tree.admittance(S), 1 / np.asarray(tree(S)), rtol=1e-12)
 
 
 def test_a_constant_phase_is_no_ratio_of_polynomials():
-    assert SkinTwoLayer().is_rational
+    assert SkinLayers().is_rational
     assert not SkinCole().is_rational
     with pytest.raises(ValueError, match=r"no rational function of s; .*maximum_likelihood"):
         SkinCole().impedance().rational()

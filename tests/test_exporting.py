@@ -95,7 +95,7 @@ def test_a_parquet_table_has_its_units_in_the_metadata(fits, file, parts, tmp_pa
     assert schema.field("c_p_stderr").metadata == {b"unit": b"farad"}
     assert schema.field("verdict").metadata is None
     assert schema.field("steps").type == "int64"
-    about = {b"circuit": b"SkinRC", b"method": b"maximum_likelihood"}
+    about = {b"circuit": b"etid:SkinRC", b"method": b"maximum_likelihood"}
     assert about.items() <= schema.metadata.items()
 
 

@@ -11,12 +11,11 @@ import pytest
 import etid
 from benchmarks import ngspice
 from benchmarks.ladder import CALIBRATION, rung
-from benchmarks.skins import SkinCole, SkinTwoLayer
-from etid.circuits.elements import Exponent, Farad, Ohm
-from etid.circuits.netlist import BAND, LADDER_ERROR, ladder
+from etid.circuits.elements import LADDER_ERROR, Exponent, Farad, Ohm, ladder
+from etid.circuits.netlist import BAND
 from etid.simulation.scenes import Trial
 
-SPREAD = SkinCole(33.4e3, 186e3, 22e-6, 0.85)
+SPREAD = etid.SkinCole(33.4e3, 186e3, 22e-6, 0.85)
 FREQUENCY = np.geomspace(*BAND, 300)
 
 
@@ -34,7 +33,7 @@ class Nested(etid.AbstractCircuit):
         return etid.series(etid.parallel(inner, r), r)
 
 
-CIRCUITS = [etid.Resistor(98.8e3), etid.SkinRC(), SkinTwoLayer(), SPREAD, Nested()]
+CIRCUITS = [etid.Resistor(98.8e3), etid.SkinRC(), etid.SkinLayers(), SPREAD, Nested()]
 rational = pytest.mark.parametrize("circuit", CIRCUITS[:3], ids=lambda c: type(c).__name__)
 every = pytest.mark.parametrize("circuit", CIRCUITS, ids=lambda c: type(c).__name__)
 
@@ -120,7 +119,7 @@ def test_a_string_is_its_circuit(circuit):
 
 def test_strings_look_as_those_of_impedance_py_do():
     assert etid.circuit_string(etid.SkinRC(1.0, 2.0, 3.0)) == ("R0-p(R1,C1)", [1.0, 2.0, 3.0])
-    assert etid.circuit_string(SkinTwoLayer())[0] == "R0-p(R1,C1)-p(R2,C2)"
+    assert etid.circuit_string(etid.SkinLayers())[0] == "R0-p(R1,C1)-p(R2,C2)"
     assert etid.circuit_string(SPREAD)[0] == "R0-p(R1,CPE1)"
 
 
@@ -163,7 +162,7 @@ def test_what_is_no_circuit_is_refused(write):
 
 def test_an_exponent_above_one_has_no_passive_network():
     with pytest.raises(ValueError, match=r"exponent is 1\.02; above 1 there is no passive"):
-        etid.netlist(SkinCole(33e3, 186e3, 22e-6, 1.02))
+        etid.netlist(etid.SkinCole(33e3, 186e3, 22e-6, 1.02))
 
 
 # --- ngspice --------------------------------------------------------------------------------------
@@ -175,7 +174,7 @@ def test_an_exponent_above_one_has_no_passive_network():
 def test_netlists_of_identified_circuits_give_their_voltages_back(tmp_path, monkeypatch):
     """From records, through a fit and ngspice, to what the records are without their noise."""
     monkeypatch.setattr(ngspice, "CACHE", tmp_path)
-    circuits = {"layers": SkinTwoLayer(33.4e3, 150e3, 0.12e-9, 36e3, 5e-9), "cole": SPREAD}
+    circuits = {"layers": etid.SkinLayers(33.4e3, 150e3, 0.12e-9, 36e3, 5e-9), "cole": SPREAD}
     trials = tuple(Trial(path, circuit) for path, circuit in circuits.items())
     scene = dataclasses.replace(rung("dry"), trials=trials)
     study = scene.simulate(0)

@@ -10,7 +10,6 @@ import pytest
 import etid
 from benchmarks.failure_axes import Cole, TwoLayers
 from benchmarks.ladder import CALIBRATION, LOADS, rung
-from benchmarks.skins import SkinCole, SkinTwoLayer
 from etid.circuits.circuit import Resistor
 from etid.estimators.score_tests import other_circuit
 from etid.simulation.scenes import Trial
@@ -34,7 +33,7 @@ def test_the_slope_is_that_of_a_constant_phase():
 
 def test_the_slope_of_a_spread_relaxation_is_that_of_its_asymmetry():
     """Against a central difference of ln s + ε ln² (s/s₀) in the place of ln s."""
-    circuit, step = SkinCole(33e3, 186e3, 22e-6, 0.85), 1e-5
+    circuit, step = etid.SkinCole(33e3, 186e3, 22e-6, 0.85), 1e-5
     f = np.geomspace(60.0, 1e5, 30)
     log_s = np.log(2j * np.pi * f)
     middle = np.log(2 * np.pi * np.sqrt(60.0 * 1e5))
@@ -145,8 +144,8 @@ def identified(load, snr_db, circuit=None, method=None):
 
 def test_two_layers_are_no_cole_relaxation_where_chi2_does_not_show_it():
     """R_s is 10 standard errors off, χ² 1.02."""
-    load = SkinTwoLayer(33.4e3, 150e3, 0.12e-9, 36e3, 5e-9)
-    fit = identified(load, 40.0, SkinCole())
+    load = etid.SkinLayers(33.4e3, 150e3, 0.12e-9, 36e3, 5e-9)
+    fit = identified(load, 40.0, etid.SkinCole())
     assert fit.chi2 < 1.5
     assert abs(fit.circuit.values()[0] - 33.4e3) > 5 * fit.stderr.values()[0]
     assert fit.verdict == "misfit"

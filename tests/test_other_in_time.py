@@ -11,7 +11,8 @@ import pytest
 import etid
 from benchmarks.failure_axes import Cole, TwoLayers
 from benchmarks.ladder import CALIBRATION, LOADS, rung
-from etid.circuits.elements import capacitor, parallel, resistor, series
+from etid.circuits.elements import capacitor, resistor
+from etid.circuits.impedance import parallel, series
 from etid.estimators.output_error.information import Slopes
 from etid.estimators.output_error.prediction import (
     Records,

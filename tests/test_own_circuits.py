@@ -9,14 +9,13 @@ import pytest
 
 import etid
 from benchmarks.ladder import CALIBRATION, rung
-from benchmarks.skins import SkinCole, SkinTwoLayer
 from etid.circuits.elements import Exponent, Ohm, PseudoCapacitance
 from etid.identify.steady_state import periodic_voltage
 from etid.results.verdicts import verdict
 from etid.simulation.scenes import Trial
 
-LAYERS = SkinTwoLayer(33.4e3, 150e3, 0.12e-9, 36e3, 5e-9)
-SPREAD = SkinCole(33.4e3, 186e3, 22e-6, 0.85)
+LAYERS = etid.SkinLayers(33.4e3, 150e3, 0.12e-9, 36e3, 5e-9)
+SPREAD = etid.SkinCole(33.4e3, 186e3, 22e-6, 0.85)
 DRY = etid.SkinRC(33.4e3, 186e3, 0.12e-9)
 TRIALS = {"layers": LAYERS, "spread": SPREAD, "dry": DRY}
 SIGMAS = 5.0  # one in 2e6; with fixed seeds a test passes always or never
@@ -106,12 +105,12 @@ def test_one_relaxation_of_two_is_seen(study, driver):
 
 
 def test_a_second_layer_that_is_not_there_is_insensitive(study, driver):
-    fit = etid.identify_skin(study["dry"], driver, circuit=SkinTwoLayer(), throw=False)
+    fit = etid.identify_skin(study["dry"], driver, circuit=etid.SkinLayers(), throw=False)
     assert fit.verdict == "insensitive"
 
 
 def test_a_spread_that_is_not_there_is_an_exponent_of_one(study, driver):
-    fit = etid.identify_skin(study["dry"], driver, circuit=SkinCole())
+    fit = etid.identify_skin(study["dry"], driver, circuit=etid.SkinCole())
     off = np.abs(np.asarray(fit.circuit.values()) / [33.4e3, 186e3, 186e3 * 0.12e-9, 1.0] - 1)
     assert (off < SIGMAS * np.asarray(fit.stderr.values() / fit.circuit.values())).all()
 
@@ -167,7 +166,7 @@ def test_a_fit_prints_its_units():
 )
 def test_a_method_that_cannot_says_which_can(study, driver, method, says):
     with pytest.raises(ValueError, match=says):
-        etid.identify_skin(study["spread"], driver, circuit=SkinCole(), method=method)
+        etid.identify_skin(study["spread"], driver, circuit=etid.SkinCole(), method=method)
 
 
 def test_a_record_for_which_no_default_is_left_says_what_to_do(driver):
@@ -175,14 +174,14 @@ def test_a_record_for_which_no_default_is_left_says_what_to_do(driver):
     single = scene(samples=3_334).simulate(3)["spread"]
     says = "Record three periods or more .* or ask for method='maximum_likelihood'"
     with pytest.raises(ValueError, match=says):
-        etid.identify_skin(single, driver, circuit=SkinCole())
-    fits = etid.identify_skins([single], driver, circuit=SkinCole())
+        etid.identify_skin(single, driver, circuit=etid.SkinCole())
+    fits = etid.identify_skins([single], driver, circuit=etid.SkinCole())
     assert fits.counts() == {"not_periodic": 1}
     assert "constant-phase" in str(fits.notes[0])
     with pytest.raises(ValueError, match=says):
         etid.identify_samples(
             jnp.asarray(single.v_th), jnp.asarray(single.v_out), driver,
-            sample_rate=200e3, pulse_rate=60.0, circuit=SkinCole(),
+            sample_rate=200e3, pulse_rate=60.0, circuit=etid.SkinCole(),
         )  # fmt: skip
 
 
@@ -202,12 +201,12 @@ def measured(circuit, seed, sigma=100.0):
     return f, z + sigma * (rng.normal(size=60) + 1j * rng.normal(size=60))
 
 
-@pytest.mark.parametrize("kind", [SkinCole, SkinPhase])
+@pytest.mark.parametrize("kind", [etid.SkinCole, SkinPhase])
 @pytest.mark.parametrize("tau", [2e-6, 2e-3])
 def test_a_spread_relaxation_is_found_wherever_it_is(kind, tau):
-    truth = SkinCole(33.4e3, 186e3, tau, 0.75)
+    truth = etid.SkinCole(33.4e3, 186e3, tau, 0.75)
     fit = etid.identify_impedance(*measured(truth, 1), stderr=100.0, circuit=kind())
-    expected = [33.4e3, 186e3, tau if kind is SkinCole else tau**0.75 / 186e3, 0.75]
+    expected = [33.4e3, 186e3, tau if kind is etid.SkinCole else tau**0.75 / 186e3, 0.75]
     error = np.abs(np.asarray(fit.circuit.values()) - expected)
     assert (error < SIGMAS * np.asarray(fit.stderr.values())).all()
     assert (np.asarray(fit.stderr.values()) < 0.03 * np.array(expected)).all()
@@ -216,11 +215,11 @@ def test_a_spread_relaxation_is_found_wherever_it_is(kind, tau):
 def test_an_exponent_above_one_by_chance_is_a_success_and_by_far_is_nonphysical():
     found = []
     for seed in range(20):
-        truth = SkinCole(33.4e3, 186e3, 22e-6, 1.0)
-        fit = etid.identify_impedance(*measured(truth, seed), stderr=100.0, circuit=SkinCole())
+        truth = etid.SkinCole(33.4e3, 186e3, 22e-6, 1.0)
+        fit = etid.identify_impedance(*measured(truth, seed), stderr=100.0, circuit=etid.SkinCole())
         assert fit.verdict == "successful"
         found.append(float(fit.circuit.values()[-1]))
     assert min(found) < 1 < max(found)  # estimates are not clipped, or their mean would be off
-    steep = measured(SkinCole(33.4e3, 186e3, 22e-6, 1.05), 0)
-    fit = etid.identify_impedance(*steep, stderr=100.0, circuit=SkinCole(), throw=False)
+    steep = measured(etid.SkinCole(33.4e3, 186e3, 22e-6, 1.05), 0)
+    fit = etid.identify_impedance(*steep, stderr=100.0, circuit=etid.SkinCole(), throw=False)
     assert fit.verdict == "nonphysical"

@@ -1,4 +1,4 @@
-"""Circuits: named elements with units and typical values, and the skin.
+"""Circuits: named elements with units and typical values, and those that come with etid.
 
 A circuit is a frozen module with named parameters and one method, `impedance()`, built from
 `resistor`, `capacitor`, `constant_phase`, `cole`, `series` and `parallel`. Everything else (filter,
@@ -7,7 +7,7 @@ fit, covariance, printing with units, netlist) follows from these lines.
 
 import abc
 import dataclasses
-from typing import Any, TypeVar
+from typing import Any, ClassVar, TypeVar
 
 import equinox as eqx
 import jax
@@ -16,15 +16,15 @@ from jaxtyping import Array, Bool, Complex, Float
 
 from etid.circuits.display import DISPLAY
 from etid.circuits.elements import (
-    AbstractImpedance,
+    Exponent,
     Farad,
     Ohm,
+    Second,
     capacitor,
-    exponents,
-    parallel,
+    cole,
     resistor,
-    series,
 )
+from etid.circuits.impedance import AbstractImpedance, parallel, series
 from etid.signals.transfer import frequency_variable
 
 Circuit = TypeVar("Circuit", bound="AbstractCircuit")
@@ -63,7 +63,13 @@ def parameter(unit: str, *, typical: float) -> Any:
 
 
 class AbstractCircuit(eqx.Module):
-    """A passive two-terminal circuit with positive parameters."""
+    """A passive two-terminal circuit with positive parameters.
+
+    Attributes:
+        formula: Its impedance for people, in the names of its parameters and s; may be empty.
+    """
+
+    formula: ClassVar[str] = ""
 
     @abc.abstractmethod
     def impedance(self) -> AbstractImpedance:
@@ -117,8 +123,8 @@ class AbstractCircuit(eqx.Module):
 
     @property
     def is_rational(self) -> bool:
-        """Whether the impedance is a ratio of polynomials: there is no constant-phase element."""
-        return not exponents(self.impedance())
+        """Whether the impedance is a ratio of polynomials in s."""
+        return self.impedance().is_rational
 
     def is_too_steep(self, cov: Float[Array, "parameter parameter"]) -> Bool[Array, ""]:
         """Whether an exponent α exceeds 1 by more than its standard error explains.
@@ -130,10 +136,10 @@ class AbstractCircuit(eqx.Module):
         """
 
         def alphas(log_values):
-            found = exponents(self.with_log_values(log_values).impedance())
+            found = self.with_log_values(log_values).impedance().exponents()
             return jnp.stack([jnp.asarray(alpha) for alpha in found])
 
-        if self.is_rational:
+        if not self.impedance().exponents():
             return jnp.array(False)
         slope = jax.jacfwd(alphas)(self.log_values())
         error = jnp.sqrt(jnp.diagonal(slope @ cov @ slope.T))
@@ -143,9 +149,12 @@ class AbstractCircuit(eqx.Module):
 class SkinRC(AbstractCircuit):
     """Skin as a series resistor and one relaxation, Z = R_s + R_p / (1 + s R_p C_p) (paper, eq. 7).
 
-    Equal to eq. 7, Z_bio(s) = ((R_s + R_p) + R_s R_p C_p s) / (1 + R_p C_p s).
+    Equal to eq. 7, Z_bio(s) = ((R_s + R_p) + R_s R_p C_p s) / (1 + R_p C_p s). Typical values lie
+    between those of dry and damp fingertips (paper, Tables II and III): 186 and 17.4 kΩ, 0.12 and
+    0.66 nF, 33.4 and 6.1 kΩ.
     """
 
+    formula: ClassVar[str] = "r_s + r_p / (1 + s r_p c_p)"
     r_s: Ohm = parameter("ohm", typical=20e3)
     r_p: Ohm = parameter("ohm", typical=100e3)
     c_p: Farad = parameter("farad", typical=0.3e-9)
@@ -160,9 +169,68 @@ class SkinRC(AbstractCircuit):
         return 1 / (2 * jnp.pi * jnp.asarray(self.r_p * self.c_p))
 
 
-class Resistor(AbstractCircuit):
-    """One resistor, Z = R: the paper's Table I loads."""
+class SkinCole(AbstractCircuit):
+    """Skin whose relaxation is spread over time constants, Z = R_s + R_p / (1 + (s τ)^α).
 
+    The formula is that of Cole (1940). Typical values are those of `SkinRC`, with τ = R_p C_p. The
+    typical α is that of dry skin below 100 MHz, 1 - 0.2 (Gabriel, Lau and Gabriel, The dielectric
+    properties of biological tissues: III, 1996, Table 1).
+    """
+
+    formula: ClassVar[str] = "r_s + r_p / (1 + (s tau)^alpha)"
+    r_s: Ohm = parameter("ohm", typical=20e3)
+    r_p: Ohm = parameter("ohm", typical=100e3)
+    tau: Second = parameter("second", typical=30e-6)
+    alpha: Exponent = parameter("1", typical=0.8)
+
+    def impedance(self) -> AbstractImpedance:
+        """Impedance of Cole's formula."""
+        return series(resistor(self.r_s), cole(self.r_p, self.tau, self.alpha))
+
+
+class SkinLayers(AbstractCircuit):
+    """Skin of two layers, each one relaxation, Z = R_s + R_1/(1 + s R_1 C_1) + R_2/(1 + s R_2 C_2).
+
+    The first layer is the faster one by its typical values. The sum of the typical resistances is
+    that of `SkinRC`. The typical time constants, 20 and 150 µs, are those that Birlea, Birlea and
+    Culea found in human skin, 10 to 40 and 100 to 200 µs (The Skin's Electrical Time Constants,
+    2011, doi 10.1007/978-3-642-22586-4_34).
+    """
+
+    formula: ClassVar[str] = "r_s + r_1 / (1 + s r_1 c_1) + r_2 / (1 + s r_2 c_2)"
+    r_s: Ohm = parameter("ohm", typical=20e3)
+    r_1: Ohm = parameter("ohm", typical=70e3)
+    c_1: Farad = parameter("farad", typical=0.3e-9)
+    r_2: Ohm = parameter("ohm", typical=30e3)
+    c_2: Farad = parameter("farad", typical=5e-9)
+
+    def impedance(self) -> AbstractImpedance:
+        """Impedance of both layers."""
+        first = parallel(resistor(self.r_1), capacitor(self.c_1))
+        second = parallel(resistor(self.r_2), capacitor(self.c_2))
+        return series(resistor(self.r_s), first, second)
+
+
+class ParallelRC(AbstractCircuit):
+    """A resistor and a capacitor in parallel, Z = R_p / (1 + s R_p C_p).
+
+    It is skin whose series resistance is too small to be seen. Typical values are those of
+    `SkinRC` (paper, Tables II and III).
+    """
+
+    formula: ClassVar[str] = "r_p / (1 + s r_p c_p)"
+    r_p: Ohm = parameter("ohm", typical=100e3)
+    c_p: Farad = parameter("farad", typical=0.3e-9)
+
+    def impedance(self) -> AbstractImpedance:
+        """Impedance of one relaxation."""
+        return parallel(resistor(self.r_p), capacitor(self.c_p))
+
+
+class Resistor(AbstractCircuit):
+    """One resistor, Z = R: the loads of the paper's Table I, 21.62 to 555 kΩ."""
+
+    formula: ClassVar[str] = "r"
     r: Ohm = parameter("ohm", typical=100e3)
 
     def impedance(self) -> AbstractImpedance:

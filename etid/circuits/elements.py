@@ -1,53 +1,55 @@
-"""Impedances of networks of resistors, capacitors and constant-phase elements, as trees.
+"""The elements: resistor, capacitor and constant-phase element.
 
-Leaves are elements, nodes connect them in series or in parallel. A tree keeps what a polynomial in
-s has lost, which elements there are and where: it is evaluated exactly at any s, a constant phase
-too, and becomes a netlist (`etid.netlist`). Where polynomials are needed, `rational()` makes them.
+SPICE has no constant-phase element, but its impedance is a sum of relaxations of all time constants
+(x [rad/s] are their corner frequencies; put x = s y to verify),
+
+    1 / (Q s^α) = sin(πα) / (πQ) ∫ x^(−α) / (s + x) dx,      x from 0 to ∞, 0 < α < 1,
+
+and sampled at x_k = x₀ e^(kh) the integral is a chain of resistors with capacitors in parallel
+(Foster 1924), evenly spaced over ln x as in Oustaloup's recursion (Oustaloup et al. 2000):
+
+    R_k = sin(πα) h x_k^(−α) / (πQ),      C_k = 1 / (R_k x_k).
+
+In ln x the trapezoidal rule converges exponentially (Trefethen and Weideman 2014): the nearest pole
+for s = jω lies π/2 off the real axis, so that its error is 2 e^(−π²/h). The slower relaxations that
+are left out are, at higher frequencies, one capacitor in series, the faster ones one resistor; both
+are geometric series.
 """
 
-import abc
-from functools import reduce
+from typing import ClassVar
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Complex, Float
+from jaxtyping import Array, Complex
 
+from etid.circuits.impedance import (
+    AbstractImpedance,
+    AbstractIrrational,
+    AbstractRational,
+    Netlist,
+    Parallel,
+    Quantity,
+    parallel,
+    series,
+)
 from etid.signals.transfer import Rational, as_complex, reciprocal
 
-# What a parameter may hold: one value, or a batch of them.
-Quantity = Float[Array, "..."] | Float[np.ndarray, "..."] | float
 Ohm = Quantity
 Farad = Quantity
 Second = Quantity
 Exponent = Quantity
 PseudoCapacitance = Quantity
 
-
-class AbstractImpedance(eqx.Module):
-    """A network between two terminals, as a function of s [rad/s]."""
-
-    @abc.abstractmethod
-    def __call__(self, s: Complex[Array, "..."]) -> Complex[Array, "..."]:
-        """Impedance [Ω]."""
-
-    @abc.abstractmethod
-    def admittance(self, s: Complex[Array, "..."]) -> Complex[Array, "..."]:
-        """Admittance 1/Z [S]."""
-
-    @abc.abstractmethod
-    def rational(self) -> Rational:
-        """Impedance [Ω] as a ratio of polynomials in s.
-
-        Raises:
-            ValueError: It is none: there is a constant-phase element.
-        """
+LADDER_ERROR = 1e-4  # relative, at most, in the band
+STEP = 0.95  # of ln x; the rule itself is off by 6e-5 then
+BEYOND = np.log(600.0)  # ln x on both sides of the band, for what ends leave out to second order
 
 
-class Resistance(AbstractImpedance):
+class Resistance(AbstractRational):
     """A resistor, Z = R."""
 
+    symbol: ClassVar[str] = "R"
     r: Ohm
 
     def __call__(self, s: Complex[Array, "..."]) -> Complex[Array, "..."]:
@@ -62,10 +64,15 @@ class Resistance(AbstractImpedance):
         """Impedance [Ω] as a ratio of polynomials in s."""
         return Rational(jnp.stack([jnp.asarray(self.r)]), jnp.ones(1))
 
+    def connect(self, netlist: Netlist, plus: str, minus: str) -> None:
+        """Write the resistor."""
+        netlist.part("R", self.r, plus, minus)
 
-class Capacitance(AbstractImpedance):
+
+class Capacitance(AbstractRational):
     """A capacitor, Z = 1 / (s C)."""
 
+    symbol: ClassVar[str] = "C"
     c: Farad
 
     def __call__(self, s: Complex[Array, "..."]) -> Complex[Array, "..."]:
@@ -81,10 +88,15 @@ class Capacitance(AbstractImpedance):
         c = jnp.asarray(self.c)
         return Rational(jnp.ones(1), jnp.stack([jnp.zeros_like(c), c]))
 
+    def connect(self, netlist: Netlist, plus: str, minus: str) -> None:
+        """Write the capacitor."""
+        netlist.part("C", self.c, plus, minus)
 
-class ConstantPhase(AbstractImpedance):
+
+class ConstantPhase(AbstractIrrational):
     """A constant-phase element, Z = 1 / (Q s^α), whose phase is −90° α at every frequency."""
 
+    symbol: ClassVar[str] = "CPE"
     q: PseudoCapacitance
     alpha: Exponent
 
@@ -98,59 +110,46 @@ class ConstantPhase(AbstractImpedance):
         power = jnp.exp(jax.lax.complex(alpha * log.real, alpha * log.imag))
         return as_complex(jnp.asarray(self.q)) * power
 
-    def rational(self) -> Rational:
-        """There is none."""
-        raise ValueError(
-            "a constant-phase element is no rational function of s; it is exact at harmonics "
-            "(method='maximum_likelihood' or 'non_parametric') and as Z(s)"
+    def exponents(self) -> tuple[Exponent, ...]:
+        """α."""
+        return (self.alpha,)
+
+    def connect(self, netlist: Netlist, plus: str, minus: str) -> None:
+        """Write a ladder."""
+        low, high = netlist.band
+        netlist.remarks.add(
+            f"constant phase as RC pairs, within {100 * LADDER_ERROR:g} % "
+            f"from {low:g} Hz to {high:g} Hz"
         )
+        ladder(float(self.q), float(self.alpha), netlist.band).connect(netlist, plus, minus)
 
 
-class Series(AbstractImpedance):
-    """A series connection, Z = Z₁ + Z₂ + …."""
+def ladder(q: float, alpha: float, band: tuple[float, float]) -> AbstractImpedance:
+    """Resistors and capacitors that are a constant-phase element in a band of frequencies.
 
-    parts: tuple[AbstractImpedance, ...]
+    Args:
+        q: Q [S s^α].
+        alpha: α.
+        band: Lowest and highest frequency [Hz].
 
-    def __call__(self, s: Complex[Array, "..."]) -> Complex[Array, "..."]:
-        """Impedance [Ω]."""
-        return reduce(jnp.add, [part(s) for part in self.parts])
-
-    def admittance(self, s: Complex[Array, "..."]) -> Complex[Array, "..."]:
-        """Admittance 1/Z [S]."""
-        return reciprocal(self(s))
-
-    def rational(self) -> Rational:
-        """Impedance [Ω] as a ratio of polynomials in s."""
-        return reduce(Rational.add, [part.rational() for part in self.parts])
-
-
-class Parallel(AbstractImpedance):
-    """A parallel connection, 1/Z = 1/Z₁ + 1/Z₂ + …."""
-
-    parts: tuple[AbstractImpedance, ...]
-
-    def __call__(self, s: Complex[Array, "..."]) -> Complex[Array, "..."]:
-        """Impedance [Ω]."""
-        return reciprocal(self.admittance(s))
-
-    def admittance(self, s: Complex[Array, "..."]) -> Complex[Array, "..."]:
-        """Admittance 1/Z [S]."""
-        return reduce(jnp.add, [part.admittance(s) for part in self.parts])
-
-    def rational(self) -> Rational:
-        """Impedance [Ω] as a ratio of polynomials in s."""
-        parts = [part.rational().reciprocal() for part in self.parts]
-        return reduce(Rational.add, parts).reciprocal()
-
-
-def exponents(impedance: AbstractImpedance) -> list[Exponent]:
-    """α of every constant-phase element."""
-
-    def is_phase(node):
-        return isinstance(node, ConstantPhase)
-
-    leaves = jax.tree.leaves(impedance, is_leaf=is_phase)
-    return [leaf.alpha for leaf in leaves if is_phase(leaf)]
+    Raises:
+        ValueError: α is above 1.
+    """
+    if alpha > 1:
+        raise ValueError(
+            f"an exponent is {alpha:.6g}; above 1 there is no passive network: fit a circuit with "
+            "a capacitor in the place of the constant-phase element"
+        )
+    if alpha == 1:
+        return capacitor(q)
+    low, high = np.log(2 * np.pi * np.array(band)) + np.array([-BEYOND, BEYOND])
+    x = np.exp(np.arange(low, high + STEP, STEP))
+    level = (1 - alpha) * np.sinc(1 - alpha) * STEP / q  # sin(πα) h / (πQ)
+    r = level * x**-alpha
+    slower = level * x[0] ** (1 - alpha) / np.expm1(STEP * (1 - alpha))
+    faster = level * x[-1] ** -alpha / np.expm1(STEP * alpha)
+    pairs = [parallel(resistor(a), capacitor(1 / (a * b))) for a, b in zip(r, x, strict=True)]
+    return series(resistor(faster), *pairs, capacitor(1 / slower))
 
 
 def resistor(r: Ohm) -> Resistance:
@@ -207,41 +206,3 @@ def cole(r: Ohm, tau: Second, alpha: Exponent) -> Parallel:
     """
     r, tau, alpha = map(jnp.asarray, (r, tau, alpha))
     return parallel(resistor(r), constant_phase(tau**alpha / r, alpha))
-
-
-def series(*impedances: AbstractImpedance) -> Series:
-    """Series connection, Z = Z₁ + Z₂ + ….
-
-    Args:
-        *impedances: What is connected, at least one.
-
-    Returns:
-        An impedance, to be connected with others.
-
-    Raises:
-        ValueError: There is none.
-    """
-    return Series(_connected("series", impedances))
-
-
-def parallel(*impedances: AbstractImpedance) -> Parallel:
-    """Parallel connection, 1/Z = 1/Z₁ + 1/Z₂ + ….
-
-    Args:
-        *impedances: What is connected, at least one.
-
-    Returns:
-        An impedance, to be connected with others.
-
-    Raises:
-        ValueError: There is none.
-    """
-    return Parallel(_connected("parallel", impedances))
-
-
-def _connected(
-    how: str, impedances: tuple[AbstractImpedance, ...]
-) -> tuple[AbstractImpedance, ...]:
-    if not impedances:
-        raise ValueError(f"{how}() connects nothing; give it at least one impedance")
-    return impedances

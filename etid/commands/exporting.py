@@ -9,6 +9,7 @@ import datetime
 import pathlib
 
 from etid.commands import Outcome
+from etid.commands.circuits import add_circuit
 from etid.files.exporting import CIRCUITS, export_circuit, export_fits, export_study
 
 
@@ -32,6 +33,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="TIME",
         help="for .nwb: when the session began, such as 2026-01-31T09:30:00+01:00",
     )
+    add_circuit(parser, "for .cir and .json: the circuit of the fits, if it is not one of etid")
 
 
 def moment(text: str) -> datetime.datetime:
@@ -43,14 +45,15 @@ def run(arguments: argparse.Namespace) -> Outcome:
     """Write one file."""
     source, target = arguments.source, arguments.target
     suffix = target.suffix.lower()
-    if arguments.path is not None and suffix not in CIRCUITS:
-        raise ValueError(f"{target}: --path is for {' and '.join(CIRCUITS)}")
+    for name in ("path", "circuit"):
+        if getattr(arguments, name) is not None and suffix not in CIRCUITS:
+            raise ValueError(f"{target}: --{name} is for {' and '.join(CIRCUITS)}")
     if arguments.session_start is not None and suffix != ".nwb":
         raise ValueError(f"{target}: --session-start is for .nwb")
     if suffix == ".nwb":
         export_study(source, target, session_start=arguments.session_start)
     elif suffix in CIRCUITS:
-        export_circuit(source, target, arguments.path)
+        export_circuit(source, target, arguments.path, circuit=arguments.circuit)
     else:
         export_fits(source, target)
     return Outcome(data={"source": source, "target": target})

@@ -13,6 +13,7 @@ import numpy as np
 
 from etid.circuits.display import DISPLAY, heading
 from etid.commands import DONE, WRONG_DATA, Outcome
+from etid.commands.circuits import add_circuit
 from etid.estimators.registry import METHODS
 from etid.identify.file import fit_file, kept, processes
 from etid.identify.jointly import identify_jointly
@@ -32,6 +33,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         choices=METHODS,
         help="default maximum_likelihood where the record allows it, else output_error",
     )
+    add_circuit(parser, "the circuit of the loads, default SkinRC")
     parser.add_argument("--order", type=int, default=5, help="poles of the driver, default 5")
     parser.add_argument(
         "--driver-drift",
@@ -65,12 +67,15 @@ def run(arguments: argparse.Namespace) -> Outcome:
         raise ValueError(f"--joint is by maximum likelihood, not by {arguments.method}")
     if arguments.joint and arguments.driver_drift:
         raise ValueError("--joint has no --driver-drift: it identifies the driver as it is")
+    circuit = None if arguments.circuit is None else arguments.circuit()
     progress = sys.stderr.isatty()
     if arguments.joint:
         if arguments.resume or arguments.workers or arguments.dask:
             raise ValueError("--joint is one fit: it has no --resume, --workers or --dask")
         with hdf5.read(arguments.source) as study:
-            outcome = identify_jointly(study, order=arguments.order, progress=progress)
+            outcome = identify_jointly(
+                study, order=arguments.order, circuit=circuit, progress=progress
+            )
         outcome.write(arguments.target)
     else:
         with _executor(arguments) as executor:
@@ -78,6 +83,7 @@ def run(arguments: argparse.Namespace) -> Outcome:
                 arguments.source,
                 arguments.target,
                 order=arguments.order,
+                circuit=circuit,
                 method=arguments.method,
                 driver_drift=arguments.driver_drift,
                 resume=arguments.resume,

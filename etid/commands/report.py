@@ -4,6 +4,7 @@ import argparse
 import pathlib
 
 from etid.commands import Outcome
+from etid.commands.circuits import add_circuit
 from etid.report.study import write_report
 
 
@@ -19,10 +20,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="FILE",
         help="what was identified, to draw the worst; default: where the fits came from",
     )
+    add_circuit(parser, "the circuit of the fits, if it is not one of etid")
 
 
 def run(arguments: argparse.Namespace) -> Outcome:
     """Write the page and say where it is."""
     page = arguments.page or arguments.fits.with_suffix(".html")
-    write_report(arguments.fits, page, recordings=arguments.recordings)
+    write_report(arguments.fits, page, recordings=arguments.recordings, circuit=arguments.circuit)
     return Outcome(str(page), {"fits": arguments.fits, "page": page})

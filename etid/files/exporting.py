@@ -149,7 +149,7 @@ def export_circuit(
         source: File of fits.
         target: The file to write; one that exists is replaced at the end.
         path: Path of the recording; not needed if the file has one fit only.
-        circuit: The kind of circuit, if it is not one of etid's own.
+        circuit: As in `Fits.read`.
 
     Raises:
         ValueError: The source is no file of fits or has no such fit, the fit has not been

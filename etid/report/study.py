@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from etid.circuits.circuit import AbstractCircuit
 from etid.recordings.study import Study
 from etid.report import tables as study_tables
 from etid.report.html import Picture, Section, write_page
@@ -28,6 +29,7 @@ def write_report(
     page: str | os.PathLike[str],
     *,
     recordings: str | os.PathLike[str] | Study | None = None,
+    circuit: type[AbstractCircuit] | None = None,
 ) -> None:
     """Write a report on the fits of a study: one HTML page that needs no other file.
 
@@ -41,6 +43,7 @@ def write_report(
         recordings: The recordings, of which the worst are drawn. If not given, they are looked for
             where the fits say that they came from, and beside the file of fits; where they are not
             found, the report says so.
+        circuit: As in `Fits.read`.
 
     Raises:
         ValueError: `fits` is not a file of fits, or holds none, or `page` would replace it.
@@ -55,7 +58,7 @@ def write_report(
     elif isinstance(fits, Fits):
         found = StudyFits(fits, {}, {})
     else:
-        found = StudyFits.read(fits)
+        found = StudyFits.read(fits, circuit)
     if not len(found.fits):
         raise ValueError(f"{file or 'fits'}: there is no fit to report on")
     for read in (file, recordings):

@@ -3,6 +3,7 @@
 import dataclasses
 import importlib.metadata
 import os
+import reprlib
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -12,8 +13,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Complex, Float, Int
 
-from etid.circuits.circuit import AbstractCircuit, Resistor, SkinRC
+from etid.circuits.circuit import AbstractCircuit
 from etid.circuits.display import DISPLAY, plus_minus, quantity
+from etid.circuits.lookup import qualified, remembered
 from etid.recordings.recording import Label, RecordingError, wanted_labels
 from etid.recordings.remarks import remarks_of, texts, words
 from etid.results.hdf5_table import Table, opened_table, same_length, write_table
@@ -352,7 +354,7 @@ class Fits:
             "schema": SCHEMA,
             "schema_version": "1.2",
             "etid_version": importlib.metadata.version("etid"),
-            "circuit": type(self.circuit).__name__,
+            "circuit": qualified(type(self.circuit)),
             "parameters": list(self.circuit.names()),
             "method": self.fit.method,
         }
@@ -371,10 +373,11 @@ class Fits:
 
         Args:
             path: The file.
-            circuit: The kind of circuit, if it is not one of etid's own.
+            circuit: The kind of circuit. It need not be given if its module has been imported.
 
         Raises:
-            RecordingError: The file is not a file of fits, or `circuit` is not the one it holds.
+            RecordingError: The file is not a file of fits, or holds those of another circuit than
+                `circuit`, or of one that is neither given nor imported: a file imports nothing.
         """
         with opened_table(path, SCHEMA) as table:
             return cls.of_table(table, circuit)
@@ -386,15 +389,7 @@ class Fits:
         Raises:
             RecordingError: A column or an attribute is missing, or not what it should be.
         """
-        known = {kind.__name__: kind for kind in (SkinRC, Resistor)}
-        stored = table.text("circuit")
-        kind = circuit or known.get(stored)
-        if kind is None or kind.__name__ != stored:
-            raise RecordingError(
-                f"{table.name} holds fits of {stored!r}; pass that class as `circuit`",
-                file=table.name,
-                field="circuit",
-            )
+        kind = _circuit(table, circuit)
         size = len(kind.names())
         columns = {name: table.column(name, "text") for name in (*LABELS, "verdict", "note")}
         columns |= {name: table.column(name, "number") for name in (*kind.names(), "rrse", "chi2")}
@@ -425,6 +420,30 @@ class Fits:
             **_changes_of(read, changes),
         )
         return cls(fit, {name: read[name] for name in LABELS}, read["note"])
+
+
+def _circuit(table: Table, given: type[AbstractCircuit] | None) -> type[AbstractCircuit]:
+    """The kind of circuit whose fits a file holds. What the file says imports nothing."""
+    stored = table.text("circuit")
+    try:
+        kind = remembered(stored, given)
+    except LookupError as error:
+        raise RecordingError(
+            f"is {reprlib.repr(stored)}",
+            file=table.name,
+            field="circuit",
+            remedy=str(error),
+        ) from None
+    parameters = table.attribute("parameters")
+    names = parameters if isinstance(parameters, list) else [parameters]
+    if tuple(names) != kind.names():
+        raise RecordingError(
+            f"is {reprlib.repr(names)}, but {kind.__name__} has {', '.join(kind.names())}",
+            file=table.name,
+            field="parameters",
+            remedy="Pass the class as it was when the fits were made, or fit the recordings again",
+        )
+    return kind
 
 
 def _verdicts(table: Table, names: np.ndarray) -> RESULTS:

@@ -86,10 +86,10 @@ class StudyFits:
 
         Args:
             path: The file.
-            circuit: The kind of circuit, if it is not one of etid's own.
+            circuit: As in `Fits.read`.
 
         Raises:
-            RecordingError: The file is not a file of fits, or `circuit` is not the one it holds.
+            RecordingError: As in `Fits.read`.
         """
         with opened_table(path, SCHEMA) as table:
             fits = Fits.of_table(table, circuit)

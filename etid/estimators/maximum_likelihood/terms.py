@@ -21,7 +21,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Complex, Float
 
-from etid.circuits.elements import AbstractImpedance
+from etid.circuits.impedance import AbstractImpedance
 from etid.results.driver import SourceImpedance
 from etid.signals.harmonics import Spectrum, local_sum, signal_share
 from etid.signals.mains import lines

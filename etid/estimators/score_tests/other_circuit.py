@@ -28,7 +28,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Complex, Float
 
-from etid.circuits.elements import AbstractImpedance, exponents
+from etid.circuits.impedance import AbstractImpedance
 from etid.signals.transfer import as_complex, frequency_variable
 
 # Standard deviations. By chance the spread exceeds its own in one fit of 16 000. Of the relaxations
@@ -49,7 +49,7 @@ def changes(
     """Z and ∂Z/∂ε [Ω] of all changes at real frequencies [Hz]; the first is the spread."""
     s = frequency_variable(frequency)
     log_s = jax.lax.complex(jnp.log(s.imag), jnp.full_like(frequency, jnp.pi / 2))
-    if exponents(impedance):
+    if impedance.exponents():
         log_s = log_s - as_complex((log_s.real[0] + log_s.real[-1]) / 2)
         log_s = log_s * log_s
     z, spread = jax.jvp(impedance, (s,), (s * log_s,))

@@ -19,7 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from etid.circuits.elements import AbstractImpedance
+from etid.circuits.impedance import AbstractImpedance
 from etid.estimators.output_error.information import Slopes, bin_weights, noise_power, padded_size
 from etid.estimators.output_error.prediction import (
     Records,

@@ -1,0 +1,166 @@
+"""Fits of a circuit of one's own in files: which circuit it is, report, export, the command."""
+
+import csv
+import dataclasses
+import sys
+
+import h5py
+import numpy as np
+import pytest
+
+import etid
+from benchmarks.ladder import rung
+from etid import cli
+from etid.circuits import lookup
+from etid.commands import fit as command
+from etid.simulation.scenes import Trial
+
+DONE, WRONG_DATA, WRONG_USAGE = 0, 1, 2
+SIGMAS = 5.0  # one in 2e6; with a fixed seed a test passes always or never
+MODULE = '''
+import etid
+from etid.circuits.elements import Exponent, Ohm, Second
+
+class Spread(etid.AbstractCircuit):
+    """As etid.SkinCole, with other names."""
+
+    outer: Ohm = etid.parameter("ohm", typical=20e3)
+    inner: Ohm = etid.parameter("ohm", typical=100e3)
+    slow: Second = etid.parameter("second", typical=30e-6)
+    part: Exponent = etid.parameter("1", typical=0.8)
+
+    def impedance(self):
+        return etid.series(etid.resistor(self.outer), etid.cole(self.inner, self.slow, self.part))
+'''
+TRUTH = etid.SkinCole(33.4e3, 186e3, 22e-6, 0.85)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """A study of two recordings, a module with a circuit, and the fits that the command made."""
+    folder = tmp_path_factory.mktemp("own")
+    (folder / "lab_skins.py").write_text(MODULE)
+    trials = tuple(Trial(f"skin/{i}", TRUTH, subject="s01") for i in range(2))
+    dataclasses.replace(rung("dry"), trials=trials).simulate(3).write(folder / "study.h5")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(folder)
+        patch.setattr(sys, "path", [*sys.path])
+        asked = ("--circuit", "lab_skins:Spread")
+        assert cli.main(["fit", "study.h5", "-o", "fits.h5", *asked]) == DONE
+        yield folder
+    sys.modules.pop("lab_skins", None)
+
+
+@pytest.fixture
+def files(folder, monkeypatch):
+    monkeypatch.chdir(folder)
+    return folder
+
+
+def test_the_command_fits_a_circuit_of_ones_own(files):
+    fits = etid.Fits.read("fits.h5")
+    assert type(fits.circuit).__module__ == "lab_skins"
+    assert fits.counts() == {"successful": 2}
+    error = np.asarray(fits.circuit.values()) - np.asarray(TRUTH.values())
+    assert (np.abs(error) < SIGMAS * np.asarray(fits.stderr.values())).all()
+    with h5py.File("fits.h5") as content:
+        assert content.attrs["circuit"] == "lab_skins:Spread"
+
+
+def test_its_fits_are_reported_and_exported(files):
+    assert cli.main(["report", "fits.h5"]) == DONE
+    page = (files / "fits.html").read_text("utf-8")
+    assert "identified as Spread" in page
+    assert "slow [µs]" in page
+    assert cli.main(["export", "fits.h5", "-o", "fits.csv"]) == DONE
+    with open("fits.csv", newline="", encoding="utf-8") as text:
+        rows = list(csv.DictReader(text))
+    assert [float(row["slow [second]"]) for row in rows] == pytest.approx([22e-6] * 2, rel=0.1)
+    chosen = ("--path", "skin/1", "--circuit", "lab_skins:Spread")
+    starts = {"skin.cir": "* skin/1, by maximum_likelihood\n* Spread", "skin.json": "{"}
+    for name, start in starts.items():
+        assert cli.main(["export", "fits.h5", "-o", name, *chosen]) == DONE
+        assert (files / name).read_text("utf-8").startswith(start)
+
+
+@pytest.mark.parametrize("options", [(), ("--joint",)])
+def test_the_command_passes_a_circuit_of_etid_on(files, options, monkeypatch, tmp_path):
+    asked = {}
+
+    def fitted(*_, circuit, **__):
+        asked["circuit"] = circuit
+        return etid.StudyFits.read("fits.h5")
+
+    monkeypatch.setattr(command, "identify_jointly" if options else "fit_file", fitted)
+    target = str(tmp_path / "new.h5")
+    assert cli.main(["fit", "study.h5", "-o", target, "--circuit", "SkinCole", *options]) == DONE
+    assert type(asked["circuit"]) is etid.SkinCole
+
+
+def test_a_file_imports_nothing_and_says_what_to_import(files, tmp_path, capsys, monkeypatch):
+    """A module beside a hostile file must not run because the file is read."""
+    (tmp_path / "absent_lab.py").write_text("raise SystemExit('imported')")
+    other = tmp_path / "fits.h5"
+    other.write_bytes((files / "fits.h5").read_bytes())
+    with h5py.File(other, "a") as content:
+        content.attrs["circuit"] = "absent_lab:Spread"
+    monkeypatch.chdir(tmp_path)
+    for arguments in (("report", "fits.h5"), ("export", "fits.h5", "-o", "skin.cir")):
+        assert cli.main(arguments) == WRONG_DATA
+        (line,) = capsys.readouterr().err.splitlines()
+        assert "fits.h5, circuit: is 'absent_lab:Spread'. absent_lab is not imported" in line
+        assert line.endswith("say --circuit absent_lab:Spread.")
+    assert "absent_lab" not in sys.modules
+    assert etid.Fits.read(other, lookup.imported("lab_skins:Spread")).counts()
+
+
+@pytest.mark.parametrize(
+    ("stored", "says"),
+    [
+        ("etid:SkinOil", "etid has no such circuit: read it with the version that wrote it"),
+        ("__main__:Mine", "Mine was defined in a script or a notebook"),
+        ("os:system", "os is not imported, and a file imports nothing"),
+        ("SkinRC", "No circuit has such a name"),
+        ("__import__('os').abort():x", "No circuit has such a name"),
+        ("lab_skins:Other", "lab_skins is not imported"),
+    ],
+)
+def test_an_unknown_circuit_is_one_error(files, tmp_path, stored, says):
+    other = tmp_path / "fits.h5"
+    other.write_bytes((files / "fits.h5").read_bytes())
+    with h5py.File(other, "a") as content:
+        content.attrs["circuit"] = stored
+    with pytest.raises(etid.RecordingError, match=rf"fits\.h5, circuit: .*{says}"):
+        etid.Fits.read(other)
+
+
+def test_a_circuit_that_has_changed_is_refused(files, tmp_path):
+    class Spread(etid.AbstractCircuit):
+        outer: float = etid.parameter("ohm", typical=1.0)
+
+        def impedance(self):
+            return etid.resistor(self.outer)
+
+    with pytest.raises(etid.RecordingError, match=r"Spread has outer\. Pass the class as it was"):
+        etid.Fits.read("fits.h5", Spread)
+    with pytest.raises(etid.RecordingError, match="that was passed is SkinRC: pass Spread"):
+        etid.Fits.read("fits.h5", etid.SkinRC)
+
+
+@pytest.mark.parametrize(
+    ("name", "says"),
+    [
+        (
+            "SkinOil",
+            "no circuit 'SkinOil' in etid; use one of ParallelRC, Resistor, SkinCole",
+        ),
+        ("absent_lab:Mine", "cannot import absent_lab: ModuleNotFoundError"),
+        ("lab_skins:Other", "Other of lab_skins is None, no subclass of etid.AbstractCircuit"),
+        ("lab_skins:etid", "no subclass of etid.AbstractCircuit"),
+    ],
+)
+def test_what_is_no_circuit_is_wrong_usage(files, capsys, name, says):
+    with pytest.raises(SystemExit) as stop:
+        cli.main(["fit", "study.h5", "-o", "new.h5", "--circuit", name])
+    assert stop.value.code == WRONG_USAGE
+    assert says in capsys.readouterr().err
