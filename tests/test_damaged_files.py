@@ -77,6 +77,14 @@ def test_a_heap_whose_objects_go_in_a_circle_is_an_error_and_no_hang(texts):
             untrusted.attribute(file["s02/dry"], "kind")
 
 
+def test_a_heap_that_declares_more_than_the_file_holds_is_an_error_before_it_is_allocated(texts):
+    data = bytearray(texts.read_bytes())
+    heap = data.find(b"GCOL\x01")
+    data[heap + 8 : heap + 16] = (2 << 30).to_bytes(8, "little")
+    texts.write_bytes(data)
+    assert "the heap of texts" in hdf5.check(texts)[0].message
+
+
 def declared(texts, shape, chunks):
     with h5py.File(texts, "r+") as file:
         attributes = dict(file["s02/dry/v_out"].attrs)

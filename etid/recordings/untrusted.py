@@ -61,7 +61,7 @@ def translated(file: str, path: str = "", field: str = "") -> Iterator[None]:
 
 
 class Guarded(io.FileIO):
-    """A file for the HDF5 library that lets no global heap pass whose objects go in a circle."""
+    """A file for the HDF5 library that refuses a damaged global heap: a circle, or a false size."""
 
     def readinto(self, buffer: Any) -> int:
         """Read as much as the buffer holds, after a look at the heaps that begin in it."""
@@ -79,17 +79,19 @@ class Guarded(io.FileIO):
         return len(part)
 
     def _follow(self, heap: int) -> None:
-        """Raise OSError if one object of a heap does not lead to the next."""
+        """Raise OSError if a heap exceeds the file, or one object does not lead to the next."""
         self.seek(heap + len(_HEAP))
-        size = int.from_bytes(self.read(8), "little")
-        end = min(heap + size, os.fstat(self.fileno()).st_size) - _OBJECT.size
+        end = heap + int.from_bytes(self.read(8), "little")
+        damaged = OSError(f"the heap of texts at byte {heap} is damaged")
+        if end > os.fstat(self.fileno()).st_size:  # the library would allocate its declared size
+            raise damaged
         place = heap + _HEAP_HEAD
-        while place <= end:
+        while place <= end - _OBJECT.size:
             self.seek(place)
             index, _, length = _OBJECT.unpack(self.read(_OBJECT.size))
             step = length if index == 0 else _OBJECT.size + (length + 7) // 8 * 8
             if step == 0:
-                raise OSError(f"the heap of texts at byte {heap} is damaged")
+                raise damaged
             place += step
 
 
