@@ -13,9 +13,10 @@
 # %% [markdown]
 # # Your own circuit
 #
-# At the end you will know how to identify a circuit that etid does not have, in ten lines from its
-# definition to a SPICE netlist: skin of two layers, and skin with Cole's relaxation, a
-# constant-phase element. And how to see that a circuit is too small, or too large.
+# At the end you will know how to identify a circuit of your own, in ten lines from its definition
+# to a SPICE netlist: skin of two layers, and skin with Cole's relaxation, a constant-phase element.
+# etid has both, as `etid.SkinLayers` and `etid.SkinCole`; this is how they are made. You will also
+# know how to see that a circuit is too small, or too large.
 
 # %%
 # %matplotlib inline

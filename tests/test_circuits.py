@@ -84,7 +84,8 @@ def test_a_circuit_has_everything():
 @pytest.mark.parametrize("kind", lookup.built_in().values())
 def test_the_formula_is_the_impedance(kind):
     """As a person reads it: what stands beside each other is multiplied, ^ is a power."""
-    product = re.sub(r"(?<=[\w)]) (?=[\w(])", " * ", kind.formula).replace("^", "**")
+    text = kind.formula.lower().replace("^", "**")
+    product = re.sub(r"(?<=[\w)]) (?=[\w(])", " * ", text)
     values = dict(zip(kind.names(), kind().values().tolist(), strict=True))
     expected = eval(product, values | {"s": np.asarray(S)})
     np.testing.assert_allclose(kind().response(FREQUENCY), expected + 0 * S, rtol=1e-12)

@@ -320,7 +320,7 @@ def test_another_circuit_is_reported_as_itself(tmp_path):
     etid.write_report(dataclasses.replace(one, fit=fit), tmp_path / "page.html")
     text = _Read(tmp_path / "page.html").text
     assert "identified as Resistor" in text
-    assert "The load is one resistor R." in text
+    assert "The load is the circuit Resistor, Z_L = R." in text
     assert "r [kΩ]" in text
     assert "r_s" not in text
 

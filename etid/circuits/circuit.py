@@ -66,7 +66,7 @@ class AbstractCircuit(eqx.Module):
     """A passive two-terminal circuit with positive parameters.
 
     Attributes:
-        formula: Its impedance for people, in the names of its parameters and s; may be empty.
+        formula: Its impedance as a methods section writes it; may be empty.
     """
 
     formula: ClassVar[str] = ""
@@ -154,7 +154,7 @@ class SkinRC(AbstractCircuit):
     0.66 nF, 33.4 and 6.1 kΩ.
     """
 
-    formula: ClassVar[str] = "r_s + r_p / (1 + s r_p c_p)"
+    formula: ClassVar[str] = "R_s + R_p / (1 + s R_p C_p)"
     r_s: Ohm = parameter("ohm", typical=20e3)
     r_p: Ohm = parameter("ohm", typical=100e3)
     c_p: Farad = parameter("farad", typical=0.3e-9)
@@ -177,7 +177,7 @@ class SkinCole(AbstractCircuit):
     properties of biological tissues: III, 1996, Table 1).
     """
 
-    formula: ClassVar[str] = "r_s + r_p / (1 + (s tau)^alpha)"
+    formula: ClassVar[str] = "R_s + R_p / (1 + (s tau)^alpha)"
     r_s: Ohm = parameter("ohm", typical=20e3)
     r_p: Ohm = parameter("ohm", typical=100e3)
     tau: Second = parameter("second", typical=30e-6)
@@ -197,7 +197,7 @@ class SkinLayers(AbstractCircuit):
     2011, doi 10.1007/978-3-642-22586-4_34).
     """
 
-    formula: ClassVar[str] = "r_s + r_1 / (1 + s r_1 c_1) + r_2 / (1 + s r_2 c_2)"
+    formula: ClassVar[str] = "R_s + R_1 / (1 + s R_1 C_1) + R_2 / (1 + s R_2 C_2)"
     r_s: Ohm = parameter("ohm", typical=20e3)
     r_1: Ohm = parameter("ohm", typical=70e3)
     c_1: Farad = parameter("farad", typical=0.3e-9)
@@ -218,7 +218,7 @@ class ParallelRC(AbstractCircuit):
     `SkinRC` (paper, Tables II and III).
     """
 
-    formula: ClassVar[str] = "r_p / (1 + s r_p c_p)"
+    formula: ClassVar[str] = "R_p / (1 + s R_p C_p)"
     r_p: Ohm = parameter("ohm", typical=100e3)
     c_p: Farad = parameter("farad", typical=0.3e-9)
 
@@ -230,7 +230,7 @@ class ParallelRC(AbstractCircuit):
 class Resistor(AbstractCircuit):
     """One resistor, Z = R: the loads of the paper's Table I, 21.62 to 555 kΩ."""
 
-    formula: ClassVar[str] = "r"
+    formula: ClassVar[str] = "R"
     r: Ohm = parameter("ohm", typical=100e3)
 
     def impedance(self) -> AbstractImpedance:

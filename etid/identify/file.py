@@ -27,6 +27,7 @@ import jax
 from tqdm import tqdm
 
 from etid.circuits.circuit import AbstractCircuit
+from etid.circuits.lookup import qualified
 from etid.estimators.registry import Method, check_method
 from etid.identify.arguments import circuit_of, order_of
 from etid.identify.many import Drivers, identify_part, to_identify
@@ -222,7 +223,9 @@ def fit_file(
         run = {
             **{name.replace("_", " "): value for name, value in described.items()},
             "source date": stamp,
-            "circuit": hashlib.sha256(repr(circuit).encode()).hexdigest(),
+            "circuit": hashlib.sha256(
+                f"{qualified(type(circuit))} {circuit!r}".encode()
+            ).hexdigest(),
             "size of a part": PART,
         }
         parts = _Parts(target, run, resume)

@@ -14,7 +14,8 @@ import numpy.typing as npt
 import optimistix as optx
 from jaxtyping import Array, Complex, Float
 
-from etid.circuits.circuit import AbstractCircuit, SkinRC
+from etid.circuits.circuit import AbstractCircuit
+from etid.identify.arguments import circuit_of
 from etid.identify.compiled import stored_jit
 from etid.results.fits import Fit, IdentificationError, complex_rrse
 from etid.results.verdicts import RESULTS, first_verdict, message, verdict
@@ -109,7 +110,7 @@ def identify_impedance(
         IdentificationError: The verdict is not successful and `throw` is set.
     """
     require_float64()
-    circuit = SkinRC() if circuit is None else circuit
+    circuit = circuit_of(circuit)
     f, z = np.asarray(frequency, float), np.asarray(impedance, complex)
     sigma = np.broadcast_to(np.asarray(1.0 if stderr is None else stderr, float), f.shape)
     if f.ndim != 1 or z.shape != f.shape:

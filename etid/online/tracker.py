@@ -38,11 +38,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float, Int
 
-from etid.circuits.circuit import AbstractCircuit, SkinRC
+from etid.circuits.circuit import AbstractCircuit
 from etid.estimators.judgement import MAX_STEPS_REACHED, SUCCESSFUL, misses
 from etid.estimators.maximum_likelihood.given_driver import GivenDriver, combined
 from etid.estimators.refinement import circuit_starts
 from etid.estimators.registry import check_driver
+from etid.identify.arguments import circuit_of
 from etid.identify.compiled import stored_jit
 from etid.identify.lanes import explained, given
 from etid.online.gain_bands import cut, unloaded_bands
@@ -166,7 +167,7 @@ class Tracker(eqx.Module):
         low, high = unloaded.adc_range or (-np.inf, np.inf)
         half = seen.step_th / 2
         model = GainModel.of(
-            SkinRC() if circuit is None else circuit,
+            circuit_of(circuit),
             bands,
             known.z_th(combined(known.mean, known.slope)),
             driver.source.response(rate - bands.frequency),

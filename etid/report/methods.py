@@ -115,12 +115,9 @@ def _model(found: StudyFits) -> str:
         which += f" of {pathlib.Path(settings.source).name}"
     text = f"The {which} were identified with etid as loads of a driver with source impedance Z_th,"
     text += " V_out = V_th Z_L / (Z_L + Z_th). "
-    if isinstance(circuit, circuits.SkinRC):
-        text += "The load is R_s + R_p / (1 + s R_p C_p)"
-    elif isinstance(circuit, circuits.Resistor):
-        text += "The load is one resistor R"
-    else:
-        text += f"The load is the circuit {type(circuit).__name__}"
+    text += f"The load is the circuit {type(circuit).__name__}"
+    if circuit.formula:
+        text += f", Z_L = {circuit.formula}"
     if settings is not None:
         typical = ", ".join(
             f"{name} {quantity(value, unit)}"

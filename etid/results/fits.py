@@ -352,7 +352,7 @@ class Fits:
         columns["change_stderr"] = self._changes[1]
         attributes = {
             "schema": SCHEMA,
-            "schema_version": "1.2",
+            "schema_version": "1.3",
             "etid_version": importlib.metadata.version("etid"),
             "circuit": qualified(type(self.circuit)),
             "parameters": list(self.circuit.names()),
