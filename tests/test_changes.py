@@ -134,6 +134,17 @@ def test_hum_and_wander_are_no_change_of_the_skin(frequency):
     assert not change.seen
 
 
+def test_a_record_that_begins_within_a_pulse_is_cut_between_pulses():
+    """Early by 50 samples, more than the 24 before the first pulse."""
+    scene, skin = rung("dry"), LOADS["dry"]
+    recording = scene.simulate(1)[TRIAL]
+    before = change_of(recording, scene, skin)
+    after = change_of(recording.replace(v_out=np.roll(recording.v_out, -50)), scene, skin)
+    assert not after.seen
+    # The same samples: what moves from the end of the record to its begin holds next to nothing.
+    np.testing.assert_allclose(after.stderr, before.stderr, rtol=0.1)
+
+
 @pytest.mark.slow
 def test_a_clock_that_drifts_is_no_change():
     scene, skin = rung("dry", samples=100_000, pulse_rate_ppm=200.0), LOADS["dry"]

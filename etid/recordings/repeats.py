@@ -176,7 +176,9 @@ def _of_equal_periods(
     at = spacing[:, None] * np.arange(periods)
     known = bands(of.sample_rate, of.pulse_rate)
     sigma = np.array([one.sigma_out for one in group])
-    own = _deviations([v_out for _, v_out in records], at, known, sigma)
+    # A record that is late would be cut within its pulses.
+    loaded = [_turned(v, one) for one, (_, v) in zip(group, records, strict=True)]
+    own = _deviations(loaded, at, known, sigma)
     sigma = np.array([one.sigma_th for one in group])
     merged = bands(of.sample_rate / MERGED, of.pulse_rate)
     sums = [_merged(v_th) for v_th, _ in records]
@@ -207,6 +209,11 @@ def _smooth(mean: np.ndarray, known: Bands) -> np.ndarray:
     """Σ conj(Y) times each polynomial, for each recording."""
     products = np.conj(mean)[:, None, :] * known.polynomials
     return np.add.reduceat(products, known.edges, axis=2)
+
+
+def _turned(v_out: Float[np.ndarray, " time"], of: Inspected) -> Float[np.ndarray, " time"]:
+    """The loaded voltage without its lag: what is cut off at one end is put to the other."""
+    return np.roll(v_out[: of.periods[1]], -of.lag) if of.lag else v_out
 
 
 class _Deviations(NamedTuple):
