@@ -165,7 +165,11 @@ def _driver(seen: Sequence[Inspected], order: int, method: Method) -> Driver:
         cut = [(v_th[:size], v_out[:size], *rest) for v_th, v_out, *rest in samples]
         return driver_of(stacked(cut), r_load, order, method, None)
     # Only starts are made from samples: of one length, so that the compiled function serves all.
-    samples = [(one.v_th, np.roll(one.v_out, -one.lag), *arrays(one)[2:]) for one in seen]
+    shortest = min(one.v_th.size for one in seen)  # periods of the others may be left out
+    samples = [
+        (one.v_th[:shortest], np.roll(one.v_out, -one.lag)[:shortest], *arrays(one)[2:])
+        for one in seen
+    ]
     lanes = [lane(one, method)[:-1] for one in seen]
     size = min(fields[0].size for fields in lanes)  # a pulse rate that is counted may cost one
     spectra = Spectrum(*stacked([tuple(field[:size] for field in fields) for fields in lanes]))
@@ -360,6 +364,7 @@ def predict(
     if not circuit.is_rational:
         return _predict_periods(recording, driver, circuit)
     seen = Inspected(recording)
+    seen.kept = None  # disturbed periods are predicted too
     inner = np.asarray(_fitted(tuple(map(jnp.asarray, arrays(seen))), driver, circuit))
     predicted = np.full(recording.v_out.size, np.nan)
     first = TAPS - 1 + max(seen.lag, 0)
@@ -372,7 +377,7 @@ def _predict_periods(
 ) -> Float[np.ndarray, " time"]:
     rate = recording.sample_rate
     seen = Inspected(recording)
-    periods, samples = seen.periods
+    periods, samples = seen.whole_periods
     if periods == 0:
         raise ValueError(
             f"recording {recording.path!r} holds no whole pulse period; the voltage at a "

@@ -10,8 +10,9 @@ from etid.recordings.recording import Recording
 from etid.recordings.remarks import Remark
 from etid.signals import rounding
 from etid.signals.alignment import lag_of, shifted, whole_lag
+from etid.signals.disturbances import Joint, disturbed, joint
 from etid.signals.filtering import TAPS
-from etid.signals.harmonics import whole_periods
+from etid.signals.harmonics import ALIASED, whole_periods
 from etid.signals.mains import Hum, separated
 from etid.signals.measurement import trusted
 from etid.signals.noise import noise_std
@@ -43,33 +44,81 @@ class Inspected:
 
     @functools.cached_property
     def v_th(self) -> Float[np.ndarray, " time"]:
-        """Unloaded voltage [V], without hum that can be told from the pulses."""
-        return self._without(self.hum_th, self.recorded_th)
+        """Unloaded voltage [V], without hum that can be told from the pulses and as `kept`."""
+        return self._joined(self.quiet_th)
 
     @functools.cached_property
     def v_out(self) -> Float[np.ndarray, " time"]:
-        """Loaded voltage [V], without such hum."""
-        return self._without(self.hum_out, self.recorded_out)
+        """The same of the loaded voltage."""
+        return self._joined(self.quiet_out)
 
     @functools.cached_property
     def recorded_th(self) -> Float[np.ndarray, " time"]:
-        """Unloaded voltage as it was recorded [V]."""
-        return self.recording.v_th
+        """Unloaded voltage as it was recorded [V], as `kept`."""
+        return self._joined(self.whole_th)
 
     @functools.cached_property
     def recorded_out(self) -> Float[np.ndarray, " time"]:
         """The same of the loaded voltage."""
+        return self._joined(self.whole_out)
+
+    @functools.cached_property
+    def whole_th(self) -> Float[np.ndarray, " time"]:
+        """Unloaded voltage as it was recorded [V], of all periods."""
+        return self.recording.v_th
+
+    @functools.cached_property
+    def whole_out(self) -> Float[np.ndarray, " time"]:
+        """The same of the loaded voltage."""
         return self.recording.v_out
+
+    @functools.cached_property
+    def quiet_th(self) -> Float[np.ndarray, " time"]:
+        """Unloaded voltage [V] of all periods without hum."""
+        return self._without(self.hum_th, self.whole_th)
+
+    @functools.cached_property
+    def quiet_out(self) -> Float[np.ndarray, " time"]:
+        """The same of the loaded voltage."""
+        return self._without(self.hum_out, self.whole_out)
+
+    @functools.cached_property
+    def kept(self) -> Joint | None:
+        """The pulse periods that are used, if one was disturbed and is left out; else None.
+
+        Disturbed are the fewest: of others it would not be known what they should look like.
+        """
+        if self.train.mismatch:
+            return None
+        bad = disturbed(
+            (self.quiet_th, self.quiet_out),
+            (float(self.noise_th), float(self.noise_out)),
+            (self.coarse_th, self.coarse_out),
+            self.spacing,
+            self.whole_periods[0],
+        )
+        left = np.count_nonzero(~bad)
+        if not max(2, bad.size // 2 + 1) <= left < bad.size:
+            return None
+        return joint(~bad, self.spacing, self.whole_out.size)
+
+    def _joined(self, v: Float[np.ndarray, " time"]) -> Float[np.ndarray, " kept"]:
+        return v if self.kept is None else self.kept(v)
+
+    @property
+    def begins(self) -> Float[np.ndarray, " period"]:
+        """Where the periods of `v_th` begin [samples]."""
+        return self.spacing * np.arange(self.periods[0]) if self.kept is None else self.kept.begins
 
     @functools.cached_property
     def coarse_th(self) -> float:
         """Converter step [V] of `v_th` if it exceeds the noise, else 0."""
-        return self._coarse(self.recorded_th, self.step_th)
+        return self._coarse(self.whole_th, self.step_th)
 
     @functools.cached_property
     def coarse_out(self) -> float:
         """The same of `v_out`."""
-        return self._coarse(self.recorded_out, self.step_out)
+        return self._coarse(self.whole_out, self.step_out)
 
     def _coarse(self, v: Float[np.ndarray, " time"], told: float) -> float:
         step = told or rounding.step_of(v)
@@ -78,25 +127,29 @@ class Inspected:
     @functools.cached_property
     def hum_th(self) -> Hum | None:
         """Hum of `v_th` that was subtracted."""
-        return self._hum(self.recorded_th, self.sigma_th)
+        return self._hum(self.whole_th, self.noise_th)
 
     @functools.cached_property
     def hum_out(self) -> Hum | None:
         """The same of `v_out`."""
-        return self._hum(self.recorded_out, self.sigma_out)
+        return self._hum(self.whole_out, self.noise_out)
 
     def _hum(self, v: Float[np.ndarray, " time"], sigma: Float[np.ndarray, ""]) -> Hum | None:
         of = self.recording
-        return separated(v, sigma, of.sample_rate, of.pulse_rate, *self.periods)
+        return separated(v, sigma, of.sample_rate, of.pulse_rate, *self.whole_periods)
 
     def _without(self, hum: Hum | None, v: Float[np.ndarray, " time"]) -> np.ndarray:
         return v if hum is None else v - hum(v.size, self.recording.sample_rate)
 
     def covered(self, frequency: Float[np.ndarray, " harmonic"]) -> Bool[np.ndarray, " harmonic"]:
-        """Harmonics that hum covers although it was subtracted."""
-        none = np.zeros(frequency.shape, bool)
+        """Harmonics that hum covers although it was subtracted, or that aliases do.
+
+        Aliases of two periods, or without one of three, are half as large as those of a single one.
+        """
+        aliased = self.kept is not None or self.periods[0] == 2
+        none = aliased & (frequency > ALIASED * self.recording.sample_rate)
         found = [hum for hum in (self.hum_th, self.hum_out) if hum is not None]
-        return sum((hum.covers(frequency, self.periods[0]) for hum in found), start=none)
+        return sum((hum.covers(frequency, self.whole_periods[0]) for hum in found), start=none)
 
     @property
     def step_th(self) -> float:
@@ -109,13 +162,27 @@ class Inspected:
         return self.recording.samples["v_out"].resolution or 0.0
 
     @functools.cached_property
+    def noise_th(self) -> Float[np.ndarray, ""]:
+        """Noise of a sample of `whole_th` [V]."""
+        return np.asarray(noise_std(self.whole_th, self.step_th))
+
+    @functools.cached_property
+    def noise_out(self) -> Float[np.ndarray, ""]:
+        """The same of `whole_out`."""
+        return np.asarray(noise_std(self.whole_out, self.step_out))
+
+    @functools.cached_property
     def sigma_th(self) -> Float[np.ndarray, ""]:
         """Noise of a sample of `v_th` [V]."""
+        if self.kept is None:
+            return self.noise_th
         return np.asarray(noise_std(self.recorded_th, self.step_th))
 
     @functools.cached_property
     def sigma_out(self) -> Float[np.ndarray, ""]:
         """The same of `v_out`."""
+        if self.kept is None:
+            return self.noise_out
         return np.asarray(noise_std(self.recorded_out, self.step_out))
 
     @property
@@ -125,6 +192,7 @@ class Inspected:
         coarse = self.coarse_th > 0 or self.coarse_out > 0
         off = abs(self.train.counted / self.recording.pulse_rate - 1) > CLOCK
         found = Remark.mains_hum if hum else Remark(0)
+        found |= Remark.periods_left_out if self.kept is not None else Remark(0)
         found |= Remark.coarse_converter if coarse else Remark(0)
         found |= Remark.aligned if self.lag else Remark(0)
         return found | (Remark.pulse_rate_counted if off else Remark(0))
@@ -147,17 +215,27 @@ class Inspected:
     @functools.cached_property
     def train(self) -> PulseTrain:
         """The pulses of `v_th`."""
-        return find_pulses(self.recorded_th, self.recording.sample_rate, self.recording.pulse_rate)
+        return find_pulses(self.whole_th, self.recording.sample_rate, self.recording.pulse_rate)
 
     @functools.cached_property
     def pulse_rate(self) -> float:
         """Pulse rate [Hz] by its own clock."""
         return self.train.counted
 
+    @property
+    def spacing(self) -> float:
+        """Length of a period by its own clock [samples]."""
+        return self.recording.sample_rate / self.pulse_rate
+
     @functools.cached_property
-    def periods(self) -> tuple[int, int]:
+    def whole_periods(self) -> tuple[int, int]:
         """How many whole periods it holds by its own clock, and how many samples they are."""
-        return whole_periods(self.recorded_out.size, self.recording.sample_rate, self.pulse_rate)
+        return whole_periods(self.whole_out.size, self.recording.sample_rate, self.pulse_rate)
+
+    @property
+    def periods(self) -> tuple[int, int]:
+        """The same of the periods that are `kept`."""
+        return self.whole_periods if self.kept is None else (self.kept.first.size, self.v_out.size)
 
     @functools.cached_property
     def is_periodic(self) -> bool:
@@ -169,7 +247,7 @@ class Inspected:
         periods, samples = self.periods
         if periods == 0:
             return False
-        rest = abs(periods * self.recording.sample_rate / self.train.counted - samples)
+        rest = abs(periods * self.spacing - samples) if self.kept is None else 1.0
         for v, sigma in ((self.v_th, self.sigma_th), (self.v_out, self.sigma_out)):
             joint = np.concatenate([v[samples - SEAM : samples], v[:SEAM]])
             if rest * np.abs(np.diff(joint)).max() > STEP * trusted(v, sigma):

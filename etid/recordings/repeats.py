@@ -172,8 +172,7 @@ def _of_equal_periods(
 ) -> list[Repeats]:
     """The deviations of recordings with as many periods and equal rates, from these voltages."""
     of, (periods, _) = group[0].recording, group[0].periods
-    spacing = np.array([of.sample_rate / one.pulse_rate for one in group])
-    at = spacing[:, None] * np.arange(periods)
+    at = np.stack([one.begins for one in group])
     known = bands(of.sample_rate, of.pulse_rate)
     sigma = np.array([one.sigma_out for one in group])
     # A record that is late would be cut within its pulses.

@@ -35,7 +35,7 @@ def lag_of(
         The lag [samples]; None if the records have opposite polarity or are too far apart.
     """
     period = train.spacing or train.sample_rate / train.pulse_rate
-    rise, edges = rise_time(train.sample_rate), train.edges
+    rise, edges = rise_time(train.sample_rate), train.edges[train.edges < v_th.size]
     edge = edges[edges.size // 2] if edges.size else np.argmax(np.abs(rises(v_th, rise)))
     first = max(0, int(edge) - int(AROUND * period))
     template = rises(v_th[first : int(edge) + int(AROUND * period) + rise], rise)

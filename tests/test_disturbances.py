@@ -1,0 +1,179 @@
+"""A spike, a burst or a missing pulse in one of several periods: that period is left out."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import etid
+from benchmarks.ladder import CALIBRATION, LOADS, TRIAL, rung
+from etid.recordings.preflight import Inspected, preflight
+from etid.recordings.remarks import Remark
+from etid.recordings.study import Study
+from etid.signals.disturbances import joint
+from tests.test_changes import falling, recorded
+
+PERIOD = 1 / 60.0
+LEFT_OUT = int(Remark.periods_left_out)
+
+
+def with_spike(recording, period, height=0.1, which="v_out", width=1e-3):
+    """Half a sine of this height [V at the converter] in the second half of a period."""
+    place = (recording.time - (period + 0.6) * PERIOD) / width
+    spike = np.where((place > 0) & (place < 1), np.sin(np.pi * place), 0.0)
+    volts = getattr(recording, which) + height / rung("dry").scale * spike
+    return recording.replace(**{which: volts})
+
+
+def off(fits, load):
+    """Errors of all elements, in standard errors."""
+    names = ("r_s", "r_p", "c_p")
+    values = np.stack([getattr(fits.circuit, name) for name in names])
+    errors = np.stack([getattr(fits.stderr, name) for name in names])
+    truth = np.array([[getattr(LOADS[load], name)] for name in names])
+    return (values - truth) / errors
+
+
+@pytest.fixture(scope="module")
+def driver():
+    return etid.identify_driver(rung("dry").simulate(0)[CALIBRATION])
+
+
+@pytest.mark.parametrize("load", LOADS)
+@pytest.mark.parametrize("samples", [10_000, 20_000])
+def test_a_disturbed_period_is_left_out_and_the_elements_are_right(driver, load, samples):
+    scene = rung(load, samples=samples)
+    records = [
+        with_spike(scene.simulate(seed)[TRIAL], seed % 3, (0.1, 1.0)[seed % 2], which)
+        for seed, which in enumerate(("v_out", "v_th", "v_out", "v_out"))
+    ]
+    fits = etid.identify_skins(records, driver)
+    assert set(fits.verdicts) == {"successful"}
+    np.testing.assert_array_equal(np.asarray(fits.fit.remarks) & LEFT_OUT, LEFT_OUT)
+    assert np.abs(off(fits, load)).max() < 4.0  # one of 12 normal numbers in 1300
+
+
+def test_both_voltages_and_what_is_known_of_them_are_of_the_same_periods():
+    recording = rung("dry").simulate(1)[TRIAL]
+    seen = Inspected(with_spike(recording, 1, 1.0))
+    assert seen.kept is not None
+    assert seen.periods == (2, 6667)
+    kept = np.concatenate([np.arange(3333), np.arange(6666, 10_000)])
+    np.testing.assert_array_equal(seen.v_th, recording.v_th[kept])
+    np.testing.assert_array_equal(seen.v_out, recording.v_out[kept])
+    loud = recording.v_out + np.where(
+        (recording.time > 1.2 * PERIOD) & (recording.time < 1.9 * PERIOD),
+        np.random.default_rng(1).normal(0, 20.0, recording.time.size),
+        0.0,
+    )
+    noisy = Inspected(recording.replace(v_out=loud))
+    assert noisy.kept is not None
+    np.testing.assert_allclose(noisy.sigma_out, seen.sigma_out)  # the same two periods
+
+
+@pytest.mark.parametrize("spacing", [3333.3, 3333.5, 4000.0, 166.7])
+def test_a_record_of_the_periods_that_are_kept_is_as_long_as_one_of_so_many(spacing):
+    for bad in ([0], [1], [4], [0, 2], [1, 2]):
+        kept = np.isin(np.arange(5), bad, invert=True)
+        size = round(5 * spacing)
+        of = joint(kept, spacing, size)
+        assert of.lengths.sum() == round(kept.sum() * spacing)
+        assert (of.first >= 0).all()
+        assert (of.first + of.lengths <= size).all()
+        # Each begins a sample at most from where it should.
+        assert np.abs(of.first - np.flatnonzero(kept) * spacing).max() <= 1.0
+        before = np.concatenate([[0], np.cumsum(of.lengths)[:-1]])
+        np.testing.assert_allclose(
+            of.begins - before, np.flatnonzero(kept) * spacing - of.first, atol=1e-9
+        )
+
+
+@pytest.mark.parametrize("load", LOADS)
+@pytest.mark.parametrize("samples", [10_000, 20_000])
+def test_no_period_of_an_undisturbed_record_is_left_out(load, samples):
+    for snr_db in (20.0, 30.0, 80.0):
+        for jitter in (5e-8, 5e-6):
+            scene = rung(load, samples=samples, snr_db=snr_db, trigger_jitter_rms=jitter)
+            assert Inspected(scene.simulate(3)[TRIAL]).kept is None
+
+
+@pytest.mark.parametrize("bits", [8, 10])
+def test_steps_of_a_converter_are_no_disturbance(bits):
+    for load in LOADS:
+        assert Inspected(rung(load, bits=bits, snr_db=80.0).simulate(1)[TRIAL]).kept is None
+
+
+@pytest.mark.parametrize("name", ["r_s", "r_p", "c_p"])
+def test_skin_that_changes_is_no_disturbance(name):
+    for load in LOADS:
+        scene = rung(load)
+        for loads in (
+            falling(LOADS[load], name, 0.3),
+            [LOADS[load], *falling(LOADS[load], name, 0.3)[1:]][::-1],
+            [LOADS[load], LOADS[load], falling(LOADS[load], name, 0.3)[-1]],
+        ):
+            assert Inspected(recorded(scene, loads)).kept is None
+
+
+def test_what_leaves_no_majority_of_equal_periods_is_not_left_out():
+    recording = rung("dry").simulate(1)[TRIAL]
+    assert Inspected(with_spike(with_spike(recording, 0), 1, -0.2)).kept is None
+    four = rung("dry", samples=13_333).simulate(1)[TRIAL]
+    assert Inspected(with_spike(with_spike(four, 0), 1, -0.2)).kept is None
+    two = rung("dry", samples=6_667).simulate(1)[TRIAL]
+    assert Inspected(with_spike(two, 1)).kept is None
+
+
+def test_a_missing_pulse_and_a_touched_rail_are_left_out():
+    recording = rung("damp").simulate(1)[TRIAL]
+    inside = (recording.time > PERIOD) & (recording.time < 2 * PERIOD)
+    missing = Inspected(recording.replace(v_out=np.where(inside, 0.0, recording.v_out)))
+    assert missing.kept is not None
+    assert preflight(missing) is None
+    clipped = with_spike(recording, 2, 20.0)
+    assert recording.adc_range is not None
+    high = recording.adc_range[1]
+    railed = Inspected(clipped.replace(v_out=np.minimum(clipped.v_out, high)))
+    assert railed.kept is not None
+    assert preflight(railed) is None
+
+
+def test_hum_is_subtracted_before_periods_are_compared():
+    recording = rung("dry").simulate(1)[TRIAL]
+    hum = 0.1 / rung("dry").scale * np.sin(2 * np.pi * 50 * recording.time + 1)
+    assert Inspected(recording.replace(v_out=recording.v_out + hum)).kept is None
+
+
+@pytest.mark.slow
+def test_a_disturbed_calibration_gives_the_driver_of_the_other_periods(driver):
+    scene = rung("dry")
+    calibration = with_spike(scene.simulate(0)[CALIBRATION], 1, 0.3)
+    found = etid.identify_driver(calibration)
+    assert int(found.remarks) & LEFT_OUT
+    f = jnp.geomspace(60.0, 4e4, 50)
+    both = np.hypot(*(np.asarray(of.response_stderr(f)) for of in (found, driver)))
+    # Most of the noise is common to both.
+    assert (np.abs(np.asarray(found.response(f) - driver.response(f))) < 4 * both).all()
+
+
+@pytest.mark.parametrize("load", LOADS)
+def test_two_periods_of_little_noise_are_fitted_where_aliases_are_small(load):
+    """Half of what has aliased is left; above 0.35 of the rate it cost up to 8 standard errors."""
+    scene = rung(load, snr_db=80.0, samples=6_667)
+    three = etid.identify_driver(rung(load, snr_db=80.0).simulate(0)[CALIBRATION])
+    fits = etid.identify_skins([scene.simulate(seed)[TRIAL] for seed in range(4)], three)
+    assert set(fits.verdicts) == {"successful"}
+    assert np.abs(off(fits, load)).max() < 5.0  # a bias of two, and noise
+
+
+@pytest.mark.slow
+def test_a_joint_fit_leaves_it_out_too():
+    scene = rung("dry")
+    study = scene.simulate(0)
+    trials = [
+        with_spike(scene.simulate(seed)[TRIAL], seed - 1).replace(path=f"skin/{seed:02d}")
+        for seed in (1, 2, 3)
+    ]
+    fits = etid.identify_jointly(Study.from_recordings([study[CALIBRATION], *trials])).fits
+    assert set(fits.verdicts) == {"successful"}
+    assert (np.asarray(fits.fit.remarks) & LEFT_OUT).all()
+    assert np.abs(off(fits, "dry")).max() < 4.0
