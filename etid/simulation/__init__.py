@@ -1,1 +1,1 @@
-"""Recordings from a known circuit: the transformer, a laboratory's scenes, the Cramer-Rao bound."""
+"""Recordings of a known circuit: the transformer driver, scenes, and the Cramer-Rao bound."""

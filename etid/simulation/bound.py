@@ -1,14 +1,15 @@
-"""The Cramer-Rao bound of a scene: how well any unbiased estimator can identify it.
+"""The Cramer-Rao bound of a scene: the smallest standard errors of any unbiased estimator.
 
-At every harmonic k the records are X_k, Y_k = G_k e^(−jω_k τ) X_k and the same of each calibration,
-G = Z_L / (Z_L + Z_th), all with white noise. X_k and Z_th(f_k) are unknown complex numbers of every
-harmonic, so that the bound holds for a driver of any kind; they are projected out, and what is left
-is the Fisher information of the elements and the trigger delays,
+At every harmonic k the records are X_k and Y_k = G_k e^(−jω_k τ) X_k with G = Z_L / (Z_L + Z_th),
+and the same for each calibration. All records have white noise. X_k and Z_th(f_k) are unknown
+complex numbers at every harmonic, so the bound holds for every kind of driver. To project them out
+leaves the Fisher information of the elements and the trigger delays,
 
-    F = 2 Re Σ_k A_kᴴ (I − B_k B_k⁺) A_k,
+    F = 2 Re Σ_k A_kᴴ (I − B_k B_k⁺) A_k.
 
-A the derivatives by elements and delays, B those by X_k and Z_th(f_k), both over the standard
-deviation of a coefficient (Pintelon and Schoukens, System Identification, 2012, ch. 9 and 16).
+A holds the derivatives with respect to elements and delays, B those with respect to X_k and
+Z_th(f_k). Both are divided by the standard deviation of a coefficient (Pintelon and Schoukens,
+System Identification, 2012, ch. 9 and 16).
 """
 
 import dataclasses
@@ -30,11 +31,11 @@ from etid.solvers.matrices import inverse
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Bound:
-    """The smallest standard errors with which one trial of a scene can be identified.
+    """The smallest standard errors for one trial of a scene.
 
     Attributes:
         path: Path of the trial.
-        circuit: Its true elements, SI.
+        circuit: True elements of its load [SI].
         cov: Bound of the covariance of the logarithms of the elements.
     """
 
@@ -50,7 +51,7 @@ class Bound:
 
     @property
     def stderr(self) -> dict[str, float]:
-        """Bound of the standard error of each element, SI."""
+        """Bound of the standard error of each element [SI]."""
         return {name: e * float(getattr(self.circuit, name)) for name, e in self.relative.items()}
 
     @property
@@ -75,22 +76,23 @@ class Bound:
 
 
 def bound(scene: Scene, *, delays: bool = True, known_driver: bool = False) -> dict[str, Bound]:
-    """Predict, before it is recorded, how well each trial of a scene can be identified.
+    """Predict the smallest standard errors of each trial of a scene before it is recorded.
 
-    Every trial is identified with all calibrations of the scene and without the other trials. A
-    record counts for its length: half a period, for half the information of a whole one.
+    The bound of a trial uses this trial and all calibrations of the scene, but no other trial. The
+    information is proportional to the length of a record: half a period has half the information of
+    a whole period.
 
     Args:
-        scene: Driver, loads, noise and converter; trials with circuits, resistors or skin.
+        scene: Driver, loads, noise and converter. The loads are circuits, resistors or skin.
         delays: Whether the trigger delays of all loaded records are unknown.
-        known_driver: Whether Z_th is known exactly, and calibrations are not needed.
+        known_driver: Whether Z_th is known exactly, so that no calibration is needed.
 
     Returns:
-        The bounds by path.
+        The bound of each trial, by path.
 
     Raises:
-        ValueError: A trial's load has no elements, there is neither noise nor a converter, or no
-            calibration.
+        ValueError: The load of a trial has no elements. Or the scene has neither noise nor a
+            converter. Or it has no calibration and the driver is not known.
     """
     require_float64()
     require(
@@ -141,7 +143,10 @@ def _covariance(
     known_driver: bool,
     shared_v_th: bool,
 ) -> Float[np.ndarray, "element element"]:
-    """Inverse of the information about the elements; x in standard deviations of a coefficient."""
+    """Bound of the covariance of the elements' logarithms.
+
+    `x` is in standard deviations of a coefficient.
+    """
     loads = [circuit, *known]
     frequency = jnp.asarray(f)
     z = [np.asarray(load.response(frequency)) for load in loads]

@@ -2,13 +2,14 @@
 
     study = etid.scenes.paper(snr_db=60).simulate(seed=0)
 
-Each function named `paper…` returns a `Scene`, one experiment of the paper; `PRESETS` lists them
-by name. Their keywords are the fields of `Scene`: noise, jitter, window, converter. A scene is a
-frozen description; `Scene.simulate` makes the records, `Scene.truth` tells what is behind them.
+Each function named `paper…` returns a `Scene`, one experiment of the paper. `PRESETS` lists these
+functions by name. Their keywords are the fields of `Scene`: noise, jitter, window, converter. A
+scene is a frozen description. `Scene.simulate` makes the records; `Scene.truth` gives the true
+elements.
 
-Every trial has an unloaded record v_th of its own, as in the paper: it is recorded at another pulse
-than v_out, with its own noise, trigger delay and offset; or all share one. The chain from circuit
-to file is
+As in the paper, every trial has its own unloaded record v_th. It is recorded at another pulse than
+v_out, with its own noise, trigger delay and offset. Alternatively, all trials share one unloaded
+record. The chain from circuit to file is
 
     exact periodic waveform → anti-alias filter → sampling at start + delay + n / sample_rate
     → · scale → + offset + white noise → rounding to a code, clipped at the full scale.
@@ -42,16 +43,16 @@ from etid.simulation.transformer import (
 
 @dataclasses.dataclass(frozen=True)
 class Trial:
-    """One recording to be made.
+    """One recording to simulate.
 
     Args:
         path: Name of the recording in its study, such as `s01/dry/03`.
-        load: What is connected: a load of this module, a circuit, or any function from frequencies
-            [Hz] to impedance [ohm].
-        subject: Who.
+        load: The load: one of `etid.simulation.transformer`, a circuit, or any function from
+            frequencies [Hz] to impedance [ohm].
+        subject: Label of the person.
         condition: State of the skin.
-        electrode: Which electrode.
-        trial: Which repetition.
+        electrode: Label of the electrode.
+        trial: Label of the repetition.
     """
 
     path: str
@@ -61,23 +62,23 @@ class Trial:
     electrode: str = ""
     trial: str = ""
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         if not self.path or tidy_path(self.path) != self.path:
             raise ValueError(
-                f"{self.path!r} cannot name a trial; use a path without outer slashes, such as "
-                "'s01/dry/03'"
+                f"{self.path!r} cannot name a trial; use a path without a slash at its start or "
+                "end, such as 's01/dry/03'"
             )
 
 
 @dataclasses.dataclass(frozen=True)
 class Waveform:
-    """Harmonics of a scene without noise, and the noise.
+    """Noise-free harmonics of a scene, and its noise.
 
     Attributes:
         f: Harmonics of the pulse rate [Hz], far beyond half the sample rate.
         v_th: Fourier coefficients of the unloaded voltage after the anti-alias filter [V].
         z_th: Source impedance [ohm].
-        sigma: Standard deviation of a sample, noise and rounding together [V].
+        sigma: Standard deviation of a sample, from noise and rounding together [V].
     """
 
     f: Float[np.ndarray, " f"]
@@ -95,20 +96,20 @@ class Scene:
         calibration: Recordings with known resistors; every trial refers to all of them.
         driver: The pulse transformer.
         sample_rate: Samples per second [Hz].
-        pulse_rate: Nominal pulses per second [Hz], as the files will tell it.
-        pulse_rate_ppm: True pulse rate relative to the nominal one, as the converter's clock sees
-            it [1e-6]. The files do not tell it.
-        samples: Length of a record; 10 000 are three periods.
+        pulse_rate: Nominal pulses per second [Hz]; the files contain this rate.
+        pulse_rate_ppm: Deviation of the true pulse rate from the nominal one, measured by the
+            converter's clock [1e-6]. The files do not contain it.
+        samples: Length of a record [samples]; 10 000 are three periods.
         start: Time of the first sample after the start of a period [s].
         antialias: Corner of the 4th-order Butterworth anti-alias filter, relative to `sample_rate`.
         snr_db: Effective value of the unloaded voltage over one period, after the anti-alias
             filter, relative to that of the white noise of every record [dB]; None for no noise.
-        trigger_jitter_rms: Standard deviation of the delay of every single record [s]. A positive
-            delay samples late.
-        offset_rms: Standard deviation of the offset of every single record [V at the converter].
-        shared_v_th: Whether all trials and calibrations share one unloaded record, and its noise.
+        trigger_jitter_rms: Standard deviation of the delay, drawn for each record [s]. A positive
+            delay means late sampling.
+        offset_rms: Standard deviation of the offset, drawn for each record [V at the converter].
+        shared_v_th: Whether all trials and calibrations share one unloaded record and its noise.
         full_scale: The converter clips at ± this voltage [V at the converter].
-        bits: Resolution of the converter; None stores unrounded volts at the converter.
+        bits: Resolution of the converter [bit]; None stores unrounded volts at the converter.
         scale: Volts at the converter per volt at the terminal.
     """
 
@@ -129,7 +130,7 @@ class Scene:
     bits: int | None = 16
     scale: float = 0.0535
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         counts = collections.Counter(trial.path for trial in self.calibration + self.trials)
         twice = sorted(path for path, count in counts.items() if count > 1)
         if twice:
@@ -138,7 +139,7 @@ class Scene:
             if not isinstance(trial.load, ResistorLoad):
                 raise ValueError(
                     f"calibration {trial.path!r} has the load {trial.load!r}; a calibration needs "
-                    "a ResistorLoad, move other loads to `trials`"
+                    "a ResistorLoad. Move other loads to `trials`"
                 )
         for name in ("sample_rate", "pulse_rate", "antialias", "full_scale", "scale"):
             value = getattr(self, name)
@@ -148,25 +149,25 @@ class Scene:
             if not getattr(self, name) >= 0:
                 raise ValueError(f"{name} is {getattr(self, name)}; it must not be negative")
         if self.samples < 1:
-            raise ValueError(f"samples is {self.samples}; a record has at least one")
+            raise ValueError(f"samples is {self.samples}; a record has at least one sample")
         if self.bits is not None and not 2 <= self.bits <= 32:
-            raise ValueError(f"bits is {self.bits}; a converter has 2 to 32, or None for volts")
+            raise ValueError(f"bits is {self.bits}; use 2 to 32, or None to store volts")
 
     def truth(self) -> dict[str, dict[str, float]]:
-        """Elements of every load by path, SI; empty for an open circuit or a plain function."""
+        """Elements of every load by path [SI]; empty for an open circuit or a plain function."""
         return {trial.path: _elements(trial.load) for trial in self.calibration + self.trials}
 
     def simulate(self, seed: int) -> Study:
         """Make the recordings.
 
-        The random numbers of a record depend on `seed` and its path only: the same trial in two
-        scenes differs by what the scenes differ in, not by another draw.
+        The random numbers of a record depend only on `seed` and its path. The same trial in two
+        scenes therefore has the same draws, and differs only by the settings of the scenes.
 
         Args:
             seed: Seed of noise, delays and offsets.
 
         Returns:
-            One recording per calibration and trial.
+            A study with one recording for each calibration and trial.
         """
         _, v_th, z_th, _ = self._exact()
         return self.record(seed, lambda trial, f: v_th * loading(_impedance(trial, f), z_th))
@@ -176,26 +177,26 @@ class Scene:
         seed: int,
         voltage: Callable[[Trial, Float[np.ndarray, " f"]], Complex[np.ndarray, " f"]],
     ) -> Study:
-        """Record terminal voltages that come from elsewhere, such as a circuit simulator.
+        """Make recordings of given terminal voltages, for example from a circuit simulator.
 
-        Noise, delays and offsets are those of `simulate` at the same seed: what differs between the
-        two studies is the voltage alone.
+        Noise, delays and offsets are those of `simulate` with the same seed. The two studies differ
+        only in the voltage.
 
         Args:
             seed: Seed of noise, delays and offsets.
-            voltage: Fourier coefficients [V] of the terminal voltage of a trial at the harmonics
-                [Hz] of the true pulse rate, before the anti-alias filter. It is asked for the
-                unloaded voltage as well, by a trial whose load is open.
+            voltage: Function of a trial and the harmonics of the true pulse rate [Hz]. It returns
+                the Fourier coefficients of the terminal voltage before the anti-alias filter [V].
+                For the unloaded voltage it is called with a trial whose load is open.
 
         Returns:
-            One recording per calibration and trial.
+            A study with one recording for each calibration and trial.
         """
         sampler, _, _, sigma = self._exact()
         v_th = voltage(Trial("unloaded", OpenLoad()), sampler.f)
         resistances = {
             trial.path: trial.load.r
             for trial in self.calibration
-            if isinstance(trial.load, ResistorLoad)  # __post_init__ holds it; this tells the type
+            if isinstance(trial.load, ResistorLoad)  # always true; the type checker needs it
         }
         step, lowest, highest = self._converter()
 
@@ -225,7 +226,7 @@ class Scene:
         return Study.from_recordings(recordings)
 
     def waveform(self) -> "Waveform":
-        """What the records hold at the harmonics of the pulse rate."""
+        """Noise-free harmonics of the records, and the noise of a sample."""
         sampler, v_th, z_th, sigma = self._exact()
         step = self._converter()[0] if self.bits is not None else 0.0
         total = math.hypot(sigma, step / math.sqrt(12)) / self.scale
@@ -259,7 +260,7 @@ class Scene:
         rng: np.random.Generator,
     ) -> Samples:
         """One record as the converter stores it, from Fourier coefficients at the terminal [V]."""
-        # Drawn even where multiplied by 0: scenes with and without an effect stay comparable.
+        # Draw also if the factor is 0: scenes with and without an effect then have the same noise.
         delay = self.trigger_jitter_rms * rng.standard_normal()
         offset = self.offset_rms * rng.standard_normal()
         noise = sigma * rng.standard_normal(self.samples)
@@ -273,6 +274,7 @@ class Scene:
 
 
 def _elements(load: Impedance | AbstractCircuit) -> dict[str, float]:
+    """Elements of a load by name [SI]; empty if it has none."""
     if isinstance(load, AbstractCircuit):
         return dict(zip(load.names(), load.values().tolist(), strict=True))
     known = isinstance(load, OpenLoad | ResistorLoad | SkinLoad)
@@ -280,7 +282,7 @@ def _elements(load: Impedance | AbstractCircuit) -> dict[str, float]:
 
 
 def _impedance(trial: Trial, f: Float[np.ndarray, " f"]) -> Complex[np.ndarray, " f"]:
-    """The load's impedance, checked because any function may stand there."""
+    """Impedance of the load; checked, because the load may be any function."""
     if isinstance(trial.load, AbstractCircuit):
         require_float64()
         z = np.asarray(trial.load.response(jnp.asarray(f)))
@@ -290,7 +292,7 @@ def _impedance(trial: Trial, f: Float[np.ndarray, " f"]) -> Complex[np.ndarray, 
         raise ValueError(
             f"the load of {trial.path!r} returned shape {z.shape} with {np.isnan(z).sum()} NaN for "
             f"{f.size} frequencies from {f[0]:g} to {f[-1]:g} Hz; it must return one impedance "
-            "[ohm] for each (infinite where open)"
+            "[ohm] for each frequency (infinite if the circuit is open)"
         )
     return z
 
@@ -322,7 +324,7 @@ _RESISTORS = _resistors("resistors", (21.62e3, 55.20e3, 216.6e3, 328.9e3, 555.0e
 _DRY = SkinLoad(r_s=33.4e3, r_p=186e3, c_p=0.12e-9)  # Table II
 _DAMP = SkinLoad(r_s=6.1e3, r_p=17.4e3, c_p=0.66e-9)  # Table III
 _BUILT = SkinLoad(r_s=32.46e3, r_p=179.8e3, c_p=0.12e-9)  # Table IV
-# What ten subjects spanned, r_s, r_p [ohm], c_p [F]: Table II (dry) and Table III (damp).
+# Ranges of ten subjects, r_s, r_p [ohm], c_p [F]: Table II (dry) and Table III (damp).
 _RANGES = {
     "dry": ((19e3, 69.8e3), (194e3, 616e3), (45e-12, 165e-12)),
     "damp": ((3.9e3, 19.8e3), (20.2e3, 165e3), (160e-12, 845e-12)),
@@ -334,12 +336,12 @@ _POPULATION_SEED = 10
 
 
 def paper_calibration(**settings: Any) -> Scene:
-    """The reference resistor of 98.8 kΩ alone. Keywords are fields of `Scene`."""
+    """Only the reference resistor, 98.8 kΩ. Keywords are fields of `Scene`."""
     return Scene((), _CALIBRATION, **settings)
 
 
 def paper_resistors(**settings: Any) -> Scene:
-    """The five test resistors of Table I. Keywords are fields of `Scene`."""
+    """The five resistors of Table I. Keywords are fields of `Scene`."""
     return Scene(_RESISTORS, _CALIBRATION, **settings)
 
 
@@ -364,9 +366,9 @@ def paper_damp(**settings: Any) -> Scene:
 def paper_subjects(**settings: Any) -> Scene:
     """Ten subjects, dry and damp, five trials each.
 
-    The elements are log-uniform in the ranges of Tables II and III, drawn once for all: the same
-    people in every scene. The trials of a subject and condition share their elements, so that any
-    spread between them is the estimator's. Keywords are fields of `Scene`.
+    The elements are log-uniform in the ranges of Tables II and III. They are drawn with a fixed
+    seed, so every scene has the same people. All trials of a subject and condition have the same
+    elements, so any spread between them comes from the estimator. Keywords are fields of `Scene`.
     """
     rng = np.random.default_rng(_POPULATION_SEED)
     trials: tuple[Trial, ...] = ()
@@ -385,7 +387,7 @@ def paper_subjects(**settings: Any) -> Scene:
 
 
 def paper(**settings: Any) -> Scene:
-    """Everything above in one study, 149 recordings. Keywords are fields of `Scene`."""
+    """All experiments of the paper in one study, 149 recordings. Keywords are fields of `Scene`."""
     parts = (paper_resistors, paper_built, paper_dry, paper_damp, paper_subjects)
     trials = tuple(trial for part in parts for trial in part().trials)
     return Scene(trials, _CALIBRATION, **settings)

@@ -9,11 +9,13 @@ The driver is a lumped circuit, solved at each frequency by nodal analysis (s = 
                 gnd          gnd                 gnd        gnd      and C_ww from p to s
 
 Referred to the secondary, z_1 = n²(R_1 + sL_1), z_m = n²(sL_m ‖ R_core) and z_2 = R_2 + sL_2 form a
-T, whose admittances are finite at every frequency, f = 0 included. Eliminating p leaves a Thévenin
-source at s; R_prot and the shunt at o finish it. Z_th has six poles and V_th no DC.
+T circuit. Its admittances are finite at every frequency, including f = 0. Elimination of node p
+leaves a Thévenin source at node s. R_prot and the shunt at node o complete the driver. Z_th has six
+poles, and V_th has no direct voltage.
 
-A load Z_L draws V_out = V_th · Z_L / (Z_L + Z_th) at every harmonic of the pulse rate; a record is
-the sum of the harmonics at the sampling times. Nothing is discretised, so nothing is biased by it.
+With a load Z_L the voltage is V_out = V_th · Z_L / (Z_L + Z_th) at every harmonic of the pulse
+rate. A record is the sum of the harmonics at the sampling times. Nothing is discretised, so there
+is no bias by discretisation.
 """
 
 import dataclasses
@@ -25,14 +27,14 @@ import numpy as np
 from jaxtyping import Complex, Float
 
 Impedance = Callable[[Float[np.ndarray, " f"]], Complex[np.ndarray, " f"]]
-"""A load: frequencies [Hz] to impedance [ohm]."""
+"""A load: a function from frequencies [Hz] to impedance [ohm]."""
 
-# Harmonics are summed up to this multiple of the anti-alias corner, where the filter passes 3e-6.
-# What lies beyond it adds less than 1e-6 V to a 50 V pulse, 1/1000 of a 16-bit step.
+# Harmonics are summed up to this multiple of the anti-alias corner, where the gain of the filter is
+# 3e-6. Higher harmonics add less than 1e-6 V to a 50 V pulse, 1/1000 of a 16-bit step.
 _BANDWIDTH = 25
-# Longest repeating block synthesised by one inverse FFT; a longer one is summed directly.
+# [samples] Longest repeating block for one inverse FFT; a longer block is summed directly.
 _MAX_BLOCK = 1_000_000
-# Harmonics summed at a time without an FFT: bounds the memory at 2·chunk·sqrt(samples) numbers.
+# Harmonics per step of the direct sum; limits the memory to 2·chunk·sqrt(samples) numbers.
 _CHUNK = 4096
 
 
@@ -40,9 +42,10 @@ _CHUNK = 4096
 class TransformerDriver:
     """Square-pulse source, 1:12 step-up transformer, protection resistor, measuring divider.
 
-    The defaults are plausible for a small transformer with a metre of cable and belong to no
-    particular device: 4.2 V become a 50 V pulse that overshoots, rings at some 60 kHz and droops by
-    14 %; |Z_th| is 12.7 kΩ at 1 kHz and peaks at 39 kΩ near 60 kHz.
+    The defaults are plausible for a small transformer with a metre of cable. They describe no
+    particular device. A source pulse of 4.2 V becomes a pulse of 50 V. This pulse overshoots, rings
+    at about 60 kHz and droops by 14 %. |Z_th| is 12.7 kΩ at 1 kHz and has a maximum of 39 kΩ near
+    60 kHz.
 
     Args:
         amplitude: Height of the source pulse [V].
@@ -89,7 +92,7 @@ class TransformerDriver:
     def v_th_spectrum(self, f: Float[np.ndarray, " f"]) -> Complex[np.ndarray, " f"]:
         """Fourier transform of one unloaded pulse, ∫ v_th(t) e^(−j2πft) dt.
 
-        Times the pulse rate it is the Fourier coefficient of the harmonic at f.
+        The Fourier coefficient of the harmonic at f is this transform times the pulse rate.
 
         Args:
             f: Frequencies [Hz].
@@ -116,14 +119,14 @@ class TransformerDriver:
     def _thevenin(
         self, f: Float[np.ndarray, " f"]
     ) -> tuple[Complex[np.ndarray, " f"], Complex[np.ndarray, " f"]]:
-        """Gain from the source to the open terminal, and the impedance seen there [ohm]."""
+        """Gain from the source to the open terminal, and the source impedance there [ohm]."""
         s = 2j * np.pi * f
         n = self.turns
         z_1 = n**2 * (self.r_primary + s * self.l_primary)
         z_m = n**2 * s * self.l_magnetising * self.r_core / (s * self.l_magnetising + self.r_core)
         z_2 = self.r_secondary + s * self.l_secondary
         delta = z_1 * z_2 + z_1 * z_m + z_2 * z_m
-        # Nodal matrix of p and s: the T referred back to real primary volts, and what hangs on it.
+        # Nodal matrix of p and s in real primary volts: the T circuit and what is connected to it.
         y_pp = (
             n**2 * (z_2 + z_m) / delta + 1 / self.r_source + s * (self.c_primary + self.c_winding)
         )
@@ -138,7 +141,7 @@ class TransformerDriver:
 
 @dataclasses.dataclass(frozen=True)
 class OpenLoad:
-    """Nothing connected: V_out = V_th."""
+    """An open terminal: V_out = V_th."""
 
     def __call__(self, f: Float[np.ndarray, " f"]) -> Complex[np.ndarray, " f"]:
         """Infinite impedance at frequencies f [Hz]."""
@@ -182,14 +185,14 @@ class SkinLoad:
 def loading(
     z_load: Complex[np.ndarray, " f"], z_th: Complex[np.ndarray, " f"]
 ) -> Complex[np.ndarray, " f"]:
-    """V_out / V_th = Z_L / (Z_L + Z_th); 1 where the load is open (infinite).
+    """Ratio of loaded to unloaded voltage, V_out / V_th = Z_L / (Z_L + Z_th).
 
     Args:
-        z_load: Load [ohm].
+        z_load: Impedance of the load [ohm]; infinite if the terminal is open.
         z_th: Source impedance [ohm].
 
     Returns:
-        The ratio of loaded to unloaded voltage.
+        The ratio; 1 where the terminal is open.
     """
     ratio = np.ones(z_load.shape, complex)
     connected = ~np.isinf(z_load)
@@ -198,13 +201,13 @@ def loading(
 
 
 class Sampler:
-    """Periodic waveforms, anti-alias filtered (4th-order Butterworth) and sampled exactly.
+    """Samples periodic waveforms exactly, after a 4th-order Butterworth anti-alias filter.
 
     v_n = Σ_k c_k H(k f_0) e^(j2π k f_0 t_n),   t_n = start + n / sample_rate,   k = ±1, ±2, …
 
-    The harmonics reach far beyond half the sample rate, so the record holds the aliases that a real
-    converter would hold. Where a whole number of periods fits a block of samples the sum is one
-    inverse FFT with folded harmonics, repeated as often as needed; else it is summed directly.
+    The harmonics reach far beyond half the sample rate, so the record contains the aliases of a
+    real converter. If a whole number of periods is a block of whole samples, one inverse FFT with
+    folded harmonics gives the block, which is then repeated. Otherwise the sum is direct.
 
     Args:
         sample_rate: Samples per second [Hz].
@@ -212,7 +215,7 @@ class Sampler:
         corner: Half-power frequency of the anti-alias filter [Hz].
     """
 
-    def __init__(self, sample_rate: float, pulse_rate: float, corner: float):
+    def __init__(self, sample_rate: float, pulse_rate: float, corner: float) -> None:
         self.sample_rate = sample_rate
         self.pulse_rate = pulse_rate
         self.harmonics = np.arange(1, math.ceil(_BANDWIDTH * corner / pulse_rate) + 1)
@@ -222,13 +225,13 @@ class Sampler:
         self.antialias = 1 / (pairs[0] * pairs[1])
 
     def rms(self, coefficients: Complex[np.ndarray, " f"]) -> float:
-        """Root mean square, over one period, of what the converter sees.
+        """Effective value over one period of the voltage at the converter.
 
         Args:
             coefficients: Fourier coefficients c_k [V], before the anti-alias filter.
 
         Returns:
-            Effective value [V].
+            Root mean square after the anti-alias filter [V].
         """
         return float(np.sqrt(2 * np.sum(np.abs(coefficients * self.antialias) ** 2)))
 
@@ -245,10 +248,10 @@ class Sampler:
         Returns:
             The record [V].
         """
-        # Whole periods drop out of the phase, which then keeps its digits for any start time.
+        # Remove whole periods from the phase, so that it keeps its digits for any start time.
         turns = np.remainder(start * self.pulse_rate, 1.0) * self.harmonics
         c = coefficients * self.antialias * np.exp(2j * np.pi * turns)
-        # str: the ratio of the rates as written in decimals (59.94 is 2997/50, not its binary form)
+        # str keeps the decimal value of a rate: 59.94 is 2997/50, its binary form is not.
         block = Fraction(str(self.sample_rate)) / Fraction(str(self.pulse_rate))
         if block.numerator <= _MAX_BLOCK:
             return self._folded(c, block, samples)
@@ -257,17 +260,21 @@ class Sampler:
     def _folded(
         self, c: Complex[np.ndarray, " f"], block: Fraction, samples: int
     ) -> Float[np.ndarray, " samples"]:
-        """One block of p samples = q periods by inverse FFT; harmonic k falls on bin kq mod p."""
+        """Repeated block of p samples = q periods, by an inverse FFT.
+
+        Harmonic k falls on bin kq mod p.
+        """
         p, q = block.numerator, block.denominator
         bins = self.harmonics * q % p
         spectrum = np.bincount(bins, np.real(c), p) + 1j * np.bincount(bins, np.imag(c), p)
         return np.resize(2 * p * np.real(np.fft.ifft(spectrum)), samples)
 
     def _summed(self, c: Complex[np.ndarray, " f"], samples: int) -> Float[np.ndarray, " samples"]:
-        """The same sum for rates without a common block.
+        """Direct sum of the harmonics, for rates without a short common block.
 
-        With n = i m + j the exponential factors, e^(jωn) = e^(jωim) e^(jωj): a matrix product over
-        the harmonics from 2 sqrt(samples) exponentials each, instead of `samples`.
+        With n = i m + j the exponential is a product, e^(jωn) = e^(jωim) e^(jωj). The sum is then a
+        matrix product over the harmonics. Each harmonic needs 2 sqrt(samples) exponentials instead
+        of `samples`.
         """
         m = math.isqrt(samples - 1) + 1
         step = self.pulse_rate / self.sample_rate

@@ -1,4 +1,4 @@
 """Least squares: Levenberg-Marquardt, its arrowhead form for joint fits, and propagation of errors.
 
-What is fitted does not belong here: the solvers see residuals and normal equations only.
+Models do not belong here: the solvers see only residuals and normal equations.
 """

@@ -1,15 +1,17 @@
-"""Normal equations of many problems with a few parameters in common, and their solution.
+"""Normal equations of many problems that share a few parameters, and their solution.
 
-`common` parameters enter the terms of every problem, `own` ones those of one problem alone. Then
-JᵀJ is an arrowhead, and without the own parameters it has the size of `common`:
+The `common` parameters enter the terms of every problem. The `own` parameters of a problem enter
+only the terms of this problem. JᵀJ is then an arrowhead matrix. Elimination of the own parameters
+leaves a matrix S of the size of `common`:
 
     [ C    B₁ᵀ …  B_Tᵀ ]
     [ B₁   A₁          ]              S = C − Σ_i B_iᵀ A_i⁻¹ B_i.
     [ …       …        ]
     [ B_T          A_T ]
 
-Memory and time are linear in the number of problems, where one matrix would take its square and its
-cube. Parameters are one vector: the common ones, then the own ones of each problem.
+Memory and time are linear in the number of problems. One full matrix would take memory
+proportional to its square and time proportional to its cube. All parameters form one vector: the
+common parameters, then the own parameters of each problem.
 """
 
 from typing import Any
@@ -34,7 +36,7 @@ class Arrowhead(lx.AbstractLinearOperator):
     def split(
         self, vector: Float[Array, " parameter"]
     ) -> tuple[Float[Array, " common"], Float[Array, "problem own"]]:
-        """A vector's common part, and that of each problem."""
+        """The common part of a vector, and the part of each problem."""
         return split(vector, self.coupling.shape[0], self.coupling.shape[1])
 
     def mv(self, vector: Float[Array, " parameter"]) -> Float[Array, " parameter"]:
@@ -92,7 +94,7 @@ class Arrowhead(lx.AbstractLinearOperator):
 def _solve(
     matrix: Float[Array, "n n"], right: Float[Array, "n column"]
 ) -> Float[Array, "n column"]:
-    """Solve with a positive definite matrix; NaN if it is none."""
+    """Solve with a positive definite matrix; NaN if the matrix is not positive definite."""
     return jax.scipy.linalg.cho_solve(jax.scipy.linalg.cho_factor(matrix), right)
 
 
@@ -129,7 +131,7 @@ class ArrowheadEquations(AbstractNormalEquations):
         return self.matrix.diagonal()
 
     def scaled(self, by: Float[Array, " parameter"]) -> "ArrowheadEquations":
-        """The same in the parameters z = `by` · y."""
+        """The normal equations in the parameters z = `by` · y."""
         return ArrowheadEquations(self.objective, self.gradient / by, self.matrix.scaled(by))
 
     def hessian(self) -> Arrowhead:
@@ -150,7 +152,7 @@ class EliminationDescent(optx.AbstractDescent):
         return _Descent(f_info_struct)
 
     def query(self, y: Array, f_info: Any, state: _Descent) -> _Descent:
-        """Look at the normal equations of a new point."""
+        """State with the normal equations of a new point."""
         del y, state
         return _Descent(f_info)
 

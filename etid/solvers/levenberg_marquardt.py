@@ -1,22 +1,21 @@
 """Levenberg-Marquardt on normal equations, built from optimistix parts.
 
 `optimistix.LevenbergMarquardt` carries the residual and its Jacobian in the solver's state. Under
-`vmap` a step of one lane selects between two copies of that state for all lanes, which costs about
-twelve times the step itself when the residual has thousands of samples. Here the state holds the
-objective, its gradient and the p×p Gauss-Newton matrix only: `optimistix.DampedNewtonDescent`
-solves the damped step, `optimistix.ClassicalTrustRegion` accepts it and sets the damping. Where the
-matrix has a structure worth keeping (`etid.solvers.arrowhead`), its equations and its descent take
-their places.
+`vmap`, a step of one lane selects between two copies of this state for all lanes. With thousands of
+samples, that costs about twelve times as much as the step itself. Here the state holds only the
+objective, its gradient and the p×p Gauss-Newton matrix. `optimistix.DampedNewtonDescent` solves
+the damped step; `optimistix.ClassicalTrustRegion` accepts it and sets the damping. A matrix with a
+useful structure brings its own equations and descent (`etid.solvers.arrowhead`).
 
-Three things make the method scale-free:
+Three properties make the method independent of the scale of parameters and residual:
 
-- **Marquardt scaling.** The step is solved in z = D y, D² = diag(JᵀJ) (the largest seen, as in Moré
-  1978), so that multiplying a parameter by a constant changes no iterate.
-- **Stopping on an angle.** The relative offset of Bates & Watts (1981), the sine of the angle
-  between the residual and the tangent plane, has neither the unit of the residual nor of a
-  parameter. Times √(samples) it is the distance to the minimum in standard errors. A step too small
-  to move the parameters is *not* convergence: a solver that cannot move must not report success.
-- **A trial step whose residual or slope is not finite is rejected**, as if its objective were
+- **Marquardt scaling.** The step is solved in z = D y with D² = diag(JᵀJ), the largest value so far
+  (Moré 1978). To multiply a parameter by a constant therefore changes no iterate.
+- **Stopping on an angle.** The relative offset of Bates & Watts (1981) is the sine of the angle
+  between the residual and the tangent plane. It has no unit. Times √(samples) it is the distance to
+  the minimum in standard errors. A step too small to move the parameters is *not* convergence: a
+  solver that cannot move must not report success.
+- **Rejection of trial steps whose residual or slope is not finite**, as if their objective were
   infinite.
 """
 
@@ -33,15 +32,18 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 
 INITIAL_DAMPING = 1e-2  # relative to the unit diagonal of the scaled Gauss-Newton matrix
 RIDGE = 1e-13  # of the scaled matrix, for directions that double precision cannot resolve
-ROUNDING = 4.0  # units of ε that the model's own arithmetic loses
-IDLE_STEPS = 3  # in a row; the steps grow fivefold from one to the next
-ACCELERATION = 0.75  # of the step, that its second order may be (Transtrum and Sethna)
-DIFFERENCE = 0.1  # of the step, at which its second derivative is taken (Transtrum and Sethna)
+ROUNDING = 4.0  # rounding error of the model [ε]
+IDLE_STEPS = 3  # accepted steps in a row without progress, while the steps grow fivefold
+ACCELERATION = 0.75  # largest second-order part relative to the step (Transtrum and Sethna)
+DIFFERENCE = 0.1  # of the step: spacing of the second difference (Transtrum and Sethna)
 STALLED_STEP = 1e-15  # a relative step that no longer changes the parameters in double precision
 
 
 class AbstractNormalEquations(eqx.Module):
-    """Objective ½|r|², gradient Jᵀr and Gauss-Newton matrix JᵀJ of a residual r, however stored."""
+    """Objective ½|r|², gradient Jᵀr and Gauss-Newton matrix JᵀJ of a residual r.
+
+    Subclasses decide how the matrix is stored.
+    """
 
     objective: eqx.AbstractVar[Float[Array, ""]]
     gradient: eqx.AbstractVar[Float[Array, " parameter"]]
@@ -52,11 +54,11 @@ class AbstractNormalEquations(eqx.Module):
 
     @abc.abstractmethod
     def scaled(self, by: Float[Array, " parameter"]) -> "AbstractNormalEquations":
-        """The same in the parameters z = `by` · y."""
+        """The normal equations in the parameters z = `by` · y."""
 
     @abc.abstractmethod
     def hessian(self) -> lx.AbstractLinearOperator:
-        """JᵀJ, for the descent and the search of optimistix."""
+        """JᵀJ as an operator, for the descent and the search of optimistix."""
 
 
 class NormalEquations(AbstractNormalEquations):
@@ -71,14 +73,14 @@ class NormalEquations(AbstractNormalEquations):
         return jnp.diagonal(self.matrix)
 
     def scaled(self, by: Float[Array, " parameter"]) -> "NormalEquations":
-        """The same in the parameters z = `by` · y."""
+        """The normal equations in the parameters z = `by` · y."""
         matrix = self.matrix / by[:, None] / by[None, :]
         return NormalEquations(self.objective, self.gradient / by, matrix)
 
     def finite(self) -> "NormalEquations":
-        """The same, with an infinite objective where value or slope are not finite.
+        """The normal equations, with an infinite objective if value or slope is not finite.
 
-        A slope that is not finite is as bad as such a value: nothing could follow from this point.
+        A point whose slope is not finite is useless too: no step can start from it.
         """
         finite = jnp.isfinite(self.objective) & jnp.isfinite(self.gradient).all()
         return NormalEquations(
@@ -95,9 +97,11 @@ def normal_equations(
     y: Float[Array, " parameter"],
     args: Any = None,
 ) -> NormalEquations:
-    """Evaluate the normal equations of `residual(y, args)`, by forward differentiation."""
+    """Normal equations of `residual(y, args)`, by forward differentiation."""
 
-    def twice(y):
+    def twice(
+        y: Float[Array, " parameter"],
+    ) -> tuple[Float[Array, " sample"], Float[Array, " sample"]]:
         r = residual(y, args)
         return r, r
 
@@ -128,15 +132,19 @@ def second_order(
     step: Float[Array, " parameter"],
     args: Any = None,
 ) -> Float[Array, " parameter"]:
-    """Jᵀ r″, r″ the second derivative of the residual along the step."""
+    """Jᵀ r″, where r″ is the second derivative of the residual along the step."""
 
-    def value(y):
+    def value(y: Float[Array, " parameter"]) -> Float[Array, " sample"]:
         return residual(y, args)
 
-    # By differences, which are good enough for a step: nested derivatives compile twice as long.
+    # Differences are accurate enough for a step. Nested derivatives compile twice as long.
     ends = jax.vmap(value)(y[None, :] + DIFFERENCE * jnp.array([[1.0], [-1.0]]) * step[None, :])
     middle, pullback = jax.vjp(value, y)
     return pullback((ends.sum(0) - 2 * middle) / DIFFERENCE**2)[0]
+
+
+Residual = Callable[[Array, Any], tuple[Array, Any]]
+"""A residual function of optimistix: (y, args) to the residual and an auxiliary output."""
 
 
 class _State(eqx.Module):
@@ -151,12 +159,13 @@ class _State(eqx.Module):
     idle: Int[Array, ""]
 
 
-def _value(fn):
+def _value(fn: Residual) -> Callable[[Array, Any], Array]:
     """`fn` without its auxiliary output."""
     return lambda y, args: fn(y, args)[0]
 
 
-def _select(pred, new: PyTree, old: PyTree) -> PyTree:
+def _select(pred: Bool[Array, ""], new: PyTree, old: PyTree) -> PyTree:
+    """`new` where `pred`, else `old`."""
     return jax.tree.map(lambda a, b: jnp.where(pred, a, b), new, old)
 
 
@@ -166,23 +175,23 @@ class LevenbergMarquardt(optx.AbstractLeastSquaresSolver):
     The residual function takes and returns one-dimensional arrays.
 
     Attributes:
-        rtol: Stop when the relative offset, |Q₁ᵀ r| / |r| with Q₁ a basis of the range of J, is
-            below this.
-        atol: Stop when the remaining Gauss-Newton step, scaled, is below this times the scaled
-            parameters (problems without noise, where the residual itself vanishes).
-        ftol: Stop when several accepted steps in a row each reduce |r|² by less than this part, and
-            promised no more: along a valley whose floor is flat within rounding, as of a
-            superfluous pole, the two criteria above are never met.
+        rtol: Stop when the relative offset is below this. The relative offset is |Q₁ᵀ r| / |r|,
+            where Q₁ is a basis of the range of J.
+        atol: Stop when the remaining scaled Gauss-Newton step is below this times the scaled
+            parameters (for problems without noise, where the residual itself vanishes).
+        ftol: Stop when several accepted steps in a row each reduce |r|² by less than this fraction,
+            and each predicted no larger reduction. A valley whose floor is flat within rounding,
+            for example of a superfluous pole, never meets the two criteria above.
         norm: Norm of the scaled step and parameters.
-        geodesic: Bend each step along the model's curvature, by its second derivative (Transtrum
-            and Sethna 2012, arXiv:1201.5885): curved valleys take a fraction of the steps, and each
-            costs a third more.
+        geodesic: Bend each step along the curvature of the model, by its second derivative
+            (Transtrum and Sethna 2012, arXiv:1201.5885). In curved valleys this takes a fraction of
+            the steps. Each step costs a third more.
         descent: Solves the damped step.
-        search: Accepts it and sets the damping.
-        equations: Evaluates the normal equations of `fn(y, args)`. With a descent that knows their
-            kind, a problem of many parameters can keep its structure.
+        search: Accepts or rejects the step and sets the damping.
+        equations: Evaluates the normal equations of `fn(y, args)`. Own equations together with a
+            matching `descent` keep the structure of a problem with many parameters.
         second_order: Evaluates Jᵀ r″ of `fn(y, args)`.
-        empty: Makes normal equations of zeros, for parameters and `args`.
+        empty: Returns normal equations of zeros for given parameters and `args`.
     """
 
     rtol: float = 1e-6
@@ -190,8 +199,9 @@ class LevenbergMarquardt(optx.AbstractLeastSquaresSolver):
     ftol: float = 1e-8
     norm: Callable[[PyTree], Array] = optx.two_norm
     descent: optx.AbstractDescent = optx.DampedNewtonDescent(linear_solver=lx.Cholesky())
-    # MINPACK's threshold, and constants whose powers differ: with 10 and 1/10 the damping returns
-    # over and over to the value just rejected, and a curved valley costs three times the steps.
+    # MINPACK's threshold, and two constants that are not powers of each other. With 10 and 1/10 the
+    # damping returns again and again to the value just rejected; a curved valley then takes three
+    # times as many steps.
     search: optx.ClassicalTrustRegion = optx.ClassicalTrustRegion(
         high_cutoff=0.75, high_constant=5.0, low_constant=0.25
     )
@@ -200,8 +210,17 @@ class LevenbergMarquardt(optx.AbstractLeastSquaresSolver):
     second_order: Callable[[Callable, Array, Array, Any], Array] = second_order
     empty: Callable[[Array, Any], AbstractNormalEquations] = empty
 
-    def init(self, fn, y, args, options, f_struct, aux_struct, tags) -> _State:
-        """Set up an empty state; the first step evaluates `y` itself."""
+    def init(
+        self,
+        fn: Residual,
+        y: Array,
+        args: PyTree,
+        options: dict[str, Any],
+        f_struct: PyTree[jax.ShapeDtypeStruct],
+        aux_struct: PyTree[jax.ShapeDtypeStruct],
+        tags: frozenset[object],
+    ) -> _State:
+        """An empty state; the first step evaluates `y` itself."""
         del fn, options, f_struct, aux_struct, tags
         zero = self.empty(y, args)
         return _State(
@@ -216,13 +235,21 @@ class LevenbergMarquardt(optx.AbstractLeastSquaresSolver):
             idle=jnp.array(0),
         )
 
-    def _info(self, equations: AbstractNormalEquations):
+    def _info(self, equations: AbstractNormalEquations) -> Any:  # FunctionInfo.EvalGradHessian
         return optx.FunctionInfo.EvalGradHessian(
             equations.objective, equations.gradient, equations.hessian()
         )
 
-    def step(self, fn, y, args, options, state: _State, tags):
-        """Evaluate the trial point, accept or reject it, and propose the next."""
+    def step(
+        self,
+        fn: Residual,
+        y: Array,
+        args: PyTree,
+        options: dict[str, Any],
+        state: _State,
+        tags: frozenset[object],
+    ) -> tuple[Array, _State, None]:
+        """Evaluate the trial point, accept or reject it, and propose the next trial point."""
         del options, tags
         trial = self.equations(_value(fn), state.y_eval, args)
         step_size, accept, _, search_state = self.search.step(
@@ -238,7 +265,7 @@ class LevenbergMarquardt(optx.AbstractLeastSquaresSolver):
         promised = -self.search.predict_reduction(tried, self._info(state.accepted))
         reduced = state.accepted.objective - trial.objective
         negligible = jnp.maximum(jnp.abs(reduced), promised) <= self.ftol * trial.objective
-        # Once is no sign of it: after a rejection, a step is as short as its reduction is small.
+        # One such step proves nothing: a step after a rejection is short, so it reduces little.
         idle = jnp.where(negligible & ~state.first_step, state.idle + 1, 0)
         idle = jnp.where(accept, idle, state.idle)
         accepted = _select(accept, trial, state.accepted)
@@ -247,12 +274,12 @@ class LevenbergMarquardt(optx.AbstractLeastSquaresSolver):
         scale = jnp.maximum(state.scale, diagonal)
         safe = jnp.where(scale > 0, scale, 1.0)
 
-        # The step is solved in z = D y; a descent takes the damping as 1 / step_size.
+        # The step is solved in z = D y. The descent takes the damping as 1 / step_size.
         scaled = accepted.scaled(safe)
         info = self._info(scaled)
         descent_state = self.descent.query(y, info, self.descent.init(y, info))
-        # A factorisation that fails proposes a step that is not finite; the next trial rejects it
-        # and raises the damping.
+        # If the factorisation fails, the proposed step is not finite. The next trial rejects it and
+        # raises the damping.
         proposed, _ = self.descent.step(step_size / INITIAL_DAMPING, descent_state)
         if self.geodesic:
             bent = self.second_order(_value(fn), y, proposed / safe, args) / safe
@@ -269,8 +296,8 @@ class LevenbergMarquardt(optx.AbstractLeastSquaresSolver):
         offset = -jnp.dot(newton, scaled.gradient)  # |Q₁ᵀ r|²
         squares = 2 * accepted.objective
         converged = offset <= self.rtol**2 * squares
-        # Rounding in the residual is ε times the model, which is about |J y|: a reduction of |r|²
-        # below |r| times that cannot be seen, and the rejection of a step then means nothing.
+        # The rounding error of the residual is ε times the model, which is about |J y|. A reduction
+        # of |r|² below |r| times this error is invisible, and a rejected step then means nothing.
         model = self.norm(diagonal * y)
         unseen = offset <= ROUNDING * jnp.finfo(y.dtype).eps * jnp.sqrt(squares) * model
         converged = converged | (unseen & ~accept)
@@ -295,12 +322,30 @@ class LevenbergMarquardt(optx.AbstractLeastSquaresSolver):
         )
         return y, state, None
 
-    def terminate(self, fn, y, args, options, state: _State, tags):
+    def terminate(
+        self,
+        fn: Residual,
+        y: Array,
+        args: PyTree,
+        options: dict[str, Any],
+        state: _State,
+        tags: frozenset[object],
+    ) -> tuple[Bool[Array, ""], optx.RESULTS]:
         """Whether to stop, and the verdict so far."""
         del fn, y, args, options, tags
         return state.terminate, state.result
 
-    def postprocess(self, fn, y, aux, args, options, state: _State, tags, result):
+    def postprocess(
+        self,
+        fn: Residual,
+        y: Array,
+        aux: Any,
+        args: PyTree,
+        options: dict[str, Any],
+        state: _State,
+        tags: frozenset[object],
+        result: optx.RESULTS,
+    ) -> tuple[Array, Any, dict[str, Any]]:
         """Return the normal equations at the solution as statistics: the covariance needs them."""
         del fn, args, options, tags, result
         stats = {"normal_equations": state.accepted, "accepted_steps": state.accepted_steps}

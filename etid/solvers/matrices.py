@@ -1,22 +1,21 @@
-"""Inverses of symmetric matrices, each in its own scaling.
+"""Inverses and roots of symmetric matrices, each scaled to a unit diagonal.
 
-The parameters of a fit have different units, or are known with very different accuracy. A matrix of
-their curvatures is therefore scaled to a unit diagonal, D⁻¹ M D⁻¹ with D² the diagonal of M, before
-it is factorised. All functions here do so.
+The parameters of a fit have different units, or very different accuracies. Every function here
+therefore scales its matrix M before it is factorised: D⁻¹ M D⁻¹, where D² is the diagonal of M.
 """
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-SMALLEST = 1e-12  # of a scaled matrix; below it double precision sees nothing
+SMALLEST = 1e-12  # eigenvalue of a scaled matrix; double precision resolves no smaller one
 
 
 def inverse(matrix: Float[Array, "n n"], *, drop: bool = False) -> Float[Array, "n n"]:
     """Inverse of a symmetric matrix.
 
-    Directions without information keep an enormous variance, or with `drop` none: nuisances that
-    the data do not determine have no effect either.
+    Directions without information get an enormous variance. With `drop` they get none: nuisance
+    parameters that the data do not determine do not affect the other parameters.
     """
     scaled, scale = _unit_diagonal(matrix)
     values, vectors = jnp.linalg.eigh(scaled)
@@ -26,9 +25,9 @@ def inverse(matrix: Float[Array, "n n"], *, drop: bool = False) -> Float[Array, 
 
 
 def inverse_of_few(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
-    """Inverse of a positive definite matrix of a few rows, all lanes at once.
+    """Inverse of a positive definite matrix of a few rows, for all lanes at once.
 
-    By Gauss and Jordan: a call of LAPACK for each lane costs twenty times as much.
+    It uses Gauss-Jordan elimination: a call of LAPACK for each lane costs twenty times as much.
     """
     scaled, scale = _unit_diagonal(matrix)
     size = matrix.shape[0]
@@ -54,13 +53,13 @@ def inverse_root(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
 def _unit_diagonal(
     matrix: Float[Array, "n n"],
 ) -> tuple[Float[Array, "n n"], Float[Array, " n"]]:
-    """D⁻¹ M D⁻¹ and the diagonal of D; 1 where M has no positive diagonal."""
+    """D⁻¹ M D⁻¹ and the diagonal of D, which is 1 where the diagonal of M is not positive."""
     scale = jnp.sqrt(jnp.maximum(jnp.diagonal(matrix), 0.0))
     scale = jnp.where(scale > 0, scale, 1.0)
     return matrix / scale[:, None] / scale[None, :], scale
 
 
 def _factor(matrix: Float[Array, "n n"]) -> tuple[Float[Array, "n n"], Float[Array, " n"]]:
-    """Cholesky factor of D⁻¹ M D⁻¹, with a ridge for directions of which nothing is known."""
+    """Cholesky factor of D⁻¹ M D⁻¹ with a ridge for directions without information, and D."""
     scaled, scale = _unit_diagonal(matrix)
     return jax.scipy.linalg.cholesky(scaled + SMALLEST * jnp.eye(scale.size), lower=True), scale

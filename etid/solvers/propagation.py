@@ -1,4 +1,4 @@
-"""Standard errors of an impedance from those of its parameters."""
+"""Standard errors of an impedance from the covariance of its parameters."""
 
 from collections.abc import Callable
 
@@ -17,8 +17,8 @@ def log_stderr(
     var = J cov Jᵀ,    J = ∂(ln |Z|, arg Z) / ∂parameters
 
     Args:
-        response: Impedance [Ω] at all frequencies as a function of the parameters.
-        values: Where to linearise.
+        response: Impedance at all frequencies [Ω] as a function of the parameters.
+        values: Parameters at which the response is linearised.
         cov: Covariance of the parameters.
     """
 
