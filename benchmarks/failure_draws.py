@@ -31,6 +31,7 @@ from benchmarks.mappings import make_room
 from etid.circuits.circuit import AbstractCircuit, Resistor, SkinRC
 from etid.estimators.registry import REFINED, Method, choose
 from etid.recordings.preflight import Inspected
+from etid.results.driver import DiscreteDriver
 from etid.signals.transfer import is_stable
 from etid.simulation.scenes import Scene
 from etid.simulation.transformer import Impedance, SkinLoad
@@ -204,7 +205,7 @@ class Draw:
                 yield Answer(name, self.seed, record.path, "driver_failed", nothing, nothing, bound)
             return
         loads = {t.path: t.load for t in self.cell.scene.trials}
-        discrete = driver.source is None and not bool(is_stable(driver.a))
+        discrete = isinstance(driver, DiscreteDriver) and not bool(is_stable(driver.a))
         fits = etid.identify_skins(records, driver, method=method, circuit=self.cell.circuit)
         for number, record in enumerate(records):
             fit, path = fits[number], record.path

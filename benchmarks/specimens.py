@@ -18,7 +18,7 @@ from benchmarks import mutations
 from benchmarks.mutations import Rng
 from etid import cli
 from etid.recordings.preflight import Inspected, preflight
-from etid.results.driver import Calibration, SourceImpedance
+from etid.results.driver import Calibration, ContinuousDriver, SourceImpedance
 from etid.results.provenance import Settings
 from etid.results.study_fits import StudyFits
 from etid.results.verdicts import message, verdict, verdicts_of
@@ -168,13 +168,13 @@ def study_fits() -> StudyFits:
     )
     fits = etid.Fits(fit, labels, np.array([message(name) for name in names]))
     numbers = (np.log(5e3), [np.log(4e5)], [np.log(0.3)], [5e3], [2e3], [np.log(6e2)], [-3e3])
-    driver = etid.Driver(
+    driver = ContinuousDriver(
         b=jnp.ones(3),
         a=jnp.ones(4),
         sample_rate=2e5,
         source=SourceImpedance(*map(jnp.asarray, numbers)),
         cov=1e-4 * jnp.eye(7),
-        calibration=Calibration(jnp.array([98.8e3]), jnp.array(np.nan), jnp.zeros(1), None),
+        calibration=Calibration(jnp.array([98.8e3]), jnp.zeros(1), jnp.array(np.nan)),
         rrse=jnp.array(0.003),
         chi2=jnp.array(1.1),
         result=verdict("successful"),

@@ -16,7 +16,7 @@ import numpy as np
 
 import etid
 from etid.plotting import figure_of
-from etid.results.driver import Calibration, Driver, SourceImpedance
+from etid.results.driver import Calibration, ContinuousDriver, Driver, SourceImpedance
 from etid.results.fits import Fit, Fits
 from etid.results.verdicts import verdicts_of
 from etid.simulation.scenes import PRESETS
@@ -46,13 +46,13 @@ def driver(verdict: str = "successful") -> Driver:
     )
     errors = np.array([0.3, 0.05, 0.02, 0.1, 0.02, 100, 50, 200, 50, 0.02, 50])
     r_load = jnp.array([98.8e3])
-    return Driver(
+    return ContinuousDriver(
         b=jnp.ones(6),
         a=jnp.ones(6),
         sample_rate=200e3,
         source=source,
         cov=jnp.diag(jnp.asarray(errors**2)),
-        calibration=Calibration(r_load, jnp.array(2.5e-6), jnp.zeros(1), None),
+        calibration=Calibration(r_load, jnp.zeros(1), jnp.array(0.5)),
         rrse=jnp.array(1e-3),
         chi2=jnp.array(1.02),
         result=verdicts_of(np.array(verdict)),

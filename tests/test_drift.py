@@ -11,7 +11,7 @@ from jax.flatten_util import ravel_pytree
 import etid
 from benchmarks.ladder import LOADS
 from benchmarks.perturbed_study import drawn_driver
-from etid.results.driver import SourceImpedance
+from etid.results.driver import ContinuousDriver, SourceImpedance
 from etid.simulation.scenes import Scene, Trial
 from etid.simulation.transformer import OpenLoad, ResistorLoad, SkinLoad, TransformerDriver, loading
 
@@ -111,4 +111,6 @@ def test_a_study_and_its_file_pass_the_drift_on(tmp_path):
     for one in (*found, etid.StudyFits.read(tmp_path / "fits.h5")):
         assert one.settings is not None
         assert one.settings.driver_drift == DRIFT
-        assert [driver.drift for driver in one.drivers.values()] == [DRIFT]
+        (driver,) = one.drivers.values()
+        assert isinstance(driver, ContinuousDriver)
+        assert driver.drift == DRIFT

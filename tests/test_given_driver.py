@@ -35,7 +35,7 @@ def information(driver):
     )
     sigma_th, sigma_out = (float(noise(v, np.asarray(0.0))) for v in (noisy.v_th, noisy.v_out))
     parameters, unflatten = ravel_pytree(driver.source)
-    at = np.append(np.asarray(parameters), float(driver.calibration.delay[0]))
+    at = np.append(np.asarray(parameters), float(driver.calibration.delay_samples[0]))
 
     def gain(p):
         z = np.asarray(unflatten(jnp.asarray(p[:-1])).response(jnp.asarray(f)))
@@ -68,7 +68,7 @@ def test_the_covariance_of_a_driver_is_the_inverse_of_its_information(driver):
 
 def test_what_a_calibration_tells_is_one_standard_deviation_along_each_direction(driver):
     """z is scaled by the information, so that its covariance is 1, and its mean next to 0."""
-    frequency = driver.calibration.spectra.frequency[0]
+    frequency = driver.spectra.frequency[0]
     known = lanes.given(driver, frequency, False)
     of = np.linalg.eigvalsh(np.asarray(known.cov))
     assert of.min() > 0.8, of

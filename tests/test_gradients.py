@@ -12,6 +12,7 @@ from jaxtyping import Array
 
 import etid
 from etid.estimators.maximum_likelihood import load as single_load
+from etid.results.driver import ContinuousDriver
 from etid.simulation.scenes import Scene, Trial
 from etid.simulation.transformer import ResistorLoad, SkinLoad
 
@@ -49,7 +50,7 @@ def derivatives(load, circuit, order, monkeypatch):
         )
         return fit.circuit.log_values()
 
-    assert driver.calibration is not None
+    assert isinstance(driver, ContinuousDriver)
     r_load = driver.calibration.r_load
     shape = jnp.sin(jnp.arange(2000.0) * 0.13) + 0.3
     both = jax.jit(lambda v, r, dv, dr: jax.jvp(elements, (v, r), (dv, dr)))

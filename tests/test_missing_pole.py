@@ -8,7 +8,7 @@ import pytest
 import etid
 from benchmarks.failure_axes import transformer
 from benchmarks.ladder import CALIBRATION, rung
-from etid.estimators.refinement import calibrations_of
+from etid.estimators.maximum_likelihood.driver import Calibrations
 from etid.estimators.score_tests import missing_pole
 from etid.results.driver import SourceImpedance
 
@@ -62,6 +62,6 @@ def test_an_order_that_is_high_enough_shows_noise_only(identified):
     for seed in range(8):
         _, driver = identified(3, 3, seed)
         assert driver.verdict == "successful"
-        squares.append(np.asarray(squares_of(calibrations_of(driver))))
+        squares.append(np.asarray(squares_of(Calibrations.of(driver))))
     assert np.nanmax(squares) < missing_pole.SEEN
     assert abs(np.nanmean(squares) - 2) < 5 * 0.22

@@ -13,6 +13,7 @@ from benchmarks.ladder import LOADS
 from etid.estimators import non_parametric
 from etid.identify.lanes import lane
 from etid.recordings.preflight import Inspected
+from etid.results.driver import HarmonicDriver
 from etid.results.verdicts import verdict
 from etid.signals.harmonics import Spectrum
 from etid.signals.transfer import as_complex
@@ -29,7 +30,7 @@ def z(fit, name):
 def coarse_driver(study):
     """A driver whose Z_th is a third too large, and known to be wrong: only harmonics are used."""
     driver = etid.identify_driver(list(study.calibrations.recordings()), throw=False)
-    assert driver.source is not None
+    assert isinstance(driver, HarmonicDriver)
     wrong = jax.tree.map(lambda leaf: 1.3 * leaf, (driver.source.gain, driver.source.slope))
     source = dataclasses.replace(driver.source, gain=wrong[0], slope=wrong[1])
     return dataclasses.replace(driver, source=source, result=verdict("misfit"))
@@ -121,7 +122,6 @@ def test_one_unloaded_record_has_one_noise():
 
 def test_bias_is_taken_off_the_estimate(study, coarse, monkeypatch):
     """In the place of a bias the change that a larger Y makes; R alone keeps it cheap."""
-    calibration = coarse.calibration
     *fields, rate = map(jnp.asarray, lane(Inspected(study["dry"]), "non_parametric"))
     start = jnp.array([[np.log(150e3), 0.0]])
 
@@ -134,7 +134,7 @@ def test_bias_is_taken_off_the_estimate(study, coarse, monkeypatch):
         with monkeypatch.context() as patched:
             patched.setattr(non_parametric, "_bias", bias)
             estimate, off = non_parametric.fit_circuit(
-                etid.Resistor(), calibration, coarse.sample_rate, spectrum, rate, start
+                etid.Resistor(), coarse, spectrum, rate, start
             )
         return estimate.parameters, off
 

@@ -16,6 +16,7 @@ from etid.identify.lanes import lane
 from etid.online import gain_bands
 from etid.online.tracker import MEMORY, PATIENCE, Tracker
 from etid.recordings.preflight import Inspected
+from etid.results.driver import ContinuousDriver
 from etid.signals.harmonics import ALIASED, Spectrum
 from etid.simulation.scenes import Scene, Trial
 from etid.simulation.transformer import ResistorLoad, SkinLoad, loading
@@ -133,8 +134,8 @@ def explained():
     The trigger of the records is 0.3 µs late.
     """
     driver, _ = calibrated()
+    assert isinstance(driver, ContinuousDriver)
     source = driver.source
-    assert source is not None
     tracker = Tracker.of(driver, quiet()["cal/0"], electrodes=2)
     model = tracker.model
     model = dataclasses.replace(model, source=source.response(model.bands.frequency))
@@ -243,7 +244,9 @@ def test_after_some_pulses_it_is_what_a_batch_fit_of_these_periods_is():
 def batch(driver, recording):
     """Elements by maximum likelihood from the harmonics of a whole record, with the same Z_th."""
     *fields, rate = map(jnp.asarray, lane(Inspected(recording), "maximum_likelihood"))
-    model = maximum_likelihood.Joint(etid.SkinRC(), refinement.calibrations_of(driver), False)
+    model = maximum_likelihood.Joint(
+        etid.SkinRC(), maximum_likelihood.Calibrations.of(driver), False
+    )
     spectrum = Spectrum(*fields)
     selected = spectrum.selected & (spectrum.frequency < ALIASED * RATE)
     spectrum = dataclasses.replace(spectrum, selected=selected)

@@ -14,6 +14,7 @@ import etid
 from benchmarks import paper, paper_tables
 from etid.paper import demo, tables
 from etid.report import html as report
+from etid.results.driver import DiscreteDriver
 from etid.results.verdicts import verdict, verdicts_of
 
 EXCESS = 1.1  # of every identified element over the true one
@@ -91,8 +92,8 @@ def _outcome(excess):
     truth = etid.scenes.paper().truth()
     skins = [path for path in truth if "r_s" in truth[path]]
     resistors = [path for path in truth if path.startswith("resistors/")]
-    driver = etid.Driver(
-        b=jnp.ones(2), a=jnp.ones(2), sample_rate=2e5, source=None, cov=None, calibration=None,
+    driver = DiscreteDriver(
+        b=jnp.ones(2), a=jnp.ones(2), sample_rate=2e5,
         rrse=jnp.array(0.1), chi2=jnp.array(1.0), result=verdict("successful"), steps=jnp.array(1),
         method="by hand",
     )  # fmt: skip

@@ -18,7 +18,12 @@ from etid.report import citations, figures, tables, worst_fits
 from etid.report import methods as methods_section
 from etid.report.html import Table
 from etid.report.recordings import Recordings
-from etid.results.driver import Calibration, SourceImpedance
+from etid.results.driver import (
+    Calibration,
+    ContinuousDriver,
+    DiscreteDriver,
+    SourceImpedance,
+)
 from etid.results.provenance import Settings
 from etid.results.study_fits import StudyFits
 from etid.results.verdicts import message, verdict, verdicts_of
@@ -54,9 +59,9 @@ def driver():
         *map(jnp.asarray, (np.log(5e3), [np.log(4e5)], [np.log(0.3)], [5e3], [2e3], [6e2], [-3e3]))
     )
     source = dataclasses.replace(source, log_omega_real=jnp.log(source.log_omega_real))
-    return etid.Driver(
+    return ContinuousDriver(
         b=jnp.ones(3), a=jnp.ones(4), sample_rate=2e5, source=source, cov=1e-4 * jnp.eye(7),
-        calibration=Calibration(jnp.array([98.8e3]), jnp.array(np.nan), jnp.zeros(1), None),
+        calibration=Calibration(jnp.array([98.8e3]), jnp.zeros(1), jnp.array(np.nan)),
         rrse=jnp.array(0.003), chi2=jnp.array(1.1), result=verdict("successful"),
         steps=jnp.array(9), method="maximum_likelihood",
     )  # fmt: skip
@@ -195,11 +200,12 @@ def test_a_file_of_fits_gives_back_drivers_and_settings(found, driver, tmp_path)
 
 
 def test_a_driver_without_a_continuous_impedance_is_kept_as_well(found, driver, tmp_path):
-    plain = dataclasses.replace(driver, source=None, cov=None, calibration=None)
+    common = {field.name: getattr(driver, field.name) for field in dataclasses.fields(etid.Driver)}
+    plain = DiscreteDriver(**common)
     of_old = dataclasses.replace(found, drivers={("calibration/0",): plain})
     of_old.write(tmp_path / "fits.h5")
     (stored,) = StudyFits.read(tmp_path / "fits.h5").drivers.values()
-    assert (stored.source, stored.cov, stored.calibration) == (None, None, None)
+    assert isinstance(stored, DiscreteDriver)
     place = Recordings(
         dataclasses.replace(of_old, drivers={("calibration/0",): stored}), None, None
     )

@@ -26,7 +26,7 @@ from etid.estimators.maximum_likelihood.terms import (
 )
 from etid.estimators.score_tests import other_circuit
 from etid.estimators.score_tests.unloaded import UnloadedShape
-from etid.results.driver import Driver
+from etid.results.driver import ContinuousDriver, DiscreteDriver, Driver
 from etid.results.fits import Fit
 from etid.results.verdicts import RESULTS, first_verdict
 from etid.signals.harmonics import Spectrum
@@ -95,7 +95,10 @@ def skin_by_steiglitz_mcbride(m: Measurement, driver: Driver, iterations: int) -
 
 
 def skin_by_harmonic_steiglitz_mcbride(
-    spectrum: Spectrum, sample_rate: Float[Array, ""], driver: Driver, known: UnloadedShape | None
+    spectrum: Spectrum,
+    sample_rate: Float[Array, ""],
+    driver: ContinuousDriver,
+    known: UnloadedShape | None,
 ) -> Fit:
     """SkinRC by Steiglitz-McBride on the harmonics, judged by the likelihood with Z_th as it is.
 
@@ -106,7 +109,6 @@ def skin_by_harmonic_steiglitz_mcbride(
         known: The unloaded voltage of its calibration, if it can be compared.
     """
     source, source_cov = driver.source, driver.later_cov()
-    assert source is not None  # check_driver
     best = harmonic_steiglitz_mcbride.fit_skin(spectrum, source.response(spectrum.frequency))
     values = best.circuit.values()
     late = best.delay * sample_rate
@@ -159,7 +161,7 @@ def _is_another(
     own: Float[Array, " own"],
     sample_rate: Float[Array, ""],
     circuit: SkinRC,
-    driver: Driver,
+    driver: ContinuousDriver,
 ) -> Bool[Array, ""]:
     """Whether the load is seen to be another circuit, whatever Z_th is within its covariance.
 
@@ -171,7 +173,6 @@ def _is_another(
         circuit: The circuit.
         driver: Its driver.
     """
-    assert driver.cov is not None  # check_driver
     f, elements = spectrum.frequency, own.size - 1
     s = frequency_variable(f)
     vector, unflatten = ravel_pytree(driver.source)
@@ -226,7 +227,7 @@ def _is_another(
 
 def driver_by_steiglitz_mcbride(
     m: Measurement, r_load: Float[Array, " record"], order: int, iterations: int
-) -> Driver:
+) -> DiscreteDriver:
     """The paper's estimate of Z_th (eqs. 4-6); `iterations` 1 is equation error."""
     best = steiglitz_mcbride.driver_filter(m.v_th, m.v_out, r_load, order, iterations)
     free = best.filter.num.size
@@ -241,13 +242,10 @@ def driver_by_steiglitz_mcbride(
     chi2, distance = jax.vmap(score)(m, r_load)
     chi2 = chi2.max()
     unstable = ~jnp.isfinite(best.rrse) | ~best.stable
-    return Driver(
+    return DiscreteDriver(
         b=best.filter.num,
         a=best.filter.den,
         sample_rate=m.sample_rate[0],
-        source=None,
-        cov=None,
-        calibration=None,
         rrse=best.rrse,
         chi2=jnp.where(jnp.isfinite(best.rrse), chi2, jnp.inf),
         result=first_verdict(

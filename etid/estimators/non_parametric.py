@@ -24,7 +24,7 @@ from jaxtyping import Array, Bool, Complex, Float
 from etid.circuits.circuit import AbstractCircuit
 from etid.estimators.estimate import DELAY_WIDTH, MAX_STEPS, SOLVER, Estimate
 from etid.estimators.maximum_likelihood.terms import as_list, excess, same_unloaded, stands_out
-from etid.results.driver import Calibration
+from etid.results.driver import HarmonicDriver
 from etid.results.fits import complex_rrse
 from etid.signals.harmonics import Spectrum, signal_share
 from etid.signals.transfer import as_complex, delayed, frequency_variable, power, reciprocal
@@ -163,8 +163,7 @@ class _Model(eqx.Module):
 
 def fit_circuit(
     circuit: AbstractCircuit,
-    calibration: Calibration,
-    calibration_rate: Float[Array, ""],
+    driver: HarmonicDriver,
     spectrum: Spectrum,
     sample_rate: Float[Array, ""],
     candidates: Float[Array, "start own"],
@@ -173,8 +172,7 @@ def fit_circuit(
 
     Args:
         circuit: Structure of the load.
-        calibration: The calibrations, with harmonics of the same pulse rate.
-        calibration_rate: Their sampling rate [Hz].
+        driver: Its driver, whose calibrations have the same pulse rate.
         spectrum: The recording.
         sample_rate: Its sampling rate [Hz].
         candidates: Logarithms of elements, and delays in samples, to start from; the start that
@@ -184,15 +182,16 @@ def fit_circuit(
         The estimate, whose parameters are the logarithms of the elements, and the bias that has
         been subtracted from them.
     """
-    assert calibration.spectra is not None  # check_driver
-    known, elements = as_list(calibration.spectra), candidates.shape[1] - 1
+    calibration, calibration_rate = driver.calibration, jnp.asarray(driver.sample_rate)
+    known, elements = as_list(driver.spectra), candidates.shape[1] - 1
     count = min(spectrum.x.size, known[0].x.size)
     records = [jax.tree.map(lambda leaf: leaf[:count], s) for s in (*known, spectrum)]
     clear = _clear(records[:-1])
     selected = clear.any(0) & records[-1].selected
     model = _Model(circuit, calibration.r_load, calibration_rate, sample_rate, clear, selected)
 
-    late = jnp.broadcast_to(calibration.delay, (candidates.shape[0], calibration.delay.size))
+    late = calibration.delay_samples
+    late = jnp.broadcast_to(late, (candidates.shape[0], late.size))
     starts = jnp.concatenate([candidates[:, :-1], late, candidates[:, -1:]], axis=1)
     best = best_start(lambda q: model.terms(q, records), starts)
 

@@ -1,6 +1,7 @@
 """Refinement: samples or harmonics in, judged estimate out; for one recording and for a batch."""
 
 import dataclasses
+import functools
 
 import jax
 import jax.numpy as jnp
@@ -21,14 +22,13 @@ from etid.estimators.judgement import (
     unless,
 )
 from etid.estimators.maximum_likelihood import driver as maximum_likelihood
-from etid.estimators.maximum_likelihood import given_driver
 from etid.estimators.maximum_likelihood import load as single_load
 from etid.estimators.maximum_likelihood.given_driver import GivenDriver
 from etid.estimators.output_error import fit as output_error
 from etid.estimators.output_error import prediction
 from etid.estimators.score_tests import missing_pole, resistors
 from etid.estimators.score_tests.unloaded import UnloadedShape
-from etid.results.driver import Driver, SourceImpedance
+from etid.results.driver import ContinuousDriver, Driver, HarmonicDriver, SourceImpedance
 from etid.results.fits import Fit
 from etid.results.verdicts import RESULTS, first_verdict
 from etid.signals.harmonics import Spectrum
@@ -67,53 +67,30 @@ def circuit_starts(
 
 
 def skin_by_output_error(
-    m: Measurement, samples: Int[Array, ""], driver: Driver, circuit: AbstractCircuit
+    m: Measurement, samples: Int[Array, ""], driver: ContinuousDriver, circuit: AbstractCircuit
 ) -> Fit:
     """Refine from the best of several starts.
 
     Args:
         m: One recording.
         samples: How many of its first samples were recorded.
-        driver: Its driver, with a continuous source impedance.
+        driver: Its driver.
         circuit: Structure and typical values.
     """
-    source, source_cov, calibration = driver.source, driver.later_cov(), driver.calibration
-    assert source is not None  # check_driver
-    assert calibration is not None
     baseline = None
     if isinstance(circuit, SkinRC):
         baseline = skin_by_steiglitz_mcbride(m, driver, steiglitz_mcbride.ITERATIONS).circuit
     starts = circuit.with_log_values(circuit_starts(circuit, baseline))
     _, estimate, other = output_error.fit_circuit(
-        prediction.prepare(m, samples=samples), source, source_cov, calibration, starts
+        prediction.prepare(m, samples=samples), driver, starts
     )
     fit = judged(estimate, circuit, driver.result, "output_error")
     fit = unless(fit, misses(estimate.chi2, estimate.rrse, INTERPOLATED), RESULTS.biased)
-    if calibration.spectra is not None:
+    if isinstance(driver, HarmonicDriver):
         # Maximum likelihood knows its driver better than output error is exact: what that is off
         # by, three standard errors, would be seen as a relaxation.
         return fit
     return unless(fit, other, RESULTS.misfit)
-
-
-def calibrations_of(driver: Driver) -> maximum_likelihood.Calibrations:
-    """The likelihood of the calibrations of a driver that was identified on their harmonics."""
-    assert driver.source is not None  # check_driver
-    assert driver.calibration is not None
-    return maximum_likelihood.Calibrations(
-        driver.source, driver.calibration, jnp.asarray(driver.sample_rate)
-    )
-
-
-def given(driver: Driver, frequency: Float[Array, " harmonic"], shared: bool) -> GivenDriver:
-    """What `skin_by_maximum_likelihood` needs of a driver, the same for all its loads.
-
-    Args:
-        driver: The driver.
-        frequency: Harmonics of the loads [Hz].
-        shared: Whether the unloaded record of a load may be that of a calibration.
-    """
-    return given_driver.given(driver, calibrations_of(driver), frequency, shared)
 
 
 def harmonic_starts(
@@ -167,18 +144,13 @@ def skin_by_maximum_likelihood(
 def skin_by_non_parametric(
     spectrum: Spectrum,
     sample_rate: Float[Array, ""],
-    driver: Driver,
+    driver: HarmonicDriver,
     known: UnloadedShape | None,
     circuit: AbstractCircuit,
 ) -> Fit:
     """The same with Z_th as the calibrations show it at each harmonic, and their V_th."""
-    source, calibration = driver.source, driver.calibration
-    assert source is not None  # check_driver
-    assert calibration is not None
-    starts = harmonic_starts(spectrum, sample_rate, source.response(spectrum.frequency), circuit)
-    estimate, bias = non_parametric.fit_circuit(
-        circuit, calibration, jnp.asarray(driver.sample_rate), spectrum, sample_rate, starts
-    )
+    starts = harmonic_starts(spectrum, sample_rate, driver.response(spectrum.frequency), circuit)
+    estimate, bias = non_parametric.fit_circuit(circuit, driver, spectrum, sample_rate, starts)
     # It needs the harmonics of the driver, whether or not a model of them was found.
     fit = judged(estimate, circuit, SUCCESSFUL, "non_parametric")
     if known is not None:
@@ -295,7 +267,9 @@ def driver_by_refinement(
     lacks = wrong = jnp.array(False)
     terms = jnp.asarray(m.v_out.size, m.v_out.dtype)
     if spectra is not None:
-        calibrations = maximum_likelihood.Calibrations(source, calibration, m.sample_rate[0])
+        calibrations = maximum_likelihood.Calibrations(
+            source, calibration, spectra, m.sample_rate[0]
+        )
         lacks = missing_pole.is_seen(calibrations)
         terms = 2 * jnp.sum(spectra.selected, dtype=terms.dtype)
         if r_load.size > 1:
@@ -303,7 +277,10 @@ def driver_by_refinement(
             calibration = dataclasses.replace(calibration, mismatch=off)
     if calibration.mismatch is not None:
         wrong = resistors.disagree(calibration.mismatch, estimate.chi2, terms)
-    return Driver(
+    kind = (
+        ContinuousDriver if spectra is None else functools.partial(HarmonicDriver, spectra=spectra)
+    )
+    return kind(
         b=baseline.b,
         a=baseline.a,
         sample_rate=m.sample_rate[0],

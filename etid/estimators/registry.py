@@ -1,7 +1,7 @@
 """The estimators, and which of them can identify what."""
 
 from collections.abc import Sequence
-from typing import Literal, get_args
+from typing import Literal, TypeVar, get_args
 
 import numpy as np
 
@@ -9,7 +9,7 @@ from etid.circuits.circuit import AbstractCircuit, SkinRC
 from etid.estimators import steiglitz_mcbride
 from etid.recordings.preflight import Inspected, preflight
 from etid.recordings.recording import Recording
-from etid.results.driver import Driver
+from etid.results.driver import ContinuousDriver, Driver, HarmonicDriver
 from etid.signals.harmonics import separates_aliases
 from etid.signals.precision import require_float64
 
@@ -27,6 +27,7 @@ REFINED = METHODS[:3]  # those for any circuit
 CONTINUOUS = METHODS[:4]  # those that use a continuous source impedance
 HARMONIC = (*CALIBRATED, METHODS[3])  # those on the harmonics of whole pulse periods
 SAME_PULSE_RATE = 1e-3  # part by which rates may differ: Z_th is smooth
+_Kind = TypeVar("_Kind", bound=Driver)
 
 
 def iterations(method: Method) -> int:
@@ -70,11 +71,6 @@ def check_default(method: Method, circuit: AbstractCircuit) -> None:
         )
 
 
-def has_harmonics(driver: Driver) -> bool:
-    """Whether maximum likelihood can use this driver."""
-    return driver.calibration is not None and driver.calibration.spectra is not None
-
-
 def choose(method: Method | None, recordings: Sequence[Inspected]) -> Method:
     """The method given, or else maximum likelihood if all records hold several whole periods.
 
@@ -91,7 +87,7 @@ def choose(method: Method | None, recordings: Sequence[Inspected]) -> Method:
 
 def _choose_for(method: Method | None, seen: Inspected, driver: Driver) -> Method:
     """As `choose`, for a load that is identified with `driver`."""
-    if method is None and not has_harmonics(driver):
+    if method is None and not isinstance(driver, HarmonicDriver):
         return "output_error"
     return choose(method, [seen])
 
@@ -109,14 +105,12 @@ def plan(given: Method | None, seen: Inspected, driver: Driver) -> tuple[Method,
         method = given or "output_error"
     check_driver(driver, method, seen.recording.sample_rate)
     if method == "non_parametric":
-        _check_pulse_rate(driver, seen.recording)
+        _check_pulse_rate(serving(driver, HarmonicDriver, method), seen.recording)
     return method, name
 
 
-def _check_pulse_rate(driver: Driver, recording: Recording) -> None:
-    assert driver.calibration is not None  # check_driver
-    assert driver.calibration.spectra is not None
-    known = float(driver.calibration.spectra.frequency[0, 0])
+def _check_pulse_rate(driver: HarmonicDriver, recording: Recording) -> None:
+    known = float(driver.spectra.frequency[0, 0])
     if not np.isclose(recording.pulse_rate, known, rtol=SAME_PULSE_RATE):
         raise ValueError(
             f"non_parametric knows Z_th at harmonics of {known:.6g} Hz only, but the recording has "
@@ -124,19 +118,32 @@ def _check_pulse_rate(driver: Driver, recording: Recording) -> None:
         )
 
 
-def check_driver(driver: Driver, method: Method, sample_rate: float) -> None:
-    """Raise ValueError if `driver` cannot serve `method` at `sample_rate` [Hz]."""
-    if method in CONTINUOUS and driver.source is None:
+def serving(driver: Driver, kind: type[_Kind], method: str) -> _Kind:
+    """The driver as the kind that `method` needs.
+
+    Raises:
+        ValueError: It is of a kind that lacks what the method needs.
+    """
+    if isinstance(driver, kind):
+        return driver
+    if not isinstance(driver, ContinuousDriver):
         raise ValueError(
             f"this driver was identified by {driver.method}, which gives no continuous source "
             f"impedance; identify it with method={method!r}"
         )
-    if method in CALIBRATED and not has_harmonics(driver):
-        raise ValueError(
-            f"this driver was identified by {driver.method}, which keeps no harmonics of its "
-            "calibrations; identify it with method='maximum_likelihood'"
-        )
-    if method not in CONTINUOUS and not np.isclose(float(driver.sample_rate), sample_rate):
+    raise ValueError(
+        f"this driver was identified by {driver.method}, which keeps no harmonics of its "
+        "calibrations; identify it with method='maximum_likelihood'"
+    )
+
+
+def check_driver(driver: Driver, method: Method, sample_rate: float) -> None:
+    """Raise ValueError if `driver` cannot serve `method` at `sample_rate` [Hz]."""
+    if method in CALIBRATED:
+        serving(driver, HarmonicDriver, method)
+    elif method in CONTINUOUS:
+        serving(driver, ContinuousDriver, method)
+    elif not np.isclose(float(driver.sample_rate), sample_rate):
         raise ValueError(
             f"{method} needs recording and calibration at one sample rate, but the recording has "
             f"{sample_rate:g} Hz and the driver {float(driver.sample_rate):g} Hz; "

@@ -21,8 +21,8 @@ from etid.circuits.circuit import AbstractCircuit
 from etid.estimators import judgement, refinement
 from etid.estimators.joint import fit as shared_driver
 from etid.estimators.joint.terms import Loads
-from etid.estimators.maximum_likelihood.driver import Joint, fit_load
-from etid.estimators.registry import HARMONIC
+from etid.estimators.maximum_likelihood.driver import Calibrations, Joint, fit_load
+from etid.estimators.registry import HARMONIC, serving
 from etid.estimators.score_tests.unloaded import shape_of
 from etid.identify import changes
 from etid.identify.arguments import circuit_of, order_of, require
@@ -44,7 +44,7 @@ from etid.recordings.preflight import Inspected
 from etid.recordings.remarks import Remark
 from etid.recordings.repeats import Repeats, repeats
 from etid.recordings.study import Study
-from etid.results.driver import Driver
+from etid.results.driver import HarmonicDriver
 from etid.results.fits import Fit
 from etid.results.provenance import Settings
 from etid.results.study_fits import StudyFits
@@ -61,7 +61,7 @@ SINGLE = (
 
 @stored_jit
 def _alone(
-    lanes: Any, count: Int[Array, ""], model: Joint, driver: Driver
+    lanes: Any, count: Int[Array, ""], model: Joint, driver: HarmonicDriver
 ) -> tuple[Loads, Bool[Array, " load"], Bool[Array, " load"]]:
     """Loads identified one by one with Z_th as it is, where a joint fit may start.
 
@@ -88,9 +88,9 @@ def _together(
     model: Joint,
     groups: list[Loads],
     several: tuple[int, ...],
-    driver: Driver,
+    driver: HarmonicDriver,
     tolerance: Array,
-) -> tuple[list[Fit], Driver]:
+) -> tuple[list[Fit], HarmonicDriver]:
     common, cov, found = shared_driver.fit(model, groups, several)
     # All impedances are measured in units of the known resistor.
     power, _ = model.circuit.scaling()
@@ -106,7 +106,7 @@ def _together(
 
     split = model.calibrations.sources
     better = eqx.tree_at(
-        lambda d: (d.source, d.cov, d.calibration.delay, d.result),
+        lambda d: (d.source, d.cov, d.calibration.delay_samples, d.result),
         driver,
         (
             model.calibrations.z_th(common),
@@ -123,7 +123,7 @@ def _together(
 class _Waiting:
     """Recordings with equally many harmonics and one driver."""
 
-    def __init__(self, model: Joint, driver: Driver):
+    def __init__(self, model: Joint, driver: HarmonicDriver):
         self.model = model
         self.driver = driver
         self.rows: list[int] = []
@@ -237,13 +237,14 @@ def identify_jointly(
 
     for row in tqdm(range(len(paths)), unit="recording", disable=not progress):
         try:
-            seen, driver, method = planned(functools.partial(load, row), None)
+            seen, found, method = planned(functools.partial(load, row), None)
             if method not in HARMONIC:
                 raise Refusal("not_periodic", SINGLE)
         except Refusal as refusal:
             fits[row] = failed_fit(refusal.name, circuit, METHOD)
             notes[row] = refusal.note
             continue
+        driver = serving(found, HarmonicDriver, method)
         lengths = waiting.setdefault(drivers.of(seen.recording), {})
         shared = is_shared(seen, driver)
         key = seen.v_th.size, shared, seen.recording.sample_rate, seen.recording.pulse_rate
@@ -251,7 +252,7 @@ def identify_jointly(
             lengths[key] = _Waiting(_model(circuit, driver, shared), driver)
         lengths[key].add(row, seen)
     for names, lengths in tqdm(waiting.items(), unit="driver", disable=not progress):
-        driver = drivers.found[names]
+        driver = next(iter(lengths.values())).driver
         groups = [group.loads() for group in lengths.values()]
         several = tuple(len(group.several()) for group in lengths.values())
         shared = any(group.model.shared for group in lengths.values())
@@ -281,5 +282,5 @@ def _of(fit: Fit, changed: bool) -> Fit:
     return dataclasses.replace(fit, result=verdict("inconsistent")) if explained else fit
 
 
-def _model(circuit: AbstractCircuit, driver: Driver, shared: bool) -> Joint:
-    return Joint(circuit, refinement.calibrations_of(driver), shared)
+def _model(circuit: AbstractCircuit, driver: HarmonicDriver, shared: bool) -> Joint:
+    return Joint(circuit, Calibrations.of(driver), shared)

@@ -18,13 +18,14 @@ from jaxtyping import Array, Float
 from etid.circuits.circuit import AbstractCircuit
 from etid.estimators import baseline, refinement
 from etid.estimators.judgement import MISFIT_CHI2
+from etid.estimators.maximum_likelihood import given_driver
 from etid.estimators.maximum_likelihood.given_driver import GivenDriver
-from etid.estimators.registry import CONTINUOUS, HARMONIC, Method, iterations
+from etid.estimators.registry import CONTINUOUS, HARMONIC, Method, iterations, serving
 from etid.estimators.score_tests.unloaded import UnloadedShape, shape_of
 from etid.identify.compiled import stored_jit
 from etid.recordings.preflight import Inspected
 from etid.recordings.remarks import Remark
-from etid.results.driver import Driver
+from etid.results.driver import ContinuousDriver, Driver, HarmonicDriver
 from etid.results.fits import Fit
 from etid.results.verdicts import message, verdict
 from etid.signals import mains, rounding
@@ -101,7 +102,7 @@ def late_by(lane: tuple[np.ndarray, ...], method: Method, fit: Fit, driver: Driv
     misfit: edges that the load smoothes let its record look later than it is.
     """
     known = method in HARMONIC or method == "output_error"
-    if fit.verdict != "misfit" or not known or driver.source is None:
+    if fit.verdict != "misfit" or not known or not isinstance(driver, ContinuousDriver):
         return 0
     if method in HARMONIC:
         frequency, x, y, variance_x, variance_y, selected, rate = lane
@@ -160,7 +161,7 @@ def checksum(seen: Inspected) -> int:
 
 def is_shared(seen: Inspected, driver: Driver) -> bool:
     """Whether the unloaded record of a recording may be that of a calibration."""
-    known = None if driver.calibration is None else driver.calibration.unloaded
+    known = driver.unloaded if isinstance(driver, HarmonicDriver) else None
     return known is None or checksum(seen) in known
 
 
@@ -186,9 +187,11 @@ def unloaded(driver: Driver, frequency: Float[Array, " harmonic"]) -> UnloadedSh
 
 
 @stored_jit
-def given(driver: Driver, frequency: Float[Array, " harmonic"], shared: bool) -> GivenDriver:
+def given(
+    driver: HarmonicDriver, frequency: Float[Array, " harmonic"], shared: bool
+) -> GivenDriver:
     """What all loads of a driver need to know of it for maximum likelihood."""
-    return refinement.given(driver, frequency, shared)
+    return given_driver.given(driver, frequency, shared)
 
 
 def known_driver(
@@ -199,7 +202,7 @@ def known_driver(
         return None
     frequency = jnp.asarray(lane[0])
     if method == "maximum_likelihood":
-        return given(driver, frequency, shared)
+        return given(serving(driver, HarmonicDriver, method), frequency, shared)
     return unloaded(driver, frequency)
 
 
@@ -213,7 +216,8 @@ def skin_lane(
     """Identify one lane; differentiable code, to be jitted and batched by the caller."""
     if method == "output_error":
         *fields, samples = lane
-        return refinement.skin_by_output_error(Measurement(*fields), samples, driver, circuit)
+        continuous = serving(driver, ContinuousDriver, method)
+        return refinement.skin_by_output_error(Measurement(*fields), samples, continuous, circuit)
     if method not in HARMONIC:
         m = measure(*lane)
         return baseline.skin_by_steiglitz_mcbride(m, driver, iterations(method))
@@ -222,8 +226,10 @@ def skin_lane(
     if isinstance(known, GivenDriver):
         return refinement.skin_by_maximum_likelihood(spectrum, rate, driver, known, circuit)
     if method == "harmonic_steiglitz_mcbride":
-        return baseline.skin_by_harmonic_steiglitz_mcbride(spectrum, rate, driver, known)
-    return refinement.skin_by_non_parametric(spectrum, rate, driver, known, circuit)
+        continuous = serving(driver, ContinuousDriver, method)
+        return baseline.skin_by_harmonic_steiglitz_mcbride(spectrum, rate, continuous, known)
+    harmonic = serving(driver, HarmonicDriver, method)
+    return refinement.skin_by_non_parametric(spectrum, rate, harmonic, known, circuit)
 
 
 skin = stored_jit(skin_lane)

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from etid.circuits.circuit import AbstractCircuit, Resistor
-from etid.estimators import refinement
+from etid.estimators.maximum_likelihood import given_driver
 from etid.estimators.output_error import fit as output_error
 from etid.estimators.output_error import prediction
 from etid.estimators.registry import (
@@ -21,8 +21,8 @@ from etid.estimators.registry import (
     check_driver,
     check_method,
     choose,
-    has_harmonics,
     plan,
+    serving,
 )
 from etid.estimators.score_tests import resistors
 from etid.estimators.score_tests.unloaded import shape_of
@@ -51,7 +51,7 @@ from etid.identify.steady_state import periodic_voltage
 from etid.recordings.preflight import Inspected, preflight
 from etid.recordings.recording import Recording
 from etid.recordings.repeats import repeats
-from etid.results.driver import Driver
+from etid.results.driver import ContinuousDriver, Driver, HarmonicDriver
 from etid.results.fits import Fit, IdentificationError
 from etid.results.verdicts import message, verdict
 from etid.signals import mains
@@ -102,11 +102,13 @@ def identify_driver(
         raise ValueError(
             "no calibration given; a driver needs at least one record with a known r_load"
         )
+    resistances: list[float] = []
     for record in records:
         if record.r_load is None:
             raise ValueError(
                 f"recording {record.path!r} has no r_load; a calibration needs its resistor [ohm]"
             )
+        resistances.append(record.r_load)
     if not 0 <= driver_drift < 1:
         raise ValueError(f"driver_drift is {driver_drift}; it is a part, such as 0.01")
     if order < 2:
@@ -123,7 +125,7 @@ def identify_driver(
         if name is not None:
             text = f"calibration {one.recording.path!r}: {name}. {explained(one, name)}"
             raise IdentificationError(text, None)
-    rough = [resistors.rough_impedance(one) for one in seen]
+    rough = [resistors.rough_impedance(*one) for one in zip(seen, resistances, strict=True)]
     if max(rough) > resistors.ROUGHLY * min(rough):
         shown = ", ".join(
             f"{one.recording.path!r} {z / 1e3:.3g} kohm" for one, z in zip(seen, rough, strict=True)
@@ -132,22 +134,21 @@ def identify_driver(
         raise IdentificationError(text + message("resistors_disagree"), None)
     method = choose(method, seen)
     driver = _driver(seen, order, method)
-    known = driver.calibration
-    late = np.zeros(len(seen)) if known is None else np.asarray(known.delay)
+    late = np.zeros(len(seen))
+    if isinstance(driver, ContinuousDriver):
+        late = np.asarray(driver.calibration.delay_samples)
     if driver.verdict != "successful" and 1 < np.max(np.abs(late)) < np.inf:
         for one, delay in zip(seen, late, strict=True):
             one.lag += round(delay)
         driver = _driver(seen, order, method)
     remarks = functools.reduce(operator.or_, (one.remarks for one in seen))
     driver = dataclasses.replace(driver, remarks=np.asarray(int(remarks) | int(driver.remarks)))
-    if driver.calibration is not None:
+    if isinstance(driver, HarmonicDriver):
         unloaded = np.array([checksum(one) for one in seen])
-        calibration = dataclasses.replace(driver.calibration, unloaded=unloaded)
-        driver = dataclasses.replace(driver, calibration=calibration)
-    if driver_drift:
+        driver = dataclasses.replace(driver, unloaded=unloaded)
+    if driver_drift and isinstance(driver, ContinuousDriver):
         driver = dataclasses.replace(driver, drift=np.asarray(driver_drift, float))
-    r_load = jnp.asarray([record.r_load for record in records])
-    driver = changes.driver_judged(driver, r_load, repeats(seen))
+    driver = changes.driver_judged(driver, jnp.asarray(resistances), repeats(seen))
     size = float(jnp.abs(driver.response(jnp.asarray(1e3))))
     if np.isfinite(size) and not plausible[0] <= size <= plausible[1]:
         driver = dataclasses.replace(driver, result=verdict("implausible"))
@@ -297,7 +298,7 @@ def identify_samples(
     check_method(method, circuit)
     periods = whole_periods(v_out.shape[0], sample_rate, pulse_rate)
     if method is None:
-        fit_for = has_harmonics(driver) and separates_aliases(*periods)
+        fit_for = isinstance(driver, HarmonicDriver) and separates_aliases(*periods)
         method = "maximum_likelihood" if fit_for else "output_error"
         check_default(method, circuit)
     check_driver(driver, method, sample_rate)
@@ -313,7 +314,7 @@ def identify_samples(
         fields = spectrum(v_th, v_out, sigma_th, sigma_out, rate, *periods)
         samples = (*map(jnp.asarray, fields), rate)
         if method == "maximum_likelihood":
-            known = refinement.given(driver, samples[0], True)
+            known = given_driver.given(serving(driver, HarmonicDriver, method), samples[0], True)
         else:
             known = shape_of(driver, samples[0])
     fit = skin_lane(samples, driver, known, circuit, method)
@@ -321,10 +322,10 @@ def identify_samples(
 
 
 @stored_jit
-def _fitted(samples: Any, driver: Driver, circuit: AbstractCircuit) -> Float[Array, " interval"]:
+def _fitted(
+    samples: Any, driver: ContinuousDriver, circuit: AbstractCircuit
+) -> Float[Array, " interval"]:
     records = prediction.prepare(measure(*samples), cutoff=0.5)  # the band as it was recorded
-    assert driver.source is not None
-    assert driver.calibration is not None
     r_load = driver.calibration.r_load[0]
     return output_error.fitted_voltage(
         records, driver.source, r_load, circuit.impedance().rational()
@@ -360,7 +361,7 @@ def predict(
         if recording.r_load is None:
             raise ValueError("give the circuit: this recording has no known resistor")
         circuit = Resistor(recording.r_load)
-    check_driver(driver, "output_error", recording.sample_rate)
+    driver = serving(driver, ContinuousDriver, "output_error")
     if not circuit.is_rational:
         return _predict_periods(recording, driver, circuit)
     seen = Inspected(recording)
@@ -373,7 +374,7 @@ def predict(
 
 
 def _predict_periods(
-    recording: Recording, driver: Driver, circuit: AbstractCircuit
+    recording: Recording, driver: ContinuousDriver, circuit: AbstractCircuit
 ) -> Float[np.ndarray, " time"]:
     rate = recording.sample_rate
     seen = Inspected(recording)
@@ -383,8 +384,6 @@ def _predict_periods(
             f"recording {recording.path!r} holds no whole pulse period; the voltage at a "
             f"constant-phase element, as in {type(circuit).__name__}, is predicted for whole ones"
         )
-    assert driver.source is not None  # check_driver
-    assert driver.calibration is not None
     frequency = jnp.asarray(np.fft.rfftfreq(samples, 1 / rate)[1:])
     predicted = np.full(recording.v_out.size, np.nan)
     aligned = periodic_voltage(

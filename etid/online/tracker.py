@@ -42,7 +42,7 @@ from etid.circuits.circuit import AbstractCircuit
 from etid.estimators.judgement import MAX_STEPS_REACHED, SUCCESSFUL, misses
 from etid.estimators.maximum_likelihood.given_driver import GivenDriver, combined
 from etid.estimators.refinement import circuit_starts
-from etid.estimators.registry import check_driver
+from etid.estimators.registry import serving
 from etid.identify.arguments import circuit_of
 from etid.identify.compiled import stored_jit
 from etid.identify.lanes import explained, given
@@ -58,7 +58,7 @@ from etid.online.pulse_fit import (
 )
 from etid.recordings.preflight import Inspected, preflight
 from etid.recordings.recording import Recording
-from etid.results.driver import Driver
+from etid.results.driver import Driver, HarmonicDriver
 from etid.results.fits import LABELS, Fit, Fits, IdentificationError
 from etid.results.verdicts import RESULTS, first_verdict, message, verdicts_of
 from etid.signals.precision import require_float64
@@ -149,7 +149,7 @@ class Tracker(eqx.Module):
             IdentificationError: The recording is of no use; the message says why.
         """
         require_float64()
-        check_driver(driver, "maximum_likelihood", unloaded.sample_rate)
+        driver = serving(driver, HarmonicDriver, "maximum_likelihood")
         if electrodes < 1:
             raise ValueError(f"electrodes is {electrodes}; a display has at least one")
         if not (np.isfinite(change) and change >= 0):
@@ -163,7 +163,6 @@ class Tracker(eqx.Module):
         period = rate / seen.train.counted
         bands = unloaded_bands(seen.v_th, float(seen.sigma_th), rate, period)
         known = given(driver, bands.frequency, False)
-        assert driver.source is not None  # check_driver
         low, high = unloaded.adc_range or (-np.inf, np.inf)
         half = seen.step_th / 2
         model = GainModel.of(

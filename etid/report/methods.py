@@ -16,6 +16,7 @@ from etid.estimators.estimate import MAX_STEPS
 from etid.estimators.score_tests import missing_pole, other_circuit
 from etid.report import citations
 from etid.report.html import Section, Table
+from etid.results.driver import ContinuousDriver
 from etid.results.provenance import Settings
 from etid.results.study_fits import StudyFits
 
@@ -129,7 +130,8 @@ def _model(found: StudyFits) -> str:
 
 def _driver(found: StudyFits) -> str:
     drivers = list(found.drivers.values())
-    known = [driver.calibration.r_load for driver in drivers if driver.calibration is not None]
+    continuous = [driver for driver in drivers if isinstance(driver, ContinuousDriver)]
+    known = [driver.calibration.r_load for driver in continuous]
     resistors = sorted(set(np.concatenate(known).tolist())) if known else []
     order = found.settings.order if found.settings is not None else None
     if order is None and drivers:
@@ -137,7 +139,7 @@ def _driver(found: StudyFits) -> str:
     if order is None:
         return ""
     text = f"Z_th is a rational function of order {order}"
-    if any(driver.source is not None for driver in drivers):
+    if continuous:
         text += ", stable by its modal parameters"
     count = len(found.drivers) + len(found.failures)
     text += ". It was identified from calibrations"

@@ -102,7 +102,8 @@ class Recordings:
             return None
         names = ("path", *LABELS)
         shown = recording.replace(**{name: plain(getattr(recording, name)) for name in names})
-        figure, why = self._predicted(shown, fit)
+        names = recording.calibration or tuple(self.study.calibrations)
+        figure, why = _predicted(shown, fit, self._found.drivers.get(names))
         elements = ", ".join(fit.elements)
         about = f"{path}: {fit.verdict} ({text})."
         if why:
@@ -113,21 +114,16 @@ class Recordings:
             caption = f"{about} χ² {significant(float(fit.chi2), 3)}, {elements}."
         return Picture(caption, svg(figure), alt)
 
-    def _predicted(self, recording: Recording, fit: Fit) -> tuple[Figure, str]:
-        """One pulse with its prediction; without one, also why."""
-        driver = self._driver(recording)
-        values = np.asarray(fit.circuit.values())
-        if driver is None:
-            return figure_of(recording), "the fits hold no driver for it."
-        if (values <= 0).any():
-            return figure_of(recording), "an element is not positive."
-        why = "" if np.isfinite(values).all() else "no circuit was identified."
-        try:
-            return figure_of(fit, recording, driver), why
-        except ValueError as error:
-            return figure_of(recording), f"{error}."
 
-    def _driver(self, recording: Recording) -> Driver | None:
-        assert self.study is not None
-        names = recording.calibration or tuple(self.study.calibrations)
-        return self._found.drivers.get(names)
+def _predicted(recording: Recording, fit: Fit, driver: Driver | None) -> tuple[Figure, str]:
+    """One pulse with its prediction; without one, also why."""
+    values = np.asarray(fit.circuit.values())
+    if driver is None:
+        return figure_of(recording), "the fits hold no driver for it."
+    if (values <= 0).any():
+        return figure_of(recording), "an element is not positive."
+    why = "" if np.isfinite(values).all() else "no circuit was identified."
+    try:
+        return figure_of(fit, recording, driver), why
+    except ValueError as error:
+        return figure_of(recording), f"{error}."

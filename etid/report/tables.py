@@ -13,7 +13,7 @@ import numpy as np
 
 from etid.circuits.display import DISPLAY, heading, plus_minus
 from etid.report.html import Table
-from etid.results.driver import Driver
+from etid.results.driver import ContinuousDriver, Driver
 from etid.results.fits import Fits
 from etid.results.verdicts import message
 
@@ -58,7 +58,9 @@ def drivers(
     chosen = sorted(found.items(), key=lambda item: (item[1].verdict == "successful", item[0]))
     for paths, driver in chosen[: max(0, ROWS - len(rows))]:
         z, error = _at_1_khz(driver)
-        resistors = [] if driver.calibration is None else driver.calibration.r_load.tolist()
+        resistors = (
+            driver.calibration.r_load.tolist() if isinstance(driver, ContinuousDriver) else []
+        )
         rows.append(
             (
                 _calibrations(paths),

@@ -9,6 +9,9 @@ ones 50…100; every value of the parameters is a stable impedance; and a pair o
 complex to real without a change of branch.
 """
 
+import abc
+import dataclasses
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -136,37 +139,31 @@ class Calibration(eqx.Module):
 
     Attributes:
         r_load: Known resistors [Ω].
-        delay_std: Standard deviation [s] of their common trigger delay. Only records with different
-            resistors tell that delay from a fast pole of Z_th; one resistor leaves it open.
-        delay: Their trigger delays as identified [samples].
-        spectra: Their harmonics, stacked along a leading axis; None if the method uses none.
-        unloaded: Checksums of their unloaded records; None if not known. A load whose checksum is
-            none of them needs no search for what it shares with them, which doubles its cost.
+        delay_samples: Trigger delay of each calibration [samples of the calibration].
+        delay_std_samples: Standard deviation of their common trigger delay [samples]. Only records
+            with different resistors tell that delay from a fast pole of Z_th; one resistor leaves
+            it open.
         mismatch: By how much the logarithm of each known resistor exceeds what the other
             calibrations say of it, and its standard error; None for one, or if not known.
     """
 
     r_load: Float[Array, " record"]
-    delay_std: Float[Array, ""]
-    delay: Float[Array, " record"]
-    spectra: Spectrum | None
-    unloaded: Int[np.ndarray, " record"] | None = None
+    delay_samples: Float[Array, " record"]
+    delay_std_samples: Float[Array, ""]
     mismatch: Float[Array, "2 record"] | None = None
 
 
 class Driver(eqx.Module):
-    """An identified driver: Z_th as a discrete filter and, once refined, in continuous time.
+    """An identified driver: what every kind of it has.
 
-    Only ratios to Z_th are observable: the tolerance of the calibration resistor passes 1:1 into
-    every resistance identified with this driver.
+    Its kinds are `DiscreteDriver`, `ContinuousDriver` and `HarmonicDriver`. Only ratios to Z_th are
+    observable: the tolerance of the calibration resistor passes 1:1 into every resistance
+    identified with this driver.
 
     Attributes:
         b: Numerator α₀ … of the discrete Z_th by Steiglitz-McBride (paper, eq. 4) [Ω].
         a: Denominator 1, β₁ … of the discrete Z_th.
-        sample_rate: Rate of the discrete filter [Hz].
-        source: Continuous Z_th, valid at any sample rate; None if the method gives none.
-        cov: Covariance of the parameters of `source`, flattened in field order.
-        calibration: What skins need of the calibrations.
+        sample_rate: Rate of the calibrations and of the discrete filter [Hz].
         rrse: Largest root relative squared error over the calibrations (paper, eq. 3).
         chi2: Residual over expected variance per degree of freedom: 1 if the model is right.
         result: Verdict.
@@ -174,23 +171,18 @@ class Driver(eqx.Module):
         method: Name of the estimator.
         remarks: What was done to the calibrations before, `etid.recordings.remarks.Remark` as an
             integer.
-        drift: Relative standard deviation by which each parameter of `source` may have changed
-            when a skin is recorded; None if it cannot. `cov` does not contain it.
     """
 
+    _: dataclasses.KW_ONLY
     b: Float[Array, " b"]
     a: Float[Array, " a"]
     sample_rate: float | Float[Array, ""]
-    source: SourceImpedance | None
-    cov: Float[Array, "parameter parameter"] | None
-    calibration: Calibration | None
     rrse: Float[Array, ""]
     chi2: Float[Array, ""]
     result: RESULTS
     steps: Int[Array, ""]
     method: str = eqx.field(static=True)
     remarks: Int[Array | np.ndarray, ""] = eqx.field(default_factory=lambda: np.zeros((), int))
-    drift: Float[Array | np.ndarray, ""] | None = None
 
     @property
     def order(self) -> int:
@@ -202,42 +194,19 @@ class Driver(eqx.Module):
         """Name of the verdict."""
         return verdict_names(self.result).item()
 
-    def drift_std(self) -> Float[Array, " parameter"]:
-        """Standard deviations of the parameters of `source` that come from `drift` alone."""
-        assert self.source is not None  # check_driver
-        # Frequencies, dampings and R are logarithms: relative already.
-        relative = jax.tree.map(jnp.ones_like, self.source)
-        gains = (self.source.gain, self.source.slope, self.source.gain_real)
-        relative = eqx.tree_at(lambda s: (s.gain, s.slope, s.gain_real), relative, gains)
-        return jnp.abs(ravel_pytree(relative)[0]) * (0.0 if self.drift is None else self.drift)
-
-    def later_cov(self) -> Float[Array, "parameter parameter"]:
-        """Covariance of the parameters of `source` when a skin is recorded."""
-        assert self.cov is not None  # check_driver
-        return self.cov if self.drift is None else self.cov + jnp.diag(self.drift_std() ** 2)
-
+    @abc.abstractmethod
     def response(self, frequency: Float[Array, "..."]) -> Complex[Array, "..."]:
-        """Source impedance Z_th [Ω], in continuous time where the method gives it.
+        """Source impedance Z_th(j 2π f) [Ω], in continuous time where the method gives it.
 
         Args:
             frequency: Real frequencies [Hz].
-
-        Returns:
-            Z_th(j 2π f) [Ω]; without a continuous form that of the discrete filter (paper, eq. 4).
         """
-        if self.source is not None:
-            return self.source.response(frequency)
-        z = delay_variable(jnp.asarray(frequency), self.sample_rate)
-        return Rational(self.b, self.a)(z)
 
+    @abc.abstractmethod
     def log_response_stderr(
         self, frequency: Float[Array, " frequency"]
     ) -> Float[Array, "2 frequency"]:
         """Standard errors of ln |Z_th| and of its phase [rad]; NaN if there is no covariance."""
-        if self.source is None or self.cov is None:
-            return jnp.full((2, frequency.size), jnp.nan)
-        values, unflatten = ravel_pytree(self.source)
-        return log_stderr(lambda p: unflatten(p).response(frequency), values, self.cov)
 
     def response_stderr(self, frequency: Float[Array, " frequency"]) -> Float[Array, " frequency"]:
         """Standard error of the magnitude of Z_th, by the slope of |Z_th| in its parameters.
@@ -252,23 +221,96 @@ class Driver(eqx.Module):
 
     def __str__(self) -> str:
         z = complex(self.response(jnp.array(1e3)))
-        text = f"Driver of order {self.order}: {self.verdict} in {int(self.steps)} steps"
-        text += (
-            f" ({self.method}), RRSE {100 * float(self.rrse):.3g} %, chi2 {float(self.chi2):.3g}\n"
-        )
-        text += f"  Z_th at 1 kHz {z.real / 1e3:.4g} {z.imag / 1e3:+.4g}j kΩ"
-        text += self._resistors()
+        lines = [
+            f"Driver of order {self.order}: {self.verdict} in {int(self.steps)} steps "
+            f"({self.method}), RRSE {100 * float(self.rrse):.3g} %, chi2 {float(self.chi2):.3g}",
+            f"Z_th at 1 kHz {z.real / 1e3:.4g} {z.imag / 1e3:+.4g}j kΩ",
+            *self._resistors(),
+        ]
         if self.verdict != "successful":
-            text += "\n  " + message(self.verdict)
-        return "\n  ".join([text, *texts(int(self.remarks))])
+            lines.append(message(self.verdict))
+        return "\n  ".join([*lines, *texts(int(self.remarks))])
 
-    def _resistors(self) -> str:
+    def _resistors(self) -> list[str]:
         """What the calibrations say of each other's resistors."""
+        return []
+
+
+class DiscreteDriver(Driver):
+    """A driver by Steiglitz-McBride: Z_th is the discrete filter `b`, `a` (paper, eq. 4)."""
+
+    def response(self, frequency: Float[Array, "..."]) -> Complex[Array, "..."]:
+        """Source impedance Z_th [Ω] of the discrete filter at real frequencies [Hz]."""
+        z = delay_variable(jnp.asarray(frequency), self.sample_rate)
+        return Rational(self.b, self.a)(z)
+
+    def log_response_stderr(
+        self, frequency: Float[Array, " frequency"]
+    ) -> Float[Array, "2 frequency"]:
+        """NaN: Steiglitz-McBride gives no covariance."""
+        return jnp.full((2, frequency.size), jnp.nan)
+
+
+class ContinuousDriver(Driver):
+    """A driver whose Z_th is known in continuous time, with its covariance.
+
+    Attributes:
+        source: Continuous Z_th, valid at any sample rate.
+        cov: Covariance of the parameters of `source`, flattened in field order.
+        calibration: What skins need of the calibrations.
+        drift: Relative standard deviation by which each parameter of `source` may have changed
+            when a skin is recorded; None if it cannot. `cov` does not contain it.
+    """
+
+    _: dataclasses.KW_ONLY
+    source: SourceImpedance
+    cov: Float[Array, "parameter parameter"]
+    calibration: Calibration
+    drift: Float[Array | np.ndarray, ""] | None = None
+
+    def drift_std(self) -> Float[Array, " parameter"]:
+        """Standard deviations of the parameters of `source` that come from `drift` alone."""
+        # Frequencies, dampings and R are logarithms: relative already.
+        relative = jax.tree.map(jnp.ones_like, self.source)
+        gains = (self.source.gain, self.source.slope, self.source.gain_real)
+        relative = eqx.tree_at(lambda s: (s.gain, s.slope, s.gain_real), relative, gains)
+        return jnp.abs(ravel_pytree(relative)[0]) * (0.0 if self.drift is None else self.drift)
+
+    def later_cov(self) -> Float[Array, "parameter parameter"]:
+        """Covariance of the parameters of `source` when a skin is recorded."""
+        return self.cov if self.drift is None else self.cov + jnp.diag(self.drift_std() ** 2)
+
+    def response(self, frequency: Float[Array, "..."]) -> Complex[Array, "..."]:
+        """Source impedance Z_th [Ω] in continuous time at real frequencies [Hz]."""
+        return self.source.response(frequency)
+
+    def log_response_stderr(
+        self, frequency: Float[Array, " frequency"]
+    ) -> Float[Array, "2 frequency"]:
+        """Standard errors of ln |Z_th| and of its phase [rad] at real frequencies [Hz]."""
+        values, unflatten = ravel_pytree(self.source)
+        return log_stderr(lambda p: unflatten(p).response(frequency), values, self.cov)
+
+    def _resistors(self) -> list[str]:
         known = self.calibration
-        if known is None or known.mismatch is None:
-            return ""
-        lines = ""
-        for r, off, error in zip(known.r_load, *known.mismatch, strict=True):
-            lines += f"\n  r_load {float(r) / 1e3:.6g} kΩ is {100 * float(np.expm1(off)):+.3g}"
-            lines += f" ± {100 * float(error):.2g} % off what the others say"
-        return lines
+        if known.mismatch is None:
+            return []
+        return [
+            f"r_load {float(r) / 1e3:.6g} kΩ is {100 * float(np.expm1(off)):+.3g}"
+            f" ± {100 * float(error):.2g} % off what the others say"
+            for r, off, error in zip(known.r_load, *known.mismatch, strict=True)
+        ]
+
+
+class HarmonicDriver(ContinuousDriver):
+    """A driver that was identified on the harmonics of its calibrations, and keeps them.
+
+    Attributes:
+        spectra: Harmonics of the calibrations, stacked along a leading axis.
+        unloaded: Checksums of their unloaded records; None if not known. A load whose checksum is
+            none of them needs no search for what it shares with them, which doubles its cost.
+    """
+
+    _: dataclasses.KW_ONLY
+    spectra: Spectrum
+    unloaded: Int[np.ndarray, " record"] | None = None

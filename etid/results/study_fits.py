@@ -5,12 +5,13 @@ settings as attributes of the file, and a dataset `drivers` with one line of JSO
 """
 
 import dataclasses
+import functools
 import json
 import math
 import os
 import reprlib
 import typing
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
 import jax
@@ -21,7 +22,13 @@ from jaxtyping import Array
 from etid.circuits.circuit import AbstractCircuit
 from etid.recordings.recording import RecordingError
 from etid.recordings.remarks import remarks_of, words
-from etid.results.driver import Calibration, Driver, SourceImpedance
+from etid.results.driver import (
+    Calibration,
+    ContinuousDriver,
+    DiscreteDriver,
+    Driver,
+    SourceImpedance,
+)
 from etid.results.fits import SCHEMA, Fits
 from etid.results.hdf5_table import Table, opened_table, write_table
 from etid.results.provenance import Settings
@@ -159,73 +166,75 @@ def _lists(module: Any) -> dict[str, Any]:
 
 
 def _to_json(paths: tuple[str, ...], driver: Driver) -> str:
-    known = driver.calibration
-    return json.dumps(
-        {
-            "calibrations": paths,
-            "method": driver.method,
-            "verdict": driver.verdict,
-            "steps": int(driver.steps),
-            "remarks": words(int(driver.remarks)),
+    stored = {
+        "calibrations": paths,
+        "method": driver.method,
+        "verdict": driver.verdict,
+        "steps": int(driver.steps),
+        "remarks": words(int(driver.remarks)),
+        "rrse": float(driver.rrse),
+        "chi2": float(driver.chi2),
+        "b": np.asarray(driver.b).tolist(),
+        "a": np.asarray(driver.a).tolist(),
+        "sample_rate": float(driver.sample_rate),
+    }
+    if isinstance(driver, ContinuousDriver):
+        stored |= {
             "drift": None if driver.drift is None else float(driver.drift),
-            "rrse": float(driver.rrse),
-            "chi2": float(driver.chi2),
-            "b": np.asarray(driver.b).tolist(),
-            "a": np.asarray(driver.a).tolist(),
-            "sample_rate": float(driver.sample_rate),
-            "source": None if driver.source is None else _lists(driver.source),
-            "cov": None if driver.cov is None else np.asarray(driver.cov).tolist(),
-            "r_load": None if known is None else np.asarray(known.r_load).tolist(),
-            "delay": None if known is None else np.asarray(known.delay).tolist(),
-            "delay_std": None if known is None else float(known.delay_std),
+            "source": _lists(driver.source),
+            "cov": np.asarray(driver.cov).tolist(),
+            "r_load": np.asarray(driver.calibration.r_load).tolist(),
+            "delay_samples": np.asarray(driver.calibration.delay_samples).tolist(),
+            "delay_std_samples": float(driver.calibration.delay_std_samples),
         }
-    )
+    return json.dumps(stored)
 
 
 def _from_json(stored: Mapping[str, Any]) -> Driver:
-    """A driver from what `_to_json` has made of it.
+    """A driver from what `_to_json` has made of it; the harmonics of calibrations are not kept.
 
     Raises:
         ValueError, TypeError, KeyError, OverflowError: It is something else.
     """
     if not all(isinstance(stored[name], str) for name in ("method", "verdict")):
         raise TypeError("method and verdict must be texts")
-    source = known = None
-    if stored["source"] is not None:
-        own = stored["source"]
-        pairs = len(_numbers(own, "log_omega", 1))
-        reals = len(_numbers(own, "log_omega_real", 1))
-        shapes = {
-            "log_resistance": (),
-            **dict.fromkeys(("log_omega", "log_zeta", "gain", "slope"), (pairs,)),
-            **dict.fromkeys(("log_omega_real", "gain_real"), (reals,)),
-        }
-        fields = {name: _numbers(own, name, len(shape), shape) for name, shape in shapes.items()}
-        source = SourceImpedance(**fields)
-    cov = None if stored["cov"] is None else _numbers(stored, "cov", 2)
-    size = None if source is None else sum(leaf.size for leaf in jax.tree.leaves(source))
-    if cov is not None and cov.shape != (size, size):
-        raise ValueError(f"cov has shape {cov.shape}, the driver has {size} parameters")
-    if stored["r_load"] is not None:
-        r_load = _numbers(stored, "r_load", 1)
-        delay = _numbers(stored, "delay", 1, r_load.shape)
-        known = Calibration(r_load, _numbers(stored, "delay_std", 0), delay, spectra=None)
     rate = float(_numbers(stored, "sample_rate", 0))
     if not 0 < rate < math.inf:
         raise ValueError(f"sample_rate is {rate}")
-    return Driver(
+    kind = DiscreteDriver if "source" not in stored else _continuous(stored)
+    return kind(
         b=_numbers(stored, "b", 1),
         a=_numbers(stored, "a", 1),
         sample_rate=rate,
-        source=source,
-        cov=cov,
-        calibration=known,
         rrse=_numbers(stored, "rrse", 0),
         chi2=_numbers(stored, "chi2", 0),
         result=verdicts_of(np.asarray(stored["verdict"])),
         steps=_numbers(stored, "steps", 0).astype(int),
         method=stored["method"],
         remarks=np.asarray(remarks_of(stored.get("remarks", ""))),
+    )
+
+
+def _continuous(stored: Mapping[str, Any]) -> Callable[..., ContinuousDriver]:
+    """`ContinuousDriver` with the fields that a discrete driver lacks."""
+    own = stored["source"]
+    pairs = len(_numbers(own, "log_omega", 1))
+    reals = len(_numbers(own, "log_omega_real", 1))
+    shapes = {
+        "log_resistance": (),
+        **dict.fromkeys(("log_omega", "log_zeta", "gain", "slope"), (pairs,)),
+        **dict.fromkeys(("log_omega_real", "gain_real"), (reals,)),
+    }
+    fields = {name: _numbers(own, name, len(shape), shape) for name, shape in shapes.items()}
+    source = SourceImpedance(**fields)
+    size = sum(leaf.size for leaf in jax.tree.leaves(source))
+    r_load = _numbers(stored, "r_load", 1)
+    delay = _numbers(stored, "delay_samples", 1, r_load.shape)
+    return functools.partial(
+        ContinuousDriver,
+        source=source,
+        cov=_numbers(stored, "cov", 2, (size, size)),
+        calibration=Calibration(r_load, delay, _numbers(stored, "delay_std_samples", 0)),
         drift=None if stored.get("drift") is None else _numbers(stored, "drift", 0),
     )
 

@@ -36,7 +36,7 @@ from etid.estimators.maximum_likelihood.terms import (
     shows_hum,
     weights,
 )
-from etid.results.driver import Calibration, SourceImpedance
+from etid.results.driver import Calibration, HarmonicDriver, SourceImpedance
 from etid.results.fits import complex_rrse
 from etid.signals.harmonics import Spectrum
 from etid.solvers.levenberg_marquardt import LevenbergMarquardt, best_start
@@ -117,7 +117,7 @@ def fit_source(
         steps=solution.stats["num_steps"],
         hum=jnp.stack([shows_hum(s, g) for s, g in found]).any(),
     )
-    calibration = Calibration(r_load, delay_std(r_load) / sample_rate, q[kept:], spectra)
+    calibration = Calibration(r_load, q[kept:], delay_std(r_load))
     return unflatten(q[:kept]), estimate, calibration
 
 
@@ -128,13 +128,21 @@ class Calibrations(eqx.Module):
 
     Attributes:
         source: Z_th as identified from the calibrations.
-        calibration: The calibrations, with their harmonics.
+        calibration: Their resistors and delays.
+        spectra: Their harmonics.
         rate: Their sampling rate [Hz].
     """
 
     source: SourceImpedance
     calibration: Calibration
+    spectra: Spectrum
     rate: Float[Array, ""]
+
+    @classmethod
+    def of(cls, driver: HarmonicDriver) -> "Calibrations":
+        """Those of an identified driver."""
+        rate = jnp.asarray(driver.sample_rate)
+        return cls(driver.source, driver.calibration, driver.spectra, rate)
 
     @property
     def sources(self) -> int:
@@ -144,12 +152,11 @@ class Calibrations(eqx.Module):
     @property
     def records(self) -> list[Spectrum]:
         """The calibrations one by one."""
-        assert self.calibration.spectra is not None  # check_driver
-        return as_list(self.calibration.spectra)
+        return as_list(self.spectra)
 
     def start(self) -> Float[Array, " common"]:
         """The common parameters as the calibrations alone have them."""
-        return jnp.concatenate([ravel_pytree(self.source)[0], self.calibration.delay])
+        return jnp.concatenate([ravel_pytree(self.source)[0], self.calibration.delay_samples])
 
     def z_th(self, common: Float[Array, " common"]) -> SourceImpedance:
         """Z_th of the common parameters."""
@@ -157,10 +164,8 @@ class Calibrations(eqx.Module):
 
     def gains(self, common: Float[Array, " common"]) -> list[Complex[Array, " harmonic"]]:
         """Gains with the known resistors."""
-        spectra = self.calibration.spectra
-        assert spectra is not None
         delay = common[self.sources :]
-        return _gains(spectra, self.z_th(common), self.calibration.r_load, delay, self.rate)
+        return _gains(self.spectra, self.z_th(common), self.calibration.r_load, delay, self.rate)
 
     def terms(
         self, common: Float[Array, " common"], records: Sequence[Spectrum]

@@ -36,7 +36,7 @@ from etid.estimators.maximum_likelihood.terms import (
     weights,
 )
 from etid.estimators.score_tests.unloaded import UnloadedShape, shape_of
-from etid.results.driver import Driver
+from etid.results.driver import HarmonicDriver
 from etid.signals.harmonics import Spectrum
 from etid.signals.transfer import as_complex, reciprocal
 from etid.solvers.matrices import inverse_root
@@ -111,16 +111,16 @@ class GivenDriver(eqx.Module):
 
 
 def given(
-    driver: Driver, calibrations: Calibrations, frequency: Float[Array, " harmonic"], shared: bool
+    driver: HarmonicDriver, frequency: Float[Array, " harmonic"], shared: bool
 ) -> GivenDriver:
-    """What the calibrations tell.
+    """What the calibrations of a driver tell, the same for all its loads.
 
     Args:
         driver: The driver.
-        calibrations: Its calibrations.
         frequency: Harmonics of the loads [Hz].
         shared: Whether a load's unloaded record may be that of a calibration.
     """
+    calibrations = Calibrations.of(driver)
     c, records = calibrations.start(), calibrations.records
     gains = calibrations.gains(c)
     clean, shares = denoised(records, gains)
@@ -183,7 +183,7 @@ def around(
         resistance,
         mean,
         cov,
-        calibrations.calibration.spectra if shared else None,
+        calibrations.spectra if shared else None,
         of_known(c) if shared else None,
         along(of_known) if shared else None,
     )

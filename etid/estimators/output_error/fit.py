@@ -43,7 +43,7 @@ from etid.estimators.output_error.prediction import (
     scaled_residual,
 )
 from etid.estimators.score_tests.other_in_time import relaxed, score
-from etid.results.driver import Calibration, SourceImpedance, loaded
+from etid.results.driver import Calibration, ContinuousDriver, SourceImpedance, loaded
 from etid.results.fits import rrse
 from etid.signals.transfer import Rational
 from etid.solvers.levenberg_marquardt import best_start
@@ -139,13 +139,7 @@ def fit_source(
     return (
         unflatten(q[:kept]),
         estimate,
-        Calibration(
-            r_load,
-            delay_std(r_load) / records.sample_rate[0],
-            nuisance[:, -1],
-            spectra=None,
-            mismatch=mismatch,
-        ),
+        Calibration(r_load, nuisance[:, -1], delay_std(r_load), mismatch),
     )
 
 
@@ -163,18 +157,14 @@ def _arrow(
 
 def fit_circuit(
     records: Records,
-    source: SourceImpedance,
-    source_cov: Float[Array, "m m"],
-    calibration: Calibration,
+    driver: ContinuousDriver,
     starts: AbstractCircuit,
 ) -> tuple[AbstractCircuit, Estimate, Bool[Array, ""]]:
     """Identify the load of one recording.
 
     Args:
         records: One recording.
-        source: Known Z_th.
-        source_cov: Covariance of its flattened parameters.
-        calibration: What else is in doubt.
+        driver: Its driver.
         starts: Candidate starts, stacked along a leading axis; the one that predicts best is
             refined.
 
@@ -182,12 +172,14 @@ def fit_circuit(
         The circuit; the estimate, whose parameters are the logarithms of the elements; and whether
         the load is seen to be another circuit.
     """
+    source, source_cov, calibration = driver.source, driver.later_cov(), driver.calibration
     source_vector, unflatten = ravel_pytree(source)
     candidates = starts.log_values()
     kept, sources = candidates.shape[-1], source_vector.shape[0]
     circuit = jax.tree.map(lambda leaf: leaf[0], starts)
     states = jax.eval_shape(lambda: loaded(source, circuit.impedance().rational(), 1.0).C).shape[0]
-    late_std = calibration.delay_std * records.sample_rate  # [samples]
+    # In samples of this record.
+    late_std = calibration.delay_std_samples * (records.sample_rate / driver.sample_rate)
 
     def load(q):
         return circuit.with_log_values(q[:kept]).impedance().rational()

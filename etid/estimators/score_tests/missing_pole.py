@@ -15,7 +15,7 @@ Over the map of failures (`python -m benchmarks failure_map`) it is 15 at most w
 high enough, and 116 or more where a lower one costs an element five of its standard errors.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import jax
 import jax.numpy as jnp
@@ -23,7 +23,6 @@ from jaxtyping import Array, Bool, Complex, Float
 
 from etid.estimators.maximum_likelihood.driver import Calibrations
 from etid.estimators.maximum_likelihood.terms import denoised, excess, residuals, weights
-from etid.results.driver import Calibration
 from etid.signals.transfer import as_complex, frequency_variable, reciprocal
 from etid.solvers.matrices import inverse
 
@@ -68,7 +67,7 @@ def squares(calibrations: Calibrations) -> Float[Array, " section"]:
     parts = residuals(records, gains)
     of_noise = [excess(r, s.selected) for r, s in zip(parts, records, strict=True)]
     noise = weights(of_noise, count)
-    of_gains = _by_gains(calibrations.calibration, gains, calibrations.z_th(c).response)
+    of_gains = _by_gains(calibrations, gains)
 
     def row(number):
         slopes = [of[number] for of in of_gains]
@@ -85,19 +84,16 @@ def squares(calibrations: Calibrations) -> Float[Array, " section"]:
 
 
 def _by_gains(
-    calibration: Calibration,
-    gains: Sequence[Complex[Array, " harmonic"]],
-    z_th: Callable[[Float[Array, " harmonic"]], Complex[Array, " harmonic"]],
+    calibrations: Calibrations, gains: Sequence[Complex[Array, " harmonic"]]
 ) -> list[Complex[Array, "row harmonic"]]:
     """Derivatives of the gains, G = R/(R + Z_th), by g and h of all sections."""
-    spectra = calibration.spectra
-    assert spectra is not None  # check_driver
+    spectra = calibrations.spectra
     lowest = spectra.frequency[0, 0]
     highest = jnp.max(jnp.where(spectra.selected, spectra.frequency, lowest))
     found = []
-    for number, (r, g) in enumerate(zip(calibration.r_load, gains, strict=True)):
+    for number, (r, g) in enumerate(zip(calibrations.calibration.r_load, gains, strict=True)):
         frequency = spectra.frequency[number]
-        of_z = -g * reciprocal(as_complex(r) + z_th(frequency))
+        of_z = -g * reciprocal(as_complex(r) + calibrations.source.response(frequency))
         by_z = sections(frequency, lowest, highest)
         found.append((by_z * of_z[None, None, :]).reshape(-1, frequency.size))
     return found

@@ -95,9 +95,7 @@ def disagree(
     return jnp.any((squares > SEEN**2) & (jnp.abs(off) > SIZE) & explained)
 
 
-def rough_impedance(calibration: Inspected) -> float:
-    """About |Z_th| [Ω], from the amplitudes of both records alone."""
+def rough_impedance(calibration: Inspected, r_load: float) -> float:
+    """About |Z_th| [Ω] by a resistor [Ω], from the amplitudes of both records alone."""
     x, y = (v - v.mean() for v in calibration.aligned)
-    r_load = calibration.recording.r_load
-    assert r_load is not None  # identify_driver
     return r_load * abs(float(x @ x / (y @ x)) - 1)

@@ -21,7 +21,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Complex, Float
 
 from etid.estimators.maximum_likelihood.terms import excess
-from etid.results.driver import Driver
+from etid.results.driver import Driver, HarmonicDriver
 from etid.signals.harmonics import Spectrum, signal_share
 from etid.signals.transfer import as_complex, power, turns
 
@@ -129,7 +129,6 @@ def shape_of(driver: Driver, frequency: Float[Array, " harmonic"]) -> UnloadedSh
     Returns:
         None if the driver has no harmonics, or others than the loads.
     """
-    known = None if driver.calibration is None else driver.calibration.spectra
-    if known is None or known.x.shape[1:] != frequency.shape:
+    if not isinstance(driver, HarmonicDriver) or driver.spectra.x.shape[1:] != frequency.shape:
         return None
-    return shape(jax.tree.map(lambda leaf: leaf[0], known), driver.drift)
+    return shape(jax.tree.map(lambda leaf: leaf[0], driver.spectra), driver.drift)
