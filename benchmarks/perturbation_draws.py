@@ -22,7 +22,6 @@ from benchmarks.perturbation_list import PERTURBATIONS
 from benchmarks.perturbed_study import RESISTOR, Truth, undisturbed
 from etid.estimators.registry import Method, choose
 from etid.recordings.preflight import Inspected
-from etid.recordings.recording import SIGNALS
 from etid.simulation.scenes import Scene, Trial
 from etid.simulation.transformer import ResistorLoad
 
@@ -129,7 +128,7 @@ def _bounds(snr_db: float, samples: int, bits: int, full_scale: float) -> dict[s
 def _checksum(records: Sequence[etid.Recording]) -> tuple:
     """Tells calibrations apart: a driver is identified once for all perturbations that share it."""
     return tuple(
-        (*(zlib.crc32(r.samples[name].stored.tobytes()) for name in SIGNALS[:2]), r.metadata)
+        (*(zlib.crc32(r.samples[name].stored.tobytes()) for name in ("v_th", "v_out")), r.metadata)
         for r in records
     )
 

@@ -1,12 +1,14 @@
 """Write the schema for machines and for people: `python data_schema/make_page.py`.
 
-Both are made from the table in `etid.recordings.schema`; the page for people adds examples.
+Both are made from `etid.recordings.schema`, which takes the fields of a recording from
+`etid.recordings.fields`; the page for people adds examples.
 """
 
 import json
 import pathlib
 
 from etid.recordings import schema
+from etid.recordings.fields import DECLARED
 
 EXAMPLE = """\
 import h5py
@@ -31,7 +33,7 @@ with h5py.File("study.h5", "w") as file:
 _INTRODUCTION = f"""\
 # Data schema {schema.VERSION}
 
-<!-- made from the table in etid/recordings/schema.py by `python data_schema/make_page.py` -->
+<!-- made from etid/recordings/fields.py and schema.py by `python data_schema/make_page.py` -->
 
 An etid file is an HDF5 file with recordings of a stimulator's output: unloaded (`v_th`) and with a
 load (`v_out`), on one clock. Every group, at any depth, with the attribute `kind` is a recording,
@@ -124,8 +126,7 @@ the first one holds for all. Its keys:
   the same.
 - `path` of the recording in the etid file. Several trials become `path/0`, `path/1`, …; without a
   path, a single `[[recording]]` becomes `loaded/0`, … or, with `r_load`, `calibration/0`, ….
-- `r_load`, `adc_range`, `calibration`, `subject`, `condition`, `electrode`, `trial`: as above;
-  `trial` may be a list with a label per trial.
+- FIELDS: as above; `trial` may be a list with a label per trial.
 
 ### CSV
 
@@ -248,7 +249,9 @@ def as_markdown() -> str:
                 f"{field.description} | `{example}` |"
             )
         parts.append("\n".join(lines) + "\n")
-    return "\n".join([*parts, _RULES, OTHER_FORMATS])
+    rates = ("sample_rate", "pulse_rate")  # which have lines of their own
+    names = ", ".join(f"`{name}`" for name in DECLARED if name not in rates)
+    return "\n".join([*parts, _RULES, OTHER_FORMATS.replace("FIELDS", names)])
 
 
 def write(folder: pathlib.Path) -> None:

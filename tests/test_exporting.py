@@ -225,7 +225,7 @@ def test_nwb_holds_what_was_stored_and_all_that_was_said(study_file, tmp_path):
                 assert row[name] == getattr(recording.metadata, name), name
             assert tuple(row["calibration"].splitlines()) == recording.calibration
             limits = recording.adc_range or (np.nan, np.nan)
-            np.testing.assert_array_equal([row["adc_low"], row["adc_high"]], limits)
+            np.testing.assert_array_equal(row["adc_range"], limits)
             load = np.nan if recording.r_load is None else recording.r_load
             np.testing.assert_array_equal(row["r_load"], load)
 

@@ -11,7 +11,8 @@ from hypothesis import strategies as st
 
 from etid.recordings import contents as scan
 from etid.recordings import hdf5
-from etid.recordings.recording import SIGNALS, Recording, RecordingError, Samples
+from etid.recordings.fields import SIGNALS
+from etid.recordings.recording import Recording, RecordingError, Samples
 from etid.recordings.study import Study
 
 FOLDER = pathlib.Path(__file__).parents[1] / "data_schema"

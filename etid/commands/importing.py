@@ -6,6 +6,8 @@ import pathlib
 
 from etid.commands import Outcome
 from etid.files.importing import import_file
+from etid.files.mapping import CHANNELS, FIELDS
+from etid.recordings.fields import DECLARED, SIGNALS
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -18,28 +20,28 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="FILE",
         help="TOML file that says all of this, for several recordings (data_schema/README.md)",
     )
-    for name, text in {
-        "v-th": "channel of the unloaded output, in volts unless the file names its unit",
-        "v-out": "channel of the output with the load, likewise",
-        "current": "channel of the current, in amperes unless the file names its unit",
-        "time": "channel of the time, in seconds likewise, instead of --sample-rate",
-    }.items():
-        parser.add_argument(f"--{name}", metavar="NAME", help=text)
-    for name, text in {
-        "sample-rate": "samples per second [Hz]",
-        "pulse-rate": "pulses per second [Hz]",
-        "scale": "volts at the terminal are the value divided by this",
-        "r-load": "known resistor [ohm], for calibrations",
-    }.items():
-        parser.add_argument(f"--{name}", type=float, metavar="NUMBER", help=text)
-    parser.add_argument("--subject", default="")
-    parser.add_argument("--condition", default="")
+    channel = "channel of {}, in {} unless the file names its unit".format
+    for name, signal in SIGNALS.items():
+        _option(parser, name, help=channel(name, signal.unit))
+    _option(parser, "time", help=f"{channel('the time', 'seconds')}, instead of --sample-rate")
+    _option(parser, "scale", float, "volts at the terminal are the value divided by this")
+    for name, field in DECLARED.items():
+        if field.type in ("number", "label"):
+            unit = f" [{field.unit}]" if field.unit else ""
+            kind = float if field.type == "number" else str
+            _option(parser, name, kind, f"{field.description.rstrip('.')}{unit}")
+
+
+def _option(
+    parser: argparse.ArgumentParser, name: str, kind: type[str] | type[float] = str, help: str = ""
+) -> None:
+    metavar = "NAME" if kind is str else "NUMBER"
+    parser.add_argument(f"--{name.replace('_', '-')}", type=kind, metavar=metavar, help=help)
 
 
 def run(arguments: argparse.Namespace) -> Outcome:
     """Import one file, and say what was used for what."""
-    names = ("v_th", "v_out", "current", "time", "sample_rate", "pulse_rate", "scale", "r_load")
-    given = {name: getattr(arguments, name) for name in (*names, "subject", "condition")}
+    given = {name: value for name, value in vars(arguments).items() if name in (*CHANNELS, *FIELDS)}
     used = import_file(arguments.source, arguments.target, arguments.mapping, **given)
     data = {
         "source": arguments.source,

@@ -15,16 +15,8 @@ from etid.files.clock import sample_rate
 from etid.files.mapping import Plan, Signal, unit_of
 from etid.files.units import Unit
 from etid.recordings import limits
-from etid.recordings.recording import (
-    SIGNALS,
-    AbstractSource,
-    Layout,
-    Metadata,
-    Recording,
-    RecordingError,
-    Samples,
-    metadata_from,
-)
+from etid.recordings.fields import SIGNALS, Metadata, metadata_from
+from etid.recordings.recording import AbstractSource, Layout, Recording, RecordingError, Samples
 
 # A matrix with more trials than samples, each a small part of a pulse period, lies on its side.
 _SHORTEST_STACKED = 0.1

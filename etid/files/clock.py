@@ -7,7 +7,8 @@ import numpy as np
 from etid.files.channel import Channel, located
 from etid.files.mapping import Plan
 from etid.files.units import Unit
-from etid.recordings.recording import Metadata, RecordingError
+from etid.recordings.fields import Metadata
+from etid.recordings.recording import RecordingError
 from etid.signals.pulse_train import find_pulses
 
 # Largest distance of a time stamp from a uniform grid, in sample periods: more than the rounding of

@@ -19,7 +19,7 @@ from etid.recordings import limits
 from etid.recordings.recording import RecordingError
 from etid.recordings.replacing import replacing
 from etid.recordings.untrusted import attribute, translated
-from etid.results.fits import LABELS, SCHEMA, Fit, Fits
+from etid.results.fits import DESCRIBED, SCHEMA, Fit, Fits
 from etid.results.hdf5_table import Table, opened_table, same_length
 
 ROWS = 1 << 16  # of fits in memory at once
@@ -72,7 +72,7 @@ def _columns(table: Table) -> dict[str, h5py.Dataset]:
     elements = [name + ending for name in names for ending in ("", "_stderr")]
     changes = (f"{name}_change" for name in (*names, "amplitude"))
     elements += [name for name in changes if name in table]  # not before schema version 1.2
-    kinds = dict.fromkeys(LABELS, "text") | dict.fromkeys(elements, "number") | _QUALITY
+    kinds = DESCRIBED | dict.fromkeys(elements, "number") | _QUALITY
     columns = {name: table.column(name, kind) for name, kind in kinds.items()}
     same_length(table, columns)
     return columns

@@ -13,8 +13,9 @@ from typing import Any
 from etid.files.assemble import Imported, Used, sources_of
 from etid.files.channel import located
 from etid.files.clock import check_spacing
-from etid.files.mapping import plans, read_mapping
+from etid.files.mapping import CHANNELS, plans, read_mapping
 from etid.files.readers import abf, delimited, matlab, npz, tdms
+from etid.recordings.fields import LABELS
 from etid.recordings.recording import AbstractSource, RecordingError
 from etid.recordings.study import Study, refuse_nested
 
@@ -31,17 +32,7 @@ def import_file(
     source: str | os.PathLike[str],
     target: str | os.PathLike[str],
     mapping: str | os.PathLike[str] | Mapping[str, Any] | None = None,
-    *,
-    v_th: str | None = None,
-    v_out: str | None = None,
-    current: str | None = None,
-    time: str | None = None,
-    sample_rate: float | int | None = None,
-    pulse_rate: float | int | None = None,
-    scale: float | int | None = None,
-    r_load: float | int | None = None,
-    subject: str = "",
-    condition: str = "",
+    **given: Any,
 ) -> list[Imported]:
     """Turn a file of another format into an etid file.
 
@@ -50,14 +41,13 @@ def import_file(
       MATLAB's files before 7.3 need `pip install etid[matlab]`.
     - `.tdms`: channels `group/channel` of NI's files; `pip install etid[tdms]`.
     - `.abf`: ADC channels of Axon's files, sweeps are trials; `pip install etid[abf]`.
-    - `.npz`: converter codes that say everything themselves (`etid.files.readers.npz`); only
-      `subject`
-      and `condition` (default: the file's name) may be given.
+    - `.npz`: converter codes that say everything themselves (`etid.files.readers.npz`); only labels
+      but `trial` may be given. The condition is the file's name if it is not given.
 
     Which channel is which signal is said by a mapping, whose keys data_schema/README.md lists, or,
-    for one recording, by the arguments: a file's units are used where it names them, other values
-    are in volts, amperes and seconds.  The trials of a recording without a path become `loaded/0`,
-    … or, with `r_load`, `calibration/0`, ….
+    for one recording, by arguments of the same names.  With arguments, values are in volts, amperes
+    and seconds where the file names no unit.  The trials of a recording without a path become
+    `loaded/0`, … or, with `r_load`, `calibration/0`, ….
 
     At most a part of a record is in memory, except of MATLAB files before 7.3 and of `.npz`.
 
@@ -65,17 +55,8 @@ def import_file(
         source: The file to import; its suffix says what it is.
         target: The etid file to write; one that exists is replaced.
         mapping: TOML file, or what it would hold; instead of all that follows.
-        v_th: Channel of the unloaded output.
-        v_out: Channel of the output with the load.
-        current: Channel of the current; optional.
-        time: Channel of the time, instead of `sample_rate`.
-        sample_rate: Samples per second [Hz].
-        pulse_rate: Stimulation pulses per second [Hz].
-        scale: Volts at the terminal are the value divided by this; 1 if the values are those at the
-            terminal.
-        r_load: Known resistor [ohm], for calibrations.
-        subject: Who.
-        condition: Which state of the skin, or which circuit.
+        **given: Keys of a mapping for one recording: the names of the channels `v_th`, `v_out`,
+            `current` and `time`; `scale`; and the fields, such as `pulse_rate` [Hz].
 
     Returns:
         What was used for what.
@@ -89,17 +70,14 @@ def import_file(
         raise RecordingError("there is no such file", file=file, remedy="Check the path")
     if not folder.is_dir():
         raise RecordingError("there is no folder to write it to", file=os.fspath(target))
-    names = {"v_th": v_th, "v_out": v_out, "current": current, "time": time}
-    numbers = {"sample_rate": sample_rate, "pulse_rate": pulse_rate, "scale": scale}
-    labels = {name: value for name, value in (("subject", subject), ("condition", condition))
-              if value}  # fmt: skip
-    given = {**names, **numbers, "r_load": r_load}
     given = {name: value for name, value in given.items() if value is not None}
     suffix = path.suffix.lower()
     if suffix == ".npz":
+        own = {name for name in LABELS if name in given and name != "trial"}
+        labels = {name: given.pop(name) for name in own}
         _refuse(given | ({} if mapping is None else {"mapping": mapping}), file,
                 "an npz file of recordings says this itself")  # fmt: skip
-        return _import_npz(path, target, subject, condition or path.stem)
+        return _import_npz(path, target, {"condition": path.stem} | labels)
     if suffix not in READERS:
         raise RecordingError(
             f"a file {path.suffix!r} cannot be imported",
@@ -108,12 +86,11 @@ def import_file(
         )
     if mapping is None:
         said: Mapping[str, Any] = {
-            name: {"channel": value} if name in names else value
-            for name, value in (given | labels).items()
+            name: {"channel": value} if name in CHANNELS else value for name, value in given.items()
         }
         by, place, implied = "command", file, _IMPLIED
     else:
-        _refuse(given | labels, file, "is for the mapping to say")
+        _refuse(given, file, "is for the mapping to say")
         inside = isinstance(mapping, Mapping)
         said = mapping if inside else read_mapping(mapping)
         by, place, implied = "mapping", file if inside else f"{os.fspath(mapping)} of {file}", {}
@@ -142,10 +119,10 @@ def _refuse(given: Mapping[str, Any], file: str, reason: str) -> None:
 
 
 def _import_npz(
-    path: pathlib.Path, target: str | os.PathLike[str], subject: str, condition: str
+    path: pathlib.Path, target: str | os.PathLike[str], labels: Mapping[str, Any]
 ) -> list[Imported]:
     with located(str(path)):
-        recordings = npz.recordings(path, subject, condition)
+        recordings = npz.recordings(path, labels)
         study = Study.from_recordings(recordings)
         for recording in study.recordings():
             check_spacing(recording.v_th, recording.metadata)

@@ -15,23 +15,14 @@ from typing import Any
 
 from etid.files.channel import chosen, listed
 from etid.files.units import UNITS, Unit, parse_unit
-from etid.recordings import limits, schema
-from etid.recordings.recording import SIGNALS, RecordingError, tidy_path
+from etid.recordings import limits
+from etid.recordings.fields import DECLARED, SIGNALS, check_names, tidy_path
+from etid.recordings.recording import RecordingError
 
 CHANNELS = (*SIGNALS, "time")
-FIELDS = (
-    "sample_rate",
-    "pulse_rate",
-    "scale",
-    "r_load",
-    "subject",
-    "condition",
-    "electrode",
-    "trial",
-    "calibration",
-    "adc_range",
-)
+FIELDS = (*DECLARED, "scale")
 KEYS = ("channel", "unit", "scale", "rows")  # of a signal
+_KEY = "key of a mapping"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -112,11 +103,11 @@ def plans(
     if not isinstance(tables, list) or not all(isinstance(table, Mapping) for table in tables):
         raise RecordingError("must be tables", field="recording", remedy="Write [[recording]]")
     common = {key: value for key, value in mapping.items() if key != "recording"}
-    _known(common, (*CHANNELS, *FIELDS, "recording" if tables else "path"))
+    check_names(common, (*CHANNELS, *FIELDS, "recording" if tables else "path"), _KEY)
     found: list[Plan] = []
     for table in tables or [{}]:
         said = {**common, **table}
-        _known(said, (*CHANNELS, *FIELDS, "path"))
+        check_names(said, (*CHANNELS, *FIELDS, "path"), _KEY)
         path = tidy_path(said.get("path", ""))
         if not path and len(tables) > 1:
             raise RecordingError(
@@ -130,17 +121,6 @@ def plans(
         except RecordingError as error:
             raise error.located(path=path if len(tables) > 1 else "") from None
     return found
-
-
-def _known(said: Mapping[str, Any], keys: Sequence[str], of: str = "") -> None:
-    for key in said:
-        if key not in keys:
-            near = schema.near_miss(key, keys)
-            raise RecordingError(
-                f"is no key of a mapping{f', did you mean {near}?' if near else ''}",
-                field=f"{of}{key}",
-                remedy=f"The keys are {', '.join(keys)}",
-            )
 
 
 def _plan(
@@ -164,9 +144,12 @@ def _plan(
             "is given, and so is time: one of time and sample_rate is needed, not both",
             field="sample_rate",
         )
-    for name in ("sample_rate", "pulse_rate", "r_load"):
-        _number(name, said.get(name))
-    fields = {key: said[key] for key in FIELDS if key in said and key != "scale"}
+    # A stack has several labels of trials, which are checked one by one.
+    fields = {
+        name: value if name == "trial" else DECLARED[name].checked(value)
+        for name, value in said.items()
+        if name in DECLARED
+    }
     return Plan(path, signals, fields)
 
 
@@ -184,7 +167,7 @@ def _signal(name: str, said: Any, common: Any, implied: str) -> Signal:
         raise RecordingError(
             "names no channel", field=name, remedy=f'Write {name} = {{channel = "…", unit = "…"}}'
         )
-    _known(said, KEYS, f"{name}.")
+    check_names(said, KEYS, _KEY, f"{name}.")
     unit = said.get("unit", "")
     if "unit" in said and (not isinstance(unit, str) or parse_unit(unit) is None):
         raise RecordingError(

@@ -16,34 +16,14 @@ import pynwb
 from hdmf.data_utils import GenericDataChunkIterator
 
 from etid.recordings import schema
+from etid.recordings.fields import DECLARED, SIGNALS
 from etid.recordings.hdf5 import read
-from etid.recordings.recording import LABELS, AbstractSource, Layout, RecordingError
+from etid.recordings.recording import AbstractSource, Layout, RecordingError
 from etid.recordings.replacing import replacing
 
 # How pynwb declares arguments hides them from a type checker.
 _nwb: Any = pynwb
 _tables: Any = hdmf.common
-
-_LABELS = {
-    "path": "path in the etid file",
-    "kind": "calibration: a known resistor is the load; loaded: anything else",
-    "subject": "who",
-    "condition": "which state of the skin, or which circuit",
-    "electrode": "which electrode of the display",
-    "trial": "which repetition",
-    "calibration": "paths of the calibrations that belong to it, a line each",
-}
-_NUMBERS = {
-    "pulse_rate": "stimulation pulses per second [Hz]",
-    "r_load": "known resistor [ohm], NaN where the load is unknown",
-    "adc_low": "lowest voltage at the terminal that the converter can tell [V], NaN if not known",
-    "adc_high": "highest voltage at the terminal that the converter can tell [V]",
-}
-_SERIES = {
-    "v_th": "unloaded output of the driver",
-    "v_out": "output of the driver with its load",
-    "current": "current through the load",
-}
 
 
 def write_nwb(
@@ -75,10 +55,9 @@ def write_nwb(
                     )
                 file.add_acquisition(each)
             rows.append(_row(recording, {name: each.name for name, each in series.items()}))
-        described = _LABELS | _NUMBERS | {key: f"TimeSeries: {_SERIES[key]}" for key in _SERIES}
         columns = [
             _tables.VectorData(name=name, description=text, data=[row[name] for row in rows])
-            for name, text in described.items()
+            for name, text in _columns().items()
         ]
         table = _tables.DynamicTable(
             name="recordings", description="A line per recording", columns=columns
@@ -113,9 +92,9 @@ def _series(path: str, source: AbstractSource, shared: dict[Hashable, Any]) -> d
         key = source.unloaded if record.name == "v_th" else None
         series[record.name] = _nwb.TimeSeries(
             name=f"{path}/{record.name}".replace("/", ".").replace(":", "."),
-            description=_SERIES[record.name],
+            description=SIGNALS[record.name].description,
             data=shared[key] if key in shared else _Samples(source, record),
-            unit=schema.at("dataset")[record.name].unit,
+            unit=SIGNALS[record.name].unit,
             conversion=record.conversion,
             offset=record.offset,
             rate=source.metadata.sample_rate,
@@ -126,17 +105,23 @@ def _series(path: str, source: AbstractSource, shared: dict[Hashable, Any]) -> d
     return series
 
 
+def _columns() -> dict[str, str]:
+    """Descriptions of the columns of the table."""
+    columns = {"path": "Path in the etid file."}
+    for name, field in schema.at("group attribute").items():
+        columns[name] = field.description + (f" [{field.unit}]" if field.unit else "")
+    return columns | {name: f"TimeSeries: {field.description}" for name, field in SIGNALS.items()}
+
+
 def _row(source: AbstractSource, series: Mapping[str, str]) -> dict[str, Any]:
+    """The fields of a recording; text for paths, NaN where a number is not known."""
     metadata = source.metadata
-    low, high = metadata.adc_range or (np.nan, np.nan)
-    return {
-        "path": metadata.path,
-        "kind": metadata.kind,
-        **{name: getattr(metadata, name) for name in LABELS},
-        "calibration": "\n".join(metadata.calibration),
-        "pulse_rate": metadata.pulse_rate,
-        "r_load": np.nan if metadata.r_load is None else metadata.r_load,
-        "adc_low": low,
-        "adc_high": high,
-        **{name: series.get(name, "") for name in _SERIES},
-    }
+    row: dict[str, Any] = {"path": metadata.path, "kind": metadata.kind}
+    for name, field in DECLARED.items():
+        value = getattr(metadata, name)
+        if field.type == "paths":
+            value = "\n".join(value)
+        elif value is None:
+            value = (np.nan, np.nan) if field.type == "range" else np.nan
+        row[name] = value
+    return row | {name: series.get(name, "") for name in SIGNALS}

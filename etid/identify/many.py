@@ -44,11 +44,11 @@ from etid.identify.lanes import (
 from etid.identify.one import failed_fit, identify_driver, note
 from etid.identify.prefetch import prefetch
 from etid.recordings.preflight import Inspected
-from etid.recordings.recording import Metadata, Recording, RecordingError
+from etid.recordings.recording import Recording, RecordingError
 from etid.recordings.repeats import repeats
 from etid.recordings.study import Study
 from etid.results.driver import Driver
-from etid.results.fits import LABELS, Fit, Fits, IdentificationError
+from etid.results.fits import Fit, Fits, IdentificationError, described
 from etid.results.provenance import Settings
 from etid.results.study_fits import StudyFits
 from etid.results.verdicts import message
@@ -86,21 +86,6 @@ def each(fit: Callable[[Any], Any], lanes: Any, count: int | Int[Array, ""]) -> 
 
     size = jax.tree.leaves(lanes)[0].shape[0]
     return jax.lax.map(one, (jnp.arange(size), lanes))
-
-
-@dataclasses.dataclass(frozen=True)
-class _Unreadable:
-    """Labels of a recording of which only the path is known."""
-
-    path: str
-    subject: str = ""
-    condition: str = ""
-    electrode: str = ""
-    trial: str = ""
-
-
-def _labels(metadata: Sequence[Metadata | _Unreadable]) -> dict[str, np.ndarray]:
-    return {name: np.array([getattr(m, name) for m in metadata], dtype=str) for name in LABELS}
 
 
 def _stack(fits: Sequence[Fit]) -> Fit:
@@ -307,19 +292,19 @@ def identify_skins(
     check_method(method, circuit)
     if isinstance(recordings, Study):
         study, paths = recordings, [*recordings, *recordings.problems]
-        metadata = [_metadata(study, path) for path in paths]
+        known = [_known(study, path) for path in paths]
         fits, notes = _identify(
             len(paths), lambda row: (study[paths[row]], driver), circuit, method, progress
         )
     else:
         records = several("recordings", recordings)
-        metadata = [record.metadata for record in records]
+        known = [vars(record.metadata) for record in records]
         fits, notes = _identify(
             len(records), lambda row: (records[row], driver), circuit, method, progress
         )
     if not fits:
         raise ValueError("there is no recording to identify")
-    return Fits(_stack(fits), _labels(metadata), np.array(notes, dtype=str))
+    return Fits(_stack(fits), described(known), np.array(notes, dtype=str))
 
 
 def identify_study(
@@ -393,8 +378,8 @@ def table(study: Study, paths: Sequence[str], fits: Sequence[Fit], notes: Sequen
     """
     if not fits:
         raise ValueError("the study has no loaded recording")
-    metadata = [_metadata(study, path) for path in paths]
-    return Fits(_stack(fits), _labels(metadata), np.array(notes, dtype=str))
+    known = [_known(study, path) for path in paths]
+    return Fits(_stack(fits), described(known), np.array(notes, dtype=str))
 
 
 class Drivers:
@@ -451,8 +436,9 @@ class Drivers:
             self.failures[names] = str(error)
 
 
-def _metadata(study: Study, path: str) -> Metadata | _Unreadable:
+def _known(study: Study, path: str) -> dict[str, Any]:
+    """The fields of a recording; of one that cannot be read, its path."""
     try:
-        return study.metadata(path)
+        return vars(study.metadata(path))
     except RecordingError:
-        return _Unreadable(path)
+        return {"path": path}

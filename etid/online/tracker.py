@@ -59,7 +59,7 @@ from etid.online.pulse_fit import (
 from etid.recordings.preflight import Inspected, preflight
 from etid.recordings.recording import Recording
 from etid.results.driver import Driver, HarmonicDriver
-from etid.results.fits import LABELS, Fit, Fits, IdentificationError
+from etid.results.fits import Fit, Fits, IdentificationError, described
 from etid.results.verdicts import RESULTS, first_verdict, message, verdicts_of
 from etid.signals.precision import require_float64
 from etid.signals.transfer import as_complex, power, reciprocal
@@ -248,11 +248,12 @@ class Tracker(eqx.Module):
             One fit per electrode, in their order, labelled by `electrode`.
         """
         fit = jax.tree.map(np.asarray, _judged(self, state))
-        labels = {name: np.full(self.electrodes, "", dtype=str) for name in LABELS}
-        labels["electrode"] = np.array([str(number) for number in range(self.electrodes)])
-        labels["path"] = np.array([f"electrode/{number}" for number in range(self.electrodes)])
+        electrodes = [
+            {"path": f"electrode/{number}", "electrode": str(number)}
+            for number in range(self.electrodes)
+        ]
         notes = np.array([message(name) for name in fit.verdict])
-        return Fits(fit, labels, notes)
+        return Fits(fit, described(electrodes), notes)
 
 
 def _electrode(

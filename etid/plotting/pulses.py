@@ -7,7 +7,8 @@ from matplotlib.axes import Axes
 from etid.circuits.circuit import AbstractCircuit, Resistor
 from etid.identify.one import predict
 from etid.plotting.style import BLUE, INK, RED, Canvas, titled
-from etid.recordings.recording import LABELS, Recording
+from etid.recordings.fields import LABELS
+from etid.recordings.recording import Recording
 from etid.results.driver import Driver
 from etid.results.fits import Fit, rrse
 from etid.signals.measurement import noise

@@ -16,17 +16,9 @@ import numpy as np
 from h5py import h5o  # type: ignore[attr-defined]  # compiled, without stubs
 
 from etid.recordings import limits, schema
-from etid.recordings.recording import (
-    SIGNALS,
-    AbstractSource,
-    Layout,
-    Metadata,
-    Recording,
-    RecordingError,
-    Samples,
-    metadata_from,
-    tidy_path,
-)
+from etid.recordings.errors import near_miss
+from etid.recordings.fields import SIGNALS, Field, Metadata, metadata_from, tidy_path
+from etid.recordings.recording import AbstractSource, Layout, Recording, RecordingError, Samples
 from etid.recordings.untrusted import LIBRARY_ERRORS, Attributes, check_size, local_link, translated
 from etid.signals.pulse_train import find_pulses
 
@@ -198,7 +190,7 @@ class Scan:
                     remedy="Use a path such as 's01/dry/03'",
                 )
             attributes = self._stored.names(group)
-            near = "kind" in attributes or schema.near_miss("kind", attributes)
+            near = "kind" in attributes or near_miss("kind", attributes)
             names = sorted(group, key=_natural)
             if near or "v_out" in names:
                 return self._inspect(group, path, names)
@@ -280,21 +272,19 @@ class Scan:
                 self.blocks[path] = self._block(path, found, headers)
         return None
 
-    def _missing(self, path: str, field: schema.Field) -> None:
+    def _missing(self, path: str, field: Field) -> None:
         self._report(path, field.name, "is missing", f"Add {field.expects}")
 
-    def _near_misses(
-        self, names: list[str], known: dict[str, schema.Field], path: str, of: str
-    ) -> None:
+    def _near_misses(self, names: list[str], known: dict[str, Field], path: str, of: str) -> None:
         absent = [name for name in known if name not in names]
         for name in names:
-            near = None if name in _NAMES else schema.near_miss(name, absent)
+            near = None if name in _NAMES else near_miss(name, absent)
             if near:
                 message = f"is not in the schema, did you mean {near}?"
                 self._report(path, f"{of}{name}", message, "Rename it")
 
     def _attributes(
-        self, owner: h5py.HLObject, known: dict[str, schema.Field], path: str, of: str
+        self, owner: h5py.HLObject, known: dict[str, Field], path: str, of: str
     ) -> dict[str, Any]:
         """The attributes that are in the schema, parsed; those that cannot be are reported."""
         found: dict[str, Any] = {}
@@ -313,7 +303,7 @@ class Scan:
                 self._report(path, f"{of}{name}", str(error), remedy)
         return found
 
-    def _header(self, group: h5py.Group, field: schema.Field, path: str) -> _Header:
+    def _header(self, group: h5py.Group, field: Field, path: str) -> _Header:
         """Shape, dtype and scale of a dataset that lies in this file."""
         link = local_link(group, field.name)
         remedy = "Copy the samples into the file"
@@ -363,7 +353,8 @@ class Scan:
         """What a group holds, once each field is right by itself."""
         shapes = {name: header.shape for name, header in headers.items()}
         out = shapes["v_out"]
-        if shapes["v_th"] not in (out, out[-1:]) or shapes.get("current", out) != out:
+        once = [name for name, shape in shapes.items() if shape != out]
+        if once and (once != ["v_th"] or shapes["v_th"] != out[-1:]):
             found_shapes = ", ".join(f"{name} {shape}" for name, shape in shapes.items())
             raise RecordingError(
                 f"shapes do not fit each other: {found_shapes}",

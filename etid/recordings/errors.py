@@ -1,5 +1,8 @@
 """The error that says where something is wrong, what, and what to do."""
 
+import difflib
+from collections.abc import Iterable
+
 
 class RecordingError(ValueError):
     """Something is wrong with a recording or its file; says where, what, and what to do.
@@ -46,3 +49,14 @@ class RecordingError(ValueError):
 
 def _rebuild_error(message: str, file: str, path: str, field: str, remedy: str) -> RecordingError:
     return RecordingError(message, file=file, path=path, field=field, remedy=remedy)
+
+
+def near_miss(name: str, known: Iterable[str]) -> str | None:
+    """The known name that an unknown one was probably meant to be."""
+    simple = {_simple(other): other for other in known}
+    close = difflib.get_close_matches(_simple(name), simple, n=1, cutoff=0.8)
+    return simple[close[0]] if close else None
+
+
+def _simple(name: str) -> str:
+    return name.lower().replace("_", "").replace("-", "").replace(" ", "")

@@ -11,6 +11,7 @@ import h5py
 
 from etid.recordings import schema
 from etid.recordings.contents import Scan
+from etid.recordings.errors import near_miss
 from etid.recordings.recording import RecordingError
 from etid.recordings.study import Study
 from etid.recordings.untrusted import Attributes, check_file, translated
@@ -82,7 +83,7 @@ def _check_root(file: h5py.File, name: str, attributes: Attributes) -> None:
         remedy = f"The file needs the attributes schema={schema.NAME!r} and schema_version"
         with translated(name, field=field.name):
             if field.name not in file.attrs:
-                near = schema.near_miss(field.name, attributes.names(file))
+                near = near_miss(field.name, attributes.names(file))
                 hint = f", did you mean {field.name} by {near}?" if near else ""
                 raise RecordingError(f"is missing{hint}", remedy=remedy)
             try:

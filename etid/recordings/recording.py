@@ -8,8 +8,7 @@ the size of a quantisation step stays known.
 
 import abc
 import dataclasses
-import math
-from collections.abc import Hashable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Hashable, Iterator, Mapping
 from types import MappingProxyType
 from typing import Any, NamedTuple, SupportsFloat
 
@@ -17,71 +16,9 @@ import numpy as np
 import numpy.typing as npt
 from jaxtyping import Float
 
-from etid.recordings import schema
 from etid.recordings.errors import RecordingError as RecordingError
-
-Label = str | int | np.integer
-SIGNALS = ("v_th", "v_out", "current")
-
-
-def _real(field: str, value: object) -> float:
-    """A finite real number, or an error; text and booleans are no numbers."""
-    number = isinstance(value, int | float | np.integer | np.floating) or (
-        getattr(value, "shape", None) == () and getattr(value, "dtype", np.dtype("O")).kind in "iuf"
-    )
-    if not number or isinstance(value, bool) or not math.isfinite(float(value)):  # type: ignore[arg-type]  # checked on this line
-        raise RecordingError(f"is {value!r}, must be a finite real number", field=field)
-    return float(value)  # type: ignore[arg-type]  # checked above
-
-
-def _positive(field: str, value: object, unit: str) -> float:
-    number = _real(field, value)
-    if number <= 0:
-        raise RecordingError(f"is {number:g} {unit}, must be > 0", field=field)
-    return number
-
-
-def text(field: str, value: object) -> str:
-    """A label as text; integers become their decimal digits."""
-    if isinstance(value, int | np.integer) and not isinstance(value, bool):
-        value = int(value)
-    elif not isinstance(value, str):
-        raise RecordingError(f"is {value!r}, must be text or an integer", field=field)
-    label = str(value)
-    if "\0" in label or any("\ud800" <= character <= "\udfff" for character in label):
-        raise RecordingError(f"{label!r} cannot be stored as UTF-8 text", field=field)
-    return label
-
-
-def wanted_labels(given: Mapping[str, Any], known: Sequence[str]) -> dict[str, str]:
-    """Labels by which recordings or fits are chosen, as text; those that are None are left out.
-
-    Raises:
-        RecordingError: There is no label of that name, or its value is no label.
-    """
-    for name in given:
-        if name not in known:
-            near = schema.near_miss(name, known)
-            raise RecordingError(
-                f"is no label{f', did you mean {near}?' if near else ''}",
-                field=name,
-                remedy=f"The labels are {', '.join(known)}",
-            )
-    return {name: text(name, value) for name, value in given.items() if value is not None}
-
-
-def tidy_path(path: str) -> str:
-    """An HDF5 path without leading and trailing slashes; refuses what cannot be a recording's."""
-    tidy = text("path", path).strip("/")
-    parts = tidy.split("/") if tidy else []
-    if any(part in ("", ".", "..", *SIGNALS) for part in parts):
-        raise RecordingError(
-            f"{path!r} cannot be the path of a recording: no part of it may be empty, '.', '..' "
-            f"or one of the names {', '.join(SIGNALS)}",
-            field="path",
-            remedy="Use a path such as 's01/dry/03'",
-        )
-    return tidy
+from etid.recordings.fields import LABELS, AbstractFields, Metadata, metadata_from
+from etid.recordings.values import real
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -114,12 +51,12 @@ class Samples:
         if array.flags.writeable:  # a copy, because the caller may go on writing to the original
             array = array.copy()
             array.flags.writeable = False
-        scale = _real("conversion", conversion)
+        scale = real("conversion", conversion)
         if scale == 0:
             raise RecordingError("is 0, every sample would be equal", field="conversion")
         object.__setattr__(self, "stored", array)
         object.__setattr__(self, "conversion", scale)
-        object.__setattr__(self, "offset", _real("offset", offset))
+        object.__setattr__(self, "offset", real("offset", offset))
 
     @property
     def values(self) -> Float[np.ndarray, "..."]:
@@ -139,97 +76,18 @@ class Samples:
         return abs(self.conversion) if self.stored.dtype.kind in "iu" else None
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class Metadata:
-    """Everything about a recording but its samples.
-
-    Attributes:
-        path: HDF5 path inside a study, such as `s01/dry/03`.
-        sample_rate: Samples per second [Hz].
-        pulse_rate: Stimulation pulses per second [Hz].
-        r_load: Known resistor of a calibration [ohm]; None for an unknown load.
-        subject: Who.
-        condition: Which state of the skin, or which circuit.
-        electrode: Which electrode of the display.
-        trial: Which repetition.
-        calibration: Paths of the calibration recordings that belong to this one.
-        adc_range: Terminal voltages at which the converter saturates [V].
-    """
-
-    path: str = ""
-    sample_rate: float
-    pulse_rate: float
-    r_load: float | None = None
-    subject: str = ""
-    condition: str = ""
-    electrode: str = ""
-    trial: str = ""
-    calibration: tuple[str, ...] = ()
-    adc_range: tuple[float, float] | None = None
-
-    def __post_init__(self) -> None:
-        if self.pulse_rate >= self.sample_rate / 2:
-            raise RecordingError(
-                f"is {self.pulse_rate:g} Hz, must be below half the sample rate of "
-                f"{self.sample_rate:g} Hz",
-                field="pulse_rate",
-            )
-        if self.r_load is not None and self.calibration:
-            raise RecordingError(
-                "a recording with a known resistor (r_load) is a calibration and has none itself",
-                field="calibration",
-            )
-        if self.adc_range is not None and not self.adc_range[0] < self.adc_range[1]:
-            raise RecordingError(
-                f"is {self.adc_range}, must be two increasing voltages", field="adc_range"
-            )
-
-    @property
-    def kind(self) -> str:
-        """`calibration` or `loaded`."""
-        return "loaded" if self.r_load is None else "calibration"
-
-
-def metadata_from(**fields: Any) -> Metadata:
-    """Metadata from unchecked values; the one place where their types are settled."""
-    tidy: dict[str, Any] = {name: text(name, fields.get(name, "")) for name in LABELS}
-    tidy["path"] = tidy_path(fields.get("path", ""))
-    tidy["sample_rate"] = _positive("sample_rate", fields["sample_rate"], "Hz")
-    tidy["pulse_rate"] = _positive("pulse_rate", fields["pulse_rate"], "Hz")
-    if fields.get("r_load") is not None:
-        tidy["r_load"] = _positive("r_load", fields["r_load"], "ohm")
-    calibration = fields.get("calibration", ())
-    paths = (calibration,) if isinstance(calibration, str) else calibration
-    tidy["calibration"] = tuple(tidy_path(path) for path in paths)
-    if fields.get("adc_range") is not None:
-        limits = tuple(fields["adc_range"])
-        if len(limits) != 2:
-            raise RecordingError(f"is {limits}, must be two increasing voltages", field="adc_range")
-        tidy["adc_range"] = (_real("adc_range", limits[0]), _real("adc_range", limits[1]))
-    return Metadata(**tidy)
-
-
-LABELS = ("subject", "condition", "electrode", "trial")
-
-
 @dataclasses.dataclass(frozen=True, eq=False, repr=False, init=False)
-class Recording:
+class Recording(AbstractFields):
     """Unloaded and loaded output of a driver on one clock.  Immutable; equal only to itself.
 
     Args:
         v_th: Unloaded output [V], real numbers or `Samples`.
         v_out: Output with the load [V], real numbers or `Samples`.
-        sample_rate: Samples per second [Hz].
-        pulse_rate: Stimulation pulses per second [Hz].
-        r_load: Known resistor [ohm]; given, the recording is a calibration.
         current: Measured current through the load [A], optional.
-        subject: Who.
-        condition: Which state of the skin, or which circuit.
-        electrode: Which electrode of the display.
-        trial: Which repetition.
-        calibration: Path or paths of the calibration recordings that belong to this one.
-        adc_range: Terminal voltages at which the converter saturates [V], optional.
-        path: HDF5 path inside a study.
+        **fields: All other fields, by name: `path`, `sample_rate` [Hz] and `pulse_rate` [Hz], which
+            are required, `r_load` [ohm], which makes the recording a calibration, the labels
+            `subject`, `condition`, `electrode` and `trial`, the paths of its `calibration`, and
+            `adc_range` [V].
 
     Raises:
         RecordingError: A mistake that can be seen without looking at the values of the samples.
@@ -238,33 +96,14 @@ class Recording:
 
     samples: Mapping[str, Samples]
     metadata: Metadata
-    sample_rate: float
-    pulse_rate: float
-    r_load: float | None
-    subject: str
-    condition: str
-    electrode: str
-    trial: str
-    calibration: tuple[str, ...]
-    adc_range: tuple[float, float] | None
-    path: str
 
     def __init__(
         self,
         v_th: npt.ArrayLike | Samples,
         v_out: npt.ArrayLike | Samples,
         *,
-        sample_rate: SupportsFloat,
-        pulse_rate: SupportsFloat,
-        r_load: SupportsFloat | None = None,
         current: npt.ArrayLike | Samples | None = None,
-        subject: Label = "",
-        condition: Label = "",
-        electrode: Label = "",
-        trial: Label = "",
-        calibration: str | Iterable[str] = (),
-        adc_range: Iterable[SupportsFloat] | None = None,
-        path: str = "",
+        **fields: Any,
     ) -> None:
         try:
             samples = {"v_th": _samples("v_th", v_th), "v_out": _samples("v_out", v_out)}
@@ -277,24 +116,13 @@ class Recording:
                     f"numbers of samples differ: {found}",
                     remedy="Cut the records to the same stretch of time",
                 )
-            metadata = metadata_from(
-                sample_rate=sample_rate,
-                pulse_rate=pulse_rate,
-                r_load=r_load,
-                subject=subject,
-                condition=condition,
-                electrode=electrode,
-                trial=trial,
-                calibration=calibration,
-                adc_range=adc_range,
-                path=path,
-            )
+            metadata = metadata_from(**fields)
         except RecordingError as error:
-            raise error.located(path=path) from None
+            raise error.located(path=str(fields.get("path", ""))) from None
         object.__setattr__(self, "samples", MappingProxyType(samples))
         object.__setattr__(self, "metadata", metadata)
-        for field in dataclasses.fields(Metadata):
-            object.__setattr__(self, field.name, getattr(metadata, field.name))
+        for name, value in vars(metadata).items():
+            object.__setattr__(self, name, value)
 
     @property
     def v_th(self) -> Float[np.ndarray, " time"]:

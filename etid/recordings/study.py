@@ -7,16 +7,8 @@ from collections.abc import Callable, Collection, Hashable, Iterable, Iterator, 
 
 import numpy.typing as npt
 
-from etid.recordings.recording import (
-    LABELS,
-    AbstractSource,
-    Label,
-    Layout,
-    Metadata,
-    Recording,
-    RecordingError,
-    wanted_labels,
-)
+from etid.recordings.fields import LABELS, Label, Metadata, wanted_labels
+from etid.recordings.recording import AbstractSource, Layout, Recording, RecordingError
 from etid.recordings.writing import write
 
 
@@ -170,27 +162,19 @@ class Study(Mapping[str, Recording]):
         """The recordings one after the other, each loaded when its turn comes."""
         return (source.load() for source in self._sources.values())
 
-    def where(
-        self,
-        *,
-        subject: Label | None = None,
-        condition: Label | None = None,
-        electrode: Label | None = None,
-        trial: Label | None = None,
-    ) -> "Study":
+    def where(self, **labels: Label | None) -> "Study":
         """The recordings whose labels equal those given; no samples are read.
 
         Args:
-            subject: Who.
-            condition: Which state of the skin, or which circuit.
-            electrode: Which electrode of the display.
-            trial: Which repetition.
+            **labels: `subject`, `condition`, `electrode` or `trial`.
 
         Returns:
             A study that reads from the same file.
+
+        Raises:
+            RecordingError: There is no such label, or its value is neither text nor an integer.
         """
-        given = zip(LABELS, (subject, condition, electrode, trial), strict=True)
-        wanted = wanted_labels(dict(given), LABELS)
+        wanted = wanted_labels(labels, LABELS)
         return self._part(
             lambda metadata: all(getattr(metadata, name) == label for name, label in wanted.items())
         )

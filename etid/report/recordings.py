@@ -7,8 +7,9 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from etid.plotting import figure_of
+from etid.recordings.fields import LABELS
 from etid.recordings.hdf5 import read
-from etid.recordings.recording import LABELS, Recording, RecordingError
+from etid.recordings.recording import Recording, RecordingError
 from etid.recordings.study import Study
 from etid.report.figures import plain, svg
 from etid.report.html import Picture

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from etid.circuits.circuit import AbstractCircuit
+from etid.recordings.fields import DESCRIBING
 from etid.recordings.study import Study
 from etid.report import tables as study_tables
 from etid.report.html import Picture, Section, write_page
@@ -81,23 +82,28 @@ def write_report(
         ]
     finally:
         place.close()
-    write_page(page, f"Report on {name}", _summary(found), sections)
+    write_page(page, f"Report on {name}", summary(found), sections)
 
 
 def _same(one: str | os.PathLike[str], other: str | os.PathLike[str]) -> bool:
     return os.path.exists(one) and os.path.exists(other) and os.path.samefile(one, other)
 
 
-def _summary(found: StudyFits) -> str:
+def summary(found: StudyFits) -> str:
     """The study in two sentences."""
     fits, settings = found.fits, found.settings
     good = fits.counts().get("successful", 0)
     source = pathlib.Path(settings.source).name if settings is not None else ""
     text = f"{len(fits)} recordings{f' of {source}' if source else ''}"
-    for label in ("subject", "condition", "electrode"):
-        count = len(set(map(str, fits.labels[label])) - {""})
-        if count:
-            text += f", {count} {label}{'s' if count > 1 else ''}"
+    for name, field in DESCRIBING.items():
+        column = fits.labels[name]
+        if field.type == "number":
+            known = column[np.isfinite(column)]
+            if known.size:
+                text += f", {name} {known.min():.4g} to {known.max():.4g} {field.unit}"
+        elif name != "trial":
+            count = len(set(map(str, column)) - {""})
+            text += f", {count} {name}{'s' if count > 1 else ''}" if count else ""
     text += f", identified as {type(fits.circuit).__name__} by {words(fits.fit.method)}. "
     share = f"{100 * good / len(fits):.1f} %"
     return text + f"{good} fits ({share}) are successful; only these enter medians and spreads."

@@ -16,13 +16,18 @@ from jaxtyping import Array, Bool, Complex, Float, Int
 from etid.circuits.circuit import AbstractCircuit
 from etid.circuits.display import DISPLAY, plus_minus, quantity
 from etid.circuits.lookup import qualified, remembered
-from etid.recordings.recording import Label, RecordingError, wanted_labels
+from etid.recordings.fields import DESCRIBING, Label, wanted_labels
+from etid.recordings.recording import RecordingError
 from etid.recordings.remarks import remarks_of, texts, words
 from etid.results.hdf5_table import Table, opened_table, same_length, write_table
 from etid.results.verdicts import RESULTS, message, verdict_names, verdicts_of
 
 SCHEMA = "etid/fits"
-LABELS = ("path", "subject", "condition", "electrode", "trial")
+# What a table says of each recording: its path, its labels, and numbers that describe it.
+DESCRIBED = {"path": "text"} | {
+    name: "text" if field.type == "label" else "number" for name, field in DESCRIBING.items()
+}
+LABELS = tuple(name for name, kind in DESCRIBED.items() if kind == "text")
 
 
 def rrse(predicted: Float[Array, " time"], measured: Float[Array, " time"]) -> Float[Array, ""]:
@@ -153,13 +158,30 @@ class Fit(eqx.Module):
         return "\n".join(lines)
 
 
+def described(recordings: Sequence[Mapping[str, Any]]) -> dict[str, np.ndarray]:
+    """The columns of `Fits.labels`.
+
+    Args:
+        recordings: What is known of each: fields by name. A label that is missing is empty, a
+            number NaN.
+    """
+    columns = {name: [one.get(name) for one in recordings] for name in DESCRIBED}
+    return {
+        name: np.array([value or "" for value in column], str)
+        if DESCRIBED[name] == "text"
+        else np.array(column, float)
+        for name, column in columns.items()
+    }
+
+
 @dataclasses.dataclass(frozen=True, eq=False)
 class Fits:
     """Identified circuits of many recordings, in the order of the recordings.
 
     Attributes:
         fit: The fits, batched along one leading axis, as numpy arrays.
-        labels: `path`, `subject`, `condition`, `electrode` and `trial` of each recording.
+        labels: `path`, `subject`, `condition`, `electrode` and `trial` of each recording, and
+            numbers that describe it.
         notes: What went wrong in words, where something did; else empty.
     """
 
@@ -210,7 +232,7 @@ class Fits:
         fits = [dataclasses.replace(part.fit, method=method) for part in parts]
         return cls(
             jax.tree.map(lambda *leaves: np.concatenate(leaves), *fits),
-            {name: np.concatenate([part.labels[name] for part in parts]) for name in LABELS},
+            {name: np.concatenate([part.labels[name] for part in parts]) for name in DESCRIBED},
             np.concatenate([part.notes for part in parts]),
         )
 
@@ -243,7 +265,7 @@ class Fits:
 
     def table(self) -> dict[str, np.ndarray]:
         """One column per label, element [SI], standard error, quality and verdict."""
-        columns = {name: self.labels[name] for name in LABELS}
+        columns = {name: self.labels[name] for name in DESCRIBED}
         for name in self.circuit.names():
             columns[name] = np.asarray(getattr(self.circuit, name))
             columns[f"{name}_stderr"] = np.asarray(getattr(self.stderr, name))
@@ -348,6 +370,7 @@ class Fits:
         """Columns, their units and the attributes of the file that `write` writes."""
         units = self.circuit.units()
         units |= {f"{name}_stderr": unit for name, unit in units.items()}
+        units |= {name: field.unit for name, field in DESCRIBING.items() if field.unit}
         columns = self.table() | {"cov": self.cov, "shared_cov": self.fit.shared_cov}
         columns["change_stderr"] = self._changes[1]
         attributes = {
@@ -391,7 +414,8 @@ class Fits:
         """
         kind = _circuit(table, circuit)
         size = len(kind.names())
-        columns = {name: table.column(name, "text") for name in (*LABELS, "verdict", "note")}
+        columns = {name: table.column(name, "text") for name in ("verdict", "note")}
+        columns |= {name: table.column(name, kind) for name, kind in DESCRIBED.items()}
         columns |= {name: table.column(name, "number") for name in (*kind.names(), "rrse", "chi2")}
         columns["steps"] = table.column("steps", "integer")
         for name in ("cov", "shared_cov"):
@@ -419,7 +443,7 @@ class Fits:
             remarks=remarks,
             **_changes_of(read, changes),
         )
-        return cls(fit, {name: read[name] for name in LABELS}, read["note"])
+        return cls(fit, {name: read[name] for name in DESCRIBED}, read["note"])
 
 
 def _circuit(table: Table, given: type[AbstractCircuit] | None) -> type[AbstractCircuit]:

@@ -27,7 +27,8 @@ import numpy as np
 from jaxtyping import Complex, Float
 
 from etid.circuits.circuit import AbstractCircuit
-from etid.recordings.recording import Recording, Samples, tidy_path
+from etid.recordings.fields import tidy_path
+from etid.recordings.recording import Recording, Samples
 from etid.recordings.study import Study
 from etid.signals.precision import require_float64
 from etid.simulation.transformer import (

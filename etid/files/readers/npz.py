@@ -3,6 +3,7 @@
 import math
 import pathlib
 import zipfile
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -13,8 +14,8 @@ from etid.recordings import limits
 from etid.recordings.recording import Recording, RecordingError, Samples
 
 
-def recordings(path: pathlib.Path, subject: str, condition: str) -> list[Recording]:
-    """All recordings of an archive.
+def recordings(path: pathlib.Path, labels: Mapping[str, Any]) -> list[Recording]:
+    """All recordings of an archive, with these labels.
 
     `adc_th`, `adc_out` (trial, time) and `adc_ref` (resistor, time) are converter codes; `R_ref`,
     `fs`, `f0`, `lsb` and `scale` are numbers.  They become `calibration/0`, … and `loaded/0`, …;
@@ -50,8 +51,7 @@ def recordings(path: pathlib.Path, subject: str, condition: str) -> list[Recordi
     common: dict[str, Any] = {
         "sample_rate": rate,
         "pulse_rate": pulses,
-        "subject": subject,
-        "condition": condition,
+        **labels,
         "adc_range": (limits.min * conversion, limits.max * conversion),
     }
     first = Samples(th[0], conversion)
