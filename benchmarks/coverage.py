@@ -25,6 +25,7 @@ from benchmarks.ladder import LOADS
 from benchmarks.perturbed_study import drawn_driver
 from benchmarks.spice import ESTIMATORS, FOLDER, JOINT, add_data, scene_of
 from etid.estimators.registry import Method
+from etid.simulation.published import REFERENCE
 from etid.simulation.scenes import Scene, Trial
 from etid.simulation.transformer import ResistorLoad
 
@@ -79,7 +80,7 @@ def expected_covered(fits: int) -> tuple[float, float]:
 def scene(
     snr_db: float,
     samples: int,
-    resistors: Sequence[float] = (98.8e3,),
+    resistors: Sequence[float] = (REFERENCE,),
     jitter: float = 50e-9,
     shared_v_th: bool = False,
     more: int = 0,
@@ -198,7 +199,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--samples", type=int, default=10_000)
     parser.add_argument("--repetitions", type=int, default=200)
     parser.add_argument("--jitter", type=float, default=50e-9, help="rms trigger delay [s]")
-    parser.add_argument("--resistors", type=float, nargs="+", default=[98.8e3], help="[ohm]")
+    parser.add_argument("--resistors", type=float, nargs="+", default=[REFERENCE], help="[ohm]")
     parser.add_argument("--shared", action="store_true", help="one unloaded record for all")
     parser.add_argument("--method", choices=ESTIMATORS, help="default: that of the records")
     parser.add_argument("--more", type=int, default=0, help="further trials, for a joint fit")

@@ -13,6 +13,7 @@ import scipy.optimize
 
 import etid
 from benchmarks.ladder import LOADS
+from etid.simulation.published import REFERENCE
 from etid.simulation.scenes import Scene, Trial
 from etid.simulation.transformer import ResistorLoad, TransformerDriver
 
@@ -29,7 +30,7 @@ def scene(pulse_rate: float, load: str) -> Scene:
     )
     made = Scene(
         (Trial(load, LOADS[load]),),
-        (Trial("calibration", ResistorLoad(98.8e3)),),
+        (Trial("calibration", ResistorLoad(REFERENCE)),),
         pulse,
         pulse_rate=pulse_rate,
         samples=round(DURATION * 200e3),

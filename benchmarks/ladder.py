@@ -9,13 +9,11 @@ from typing import Any
 
 from benchmarks import ngspice
 from etid.recordings.study import Study
+from etid.simulation.published import REFERENCE, TYPICAL
 from etid.simulation.scenes import Scene, Trial
-from etid.simulation.transformer import ResistorLoad, SkinLoad
+from etid.simulation.transformer import ResistorLoad
 
-LOADS = {
-    "dry": SkinLoad(r_s=33.4e3, r_p=186e3, c_p=0.12e-9),
-    "damp": SkinLoad(r_s=6.1e3, r_p=17.4e3, c_p=0.66e-9),
-}
+LOADS = TYPICAL
 START = (20e3, 100e3, 0.3e-9)  # elements, in SI, of no fingertip in particular
 TRIAL = "skin/01"
 CALIBRATION = "calibration/98k8"
@@ -34,7 +32,7 @@ def rung(load: str, **settings: Any) -> Scene:
     middle = {"snr_db": 60.0, "samples": 10_000, "trigger_jitter_rms": 50e-9}
     return Scene(
         (Trial(TRIAL, LOADS[load]),),
-        (Trial(CALIBRATION, ResistorLoad(98.8e3)),),
+        (Trial(CALIBRATION, ResistorLoad(REFERENCE)),),
         **{**middle, **settings},
     )
 

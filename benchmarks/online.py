@@ -13,10 +13,11 @@ from tqdm import tqdm
 
 import etid
 from benchmarks.speed import pin
+from etid.simulation.published import REFERENCE, TYPICAL
 from etid.simulation.scenes import Scene, Trial
-from etid.simulation.transformer import ResistorLoad, SkinLoad
+from etid.simulation.transformer import ResistorLoad
 
-LOADS = (SkinLoad(r_s=33.4e3, r_p=186e3, c_p=0.12e-9), SkinLoad(r_s=6.1e3, r_p=17.4e3, c_p=0.66e-9))
+LOADS = tuple(TYPICAL.values())
 TARGET = 0.15  # of the time between two pulses, which 99 % of the ticks must keep to
 WARM = 50  # ticks before the first that counts: compilation, and the start of every electrode
 KINDS = 60  # different pulses, over and over
@@ -54,7 +55,7 @@ def main(arguments: argparse.Namespace) -> bool:
 def _problem(electrodes: int, lifted: int) -> tuple[etid.Tracker, np.ndarray]:
     """A tracker, and pulses for it (pulse, electrode, sample)."""
     trials = tuple(Trial(f"loaded/{i}", LOADS[i % len(LOADS)]) for i in range(electrodes))
-    resistors = (98.8e3, 21.62e3)
+    resistors = (REFERENCE, 21.62e3)
     calibration = tuple(Trial(f"calibration/{i}", ResistorLoad(r)) for i, r in enumerate(resistors))
     whole = Scene(trials, calibration, trigger_jitter_rms=50e-9)
     study = whole.simulate(seed=0)

@@ -28,9 +28,9 @@ import etid
 from benchmarks import charts
 from benchmarks.paper_tables import Groups, Row, with_circuit
 from etid.circuits.display import DISPLAY
-from etid.paper import tables as experiments
 from etid.paper.tables import CALIBRATION, METHODS, ORDER, Outcome, Truth
 from etid.plotting.pulses import draw_pulse, pulse
+from etid.simulation import published
 
 GOOD, NOISY = "good", "both"
 OURS, THEIRS = METHODS
@@ -94,7 +94,7 @@ def pulses(study: etid.Study, path: pathlib.Path) -> None:
 def driver(study: etid.Study, found: etid.Driver, path: pathlib.Path) -> None:
     """Figure 7: the calibration, and two resistors that the driver has not seen."""
     figure, axes = charts.new_figure(2, 3, (12.0, 4.6), gridspec_kw=HEIGHTS, sharex="col")
-    known = experiments.TABLE_1
+    known = published.TABLE_1
     resistances = {etid.scenes.resistor_label(r): r for r in known}
     for (upper, lower), of in zip(axes.T, (CALIBRATION, *RESISTORS), strict=True):
         record = study[of]
@@ -166,7 +166,7 @@ def _legend_above(figure: Figure, axes: Axes) -> None:
 def subjects(first: Mapping[tuple[str, str], Outcome], truth: Truth, path: pathlib.Path) -> None:
     """Figure 10: true and identified elements of all subjects; the paper's range is grey."""
     figure, axes = charts.new_figure(len(ORDER), 2, (10.5, 7.5), sharex="col")
-    for column, condition in zip(axes.T, experiments.FINGERTIPS, strict=True):
+    for column, condition in zip(axes.T, published.FINGERTIPS, strict=True):
         for axis, name in zip(column, ORDER, strict=True):
             _elements_of(axis, first, truth, condition, name)
         column[0].set_title(f"{condition}, {_settings(NOISY)}", fontsize=10)
@@ -184,7 +184,7 @@ def _elements_of(
 ) -> None:
     """One panel of figure 10; estimates that lie outside are counted."""
     scale, symbol = DISPLAY[etid.SkinRC.units()[name]]
-    typical, lowest, highest = (v / scale for v in experiments.FINGERTIPS[condition][name])
+    typical, lowest, highest = (v / scale for v in published.FINGERTIPS[condition][name])
     axis.axhspan(lowest, highest, color="0.93", label="range of the paper's subjects", zorder=0)
     low, high = min(typical, lowest) / ROOM, max(typical, highest) * ROOM
     outside = []
@@ -225,7 +225,7 @@ def causes(rows: Sequence[Row], path: pathlib.Path) -> None:
     laboratories = list(dict.fromkeys(row["laboratory"] for row in rows))
     names = ["paper", *laboratories]
     for axis, element in zip(axes[0], ORDER, strict=True):
-        error, scatter = experiments.TABLE_4[element]
+        error, scatter = published.TABLE_4[element]
         axis.axvline(0.0, color="0.6", lw=0.8)
         axis.errorbar(
             error, 0, xerr=scatter, fmt="D", ms=5, color=charts.INK, lw=1.2, capsize=3,

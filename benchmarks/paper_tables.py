@@ -14,6 +14,7 @@ from etid.circuits.display import DISPLAY
 from etid.paper import tables as experiments
 from etid.paper.tables import ORDER, Outcome, Truth
 from etid.report.html import Table, number
+from etid.simulation import published
 
 Row = dict[str, Any]
 Groups = Mapping[tuple[str, str], Sequence[Outcome]]
@@ -40,7 +41,7 @@ def table_1(groups: Groups) -> list[Row]:
     rows = []
     for (laboratory, method), outcomes in groups.items():
         found = [experiments.resistor_errors(outcome) for outcome in outcomes]
-        for r, paper in experiments.TABLE_1.items():
+        for r, paper in published.TABLE_1.items():
             every = np.array([of[r] for of in found])
             some = every[np.isfinite(every)]
             rows.append(
@@ -66,7 +67,7 @@ def table_fingertips(groups: Groups, truth: Truth, condition: str) -> list[Row]:
         every = [outcome.skins.where(condition=condition) for outcome in outcomes]
         some = [fits for fits in map(with_circuit, every) if _is_complete(fits, every[0])]
         for name in ORDER:
-            typical, lowest, highest = experiments.FINGERTIPS[condition][name]
+            typical, lowest, highest = published.FINGERTIPS[condition][name]
             found = [vars(experiments.fingertips(fits, truth, name)) for fits in some]
             fields = experiments.Fingertips.__dataclass_fields__
             rows.append(
@@ -107,7 +108,7 @@ def table_4(groups: Groups, truth: Truth) -> list[Row]:
         for i, name in enumerate(etid.SkinRC.names()):
             found = [experiments.errors(fits, truth)[name] for fits in some]
             means = np.array([errors.mean() for errors in found])
-            paper_error, paper_scatter = experiments.TABLE_4[name]
+            paper_error, paper_scatter = published.TABLE_4[name]
             rows.append(
                 {
                     "laboratory": laboratory,
@@ -139,7 +140,7 @@ def _stderr_of_mean(fits: etid.Fits, truth: Truth, i: int) -> float:
 def show_1(rows: Sequence[Row]) -> Table:
     """Table I for the terminal: mean error ± spread between studies."""
     names = list(dict.fromkeys((row["laboratory"], row["method"]) for row in rows))
-    resistances = experiments.TABLE_1
+    resistances = published.TABLE_1
     lines: list[tuple[str, ...]] = [
         ("paper", "", *(f"{error:g}" for error in resistances.values()), "")
     ]
@@ -186,9 +187,9 @@ def show_fingertips(rows: Sequence[Row]) -> Table:
 def show_4(rows: Sequence[Row]) -> Table:
     """Table IV for the terminal: mean error / scatter within a study, and between studies."""
     names = list(dict.fromkeys((row["laboratory"], row["method"]) for row in rows))
-    paper = (f"±{error:g} / {scatter:g}" for error, scatter in experiments.TABLE_4.values())
+    paper = (f"±{error:g} / {scatter:g}" for error, scatter in published.TABLE_4.values())
     lines: list[tuple[str, ...]] = [
-        ("paper", "", *paper, "{} to {}".format(*experiments.RRSE), "", "")
+        ("paper", "", *paper, "{} to {}".format(*published.RRSE), "", "")
     ]
     for name in names:
         of = {row["element"]: row for row in rows if (row["laboratory"], row["method"]) == name}

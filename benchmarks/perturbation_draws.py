@@ -19,7 +19,7 @@ from benchmarks.laboratory import Record
 from benchmarks.ladder import LOADS
 from benchmarks.mappings import make_room
 from benchmarks.perturbation_list import PERTURBATIONS
-from benchmarks.perturbed_study import RESISTOR, Truth, undisturbed
+from benchmarks.perturbed_study import REFERENCE, Truth, undisturbed
 from etid.estimators.registry import Method, choose
 from etid.recordings.preflight import Inspected
 from etid.simulation.scenes import Scene, Trial
@@ -116,7 +116,7 @@ def _bounds(snr_db: float, samples: int, bits: int, full_scale: float) -> dict[s
     """Bounds of the undisturbed scene with this noise and converter, by path."""
     scene = Scene(
         tuple(Trial(name, skin) for name, skin in LOADS.items()),
-        (Trial("calibration", ResistorLoad(RESISTOR)),),
+        (Trial("calibration", ResistorLoad(REFERENCE)),),
         snr_db=snr_db,
         samples=samples,
         bits=bits,

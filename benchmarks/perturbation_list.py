@@ -15,7 +15,7 @@ from collections.abc import Mapping
 from benchmarks.disturbances import Hum, Offset, Spike
 from benchmarks.failure_axes import Cole, TwoLayers
 from benchmarks.perturbed_study import (
-    RESISTOR,
+    REFERENCE,
     Change,
     all_records,
     both,
@@ -169,9 +169,9 @@ DRIVERS: Mapping[str, Change] = {
 }
 
 CALIBRATIONS: Mapping[str, Change] = {
-    "driver_Rload_wrong_5%": calibrations(out(loads=(ResistorLoad(1.05 * RESISTOR),))),
+    "driver_Rload_wrong_5%": calibrations(out(loads=(ResistorLoad(1.05 * REFERENCE),))),
     "two_resistors_one_wrong_5%": second_resistor(1.05),
-    "says_98.8ohm": calibrations(record(told={"r_load": RESISTOR / 1000})),
+    "says_98.8ohm": calibrations(record(told={"r_load": REFERENCE / 1000})),
     "says_1mohm": calibrations(record(told={"r_load": 1e-3})),
     "says_1Tohm": calibrations(record(told={"r_load": 1e12})),
     "calibration_v_out_is_v_th": calibrations(record(copied=True)),

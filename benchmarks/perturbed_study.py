@@ -15,9 +15,10 @@ from jaxtyping import Float
 from benchmarks.disturbances import Leaky, Nonlinear, Pink
 from benchmarks.laboratory import Crosstalk, Output, Record, noise
 from benchmarks.ladder import LOADS
+from etid.simulation.published import REFERENCE
 from etid.simulation.transformer import Impedance, ResistorLoad, SkinLoad, TransformerDriver
 
-RESISTOR, SECOND = 98.8e3, 21.62e3  # [ohm]
+SECOND = 21.62e3  # [ohm]
 DELAY = 50e-9  # [s] rms, of every loaded and unloaded record
 PARTS = 0.03  # standard deviation of the logarithm of every part of a driver
 FIXED = ("amplitude", "width", "edge", "lead_in", "turns")
@@ -106,7 +107,7 @@ def undisturbed(number: int, snr_db: float) -> Study:
 
     return Study(
         number,
-        (made("calibration/98k8", ResistorLoad(RESISTOR), RESISTOR),),
+        (made("calibration/98k8", ResistorLoad(REFERENCE), REFERENCE),),
         tuple(made(name, skin) for name, skin in LOADS.items()),
         {name: Truth.of(skin) for name, skin in LOADS.items()},
     )

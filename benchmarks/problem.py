@@ -13,11 +13,12 @@ from etid.estimators.maximum_likelihood.load import Load
 from etid.identify.lanes import known_driver, lane, stacked
 from etid.recordings.preflight import Inspected
 from etid.signals.harmonics import Spectrum
+from etid.simulation.published import REFERENCE, TYPICAL
 from etid.simulation.scenes import Scene, Trial
-from etid.simulation.transformer import ResistorLoad, SkinLoad
+from etid.simulation.transformer import ResistorLoad
 
 SAMPLES = 33_330  # ten pulse periods at 200 kHz
-LOAD = SkinLoad(r_s=33.4e3, r_p=186e3, c_p=0.12e-9)
+LOAD = TYPICAL["dry"]
 # Logarithms of typical values, a factor of two from the truth, and no delay.
 START = np.append(np.log([20e3, 100e3, 0.3e-9]), 0.0)
 
@@ -74,7 +75,7 @@ def problem(samples: int, lanes: int, sample_rate: float = 200e3) -> Problem:
     """Simulate `lanes` trials of `samples` samples and identify their driver."""
     scene = Scene(
         tuple(Trial(f"loaded/{i}", LOAD) for i in range(lanes)),
-        (Trial("calibration/0", ResistorLoad(98.8e3)),),
+        (Trial("calibration/0", ResistorLoad(REFERENCE)),),
         samples=samples,
         sample_rate=sample_rate,
         trigger_jitter_rms=50e-9,

@@ -18,10 +18,10 @@ from jaxtyping import Complex, Float
 
 from benchmarks.ladder import rung
 from etid.circuits.circuit import SkinRC
+from etid.simulation.published import REFERENCE
 from etid.simulation.transformer import SkinLoad, loading
 
 BAND = 0.4  # of the sample rate
-RESISTOR = 98.8e3  # [ohm]
 
 Gain = Complex[np.ndarray, " f"]
 
@@ -85,7 +85,7 @@ def deviations(load: SkinLoad, snr_db: float, change: Change) -> float:
             circuit.log_values()
         )
     )
-    loads = load(f), np.full(f.size, complex(RESISTOR))
+    loads = load(f), np.full(f.size, complex(REFERENCE))
     gains = loading(loads[0], z_th), loading(loads[1], z_th)
     changed = change(Records(f, loads[0], z_th, gains))
     # Rows: V_out with the skin and the resistor, then both V_th. Columns of b: both X, and Z_th.

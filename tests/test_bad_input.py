@@ -245,7 +245,7 @@ def test_nothing_to_identify_is_said(calibration, driver):
 @pytest.mark.parametrize(
     ("fields", "message"),
     [
-        ({"sample_rate": 0.0}, "sample_rate: is 0 Hz, must be > 0"),
+        ({"sample_rate": 0.0}, "sample_rate: is 0 hertz, must be > 0"),
         ({"v_out": np.zeros(3)}, "numbers of samples differ"),
         ({"r_load": -1.0}, "r_load"),
     ],

@@ -219,7 +219,7 @@ PROBLEMS = {
         delete(DAMP, "sample_rate"),
         "sample_rate: is missing. Add sample_rate [hertz]",
     ),
-    "zero rate": (set_attribute(DAMP, "sample_rate", 0.0), "sample_rate: is 0 Hz, must be > 0"),
+    "zero rate": (set_attribute(DAMP, "sample_rate", 0.0), "sample_rate: is 0 hertz, must be > 0"),
     "text rate": (
         set_attribute(DAMP, "sample_rate", "200k"),
         "sample_rate: is text '200k', must be",

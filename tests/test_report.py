@@ -16,6 +16,7 @@ from etid.paper import demo, tables
 from etid.report import html as report
 from etid.results.driver import DiscreteDriver
 from etid.results.verdicts import verdict, verdicts_of
+from etid.simulation.published import FINGERTIPS
 
 EXCESS = 1.1  # of every identified element over the true one
 
@@ -158,7 +159,7 @@ def test_tables_tell_errors_of_studies_from_scatter_of_trials(groups):
         for row in paper_tables.table_fingertips(groups, truth, condition):
             found = [row[name] for name in ("error", "spread", "subject_error", "worst")]
             np.testing.assert_allclose(found, [20.0, 0.0, 20.0, 20.0], atol=1e-9)
-            assert row["paper_typical"] == tables.FINGERTIPS[condition][row["element"]][0]
+            assert row["paper_typical"] == FINGERTIPS[condition][row["element"]][0]
 
 
 def _without(fits, rows):

@@ -23,13 +23,9 @@ import etid
 from etid.circuits.display import DISPLAY
 from etid.paper.tables import (
     CALIBRATION,
-    FINGERTIPS,
     LABORATORIES,
     METHODS,
     ORDER,
-    RRSE,
-    TABLE_1,
-    TABLE_4,
     Outcome,
     Truth,
     errors,
@@ -40,6 +36,7 @@ from etid.paper.tables import (
 from etid.plotting import figure_of
 from etid.plotting.style import save
 from etid.report.html import Picture, Section, Table, number, write_page
+from etid.simulation.published import FINGERTIPS, RRSE, TABLE_1, TABLE_4
 
 _SEED = 0
 _READING = (

@@ -1,4 +1,4 @@
-"""The paper's experiments: what it prints, and the same statistics of identified studies.
+"""The paper's experiments: the statistics that it prints, of identified studies.
 
 A study is made by a preset of `etid.scenes`, or has its paths and labels.
 """
@@ -16,6 +16,7 @@ from etid.identify.one import identify_driver
 from etid.recordings.study import Study
 from etid.results.driver import Driver
 from etid.results.fits import Fits
+from etid.simulation.published import TABLE_1
 from etid.simulation.scenes import resistor_label
 
 CALIBRATION = "calibration/98k8"
@@ -26,24 +27,6 @@ LABORATORIES: Mapping[str, Mapping[str, float]] = {
 }
 METHODS: tuple[Method, ...] = ("maximum_likelihood", "steiglitz_mcbride")  # ours, the paper's
 ORDER = ("r_p", "c_p", "r_s")  # as the paper's tables have them
-
-# What the paper reports: Table I [%], Tables II and III (a typical fingertip, lowest and highest of
-# ten subjects) [SI], Table IV (mean error, scatter between 23 trials) [%], RRSE [%].
-TABLE_1 = {21.62e3: 4.26, 55.20e3: 0.42, 216.6e3: 9.6, 328.9e3: 12.2, 555.0e3: 0.25}
-FINGERTIPS = {
-    "dry": {
-        "r_p": (186e3, 194e3, 616e3),
-        "c_p": (0.12e-9, 45e-12, 165e-12),
-        "r_s": (33.4e3, 19e3, 69.8e3),
-    },
-    "damp": {
-        "r_p": (17.4e3, 20.2e3, 165e3),
-        "c_p": (0.66e-9, 160e-12, 845e-12),
-        "r_s": (6.1e3, 3.9e3, 19.8e3),
-    },
-}
-TABLE_4 = {"r_p": (2.46, 17.5), "c_p": (10.4, 26.9), "r_s": (15.5, 43.2)}
-RRSE = (4, 13)
 
 Truth = Mapping[str, Mapping[str, float]]
 """Elements by path, as `etid.scenes.Scene.truth` has them."""

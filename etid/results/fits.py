@@ -414,8 +414,8 @@ class Fits:
         """
         kind = _circuit(table, circuit)
         size = len(kind.names())
-        columns = {name: table.column(name, "text") for name in ("verdict", "note")}
-        columns |= {name: table.column(name, kind) for name, kind in DESCRIBED.items()}
+        kinds = DESCRIBED | {"verdict": "text", "note": "text"}
+        columns = {name: table.column(name, kind) for name, kind in kinds.items()}
         columns |= {name: table.column(name, "number") for name in (*kind.names(), "rrse", "chi2")}
         columns["steps"] = table.column("steps", "integer")
         for name in ("cov", "shared_cov"):

@@ -31,6 +31,7 @@ from etid.recordings.fields import tidy_path
 from etid.recordings.recording import Recording, Samples
 from etid.recordings.study import Study
 from etid.signals.precision import require_float64
+from etid.simulation.published import BUILT, FINGERTIPS, REFERENCE, TABLE_1, TYPICAL
 from etid.simulation.transformer import (
     Impedance,
     OpenLoad,
@@ -320,16 +321,18 @@ def _repeated(folder: str, load: SkinLoad, count: int, **labels: str) -> tuple[T
     )
 
 
-_CALIBRATION = _resistors("calibration", (98.8e3,))  # the paper's reference resistor
-_RESISTORS = _resistors("resistors", (21.62e3, 55.20e3, 216.6e3, 328.9e3, 555.0e3))  # Table I
-_DRY = SkinLoad(r_s=33.4e3, r_p=186e3, c_p=0.12e-9)  # Table II
-_DAMP = SkinLoad(r_s=6.1e3, r_p=17.4e3, c_p=0.66e-9)  # Table III
-_BUILT = SkinLoad(r_s=32.46e3, r_p=179.8e3, c_p=0.12e-9)  # Table IV
-# Ranges of ten subjects, r_s, r_p [ohm], c_p [F]: Table II (dry) and Table III (damp).
-_RANGES = {
-    "dry": ((19e3, 69.8e3), (194e3, 616e3), (45e-12, 165e-12)),
-    "damp": ((3.9e3, 19.8e3), (20.2e3, 165e3), (160e-12, 845e-12)),
-}
+def _typical(condition: str) -> tuple[Trial, ...]:
+    return _repeated(
+        f"typical/{condition}",
+        TYPICAL[condition],
+        _TYPICAL_TRIALS,
+        subject="typical",
+        condition=condition,
+    )
+
+
+_CALIBRATION = _resistors("calibration", (REFERENCE,))
+_RESISTORS = _resistors("resistors", tuple(TABLE_1))
 _TYPICAL_TRIALS = 10
 _SUBJECTS = 10
 _SUBJECT_TRIALS = 5
@@ -348,20 +351,18 @@ def paper_resistors(**settings: Any) -> Scene:
 
 def paper_built(**settings: Any) -> Scene:
     """The soldered circuit of Table IV, 23 trials. Keywords are fields of `Scene`."""
-    trials = _repeated("built", _BUILT, 23, condition="built")
+    trials = _repeated("built", BUILT, 23, condition="built")
     return Scene(trials, _CALIBRATION, **settings)
 
 
 def paper_dry(**settings: Any) -> Scene:
     """The typical dry fingertip of Table II, ten trials. Keywords are fields of `Scene`."""
-    trials = _repeated("typical/dry", _DRY, _TYPICAL_TRIALS, subject="typical", condition="dry")
-    return Scene(trials, _CALIBRATION, **settings)
+    return Scene(_typical("dry"), _CALIBRATION, **settings)
 
 
 def paper_damp(**settings: Any) -> Scene:
     """The typical damp fingertip of Table III, ten trials. Keywords are fields of `Scene`."""
-    trials = _repeated("typical/damp", _DAMP, _TYPICAL_TRIALS, subject="typical", condition="damp")
-    return Scene(trials, _CALIBRATION, **settings)
+    return Scene(_typical("damp"), _CALIBRATION, **settings)
 
 
 def paper_subjects(**settings: Any) -> Scene:
@@ -375,11 +376,14 @@ def paper_subjects(**settings: Any) -> Scene:
     trials: tuple[Trial, ...] = ()
     for number in range(1, _SUBJECTS + 1):
         subject = f"s{number:02d}"
-        for condition, ranges in _RANGES.items():
-            r_s, r_p, c_p = (float(np.exp(rng.uniform(*np.log(limits)))) for limits in ranges)
+        for condition, elements in FINGERTIPS.items():
+            drawn = {
+                name: float(np.exp(rng.uniform(*np.log(limits))))
+                for name, (_, *limits) in elements.items()
+            }
             trials += _repeated(
                 f"{subject}/{condition}",
-                SkinLoad(r_s, r_p, c_p),
+                SkinLoad(**drawn),
                 _SUBJECT_TRIALS,
                 subject=subject,
                 condition=condition,
