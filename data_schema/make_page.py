@@ -1,7 +1,7 @@
-"""Write the schema for machines and for people: `python data_schema/make_page.py`.
+"""Write `recording-1.json` and `README.md`: `python data_schema/make_page.py`.
 
-Both are made from `etid.recordings.schema`, which takes the fields of a recording from
-`etid.recordings.fields`; the page for people adds examples.
+Both come from `etid.recordings.schema`, which takes the fields of a recording from
+`etid.recordings.fields`. The page adds rules and examples.
 """
 
 import json
@@ -35,10 +35,10 @@ _INTRODUCTION = f"""\
 
 <!-- made from etid/recordings/fields.py and schema.py by `python data_schema/make_page.py` -->
 
-An etid file is an HDF5 file with recordings of a stimulator's output: unloaded (`v_th`) and with a
-load (`v_out`), on one clock. Every group, at any depth, with the attribute `kind` is a recording,
-or a stack of trials that differ in nothing but their samples and the label `trial`.
-`recording-1.json` holds the same table for machines.
+An etid file is an HDF5 file with recordings of a stimulator's output voltage: unloaded (`v_th`) and
+with a load (`v_out`), sampled by one clock. Every group with the attribute `kind`, at any depth, is
+a recording or a stack of trials. The trials of a stack differ only in their samples and the label
+`trial`. `recording-1.json` contains the same table for programs.
 
 ```
 study.h5                     schema="etid/recording", schema_version="1.0"
@@ -50,83 +50,83 @@ study.h5                     schema="etid/recording", schema_version="1.0"
     └── v_out (trial, time)  read as the recordings s01/dry/0, s01/dry/1, …
 ```
 
-## Write one
+## Write a file
 
 ```python
 {EXAMPLE}```
 
-`etid check study.h5` says what is wrong with a file, field by field. `example.h5` is a file with a
-calibration and a stack of three trials; `python data_schema/make_example.py data_schema/example.h5`
-made it.
+`etid check study.h5` lists the faults of each field of a file. `example.h5` contains a calibration
+and a stack of three trials. `python data_schema/make_example.py data_schema/example.h5` made it.
 """
 
 _RULES = """\
 ## Reading rules
 
 - The value of a sample is `conversion · stored + offset` in `unit`, as in NWB's TimeSeries. Store
-  converter codes as integers: their step is then known, and nothing is rounded.
-- Row `t` of a stacked group `g` is the recording `g/t`. Rows are trials, columns are time; nothing
-  is transposed. A calibration group holds one recording, and no recording lies inside another.
-- Recordings come in the order of their paths, numbers in them by value: `s2` before `s10`.
+  converter codes as integers: etid then knows the step of the converter, and nothing is rounded.
+- Row `t` of a stacked group `g` is the recording `g/t`. Rows are trials, columns are time. etid
+  transposes nothing. A calibration group contains one recording. No recording lies inside another.
+- Recordings are sorted by path, and numbers in a path by value: `s2` comes before `s10`.
 - `v_th`, `v_out` and `current` may be hard or soft links to a dataset of the same file, for example
   to an unloaded record that several groups share. External links, external storage and virtual
-  datasets are refused: a file is whole. Groups are not reached through soft links.
+  datasets are refused, because a file must be complete. Soft links to groups are not followed.
 - `NaN` is a missing sample. Samples are never complex.
-- Unknown attributes, datasets and groups are ignored, except where the name is nearly that of an
-  absent field (`samplerate`): that is reported, not guessed.
-- A recording that breaks a rule is left out and listed in `Study.problems`; the others are read.
+- Unknown attributes, datasets and groups are ignored. If such a name is almost the name of an
+  absent field (`samplerate`), etid reports it and does not guess.
+- A recording that breaks a rule is left out and listed in `Study.problems`. The others are read.
 - Text is UTF-8. An array of one element counts as a scalar.
-- etid writes text of a fixed length and opens files with `libver="v108"`: all but the samples is
-  then under checksums, and damage is an error. Text of variable length, h5py's default, is read
-  too, but no checksum protects it: damage inside it may be read as another text.
-- A record has at most 2^27 samples, a stack 2^21 trials, a path 50 groups; what is declared but not
-  stored is refused (`etid/recordings/limits.py`).
-- A file of a newer minor version is read, one of another major version is refused.
+- etid writes text of fixed length and opens files with `libver="v108"`. Checksums then protect
+  everything except the samples, so damage is an error. etid also reads text of variable length,
+  the default of h5py. No checksum protects such text: damage may change it without an error.
+- A record has at most 2^27 samples, a stack at most 2^21 trials, a path at most 50 groups. A
+  dataset that is declared but not stored is refused (`etid/recordings/limits.py`).
+- A file of a newer minor version is read. A file of another major version is refused.
 
-What etid writes is the same layout: recordings `g/0 … g/T-1` that differ in nothing but samples and
-trial become one stacked group `g`, every other recording a group of its own.
+etid writes the same layout. Recordings `g/0 … g/T-1` that differ only in samples and `trial` become
+one stacked group `g`. Every other recording becomes its own group.
 """
 
 
 OTHER_FORMATS = """\
 ## Other formats
 
-`etid import FILE study.h5 --mapping FILE.toml` turns a file of an instrument into an etid file, and
-prints which channel, unit, scale and rate it took for what. Nothing is guessed: a channel, unit or
-rate that neither the file nor the mapping says is an error, which lists the channels that there
-are; so is what both say differently.
+`etid import FILE study.h5 --mapping FILE.toml` converts a file of an instrument to an etid file. It
+prints which channel, unit, scale and rate it used for each signal. Nothing is guessed. A channel,
+unit or rate that neither the file nor the mapping gives is an error, and the error lists the
+channels of the file. A contradiction between file and mapping is an error too.
 
-| file | channels | the file says | trials | install |
+| file | channels | the file contains | trials | install |
 |---|---|---|---|---|
 | `.csv` | columns, by the first line | units: `open [mV]`, or a second line of them | none | |
 | `.mat` | variables, `a.b` for field b of structure a | nothing | rows | `etid[matlab]` |
 | `.tdms` | `group/channel` | units (`unit_string`), rate (`wf_increment`) | none | `etid[tdms]` |
 | `.abf` | ADC channels, or `channel 0`, … | units and rate | sweeps | `etid[abf]` |
 
-At most a part of a record is in memory; only MATLAB files before version 7.3 are read whole, and
-only they need `etid[matlab]`. Integer codes stay integers where a line makes volts of them.
+The import keeps only a part of a record in memory. MATLAB files before version 7.3 are the
+exception: they are read completely, and only they need `etid[matlab]`. Integer codes stay integers
+if a straight line converts them to volts.
 
-A mapping is TOML. Each `[[recording]]` is a recording or a stack of trials, and what stands above
-the first one holds for all. Its keys:
+A mapping is TOML. Each `[[recording]]` is a recording or a stack of trials. Keys above the first
+`[[recording]]` hold for all of them. The keys are:
 
-- `v_th`, `v_out`: unloaded output, and output with the load, each a table of
+- `v_th`, `v_out`: unloaded output, and output with the load. Each is a table with these keys:
     - `channel`: its name in the file;
-    - `unit` of its values: `V`, `A` or `s`, with `k`, `m`, `u` or `µ`, `n`, `p`, or in words;
-      needed unless the file says it;
+    - `unit` of its values: `V`, `A` or `s`, with the prefix `k`, `m`, `u` or `µ`, `n`, `p`, or in
+      words; needed unless the file contains it;
     - `scale` of this channel alone;
-    - `rows`: which of its trials, a number or a list, from 0 on; without it all. A single row of
-      `v_th` is the unloaded record of all trials.
-- `current`: measured current through the load, such a table too; with a `scale` in volts per ampere
-  it may be recorded as a voltage. Optional.
-- `time`: times of a uniform clock, such a table too, instead of `sample_rate`.
-- `sample_rate` [Hz]: needed unless the file says it. The two may differ by 100 ppm; this one
-  holds.
+    - `rows`: the trials to use, a number or a list, counted from 0; all trials if absent. A single
+      row of `v_th` is the unloaded record of all trials.
+- `current`: measured current through the load, a table with the same keys. Optional. It may be
+  recorded as a voltage, with a `scale` in volts per ampere.
+- `time`: times of a uniform clock, a table with the same keys, instead of `sample_rate`.
+- `sample_rate` [Hz]: needed unless the file contains it. It may differ from the rate in the file by
+  100 ppm, and then replaces it.
 - `pulse_rate` [Hz].
-- `scale`: volts at the terminal are the values of `v_th` and `v_out` divided by this; 1 if they are
-  the same.
-- `path` of the recording in the etid file. Several trials become `path/0`, `path/1`, …; without a
-  path, a single `[[recording]]` becomes `loaded/0`, … or, with `r_load`, `calibration/0`, ….
-- FIELDS: as above; `trial` may be a list with a label per trial.
+- `scale`: the values of `v_th` and `v_out` divided by this are volts at the terminal. Give 1 if
+  they are already volts at the terminal.
+- `path` of the recording in the etid file. Several trials become `path/0`, `path/1`, …. Without a
+  path, a single `[[recording]]` becomes `loaded/0`, …, or with `r_load` `calibration/0`, ….
+- FIELDS: as in the tables above. `trial` may be a list with one label per trial.
 
 ### CSV
 
@@ -150,8 +150,8 @@ v_th = {channel = "open"}
 v_out = {channel = "skin"}
 ```
 
-For one recording the command line is enough; there, values are in volts, amperes and seconds unless
-the file says otherwise:
+For one recording, the command line is enough. Its values are in volts, amperes and seconds unless
+the file contains other units:
 
 ```
 etid import table.csv study.h5 --v-th open --v-out skin --time t --pulse-rate 60 --scale 0.0535
@@ -220,13 +220,13 @@ v_out = {channel = "channel 0", rows = [1, 2]}
 
 ### NumPy
 
-A `.npz` archive with the converter codes `adc_th`, `adc_out` (trial, time) and `adc_ref` (resistor,
-time), and with `R_ref`, `fs`, `f0`, `lsb` and `scale`, says everything itself: it has no mapping.
+A `.npz` archive needs no mapping. It contains the converter codes `adc_th` and `adc_out` (trial,
+time) and `adc_ref` (resistor, time), and the numbers `R_ref`, `fs`, `f0`, `lsb` and `scale`.
 """
 
 
 def as_markdown() -> str:
-    """The table for people."""
+    """The page `README.md`."""
     titles = {
         "file attribute": "Attributes of the file",
         "group attribute": "Attributes of a recording's group",

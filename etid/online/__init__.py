@@ -1,1 +1,1 @@
-"""The tracker: a fit after every pulse, for each electrode of a display."""
+"""The tracker: one fit per pulse for each electrode of a display."""

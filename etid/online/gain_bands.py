@@ -1,23 +1,24 @@
-"""From the samples of one pulse to the gain in bands of frequency.
+"""Gain in bands of frequency, from the samples of one pulse.
 
-One period is cut out as the samples nearest to it, less the few that make its Fourier transform
-dear. Where windows begin and end in the quiet between two pulses, Y(f) = G(f) X(f) holds at their
-frequencies too, although they are not quite harmonics: 3332 samples for a period of 3333⅓ bias an
-element by less than a tenth of what the noise of 100 pulses at 60 dB leaves. The tail between two
-pulses is not at rest: 3360 samples, those that are missing filled in, biased it by 1.5 times that.
+**A window** is one period, cut at the nearest samples. A few samples at its end are not used, so
+that its Fourier transform is cheap. The windows begin and end in the quiet between two pulses.
+Y(f) = G(f) X(f) therefore holds at the frequencies of the window, although they are not exactly
+harmonics. With 3332 samples for a period of 3333⅓, the bias of an element is less than a tenth of
+the standard error of 100 pulses at 60 dB. To fill a window up to 3360 samples gave a bias of 1.5
+times this standard error, because the voltage between two pulses is not at rest.
 
-**A band** is a few neighbouring bins k, a sixteenth of their frequency at most, over which a
-gain is nearly linear. All that a pulse tells of it is
+**A band** is a few neighbouring bins k, at most a sixteenth of their frequency wide. Over a band
+the gain is nearly linear. The pulse determines it as
 
-    Ĝ = Σ X̄_k Y_k / Σ (|X_k|² − σ_x²)    at    f = Σ |X_k|² f_k / Σ |X_k|²,
+    Ĝ = Σ X̄_k Y_k / Σ (|X_k|² − σ_x²)    at    f = Σ |X_k|² f_k / Σ |X_k|².
 
-and what a straight line through the band leaves of Y is its noise, without a model of the load. A
-fifth of the numbers is left to be fitted, without a loss.
+The residual of a straight line through the band is the noise of Y; this needs no model of the load.
+The bands reduce the numbers to be fitted to a fifth, without loss of information.
 
-**What has aliased**, X(f − fs), cannot be told from X(f) in one period. But periods that are no
-whole number of samples are sampled at different phases φ [samples], and show
-X(f) + e^(−j2πφ) X(f − fs): an unloaded record of several periods tells them apart, and with them
-what aliases in a load.
+**Aliases**, X(f − fs), cannot be distinguished from X(f) in one period. If a period is not a whole
+number of samples, each period is sampled at a different phase φ [samples] and contains
+X(f) + e^(−j2πφ) X(f − fs). An unloaded record of several periods therefore separates X from its
+aliases, and predicts the aliases behind a load.
 """
 
 import math
@@ -33,24 +34,25 @@ from etid.signals.harmonics import ALIASED
 from etid.signals.measurement import RIPPLE
 from etid.signals.transfer import as_complex, power
 
-RELATIVE = 16  # bins of a band's frequency for each of its own
-WIDEST = 16  # bins
-REACH = 1e-3  # of a period, that its transform may leave out
-PRESENT = 0.5  # part of a band's power in X that must not be noise
-DIVERSE = 0.9  # |mean e^(−j2πφ)| from which on sampling phases are too much alike
+RELATIVE = 16  # frequency of a band over its width
+WIDEST = 16  # [bins] largest width of a band
+REACH = 1e-3  # fraction of a period that the transform may leave out
+PRESENT = 0.5  # minimum fraction of a band's power in X that must be signal
+DIVERSE = 0.9  # |mean e^(−j2πφ)| above which the sampling phases are too similar
 
 
 def cut(
     v: Float[np.ndarray, "*lane time"], period: float
 ) -> Float[np.ndarray, "pulse *lane sample"]:
-    """Windows of one pulse each from a longer record.
+    """Windows of one pulse each, cut from longer records.
 
     Args:
         v: Records that begin between two pulses [V].
-        period: Length of a period in samples.
+        period: Length of a period [samples].
 
     Returns:
-        Windows of round(period) samples, each beginning at the sample nearest to its period.
+        Windows of round(period) samples [V]. Each begins at the sample nearest to the start of its
+        period.
     """
     size = round(period)
     begins = [round(p * period) for p in range(math.ceil(v.shape[-1] / period) + 1)]
@@ -59,7 +61,7 @@ def cut(
 
 
 def _groups(bins: int) -> tuple[tuple[int, int, int], ...]:
-    """(first bin, bins of a band, number of bands) of bands of one width, upwards from bin 1."""
+    """Groups of bands of one width, from bin 1 upwards: (first bin, width [bins], bands)."""
     groups, first = [], 1
     for doubling in range(int(math.log2(WIDEST)) + 1):
         width = 2**doubling
@@ -71,10 +73,10 @@ def _groups(bins: int) -> tuple[tuple[int, int, int], ...]:
 
 
 class Gains(NamedTuple):
-    """What one pulse tells.
+    """The measured gain of one pulse.
 
     Attributes:
-        gain: Ĝ, and with it the turn of a delay.
+        gain: Ĝ in each band; it includes the phase of the trigger delay.
         variance: E|noise|² of a Fourier coefficient of V_out [V²].
     """
 
@@ -83,27 +85,30 @@ class Gains(NamedTuple):
 
 
 class Bands(eqx.Module):
-    """The unloaded pulse, and the bands in which pulses are compared with it.
+    """The unloaded pulse, and the bands in which loaded pulses are compared with it.
 
     Attributes:
-        x: Its Fourier coefficients, unscaled, from bin 1 on [V].
-        variance_x: E|noise|² of one of them [V²].
-        offset: Bins from the centre of their band.
-        frequency: Centres of the bands [Hz].
-        strength: Σ |X|² [V²].
-        signal: The same without noise; as it is where there is little else.
-        weight: Σ of the squares of Ĝ − G is to be weighed with it, by the variance of V_out [V²].
-        width: Σ |X|² offset²; 0 for a band of one bin.
-        bent: By how much the mean over a band of a function of frequency differs from the function
-            at its centre, by its values in the band before, itself and the next one.
-        turned: By how much it differs for a delay of one sample, by the same values, divided by −j.
-        spread: The same by the square of a delay, divided by −½ [rad²].
-        alias: Σ X̄(f) X(f − fs) / Σ |X|²: what aliases, per gain at fs − f; 0 where it is not known.
-        floor: Variance that no coefficient of V_out is trusted to have less of [V²].
-        sample_rate: [Hz].
-        samples: Of a window.
-        size: Of a Fourier transform.
-        groups: Bands of one width.
+        x: Fourier coefficients of the unloaded pulse, not normalised, from bin 1 on [V].
+        variance_x: E|noise|² of a coefficient in `x` [V²].
+        offset: Distance of each bin from the centre of its band [bins].
+        frequency: Centre of each band [Hz].
+        strength: Σ |X|² over each band [V²].
+        signal: `strength` without the expected noise; equal to `strength` where noise dominates.
+        weight: Weight of |Ĝ − G|² before division by the variance of V_out [V²].
+        width: Σ |X|² offset² over each band [V²]; 0 for a band of one bin.
+        bent: Coefficients of a function's values in the band before, the band itself and the next
+            band. The sum of products is the function's mean over the band minus its value at the
+            centre.
+        turned: The same for the part that is proportional to a delay, per sample of delay and
+            divided by −j.
+        spread: Coefficient of the part that is proportional to the squared delay, per squared
+            sample of delay and divided by −½ [rad²].
+        alias: Σ X̄(f) X(f − fs) / Σ |X|², the alias per unit of gain at fs − f; 0 if it is unknown.
+        floor: Smallest variance that is accepted for a coefficient of V_out [V²].
+        sample_rate: Samples per second [Hz].
+        samples: Length of a window [samples].
+        size: Length of the Fourier transform [samples].
+        groups: Groups of bands of one width, as `_groups` returns them.
     """
 
     x: Complex[Array, " bin"]
@@ -125,7 +130,7 @@ class Bands(eqx.Module):
     groups: tuple[tuple[int, int, int], ...] = eqx.field(static=True)
 
     def summed(self, values: Array) -> Array:
-        """Sums over the bins of each band, along the last axis."""
+        """Sum over the bins of each band, along the last axis."""
         sums = []
         for first, width, count in self.groups:
             part = values[..., first - 1 : first - 1 + width * count]
@@ -135,9 +140,14 @@ class Bands(eqx.Module):
     def departure(
         self, gain: Complex[Array, " band"], delay: Float[Array, ""]
     ) -> Complex[Array, " band"]:
-        """How the mean over a band of a delayed gain, turned back, departs from that at its centre.
+        """Mean of a delayed gain over each band, minus its value at the centre of the band.
 
-        ½ s² (G″ − 2jτ G′ − τ² G), s² the variance of the frequency within the band.
+        The phase of the delay at the centre is removed. The difference is
+        ½ s² (G″ − 2jτ G′ − τ² G), where s² is the variance of the frequency within the band.
+
+        Args:
+            gain: Gain G without a delay, at the centres.
+            delay: Delay τ [samples].
         """
         ends = jnp.concatenate([gain[:1], gain, gain[-1:]])
         values = jnp.stack([ends[:-2], gain, ends[2:]])
@@ -145,9 +155,13 @@ class Bands(eqx.Module):
         return jnp.sum(factor * values, axis=0) - as_complex(0.5 * delay**2 * self.spread) * gain
 
     def measure(self, v_out: Float[Array, "lane sample"]) -> Gains:
-        """Gains and noise of one pulse at all electrodes."""
-        # In single precision, which takes two thirds of the time: it loses 2e-8 of the peak, a
-        # five-hundredth of what any record is trusted with.
+        """Gains and noise of one pulse at all electrodes.
+
+        Args:
+            v_out: One window per electrode [V].
+        """
+        # Single precision takes two thirds of the time. Its error is 2e-8 of the peak, a
+        # five-hundredth of the smallest noise that etid accepts for a record.
         y = _transform(v_out.astype(jnp.float32), self.size, self.x.shape[0]).astype(self.x.dtype)
         product = jnp.conj(self.x)[None, :] * y
         level = self.summed(product)
@@ -167,9 +181,9 @@ def _transform(v: Array, size: int, bins: int) -> Array:
 
 
 def _cheap_size(samples: int) -> int:
-    """A length next to a period whose largest prime factor is small."""
+    """The length near a period whose largest prime factor is smallest."""
 
-    def largest(size):
+    def largest(size: int) -> int:
         factor = 2
         while factor * factor <= size:
             if size % factor == 0:
@@ -184,7 +198,10 @@ def _cheap_size(samples: int) -> int:
 def _slopes(
     x: Float[np.ndarray, " band"],
 ) -> tuple[Float[np.ndarray, "3 band"], Float[np.ndarray, "3 band"]]:
-    """First and second derivative by the values before, at and after each point; 0 at the ends."""
+    """Coefficients of the first and second derivative at each point; 0 at the ends.
+
+    The coefficients multiply the values before, at and after the point.
+    """
     before, after = np.diff(x)[:-1], np.diff(x)[1:]
     both = before + after
     first = [-after / before / both, (after - before) / before / after, before / after / both]
@@ -201,10 +218,10 @@ def unloaded_bands(
     """Bands of an unloaded record.
 
     Args:
-        v_th: At least one whole period, from between two pulses on [V].
-        sigma_th: Noise of a sample [V].
-        sample_rate: [Hz].
-        period: Length of a period in samples.
+        v_th: Unloaded voltage of at least one whole period; it begins between two pulses [V].
+        sigma_th: Standard deviation of the noise of a sample [V].
+        sample_rate: Samples per second [Hz].
+        period: Length of a period [samples].
     """
     windows = cut(v_th, period)
     samples = windows.shape[-1]
@@ -215,7 +232,7 @@ def unloaded_bands(
     phase = np.array([round(p * period) - p * period for p in range(len(windows))])
     turned = np.exp(-2j * np.pi * np.outer(phase, np.arange(1, bins + 1)) / size)
     y = np.asarray(_transform(jnp.asarray(windows), size, bins)) * turned
-    # X(f) and, where the phases tell it from that, X(f − fs).
+    # Unknowns: X(f) and, if the phases differ enough, X(f − fs).
     design = np.exp(-2j * np.pi * np.outer(phase, [0, 1]))
     if abs(design[:, 1].mean()) > DIVERSE:
         design = design[:, :1]
@@ -230,7 +247,7 @@ def unloaded_bands(
         for first, width, count in groups
     ]
 
-    def summed(values):
+    def summed(values: np.ndarray) -> np.ndarray:
         return np.concatenate([values[index].sum(-1) for index in of])
 
     wide = np.concatenate([np.full(count, width) for _, width, count in groups])

@@ -1,7 +1,7 @@
-"""The fit of one pulse at one electrode: the likeliest delay, and a step from there.
+"""The fit of one pulse at one electrode: the best delay of a grid, and one step from there.
 
-The gain in a band is Ĝ = G e^(−jωτ) + what has aliased + what a band makes of a curve; the last two
-are small, and taken out as the elements before the pulse have them.
+The gain in a band is Ĝ = G e^(−jωτ) + aliases + the effect of the curvature of G over the band. The
+last two terms are small. They are computed with the start values and subtracted before the fit.
 """
 
 from collections.abc import Callable
@@ -19,10 +19,11 @@ from etid.online.gain_bands import Bands
 from etid.signals.transfer import as_complex, power, reciprocal
 from etid.solvers.matrices import inverse_of_few
 
-STEP = 0.1  # [samples]
-DELAYS = STEP * np.arange(-15, 16)  # [samples] one of a trigger, half a one of a window
-DAMPING, LOWER, RAISE = 1e-2, 0.1, 8.0  # of the first step, after a good one, after a bad one
-SETTLED = 1.0  # standard errors of a pulse from the minimum, before the last step
+STEP = 0.1  # [samples] spacing of the grid of delays
+DELAYS = STEP * np.arange(-15, 16)  # [samples] up to 1 by the trigger and 0.5 by the window
+# Damping of the first step, and its factors after a good and after a bad step.
+DAMPING, LOWER, RAISE = 1e-2, 0.1, 8.0
+SETTLED = 1.0  # distance to the minimum before the last step [standard errors of one pulse]
 
 
 def _unit(angle: Float[Array, "..."]) -> Complex[Array, "..."]:
@@ -31,15 +32,15 @@ def _unit(angle: Float[Array, "..."]) -> Complex[Array, "..."]:
 
 
 class GainModel(eqx.Module):
-    """What a pulse should be.
+    """Model of the gain of a pulse.
 
     Attributes:
         circuit: Structure of the load.
-        bands: The unloaded pulse.
-        source: Z_th [Ω].
-        source_alias: Z_th where aliases come from [Ω].
-        turn: Turn of the gain by a delay of one sample [rad].
-        turns: e^(jωτ) for each of `DELAYS`.
+        bands: The unloaded pulse and its bands.
+        source: Z_th in each band [Ω].
+        source_alias: Z_th at the frequency from which the aliases of a band come [Ω].
+        turn: Phase of a delay of one sample [rad].
+        turns: e^(jωτ) for each delay of `DELAYS`.
     """
 
     circuit: AbstractCircuit
@@ -57,7 +58,7 @@ class GainModel(eqx.Module):
         source: Complex[Array, " band"],
         source_alias: Complex[Array, " band"],
     ) -> "GainModel":
-        """The model with the turns of its delays."""
+        """The model, with the phases of all `DELAYS`."""
         turn = 2 * jnp.pi * bands.frequency / bands.sample_rate
         turns = _unit(jnp.asarray(DELAYS)[:, None] * turn[None, :])
         return cls(circuit, bands, source, source_alias, turn, turns)
@@ -65,9 +66,9 @@ class GainModel(eqx.Module):
     def gain(
         self, logs: Float[Array, " element"]
     ) -> tuple[Complex[Array, " band"], Complex[Array, "element band"]]:
-        """G and its derivative by the elements."""
+        """G and its derivatives with respect to the logarithms of the elements."""
 
-        def load(logs):
+        def load(logs: Float[Array, " element"]) -> Complex[Array, " band"]:
             return self.circuit.with_log_values(logs).response(self.bands.frequency)
 
         z = load(logs)
@@ -76,7 +77,7 @@ class GainModel(eqx.Module):
         return z * admittance, by_element * (self.source * admittance * admittance)[None, :]
 
     def departure(self, own: Float[Array, " own"]) -> Complex[Array, " band"]:
-        """What Ĝ holds besides G e^(−jωτ): aliases, and what a band makes of a curve."""
+        """Ĝ − G e^(−jωτ): aliases, and the effect of the curvature of G over a band."""
         load, delay = self.circuit.with_log_values(own[:-1]), own[-1]
         above = load.response(self.bands.sample_rate - self.bands.frequency)
         aliased = jnp.conj(above * reciprocal(above + self.source_alias)) * self.bands.alias
@@ -85,7 +86,7 @@ class GainModel(eqx.Module):
         return departure * jnp.conj(self.turned(delay))
 
     def turned(self, delay: Float[Array, ""]) -> Complex[Array, " band"]:
-        """e^(jωτ), from a table and its Taylor series: a sine costs as much as all the rest."""
+        """e^(jωτ) from a table and a Taylor series: a sine costs as much as the rest of the fit."""
         near = jnp.clip(jnp.round((delay - DELAYS[0]) / STEP), 0, DELAYS.size - 1).astype(int)
         angle = (delay - jnp.asarray(DELAYS)[near]) * self.turn
         square = angle * angle
@@ -96,7 +97,10 @@ class GainModel(eqx.Module):
     def distances(
         self, gain: Complex[Array, " band"], expected: Complex[Array, " band"]
     ) -> Float[Array, " delay"]:
-        """How far `gain` is from what is expected, for each delay of `DELAYS`."""
+        """Weighted squared distance of `gain` from `expected` for each delay of `DELAYS`.
+
+        A constant is left out: the weighted square of `gain`.
+        """
         product = as_complex(self.bands.weight) * jnp.conj(expected) * gain
         parts = jnp.concatenate([product.real, -product.imag])
         turns = jnp.concatenate([self.turns.real, self.turns.imag], axis=1)
@@ -111,11 +115,12 @@ class GainModel(eqx.Module):
 def nearest(
     model: GainModel, gain: Complex[Array, " band"], logs: Float[Array, "start element"]
 ) -> tuple[Float[Array, " own"], Float[Array, ""]]:
-    """Which of several elements, with which delay, comes next to a gain, and how near."""
+    """The start whose gain is nearest to `gain`, with its delay [samples], and the distance."""
     distances = jax.vmap(lambda one: model.distances(gain, model.undelayed(one)))(logs)
     best = jnp.argmin(distances)
     start, at = best // DELAYS.size, best % DELAYS.size
-    # A parabola through the distances beside it: a tenth of a sample is a hundred standard errors.
+    # A parabola through three distances: a step of the grid, 0.1 samples, is a hundred standard
+    # errors.
     around = distances[start, jnp.clip(at, 1, DELAYS.size - 2) + jnp.arange(-1, 2)]
     curved = around[0] - 2 * around[1] + around[2]
     delay = DELAYS[0] + STEP * (at.astype(around.dtype) + 0.5 * (around[0] - around[2]) / curved)
@@ -125,14 +130,14 @@ def nearest(
 
 
 class Equations(NamedTuple):
-    """Normal equations of a pulse, and of what was known before it.
+    """Normal equations of a pulse and of the prior from the pulses before it.
 
     Attributes:
-        objective: Σ r² of both.
-        squares: Σ r² of the pulse.
-        gradient: Jᵀr of both.
-        curvature: JᵀJ of the pulse.
-        matrix: JᵀJ of both.
+        objective: Σ r² of pulse and prior.
+        squares: Σ r² of the pulse alone.
+        gradient: Jᵀr of pulse and prior.
+        curvature: JᵀJ of the pulse alone.
+        matrix: JᵀJ of pulse and prior.
     """
 
     objective: Float[Array, ""]
@@ -147,11 +152,11 @@ def minimum(
     start: Float[Array, " own"],
     damping: Float[Array, ""],
 ) -> tuple[Float[Array, " own"], Equations, Float[Array, ""], Float[Array, ""]]:
-    """A step of Levenberg and Marquardt's and, where that was the last but one, one of Newton's.
+    """One Levenberg-Marquardt step; near the minimum also one Gauss-Newton step.
 
     Returns:
-        The minimum, or what was reached of the way to it; the last equations; by how much Σ r² was
-        to fall from there; and the damping with which to go on.
+        The parameters after these steps, the last normal equations that were accepted, the
+        reduction of Σ r² that these predict, and the damping for the next pulse.
     """
     before = equations(start)
     matrix = before.matrix + damping * jnp.diag(jnp.diagonal(before.matrix))
@@ -167,7 +172,15 @@ def minimum(
 
 
 class Pulse(eqx.Module):
-    """What is minimised for one electrode at one pulse."""
+    """The objective for one electrode at one pulse.
+
+    Attributes:
+        model: Model of the gain.
+        gain: Measured gain, without aliases and curvature.
+        variance: E|noise|² of a Fourier coefficient of V_out [V²].
+        centre: Logarithms of the elements before the pulse [SI].
+        information: Inverse covariance of `centre`.
+    """
 
     model: GainModel
     gain: Complex[Array, " band"]
@@ -176,18 +189,19 @@ class Pulse(eqx.Module):
     information: Float[Array, "element element"]
 
     def terms(self, q: Float[Array, " own"]) -> Float[Array, "own1 part"]:
-        """Derivatives of the residual and, last, the residual, in standard deviations."""
+        """Derivatives of the residual and, as the last row, the residual [standard deviations]."""
         of = self.model
         weight = as_complex(jnp.sqrt(of.bands.weight / self.variance))
         model, slope = of.gain(q[:-1])
-        # By the delay it is jω Ĝ e^(jωτ), of which the noise is left out: it would be information.
+        # The derivative with respect to the delay is jω Ĝ e^(jωτ). Here the model replaces Ĝ:
+        # otherwise the noise of Ĝ would count as information.
         by_delay = model * jax.lax.complex(jnp.zeros_like(of.turn), of.turn)
         residual = self.gain * of.turned(q[-1]) - model
         rows = jnp.concatenate([-slope, by_delay[None, :], residual[None, :]]) * weight[None, :]
         return jnp.concatenate([rows.real, rows.imag], axis=1)
 
     def equations(self, q: Float[Array, " own"]) -> Equations:
-        """Normal equations."""
+        """Normal equations of the pulse and of the prior."""
         terms = self.terms(q)
         products = terms @ terms.T
         off = q[:-1] - self.centre

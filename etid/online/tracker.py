@@ -1,4 +1,4 @@
-"""On-line: the loads at all electrodes of a display, identified anew with every pulse.
+"""On-line identification: the loads at all electrodes of a display, after every pulse.
 
     tracker = etid.Tracker.of(driver, unloaded, electrodes=98)
     state = tracker.start()
@@ -6,30 +6,31 @@
         state = tracker.update(state, v_out)
     print(tracker.read(state))
 
-An extended Kalman filter in information form, iterated at each pulse (Bell and Cathey 1993). For
-one electrode, with ϑ the logarithms of its elements, Λ their information and Ĝ the gains of
-`etid.online.gain_bands`,
+The method is an extended Kalman filter in information form, iterated at each pulse (Bell and Cathey
+1993). For one electrode, ϑ are the logarithms of its elements, Λ is their information, and Ĝ are
+the gains of `etid.online.gain_bands`:
 
     Λ⁻ = (Λ⁻¹ + q² 1)⁻¹                                              (a random walk of the skin)
     minimise  |ϑ − ϑ⁻|²_Λ⁻ + Σ w |Ĝ e^(jωτ) − G(ϑ)|² / σ²   over ϑ and τ
     Λ  = Λ⁻ + H_ϑϑ − H_ϑτ H_τϑ / H_ττ,                               H = JᵀJ
 
-What of Ĝ is aliases, and what a band makes of a curved G, are taken out of it as ϑ⁻ has them.
+Aliases and the curvature of G over a band are computed with ϑ⁻ and subtracted from Ĝ.
 
-**The delay τ is taken as drawn anew at each pulse.** That is right if a trigger starts each window,
-and if the converter runs freely, where windows begin up to half a sample beside the pulse. A delay
-that all pulses share would be known better, but nothing else: the information on ϑ is the same sum.
+**Each pulse has its own delay τ.** This is right if a trigger starts each window. It is also right
+for a converter that runs freely, because its windows begin up to half a sample beside the pulse. A
+model with one common delay would determine this delay better, but not ϑ: the information about ϑ
+is the same sum.
 
-**Every pulse takes the same time**: one step of Levenberg and Marquardt's, from the likeliest
-delay, and a look at generic values while an electrode starts. From these, of 96 kinds of skin up to
-a factor of 3 away, two thirds were found after 5 pulses and all after 30.
+**Every pulse takes the same time**: one Levenberg-Marquardt step from the best delay of a grid. An
+electrode without a good pulse also tries generic start values. In a test with 96 kinds of skin,
+each up to a factor of 3 from these values, two thirds were found after 5 pulses and all after 30.
 
-**A pulse that does not fit** changes nothing but the verdict. After several in a row, or if the
-pulses have long disagreed with the intervals, the electrode starts again.
+**A pulse that does not fit** changes only the verdict. The electrode starts again after several
+such pulses in a row, or if the pulses disagree with their standard errors for a long time.
 
-Z_th stays as the calibrations have it: what the pulses tell of it is not used. No number of pulses
-lessens its error, nor that by the noise of the unloaded record: both are `shared_cov`. Calibrate
-with two resistors, or the delay that one leaves open is an error of C_p, of one per cent or two.
+Z_th comes from the calibrations only; the pulses do not change it. More pulses reduce neither its
+error nor the error from the noise of the unloaded record: both are in `shared_cov`. Calibrate with
+two resistors. One resistor leaves a delay open, which makes an error of one or two per cent in C_p.
 """
 
 import equinox as eqx
@@ -65,25 +66,26 @@ from etid.signals.precision import require_float64
 from etid.signals.transfer import as_complex, power, reciprocal
 from etid.solvers.matrices import inverse, inverse_of_few
 
-FLAT = 4.0  # times the power that noise alone has
-PATIENCE = 5  # pulses that do not fit, in a row, after which an electrode starts again
-MEMORY = 30  # pulses over which their disagreement with the intervals is averaged
-STRAINED = 2.0  # of 1 expected; its standard deviation is 0.15
+FLAT = 4.0  # power relative to that of noise alone; below this, the pulse is `flat`
+PATIENCE = 5  # pulses in a row that do not fit, after which an electrode starts again
+MEMORY = 30  # pulses over which `strain` is averaged
+STRAINED = 2.0  # limit of `strain`; it is 1 on average, with a standard deviation of 0.15
 
 
 class TrackerState(eqx.Module):
-    """What is known of every electrode.
+    """Estimates for every electrode after a pulse.
 
     Attributes:
-        own: Logarithms of its elements [SI], and the delay of the last pulse [samples].
-        information: Inverse covariance of the elements' logarithms, 0 before the first good pulse.
-        pulses: Number of pulses that these rest on.
-        missed: Pulses in a row that did not fit.
-        damping: Of the next step.
-        strain: Squared disagreement of pulses with their predictions, in units of its variance.
+        own: Logarithms of the elements [SI], and the delay of the last pulse [samples].
+        information: Inverse covariance of the elements' logarithms; 0 before the first good pulse.
+        pulses: Number of pulses that contribute to `information`.
+        missed: Number of pulses in a row that did not fit.
+        damping: Damping of the next step.
+        strain: Mean squared difference between pulses and their predictions, in units of its
+            variance.
         variance: E|noise|² of a Fourier coefficient of the last pulse [V²].
-        chi2: Of the last pulse.
-        rrse: Of the last pulse.
+        chi2: χ² of the last pulse.
+        rrse: RRSE of the last pulse.
         result: Verdict on the last pulse.
     """
 
@@ -100,16 +102,18 @@ class TrackerState(eqx.Module):
 
 
 class Tracker(eqx.Module):
-    """Identifies all electrodes of a display with every pulse. Make one with `Tracker.of`.
+    """Identifies the loads at all electrodes of a display with every pulse.
+
+    Make a tracker with `Tracker.of`.
 
     Attributes:
-        model: What pulses should be.
-        known: What the calibrations tell of Z_th at the bands.
-        change: Random walk of the elements' logarithms [1/√pulse].
+        model: Model of the gain of a pulse.
+        known: Z_th in the bands and its covariance, from the calibrations.
+        change: Standard deviation of the random walk of the elements' logarithms [1/√pulse].
         adc_range: Voltages at which the converter saturates [V].
         driver_result: Verdict of the driver.
         electrodes: Number of electrodes.
-        period: Length of a period in samples.
+        period: Length of a period [samples].
     """
 
     model: GainModel
@@ -130,28 +134,29 @@ class Tracker(eqx.Module):
         circuit: AbstractCircuit | None = None,
         change: float = 0.0,
     ) -> "Tracker":
-        """Prepare to track.
+        """A tracker for one driver.
 
         Args:
-            driver: Identified driver, by maximum likelihood.
-            unloaded: A recording whose `v_th` is the unloaded voltage, such as the calibration.
-                Several periods, which tell what aliases. Its rates are those of the pulses.
+            driver: Driver identified by maximum likelihood.
+            unloaded: A recording whose `v_th` is the unloaded voltage, such as the calibration. Use
+                several periods: they determine the aliases. The pulses must have its sample rate
+                and pulse rate.
             electrodes: Number of electrodes.
             circuit: Structure of the load and its typical values; `SkinRC` if not given.
-            change: By how much the elements may change, as standard deviation of the random walk
-                of their logarithms per pulse [1/√pulse]; 0 for skin that does not.
+            change: Standard deviation of the change of the elements' logarithms from pulse to pulse
+                (a random walk) [1/√pulse]; 0 for elements that do not change.
 
         Returns:
-            The tracker, which does not change; what is known of the skin is in its states.
+            The tracker. It does not change; its states hold the estimates.
 
         Raises:
             ValueError: The driver has no harmonics of its calibrations, or a number is too small.
-            IdentificationError: The recording is of no use; the message says why.
+            IdentificationError: The recording cannot be used; the message says why.
         """
         require_float64()
         driver = serving(driver, HarmonicDriver, "maximum_likelihood")
         if electrodes < 1:
-            raise ValueError(f"electrodes is {electrodes}; a display has at least one")
+            raise ValueError(f"electrodes is {electrodes}; a display has at least one electrode")
         if not (np.isfinite(change) and change >= 0):
             raise ValueError(f"change is {change}; it must be finite and not negative")
         seen = Inspected(unloaded)
@@ -182,7 +187,7 @@ class Tracker(eqx.Module):
         )
 
     def start(self) -> TrackerState:
-        """The state before the first pulse: nothing is known."""
+        """The state before the first pulse, without information."""
         lanes, elements = self.electrodes, len(self.model.circuit.names())
         typical = jnp.append(self.model.circuit.log_values(), 0.0)
         nan = jnp.full(lanes, jnp.nan)
@@ -202,35 +207,36 @@ class Tracker(eqx.Module):
     def pulses(
         self, v_out: Float[np.ndarray, "*lane time"]
     ) -> Float[np.ndarray, "pulse *lane sample"]:
-        """Cut records that begin between two pulses into windows of one pulse each.
+        """Windows of one pulse each, cut from longer records.
 
         Args:
-            v_out: Loaded voltages [V].
+            v_out: Loaded voltages [V]. The records begin between two pulses.
 
         Returns:
-            The same voltages [V], window after window; what is left at the end is not in it.
+            The windows [V]. Samples after the last whole window are left out.
         """
         return cut(v_out, self.period)
 
     def update(
         self, state: TrackerState, v_out: Float[Array | np.ndarray, "lane sample"]
     ) -> TrackerState:
-        """What is known after one more pulse.
+        """The state after one more pulse.
 
         Args:
-            state: What was known before it.
-            v_out: Loaded voltage of one period at every electrode [V], from between two pulses on.
+            state: State before this pulse; it does not change.
+            v_out: Loaded voltage of one period at every electrode [V]. The windows begin between
+                two pulses.
 
         Returns:
-            What is known after it; the state that was given stays as it is.
+            State after this pulse.
 
         Raises:
-            ValueError: Not one window for each electrode, of one period.
+            ValueError: `v_out` does not hold one window of one period for each electrode.
         """
         expected = (self.electrodes, self.model.bands.samples)
         if np.shape(v_out) != expected:
             raise ValueError(
-                f"v_out has shape {np.shape(v_out)}; one period at each electrode is "
+                f"v_out has shape {np.shape(v_out)}; one period at each electrode has the shape "
                 f"(electrode, sample) = {expected} (Tracker.pulses cuts longer records)"
             )
         return _updated(self, state, jnp.asarray(v_out, dtype=float))
@@ -238,14 +244,15 @@ class Tracker(eqx.Module):
     def read(self, state: TrackerState) -> Fits:
         """Elements, standard errors, χ² of the last pulse and verdict of every electrode.
 
-        `steps` is the number of pulses that the elements rest on, `shared_cov` what no number of
-        pulses lessens. Where the last pulse did not fit, elements are those before it.
+        `steps` is the number of pulses that contribute to the elements. `shared_cov` is the part of
+        the covariance that more pulses do not reduce. If the last pulse did not fit, the elements
+        are those before it.
 
         Args:
-            state: What is known.
+            state: State of the tracker.
 
         Returns:
-            One fit per electrode, in their order, labelled by `electrode`.
+            One fit per electrode, in the order of the electrodes, with the label `electrode`.
         """
         fit = jax.tree.map(np.asarray, _judged(self, state))
         electrodes = [
@@ -265,7 +272,17 @@ def _electrode(
     elsewhere: Float[Array, " own"],
     distance: Float[Array, ""],
 ) -> TrackerState:
-    """One electrode at one pulse; `bad` is the verdict on its samples."""
+    """State of one electrode after one pulse.
+
+    Args:
+        tracker: The tracker.
+        state: State of this electrode before the pulse.
+        gain: Measured gain of the pulse.
+        variance: E|noise|² of a Fourier coefficient of V_out [V²].
+        bad: Verdict on the samples of the pulse.
+        elsewhere: Nearest generic start: logarithms of the elements [SI] and delay [samples].
+        distance: Distance of its gain from the measured gain.
+    """
     logs, elements = state.own[:-1], state.own.size - 1
     running = state.pulses > 0
     lost = inverse_of_few(jnp.eye(elements) + tracker.change**2 * state.information)
@@ -288,7 +305,7 @@ def _electrode(
     told = at.curvature[:-1, :-1] - jnp.outer(by_delay, by_delay) / at.curvature[-1, -1]
     spread = inverse_of_few(told)
 
-    # What the pulse alone would have: χ² of its distance from what was expected, per element.
+    # χ² per element of the difference between the elements of this pulse alone and the prediction.
     off = own[:-1] - logs
     pull = information @ off
     surprise = (jnp.dot(off, pull) + jnp.dot(pull, spread @ pull)) / elements
@@ -323,11 +340,11 @@ def _electrode(
     )
 
 
-@jax.jit  # not `stored_jit`, nor equinox's, whose care costs a tenth of a tick at every call
+@jax.jit  # `stored_jit` and `equinox.filter_jit` would cost a tenth of a tick at every call
 def _updated(
     tracker: Tracker, state: TrackerState, v_out: Float[Array, "lane sample"]
 ) -> TrackerState:
-    lowest, highest = v_out.min(axis=1), v_out.max(axis=1)  # not a number if one sample is none
+    lowest, highest = v_out.min(axis=1), v_out.max(axis=1)  # NaN if a sample is NaN
     finite = jnp.isfinite(lowest) & jnp.isfinite(highest)
     clipped = (lowest <= tracker.adc_range[0]) | (highest >= tracker.adc_range[1])
     bands = tracker.model.bands
@@ -373,7 +390,7 @@ def _fit(tracker: Tracker, state: TrackerState) -> Fit:
     by_w = as_complex(weight) * z * loaded * admittance * admittance
     by_z = by_w[None, :] * known.slope
     of_z = by_term @ jnp.concatenate([by_z.real, by_z.imag], axis=1).T
-    # The noise of X is in every pulse the same: G times it.
+    # The noise of X is the same in every pulse. It enters Ĝ multiplied by G.
     of_x = jnp.tile(power(model) * bands.variance_x / state.variance, 2)
     shared = of_z @ known.cov @ of_z.T + (by_term * of_x[None, :]) @ by_term.T
     cov = inverse(state.information) + shared

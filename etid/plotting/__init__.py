@@ -1,7 +1,7 @@
 """Pictures for a notebook or a paper: recordings, fits, impedances, studies, bounds.
 
-`plot` is for people, `figure_of` for programs that write files. matplotlib is imported by the first
-picture.
+`plot` is for people, `figure_of` for programs that write files. The first picture imports
+matplotlib.
 """
 
 from collections.abc import Mapping, Sequence
@@ -44,36 +44,36 @@ def plot(
     *,
     axes: AnyAxes = None,
 ) -> np.ndarray:
-    """Draw what etid reads, identifies or predicts.
+    """Draw a recording, a fit, a driver, an impedance, fits or bounds.
 
     | call | shows | axes |
     |---|---|---|
     | `plot(recording)` | V_th and V_out [V]: the whole record, and one pulse | 2 |
     | `plot(fit, recording, driver)` | one pulse measured and predicted [V]; residual [mV] | 2 |
-    | `plot(driver, calibration)` | the same with the calibration's resistor | 2 |
+    | `plot(driver, calibration)` | the same two diagrams for the calibration's resistor | 2 |
     | `plot(driver)`, `plot(circuit)` | magnitude [kΩ] and phase [deg] of an impedance | 2 |
     | `plot({label: driver, fit or circuit})` | several of these in one diagram | 2 |
     | `plot(fits)` | each element by subject, conditions side by side | one per element |
-    | `plot(etid.bound(scene))` | relative standard errors [%] to expect in each recording | 1 |
+    | `plot(etid.bound(scene))` | smallest relative standard errors [%] of each recording | 1 |
 
-    The band around a residual is ±2σ of the noise of both records, σ² = σ_out² + σ_th² mean |G|²,
-    G = Z_L / (Z_L + Z_th): where nothing but noise is left, 95 % lie inside. Bands around
-    impedances are two standard errors, from the covariance of what was identified. What was not
-    identified successfully says so in red, and its points are hollow.
+    The band around a residual is ±2σ of the noise of both records, σ² = σ_out² + σ_th² mean |G|²
+    with G = Z_L / (Z_L + Z_th). If only noise is left, 95 % of the residual lies inside. The bands
+    around impedances are two standard errors, from the covariance of the fit or driver. Fits and
+    drivers without success have a red title, and their points are hollow.
 
     Args:
-        x: What to draw.
-        recording: What `x` was identified in, for a fit or a driver.
-        driver: What `x` was identified with, for a fit.
-        axes: Where to draw, as many as the table says; if not given, on a new figure of
+        x: The object to draw.
+        recording: Recording of the fit, or calibration of the driver.
+        driver: Driver of the fit.
+        axes: Axes to draw on, as many as the table says. Without axes, `plot` makes a figure of
             `matplotlib.pyplot`, which a notebook shows.
 
     Returns:
-        The axes that were drawn on, (axis,), to be worked on further.
+        The axes of the picture, (axis,), for further changes.
 
     Raises:
-        TypeError: `x` is nothing that etid can draw, or `recording` or `driver` is missing.
-        ValueError: `x` is empty, or `axes` are not as many as the picture has.
+        TypeError: etid cannot draw `x`, or `recording` or `driver` is missing.
+        ValueError: `x` is empty, or the picture needs another number of axes.
     """
     from etid.plotting import style
 
@@ -84,7 +84,7 @@ def plot(
 def figure_of(
     x: Any, recording: Recording | None = None, driver: Driver | None = None
 ) -> "matplotlib.figure.Figure":
-    """What `plot` draws, on a figure that belongs to no global state; arguments as there."""
+    """The picture of `plot`, on a figure outside of `matplotlib.pyplot`; same arguments."""
     from etid.plotting import style
 
     def canvas(*layout: Any, **options: Any) -> np.ndarray:
@@ -108,8 +108,8 @@ def _draw(
                 return pulses.draw_calibration(canvas, x, recording)
             case Fit(), _, _:
                 raise TypeError(
-                    "a fit is drawn with its recording and driver, plot(fit, recording, driver); "
-                    'its impedance alone by plot({"skin": fit})'
+                    "to draw a fit, pass its recording and driver: plot(fit, recording, driver). "
+                    'plot({"skin": fit}) draws its impedance alone'
                 )
             case Recording(), None, None:
                 return pulses.draw_recording(canvas, x)
@@ -127,13 +127,13 @@ def _draw(
                 return impedances.draw_bode(canvas, x)
     raise TypeError(
         f"cannot draw {_kinds(x, recording, driver)}; plot takes a Recording, a Fit with its "
-        "recording and driver, a Driver alone or with a calibration, a circuit, Fits, a Bound, or "
-        "a dictionary of bounds, or of drivers, fits and circuits"
+        "recording and driver, a Driver alone or with a calibration, a circuit, Fits, a Bound, a "
+        "dictionary of bounds, or a dictionary of drivers, fits and circuits"
     )
 
 
 def _kinds(*arguments: Any) -> str:
-    """Types of arguments in words, with those of the values of a dictionary."""
+    """Names of the types of the arguments, and of the values in dictionaries."""
     words = []
     for x in arguments:
         if isinstance(x, dict):

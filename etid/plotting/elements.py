@@ -1,4 +1,4 @@
-"""Elements with their standard errors: those of a study, and those to expect of a scene."""
+"""Pictures of elements with standard errors: the fits of a study, and the bounds of a scene."""
 
 from collections.abc import Sequence
 
@@ -11,12 +11,12 @@ from etid.plotting.style import COLOURS, INK, MARKS, RED, Canvas, plain_ticks, t
 from etid.results.fits import Fits
 from etid.simulation.bound import Bound
 
-CROWDED = 60  # letters below an axis, above which they are turned
+CROWDED = 60  # letters below an axis; longer rows of labels are turned
 UNDETERMINED = 1.0  # relative standard error (see Bound.undetermined)
 
 
 def draw_fits(canvas: Canvas, fits: Fits) -> np.ndarray:
-    """Elements of all fits by subject, with standard errors; what did not succeed is hollow."""
+    """Elements of all fits by subject, with standard errors; fits without success are hollow."""
     if not len(fits):
         raise ValueError("there are no fits to draw")
     units = fits.circuit.units()
@@ -37,7 +37,7 @@ def draw_fits(canvas: Canvas, fits: Fits) -> np.ndarray:
         axis.set_yscale("log")
         plain_ticks(axis.yaxis)
         shown = drawable
-        if good.any():  # what was not determined may lie decades away
+        if good.any():  # an undetermined element may lie decades away
             low, high = values[good].min() / 2, values[good].max() * 2
             axis.set_ylim(low, high)
             shown = drawable & (values > low) & (values < high)
@@ -60,7 +60,7 @@ def draw_fits(canvas: Canvas, fits: Fits) -> np.ndarray:
 
 
 def _side_by_side(place: np.ndarray, labels: np.ndarray, conditions: Sequence[str]) -> np.ndarray:
-    """Where each fit stands: conditions beside each other, trials of one fanned out."""
+    """Horizontal position of each fit: conditions side by side, trials spread out."""
     width = 0.8 / len(conditions)
     x = place.astype(float)
     for i, condition in enumerate(conditions):
@@ -93,7 +93,7 @@ def _points(
 
 
 def _legend(axis: Axes, series: Sequence[str], hollow: str, *, beside: bool = False) -> None:
-    """One entry for each series, and one for what hollow points mean, if there are any."""
+    """A legend with one entry per series, and one entry that explains hollow points."""
     handles = [
         Line2D([], [], ls="", marker=MARKS[i % len(MARKS)], ms=4, color=COLOURS[i % len(COLOURS)],
                label=name)
@@ -109,16 +109,16 @@ def _legend(axis: Axes, series: Sequence[str], hollow: str, *, beside: bool = Fa
 
 
 def draw_bounds(canvas: Canvas, bounds: Sequence[Bound]) -> np.ndarray:
-    """Smallest relative standard errors by recording; what is not determined is hollow."""
+    """Smallest relative standard errors by recording; undetermined elements are hollow."""
     height = 1.3 + 0.22 * len(bounds)
     (axis,) = axes = canvas(1, 1, (7.5, height)).ravel()
     names = list(dict.fromkeys(name for one in bounds for name in one.circuit.names()))
     known = [e for one in bounds for e in one.relative.values() if np.isfinite(e)]
-    edge = 100 * max([UNDETERMINED, *known])  # of what not even a number bounds
+    edge = 100 * max([UNDETERMINED, *known])  # place of bounds that are not finite
     undetermined = []
     for i, name in enumerate(names):
         of = [(row, one) for row, one in enumerate(bounds) if name in one.relative]
-        offset = 0.5 * ((i + 0.5) / len(names) - 0.5)  # equal errors do not hide each other
+        offset = 0.5 * ((i + 0.5) / len(names) - 0.5)  # so that equal errors do not overlap
         place = np.array([row + offset for row, _ in of])
         error = 100 * np.array([one.relative[name] for _, one in of])
         hollow = np.array([name in one.undetermined for _, one in of])

@@ -1,4 +1,4 @@
-"""Impedances over frequency, with what their parameters' covariance leaves open."""
+"""Pictures of impedances over frequency, with bands of two standard errors."""
 
 from collections.abc import Mapping
 
@@ -16,13 +16,13 @@ from etid.solvers.propagation import log_stderr
 LOWEST, HIGHEST = 60.0, 100e3  # [Hz] the paper's pulse rate and half its sample rate
 POINTS = 300
 ROOM = 1.5  # factor between the curves and the frame
-BEYOND = 50.0  # a logarithm of no axis, whose exponential is a number
+BEYOND = 50.0  # limit of a logarithm: outside of every axis, but its exponential is finite
 
 
 def draw_bode(
     canvas: Canvas, things: Mapping[str, Driver | Fit | AbstractCircuit | SourceImpedance]
 ) -> np.ndarray:
-    """Magnitude and phase of impedances (the paper's figure 9), with two standard errors."""
+    """Magnitude and phase of impedances (the paper's figure 9), with bands."""
     magnitude, phase = axes = canvas(2, 1, (6.0, 5.0), sharex=True).ravel()
     frequency = jnp.geomspace(LOWEST, HIGHEST, POINTS)
     kilohertz = np.asarray(frequency) / 1e3
@@ -57,7 +57,7 @@ def draw_bode(
 
 
 def _frame(magnitude: Axes, phase: Axes, sizes: Float[np.ndarray, " value"]) -> None:
-    """Limits that show the curves, however wide the bands, and ticks at 1, 2 and 5."""
+    """Set limits that show the curves even if the bands are wide, and ticks at 1, 2 and 5."""
     sizes = sizes[np.isfinite(sizes)]
     if sizes.size:
         magnitude.set_ylim(sizes.min() / ROOM, sizes.max() * ROOM)
@@ -70,11 +70,11 @@ def _frame(magnitude: Axes, phase: Axes, sizes: Float[np.ndarray, " value"]) -> 
 def impedance(
     thing: Driver | Fit | AbstractCircuit | SourceImpedance,
 ) -> Driver | AbstractCircuit | SourceImpedance:
-    """What has a response: of a fit, its circuit."""
+    """The object with an impedance: the circuit of a fit, otherwise `thing` itself."""
     if not isinstance(thing, Fit):
         return thing
     if np.ndim(thing.rrse):
-        raise TypeError(f"this is a batch of {np.shape(thing.rrse)} fits; draw one, fits[i]")
+        raise TypeError(f"this is a batch of {np.shape(thing.rrse)} fits; draw one fit, fits[i]")
     return thing.circuit
 
 

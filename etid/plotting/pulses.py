@@ -1,4 +1,4 @@
-"""Recordings in time: a record, one pulse of it, and how well a circuit predicts that pulse."""
+"""Pictures over time: a record, one pulse, and the residual of a predicted pulse."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -14,14 +14,14 @@ from etid.results.fits import Fit, rrse
 from etid.signals.measurement import noise
 from etid.simulation.transformer import loading
 
-BEFORE, AFTER = 0.15e-3, 1.2e-3  # [s] shown around the first edge of a pulse
-FREQUENCIES = 2048  # at which |G|² is averaged; its features are wider than 1/1000 of the band
-PAIR = {"sharex": True, "gridspec_kw": {"height_ratios": [3, 1.2]}}  # of pulse and residual
+BEFORE, AFTER = 0.15e-3, 1.2e-3  # [s] time shown before and after the first edge of a pulse
+FREQUENCIES = 2048  # for the mean of |G|²; features of G are wider than 1/1000 of the band
+PAIR = {"sharex": True, "gridspec_kw": {"height_ratios": [3, 1.2]}}  # axes of pulse and residual
 
 
 def pulse(recording: Recording) -> slice:
-    """Samples around the first edge whose surroundings lie inside the record: one pulse."""
-    step = np.nan_to_num(np.diff(recording.v_th))  # a bad sample hides no edge
+    """Samples of one pulse: around the first edge that is far enough from both ends."""
+    step = np.nan_to_num(np.diff(recording.v_th))  # a missing sample must not hide an edge
     size = recording.v_th.size
     before = int(BEFORE * recording.sample_rate)
     after = int(AFTER * recording.sample_rate)
@@ -51,11 +51,11 @@ def draw_recording(canvas: Canvas, recording: Recording) -> np.ndarray:
 
 
 def draw_fit(canvas: Canvas, fit: Fit, recording: Recording, driver: Driver) -> np.ndarray:
-    """Measured and predicted pulse with the residual below, under the fit's verdict."""
+    """Measured and predicted pulse, the residual, and the verdict of the fit as title."""
     if np.ndim(fit.rrse):
         raise TypeError(
-            f"this is a batch of {np.shape(fit.rrse)} fits; draw one of them, fits[i], or all, "
-            "plot(fits)"
+            f"this is a batch of {np.shape(fit.rrse)} fits; draw one fit, fits[i], or all of "
+            "them, plot(fits)"
         )
     axes = canvas(2, 1, (6.0, 4.8), **PAIR).ravel()
     good = fit.verdict == "successful"
@@ -69,11 +69,11 @@ def draw_fit(canvas: Canvas, fit: Fit, recording: Recording, driver: Driver) -> 
 
 
 def draw_calibration(canvas: Canvas, driver: Driver, recording: Recording) -> np.ndarray:
-    """Measured pulse on a known resistor, and what the driver predicts, under its verdict."""
+    """Pulse on a known resistor, its prediction, and the verdict of the driver as title."""
     if recording.r_load is None:
         raise TypeError(
-            "a driver is drawn with a calibration, but this recording has no r_load; "
-            "draw the fit of it, plot(fit, recording, driver)"
+            "a driver is drawn with a calibration, but this recording has no r_load; draw the "
+            "fit of this recording, plot(fit, recording, driver)"
         )
     axes = canvas(2, 1, (6.0, 4.8), **PAIR).ravel()
     draw_pulse(axes[0], axes[1], recording, driver, Resistor(recording.r_load))
@@ -94,12 +94,12 @@ def _headline(recording: Recording, found: Fit | Driver) -> str:
 def draw_pulse(
     upper: Axes, lower: Axes, recording: Recording, driver: Driver, circuit: AbstractCircuit
 ) -> None:
-    """One pulse measured and predicted, and the residual within ±2σ of the noise.
+    """Draw one pulse, measured and predicted, and the residual with ±2σ of the noise.
 
     Args:
         upper: Axes of the pulse.
         lower: Axes of the residual.
-        recording: What was measured.
+        recording: The measured voltages.
         driver: Driver with a continuous source impedance.
         circuit: The load.
     """
@@ -142,7 +142,7 @@ def _unpredicted(upper: Axes, lower: Axes, recording: Recording) -> None:
 
 
 def residual_std(recording: Recording, driver: Driver, circuit: AbstractCircuit) -> float:
-    """Standard deviation [V] of predicted − measured where nothing but noise is left.
+    """Standard deviation of predicted − measured voltage if only noise is left [V].
 
     The noise of V_th reaches the residual through the loaded driver G = Z_L / (Z_L + Z_th),
 

@@ -1,8 +1,8 @@
-"""What all pictures have in common, and where they are drawn.
+"""Style of all pictures, and the figures that they are drawn on.
 
-Lines differ in style as well as in colour and points in shape, so that they can be told apart in
-black and white. Figures are white paper whatever the page around them or the reader's own style,
-which would else set dark curves on a dark ground.
+Lines differ in style as well as in colour, and points differ in shape, so that black and white
+prints stay readable. The background is always white: a dark style of the reader would give dark
+curves on a dark background.
 """
 
 import os
@@ -34,21 +34,21 @@ PAPER: Any = {
     "ytick.color": INK,
 }
 
-# Makes the axes of a picture, [row, column], from rows, columns, size [inch] and what else
-# `Figure.subplots` takes.
+# Returns the axes of a picture, [row, column]. Its arguments are rows, columns, size [inch] and
+# options of `Figure.subplots`.
 Canvas = Callable[..., np.ndarray]
 
 
 def new_figure(
     rows: int, columns: int, size: tuple[float, float], **options: Any
 ) -> tuple[Figure, np.ndarray]:
-    """A figure that belongs to no global state, with a light grid, and its axes [row, column].
+    """A figure outside of `matplotlib.pyplot`, with a light grid, and its axes [row, column].
 
     Args:
-        rows: Of axes.
-        columns: Of axes.
+        rows: Number of rows of axes.
+        columns: Number of columns of axes.
         size: Width and height [inch].
-        **options: As `Figure.subplots` takes them.
+        **options: Options of `Figure.subplots`.
     """
     with mpl.rc_context(PAPER):
         figure = Figure(figsize=size, layout="constrained")
@@ -57,18 +57,18 @@ def new_figure(
 
 
 def on_pyplot(rows: int, columns: int, size: tuple[float, float], **options: Any) -> np.ndarray:
-    """A canvas: a figure that a notebook or `matplotlib.pyplot.show` shows."""
-    import matplotlib.pyplot as plt  # chooses a backend for the process: only who wants it does
+    """A canvas on a new figure that a notebook or `matplotlib.pyplot.show` shows."""
+    import matplotlib.pyplot as plt  # here, because it chooses a backend for the whole process
 
     with mpl.rc_context(PAPER):
         return _subplots(plt.figure(figsize=size, layout="constrained"), rows, columns, options)
 
 
 def on_axes(axes: Sequence[Axes] | np.ndarray) -> Canvas:
-    """A canvas: axes that exist, in the order in which they are drawn.
+    """A canvas on given axes, used in their order.
 
     Raises:
-        ValueError: They are not as many as the picture has, once it is drawn.
+        ValueError: The picture needs another number of axes. The canvas raises it when it draws.
     """
     given = np.asarray(axes, dtype=object).ravel()
 
@@ -86,7 +86,8 @@ def _subplots(figure: Figure, rows: int, columns: int, options: dict[str, Any]) 
         axis.grid(True, color="0.9", linewidth=0.6)
         axis.set_axisbelow(True)
         axis.spines[["top", "right"]].set_visible(False)
-        axis.tick_params(which="both", colors=INK)  # ticks are made late, in the reader's style
+        # matplotlib makes ticks later, and would then use the reader's style.
+        axis.tick_params(which="both", colors=INK)
     return axes
 
 
@@ -98,14 +99,14 @@ def plain_ticks(axis: Axis) -> None:
 
 
 def titled(axis: Axes, lines: Sequence[str], *, good: bool = True) -> None:
-    """Set a title to the left; red and bold over what must not be taken for a result."""
+    """Set a title on the left; red and bold if the picture does not show a valid result."""
     look: dict[str, Any] = {"color": INK} if good else {"color": RED, "fontweight": "bold"}
     axis.set_title("\n".join(filter(None, lines)), loc="left", fontsize=9, **look)
 
 
 def save(figure: Figure, path: str | os.PathLike[str]) -> None:
-    """Write a figure as PNG or SVG, without dates, so that equal figures are equal files."""
+    """Write a figure as PNG or SVG without a date, so that equal figures give equal files."""
     suffix = pathlib.Path(path).suffix.lower()
     if suffix not in (".png", ".svg"):
-        raise ValueError(f"{path}: figures are written as .png or .svg, not {suffix or 'nothing'}")
+        raise ValueError(f"{path}: use the suffix .png or .svg instead of {suffix or 'none'}")
     figure.savefig(path, dpi=150, metadata={"Date": None} if suffix == ".svg" else {})

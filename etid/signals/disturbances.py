@@ -1,10 +1,10 @@
-"""Which pulse periods of a record are unlike the others: a spike, a burst, a missing pulse.
+"""Disturbed pulse periods of a record: periods with a spike, a burst or a missing pulse.
 
-A hand that moves spoils one of several periods, and with it the average over all. Each period is
-compared with the median of all, in means over `MERGED` samples. A period is *disturbed* where it
-differs by more than `PART` of the largest value and by more than `SHARE` of what is there. A load
-that changes by less than a factor of two does not do that, nor do edges that fall between samples,
-nor noise.
+A movement of the hand can spoil one of several periods, and with it the average of all periods.
+Each period is compared with the median of all periods, after averaging over `MERGED` samples. A
+period is *disturbed* if it differs by more than `PART` of the largest value and by more than
+`SHARE` of the value at the same place. A load that changes by less than a factor of two does not
+exceed these limits. Edges between samples and noise do not exceed them either.
 """
 
 from collections.abc import Sequence
@@ -13,11 +13,11 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-MERGED = 16  # samples of a mean
-FEWEST = 3  # periods, to tell one from the others
-PART = 0.02  # of the largest value: 0.05 V at the converter in records of 2.5 V
-SHARE = 0.5  # of what is there
-NOISE = 8.0  # standard deviations of a mean
+MERGED = 16  # samples that are averaged
+FEWEST = 3  # periods that are needed to recognise a disturbed one
+PART = 0.02  # limit relative to the largest value: 0.05 V at the converter in records of 2.5 V
+SHARE = 0.5  # limit relative to the value at the same place
+NOISE = 8.0  # limit relative to the standard deviation of a mean
 
 
 def disturbed(
@@ -27,16 +27,16 @@ def disturbed(
     spacing: float,
     periods: int,
 ) -> Bool[np.ndarray, " period"]:
-    """Whether each period is unlike the others in one of several records of equal lengths.
+    """Whether each period is disturbed in at least one of several records of equal lengths.
 
-    None is if there are fewer than three.
+    With fewer than three periods, the answer is no for all of them.
 
     Args:
         records: Voltages [V].
-        sigma: Noise of a sample of each [V].
-        step: Step of the converter of each [V] if it is coarse, else 0.
+        sigma: Standard deviation of the noise of a sample of each record [V].
+        step: Step of the converter of each record if it is coarse, else 0 [V].
         spacing: Length of a period [samples].
-        periods: How many whole ones each record holds.
+        periods: Number of whole periods in each record.
     """
     length = int(spacing) // MERGED * MERGED
     if periods < FEWEST or length < 3 * MERGED:
@@ -46,12 +46,13 @@ def disturbed(
     cut = [[np.add.reduceat(v[one : one + length], parts) for one in at] for v in records]
     means = np.array(cut) / MERGED
     half = parts.size // 2
-    means -= np.partition(means, half, axis=2)[:, :, half, None]  # of each: the mean may drift
+    # Subtract the median of each period, because the mean may drift.
+    means -= np.partition(means, half, axis=2)[:, :, half, None]
     low, high = means.min(1), means.max(1)
     noise = NOISE / MERGED**0.5 * np.asarray(sigma)
     floor = np.maximum(PART * high.max(1), noise) + step
     if not (high - low > SHARE * np.maximum(low, -high) + floor[:, None]).any():
-        return np.zeros(periods, bool)  # as of most records, for half of the time
+        return np.zeros(periods, bool)  # most records end here, in half of the time
     usual = np.median(means, axis=1)
     floor = np.maximum(PART * np.abs(usual).max(1), noise) + step
     # The first and the last mean lie between pulses.
@@ -64,16 +65,17 @@ def disturbed(
 
 
 class Joint(NamedTuple):
-    """How a record of the periods that are kept is put together.
+    """A plan to join the periods that are kept to one record.
 
-    It is as long as if it had been recorded without the others. Each period begins at a sample, by
-    which pulses may be a sample nearer or farther. Of two voltages that are cut alike, the ratio at
-    each frequency stays the same, as both are at rest at the joints.
+    The joined record is as long as a record of these periods alone. Each period begins at a whole
+    sample, so the spacing of pulses may change by one sample at a joint. If two voltages are joined
+    in the same way, their ratio at each frequency stays the same, because both are at rest at the
+    joints.
 
     Attributes:
-        first: First samples of the periods in the whole record.
-        lengths: Their samples.
-        begins: Where they begin in the record that is put together [samples].
+        first: First sample of each period in the whole record.
+        lengths: Number of samples of each period.
+        begins: Start of each period in the joined record [samples].
     """
 
     first: Int[np.ndarray, " kept"]
@@ -81,18 +83,18 @@ class Joint(NamedTuple):
     begins: Float[np.ndarray, " kept"]
 
     def __call__(self, v: Float[np.ndarray, " time"]) -> Float[np.ndarray, " kept"]:
-        """A voltage of these periods only."""
+        """The joined record of a voltage."""
         parts = zip(self.first, self.lengths, strict=True)
         return np.concatenate([v[first : first + length] for first, length in parts])
 
 
 def joint(kept: Bool[np.ndarray, " period"], spacing: float, size: int) -> Joint:
-    """The periods to keep.
+    """The plan to join the periods that are kept.
 
     Args:
-        kept: Whether each is kept.
+        kept: Whether each period is kept.
         spacing: Length of a period [samples].
-        size: Samples of the record.
+        size: Number of samples of the record.
     """
     number = np.flatnonzero(kept)
     ends = np.rint(np.arange(number.size + 1) * spacing).astype(int)
