@@ -85,6 +85,17 @@ def test_intervals_hold_the_truth_as_often_as_they_say(path):
     assert (np.abs(np.mean(inside, 0) - 0.95) < 3 * np.sqrt(0.95 * 0.05 / draws)).all()
 
 
+@pytest.mark.slow
+def test_a_joint_fit_takes_any_circuit():
+    trials = tuple(Trial(f"skin/{i}", SPREAD) for i in range(2))
+    fits = etid.identify_jointly(
+        dataclasses.replace(scene(), trials=trials).simulate(3), circuit=etid.SkinCole()
+    ).fits
+    assert fits.counts() == {"successful": 2}
+    error = np.asarray(fits.circuit.values()) - np.asarray(SPREAD.values())
+    assert (np.abs(error) < SIGMAS * np.asarray(fits.stderr.values())).all()
+
+
 def test_simulated_loads_and_their_truth_are_those_of_the_circuit(study):
     assert scene().truth()["spread"] == pytest.approx(
         {"r_s": 33.4e3, "r_p": 186e3, "tau": 22e-6, "alpha": 0.85}, rel=1e-15
