@@ -1,6 +1,6 @@
 """Would the tests tell? Bugs are put in, one at a time, and the tests of the files concerned run.
 
-    python -m benchmarks mutation --mutants 40 --modules judging levenberg_marquardt
+    python -m benchmarks mutation --mutants 40 --modules estimators.judgement signals.harmonics
 
 A mutant that all tests let pass has survived. Some are no bug at all: another start of an
 iteration, a tolerance that nothing depends on; they are counted all the same. Mutants are drawn by
@@ -28,26 +28,28 @@ from benchmarks.provenance import ROOT
 TARGET = 0.1  # part of the mutants that may survive
 COPIED = ("etid", "tests", "benchmarks", "data_schema", "docs", "notebooks", ".ci")
 LIMIT = 300.0  # [s] of a mutant; an endless loop is seen, too
-# What the tests of a module are, the cheapest first.
+# The tests of each module, the cheapest first.
 TESTS: Mapping[str, Sequence[str]] = {
-    "arrowhead": ("arrowhead",),
-    "bands": ("online",),
-    "given_driver": ("given_driver", "maximum_likelihood"),
-    "information": ("output_error", "identification"),
-    "joint": ("joint",),
-    "judging": ("judging",),
-    "levenberg_marquardt": ("levenberg_marquardt",),
-    "likelihood": ("maximum_likelihood",),
-    "non_parametric": ("non_parametric",),
-    "online": ("online",),
-    "output_error": ("output_error", "identification"),
-    "prediction": ("output_error", "identification"),
-    "results": ("recording", "joint", "identification"),
-    "shared_errors": ("joint",),
-    "single_load": ("maximum_likelihood", "own_circuits"),
-    "spectra": ("spectra",),
-    "streaming": ("streaming",),
-    "tables": ("exporting", "cli"),
+    "estimators.joint.errors": ("joint",),
+    "estimators.joint.fit": ("joint",),
+    "estimators.joint.terms": ("joint",),
+    "estimators.judgement": ("judging",),
+    "estimators.maximum_likelihood.given_driver": ("given_driver", "maximum_likelihood"),
+    "estimators.maximum_likelihood.load": ("maximum_likelihood", "own_circuits"),
+    "estimators.maximum_likelihood.terms": ("maximum_likelihood",),
+    "estimators.non_parametric": ("non_parametric",),
+    "estimators.output_error.fit": ("output_error", "identification"),
+    "estimators.output_error.information": ("output_error", "identification"),
+    "estimators.output_error.prediction": ("output_error", "identification"),
+    "identify.changes": ("changes", "other_in_time"),
+    "identify.file": ("streaming",),
+    "online.gain_bands": ("online",),
+    "online.tracker": ("online",),
+    "results.fits": ("recording", "joint", "identification"),
+    "results.hdf5_table": ("exporting", "cli"),
+    "signals.harmonics": ("spectra",),
+    "solvers.arrowhead": ("arrowhead",),
+    "solvers.levenberg_marquardt": ("levenberg_marquardt",),
 }
 
 
@@ -114,7 +116,7 @@ def outcomes(
             if mutant.key in before:
                 yield before[mutant.key]
                 continue
-            name = pathlib.PurePath(mutant.path).stem
+            name = mutant.path.removeprefix("etid/").removesuffix(".py").replace("/", ".")
             if name not in sound and passes(folder, tests[name], 10 * limit) is not True:
                 raise SystemExit(f"the tests of {mutant.path} fail without any mutant")
             sound.add(name)
@@ -144,9 +146,9 @@ def show(rows: Sequence[Mapping[str, Any]]) -> float:
     modules = collections.defaultdict(list)
     for row in rows:
         modules[row["module"]].append(row["outcome"] == "survived")
-    print(f"{'module':<24}{'mutants':>8}{'survived':>10}")
+    print(f"{'module':<44}{'mutants':>8}{'survived':>10}")
     for name, survived in sorted(modules.items()):
-        print(f"{name:<24}{len(survived):>8}{sum(survived):>10}")
+        print(f"{name:<44}{len(survived):>8}{sum(survived):>10}")
     left = [row for row in rows if row["outcome"] == "survived"]
     low, high = clopper_pearson(len(left), len(rows))
     share = len(left) / len(rows)
@@ -172,12 +174,12 @@ def main(arguments: argparse.Namespace) -> bool:
     """Run the command."""
     every = []
     for name in arguments.modules:
-        path = f"etid/{name}.py"
+        path = f"etid/{name.replace('.', '/')}.py"
         every += mutants(path, (ROOT / path).read_text("utf-8"))
     chosen = drawn(every, arguments.mutants, arguments.seed)
     print(f"{len(chosen)} of {len(every)} mutants of {len(arguments.modules)} modules")
     rows = []
     for row in outcomes(ROOT, TESTS, chosen, arguments.output, arguments.limit):
         rows.append(row)
-        print(f"{row['place']:<36}{row['kind']:<20}{row['outcome']}", flush=True)
+        print(f"{row['place']:<52}{row['kind']:<20}{row['outcome']}", flush=True)
     return show(rows) <= TARGET

@@ -6,6 +6,7 @@ import pytest
 
 from benchmarks import mutation
 from benchmarks.mutants import drawn, mutants
+from benchmarks.provenance import ROOT
 
 SOURCE = '''"""A module."""
 
@@ -79,6 +80,13 @@ def test_what_no_test_sees_survives_and_what_is_done_is_kept(tree, tmp_path, mon
     assert path.read_text().startswith("UNUSED = 5")
     monkeypatch.setattr(mutation, "passes", None)  # or it would be called
     assert list(mutation.outcomes(tree, tests, chosen[:2], kept, 60.0)) == rows
+
+
+def test_modules_and_their_tests_are_where_the_benchmark_looks_for_them():
+    for name, tests in mutation.TESTS.items():
+        assert (ROOT / "etid" / f"{name.replace('.', '/')}.py").exists()
+        for test in tests:
+            assert (ROOT / "tests" / f"test_{test}.py").exists()
 
 
 def test_survivors_are_shown_with_their_place(capsys):
