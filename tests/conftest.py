@@ -17,6 +17,10 @@ jax.config.update("jax_numpy_dtype_promotion", "strict")
 settings.register_profile("etid", deadline=None, derandomize=True, max_examples=40)
 settings.load_profile("etid")
 
+# XLA compiles the programs of these tests in a third of the time: code of fusions without MLIR, and
+# few passes of LLVM. That makes the programs slower, which only statistics would notice.
+COMPILE_FAST = "--xla_cpu_use_fusion_emitters=false --xla_backend_optimization_level=0"
+
 REFERENCE_DATA = pathlib.Path(__file__).parents[2] / "shared" / "data"
 
 
@@ -24,14 +28,21 @@ def pytest_configure(config):
     """Share what is compiled between the workers, and give each a core of its own.
 
     Compilation is most of the time of the tests. On one core XLA's threads do not slow each other
-    down sixfold.
+    down sixfold. Slow tests and notebooks are compiled as users' programs are.
     """
+    if config.option.markexpr in config.getini("addopts"):  # JAX has not read it yet
+        os.environ["XLA_FLAGS"] = f"{COMPILE_FAST} {os.environ.get('XLA_FLAGS', '')}"
     os.environ["JAX_COMPILATION_CACHE_DIR"] = str(config.cache.mkdir("xla"))  # for notebooks
     jax.config.update("jax_compilation_cache_dir", os.environ["JAX_COMPILATION_CACHE_DIR"])
     worker = os.environ.get("PYTEST_XDIST_WORKER")
     if worker is not None and hasattr(os, "sched_setaffinity"):
         cores = sorted(os.sched_getaffinity(0))
         os.sched_setaffinity(0, {cores[int(worker.removeprefix("gw")) % len(cores)]})
+
+
+def pytest_xdist_auto_num_workers():
+    """One worker for each core that these tests may use, which may be fewer than there are."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else None
 
 
 @pytest.fixture(autouse=True, scope="module")

@@ -112,10 +112,11 @@ def test_nonphysical_and_driver_failed(study):
     calibration = study["calibration/98k8"]
     v = calibration.v_out * np.std(calibration.v_th) / np.std(calibration.v_out)
     more = calibration.replace(v_out=1.004 * v, adc_range=None)
-    driver = etid.identify_driver(more, throw=False)
-    assert driver.verdict == "nonphysical"
-    with pytest.raises(etid.IdentificationError, match="driver: nonphysical"):
+    with pytest.raises(etid.IdentificationError, match="driver: nonphysical") as raised:
         etid.identify_driver(more)
+    driver = raised.value.outcome
+    assert isinstance(driver, etid.Driver)
+    assert driver.verdict == "nonphysical"
     assert verdict_of(study["loaded/0"], driver) in ("driver_failed", "misfit")
 
 
