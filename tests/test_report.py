@@ -61,7 +61,7 @@ def test_page_is_whole_escaped_and_needs_no_other_file(tmp_path):
     assert parser.open == []
     for escaped in (
         "Title &lt;t&gt;", "R &lt; 1", "a &amp; b", "&lt;1&gt;", "&lt;g&gt;", "of &lt;t&gt;",
-        "caption &lt;c&gt;", "a &quot;b&quot;", "&lt;w&gt;", "@x{&lt;key&gt;}",
+        "caption &lt;c&gt;", "a &#34;b&#34;", "&lt;w&gt;", "@x{&lt;key&gt;}",
     ):  # fmt: skip
         assert escaped in page
     assert all(source.startswith("data:") for source in re.findall(r'src="([^"]*)"', page))

@@ -377,9 +377,9 @@ def test_methods_cite_what_they_name_and_say_the_settings(found, method):
 
 
 def test_every_entry_is_whole_bibtex():
-    everything = citations.bibtex(citations._ENTRIES)
+    everything = citations.bibtex(citations.entries())
     entries = everything.split("\n\n")
-    assert len(entries) == len(citations._ENTRIES)
+    assert len(entries) == len(citations.entries())
     for entry in entries:
         assert entry.count("{") == entry.count("}")
         assert re.fullmatch(r"@\w+\{\w+,\n(.+\n)+\}", entry), entry
