@@ -192,9 +192,9 @@ class SkinLayers(AbstractCircuit):
     """Skin of two layers, each one relaxation, Z = R_s + R_1/(1 + s R_1 C_1) + R_2/(1 + s R_2 C_2).
 
     The first layer is the faster one by its typical values. The sum of the typical resistances is
-    that of `SkinRC`. The typical time constants, 20 and 150 µs, are those that Birlea, Birlea and
-    Culea found in human skin, 10 to 40 and 100 to 200 µs (The Skin's Electrical Time Constants,
-    2011, doi 10.1007/978-3-642-22586-4_34).
+    that of `SkinRC`. The typical time constants, 21 and 120 µs, lie in the ranges that Birlea,
+    Birlea and Culea found in human skin, 10 to 40 and 100 to 200 µs (The Skin's Electrical Time
+    Constants, 2011, doi 10.1007/978-3-642-22586-4_34).
     """
 
     formula: ClassVar[str] = "R_s + R_1 / (1 + s R_1 C_1) + R_2 / (1 + s R_2 C_2)"
@@ -202,7 +202,7 @@ class SkinLayers(AbstractCircuit):
     r_1: Ohm = parameter("ohm", typical=70e3)
     c_1: Farad = parameter("farad", typical=0.3e-9)
     r_2: Ohm = parameter("ohm", typical=30e3)
-    c_2: Farad = parameter("farad", typical=5e-9)
+    c_2: Farad = parameter("farad", typical=4e-9)
 
     def impedance(self) -> AbstractImpedance:
         """Impedance of both layers."""
