@@ -1,7 +1,9 @@
-"""Notebooks as pages, with their figures: executed by `make notebooks`, or else here.
+"""Pages of the executed notebooks, with their figures.
 
-What is shown was made by the code that stands above it. Each becomes a page `notebooks/NAME.md`;
-the mark `<!-- gallery -->` lists them with their first figure.
+`make notebooks` executes the notebooks; this hook executes those that are older than their source.
+Every output on a page comes from the code above it. A notebook becomes the page
+`notebooks/NAME.md`. The mark `<!-- gallery -->` becomes a list of all notebooks with their first
+figure.
 """
 
 import functools
@@ -18,13 +20,13 @@ from mkdocs.structure.files import File
 
 ROOT = pathlib.Path(__file__).parents[2]
 MARK = "<!-- gallery -->"
-SECONDS = 300  # of one notebook
+SECONDS = 300  # time limit of one notebook
 
 log = get_plugin_logger("gallery")
 
 
 def executed(path):
-    """Markdown of an executed notebook, its figures by name, and the time it took [s]."""
+    """Markdown of an executed notebook, its figures by name, and its run time [s]."""
     made = path.with_suffix(".ipynb")
     if made.exists() and made.stat().st_mtime > path.stat().st_mtime:
         notebook = nbformat.read(made, as_version=4)
@@ -35,7 +37,7 @@ def executed(path):
     return body, resources["outputs"], taken
 
 
-@functools.cache  # while a site is served, only what was changed is executed again
+@functools.cache  # while a site is served, only changed notebooks are executed again
 def _execute(text):
     notebook = jupytext.reads(text, fmt="py:percent")
     begun = time.perf_counter()
@@ -44,7 +46,7 @@ def _execute(text):
 
 
 def on_config(config):
-    """Put the notebooks below the gallery."""
+    """Add the notebooks to the navigation, below the gallery."""
     pages = [f"notebooks/{path.stem}.md" for path in _notebooks()]
     for entry in config.nav:
         if entry == {"Notebooks": "gallery.md"}:
@@ -70,7 +72,7 @@ def on_files(files, config):
 
 
 def on_page_markdown(markdown, page, config, files):
-    """List the notebooks where the gallery has its mark."""
+    """Replace the mark by a list of the notebooks."""
     if MARK not in markdown:
         return markdown
     notebooks = sorted(

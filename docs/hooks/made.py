@@ -1,7 +1,7 @@
-"""What pages show of the code is made from the code: `<!-- made: NAME -->` in a page.
+"""Parts of pages that are made from the code: `<!-- made: NAME -->` in a page.
 
-Verdicts come from their messages, the command line from its parsers, the reference from the names
-that `etid` exports.
+The table of verdicts comes from their messages, the command line from its parsers, and the
+reference from the names that `etid` exports.
 """
 
 import os
@@ -15,16 +15,16 @@ from etid import cli
 from etid.results import verdicts
 
 MARK = re.compile(r"^<!-- made: (\w+) -->$", re.MULTILINE)
-BORROWED = ("successful", "max_steps_reached", "nonfinite")  # of optimistix, see etid.RESULTS
+BORROWED = ("successful", "max_steps_reached", "nonfinite")  # from optimistix, see etid.RESULTS
 
 
 def on_page_markdown(markdown, page, config, files):
-    """Fill the marked places."""
+    """Replace the marks."""
     return MARK.sub(lambda mark: MADE[mark[1]](), markdown)
 
 
 def table_of_verdicts():
-    """Every verdict that etid gives, and what it says."""
+    """Table of all verdicts of etid and their messages."""
 
     def names(kind):
         return list(vars(kind)["_name_to_item"])
@@ -37,7 +37,7 @@ def table_of_verdicts():
 
 
 def commands():
-    """Help of every command, as the terminal shows it."""
+    """Help of all commands, as the terminal shows it."""
     os.environ["COLUMNS"] = "90"
     parser = cli.parser()
     helps = {"etid": parser.format_help()}
@@ -48,7 +48,7 @@ def commands():
 
 
 def reference():
-    """Every name that `import etid` gives."""
+    """Reference of all names that `etid` exports."""
     names = sorted(etid.__all__, key=str.lower)
     groups = {"Functions": types.FunctionType, "Classes": type, "Modules": types.ModuleType}
     parts = []

@@ -1,4 +1,4 @@
-"""Equations become MathML when the site is built: no script renders them, nothing is fetched."""
+"""Conversion of equations to MathML when the site is built, so that pages need no script."""
 
 import html
 import re
@@ -10,7 +10,7 @@ DISPLAYED = re.compile(r'<div class="arithmatex">\s*\\\[(.*?)\\\]\s*</div>', re.
 
 
 def on_page_content(content, page, config, files):
-    """Replace LaTeX."""
+    """Replace LaTeX by MathML."""
     for pattern, display in ((INLINE, "inline"), (DISPLAYED, "block")):
         content = pattern.sub(lambda found, how=display: _mathml(found[1], how), content)
     return content

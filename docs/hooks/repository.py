@@ -1,8 +1,8 @@
-"""Pages that are files of the repository, links as they are there, and nothing from elsewhere.
+"""Pages of the site from files of the repository, without content from other hosts.
 
-A page is written once: the README is the start of the site, the folders' READMEs are pages. Links
-are those of the repository, so that they lead somewhere there too; here they are turned into those
-of the site, where `docs/` is the root.
+The README is the first page of the site, and the READMEs of the folders are pages too. Links are
+written for the repository, so that they work there. This hook converts them to links of the site,
+whose root is `docs/`.
 """
 
 import html.parser
@@ -34,7 +34,7 @@ FETCHED = {"script": "src", "img": "src", "iframe": "src", "source": "src"}
 
 
 def on_files(files, config):
-    """Add the pages and files of the repository, at their places in it."""
+    """Add pages and files of the repository with the paths that they have there."""
     paths = [path for pattern in SHOWN for path in sorted(ROOT.glob(pattern))]
     for name in (*PAGES, *(path.relative_to(ROOT).as_posix() for path in paths)):
         files.append(File(name, str(ROOT), config.site_dir, config.use_directory_urls))
@@ -42,7 +42,7 @@ def on_files(files, config):
 
 
 def on_page_markdown(markdown, page, config, files):
-    """Turn links of the repository into links of the site."""
+    """Convert links of the repository to links of the site."""
     shown = page.file.src_uri
     inside = page.file.abs_src_path and pathlib.Path(page.file.abs_src_path).relative_to(ROOT)
     if not inside:
@@ -60,7 +60,7 @@ def on_page_markdown(markdown, page, config, files):
 
 
 def on_post_build(config):
-    """Refuse a site that a reader without a network would not see whole."""
+    """Raise an error if a page needs the network."""
     for path in sorted(pathlib.Path(config.site_dir).rglob("*.html")):
         reader = _Fetched()
         reader.feed(path.read_text("utf-8"))
@@ -69,7 +69,7 @@ def on_post_build(config):
 
 
 class _Fetched(html.parser.HTMLParser):
-    """What a page loads from other hosts; links to them are no such thing."""
+    """Addresses that a page loads from other hosts; ordinary links do not count."""
 
     def __init__(self):
         super().__init__()
