@@ -92,6 +92,29 @@ def test_a_step_and_a_single_period_are_seen_as_well_as_a_line():
         assert abs(change.size[1] + 0.1) < 4 * change.stderr[1] + 0.005
 
 
+def test_an_element_that_moves_alone_is_seen_where_all_together_hide_it():
+    """One of the records at 40 dB in which R_p falls by 5 % and χ² of all four is too small."""
+    scene, skin = rung("dry", snr_db=40.0), LOADS["dry"]
+    assert change_of(recorded(scene, falling(skin, "r_p", 0.05), seed=21), scene, skin).seen
+
+
+def test_chi_squared_of_one_parameter_alone_is_that_of_a_fit_of_it_and_the_delays():
+    rng = np.random.default_rng(2)
+    design = rng.normal(size=(1, 3, 40, 6))
+    data = rng.normal(size=(1, 3, 40))
+    normal = np.swapaxes(design, -1, -2) @ design
+    right = (design * data[..., None]).sum(-2)
+    found = changes._alone(normal, right, 4)
+    for course in range(3):
+        for number in range(4):
+            left = []
+            for columns in ([4, 5], [number, 4, 5]):
+                x = design[0, course][:, columns]
+                rest = data[0, course] - x @ np.linalg.lstsq(x, data[0, course])[0]
+                left.append(rest @ rest)
+            assert found[0, course, number] == pytest.approx(left[0] - left[1], rel=1e-6)
+
+
 UNDISTURBED = {
     "20 dB": {"snr_db": 20.0},
     "80 dB": {"snr_db": 80.0},

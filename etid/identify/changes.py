@@ -20,13 +20,13 @@ little noise behind a driver that is known worse, the fit is as good as it says.
 
 import dataclasses
 import functools
-import statistics
 from collections.abc import Sequence
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+import scipy.special
 from jaxtyping import Array, Complex, Float
 
 from etid.circuits.circuit import AbstractCircuit, Resistor
@@ -106,9 +106,8 @@ def courses(periods: int) -> Float[np.ndarray, "course period"]:
 
 @functools.lru_cache(maxsize=64)
 def threshold(freedom: int, count: int) -> float:
-    """χ² that the largest of `count` exceeds with the probability `ALARM` (Wilson, Hilferty)."""
-    z = statistics.NormalDist().inv_cdf(1 - ALARM / count)
-    return freedom * (1 - 2 / (9 * freedom) + z * (2 / (9 * freedom)) ** 0.5) ** 3
+    """χ² that the largest of `count` exceeds with the probability `ALARM`."""
+    return float(scipy.special.chdtri(freedom, ALARM / count))
 
 
 def found(
@@ -155,7 +154,10 @@ def _changes(
     # parameters leave tells how large it is.
     freedom = 2 * of.frequency.shape[1] - right.shape[-1]
     noise = np.maximum(1.0, (total - explained) / freedom)
-    seen = (square / noise).max(1) > threshold(tested, len(course))
+    # Half of the alarms are left to elements that move alone, which four together would hide.
+    alone = (_alone(normal, right, tested) / noise[..., None]).max((1, 2))
+    seen = (square / noise).max(1) > threshold(tested, 2 * len(course))
+    seen |= alone > threshold(1, 2 * len(course) * tested)
     cov = cov * noise[..., None, None]
     # Without aliases courses do not mix: the likeliest is the one that fits best.
     best = np.where(seen, np.argmax(_solved(whole[:, None], plain, tested)[2], axis=1), 0)
@@ -232,6 +234,18 @@ def _solved(
     square = (theta * np.linalg.solve(cov, theta)).sum((-1, -2))
     cov = np.broadcast_to(cov, (*theta.shape[:-1], tested))
     return theta[..., 0], cov, square, explained
+
+
+def _alone(normal: np.ndarray, right: np.ndarray, tested: int) -> np.ndarray:
+    """χ² of each of the first parameters if it is the only one of them, for recordings and courses.
+
+    The others, delays, are fitted with it.
+    """
+    cross, others = normal[..., :tested, tested:], normal[..., tested:, tested:]
+    solved = cross @ np.linalg.inv(others + RIDGE * np.eye(others.shape[-1]))
+    score = right[..., :tested] - (solved * right[..., None, tested:]).sum(-1)
+    own = np.diagonal(normal, axis1=-2, axis2=-1)[..., :tested] - (solved * cross).sum(-1)
+    return score**2 / np.maximum(own, RIDGE)
 
 
 def _uneven(of: Repeats, course: Float[np.ndarray, "course period"]) -> np.ndarray:
