@@ -171,7 +171,8 @@ def harmonic_steiglitz_mcbride(ten_periods: Problem, iterations: int) -> Run:
     z_th = known.z_th(jnp.zeros_like(known.loaded))
 
     def ours(one):
-        return fit_skin(Spectrum(*one[:-1]), z_th, iterations).circuit.values()
+        *fields, rate = one
+        return fit_skin(Spectrum(*fields), z_th, rate, iterations).circuit.values()
 
     return _each(ours, ten_periods.lanes)
 

@@ -11,6 +11,7 @@ import etid
 from benchmarks.coverage import scene
 from benchmarks.ladder import LOADS
 from etid.estimators import non_parametric
+from etid.estimators.unknowns import LoadUnknowns
 from etid.identify.lanes import lane
 from etid.recordings.preflight import Inspected
 from etid.results.driver import HarmonicDriver
@@ -123,7 +124,7 @@ def test_one_unloaded_record_has_one_noise():
 def test_bias_is_taken_off_the_estimate(study, coarse, monkeypatch):
     """In the place of a bias the change that a larger Y makes; R alone keeps it cheap."""
     *fields, rate = map(jnp.asarray, lane(Inspected(study["dry"]), "non_parametric"))
-    start = jnp.array([[np.log(150e3), 0.0]])
+    start = LoadUnknowns(jnp.array([[np.log(150e3)]]), jnp.zeros(1))
 
     @jax.jit
     def fit(spectrum, larger):

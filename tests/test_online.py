@@ -253,7 +253,7 @@ def batch(driver, recording):
     z_th = driver.response(spectrum.frequency)
     starts = refinement.harmonic_starts(spectrum, rate, z_th, etid.SkinRC())
     own, *_ = maximum_likelihood.fit_load(model, spectrum, rate, starts)
-    return np.exp(np.asarray(own[:-1]))
+    return np.exp(np.asarray(own.log_elements))
 
 
 def test_a_lane_without_numbers_changes_no_bit_of_the_other_and_nor_does_their_order():

@@ -11,6 +11,7 @@ import etid
 from benchmarks.failure_axes import Cole, TwoLayers
 from benchmarks.ladder import CALIBRATION, LOADS, rung
 from etid.circuits.circuit import Resistor
+from etid.estimators.sandwich import Linear
 from etid.estimators.score_tests import other_circuit
 from etid.simulation.scenes import Trial
 
@@ -63,16 +64,14 @@ def scores(residual, rows, jacobian):
     """Without priors, in white noise of known size."""
     q = jacobian.shape[0]
     covariance = np.linalg.inv(jacobian @ jacobian.T)
-    ones = np.ones(residual.size)
+    ones = jnp.ones(residual.size)
     return other_circuit.scores(
         jnp.asarray(rows),
-        jnp.asarray(jacobian),
+        Linear(jnp.asarray(jacobian), ones, ones),
         jnp.asarray(residual),
         jnp.zeros(q),
         jnp.zeros((q, q)),
         jnp.asarray(covariance),
-        jnp.asarray(ones),
-        jnp.asarray(ones),
         slice(q),
     )
 

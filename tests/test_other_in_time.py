@@ -25,6 +25,7 @@ from etid.estimators.output_error.prediction import (
 )
 from etid.estimators.score_tests.other_circuit import GRID, relaxations
 from etid.estimators.score_tests.other_in_time import HIGHEST, relaxed, score
+from etid.estimators.unknowns import Nuisance
 from etid.results.driver import SourceImpedance
 from etid.signals.measurement import Measurement
 from etid.simulation.scenes import Trial
@@ -48,7 +49,7 @@ def test_slopes_are_those_of_a_load_with_one_more_relaxation():
     """The load as a whole, its relaxation a resistor and a capacitor, made a little larger."""
     of, step = records(), 1e-6
     impedance = SKIN.impedance()
-    found = jax.jit(relaxed)(of, SOURCE, impedance, jnp.zeros(4))
+    found = jax.jit(relaxed)(of, SOURCE, impedance, Nuisance.of(jnp.zeros(4)))
     corner, level = relaxations(impedance, RATE / of.intervals, jnp.asarray(HIGHEST))
 
     @jax.jit
@@ -56,7 +57,7 @@ def test_slopes_are_those_of_a_load_with_one_more_relaxation():
     def whole(corner, r):
         more = series(impedance, parallel(resistor(r), capacitor(1 / (corner * r))))
         system = loaded_filter(SOURCE, more.rational(), of.sample_rate)
-        return predict(system, of, jnp.zeros(5)), impulse_response(system)
+        return predict(system, of, Nuisance.of(jnp.zeros(5))), impulse_response(system)
 
     sides = zip(whole(corner, step * level), whole(corner, -step * level), strict=True)
     for side, (high, low) in zip((found.v_out, found.h), sides, strict=True):
@@ -69,7 +70,7 @@ def test_a_load_without_states_relaxes_too():
     """A resistor; its source is one as well: V_out = R_L / (R_L + R), and i = V_th / (R_L + R)."""
     of = records()
     source = eqx.tree_at(lambda z: z.gain_real, SOURCE, jnp.zeros(1))
-    found = jax.jit(relaxed)(of, source, resistor(20e3), jnp.zeros(3))
+    found = jax.jit(relaxed)(of, source, resistor(20e3), Nuisance.of(jnp.zeros(3)))
     still = relaxations(resistor(20e3), RATE / of.intervals, jnp.asarray(HIGHEST))
     assert found.v_out.shape == (of.hold.shape[0], GRID)
     # The fastest follows a slow pulse: ∂V_out/∂ε = R_L R / (R_L + R)² V_th, R_L being its level,

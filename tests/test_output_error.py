@@ -14,10 +14,8 @@ from etid.circuits.elements import resistor
 from etid.estimators.estimate import DELAY_WIDTH, KNOWN_DELAY, delay_std
 from etid.estimators.output_error.fit import fit_source
 from etid.estimators.output_error.information import (
-    Curvature,
     Slopes,
     curvature,
-    eliminate,
     inverse,
 )
 from etid.estimators.output_error.prediction import (
@@ -27,6 +25,7 @@ from etid.estimators.output_error.prediction import (
     measured_impulse,
     prepare,
 )
+from etid.estimators.sandwich import Curvature
 from etid.identify import lanes
 from etid.recordings.preflight import Inspected
 from etid.results.driver import SourceImpedance
@@ -114,7 +113,7 @@ def test_nuisances_are_projected_out():
     rng = np.random.default_rng(4)
     j, noise = rng.normal(size=(40, 5)), rng.uniform(1, 2, 40)
     of = Curvature(jnp.asarray(j.T @ j), jnp.asarray((j.T * noise) @ j))
-    found = eliminate(of, 2)
+    found = of.eliminate(2)
     full = np.linalg.inv(j.T @ j)
     np.testing.assert_allclose(np.linalg.inv(found.expected), full[:2, :2], rtol=1e-9)
     sandwich = full @ ((j.T * noise) @ j) @ full

@@ -24,8 +24,10 @@ from etid.estimators.maximum_likelihood.terms import (
     stands_out,
     variance,
 )
+from etid.estimators.sandwich import Linear
 from etid.estimators.score_tests import other_circuit
 from etid.estimators.score_tests.unloaded import UnloadedShape
+from etid.estimators.unknowns import LoadUnknowns
 from etid.results.driver import ContinuousDriver, DiscreteDriver, Driver
 from etid.results.fits import Fit
 from etid.results.verdicts import RESULTS, first_verdict
@@ -109,32 +111,35 @@ def skin_by_harmonic_steiglitz_mcbride(
         known: The unloaded voltage of its calibration, if it can be compared.
     """
     source, source_cov = driver.source, driver.later_cov()
-    best = harmonic_steiglitz_mcbride.fit_skin(spectrum, source.response(spectrum.frequency))
-    values = best.circuit.values()
-    late = best.delay * sample_rate
+    z_th = source.response(spectrum.frequency)
+    best = harmonic_steiglitz_mcbride.fit_skin(spectrum, z_th, sample_rate)
+    values, late = best.circuit.values(), best.delay_samples
     physical = jnp.isfinite(best.rrse)  # or else any likelihood will do
     elements = jnp.where(physical, values, SkinRC().values())
 
     def terms(q, spectrum):
-        load = best.circuit.with_log_values(q[:-1]).impedance()
-        delay = q[-1] / sample_rate
-        return residual(spectrum, delayed_gain(source, load, spectrum.frequency, delay))
+        of, f = LoadUnknowns.of(q), spectrum.frequency
+        load = best.circuit.with_log_values(of.log_elements).impedance()
+        return residual(spectrum, delayed_gain(source, load, f, of.delay_samples, sample_rate))
 
-    at = jnp.append(jnp.log(elements), late)
+    own = LoadUnknowns(jnp.log(elements), late)
+    at = own.vector()
     equations = normal_equations(terms, at, spectrum)
     freedom = 2 * jnp.sum(spectrum.selected, dtype=values.dtype) - values.size
     chi2 = 2 * equations.objective / freedom
     noise = excess(terms(at, spectrum), spectrum.selected)[: spectrum.x.size]
     everywhere = eqx.tree_at(lambda s: s.selected, spectrum, jnp.ones_like(spectrum.selected))
     square = jnp.sum(terms(at, everywhere).reshape(2, -1) ** 2, 0) / 2
-    own, shared = harmonic_steiglitz_mcbride.covariance(spectrum, noise, source, source_cov, best)
-    errors = jnp.diagonal(own + shared)  # of the logarithms, squared
-    fitted = best.circuit.with_log_values(at[:-1])
-    other = _is_another(spectrum, noise, at, sample_rate, fitted, driver)
+    private, shared = harmonic_steiglitz_mcbride.covariance(
+        spectrum, noise, source, source_cov, sample_rate, best
+    )
+    errors = jnp.diagonal(private + shared)  # of the logarithms, squared
+    fitted = best.circuit.with_log_values(own.log_elements)
+    other = _is_another(spectrum, noise, own, sample_rate, fitted, driver)
     changed = jnp.array(False) if known is None else known.differs(spectrum)
     return Fit(
         circuit=best.circuit,
-        cov=(own + shared) * jnp.outer(values, values),
+        cov=(private + shared) * jnp.outer(values, values),
         shared_cov=shared * jnp.outer(values, values),
         rrse=best.rrse,
         chi2=jnp.where(physical, chi2, jnp.inf),
@@ -158,7 +163,7 @@ def skin_by_harmonic_steiglitz_mcbride(
 def _is_another(
     spectrum: Spectrum,
     noise: Float[Array, " harmonic"],
-    own: Float[Array, " own"],
+    own: LoadUnknowns,
     sample_rate: Float[Array, ""],
     circuit: SkinRC,
     driver: ContinuousDriver,
@@ -168,12 +173,12 @@ def _is_another(
     Args:
         spectrum: The recording.
         noise: Variance of its noise in units of what it says.
-        own: Logarithms of the elements, and the delay in samples.
+        own: What was unknown.
         sample_rate: Its sampling rate [Hz].
         circuit: The circuit.
         driver: Its driver.
     """
-    f, elements = spectrum.frequency, own.size - 1
+    f, elements = spectrum.frequency, own.log_elements.size
     s = frequency_variable(f)
     vector, unflatten = ravel_pytree(driver.source)
     deviations = root(driver.cov).T
@@ -189,17 +194,17 @@ def _is_another(
         z_th = unflatten(vector).response(f)
         z, changes = other_circuit.changes(circuit.impedance(), f)
         total = reciprocal(z + z_th)
-        g = z * total * turns(-f[0] * own[-1] / sample_rate, f.size)
+        g = z * total * turns(-f[0] * own.delay_samples / sample_rate, f.size)
         by_load = g * z_th * total * reciprocal(z)
         by_source = along(lambda p: unflatten(p).response(f), vector, deviations)
         by_own = [
-            by_load[None, :] * along(load, own[:-1], jnp.eye(elements)),
+            by_load[None, :] * along(load, own.log_elements, jnp.eye(elements)),
             (-g * s * as_complex(1 / sample_rate))[None, :],
         ]
         slopes = [*by_own, (-g * total)[None, :] * by_source, by_load[None, :] * changes]
         return g, jnp.concatenate(slopes)
 
-    g, slopes = apart(of_gain, own)
+    g, slopes = apart(of_gain, own.vector())
 
     def of_residual(_):
         # At the X that both records tell: the noise of that of one is in the residual as well.
@@ -208,19 +213,17 @@ def _is_another(
         rows = slopes * (-clean.x * as_complex(weight))[None, :]
         return jnp.concatenate([rows.real, rows.imag], axis=1), share
 
-    rows, share = apart(of_residual, own)
-    count = own.size + vector.size
-    jacobian = rows[:count]
-    prior = jnp.diag(jnp.pad(jnp.ones(vector.size), (own.size, 0)))
+    rows, share = apart(of_residual, own.vector())
+    count = elements + 1 + vector.size
+    prior = jnp.diag(jnp.pad(jnp.ones(vector.size), (elements + 1, 0)))
+    linear = Linear(rows[:count], share, jnp.tile(noise, 2), prior)
     return other_circuit.scores(
         rows[count:],
-        jacobian,
+        linear,
         residual(spectrum, g),
         jnp.zeros(count),
         prior,
-        inverse((jacobian * share[None, :]) @ jacobian.T + prior),
-        share,
-        jnp.tile(noise, 2),
+        linear.bread(),
         slice(elements),
     ).seen()
 

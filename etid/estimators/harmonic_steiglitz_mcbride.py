@@ -57,7 +57,7 @@ class Iterate(eqx.Module):
 
     Attributes:
         circuit: Its elements, whatever their sign.
-        delay: Trigger delay of V_out [s].
+        delay_samples: Trigger delay of V_out [samples].
         rrse: Of the harmonics of V_out it predicts; infinite if an element is not positive.
         iteration: At which it was found.
         converged: Whether the *last* iterations settled.
@@ -65,7 +65,7 @@ class Iterate(eqx.Module):
     """
 
     circuit: SkinRC
-    delay: Float[Array, ""]
+    delay_samples: Float[Array, ""]
     rrse: Float[Array, ""]
     iteration: Int[Array, ""]
     converged: Bool[Array, ""]
@@ -140,13 +140,17 @@ def _elements(q: Float[Array, " coefficient"]) -> SkinRC:
 
 
 def fit_skin(
-    spectrum: Spectrum, z_th: Complex[Array, " harmonic"], iterations: int = ITERATIONS
+    spectrum: Spectrum,
+    z_th: Complex[Array, " harmonic"],
+    sample_rate: Float[Array, ""],
+    iterations: int = ITERATIONS,
 ) -> Iterate:
     """Identify the continuous first-order Z_bio and a delay from harmonics (paper, eqs. 7-9).
 
     Args:
         spectrum: Harmonics of a recording.
         z_th: Source impedance at them [Ω].
+        sample_rate: Sampling rate of the recording [Hz].
         iterations: How many.
     """
     of = _products(spectrum, z_th)
@@ -164,7 +168,7 @@ def fit_skin(
         error = complex_rrse(jnp.where(used, predicted, 0.0), measured)
         error = jnp.where((circuit.values() > 0).all() & jnp.isfinite(error), error, jnp.inf)
         converged = jnp.abs(q - previous)[2:].max() < SETTLED * jnp.abs(a1)
-        current = Iterate(circuit, tau / RATE, error, iteration, converged, a1 > 0)
+        current = Iterate(circuit, tau / RATE * sample_rate, error, iteration, converged, a1 > 0)
         # As long as none is a circuit, the latest is the best there is.
         better = (error < best.rrse) | ~jnp.isfinite(best.rrse)
         best = jax.tree.map(lambda new, old: jnp.where(better, new, old), current, best)
@@ -187,6 +191,7 @@ def covariance(
     noise: Float[Array, " harmonic"],
     source: SourceImpedance,
     source_cov: Float[Array, "parameter parameter"],
+    sample_rate: Float[Array, ""],
     best: Iterate,
 ) -> tuple[Float[Array, "element element"], Float[Array, "element element"]]:
     """Covariance of the logarithms of the elements, to first order in the noise.
@@ -196,6 +201,7 @@ def covariance(
         noise: Variance of its noise in units of what it says.
         source: Source impedance with which it was identified.
         source_cov: Covariance of its flattened parameters.
+        sample_rate: Sampling rate of the recording [Hz].
         best: The estimate, settled.
 
     Returns:
@@ -203,7 +209,8 @@ def covariance(
     """
     of = best.circuit
     a1 = RATE * of.r_p * of.c_p
-    q = jnp.stack([of.r_s + of.r_p, of.r_s * a1, a1, RATE * best.delay])
+    delay = best.delay_samples / sample_rate
+    q = jnp.stack([of.r_s + of.r_p, of.r_s * a1, a1, RATE * delay])
     parameters, unflatten = ravel_pytree(source)
 
     def following(q, x, y, parameters):

@@ -24,6 +24,7 @@ from jaxtyping import Array, Bool, Complex, Float
 from etid.circuits.circuit import AbstractCircuit
 from etid.estimators.estimate import DELAY_WIDTH, MAX_STEPS, SOLVER, Estimate
 from etid.estimators.maximum_likelihood.terms import as_list, excess, same_unloaded, stands_out
+from etid.estimators.unknowns import LoadUnknowns
 from etid.results.driver import HarmonicDriver
 from etid.results.fits import complex_rrse
 from etid.signals.harmonics import Spectrum, signal_share
@@ -68,7 +69,7 @@ class _Measured(eqx.Module):
 
 
 class _Model(eqx.Module):
-    """The terms of the calibrations and, last, a load; parameters are elements and delays."""
+    """The terms of the calibrations and, last, a load."""
 
     circuit: AbstractCircuit
     r_load: Float[Array, " calibration"]
@@ -77,18 +78,24 @@ class _Model(eqx.Module):
     clear: Bool[Array, "calibration harmonic"]
     selected: Bool[Array, " harmonic"]
 
+    def named(self, q: Float[Array, " q"]) -> tuple[LoadUnknowns, Float[Array, " calibration"]]:
+        """What is unknown of the load, and the delays of the calibrations [samples]."""
+        last = q.size - 1
+        elements, late, delay = jnp.split(q, (last - self.r_load.size, last))
+        return LoadUnknowns(elements, delay[0]), late
+
     def load(self, q: Float[Array, " q"], frequency: Float[Array, " harmonic"]):
         """Z_L."""
-        elements = q[: q.size - self.r_load.size - 1]
-        load = self.circuit.with_log_values(elements).impedance()
+        load = self.circuit.with_log_values(self.named(q)[0].log_elements).impedance()
         return load(frequency_variable(frequency))
 
     def z_th(self, q: Float[Array, " q"], records: list[Spectrum]) -> _Measured:
         """Mean of what the calibrations say, by their variances."""
         z, by_x, by_y, weights = [], [], [], []
-        late = q[-self.r_load.size - 1 : -1]
+        _, late = self.named(q)
         for r, delay, s, clear in zip(self.r_load, late, records[:-1], self.clear, strict=True):
-            inverse_y = reciprocal(delayed(s.y, s.frequency, -delay / self.calibration_rate))
+            y = delayed(s.y, s.frequency, -delay, self.calibration_rate)
+            inverse_y = reciprocal(y)
             slope = as_complex(r) * inverse_y
             one = slope * s.x - as_complex(r)
             variance = power(slope * s.x * inverse_y) * s.variance_y
@@ -124,7 +131,8 @@ class _Model(eqx.Module):
 
     def _in_time(self, q, records):
         spectrum = records[-1]
-        return delayed(spectrum.y, spectrum.frequency, -q[-1] / self.sample_rate)
+        late = self.named(q)[0].delay_samples
+        return delayed(spectrum.y, spectrum.frequency, -late, self.sample_rate)
 
     def terms(self, q: Float[Array, " q"], records: list[Spectrum]) -> Float[Array, " term"]:
         """Scaled e, the weak priors of the delays, and what calibrations say of each other's."""
@@ -133,7 +141,9 @@ class _Model(eqx.Module):
         variance, _ = self._variance(q, records, y, of)
         weight = jnp.where(self.selected, jnp.sqrt(2 / variance), 0.0)
         e = ((load + of.z) * y - load * records[-1].x) * as_complex(weight)
-        parts = [e.real, e.imag, q[-self.r_load.size - 1 :] / DELAY_WIDTH]
+        own, late = self.named(q)
+        delays = jnp.append(late, own.delay_samples) / DELAY_WIDTH
+        parts = [e.real, e.imag, delays]
         if len(of.apart) > 1:
             apart = jnp.where(self.selected[None, :], jnp.stack(of.apart), 0.0).ravel()
             parts += [apart.real, apart.imag]
@@ -151,7 +161,8 @@ class _Model(eqx.Module):
         spectrum, of = records[-1], self.z_th(q, records)
         load = self.load(q, spectrum.frequency)
         g = load * reciprocal(load + of.z)
-        y = delayed(g * spectrum.x, spectrum.frequency, q[-1] / self.sample_rate)
+        late = self.named(q)[0].delay_samples
+        y = delayed(g * spectrum.x, spectrum.frequency, late, self.sample_rate)
         return [*records[:-1], eqx.tree_at(lambda s: s.y, spectrum, y)]
 
     def private(self, q: Float[Array, " q"], records: list[Spectrum]) -> Float[Array, " harmonic"]:
@@ -166,7 +177,7 @@ def fit_circuit(
     driver: HarmonicDriver,
     spectrum: Spectrum,
     sample_rate: Float[Array, ""],
-    candidates: Float[Array, "start own"],
+    candidates: LoadUnknowns,
 ) -> tuple[Estimate, Float[Array, " element"]]:
     """Identify the load of one recording by the harmonics of the calibrations of its driver.
 
@@ -175,15 +186,14 @@ def fit_circuit(
         driver: Its driver, whose calibrations have the same pulse rate.
         spectrum: The recording.
         sample_rate: Its sampling rate [Hz].
-        candidates: Logarithms of elements, and delays in samples, to start from; the start that
-            predicts best is refined.
+        candidates: To start from, stacked; the start that predicts best is refined.
 
     Returns:
         The estimate, whose parameters are the logarithms of the elements, and the bias that has
         been subtracted from them.
     """
     calibration, calibration_rate = driver.calibration, jnp.asarray(driver.sample_rate)
-    known, elements = as_list(driver.spectra), candidates.shape[1] - 1
+    known, elements = as_list(driver.spectra), candidates.log_elements.shape[1]
     count = min(spectrum.x.size, known[0].x.size)
     records = [jax.tree.map(lambda leaf: leaf[:count], s) for s in (*known, spectrum)]
     clear = _clear(records[:-1])
@@ -191,8 +201,10 @@ def fit_circuit(
     model = _Model(circuit, calibration.r_load, calibration_rate, sample_rate, clear, selected)
 
     late = calibration.delay_samples
-    late = jnp.broadcast_to(late, (candidates.shape[0], late.size))
-    starts = jnp.concatenate([candidates[:, :-1], late, candidates[:, -1:]], axis=1)
+    late = jnp.broadcast_to(late, (candidates.delay_samples.size, late.size))
+    starts = jnp.concatenate(
+        [candidates.log_elements, late, candidates.delay_samples[:, None]], axis=1
+    )
     best = best_start(lambda q: model.terms(q, records), starts)
 
     def solve(records, start):
@@ -218,7 +230,7 @@ def fit_circuit(
     shared = (by_term * ((1 - weights) * noise)[None, :]) @ by_term.T
     estimate = Estimate(
         parameters=(q - bias)[:elements],
-        delay_samples=q[-1:],
+        delay_samples=model.named(q)[0].delay_samples[None],
         cov=own_cov + shared,
         shared_cov=shared,
         chi2=chi2,

@@ -28,6 +28,7 @@ from etid.estimators.output_error import fit as output_error
 from etid.estimators.output_error import prediction
 from etid.estimators.score_tests import missing_pole, resistors
 from etid.estimators.score_tests.unloaded import UnloadedShape
+from etid.estimators.unknowns import LoadUnknowns
 from etid.results.driver import ContinuousDriver, Driver, HarmonicDriver, SourceImpedance
 from etid.results.fits import Fit
 from etid.results.verdicts import RESULTS, first_verdict
@@ -98,8 +99,8 @@ def harmonic_starts(
     sample_rate: Float[Array, ""],
     z_th: Complex[Array, " harmonic"],
     circuit: AbstractCircuit,
-) -> Float[Array, "start own"]:
-    """Logarithms of elements, and delays in samples, from which a fit on harmonics may start.
+) -> LoadUnknowns:
+    """Where a fit on harmonics may start, stacked; the likeliest comes last.
 
     Args:
         spectrum: One recording.
@@ -108,11 +109,11 @@ def harmonic_starts(
         circuit: Structure and typical values.
     """
     if not isinstance(circuit, SkinRC):
-        return jnp.pad(circuit_starts(circuit, None), ((0, 0), (0, 1)))
-    baseline = harmonic_steiglitz_mcbride.fit_skin(spectrum, z_th, START_STEPS)
+        starts = circuit_starts(circuit, None)
+        return LoadUnknowns(starts, jnp.zeros(starts.shape[0]))
+    baseline = harmonic_steiglitz_mcbride.fit_skin(spectrum, z_th, sample_rate, START_STEPS)
     starts = circuit_starts(circuit, baseline.circuit)
-    delays = jnp.zeros(starts.shape[0]).at[-1].set(baseline.delay * sample_rate)
-    return jnp.concatenate([starts, delays[:, None]], axis=1)
+    return LoadUnknowns(starts, jnp.zeros(starts.shape[0]).at[-1].set(baseline.delay_samples))
 
 
 def skin_by_maximum_likelihood(

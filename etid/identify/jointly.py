@@ -104,14 +104,15 @@ def _together(
         fit = judgement.judged(with_scale, model.circuit, driver.result, METHOD)
         return judgement.unless(fit, other, RESULTS.misfit)
 
-    split = model.calibrations.sources
+    of_driver = model.calibrations.named(common)
+    kept = of_driver.source.size
     better = eqx.tree_at(
         lambda d: (d.source, d.cov, d.calibration.delay_samples, d.result),
         driver,
         (
             model.calibrations.z_th(common),
-            cov[:split, :split],
-            common[split:],
+            cov[:kept, :kept],
+            of_driver.delay_samples,
             RESULTS.where(
                 found[0][0].strain[0] > judgement.STRAINED, RESULTS.inconsistent, driver.result
             ),
@@ -149,7 +150,7 @@ class _Waiting:
             return
         first = len(self.rows) - len(self.lanes)
         loads, hum, changed = self._alone(self.lanes)
-        late = loads.own[:, -1]
+        late = loads.own.delay_samples
         late = np.where(np.abs(late) > 1, np.round(late), 0)  # more than a fit allows for
         if np.any(late) and np.isfinite(late).all():
             for number, delay in enumerate(late.astype(int)):

@@ -116,10 +116,13 @@ def frequency_variable(frequency: Float[Array, "..."]) -> Complex[Array, "..."]:
 
 
 def delayed(
-    value: Complex[Array, "..."], frequency: Float[Array, "..."], delay: Float[Array, ""]
+    value: Complex[Array, "..."],
+    frequency: Float[Array, "..."],
+    delay_samples: Float[Array, ""],
+    sample_rate: Float[Array, ""],
 ) -> Complex[Array, "..."]:
-    """`value` · e^(−j 2π f τ) at real frequencies [Hz], for a delay τ [s]."""
-    turn = -2 * jnp.pi * frequency * delay
+    """`value` · e^(−j 2π f τ) at real frequencies [Hz], for a delay τ in samples."""
+    turn = -2 * jnp.pi * frequency * (delay_samples / sample_rate)
     return value * jax.lax.complex(jnp.cos(turn), jnp.sin(turn))
 
 

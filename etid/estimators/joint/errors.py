@@ -24,12 +24,12 @@ from etid.estimators.maximum_likelihood.terms import (
     denoised,
     excess,
     residual,
-    residuals,
     variance,
     weights,
 )
-from etid.estimators.output_error.information import Curvature, eliminate
+from etid.estimators.sandwich import Curvature, Linear
 from etid.estimators.score_tests import other_circuit
+from etid.estimators.unknowns import LoadUnknowns
 from etid.results.fits import complex_rrse
 from etid.signals.transfer import reciprocal
 from etid.solvers.matrices import inverse
@@ -51,30 +51,18 @@ class _Eliminated(eqx.Module):
     bread: Float[Array, "own own"]
 
 
-def _curvature(
-    jacobian: Float[Array, "term n"],
-    shares: Sequence[Float[Array, "_"]],
-    noise: Sequence[Float[Array, "_"]],
-) -> Curvature:
-    """H and Jᵀ C J of `likelihood.denoised` and `likelihood.excess`, at denoised records."""
-    weight, excess = (weights(of, jacobian.shape[0]) for of in (shares, noise))
-    return Curvature(
-        (jacobian.T * weight[None, :]) @ jacobian, (jacobian.T * excess[None, :]) @ jacobian
-    )
-
-
 def _without_own(of: Curvature, common: int) -> _Eliminated:
     """Eliminate a load's own parameters, which come after the `common` ones."""
     bread = inverse(of.expected[common:, common:])
     slope = -bread @ of.expected[common:, :common]
     cov = bread @ of.score[common:, common:] @ bread
-    return _Eliminated(eliminate(of, common), cov, slope, bread)
+    return _Eliminated(of.eliminate(common), cov, slope, bread)
 
 
 def estimates(
     study: DriverStudy,
     common: Float[Array, " common"],
-    fitted: Sequence[tuple[Float[Array, "load own"], optx.RESULTS]],
+    fitted: Sequence[tuple[LoadUnknowns, optx.RESULTS]],
     several: Sequence[int],
     solution: optx.Solution,
 ) -> tuple[Float[Array, "common common"], list[tuple[Estimate, Bool[Array, " load"]]]]:
@@ -85,7 +73,7 @@ def estimates(
     Args:
         study: Calibrations and loads.
         common: Common parameters at the minimum.
-        fitted: Own parameters of each group at the minimum, and how their solvers ended.
+        fitted: What was unknown of the loads of each group, and how their solvers ended.
         several: In each group, how many unloaded records several loads have.
         solution: How the joint solver ended.
     """
@@ -95,11 +83,7 @@ def estimates(
         over(lambda load, own: _eliminated(study, load, common, own), loads, own)
         for loads, own in zip(groups, owns, strict=True)
     ]
-    clean, shares = denoised(model.calibrations.records, model.calibrations.gains(common))
-    parts = residuals(model.calibrations.records, model.calibrations.gains(common))
-    noise = [excess(r, s.selected) for r, s in zip(parts, model.calibrations.records, strict=True)]
-    jacobian = jax.jacfwd(lambda c: model.calibrations.terms(c, clean))(common)
-    total = _curvature(jacobian, shares, noise)
+    total = model.calibrations.linear(common).curvature()
     for loads, eliminated in zip(groups, found, strict=True):
         used = jax.tree.map(
             lambda leaf, loads=loads: jnp.where(loads.used[:, None, None], leaf, 0.0).sum(0),
@@ -129,10 +113,10 @@ def estimates(
                 private = private - by_x
             whole = private + shared
             estimate = Estimate(
-                parameters=own[:-1],
-                delay_samples=own[-1:],
-                cov=whole[:-1, :-1],
-                shared_cov=shared[:-1, :-1],
+                parameters=own.log_elements,
+                delay_samples=own.delay_samples[None],
+                cov=_of_elements(whole),
+                shared_cov=_of_elements(shared),
                 chi2=chi2,
                 rrse=rrse,
                 result=optx.RESULTS.where(
@@ -147,10 +131,20 @@ def estimates(
     return cov, judged
 
 
+def _of_elements(cov: Float[Array, "own own"]) -> Float[Array, "element element"]:
+    """Covariance of the elements alone, without the delay."""
+    return LoadUnknowns.of(LoadUnknowns.of(cov).log_elements.T).log_elements
+
+
+def _residual(study: DriverStudy, load: Loads, common, own) -> Float[Array, " part"]:
+    """Residual of a load, without the prior of its delay."""
+    return study.of_load(load, common, own)[: 2 * load.spectrum.x.size]
+
+
 def _misfit(study: DriverStudy, load: Loads, common, own):
     """χ² and RRSE of a load."""
-    squares = jnp.sum(study.of_load(load, common, own)[:-1] ** 2)
-    freedom = 2 * jnp.sum(load.spectrum.selected, dtype=own.dtype) - own.shape[0]
+    squares = jnp.sum(_residual(study, load, common, own) ** 2)
+    freedom = 2 * jnp.sum(load.spectrum.selected, dtype=squares.dtype) - study.owned
     g = study.model.gain(own, common, load.spectrum, load.sample_rate)
     return squares / freedom, complex_rrse(
         g * load.spectrum.x, load.spectrum.y, load.spectrum.selected
@@ -161,10 +155,9 @@ def _is_another(
     study: DriverStudy, load: Loads, common, own, eliminated: _Eliminated, bread, score
 ) -> Bool[Array, ""]:
     """The score test on one load; `bread` and `score` are those of `common` by all terms."""
-    jacobian, share = _jacobian(study, load, common, own)
+    linear = _linear(study, load, common, own)
     rows = _by_changes(study, load, common, own)
     terms = study.of_load(load, common, own)
-    noise = excess(terms[:-1], load.spectrum.selected)
     slope = eliminated.slope
     covariance = jnp.block(
         [
@@ -175,14 +168,12 @@ def _is_another(
     spread = jnp.zeros_like(covariance).at[: bread.shape[0], : bread.shape[0]]
     found = other_circuit.scores(
         jnp.pad(rows, ((0, 0), (0, 1))),  # no change has an effect on the prior of the delay
-        jacobian.T,
+        linear,
         terms,
-        -jacobian.T @ terms,  # at the minimum all other terms have the opposite gradient
+        -linear.jacobian @ terms,  # at the minimum all other terms have the opposite gradient
         spread.set(score - eliminated.rest.score),
         covariance,
-        weights([share], terms.size),
-        weights([noise], terms.size),
-        slice(common.size, common.size + own.size - 1),
+        slice(common.size, common.size + own.log_elements.size),
     )
     return found.seen() & load.used  # what takes no part has a verdict of its own
 
@@ -191,7 +182,9 @@ def _by_changes(study: DriverStudy, load: Loads, common, own) -> Float[Array, "c
     """Derivatives of a load's denoised terms by the changes of its circuit."""
     model, f = study.model, load.spectrum.frequency
     g = model.gain(own, common, load.spectrum, load.sample_rate)
-    z, changes = other_circuit.changes(model.circuit.with_log_values(own[:-1]).impedance(), f)
+    z, changes = other_circuit.changes(
+        model.circuit.with_log_values(own.log_elements).impedance(), f
+    )
     z_th = model.calibrations.z_th(common).response(f)
     by_z = g * z_th * reciprocal(z * (z + z_th))
     gains = [*model.calibrations.gains(common), g]
@@ -204,24 +197,26 @@ def _by_changes(study: DriverStudy, load: Loads, common, own) -> Float[Array, "c
     return jax.lax.map(row, changes)
 
 
-def _jacobian(study: DriverStudy, load: Loads, common, own):
-    """Derivatives of a load's denoised terms by (common, own), and the shares of signal."""
+def _linear(study: DriverStudy, load: Loads, common, own) -> Linear:
+    """A load's terms around their minimum, by (common, own)."""
     model, c = study.model, common.shape[0]
     gains = [
         *model.calibrations.gains(common),
         model.gain(own, common, load.spectrum, load.sample_rate),
     ]
     (*known, spectrum), shares = denoised([*model.calibrations.records, load.spectrum], gains)
-    jacobian = jax.jacfwd(lambda q: model.of_load(q[c:], q[:c], spectrum, load.sample_rate, known))(
-        jnp.concatenate([common, own])
-    )
-    return jacobian, shares[-1]
+
+    def terms(q):
+        return model.of_load(LoadUnknowns.of(q[c:]), q[:c], spectrum, load.sample_rate, known)
+
+    jacobian = jax.jacfwd(terms)(jnp.concatenate([common, own.vector()]))
+    noise = excess(_residual(study, load, common, own), load.spectrum.selected)
+    count = jacobian.shape[0]
+    return Linear(jacobian.T, weights(shares[-1:], count), weights([noise], count))
 
 
 def _eliminated(study: DriverStudy, load: Loads, common, own) -> _Eliminated:
-    jacobian, share = _jacobian(study, load, common, own)
-    noise = excess(study.of_load(load, common, own)[:-1], load.spectrum.selected)
-    return _without_own(_curvature(jacobian, [share], [noise]), common.shape[0])
+    return _without_own(_linear(study, load, common, own).curvature(), common.shape[0])
 
 
 # --- Loads with one unloaded record --------------------------------------------------------------
@@ -233,7 +228,7 @@ def _eliminated(study: DriverStudy, load: Loads, common, own) -> _Eliminated:
 
 def _influence(study: DriverStudy, common, load: Loads, own, eliminated: _Eliminated):
     """What unit noise in the parts of X adds to the score of `common`, and to the load's own."""
-    jacobian, _ = _jacobian(study, load, common, own)
+    jacobian = _linear(study, load, common, own).jacobian.T
     known = study.model.informed(load.spectrum, common, study.model.calibrations.records)
     g = study.model.gain(own, common, load.spectrum, load.sample_rate)
     size = jnp.where(known.selected, jnp.sqrt(known.variance_x / variance(known, g)), 0.0)

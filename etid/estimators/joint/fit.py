@@ -19,6 +19,7 @@ from etid.estimators.joint.terms import DriverStudy, Loads, over
 from etid.estimators.maximum_likelihood.driver import Joint
 from etid.estimators.maximum_likelihood.given_driver import GivenDriver, around
 from etid.estimators.maximum_likelihood.load import Load
+from etid.estimators.unknowns import LoadUnknowns
 from etid.solvers.arrowhead import Arrowhead, ArrowheadEquations, EliminationDescent, join
 from etid.solvers.levenberg_marquardt import (
     DIFFERENCE,
@@ -62,9 +63,10 @@ def _equations(_, y: Float[Array, " parameter"], study: DriverStudy) -> Arrowhea
 
         def one(load, own):
             lane = _lane(study, driver, load)
-            part, jacobian = lane.jacobian(jnp.concatenate([own, driver.mean]))
-            late = own[-1] / DELAY_WIDTH
-            slope = jnp.zeros(jacobian.shape[0]).at[own.size - 1].set(1 / DELAY_WIDTH)
+            part, jacobian = lane.jacobian(jnp.concatenate([own.vector(), driver.mean]))
+            late = own.delay_samples / DELAY_WIDTH
+            slope = LoadUnknowns(jnp.zeros_like(own.log_elements), jnp.asarray(1 / DELAY_WIDTH))
+            slope = jnp.concatenate([slope.vector(), jnp.zeros_like(driver.mean)])
             found = NormalEquations(
                 0.5 * (jnp.dot(part, part) + late**2),
                 jacobian @ part + late * slope,
@@ -77,7 +79,7 @@ def _equations(_, y: Float[Array, " parameter"], study: DriverStudy) -> Arrowhea
     found = [of_group(*group) for group in zip(study.groups, parts, strict=True)]
     loads = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *found)
     known = normal_equations(lambda q, _: study.of_calibrations(q), common)
-    o = parts[0].shape[1]
+    o = study.owned
     return ArrowheadEquations(
         known.objective + loads.objective.sum(),
         join(known.gradient + loads.gradient[:, o:].sum(0), loads.gradient[:, :o]),
@@ -107,6 +109,7 @@ def _second_order(_, y, step, study: DriverStudy) -> Float[Array, " parameter"]:
 
         def one(load, own, step):
             lane = _lane(study, driver, load)
+            own, step = own.vector(), step.vector()
             _, jacobian = lane.jacobian(jnp.concatenate([own, driver.mean]))
             count = jacobian.shape[1]  # of the terms that are not linear
             bent = sum(_lane(study, end, load)(own + h * step)[:count] for h, end in ends)
@@ -116,7 +119,7 @@ def _second_order(_, y, step, study: DriverStudy) -> Float[Array, " parameter"]:
         return _in_turn(one, loads, owns, steps)
 
     found = [of_group(*group) for group in zip(study.groups, parts, steps, strict=True)]
-    loads, o = jnp.concatenate(found), parts[0].shape[1]
+    loads, o = jnp.concatenate(found), study.owned
     known = second_order(lambda q, _: study.of_calibrations(q), common, towards)
     return join(known + loads[:, o:].sum(0), loads[:, :o])
 
@@ -170,10 +173,10 @@ def fit(
 def _refit(study: DriverStudy, load: Loads, common, own):
     """A load at its minimum with this Z_th, and how its solver ended."""
     solution = optx.least_squares(
-        lambda own, _: study.of_load(load, common, own),
+        lambda q, _: study.of_load(load, common, LoadUnknowns.of(q)),
         SOLVER,
-        own,
+        own.vector(),
         max_steps=MAX_STEPS,
         throw=False,
     )
-    return solution.value, solution.result
+    return LoadUnknowns.of(solution.value), solution.result

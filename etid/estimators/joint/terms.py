@@ -14,6 +14,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from etid.estimators.maximum_likelihood.driver import Joint
+from etid.estimators.unknowns import LoadUnknowns
 from etid.signals.harmonics import Spectrum
 from etid.solvers.arrowhead import join, split
 
@@ -26,7 +27,7 @@ class Loads(eqx.Module):
     Attributes:
         spectrum: Their harmonics.
         sample_rate: Their sampling rates [Hz].
-        own: Elements (logarithms) and delay of each, identified alone.
+        own: What is unknown of each, as it was identified alone.
         used: Whether the recording takes part; the others are fitted, but tell nothing of Z_th.
         unloaded: Number of its unloaded record among those that several loads have; −1 if none has
             the same.
@@ -34,7 +35,7 @@ class Loads(eqx.Module):
 
     spectrum: Spectrum
     sample_rate: Float[Array, "*load"]
-    own: Float[Array, "*load own"]
+    own: LoadUnknowns
     used: Bool[Array, "*load"]
     unloaded: Int[Array, "*load"]
 
@@ -56,7 +57,7 @@ class DriverStudy(eqx.Module):
         return [self.of_calibrations(common), *loaded]
 
     def of_load(
-        self, load: Loads, common: Float[Array, " common"], own: Float[Array, " own"]
+        self, load: Loads, common: Float[Array, " common"], own: LoadUnknowns
     ) -> Float[Array, " term"]:
         """Terms of one load."""
         records = self.model.calibrations.records
@@ -68,17 +69,24 @@ class DriverStudy(eqx.Module):
 
     def start(self) -> Float[Array, " parameter"]:
         """The driver of the calibrations, and each load identified alone."""
-        own = jnp.concatenate([loads.own for loads in self.groups])
+        own = jnp.concatenate([loads.own.vector() for loads in self.groups])
         return join(self.model.calibrations.start(), own)
 
     def split(
         self, y: Float[Array, " parameter"]
-    ) -> tuple[Float[Array, " common"], list[Float[Array, "load own"]]]:
+    ) -> tuple[Float[Array, " common"], list[LoadUnknowns]]:
         """Common parameters, and the own ones of each group."""
-        counts = [loads.own.shape[0] for loads in self.groups]
-        common, own = split(y, sum(counts), self.groups[0].own.shape[1])
-        ends = list(itertools.accumulate(counts))
-        return common, jnp.split(own, ends[:-1])
+        counts = [loads.used.size for loads in self.groups]
+        common, own = split(y, sum(counts), self.owned)
+        ends = itertools.accumulate(counts)
+        return common, [
+            LoadUnknowns.of(own[end - count : end]) for end, count in zip(ends, counts, strict=True)
+        ]
+
+    @property
+    def owned(self) -> int:
+        """Number of own parameters of a load."""
+        return len(self.model.circuit.names()) + 1
 
 
 def over(one: Callable, *lanes: Any) -> Any:

@@ -6,6 +6,7 @@ calibration that one known resistor leaves open, is used. `etid.estimators.joint
 for many skins at once.
 """
 
+import dataclasses
 from collections.abc import Sequence
 
 import equinox as eqx
@@ -36,28 +37,15 @@ from etid.estimators.maximum_likelihood.terms import (
     shows_hum,
     weights,
 )
+from etid.estimators.sandwich import Linear
+from etid.estimators.unknowns import DriverUnknowns, LoadUnknowns
 from etid.results.driver import Calibration, HarmonicDriver, SourceImpedance
 from etid.results.fits import complex_rrse
 from etid.signals.harmonics import Spectrum
 from etid.solvers.levenberg_marquardt import LevenbergMarquardt, best_start
-from etid.solvers.matrices import inverse
 
 # Z_th and a delay bend each other's valley; a load alone has none.
 CURVED = LevenbergMarquardt(rtol=SOLVER.rtol, ftol=SOLVER.ftol, geodesic=True)
-
-
-def _gains(
-    spectra: Spectrum,
-    source: SourceImpedance,
-    r_load: Float[Array, " record"],
-    delay: Float[Array, " record"],
-    sample_rate: Float[Array, ""],
-) -> list[Complex[Array, " harmonic"]]:
-    """Delayed gains of all calibrations, for delays in samples."""
-    gains = jax.vmap(lambda f, r, d: delayed_gain(source, resistor(r), f, d))(
-        spectra.frequency, r_load, delay / sample_rate
-    )
-    return list(gains)
 
 
 def fit_source(
@@ -77,54 +65,36 @@ def fit_source(
     Returns:
         Z_th, the estimate, whose parameters are `start` flattened, and what its skins need.
     """
-    start_vector, unflatten = ravel_pytree(start)
-    kept, count = start_vector.shape[0], r_load.shape[0]
-    regularise = prior(start, sample_rate, r_load.mean())
-
-    def gains(q):
-        return _gains(spectra, unflatten(q[:kept]), r_load, q[kept:], sample_rate)
-
-    def of_all(q, records):
-        weak = [regularise(q[:kept]), q[kept:] / DELAY_WIDTH]
-        return jnp.concatenate(residuals(records, gains(q)) + weak)
-
-    records = as_list(spectra)
-    q0 = jnp.concatenate([start_vector, jnp.zeros(count)])
+    calibration = Calibration(r_load, jnp.zeros(r_load.shape), delay_std(r_load))
+    model = Calibrations(start, calibration, spectra, sample_rate)
     solution = optx.least_squares(
-        of_all, CURVED, q0, args=records, max_steps=MAX_STEPS, throw=False
+        model.terms, CURVED, model.start(), model.records, max_steps=MAX_STEPS, throw=False
     )
-    q = solution.value
-    clean, shares = denoised(records, gains(q))
-    jacobian = jax.jacfwd(of_all)(q, clean)
-    weight = weights(shares, jacobian.shape[0])
-    by_term = inverse((jacobian.T * weight[None, :]) @ jacobian) @ jacobian.T
-    freedom = 2 * jnp.sum(spectra.selected, dtype=q.dtype) - q.shape[0]
-    chi2 = 2 * solution.stats["normal_equations"].objective / freedom
-    parts = residuals(records, gains(q))
-    of_noise = [excess(r, s.selected) for r, s in zip(parts, records, strict=True)]
-    noise = weights(of_noise, by_term.shape[1])
-    cov = ((by_term * noise[None, :]) @ by_term.T)[:kept, :kept]
-    found = list(zip(records, gains(q), strict=True))
-    errors = jnp.stack([complex_rrse(g * s.x, s.y, s.selected) for s, g in found])
+    q, found = solution.value, model.named(solution.value)
+    kept = found.source.size
+    cov = model.linear(q).covariance()[:kept, :kept]
+    freedom = 2 * jnp.sum(spectra.selected, dtype=q.dtype) - q.size
+    seen = list(zip(model.records, model.gains(q), strict=True))
+    errors = jnp.stack([complex_rrse(g * s.x, s.y, s.selected) for s, g in seen])
     estimate = Estimate(
-        parameters=q[:kept],
-        delay_samples=q[kept:],
+        parameters=found.source,
+        delay_samples=found.delay_samples,
         cov=cov,
         shared_cov=jnp.zeros_like(cov),
-        chi2=chi2,
+        chi2=2 * solution.stats["normal_equations"].objective / freedom,
         rrse=errors.max(),
         result=solution.result,
         steps=solution.stats["num_steps"],
-        hum=jnp.stack([shows_hum(s, g) for s, g in found]).any(),
+        hum=jnp.stack([shows_hum(s, g) for s, g in seen]).any(),
     )
-    calibration = Calibration(r_load, q[kept:], delay_std(r_load))
-    return unflatten(q[:kept]), estimate, calibration
+    calibration = dataclasses.replace(calibration, delay_samples=found.delay_samples)
+    return model.z_th(q), estimate, calibration
 
 
 class Calibrations(eqx.Module):
     """The likelihood of the calibrations of a driver.
 
-    Everywhere `common` are the parameters of Z_th and the delays of the calibrations in samples.
+    Everywhere `common` are the `DriverUnknowns` as a vector.
 
     Attributes:
         source: Z_th as identified from the calibrations.
@@ -145,27 +115,32 @@ class Calibrations(eqx.Module):
         return cls(driver.source, driver.calibration, driver.spectra, rate)
 
     @property
-    def sources(self) -> int:
-        """Number of parameters of Z_th."""
-        return ravel_pytree(self.source)[0].shape[0]
-
-    @property
     def records(self) -> list[Spectrum]:
         """The calibrations one by one."""
         return as_list(self.spectra)
 
     def start(self) -> Float[Array, " common"]:
         """The common parameters as the calibrations alone have them."""
-        return jnp.concatenate([ravel_pytree(self.source)[0], self.calibration.delay_samples])
+        vector, _ = ravel_pytree(self.source)
+        return DriverUnknowns(vector, self.calibration.delay_samples).vector()
+
+    def named(self, common: Float[Array, " common"]) -> DriverUnknowns:
+        """The common parameters by name."""
+        return DriverUnknowns.of(common, self.calibration.r_load.size)
 
     def z_th(self, common: Float[Array, " common"]) -> SourceImpedance:
         """Z_th of the common parameters."""
-        return ravel_pytree(self.source)[1](common[: self.sources])
+        return ravel_pytree(self.source)[1](self.named(common).source)
 
     def gains(self, common: Float[Array, " common"]) -> list[Complex[Array, " harmonic"]]:
         """Gains with the known resistors."""
-        delay = common[self.sources :]
-        return _gains(self.spectra, self.z_th(common), self.calibration.r_load, delay, self.rate)
+        source = self.z_th(common)
+
+        def one(frequency, r_load, delay_samples):
+            return delayed_gain(source, resistor(r_load), frequency, delay_samples, self.rate)
+
+        late = self.named(common).delay_samples
+        return list(jax.vmap(one)(self.spectra.frequency, self.calibration.r_load, late))
 
     def terms(
         self, common: Float[Array, " common"], records: Sequence[Spectrum]
@@ -173,8 +148,34 @@ class Calibrations(eqx.Module):
         """Terms of the calibrations and of the weak prior."""
         regularise = prior(self.source, self.rate, self.calibration.r_load.mean())
         parts = residuals(records, self.gains(common))
-        weak = [regularise(common[: self.sources]), common[self.sources :] / DELAY_WIDTH]
+        of = self.named(common)
+        weak = [regularise(of.source), of.delay_samples / DELAY_WIDTH]
         return jnp.concatenate(parts + weak)
+
+    def linear(self, common: Float[Array, " common"]) -> Linear:
+        """The terms around their minimum."""
+        records, gains = self.records, self.gains(common)
+        clean, shares = denoised(records, gains)
+        jacobian = jax.jacfwd(lambda c: self.terms(c, clean))(common)
+        parts = residuals(records, gains)
+        noise = [excess(r, s.selected) for r, s in zip(parts, records, strict=True)]
+        count = jacobian.shape[0]
+        return Linear(jacobian.T, weights(shares, count), weights(noise, count))
+
+    def by_gains(
+        self, common: Float[Array, " common"], slopes: Sequence[Complex[Array, "row harmonic"]]
+    ) -> Float[Array, "row term"]:
+        """Derivatives of the denoised terms by what moves the gain of each record by `slopes`."""
+        gains = self.gains(common)
+        clean, _ = denoised(self.records, gains)
+
+        def row(number):
+            at = [of[number] for of in slopes]
+            part = jax.jvp(lambda g: jnp.concatenate(residuals(clean, g)), (gains,), (at,))[1]
+            priors = self.terms(common, self.records).size - part.size
+            return jnp.pad(part, (0, priors))
+
+        return jax.vmap(row)(jnp.arange(slopes[0].shape[0]))
 
     def strain(self, common: Float[Array, " common"]) -> Float[Array, ""]:
         """By how much Σ r² of the calibrations has grown from what they alone have.
@@ -182,17 +183,15 @@ class Calibrations(eqx.Module):
         About as much as there are common parameters, if loads and calibrations agree on them; r in
         standard deviations that the noise of the calibrations has.
         """
-        records, start = self.records, self.start()
-        parts = residuals(records, self.gains(start))
-        alone, now = (self.terms(c, records) for c in (start, common))
-        noise = [excess(r, s.selected) for r, s in zip(parts, records, strict=True)]
-        return jnp.sum((now**2 - alone**2) / weights(noise, now.size))
+        start = self.start()
+        alone, now = (self.terms(c, self.records) for c in (start, common))
+        return jnp.sum((now**2 - alone**2) / self.linear(start).noise)
 
 
 class Joint(eqx.Module):
     """The likelihood of loads and of the calibrations of their driver, term by term.
 
-    `own` are the logarithms of a load's elements and its delay in samples.
+    `own` are what is unknown of a load.
 
     Attributes:
         circuit: Structure of the loads.
@@ -206,20 +205,19 @@ class Joint(eqx.Module):
 
     def gain(
         self,
-        own: Float[Array, " own"],
+        own: LoadUnknowns,
         common: Float[Array, " common"],
         spectrum: Spectrum,
         sample_rate: Float[Array, ""],
     ) -> Complex[Array, " harmonic"]:
         """Gain with a load."""
-        load = self.circuit.with_log_values(own[:-1]).impedance()
-        return delayed_gain(
-            self.calibrations.z_th(common), load, spectrum.frequency, own[-1] / sample_rate
-        )
+        load = self.circuit.with_log_values(own.log_elements).impedance()
+        source, frequency = self.calibrations.z_th(common), spectrum.frequency
+        return delayed_gain(source, load, frequency, own.delay_samples, sample_rate)
 
     def of_load(
         self,
-        own: Float[Array, " own"],
+        own: LoadUnknowns,
         common: Float[Array, " common"],
         spectrum: Spectrum,
         sample_rate: Float[Array, ""],
@@ -228,7 +226,7 @@ class Joint(eqx.Module):
         """Terms of one recording, given the calibrations; the last is the prior of its delay."""
         known = self.informed(spectrum, common, records)
         part = residual(known, self.gain(own, common, spectrum, sample_rate))
-        return jnp.append(part, own[-1] / DELAY_WIDTH)
+        return jnp.append(part, own.delay_samples / DELAY_WIDTH)
 
     def informed(
         self, spectrum: Spectrum, common: Float[Array, " common"], records: Sequence[Spectrum]
@@ -245,33 +243,32 @@ def fit_load(
     model: Joint,
     spectrum: Spectrum,
     sample_rate: Float[Array, ""],
-    candidates: Float[Array, "start own"],
-) -> tuple[Float[Array, " own"], optx.RESULTS, Float[Array, ""], Float[Array, ""], Bool[Array, ""]]:
+    candidates: LoadUnknowns,
+) -> tuple[LoadUnknowns, optx.RESULTS, Float[Array, ""], Float[Array, ""], Bool[Array, ""]]:
     """Identify the load of one recording with Z_th as the calibrations have it.
 
     Args:
         model: Calibrations and kind of circuit.
         spectrum: The recording.
         sample_rate: Its sampling rate [Hz].
-        candidates: Logarithms of elements, and delays in samples, to start from; the start that
-            predicts best is refined.
+        candidates: To start from, stacked; the start that predicts best is refined.
 
     Returns:
-        Elements and delay, how the solver ended, χ² per degree of freedom, RRSE, and whether mains
+        What was unknown, how the solver ended, χ² per degree of freedom, RRSE, and whether mains
         hum is seen.
     """
     records, common = model.calibrations.records, model.calibrations.start()
 
-    def terms(own, spectrum):
-        return model.of_load(own, common, spectrum, sample_rate, records)
+    def terms(q, spectrum):
+        return model.of_load(LoadUnknowns.of(q), common, spectrum, sample_rate, records)
 
-    best = best_start(lambda own: terms(own, spectrum), candidates)
+    best = best_start(lambda q: terms(q, spectrum), candidates.vector())
     solution = optx.least_squares(
         terms, SOLVER, best, args=spectrum, max_steps=MAX_STEPS, throw=False
     )
-    own = solution.value
+    own = LoadUnknowns.of(solution.value)
     squares = 2 * solution.stats["normal_equations"].objective
-    chi2 = squares / (2 * jnp.sum(spectrum.selected, dtype=own.dtype) - own.shape[0])
+    chi2 = squares / (2 * jnp.sum(spectrum.selected, dtype=squares.dtype) - best.size)
     g = model.gain(own, common, spectrum, sample_rate)
     error = complex_rrse(g * spectrum.x, spectrum.y, spectrum.selected)
     hum = shows_hum(model.informed(spectrum, common, records), g)

@@ -29,11 +29,7 @@ from jaxtyping import Array, Complex, Float
 from etid.estimators.maximum_likelihood.driver import Calibrations
 from etid.estimators.maximum_likelihood.terms import (
     as_list,
-    denoised,
-    excess,
     informed,
-    residuals,
-    weights,
 )
 from etid.estimators.score_tests.unloaded import UnloadedShape, shape_of
 from etid.results.driver import HarmonicDriver
@@ -121,20 +117,11 @@ def given(
         shared: Whether a load's unloaded record may be that of a calibration.
     """
     calibrations = Calibrations.of(driver)
-    c, records = calibrations.start(), calibrations.records
-    gains = calibrations.gains(c)
-    clean, shares = denoised(records, gains)
-    jacobian = jax.jacfwd(lambda c: calibrations.terms(c, clean))(c)
-    weight = weights(shares, jacobian.shape[0])
-    curvature = (jacobian.T * weight[None, :]) @ jacobian
-    root = inverse_root(curvature)
-    value, pullback = jax.vjp(lambda c: calibrations.terms(c, records), c)
-    parts = residuals(records, gains)
-    of_noise = [excess(r, s.selected) for r, s in zip(parts, records, strict=True)]
-    whitened = jacobian @ root
-    noise = weights(of_noise, whitened.shape[0])
-    mean = -root.T @ pullback(value)[0]
-    cov = (whitened.T * noise[None, :]) @ whitened
+    c = calibrations.start()
+    linear = calibrations.linear(c)
+    root = inverse_root(linear.curvature().expected)
+    value, pullback = jax.vjp(lambda c: calibrations.terms(c, calibrations.records), c)
+    mean, cov = -root.T @ pullback(value)[0], linear.along(root).curvature().score
     if driver.drift is None:
         found = around(calibrations, c, root, frequency, shared, mean, cov)
     else:

@@ -27,12 +27,13 @@ from etid.estimators.maximum_likelihood.terms import (
     stands_out,
     variance,
 )
+from etid.estimators.sandwich import Linear
 from etid.estimators.score_tests import other_circuit
+from etid.estimators.unknowns import LoadUnknowns
 from etid.results.fits import complex_rrse
 from etid.signals.harmonics import Spectrum
 from etid.signals.transfer import as_complex, frequency_variable, reciprocal, turns
 from etid.solvers.levenberg_marquardt import LevenbergMarquardt, NormalEquations, best_start
-from etid.solvers.matrices import inverse
 
 
 class _Slopes(NamedTuple):
@@ -60,8 +61,7 @@ class _Slopes(NamedTuple):
 class Load(eqx.Module):
     """One recording, with all that its terms depend on.
 
-    The parameters are its `own`, logarithms of the elements and the delay [samples], and after them
-    z, if it is not z₀.
+    The parameters `q` of its solver are those of `LoadUnknowns` and after them z, if it is not z₀.
     """
 
     driver: GivenDriver
@@ -75,19 +75,20 @@ class Load(eqx.Module):
         """Number of own parameters."""
         return len(self.circuit.names()) + 1
 
-    def split(self, q: Float[Array, " q"]) -> tuple[Float[Array, " own"], Float[Array, " z"]]:
-        """`own` and z."""
-        return q[: self.owned], q[self.owned :] if q.size > self.owned else self.driver.mean
+    def split(self, q: Float[Array, "*row q"]) -> tuple[LoadUnknowns, Float[Array, "*row z"]]:
+        """What is unknown of the load, and z; or other numbers in their order."""
+        own = LoadUnknowns.of(q[..., : self.owned])
+        return own, q[..., self.owned :] if q.shape[-1] > self.owned else self.driver.mean
 
-    def load(self, own: Float[Array, " own"]) -> Complex[Array, " harmonic"]:
+    def load(self, log_elements: Float[Array, " element"]) -> Complex[Array, " harmonic"]:
         """Z_L."""
         s = frequency_variable(self.spectrum.frequency)
-        return self.circuit.with_log_values(own[:-1]).impedance()(s)
+        return self.circuit.with_log_values(log_elements).impedance()(s)
 
-    def turns(self, own: Float[Array, " own"]) -> Complex[Array, " harmonic"]:
+    def turns(self, delay_samples: Float[Array, ""]) -> Complex[Array, " harmonic"]:
         """e^(−jωτ)."""
         f = self.spectrum.frequency
-        return turns(-f[0] * own[-1] / self.sample_rate, f.size)
+        return turns(-f[0] * delay_samples / self.sample_rate, f.size)
 
     def divided(
         self, load: Complex[Array, " harmonic"], w: Complex[Array, " harmonic"]
@@ -109,7 +110,8 @@ class Load(eqx.Module):
         """Gain, and the recording with the X that calibrations leave."""
         own, z = self.split(q)
         w, spectrum = self.at(z)
-        return self.divided(self.load(own), w) * self.turns(own), spectrum
+        gain = self.divided(self.load(own.log_elements), w)
+        return gain * self.turns(own.delay_samples), spectrum
 
     def __call__(self, q: Float[Array, " q"]) -> Float[Array, " term"]:
         """Terms of the recording, of its delay and of z."""
@@ -123,9 +125,9 @@ class Load(eqx.Module):
 
     def widths(self, q: Float[Array, " q"]) -> Float[Array, " q"]:
         """Standard deviations of that."""
-        return (
-            jnp.ones(q.size).at[: self.owned - 1].set(jnp.inf).at[self.owned - 1].set(DELAY_WIDTH)
-        )
+        free = jnp.full(self.owned - 1, jnp.inf)
+        own = LoadUnknowns(free, jnp.asarray(DELAY_WIDTH)).vector()
+        return jnp.concatenate([own, jnp.ones(q.size - self.owned)])
 
     def slopes(self, q: Float[Array, " q"]) -> _Slopes:
         """Derivatives at each harmonic.
@@ -140,9 +142,11 @@ class Load(eqx.Module):
             return jnp.ones_like(v)
 
         def of_load(_):
-            elements = jnp.eye(own.size)[:-1]
-            by_element = jax.vmap(lambda v: jax.jvp(self.load, (own,), (v,))[1])(elements)
-            return self.load(own), by_element, self.turns(own)
+            logs = own.log_elements
+            by_element = jax.vmap(lambda v: jax.jvp(self.load, (logs,), (v,))[1])(
+                jnp.eye(logs.size)
+            )
+            return self.load(logs), by_element, self.turns(own.delay_samples)
 
         load, by_element, turns = apart(of_load, q)
 
@@ -152,7 +156,8 @@ class Load(eqx.Module):
             return divided, by_load * turns, by_w * turns
 
         divided, by_load, turned = apart(of_gain, q)
-        by_delay = jax.jvp(self.turns, (own,), (jnp.zeros(own.size).at[-1].set(1.0),))[1]
+        late = own.delay_samples
+        by_delay = jax.jvp(self.turns, (late,), (jnp.ones_like(late),))[1]
         slopes = jnp.concatenate([by_load[None, :] * by_element, (divided * by_delay)[None, :]])
 
         g = divided * turns
@@ -186,7 +191,7 @@ class Load(eqx.Module):
         V_out alone: 1 % more makes R_p of dry skin wrong by a quarter, and shows in χ² at 60 dB
         only.
         """
-        impedance = self.circuit.with_log_values(self.split(q)[0][:-1]).impedance()
+        impedance = self.circuit.with_log_values(self.split(q)[0].log_elements).impedance()
 
         def parts(_):
             _, changes = other_circuit.changes(impedance, self.spectrum.frequency)
@@ -270,7 +275,7 @@ def fit_circuit(
     circuit: AbstractCircuit,
     spectrum: Spectrum,
     sample_rate: Float[Array, ""],
-    candidates: Float[Array, "start own"],
+    candidates: LoadUnknowns,
 ) -> tuple[Estimate, Bool[Array, ""], Bool[Array, ""]]:
     """Identify the load of one recording.
 
@@ -279,8 +284,8 @@ def fit_circuit(
         circuit: Structure of the load.
         spectrum: The recording.
         sample_rate: Its sampling rate [Hz].
-        candidates: Logarithms of elements, and delays in samples, to start from, the likeliest
-            last; the start that predicts best is refined.
+        candidates: To start from, stacked, the likeliest last; the start that predicts best is
+            refined.
 
     Returns:
         The estimate, whose parameters are the logarithms of the elements; whether W went so far
@@ -296,9 +301,10 @@ def fit_circuit(
         )
 
     # First with Z_th as it is: from a start far away, a joint fit would bend Z_th to meet it.
-    likely = candidates[-1]
+    starts = candidates.vector()
+    likely = starts[-1]
     near = jnp.sum(load(likely) ** 2) < NEAR * 2 * jnp.sum(spectrum.selected, dtype=likely.dtype)
-    start = jax.lax.cond(near, lambda: likely, lambda: best_start(load, candidates))
+    start = jax.lax.cond(near, lambda: likely, lambda: best_start(load, starts))
     alone = solve(ROUGHLY, start).value
     solution = solve(TOGETHER, jnp.concatenate([alone, driver.mean]))
     q = solution.value
@@ -316,24 +322,23 @@ def fit_circuit(
     slopes = apart(clean.slopes, q)
     jacobian = clean.chained(q, slopes)
     prior = 1 / load.widths(q) ** 2
-    information = inverse((jacobian * share[None, :]) @ jacobian.T + jnp.diag(prior))
-    elements = information[: own.size - 1]
+    linear = Linear(jacobian, share, excess(part, spectrum.selected), jnp.diag(prior))
+    information, count = linear.bread(), own.log_elements.size
+    elements = information[:count]
     by_term = elements @ jacobian
-    noise = excess(part, spectrum.selected)
+    noise = linear.noise
     rows = clean.by_changes(q, slopes)
     other = other_circuit.scores(
         rows,
-        jacobian,
+        linear,
         part,
         prior * (q - load.centre(q)),
-        jax.scipy.linalg.block_diag(jnp.diag(prior[: own.size]), driver.cov),
+        jax.scipy.linalg.block_diag(jnp.diag(prior[: load.owned]), driver.cov),
         information,
-        share,
-        noise,
-        slice(own.size - 1),
+        slice(count),
     )
     # What the low harmonics have too much, a wrong gain may explain; it is no hum then.
-    gain = rows[-1] - (rows[-1] * share) @ jacobian.T @ information @ jacobian
+    gain = rows[-1] - linear.told(rows[-1:])[0] @ information @ jacobian
     rest = jnp.sum((part - other.size[-1] * gain).reshape(2, -1) ** 2, axis=0) / 2
     wrong_gain = jnp.abs(other.z[-1]) > other_circuit.SEEN_RELAXATION
     wrong_gain = wrong_gain & ~stands_out(rest, known)
@@ -344,17 +349,18 @@ def fit_circuit(
         1.0,
     )
     private = jnp.tile(private, 2)
-    of_delay = jnp.outer(elements[:, own.size - 1], elements[:, own.size - 1]) / DELAY_WIDTH**2
-    of_driver = elements[:, own.size :] @ driver.cov @ elements[:, own.size :].T
+    by_own, by_z = load.split(elements)
+    of_delay = jnp.outer(by_own.delay_samples, by_own.delay_samples) / DELAY_WIDTH**2
+    of_driver = by_z @ driver.cov @ by_z.T
     shared = of_driver + (by_term * ((1 - private) * noise)[None, :]) @ by_term.T
     # Of an element without any effect a product of matrices keeps but rounding errors.
     unknown = jnp.diagonal(elements)
     unknown = jnp.diag(jnp.where(unknown > 1, unknown, 0.0))
     change = z - driver.mean
-    freedom = 2 * jnp.sum(spectrum.selected, dtype=own.dtype) - own.size
+    freedom = 2 * jnp.sum(spectrum.selected, dtype=q.dtype) - load.owned
     estimate = Estimate(
-        parameters=own[:-1],
-        delay_samples=own[-1:],
+        parameters=own.log_elements,
+        delay_samples=own.delay_samples[None],
         cov=(by_term * (private * noise)[None, :]) @ by_term.T + of_delay + shared + unknown,
         shared_cov=shared,
         chi2=jnp.sum(part**2) / freedom,

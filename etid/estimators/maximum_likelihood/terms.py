@@ -45,10 +45,11 @@ def delayed_gain(
     source: SourceImpedance,
     load: AbstractImpedance,
     frequency: Float[Array, " harmonic"],
-    delay: Float[Array, ""],
+    delay_samples: Float[Array, ""],
+    sample_rate: Float[Array, ""],
 ) -> Complex[Array, " harmonic"]:
-    """G e^(−jωτ), for a delay τ in seconds."""
-    return delayed(gain(source, load, frequency), frequency, delay)
+    """G e^(−jωτ)."""
+    return delayed(gain(source, load, frequency), frequency, delay_samples, sample_rate)
 
 
 def variance(spectrum: Spectrum, g: Complex[Array, " harmonic"]) -> Float[Array, " harmonic"]:

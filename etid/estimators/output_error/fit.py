@@ -12,6 +12,7 @@ apart. 10 ns cost 3 % in C_p. A skin's record does show τ, by the excess impeda
 `late_calibration`. It is therefore fitted with every skin.
 """
 
+import dataclasses
 import math
 
 import jax
@@ -30,7 +31,7 @@ from etid.estimators.estimate import (
     delay_std,
     prior,
 )
-from etid.estimators.output_error.information import curvature, eliminate, further, slopes
+from etid.estimators.output_error.information import curvature, further, slopes
 from etid.estimators.output_error.prediction import (
     IMPULSE,
     Late,
@@ -42,7 +43,9 @@ from etid.estimators.output_error.prediction import (
     predict,
     scaled_residual,
 )
+from etid.estimators.sandwich import Curvature
 from etid.estimators.score_tests.other_in_time import relaxed, score
+from etid.estimators.unknowns import Nuisance
 from etid.results.driver import Calibration, ContinuousDriver, SourceImpedance, loaded
 from etid.results.fits import rrse
 from etid.signals.transfer import Rational
@@ -68,67 +71,73 @@ def fit_source(
         Z_th, the estimate, whose parameters are `start` flattened, and what else is in doubt.
     """
     start_vector, unflatten = ravel_pytree(start)
-    kept, count, states = start_vector.shape[0], r_load.shape[0], start.order + 2
+    kept, count = start_vector.size, r_load.size
 
     def one(record, r, parameters, nuisance):
         return scaled_residual(record, unflatten(parameters), resistor(r).rational(), nuisance)
 
     regularise = prior(start, records.sample_rate[0], r_load.mean())
 
+    q0, named = ravel_pytree((start_vector, jnp.zeros((count, start.order + 2))))
+
     def residual(q, _):
-        nuisance = q[kept:].reshape(count, states)
-        parts = jax.vmap(one, in_axes=(0, 0, None, 0))(records, r_load, q[:kept], nuisance)
-        late = nuisance[:, -1] / DELAY_WIDTH
-        return jnp.concatenate([parts.reshape(-1), regularise(q[:kept]), late])
+        parameters, vectors = named(q)
+        nuisance = Nuisance.of(vectors)
+        parts = jax.vmap(one, in_axes=(0, 0, None, 0))(records, r_load, parameters, nuisance)
+        late = nuisance.delay_samples / DELAY_WIDTH
+        return jnp.concatenate([parts.reshape(-1), regularise(parameters), late])
 
-    q0 = jnp.concatenate([start_vector, jnp.zeros(count * states)])
     solution = optx.least_squares(residual, SOLVER, q0, max_steps=MAX_STEPS, throw=False)
-    q = solution.value
-    nuisance = q[kept:].reshape(count, states)
-
-    states = nuisance.shape[1]
-    precision = jnp.zeros(kept + 1 + states).at[-1].set(1 / DELAY_WIDTH**2)
-    weak = jax.jacfwd(regularise)(q[:kept])
+    parameters, vectors = named(solution.value)
+    nuisance, source = Nuisance.of(vectors), unflatten(parameters)
+    weak = jax.jacfwd(regularise)(parameters)
     chi2 = (
         2
         * solution.stats["normal_equations"].objective
-        / (math.prod(records.hold.shape[:-1]) - q.shape[0])
+        / (math.prod(records.hold.shape[:-1]) - q0.size)
     )
 
     # Curvature over source, logarithm of the resistor and nuisances, in this order.
     def at_minimum(record, r, nuisance):
+        at, named = ravel_pytree((parameters, jnp.zeros(()), nuisance))
+        nothing = jax.tree.map(jnp.zeros_like, nuisance)
+        towards, _ = ravel_pytree((jnp.zeros_like(parameters), jnp.ones(()), nothing))
+        open_delay = dataclasses.replace(nothing, delay_samples=jnp.asarray(1 / DELAY_WIDTH**2))
+        precision, _ = ravel_pytree((jnp.zeros_like(parameters), jnp.zeros(()), open_delay))
+
         def residual(p):
-            return one(record, r * jnp.exp(p[kept]), p[:kept], p[kept + 1 :])
+            parameters, log_r, nuisance = named(p)
+            return one(record, r * jnp.exp(log_r), parameters, nuisance)
 
         def response(p):
-            load = resistor(r * jnp.exp(p[kept])).rational()
-            return impulse_response(loaded_filter(unflatten(p[:kept]), load, record.sample_rate))
+            parameters, log_r, _ = named(p)
+            load = resistor(r * jnp.exp(log_r)).rational()
+            return impulse_response(loaded_filter(unflatten(parameters), load, record.sample_rate))
 
-        at = jnp.concatenate([q[:kept], jnp.zeros(1), nuisance])
-        towards = jnp.zeros_like(at).at[kept].set(1.0)
         value, slope = jax.jvp(residual, (at,), (towards,))
         return curvature(record, slopes(residual, response, at), precision), jnp.vdot(slope, value)
 
     def error(record, r, nuisance):
-        system = loaded_filter(unflatten(q[:kept]), resistor(r).rational(), record.sample_rate)
-        return rrse(predict(system, record, nuisance), measured(record, nuisance))
+        system = loaded_filter(source, resistor(r).rational(), record.sample_rate)
+        return rrse(predict(system, record, nuisance), measured(record, nuisance.delay_samples))
 
     parts, by_resistor = jax.vmap(at_minimum)(records, r_load, nuisance)
-    parts = jax.vmap(lambda part: eliminate(part, kept + 1))(parts)
-    information = _arrow(parts.expected, weak.T @ weak)
-    spread = _arrow(parts.score, jnp.zeros((kept, kept)))
-    bread = inverse(information[:kept, :kept])
-    cov = bread @ spread[:kept, :kept] @ bread * jnp.maximum(chi2, 1.0)
+    parts = jax.vmap(lambda part: part.eliminate(kept + 1))(parts)
+    whole = Curvature(
+        _arrow(parts.expected, weak.T @ weak), _arrow(parts.score, jnp.zeros((kept, kept)))
+    )
+    of_source = jax.tree.map(lambda leaf: leaf[:kept, :kept], whole)
+    cov = of_source.covariance() * jnp.maximum(chi2, 1.0)
     mismatch = None
     if count > 1:
         gradient = jnp.concatenate([jnp.zeros(kept), by_resistor])  # it is at its minimum
-        step, error_of_step = further(information, spread, gradient, kept)
+        step, error_of_step = further(whole, gradient, kept)
         # What the worst of the resistors explains is no noise.
         left = chi2 - jnp.max((step / error_of_step) ** 2) / math.prod(records.hold.shape[:-1])
         mismatch = jnp.stack([-step, error_of_step * jnp.sqrt(jnp.maximum(left, 1.0))])
     estimate = Estimate(
-        parameters=q[:kept],
-        delay_samples=nuisance[:, -1],
+        parameters=parameters,
+        delay_samples=nuisance.delay_samples,
         cov=cov,
         shared_cov=jnp.zeros_like(cov),
         chi2=chi2,
@@ -137,9 +146,9 @@ def fit_source(
         steps=solution.stats["num_steps"],
     )
     return (
-        unflatten(q[:kept]),
+        source,
         estimate,
-        Calibration(r_load, nuisance[:, -1], delay_std(r_load), mismatch),
+        Calibration(r_load, nuisance.delay_samples, delay_std(r_load), mismatch),
     )
 
 
@@ -181,15 +190,21 @@ def fit_circuit(
     # In samples of this record.
     late_std = calibration.delay_std_samples * (records.sample_rate / driver.sample_rate)
 
-    def load(q):
-        return circuit.with_log_values(q[:kept]).impedance().rational()
+    def load(log_elements):
+        return circuit.with_log_values(log_elements).impedance().rational()
 
-    # q holds the elements, the nuisances of the record, and the delay of the calibration, by which
-    # voltage and impulse response change linearly.
+    # Logarithms of the elements, the nuisances of the record, and the delay of the calibration, by
+    # which voltage and impulse response change linearly.
+    zero = jnp.zeros(())
+    nuisance = Nuisance(jnp.zeros(states), zero, zero)
+    _, named = ravel_pytree((candidates[0], nuisance, zero))
+
     def residual(q, late):
-        change = jax.tree.map(lambda leaf: q[-1] * leaf, late)
-        scaled = scaled_residual(records, source, load(q), q[kept:-1], change)
-        return jnp.concatenate([scaled, q[-2:] / jnp.stack([DELAY_WIDTH, late_std])])
+        log_elements, nuisance, late_samples = named(q)
+        change = jax.tree.map(lambda leaf: late_samples * leaf, late)
+        scaled = scaled_residual(records, source, load(log_elements), nuisance, change)
+        delays = jnp.stack([nuisance.delay_samples, late_samples])
+        return jnp.concatenate([scaled, delays / jnp.stack([DELAY_WIDTH, late_std])])
 
     def refine(carry, _):
         q, late = carry
@@ -197,53 +212,58 @@ def fit_circuit(
             residual, SOLVER, q, args=late, max_steps=MAX_STEPS, throw=False
         )
         q = solution.value
-        x0 = q[kept : kept + states]
-        late = late_calibration(records, source, load(q), calibration.r_load[0], x0)
+        log_elements, nuisance, _ = named(q)
+        load_there, x0 = load(log_elements), nuisance.state
+        late = late_calibration(records, source, load_there, calibration.r_load[0], x0)
         equations = solution.stats["normal_equations"]
         return (q, late), (equations.objective, solution.result, solution.stats["num_steps"])
 
     nothing = Late(jnp.zeros(records.hold.shape[0]), jnp.zeros(IMPULSE + 1))
-    q0 = jnp.concatenate([candidates, jnp.zeros((candidates.shape[0], states + 3))], axis=-1)
+    q0 = jax.vmap(lambda log_elements: ravel_pytree((log_elements, nuisance, zero))[0])(candidates)
     best = best_start(lambda q: residual(q, nothing), q0)
     # First with the calibration in time, then with its delay; one loop, so that one solver is
     # compiled.
     (q, late), outcomes = jax.lax.scan(refine, (best, nothing), length=PASSES)
     objective, result, steps = outcomes
     result = jax.tree.map(lambda leaf: leaf[-1], result)
+    log_elements, nuisance, late_samples = named(q)
+    fitted = circuit.with_log_values(log_elements)
 
     # Curvature over elements, delay of the calibration, source and nuisances, in this order.
     both = kept + 1 + sources
-    at = jnp.concatenate([q[:kept], q[-1:], source_vector, q[kept:-1]])
+    at, named_all = ravel_pytree((log_elements, late_samples, source_vector, nuisance))
 
     def of_all(p):
-        z_th = unflatten(p[kept + 1 : both])
-        change = jax.tree.map(lambda leaf: p[kept] * leaf, late)
-        return scaled_residual(records, z_th, load(p), p[both:], change)
+        log_elements, late_samples, vector, nuisance = named_all(p)
+        change = jax.tree.map(lambda leaf: late_samples * leaf, late)
+        return scaled_residual(records, unflatten(vector), load(log_elements), nuisance, change)
 
     def response(p):
-        z_th = unflatten(p[kept + 1 : both])
-        h = impulse_response(loaded_filter(z_th, load(p), records.sample_rate))
-        return h + p[kept] * late.h
+        log_elements, late_samples, vector, _ = named_all(p)
+        system = loaded_filter(unflatten(vector), load(log_elements), records.sample_rate)
+        return impulse_response(system) + late_samples * late.h
 
-    precision = jnp.zeros_like(at).at[kept].set(1 / late_std**2).at[-1].set(1 / DELAY_WIDTH**2)
+    open_delay = Nuisance(jnp.zeros(states), zero, jnp.asarray(1 / DELAY_WIDTH**2))
+    priors = (jnp.zeros(kept), 1 / late_std**2, jnp.zeros(sources), open_delay)
+    precision, _ = ravel_pytree(priors)
     derivatives = slopes(of_all, response, at)
-    full = eliminate(curvature(records, derivatives, precision), both)
-    change = relaxed(records, source, circuit.with_log_values(q[:kept]).impedance(), q[kept:-1])
+    full = curvature(records, derivatives, precision).eliminate(both)
+    change = relaxed(records, source, fitted.impedance(), nuisance)
     found = score(
         records, change, derivatives, source_cov, kept + 1, precision * at, precision, kept
     )
     own = inverse(full.expected[: kept + 1, : kept + 1])
-    chi2 = 2 * objective[-1] / (records.intervals - q.shape[0])
+    chi2 = 2 * objective[-1] / (records.intervals - q.size)
     inherited = (-own @ full.expected[: kept + 1, kept + 1 :])[:kept]
     shared = inherited @ source_cov @ inherited.T
     cov = (own @ full.score[: kept + 1, : kept + 1] @ own)[:kept, :kept]
-    system = loaded_filter(source, load(q), records.sample_rate)
-    predicted = predict(system, records, q[kept:-1]) + q[-1] * late.v_out
-    seen, used = measured(records, q[kept:-1]), records.used > 0
+    system = loaded_filter(source, load(log_elements), records.sample_rate)
+    predicted = predict(system, records, nuisance) + late_samples * late.v_out
+    seen, used = measured(records, nuisance.delay_samples), records.used > 0
     mean = jnp.sum(seen * records.used) / records.intervals
     estimate = Estimate(
-        parameters=q[:kept],
-        delay_samples=q[-2:-1],
+        parameters=log_elements,
+        delay_samples=nuisance.delay_samples[None],
         cov=cov * jnp.maximum(chi2, 1.0) + shared,
         shared_cov=shared,
         chi2=chi2,
@@ -251,7 +271,7 @@ def fit_circuit(
         result=result,
         steps=steps.sum(),
     )
-    return circuit.with_log_values(q[:kept]), estimate, found.relaxes()
+    return fitted, estimate, found.relaxes()
 
 
 def fitted_voltage(
@@ -262,18 +282,20 @@ def fitted_voltage(
     Initial state, offset, delay and the delay of the calibration with `r_load` [Ω] are fitted.
     """
     system = loaded_filter(source, load, records.sample_rate)
-    states = system.C.shape[0]
-    q = jnp.zeros(states + 3)
+    zero = jnp.zeros(())
+    q, named = ravel_pytree((Nuisance(jnp.zeros_like(system.C), zero, zero), zero))
 
     def residual(q, late):
-        return predict(system, records, q[:-1]) + q[-1] * late - measured(records, q[:-1])
+        nuisance, late_samples = named(q)
+        predicted = predict(system, records, nuisance) + late_samples * late
+        return predicted - measured(records, nuisance.delay_samples)
 
     # Linear but for the delay, which is a small fraction of a sample, and for the state in `late`,
     # which is that of the step before: a state that decays within a sample multiplied by the delay
     # of the calibration would leave the first sample at any voltage.
     late = jnp.zeros_like(records.v_out[:, 0])
     for _ in range(3):
-        late = late_calibration(records, source, load, r_load, q[:states]).v_out
+        late = late_calibration(records, source, load, r_load, named(q)[0].state).v_out
         basis = jax.jacfwd(residual)(q, late)
         q = q - jnp.linalg.lstsq(basis, residual(q, late))[0]
     return residual(q, late) + records.v_out[:, 0]

@@ -25,14 +25,8 @@ from etid.estimators.output_error.prediction import (
     measured_impulse,
     residual_variance,
 )
+from etid.estimators.sandwich import Curvature
 from etid.solvers.matrices import inverse
-
-
-class Curvature(eqx.Module):
-    """H and Jᵀ Σ J of one record, over (parameters, nuisance)."""
-
-    expected: Float[Array, "n n"]
-    score: Float[Array, "n n"]
 
 
 class Slopes(eqx.Module):
@@ -105,10 +99,7 @@ def curvature(records: Records, at: Slopes, precision: Float[Array, " n"]) -> Cu
 
 
 def further(
-    information: Float[Array, "all all"],
-    spread: Float[Array, "all all"],
-    gradient: Float[Array, " all"],
-    kept: int,
+    of: Curvature, gradient: Float[Array, " all"], kept: int
 ) -> tuple[Float[Array, " further"], Float[Array, " further"]]:
     """Where each further parameter alone would go from a minimum over the first `kept`.
 
@@ -116,27 +107,16 @@ def further(
     where this step is large against its error).
 
     Args:
-        information: Expected curvature over all parameters.
-        spread: Covariance of the gradient.
+        of: Curvature over all parameters.
         gradient: Of the objective.
         kept: How many parameters are at their minimum.
 
     Returns:
         The steps, and their standard errors.
     """
-    others = information[kept:, :kept] @ inverse(information[:kept, :kept])
-    towards = jnp.concatenate([-others, jnp.eye(information.shape[0] - kept)], axis=1)
-    own = jnp.diagonal(towards @ information[:, kept:])
-    variance = jnp.einsum("ij,jk,ik->i", towards, spread, towards)
+    h = of.expected
+    others = h[kept:, :kept] @ inverse(h[:kept, :kept])
+    towards = jnp.concatenate([-others, jnp.eye(h.shape[0] - kept)], axis=1)
+    own = jnp.diagonal(towards @ h[:, kept:])
+    variance = jnp.einsum("ij,jk,ik->i", towards, of.score, towards)
     return -(towards @ gradient) / own, jnp.sqrt(variance) / own
-
-
-def eliminate(of: Curvature, kept: int) -> Curvature:
-    """Project out all but the first `kept` parameters: nuisances, which no other record shares."""
-    h, m = of.expected, of.score
-    k = -inverse(h[kept:, kept:], drop=True) @ h[kept:, :kept]
-    reduced = h[:kept, :kept] + h[:kept, kept:] @ k
-    score = (
-        m[:kept, :kept] + m[:kept, kept:] @ k + k.T @ m[kept:, :kept] + k.T @ m[kept:, kept:] @ k
-    )
-    return Curvature(reduced, score)

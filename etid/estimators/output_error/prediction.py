@@ -19,6 +19,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
+from etid.estimators.unknowns import Nuisance
 from etid.results.driver import SourceImpedance, loaded
 from etid.signals.filtering import CUTOFF, TAPS, StateSpace, band_limited, hold, shiftable, simulate
 from etid.signals.measurement import Measurement
@@ -76,19 +77,17 @@ def loaded_filter(
     return hold(loaded(source, load, sample_rate), sample_rate)
 
 
-def predict(
-    system: StateSpace, records: Records, nuisance: Float[Array, " nuisance"]
-) -> Float[Array, " interval"]:
-    """Terminal voltage [V]; `nuisance` is the initial state, the offset [V] and the delay."""
-    return simulate(system, records.hold, nuisance[:-2])[0] + nuisance[-2]
+def predict(system: StateSpace, records: Records, nuisance: Nuisance) -> Float[Array, " interval"]:
+    """Terminal voltage [V]."""
+    return simulate(system, records.hold, nuisance.state)[0] + nuisance.offset
 
 
-def measured(records: Records, nuisance: Float[Array, " nuisance"]) -> Float[Array, " interval"]:
-    """Measured voltage [V] at the instants of V_th; it was sampled `nuisance[-1]` samples late.
+def measured(records: Records, delay_samples: Float[Array, ""]) -> Float[Array, " interval"]:
+    """Measured voltage [V] at the instants of V_th; it was sampled `delay_samples` late.
 
     50 ns between the triggers of two records are 0.01 samples, and spread R_s by 8 %.
     """
-    late = -nuisance[-1]
+    late = -delay_samples
     value = records.v_out[:, -1]
     for k in range(records.v_out.shape[1] - 2, -1, -1):  # Horner
         value = value * late + records.v_out[:, k]
@@ -132,7 +131,7 @@ def scaled_residual(
     records: Records,
     source: SourceImpedance,
     load: Rational,
-    nuisance: Float[Array, " nuisance"],
+    nuisance: Nuisance,
     change: Late | None = None,
 ) -> Float[Array, " interval"]:
     """(Predicted − measured) / √s; `change` is added to what is predicted."""
@@ -141,7 +140,7 @@ def scaled_residual(
     if change is not None:
         predicted, h = predicted + change.v_out, h + change.h
     scale = records.used / jnp.sqrt(residual_variance(records, h))
-    return (predicted - measured(records, nuisance)) * scale
+    return (predicted - measured(records, nuisance.delay_samples)) * scale
 
 
 def late_calibration(

@@ -15,16 +15,11 @@ Over the map of failures (`python -m benchmarks failure_map`) it is 15 at most w
 high enough, and 116 or more where a lower one costs an element five of its standard errors.
 """
 
-from collections.abc import Sequence
-
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Complex, Float
 
 from etid.estimators.maximum_likelihood.driver import Calibrations
-from etid.estimators.maximum_likelihood.terms import denoised, excess, residuals, weights
 from etid.signals.transfer import as_complex, frequency_variable, reciprocal
-from etid.solvers.matrices import inverse
 
 SEEN = 36.0  # χ² of two degrees of freedom; one of some hundred sections has it once in 10⁶
 DAMPINGS = (0.1, 0.3, 1.0)
@@ -58,36 +53,19 @@ def squares(calibrations: Calibrations) -> Float[Array, " section"]:
     Args:
         calibrations: At the minimum of their likelihood.
     """
-    c, records = calibrations.start(), calibrations.records
-    gains = calibrations.gains(c)
-    clean, shares = denoised(records, gains)
-    jacobian = jax.jacfwd(lambda c: calibrations.terms(c, clean))(c)
-    count = jacobian.shape[0]
-    share = weights(shares, count)
-    parts = residuals(records, gains)
-    of_noise = [excess(r, s.selected) for r, s in zip(parts, records, strict=True)]
-    noise = weights(of_noise, count)
-    of_gains = _by_gains(calibrations, gains)
-
-    def row(number):
-        slopes = [of[number] for of in of_gains]
-        part = jax.jvp(lambda gains: jnp.concatenate(residuals(clean, gains)), (gains,), (slopes,))
-        return jnp.pad(part[1], (0, count - part[1].size))
-
-    rows = jax.vmap(row)(jnp.arange(of_gains[0].shape[0]))
-    others = (rows * share[None, :]) @ jacobian @ inverse((jacobian.T * share[None, :]) @ jacobian)
-    directions = rows - others @ jacobian.T
-    score = (directions @ calibrations.terms(c, records)).reshape(-1, 2, 1)
-    directions = directions.reshape(-1, 2, count)
-    variance = jnp.einsum("sit,t,sjt->sij", directions, noise, directions)
+    c = calibrations.start()
+    linear = calibrations.linear(c)
+    rows = calibrations.by_gains(c, _slopes(calibrations))
+    directions = rows - linear.told(rows) @ linear.bread() @ linear.jacobian
+    score = (directions @ calibrations.terms(c, calibrations.records)).reshape(-1, 2, 1)
+    directions = directions.reshape(-1, 2, rows.shape[1])
+    variance = jnp.einsum("sit,t,sjt->sij", directions, linear.noise, directions)
     return jnp.sum(score * jnp.linalg.solve(variance, score), axis=(1, 2))
 
 
-def _by_gains(
-    calibrations: Calibrations, gains: Sequence[Complex[Array, " harmonic"]]
-) -> list[Complex[Array, "row harmonic"]]:
+def _slopes(calibrations: Calibrations) -> list[Complex[Array, "row harmonic"]]:
     """Derivatives of the gains, G = R/(R + Z_th), by g and h of all sections."""
-    spectra = calibrations.spectra
+    spectra, gains = calibrations.spectra, calibrations.gains(calibrations.start())
     lowest = spectra.frequency[0, 0]
     highest = jnp.max(jnp.where(spectra.selected, spectra.frequency, lowest))
     found = []

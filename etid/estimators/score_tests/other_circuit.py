@@ -29,6 +29,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Complex, Float
 
 from etid.circuits.impedance import AbstractImpedance
+from etid.estimators.sandwich import Linear
 from etid.signals.transfer import as_complex, frequency_variable
 
 # Standard deviations. By chance the spread exceeds its own in one fit of 16 000. Of the relaxations
@@ -92,13 +93,11 @@ class Scores(NamedTuple):
 
 def scores(
     rows: Float[Array, "change term"],
-    jacobian: Float[Array, "q term"],
+    linear: Linear,
     residual: Float[Array, " term"],
     rest: Float[Array, " q"],
     spread: Float[Array, "q q"],
     covariance: Float[Array, "q q"],
-    share: Float[Array, " term"],
-    noise: Float[Array, " term"],
     elements: slice,
 ) -> Scores:
     """Score of each change.
@@ -108,22 +107,22 @@ def scores(
 
     Args:
         rows: Derivatives of the residual by ε.
-        jacobian: The same by the parameters.
+        linear: The terms by the parameters.
         residual: In standard deviations.
         rest: Gradient of the priors.
         spread: Covariance of that.
-        covariance: Inverse of the information.
-        share: Weights of the terms in the information.
-        noise: Variance of each residual.
+        covariance: Inverse of the information, that of other terms included.
         elements: Which parameters are the logarithms of the elements.
     """
-    others = (rows * share[None, :]) @ jacobian.T @ covariance
-    directions = rows - others @ jacobian
+    others = linear.told(rows) @ covariance
+    directions = rows - others @ linear.jacobian
     score = directions @ residual - others @ rest
     # Products of matrices, which take a fifth of the time of sums.
     of_priors = jnp.sum((others @ spread) * others, axis=1)
-    variance, curvature = (directions**2 @ jnp.stack([noise, share], axis=1)).T + of_priors[None]
-    can = curvature <= NOTHING * (rows**2 @ share)
+    variance, curvature = (
+        directions**2 @ jnp.stack([linear.noise, linear.share], axis=1)
+    ).T + of_priors[None]
+    can = curvature <= NOTHING * (rows**2 @ linear.share)
     size = score / curvature
     moved = jnp.max(jnp.abs(others[:, elements]), axis=1)
     return Scores(jnp.where(can, jnp.nan, score / jnp.sqrt(variance)), size, jnp.abs(size) * moved)

@@ -13,6 +13,8 @@ and divided by √P. P moves with the parameters, by which the slopes are free o
 V_th in them has in common with the residual, as in `etid.estimators.output_error.prediction`.
 """
 
+import dataclasses
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -28,7 +30,9 @@ from etid.estimators.output_error.prediction import (
     predict,
     residual_variance,
 )
+from etid.estimators.sandwich import Linear
 from etid.estimators.score_tests.other_circuit import Scores, relaxations, scores
+from etid.estimators.unknowns import Nuisance
 from etid.results.driver import SourceImpedance, connected, realise
 from etid.signals.filtering import StateSpace, hold
 from etid.signals.transfer import as_complex
@@ -57,7 +61,7 @@ def relaxed(
     records: Records,
     source: SourceImpedance,
     impedance: AbstractImpedance,
-    nuisance: Float[Array, " nuisance"],
+    nuisance: Nuisance,
 ) -> Relaxed:
     """Derivatives by one more relaxation of each time constant.
 
@@ -65,14 +69,15 @@ def relaxed(
         records: One recording.
         source: Z_th.
         impedance: The load.
-        nuisance: As in `prediction.predict`.
+        nuisance: What else is unknown of it.
     """
     rate = records.sample_rate
     corner, level = relaxations(impedance, rate / records.intervals, jnp.asarray(HIGHEST))
     load, count = realise(impedance.rational(), rate), corner.size
     A = jax.scipy.linalg.block_diag(load.A, -jnp.diag(corner))
     B = jnp.concatenate([load.B, corner[:, None]])
-    nuisance = jnp.concatenate([nuisance[:-2], jnp.zeros(count), nuisance[-2:]])
+    state = jnp.concatenate([nuisance.state, jnp.zeros(count)])
+    nuisance = dataclasses.replace(nuisance, state=state)
 
     def simulated(epsilon):
         C = jnp.concatenate([load.C, epsilon * level])
@@ -160,15 +165,14 @@ def score(
     scaled = terms(rows)
     by_change, by_parameter = scaled[:count], scaled[count:]
     ones = jnp.ones(scaled.shape[1])
+    linear = Linear(by_parameter, ones, ones, jnp.diag(known))
     return scores(
         by_change,
-        by_parameter,
+        linear,
         terms(residual),
         rest,
         jnp.diag(known),
         # What the record does not determine, an initial state for instance, has no effect.
-        inverse(by_parameter @ by_parameter.T + jnp.diag(known), drop=True),
-        ones,
-        ones,
+        inverse(linear.curvature().expected, drop=True),
         slice(elements),
     )

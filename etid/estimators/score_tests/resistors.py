@@ -9,15 +9,13 @@ smaller the others say that it is, with
 and Z_th and all delays free.
 """
 
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Complex, Float
 
 from etid.estimators.maximum_likelihood.driver import Calibrations
-from etid.estimators.maximum_likelihood.terms import denoised, excess, residuals, weights
+from etid.estimators.maximum_likelihood.terms import excess, weights
 from etid.recordings.preflight import Inspected
 from etid.signals.transfer import as_complex
-from etid.solvers.matrices import inverse
 
 # Standard errors: one calibration in two million is off by chance.
 SEEN = 5.0
@@ -38,26 +36,17 @@ def mismatch(calibrations: Calibrations) -> Float[Array, "2 record"]:
         calibrations: Two or more, at the minimum of their likelihood.
     """
     c, records = calibrations.start(), calibrations.records
-    gains = calibrations.gains(c)
-    clean, shares = denoised(records, gains)
-    jacobian = jax.jacfwd(lambda c: calibrations.terms(c, clean))(c)
-    count = jacobian.shape[0]
-    z_th = calibrations.z_th(c).response
+    linear, value = calibrations.linear(c), calibrations.terms(c, records)
+    z_th, alone = calibrations.z_th(c).response, jnp.eye(len(records))
     slopes = [
-        _slope(g, r, z_th(s.frequency))
-        for g, r, s in zip(gains, calibrations.calibration.r_load, records, strict=True)
+        as_complex(alone[i])[:, None] * _slope(g, r, z_th(s.frequency))[None, :]
+        for i, (g, r, s) in enumerate(
+            zip(calibrations.gains(c), calibrations.calibration.r_load, records, strict=True)
+        )
     ]
-
-    def row(number):
-        at = [jnp.where(number == i, slope, 0) for i, slope in enumerate(slopes)]
-        part = jax.jvp(lambda gains: jnp.concatenate(residuals(clean, gains)), (gains,), (at,))[1]
-        return jnp.pad(part, (0, count - part.size))
-
-    rows = jax.vmap(row)(jnp.arange(len(slopes)))
-    share, value = weights(shares, count), calibrations.terms(c, records)
-    others = (rows * share[None, :]) @ jacobian @ inverse((jacobian.T * share[None, :]) @ jacobian)
-    directions = rows - others @ jacobian.T
-    own = jnp.sum(rows * share[None, :] * directions, axis=1)
+    rows = calibrations.by_gains(c, slopes)
+    directions = rows - linear.told(rows) @ linear.bread() @ linear.jacobian
+    own = jnp.sum(rows * linear.share[None, :] * directions, axis=1)
     score = directions @ value
     # The noise is what is left after the resistor that explains most, whose mistake is none.
     best = jnp.argmax(score**2 / own)
@@ -66,7 +55,7 @@ def mismatch(calibrations: Calibrations) -> Float[Array, "2 record"]:
     of_noise = [
         excess(rest[2 * i * size : 2 * (i + 1) * size], s.selected) for i, s in enumerate(records)
     ]
-    error = jnp.sqrt(jnp.sum(weights(of_noise, count)[None, :] * directions**2, axis=1)) / own
+    error = jnp.sqrt(jnp.sum(weights(of_noise, value.size)[None, :] * directions**2, axis=1)) / own
     return jnp.stack([score / own, error])
 
 

@@ -1,0 +1,86 @@
+"""The "sandwich": covariance of a fit whose noise is not what the fit expected.
+
+    cov = H⁻¹ (J C Jᵀ) H⁻¹,      H = J W Jᵀ + P
+
+J are the derivatives of the terms by the parameters, C is the variance that each term has, W is the
+share of signal in each term, whose noise would count as information, and P is the curvature of
+priors that are no terms (White 1980, "A heteroskedasticity-consistent covariance matrix estimator",
+Econometrica 48).
+"""
+
+import dataclasses
+
+import equinox as eqx
+from jaxtyping import Array, Float
+
+from etid.solvers.matrices import inverse
+
+
+class Curvature(eqx.Module):
+    """Both parts of a sandwich; those of several recordings add up.
+
+    Attributes:
+        expected: H.
+        score: J C Jᵀ, the covariance of the gradient.
+    """
+
+    expected: Float[Array, "n n"]
+    score: Float[Array, "n n"]
+
+    def covariance(self) -> Float[Array, "n n"]:
+        """H⁻¹ (J C Jᵀ) H⁻¹."""
+        bread = inverse(self.expected)
+        return bread @ self.score @ bread
+
+    def eliminate(self, kept: int) -> "Curvature":
+        """Project out all but the first `kept` parameters: nuisances of one recording alone."""
+        h, m = self.expected, self.score
+        k = -inverse(h[kept:, kept:], drop=True) @ h[kept:, :kept]
+        return Curvature(
+            h[:kept, :kept] + h[:kept, kept:] @ k,
+            m[:kept, :kept]
+            + m[:kept, kept:] @ k
+            + k.T @ m[kept:, :kept]
+            + k.T @ m[kept:, kept:] @ k,
+        )
+
+
+class Linear(eqx.Module):
+    """Terms of a likelihood around its minimum, linear in the parameters.
+
+    Attributes:
+        jacobian: J.
+        share: Diagonal of W.
+        noise: Diagonal of C.
+        prior: P; None if all priors are terms.
+    """
+
+    jacobian: Float[Array, "q term"]
+    share: Float[Array, " term"]
+    noise: Float[Array, " term"]
+    prior: Float[Array, "q q"] | None = None
+
+    def curvature(self) -> Curvature:
+        """H and J C Jᵀ."""
+        return Curvature(self._expected(), (self.jacobian * self.noise[None, :]) @ self.jacobian.T)
+
+    def bread(self) -> Float[Array, "q q"]:
+        """H⁻¹."""
+        return inverse(self._expected())
+
+    def covariance(self) -> Float[Array, "q q"]:
+        """The sandwich, from how each term moves the parameters, which loses fewest digits."""
+        by_term = self.bread() @ self.jacobian
+        return (by_term * self.noise[None, :]) @ by_term.T
+
+    def told(self, rows: Float[Array, "row term"]) -> Float[Array, "row q"]:
+        """R W Jᵀ: what other derivatives R of the terms have in common with the parameters."""
+        return (rows * self.share[None, :]) @ self.jacobian.T
+
+    def along(self, directions: Float[Array, "q z"]) -> "Linear":
+        """The same terms by parameters that count along these directions, without a prior."""
+        return dataclasses.replace(self, jacobian=directions.T @ self.jacobian, prior=None)
+
+    def _expected(self) -> Float[Array, "q q"]:
+        told = self.told(self.jacobian)
+        return told if self.prior is None else told + self.prior
