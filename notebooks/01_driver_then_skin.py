@@ -13,9 +13,9 @@
 # %% [markdown]
 # # Driver, then skin
 #
-# At the end you will know how to get from recordings to the source impedance of a driver and to
-# R_s, R_p and C_p of a fingertip with standard errors, how to see whether to believe them, and why
-# the Steiglitz-McBride method of the paper is a start and not an answer.
+# This notebook identifies the source impedance of a driver from a recording, and then R_s, R_p and
+# C_p of a fingertip with standard errors. It shows how to judge the results. It also shows why the
+# Steiglitz-McBride method of the paper gives only a start for a better method.
 
 # %%
 # %matplotlib inline
@@ -31,9 +31,9 @@ SEED = 0
 
 # %% [markdown]
 # ## The recordings
-# One calibration with a known resistor, three trials of a dry and three of a damp fingertip, all
-# with 60 dB: three pulse periods at 200 kHz. They are simulated, so the truth is known. With a file
-# of your own, `study = etid.read("study.h5")` is all that changes.
+# The study has one calibration with a known resistor, three trials of a dry fingertip and three of
+# a damp one. Each recording has 60 dB and three pulse periods at 200 kHz. The recordings are
+# simulated, so the truth is known. For your own file, use `study = etid.read("study.h5")` instead.
 
 # %%
 dry, damp = etid.scenes.paper_dry(), etid.scenes.paper_damp()
@@ -47,9 +47,9 @@ axes = etid.plot(study["typical/dry/01"])
 
 # %% [markdown]
 # ## The driver
-# Behind the display stands a pulse transformer. With a known resistor in place of the skin, the
-# loaded and the unloaded voltage give its source impedance Z_th. χ² is 1 if the model explains the
-# recording down to its noise.
+# A pulse transformer drives the display. The calibration has a known resistor in place of the skin.
+# Its loaded and unloaded voltages determine the source impedance Z_th of the driver. χ² is 1 if the
+# model explains the recording down to its noise.
 
 # %%
 calibration = study["calibration/98k8"]
@@ -61,8 +61,8 @@ axes = etid.plot(driver, calibration)
 
 # %% [markdown]
 # ## The skin
-# Now the load is unknown: a resistor in series with a resistor and a capacitor in parallel. All six
-# trials are identified in one call.
+# Now the load is unknown. Its circuit is a resistor R_s in series with a parallel resistor R_p and
+# capacitor C_p. One call identifies all six trials.
 
 # %%
 fits = etid.identify_skins(study.loaded, driver)
@@ -80,9 +80,10 @@ axes = etid.plot(
 
 # %% [markdown]
 # ## Spread and standard error are different numbers
-# The spread between trials holds what differs between them, here only noise. The standard error
-# also holds the error of the driver, which all trials share and no spread shows. The tolerance of
-# the calibration resistor is in neither of them: it passes 1:1 into every resistance.
+# The spread contains everything that differs between trials; here this is only noise. The standard
+# error also contains the error of the driver. All trials share this error, so the spread does not
+# show it. Neither of them contains the tolerance of the calibration resistor, which passes 1:1 into
+# every resistance.
 
 # %%
 for row in fits.summary("condition"):
@@ -93,9 +94,9 @@ for row in fits.summary("condition"):
 
 # %% [markdown]
 # ## Steiglitz-McBride on the same recordings
-# It filters both records and solves a linear problem, again and again. The noise of V_out stands on
-# both sides of that problem, so its answer is biased, and discretisation biases C_p even without
-# noise. The verdict says so.
+# This method filters both records and solves a linear problem, repeatedly. The noise of V_out is on
+# both sides of the linear problem, so the result is biased. Discretisation biases C_p even without
+# noise. The verdict reports this.
 
 # %%
 method = "steiglitz_mcbride"
@@ -107,7 +108,7 @@ print(baseline.counts())
 
 # %%
 def errors(fits):
-    """Relative error of each element in each trial."""
+    """Relative error of each element in each trial, by name."""
     return {
         name: np.array(
             [
@@ -135,6 +136,6 @@ assert fits.counts() == {"successful": 6}
 for name, error in errors(fits).items():
     relative = np.asarray(getattr(fits.stderr, name)) / np.asarray(getattr(fits.circuit, name))
     assert np.all(abs(error) < 5 * relative), name  # five standard errors: 1 in 10⁶ by chance
-    assert np.all(relative < 0.05), name  # and they are small enough to be of use
-assert "successful" not in baseline.counts()  # it is off, and it says so
+    assert np.all(relative < 0.05), name  # small enough to be useful
+assert "successful" not in baseline.counts()  # the results are wrong, and the verdicts say so
 assert abs(errors(baseline)["c_p"]).min() > abs(errors(fits)["c_p"]).max()

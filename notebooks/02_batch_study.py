@@ -13,10 +13,9 @@
 # %% [markdown]
 # # A batch study
 #
-# At the end you will know how to get from a file with subjects, conditions and trials to a table of
-# fits, and how to tell three things apart that one spread mixes up: how people differ, how trials
-# of one person differ, and what is only measurement. You will also know the fourth, which no spread
-# shows at all.
+# This notebook makes a table of fits from a file with subjects, conditions and trials. Then it
+# separates three parts of the spread: differences between people, differences between the trials of
+# one person, and measurement noise. A fourth part, the error of the driver, is in no spread.
 
 # %%
 # %matplotlib inline
@@ -38,10 +37,10 @@ SEED = 0
 
 # %% [markdown]
 # ## A study whose truth is known
-# Eight subjects, dry and damp, six trials each: 96 recordings with 40 dB, behind one driver.
-# Elements differ between subjects and between trials by log-normal factors. R_s lies deep and is
-# the same in every trial of a subject; R_p and C_p belong to the outer skin and are not. With
-# recordings of your own, the next cell is all that falls away.
+# The study has eight subjects, dry and damp skin, and six trials each: 96 recordings with 40 dB and
+# one driver. The elements differ between subjects and between trials by log-normal factors. R_s
+# belongs to deep tissue and is the same in every trial of a subject. R_p and C_p belong to the
+# outer skin and change from trial to trial. For your own recordings, leave out the next cell.
 
 # %%
 SUBJECTS, TRIALS = 8, 6
@@ -64,8 +63,8 @@ study, truth = scene.simulate(SEED), scene.truth()
 
 # %% [markdown]
 # ## From a file to a file
-# In a terminal it is `etid fit study.h5 -o fits.h5`. A file may have any size: it is fitted in
-# parts, and a run that was interrupted goes on with `resume=True`.
+# The command is `etid fit study.h5 -o fits.h5`. The file may have any size, because it is fitted in
+# parts. `resume=True` continues a run that was interrupted.
 
 # %%
 with tempfile.TemporaryDirectory() as name:
@@ -79,9 +78,9 @@ print(fits)
 axes = etid.plot(fits)
 
 # %% [markdown]
-# ## What a spread is made of
-# Of each subject's six trials, `summary` gives the standard deviation (`spread`), what noise alone
-# would make of it (`own`), what is left (`between`), and the error that all fits have in common
+# ## The parts of a spread
+# For the six trials of each subject, `summary` gives the standard deviation (`spread`), its part
+# from noise alone (`own`), and the rest (`between`). It also gives the error that all fits share,
 # because they have one driver (`shared`). In per cent of R_s:
 
 # %%
@@ -94,23 +93,22 @@ for row in rows:
         print(f"{row['subject']:<9}" + values)
 
 # %% [markdown]
-# R_s is the same in every trial of a subject here, and yet it spreads by some per cent: that is
-# noise. Six trials are few to tell it, so some subjects seem to vary and some do not. All subjects
-# together tell it well.
+# Here R_s is the same in every trial of a subject, but its estimates spread by some per cent. This
+# is noise. Six trials are too few to show it: some subjects seem to vary and some do not. All
+# subjects together show it clearly.
 #
 # ## Variance components
 # Let y be the logarithm of an element in trial t of subject s, in one condition:
 #
 # $$y_{st} = \mu + \text{subject}_s + \text{trial}_{st} + \text{noise}_{st} + \text{driver}$$
 #
-# With T trials of each of S subjects, the mean squares within and between subjects are expected to
-# be (Searle, Casella, McCulloch, *Variance Components*, 1992, chapter 3)
+# There are S subjects with T trials each. The expected mean squares within and between subjects are
+# (Searle, Casella, McCulloch, *Variance Components*, 1992, chapter 3)
 #
 # $$M_\text{within} = \sigma_\text{trial}^2 + \sigma_\text{own}^2, \qquad
 # M_\text{between} = M_\text{within} + T\,\sigma_\text{subject}^2,$$
 #
-# and σ_own is known, because every fit has its own standard error. The driver's error is in neither
-# of them.
+# The standard errors of the fits give σ_own. Neither mean square contains the error of the driver.
 
 
 # %%
@@ -120,14 +118,14 @@ def components(condition, element):
     value = np.asarray(getattr(part.circuit, element))
     shared = np.mean(part.fit.shared_cov[:, i, i] / value**2)
     own = np.mean(part.cov[:, i, i] / value**2) - shared
-    y = np.log(value).reshape(SUBJECTS, TRIALS)  # a file gives recordings in order of their paths
+    y = np.log(value).reshape(SUBJECTS, TRIALS)  # recordings of a file are sorted by path
     within = y.var(axis=1, ddof=1).mean()
     between = TRIALS * y.mean(axis=1).var(ddof=1)
     return np.array([(between - within) / TRIALS, within - own, own, shared])
 
 
 def true_components(condition, element):
-    """The same of the elements that were simulated."""
+    """Variances of the logarithm of a simulated element: subjects, trials."""
     paths = fits.where(condition=condition).labels["path"]
     y = np.log([truth[path][element] for path in paths]).reshape(SUBJECTS, TRIALS)
     within = y.var(axis=1, ddof=1).mean()
@@ -163,12 +161,13 @@ for axis, condition in zip(axes, TYPICAL, strict=True):
 axes[0].set_ylabel("standard deviation [%]")
 axes[1].legend(fontsize=8, ncols=2)
 # %% [markdown]
-# Spreads of R_s between trials are noise and nothing else, and the estimate says so. `between` of
-# `summary` is the same for one subject.
+# The spread of R_s between trials is only noise, and the estimate shows this. `between` of
+# `summary` is the same quantity for one subject.
 #
 # ## The error that no spread shows
-# All 96 fits rest on one driver, and its error moves them together. Only because the truth is known
-# here can it be seen: the mean error of 48 fits should be a seventh of the noise, and is not.
+# All 96 fits use one driver, and its error moves them in the same direction. We can see this error
+# only because the truth is known here. Noise alone would give 48 fits a mean error of a seventh of
+# the noise; the mean error is larger.
 
 # %%
 print("mean error of 48 fits [%]   found   noise of a mean   driver")
@@ -187,11 +186,11 @@ for condition, element in CASES:
     )
 
 # %% [markdown]
-# ## What the next study needs
-# The mean over all subjects is as uncertain as its parts make it: σ_subject² / S from people,
-# (σ_trial² + σ_own²) / ST from trials and noise, and the whole of the driver's variance, which no
-# number of subjects or trials reduces. What does reduce it: a longer calibration, one more
-# resistor, or `etid.identify_jointly`. The tolerance of the resistor comes on top.
+# ## The size of the next study
+# The variance of the mean over all subjects has three parts: σ_subject² / S from people,
+# (σ_trial² + σ_own²) / ST from trials and noise, and the full variance of the driver. More subjects
+# or trials do not reduce the variance of the driver. A longer calibration, one more resistor or
+# `etid.identify_jointly` reduce it. The tolerance of the resistor must be added.
 
 # %%
 print("standard errors of the means, dry [%]:   r_s     r_p     c_p")
@@ -205,8 +204,8 @@ for subjects, trials_each in ((8, 6), (8, 60), (80, 6)):
     )
 
 # %% [markdown]
-# More trials of the same people are worth nothing here. And eight people tell a spread between
-# people only to within a factor: with S − 1 degrees of freedom, its 95 % interval is
+# More trials of the same people do not help here. Eight people determine the spread between people
+# only roughly: with S − 1 degrees of freedom, its 95 % interval is
 
 # %%
 QUANTILES = scipy.stats.chi2.ppf([0.025, 0.975], SUBJECTS - 1)
@@ -216,11 +215,11 @@ for element, population in zip(ELEMENTS, BETWEEN_SUBJECTS, strict=True):
 
 # %% [markdown]
 # ## What must hold
-# Estimates are compared with the spreads that were really drawn, so that only measurement parts
-# them. With ν = S (T − 1) degrees of freedom the variance of σ_trial² is
-# (2σ_own⁴ + 4σ_own²σ_trial²) / ν, and that of σ_subject² is 4σ_subject² (σ_own² / T +
-# σ_driver²) / (S − 1) at most. Four standard errors: once in 16 000 by chance. With the noise left
-# in, the same test fails.
+# The estimates are compared with the spreads of the elements that were drawn, so they differ only
+# by measurement errors. With ν = S (T − 1) degrees of freedom, the variance of σ_trial² is
+# (2σ_own⁴ + 4σ_own²σ_trial²) / ν. The variance of σ_subject² is at most
+# 4σ_subject² (σ_own² / T + σ_driver²) / (S − 1). The limit of four standard errors is exceeded once
+# in 16 000 by chance. Without the subtraction of the noise, the same test fails.
 
 # %%
 assert fits.counts() == {"successful": SUBJECTS * TRIALS * len(TYPICAL)}
@@ -233,7 +232,7 @@ for case in CASES:
     assert abs(trial - true_trial) < 4 * of_trial, case
     assert abs(subject - true_subject) < 4 * of_subject < 0.5 * true_subject, case
     if true_trial == 0:
-        assert trial + own > 3 * of_trial, case  # the spread as it is: 4.5 are to be expected
+        assert trial + own > 3 * of_trial, case  # the spread with its noise; 4.5 is expected
     error, noise, driver = common[case]
     assert abs(error) < 4 * np.hypot(noise, driver), case
-assert max(abs(error) / noise for error, noise, _ in common.values()) > 5  # no noise, but a driver
+assert max(abs(error) / noise for error, noise, _ in common.values()) > 5  # the driver, not noise

@@ -34,9 +34,9 @@ SEED = 0
 
 # %% [markdown]
 # ## Two circuits
-# A circuit is a class with named parameters, each with a unit and a typical value where fits start,
-# and one method, which connects elements. Stratum corneum and the living skin below it are two
-# relaxations in series:
+# A circuit is a class with named parameters and one method, which connects elements. Each parameter
+# has a unit and a typical value, where fits start. The stratum corneum and the living skin below it
+# are two relaxations in series:
 
 
 # %%
@@ -54,9 +54,9 @@ class SkinTwoLayer(etid.AbstractCircuit):
 
 
 # %% [markdown]
-# Cole (1940) found that the relaxation of membranes is spread over time constants,
+# Cole (1940) found that the relaxation of membranes is distributed over time constants:
 # R / (1 + (jωτ)^α) with α below 1. No filter with a finite number of coefficients has this
-# impedance; at the harmonics of the pulses it is exact.
+# impedance. etid evaluates it exactly at the harmonics of the pulses.
 
 
 # %%
@@ -80,8 +80,8 @@ etid.plot(truth)
 
 # %% [markdown]
 # ## Recordings
-# A load of a scene may be any circuit. With your own recordings, `etid.read("study.h5")` takes the
-# place of this cell.
+# Any circuit can be a load of a scene. For your own recordings, replace this cell by
+# `study = etid.read("study.h5")`.
 
 # %%
 trials = tuple(etid.scenes.Trial(name, circuit) for name, circuit in truth.items())
@@ -93,8 +93,8 @@ study
 
 # %% [markdown]
 # ## Elements with standard errors
-# Nothing else has to be said of a circuit: the fit, its gradients, the covariance and the units
-# follow from its ten lines. It starts at the typical values.
+# The ten lines of a circuit are enough: the fit, its gradients, the covariance and the units follow
+# from them. The fit starts at the typical values.
 
 # %%
 layers = etid.identify_skin(study["two layers"], driver, circuit=SkinTwoLayer())
@@ -105,16 +105,17 @@ spread = etid.identify_skin(study["Cole"], driver, circuit=SkinCole())
 print(spread)
 
 # %% [markdown]
-# What rings in the residual at the edges lies near half the sample rate, where the recording holds
-# what has aliased; the fit itself leaves that out.
+# The residual rings at the edges, with a frequency near half the sample rate. There the recording
+# contains aliases. The fit does not use these frequencies.
 
 # %%
 etid.plot(spread, study["Cole"], driver)
 
 # %% [markdown]
-# ## Could it be known better?
-# The Cramer-Rao bound of the scene is the smallest standard error of any unbiased estimator that
-# has no model of the driver. A fit, which has one, comes close to it or is a little better.
+# ## Comparison with the bound
+# The Cramer-Rao bound of the scene is the smallest standard error of any unbiased estimator without
+# a model of the driver. A fit has a model of the driver. It comes close to the bound or is slightly
+# better.
 
 # %%
 bounds = etid.bound(scene)
@@ -125,9 +126,9 @@ for name, fit in {"two layers": layers, "Cole": spread}.items():
 
 # %% [markdown]
 # ## Is it the right circuit?
-# **Too small.** With one RC for the skin of two layers, or for Cole's, R_s would be off by 10 and
-# 45 %. The verdict says that the circuit cannot be it: `misfit`; or `inconsistent` where the fit
-# had to bend the impedance of the driver to come near.
+# **Too small.** One RC gives an error of R_s of 10 % for the skin of two layers, and of 45 % for
+# Cole's. The verdict rejects the circuit: `misfit`, or `inconsistent` if the fit had to change the
+# impedance of the driver to explain the recording.
 
 # %%
 small = {
@@ -138,9 +139,9 @@ for name, fit in small.items():
     print(f"{'':<12} R_s {float(fit.circuit.r_s) / 1e3:.1f} kΩ, in truth 33.4 kΩ\n")
 
 # %% [markdown]
-# **Too large.** Two layers for skin that is one RC: the recording does not tell the layers apart,
-# their standard errors exceed their values, and the verdict is `insensitive`. Cole's circuit is not
-# too large, for α = 1 is one RC; α is found to be 1 within its error.
+# **Too large.** With a circuit of two layers for skin that is one RC, the recording does not
+# separate the layers. Their standard errors exceed their values, and the verdict is `insensitive`.
+# Cole's circuit is not too large, because α = 1 is one RC. The fit finds α = 1 within its error.
 
 # %%
 large = etid.identify_skin(study["one RC"], driver, circuit=SkinTwoLayer(), throw=False)
@@ -152,22 +153,22 @@ print(one)
 
 # %% [markdown]
 # ## To other programs
-# `etid.netlist` writes a subcircuit that any SPICE simulates, to be used as `X1 out 0 skin`.
+# `etid.netlist` writes a subcircuit for every SPICE simulator. Use it as `X1 out 0 skin`.
 
 # %%
 netlist = etid.netlist(layers.circuit, name="skin")
 print(netlist)
 
 # %% [markdown]
-# SPICE has no constant phase. A chain of resistors and capacitors takes its place, within 0.01 % of
-# its impedance from 1 Hz to 10 MHz:
+# SPICE has no constant-phase element. A chain of resistors and capacitors replaces it, with an
+# error below 0.01 % of its impedance from 1 Hz to 10 MHz:
 
 # %%
 chain = etid.netlist(spread.circuit, name="skin")
 print(*chain.splitlines()[:12], "…", sep="\n")
 
 # %% [markdown]
-# `etid.circuit_string` is the notation of impedance.py, for
+# `etid.circuit_string` gives the circuit in the notation of impedance.py, for
 # `CustomCircuit(string, initial_guess=values)`.
 
 # %%

@@ -13,9 +13,9 @@
 # %% [markdown]
 # # When methods fail
 #
-# At the end you will have seen seven ways to get a wrong answer, some of them from fits that look
-# perfect, and what etid says to each. A residual does not show a wrong circuit, and a small
-# RRSE does not show a right one: what counts is the noise of the record, and the verdict.
+# This notebook shows seven ways to get a wrong answer, and the verdict of etid for each. Some of the
+# wrong fits look perfect. A residual does not show a wrong circuit, and a small RRSE does not show a
+# right one. Compare the residual with the noise of the record, and read the verdict.
 
 # %%
 # %matplotlib inline
@@ -40,8 +40,8 @@ PAPER = "steiglitz_mcbride"
 
 # %% [markdown]
 # ## Recordings without fault
-# Sixteen trials of one damp fingertip at 40 dB. Nothing is wrong with them, and the default method
-# finds the elements within their standard errors. All that follows is compared with this.
+# These are sixteen trials of one damp fingertip at 40 dB, without any fault. The default method
+# finds the elements within their standard errors. All later cases are compared with this one.
 
 # %%
 good = Scene(
@@ -52,7 +52,11 @@ good = Scene(
 
 
 def identified(scene, method=None, order=5, calibrated=None):
-    """Fits of all trials of a scene, and their driver; `calibrated` is a scene of its own."""
+    """Fits of all trials of a scene, their driver, and the study.
+
+    `calibrated` is another scene for the calibration; without it, the scene's own calibration is
+    used.
+    """
     study = scene.simulate(SEED)
     records = study if calibrated is None else calibrated.simulate(SEED + 1)
     driver = etid.identify_driver(records["calibration"], order=order, method=method, throw=False)
@@ -68,7 +72,7 @@ CASES = {}
 
 
 def tell(name, fits):
-    """Keep a case; print its errors, what it says of them, and its verdicts."""
+    """Keep a case; print its verdicts, its errors and its standard errors."""
     CASES[name] = fits
     mean, stderr = 100 * errors(fits).mean(axis=0), 100 * np.asarray(fits.stderr.values()) / TRUTH
     said = np.nanmedian(stderr, axis=0) if np.isfinite(stderr).any() else np.full(3, np.nan)
@@ -86,9 +90,9 @@ axes = etid.plot(fits[0], study["damp/00"], driver)
 
 # %% [markdown]
 # ## 1. Bias: the paper's method
-# Steiglitz-McBride filters both records and solves a linear problem. The noise of V_out stands on
-# both sides of it, so its answer is off, in every trial by as much and in the same direction: no
-# average over trials helps.
+# Steiglitz-McBride filters both records and solves a linear problem. The noise of V_out is on both
+# sides of this problem, so the result is biased. The bias is the same in every trial, so the mean
+# over trials does not reduce it.
 
 # %%
 paper, paper_driver, _ = identified(good, PAPER)
@@ -96,9 +100,9 @@ tell("Steiglitz-McBride", paper)
 
 # %% [markdown]
 # ## 2. Trigger delay
-# A tenth of a sample, 500 ns, between the unloaded and the loaded record looks like a phase, and a
-# phase looks like a capacitor. Steiglitz-McBride knows no delay: its C_p now spreads. The default
-# method fits the delay of each record and loses next to nothing.
+# A delay of a tenth of a sample, 500 ns, between the unloaded and the loaded record looks like a
+# phase, and a phase looks like a capacitor. Steiglitz-McBride does not fit delays, so its C_p
+# spreads. The default method fits the delay of each record and loses almost nothing.
 
 # %%
 late = dataclasses.replace(good, trigger_jitter_rms=500e-9)
@@ -111,8 +115,8 @@ for name, some in (("default", late_fits), ("Steiglitz-McBride", late_paper)):
 
 # %% [markdown]
 # ## 3. Clipping
-# The converter's range ends below the top of the pulse. Every sample is a number, and a fit would
-# run. It is not tried: the codes at the end of the range say what happened.
+# The range of the converter ends below the top of the pulse. Every sample is a number, so a fit
+# would run. etid does not try it, because the codes at the end of the range show the clipping.
 
 # %%
 narrow = dataclasses.replace(good, full_scale=2.4)
@@ -125,10 +129,10 @@ axes = etid.plot(narrow.simulate(SEED)["damp/00"])
 
 # %% [markdown]
 # ## 4. Skin that is not one R_p ‖ C_p
-# A relaxation that is spread over time constants (Cole, α = 0.9). The best R_s + R_p ‖ C_p leaves
-# a residual that over the whole record has the size of the noise, χ² is 1.1, and R_s is off by
-# 40 %. What gives it away: Z_th has to bend to make up for it, against the calibration
-# (`inconsistent`), or a test for just this spread sees it
+# This skin has a relaxation that is distributed over time constants (Cole, α = 0.9). The best fit of
+# R_s + R_p ‖ C_p leaves a residual that has the size of the noise over the whole record. χ² is 1.1,
+# but the error of R_s is 40 %. Two things show the wrong circuit. The fit changes Z_th against the
+# calibration (`inconsistent`), or a test for this kind of relaxation detects it
 # (`etid.estimators.score_tests.other_circuit`, `misfit`).
 
 
@@ -147,8 +151,8 @@ axes = etid.plot(spread_fits[0], spread_study["damp/00"], spread_driver)
 
 # %% [markdown]
 # ## 5. A driver that has changed
-# Between the calibration and the recordings its protection resistor has grown by a third. A skin
-# would have to make up for that, and cannot: it would need another Z_th than the calibration's.
+# Between the calibration and the recordings, the protection resistor of the driver has increased by
+# a third. No skin can compensate for this: the recordings need another Z_th than the calibration.
 
 # %%
 warm = TransformerDriver(r_protection=TransformerDriver().r_protection * 4 / 3)
@@ -157,12 +161,13 @@ changed_fits, *_ = identified(changed, calibrated=good)
 tell("another driver", changed_fits)
 
 # %% [markdown]
-# Not every change is seen: one of a few per cent passes as a success, and costs one per cent. To
-# calibrate again at the end of a session is the only remedy.
+# Not every change is detected. A change of a few per cent can pass as a success, with an error of
+# one per cent. The only remedy is to calibrate again at the end of a session.
 #
 # ## 6. A driver of too low an order
-# With three poles instead of six the calibration is explained down to its noise, χ² is 1, and all
-# skins behind it are wrong. Here at 60 dB, where it matters.
+# A driver with three poles instead of six explains the calibration down to its noise. χ² is 1, but
+# all skins that are identified with this driver are wrong. The example has 60 dB, where this error
+# is larger than the noise.
 
 # %%
 quiet = dataclasses.replace(good, snr_db=60.0)
@@ -172,8 +177,8 @@ tell("order 3", low_fits)
 
 # %% [markdown]
 # ## 7. Too little in the record
-# At 10 dB the record does not determine R_s. What comes out is some number, whose standard error is
-# as large as itself, and so the verdict is not a success. The bound has known it before.
+# At 10 dB the record does not determine R_s. The standard error is as large as the value, so the
+# verdict is not a success. The bound predicts this before the recording.
 
 # %%
 poor = dataclasses.replace(good, snr_db=10.0)
@@ -183,10 +188,11 @@ print(etid.bound(poor)["damp/00"])
 
 # %% [markdown]
 # ## RRSE is blind
-# All of them at a glance, over the RRSE by which fits are commonly judged. At 40 dB, records
-# without fault have an RRSE of 1 %. So have those of another skin and of another driver, which are
-# wrong by tens of per cent; Steiglitz-McBride's is twice as large, and its R_s is nearer. The order
-# 3 at 60 dB has the smallest of all, and errs by seven standard errors.
+# The picture shows the errors of all cases over the RRSE, the usual measure of a fit. At 40 dB, fits
+# of records without fault have an RRSE of 1 %. The fits of another skin and of another driver have
+# the same RRSE, but are wrong by tens of per cent. The RRSE of Steiglitz-McBride is twice as large,
+# but its R_s is nearer to the truth. The driver of order 3 at 60 dB has the smallest RRSE of all,
+# but its error is seven standard errors.
 
 # %%
 figure, axis = plt.subplots(figsize=(8, 4), layout="constrained")
@@ -207,7 +213,8 @@ plt.show()
 
 # %% [markdown]
 # ## What must hold
-# Successes are right: five of their standard errors, 1 in 10⁶ by chance. What is wrong says so.
+# Successful fits are right within five of their standard errors (exceeded 1 in 10⁶ by chance). The
+# verdict of a wrong fit is never `successful`.
 
 # %%
 for name in ("default", "default, late trigger"):

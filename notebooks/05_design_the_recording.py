@@ -13,9 +13,10 @@
 # %% [markdown]
 # # Design the recording
 #
-# At the end you will know how many pulses, of which width, height and rate, at which sample rate
-# and after which calibration, determine R_s to 1 % in dry and in damp skin: before anything is
-# recorded, from the Cramér-Rao bound. And that the bound tells the truth.
+# This notebook designs a recording that determines R_s to 1 % in dry and in damp skin. The
+# Cramér-Rao bound predicts the error before anything is recorded. From it follow the number of
+# pulses, their width, height and rate, the sample rate, and the calibration. At the end a
+# simulation shows that the bound is right.
 
 # %%
 # %matplotlib inline
@@ -43,10 +44,10 @@ STYLE = {"dry": "o-", "damp": "s--"}
 
 # %% [markdown]
 # ## A recording that does not exist yet
-# What decides: the pulse, the sample rate, the length, the noise, the calibrations. The noise is
-# that of your own recorder, in volts, whatever the pulse. 0.1 V is 40 dB below the pulses of the
-# paper; all durations below go with the square of it. The pulses are those of `TransformerDriver`:
-# put your own driver there.
+# The error depends on the pulse, the sample rate, the length, the noise and the calibrations. The
+# noise is that of your own recorder, in volts, and does not depend on the pulse. 0.1 V is 40 dB
+# below the pulses of the paper. All durations below are proportional to the square of the noise.
+# The pulses are those of `TransformerDriver`; replace it by your own driver.
 
 
 # %%
@@ -77,13 +78,13 @@ axes = etid.plot(today)
 
 # %% [markdown]
 # ## How many pulses?
-# Pulses add up: twice the record has half the variance. So one bound tells the duration for any
-# error.
+# The information of pulses adds up: a record of twice the length has half the variance. So one
+# bound gives the duration for any error.
 
 
 # %%
 def seconds(scene, **options):
-    """How long a record must be for the goal, by skin [s]."""
+    """Duration of a record that reaches the goal, by skin [s]."""
     bounds = etid.bound(scene, **options)
     length = scene.samples / scene.sample_rate
     return {name: length * (bounds[f"{name}/000"].relative["r_s"] / GOAL) ** 2 for name in SKIN}
@@ -93,15 +94,15 @@ for name, t in seconds(recording()).items():
     print(f"{name:<5}{t:5.2f} s, {60 * t:4.1f} pulses")
 
 # %% [markdown]
-# ## What calibrations and a trigger bring
-# Most of the variance is the driver's: a trial can be no better than the calibration that it rests
-# on. Three ways out:
-# - **A second resistor**, well below the first. One alone leaves the delay of its own record open,
-#   and every skin has to tell that delay from its own elements.
-# - **Long calibrations.** They are recorded once, with nobody at the electrodes. Z_th is known then
-#   as far as trials of a second can tell.
-# - **A known delay**, from a trigger that starts the pulse and the converter by one clock. Else
-#   every record has an unknown delay of its own.
+# ## The effect of calibrations and a trigger
+# Most of the variance comes from the driver: a trial cannot be better than its calibration. There
+# are three remedies:
+# - **A second resistor**, much smaller than the first. A single resistor leaves the delay of its own
+#   record open. Every skin fit must then separate this delay from the elements of the skin.
+# - **Long calibrations.** They are recorded once, without a person. For trials of a second, Z_th is
+#   then as good as known.
+# - **A known delay**, from a trigger that starts pulse and converter by one clock. Otherwise every
+#   record has its own unknown delay.
 
 # %%
 one, two = recording(), recording(resistors=(98.8e3, 21.62e3))
@@ -132,8 +133,8 @@ axes[0].legend(frameon=False, fontsize=8)
 plt.show()
 
 # %% [markdown]
-# How long is long? Four times the trial, with two resistors, is within a tenth of what endless
-# calibrations give; with one resistor it takes sixteen times.
+# How long must calibrations be? With two resistors, four times the length of a trial gives an error
+# within a tenth of that of endless calibrations. With one resistor, sixteen times are necessary.
 
 # %%
 known = etid.bound(two, known_driver=True)["damp/000"].relative["r_s"]
@@ -146,10 +147,10 @@ for resistors in ((98.8e3,), (98.8e3, 21.62e3)):
 
 # %% [markdown]
 # ## Which pulse?
-# What limits it is the skin. For short pulses the charge of a pulse decides whether it is felt
-# (Weiss, 1901); current, and charge per second, are matters of safety. Here the pulses of the paper
-# are the limit: nothing may exceed them. Put your own limits there. A transformer passes no direct
-# current, so the charge that enters during a pulse leaves after it; we count what enters.
+# The person limits the pulse. For short pulses, the charge of a pulse decides whether a person feels
+# it (Weiss, 1901). Current and charge per second matter for safety. Here the pulses of the paper are
+# the limit; replace them by your own limits. A transformer passes no direct current, so the charge
+# that enters during a pulse leaves after it. We count the charge that enters.
 
 
 # %%
@@ -175,12 +176,12 @@ for name, (peak, pulse, second) in limits.items():
     )
 
 # %% [markdown]
-# R_s is the impedance at the highest frequencies, and these are in the edges. What lies between two
-# edges carries charge, but tells nothing of R_s, down to the 40 µs that the ringing of the edges
-# takes.
+# R_s is the impedance at the highest frequencies, and the edges contain these frequencies. The part
+# between two edges carries charge, but no information about R_s. This holds for widths down to
+# 40 µs, the duration of the ringing after an edge.
 
 # %%
-RATE = 240.0  # [Hz] with a fraction of a sample in a period, which tells aliases from harmonics
+RATE = 240.0  # [Hz] a period is not a whole number of samples, which separates the aliases
 widths = np.array([10, 20, 40, 80, 160, 320, 0.04 / 60 * 1e6]) * 1e-6
 pulses = [recording(width, rate=RATE) for width in widths]  # the same edges, whatever the rate
 each = [seconds(scene, known_driver=True) for scene in pulses]
@@ -199,8 +200,8 @@ for axis in axes:
 plt.show()
 
 # %% [markdown]
-# So make pulses short, and spend what is left of the charge on their number, up to the rate that
-# brings the charge per second back to the limit, or to what shall be felt.
+# So use short pulses, and use the saved charge for more pulses. Increase the rate until the charge
+# per second reaches its limit, or until the sensation is as strong as intended.
 
 # %%
 print("width     rate, charge per second as before     time to 1 %, damp")
@@ -211,9 +212,9 @@ for width, t, *q in zip(widths, each, charge["dry"], charge["damp"], strict=True
     print(f"{1e6 * width:4.0f} µs  {rate:6.0f} Hz {fastest[round(1e6 * width)]:36.1f} ms")
 
 # %% [markdown]
-# Height counts twice: the error falls in proportion to it, but only with the square root of the
-# number of pulses. One pulse of twice the height is worth four, with half of their charge, until
-# the peak of the current sets the limit.
+# Height matters more than number: the error is inversely proportional to the height, but only to
+# the square root of the number of pulses. One pulse of twice the height replaces four pulses, with
+# half of their charge. The limit of the peak current limits the height.
 
 # %%
 higher = seconds(recording(40e-6, RATE, height=2.0), known_driver=True)
@@ -222,9 +223,9 @@ print(f"twice the height: {fewer:.2f} times fewer pulses, each with twice the ch
 
 # %% [markdown]
 # ## Which sample rate?
-# A faster converter sees more of the edges, but passes more noise. Where the noise is that of an
-# amplifier, it grows with the square root of the band (left); where it is the converter's own, a
-# sample has the same at any rate (right).
+# A faster converter records more of the edges, but also more noise. The noise of an amplifier grows
+# with the square root of the bandwidth (left). The noise of the converter itself is the same for
+# every sample at any rate (right).
 
 # %%
 print("seconds to 1 % on R_s     amplifier's noise     converter's noise")
@@ -239,11 +240,11 @@ for sample_rate in (50e3, 100e3, 200e3, 500e3, 1e6):
     print(f"{1e-3 * sample_rate:8.0f} kHz, dry and damp " + cells)
 
 # %% [markdown]
-# ## The recording, and whether the bound tells the truth
-# Twelve pulses of 40 µs at 240 Hz, 50 ms in all, where it would be 640 ms now; calibrated with two
-# resistors, two records of each. Three such sessions are simulated, each with twenty trials of both
-# skins, and identified. If the bound is right and the estimator reaches it, errors in units of the
-# bound have a mean square of 1.
+# ## The recording, and a test of the bound
+# The design has twelve pulses of 40 µs at 240 Hz, 50 ms in total; the paper's pulses would need
+# 640 ms. The calibration has two resistors with two records each. Three such sessions are simulated
+# and identified, each with twenty trials of both skins. If the bound is right and the estimator
+# attains it, the errors divided by the bound have a mean square of 1.
 
 # %%
 SESSIONS, TRIALS = 3, 20
@@ -269,17 +270,17 @@ for name, row in zip(order, square, strict=True):
 
 # %% [markdown]
 # ## What must hold
-# The error of a session's driver is in all its trials, about a fifth of their variance. The mean
+# All trials of a session share the error of its driver, about a fifth of their variance. The mean
 # square over three sessions of twenty trials has a standard deviation of
-# √(2/3 (1/5² + (1 − 1/5²)/20)), 0.24; three of them for each of the six numbers.
+# √(2/3 (1/5² + (1 − 1/5²)/20)), 0.24. The limit for each of the six numbers is three of them.
 
 # %%
 assert set(verdicts) == {"successful"}
 assert (abs(square - 1) < 3 * 0.24).all()
 r_s = np.sqrt(np.mean(np.square(errors), axis=(0, 2)))[:, 0]
-assert (r_s < 1.5 * GOAL).all(), r_s  # 1 %, as far as 60 trials tell
+assert (r_s < 1.5 * GOAL).all(), r_s  # 1 %, as well as 60 trials can show
 assert all(promised[f"{name}/000"].relative["r_s"] < 1.2 * GOAL for name in SKIN)
-# What the text says.
+# The statements of the text.
 assert excess[2, 4] < 1.1 < excess[1, 4]
 assert excess[1, 16] < 1.1
 assert all(ways["two resistors"][name] < 0.7 * ways["one resistor"][name] for name in SKIN)
