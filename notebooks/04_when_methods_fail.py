@@ -13,9 +13,9 @@
 # %% [markdown]
 # # When methods fail
 #
-# This notebook shows seven ways to get a wrong answer, and the verdict of etid for each. Some of the
-# wrong fits look perfect. A residual does not show a wrong circuit, and a small RRSE does not show a
-# right one. Compare the residual with the noise of the record, and read the verdict.
+# This notebook shows seven ways to get a wrong answer, and the verdict of etid for each. Some of
+# the wrong fits look perfect. A residual does not show a wrong circuit, and a small RRSE does not
+# show a right one. Compare the residual with the noise of the record, and read the verdict.
 
 # %%
 # %matplotlib inline
@@ -129,10 +129,10 @@ axes = etid.plot(narrow.simulate(SEED)["damp/00"])
 
 # %% [markdown]
 # ## 4. Skin that is not one R_p ‖ C_p
-# This skin has a relaxation that is distributed over time constants (Cole, α = 0.9). The best fit of
-# R_s + R_p ‖ C_p leaves a residual that has the size of the noise over the whole record. χ² is 1.1,
-# but the error of R_s is 40 %. Two things show the wrong circuit. The fit changes Z_th against the
-# calibration (`inconsistent`), or a test for this kind of relaxation detects it
+# This skin has a relaxation that is distributed over time constants (Cole, α = 0.9). The best fit
+# of R_s + R_p ‖ C_p leaves a residual that has the size of the noise over the whole record. χ² is
+# 1.1, but the error of R_s is 40 %. Two things show the wrong circuit. The fit changes Z_th against
+# the calibration (`inconsistent`), or a test for this kind of relaxation detects it
 # (`etid.estimators.score_tests.other_circuit`, `misfit`).
 
 
@@ -188,11 +188,11 @@ print(etid.bound(poor)["damp/00"])
 
 # %% [markdown]
 # ## RRSE is blind
-# The picture shows the errors of all cases over the RRSE, the usual measure of a fit. At 40 dB, fits
-# of records without fault have an RRSE of 1 %. The fits of another skin and of another driver have
-# the same RRSE, but are wrong by tens of per cent. The RRSE of Steiglitz-McBride is twice as large,
-# but its R_s is nearer to the truth. The driver of order 3 at 60 dB has the smallest RRSE of all,
-# but its error is seven standard errors.
+# The picture shows the errors of all cases over the RRSE, the usual measure of a fit. At 40 dB,
+# fits of records without fault have an RRSE of 1 %. The fits of another skin and of another driver
+# have the same RRSE, but are wrong by tens of per cent. The RRSE of Steiglitz-McBride is twice as
+# large, but its R_s is nearer to the truth. The driver of order 3 at 60 dB has the smallest RRSE of
+# all, but its error is seven standard errors.
 
 # %%
 figure, axis = plt.subplots(figsize=(8, 4), layout="constrained")

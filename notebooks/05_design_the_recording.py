@@ -97,8 +97,8 @@ for name, t in seconds(recording()).items():
 # ## The effect of calibrations and a trigger
 # Most of the variance comes from the driver: a trial cannot be better than its calibration. There
 # are three remedies:
-# - **A second resistor**, much smaller than the first. A single resistor leaves the delay of its own
-#   record open. Every skin fit must then separate this delay from the elements of the skin.
+# - **A second resistor**, much smaller than the first. A single resistor leaves the delay of its
+#   own record open. Every skin fit must then separate this delay from the elements of the skin.
 # - **Long calibrations.** They are recorded once, without a person. For trials of a second, Z_th is
 #   then as good as known.
 # - **A known delay**, from a trigger that starts pulse and converter by one clock. Otherwise every
@@ -147,10 +147,10 @@ for resistors in ((98.8e3,), (98.8e3, 21.62e3)):
 
 # %% [markdown]
 # ## Which pulse?
-# The person limits the pulse. For short pulses, the charge of a pulse decides whether a person feels
-# it (Weiss, 1901). Current and charge per second matter for safety. Here the pulses of the paper are
-# the limit; replace them by your own limits. A transformer passes no direct current, so the charge
-# that enters during a pulse leaves after it. We count the charge that enters.
+# The person limits the pulse. For short pulses, the charge of a pulse decides whether a person
+# feels it (Weiss, 1901). Current and charge per second matter for safety. Here the pulses of the
+# paper are the limit; replace them by your own limits. A transformer passes no direct current, so
+# the charge that enters during a pulse leaves after it. We count the charge that enters.
 
 
 # %%
