@@ -69,6 +69,7 @@ def on_the_command_line(folder):
     found = command("fit", study, "-o", fits)
     assert found["verdicts"] == {"successful": 10}, found
     assert etid.Fits.read(fits).counts() == found["verdicts"]
+    command("report", fits, "-o", folder / "report.html")
     assert "no such file" in command("fit", folder / "absent.h5", "-o", fits, status=1)["error"]
     wrong = subprocess.run([PROGRAM, "fit"], capture_output=True, check=False)
     assert wrong.returncode == 2

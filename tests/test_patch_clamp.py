@@ -17,7 +17,7 @@ import scipy.signal
 from etid.circuits.circuit import SkinRC
 from etid.results.driver import realise
 from etid.signals.filtering import StateSpace, hold, simulate
-from etid.signals.transfer import Rational
+from etid.signals.transfer import Rational, multiply_polynomials
 from etid.solvers.levenberg_marquardt import LevenbergMarquardt
 
 SAMPLE_RATE = 20e3  # [Hz]
@@ -52,8 +52,10 @@ def predicted_current(parameters, steps, time):
     circuit = SkinRC(1.0, 1.0, 1.0).with_log_values(parameters[:3])
     omega = 2 * jnp.pi * jnp.exp(parameters[3])
     scale = omega ** -jnp.arange(5.0)
-    bessel = Rational(jnp.asarray(NUM), jnp.asarray(DEN[::-1].copy()) * scale)
-    system = realise(circuit.impedance().rational().reciprocal().multiply(bessel), RATE)
+    den = jnp.asarray(DEN[::-1].copy()) * scale
+    z = circuit.impedance().rational()
+    admittance = Rational(z.den * NUM[0], multiply_polynomials(z.num, den))
+    system = realise(admittance, RATE)
     # The first column of `hold` is the response to a constant. A step that comes `delay` after a
     # sample acts for the rest of that interval, then for whole ones.
     whole = hold(system, SAMPLE_RATE)

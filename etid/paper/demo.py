@@ -216,7 +216,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     sections = [
         Section(
             "Table I: errors of five resistors [%]",
-            "Output error identifies one resistor. Steiglitz-McBride identifies eq. 7, whose "
+            "Maximum likelihood identifies one resistor. Steiglitz-McBride identifies eq. 7, whose "
             "resistance is R_s + R_p.",
             (table_1(outcomes),),
         ),

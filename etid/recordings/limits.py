@@ -16,7 +16,6 @@ DEPTH = 50  # groups inside each other, or tables and lists of a mapping; Python
 LINKS = 20  # soft links that lead from one to the next
 ATTRIBUTES = 1000  # of one group or dataset; the schema has 13
 ATTRIBUTE = 1 << 24  # bytes of one attribute: labels of TRIALS trials
-TEXT = 1 << 16  # characters of a label or of the name of a channel
 COLUMNS = 1000  # of a table
 MAPPING = 1 << 22  # bytes of a mapping file
 FITS = 1 << 24  # rows of a file of fits

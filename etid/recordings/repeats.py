@@ -25,6 +25,7 @@ import numpy as np
 from jaxtyping import Complex, Float
 
 from etid.recordings.preflight import Inspected
+from etid.signals.harmonics import fast_length
 from etid.signals.measurement import RIPPLE
 from etid.signals.pulse_train import RATE
 
@@ -95,7 +96,7 @@ class Bands(NamedTuple):
 def bands(sample_rate: float, pulse_rate: float) -> Bands:
     """The bands for a nominal pulse rate, whatever the clock makes of it."""
     length = int((1 - RATE) * sample_rate / pulse_rate)
-    size = _fast(length)
+    size = fast_length(length)
     count = int(BAND * size)
     edges = [*range(min(SINGLE, count))]
     while edges and edges[-1] * RATIO + 1 < count:
@@ -110,19 +111,6 @@ def bands(sample_rate: float, pulse_rate: float) -> Bands:
     joined = np.linalg.qr(np.concatenate([transforms.real, transforms.imag]))[0].T
     polynomials = joined[:, :count] + 1j * joined[:, count:]
     return Bands(length, size, edges, number, middle, polynomials.astype(np.complex64))
-
-
-def _fast(length: int) -> int:
-    """The next number without a prime factor above 5."""
-    size = length
-    while True:
-        rest = size
-        for factor in (2, 3, 5):
-            while rest % factor == 0:
-                rest //= factor
-        if rest == 1:
-            return size
-        size += 1
 
 
 def repeats(seen: Sequence[Inspected]) -> list[Repeats | None]:

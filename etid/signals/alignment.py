@@ -4,11 +4,10 @@ Two records with separate triggers may start hundreds of samples apart. This mod
 samples before a fit. The fit then estimates the rest, about half a sample, with the elements.
 """
 
-import math
-
 import numpy as np
 from jaxtyping import Complex, Float
 
+from etid.signals.harmonics import fast_length
 from etid.signals.pulse_train import PulseTrain, highest, rise_time, rises
 
 LAGS = 400  # [samples] largest lag, late or early
@@ -45,7 +44,7 @@ def lag_of(
     found = rises(v_out[start : first + reach + template.size + rise], rise)
     begin = start - (first - reach)
     where[begin : begin + found.size] = found
-    size = _fast(where.size)
+    size = fast_length(where.size)
     product = np.fft.rfft(where, size) * np.conj(np.fft.rfft(template, size))
     correlation = np.fft.irfft(product, size)[: 2 * reach + 1]
     if correlation.max() <= -correlation.min():
@@ -66,11 +65,6 @@ def shifted(
     if late < 0:
         return v_th[-late:], v_out[:late]
     return v_th[: v_th.size - late], v_out[late:]
-
-
-def _fast(size: int) -> int:
-    """Smallest 2ⁿ, 3 · 2ⁿ or 5 · 2ⁿ that is not below `size`: its Fourier transform is fast."""
-    return min(part << max(0, math.ceil(math.log2(size / part))) for part in (1, 3, 5))
 
 
 def rest(

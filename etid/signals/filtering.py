@@ -178,8 +178,8 @@ def lfilter(
 @functools.cache
 def _interpolation_kernel(cutoff: float, earliest: float, degree: int) -> np.ndarray:
     """Weights of the neighbours n−TAPS+1 … n+TAPS as polynomials in τ on [earliest, 1]."""
-    chebyshev = -np.cos(np.pi * (np.arange(4 * degree) + 0.5) / (4 * degree))
-    nodes = earliest + (1 - earliest) * (chebyshev + 1) / 2
+    points = np.polynomial.chebyshev.chebpts1(4 * degree)
+    nodes = earliest + (1 - earliest) * (points + 1) / 2
     distance = nodes[:, None] - np.arange(-TAPS + 1, TAPS + 1)[None, :]
     window = np.i0(10.0 * np.sqrt(np.maximum(0.0, 1 - (distance / TAPS) ** 2))) / np.i0(10.0)
     values = 2 * cutoff * np.sinc(2 * cutoff * distance) * window

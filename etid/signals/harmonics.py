@@ -175,3 +175,16 @@ def spectrum(
     highest = 0.5 if separates_aliases(periods, samples) else ALIASED
     selected = (frequency < highest * sample_rate) & (number <= count)
     return frequency, x, y, variance_x, variance_y, selected
+
+
+def fast_length(length: int) -> int:
+    """The next number without a prime factor above 5."""
+    size = length
+    while True:
+        rest = size
+        for factor in (2, 3, 5):
+            while rest % factor == 0:
+                rest //= factor
+        if rest == 1:
+            return size
+        size += 1

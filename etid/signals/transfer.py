@@ -1,4 +1,4 @@
-"""Rational functions: evaluation, product, sum, discretisation, poles, stability.
+"""Rational functions: evaluation, sum, poles, stability.
 
 Coefficients are stored in *ascending* powers of the variable. In z⁻¹ this is SciPy's order of `b`
 and `a`; in s it is the reverse of `scipy.signal`. Polynomials are multiplied with shifts, not with
@@ -73,41 +73,9 @@ class Rational(eqx.Module):
             multiply_polynomials(self.den, other.den),
         )
 
-    def multiply(self, other: "Rational") -> "Rational":
-        """The product `self · other`."""
-        return Rational(
-            multiply_polynomials(self.num, other.num), multiply_polynomials(self.den, other.den)
-        )
-
     def reciprocal(self) -> "Rational":
         """The reciprocal `1 / self`."""
         return Rational(self.den, self.num)
-
-
-def tustin(continuous: Rational, sample_rate: float) -> Rational:
-    """Discretise by the bilinear transform, s = 2 fs (1 − z⁻¹) / (1 + z⁻¹).
-
-    Args:
-        continuous: Rational function of s [rad/s].
-        sample_rate: Sampling rate fs [Hz].
-
-    Returns:
-        Rational function of z⁻¹ with `den[0] = 1`.
-    """
-    order = max(continuous.num.shape[0], continuous.den.shape[0]) - 1
-
-    def substitute(p: Float[Array, " p"]) -> Float[Array, " order1"]:
-        total = jnp.zeros(order + 1, p.dtype)
-        for k in range(p.shape[0]):
-            term = jnp.ones(1, p.dtype)
-            for i in range(order):
-                sign = -1.0 if i < k else 1.0
-                term = multiply_polynomials(term, jnp.array([1.0, sign], p.dtype))
-            total = total + p[k] * (2 * sample_rate) ** k * term
-        return total
-
-    num, den = substitute(continuous.num), substitute(continuous.den)
-    return Rational(num / den[0], den / den[0])
 
 
 def frequency_variable(frequency: Float[Array, "..."]) -> Complex[Array, "..."]:
