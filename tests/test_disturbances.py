@@ -1,4 +1,4 @@
-"""A spike, a burst or a missing pulse in one of several periods: that period is left out."""
+"""A spike or a burst in one of several periods: that period is left out."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -121,6 +121,16 @@ def test_what_leaves_no_majority_of_equal_periods_is_not_left_out():
     assert Inspected(with_spike(with_spike(four, 0), 1, -0.2)).kept is None
     two = rung("dry", samples=6_667).simulate(1)[TRIAL]
     assert Inspected(with_spike(two, 1)).kept is None
+
+
+def test_another_pulse_of_the_source_is_no_disturbance():
+    """Both records show it, and the ratio of their harmonics is as without it."""
+    recording = rung("damp").simulate(1)[TRIAL]
+    later = {name: np.roll(getattr(recording, name), 5000) for name in ("v_th", "v_out")}
+    inside = (recording.time > 1.2 * PERIOD) & (recording.time < 1.8 * PERIOD)
+    both = {name: np.where(inside, later[name], getattr(recording, name)) for name in later}
+    assert Inspected(recording.replace(**both)).kept is None
+    assert Inspected(recording.replace(v_out=both["v_out"])).kept is not None
 
 
 def test_a_missing_pulse_and_a_touched_rail_are_left_out():

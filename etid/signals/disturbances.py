@@ -1,4 +1,4 @@
-"""Disturbed pulse periods of a record: periods with a spike, a burst or a missing pulse.
+"""Disturbed pulse periods of a record: periods with a spike or a burst.
 
 A movement of the hand can spoil one of several periods, and with it the average of all periods.
 Each period is compared with the median of all periods, after averaging over `MERGED` samples. A
@@ -27,9 +27,10 @@ def disturbed(
     spacing: float,
     periods: int,
 ) -> Bool[np.ndarray, " period"]:
-    """Whether each period is disturbed in at least one of several records of equal lengths.
+    """Whether each period is disturbed in one of two records of equal lengths, but not in both.
 
-    With fewer than three periods, the answer is no for all of them.
+    What both records show, a second pulse for instance, comes from the source. The ratio of the
+    records stays right. With fewer than three periods, the answer is no for all of them.
 
     Args:
         records: Voltages [V].
@@ -61,7 +62,8 @@ def disturbed(
     low = np.minimum(np.minimum(left, middle), right)
     allowed = SHARE * np.maximum(high, -low) + (high - low) + floor[:, None]
     off = np.abs(means - usual[:, None])[:, :, 1:-1]
-    return np.any(off > allowed[:, None], axis=2).any(axis=0)
+    unlike = np.any(off > allowed[:, None], axis=2)
+    return unlike.any(axis=0) & ~unlike.all(axis=0)
 
 
 class Joint(NamedTuple):
