@@ -1,17 +1,17 @@
-"""What the paper prints: its resistors, its tables I to IV and its RRSE, in SI units and per cent.
+"""Published values of the paper: resistors, tables I to IV and RRSE, in SI units and per cent.
 
 *Towards On-line Fingertip Bio-impedance Identification for Enhancement of Electro-tactile
-Rendering*. Scenes simulate these values, and `etid.paper` sets its results beside them.
+Rendering*. Scenes simulate these values, and `etid.paper` compares its results with them.
 """
 
 from etid.simulation.transformer import SkinLoad
 
-REFERENCE = 98.8e3  # resistor that calibrates the driver [ohm]
+REFERENCE = 98.8e3  # resistor of the calibration [ohm]
 
 # Table I: error [%] of each test resistor [ohm].
 TABLE_1 = {21.62e3: 4.26, 55.20e3: 0.42, 216.6e3: 9.6, 328.9e3: 12.2, 555.0e3: 0.25}
 
-# Tables II and III: a typical fingertip, the lowest and the highest of ten subjects [SI].
+# Tables II and III: typical fingertip, lowest and highest value of ten subjects [SI].
 FINGERTIPS = {
     "dry": {
         "r_s": (33.4e3, 19e3, 69.8e3),
@@ -29,7 +29,7 @@ TYPICAL = {
     for condition, elements in FINGERTIPS.items()
 }
 
-# Table IV: the soldered circuit; error of the mean and scatter between 23 trials [%].
+# Table IV: the soldered circuit; error of the mean, and scatter between 23 trials [%].
 BUILT = SkinLoad(r_s=32.46e3, r_p=179.8e3, c_p=0.12e-9)
 TABLE_4 = {"r_p": (2.46, 17.5), "c_p": (10.4, 26.9), "r_s": (15.5, 43.2)}
 
