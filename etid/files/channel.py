@@ -1,8 +1,8 @@
 """What a file of another format holds: named channels, none of them read yet."""
 
-import contextlib
 import csv
 import dataclasses
+import functools
 import struct
 import tokenize
 import zipfile
@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterable, Iterator
 
 import numpy as np
 
+from etid.recordings import errors
 from etid.recordings.recording import RecordingError
 from etid.recordings.untrusted import LIBRARY_ERRORS
 
@@ -138,17 +139,8 @@ def rate_of(interval: float, precision: float) -> float:
     return float(round(rate)) if abs(rate - round(rate)) <= precision * rate else rate
 
 
-@contextlib.contextmanager
-def located(file: str, path: str = "", field: str = "") -> Iterator[None]:
-    """Errors of this place, whoever finds them."""
-    try:
-        yield
-    except RecordingError as error:
-        raise error.located(file=file, path=path, field=field) from None
-    except _READ_ERRORS as error:
-        raise RecordingError(
-            f"cannot be read ({type(error).__name__}: {error})", file=file, path=path, field=field
-        ) from error
+# The block that reads from a file of another format, `with located(file, path, field)`.
+located = functools.partial(errors.located, foreign=_READ_ERRORS)
 
 
 def needs(package: str, extra: str, file: str) -> RecordingError:

@@ -1,7 +1,8 @@
 """The error that says where something is wrong, what, and what to do."""
 
+import contextlib
 import difflib
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 
 
 class RecordingError(ValueError):
@@ -49,6 +50,43 @@ class RecordingError(ValueError):
 
 def _rebuild_error(message: str, file: str, path: str, field: str, remedy: str) -> RecordingError:
     return RecordingError(message, file=file, path=path, field=field, remedy=remedy)
+
+
+@contextlib.contextmanager
+def located(
+    file: str = "",
+    path: str = "",
+    field: str = "",
+    *,
+    foreign: tuple[type[Exception], ...] = (),
+    message: str = "cannot be read",
+    remedy: str = "",
+) -> Iterator[None]:
+    """Give an error of this block its place, and make a `RecordingError` of a library's error.
+
+    Args:
+        file: Path of the file.
+        path: HDF5 path of the recording.
+        field: Name of the attribute, dataset or argument.
+        foreign: Errors of a library.
+        message: What such an error means; its own text stands behind.
+        remedy: What to do about it.
+
+    Raises:
+        RecordingError: In place of every error of the block; one of etid keeps its text.
+    """
+    try:
+        yield
+    except RecordingError as error:
+        raise error.located(file=file, path=path, field=field) from None
+    except foreign as error:
+        raise RecordingError(
+            f"{message} ({type(error).__name__}: {error})",
+            file=file,
+            path=path,
+            field=field,
+            remedy=remedy,
+        ) from error
 
 
 def near_miss(name: str, known: Iterable[str]) -> str | None:

@@ -9,6 +9,7 @@ that samples, and all metadata of files that etid has written, are read without 
 """
 
 import contextlib
+import functools
 import io
 import math
 import os
@@ -20,7 +21,7 @@ import h5py
 import numpy as np
 
 from etid.recordings import limits
-from etid.recordings.errors import RecordingError
+from etid.recordings.errors import RecordingError, located
 
 # What h5py raises, depending on where in a damaged file the HDF5 library gives up.
 LIBRARY_ERRORS = (
@@ -43,21 +44,10 @@ _OBJECT = struct.Struct("<HH4xQ")  # index, reference count, size
 _SIZES = {0: 13, 1: 13, 2: 9, 3: 9}  # where a superblock of this version has its sizes of numbers
 
 
-@contextlib.contextmanager
-def translated(file: str, path: str = "", field: str = "") -> Iterator[None]:
-    """Errors of the HDF5 library as errors of a recording; ours keep their text."""
-    try:
-        yield
-    except RecordingError as error:
-        raise error.located(file=file, path=path, field=field) from None
-    except LIBRARY_ERRORS as error:
-        raise RecordingError(
-            f"the HDF5 library cannot read it ({type(error).__name__}: {error})",
-            file=file,
-            path=path,
-            field=field,
-            remedy=DAMAGED,
-        ) from error
+# The block that reads from an HDF5 file, `with translated(file, path, field)`.
+translated = functools.partial(
+    located, foreign=LIBRARY_ERRORS, message="the HDF5 library cannot read it", remedy=DAMAGED
+)
 
 
 class Guarded(io.FileIO):
