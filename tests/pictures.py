@@ -61,6 +61,11 @@ def driver(verdict: str = "successful") -> Driver:
     )
 
 
+def as_kind(driver: Driver, kind: type[Driver]) -> Driver:
+    """A driver as another kind, which keeps less of it."""
+    return kind(**{field.name: getattr(driver, field.name) for field in dataclasses.fields(kind)})
+
+
 def fit(verdict: str = "successful", circuit: etid.AbstractCircuit = SKIN) -> Fit:
     """A fit of one dry trial."""
     cov = jnp.diag((circuit.values() * RELATIVE) ** 2)

@@ -12,13 +12,14 @@ from jax.flatten_util import ravel_pytree
 import etid
 from etid.circuits.circuit import SkinRC
 from etid.estimators.harmonic_steiglitz_mcbride import covariance, fit_skin
-from etid.results.driver import SourceImpedance
+from etid.results.driver import DiscreteDriver, SourceImpedance
 from etid.results.verdicts import verdict
 from etid.signals.harmonics import Spectrum, spectrum, whole_periods
 from etid.signals.noise import noise_std
 from etid.signals.transfer import delayed
 from etid.simulation.scenes import Scene, Trial
 from etid.simulation.transformer import ResistorLoad, SkinLoad
+from tests import pictures
 
 METHOD = "harmonic_steiglitz_mcbride"
 LENGTH = 3334  # of one period, as in other tests
@@ -282,7 +283,7 @@ def test_a_driver_that_failed_is_told(driver):
 
 def test_it_needs_a_continuous_source_and_a_skin(driver):
     study = simulate(LOADS["dry"])
-    discrete = dataclasses.replace(driver, source=None)
+    discrete = pictures.as_kind(driver, DiscreteDriver)
     with pytest.raises(ValueError, match="no continuous source"):
         etid.identify_skin(study["a"], discrete, method=METHOD)
     with pytest.raises(ValueError, match="SkinRC only"):

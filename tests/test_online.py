@@ -20,6 +20,7 @@ from etid.results.driver import ContinuousDriver
 from etid.signals.harmonics import ALIASED, Spectrum
 from etid.simulation.scenes import Scene, Trial
 from etid.simulation.transformer import ResistorLoad, SkinLoad, loading
+from tests import pictures
 
 DRY = SkinLoad(r_s=33.4e3, r_p=186e3, c_p=0.12e-9)
 DAMP = SkinLoad(r_s=6.1e3, r_p=17.4e3, c_p=0.66e-9)
@@ -455,7 +456,7 @@ def test_what_cannot_be_tracked_is_refused_with_a_reason():
         Tracker.of(driver, unloaded, electrodes=0)
     with pytest.raises(ValueError, match="change is -1"):
         Tracker.of(driver, unloaded, electrodes=1, change=-1.0)
-    plain = dataclasses.replace(driver, calibration=None)
+    plain = pictures.as_kind(driver, ContinuousDriver)
     with pytest.raises(ValueError, match="harmonics"):
         Tracker.of(plain, unloaded, electrodes=1)
     half = etid.Recording(

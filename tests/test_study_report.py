@@ -29,6 +29,7 @@ from etid.results.study_fits import StudyFits
 from etid.results.verdicts import message, verdict, verdicts_of
 from etid.simulation.scenes import Scene, Trial
 from etid.simulation.transformer import ResistorLoad, SkinLoad
+from tests import pictures
 
 EVIL = r"<script>document.title='$\broken{$'</script>"
 TRUE = {"r_s": 33.4e3, "r_p": 186e3, "c_p": 0.12e-9}
@@ -200,8 +201,7 @@ def test_a_file_of_fits_gives_back_drivers_and_settings(found, driver, tmp_path)
 
 
 def test_a_driver_without_a_continuous_impedance_is_kept_as_well(found, driver, tmp_path):
-    common = {field.name: getattr(driver, field.name) for field in dataclasses.fields(etid.Driver)}
-    plain = DiscreteDriver(**common)
+    plain = pictures.as_kind(driver, DiscreteDriver)
     of_old = dataclasses.replace(found, drivers={("calibration/0",): plain})
     of_old.write(tmp_path / "fits.h5")
     (stored,) = StudyFits.read(tmp_path / "fits.h5").drivers.values()

@@ -15,6 +15,7 @@ from jaxtyping import Array, Complex, Float
 
 from etid.circuits.circuit import AbstractCircuit
 from etid.estimators.estimate import DELAY_WIDTH
+from etid.estimators.unknowns import LoadUnknowns
 from etid.online.gain_bands import Bands
 from etid.signals.transfer import as_complex, power, reciprocal
 from etid.solvers.matrices import inverse_of_few
@@ -76,13 +77,13 @@ class GainModel(eqx.Module):
         admittance = reciprocal(z + self.source)
         return z * admittance, by_element * (self.source * admittance * admittance)[None, :]
 
-    def departure(self, own: Float[Array, " own"]) -> Complex[Array, " band"]:
+    def departure(self, own: LoadUnknowns) -> Complex[Array, " band"]:
         """Ĝ − G e^(−jωτ): aliases, and the effect of the curvature of G over a band."""
-        load, delay = self.circuit.with_log_values(own[:-1]), own[-1]
+        load, delay = self.circuit.with_log_values(own.log_elements), own.delay_samples
         above = load.response(self.bands.sample_rate - self.bands.frequency)
         aliased = jnp.conj(above * reciprocal(above + self.source_alias)) * self.bands.alias
         departure = aliased * _unit(2 * jnp.pi * delay)
-        departure = departure + self.bands.departure(self.undelayed(own[:-1]), delay)
+        departure = departure + self.bands.departure(self.undelayed(own.log_elements), delay)
         return departure * jnp.conj(self.turned(delay))
 
     def turned(self, delay: Float[Array, ""]) -> Complex[Array, " band"]:
@@ -114,7 +115,7 @@ class GainModel(eqx.Module):
 
 def nearest(
     model: GainModel, gain: Complex[Array, " band"], logs: Float[Array, "start element"]
-) -> tuple[Float[Array, " own"], Float[Array, ""]]:
+) -> tuple[LoadUnknowns, Float[Array, ""]]:
     """The start whose gain is nearest to `gain`, with its delay [samples], and the distance."""
     distances = jax.vmap(lambda one: model.distances(gain, model.undelayed(one)))(logs)
     best = jnp.argmin(distances)
@@ -126,7 +127,7 @@ def nearest(
     delay = DELAYS[0] + STEP * (at.astype(around.dtype) + 0.5 * (around[0] - around[2]) / curved)
     inside = (at > 0) & (at < DELAYS.size - 1) & (curved > 0)
     delay = jnp.where(inside, delay, jnp.asarray(DELAYS)[at])
-    return jnp.append(logs[start], delay), distances.reshape(-1)[best]
+    return LoadUnknowns(logs[start], delay), distances.reshape(-1)[best]
 
 
 class Equations(NamedTuple):
@@ -190,13 +191,13 @@ class Pulse(eqx.Module):
 
     def terms(self, q: Float[Array, " own"]) -> Float[Array, "own1 part"]:
         """Derivatives of the residual and, as the last row, the residual [standard deviations]."""
-        of = self.model
+        of, own = self.model, LoadUnknowns.of(q)
         weight = as_complex(jnp.sqrt(of.bands.weight / self.variance))
-        model, slope = of.gain(q[:-1])
+        model, slope = of.gain(own.log_elements)
         # The derivative with respect to the delay is jω Ĝ e^(jωτ). Here the model replaces Ĝ:
         # otherwise the noise of Ĝ would count as information.
         by_delay = model * jax.lax.complex(jnp.zeros_like(of.turn), of.turn)
-        residual = self.gain * of.turned(q[-1]) - model
+        residual = self.gain * of.turned(own.delay_samples) - model
         rows = jnp.concatenate([-slope, by_delay[None, :], residual[None, :]]) * weight[None, :]
         return jnp.concatenate([rows.real, rows.imag], axis=1)
 
@@ -204,12 +205,15 @@ class Pulse(eqx.Module):
         """Normal equations of the pulse and of the prior."""
         terms = self.terms(q)
         products = terms @ terms.T
-        off = q[:-1] - self.centre
-        pull = jnp.append(self.information @ off, q[-1] / DELAY_WIDTH**2)
+        own = LoadUnknowns.of(q)
+        off = LoadUnknowns(own.log_elements - self.centre, own.delay_samples)
+        pull = LoadUnknowns(
+            self.information @ off.log_elements, off.delay_samples / DELAY_WIDTH**2
+        ).vector()
         squares, curvature = products[-1, -1], products[:-1, :-1]
         prior = jnp.pad(self.information, (0, 1)).at[-1, -1].set(1 / DELAY_WIDTH**2)
         return Equations(
-            squares + jnp.dot(pull, jnp.append(off, q[-1])),
+            squares + jnp.dot(pull, off.vector()),
             squares,
             products[:-1, -1] + pull,
             curvature,

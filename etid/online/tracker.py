@@ -44,6 +44,7 @@ from etid.estimators.judgement import MAX_STEPS_REACHED, SUCCESSFUL, misses
 from etid.estimators.maximum_likelihood.given_driver import GivenDriver, combined
 from etid.estimators.refinement import circuit_starts
 from etid.estimators.registry import serving
+from etid.estimators.unknowns import LoadUnknowns
 from etid.identify.arguments import circuit_of
 from etid.identify.compiled import stored_jit
 from etid.identify.lanes import explained, given
@@ -269,7 +270,7 @@ def _electrode(
     gain: Complex[Array, " band"],
     variance: Float[Array, ""],
     bad: RESULTS,
-    elsewhere: Float[Array, " own"],
+    elsewhere: LoadUnknowns,
     distance: Float[Array, ""],
 ) -> TrackerState:
     """State of one electrode after one pulse.
@@ -283,7 +284,8 @@ def _electrode(
         elsewhere: Nearest generic start: logarithms of the elements [SI] and delay [samples].
         distance: Distance of its gain from the measured gain.
     """
-    logs, elements = state.own[:-1], state.own.size - 1
+    before = LoadUnknowns.of(state.own)
+    logs, elements = before.log_elements, before.log_elements.size
     running = state.pulses > 0
     lost = inverse_of_few(jnp.eye(elements) + tracker.change**2 * state.information)
     lost = state.information @ lost @ state.information
@@ -291,11 +293,11 @@ def _electrode(
 
     start, own_distance = nearest(tracker.model, gain, logs[None, :])
     away = ~running & ~(own_distance <= distance)
-    start = jnp.where(away, elsewhere, start)
+    start = jax.tree.map(lambda new, old: jnp.where(away, new, old), elsewhere, start)
     damping = jnp.where(away, DAMPING, state.damping)
     gain = gain - tracker.model.departure(start)
     pulse = Pulse(tracker.model, gain, variance, logs, information)
-    own, at, decrement, damping = minimum(pulse.equations, start, damping)
+    own, at, decrement, damping = minimum(pulse.equations, start.vector(), damping)
     bands = tracker.model.bands
     selected = bands.weight > 0
     chi2 = at.squares / (2 * jnp.sum(selected, dtype=at.squares.dtype) - own.size)
@@ -306,20 +308,21 @@ def _electrode(
     spread = inverse_of_few(told)
 
     # χ² per element of the difference between the elements of this pulse alone and the prediction.
-    off = own[:-1] - logs
+    found = LoadUnknowns.of(own)
+    off = found.log_elements - logs
     pull = information @ off
     surprise = (jnp.dot(off, pull) + jnp.dot(pull, spread @ pull)) / elements
     share = 1 / jnp.clip(state.pulses, 1, MEMORY).astype(surprise.dtype)
     strain = state.strain + (surprise - state.strain) * share
     strained = running & (state.pulses >= MEMORY) & (strain > STRAINED)
 
-    settled = decrement < SETTLED**2
+    settled, late = decrement < SETTLED**2, jnp.abs(found.delay_samples) > DELAYS[-1]
     determined = running | jnp.all(jnp.diagonal(spread) < 1)
     result = first_verdict(
         (bad != SUCCESSFUL, bad),
         (~jnp.isfinite(own).all(), RESULTS.nonphysical),
         (~settled, MAX_STEPS_REACHED),
-        (misses(chi2, rrse) | (jnp.abs(own[-1]) > DELAYS[-1]) | strained, RESULTS.misfit),
+        (misses(chi2, rrse) | late | strained, RESULTS.misfit),
         (~determined, RESULTS.insensitive),
     )
     good = result == SUCCESSFUL
@@ -357,11 +360,14 @@ def _updated(
         )
     )(finite, clipped, flat)
     starts = circuit_starts(tracker.model.circuit, None)
-    lanes, own = state.own.shape
+    lanes, elements = state.information.shape[:2]
     elsewhere = jax.lax.cond(
         (state.pulses == 0).any(),
         jax.vmap(lambda gain: nearest(tracker.model, gain, starts)),
-        lambda _: (jnp.zeros((lanes, own)), jnp.full(lanes, jnp.inf)),
+        lambda _: (
+            LoadUnknowns(jnp.zeros((lanes, elements)), jnp.zeros(lanes)),
+            jnp.full(lanes, jnp.inf),
+        ),
         gains.gain,
     )
     return jax.vmap(lambda *of: _electrode(tracker, *of))(state, *gains, bad, *elsewhere)
@@ -374,7 +380,8 @@ def _judged(tracker: Tracker, state: TrackerState) -> Fit:
 
 def _fit(tracker: Tracker, state: TrackerState) -> Fit:
     """The fit of one electrode."""
-    known, bands, logs = tracker.known, tracker.model.bands, state.own[:-1]
+    known, bands = tracker.known, tracker.model.bands
+    logs = LoadUnknowns.of(state.own).log_elements
     elements = logs.size
     model = tracker.model.undelayed(logs)
     pulse = Pulse(
