@@ -10,13 +10,13 @@ from etid.recordings.recording import Recording
 from etid.recordings.remarks import Remark
 from etid.signals import rounding
 from etid.signals.alignment import lag_of, shifted, whole_lag
-from etid.signals.disturbances import Joint, disturbed, joint
+from etid.signals.disturbances import Joint, disturbed, joint, of_source
 from etid.signals.filtering import TAPS
 from etid.signals.harmonics import ALIASED, whole_periods
 from etid.signals.mains import Hum, separated
 from etid.signals.measurement import trusted
 from etid.signals.noise import noise_std
-from etid.signals.pulse_train import CLOCK, PulseTrain, find_pulses
+from etid.signals.pulse_train import CLOCK, PulseTrain, find_pulses, rise_time
 
 SHORTEST = 4 * TAPS + 104  # samples: the interpolation's edges and a hundred and some to fit
 FLAT = (
@@ -99,6 +99,9 @@ class Inspected:
         )
         left = np.count_nonzero(~bad)
         if not max(2, bad.size // 2 + 1) <= left < bad.size:
+            return None
+        rise = rise_time(self.recording.sample_rate)
+        if any(of_source(v, bad, self.spacing, rise) for v in (self.quiet_th, self.quiet_out)):
             return None
         return joint(~bad, self.spacing, self.whole_out.size)
 

@@ -7,6 +7,7 @@ period is *disturbed* if it differs by more than `PART` of the largest value and
 exceed these limits. Edges between samples and noise do not exceed them either.
 """
 
+import itertools
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -14,6 +15,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 MERGED = 16  # samples that are averaged
+STEEP = 0.3  # of the steepest rise of a pulse
+BESIDE = 10  # times the samples over which edges rise, in which there is one edge
 FEWEST = 3  # periods that are needed to recognise a disturbed one
 PART = 0.02  # limit relative to the largest value: 0.05 V at the converter in records of 2.5 V
 SHARE = 0.5  # limit relative to the value at the same place
@@ -64,6 +67,35 @@ def disturbed(
     off = np.abs(means - usual[:, None])[:, :, 1:-1]
     unlike = np.any(off > allowed[:, None], axis=2)
     return unlike.any(axis=0) & ~unlike.all(axis=0)
+
+
+def of_source(
+    v: Float[np.ndarray, " time"], bad: Bool[np.ndarray, " period"], spacing: float, rise: int
+) -> bool:
+    """Whether a disturbed period lacks a pulse or has a second one, by the number of its edges.
+
+    The period that follows is disturbed too, by what a transformer keeps of its history.
+
+    Args:
+        v: A record [V].
+        bad: The disturbed periods.
+        spacing: Length of a period [samples].
+        rise: Samples over which edges rise.
+    """
+    slope = np.abs(v[rise:] - v[:-rise])
+    ends = np.rint(np.arange(bad.size + 1) * spacing).astype(int)
+    parts = [slope[first:end] for first, end in itertools.pairwise(ends)]
+    largest = np.array([part.max() for part in parts])
+    steep = STEEP * np.median(largest[~bad])
+    # Steep samples next to each other are one edge.
+    count = np.array(
+        [
+            np.count_nonzero(np.diff(np.flatnonzero(part > steep), prepend=-np.inf) > BESIDE * rise)
+            for part in parts
+        ]
+    )
+    ratio = count[bad] / max(1.0, float(np.median(count[~bad])))
+    return bool(((ratio < 0.5) | ((ratio > 1.5) & (ratio < 2.5))).any())
 
 
 class Joint(NamedTuple):
