@@ -14,7 +14,6 @@ import dataclasses
 import json
 import pathlib
 from collections.abc import Sequence
-from typing import cast
 
 import numpy as np
 import scipy.stats
@@ -24,7 +23,6 @@ import etid
 from benchmarks.ladder import LOADS
 from benchmarks.perturbed_study import drawn_driver
 from benchmarks.spice import ESTIMATORS, FOLDER, JOINT, add_data, scene_of
-from etid.estimators.registry import Method
 from etid.simulation.published import REFERENCE
 from etid.simulation.scenes import Scene, Trial
 from etid.simulation.transformer import ResistorLoad
@@ -150,7 +148,7 @@ def _identify(study: etid.Study, paths: Sequence[str], method: str | None) -> di
         fits = etid.identify_jointly(study).fits
         found = list(fits.labels["path"])
         return {path: fits[found.index(path)] for path in paths}
-    given = cast(Method | None, method)
+    given = method
     calibrations = list(study.calibrations.recordings())
     try:
         driver = etid.identify_driver(calibrations, method=given, throw=False)

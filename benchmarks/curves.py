@@ -24,7 +24,6 @@ from benchmarks.provenance import write_csv
 from benchmarks.speed import pin
 from benchmarks.timing import first_and_warm
 from etid.estimators.maximum_likelihood.load import TOGETHER
-from etid.estimators.registry import Method
 from etid.signals.filtering import lfilter
 from etid.solvers.levenberg_marquardt import normal_equations
 
@@ -98,7 +97,7 @@ def against_lanes(counts: Sequence[int]) -> Iterable[dict[str, Any]]:
     """Seconds per lane of a batch, from recordings in memory to fits."""
     records = problem(5_000, 16, 100e3)
     loaded, given = records.records, records.driver
-    drivers: dict[Method, etid.Driver] = {
+    drivers: dict[str, etid.Driver] = {
         "maximum_likelihood": given,
         "equation_error": etid.identify_driver(
             records.study["calibration/0"], method="equation_error", throw=False

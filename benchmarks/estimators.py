@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Callable, Iterable, Sequence
-from typing import Any, NamedTuple, cast
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -11,11 +11,12 @@ from jaxtyping import Bool, Float
 import etid
 from benchmarks import rivals
 from benchmarks.ladder import CALIBRATION, START, TRIAL
-from etid.estimators.registry import HARMONIC, METHODS, Method
+from etid.estimators.registry import named, names
 from etid.simulation.scenes import Scene
 
 DEFAULT = "default"
-OURS = (DEFAULT, *METHODS)
+
+OURS = (DEFAULT, *names())
 BATCH = 32  # recordings of a timed batch
 FAR = 5.0  # standard deviations of the bound, and own standard errors
 OFF = 0.2
@@ -85,7 +86,7 @@ class Drivers:
         self.known: dict[tuple[str | None, int], etid.Driver | None] = {}
         self.times: dict[str | None, list[float]] = {}
 
-    def of(self, method: Method | None, number: int) -> etid.Driver | None:
+    def of(self, method: str | None, number: int) -> etid.Driver | None:
         """The driver of one draw, if there is one."""
         kind = shared(method)
         if (kind, number) not in self.known:
@@ -95,20 +96,21 @@ class Drivers:
             self.times.setdefault(kind, []).append(time.perf_counter() - begin)
         return self.known[kind, number]
 
-    def seconds(self, method: Method | None) -> float:
+    def seconds(self, method: str | None) -> float:
         """Median time of one, but for the first."""
         times = self.times.get(shared(method), [])
         return float(np.median(times[1:])) if times[1:] else np.nan
 
 
-def shared(method: Method | None) -> Method | None:
+def shared(method: str | None) -> str | None:
     """The method whose driver a method uses: all on the harmonics that of maximum likelihood."""
-    return "maximum_likelihood" if method in HARMONIC else method
+    periodic = method is not None and named(method).lane.periodic
+    return "maximum_likelihood" if periodic else method
 
 
 def driver_of(
     calibrations: etid.Recording | Sequence[etid.Recording],
-    method: Method | None,
+    method: str | None,
     order: int = 5,
 ) -> etid.Driver | None:
     """The driver, whatever its verdict; None if pre-flight refuses a calibration."""
@@ -127,7 +129,7 @@ def ours(draws: Draws, drivers: Drivers, name: str, budget: float) -> Iterable[R
         name: Of the estimator.
         budget: Time [s] after which the other draws are left out, but for `FEWEST`.
     """
-    method: Method | None = None if name == DEFAULT else cast(Method, name)
+    method: str | None = None if name == DEFAULT else name
     rows: list[tuple[np.ndarray, bool, np.ndarray]] = []
     usable, times = [], []
     nothing = np.full(draws.truth.size, np.nan)

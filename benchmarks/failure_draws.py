@@ -18,7 +18,6 @@ is wrong by 20 % only. So is a resistor that is fitted to skin, by R_s + R_p, in
 import dataclasses
 import zlib
 from collections.abc import Iterator, Sequence
-from typing import cast
 
 import jax
 import numpy as np
@@ -29,7 +28,7 @@ from benchmarks.estimators import DEFAULT, FAR, driver_of, is_off, shared
 from benchmarks.failure_axes import Cell, Cole, TwoLayers
 from benchmarks.mappings import make_room
 from etid.circuits.circuit import AbstractCircuit, Resistor, SkinRC
-from etid.estimators.registry import REFINED, Method, choose
+from etid.estimators.registry import for_calibrations, named
 from etid.recordings.preflight import Inspected
 from etid.results.driver import DiscreteDriver
 from etid.signals.transfer import is_stable
@@ -178,15 +177,16 @@ class Draw:
         every = list(records if change is None else (change(r, rng) for r in records))
         self.calibrations = [r for r in every if r.is_calibration]
         self.trials = [r for r in every if not r.is_calibration]
-        self._drivers: dict[Method | None, etid.Driver | None] = {}
+        self._drivers: dict[str | None, etid.Driver | None] = {}
 
-    def driver(self, method: Method | None) -> etid.Driver | None:
+    def driver(self, method: str | None) -> etid.Driver | None:
         """The driver for a method; None if pre-flight refuses the calibration.
 
         All methods on the harmonics use that of maximum likelihood, and the default method is one
         of the others.
         """
-        chosen = choose(method, [Inspected(record) for record in self.calibrations])
+        seen = [Inspected(record) for record in self.calibrations]
+        chosen = method or str(for_calibrations(None, seen))
         kind = shared(chosen)
         if kind not in self._drivers:
             self._drivers[kind] = driver_of(self.calibrations, kind, self.cell.order)
@@ -196,7 +196,7 @@ class Draw:
         self, name: str, trials: int, limits: dict[str, Float[np.ndarray, " element"]]
     ) -> Iterator[Answer]:
         """What a method says of the first trials."""
-        method = None if name == DEFAULT else cast(Method, name)
+        method = None if name == DEFAULT else name
         records, driver = self.trials[:trials], self.driver(method)
         nothing = np.full(len(ELEMENTS), np.nan)
         if driver is None:
@@ -240,7 +240,7 @@ def answers(cell: Cell, efforts: dict[str, Effort]) -> list[Answer]:
         for number, seed in enumerate(seeds(cell, max(e.drivers for e in efforts.values()))):
             drawn = Draw(cell, seed)
             for name, effort in efforts.items():
-                able = cell.circuit is None or name in (DEFAULT, *REFINED)
+                able = cell.circuit is None or name == DEFAULT or named(name).any_circuit
                 if able and number < effort.drivers:
                     found += drawn.answers(name, effort.trials, limits)
     return found

@@ -21,13 +21,12 @@ from jaxtyping import Array, Float
 import etid
 from benchmarks.problem import SAMPLES, START, ByNumPy, Problem, harmonics, problem, terms
 from benchmarks.timing import first_and_warm
-from etid.estimators import steiglitz_mcbride
 from etid.estimators.estimate import MAX_STEPS
-from etid.estimators.harmonic_steiglitz_mcbride import fit_skin
+from etid.estimators.harmonic_steiglitz_mcbride.iteration import fit_skin
 from etid.estimators.maximum_likelihood.load import TOGETHER
+from etid.estimators.steiglitz_mcbride.iteration import iterate
 from etid.identify.many import each
 from etid.signals.filtering import lfilter
-from etid.signals.harmonics import Spectrum
 from etid.signals.transfer import Rational
 from etid.solvers.levenberg_marquardt import normal_equations
 
@@ -151,7 +150,7 @@ def _steiglitz_mcbride(ten_periods: Problem) -> Stage:
         def unjudged(_):
             return jnp.zeros(()), jnp.array(True)
 
-        return steiglitz_mcbride.iterate(x[None], w[None], 1, 1, unjudged, 1).filter.num
+        return iterate(x[None], w[None], 1, 1, unjudged, 1).filter.num
 
     def by_scipy(records):
         return numpy_steiglitz_mcbride(records[0], records[1], b, a, 1)[0]
@@ -171,8 +170,7 @@ def harmonic_steiglitz_mcbride(ten_periods: Problem, iterations: int) -> Run:
     z_th = known.z_th(jnp.zeros_like(known.loaded))
 
     def ours(one):
-        *fields, rate = one
-        return fit_skin(Spectrum(*fields), z_th, rate, iterations).circuit.values()
+        return fit_skin(one.spectrum, z_th, one.sample_rate, iterations).circuit.values()
 
     return _each(ours, ten_periods.lanes)
 

@@ -6,7 +6,7 @@ import functools
 import itertools
 import zlib
 from collections.abc import Sequence
-from typing import Any, Literal, cast
+from typing import Any, Literal
 
 import jax
 import numpy as np
@@ -20,7 +20,7 @@ from benchmarks.ladder import LOADS
 from benchmarks.mappings import make_room
 from benchmarks.perturbation_list import PERTURBATIONS
 from benchmarks.perturbed_study import REFERENCE, Truth, undisturbed
-from etid.estimators.registry import Method, choose
+from etid.estimators.registry import for_calibrations
 from etid.recordings.preflight import Inspected
 from etid.simulation.scenes import Scene, Trial
 from etid.simulation.transformer import ResistorLoad
@@ -98,7 +98,7 @@ def error_of(
 def answers_of(
     records: Sequence[etid.Recording],
     driver: etid.Driver | None,
-    method: Method | None,
+    method: str | None,
 ) -> list[tuple[str, np.ndarray, np.ndarray, bool]]:
     """Verdict, elements, standard errors, and whether there is a remark, for each recording."""
     if driver is None:
@@ -149,9 +149,9 @@ def draw(names: Sequence[str], number: int, snr_db: float, methods: Sequence[str
         drivers: dict[tuple, etid.Driver | None] = {}
         found = []
         for (key, trials), method in itertools.product(waiting.items(), methods):
-            given = None if method == DEFAULT else cast(Method, method)
+            given = None if method == DEFAULT else method
             seen = [Inspected(record) for record in calibrations[key]]
-            kind = shared(given if given is not None else choose(None, seen))
+            kind = shared(given or str(for_calibrations(None, seen)))
             if (key, kind) not in drivers:
                 drivers[key, kind] = driver_of(calibrations[key], kind)
             said = answers_of([trial[-1] for trial in trials], drivers[key, kind], given)

@@ -8,11 +8,12 @@ from jaxtyping import Array, Float
 
 import etid
 from etid.circuits.circuit import SkinRC
+from etid.estimators.lanes import Harmonics, stacked
 from etid.estimators.maximum_likelihood.given_driver import GivenDriver
 from etid.estimators.maximum_likelihood.load import Load
-from etid.identify.lanes import known_driver, lane, stacked
+from etid.estimators.registry import MAXIMUM_LIKELIHOOD
+from etid.identify.one import known_of
 from etid.recordings.preflight import Inspected
-from etid.signals.harmonics import Spectrum
 from etid.simulation.published import REFERENCE, TYPICAL
 from etid.simulation.scenes import Scene, Trial
 from etid.simulation.transformer import ResistorLoad
@@ -37,7 +38,7 @@ class Problem(NamedTuple):
     study: etid.Study
     driver: etid.Driver
     records: list[etid.Recording]
-    lanes: tuple[Array, ...]
+    lanes: Harmonics
     known: GivenDriver
 
     def samples(self) -> tuple[np.ndarray, np.ndarray]:
@@ -48,8 +49,7 @@ class Problem(NamedTuple):
 
     def load(self, one: Any) -> Load:
         """A lane with Z_th as it is; calling it gives the terms of elements and delay."""
-        *fields, rate = one
-        return Load(self.known, SkinRC(), Spectrum(*fields), None, rate)
+        return Load(self.known, SkinRC(), one.spectrum, None, one.sample_rate)
 
 
 def terms(own: Float[Array, " own"], load: Load) -> Float[Array, " term"]:
@@ -57,16 +57,16 @@ def terms(own: Float[Array, " own"], load: Load) -> Float[Array, " term"]:
     return load(own)
 
 
-def harmonics(record: etid.Recording) -> tuple[np.ndarray, ...]:
+def harmonics(record: etid.Recording) -> Harmonics:
     """The lane of a trial: harmonics and noise."""
-    return lane(Inspected(record), "maximum_likelihood")
+    return Harmonics.of(Inspected(record))
 
 
 def problem_of(study: etid.Study, driver: etid.Driver) -> Problem:
     """The same for given recordings."""
     records = list(study.loaded.recordings())
     lanes = [harmonics(record) for record in records]
-    known = known_driver(lanes[0], driver, "maximum_likelihood", False)
+    known = known_of(lanes[0], driver, False, MAXIMUM_LIKELIHOOD)
     assert isinstance(known, GivenDriver)
     return Problem(study, driver, records, stacked(lanes), known)
 

@@ -23,7 +23,7 @@ import numpy as np
 
 from benchmarks.large_file import LAYOUTS, large_file
 from benchmarks.provenance import ROOT, write_csv
-from etid.estimators.registry import METHODS
+from etid.estimators.registry import names
 from etid.identify import file as streaming
 
 FILES = pathlib.Path(tempfile.gettempdir()) / "etid-scale"
@@ -242,7 +242,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--method",
         nargs="+",
-        choices=("default", *METHODS),
+        choices=("default", *names()),
         default=["default", "equation_error"],
         help="the last is run in all layouts, and killed",
     )

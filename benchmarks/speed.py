@@ -24,7 +24,7 @@ from benchmarks.peers import A, B
 from benchmarks.problem import LOAD, SAMPLES, Problem, harmonics, problem
 from benchmarks.provenance import write_csv
 from benchmarks.timing import first_and_warm, import_time
-from etid.estimators.steiglitz_mcbride import ITERATIONS
+from etid.estimators.steiglitz_mcbride.iteration import ITERATIONS
 from etid.signals.filtering import lfilter
 from etid.solvers.levenberg_marquardt import normal_equations
 

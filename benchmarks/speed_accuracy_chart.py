@@ -10,7 +10,7 @@ from adjustText import adjust_text
 from matplotlib.axes import Axes
 
 from benchmarks import charts
-from etid.estimators.registry import METHODS
+from etid.estimators import registry
 
 # What stands in a panel for each estimator.
 LETTERS = {
@@ -59,7 +59,7 @@ def chart(rows: Sequence[Mapping[str, Any]], path: pathlib.Path) -> None:
         panel.set_ylabel("median error / Cramer-Rao bound")
     for panel in axes[-1]:
         panel.set_xlabel("time per skin [ms]")
-    key = ", ".join(f"{short(name)} {name.replace('_', ' ')}" for name in METHODS)
+    key = ", ".join(f"{short(name)} {name.replace('_', ' ')}" for name in registry.names())
     figure.supxlabel(
         "\n".join(
             textwrap.wrap(
@@ -83,7 +83,7 @@ def _panel(axes: Axes, rows: Sequence[Mapping[str, Any]]) -> None:
     for name in dict.fromkeys(row["estimator"] for row in rows):
         if (
             name != "default"
-            and name in METHODS
+            and name in registry.names()
             and {r["error"] for r in rows if r["estimator"] == name} <= same
         ):
             continue  # what the default has chosen

@@ -11,13 +11,12 @@ import json
 import pathlib
 import tempfile
 from collections import Counter
-from typing import cast
 
 import numpy as np
 
 import etid
 from etid.circuits.circuit import AbstractCircuit
-from etid.estimators.registry import METHODS, REFINED, Method
+from etid.estimators.registry import named, names
 from etid.simulation.scenes import Scene, Trial
 from etid.simulation.transformer import ResistorLoad, SkinLoad, TransformerDriver
 
@@ -72,7 +71,7 @@ def scene_of(truth: dict) -> Scene:
 
 
 JOINT = "joint"
-ESTIMATORS: tuple[str, ...] = (*METHODS, JOINT)
+ESTIMATORS: tuple[str, ...] = (*names(), JOINT)
 
 
 def fit_scene(source: pathlib.Path, truth: dict, method: str) -> list[dict]:
@@ -80,7 +79,7 @@ def fit_scene(source: pathlib.Path, truth: dict, method: str) -> list[dict]:
     trials = truth["trials"]
     is_resistor = "R" in trials[0]["elements"]
     circuit: AbstractCircuit = etid.Resistor() if is_resistor else etid.SkinRC()
-    if is_resistor and method not in (*REFINED, JOINT):
+    if is_resistor and method != JOINT and not named(method).any_circuit:
         return []  # Steiglitz-McBride is written for the skin
     with tempfile.TemporaryDirectory() as folder:
         study_file = pathlib.Path(folder) / "study.h5"
@@ -89,7 +88,7 @@ def fit_scene(source: pathlib.Path, truth: dict, method: str) -> list[dict]:
             if method == JOINT:
                 result = etid.identify_jointly(study, circuit=circuit)
             else:
-                result = etid.identify_study(study, circuit=circuit, method=cast(Method, method))
+                result = etid.identify_study(study, circuit=circuit, method=method)
     fits = result.fits
     order = np.argsort([int(path.rsplit("/", 1)[1]) for path in fits.labels["path"]])
     fits = fits.take(order)

@@ -12,7 +12,7 @@ import jax
 import numpy as np
 
 import etid
-from etid.estimators.registry import METHODS
+from etid.estimators.registry import names
 
 REPEATS = 7
 
@@ -54,7 +54,7 @@ def run(lanes: int) -> None:
     first, warm = first_and_warm(lambda: etid.identify_driver(calibration, throw=False), 3)
     print(f"driver, first call           {first:8.2f} s   warm {warm:.3f} s")
     driver = etid.identify_driver(calibration, throw=False)
-    for method in METHODS:
+    for method in names():
         fit = functools.partial(
             etid.identify_skin, recordings[0], driver, method=method, throw=False
         )

@@ -11,7 +11,7 @@ import numpy as np
 from benchmarks.estimators import OURS
 from benchmarks.provenance import RESULTS, ROOT
 from benchmarks.speed_accuracy import FILE
-from etid.estimators.registry import METHODS
+from etid.estimators.registry import names
 
 README = ROOT / "README.md"
 BEGIN, END = "<!-- python -m benchmarks which -->\n", "<!-- end -->\n"
@@ -30,7 +30,7 @@ def read(path: pathlib.Path) -> list[dict[str, Any]]:
 
 def table(rows: Sequence[Mapping[str, Any]]) -> str:
     """Markdown: a row for each scene with the error of each estimator, and which to use."""
-    methods = [method for method in METHODS if any(r["estimator"] == method for r in rows)]
+    methods = [method for method in names() if any(r["estimator"] == method for r in rows)]
     lines = [
         "| recording | " + " | ".join(name.replace("_", " ") for name in methods) + " | use |",
         "|---" * (len(methods) + 2) + "|",
@@ -51,7 +51,7 @@ def best(rows: Sequence[Mapping[str, Any]]) -> str | None:
     trusted = [
         row
         for row in sorted(rows, key=lambda row: OURS.index(row["estimator"]))
-        if row["estimator"] in METHODS and _trusted(row) and np.isfinite(row["error"])
+        if row["estimator"] in names() and _trusted(row) and np.isfinite(row["error"])
     ]
     if not trusted:
         return None

@@ -26,11 +26,20 @@ from etid.circuits.circuit import (
 from etid.circuits.elements import capacitor, cole, constant_phase, resistor
 from etid.circuits.impedance import parallel, series
 from etid.circuits.netlist import circuit_string, netlist
+from etid.estimators.estimator import AbstractEstimator
+from etid.estimators.harmonic_steiglitz_mcbride.estimator import HarmonicSteiglitzMcBride
+from etid.estimators.maximum_likelihood.estimator import MaximumLikelihood
+from etid.estimators.non_parametric.estimator import NonParametric
+from etid.estimators.output_error.estimator import OutputError
+from etid.estimators.registry import register
+from etid.estimators.steiglitz_mcbride.estimator import EquationError, SteiglitzMcBride
+from etid.identify.driver import identify_driver
 from etid.identify.file import fit_file
 from etid.identify.impedance import identify_impedance
 from etid.identify.jointly import identify_jointly
 from etid.identify.many import identify_skins, identify_study
-from etid.identify.one import identify_driver, identify_samples, identify_skin, predict
+from etid.identify.one import identify_samples, identify_skin
+from etid.identify.predict import predict
 from etid.online.tracker import Tracker
 from etid.plotting import plot
 from etid.recordings.hdf5 import check, read
@@ -62,11 +71,17 @@ __version__ = "0.1.0"
 __all__ = [
     "RESULTS",
     "AbstractCircuit",
+    "AbstractEstimator",
     "Bound",
     "Driver",
+    "EquationError",
     "Fit",
     "Fits",
+    "HarmonicSteiglitzMcBride",
     "IdentificationError",
+    "MaximumLikelihood",
+    "NonParametric",
+    "OutputError",
     "ParallelRC",
     "Recording",
     "RecordingError",
@@ -75,6 +90,7 @@ __all__ = [
     "SkinCole",
     "SkinLayers",
     "SkinRC",
+    "SteiglitzMcBride",
     "Study",
     "StudyFits",
     "Tracker",
@@ -103,6 +119,7 @@ __all__ = [
     "plot",
     "predict",
     "read",
+    "register",
     "resistor",
     "scenes",
     "series",

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import etid
-from etid.identify import lanes
+from etid.estimators.lanes import Harmonics, PaddedSamples
 from etid.recordings.preflight import Inspected, preflight
 from etid.recordings.remarks import Remark
 from etid.signals.alignment import lag_of, whole_lag
@@ -75,11 +75,11 @@ def test_what_is_fitted_does_not_depend_on_whole_samples(late):
     """To the steps of a 16-bit converter: nothing wraps around, and the phases are exact."""
     there, here = Inspected(simulate(late, snr_db=None)["dry"]), simulate(snr_db=None)["dry"]
     assert there.lag == late
-    harmonic, right = lanes.lane(there, "maximum_likelihood"), Inspected(here)
+    harmonic, right = Harmonics.of(there), Harmonics.of(Inspected(here))
     step = 10 / 2**15 / 0.0535  # rounding of two records, shared by 10 000 samples
-    *_, y, _, _, _, _ = lanes.lane(right, "maximum_likelihood")
-    np.testing.assert_allclose(harmonic[2], y, atol=6 * step / np.sqrt(10_000))
-    v_th, v_out, *_, size = lanes.lane(there, "output_error")
+    np.testing.assert_allclose(harmonic.y, right.y, atol=6 * step / np.sqrt(10_000))
+    padded = PaddedSamples.of(there)
+    v_th, v_out, size = padded.v_th, padded.v_out, padded.samples
     assert size == 10_000 - abs(late)
     begin = max(0, -late)
     np.testing.assert_array_equal(v_th[:size], here.v_th[begin : begin + size])

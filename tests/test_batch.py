@@ -9,8 +9,10 @@ import numpy as np
 import pytest
 
 import etid
-from etid.identify import lanes
+from etid.estimators.lanes import PaddedSamples
+from etid.estimators.registry import OUTPUT_ERROR
 from etid.identify import many as batch
+from etid.identify.one import skin_lane
 from etid.recordings.preflight import Inspected
 from etid.simulation.scenes import Scene, Trial
 from etid.simulation.transformer import ResistorLoad, SkinLoad
@@ -115,7 +117,7 @@ def test_a_study_of_ragged_lengths_compiles_for_few(study, driver, monkeypatch):
 
     def counted(*arguments):
         traced.append(arguments)
-        return lanes.skin_lane(*arguments)
+        return skin_lane(*arguments)
 
     monkeypatch.setattr(batch, "skin_lane", counted)
     records = [
@@ -135,12 +137,11 @@ def test_a_study_of_ragged_lengths_compiles_for_few(study, driver, monkeypatch):
 def test_what_fills_a_record_up_changes_no_digit(study, driver):
     """The same samples in a longer lane."""
     recording = study["s01/dry/0"]
-    *fields, samples = map(jax.numpy.asarray, lanes.lane(Inspected(recording), "output_error"))
-    fit = lanes.skin_lane((*fields, samples), driver, None, etid.SkinRC(), "output_error")
-    longer = [jax.numpy.pad(v, (0, 555)) for v in fields[:2]]
-    again = lanes.skin_lane(
-        (*longer, *fields[2:], samples), driver, None, etid.SkinRC(), "output_error"
-    )
+    lane = jax.tree.map(jax.numpy.asarray, PaddedSamples.of(Inspected(recording)))
+    fit = OUTPUT_ERROR.fit_load(lane, driver, None, etid.SkinRC())
+    v_th, v_out = (jax.numpy.pad(v, (0, 555)) for v in (lane.v_th, lane.v_out))
+    longer = dataclasses.replace(lane, v_th=v_th, v_out=v_out)
+    again = OUTPUT_ERROR.fit_load(longer, driver, None, etid.SkinRC())
     for one, other in zip(jax.tree.leaves(fit), jax.tree.leaves(again), strict=True):
         np.testing.assert_allclose(one, other, rtol=1e-5)  # of solvers that stop at 1e-3 errors
 

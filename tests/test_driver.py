@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from jax.flatten_util import ravel_pytree
 
 from etid import Resistor, SkinRC, capacitor, parallel, resistor, series
-from etid.estimators.refinement import is_split
+from etid.estimators.refined_driver import is_split
 from etid.results.driver import SourceImpedance, loaded, realise
 from etid.signals.transfer import Rational, frequency_variable
 

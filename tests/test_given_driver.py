@@ -8,7 +8,7 @@ from jax.flatten_util import ravel_pytree
 
 import etid
 from etid.estimators.estimate import DELAY_WIDTH, prior
-from etid.identify import lanes
+from etid.estimators.registry import MAXIMUM_LIKELIHOOD
 from etid.signals.harmonics import spectrum
 from etid.signals.measurement import noise
 from etid.simulation.scenes import Scene, Trial
@@ -69,7 +69,7 @@ def test_the_covariance_of_a_driver_is_the_inverse_of_its_information(driver):
 def test_what_a_calibration_tells_is_one_standard_deviation_along_each_direction(driver):
     """z is scaled by the information, so that its covariance is 1, and its mean next to 0."""
     frequency = driver.spectra.frequency[0]
-    known = lanes.given(driver, frequency, False)
+    known = MAXIMUM_LIKELIHOOD.known(driver, frequency, False)
     of = np.linalg.eigvalsh(np.asarray(known.cov))
     assert of.min() > 0.8, of
     assert of.max() < 1.6, of

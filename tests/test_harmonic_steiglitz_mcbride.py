@@ -11,7 +11,7 @@ from jax.flatten_util import ravel_pytree
 
 import etid
 from etid.circuits.circuit import SkinRC
-from etid.estimators.harmonic_steiglitz_mcbride import covariance, fit_skin
+from etid.estimators.harmonic_steiglitz_mcbride.iteration import covariance, fit_skin
 from etid.results.driver import DiscreteDriver, SourceImpedance
 from etid.results.verdicts import verdict
 from etid.signals.harmonics import Spectrum, spectrum, whole_periods

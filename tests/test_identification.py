@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import etid
-from etid.identify import lanes
+from etid.identify.one import skin_lane
 from etid.simulation.scenes import Scene, Trial
 from etid.simulation.transformer import ResistorLoad, SkinLoad
 
@@ -262,7 +262,7 @@ def test_a_chunk_compiles_once_per_length(study, driver, monkeypatch):
 
     def counted(*arguments):
         traces.append(arguments)
-        return lanes.skin_lane(*arguments)
+        return skin_lane(*arguments)
 
     monkeypatch.setattr(batch, "skin_lane", counted)
     other = etid.SkinRC(10e3, 50e3, 1e-9)  # typical values are data, not structure

@@ -8,7 +8,6 @@ import optimistix as optx
 import pytest
 
 import etid
-from etid.estimators import refinement
 from etid.estimators.estimate import Estimate
 from etid.estimators.judgement import (
     MISFIT_CHI2,
@@ -19,6 +18,7 @@ from etid.estimators.judgement import (
     too_late,
     unless,
 )
+from etid.estimators.output_error.estimator import INTERPOLATED
 from etid.results.verdicts import RESULTS, verdict
 
 
@@ -70,9 +70,9 @@ def test_what_a_residual_may_leave_unexplained_depends_on_the_method():
     """Output error at 100 kHz and 80 dB: R_s was ten standard errors off and called successful."""
     of = jnp.asarray(4.5), jnp.asarray(6.7e-4)
     assert not misses(*of)
-    assert misses(*of, refinement.INTERPOLATED)
+    assert misses(*of, INTERPOLATED)
     # At 200 kHz, where it is right.
-    assert not misses(jnp.asarray(1.43), jnp.asarray(2.9e-4), refinement.INTERPOLATED)
+    assert not misses(jnp.asarray(1.43), jnp.asarray(2.9e-4), INTERPOLATED)
 
 
 @pytest.mark.parametrize(

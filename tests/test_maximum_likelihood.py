@@ -12,8 +12,8 @@ from etid.circuits.circuit import SkinRC
 from etid.circuits.elements import resistor
 from etid.estimators import registry
 from etid.estimators.maximum_likelihood import terms as likelihood
-from etid.identify import lanes
 from etid.identify import many as batch
+from etid.identify.one import skin_lane
 from etid.recordings.preflight import Inspected
 from etid.simulation.scenes import Scene, Trial
 from etid.simulation.transformer import ResistorLoad, SkinLoad
@@ -94,7 +94,7 @@ def short(study):
 def test_a_record_without_a_whole_period_is_told_so_or_goes_to_output_error(short, driver):
     with pytest.raises(etid.IdentificationError, match="not_periodic"):
         etid.identify_skin(short, driver, method="maximum_likelihood")
-    assert registry.plan(None, Inspected(short), driver) == ("output_error", None)
+    assert registry.plan(None, Inspected(short), driver) == (registry.OUTPUT_ERROR, None)
 
 
 @pytest.mark.slow
@@ -120,7 +120,7 @@ def test_a_batch_of_both_kinds_is_mixed_and_each_is_right(study, driver):
     record = study["loaded/1"]
     short = record.replace(v_th=record.v_th[:SHORT], v_out=record.v_out[:SHORT])
     fits = etid.identify_skins([record, short], driver)
-    assert fits.fit.method == "mixed"
+    assert fits.fit.method == "maximum_likelihood + output_error"
     assert fits.counts() == {"successful": 2}
 
 
@@ -162,7 +162,7 @@ def test_a_study_of_ragged_lengths_compiles_once(study, driver, monkeypatch):
 
     def counted(*arguments):
         traced.append(arguments)
-        return lanes.skin_lane(*arguments)
+        return skin_lane(*arguments)
 
     monkeypatch.setattr(batch, "skin_lane", counted)
     records = [

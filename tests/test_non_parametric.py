@@ -10,9 +10,9 @@ import pytest
 import etid
 from benchmarks.coverage import scene
 from benchmarks.ladder import LOADS
-from etid.estimators import non_parametric
+from etid.estimators.lanes import Harmonics
+from etid.estimators.non_parametric import fit as non_parametric
 from etid.estimators.unknowns import LoadUnknowns
-from etid.identify.lanes import lane
 from etid.recordings.preflight import Inspected
 from etid.results.driver import HarmonicDriver
 from etid.results.verdicts import verdict
@@ -123,7 +123,8 @@ def test_one_unloaded_record_has_one_noise():
 
 def test_bias_is_taken_off_the_estimate(study, coarse, monkeypatch):
     """In the place of a bias the change that a larger Y makes; R alone keeps it cheap."""
-    *fields, rate = map(jnp.asarray, lane(Inspected(study["dry"]), "non_parametric"))
+    lane = Harmonics.of(Inspected(study["dry"]))
+    rate = jnp.asarray(lane.sample_rate)
     start = LoadUnknowns(jnp.array([[np.log(150e3)]]), jnp.zeros(1))
 
     @jax.jit
@@ -139,7 +140,7 @@ def test_bias_is_taken_off_the_estimate(study, coarse, monkeypatch):
             )
         return estimate.parameters, off
 
-    spectrum = Spectrum(*fields)
+    spectrum = lane.spectrum
     one = jnp.asarray(1.0 + 0j)
     plain, nothing = fit(spectrum, one)
     moved, _ = fit(dataclasses.replace(spectrum, y=spectrum.y * 1.001), one)

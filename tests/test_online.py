@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import html
 
 import jax
 import jax.numpy as jnp
@@ -9,15 +10,15 @@ import numpy as np
 import pytest
 
 import etid
-from etid.estimators import refinement
+from etid.estimators.lanes import Harmonics
 from etid.estimators.maximum_likelihood import driver as maximum_likelihood
 from etid.estimators.maximum_likelihood import given_driver
-from etid.identify.lanes import lane
+from etid.estimators.starts import harmonic_starts
 from etid.online import gain_bands
 from etid.online.tracker import MEMORY, PATIENCE, Tracker
 from etid.recordings.preflight import Inspected
 from etid.results.driver import ContinuousDriver
-from etid.signals.harmonics import ALIASED, Spectrum
+from etid.signals.harmonics import ALIASED
 from etid.simulation.scenes import Scene, Trial
 from etid.simulation.transformer import ResistorLoad, SkinLoad, loading
 from tests import pictures
@@ -100,6 +101,19 @@ def test_constant_skin_is_found_within_its_standard_errors_from_the_second_tenth
     gain = np.sqrt((fits.fit.steps - 30) / fits.fit.steps)
     np.testing.assert_allclose(widths[-1], widths[-31] * gain[:, None], rtol=0.1)
     assert (np.diagonal(fits.fit.shared_cov, axis1=1, axis2=2) > 0).all()
+
+
+def test_the_tracker_describes_itself_in_a_report(tmp_path):
+    """And not as the default of other identifications, which it is not."""
+    tracker = tracker_of(2)
+    fits = tracker.read(followed(tracker, tracker.pulses(loaded(scene(4).simulate(seed=5)))))
+    etid.write_report(fits, tmp_path / "page.html")
+    page = html.unescape((tmp_path / "page.html").read_text("utf-8"))
+    methods = page[page.index(">Methods<") :]
+    assert "iterated at each pulse (Bell and Cathey, 1993)" in methods
+    assert "by on-line tracking" in page
+    for wrong in ("aximum likelihood", "utput error", "Both occurred", "Levenberg"):
+        assert wrong not in page
 
 
 FACTOR = 3.0  # of every element from the values where the tracker starts
@@ -244,15 +258,15 @@ def test_after_some_pulses_it_is_what_a_batch_fit_of_these_periods_is():
 
 def batch(driver, recording):
     """Elements by maximum likelihood from the harmonics of a whole record, with the same Z_th."""
-    *fields, rate = map(jnp.asarray, lane(Inspected(recording), "maximum_likelihood"))
+    lane = Harmonics.of(Inspected(recording))
+    spectrum, rate = lane.spectrum, jnp.asarray(lane.sample_rate)
     model = maximum_likelihood.Joint(
         etid.SkinRC(), maximum_likelihood.Calibrations.of(driver), False
     )
-    spectrum = Spectrum(*fields)
     selected = spectrum.selected & (spectrum.frequency < ALIASED * RATE)
     spectrum = dataclasses.replace(spectrum, selected=selected)
     z_th = driver.response(spectrum.frequency)
-    starts = refinement.harmonic_starts(spectrum, rate, z_th, etid.SkinRC())
+    starts = harmonic_starts(spectrum, rate, z_th, etid.SkinRC())
     own, *_ = maximum_likelihood.fit_load(model, spectrum, rate, starts)
     return np.exp(np.asarray(own.log_elements))
 

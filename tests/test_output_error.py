@@ -12,6 +12,7 @@ import etid
 from benchmarks.ladder import CALIBRATION, LOADS, TRIAL, rung
 from etid.circuits.elements import resistor
 from etid.estimators.estimate import DELAY_WIDTH, KNOWN_DELAY, delay_std
+from etid.estimators.lanes import PaddedSamples
 from etid.estimators.output_error.fit import fit_source
 from etid.estimators.output_error.information import (
     Slopes,
@@ -25,8 +26,9 @@ from etid.estimators.output_error.prediction import (
     measured_impulse,
     prepare,
 )
+from etid.estimators.registry import OUTPUT_ERROR
 from etid.estimators.sandwich import Curvature
-from etid.identify import lanes
+from etid.identify.one import skin
 from etid.recordings.preflight import Inspected
 from etid.results.driver import SourceImpedance
 from etid.signals.measurement import Measurement
@@ -139,10 +141,10 @@ def fitted():
     driver = etid.identify_driver(study["c"])
 
     def of(scale):
-        lane = list(lanes.lane(Inspected(study["a"]), "output_error"))
-        lane[2:4] = scale * lane[2], scale * lane[3]
-        lane = tuple(map(jnp.asarray, lane))
-        return lanes.skin(lane, driver, None, etid.SkinRC(), "output_error")
+        lane = PaddedSamples.of(Inspected(study["a"]))
+        sigmas = {"sigma_th": scale * lane.sigma_th, "sigma_out": scale * lane.sigma_out}
+        lane = jax.tree.map(jnp.asarray, dataclasses.replace(lane, **sigmas))
+        return skin(lane, driver, None, etid.SkinRC(), OUTPUT_ERROR)
 
     return of
 

@@ -8,7 +8,7 @@ import pytest
 import scipy.signal
 
 from etid import SkinRC
-from etid.estimators.steiglitz_mcbride import (
+from etid.estimators.steiglitz_mcbride.iteration import (
     driver_filter,
     iterate,
     skin_elements,

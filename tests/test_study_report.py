@@ -13,6 +13,7 @@ from chromium import chromium
 
 import etid
 from etid import cli
+from etid.estimators import registry
 from etid.files import exporting
 from etid.report import citations, figures, tables, worst_fits
 from etid.report import methods as methods_section
@@ -88,7 +89,7 @@ def found(study_file, driver):
         condition=np.array([r"dry & $\hot$"] * 6),
     )
     with etid.read(study_file) as study:
-        settings = Settings.of(study, 6, 5, None, etid.SkinRC())
+        settings = Settings.of(study, 6, 5, "", etid.SkinRC())
     drivers = {("calibration/0",): driver}
     return StudyFits(fits, drivers, {("calibration/1",): "r_load <b>is</b> missing"}, settings)
 
@@ -344,16 +345,20 @@ CITED = {  # what a reader sees, and the key of the entry that it must have
     "McBride": "steiglitz1965",
     "Söderström, 2007": "soderstrom2007",
     "White, 1980": "white1980",
+    "Bell and Cathey, 1993": "bell1993",
     "Rader et al., 2024": "optimistix2024",
     "Bradbury et al., 2018": "jax2018",
 }
 
 
-@pytest.mark.parametrize("method", [*methods_section._TEXTS, "mixed"])
+TWO = "maximum_likelihood + output_error"
+
+
+@pytest.mark.parametrize("method", [*registry.names(), "joint", "online", TWO])
 def test_methods_cite_what_they_name_and_say_the_settings(found, method):
     fit = dataclasses.replace(found.fits.fit, method=method)
     settings = dataclasses.replace(found.settings, order=4, r_load_tolerance=0.001)
-    by = "maximum_likelihood" if method == "mixed" else method
+    by = method.partition(" + ")[0]
     drivers = {
         paths: dataclasses.replace(driver, method=by) for paths, driver in found.drivers.items()
     }

@@ -9,11 +9,10 @@ import numpy as np
 import pytest
 
 import etid
+from etid.estimators.lanes import Harmonics
 from etid.estimators.score_tests.unloaded import UnloadedShape, shape
-from etid.identify.lanes import lane
 from etid.recordings.preflight import Inspected
 from etid.recordings.study import Study
-from etid.signals.harmonics import Spectrum
 from etid.simulation.scenes import Scene, Trial
 from etid.simulation.transformer import ResistorLoad, SkinLoad, TransformerDriver
 
@@ -35,8 +34,8 @@ def study(driver=USUAL, seed=0, **options):
 
 
 def spectrum(recording):
-    *fields, _ = lane(Inspected(recording), "maximum_likelihood")
-    return Spectrum(*map(jnp.asarray, fields))
+    lane = Harmonics.of(Inspected(recording))
+    return lane.spectrum
 
 
 def is_changed(driver, seed=1, snr_db=60.0, **options):

@@ -14,7 +14,7 @@ import numpy as np
 from etid.circuits.display import DISPLAY, heading
 from etid.commands import DONE, WRONG_DATA, Outcome
 from etid.commands.circuits import add_circuit
-from etid.estimators.registry import METHODS
+from etid.estimators import registry
 from etid.identify.file import fit_file, kept, processes
 from etid.identify.jointly import identify_jointly
 from etid.recordings import hdf5
@@ -30,7 +30,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("-o", dest="target", type=pathlib.Path, required=True, metavar="FITS")
     parser.add_argument(
         "--method",
-        choices=METHODS,
+        choices=registry.names(),
         help="default maximum_likelihood where the record allows it, else output_error",
     )
     add_circuit(parser, "the circuit of the loads, default SkinRC")

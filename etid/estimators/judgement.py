@@ -15,6 +15,8 @@ from etid.estimators.estimate import Estimate
 from etid.recordings.remarks import Remark
 from etid.results.fits import Fit
 from etid.results.verdicts import RESULTS, first_verdict, verdict
+from etid.solvers.levenberg_marquardt import NormalEquations
+from etid.solvers.matrices import inverse
 
 # Members inherited from lineax, of which the type checker thinks they are not ours.
 SUCCESSFUL = verdict("successful")
@@ -26,6 +28,7 @@ MISFIT_RRSE = (
 # Growth of the calibrations' sum of squares in a joint fit. It is chi-squared with as many degrees
 # of freedom as Z_th and the delays have parameters at most: 12 exceed this once in ten thousand.
 STRAINED = 39.0
+BIASED = 16.0  # squared standard errors between an estimate and the minimum of its own model
 
 
 def misses(
@@ -94,3 +97,8 @@ def unless(fit: Fit, bad: Bool[Array, ""], result: RESULTS) -> Fit:
     """The same with another verdict, if it would be successful and should not."""
     wrong = bad & (fit.result == SUCCESSFUL)
     return dataclasses.replace(fit, result=RESULTS.where(wrong, result, fit.result))
+
+
+def distance_to_minimum(equations: NormalEquations) -> Float[Array, ""]:
+    """Squared distance to the minimum in standard errors."""
+    return equations.gradient @ inverse(equations.matrix) @ equations.gradient

@@ -1,151 +1,152 @@
-"""The estimators, and which of them can identify what."""
+"""The estimators by name, and which one a recording needs if none was asked for."""
 
+import ast
+import dataclasses
 from collections.abc import Sequence
-from typing import Literal, TypeVar, get_args
 
-import numpy as np
-
-from etid.circuits.circuit import AbstractCircuit, SkinRC
-from etid.estimators import steiglitz_mcbride
+from etid.circuits.circuit import AbstractCircuit
+from etid.estimators.estimator import AbstractEstimator, Description
+from etid.estimators.harmonic_steiglitz_mcbride.estimator import HarmonicSteiglitzMcBride
+from etid.estimators.maximum_likelihood.estimator import MaximumLikelihood
+from etid.estimators.non_parametric.estimator import NonParametric
+from etid.estimators.output_error.estimator import OutputError
+from etid.estimators.steiglitz_mcbride.estimator import EquationError, SteiglitzMcBride
 from etid.recordings.preflight import Inspected, preflight
-from etid.recordings.recording import Recording
-from etid.results.driver import ContinuousDriver, Driver, HarmonicDriver
+from etid.results.driver import Driver, HarmonicDriver
 from etid.signals.harmonics import separates_aliases
 from etid.signals.precision import require_float64
 
-Method = Literal[
-    "maximum_likelihood",
-    "non_parametric",
-    "output_error",
-    "harmonic_steiglitz_mcbride",
-    "steiglitz_mcbride",
-    "equation_error",
-]
-METHODS: tuple[Method, ...] = get_args(Method)
-CALIBRATED = METHODS[:2]  # those that use the harmonics of the calibrations
-REFINED = METHODS[:3]  # those for any circuit
-CONTINUOUS = METHODS[:4]  # those that use a continuous source impedance
-HARMONIC = (*CALIBRATED, METHODS[3])  # those on the harmonics of whole pulse periods
-SAME_PULSE_RATE = 1e-3  # part by which rates may differ: Z_th is smooth
-_Kind = TypeVar("_Kind", bound=Driver)
+Method = str | AbstractEstimator  # a name in the registry, or an estimator with its options
+MAXIMUM_LIKELIHOOD = MaximumLikelihood()
+OUTPUT_ERROR = OutputError()
+
+_ESTIMATORS: dict[str, AbstractEstimator] = {}
+_DESCRIPTIONS: dict[str, Description] = {}  # of what is no estimator of single recordings
 
 
-def iterations(method: Method) -> int:
-    """Of Steiglitz-McBride in time."""
-    return 1 if method == "equation_error" else steiglitz_mcbride.ITERATIONS
+def register(estimator: AbstractEstimator) -> None:
+    """Make an estimator known by its name, for `method`, files of fits and reports.
+
+    Raises:
+        ValueError: Another estimator has this name.
+    """
+    if estimator != _ESTIMATORS.setdefault(estimator.name, estimator):
+        raise ValueError(f"{estimator.name} is the name of {_ESTIMATORS[estimator.name]!r}")
 
 
-def check_method(method: str | None, circuit: AbstractCircuit | None = None) -> None:
-    """Raise ValueError unless the method exists and can identify this circuit."""
+for _estimator in (
+    MAXIMUM_LIKELIHOOD,
+    NonParametric(),
+    OUTPUT_ERROR,
+    HarmonicSteiglitzMcBride(),
+    SteiglitzMcBride(),
+    EquationError(),
+):
+    register(_estimator)
+
+
+def register_description(name: str, description: Description) -> None:
+    """Say for a methods section what fits are whose `method` is this name."""
+    _DESCRIPTIONS[name] = description
+
+
+def names() -> tuple[str, ...]:
+    """The names of all estimators."""
+    return tuple(_ESTIMATORS)
+
+
+def named(method: str) -> AbstractEstimator:
+    """The estimator that a text names, as `str(estimator)` writes it.
+
+    Raises:
+        ValueError: There is none of this name, or it has no such option.
+    """
+    name, _, options = method.partition("(")
+    if name not in _ESTIMATORS:
+        raise ValueError(f"method {method!r} is not known; use one of {', '.join(names())}")
+    if not options:
+        return _ESTIMATORS[name]
+    try:
+        call = ast.parse(f"dict({options}", mode="eval").body
+        keywords = call.keywords if isinstance(call, ast.Call) else []
+        given = {str(one.arg): ast.literal_eval(one.value) for one in keywords}
+        return dataclasses.replace(_ESTIMATORS[name], **given)
+    except (SyntaxError, ValueError, TypeError, RecursionError) as error:
+        raise ValueError(f"method {method!r}: {name} has no such options") from error
+
+
+def described(method: str) -> Description | None:
+    """The description of the method that a fit names; None if no module has registered it."""
+    if method in _DESCRIPTIONS:
+        return _DESCRIPTIONS[method]
+    try:
+        return named(method).describe()
+    except ValueError:
+        return None
+
+
+def estimator_of(
+    method: Method | None, circuit: AbstractCircuit | None = None
+) -> AbstractEstimator | None:
+    """The estimator that was asked for; None if the recordings are to choose.
+
+    Raises:
+        ValueError: There is no such estimator, or it cannot identify this circuit.
+    """
     require_float64()
     if method is None:
-        return
-    if method not in METHODS:
-        raise ValueError(f"method {method!r} is not known; use one of {', '.join(METHODS)}")
-    if method not in REFINED and circuit is not None and not isinstance(circuit, SkinRC):
-        raise ValueError(
-            f"method {method!r} identifies SkinRC only, not {type(circuit).__name__}; "
-            "use method='maximum_likelihood'"
-        )
-    if method == "output_error" and circuit is not None and not circuit.is_rational:
-        raise ValueError(
-            "method 'output_error' needs a ratio of polynomials in s, which "
-            f"{_not_rational(circuit)}; use method='maximum_likelihood'"
-        )
+        return None
+    estimator = method if isinstance(method, AbstractEstimator) else named(str(method))
+    if circuit is not None:
+        estimator.check_circuit(circuit)
+    return estimator
 
 
-def _not_rational(circuit: AbstractCircuit) -> str:
-    return f"{type(circuit).__name__}, with its constant-phase element, is not"
-
-
-def check_default(method: Method, circuit: AbstractCircuit) -> None:
-    """Raise ValueError if the method that was chosen cannot identify this circuit."""
-    if method == "output_error" and not circuit.is_rational:
+def check_default(estimator: AbstractEstimator, circuit: AbstractCircuit) -> None:
+    """Raise ValueError if the estimator that was chosen cannot identify this circuit."""
+    try:
+        estimator.check_circuit(circuit)
+    except ValueError as error:
         raise ValueError(
             "the record holds less than two whole pulse periods or begins in a pulse, or its "
-            "driver was identified without harmonics; the method for it is output_error, which "
-            f"needs a ratio of polynomials in s, and {_not_rational(circuit)}. Record three "
-            "periods or more and identify the driver with method='maximum_likelihood', or ask for "
-            "method='maximum_likelihood': in a single period its standard errors leave out what "
-            "aliases do"
-        )
+            f"driver was identified without harmonics; {str(error).partition(';')[0]}. Record "
+            "three periods or more and identify the driver with method='maximum_likelihood', or "
+            "ask for method='maximum_likelihood': in a single period its standard errors leave "
+            "out what aliases do"
+        ) from error
 
 
-def choose(method: Method | None, recordings: Sequence[Inspected]) -> Method:
-    """The method given, or else maximum likelihood if all records hold several whole periods.
+def for_calibrations(
+    asked: AbstractEstimator | None, recordings: Sequence[Inspected]
+) -> AbstractEstimator:
+    """The estimator asked for, or else maximum likelihood if all records hold several periods.
 
     Where aliases cannot be told from harmonics, as in a single period, it would be biased by more
     than its errors say.
     """
-    if method is not None:
-        return method
-    for seen in recordings:
-        if not separates_aliases(*seen.periods) or not seen.is_periodic:
-            return "output_error"
-    return "maximum_likelihood"
+    if asked is not None:
+        return asked
+    several = all(separates_aliases(*seen.periods) and seen.is_periodic for seen in recordings)
+    return MAXIMUM_LIKELIHOOD if several else OUTPUT_ERROR
 
 
-def _choose_for(method: Method | None, seen: Inspected, driver: Driver) -> Method:
-    """As `choose`, for a load that is identified with `driver`."""
-    if method is None and not isinstance(driver, HarmonicDriver):
-        return "output_error"
-    return choose(method, [seen])
+def for_samples(driver: Driver, periods: tuple[int, int]) -> AbstractEstimator:
+    """The estimator for bare arrays of so many whole periods and samples."""
+    several = isinstance(driver, HarmonicDriver) and separates_aliases(*periods)
+    return MAXIMUM_LIKELIHOOD if several else OUTPUT_ERROR
 
 
-def plan(given: Method | None, seen: Inspected, driver: Driver) -> tuple[Method, str | None]:
-    """The method for a load, and the verdict that forbids to fit it, if there is one.
-
-    Raises:
-        ValueError: The driver cannot serve the method.
-    """
-    name = preflight(seen, periodic=given in HARMONIC)
-    if name is None:
-        method = _choose_for(given, seen, driver)
-    else:
-        method = given or "output_error"
-    check_driver(driver, method, seen.recording.sample_rate)
-    if method == "non_parametric":
-        _check_pulse_rate(serving(driver, HarmonicDriver, method), seen.recording)
-    return method, name
-
-
-def _check_pulse_rate(driver: HarmonicDriver, recording: Recording) -> None:
-    known = float(driver.spectra.frequency[0, 0])
-    if not np.isclose(recording.pulse_rate, known, rtol=SAME_PULSE_RATE):
-        raise ValueError(
-            f"non_parametric knows Z_th at harmonics of {known:.6g} Hz only, but the recording has "
-            f"{recording.pulse_rate:.6g} Hz; use method='maximum_likelihood'"
-        )
-
-
-def serving(driver: Driver, kind: type[_Kind], method: str) -> _Kind:
-    """The driver as the kind that `method` needs.
+def plan(
+    asked: AbstractEstimator | None, seen: Inspected, driver: Driver
+) -> tuple[AbstractEstimator, str | None]:
+    """The estimator for a load, and the verdict that forbids to fit it, if there is one.
 
     Raises:
-        ValueError: It is of a kind that lacks what the method needs.
+        ValueError: The driver cannot serve it.
     """
-    if isinstance(driver, kind):
-        return driver
-    if not isinstance(driver, ContinuousDriver):
-        raise ValueError(
-            f"this driver was identified by {driver.method}, which gives no continuous source "
-            f"impedance; identify it with method={method!r}"
-        )
-    raise ValueError(
-        f"this driver was identified by {driver.method}, which keeps no harmonics of its "
-        "calibrations; identify it with method='maximum_likelihood'"
-    )
-
-
-def check_driver(driver: Driver, method: Method, sample_rate: float) -> None:
-    """Raise ValueError if `driver` cannot serve `method` at `sample_rate` [Hz]."""
-    if method in CALIBRATED:
-        serving(driver, HarmonicDriver, method)
-    elif method in CONTINUOUS:
-        serving(driver, ContinuousDriver, method)
-    elif not np.isclose(float(driver.sample_rate), sample_rate):
-        raise ValueError(
-            f"{method} needs recording and calibration at one sample rate, but the recording has "
-            f"{sample_rate:g} Hz and the driver {float(driver.sample_rate):g} Hz; "
-            "use method='output_error'"
-        )
+    name = preflight(seen, periodic=asked is not None and asked.lane.periodic)
+    estimator = asked or OUTPUT_ERROR
+    if name is None and isinstance(driver, HarmonicDriver):
+        estimator = for_calibrations(asked, [seen])
+    estimator.check_driver(driver, seen.recording.sample_rate, seen.recording.pulse_rate)
+    return estimator, name

@@ -28,7 +28,8 @@ from tqdm import tqdm
 
 from etid.circuits.circuit import AbstractCircuit
 from etid.circuits.lookup import qualified
-from etid.estimators.registry import Method, check_method
+from etid.estimators.estimator import AbstractEstimator
+from etid.estimators.registry import Method, estimator_of
 from etid.identify.arguments import circuit_of, order_of
 from etid.identify.many import Drivers, identify_part, to_identify
 from etid.recordings.hdf5 import read
@@ -59,27 +60,31 @@ class _Opened(NamedTuple):
     drivers: Drivers
 
 
-def _open(source: str, order: int, method: Method | None, driver_drift: float) -> _Opened:
+def _open(source: str, order: int, asked: AbstractEstimator | None, driver_drift: float) -> _Opened:
     study = read(source)
-    return _Opened(study, to_identify(study), Drivers(study, order, method, driver_drift))
+    return _Opened(study, to_identify(study), Drivers(study, order, asked, driver_drift))
 
 
 @functools.cache
 def _kept_open(
-    source: str, stamp: int, order: int, method: Method | None, driver_drift: float
+    source: str, stamp: int, order: int, asked: AbstractEstimator | None, driver_drift: float
 ) -> _Opened:
     """The same, once per process and as long as that lives: parts come one by one."""
     del stamp
-    return _open(source, order, method, driver_drift)
+    return _open(source, order, asked, driver_drift)
 
 
 def _fit(
-    opened: _Opened, circuit: AbstractCircuit, method: Method | None, size: int, number: int
+    opened: _Opened,
+    circuit: AbstractCircuit,
+    asked: AbstractEstimator | None,
+    size: int,
+    number: int,
 ) -> StudyFits:
     """Fit one part; with its own drivers, whatever else this process has identified before."""
     study, paths, drivers = opened
     part = paths[number * size : (number + 1) * size]
-    fits = identify_part(study, part, drivers, circuit, method)
+    fits = identify_part(study, part, drivers, circuit, asked)
     used = set()
     for path in part:
         with contextlib.suppress(RecordingError):
@@ -93,7 +98,7 @@ def _fit_elsewhere(
     source: str,
     stamp: int,
     order: int,
-    method: Method | None,
+    asked: AbstractEstimator | None,
     driver_drift: float,
     circuit: AbstractCircuit,
     size: int,
@@ -102,7 +107,7 @@ def _fit_elsewhere(
     """Fit one part in any process that sees the file."""
     with jax.enable_x64(True):  # of a worker: the caller's own was checked
         return _fit(
-            _kept_open(source, stamp, order, method, driver_drift), circuit, method, size, number
+            _kept_open(source, stamp, order, asked, driver_drift), circuit, asked, size, number
         )
 
 
@@ -207,9 +212,9 @@ def fit_file(
     """
     order = order_of(order)
     circuit = circuit_of(circuit)
-    check_method(method, circuit)
+    asked = estimator_of(method, circuit)
     source, target = os.path.abspath(source), pathlib.Path(target)
-    opened = _open(source, order, method, driver_drift)
+    opened = _open(source, order, asked, driver_drift)
     with opened.study:
         count = len(opened.paths)
         if not count:
@@ -217,7 +222,7 @@ def fit_file(
         numbers = range((count + PART - 1) // PART)
         stamp = os.stat(source).st_mtime_ns
         settings = Settings.of(
-            opened.study, count, order, method, circuit, driver_drift=driver_drift
+            opened.study, count, order, str(asked or ""), circuit, driver_drift=driver_drift
         )
         described = json.loads(json.dumps(dataclasses.asdict(settings)))  # tuples become lists
         run = {
@@ -230,10 +235,10 @@ def fit_file(
         }
         parts = _Parts(target, run, resume)
         left = [number for number in numbers if not parts.path(number).exists()]
-        task = functools.partial(_fit, opened, circuit, method, PART)
+        task = functools.partial(_fit, opened, circuit, asked, PART)
         if executor is not None:
             task = functools.partial(
-                _fit_elsewhere, source, stamp, order, method, driver_drift, circuit, PART
+                _fit_elsewhere, source, stamp, order, asked, driver_drift, circuit, PART
             )
         drivers = {}
         done = min(count, (len(numbers) - len(left)) * PART)

@@ -8,7 +8,8 @@ result tell what is a trial's own from what all trials have in common.
 import dataclasses
 import functools
 from collections import Counter
-from typing import Any
+from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -18,16 +19,25 @@ from jaxtyping import Array, Bool, Int
 from tqdm import tqdm
 
 from etid.circuits.circuit import AbstractCircuit
-from etid.estimators import judgement, refinement
+from etid.estimators import judgement
+from etid.estimators.estimator import (
+    BY_RESIDUALS,
+    CHECKED,
+    DETERMINED,
+    HARMONICS,
+    Description,
+    serving,
+)
 from etid.estimators.joint import fit as shared_driver
 from etid.estimators.joint.terms import Loads
+from etid.estimators.lanes import AbstractLane, Harmonics
 from etid.estimators.maximum_likelihood.driver import Calibrations, Joint, fit_load
-from etid.estimators.registry import HARMONIC, serving
+from etid.estimators.maximum_likelihood.estimator import OF_DRIVER, TESTED
+from etid.estimators.registry import register_description
 from etid.estimators.score_tests.unloaded import shape_of
-from etid.identify import changes
+from etid.estimators.starts import harmonic_starts
 from etid.identify.arguments import circuit_of, order_of, require
 from etid.identify.compiled import stored_jit
-from etid.identify.lanes import checksum, is_shared, lane, realigned, remarked, without_mains
 from etid.identify.many import (
     LANES,
     Drivers,
@@ -39,7 +49,7 @@ from etid.identify.many import (
     to_identify,
     unstacked,
 )
-from etid.identify.one import failed_fit, note
+from etid.identify.one import checksum, concluded, failed_fit, is_shared, note, repeated
 from etid.recordings.preflight import Inspected
 from etid.recordings.remarks import Remark
 from etid.recordings.repeats import Repeats, repeats
@@ -49,7 +59,6 @@ from etid.results.fits import Fit
 from etid.results.provenance import Settings
 from etid.results.study_fits import StudyFits
 from etid.results.verdicts import RESULTS, verdict
-from etid.signals.harmonics import Spectrum
 from etid.signals.precision import require_float64
 
 METHOD = "joint"
@@ -57,28 +66,52 @@ SINGLE = (
     "The record or its calibration does not hold several whole pulse periods, which a joint fit "
     "needs. Record more, or identify it on its own."
 )
+register_description(
+    METHOD,
+    Description(
+        words="joint maximum likelihood",
+        text=HARMONICS + "each driver and all recordings made with it were estimated in one fit by "
+        "maximum likelihood with noise on both records (Pintelon and Schoukens, 2012, ch. 9): the "
+        "residual Y - G exp(-jωτ) X of each loaded record Y and its unloaded record X is weighted "
+        "by its variance, var Y + |G|² var X, G = Z_L / (Z_L + Z_th). Z_th is common to all, each "
+        "record has its own trigger delay τ.",
+        conditions=(*CHECKED, DETERMINED, *TESTED),
+        of_driver=OF_DRIVER,
+        errors=BY_RESIDUALS,
+        refined=True,
+        cited=("pintelon2012", "optimistix2024", "white1980"),
+    ),
+)
+
+
+class _Start(NamedTuple):
+    """Loads identified one by one with Z_th as it is, where a joint fit may start.
+
+    Attributes:
+        loads: The loads.
+        hum: Whether each shows mains hum.
+        changed: Whether it shows that the driver has changed since its calibration.
+    """
+
+    loads: Loads
+    hum: Bool[Array | np.ndarray, "*lane"]
+    changed: Bool[Array | np.ndarray, "*lane"]
 
 
 @stored_jit
-def _alone(
-    lanes: Any, count: Int[Array, ""], model: Joint, driver: HarmonicDriver
-) -> tuple[Loads, Bool[Array, " load"], Bool[Array, " load"]]:
-    """Loads identified one by one with Z_th as it is, where a joint fit may start.
-
-    And whether each shows mains hum, and that the driver has changed since its calibration.
-    """
-    known = shape_of(driver, lanes[0][0])
+def _alone(lanes: Any, count: Int[Array, ""], model: Joint, driver: HarmonicDriver) -> _Start:
+    known = shape_of(driver, jnp.asarray(lanes.frequency)[0])
 
     def one(lane):
-        *fields, sample_rate = lane
-        spectrum = Spectrum(*fields)
+        spectrum, sample_rate = lane.spectrum, lane.sample_rate
         z_th = model.calibrations.source.response(spectrum.frequency)
-        starts = refinement.harmonic_starts(spectrum, sample_rate, z_th, model.circuit)
+        starts = harmonic_starts(spectrum, sample_rate, z_th, model.circuit)
         own, result, chi2, error, hum = fit_load(model, spectrum, sample_rate, starts)
         settled = RESULTS.promote(result) == RESULTS.successful
         good = settled & jnp.isfinite(chi2) & ~judgement.misses(chi2, error)
         changed = jnp.array(False) if known is None else known.differs(spectrum)
-        return Loads(spectrum, sample_rate, own, good & ~changed, jnp.array(-1)), hum, changed
+        loads = Loads(spectrum, sample_rate, own, good & ~changed, jnp.array(-1))
+        return _Start(loads, hum, changed)
 
     return each(one, lanes, count)
 
@@ -128,58 +161,40 @@ class _Waiting:
         self.model = model
         self.driver = driver
         self.rows: list[int] = []
-        self.lanes: list[tuple[np.ndarray, ...]] = []
-        self.chunks: list[Loads] = []
+        self.lanes: list[Harmonics] = []
+        self.seen: list[Inspected] = []  # those of `lanes`
+        self.starts: list[_Start] = []
         self.remarks: list[int] = []
-        self.changed: list[bool] = []  # since the calibration of the driver
         self.unloaded: list[int] = []
         self.repeats: list[Repeats | None] = []
-        self.seen: list[Inspected] = []  # those of `lanes`
 
     def add(self, row: int, seen: Inspected) -> None:
         self.rows.append(row)
         self.unloaded.append(checksum(seen))
         self.seen.append(seen)
-        self.lanes.append(lane(seen, "maximum_likelihood"))
-        self.remarks.append(int(seen.remarks))
+        self.lanes.append(Harmonics.of(seen))
         if len(self.lanes) == LANES:
             self.run()
 
     def run(self) -> None:
         if not self.lanes:
             return
-        first = len(self.rows) - len(self.lanes)
-        loads, hum, changed = self._alone(self.lanes)
-        late = loads.own.delay_samples
-        late = np.where(np.abs(late) > 1, np.round(late), 0)  # more than a fit allows for
-        if np.any(late) and np.isfinite(late).all():
-            for number, delay in enumerate(late.astype(int)):
-                one = self.lanes[number]
-                self.lanes[number] = realigned(one, "maximum_likelihood", int(delay))
-                self.remarks[first + number] |= Remark.aligned if delay else 0
-            loads, hum, changed = self._alone(self.lanes)
-        again = {}
-        for number, one in enumerate(self.lanes):
-            few = without_mains(one, "maximum_likelihood")
-            if few is not None and (hum[number] or not loads.used[number]):
-                again[number] = few
-        if again:
-            others, seen, _ = self._alone(list(again.values()))
-            for row, number in enumerate(again):
-                if others.used[row] and seen[row]:
-                    self.remarks[first + number] |= Remark.mains_hum
-                    for leaf, other in zip(*map(jax.tree.leaves, (loads, others)), strict=True):
-                        leaf[number] = other[row]
-        self.chunks.append(loads)
-        self.changed += changed.tolist()
+        starts = repeated(self.lanes, self.seen, self._alone, _late_by, _needs_another, _of_both)
+        for start, seen in zip(starts, self.seen, strict=True):
+            self.remarks.append(int(seen.remarks | (Remark.mains_hum if start.hum else 0)))
+        self.starts += starts
         self.repeats += repeats(self.seen)
         self.lanes, self.seen = [], []
 
-    def _alone(self, lanes: list[tuple[np.ndarray, ...]]) -> tuple[Loads, np.ndarray, np.ndarray]:
-        count = len(lanes)
+    def _alone(self, lanes: Sequence[AbstractLane]) -> list[_Start]:
         of = self.model, self.driver
-        found = jax.device_get(_alone(filled(lanes), jnp.asarray(count), *of))
-        return jax.tree.map(lambda leaf: leaf[:count].copy(), found)
+        found = jax.device_get(_alone(filled(lanes), jnp.asarray(len(lanes)), *of))
+        return list(unstacked(found))[: len(lanes)]
+
+    @property
+    def changed(self) -> list[bool]:
+        """Whether each recording shows that the driver has changed since its calibration."""
+        return [bool(start.changed) for start in self.starts]
 
     def several(self) -> list[int]:
         """Checksums of the unloaded records that several recordings have."""
@@ -187,10 +202,27 @@ class _Waiting:
 
     def loads(self) -> Loads:
         self.run()
-        loads = jax.tree.map(lambda *parts: np.concatenate(parts), *self.chunks)
+        starts = [start.loads for start in self.starts]
+        loads = jax.tree.map(lambda *parts: np.stack(parts), *starts)
         number = {key: i for i, key in enumerate(self.several())}
         unloaded = np.array([number.get(key, -1) for key in self.unloaded])
         return eqx.tree_at(lambda of: of.unloaded, loads, unloaded)
+
+
+def _late_by(lane: AbstractLane, start: _Start) -> int:
+    del lane
+    late = float(start.loads.own.delay_samples)
+    return round(late) if 1 < abs(late) < np.inf else 0  # more than a fit allows for
+
+
+def _needs_another(start: _Start) -> bool:
+    return bool(start.hum) or not start.loads.used
+
+
+def _of_both(first: _Start, second: _Start) -> _Start:
+    if second.loads.used and second.hum:
+        return second._replace(changed=first.changed)
+    return first._replace(hum=np.asarray(False))
 
 
 def identify_jointly(
@@ -238,14 +270,14 @@ def identify_jointly(
 
     for row in tqdm(range(len(paths)), unit="recording", disable=not progress):
         try:
-            seen, found, method = planned(functools.partial(load, row), None)
-            if method not in HARMONIC:
+            seen, found, estimator = planned(functools.partial(load, row), None)
+            if not estimator.lane.periodic:
                 raise Refusal("not_periodic", SINGLE)
         except Refusal as refusal:
             fits[row] = failed_fit(refusal.name, circuit, METHOD)
             notes[row] = refusal.note
             continue
-        driver = serving(found, HarmonicDriver, method)
+        driver = serving(found, HarmonicDriver, str(estimator))
         lengths = waiting.setdefault(drivers.of(seen.recording), {})
         shared = is_shared(seen, driver)
         key = seen.v_th.size, shared, seen.recording.sample_rate, seen.recording.pulse_rate
@@ -260,14 +292,16 @@ def identify_jointly(
         tolerance = jnp.asarray(r_load_tolerance, dtype=float)
         model = _model(circuit, driver, shared)
         found, better = _together(model, groups, several, driver, tolerance)
+        # What comes out of a compiled function is an array of JAX, and the checksums are none.
+        better = dataclasses.replace(better, method=METHOD, unloaded=driver.unloaded)
         changed = any(any(group.changed) for group in lengths.values())
         if changed and not any(np.any(loads.used) for loads in groups):
             better = dataclasses.replace(better, result=verdict("inconsistent"))
-        drivers.found[names] = dataclasses.replace(better, method=METHOD)
+        drivers.found[names] = better
         for group, fit in zip(lengths.values(), jax.device_get(found), strict=True):
-            of_group = zip(group.remarks, group.changed, unstacked(fit), strict=True)
-            marked = [remarked(_of(one, changed), remarks) for remarks, changed, one in of_group]
-            judged = changes.judged(marked, better, group.repeats)
+            of_group = zip(unstacked(fit), group.changed, strict=True)
+            alone = [_of(one, changed) for one, changed in of_group]
+            judged = concluded(alone, better, group.remarks, group.repeats)
             for row, one in zip(group.rows, judged, strict=True):
                 fits[row] = one
                 notes[row] = note(one)
@@ -280,6 +314,8 @@ def identify_jointly(
 def _of(fit: Fit, changed: bool) -> Fit:
     """The fit with the verdict of a driver that has changed since its calibration."""
     explained = changed and fit.verdict in ("successful", "misfit")
+    # Whether hum was left out was decided when each was fitted alone.
+    fit = dataclasses.replace(fit, remarks=np.zeros((), int))
     return dataclasses.replace(fit, result=verdict("inconsistent")) if explained else fit
 
 

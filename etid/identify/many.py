@@ -12,7 +12,7 @@ import dataclasses
 import functools
 import threading
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from typing import Any
+from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -21,40 +21,43 @@ from jaxtyping import Array, Int
 from tqdm import tqdm
 
 from etid.circuits.circuit import AbstractCircuit
-from etid.estimators.registry import Method, check_default, check_method, plan
-from etid.identify import changes
+from etid.estimators.estimator import AbstractEstimator
+from etid.estimators.lanes import AbstractLane, stacked
+from etid.estimators.registry import (
+    MAXIMUM_LIKELIHOOD,
+    Method,
+    check_default,
+    estimator_of,
+    plan,
+)
 from etid.identify.arguments import circuit_of, order_of, require
 from etid.identify.arguments import recordings as several
 from etid.identify.compiled import stored_jit
-from etid.identify.lanes import (
-    Known,
+from etid.identify.driver import identify_driver
+from etid.identify.one import (
+    concluded,
     explained,
+    failed_fit,
     is_shared,
-    known_driver,
-    lane,
-    late_by,
-    needs_another,
-    of_both,
-    realigned,
-    remarked,
+    known_of,
+    note,
+    refined,
     skin_lane,
-    stacked,
-    without_mains,
 )
-from etid.identify.one import failed_fit, identify_driver, note
 from etid.identify.prefetch import prefetch
 from etid.recordings.preflight import Inspected
 from etid.recordings.recording import Recording, RecordingError
 from etid.recordings.repeats import repeats
 from etid.recordings.study import Study
 from etid.results.driver import Driver
-from etid.results.fits import Fit, Fits, IdentificationError, described
+from etid.results.fits import Fit, Fits, IdentificationError, described, joined
 from etid.results.provenance import Settings
 from etid.results.study_fits import StudyFits
 from etid.results.verdicts import message
 
 LANES = 16  # of one call, the last of which is filled up
 AHEAD = 2 * LANES  # recordings that are read, and looked at, before their turn
+_Found = TypeVar("_Found")
 
 
 @stored_jit
@@ -62,11 +65,11 @@ def _chunk(
     lanes: Any,
     count: Int[Array, ""],
     driver: Driver,
-    known: Known,
+    known: Any,
     circuit: AbstractCircuit,
-    method: Method,
+    estimator: AbstractEstimator,
 ) -> Fit:
-    return each(lambda lane: skin_lane(lane, driver, known, circuit, method), lanes, count)
+    return each(lambda lane: skin_lane(lane, driver, known, circuit, estimator), lanes, count)
 
 
 def each(fit: Callable[[Any], Any], lanes: Any, count: int | Int[Array, ""]) -> Any:
@@ -92,9 +95,9 @@ def _stack(fits: Sequence[Fit]) -> Fit:
     return jax.tree.map(lambda *leaves: np.stack(leaves), *fits)
 
 
-def _of_one_method(fits: Sequence[Fit], used: Sequence[str], otherwise: str) -> list[Fit]:
-    """The same with one name: a batch has one, "mixed" if several were used."""
-    name = used[0] if len(set(used)) == 1 else "mixed" if used else otherwise
+def _of_one_method(fits: Sequence[Fit], used: Sequence[str]) -> list[Fit]:
+    """The same with one name: a batch has one, of all methods that were used."""
+    name = joined(used)
     arrays = [jax.tree.map(np.asarray, fit) for fit in fits]
     return [dataclasses.replace(fit, method=name) for fit in arrays]
 
@@ -109,9 +112,9 @@ class Refusal(Exception):
 
 
 def planned(
-    load: Callable[[], tuple[Recording, Driver]], given: Method | None
-) -> tuple[Inspected, Driver, Method]:
-    """Load a recording and its driver, and choose its method.
+    load: Callable[[], tuple[Recording, Driver]], asked: AbstractEstimator | None
+) -> tuple[Inspected, Driver, AbstractEstimator]:
+    """Load a recording and its driver, and choose its estimator.
 
     Raises:
         Refusal: Any of it failed, or pre-flight forbids a fit.
@@ -119,17 +122,17 @@ def planned(
     try:
         recording, driver = load()
         seen = Inspected(recording)
-        method, name = plan(given, seen, driver)
+        estimator, name = plan(asked, seen, driver)
     except (RecordingError, ValueError) as error:
         raise Refusal("unreadable", str(error)) from error
     except IdentificationError as error:
         raise Refusal("driver_failed", str(error)) from error
     if name is not None:
         raise Refusal(name, explained(seen, name))
-    return seen, driver, method
+    return seen, driver, estimator
 
 
-def filled(lanes: Sequence[tuple[np.ndarray, ...]]) -> tuple[Array, ...]:
+def filled(lanes: Sequence[AbstractLane]) -> AbstractLane:
     """A chunk, filled up by the last lane."""
     return stacked([*lanes, *[lanes[-1]] * (LANES - len(lanes))])
 
@@ -138,67 +141,39 @@ class _Queue:
     """Recordings that one compiled function takes, with one driver, waiting to fill a chunk."""
 
     def __init__(
-        self,
-        driver: Driver,
-        known: Known,
-        circuit: AbstractCircuit,
-        method: Method,
+        self, driver: Driver, known: Any, circuit: AbstractCircuit, estimator: AbstractEstimator
     ):
         self.driver = driver
         self.known = known
         self.circuit = circuit
-        self.method: Method = method
+        self.estimator = estimator
         self.rows: list[int] = []
-        self.lanes: list[tuple[np.ndarray, ...]] = []
+        self.lanes: list[AbstractLane] = []
         self.seen: list[Inspected] = []
-        self.again: set[int] = set()
 
-    def add(self, row: int, lane: tuple[np.ndarray, ...], seen: Inspected) -> None:
+    def add(self, row: int, lane: AbstractLane, seen: Inspected) -> None:
         """Let a recording wait."""
         self.rows.append(row)
         self.lanes.append(lane)
         self.seen.append(seen)
 
     def run(self) -> Iterator[tuple[int, Fit]]:
-        """Fit what is waiting; what has to be aligned anew, once, waits again."""
-        fits, kept = self._fits(self.lanes), []
+        """Fit what is waiting."""
         rows, lanes, seen = self.rows, self.lanes, self.seen
         self.rows, self.lanes, self.seen = [], [], []
-        for number, (row, one) in enumerate(zip(rows, lanes, strict=True)):
-            late = late_by(one, self.method, fits[number], self.driver)
-            if late and row not in self.again:
-                self.again.add(row)
-                seen[number].lag += late
-                self.add(row, realigned(one, self.method, late), seen[number])
-            else:
-                self.again.discard(row)
-                kept.append(number)
-        again = {
-            number: few
-            for number in kept
-            if needs_another(fits[number])
-            and (few := without_mains(lanes[number], self.method)) is not None
-        }
-        if again:
-            for number, second in zip(again, self._fits(list(again.values())), strict=True):
-                fits[number] = of_both(fits[number], second)
-        marked = [
-            remarked(fits[number], int(seen[number].remarks) | int(fits[number].remarks))
-            for number in kept
-        ]
-        if kept:
-            found = changes.judged(marked, self.driver, repeats([seen[number] for number in kept]))
-            yield from zip([rows[number] for number in kept], found, strict=True)
+        fits = refined(lanes, seen, self._fits, self.driver)
+        remarks = [int(one.remarks) for one in seen]
+        yield from zip(rows, concluded(fits, self.driver, remarks, repeats(seen)), strict=True)
 
-    def _fits(self, lanes: Sequence[tuple[np.ndarray, ...]]) -> list[Fit]:
-        of = self.driver, self.known, self.circuit, self.method
+    def _fits(self, lanes: Sequence[AbstractLane]) -> list[Fit]:
+        of = self.driver, self.known, self.circuit, self.estimator
         fits = jax.device_get(_chunk(filled(lanes), jnp.asarray(len(lanes)), *of))
         return list(unstacked(fits))[: len(lanes)]  # what fills it up is left out
 
 
-def unstacked(fits: Fit) -> Iterator[Fit]:
-    """The fits of a chunk one by one."""
-    leaves, structure = jax.tree.flatten(fits)
+def unstacked(found: _Found) -> Iterator[_Found]:
+    """What was found for a chunk, lane by lane."""
+    leaves, structure = jax.tree.flatten(found)
     return (
         jax.tree.unflatten(structure, map(np.asarray, one)) for one in zip(*leaves, strict=True)
     )
@@ -208,26 +183,27 @@ def _identify(
     count: int,
     load: Callable[[int], tuple[Recording, Driver]],
     circuit: AbstractCircuit,
-    given: Method | None,
+    asked: AbstractEstimator | None,
     progress: bool,
 ) -> tuple[list[Fit], list[str]]:
     """Fit `count` recordings; what `load(row)` raises becomes the verdict of its row."""
     fits: dict[int, Fit] = {}
     notes = [""] * count
     used: list[str] = []
+    otherwise = str(asked or MAXIMUM_LIKELIHOOD)
     queues: dict[tuple, _Queue] = {}
 
     def read(row):
         with jax.enable_x64(True):  # of the thread that reads: the caller's own was checked
-            seen, driver, method = planned(functools.partial(load, row), given)
+            seen, driver, estimator = planned(functools.partial(load, row), asked)
             try:
-                check_default(method, circuit)
+                check_default(estimator, circuit)
             except ValueError as error:
                 raise Refusal("not_periodic", str(error)) from error
         rates = seen.recording.sample_rate, seen.recording.pulse_rate
-        waiting, shared = lane(seen, method), is_shared(seen, driver)
-        key = id(driver), method, waiting[0].size, shared, rates
-        return driver, waiting, seen, method, shared, key
+        waiting, shared = estimator.lane.of(seen), is_shared(seen, driver)
+        key = id(driver), estimator, waiting.size, shared, rates
+        return driver, waiting, seen, estimator, shared, key
 
     with (
         tqdm(total=count, unit="fit", disable=not progress) as bar,
@@ -243,24 +219,24 @@ def _identify(
 
         for row, prepared in enumerate(recordings):
             try:
-                driver, waiting, seen, method, shared, key = prepared()
+                driver, waiting, seen, estimator, shared, key = prepared()
             except Refusal as refusal:
-                fits[row] = failed_fit(refusal.name, circuit, given or "maximum_likelihood")
+                fits[row] = failed_fit(refusal.name, circuit, otherwise)
                 notes[row] = refusal.note
                 bar.update()
                 continue
             if key not in queues:
-                known = known_driver(waiting, driver, method, shared)
-                queues[key] = _Queue(driver, known, circuit, method)
+                known = known_of(waiting, driver, shared, estimator)
+                queues[key] = _Queue(driver, known, circuit, estimator)
             queue = queues[key]
             queue.add(row, waiting, seen)
-            while len(queue.rows) == LANES:
+            if len(queue.rows) == LANES:
                 run(queue)
         for queue in queues.values():
-            while queue.rows:
+            if queue.rows:
                 run(queue)
     ordered = [fits[row] for row in range(count)]
-    return _of_one_method(ordered, used, given or "maximum_likelihood"), notes
+    return _of_one_method(ordered, used or [otherwise]), notes
 
 
 def identify_skins(
@@ -281,26 +257,26 @@ def identify_skins(
         progress: Show a progress bar.
 
     Returns:
-        One fit per recording, in their order; none is left without a verdict. The method is "mixed"
-        if some had to be identified by another than the others.
+        One fit per recording, in their order; none is left without a verdict. The method
+        names all that were used.
 
     Raises:
         ValueError: No recording, or method and circuit do not go together.
     """
     require("driver", driver, Driver)
     circuit = circuit_of(circuit)
-    check_method(method, circuit)
+    asked = estimator_of(method, circuit)
     if isinstance(recordings, Study):
         study, paths = recordings, [*recordings, *recordings.problems]
         known = [_known(study, path) for path in paths]
         fits, notes = _identify(
-            len(paths), lambda row: (study[paths[row]], driver), circuit, method, progress
+            len(paths), lambda row: (study[paths[row]], driver), circuit, asked, progress
         )
     else:
         records = several("recordings", recordings)
         known = [vars(record.metadata) for record in records]
         fits, notes = _identify(
-            len(records), lambda row: (records[row], driver), circuit, method, progress
+            len(records), lambda row: (records[row], driver), circuit, asked, progress
         )
     if not fits:
         raise ValueError("there is no recording to identify")
@@ -339,11 +315,13 @@ def identify_study(
     require("study", study, Study)
     order = order_of(order)
     circuit = circuit_of(circuit)
-    check_method(method, circuit)
-    drivers = Drivers(study, order, method, driver_drift)
+    asked = estimator_of(method, circuit)
+    drivers = Drivers(study, order, asked, driver_drift)
     paths = to_identify(study)
-    fits = identify_part(study, paths, drivers, circuit, method, progress)
-    settings = Settings.of(study, len(paths), order, method, circuit, driver_drift=driver_drift)
+    fits = identify_part(study, paths, drivers, circuit, asked, progress)
+    settings = Settings.of(
+        study, len(paths), order, str(asked or ""), circuit, driver_drift=driver_drift
+    )
     return StudyFits(fits, drivers.found, drivers.failures, settings)
 
 
@@ -357,7 +335,7 @@ def identify_part(
     paths: Sequence[str],
     drivers: "Drivers",
     circuit: AbstractCircuit,
-    method: Method | None,
+    asked: AbstractEstimator | None,
     progress: bool = False,
 ) -> Fits:
     """Identify some recordings of a study, with its drivers."""
@@ -366,7 +344,7 @@ def identify_part(
         recording = study[paths[row]]
         return recording, drivers.found[drivers.of(recording)]
 
-    fits, notes = _identify(len(paths), load, circuit, method, progress)
+    fits, notes = _identify(len(paths), load, circuit, asked, progress)
     return table(study, paths, fits, notes)
 
 
@@ -390,11 +368,17 @@ class Drivers:
         failures: Why a driver could not be identified, by the paths of its calibrations.
     """
 
-    def __init__(self, study: Study, order: int, method: Method | None, driver_drift: float = 0.0):
+    def __init__(
+        self,
+        study: Study,
+        order: int,
+        asked: AbstractEstimator | None,
+        driver_drift: float = 0.0,
+    ):
         self.study = study
         self.driver_drift = driver_drift
         self.order = order
-        self.method: Method | None = method
+        self.asked = asked
         self.calibrations = tuple(study.calibrations)
         self.found: dict[tuple[str, ...], Driver] = {}
         self.failures: dict[tuple[str, ...], str] = {}
@@ -428,7 +412,7 @@ class Drivers:
             self.found[names] = identify_driver(
                 records,
                 order=self.order,
-                method=self.method,
+                method=self.asked,
                 driver_drift=self.driver_drift,
                 throw=False,
             )

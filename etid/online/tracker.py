@@ -40,14 +40,21 @@ import numpy as np
 from jaxtyping import Array, Complex, Float, Int
 
 from etid.circuits.circuit import AbstractCircuit
-from etid.estimators.judgement import MAX_STEPS_REACHED, SUCCESSFUL, misses
+from etid.estimators.estimator import Description, serving
+from etid.estimators.judgement import (
+    MAX_STEPS_REACHED,
+    MISFIT_CHI2,
+    MISFIT_RRSE,
+    SUCCESSFUL,
+    misses,
+)
 from etid.estimators.maximum_likelihood.given_driver import GivenDriver, combined
-from etid.estimators.refinement import circuit_starts
-from etid.estimators.registry import serving
+from etid.estimators.registry import MAXIMUM_LIKELIHOOD, register_description
+from etid.estimators.starts import circuit_starts
 from etid.estimators.unknowns import LoadUnknowns
 from etid.identify.arguments import circuit_of
 from etid.identify.compiled import stored_jit
-from etid.identify.lanes import explained, given
+from etid.identify.one import explained, known_at
 from etid.online.gain_bands import cut, unloaded_bands
 from etid.online.pulse_fit import (
     DAMPING,
@@ -67,10 +74,39 @@ from etid.signals.precision import require_float64
 from etid.signals.transfer import as_complex, power, reciprocal
 from etid.solvers.matrices import inverse, inverse_of_few
 
+METHOD = "online"
 FLAT = 4.0  # power relative to that of noise alone; below this, the pulse is `flat`
 PATIENCE = 5  # pulses in a row that do not fit, after which an electrode starts again
 MEMORY = 30  # pulses over which `strain` is averaged
 STRAINED = 2.0  # limit of `strain`; it is 1 on average, with a standard deviation of 0.15
+
+register_description(
+    METHOD,
+    Description(
+        words="on-line tracking",
+        text="The loads were identified on-line, anew with each pulse, by an extended Kalman "
+        "filter in information form, iterated at each pulse (Bell and Cathey, 1993). In bands of "
+        "frequency of each pulse, the ratio of the loaded to the unloaded voltage was compared "
+        "with Z_L / (Z_L + Z_th) exp(-jωτ), in continuous time and with what has aliased; the "
+        "trigger delay τ of each pulse was one more unknown. The logarithms of the elements follow "
+        "a random walk. Z_th is that of the calibrations.",
+        conditions=(
+            "the last pulse passed the checks for flat, clipped and missing samples",
+            "its iteration settled",
+            "its residual does not exceed the noise (χ² per degree of freedom of at most "
+            f"{MISFIT_CHI2:g}, or an unexplained part of at most {100 * MISFIT_RRSE:g} % of the "
+            "signal)",
+            f"its trigger delay is at most {DELAYS[-1]:g} samples",
+            "pulses do not disagree with their predictions by more than their errors",
+            "every relative standard error is below 1",
+        ),
+        errors="accumulate the information of all pulses; to them the error of Z_th and of the "
+        "unloaded voltage was added, which no number of pulses lessens",
+        noise="The variance of the noise was estimated at each pulse from what a straight line "
+        "through each band leaves.",
+        cited=("bell1993",),
+    ),
+)
 
 
 class TrackerState(eqx.Module):
@@ -155,7 +191,7 @@ class Tracker(eqx.Module):
             IdentificationError: The recording cannot be used; the message says why.
         """
         require_float64()
-        driver = serving(driver, HarmonicDriver, "maximum_likelihood")
+        driver = serving(driver, HarmonicDriver, str(MAXIMUM_LIKELIHOOD))
         if electrodes < 1:
             raise ValueError(f"electrodes is {electrodes}; a display has at least one electrode")
         if not (np.isfinite(change) and change >= 0):
@@ -168,7 +204,7 @@ class Tracker(eqx.Module):
         rate = unloaded.sample_rate
         period = rate / seen.train.counted
         bands = unloaded_bands(seen.v_th, float(seen.sigma_th), rate, period)
-        known = given(driver, bands.frequency, False)
+        known = known_at(bands.frequency, driver, False, MAXIMUM_LIKELIHOOD)
         low, high = unloaded.adc_range or (-np.inf, np.inf)
         half = seen.step_th / 2
         model = GainModel.of(
@@ -417,5 +453,5 @@ def _fit(tracker: Tracker, state: TrackerState) -> Fit:
             (tracker.driver_result != SUCCESSFUL, RESULTS.driver_failed),
         ),
         steps=state.pulses,
-        method="online",
+        method=METHOD,
     )

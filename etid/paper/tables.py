@@ -10,9 +10,8 @@ import numpy as np
 from jaxtyping import Float
 
 from etid.circuits.circuit import Resistor, SkinRC
-from etid.estimators.registry import Method
+from etid.identify.driver import identify_driver
 from etid.identify.many import identify_skins
-from etid.identify.one import identify_driver
 from etid.recordings.study import Study
 from etid.results.driver import Driver
 from etid.results.fits import Fits
@@ -25,7 +24,7 @@ LABORATORIES: Mapping[str, Mapping[str, float]] = {
     "quiet": {"snr_db": 60.0},
     "noisy": {"snr_db": 40.0, "trigger_jitter_rms": 200e-9},
 }
-METHODS: tuple[Method, ...] = ("maximum_likelihood", "steiglitz_mcbride")  # ours, the paper's
+METHODS: tuple[str, ...] = ("maximum_likelihood", "steiglitz_mcbride")  # ours, the paper's
 ORDER = ("r_p", "c_p", "r_s")  # as the paper's tables have them
 
 Truth = Mapping[str, Mapping[str, float]]
@@ -46,7 +45,7 @@ class Outcome:
     """
 
     laboratory: str
-    method: Method
+    method: str
     driver: Driver
     skins: Fits
     resistors: Fits
@@ -57,7 +56,7 @@ class Outcome:
         return self.laboratory, self.method
 
 
-def identify(laboratory: str, study: Study, method: Method, *, progress: bool = False) -> Outcome:
+def identify(laboratory: str, study: Study, method: str, *, progress: bool = False) -> Outcome:
     """Identify the driver, the test resistors as resistors, everything else as skin.
 
     Args:

@@ -5,7 +5,7 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from etid.circuits.circuit import AbstractCircuit, Resistor
-from etid.identify.one import predict
+from etid.identify.predict import predict
 from etid.plotting.style import BLUE, INK, RED, Canvas, titled
 from etid.recordings.fields import LABELS
 from etid.recordings.recording import Recording

@@ -1,68 +1,24 @@
 """The paragraphs on methods that a paper needs, written from the settings of the fits themselves.
 
-Numbers in them, thresholds included, are those that the estimators use.
+Each estimator describes itself; numbers, thresholds included, are those that it uses.
 """
 
-import math
 import pathlib
+from collections.abc import Sequence
 
 import numpy as np
 
 from etid.circuits import circuit as circuits
 from etid.circuits.display import quantity
-from etid.estimators import judgement, steiglitz_mcbride
-from etid.estimators.baseline import BIASED
 from etid.estimators.estimate import MAX_STEPS
-from etid.estimators.score_tests import missing_pole, other_circuit
+from etid.estimators.estimator import Description
+from etid.estimators.registry import MAXIMUM_LIKELIHOOD, OUTPUT_ERROR, described
 from etid.report import citations
 from etid.report.html import Section, Table
 from etid.results.driver import ContinuousDriver
+from etid.results.fits import AND, joined
 from etid.results.provenance import Settings
 from etid.results.study_fits import StudyFits
-
-_HARMONICS = (
-    "At the harmonics of the pulse rate, in the periodic steady state and in continuous time, "
-)
-_TEXTS = {
-    "maximum_likelihood": "the load was estimated by maximum likelihood with noise on both "
-    "records (Pintelon and Schoukens, 2012, ch. 9): the residual Y - G exp(-jωτ) X of the loaded "
-    "record Y and the unloaded record X is weighted by its variance, var Y + |G|² var X, G = Z_L / "
-    "(Z_L + Z_th). Each load was estimated jointly with what the calibrations tell of Z_th and of "
-    "their trigger delays; its own trigger delay τ is one more unknown.",
-    "joint": "each driver and all recordings made with it were estimated in one fit by maximum "
-    "likelihood with noise on both records (Pintelon and Schoukens, 2012, ch. 9): the residual "
-    "Y - G exp(-jωτ) X of each loaded record Y and its unloaded record X is weighted by its "
-    "variance, var Y + |G|² var X, G = Z_L / (Z_L + Z_th). Z_th is common to all, each record has "
-    "its own trigger delay τ.",
-    "non_parametric": "the load was estimated by maximum likelihood with Z_th as the calibrations "
-    "show it at each harmonic, without a model of it, noise on all records being accounted for "
-    "(Pintelon and Schoukens, 2012, ch. 9 and 10). Trigger delays were estimated with the load.",
-    "output_error": "the load was estimated by output error (Ljung, 1999): the terminal voltage "
-    "was predicted in continuous time from the band-limited unloaded record, and its difference to "
-    "the loaded record, weighted by the noise of both, was minimised. The state at the start of "
-    "the record, an offset and the trigger delay were estimated with the load.",
-    "harmonic_steiglitz_mcbride": "the load was estimated by Steiglitz-McBride iteration "
-    "(Steiglitz and McBride, 1965) with the variance of the noise taken out of its sums "
-    "(Söderström, 2007) and the trigger delay as one more linear unknown.",
-    "steiglitz_mcbride": "Z_th and the load were estimated as discrete filters by at most "
-    f"{steiglitz_mcbride.ITERATIONS} iterations of Steiglitz and McBride (1965), of which the one "
-    "that predicts the terminal voltage best was kept. It accounts neither for trigger delays nor "
-    "for the noise that both of its regressors share, and gives no standard errors.",
-    "equation_error": "Z_th and the load were estimated as discrete filters by least squares of "
-    "the equation error, the first iteration of Steiglitz and McBride (1965). It is biased by "
-    "noise and gives no standard errors.",
-}  # fmt: skip
-_IN_TIME = ("output_error", "steiglitz_mcbride", "equation_error")
-_BY_LEVENBERG_MARQUARDT = ("maximum_likelihood", "joint", "non_parametric", "output_error")
-_CITED = {
-    "maximum_likelihood": ("pintelon2012", "optimistix2024", "white1980"),
-    "joint": ("pintelon2012", "optimistix2024", "white1980"),
-    "non_parametric": ("pintelon2012", "optimistix2024", "white1980"),
-    "output_error": ("ljung1999", "optimistix2024"),
-    "harmonic_steiglitz_mcbride": ("soderstrom2007", "white1980"),
-    "steiglitz_mcbride": (),
-    "equation_error": (),
-}
 
 
 def methods_section(found: StudyFits) -> Section:
@@ -71,22 +27,28 @@ def methods_section(found: StudyFits) -> Section:
     Args:
         found: The fits; without settings the section says what is missing.
     """
-    used = _methods(found)
-    by_driver = {driver.method for driver in found.drivers.values()}
+    used = {name: described(name) for name in found.fits.fit.method.split(AND)}
+    known = [one for one in used.values() if one is not None]
+    by_driver = [described(driver.method) for driver in found.drivers.values()]
+    of_drivers = [one for one in by_driver if one is not None]
     cited = {"etid", "fingertip", "steiglitz1965", "jax2018"}
-    cited.update(key for method in used | (by_driver & _CITED.keys()) for key in _CITED[method])
+    cited.update(key for one in (*known, *of_drivers) for key in one.cited)
     settings = found.settings
     paragraphs = [
         _model(found),
         _driver(found),
-        _estimator(found, used),
-        _errors(used, settings),
-        _verdicts(used, by_driver),
+        _estimator(found, known),
+        _errors(known, settings),
+        _verdicts(known, of_drivers),
         _computed(settings),
     ]
-    warning = ""
+    warnings = [
+        f"Nothing is known here of the estimator {name!r}: import the module that registers it."
+        for name, one in used.items()
+        if one is None
+    ]
     if settings is None:
-        warning = (
+        warnings.append(
             "This file of fits does not say from which recordings, with which order of the driver "
             "and with which versions it was made. Fit again with this version of etid to have it."
         )
@@ -94,17 +56,15 @@ def methods_section(found: StudyFits) -> Section:
         "Methods",
         "\n\n".join(filter(None, paragraphs)),
         () if settings is None else (_table(found, settings),),
-        warning=warning,
+        warning=" ".join(warnings),
         code=citations.bibtex(cited),
     )
 
 
-def _methods(found: StudyFits) -> set[str]:
-    """The estimators that were used, "mixed" told apart."""
-    method = found.fits.fit.method
-    if method in _TEXTS:
-        return {method}
-    return {"maximum_likelihood", "output_error"}
+def words(method: str) -> str:
+    """The estimators of a fit, or of several, in a sentence."""
+    found = {name: described(name) for name in method.split(AND)}
+    return " and ".join(name if one is None else one.words for name, one in found.items())
 
 
 def _model(found: StudyFits) -> str:
@@ -154,25 +114,21 @@ def _driver(found: StudyFits) -> str:
     return text + "."
 
 
-def _estimator(found: StudyFits, used: set[str]) -> str:
-    asked = found.settings.asked_method if found.settings is not None else None
+def _estimator(found: StudyFits, used: Sequence[Description]) -> str:
+    method = found.fits.fit.method
+    automatic = joined([str(MAXIMUM_LIKELIHOOD), str(OUTPUT_ERROR)])
     text = ""
-    if asked == "" or len(used) > 1:
+    if method == automatic or (found.settings is not None and not found.settings.asked_method):
         text = (
             "Maximum likelihood was the method for recordings of several whole pulse periods, "
             "whose harmonics can be told from aliases; output error for all others. "
         )
-        text += "Both occurred. " if len(used) > 1 else f"Here it was {words(*used)} for all. "
-    for method in sorted(used):
-        sentence = _TEXTS[method] if method in _IN_TIME else _HARMONICS + _TEXTS[method]
-        text += sentence[0].upper() + sentence[1:] + " "
-    if used & set(_BY_LEVENBERG_MARQUARDT):
-        text += _refined(found.fits.circuit)
-    text += (
-        "The variances of the noise were estimated from each record by the median of its "
-        "differences of sixth order."
-    )
-    return text
+        text += "Both occurred. " if method == automatic else f"Here it was {words(method)}. "
+    parts = [one.text for one in used]
+    if any(one.refined for one in used):
+        parts.append(_refined(found.fits.circuit))
+    parts += dict.fromkeys(one.noise for one in used)
+    return text + " ".join(parts)
 
 
 def _refined(circuit: circuits.AbstractCircuit) -> str:
@@ -182,28 +138,19 @@ def _refined(circuit: circuits.AbstractCircuit) -> str:
     return (
         "Minima were found by Levenberg-Marquardt, composed of the parts of optimistix (Rader et "
         f"al., 2024), in at most {MAX_STEPS} steps, from several starts {at}, from "
-        "the estimate of Steiglitz and McBride (1965). "
+        "the estimate of Steiglitz and McBride (1965)."
     )
 
 
-def words(method: str) -> str:
-    """The name of an estimator in a sentence."""
-    return "joint maximum likelihood" if method == "joint" else method.replace("_", " ")
-
-
-def _errors(used: set[str], settings: Settings | None) -> str:
-    if not used - {"steiglitz_mcbride", "equation_error"}:
-        return "The estimator gives no standard errors."
+def _errors(used: Sequence[Description], settings: Settings | None) -> str:
+    ways = dict.fromkeys(one.errors for one in used if one.errors)
+    if not ways:
+        return "The estimator gives no standard errors." if used else ""
     text = "Standard errors follow from the curvature at the minimum, "
-    if used - {"output_error"}:
-        text += (
-            "and were made with the variance that the residuals have around each harmonic where "
-            "that exceeds the noise (White, 1980). "
-        )
+    if len(ways) == 1:
+        text += f"and {next(iter(ways))}. "
     else:
-        text += (
-            "and were multiplied by the square root of χ² where the residual exceeds the noise. "
-        )
+        text += "; ".join(f"those by {one.words} {one.errors}" for one in used) + ". "
     text += (
         "They are told in two parts: own, the noise of a recording, and shared, the error of the "
         "driver, which all recordings with one driver have in common and no spread between them "
@@ -223,38 +170,15 @@ def _errors(used: set[str], settings: Settings | None) -> str:
     return text
 
 
-def _verdicts(used: set[str], by_driver: set[str]) -> str:
-    text = (
-        "A fit counts as successful if the records passed the checks for flat, clipped, missing "
-        "and misplaced samples, the iteration settled, all elements are positive, and the residual "
-        "does not exceed the noise (χ² per degree of freedom of at most "
-        f"{judgement.MISFIT_CHI2:g}, or an unexplained part of at most "
-        f"{100 * judgement.MISFIT_RRSE:g} % of the signal)"
-    )
-    if used - {"steiglitz_mcbride", "equation_error"}:
-        text += ", the trigger delay is at most one sample, every relative standard error below 1"
-    if used & {"maximum_likelihood", "joint"}:
-        text += (
-            ", score tests against a relaxation that is spread over time constants (at "
-            f"{other_circuit.SEEN_SPREAD:g} standard deviations) and against one more relaxation "
-            f"(at {other_circuit.SEEN_RELAXATION:g}) find none"
-        )
-    if used & {"maximum_likelihood", "joint"}:
-        text += (
-            ", recording and calibrations agree about Z_th (the calibrations' sum of squares grows "
-            f"by at most {judgement.STRAINED:g})"
-        )
-    if used & {"harmonic_steiglitz_mcbride", "steiglitz_mcbride", "equation_error"}:
-        text += (
-            f", the estimate is within {math.sqrt(BIASED):g} standard errors of the minimum of its "
-            "own model"
-        )
-    text += ", and the driver was identified successfully"
-    if by_driver & {"maximum_likelihood", "joint"}:
-        text += (
-            ", for which it has to be passive, and its calibrations must not show one more section "
-            f"of Z_th (score test, χ² of at most {missing_pole.SEEN:g} with two degrees of freedom)"
-        )
+def _verdicts(used: Sequence[Description], of_drivers: Sequence[Description]) -> str:
+    conditions = dict.fromkeys(condition for one in used for condition in one.conditions)
+    if not conditions:
+        return ""
+    text = f"A fit counts as successful if {', '.join(conditions)}, "
+    text += "and the driver was identified successfully"
+    driver = dict.fromkeys(condition for one in of_drivers for condition in one.of_driver)
+    if driver:
+        text += f", for which {', and '.join(driver)}"
     return text + "."
 
 

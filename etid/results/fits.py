@@ -51,6 +51,14 @@ def complex_rrse(
     return jnp.sqrt(missed / jnp.sum(jnp.where(used, jnp.abs(measured) ** 2, 0.0)))
 
 
+AND = " + "  # between the names of estimators
+
+
+def joined(methods: Sequence[str]) -> str:
+    """One name for a table of fits by several estimators: each of theirs once."""
+    return AND.join(sorted({name for method in methods for name in method.split(AND)}))
+
+
 class IdentificationError(RuntimeError):
     """An identification did not end successfully.
 
@@ -77,7 +85,8 @@ class Fit(eqx.Module):
         chi2: Σ residual² / expected variance, per degree of freedom: 1 if the model is right.
         result: Verdict.
         steps: Iterations of the solver.
-        method: Name of the estimator.
+        method: Name of the estimator, with the options that are not the default; of a batch all
+            names, with " + " between them.
         remarks: What was done to the recording before the fit, `etid.recordings.remarks.Remark` as
             integers.
         change: Relative change during the record of each element and, last, of the amplitude: from
@@ -225,10 +234,9 @@ class Fits:
             parts: Fits of circuits of one kind.
 
         Returns:
-            All of them, in this order; the method is "mixed" if theirs differ.
+            All of them, in this order; the method names all of theirs.
         """
-        methods = {part.fit.method for part in parts}
-        method = methods.pop() if len(methods) == 1 else "mixed"
+        method = joined([part.fit.method for part in parts])
         fits = [dataclasses.replace(part.fit, method=method) for part in parts]
         return cls(
             jax.tree.map(lambda *leaves: np.concatenate(leaves), *fits),

@@ -50,7 +50,7 @@ class Settings:
         study: Study,
         count: int,
         order: int,
-        method: str | None,
+        method: str,
         circuit: AbstractCircuit,
         r_load_tolerance: float = 0.0,
         driver_drift: float = 0.0,
@@ -61,7 +61,7 @@ class Settings:
             study: Its recordings.
             count: How many of them are to be identified.
             order: As in `identify_driver`.
-            method: As in `identify_skin`.
+            method: Name of the estimator that was asked for; empty if none was.
             circuit: As in `identify_skin`.
             r_load_tolerance: As in `identify_jointly`.
             driver_drift: As in `identify_driver`.
@@ -71,7 +71,7 @@ class Settings:
             source=source,
             source_size=os.path.getsize(source) if source else 0,
             recordings=count,
-            asked_method=method or "",
+            asked_method=method,
             order=order,
             start=tuple(np.asarray(circuit.values()).tolist()),
             r_load_tolerance=float(r_load_tolerance),

@@ -43,7 +43,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Complex, Float, Int
 
 from etid.circuits.circuit import SkinRC
-from etid.estimators.steiglitz_mcbride import ITERATIONS, SETTLED
+from etid.estimators.steiglitz_mcbride.iteration import ITERATIONS, SETTLED
 from etid.results.driver import SourceImpedance
 from etid.results.fits import complex_rrse
 from etid.signals.harmonics import Spectrum

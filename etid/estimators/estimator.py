@@ -1,0 +1,188 @@
+"""What an estimator is: a class whose fields are its options.
+
+It says what it needs of a recording and of a driver, fits both, and describes itself for a paper.
+An estimator of one's own is a subclass, made known by `etid.estimators.registry.register`.
+"""
+
+import abc
+import dataclasses
+import math
+from typing import Any, ClassVar, TypeVar
+
+import numpy as np
+from jaxtyping import Array, Float
+
+from etid.circuits.circuit import AbstractCircuit, SkinRC
+from etid.estimators import judgement
+from etid.estimators.lanes import AbstractLane
+from etid.results.driver import ContinuousDriver, Driver
+from etid.results.fits import Fit
+from etid.signals.harmonics import Spectrum
+from etid.signals.measurement import Measurement
+
+CHECKED = (
+    "the records passed the checks for flat, clipped, missing and misplaced samples",
+    "the iteration settled",
+    "all elements are positive",
+    f"the residual does not exceed the noise (χ² per degree of freedom of at most "
+    f"{judgement.MISFIT_CHI2:g}, or an unexplained part of at most "
+    f"{100 * judgement.MISFIT_RRSE:g} % of the signal)",
+)
+DETERMINED = "the trigger delay is at most one sample, every relative standard error below 1"
+NEAR_MINIMUM = (
+    f"the estimate is within {math.sqrt(judgement.BIASED):g} standard errors of the minimum of its "
+    "own model"
+)
+NOISE = (
+    "The variances of the noise were estimated from each record by the median of its differences "
+    "of sixth order."
+)
+BY_RESIDUALS = (
+    "were made with the variance that the residuals have around each harmonic where that exceeds "
+    "the noise (White, 1980)"
+)
+_Kind = TypeVar("_Kind", bound=Driver)
+HARMONICS = (
+    "At the harmonics of the pulse rate, in the periodic steady state and in continuous time, "
+)
+
+
+def serving(driver: Driver, kind: type[_Kind], method: str) -> _Kind:
+    """The driver as the kind that `method` needs.
+
+    Raises:
+        ValueError: It is of a kind that lacks what the method needs.
+    """
+    if isinstance(driver, kind):
+        return driver
+    if not isinstance(driver, ContinuousDriver):
+        raise ValueError(
+            f"this driver was identified by {driver.method}, which gives no continuous source "
+            f"impedance; identify it with method={method!r}"
+        )
+    raise ValueError(
+        f"this driver was identified by {driver.method}, which keeps no harmonics of its "
+        "calibrations; identify it with method='maximum_likelihood'"
+    )
+
+
+@dataclasses.dataclass(frozen=True)
+class Description:
+    """What the methods section of a paper says of an estimator.
+
+    Attributes:
+        words: Its name in a sentence.
+        text: Sentences: what was estimated and how.
+        conditions: What holds for a successful fit.
+        of_driver: The same for a driver that it has identified.
+        errors: How standard errors were made, as the end of a sentence; empty if there are none.
+        refined: Whether minima were found by Levenberg-Marquardt from several starts.
+        noise: Sentence: how the noise of the records was estimated.
+        cited: Keys of the references in these texts.
+    """
+
+    words: str
+    text: str
+    conditions: tuple[str, ...] = CHECKED
+    of_driver: tuple[str, ...] = ()
+    errors: str = ""
+    refined: bool = False
+    noise: str = NOISE
+    cited: tuple[str, ...] = ()
+
+
+@dataclasses.dataclass(frozen=True)
+class AbstractEstimator(abc.ABC):
+    """A way to identify drivers and loads. Its fields are its options.
+
+    Instances are compared by their fields, so that one compiled function serves all that are equal.
+
+    Attributes:
+        name: Name of the estimator with its default options.
+        lane: What of a recording is fitted: its harmonics, which need whole periods, or samples.
+        driver: The kind of driver that it needs. A discrete one has to have the sample rate of the
+            recording.
+        any_circuit: Whether it identifies circuits other than `SkinRC`.
+    """
+
+    name: ClassVar[str]
+    lane: ClassVar[type[AbstractLane]]
+    driver: ClassVar[type[Driver]]
+    any_circuit: ClassVar[bool] = True
+
+    @abc.abstractmethod
+    def fit_driver(
+        self,
+        records: Measurement,
+        r_load: Float[Array, " record"],
+        order: int,
+        spectra: Spectrum | None,
+    ) -> Driver:
+        """Identify a driver.
+
+        Args:
+            records: Calibrations, stacked along a leading axis.
+            r_load: Their resistors [Ω].
+            order: Number of poles of Z_th.
+            spectra: Their harmonics, if the lanes of this estimator are `periodic`.
+        """
+
+    @abc.abstractmethod
+    def fit_load(self, lane: Any, driver: Any, known: Any, circuit: AbstractCircuit) -> Fit:
+        """Identify a load: differentiable code, which the caller compiles and batches.
+
+        Args:
+            lane: Of one recording.
+            driver: Its driver.
+            known: What `known` has returned for it.
+            circuit: Structure of the load and its typical values.
+        """
+
+    @abc.abstractmethod
+    def describe(self) -> Description:
+        """What a methods section says of this estimator, its options included."""
+
+    def known(self, driver: Any, frequency: Float[Array, " harmonic"], shared: bool) -> Any:
+        """What all loads of a driver with the same harmonics have in common, computed once.
+
+        Args:
+            driver: The driver.
+            frequency: Harmonics of the loads [Hz].
+            shared: Whether the unloaded record of a load may be that of a calibration.
+        """
+        del driver, frequency, shared
+
+    def check_circuit(self, circuit: AbstractCircuit) -> None:
+        """Raise ValueError unless this estimator can identify the circuit."""
+        if not self.any_circuit and not isinstance(circuit, SkinRC):
+            raise ValueError(
+                f"method {str(self)!r} identifies SkinRC only, not {type(circuit).__name__}; "
+                "use method='maximum_likelihood'"
+            )
+
+    def check_driver(self, driver: Driver, sample_rate: float, pulse_rate: float) -> None:
+        """Raise ValueError unless a driver serves for loads.
+
+        Args:
+            driver: The driver.
+            sample_rate: Of the recording [Hz].
+            pulse_rate: Of the recording [Hz].
+        """
+        del pulse_rate
+        serving(driver, self.driver, str(self))
+        discrete = not issubclass(self.driver, ContinuousDriver)
+        if discrete and not np.isclose(float(driver.sample_rate), sample_rate):
+            raise ValueError(
+                f"{self} needs recording and calibration at one sample rate, but the recording has "
+                f"{sample_rate:g} Hz and the driver {float(driver.sample_rate):g} Hz; "
+                "use method='output_error'"
+            )
+
+    def __str__(self) -> str:
+        """The name, with the options that differ from the defaults: `registry.named` reads it."""
+        changed = [
+            f"{option.name}={getattr(self, option.name)!r}"
+            for option in dataclasses.fields(self)
+            if getattr(self, option.name) != option.default
+        ]
+        return f"{self.name}({', '.join(changed)})" if changed else self.name

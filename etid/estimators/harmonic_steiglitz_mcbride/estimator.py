@@ -1,0 +1,228 @@
+"""Steiglitz-McBride on the harmonics, judged by the likelihood with Z_th as it is."""
+
+import dataclasses
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, Bool, Float
+
+from etid.circuits.circuit import AbstractCircuit, SkinRC
+from etid.estimators.estimator import (
+    BY_RESIDUALS,
+    CHECKED,
+    DETERMINED,
+    HARMONICS,
+    NEAR_MINIMUM,
+    AbstractEstimator,
+    Description,
+)
+from etid.estimators.harmonic_steiglitz_mcbride import iteration
+from etid.estimators.judgement import (
+    BIASED,
+    MAX_STEPS_REACHED,
+    SUCCESSFUL,
+    distance_to_minimum,
+    misses,
+    remarks,
+)
+from etid.estimators.lanes import Harmonics
+from etid.estimators.maximum_likelihood.estimator import MaximumLikelihood
+from etid.estimators.maximum_likelihood.terms import (
+    apart,
+    delayed_gain,
+    denoised,
+    excess,
+    residual,
+    stands_out,
+    variance,
+)
+from etid.estimators.sandwich import Linear
+from etid.estimators.score_tests import other_circuit
+from etid.estimators.score_tests.unloaded import UnloadedShape, shape_of
+from etid.estimators.unknowns import LoadUnknowns
+from etid.results.driver import ContinuousDriver, Driver
+from etid.results.fits import Fit
+from etid.results.verdicts import RESULTS, first_verdict
+from etid.signals.harmonics import Spectrum
+from etid.signals.measurement import Measurement
+from etid.signals.transfer import as_complex, frequency_variable, reciprocal, turns
+from etid.solvers.levenberg_marquardt import normal_equations
+from etid.solvers.matrices import root
+
+
+@dataclasses.dataclass(frozen=True)
+class HarmonicSteiglitzMcBride(AbstractEstimator):
+    """SkinRC by Steiglitz-McBride on the harmonics, freed of the bias by noise.
+
+    Attributes:
+        iterations: The most there are, at least one.
+    """
+
+    name = "harmonic_steiglitz_mcbride"
+    lane = Harmonics
+    driver = ContinuousDriver
+    any_circuit = False
+
+    iterations: int = iteration.ITERATIONS
+
+    def __post_init__(self) -> None:
+        if self.iterations < 1:
+            raise ValueError(f"iterations is {self.iterations}; there is at least one")
+
+    def fit_driver(
+        self,
+        records: Measurement,
+        r_load: Float[Array, " record"],
+        order: int,
+        spectra: Spectrum | None,
+    ) -> Driver:
+        """Identify a driver by maximum likelihood."""
+        return MaximumLikelihood().fit_driver(records, r_load, order, spectra)
+
+    def known(
+        self, driver: Driver, frequency: Float[Array, " harmonic"], shared: bool
+    ) -> UnloadedShape | None:
+        """The unloaded voltage of the calibrations, if it can be compared."""
+        del shared
+        return shape_of(driver, frequency)
+
+    def fit_load(
+        self,
+        lane: Harmonics,
+        driver: ContinuousDriver,
+        known: UnloadedShape | None,
+        circuit: AbstractCircuit,
+    ) -> Fit:
+        """Identify a skin."""
+        del circuit
+        spectrum, sample_rate = lane.spectrum, jnp.asarray(lane.sample_rate)
+        source, source_cov = driver.source, driver.later_cov()
+        z_th = source.response(spectrum.frequency)
+        best = iteration.fit_skin(spectrum, z_th, sample_rate, self.iterations)
+        values, late = best.circuit.values(), best.delay_samples
+        physical = jnp.isfinite(best.rrse)  # or else any likelihood will do
+        elements = jnp.where(physical, values, SkinRC().values())
+
+        def terms(q, spectrum):
+            of, f = LoadUnknowns.of(q), spectrum.frequency
+            load = best.circuit.with_log_values(of.log_elements).impedance()
+            return residual(spectrum, delayed_gain(source, load, f, of.delay_samples, sample_rate))
+
+        own = LoadUnknowns(jnp.log(elements), late)
+        at = own.vector()
+        equations = normal_equations(terms, at, spectrum)
+        freedom = 2 * jnp.sum(spectrum.selected, dtype=values.dtype) - values.size
+        chi2 = 2 * equations.objective / freedom
+        noise = excess(terms(at, spectrum), spectrum.selected)[: spectrum.x.size]
+        everywhere = eqx.tree_at(lambda s: s.selected, spectrum, jnp.ones_like(spectrum.selected))
+        square = jnp.sum(terms(at, everywhere).reshape(2, -1) ** 2, 0) / 2
+        private, shared = iteration.covariance(
+            spectrum, noise, source, source_cov, sample_rate, best
+        )
+        errors = jnp.diagonal(private + shared)  # of the logarithms, squared
+        fitted = best.circuit.with_log_values(own.log_elements)
+        other = _is_another(spectrum, noise, own, sample_rate, fitted, driver)
+        changed = jnp.array(False) if known is None else known.differs(spectrum)
+        return Fit(
+            circuit=best.circuit,
+            cov=(private + shared) * jnp.outer(values, values),
+            shared_cov=shared * jnp.outer(values, values),
+            rrse=best.rrse,
+            chi2=jnp.where(physical, chi2, jnp.inf),
+            result=first_verdict(
+                (~best.stable, RESULTS.unstable),
+                (~physical, RESULTS.nonphysical),
+                (~best.converged, MAX_STEPS_REACHED),
+                (misses(chi2, best.rrse) | (jnp.abs(late) > 1), RESULTS.misfit),
+                (~(distance_to_minimum(equations) <= BIASED), RESULTS.biased),
+                (~jnp.all((errors > 0) & (errors < 1)), RESULTS.insensitive),
+                (changed, RESULTS.inconsistent),
+                (other, RESULTS.misfit),
+                (driver.result != SUCCESSFUL, RESULTS.driver_failed),
+            ),
+            steps=best.iteration,
+            method=str(self),
+            remarks=remarks(stands_out(square, spectrum)),
+        )
+
+    def describe(self) -> Description:
+        """Its methods section."""
+        return Description(
+            words="Steiglitz-McBride on harmonics",
+            text=HARMONICS + "the load was estimated by Steiglitz-McBride iteration (Steiglitz and "
+            "McBride, 1965) with the variance of the noise taken out of its sums (Söderström, "
+            "2007) and the trigger delay as one more linear unknown.",
+            conditions=(*CHECKED, DETERMINED, NEAR_MINIMUM),
+            errors=BY_RESIDUALS,
+            cited=("soderstrom2007", "white1980"),
+        )
+
+
+def _is_another(
+    spectrum: Spectrum,
+    noise: Float[Array, " harmonic"],
+    own: LoadUnknowns,
+    sample_rate: Float[Array, ""],
+    circuit: SkinRC,
+    driver: ContinuousDriver,
+) -> Bool[Array, ""]:
+    """Whether the load is seen to be another circuit, whatever Z_th is within its covariance.
+
+    Args:
+        spectrum: The recording.
+        noise: Variance of its noise in units of what it says.
+        own: What was unknown.
+        sample_rate: Its sampling rate [Hz].
+        circuit: The circuit.
+        driver: Its driver.
+    """
+    f, elements = spectrum.frequency, own.log_elements.size
+    s = frequency_variable(f)
+    vector, unflatten = ravel_pytree(driver.source)
+    deviations = root(driver.cov).T
+
+    def along(function, at, directions):
+        return jax.vmap(lambda of: jax.jvp(function, (at,), (of,))[1])(directions)
+
+    def load(log_values):
+        return circuit.with_log_values(log_values).impedance()(s)
+
+    def of_gain(_):
+        """Derivatives of the gain by all parameters and changes."""
+        z_th = unflatten(vector).response(f)
+        z, changes = other_circuit.changes(circuit.impedance(), f)
+        total = reciprocal(z + z_th)
+        g = z * total * turns(-f[0] * own.delay_samples / sample_rate, f.size)
+        by_load = g * z_th * total * reciprocal(z)
+        by_source = along(lambda p: unflatten(p).response(f), vector, deviations)
+        by_own = [
+            by_load[None, :] * along(load, own.log_elements, jnp.eye(elements)),
+            (-g * s * as_complex(1 / sample_rate))[None, :],
+        ]
+        slopes = [*by_own, (-g * total)[None, :] * by_source, by_load[None, :] * changes]
+        return g, jnp.concatenate(slopes)
+
+    g, slopes = apart(of_gain, own.vector())
+
+    def of_residual(_):
+        # At the X that both records tell: the noise of that of one is in the residual as well.
+        [clean], [share] = denoised([spectrum], [g])
+        weight = jnp.where(spectrum.selected, jnp.sqrt(2 / variance(spectrum, g)), 0.0)
+        rows = slopes * (-clean.x * as_complex(weight))[None, :]
+        return jnp.concatenate([rows.real, rows.imag], axis=1), share
+
+    rows, share = apart(of_residual, own.vector())
+    count = elements + 1 + vector.size
+    prior = jnp.diag(jnp.pad(jnp.ones(vector.size), (elements + 1, 0)))
+    linear = Linear(rows[:count], share, jnp.tile(noise, 2), prior)
+    return other_circuit.scores(
+        rows[count:],
+        linear,
+        residual(spectrum, g),
+        jnp.zeros(count),
+        prior,
+        linear.bread(),
+        slice(elements),
+    ).seen()

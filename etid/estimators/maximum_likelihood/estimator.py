@@ -1,0 +1,96 @@
+"""Maximum likelihood on the harmonics, each load jointly with what its driver leaves open."""
+
+import dataclasses
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from etid.circuits.circuit import AbstractCircuit
+from etid.estimators.estimator import (
+    BY_RESIDUALS,
+    CHECKED,
+    DETERMINED,
+    HARMONICS,
+    AbstractEstimator,
+    Description,
+)
+from etid.estimators.judgement import STRAINED, judged, unless
+from etid.estimators.lanes import Harmonics
+from etid.estimators.maximum_likelihood import given_driver, load
+from etid.estimators.maximum_likelihood.given_driver import GivenDriver
+from etid.estimators.refined_driver import refined_driver
+from etid.estimators.score_tests import missing_pole, other_circuit
+from etid.estimators.starts import harmonic_starts
+from etid.results.driver import Driver, HarmonicDriver
+from etid.results.fits import Fit
+from etid.results.verdicts import RESULTS
+from etid.signals.harmonics import Spectrum
+from etid.signals.measurement import Measurement
+
+TESTED = (
+    "score tests against a relaxation that is spread over time constants (at "
+    f"{other_circuit.SEEN_SPREAD:g} standard deviations) and against one more relaxation (at "
+    f"{other_circuit.SEEN_RELAXATION:g}) find none",
+    "recording and calibrations agree about Z_th (the calibrations' sum of squares grows by at "
+    f"most {STRAINED:g})",
+)
+OF_DRIVER = (
+    "it has to be passive",
+    "its calibrations must not show one more section of Z_th (score test, χ² of at most "
+    f"{missing_pole.SEEN:g} with two degrees of freedom)",
+)
+
+
+@dataclasses.dataclass(frozen=True)
+class MaximumLikelihood(AbstractEstimator):
+    """Maximum likelihood with noise on both records, on the harmonics of whole pulse periods."""
+
+    name = "maximum_likelihood"
+    lane = Harmonics
+    driver = HarmonicDriver
+
+    def fit_driver(
+        self,
+        records: Measurement,
+        r_load: Float[Array, " record"],
+        order: int,
+        spectra: Spectrum | None,
+    ) -> Driver:
+        """Identify a driver: Z_th and the trigger delays of its calibrations."""
+        return refined_driver(records, r_load, order, spectra, str(self))
+
+    def known(
+        self, driver: HarmonicDriver, frequency: Float[Array, " harmonic"], shared: bool
+    ) -> GivenDriver:
+        """What the calibrations tell of Z_th at the harmonics."""
+        return given_driver.given(driver, frequency, shared)
+
+    def fit_load(
+        self, lane: Harmonics, driver: HarmonicDriver, known: GivenDriver, circuit: AbstractCircuit
+    ) -> Fit:
+        """Refine from the best of several starts, jointly with what the driver leaves open."""
+        spectrum, rate = lane.spectrum, jnp.asarray(lane.sample_rate)
+        z_th = known.z_th(jnp.zeros_like(known.loaded))
+        starts = harmonic_starts(spectrum, rate, z_th, circuit)
+        estimate, far, other = load.fit_circuit(known, circuit, spectrum, rate, starts)
+        fit = judged(estimate, circuit, driver.result, str(self))
+        if known.shape is not None:
+            fit = unless(fit, known.shape.differs(spectrum), RESULTS.inconsistent)
+        return unless(unless(fit, far, RESULTS.driver_unclear), other, RESULTS.misfit)
+
+    def describe(self) -> Description:
+        """Its methods section."""
+        return Description(
+            words="maximum likelihood",
+            text=HARMONICS + "the load was estimated by maximum likelihood with noise on both "
+            "records (Pintelon and Schoukens, 2012, ch. 9): the residual Y - G exp(-jωτ) X of the "
+            "loaded record Y and the unloaded record X is weighted by its variance, var Y + |G|² "
+            "var X, G = Z_L / (Z_L + Z_th). Each load was estimated jointly with what the "
+            "calibrations tell of Z_th and of their trigger delays; its own trigger delay τ is one "
+            "more unknown.",
+            conditions=(*CHECKED, DETERMINED, *TESTED),
+            of_driver=OF_DRIVER,
+            errors=BY_RESIDUALS,
+            refined=True,
+            cited=("pintelon2012", "optimistix2024", "white1980"),
+        )

@@ -1,0 +1,101 @@
+"""Maximum likelihood with Z_th as the calibrations show it at each harmonic."""
+
+import dataclasses
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from etid.circuits.circuit import AbstractCircuit
+from etid.estimators.estimator import (
+    BY_RESIDUALS,
+    CHECKED,
+    DETERMINED,
+    HARMONICS,
+    AbstractEstimator,
+    Description,
+    serving,
+)
+from etid.estimators.judgement import SUCCESSFUL, judged, unless
+from etid.estimators.lanes import Harmonics
+from etid.estimators.maximum_likelihood.estimator import MaximumLikelihood
+from etid.estimators.non_parametric.fit import fit_circuit
+from etid.estimators.score_tests.unloaded import UnloadedShape, shape_of
+from etid.estimators.starts import harmonic_starts
+from etid.results.driver import Driver, HarmonicDriver
+from etid.results.fits import Fit
+from etid.results.verdicts import RESULTS
+from etid.signals.harmonics import Spectrum
+from etid.signals.measurement import Measurement
+
+SAME_PULSE_RATE = 1e-3  # part by which rates may differ: Z_th is smooth
+# Standard errors of bias that may be corrected; what it leaves is below half of one.
+CORRECTED = 2.0
+
+
+@dataclasses.dataclass(frozen=True)
+class NonParametric(AbstractEstimator):
+    """Maximum likelihood that needs no model of Z_th, for records of the calibrations' rate."""
+
+    name = "non_parametric"
+    lane = Harmonics
+    driver = HarmonicDriver
+
+    def check_driver(self, driver: Driver, sample_rate: float, pulse_rate: float) -> None:
+        """Raise ValueError unless a driver knows Z_th at the harmonics of the recording."""
+        super().check_driver(driver, sample_rate, pulse_rate)
+        known = float(serving(driver, HarmonicDriver, str(self)).spectra.frequency[0, 0])
+        if not np.isclose(pulse_rate, known, rtol=SAME_PULSE_RATE):
+            raise ValueError(
+                f"{self} knows Z_th at harmonics of {known:.6g} Hz only, but the recording has "
+                f"{pulse_rate:.6g} Hz; use method='maximum_likelihood'"
+            )
+
+    def fit_driver(
+        self,
+        records: Measurement,
+        r_load: Float[Array, " record"],
+        order: int,
+        spectra: Spectrum | None,
+    ) -> Driver:
+        """Identify a driver by maximum likelihood, which keeps the harmonics that are needed."""
+        return MaximumLikelihood().fit_driver(records, r_load, order, spectra)
+
+    def known(
+        self, driver: Driver, frequency: Float[Array, " harmonic"], shared: bool
+    ) -> UnloadedShape | None:
+        """The unloaded voltage of the calibrations, if it can be compared."""
+        del shared
+        return shape_of(driver, frequency)
+
+    def fit_load(
+        self,
+        lane: Harmonics,
+        driver: HarmonicDriver,
+        known: UnloadedShape | None,
+        circuit: AbstractCircuit,
+    ) -> Fit:
+        """Refine from the best of several starts."""
+        spectrum, rate = lane.spectrum, jnp.asarray(lane.sample_rate)
+        starts = harmonic_starts(spectrum, rate, driver.response(spectrum.frequency), circuit)
+        estimate, bias = fit_circuit(circuit, driver, spectrum, rate, starts)
+        # It needs the harmonics of the driver, whether or not a model of them was found.
+        fit = judged(estimate, circuit, SUCCESSFUL, str(self))
+        if known is not None:
+            fit = unless(fit, known.differs(spectrum), RESULTS.inconsistent)
+        far = jnp.any(jnp.abs(bias) > CORRECTED * jnp.sqrt(jnp.diagonal(estimate.cov)))
+        return unless(fit, far, RESULTS.biased)
+
+    def describe(self) -> Description:
+        """Its methods section."""
+        return Description(
+            words="non-parametric maximum likelihood",
+            text=HARMONICS + "the load was estimated by maximum likelihood with Z_th as the "
+            "calibrations show it at each harmonic, without a model of it, noise on all records "
+            "being accounted for (Pintelon and Schoukens, 2012, ch. 9 and 10). Trigger delays were "
+            "estimated with the load.",
+            conditions=(*CHECKED, DETERMINED),
+            errors=BY_RESIDUALS,
+            refined=True,
+            cited=("pintelon2012", "optimistix2024", "white1980"),
+        )

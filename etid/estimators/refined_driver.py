@@ -1,0 +1,128 @@
+"""Z_th refined from several starts, of which the best is kept and judged."""
+
+import dataclasses
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, Bool, Float
+
+from etid.estimators.judgement import MAX_STEPS_REACHED, misses, remarks, too_late
+from etid.estimators.maximum_likelihood import driver as maximum_likelihood
+from etid.estimators.output_error import fit as output_error
+from etid.estimators.output_error import prediction
+from etid.estimators.score_tests import missing_pole, resistors
+from etid.estimators.starts import source_starts
+from etid.estimators.steiglitz_mcbride import iteration
+from etid.results.driver import ContinuousDriver, HarmonicDriver, SourceImpedance
+from etid.results.verdicts import RESULTS, first_verdict
+from etid.signals.harmonics import Spectrum
+from etid.signals.measurement import Measurement
+
+PASSIVE = 2.0  # standard errors by which Re Z_th may be negative
+BAND = np.linspace(0.0003, 0.4, 400)  # of the sample rate, where a source must be passive
+UNWANTED = 1e3  # added to the cost of a start that did not settle; any cost is smaller
+# Two sections closer than this in ln ω and ln ζ are one that noise has split: their gains grow
+# against each other along a curved valley, of which the curvature at one place tells nothing. Costs
+# of good starts differ by 0.01.
+SPLIT, BLURRED = 0.1, 1.0
+
+
+def is_split(source: SourceImpedance) -> Bool[Array, ""]:
+    """Whether two sections of a source are in one place."""
+    place = jnp.stack([source.log_omega, source.log_zeta])
+    first, second = np.triu_indices(place.shape[1], 1)
+    return jnp.any(jnp.all(jnp.abs(place[:, first] - place[:, second]) < SPLIT, axis=0))
+
+
+def refined_driver(
+    m: Measurement,
+    r_load: Float[Array, " record"],
+    order: int,
+    spectra: Spectrum | None,
+    method: str,
+) -> ContinuousDriver:
+    """Refine Z_th from several starts and keep the best that settled.
+
+    Args:
+        m: Calibrations, stacked along a leading axis.
+        r_load: Their resistors [Ω].
+        order: Number of poles.
+        spectra: Their harmonics, for maximum likelihood; None for output error.
+        method: Name of the estimator.
+    """
+    baseline = iteration.driver_filter(m.v_th, m.v_out, r_load, order).filter
+    starts = source_starts(baseline.den, order, m.sample_rate[0], r_load.mean())
+    if spectra is None:
+        records = jax.vmap(prediction.prepare)(m)
+
+        def fit(start):
+            return output_error.fit_source(records, r_load, start)
+    else:
+
+        def fit(start):
+            return maximum_likelihood.fit_source(spectra, r_load, m.sample_rate[0], start)
+
+    # One start after the other: side by side they would all run as long as the slowest, and slower.
+    sources, estimates, known = jax.lax.map(fit, starts)
+    frequency = jnp.asarray(BAND) * m.sample_rate[0]
+
+    def resistance(source, cov):
+        vector, unflatten = ravel_pytree(source)
+        slope = jax.jacfwd(lambda p: unflatten(p).response(frequency).real)(vector)
+        error = jnp.sqrt(jnp.maximum(jnp.einsum("fi,ij,fj->f", slope, cov, slope), 0.0))
+        return jnp.min(source.response(frequency).real + PASSIVE * error)
+
+    passive = jax.vmap(resistance)(sources, estimates.cov) >= 0
+    settled = RESULTS.promote(estimates.result) == RESULTS.successful
+    finite = jnp.isfinite(estimates.chi2)
+    # Starts that settled on a passive circuit come first. Between them log s + chi2 decides, not
+    # chi2 alone, which a noisy
+    # record can lower by a spurious resonance that raises s.
+    log_s = jnp.log(estimates.rrse**2 / estimates.chi2)
+    cost = jnp.where(finite, estimates.chi2 + log_s, jnp.inf)
+    cost = cost + jnp.where(settled, 0.0, UNWANTED) + jnp.where(passive, 0.0, UNWANTED)
+    cost = cost + jnp.where(jax.vmap(is_split)(sources), BLURRED, 0.0)
+    chosen = jnp.argmin(jnp.where(finite, cost, jnp.inf))
+    source, estimate, calibration = jax.tree.map(
+        lambda leaf: leaf[chosen], (sources, estimates, known)
+    )
+    lacks = wrong = jnp.array(False)
+    terms = jnp.asarray(m.v_out.size, m.v_out.dtype)
+    if spectra is not None:
+        calibrations = maximum_likelihood.Calibrations(
+            source, calibration, spectra, m.sample_rate[0]
+        )
+        lacks = missing_pole.is_seen(calibrations)
+        terms = 2 * jnp.sum(spectra.selected, dtype=terms.dtype)
+        if r_load.size > 1:
+            off = resistors.mismatch(calibrations)
+            calibration = dataclasses.replace(calibration, mismatch=off)
+    if calibration.mismatch is not None:
+        wrong = resistors.disagree(calibration.mismatch, estimate.chi2, terms)
+    kind = (
+        ContinuousDriver if spectra is None else functools.partial(HarmonicDriver, spectra=spectra)
+    )
+    return kind(
+        b=baseline.num,
+        a=baseline.den,
+        sample_rate=m.sample_rate[0],
+        source=source,
+        cov=estimate.cov,
+        calibration=calibration,
+        rrse=estimate.rrse,
+        chi2=estimate.chi2,
+        result=first_verdict(
+            (~finite[chosen], RESULTS.unstable),
+            (wrong, RESULTS.resistors_disagree),
+            (~passive[chosen], RESULTS.nonphysical),
+            (~settled[chosen], MAX_STEPS_REACHED),
+            (misses(estimate.chi2, estimate.rrse) | too_late(estimate), RESULTS.misfit),
+            (lacks, RESULTS.order_too_low),
+        ),
+        steps=estimate.steps,
+        remarks=remarks(estimate.hum),
+        method=method,
+    )

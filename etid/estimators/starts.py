@@ -1,0 +1,103 @@
+"""Where fits start: impedance levels, simpler estimates, generic resonances."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Complex, Float
+
+from etid.circuits.circuit import AbstractCircuit, SkinRC
+from etid.estimators.harmonic_steiglitz_mcbride import iteration
+from etid.estimators.unknowns import LoadUnknowns
+from etid.results.driver import SourceImpedance
+from etid.signals.harmonics import Spectrum
+from etid.signals.transfer import poles
+
+LEVELS = (1.0, 0.125, 0.5, 2.0, 8.0)  # impedance levels at which a circuit is started
+START_STEPS = 8  # of Steiglitz-McBride on harmonics, which settles in three to eight
+
+
+def circuit_starts(
+    circuit: AbstractCircuit, baseline: AbstractCircuit | None
+) -> Float[Array, "start element"]:
+    """Logarithms of elements: several impedance levels, and a simpler estimate of them."""
+    typical = circuit.log_values()
+    power, _ = circuit.scaling()
+    starts = [typical + float(np.log(level)) * power for level in LEVELS]
+    if baseline is not None:
+        values = baseline.values()
+        usable = jnp.all(values > 0) & jnp.isfinite(values).all()
+        starts.append(jnp.where(usable, jnp.log(jnp.where(usable, values, 1.0)), typical))
+    return jnp.stack(starts)
+
+
+def harmonic_starts(
+    spectrum: Spectrum,
+    sample_rate: Float[Array, ""],
+    z_th: Complex[Array, " harmonic"],
+    circuit: AbstractCircuit,
+) -> LoadUnknowns:
+    """Where a fit on harmonics may start, stacked; the likeliest comes last.
+
+    Args:
+        spectrum: One recording.
+        sample_rate: Its sampling rate [Hz].
+        z_th: Source impedance there [Ω].
+        circuit: Structure and typical values.
+    """
+    if not isinstance(circuit, SkinRC):
+        starts = circuit_starts(circuit, None)
+        return LoadUnknowns(starts, jnp.zeros(starts.shape[0]))
+    baseline = iteration.fit_skin(spectrum, z_th, sample_rate, START_STEPS)
+    starts = circuit_starts(circuit, baseline.circuit)
+    return LoadUnknowns(starts, jnp.zeros(starts.shape[0]).at[-1].set(baseline.delay_samples))
+
+
+def source_starts(
+    baseline: Float[Array, " a"],
+    order: int,
+    sample_rate: Float[Array, ""],
+    r_load: Float[Array, ""],
+) -> SourceImpedance:
+    """Starts for Z_th, stacked: three generic ones, and one with the baseline's resonance.
+
+    Every start has one slow real pole and sections at the given frequencies and damping ratios; all
+    gains are of the size of a tenth of the known resistor.
+    """
+    sections = (order - 1) // 2
+    reals = order - 2 * sections
+    turn = 2 * jnp.pi * sample_rate
+    generic = [[(0.1, 0.3), (0.5, 1.5)], [(0.25, 0.3), (0.5, 1.5)], [(0.1, 0.3), (0.25, 0.3)]]
+    far = (0.5, 1.5)  # further sections start overdamped at the edge of what was sampled
+
+    def start(pairs):
+        pairs = (pairs + [far] * sections)[:sections]
+        omega = (
+            jnp.stack([jnp.asarray(w) * jnp.ones(()) for w, _ in pairs]) if pairs else jnp.ones(0)
+        )
+        zeta = (
+            jnp.stack([jnp.asarray(z) * jnp.ones(()) for _, z in pairs]) if pairs else jnp.ones(0)
+        )
+        slow = jnp.array([3e-4] + [0.5] * (reals - 1))
+        small = 0.1 * r_load
+        return SourceImpedance(
+            log_resistance=jnp.log(0.05 * small),
+            log_omega=jnp.log(omega * turn),
+            log_zeta=jnp.log(zeta),
+            gain=jnp.full(sections, small),
+            slope=jnp.full(sections, small),
+            log_omega_real=jnp.log(slow * turn),
+            gain_real=jnp.full(reals, -0.5 * small),
+        )
+
+    starts = [start(pairs) for pairs in generic]
+    if sections:
+        s = jnp.log(poles(baseline))  # s / fs of the discrete poles
+        # Resonances are the poles well inside the band; the least damped comes first.
+        resonant = (s.imag > 0.05) & (s.imag < 0.9 * jnp.pi) & (s.real < 0)
+        damping = jnp.where(resonant, -s.real / jnp.abs(s), jnp.inf)
+        found = jnp.argsort(damping)[0]
+        usable = jnp.isfinite(damping[found])
+        omega = jnp.where(usable, jnp.abs(s[found]) / (2 * jnp.pi), 0.1)
+        zeta = jnp.where(usable, damping[found], 0.3)
+        starts.append(start([(omega, zeta)]))
+    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *starts)

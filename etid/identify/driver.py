@@ -1,0 +1,170 @@
+"""Identify a driver: pre-flight, baseline, refinement, verdict."""
+
+import dataclasses
+import functools
+import operator
+from collections.abc import Sequence
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from etid.estimators.estimator import AbstractEstimator
+from etid.estimators.lanes import AlignedSamples, Harmonics, stacked
+from etid.estimators.registry import Method, estimator_of, for_calibrations
+from etid.estimators.score_tests import resistors
+from etid.identify import changes
+from etid.identify.arguments import order_of, recordings
+from etid.identify.compiled import stored_jit
+from etid.identify.one import checksum, explained, needs_another, of_both
+from etid.recordings.preflight import Inspected, preflight
+from etid.recordings.recording import Recording
+from etid.recordings.repeats import repeats
+from etid.results.driver import ContinuousDriver, Driver, HarmonicDriver
+from etid.results.fits import IdentificationError
+from etid.results.verdicts import message, verdict
+from etid.signals import mains
+from etid.signals.harmonics import Spectrum
+
+# |Z_th| [Ω] at 1 kHz: from a microphone's transformer to a tube's.
+PLAUSIBLE = (300.0, 300e3)
+
+
+def identify_driver(
+    calibrations: Recording | Sequence[Recording],
+    *,
+    order: int = 5,
+    method: Method | None = None,
+    plausible: tuple[float, float] = PLAUSIBLE,
+    driver_drift: float = 0.0,
+    throw: bool = True,
+) -> Driver:
+    """Identify the source impedance Z_th from one or several records with known resistors.
+
+    Args:
+        calibrations: Recordings with `r_load`, of one length and sample rate.
+        order: Number of poles of Z_th (the paper uses 5).
+        method: `"maximum_likelihood"`, for records of several whole pulse periods, or
+            `"output_error"`, or the paper's `"steiglitz_mcbride"`, or its first iteration
+            `"equation_error"`; or an estimator with its options, as in
+            `etid.SteiglitzMcBride(iterations=5)`. If not given, the first where the record allows
+            it, else the second.
+        plausible: Least and largest |Z_th| [Ω] at 1 kHz that is believed. The range spans a factor
+            of 1000: no driver in it stays in it if `r_load` is given in kΩ.
+        driver_drift: Relative standard deviation by which each parameter of Z_th may have changed
+            until a skin is recorded. It enters the standard errors of the skins, as `shared_cov`.
+        throw: Raise if the verdict is not successful.
+
+    Returns:
+        The driver, with its verdict.
+
+    Raises:
+        ValueError: No calibration, one without `r_load`, different lengths, or order below 2.
+        IdentificationError: The verdict is not successful and `throw` is set.
+    """
+    asked = estimator_of(method)
+    order = order_of(order)
+    single = isinstance(calibrations, Recording)
+    records = recordings("calibrations", [calibrations] if single else calibrations)
+    if not records:
+        raise ValueError(
+            "no calibration given; a driver needs at least one record with a known r_load"
+        )
+    resistances: list[float] = []
+    for record in records:
+        if record.r_load is None:
+            raise ValueError(
+                f"recording {record.path!r} has no r_load; a calibration needs its resistor [ohm]"
+            )
+        resistances.append(record.r_load)
+    if not 0 <= driver_drift < 1:
+        raise ValueError(f"driver_drift is {driver_drift}; it is a part, such as 0.01")
+    if order < 2:
+        raise ValueError(f"order is {order}; a source impedance needs at least order 2")
+    sizes = {(record.v_th.size, record.sample_rate, record.pulse_rate) for record in records}
+    if len(sizes) > 1:
+        raise ValueError(
+            f"calibrations differ in (samples, sample rate, pulse rate): {sorted(sizes)}; "
+            "cut them to one length"
+        )
+    seen = [Inspected(record) for record in records]
+    for one in seen:
+        name = preflight(one, periodic=asked is not None and asked.lane.periodic)
+        if name is not None:
+            text = f"calibration {one.recording.path!r}: {name}. {explained(one, name)}"
+            raise IdentificationError(text, None)
+    rough = [resistors.rough_impedance(*one) for one in zip(seen, resistances, strict=True)]
+    if max(rough) > resistors.ROUGHLY * min(rough):
+        shown = ", ".join(
+            f"{one.recording.path!r} {z / 1e3:.3g} kohm" for one, z in zip(seen, rough, strict=True)
+        )
+        text = f"calibrations show impedances of about {shown}: resistors_disagree. "
+        raise IdentificationError(text + message("resistors_disagree"), None)
+    estimator = for_calibrations(asked, seen)
+    driver = _driver(seen, order, estimator)
+    late = np.zeros(len(seen))
+    if isinstance(driver, ContinuousDriver):
+        late = np.asarray(driver.calibration.delay_samples)
+    if driver.verdict != "successful" and 1 < np.max(np.abs(late)) < np.inf:
+        for one, delay in zip(seen, late, strict=True):
+            one.lag += round(delay)
+        driver = _driver(seen, order, estimator)
+    remarks = functools.reduce(operator.or_, (one.remarks for one in seen))
+    driver = dataclasses.replace(driver, remarks=np.asarray(int(remarks) | int(driver.remarks)))
+    if isinstance(driver, HarmonicDriver):
+        unloaded = np.array([checksum(one) for one in seen])
+        driver = dataclasses.replace(driver, unloaded=unloaded)
+    if driver_drift and isinstance(driver, ContinuousDriver):
+        driver = dataclasses.replace(driver, drift=np.asarray(driver_drift, float))
+    driver = changes.driver_judged(driver, jnp.asarray(resistances), repeats(seen))
+    size = float(jnp.abs(driver.response(jnp.asarray(1e3))))
+    if np.isfinite(size) and not plausible[0] <= size <= plausible[1]:
+        driver = dataclasses.replace(driver, result=verdict("implausible"))
+    if throw and driver.verdict != "successful":
+        raise IdentificationError(f"driver: {driver.verdict}. {message(driver.verdict)}", driver)
+    return driver
+
+
+def _driver(seen: Sequence[Inspected], order: int, estimator: AbstractEstimator) -> Driver:
+    """The driver of calibrations that passed the pre-flight, aligned by their lags."""
+    r_load = jnp.asarray([one.recording.r_load for one in seen])
+    aligned = [AlignedSamples.of(one) for one in seen]
+    if not estimator.lane.periodic:
+        size = min(one.size for one in aligned)
+        cut = [
+            dataclasses.replace(one, v_th=one.v_th[:size], v_out=one.v_out[:size])
+            for one in aligned
+        ]
+        return _identified(stacked(cut), r_load, order, estimator, None)
+    # Only starts are made from samples: of one length, so that the compiled function serves all.
+    shortest = min(one.v_th.size for one in seen)  # periods of the others may be left out
+    whole = [
+        dataclasses.replace(
+            one, v_th=of.v_th[:shortest], v_out=np.roll(of.v_out, -of.lag)[:shortest]
+        )
+        for one, of in zip(aligned, seen, strict=True)
+    ]
+    spectra = [Harmonics.of(one).spectrum for one in seen]
+    size = min(one.x.size for one in spectra)  # a pulse rate that is counted may cost one
+    spectra = jax.tree.map(lambda *of: jnp.stack([field[:size] for field in of]), *spectra)
+    records = stacked(whole)
+    driver = _identified(records, r_load, order, estimator, spectra)
+    # A driver bends to hum on one harmonic, by a pole there, and then lacks another.
+    if needs_another(driver) or driver.verdict != "successful":
+        few = spectra.selected & ~mains.lines(spectra.frequency)
+        spectra = dataclasses.replace(spectra, selected=few)
+        driver = of_both(driver, _identified(records, r_load, order, estimator, spectra))
+    return driver
+
+
+@stored_jit
+def _identified(
+    samples: AlignedSamples,
+    r_load: Float[Array, " record"],
+    order: int,
+    estimator: AbstractEstimator,
+    spectra: Spectrum | None,
+) -> Driver:
+    records = jax.vmap(AlignedSamples.measure)(samples)
+    return estimator.fit_driver(records, r_load, order, spectra)

@@ -1,0 +1,98 @@
+"""The terminal voltage that a driver and a circuit predict for a recording."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from etid.circuits.circuit import AbstractCircuit, Resistor
+from etid.estimators.estimator import serving
+from etid.estimators.lanes import AlignedSamples
+from etid.estimators.output_error import fit as output_error
+from etid.estimators.output_error import prediction
+from etid.estimators.registry import OUTPUT_ERROR
+from etid.identify.arguments import circuit_of, require
+from etid.identify.compiled import stored_jit
+from etid.identify.steady_state import periodic_voltage
+from etid.recordings.preflight import Inspected
+from etid.recordings.recording import Recording
+from etid.results.driver import ContinuousDriver, Driver
+from etid.signals.filtering import TAPS
+from etid.signals.precision import require_float64
+
+
+@stored_jit
+def _fitted(
+    samples: AlignedSamples, driver: ContinuousDriver, circuit: AbstractCircuit
+) -> Float[Array, " interval"]:
+    records = prediction.prepare(samples.measure(), cutoff=0.5)  # the band as it was recorded
+    r_load = driver.calibration.r_load[0]
+    return output_error.fitted_voltage(
+        records, driver.source, r_load, circuit.impedance().rational()
+    )
+
+
+def predict(
+    recording: Recording, driver: Driver, circuit: AbstractCircuit | None = None
+) -> Float[np.ndarray, " time"]:
+    """Predict the terminal voltage [V] of a recording, for plots and residuals.
+
+    The state at the start of the record and an offset are fitted to `recording.v_out`.
+
+    Args:
+        recording: Unloaded and loaded voltage.
+        driver: Driver with a continuous source impedance.
+        circuit: The load; the known resistor of a calibration if not given.
+
+    Returns:
+        Predicted voltage [V]; NaN at both edges, where the interpolation lacks neighbours. With a
+        constant-phase element, NaN after the last whole period.
+
+    Raises:
+        ValueError: There is no circuit, the driver cannot serve, or a circuit with a constant-phase
+            element meets a record without a whole period.
+    """
+    require_float64()
+    require("recording", recording, Recording)
+    require("driver", driver, Driver)
+    if circuit is not None:
+        circuit = circuit_of(circuit)
+    else:
+        if recording.r_load is None:
+            raise ValueError("give the circuit: this recording has no known resistor")
+        circuit = Resistor(recording.r_load)
+    driver = serving(driver, ContinuousDriver, str(OUTPUT_ERROR))
+    if not circuit.is_rational:
+        return _predict_periods(recording, driver, circuit)
+    seen = Inspected(recording)
+    seen.kept = None  # disturbed periods are predicted too
+    inner = np.asarray(_fitted(jax.tree.map(jnp.asarray, AlignedSamples.of(seen)), driver, circuit))
+    predicted = np.full(recording.v_out.size, np.nan)
+    first = TAPS - 1 + max(seen.lag, 0)
+    predicted[first : first + inner.size] = inner
+    return predicted
+
+
+def _predict_periods(
+    recording: Recording, driver: ContinuousDriver, circuit: AbstractCircuit
+) -> Float[np.ndarray, " time"]:
+    rate = recording.sample_rate
+    seen = Inspected(recording)
+    periods, samples = seen.whole_periods
+    if periods == 0:
+        raise ValueError(
+            f"recording {recording.path!r} holds no whole pulse period; the voltage at a "
+            f"constant-phase element, as in {type(circuit).__name__}, is predicted for whole ones"
+        )
+    frequency = jnp.asarray(np.fft.rfftfreq(samples, 1 / rate)[1:])
+    predicted = np.full(recording.v_out.size, np.nan)
+    aligned = periodic_voltage(
+        recording.v_th[:samples],
+        np.roll(recording.v_out[:samples], -seen.lag),
+        rate,
+        np.asarray(driver.source.response(frequency)),
+        np.asarray(circuit.response(frequency)),
+        float(driver.calibration.r_load[0]),
+    )
+    predicted[:samples] = np.roll(aligned, seen.lag)
+    return predicted
