@@ -59,7 +59,7 @@ def copied(root: pathlib.Path, folder: pathlib.Path) -> None:
         if path.is_file() and not path.name.startswith("."):
             shutil.copy2(path, folder)
         elif path.name in COPIED:
-            ignored = shutil.ignore_patterns("__pycache__", "results")
+            ignored = shutil.ignore_patterns("__pycache__")
             shutil.copytree(path, folder / path.name, ignore=ignored)
     shared = root.parent / "shared"
     if shared.exists():

@@ -89,6 +89,14 @@ def test_modules_and_their_tests_are_where_the_benchmark_looks_for_them():
             assert (ROOT / "tests" / f"test_{test}.py").exists()
 
 
+def test_the_copy_that_is_broken_has_every_module(tmp_path):
+    folder = tmp_path / "tree"
+    folder.mkdir()
+    mutation.copied(ROOT, folder)
+    for path in (ROOT / "etid").rglob("*.py"):
+        assert (folder / path.relative_to(ROOT)).exists()
+
+
 def test_survivors_are_shown_with_their_place(capsys):
     row = {"module": "a", "place": "etid/a.py:7", "kind": "sign", "before": "-x", "after": "(x)"}
     share = mutation.show([{**row, "outcome": "survived"}, {**row, "outcome": "killed"}])
