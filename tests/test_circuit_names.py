@@ -109,7 +109,7 @@ def test_a_file_imports_nothing_and_says_what_to_import(files, tmp_path, capsys,
         assert cli.main(arguments) == WRONG_DATA
         (line,) = capsys.readouterr().err.splitlines()
         assert "fits.h5, circuit: is 'absent_lab:Spread'. absent_lab is not imported" in line
-        assert line.endswith("say --circuit absent_lab:Spread.")
+        assert line.endswith("add --circuit absent_lab:Spread.")
     assert "absent_lab" not in sys.modules
     assert etid.Fits.read(other, lookup.imported("lab_skins:Spread")).counts()
 
@@ -117,11 +117,11 @@ def test_a_file_imports_nothing_and_says_what_to_import(files, tmp_path, capsys,
 @pytest.mark.parametrize(
     ("stored", "says"),
     [
-        ("etid:SkinOil", "etid has no such circuit: read it with the version that wrote it"),
+        ("etid:SkinOil", "etid has no such circuit: read the file with the version of etid"),
         ("__main__:Mine", "Mine was defined in a script or a notebook"),
-        ("os:system", "os is not imported, and a file imports nothing"),
-        ("SkinRC", "No circuit has such a name"),
-        ("__import__('os').abort():x", "No circuit has such a name"),
+        ("os:system", "os is not imported, and etid imports no module because a file names it"),
+        ("SkinRC", "This is not a name of a circuit"),
+        ("__import__('os').abort():x", "This is not a name of a circuit"),
         ("lab_skins:Other", "lab_skins is not imported"),
     ],
 )
@@ -155,8 +155,8 @@ def test_a_circuit_that_has_changed_is_refused(files, tmp_path):
             "no circuit 'SkinOil' in etid; use one of ParallelRC, Resistor, SkinCole",
         ),
         ("absent_lab:Mine", "cannot import absent_lab: ModuleNotFoundError"),
-        ("lab_skins:Other", "Other of lab_skins is None, no subclass of etid.AbstractCircuit"),
-        ("lab_skins:etid", "no subclass of etid.AbstractCircuit"),
+        ("lab_skins:Other", "Other of lab_skins is None, not a subclass of etid.AbstractCircuit"),
+        ("lab_skins:etid", "not a subclass of etid.AbstractCircuit"),
     ],
 )
 def test_what_is_no_circuit_is_wrong_usage(files, capsys, name, says):

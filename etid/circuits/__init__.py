@@ -1,4 +1,4 @@
-"""What can be connected to a driver: elements, circuits made of them, and their netlists.
+"""Loads of a driver: elements, circuits that are built from elements, and their netlists.
 
-How a circuit is identified does not belong here.
+Code that identifies a circuit does not belong here.
 """

@@ -1,8 +1,8 @@
-"""Circuits: named elements with units and typical values, and those that come with etid.
+"""Circuits: parameters with names, units and typical values; and the circuits of etid.
 
-A circuit is a frozen module with named parameters and one method, `impedance()`, built from
-`resistor`, `capacitor`, `constant_phase`, `cole`, `series` and `parallel`. Everything else (filter,
-fit, covariance, printing with units, netlist) follows from these lines.
+A circuit is a frozen module with named parameters and one method, `impedance()`. This method builds
+the impedance from `resistor`, `capacitor`, `constant_phase`, `cole`, `series` and `parallel`. etid
+derives everything else from the circuit: filter, fit, covariance, text with units, and netlist.
 """
 
 import abc
@@ -28,16 +28,17 @@ from etid.circuits.impedance import AbstractImpedance, parallel, series
 from etid.signals.transfer import frequency_variable
 
 Circuit = TypeVar("Circuit", bound="AbstractCircuit")
-# Powers with which a parameter goes with the impedance and with the time scale of its circuit.
+# A parameter is proportional to these powers of the impedance and the time scale of its circuit.
 SCALING = {
     "ohm": (1.0, 0.0),
     "farad": (-1.0, 1.0),
     "second": (0.0, 1.0),
-    "siemens second^alpha": (-1.0, 0.8),  # of a common α; only starts of a fit are made with it
+    "siemens second^alpha": (-1.0, 0.8),  # for a typical α; used only for the start of a fit
     "1": (0.0, 0.0),
 }
-# Standard errors by which an exponent may exceed 1: of a relaxation of one time constant it does so
-# by chance, in every second fit by less than one, in one of 30 000 by more than four.
+# Number of standard errors by which a fitted exponent may exceed 1. If the true exponent is 1,
+# noise makes the fitted exponent exceed 1 in every second fit, mostly by less than one standard
+# error. It exceeds 1 by more than four standard errors in one of 30 000 fits.
 ABOVE_ONE = 4.0
 
 
@@ -47,10 +48,10 @@ def parameter(unit: str, *, typical: float) -> Any:
     Args:
         unit: `"ohm"`, `"farad"`, `"second"`, `"siemens second^alpha"` for the Q of a constant-phase
             element, or `"1"` for its exponent.
-        typical: Magnitude to expect, in SI; a fit may start there.
+        typical: Expected magnitude in the SI unit; a fit may start at this value.
 
     Returns:
-        A field of a circuit, to stand behind the `=` of its declaration.
+        A field for the class body of a circuit, as in `r: Ohm = parameter("ohm", typical=1e5)`.
 
     Raises:
         ValueError: The unit is not known.
@@ -66,7 +67,7 @@ class AbstractCircuit(eqx.Module):
     """A passive two-terminal circuit with positive parameters.
 
     Attributes:
-        formula: Its impedance as a methods section writes it; may be empty.
+        formula: Impedance of the circuit as text for a methods section; may be empty.
     """
 
     formula: ClassVar[str] = ""
@@ -87,7 +88,7 @@ class AbstractCircuit(eqx.Module):
 
     @classmethod
     def scaling(cls) -> Float[Array, "2 parameter"]:
-        """Powers with which each parameter goes with the impedance and with the time scale."""
+        """Powers of impedance and of time scale to which each parameter is proportional."""
         return jnp.array([SCALING[unit] for unit in cls.units().values()]).T
 
     def response(self, frequency: Float[Array, "..."]) -> Complex[Array, "..."]:
@@ -97,7 +98,7 @@ class AbstractCircuit(eqx.Module):
             frequency: Real frequencies [Hz].
 
         Returns:
-            Impedance [Ω] at each.
+            Impedance [Ω] at each frequency.
         """
         return self.impedance()(frequency_variable(jnp.asarray(frequency)))
 
@@ -110,13 +111,13 @@ class AbstractCircuit(eqx.Module):
         return jnp.log(self.values())
 
     def with_log_values(self: Circuit, log_values: Float[Array, "*lane parameter"]) -> Circuit:
-        """The same circuit with other parameters.
+        """A circuit of the same class with other parameters.
 
         Args:
             log_values: Natural logarithms of the parameters in SI units, in the order of `names`.
 
         Returns:
-            A circuit of the same kind; this one stays as it is.
+            A new circuit; this circuit does not change.
         """
         values = jnp.exp(log_values)
         return type(self)(**{name: values[..., i] for i, name in enumerate(self.names())})
@@ -127,15 +128,15 @@ class AbstractCircuit(eqx.Module):
         return self.impedance().is_rational
 
     def is_too_steep(self, cov: Float[Array, "parameter parameter"]) -> Bool[Array, ""]:
-        """Whether an exponent α exceeds 1 by more than its standard error explains.
+        """Whether an exponent α exceeds 1 by more than `ABOVE_ONE` standard errors.
 
-        No passive element is steeper than a capacitor.
+        The impedance of a passive element cannot fall faster than that of a capacitor (α = 1).
 
         Args:
             cov: Covariance of `log_values`.
         """
 
-        def alphas(log_values):
+        def alphas(log_values: Float[Array, " parameter"]) -> Float[Array, " exponent"]:
             found = self.with_log_values(log_values).impedance().exponents()
             return jnp.stack([jnp.asarray(alpha) for alpha in found])
 
@@ -149,9 +150,9 @@ class AbstractCircuit(eqx.Module):
 class SkinRC(AbstractCircuit):
     """Skin as a series resistor and one relaxation, Z = R_s + R_p / (1 + s R_p C_p) (paper, eq. 7).
 
-    Equal to eq. 7, Z_bio(s) = ((R_s + R_p) + R_s R_p C_p s) / (1 + R_p C_p s). Typical values lie
-    between those of dry and damp fingertips (paper, Tables II and III): 186 and 17.4 kΩ, 0.12 and
-    0.66 nF, 33.4 and 6.1 kΩ.
+    The paper writes eq. 7 as Z_bio(s) = ((R_s + R_p) + R_s R_p C_p s) / (1 + R_p C_p s). The
+    typical values lie between the values of dry and damp fingertips (paper, Tables II and III).
+    These are 186 and 17.4 kΩ for R_p, 0.12 and 0.66 nF for C_p, and 33.4 and 6.1 kΩ for R_s.
     """
 
     formula: ClassVar[str] = "R_s + R_p / (1 + s R_p C_p)"
@@ -170,11 +171,11 @@ class SkinRC(AbstractCircuit):
 
 
 class SkinCole(AbstractCircuit):
-    """Skin whose relaxation is spread over time constants, Z = R_s + R_p / (1 + (s τ)^α).
+    """Skin with a distribution of time constants, Z = R_s + R_p / (1 + (s τ)^α).
 
-    The formula is that of Cole (1940). Typical values are those of `SkinRC`, with τ = R_p C_p. The
-    typical α is that of dry skin below 100 MHz, 1 - 0.2 (Gabriel, Lau and Gabriel, The dielectric
-    properties of biological tissues: III, 1996, Table 1).
+    The formula is from Cole (1940). The typical resistances are those of `SkinRC`. The typical τ is
+    R_p C_p of `SkinRC`. The typical α is the value of dry skin below 100 MHz, 1 - 0.2 (Gabriel, Lau
+    and Gabriel, The dielectric properties of biological tissues: III, 1996, Table 1).
     """
 
     formula: ClassVar[str] = "R_s + R_p / (1 + (s tau)^alpha)"
@@ -191,10 +192,10 @@ class SkinCole(AbstractCircuit):
 class SkinLayers(AbstractCircuit):
     """Skin of two layers, each one relaxation, Z = R_s + R_1/(1 + s R_1 C_1) + R_2/(1 + s R_2 C_2).
 
-    The first layer is the faster one by its typical values. The sum of the typical resistances is
-    that of `SkinRC`. The typical time constants, 21 and 120 µs, lie in the ranges that Birlea,
-    Birlea and Culea found in human skin, 10 to 40 and 100 to 200 µs (The Skin's Electrical Time
-    Constants, 2011, doi 10.1007/978-3-642-22586-4_34).
+    With the typical values, the first layer is the faster layer. The sum of the typical resistances
+    equals that of `SkinRC`. The typical time constants are 21 and 120 µs. Birlea, Birlea and Culea
+    measured 10 to 40 and 100 to 200 µs in human skin (The Skin's Electrical Time Constants, 2011,
+    doi 10.1007/978-3-642-22586-4_34).
     """
 
     formula: ClassVar[str] = "R_s + R_1 / (1 + s R_1 C_1) + R_2 / (1 + s R_2 C_2)"
@@ -205,7 +206,7 @@ class SkinLayers(AbstractCircuit):
     c_2: Farad = parameter("farad", typical=4e-9)
 
     def impedance(self) -> AbstractImpedance:
-        """Impedance of both layers."""
+        """Impedance of the series resistor and both layers."""
         first = parallel(resistor(self.r_1), capacitor(self.c_1))
         second = parallel(resistor(self.r_2), capacitor(self.c_2))
         return series(resistor(self.r_s), first, second)
@@ -214,8 +215,8 @@ class SkinLayers(AbstractCircuit):
 class ParallelRC(AbstractCircuit):
     """A resistor and a capacitor in parallel, Z = R_p / (1 + s R_p C_p).
 
-    It is skin whose series resistance is too small to be seen. Typical values are those of
-    `SkinRC` (paper, Tables II and III).
+    It describes skin whose series resistance is too small to be measured. The typical values are
+    those of `SkinRC` (paper, Tables II and III).
     """
 
     formula: ClassVar[str] = "R_p / (1 + s R_p C_p)"
@@ -228,7 +229,7 @@ class ParallelRC(AbstractCircuit):
 
 
 class Resistor(AbstractCircuit):
-    """One resistor, Z = R: the loads of the paper's Table I, 21.62 to 555 kΩ."""
+    """One resistor, Z = R, like the loads of the paper's Table I, 21.62 to 555 kΩ."""
 
     formula: ClassVar[str] = "R"
     r: Ohm = parameter("ohm", typical=100e3)

@@ -1,11 +1,11 @@
-"""How elements are printed: scaled units, and a value with its standard error.
+"""Text for parameters: scaled units, and a value with its standard error.
 
-Inside etid all numbers have SI units. Only text, tables and pictures have the units of this file.
+Inside etid all numbers are in SI units. Only text, tables and figures use the units of this module.
 """
 
 import numpy as np
 
-# Factor in SI units, and symbol, of the unit in which a parameter is printed.
+# Unit for the display of a parameter, by its SI unit: size in the SI unit, and symbol.
 DISPLAY = {
     "ohm": (1e3, "kΩ"),
     "farad": (1e-9, "nF"),
@@ -16,15 +16,16 @@ DISPLAY = {
 
 
 def heading(name: str, unit: str) -> str:
-    """Name and scaled unit of a parameter, as in `r_s [kΩ]`."""
+    """Name and scaled unit of a parameter, such as `r_s [kΩ]`."""
     symbol = DISPLAY[unit][1]
     return f"{name} [{symbol}]" if symbol else name
 
 
 def plus_minus(value: float, error: float) -> str:
-    """A value with its standard error, both to two digits of the error, padded for a column.
+    """A value with its standard error, padded for a column.
 
-    Without an error, the value has four significant digits.
+    Both are rounded to two significant digits of the error. Without an error, the value has four
+    significant digits.
     """
     if not np.isfinite(error) or error <= 0:
         return f"{value:10.4g}            "
@@ -33,12 +34,12 @@ def plus_minus(value: float, error: float) -> str:
 
 
 def quantity(value: float, unit: str, error: float = np.nan) -> str:
-    """A parameter in its scaled unit, as in `33.40 ± 0.10 kΩ`, or `33.4 kΩ` without an error.
+    """A parameter in its scaled unit, such as `33.40 ± 0.10 kΩ`, or `33.4 kΩ` without an error.
 
     Args:
-        value: In SI units.
-        unit: The SI unit, one of `DISPLAY`.
-        error: Standard error in SI units; NaN if there is none.
+        value: Value in the SI unit.
+        unit: SI unit, a key of `DISPLAY`.
+        error: Standard error in the SI unit; NaN if there is none.
     """
     scale, symbol = DISPLAY[unit]
     return " ".join([*plus_minus(value / scale, error / scale).split(), symbol]).rstrip()

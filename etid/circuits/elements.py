@@ -1,19 +1,20 @@
 """The elements: resistor, capacitor and constant-phase element.
 
-SPICE has no constant-phase element, but its impedance is a sum of relaxations of all time constants
-(x [rad/s] are their corner frequencies; put x = s y to verify),
+SPICE has no constant-phase element. Its impedance is an integral over relaxations with all corner
+frequencies x [rad/s] (substitute x = s y to verify):
 
-    1 / (Q s^α) = sin(πα) / (πQ) ∫ x^(−α) / (s + x) dx,      x from 0 to ∞, 0 < α < 1,
+    1 / (Q s^α) = sin(πα) / (πQ) ∫ x^(−α) / (s + x) dx,      x from 0 to ∞, 0 < α < 1.
 
-and sampled at x_k = x₀ e^(kh) the integral is a chain of resistors with capacitors in parallel
-(Foster 1924), evenly spaced over ln x as in Oustaloup's recursion (Oustaloup et al. 2000):
+The trapezoidal rule at x_k = x₀ e^(kh) turns the integral into a chain of resistors with parallel
+capacitors (Foster 1924). They are evenly spaced in ln x, as in Oustaloup's recursion (Oustaloup et
+al. 2000):
 
     R_k = sin(πα) h x_k^(−α) / (πQ),      C_k = 1 / (R_k x_k).
 
-In ln x the trapezoidal rule converges exponentially (Trefethen and Weideman 2014): the nearest pole
-for s = jω lies π/2 off the real axis, so that its error is 2 e^(−π²/h). The slower relaxations that
-are left out are, at higher frequencies, one capacitor in series, the faster ones one resistor; both
-are geometric series.
+In ln x the trapezoidal rule converges exponentially (Trefethen and Weideman 2014). For s = jω the
+nearest pole lies at a distance of π/2 from the real axis, so the error of the rule is 2 e^(−π²/h).
+The chain is finite. One series capacitor replaces all slower relaxations; one series resistor
+replaces all faster relaxations. Both values are sums of geometric series.
 """
 
 from typing import ClassVar
@@ -41,9 +42,9 @@ Second = Quantity
 Exponent = Quantity
 PseudoCapacitance = Quantity
 
-LADDER_ERROR = 1e-4  # relative, at most, in the band
-STEP = 0.95  # of ln x; the rule itself is off by 6e-5 then
-BEYOND = np.log(600.0)  # ln x on both sides of the band, for what ends leave out to second order
+LADDER_ERROR = 1e-4  # largest relative error of the impedance in the band
+STEP = 0.95  # step h of ln x; the relative error of the trapezoidal rule is then 6e-5
+BEYOND = np.log(600.0)  # margin of ln x beyond the band: the ends are exact to first order only
 
 
 class Resistance(AbstractRational):
@@ -65,7 +66,7 @@ class Resistance(AbstractRational):
         return Rational(jnp.stack([jnp.asarray(self.r)]), jnp.ones(1))
 
     def connect(self, netlist: Netlist, plus: str, minus: str) -> None:
-        """Write the resistor."""
+        """Write the resistor into the netlist."""
         netlist.part("R", self.r, plus, minus)
 
 
@@ -89,7 +90,7 @@ class Capacitance(AbstractRational):
         return Rational(jnp.ones(1), jnp.stack([jnp.zeros_like(c), c]))
 
     def connect(self, netlist: Netlist, plus: str, minus: str) -> None:
-        """Write the capacitor."""
+        """Write the capacitor into the netlist."""
         netlist.part("C", self.c, plus, minus)
 
 
@@ -111,21 +112,23 @@ class ConstantPhase(AbstractIrrational):
         return as_complex(jnp.asarray(self.q)) * power
 
     def exponents(self) -> tuple[Exponent, ...]:
-        """α."""
+        """Exponent α."""
         return (self.alpha,)
 
     def connect(self, netlist: Netlist, plus: str, minus: str) -> None:
-        """Write a ladder."""
+        """Write the ladder that replaces the element into the netlist."""
         low, high = netlist.band
         netlist.remarks.add(
-            f"constant phase as RC pairs, within {100 * LADDER_ERROR:g} % "
+            f"constant-phase element as RC pairs, error below {100 * LADDER_ERROR:g} % "
             f"from {low:g} Hz to {high:g} Hz"
         )
         ladder(float(self.q), float(self.alpha), netlist.band).connect(netlist, plus, minus)
 
 
 def ladder(q: float, alpha: float, band: tuple[float, float]) -> AbstractImpedance:
-    """Resistors and capacitors that are a constant-phase element in a band of frequencies.
+    """Resistors and capacitors that approximate a constant-phase element in a frequency band.
+
+    A capacitor replaces it exactly if α is 1.
 
     Args:
         q: Q [S s^α].
@@ -137,8 +140,8 @@ def ladder(q: float, alpha: float, band: tuple[float, float]) -> AbstractImpedan
     """
     if alpha > 1:
         raise ValueError(
-            f"an exponent is {alpha:.6g}; above 1 there is no passive network: fit a circuit with "
-            "a capacitor in the place of the constant-phase element"
+            f"an exponent is {alpha:.6g}; no passive network has an exponent above 1: fit a "
+            "circuit with a capacitor instead of the constant-phase element"
         )
     if alpha == 1:
         return capacitor(q)
@@ -177,10 +180,10 @@ def capacitor(c: Farad) -> Capacitance:
 
 
 def constant_phase(q: PseudoCapacitance, alpha: Exponent) -> ConstantPhase:
-    """Impedance of a constant-phase element, Z = 1 / (Q s^α) [Ω], the `CPE` of impedance.py.
+    """Impedance of a constant-phase element, Z = 1 / (Q s^α) [Ω]; impedance.py calls it `CPE`.
 
     Args:
-        q: Q [S s^α], a capacitance if α = 1.
+        q: Q [S s^α]; it is a capacitance [F] if α = 1.
         alpha: α, above 0 and at most 1.
 
     Returns:
@@ -190,16 +193,17 @@ def constant_phase(q: PseudoCapacitance, alpha: Exponent) -> ConstantPhase:
 
 
 def cole(r: Ohm, tau: Second, alpha: Exponent) -> Parallel:
-    """Impedance of a relaxation that is spread over time constants, Z = R / (1 + (s τ)^α) [Ω].
+    """Impedance of a relaxation with a distribution of time constants, Z = R / (1 + (s τ)^α) [Ω].
 
-    K. S. Cole, Permeability and impermeability of cell membranes for ions, 1940. It is R in
-    parallel with a constant-phase element of Q = τ^α / R, but unlike those of Q, the errors of τ
-    and α hardly go together, and the unit of τ is that of a time whatever α is.
+    Source: K. S. Cole, Permeability and impermeability of cell membranes for ions, 1940. The
+    element is R in parallel with a constant-phase element of Q = τ^α / R. The parameters are τ and
+    α instead of Q and α for two reasons: the errors of τ and α are almost uncorrelated, and the
+    unit of τ does not depend on α.
 
     Args:
         r: R [Ω].
         tau: τ [s].
-        alpha: α, above 0 and at most 1; 1 is a resistor and a capacitor.
+        alpha: α, above 0 and at most 1. With α = 1 it is a resistor parallel to a capacitor.
 
     Returns:
         An impedance, to be connected with others.

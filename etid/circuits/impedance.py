@@ -1,9 +1,10 @@
-"""Impedances as trees: leaves are elements, nodes connect them in series or in parallel.
+"""Impedances as trees: leaves are elements, nodes connect impedances in series or in parallel.
 
-A tree keeps what a polynomial in s has lost, which elements there are and where. It is evaluated
-exactly at any s, whether or not it is a ratio of polynomials, and it writes itself as a netlist.
-Everything that depends on the kind of an element is a method of that element: a new kind of element
-is one subclass of `AbstractRational`, or of `AbstractIrrational` if it is no ratio of polynomials.
+A tree keeps the elements and their positions; a polynomial in s does not. A tree can be evaluated
+exactly at any s, even if it is not a ratio of polynomials. It can also be written as a netlist.
+Everything that depends on the kind of an element is a method of its class. A new kind of element
+is one subclass of `AbstractRational`, or of `AbstractIrrational` if its impedance is not a ratio of
+polynomials.
 """
 
 import abc
@@ -18,18 +19,21 @@ from jaxtyping import Array, Complex, Float
 
 from etid.signals.transfer import Rational, reciprocal
 
-# What a parameter may hold: one value, or a batch of them.
+# Type of a parameter: one value, or a batch of values.
 Quantity = Float[Array, "..."] | Float[np.ndarray, "..."] | float
 
 
 class Names:
-    """Names of parts: each kind counts, and what stands together has equal numbers."""
+    """Names of the parts of a netlist, such as R1 and C1.
+
+    Each prefix has its own counter. Neighbouring parts of different kinds get the same number.
+    """
 
     def __init__(self):
         self.used: dict[str, int] = {}
 
     def next(self, prefix: str) -> str:
-        """A name that was not given before."""
+        """A new name with this prefix."""
         number = max(self.used.get(prefix, -1) + 1, *self.used.values(), 0)
         self.used[prefix] = number
         return f"{prefix}{number}"
@@ -39,9 +43,9 @@ class Netlist:
     """Resistors and capacitors between numbered nodes, one per line.
 
     Attributes:
-        band: Lowest and highest frequency [Hz] at which a ladder has to be right.
-        lines: What was written.
-        remarks: What a reader of the netlist should know.
+        band: Lowest and highest frequency [Hz] at which a ladder must be accurate.
+        lines: Parts that were written, one per line.
+        remarks: Notes for the reader of the netlist.
     """
 
     def __init__(self, band: tuple[float, float]):
@@ -52,7 +56,7 @@ class Netlist:
         self.nodes = 0
 
     def node(self) -> str:
-        """A node that nothing is connected to yet."""
+        """Name of a new node."""
         self.nodes += 1
         return f"n{self.nodes}"
 
@@ -65,7 +69,7 @@ class Notation:
     """An impedance in the notation of impedance.py, such as `R0-p(R1,C1)`.
 
     Attributes:
-        values: Values of the elements, in the order in which they stand in the text.
+        values: Values of the elements, in their order in the text.
     """
 
     def __init__(self):
@@ -94,16 +98,21 @@ class AbstractImpedance(eqx.Module):
         """Impedance [Ω] as a ratio of polynomials in s.
 
         Raises:
-            ValueError: It is none.
+            ValueError: The impedance is not a ratio of polynomials.
         """
 
     @abc.abstractmethod
     def exponents(self) -> tuple[Quantity, ...]:
-        """Exponents of powers of s, each of which is at most 1 in a passive network."""
+        """Exponents of the powers of s. In a passive network each exponent is at most 1."""
 
     @abc.abstractmethod
     def connect(self, netlist: Netlist, plus: str, minus: str) -> None:
-        """Write the network between two nodes, exactly or as a ladder that is right in the band.
+        """Write the network between two nodes, exactly or as a ladder that is accurate in the band.
+
+        Args:
+            netlist: The netlist to extend.
+            plus: Name of the first node.
+            minus: Name of the second node.
 
         Raises:
             ValueError: No passive network has these values.
@@ -119,11 +128,11 @@ class AbstractImpedance(eqx.Module):
 
 
 class AbstractElement(AbstractImpedance):
-    """A leaf: one element.
+    """One element, a leaf of the tree.
 
     Attributes:
-        symbol: Its name in impedance.py, whose values are the fields in their order; empty if
-            impedance.py does not have it.
+        symbol: Name of the element in impedance.py; empty if impedance.py does not have it. The
+            fields must have the same order as the values of impedance.py.
     """
 
     symbol: ClassVar[str] = ""
@@ -137,36 +146,36 @@ class AbstractElement(AbstractImpedance):
 
 
 class AbstractRational(AbstractElement):
-    """An element that is a ratio of polynomials in s, without powers of other exponents."""
+    """An element whose impedance is a ratio of polynomials in s."""
 
     @property
     def is_rational(self) -> bool:
-        """Yes."""
+        """True."""
         return True
 
     def exponents(self) -> tuple[Quantity, ...]:
-        """None."""
+        """Empty: a ratio of polynomials has no other exponents."""
         return ()
 
 
 class AbstractIrrational(AbstractElement):
-    """An element that is no ratio of polynomials in s."""
+    """An element whose impedance is not a ratio of polynomials in s."""
 
     @property
     def is_rational(self) -> bool:
-        """No."""
+        """False."""
         return False
 
     def rational(self) -> Rational:
-        """There is none."""
+        """Raise ValueError: the impedance is not a ratio of polynomials."""
         raise ValueError(
-            f"{type(self).__name__} is no rational function of s; it is exact at harmonics "
-            "(method='maximum_likelihood' or 'non_parametric') and as Z(s)"
+            f"{type(self).__name__} is no rational function of s; use a method that evaluates Z(s) "
+            "at harmonics (method='maximum_likelihood' or 'non_parametric')"
         )
 
 
 class AbstractConnection(AbstractImpedance):
-    """A node: several impedances that are connected.
+    """A connection of several impedances, a node of the tree.
 
     Attributes:
         parts: The impedances, at least one.
@@ -177,7 +186,7 @@ class AbstractConnection(AbstractImpedance):
     def __check_init__(self):
         if not self.parts:
             raise ValueError(
-                f"{type(self).__name__.lower()}() connects nothing; give it at least one impedance"
+                f"{type(self).__name__.lower()}() has no arguments; give it at least one impedance"
             )
 
     @property
@@ -208,7 +217,7 @@ class Series(AbstractConnection):
         return reduce(Rational.add, [part.rational() for part in self.parts])
 
     def connect(self, netlist: Netlist, plus: str, minus: str) -> None:
-        """Write the parts one behind the other."""
+        """Write the parts one after the other, with a new node between neighbours."""
         for part in self.parts[:-1]:
             node = netlist.node()
             part.connect(netlist, plus, node)
@@ -216,7 +225,7 @@ class Series(AbstractConnection):
         self.parts[-1].connect(netlist, plus, minus)
 
     def text(self, notation: Notation) -> str:
-        """The parts with dashes between them."""
+        """The parts, separated by dashes."""
         return "-".join(part.text(notation) for part in self.parts)
 
 
@@ -244,7 +253,7 @@ class Parallel(AbstractConnection):
             part.connect(netlist, plus, minus)
 
     def text(self, notation: Notation) -> str:
-        """The parts within p()."""
+        """The parts, separated by commas, in p()."""
         return f"p({','.join(part.text(notation) for part in self.parts)})"
 
 
@@ -252,13 +261,13 @@ def series(*impedances: AbstractImpedance) -> Series:
     """Series connection, Z = Z₁ + Z₂ + ….
 
     Args:
-        *impedances: What is connected, at least one.
+        *impedances: Impedances to connect, at least one.
 
     Returns:
-        An impedance, to be connected with others.
+        Impedance of the connection.
 
     Raises:
-        ValueError: There is none.
+        ValueError: No impedance is given.
     """
     return Series(impedances)
 
@@ -267,12 +276,12 @@ def parallel(*impedances: AbstractImpedance) -> Parallel:
     """Parallel connection, 1/Z = 1/Z₁ + 1/Z₂ + ….
 
     Args:
-        *impedances: What is connected, at least one.
+        *impedances: Impedances to connect, at least one.
 
     Returns:
-        An impedance, to be connected with others.
+        Impedance of the connection.
 
     Raises:
-        ValueError: There is none.
+        ValueError: No impedance is given.
     """
     return Parallel(impedances)

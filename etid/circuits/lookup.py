@@ -1,7 +1,7 @@
-"""Circuits by name: what a file of fits says, and what a command is asked for.
+"""Circuit classes by name, for files of fits and for the option `--circuit`.
 
-The name is `module:Class`, and `etid:Class` for the circuits that come with etid. A name that was
-read in a file imports nothing: it is looked up among the classes that exist.
+The name is `module:Class`, and `etid:Class` for the circuits of etid. A name from a file never
+causes an import: etid searches for it only among the classes that are already defined.
 """
 
 import importlib
@@ -16,29 +16,30 @@ _NAME = re.compile(r"([A-Za-z_]\w*(?:\.\w+)*):(?:[\w<>]+\.)*(\w+)", flags=re.ASC
 
 
 def qualified(kind: type[AbstractCircuit]) -> str:
-    """The name by which a file of fits remembers a circuit."""
+    """Name of a circuit in a file of fits, such as `etid:SkinRC`."""
     module = "etid" if kind.__module__ == circuits.__name__ else kind.__module__
     return f"{module}:{kind.__qualname__}"
 
 
 def built_in() -> dict[str, type[AbstractCircuit]]:
-    """The circuits that come with etid, by the names of their classes."""
+    """Circuits of etid by class name."""
     return {kind.__name__: kind for kind in _defined() if kind.__module__ == circuits.__name__}
 
 
 def remembered(stored: str, given: type[AbstractCircuit] | None = None) -> type[AbstractCircuit]:
-    """The circuit of a file of fits.
+    """Circuit class of a file of fits.
 
     Args:
-        stored: Its qualified name, as the file has it.
-        given: The class that the caller takes it for; if not given, it is looked up.
+        stored: Qualified name of the circuit in the file.
+        given: Class that the caller expects. If it is None, the class is searched by name.
 
     Raises:
-        LookupError: It is not known, or another one; the message says what to do.
+        LookupError: No class has this name, or `given` has a different name. The message says what
+            to do.
     """
     found = _NAME.fullmatch(stored)
     if found is None:
-        raise LookupError("No circuit has such a name: fit the recordings again")
+        raise LookupError("This is not a name of a circuit: fit the recordings again")
     module, name = found.groups()
     if given is not None:
         if given.__name__ != name:
@@ -48,26 +49,30 @@ def remembered(stored: str, given: type[AbstractCircuit] | None = None) -> type[
         if qualified(kind) == stored:
             return kind
     if module == "etid":
-        raise LookupError("etid has no such circuit: read it with the version that wrote it")
+        raise LookupError(
+            "etid has no such circuit: read the file with the version of etid that wrote it"
+        )
     if module == "__main__":
         raise LookupError(
-            f"{name} was defined in a script or a notebook: define it before you read, or pass the "
-            f"class as circuit; for a command, put it into a module and say --circuit MODULE:{name}"
+            f"{name} was defined in a script or a notebook: define it before you read the file, or "
+            f"pass the class as circuit; for a command, put the class into a module and add "
+            f"--circuit MODULE:{name}"
         )
     raise LookupError(
-        f"{module} is not imported, and a file imports nothing: import it before you read, or pass "
-        f"the class as circuit; for a command, say --circuit {module}:{name}"
+        f"{module} is not imported, and etid imports no module because a file names it: import it "
+        f"before you read the file, or pass the class as circuit; for a command, add --circuit "
+        f"{module}:{name}"
     )
 
 
 def imported(name: str) -> type[AbstractCircuit]:
-    """The circuit that a user asks for, whose module is imported.
+    """Circuit class that the user names; its module is imported.
 
     Args:
         name: `Class` for a circuit of etid, else `module:Class`.
 
     Raises:
-        ValueError: There is no such module or no such circuit in it.
+        ValueError: The module cannot be imported or has no such circuit.
     """
     module, _, attribute = name.rpartition(":")
     if not module:
@@ -80,17 +85,18 @@ def imported(name: str) -> type[AbstractCircuit]:
         return known[name]
     try:
         found = getattr(importlib.import_module(module), attribute, None)
-    except Exception as error:  # whatever a module of someone else may raise
+    except Exception as error:  # a user's module may raise anything
         raise ValueError(f"cannot import {module}: {type(error).__name__}: {error}") from error
     if not (isinstance(found, type) and issubclass(found, AbstractCircuit)):
         raise ValueError(
-            f"{attribute} of {module} is {reprlib.repr(found)}, no subclass of etid.AbstractCircuit"
+            f"{attribute} of {module} is {reprlib.repr(found)}, not a subclass of "
+            "etid.AbstractCircuit"
         )
     return found
 
 
 def _defined(of: type[AbstractCircuit] = AbstractCircuit) -> Iterator[type[AbstractCircuit]]:
-    """All circuits that exist, the latest definition first."""
+    """All subclasses of `of` that are defined, the latest definition first."""
     for kind in reversed(of.__subclasses__()):
         yield kind
         yield from _defined(kind)

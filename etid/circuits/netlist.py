@@ -1,4 +1,4 @@
-"""Circuits in the languages of others: a SPICE netlist, and impedance.py's string."""
+"""Circuits for other programs: a SPICE netlist, and the string of impedance.py."""
 
 import re
 
@@ -8,35 +8,36 @@ import numpy as np
 from etid.circuits.circuit import AbstractCircuit
 from etid.circuits.impedance import Netlist, Notation
 
-BAND = (1.0, 10e6)  # [Hz] where a ladder replaces an element that SPICE does not have
+BAND = (1.0, 10e6)  # [Hz] band in which a ladder replaces an element that SPICE does not have
 
 
 def netlist(
     circuit: AbstractCircuit, *, name: str = "load", band: tuple[float, float] = BAND
 ) -> str:
-    """SPICE subcircuit of a circuit, of resistors and capacitors alone, between `plus` and `minus`.
+    """SPICE subcircuit of resistors and capacitors between the nodes `plus` and `minus`.
 
-    A constant phase becomes a chain of RC pairs, good to `LADDER_ERROR` of its impedance in `band`.
-    Use it as in `X1 out 0 load`.
+    A chain of RC pairs replaces a constant-phase element. Its relative error in `band` is at most
+    `LADDER_ERROR`. A line such as `X1 out 0 load` connects the subcircuit.
 
     Args:
         circuit: One circuit, such as `fit.circuit`.
         name: Name of the subcircuit.
-        band: Lowest and highest frequency [Hz] at which a constant phase has to be right.
+        band: Lowest and highest frequency [Hz] at which RC pairs must be accurate.
 
     Returns:
-        The text of the subcircuit, elements in SI units.
+        Text of the subcircuit, with elements in SI units.
 
     Raises:
-        ValueError: The name or the band is none, the circuit is a batch, or an element is not
-            positive or an exponent above 1, so that no such network exists.
+        ValueError: The name or the band is invalid, the circuit is a batch, an element is not a
+            positive number, or an exponent is above 1.
     """
     if not re.fullmatch(r"[A-Za-z]\w*", name, flags=re.ASCII):
         raise ValueError(
-            f"{name!r} cannot name a subcircuit; use letters, digits and _, a letter first"
+            f"{name!r} cannot be the name of a subcircuit; use letters, digits and _, and begin "
+            "with a letter"
         )
     if not 0 < band[0] < band[1] < np.inf:
-        raise ValueError(f"band is {band}; it must be two rising frequencies [Hz] above 0")
+        raise ValueError(f"band is {band}; it must be two increasing frequencies [Hz] above 0")
     values = _checked(circuit)
     lines = [f"* {type(circuit).__name__}, written by etid, in SI units"]
     lines += [f"* {key} = {value:.6g}" for key, value in values.items()]
@@ -47,17 +48,18 @@ def netlist(
 
 
 def circuit_string(circuit: AbstractCircuit) -> tuple[str, list[float]]:
-    """A circuit in the notation of impedance.py, as `R0-p(R1,C1)`, and its values in that order.
+    """A circuit in the notation of impedance.py, such as `R0-p(R1,C1)`, and the element values.
 
         CustomCircuit(string, initial_guess=values)
 
-    Its `CPE` has two values, Q [S s^α] and α.
+    The values have the order of the elements in the string. A `CPE` has two values: Q [S s^α] and
+    α.
 
     Args:
         circuit: One circuit, such as `fit.circuit`.
 
     Returns:
-        The string, and the values in SI units.
+        String, and values in SI units.
 
     Raises:
         ValueError: The circuit is a batch, an element is not a positive number, or impedance.py has
@@ -69,9 +71,9 @@ def circuit_string(circuit: AbstractCircuit) -> tuple[str, list[float]]:
 
 
 def _checked(circuit: AbstractCircuit) -> dict[str, float]:
-    """Parameters by name."""
+    """Parameters by name, if the circuit is not a batch and all parameters are positive."""
     if jnp.ndim(circuit.values()) != 1:
-        raise ValueError("the circuit is a batch; give one of them, such as fits[0].circuit")
+        raise ValueError("the circuit is a batch; give one circuit, such as fits[0].circuit")
     values = dict(zip(circuit.names(), circuit.values().tolist(), strict=True))
     for key, value in values.items():
         if not 0 < value < np.inf:
