@@ -37,7 +37,7 @@ TESTS: Mapping[str, Sequence[str]] = {
     "estimators.maximum_likelihood.given_driver": ("given_driver", "maximum_likelihood"),
     "estimators.maximum_likelihood.load": ("maximum_likelihood", "own_circuits"),
     "estimators.maximum_likelihood.terms": ("maximum_likelihood",),
-    "estimators.non_parametric": ("non_parametric",),
+    "estimators.non_parametric.fit": ("non_parametric",),
     "estimators.output_error.fit": ("output_error", "identification"),
     "estimators.output_error.information": ("output_error", "identification"),
     "estimators.output_error.prediction": ("output_error", "identification"),
