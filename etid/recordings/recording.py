@@ -8,6 +8,7 @@ the size of a quantisation step stays known.
 
 import abc
 import dataclasses
+import inspect
 from collections.abc import Hashable, Iterator, Mapping
 from types import MappingProxyType
 from typing import Any, NamedTuple, SupportsFloat
@@ -178,6 +179,17 @@ class Recording(AbstractFields):
             f"<Recording {self.path!r}: {load}, {size} samples at {self.sample_rate:g} Hz, "
             f"{self.periods:.4g} periods of {self.pulse_rate:g} Hz{', ' if labels else ''}{labels}>"
         )
+
+
+def _signature() -> inspect.Signature:
+    """The signature of `Recording` with the name of each declared field."""
+    written = inspect.signature(Recording.__init__).parameters.values()
+    samples = [one for one in written if one.name not in ("self", "fields")]
+    return inspect.Signature([*samples, *inspect.signature(Metadata).parameters.values()])
+
+
+# Notebooks and editors show this one.
+setattr(Recording, "__signature__", _signature())  # noqa: B010  # pyright knows no such attribute
 
 
 def _samples(name: str, record: npt.ArrayLike | Samples) -> Samples:
