@@ -16,6 +16,11 @@ LEVELS = (1.0, 0.125, 0.5, 2.0, 8.0)  # impedance levels at which a circuit is s
 START_STEPS = 8  # of Steiglitz-McBride on harmonics, which settles in three to eight
 
 
+def has_simpler_estimate(circuit: AbstractCircuit) -> bool:
+    """Whether Steiglitz-McBride estimates this circuit, so that fits start from there as well."""
+    return isinstance(circuit, SkinRC)
+
+
 def circuit_starts(
     circuit: AbstractCircuit, baseline: AbstractCircuit | None
 ) -> Float[Array, "start element"]:
@@ -44,7 +49,7 @@ def harmonic_starts(
         z_th: Source impedance there [Ω].
         circuit: Structure and typical values.
     """
-    if not isinstance(circuit, SkinRC):
+    if not has_simpler_estimate(circuit):
         starts = circuit_starts(circuit, None)
         return LoadUnknowns(starts, jnp.zeros(starts.shape[0]))
     baseline = iteration.fit_skin(spectrum, z_th, sample_rate, START_STEPS)

@@ -45,12 +45,12 @@ def predict(
         circuit: The load; the known resistor of a calibration if not given.
 
     Returns:
-        Predicted voltage [V]; NaN at both edges, where the interpolation lacks neighbours. With a
-        constant-phase element, NaN after the last whole period.
+        Predicted voltage [V]; NaN at both edges, where the interpolation lacks neighbours. For
+        a circuit that is no ratio of polynomials in s, NaN after the last whole period.
 
     Raises:
-        ValueError: There is no circuit, the driver cannot serve, or a circuit with a constant-phase
-            element meets a record without a whole period.
+        ValueError: There is no circuit, the driver cannot serve, or a circuit that is no ratio of
+            polynomials in s meets a record without a whole period.
     """
     require_float64()
     require("recording", recording, Recording)
@@ -81,8 +81,9 @@ def _predict_periods(
     periods, samples = seen.whole_periods
     if periods == 0:
         raise ValueError(
-            f"recording {recording.path!r} holds no whole pulse period; the voltage at a "
-            f"constant-phase element, as in {type(circuit).__name__}, is predicted for whole ones"
+            f"recording {recording.path!r} holds no whole pulse period; the voltage at "
+            f"{type(circuit).__name__}, whose impedance is no ratio of polynomials in s, is "
+            "predicted for whole periods"
         )
     frequency = jnp.asarray(np.fft.rfftfreq(samples, 1 / rate)[1:])
     predicted = np.full(recording.v_out.size, np.nan)

@@ -8,11 +8,12 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from etid.circuits import circuit as circuits
+from etid.circuits.circuit import AbstractCircuit
 from etid.circuits.display import quantity
 from etid.estimators.estimate import MAX_STEPS
 from etid.estimators.estimator import Description
 from etid.estimators.registry import MAXIMUM_LIKELIHOOD, OUTPUT_ERROR, described
+from etid.estimators.starts import has_simpler_estimate
 from etid.report import citations
 from etid.report.html import Section, Table
 from etid.results.driver import ContinuousDriver
@@ -131,9 +132,9 @@ def _estimator(found: StudyFits, used: Sequence[Description]) -> str:
     return text + " ".join(parts)
 
 
-def _refined(circuit: circuits.AbstractCircuit) -> str:
+def _refined(circuit: AbstractCircuit) -> str:
     at = "around the typical elements and, for Z_th"
-    if isinstance(circuit, circuits.SkinRC):
+    if has_simpler_estimate(circuit):
         at += " and the load alike"
     return (
         "Minima were found by Levenberg-Marquardt, composed of the parts of optimistix (Rader et "

@@ -5,13 +5,13 @@ import dataclasses
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from etid.circuits.circuit import AbstractCircuit, SkinRC
+from etid.circuits.circuit import AbstractCircuit
 from etid.estimators.estimator import CHECKED, DETERMINED, AbstractEstimator, Description
 from etid.estimators.judgement import judged, misses, unless
 from etid.estimators.lanes import PaddedSamples
 from etid.estimators.output_error import fit, prediction
 from etid.estimators.refined_driver import refined_driver
-from etid.estimators.starts import circuit_starts
+from etid.estimators.starts import circuit_starts, has_simpler_estimate
 from etid.estimators.steiglitz_mcbride import iteration
 from etid.results.driver import ContinuousDriver, Driver, HarmonicDriver
 from etid.results.fits import Fit
@@ -38,7 +38,7 @@ class OutputError(AbstractEstimator):
         if not circuit.is_rational:
             raise ValueError(
                 f"method {str(self)!r} needs a ratio of polynomials in s, which "
-                f"{type(circuit).__name__}, with its constant-phase element, is not; "
+                f"the impedance of {type(circuit).__name__} is not; "
                 "use method='maximum_likelihood'"
             )
 
@@ -60,7 +60,7 @@ class OutputError(AbstractEstimator):
         del known
         m, samples = lane.measurement, jnp.asarray(lane.samples)
         simpler = None
-        if isinstance(circuit, SkinRC):
+        if has_simpler_estimate(circuit):
             z_th = Rational(driver.b, driver.a)
             discrete = iteration.skin_filter(m.v_th, m.v_out, z_th).filter
             simpler = iteration.skin_elements(discrete, m.sample_rate)
