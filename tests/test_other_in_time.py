@@ -89,7 +89,7 @@ def test_scores_say_how_far_a_residual_goes_along_a_change():
     """
     of, rng = records(), np.random.default_rng(9)
     rows = of.hold.shape[0]
-    found = jax.jit(relaxed)(of, SOURCE, SKIN.impedance(), jnp.zeros(4))
+    found = jax.jit(relaxed)(of, SOURCE, SKIN.impedance(), Nuisance.of(jnp.zeros(4)))
     h = jax.jit(lambda z: impulse_response(loaded_filter(SOURCE, z.rational(), of.sample_rate)))(
         SKIN.impedance()
     )
