@@ -1,10 +1,15 @@
 """The command line: `etid COMMAND`.
 
-Exit status: 0 done, 1 something is wrong with the data or no recording could be identified, 2 the
-command itself is wrong, 130 Ctrl-C. What is wrong is one line on stderr, never a traceback. With
-`--json` a command prints one JSON object on stdout, whether it ends with 0 or 1; its keys
-`command`, `status` and, if something is wrong with the data, `error` are the same for all. JSON has
-no infinity and no NaN: such numbers are null.
+Exit status:
+
+- 0: done.
+- 1: the data are faulty, or no recording could be identified.
+- 2: the command itself is wrong.
+- 130: Ctrl-C.
+
+An error is one line on stderr, never a traceback. With `--json` a command prints one JSON object on
+stdout, for status 0 and 1. Every object has the keys `command` and `status`, and `error` if the
+whole file is faulty. JSON has no infinity and no NaN: such a number is null.
 """
 
 import argparse
@@ -41,17 +46,17 @@ COMMANDS = {
     "report": report,
     "export": exporting,
 }
-SHELLS = ("bash", "zsh", "fish", "tcsh", "powershell")  # those that shtab writes for
+SHELLS = ("bash", "zsh", "fish", "tcsh", "powershell")  # the shells that shtab supports
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command.
 
     Args:
-        argv: Arguments; those of the process if not given.
+        argv: Arguments; default: the arguments of the process.
 
     Returns:
-        The exit status.
+        Exit status.
     """
     jax.config.update("jax_enable_x64", True)
     _keep_programs()
@@ -59,7 +64,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     arguments = commands.parse_args(argv)
     source = getattr(arguments, "source", None)
     if source is not None and _same_file(source, arguments.target):
-        commands.error(f"{arguments.target} would replace the file that is read; name another")
+        commands.error(f"{arguments.target} is the file to read; name another file to write")
     try:
         outcome = arguments.run(arguments)
     except (etid.RecordingError, etid.IdentificationError, ValueError, OSError) as error:
@@ -78,7 +83,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _after_interrupt(arguments: argparse.Namespace) -> str:
-    """What is left of a command, and how to go on: results are written whole or not at all."""
+    """Message after Ctrl-C; a result is written completely or not at all."""
     if arguments.run is fit.run:
         return fit.after_interrupt(arguments)
     target = getattr(arguments, "target", getattr(arguments, "page", None))
@@ -86,19 +91,18 @@ def _after_interrupt(arguments: argparse.Namespace) -> str:
 
 
 def parser() -> argparse.ArgumentParser:
-    """The arguments of all commands, from which their reference and completion are made."""
+    """Parser of all commands; the reference in the docs and the shell completion also use it."""
     parser = argparse.ArgumentParser(
         prog="etid",
         description="Identify circuits from electro-tactile stimulation recordings.",
-        epilog="Exit status: 0 done, 1 something is wrong with the data, 2 wrong usage, "
-        "130 interrupted.",
+        epilog="Exit status: 0 done, 1 faulty data, 2 wrong usage, 130 interrupted.",
     )
-    parser.add_argument("--version", action=_Version, help="versions, backend and precision")
+    parser.add_argument("--version", action=_Version, help="print versions, backend and precision")
     parser.add_argument(
         "--completion",
         action=_Completion,
         choices=SHELLS,
-        help="print what completes commands in this shell (etid[completion])",
+        help="print the completion script of this shell (etid[completion])",
     )
     commands = parser.add_subparsers(required=True, metavar="COMMAND", dest="command")
     for name, module in COMMANDS.items():
@@ -114,7 +118,7 @@ def parser() -> argparse.ArgumentParser:
 
 
 class _Version(argparse.Action):
-    """Print what a report of a fault should say, and end."""
+    """Print the versions for a bug report, and exit."""
 
     def __init__(self, **options: Any):
         super().__init__(nargs=0, **options)
@@ -126,7 +130,7 @@ class _Version(argparse.Action):
 
 
 class _Completion(argparse.Action):
-    """Print a shell's completion, and end."""
+    """Print the completion script of a shell, and exit."""
 
     def __call__(self, parser: argparse.ArgumentParser, _: Any, shell: Any, *__: Any) -> None:
         try:
@@ -139,31 +143,33 @@ class _Completion(argparse.Action):
 
 
 def _complete_paths(parser: argparse.ArgumentParser, how: Any) -> None:
-    """Have every argument that is a path completed as one, in subcommands too."""
+    """Declare every argument of type Path as a path for shtab, also in subcommands."""
     for action in parser._actions:
         if action.type is pathlib.Path:
-            vars(action)["complete"] = how  # where shtab looks for it
+            vars(action)["complete"] = how  # shtab reads this attribute
         elif isinstance(action, argparse._SubParsersAction):
             for command in action.choices.values():
                 _complete_paths(command, how)
 
 
 def _print(text: str) -> None:
-    """Print, if there is something; a reader that has gone, such as `head`, is no error."""
+    """Print a text unless it is empty; a closed pipe, as after `| head`, is no error."""
     try:
         if text:
             print(text, flush=True)
     except BrokenPipeError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # for what Python flushes
+        os.dup2(
+            os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno()
+        )  # Python flushes stdout at exit
 
 
 def _keep_programs() -> None:
-    """Have JAX keep what it compiles, so that only the first fit of all waits for it.
+    """Let JAX keep compiled programs on disk, so that only the first fit waits for compilation.
 
-    Where the user has named a folder (`JAX_COMPILATION_CACHE_DIR`) there, else in the one that
-    programs of this user have for such things.
+    The folder is `JAX_COMPILATION_CACHE_DIR` if the user has set it, else `etid` in the user's
+    cache folder.
     """
-    config: Any = jax.config  # its attributes come into being at run time
+    config: Any = jax.config  # JAX defines its attributes at run time
     if config.jax_compilation_cache_dir is not None:
         return
     home = os.environ.get("XDG_CACHE_HOME") or pathlib.Path.home() / ".cache"
@@ -171,7 +177,7 @@ def _keep_programs() -> None:
     try:
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
     except OSError:
-        return  # compiled anew each time
+        return  # without a folder, each process compiles again
     if os.access(folder, os.W_OK):
         jax.config.update("jax_compilation_cache_dir", str(folder))
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
@@ -182,7 +188,7 @@ def _same_file(source: pathlib.Path, target: pathlib.Path) -> bool:
 
 
 def _plain(value: Any) -> Any:
-    """What JSON can hold of a value."""
+    """A value in types that JSON has."""
     if isinstance(value, Mapping):
         return {str(key): _plain(item) for key, item in value.items()}
     if isinstance(value, list | tuple):

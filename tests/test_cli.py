@@ -87,7 +87,7 @@ def test_simulate_passes_noise_and_delay_on(run, tmp_path):
 def test_check_counts_the_recordings_of_a_good_file(run, tmp_path):
     file = tmp_path / "study.h5"
     etid.scenes.paper_dry().simulate(seed=0).write(file)
-    assert run("check", file) == (DONE, [f"{file}: 11 recordings, nothing wrong"], [])
+    assert run("check", file) == (DONE, [f"{file}: 11 recordings, no faults"], [])
 
 
 def test_check_names_every_wrong_field(run, study_file):
@@ -168,7 +168,7 @@ def test_fit_joint_fits_all_recordings_together(run, study_file, tmp_path, monke
     options = ("--joint", "--method", "output_error")
     status, _, complaints = run("fit", study_file, "-o", tmp_path / "f.h5", *options)
     assert status == WRONG_DATA
-    assert "--joint is by maximum likelihood" in complaints[0]
+    assert "--joint uses maximum_likelihood" in complaints[0]
 
 
 def test_fit_passes_method_and_order_on(run, study_file, tmp_path):
@@ -197,7 +197,10 @@ def test_fit_without_any_success_says_so_and_lists_twenty_at_most(run, tmp_path)
     [
         (("fit", "absent.h5", "-o", "fits.h5"), "absent.h5: there is no such file"),
         (("fit", "garbage.h5", "-o", "fits.h5"), "garbage.h5: is not an HDF5 file"),
-        (("fit", "study.h5", "-o", "absent/fits.h5"), "absent/fits.h5: there is no folder"),
+        (
+            ("fit", "study.h5", "-o", "absent/fits.h5"),
+            "absent/fits.h5: the folder of this file does not exist",
+        ),
         (("fit", "calibration.h5", "-o", "fits.h5"), "no loaded recording"),
         (("import", "absent.csv", "out.h5"), "absent.csv: there is no such file"),
         (("import", "table.csv", "out.h5"), "v_th: is not given"),
@@ -230,7 +233,7 @@ def test_the_file_that_is_read_is_never_replaced(run, study_file, command):
     target = ("-o", study_file) if command == "fit" else (study_file,)
     status, _, complaints = run(command, study_file, *target)
     assert status == WRONG_USAGE
-    assert "would replace the file that is read" in complaints[-1]
+    assert "is the file to read; name another file to write" in complaints[-1]
     assert study_file.read_bytes() == before
 
 

@@ -303,9 +303,9 @@ def test_a_missing_package_is_named_with_its_extra(
         (("study.h5", "-o", "t.nwb"), "session_start: is not given with a time zone"),
         (
             ("fits.h5", "-o", "t.csv", "--session-start", "2026-01-31"),
-            "--session-start is for .nwb",
+            "--session-start is only for .nwb",
         ),
-        (("fits.h5", "-o", "t.csv", "--path", "path 1"), "t.csv: --path is for .cir and .json"),
+        (("fits.h5", "-o", "t.csv", "--path", "path 1"), "t.csv: --path is only for .cir and"),
         (("fits.h5", "-o", "t.cir"), "say which recording"),
         (("short.h5", "-o", "t.csv"), "chi2: the column is missing"),
         (("absent.h5", "-o", "t.nwb", "--session-start", "2026-01-31T09:30Z"), "no such file"),

@@ -73,7 +73,7 @@ def test_ctrl_c_says_what_was_kept_and_how_to_go_on(interrupted):
         130,
         [
             f"etid: interrupted: 6 of 14 recordings are fitted and kept in {folder}/fit.h5.parts; "
-            "add --resume to the same command to go on"
+            "to continue, add --resume to the same command"
         ],
     )
     assert (folder / "fit.h5.parts" / "000000.h5").exists()

@@ -1,24 +1,25 @@
-"""The commands of `etid`, a module each.
+"""The commands of `etid`, one module per command.
 
-A command is a module with `add_arguments(parser)` and `run(arguments)`, which returns an `Outcome`
-and prints nothing on stdout; the first line of its docstring is its help.
+The module of a command has two functions, `add_arguments(parser)` and `run(arguments)`. `run`
+returns an `Outcome` and prints nothing on stdout. The first line of the module's docstring is the
+help of the command.
 """
 
 import dataclasses
 from collections.abc import Mapping
 from typing import Any
 
-DONE, WRONG_DATA = 0, 1  # argparse exits with 2 by itself
-INTERRUPTED = 130  # what shells give a command that Ctrl-C has ended: 128 + SIGINT
+DONE, WRONG_DATA = 0, 1  # argparse itself exits with 2
+INTERRUPTED = 130  # as shells report a command that Ctrl-C ended: 128 + SIGINT
 
 
 @dataclasses.dataclass(frozen=True)
 class Outcome:
-    """What a command came to.
+    """Result of a command.
 
     Attributes:
-        text: For people; nothing is printed if it is empty.
-        data: For scripts, what `--json` prints: names, numbers in SI units, lists, mappings.
+        text: Text for people; if it is empty, nothing is printed.
+        data: Data for scripts, printed with `--json`: names, numbers in SI units, lists, mappings.
         status: Exit status, `DONE` or `WRONG_DATA`.
     """
 

@@ -1,4 +1,4 @@
-"""Say what is wrong with a file, field by field."""
+"""List the faults of a file of recordings, field by field."""
 
 import argparse
 import pathlib
@@ -8,12 +8,12 @@ from etid.recordings import hdf5
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """The file."""
+    """Add the argument of the command: the file."""
     parser.add_argument("file", type=pathlib.Path)
 
 
 def run(arguments: argparse.Namespace) -> Outcome:
-    """All that is wrong."""
+    """Return all faults of the file."""
     problems = hdf5.check(arguments.file)
     places = [
         {"path": each.path, "field": each.field, "message": each.message, "remedy": each.remedy}
@@ -24,4 +24,4 @@ def run(arguments: argparse.Namespace) -> Outcome:
         return Outcome("\n".join(map(str, problems)), data, WRONG_DATA)
     with hdf5.read(arguments.file) as study:
         data["recordings"] = len(study)
-    return Outcome(f"{arguments.file}: {data['recordings']} recordings, nothing wrong", data, DONE)
+    return Outcome(f"{arguments.file}: {data['recordings']} recordings, no faults", data, DONE)

@@ -1,4 +1,4 @@
-"""The option --circuit: a circuit of etid, or one of the user's own modules."""
+"""The option --circuit: a circuit of etid, or a circuit from a module of the user."""
 
 import argparse
 import os
@@ -9,24 +9,24 @@ from etid.circuits.circuit import AbstractCircuit
 
 
 def add_circuit(parser: argparse.ArgumentParser, purpose: str) -> None:
-    """Let a command ask for a circuit.
+    """Add the option --circuit to a command.
 
     Args:
-        parser: Of the command.
-        purpose: What it needs the circuit for.
+        parser: Parser of the command.
+        purpose: Purpose of the circuit, the first words of the help.
     """
     parser.add_argument(
         "--circuit",
         type=_circuit,
         metavar="NAME",
-        help=f"{purpose}: {', '.join(lookup.built_in())}, or module:Class, whose module is "
-        "imported from the current folder or from where Python finds it",
+        help=f"{purpose}: {', '.join(lookup.built_in())}, or module:Class; the module is "
+        "imported from the current folder or from the search path of Python",
     )
 
 
 def _circuit(name: str) -> type[AbstractCircuit]:
-    """The class of that name; its module may lie in the current folder."""
-    if os.getcwd() not in sys.path:  # a command does not have it there; workers inherit it
+    """Circuit class of this name; its module may be in the current folder."""
+    if os.getcwd() not in sys.path:  # not in the path of a command; workers inherit it
         sys.path.insert(0, os.getcwd())
     try:
         return lookup.imported(name)

@@ -1,7 +1,7 @@
-"""Turn fits or recordings into files of other programs.
+"""Convert fits or recordings into files for other programs.
 
-Fits become a table (.csv, .parquet); one of them, with --path, a SPICE netlist (.cir) or a circuit
-of impedance.py (.json); recordings become .nwb.
+A file of fits becomes a table (.csv, .parquet). One fit, chosen by --path, becomes a SPICE netlist
+(.cir) or a circuit of impedance.py (.json). A file of recordings becomes .nwb.
 """
 
 import argparse
@@ -14,42 +14,44 @@ from etid.files.exporting import CIRCUITS, export_circuit, export_fits, export_s
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Files, and what NWB has to know."""
-    parser.add_argument("source", type=pathlib.Path, metavar="FILE", help="fits or recordings")
+    """Add the arguments: the files, the recording, the start of the session, and the circuit."""
+    parser.add_argument(
+        "source", type=pathlib.Path, metavar="FILE", help="file of fits or recordings"
+    )
     parser.add_argument(
         "-o",
         dest="target",
         type=pathlib.Path,
         required=True,
         metavar="FILE",
-        help="its suffix says what it becomes",
+        help="file to write; its suffix chooses the format",
     )
     parser.add_argument(
-        "--path", metavar="RECORDING", help="for .cir and .json: the recording whose fit it is"
+        "--path", metavar="RECORDING", help="for .cir and .json: path of the recording"
     )
     parser.add_argument(
         "--session-start",
         type=moment,
         metavar="TIME",
-        help="for .nwb: when the session began, such as 2026-01-31T09:30:00+01:00",
+        help="for .nwb: start of the session, such as 2026-01-31T09:30:00+01:00",
     )
-    add_circuit(parser, "for .cir and .json: the circuit of the fits, if it is not one of etid")
+    add_circuit(parser, "for .cir and .json: circuit of the fits, if it is not a circuit of etid")
 
 
 def moment(text: str) -> datetime.datetime:
-    """A date and time as ISO 8601 writes it."""
+    """Date and time from a text in the format of ISO 8601."""
     return datetime.datetime.fromisoformat(text)
 
 
 def run(arguments: argparse.Namespace) -> Outcome:
-    """Write one file."""
+    """Write the target file."""
     source, target = arguments.source, arguments.target
     suffix = target.suffix.lower()
     for name in ("path", "circuit"):
         if getattr(arguments, name) is not None and suffix not in CIRCUITS:
-            raise ValueError(f"{target}: --{name} is for {' and '.join(CIRCUITS)}")
+            raise ValueError(f"{target}: --{name} is only for {' and '.join(CIRCUITS)}")
     if arguments.session_start is not None and suffix != ".nwb":
-        raise ValueError(f"{target}: --session-start is for .nwb")
+        raise ValueError(f"{target}: --session-start is only for .nwb")
     if suffix == ".nwb":
         export_study(source, target, session_start=arguments.session_start)
     elif suffix in CIRCUITS:

@@ -1,4 +1,4 @@
-"""Identify drivers and loads of a whole file."""
+"""Identify the drivers and the loads of a file of recordings."""
 
 import argparse
 import concurrent.futures
@@ -21,57 +21,62 @@ from etid.recordings import hdf5
 from etid.report.html import Table
 from etid.results.study_fits import StudyFits
 
-_SHOWN = 20  # recordings without success that are listed one by one
+_SHOWN = 20  # most unsuccessful recordings to list
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Files, method, and where to compute."""
+    """Add the arguments: files, method, circuit, driver, and processes."""
     parser.add_argument("source", type=pathlib.Path, metavar="FILE")
     parser.add_argument("-o", dest="target", type=pathlib.Path, required=True, metavar="FITS")
     parser.add_argument(
         "--method",
         choices=registry.names(),
-        help="default maximum_likelihood where the record allows it, else output_error",
+        help="default maximum_likelihood if the record allows it, else output_error",
     )
-    add_circuit(parser, "the circuit of the loads, default SkinRC")
-    parser.add_argument("--order", type=int, default=5, help="poles of the driver, default 5")
+    add_circuit(parser, "circuit of the loads, default SkinRC")
+    parser.add_argument(
+        "--order", type=int, default=5, help="number of poles of the driver, default 5"
+    )
     parser.add_argument(
         "--driver-drift",
         type=float,
         default=0.0,
         metavar="PART",
-        help="by which Z_th may have changed since its calibration, as 0.01; default 0",
+        help="possible relative change of Z_th since its calibration, such as 0.01; default 0",
     )
     parser.add_argument(
         "--joint",
         action="store_true",
-        help="one fit for all recordings of a driver, by maximum likelihood",
+        help="fit each driver together with its recordings, by maximum likelihood",
     )
-    parser.add_argument(
-        "--resume", action="store_true", help="go on where a run that was killed has stopped"
-    )
+    parser.add_argument("--resume", action="store_true", help="continue a run that was killed")
     where = parser.add_mutually_exclusive_group()
     where.add_argument(
-        "--workers", type=int, metavar="N", help="processes of this machine, a core each"
+        "--workers",
+        type=int,
+        metavar="N",
+        help="number of processes on this machine, one core each",
     )
     where.add_argument(
-        "--dask", metavar="ADDRESS", help="scheduler of a cluster that sees the file (etid[dask])"
+        "--dask",
+        metavar="ADDRESS",
+        help="scheduler of a cluster that can read the file (etid[dask])",
     )
 
 
 def run(arguments: argparse.Namespace) -> Outcome:
-    """Identify, and write the fits."""
-    if not arguments.target.absolute().parent.is_dir():  # known before hours of fitting
-        raise ValueError(f"{arguments.target}: there is no folder to write it to")
+    """Identify the drivers and loads, and write the file of fits."""
+    if not arguments.target.absolute().parent.is_dir():  # checked before hours of fitting
+        raise ValueError(f"{arguments.target}: the folder of this file does not exist")
     if arguments.joint and arguments.method not in (None, "maximum_likelihood"):
-        raise ValueError(f"--joint is by maximum likelihood, not by {arguments.method}")
+        raise ValueError(f"--joint uses maximum_likelihood; remove --method {arguments.method}")
     if arguments.joint and arguments.driver_drift:
-        raise ValueError("--joint has no --driver-drift: it identifies the driver as it is")
+        raise ValueError("--joint identifies the driver itself; remove --driver-drift")
     circuit = None if arguments.circuit is None else arguments.circuit()
     progress = sys.stderr.isatty()
     if arguments.joint:
         if arguments.resume or arguments.workers or arguments.dask:
-            raise ValueError("--joint is one fit: it has no --resume, --workers or --dask")
+            raise ValueError("--joint is one fit per driver; remove --resume, --workers and --dask")
         with hdf5.read(arguments.source) as study:
             outcome = identify_jointly(
                 study, order=arguments.order, circuit=circuit, progress=progress
@@ -96,10 +101,10 @@ def run(arguments: argparse.Namespace) -> Outcome:
 
 
 def after_interrupt(arguments: argparse.Namespace) -> str:
-    """What was kept of a fit, and how to go on."""
+    """Message after Ctrl-C: what was kept of a fit, and how to continue."""
     left = "" if arguments.joint else kept(arguments.target)
     if left:
-        return f"{left}; add --resume to the same command to go on"
+        return f"{left}; to continue, add --resume to the same command"
     return f"{arguments.target} was not written, and nothing was kept: run the same command again"
 
 
@@ -120,7 +125,7 @@ def _executor(arguments: argparse.Namespace) -> Iterator[concurrent.futures.Exec
 
 
 def _summary(outcome: StudyFits) -> str:
-    """What a batch came to: verdicts, drivers, medians, and what went wrong where."""
+    """Text for people: verdicts, drivers, medians, and the recordings without success."""
     fits = outcome.fits
     verdicts = ", ".join(f"{count} {name}" for name, count in fits.counts().items())
     lines = [f"{len(fits)} recordings by {fits.fit.method}: {verdicts}"]
@@ -143,12 +148,14 @@ def _summary(outcome: StudyFits) -> str:
         lines += ["", f"without success: {len(wrong)} recordings"]
         lines += [" ".join(line.split()) for line in wrong[:_SHOWN]]
     if len(wrong) > _SHOWN:
-        lines.append(f"and {len(wrong) - _SHOWN} more; the file of fits has a note for each fit")
+        lines.append(
+            f"and {len(wrong) - _SHOWN} more; the file of fits contains a note for each fit"
+        )
     return "\n".join(lines)
 
 
 def _data(outcome: StudyFits) -> dict[str, Any]:
-    """The same for scripts; the numbers of single recordings are in the file of fits."""
+    """Data for scripts; the numbers of single recordings are only in the file of fits."""
     fits = outcome.fits
     drivers = [
         {
@@ -182,7 +189,7 @@ def _medians(outcome: StudyFits) -> Table:
     rows = []
     for group in outcome.fits.summary("subject", "condition"):
         if not (group["subject"] or group["condition"] or group["successful"]):
-            continue  # what could not be read has no labels
+            continue  # recordings that could not be read have no labels
         row = [group["subject"], group["condition"], f"{group['successful']}/{group['fits']}"]
         for name, unit in units.items():
             numbers = (
@@ -195,6 +202,6 @@ def _medians(outcome: StudyFits) -> Table:
 
 
 def _cell(value: float, spread: float, error: float) -> str:
-    """Three numbers in one unit, to two digits of the standard error."""
+    """Three numbers in one unit, rounded to two significant digits of the standard error."""
     digits = max(0, 1 - math.floor(math.log10(error))) if 0 < error < math.inf else 3
     return f"{value:.{digits}f} ({spread:.{digits}f}; {error:.{digits}f})"

@@ -1,4 +1,4 @@
-"""Turn a file of a lab (.csv, .mat, .tdms, .abf, .npz) into an etid file."""
+"""Convert a laboratory file (.csv, .mat, .tdms, .abf, .npz) into an etid file."""
 
 import argparse
 import dataclasses
@@ -11,20 +11,21 @@ from etid.recordings.fields import DECLARED, SIGNALS
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Files, and which channel is what."""
+    """Add the arguments: the files, the mapping, the channels, and the fields."""
     parser.add_argument("source", type=pathlib.Path)
     parser.add_argument("target", type=pathlib.Path)
     parser.add_argument(
         "--mapping",
         type=pathlib.Path,
         metavar="FILE",
-        help="TOML file that says all of this, for several recordings (data_schema/README.md)",
+        help="TOML file in place of the options below, also for several recordings "
+        "(data_schema/README.md)",
     )
-    channel = "channel of {}, in {} unless the file names its unit".format
+    channel = "channel of {}; its unit is {} unless the file names another".format
     for name, signal in SIGNALS.items():
         _option(parser, name, help=channel(name, signal.unit))
-    _option(parser, "time", help=f"{channel('the time', 'seconds')}, instead of --sample-rate")
-    _option(parser, "scale", float, "volts at the terminal are the value divided by this")
+    _option(parser, "time", help=f"{channel('the time', 'second')}; replaces --sample-rate")
+    _option(parser, "scale", float, "divisor of the voltages: volt at the terminal = value / scale")
     for name, field in DECLARED.items():
         if field.type in ("number", "label"):
             unit = f" [{field.unit}]" if field.unit else ""
@@ -40,7 +41,7 @@ def _option(
 
 
 def run(arguments: argparse.Namespace) -> Outcome:
-    """Import one file, and say what was used for what."""
+    """Import one file, and return which channel became which signal."""
     given = {name: value for name, value in vars(arguments).items() if name in (*CHANNELS, *FIELDS)}
     used = import_file(arguments.source, arguments.target, arguments.mapping, **given)
     data = {

@@ -1,4 +1,4 @@
-"""Write a report on a file of fits: one HTML page."""
+"""Write a report about a file of fits: one HTML page."""
 
 import argparse
 import pathlib
@@ -9,22 +9,26 @@ from etid.report.study import write_report
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """The fits, the page, and where the recordings are."""
+    """Add the arguments: the fits, the page, the recordings, and the circuit."""
     parser.add_argument("fits", type=pathlib.Path, metavar="FITS")
     parser.add_argument(
-        "-o", dest="page", type=pathlib.Path, metavar="PAGE", help="default: FITS with .html"
+        "-o",
+        dest="page",
+        type=pathlib.Path,
+        metavar="PAGE",
+        help="page to write; default: FITS with the suffix .html",
     )
     parser.add_argument(
         "--recordings",
         type=pathlib.Path,
         metavar="FILE",
-        help="what was identified, to draw the worst; default: where the fits came from",
+        help="recordings, for figures of the worst fits; default: the file that was fitted",
     )
-    add_circuit(parser, "the circuit of the fits, if it is not one of etid")
+    add_circuit(parser, "circuit of the fits, if it is not a circuit of etid")
 
 
 def run(arguments: argparse.Namespace) -> Outcome:
-    """Write the page and say where it is."""
+    """Write the page and return its path."""
     page = arguments.page or arguments.fits.with_suffix(".html")
     write_report(arguments.fits, page, recordings=arguments.recordings, circuit=arguments.circuit)
     return Outcome(str(page), {"fits": arguments.fits, "page": page})

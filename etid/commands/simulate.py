@@ -1,4 +1,4 @@
-"""Make synthetic recordings."""
+"""Simulate recordings of an experiment."""
 
 import argparse
 import json
@@ -9,21 +9,33 @@ from etid.simulation import scenes
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Experiment, noise, seed and files."""
-    parser.add_argument("preset", choices=list(scenes.PRESETS), help="experiment")
+    """Add the arguments: experiment, noise, jitter, seed, and files."""
+    parser.add_argument("preset", choices=list(scenes.PRESETS), help="experiment to simulate")
     parser.add_argument("-o", dest="target", type=pathlib.Path, required=True, metavar="FILE")
-    parser.add_argument("--snr-db", type=float, default=60.0, help="default 60; inf for no noise")
     parser.add_argument(
-        "--jitter", type=float, default=0.0, metavar="SECONDS", help="rms trigger delay, default 0"
+        "--snr-db",
+        type=float,
+        default=60.0,
+        help="signal-to-noise ratio [dB], default 60; inf: no noise",
+    )
+    parser.add_argument(
+        "--jitter",
+        type=float,
+        default=0.0,
+        metavar="SECONDS",
+        help="rms of the trigger delay, default 0",
     )
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument(
-        "--truth", type=pathlib.Path, metavar="FILE", help="write the true elements as JSON, SI"
+        "--truth",
+        type=pathlib.Path,
+        metavar="FILE",
+        help="also write the true elements, as JSON in SI units",
     )
 
 
 def run(arguments: argparse.Namespace) -> Outcome:
-    """Write the study, and the truth where it is wanted."""
+    """Write the recordings, and the true elements if --truth is given."""
     scene = scenes.PRESETS[arguments.preset](
         snr_db=arguments.snr_db, trigger_jitter_rms=arguments.jitter
     )

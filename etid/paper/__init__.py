@@ -1,1 +1,1 @@
-"""The paper's experiments: its published tables, and the demonstration that repeats them."""
+"""The paper's experiments: the statistics of its tables, and a demo that repeats the paper."""

@@ -1,11 +1,12 @@
-"""The paper's experiments, simulated, identified by both methods, and set beside the paper.
+"""The paper's experiments: simulated, identified by two methods, and compared with the paper.
 
     python -m etid.paper.demo FOLDER
 
-Two laboratories make the same 149 recordings. `quiet` has 60 dB and one clock. `noisy` has 40 dB of
-white noise and 200 ns (rms) of trigger delay: with these the paper's own method makes errors of the
-published size on the built circuit. The paper does not say what its noise was; its RRSE of 4 to
-13 % would be 30 dB of white noise, but that alone costs Steiglitz-McBride 90 % of R_s.
+Two laboratories make the same 149 recordings. `quiet` has a signal-to-noise ratio (SNR) of 60 dB
+and no trigger delay. `noisy` has white noise with an SNR of 40 dB and a trigger delay of 200 ns
+(rms). With these values the paper's method has errors of the published size on the built circuit.
+The paper does not describe its noise. Its RRSE of 4 to 13 % would correspond to white noise with an
+SNR of 30 dB, but this noise alone gives Steiglitz-McBride an error of 90 % in R_s.
 """
 
 import argparse
@@ -40,11 +41,11 @@ from etid.simulation.published import FINGERTIPS, RRSE, TABLE_1, TABLE_4
 
 _SEED = 0
 _READING = (
-    "Rows and columns named paper are what the paper measured; all other numbers come from "
-    "simulated recordings, whose elements are known. Quiet records have 60 dB and no trigger "
-    "delay; noisy ones 40 dB and 200 ns, at which the paper's method errs about as much as the "
-    "paper says. Every estimate enters the tables, whatever its verdict; `successful` counts the "
-    "good ones."
+    "Rows and columns named paper are measurements of the paper. All other numbers come from "
+    "simulated recordings, whose true elements are known. Quiet records have a signal-to-noise "
+    "ratio of 60 dB and no trigger delay. Noisy records have 40 dB and 200 ns; the errors of the "
+    "paper's method then have about the published size. The tables include every estimate, "
+    "whatever its verdict; `successful` counts the successful fits."
 )
 
 
@@ -53,7 +54,7 @@ def _successes(fits: etid.Fits) -> str:
 
 
 def table_1(outcomes: Sequence[Outcome]) -> Table:
-    """Errors of the five test resistors [%]."""
+    """Table I: errors of the five test resistors [%]."""
     heads = tuple(f"{name} {outcome.method}" for outcome in outcomes for name in outcome.names[:1])
     found = [resistor_errors(outcome) for outcome in outcomes]
     rows = tuple(
@@ -64,7 +65,7 @@ def table_1(outcomes: Sequence[Outcome]) -> Table:
 
 
 def table_fingertips(outcomes: Sequence[Outcome], truth: Truth, condition: str) -> Table:
-    """A typical fingertip and ten subjects, identified and true: Table II (dry), III (damp)."""
+    """Table II (dry) or III (damp): elements and errors of a typical fingertip and ten subjects."""
     rows = []
     units = etid.SkinRC.units()
     for name in ORDER:
@@ -107,7 +108,7 @@ def table_fingertips(outcomes: Sequence[Outcome], truth: Truth, condition: str) 
 
 
 def table_4(outcomes: Sequence[Outcome], truth: Truth) -> Table:
-    """The built circuit: error of the mean and scatter of 23 trials [%]."""
+    """Table IV, the built circuit: mean error and scatter of 23 trials [%]."""
     paper = (f"{error:g} / {scatter:g}" for error, scatter in (TABLE_4[name] for name in ORDER))
     rows = [("paper", "", *paper, "{} to {}".format(*RRSE), "")]
     for outcome in outcomes:
@@ -124,7 +125,7 @@ def table_4(outcomes: Sequence[Outcome], truth: Truth) -> Table:
 
 
 def table_verdicts(outcomes: Sequence[Outcome], truth: Truth) -> Table:
-    """How the identifications ended, and whether the successful ones are as good as they say."""
+    """Verdicts, and the percentage of successful fits whose error is within two standard errors."""
     rows = []
     for outcome in outcomes:
         verdicts = ", ".join(f"{count} {name}" for name, count in outcome.skins.counts().items())
@@ -141,7 +142,11 @@ def table_verdicts(outcomes: Sequence[Outcome], truth: Truth) -> Table:
 
 
 def figures(folder: pathlib.Path, study: etid.Study, outcome: Outcome) -> tuple[Picture, ...]:
-    """The paper's figures 7 to 9 and the elements of all subjects, as PNG and SVG."""
+    """Write the paper's figures 7 to 9 and the elements of all subjects, as PNG and SVG.
+
+    Returns:
+        The figures as SVG, with captions, for the page.
+    """
     folder.mkdir(exist_ok=True)
     driver, calibration = outcome.driver, study[CALIBRATION]
     skins = {
@@ -183,13 +188,13 @@ def main(argv: Sequence[str] | None = None) -> None:
     """Simulate, identify, print the tables, and write files, figures and a page.
 
     Args:
-        argv: Arguments; those of the process if not given.
+        argv: Arguments; default: the arguments of the process.
     """
     parser = argparse.ArgumentParser(
         prog="python -m etid.paper.demo",
         description="Simulate and identify the paper's experiments.",
     )
-    parser.add_argument("folder", type=pathlib.Path, help="where to write everything")
+    parser.add_argument("folder", type=pathlib.Path, help="folder for all files")
     folder = parser.parse_args(argv).folder
     jax.config.update("jax_enable_x64", True)
 
@@ -224,8 +229,9 @@ def main(argv: Sequence[str] | None = None) -> None:
             Section(
                 f"Table {number}: {condition} fingertips",
                 "One typical fingertip: median of ten trials, its error, and the spread between "
-                "trials. Ten subjects: range of their medians over five trials, median and largest "
-                "absolute error.",
+                "the trials. Ten subjects: a median over five trials for each subject; the table "
+                "has the range of these medians, and the median and the maximum of their absolute "
+                "errors.",
                 (table_fingertips(outcomes, truth, condition),),
             )
             for number, condition in (("II", "dry"), ("III", "damp"))
@@ -237,9 +243,9 @@ def main(argv: Sequence[str] | None = None) -> None:
         ),
         Section(
             "Verdicts",
-            "The last columns: how often the truth lies within two standard errors (se) of a "
-            "successful fit. All fits of a study share the error of its driver, so they are right "
-            "or wrong together.",
+            "The last three columns: percentage of the successful fits whose error is at most two "
+            "standard errors (se). All fits of a study share the error of the driver, so their "
+            "errors are correlated.",
             (table_verdicts(outcomes, truth),),
         ),
     ]

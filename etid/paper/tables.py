@@ -1,6 +1,6 @@
-"""The paper's experiments: the statistics that it prints, of identified studies.
+"""Statistics of the paper's tables, computed from identified studies.
 
-A study is made by a preset of `etid.scenes`, or has its paths and labels.
+A preset of `etid.scenes` makes the study. Another study must have the same paths and labels.
 """
 
 import dataclasses
@@ -19,16 +19,16 @@ from etid.simulation.published import TABLE_1
 from etid.simulation.scenes import resistor_label
 
 CALIBRATION = "calibration/98k8"
-# `noisy` is where the paper's method makes errors of the size that the paper prints in Table IV.
+# With `noisy`, the errors of the paper's method are about as large as in the paper's Table IV.
 LABORATORIES: Mapping[str, Mapping[str, float]] = {
     "quiet": {"snr_db": 60.0},
     "noisy": {"snr_db": 40.0, "trigger_jitter_rms": 200e-9},
 }
-METHODS: tuple[str, ...] = ("maximum_likelihood", "steiglitz_mcbride")  # ours, the paper's
-ORDER = ("r_p", "c_p", "r_s")  # as the paper's tables have them
+METHODS: tuple[str, ...] = ("maximum_likelihood", "steiglitz_mcbride")  # of etid, of the paper
+ORDER = ("r_p", "c_p", "r_s")  # as in the paper's tables
 
 Truth = Mapping[str, Mapping[str, float]]
-"""Elements by path, as `etid.scenes.Scene.truth` has them."""
+"""True elements of each recording by its path, from `etid.scenes.Scene.truth`."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -36,12 +36,12 @@ class Outcome:
     """One study identified by one method.
 
     Attributes:
-        laboratory: Who made the study.
+        laboratory: Name of the laboratory, a key of `LABORATORIES`.
         method: Name of the estimator.
-        driver: The driver.
-        skins: Everything but the test resistors.
-        resistors: The test resistors, as one resistor by maximum likelihood. Steiglitz-McBride
-            identifies eq. 7 only; the resistance is then Z(0) = R_s + R_p.
+        driver: Identified driver.
+        skins: Fits of all loads except the test resistors.
+        resistors: Fits of the test resistors. Maximum likelihood fits one resistor.
+            Steiglitz-McBride fits eq. 7; the resistance is then Z(0) = R_s + R_p.
     """
 
     laboratory: str
@@ -52,18 +52,18 @@ class Outcome:
 
     @property
     def names(self) -> tuple[str, str]:
-        """First two cells of its rows."""
+        """First two cells of a row: laboratory and method."""
         return self.laboratory, self.method
 
 
 def identify(laboratory: str, study: Study, method: str, *, progress: bool = False) -> Outcome:
-    """Identify the driver, the test resistors as resistors, everything else as skin.
+    """Driver, test resistors and skins of a study, identified by one method.
 
     Args:
-        laboratory: Who made the study.
-        study: Its recordings.
-        method: The estimator.
-        progress: Show how many skins are done.
+        laboratory: Name of the laboratory.
+        study: Recordings of the laboratory.
+        method: Name of the estimator.
+        progress: Whether to show the number of fitted skins.
     """
     driver = identify_driver(study[CALIBRATION], method=method, throw=False)
     resistors = study.where(condition="resistors")
@@ -79,7 +79,7 @@ def identify(laboratory: str, study: Study, method: str, *, progress: bool = Fal
 
 
 def errors(fits: Fits, truth: Truth) -> dict[str, Float[np.ndarray, " fit"]]:
-    """Errors of the elements of each fit [%], NaN where there is no circuit."""
+    """Errors of the elements of each fit [%]; NaN if the fit has no circuit."""
     known = [truth[str(path)] for path in fits.labels["path"]]
     return {
         name: 100 * (np.asarray(getattr(fits.circuit, name)) / [of[name] for of in known] - 1)
@@ -88,7 +88,7 @@ def errors(fits: Fits, truth: Truth) -> dict[str, Float[np.ndarray, " fit"]]:
 
 
 def resistor_errors(outcome: Outcome) -> dict[float, float]:
-    """Error of each test resistor [%] by its resistance (Table I)."""
+    """Error of each test resistor [%], by its true resistance [Ω] (Table I)."""
     found = {}
     for r in TABLE_1:
         circuit = outcome.resistors.where(path=f"resistors/{resistor_label(r)}").circuit
@@ -99,16 +99,16 @@ def resistor_errors(outcome: Outcome) -> dict[float, float]:
 
 @dataclasses.dataclass(frozen=True)
 class Fingertips:
-    """One element of fingertips in one state (a row of Table II or III).
+    """Statistics of one element of dry or damp fingertips (a row of Table II or III).
 
     Attributes:
         typical: Median of the trials of the typical fingertip [SI].
-        error: Median error of these [%].
-        spread: Standard deviation between them [%].
-        lowest: Smallest of the medians of the subjects [SI].
-        highest: Largest of these [SI].
+        error: Median of the errors of these trials [%].
+        spread: Standard deviation of the errors of these trials [%].
+        lowest: Smallest of the subjects' medians [SI].
+        highest: Largest of the subjects' medians [SI].
         subject_error: Median of the absolute errors of the subjects' medians [%].
-        worst: Largest of these [%].
+        worst: Largest of the absolute errors of the subjects' medians [%].
     """
 
     typical: float
@@ -121,12 +121,12 @@ class Fingertips:
 
 
 def fingertips(fits: Fits, truth: Truth, name: str) -> Fingertips:
-    """Statistics of one element; a fit without a circuit makes them NaN.
+    """Statistics of one element; NaN if a fit has no circuit.
 
     Args:
-        fits: The skins of one condition, the typical fingertip and the subjects.
-        truth: Elements by path.
-        name: The element.
+        fits: Fits of one condition: of the typical fingertip and of the subjects.
+        truth: True elements by path.
+        name: Name of the element.
     """
     typical = fits.where(subject="typical")
     values, error = np.asarray(getattr(typical.circuit, name)), errors(typical, truth)[name]
