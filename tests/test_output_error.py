@@ -142,8 +142,10 @@ def fitted():
 
     def of(scale):
         lane = PaddedSamples.of(Inspected(study["a"]))
-        sigmas = {"sigma_th": scale * lane.sigma_th, "sigma_out": scale * lane.sigma_out}
-        lane = jax.tree.map(jnp.asarray, dataclasses.replace(lane, **sigmas))
+        told = jax.tree.map(jnp.asarray, lane)
+        lane = dataclasses.replace(
+            told, sigma_th=scale * told.sigma_th, sigma_out=scale * told.sigma_out
+        )
         return skin(lane, driver, None, etid.SkinRC(), OUTPUT_ERROR)
 
     return of
