@@ -153,7 +153,7 @@ def test_a_single_fit_needs_no_path(fits, tmp_path):
 @pytest.mark.parametrize(
     ("path", "words"),
     [
-        ("path 4", "the fit of 'path 4' is flat, no circuit to work with. is \"flat\", to a"),
+        ("path 4", 'is flat, not successful; its circuit is not exported. is "flat", to a'),
         ("path 99", "there is no fit of 'path 99'; the fits are of 'path 0', 'path 1', "),
         (None, "say which recording; the fits are of 'path 0', "),
     ],

@@ -147,7 +147,7 @@ def test_data_that_were_scaled_before_they_were_written_are_not_scaled_again(tmp
 
 def test_a_temperature_is_no_voltage(tmp_path):
     own = {**LINE, "NI_Scale[0]_Scale_Type": "Thermocouple"}
-    refused(rig(tmp_path, v_out=CODES, **own), pair(), r"v_out: 'rig/skin' is scaled by Thermocoup")
+    refused(rig(tmp_path, v_out=CODES, **own), pair(), r"'rig/skin' has the scaling Thermocoup")
 
 
 def test_a_name_that_two_channels_have_is_not_chosen_from(tmp_path):
@@ -176,7 +176,7 @@ def test_text_and_empty_channels_cannot_be_records(tmp_path):
 def test_a_tdms_file_that_was_cut_off_is_refused_wherever_it_was(cut, tmp_path):
     path = rig(tmp_path)
     path.write_bytes(path.read_bytes()[:-cut])
-    refused(path, pair(), "is cut off: the last segment ends at byte")
+    refused(path, pair(), "is truncated: the last segment ends at byte")
 
 
 # MATLAB

@@ -1,4 +1,4 @@
 """Files of other programs: import by a mapping, export, and one reader for each format.
 
-etid's own files belong to `etid.recordings` and `etid.results`.
+Code for etid's own files belongs to `etid.recordings` and `etid.results`.
 """

@@ -1,7 +1,7 @@
-"""Channels of a file become recordings: units, scales and trials, each said by someone.
+"""Recordings from the channels of a file: units, scales and trials come from file or mapping.
 
-Nothing is guessed.  What neither the file nor the mapping says is an error, and so is what they say
-differently.
+Nothing is guessed. It is an error if a fact is missing in both the file and the mapping. It is also
+an error if the file and the mapping disagree.
 """
 
 import dataclasses
@@ -18,21 +18,21 @@ from etid.recordings import limits
 from etid.recordings.fields import SIGNALS, Metadata, metadata_from
 from etid.recordings.recording import AbstractSource, Layout, Recording, RecordingError, Samples
 
-# A matrix with more trials than samples, each a small part of a pulse period, lies on its side.
+# [pulse periods] A matrix with more trials than samples and with shorter trials must be transposed.
 _SHORTEST_STACKED = 0.1
 
-_KINDS = ("loaded", "calibration")  # paths of what has no path of its own
+_KINDS = ("loaded", "calibration")  # default paths of recordings without a path
 
 
 @dataclasses.dataclass(frozen=True)
 class Used:
-    """Which channel became a signal, and how its values were understood.
+    """The channel that became a signal, and the meaning of its values.
 
     Attributes:
-        channel: Its name in the file.
-        unit: Of its values.
-        unit_by: Who says so: `file`, `mapping`, both, or the `command`.
-        scale: What the values were divided by.
+        channel: Name of the channel in the file.
+        unit: Unit of the channel's values.
+        unit_by: Source of the unit: `file`, `mapping`, both, or the `command`.
+        scale: Divisor of the values.
     """
 
     channel: str
@@ -47,15 +47,15 @@ class Used:
 
 @dataclasses.dataclass(frozen=True)
 class Imported:
-    """What one recording, or a stack of trials, was made of.
+    """The sources of one imported recording, or of a stack of trials.
 
     Attributes:
         paths: HDF5 paths of the recordings.
-        samples: How many each has.
+        samples: Number of samples of each recording.
         sample_rate: Samples per second [Hz].
-        rate_by: Who says so: `file`, `mapping`, both, or the `time` channel.
+        rate_by: Source of the sample rate: `file`, `mapping`, both, or the `time` channel.
         pulse_rate: Pulses per second [Hz].
-        signals: The channel of each signal.
+        signals: Channel of each signal.
     """
 
     paths: tuple[str, ...]
@@ -76,7 +76,7 @@ class Imported:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class _Record:
-    """One trial of a channel, in SI units."""
+    """One trial of a channel, with the conversion of its stored samples to SI units."""
 
     channel: Channel
     trial: int
@@ -130,16 +130,16 @@ class _Source(AbstractSource):
 def sources_of(
     plan: Plan, channel: Callable[[str], Channel], file: str, by: str
 ) -> tuple[dict[str, AbstractSource], Imported]:
-    """The recordings of a plan, by path, and what they are made of.
+    """The recordings of a plan by path, and a summary of their sources.
 
     Args:
-        plan: What the mapping says.
-        channel: The channel of a name.
-        file: The file, for errors.
-        by: Who says what the plan says.
+        plan: Plan of one recording or one stack of trials, from a mapping.
+        channel: Function that returns the channel of a name.
+        file: Path of the file, for errors.
+        by: Source of the plan, for errors: `mapping` or `command`.
 
     Raises:
-        RecordingError: File and plan do not give recordings.
+        RecordingError: The file and the plan do not describe valid recordings.
     """
     channels: dict[str, Channel] = {}
     units: dict[str, tuple[Unit, str]] = {}
@@ -150,10 +150,10 @@ def sources_of(
     for name, own in channels.items():
         if own.length > limits.SAMPLES or (len(own.shape) == 2 and own.shape[0] > limits.TRIALS):
             raise RecordingError(
-                f"channel {own.name!r} has shape {own.shape}, at most {limits.TRIALS} trials of "
-                f"{limits.SAMPLES} samples are read",
+                f"channel {own.name!r} has shape {own.shape}; etid reads at most {limits.TRIALS} "
+                f"trials of {limits.SAMPLES} samples",
                 field=name,
-                remedy="Split it",
+                remedy="Split the channel",
             )
     rows = _rows(plan.signals, channels)
     length = channels["v_out"].length
@@ -167,7 +167,7 @@ def sources_of(
             f"{plan.signals['v_out'].channel!r} would be {len(trials)} trials of {length} samples, "
             f"{periods:.2g} pulse periods each",
             field="v_out",
-            remedy="Rows are trials and columns are time: transpose the variables",
+            remedy="Rows are trials, columns are times: transpose the variables",
         )
     labels = _labels(plan.fields.get("trial"), trials, stacked)
     sources: dict[str, AbstractSource] = {}
@@ -195,7 +195,7 @@ def sources_of(
 
 
 def _unit(name: str, signal: Signal, said: str) -> tuple[Unit, str]:
-    """The unit of a signal, which its meaning allows."""
+    """Unit of a signal and its source; an error if the signal cannot have this unit."""
     unit, by = unit_of(name, signal, said)
     wanted = {"time": "second", "current": "ampere"}.get(name, "volt")
     over_a_shunt = name == "current" and unit.si == "volt" and signal.scale is not None
@@ -203,7 +203,7 @@ def _unit(name: str, signal: Signal, said: str) -> tuple[Unit, str]:
         raise RecordingError(
             f"channel {signal.channel!r} is in {unit.si} ({by}), must be in {wanted}",
             field=f"{name}.unit",
-            remedy="Give the current that a voltage stands for a scale, in volts per ampere"
+            remedy="Add a scale in volts per ampere, if this voltage represents the current"
             if name == "current" and unit.si == "volt"
             else "Name another channel",
         )
@@ -211,7 +211,7 @@ def _unit(name: str, signal: Signal, said: str) -> tuple[Unit, str]:
 
 
 def _rows(signals: Mapping[str, Signal], channels: Mapping[str, Channel]) -> dict[str, list[int]]:
-    """The trials of each signal: those of `v_out`, or a single one of `v_th` for all of them."""
+    """Rows of each signal, one per trial of `v_out`; `v_th` may have one row for all trials."""
     found: dict[str, list[int]] = {}
     for name in SIGNALS:
         if name not in channels:
@@ -221,7 +221,8 @@ def _rows(signals: Mapping[str, Signal], channels: Mapping[str, Channel]) -> dic
         every = tuple(range(count)) if rows is None else (rows,) if isinstance(rows, int) else rows
         if max(every) >= count:
             raise RecordingError(
-                f"names row {max(every)}, channel {signals[name].channel!r} has {count}, from 0 on",
+                f"row {max(every)} does not exist: channel {signals[name].channel!r} has {count} "
+                "rows, counted from 0",
                 field=f"{name}.rows",
             )
         found[name] = list(every)
@@ -241,8 +242,8 @@ def _rows(signals: Mapping[str, Signal], channels: Mapping[str, Channel]) -> dic
         )
         raise RecordingError(
             f"shapes do not fit each other: {shapes}",
-            remedy="They must be (time,) or (trial, time); only v_th may be (time,), or one row, "
-            "beside a stacked v_out",
+            remedy="All shapes must be (time,) or (trial, time); only v_th may be (time,), or one "
+            "row, if v_out is a stack",
         )
     return found
 

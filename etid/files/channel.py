@@ -1,4 +1,4 @@
-"""What a file of another format holds: named channels, none of them read yet."""
+"""Named channels of a file of another format; their samples are read later."""
 
 import csv
 import dataclasses
@@ -15,10 +15,10 @@ from etid.recordings import errors
 from etid.recordings.recording import RecordingError
 from etid.recordings.untrusted import LIBRARY_ERRORS
 
-BLOCK = 1 << 20  # samples that are in memory at once, 8 MB of real numbers
-LISTED = 30  # names in an error
+BLOCK = 1 << 20  # [samples] size of a block in memory, 8 MB of real numbers
+LISTED = 30  # most names in an error message
 
-# What readers raise, depending on where in a damaged file they give up.
+# Errors that readers of damaged files raise; the kind depends on the place of the damage.
 _READ_ERRORS = (
     *LIBRARY_ERRORS,
     ArithmeticError,
@@ -41,12 +41,12 @@ class Channel:
     value [unit] = conversion · stored + offset
 
     Attributes:
-        name: Its name in the file.
-        shape: `(time,)` or `(trial, time)`; whatever else it has, no recording can be made of it.
-        dtype: Of the stored samples.
-        read: The stored samples of a trial, from one index up to another.
-        unit: As the file spells it; empty where it names none.
-        sample_rate: Samples per second [Hz]; None where the file does not say.
+        name: Name of the channel in the file.
+        shape: `(time,)` or `(trial, time)`; a channel of another shape cannot become a recording.
+        dtype: Type of the stored samples.
+        read: Function of trial, start and stop; it returns the stored samples.
+        unit: Unit in the spelling of the file; empty if the file does not name it.
+        sample_rate: Samples per second [Hz]; None if the file does not contain it.
         conversion: Units per stored unit.
         offset: Value of a stored zero, in the unit.
     """
@@ -62,14 +62,14 @@ class Channel:
 
     @property
     def length(self) -> int:
-        """Samples of a trial."""
+        """Number of samples of a trial."""
         return self.shape[-1]
 
     def blocks(self, trial: int = 0) -> Iterator[np.ndarray]:
-        """The stored samples of a trial, `BLOCK` at a time.
+        """The stored samples of a trial, in blocks of `BLOCK` samples.
 
         Raises:
-            RecordingError: The file ends before them.
+            RecordingError: The file ends before the last sample.
         """
         for start in range(0, self.length, BLOCK):
             stop = min(start + BLOCK, self.length)
@@ -88,12 +88,12 @@ def _nothing(names: Iterable[str]) -> None:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Contents:
-    """A file of another format, open.
+    """An open file of another format.
 
     Attributes:
-        names: Its channels, in order.
-        channel: The channel of a name.
-        prepare: To be told once, before, which channels will be asked for.
+        names: Names of the channels, in their order in the file.
+        channel: Function that returns the channel of a name.
+        prepare: Function to call once with the names of all channels that will be read.
     """
 
     names: tuple[str, ...]
@@ -102,20 +102,20 @@ class Contents:
 
 
 def listed(names: Iterable[str]) -> str:
-    """Names for an error."""
+    """Text of names for an error message."""
     every = list(names)
     more = f" and {len(every) - LISTED} more" if len(every) > LISTED else ""
     return (", ".join(map(repr, every[:LISTED])) or "none") + more
 
 
 def chosen(names: Iterable[str], name: str, field: str) -> None:
-    """Refuse a name that is not there, or there twice."""
+    """Raise an error if a name is missing or occurs twice."""
     every = list(names)
     if name not in every:
         raise RecordingError(
             f"there is no {name!r}; the names are {listed(every)}",
             field=field,
-            remedy="Name one of them",
+            remedy="Use one of these names",
         )
     if every.count(name) > 1:
         raise RecordingError(
@@ -124,7 +124,7 @@ def chosen(names: Iterable[str], name: str, field: str) -> None:
 
 
 def real(name: str, dtype: np.dtype, shape: tuple[int, ...]) -> None:
-    """Refuse what is no array of real numbers."""
+    """Raise an error if an array is empty or does not hold real numbers."""
     if dtype.kind not in "iuf" or dtype.itemsize > 8:
         raise RecordingError(
             f"{name!r} is a {dtype} array, must be an array of real numbers of at most 64 bits"
@@ -134,17 +134,17 @@ def real(name: str, dtype: np.dtype, shape: tuple[int, ...]) -> None:
 
 
 def rate_of(interval: float, precision: float) -> float:
-    """Samples per second, a whole number where an interval [s] of this precision may mean one."""
+    """Sample rate [Hz] from an interval [s]; a whole number if the precision allows it."""
     rate = 1 / interval
     return float(round(rate)) if abs(rate - round(rate)) <= precision * rate else rate
 
 
-# The block that reads from a file of another format, `with located(file, path, field)`.
+# For a block that reads a file of another format: its errors become a RecordingError of this place.
 located = functools.partial(errors.located, foreign=_READ_ERRORS)
 
 
 def needs(package: str, extra: str, file: str) -> RecordingError:
-    """The error of a file whose reader is not installed."""
+    """Error of a file that needs a package that is not installed."""
     return RecordingError(
         f"needs the package {package}", file=file, remedy=f"Run pip install 'etid[{extra}]'"
     )

@@ -1,4 +1,4 @@
-"""The sample rate of a recording: from the file, from a mapping, or from time stamps."""
+"""Sample rate of a recording: from the file, from a mapping, or from time stamps."""
 
 from collections.abc import Iterator, Mapping
 
@@ -11,30 +11,31 @@ from etid.recordings.fields import Metadata
 from etid.recordings.recording import RecordingError
 from etid.signals.pulse_train import find_pulses
 
-# Largest distance of a time stamp from a uniform grid, in sample periods: more than the rounding of
-# a printed time, less than a lost or doubled sample (1).
+# Largest distance of a time stamp from a uniform grid, in sample periods. The rounding of a printed
+# time must pass; a missing or repeated sample (a distance of 1) must not pass.
 _TIME_TOLERANCE = 0.25
 
-# A crystal is at most this far off: a measured rate may differ so much from the nominal one.
+# Largest relative error of a quartz clock, so of a measured rate relative to the nominal rate.
 _CLOCK_TOLERANCE = 1e-4
 
-# The channels of one clock have one rate, but for the last digits of its reciprocal.
+# Channels of one clock have equal rates, except for rounding errors of the reciprocal.
 _ROUNDING = 1e-9
 
 
 def sample_rate(
     plan: Plan, channels: Mapping[str, Channel], units: Mapping[str, tuple[Unit, str]], by: str
 ) -> tuple[float, str]:
-    """The sample rate [Hz] of a recording, and who says it.
+    """Sample rate [Hz] of a recording, and the source of this rate.
 
     Args:
-        plan: What the mapping says.
-        channels: The channel of each signal.
-        units: Their units, and who says them.
-        by: Who says what the plan says.
+        plan: Plan of the recording, from a mapping.
+        channels: Channel of each signal.
+        units: Unit of each signal, and its source.
+        by: Source of the plan: `mapping` or `command`.
 
     Raises:
-        RecordingError: Nobody says it, two say it differently, or the times are no clock.
+        RecordingError: The rate is missing, two sources disagree, or the time stamps are not
+            uniform.
     """
     said = {
         plan.signals[name].channel: channel.sample_rate
@@ -57,17 +58,17 @@ def sample_rate(
     if ours is None:
         if theirs is None:
             raise RecordingError(
-                "is not given, the file does not say it, and it is not guessed: one of time and "
-                "sample_rate is needed",
+                "is not given, the file does not contain it, and it is not guessed: one of time "
+                "and sample_rate is needed",
                 field="sample_rate",
-                remedy="Give the rate, or the channel of the times",
+                remedy="Give the rate, or the channel of the time",
             )
         return theirs, "file"
     if theirs is None:
         return ours, by
     if not _agree(_CLOCK_TOLERANCE, ours, theirs):
         raise RecordingError(
-            f"is {ours:.9g} Hz by the {by}, {theirs:.9g} Hz by the file",
+            f"is {ours:.9g} Hz from the {by}, but {theirs:.9g} Hz from the file",
             field="sample_rate",
             remedy="Correct the one that is wrong",
         )
@@ -75,14 +76,14 @@ def sample_rate(
 
 
 def check_spacing(v_th: np.ndarray, metadata: Metadata) -> None:
-    """Compare the distance of the pulses with both rates.
+    """Check the distance between the pulses against the sample rate and the pulse rate.
 
     Args:
-        v_th: The unloaded record or its beginning, in any unit.
-        metadata: Of the recording.
+        v_th: Unloaded record or its first part, in any unit.
+        metadata: Fields of the recording.
 
     Raises:
-        RecordingError: The pulses are not as far apart as both rates say.
+        RecordingError: The distance between the pulses does not match the two rates.
     """
     if not np.isfinite(v_th).all():
         return
@@ -101,7 +102,7 @@ def _agree(tolerance: float, *rates: float) -> bool:
 
 
 def _clock(time: Channel, factor: float, length: int) -> float:
-    """Sample rate of uniform time stamps, from the first and the last."""
+    """Sample rate [Hz] from the first and the last time stamp; the stamps must be uniform."""
     if time.shape != (length,) or length < 2:
         raise RecordingError(
             f"has shape {time.shape}, must be ({length},) with at least two times", field="time"
@@ -122,13 +123,13 @@ def _clock(time: Channel, factor: float, length: int) -> float:
     start = 0
     for block in stamps():
         distance = np.abs(block - (first + step * np.arange(start, start + block.size))) / step
-        worst = int(np.argmax(distance))  # of a NaN, where there is one
+        worst = int(np.argmax(distance))  # argmax returns the first NaN, if there is one
         if not distance[worst] <= _TIME_TOLERANCE:
             raise RecordingError(
-                f"is not uniform: sample {start + worst} is {distance[worst]:.2g} sample periods "
-                "off",
+                f"is not uniform: sample {start + worst} is wrong by {distance[worst]:.2g} sample "
+                "periods",
                 field="time",
-                remedy="Resample outside, or give the sample_rate the instrument was set to",
+                remedy="Resample the data, or give the sample_rate of the instrument instead",
             )
         start += block.size
     return float(1 / step)

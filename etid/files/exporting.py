@@ -1,4 +1,4 @@
-"""Files for other programs: tables of fits, one identified circuit, recordings as NWB."""
+"""Files for other programs: tables of fits, identified circuits, and recordings as NWB."""
 
 import csv
 import datetime
@@ -22,7 +22,7 @@ from etid.recordings.untrusted import attribute, translated
 from etid.results.fits import DESCRIBED, SCHEMA, Fit, Fits
 from etid.results.hdf5_table import Table, opened_table, same_length
 
-ROWS = 1 << 16  # of fits in memory at once
+ROWS = 1 << 16  # fits in memory at a time
 
 CIRCUITS = (".cir", ".json")
 
@@ -33,20 +33,20 @@ _QUALITY = {"rrse": "number", "chi2": "number", "steps": "integer", "verdict": "
 def export_fits(source: str | os.PathLike[str], target: str | os.PathLike[str]) -> None:
     """Write the table of a file of fits, `Fits.table()`, for other programs.
 
-    - `.csv`: a line of names, such as `r_s [ohm]` and `r_s_stderr [ohm]`, then a line per fit, in
-      SI units, with all digits. What is not known is `nan`.
-    - `.parquet`: columns of the same names without units. The metadata of a column has its `unit`,
-      those of the file have `circuit`, `method` and `etid_version`. Needs
-      `pip install etid[parquet]`.
+    - `.csv`: one line of column names, such as `r_s [ohm]` and `r_s_stderr [ohm]`, then one line
+      per fit. Numbers are in SI units with all digits. An unknown number is `nan`.
+    - `.parquet`: the same columns; their names have no unit. The metadata of a column contain its
+      `unit`. The metadata of the file contain `circuit`, `method` and `etid_version`. This format
+      needs `pip install etid[parquet]`.
 
-    Covariances stay in the file of fits. At most 65536 fits are in memory.
+    The covariances are not exported. At most 65536 fits are in memory at a time.
 
     Args:
         source: File of fits.
-        target: The file to write; one that exists is replaced at the end.
+        target: File to write. An existing file is replaced at the end.
 
     Raises:
-        ValueError: The source is no file of fits, or the target has another suffix.
+        ValueError: The source is not a file of fits, or the target has another suffix.
         RecordingError: pyarrow is not installed.
     """
     suffix = pathlib.Path(target).suffix.lower()
@@ -61,7 +61,7 @@ def export_fits(source: str | os.PathLike[str], target: str | os.PathLike[str]) 
 
 
 def _columns(table: Table) -> dict[str, h5py.Dataset]:
-    """The columns of `Fits.table()`, none of them read yet."""
+    """The columns of `Fits.table()` as HDF5 datasets that are not read yet."""
     parameters = table.attribute("parameters")
     names = parameters if isinstance(parameters, list) else [parameters]
     if not all(isinstance(name, str) for name in names) or len(names) > limits.COLUMNS:
@@ -71,7 +71,9 @@ def _columns(table: Table) -> dict[str, h5py.Dataset]:
         )  # fmt: skip
     elements = [name + ending for name in names for ending in ("", "_stderr")]
     changes = (f"{name}_change" for name in (*names, "amplitude"))
-    elements += [name for name in changes if name in table]  # not before schema version 1.2
+    elements += [
+        name for name in changes if name in table
+    ]  # files before schema version 1.2 lack them
     kinds = DESCRIBED | dict.fromkeys(elements, "number") | _QUALITY
     columns = {name: table.column(name, kind) for name, kind in kinds.items()}
     same_length(table, columns)
@@ -79,7 +81,7 @@ def _columns(table: Table) -> dict[str, h5py.Dataset]:
 
 
 def _units(column: h5py.Dataset, table: Table) -> str | None:
-    """The unit of a column."""
+    """Unit of a column; None if it has none."""
     with translated(table.name, field=str(column.name).strip("/")):
         unit = attribute(column, "unit") if "unit" in column.attrs else None
         if not isinstance(unit, str | None):
@@ -88,7 +90,7 @@ def _units(column: h5py.Dataset, table: Table) -> str | None:
 
 
 def _parts(table: Table, columns: dict[str, h5py.Dataset]) -> Iterator[dict[str, np.ndarray]]:
-    """The rows, some at a time."""
+    """The columns in parts of `ROWS` rows."""
     for start in range(0, len(columns["path"]), ROWS):
         rows = slice(start, start + ROWS)
         yield {name: table.read(column, rows) for name, column in columns.items()}
@@ -140,20 +142,20 @@ def export_circuit(
 ) -> None:
     """Write one identified circuit of a file of fits for other programs.
 
-    - `.cir`: a SPICE subcircuit between `plus` and `minus`, called `load_` and the path of the
-      recording, as in `load_s01_dry_03` (`etid.netlist`).
-    - `.json`: what `CustomCircuit().load(…)` of impedance.py reads; its initial guess is the
-      identified values (`etid.circuit_string`).
+    - `.cir`: a SPICE subcircuit with the nodes `plus` and `minus`. Its name is `load_` and the path
+      of the recording, such as `load_s01_dry_03`. See `etid.netlist`.
+    - `.json`: a file for `CustomCircuit().load(…)` of impedance.py. The initial guess holds the
+      identified values. See `etid.circuit_string`.
 
     Args:
         source: File of fits.
-        target: The file to write; one that exists is replaced at the end.
-        path: Path of the recording; not needed if the file has one fit only.
-        circuit: As in `Fits.read`.
+        target: File to write. An existing file is replaced at the end.
+        path: Path of the recording; not needed if the file has only one fit.
+        circuit: Class of the circuit, as in `Fits.read`.
 
     Raises:
-        ValueError: The source is no file of fits or has no such fit, the fit has not been
-            successful, or the target has another suffix.
+        ValueError: The source is not a file of fits, the fit does not exist or is not successful,
+            or the target has another suffix.
     """
     suffix = pathlib.Path(target).suffix.lower()
     if suffix not in CIRCUITS:
@@ -169,19 +171,19 @@ def export_circuit(
     fit = fits[index]
     if fit.verdict != "successful":
         raise ValueError(
-            f"{os.fspath(source)}: the fit of {paths[index]!r} is {fit.verdict}, no circuit to "
-            f"work with. {fits.notes[index]}"
+            f"{os.fspath(source)}: the fit of {paths[index]!r} is {fit.verdict}, not successful; "
+            f"its circuit is not exported. {fits.notes[index]}"
         )
     try:
         text = _written(fit, paths[index], suffix)
-    except ValueError as error:  # an element that is 0, or no number
+    except ValueError as error:  # an element is 0 or not finite
         raise RecordingError(str(error), file=os.fspath(source), path=paths[index]) from error
     with replacing(target) as partial:
         partial.write_text(text, encoding="utf-8")
 
 
 def _written(fit: Fit, path: str, suffix: str) -> str:
-    """A circuit in the language of another program."""
+    """Text of a circuit in the format of the suffix."""
     if suffix == ".cir":
         name = "load_" + re.sub(r"\W", "_", path, flags=re.ASCII)
         return f"* {path}, by {fit.method}\n{netlist(fit.circuit, name=name)}"
@@ -191,7 +193,7 @@ def _written(fit: Fit, path: str, suffix: str) -> str:
         "Circuit String": string,
         "Initial Guess": values,
         "Constants": {},
-        "Fit": False,  # its "Fit" would come with impedance.py's own standard errors
+        "Fit": False,  # a fit of impedance.py would contain its own standard errors
     }
     return json.dumps(content, indent=1, ensure_ascii=False) + "\n"
 
@@ -204,24 +206,25 @@ def export_study(
 ) -> None:
     """Write a file of recordings as NWB, one TimeSeries per record.
 
-    A TimeSeries in `acquisition` is called `s01.dry.0.v_out` for the record `v_out` of `s01/dry/0`
-    and has its stored samples, `conversion`, `offset`, `unit` and `rate`; an unloaded record that
-    several recordings share is stored once and linked.  The table `recordings` has everything else,
-    a line per recording, with the names of its TimeSeries.  A file of recordings does not say when
-    they began: `starting_time` is 0 for each.
+    The group `acquisition` contains the TimeSeries. The record `v_out` of `s01/dry/0` becomes the
+    TimeSeries `s01.dry.0.v_out`. It has the stored samples, `conversion`, `offset`, `unit` and
+    `rate`. If several recordings share an unloaded record, it is stored once and linked. The table
+    `recordings` contains all other fields. It has one line per recording, with the names of its
+    TimeSeries. A file of recordings does not contain the start times of the recordings, so
+    `starting_time` is always 0.
 
-    One record at a time is in memory.  Needs `pip install etid[nwb]`.
+    One record at a time is in memory. The export needs `pip install etid[nwb]`.
 
     Args:
         source: File of recordings.
-        target: The file to write, `.nwb`; one that exists is replaced at the end.
-        session_start: When the session began, with its time zone: NWB requires it, and the source
-            does not say it.
+        target: File to write, with the suffix `.nwb`. An existing file is replaced at the end.
+        session_start: Start of the session, with a time zone. NWB requires it, and a file of
+            recordings does not contain it.
 
     Raises:
-        RecordingError: The source cannot be read, `session_start` is missing, or pynwb is not
-            installed.
-        ValueError: The target is not called `.nwb`.
+        RecordingError: The source cannot be read, `session_start` is missing or has no time zone,
+            or pynwb is not installed.
+        ValueError: The target has another suffix than `.nwb`.
     """
     if pathlib.Path(target).suffix.lower() != ".nwb":
         raise ValueError(f"{os.fspath(target)}: recordings are exported as .nwb")
@@ -230,7 +233,7 @@ def export_study(
             "is not given with a time zone, and is not guessed: NWB requires it",
             file=os.fspath(source),
             field="session_start",
-            remedy="Say when the session began, such as 2026-01-31T09:30:00+01:00",
+            remedy="Give the start of the session, such as 2026-01-31T09:30:00+01:00",
         )
     try:
         from etid.files.nwb import write_nwb

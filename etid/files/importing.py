@@ -1,8 +1,8 @@
-"""Files of other formats become files of recordings.
+"""Import of files of other formats into files of recordings.
 
-A reader per format (`etid.files.readers`) names the channels of a file, a mapping
-(`etid.files.mapping`) says which of them is which signal, `etid.files.assemble` makes recordings of
-them, and these are written while they are read.
+A reader for each format (`etid.files.readers`) lists the channels of a file. A mapping
+(`etid.files.mapping`) assigns channels to signals. `etid.files.assemble` makes recordings from the
+channels. The recordings are written while they are read.
 """
 
 import os
@@ -34,55 +34,56 @@ def import_file(
     mapping: str | os.PathLike[str] | Mapping[str, Any] | None = None,
     **given: Any,
 ) -> list[Imported]:
-    """Turn a file of another format into an etid file.
+    """Convert a file of another format into an etid file.
 
     - `.csv`: comma-separated columns with a header line, one trial.
-    - `.mat`: variables of shape (time,) or (trial, time), `a.b` for field b of structure a.
-      MATLAB's files before 7.3 need `pip install etid[matlab]`.
-    - `.tdms`: channels `group/channel` of NI's files; `pip install etid[tdms]`.
-    - `.abf`: ADC channels of Axon's files, sweeps are trials; `pip install etid[abf]`.
-    - `.npz`: converter codes that say everything themselves (`etid.files.readers.npz`); only labels
-      but `trial` may be given. The condition is the file's name if it is not given.
+    - `.mat`: variables of shape (time,) or (trial, time). `a.b` is field b of structure a. MATLAB
+      files before version 7.3 need `pip install etid[matlab]`.
+    - `.tdms`: channels `group/channel` of NI files. They need `pip install etid[tdms]`.
+    - `.abf`: ADC channels of Axon files; sweeps become trials. They need `pip install etid[abf]`.
+    - `.npz`: converter codes with all fields (see `etid.files.readers.npz`). Only labels can be
+      given, without `trial`. The default condition is the name of the file.
 
-    Which channel is which signal is said by a mapping, whose keys data_schema/README.md lists, or,
-    for one recording, by arguments of the same names.  With arguments, values are in volts, amperes
-    and seconds where the file names no unit.  The trials of a recording without a path become
+    A mapping assigns channels to signals; data_schema/README.md lists its keys. For one recording,
+    arguments with the same names can replace the mapping. With arguments, a channel without a unit
+    in the file is in volt, ampere or second. The trials of a recording without a path become
     `loaded/0`, … or, with `r_load`, `calibration/0`, ….
 
-    At most a part of a record is in memory, except of MATLAB files before 7.3 and of `.npz`.
+    Only a part of a record is in memory at a time, except for MATLAB files before version 7.3 and
+    for `.npz`.
 
     Args:
-        source: The file to import; its suffix says what it is.
-        target: The etid file to write; one that exists is replaced.
-        mapping: TOML file, or what it would hold; instead of all that follows.
-        **given: Keys of a mapping for one recording: the names of the channels `v_th`, `v_out`,
-            `current` and `time`; `scale`; and the fields, such as `pulse_rate` [Hz].
+        source: File to import; its suffix gives the format.
+        target: etid file to write. An existing file is replaced.
+        mapping: TOML file, or its content as a mapping. It replaces all other arguments.
+        **given: Keys of a mapping for one recording: the channel names `v_th`, `v_out`, `current`
+            and `time`; `scale`; and fields such as `pulse_rate` [Hz].
 
     Returns:
-        What was used for what.
+        Sources of each recording or stack of trials: channels, units and sample rate.
 
     Raises:
-        RecordingError: The file cannot be read, or something about it is missing or wrong.
+        RecordingError: The file cannot be read, or a fact about it is missing or wrong.
     """
     path, folder = pathlib.Path(os.fspath(source)), pathlib.Path(os.fspath(target)).parent
     file = str(path)
     if not path.is_file():
         raise RecordingError("there is no such file", file=file, remedy="Check the path")
     if not folder.is_dir():
-        raise RecordingError("there is no folder to write it to", file=os.fspath(target))
+        raise RecordingError("the folder of this file does not exist", file=os.fspath(target))
     given = {name: value for name, value in given.items() if value is not None}
     suffix = path.suffix.lower()
     if suffix == ".npz":
         own = {name for name in LABELS if name in given and name != "trial"}
         labels = {name: given.pop(name) for name in own}
         _refuse(given | ({} if mapping is None else {"mapping": mapping}), file,
-                "an npz file of recordings says this itself")  # fmt: skip
+                "is not an argument for npz files, which contain it")  # fmt: skip
         return _import_npz(path, target, {"condition": path.stem} | labels)
     if suffix not in READERS:
         raise RecordingError(
-            f"a file {path.suffix!r} cannot be imported",
+            f"etid cannot import files with the suffix {path.suffix!r}",
             file=file,
-            remedy=f"Export it as one of {', '.join(READERS)}, or write the schema with h5py",
+            remedy=f"Export it as one of {', '.join(READERS)}, or write an etid file with h5py",
         )
     if mapping is None:
         said: Mapping[str, Any] = {
@@ -90,7 +91,7 @@ def import_file(
         }
         by, place, implied = "command", file, _IMPLIED
     else:
-        _refuse(given, file, "is for the mapping to say")
+        _refuse(given, file, "cannot be an argument together with a mapping")
         inside = isinstance(mapping, Mapping)
         said = mapping if inside else read_mapping(mapping)
         by, place, implied = "mapping", file if inside else f"{os.fspath(mapping)} of {file}", {}
@@ -115,7 +116,7 @@ def import_file(
 
 def _refuse(given: Mapping[str, Any], file: str, reason: str) -> None:
     for name in given:
-        raise RecordingError(reason, file=file, field=name, remedy="Leave the argument out")
+        raise RecordingError(reason, file=file, field=name, remedy="Remove the argument")
 
 
 def _import_npz(

@@ -1,7 +1,7 @@
-"""Mapping files: which channel of a file is which signal, and how it was recorded.
+"""Mapping files: they assign the channels of a file to signals, and contain the other fields.
 
-A mapping is TOML.  Each `[[recording]]` is a recording, or a stack of trials; what is said above
-the first of them is said for all.
+A mapping is a TOML file. Each `[[recording]]` is a recording or a stack of trials. Keys above the
+first `[[recording]]` apply to all of them.
 """
 
 import dataclasses
@@ -21,7 +21,7 @@ from etid.recordings.recording import RecordingError
 
 CHANNELS = (*SIGNALS, "time")
 FIELDS = (*DECLARED, "scale")
-KEYS = ("channel", "unit", "scale", "rows")  # of a signal
+KEYS = ("channel", "unit", "scale", "rows")  # keys of a signal
 _KEY = "key of a mapping"
 
 
@@ -30,11 +30,13 @@ class Signal:
     """One signal of a recording.
 
     Attributes:
-        channel: Name of its channel.
-        unit: Of the channel's values, as the mapping spells it; empty if the file has to say it.
-        scale: Volts of the record per volt at the terminal; for the current volts per ampere.
-        rows: Which trials of the channel; None for all.
-        implied: Its unit where neither mapping nor file name one; empty if that is an error.
+        channel: Name of the channel.
+        unit: Unit of the channel's values in the spelling of the mapping; empty if the mapping does
+            not name it.
+        scale: Volts of the record per volt at the terminal; for the current: volts per ampere.
+        rows: Rows of the channel to use as trials, counted from 0; None: all rows.
+        implied: Unit if neither the mapping nor the file names one; empty if a missing unit is an
+            error.
     """
 
     channel: str
@@ -46,12 +48,12 @@ class Signal:
 
 @dataclasses.dataclass(frozen=True)
 class Plan:
-    """One recording, or a stack of trials, of which nothing has been read yet.
+    """Plan of one recording or one stack of trials; no samples have been read yet.
 
     Attributes:
         path: HDF5 path.
-        signals: `v_th`, `v_out` and, where they are, `current` and `time`.
-        fields: Everything else that is said, but `path` and `scale`.
+        signals: `v_th`, `v_out` and, if the mapping names them, `current` and `time`.
+        fields: All other keys of the mapping except `path` and `scale`.
     """
 
     path: str
@@ -60,48 +62,52 @@ class Plan:
 
 
 def read_mapping(path: str | os.PathLike[str]) -> dict[str, Any]:
-    """A mapping file as it is.
+    """Content of a mapping file, not checked yet.
 
     Raises:
-        RecordingError: It is missing, or no TOML.
+        RecordingError: The file is missing or is not TOML.
     """
     file = pathlib.Path(path)
     if not file.is_file():
-        raise RecordingError("there is no such mapping", file=str(file), remedy="Check the path")
+        raise RecordingError(
+            "there is no such mapping file", file=str(file), remedy="Check the path"
+        )
     size = file.stat().st_size
     if size > limits.MAPPING:
         raise RecordingError(
-            f"has {size} bytes, at most {limits.MAPPING} are read",
+            f"has {size} bytes, more than the {limits.MAPPING} bytes that etid reads",
             file=str(file),
-            remedy="Name a mapping, not the data",
+            remedy="Give a mapping file, not a data file",
         )
     try:
         text = file.read_text("utf-8")
         if any(part.count(".") > limits.DEPTH for part in re.split(r"[=,\[\]{}\n]", text)):
-            # the time that tomllib takes for one key goes with the square of its length
+            # The time that tomllib needs for a key grows with the square of its length.
             raise ValueError(f"a key has more than {limits.DEPTH} parts")
         return tomllib.loads(text)
-    except (ValueError, RecursionError) as error:  # of the syntax, the encoding or its depth
+    except (ValueError, RecursionError) as error:  # wrong syntax, encoding or depth
         raise RecordingError(f"is not TOML ({error})", file=str(file)) from error
 
 
 def plans(
     mapping: Mapping[str, Any], names: Sequence[str], implied: Mapping[str, str]
 ) -> list[Plan]:
-    """The recordings that a mapping speaks of.
+    """Plans of the recordings of a mapping.
 
     Args:
-        mapping: As `read_mapping` returns it.
-        names: The channels of the file, for they are all that can be named.
-        implied: Units of signals where neither mapping nor file name one.
+        mapping: Content of a mapping, from `read_mapping`.
+        names: Names of the channels of the file; the mapping may use only these.
+        implied: Unit of each signal if neither the mapping nor the file names one.
 
     Raises:
-        RecordingError: Something is missing, unknown, or not of its type.
+        RecordingError: A key is missing, unknown, or of the wrong type.
     """
     tables = mapping.get("recording", [])
     tables = [tables] if isinstance(tables, Mapping) else tables
     if not isinstance(tables, list) or not all(isinstance(table, Mapping) for table in tables):
-        raise RecordingError("must be tables", field="recording", remedy="Write [[recording]]")
+        raise RecordingError(
+            "must be a list of tables", field="recording", remedy="Write [[recording]]"
+        )
     common = {key: value for key, value in mapping.items() if key != "recording"}
     check_names(common, (*CHANNELS, *FIELDS, "recording" if tables else "path"), _KEY)
     found: list[Plan] = []
@@ -141,10 +147,10 @@ def _plan(
             raise _missing("scale", hint="; 1 if the values are those at the terminal")
     if "time" in said and "sample_rate" in said:
         raise RecordingError(
-            "is given, and so is time: one of time and sample_rate is needed, not both",
+            "is given together with time: one of time and sample_rate is needed, not both",
             field="sample_rate",
         )
-    # A stack has several labels of trials, which are checked one by one.
+    # The trial of a stack is a list of labels; `sources_of` checks each label.
     fields = {
         name: value if name == "trial" else DECLARED[name].checked(value)
         for name, value in said.items()
@@ -158,7 +164,7 @@ def _missing(name: str, known: str = "", hint: str = "") -> RecordingError:
     return RecordingError(
         f"is not given, and is not guessed{known}",
         field=name,
-        remedy=f"Say it in the mapping, or by --{option}{hint}",
+        remedy=f"Give it in the mapping, or with --{option}{hint}",
     )
 
 
@@ -171,7 +177,7 @@ def _signal(name: str, said: Any, common: Any, implied: str) -> Signal:
     unit = said.get("unit", "")
     if "unit" in said and (not isinstance(unit, str) or parse_unit(unit) is None):
         raise RecordingError(
-            f"is {unit!r}, which is no unit of a recording",
+            f"is {unit!r}, which is not a unit of a recording",
             field=f"{name}.unit",
             remedy=f"Units are {', '.join(key for key in UNITS if len(key) < 3)} and their names",
         )
@@ -188,7 +194,9 @@ def _rows(field: str, value: Any) -> tuple[int, ...] | int | None:
         return int(value)
     if isinstance(value, list) and value and all(map(_is_row, value)):
         return tuple(value)
-    raise RecordingError(f"is {value!r}, must be one number or several, from 0 on", field=field)
+    raise RecordingError(
+        f"is {value!r}, must be one row number or a list, counted from 0", field=field
+    )
 
 
 def _is_row(row: object) -> bool:
@@ -205,15 +213,15 @@ def _number(field: str, value: Any) -> float | None:
 
 
 def unit_of(name: str, signal: Signal, said: str) -> tuple[Unit, str]:
-    """The unit of a channel's values, and who says so.
+    """Unit of a channel's values, and the source of this unit.
 
     Args:
-        name: The signal.
-        signal: What the mapping says of it.
-        said: What the file says.
+        name: Name of the signal.
+        signal: The signal in the mapping.
+        said: Unit in the file; empty if the file does not name it.
 
     Raises:
-        RecordingError: Nobody says it, or file and mapping differ.
+        RecordingError: The unit is missing, or the file and the mapping disagree.
     """
     field = f"{name}.unit"
     ours, theirs = parse_unit(signal.unit), parse_unit(said)
@@ -238,7 +246,7 @@ def unit_of(name: str, signal: Signal, said: str) -> tuple[Unit, str]:
     if implied:
         return implied, "command"
     raise RecordingError(
-        f"is not given {where}, the file does not say it, and it is not guessed",
+        f"is not given {where}, the file does not contain it, and it is not guessed",
         field=field,
         remedy=f'Write {name} = {{channel = "{signal.channel}", unit = "…"}}',
     )

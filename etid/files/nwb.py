@@ -1,6 +1,6 @@
-"""Recordings in a file of Neurodata Without Borders (NWB), as TimeSeries.
+"""Recordings as TimeSeries in a file of Neurodata Without Borders (NWB).
 
-Importing this module needs pynwb; `etid.files.exporting` does it when it is asked to.
+This module needs pynwb, so `etid.files.exporting` imports it only for an export.
 """
 
 import datetime
@@ -21,7 +21,7 @@ from etid.recordings.hdf5 import read
 from etid.recordings.recording import AbstractSource, Layout, RecordingError
 from etid.recordings.replacing import replacing
 
-# How pynwb declares arguments hides them from a type checker.
+# pynwb declares its arguments with a decorator that hides them from the type checker.
 _nwb: Any = pynwb
 _tables: Any = hdmf.common
 
@@ -31,7 +31,7 @@ def write_nwb(
     target: str | os.PathLike[str],
     session_start: datetime.datetime,
 ) -> None:
-    """Write a file of recordings as NWB; `etid.export_study` says how."""
+    """Write a file of recordings as NWB; see `etid.export_study`."""
     with read(source) as study, pathlib.Path(source).open("rb") as content:
         if study.problems:
             raise next(iter(study.problems.values()))
@@ -60,7 +60,7 @@ def write_nwb(
             for name, text in _columns().items()
         ]
         table = _tables.DynamicTable(
-            name="recordings", description="A line per recording", columns=columns
+            name="recordings", description="One line per recording", columns=columns
         )
         file.add_acquisition(table)
         with replacing(target) as partial, _nwb.NWBHDF5IO(partial, "w") as output:
@@ -68,7 +68,7 @@ def write_nwb(
 
 
 class _Samples(GenericDataChunkIterator):
-    """The stored samples of one record, read when they are written."""
+    """The stored samples of one record; they are read only while they are written."""
 
     def __init__(self, source: AbstractSource, record: Layout):
         self.source, self.record = source, record
@@ -86,7 +86,7 @@ class _Samples(GenericDataChunkIterator):
 
 
 def _series(path: str, source: AbstractSource, shared: dict[Hashable, Any]) -> dict[str, Any]:
-    """The records of a recording."""
+    """TimeSeries of the records of a recording, by name."""
     series = {}
     for record in source.layout:
         key = source.unloaded if record.name == "v_th" else None
@@ -114,7 +114,7 @@ def _columns() -> dict[str, str]:
 
 
 def _row(source: AbstractSource, series: Mapping[str, str]) -> dict[str, Any]:
-    """The fields of a recording; text for paths, NaN where a number is not known."""
+    """Line of the table for a recording; paths are text, and an unknown number is NaN."""
     metadata = source.metadata
     row: dict[str, Any] = {"path": metadata.path, "kind": metadata.kind}
     for name, field in DECLARED.items():

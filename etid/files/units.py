@@ -1,4 +1,4 @@
-"""Units of volts, amperes and seconds, as the files of instruments spell them."""
+"""Units of voltage, current and time in the spellings of instrument files."""
 
 from typing import NamedTuple
 
@@ -14,7 +14,7 @@ _WORDS = {
     "seconds": "second",
     "sec": "second",
 }
-# "M" is left out: "MV" is as likely a millivolt in capitals as a megavolt.
+# "M" is missing, because "MV" can be a millivolt in capital letters or a megavolt.
 _PREFIXES = {
     "": 1.0,
     "k": 1e3,
@@ -36,11 +36,11 @@ UNITS |= {f"{prefix}{word}": (factor, unit)
 
 
 class Unit(NamedTuple):
-    """A unit that recordings come in.
+    """A unit of the values in a file.
 
     Attributes:
-        factor: How many of the SI unit it is.
-        si: `volt`, `ampere` or `second`.
+        factor: Size of the unit in its SI unit.
+        si: SI unit: `volt`, `ampere` or `second`.
     """
 
     factor: float
@@ -48,9 +48,9 @@ class Unit(NamedTuple):
 
 
 def parse_unit(text: str) -> Unit | None:
-    """The unit that a text means, such as `mV` or `millivolts`; None if it is none of these.
+    """Unit of a text such as `mV` or `millivolts`; None if the text is not a known unit.
 
-    Symbols are taken as they are written, words in any case.
+    Symbols are case-sensitive; words are not.
     """
     name = text.strip()
     found = UNITS.get(name) or UNITS.get(name.lower() if len(name) > 2 else name)

@@ -1,5 +1,5 @@
-"""Readers of files of other formats, a module each.
+"""Readers for files of other formats, one module per format.
 
-A reader is a context manager `opened(path, folder)`: the file's `Contents`, until it is left.  It
-may put temporary files into `folder`.
+A reader is a context manager `opened(path, folder)` that returns the `Contents` of the file. It may
+create temporary files in `folder`. `npz` is an exception: it returns recordings.
 """

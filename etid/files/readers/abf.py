@@ -1,7 +1,8 @@
-"""Axon's ABF files of both versions: the header by pyabf, the samples by blocks.
+"""Reader for Axon's ABF files of both versions.
 
-Each ADC channel is called by its name, or `channel 0`, … where it has none of its own.  Several
-sweeps are trials.  pyabf itself would read the whole file and round its codes to float32.
+pyabf reads the header. This module reads the samples in blocks, because pyabf would read the whole
+file and round the codes to float32. A channel has the name of its ADC channel. If this name is
+empty or not unique, the name is `channel 0`, …. Several sweeps become trials.
 """
 
 import contextlib
@@ -14,15 +15,15 @@ import numpy as np
 from etid.files.channel import Channel, Contents, needs, rate_of
 from etid.recordings.recording import RecordingError
 
-_PRECISION = 1e-6  # of a sample interval, a float32
+_PRECISION = 1e-6  # relative precision of a sample interval in float32
 
 
 @contextlib.contextmanager
 def opened(path: pathlib.Path, folder: pathlib.Path) -> Iterator[Contents]:
-    """An ABF file."""
+    """Channels of an ABF file."""
     del folder
     try:
-        import pyabf  # optional: only labs with instruments of Axon need it
+        import pyabf  # optional: only users of Axon instruments need it
     except ImportError:
         raise needs("pyabf", "abf", str(path)) from None
 
@@ -31,22 +32,22 @@ def opened(path: pathlib.Path, folder: pathlib.Path) -> Iterator[Contents]:
     sweeps, length, count = abf.sweepCount, abf.sweepPointCount, abf.channelCount
     if hasattr(abf, "_synchArraySection") and len(set(abf._synchArraySection.lLength)) > 1:
         raise RecordingError(
-            "its sweeps differ in length", remedy="Export sweeps of one length from Clampfit"
+            "has sweeps of different lengths", remedy="Export sweeps of equal length from Clampfit"
         )
     end = abf.dataByteStart + abf.dataPointCount * dtype.itemsize
     if end > path.stat().st_size or min(sweeps, length, count) < 1:
         raise RecordingError(
-            f"is cut off: its samples end at byte {end}, the file at {path.stat().st_size}",
+            f"is truncated: its samples end at byte {end}, the file at {path.stat().st_size}",
             remedy="Copy it again",
         )
-    # Of sweeps, time and channels, the channels are next to each other.
+    # The file stores one value per channel for each sample; channels are the last axis.
     stored = np.memmap(path, dtype, "r", abf.dataByteStart, (sweeps, length, count))
     own = [name.strip("? \0") for name in abf.adcNames]
     names = [
         name if name and own.count(name) == 1 else f"channel {index}"
         for index, name in enumerate(own)
     ]
-    # pyabf's own dataRate has lost what is behind the point: 149999 for 150000
+    # dataRate of pyabf is truncated to an integer: 149999 instead of 150000
     if abf.abfVersion["major"] == 1:
         interval = abf._headerV1.fADCSampleInterval * count
     else:

@@ -1,7 +1,7 @@
-"""Comma-separated tables with a header line, read in one pass and in bounded memory.
+"""Reader for comma-separated tables with a header line, in one pass and in bounded memory.
 
-A column `open [mV]` or `open (mV)` is called `open` and has that unit.  Oscilloscopes write the
-units into a second line instead: one without any number, `(ms),(mV),(mV)`.
+A column `open [mV]` or `open (mV)` has the name `open` and the unit mV. Oscilloscopes write the
+units into a second line instead, such as `(ms),(mV),(mV)`. This line contains no number.
 """
 
 import contextlib
@@ -19,14 +19,14 @@ from etid.files.channel import Channel, Contents
 from etid.files.units import parse_unit
 from etid.recordings.recording import RecordingError
 
-ROWS = 1 << 16  # of text in memory at once
+ROWS = 1 << 16  # rows of text in memory at a time
 
 _WITH_UNIT = re.compile(r"(?P<name>.*\S)\s*[\[(](?P<unit>[^\[\]()]+)[\])]")
 
 
 @contextlib.contextmanager
 def opened(path: pathlib.Path, folder: pathlib.Path) -> Iterator[Contents]:
-    """A table, whose columns become binary files when they are asked for."""
+    """Columns of a table; `prepare` copies the needed columns to temporary binary files."""
     with contextlib.ExitStack() as files:
         with path.open(newline="", encoding="utf-8-sig") as text:
             names, units, skipped = _header(text)
@@ -52,7 +52,7 @@ def opened(path: pathlib.Path, folder: pathlib.Path) -> Iterator[Contents]:
 
 
 def _header(text: TextIO) -> tuple[tuple[str, ...], tuple[str, ...], int]:
-    """Names, units, and how many lines they take."""
+    """Names, units, and the number of header lines."""
     cells = _cells(text.readline())
     if cells and all(_is_number(cell) for cell in cells):
         raise RecordingError(
@@ -66,7 +66,11 @@ def _header(text: TextIO) -> tuple[tuple[str, ...], tuple[str, ...], int]:
     if len(below) != len(names) or not any(below) or any(map(_is_number, below)):
         return tuple(names), tuple(units), 1
     if any(cell and not parse_unit(cell) for cell in below):
-        return tuple(names), tuple(units), 1  # not units: the numbers' parser will say what it is
+        return (
+            tuple(names),
+            tuple(units),
+            1,
+        )  # not units: the parser of the numbers will raise the error
     both = zip(units, below, strict=True)
     return tuple(names), tuple(above or unit for above, unit in both), 2
 
@@ -84,7 +88,7 @@ def _is_number(cell: str) -> bool:
 
 
 def _spool(path: pathlib.Path, skipped: int, columns: dict[int, BinaryIO]) -> int:
-    """Write columns to files as real numbers; how many rows there are."""
+    """Write columns to files as real numbers, and return the number of rows."""
     rows = 0
     with path.open(newline="", encoding="utf-8-sig") as text:
         lines = (line for line in itertools.islice(text, skipped, None) if line.strip())

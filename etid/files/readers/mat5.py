@@ -1,8 +1,8 @@
-"""A look at MATLAB's files of version 5 before SciPy reads them.
+"""Check of MATLAB files of version 5 before SciPy reads them.
 
-SciPy trusts them: an element of an unknown type ends the process, and a cell array is made as large
-as it says. Elements follow each other as (type, size, bytes), matrices hold others (MathWorks,
-MAT-File Format, chapter 1).
+SciPy does not check these files. An element of an unknown type crashes the process, and SciPy
+allocates a cell array with its declared size. A file is a sequence of elements (type, size, bytes);
+a matrix contains further elements (MathWorks, MAT-File Format, chapter 1).
 """
 
 import math
@@ -13,25 +13,25 @@ import zlib
 from etid.recordings import limits
 from etid.recordings.errors import RecordingError
 
-_HEAD = 128  # bytes
+_HEAD = 128  # [bytes]
 _MATRIX, _COMPRESSED = 14, 15
 _NUMBERS = {1, 2, 3, 4, 5, 6, 7, 9, 12, 13, 16, 17, 18}  # integers, reals, texts
 _MADE_WHOLE = {1, 2, 3}  # cells, structures, objects: arrays of Python objects
 
 
 def check(path: pathlib.Path) -> None:
-    """Refuse a file whose elements are not what they should be; other versions pass.
+    """Raise an error if an element of a version-5 file is invalid; other versions pass.
 
     Raises:
-        RecordingError: An element is of no known type, longer than the file, too deep, or declares
-            more than it holds.
+        RecordingError: An element has an unknown type, is longer than the file, is nested too
+            deep, or declares more data than it contains.
     """
     data = path.read_bytes()
     order = {b"IM": "<", b"MI": ">"}.get(data[126:_HEAD])
     if 0 in data[:4]:
         return  # version 4
     if order is None:
-        raise _error("is no MATLAB file of version 5 or 7.3")
+        raise _error("is not a MATLAB file of version 5 or 7.3")
     _walk(memoryview(data)[_HEAD:], order, 0)
 
 
@@ -40,16 +40,16 @@ def _error(message: str) -> RecordingError:
 
 
 def _walk(data: memoryview, order: str, depth: int) -> list[tuple[int, memoryview]]:
-    """The elements one after the other, those inside others too."""
+    """List the elements of one level, and check the elements inside them."""
     if depth > limits.DEPTH:
-        raise _error(f"has variables more than {limits.DEPTH} deep")
+        raise _error(f"has variables nested more than {limits.DEPTH} deep")
     found: list[tuple[int, memoryview]] = []
     place = 0
     while place < len(data):
         if len(data) - place < 8:
             raise _error("ends inside an element")
         kind, size = struct.unpack_from(f"{order}II", data, place)
-        if kind >> 16:  # up to 4 bytes beside type and size
+        if kind >> 16:  # short element: type, size and up to 4 bytes in 8 bytes
             kind, size, start, after = kind & 0xFFFF, kind >> 16, place + 4, place + 8
             if size > 4:
                 raise _error(f"has a short element of {size} bytes")
@@ -57,7 +57,7 @@ def _walk(data: memoryview, order: str, depth: int) -> list[tuple[int, memoryvie
             start, after = place + 8, place + 8 + size
             after += 0 if kind == _COMPRESSED else -size % 8
         if start + size > len(data):
-            raise _error(f"has an element of {size} bytes that ends behind it")
+            raise _error(f"has an element of {size} bytes that ends after the file")
         body = data[start : start + size]
         if kind == _COMPRESSED:
             _walk(_unpacked(body), order, depth + 1)
@@ -80,9 +80,9 @@ def _unpacked(body: memoryview) -> memoryview:
 
 
 def _check_matrix(parts: list[tuple[int, memoryview]], order: str, size: int) -> None:
-    """Refuse a matrix of more cells than it has room for."""
+    """Raise an error if a matrix declares more cells than its bytes can hold."""
     if len(parts) < 2 or len(parts[0][1]) < 4:
-        return  # empty, or nothing that SciPy makes large
+        return  # empty, or without a size that SciPy allocates
     (flags,) = struct.unpack_from(f"{order}I", parts[0][1])
     if flags & 0xFF not in _MADE_WHOLE:
         return

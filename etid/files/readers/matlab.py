@@ -1,6 +1,7 @@
-"""MATLAB's files: version 7.3, which is HDF5, by blocks, and those before it as a whole.
+"""Reader for MATLAB files.
 
-Field b of structure a is the channel `a.b`.  Rows are trials, columns are time.
+Version 7.3 is HDF5 and is read in blocks. Earlier versions are read completely. Field b of
+structure a is the channel `a.b`. Rows are trials, columns are times.
 """
 
 import contextlib
@@ -18,12 +19,12 @@ from etid.recordings import limits
 from etid.recordings.recording import RecordingError
 from etid.recordings.untrusted import attribute, check_size, guarded, local_link
 
-_CACHE = 1 << 25  # bytes: MATLAB's chunks hold several trials, which are read one after the other
+_CACHE = 1 << 25  # [bytes] a chunk holds several trials, which are read one by one
 
 
 @contextlib.contextmanager
 def opened(path: pathlib.Path, folder: pathlib.Path) -> Iterator[Contents]:
-    """A MATLAB file of any version."""
+    """Channels of a MATLAB file of any version."""
     del folder
     if h5py.is_hdf5(path):
         with guarded(str(path), rdcc_nbytes=_CACHE) as file:
@@ -33,9 +34,9 @@ def opened(path: pathlib.Path, folder: pathlib.Path) -> Iterator[Contents]:
 
 
 def _hdf5(file: h5py.File) -> Contents:
-    """Version 7.3: HDF5 with reversed axes; what begins with `#` is MATLAB's own."""
+    """Channels of version 7.3: HDF5 with reversed axes; names with `#` are internal to MATLAB."""
     found: dict[str, h5py.Dataset] = {}
-    seen: set[int] = set()  # of links that lead back
+    seen: set[int] = set()  # addresses, because links may form a loop
 
     def walk(group: h5py.Group, prefix: str) -> None:
         address = h5o.get_info(group.id).addr
@@ -43,7 +44,7 @@ def _hdf5(file: h5py.File) -> Contents:
             return
         seen.add(address)
         if prefix.count(".") > limits.DEPTH:
-            raise RecordingError(f"has structures more than {limits.DEPTH} deep")
+            raise RecordingError(f"has structures nested more than {limits.DEPTH} deep")
         names: Any = list(group)
         for name in names:
             if name.startswith("#"):
@@ -83,9 +84,9 @@ def _hdf5(file: h5py.File) -> Contents:
 
 
 def _whole(path: pathlib.Path) -> Contents:
-    """Version 5 and older."""
+    """Channels of version 5 and older."""
     try:
-        import pymatreader  # optional: only labs with MATLAB need it
+        import pymatreader  # optional: only users of MATLAB need it
     except ImportError:
         raise needs("pymatreader", "matlab", str(path)) from None
     from scipy.io.matlab import MatReadError
@@ -112,7 +113,7 @@ def _whole(path: pathlib.Path) -> Contents:
 
 
 def _flat(content: dict[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Variables by name, fields of structures as `structure.field`."""
+    """Variables by name; the fields of structures have names such as `structure.field`."""
     flat: dict[str, Any] = {}
     for name, value in content.items():
         if isinstance(value, dict):

@@ -1,4 +1,4 @@
-"""Archives of NumPy with converter codes, which say everything themselves."""
+"""Reader for NumPy archives with converter codes and all fields of the recordings."""
 
 import math
 import pathlib
@@ -17,9 +17,10 @@ from etid.recordings.recording import Recording, RecordingError, Samples
 def recordings(path: pathlib.Path, labels: Mapping[str, Any]) -> list[Recording]:
     """All recordings of an archive, with these labels.
 
-    `adc_th`, `adc_out` (trial, time) and `adc_ref` (resistor, time) are converter codes; `R_ref`,
-    `fs`, `f0`, `lsb` and `scale` are numbers.  They become `calibration/0`, … and `loaded/0`, …;
-    as there is no unloaded record for the calibrations, they share `adc_th[0]`.
+    `adc_th`, `adc_out` (trial, time) and `adc_ref` (resistor, time) are converter codes. `R_ref`
+    has the resistance of each resistor. `fs`, `f0`, `lsb` and `scale` are numbers. The recordings
+    are `calibration/0`, … and `loaded/0`, …. The archive has no unloaded records for the
+    calibrations, so all calibrations share `adc_th[0]`.
     """
     if not zipfile.is_zipfile(path):
         raise RecordingError("is not an npz file")
@@ -40,7 +41,7 @@ def recordings(path: pathlib.Path, labels: Mapping[str, Any]) -> list[Recording]
     for key in ("adc_th", "adc_out", "adc_ref"):
         if held[key].dtype.kind not in "iu" or held[key].dtype != th.dtype:
             raise RecordingError(
-                f"has dtype {held[key].dtype}, must hold integer codes like the others",
+                f"has dtype {held[key].dtype}; all codes must have the same integer dtype",
                 field=key,
             )
     rate, pulses, step, scale = (_number(held[key], key) for key in keys[4:])
@@ -81,7 +82,7 @@ def recordings(path: pathlib.Path, labels: Mapping[str, Any]) -> list[Recording]
 
 
 def _check_size(archive: Any, key: str) -> None:
-    """Refuse an array that declares more than the archive holds, before it is made."""
+    """Raise an error if an array declares more data than the archive holds, before allocation."""
     info = archive.zip.getinfo(f"{key}.npy")
     with archive.zip.open(info) as member:
         version = np.lib.format.read_magic(member)
@@ -91,11 +92,11 @@ def _check_size(archive: Any, key: str) -> None:
         shape, _, dtype = head(member)
         declared = math.prod(shape) * dtype.itemsize + member.tell()
     if dtype.hasobject:
-        return  # which NumPy refuses
+        return  # NumPy refuses this array
     unpacked = max(limits.FREE, limits.COMPRESSION * info.compress_size)
     if declared != info.file_size or declared > unpacked or min(shape, default=1) < 0:
         raise RecordingError(
-            f"declares {dtype} of shape {shape}, but takes {info.file_size} bytes",
+            f"declares {dtype} of shape {shape}, but has {info.file_size} bytes",
             field=key,
             remedy="The file is damaged: copy or write it again",
         )

@@ -1,6 +1,6 @@
-"""NI's TDMS files, as LabVIEW and DAQmx write them, read by npTDMS in blocks.
+"""Reader for NI's TDMS files from LabVIEW and DAQmx; npTDMS reads them in blocks.
 
-Channel c of group g is called `g/c`.
+Channel c of group g has the name `g/c`.
 """
 
 import contextlib
@@ -15,28 +15,30 @@ import numpy as np
 from etid.files.channel import Channel, Contents, needs, rate_of, real
 from etid.recordings.recording import RecordingError
 
-# Scalings that make a voltage of a voltage; npTDMS returns raw codes for those it does not know.
+# Scalings that turn a voltage into a voltage. For an unknown scaling npTDMS returns raw codes.
 _SCALINGS = {"Linear", "Polynomial", "Table", "Add", "Subtract", "AdvancedAPI"}
 _UNITS = ("unit_string", "NI_UnitDescription")
-_LEAD_IN = struct.Struct("<4slLQQ")  # tag, contents, version, length, length of the description
+_LEAD_IN = struct.Struct("<4slLQQ")  # tag, contents, version, length, length of the metadata
 
 
 @contextlib.contextmanager
 def opened(path: pathlib.Path, folder: pathlib.Path) -> Iterator[Contents]:
-    """A TDMS file."""
+    """Channels of a TDMS file."""
     del folder
     try:
-        import nptdms.log  # optional: only labs with instruments of NI need it
+        import nptdms.log  # optional: only users of NI instruments need it
     except ImportError:
         raise needs("npTDMS", "tdms", str(path)) from None
 
     _check_length(path)
     console = nptdms.log.log_manager.console_handler
     with contextlib.ExitStack() as stack:
-        # What it would print on stderr is an error here, or text that is not UTF-8, which is shown.
+        # Silence npTDMS on stderr: it reports errors, which are raised here, and text that is not
+        # UTF-8, which is visible anyway.
         console.addFilter(_silent)
         stack.callback(console.removeFilter, _silent)
-        # An open file, because it does not close its own when it fails, and may prefer an index.
+        # Pass an open file: npTDMS does not close its own file after an error, and might read an
+        # index file instead.
         file = stack.enter_context(nptdms.TdmsFile.open(stack.enter_context(path.open("rb"))))
         found = [
             (f"{group.name}/{channel.name}", channel)
@@ -52,7 +54,7 @@ def _silent(_: logging.LogRecord) -> bool:
 
 
 def _check_length(path: pathlib.Path) -> None:
-    """Refuse a file that ends inside a segment: npTDMS would read it as far as it goes."""
+    """Raise an error if a file ends inside a segment; npTDMS would read the part that exists."""
     size, position = path.stat().st_size, 0
     with path.open("rb") as file:
         while position < size:
@@ -63,13 +65,13 @@ def _check_length(path: pathlib.Path) -> None:
             )
             if tag != b"TDSm":
                 raise RecordingError(f"is not a TDMS file: no segment begins at byte {position}")
-            if contents & (1 << 6):  # a segment with its bytes the other way round
+            if contents & (1 << 6):  # the segment is big-endian
                 length = int.from_bytes(lead[12:20], "big")
             position += _LEAD_IN.size + length
     if position != size or size == 0:
         raise RecordingError(
-            f"is cut off: the last segment ends at byte {position}, the file at byte {size}",
-            remedy="Copy it again, or record it again if the program that wrote it has crashed",
+            f"is truncated: the last segment ends at byte {position}, the file at byte {size}",
+            remedy="Copy it again, or record it again if the recording program crashed",
         )
 
 
@@ -79,7 +81,7 @@ def _channel(name: str, channel: Any) -> Channel:
     if not kinds <= _SCALINGS:
         found = ", ".join(sorted(kinds - _SCALINGS))
         raise RecordingError(
-            f"{name!r} is scaled by {found}, which gives neither volts nor amperes"
+            f"{name!r} has the scaling {found}, which gives neither volts nor amperes"
         )
     real(name, channel.dtype, (len(channel),))
     raw = np.dtype(getattr(channel.data_type, "nptype", None) or "V8")
@@ -104,7 +106,7 @@ def _channel(name: str, channel: Any) -> Channel:
 
 
 def _line(properties: dict[str, Any]) -> tuple[float, float]:
-    """Slope and intercept where the scaling of codes is a line; else 1 and 0, and npTDMS scales."""
+    """Slope and intercept of a linear scaling; 1 and 0 if npTDMS must apply the scaling."""
     only = int(properties.get("NI_Number_Of_Scales", 0)) == 1
     if not only or properties.get("NI_Scale[0]_Scale_Type") != "Linear":
         return 1.0, 0.0
