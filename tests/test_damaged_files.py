@@ -98,8 +98,8 @@ def declared(texts, shape, chunks):
     [
         ((limits.SAMPLES + 1,), (64,), "samples are read"),
         ((limits.TRIALS + 1, 64), (64, 64), "trials of"),
-        ((limits.FREE,), (64,), "0 of them stored"),
-        ((limits.FREE_TRIALS + 1, 4), (64, 4), "0 of them stored"),
+        ((limits.FREE,), (64,), "only 0 bytes are stored"),
+        ((limits.FREE_TRIALS + 1, 4), (64, 4), "only 0 bytes are stored"),
         ((limits.CHUNK,), (limits.CHUNK,), "samples are read|chunks of"),
     ],
 )
@@ -119,7 +119,7 @@ def test_what_is_declared_beyond_a_limit_is_refused_before_it_is_read(
         (lambda f: f.create_group("/".join("g" * (limits.DEPTH + 2))), "groups deep"),
         (lambda f: [f["s01"].attrs.update({f"x{i}": i}) for i in range(limits.ATTRIBUTES + 1)],
          "attributes, at most"),
-        (lambda f: f.__setitem__("s01/x", h5py.SoftLink("/s01/x")), "in a circle"),
+        (lambda f: f.__setitem__("s01/x", h5py.SoftLink("/s01/x")), "in a loop"),
     ],
 )  # fmt: skip
 def test_depth_counts_and_links_have_limits(texts, change, message):
@@ -206,7 +206,7 @@ def test_matlab_that_declares_a_huge_shape_is_refused_at_once(kinds, tmp_path):
         del file["skin"]
         data = file.create_dataset("skin", (2**40, 1), "f8", chunks=(64, 1))
         data.attrs["MATLAB_class"] = np.bytes_("double")
-    with pytest.raises(etid.RecordingError, match="0 of them stored"):
+    with pytest.raises(etid.RecordingError, match="only 0 bytes are stored"):
         kinds["matlab"].use(path, 0)
 
 

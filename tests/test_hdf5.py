@@ -227,7 +227,7 @@ PROBLEMS = {
     "NaN rate": (set_attribute(DAMP, "pulse_rate", np.nan), "pulse_rate: is nan"),
     "aliased": (set_attribute(DAMP, "pulse_rate", 1e5), "pulse_rate: is 100000 Hz, must be below"),
     "null": (set_attribute(DAMP, "pulse_rate", h5py.Empty("f8")), "pulse_rate: is empty"),
-    "kind": (set_attribute(DAMP, "kind", "skin"), "kind: is 'skin'. The schema wants kind"),
+    "kind": (set_attribute(DAMP, "kind", "skin"), "kind: is 'skin'. The schema requires kind"),
     "no kind": (delete(DAMP, "kind"), "kind: is missing"),
     "r_load": (set_attribute(DAMP, "r_load", 1e3), "r_load: a loaded recording must not have it"),
     "no calibration": (
@@ -282,8 +282,8 @@ PROBLEMS = {
         put("v_out", h5py.ExternalLink("b.h5", "/x")),
         "is a link to another file, 'b.h5'",
     ),
-    "virtual": (make_virtual, "v_out: its samples lie in another file"),
-    "external storage": (make_external_storage, "v_out: its samples lie in another file"),
+    "virtual": (make_virtual, "v_out: its samples are in another file"),
+    "external storage": (make_external_storage, "v_out: its samples are in another file"),
 }
 
 
@@ -312,7 +312,7 @@ def test_a_reference_is_not_a_path(edit):
     problem = hdf5.check(edit(refer))[0]
     assert (problem.field, problem.message) == (
         "calibration",
-        "is an HDF5 reference, write the path as text",
+        "is an HDF5 reference; write the path as text",
     )
 
 
@@ -374,7 +374,7 @@ STRUCTURE = {
     "dataset for a group": (
         lambda file: file.create_dataset("s02", data=1.0).attrs.update(kind="loaded"),
         "s02",
-        "where a group is expected",
+        "but must be a group",
     ),
     "lost dataset": (
         lambda file: file.create_dataset("s02/v_th", data=1.0),

@@ -1,4 +1,4 @@
-"""Recordings and studies: their fields, their HDF5 files, and what is checked before a fit.
+"""Recordings and studies: their fields, their HDF5 files, and the checks before a fit.
 
-Files of other programs are read in `etid.files`.
+Code for files of other programs belongs to `etid.files`.
 """

@@ -1,6 +1,6 @@
-"""One walk through an HDF5 file: which recordings it holds, and what is wrong with the others.
+"""Recordings of an HDF5 file, and the faults of the others, found in one walk through the file.
 
-Attributes and the headers of datasets are read; samples are not, until a recording is loaded.
+The walk reads attributes and the headers of datasets. Samples are read when a recording is loaded.
 """
 
 import contextlib
@@ -22,15 +22,15 @@ from etid.recordings.recording import AbstractSource, Layout, Recording, Recordi
 from etid.recordings.untrusted import LIBRARY_ERRORS, Attributes, check_size, local_link, translated
 from etid.signals.pulse_train import find_pulses
 
-_DIGITS = 1000  # of a number in a name, above which Python refuses to read it
-OPEN = 8  # datasets of stacks that stay open
+_DIGITS = 1000  # most digits of a number in a name; Python does not convert much longer numbers
+OPEN = 8  # most datasets of stacks that stay open
 
 _NAMES = {field.name for field in schema.FIELDS}
 
 
 @dataclasses.dataclass(frozen=True)
 class _Header:
-    """What is known of a dataset without reading its samples."""
+    """Shape, dtype and scale of a dataset, read without its samples."""
 
     shape: tuple[int, ...]
     dtype: np.dtype
@@ -77,14 +77,14 @@ class _Block:
             stored = dataset[row] if header.stacked else dataset[()]
             stored.flags.writeable = False
             samples = Samples(stored, header.conversion, header.offset)
-        if common:  # kept as long as some recording of the stack is in use
+        if common:  # shared as long as a recording of the stack is in use
             self.shared = weakref.ref(samples)
         return samples
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class _Row(AbstractSource):
-    """One recording of a file."""
+    """One recording of a file; `row` is None if the group is not a stack."""
 
     block: _Block
     row: int | None
@@ -120,12 +120,13 @@ class _Row(AbstractSource):
 
 
 class Scan:
-    """One walk through a file: its recording groups, and what is wrong with the others."""
+    """Recording groups of a file, and the faults of the others."""
 
     def __init__(self, file: h5py.File, name: str) -> None:
         self.file = file
         self.name = name
-        # Opening a stack costs as much as reading a row, but each holds megabytes of its chunks.
+        # To open a stack takes as long as to read a row, but an open stack keeps megabytes of
+        # chunks in memory.
         self.opened = functools.lru_cache(OPEN)(file.__getitem__)
         self.blocks: dict[str, _Block] = {}
         self.problems: list[RecordingError] = []
@@ -140,11 +141,11 @@ class Scan:
         self.blocks = {path: block for path, block in self.blocks.items() if path not in wrong}
 
     def sources(self) -> dict[str, AbstractSource]:
-        """The recordings that can be read, by path."""
+        """The readable recordings, by path."""
         return {row.metadata.path: row for block in self.blocks.values() for row in block.rows()}
 
     def check_samples(self) -> None:
-        """Read all samples; what cannot be read, is not finite or denies the rates is a problem."""
+        """Read all samples, and report unreadable and infinite samples and wrong rates."""
         for path, source in self.sources().items():
             with self._reported(path):
                 recording = source.load()
@@ -155,7 +156,7 @@ class Scan:
                             path,
                             name,
                             f"{count} of {record.stored.size} samples are not finite",
-                            "Record again, or expect a verdict instead of a fit",
+                            "Record again; a fit of this recording only gives a verdict",
                         )
                 train = find_pulses(recording.v_th, recording.sample_rate, recording.pulse_rate)
                 if train.mismatch:
@@ -169,7 +170,7 @@ class Scan:
 
     @contextlib.contextmanager
     def _reported(self, path: str, field: str = "") -> Iterator[None]:
-        """Put an error aside and go on."""
+        """Add an error to `problems` and continue."""
         try:
             with translated(self.name, path or "/", field):
                 yield
@@ -201,12 +202,12 @@ class Scan:
         return None
 
     def _enter(self, group: h5py.Group, name: str, path: str) -> None:
-        """Walk on into a member of an ordinary group."""
+        """Continue the walk in a member of a group that is not a recording."""
         link = local_link(group, name)
         if isinstance(link, h5py.SoftLink):
             if group.get(name) is None:
                 raise RecordingError(
-                    f"is a dangling link to {link.path!r}", remedy="Remove or mend it"
+                    f"is a dangling link to {link.path!r}", remedy="Remove or repair it"
                 )
             if isinstance(group[name], h5py.Group):
                 raise RecordingError(
@@ -223,7 +224,7 @@ class Scan:
             )
         elif isinstance(member, h5py.Dataset) and "kind" in member.attrs:
             raise RecordingError(
-                "is a dataset with the attribute kind, where a group is expected",
+                "is a dataset with the attribute kind, but must be a group",
                 remedy="Make it a group with the datasets v_th and v_out",
             )
 
@@ -263,7 +264,7 @@ class Scan:
             if isinstance(group.get(name, getlink=True), h5py.HardLink):
                 member = group[name]
                 if isinstance(member, h5py.Group) and "kind" in member.attrs:
-                    remedy = "Put it beside the other"
+                    remedy = "Move it out of that recording"
                     self._report(
                         f"{path}/{name}", "", f"lies inside the recording {path!r}", remedy
                     )
@@ -286,7 +287,7 @@ class Scan:
     def _attributes(
         self, owner: h5py.HLObject, known: dict[str, Field], path: str, of: str
     ) -> dict[str, Any]:
-        """The attributes that are in the schema, parsed; those that cannot be are reported."""
+        """Parsed values of the attributes in the schema; invalid values are reported."""
         found: dict[str, Any] = {}
         for name in self._stored.names(owner):
             if name not in known:
@@ -299,38 +300,38 @@ class Scan:
             try:
                 found[name] = known[name].parse(value)
             except ValueError as error:
-                remedy = f"The schema wants {known[name].expects}"
+                remedy = f"The schema requires {known[name].expects}"
                 self._report(path, f"{of}{name}", str(error), remedy)
         return found
 
     def _header(self, group: h5py.Group, field: Field, path: str) -> _Header:
-        """Shape, dtype and scale of a dataset that lies in this file."""
+        """Shape, dtype and scale of a dataset; its samples must be in this file."""
         link = local_link(group, field.name)
         remedy = "Copy the samples into the file"
         if group.get(field.name) is None:
             target = getattr(link, "path", "")
-            raise RecordingError(f"is a dangling link to {target!r}", remedy="Mend the link")
+            raise RecordingError(f"is a dangling link to {target!r}", remedy="Repair the link")
         dataset = group[field.name]
         if not isinstance(dataset, h5py.Dataset):
             what = "group" if isinstance(dataset, h5py.Group) else "datatype"
             raise RecordingError(f"is a {what}", remedy=f"Add {field.expects} as a dataset")
         here = h5o.get_info(self.file.id).fileno
         if h5o.get_info(dataset.id).fileno != here or dataset.external or dataset.is_virtual:
-            raise RecordingError("its samples lie in another file", remedy=remedy)
+            raise RecordingError("its samples are in another file", remedy=remedy)
         if dataset.dtype.kind not in "iuf" or dataset.dtype.itemsize > 8:
             raise RecordingError(
                 f"has dtype {dataset.dtype}",
-                remedy="Store integers or real numbers, at most 64 bit",
+                remedy="Store integers or real numbers of at most 64 bits",
             )
         shape = dataset.shape
         if shape is None or len(shape) not in (1, 2) or 0 in shape:
             what = "is empty" if shape is None or 0 in shape else f"has shape {shape}"
-            raise RecordingError(what, remedy=f"The schema wants {field.expects}")
+            raise RecordingError(what, remedy=f"The schema requires {field.expects}")
         if shape[-1] > limits.SAMPLES or (shape[0] > limits.TRIALS and len(shape) == 2):
             raise RecordingError(
-                f"has shape {shape}, at most {limits.TRIALS} trials of {limits.SAMPLES} samples "
+                f"has shape {shape}; at most {limits.TRIALS} trials of {limits.SAMPLES} samples "
                 "are read",
-                remedy="Split it",
+                remedy="Split the recording",
             )
         check_size(dataset)
         before = len(self.problems)
@@ -350,7 +351,7 @@ class Scan:
         return _Header(shape, dataset.dtype, *scale)
 
     def _block(self, path: str, found: dict[str, Any], headers: dict[str, _Header]) -> _Block:
-        """What a group holds, once each field is right by itself."""
+        """Block of a group whose fields are valid; checks that the fields match each other."""
         shapes = {name: header.shape for name, header in headers.items()}
         out = shapes["v_out"]
         once = [name for name, shape in shapes.items() if shape != out]
@@ -358,8 +359,8 @@ class Scan:
             found_shapes = ", ".join(f"{name} {shape}" for name, shape in shapes.items())
             raise RecordingError(
                 f"shapes do not fit each other: {found_shapes}",
-                remedy="The schema wants (time,) or (trial, time); only v_th may be (time,) beside "
-                "a stacked v_out",
+                remedy="The schema requires (time,) or (trial, time); only v_th may be (time,) "
+                "if v_out is stacked",
             )
         stacked = len(out) == 2
         if stacked and found["kind"] == "calibration":
@@ -380,7 +381,7 @@ class Scan:
             found["trial"] = trials[0]
         metadata = metadata_from(**found, path=path)
         for trial in trials or ():
-            metadata_from(**{**found, "trial": trial})  # for its check of the text
+            metadata_from(**{**found, "trial": trial})  # checks the text of the label
         return _Block(
             self.file, self.opened, self.name, metadata, trials if stacked else None, headers
         )
@@ -395,7 +396,7 @@ class Scan:
 
 
 def _natural(name: str) -> list[tuple[int, str]]:
-    """Sorting key: digits count as numbers."""
+    """Sorting key that orders digits by their number: 2 before 10."""
     parts = re.split(r"([0-9]+)", name)
     numbers = (part.isdecimal() and len(part) < _DIGITS for part in parts)
     return [(int(p), "") if whole else (-1, p) for p, whole in zip(parts, numbers, strict=True)]

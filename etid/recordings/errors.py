@@ -1,4 +1,4 @@
-"""The error that says where something is wrong, what, and what to do."""
+"""The error that names the place of a fault, the fault, and a remedy."""
 
 import contextlib
 import difflib
@@ -6,14 +6,14 @@ from collections.abc import Iterable, Iterator
 
 
 class RecordingError(ValueError):
-    """Something is wrong with a recording or its file; says where, what, and what to do.
+    """Fault of a recording or its file: names the place, the fault, and a remedy.
 
     Attributes:
-        message: What was found and what was expected.
+        message: The fault: what was found and what was expected.
         file: Path of the file; empty for a recording in memory.
-        path: HDF5 path of the recording inside the file.
+        path: HDF5 path of the recording in the file.
         field: Name of the attribute, dataset or argument.
-        remedy: What to do about it.
+        remedy: What the user can do.
     """
 
     def __init__(
@@ -34,11 +34,12 @@ class RecordingError(ValueError):
         return f"{text}. {self.remedy}." if self.remedy else f"{text}."
 
     def __reduce__(self) -> tuple:
-        # exceptions pickle by their positional arguments alone; workers send these across processes
+        # Workers send these errors between processes. By default an exception pickles only its
+        # positional arguments.
         return (_rebuild_error, (self.message, self.file, self.path, self.field, self.remedy))
 
     def located(self, *, file: str = "", path: str = "", field: str = "") -> "RecordingError":
-        """The same error with the parts of its place that it did not know yet."""
+        """The same error; parts of its place that are empty are filled in."""
         return RecordingError(
             self.message,
             file=self.file or file,
@@ -62,18 +63,18 @@ def located(
     message: str = "cannot be read",
     remedy: str = "",
 ) -> Iterator[None]:
-    """Give an error of this block its place, and make a `RecordingError` of a library's error.
+    """Add the place to an error of this block, and convert a library's error to `RecordingError`.
 
     Args:
         file: Path of the file.
         path: HDF5 path of the recording.
         field: Name of the attribute, dataset or argument.
-        foreign: Errors of a library.
-        message: What such an error means; its own text stands behind.
-        remedy: What to do about it.
+        foreign: Types of a library's errors.
+        message: Message for a library's error; the error's own text follows in brackets.
+        remedy: Remedy for a library's error.
 
     Raises:
-        RecordingError: In place of every error of the block; one of etid keeps its text.
+        RecordingError: The block raised a `RecordingError` or an error of `foreign`.
     """
     try:
         yield
@@ -90,7 +91,7 @@ def located(
 
 
 def near_miss(name: str, known: Iterable[str]) -> str | None:
-    """The known name that an unknown one was probably meant to be."""
+    """Known name that is similar to an unknown name; None if there is none."""
     simple = {_simple(other): other for other in known}
     close = difflib.get_close_matches(_simple(name), simple, n=1, cutoff=0.8)
     return simple[close[0]] if close else None

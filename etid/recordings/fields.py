@@ -1,8 +1,9 @@
 """The fields of a recording, declared once.
 
-`AbstractFields` declares everything about a recording but its samples, and `SIGNALS` its samples.
-The schema and its page, the reader, the writer, `Recording`, mappings, the command line, the table
-of fits and the report take the fields from here. A new field is a line here and nowhere else.
+`SIGNALS` declares the samples of a recording. `AbstractFields` declares all other fields. The
+schema and its page, the reader, the writer, `Recording`, mappings, the command line, the table of
+fits and the report use these declarations. A new field needs one declaration here and no other
+change.
 """
 
 import dataclasses
@@ -25,18 +26,19 @@ class Field:
     """One field of the schema.
 
     Attributes:
-        place: What it is and what it belongs to.
-        name: Its name in the file.
+        place: Kind of HDF5 object: an attribute of a file, group or dataset, or a dataset.
+        name: Name of the field in the file.
         type: `text`; `paths`, one or more paths of recordings; `label`, text or an integer;
             `number`; `range`, two increasing numbers; `samples`, integers or real numbers.
-        shape: Its dimensions; `()` is a scalar, and so is an array of one element.
-        unit: SI unit; empty for what has none.
+        shape: Shape of the value; `()` is a scalar or an array of one element.
+        unit: SI unit; empty if the field has no unit.
         positive: Whether a number must be > 0.
-        required: Where it must be present: `always`, `optional`, or a kind of recording.
-        forbidden: The kind of recording that must not have it.
-        values: The only texts allowed; empty if any is.
-        description: What it means.
-        example: A value.
+        required: Whether the field must be present: `always`, `optional`, or the kind of recording
+            that needs it.
+        forbidden: Kind of recording that must not have the field; empty if there is none.
+        values: Allowed texts; empty if every text is allowed.
+        description: Meaning of the field.
+        example: Example of a value.
     """
 
     place: Place
@@ -53,21 +55,21 @@ class Field:
 
     @property
     def expects(self) -> str:
-        """What a writer has to put there, in words."""
+        """Text for errors: name, unit, type, shape and allowed values."""
         unit = f" [{self.unit}]" if self.unit else ""
         values = f", one of {', '.join(map(repr, self.values))}" if self.values else ""
         return f"{self.name}{unit}: {self.type} of shape {self.shape}{values}"
 
     @property
     def empty(self) -> Any:
-        """The value of a recording that has none."""
+        """Value of the field if a recording does not have it."""
         return {"label": "", "paths": ()}.get(self.type)
 
     def parse(self, value: Any) -> Any:
-        """The value of an attribute in a file as plain Python: str, float, tuple of either.
+        """Value of an attribute of a file as a Python str, a float, or a tuple of them.
 
         Raises:
-            ValueError: It is not what the schema says; the text says what it is instead.
+            ValueError: The value does not follow the schema; the text describes the value.
         """
         array = np.asarray(value)
         if array.size == 0 or "Empty" in type(value).__name__:
@@ -75,7 +77,7 @@ class Field:
         if array.dtype.names is not None:
             raise ValueError("is a compound value")
         if array.dtype.hasobject and any(type(x).__module__.startswith("h5py") for x in array.flat):
-            raise ValueError("is an HDF5 reference, write the path as text")
+            raise ValueError("is an HDF5 reference; write the path as text")
         items = [stored(item, self.type) for item in array.flat]
         if self.values and items[0] not in self.values:
             raise ValueError(f"is {items[0]!r}")
@@ -87,10 +89,10 @@ class Field:
         return tuple(items) if many else items[0]
 
     def checked(self, value: Any) -> Any:
-        """The value of a caller as plain Python.
+        """Value that a caller gives, as Python types.
 
         Raises:
-            RecordingError: It is not what the schema says.
+            RecordingError: The value does not follow the schema.
         """
         if value is None:
             return self.empty
@@ -118,8 +120,8 @@ SIGNALS = {
             type="samples",
             shape="(time,) or (trial, time)",
             unit="volt",
-            description="Unloaded output of the driver. `(time,)` beside a stacked `v_out` is one "
-            "unloaded record for all its trials.",
+            description="Unloaded output voltage of the driver. If `v_out` is stacked, the shape "
+            "`(time,)` means one unloaded record for all trials.",
             example=[0, -3, 812],
         ),
         Field(
@@ -128,7 +130,7 @@ SIGNALS = {
             type="samples",
             shape="(time,) or (trial, time)",
             unit="volt",
-            description="Output with the load connected.",
+            description="Output voltage of the driver with the load connected.",
             example=[0, -2, 640],
         ),
         Field(
@@ -146,7 +148,7 @@ SIGNALS = {
 
 
 def tidy_path(path: str) -> str:
-    """An HDF5 path without leading and trailing slashes; refuses what cannot be a recording's."""
+    """HDF5 path of a recording, without slashes at its ends; raises an error if it is invalid."""
     tidy = text("path", path).strip("/")
     parts = tidy.split("/") if tidy else []
     if any(part in ("", ".", "..", *SIGNALS) for part in parts):
@@ -160,7 +162,7 @@ def tidy_path(path: str) -> str:
 
 
 def _field(kind: Type, *, required: str = "optional", **declared: Any) -> Any:
-    """A field of a recording: an attribute of its group in a file."""
+    """Declare a field of a recording; in a file it is an attribute of the recording's group."""
     field = Field(place="group attribute", name="", type=kind, required=required, **declared)
     default = dataclasses.MISSING if required == "always" else field.empty
     return dataclasses.field(default=default, metadata={"declared": field})
@@ -168,10 +170,10 @@ def _field(kind: Type, *, required: str = "optional", **declared: Any) -> Any:
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
 class AbstractFields:
-    """The fields of a recording, but its samples.
+    """All fields of a recording except its samples.
 
     Attributes:
-        path: HDF5 path inside a study, such as `s01/dry/03`; not a field of the file.
+        path: HDF5 path in the study, such as `s01/dry/03`. It is not stored as a field.
     """
 
     path: str = ""
@@ -197,26 +199,26 @@ class AbstractFields:
         positive=True,
         required="calibration",
         forbidden="loaded",
-        description="The known resistor, > 0. Its error passes one to one into every impedance "
-        "that is identified with it.",
+        description="Resistance of the known resistor, > 0. A relative error of this value causes "
+        "the same relative error in every impedance that is identified with this calibration.",
         example=98800.0,
     )
-    subject: str = _field("label", description="Who.", example="s01")
+    subject: str = _field("label", description="Person whose skin was recorded.", example="s01")
     condition: str = _field(
-        "label", description="Which state of the skin, or which circuit.", example="dry"
+        "label", description="State of the skin, or name of the circuit.", example="dry"
     )
-    electrode: str = _field("label", description="Which electrode of the display.", example="E17")
+    electrode: str = _field("label", description="Electrode of the display.", example="E17")
     trial: str = _field(
         "label",
         shape="() or (trial,)",
-        description="Which repetition; one label per row in a stacked group.",
+        description="Repetition of the measurement; a stacked group has one label per row.",
         example=["0", "1", "2"],
     )
     calibration: tuple[str, ...] = _field(
         "paths",
         shape="() or (calibration,)",
         forbidden="calibration",
-        description="HDF5 paths of the calibration groups that belong to the recording; "
+        description="HDF5 paths of the calibration groups of this recording; "
         "each must exist in the file.",
         example=["calibration/0"],
     )
@@ -224,7 +226,7 @@ class AbstractFields:
         "range",
         shape="(2,)",
         unit="volt",
-        description="Lowest and highest voltage at the terminal that the converter can tell; "
+        description="Lowest and highest voltage at the terminal that the converter can measure; "
         "samples at these limits are saturated.",
         example=[-186.9, 186.9],
     )
@@ -236,7 +238,7 @@ DECLARED: dict[str, Field] = {
     if "declared" in field.metadata
 }
 LABELS = tuple(name for name, field in DECLARED.items() if field.type == "label")
-# What a table of fits says of each recording besides its path: labels, and measured numbers.
+# Fields that a table of fits contains for each recording: labels and optional numbers.
 DESCRIBING = {
     name: field
     for name, field in DECLARED.items()
@@ -246,7 +248,7 @@ DESCRIBING = {
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Metadata(AbstractFields):
-    """Everything about a recording but its samples."""
+    """All fields of a recording except its samples, with checked values."""
 
     def __post_init__(self) -> None:
         if self.pulse_rate >= self.sample_rate / 2:
@@ -257,7 +259,7 @@ class Metadata(AbstractFields):
             )
         if self.r_load is not None and self.calibration:
             raise RecordingError(
-                "a recording with a known resistor (r_load) is a calibration and has none itself",
+                "a recording with a known resistor (r_load) is a calibration; it has none itself",
                 field="calibration",
             )
 
@@ -268,10 +270,10 @@ class Metadata(AbstractFields):
 
 
 def metadata_from(*, path: str = "", **fields: Any) -> Metadata:
-    """Metadata from unchecked values; the one place where their types are settled.
+    """Metadata from unchecked values; only this function checks and converts their types.
 
     Raises:
-        RecordingError: A value is not what the schema says, a field is unknown, or one is missing.
+        RecordingError: A value does not follow the schema, or a field is unknown or missing.
     """
     check_names(fields, tuple(DECLARED), "field of a recording")
     for name, field in DECLARED.items():
@@ -282,16 +284,16 @@ def metadata_from(*, path: str = "", **fields: Any) -> Metadata:
 
 
 def check_names(given: Mapping[str, Any], known: Sequence[str], what: str, of: str = "") -> None:
-    """Refuse a name that is not known.
+    """Raise an error if a name is not known.
 
     Args:
         given: Values by name.
-        known: Names that there are.
-        what: What they are names of.
-        of: What stands before the name in the error.
+        known: Known names.
+        what: Word for these names in the error, such as "label".
+        of: Text before the name in the error, such as "v_th.".
 
     Raises:
-        RecordingError: A name is not known; the error names one that is near.
+        RecordingError: A name is not known; the error suggests a similar known name.
     """
     for name in given:
         if name not in known:
@@ -299,15 +301,15 @@ def check_names(given: Mapping[str, Any], known: Sequence[str], what: str, of: s
             raise RecordingError(
                 f"is no {what}{f', did you mean {near}?' if near else ''}",
                 field=f"{of}{name}",
-                remedy=f"There are {', '.join(known)}",
+                remedy=f"Use one of {', '.join(known)}",
             )
 
 
 def wanted_labels(given: Mapping[str, Any], known: Sequence[str]) -> dict[str, str]:
-    """Labels by which recordings or fits are chosen, as text; those that are None are left out.
+    """Labels for a choice of recordings or fits, as text; labels that are None are ignored.
 
     Raises:
-        RecordingError: There is no label of that name, or its value is no label.
+        RecordingError: The name of a label is unknown, or a value is neither text nor an integer.
     """
     check_names(given, known, "label")
     return {name: text(name, value) for name, value in given.items() if value is not None}

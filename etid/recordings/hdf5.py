@@ -1,8 +1,8 @@
-"""Studies in HDF5 files: `read`, and `check`, which says all that is wrong with a file.
+"""Studies in HDF5 files: `read` opens a file, `check` lists all faults of a file.
 
-The layout is that of `etid.recordings.schema`. Opening a file reads attributes and the headers of
-datasets only; samples are read when a recording is accessed. Trouble with the whole file is raised,
-trouble with one recording is put aside in `Study.problems`.
+The layout is that of `etid.recordings.schema`. `read` reads only attributes and the headers of
+datasets; samples are read when a recording is accessed. A fault of the whole file is raised. A
+fault of one recording is stored in `Study.problems`.
 """
 
 import os
@@ -18,16 +18,16 @@ from etid.recordings.untrusted import Attributes, check_file, translated
 
 
 def read(path: str | os.PathLike[str]) -> Study:
-    """Open a file of recordings; the samples are read when they are needed.
+    """Open a file of recordings; samples are read when a recording is accessed.
 
     Args:
-        path: The file.
+        path: Path of the file.
 
     Returns:
-        Its recordings in the order of their paths, numbers in them by value.
+        Recordings of the file, sorted by path; numbers in a path are sorted by value.
 
     Raises:
-        RecordingError: The file as a whole is missing, damaged or of another schema.
+        RecordingError: The file is missing, damaged or of another schema.
     """
     name = os.fspath(path)
     file = _open(name)
@@ -43,15 +43,16 @@ def read(path: str | os.PathLike[str]) -> Study:
 
 
 def check(path: str | os.PathLike[str]) -> list[RecordingError]:
-    """All that is wrong with a file, field by field.
+    """All faults of a file, field by field.
 
-    Samples that are not finite are, and pulses that are not as far apart as both rates say.
+    Faults are also samples that are not finite, and a distance between the pulses that does not
+    match the sample rate and the pulse rate.
 
     Args:
-        path: The file.
+        path: Path of the file.
 
     Returns:
-        The problems; none, if the file can be used whole.
+        The faults; empty if all recordings of the file can be used.
     """
     name = os.fspath(path)
     try:
@@ -64,7 +65,7 @@ def check(path: str | os.PathLike[str]) -> list[RecordingError]:
 
 
 def _open(name: str) -> h5py.File:
-    """The file, once its root says that it follows the schema."""
+    """Open file, if its root has the attributes of the schema."""
     check_file(name)
     with translated(name):
         file = h5py.File(name, "r")
@@ -93,5 +94,5 @@ def _check_root(file: h5py.File, name: str, attributes: Attributes) -> None:
     problem = schema.version_problem(found["schema_version"])
     if problem:
         raise RecordingError(
-            problem, file=name, field="schema_version", remedy="Read it with the etid that wrote it"
+            problem, file=name, field="schema_version", remedy="Use the etid that wrote the file"
         )

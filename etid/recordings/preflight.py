@@ -1,4 +1,4 @@
-"""Pre-flight: what can be seen to be wrong with a recording before anything is fitted."""
+"""Pre-flight: faults of a recording that can be detected before a fit."""
 
 import functools
 import math
@@ -18,22 +18,21 @@ from etid.signals.measurement import trusted
 from etid.signals.noise import noise_std
 from etid.signals.pulse_train import CLOCK, PulseTrain, find_pulses, rise_time
 
-SHORTEST = 4 * TAPS + 104  # samples: the interpolation's edges and a hundred and some to fit
-FLAT = (
-    8.0  # standard deviations of the noise that a signal must exceed, peak to peak, beyond chance
-)
-RAIL = 3  # equal extreme samples in a row that a noisy or sloping signal does not produce
-JUMP = 8.0  # converter steps by which a clipped signal enters and leaves its rail
-POWER = 1.01  # of v_out over v_th; a passive load takes power, and gains match better than this
-EQUAL = 1e-3  # by which amplitudes may differ if nothing is connected
-SAME = 1.5  # of the variance of the noise, by which they may differ then
-LATE = 5e-3  # of the signal, which a delay of a tenth of a sample leaves of the edges as well
-SEAM = 3  # samples on both sides of the joint between two periods
-STEP = 4.0  # standard deviations of the noise by which they may differ there
+SHORTEST = 4 * TAPS + 104  # [samples] edges of the interpolation, and 104 samples for the fit
+# [standard deviations] peak-to-peak value that noise alone hardly exceeds; a signal must exceed it
+FLAT = 8.0
+RAIL = 3  # equal extreme samples in a row; a noisy or sloping signal does not produce them
+JUMP = 8.0  # [converter steps] a clipped signal reaches and leaves its rail in larger jumps
+POWER = 1.01  # largest variance of v_out relative to v_th: a passive load takes power
+EQUAL = 1e-3  # largest relative difference of the amplitudes if no load is connected
+SAME = 1.5  # largest variance of their difference then, relative to the noise
+LATE = 5e-3  # fraction of the signal that a delay of 0.1 sample may leave at the edges
+SEAM = 3  # samples on each side of the joint between two periods
+STEP = 4.0  # [standard deviations] largest difference there; also allowed in addition to EQUAL
 
 
 class Inspected:
-    """A recording, and what can be said of it without a model: everything once, when asked.
+    """A recording and its properties that need no model; each is computed once, when it is used.
 
     Attributes:
         recording: The recording.
@@ -44,49 +43,50 @@ class Inspected:
 
     @functools.cached_property
     def v_th(self) -> Float[np.ndarray, " time"]:
-        """Unloaded voltage [V], without hum that can be told from the pulses and as `kept`."""
+        """Unloaded voltage [V] of the periods in use, without hum between the harmonics."""
         return self._joined(self.quiet_th)
 
     @functools.cached_property
     def v_out(self) -> Float[np.ndarray, " time"]:
-        """The same of the loaded voltage."""
+        """Loaded voltage [V] of the periods in use, without hum between the harmonics."""
         return self._joined(self.quiet_out)
 
     @functools.cached_property
     def recorded_th(self) -> Float[np.ndarray, " time"]:
-        """Unloaded voltage as it was recorded [V], as `kept`."""
+        """Unloaded voltage of the periods in use as it was recorded [V]."""
         return self._joined(self.whole_th)
 
     @functools.cached_property
     def recorded_out(self) -> Float[np.ndarray, " time"]:
-        """The same of the loaded voltage."""
+        """Loaded voltage of the periods in use as it was recorded [V]."""
         return self._joined(self.whole_out)
 
     @functools.cached_property
     def whole_th(self) -> Float[np.ndarray, " time"]:
-        """Unloaded voltage as it was recorded [V], of all periods."""
+        """Unloaded voltage of all periods as it was recorded [V]."""
         return self.recording.v_th
 
     @functools.cached_property
     def whole_out(self) -> Float[np.ndarray, " time"]:
-        """The same of the loaded voltage."""
+        """Loaded voltage of all periods as it was recorded [V]."""
         return self.recording.v_out
 
     @functools.cached_property
     def quiet_th(self) -> Float[np.ndarray, " time"]:
-        """Unloaded voltage [V] of all periods without hum."""
+        """Unloaded voltage of all periods without hum [V]."""
         return self._without(self.hum_th, self.whole_th)
 
     @functools.cached_property
     def quiet_out(self) -> Float[np.ndarray, " time"]:
-        """The same of the loaded voltage."""
+        """Loaded voltage of all periods without hum [V]."""
         return self._without(self.hum_out, self.whole_out)
 
     @functools.cached_property
     def kept(self) -> Joint | None:
-        """The pulse periods that are used, if one was disturbed and is left out; else None.
+        """The pulse periods in use if disturbed periods are left out; None if all are in use.
 
-        Disturbed are the fewest: of others it would not be known what they should look like.
+        Fewer than half of the periods may be left out: the others must show the shape of an
+        undisturbed period.
         """
         if self.train.mismatch:
             return None
@@ -110,7 +110,7 @@ class Inspected:
 
     @property
     def begins(self) -> Float[np.ndarray, " period"]:
-        """Where the periods of `v_th` begin [samples]."""
+        """Start of each period of `v_th` [samples]."""
         return self.spacing * np.arange(self.periods[0]) if self.kept is None else self.kept.begins
 
     @functools.cached_property
@@ -120,7 +120,7 @@ class Inspected:
 
     @functools.cached_property
     def coarse_out(self) -> float:
-        """The same of `v_out`."""
+        """Converter step [V] of `v_out` if it exceeds the noise, else 0."""
         return self._coarse(self.whole_out, self.step_out)
 
     def _coarse(self, v: Float[np.ndarray, " time"], told: float) -> float:
@@ -129,12 +129,12 @@ class Inspected:
 
     @functools.cached_property
     def hum_th(self) -> Hum | None:
-        """Hum of `v_th` that was subtracted."""
+        """Hum that is subtracted from `v_th`; None if there is none."""
         return self._hum(self.whole_th, self.noise_th)
 
     @functools.cached_property
     def hum_out(self) -> Hum | None:
-        """The same of `v_out`."""
+        """Hum that is subtracted from `v_out`; None if there is none."""
         return self._hum(self.whole_out, self.noise_out)
 
     def _hum(self, v: Float[np.ndarray, " time"], sigma: Float[np.ndarray, ""]) -> Hum | None:
@@ -145,9 +145,11 @@ class Inspected:
         return v if hum is None else v - hum(v.size, self.recording.sample_rate)
 
     def covered(self, frequency: Float[np.ndarray, " harmonic"]) -> Bool[np.ndarray, " harmonic"]:
-        """Harmonics that hum covers although it was subtracted, or that aliases do.
+        """Whether each harmonic is unusable because of hum or aliases.
 
-        Aliases of two periods, or without one of three, are half as large as those of a single one.
+        Hum covers a harmonic if the subtraction does not remove it there. Aliases cover the high
+        harmonics of records with two periods or with periods left out. They are half as large as
+        the aliases of a single period.
         """
         aliased = self.kept is not None or self.periods[0] == 2
         none = aliased & (frequency > ALIASED * self.recording.sample_rate)
@@ -156,41 +158,41 @@ class Inspected:
 
     @property
     def step_th(self) -> float:
-        """Converter step [V] of `v_th`, 0 if it is not known."""
+        """Converter step [V] of `v_th`; 0 if it is unknown."""
         return self.recording.samples["v_th"].resolution or 0.0
 
     @property
     def step_out(self) -> float:
-        """The same of `v_out`."""
+        """Converter step [V] of `v_out`; 0 if it is unknown."""
         return self.recording.samples["v_out"].resolution or 0.0
 
     @functools.cached_property
     def noise_th(self) -> Float[np.ndarray, ""]:
-        """Noise of a sample of `whole_th` [V]."""
+        """Standard deviation of the noise of a sample of `whole_th` [V]."""
         return np.asarray(noise_std(self.whole_th, self.step_th))
 
     @functools.cached_property
     def noise_out(self) -> Float[np.ndarray, ""]:
-        """The same of `whole_out`."""
+        """Standard deviation of the noise of a sample of `whole_out` [V]."""
         return np.asarray(noise_std(self.whole_out, self.step_out))
 
     @functools.cached_property
     def sigma_th(self) -> Float[np.ndarray, ""]:
-        """Noise of a sample of `v_th` [V]."""
+        """Standard deviation of the noise of a sample of `v_th` [V]."""
         if self.kept is None:
             return self.noise_th
         return np.asarray(noise_std(self.recorded_th, self.step_th))
 
     @functools.cached_property
     def sigma_out(self) -> Float[np.ndarray, ""]:
-        """The same of `v_out`."""
+        """Standard deviation of the noise of a sample of `v_out` [V]."""
         if self.kept is None:
             return self.noise_out
         return np.asarray(noise_std(self.recorded_out, self.step_out))
 
     @property
     def remarks(self) -> Remark:
-        """What is done to the recording before a fit."""
+        """Remarks on how the recording is changed before a fit."""
         hum = self.hum_th is not None or self.hum_out is not None
         coarse = self.coarse_th > 0 or self.coarse_out > 0
         off = abs(self.train.counted / self.recording.pulse_rate - 1) > CLOCK
@@ -202,50 +204,50 @@ class Inspected:
 
     @functools.cached_property
     def correlated(self) -> float | None:
-        """By how many samples `v_out` is late, up to one more by the load; None if misaligned."""
+        """Lag of `v_out` [samples]; the load may add up to one sample. None if misaligned."""
         return lag_of(self.v_th, self.v_out, self.train)
 
     @functools.cached_property
     def lag(self) -> int:
-        """Whole samples by which `v_out` is late, and by which it is shifted before a fit."""
+        """Lag of `v_out` in whole samples; `v_out` is shifted by it before a fit."""
         return 0 if self.correlated is None else whole_lag(self.correlated)
 
     @property
     def aligned(self) -> tuple[Float[np.ndarray, " overlap"], Float[np.ndarray, " overlap"]]:
-        """Both voltages [V] where they overlap after that shift."""
+        """Both voltages [V] in their overlap after the shift by `lag`."""
         return shifted(self.v_th, self.v_out, self.lag)
 
     @functools.cached_property
     def train(self) -> PulseTrain:
-        """The pulses of `v_th`."""
+        """Pulse train of `v_th`."""
         return find_pulses(self.whole_th, self.recording.sample_rate, self.recording.pulse_rate)
 
     @functools.cached_property
     def pulse_rate(self) -> float:
-        """Pulse rate [Hz] by its own clock."""
+        """Pulse rate [Hz], measured with the clock of the recording."""
         return self.train.counted
 
     @property
     def spacing(self) -> float:
-        """Length of a period by its own clock [samples]."""
+        """Length of a pulse period [samples], from the measured pulse rate."""
         return self.recording.sample_rate / self.pulse_rate
 
     @functools.cached_property
     def whole_periods(self) -> tuple[int, int]:
-        """How many whole periods it holds by its own clock, and how many samples they are."""
+        """Number of whole periods in the record, and their number of samples."""
         return whole_periods(self.whole_out.size, self.recording.sample_rate, self.pulse_rate)
 
     @property
     def periods(self) -> tuple[int, int]:
-        """The same of the periods that are `kept`."""
+        """Number of periods in use, and their number of samples."""
         return self.whole_periods if self.kept is None else (self.kept.first.size, self.v_out.size)
 
     @functools.cached_property
     def is_periodic(self) -> bool:
-        """Whether it holds whole pulse periods, each like the other where they are joined.
+        """Whether the record holds whole pulse periods, without a step from its end to its start.
 
-        Periods are a whole number of samples long to within half a sample, which matters where the
-        signal is steep at the joint.
+        The length of the periods differs from whole samples by up to half a sample. This makes a
+        step if the signal is steep at the joint.
         """
         periods, samples = self.periods
         if periods == 0:
@@ -259,14 +261,14 @@ class Inspected:
 
 
 def preflight(seen: Inspected, *, periodic: bool = False) -> str | None:
-    """Name the verdict that forbids a fit, or None.
+    """Name of the verdict that forbids a fit; None if a fit is allowed.
 
     Verdicts: `too_short`, `nonfinite_samples`, `flat`, `saturated`, `unconnected`,
     `rate_mismatch`, `misaligned`, `not_periodic`.
 
     Args:
-        seen: Unloaded and loaded voltage.
-        periodic: Whether whole pulse periods are needed.
+        seen: The recording with its properties.
+        periodic: Whether the fit needs whole pulse periods.
     """
     v_th, v_out, of = seen.v_th, seen.v_out, seen.recording
     if v_th.size < SHORTEST:
@@ -295,7 +297,7 @@ def _is_flat(v: Float[np.ndarray, " time"], sigma: Float[np.ndarray, ""]) -> boo
 
 
 def _is_saturated(v: Float[np.ndarray, " time"], step: float, recording: Recording) -> bool:
-    """Samples at the converter's rails, or a flat top entered and left in jumps."""
+    """Whether samples are at a limit of the converter, or a flat top begins and ends in jumps."""
     if recording.adc_range is not None:
         low, high = recording.adc_range
         return bool((v <= low + step / 2).any() or (v >= high - step / 2).any())
@@ -314,7 +316,7 @@ def _is_saturated(v: Float[np.ndarray, " time"], step: float, recording: Recordi
 
 
 def _is_unconnected(seen: Inspected) -> bool:
-    """Whether v_out is v_th, but for noise, an offset and a part of a sample of delay."""
+    """Whether v_out equals v_th, except for noise, an offset and a delay below one sample."""
     x, y = (v - v.mean() for v in seen.aligned)
     variance = seen.sigma_th**2 + seen.sigma_out**2
     power = x @ x - x.size * seen.sigma_th**2

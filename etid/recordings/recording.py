@@ -1,9 +1,9 @@
 """Recordings of a stimulation experiment in memory.
 
-A recording is two voltages on one clock: `v_th`, the driver's unloaded output, and `v_out`, its
-output with a load.  Samples stay as the instrument stored them; their SI values are
-`conversion * stored + offset`, as in NWB's TimeSeries, so integer converter codes lose nothing and
-the size of a quantisation step stays known.
+A recording is two voltages on one clock: `v_th`, the unloaded output of the driver, and `v_out`,
+its output with a load. Samples stay as the instrument stored them. Their SI values are
+`conversion * stored + offset`, as in a TimeSeries of NWB. So integer converter codes stay exact,
+and the size of a quantisation step is known.
 """
 
 import abc
@@ -24,7 +24,7 @@ from etid.recordings.values import real
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Samples:
-    """One record as its instrument stored it.
+    """One record as the instrument stored it.
 
     value = conversion · stored + offset                    (NWB, TimeSeries)
 
@@ -49,7 +49,7 @@ class Samples:
             raise RecordingError(
                 f"has dtype {array.dtype}, must be integers or real numbers of at most 64 bits"
             )
-        if array.flags.writeable:  # a copy, because the caller may go on writing to the original
+        if array.flags.writeable:  # a copy, because the caller may change the original later
             array = array.copy()
             array.flags.writeable = False
         scale = real("conversion", conversion)
@@ -65,7 +65,7 @@ class Samples:
         if self.conversion == 1 and self.offset == 0 and self.stored.dtype == np.float64:
             return self.stored
         values = self.stored.astype(np.float64)
-        with np.errstate(over="ignore", invalid="ignore"):  # infinite samples have a verdict
+        with np.errstate(over="ignore", invalid="ignore"):  # infinite samples get a verdict
             values *= self.conversion
             values += self.offset
         values.flags.writeable = False
@@ -79,20 +79,20 @@ class Samples:
 
 @dataclasses.dataclass(frozen=True, eq=False, repr=False, init=False)
 class Recording(AbstractFields):
-    """Unloaded and loaded output of a driver on one clock.  Immutable; equal only to itself.
+    """Unloaded and loaded output of a driver on one clock. It is immutable and equals only itself.
 
     Args:
         v_th: Unloaded output [V], real numbers or `Samples`.
         v_out: Output with the load [V], real numbers or `Samples`.
         current: Measured current through the load [A], optional.
-        **fields: All other fields, by name: `path`, `sample_rate` [Hz] and `pulse_rate` [Hz], which
-            are required, `r_load` [ohm], which makes the recording a calibration, the labels
-            `subject`, `condition`, `electrode` and `trial`, the paths of its `calibration`, and
-            `adc_range` [V].
+        **fields: All other fields, by name. `sample_rate` [Hz] and `pulse_rate` [Hz] are required.
+            Optional are `path`; `r_load` [ohm], which makes the recording a calibration; the labels
+            `subject`, `condition`, `electrode` and `trial`; `calibration`, the paths of its
+            calibrations; and `adc_range` [V].
 
     Raises:
-        RecordingError: A mistake that can be seen without looking at the values of the samples.
-            NaN samples are no such mistake.
+        RecordingError: A field is wrong, or a record has a wrong shape or dtype. The values of the
+            samples are not checked: NaN samples raise no error.
     """
 
     samples: Mapping[str, Samples]
@@ -115,7 +115,7 @@ class Recording(AbstractFields):
                 found = ", ".join(f"{name} {length}" for name, length in lengths.items())
                 raise RecordingError(
                     f"numbers of samples differ: {found}",
-                    remedy="Cut the records to the same stretch of time",
+                    remedy="Cut the records to the same time interval",
                 )
             metadata = metadata_from(**fields)
         except RecordingError as error:
@@ -137,7 +137,7 @@ class Recording(AbstractFields):
 
     @property
     def current(self) -> Float[np.ndarray, " time"] | None:
-        """Measured current through the load [A], if there is one."""
+        """Measured current through the load [A]; None if it was not recorded."""
         return self.samples["current"].values if "current" in self.samples else None
 
     @property
@@ -147,12 +147,12 @@ class Recording(AbstractFields):
 
     @property
     def periods(self) -> float:
-        """Length of the records in pulse periods; seldom a whole number."""
+        """Length of the records in pulse periods; usually not a whole number."""
         return self.duration * self.pulse_rate
 
     @property
     def time(self) -> Float[np.ndarray, " time"]:
-        """Time of each sample after the first [s]."""
+        """Time of each sample relative to the first sample [s]."""
         return np.arange(self.samples["v_out"].stored.size) / self.sample_rate
 
     @property
@@ -161,13 +161,13 @@ class Recording(AbstractFields):
         return self.r_load is not None
 
     def replace(self, **changes: Any) -> "Recording":
-        """A copy with some of the constructor's arguments changed.
+        """A copy of the recording with other values for some arguments of the constructor.
 
         Args:
             **changes: New values of arguments, as in `replace(condition="damp")`.
 
         Raises:
-            RecordingError: The new recording would not be a valid one.
+            RecordingError: The new recording would be invalid.
         """
         return Recording(**{**self.samples, **vars(self.metadata), **changes})
 
@@ -188,12 +188,12 @@ def _signature() -> inspect.Signature:
     return inspect.Signature([*samples, *inspect.signature(Metadata).parameters.values()])
 
 
-# Notebooks and editors show this one.
+# Notebooks and editors show this signature.
 setattr(Recording, "__signature__", _signature())  # noqa: B010  # pyright knows no such attribute
 
 
 def _samples(name: str, record: npt.ArrayLike | Samples) -> Samples:
-    """One record of a recording, checked for its shape and dtype."""
+    """Samples of one record, after a check of shape and dtype."""
     try:
         samples = record if isinstance(record, Samples) else Samples(record)
     except RecordingError as error:
@@ -203,7 +203,7 @@ def _samples(name: str, record: npt.ArrayLike | Samples) -> Samples:
             f"holds integers ({samples.stored.dtype}) without a scale",
             field=name,
             remedy="Wrap converter codes in Samples(codes, conversion=volts_per_code); "
-            "turn numbers that are volts into floats",
+            "convert voltages to floats",
         )
     if samples.stored.ndim != 1 or samples.stored.size == 0:
         raise RecordingError(
@@ -215,7 +215,7 @@ def _samples(name: str, record: npt.ArrayLike | Samples) -> Samples:
 
 
 class Layout(NamedTuple):
-    """One record of a recording without its samples, as in `Samples`."""
+    """Description of one record without its samples; the fields are those of `Samples`."""
 
     name: str
     dtype: str
@@ -225,26 +225,26 @@ class Layout(NamedTuple):
 
 
 class AbstractSource(abc.ABC):
-    """What a study holds: metadata now, a `Recording` when asked for."""
+    """Source of one recording in a study: it gives metadata at once, and samples on request."""
 
     @property
     @abc.abstractmethod
     def metadata(self) -> Metadata:
-        """All fields but the samples."""
+        """All fields except the samples."""
 
     @property
     @abc.abstractmethod
     def layout(self) -> tuple[Layout, ...]:
-        """Names, dtypes, lengths and scales; recordings of equal layout fit in one stack."""
+        """Names, dtypes, lengths and scales. Recordings of equal layout can form one stack."""
 
     @property
     @abc.abstractmethod
     def unloaded(self) -> Hashable:
-        """Identity of `v_th`: equal for recordings that share one unloaded record."""
+        """Identity of `v_th`; it is equal for recordings that share one unloaded record."""
 
     @abc.abstractmethod
     def blocks(self, name: str) -> Iterator[npt.NDArray]:
-        """The stored samples of one record, in order, as much at a time as memory should hold."""
+        """The stored samples of one record, in order, in blocks that fit into memory."""
 
     @abc.abstractmethod
     def load(self) -> Recording:

@@ -1,19 +1,20 @@
-"""What differs between the pulse periods of one record, band by band.
+"""Differences between the pulse periods of one record, in bands of frequency.
 
-An average over the periods, which is what estimators fit, hides every difference between them. Here
-a record is cut into its P periods, each of them is transformed, and the deviation of each from
-their mean Y is given as a change of the logarithm of the gain in some fifty bands of frequency,
+Estimators fit the average over the periods. The average hides all differences between the periods.
+This module cuts a record into its P periods and transforms each period. The deviation of a period p
+from the mean Y is a change of the logarithm of the gain in about fifty bands of frequency,
 
-    η = Σ conj(Y) (Y_p − Y) / Σ |Y|²,
+    η = Σ conj(Y) (Y_p − Y) / Σ |Y|².
 
-with the variance that noise gives it. No model of driver or load is needed for that.
+The module also computes the variance of η that noise causes. It needs no model of driver or load.
 
-Periods are seldom a whole number of samples. The cut falls on the nearest sample, and the fraction
-is taken out by a turn of the phase. Smooth parts of a deviation, which no pulse makes (a drift of
-the mean, mains hum of 50 Hz), are projected out as a polynomial over the period.
+The length of a period is usually not a whole number of samples. A cut is at the nearest sample; a
+rotation of the phase corrects the remaining fraction. Smooth parts of a deviation do not come from
+pulses but from a drift of the mean or from mains hum of 50 Hz. They are projected out as a
+polynomial over the period.
 
-**What has aliased** turns by e^(−j2πδ) where a cut is late by a fraction δ of a sample, unlike the
-rest. `turn` is that direction, in which nothing can be concluded from a deviation.
+**Aliases** rotate by e^(−j2πδ) if a cut is late by a fraction δ of a sample; the rest does not.
+`turn` is the direction of this rotation. A deviation in this direction proves nothing.
 """
 
 import functools
@@ -29,35 +30,37 @@ from etid.signals.harmonics import fast_length
 from etid.signals.measurement import RIPPLE
 from etid.signals.pulse_train import RATE
 
-BAND = 0.25  # of the sample rate; above it there is more of aliases than of the load
-DEGREE = 6  # of the polynomial: it holds 0.994 of the 0.83 turns of mains hum of 50 Hz
-SINGLE = 12  # harmonics that are bands of their own
-RATIO = 1.08  # of the edges of the bands above
-ALIGNED = 1e-3  # samples, below which a delay changes the gain in proportion
-PASSES = 5  # to align periods; a clock that is off by 200 ppm needs three
-MERGED = 4  # samples of V_th whose sum is one
-LOW = 0.5  # of what is left of the band, in which such sums are as good as samples
-TINY = 1e-30  # in place of the power of a record of zeros
-# Amplitude by which cuts between samples let V_th differ, times the square of the pulse's width in
-# samples: 1e-4 for 133 samples, 0.03 for 8.
+BAND = 0.25  # largest frequency relative to the sample rate; above it aliases exceed the load
+DEGREE = 6  # degree of the polynomial: it describes 0.994 of the 0.83 turns of 50 Hz hum
+SINGLE = 12  # number of lowest harmonics that each form a band
+RATIO = 1.08  # ratio of the edges of the bands above these harmonics
+ALIGNED = 1e-3  # [samples] a smaller delay changes the gain in proportion
+PASSES = 5  # iterations to align periods; a clock error of 200 ppm needs three
+MERGED = 4  # number of samples of V_th that are added to one
+LOW = 0.5  # lower fraction of the remaining band, in which such sums are as good as samples
+TINY = 1e-30  # replaces the power of a record of zeros
+# Because cuts fall between samples, the amplitude of V_th differs by this number divided by the
+# square of the pulse width in samples: by 1e-4 for 133 samples, by 0.03 for 8 samples.
 CUT = 2.0
-SURE = 5.0  # standard deviations by which the noise of a band must exceed that of all
+SURE = 5.0  # [standard deviations] the noise of a band must exceed that of all bands by this
 
 
 class Repeats(NamedTuple):
-    """Deviations of the periods of a recording from their mean; of several, along a first axis.
+    """Deviations of the periods of a recording from their mean.
+
+    A batch of recordings has one more axis, the first axis.
 
     Attributes:
-        frequency: Middles of the bands [Hz].
+        frequency: Centre of each band [Hz].
         sample_rate: Samples per second [Hz].
-        gain: Deviation of the logarithm of V_out.
+        gain: Deviation η of the logarithm of V_out.
         power: Σ |Y|².
         smooth: Σ conj(Y) times each polynomial.
-        variance: Of the real part of a sum of `gain` over the periods with weights whose squares
-            have the sum 1; of the imaginary part as well.
-        turn: Direction of what has aliased, of length 1, or 0.
+        variance: Variance of the real part of a weighted sum of `gain` over the periods, if the
+            squares of the weights have the sum 1. The imaginary part has the same variance.
+        turn: Direction of the aliases; its length is 1, or 0 if all cuts have the same delay.
         unloaded: Deviation of the amplitude of V_th.
-        unloaded_variance: As `variance`.
+        unloaded_variance: Variance of `unloaded`, defined as `variance`.
     """
 
     frequency: Float[np.ndarray, "*lane band"]
@@ -72,16 +75,16 @@ class Repeats(NamedTuple):
 
 
 class Bands(NamedTuple):
-    """The bands of records with one length of a period.
+    """Bands of frequency of records with equal sample rates and pulse rates.
 
     Attributes:
-        length: Samples of a period that are used.
-        size: Samples to which they are filled up, whose transform is fast.
-        edges: First harmonics of the bands, counted from 0.
-        number: How many harmonics each has.
-        middle: Middle of each [radian per sample].
-        polynomials: Transforms of polynomials at the harmonics, orthonormal if their real and
-            imaginary parts are put side by side.
+        length: Number of samples of a period that are used.
+        size: Number of samples after zero padding, chosen for a fast transform.
+        edges: First harmonic of each band, counted from 0.
+        number: Number of harmonics in each band.
+        middle: Centre of each band [radian per sample].
+        polynomials: Transforms of polynomials at the harmonics. As real vectors of real and
+            imaginary parts they are orthonormal.
     """
 
     length: int
@@ -94,7 +97,7 @@ class Bands(NamedTuple):
 
 @functools.lru_cache(maxsize=16)
 def bands(sample_rate: float, pulse_rate: float) -> Bands:
-    """The bands for a nominal pulse rate, whatever the clock makes of it."""
+    """Bands for a nominal pulse rate; the measured pulse rate may differ from it."""
     length = int((1 - RATE) * sample_rate / pulse_rate)
     size = fast_length(length)
     count = int(BAND * size)
@@ -114,16 +117,18 @@ def bands(sample_rate: float, pulse_rate: float) -> Bands:
 
 
 def repeats(seen: Sequence[Inspected]) -> list[Repeats | None]:
-    """The deviations of the periods of recordings.
+    """Deviations of the periods of each recording.
 
-    None for those that hold less than two, or whose converter is coarse: its rounding differs
-    between the periods, and is no noise.
+    The result is None for a recording with fewer than two periods or with a coarse converter: the
+    rounding errors of a coarse converter differ between the periods and are not noise.
 
-    In single precision: the noise of a record is a hundred times its rounding errors. Recordings
-    of equally many periods are looked at together, for a third of the time.
+    The computation uses single precision: the noise of a record is a hundred times its rounding
+    errors. Recordings with the same number of periods are processed together, in a third of the
+    time.
 
-    Skin that changes during the record looks like hum between the harmonics. Where periods still
-    differ after hum was subtracted, it was not the hum: they are compared as they were recorded.
+    Skin that changes during the record looks like hum between the harmonics. If the periods still
+    differ after the subtraction of hum, hum was not the reason. Then the periods are compared as
+    they were recorded.
     """
     found: list[Repeats | None] = [None] * len(seen)
     alike: dict[tuple, list[int]] = {}
@@ -148,7 +153,7 @@ def repeats(seen: Sequence[Inspected]) -> list[Repeats | None]:
 
 
 def _differ(of: Repeats) -> bool:
-    """Whether the periods differ by more than noise."""
+    """Whether the periods differ by more than noise explains."""
     periods, count = of.gain.shape
     square = (_power(of.gain) / of.variance).sum()
     freedom = 2 * (periods - 1) * count
@@ -158,12 +163,12 @@ def _differ(of: Repeats) -> bool:
 def _of_equal_periods(
     group: Sequence[Inspected], records: Sequence[tuple[np.ndarray, np.ndarray]]
 ) -> list[Repeats]:
-    """The deviations of recordings with as many periods and equal rates, from these voltages."""
+    """Deviations of recordings with equal rates and numbers of periods, from these voltages."""
     of, (periods, _) = group[0].recording, group[0].periods
     at = np.stack([one.begins for one in group])
     known = bands(of.sample_rate, of.pulse_rate)
     sigma = np.array([one.sigma_out for one in group])
-    # A record that is late would be cut within its pulses.
+    # Without this shift, a late record would be cut within its pulses.
     loaded = [_turned(v, one) for one, (_, v) in zip(group, records, strict=True)]
     own = _deviations(loaded, at, known, sigma)
     sigma = np.array([one.sigma_th for one in group])
@@ -172,12 +177,12 @@ def _of_equal_periods(
     unloaded = _deviations(sums, at / MERGED, merged, sigma * math.sqrt(MERGED))
     weight = np.where(merged.middle < LOW * merged.middle[-1], 1 / unloaded.variance, 0.0)
     smooth = _smooth(unloaded.mean, merged)
-    # What a change of the amplitude by 1 makes where polynomials are projected out.
+    # Effect of an amplitude change by 1 after the projection of the polynomials.
     unit = 1 - (np.real(smooth.sum(2))[:, :, None] * smooth).sum(1) / unloaded.power
     total = (weight * _power(unit)).sum(1)
     along = np.real(unloaded.gain * (weight * np.conj(unit))[:, None, :]).sum(2)
     amplitude, smooth = along / total[:, None], _smooth(own.mean, known)
-    # Coloured noise is in no way of the amplitude: what that leaves tells how large it is.
+    # Coloured noise does not look like an amplitude change: the rest measures its size.
     rest = unloaded.gain - amplitude[:, :, None] * unit[:, None, :]
     freedom = (2 * np.count_nonzero(weight, axis=1) - 1) * (periods - 1)
     noise = np.maximum(1.0, (weight[:, None, :] * _power(rest)).sum((1, 2)) / freedom)
@@ -193,18 +198,18 @@ def _of_equal_periods(
 
 
 def _smooth(mean: np.ndarray, known: Bands) -> np.ndarray:
-    """Σ conj(Y) times each polynomial, for each recording."""
+    """Σ conj(Y) times each polynomial, for each recording and band."""
     products = np.conj(mean)[:, None, :] * known.polynomials
     return np.add.reduceat(products, known.edges, axis=2)
 
 
 def _turned(v_out: Float[np.ndarray, " time"], of: Inspected) -> Float[np.ndarray, " time"]:
-    """The loaded voltage without its lag: what is cut off at one end is put to the other."""
+    """Loaded voltage without its lag; the samples cut off at one end are added at the other."""
     return np.roll(v_out[: of.periods[1]], -of.lag) if of.lag else v_out
 
 
 class _Deviations(NamedTuple):
-    """`gain`, `power` and `variance` of a `Repeats`, the mean, and how late each cut is."""
+    """`gain`, `power` and `variance` as in `Repeats`, the mean, and the delay of each cut."""
 
     gain: np.ndarray
     power: np.ndarray
@@ -214,7 +219,7 @@ class _Deviations(NamedTuple):
 
 
 def _merged(v: Float[np.ndarray, " time"]) -> Float[np.ndarray, " part"]:
-    """Sums of a few samples, which do for the amplitude at low frequencies."""
+    """Sums of `MERGED` samples; they are sufficient for the amplitude at low frequencies."""
     whole = v[: v.size // MERGED * MERGED]
     return functools.reduce(np.add, (whole[first::MERGED] for first in range(MERGED)))
 
@@ -225,7 +230,7 @@ def _deviations(
     known: Bands,
     sigma: Float[np.ndarray, " lane"],
 ) -> "_Deviations":
-    """Deviations of periods that begin `at`."""
+    """Deviations of the periods with the starts `at` [samples]."""
     lanes, periods = at.shape
     last = np.array([v.size - known.length for v in records])
     starts = np.minimum(np.rint(at), last[:, None]).astype(int)
@@ -240,7 +245,7 @@ def _deviations(
     raw = np.fft.rfft(cut, known.size)[:, :, 1 : count + 1]
     power, mean, weight, gain = _compared(raw, late, known)
     for _ in range(PASSES):
-        # Least squares of a delay, η = jωτ, which is not quite right where the gain changes too.
+        # Least-squares estimate of a delay, η = jωτ; it is approximate if the gain changes too.
         of_delay = known.middle * weight
         total = (known.middle * of_delay).sum(1)
         more = (np.imag(gain) * of_delay[:, None, :]).sum(2) / total[:, None]
@@ -250,7 +255,7 @@ def _deviations(
             break
         late = late + np.where(moved[:, None], more, 0.0)
         power, mean, weight, gain = _compared(raw, late, known)
-    # What no change of the gain explains is noise.
+    # The part that no change of the gain explains is noise.
     rest = np.add.reduceat(power, known.edges, axis=1) - weight * _power(gain).sum(1)
     freedom = 2 * (known.number - 1) * (periods - 1)
     overall = np.maximum(rest.sum(1) / max(freedom.sum(), 1), sigma**2 * known.length / 2)[:, None]
@@ -266,9 +271,9 @@ def _deviations(
 
 
 def _noise_of_single(gain: np.ndarray, weight: np.ndarray) -> np.ndarray:
-    """Noise of bands of one harmonic, from second differences between them.
+    """Noise of the bands of one harmonic, from second differences between these bands.
 
-    A change of the load is smooth over the first harmonics, and coloured noise is not.
+    A change of the load is smooth over the first harmonics; coloured noise is not.
     """
     bend = gain[:, :, :-2] - 2 * gain[:, :, 1:-1] + gain[:, :, 2:]
     spread = 1 / weight[:, :-2] + 4 / weight[:, 1:-1] + 1 / weight[:, 2:]
@@ -283,7 +288,7 @@ def _power(values: np.ndarray) -> np.ndarray:
 def _compared(
     raw: np.ndarray, late: Float[np.ndarray, "lane period"], known: Bands
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Of periods that are late: power of the deviations, the mean, its power, and `gain`."""
+    """Power of the deviations, mean, its power, and `gain`, for periods with these delays."""
     aligned = raw * _turns(late * (2 * np.pi / known.size), raw.shape[2])
     mean = aligned.mean(1)
     aligned -= mean[:, None, :]
@@ -294,7 +299,7 @@ def _compared(
 
 
 def _turns(angle: Float[np.ndarray, "lane period"], count: int) -> np.ndarray:
-    """e^(−j k angle) for k = 1 … `count`, by products of few exponentials."""
+    """e^(−j k angle) for k = 1 … `count`, as products of a few exponentials for speed."""
     step = 1 << ((count - 1).bit_length() + 1) // 2
     fine = np.exp(-1j * angle[..., None] * np.arange(1, step + 1)).astype(np.complex64)
     coarse = np.exp(-1j * angle[..., None] * np.arange(0, count, step)).astype(np.complex64)
@@ -303,8 +308,8 @@ def _turns(angle: Float[np.ndarray, "lane period"], count: int) -> np.ndarray:
 
 
 def _without(deviation: np.ndarray, polynomials: np.ndarray) -> np.ndarray:
-    """Deviations without what the polynomials can do."""
-    # One recording after the other: products so small start no threads.
+    """Deviations without their projection on the polynomials; changed in place."""
+    # One recording after the other, because such small products start no threads.
     for own in deviation:
         own -= np.real(own @ polynomials.conj().T).astype(own.dtype) @ polynomials
     return deviation

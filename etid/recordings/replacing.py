@@ -1,4 +1,4 @@
-"""Files are written whole or not at all."""
+"""Writing of a file completely or not at all."""
 
 import contextlib
 import os
@@ -11,16 +11,17 @@ from etid.recordings.errors import RecordingError
 
 @contextlib.contextmanager
 def replacing(path: str | os.PathLike[str]) -> Iterator[pathlib.Path]:
-    """Give a temporary name beside a file, and rename it to the file when the block succeeds.
+    """Path of a temporary file for the block; it replaces the target when the block succeeds.
 
-    The name is new in each call, because several processes may write the same file. It keeps the
-    suffix, because some writers choose the format by it.
+    The temporary file is in the folder of the target. Its name is new in each call, because several
+    processes may write the same file. It has the suffix of the target, because some writers choose
+    the format by the suffix.
 
     Args:
-        path: The file; one that exists is replaced at the end.
+        path: Path of the target. An existing file is replaced at the end.
 
     Raises:
-        RecordingError: The block or the renaming has raised an OSError.
+        RecordingError: The block or the renaming raised an OSError.
     """
     name = os.fspath(path)
     target = pathlib.Path(name)
@@ -30,8 +31,10 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[pathlib.Path]:
         os.replace(partial, target)
     except OSError as error:
         raise RecordingError(
-            f"cannot be written ({error})", file=name, remedy="Check folder, rights and disk space"
+            f"cannot be written ({error})",
+            file=name,
+            remedy="Check folder, permissions and disk space",
         ) from error
     finally:
-        with contextlib.suppress(OSError):  # where nothing can be written, there is no such file
+        with contextlib.suppress(OSError):  # the file may not exist
             partial.unlink(missing_ok=True)

@@ -1,8 +1,8 @@
-"""The layout of an etid file, version 1.0: one table.
+"""Layout of an etid file, version 1.0, as one table.
 
-`FIELDS` are the fields of a recording (`etid.recordings.fields`) and what else a file needs. The
-reader checks a file against them, and `python data_schema/make_page.py` turns them into
-`recording-1.json`, for machines, and `README.md`, for people.
+`FIELDS` contains the fields of a recording (`etid.recordings.fields`) and all other fields of a
+file. The reader checks a file against this table. `python data_schema/make_page.py` writes the
+table to `recording-1.json` for programs and to `README.md` for people.
 """
 
 import dataclasses
@@ -19,7 +19,7 @@ FIELDS: tuple[Field, ...] = (
         name="schema",
         type="text",
         values=(NAME,),
-        description="Says that the file follows this schema.",
+        description="States that the file follows this schema.",
         example=NAME,
     ),
     Field(
@@ -34,8 +34,8 @@ FIELDS: tuple[Field, ...] = (
         name="kind",
         type="text",
         values=KINDS,
-        description="Makes the group a recording: `calibration` has a known resistor as its load, "
-        "`loaded` anything else.",
+        description="Marks the group as a recording. The load is a known resistor for "
+        "`calibration`, and any other load for `loaded`.",
         example="loaded",
     ),
     *DECLARED.values(),
@@ -56,7 +56,7 @@ FIELDS: tuple[Field, ...] = (
         type="number",
         unit="SI unit per stored unit",
         required="optional",
-        description="value = conversion · stored + offset; 1 if absent, not 0.",
+        description="value = conversion · stored + offset. It must not be 0; it is 1 if absent.",
         example=0.00570422,
     ),
     Field(
@@ -72,12 +72,12 @@ FIELDS: tuple[Field, ...] = (
 
 
 def at(place: Place) -> dict[str, Field]:
-    """The fields of one place, by name."""
+    """Fields of one place, by name."""
     return {field.name: field for field in FIELDS if field.place == place}
 
 
 def version_problem(version: str) -> str | None:
-    """Why this reader cannot read a file of that version, if it cannot."""
+    """Reason why this reader cannot read a file of a version; None if it can."""
     major, _, minor = version.partition(".")
     if not (major.isascii() and major.isdigit() and minor.isascii() and minor.isdigit()):
         return f"is {version!r}, must be 'major.minor'"
@@ -87,7 +87,7 @@ def version_problem(version: str) -> str | None:
 
 
 def as_json() -> str:
-    """The table for machines."""
+    """The table as JSON, for programs."""
     table = {
         "schema": NAME,
         "schema_version": VERSION,

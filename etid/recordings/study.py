@@ -14,7 +14,7 @@ from etid.recordings.writing import write
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class _InMemory(AbstractSource):
-    """A recording that needs no loading."""
+    """A recording in memory."""
 
     recording: Recording
 
@@ -43,7 +43,7 @@ class _InMemory(AbstractSource):
 
 
 def refuse_nested(paths: Collection[str]) -> None:
-    """Refuse paths of which one lies inside another."""
+    """Raise an error if one path lies inside another path."""
     for path in paths:
         outer = path.rpartition("/")[0]
         while outer:
@@ -51,20 +51,21 @@ def refuse_nested(paths: Collection[str]) -> None:
                 raise RecordingError(
                     f"lies inside another recording, {outer!r}",
                     path=path,
-                    remedy="Give it a path beside the other",
+                    remedy="Give it a path outside of the other",
                 )
             outer = outer.rpartition("/")[0]
 
 
 class Study(Mapping[str, Recording]):
-    """Recordings by path, in order; those of a file are loaded when they are accessed.
+    """Ordered recordings by path; recordings of a file are loaded when they are accessed.
 
-    Build one with `Study.from_recordings` or `etid.read`.  A study that comes from a file holds it
-    open: use `with`, or `close()`.
+    `Study.from_recordings` and `etid.read` make a study. A study from a file keeps the file open:
+    use `with`, or call `close()`.
 
     Attributes:
-        file: Path of the file it comes from; empty in memory.
-        problems: Recordings of the file that cannot be read, by path; accessing one raises it.
+        file: Path of the file; empty for a study in memory.
+        problems: Errors of the recordings that cannot be read, by path. Access to such a recording
+            raises its error.
     """
 
     def __init__(
@@ -88,10 +89,10 @@ class Study(Mapping[str, Recording]):
             recordings: Calibrations and loaded recordings.
 
         Returns:
-            The study, in the order of the recordings.
+            Study with the recordings in the given order.
 
         Raises:
-            RecordingError: Two recordings have the same path, or one lies inside another.
+            RecordingError: Two recordings have the same path, or a path lies inside another path.
         """
         sources: dict[str, AbstractSource] = {}
         unnamed = {"loaded": 0, "calibration": 0}
@@ -123,17 +124,17 @@ class Study(Mapping[str, Recording]):
         return isinstance(path, str) and path.strip("/") in self._sources
 
     def __eq__(self, other: object) -> bool:
-        return self is other  # a Mapping would load and compare every sample
+        return self is other  # the method of Mapping would load and compare all samples
 
     def __hash__(self) -> int:
         return id(self)
 
     def source(self, path: str) -> AbstractSource:
-        """What the study holds at a path, without its samples.
+        """Source of the recording at a path; it gives metadata without reading samples.
 
         Raises:
-            RecordingError: The recording at that path cannot be read.
-            KeyError: There is none; the message names those that are near.
+            RecordingError: The recording at this path cannot be read.
+            KeyError: There is no recording at this path; the message suggests similar paths.
         """
         tidy = path.strip("/")
         if tidy in self._sources:
@@ -150,29 +151,30 @@ class Study(Mapping[str, Recording]):
         raise KeyError(f"no recording {path!r}; this study has {len(self)}, such as {known}")
 
     def metadata(self, path: str) -> Metadata:
-        """All fields of a recording but its samples, which are not read.
+        """All fields of a recording except its samples; no samples are read.
 
         Raises:
-            RecordingError: The recording at that path cannot be read.
-            KeyError: There is none.
+            RecordingError: The recording at this path cannot be read.
+            KeyError: There is no recording at this path.
         """
         return self.source(path).metadata
 
     def recordings(self) -> Iterator[Recording]:
-        """The recordings one after the other, each loaded when its turn comes."""
+        """Iterator over the recordings; it loads one recording at a time."""
         return (source.load() for source in self._sources.values())
 
     def where(self, **labels: Label | None) -> "Study":
-        """The recordings whose labels equal those given; no samples are read.
+        """Study of the recordings with these labels; no samples are read.
 
         Args:
-            **labels: `subject`, `condition`, `electrode` or `trial`.
+            **labels: Values of `subject`, `condition`, `electrode` or `trial`.
 
         Returns:
-            A study that reads from the same file.
+            Study that reads from the same file.
 
         Raises:
-            RecordingError: There is no such label, or its value is neither text nor an integer.
+            RecordingError: The name of a label is unknown, or a value is neither text nor an
+                integer.
         """
         wanted = wanted_labels(labels, LABELS)
         return self._part(
@@ -181,12 +183,12 @@ class Study(Mapping[str, Recording]):
 
     @property
     def calibrations(self) -> "Study":
-        """The recordings with a known resistor."""
+        """Study of the recordings with a known resistor."""
         return self._part(lambda metadata: metadata.kind == "calibration")
 
     @property
     def loaded(self) -> "Study":
-        """The recordings with an unknown load."""
+        """Study of the recordings with an unknown load."""
         return self._part(lambda metadata: metadata.kind == "loaded")
 
     def _part(self, belongs: Callable[[Metadata], bool]) -> "Study":
@@ -196,30 +198,30 @@ class Study(Mapping[str, Recording]):
         return Study(chosen, problems=self.problems, file=self.file, close=self._close)
 
     def write(self, path: str | os.PathLike[str]) -> None:
-        """Write the study to an HDF5 file, whole or not at all.
+        """Write the study to an HDF5 file, completely or not at all.
 
-        Recordings `g/0 … g/T-1`, at least two and all that lie below `g`, become one stacked group
-        `g` if they are loaded and agree in everything but samples and trial; if they also share one
-        `v_th`, it is stored once.  Every other recording becomes a group of its own.  Reading the
-        file gives the same paths, stored integers and metadata.
+        Loaded recordings `g/0 … g/T-1` become one stacked group `g`, if there are at least two, if
+        there are no other recordings below `g`, and if all fields except samples and trial are
+        equal. If they share one `v_th`, it is stored once. Every other recording becomes a separate
+        group. `etid.read` gives the same paths, stored integers and metadata.
 
         Args:
-            path: The file; one that exists is replaced at the end.
+            path: File to write. An existing file is replaced at the end.
 
         Raises:
-            RecordingError: The study holds recordings that cannot be read, names calibrations that
-                it does not hold, or the file cannot be written.
+            RecordingError: A recording of the study cannot be read, a named calibration is missing
+                in the study, or the file cannot be written.
         """
         if self.problems:
             raise RecordingError(
                 f"{len(self.problems)} recordings of the study cannot be read",
                 file=self.file,
-                remedy="Leave them out with Study.from_recordings(study.recordings())",
+                remedy="Remove them with Study.from_recordings(study.recordings())",
             )
         write(self._sources, path)
 
     def close(self) -> None:
-        """Close the file that the study, and every part of it, reads from."""
+        """Close the file of the study; all parts of the study use the same file."""
         if self._close is not None:
             self._close()
 

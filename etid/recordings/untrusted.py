@@ -1,11 +1,11 @@
-"""HDF5 files of others: types and sizes are looked at before anything is read.
+"""Reading of HDF5 files from other sources: types and sizes are checked before data are read.
 
-The HDF5 library ends most damaged files with an error. It does not end one: the objects of a
-global heap, where it keeps texts of variable length, follow each other by their sizes, and where a
-free object has size 0 it goes round for ever, inside C, where Python cannot stop it. A `Guarded`
-file therefore shows the library no heap before it has followed its objects itself. All hangs that
-`python -m benchmarks fuzz` has found were of this kind. It costs a call of Python for each read, so
-that samples, and all metadata of files that etid has written, are read without it.
+For most damaged files the HDF5 library raises an error. There is one exception. A global heap holds
+texts of variable length, and the size of each object leads to the next object. If a free object has
+size 0, the library loops forever in C, and Python cannot stop it. A `Guarded` file therefore
+follows the objects of a heap itself before the library reads the heap. All hangs that
+`python -m benchmarks fuzz` has found were of this kind. The guard needs a Python call for each
+read. So samples, and all metadata of files that etid has written, are read without it.
 """
 
 import contextlib
@@ -23,7 +23,7 @@ import numpy as np
 from etid.recordings import limits
 from etid.recordings.errors import RecordingError, located
 
-# What h5py raises, depending on where in a damaged file the HDF5 library gives up.
+# Errors that h5py raises for damaged files; the kind depends on the place of the damage.
 LIBRARY_ERRORS = (
     OSError,
     RuntimeError,
@@ -37,26 +37,26 @@ LIBRARY_ERRORS = (
 
 DAMAGED = "The file is damaged or was not closed: copy or record it again"
 
-_PLAIN = 4096  # bytes of a number or text that is read without another look
+_PLAIN = 4096  # [bytes] largest number or text that is read without a further check
 _HEAP = b"GCOL\x01\0\0\0"
-_HEAP_HEAD = 16  # bytes: signature, version, size of the collection
+_HEAP_HEAD = 16  # [bytes] signature, version, size of the collection
 _OBJECT = struct.Struct("<HH4xQ")  # index, reference count, size
-_SIZES = {0: 13, 1: 13, 2: 9, 3: 9}  # where a superblock of this version has its sizes of numbers
+_SIZES = {0: 13, 1: 13, 2: 9, 3: 9}  # offset of the sizes of numbers, by version of the superblock
 
 
-# The block that reads from an HDF5 file, `with translated(file, path, field)`.
+# For a block that reads an HDF5 file: its errors become a RecordingError of this place.
 translated = functools.partial(
     located, foreign=LIBRARY_ERRORS, message="the HDF5 library cannot read it", remedy=DAMAGED
 )
 
 
 class Guarded(io.FileIO):
-    """A file for the HDF5 library that refuses a damaged global heap: a circle, or a false size."""
+    """A file for the HDF5 library that refuses a damaged global heap: a loop, or a wrong size."""
 
     def readinto(self, buffer: Any) -> int:
-        """Read as much as the buffer holds, after a look at the heaps that begin in it."""
+        """Fill the buffer, after a check of the heaps that begin in it."""
         start = self.tell()
-        before = min(start, len(_HEAP) - 1)  # a heap may have begun in what was read before
+        before = min(start, len(_HEAP) - 1)  # a signature may begin in the previous read
         self.seek(start - before)
         seen = self.read(before + len(buffer) + len(_HEAP) - 1)
         place = seen.find(_HEAP)
@@ -69,7 +69,7 @@ class Guarded(io.FileIO):
         return len(part)
 
     def _follow(self, heap: int) -> None:
-        """Raise OSError if a heap exceeds the file, or one object does not lead to the next."""
+        """Raise OSError if a heap exceeds the file, or an object does not lead to the next."""
         self.seek(heap + len(_HEAP))
         end = heap + int.from_bytes(self.read(8), "little")
         damaged = OSError(f"the heap of texts at byte {heap} is damaged")
@@ -87,14 +87,14 @@ class Guarded(io.FileIO):
 
 @contextlib.contextmanager
 def guarded(path: str, **options: Any) -> Iterator[h5py.File]:
-    """An HDF5 file behind a guard.
+    """An HDF5 file that is read through `Guarded`.
 
     Args:
-        path: The file.
-        **options: Of `h5py.File`.
+        path: Path of the file.
+        **options: Options of `h5py.File`.
 
     Raises:
-        RecordingError: It is missing, no HDF5, or damaged.
+        RecordingError: The file is missing, not HDF5, or damaged.
     """
     check_file(path)
     with translated(path), contextlib.ExitStack() as stack:
@@ -105,39 +105,39 @@ def guarded(path: str, **options: Any) -> Iterator[h5py.File]:
 
 
 def check_file(path: str) -> None:
-    """Refuse what is no HDF5 file; a pipe or a device is not opened.
+    """Raise an error if a path is not an HDF5 file; pipes and devices are not opened.
 
     Raises:
-        RecordingError: It is missing, or no HDF5.
+        RecordingError: The file is missing or not HDF5.
     """
     if not os.path.isfile(path):
         raise RecordingError("there is no such file", file=path, remedy="Check the path")
     if not h5py.is_hdf5(path):
         raise RecordingError(
-            "is not an HDF5 file, or its head is damaged",
+            "is not an HDF5 file, or its header is damaged",
             file=path,
-            remedy="If it is of another format, turn it into one of etid with `etid import`",
+            remedy="If it has another format, convert it with `etid import`",
         )
 
 
 def _check_numbers(raw: io.FileIO) -> None:
-    """Refuse addresses and lengths of other than 8 bytes: the guard reads no others."""
+    """Raise an error if addresses or lengths do not have 8 bytes: the guard needs 8 bytes."""
     for place in (0, 512, 1024, 2048):
         raw.seek(place)
         head = raw.read(16)
         if head.startswith(b"\x89HDF\r\n\x1a\n"):
             at = _SIZES.get(head[8])
             if at is None or head[at : at + 2] != b"\x08\x08":
-                raise OSError("its addresses are not of 8 bytes")
+                raise OSError("its addresses do not have 8 bytes")
             break
     raw.seek(0)
 
 
 class Attributes:
-    """Attributes of the objects of one file, read after a look at their type and size.
+    """Attributes of the objects of one file, read after a check of type and size.
 
-    Texts of variable length are read behind a guard, from a second handle that is opened when the
-    first of them is found.
+    Texts of variable length are read through a guard, from a second handle of the file. This handle
+    is opened when the first such text is found.
     """
 
     def __init__(self, path: str):
@@ -156,27 +156,27 @@ class Attributes:
         """Names of the attributes of a group or dataset.
 
         Raises:
-            RecordingError: There are more than any schema has.
+            RecordingError: There are too many attributes.
         """
         names = list(owner.attrs)
         if len(names) > limits.ATTRIBUTES:
             raise RecordingError(
                 f"has {len(names)} attributes, at most {limits.ATTRIBUTES} are read",
-                remedy="Keep what is not in the schema elsewhere",
+                remedy="Remove attributes that are not in the schema",
             )
         return names
 
     def value(self, owner: h5py.HLObject, name: str) -> Any:
-        """The value of an attribute.
+        """Value of an attribute.
 
         Raises:
-            Exception: One of `LIBRARY_ERRORS`: it cannot be read, or is too large.
+            Exception: One of `LIBRARY_ERRORS`: the value cannot be read or is too large.
         """
         attributes = owner.attrs
         stored = attributes.get_id(name)
         dtype = stored.dtype
         if not dtype.hasobject and math.prod(stored.shape or ()) * dtype.itemsize <= _PLAIN:
-            return attributes[name]  # as etid writes all of them
+            return attributes[name]  # etid writes all attributes in this way
         if in_a_heap(dtype):
             if self._second is None:
                 self._second = self._open.enter_context(guarded(self._path))
@@ -185,17 +185,18 @@ class Attributes:
 
 
 def in_a_heap(dtype: np.dtype) -> bool:
-    """Whether values of a type lie in a global heap: texts of variable length, regions."""
+    """Whether a global heap holds the values of a type: texts of variable length, regions."""
     return dtype.hasobject and h5py.check_ref_dtype(dtype) is not h5py.Reference
 
 
 def attribute(owner: h5py.HLObject, name: str) -> Any:
-    """The value of an attribute, whose type and size are looked at first.
+    """Value of an attribute, after a check of its type and size.
 
-    A sequence of variable length is in no schema; made from a damaged text, it crashes the library.
+    No schema contains a sequence of variable length. A damaged text may look like one, and the
+    library would crash.
 
     Raises:
-        Exception: One of `LIBRARY_ERRORS`: it cannot be read, or is too large.
+        Exception: One of `LIBRARY_ERRORS`: the value cannot be read or is too large.
     """
     stored = owner.attrs.get_id(name)
     if h5py.check_vlen_dtype(stored.dtype) not in (None, str, bytes):
@@ -207,14 +208,15 @@ def attribute(owner: h5py.HLObject, name: str) -> Any:
 
 
 def check_size(dataset: h5py.Dataset) -> None:
-    """Refuse a dataset that declares more than it can hold, before anything is allocated.
+    """Raise an error if a dataset declares too much data, before memory is allocated.
 
     Raises:
-        RecordingError: It is beyond one of `etid.recordings.limits`, or beyond its file.
+        RecordingError: The dataset exceeds a limit of `etid.recordings.limits`, or is larger than
+            its file allows.
     """
     if dataset.external or dataset.is_virtual:
         raise RecordingError(
-            "its samples lie in another file", remedy="Copy the samples into the file"
+            "its samples are in another file", remedy="Copy the samples into the file"
         )
     itemsize = dataset.dtype.itemsize
     declared = math.prod(dataset.shape or ()) * itemsize
@@ -231,16 +233,16 @@ def check_size(dataset: h5py.Dataset) -> None:
     held = min(stored, dataset.file.id.get_filesize())
     if declared > limits.COMPRESSION * held or stored > held:
         raise RecordingError(
-            f"declares {declared} bytes, {held} of them stored",
+            f"declares {declared} bytes, but only {held} bytes are stored",
             remedy=DAMAGED,
         )
 
 
 def local_link(group: h5py.Group, name: str) -> h5py.HardLink | h5py.SoftLink:
-    """The link of a member, which does not leave the file.
+    """Link of a member of a group, which stays in the file.
 
     Raises:
-        RecordingError: It is a link to another file, or passes through one.
+        RecordingError: The link leads to another file, or is a loop of soft links.
     """
     remedy = "Copy the data into the file"
     link: Any = group.get(name, getlink=True)
@@ -252,7 +254,7 @@ def local_link(group: h5py.Group, name: str) -> h5py.HardLink | h5py.SoftLink:
 
 
 def _check_soft(group: h5py.Group, path: str) -> None:
-    """Refuse a soft link that leads out of the file or in a circle; a dangling one passes."""
+    """Raise an error if a soft link leaves the file or is a loop; a dangling link passes."""
     place: Any = group.file if path.startswith("/") else group
     left = path.split("/")[::-1]
     links = 0
@@ -267,7 +269,7 @@ def _check_soft(group: h5py.Group, path: str) -> None:
         if isinstance(link, h5py.SoftLink):
             links += 1
             if links > limits.LINKS:
-                raise RecordingError("is a soft link in a circle", remedy="Remove the link")
+                raise RecordingError("is a soft link in a loop", remedy="Remove the link")
             place = place.file if link.path.startswith("/") else place
             left += link.path.split("/")[::-1]
         elif link is not None:

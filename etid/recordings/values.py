@@ -1,7 +1,7 @@
-"""Values of fields, from a file or from a caller, as plain text and numbers.
+"""Values of fields as Python text and numbers, from a file or from a caller.
 
-A caller's mistake is a `RecordingError`. What a file holds is a ValueError here, because only the
-reader knows the file.
+A wrong value of a caller is a `RecordingError`. A wrong value in a file is a ValueError here,
+because only the reader knows the name of the file.
 """
 
 import math
@@ -27,7 +27,7 @@ def text(field: str, value: object) -> str:
 
 
 def real(field: str, value: object) -> float:
-    """A finite real number, or an error; text and booleans are no numbers."""
+    """A finite real number; text and booleans are an error."""
     number = isinstance(value, int | float | np.integer | np.floating) or (
         getattr(value, "shape", None) == () and getattr(value, "dtype", np.dtype("O")).kind in "iuf"
     )
@@ -41,16 +41,16 @@ def several(field: str, value: object) -> list[Any]:
     if isinstance(value, str):
         return [value]
     try:
-        return list(value)  # type: ignore[call-overload]  # what is not iterable raises TypeError
+        return list(value)  # type: ignore[call-overload]  # other types raise TypeError
     except TypeError:
         raise RecordingError(f"is {value!r}, must be a sequence", field=field) from None
 
 
 def stored(item: Any, kind: Type) -> str | float:
-    """One element of an attribute in a file, in the Python type of its field.
+    """One element of an attribute of a file, in the Python type of its field.
 
     Raises:
-        ValueError: It has another type; the text says what it is instead.
+        ValueError: The element has another type; the text describes the element.
     """
     if kind in ("number", "range"):
         if not isinstance(item, int | float | np.integer | np.floating) or isinstance(item, bool):

@@ -1,4 +1,4 @@
-"""Writing recordings to an HDF5 file of the schema."""
+"""Writing of recordings to an HDF5 file that follows the schema."""
 
 import dataclasses
 import os
@@ -14,9 +14,9 @@ from etid.recordings.replacing import replacing
 
 
 def write(sources: Mapping[str, AbstractSource], path: str | os.PathLike[str]) -> None:
-    """Write recordings, by path, to a file; `Study.write` says how.
+    """Write recordings to a file; see `Study.write`.
 
-    One recording at a time is in memory, or as much of it as its source gives at once.
+    Only one block of a recording is in memory at a time; its source chooses the size of a block.
     """
     for own, source in sources.items():
         for calibration in source.metadata.calibration:
@@ -25,9 +25,9 @@ def write(sources: Mapping[str, AbstractSource], path: str | os.PathLike[str]) -
                     f"{calibration!r} is not a calibration of the study",
                     path=own,
                     field="calibration",
-                    remedy="Add that recording, or remove the path with recording.replace",
+                    remedy="Add that calibration, or remove its path with recording.replace",
                 )
-    # v108 has checksums over all but the samples, and room for the labels of large stacks
+    # v108 has checksums for everything except samples, and allows the labels of large stacks
     libver = ("v108", "latest")
     with replacing(path) as partial, h5py.File(partial, "x", libver=libver) as file:
         _write_attribute(file, "schema", schema.NAME)
@@ -37,8 +37,8 @@ def write(sources: Mapping[str, AbstractSource], path: str | os.PathLike[str]) -
 
 
 def _stacks(sources: Mapping[str, AbstractSource]) -> dict[str, list[str]]:
-    """Which group of the file holds which recordings."""
-    below: dict[str, int] = {}  # recordings anywhere below a path
+    """Paths of the recordings of each group of the file."""
+    below: dict[str, int] = {}  # number of recordings below each path
     children: dict[str, list[str]] = {}
     for path in sources:
         children.setdefault(path.rpartition("/")[0], []).append(path)
@@ -96,10 +96,10 @@ def _write_group(file: h5py.File, path: str, sources: list[AbstractSource]) -> N
 
 
 def _write_attribute(owner: h5py.Group | h5py.Dataset, name: str, value: Any) -> None:
-    """Write a number or text, or several.
+    """Write a number or text, or a list of them, as an attribute.
 
-    Text has a fixed length: the library keeps text of variable length in a heap that no checksum
-    protects, and reads it through pointers that a damaged byte can turn against the process.
+    Text has a fixed length. The library would store text of variable length in a heap without a
+    checksum, and read it through pointers; one damaged byte could then crash the process.
     """
     items = np.ravel(value)
     if not isinstance(items[0], str):
