@@ -19,7 +19,7 @@ def add_circuit(parser: argparse.ArgumentParser, purpose: str) -> None:
         "--circuit",
         type=_circuit,
         metavar="NAME",
-        help=f"{purpose}: {', '.join(lookup.built_in())}, or module:Class; the module is "
+        help=f"{purpose}. NAME is {', '.join(lookup.built_in())}, or module:Class; the module is "
         "imported from the current folder or from the search path of Python",
     )
 

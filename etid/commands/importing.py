@@ -21,7 +21,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="TOML file in place of the options below, also for several recordings "
         "(data_schema/README.md)",
     )
-    channel = "channel of {}; its unit is {} unless the file names another".format
+    channel = "channel of {}; its unit is {} unless the file names a unit".format
     for name, signal in SIGNALS.items():
         _option(parser, name, help=channel(name, signal.unit))
     _option(parser, "time", help=f"{channel('the time', 'second')}; replaces --sample-rate")

@@ -73,7 +73,7 @@ class _Block:
                 raise RecordingError("the file is closed", remedy="Read it again, or use `with`")
             path = f"{self.metadata.path}/{name}"
             dataset = self.opened(path) if header.stacked else self.file[path]
-            assert isinstance(dataset, h5py.Dataset)  # the scan has seen it
+            assert isinstance(dataset, h5py.Dataset)  # the scan has checked this
             stored = dataset[row] if header.stacked else dataset[()]
             stored.flags.writeable = False
             samples = Samples(stored, header.conversion, header.offset)

@@ -15,8 +15,8 @@ from etid.recordings.errors import RecordingError
 
 _HEAD = 128  # [bytes]
 _MATRIX, _COMPRESSED = 14, 15
-_NUMBERS = {1, 2, 3, 4, 5, 6, 7, 9, 12, 13, 16, 17, 18}  # integers, reals, texts
-_MADE_WHOLE = {1, 2, 3}  # cells, structures, objects: arrays of Python objects
+_NUMBERS = {1, 2, 3, 4, 5, 6, 7, 9, 12, 13, 16, 17, 18}  # types of elements: integers, reals, texts
+_MADE_WHOLE = {1, 2, 3}  # cells, structures, objects: SciPy makes arrays of Python objects
 
 
 def check(path: pathlib.Path) -> None:
