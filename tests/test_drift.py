@@ -101,9 +101,9 @@ def recorded_calibration():
 def test_a_study_and_its_file_pass_the_drift_on(tmp_path):
     trials = (Trial("loaded/0", DRY),)
     known = (Trial("calibration/0", ResistorLoad(98.8e3)),)
-    study = Scene(trials, known, samples=3334).simulate(seed=1)
+    study = Scene(trials, known, samples=10_000).simulate(seed=1)
     study.write(tmp_path / "study.h5")
-    options: dict[str, Any] = {"method": "equation_error", "order": 3, "driver_drift": DRIFT}
+    options: dict[str, Any] = {"order": 5, "driver_drift": DRIFT}
     found = [
         etid.identify_study(study, **options),
         etid.fit_file(tmp_path / "study.h5", tmp_path / "fits.h5", **options),

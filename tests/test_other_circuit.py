@@ -193,3 +193,13 @@ def test_other_methods_see_another_skin_where_chi2_does_not_show_it(method, snr_
 def test_other_methods_see_none_where_there_is_none(method, snr_db):
     """Noise biases the score by three standard deviations, as it does the elements."""
     assert identified(LOADS["dry"], snr_db, method=method).verdict == "successful"
+
+
+def test_a_wrong_gain_is_seen_where_it_moves_r_p_by_a_quarter():
+    """At 40 dB, 1 % is five standard deviations of the gain: 93 % exceed 3.5, half exceed 5."""
+    study = etid.scenes.paper_dry(snr_db=40.0).simulate(seed=3)
+    driver = etid.identify_driver(study["calibration/98k8"])
+    right = list(study.loaded.recordings())
+    wrong = [one.replace(v_out=1.01 * one.v_out, adc_range=None) for one in right]
+    assert etid.identify_skins(right, driver).counts() == {"successful": 10}
+    assert etid.identify_skins(wrong, driver).counts()["misfit"] >= 8

@@ -371,4 +371,4 @@ def fit_circuit(
         strain=jnp.dot(change, jnp.linalg.solve(driver.cov, change)),
         hum=shows_hum(known, g) & ~wrong_gain,
     )
-    return estimate, moved > FAR, other.seen()
+    return estimate, moved > FAR, other.seen() | other.has_other_gain()

@@ -35,6 +35,9 @@ from etid.signals.transfer import as_complex, frequency_variable
 # Standard deviations. By chance the spread exceeds its own in one fit of 16 000. Of the relaxations
 # the fast ones have 1.2 to 1.3 where 1 is expected (60 dB, order 5 for six poles), so that 5 is 4.
 SEEN_SPREAD, SEEN_RELAXATION = 4.0, 5.0
+# Standard deviations of a wrong gain. Among 1200 undisturbed fits one reaches 3.5. A gain that is
+# 1 % wrong is five standard deviations at 40 dB and makes R_p of dry skin a quarter too large.
+SEEN_GAIN = 3.5
 # By which α, or ε, must be off as well, which costs R_s a few per cent. A driver of too low an
 # order can imitate 0.002: at 60 dB, behind damp skin, four standard deviations.
 SPREAD = 0.01
@@ -85,6 +88,10 @@ class Scores(NamedTuple):
         """Whether the load is another circuit."""
         spread = (jnp.abs(self.z[0]) > SEEN_SPREAD) & (jnp.abs(self.size[0]) > SPREAD)
         return spread | Scores(self.z[1:], self.size[1:], self.moved[1:]).relaxes()
+
+    def has_other_gain(self) -> Bool[Array, ""]:
+        """Whether V_out has another gain than V_th, if the last change is a gain."""
+        return (jnp.abs(self.z[-1]) > SEEN_GAIN) & (self.moved[-1] > MOVED)
 
     def relaxes(self) -> Bool[Array, ""]:
         """The same of relaxations alone."""
