@@ -1,4 +1,4 @@
-"""The methods: harmonics or samples of one recording in, a judged fit or driver out.
+"""The estimators: they turn the harmonics or samples of one recording into a judged fit or driver.
 
-Reading files, and batches, belong to `etid.identify`.
+`etid.identify` reads files and handles batches.
 """

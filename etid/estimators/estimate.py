@@ -1,4 +1,4 @@
-"""What every fit shares: its solver, its weak priors, and the estimate that it returns."""
+"""Parts that all fits share: the solver, the weak priors, and the estimate that a fit returns."""
 
 import dataclasses
 import math
@@ -15,27 +15,30 @@ from etid.solvers.levenberg_marquardt import LevenbergMarquardt
 
 MAX_STEPS = 500
 PASSIVE_BAND = np.geomspace(1e-4, 10.0, 128)  # of the sample rate
-DELAY_WIDTH = 0.5  # [samples] of the weak prior of a delay; one sample is as far as it may go
-KNOWN_DELAY = 1e-9  # [samples] by which several different resistors leave it in doubt, or so
-SAME_LOAD = 0.01  # resistors closer than this do not resolve the delay of their records
+# [samples] Standard deviation of the weak prior of a delay. A delay above one sample is a misfit.
+DELAY_WIDTH = 0.5
+# [samples] Approximate standard deviation of the delay if the resistors differ.
+KNOWN_DELAY = 1e-9
+# Relative difference of resistors; with a smaller one, the delays of their records are unknown.
+SAME_LOAD = 0.01
 SOLVER = LevenbergMarquardt(rtol=1e-5, ftol=1e-6)  # 1e-3 standard errors at 10 000 samples
 
 
 class Estimate(eqx.Module):
-    """What a fit returns before it is judged.
+    """The result of a fit, without a verdict.
 
     Attributes:
         parameters: Estimated parameters.
         delay_samples: Trigger delay of each record [samples].
         cov: Covariance of `parameters`.
         chi2: Σ r²/s per degree of freedom.
-        rrse: Root relative squared error of V_out, the largest over the records.
+        rrse: Root relative squared error of V_out; the largest of all records.
         result: Verdict of the solver.
         steps: Trial steps of the solver.
-        shared_cov: The part of `cov` that comes from the driver, common to all skins identified
-            with it.
-        strain: By how much the calibrations' own Σ r² grew in a joint fit; 0 without one.
-        hum: Whether mains hum is seen in the residual; a fit in time does not look for it.
+        shared_cov: Part of `cov` that comes from the driver; all skins identified with this driver
+            share it.
+        strain: Increase of the Σ r² of the calibrations in a joint fit; 0 for other fits.
+        hum: Whether the residual shows mains hum; a fit in time does not test for it.
     """
 
     _: dataclasses.KW_ONLY
@@ -54,18 +57,21 @@ class Estimate(eqx.Module):
 def prior(start: SourceImpedance, sample_rate: Float[Array, ""], r_load: Float[Array, ""]):
     """Weak prior of the modal parameters, as additional residuals.
 
-    A pole that a noisy recording cannot determine would otherwise run away, to Q = ∞ for instance,
-    and take the solver with it. At 60 dB a recording carries 1e4 and more times the information of
-    this prior. What it allows (one standard deviation) is, for the first section, the resonance, a
-    frequency within e^3 of half the Nyquist frequency and a damping ratio of 0.7 within e^1.5; for
-    further ones an overdamped tail above the band, 1.5 times the Nyquist frequency within e^1.5 and
-    1.5 within e^0.5: a second sharp resonance beside the first is what noise makes when the trigger
-    delay is fitted too. Slow real poles lie within e^3 of 1/500 of half the Nyquist frequency, and
-    impedances below 10 times the known resistor.
+    Without a prior, a pole that a noisy recording does not determine would diverge, for example to
+    Q = ∞, and the solver with it. At 60 dB a recording has at least 1e4 times the information of
+    this prior. Its centres, with one standard deviation as a factor, are:
+
+    - First section, the resonance: half the Nyquist frequency (e^3), a damping ratio of 0.7
+      (e^1.5).
+    - Further sections, an overdamped tail above the band: 1.5 times the Nyquist frequency (e^1.5),
+      a damping ratio of 1.5 (e^0.5). If the trigger delay is fitted too, noise produces a second
+      sharp resonance beside the first; this prior prevents it.
+    - Slow real pole: 1/500 of half the Nyquist frequency (e^3).
+    - Impedances: 0, with a standard deviation of 10 times the known resistor.
 
     A transformer is passive, so Re Z_th ≥ 0 at all frequencies, inside the recorded band and above
-    it; otherwise some skin would make the loaded driver oscillate. Each frequency where it is not
-    adds Re Z_th / (10⁻³ R_L).
+    it. Otherwise the loaded driver would oscillate with some skins. Each frequency with Re Z_th < 0
+    adds the residual Re Z_th / (10⁻³ R_L).
     """
     half = 0.5 * jnp.pi * sample_rate
     wide = 10 * r_load
@@ -101,9 +107,9 @@ def prior(start: SourceImpedance, sample_rate: Float[Array, ""], r_load: Float[A
 
 
 def delay_std(r_load: Float[Array, " record"]) -> Float[Array, ""]:
-    """Standard deviation [samples] to which calibrations with these resistors know their delay.
+    """Standard deviation of the delay of calibrations with these resistors [samples].
 
-    Records with one and the same resistor share its ambiguity, others resolve it.
+    Records with the same resistor do not determine their delay. Different resistors determine it.
     """
     same = jnp.ptp(r_load) < SAME_LOAD * r_load.mean()
     return jnp.where(same, DELAY_WIDTH, KNOWN_DELAY)

@@ -1,7 +1,7 @@
-"""What an estimator is: a class whose fields are its options.
+"""Base class of the estimators; the fields of an estimator are its options.
 
-It says what it needs of a recording and of a driver, fits both, and describes itself for a paper.
-An estimator of one's own is a subclass, made known by `etid.estimators.registry.register`.
+An estimator states what it needs from a recording and from a driver. It fits both, and it describes
+itself for a paper. Your own estimator is a subclass; `etid.estimators.registry.register` adds it.
 """
 
 import abc
@@ -48,10 +48,10 @@ HARMONICS = (
 
 
 def serving(driver: Driver, kind: type[_Kind], method: str) -> _Kind:
-    """The driver as the kind that `method` needs.
+    """The driver, with the type that `method` needs.
 
     Raises:
-        ValueError: It is of a kind that lacks what the method needs.
+        ValueError: The driver has another type and lacks what the method needs.
     """
     if isinstance(driver, kind):
         return driver
@@ -68,16 +68,17 @@ def serving(driver: Driver, kind: type[_Kind], method: str) -> _Kind:
 
 @dataclasses.dataclass(frozen=True)
 class Description:
-    """What the methods section of a paper says of an estimator.
+    """Text about an estimator for the methods section of a paper.
 
     Attributes:
-        words: Its name in a sentence.
-        text: Sentences: what was estimated and how.
-        conditions: What holds for a successful fit.
-        of_driver: The same for a driver that it has identified.
-        errors: How standard errors were made, as the end of a sentence; empty if there are none.
-        refined: Whether minima were found by Levenberg-Marquardt from several starts.
-        noise: Sentence: how the noise of the records was estimated.
+        words: Name of the estimator in a sentence.
+        text: Sentences that state what was estimated, and how.
+        conditions: Conditions that a successful fit meets.
+        of_driver: Further conditions that an identified driver meets.
+        errors: How the standard errors were computed, as the end of a sentence; empty without
+            standard errors.
+        refined: Whether Levenberg-Marquardt found the minima from several starts.
+        noise: Sentence that states how the noise of the records was estimated.
         cited: Keys of the references in these texts.
     """
 
@@ -93,16 +94,17 @@ class Description:
 
 @dataclasses.dataclass(frozen=True)
 class AbstractEstimator(abc.ABC):
-    """A way to identify drivers and loads. Its fields are its options.
+    """An estimator of drivers and loads. Its fields are its options.
 
-    Instances are compared by their fields, so that one compiled function serves all that are equal.
+    Two instances are equal if their fields are equal. Equal instances share a compiled function.
 
     Attributes:
         name: Name of the estimator with its default options.
-        lane: What of a recording is fitted: its harmonics, which need whole periods, or samples.
-        driver: The kind of driver that it needs. A discrete one has to have the sample rate of the
-            recording.
-        any_circuit: Whether it identifies circuits other than `SkinRC`.
+        lane: The data of a recording that are fitted: samples, or harmonics. Harmonics need whole
+            periods.
+        driver: The type of driver that the estimator needs. A discrete driver must have the sample
+            rate of the recording.
+        any_circuit: Whether the estimator identifies circuits other than `SkinRC`.
     """
 
     name: ClassVar[str]
@@ -122,28 +124,30 @@ class AbstractEstimator(abc.ABC):
 
         Args:
             records: Calibrations, stacked along a leading axis.
-            r_load: Their resistors [Ω].
+            r_load: Resistor of each calibration [Ω].
             order: Number of poles of Z_th.
-            spectra: Their harmonics, if the lanes of this estimator are `periodic`.
+            spectra: Harmonics of the calibrations, if the lanes of this estimator are `periodic`.
         """
 
     @abc.abstractmethod
     def fit_load(self, lane: Any, driver: Any, known: Any, circuit: AbstractCircuit) -> Fit:
-        """Identify a load: differentiable code, which the caller compiles and batches.
+        """Identify a load.
+
+        The code must be differentiable. The caller compiles and batches it.
 
         Args:
-            lane: Of one recording.
-            driver: Its driver.
-            known: What `known` has returned for it.
+            lane: Data of one recording.
+            driver: Driver of the recording.
+            known: The value that `known` returned for this driver.
             circuit: Structure of the load and its typical values.
         """
 
     @abc.abstractmethod
     def describe(self) -> Description:
-        """What a methods section says of this estimator, its options included."""
+        """The text for a methods section, including the options."""
 
     def known(self, driver: Any, frequency: Float[Array, " harmonic"], shared: bool) -> Any:
-        """What all loads of a driver with the same harmonics have in common, computed once.
+        """Data that all loads of a driver with the same harmonics share; computed once.
 
         Args:
             driver: The driver.
@@ -161,25 +165,25 @@ class AbstractEstimator(abc.ABC):
             )
 
     def check_driver(self, driver: Driver, sample_rate: float, pulse_rate: float) -> None:
-        """Raise ValueError unless a driver serves for loads.
+        """Raise ValueError unless this estimator can use the driver for a recording.
 
         Args:
             driver: The driver.
-            sample_rate: Of the recording [Hz].
-            pulse_rate: Of the recording [Hz].
+            sample_rate: Sampling rate of the recording [Hz].
+            pulse_rate: Pulse rate of the recording [Hz].
         """
         del pulse_rate
         serving(driver, self.driver, str(self))
         discrete = not issubclass(self.driver, ContinuousDriver)
         if discrete and not np.isclose(float(driver.sample_rate), sample_rate):
             raise ValueError(
-                f"{self} needs recording and calibration at one sample rate, but the recording has "
-                f"{sample_rate:g} Hz and the driver {float(driver.sample_rate):g} Hz; "
+                f"{self} needs recording and calibration at the same sample rate; the recording "
+                f"has {sample_rate:g} Hz and the driver {float(driver.sample_rate):g} Hz; "
                 "use method='output_error'"
             )
 
     def __str__(self) -> str:
-        """The name, with the options that differ from the defaults: `registry.named` reads it."""
+        """The name, with the options that differ from the defaults. `registry.named` reads it."""
         changed = [
             f"{option.name}={getattr(self, option.name)!r}"
             for option in dataclasses.fields(self)

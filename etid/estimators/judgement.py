@@ -1,8 +1,8 @@
-"""From an estimate to a fit: every one passes through a judge, so that none lacks a verdict.
+"""The verdict of an estimate, which makes it a fit.
 
-Among several applicable verdicts the most fundamental is reported: a loop that cannot be simulated,
-then elements that are no circuit, then a solver that did not settle, then a model that misses the
-data, then parameters that the data do not determine.
+If several verdicts apply, the most fundamental one is reported. The order is: the loop cannot be
+simulated, the elements are no circuit, the solver did not converge, the model does not explain the
+data, the data do not determine the parameters.
 """
 
 import dataclasses
@@ -18,35 +18,36 @@ from etid.results.verdicts import RESULTS, first_verdict, verdict
 from etid.solvers.levenberg_marquardt import NormalEquations
 from etid.solvers.matrices import inverse
 
-# Members inherited from lineax, of which the type checker thinks they are not ours.
+# Inherited from lineax; the type checker does not see them as members of our class.
 SUCCESSFUL = verdict("successful")
 MAX_STEPS_REACHED = verdict("max_steps_reached")
-MISFIT_CHI2 = 1.5  # the noise is known from the record to about 5 %, chi2 therefore to 10 %
+MISFIT_CHI2 = 1.5  # the record gives the noise to about 5 %, so chi2 is known to 10 %
 MISFIT_RRSE = (
-    1e-3  # of the signal; what converters and transformers leave unexplained at their best
+    1e-3  # of the signal; the best converters and transformers leave this part unexplained
 )
-# Growth of the calibrations' sum of squares in a joint fit. It is chi-squared with as many degrees
-# of freedom as Z_th and the delays have parameters at most: 12 exceed this once in ten thousand.
+# Increase of the calibrations' sum of squares in a joint fit. Its distribution is chi-squared. The
+# degrees of freedom are at most the number of parameters of Z_th and the delays. With 12 degrees of
+# freedom the increase exceeds this value once in ten thousand.
 STRAINED = 39.0
-BIASED = 16.0  # squared standard errors between an estimate and the minimum of its own model
+BIASED = 16.0  # squared standard errors from an estimate to the minimum of its model
 
 
 def misses(
     chi2: Float[Array, ""], error: Float[Array, ""], least: float = MISFIT_RRSE
 ) -> Bool[Array, ""]:
-    """Whether the residual exceeds the noise both in standard deviations and in volts.
+    """Whether the residual exceeds the noise, both in standard deviations and in volts.
 
     Args:
-        chi2: Of the fit.
-        error: Its RRSE.
-        least: Part of the signal that it may leave unexplained.
+        chi2: χ² per degree of freedom of the fit.
+        error: RRSE of the fit.
+        least: Part of the signal that may remain unexplained.
     """
     excess = error * jnp.sqrt(jnp.maximum(1 - 1 / chi2, 0.0))
     return (chi2 > MISFIT_CHI2) & (excess > least)
 
 
 def too_late(estimate: Estimate) -> Bool[Array, ""]:
-    """Whether a trigger delay lies outside the one sample for which it is modelled."""
+    """Whether a trigger delay exceeds one sample; the model holds up to one sample."""
     return jnp.any(jnp.abs(estimate.delay_samples) > 1)
 
 
@@ -56,14 +57,14 @@ def judged(
     """The fit of an estimate, with its verdict.
 
     Args:
-        estimate: Its parameters are the logarithms of the elements.
+        estimate: Estimate whose parameters are the logarithms of the elements.
         circuit: Structure of the load.
         driver_result: Verdict of the driver.
         method: Name of the estimator.
     """
     fitted = circuit.with_log_values(estimate.parameters)
     values = fitted.values()
-    errors = jnp.sqrt(jnp.diagonal(estimate.cov))  # of the logarithms, so relative ones
+    errors = jnp.sqrt(jnp.diagonal(estimate.cov))  # of the logarithms, so they are relative
     settled = RESULTS.promote(estimate.result) == RESULTS.successful
     return Fit(
         circuit=fitted,
@@ -78,7 +79,7 @@ def judged(
             (~settled, MAX_STEPS_REACHED),
             (misses(estimate.chi2, estimate.rrse) | too_late(estimate), RESULTS.misfit),
             (estimate.strain > STRAINED, RESULTS.inconsistent),
-            # None of 0: that is an element without any effect.
+            # An error of 0 also fails: the element has no effect.
             (~jnp.all((errors > 0) & (errors < 1)), RESULTS.insensitive),
             (driver_result != SUCCESSFUL, RESULTS.driver_failed),
         ),
@@ -89,16 +90,16 @@ def judged(
 
 
 def remarks(hum: Bool[Array, ""]) -> Int[Array, ""]:
-    """The remark of a fit that shows mains hum."""
+    """The remark `mains_hum` if `hum` is true; otherwise 0."""
     return jnp.where(hum, jnp.array(int(Remark.mains_hum)), 0)
 
 
 def unless(fit: Fit, bad: Bool[Array, ""], result: RESULTS) -> Fit:
-    """The same with another verdict, if it would be successful and should not."""
+    """The fit with the verdict `result`, if it is successful and `bad` is true."""
     wrong = bad & (fit.result == SUCCESSFUL)
     return dataclasses.replace(fit, result=RESULTS.where(wrong, result, fit.result))
 
 
 def distance_to_minimum(equations: NormalEquations) -> Float[Array, ""]:
-    """Squared distance to the minimum in standard errors."""
+    """Squared distance to the minimum [standard errors squared]."""
     return equations.gradient @ inverse(equations.matrix) @ equations.gradient

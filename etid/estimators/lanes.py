@@ -1,8 +1,8 @@
 """Lanes: the arrays of a recording that an estimator fits, its harmonics or its samples.
 
-They are prepared with NumPy: JAX would compile for every length of a record. Records of most
-lengths have equally many harmonics, and samples are filled up to one of few lengths, so that one
-compiled function serves many recordings.
+NumPy prepares them, because JAX would compile once for each length of a record. Records of most
+lengths have the same number of harmonics. Samples are padded to one of a few lengths. Many
+recordings therefore share one compiled function.
 """
 
 import abc
@@ -25,12 +25,12 @@ from etid.signals.alignment import rest, shifted
 from etid.signals.harmonics import ALIASED, Spectrum, spectrum
 from etid.signals.measurement import Measurement, measure, noise, trusted
 
-LEFT = 0.75  # samples that are worth another fit; the delay that a fit allows for is 0.5
-STEPS = 4  # lengths in an octave: the longest filling is a fifth
+LEFT = 0.75  # samples; a larger delay needs a second fit. The prior of a delay is 0.5 wide
+STEPS = 4  # lengths per octave; the padding is at most a fifth
 
 
 class AbstractLane(eqx.Module):
-    """The arrays of one recording that an estimator fits, or of several along a leading axis.
+    """The arrays that an estimator fits: of one recording, or of several along a leading axis.
 
     Attributes:
         periodic: Whether the recording must hold whole pulse periods.
@@ -41,7 +41,7 @@ class AbstractLane(eqx.Module):
     @classmethod
     @abc.abstractmethod
     def of(cls, seen: Inspected) -> "AbstractLane":
-        """The lane of a recording that has passed the pre-flight."""
+        """The lane of a recording that has passed the preflight checks."""
 
     @classmethod
     @abc.abstractmethod
@@ -53,31 +53,31 @@ class AbstractLane(eqx.Module):
         sample_rate: Float[Array, ""],
         periods: tuple[int, int],
     ) -> "AbstractLane":
-        """The lane of bare arrays, which JAX may trace.
+        """The lane of bare arrays; JAX can trace this function.
 
         Args:
             v_th: Unloaded voltage [V].
             v_out: Loaded voltage [V].
             resolution: Step of the converter [V], 0 if not known.
             sample_rate: Sampling rate [Hz].
-            periods: From `whole_periods`.
+            periods: Numbers of periods and samples from `whole_periods`.
         """
 
     @property
     def size(self) -> int:
-        """Length of the arrays: lanes of one size share a compiled function."""
+        """Length of the arrays; lanes of the same size share a compiled function."""
         return jax.tree.leaves(self)[0].shape[-1]
 
     def realigned(self, late: int) -> "AbstractLane":
-        """The same with a `v_out` that is earlier by whole samples."""
+        """The lane with `v_out` advanced by whole samples."""
         del late
         return self
 
     def late_by(self, circuit: AbstractCircuit, driver: Driver) -> int:
-        """Whole samples by which `v_out` is later than with this load; 0 if they are few.
+        """Whole samples by which `v_out` is later than this load predicts; 0 for small delays.
 
-        Edges that the load smoothes let its record look later than it is. A fit that is a sample or
-        more away from the alignment finds the elements, but calls it a misfit.
+        A load smooths the edges, so its record seems later than it is. If the alignment is wrong by
+        a sample or more, the fit finds the elements, but its verdict is `misfit`.
         """
         del circuit, driver
         return 0
@@ -88,7 +88,7 @@ class AbstractLane(eqx.Module):
 
 
 class Harmonics(AbstractLane):
-    """Fourier coefficients of whole pulse periods: the fields of a `Spectrum`, and the rate.
+    """Fourier coefficients of whole pulse periods: the fields of a `Spectrum` and the sample rate.
 
     Attributes:
         sample_rate: Sampling rate [Hz].
@@ -106,7 +106,7 @@ class Harmonics(AbstractLane):
 
     @classmethod
     def of(cls, seen: Inspected) -> "Harmonics":
-        """The harmonics of a recording, aligned; a coarse converter's noise is its rounding."""
+        """Aligned harmonics of a recording; rounding is the noise of a coarse converter."""
         rate = np.asarray(seen.recording.sample_rate)
         sigma_th = np.asarray(trusted(seen.v_th, seen.sigma_th))
         sigma_out = np.asarray(trusted(seen.v_out, seen.sigma_out))
@@ -135,7 +135,7 @@ class Harmonics(AbstractLane):
         """The harmonics of bare arrays.
 
         Raises:
-            ValueError: They hold no whole period.
+            ValueError: The arrays hold no whole period.
         """
         if periods[0] == 0:
             raise ValueError(f"{v_out.shape[0]} samples hold no whole pulse period")
@@ -145,12 +145,12 @@ class Harmonics(AbstractLane):
 
     @property
     def spectrum(self) -> Spectrum:
-        """The harmonics without the rate, as arrays of JAX."""
+        """The harmonics without the sample rate, as arrays of JAX."""
         fields = (self.frequency, self.x, self.y, self.variance_x, self.variance_y, self.selected)
         return Spectrum(*map(jnp.asarray, fields))
 
     def realigned(self, late: int) -> "Harmonics":
-        """The same with a `v_out` that is earlier by whole samples: turned by e^(jω late / fs)."""
+        """The lane with `v_out` advanced by whole samples: multiplied by e^(jω late / fs)."""
         if late == 0:
             return self
         turn = np.exp(2j * np.pi * late / self.sample_rate * self.frequency)
@@ -172,7 +172,7 @@ class Harmonics(AbstractLane):
 
 
 class PaddedSamples(AbstractLane):
-    """Samples, filled up with zeros to one of few lengths.
+    """Samples, padded with zeros to one of a few lengths.
 
     Attributes:
         v_th: Unloaded voltage [V].
@@ -180,7 +180,7 @@ class PaddedSamples(AbstractLane):
         sigma_th: Noise of `v_th` [V].
         sigma_out: Noise of `v_out` [V].
         sample_rate: Sampling rate [Hz].
-        samples: How many of the first samples were recorded.
+        samples: Number of recorded samples; zeros follow them.
     """
 
     v_th: Float[Array | np.ndarray, "*lane time"]
@@ -192,7 +192,7 @@ class PaddedSamples(AbstractLane):
 
     @classmethod
     def of(cls, seen: Inspected) -> "PaddedSamples":
-        """The samples of a recording, aligned."""
+        """The aligned samples of a recording."""
         size = seen.v_th.size
         room = math.ceil(2 ** (math.ceil(STEPS * math.log2(size)) / STEPS)) - size
         one = cls(
@@ -214,7 +214,7 @@ class PaddedSamples(AbstractLane):
         sample_rate: Float[Array, ""],
         periods: tuple[int, int],
     ) -> "PaddedSamples":
-        """Bare arrays, to which nothing is added."""
+        """The lane of bare arrays, without padding."""
         del periods
         sigmas = jnp.asarray(noise(v_th, resolution)), jnp.asarray(noise(v_out, resolution))
         return cls(v_th, v_out, *sigmas, sample_rate, jnp.asarray(v_out.shape[0]))
@@ -226,7 +226,7 @@ class PaddedSamples(AbstractLane):
         return Measurement(*map(jnp.asarray, fields))
 
     def realigned(self, late: int) -> "PaddedSamples":
-        """The same with a `v_out` that is earlier by whole samples, where the two overlap."""
+        """The overlap of both records, with `v_out` advanced by whole samples."""
         if late == 0:
             return self
         samples = int(self.samples)
@@ -246,19 +246,19 @@ class PaddedSamples(AbstractLane):
         frequency = np.fft.rfftfreq(self.v_th.size, 1 / rate)[1:]
         x, y = np.fft.rfft(self.v_th)[1:], np.fft.rfft(self.v_out)[1:]
         gain = _gain(circuit, driver, frequency)
-        # Edges, as if both had been differentiated.
+        # The weight emphasises the edges, like a derivative of both records.
         weight = (frequency < ALIASED * rate) / (frequency**-2.0 * (1 + np.abs(gain) ** 2))
         return _whole(rest(gain * x, y, weight, 2 * np.pi * frequency / rate))
 
 
 class AlignedSamples(AbstractLane):
-    """Both records as they are, where they overlap after the alignment.
+    """The overlap of both records after the alignment, without padding.
 
     Attributes:
         v_th: Unloaded voltage [V].
         v_out: Loaded voltage [V].
         resolution_th: Converter step of `v_th` [V], 0 if not known.
-        resolution_out: The same of `v_out`.
+        resolution_out: Converter step of `v_out` [V], 0 if not known.
         sample_rate: Sampling rate [Hz].
     """
 
@@ -270,7 +270,7 @@ class AlignedSamples(AbstractLane):
 
     @classmethod
     def of(cls, seen: Inspected) -> "AlignedSamples":
-        """The records of a recording, aligned."""
+        """The aligned records of a recording."""
         steps = np.asarray(seen.step_th), np.asarray(seen.step_out)
         return cls(*seen.aligned, *steps, np.asarray(seen.recording.sample_rate))
 
@@ -283,12 +283,12 @@ class AlignedSamples(AbstractLane):
         sample_rate: Float[Array, ""],
         periods: tuple[int, int],
     ) -> "AlignedSamples":
-        """Bare arrays."""
+        """The lane of bare arrays."""
         del periods
         return cls(v_th, v_out, resolution, resolution, sample_rate)
 
     def measure(self) -> Measurement:
-        """Both records and their noise, which JAX estimates."""
+        """Both records and the noise that JAX estimates from them."""
         fields = self.v_th, self.v_out, self.resolution_th, self.resolution_out, self.sample_rate
         return measure(*map(jnp.asarray, fields))
 
@@ -296,12 +296,14 @@ class AlignedSamples(AbstractLane):
 def _gain(
     circuit: AbstractCircuit, driver: Driver, frequency: Float[Array | np.ndarray, " frequency"]
 ) -> Complex[np.ndarray, " frequency"]:
+    """Z_L / (Z_L + Z_th) at these frequencies [Hz]."""
     at = jnp.asarray(frequency)
     z = np.asarray(circuit.response(at))
     return z / (z + np.asarray(driver.response(at)))
 
 
 def _whole(late: float) -> int:
+    """A delay rounded to whole samples; 0 up to `LEFT`."""
     return round(late) if abs(late) > LEFT else 0
 
 
@@ -309,5 +311,5 @@ _Lane = TypeVar("_Lane", bound=AbstractLane)
 
 
 def stacked(lanes: Sequence[_Lane]) -> _Lane:
-    """Lanes of one size along a leading axis, as arrays of JAX."""
+    """Lanes of the same size, stacked along a leading axis as arrays of JAX."""
     return jax.tree.map(lambda *fields: jnp.asarray(np.stack(fields)), *lanes)

@@ -1,4 +1,4 @@
-"""The estimators by name, and which one a recording needs if none was asked for."""
+"""The estimators by name, and the default estimator of a recording."""
 
 import ast
 import dataclasses
@@ -21,11 +21,11 @@ MAXIMUM_LIKELIHOOD = MaximumLikelihood()
 OUTPUT_ERROR = OutputError()
 
 _ESTIMATORS: dict[str, AbstractEstimator] = {}
-_DESCRIPTIONS: dict[str, Description] = {}  # of what is no estimator of single recordings
+_DESCRIPTIONS: dict[str, Description] = {}  # of methods that do not fit single recordings
 
 
 def register(estimator: AbstractEstimator) -> None:
-    """Make an estimator known by its name, for `method`, files of fits and reports.
+    """Add an estimator under its name. `method`, files of fits and reports then know the name.
 
     Raises:
         ValueError: Another estimator has this name.
@@ -46,7 +46,7 @@ for _estimator in (
 
 
 def register_description(name: str, description: Description) -> None:
-    """Say for a methods section what fits are whose `method` is this name."""
+    """Add the text of a methods section for fits whose `method` is this name."""
     _DESCRIPTIONS[name] = description
 
 
@@ -56,10 +56,10 @@ def names() -> tuple[str, ...]:
 
 
 def named(method: str) -> AbstractEstimator:
-    """The estimator that a text names, as `str(estimator)` writes it.
+    """The estimator of a name and options, as `str(estimator)` writes them.
 
     Raises:
-        ValueError: There is none of this name, or it has no such option.
+        ValueError: No estimator has this name, or the estimator has no such options.
     """
     name, _, options = method.partition("(")
     if name not in _ESTIMATORS:
@@ -76,7 +76,7 @@ def named(method: str) -> AbstractEstimator:
 
 
 def described(method: str) -> Description | None:
-    """The description of the method that a fit names; None if no module has registered it."""
+    """The description of the method of a fit; None if the name is not registered."""
     if method in _DESCRIPTIONS:
         return _DESCRIPTIONS[method]
     try:
@@ -88,10 +88,10 @@ def described(method: str) -> Description | None:
 def estimator_of(
     method: Method | None, circuit: AbstractCircuit | None = None
 ) -> AbstractEstimator | None:
-    """The estimator that was asked for; None if the recordings are to choose.
+    """The requested estimator; None if `method` is None, so that each recording gets its default.
 
     Raises:
-        ValueError: There is no such estimator, or it cannot identify this circuit.
+        ValueError: No estimator has this name, or the estimator cannot identify this circuit.
     """
     require_float64()
     if method is None:
@@ -103,7 +103,7 @@ def estimator_of(
 
 
 def check_default(estimator: AbstractEstimator, circuit: AbstractCircuit) -> None:
-    """Raise ValueError if the estimator that was chosen cannot identify this circuit."""
+    """Raise ValueError if the default estimator cannot identify this circuit."""
     try:
         estimator.check_circuit(circuit)
     except ValueError as error:
@@ -111,18 +111,19 @@ def check_default(estimator: AbstractEstimator, circuit: AbstractCircuit) -> Non
             "the record holds less than two whole pulse periods or begins in a pulse, or its "
             f"driver was identified without harmonics; {str(error).partition(';')[0]}. Record "
             "three periods or more and identify the driver with method='maximum_likelihood', or "
-            "ask for method='maximum_likelihood': in a single period its standard errors leave "
-            "out what aliases do"
+            "ask for method='maximum_likelihood', whose standard errors do not include the "
+            "effect of aliases in a single period"
         ) from error
 
 
 def for_calibrations(
     asked: AbstractEstimator | None, recordings: Sequence[Inspected]
 ) -> AbstractEstimator:
-    """The estimator asked for, or else maximum likelihood if all records hold several periods.
+    """The requested estimator, or the default estimator of calibrations.
 
-    Where aliases cannot be told from harmonics, as in a single period, it would be biased by more
-    than its errors say.
+    The default is maximum likelihood if all records hold several periods. Otherwise it is output
+    error. If aliases and harmonics cannot be separated, as in a single period, the bias of maximum
+    likelihood exceeds its standard errors.
     """
     if asked is not None:
         return asked
@@ -131,7 +132,7 @@ def for_calibrations(
 
 
 def for_samples(driver: Driver, periods: tuple[int, int]) -> AbstractEstimator:
-    """The estimator for bare arrays of so many whole periods and samples."""
+    """The default estimator of arrays with this number of whole periods and samples."""
     several = isinstance(driver, HarmonicDriver) and separates_aliases(*periods)
     return MAXIMUM_LIKELIHOOD if several else OUTPUT_ERROR
 
@@ -139,10 +140,10 @@ def for_samples(driver: Driver, periods: tuple[int, int]) -> AbstractEstimator:
 def plan(
     asked: AbstractEstimator | None, seen: Inspected, driver: Driver
 ) -> tuple[AbstractEstimator, str | None]:
-    """The estimator for a load, and the verdict that forbids to fit it, if there is one.
+    """The estimator of a load, and the verdict that excludes a fit; None if it can be fitted.
 
     Raises:
-        ValueError: The driver cannot serve it.
+        ValueError: The estimator cannot use this driver.
     """
     name = preflight(seen, periodic=asked is not None and asked.lane.periodic)
     estimator = asked or OUTPUT_ERROR
