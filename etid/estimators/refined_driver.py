@@ -1,4 +1,4 @@
-"""Z_th refined from several starts, of which the best is kept and judged."""
+"""Refined Z_th: a fit from several starts; the best result is kept and judged."""
 
 import dataclasses
 import functools
@@ -22,16 +22,16 @@ from etid.signals.harmonics import Spectrum
 from etid.signals.measurement import Measurement
 
 PASSIVE = 2.0  # standard errors by which Re Z_th may be negative
-BAND = np.linspace(0.0003, 0.4, 400)  # of the sample rate, where a source must be passive
-UNWANTED = 1e3  # added to the cost of a start that did not settle; any cost is smaller
-# Two sections closer than this in ln ω and ln ζ are one that noise has split: their gains grow
-# against each other along a curved valley, of which the curvature at one place tells nothing. Costs
-# of good starts differ by 0.01.
+BAND = np.linspace(0.0003, 0.4, 400)  # of the sample rate; the source must be passive there
+UNWANTED = 1e3  # added to the cost of a start that did not converge; larger than any cost
+# Two sections closer than `SPLIT` in ln ω and ln ζ are one section, split by noise. Their gains
+# grow with opposite signs along a curved valley, so the curvature at one point is not informative.
+# `BLURRED` is added to the cost of such a start. The costs of good starts differ by 0.01.
 SPLIT, BLURRED = 0.1, 1.0
 
 
 def is_split(source: SourceImpedance) -> Bool[Array, ""]:
-    """Whether two sections of a source are in one place."""
+    """Whether two sections of a source coincide."""
     place = jnp.stack([source.log_omega, source.log_zeta])
     first, second = np.triu_indices(place.shape[1], 1)
     return jnp.any(jnp.all(jnp.abs(place[:, first] - place[:, second]) < SPLIT, axis=0))
@@ -44,13 +44,13 @@ def refined_driver(
     spectra: Spectrum | None,
     method: str,
 ) -> ContinuousDriver:
-    """Refine Z_th from several starts and keep the best that settled.
+    """Refine Z_th from several starts and keep the best that converged.
 
     Args:
         m: Calibrations, stacked along a leading axis.
-        r_load: Their resistors [Ω].
+        r_load: Resistor of each calibration [Ω].
         order: Number of poles.
-        spectra: Their harmonics, for maximum likelihood; None for output error.
+        spectra: Harmonics of the calibrations for maximum likelihood; None for output error.
         method: Name of the estimator.
     """
     baseline = iteration.driver_filter(m.v_th, m.v_out, r_load, order).filter
@@ -65,7 +65,7 @@ def refined_driver(
         def fit(start):
             return maximum_likelihood.fit_source(spectra, r_load, m.sample_rate[0], start)
 
-    # One start after the other: side by side they would all run as long as the slowest, and slower.
+    # One start after the other. In parallel all would run as long as the slowest, and be slower.
     sources, estimates, known = jax.lax.map(fit, starts)
     frequency = jnp.asarray(BAND) * m.sample_rate[0]
 
@@ -78,9 +78,8 @@ def refined_driver(
     passive = jax.vmap(resistance)(sources, estimates.cov) >= 0
     settled = RESULTS.promote(estimates.result) == RESULTS.successful
     finite = jnp.isfinite(estimates.chi2)
-    # Starts that settled on a passive circuit come first. Between them log s + chi2 decides, not
-    # chi2 alone, which a noisy
-    # record can lower by a spurious resonance that raises s.
+    # Starts that converged to a passive circuit come first. Among them log s + chi2 decides. With a
+    # noisy record, a spurious resonance can lower chi2 alone; but it raises s.
     log_s = jnp.log(estimates.rrse**2 / estimates.chi2)
     cost = jnp.where(finite, estimates.chi2 + log_s, jnp.inf)
     cost = cost + jnp.where(settled, 0.0, UNWANTED) + jnp.where(passive, 0.0, UNWANTED)

@@ -1,11 +1,11 @@
-"""The "sandwich": covariance of a fit whose noise is not what the fit expected.
+"""The "sandwich": covariance of a fit whose noise differs from the expected noise.
 
     cov = H⁻¹ (J C Jᵀ) H⁻¹,      H = J W Jᵀ + P
 
-J are the derivatives of the terms by the parameters, C is the variance that each term has, W is the
-share of signal in each term, whose noise would count as information, and P is the curvature of
-priors that are no terms (White 1980, "A heteroskedasticity-consistent covariance matrix estimator",
-Econometrica 48).
+J are the derivatives of the terms with respect to the parameters, and C is the variance of each
+term. W is the share of signal in each term; without it, noise would count as information. P is the
+curvature of the priors that are not among the terms (White 1980, "A heteroskedasticity-consistent
+covariance matrix estimator", Econometrica 48).
 """
 
 import dataclasses
@@ -17,7 +17,7 @@ from etid.solvers.matrices import inverse
 
 
 class Curvature(eqx.Module):
-    """Both parts of a sandwich; those of several recordings add up.
+    """Both parts of a sandwich; the parts of several recordings are added.
 
     Attributes:
         expected: H.
@@ -33,7 +33,7 @@ class Curvature(eqx.Module):
         return bread @ self.score @ bread
 
     def eliminate(self, kept: int) -> "Curvature":
-        """Project out all but the first `kept` parameters: nuisances of one recording alone."""
+        """Project out all but the first `kept` parameters: the nuisances of one recording."""
         h, m = self.expected, self.score
         k = -inverse(h[kept:, kept:], drop=True) @ h[kept:, :kept]
         return Curvature(
@@ -52,7 +52,7 @@ class Linear(eqx.Module):
         jacobian: J.
         share: Diagonal of W.
         noise: Diagonal of C.
-        prior: P; None if all priors are terms.
+        prior: P; None if all priors are among the terms.
     """
 
     jacobian: Float[Array, "q term"]
@@ -69,16 +69,16 @@ class Linear(eqx.Module):
         return inverse(self._expected())
 
     def covariance(self) -> Float[Array, "q q"]:
-        """The sandwich, from how each term moves the parameters, which loses fewest digits."""
+        """The sandwich, from the effect of each term on the parameters: loses fewest digits."""
         by_term = self.bread() @ self.jacobian
         return (by_term * self.noise[None, :]) @ by_term.T
 
     def told(self, rows: Float[Array, "row term"]) -> Float[Array, "row q"]:
-        """R W Jᵀ: what other derivatives R of the terms have in common with the parameters."""
+        """R W Jᵀ: products of other derivatives R of the terms with those of the parameters."""
         return (rows * self.share[None, :]) @ self.jacobian.T
 
     def along(self, directions: Float[Array, "q z"]) -> "Linear":
-        """The same terms by parameters that count along these directions, without a prior."""
+        """The terms with coordinates along these directions as parameters, without a prior."""
         return dataclasses.replace(self, jacobian=directions.T @ self.jacobian, prior=None)
 
     def _expected(self) -> Float[Array, "q q"]:

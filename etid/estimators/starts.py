@@ -1,4 +1,4 @@
-"""Where fits start: impedance levels, simpler estimates, generic resonances."""
+"""Starts of the fits: impedance levels, simpler estimates, generic resonances."""
 
 import jax
 import jax.numpy as jnp
@@ -12,19 +12,19 @@ from etid.results.driver import SourceImpedance
 from etid.signals.harmonics import Spectrum
 from etid.signals.transfer import poles
 
-LEVELS = (1.0, 0.125, 0.5, 2.0, 8.0)  # impedance levels at which a circuit is started
-START_STEPS = 8  # of Steiglitz-McBride on harmonics, which settles in three to eight
+LEVELS = (1.0, 0.125, 0.5, 2.0, 8.0)  # impedance levels of the starts of a circuit
+START_STEPS = 8  # iterations of Steiglitz-McBride on harmonics; it converges in three to eight
 
 
 def has_simpler_estimate(circuit: AbstractCircuit) -> bool:
-    """Whether Steiglitz-McBride estimates this circuit, so that fits start from there as well."""
+    """Whether Steiglitz-McBride can estimate this circuit; its estimate is then one more start."""
     return isinstance(circuit, SkinRC)
 
 
 def circuit_starts(
     circuit: AbstractCircuit, baseline: AbstractCircuit | None
 ) -> Float[Array, "start element"]:
-    """Logarithms of elements: several impedance levels, and a simpler estimate of them."""
+    """Starts of the elements' logarithms: several impedance levels, and a simpler estimate."""
     typical = circuit.log_values()
     power, _ = circuit.scaling()
     starts = [typical + float(np.log(level)) * power for level in LEVELS]
@@ -41,12 +41,12 @@ def harmonic_starts(
     z_th: Complex[Array, " harmonic"],
     circuit: AbstractCircuit,
 ) -> LoadUnknowns:
-    """Where a fit on harmonics may start, stacked; the likeliest comes last.
+    """Starts of a fit on harmonics, stacked; the likeliest is the last.
 
     Args:
         spectrum: One recording.
         sample_rate: Its sampling rate [Hz].
-        z_th: Source impedance there [Ω].
+        z_th: Source impedance at its harmonics [Ω].
         circuit: Structure and typical values.
     """
     if not has_simpler_estimate(circuit):
@@ -63,16 +63,16 @@ def source_starts(
     sample_rate: Float[Array, ""],
     r_load: Float[Array, ""],
 ) -> SourceImpedance:
-    """Starts for Z_th, stacked: three generic ones, and one with the baseline's resonance.
+    """Starts of Z_th, stacked: three generic ones, and one with the resonance of the baseline.
 
-    Every start has one slow real pole and sections at the given frequencies and damping ratios; all
-    gains are of the size of a tenth of the known resistor.
+    Each start has one slow real pole, and sections with given frequencies and damping ratios. All
+    gains have the size of a tenth of the known resistor.
     """
     sections = (order - 1) // 2
     reals = order - 2 * sections
     turn = 2 * jnp.pi * sample_rate
     generic = [[(0.1, 0.3), (0.5, 1.5)], [(0.25, 0.3), (0.5, 1.5)], [(0.1, 0.3), (0.25, 0.3)]]
-    far = (0.5, 1.5)  # further sections start overdamped at the edge of what was sampled
+    far = (0.5, 1.5)  # further sections start overdamped at the edge of the sampled band
 
     def start(pairs):
         pairs = (pairs + [far] * sections)[:sections]
@@ -97,7 +97,7 @@ def source_starts(
     starts = [start(pairs) for pairs in generic]
     if sections:
         s = jnp.log(poles(baseline))  # s / fs of the discrete poles
-        # Resonances are the poles well inside the band; the least damped comes first.
+        # Resonances are poles well inside the band. The least damped one is used.
         resonant = (s.imag > 0.05) & (s.imag < 0.9 * jnp.pi) & (s.real < 0)
         damping = jnp.where(resonant, -s.real / jnp.abs(s), jnp.inf)
         found = jnp.argsort(damping)[0]

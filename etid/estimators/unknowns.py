@@ -1,6 +1,6 @@
-"""What the fits search for, by name.
+"""The unknowns of the fits, by name.
 
-A solver sees one vector. Its order is known to `of` and `vector` here, and nowhere else.
+A solver uses one vector. Only `of` and `vector` of these classes know its order.
 """
 
 import equinox as eqx
@@ -9,7 +9,7 @@ from jaxtyping import Array, Float
 
 
 class LoadUnknowns(eqx.Module):
-    """What is unknown of a load and its recording; several may be stacked along leading axes.
+    """Unknowns of a load and its recording; several can be stacked along leading axes.
 
     Attributes:
         log_elements: Logarithms of the elements of the circuit [SI].
@@ -21,20 +21,20 @@ class LoadUnknowns(eqx.Module):
 
     @classmethod
     def of(cls, vector: Float[Array, "*lane own"]) -> "LoadUnknowns":
-        """From the vector of a solver, or from other numbers in its order along the last axis."""
+        """The unknowns, or other numbers by name, from a vector in the solver's order."""
         return cls(vector[..., :-1], vector[..., -1])
 
     def vector(self) -> Float[Array, "*lane own"]:
-        """For a solver."""
+        """The vector for a solver."""
         return jnp.concatenate([self.log_elements, self.delay_samples[..., None]], axis=-1)
 
 
 class Nuisance(eqx.Module):
-    """What is unknown of a recording in time, besides its load; several may be stacked.
+    """Unknowns of a recording in time, without those of its load; several can be stacked.
 
     Attributes:
         state: State of the loaded driver at the first sample.
-        offset: Of V_out [V].
+        offset: Offset of V_out [V].
         delay_samples: Trigger delay of the recording [samples].
     """
 
@@ -44,17 +44,17 @@ class Nuisance(eqx.Module):
 
     @classmethod
     def of(cls, vector: Float[Array, "*lane nuisance"]) -> "Nuisance":
-        """From the vector of a solver."""
+        """The unknowns from the vector of a solver."""
         return cls(vector[..., :-2], vector[..., -2], vector[..., -1])
 
     def vector(self) -> Float[Array, "*lane nuisance"]:
-        """For a solver."""
+        """The vector for a solver."""
         last = jnp.stack([self.offset, self.delay_samples], axis=-1)
         return jnp.concatenate([self.state, last], axis=-1)
 
 
 class DriverUnknowns(eqx.Module):
-    """What is unknown of a driver and its calibrations.
+    """Unknowns of a driver and its calibrations.
 
     Attributes:
         source: Parameters of Z_th, flattened in field order.
@@ -66,9 +66,9 @@ class DriverUnknowns(eqx.Module):
 
     @classmethod
     def of(cls, vector: Float[Array, " common"], records: int) -> "DriverUnknowns":
-        """From the vector of a solver."""
+        """The unknowns from the vector of a solver."""
         return cls(vector[:-records], vector[-records:])
 
     def vector(self) -> Float[Array, " common"]:
-        """For a solver."""
+        """The vector for a solver."""
         return jnp.concatenate([self.source, self.delay_samples])

@@ -1,4 +1,4 @@
-"""Tests of what a fit assumes: its circuit, the driver's order, the resistors, an unchanged driver.
+"""Tests of the assumptions of a fit: circuit, driver order, known resistors, unchanged driver.
 
-Each looks at the residuals of a fit that is done; none fits again.
+Each test uses the residuals of a finished fit. No test fits again.
 """

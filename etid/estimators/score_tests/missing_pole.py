@@ -1,18 +1,18 @@
-"""Has a driver a pole that its model lacks? A score test on the calibrations.
+"""Score test of the calibrations for a pole that the model of the driver lacks.
 
-A Z_th of too low an order can fit a calibration with χ² of 1 and a residual of the size of the
-noise, and still be wrong by 5 %: at 60 dB an order of 3 given for 5 or 6 costs R_s three per cent,
-ten of its standard errors. What it lacks is smooth in frequency, and noise is not. So Rao's score
-test asks for one more section,
+A Z_th whose order is too low can fit a calibration with χ² = 1 and a residual of the size of the
+noise. It can still be wrong by 5 %. At 60 dB, order 3 in place of 5 or 6 changes R_s by three per
+cent, ten of its standard errors. The missing part is smooth in frequency, and noise is not. Rao's
+score test therefore tests for one more section,
 
     ∂Z_th = (g + h x) / (1 + 2ζx + x²),      x = s/ω,
 
-at g = h = 0, for each ω of a grid that covers the band, and three dampings; a single pole is ζ = 1
-with g = h. The score of g and h, less what the other parameters can do, has two degrees of freedom;
-the largest of all sections decides.
+at g = h = 0, for three dampings and for each ω of a grid that covers the band. A single pole is
+ζ = 1 with g = h. The effect of the other parameters is projected out of the score of g and h. The
+statistic has two degrees of freedom, and the largest of all sections decides.
 
-Over the map of failures (`python -m benchmarks failure_map`) it is 15 at most where the order is
-high enough, and 116 or more where a lower one costs an element five of its standard errors.
+In the map of failures (`python -m benchmarks failure_map`) it is at most 15 if the order is high
+enough. It is at least 116 if a lower order changes an element by five of its standard errors.
 """
 
 import jax.numpy as jnp
@@ -21,16 +21,16 @@ from jaxtyping import Array, Bool, Complex, Float
 from etid.estimators.maximum_likelihood.driver import Calibrations
 from etid.signals.transfer import as_complex, frequency_variable, reciprocal
 
-SEEN = 36.0  # χ² of two degrees of freedom; one of some hundred sections has it once in 10⁶
+SEEN = 36.0  # χ² of two degrees of freedom; by chance one of about 100 sections has it once in 10⁶
 DAMPINGS = (0.1, 0.3, 1.0)
-GRID = 36  # frequencies, eight in a decade
-BEYOND = 3.0  # by which they exceed the band, in which a slow or a fast pole still shows
+GRID = 36  # frequencies, eight per decade
+BEYOND = 3.0  # factor by which the grid exceeds the band; poles beyond the band still have effect
 
 
 def sections(
     frequency: Float[Array, " harmonic"], lowest: Float[Array, ""], highest: Float[Array, ""]
 ) -> Complex[Array, "section 2 harmonic"]:
-    """∂Z_th/∂g and ∂Z_th/∂h of all sections."""
+    """∂Z_th/∂g and ∂Z_th/∂h of all sections, for a band [Hz]."""
     omega = 2 * jnp.pi * jnp.geomspace(lowest / BEYOND, highest * BEYOND, GRID)
     omega, zeta = (of.ravel() for of in jnp.meshgrid(omega, jnp.asarray(DAMPINGS)))
     x = frequency_variable(frequency)[None, :] * as_complex(1 / omega)[:, None]
@@ -42,16 +42,16 @@ def is_seen(calibrations: Calibrations) -> Bool[Array, ""]:
     """Whether the calibrations show one more section.
 
     Args:
-        calibrations: At the minimum of their likelihood.
+        calibrations: Calibrations at the minimum of their likelihood.
     """
-    return jnp.nanmax(squares(calibrations)) > SEEN  # none where a section has no effect
+    return jnp.nanmax(squares(calibrations)) > SEEN  # NaN if a section has no effect
 
 
 def squares(calibrations: Calibrations) -> Float[Array, " section"]:
-    """Score statistic of each section, χ² with two degrees of freedom if there is none.
+    """Score statistic of each section: χ² with two degrees of freedom if the section is absent.
 
     Args:
-        calibrations: At the minimum of their likelihood.
+        calibrations: Calibrations at the minimum of their likelihood.
     """
     c = calibrations.start()
     linear = calibrations.linear(c)
@@ -64,7 +64,7 @@ def squares(calibrations: Calibrations) -> Float[Array, " section"]:
 
 
 def _slopes(calibrations: Calibrations) -> list[Complex[Array, "row harmonic"]]:
-    """Derivatives of the gains, G = R/(R + Z_th), by g and h of all sections."""
+    """Derivatives of the gains G = R/(R + Z_th) with respect to g and h of all sections."""
     spectra, gains = calibrations.spectra, calibrations.gains(calibrations.start())
     lowest = spectra.frequency[0, 0]
     highest = jnp.max(jnp.where(spectra.selected, spectra.frequency, lowest))

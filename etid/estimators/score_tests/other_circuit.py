@@ -1,25 +1,26 @@
-"""Is a load the circuit that is fitted? Score tests against other relaxations.
+"""Score tests whether a load is another circuit than the fitted one.
 
-Let Z be the impedance that is fitted, and r the residual in standard deviations. Rao's score test
-asks whether r goes with a change of Z that the circuit cannot make: with d the derivative of r by
-the size ε of the change, less what the other parameters can do, z = d·r / σ(d·r) is normal if the
-circuit is right. It sees what χ² over all harmonics does not. There are two kinds of change.
+Let Z be the fitted impedance, and r the residual in standard deviations. Rao's score test checks
+whether r correlates with a change of Z that the circuit cannot make. Let d be the derivative of r
+with respect to the size ε of the change, with the effect of the other parameters projected out. If
+the circuit is right, z = d·r / σ(d·r) is normal. The test detects changes that χ² over all
+harmonics does not show. There are two kinds of change.
 
-**A relaxation that is spread over time constants.** The most common description of skin that is not
-one RC is Cole's (1940), which puts (jω)^α in the place of jω, and α = 1 is the circuit itself:
+**A relaxation that is spread over time constants.** The most common model of skin that is not one
+RC is that of Cole (1940). It replaces jω by (jω)^α; α = 1 is the circuit itself:
 
     ∂Z/∂α = s ln s dZ/ds.
 
-At 40 dB and α = 0.9, which costs R_s a quarter of its value, χ² is 1.1 and z above 10. A circuit
-with an α of its own can do this itself. It is asked instead whether the spread is the same on both
-sides, as Cole's is and that of Davidson and Cole (1951) is not: ln s goes on to
+At 40 dB, α = 0.9 changes R_s by a quarter of its value; χ² is 1.1 and z above 10. A circuit with
+its own α can make this change itself. For such a circuit the test checks whether the spread is
+symmetric. Cole's spread is symmetric; that of Davidson and Cole (1951) is not. ln s becomes
 ln s + ε ln² (s/s₀) around the middle s₀ of the band, and
 
     ∂Z/∂ε = s ln² (s/s₀) dZ/ds.
 
-**One more relaxation**, ΔZ = ε |Z(j/τ)| / (1 + sτ), for each τ of a grid that covers the band and
-exceeds it. This has power where dZ/ds = 0: a resistor has no phase to be spread. What the circuit
-can do itself, such as this relaxation where it has one with this τ, is no evidence: d vanishes.
+**One more relaxation**, ΔZ = ε |Z(j/τ)| / (1 + sτ), for each τ of a grid that exceeds the band.
+This test also has power if dZ/ds = 0, as for a resistor. A change that the circuit can make itself
+is no evidence: d vanishes. An example is a relaxation with a τ that the circuit has already.
 """
 
 from typing import NamedTuple
@@ -32,19 +33,19 @@ from etid.circuits.impedance import AbstractImpedance
 from etid.estimators.sandwich import Linear
 from etid.signals.transfer import as_complex, frequency_variable
 
-# Standard deviations. By chance the spread exceeds its own in one fit of 16 000. Of the relaxations
-# the fast ones have 1.2 to 1.3 where 1 is expected (60 dB, order 5 for six poles), so that 5 is 4.
+# Standard deviations. By chance the spread exceeds its limit in one fit of 16 000. The fast
+# relaxations have 1.2 to 1.3 where 1 is expected (60 dB, order 5 for six poles), so 5 is in fact 4.
 SEEN_SPREAD, SEEN_RELAXATION = 4.0, 5.0
-# Standard deviations of a wrong gain. Among 1200 undisturbed fits one reaches 3.5. A gain that is
-# 1 % wrong is five standard deviations at 40 dB and makes R_p of dry skin a quarter too large.
+# Standard deviations of a wrong gain. One of 1200 undisturbed fits reaches 3.5. A gain that is 1 %
+# wrong has five standard deviations at 40 dB, and makes R_p of dry skin a quarter too large.
 SEEN_GAIN = 3.5
-# By which α, or ε, must be off as well, which costs R_s a few per cent. A driver of too low an
-# order can imitate 0.002: at 60 dB, behind damp skin, four standard deviations.
+# α or ε must also deviate by this, which changes R_s by a few per cent. A driver whose order is too
+# low can imitate 0.002: four standard deviations at 60 dB with damp skin.
 SPREAD = 0.01
-MOVED = 0.02  # of an element, which the relaxation must have cost as well, for the same reason
-GRID = 7  # time constants, two in a decade: a relaxation is wider than that
-BEYOND = 2.0  # by which they exceed the band
-NOTHING = 1e-9  # of a change's power: less is what rounding leaves of one that the circuit can make
+MOVED = 0.02  # relative change of an element that is also necessary, for the same reason
+GRID = 7  # time constants, two per decade; a relaxation is wider than that
+BEYOND = 2.0  # factor by which they exceed the band
+NOTHING = 1e-9  # of the power of a change; rounding leaves less of one that the circuit can make
 
 
 def changes(
@@ -72,12 +73,12 @@ def relaxations(
 
 
 class Scores(NamedTuple):
-    """What a residual says of each change; the first is the spread.
+    """Scores of all changes for one residual; the first change is the spread.
 
     Attributes:
-        z: Standard deviations; not a number if the circuit can make the change itself.
+        z: Standard deviations; NaN if the circuit can make the change itself.
         size: Estimate of ε.
-        moved: By how much ε has moved the elements at most (of logarithms).
+        moved: Largest change of the logarithm of an element by this ε.
     """
 
     z: Float[Array, " change"]
@@ -85,16 +86,16 @@ class Scores(NamedTuple):
     moved: Float[Array, " change"]
 
     def seen(self) -> Bool[Array, ""]:
-        """Whether the load is another circuit."""
+        """Whether the scores show another circuit."""
         spread = (jnp.abs(self.z[0]) > SEEN_SPREAD) & (jnp.abs(self.size[0]) > SPREAD)
         return spread | Scores(self.z[1:], self.size[1:], self.moved[1:]).relaxes()
 
     def has_other_gain(self) -> Bool[Array, ""]:
-        """Whether V_out has another gain than V_th, if the last change is a gain."""
+        """Whether V_out and V_th have different gains; the last change must be a gain."""
         return (jnp.abs(self.z[-1]) > SEEN_GAIN) & (self.moved[-1] > MOVED)
 
     def relaxes(self) -> Bool[Array, ""]:
-        """The same of relaxations alone."""
+        """Whether one more relaxation is seen; all changes must be relaxations."""
         return jnp.any((jnp.abs(self.z) > SEEN_RELAXATION) & (self.moved > MOVED))
 
 
@@ -109,22 +110,22 @@ def scores(
 ) -> Scores:
     """Score of each change.
 
-    The parameters need not be at a minimum: what they could still explain of the residual is taken
-    out of it (Neyman's C(α)).
+    The parameters need not be at a minimum: the part of the residual that they could still explain
+    is projected out (Neyman's C(α)).
 
     Args:
-        rows: Derivatives of the residual by ε.
-        linear: The terms by the parameters.
-        residual: In standard deviations.
+        rows: Derivatives of the residual with respect to ε.
+        linear: The terms, linear in the parameters.
+        residual: Residual [standard deviations].
         rest: Gradient of the priors.
-        spread: Covariance of that.
-        covariance: Inverse of the information, that of other terms included.
-        elements: Which parameters are the logarithms of the elements.
+        spread: Covariance of this gradient.
+        covariance: Inverse of the information, including that of other terms.
+        elements: Slice of the parameters that are the logarithms of the elements.
     """
     others = linear.told(rows) @ covariance
     directions = rows - others @ linear.jacobian
     score = directions @ residual - others @ rest
-    # Products of matrices, which take a fifth of the time of sums.
+    # Matrix products take a fifth of the time of sums.
     of_priors = jnp.sum((others @ spread) * others, axis=1)
     variance, curvature = (
         directions**2 @ jnp.stack([linear.noise, linear.share], axis=1)

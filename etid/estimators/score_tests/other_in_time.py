@@ -1,16 +1,17 @@
-"""Is a load the circuit that is fitted? Score tests of a fit in time.
+"""Score tests of a fit in time whether a load is another circuit than the fitted one.
 
-Those of `etid.estimators.score_tests.other_circuit` ask for one more relaxation,
-ΔZ = ε |Z(j/τ)| / (1 + sτ). In time it is one more state of the load, and the slope of the predicted
-voltage by ε comes from the same simulation.
+Like `etid.estimators.score_tests.other_circuit`, they test for one more relaxation,
+ΔZ = ε |Z(j/τ)| / (1 + sτ). In time this is one more state of the load. The same simulation gives
+the slope of the predicted voltage with respect to ε.
 
-The residual is coloured, G having filtered the noise of V_th. Residual and slopes are therefore
-taken to frequencies, where the noise is independent with the power
+The residual is coloured, because G filters the noise of V_th. The residual and the slopes are
+therefore transformed to frequencies. There the noise is independent and has the power
 
     P(θ) = σ_out² |K|² + σ_th² |G|²,
 
-and divided by √P. P moves with the parameters, by which the slopes are free of what the noise of
-V_th in them has in common with the residual, as in `etid.estimators.output_error.prediction`.
+by whose root √P they are divided. P depends on the parameters. This dependence removes from the
+slopes the noise of V_th that they share with the residual, as in
+`etid.estimators.output_error.prediction`.
 """
 
 import dataclasses
@@ -38,15 +39,15 @@ from etid.signals.filtering import StateSpace, hold
 from etid.signals.transfer import as_complex
 from etid.solvers.matrices import inverse
 
-# Hz. Faster relaxations look like delays and like the driver's fast poles, which at 40 dB are in
-# doubt further than a linear distribution holds: of three damp skins one had z = 13 at 140 kHz.
+# [Hz] Faster relaxations resemble delays and the fast poles of the driver. At 40 dB these poles are
+# more uncertain than a linear distribution allows: one of three damp skins had z = 13 at 140 kHz.
 HIGHEST = 5e3
-PASSED = 0.5  # of the power, which the interpolation must let through
-BESIDE = 8  # bins to either side, with which the power of V_th is averaged
+PASSED = 0.5  # part of the power that the interpolation must pass
+BESIDE = 8  # bins on either side over which the power of V_th is averaged
 
 
 class Relaxed(eqx.Module):
-    """How voltage and impulse response change by each ε.
+    """Derivatives of voltage and impulse response with respect to each ε.
 
     Attributes:
         v_out: Terminal voltage [V].
@@ -63,13 +64,13 @@ def relaxed(
     impedance: AbstractImpedance,
     nuisance: Nuisance,
 ) -> Relaxed:
-    """Derivatives by one more relaxation of each time constant.
+    """Derivatives with respect to one more relaxation, for each time constant.
 
     Args:
         records: One recording.
         source: Z_th.
         impedance: The load.
-        nuisance: What else is unknown of it.
+        nuisance: Other unknowns of the recording.
     """
     rate = records.sample_rate
     corner, level = relaxations(impedance, rate / records.intervals, jnp.asarray(HIGHEST))
@@ -109,13 +110,13 @@ def score(
 
     Args:
         records: One recording.
-        change: Derivatives by the relaxations.
-        at: Those by the parameters.
+        change: Derivatives with respect to the relaxations.
+        at: Derivatives with respect to the parameters.
         source_cov: Covariance of the parameters of the source.
-        first: Place of these among the parameters.
-        rest: Gradient of the priors of the others.
-        precision: Of these priors.
-        elements: How many parameters, the first, are the logarithms of elements.
+        first: Index of the first parameter of the source.
+        rest: Gradient of the priors of the other parameters.
+        precision: Precision of these priors.
+        elements: Number of elements; their logarithms are the first parameters.
     """
     # Parameters of the source in standard deviations.
     values, vectors = jnp.linalg.eigh(source_cov)
@@ -128,7 +129,7 @@ def score(
         )
 
     known = jnp.zeros_like(precision).at[first:last].set(1.0) + precision
-    # In volts, which the scaled residual is not.
+    # In volts; the scaled residual is in standard deviations.
     s = residual_variance(records, at.h)
     s_slope = 2 * records.sigma_th**2 * at.h @ at.slope
     jacobian = at.jacobian + at.residual[:, None] * s_slope[None, :] / (2 * s)
@@ -149,8 +150,8 @@ def score(
         records.sigma_th**2 / power
     )[:, None]
     rows = jnp.fft.rfft(of_time, size, axis=0) - residual[:, None] * as_complex(wider)
-    # The noise of V_th in the slopes, which would count as information, is left out as Wiener does.
-    # Initial state and offset, before the delay at the end, have none.
+    # A Wiener filter removes the noise of V_th from the slopes: it would count as information. The
+    # slopes of initial state and offset have no noise. They come before the delay, which is last.
     v_th = _smooth(jnp.abs(jnp.fft.rfft(records.hold[:, 0] * records.used, size)) ** 2)
     share = jnp.maximum(1 - records.sigma_th**2 * passed * records.intervals / v_th, 0.0)
     count = change.v_out.shape[1]
@@ -172,7 +173,7 @@ def score(
         terms(residual),
         rest,
         jnp.diag(known),
-        # What the record does not determine, an initial state for instance, has no effect.
+        # A parameter that the record does not determine, such as an initial state, has no effect.
         inverse(linear.curvature().expected, drop=True),
         slice(elements),
     )

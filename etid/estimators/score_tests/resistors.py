@@ -1,12 +1,12 @@
-"""Do the known resistors of a driver's calibrations belong together?
+"""Score test whether the known resistors of the calibrations agree.
 
-Only ratios to Z_th are observable, so one resistor that is wrong shows nowhere: Z_th is wrong by
-as much. Several must show the same Z_th. For each of them the score test asks how much larger or
-smaller the others say that it is, with
+Only ratios to Z_th are observable. The error of a single resistor is therefore not visible: Z_th
+has the same relative error. Several resistors must show the same Z_th. For each resistor the score
+test estimates how far its value differs from the value that the others show, with
 
-    ∂G/∂ log R = G Z_th / (R + Z_th) = G (1 − G₀),      G = G₀ e^(−jωτ),
+    ∂G/∂ log R = G Z_th / (R + Z_th) = G (1 − G₀),      G = G₀ e^(−jωτ).
 
-and Z_th and all delays free.
+Z_th and all delays are free.
 """
 
 import jax.numpy as jnp
@@ -17,23 +17,23 @@ from etid.estimators.maximum_likelihood.terms import excess, weights
 from etid.recordings.preflight import Inspected
 from etid.signals.transfer import as_complex
 
-# Standard errors: one calibration in two million is off by chance.
+# Standard errors; by chance one calibration in two million exceeds this.
 SEEN = 5.0
-# Resistors of 0.1 % and meters are better than this. A smaller mistake costs elements no more.
+# Relative error. Resistors of 0.1 % and meters are better. A smaller error affects elements no more.
 SIZE = 0.005
-# Part of what chi2 has too much that one wrong resistor must explain; or else the records are
-# wrong in another way, which can imitate a wrong resistor.
+# Part of the excess of chi2 that one wrong resistor must explain. Otherwise the records have
+# another fault, which can imitate a wrong resistor.
 EXPLAINED = 0.5
-# By which resistances at low frequency may differ in what they say of Z_th, roughly. It is real
-# there to a few per cent.
+# Factor by which rough values of |Z_th| may differ between resistors. At low frequency Z_th is real
+# to a few per cent.
 ROUGHLY = 3.0
 
 
 def mismatch(calibrations: Calibrations) -> Float[Array, "2 record"]:
-    """By how much each log R exceeds what the other calibrations say, and its standard error.
+    """Excess of each log R over the value that the other calibrations show, and its standard error.
 
     Args:
-        calibrations: Two or more, at the minimum of their likelihood.
+        calibrations: Two or more calibrations at the minimum of their likelihood.
     """
     c, records = calibrations.start(), calibrations.records
     linear, value = calibrations.linear(c), calibrations.terms(c, records)
@@ -48,7 +48,7 @@ def mismatch(calibrations: Calibrations) -> Float[Array, "2 record"]:
     directions = rows - linear.told(rows) @ linear.bread() @ linear.jacobian
     own = jnp.sum(rows * linear.share[None, :] * directions, axis=1)
     score = directions @ value
-    # The noise is what is left after the resistor that explains most, whose mistake is none.
+    # Estimate the noise after the resistor that explains most: its error must not count as noise.
     best = jnp.argmax(score**2 / own)
     rest = value - directions[best] * (score / own)[best]
     size = records[0].x.size
@@ -72,19 +72,19 @@ def disagree(
     """Whether a known resistor is seen to be wrong.
 
     Args:
-        mismatch: From `mismatch`.
-        chi2: Of the driver.
-        terms: How many terms χ² is the mean of.
+        mismatch: Result of the function `mismatch`.
+        chi2: χ² per degree of freedom of the driver.
+        terms: Number of terms in χ².
     """
     off, error = mismatch
     squares = (off / error) ** 2
-    # Errors are those of the noise that a resistor leaves, χ² counts in that of the records.
+    # The errors use the noise without the wrong resistor; χ² uses the noise of the records.
     left = jnp.maximum(chi2 / (1 + squares / terms), 1.0)
     explained = squares * left > EXPLAINED * (chi2 - 1) * terms
     return jnp.any((squares > SEEN**2) & (jnp.abs(off) > SIZE) & explained)
 
 
 def rough_impedance(calibration: Inspected, r_load: float) -> float:
-    """About |Z_th| [Ω] by a resistor [Ω], from the amplitudes of both records alone."""
+    """Rough |Z_th| [Ω] from a resistor [Ω] and the amplitudes of both records."""
     x, y = (v - v.mean() for v in calibration.aligned)
     return r_load * abs(float(x @ x / (y @ x)) - 1)

@@ -1,16 +1,16 @@
-"""Is the unloaded voltage still that of the calibration? It shows that a driver has changed.
+"""Test whether a driver has changed: its unloaded voltage differs from that of the calibration.
 
-A change of Z_th bends Y/X as a change of the load does: with a resistor of 5 % more in the driver,
-R_p of dry skin is 63 standard errors off at 60 dB, and χ² is 1. But the parts of Z_th make V_th as
-well, where there is no skin: the same resistor, and the capacitance of the cable behind it, take a
-thousandth of the edges. So the harmonics of two unloaded records of one driver may differ by an
-amplitude a and a delay τ only,
+A change of Z_th affects Y/X like a change of the load. If a resistor in the driver grows by 5 %,
+R_p of dry skin is wrong by 63 standard errors at 60 dB, and χ² is 1. But the parts of Z_th also
+shape V_th, without any skin. The same resistor, with the capacitance of the cable behind it,
+changes the edges by a thousandth. The harmonics of two unloaded records of an unchanged driver
+differ only by an amplitude a and a delay τ,
 
     X_k = a e^(−jω_k τ) X⁰_k (1 + δ_k),      δ = 0.
 
-δ of a part that has changed is smooth in frequency: here `DEGREE` complex polynomials of log f.
-Another pulse, a longer one for instance, has its zeros elsewhere, which is not smooth: it says
-nothing of the driver and is no fault.
+If a part has changed, δ is smooth in frequency; here `DEGREE` complex polynomials of log f.
+Another pulse, for example a longer one, has other zeros, and its δ is not smooth. It tells nothing
+about the driver and is no fault.
 """
 
 from typing import NamedTuple
@@ -25,18 +25,18 @@ from etid.results.driver import Driver, HarmonicDriver
 from etid.signals.harmonics import Spectrum, signal_share
 from etid.signals.transfer import as_complex, power, turns
 
-DEGREE = 6  # of δ: its real part has a constant less, which is the amplitude
-FIRST = 6  # harmonics that are left out: hum and drift
-SIGNAL = 0.9  # share of signal in the power around a harmonic from which on it is used
-SEEN = 36.0  # of 11 degrees of freedom: one recording in 6000 by chance
-SIZE = 1.5e-4  # of V_th, that must differ as well; pulses are repeated to no better than this
-# By a driver whose parts are known to drift, relative to that: three times the standard deviation
-# of an inductance, which does most.
+DEGREE = 6  # polynomials of δ; its real part has no constant, because that is the amplitude
+FIRST = 6  # first harmonics, which are not used because of hum and drift
+SIGNAL = 0.9  # smallest share of signal in the power around a harmonic that is used
+SEEN = 36.0  # χ² of 11 degrees of freedom; by chance one recording in 6000 exceeds this
+SIZE = 1.5e-4  # smallest difference relative to V_th; pulses repeat no better than this
+# Additional difference for a driver with a known drift, relative to the drift. It is three times
+# the standard deviation of an inductance, which has the largest effect.
 DRIFT = 0.2
-OTHER = 0.1  # of V_th, from which on it is another pulse; a part of twice its size does less
-SMOOTH = 1 / 3  # of what the records differ by must be smooth
-# By which pulse rates may differ: records of other lengths are cut to other whole samples, which
-# moves the zeros of a pulse at its thousandth harmonic by as much as a part that has changed.
+OTHER = 0.1  # difference relative to V_th of another pulse; doubling a part has less effect
+SMOOTH = 1 / 3  # part of the difference that must be smooth
+# Relative difference of pulse rates. Records of other lengths are cut to other whole samples. This
+# moves the zeros of a pulse at its thousandth harmonic as much as a part that has changed.
 SAME_FREQUENCY = 1e-6
 
 
@@ -44,13 +44,14 @@ class UnloadedShape(NamedTuple):
     """The unloaded voltage of a calibration.
 
     Attributes:
-        frequency: Its harmonics [Hz].
-        x: Their coefficients [V], 0 where they are not used.
-        variance: E|noise|² of each [V²].
-        directions: Orthonormal ways in which `x` changes with δ, at right angles to amplitude and
-            delay; real parts, then imaginary ones.
-        bias: What the noise of `x`, which is in the directions too, takes along each [V].
-        least: Part of V_th by which another has to differ.
+        frequency: Harmonics [Hz].
+        x: Fourier coefficients [V]; 0 where they are not used.
+        variance: E|noise|² of each coefficient [V²].
+        directions: Orthonormal directions in which δ changes `x`, orthogonal to amplitude and
+            delay; first the real parts, then the imaginary parts.
+        bias: Bias along each direction [V]. It arises because the directions contain the noise of
+            `x` too.
+        least: Smallest difference that counts, relative to V_th.
     """
 
     frequency: Float[Array, " harmonic"]
@@ -61,7 +62,7 @@ class UnloadedShape(NamedTuple):
     least: Float[Array, ""]
 
     def differs(self, spectrum: Spectrum) -> Bool[Array, ""]:
-        """Whether a recording's unloaded voltage is that of a driver that has changed."""
+        """Whether the unloaded voltage of a recording shows that the driver has changed."""
         known = jnp.where(spectrum.selected, self.x, 0)
         number = jnp.arange(1.0, known.size + 1)
         total = jnp.sum(power(known))
@@ -88,18 +89,18 @@ class UnloadedShape(NamedTuple):
             noise = excess(part - along @ self.directions, known != 0)
             return jnp.sum(along**2 / (self.directions**2 @ noise)) > SEEN
 
-        # No noise is smaller than 1, so that it need not be known where this is none.
-        another = all_of_it > of_chance / 2  # or else it is the same record
+        # The noise is at least 1, so a sum below `SEEN` needs no estimate of the noise.
+        another = all_of_it > of_chance / 2  # otherwise both are the same record
         seen = same & large & another & (smooth > SEEN)
         return jax.lax.cond(seen, in_its_noise, lambda _: jnp.array(False), None)
 
 
 def shape(spectrum: Spectrum, drift: Float[Array | np.ndarray, ""] | None = None) -> UnloadedShape:
-    """The unloaded voltage of a calibration, to compare others with.
+    """The unloaded voltage of a calibration, for a comparison with other records.
 
     Args:
         spectrum: The calibration.
-        drift: That of its driver.
+        drift: Drift of its driver.
     """
     f, size = spectrum.frequency, spectrum.x.shape[0]
     clear = signal_share(spectrum.x, spectrum.variance_x) > SIGNAL
@@ -112,7 +113,7 @@ def shape(spectrum: Spectrum, drift: Float[Array | np.ndarray, ""] | None = None
     rows = jnp.concatenate([x[None], by_delay[None], by_delta[1:], by_delta * 1j])
     real = jnp.concatenate([rows.real, rows.imag], axis=1)
     directions = jnp.linalg.qr(real.T)[0].T[2:]
-    # Σ Re (q/x)* σ²: a direction q is x times a function of frequency, and the difference has −x.
+    # Σ Re (q/x)* σ²: a direction q is x times a function of frequency; the difference contains −x.
     share = jnp.where(used, spectrum.variance_x / jnp.where(used, power(x), 1.0), 0.0)
     bias = directions @ (jnp.concatenate([x.real, x.imag]) * jnp.tile(share, 2))
     least = jnp.asarray(SIZE) + DRIFT * (0.0 if drift is None else drift)
@@ -127,7 +128,7 @@ def shape_of(driver: Driver, frequency: Float[Array, " harmonic"]) -> UnloadedSh
         frequency: Harmonics of the loads [Hz].
 
     Returns:
-        None if the driver has no harmonics, or others than the loads.
+        The unloaded voltage; None if the driver has no harmonics, or another number than the loads.
     """
     if not isinstance(driver, HarmonicDriver) or driver.spectra.x.shape[1:] != frequency.shape:
         return None
