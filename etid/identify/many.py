@@ -99,7 +99,7 @@ def _of_one_method(fits: Sequence[Fit], used: Sequence[str]) -> list[Fit]:
     """The same with one name: a batch has one, of all methods that were used."""
     name = joined(used)
     arrays = [jax.tree.map(np.asarray, fit) for fit in fits]
-    return [dataclasses.replace(fit, method=name) for fit in arrays]
+    return [fit if fit.method == name else dataclasses.replace(fit, method=name) for fit in arrays]
 
 
 class Refusal(Exception):

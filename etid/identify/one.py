@@ -248,18 +248,24 @@ def concluded(
         remarks: Of their recordings.
         repeats: The periods of their recordings.
     """
-    marked = [
-        _remarked(fit, int(fit.remarks) | of_recording)
-        for fit, of_recording in zip(fits, remarks, strict=True)
-    ]
-    return changes.judged(marked, driver, repeats)
+    found = changes.of_fits(fits, driver, repeats)
+    return [_marked(*parts) for parts in zip(fits, remarks, found, strict=True)]
 
 
-def _remarked(fit: Fit, remarks: int) -> Fit:
-    """The fit with these remarks; what a coarse converter leaves open is `resolution`."""
+def _marked(fit: Fit, remarks: int, change: changes.Change) -> Fit:
+    """The fit with the remarks on its recording and what changed during it, in one copy."""
+    remarks, result = int(fit.remarks) | remarks, fit.result
     if remarks & Remark.coarse_converter and fit.verdict == "insensitive":
-        fit = dataclasses.replace(fit, result=verdict("resolution"))
-    return dataclasses.replace(fit, remarks=np.asarray(remarks))
+        result = verdict("resolution")
+    if change.seen and fit.verdict in changes.EXPLAINED:
+        result = verdict("changed")
+    return dataclasses.replace(
+        fit,
+        remarks=np.asarray(remarks),
+        change=change.size,
+        change_stderr=change.stderr,
+        result=result,
+    )
 
 
 def checksum(seen: Inspected) -> int:
