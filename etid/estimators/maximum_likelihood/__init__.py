@@ -1,1 +1,1 @@
-"""Maximum likelihood on the harmonics: the terms, a driver, and a load given its driver."""
+"""Maximum likelihood on the harmonics: terms, fit of a driver, and fit of a load."""

@@ -1,9 +1,9 @@
 """Maximum likelihood on the harmonics of the pulse rate: the driver, and a skin.
 
-The terms are those of `etid.estimators.maximum_likelihood.terms`. A skin is identified *jointly*
-with the calibrations of its driver: what a skin's record says about Z_th, and about the delay of a
-calibration that one known resistor leaves open, is used. `etid.estimators.joint.fit` does the same
-for many skins at once.
+`etid.estimators.maximum_likelihood.terms` gives the terms. A skin is identified *jointly* with the
+calibrations of its driver. The fit uses the information of the skin's record about Z_th, and about
+the delay of a calibration, which one known resistor does not determine. `etid.estimators.joint.fit`
+does the same for many skins at once.
 """
 
 import dataclasses
@@ -44,7 +44,7 @@ from etid.results.fits import complex_rrse
 from etid.signals.harmonics import Spectrum
 from etid.solvers.levenberg_marquardt import LevenbergMarquardt, best_start
 
-# Z_th and a delay bend each other's valley; a load alone has none.
+# Z_th and a delay form a curved valley; a load alone has no such valley.
 CURVED = LevenbergMarquardt(rtol=SOLVER.rtol, ftol=SOLVER.ftol, geodesic=True)
 
 
@@ -57,13 +57,14 @@ def fit_source(
     """Identify Z_th from one or several records with known resistors.
 
     Args:
-        spectra: Stacked along a leading axis.
-        r_load: The resistors [Ω].
+        spectra: Harmonics of the records, stacked along a leading axis.
+        r_load: Resistor of each record [Ω].
         sample_rate: Sampling rate [Hz].
         start: Initial Z_th; its structure is the order.
 
     Returns:
-        Z_th, the estimate, whose parameters are `start` flattened, and what its skins need.
+        Z_th; the estimate, with parameters in the order of the flattened `start`; and the data of
+        the calibrations that a skin's fit needs.
     """
     calibration = Calibration(r_load, jnp.zeros(r_load.shape), delay_std(r_load))
     model = Calibrations(start, calibration, spectra, sample_rate)
@@ -94,13 +95,13 @@ def fit_source(
 class Calibrations(eqx.Module):
     """The likelihood of the calibrations of a driver.
 
-    Everywhere `common` are the `DriverUnknowns` as a vector.
+    In all methods `common` is the vector of the `DriverUnknowns`.
 
     Attributes:
-        source: Z_th as identified from the calibrations.
-        calibration: Their resistors and delays.
-        spectra: Their harmonics.
-        rate: Their sampling rate [Hz].
+        source: Z_th identified from the calibrations.
+        calibration: Resistors and delays of the calibrations.
+        spectra: Harmonics of the calibrations.
+        rate: Sampling rate of the calibrations [Hz].
     """
 
     source: SourceImpedance
@@ -110,17 +111,17 @@ class Calibrations(eqx.Module):
 
     @classmethod
     def of(cls, driver: HarmonicDriver) -> "Calibrations":
-        """Those of an identified driver."""
+        """The calibrations of an identified driver."""
         rate = jnp.asarray(driver.sample_rate)
         return cls(driver.source, driver.calibration, driver.spectra, rate)
 
     @property
     def records(self) -> list[Spectrum]:
-        """The calibrations one by one."""
+        """The harmonics of each calibration."""
         return as_list(self.spectra)
 
     def start(self) -> Float[Array, " common"]:
-        """The common parameters as the calibrations alone have them."""
+        """The common parameters identified from the calibrations alone."""
         vector, _ = ravel_pytree(self.source)
         return DriverUnknowns(vector, self.calibration.delay_samples).vector()
 
@@ -129,7 +130,7 @@ class Calibrations(eqx.Module):
         return DriverUnknowns.of(common, self.calibration.r_load.size)
 
     def z_th(self, common: Float[Array, " common"]) -> SourceImpedance:
-        """Z_th of the common parameters."""
+        """Z_th with these common parameters."""
         return ravel_pytree(self.source)[1](self.named(common).source)
 
     def gains(self, common: Float[Array, " common"]) -> list[Complex[Array, " harmonic"]]:
@@ -145,7 +146,7 @@ class Calibrations(eqx.Module):
     def terms(
         self, common: Float[Array, " common"], records: Sequence[Spectrum]
     ) -> Float[Array, " term"]:
-        """Terms of the calibrations and of the weak prior."""
+        """Terms of the calibrations and of the weak priors."""
         regularise = prior(self.source, self.rate, self.calibration.r_load.mean())
         parts = residuals(records, self.gains(common))
         of = self.named(common)
@@ -153,7 +154,7 @@ class Calibrations(eqx.Module):
         return jnp.concatenate(parts + weak)
 
     def linear(self, common: Float[Array, " common"]) -> Linear:
-        """The terms around their minimum."""
+        """The terms, linear around their minimum."""
         records, gains = self.records, self.gains(common)
         clean, shares = denoised(records, gains)
         jacobian = jax.jacfwd(lambda c: self.terms(c, clean))(common)
@@ -165,7 +166,7 @@ class Calibrations(eqx.Module):
     def by_gains(
         self, common: Float[Array, " common"], slopes: Sequence[Complex[Array, "row harmonic"]]
     ) -> Float[Array, "row term"]:
-        """Derivatives of the denoised terms by what moves the gain of each record by `slopes`."""
+        """Derivatives of the denoised terms; `slopes` are those of the gain of each record."""
         gains = self.gains(common)
         clean, _ = denoised(self.records, gains)
 
@@ -178,10 +179,10 @@ class Calibrations(eqx.Module):
         return jax.vmap(row)(jnp.arange(slopes[0].shape[0]))
 
     def strain(self, common: Float[Array, " common"]) -> Float[Array, ""]:
-        """By how much Σ r² of the calibrations has grown from what they alone have.
+        """Increase of the Σ r² of the calibrations over its value at their own minimum.
 
-        About as much as there are common parameters, if loads and calibrations agree on them; r in
-        standard deviations that the noise of the calibrations has.
+        r is in standard deviations of the noise of the calibrations. If loads and calibrations
+        agree, the increase is about the number of common parameters.
         """
         start = self.start()
         alone, now = (self.terms(c, self.records) for c in (start, common))
@@ -191,12 +192,12 @@ class Calibrations(eqx.Module):
 class Joint(eqx.Module):
     """The likelihood of loads and of the calibrations of their driver, term by term.
 
-    `own` are what is unknown of a load.
+    In all methods `own` holds the unknowns of a load.
 
     Attributes:
         circuit: Structure of the loads.
-        calibrations: Those of their driver.
-        shared: Whether a load's unloaded record may be that of a calibration.
+        calibrations: Calibrations of the driver of the loads.
+        shared: Whether the unloaded record of a load may be that of a calibration.
     """
 
     circuit: AbstractCircuit
@@ -210,7 +211,7 @@ class Joint(eqx.Module):
         spectrum: Spectrum,
         sample_rate: Float[Array, ""],
     ) -> Complex[Array, " harmonic"]:
-        """Gain with a load."""
+        """Gain with a load, including its delay."""
         load = self.circuit.with_log_values(own.log_elements).impedance()
         source, frequency = self.calibrations.z_th(common), spectrum.frequency
         return delayed_gain(source, load, frequency, own.delay_samples, sample_rate)
@@ -223,7 +224,7 @@ class Joint(eqx.Module):
         sample_rate: Float[Array, ""],
         records: Sequence[Spectrum],
     ) -> Float[Array, " term"]:
-        """Terms of one recording, given the calibrations; the last is the prior of its delay."""
+        """Terms of one recording, given the calibrations; the last is the prior of the delay."""
         known = self.informed(spectrum, common, records)
         part = residual(known, self.gain(own, common, spectrum, sample_rate))
         return jnp.append(part, own.delay_samples / DELAY_WIDTH)
@@ -231,7 +232,7 @@ class Joint(eqx.Module):
     def informed(
         self, spectrum: Spectrum, common: Float[Array, " common"], records: Sequence[Spectrum]
     ) -> Spectrum:
-        """A recording with what the calibrations tell of its X."""
+        """A recording with the estimate of its X that uses the calibrations."""
         return (
             informed(spectrum, records, self.calibrations.gains(common))
             if self.shared
@@ -245,16 +246,16 @@ def fit_load(
     sample_rate: Float[Array, ""],
     candidates: LoadUnknowns,
 ) -> tuple[LoadUnknowns, optx.RESULTS, Float[Array, ""], Float[Array, ""], Bool[Array, ""]]:
-    """Identify the load of one recording with Z_th as the calibrations have it.
+    """Identify the load of one recording; Z_th is fixed at the estimate of the calibrations.
 
     Args:
-        model: Calibrations and kind of circuit.
+        model: Calibrations and structure of the circuit.
         spectrum: The recording.
         sample_rate: Its sampling rate [Hz].
-        candidates: To start from, stacked; the start that predicts best is refined.
+        candidates: Starts, stacked; the start that predicts best is refined.
 
     Returns:
-        What was unknown, how the solver ended, χ² per degree of freedom, RRSE, and whether mains
+        The unknowns, the result of the solver, χ² per degree of freedom, RRSE, and whether mains
         hum is seen.
     """
     records, common = model.calibrations.records, model.calibrations.start()

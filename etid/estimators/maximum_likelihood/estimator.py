@@ -1,4 +1,4 @@
-"""Maximum likelihood on the harmonics, each load jointly with what its driver leaves open."""
+"""Maximum likelihood on the harmonics; each load is fitted jointly with its driver."""
 
 import dataclasses
 
@@ -62,13 +62,13 @@ class MaximumLikelihood(AbstractEstimator):
     def known(
         self, driver: HarmonicDriver, frequency: Float[Array, " harmonic"], shared: bool
     ) -> GivenDriver:
-        """What the calibrations tell of Z_th at the harmonics."""
+        """The distribution of Z_th at the harmonics, given the calibrations."""
         return given_driver.given(driver, frequency, shared)
 
     def fit_load(
         self, lane: Harmonics, driver: HarmonicDriver, known: GivenDriver, circuit: AbstractCircuit
     ) -> Fit:
-        """Refine from the best of several starts, jointly with what the driver leaves open."""
+        """Refine from the best of several starts, jointly with the uncertain part of the driver."""
         spectrum, rate = lane.spectrum, jnp.asarray(lane.sample_rate)
         z_th = known.z_th(jnp.zeros_like(known.loaded))
         starts = harmonic_starts(spectrum, rate, z_th, circuit)
@@ -79,7 +79,7 @@ class MaximumLikelihood(AbstractEstimator):
         return unless(unless(fit, far, RESULTS.driver_unclear), other, RESULTS.misfit)
 
     def describe(self) -> Description:
-        """Its methods section."""
+        """The text for a methods section."""
         return Description(
             words="maximum likelihood",
             text=HARMONICS + "the load was estimated by maximum likelihood with noise on both "

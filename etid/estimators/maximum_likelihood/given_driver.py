@@ -1,21 +1,23 @@
-"""A load, given what the calibrations of its driver tell of Z_th.
+"""The distribution of Z_th at the harmonics of a load, given the calibrations of its driver.
 
-What the calibrations know is a normal distribution of the common parameters c, of Z_th and of their
-delays, around the minimum of their likelihood. In modal parameters the distribution is far from
-normal: a fast pole hides behind a delay along a curved valley. At the harmonics it nearly is, for
+The common parameters c are the parameters of Z_th and the delays of the calibrations. The
+calibrations give a distribution of c around the minimum of their likelihood. In modal parameters it
+is far from normal: a fast pole and a delay form a curved valley. At the harmonics it is nearly
+normal in
 
-    W = log(Z_th + R)
+    W = log(Z_th + R).
 
-is what a calibration with R shows, log (R X / Y), but for −jωτ, linear in its delay τ. So
+A calibration with R shows log(R X / Y), which is W apart from −jωτ, linear in its delay τ. So
 
     W = W₀ + Σ_i z_i ∂W/∂z_i,      c = c₀ + L z,      L Lᵀ = H⁻¹,      z ~ N(z₀, 1),
 
-H the curvature of the likelihood of the calibrations, and z₀ the step that is left to its minimum.
-A load is identified *jointly* with the z: what its record says about Z_th, and about the delay that
-one known resistor leaves open, is used. The terms of the calibrations themselves are not evaluated
-again, which would cost ten times as much. Both estimates are as good against truth, but not the
-same: they may differ by a standard error along the direction that one known resistor leaves open
-(`etid.estimators.joint.fit` has the terms themselves, for many loads at once).
+where H is the curvature of the likelihood of the calibrations, and z₀ is the remaining step to its
+minimum. A load is identified *jointly* with z. The fit uses the information of its record about
+Z_th, and about the delay that one known resistor does not determine. It does not evaluate the terms
+of the calibrations again, which would take ten times as long. `etid.estimators.joint.fit` uses the
+terms themselves, for many loads at once. Both estimates have the same errors against the truth, but
+they are not equal. They may differ by a standard error along the direction that one known resistor
+does not determine.
 """
 
 import dataclasses
@@ -39,11 +41,11 @@ from etid.solvers.matrices import inverse_root
 
 
 class UnloadedSlopes(NamedTuple):
-    """Derivatives by z of what calibrations tell of the X of a load.
+    """Derivatives with respect to z of the X of a load that the calibrations estimate.
 
     Attributes:
-        x: Of X.
-        log_variance: Of the logarithm of its variance.
+        x: Derivatives of X.
+        log_variance: Derivatives of the logarithm of the variance of X.
     """
 
     x: Complex[Array, "z harmonic"]
@@ -51,20 +53,20 @@ class UnloadedSlopes(NamedTuple):
 
 
 class GivenDriver(eqx.Module):
-    """What the calibrations of a driver tell at the harmonics of its loads.
+    """The distribution of Z_th at the harmonics of the loads, given the calibrations.
 
     Attributes:
-        frequency: The harmonics [Hz]. Those of a load may be off by a small part, the same for all:
-            clocks are, and so are records cut to a whole number of samples.
+        frequency: The harmonics [Hz]. The harmonics of a load may differ from them by a small
+            common factor, because of clocks and of records cut to a whole number of samples.
         loaded: Z_th + R [Ω] at W₀.
         w_slope: ∂W₀/∂ log f.
         slope: ∂W/∂z.
         resistance: R [Ω], the mean of the known resistors.
         mean: z₀.
-        cov: Covariance of z by the noise that the residuals of the calibrations have.
+        cov: Covariance of z, from the noise in the residuals of the calibrations.
         records: The calibrations, if a load may have the unloaded record of one of them.
-        gains: Their gains.
-        gain_slopes: The derivatives of these by z.
+        gains: Gains of these calibrations.
+        gain_slopes: Derivatives of these gains with respect to z.
         shape: Unloaded voltage of the first calibration; None if loads have other harmonics.
     """
 
@@ -82,7 +84,7 @@ class GivenDriver(eqx.Module):
 
     def z_th(self, w: Complex[Array, " harmonic"]) -> Complex[Array, " harmonic"]:
         """Z_th [Ω] at W₀ + w."""
-        # (2, 2) Padé approximant of the exponential, good to w⁵/720: a tenth of its time.
+        # (2, 2) Padé approximant of the exponential: error w⁵/720, a tenth of the time.
         square = 1 + w * w * as_complex(jnp.array(1 / 12))
         half = w * as_complex(jnp.array(0.5))
         return self.loaded * (square + half) * reciprocal(square - half) - as_complex(
@@ -90,7 +92,7 @@ class GivenDriver(eqx.Module):
         )
 
     def informed(self, spectrum: Spectrum) -> tuple[Spectrum, UnloadedSlopes | None]:
-        """A recording with what the calibrations tell of its X at z = 0, and how z moves that."""
+        """A recording with X estimated by the calibrations at z = 0, and derivatives of X."""
         if self.records is None or self.gains is None or self.gain_slopes is None:
             return spectrum, None
         records = as_list(self.records)
@@ -109,12 +111,12 @@ class GivenDriver(eqx.Module):
 def given(
     driver: HarmonicDriver, frequency: Float[Array, " harmonic"], shared: bool
 ) -> GivenDriver:
-    """What the calibrations of a driver tell, the same for all its loads.
+    """The distribution of Z_th given the calibrations; it is the same for all loads.
 
     Args:
         driver: The driver.
         frequency: Harmonics of the loads [Hz].
-        shared: Whether a load's unloaded record may be that of a calibration.
+        shared: Whether the unloaded record of a load may be that of a calibration.
     """
     calibrations = Calibrations.of(driver)
     c = calibrations.start()
@@ -125,7 +127,7 @@ def given(
     if driver.drift is None:
         found = around(calibrations, c, root, frequency, shared, mean, cov)
     else:
-        # What may have changed since is further z, of which the calibrations know nothing.
+        # Later changes of the driver are further z. The calibrations tell nothing about them.
         std = driver.drift_std()
         changes = jnp.pad(jnp.diag(std), ((0, c.size - std.size), (0, 0)))
         directions = jnp.concatenate([root, changes], axis=1)
@@ -147,7 +149,7 @@ def around(
     mean: Float[Array, " z"],
     cov: Float[Array, "z z"],
 ) -> GivenDriver:
-    """A driver around the common parameters c, z counting along `directions`; else as `given`."""
+    """A driver around the common parameters c, with z along `directions`; like `given`."""
     resistance = calibrations.calibration.r_load.mean()
 
     def loaded(c, frequency):
@@ -179,5 +181,5 @@ def around(
 def combined(
     z: Float[Array, " z"], slope: Complex[Array, "z harmonic"]
 ) -> Complex[Array, " harmonic"]:
-    """Σ z ∂/∂z, in real arithmetic: complex products of matrices are ten times as slow."""
+    """Σ z ∂/∂z, in real arithmetic, because complex matrix products take ten times as long."""
     return jax.lax.complex(z @ slope.real, z @ slope.imag)

@@ -1,9 +1,9 @@
-"""One load, given what the calibrations of its driver tell: terms, derivatives, and the fit.
+"""One load, given the calibrations of its driver: terms, derivatives, and the fit.
 
-The likelihood is that of `etid.estimators.maximum_likelihood.terms` with the z of
-`etid.estimators.maximum_likelihood.given_driver` for the parameters of Z_th. All parameters act on
-a harmonic through three numbers, Z_L, the delay's turn and W, and so do the derivatives: they are
-taken of those, and combined.
+The likelihood is that of `etid.estimators.maximum_likelihood.terms`, with the z of
+`etid.estimators.maximum_likelihood.given_driver` as parameters of Z_th. All parameters act on a
+harmonic through three numbers: Z_L, the phase factor of the delay, and W. The code computes the
+derivatives with respect to these three and applies the chain rule.
 """
 
 from collections.abc import Callable
@@ -37,16 +37,18 @@ from etid.solvers.levenberg_marquardt import LevenbergMarquardt, NormalEquations
 
 
 class _Slopes(NamedTuple):
-    """How the residual of a recording changes, harmonic by harmonic.
+    """Derivatives of the residual of a recording at each harmonic.
 
     Attributes:
         part: The residual.
-        by_load: Derivative of the gain by Z_L.
-        own: The same by the elements and the delay.
-        by_g: Derivatives of the residual by real and imaginary part of the gain.
-        by_w: The same by W.
-        by_x: The same by X; None if no z moves it.
-        by_variance: Derivative by the logarithm of its variance.
+        by_load: Derivative of the gain with respect to Z_L.
+        own: Derivatives of the gain with respect to the elements and the delay.
+        by_g: Derivatives of the residual with respect to real and imaginary part of the gain.
+        by_w: Derivatives of the residual with respect to both parts of W.
+        by_x: Derivatives of the residual with respect to both parts of X; None if X does not
+            depend on z.
+        by_variance: Derivative of the residual with respect to the logarithm of the variance of X;
+            None as for `by_x`.
     """
 
     part: Float[Array, " part"]
@@ -59,9 +61,9 @@ class _Slopes(NamedTuple):
 
 
 class Load(eqx.Module):
-    """One recording, with all that its terms depend on.
+    """One recording, with all data that its terms need.
 
-    The parameters `q` of its solver are those of `LoadUnknowns` and after them z, if it is not z₀.
+    The parameters `q` of the solver are those of `LoadUnknowns`, followed by z unless z = z₀.
     """
 
     driver: GivenDriver
@@ -76,7 +78,7 @@ class Load(eqx.Module):
         return len(self.circuit.names()) + 1
 
     def split(self, q: Float[Array, "*row q"]) -> tuple[LoadUnknowns, Float[Array, "*row z"]]:
-        """What is unknown of the load, and z; or other numbers in their order."""
+        """The unknowns of the load, and z; or other numbers in the same order."""
         own = LoadUnknowns.of(q[..., : self.owned])
         return own, q[..., self.owned :] if q.shape[-1] > self.owned else self.driver.mean
 
@@ -93,11 +95,11 @@ class Load(eqx.Module):
     def divided(
         self, load: Complex[Array, " harmonic"], w: Complex[Array, " harmonic"]
     ) -> Complex[Array, " harmonic"]:
-        """Z_L / (Z_L + Z_th) where the driver has W = W₀ + `w`."""
+        """Z_L / (Z_L + Z_th) at W = W₀ + `w`."""
         return load * reciprocal(load + self.driver.z_th(w))
 
     def at(self, z: Float[Array, " z"]) -> tuple[Complex[Array, " harmonic"], Spectrum]:
-        """W − W₀, and the recording with the X that calibrations leave."""
+        """W − W₀, and the recording with the X that the calibrations estimate."""
         off = jnp.log(self.spectrum.frequency[0] / self.driver.frequency[0])
         w = as_complex(off) * self.driver.w_slope + combined(z, self.driver.slope)
         if self.unloaded is None:
@@ -107,24 +109,24 @@ class Load(eqx.Module):
         return w, eqx.tree_at(lambda s: (s.x, s.variance_x), self.spectrum, (x, variance))
 
     def predicted(self, q: Float[Array, " q"]) -> tuple[Complex[Array, " harmonic"], Spectrum]:
-        """Gain, and the recording with the X that calibrations leave."""
+        """Gain, and the recording with the X that the calibrations estimate."""
         own, z = self.split(q)
         w, spectrum = self.at(z)
         gain = self.divided(self.load(own.log_elements), w)
         return gain * self.turns(own.delay_samples), spectrum
 
     def __call__(self, q: Float[Array, " q"]) -> Float[Array, " term"]:
-        """Terms of the recording, of its delay and of z."""
+        """Terms of the recording, and the priors of its delay and of z."""
         g, spectrum = apart(self.predicted, q)
         prior = 1 / self.widths(q)
         return jnp.concatenate([residual(spectrum, g), (prior * (q - self.centre(q)))])
 
     def centre(self, q: Float[Array, " q"]) -> Float[Array, " q"]:
-        """What is expected of the parameters before this recording."""
+        """Prior means of the parameters."""
         return jnp.concatenate([jnp.zeros(self.owned), self.driver.mean])[: q.size]
 
     def widths(self, q: Float[Array, " q"]) -> Float[Array, " q"]:
-        """Standard deviations of that."""
+        """Prior standard deviations of the parameters."""
         free = jnp.full(self.owned - 1, jnp.inf)
         own = LoadUnknowns(free, jnp.asarray(DELAY_WIDTH)).vector()
         return jnp.concatenate([own, jnp.ones(q.size - self.owned)])
@@ -132,8 +134,8 @@ class Load(eqx.Module):
     def slopes(self, q: Float[Array, " q"]) -> _Slopes:
         """Derivatives at each harmonic.
 
-        The parameters move the gain by Z_L, the delay or W, whose complex derivatives do for all: a
-        fifth of the time that it takes to push each parameter through all of it.
+        The parameters change the gain through Z_L, the delay or W. The complex derivatives of these
+        serve all parameters. This takes a fifth of the time of one pass for each parameter.
         """
         own, z = self.split(q)
         w, spectrum = self.at(z)
@@ -185,11 +187,11 @@ class Load(eqx.Module):
         return _Slopes(part, by_load, slopes, (real, imaginary), by_w, by_x, by_variance)
 
     def by_changes(self, q: Float[Array, " q"], slopes: _Slopes) -> Float[Array, "change part"]:
-        """Derivatives of the residual by each change of a score test and, last, by a gain.
+        """Derivatives of the residual with respect to changes of the circuit and, last, to a gain.
 
         The changes are those of `etid.estimators.score_tests.other_circuit`. The gain is that of
-        V_out alone: 1 % more makes R_p of dry skin wrong by a quarter, and shows in χ² at 60 dB
-        only.
+        V_out alone. If it is 1 % too large, R_p of dry skin is wrong by a quarter, and χ² shows
+        this only at 60 dB.
         """
         impedance = self.circuit.with_log_values(self.split(q)[0].log_elements).impedance()
 
@@ -205,12 +207,12 @@ class Load(eqx.Module):
     def jacobian(
         self, q: Float[Array, " q"]
     ) -> tuple[Float[Array, " part"], Float[Array, "q part"]]:
-        """Residual of the recording alone and, transposed, its Jacobian."""
+        """Residual of the recording alone, and its transposed Jacobian."""
         slopes = apart(self.slopes, q)
         return slopes.part, self.chained(q, slopes)
 
     def chained(self, q: Float[Array, " q"], slopes: _Slopes) -> Float[Array, "q part"]:
-        """Jacobian, transposed."""
+        """Transposed Jacobian of the residual."""
         _, _, own, by_g, by_w, by_x, by_variance = slopes
         rows = _chained(own, by_g)
         if q.size == self.owned:
@@ -226,7 +228,7 @@ class Load(eqx.Module):
 def _by_parts(
     value: Complex[Array, " harmonic"], function: Callable[[Array, Array], Array]
 ) -> tuple[Array, Array]:
-    """Derivatives of a residual by the real and the imaginary part of its argument."""
+    """Derivatives of a residual with respect to real and imaginary part of its argument."""
     at = (value.real, value.imag)
     one, zero = jnp.ones_like(value.real), jnp.zeros_like(value.real)
     by_real, by_imaginary = (jax.jvp(function, at, of)[1] for of in ((one, zero), (zero, one)))
@@ -234,7 +236,10 @@ def _by_parts(
 
 
 def _turned(by: tuple[Array, Array], slope: Complex[Array, " harmonic"]) -> tuple[Array, Array]:
-    """Derivatives of a residual by both parts of what its argument depends on with this slope."""
+    """Chain rule: derivatives with respect to both parts of a complex variable.
+
+    The argument of the residual depends on this variable with `slope`.
+    """
     real, imaginary = by
     return (
         real * slope.real[None, :] + imaginary * slope.imag[None, :],
@@ -243,7 +248,7 @@ def _turned(by: tuple[Array, Array], slope: Complex[Array, " harmonic"]) -> tupl
 
 
 def _chained(slope: Complex[Array, "q harmonic"], by: tuple[Array, Array]) -> Array:
-    """Derivatives of a residual by those of its real and imaginary argument."""
+    """Derivatives of a residual whose complex argument depends on real parameters."""
     return jax.lax.map(
         lambda row: (row.real[None, :] * by[0] + row.imag[None, :] * by[1]).ravel(), slope
     )
@@ -261,11 +266,11 @@ def _equations(_, q: Float[Array, " q"], load: Load) -> NormalEquations:
     ).finite()
 
 
-# Of W, in which 0.1 is left open at 40 dB. At 24 dB it is exceeded by one fit of 30, and by the two
-# of 200 that were wrong by five standard errors.
+# Largest change of W, which is uncertain by 0.1 at 40 dB. At 24 dB one fit of 30 exceeds it. Two of
+# 200 fits were wrong by five standard errors; both exceed it.
 FAR = 0.5
-NEAR = 4.0  # χ² of a start beside which there is no need to look at others
-# Half a standard error of 3000 terms.
+NEAR = 4.0  # χ² of the likeliest start; below this value the other starts are not tried
+# Half a standard error for 3000 terms.
 ROUGHLY = LevenbergMarquardt(rtol=1e-2, ftol=1e-3, equations=_equations)
 TOGETHER = LevenbergMarquardt(rtol=SOLVER.rtol, ftol=SOLVER.ftol, equations=_equations)
 
@@ -280,17 +285,17 @@ def fit_circuit(
     """Identify the load of one recording.
 
     Args:
-        driver: What the calibrations tell, at the harmonics of the recording.
+        driver: Distribution of Z_th at the harmonics of the recording.
         circuit: Structure of the load.
         spectrum: The recording.
         sample_rate: Its sampling rate [Hz].
-        candidates: To start from, stacked, the likeliest last; the start that predicts best is
+        candidates: Starts, stacked; the likeliest is the last. The start that predicts best is
             refined.
 
     Returns:
-        The estimate, whose parameters are the logarithms of the elements; whether W went so far
-        from W₀ that the linear distribution of it means nothing; and whether the load is seen to be
-        another circuit.
+        The estimate, whose parameters are the logarithms of the elements. Whether W is too far from
+        W₀ for its linear distribution. Whether the data show another circuit or another gain of
+        V_out.
     """
     known, unloaded = driver.informed(spectrum)
     load = Load(driver, circuit, known, unloaded, sample_rate)
@@ -300,7 +305,7 @@ def fit_circuit(
             lambda q, load: load(q), solver, start, args=load, max_steps=MAX_STEPS, throw=False
         )
 
-    # First with Z_th as it is: from a start far away, a joint fit would bend Z_th to meet it.
+    # First with Z_th fixed: from a distant start, a joint fit would distort Z_th.
     starts = candidates.vector()
     likely = starts[-1]
     near = jnp.sum(load(likely) ** 2) < NEAR * 2 * jnp.sum(spectrum.selected, dtype=likely.dtype)
@@ -313,9 +318,9 @@ def fit_circuit(
     part = residual(known, g)
     moved = jnp.max(jnp.where(spectrum.selected, jnp.abs(load.at(z)[0]), 0.0))
 
-    # The Jacobian where it has no noise, which would count as information.
+    # The Jacobian at denoised data: noise in it would count as information.
     [clean], [share] = denoised([known], [g])
-    if unloaded is not None:  # X is that of this z already
+    if unloaded is not None:  # X contains the effect of this z already
         x = clean.x - combined(z, unloaded.x)
         clean = eqx.tree_at(lambda s: (s.x, s.variance_x), clean, (x, load.spectrum.variance_x))
     clean = Load(driver, circuit, clean, unloaded, sample_rate)
@@ -337,12 +342,12 @@ def fit_circuit(
         information,
         slice(count),
     )
-    # What the low harmonics have too much, a wrong gain may explain; it is no hum then.
+    # If a wrong gain explains the excess of the low harmonics, the excess is no hum.
     gain = rows[-1] - linear.told(rows[-1:])[0] @ information @ jacobian
     rest = jnp.sum((part - other.size[-1] * gain).reshape(2, -1) ** 2, axis=0) / 2
     wrong_gain = jnp.abs(other.z[-1]) > other_circuit.SEEN_RELAXATION
     wrong_gain = wrong_gain & ~stands_out(rest, known)
-    # What is the trial's own of the noise: all, or that of V_out if V_th is shared.
+    # Part of the noise that only this trial has: all, or that of V_out if V_th is shared.
     private = jnp.where(
         jnp.any(known.variance_x != spectrum.variance_x),
         spectrum.variance_y / variance(known, g),
@@ -353,7 +358,7 @@ def fit_circuit(
     of_delay = jnp.outer(by_own.delay_samples, by_own.delay_samples) / DELAY_WIDTH**2
     of_driver = by_z @ driver.cov @ by_z.T
     shared = of_driver + (by_term * ((1 - private) * noise)[None, :]) @ by_term.T
-    # Of an element without any effect a product of matrices keeps but rounding errors.
+    # For an element without any effect the matrix product contains only rounding errors.
     unknown = jnp.diagonal(elements)
     unknown = jnp.diag(jnp.where(unknown > 1, unknown, 0.0))
     change = z - driver.mean
@@ -367,7 +372,7 @@ def fit_circuit(
         rrse=complex_rrse(g * spectrum.x, spectrum.y, spectrum.selected),
         result=solution.result,
         steps=solution.stats["num_steps"],
-        # By how much Σ r² of the calibrations has grown.
+        # Increase of the Σ r² of the calibrations.
         strain=jnp.dot(change, jnp.linalg.solve(driver.cov, change)),
         hum=shows_hum(known, g) & ~wrong_gain,
     )

@@ -1,16 +1,17 @@
 """The likelihood of harmonics, with noise on both records of every recording.
 
 In the periodic steady state Y = G e^(−jωτ) X holds exactly at every harmonic, with continuous R_s,
-R_p, C_p and Z_th(s): nothing is discretised, no initial state is unknown, and the likelihood is
-(Pintelon and Schoukens, System Identification, 2012, ch. 9)
+R_p, C_p and Z_th(s). Nothing is discretised, and there is no unknown initial state. The
+maximum-likelihood cost is (Pintelon and Schoukens, System Identification, 2012, ch. 9)
 
     Σ_k |Y_k − G_k e^(−jω_k τ) X_k|² / (σ_y² + |G_k|² σ_x²),      G = Z_L / (Z_L + Z_th),
 
-of which the unknown true X has been eliminated. σ² are the variances of one coefficient.
+The unknown true X is eliminated. σ² are the variances of one coefficient.
 
-**One unloaded record for several loaded ones** is one noise in all of them, and they all tell of
-the same X. Record by record, X and σ_x² are then replaced by what the earlier ones with the same X
-leave of them (`_learn`, one step of a Kalman filter): the likelihood of all, in independent terms.
+**One unloaded record for several loaded records** has the same noise in all of them, and all give
+information about the same X. For each record, X and σ_x² are then replaced by their estimates from
+the earlier records with the same X (`_learn`, one step of a Kalman filter). The result is the
+likelihood of all records, in independent terms.
 """
 
 from collections.abc import Callable, Sequence
@@ -27,10 +28,10 @@ from etid.signals.harmonics import Spectrum, local_sum, signal_share
 from etid.signals.mains import lines
 from etid.signals.transfer import as_complex, delayed, frequency_variable, power, reciprocal
 
-SURE = 4.0  # standard deviations of a local variance
-LOW = 128  # harmonics, the first, among which mains hum is looked for
-HUM = 14.4  # of its mean; an exponential exceeds it as rarely as a normal number five σ
-ROUNDING = 1e-12  # of a record, by which two transforms of the same samples may differ
+SURE = 4.0  # standard deviations by which a local variance must exceed the mean
+LOW = 128  # number of first harmonics that are tested for mains hum
+HUM = 14.4  # times the mean; an exponential exceeds it as rarely as a normal number exceeds five σ
+ROUNDING = 1e-12  # relative difference of two transforms of the same samples
 
 
 def gain(
@@ -53,7 +54,7 @@ def delayed_gain(
 
 
 def variance(spectrum: Spectrum, g: Complex[Array, " harmonic"]) -> Float[Array, " harmonic"]:
-    """E|Y − g X|² of the noise."""
+    """Variance E|Y − g X|² by the noise."""
     return spectrum.variance_y + power(g) * spectrum.variance_x
 
 
@@ -65,17 +66,17 @@ def residual(spectrum: Spectrum, g: Complex[Array, " harmonic"]) -> Float[Array,
 
 
 def shows_hum(spectrum: Spectrum, g: Complex[Array, " harmonic"]) -> Bool[Array, ""]:
-    """Whether Y − g X shows mains hum: more on a harmonic where it may be than noise explains.
+    """Whether Y − g X shows mains hum: a harmonic near mains frequencies exceeds the noise.
 
-    Noise is what the variances say, or what the other low harmonics show, if that is more. It is
-    looked for among harmonics that are not selected, too.
+    The noise is the larger of two: the variances, or the residual of the other low harmonics.
+    Harmonics that are not selected are tested too.
     """
     squares = power(spectrum.y - g * spectrum.x) / variance(spectrum, g)
     return stands_out(squares, spectrum)
 
 
 def stands_out(squares: Float[Array, " harmonic"], spectrum: Spectrum) -> Bool[Array, ""]:
-    """The same for any residual, whose squares would be 1 on average without hum."""
+    """Whether `squares` show mains hum; without hum their mean is 1."""
     squares, suspect = squares[:LOW], lines(spectrum.frequency[:LOW])
     others = spectrum.selected[:LOW] & ~suspect
     count = jnp.maximum(jnp.sum(others, dtype=squares.dtype), 1.0)
@@ -89,7 +90,7 @@ def _learn(
     g: Complex[Array, " harmonic"],
     same: Bool[Array, ""] | bool,
 ) -> Spectrum:
-    """What is known of the X of `spectrum` after Y = `g` X of another record, if X is the same."""
+    """`spectrum` with X updated by Y = `g` X of another record, if both have the same X."""
     total = other.variance_y + power(g) * spectrum.variance_x
     used = other.selected & same
     share = jnp.where(used, spectrum.variance_x / total, 0.0)
@@ -99,7 +100,7 @@ def _learn(
 
 
 def same_unloaded(one: Spectrum, other: Spectrum) -> Bool[Array, ""] | bool:
-    """Whether two recordings have one and the same unloaded record."""
+    """Whether two recordings have the same unloaded record."""
     if one is other:
         return True
     if one.x.shape != other.x.shape:
@@ -108,7 +109,7 @@ def same_unloaded(one: Spectrum, other: Spectrum) -> Bool[Array, ""] | bool:
 
 
 def as_list(spectra: Spectrum) -> list[Spectrum]:
-    """Recordings stacked along a leading axis, one by one."""
+    """A list of recordings, from recordings stacked along a leading axis."""
     return [jax.tree.map(lambda leaf, i=i: leaf[i], spectra) for i in range(spectra.x.shape[0])]
 
 
@@ -117,7 +118,7 @@ def informed(
     others: Sequence[Spectrum],
     gains: Sequence[Complex[Array, " harmonic"]],
 ) -> Spectrum:
-    """A recording with what others of the same unloaded record tell of its X."""
+    """A recording with X updated by other recordings with the same unloaded record."""
     known = spectrum
     for other, g in zip(others, gains, strict=True):
         same = same_unloaded(spectrum, other)
@@ -129,14 +130,15 @@ def informed(
 def denoised(
     spectra: Sequence[Spectrum], gains: Sequence[Complex[Array, " harmonic"]]
 ) -> tuple[list[Spectrum], list[Float[Array, " part"]]]:
-    """The same with X by its maximum-likelihood estimate from all recordings, and Y = G X.
+    """Recordings with the maximum-likelihood estimate of X from all of them, and Y = G X.
 
-    The Jacobian J there has no noise of the residual, which would count as information. What is
-    left in it of the noise of X makes the score noisier but is no information either, so that
+    The Jacobian J of these recordings does not contain the noise of the residual, which would count
+    as information. The remaining noise of X makes the score noisier. It is no information either,
+    so
 
-        cov = H⁻¹ (Jᵀ J) H⁻¹,      H = Jᵀ W J,
+        cov = H⁻¹ (Jᵀ J) H⁻¹,      H = Jᵀ W J.
 
-    W being the share of signal in the power of X, which is returned for every residual.
+    W is the share of signal in the power of X; it is returned for each residual.
     """
     found, shares = [], []
     for one, g in zip(spectra, gains, strict=True):
@@ -147,7 +149,7 @@ def denoised(
 
 
 def weights(shares: Sequence[Float[Array, "_"]], terms: int) -> Float[Array, " term"]:
-    """W of `denoised` for all terms: the shares of the first, and 1 for the priors after them."""
+    """W of `denoised` for all terms: `shares` for the first terms, 1 for the priors after them."""
     weight = jnp.concatenate(list(shares))
     return jnp.pad(weight, (0, terms - weight.size), constant_values=1.0)
 
@@ -155,11 +157,12 @@ def weights(shares: Sequence[Float[Array, "_"]], terms: int) -> Float[Array, " t
 def excess(
     part: Float[Array, " part"], selected: Bool[Array, " harmonic"]
 ) -> Float[Array, " part"]:
-    """Variance of a residual in units of what was expected, 1 or more, around each harmonic.
+    """Variance of a residual around each harmonic, relative to the expected variance; at least 1.
 
-    Noise is taken as white when it is weighed, but it may be coloured, and a model is never exact.
-    The covariance (Jᵀ C J for Jᵀ J, White 1980) is made with the variance that the residual has:
-    over `spectra.WINDOW` harmonics where that is surely larger than the mean over all.
+    The weights assume white noise, but noise may be coloured, and no model is exact. The covariance
+    (Jᵀ C J in place of Jᵀ J, White 1980) therefore uses the variance of the residual. It is the
+    mean over `harmonics.WINDOW` harmonics where this surely exceeds the mean over all harmonics,
+    and otherwise the mean over all.
     """
     count = selected.size
     power = part[:count] ** 2 + part[count:] ** 2
@@ -174,7 +177,7 @@ def excess(
 def residuals(
     spectra: Sequence[Spectrum], gains: Sequence[Complex[Array, " harmonic"]]
 ) -> list[Float[Array, " part"]]:
-    """`residual` of each recording given those before it: all are independent."""
+    """`residual` of each recording, given the recordings before it; all are independent."""
     return [
         residual(informed(one, spectra[:i], gains[:i]), g)
         for i, (one, g) in enumerate(zip(spectra, gains, strict=True))
@@ -182,10 +185,10 @@ def residuals(
 
 
 def apart(evaluate: Callable[[Array], Any], q: Float[Array, " q"]) -> Any:
-    """`evaluate(q)`, kept in memory; not a number if `q` is none.
+    """`evaluate(q)`, computed once; NaN if `q` is not finite.
 
-    XLA repeats what it takes to make one number in every loop that reads it, here a dozen times.
-    What a branch returns is computed once.
+    XLA repeats a computation in every loop that reads its result, here a dozen times. It computes
+    the result of a branch only once.
     """
     shapes = jax.eval_shape(evaluate, q)
 
