@@ -66,6 +66,7 @@ def test_the_covariance_of_a_driver_is_the_inverse_of_its_information(driver):
     assert (ratio < 1.5).all(), ratio
 
 
+@pytest.mark.slow
 def test_what_a_calibration_tells_is_one_standard_deviation_along_each_direction(driver):
     """z is scaled by the information, so that its covariance is 1, and its mean next to 0."""
     frequency = driver.spectra.frequency[0]

@@ -141,6 +141,7 @@ def identified(load, snr_db, circuit=None, method=None):
     return etid.identify_skin(study["skin"], driver, circuit=circuit, method=method, throw=False)
 
 
+@pytest.mark.slow
 def test_two_layers_are_no_cole_relaxation_where_chi2_does_not_show_it():
     """R_s is 10 standard errors off, χ² 1.02."""
     load = etid.SkinLayers(33.4e3, 150e3, 0.12e-9, 36e3, 5e-9)

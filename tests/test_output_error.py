@@ -64,7 +64,7 @@ def plain(resistance):
     return SourceImpedance(log, none, none, none, none, jnp.log(jnp.array([1e4])), jnp.zeros(1))
 
 
-@pytest.mark.parametrize("z_load", [20e3, 300e3])
+@pytest.mark.parametrize("z_load", [pytest.param(20e3, marks=pytest.mark.slow), 300e3])
 def test_a_late_calibration_is_an_excess_impedance_and_a_delay(z_load):
     """−G sτ ((R_L − Z_L) / (Z_L + R) + 1) of V_th, a sine, all of them resistors.
 

@@ -53,6 +53,7 @@ def driver(study):
     return etid.identify_driver(study[CALIBRATION])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("path", ["layers", "spread"])
 def test_elements_are_found_from_typical_values_nearly_as_well_as_possible(study, driver, path):
     truth = TRIALS[path]

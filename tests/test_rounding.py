@@ -81,7 +81,11 @@ def test_too_coarse_a_converter_says_so():
 
 @pytest.mark.parametrize(
     ("bits", "full_scale", "snr_db", "codes"),
-    [(8, 10.0, 60.0, True), (8, 4.0, None, True), (10, 10.0, None, False)],
+    [
+        (8, 10.0, 60.0, True),
+        pytest.param(8, 4.0, None, True, marks=pytest.mark.slow),
+        pytest.param(10, 10.0, None, False, marks=pytest.mark.slow),
+    ],
 )
 def test_elements_are_right_within_wider_errors(bits, full_scale, snr_db, codes):
     study = study_of(bits=bits, full_scale=full_scale, snr_db=snr_db)
