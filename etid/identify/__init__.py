@@ -1,4 +1,4 @@
-"""What a user calls: identify one recording, many, a file, or all of them jointly.
+"""Functions that identify one recording, many recordings, a file, or a study jointly.
 
-The methods themselves are in `etid.estimators`.
+The estimation methods are in `etid.estimators`.
 """

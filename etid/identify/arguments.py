@@ -1,4 +1,4 @@
-"""Types of arguments: what is of another one is refused in words, before anything is computed."""
+"""Checks of argument types: a wrong type is refused with a message before any computation."""
 
 import operator
 import reprlib
@@ -10,7 +10,7 @@ from etid.recordings.recording import Recording, RecordingError
 from etid.recordings.study import Study
 from etid.results.driver import Driver
 
-LARGEST_ORDER = 50  # of a driver: ten times the paper's; the memory of a fit grows with its square
+LARGEST_ORDER = 50  # ten times the order of the paper; memory grows with the square of the order
 
 _REMEDIES: dict[type, str] = {
     Recording: "Take one from a study, as in study['s01/dry/0'], or make one with etid.Recording",
@@ -21,16 +21,17 @@ _REMEDIES: dict[type, str] = {
 
 
 def require(field: str, value: object, kind: type, remedy: str = "") -> None:
-    """Refuse an argument that is no instance of a class.
+    """Refuse an argument that is not an instance of a class.
 
     Args:
         field: Name of the argument.
-        value: What was passed.
-        kind: The class.
-        remedy: What to do about it; not needed for classes of etid.
+        value: The argument.
+        kind: The class that it must have.
+        remedy: What the user should do; not needed for classes of etid.
 
     Raises:
-        RecordingError: It is something else; a class in place of its instance is told apart.
+        RecordingError: The argument has another type. The message says so if it is the class
+            itself instead of an instance.
     """
     if isinstance(value, kind):
         return
@@ -50,7 +51,7 @@ def recordings(field: str, value: Iterable[Recording]) -> list[Recording]:
     """Several recordings as a list.
 
     Raises:
-        RecordingError: It is no iterable, or one of them is something else.
+        RecordingError: The value is not an iterable, or an item is not a recording.
     """
     if isinstance(value, Recording):
         raise RecordingError(
@@ -65,10 +66,10 @@ def recordings(field: str, value: Iterable[Recording]) -> list[Recording]:
 
 
 def circuit_of(value: AbstractCircuit | None) -> AbstractCircuit:
-    """The circuit that was passed, or `SkinRC` where none was.
+    """The given circuit, or `SkinRC` if none is given.
 
     Raises:
-        RecordingError: It is something else, a class of circuits for instance.
+        RecordingError: The value is not a circuit; a class of circuits, for instance.
     """
     if value is None:
         return SkinRC()
@@ -80,7 +81,7 @@ def order_of(value: Any) -> int:
     """The number of poles of a driver.
 
     Raises:
-        RecordingError: It is no whole number, or above `LARGEST_ORDER`.
+        RecordingError: The value is not a whole number, or it exceeds `LARGEST_ORDER`.
     """
     remedy = f"Pass a whole number from 2 to {LARGEST_ORDER}, as in order=5"
     try:
@@ -93,4 +94,4 @@ def order_of(value: Any) -> int:
         )
     if order > LARGEST_ORDER:
         raise RecordingError(f"is {order}, too many poles", field="order", remedy=remedy)
-    return order  # of one below 2 `identify_driver` says that there is no such driver
+    return order  # `identify_driver` refuses an order below 2

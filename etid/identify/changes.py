@@ -1,21 +1,22 @@
-"""Did the load or the driver change during the record? A test, and which element moved.
+"""Test whether the load or the driver changed during the record, and which element changed.
 
-The harmonics of a record show its mean: skin whose R_p falls by 20 % over the record ends 58 of its
-standard errors away, with χ² of 1. What changes lies between the harmonics.
-`etid.recordings.repeats` measures
-it: the deviation η of the logarithm of the gain, period by period, band by band. A change of the
-elements by θ (of their logarithms) makes
+The harmonics of a record show its mean only. Skin whose R_p falls by 20 % over the record ends 58
+of its standard errors away, and χ² is still 1. The change appears between the harmonics.
+`etid.recordings.repeats` measures it as the deviation η of the logarithm of the gain, for each
+period and each band. A change θ of the logarithms of the elements gives
 
     η = Σ θ_i ∂ ln G/∂ ln q_i + a − jωτ,      ∂ ln G/∂Z_L = Z_th / (Z_L (Z_L + Z_th)),
 
-with a change a of the amplitude, and a drift τ of the clock, which does no harm. Linear least
-squares gives θ and a for each of some courses over the periods: a line, a step after each period,
-one period unlike all others. χ² of θ and a says whether there is such a change.
+where a is a change of the amplitude and τ a drift of the clock. The drift does no harm. Linear
+least squares estimates θ and a for several courses over the periods: a line, a step after each
+period, and one period that differs from all others. χ² of θ and a tells whether there is such a
+change.
 
-**Does it matter?** What it moves if nobody knows of it are the elements per period, fitted without
-a. It matters if one of them moves by more than its standard error in the fit: then it was farther
-than half of that from its mean at one end of the record. Where it is less, as in long records of
-little noise behind a driver that is known worse, the fit is as good as it says.
+**Does the change matter?** A fit that ignores the change of the amplitude shows how far the change
+moves the elements. The change matters if an element moves by more than its standard error in the
+fit: at one end of the record it is then more than half a standard error away from its mean. Smaller
+changes do not matter. They occur in long records with little noise and a less certain driver. The
+standard errors of the fit are then right.
 """
 
 import dataclasses
@@ -37,28 +38,28 @@ from etid.results.fits import Fit
 from etid.results.verdicts import verdict
 from etid.signals.transfer import frequency_variable, reciprocal
 
-ALARM = 1e-5  # probability that a record without any change has one
-CLEAN = 0.03  # of the sample rate, below which there are no aliases
-UNEQUAL = 5e-4  # by which amplitudes of V_th may differ: cuts between samples make 1e-4
+ALARM = 1e-5  # probability of a false alarm in a record without a change
+CLEAN = 0.03  # of the sample rate; below, there are no aliases
+UNEQUAL = 5e-4  # largest change of the amplitude of V_th; cuts between samples cause 1e-4
 EXPLAINED = (
     "successful",
     "misfit",
     "inconsistent",
     "biased",
-)  # verdicts of which a change is the cause
+)  # verdicts that a change may cause
 LANES = 16  # circuits of one call
-RIDGE = 1e-10  # of the diagonal, for elements without effect
-LARGEST = 20.0  # change of a logarithm; one that is not determined can have any
-DRIVER = 2e-3  # by which a change may look like another calibration resistor
+RIDGE = 1e-10  # added to the diagonal, for elements without effect
+LARGEST = 20.0  # limit on the change of a logarithm; an undetermined change can be arbitrary
+DRIVER = 2e-3  # allowed change of a driver, expressed as a change of the calibration resistor
 
 
 class Change(NamedTuple):
-    """What changed during a record.
+    """Change of the elements and of the amplitude during a record.
 
     Attributes:
         size: Relative change of each element and, last, of the amplitude, over the record.
         stderr: Standard errors of `size`.
-        seen: Whether there is a change that matters.
+        seen: Whether a change was detected that matters.
     """
 
     size: Float[np.ndarray, " moved"]
@@ -67,7 +68,7 @@ class Change(NamedTuple):
 
 
 def unknown(count: int) -> Change:
-    """The change of `count` elements where nothing can be said."""
+    """An unknown change of `count` elements: all NaN."""
     nothing = np.full(count + 1, np.nan)
     return Change(nothing, nothing, False)
 
@@ -95,7 +96,7 @@ def log_slopes(
 
 @functools.lru_cache(maxsize=64)
 def courses(periods: int) -> Float[np.ndarray, "course period"]:
-    """How a change may go on over the periods: of length 1, with the mean 0, first the line."""
+    """Courses of a change over the periods, of norm 1 and mean 0; the line comes first."""
     p = np.arange(periods)
     rows = [p, *(p >= first for first in range(1, periods))]
     rows += [p == one for one in range(1, periods - 1)]
@@ -106,7 +107,7 @@ def courses(periods: int) -> Float[np.ndarray, "course period"]:
 
 @functools.lru_cache(maxsize=64)
 def threshold(freedom: int, count: int) -> float:
-    """χ² that the largest of `count` exceeds with the probability `ALARM`."""
+    """Threshold that the largest of `count` values of χ² exceeds with the probability `ALARM`."""
     return float(scipy.special.chdtri(freedom, ALARM / count))
 
 
@@ -115,12 +116,12 @@ def found(
     slopes: Complex[np.ndarray, "lane element band"] | None,
     allowed: Float[np.ndarray, "lane element"],
 ) -> list[Change]:
-    """The changes of loads during their records.
+    """Changes of loads during their records.
 
     Args:
         repeats: The periods of each record; None if there are less than two.
-        slopes: ∂ ln G/∂ ln q; None if there are no periods.
-        allowed: Changes of the logarithms of the elements that do not matter.
+        slopes: ∂ ln G/∂ ln q; None if no record has periods.
+        allowed: Largest changes of the logarithms of the elements that do not matter.
     """
     changes = [unknown(allowed.shape[1])] * len(repeats)
     if slopes is None:
@@ -141,28 +142,29 @@ def found(
 def _changes(
     of: Repeats, slopes: np.ndarray, allowed: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The parts of a `Change`, for recordings of equally many periods along the first axis."""
+    """The fields of `Change`, for recordings with the same number of periods."""
     elements, course = slopes.shape[1], courses(of.gain.shape[1])
     low, whole, right, plain, unit, total = _equations(of, slopes, course)
-    # The share of each course that what has aliased cannot imitate.
+    # The share of each course that aliases cannot imitate.
     share = 1 - np.abs(np.einsum("cp,lp->lc", course, of.turn.conj())) ** 2
     share = np.where(share > ALIGNED, share, 0.0)[:, :, None, None]
     normal = low[:, None] + share * (whole - low)[:, None]
     tested = elements + 1  # and the amplitude; not the delays
     theta, cov, square, explained = _solved(normal, right, tested)
-    # Coloured noise differs from period to period too, but in no way of an element: what the
-    # parameters leave tells how large it is.
+    # Coloured noise differs from period to period too, but not as an element does. The residual of
+    # the parameters gives its size.
     freedom = 2 * of.frequency.shape[1] - right.shape[-1]
     noise = np.maximum(1.0, (total - explained) / freedom)
-    # Half of the alarms are left to elements that move alone, which four together would hide.
+    # Half of the false alarms are allowed to elements that change alone: a test of four elements
+    # together would hide such a change.
     alone = (_alone(normal, right, tested) / noise[..., None]).max((1, 2))
     seen = (square / noise).max(1) > threshold(tested, 2 * len(course))
     seen |= alone > threshold(1, 2 * len(course) * tested)
     cov = cov * noise[..., None, None]
-    # Without aliases courses do not mix: the likeliest is the one that fits best.
+    # Without aliases the courses do not mix: the course that fits best is the most likely one.
     best = np.where(seen, np.argmax(_solved(whole[:, None], plain, tested)[2], axis=1), 0)
     lane, reach = np.arange(len(best)), np.ptp(course, axis=1)[best][:, None]
-    # What moves the elements if they are fitted without the amplitude.
+    # How far the elements move if they are fitted without the amplitude.
     others = np.arange(normal.shape[-1]) != elements
     normal, right = normal[lane, best][:, others], right[lane, best][:, others]
     blind = np.linalg.inv(normal[:, :, others] + RIDGE * np.eye(others.sum()))[:, :elements]
@@ -186,9 +188,9 @@ def _equations(
     """Normal equations of the elements, the amplitude and the delay.
 
     Returns:
-        The matrix of the bands without aliases, and of all; right sides, for each course, without
-        what has aliased and with it; and the units of the parameters, whose equations have a
-        diagonal of 1; and Σ η² / variance for each course.
+        Matrix of the bands without aliases; matrix of all bands; right sides for each course,
+        without aliases and with them; units of the parameters, which make the diagonal of the
+        equations 1; Σ η² / variance for each course.
     """
     high: np.ndarray = np.greater(of.frequency, CLEAN * of.sample_rate[:, None])
     plain = course @ of.gain
@@ -196,11 +198,11 @@ def _equations(
     aliased = (turn[:, :, None] * of.gain).sum(1)
     turned = plain - (turn @ course.T).conj()[:, :, None] * aliased[:, None]
     late = -2j * np.pi * of.frequency / of.sample_rate[:, None]
-    # Delays along another course turn into this one where aliases are taken out.
+    # Where aliases are removed, delays along other courses leak into this one.
     cross = np.where(high & np.any(turn, axis=1, keepdims=True), 1j * late, 0)
     nuisance = np.stack([np.ones_like(late), late, cross], axis=1)
     rows = np.concatenate([slopes, nuisance], axis=1)
-    # From them, too, polynomials are projected out.
+    # As for the deviations, polynomials are projected out.
     smooth = np.real(rows @ of.smooth.conj().swapaxes(1, 2)) @ of.smooth
     rows = _real(rows - smooth / of.power[:, None])
     weight = np.tile(1 / of.variance, 2)[:, None]
@@ -223,9 +225,9 @@ def _real(values: np.ndarray) -> np.ndarray:
 def _solved(
     normal: np.ndarray, right: np.ndarray, tested: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """For each recording and course: the first parameters, their covariance and their χ².
+    """The first parameters, their covariance and their χ², for each recording and course.
 
-    And by how much all parameters lower Σ η² / variance.
+    The last value is the reduction of Σ η² / variance by all parameters.
     """
     cov = np.linalg.inv(normal + RIDGE * np.eye(right.shape[-1]))
     theta = cov @ right[..., None]
@@ -237,9 +239,9 @@ def _solved(
 
 
 def _alone(normal: np.ndarray, right: np.ndarray, tested: int) -> np.ndarray:
-    """χ² of each of the first parameters if it is the only one of them, for recordings and courses.
+    """χ² of each of the first parameters if it changes alone, for each recording and course.
 
-    The others, delays, are fitted with it.
+    The other parameters, the delays, are fitted with it.
     """
     cross, others = normal[..., :tested, tested:], normal[..., tested:, tested:]
     solved = cross @ np.linalg.inv(others + RIDGE * np.eye(others.shape[-1]))
@@ -249,7 +251,7 @@ def _alone(normal: np.ndarray, right: np.ndarray, tested: int) -> np.ndarray:
 
 
 def _uneven(of: Repeats, course: Float[np.ndarray, "course period"]) -> np.ndarray:
-    """By how much the amplitude of V_th changes in each recording, where that is seen."""
+    """Change of the amplitude of V_th in each recording; 0 where it is not significant."""
     along = np.abs(of.unloaded @ course.T)
     worst = np.argmax(along, axis=1)
     largest = along[np.arange(len(worst)), worst]
@@ -258,12 +260,12 @@ def _uneven(of: Repeats, course: Float[np.ndarray, "course period"]) -> np.ndarr
 
 
 def of_fits(fits: Sequence[Fit], driver: Driver, repeats: Sequence[Repeats | None]) -> list[Change]:
-    """What changed during the record of each fit.
+    """The change during the record of each fit.
 
     Args:
         fits: Fits of circuits of one kind.
-        driver: Their driver.
-        repeats: The periods of their records, with equal bands; None where there are less than two.
+        driver: The driver of these fits.
+        repeats: The periods of the records, with equal bands; None if there are less than two.
     """
     # Not `circuit.values()`, whose arrays of JAX cost 0.3 ms a fit.
     names = fits[0].circuit.names()
@@ -285,7 +287,7 @@ def of_fits(fits: Sequence[Fit], driver: Driver, repeats: Sequence[Repeats | Non
 def _slopes(
     circuits: Sequence[AbstractCircuit], driver: Driver, frequency: Float[np.ndarray, " band"]
 ) -> Complex[np.ndarray, "lane element band"]:
-    """`log_slopes` of one circuit, or of some as if they were `LANES`: it is compiled for both."""
+    """`log_slopes` of one circuit, or of several padded to `LANES`: two compiled sizes suffice."""
     size = 1 if len(circuits) == 1 else LANES
     whole = [*circuits, *[circuits[-1]] * (size - len(circuits))]
     stacked = jax.tree.map(lambda *leaves: jnp.asarray(np.stack(leaves)), *whole)
@@ -296,12 +298,12 @@ def _slopes(
 def driver_judged(
     driver: Driver, r_load: Float[Array, " record"], repeats: Sequence[Repeats | None]
 ) -> Driver:
-    """A driver, with a verdict if it, or its pulses, changed during one of its calibrations.
+    """The driver, with the verdict `changed` if it or its pulses changed during a calibration.
 
     Args:
         driver: The driver.
         r_load: The resistors of its calibrations [Ω].
-        repeats: Their periods.
+        repeats: The periods of its calibrations.
     """
     frequency = next((of.frequency for of in repeats if of is not None), None)
     if frequency is None or driver.verdict != "successful":

@@ -1,13 +1,14 @@
-"""Traced functions kept on disk, so that a process need not trace what another one has.
+"""Traced functions on disk: a process need not trace what another process has traced.
 
-JAX's persistent compilation cache keeps what XLA makes, but its key is the traced and lowered
-program: every process traces its first fit anew, for seconds. Where that cache has a folder, here
-the lowered program (`jax.export`) is kept in it as well, in a file named by all that determines it:
-etid's source files and module constants, the versions of what it is built on, JAX's settings, the
-platform, and of the arguments the structure, the static parts, and the shapes and types of arrays.
+The persistent compilation cache of JAX stores the programs that XLA compiles. Its key is the traced
+and lowered program, so every process must trace its first fit again. This takes seconds. If that
+cache has a folder, this module stores the lowered program (`jax.export`) there too. The name of the
+file depends on all that determines the program: the source files and module constants of etid, the
+versions of the packages that it uses, the settings of JAX, the platform, and the arguments: their
+structure, their static parts, and the shapes and types of their arrays.
 
-Files are written whole or not at all; one that is damaged counts as absent. They are pickles: trust
-a folder as you would trust the compilation cache itself, whose executables run as they are.
+Files are written completely or not at all. A damaged file counts as absent. The files are pickles:
+trust a folder as you trust the compilation cache itself, whose executables run unchecked.
 """
 
 import contextlib
@@ -42,26 +43,30 @@ Result = TypeVar("Result")
 
 # Packages whose code the key knows: etid by its source files, all others by their versions.
 KNOWN = {"etid", "builtins", "equinox", "jax", "jaxlib", "lineax", "numpy", "optimistix", "scipy"}
-FOLDER = "etid"  # inside that of the compilation cache
+FOLDER = "etid"  # inside the folder of the compilation cache
 LOADED = time.time()
-# Settings of JAX that change no program.
+# Settings of JAX that do not change a program.
 UNRELATED = ("jax_compilation_cache", "jax_persistent_cache", "jax_log", "jax_dump", "jax_explain")
 
 
 def stored_jit(function: Callable[Parameters, Result]) -> Callable[Parameters, Result]:
-    """`equinox.filter_jit`, of which the traced function is kept in JAX's compilation cache.
+    """`equinox.filter_jit` that stores the traced function in the compilation cache of JAX.
 
-    Without a folder for that cache (`JAX_COMPILATION_CACHE_DIR`) it is `equinox.filter_jit` and
-    nothing else. The same holds under transformations (`jax.grad`, `jax.vmap`, `jax.jit`), which
-    need the function itself; for what `jax.export` cannot hold; with settings that take a function
-    apart (`jax_disable_jit`, `jax_debug_nans`); and for arguments of classes that are defined
-    elsewhere, such as a circuit of one's own, whose code is in no key.
+    In these cases it is plain `equinox.filter_jit`:
+
+    - The cache has no folder (`JAX_COMPILATION_CACHE_DIR`).
+    - A transformation (`jax.grad`, `jax.vmap`, `jax.jit`) needs the function itself.
+    - `jax.export` cannot hold the function.
+    - A setting of JAX runs the parts of a function one by one (`jax_disable_jit`,
+      `jax_debug_nans`).
+    - An argument belongs to a class from outside etid, such as your own circuit: its code is not
+      in the key.
     """
     plain = eqx.filter_jit(function)
 
     @eqx.filter_jit
     @functools.wraps(function)
-    def kept(*args, **kwargs):  # executed once for each trace
+    def kept(*args, **kwargs):  # runs once for each trace
         found = _trace(function, args, kwargs)
         if found is None:
             return function(*args, **kwargs)
@@ -77,11 +82,11 @@ def stored_jit(function: Callable[Parameters, Result]) -> Callable[Parameters, R
 
 
 def _folder() -> pathlib.Path | None:
-    """Where traces are kept; None if they are not."""
-    config: Any = jax.config  # its attributes come into being at run time
+    """Folder of the traces; None if they are not stored."""
+    config: Any = jax.config  # its attributes are made at run time
     folder = config.jax_compilation_cache_dir
     takes_apart = config.jax_disable_jit or config.jax_debug_nans or config.jax_debug_infs
-    # What is exported is for the default device.
+    # An exported program is for the default device.
     elsewhere = config.jax_default_device is not None
     if not folder or "://" in folder or takes_apart or elsewhere:
         return None
@@ -93,7 +98,7 @@ def _arrays(tree: Any) -> list[Any]:
 
 
 def _on_device(arrays: list[Any]) -> bool:
-    """Whether arrays hold numbers, each on one device of the default kind."""
+    """Whether all arrays hold numbers and each is on one device of the default kind."""
     platform = jax.default_backend()
     for array in arrays:
         if isinstance(array, jax.core.Tracer):
@@ -120,7 +125,7 @@ def _filled(shell: Any, arrays: Any) -> Any:
 
 
 def _trace(function: Callable, args: tuple, kwargs: dict) -> tuple[jax.export.Exported, Any] | None:
-    """The exported function and the shell of its result; None if that cannot be had."""
+    """The exported function and the shell of its result; None if there is no export."""
     folder = _folder()
     try:
         key = _key(function, args, kwargs)
@@ -135,8 +140,8 @@ def _trace(function: Callable, args: tuple, kwargs: dict) -> tuple[jax.export.Ex
     try:
         found = _export(function, args, kwargs)
         content = pickle.dumps(found)
-    # Of any kind: a callback or a custom call that no file can hold, a result that has no name. The
-    # function is traced in the ordinary way then, and if the fault is its own, raises it there.
+    # Errors of any kind: a callback or a custom call that a file cannot hold, a result without a
+    # name. The function is then traced in the ordinary way. Its own errors are raised there.
     except Exception:
         return None
     _write(path, content)
@@ -165,7 +170,7 @@ def _export(function: Callable, args: tuple, kwargs: dict) -> tuple[jax.export.E
         for leaf in map(leaves.__getitem__, places)
     ]
     exported = jax.export.export(jax.jit(flat))(*shapes)
-    # How to differentiate it is a function of Python, and it is not differentiated.
+    # The derivative is a Python function, and a stored program is not differentiated.
     return dataclasses.replace(exported, _get_vjp=None), shells[0]
 
 
@@ -177,23 +182,23 @@ def _is_weak(array: Any) -> bool:
 
 
 def _read(path: pathlib.Path) -> Any:
-    """What a file holds; None if it is not there or not whole."""
+    """Content of a file; None if the file is missing or damaged."""
     try:
         content = path.read_bytes()
         checksum, packed = content[:32], content[32:]
         if hashlib.sha256(path.name.encode() + packed).digest() != checksum:
             return None
         return pickle.loads(zlib.decompress(packed))
-    # Any kind of exception comes out of a pickle that was made for something else.
+    # A pickle that was made for something else may raise any exception.
     except Exception:
         return None
 
 
 def _write(path: pathlib.Path, content: bytes) -> None:
-    """Write a file whole or not at all: several processes may write the same one."""
+    """Write a file completely or not at all: several processes may write the same file."""
     packed = zlib.compress(content, 1)
     checksum = hashlib.sha256(path.name.encode() + packed).digest()
-    # A folder that cannot be written still serves those who read it.
+    # A folder that cannot be written can still be read.
     with contextlib.suppress(OSError, RecordingError):
         path.parent.mkdir(parents=True, exist_ok=True)
         with replacing(path) as partial:
@@ -204,7 +209,7 @@ def _write(path: pathlib.Path, content: bytes) -> None:
 
 
 class _Unknown(Exception):
-    """Something whose code or value is in no key."""
+    """A value or a function that the key does not describe."""
 
 
 def _key(function: Callable, args: tuple, kwargs: dict) -> str | None:
@@ -224,9 +229,9 @@ def _key(function: Callable, args: tuple, kwargs: dict) -> str | None:
 
 @functools.cache
 def _sources() -> str | None:
-    """Digest of all files of the package; None if they may not be what this process has loaded."""
+    """Digest of all files of the package; None if they may have changed since they were loaded."""
     digest = hashlib.sha256()
-    # The whole package, wherever in it this file is: a program may be traced through any of them.
+    # The whole package, because a program may be traced through any of its files.
     package = pathlib.Path(str(sys.modules[__name__.partition(".")[0]].__file__)).parent
     paths = sorted(package.rglob("*.py"))
     try:
@@ -252,20 +257,20 @@ def _platform() -> tuple[str, ...]:
 
 
 def _settings() -> list[str]:
-    """Settings of JAX and equinox, which may change a program."""
+    """Settings of JAX and equinox that may change a program."""
     values = jax.config.values
     return [os.environ.get("EQX_ON_ERROR", "")] + [
-        f"{name}={getattr(jax.config, name, values[name])}"  # the attribute knows of contexts
+        f"{name}={getattr(jax.config, name, values[name])}"  # includes context managers
         for name in sorted(values)
         if not name.startswith(UNRELATED)
     ]
 
 
 def _constants(module: types.ModuleType, seen: set[str]) -> Iterator[tuple[str, Any]]:
-    """The constants of a module and of those of etid that it uses: someone may have set them.
+    """Constants of a module and of the modules of etid that it uses: a user may have changed them.
 
     Raises:
-        _Unknown: A function was replaced by one from elsewhere.
+        _Unknown: A function was replaced by a function of another package.
     """
     seen.add(module.__name__)
     for name, value in sorted(vars(module).items()):
@@ -285,20 +290,20 @@ def _constants(module: types.ModuleType, seen: set[str]) -> Iterator[tuple[str, 
             try:
                 yield f"{module.__name__}.{name}", _described(value, by_value=True)
             except _Unknown:
-                pass  # types, loggers and the like
+                pass  # types, loggers and similar values
         if home.startswith("etid.") and home not in (*seen, __name__) and home in sys.modules:
             yield from _constants(sys.modules[home], seen)
 
 
 def _described(node: Any, by_value: bool = False) -> Any:
-    """A value in words that are the same in every process.
+    """Description of a value that is the same in every process.
 
     Args:
         node: Arguments of a function, or a constant.
-        by_value: Whether the numbers in an array matter, or its type only.
+        by_value: Whether the numbers in an array matter, or only its shape and type.
 
     Raises:
-        _Unknown: It contains something of a class or function from elsewhere.
+        _Unknown: The value contains a class or a function of another package.
     """
     kind = type(node)
     inner = functools.partial(_described, by_value=by_value)

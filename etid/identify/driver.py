@@ -1,4 +1,4 @@
-"""Identify a driver: pre-flight, baseline, refinement, verdict."""
+"""Identification of a driver: pre-flight, baseline, refinement, verdict."""
 
 import dataclasses
 import functools
@@ -27,7 +27,7 @@ from etid.results.verdicts import message, verdict
 from etid.signals import mains
 from etid.signals.harmonics import Spectrum
 
-# |Z_th| [Ω] at 1 kHz: from a microphone's transformer to a tube's.
+# |Z_th| [Ω] at 1 kHz: from the transformer of a microphone to the transformer of a tube.
 PLAUSIBLE = (300.0, 300e3)
 
 
@@ -43,24 +43,26 @@ def identify_driver(
     """Identify the source impedance Z_th from one or several records with known resistors.
 
     Args:
-        calibrations: Recordings with `r_load`, of one length and sample rate.
+        calibrations: Recordings with `r_load`, all of the same length, sample rate and pulse rate.
         order: Number of poles of Z_th (the paper uses 5).
-        method: `"maximum_likelihood"`, for records of several whole pulse periods, or
-            `"output_error"`, or the paper's `"steiglitz_mcbride"`, or its first iteration
-            `"equation_error"`; or an estimator with its options, as in
-            `etid.SteiglitzMcBride(iterations=5)`. If not given, the first where the record allows
-            it, else the second.
-        plausible: Least and largest |Z_th| [Ω] at 1 kHz that is believed. The range spans a factor
-            of 1000: no driver in it stays in it if `r_load` is given in kΩ.
-        driver_drift: Relative standard deviation by which each parameter of Z_th may have changed
-            until a skin is recorded. It enters the standard errors of the skins, as `shared_cov`.
-        throw: Raise if the verdict is not successful.
+        method: `"maximum_likelihood"` (for records of several whole pulse periods),
+            `"output_error"`, the paper's `"steiglitz_mcbride"`, or its first iteration,
+            `"equation_error"`. An estimator with options is possible too, as in
+            `etid.SteiglitzMcBride(iterations=5)`. If not given, maximum likelihood is used if the
+            records allow it, else output error.
+        plausible: Smallest and largest |Z_th| [Ω] at 1 kHz that is accepted. The default range
+            spans a factor of 1000: a driver within the range leaves it if `r_load` is given in kΩ.
+        driver_drift: Relative standard deviation of the change of each parameter of Z_th between
+            the calibration and the recording of a skin. It enters the standard errors of the
+            skins, as part of `shared_cov`.
+        throw: Raise an error if the verdict is not successful.
 
     Returns:
         The driver, with its verdict.
 
     Raises:
-        ValueError: No calibration, one without `r_load`, different lengths, or order below 2.
+        ValueError: There is no calibration, a calibration has no `r_load`, their lengths or rates
+            differ, the order is below 2, or `driver_drift` is not in 0 ≤ drift < 1.
         IdentificationError: The verdict is not successful and `throw` is set.
     """
     asked = estimator_of(method)
@@ -127,7 +129,7 @@ def identify_driver(
 
 
 def _driver(seen: Sequence[Inspected], order: int, estimator: AbstractEstimator) -> Driver:
-    """The driver of calibrations that passed the pre-flight, aligned by their lags."""
+    """The driver from calibrations that passed the pre-flight, aligned by their lags."""
     r_load = jnp.asarray([one.recording.r_load for one in seen])
     aligned = [AlignedSamples.of(one) for one in seen]
     if not estimator.lane.periodic:
@@ -137,8 +139,8 @@ def _driver(seen: Sequence[Inspected], order: int, estimator: AbstractEstimator)
             for one in aligned
         ]
         return _identified(stacked(cut), r_load, order, estimator, None)
-    # Only starts are made from samples: of one length, so that the compiled function serves all.
-    shortest = min(one.v_th.size for one in seen)  # periods of the others may be left out
+    # The samples give the starts only. One length lets all records use one compiled function.
+    shortest = min(one.v_th.size for one in seen)  # disturbed periods may be left out of some
     whole = [
         dataclasses.replace(
             one, v_th=of.v_th[:shortest], v_out=np.roll(of.v_out, -of.lag)[:shortest]
@@ -146,11 +148,12 @@ def _driver(seen: Sequence[Inspected], order: int, estimator: AbstractEstimator)
         for one, of in zip(aligned, seen, strict=True)
     ]
     spectra = [Harmonics.of(one).spectrum for one in seen]
-    size = min(one.x.size for one in spectra)  # a pulse rate that is counted may cost one
+    size = min(one.x.size for one in spectra)  # counted pulse rates may differ by one harmonic
     spectra = jax.tree.map(lambda *of: jnp.stack([field[:size] for field in of]), *spectra)
     records = stacked(whole)
     driver = _identified(records, r_load, order, estimator, spectra)
-    # A driver bends to hum on one harmonic, by a pole there, and then lacks another.
+    # A driver fits hum on a harmonic by a pole at that frequency, and this pole is then missing
+    # elsewhere.
     if needs_another(driver) or driver.verdict != "successful":
         few = spectra.selected & ~mains.lines(spectra.frequency)
         spectra = dataclasses.replace(spectra, selected=few)

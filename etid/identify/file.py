@@ -1,12 +1,14 @@
-"""A file of any size, identified in parts: memory is bounded, and what is done stays done.
+"""Identification of a file of any size in parts: memory is bounded, and finished parts are kept.
 
-The recordings of a file are cut, in their order, into parts of `PART`. Each part is fitted by
-`identify_study` and written, whole or not at all, into a folder beside the result; in the end all
-parts become one file. A run that was killed has lost the part it was at: `resume` goes on with the
-next, and ends with the same numbers, because parts are cut and fitted alike each time.
+The recordings of a file are divided, in their order, into parts of `PART` recordings. Each part is
+fitted as `identify_study` does. It is written completely or not at all, into a folder beside the
+result. In the end all parts become one file. A killed run loses only the part that it was fitting.
+`resume` continues with the missing parts and gives the same numbers, because the parts are divided
+and fitted in the same way each time.
 
-Parts are independent, so that any `concurrent.futures.Executor` can spread them: processes of this
-machine (`workers`), or a cluster (`dask.distributed.Client.get_executor()`).
+The parts are independent. Any `concurrent.futures.Executor` can therefore distribute them: over
+processes of this machine (`processes`), or over a cluster
+(`dask.distributed.Client.get_executor()`).
 """
 
 import concurrent.futures
@@ -39,20 +41,20 @@ from etid.recordings.study import Study
 from etid.results.provenance import Settings
 from etid.results.study_fits import StudyFits
 
-PART = 256  # recordings, some seconds of work: what a killed run may lose
+PART = 256  # recordings, some seconds of work; a killed run loses at most one part
 
 
 class ResumeError(ValueError):
-    """A run was interrupted, or what it has left does not belong to this one."""
+    """A run was interrupted, or the parts of an earlier run do not belong to this run."""
 
 
 class _Opened(NamedTuple):
     """A file in use.
 
     Attributes:
-        study: Its recordings.
-        paths: Those to identify, in order.
-        drivers: Its drivers, as far as they were asked for.
+        study: The recordings of the file.
+        paths: Paths of the recordings to identify, in order.
+        drivers: The drivers that were needed so far.
     """
 
     study: Study
@@ -69,7 +71,7 @@ def _open(source: str, order: int, asked: AbstractEstimator | None, driver_drift
 def _kept_open(
     source: str, stamp: int, order: int, asked: AbstractEstimator | None, driver_drift: float
 ) -> _Opened:
-    """The same, once per process and as long as that lives: parts come one by one."""
+    """`_open`, kept for the lifetime of the process: a worker gets its parts one by one."""
     del stamp
     return _open(source, order, asked, driver_drift)
 
@@ -81,7 +83,10 @@ def _fit(
     size: int,
     number: int,
 ) -> StudyFits:
-    """Fit one part; with its own drivers, whatever else this process has identified before."""
+    """The fits of one part, with the drivers of this part only.
+
+    This process may have identified the drivers of other parts before.
+    """
     study, paths, drivers = opened
     part = paths[number * size : (number + 1) * size]
     fits = identify_part(study, part, drivers, circuit, asked)
@@ -104,17 +109,18 @@ def _fit_elsewhere(
     size: int,
     number: int,
 ) -> StudyFits:
-    """Fit one part in any process that sees the file."""
-    with jax.enable_x64(True):  # of a worker: the caller's own was checked
+    """The fits of one part, in any process that can read the file."""
+    with jax.enable_x64(True):  # a worker does not have the setting of its caller
         return _fit(
             _kept_open(source, stamp, order, asked, driver_drift), circuit, asked, size, number
         )
 
 
 def _pin(cores: Any) -> None:
-    """Give this process a core of its own: sharing them costs XLA more than it gains.
+    """Bind this process to one core: shared cores cost XLA more than they gain.
 
-    Ctrl-C reaches it as well as its parent, which says what was kept: it ends without a word.
+    Ctrl-C reaches this process and its parent. The parent says what was kept, so this process ends
+    silently.
     """
     signal.signal(signal.SIGINT, signal.SIG_DFL)
     if hasattr(os, "sched_setaffinity"):
@@ -123,7 +129,7 @@ def _pin(cores: Any) -> None:
 
 @contextlib.contextmanager
 def processes(workers: int) -> Iterator[concurrent.futures.Executor]:
-    """An executor of as many processes of this machine, each on a core of its own."""
+    """An executor of `workers` processes of this machine, each bound to one core."""
     context = multiprocessing.get_context("spawn")
     available = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else [0]
     cores = context.Queue()
@@ -161,7 +167,7 @@ class _Parts:
 
 
 def kept(target: str | os.PathLike[str]) -> str:
-    """What a run that did not end has left beside its result, in words; empty if nothing."""
+    """A sentence on what an unfinished run has kept beside its result; empty if nothing."""
     folder = _folder(pathlib.Path(target))
     try:
         run = json.loads((folder / "run.json").read_text("utf-8"))
@@ -191,22 +197,23 @@ def fit_file(
     """Identify all drivers and recordings of a file of any size.
 
     Args:
-        source: File of recordings; every process of `executor` must see it under this name.
+        source: File of recordings. Every process of `executor` must find it under this name.
         target: File of fits to write. Until it is complete, its parts are in `target.parts`.
         order: As in `identify_driver`.
         circuit: As in `identify_skin`.
         method: As in `identify_skin`.
         driver_drift: As in `identify_driver`.
-        resume: Keep the parts of an earlier run that did not end.
-        executor: Where parts are fitted; in this process if not given.
+        resume: Keep the parts of an earlier run that did not finish.
+        executor: Executor that fits the parts. If not given, this process fits them.
         progress: Show a progress bar.
 
     Returns:
-        As `identify_study`; the drivers of parts that an earlier run has fitted hold no harmonics
+        As `identify_study`. The drivers of parts that an earlier run has fitted hold no harmonics
         of their calibrations.
 
     Raises:
-        ResumeError: The earlier run had other settings, or the source has changed since.
+        ResumeError: The earlier run had other settings, the source has changed since, or a worker
+            was lost.
         RecordingError: The source as a whole is missing, damaged or of another schema.
         ValueError: The source has no loaded recording.
     """
@@ -260,7 +267,7 @@ def _results(
     numbers: Sequence[int],
     executor: concurrent.futures.Executor | None,
 ) -> Iterator[tuple[int, StudyFits]]:
-    """The parts as they are finished."""
+    """Numbers and fits of the parts, in the order in which they finish."""
     if executor is None:
         for number in numbers:
             yield number, task(number)
@@ -272,5 +279,5 @@ def _results(
     except concurrent.futures.BrokenExecutor as error:
         raise ResumeError("a worker was lost; what is done is kept, go on with resume") from error
     finally:
-        for future in futures:  # those left if this was interrupted: the executor would end them
+        for future in futures:  # after an interruption the executor would finish the others first
             future.cancel()

@@ -1,11 +1,12 @@
-"""Identify a circuit from its measured impedance: frequency, Z, standard error.
+"""Identification of a circuit from its measured impedance: frequency, Z, standard error.
 
-Potentiostats and impedance analysers give Z itself, without a driver in between. Minimised is
+Potentiostats and impedance analysers measure Z itself, without a driver in between. The fit
+minimises
 
     Σ_k |Z(jω_k) − Z_k|² / σ_k²
 
-over the logarithms of the elements, from the best of a grid of impedance levels and corner
-frequencies that spans the data.
+over the logarithms of the elements. It starts at the best point of a grid of impedance levels and
+corner frequencies that spans the data.
 """
 
 import jax.numpy as jnp
@@ -25,8 +26,8 @@ from etid.solvers.matrices import inverse
 
 MAX_STEPS = 500
 MISFIT_CHI2 = 1.5  # a standard error of a measured impedance is seldom known to better than 20 %
-LEVELS = np.geomspace(0.1, 10.0, 5)  # of the impedance around that of the data
-CORNERS = 9  # per grid, between the lowest and the highest frequency
+LEVELS = np.geomspace(0.1, 10.0, 5)  # impedance levels of the grid, relative to the data
+CORNERS = 9  # corner frequencies of the grid, between the lowest and the highest frequency
 SOLVER = LevenbergMarquardt()
 
 
@@ -42,7 +43,8 @@ def _fit(
         difference = (circuit.with_log_values(q).response(frequency) - z) / sigma.astype(z.dtype)
         return jnp.concatenate([difference.real, difference.imag])
 
-    # A circuit scaled in impedance by g and in frequency by t has R·g and C/(g t).
+    # If a circuit is scaled in impedance by g and in frequency by t, R becomes R·g, C becomes
+    # C/(g t).
     typical, (of_level, of_time) = circuit.log_values(), circuit.scaling()
     size = jnp.log(jnp.median(jnp.abs(z)) / jnp.median(jnp.abs(circuit.response(frequency))))
     slow = of_time > 0
@@ -94,19 +96,19 @@ def identify_impedance(
 
     Args:
         frequency: Frequencies [Hz], > 0.
-        impedance: Complex impedance [Ω] at each.
-        stderr: Standard error [Ω] of real and imaginary part, one for all or one for each. If not
-            given, it is taken as one for all and estimated from the residual: χ² is then NaN, and
-            nothing can say that the circuit is wrong.
+        impedance: Complex impedance [Ω] at each frequency.
+        stderr: Standard error [Ω] of the real and of the imaginary part: one number, or one for
+            each frequency. If not given, the fit estimates one number from the residual. χ² is
+            then NaN, and the fit cannot detect a wrong circuit.
         circuit: Structure of the circuit; `SkinRC` if not given. Its values matter little.
-        throw: Raise if the verdict is not successful.
+        throw: Raise an error if the verdict is not successful.
 
     Returns:
         Elements, standard errors and verdict.
 
     Raises:
-        ValueError: The arrays do not fit each other, or are not finite and positive where they
-            must be.
+        ValueError: The shapes of the arrays differ, there are too few impedances for the elements,
+            or a number is not finite or not positive where it must be.
         IdentificationError: The verdict is not successful and `throw` is set.
     """
     require_float64()

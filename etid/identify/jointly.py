@@ -1,8 +1,8 @@
-"""A whole study in one fit: one source impedance, and every trial its own load and trigger delay.
+"""Joint fit of a study: one source impedance; a load and a trigger delay for each trial.
 
-Fitted one by one, trials share the error of the driver, and no spread between them shows it. Fitted
-together they determine the driver better than its calibration does, and the standard errors of the
-result tell what is a trial's own from what all trials have in common.
+Trials that are fitted one by one share the error of the driver. The spread between the trials does
+not show this error. A joint fit determines the driver better than its calibration does. Its
+standard errors separate the own error of a trial from the error that all trials share.
 """
 
 import dataclasses
@@ -85,12 +85,12 @@ register_description(
 
 
 class _Start(NamedTuple):
-    """Loads identified one by one with Z_th as it is, where a joint fit may start.
+    """Loads identified one by one with a fixed Z_th; a joint fit starts from them.
 
     Attributes:
         loads: The loads.
-        hum: Whether each shows mains hum.
-        changed: Whether it shows that the driver has changed since its calibration.
+        hum: Whether each recording shows mains hum.
+        changed: Whether each recording shows that the driver has changed since its calibration.
     """
 
     loads: Loads
@@ -125,7 +125,7 @@ def _together(
     tolerance: Array,
 ) -> tuple[list[Fit], HarmonicDriver]:
     common, cov, found = shared_driver.fit(model, groups, several)
-    # All impedances are measured in units of the known resistor.
+    # The records determine all impedances in units of the known resistor.
     power, _ = model.circuit.scaling()
     scale = tolerance**2 * jnp.outer(power, power)
 
@@ -155,14 +155,14 @@ def _together(
 
 
 class _Waiting:
-    """Recordings with equally many harmonics and one driver."""
+    """Recordings of one driver with the same number of harmonics."""
 
     def __init__(self, model: Joint, driver: HarmonicDriver):
         self.model = model
         self.driver = driver
         self.rows: list[int] = []
         self.lanes: list[Harmonics] = []
-        self.seen: list[Inspected] = []  # those of `lanes`
+        self.seen: list[Inspected] = []  # the recordings of `lanes`
         self.starts: list[_Start] = []
         self.remarks: list[int] = []
         self.unloaded: list[int] = []
@@ -197,7 +197,7 @@ class _Waiting:
         return [bool(start.changed) for start in self.starts]
 
     def several(self) -> list[int]:
-        """Checksums of the unloaded records that several recordings have."""
+        """Checksums of the unloaded records that several recordings share."""
         return [key for key, count in Counter(self.unloaded).items() if count > 1]
 
     def loads(self) -> Loads:
@@ -212,7 +212,7 @@ class _Waiting:
 def _late_by(lane: AbstractLane, start: _Start) -> int:
     del lane
     late = float(start.loads.own.delay_samples)
-    return round(late) if 1 < abs(late) < np.inf else 0  # more than a fit allows for
+    return round(late) if 1 < abs(late) < np.inf else 0  # a fit allows for one sample
 
 
 def _needs_another(start: _Start) -> bool:
@@ -235,21 +235,22 @@ def identify_jointly(
 ) -> StudyFits:
     """Identify every driver of a study together with all recordings made with it.
 
-    By maximum likelihood, for records of several whole pulse periods; its cost is linear in their
-    number. A recording that no circuit of this kind explains does not take part in the driver.
+    The method is maximum likelihood, for records of several whole pulse periods. Its cost is linear
+    in the number of records. A recording that this kind of circuit does not explain does not
+    influence the driver.
 
     Args:
         study: Calibrations and loaded recordings.
         order: Number of poles of Z_th.
         circuit: Structure of the loads and its typical values; `SkinRC` if not given.
-        r_load_tolerance: Relative standard deviation of the known resistors, which no record can
-            tell; it passes 1:1 into every resistance and, inversely, into every capacitance.
+        r_load_tolerance: Relative standard deviation of the known resistors. No record shows this
+            error. It passes 1:1 into every resistance and inversely into every capacitance.
         progress: Show a progress bar.
 
     Returns:
-        One fit per recording, and the drivers as all records together determine them. In the fits,
-        `shared_cov` holds what all recordings with one driver have in common: the error of Z_th and
-        `r_load_tolerance`; the rest of `cov` is each recording's own.
+        One fit for each recording, and the drivers that all records together determine. In the
+        fits, `shared_cov` is the error that all recordings with one driver share: the error of
+        Z_th and `r_load_tolerance`. The rest of `cov` is the own error of each recording.
 
     Raises:
         ValueError: The study has no loaded recording.
@@ -292,7 +293,7 @@ def identify_jointly(
         tolerance = jnp.asarray(r_load_tolerance, dtype=float)
         model = _model(circuit, driver, shared)
         found, better = _together(model, groups, several, driver, tolerance)
-        # What comes out of a compiled function is an array of JAX, and the checksums are none.
+        # A compiled function returns JAX arrays. The checksums must stay a numpy array.
         better = dataclasses.replace(better, method=METHOD, unloaded=driver.unloaded)
         changed = any(any(group.changed) for group in lengths.values())
         if changed and not any(np.any(loads.used) for loads in groups):
@@ -312,9 +313,9 @@ def identify_jointly(
 
 
 def _of(fit: Fit, changed: bool) -> Fit:
-    """The fit with the verdict of a driver that has changed since its calibration."""
+    """The fit without remarks; its verdict is `inconsistent` if the driver has changed."""
     explained = changed and fit.verdict in ("successful", "misfit")
-    # Whether hum was left out was decided when each was fitted alone.
+    # The fit of each recording alone decides whether hum is left out.
     fit = dataclasses.replace(fit, remarks=np.zeros((), int))
     return dataclasses.replace(fit, result=verdict("inconsistent")) if explained else fit
 

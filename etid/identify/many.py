@@ -1,10 +1,10 @@
-"""Many recordings: lanes in chunks of one compiled function, and whole studies from HDF5.
+"""Identification of many recordings in chunks, and of whole studies.
 
-Recordings of one length share a compiled function, which takes `LANES` of them, so that memory is
-bounded. On a processor they run one after the other: side by side (`vmap`) all would take the steps
-of the slowest, which costs half as much again. Accelerators run them side by side. While a chunk is
-fitted, a thread reads the recordings of the next. What is wrong with a recording costs that
-recording alone: it gets a verdict and a note.
+Recordings of one length share one compiled function. It takes a chunk of `LANES` recordings, so
+that memory is bounded. A CPU fits the recordings of a chunk one after the other: side by side
+(`vmap`), all would take as many steps as the slowest, which costs 50 % more time. Accelerators fit
+them side by side. During the fit of a chunk, a thread reads the recordings of the next chunk. A bad
+recording gets a verdict and a note; the other recordings are not affected.
 """
 
 import contextlib
@@ -55,8 +55,8 @@ from etid.results.provenance import Settings
 from etid.results.study_fits import StudyFits
 from etid.results.verdicts import message
 
-LANES = 16  # of one call, the last of which is filled up
-AHEAD = 2 * LANES  # recordings that are read, and looked at, before their turn
+LANES = 16  # lanes of one chunk; the last chunk is padded
+AHEAD = 2 * LANES  # recordings that are read and inspected in advance
 _Found = TypeVar("_Found")
 
 
@@ -73,10 +73,10 @@ def _chunk(
 
 
 def each(fit: Callable[[Any], Any], lanes: Any, count: int | Int[Array, ""]) -> Any:
-    """`fit` of the first `count` lanes, side by side where that is faster; of the others, zeros."""
+    """Results of `fit` for the first `count` lanes; zeros for the others on a CPU."""
     if jax.default_backend() != "cpu":
         return jax.vmap(fit)(lanes)
-    once = jax.jit(fit)  # traced once, for its shapes and for its use
+    once = jax.jit(fit)  # so that the shapes and the calls need one trace only
     first = jax.tree.map(lambda leaf: leaf[0], lanes)
     shapes = jax.eval_shape(once, first)
 
@@ -96,14 +96,17 @@ def _stack(fits: Sequence[Fit]) -> Fit:
 
 
 def _of_one_method(fits: Sequence[Fit], used: Sequence[str]) -> list[Fit]:
-    """The same with one name: a batch has one, of all methods that were used."""
+    """The fits as numpy arrays, all with one method name: a batch has a single name.
+
+    The name lists all methods that were used.
+    """
     name = joined(used)
     arrays = [jax.tree.map(np.asarray, fit) for fit in fits]
     return [fit if fit.method == name else dataclasses.replace(fit, method=name) for fit in arrays]
 
 
 class Refusal(Exception):
-    """Why a recording cannot be fitted: the name of its verdict, and a note."""
+    """A recording cannot be fitted; holds the name of its verdict and a note."""
 
     def __init__(self, name: str, note: str = ""):
         super().__init__(name)
@@ -114,10 +117,10 @@ class Refusal(Exception):
 def planned(
     load: Callable[[], tuple[Recording, Driver]], asked: AbstractEstimator | None
 ) -> tuple[Inspected, Driver, AbstractEstimator]:
-    """Load a recording and its driver, and choose its estimator.
+    """The inspected recording, its driver and its estimator.
 
     Raises:
-        Refusal: Any of it failed, or pre-flight forbids a fit.
+        Refusal: One of these steps failed, or pre-flight refused the recording.
     """
     try:
         recording, driver = load()
@@ -133,12 +136,12 @@ def planned(
 
 
 def filled(lanes: Sequence[AbstractLane]) -> AbstractLane:
-    """A chunk, filled up by the last lane."""
+    """A chunk of `LANES` lanes, padded with copies of the last lane."""
     return stacked([*lanes, *[lanes[-1]] * (LANES - len(lanes))])
 
 
 class _Queue:
-    """Recordings that one compiled function takes, with one driver, waiting to fill a chunk."""
+    """Recordings that wait until a chunk is full; they share a compiled function and a driver."""
 
     def __init__(
         self, driver: Driver, known: Any, circuit: AbstractCircuit, estimator: AbstractEstimator
@@ -152,13 +155,13 @@ class _Queue:
         self.seen: list[Inspected] = []
 
     def add(self, row: int, lane: AbstractLane, seen: Inspected) -> None:
-        """Let a recording wait."""
+        """Append a recording."""
         self.rows.append(row)
         self.lanes.append(lane)
         self.seen.append(seen)
 
     def run(self) -> Iterator[tuple[int, Fit]]:
-        """Fit what is waiting."""
+        """Fit the waiting recordings and empty the queue."""
         rows, lanes, seen = self.rows, self.lanes, self.seen
         self.rows, self.lanes, self.seen = [], [], []
         fits = refined(lanes, seen, self._fits, self.driver)
@@ -168,11 +171,11 @@ class _Queue:
     def _fits(self, lanes: Sequence[AbstractLane]) -> list[Fit]:
         of = self.driver, self.known, self.circuit, self.estimator
         fits = jax.device_get(_chunk(filled(lanes), jnp.asarray(len(lanes)), *of))
-        return list(unstacked(fits))[: len(lanes)]  # what fills it up is left out
+        return list(unstacked(fits))[: len(lanes)]  # without the padding
 
 
 def unstacked(found: _Found) -> Iterator[_Found]:
-    """What was found for a chunk, lane by lane."""
+    """The results of a chunk, one lane at a time."""
     leaves, structure = jax.tree.flatten(found)
     return (
         jax.tree.unflatten(structure, map(np.asarray, one)) for one in zip(*leaves, strict=True)
@@ -186,7 +189,7 @@ def _identify(
     asked: AbstractEstimator | None,
     progress: bool,
 ) -> tuple[list[Fit], list[str]]:
-    """Fit `count` recordings; what `load(row)` raises becomes the verdict of its row."""
+    """Fits and notes of `count` recordings. An error of `load(row)` becomes the verdict of row."""
     fits: dict[int, Fit] = {}
     notes = [""] * count
     used: list[str] = []
@@ -194,7 +197,7 @@ def _identify(
     queues: dict[tuple, _Queue] = {}
 
     def read(row):
-        with jax.enable_x64(True):  # of the thread that reads: the caller's own was checked
+        with jax.enable_x64(True):  # the setting belongs to a thread, and this runs in another one
             seen, driver, estimator = planned(functools.partial(load, row), asked)
             try:
                 check_default(estimator, circuit)
@@ -247,21 +250,22 @@ def identify_skins(
     method: Method | None = None,
     progress: bool = False,
 ) -> Fits:
-    """Identify many recordings made with one driver.
+    """Identify many recordings that were made with one driver.
 
     Args:
-        recordings: Recordings, or a study of loaded ones; of any lengths and sample rates.
+        recordings: Recordings, or a study of loaded recordings. Lengths and sample rates may
+            differ.
         driver: Identified driver.
         circuit: As in `identify_skin`.
         method: As in `identify_skin`.
         progress: Show a progress bar.
 
     Returns:
-        One fit per recording, in their order; none is left without a verdict. The method
-        names all that were used.
+        One fit for each recording, in the order of the recordings. Each fit has a verdict. The
+        name of the method lists all methods that were used.
 
     Raises:
-        ValueError: No recording, or method and circuit do not go together.
+        ValueError: There is no recording, or the method cannot use this circuit.
     """
     require("driver", driver, Driver)
     circuit = circuit_of(circuit)
@@ -294,9 +298,9 @@ def identify_study(
 ) -> StudyFits:
     """Identify every driver of a study from its calibrations, then every loaded recording.
 
-    A recording that names no calibration belongs to the only one in the study; if there are
-    several, it gets the verdict `unreadable` rather than a guess. What cannot be read at all,
-    `study.problems`, comes last and has that verdict too.
+    If a recording names no calibration, the only calibration of the study is used. If the study
+    has several, the recording gets the verdict `unreadable`. Recordings that cannot be read
+    (`study.problems`) come last and get this verdict too.
 
     Args:
         study: Calibrations and loaded recordings.
@@ -307,10 +311,10 @@ def identify_study(
         progress: Show a progress bar.
 
     Returns:
-        One fit per loaded recording, and the drivers.
+        One fit for each loaded recording, and the drivers.
 
     Raises:
-        ValueError: No loaded recording, or method and circuit do not go together.
+        ValueError: There is no loaded recording, or the method cannot use this circuit.
     """
     require("study", study, Study)
     order = order_of(order)
@@ -326,7 +330,7 @@ def identify_study(
 
 
 def to_identify(study: Study) -> list[str]:
-    """Paths of all loaded recordings, and of what cannot be read."""
+    """Paths of all loaded recordings, then of all recordings that cannot be read."""
     return [*study.loaded, *study.problems]
 
 
@@ -338,7 +342,7 @@ def identify_part(
     asked: AbstractEstimator | None,
     progress: bool = False,
 ) -> Fits:
-    """Identify some recordings of a study, with its drivers."""
+    """Fits of some recordings of a study, with its drivers."""
 
     def load(row: int) -> tuple[Recording, Driver]:
         recording = study[paths[row]]
@@ -349,10 +353,10 @@ def identify_part(
 
 
 def table(study: Study, paths: Sequence[str], fits: Sequence[Fit], notes: Sequence[str]) -> Fits:
-    """The fits of these recordings of a study, with their labels.
+    """Fits of some recordings of a study, with their labels.
 
     Raises:
-        ValueError: There is none.
+        ValueError: There is no fit.
     """
     if not fits:
         raise ValueError("the study has no loaded recording")
@@ -361,11 +365,12 @@ def table(study: Study, paths: Sequence[str], fits: Sequence[Fit], notes: Sequen
 
 
 class Drivers:
-    """The drivers of a study, each identified when its first recording asks for it.
+    """The drivers of a study; each is identified when its first recording needs it.
 
     Attributes:
-        found: The drivers, by the paths of their calibrations.
-        failures: Why a driver could not be identified, by the paths of its calibrations.
+        found: The identified drivers. The keys are the paths of their calibrations.
+        failures: Reasons why a driver could not be identified. The keys are the paths of its
+            calibrations.
     """
 
     def __init__(
@@ -385,10 +390,11 @@ class Drivers:
         self._one_at_a_time = threading.Lock()
 
     def of(self, recording: Recording) -> tuple[str, ...]:
-        """Paths of the calibrations of a recording, whose driver is in `found` then.
+        """Paths of the calibrations of a recording; their driver is then in `found`.
 
         Raises:
-            RecordingError: The recording does not say which of several it is.
+            RecordingError: The recording names no calibration, and the study does not have exactly
+                one.
             IdentificationError: The driver could not be identified.
         """
         names = recording.calibration or self.calibrations
@@ -421,7 +427,7 @@ class Drivers:
 
 
 def _known(study: Study, path: str) -> dict[str, Any]:
-    """The fields of a recording; of one that cannot be read, its path."""
+    """The fields of a recording; only its path if it cannot be read."""
     try:
         return vars(study.metadata(path))
     except RecordingError:

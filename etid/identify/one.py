@@ -1,4 +1,4 @@
-"""Identify a skin: pre-flight, refinement, verdict; and what batches have in common with it."""
+"""Identification of one skin: pre-flight, refinement, verdict. Batches share these steps."""
 
 import dataclasses
 import zlib
@@ -45,21 +45,22 @@ def identify_skin(
     method: Method | None = None,
     throw: bool = True,
 ) -> Fit:
-    """Identify what is connected to the driver in one recording.
+    """Identify the circuit that is connected to the driver in one recording.
 
     Args:
         recording: Unloaded and loaded voltage.
         driver: Identified driver.
         circuit: Structure of the load and its typical values; `SkinRC` if not given.
-        method: As in `identify_driver`, or `"non_parametric"` or `"harmonic_steiglitz_mcbride"`,
-            whose drivers are those of maximum likelihood; or any name that was registered.
-        throw: Raise if the verdict is not successful.
+        method: A method of `identify_driver`, or `"non_parametric"` or
+            `"harmonic_steiglitz_mcbride"`, or any registered name. `"non_parametric"` and
+            `"harmonic_steiglitz_mcbride"` use the drivers of maximum likelihood.
+        throw: Raise an error if the verdict is not successful.
 
     Returns:
         Elements, standard errors and verdict.
 
     Raises:
-        ValueError: The driver cannot serve this method, or the method this circuit.
+        ValueError: The method cannot use this driver or this circuit.
         IdentificationError: The verdict is not successful and `throw` is set.
     """
     require("recording", recording, Recording)
@@ -98,12 +99,12 @@ def identify_samples(
     circuit: AbstractCircuit | None = None,
     method: Method | None = None,
 ) -> Fit:
-    """`identify_skin` for bare arrays, to be transformed by `jax.grad`, `jax.jit` and `jax.vmap`.
+    """`identify_skin` for plain arrays; `jax.grad`, `jax.jit` and `jax.vmap` can transform it.
 
     The elements are differentiable with respect to both records and to every number in `driver`,
-    its resistors `driver.calibration.r_load` for instance, by implicit differentiation of the
-    minimum: as accurate as the minimum itself, a thousandth of a standard error. There is no
-    pre-flight, but there is a verdict.
+    for example its resistors `driver.calibration.r_load`. The derivatives come from implicit
+    differentiation of the minimum. They are as accurate as the minimum itself: a thousandth of a
+    standard error. There is no pre-flight, but there is a verdict.
 
     Args:
         v_th: Unloaded voltage [V].
@@ -111,16 +112,17 @@ def identify_samples(
         driver: Identified driver.
         sample_rate: Samples per second [Hz].
         pulse_rate: Pulses per second [Hz].
-        resolution: Step of the converter [V] at the terminal, 0 if not known.
+        resolution: Step of the converter [V] at the terminal; 0 if not known.
         circuit: As in `identify_skin`.
-        method: As in `identify_driver`; if not given, maximum likelihood for several whole
-            periods, else output error. Whether they begin between pulses is not looked at.
+        method: As in `identify_driver`. If not given, maximum likelihood for several whole
+            periods, else output error. The function does not check that the periods begin between
+            pulses.
 
     Returns:
         Elements, standard errors and verdict, as arrays that JAX can trace.
 
     Raises:
-        ValueError: The driver cannot serve this method, or the method this circuit.
+        ValueError: The method cannot use this driver or this circuit.
     """
     require("driver", driver, Driver)
     circuit = circuit_of(circuit)
@@ -139,16 +141,17 @@ def identify_samples(
         else None
     )
     fit = skin_lane(lane, driver, known, circuit, estimator)
-    return dataclasses.replace(fit, remarks=jnp.zeros_like(fit.remarks))  # nothing is left out
+    # No harmonic is left out here, so a remark about hum would be untrue.
+    return dataclasses.replace(fit, remarks=jnp.zeros_like(fit.remarks))
 
 
-# --- What one recording and batches have in common ------------------------------------------------
+# --- Steps that one recording and batches share ---------------------------------------------------
 
 
 def skin_lane(
     lane: Any, driver: Driver, known: Any, circuit: AbstractCircuit, estimator: AbstractEstimator
 ) -> Fit:
-    """Identify one lane; differentiable code, to be jitted and batched by the caller."""
+    """The fit of one lane. The code is differentiable; the caller compiles and batches it."""
     return estimator.fit_load(lane, driver, known, circuit)
 
 
@@ -164,7 +167,10 @@ def known_at(
 
 
 def known_of(lane: AbstractLane, driver: Driver, shared: bool, estimator: AbstractEstimator) -> Any:
-    """What an estimator needs to know of a driver, for this lane and all with harmonics like it."""
+    """What an estimator must know of a driver; valid for all lanes with equal harmonics.
+
+    None for lanes without harmonics.
+    """
     if not isinstance(lane, Harmonics):
         return None
     return known_at(jnp.asarray(lane.frequency), driver, shared, estimator)
@@ -178,15 +184,18 @@ def repeated(
     needs_another: Callable[[_Found], bool],
     of_both: Callable[[_Found, _Found], _Found],
 ) -> list[_Found]:
-    """Fit lanes; those that are late once more, and those with hum again without its harmonics.
+    """Fits of lanes, some of them fitted again.
+
+    A lane that is late is realigned and fitted again. A lane with hum is fitted again without the
+    mains harmonics.
 
     Args:
-        lanes: Of the recordings.
-        seen: The recordings; the lag of those that are late is corrected.
+        lanes: Lanes of the recordings.
+        seen: The recordings. The function corrects the lag of those that are late.
         fit: Fits lanes.
-        late_by: Whole samples by which a lane is later than what was fitted to it.
-        needs_another: Whether hum is seen in what was fitted, or may explain it.
-        of_both: The better of two, the second without the harmonics of the mains.
+        late_by: Lag of a lane behind its fit [whole samples].
+        needs_another: Whether the fit shows hum, or hum may explain the fit.
+        of_both: The better of two fits; the second is without the mains harmonics.
     """
     lanes = list(lanes)
     found = fit(lanes)
@@ -214,7 +223,7 @@ def refined(
     fit: Callable[[Sequence[AbstractLane]], list[Fit]],
     driver: Driver,
 ) -> list[Fit]:
-    """`repeated` for fits of single recordings with a driver."""
+    """`repeated` for the fits of single recordings with a known driver."""
 
     def late_by(lane: AbstractLane, fit: Fit) -> int:
         return lane.late_by(fit.circuit, driver) if fit.verdict == "misfit" else 0
@@ -223,12 +232,15 @@ def refined(
 
 
 def needs_another(fit: Fit | Driver) -> bool:
-    """Whether hum is seen in a fit, or it misses the recording, be it for hum or not."""
+    """Whether a fit shows hum, or misses the recording for any reason."""
     return bool(int(fit.remarks) & Remark.mains_hum) or not fit.chi2 < MISFIT_CHI2
 
 
 def of_both(first: _Outcome, second: _Outcome) -> _Outcome:
-    """A fit, or the `second` without the mains harmonics, if it is good and they show hum."""
+    """The second fit if it is successful and shows hum, else the first fit without its remarks.
+
+    The second fit is the one without the mains harmonics.
+    """
     if second.verdict == "successful" and int(second.remarks) & Remark.mains_hum:
         return second
     return dataclasses.replace(first, remarks=np.zeros((), int))
@@ -240,20 +252,20 @@ def concluded(
     remarks: Sequence[int],
     repeats: Sequence[Repeats | None],
 ) -> list[Fit]:
-    """Fits with the remarks on their recordings, and with what changed during them.
+    """Fits with the remarks on their recordings and the changes during the records.
 
     Args:
-        fits: Fits of circuits of one kind, with remarks of their own.
-        driver: Their driver.
-        remarks: Of their recordings.
-        repeats: The periods of their recordings.
+        fits: Fits of circuits of one kind; they may have remarks already.
+        driver: The driver of these fits.
+        remarks: Remarks on the recordings.
+        repeats: The periods of the recordings.
     """
     found = changes.of_fits(fits, driver, repeats)
     return [_marked(*parts) for parts in zip(fits, remarks, found, strict=True)]
 
 
 def _marked(fit: Fit, remarks: int, change: changes.Change) -> Fit:
-    """The fit with the remarks on its recording and what changed during it, in one copy."""
+    """The fit with the remarks on its recording and the changes during it, in one copy."""
     remarks, result = int(fit.remarks) | remarks, fit.result
     if remarks & Remark.coarse_converter and fit.verdict == "insensitive":
         result = verdict("resolution")
@@ -274,19 +286,19 @@ def checksum(seen: Inspected) -> int:
 
 
 def is_shared(seen: Inspected, driver: Driver) -> bool:
-    """Whether the unloaded record of a recording may be that of a calibration."""
+    """Whether a recording and a calibration may share one unloaded record."""
     known = driver.unloaded if isinstance(driver, HarmonicDriver) else None
     return known is None or checksum(seen) in known
 
 
 def explained(seen: Inspected, name: str) -> str:
-    """What a verdict of `etid.recordings.preflight` means, with the numbers that were found."""
+    """The message of a verdict of `etid.recordings.preflight`, with the numbers found."""
     found = seen.train.mismatch if name == "rate_mismatch" else ""
     return f"{found} {message(name)}".strip()
 
 
 def failed_fit(name: str, circuit: AbstractCircuit, method: str) -> Fit:
-    """A fit without numbers, for a recording that was stopped before it."""
+    """A fit without numbers, for a recording that was not fitted."""
     size = len(circuit.names())
     nan = np.full((size, size), np.nan)
     empty = circuit.with_log_values(jnp.full(size, jnp.nan))
@@ -299,6 +311,6 @@ def failed_fit(name: str, circuit: AbstractCircuit, method: str) -> Fit:
 
 
 def note(fit: Fit) -> str:
-    """What the verdict of a fit means, and what changed if that is what it says."""
+    """The message of the verdict of a fit; for `changed` also the changes."""
     text = message(fit.verdict)
     return f"{text} {fit.changes}" if fit.verdict == "changed" else text

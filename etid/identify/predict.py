@@ -1,4 +1,4 @@
-"""The terminal voltage that a driver and a circuit predict for a recording."""
+"""Prediction of the terminal voltage of a recording from a driver and a circuit."""
 
 import jax
 import jax.numpy as jnp
@@ -25,7 +25,7 @@ from etid.signals.precision import require_float64
 def _fitted(
     samples: AlignedSamples, driver: ContinuousDriver, circuit: AbstractCircuit
 ) -> Float[Array, " interval"]:
-    records = prediction.prepare(samples.measure(), cutoff=0.5)  # the band as it was recorded
+    records = prediction.prepare(samples.measure(), cutoff=0.5)  # the whole band of the record
     r_load = driver.calibration.r_load[0]
     return output_error.fitted_voltage(
         records, driver.source, r_load, circuit.impedance().rational()
@@ -37,20 +37,21 @@ def predict(
 ) -> Float[np.ndarray, " time"]:
     """Predict the terminal voltage [V] of a recording, for plots and residuals.
 
-    The state at the start of the record and an offset are fitted to `recording.v_out`.
+    The function fits the state at the start of the record and an offset to `recording.v_out`.
 
     Args:
         recording: Unloaded and loaded voltage.
         driver: Driver with a continuous source impedance.
-        circuit: The load; the known resistor of a calibration if not given.
+        circuit: The load. If not given, it is the known resistor of the calibration.
 
     Returns:
-        Predicted voltage [V]; NaN at both edges, where the interpolation lacks neighbours. For
-        a circuit that is no ratio of polynomials in s, NaN after the last whole period.
+        Predicted voltage [V]. It is NaN at both edges, where the interpolation lacks neighbours.
+        For a circuit that is not a ratio of polynomials in s, it is NaN only after the last whole
+        period.
 
     Raises:
-        ValueError: There is no circuit, the driver cannot serve, or a circuit that is no ratio of
-            polynomials in s meets a record without a whole period.
+        ValueError: There is no circuit, or the driver has no continuous source impedance, or the
+            circuit is not a ratio of polynomials in s and the record holds no whole period.
     """
     require_float64()
     require("recording", recording, Recording)

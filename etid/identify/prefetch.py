@@ -1,4 +1,4 @@
-"""Read on while something else computes: one thread is a few steps ahead."""
+"""Reading in advance: a thread loads the next items during a computation."""
 
 import collections
 from collections.abc import Callable, Generator
@@ -13,15 +13,15 @@ def prefetch(
 ) -> Generator[Callable[[], T], None, None]:
     """Call `load(0)`, `load(1)`, … in another thread, in this order and one at a time.
 
-    Close the iterator to stop it early: what has begun is waited for, the rest is not begun.
+    Close the iterator to stop early: the running call finishes, the others do not start.
 
     Args:
-        load: What takes time without Python: reading a file, numpy.
-        count: How many calls.
-        ahead: How many calls may have begun of which the caller has not come to the result.
+        load: A function that spends its time outside Python, in file access or numpy.
+        count: Number of calls.
+        ahead: Largest number of calls in advance of the caller.
 
     Yields:
-        For each call a function that waits for its result and returns it, or raises what it raised.
+        For each call a function that waits for the result and returns it, or raises its error.
     """
     with ThreadPoolExecutor(1, thread_name_prefix="prefetch") as thread:
         waiting = collections.deque(thread.submit(load, row) for row in range(min(ahead, count)))

@@ -1,14 +1,15 @@
-"""The terminal voltage of a whole number of periods, for loads that no filter describes.
+"""Terminal voltage over whole periods, for loads that no finite filter describes.
 
-A record of whole periods is a sum of its Fourier coefficients, and the load acts on each as it is:
-Y = G X, G = Z_L / (Z_L + Z_th). A constant phase, which has no finite filter, needs no other.
+The Fourier coefficients describe a record of whole periods completely. The load acts on each
+coefficient separately: Y = G X, G = Z_L / (Z_L + Z_th). This suffices for a constant phase, which
+has no finite filter.
 """
 
 import numpy as np
 from jaxtyping import Complex, Float
 
-ITERATIONS = 3  # of two delays of a hundredth of a sample: the first leaves 1e-4 of them
-BAND = 0.4  # of the sample rate; beyond it anti-alias filters leave noise and aliases
+ITERATIONS = 3  # for two delays of 0.01 samples; the first iteration leaves 1e-4 of them
+BAND = 0.4  # of the sample rate; above it, anti-alias filters leave noise and aliases
 
 
 def periodic_voltage(
@@ -19,21 +20,21 @@ def periodic_voltage(
     z_load: Complex[np.ndarray, " frequency"],
     r_load: float,
 ) -> Float[np.ndarray, " time"]:
-    """Terminal voltage [V] with a load, as far as a record tells.
+    """Terminal voltage [V] with a load, aligned with a record.
 
-    Offset, delay and the delay of the calibration are fitted, the last by its excess impedance
-    (`prediction.late_calibration`).
+    The function fits the offset, the delay and the delay of the calibration. The delay of the
+    calibration enters as an excess impedance (`prediction.late_calibration`).
 
     Args:
         v_th: Unloaded voltage [V], a whole number of periods.
         v_out: Loaded voltage [V].
         sample_rate: Samples per second [Hz].
         z_th: Source impedance [Ω] at `np.fft.rfftfreq(v_th.size, 1 / sample_rate)[1:]`.
-        z_load: The load there [Ω].
+        z_load: Impedance of the load [Ω] at the same frequencies.
         r_load: Resistor of the calibration [Ω].
     """
     f = np.fft.rfftfreq(v_th.size, 1 / sample_rate)[1:]
-    samples = 2j * np.pi * f / sample_rate  # s, per sample
+    samples = 2j * np.pi * f / sample_rate  # s times the sample interval
     x, y = np.fft.rfft(v_th)[1:], np.fft.rfft(v_out)[1:]
     excess = samples * (r_load - z_load)
     used = f < BAND * sample_rate

@@ -1,4 +1,4 @@
-"""What an identification returns: verdicts, fits, drivers, and the file that keeps them.
+"""Results of an identification: verdicts, fits, drivers, and the files that store them.
 
-How they are found does not belong here.
+Code that identifies does not belong here.
 """

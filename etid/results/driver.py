@@ -1,12 +1,12 @@
-"""The driver: its source impedance in continuous time, and the loaded terminal voltage.
+"""Drivers: the source impedance in continuous time, and the loaded terminal voltage.
 
     V_th(t) --[Z_th]--+-- V_out        V_out = V_th · Z_L / (Z_L + Z_th)
                     [Z_L]
 
-Z_th is kept in *modal* form, a sum of second-order sections with log-frequency and log-damping.
-Polynomial coefficients of the same impedance have Jacobian condition numbers of 1e4…1e7, the modal
-ones 50…100; every value of the parameters is a stable impedance; and a pair of poles passes from
-complex to real without a change of branch.
+Z_th has *modal* form: a sum of second-order sections with log-frequency and log-damping. With
+polynomial coefficients, the Jacobian of the same impedance has condition numbers of 1e4…1e7; with
+modal parameters, 50…100. All values of the modal parameters give a stable impedance. A pair of
+poles passes from complex to real without a change of branch.
 """
 
 import abc
@@ -38,10 +38,10 @@ class SourceImpedance(eqx.Module):
 
     Z_th = R + Σ_k (g_k + h_k s/ω_k) / (1 + 2 ζ_k s/ω_k + (s/ω_k)²) + Σ_j g_j / (1 + s/ω_j)
 
-    g, h are in ohm and may have either sign; R [Ω], ω [rad/s] and ζ are positive and stored as
-    logarithms: with R < 0 the driver could not be loaded with a capacitor. ζ > 1 is a pair of real
-    poles. Order n has ⌊(n−1)/2⌋ sections, because a transformer always has one slow real pole, its
-    magnetising inductance.
+    g, h [Ω] may have either sign. R [Ω], ω [rad/s] and ζ are positive and stored as logarithms:
+    with R < 0 the driver could not be loaded with a capacitor. ζ > 1 is a pair of real poles. Order
+    n has ⌊(n−1)/2⌋ sections, because a transformer always has one slow real pole: its magnetising
+    inductance.
     """
 
     log_resistance: Float[Array, ""]
@@ -90,17 +90,17 @@ class SourceImpedance(eqx.Module):
 
 
 def realise(impedance: Rational, rate: float | Float[Array, ""]) -> StateSpace:
-    """Realise a load impedance, current [A] to voltage [V].
+    """State space of a load impedance, from current [A] to voltage [V].
 
     Args:
         impedance: Proper rational function of s [rad/s].
-        rate: Typical rate [1/s] by which the states are scaled; any value gives the same impedance.
+        rate: Typical rate [1/s] that scales the states. It does not change the impedance.
     """
     order = impedance.den.shape[0] - 1
     if impedance.num.shape[0] > order + 1:
         raise ValueError(
-            "the load's impedance grows without bound at high frequency (an inductor in series?); "
-            "a load must stay finite: put a resistor in parallel"
+            "the impedance of the load grows without bound at high frequency (an inductor in "
+            "series?); a load must stay finite: put a resistor in parallel"
         )
     scale = jnp.array([rate**k for k in range(order + 1)])
     num = jnp.pad(impedance.num, (0, order + 1 - impedance.num.shape[0])) * scale
@@ -115,14 +115,14 @@ def realise(impedance: Rational, rate: float | Float[Array, ""]) -> StateSpace:
 def loaded(source: SourceImpedance, load: Rational, rate: float | Float[Array, ""]) -> StateSpace:
     """The system V_th → V_out with `load` at the terminal, in continuous time.
 
-    The current i = (V_th − C₁x₁ − C₂x₂) / (D₁ + D₂) drives both impedances, x₁ the source's states,
-    x₂ the load's.
+    The current i = (V_th − C₁x₁ − C₂x₂) / (D₁ + D₂) drives both impedances. x₁ are the states of
+    the source, x₂ the states of the load.
     """
     return connected(source, realise(load, rate))
 
 
 def connected(source: SourceImpedance, z2: StateSpace) -> StateSpace:
-    """The same with a load that is realised, current [A] to voltage [V]."""
+    """The same as `loaded`, with the state space of the load, from current [A] to voltage [V]."""
     z1 = source.state_space()
     total = z1.D[0] + z2.D[0]
     drop = jnp.concatenate([z1.C, z2.C])
@@ -135,16 +135,17 @@ def connected(source: SourceImpedance, z2: StateSpace) -> StateSpace:
 
 
 class Calibration(eqx.Module):
-    """What a skin must know of the calibrations, besides Z_th and its covariance.
+    """Results of the calibrations that a skin needs besides Z_th and its covariance.
 
     Attributes:
         r_load: Known resistors [Ω].
         delay_samples: Trigger delay of each calibration [samples of the calibration].
-        delay_std_samples: Standard deviation of their common trigger delay [samples]. Only records
-            with different resistors tell that delay from a fast pole of Z_th; one resistor leaves
-            it open.
-        mismatch: By how much the logarithm of each known resistor exceeds what the other
-            calibrations say of it, and its standard error; None for one, or if not known.
+        delay_std_samples: Standard deviation of the common trigger delay of the calibrations
+            [samples]. Only records with different resistors can separate this delay from a fast
+            pole of Z_th. With one resistor the delay stays open.
+        mismatch: Difference between the logarithm of each known resistor and its value from the
+            other calibrations, and the standard error of this difference. None for one
+            calibration, or if not known.
     """
 
     r_load: Float[Array, " record"]
@@ -154,10 +155,10 @@ class Calibration(eqx.Module):
 
 
 class Driver(eqx.Module):
-    """An identified driver: what every kind of it has.
+    """An identified driver: the fields and methods that all kinds of drivers have.
 
-    Its kinds are `DiscreteDriver`, `ContinuousDriver` and `HarmonicDriver`. Only ratios to Z_th are
-    observable: the tolerance of the calibration resistor passes 1:1 into every resistance
+    The kinds are `DiscreteDriver`, `ContinuousDriver` and `HarmonicDriver`. Only ratios to Z_th are
+    observable. The tolerance of the calibration resistor therefore passes 1:1 into every resistance
     identified with this driver.
 
     Attributes:
@@ -165,12 +166,11 @@ class Driver(eqx.Module):
         a: Denominator 1, β₁ … of the discrete Z_th.
         sample_rate: Rate of the calibrations and of the discrete filter [Hz].
         rrse: Largest root relative squared error over the calibrations (paper, eq. 3).
-        chi2: Residual over expected variance per degree of freedom: 1 if the model is right.
+        chi2: Σ residual² / expected variance, per degree of freedom; 1 if the model is right.
         result: Verdict.
         steps: Iterations of the solver.
         method: Name of the estimator.
-        remarks: What was done to the calibrations before, `etid.recordings.remarks.Remark` as an
-            integer.
+        remarks: Remarks on the calibrations, `etid.recordings.remarks.Remark` as an integer.
     """
 
     _: dataclasses.KW_ONLY
@@ -196,7 +196,7 @@ class Driver(eqx.Module):
 
     @abc.abstractmethod
     def response(self, frequency: Float[Array, "..."]) -> Complex[Array, "..."]:
-        """Source impedance Z_th(j 2π f) [Ω], in continuous time where the method gives it.
+        """Source impedance Z_th(j 2π f) [Ω], in continuous time if the method gives it.
 
         Args:
             frequency: Real frequencies [Hz].
@@ -206,10 +206,10 @@ class Driver(eqx.Module):
     def log_response_stderr(
         self, frequency: Float[Array, " frequency"]
     ) -> Float[Array, "2 frequency"]:
-        """Standard errors of ln |Z_th| and of its phase [rad]; NaN if there is no covariance."""
+        """Standard errors of ln |Z_th| and of the phase [rad]; NaN if there is no covariance."""
 
     def response_stderr(self, frequency: Float[Array, " frequency"]) -> Float[Array, " frequency"]:
-        """Standard error of the magnitude of Z_th, by the slope of |Z_th| in its parameters.
+        """Standard error of |Z_th|, from the derivatives of |Z_th| by its parameters.
 
         Args:
             frequency: Real frequencies [Hz].
@@ -232,12 +232,12 @@ class Driver(eqx.Module):
         return "\n  ".join([*lines, *texts(int(self.remarks))])
 
     def _resistors(self) -> list[str]:
-        """What the calibrations say of each other's resistors."""
+        """Lines on the known resistors that differ from the values of the other calibrations."""
         return []
 
 
 class DiscreteDriver(Driver):
-    """A driver by Steiglitz-McBride: Z_th is the discrete filter `b`, `a` (paper, eq. 4)."""
+    """A driver from Steiglitz-McBride: Z_th is the discrete filter `b`, `a` (paper, eq. 4)."""
 
     def response(self, frequency: Float[Array, "..."]) -> Complex[Array, "..."]:
         """Source impedance Z_th [Ω] of the discrete filter at real frequencies [Hz]."""
@@ -252,14 +252,15 @@ class DiscreteDriver(Driver):
 
 
 class ContinuousDriver(Driver):
-    """A driver whose Z_th is known in continuous time, with its covariance.
+    """A driver with Z_th in continuous time and its covariance.
 
     Attributes:
         source: Continuous Z_th, valid at any sample rate.
         cov: Covariance of the parameters of `source`, flattened in field order.
-        calibration: What skins need of the calibrations.
-        drift: Relative standard deviation by which each parameter of `source` may have changed
-            when a skin is recorded; None if it cannot. `cov` does not contain it.
+        calibration: Results of the calibrations that skins need.
+        drift: Relative standard deviation of the change of each parameter of `source` between the
+            calibration and the recording of a skin; None if there is no change. `cov` does not
+            contain it.
     """
 
     _: dataclasses.KW_ONLY
@@ -270,14 +271,14 @@ class ContinuousDriver(Driver):
 
     def drift_std(self) -> Float[Array, " parameter"]:
         """Standard deviations of the parameters of `source` that come from `drift` alone."""
-        # Frequencies, dampings and R are logarithms: relative already.
+        # Frequencies, dampings and R are stored as logarithms, so their changes are relative.
         relative = jax.tree.map(jnp.ones_like, self.source)
         gains = (self.source.gain, self.source.slope, self.source.gain_real)
         relative = eqx.tree_at(lambda s: (s.gain, s.slope, s.gain_real), relative, gains)
         return jnp.abs(ravel_pytree(relative)[0]) * (0.0 if self.drift is None else self.drift)
 
     def later_cov(self) -> Float[Array, "parameter parameter"]:
-        """Covariance of the parameters of `source` when a skin is recorded."""
+        """Covariance of the parameters of `source` at the time when a skin is recorded."""
         return self.cov if self.drift is None else self.cov + jnp.diag(self.drift_std() ** 2)
 
     def response(self, frequency: Float[Array, "..."]) -> Complex[Array, "..."]:
@@ -303,12 +304,13 @@ class ContinuousDriver(Driver):
 
 
 class HarmonicDriver(ContinuousDriver):
-    """A driver that was identified on the harmonics of its calibrations, and keeps them.
+    """A driver that was identified from the harmonics of its calibrations and keeps them.
 
     Attributes:
         spectra: Harmonics of the calibrations, stacked along a leading axis.
-        unloaded: Checksums of their unloaded records; None if not known. A load whose checksum is
-            none of them needs no search for what it shares with them, which doubles its cost.
+        unloaded: Checksums of the unloaded records of the calibrations; None if not known. A load
+            with another checksum shares no unloaded record with them. Its fit then skips the
+            search for what they share, which doubles the cost.
     """
 
     _: dataclasses.KW_ONLY

@@ -1,4 +1,4 @@
-"""What an identification returns: one fit, and a table of many."""
+"""Results of an identification: one fit, and a table of many fits."""
 
 import dataclasses
 import importlib.metadata
@@ -23,7 +23,7 @@ from etid.results.hdf5_table import Table, opened_table, same_length, write_tabl
 from etid.results.verdicts import RESULTS, message, verdict_names, verdicts_of
 
 SCHEMA = "etid/fits"
-# What a table says of each recording: its path, its labels, and numbers that describe it.
+# Columns that describe each recording: its path, its labels, and numbers.
 DESCRIBED = {"path": "text"} | {
     name: "text" if field.type == "label" else "number" for name, field in DESCRIBING.items()
 }
@@ -33,8 +33,8 @@ LABELS = tuple(name for name, kind in DESCRIBED.items() if kind == "text")
 def rrse(predicted: Float[Array, " time"], measured: Float[Array, " time"]) -> Float[Array, ""]:
     """Root relative squared error, sqrt(Σ (V − W)² / Σ (W − mean W)²)   (paper, eq. 3).
 
-    It does not see circuit error: 2.73 % is as common with a right C_p as with one that is 85 %
-    off. Judge by χ² and standard errors.
+    The RRSE does not show errors of the circuit: 2.73 % is as common with a correct C_p as with a
+    C_p that is wrong by 85 %. Judge a fit by χ² and the standard errors.
     """
     return jnp.sqrt(
         jnp.sum((predicted - measured) ** 2) / jnp.sum((measured - jnp.mean(measured)) ** 2)
@@ -46,7 +46,7 @@ def complex_rrse(
     measured: Complex[Array, " value"],
     used: Bool[Array, " value"] | bool = True,
 ) -> Float[Array, ""]:
-    """RRSE of harmonics or impedances that are used, from which no mean is to be taken."""
+    """RRSE of the harmonics or impedances that are used; their mean is not subtracted."""
     missed = jnp.sum(jnp.where(used, jnp.abs(measured - predicted) ** 2, 0.0))
     return jnp.sqrt(missed / jnp.sum(jnp.where(used, jnp.abs(measured) ** 2, 0.0)))
 
@@ -55,15 +55,15 @@ AND = " + "  # between the names of estimators
 
 
 def joined(methods: Sequence[str]) -> str:
-    """One name for a table of fits by several estimators: each of theirs once."""
+    """One name for fits by several estimators; it holds each estimator once."""
     return AND.join(sorted({name for method in methods for name in method.split(AND)}))
 
 
 class IdentificationError(RuntimeError):
-    """An identification did not end successfully.
+    """An identification was not successful.
 
     Attributes:
-        outcome: The fit or driver as far as it got.
+        outcome: The unsuccessful fit or driver; None if there is none.
     """
 
     def __init__(self, text: str, outcome: Any):
@@ -76,22 +76,21 @@ class Fit(eqx.Module):
 
     Attributes:
         circuit: Identified elements in SI units.
-        cov: Covariance of the elements, SI units; NaN where a method gives none. It does not
+        cov: Covariance of the elements in SI units; NaN if the method gives none. It does not
             contain the tolerance of the calibration resistor, which passes 1:1 into every
-            resistance.
-        shared_cov: The part of `cov` due to the driver, common to all fits made with it: a spread
-            between trials never shows it.
+            resistance. The fits of `identify_jointly` contain its `r_load_tolerance`.
+        shared_cov: The part of `cov` that comes from the driver. All fits with this driver share
+            it, so the spread between trials does not show it.
         rrse: Root relative squared error of V_out (paper, eq. 3).
-        chi2: Σ residual² / expected variance, per degree of freedom: 1 if the model is right.
+        chi2: Σ residual² / expected variance, per degree of freedom; 1 if the model is right.
         result: Verdict.
         steps: Iterations of the solver.
-        method: Name of the estimator, with the options that are not the default; of a batch all
-            names, with " + " between them.
-        remarks: What was done to the recording before the fit, `etid.recordings.remarks.Remark` as
-            integers.
-        change: Relative change during the record of each element and, last, of the amplitude: from
-            the first to the last period, or by the step that was seen. NaN where the record holds
-            less than two periods, None where it was not asked for.
+        method: Name of the estimator with the options that are not the default. A batch has all
+            names, joined by " + ".
+        remarks: Remarks on the recording, `etid.recordings.remarks.Remark` as integers.
+        change: Relative change of each element and, last, of the amplitude during the record: from
+            the first to the last period, or the size of the detected step. NaN if the record holds
+            less than two periods; None if no change was computed.
         change_stderr: Standard errors of `change`.
     """
 
@@ -109,7 +108,7 @@ class Fit(eqx.Module):
 
     @property
     def stderr(self) -> AbstractCircuit:
-        """Standard errors, in a circuit of the same kind."""
+        """Standard errors of the elements, as a circuit of the same kind."""
         variance = jnp.diagonal(jnp.asarray(self.cov), axis1=-2, axis2=-1)
         values = jnp.sqrt(jnp.where(variance >= 0, variance, jnp.nan))
         names = self.circuit.names()
@@ -117,13 +116,13 @@ class Fit(eqx.Module):
 
     @property
     def verdict(self) -> Any:
-        """Name of the verdict (an array of names for a batch)."""
+        """Name of the verdict; an array of names for a batch."""
         names = verdict_names(self.result)
         return names.item() if names.ndim == 0 else names
 
     @property
     def elements(self) -> tuple[str, ...]:
-        """Each element with its standard error and unit, as it is printed; for one fit."""
+        """Each element as text, with standard error and unit; for one fit."""
         return tuple(
             f"{name} {quantity(float(value), unit, float(error))}"
             for (name, unit), value, error in zip(
@@ -136,7 +135,7 @@ class Fit(eqx.Module):
 
     @property
     def changes(self) -> str:
-        """How each element and the amplitude changed during the record, in words; for one fit."""
+        """A sentence on the change of each element and of the amplitude; for one fit."""
         if self.change is None or self.change_stderr is None:
             return ""
         return "During the record: " + ", ".join(
@@ -171,7 +170,7 @@ def described(recordings: Sequence[Mapping[str, Any]]) -> dict[str, np.ndarray]:
     """The columns of `Fits.labels`.
 
     Args:
-        recordings: What is known of each: fields by name. A label that is missing is empty, a
+        recordings: Fields of each recording by name. A missing label becomes empty, a missing
             number NaN.
     """
     columns = {name: [one.get(name) for one in recordings] for name in DESCRIBED}
@@ -190,8 +189,8 @@ class Fits:
     Attributes:
         fit: The fits, batched along one leading axis, as numpy arrays.
         labels: `path`, `subject`, `condition`, `electrode` and `trial` of each recording, and
-            numbers that describe it.
-        notes: What went wrong in words, where something did; else empty.
+            numbers that describe the recording.
+        notes: A sentence for each fit that is not successful; empty for the others.
     """
 
     fit: Fit
@@ -215,10 +214,10 @@ class Fits:
         """The fits selected by an array.
 
         Args:
-            index: Places of the wanted fits, or for each fit whether it is wanted.
+            index: Indices of the fits, or a mask with one entry for each fit.
 
         Returns:
-            Those fits, in this order.
+            The selected fits, in the order of `index`.
         """
         return type(self)(
             jax.tree.map(lambda leaf: np.asarray(leaf)[index], self.fit),
@@ -228,13 +227,13 @@ class Fits:
 
     @classmethod
     def concatenate(cls, parts: Sequence["Fits"]) -> "Fits":
-        """One table of several.
+        """One table made of several.
 
         Args:
-            parts: Fits of circuits of one kind.
+            parts: Tables of fits of circuits of one kind.
 
         Returns:
-            All of them, in this order; the method names all of theirs.
+            All fits, in this order. The name of the method lists all their methods.
         """
         method = joined([part.fit.method for part in parts])
         fits = [dataclasses.replace(part.fit, method=method) for part in parts]
@@ -251,10 +250,10 @@ class Fits:
             **labels: `path`, `subject`, `condition`, `electrode` or `trial`.
 
         Returns:
-            Those fits, in their order.
+            The selected fits, in their order.
 
         Raises:
-            RecordingError: There is no such label, or its value is neither text nor an integer.
+            RecordingError: A label does not exist, or its value is neither text nor an integer.
         """
         chosen = np.ones(len(self), bool)
         for name, value in wanted_labels(labels, LABELS).items():
@@ -291,7 +290,7 @@ class Fits:
 
     @property
     def _changes(self) -> tuple[np.ndarray, np.ndarray]:
-        """Changes during the record and their standard errors; NaN where none was asked for."""
+        """Changes during the record and their standard errors; NaN if none were computed."""
         nothing = np.full((len(self), len(self.circuit.names()) + 1), np.nan)
         fit = self.fit
         if fit.change is None or fit.change_stderr is None:
@@ -311,21 +310,27 @@ class Fits:
         return pandas.DataFrame(self.table())
 
     def summary(self, *by: str) -> list[dict[str, Any]]:
-        """Medians of the successful fits and counts, per group of labels.
+        """Counts, and medians of the successful fits, for each group of labels.
 
-        Per element: `NAME` the median, `NAME_spread` the standard deviation between the recordings,
-        `NAME_stderr` the median standard error, and its two parts: `NAME_own`, the noise of the
-        recording, which the spread contains, and `NAME_shared`, which no spread shows because all
-        recordings with one driver have it in common. What really varies between the recordings is
-        `NAME_between`, sqrt(spread² − mean own²), or 0. The mean is what noise adds to spread², and
-        where some recordings are noisier than others not the square of the median.
+        Each element has these keys:
+
+        - `NAME`: the median.
+        - `NAME_spread`: the standard deviation between the recordings.
+        - `NAME_stderr`: the median standard error.
+        - `NAME_own`: the part of the standard error from the noise of the recording. The spread
+          contains it.
+        - `NAME_shared`: the part that all recordings with one driver share. The spread does not
+          contain it.
+        - `NAME_between`: the variation between the recordings without noise,
+          sqrt(spread² − mean own²), or 0. Noise adds the mean of own² to spread². If some
+          recordings are noisier than others, this mean differs from the square of the median.
 
         Args:
-            *by: Labels that make the groups; without one all fits are one group.
+            *by: Labels that define the groups. Without a label, all fits are one group.
 
         Returns:
-            A row for each group, in the order of its labels; numbers in SI units, NaN without any
-            success.
+            A row for each group, sorted by the labels. Numbers are in SI units; they are NaN if the
+            group has no successful fit.
         """
         columns = [map(str, self.labels[name].tolist()) for name in by]
         keys = list(zip(*columns, strict=True)) if by else [()] * len(self)
@@ -375,7 +380,7 @@ class Fits:
         return "\n".join(lines)
 
     def as_table(self) -> tuple[dict[str, np.ndarray], dict[str, str], dict[str, Any]]:
-        """Columns, their units and the attributes of the file that `write` writes."""
+        """Columns of the file that `write` makes, their units, and its attributes."""
         units = self.circuit.units()
         units |= {f"{name}_stderr": unit for name, unit in units.items()}
         units |= {name: field.unit for name, field in DESCRIBING.items() if field.unit}
@@ -392,7 +397,7 @@ class Fits:
         return columns, units, attributes
 
     def write(self, path: str | os.PathLike[str]) -> None:
-        """Write the table, the covariances and how they were made to an HDF5 file."""
+        """Write the table, the covariances, the method and the version of etid to an HDF5 file."""
         columns, units, attributes = self.as_table()
         write_table(path, columns, units=units, attributes=attributes)
 
@@ -404,21 +409,21 @@ class Fits:
 
         Args:
             path: The file.
-            circuit: The kind of circuit. It need not be given if its module has been imported.
+            circuit: The class of the circuit. It can be left out if its module is imported.
 
         Raises:
-            RecordingError: The file is not a file of fits, or holds those of another circuit than
-                `circuit`, or of one that is neither given nor imported: a file imports nothing.
+            RecordingError: The file is not a file of fits, or its circuit is not `circuit`, or
+                its circuit is neither given nor imported. Reading a file never imports a module.
         """
         with opened_table(path, SCHEMA) as table:
             return cls.of_table(table, circuit)
 
     @classmethod
     def of_table(cls, table: Table, circuit: type[AbstractCircuit] | None) -> "Fits":
-        """What `read` makes of an open file.
+        """The fits of an open file; `read` calls this.
 
         Raises:
-            RecordingError: A column or an attribute is missing, or not what it should be.
+            RecordingError: A column or an attribute is missing or invalid.
         """
         kind = _circuit(table, circuit)
         size = len(kind.names())
@@ -455,7 +460,7 @@ class Fits:
 
 
 def _circuit(table: Table, given: type[AbstractCircuit] | None) -> type[AbstractCircuit]:
-    """The kind of circuit whose fits a file holds. What the file says imports nothing."""
+    """The class of the circuits in a file. The file cannot make etid import a module."""
     stored = table.text("circuit")
     try:
         kind = remembered(stored, given)
@@ -503,7 +508,7 @@ def _remarks(table: Table, texts: np.ndarray) -> np.ndarray:
 
 
 def _changes_of(read: Mapping[str, np.ndarray], names: Sequence[str]) -> dict[str, np.ndarray]:
-    """The changes of a file of fits; none before schema version 1.2."""
+    """The changes in a file of fits; empty for files before schema version 1.2."""
     if "change_stderr" not in read:
         return {}
     change = np.stack([read[name].astype(float) for name in names], axis=1)

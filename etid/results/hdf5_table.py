@@ -1,4 +1,4 @@
-"""Tables in HDF5: named columns with units, written whole or not at all."""
+"""Tables in HDF5: named columns with units, written completely or not at all."""
 
 import contextlib
 import os
@@ -21,12 +21,12 @@ def write_table(
     units: Mapping[str, str],
     attributes: Mapping[str, Any],
 ) -> None:
-    """Write columns to an HDF5 file, replacing it only when everything is on disk.
+    """Write columns to an HDF5 file. An old file is replaced only when all data are on disk.
 
     Args:
         path: The file.
-        columns: Arrays of one length along their first axis; text is stored as UTF-8.
-        units: SI units of columns that have one, stored as their attribute `unit`.
+        columns: Arrays of equal length along their first axis. Text is stored as UTF-8.
+        units: SI units of the columns that have one. They are stored as attribute `unit`.
         attributes: Attributes of the file.
     """
     with replacing(path) as partial, h5py.File(partial, "w") as file:
@@ -40,10 +40,10 @@ def write_table(
 
 
 class Table:
-    """A file of columns, none of them read yet.
+    """An open file of columns; a column is read on request.
 
-    What is wrong with it is one error, which names the file, the column or attribute, and what to
-    do.
+    Every fault of the file is one error. It names the file, the column or attribute, and the
+    remedy.
     """
 
     def __init__(self, file: h5py.File, name: str):
@@ -54,10 +54,10 @@ class Table:
         return RecordingError(message, file=self.name, field=field, remedy=_REMEDY)
 
     def text(self, name: str) -> str:
-        """An attribute that is a text.
+        """An attribute that is text.
 
         Raises:
-            RecordingError: It is missing, or something else.
+            RecordingError: The attribute is missing or is not text.
         """
         value = self.attribute(name)
         if not isinstance(value, str):
@@ -65,10 +65,10 @@ class Table:
         return value
 
     def attribute(self, name: str) -> Any:
-        """An attribute as plain Python: a number, a text, or a list of them.
+        """An attribute as a Python value: a number, text, or a list of these.
 
         Raises:
-            RecordingError: It is missing, cannot be read, or of another type.
+            RecordingError: The attribute is missing, cannot be read, or has another type.
         """
         with translated(self.name, field=name):
             if name not in self.file.attrs:
@@ -94,15 +94,15 @@ class Table:
             return name in self.file
 
     def column(self, name: str, kind: str, shape: tuple[int, ...] = ()) -> h5py.Dataset:
-        """A column, once its header says that it can be read.
+        """A column whose header is valid; its data are not read.
 
         Args:
-            name: Its name.
+            name: Name of the column.
             kind: `text`, `number` or `integer`.
-            shape: Its dimensions behind the first.
+            shape: Sizes of its dimensions after the first.
 
         Raises:
-            RecordingError: It is missing, of another kind or shape, or declares too much.
+            RecordingError: The column is missing, has another kind or shape, or is too large.
         """
         with translated(self.name, field=name):
             if name not in self.file:
@@ -131,7 +131,7 @@ class Table:
         return column
 
     def read(self, column: h5py.Dataset, rows: Any = ()) -> np.ndarray:
-        """Some rows of a column, or all.
+        """Some or all rows of a column.
 
         Raises:
             RecordingError: The file is damaged.
@@ -146,14 +146,14 @@ _REMEDY = "Fit the recordings again"
 
 @contextlib.contextmanager
 def opened_table(path: str | os.PathLike[str], kind: str) -> Iterator[Table]:
-    """A file of columns.
+    """Open a file of columns.
 
     Args:
         path: The file.
-        kind: What its attribute `schema` must say.
+        kind: Value that the attribute `schema` must have.
 
     Raises:
-        RecordingError: The file is missing, no HDF5, or of another kind.
+        RecordingError: The file is missing, is not HDF5, or has another schema.
     """
     name = os.fspath(path)
     with guarded(name) as file:
@@ -167,10 +167,10 @@ def opened_table(path: str | os.PathLike[str], kind: str) -> Iterator[Table]:
 
 
 def same_length(table: Table, columns: Mapping[str, np.ndarray | h5py.Dataset]) -> int:
-    """How many rows all these columns have.
+    """Number of rows of these columns.
 
     Raises:
-        RecordingError: They differ.
+        RecordingError: The numbers of rows differ.
     """
     sizes = {name: column.shape[0] for name, column in columns.items()}
     first = next(iter(sizes.values()), 0)

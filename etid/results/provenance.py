@@ -1,4 +1,4 @@
-"""With what fits were made: all that a methods section has to say and a file has to remember."""
+"""Settings of a run: the facts that a methods section needs and that a file of fits stores."""
 
 import dataclasses
 import importlib.metadata
@@ -15,21 +15,22 @@ PACKAGES = ("etid", "jax", "jaxlib", "optimistix", "equinox", "numpy")
 
 @dataclasses.dataclass(frozen=True)
 class Settings:
-    """With what fits were made. There is no date in it: equal runs have equal settings.
+    """Settings of a run. They hold no date, so that equal runs have equal settings.
 
     Attributes:
         source: Absolute path of the file of recordings; empty if they were in memory.
-        source_size: Its size [byte], by which another file of that name is told; 0 in memory.
-        recordings: How many there were to identify.
-        asked_method: The method that was asked for; empty if each recording chose its own.
+        source_size: Size of the file [byte], which detects another file of the same name; 0 if
+            the recordings were in memory.
+        recordings: Number of recordings to identify.
+        asked_method: The method that the user chose; empty if etid chose it for each recording.
         order: Number of poles of Z_th.
-        start: Typical values of the elements [SI], where fits may start.
-        r_load_tolerance: Relative standard deviation of the known resistors that is in the
-            standard errors.
+        start: Typical values of the elements [SI]; fits start around them.
+        r_load_tolerance: Relative standard deviation of the known resistors that is included in
+            the standard errors.
         driver_drift: As in `identify_driver`.
-        precision: Floating-point numbers computed with.
-        backend: What JAX computed on.
-        versions: Packages and their versions, as `"jax 0.10.2"`.
+        precision: Floating-point type of the computation.
+        backend: Backend of JAX, such as `"cpu"`.
+        versions: Packages and their versions, such as `"jax 0.10.2"`.
     """
 
     source: str
@@ -58,10 +59,10 @@ class Settings:
         """The settings of a run in this process.
 
         Args:
-            study: Its recordings.
-            count: How many of them are to be identified.
+            study: The recordings.
+            count: Number of recordings to identify.
             order: As in `identify_driver`.
-            method: Name of the estimator that was asked for; empty if none was.
+            method: Name of the estimator that the user chose; empty if none.
             circuit: As in `identify_skin`.
             r_load_tolerance: As in `identify_jointly`.
             driver_drift: As in `identify_driver`.

@@ -1,7 +1,7 @@
-"""What the identification of a study came to, in memory and in a file of fits.
+"""Results of the identification of a study, in memory and in a file of fits.
 
-The file is that of `etid.Fits` with two additions, which readers of fits alone do not notice: the
-settings as attributes of the file, and a dataset `drivers` with one line of JSON for each driver.
+The file is a file of `etid.Fits` with two additions: the settings as attributes of the file, and a
+dataset `drivers` with one line of JSON for each driver. `etid.Fits.read` ignores both.
 """
 
 import dataclasses
@@ -34,22 +34,23 @@ from etid.results.hdf5_table import Table, opened_table, write_table
 from etid.results.provenance import Settings
 from etid.results.verdicts import verdicts_of
 
-# What a line of JSON that was damaged may raise on its way to a driver.
+# Errors that a damaged line of JSON may raise.
 _DAMAGED = (ValueError, TypeError, AttributeError, KeyError, OverflowError, RecursionError)
 _SETTINGS = {field.name: field.type for field in dataclasses.fields(Settings)}
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class StudyFits:
-    """What `identify_study`, `identify_jointly` and `fit_file` return, and what their file holds.
+    """Fits and drivers of a study, from `identify_study`, `identify_jointly`, `fit_file` or a file.
 
     Attributes:
-        fits: One fit per loaded recording.
-        drivers: The drivers, by the paths of their calibrations. Those from a file predict and have
-            standard errors, but hold no harmonics of their calibrations: they serve output error,
-            not maximum likelihood.
-        failures: Why a driver could not be identified, by the paths of its calibrations.
-        settings: With what they were made; None if the file does not say.
+        fits: One fit for each loaded recording.
+        drivers: The drivers. The keys are the paths of their calibrations. Drivers from a file can
+            predict and have standard errors. They hold no harmonics of their calibrations, so they
+            can be used with output error, not with maximum likelihood.
+        failures: Reasons why a driver could not be identified. The keys are the paths of its
+            calibrations.
+        settings: Settings of the run; None if the file does not hold them.
     """
 
     fits: Fits
@@ -59,7 +60,7 @@ class StudyFits:
 
     @classmethod
     def concatenate(cls, parts: Iterable["StudyFits"]) -> "StudyFits":
-        """One of several parts of a study, which were made with equal settings."""
+        """One result from the parts of a study. All parts must have equal settings."""
         found = list(parts)
         drivers = {paths: driver for part in found for paths, driver in part.drivers.items()}
         failures = {paths: text for part in found for paths, text in part.failures.items()}
@@ -69,7 +70,7 @@ class StudyFits:
     def write(self, path: str | os.PathLike[str]) -> None:
         """Write the fits, the drivers and the settings to an HDF5 file.
 
-        `etid.Fits.read` and `StudyFits.read` both read it.
+        `etid.Fits.read` and `StudyFits.read` can both read this file.
         """
         columns, units, attributes = self.fits.as_table()
         lines = [_to_json(paths, driver) for paths, driver in self.drivers.items()]
@@ -89,7 +90,7 @@ class StudyFits:
     def read(
         cls, path: str | os.PathLike[str], circuit: type[AbstractCircuit] | None = None
     ) -> "StudyFits":
-        """Read a file of fits; what an older one does not hold is empty.
+        """Read a file of fits. Fields that an older file does not have are empty.
 
         Args:
             path: The file.
@@ -127,7 +128,7 @@ def _settings(table: Table) -> Settings | None:
     values: dict[str, Any] = {}
     for name, kind in _SETTINGS.items():
         value = table.attribute(name)
-        several = typing.get_args(kind)  # of a tuple; a single one is stored as such, or as a list
+        several = typing.get_args(kind)  # only tuples; the file stores them as a list or one item
         items = value if several and isinstance(value, list) else [value]
         wanted: Any = several[0] if several else kind
         known = (int, float) if wanted is float else wanted
@@ -143,10 +144,10 @@ def _settings(table: Table) -> Settings | None:
 
 
 def _of_line(line: str) -> tuple[tuple[str, ...], Driver | str]:
-    """Paths of the calibrations, and the driver or why there is none.
+    """Paths of the calibrations, and the driver or the reason why there is none.
 
     Raises:
-        ValueError, TypeError, KeyError, OverflowError, RecursionError: It is no such line.
+        ValueError, TypeError, KeyError, OverflowError, RecursionError: The line is damaged.
     """
     stored = json.loads(line)
     paths = stored["calibrations"]
@@ -191,10 +192,10 @@ def _to_json(paths: tuple[str, ...], driver: Driver) -> str:
 
 
 def _from_json(stored: Mapping[str, Any]) -> Driver:
-    """A driver from what `_to_json` has made of it; the harmonics of calibrations are not kept.
+    """A driver from the result of `_to_json`, which does not hold harmonics of calibrations.
 
     Raises:
-        ValueError, TypeError, KeyError, OverflowError: It is something else.
+        ValueError, TypeError, KeyError, OverflowError: The line is damaged.
     """
     if not all(isinstance(stored[name], str) for name in ("method", "verdict")):
         raise TypeError("method and verdict must be texts")
@@ -216,7 +217,7 @@ def _from_json(stored: Mapping[str, Any]) -> Driver:
 
 
 def _continuous(stored: Mapping[str, Any]) -> Callable[..., ContinuousDriver]:
-    """`ContinuousDriver` with the fields that a discrete driver lacks."""
+    """`ContinuousDriver` with the fields that a discrete driver does not have."""
     own = stored["source"]
     pairs = len(_numbers(own, "log_omega", 1))
     reals = len(_numbers(own, "log_omega_real", 1))
@@ -242,7 +243,7 @@ def _continuous(stored: Mapping[str, Any]) -> Callable[..., ContinuousDriver]:
 def _numbers(
     stored: Mapping[str, Any], name: str, dimensions: int, shape: tuple[int, ...] | None = None
 ) -> Array:
-    """Numbers of a shape, or of a number of dimensions."""
+    """A field as an array of numbers; its dimensions and its shape, if given, are checked."""
     found = np.asarray(stored[name])
     if found.dtype.kind not in "iuf" or found.ndim != dimensions:
         raise TypeError(f"{name} is {reprlib.repr(stored[name])}")

@@ -1,7 +1,7 @@
-"""Verdicts: how an identification ended, in words, for every lane.
+"""Verdicts: the outcome of an identification, for each lane.
 
-`RESULTS` extends `optimistix.RESULTS`. A member is an integer under `jit` and prints as its
-message: the cause, then what to do.
+`RESULTS` extends `optimistix.RESULTS`. A member is an integer under `jit`. It prints as a message:
+the cause, then the remedy.
 """
 
 import jax
@@ -11,20 +11,20 @@ from jaxtyping import Array, Bool
 
 
 class RESULTS(optx.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]  # equinox enumerations extend by inheritance
-    """How one identification ended. `successful` is the only good one.
+    """Outcome of one identification. Only `successful` means that the result can be used.
 
     Three members come from optimistix and lineax: `successful`, `max_steps_reached` (the iteration
-    did not settle) and `nonfinite` (inf or NaN appeared during the fit).
+    did not converge) and `nonfinite` (inf or NaN appeared during the fit).
     """
 
     unstable = (
-        "The identified filters are unstable with this load, so the voltage cannot be predicted. "
+        "The identified filters are unstable with this load: they cannot predict the voltage. "
         "Use method='output_error', or repeat the calibration with less noise."
     )
     nonphysical = (
         "An element is negative or not a number, an exponent exceeds 1 by more than its error, or "
         "the source impedance is not passive. "
-        "The record is too noisy for this method, the trigger moved between the records, or "
+        "The record is too noisy for this method, or the trigger moved between the records, or "
         "v_th, v_out and r_load do not belong together."
     )
     insensitive = (
@@ -32,27 +32,27 @@ class RESULTS(optx.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]  # equi
         "Record more periods, reduce the noise, or fit a simpler circuit."
     )
     resolution = (
-        "The converter's steps are too coarse: with their rounding error, the standard error of a "
-        "parameter exceeds its value. Use a finer range, more bits, or an amplifier."
+        "The steps of the converter are too coarse: with their rounding error, the standard error "
+        "of a parameter exceeds its value. Use a finer range, more bits, or an amplifier."
     )
     misfit = (
-        "The prediction misses the recording by far more than its noise (chi2), or in the way of "
-        "another relaxation, or of one that is spread over time constants. The circuit is wrong, "
-        "the trigger moved between the records, the signal drifted or clipped, or output error met "
-        "mains hum."
+        "The prediction misses the recording by far more than its noise (chi2), or the residual "
+        "looks like one more relaxation, or like a relaxation that is spread over time constants. "
+        "The circuit is wrong, or the trigger moved between the records, or the signal drifted or "
+        "clipped, or the method is output error and the record has mains hum."
     )
     changed = (
-        "The load or the driver changed during the record: its pulse periods differ by more than "
-        "noise, in the way of an element or of the amplitude. Record shorter, or cut the record to "
-        "a part in which nothing changes."
+        "The load or the driver changed during the record: the pulse periods differ by more than "
+        "noise, as if an element or the amplitude changed. Make a shorter record, or cut the "
+        "record to a part in which nothing changes."
     )
     order_too_low = (
-        "The calibrations show a pole of the source impedance that the driver lacks. Raise `order` "
-        "by one or two."
+        "The calibrations show a pole of the source impedance that the driver does not have. Raise "
+        "`order` by one or two."
     )
     resistors_disagree = (
         "The calibrations with different known resistors show different source impedances. One "
-        "r_load is wrong, or belongs to another record; print the driver to see which may be. "
+        "r_load is wrong, or belongs to another record; print the driver to see which one. "
         "Measure the resistors, and give every r_load in ohm."
     )
     implausible = (
@@ -60,23 +60,23 @@ class RESULTS(optx.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]  # equi
         "resistor connected? If the driver really is like this, set `plausible` [ohm]."
     )
     unconnected = (
-        "v_out equals v_th to within their noise: nothing is connected that draws a current, or "
-        "both are the same record. Check the contact and the channels."
+        "v_out equals v_th within the noise: no load draws a current, or both are the same record. "
+        "Check the contact and the channels."
     )
     inconsistent = (
         "The recording and the calibrations contradict each other about the source impedance, or "
         "their unloaded voltages differ by more than amplitude and delay. "
-        "The driver changed in between, or r_load is not what it is said to be. Calibrate again."
+        "The driver changed in between, or r_load is wrong. Calibrate again."
     )
     driver_unclear = (
-        "The calibrations are so noisy that this recording moves the source impedance further than "
-        "they can be followed. Repeat them with less noise, more periods or a second resistor, or "
-        "identify all recordings together with identify_jointly."
+        "The calibrations are too noisy: this recording moves the source impedance further than "
+        "the fit can follow them. Repeat the calibrations with less noise, more periods or a "
+        "second resistor, or identify all recordings together with identify_jointly."
     )
     biased = (
-        "Noise has shifted the estimate by several standard errors: Steiglitz-McBride from the "
-        "minimum of its own model, a non-parametric fit from what it would be without noise. Or "
-        "the sample rate is too low for the interpolation of output error, which misses the "
+        "Noise has shifted the estimate by several standard errors: with Steiglitz-McBride from "
+        "the minimum of its own model, with a non-parametric fit from the estimate without noise. "
+        "Or the sample rate is too low for the interpolation of output error, which misses the "
         "recording by more than its noise. Use the default method."
     )
     flat = "A record carries no signal above its noise. Check the contact and the channel."
@@ -88,8 +88,8 @@ class RESULTS(optx.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]  # equi
         "Swap the two records, or align them on the edge of the pulse."
     )
     rate_mismatch = (
-        "The pulses of v_th are not as far apart as sample_rate and pulse_rate say, and every time "
-        "constant would be wrong by that. Correct the number that is wrong."
+        "The distance between the pulses of v_th contradicts sample_rate and pulse_rate. Every "
+        "time constant would be wrong by the same factor. Correct the wrong number."
     )
     not_periodic = (
         "The record holds no whole pulse period, or begins in the middle of an edge. "
@@ -97,15 +97,15 @@ class RESULTS(optx.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]  # equi
     )
     unreadable = "The recording could not be read from its file; `etid check` says why."
     driver_failed = (
-        "The driver this fit rests on was not identified successfully; its own verdict says why. "
-        "Repeat the calibration before trusting the elements."
+        "The driver of this fit was not identified successfully; its own verdict says why. "
+        "Repeat the calibration before you use the elements."
     )
 
 
-# lineax' own text advises an argument that etid does not have.
+# The text of lineax recommends an argument that etid does not have.
 _MESSAGES = {
     "max_steps_reached": (
-        "The iteration did not settle; its best iterate is reported. "
+        "The iteration did not converge; the fit reports the best iterate. "
         "Average more periods, or use method='output_error'."
     ),
 }
@@ -113,12 +113,12 @@ _NAMES = {int(item._value): name for name, item in RESULTS._name_to_item.items()
 
 
 def verdict(name: str) -> RESULTS:
-    """The verdict of this name."""
+    """The verdict with this name."""
     return RESULTS._name_to_item[name]
 
 
 def first_verdict(*conditions: tuple[Bool[Array, ""], RESULTS]) -> RESULTS:
-    """The first verdict whose condition holds, else successful."""
+    """The first verdict whose condition is true, else `successful`."""
     result = verdict("successful")
     for condition, item in reversed(conditions):
         result = RESULTS.where(condition, item, result)
@@ -126,13 +126,13 @@ def first_verdict(*conditions: tuple[Bool[Array, ""], RESULTS]) -> RESULTS:
 
 
 def verdict_names(result: RESULTS) -> np.ndarray:
-    """Names of the verdicts of all lanes, as an array of strings with the lanes' shape."""
+    """Names of the verdicts of all lanes, as an array of strings of the same shape."""
     values = np.asarray(result._value)
     return np.vectorize(_NAMES.__getitem__, otypes=[object])(values).astype(str)
 
 
 def verdicts_of(names: np.ndarray) -> RESULTS:
-    """The verdicts of many lanes from their names; the inverse of `verdict_names`."""
+    """The verdicts of many lanes from their names: the inverse of `verdict_names`."""
     item = RESULTS.successful
     values = [int(verdict(str(name))._value) for name in np.ravel(names)]
     leaves, tree = jax.tree.flatten(item)
@@ -140,5 +140,5 @@ def verdicts_of(names: np.ndarray) -> RESULTS:
 
 
 def message(name: str) -> str:
-    """What a verdict means and what to do; empty for `successful`."""
+    """Meaning and remedy of a verdict; empty for `successful`."""
     return _MESSAGES.get(name, RESULTS[RESULTS._name_to_item[name]])
