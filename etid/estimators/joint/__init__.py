@@ -1,1 +1,1 @@
-"""Joint maximum likelihood of many loads that share one driver: terms, fit and errors."""
+"""Joint maximum likelihood of many loads with one driver: terms, fit and standard errors."""

@@ -1,13 +1,13 @@
-"""Standard errors of many loads with one driver: each load's own, and what all have in common.
+"""Standard errors of many loads with one driver: the own part of each load, and the shared part.
 
     cov = H⁻¹ (Jᵀ C J) H⁻¹
 
-of `etid.estimators.maximum_likelihood.terms`, without the own parameters for `common`; a load
-inherits K cov Kᵀ with its slope K = −A⁻¹ B.
+is that of `etid.estimators.maximum_likelihood.terms`. For `common` the own parameters of the loads
+are eliminated. A load inherits K cov Kᵀ with its slope K = −A⁻¹ B.
 
-**One unloaded record in several loads** is one noise of X in all of them. The fit takes them as
-independent, its errors do not: what unit noise in X does to the terms of every load is followed
-through to `common` and to each load, and adds up before it is squared.
+**One unloaded record in several loads** has the same noise of X in all of them. The fit takes the
+loads as independent, but the standard errors do not. The effect of unit noise in X on the terms of
+all loads is propagated to `common` and to each load. The effects are added before they are squared.
 """
 
 from collections.abc import Sequence
@@ -36,13 +36,13 @@ from etid.solvers.matrices import inverse
 
 
 class _Eliminated(eqx.Module):
-    """A load without its own parameters.
+    """A load whose own parameters are eliminated.
 
     Attributes:
-        rest: What it tells of `common`.
-        cov: Covariance of its own parameters at a given `common`.
-        slope: How its minimum depends on `common`.
-        bread: Inverse of its own curvature.
+        rest: Curvature over `common` that remains.
+        cov: Covariance of the own parameters at a given `common`.
+        slope: Derivative of the minimum over the own parameters with respect to `common`.
+        bread: Inverse of the curvature over the own parameters.
     """
 
     rest: Curvature
@@ -52,7 +52,7 @@ class _Eliminated(eqx.Module):
 
 
 def _without_own(of: Curvature, common: int) -> _Eliminated:
-    """Eliminate a load's own parameters, which come after the `common` ones."""
+    """Eliminate the own parameters of a load, which follow the `common` ones."""
     bread = inverse(of.expected[common:, common:])
     slope = -bread @ of.expected[common:, :common]
     cov = bread @ of.score[common:, common:] @ bread
@@ -66,16 +66,17 @@ def estimates(
     several: Sequence[int],
     solution: optx.Solution,
 ) -> tuple[Float[Array, "common common"], list[tuple[Estimate, Bool[Array, " load"]]]]:
-    """Covariance of `common`, and of each group the estimates with theirs.
+    """Covariance of `common`, and the estimates of each group with their covariances.
 
-    And whether a load is seen to be another circuit (`etid.estimators.score_tests.other_circuit`).
+    For each load it also returns whether the data show another circuit
+    (`etid.estimators.score_tests.other_circuit`).
 
     Args:
         study: Calibrations and loads.
         common: Common parameters at the minimum.
-        fitted: What was unknown of the loads of each group, and how their solvers ended.
-        several: In each group, how many unloaded records several loads have.
-        solution: How the joint solver ended.
+        fitted: Unknowns of the loads of each group, and the results of their solvers.
+        several: Number of unloaded records in each group that several loads share.
+        solution: Solution of the joint solver.
     """
     groups, model = study.groups, study.model
     owns = [own for own, _ in fitted]
@@ -154,7 +155,7 @@ def _misfit(study: DriverStudy, load: Loads, common, own):
 def _is_another(
     study: DriverStudy, load: Loads, common, own, eliminated: _Eliminated, bread, score
 ) -> Bool[Array, ""]:
-    """The score test on one load; `bread` and `score` are those of `common` by all terms."""
+    """Score test of one load; `bread` and `score` are those of `common` from all terms."""
     linear = _linear(study, load, common, own)
     rows = _by_changes(study, load, common, own)
     terms = study.of_load(load, common, own)
@@ -167,19 +168,19 @@ def _is_another(
     )
     spread = jnp.zeros_like(covariance).at[: bread.shape[0], : bread.shape[0]]
     found = other_circuit.scores(
-        jnp.pad(rows, ((0, 0), (0, 1))),  # no change has an effect on the prior of the delay
+        jnp.pad(rows, ((0, 0), (0, 1))),  # no change affects the prior of the delay
         linear,
         terms,
-        -linear.jacobian @ terms,  # at the minimum all other terms have the opposite gradient
+        -linear.jacobian @ terms,  # at the minimum the other terms have the opposite gradient
         spread.set(score - eliminated.rest.score),
         covariance,
         slice(common.size, common.size + own.log_elements.size),
     )
-    return found.seen() & load.used  # what takes no part has a verdict of its own
+    return found.seen() & load.used  # a load that takes no part has its own verdict
 
 
 def _by_changes(study: DriverStudy, load: Loads, common, own) -> Float[Array, "change part"]:
-    """Derivatives of a load's denoised terms by the changes of its circuit."""
+    """Derivatives of the denoised terms of a load with respect to changes of its circuit."""
     model, f = study.model, load.spectrum.frequency
     g = model.gain(own, common, load.spectrum, load.sample_rate)
     z, changes = other_circuit.changes(
@@ -198,7 +199,7 @@ def _by_changes(study: DriverStudy, load: Loads, common, own) -> Float[Array, "c
 
 
 def _linear(study: DriverStudy, load: Loads, common, own) -> Linear:
-    """A load's terms around their minimum, by (common, own)."""
+    """Terms of a load, linear in (common, own) around their minimum."""
     model, c = study.model, common.shape[0]
     gains = [
         *model.calibrations.gains(common),
@@ -216,18 +217,19 @@ def _linear(study: DriverStudy, load: Loads, common, own) -> Linear:
 
 
 def _eliminated(study: DriverStudy, load: Loads, common, own) -> _Eliminated:
+    """A load whose own parameters are eliminated."""
     return _without_own(_linear(study, load, common, own).curvature(), common.shape[0])
 
 
 # --- Loads with one unloaded record --------------------------------------------------------------
 #
-# The noise of V_th is one noise in all of them. They are fitted as if it were not; but their errors
-# are those of correlated terms: the part of a term that is noise of X, two unit numbers for each
-# harmonic, is followed through to `common` and to every load.
+# All of them have the same noise of V_th. The fit ignores this, but the standard errors account for
+# the correlation of the terms. The noise of X has two unit numbers for each harmonic. Their effect
+# on the terms is propagated to `common` and to every load.
 
 
 def _influence(study: DriverStudy, common, load: Loads, own, eliminated: _Eliminated):
-    """What unit noise in the parts of X adds to the score of `common`, and to the load's own."""
+    """Effect of unit noise in X on the score of `common`, and on the own parameters."""
     jacobian = _linear(study, load, common, own).jacobian.T
     known = study.model.informed(load.spectrum, common, study.model.calibrations.records)
     g = study.model.gain(own, common, load.spectrum, load.sample_rate)
@@ -245,7 +247,10 @@ def _influence(study: DriverStudy, common, load: Loads, own, eliminated: _Elimin
 
 
 def _sums(study: DriverStudy, common, loads: Loads, owns, found: _Eliminated, records: int):
-    """What each shared record adds to the score of `common` over its loads, and so to its cov."""
+    """Sum of the effects of each shared record on the score of `common`.
+
+    The second result is the covariance of the score that this correlation adds.
+    """
     c = common.shape[0]
     start = (jnp.zeros((records, 2 * loads.spectrum.x.shape[1], c)), jnp.zeros((c, c)))
     if not records:
@@ -263,9 +268,10 @@ def _sums(study: DriverStudy, common, loads: Loads, owns, found: _Eliminated, re
 
 
 def _by_x(study: DriverStudy, common, load: Loads, own, eliminated: _Eliminated, sums):
-    """What a shared X adds to the covariance of a load's own parameters.
+    """Covariance of the own parameters of a load by the noise of a shared X.
 
-    And their covariance with what it adds to the score of `common` by the other loads.
+    The second result is their covariance with the effect of this noise on the score of `common`
+    through the other loads.
     """
     mine, of_own = _influence(study, common, load, own, eliminated)
     others = sums[load.unloaded] - jnp.where(load.used, mine, 0.0)

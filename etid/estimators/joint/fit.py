@@ -1,7 +1,7 @@
-"""One driver, many loads: a joint maximum-likelihood fit whose cost is linear in the loads.
+"""Joint maximum-likelihood fit of one driver and many loads; its time is linear in the loads.
 
-The normal equations are an arrowhead (`etid.solvers.arrowhead`; Pintelon and Schoukens, System
-Identification, 2012, ch. 9), of which a few loads at a time are evaluated side by side.
+The matrix of the normal equations is an arrowhead (`etid.solvers.arrowhead`; Pintelon and
+Schoukens, System Identification, 2012, ch. 9). A few loads at a time are evaluated in parallel.
 """
 
 import math
@@ -29,13 +29,13 @@ from etid.solvers.levenberg_marquardt import (
     second_order,
 )
 
-NEAR = 0.05  # standard errors of all parameters together from their minimum
+NEAR = 0.05  # distance of all parameters together from their minimum [standard errors]
 
 
 def _around(
     study: DriverStudy, common: Float[Array, " common"], loads: Loads, slopes: bool = True
 ) -> GivenDriver:
-    """The driver with these parameters, and how they move it, for a group of loads."""
+    """The driver with these parameters, and its derivatives, for a group of loads."""
     model, frequency = study.model, loads.spectrum.frequency[0]
     unit = jnp.eye(common.size)[:, : common.size if slopes else 0]
     zero = jnp.zeros(unit.shape[1])
@@ -43,12 +43,13 @@ def _around(
 
 
 def _lane(study: DriverStudy, driver: GivenDriver, load: Loads) -> Load:
+    """One load with the data that its terms need."""
     spectrum, unloaded = driver.informed(load.spectrum)
     return Load(driver, study.model.circuit, spectrum, unloaded, load.sample_rate)
 
 
 def _in_turn(one: Callable, *lanes: Any) -> Any:
-    """`one` over the leading axis of `lanes`: `Load` is made for one at a time on a processor."""
+    """`one` over the leading axis of `lanes`; on a CPU one after the other, as `Load` expects."""
     if jax.default_backend() == "cpu":
         return jax.lax.map(lambda lane: one(*lane), lanes)
     return over(one, *lanes)
@@ -92,12 +93,13 @@ def _equations(_, y: Float[Array, " parameter"], study: DriverStudy) -> Arrowhea
 
 
 def _empty(y: Float[Array, " parameter"], study: DriverStudy) -> ArrowheadEquations:
+    """Normal equations of the same shapes with zeros."""
     shapes = jax.eval_shape(lambda: _equations(None, y, study))
     return jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
 
 
 def _second_order(_, y, step, study: DriverStudy) -> Float[Array, " parameter"]:
-    """Jᵀ r″ of a study, load by load; r″ by differences, as `levenberg_marquardt.second_order`."""
+    """Jᵀ r″ of a study, load by load; r″ as in `levenberg_marquardt.second_order`."""
     (common, parts), (towards, steps) = study.split(y), study.split(step)
 
     def of_group(loads, owns, steps):
@@ -111,7 +113,7 @@ def _second_order(_, y, step, study: DriverStudy) -> Float[Array, " parameter"]:
             lane = _lane(study, driver, load)
             own, step = own.vector(), step.vector()
             _, jacobian = lane.jacobian(jnp.concatenate([own, driver.mean]))
-            count = jacobian.shape[1]  # of the terms that are not linear
+            count = jacobian.shape[1]  # number of the terms that are not linear
             bent = sum(_lane(study, end, load)(own + h * step)[:count] for h, end in ends)
             bent = (bent - 2 * lane(own)[:count]) / DIFFERENCE**2
             return jnp.where(load.used, jacobian @ bent, 0.0)
@@ -134,18 +136,17 @@ def fit(
     """Identify all loads and their driver.
 
     Args:
-        model: Calibrations, kind of circuit, and the driver to start from.
+        model: Calibrations, structure of the circuit, and the driver as start.
         groups: The recordings, one group for each length.
-        several: In each group, how many unloaded records several loads have.
+        several: Number of unloaded records in each group that several loads share.
 
     Returns:
         Common parameters, their covariance, and the estimates of each group, stacked, with whether
-        each load is seen to be another circuit. In them `shared_cov` is what the uncertainty of
-        `common`, and the noise of an unloaded record that is not the load's alone, add: it is the
-        same in every load.
+        the data show another circuit. In the estimates, `shared_cov` is the part that several loads
+        share: from the uncertainty of `common`, and from the noise of shared unloaded records.
     """
     study = DriverStudy(model, groups)
-    # The sum of squares grows with the number of loads, what can be seen in it does not.
+    # The sum of squares grows with the number of loads; a detectable change of it does not.
     terms = sum(2 * loads.spectrum.x.size for loads in groups)
     count = sum(loads.sample_rate.shape[0] for loads in groups)
     solver = LevenbergMarquardt(
@@ -161,7 +162,7 @@ def fit(
         lambda y, study: study(y), solver, study.start(), study, max_steps=MAX_STEPS, throw=False
     )
     common, parts = study.split(solution.value)
-    # The loads that take no part have been waiting for Z_th.
+    # The loads that take no part are fitted now, with the final Z_th.
     refitted = [
         over(lambda load, own: _refit(study, load, common, own), loads, own)
         for loads, own in zip(groups, parts, strict=True)
@@ -171,7 +172,7 @@ def fit(
 
 
 def _refit(study: DriverStudy, load: Loads, common, own):
-    """A load at its minimum with this Z_th, and how its solver ended."""
+    """Unknowns of a load at its minimum with this Z_th, and the result of the solver."""
     solution = optx.least_squares(
         lambda q, _: study.of_load(load, common, LoadUnknowns.of(q)),
         SOLVER,

@@ -1,7 +1,7 @@
 """The terms of one driver and its many loads.
 
-Only Z_th and the delays of the calibrations, `common`, tie the loads together; the elements and
-the delay of each, `own`, appear in its terms alone.
+All loads share Z_th and the delays of the calibrations, `common`. The elements and the delay of a
+load, `own`, appear only in the terms of this load.
 """
 
 import itertools
@@ -18,19 +18,19 @@ from etid.estimators.unknowns import LoadUnknowns
 from etid.signals.harmonics import Spectrum
 from etid.solvers.arrowhead import join, split
 
-SIDE_BY_SIDE = 8  # loads of one vectorised step
+SIDE_BY_SIDE = 8  # loads in one vectorised step
 
 
 class Loads(eqx.Module):
     """Recordings of one length with one driver, stacked along a leading axis.
 
     Attributes:
-        spectrum: Their harmonics.
-        sample_rate: Their sampling rates [Hz].
-        own: What is unknown of each, as it was identified alone.
-        used: Whether the recording takes part; the others are fitted, but tell nothing of Z_th.
-        unloaded: Number of its unloaded record among those that several loads have; −1 if none has
-            the same.
+        spectrum: Harmonics of the recordings.
+        sample_rate: Sampling rates of the recordings [Hz].
+        own: Unknowns of each load, identified alone.
+        used: Whether the recording takes part. The others are fitted, but do not affect Z_th.
+        unloaded: Index of the unloaded record among those that several loads share; −1 if no other
+            load has it.
     """
 
     spectrum: Spectrum
@@ -41,7 +41,7 @@ class Loads(eqx.Module):
 
 
 class DriverStudy(eqx.Module):
-    """All that the fit of a driver and its loads depends on."""
+    """All data of the fit of a driver and its loads."""
 
     model: Joint
     groups: list[Loads]
@@ -68,14 +68,14 @@ class DriverStudy(eqx.Module):
         return self.model.calibrations.terms(common, self.model.calibrations.records)
 
     def start(self) -> Float[Array, " parameter"]:
-        """The driver of the calibrations, and each load identified alone."""
+        """The start: the driver of the calibrations, and each load identified alone."""
         own = jnp.concatenate([loads.own.vector() for loads in self.groups])
         return join(self.model.calibrations.start(), own)
 
     def split(
         self, y: Float[Array, " parameter"]
     ) -> tuple[Float[Array, " common"], list[LoadUnknowns]]:
-        """Common parameters, and the own ones of each group."""
+        """The common parameters, and the unknowns of the loads of each group."""
         counts = [loads.used.size for loads in self.groups]
         common, own = split(y, sum(counts), self.owned)
         ends = itertools.accumulate(counts)

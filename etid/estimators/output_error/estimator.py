@@ -1,4 +1,4 @@
-"""Output error: the loaded voltage predicted in time, for records of any length."""
+"""Output error: predicts the loaded voltage in time, for records of any length."""
 
 import dataclasses
 
@@ -20,14 +20,14 @@ from etid.signals.harmonics import Spectrum
 from etid.signals.measurement import Measurement
 from etid.signals.transfer import Rational
 
-# Of the signal, what the interpolation may leave unexplained. At 100 kHz and 80 dB it is 6e-4 and
-# costs R_s ten standard errors; at 200 kHz it is 1e-4 and costs less than one.
+# Part of the signal that the interpolation may leave unexplained. At 100 kHz and 80 dB it leaves
+# 6e-4, and R_s is wrong by ten standard errors. At 200 kHz it leaves 1e-4, less than one.
 INTERPOLATED = 3e-4
 
 
 @dataclasses.dataclass(frozen=True)
 class OutputError(AbstractEstimator):
-    """Output error in continuous time; it needs no whole pulse period."""
+    """Output error in continuous time; a record need not hold a whole pulse period."""
 
     name = "output_error"
     lane = PaddedSamples
@@ -70,13 +70,13 @@ class OutputError(AbstractEstimator):
         off = misses(estimate.chi2, estimate.rrse, INTERPOLATED)
         found = unless(found, off, RESULTS.biased)
         if isinstance(driver, HarmonicDriver):
-            # Maximum likelihood knows its driver better than output error is exact: what that is
-            # off by, three standard errors, would be seen as a relaxation.
+            # The driver of maximum likelihood is more exact than output error. The test would take
+            # the error of output error, three standard errors, for a relaxation.
             return found
         return unless(found, other, RESULTS.misfit)
 
     def describe(self) -> Description:
-        """Its methods section."""
+        """The text for a methods section."""
         return Description(
             words="output error",
             text="The load was estimated by output error (Ljung, 1999): the terminal voltage was "

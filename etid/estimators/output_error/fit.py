@@ -1,15 +1,16 @@
 """Output error: Levenberg-Marquardt on the simulated terminal voltage.
 
-The parameters are the logarithms of the circuit elements or the modal parameters of Z_th;
-`etid.estimators.output_error.prediction` makes the residual,
-`etid.estimators.output_error.information` the covariance. A skin adds what it inherits from its
-driver, K cov(Z_th) Kᵀ with K = −H⁻¹ ∂²/∂θ∂Z_th. If χ² > 1 the covariance is multiplied by it.
+The parameters are the logarithms of the circuit elements, or the modal parameters of Z_th.
+`etid.estimators.output_error.prediction` computes the residual, and
+`etid.estimators.output_error.information` the covariance. The covariance of a skin contains the
+part from its driver, K cov(Z_th) Kᵀ with K = −H⁻¹ ∂²/∂θ∂Z_th. If χ² > 1, the covariance of the
+noise is multiplied by χ².
 
-**The calibration's own delay.** A calibration that was triggered τ late looks, to first order in
-τ, exactly like one in time with Z_th + sτ (R_L + Z_th) for Z_th: what a recorded band shows of a
-fast pole of Z_th and what it shows of a delay are the same, so one known resistor cannot tell them
-apart. 10 ns cost 3 % in C_p. A skin's record does show τ, by the excess impedance of
-`late_calibration`. It is therefore fitted with every skin.
+**The delay of the calibration.** To first order in τ, a calibration that was triggered τ late is
+equal to one without a delay whose Z_th is replaced by Z_th + sτ (R_L + Z_th). In a recorded band, a
+fast pole of Z_th and a delay have the same effect, so one known resistor cannot separate them. A
+delay of 10 ns changes C_p by 3 %. The record of a skin does show τ, through the excess impedance of
+`late_calibration`. τ is therefore fitted with every skin.
 """
 
 import dataclasses
@@ -52,7 +53,7 @@ from etid.signals.transfer import Rational
 from etid.solvers.levenberg_marquardt import best_start
 from etid.solvers.matrices import inverse
 
-PASSES = 3  # of a skin's fit
+PASSES = 3  # passes of the fit of a skin
 
 
 def fit_source(
@@ -63,12 +64,13 @@ def fit_source(
     """Identify Z_th from one or several records with known resistors.
 
     Args:
-        records: Stacked along a leading axis.
-        r_load: The resistors [Ω].
+        records: Records, stacked along a leading axis.
+        r_load: Resistor of each record [Ω].
         start: Initial Z_th; its structure is the order.
 
     Returns:
-        Z_th, the estimate, whose parameters are `start` flattened, and what else is in doubt.
+        Z_th; the estimate, with parameters in the order of the flattened `start`; and the data of
+        the calibrations.
     """
     start_vector, unflatten = ravel_pytree(start)
     kept, count = start_vector.size, r_load.size
@@ -130,9 +132,9 @@ def fit_source(
     cov = of_source.covariance() * jnp.maximum(chi2, 1.0)
     mismatch = None
     if count > 1:
-        gradient = jnp.concatenate([jnp.zeros(kept), by_resistor])  # it is at its minimum
+        gradient = jnp.concatenate([jnp.zeros(kept), by_resistor])  # Z_th is at its minimum
         step, error_of_step = further(whole, gradient, kept)
-        # What the worst of the resistors explains is no noise.
+        # The part of χ² that the worst resistor explains is no noise.
         left = chi2 - jnp.max((step / error_of_step) ** 2) / math.prod(records.hold.shape[:-1])
         mismatch = jnp.stack([-step, error_of_step * jnp.sqrt(jnp.maximum(left, 1.0))])
     estimate = Estimate(
@@ -155,7 +157,7 @@ def fit_source(
 def _arrow(
     parts: Float[Array, "record both both"], known: Float[Array, "source source"]
 ) -> Float[Array, "all all"]:
-    """Source and all resistors, from source and resistor of each record."""
+    """Matrix over source and all resistors, from those over source and one resistor each."""
     kept, count = known.shape[0], parts.shape[0]
     total = jnp.zeros((kept + count, kept + count))
     total = total.at[:kept, :kept].set(parts[:, :kept, :kept].sum(0) + known)
@@ -179,7 +181,7 @@ def fit_circuit(
 
     Returns:
         The circuit; the estimate, whose parameters are the logarithms of the elements; and whether
-        the load is seen to be another circuit.
+        the data show another circuit.
     """
     source, source_cov, calibration = driver.source, driver.later_cov(), driver.calibration
     source_vector, unflatten = ravel_pytree(source)
@@ -187,14 +189,14 @@ def fit_circuit(
     kept, sources = candidates.shape[-1], source_vector.shape[0]
     circuit = jax.tree.map(lambda leaf: leaf[0], starts)
     states = jax.eval_shape(lambda: loaded(source, circuit.impedance().rational(), 1.0).C).shape[0]
-    # In samples of this record.
+    # [samples] of this record.
     late_std = calibration.delay_std_samples * (records.sample_rate / driver.sample_rate)
 
     def load(log_elements):
         return circuit.with_log_values(log_elements).impedance().rational()
 
-    # Logarithms of the elements, the nuisances of the record, and the delay of the calibration, by
-    # which voltage and impulse response change linearly.
+    # Logarithms of the elements, the nuisances of the record, and the delay of the calibration.
+    # Voltage and impulse response are linear in this delay.
     zero = jnp.zeros(())
     nuisance = Nuisance(jnp.zeros(states), zero, zero)
     _, named = ravel_pytree((candidates[0], nuisance, zero))
@@ -221,7 +223,7 @@ def fit_circuit(
     nothing = Late(jnp.zeros(records.hold.shape[0]), jnp.zeros(IMPULSE + 1))
     q0 = jax.vmap(lambda log_elements: ravel_pytree((log_elements, nuisance, zero))[0])(candidates)
     best = best_start(lambda q: residual(q, nothing), q0)
-    # First with the calibration in time, then with its delay; one loop, so that one solver is
+    # First without a delay of the calibration, then with it. In one loop, only one solver is
     # compiled.
     (q, late), outcomes = jax.lax.scan(refine, (best, nothing), length=PASSES)
     objective, result, steps = outcomes
@@ -277,9 +279,9 @@ def fit_circuit(
 def fitted_voltage(
     records: Records, source: SourceImpedance, r_load: Float[Array, ""], load: Rational
 ) -> Float[Array, " interval"]:
-    """Terminal voltage [V] with `load`, as far as a record tells.
+    """Terminal voltage with `load` [V], fitted to a record.
 
-    Initial state, offset, delay and the delay of the calibration with `r_load` [Ω] are fitted.
+    The fit has the initial state, offset, delay, and delay of the calibration with `r_load` [Ω].
     """
     system = loaded_filter(source, load, records.sample_rate)
     zero = jnp.zeros(())
@@ -290,9 +292,9 @@ def fitted_voltage(
         predicted = predict(system, records, nuisance) + late_samples * late
         return predicted - measured(records, nuisance.delay_samples)
 
-    # Linear but for the delay, which is a small fraction of a sample, and for the state in `late`,
-    # which is that of the step before: a state that decays within a sample multiplied by the delay
-    # of the calibration would leave the first sample at any voltage.
+    # The residual is linear except in the delay, which is a small fraction of a sample, and in the
+    # state in `late`. `late` uses the state of the previous step: with a free state that decays
+    # within a sample, times the delay of the calibration, the first sample could be any voltage.
     late = jnp.zeros_like(records.v_out[:, 0])
     for _ in range(3):
         late = late_calibration(records, source, load, r_load, named(q)[0].state).v_out

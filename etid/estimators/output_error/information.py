@@ -1,12 +1,12 @@
-"""What the records tell about the parameters: curvature and covariance.
+"""Information of the records about the parameters: curvature and covariance.
 
-The residual r of `etid.estimators.output_error.prediction` is coloured (G filters the noise of
-V_th), and the recorded noise inflates JᵀJ. Both are accounted for,
+The residual r of `etid.estimators.output_error.prediction` is coloured, because G filters the noise
+of V_th. The noise in the records also makes JᵀJ too large. The covariance accounts for both:
 
     cov = H⁻¹ (Jᵀ Σ J) H⁻¹,      Σ = (σ_out² K Kᵀ + σ_th² G Gᵀ)/s,
     H   = JᵀJ − N ((σ_th² Σ ∂h ∂hᵀ + σ_out² Σ ∂k ∂kᵀ)/s − ∂s ∂sᵀ/(4 s²)),
 
-H being the curvature of the *expected* objective.
+H is the curvature of the *expected* objective.
 """
 
 import math
@@ -34,9 +34,9 @@ class Slopes(eqx.Module):
 
     Attributes:
         residual: Scaled residual.
-        jacobian: Its derivatives by the parameters.
+        jacobian: Derivatives of the residual with respect to the parameters.
         h: Impulse response of the loaded driver.
-        slope: Its derivatives.
+        slope: Derivatives of the impulse response with respect to the parameters.
     """
 
     residual: Float[Array, " interval"]
@@ -55,18 +55,18 @@ def slopes(
 
 
 def padded_size(rows: int) -> int:
-    """Length of an FFT in which a filter does not wrap around."""
+    """Length of an FFT without wrap-around of a filter [samples]."""
     return 2 ** math.ceil(math.log2(rows + IMPULSE))
 
 
 def noise_power(records: Records, h: Float[Array, " lag"], size: int) -> Float[Array, " bin"]:
-    """Power [V²] of the residual's noise at each frequency of an FFT, per sample."""
+    """Power of the noise of the residual at each frequency of an FFT, per sample [V²]."""
     power_out = records.sigma_out**2 * jnp.abs(jnp.fft.rfft(impulse()[:, 0], size)) ** 2
     return power_out + records.sigma_th**2 * jnp.abs(jnp.fft.rfft(h, size)) ** 2
 
 
 def bin_weights(size: int) -> Float[np.ndarray, " bin"]:
-    """By which squares of `rfft` sum to those of the samples (Parseval)."""
+    """Weights with which the squares of `rfft` sum to those of the samples (Parseval)."""
     weight = np.full(size // 2 + 1, 2.0 / size)
     weight[[0, -1]] = 1.0 / size
     return weight
@@ -78,7 +78,7 @@ def curvature(records: Records, at: Slopes, precision: Float[Array, " n"]) -> Cu
     Args:
         records: One recording.
         at: Derivatives at the minimum; the last parameter is the record's delay [samples].
-        precision: Of independent priors of q, which count as curvature.
+        precision: Precision of independent priors of the parameters; it adds to the curvature.
     """
     h, slope, jacobian = at.h, at.slope, at.jacobian
     s = residual_variance(records, h)
@@ -88,7 +88,7 @@ def curvature(records: Records, at: Slopes, precision: Float[Array, " n"]) -> Cu
     noise = noise - jnp.outer(s_slope, s_slope) / (4 * s**2)
     k_slope = measured_impulse()[:, 1]
     noise = noise.at[-1, -1].add(records.sigma_out**2 * jnp.sum(k_slope**2) / s)
-    # Jᵀ Σ J by Parseval; J is padded, so that the filters do not wrap around.
+    # Jᵀ Σ J by Parseval; J is padded to avoid wrap-around of the filters.
     size = padded_size(rows)
     weight = jnp.asarray(bin_weights(size)) * noise_power(records, h, size)
     spectrum = jnp.fft.rfft(jacobian, size, axis=0)
@@ -101,15 +101,15 @@ def curvature(records: Records, at: Slopes, precision: Float[Array, " n"]) -> Cu
 def further(
     of: Curvature, gradient: Float[Array, " all"], kept: int
 ) -> tuple[Float[Array, " further"], Float[Array, " further"]]:
-    """Where each further parameter alone would go from a minimum over the first `kept`.
+    """Newton step of each further parameter alone, from a minimum over the first `kept` parameters.
 
-    One step of Newton from 0, with the first parameters free (Rao's score test has no power but
-    where this step is large against its error).
+    The step starts from 0, and the first parameters are free. Rao's score test has power only where
+    this step is large relative to its standard error.
 
     Args:
         of: Curvature over all parameters.
-        gradient: Of the objective.
-        kept: How many parameters are at their minimum.
+        gradient: Gradient of the objective.
+        kept: Number of parameters at their minimum.
 
     Returns:
         The steps, and their standard errors.

@@ -1,17 +1,17 @@
-"""Terminal voltage predicted from the recorded V_th, and its difference to the recorded V_out.
+"""Terminal voltage predicted from the recorded V_th, and its difference from the recorded V_out.
 
-The loaded driver is a continuous-time system, run exactly for band-limited samples
-(`etid.signals.filtering`), so that discretisation costs no accuracy at the recorder's own rate. The
-state at the start of the record, an offset of V_out and its trigger delay are nuisances.
+The loaded driver is a continuous-time system. It is simulated exactly for band-limited samples
+(`etid.signals.filtering`), so discretisation causes no error at the sample rate of the recorder.
+The nuisances are the state at the start of the record, an offset of V_out and its trigger delay.
 
 **Noise on both records.** The residual r = V_out_predicted − V_out contains the noise of V_out and
 the noise of V_th filtered by the loaded driver G. For white noise its variance is
 
     s(θ) = σ_out² Σ k² + σ_th² Σ h²,
 
-k being the impulse response of the interpolation, h that of G after it. Minimising Σ r²/s(θ) is
-consistent, because E Σ r² = |noise-free misfit|² + N s(θ); minimising Σ r² alone is not (at 30 dB
-it drives Z_th to −90 kΩ).
+where k is the impulse response of the interpolation, and h that of the interpolation followed by G.
+The minimum of Σ r²/s(θ) is consistent, because E Σ r² = |noise-free misfit|² + N s(θ). The minimum
+of Σ r² alone is not consistent: at 30 dB it gives a Z_th of −90 kΩ.
 """
 
 import equinox as eqx
@@ -25,11 +25,11 @@ from etid.signals.filtering import CUTOFF, TAPS, StateSpace, band_limited, hold,
 from etid.signals.measurement import Measurement
 from etid.signals.transfer import Rational
 
-IMPULSE = 256  # samples of the impulse response whose squares are summed
+IMPULSE = 256  # length of the impulse response whose squares are summed [samples]
 
 
 class Records(eqx.Module):
-    """What one fit sees of a recording: the interpolated V_th, the measured V_out, and their noise.
+    """Data of a recording for one fit: the interpolated V_th, the measured V_out, their noise.
 
     Attributes:
         hold: Polynomial coefficients of the band-limited V_th.
@@ -37,7 +37,7 @@ class Records(eqx.Module):
         sigma_th: Noise of V_th [V].
         sigma_out: Noise of V_out [V].
         sample_rate: Sampling rate [Hz].
-        used: 1 where there is a record, 0 for what only fills it up to a common length.
+        used: 1 for the intervals of the record, 0 for padding to a common length.
     """
 
     hold: Float[Array, "interval degree"]
@@ -49,19 +49,19 @@ class Records(eqx.Module):
 
     @property
     def intervals(self) -> Float[Array, ""]:
-        """Number of those that are used."""
+        """Number of used intervals."""
         return self.used.sum()
 
 
 def prepare(
     m: Measurement, cutoff: float = CUTOFF, samples: Int[Array, ""] | int | None = None
 ) -> Records:
-    """Interpolate V_th once; the edges, where its neighbours are missing, are left out.
+    """The interpolated V_th of a recording, without the edges, where samples are missing.
 
     Args:
         m: One recording.
         cutoff: As in `filtering.band_limited`.
-        samples: How many at the beginning are the recording; all if not given.
+        samples: Number of samples before the padding; None if there is no padding.
     """
     held, delayed = band_limited(m.v_th, cutoff), shiftable(m.v_out, cutoff)
     rows = jnp.arange(held.shape[0])
@@ -83,9 +83,9 @@ def predict(system: StateSpace, records: Records, nuisance: Nuisance) -> Float[A
 
 
 def measured(records: Records, delay_samples: Float[Array, ""]) -> Float[Array, " interval"]:
-    """Measured voltage [V] at the instants of V_th; it was sampled `delay_samples` late.
+    """Measured voltage at the sampling times of V_th [V]; it was sampled `delay_samples` late.
 
-    50 ns between the triggers of two records are 0.01 samples, and spread R_s by 8 %.
+    50 ns between the triggers of two records are 0.01 samples and cause a spread of 8 % in R_s.
     """
     late = -delay_samples
     value = records.v_out[:, -1]
@@ -95,7 +95,7 @@ def measured(records: Records, delay_samples: Float[Array, ""]) -> Float[Array, 
 
 
 def impulse_response(system: StateSpace) -> Float[Array, " lag"]:
-    """Response h of the loaded driver to one sample of V_th, interpolation included."""
+    """Response h of the loaded driver to one sample of V_th, including the interpolation."""
     return simulate(system, impulse(), jnp.zeros_like(system.C))[0]
 
 
@@ -116,7 +116,7 @@ def residual_variance(records: Records, h: Float[Array, " lag"]) -> Float[Array,
 
 
 class Late(eqx.Module):
-    """What changes per sample by which the calibration was triggered later than assumed.
+    """Derivatives with respect to the delay of the calibration, per sample.
 
     Attributes:
         v_out: Terminal voltage [V].
@@ -134,7 +134,7 @@ def scaled_residual(
     nuisance: Nuisance,
     change: Late | None = None,
 ) -> Float[Array, " interval"]:
-    """(Predicted − measured) / √s; `change` is added to what is predicted."""
+    """(Predicted − measured) / √s; `change` is added to the prediction."""
     system = loaded_filter(source, load, records.sample_rate)
     predicted, h = predict(system, records, nuisance), impulse_response(system)
     if change is not None:
@@ -150,14 +150,15 @@ def late_calibration(
     r_load: Float[Array, ""],
     x0: Float[Array, " state"],
 ) -> Late:
-    """Derivative by the delay of the calibration, of which the skin's own delay absorbs a part.
+    """Derivatives with respect to the delay of the calibration, without the part that is a delay.
 
-    A calibration with R_L that is late by τ yields Z_th + sτ (R_L + Z_th) in place of Z_th: to
-    first order in τ no record with that R_L tells the two apart. A load Z_L is then seen through
+    A calibration with R_L that is late by τ yields Z_th + sτ (R_L + Z_th) in place of Z_th. To
+    first order in τ, no record with this R_L can separate the two. A load Z_L then has the total
 
-        Z_L + Z_th + sτ (R_L + Z_th) = (1 + sτ) (Z_L + Z_th) + sτ (R_L − Z_L),
+        Z_L + Z_th + sτ (R_L + Z_th) = (1 + sτ) (Z_L + Z_th) + sτ (R_L − Z_L).
 
-    a delay of its own and an excess impedance. This is the derivative by the latter.
+    The first part is a delay, which the skin's own delay absorbs. The second is an excess
+    impedance; this function returns the derivatives with respect to it.
 
     Args:
         records: One recording.
@@ -173,8 +174,8 @@ def late_calibration(
         steps = jnp.arange(1.0, hold.shape[1])
         return jnp.pad(hold[:, 1:] * steps[None, :], ((0, 0), (0, 1)))
 
-    # Z_th + ε (R_L − Z_L) for Z_th is, but for a factor of V_out, R + ε R_L for R and (1 − ε) Z_L
-    # for Z_L; that factor is the delay's.
+    # Replacing Z_th by Z_th + ε (R_L − Z_L) equals replacing R by R + ε R_L and Z_L by (1 − ε) Z_L,
+    # except for a factor of V_out, which belongs to the delay.
     def excess(epsilon):
         shifted = jnp.log(jnp.exp(source.log_resistance) + epsilon * r_load)
         altered = eqx.tree_at(lambda z: z.log_resistance, source, shifted)
