@@ -1,1 +1,1 @@
-"""The same iteration on the harmonics, without bias by noise, and its estimator."""
+"""Steiglitz-McBride on the harmonics, without bias by noise: iteration and estimator."""

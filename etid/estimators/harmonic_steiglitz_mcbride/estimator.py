@@ -1,4 +1,4 @@
-"""Steiglitz-McBride on the harmonics, judged by the likelihood with Z_th as it is."""
+"""Steiglitz-McBride on the harmonics, judged by the likelihood with a fixed Z_th."""
 
 import dataclasses
 
@@ -54,10 +54,10 @@ from etid.solvers.matrices import root
 
 @dataclasses.dataclass(frozen=True)
 class HarmonicSteiglitzMcBride(AbstractEstimator):
-    """SkinRC by Steiglitz-McBride on the harmonics, freed of the bias by noise.
+    """SkinRC by Steiglitz-McBride on the harmonics, without bias by noise.
 
     Attributes:
-        iterations: The most there are, at least one.
+        iterations: Number of iterations, at least one.
     """
 
     name = "harmonic_steiglitz_mcbride"
@@ -69,7 +69,7 @@ class HarmonicSteiglitzMcBride(AbstractEstimator):
 
     def __post_init__(self) -> None:
         if self.iterations < 1:
-            raise ValueError(f"iterations is {self.iterations}; there is at least one")
+            raise ValueError(f"iterations is {self.iterations}; use at least one")
 
     def fit_driver(
         self,
@@ -102,7 +102,7 @@ class HarmonicSteiglitzMcBride(AbstractEstimator):
         z_th = source.response(spectrum.frequency)
         best = iteration.fit_skin(spectrum, z_th, sample_rate, self.iterations)
         values, late = best.circuit.values(), best.delay_samples
-        physical = jnp.isfinite(best.rrse)  # or else any likelihood will do
+        physical = jnp.isfinite(best.rrse)  # if not, the elements do not matter
         elements = jnp.where(physical, values, SkinRC().values())
 
         def terms(q, spectrum):
@@ -121,7 +121,7 @@ class HarmonicSteiglitzMcBride(AbstractEstimator):
         private, shared = iteration.covariance(
             spectrum, noise, source, source_cov, sample_rate, best
         )
-        errors = jnp.diagonal(private + shared)  # of the logarithms, squared
+        errors = jnp.diagonal(private + shared)  # squared errors of the logarithms
         fitted = best.circuit.with_log_values(own.log_elements)
         other = _is_another(spectrum, noise, own, sample_rate, fitted, driver)
         changed = jnp.array(False) if known is None else known.differs(spectrum)
@@ -148,7 +148,7 @@ class HarmonicSteiglitzMcBride(AbstractEstimator):
         )
 
     def describe(self) -> Description:
-        """Its methods section."""
+        """The text for a methods section."""
         return Description(
             words="Steiglitz-McBride on harmonics",
             text=HARMONICS + "the load was estimated by Steiglitz-McBride iteration (Steiglitz and "
@@ -168,12 +168,12 @@ def _is_another(
     circuit: SkinRC,
     driver: ContinuousDriver,
 ) -> Bool[Array, ""]:
-    """Whether the load is seen to be another circuit, whatever Z_th is within its covariance.
+    """Whether the data show another circuit; Z_th may vary within its covariance.
 
     Args:
         spectrum: The recording.
-        noise: Variance of its noise in units of what it says.
-        own: What was unknown.
+        noise: Variance of its noise, relative to the variance in `spectrum`.
+        own: Unknowns of the load.
         sample_rate: Its sampling rate [Hz].
         circuit: The circuit.
         driver: Its driver.
@@ -190,7 +190,7 @@ def _is_another(
         return circuit.with_log_values(log_values).impedance()(s)
 
     def of_gain(_):
-        """Derivatives of the gain by all parameters and changes."""
+        """The gain, and its derivatives with respect to all parameters and changes."""
         z_th = unflatten(vector).response(f)
         z, changes = other_circuit.changes(circuit.impedance(), f)
         total = reciprocal(z + z_th)
@@ -207,7 +207,7 @@ def _is_another(
     g, slopes = apart(of_gain, own.vector())
 
     def of_residual(_):
-        # At the X that both records tell: the noise of that of one is in the residual as well.
+        # At the X estimated from both records: the noise of one record is in the residual too.
         [clean], [share] = denoised([spectrum], [g])
         weight = jnp.where(spectrum.selected, jnp.sqrt(2 / variance(spectrum, g)), 0.0)
         rows = slopes * (-clean.x * as_complex(weight))[None, :]

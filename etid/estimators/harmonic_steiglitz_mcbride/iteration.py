@@ -5,33 +5,33 @@ Z_th V_out and the continuous Z_bio = N/D (paper, eqs. 7-9),
 
     N = b₀ + b₁ s,      D = 1 + a₁ s,      R_s = b₁/a₁,   R_p = b₀ − R_s,   C_p = a₁/R_p.
 
-Nothing is discretised, and eqs. (1), (2) become sums over harmonics of |X N_i − W D_i|² with the
-weights 1/|D_{i−1}|². Two things are added to them.
+Nothing is discretised. Eqs. (1), (2) become sums over harmonics of |X N_i − W D_i|² with the
+weights 1/|D_{i−1}|². This module adds two things.
 
-**A trigger delay τ** turns V_out by e^{jωτ} = 1 + jωτ + …, which makes it one more linear unknown
-with the coefficient T = −jω V_out (N + Z_th D)_{i−1}; V_out is then turned back by what was found.
+**A trigger delay τ** multiplies V_out by e^{jωτ} = 1 + jωτ + …. It is one more linear unknown with
+the coefficient T = −jω V_out (N + Z_th D)_{i−1}. V_out is then corrected by the delay found.
 
-**Noise** of V_out is in X and in W, and biases the sums. They contain the records in three products
-only, x*x, y*y and x*y, of which the noise adds its known variance to the first two. With the
-variances subtracted (bias-compensating least squares; Söderström 2007, "Errors-in-variables methods
-in system identification", Automatica 43) what is left of the bias is what they are off.
+**Noise** of V_out is in X and in W, and biases the sums. The sums contain the records only in three
+products, x*x, y*y and x*y. The noise adds its known variance to the first two. The variances are
+subtracted (bias-compensating least squares; Söderström 2007, "Errors-in-variables methods in system
+identification", Automatica 43). The remaining bias comes from the errors of the variances.
 
-With v = (x − y)* y, ⟨ ⟩ the weighted sum over all harmonics, and k, l the coefficients without −jω
-and y, which are Z_th of a₁ and N + Z_th D of τ, the normal equations consist of
+Let v = (x − y)* y, and let ⟨ ⟩ be the weighted sum over all harmonics. k and l are coefficients
+without −jω and y: that of a₁ is Z_th, and that of τ is N + Z_th D. The normal equations consist of
 
     ⟨X* X⟩ = ⟨|x − y|²⟩,            ⟨X* k⟩ = ⟨ω Im kv⟩,
     ⟨k* l⟩ = ⟨ω² Re k*l y*y⟩,   ⟨(jωX)* k⟩ = −⟨ω² Re kv⟩,
 
-and ⟨Re Z_th v⟩, ⟨ω Im Z_th v⟩, 0 and −⟨ω Im k*Z_th y*y⟩ on the right. X and jωX are orthogonal, so
-that b₀ and b₁ are eliminated one by one, and a₁ and τ remain. A pole in the right half-plane needs
-no reflection: |1 + jωa₁| does not know the sign of a₁.
+and ⟨Re Z_th v⟩, ⟨ω Im Z_th v⟩, 0 and −⟨ω Im k*Z_th y*y⟩ on the right. X and jωX are orthogonal.
+Therefore b₀ and b₁ are eliminated one by one, and a₁ and τ remain. A pole in the right half-plane
+needs no reflection, because |1 + jωa₁| does not depend on the sign of a₁.
 
 **The covariance** is that of a fixed point q = Φ(q, X, Y, Z_th), whose differential is
 
     dq = (1 − ∂Φ/∂q)⁻¹ (∂Φ/∂X dX + ∂Φ/∂Y dY + ∂Φ/∂Z_th dZ_th).
 
-All three are taken as independent. Where a calibration has the same unloaded record, what it did to
-Z_th and does to the skin partly cancels, and the standard errors are a quarter too wide.
+All three are taken as independent. If a calibration has the same unloaded record, the effects of
+its noise on Z_th and on the skin partly cancel. The standard errors are then a quarter too large.
 """
 
 from typing import NamedTuple
@@ -49,18 +49,18 @@ from etid.results.fits import complex_rrse
 from etid.signals.harmonics import Spectrum
 from etid.signals.transfer import as_complex, power, reciprocal, turns
 
-RATE = 3e4  # of a skin's relaxation [rad/s], in units of which the coefficients are near 1
+RATE = 3e4  # [rad/s] rate of a skin's relaxation; in this unit the coefficients are near 1
 
 
 class Iterate(eqx.Module):
     """The best iterate of a run.
 
     Attributes:
-        circuit: Its elements, whatever their sign.
+        circuit: Circuit with its elements, which may be negative.
         delay_samples: Trigger delay of V_out [samples].
-        rrse: Of the harmonics of V_out it predicts; infinite if an element is not positive.
-        iteration: At which it was found.
-        converged: Whether the *last* iterations settled.
+        rrse: RRSE of the predicted harmonics of V_out; infinite if an element is not positive.
+        iteration: Number of its iteration.
+        converged: Whether the *last* iterations converged.
         stable: Whether the pole of Z_bio lies in the left half-plane.
     """
 
@@ -73,7 +73,7 @@ class Iterate(eqx.Module):
 
 
 class _Products(NamedTuple):
-    """What the sums are made of, at each harmonic."""
+    """Products of the records at each harmonic, from which the sums are computed."""
 
     omega: Float[Array, " harmonic"]
     used: Bool[Array, " harmonic"]
@@ -104,7 +104,7 @@ class _Products(NamedTuple):
         terms += [omega * yy * zk.imag]
         weight = jnp.where(used, 1 / (1 + (omega * q[2]) ** 2), 0.0)
         p0, h0, z0, k0, p2, z1, k1, zz, kz, kk, hk = jnp.stack(terms) @ weight
-        # Schur complements of b₀ and b₁, whose right sides are h0 and z0.
+        # Schur complements of b₀ and b₁; their right sides are h0 and z0.
         zz, kz, kk = (
             zz - z0**2 / p0 - z1**2 / p2,
             kz - z0 * k0 / p0 - z1 * k1 / p2,
@@ -118,6 +118,7 @@ class _Products(NamedTuple):
 
 
 def _products(spectrum: Spectrum, z_th: Complex[Array, " harmonic"]) -> _Products:
+    """The products without the variance of the noise."""
     return _Products(
         2 * jnp.pi / RATE * spectrum.frequency,
         spectrum.selected,
@@ -129,10 +130,12 @@ def _products(spectrum: Spectrum, z_th: Complex[Array, " harmonic"]) -> _Product
 
 
 def _turn(q: Float[Array, " coefficient"], frequency: Float[Array, " harmonic"]):
+    """e^(jωτ)."""
     return turns(q[3] / RATE * frequency[0], frequency.size)
 
 
 def _elements(q: Float[Array, " coefficient"]) -> SkinRC:
+    """The skin with these coefficients."""
     b0, b1, a1, _ = q
     r_s = b1 / a1
     r_p = b0 - r_s
@@ -149,9 +152,9 @@ def fit_skin(
 
     Args:
         spectrum: Harmonics of a recording.
-        z_th: Source impedance at them [Ω].
+        z_th: Source impedance at these harmonics [Ω].
         sample_rate: Sampling rate of the recording [Hz].
-        iterations: How many.
+        iterations: Number of iterations.
     """
     of = _products(spectrum, z_th)
     used = spectrum.selected
@@ -169,7 +172,7 @@ def fit_skin(
         error = jnp.where((circuit.values() > 0).all() & jnp.isfinite(error), error, jnp.inf)
         converged = jnp.abs(q - previous)[2:].max() < SETTLED * jnp.abs(a1)
         current = Iterate(circuit, tau / RATE * sample_rate, error, iteration, converged, a1 > 0)
-        # As long as none is a circuit, the latest is the best there is.
+        # While no iterate is a circuit, keep the latest.
         better = (error < best.rrse) | ~jnp.isfinite(best.rrse)
         best = jax.tree.map(lambda new, old: jnp.where(better, new, old), current, best)
         return (best, q, turn), converged
@@ -198,14 +201,14 @@ def covariance(
 
     Args:
         spectrum: The recording.
-        noise: Variance of its noise in units of what it says.
-        source: Source impedance with which it was identified.
-        source_cov: Covariance of its flattened parameters.
+        noise: Variance of its noise, relative to the variance in `spectrum`.
+        source: Source impedance of the fit.
+        source_cov: Covariance of the flattened parameters of `source`.
         sample_rate: Sampling rate of the recording [Hz].
-        best: The estimate, settled.
+        best: The converged estimate.
 
     Returns:
-        That of both records' noise, and that of the source's.
+        The covariance by the noise of both records, and the covariance by that of the source.
     """
     of = best.circuit
     a1 = RATE * of.r_p * of.c_p
@@ -228,7 +231,7 @@ def covariance(
     _, pullback = jax.vjp(lambda *data: following(q, *data), x, y, parameters)
     by_x, by_y, by_source = jax.vmap(pullback)(rows)
 
-    def of_noise(slope, variance):  # half of it in each of both parts
+    def of_noise(slope, variance):  # half of the variance in each of both parts
         return jnp.einsum("ipk,jpk,k->ij", slope, slope, variance / 2)
 
     own = of_noise(by_x, noise * spectrum.variance_x) + of_noise(by_y, noise * spectrum.variance_y)

@@ -1,1 +1,1 @@
-"""Maximum likelihood with Z_th as it is at each harmonic: its fit and its estimator."""
+"""Maximum likelihood without a model of Z_th: fit and estimator."""

@@ -1,4 +1,4 @@
-"""Maximum likelihood with Z_th as the calibrations show it at each harmonic."""
+"""Maximum likelihood with the Z_th that the calibrations show at each harmonic."""
 
 import dataclasses
 
@@ -28,14 +28,14 @@ from etid.results.verdicts import RESULTS
 from etid.signals.harmonics import Spectrum
 from etid.signals.measurement import Measurement
 
-SAME_PULSE_RATE = 1e-3  # part by which rates may differ: Z_th is smooth
-# Standard errors of bias that may be corrected; what it leaves is below half of one.
+SAME_PULSE_RATE = 1e-3  # relative difference of pulse rates that is allowed, as Z_th is smooth
+# [standard errors] Largest bias that is corrected. The remaining bias is below half of one.
 CORRECTED = 2.0
 
 
 @dataclasses.dataclass(frozen=True)
 class NonParametric(AbstractEstimator):
-    """Maximum likelihood that needs no model of Z_th, for records of the calibrations' rate."""
+    """Maximum likelihood without a model of Z_th; calibrations need the same pulse rate."""
 
     name = "non_parametric"
     lane = Harmonics
@@ -58,7 +58,7 @@ class NonParametric(AbstractEstimator):
         order: int,
         spectra: Spectrum | None,
     ) -> Driver:
-        """Identify a driver by maximum likelihood, which keeps the harmonics that are needed."""
+        """Identify a driver by maximum likelihood, which keeps the necessary harmonics."""
         return MaximumLikelihood().fit_driver(records, r_load, order, spectra)
 
     def known(
@@ -79,7 +79,7 @@ class NonParametric(AbstractEstimator):
         spectrum, rate = lane.spectrum, jnp.asarray(lane.sample_rate)
         starts = harmonic_starts(spectrum, rate, driver.response(spectrum.frequency), circuit)
         estimate, bias = fit_circuit(circuit, driver, spectrum, rate, starts)
-        # It needs the harmonics of the driver, whether or not a model of them was found.
+        # It needs only the harmonics of the driver, so the driver's verdict does not matter.
         fit = judged(estimate, circuit, SUCCESSFUL, str(self))
         if known is not None:
             fit = unless(fit, known.differs(spectrum), RESULTS.inconsistent)
@@ -87,7 +87,7 @@ class NonParametric(AbstractEstimator):
         return unless(fit, far, RESULTS.biased)
 
     def describe(self) -> Description:
-        """Its methods section."""
+        """The text for a methods section."""
         return Description(
             words="non-parametric maximum likelihood",
             text=HARMONICS + "the load was estimated by maximum likelihood with Z_th as the "

@@ -1,16 +1,17 @@
 """Maximum likelihood without a model of Z_th: one complex number for each harmonic.
 
-A calibration with R_L says of every harmonic (R_L + Z) Y₁ = R_L X₁, a load Z_L that (Z_L + Z) Y =
-Z_L X. With Z of the first in the second what is left is
+At every harmonic, a calibration with R_L gives (R_L + Z) Y₁ = R_L X₁, and a load Z_L gives
+(Z_L + Z) Y = Z_L X. The first equation gives Z, and with this Z the residual of the second is
 
     e = (Z_L + Z) Y − Z_L X,      σ_e² = |Z_L + Z|² σ_y² + |Z_L|² σ_x² + |Y|² var Z,
 
-to first order in the noise of Z; delays turn Y and Y₁. Nothing but elements and delays is fitted.
-The estimate is right for a driver of any order, and for one that is no lumped circuit at all.
+to first order in the noise of Z. Delays multiply Y and Y₁ by phase factors. Only elements and
+delays are fitted. The estimate is valid for a driver of any order, and for a driver that is no
+lumped circuit.
 
-A ratio of noisy numbers is biased, so only harmonics that a calibration shows clearly are used:
-below 40 dB `etid.estimators.maximum_likelihood.driver` sees more (Pintelon and Schoukens, 2012, ch.
-9 and 10).
+A ratio of noisy numbers is biased. Therefore only harmonics that a calibration shows clearly are
+used. Below 40 dB `etid.estimators.maximum_likelihood.driver` uses more information (Pintelon and
+Schoukens, 2012, ch. 9 and 10).
 """
 
 from collections.abc import Callable
@@ -32,8 +33,8 @@ from etid.signals.transfer import as_complex, delayed, frequency_variable, power
 from etid.solvers.levenberg_marquardt import best_start
 from etid.solvers.matrices import inverse
 
-CLEAR = 0.97  # share of signal in the power of a calibration's Y, 15 dB
-PAIRS = 4  # of draws by which bias is estimated
+CLEAR = 0.97  # smallest share of signal in the power of a calibration's Y, 15 dB
+PAIRS = 4  # pairs of draws that estimate the bias
 SEED = 1994
 
 
@@ -44,22 +45,23 @@ def _clear(calibrations: list[Spectrum]) -> Bool[Array, "calibration harmonic"]:
 
 
 def _total(values: list[Array]) -> Array:
+    """Sum of arrays."""
     return sum(values[1:], start=values[0])
 
 
 def _root(x: Float[Array, " harmonic"]) -> Float[Array, " harmonic"]:
-    """√x, whose derivative is 0 at 0."""
+    """√x with the derivative 0 at 0."""
     return jnp.where(x > 0, jnp.sqrt(jnp.where(x > 0, x, 1.0)), 0.0)
 
 
 class _Measured(eqx.Module):
-    """Z_th at the harmonics, and where its errors come from.
+    """Z_th at the harmonics, and the sources of its errors.
 
     Attributes:
         z: Z_th [Ω].
-        by_x: Its derivative by the X of each calibration.
-        by_y: Its variance from the noise of their Y.
-        apart: How far each calibration is from the mean, in standard deviations.
+        by_x: Derivative of Z_th with respect to the X of each calibration.
+        by_y: Variance of Z_th by the noise of the Y of all calibrations.
+        apart: Difference of each calibration from the mean [standard deviations].
     """
 
     z: Complex[Array, " harmonic"]
@@ -69,7 +71,7 @@ class _Measured(eqx.Module):
 
 
 class _Model(eqx.Module):
-    """The terms of the calibrations and, last, a load."""
+    """The terms of the calibrations and of a load; the load is the last record."""
 
     circuit: AbstractCircuit
     r_load: Float[Array, " calibration"]
@@ -79,7 +81,7 @@ class _Model(eqx.Module):
     selected: Bool[Array, " harmonic"]
 
     def named(self, q: Float[Array, " q"]) -> tuple[LoadUnknowns, Float[Array, " calibration"]]:
-        """What is unknown of the load, and the delays of the calibrations [samples]."""
+        """The unknowns of the load, and the delays of the calibrations [samples]."""
         last = q.size - 1
         elements, late, delay = jnp.split(q, (last - self.r_load.size, last))
         return LoadUnknowns(elements, delay[0]), late
@@ -90,7 +92,7 @@ class _Model(eqx.Module):
         return load(frequency_variable(frequency))
 
     def z_th(self, q: Float[Array, " q"], records: list[Spectrum]) -> _Measured:
-        """Mean of what the calibrations say, by their variances."""
+        """Mean of the Z_th of the calibrations, weighted by their variances."""
         z, by_x, by_y, weights = [], [], [], []
         _, late = self.named(q)
         for r, delay, s, clear in zip(self.r_load, late, records[:-1], self.clear, strict=True):
@@ -102,7 +104,7 @@ class _Model(eqx.Module):
             z.append(one)
             by_x.append(slope)
             by_y.append(variance)
-            used = clear | ~self.selected  # of those that are not selected any, but no 0/0
+            used = clear | ~self.selected  # if not selected, use all: this avoids 0/0
             weights.append(jnp.where(used, 1 / (variance + power(slope) * s.variance_x), 0.0))
         total = _total(weights)
         parts = [w / total for w in weights]
@@ -115,7 +117,7 @@ class _Model(eqx.Module):
         )
 
     def _variance(self, q, records, y, of: _Measured):
-        """Of e, and the part that is the load's own; `y` is its Y in time."""
+        """Variance of e, and the part that only the load has; `y` is Y without the delay."""
         spectrum = records[-1]
         load = self.load(q, spectrum.frequency)
         own = power(load + of.z) * spectrum.variance_y
@@ -130,12 +132,13 @@ class _Model(eqx.Module):
         return own + rest + of_x, own + jnp.where(shared, 0.0, of_x)
 
     def _in_time(self, q, records):
+        """Y of the load, without its delay."""
         spectrum = records[-1]
         late = self.named(q)[0].delay_samples
         return delayed(spectrum.y, spectrum.frequency, -late, self.sample_rate)
 
     def terms(self, q: Float[Array, " q"], records: list[Spectrum]) -> Float[Array, " term"]:
-        """Scaled e, the weak priors of the delays, and what calibrations say of each other's."""
+        """Scaled e, the weak priors of the delays, and differences between calibrations."""
         y, of = self._in_time(q, records), self.z_th(q, records)
         load = self.load(q, records[-1].frequency)
         variance, _ = self._variance(q, records, y, of)
@@ -150,14 +153,14 @@ class _Model(eqx.Module):
         return jnp.concatenate(parts)
 
     def squares(self, q: Float[Array, " q"], records: list[Spectrum]) -> Float[Array, " harmonic"]:
-        """|e|² over its variance, also of what is not selected."""
+        """|e|² divided by its variance, also for harmonics that are not selected."""
         y, of = self._in_time(q, records), self.z_th(q, records)
         load = self.load(q, records[-1].frequency)
         e = (load + of.z) * y - load * records[-1].x
         return power(e) / self._variance(q, records, y, of)[0]
 
     def without_noise(self, q: Float[Array, " q"], records: list[Spectrum]) -> list[Spectrum]:
-        """The records with Y of the load as all others predict it."""
+        """The records with the Y of the load that all other records predict."""
         spectrum, of = records[-1], self.z_th(q, records)
         load = self.load(q, spectrum.frequency)
         g = load * reciprocal(load + of.z)
@@ -166,7 +169,7 @@ class _Model(eqx.Module):
         return [*records[:-1], eqx.tree_at(lambda s: s.y, spectrum, y)]
 
     def private(self, q: Float[Array, " q"], records: list[Spectrum]) -> Float[Array, " harmonic"]:
-        """Part of the variance of e that is the load's own."""
+        """Part of the variance of e that only the load has."""
         y, of = self._in_time(q, records), self.z_th(q, records)
         variance, own = self._variance(q, records, y, of)
         return own / variance
@@ -179,18 +182,18 @@ def fit_circuit(
     sample_rate: Float[Array, ""],
     candidates: LoadUnknowns,
 ) -> tuple[Estimate, Float[Array, " element"]]:
-    """Identify the load of one recording by the harmonics of the calibrations of its driver.
+    """Identify the load of one recording with the harmonics of its driver's calibrations.
 
     Args:
         circuit: Structure of the load.
-        driver: Its driver, whose calibrations have the same pulse rate.
+        driver: Driver whose calibrations have the same pulse rate.
         spectrum: The recording.
         sample_rate: Its sampling rate [Hz].
-        candidates: To start from, stacked; the start that predicts best is refined.
+        candidates: Starts, stacked; the start that predicts best is refined.
 
     Returns:
-        The estimate, whose parameters are the logarithms of the elements, and the bias that has
-        been subtracted from them.
+        The estimate, whose parameters are the logarithms of the elements, and the bias that was
+        subtracted from them.
     """
     calibration, calibration_rate = driver.calibration, jnp.asarray(driver.sample_rate)
     known, elements = as_list(driver.spectra), candidates.log_elements.shape[1]
@@ -217,7 +220,7 @@ def fit_circuit(
     bias = _bias(lambda noisy: solve(noisy, q).value - q, records)
     freedom = 2 * jnp.sum(selected, dtype=q.dtype) - q.size
     chi2 = jnp.sum(model.terms(q, records)[: 2 * count] ** 2) / freedom
-    # The Jacobian at Y = G X, without the noise of e, which would count as information.
+    # The Jacobian at Y = G X: the noise of e in it would count as information.
     clean = model.without_noise(q, records)
     jacobian = jax.jacfwd(model.terms)(q, clean)
     by_term = inverse(jacobian.T @ jacobian)[:elements] @ jacobian.T
@@ -247,10 +250,10 @@ def fit_circuit(
 def _bias(
     change: Callable[[list[Spectrum]], Float[Array, " number"]], records: list[Spectrum]
 ) -> Float[Array, " number"]:
-    """What the noise of the records adds to the parameters on average, to second order.
+    """Bias of the parameters by the noise of the records, to second order.
 
-    By adding it once more, and its negative: the mean of both changes has no first order in it
-    (simulation and extrapolation, Cook and Stefanski 1994, with antithetic draws).
+    It is the mean of the changes by added noise and by its negative, which has no part of first
+    order (simulation and extrapolation, Cook and Stefanski 1994, with antithetic draws).
     """
 
     def drawn(key, variance):
@@ -264,7 +267,7 @@ def _bias(
         for i, s in enumerate(records):
             own = jax.random.fold_in(key, i + 1)
             same = same_unloaded(s, records[-1])
-            # One unloaded record has one noise.
+            # Recordings with the same unloaded record have the same noise of X.
             of_x = jnp.where(same, drawn(last, s.variance_x), drawn(own, s.variance_x))
             noises.append((of_x, drawn(jax.random.fold_in(own, 1), s.variance_y)))
 

@@ -1,1 +1,1 @@
-"""The paper's estimator in time: its iteration, and the estimators made of it."""
+"""The paper's estimator in time: the iteration, and the estimators that use it."""

@@ -1,7 +1,7 @@
-"""Steiglitz-McBride in time, as the paper has it, and equation error, its first iteration.
+"""Steiglitz-McBride in time, as in the paper, and equation error, its first iteration.
 
-They have no covariance. Where they would be believed wrongly they are judged by the minimum of the
-model that they stop short of: they are `biased` if it is far.
+They have no covariance. Their estimates are not at the minimum of their model. If the minimum is
+far from the estimate, the verdict is `biased`.
 """
 
 import dataclasses
@@ -24,7 +24,7 @@ from etid.signals.measurement import Measurement
 from etid.signals.transfer import Rational
 from etid.solvers.levenberg_marquardt import normal_equations
 
-IMPULSE = 512  # samples of a discrete model's impulse response
+IMPULSE = 512  # length of the impulse response of a discrete model [samples]
 
 
 def _score(
@@ -49,7 +49,7 @@ class SteiglitzMcBride(AbstractEstimator):
     """The paper's estimator: Z_th and the skin as discrete filters, by prefiltered least squares.
 
     Attributes:
-        iterations: The most there are, at least one.
+        iterations: Number of iterations, at least one.
     """
 
     name = "steiglitz_mcbride"
@@ -61,7 +61,7 @@ class SteiglitzMcBride(AbstractEstimator):
 
     def __post_init__(self) -> None:
         if self.iterations < 1:
-            raise ValueError(f"iterations is {self.iterations}; there is at least one")
+            raise ValueError(f"iterations is {self.iterations}; use at least one")
 
     def fit_driver(
         self,
@@ -138,7 +138,7 @@ class SteiglitzMcBride(AbstractEstimator):
         )
 
     def describe(self) -> Description:
-        """Its methods section."""
+        """The text for a methods section."""
         return Description(
             words="Steiglitz-McBride",
             text="Z_th and the load were estimated as discrete filters by at most "
@@ -151,14 +151,14 @@ class SteiglitzMcBride(AbstractEstimator):
 
 @dataclasses.dataclass(frozen=True)
 class EquationError(SteiglitzMcBride):
-    """The first iteration of Steiglitz and McBride's: least squares of the equation error."""
+    """The first iteration of Steiglitz-McBride: least squares of the equation error."""
 
     name = "equation_error"
 
     iterations: int = dataclasses.field(default=1, init=False)
 
     def describe(self) -> Description:
-        """Its methods section."""
+        """The text for a methods section."""
         return Description(
             words="equation error",
             text="Z_th and the load were estimated as discrete filters by least squares of the "

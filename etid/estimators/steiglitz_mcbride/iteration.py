@@ -1,19 +1,19 @@
 """The paper's baseline: Steiglitz-McBride on the discrete filters, eqs. (1)-(12).
 
-Both stages identify a rational filter N/D with X N/D = W. The output error W − X N/D is made linear
-in (N, D) by prefiltering both records with the denominator of the iteration before (Steiglitz &
-McBride 1965),
+Both stages identify a rational filter N/D with X N/D = W. Both records are prefiltered with the
+denominator of the previous iteration. This makes the output error W − X N/D linear in (N, D)
+(Steiglitz & McBride 1965),
 
     minimise  ∮ |X N_i/D_{i−1} − W D_i/D_{i−1}|² dz/z,      D_{−1} = 1          (1), (2)
 
-Iteration 0 alone is the *equation error* estimate. Driver and skin differ in their X and W only:
+Iteration 0 alone is the *equation error* estimate. Driver and skin differ only in X and W:
 
     driver:  X = V_out,          W = R_L (V_th − V_out),   N/D = Z_th      (5), (6)
     skin:    X = V_th − V_out,   W = Z_th V_out,           N/D = Z_bio     (8), (9)
 
-The iteration does not settle on most recordings and its fixed point is biased by noise, because X
-and W share the noise of V_out. What is returned is the iterate whose *simulated* terminal voltage
-fits best (RRSE, eq. 3), with its verdict.
+On most recordings the iteration does not converge. Its fixed point is biased by noise, because X
+and W share the noise of V_out. The result is the iterate whose *simulated* terminal voltage fits
+best (RRSE, eq. 3).
 """
 
 from collections.abc import Callable
@@ -43,9 +43,9 @@ class Iterate(eqx.Module):
 
     Attributes:
         filter: N/D in z⁻¹.
-        rrse: Of the terminal voltage it predicts (eq. 3), infinite if that cannot be simulated.
-        iteration: At which it was found, 0 being equation error.
-        converged: Whether the *last* iterations settled.
+        rrse: RRSE of the predicted terminal voltage (eq. 3); infinite if it cannot be simulated.
+        iteration: Number of its iteration; 0 is equation error.
+        converged: Whether the *last* iterations converged.
         stable: Whether N/D itself is stable.
         closed_loop_stable: Whether the driver loaded with this circuit is stable.
     """
@@ -59,6 +59,7 @@ class Iterate(eqx.Module):
 
 
 def _delayed(v: Float[Array, "record time"], lags: range) -> Float[Array, "record time lag"]:
+    """Copies of the records, delayed by each lag."""
     time = v.shape[-1]
     return jnp.stack([jnp.pad(v, ((0, 0), (k, 0)))[:, :time] for k in lags], axis=-1)
 
@@ -78,9 +79,9 @@ def iterate(
         w: Output records W.
         zeros: Order of N.
         poles: Order of D.
-        assess: RRSE of the voltage that a candidate predicts, and whether its closed loop is
-            stable.
-        iterations: How many; 1 is equation error.
+        assess: Function that returns the RRSE of the voltage that a candidate predicts, and
+            whether its closed loop is stable.
+        iterations: Number of iterations; 1 is equation error.
     """
     one = jnp.ones(1, x.dtype)
 
@@ -105,11 +106,10 @@ def iterate(
         change = jnp.linalg.norm(candidate.den - previous) / jnp.linalg.norm(candidate.den)
         stable = is_stable(candidate.den)
         current = Iterate(candidate, error, iteration, change < SETTLED, stable, closed_loop_stable)
-        # As long as none can be simulated, the latest is the best there is.
+        # While no iterate can be simulated, keep the latest.
         better = (error < best.rrse) | ~jnp.isfinite(best.rrse)
         best = jax.tree.map(lambda new, old: jnp.where(better, new, old), current, best)
-        # A prefilter must be stable to be run at all; reflecting its poles keeps its magnitude
-        # response.
+        # A prefilter must be stable. Reflected poles give the same magnitude response.
         reflected = reflect_poles(jnp.where(jnp.isfinite(candidate.den), candidate.den, prefilter))
         return (best, jnp.where(stable, candidate.den, reflected), candidate.den), change
 
@@ -129,10 +129,9 @@ def iterate(
 def terminal_voltage(
     z_th: Rational, z_load: Rational, v_th: Float[Array, " time"]
 ) -> tuple[Float[Array, " time"], Bool[Array, ""]]:
-    """Predict V_out = V_th · Z_L / (Z_L + Z_th), and say whether that loop is stable.
+    """Predicted V_out = V_th · Z_L / (Z_L + Z_th), and whether the closed loop is stable.
 
-    The closed loop is N_L D_th / (N_L D_th + N_th D_L): a stable Z_th can still give an unstable
-    one.
+    The closed loop is N_L D_th / (N_L D_th + N_th D_L). It can be unstable even if Z_th is stable.
     """
     forward = multiply_polynomials(z_load.num, z_th.den)
     denominator = add_polynomials(forward, multiply_polynomials(z_th.num, z_load.den))
@@ -154,10 +153,10 @@ def driver_filter(
 
     Args:
         v_th: Unloaded voltages [V].
-        v_out: Voltages [V] with the resistors.
+        v_out: Voltages with the resistors [V].
         r_load: The resistors [Ω].
-        order: Number of poles; the numerator has one order less.
-        iterations: How many; 1 is equation error.
+        order: Number of poles; the order of the numerator is one less.
+        iterations: Number of iterations; 1 is equation error.
     """
 
     def assess(candidate):
@@ -184,9 +183,9 @@ def skin_filter(
 
     Args:
         v_th: Unloaded voltage [V].
-        v_out: Voltage [V] with the skin as load.
+        v_out: Voltage with the skin as load [V].
         z_th: Discrete source impedance, a rational function of z⁻¹.
-        iterations: How many; 1 is equation error.
+        iterations: Number of iterations; 1 is equation error.
     """
 
     def assess(candidate):
@@ -206,8 +205,8 @@ def skin_elements(
     R_s = Z(∞),   R_p = Z(0) − R_s,   C_p from |Z(j/(R_p C_p))| = √((R_s+R_p)² + R_s²) / √2
 
     The paper prints the last magnitude as (2 R_s + R_p)/√2, which overestimates C_p (by 38 % for
-    dry skin, 88 % for damp) and has no root for R_s/R_p > 1/√2. Elements come out negative or NaN
-    where the filter is no circuit; nothing is repaired.
+    dry skin, 88 % for damp) and has no root for R_s/R_p > 1/√2. If the filter is no circuit, its
+    elements are negative or NaN; they are not corrected.
 
     Args:
         z_bio: Discrete impedance, a rational function of z⁻¹.
