@@ -142,7 +142,7 @@ def test_what_no_module_has_registered_is_not_described(study):
     fits = etid.identify_skins(study.loaded, driver, method="equation_error")
     unknown = dataclasses.replace(fits, fit=dataclasses.replace(fits.fit, method="by_hand"))
     section = methods_section(StudyFits(unknown, {}, {}))
-    assert "Nothing is known here of the estimator 'by_hand'" in section.warning
+    assert "The estimator 'by_hand' is not registered" in section.warning
     assert not re.search("likelihood|output error|Steiglitz", section.text)
 
 

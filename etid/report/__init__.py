@@ -1,1 +1,1 @@
-"""The page about a study, and its tables, figures and words for a methods section."""
+"""The report on a study: an HTML page with tables, figures and a methods section."""

@@ -1,7 +1,7 @@
-"""What to cite, as BibTeX.
+"""Citations as BibTeX.
 
-The entries are those of `citations.bib`, printed as they stand there. Nothing inside an entry is
-parsed.
+The entries come from `citations.bib` and are printed unchanged, except for the version of etid. The
+fields of an entry are not parsed.
 """
 
 import importlib.metadata
@@ -11,16 +11,16 @@ from collections.abc import Iterable
 
 
 def entries() -> dict[str, str]:
-    """All entries by key, in the order of the file."""
+    """All entries of the file by key, in the order of the file."""
     text = (importlib.resources.files("etid.report") / "citations.bib").read_text("utf-8")
     return {key: entry for entry, key in re.findall(r"(?ms)^(@\w+\{(\w+),$.*?^\})", text)}
 
 
 def bibtex(keys: Iterable[str]) -> str:
-    """The BibTeX entries of some keys, in the order of the file.
+    """The BibTeX entries with these keys, in the order of the file.
 
     Raises:
-        KeyError: There is no entry of that key.
+        KeyError: The file has no entry with one of the keys.
     """
     known, wanted = entries(), set(keys)
     unknown = wanted - known.keys()

@@ -1,6 +1,7 @@
-"""Pictures of a whole study, as clear with 100 000 fits as with ten: no mark for each fit.
+"""Figures of a whole study that stay clear with 100 000 fits, because they do not draw each fit.
 
-Every function returns the picture as SVG, which is the same for the same fits.
+`each_fit` is for small studies: it draws each fit. Every function returns SVG. The SVG is the same
+for the same fits.
 """
 
 import dataclasses
@@ -21,18 +22,18 @@ from etid.report.tables import Components, frequent
 from etid.results.driver import Driver
 from etid.results.fits import Fits
 
-POINTS = 300  # of a curve
-BINS = 40
-FAR = 1e6  # between the ends of an axis, above which it has powers of ten
-NARROW = 3.0  # between the largest and the smallest value, above which an axis is logarithmic
-NAMED = 30  # subjects that have their names below an axis
-CROWD = 120  # subjects that are drawn
-SERIES = 4  # conditions that are told apart
+POINTS = 300  # largest number of points of a curve
+BINS = 40  # largest number of bin edges of a histogram
+FAR = 1e6  # ratio of the ends of an axis; above, the labels are powers of ten
+NARROW = 3.0  # ratio of the largest to the smallest value; above, an axis is logarithmic
+NAMED = 30  # largest number of subjects with names below the axis
+CROWD = 120  # largest number of subjects in a figure
+SERIES = 4  # largest number of conditions in a figure
 QUARTILES, MOST = (0.25, 0.75), (0.05, 0.95)
 
 
 def svg(figure: Figure) -> bytes:
-    """A figure as SVG, without dates and random names."""
+    """A figure as SVG without dates and random names, so that equal figures give equal files."""
     buffer = io.BytesIO()
     with matplotlib.rc_context({"svg.hashsalt": "etid"}):
         figure.savefig(buffer, format="svg", metadata={"Date": None})
@@ -44,7 +45,7 @@ def _positive(values: np.ndarray) -> Float[np.ndarray, " value"]:
 
 
 def _steps(axis: Axes, values: np.ndarray, series: int, label: str) -> None:
-    """An empirical distribution function of at most `POINTS` points."""
+    """Draw an empirical distribution function with at most `POINTS` + 1 points."""
     p = np.linspace(0.0, 1.0, min(POINTS, values.size) + 1)
     axis.step(
         np.quantile(values, p, method="inverted_cdf"), 100 * p, ls=DASHES[series],
@@ -53,7 +54,7 @@ def _steps(axis: Axes, values: np.ndarray, series: int, label: str) -> None:
 
 
 def distributions(fits: Fits) -> bytes:
-    """Part of the successful fits below each value, for each element and condition."""
+    """Distribution functions of the successful fits, for each element and condition."""
     good, units = fits.successful(), fits.circuit.units()
     figure, axes = new_figure(1, len(units), (3.4 * len(units) + 1, 3.0), sharey=True)
     for axis, (name, unit) in zip(axes[0], units.items(), strict=True):
@@ -75,7 +76,7 @@ def distributions(fits: Fits) -> bytes:
 
 
 def _plain(axis: Axes, which: str) -> None:
-    """Write 20 and 50 at a logarithmic axis of few decades, 0.1 and 10 at a longer one."""
+    """Label a logarithmic axis with plain numbers: 10, 20, 50 if it is short, else 0.1, 1, 10."""
     of = axis.xaxis if which == "x" else axis.yaxis
     low, high = sorted(of.get_view_interval())
     if 0 < low and high < FAR * low:
@@ -108,9 +109,10 @@ def quality(chi2: Float[np.ndarray, " fit"], stderr: Float[np.ndarray, " fit"]) 
 
 
 def by_subject(fits: Fits) -> bytes:
-    """Median of each subject, with the middle half and nine tenths of their fits as bars.
+    """Median of each subject, with bars for the middle 50 % and the middle 90 % of the fits.
 
-    Of more than `CROWD` subjects some are drawn, evenly spaced in the order of their medians.
+    If there are more than `CROWD` subjects, the figure shows `CROWD` of them, evenly spaced in the
+    order of their medians.
     """
     good, units = fits.successful(), fits.circuit.units()
     subjects, place = np.unique(good.labels["subject"].astype(str), return_inverse=True)
@@ -150,14 +152,14 @@ def by_subject(fits: Fits) -> bytes:
 
 
 def _thinned(found: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """`CROWD` of the subjects, in the order of their medians."""
+    """Positions and quantiles of at most `CROWD` subjects, in the order of their medians."""
     order = np.argsort(found[2], kind="stable")
     chosen = order[np.linspace(0, order.size - 1, min(CROWD, order.size)).round().astype(int)]
     return np.linspace(0.0, CROWD - 1.0, chosen.size), found[:, chosen]
 
 
 def plain(name: str) -> str:
-    """A name for a picture, where dollar signs would be read as mathematics."""
+    """A name for a figure; dollar signs are escaped, because matplotlib reads them as formulas."""
     return name.replace("$", r"\$")
 
 
@@ -166,7 +168,7 @@ def _short(name: str, length: int = 16) -> str:
 
 
 def _quantiles(place: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Places that occur, and five quantiles of the values at each."""
+    """The places that occur, and five quantiles of the values at each place."""
     order = np.argsort(place, kind="stable")
     where, starts = np.unique(place[order], return_index=True)
     levels = (MOST[0], QUARTILES[0], 0.5, QUARTILES[1], MOST[1])
@@ -175,7 +177,7 @@ def _quantiles(place: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.nd
 
 
 def components(found: Sequence[Components], conditions: Sequence[str]) -> bytes:
-    """What varies and what is error, beside each other on one scale."""
+    """Variations and errors of each element, side by side on one scale."""
     names = list(dict.fromkeys(one.name for one in found))
     parts = list(found[0].parts)
     figure, axes = new_figure(1, len(names), (3.4 * len(names) + 1, 2.6), sharey=True)
@@ -202,7 +204,7 @@ def components(found: Sequence[Components], conditions: Sequence[str]) -> bytes:
 
 
 def each_fit(fits: Fits) -> bytes:
-    """Every fit with its standard error, by subject."""
+    """Each fit with its standard error, by subject."""
     labels = {
         name: np.array([_short(str(label)) for label in fits.labels[name]])
         for name in ("subject", "condition")
@@ -211,5 +213,5 @@ def each_fit(fits: Fits) -> bytes:
 
 
 def drivers(found: Mapping[str, Driver]) -> bytes:
-    """Z_th of some drivers, with bands of two standard errors."""
+    """Z_th of drivers, with bands of two standard errors."""
     return svg(figure_of({_short(name, 60): driver for name, driver in found.items()}))

@@ -1,7 +1,7 @@
 """Tables for the terminal, and one self-contained HTML page of tables and pictures.
 
-The page holds no script, and forbids every request: what a file says about itself, its labels and
-notes, can do no harm, and what is shown offline is what was shown on-line.
+The page has no script and forbids every request. Labels and notes of a file can therefore do no
+harm, and the page looks the same with and without a network.
 """
 
 import base64
@@ -15,8 +15,8 @@ from collections.abc import Sequence
 import jinja2
 import numpy as np
 
-LONG = 60  # characters, above which a cell is broken into lines
-MANY = 12  # rows, above which a table stands below the pictures
+LONG = 60  # characters; a longer cell is broken into lines
+MANY = 12  # rows; a longer table is below the pictures
 
 
 @dataclasses.dataclass(frozen=True)
@@ -25,9 +25,9 @@ class Table:
 
     Args:
         columns: Headings.
-        rows: Cells, as many in each row as there are headings.
+        rows: Rows of cells. Each row has one cell for each heading.
         groups: Headings above the headings, each with the number of columns that it spans.
-        caption: Above the table.
+        caption: Text above the table.
     """
 
     columns: tuple[str, ...]
@@ -57,13 +57,13 @@ class Table:
 
     @property
     def texts(self) -> list[bool]:
-        """Whether each column holds words, which are set to the left."""
+        """Whether each column holds words; such columns are aligned to the left."""
         columns = ([row[i] for row in self.rows if row[i]] for i in range(len(self.columns)))
         return [all(cell[:1].isalpha() for cell in column) for column in columns]
 
 
 def number(value: float | np.floating) -> str:
-    """Two decimals, readable also where an estimate has run away."""
+    """A number with two decimals, or with three digits if it is 10 000 or more."""
     return f"{value:.2f}" if abs(value) < 1e4 else f"{value:.3g}"
 
 
@@ -72,10 +72,10 @@ class Picture:
     """A picture of a page.
 
     Args:
-        caption: Below the picture.
+        caption: Text below the picture.
         svg: The picture.
-        alt: What it shows, for those who cannot see it; the caption if not given.
-        whole: Whether it needs the width of the page, which two others share.
+        alt: Description for readers who cannot see the picture; the caption if not given.
+        whole: Whether the picture needs the whole width of the page. Two other pictures share it.
     """
 
     caption: str
@@ -85,21 +85,21 @@ class Picture:
 
     @property
     def source(self) -> str:
-        """The picture as an address that holds it."""
+        """The picture as a data URL."""
         return f"data:image/svg+xml;base64,{base64.b64encode(self.svg).decode('ascii')}"
 
 
 @dataclasses.dataclass(frozen=True)
 class Section:
-    """A heading of a page and what stands below it.
+    """A section of a page: a heading, text, tables and pictures.
 
     Args:
         heading: The heading.
-        text: Paragraphs, with an empty line between them.
-        warning: A paragraph that must not be overlooked, above the others.
+        text: Paragraphs, separated by empty lines.
+        warning: A paragraph above the others that the reader must not overlook.
         tables: Tables below the paragraphs.
         pictures: Pictures below the tables; above them if a table is long.
-        code: Text to be copied as it is, at the end.
+        code: Text at the end, to be copied unchanged.
     """
 
     heading: str
@@ -117,7 +117,7 @@ class Section:
 
     @property
     def anchor(self) -> str:
-        """What a link to the section calls it."""
+        """Name of the section in a link."""
         return re.sub(r"[^a-z0-9]+", "-", self.heading.lower()).strip("-")
 
     @property
@@ -134,8 +134,8 @@ def write_page(
     Args:
         path: The HTML file.
         title: Title of the page.
-        text: What the page shows, one paragraph.
-        sections: The sections in their order; their headings differ.
+        text: One paragraph that says what the page shows.
+        sections: The sections in their order. No two headings may be equal.
     """
     pages = jinja2.Environment(
         loader=jinja2.PackageLoader("etid.report"),

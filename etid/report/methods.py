@@ -1,6 +1,7 @@
-"""The paragraphs on methods that a paper needs, written from the settings of the fits themselves.
+"""The methods section of a paper, written from the settings of the fits.
 
-Each estimator describes itself; numbers, thresholds included, are those that it uses.
+Each estimator describes itself. The numbers and thresholds in the text are those that the estimator
+uses.
 """
 
 import pathlib
@@ -23,10 +24,10 @@ from etid.results.study_fits import StudyFits
 
 
 def methods_section(found: StudyFits) -> Section:
-    """Methods of a study, ready to be copied into a paper, with what to cite.
+    """Methods of a study as text for a paper, with the BibTeX entries to cite.
 
     Args:
-        found: The fits; without settings the section says what is missing.
+        found: The fits. If they have no settings, the section says what is missing.
     """
     used = {name: described(name) for name in found.fits.fit.method.split(AND)}
     known = [one for one in used.values() if one is not None]
@@ -44,14 +45,14 @@ def methods_section(found: StudyFits) -> Section:
         _computed(settings),
     ]
     warnings = [
-        f"Nothing is known here of the estimator {name!r}: import the module that registers it."
+        f"The estimator {name!r} is not registered: import the module that registers it."
         for name, one in used.items()
         if one is None
     ]
     if settings is None:
         warnings.append(
             "This file of fits does not say from which recordings, with which order of the driver "
-            "and with which versions it was made. Fit again with this version of etid to have it."
+            "and with which versions it was made. Fit again with this version of etid to store it."
         )
     return Section(
         "Methods",
@@ -63,7 +64,7 @@ def methods_section(found: StudyFits) -> Section:
 
 
 def words(method: str) -> str:
-    """The estimators of a fit, or of several, in a sentence."""
+    """The estimators of one or several fits, as words for a sentence."""
     found = {name: described(name) for name in method.split(AND)}
     return " and ".join(name if one is None else one.words for name, one in found.items())
 
@@ -153,9 +154,9 @@ def _errors(used: Sequence[Description], settings: Settings | None) -> str:
     else:
         text += "; ".join(f"those by {one.words} {one.errors}" for one in used) + ". "
     text += (
-        "They are told in two parts: own, the noise of a recording, and shared, the error of the "
-        "driver, which all recordings with one driver have in common and no spread between them "
-        "shows."
+        "They have two parts: own, from the noise of a recording, and shared, from the error of "
+        "the driver. All recordings with one driver share this error, so the spread between them "
+        "does not show it."
     )
     tolerance = settings.r_load_tolerance if settings is not None else 0.0
     if tolerance > 0:
@@ -165,8 +166,8 @@ def _errors(used: Sequence[Description], settings: Settings | None) -> str:
         )
     else:
         text += (
-            " The tolerance of the known resistors is not contained: it passes 1:1 into every "
-            "resistance and inversely into every capacitance."
+            " They do not contain the tolerance of the known resistors. This tolerance passes 1:1 "
+            "into every resistance and inversely into every capacitance."
         )
     return text
 
@@ -193,7 +194,7 @@ def _computed(settings: Settings | None) -> str:
 
 
 def _table(found: StudyFits, settings: Settings) -> Table:
-    """The settings as the file has them."""
+    """The settings of the run as a table."""
     source = "in memory"
     if settings.source:
         source = f"file {settings.source} of {settings.source_size} bytes"

@@ -1,4 +1,4 @@
-"""Waveforms of single fits of a study, if its recordings can be found."""
+"""Waveforms of single fits of a study, if the recordings are found."""
 
 import os
 import pathlib
@@ -20,11 +20,11 @@ from etid.results.study_fits import StudyFits
 
 
 class Recordings:
-    """The recordings that fits were made from, wherever they are now.
+    """The recordings of fits, if they are found.
 
     Attributes:
         study: The recordings; None if they were not found.
-        problem: What is wrong with them, in words; empty if nothing is.
+        problem: A sentence on the problem with the recordings; empty if there is none.
     """
 
     def __init__(
@@ -33,12 +33,12 @@ class Recordings:
         file: pathlib.Path | None,
         given: str | os.PathLike[str] | Study | None,
     ):
-        """Look for them.
+        """Look for the recordings.
 
         Args:
             found: The fits.
-            file: Their file, beside which the recordings may lie.
-            given: The recordings or their file, if they need not be looked for.
+            file: File of the fits; the recordings may be in the same folder.
+            given: The recordings or their file; None to look for them.
 
         Raises:
             RecordingError: `given` is not a file of recordings.
@@ -60,7 +60,7 @@ class Recordings:
         if settings is not None and settings.source_size not in (0, path.stat().st_size):
             self.problem = (
                 f"{path} has changed since the fits were made: it had {settings.source_size} bytes "
-                f"and has {path.stat().st_size} now. What is drawn may not be what was identified."
+                f"and has {path.stat().st_size} now. The waveforms may differ from the fits."
             )
 
     def _look(self, file: pathlib.Path | None) -> None:
@@ -83,17 +83,17 @@ class Recordings:
         self.problem = f"The recordings were not found: there is no {tried}. {remedy}"
 
     def close(self) -> None:
-        """Close the file, if it was opened here."""
+        """Close the file if this object opened it."""
         if self.study is not None and self._opened:
             self.study.close()
 
     def picture(self, path: str, fit: Fit, text: str) -> Picture | None:
-        """One pulse as it was measured and as it is predicted; None if it cannot be read.
+        """One measured and predicted pulse; None if the recording cannot be read.
 
         Args:
-            path: Of the recording.
-            fit: What was identified in it.
-            text: Below the picture.
+            path: Path of the recording.
+            fit: Fit of the recording.
+            text: Text for the caption.
         """
         if self.study is None:
             return None
@@ -117,7 +117,7 @@ class Recordings:
 
 
 def _predicted(recording: Recording, fit: Fit, driver: Driver | None) -> tuple[Figure, str]:
-    """One pulse with its prediction; without one, also why."""
+    """A figure of one pulse, with its prediction or the reason why there is none."""
     values = np.asarray(fit.circuit.values())
     if driver is None:
         return figure_of(recording), "the fits hold no driver for it."

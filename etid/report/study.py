@@ -1,6 +1,6 @@
-"""A study on one page: what was identified, how well, what went wrong, and with which methods.
+"""The report on a study: one page with results, errors, failures and methods.
 
-The page needs no network, prints, and has a few megabytes at most, whatever the number of fits.
+The page needs no network and can be printed. It has a few megabytes at most for any number of fits.
 """
 
 import os
@@ -21,8 +21,8 @@ from etid.results.fits import Fits
 from etid.results.study_fits import StudyFits
 from etid.signals.precision import require_float64
 
-FEW = 300  # fits that are drawn one by one
-DRIVERS = 4  # drawn in one diagram
+FEW = 300  # largest number of fits that are drawn one by one
+DRIVERS = 4  # largest number of drivers in one diagram
 
 
 def write_report(
@@ -34,20 +34,21 @@ def write_report(
 ) -> None:
     """Write a report on the fits of a study: one HTML page that needs no other file.
 
-    It has the verdicts, the drivers, what varies between subjects and recordings apart from what is
-    error, tables and distributions, the worst fits with their waveforms, and a paragraph on methods
-    with its BibTeX.
+    The report shows the verdicts and the drivers. It separates the variation between subjects and
+    recordings from the errors. It has tables, distributions, the worst fits with their waveforms,
+    and a methods section with BibTeX.
 
     Args:
-        fits: File of fits, or what an identification has returned.
+        fits: File of fits, or the result of an identification.
         page: HTML file to write.
-        recordings: The recordings, of which the worst are drawn. If not given, they are looked for
-            where the fits say that they came from, and beside the file of fits; where they are not
-            found, the report says so.
+        recordings: The recordings or their file, for the waveforms of the worst fits. If not given,
+            `write_report` looks at the path that is stored with the fits, then in the folder of the
+            file of fits. If it does not find the recordings, the report says so.
         circuit: As in `Fits.read`.
 
     Raises:
-        ValueError: `fits` is not a file of fits, or holds none, or `page` would replace it.
+        ValueError: `fits` is not a file of fits or holds no fit, or `page` would replace a file
+            that is read.
         RecordingError: `recordings` is not a file of recordings.
     """
     from etid.report.recordings import Recordings  # matplotlib is imported by the first picture
@@ -90,7 +91,7 @@ def _same(one: str | os.PathLike[str], other: str | os.PathLike[str]) -> bool:
 
 
 def summary(found: StudyFits) -> str:
-    """The study in two sentences."""
+    """Two sentences on the study."""
     fits, settings = found.fits, found.settings
     good = fits.counts().get("successful", 0)
     source = pathlib.Path(settings.source).name if settings is not None else ""
@@ -121,9 +122,8 @@ def _drivers(found: StudyFits) -> Section:
         text = "These fits do not say with which driver they were made."
         return Section("Drivers", warning=text)
     text = (
-        "The source impedance Z_th, identified from calibrations with known resistors R_L. Its "
-        "error passes into all fits made with it. χ² is 1 where the model explains a record down "
-        "to its noise."
+        "The source impedance Z_th was identified from calibrations with known resistors R_L. Its "
+        "error passes into all fits made with it. χ² is 1 if the residual is noise only."
     )
     count = len(found.drivers) + len(found.failures)
     if count > study_tables.ROWS:
@@ -150,13 +150,13 @@ def _elements(fits: Fits, groups: Sequence[Mapping[str, Any]]) -> Section:
         return Section("Elements", warning="No fit is successful: there is nothing to average.")
     units = fits.circuit.units()
     text = (
-        "What varies and what is error, apart. Between subjects: standard deviation of their "
-        "medians. Between recordings: what really varies between the recordings of one subject in "
-        "one condition, sqrt(spread² - own²), the median over subjects; 0 if noise explains all. "
-        "Own error: standard error due to the noise of one recording. Shared error: standard error "
-        "due to the driver, which all recordings with that driver have in common, so that no "
-        "spread shows it and no number of trials reduces it. An empty cell is what the study "
-        "cannot tell."
+        "Variations and errors, separated. Between subjects: standard deviation of the medians of "
+        "the subjects. Between recordings: variation between the recordings of one subject in one "
+        "condition without the noise, sqrt(spread² - own²), the median over subjects; 0 if noise "
+        "explains all of the spread. Own error: standard error from the noise of one recording. "
+        "Shared error: standard error from the driver. All recordings with that driver share it: "
+        "the spread does not show it, and more trials do not reduce it. A cell is empty if the "
+        "study cannot determine the number."
     )
     conditions = len(set(map(str, fits.labels["condition"])))
     if conditions > study_tables.CONDITIONS:
@@ -191,8 +191,8 @@ def _subjects(fits: Fits, groups: Sequence[Mapping[str, Any]]) -> Section:
 
     good = fits.successful()
     text = (
-        "Medians of the successful fits, to two digits of their standard error; and in per cent of "
-        "the median what really varies between the recordings, their own error and the shared one."
+        "Medians of the successful fits, to two digits of their standard error. In per cent of the "
+        "median: the variation between the recordings, their own error and their shared error."
     )
     pictures = ()
     if len(good) > FEW:
@@ -264,9 +264,9 @@ def _quality(fits: Fits, stderr: np.ndarray) -> Section:
 
 def _worst(fits: Fits, place: Any) -> Section:
     text = (
-        "First some without success, of as many verdicts as there are and in each those with the "
-        "largest χ²; then the successful ones with the largest χ² and with the largest standard "
-        "error. One pulse of each is drawn. Where the model is right, the residual is noise."
+        "First fits without success: for each verdict those with the largest χ². Then successful "
+        "fits with the largest χ² and with the largest standard error. One pulse of each is drawn. "
+        "If the model is right, the residual is noise."
     )
     pictures, missing = [], []
     for one in choose(fits):
@@ -277,5 +277,5 @@ def _worst(fits: Fits, place: Any) -> Section:
         else:
             pictures.append(picture)
     if missing:
-        text += f"\n\nWithout a waveform, because they cannot be read: {', '.join(missing)}."
+        text += f"\n\nThese recordings cannot be read and have no waveform: {', '.join(missing)}."
     return Section("Worst fits", text, (), tuple(pictures), warning=place.problem)

@@ -1,6 +1,7 @@
-"""Tables of a study: verdicts, drivers, elements by group, and where their variance comes from.
+"""Tables of a study: verdicts, drivers, elements by group, and the sources of their variance.
 
-They stay readable for any number of fits: a long one is cut to `ROWS`, and says so.
+The tables stay readable for any number of fits: a long table is cut to `ROWS` rows, and the page
+says so.
 """
 
 import dataclasses
@@ -17,14 +18,14 @@ from etid.results.driver import ContinuousDriver, Driver
 from etid.results.fits import Fits
 from etid.results.verdicts import message
 
-ROWS = 100  # of a table, above which it is cut
-CONDITIONS = 30  # of a table
-BRIEF = 50  # rows of a table that lists single recordings
-PARTS = ("between", "own", "shared")  # of a spread, as `Fits.summary` has them
+ROWS = 100  # largest number of rows of a table
+CONDITIONS = 30  # largest number of conditions in a table
+BRIEF = 50  # largest number of rows of a table of single recordings
+PARTS = ("between", "own", "shared")  # keys of `Fits.summary`
 
 
 def significant(value: float, digits: int = 2) -> str:
-    """A number to some significant digits; empty where there is none."""
+    """A number with `digits` significant digits; empty if it is not finite."""
     if not math.isfinite(value):
         return ""
     if abs(value) >= 1e6 or 0 < abs(value) < 1e-4:
@@ -33,13 +34,13 @@ def significant(value: float, digits: int = 2) -> str:
 
 
 def element(value: float, error: float, unit: str) -> str:
-    """An element with its standard error, both in the unit in which they are printed."""
+    """An element with its standard error, both in the printed unit; empty if it is NaN."""
     scale = DISPLAY[unit][0]
     return " ".join(plus_minus(value / scale, error / scale).split()) if value == value else ""
 
 
 def verdicts(fits: Fits) -> Table:
-    """How often each verdict occurs, and what it means."""
+    """Frequency and meaning of each verdict."""
     rows = tuple(
         (name, str(count), f"{100 * count / len(fits):.1f}", message(name))
         for name, count in fits.counts().items()
@@ -50,7 +51,7 @@ def verdicts(fits: Fits) -> Table:
 def drivers(
     found: Mapping[tuple[str, ...], Driver], failures: Mapping[tuple[str, ...], str]
 ) -> Table:
-    """All drivers, those that failed first; at most `ROWS`."""
+    """The drivers, failed ones first; at most `ROWS`."""
     rows = [
         (_calibrations(paths), "", "", "", "failed", "", "", "", text)
         for paths, text in failures.items()
@@ -96,20 +97,20 @@ def _at_1_khz(driver: Driver) -> tuple[complex, float]:
 
 @dataclasses.dataclass(frozen=True)
 class Components:
-    """Where the variance of one element in one condition comes from, each part over the median.
+    """Variations and errors of one element in one condition, relative to the median.
 
     Attributes:
         condition: The condition.
         name: The element.
-        subjects: How many have a success.
-        successful: Fits.
-        median: Of all [SI].
-        low: Their quantile of 5 % [SI].
-        high: Their quantile of 95 % [SI].
+        subjects: Number of subjects with a successful fit.
+        successful: Number of successful fits.
+        median: Median of the successful fits [SI].
+        low: 5 % quantile of the successful fits [SI].
+        high: 95 % quantile of the successful fits [SI].
         between_subjects: Standard deviation of the medians of the subjects.
-        between_recordings: What really varies between the recordings of one subject.
-        own: Standard error due to the noise of a recording.
-        shared: Standard error due to the driver.
+        between_recordings: Variation between the recordings of one subject, without noise.
+        own: Standard error from the noise of a recording.
+        shared: Standard error from the driver.
     """
 
     condition: str
@@ -126,7 +127,7 @@ class Components:
 
     @property
     def parts(self) -> dict[str, float]:
-        """The parts by name, NaN where the study cannot tell."""
+        """The parts by name; NaN if the study cannot determine them."""
         return {
             "between subjects": self.between_subjects,
             "between recordings": self.between_recordings,
@@ -142,7 +143,7 @@ def frequent(fits: Fits, count: int) -> list[str]:
 
 
 def components(fits: Fits, groups: Sequence[Mapping[str, Any]]) -> list[Components]:
-    """Spread and errors told apart, by element and the most frequent `CONDITIONS`.
+    """Variations and errors of each element, for the `CONDITIONS` most frequent conditions.
 
     Args:
         fits: All fits.
@@ -212,8 +213,9 @@ def groups(rows: Sequence[Mapping[str, Any]], by: Sequence[str], units: Mapping[
     """Medians, spread and errors of each group of a summary.
 
     Args:
-        rows: From `Fits.summary`; above `ROWS` those with the largest share of failures are shown.
-        by: The labels by which it was made.
+        rows: Rows of `Fits.summary`. If there are more than `ROWS`, the table shows those with the
+            largest share of failures.
+        by: Labels of the groups.
         units: Units of the elements.
     """
     shown = list(rows)
@@ -237,7 +239,7 @@ def groups(rows: Sequence[Mapping[str, Any]], by: Sequence[str], units: Mapping[
 
 
 def failures(fits: Fits) -> Table:
-    """The first recordings without success, at most `BRIEF`."""
+    """The first recordings without success; at most `BRIEF`."""
     chosen = np.flatnonzero(fits.verdicts != "successful")[:BRIEF]
     some = fits.take(chosen)
     rows = []

@@ -1,4 +1,4 @@
-"""The fits of a study that are worth a look, and why."""
+"""The worst fits of a study, and the reasons why they are chosen."""
 
 import dataclasses
 from collections.abc import Iterable
@@ -7,7 +7,7 @@ import numpy as np
 
 from etid.results.fits import Fits
 
-FAILED, STRAINED, UNCERTAIN = 6, 3, 3  # how many of each are shown
+FAILED, STRAINED, UNCERTAIN = 6, 3, 3  # largest number of fits of each kind
 
 
 @dataclasses.dataclass(frozen=True)
@@ -15,8 +15,8 @@ class Worst:
     """One of the worst fits.
 
     Attributes:
-        row: Its place among the fits.
-        reason: Why it is one of them.
+        row: Row of the fit.
+        reason: Why the fit is chosen.
     """
 
     row: int
@@ -24,7 +24,7 @@ class Worst:
 
 
 def relative_stderr(fits: Fits) -> np.ndarray:
-    """Largest relative standard error of the elements of each fit; NaN without one."""
+    """Largest relative standard error of the elements of each fit; NaN if one is NaN."""
     ratios = [
         np.asarray(getattr(fits.stderr, name)) / np.abs(np.asarray(getattr(fits.circuit, name)))
         for name in fits.circuit.names()
@@ -36,9 +36,9 @@ def relative_stderr(fits: Fits) -> np.ndarray:
 def choose(fits: Fits) -> list[Worst]:
     """The worst fits: without success, then the largest χ², then the largest standard error.
 
-    Those without success are of as many verdicts as there are, the frequent ones first, so that
-    one cause with many recordings does not hide another. Among those of one verdict, the largest χ²
-    comes first.
+    The fits without success have different verdicts if possible, frequent verdicts first. One cause
+    with many recordings therefore does not hide another. Among the fits with one verdict, the
+    largest χ² comes first.
     """
     names = fits.verdicts
     chi2 = np.where(np.isfinite(fits.chi2), fits.chi2, -np.inf)
@@ -61,12 +61,12 @@ def choose(fits: Fits) -> list[Worst]:
 
 
 def _largest(rows: np.ndarray, size: np.ndarray) -> list[int]:
-    """Rows in falling order of size, those of one size in their order; a few are enough."""
+    """The first rows in descending order of size; rows of equal size keep their order."""
     order = np.argsort(-size[rows], kind="stable")[: FAILED + STRAINED + UNCERTAIN]
     return rows[order].tolist()
 
 
 def _in_turn(queues: Iterable[list[int]], count: int) -> list[int]:
-    """The first of each, then the second of each, and so on."""
+    """The first row of each queue, then the second of each, and so on; at most `count`."""
     ranked = [(place, i, row) for i, queue in enumerate(queues) for place, row in enumerate(queue)]
     return [row for _, _, row in sorted(ranked)][:count]
