@@ -138,7 +138,7 @@ def test_a_driver_serves_another_sample_rate(study):
     fit = etid.identify_skin(study["s01/dry/0"], driver)
     error = np.asarray(fit.circuit.values()) - truth("s01/dry/0")
     assert (np.abs(error) < SIGMAS * np.asarray(fit.stderr.values())).all()
-    with pytest.raises(ValueError, match="one sample rate"):
+    with pytest.raises(ValueError, match="the same sample rate"):
         etid.identify_skin(study["s01/dry/0"], driver, method="steiglitz_mcbride")
 
 

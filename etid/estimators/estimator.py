@@ -22,7 +22,7 @@ from etid.signals.measurement import Measurement
 
 CHECKED = (
     "the records passed the checks for flat, clipped, missing and misplaced samples",
-    "the iteration settled",
+    "the iteration converged",
     "all elements are positive",
     f"the residual does not exceed the noise (χ² per degree of freedom of at most "
     f"{judgement.MISFIT_CHI2:g}, or an unexplained part of at most "

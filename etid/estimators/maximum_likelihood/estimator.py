@@ -85,9 +85,9 @@ class MaximumLikelihood(AbstractEstimator):
             text=HARMONICS + "the load was estimated by maximum likelihood with noise on both "
             "records (Pintelon and Schoukens, 2012, ch. 9): the residual Y - G exp(-jωτ) X of the "
             "loaded record Y and the unloaded record X is weighted by its variance, var Y + |G|² "
-            "var X, G = Z_L / (Z_L + Z_th). Each load was estimated jointly with what the "
-            "calibrations tell of Z_th and of their trigger delays; its own trigger delay τ is one "
-            "more unknown.",
+            "var X, G = Z_L / (Z_L + Z_th). Each load was estimated jointly with Z_th and the "
+            "trigger delays of the calibrations, whose distribution the calibrations give. Its own "
+            "trigger delay τ is one more unknown.",
             conditions=(*CHECKED, DETERMINED, *TESTED),
             of_driver=OF_DRIVER,
             errors=BY_RESIDUALS,

@@ -19,7 +19,8 @@ from etid.signals.transfer import as_complex
 
 # Standard errors; by chance one calibration in two million exceeds this.
 SEEN = 5.0
-# Relative error. Resistors of 0.1 % and meters are better. A smaller error costs elements no more.
+# Relative error. Resistors of 0.1 % and meters are better. A smaller error changes an element by no
+# more than this.
 SIZE = 0.005
 # Part of the excess of chi2 that one wrong resistor must explain. Otherwise the records have
 # another fault, which can imitate a wrong resistor.

@@ -142,9 +142,10 @@ class SteiglitzMcBride(AbstractEstimator):
         return Description(
             words="Steiglitz-McBride",
             text="Z_th and the load were estimated as discrete filters by at most "
-            f"{self.iterations} iterations of Steiglitz and McBride (1965), of which the one that "
-            "predicts the terminal voltage best was kept. It accounts neither for trigger delays "
-            "nor for the noise that both of its regressors share, and gives no standard errors.",
+            f"{self.iterations} iterations of Steiglitz and McBride (1965). The iterate that "
+            "predicts the terminal voltage best was kept. The method accounts neither for trigger "
+            "delays nor for the noise that both of its regressors share, and gives no standard "
+            "errors.",
             conditions=(*CHECKED, NEAR_MINIMUM),
         )
 
