@@ -81,7 +81,7 @@ def identify_driver(
             )
         resistances.append(record.r_load)
     if not 0 <= driver_drift < 1:
-        raise ValueError(f"driver_drift is {driver_drift}; it is a part, such as 0.01")
+        raise ValueError(f"driver_drift is {driver_drift}; it must be at least 0 and below 1")
     if order < 2:
         raise ValueError(f"order is {order}; a source impedance needs at least order 2")
     sizes = {(record.v_th.size, record.sample_rate, record.pulse_rate) for record in records}

@@ -155,8 +155,8 @@ class _Parts:
             changed = sorted(name for name in run if before.get(name) != run[name])
             if changed:
                 raise ResumeError(
-                    f"{self.folder}: was begun with another {' and '.join(changed)}; "
-                    "leave out resume to begin anew"
+                    f"{self.folder}: the earlier run had another {' and '.join(changed)}; "
+                    "leave out resume to start again"
                 )
         with replacing(described) as partial:
             partial.write_text(json.dumps(run), "utf-8")

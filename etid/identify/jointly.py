@@ -63,8 +63,8 @@ from etid.signals.precision import require_float64
 
 METHOD = "joint"
 SINGLE = (
-    "The record or its calibration does not hold several whole pulse periods, which a joint fit "
-    "needs. Record more, or identify it on its own."
+    "The record or its calibration does not hold several whole pulse periods. A joint fit needs "
+    "them. Record more periods, or identify the recording alone."
 )
 register_description(
     METHOD,

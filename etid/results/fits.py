@@ -488,7 +488,7 @@ def _verdicts(table: Table, names: np.ndarray) -> RESULTS:
         return verdicts_of(names)
     except KeyError as error:
         raise RecordingError(
-            f"{error} is no verdict of this version of etid",
+            f"{error} is not a verdict of this version of etid",
             file=table.name,
             field="verdict",
             remedy="Read it with the etid that wrote it",

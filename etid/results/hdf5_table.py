@@ -110,7 +110,7 @@ class Table:
             local_link(self.file, name)
             column = self.file[name]
             if not isinstance(column, h5py.Dataset):
-                raise RecordingError("is no column", remedy=_REMEDY)
+                raise RecordingError("is not a column", remedy=_REMEDY)
             if column.shape is None or column.ndim != 1 + len(shape) or column.shape[1:] != shape:
                 wanted = ", ".join(["fit", *map(str, shape)])
                 raise RecordingError(
