@@ -15,7 +15,6 @@ from etid.estimators.estimator import (
     DETERMINED,
     HARMONICS,
     NEAR_MINIMUM,
-    AbstractEstimator,
     Description,
 )
 from etid.estimators.harmonic_steiglitz_mcbride import iteration
@@ -28,7 +27,7 @@ from etid.estimators.judgement import (
     remarks,
 )
 from etid.estimators.lanes import Harmonics
-from etid.estimators.maximum_likelihood.estimator import MaximumLikelihood
+from etid.estimators.maximum_likelihood.estimator import AbstractByMaximumLikelihood
 from etid.estimators.maximum_likelihood.terms import (
     apart,
     delayed_gain,
@@ -40,20 +39,19 @@ from etid.estimators.maximum_likelihood.terms import (
 )
 from etid.estimators.sandwich import Linear
 from etid.estimators.score_tests import other_circuit
-from etid.estimators.score_tests.unloaded import UnloadedShape, shape_of
+from etid.estimators.score_tests.unloaded import UnloadedShape
 from etid.estimators.unknowns import LoadUnknowns
-from etid.results.driver import ContinuousDriver, Driver
+from etid.results.driver import ContinuousDriver
 from etid.results.fits import Fit
 from etid.results.verdicts import RESULTS, first_verdict
 from etid.signals.harmonics import Spectrum
-from etid.signals.measurement import Measurement
 from etid.signals.transfer import as_complex, frequency_variable, reciprocal, turns
 from etid.solvers.levenberg_marquardt import normal_equations
 from etid.solvers.matrices import root
 
 
 @dataclasses.dataclass(frozen=True)
-class HarmonicSteiglitzMcBride(AbstractEstimator):
+class HarmonicSteiglitzMcBride(AbstractByMaximumLikelihood):
     """SkinRC by Steiglitz-McBride on the harmonics, without bias by noise.
 
     Attributes:
@@ -70,23 +68,6 @@ class HarmonicSteiglitzMcBride(AbstractEstimator):
     def __post_init__(self) -> None:
         if self.iterations < 1:
             raise ValueError(f"iterations is {self.iterations}; use at least one")
-
-    def fit_driver(
-        self,
-        records: Measurement,
-        r_load: Float[Array, " record"],
-        order: int,
-        spectra: Spectrum | None,
-    ) -> Driver:
-        """Identify a driver by maximum likelihood."""
-        return MaximumLikelihood().fit_driver(records, r_load, order, spectra)
-
-    def known(
-        self, driver: Driver, frequency: Float[Array, " harmonic"], shared: bool
-    ) -> UnloadedShape | None:
-        """The unloaded voltage of the calibrations, if it can be compared."""
-        del shared
-        return shape_of(driver, frequency)
 
     def fit_load(
         self,

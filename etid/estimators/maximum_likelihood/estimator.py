@@ -20,6 +20,7 @@ from etid.estimators.maximum_likelihood import given_driver, load
 from etid.estimators.maximum_likelihood.given_driver import GivenDriver
 from etid.estimators.refined_driver import refined_driver
 from etid.estimators.score_tests import missing_pole, other_circuit
+from etid.estimators.score_tests.unloaded import UnloadedShape, shape_of
 from etid.estimators.starts import harmonic_starts
 from etid.results.driver import Driver, HarmonicDriver
 from etid.results.fits import Fit
@@ -94,3 +95,25 @@ class MaximumLikelihood(AbstractEstimator):
             refined=True,
             cited=("pintelon2012", "optimistix2024", "white1980"),
         )
+
+
+@dataclasses.dataclass(frozen=True)
+class AbstractByMaximumLikelihood(AbstractEstimator):
+    """An estimator of loads behind drivers of maximum likelihood, which keep their harmonics."""
+
+    def fit_driver(
+        self,
+        records: Measurement,
+        r_load: Float[Array, " record"],
+        order: int,
+        spectra: Spectrum | None,
+    ) -> Driver:
+        """Identify a driver by maximum likelihood."""
+        return MaximumLikelihood().fit_driver(records, r_load, order, spectra)
+
+    def known(
+        self, driver: Driver, frequency: Float[Array, " harmonic"], shared: bool
+    ) -> UnloadedShape | None:
+        """The unloaded voltage of the calibrations, if it can be compared."""
+        del shared
+        return shape_of(driver, frequency)

@@ -4,7 +4,6 @@ import dataclasses
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
 
 from etid.circuits.circuit import AbstractCircuit
 from etid.estimators.estimator import (
@@ -12,21 +11,18 @@ from etid.estimators.estimator import (
     CHECKED,
     DETERMINED,
     HARMONICS,
-    AbstractEstimator,
     Description,
     serving,
 )
 from etid.estimators.judgement import SUCCESSFUL, judged, unless
 from etid.estimators.lanes import Harmonics
-from etid.estimators.maximum_likelihood.estimator import MaximumLikelihood
+from etid.estimators.maximum_likelihood.estimator import AbstractByMaximumLikelihood
 from etid.estimators.non_parametric.fit import fit_circuit
-from etid.estimators.score_tests.unloaded import UnloadedShape, shape_of
+from etid.estimators.score_tests.unloaded import UnloadedShape
 from etid.estimators.starts import harmonic_starts
 from etid.results.driver import Driver, HarmonicDriver
 from etid.results.fits import Fit
 from etid.results.verdicts import RESULTS
-from etid.signals.harmonics import Spectrum
-from etid.signals.measurement import Measurement
 
 SAME_PULSE_RATE = 1e-3  # relative difference of pulse rates that is allowed, as Z_th is smooth
 # [standard errors] Largest bias that is corrected. The remaining bias is below half of one.
@@ -34,7 +30,7 @@ CORRECTED = 2.0
 
 
 @dataclasses.dataclass(frozen=True)
-class NonParametric(AbstractEstimator):
+class NonParametric(AbstractByMaximumLikelihood):
     """Maximum likelihood without a model of Z_th; calibrations need the same pulse rate."""
 
     name = "non_parametric"
@@ -50,23 +46,6 @@ class NonParametric(AbstractEstimator):
                 f"{self} knows Z_th at harmonics of {known:.6g} Hz only, but the recording has "
                 f"{pulse_rate:.6g} Hz; use method='maximum_likelihood'"
             )
-
-    def fit_driver(
-        self,
-        records: Measurement,
-        r_load: Float[Array, " record"],
-        order: int,
-        spectra: Spectrum | None,
-    ) -> Driver:
-        """Identify a driver by maximum likelihood, which keeps the necessary harmonics."""
-        return MaximumLikelihood().fit_driver(records, r_load, order, spectra)
-
-    def known(
-        self, driver: Driver, frequency: Float[Array, " harmonic"], shared: bool
-    ) -> UnloadedShape | None:
-        """The unloaded voltage of the calibrations, if it can be compared."""
-        del shared
-        return shape_of(driver, frequency)
 
     def fit_load(
         self,
