@@ -28,7 +28,8 @@ from benchmarks.estimators import DEFAULT, FAR, driver_of, is_off, shared
 from benchmarks.failure_axes import Cell, Cole, TwoLayers
 from benchmarks.mappings import make_room
 from etid.circuits.circuit import AbstractCircuit, Resistor, SkinRC
-from etid.estimators.registry import for_calibrations, named
+from etid.estimators.registry import named
+from etid.identify.arguments import for_calibrations
 from etid.recordings.preflight import Inspected
 from etid.results.driver import DiscreteDriver
 from etid.signals.transfer import is_stable

@@ -20,7 +20,7 @@ from benchmarks.ladder import LOADS
 from benchmarks.mappings import make_room
 from benchmarks.perturbation_list import PERTURBATIONS
 from benchmarks.perturbed_study import REFERENCE, Truth, undisturbed
-from etid.estimators.registry import for_calibrations
+from etid.identify.arguments import for_calibrations
 from etid.recordings.preflight import Inspected
 from etid.simulation.scenes import Scene, Trial
 from etid.simulation.transformer import ResistorLoad

@@ -9,8 +9,7 @@ import etid
 from etid.estimators.lanes import Harmonics, PaddedSamples
 from etid.recordings.preflight import Inspected, preflight
 from etid.recordings.remarks import Remark
-from etid.signals.alignment import lag_of, whole_lag
-from etid.signals.pulse_train import find_pulses
+from etid.signals.pulse_train import find_pulses, lag_of, whole_lag
 from etid.simulation.scenes import Scene, Trial
 from etid.simulation.transformer import ResistorLoad, SkinLoad
 

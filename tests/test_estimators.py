@@ -13,6 +13,7 @@ from etid.circuits.circuit import Resistor
 from etid.estimators import registry
 from etid.estimators.estimator import AbstractEstimator, Description
 from etid.estimators.lanes import AlignedSamples
+from etid.identify import arguments
 from etid.report.methods import methods_section
 from etid.results.driver import DiscreteDriver, Driver
 from etid.results.fits import Fit
@@ -157,7 +158,7 @@ def test_what_no_module_has_registered_is_not_described(study):
 )
 def test_what_is_no_estimator_is_refused(method, says):
     with pytest.raises(ValueError, match=re.escape(says)):
-        registry.estimator_of(method)
+        arguments.estimator_of(method)
 
 
 def test_two_estimators_of_one_name_are_refused():

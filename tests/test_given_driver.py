@@ -10,7 +10,7 @@ import etid
 from etid.estimators.estimate import DELAY_WIDTH, prior
 from etid.estimators.registry import MAXIMUM_LIKELIHOOD
 from etid.signals.harmonics import spectrum
-from etid.signals.measurement import noise
+from etid.signals.noise import noise
 from etid.simulation.scenes import Scene, Trial
 from etid.simulation.transformer import ResistorLoad
 

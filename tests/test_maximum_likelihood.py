@@ -1,6 +1,8 @@
 """Maximum likelihood on the harmonics: exact without noise, joint with its calibrations."""
 
 import dataclasses
+import pathlib
+import sys
 
 import jax.numpy as jnp
 import numpy as np
@@ -12,6 +14,7 @@ from etid.circuits.circuit import SkinRC
 from etid.circuits.elements import resistor
 from etid.estimators import registry
 from etid.estimators.maximum_likelihood import terms as likelihood
+from etid.identify import arguments
 from etid.identify import many as batch
 from etid.identify.one import skin_lane
 from etid.recordings.preflight import Inspected
@@ -22,6 +25,7 @@ DRY = SkinLoad(r_s=33.4e3, r_p=186e3, c_p=0.12e-9)
 SAMPLES = 10_000
 SHORT = 3332  # less than a period; filled up like those of a period, which other tests fit
 SIGMAS = 5.0  # one in 2 million for a normal error
+FILES = 15  # that a reader of `identify_skin` opens at most
 
 
 def simulate(trials=1, resistors=(98.8e3,), samples=SAMPLES, seed=0, **options):
@@ -61,6 +65,28 @@ def test_trigger_delays_of_a_tenth_of_a_sample_leave_every_trial_within_its_erro
     assert (np.abs(wrong) / np.array(dataclasses.astuple(DRY)) < 0.02).all()
 
 
+def test_a_fit_passes_through_few_files(study, driver):
+    folder = pathlib.Path(etid.__file__).parent
+    record = study["loaded/0"]
+    etid.identify_skin(record, driver)  # compiles
+    entered: set[str] = set()
+
+    def note(frame, event, _):
+        if event == "call":
+            entered.add(frame.f_code.co_filename)
+
+    before = sys.getprofile()
+    sys.setprofile(note)
+    try:
+        etid.identify_skin(record, driver)
+    finally:
+        sys.setprofile(before)
+    found = {path for path in map(pathlib.Path, entered) if path.is_relative_to(folder)}
+    assert folder / "identify" / "one.py" in found
+    names = " ".join(sorted(path.relative_to(folder).as_posix() for path in found))
+    assert len(found) <= FILES, names
+
+
 def test_the_gain_is_that_of_the_divider(driver):
     frequency = jnp.array([60.0, 5e3, 60e3])
     g = likelihood.gain(driver.source, resistor(jnp.asarray(98.8e3)), frequency)
@@ -94,7 +120,7 @@ def short(study):
 def test_a_record_without_a_whole_period_is_told_so_or_goes_to_output_error(short, driver):
     with pytest.raises(etid.IdentificationError, match="not_periodic"):
         etid.identify_skin(short, driver, method="maximum_likelihood")
-    assert registry.plan(None, Inspected(short), driver) == (registry.OUTPUT_ERROR, None)
+    assert arguments.plan(None, Inspected(short), driver) == (registry.OUTPUT_ERROR, None)
 
 
 @pytest.mark.slow

@@ -27,7 +27,7 @@ from etid.estimators.score_tests.other_circuit import GRID, relaxations
 from etid.estimators.score_tests.other_in_time import HIGHEST, relaxed, score
 from etid.estimators.unknowns import Nuisance
 from etid.results.driver import SourceImpedance
-from etid.signals.measurement import Measurement
+from etid.signals.noise import Measurement
 from etid.simulation.scenes import Trial
 
 RATE = 200e3

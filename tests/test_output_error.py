@@ -31,7 +31,7 @@ from etid.estimators.sandwich import Curvature
 from etid.identify.one import skin
 from etid.recordings.preflight import Inspected
 from etid.results.driver import SourceImpedance
-from etid.signals.measurement import Measurement
+from etid.signals.noise import Measurement
 from etid.simulation.scenes import Scene, Trial
 from etid.simulation.transformer import ResistorLoad, SkinLoad
 

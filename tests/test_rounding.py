@@ -6,7 +6,7 @@ import pytest
 import etid
 from etid.recordings.preflight import Inspected
 from etid.recordings.remarks import Remark
-from etid.signals import rounding
+from etid.signals import noise
 from etid.signals.harmonics import harmonics
 from etid.simulation import scenes
 from etid.simulation.scenes import Scene
@@ -34,7 +34,7 @@ def as_float(recording):
 def test_the_step_is_seen_in_the_values(bits, snr_db):
     recording = study_of(bits=bits, snr_db=snr_db)["calibration/98k8"]
     step = Inspected(recording).step_out
-    np.testing.assert_allclose(rounding.step_of(recording.v_out), step, rtol=1e-6)
+    np.testing.assert_allclose(noise.step_of(recording.v_out), step, rtol=1e-6)
 
 
 @pytest.mark.parametrize("snr_db", [20.0, 60.0, 80.0])
@@ -52,7 +52,7 @@ def test_noise_below_a_step_is_seen_in_the_codes():
         v = np.round(ramp + sigma * rng.standard_normal(ramp.size))
         # 2 200 and 6 700 changes of the code, known to 2 %; at 0.3 steps the zones in which it
         # changes begin to overlap, and two changes in one direction are not counted.
-        assert rounding.noise_of(v, step) == pytest.approx(sigma, rel=0.08, abs=0.001)
+        assert noise.noise_of_codes(v, step) == pytest.approx(sigma, rel=0.08, abs=0.001)
 
 
 @pytest.mark.parametrize("samples", [10_000, 9999])  # nor does it fold what repeats exactly
@@ -64,7 +64,7 @@ def test_the_size_of_the_rounding_error_is_known_at_each_harmonic(samples):
     coarse = study_of(bits=8, **settings)["calibration/98k8"]
     step = Inspected(coarse).step_out
     error = np.abs(harmonics(coarse.v_out - exact.v_out, 3, samples)) ** 2
-    known = rounding.variance(coarse.v_out, step, 3, samples)
+    known = noise.rounding_variance(coarse.v_out, step, 3, samples)
     bands = [slice(0, 10), slice(10, 100), slice(100, 1000)]
     ratio = np.array([error[band].mean() / known[band].mean() for band in bands])
     # One draw of an error of few independent parts, weighed as at most three times as large.

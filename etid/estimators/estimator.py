@@ -18,7 +18,7 @@ from etid.estimators.lanes import AbstractLane
 from etid.results.driver import ContinuousDriver, Driver
 from etid.results.fits import Fit
 from etid.signals.harmonics import Spectrum
-from etid.signals.measurement import Measurement
+from etid.signals.noise import Measurement
 
 CHECKED = (
     "the records passed the checks for flat, clipped, missing and misplaced samples",

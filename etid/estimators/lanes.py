@@ -20,10 +20,10 @@ from jaxtyping import Array, Bool, Complex, Float, Int
 from etid.circuits.circuit import AbstractCircuit
 from etid.recordings.preflight import Inspected
 from etid.results.driver import Driver
-from etid.signals import mains, rounding
-from etid.signals.alignment import rest, shifted
+from etid.signals import mains
 from etid.signals.harmonics import ALIASED, Spectrum, spectrum
-from etid.signals.measurement import Measurement, measure, noise, trusted
+from etid.signals.noise import Measurement, measure, noise, rounding_variance, trusted
+from etid.signals.pulse_train import rest, shifted
 
 LEFT = 0.75  # samples; a larger delay needs a second fit. The prior of a delay is 0.5 wide
 STEPS = 4  # lengths per octave; the padding is at most a fifth
@@ -117,7 +117,7 @@ class Harmonics(AbstractLane):
             (seen.recorded_out, seen.coarse_out, variance_y),
         ):
             if step > 0:
-                rounded = rounding.variance(v, step, *seen.periods)
+                rounded = rounding_variance(v, step, *seen.periods)
                 variance[: rounded.size] = rounded
         selected = selected & ~seen.covered(frequency)
         one = cls(frequency, x, y, variance_x, variance_y, selected, rate)

@@ -19,7 +19,7 @@ from etid.estimators.steiglitz_mcbride import iteration
 from etid.results.driver import ContinuousDriver, HarmonicDriver, SourceImpedance
 from etid.results.verdicts import RESULTS, first_verdict
 from etid.signals.harmonics import Spectrum
-from etid.signals.measurement import Measurement
+from etid.signals.noise import Measurement
 
 PASSIVE = 2.0  # standard errors by which Re Z_th may be negative
 BAND = np.linspace(0.0003, 0.4, 400)  # of the sample rate; the source must be passive there

@@ -1,20 +1,14 @@
-"""The estimators by name, and the default estimator of a recording."""
+"""The estimators by name."""
 
 import ast
 import dataclasses
-from collections.abc import Sequence
 
-from etid.circuits.circuit import AbstractCircuit
 from etid.estimators.estimator import AbstractEstimator, Description
 from etid.estimators.harmonic_steiglitz_mcbride.estimator import HarmonicSteiglitzMcBride
 from etid.estimators.maximum_likelihood.estimator import MaximumLikelihood
 from etid.estimators.non_parametric.estimator import NonParametric
 from etid.estimators.output_error.estimator import OutputError
 from etid.estimators.steiglitz_mcbride.estimator import EquationError, SteiglitzMcBride
-from etid.recordings.preflight import Inspected, preflight
-from etid.results.driver import Driver, HarmonicDriver
-from etid.signals.harmonics import separates_aliases
-from etid.signals.precision import require_float64
 
 Method = str | AbstractEstimator  # a name in the registry, or an estimator with its options
 MAXIMUM_LIKELIHOOD = MaximumLikelihood()
@@ -83,71 +77,3 @@ def described(method: str) -> Description | None:
         return named(method).describe()
     except ValueError:
         return None
-
-
-def estimator_of(
-    method: Method | None, circuit: AbstractCircuit | None = None
-) -> AbstractEstimator | None:
-    """The requested estimator; None if `method` is None, so that each recording gets its default.
-
-    Raises:
-        ValueError: No estimator has this name, or the estimator cannot identify this circuit.
-    """
-    require_float64()
-    if method is None:
-        return None
-    estimator = method if isinstance(method, AbstractEstimator) else named(str(method))
-    if circuit is not None:
-        estimator.check_circuit(circuit)
-    return estimator
-
-
-def check_default(estimator: AbstractEstimator, circuit: AbstractCircuit) -> None:
-    """Raise ValueError if the default estimator cannot identify this circuit."""
-    try:
-        estimator.check_circuit(circuit)
-    except ValueError as error:
-        raise ValueError(
-            "the record holds less than two whole pulse periods or begins in a pulse, or its "
-            f"driver was identified without harmonics; {str(error).partition(';')[0]}. Record "
-            "three periods or more and identify the driver with method='maximum_likelihood', or "
-            "ask for method='maximum_likelihood', whose standard errors do not include the "
-            "effect of aliases in a single period"
-        ) from error
-
-
-def for_calibrations(
-    asked: AbstractEstimator | None, recordings: Sequence[Inspected]
-) -> AbstractEstimator:
-    """The requested estimator, or the default estimator of calibrations.
-
-    The default is maximum likelihood if all records hold several periods. Otherwise it is output
-    error. If aliases and harmonics cannot be separated, as in a single period, the bias of maximum
-    likelihood exceeds its standard errors.
-    """
-    if asked is not None:
-        return asked
-    several = all(separates_aliases(*seen.periods) and seen.is_periodic for seen in recordings)
-    return MAXIMUM_LIKELIHOOD if several else OUTPUT_ERROR
-
-
-def for_samples(driver: Driver, periods: tuple[int, int]) -> AbstractEstimator:
-    """The default estimator of arrays with this number of whole periods and samples."""
-    several = isinstance(driver, HarmonicDriver) and separates_aliases(*periods)
-    return MAXIMUM_LIKELIHOOD if several else OUTPUT_ERROR
-
-
-def plan(
-    asked: AbstractEstimator | None, seen: Inspected, driver: Driver
-) -> tuple[AbstractEstimator, str | None]:
-    """The estimator of a load, and the verdict that excludes a fit; None if it can be fitted.
-
-    Raises:
-        ValueError: The estimator cannot use this driver.
-    """
-    name = preflight(seen, periodic=asked is not None and asked.lane.periodic)
-    estimator = asked or OUTPUT_ERROR
-    if name is None and isinstance(driver, HarmonicDriver):
-        estimator = for_calibrations(asked, [seen])
-    estimator.check_driver(driver, seen.recording.sample_rate, seen.recording.pulse_rate)
-    return estimator, name

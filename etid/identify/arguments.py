@@ -1,14 +1,23 @@
-"""Checks of argument types: a wrong type is refused with a message before any computation."""
+"""Checks of arguments, and the estimator that they select, before any computation.
+
+A wrong type, a wrong method or the wrong precision of JAX is refused with a message.
+"""
 
 import operator
 import reprlib
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import Any
 
+import jax
+
 from etid.circuits.circuit import AbstractCircuit, SkinRC
+from etid.estimators.estimator import AbstractEstimator
+from etid.estimators.registry import MAXIMUM_LIKELIHOOD, OUTPUT_ERROR, Method, named
+from etid.recordings.preflight import Inspected, preflight
 from etid.recordings.recording import Recording, RecordingError
 from etid.recordings.study import Study
-from etid.results.driver import Driver
+from etid.results.driver import Driver, HarmonicDriver
+from etid.signals.harmonics import separates_aliases
 
 LARGEST_ORDER = 50  # ten times the order of the paper; memory grows with the square of the order
 
@@ -18,6 +27,20 @@ _REMEDIES: dict[type, str] = {
     Study: "Open a file with etid.read, or use etid.Study.from_recordings",
     AbstractCircuit: "Pass a circuit, as in etid.SkinRC()",
 }
+
+
+def require_float64() -> None:
+    """Raise unless JAX runs in float64.
+
+    Raises:
+        RuntimeError: JAX runs in float32. The filters would lose 4 to 9 digits without a warning.
+    """
+    if not jax.config.read("jax_enable_x64"):
+        raise RuntimeError(
+            "etid needs float64, and JAX is running in float32. Before making JAX arrays, call\n"
+            '    jax.config.update("jax_enable_x64", True)\n'
+            "or set the environment variable JAX_ENABLE_X64=1."
+        )
 
 
 def require(field: str, value: object, kind: type, remedy: str = "") -> None:
@@ -95,3 +118,74 @@ def order_of(value: Any) -> int:
     if order > LARGEST_ORDER:
         raise RecordingError(f"is {order}, too many poles", field="order", remedy=remedy)
     return order  # `identify_driver` refuses an order below 2
+
+
+# --- The estimator --------------------------------------------------------------------------------
+
+
+def estimator_of(
+    method: Method | None, circuit: AbstractCircuit | None = None
+) -> AbstractEstimator | None:
+    """The requested estimator; None if `method` is None, so that each recording gets its default.
+
+    Raises:
+        ValueError: No estimator has this name, or the estimator cannot identify this circuit.
+    """
+    require_float64()
+    if method is None:
+        return None
+    estimator = method if isinstance(method, AbstractEstimator) else named(str(method))
+    if circuit is not None:
+        estimator.check_circuit(circuit)
+    return estimator
+
+
+def check_default(estimator: AbstractEstimator, circuit: AbstractCircuit) -> None:
+    """Raise ValueError if the default estimator cannot identify this circuit."""
+    try:
+        estimator.check_circuit(circuit)
+    except ValueError as error:
+        raise ValueError(
+            "the record holds less than two whole pulse periods or begins in a pulse, or its "
+            f"driver was identified without harmonics; {str(error).partition(';')[0]}. Record "
+            "three periods or more and identify the driver with method='maximum_likelihood', or "
+            "ask for method='maximum_likelihood', whose standard errors do not include the "
+            "effect of aliases in a single period"
+        ) from error
+
+
+def for_calibrations(
+    asked: AbstractEstimator | None, recordings: Sequence[Inspected]
+) -> AbstractEstimator:
+    """The requested estimator, or the default estimator of calibrations.
+
+    The default is maximum likelihood if all records hold several periods. Otherwise it is output
+    error. If aliases and harmonics cannot be separated, as in a single period, the bias of maximum
+    likelihood exceeds its standard errors.
+    """
+    if asked is not None:
+        return asked
+    several = all(separates_aliases(*seen.periods) and seen.is_periodic for seen in recordings)
+    return MAXIMUM_LIKELIHOOD if several else OUTPUT_ERROR
+
+
+def for_samples(driver: Driver, periods: tuple[int, int]) -> AbstractEstimator:
+    """The default estimator of arrays with this number of whole periods and samples."""
+    several = isinstance(driver, HarmonicDriver) and separates_aliases(*periods)
+    return MAXIMUM_LIKELIHOOD if several else OUTPUT_ERROR
+
+
+def plan(
+    asked: AbstractEstimator | None, seen: Inspected, driver: Driver
+) -> tuple[AbstractEstimator, str | None]:
+    """The estimator of a load, and the verdict that excludes a fit; None if it can be fitted.
+
+    Raises:
+        ValueError: The estimator cannot use this driver.
+    """
+    name = preflight(seen, periodic=asked is not None and asked.lane.periodic)
+    estimator = asked or OUTPUT_ERROR
+    if name is None and isinstance(driver, HarmonicDriver):
+        estimator = for_calibrations(asked, [seen])
+    estimator.check_driver(driver, seen.recording.sample_rate, seen.recording.pulse_rate)
+    return estimator, name

@@ -12,10 +12,10 @@ from jaxtyping import Array, Float
 
 from etid.estimators.estimator import AbstractEstimator
 from etid.estimators.lanes import AlignedSamples, Harmonics, stacked
-from etid.estimators.registry import Method, estimator_of, for_calibrations
+from etid.estimators.registry import Method
 from etid.estimators.score_tests import resistors
 from etid.identify import changes
-from etid.identify.arguments import order_of, recordings
+from etid.identify.arguments import estimator_of, for_calibrations, order_of, recordings
 from etid.identify.compiled import stored_jit
 from etid.identify.one import checksum, explained, needs_another, of_both
 from etid.recordings.preflight import Inspected, preflight

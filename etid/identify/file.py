@@ -31,8 +31,8 @@ from tqdm import tqdm
 from etid.circuits.circuit import AbstractCircuit
 from etid.circuits.lookup import qualified
 from etid.estimators.estimator import AbstractEstimator
-from etid.estimators.registry import Method, estimator_of
-from etid.identify.arguments import circuit_of, order_of
+from etid.estimators.registry import Method
+from etid.identify.arguments import circuit_of, estimator_of, order_of
 from etid.identify.many import Drivers, identify_part, to_identify
 from etid.recordings.hdf5 import read
 from etid.recordings.recording import RecordingError

@@ -16,11 +16,10 @@ import optimistix as optx
 from jaxtyping import Array, Complex, Float
 
 from etid.circuits.circuit import AbstractCircuit
-from etid.identify.arguments import circuit_of
+from etid.identify.arguments import circuit_of, require_float64
 from etid.identify.compiled import stored_jit
 from etid.results.fits import Fit, IdentificationError, complex_rrse
 from etid.results.verdicts import RESULTS, first_verdict, message, verdict
-from etid.signals.precision import require_float64
 from etid.solvers.levenberg_marquardt import LevenbergMarquardt, best_start
 from etid.solvers.matrices import inverse
 

@@ -36,7 +36,7 @@ from etid.estimators.maximum_likelihood.estimator import OF_DRIVER, TESTED
 from etid.estimators.registry import register_description
 from etid.estimators.score_tests.unloaded import shape_of
 from etid.estimators.starts import harmonic_starts
-from etid.identify.arguments import circuit_of, order_of, require
+from etid.identify.arguments import circuit_of, order_of, require, require_float64
 from etid.identify.compiled import stored_jit
 from etid.identify.many import (
     LANES,
@@ -59,7 +59,6 @@ from etid.results.fits import Fit
 from etid.results.provenance import Settings
 from etid.results.study_fits import StudyFits
 from etid.results.verdicts import RESULTS, verdict
-from etid.signals.precision import require_float64
 
 METHOD = "joint"
 SINGLE = (

@@ -23,14 +23,8 @@ from tqdm import tqdm
 from etid.circuits.circuit import AbstractCircuit
 from etid.estimators.estimator import AbstractEstimator
 from etid.estimators.lanes import AbstractLane, stacked
-from etid.estimators.registry import (
-    MAXIMUM_LIKELIHOOD,
-    Method,
-    check_default,
-    estimator_of,
-    plan,
-)
-from etid.identify.arguments import circuit_of, order_of, require
+from etid.estimators.registry import MAXIMUM_LIKELIHOOD, Method
+from etid.identify.arguments import check_default, circuit_of, estimator_of, order_of, plan, require
 from etid.identify.arguments import recordings as several
 from etid.identify.compiled import stored_jit
 from etid.identify.driver import identify_driver

@@ -14,15 +14,16 @@ from etid.circuits.circuit import AbstractCircuit
 from etid.estimators.estimator import AbstractEstimator
 from etid.estimators.judgement import MISFIT_CHI2
 from etid.estimators.lanes import AbstractLane, Harmonics
-from etid.estimators.registry import (
-    Method,
+from etid.estimators.registry import Method
+from etid.identify import changes
+from etid.identify.arguments import (
     check_default,
+    circuit_of,
     estimator_of,
     for_samples,
     plan,
+    require,
 )
-from etid.identify import changes
-from etid.identify.arguments import circuit_of, require
 from etid.identify.compiled import stored_jit
 from etid.recordings.preflight import Inspected
 from etid.recordings.recording import Recording
@@ -305,8 +306,16 @@ def failed_fit(name: str, circuit: AbstractCircuit, method: str) -> Fit:
     scalar = np.asarray(np.nan)
     none = changes.unknown(size)
     return Fit(
-        *(empty, nan, nan, scalar, scalar, verdict(name), np.asarray(0), method),
-        *(np.zeros((), int), none.size, none.stderr),
+        circuit=empty,
+        cov=nan,
+        shared_cov=nan,
+        rrse=scalar,
+        chi2=scalar,
+        result=verdict(name),
+        steps=np.asarray(0),
+        method=method,
+        change=none.size,
+        change_stderr=none.stderr,
     )
 
 

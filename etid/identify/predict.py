@@ -11,14 +11,13 @@ from etid.estimators.lanes import AlignedSamples
 from etid.estimators.output_error import fit as output_error
 from etid.estimators.output_error import prediction
 from etid.estimators.registry import OUTPUT_ERROR
-from etid.identify.arguments import circuit_of, require
+from etid.identify.arguments import circuit_of, require, require_float64
 from etid.identify.compiled import stored_jit
 from etid.identify.steady_state import periodic_voltage
 from etid.recordings.preflight import Inspected
 from etid.recordings.recording import Recording
 from etid.results.driver import ContinuousDriver, Driver
 from etid.signals.filtering import TAPS
-from etid.signals.precision import require_float64
 
 
 @stored_jit

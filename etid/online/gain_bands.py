@@ -31,7 +31,7 @@ import numpy as np
 from jaxtyping import Array, Complex, Float
 
 from etid.signals.harmonics import ALIASED
-from etid.signals.measurement import RIPPLE
+from etid.signals.noise import RIPPLE
 from etid.signals.transfer import as_complex, power
 
 RELATIVE = 16  # frequency of a band over its width

@@ -52,7 +52,7 @@ from etid.estimators.maximum_likelihood.given_driver import GivenDriver, combine
 from etid.estimators.registry import MAXIMUM_LIKELIHOOD, register_description
 from etid.estimators.starts import circuit_starts
 from etid.estimators.unknowns import LoadUnknowns
-from etid.identify.arguments import circuit_of
+from etid.identify.arguments import circuit_of, require_float64
 from etid.identify.compiled import stored_jit
 from etid.identify.one import explained, known_at
 from etid.online.gain_bands import cut, unloaded_bands
@@ -70,7 +70,6 @@ from etid.recordings.recording import Recording
 from etid.results.driver import Driver, HarmonicDriver
 from etid.results.fits import Fit, Fits, IdentificationError, described
 from etid.results.verdicts import RESULTS, first_verdict, message, verdicts_of
-from etid.signals.precision import require_float64
 from etid.signals.transfer import as_complex, power, reciprocal
 from etid.solvers.matrices import inverse, inverse_of_few
 

@@ -11,7 +11,7 @@ from etid.recordings.fields import LABELS
 from etid.recordings.recording import Recording
 from etid.results.driver import Driver
 from etid.results.fits import Fit, rrse
-from etid.signals.measurement import noise
+from etid.signals.noise import noise
 from etid.simulation.transformer import loading
 
 BEFORE, AFTER = 0.15e-3, 1.2e-3  # [s] time shown before and after the first edge of a pulse

@@ -8,15 +8,20 @@ from jaxtyping import Bool, Float
 
 from etid.recordings.recording import Recording
 from etid.recordings.remarks import Remark
-from etid.signals import rounding
-from etid.signals.alignment import lag_of, shifted, whole_lag
 from etid.signals.disturbances import Joint, disturbed, joint, of_source
 from etid.signals.filtering import TAPS
 from etid.signals.harmonics import ALIASED, whole_periods
 from etid.signals.mains import Hum, separated
-from etid.signals.measurement import trusted
-from etid.signals.noise import noise_std
-from etid.signals.pulse_train import CLOCK, PulseTrain, find_pulses, rise_time
+from etid.signals.noise import is_coarse, noise_std, step_of, trusted
+from etid.signals.pulse_train import (
+    CLOCK,
+    PulseTrain,
+    find_pulses,
+    lag_of,
+    rise_time,
+    shifted,
+    whole_lag,
+)
 
 SHORTEST = 4 * TAPS + 104  # [samples] edges of the interpolation, and 104 samples for the fit
 # [standard deviations] peak-to-peak value that noise alone hardly exceeds; a signal must exceed it
@@ -124,8 +129,8 @@ class Inspected:
         return self._coarse(self.whole_out, self.step_out)
 
     def _coarse(self, v: Float[np.ndarray, " time"], told: float) -> float:
-        step = told or rounding.step_of(v)
-        return step if rounding.is_coarse(v, step) else 0.0
+        step = told or step_of(v)
+        return step if is_coarse(v, step) else 0.0
 
     @functools.cached_property
     def hum_th(self) -> Hum | None:

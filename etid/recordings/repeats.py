@@ -27,7 +27,7 @@ from jaxtyping import Complex, Float
 
 from etid.recordings.preflight import Inspected
 from etid.signals.harmonics import fast_length
-from etid.signals.measurement import RIPPLE
+from etid.signals.noise import RIPPLE
 from etid.signals.pulse_train import RATE
 
 BAND = 0.25  # largest frequency relative to the sample rate; above it aliases exceed the load

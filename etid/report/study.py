@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from etid.circuits.circuit import AbstractCircuit
+from etid.identify.arguments import require_float64
 from etid.recordings.fields import DESCRIBING
 from etid.recordings.study import Study
 from etid.report import tables as study_tables
@@ -19,7 +20,6 @@ from etid.report.methods import methods_section, words
 from etid.report.worst_fits import choose, relative_stderr
 from etid.results.fits import Fits
 from etid.results.study_fits import StudyFits
-from etid.signals.precision import require_float64
 
 FEW = 300  # largest number of fits that are drawn one by one
 DRIVERS = 4  # largest number of drivers in one diagram

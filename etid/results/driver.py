@@ -20,7 +20,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Complex, Float, Int
 
 from etid.recordings.remarks import texts
-from etid.results.verdicts import RESULTS, message, verdict_names
+from etid.results.verdicts import RESULTS, Judged, message
 from etid.signals.filtering import StateSpace
 from etid.signals.harmonics import Spectrum
 from etid.signals.transfer import (
@@ -154,7 +154,7 @@ class Calibration(eqx.Module):
     mismatch: Float[Array, "2 record"] | None = None
 
 
-class Driver(eqx.Module):
+class Driver(Judged):
     """An identified driver: the fields and methods that all kinds of drivers have.
 
     The kinds are `DiscreteDriver`, `ContinuousDriver` and `HarmonicDriver`. Only ratios to Z_th are
@@ -188,11 +188,6 @@ class Driver(eqx.Module):
     def order(self) -> int:
         """Number of poles."""
         return self.a.shape[0] - 1
-
-    @property
-    def verdict(self) -> str:
-        """Name of the verdict."""
-        return verdict_names(self.result).item()
 
     @abc.abstractmethod
     def response(self, frequency: Float[Array, "..."]) -> Complex[Array, "..."]:

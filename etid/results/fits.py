@@ -20,7 +20,7 @@ from etid.recordings.fields import DESCRIBING, Label, wanted_labels
 from etid.recordings.recording import RecordingError
 from etid.recordings.remarks import remarks_of, texts, words
 from etid.results.hdf5_table import Table, opened_table, same_length, write_table
-from etid.results.verdicts import RESULTS, message, verdict_names, verdicts_of
+from etid.results.verdicts import RESULTS, Judged, message, verdicts_of
 
 SCHEMA = "etid/fits"
 # Columns that describe each recording: its path, its labels, and numbers.
@@ -71,7 +71,7 @@ class IdentificationError(RuntimeError):
         self.outcome = outcome
 
 
-class Fit(eqx.Module):
+class Fit(Judged):
     """One identified circuit, or a batch of them along a leading axis.
 
     Attributes:
@@ -113,12 +113,6 @@ class Fit(eqx.Module):
         values = jnp.sqrt(jnp.where(variance >= 0, variance, jnp.nan))
         names = self.circuit.names()
         return type(self.circuit)(**{name: values[..., i] for i, name in enumerate(names)})
-
-    @property
-    def verdict(self) -> Any:
-        """Name of the verdict; an array of names for a batch."""
-        names = verdict_names(self.result)
-        return names.item() if names.ndim == 0 else names
 
     @property
     def elements(self) -> tuple[str, ...]:

@@ -4,6 +4,9 @@
 the cause, then the remedy.
 """
 
+from typing import Any
+
+import equinox as eqx
 import jax
 import numpy as np
 import optimistix as optx
@@ -129,6 +132,22 @@ def verdict_names(result: RESULTS) -> np.ndarray:
     """Names of the verdicts of all lanes, as an array of strings of the same shape."""
     values = np.asarray(result._value)
     return np.vectorize(_NAMES.__getitem__, otypes=[object])(values).astype(str)
+
+
+class Judged(eqx.Module):
+    """An outcome with a verdict, or a batch of outcomes.
+
+    Attributes:
+        result: The verdict; for a batch, the verdict of each lane.
+    """
+
+    result: eqx.AbstractVar[RESULTS]
+
+    @property
+    def verdict(self) -> Any:
+        """Name of the verdict; an array of names for a batch."""
+        value = np.asarray(self.result._value)
+        return verdict_names(self.result) if value.ndim else _NAMES[value.item()]
 
 
 def verdicts_of(names: np.ndarray) -> RESULTS:

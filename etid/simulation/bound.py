@@ -22,8 +22,7 @@ from jaxtyping import Complex, Float
 
 from etid.circuits.circuit import AbstractCircuit, Resistor, SkinRC
 from etid.circuits.display import DISPLAY
-from etid.identify.arguments import require
-from etid.signals.precision import require_float64
+from etid.identify.arguments import require, require_float64
 from etid.simulation.scenes import Scene, Trial
 from etid.simulation.transformer import ResistorLoad, SkinLoad, loading
 from etid.solvers.matrices import inverse

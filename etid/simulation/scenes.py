@@ -27,10 +27,10 @@ import numpy as np
 from jaxtyping import Complex, Float
 
 from etid.circuits.circuit import AbstractCircuit
+from etid.identify.arguments import require_float64
 from etid.recordings.fields import tidy_path
 from etid.recordings.recording import Recording, Samples
 from etid.recordings.study import Study
-from etid.signals.precision import require_float64
 from etid.simulation.published import BUILT, FINGERTIPS, REFERENCE, TABLE_1, TYPICAL
 from etid.simulation.transformer import (
     Impedance,

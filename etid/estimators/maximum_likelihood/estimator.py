@@ -26,7 +26,7 @@ from etid.results.driver import Driver, HarmonicDriver
 from etid.results.fits import Fit
 from etid.results.verdicts import RESULTS
 from etid.signals.harmonics import Spectrum
-from etid.signals.measurement import Measurement
+from etid.signals.noise import Measurement
 
 TESTED = (
     "score tests against a relaxation that is spread over time constants (at "

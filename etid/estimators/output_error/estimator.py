@@ -17,7 +17,7 @@ from etid.results.driver import ContinuousDriver, Driver, HarmonicDriver
 from etid.results.fits import Fit
 from etid.results.verdicts import RESULTS
 from etid.signals.harmonics import Spectrum
-from etid.signals.measurement import Measurement
+from etid.signals.noise import Measurement
 from etid.signals.transfer import Rational
 
 # Part of the signal that the interpolation may leave unexplained. At 100 kHz and 80 dB it leaves

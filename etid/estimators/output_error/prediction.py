@@ -22,7 +22,7 @@ from jaxtyping import Array, Float, Int
 from etid.estimators.unknowns import Nuisance
 from etid.results.driver import SourceImpedance, loaded
 from etid.signals.filtering import CUTOFF, TAPS, StateSpace, band_limited, hold, shiftable, simulate
-from etid.signals.measurement import Measurement
+from etid.signals.noise import Measurement
 from etid.signals.transfer import Rational
 
 IMPULSE = 256  # length of the impulse response whose squares are summed [samples]

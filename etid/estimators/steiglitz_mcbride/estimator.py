@@ -20,7 +20,7 @@ from etid.results.driver import DiscreteDriver, Driver
 from etid.results.fits import Fit
 from etid.results.verdicts import RESULTS, first_verdict
 from etid.signals.harmonics import Spectrum
-from etid.signals.measurement import Measurement
+from etid.signals.noise import Measurement
 from etid.signals.transfer import Rational
 from etid.solvers.levenberg_marquardt import normal_equations
 
