@@ -120,7 +120,7 @@ def parser() -> argparse.ArgumentParser:
 class _Version(argparse.Action):
     """Print the versions for a bug report, and exit."""
 
-    def __init__(self, **options: Any):
+    def __init__(self, **options: Any) -> None:
         super().__init__(nargs=0, **options)
 
     def __call__(self, parser: argparse.ArgumentParser, *_: Any) -> None:

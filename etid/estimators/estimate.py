@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+from collections.abc import Callable
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -54,7 +55,9 @@ class Estimate(eqx.Module):
     hum: Bool[Array, ""] = eqx.field(default_factory=lambda: jnp.zeros((), bool))
 
 
-def prior(start: SourceImpedance, sample_rate: Float[Array, ""], r_load: Float[Array, ""]):
+def prior(
+    start: SourceImpedance, sample_rate: Float[Array, ""], r_load: Float[Array, ""]
+) -> Callable[[Float[Array, " parameter"]], Float[Array, " term"]]:
     """Weak prior of the modal parameters, as additional residuals.
 
     Without a prior, a pole that a noisy recording does not determine would diverge, for example to
@@ -99,7 +102,7 @@ def prior(start: SourceImpedance, sample_rate: Float[Array, ""], r_load: Float[A
     _, unflatten = ravel_pytree(start)
     frequency = jnp.asarray(PASSIVE_BAND) * sample_rate
 
-    def regularise(parameters):
+    def regularise(parameters: Float[Array, " parameter"]) -> Float[Array, " term"]:
         active = jnp.minimum(unflatten(parameters).response(frequency).real, 0.0)
         return jnp.concatenate([(parameters - centre) / width, active / (1e-3 * r_load)])
 

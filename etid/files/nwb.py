@@ -70,7 +70,7 @@ def write_nwb(
 class _Samples(GenericDataChunkIterator):
     """The stored samples of one record; they are read only while they are written."""
 
-    def __init__(self, source: AbstractSource, record: Layout):
+    def __init__(self, source: AbstractSource, record: Layout) -> None:
         self.source, self.record = source, record
         whole = (record.length,)
         super().__init__(buffer_shape=whole, chunk_shape=whole)

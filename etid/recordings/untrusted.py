@@ -140,7 +140,7 @@ class Attributes:
     is opened when the first such text is found.
     """
 
-    def __init__(self, path: str):
+    def __init__(self, path: str) -> None:
         self._path = path
         self._second: h5py.File | None = None
         self._open = contextlib.ExitStack()

@@ -35,7 +35,7 @@ class Table:
     groups: tuple[tuple[str, int], ...] = ()
     caption: str = ""
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         for row in self.rows:
             if len(row) != len(self.columns):
                 raise ValueError(f"row {row} has {len(row)} cells for {len(self.columns)} columns")

@@ -32,7 +32,7 @@ class Recordings:
         found: StudyFits,
         file: pathlib.Path | None,
         given: str | os.PathLike[str] | Study | None,
-    ):
+    ) -> None:
         """Look for the recordings.
 
         Args:

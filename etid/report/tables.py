@@ -160,7 +160,7 @@ def components(fits: Fits, groups: Sequence[Mapping[str, Any]]) -> list[Componen
             medians = np.array([group[name] for group in rows])
             values = np.asarray(getattr(chosen.circuit, name))
 
-            def part(key: str, of=name, rows=rows) -> float:
+            def part(key: str, of: str = name, rows: Sequence[Mapping[str, Any]] = rows) -> float:
                 ratios = np.array([group[f"{of}_{key}"] / group[of] for group in rows])
                 known = ratios[np.isfinite(ratios)]
                 return float(np.median(known)) if known.size else math.nan

@@ -46,7 +46,7 @@ class Table:
     remedy.
     """
 
-    def __init__(self, file: h5py.File, name: str):
+    def __init__(self, file: h5py.File, name: str) -> None:
         self.file = file
         self.name = name
 

@@ -1,12 +1,13 @@
 """Steiglitz-McBride on the harmonics, judged by the likelihood with a fixed Z_th."""
 
 import dataclasses
+from collections.abc import Callable
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Complex, Float
 
 from etid.circuits.circuit import AbstractCircuit, SkinRC
 from etid.estimators.estimator import (
@@ -86,7 +87,7 @@ class HarmonicSteiglitzMcBride(AbstractByMaximumLikelihood):
         physical = jnp.isfinite(best.rrse)  # if not, the elements do not matter
         elements = jnp.where(physical, values, SkinRC().values())
 
-        def terms(q, spectrum):
+        def terms(q: Float[Array, " q"], spectrum: Spectrum) -> Float[Array, " part"]:
             of, f = LoadUnknowns.of(q), spectrum.frequency
             load = best.circuit.with_log_values(of.log_elements).impedance()
             return residual(spectrum, delayed_gain(source, load, f, of.delay_samples, sample_rate))
@@ -164,13 +165,17 @@ def _is_another(
     vector, unflatten = ravel_pytree(driver.source)
     deviations = root(driver.cov).T
 
-    def along(function, at, directions):
+    def along(
+        function: Callable[[Float[Array, " q"]], Complex[Array, " harmonic"]],
+        at: Float[Array, " q"],
+        directions: Float[Array, "direction q"],
+    ) -> Complex[Array, "direction harmonic"]:
         return jax.vmap(lambda of: jax.jvp(function, (at,), (of,))[1])(directions)
 
-    def load(log_values):
+    def load(log_values: Float[Array, " element"]) -> Complex[Array, " harmonic"]:
         return circuit.with_log_values(log_values).impedance()(s)
 
-    def of_gain(_):
+    def of_gain(_) -> tuple[Complex[Array, " harmonic"], Complex[Array, "slope harmonic"]]:
         """The gain, and its derivatives with respect to all parameters and changes."""
         z_th = unflatten(vector).response(f)
         z, changes = other_circuit.changes(circuit.impedance(), f)
@@ -187,7 +192,7 @@ def _is_another(
 
     g, slopes = apart(of_gain, own.vector())
 
-    def of_residual(_):
+    def of_residual(_) -> tuple[Float[Array, "slope part"], Float[Array, " part"]]:
         # At the X estimated from both records: the noise of one record is in the residual too.
         [clean], [share] = denoised([spectrum], [g])
         weight = jnp.where(spectrum.selected, jnp.sqrt(2 / variance(spectrum, g)), 0.0)

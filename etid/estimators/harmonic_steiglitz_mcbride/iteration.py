@@ -82,14 +82,18 @@ class _Products(NamedTuple):
     xy: Complex[Array, " harmonic"]
     z_th: Complex[Array, " harmonic"]
 
-    def loaded(self, q: Float[Array, " coefficient"]):
+    def loaded(
+        self, q: Float[Array, " coefficient"]
+    ) -> tuple[Complex[Array, " harmonic"], Complex[Array, " harmonic"]]:
         """N and N + Z_th D."""
         b0, b1, a1, _ = q
         n = jax.lax.complex(jnp.full_like(self.omega, b0), b1 * self.omega)
         d = jax.lax.complex(jnp.ones_like(self.omega), a1 * self.omega)
         return n, n + self.z_th * d
 
-    def solve(self, q: Float[Array, " coefficient"], turn: Complex[Array, " harmonic"]):
+    def solve(
+        self, q: Float[Array, " coefficient"], turn: Complex[Array, " harmonic"]
+    ) -> Float[Array, " coefficient"]:
         """b₀, b₁, a₁ and τ of the next iteration."""
         omega, used, xx, yy, xy, z_th = self
         v = xy * turn - as_complex(yy)
@@ -129,7 +133,9 @@ def _products(spectrum: Spectrum, z_th: Complex[Array, " harmonic"]) -> _Product
     )
 
 
-def _turn(q: Float[Array, " coefficient"], frequency: Float[Array, " harmonic"]):
+def _turn(
+    q: Float[Array, " coefficient"], frequency: Float[Array, " harmonic"]
+) -> Complex[Array, " harmonic"]:
     """e^(jωτ)."""
     return turns(q[3] / RATE * frequency[0], frequency.size)
 
@@ -140,6 +146,9 @@ def _elements(q: Float[Array, " coefficient"]) -> SkinRC:
     r_s = b1 / a1
     r_p = b0 - r_s
     return SkinRC(r_s, r_p, a1 / RATE / r_p)
+
+
+_Carry = tuple[Iterate, Float[Array, " coefficient"], Complex[Array, " harmonic"]]
 
 
 def fit_skin(
@@ -160,7 +169,7 @@ def fit_skin(
     used = spectrum.selected
     measured = jnp.where(used, spectrum.y, 0.0)
 
-    def step(carry, iteration):
+    def step(carry: _Carry, iteration: Int[Array, ""]) -> tuple[_Carry, Bool[Array, ""]]:
         best, previous, turn = carry
         q = of.solve(previous, turn)
         a1, tau = q[2:]
@@ -216,12 +225,17 @@ def covariance(
     q = jnp.stack([of.r_s + of.r_p, of.r_s * a1, a1, RATE * delay])
     parameters, unflatten = ravel_pytree(source)
 
-    def following(q, x, y, parameters):
+    def following(
+        q: Float[Array, " coefficient"],
+        x: Float[Array, "2 harmonic"],
+        y: Float[Array, "2 harmonic"],
+        parameters: Float[Array, " parameter"],
+    ) -> Float[Array, " coefficient"]:
         there = eqx.tree_at(lambda s: (s.x, s.y), spectrum, (as_one(x), as_one(y)))
         z_th = unflatten(parameters).response(spectrum.frequency)
         return _products(there, z_th).solve(q, _turn(q, spectrum.frequency))
 
-    def as_one(parts):
+    def as_one(parts: Float[Array, "2 harmonic"]) -> Complex[Array, " harmonic"]:
         return jax.lax.complex(parts[0], parts[1])
 
     x, y = (jnp.stack([v.real, v.imag]) for v in (spectrum.x, spectrum.y))
@@ -231,7 +245,10 @@ def covariance(
     _, pullback = jax.vjp(lambda *data: following(q, *data), x, y, parameters)
     by_x, by_y, by_source = jax.vmap(pullback)(rows)
 
-    def of_noise(slope, variance):  # half of the variance in each of both parts
+    def of_noise(
+        slope: Float[Array, "element 2 harmonic"], variance: Float[Array, " harmonic"]
+    ) -> Float[Array, "element element"]:
+        # Half of the variance is in each of both parts.
         return jnp.einsum("ipk,jpk,k->ij", slope, slope, variance / 2)
 
     own = of_noise(by_x, noise * spectrum.variance_x) + of_noise(by_y, noise * spectrum.variance_y)

@@ -16,7 +16,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import optimistix as optx
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Complex, Float
 
 from etid.estimators.estimate import Estimate
 from etid.estimators.joint.terms import DriverStudy, Loads, over
@@ -33,6 +33,8 @@ from etid.estimators.unknowns import LoadUnknowns
 from etid.results.fits import complex_rrse
 from etid.signals.transfer import reciprocal
 from etid.solvers.matrices import inverse
+
+_Sums = tuple[Float[Array, "record x common"], Float[Array, "common common"]]
 
 
 class _Eliminated(eqx.Module):
@@ -103,7 +105,14 @@ def estimates(
         lanes, sums, fitted, strict=True
     ):
 
-        def one(load, own, eliminated, result, records=records, sums_of=sums_of):
+        def one(
+            load: Loads,
+            own: LoadUnknowns,
+            eliminated: _Eliminated,
+            result: optx.RESULTS,
+            records: int = records,
+            sums_of: Float[Array, "record x common"] = sums_of,
+        ) -> tuple[Estimate, Bool[Array, ""]]:
             chi2, rrse = _misfit(study, load, common, own)
             shared = eliminated.slope @ cov @ eliminated.slope.T
             private = eliminated.cov
@@ -137,12 +146,16 @@ def _of_elements(cov: Float[Array, "own own"]) -> Float[Array, "element element"
     return LoadUnknowns.of(LoadUnknowns.of(cov).log_elements.T).log_elements
 
 
-def _residual(study: DriverStudy, load: Loads, common, own) -> Float[Array, " part"]:
+def _residual(
+    study: DriverStudy, load: Loads, common: Float[Array, " common"], own: LoadUnknowns
+) -> Float[Array, " part"]:
     """Residual of a load, without the prior of its delay."""
     return study.of_load(load, common, own)[: 2 * load.spectrum.x.size]
 
 
-def _misfit(study: DriverStudy, load: Loads, common, own):
+def _misfit(
+    study: DriverStudy, load: Loads, common: Float[Array, " common"], own: LoadUnknowns
+) -> tuple[Float[Array, ""], Float[Array, ""]]:
     """χ² and RRSE of a load."""
     squares = jnp.sum(_residual(study, load, common, own) ** 2)
     freedom = 2 * jnp.sum(load.spectrum.selected, dtype=squares.dtype) - study.owned
@@ -153,7 +166,13 @@ def _misfit(study: DriverStudy, load: Loads, common, own):
 
 
 def _is_another(
-    study: DriverStudy, load: Loads, common, own, eliminated: _Eliminated, bread, score
+    study: DriverStudy,
+    load: Loads,
+    common: Float[Array, " common"],
+    own: LoadUnknowns,
+    eliminated: _Eliminated,
+    bread: Float[Array, "common common"],
+    score: Float[Array, "common common"],
 ) -> Bool[Array, ""]:
     """Score test of one load; `bread` and `score` are those of `common` from all terms."""
     linear = _linear(study, load, common, own)
@@ -179,7 +198,9 @@ def _is_another(
     return found.seen() & load.used  # a load that takes no part has its own verdict
 
 
-def _by_changes(study: DriverStudy, load: Loads, common, own) -> Float[Array, "change part"]:
+def _by_changes(
+    study: DriverStudy, load: Loads, common: Float[Array, " common"], own: LoadUnknowns
+) -> Float[Array, "change part"]:
     """Derivatives of the denoised terms of a load with respect to changes of its circuit."""
     model, f = study.model, load.spectrum.frequency
     g = model.gain(own, common, load.spectrum, load.sample_rate)
@@ -192,13 +213,15 @@ def _by_changes(study: DriverStudy, load: Loads, common, own) -> Float[Array, "c
     (*known, spectrum), _ = denoised([*model.calibrations.records, load.spectrum], gains)
     informed = model.informed(spectrum, common, known)
 
-    def row(change):
+    def row(change: Complex[Array, " harmonic"]) -> Float[Array, " part"]:
         return jax.jvp(lambda g: residual(informed, g), (g,), (by_z * change,))[1]
 
     return jax.lax.map(row, changes)
 
 
-def _linear(study: DriverStudy, load: Loads, common, own) -> Linear:
+def _linear(
+    study: DriverStudy, load: Loads, common: Float[Array, " common"], own: LoadUnknowns
+) -> Linear:
     """Terms of a load, linear in (common, own) around their minimum."""
     model, c = study.model, common.shape[0]
     gains = [
@@ -207,7 +230,7 @@ def _linear(study: DriverStudy, load: Loads, common, own) -> Linear:
     ]
     (*known, spectrum), shares = denoised([*model.calibrations.records, load.spectrum], gains)
 
-    def terms(q):
+    def terms(q: Float[Array, " q"]) -> Float[Array, " term"]:
         return model.of_load(LoadUnknowns.of(q[c:]), q[:c], spectrum, load.sample_rate, known)
 
     jacobian = jax.jacfwd(terms)(jnp.concatenate([common, own.vector()]))
@@ -216,7 +239,9 @@ def _linear(study: DriverStudy, load: Loads, common, own) -> Linear:
     return Linear(jacobian.T, weights(shares[-1:], count), weights([noise], count))
 
 
-def _eliminated(study: DriverStudy, load: Loads, common, own) -> _Eliminated:
+def _eliminated(
+    study: DriverStudy, load: Loads, common: Float[Array, " common"], own: LoadUnknowns
+) -> _Eliminated:
     """A load whose own parameters are eliminated."""
     return _without_own(_linear(study, load, common, own).curvature(), common.shape[0])
 
@@ -228,7 +253,13 @@ def _eliminated(study: DriverStudy, load: Loads, common, own) -> _Eliminated:
 # on the terms is propagated to `common` and to every load.
 
 
-def _influence(study: DriverStudy, common, load: Loads, own, eliminated: _Eliminated):
+def _influence(
+    study: DriverStudy,
+    common: Float[Array, " common"],
+    load: Loads,
+    own: LoadUnknowns,
+    eliminated: _Eliminated,
+) -> tuple[Float[Array, "x common"], Float[Array, "x own"]]:
     """Effect of unit noise in X on the score of `common`, and on the own parameters."""
     jacobian = _linear(study, load, common, own).jacobian.T
     known = study.model.informed(load.spectrum, common, study.model.calibrations.records)
@@ -246,7 +277,14 @@ def _influence(study: DriverStudy, common, load: Loads, own, eliminated: _Elimin
     return by_x[:, :c] + by_x[:, c:] @ eliminated.slope, by_x[:, c:] @ eliminated.bread
 
 
-def _sums(study: DriverStudy, common, loads: Loads, owns, found: _Eliminated, records: int):
+def _sums(
+    study: DriverStudy,
+    common: Float[Array, " common"],
+    loads: Loads,
+    owns: LoadUnknowns,
+    found: _Eliminated,
+    records: int,
+) -> _Sums:
     """Sum of the effects of each shared record on the score of `common`.
 
     The second result is the covariance of the score that this correlation adds.
@@ -256,7 +294,7 @@ def _sums(study: DriverStudy, common, loads: Loads, owns, found: _Eliminated, re
     if not records:
         return start
 
-    def add(carry, lane):
+    def add(carry: _Sums, lane: tuple[Loads, LoadUnknowns, _Eliminated]) -> tuple[_Sums, None]:
         load, own, eliminated = lane
         sums, alone = carry
         mine, _ = _influence(study, common, load, own, eliminated)
@@ -267,7 +305,14 @@ def _sums(study: DriverStudy, common, loads: Loads, owns, found: _Eliminated, re
     return sums, jnp.einsum("rxc,rxd->cd", sums, sums) - alone
 
 
-def _by_x(study: DriverStudy, common, load: Loads, own, eliminated: _Eliminated, sums):
+def _by_x(
+    study: DriverStudy,
+    common: Float[Array, " common"],
+    load: Loads,
+    own: LoadUnknowns,
+    eliminated: _Eliminated,
+    sums: Float[Array, "record x common"],
+) -> tuple[Float[Array, "own own"], Float[Array, "own common"]]:
     """Covariance of the own parameters of a load by the noise of a shared X.
 
     The second result is their covariance with the effect of this noise on the score of `common`

@@ -59,10 +59,10 @@ def _equations(_, y: Float[Array, " parameter"], study: DriverStudy) -> Arrowhea
     """Normal equations of a study, load by load."""
     common, parts = study.split(y)
 
-    def of_group(loads, owns):
+    def of_group(loads: Loads, owns: LoadUnknowns) -> NormalEquations:
         driver = _around(study, common, loads)
 
-        def one(load, own):
+        def one(load: Loads, own: LoadUnknowns) -> NormalEquations:
             lane = _lane(study, driver, load)
             part, jacobian = lane.jacobian(jnp.concatenate([own.vector(), driver.mean]))
             late = own.delay_samples / DELAY_WIDTH
@@ -98,24 +98,26 @@ def _empty(y: Float[Array, " parameter"], study: DriverStudy) -> ArrowheadEquati
     return jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
 
 
-def _second_order(_, y, step, study: DriverStudy) -> Float[Array, " parameter"]:
+def _second_order(
+    _, y: Float[Array, " parameter"], step: Float[Array, " parameter"], study: DriverStudy
+) -> Float[Array, " parameter"]:
     """Jᵀ r″ of a study, load by load; r″ as in `levenberg_marquardt.second_order`."""
     (common, parts), (towards, steps) = study.split(y), study.split(step)
 
-    def of_group(loads, owns, steps):
+    def of_group(loads: Loads, owns: LoadUnknowns, steps: LoadUnknowns) -> Float[Array, "load q"]:
         driver = _around(study, common, loads)
         ends = [
             (h, _around(study, common + h * towards, loads, slopes=False))
             for h in (DIFFERENCE, -DIFFERENCE)
         ]
 
-        def one(load, own, step):
+        def one(load: Loads, own: LoadUnknowns, step: LoadUnknowns) -> Float[Array, " q"]:
             lane = _lane(study, driver, load)
-            own, step = own.vector(), step.vector()
-            _, jacobian = lane.jacobian(jnp.concatenate([own, driver.mean]))
+            at, way = own.vector(), step.vector()
+            _, jacobian = lane.jacobian(jnp.concatenate([at, driver.mean]))
             count = jacobian.shape[1]  # number of the terms that are not linear
-            bent = sum(_lane(study, end, load)(own + h * step)[:count] for h, end in ends)
-            bent = (bent - 2 * lane(own)[:count]) / DIFFERENCE**2
+            bent = sum(_lane(study, end, load)(at + h * way)[:count] for h, end in ends)
+            bent = (bent - 2 * lane(at)[:count]) / DIFFERENCE**2
             return jnp.where(load.used, jacobian @ bent, 0.0)
 
         return _in_turn(one, loads, owns, steps)
@@ -171,7 +173,9 @@ def fit(
     return common, cov, found
 
 
-def _refit(study: DriverStudy, load: Loads, common, own):
+def _refit(
+    study: DriverStudy, load: Loads, common: Float[Array, " common"], own: LoadUnknowns
+) -> tuple[LoadUnknowns, optx.RESULTS]:
     """Unknowns of a load at its minimum with this Z_th, and the result of the solver."""
     solution = optx.least_squares(
         lambda q, _: study.of_load(load, common, LoadUnknowns.of(q)),

@@ -50,7 +50,7 @@ class DriverStudy(eqx.Module):
         """Terms of the calibrations, and of each group."""
         common, parts = self.split(y)
 
-        def one(load, own):
+        def one(load: Loads, own: LoadUnknowns) -> Float[Array, " term"]:
             return jnp.where(load.used, self.of_load(load, common, own), 0.0)
 
         loaded = [jax.vmap(one)(loads, own) for loads, own in zip(self.groups, parts, strict=True)]

@@ -21,6 +21,7 @@ does not determine.
 """
 
 import dataclasses
+from collections.abc import Callable
 from typing import NamedTuple
 
 import equinox as eqx
@@ -97,11 +98,15 @@ class GivenDriver(eqx.Module):
             return spectrum, None
         records = as_list(self.records)
 
-        def unloaded(gains):
+        def unloaded(
+            gains: Complex[Array, "record harmonic"],
+        ) -> tuple[Complex[Array, " harmonic"], Float[Array, " harmonic"]]:
             known = informed(spectrum, records, list(gains))
             return known.x, jnp.log(known.variance_x)
 
-        def slope(direction):
+        def slope(
+            direction: Complex[Array, "record harmonic"],
+        ) -> tuple[Complex[Array, " harmonic"], Float[Array, " harmonic"]]:
             return jax.jvp(unloaded, (self.gains,), (direction,))[1]
 
         found = informed(spectrum, records, list(self.gains))
@@ -152,16 +157,22 @@ def around(
     """A driver around the common parameters c, with z along `directions`; like `given`."""
     resistance = calibrations.calibration.r_load.mean()
 
-    def loaded(c, frequency):
+    def loaded(
+        c: Float[Array, " common"], frequency: Float[Array, " harmonic"]
+    ) -> Complex[Array, " harmonic"]:
         return calibrations.z_th(c).response(frequency) + as_complex(resistance)
 
-    def w(c, frequency):
+    def w(
+        c: Float[Array, " common"], frequency: Float[Array, " harmonic"]
+    ) -> Complex[Array, " harmonic"]:
         return jnp.log(loaded(c, frequency))
 
-    def of_known(c):
+    def of_known(c: Float[Array, " common"]) -> Complex[Array, "record harmonic"]:
         return jnp.stack(calibrations.gains(c))
 
-    def along(function):
+    def along(
+        function: Callable[[Float[Array, " common"]], Complex[Array, "..."]],
+    ) -> Complex[Array, "z ..."]:
         return jax.vmap(lambda v: jax.jvp(function, (c,), (v,))[1])(directions.T)
 
     return GivenDriver(

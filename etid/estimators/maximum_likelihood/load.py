@@ -13,7 +13,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import optimistix as optx
-from jaxtyping import Array, Bool, Complex, Float
+from jaxtyping import Array, Bool, Complex, Float, Inexact
 
 from etid.circuits.circuit import AbstractCircuit
 from etid.estimators.estimate import DELAY_WIDTH, MAX_STEPS, SOLVER, Estimate
@@ -140,10 +140,16 @@ class Load(eqx.Module):
         own, z = self.split(q)
         w, spectrum = self.at(z)
 
-        def unit(v):
+        def unit(v: Inexact[Array, " harmonic"]) -> Inexact[Array, " harmonic"]:
             return jnp.ones_like(v)
 
-        def of_load(_):
+        def of_load(
+            _,
+        ) -> tuple[
+            Complex[Array, " harmonic"],
+            Complex[Array, "element harmonic"],
+            Complex[Array, " harmonic"],
+        ]:
             logs = own.log_elements
             by_element = jax.vmap(lambda v: jax.jvp(self.load, (logs,), (v,))[1])(
                 jnp.eye(logs.size)
@@ -152,7 +158,11 @@ class Load(eqx.Module):
 
         load, by_element, turns = apart(of_load, q)
 
-        def of_gain(_):
+        def of_gain(
+            _,
+        ) -> tuple[
+            Complex[Array, " harmonic"], Complex[Array, " harmonic"], Complex[Array, " harmonic"]
+        ]:
             divided, by_load = jax.jvp(lambda at: self.divided(at, w), (load,), (unit(load),))
             by_w = jax.jvp(lambda at: self.divided(load, at), (w,), (unit(w),))[1]
             return divided, by_load * turns, by_w * turns
@@ -164,16 +174,25 @@ class Load(eqx.Module):
 
         g = divided * turns
 
-        def of_g(_):
+        def of_g(
+            _,
+        ) -> tuple[
+            Float[Array, " part"],
+            tuple[Array, Array],
+            tuple[Array, Array] | None,
+            Array | None,
+        ]:
             by_g = _by_parts(g, lambda a, b: residual(spectrum, jax.lax.complex(a, b)))
             if self.unloaded is None:
                 return residual(spectrum, g), by_g, None, None
 
-            def moved(a, b):
+            def moved(
+                a: Float[Array, " harmonic"], b: Float[Array, " harmonic"]
+            ) -> Float[Array, " part"]:
                 there = eqx.tree_at(lambda s: s.x, spectrum, jax.lax.complex(a, b))
                 return residual(there, g)
 
-            def wider(log):
+            def wider(log: Float[Array, " harmonic"]) -> Float[Array, " part"]:
                 variance = spectrum.variance_x * jnp.exp(log)
                 return residual(eqx.tree_at(lambda s: s.variance_x, spectrum, variance), g)
 
@@ -195,7 +214,11 @@ class Load(eqx.Module):
         """
         impedance = self.circuit.with_log_values(self.split(q)[0].log_elements).impedance()
 
-        def parts(_):
+        def parts(
+            _,
+        ) -> tuple[
+            Complex[Array, "change harmonic"], tuple[Array, Array], Complex[Array, " harmonic"]
+        ]:
             _, changes = other_circuit.changes(impedance, self.spectrum.frequency)
             return changes, _turned(slopes.by_g, slopes.by_load), self.predicted(q)[0]
 
@@ -300,7 +323,7 @@ def fit_circuit(
     known, unloaded = driver.informed(spectrum)
     load = Load(driver, circuit, known, unloaded, sample_rate)
 
-    def solve(solver, start):
+    def solve(solver: optx.AbstractLeastSquaresSolver, start: Float[Array, " q"]) -> optx.Solution:
         return optx.least_squares(
             lambda q, load: load(q), solver, start, args=load, max_steps=MAX_STEPS, throw=False
         )

@@ -192,7 +192,7 @@ def apart(evaluate: Callable[[Array], Any], q: Float[Array, " q"]) -> Any:
     """
     shapes = jax.eval_shape(evaluate, q)
 
-    def nothing(_):
+    def nothing(_) -> Any:
         return jax.tree.map(lambda of: jnp.full(of.shape, jnp.nan, of.dtype), shapes)
 
     return jax.lax.cond(jnp.isfinite(q).all(), lambda q: evaluate(q), nothing, q)

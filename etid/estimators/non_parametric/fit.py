@@ -20,7 +20,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import optimistix as optx
-from jaxtyping import Array, Bool, Complex, Float
+from jaxtyping import Array, Bool, Complex, Float, PRNGKeyArray
 
 from etid.circuits.circuit import AbstractCircuit
 from etid.estimators.estimate import DELAY_WIDTH, MAX_STEPS, SOLVER, Estimate
@@ -86,7 +86,9 @@ class _Model(eqx.Module):
         elements, late, delay = jnp.split(q, (last - self.r_load.size, last))
         return LoadUnknowns(elements, delay[0]), late
 
-    def load(self, q: Float[Array, " q"], frequency: Float[Array, " harmonic"]):
+    def load(
+        self, q: Float[Array, " q"], frequency: Float[Array, " harmonic"]
+    ) -> Complex[Array, " harmonic"]:
         """Z_L."""
         load = self.circuit.with_log_values(self.named(q)[0].log_elements).impedance()
         return load(frequency_variable(frequency))
@@ -116,7 +118,13 @@ class _Model(eqx.Module):
             [(one - mean) * as_complex(_root(2 * w)) for one, w in zip(z, weights, strict=True)],
         )
 
-    def _variance(self, q, records, y, of: _Measured):
+    def _variance(
+        self,
+        q: Float[Array, " q"],
+        records: list[Spectrum],
+        y: Complex[Array, " harmonic"],
+        of: _Measured,
+    ) -> tuple[Float[Array, " harmonic"], Float[Array, " harmonic"]]:
         """Variance of e, and the part that only the load has; `y` is Y without the delay."""
         spectrum = records[-1]
         load = self.load(q, spectrum.frequency)
@@ -131,7 +139,9 @@ class _Model(eqx.Module):
         of_x = power(together) * spectrum.variance_x
         return own + rest + of_x, own + jnp.where(shared, 0.0, of_x)
 
-    def _in_time(self, q, records):
+    def _in_time(
+        self, q: Float[Array, " q"], records: list[Spectrum]
+    ) -> Complex[Array, " harmonic"]:
         """Y of the load, without its delay."""
         spectrum = records[-1]
         late = self.named(q)[0].delay_samples
@@ -210,7 +220,7 @@ def fit_circuit(
     )
     best = best_start(lambda q: model.terms(q, records), starts)
 
-    def solve(records, start):
+    def solve(records: list[Spectrum], start: Float[Array, " q"]) -> optx.Solution:
         return optx.least_squares(
             model.terms, SOLVER, start, args=records, max_steps=MAX_STEPS, throw=False
         )
@@ -256,12 +266,14 @@ def _bias(
     order (simulation and extrapolation, Cook and Stefanski 1994, with antithetic draws).
     """
 
-    def drawn(key, variance):
+    def drawn(
+        key: PRNGKeyArray, variance: Float[Array, " harmonic"]
+    ) -> Complex[Array, " harmonic"]:
         parts = jax.random.normal(key, (2, variance.size), variance.dtype)
         noise = parts * jnp.sqrt(variance / 2)[None, :]
         return jax.lax.complex(noise[0], noise[1])
 
-    def mean_of_pair(key):
+    def mean_of_pair(key: PRNGKeyArray) -> Float[Array, " number"]:
         noises = []
         last = jax.random.fold_in(key, 0)
         for i, s in enumerate(records):
@@ -271,7 +283,7 @@ def _bias(
             of_x = jnp.where(same, drawn(last, s.variance_x), drawn(own, s.variance_x))
             noises.append((of_x, drawn(jax.random.fold_in(own, 1), s.variance_y)))
 
-        def refitted(sign):
+        def refitted(sign: Complex[Array, ""]) -> Float[Array, " number"]:
             return change(
                 [
                     eqx.tree_at(lambda s: (s.x, s.y), s, (s.x + sign * a, s.y + sign * b))

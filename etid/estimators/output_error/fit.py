@@ -20,7 +20,7 @@ import jax
 import jax.numpy as jnp
 import optimistix as optx
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from etid.circuits.circuit import AbstractCircuit
 from etid.circuits.elements import resistor
@@ -75,14 +75,19 @@ def fit_source(
     start_vector, unflatten = ravel_pytree(start)
     kept, count = start_vector.size, r_load.size
 
-    def one(record, r, parameters, nuisance):
+    def one(
+        record: Records,
+        r: Float[Array, ""],
+        parameters: Float[Array, " parameter"],
+        nuisance: Nuisance,
+    ) -> Float[Array, " interval"]:
         return scaled_residual(record, unflatten(parameters), resistor(r).rational(), nuisance)
 
     regularise = prior(start, records.sample_rate[0], r_load.mean())
 
     q0, named = ravel_pytree((start_vector, jnp.zeros((count, start.order + 2))))
 
-    def residual(q, _):
+    def residual(q: Float[Array, " q"], _) -> Float[Array, " term"]:
         parameters, vectors = named(q)
         nuisance = Nuisance.of(vectors)
         parts = jax.vmap(one, in_axes=(0, 0, None, 0))(records, r_load, parameters, nuisance)
@@ -100,18 +105,20 @@ def fit_source(
     )
 
     # Curvature over source, logarithm of the resistor and nuisances, in this order.
-    def at_minimum(record, r, nuisance):
+    def at_minimum(
+        record: Records, r: Float[Array, ""], nuisance: Nuisance
+    ) -> tuple[Curvature, Float[Array, ""]]:
         at, named = ravel_pytree((parameters, jnp.zeros(()), nuisance))
         nothing = jax.tree.map(jnp.zeros_like, nuisance)
         towards, _ = ravel_pytree((jnp.zeros_like(parameters), jnp.ones(()), nothing))
         open_delay = dataclasses.replace(nothing, delay_samples=jnp.asarray(1 / DELAY_WIDTH**2))
         precision, _ = ravel_pytree((jnp.zeros_like(parameters), jnp.zeros(()), open_delay))
 
-        def residual(p):
+        def residual(p: Float[Array, " p"]) -> Float[Array, " interval"]:
             parameters, log_r, nuisance = named(p)
             return one(record, r * jnp.exp(log_r), parameters, nuisance)
 
-        def response(p):
+        def response(p: Float[Array, " p"]) -> Float[Array, " lag"]:
             parameters, log_r, _ = named(p)
             load = resistor(r * jnp.exp(log_r)).rational()
             return impulse_response(loaded_filter(unflatten(parameters), load, record.sample_rate))
@@ -119,7 +126,7 @@ def fit_source(
         value, slope = jax.jvp(residual, (at,), (towards,))
         return curvature(record, slopes(residual, response, at), precision), jnp.vdot(slope, value)
 
-    def error(record, r, nuisance):
+    def error(record: Records, r: Float[Array, ""], nuisance: Nuisance) -> Float[Array, ""]:
         system = loaded_filter(source, resistor(r).rational(), record.sample_rate)
         return rrse(predict(system, record, nuisance), measured(record, nuisance.delay_samples))
 
@@ -192,7 +199,7 @@ def fit_circuit(
     # [samples] of this record.
     late_std = calibration.delay_std_samples * (records.sample_rate / driver.sample_rate)
 
-    def load(log_elements):
+    def load(log_elements: Float[Array, " element"]) -> Rational:
         return circuit.with_log_values(log_elements).impedance().rational()
 
     # Logarithms of the elements, the nuisances of the record, and the delay of the calibration.
@@ -201,14 +208,19 @@ def fit_circuit(
     nuisance = Nuisance(jnp.zeros(states), zero, zero)
     _, named = ravel_pytree((candidates[0], nuisance, zero))
 
-    def residual(q, late):
+    def residual(q: Float[Array, " q"], late: Late) -> Float[Array, " term"]:
         log_elements, nuisance, late_samples = named(q)
         change = jax.tree.map(lambda leaf: late_samples * leaf, late)
         scaled = scaled_residual(records, source, load(log_elements), nuisance, change)
         delays = jnp.stack([nuisance.delay_samples, late_samples])
         return jnp.concatenate([scaled, delays / jnp.stack([DELAY_WIDTH, late_std])])
 
-    def refine(carry, _):
+    def refine(
+        carry: tuple[Float[Array, " q"], Late], _
+    ) -> tuple[
+        tuple[Float[Array, " q"], Late],
+        tuple[Float[Array, ""], optx.RESULTS, Int[Array, ""]],
+    ]:
         q, late = carry
         solution = optx.least_squares(
             residual, SOLVER, q, args=late, max_steps=MAX_STEPS, throw=False
@@ -235,12 +247,12 @@ def fit_circuit(
     both = kept + 1 + sources
     at, named_all = ravel_pytree((log_elements, late_samples, source_vector, nuisance))
 
-    def of_all(p):
+    def of_all(p: Float[Array, " p"]) -> Float[Array, " interval"]:
         log_elements, late_samples, vector, nuisance = named_all(p)
         change = jax.tree.map(lambda leaf: late_samples * leaf, late)
         return scaled_residual(records, unflatten(vector), load(log_elements), nuisance, change)
 
-    def response(p):
+    def response(p: Float[Array, " p"]) -> Float[Array, " lag"]:
         log_elements, late_samples, vector, _ = named_all(p)
         system = loaded_filter(unflatten(vector), load(log_elements), records.sample_rate)
         return impulse_response(system) + late_samples * late.h
@@ -287,7 +299,9 @@ def fitted_voltage(
     zero = jnp.zeros(())
     q, named = ravel_pytree((Nuisance(jnp.zeros_like(system.C), zero, zero), zero))
 
-    def residual(q, late):
+    def residual(
+        q: Float[Array, " q"], late: Float[Array, " interval"]
+    ) -> Float[Array, " interval"]:
         nuisance, late_samples = named(q)
         predicted = predict(system, records, nuisance) + late_samples * late
         return predicted - measured(records, nuisance.delay_samples)

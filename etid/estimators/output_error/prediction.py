@@ -170,13 +170,13 @@ def late_calibration(
     system = loaded(source, load, records.sample_rate)
     x0_rate = (system.A @ x0 + system.B[:, 0] * records.hold[0, 0]) / records.sample_rate
 
-    def rate(hold):  # per sample
+    def rate(hold: Float[Array, "interval c"]) -> Float[Array, "interval c"]:  # per sample
         steps = jnp.arange(1.0, hold.shape[1])
         return jnp.pad(hold[:, 1:] * steps[None, :], ((0, 0), (0, 1)))
 
     # Replacing Z_th by Z_th + ε (R_L − Z_L) equals replacing R by R + ε R_L and Z_L by (1 − ε) Z_L,
     # except for a factor of V_out, which belongs to the delay.
-    def excess(epsilon):
+    def excess(epsilon: Float[Array, ""]) -> tuple[Float[Array, " interval"], Float[Array, " lag"]]:
         shifted = jnp.log(jnp.exp(source.log_resistance) + epsilon * r_load)
         altered = eqx.tree_at(lambda z: z.log_resistance, source, shifted)
         reduced = Rational((1 - epsilon) * load.num, load.den)

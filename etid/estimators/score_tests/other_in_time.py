@@ -20,7 +20,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Complex, Float
 
 from etid.circuits.impedance import AbstractImpedance
 from etid.estimators.output_error.information import Slopes, bin_weights, noise_power, padded_size
@@ -80,7 +80,9 @@ def relaxed(
     state = jnp.concatenate([nuisance.state, jnp.zeros(count)])
     nuisance = dataclasses.replace(nuisance, state=state)
 
-    def simulated(epsilon):
+    def simulated(
+        epsilon: Float[Array, " change"],
+    ) -> tuple[Float[Array, " interval"], Float[Array, " lag"]]:
         C = jnp.concatenate([load.C, epsilon * level])
         system = hold(connected(source, StateSpace(A, B, C, load.D)), rate)
         return predict(system, records, nuisance), impulse_response(system)
@@ -123,7 +125,7 @@ def score(
     root = vectors * jnp.sqrt(jnp.maximum(values, 0.0))[None, :]
     last = first + root.shape[0]
 
-    def by_z(slope):
+    def by_z(slope: Float[Array, "row q"]) -> Float[Array, "row q"]:
         return jnp.concatenate(
             [slope[:, :first], slope[:, first:last] @ root, slope[:, last:]], axis=1
         )
@@ -159,7 +161,7 @@ def score(
     noisy[-1] = True
     rows = rows * as_complex(jnp.where(noisy[None, :], share[:, None], 1.0))
 
-    def terms(spectrum):
+    def terms(spectrum: Complex[Array, "frequency ..."]) -> Float[Array, "... part"]:
         weighed = spectrum * as_complex(scale).reshape(-1, *[1] * (spectrum.ndim - 1))
         return jnp.concatenate([weighed.real, weighed.imag]).T
 

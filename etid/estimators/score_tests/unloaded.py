@@ -85,7 +85,7 @@ class UnloadedShape(NamedTuple):
         of_chance = 2 * jnp.sum(known != 0, dtype=part.dtype)
         large = (size > self.least) & (size < OTHER) & (smooth > SMOOTH * (all_of_it - of_chance))
 
-        def in_its_noise(_):
+        def in_its_noise(_) -> Bool[Array, ""]:
             noise = excess(part - along @ self.directions, known != 0)
             return jnp.sum(along**2 / (self.directions**2 @ noise)) > SEEN
 

@@ -35,7 +35,7 @@ def _score(
     """χ² of a discrete model, and its squared distance to the minimum in standard errors."""
     impulse = jnp.zeros(IMPULSE).at[0].set(1.0)
 
-    def scaled(c, _):
+    def scaled(c: Float[Array, " n"], _) -> Float[Array, " time"]:
         h = predict(c, impulse)
         s = m.sigma_out**2 + m.sigma_th**2 * jnp.sum(h**2)
         return (predict(c, m.v_th) - m.v_out) / jnp.sqrt(s)
@@ -75,8 +75,8 @@ class SteiglitzMcBride(AbstractEstimator):
         best = iteration.driver_filter(records.v_th, records.v_out, r_load, order, self.iterations)
         free = best.filter.num.size
 
-        def score(m, r):
-            def predict(c, v):
+        def score(m: Measurement, r: Float[Array, ""]) -> tuple[Float[Array, ""], Float[Array, ""]]:
+            def predict(c: Float[Array, " n"], v: Float[Array, " time"]) -> Float[Array, " time"]:
                 z_th = Rational(c[:free], jnp.concatenate([jnp.ones(1), c[free:]]))
                 return iteration.terminal_voltage(z_th, Rational(r[None], jnp.ones(1)), v)[0]
 
@@ -112,7 +112,7 @@ class SteiglitzMcBride(AbstractEstimator):
         circuit = iteration.skin_elements(best.filter, m.sample_rate)
         free = best.filter.num.size
 
-        def predict(c, v):
+        def predict(c: Float[Array, " n"], v: Float[Array, " time"]) -> Float[Array, " time"]:
             load = Rational(c[:free], jnp.concatenate([jnp.ones(1), c[free:]]))
             return iteration.terminal_voltage(z_th, load, v)[0]
 

@@ -64,6 +64,9 @@ def _delayed(v: Float[Array, "record time"], lags: range) -> Float[Array, "recor
     return jnp.stack([jnp.pad(v, ((0, 0), (k, 0)))[:, :time] for k in lags], axis=-1)
 
 
+_Carry = tuple[Iterate, Float[Array, " a"], Float[Array, " a"]]
+
+
 def iterate(
     x: Float[Array, "record time"],
     w: Float[Array, "record time"],
@@ -85,7 +88,7 @@ def iterate(
     """
     one = jnp.ones(1, x.dtype)
 
-    def solve(prefilter):
+    def solve(prefilter: Float[Array, " a"]) -> Rational:
         xf = jax.vmap(lambda v: lfilter(one, prefilter, v)[0])(x)
         wf = jax.vmap(lambda v: lfilter(one, prefilter, v)[0])(w)
         columns = jnp.concatenate(
@@ -99,7 +102,7 @@ def iterate(
             coefficients[: zeros + 1], jnp.concatenate([one, coefficients[zeros + 1 :]])
         )
 
-    def step(carry, iteration):
+    def step(carry: _Carry, iteration: Int[Array, ""]) -> tuple[_Carry, Float[Array, ""]]:
         best, prefilter, previous = carry
         candidate = solve(prefilter)
         error, closed_loop_stable = assess(candidate)
@@ -159,8 +162,10 @@ def driver_filter(
         iterations: Number of iterations; 1 is equation error.
     """
 
-    def assess(candidate):
-        def one(v_th, v_out, r):
+    def assess(candidate: Rational) -> tuple[Float[Array, ""], Bool[Array, ""]]:
+        def one(
+            v_th: Float[Array, " time"], v_out: Float[Array, " time"], r: Float[Array, ""]
+        ) -> tuple[Float[Array, ""], Bool[Array, ""]]:
             load = Rational(r[None], jnp.ones(1, r.dtype))
             predicted, stable = terminal_voltage(candidate, load, v_th)
             return jnp.where(stable, rrse(predicted, v_out), jnp.inf), stable
@@ -188,7 +193,7 @@ def skin_filter(
         iterations: Number of iterations; 1 is equation error.
     """
 
-    def assess(candidate):
+    def assess(candidate: Rational) -> tuple[Float[Array, ""], Bool[Array, ""]]:
         predicted, stable = terminal_voltage(z_th, candidate, v_th)
         error = jnp.where(stable, rrse(predicted, v_out), jnp.inf)
         return jnp.where(jnp.isfinite(error), error, jnp.inf), stable
