@@ -13,6 +13,7 @@ from benchmarks.ladder import CALIBRATION, LOADS, rung
 from etid.circuits.circuit import Resistor
 from etid.estimators.sandwich import Linear
 from etid.estimators.score_tests import other_circuit
+from etid.estimators.score_tests.other_circuit import Scores
 from etid.simulation.scenes import Trial
 
 
@@ -92,7 +93,24 @@ def test_what_counts_is_the_residual_along_what_the_parameters_cannot_do(change)
     for z in (0.99 * LIMIT[change], 1.01 * LIMIT[change], -1.01 * LIMIT[change]):
         found = scores(z * along + anything, rows, jacobian)
         assert float(found.z[NUMBER[change]]) == pytest.approx(z)
-        assert bool(found.seen()) == (abs(z) > LIMIT[change])
+        assert bool(Scores.of(found).seen()) == (abs(z) > LIMIT[change])
+
+
+@pytest.mark.parametrize("z", [0.99, 1.01, 2.0, -2.0])
+def test_a_wrong_gain_is_no_relaxation(z):
+    """It has a limit of its own; it was tested as one more relaxation too."""
+    rng = np.random.default_rng(4)
+    jacobian, rows = rng.normal(size=(3, 50)), rng.normal(size=(5, 50))
+    rows[-1] += 0.1 * jacobian.sum(0)  # so that the gain moves the elements
+    others = np.concatenate([jacobian, rows[:-1]])
+    rest = rows[-1] - np.linalg.lstsq(others.T, rows[-1], rcond=None)[0] @ others
+    along = rows[-1] - np.linalg.lstsq(jacobian.T, rows[-1], rcond=None)[0] @ jacobian
+    residual = z * other_circuit.SEEN_GAIN * rest * np.linalg.norm(along) / (rest @ along)
+    found = Scores.of(scores(residual, rows, jacobian), gain=True)
+    assert found.gain is not None
+    assert float(found.gain.z) == pytest.approx(z * other_circuit.SEEN_GAIN)
+    assert bool(found.has_other_gain()) == (abs(z) > 1)
+    assert not found.seen()
 
 
 @pytest.mark.parametrize("change", NUMBER)
@@ -107,13 +125,13 @@ def test_a_change_that_hardly_matters_is_none(change):
     alone[NUMBER[change]] = row
     for factor in (0.99, 1.01):
         found = scores(factor * size[change] * row, alone, jacobian)
-        assert bool(found.seen()) == (factor > 1)
+        assert bool(Scores.of(found).seen()) == (factor > 1)
 
 
 def test_a_load_without_a_capacitor_has_no_phase_to_be_constant():
     rng = np.random.default_rng(5)
     rows = np.zeros((2, 50))
-    assert not scores(rng.normal(size=50), rows, rng.normal(size=(3, 50))).seen()
+    assert not Scores.of(scores(rng.normal(size=50), rows, rng.normal(size=(3, 50)))).seen()
 
 
 def test_a_relaxation_that_the_circuit_has_is_none():

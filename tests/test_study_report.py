@@ -381,6 +381,22 @@ def test_methods_cite_what_they_name_and_say_the_settings(found, method):
     assert ("gives no standard errors" in section.text) == without_errors
 
 
+TESTS = {  # score tests that a successful fit has passed
+    "maximum_likelihood": {"spread over time constants", "further relaxation", "gains"},
+    "joint": {"spread over time constants", "further relaxation"},
+    "harmonic_steiglitz_mcbride": {"spread over time constants", "further relaxation"},
+}
+
+
+@pytest.mark.parametrize("method", TESTS)
+def test_methods_name_the_score_tests(method):
+    description = registry.described(method)
+    assert description is not None
+    said = " ".join(description.conditions)
+    words = {"spread over time constants", "further relaxation", "gains"}
+    assert {word for word in words if word in said} == TESTS[method]
+
+
 def test_every_entry_is_whole_bibtex():
     everything = citations.bibtex(citations.entries())
     entries = everything.split("\n\n")

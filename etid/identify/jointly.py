@@ -32,8 +32,9 @@ from etid.estimators.joint import fit as shared_driver
 from etid.estimators.joint.terms import Loads
 from etid.estimators.lanes import AbstractLane, Harmonics
 from etid.estimators.maximum_likelihood.driver import Calibrations, Joint, fit_load
-from etid.estimators.maximum_likelihood.estimator import OF_DRIVER, TESTED
+from etid.estimators.maximum_likelihood.estimator import AGREED, OF_DRIVER
 from etid.estimators.registry import register_description
+from etid.estimators.score_tests.other_circuit import NO_OTHER_CIRCUIT
 from etid.estimators.score_tests.unloaded import shape_of
 from etid.estimators.starts import harmonic_starts
 from etid.identify.arguments import circuit_of, order_of, require, require_float64
@@ -74,7 +75,7 @@ register_description(
         "residual Y - G exp(-jωτ) X of each loaded record Y and its unloaded record X is weighted "
         "by its variance, var Y + |G|² var X, G = Z_L / (Z_L + Z_th). Z_th is common to all, each "
         "record has its own trigger delay τ.",
-        conditions=(*CHECKED, DETERMINED, *TESTED),
+        conditions=(*CHECKED, DETERMINED, NO_OTHER_CIRCUIT, AGREED),
         of_driver=OF_DRIVER,
         errors=BY_RESIDUALS,
         refined=True,

@@ -136,7 +136,7 @@ class HarmonicSteiglitzMcBride(AbstractByMaximumLikelihood):
             text=HARMONICS + "the load was estimated by Steiglitz-McBride iteration (Steiglitz and "
             "McBride, 1965) with the variance of the noise taken out of its sums (Söderström, "
             "2007) and the trigger delay as one more linear unknown.",
-            conditions=(*CHECKED, DETERMINED, NEAR_MINIMUM),
+            conditions=(*CHECKED, DETERMINED, NEAR_MINIMUM, other_circuit.NO_OTHER_CIRCUIT),
             errors=BY_RESIDUALS,
             cited=("soderstrom2007", "white1980"),
         )
@@ -203,7 +203,7 @@ def _is_another(
     count = elements + 1 + vector.size
     prior = jnp.diag(jnp.pad(jnp.ones(vector.size), (elements + 1, 0)))
     linear = Linear(rows[:count], share, jnp.tile(noise, 2), prior)
-    return other_circuit.scores(
+    found = other_circuit.scores(
         rows[count:],
         linear,
         residual(spectrum, g),
@@ -211,4 +211,5 @@ def _is_another(
         prior,
         linear.bread(),
         slice(elements),
-    ).seen()
+    )
+    return other_circuit.Scores.of(found).seen()

@@ -195,7 +195,9 @@ def _is_another(
         covariance,
         slice(common.size, common.size + own.log_elements.size),
     )
-    return found.seen() & load.used  # a load that takes no part has its own verdict
+    return (
+        other_circuit.Scores.of(found).seen() & load.used
+    )  # a load that takes no part has its own verdict
 
 
 def _by_changes(

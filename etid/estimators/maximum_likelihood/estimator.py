@@ -28,12 +28,9 @@ from etid.results.verdicts import RESULTS
 from etid.signals.harmonics import Spectrum
 from etid.signals.noise import Measurement
 
-TESTED = (
-    "score tests against a relaxation that is spread over time constants (at "
-    f"{other_circuit.SEEN_SPREAD:g} standard deviations) and against one more relaxation (at "
-    f"{other_circuit.SEEN_RELAXATION:g}) find none",
+AGREED = (
     "recording and calibrations agree about Z_th (the calibrations' sum of squares grows by at "
-    f"most {STRAINED:g})",
+    f"most {STRAINED:g})"
 )
 OF_DRIVER = (
     "it has to be passive",
@@ -89,7 +86,13 @@ class MaximumLikelihood(AbstractEstimator):
             "var X, G = Z_L / (Z_L + Z_th). Each load was estimated jointly with Z_th and the "
             "trigger delays of the calibrations, whose distribution the calibrations give. Its own "
             "trigger delay τ is one more unknown.",
-            conditions=(*CHECKED, DETERMINED, *TESTED),
+            conditions=(
+                *CHECKED,
+                DETERMINED,
+                other_circuit.NO_OTHER_CIRCUIT,
+                other_circuit.NO_OTHER_GAIN,
+                AGREED,
+            ),
             of_driver=OF_DRIVER,
             errors=BY_RESIDUALS,
             refined=True,

@@ -292,6 +292,7 @@ def _equations(_, q: Float[Array, " q"], load: Load) -> NormalEquations:
 # Largest change of W, which is uncertain by 0.1 at 40 dB. At 24 dB one fit of 30 exceeds it. Two of
 # 200 fits were wrong by five standard errors; both exceed it.
 FAR = 0.5
+NO_HUM = 5.0  # standard deviations of a wrong gain, above which it may pass for hum
 NEAR = 4.0  # χ² of the likeliest start; below this value the other starts are not tried
 # Half a standard error for 3000 terms.
 ROUGHLY = LevenbergMarquardt(rtol=1e-2, ftol=1e-3, equations=_equations)
@@ -356,7 +357,7 @@ def fit_circuit(
     by_term = elements @ jacobian
     noise = linear.noise
     rows = clean.by_changes(q, slopes)
-    other = other_circuit.scores(
+    found = other_circuit.scores(
         rows,
         linear,
         part,
@@ -365,11 +366,11 @@ def fit_circuit(
         information,
         slice(count),
     )
+    other = other_circuit.Scores.of(found, gain=True)
     # If a wrong gain explains the excess of the low harmonics, the excess is no hum.
     gain = rows[-1] - linear.told(rows[-1:])[0] @ information @ jacobian
-    rest = jnp.sum((part - other.size[-1] * gain).reshape(2, -1) ** 2, axis=0) / 2
-    wrong_gain = jnp.abs(other.z[-1]) > other_circuit.SEEN_RELAXATION
-    wrong_gain = wrong_gain & ~stands_out(rest, known)
+    rest = jnp.sum((part - found.size[-1] * gain).reshape(2, -1) ** 2, axis=0) / 2
+    wrong_gain = (jnp.abs(found.z[-1]) > NO_HUM) & ~stands_out(rest, known)
     # Part of the noise that only this trial has: all, or that of V_out if V_th is shared.
     private = jnp.where(
         jnp.any(known.variance_x != spectrum.variance_x),

@@ -21,6 +21,8 @@ ln s + ε ln² (s/s₀) around the middle s₀ of the band, and
 **One more relaxation**, ΔZ = ε |Z(j/τ)| / (1 + sτ), for each τ of a grid that exceeds the band.
 This test also has power if dZ/ds = 0, as for a resistor. A change that the circuit can make itself
 is no evidence: d vanishes. An example is a relaxation with a τ that the circuit has already.
+
+The same score also tests for another gain of V_out, which is no change of the circuit.
 """
 
 from typing import NamedTuple
@@ -43,6 +45,15 @@ SEEN_GAIN = 3.5
 # low can imitate 0.002: four standard deviations at 60 dB with damp skin.
 SPREAD = 0.01
 MOVED = 0.02  # relative change of an element that is also necessary, for the same reason
+# For a methods section.
+NO_OTHER_CIRCUIT = (
+    "score tests find no relaxation of the load that is spread over time constants (at most "
+    f"{SEEN_SPREAD:g} standard deviations) and no further relaxation (at most {SEEN_RELAXATION:g})"
+)
+NO_OTHER_GAIN = (
+    "a score test finds no difference between the gains of the two records (at most "
+    f"{SEEN_GAIN:g} standard deviations)"
+)
 GRID = 7  # time constants, two per decade; a relaxation is wider than that
 BEYOND = 2.0  # factor by which they exceed the band
 NOTHING = 1e-9  # of the power of a change; rounding leaves less of one that the circuit can make
@@ -72,8 +83,8 @@ def relaxations(
     return corner, jnp.abs(impedance(jax.lax.complex(jnp.zeros_like(corner), corner)))
 
 
-class Scores(NamedTuple):
-    """Scores of all changes for one residual; the first change is the spread.
+class Score(NamedTuple):
+    """Scores of changes of one kind for one residual.
 
     Attributes:
         z: Standard deviations; NaN if the circuit can make the change itself.
@@ -81,22 +92,49 @@ class Scores(NamedTuple):
         moved: Largest change of the logarithm of an element by this ε.
     """
 
-    z: Float[Array, " change"]
-    size: Float[Array, " change"]
-    moved: Float[Array, " change"]
+    z: Float[Array, "*change"]
+    size: Float[Array, "*change"]
+    moved: Float[Array, "*change"]
 
-    def seen(self) -> Bool[Array, ""]:
-        """Whether the scores show another circuit."""
-        spread = (jnp.abs(self.z[0]) > SEEN_SPREAD) & (jnp.abs(self.size[0]) > SPREAD)
-        return spread | Scores(self.z[1:], self.size[1:], self.moved[1:]).relaxes()
-
-    def has_other_gain(self) -> Bool[Array, ""]:
-        """Whether V_out and V_th have different gains; the last change must be a gain."""
-        return (jnp.abs(self.z[-1]) > SEEN_GAIN) & (self.moved[-1] > MOVED)
+    def exceeds(self, limit: float) -> Bool[Array, "*change"]:
+        """Whether z exceeds this limit and the change moves an element."""
+        return (jnp.abs(self.z) > limit) & (self.moved > MOVED)
 
     def relaxes(self) -> Bool[Array, ""]:
         """Whether one more relaxation is seen; all changes must be relaxations."""
-        return jnp.any((jnp.abs(self.z) > SEEN_RELAXATION) & (self.moved > MOVED))
+        return jnp.any(self.exceeds(SEEN_RELAXATION))
+
+
+class Scores(NamedTuple):
+    """Scores of all changes for one residual.
+
+    Attributes:
+        spread: Score of the spread.
+        relaxation: Scores of one more relaxation, for each time constant.
+        gain: Score of the gain of V_out; None if it is not tested.
+    """
+
+    spread: Score
+    relaxation: Score
+    gain: Score | None
+
+    @classmethod
+    def of(cls, scores: Score, gain: bool = False) -> "Scores":
+        """Name the scores of all `changes`; `gain` says whether that of a gain follows them."""
+
+        def part(which: int | slice) -> Score:
+            return jax.tree.map(lambda leaf: leaf[which], scores)
+
+        return cls(part(0), part(slice(1, -1 if gain else None)), part(-1) if gain else None)
+
+    def seen(self) -> Bool[Array, ""]:
+        """Whether the scores show another circuit."""
+        spread = (jnp.abs(self.spread.z) > SEEN_SPREAD) & (jnp.abs(self.spread.size) > SPREAD)
+        return spread | self.relaxation.relaxes()
+
+    def has_other_gain(self) -> Bool[Array, ""]:
+        """Whether the score shows that V_out and V_th have different gains."""
+        return jnp.asarray(False) if self.gain is None else self.gain.exceeds(SEEN_GAIN)
 
 
 def scores(
@@ -107,7 +145,7 @@ def scores(
     spread: Float[Array, "q q"],
     covariance: Float[Array, "q q"],
     elements: slice,
-) -> Scores:
+) -> Score:
     """Score of each change.
 
     The parameters need not be at a minimum: the part of the residual that they could still explain
@@ -133,4 +171,4 @@ def scores(
     can = curvature <= NOTHING * (rows**2 @ linear.share)
     size = score / curvature
     moved = jnp.max(jnp.abs(others[:, elements]), axis=1)
-    return Scores(jnp.where(can, jnp.nan, score / jnp.sqrt(variance)), size, jnp.abs(size) * moved)
+    return Score(jnp.where(can, jnp.nan, score / jnp.sqrt(variance)), size, jnp.abs(size) * moved)

@@ -32,7 +32,7 @@ from etid.estimators.output_error.prediction import (
     residual_variance,
 )
 from etid.estimators.sandwich import Linear
-from etid.estimators.score_tests.other_circuit import Scores, relaxations, scores
+from etid.estimators.score_tests.other_circuit import Score, relaxations, scores
 from etid.estimators.unknowns import Nuisance
 from etid.results.driver import SourceImpedance, connected, realise
 from etid.signals.filtering import StateSpace, hold
@@ -107,7 +107,7 @@ def score(
     rest: Float[Array, " q"],
     precision: Float[Array, " q"],
     elements: int,
-) -> Scores:
+) -> Score:
     """Score of each relaxation.
 
     Args:
