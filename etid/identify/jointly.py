@@ -20,19 +20,12 @@ from tqdm import tqdm
 
 from etid.circuits.circuit import AbstractCircuit
 from etid.estimators import judgement
-from etid.estimators.estimator import (
-    BY_RESIDUALS,
-    CHECKED,
-    DETERMINED,
-    HARMONICS,
-    Description,
-    serving,
-)
+from etid.estimators.estimator import serving
 from etid.estimators.joint import fit as shared_driver
 from etid.estimators.joint.terms import Loads
 from etid.estimators.lanes import AbstractLane, Harmonics
 from etid.estimators.maximum_likelihood.driver import Calibrations, Joint, fit_load
-from etid.estimators.maximum_likelihood.estimator import AGREED, OF_DRIVER
+from etid.estimators.maximum_likelihood.estimator import description
 from etid.estimators.registry import register_description
 from etid.estimators.score_tests.other_circuit import NO_OTHER_CIRCUIT
 from etid.estimators.score_tests.unloaded import shape_of
@@ -68,18 +61,11 @@ SINGLE = (
 )
 register_description(
     METHOD,
-    Description(
-        words="joint maximum likelihood",
-        text=HARMONICS + "each driver and all recordings made with it were estimated in one fit by "
-        "maximum likelihood with noise on both records (Pintelon and Schoukens, 2012, ch. 9): the "
-        "residual Y - G exp(-jωτ) X of each loaded record Y and its unloaded record X is weighted "
-        "by its variance, var Y + |G|² var X, G = Z_L / (Z_L + Z_th). Z_th is common to all, each "
-        "record has its own trigger delay τ.",
-        conditions=(*CHECKED, DETERMINED, NO_OTHER_CIRCUIT, AGREED),
-        of_driver=OF_DRIVER,
-        errors=BY_RESIDUALS,
-        refined=True,
-        cited=("pintelon2012", "optimistix2024", "white1980"),
+    description(
+        "joint maximum likelihood",
+        "each driver and all recordings made with it were estimated in one fit by",
+        "Z_th is common to all, each record has its own trigger delay τ.",
+        NO_OTHER_CIRCUIT,
     ),
 )
 

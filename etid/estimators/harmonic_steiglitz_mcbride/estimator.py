@@ -41,6 +41,7 @@ from etid.estimators.maximum_likelihood.terms import (
 from etid.estimators.sandwich import Linear
 from etid.estimators.score_tests import other_circuit
 from etid.estimators.score_tests.unloaded import UnloadedShape
+from etid.estimators.steiglitz_mcbride.iteration import check_iterations
 from etid.estimators.unknowns import LoadUnknowns
 from etid.results.driver import ContinuousDriver
 from etid.results.fits import Fit
@@ -67,8 +68,7 @@ class HarmonicSteiglitzMcBride(AbstractByMaximumLikelihood):
     iterations: int = iteration.ITERATIONS
 
     def __post_init__(self) -> None:
-        if self.iterations < 1:
-            raise ValueError(f"iterations is {self.iterations}; use at least one")
+        check_iterations(self.iterations)
 
     def fit_load(
         self,

@@ -28,15 +28,38 @@ from etid.results.verdicts import RESULTS
 from etid.signals.harmonics import Spectrum
 from etid.signals.noise import Measurement
 
-AGREED = (
-    "recording and calibrations agree about Z_th (the calibrations' sum of squares grows by at "
-    f"most {STRAINED:g})"
-)
-OF_DRIVER = (
-    "it has to be passive",
-    "its calibrations must not show one more section of Z_th (score test, χ² of at most "
-    f"{missing_pole.SEEN:g} with two degrees of freedom)",
-)
+
+def description(words: str, estimated: str, unknowns: str, *tests: str) -> Description:
+    """Text about fits by maximum likelihood, alone or jointly.
+
+    Args:
+        words: Name of the estimator in a sentence.
+        estimated: What was estimated, as the start of the sentence about the residual.
+        unknowns: Sentences about the unknowns.
+        *tests: The score tests that a successful fit passes.
+    """
+    return Description(
+        words=words,
+        text=f"{HARMONICS}{estimated} maximum likelihood with noise on both records (Pintelon and "
+        "Schoukens, 2012, ch. 9): the residual Y - G exp(-jωτ) X of each loaded record Y and its "
+        "unloaded record X is weighted by its variance, var Y + |G|² var X, G = Z_L / (Z_L + "
+        f"Z_th). {unknowns}",
+        conditions=(
+            *CHECKED,
+            DETERMINED,
+            *tests,
+            "recording and calibrations agree about Z_th (the calibrations' sum of squares grows "
+            f"by at most {STRAINED:g})",
+        ),
+        of_driver=(
+            "it has to be passive",
+            "its calibrations must not show one more section of Z_th (score test, χ² of at most "
+            f"{missing_pole.SEEN:g} with two degrees of freedom)",
+        ),
+        errors=BY_RESIDUALS,
+        refined=True,
+        cited=("pintelon2012", "optimistix2024", "white1980"),
+    )
 
 
 @dataclasses.dataclass(frozen=True)
@@ -78,25 +101,14 @@ class MaximumLikelihood(AbstractEstimator):
 
     def describe(self) -> Description:
         """The text for a methods section."""
-        return Description(
-            words="maximum likelihood",
-            text=HARMONICS + "the load was estimated by maximum likelihood with noise on both "
-            "records (Pintelon and Schoukens, 2012, ch. 9): the residual Y - G exp(-jωτ) X of the "
-            "loaded record Y and the unloaded record X is weighted by its variance, var Y + |G|² "
-            "var X, G = Z_L / (Z_L + Z_th). Each load was estimated jointly with Z_th and the "
-            "trigger delays of the calibrations, whose distribution the calibrations give. Its own "
-            "trigger delay τ is one more unknown.",
-            conditions=(
-                *CHECKED,
-                DETERMINED,
-                other_circuit.NO_OTHER_CIRCUIT,
-                other_circuit.NO_OTHER_GAIN,
-                AGREED,
-            ),
-            of_driver=OF_DRIVER,
-            errors=BY_RESIDUALS,
-            refined=True,
-            cited=("pintelon2012", "optimistix2024", "white1980"),
+        return description(
+            "maximum likelihood",
+            "the load was estimated by",
+            "Each load was estimated jointly with Z_th and the trigger delays of the calibrations, "
+            "whose distribution the calibrations give. Its own trigger delay τ is one more "
+            "unknown.",
+            other_circuit.NO_OTHER_CIRCUIT,
+            other_circuit.NO_OTHER_GAIN,
         )
 
 

@@ -60,8 +60,7 @@ class SteiglitzMcBride(AbstractEstimator):
     iterations: int = iteration.ITERATIONS
 
     def __post_init__(self) -> None:
-        if self.iterations < 1:
-            raise ValueError(f"iterations is {self.iterations}; use at least one")
+        iteration.check_iterations(self.iterations)
 
     def fit_driver(
         self,

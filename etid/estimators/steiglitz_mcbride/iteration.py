@@ -64,6 +64,12 @@ def _delayed(v: Float[Array, "record time"], lags: range) -> Float[Array, "recor
     return jnp.stack([jnp.pad(v, ((0, 0), (k, 0)))[:, :time] for k in lags], axis=-1)
 
 
+def check_iterations(iterations: int) -> None:
+    """Raise ValueError unless there is an iteration."""
+    if iterations < 1:
+        raise ValueError(f"iterations is {iterations}; use at least one")
+
+
 _Carry = tuple[Iterate, Float[Array, " a"], Float[Array, " a"]]
 
 
