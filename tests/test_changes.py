@@ -98,6 +98,19 @@ def test_an_element_that_moves_alone_is_seen_where_all_together_hide_it():
     assert change_of(recorded(scene, falling(skin, "r_p", 0.05), seed=21), scene, skin).seen
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_r_s_that_falls_by_a_fifth_is_seen_at_40_db(seed):
+    """R_s acts at high frequencies; from two of these records, bands up to 0.25 had too little."""
+    scene, skin = rung("dry", snr_db=40.0), LOADS["dry"]
+    assert change_of(recorded(scene, falling(skin, "r_s", 0.2), seed), scene, skin).seen
+
+
+def test_aliases_of_high_bands_are_no_noise_of_the_low_ones():
+    """At 100 kHz aliases exceed the noise from a quarter of the sample rate on."""
+    scene, skin = rung("dry", sample_rate=100e3, samples=5_000), LOADS["dry"]
+    assert change_of(recorded(scene, falling(skin, "r_p", 0.01)), scene, skin).seen
+
+
 def test_chi_squared_of_one_parameter_alone_is_that_of_a_fit_of_it_and_the_delays():
     rng = np.random.default_rng(2)
     design = rng.normal(size=(1, 3, 40, 6))

@@ -30,7 +30,10 @@ from etid.signals.harmonics import fast_length
 from etid.signals.noise import RIPPLE
 from etid.signals.pulse_train import RATE
 
-BAND = 0.25  # largest frequency relative to the sample rate; above it aliases exceed the load
+BAND = 0.4  # largest frequency relative to the sample rate
+# Relative to the sample rate. Below it, bands share one estimate of their noise. Above it, aliases
+# can exceed the noise; each band then has its own.
+PLAIN = 0.25
 DEGREE = 6  # degree of the polynomial: it describes 0.994 of the 0.83 turns of 50 Hz hum
 SINGLE = 12  # number of lowest harmonics that each form a band
 RATIO = 1.08  # ratio of the edges of the bands above these harmonics
@@ -96,11 +99,14 @@ class Bands(NamedTuple):
 
 
 @functools.lru_cache(maxsize=16)
-def bands(sample_rate: float, pulse_rate: float) -> Bands:
-    """Bands for a nominal pulse rate; the measured pulse rate may differ from it."""
+def bands(sample_rate: float, pulse_rate: float, band: float) -> Bands:
+    """Bands for a nominal pulse rate, up to `band` times the sample rate.
+
+    The measured pulse rate may differ from the nominal one.
+    """
     length = int((1 - RATE) * sample_rate / pulse_rate)
     size = fast_length(length)
-    count = int(BAND * size)
+    count = int(band * size)
     edges = [*range(min(SINGLE, count))]
     while edges and edges[-1] * RATIO + 1 < count:
         edges.append(int(np.ceil(edges[-1] * RATIO + 1e-9)))
@@ -153,10 +159,10 @@ def repeats(seen: Sequence[Inspected]) -> list[Repeats | None]:
 
 
 def _differ(of: Repeats) -> bool:
-    """Whether the periods differ by more than noise explains."""
-    periods, count = of.gain.shape
-    square = (_power(of.gain) / of.variance).sum()
-    freedom = 2 * (periods - 1) * count
+    """Whether the periods differ by more than noise explains, in bands without aliases."""
+    plain = of.frequency < PLAIN * of.sample_rate
+    square = (_power(of.gain) / of.variance)[:, plain].sum()
+    freedom = 2 * (len(of.gain) - 1) * np.count_nonzero(plain)
     return bool(square > freedom + SURE * math.sqrt(2 * freedom))
 
 
@@ -166,13 +172,13 @@ def _of_equal_periods(
     """Deviations of recordings with equal rates and numbers of periods, from these voltages."""
     of, (periods, _) = group[0].recording, group[0].periods
     at = np.stack([one.begins for one in group])
-    known = bands(of.sample_rate, of.pulse_rate)
+    known = bands(of.sample_rate, of.pulse_rate, BAND)
     sigma = np.array([one.sigma_out for one in group])
     # Without this shift, a late record would be cut within its pulses.
     loaded = [_turned(v, one) for one, (_, v) in zip(group, records, strict=True)]
     own = _deviations(loaded, at, known, sigma)
     sigma = np.array([one.sigma_th for one in group])
-    merged = bands(of.sample_rate / MERGED, of.pulse_rate)
+    merged = bands(of.sample_rate / MERGED, of.pulse_rate, PLAIN)
     sums = [_merged(v_th) for v_th, _ in records]
     unloaded = _deviations(sums, at / MERGED, merged, sigma * math.sqrt(MERGED))
     weight = np.where(merged.middle < LOW * merged.middle[-1], 1 / unloaded.variance, 0.0)
@@ -258,7 +264,9 @@ def _deviations(
     # The part that no change of the gain explains is noise.
     rest = np.add.reduceat(power, known.edges, axis=1) - weight * _power(gain).sum(1)
     freedom = 2 * (known.number - 1) * (periods - 1)
-    overall = np.maximum(rest.sum(1) / max(freedom.sum(), 1), sigma**2 * known.length / 2)[:, None]
+    plain = known.middle < 2 * np.pi * PLAIN
+    overall = rest[:, plain].sum(1) / max(freedom[plain].sum(), 1)
+    overall = np.maximum(overall, sigma**2 * known.length / 2)[:, None]
     freedom = np.maximum(freedom, 1)
     sure = rest > overall * (freedom + SURE * np.sqrt(2 * freedom))
     noise = np.where(sure & (known.number > 1), rest / freedom, overall)
