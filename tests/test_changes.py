@@ -47,7 +47,8 @@ def change_of(recording, scene, load, allowed=0.0):
     for name in NAMES:
         more = dataclasses.replace(load, **{name: getattr(load, name) * (1 + 1e-6)})
         by.append((more(of.frequency) - z) / 1e-6 * z_th / (z * (z + z_th)))
-    return changes.found([of], np.array([by]), np.full((1, 3), allowed))[0]
+    found = changes.found([of], np.array([by]), np.full((1, 3), allowed))
+    return changes.Change(*(part[0] for part in found))
 
 
 @pytest.fixture(scope="module")

@@ -14,9 +14,9 @@ from etid.circuits.circuit import SkinRC
 from etid.circuits.elements import resistor
 from etid.estimators import registry
 from etid.estimators.maximum_likelihood import terms as likelihood
-from etid.identify import arguments
+from etid.identify import arguments, one
 from etid.identify import many as batch
-from etid.identify.one import skin_lane
+from etid.identify.one import known_at, skin_lane
 from etid.recordings.preflight import Inspected
 from etid.simulation.scenes import Scene, Trial
 from etid.simulation.transformer import ResistorLoad, SkinLoad
@@ -85,6 +85,15 @@ def test_a_fit_passes_through_few_files(study, driver):
     assert folder / "identify" / "one.py" in found
     names = " ".join(sorted(path.relative_to(folder).as_posix() for path in found))
     assert len(found) <= FILES, names
+
+
+def test_what_is_known_of_a_driver_is_kept(study, driver, monkeypatch):
+    computed = []
+    monkeypatch.setattr(one, "known_at", lambda *of: computed.append(known_at(*of)) or computed[-1])
+    other = dataclasses.replace(driver, steps=driver.steps)
+    first, second = (etid.identify_skin(study["loaded/0"], other) for _ in range(2))
+    assert len(computed) == 1
+    np.testing.assert_array_equal(first.cov, second.cov)
 
 
 def test_the_gain_is_that_of_the_divider(driver):

@@ -22,7 +22,7 @@ from etid.recordings.preflight import Inspected
 from etid.results.driver import Driver
 from etid.signals import mains
 from etid.signals.harmonics import ALIASED, Spectrum, spectrum
-from etid.signals.noise import Measurement, measure, noise, rounding_variance, trusted
+from etid.signals.noise import Measurement, measure, noise, rounding_variance
 from etid.signals.pulse_train import rest, shifted
 
 LEFT = 0.75  # samples; a larger delay needs a second fit. The prior of a delay is 0.5 wide
@@ -108,9 +108,8 @@ class Harmonics(AbstractLane):
     def of(cls, seen: Inspected) -> "Harmonics":
         """Aligned harmonics of a recording; rounding is the noise of a coarse converter."""
         rate = np.asarray(seen.recording.sample_rate)
-        sigma_th = np.asarray(trusted(seen.v_th, seen.sigma_th))
-        sigma_out = np.asarray(trusted(seen.v_out, seen.sigma_out))
-        fields = spectrum(seen.v_th, seen.v_out, sigma_th, sigma_out, rate, *seen.periods)
+        sigmas = seen.trusted_th, seen.trusted_out
+        fields = spectrum(seen.v_th, seen.v_out, *sigmas, rate, *seen.periods)
         frequency, x, y, variance_x, variance_y, selected = map(np.asarray, fields)
         for v, step, variance in (
             (seen.recorded_th, seen.coarse_th, variance_x),
@@ -198,8 +197,8 @@ class PaddedSamples(AbstractLane):
         one = cls(
             v_th=np.pad(seen.v_th, (0, room)),
             v_out=np.pad(seen.v_out, (0, room)),
-            sigma_th=np.asarray(trusted(seen.v_th, seen.sigma_th)),
-            sigma_out=np.asarray(trusted(seen.v_out, seen.sigma_out)),
+            sigma_th=seen.trusted_th,
+            sigma_out=seen.trusted_out,
             sample_rate=np.asarray(seen.recording.sample_rate),
             samples=np.asarray(size),
         )
@@ -307,9 +306,15 @@ def _whole(late: float) -> int:
     return round(late) if abs(late) > LEFT else 0
 
 
-_Lane = TypeVar("_Lane", bound=AbstractLane)
+_Tree = TypeVar("_Tree")
 
 
-def stacked(lanes: Sequence[_Lane]) -> _Lane:
-    """Lanes of the same size, stacked along a leading axis as arrays of JAX."""
-    return jax.tree.map(lambda *fields: jnp.asarray(np.stack(fields)), *lanes)
+def stacked(parts: Sequence[_Tree]) -> _Tree:
+    """Lanes of the same size, or fits, stacked along a leading axis as arrays of NumPy."""
+    return jax.tree.map(lambda *fields: np.stack(fields), *parts)
+
+
+def unstacked(whole: _Tree) -> list[_Tree]:
+    """The lanes or fits along the leading axis, as arrays of NumPy."""
+    leaves, structure = jax.tree.flatten(whole)
+    return [structure.unflatten(map(np.asarray, one)) for one in zip(*leaves, strict=True)]

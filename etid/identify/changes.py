@@ -28,7 +28,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy.special
-from jaxtyping import Array, Complex, Float
+from jaxtyping import Array, Bool, Complex, Float
 
 from etid.circuits.circuit import AbstractCircuit, Resistor
 from etid.identify.compiled import stored_jit
@@ -54,7 +54,7 @@ DRIVER = 2e-3  # allowed change of a driver, expressed as a change of the calibr
 
 
 class Change(NamedTuple):
-    """Change of the elements and of the amplitude during a record.
+    """Change of the elements and of the amplitude during a record, or during each of several.
 
     Attributes:
         size: Relative change of each element and, last, of the amplitude, over the record.
@@ -62,15 +62,16 @@ class Change(NamedTuple):
         seen: Whether a change was detected that matters.
     """
 
-    size: Float[np.ndarray, " moved"]
-    stderr: Float[np.ndarray, " moved"]
-    seen: bool
+    size: Float[np.ndarray, "*lane moved"]
+    stderr: Float[np.ndarray, "*lane moved"]
+    seen: Bool[np.ndarray, "*lane"]
 
 
-def unknown(count: int) -> Change:
-    """An unknown change of `count` elements: all NaN."""
-    nothing = np.full(count + 1, np.nan)
-    return Change(nothing, nothing, False)
+def unknown(*shape: int) -> Change:
+    """Unknown changes, all NaN; `shape` ends with the number of elements."""
+    *lanes, elements = shape
+    nothing = np.full((*lanes, elements + 1), np.nan)
+    return Change(nothing, nothing.copy(), np.zeros(lanes, bool))
 
 
 @stored_jit
@@ -115,15 +116,15 @@ def found(
     repeats: Sequence[Repeats | None],
     slopes: Complex[np.ndarray, "lane element band"] | None,
     allowed: Float[np.ndarray, "lane element"],
-) -> list[Change]:
-    """Changes of loads during their records.
+) -> Change:
+    """Changes of loads during their records; NaN where there are none to compare.
 
     Args:
         repeats: The periods of each record; None if there are less than two.
         slopes: ∂ ln G/∂ ln q; None if no record has periods.
         allowed: Largest changes of the logarithms of the elements that do not matter.
     """
-    changes = [unknown(allowed.shape[1])] * len(repeats)
+    changes = unknown(*allowed.shape)
     if slopes is None:
         return changes
     alike: dict[int, list[int]] = {}
@@ -134,15 +135,13 @@ def found(
         group = [of for lane in lanes if (of := repeats[lane]) is not None]
         of = Repeats(*(np.stack(parts) for parts in zip(*group, strict=True)))
         moved = _changes(of, slopes[lanes], allowed[lanes])
-        for lane, size, stderr, seen in zip(lanes, *moved, strict=True):
-            changes[lane] = Change(size, stderr, bool(seen))
+        for whole, part in zip(changes, moved, strict=True):
+            whole[lanes] = part
     return changes
 
 
-def _changes(
-    of: Repeats, slopes: np.ndarray, allowed: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The fields of `Change`, for recordings with the same number of periods."""
+def _changes(of: Repeats, slopes: np.ndarray, allowed: np.ndarray) -> Change:
+    """The changes of recordings with the same number of periods."""
     elements, course = slopes.shape[1], courses(of.gain.shape[1])
     low, whole, right, plain, unit, total = _equations(of, slopes, course)
     # The share of each course that aliases cannot imitate.
@@ -179,7 +178,7 @@ def _changes(
     log = theta[lane, best] / units * reach
     factor = np.exp(np.clip(log, -LARGEST, LARGEST))
     error = np.sqrt(np.diagonal(cov[lane, best], axis1=1, axis2=2)) / units * reach
-    return factor - 1, factor * error, matters
+    return Change(factor - 1, factor * error, matters)
 
 
 def _equations(
@@ -259,39 +258,36 @@ def _uneven(of: Repeats, course: Float[np.ndarray, "course period"]) -> np.ndarr
     return np.where(seen, largest * np.ptp(course, axis=1)[worst], 0.0)
 
 
-def of_fits(fits: Sequence[Fit], driver: Driver, repeats: Sequence[Repeats | None]) -> list[Change]:
+def of_fits(fits: Fit, driver: Driver, repeats: Sequence[Repeats | None]) -> Change:
     """The change during the record of each fit.
 
     Args:
-        fits: Fits of circuits of one kind.
+        fits: Fits along a leading axis.
         driver: The driver of these fits.
         repeats: The periods of the records, with equal bands; None if there are less than two.
     """
-    # Not `circuit.values()`, whose arrays of JAX cost 0.3 ms a fit.
-    values = np.array([jax.tree.leaves(fit.circuit) for fit in fits])
-    variance = np.array([np.diagonal(np.asarray(fit.cov)) for fit in fits])
+    values = np.stack(jax.tree.leaves(fits.circuit), axis=1)
+    variance = np.diagonal(np.asarray(fits.cov), axis1=1, axis2=2)
     usable = np.isfinite(values) & (values != 0) & (variance >= 0)
     allowed = np.sqrt(np.where(usable, variance, 0.0)) / np.where(usable, np.abs(values), 1.0)
     slopes = None
     frequency = next((of.frequency for of in repeats if of is not None), None)
     if frequency is not None:
-        parts = [
-            _slopes([fit.circuit for fit in fits[first : first + LANES]], driver, frequency)
-            for first in range(0, len(fits), LANES)
-        ]
-        slopes = np.concatenate(parts)
+        slopes = _slopes(fits.circuit, len(values), driver, frequency)
     return found(repeats, slopes, allowed)
 
 
 def _slopes(
-    circuits: Sequence[AbstractCircuit], driver: Driver, frequency: Float[np.ndarray, " band"]
+    circuits: AbstractCircuit, count: int, driver: Driver, frequency: Float[np.ndarray, " band"]
 ) -> Complex[np.ndarray, "lane element band"]:
-    """`log_slopes` of one circuit, or of several padded to `LANES`: two compiled sizes suffice."""
-    size = 1 if len(circuits) == 1 else LANES
-    whole = [*circuits, *[circuits[-1]] * (size - len(circuits))]
-    stacked = jax.tree.map(lambda *leaves: jnp.asarray(np.stack(leaves)), *whole)
-    slopes = log_slopes(stacked, driver, jnp.asarray(frequency))
-    return np.asarray(slopes)[: len(circuits)]
+    """`log_slopes` of circuits, one at a time or `LANES` at once: two compiled sizes suffice."""
+    size = 1 if count == 1 else LANES
+    parts = []
+    for first in range(0, count, size):
+        rows = np.minimum(np.arange(first, first + size), count - 1)  # padded with the last one
+        part = jax.tree.map(lambda leaf, rows=rows: np.asarray(leaf)[rows], circuits)
+        parts.append(np.asarray(log_slopes(part, driver, jnp.asarray(frequency))))
+    return np.concatenate(parts)[:count]
 
 
 def driver_judged(
@@ -309,6 +305,6 @@ def driver_judged(
         return driver
     slopes = np.asarray(log_slopes(Resistor(r_load), driver, jnp.asarray(frequency)))
     changes = found(repeats, slopes, np.full((len(repeats), 1), DRIVER))
-    if any(change.seen for change in changes):
+    if changes.seen.any():
         return dataclasses.replace(driver, result=verdict("changed"))
     return driver

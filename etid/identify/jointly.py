@@ -23,7 +23,7 @@ from etid.estimators import judgement
 from etid.estimators.estimator import serving
 from etid.estimators.joint import fit as shared_driver
 from etid.estimators.joint.terms import Loads
-from etid.estimators.lanes import AbstractLane, Harmonics
+from etid.estimators.lanes import AbstractLane, Harmonics, unstacked
 from etid.estimators.maximum_likelihood.driver import Calibrations, Joint, fit_load
 from etid.estimators.maximum_likelihood.estimator import description
 from etid.estimators.registry import register_description
@@ -41,7 +41,6 @@ from etid.identify.many import (
     planned,
     table,
     to_identify,
-    unstacked,
 )
 from etid.identify.one import checksum, concluded, failed_fit, is_shared, note, repeated
 from etid.recordings.preflight import Inspected
@@ -175,7 +174,7 @@ class _Waiting:
     def _alone(self, lanes: Sequence[AbstractLane]) -> list[_Start]:
         of = self.model, self.driver
         found = jax.device_get(_alone(filled(lanes), jnp.asarray(len(lanes)), *of))
-        return list(unstacked(found))[: len(lanes)]
+        return unstacked(found)[: len(lanes)]
 
     @property
     def changed(self) -> list[bool]:

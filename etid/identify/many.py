@@ -12,7 +12,7 @@ import dataclasses
 import functools
 import threading
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from typing import Any, TypeVar
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -22,7 +22,7 @@ from tqdm import tqdm
 
 from etid.circuits.circuit import AbstractCircuit
 from etid.estimators.estimator import AbstractEstimator
-from etid.estimators.lanes import AbstractLane, stacked
+from etid.estimators.lanes import AbstractLane, stacked, unstacked
 from etid.estimators.registry import MAXIMUM_LIKELIHOOD, Method
 from etid.identify.arguments import check_default, circuit_of, estimator_of, order_of, plan, require
 from etid.identify.arguments import recordings as several
@@ -51,7 +51,6 @@ from etid.results.verdicts import message
 
 LANES = 16  # lanes of one chunk; the last chunk is padded
 AHEAD = 2 * LANES  # recordings that are read and inspected in advance
-_Found = TypeVar("_Found")
 
 
 @stored_jit
@@ -83,10 +82,6 @@ def each(fit: Callable[[Any], Any], lanes: Any, count: int | Int[Array, ""]) -> 
 
     size = jax.tree.leaves(lanes)[0].shape[0]
     return jax.lax.map(one, (jnp.arange(size), lanes))
-
-
-def _stack(fits: Sequence[Fit]) -> Fit:
-    return jax.tree.map(lambda *leaves: np.stack(leaves), *fits)
 
 
 def _of_one_method(fits: Sequence[Fit], used: Sequence[str]) -> list[Fit]:
@@ -165,15 +160,7 @@ class _Queue:
     def _fits(self, lanes: Sequence[AbstractLane]) -> list[Fit]:
         of = self.driver, self.known, self.circuit, self.estimator
         fits = jax.device_get(_chunk(filled(lanes), jnp.asarray(len(lanes)), *of))
-        return list(unstacked(fits))[: len(lanes)]  # without the padding
-
-
-def unstacked(found: _Found) -> Iterator[_Found]:
-    """The results of a chunk, one lane at a time."""
-    leaves, structure = jax.tree.flatten(found)
-    return (
-        jax.tree.unflatten(structure, map(np.asarray, one)) for one in zip(*leaves, strict=True)
-    )
+        return unstacked(fits)[: len(lanes)]  # without the padding
 
 
 def _identify(
@@ -278,7 +265,7 @@ def identify_skins(
         )
     if not fits:
         raise ValueError("there is no recording to identify")
-    return Fits(_stack(fits), described(known), np.array(notes, dtype=str))
+    return Fits(stacked(fits), described(known), np.array(notes, dtype=str))
 
 
 def identify_study(
@@ -355,7 +342,7 @@ def table(study: Study, paths: Sequence[str], fits: Sequence[Fit], notes: Sequen
     if not fits:
         raise ValueError("the study has no loaded recording")
     known = [_known(study, path) for path in paths]
-    return Fits(_stack(fits), described(known), np.array(notes, dtype=str))
+    return Fits(stacked(fits), described(known), np.array(notes, dtype=str))
 
 
 class Drivers:

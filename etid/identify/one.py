@@ -1,6 +1,7 @@
 """Identification of one skin: pre-flight, refinement, verdict. Batches share these steps."""
 
 import dataclasses
+import functools
 import zlib
 from collections.abc import Callable, Sequence
 from typing import Any, TypeVar
@@ -13,7 +14,7 @@ from jaxtyping import Array, Float
 from etid.circuits.circuit import AbstractCircuit
 from etid.estimators.estimator import AbstractEstimator
 from etid.estimators.judgement import MISFIT_CHI2
-from etid.estimators.lanes import AbstractLane, Harmonics
+from etid.estimators.lanes import AbstractLane, Harmonics, stacked, unstacked
 from etid.estimators.registry import Method
 from etid.identify import changes
 from etid.identify.arguments import (
@@ -31,9 +32,10 @@ from etid.recordings.remarks import Remark
 from etid.recordings.repeats import Repeats, repeats
 from etid.results.driver import Driver, HarmonicDriver
 from etid.results.fits import Fit, IdentificationError
-from etid.results.verdicts import message, verdict
+from etid.results.verdicts import message, verdict, verdicts_of
 from etid.signals.harmonics import whole_periods
 
+KEPT = 4  # drivers, for which `known_of` is kept
 _Found = TypeVar("_Found")
 _Outcome = TypeVar("_Outcome", Fit, Driver)
 
@@ -77,8 +79,8 @@ def identify_skin(
         known = known_of(lane, driver, is_shared(seen, driver), estimator)
 
         def fits(lanes: Sequence[AbstractLane]) -> list[Fit]:
-            on_device = [jax.tree.map(jnp.asarray, lane) for lane in lanes]
-            return [skin(lane, driver, known, circuit, estimator) for lane in on_device]
+            found = [skin(lane, driver, known, circuit, estimator) for lane in lanes]
+            return jax.device_get(found)
 
         [fit] = refined([lane], [seen], fits, driver)
         [fit] = concluded([fit], driver, [int(seen.remarks)], repeats([seen]))
@@ -170,11 +172,30 @@ def known_at(
 def known_of(lane: AbstractLane, driver: Driver, shared: bool, estimator: AbstractEstimator) -> Any:
     """What an estimator must know of a driver; valid for all lanes with equal harmonics.
 
-    None for lanes without harmonics.
+    It is kept for the next recordings: it takes as long as half a fit. None for lanes without
+    harmonics.
     """
     if not isinstance(lane, Harmonics):
         return None
-    return known_at(jnp.asarray(lane.frequency), driver, shared, estimator)
+    return _known_of(_Same(driver), np.asarray(lane.frequency).tobytes(), shared, estimator)
+
+
+class _Same:
+    """A driver that equals only itself: its arrays cannot be hashed."""
+
+    def __init__(self, driver: Driver):
+        self.driver = driver
+
+    def __hash__(self) -> int:
+        return id(self.driver)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _Same) and self.driver is other.driver
+
+
+@functools.lru_cache(maxsize=KEPT)
+def _known_of(driver: _Same, frequency: bytes, shared: bool, estimator: AbstractEstimator) -> Any:
+    return known_at(jnp.asarray(np.frombuffer(frequency)), driver.driver, shared, estimator)
 
 
 def repeated(
@@ -261,23 +282,20 @@ def concluded(
         remarks: Remarks on the recordings.
         repeats: The periods of the recordings.
     """
-    found = changes.of_fits(fits, driver, repeats)
-    return [_marked(*parts) for parts in zip(fits, remarks, found, strict=True)]
-
-
-def _marked(fit: Fit, remarks: int, change: changes.Change) -> Fit:
-    """The fit with the remarks on its recording and the changes during it, in one copy."""
-    remarks, result = int(fit.remarks) | remarks, fit.result
-    if remarks & Remark.coarse_converter and fit.verdict == "insensitive":
-        result = verdict("resolution")
-    if change.seen and fit.verdict in changes.EXPLAINED:
-        result = verdict("changed")
-    return dataclasses.replace(
-        fit,
-        remarks=np.asarray(remarks),
-        change=change.size,
-        change_stderr=change.stderr,
-        result=result,
+    whole = stacked(fits)
+    change = changes.of_fits(whole, driver, repeats)
+    names, remarked = whole.verdict, whole.remarks | np.asarray(remarks, int)
+    coarse = (remarked & Remark.coarse_converter) > 0
+    names = np.where(coarse & (names == "insensitive"), "resolution", names)
+    names = np.where(change.seen & np.isin(names, changes.EXPLAINED), "changed", names)
+    return unstacked(
+        dataclasses.replace(
+            whole,
+            remarks=remarked,
+            change=change.size,
+            change_stderr=change.stderr,
+            result=verdicts_of(names),
+        )
     )
 
 

@@ -195,6 +195,16 @@ class Inspected:
             return self.noise_out
         return np.asarray(noise_std(self.recorded_out, self.step_out))
 
+    @functools.cached_property
+    def trusted_th(self) -> Float[np.ndarray, ""]:
+        """`sigma_th` as far as estimators trust it: not below the error of the interpolation."""
+        return np.asarray(trusted(self.v_th, self.sigma_th))
+
+    @functools.cached_property
+    def trusted_out(self) -> Float[np.ndarray, ""]:
+        """`sigma_out` as far as estimators trust it: not below the error of the interpolation."""
+        return np.asarray(trusted(self.v_out, self.sigma_out))
+
     @property
     def remarks(self) -> Remark:
         """Remarks on how the recording is changed before a fit."""
@@ -258,9 +268,9 @@ class Inspected:
         if periods == 0:
             return False
         rest = abs(periods * self.spacing - samples) if self.kept is None else 1.0
-        for v, sigma in ((self.v_th, self.sigma_th), (self.v_out, self.sigma_out)):
+        for v, sigma in ((self.v_th, self.trusted_th), (self.v_out, self.trusted_out)):
             joint = np.concatenate([v[samples - SEAM : samples], v[:SEAM]])
-            if rest * np.abs(np.diff(joint)).max() > STEP * trusted(v, sigma):
+            if rest * np.abs(np.diff(joint)).max() > STEP * sigma:
                 return False
         return True
 
@@ -298,7 +308,8 @@ def preflight(seen: Inspected, *, periodic: bool = False) -> str | None:
 
 
 def _is_flat(v: Float[np.ndarray, " time"], sigma: Float[np.ndarray, ""]) -> bool:
-    return bool(np.ptp(v) <= FLAT * sigma or np.ptp(v) == 0)
+    span = np.ptp(v)
+    return bool(span <= FLAT * sigma or span == 0)
 
 
 def _is_saturated(v: Float[np.ndarray, " time"], step: float, recording: Recording) -> bool:

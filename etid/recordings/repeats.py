@@ -23,6 +23,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
+import scipy.fft
 from jaxtyping import Complex, Float
 
 from etid.recordings.preflight import Inspected
@@ -248,7 +249,8 @@ def _deviations(
     sigma = np.maximum(sigma, RIPPLE * np.ptp(cut[:, 0], axis=1))
     cut -= cut.mean((1, 2), keepdims=True)
     count = int(known.number.sum())
-    raw = np.fft.rfft(cut, known.size)[:, :, 1 : count + 1]
+    # In single precision, this is four times as fast as the transform of NumPy.
+    raw = np.asarray(scipy.fft.rfft(cut, known.size))[:, :, 1 : count + 1]
     power, mean, weight, gain = _compared(raw, late, known)
     for _ in range(PASSES):
         # Least-squares estimate of a delay, η = jωτ; it is approximate if the gain changes too.

@@ -4,6 +4,7 @@
 the cause, then the remedy.
 """
 
+import functools
 from typing import Any
 
 import equinox as eqx
@@ -158,6 +159,7 @@ def verdicts_of(names: np.ndarray) -> RESULTS:
     return jax.tree.unflatten(tree, [np.reshape(values, np.shape(names)).astype(leaves[0].dtype)])
 
 
+@functools.cache
 def message(name: str) -> str:
     """Meaning and remedy of a verdict; empty for `successful`."""
     return _MESSAGES.get(name, RESULTS[RESULTS._name_to_item[name]])

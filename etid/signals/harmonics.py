@@ -65,25 +65,26 @@ def separates_aliases(periods: int, samples: int) -> bool:
 
 
 def harmonics(
-    v: Float[Array | np.ndarray, " time"], periods: int, samples: int
-) -> Complex[Array | np.ndarray, " harmonic"]:
+    v: Float[Array | np.ndarray, "*record time"], periods: int, samples: int
+) -> Complex[Array | np.ndarray, "*record harmonic"]:
     """Fourier coefficients (1/M) Σ v[n] e^(−j2πkPn/M) for k = 1 … below half the sample rate.
 
-    The drift of the mean from period to period is removed.
+    The drift of the mean from period to period is removed. Two records at once take as long as one.
     """
     # Only bins that are multiples of `parts` are needed. They are the bins of the sum of so many
     # equal parts of the record, which is shorter.
     parts = math.gcd(periods, samples)
-    folded = v[:samples].reshape(parts, -1).sum(0)
-    coefficients = namespace(v).fft.rfft(folded) / samples
+    folded = v[..., :samples].reshape(*v.shape[:-1], parts, -1).sum(-2)
+    of = namespace(v)
+    transform = of.fft.rfft(folded)
     basis, fit = _drift(periods, samples)
     # The transform is linear: the drift needs only the transforms of the powers of time.
-    # Sums of products instead of `@`, which starts BLAS threads for each recording. These threads
-    # wait for each other.
-    drift = (fit * _sums(v[:samples], periods)[None, :]).sum(1)
+    # `einsum` instead of `@`, which starts BLAS threads for each recording. These threads wait for
+    # each other.
+    drift = of.einsum("dp,...p->...d", fit, _sums(v[..., :samples], periods))
     step = periods // parts
-    at_harmonics = coefficients[step : (folded.size + 1) // 2 : step]
-    return at_harmonics - (drift.astype(at_harmonics.dtype)[:, None] * basis).sum(0)
+    at_harmonics = transform[..., step : (folded.shape[-1] + 1) // 2 : step] / samples
+    return at_harmonics - of.einsum("...d,dh->...h", drift.astype(at_harmonics.dtype), basis)
 
 
 def namespace(v: Array | np.ndarray) -> ModuleType:
@@ -92,13 +93,12 @@ def namespace(v: Array | np.ndarray) -> ModuleType:
 
 
 def _sums(v: Array | np.ndarray, periods: int) -> Array | np.ndarray:
-    """Sum over each period along the first axis; a period may end between two samples."""
-    of, samples = namespace(v), v.shape[0]
+    """Sum over each period along the last axis; a period may end between two samples."""
+    of, samples = namespace(v), v.shape[-1]
     ends = np.arange(periods + 1) * (samples / periods)
     whole = np.minimum(ends.astype(int), samples - 1)
-    rest = (ends - whole).reshape(-1, *[1] * (v.ndim - 1))
-    between = of.add.reduceat(v, whole, axis=0)[:-1]
-    return between + of.diff(rest * v[whole], axis=0)
+    between = of.add.reduceat(v, whole, axis=-1)[..., :-1]
+    return between + of.diff(of.einsum("p,...p->...p", ends - whole, v[..., whole]), axis=-1)
 
 
 @functools.lru_cache(maxsize=64)
@@ -108,7 +108,7 @@ def _drift(
     """Transforms of the powers of time, and the matrix from period sums to coefficients."""
     powers = np.vander(np.linspace(-1, 1, samples), min(periods, DRIFT_DEGREE + 1), increasing=True)
     transforms = np.fft.rfft(powers, axis=0) / samples
-    fit = np.linalg.pinv(np.asarray(_sums(powers, periods)))
+    fit = np.linalg.pinv(np.asarray(_sums(powers.T, periods)).T)
     return np.ascontiguousarray(transforms[periods : (samples + 1) // 2 : periods].T), fit
 
 
@@ -156,25 +156,17 @@ def spectrum(
         samples: Number of samples from `whole_periods`.
     """
     of = namespace(v_out)
-    x, y = harmonics(v_th, periods, samples), harmonics(v_out, periods, samples)
-    count = x.shape[0]
-    room = -count % ROOM
-    number = np.arange(1.0, count + room + 1)
+    coefficients = harmonics(of.stack([v_th[:samples], v_out[:samples]]), periods, samples)
+    count = coefficients.shape[1]
+    number = np.arange(1.0, count + -count % ROOM + 1)
     frequency = number * (periods * sample_rate / samples)
-
-    def filled(
-        coefficients: Array | np.ndarray, sigma: Array | np.ndarray
-    ) -> tuple[Array | np.ndarray, Array | np.ndarray]:
-        noise = sigma / math.sqrt(samples)
-        scale = of.where(number <= count, noise, ABSENT * noise)
-        absent = scale[count:].astype(coefficients.dtype)
-        return of.concatenate([coefficients, absent]), scale**2
-
-    x, variance_x = filled(x, sigma_th)
-    y, variance_y = filled(y, sigma_out)
+    noise = of.stack([sigma_th, sigma_out])[:, None] / math.sqrt(samples)
+    scale = of.where(number[None, :] <= count, noise, ABSENT * noise)
+    absent = scale[:, count:].astype(coefficients.dtype)
+    filled, variance = of.concatenate([coefficients, absent], axis=1), scale**2
     highest = 0.5 if separates_aliases(periods, samples) else ALIASED
     selected = (frequency < highest * sample_rate) & (number <= count)
-    return frequency, x, y, variance_x, variance_y, selected
+    return frequency, filled[0], filled[1], variance[0], variance[1], selected
 
 
 def fast_length(length: int) -> int:

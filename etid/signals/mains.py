@@ -111,15 +111,18 @@ def separated(
         periods: Number of periods from `etid.signals.harmonics.whole_periods`.
         samples: Number of samples from `etid.signals.harmonics.whole_periods`.
     """
-    if periods < 2 or not sigma > 0 or not np.isfinite(v[:samples]).all():
+    if periods < 2 or not sigma > 0:
         return None
+    v = v[:samples]
     if samples <= PROBED:
         probes, left = _probes(sample_rate, periods, samples)
-        found = np.abs(np.einsum("pn,n->p", probes, v[:samples])).max()
+        found = np.abs(np.einsum("pn,n->p", probes, v)).max()
+        if not SEEN * sigma <= found < math.inf:
+            return None  # most records end here, and records that are not finite
         rest = min(abs(periods * sample_rate / pulse_rate - samples), 0.5)
-        if found < SEEN * sigma + rest * left * np.abs(v[:samples]).mean():
+        if found < SEEN * sigma + rest * left * np.abs(v).mean():
             return None
-    return _found(v[:samples], float(sigma), sample_rate, periods)
+    return _found(v, float(sigma), sample_rate, periods) if np.isfinite(v).all() else None
 
 
 def _between(bins: Int[np.ndarray, " bin"], periods: int) -> Int[np.ndarray, " between"]:

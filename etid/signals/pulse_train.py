@@ -112,7 +112,8 @@ def find_pulses(v: Float[np.ndarray, " time"], sample_rate: float, pulse_rate: f
     """
     period = sample_rate / pulse_rate
     step = max(1, int(period / COARSE))
-    coarse = v[: v.size // step * step].reshape(-1, step).mean(1)
+    whole = v.size // step * step
+    coarse = np.add.reduceat(v[:whole], np.arange(0, whole, step)) / step if whole else v[:0]
     if coarse.size == 0 or not np.isfinite(coarse).all():
         return PulseTrain(np.zeros(0, int), None, v.size, sample_rate, pulse_rate)
     coarse = coarse - coarse.mean()
@@ -204,8 +205,10 @@ def lag_of(
     begin = start - (first - reach)
     where[begin : begin + found.size] = found
     size = fast_length(where.size)
-    product = np.fft.rfft(where, size) * np.conj(np.fft.rfft(template, size))
-    correlation = np.fft.irfft(product, size)[: 2 * reach + 1]
+    both = np.zeros((2, size))  # two transforms at once take as long as one
+    both[0, : where.size], both[1, : template.size] = where, template
+    transforms = np.fft.rfft(both)
+    correlation = np.fft.irfft(transforms[0] * np.conj(transforms[1]), size)[: 2 * reach + 1]
     if correlation.max() <= -correlation.min():
         return None
     lag = highest(correlation) - reach
