@@ -43,18 +43,20 @@ def recorded(source: SourceImpedance, number: int):
 
 
 @pytest.mark.slow
-def test_standard_errors_hold_what_the_driver_drifts_by(driver):
+@pytest.mark.parametrize("method", ["maximum_likelihood", "non_parametric"])
+def test_standard_errors_hold_what_the_driver_drifts_by(driver, method):
     """Without the drift in them they are a third of the errors, or less."""
     vector, unflatten = ravel_pytree(driver.source)
     std, draws = np.asarray(driver.drift_std()), np.random.default_rng(5)
     sources = [unflatten(vector + std * draws.normal(size=std.size)) for _ in range(FITS)]
-    fits = etid.identify_skins([recorded(s, i) for i, s in enumerate(sources)], driver)
+    recordings = [recorded(s, i) for i, s in enumerate(sources)]
+    fits = etid.identify_skins(recordings, driver, method=method)
     # One in 6000 is off by chance; that a driver drifts as it may is no verdict.
     assert fits.counts() == {"successful": FITS}
     truth = np.array([DRY.r_s, DRY.r_p, DRY.c_p])
     scaled = (np.asarray(fits.circuit.values()) - truth) / np.asarray(fits.stderr.values())
     # 95 % of 60 less three standard deviations; a scatter of sqrt(1/120) around 1, and R_s, R_p
-    # and C_p are seen to be 0.7 to 0.9 here.
+    # and C_p are seen to be 0.7 to 1.0 here.
     assert (np.mean(np.abs(scaled) < 1.96, axis=0) > 0.86).all()
     size = np.sqrt(np.mean(scaled**2, axis=0))
     assert (size < 1.3).all()
@@ -68,7 +70,10 @@ def test_standard_errors_hold_what_the_driver_drifts_by(driver):
 @pytest.mark.slow
 @pytest.mark.parametrize("name", LOADS)
 def test_standard_errors_hold_what_the_parts_of_the_driver_drift_by(driver, name):
-    """Parts are no parameters of Z_th: several of these differ at once, by more than the part."""
+    """A part changes several parameters of Z_th together, which the drift takes as independent.
+
+    To first order, errors of R_p are 1.2 of their standard errors then, those of R_s 0.9 to 1.0.
+    """
     recordings = []
     for number in range(DRIVERS):
         later = drawn_driver(number, DRIFT, TransformerDriver())
@@ -82,7 +87,7 @@ def test_standard_errors_hold_what_the_parts_of_the_driver_drift_by(driver, name
     assert len(good) > 0.9 * DRIVERS
     error = np.asarray(good.circuit.values()) - np.array(dataclasses.astuple(LOADS[name]))
     covered = np.mean(np.abs(error / np.asarray(good.stderr.values())) < 1.96, axis=0)
-    # 95 % of 189 less three standard deviations; 93 to 100 % were found.
+    # 95 % of 189 less three standard deviations; R_p was found in 92 to 94 %, the others in more.
     assert (covered > 0.90).all(), covered
 
 
@@ -90,6 +95,22 @@ def test_standard_errors_hold_what_the_parts_of_the_driver_drift_by(driver, name
 def test_a_drift_is_a_part(drift):
     with pytest.raises(ValueError, match="driver_drift"):
         etid.identify_driver([recorded_calibration()], driver_drift=drift)
+
+
+@pytest.mark.parametrize("method", ["steiglitz_mcbride", "equation_error"])
+def test_a_method_without_standard_errors_takes_no_drift(method):
+    """It was ignored without a word."""
+    calibration = recorded_calibration()
+    with pytest.raises(ValueError, match=f"'{method}' gives none"):
+        etid.identify_driver(calibration, method=method, driver_drift=DRIFT)
+    study = etid.Study.from_recordings([calibration, recorded_skin()])
+    with pytest.raises(ValueError, match=f"'{method}' gives none"):
+        etid.identify_study(study, method=method, driver_drift=DRIFT)
+
+
+def recorded_skin():
+    trial = Trial("loaded/0", DRY)
+    return Scene((trial,)).simulate(seed=1)[trial.path]
 
 
 def recorded_calibration():

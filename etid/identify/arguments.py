@@ -16,7 +16,7 @@ from etid.estimators.registry import MAXIMUM_LIKELIHOOD, OUTPUT_ERROR, Method, n
 from etid.recordings.preflight import Inspected, preflight
 from etid.recordings.recording import Recording, RecordingError
 from etid.recordings.study import Study
-from etid.results.driver import Driver, HarmonicDriver
+from etid.results.driver import ContinuousDriver, Driver, HarmonicDriver
 from etid.signals.harmonics import separates_aliases
 
 LARGEST_ORDER = 50  # ten times the order of the paper; memory grows with the square of the order
@@ -118,6 +118,27 @@ def order_of(value: Any) -> int:
     if order > LARGEST_ORDER:
         raise RecordingError(f"is {order}, too many poles", field="order", remedy=remedy)
     return order  # `identify_driver` refuses an order below 2
+
+
+def drift_of(value: float, asked: AbstractEstimator | None) -> float:
+    """The drift of a driver.
+
+    Args:
+        value: Relative standard deviation.
+        asked: The estimator of driver and loads, if one is given.
+
+    Raises:
+        ValueError: The drift is not in 0 ≤ drift < 1, or the estimator gives no standard errors
+            that it could enter.
+    """
+    if not 0 <= value < 1:
+        raise ValueError(f"driver_drift is {value}; it must be at least 0 and below 1")
+    if value and asked is not None and not issubclass(asked.driver, ContinuousDriver):
+        raise ValueError(
+            f"driver_drift enters standard errors, and method {str(asked)!r} gives none; leave "
+            "driver_drift out, or use method='maximum_likelihood' or method='output_error'"
+        )
+    return value
 
 
 # --- The estimator --------------------------------------------------------------------------------

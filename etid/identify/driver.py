@@ -15,7 +15,7 @@ from etid.estimators.lanes import AlignedSamples, Harmonics, stacked
 from etid.estimators.registry import Method
 from etid.estimators.score_tests import resistors
 from etid.identify import changes
-from etid.identify.arguments import estimator_of, for_calibrations, order_of, recordings
+from etid.identify.arguments import drift_of, estimator_of, for_calibrations, order_of, recordings
 from etid.identify.compiled import stored_jit
 from etid.identify.one import checksum, explained, needs_another, of_both
 from etid.recordings.preflight import Inspected, preflight
@@ -62,7 +62,8 @@ def identify_driver(
 
     Raises:
         ValueError: There is no calibration, a calibration has no `r_load`, their lengths or rates
-            differ, the order is below 2, or `driver_drift` is not in 0 ≤ drift < 1.
+            differ, the order is below 2, `driver_drift` is not in 0 ≤ drift < 1, or the method
+            gives no standard errors that it could enter.
         IdentificationError: The verdict is not successful and `throw` is set.
     """
     asked = estimator_of(method)
@@ -80,8 +81,7 @@ def identify_driver(
                 f"recording {record.path!r} has no r_load; a calibration needs its resistor [ohm]"
             )
         resistances.append(record.r_load)
-    if not 0 <= driver_drift < 1:
-        raise ValueError(f"driver_drift is {driver_drift}; it must be at least 0 and below 1")
+    drift = drift_of(driver_drift, asked)
     if order < 2:
         raise ValueError(f"order is {order}; a source impedance needs at least order 2")
     sizes = {(record.v_th.size, record.sample_rate, record.pulse_rate) for record in records}
@@ -117,8 +117,8 @@ def identify_driver(
     if isinstance(driver, HarmonicDriver):
         unloaded = np.array([checksum(one) for one in seen])
         driver = dataclasses.replace(driver, unloaded=unloaded)
-    if driver_drift and isinstance(driver, ContinuousDriver):
-        driver = dataclasses.replace(driver, drift=np.asarray(driver_drift, float))
+    if drift and isinstance(driver, ContinuousDriver):
+        driver = dataclasses.replace(driver, drift=np.asarray(drift, float))
     driver = changes.driver_judged(driver, jnp.asarray(resistances), repeats(seen))
     size = float(jnp.abs(driver.response(jnp.asarray(1e3))))
     if np.isfinite(size) and not plausible[0] <= size <= plausible[1]:

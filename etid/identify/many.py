@@ -24,7 +24,15 @@ from etid.circuits.circuit import AbstractCircuit
 from etid.estimators.estimator import AbstractEstimator
 from etid.estimators.lanes import AbstractLane, stacked, unstacked
 from etid.estimators.registry import MAXIMUM_LIKELIHOOD, Method
-from etid.identify.arguments import check_default, circuit_of, estimator_of, order_of, plan, require
+from etid.identify.arguments import (
+    check_default,
+    circuit_of,
+    drift_of,
+    estimator_of,
+    order_of,
+    plan,
+    require,
+)
 from etid.identify.arguments import recordings as several
 from etid.identify.compiled import stored_jit
 from etid.identify.driver import identify_driver
@@ -362,7 +370,7 @@ class Drivers:
         driver_drift: float = 0.0,
     ):
         self.study = study
-        self.driver_drift = driver_drift
+        self.driver_drift = drift_of(driver_drift, asked)
         self.order = order
         self.asked = asked
         self.calibrations = tuple(study.calibrations)

@@ -20,6 +20,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import optimistix as optx
+from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Complex, Float, PRNGKeyArray
 
 from etid.circuits.circuit import AbstractCircuit
@@ -178,6 +179,25 @@ class _Model(eqx.Module):
         y = delayed(g * spectrum.x, spectrum.frequency, late, self.sample_rate)
         return [*records[:-1], eqx.tree_at(lambda s: s.y, spectrum, y)]
 
+    def by_drift(
+        self, q: Float[Array, " q"], records: list[Spectrum], driver: HarmonicDriver
+    ) -> Float[Array, "parameter term"]:
+        """Changes of e by one standard deviation of the drift of each parameter of Z_th."""
+        spectrum = records[-1]
+        source, unflatten = ravel_pytree(driver.source)
+
+        def changed(direction: Float[Array, " parameter"]) -> Complex[Array, " harmonic"]:
+            def z_th(p: Float[Array, " parameter"]) -> Complex[Array, " harmonic"]:
+                return unflatten(p).response(spectrum.frequency)
+
+            return jax.jvp(z_th, (source,), (direction,))[1]
+
+        y, of = self._in_time(q, records), self.z_th(q, records)
+        weight = jnp.sqrt(2 / self._variance(q, records, y, of)[0])
+        weight = jnp.where(self.selected, weight, 0.0)
+        e = jax.vmap(changed)(jnp.diag(driver.drift_std())) * (y * as_complex(weight))[None, :]
+        return jnp.concatenate([e.real, e.imag], axis=1)
+
     def private(self, q: Float[Array, " q"], records: list[Spectrum]) -> Float[Array, " harmonic"]:
         """Part of the variance of e that only the load has."""
         y, of = self._in_time(q, records), self.z_th(q, records)
@@ -241,6 +261,9 @@ def fit_circuit(
     noise = jnp.concatenate([noise, jnp.ones(rest + len(known))])
     own_cov = (by_term * (weights * noise)[None, :]) @ by_term.T
     shared = (by_term * ((1 - weights) * noise)[None, :]) @ by_term.T
+    if driver.drift is not None:
+        by_drift = by_term[:, : 2 * count] @ model.by_drift(q, clean, driver).T
+        shared = shared + by_drift @ by_drift.T
     estimate = Estimate(
         parameters=(q - bias)[:elements],
         delay_samples=model.named(q)[0].delay_samples[None],
