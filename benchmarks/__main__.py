@@ -11,6 +11,7 @@ from benchmarks.ngspice import NgspiceError
 NAMES = (
     "spice",
     "coverage",
+    "driver_order",
     "design",
     "timing",
     "speed",

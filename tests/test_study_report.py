@@ -28,6 +28,7 @@ from etid.results.driver import (
 from etid.results.provenance import Settings
 from etid.results.study_fits import StudyFits
 from etid.results.verdicts import message, verdict, verdicts_of
+from etid.selection.driver_order import Candidate, evidence
 from etid.simulation.scenes import Scene, Trial
 from etid.simulation.transformer import ResistorLoad, SkinLoad
 from tests import pictures
@@ -66,6 +67,9 @@ def driver():
         calibration=Calibration(jnp.array([98.8e3]), jnp.zeros(1), jnp.array(np.nan)),
         rrse=jnp.array(0.003), chi2=jnp.array(1.1), result=verdict("successful"),
         steps=jnp.array(9), method="maximum_likelihood",
+        tried=evidence(
+            [Candidate(4, 9e3, 10, 3000, 90.0, False), Candidate(5, 3e3, 12, 3000, 4.0, True)]
+        ),
     )  # fmt: skip
 
 
@@ -194,6 +198,11 @@ def test_a_file_of_fits_gives_back_drivers_and_settings(found, driver, tmp_path)
         expected = np.asarray(getattr(driver, name)(frequency))
         np.testing.assert_array_equal(np.asarray(getattr(stored, name)(frequency)), expected)
     assert (stored.verdict, stored.method, stored.order) == ("successful", driver.method, 3)
+    assert isinstance(stored, ContinuousDriver)
+    assert stored.tried.orders == [4, 5]
+    for name in ("bic", "missing_pole", "adequate"):
+        one, other = (np.asarray(getattr(of.tried, name)) for of in (stored, driver))
+        np.testing.assert_array_equal(one, other)
     again.write(tmp_path / "again.h5")
     assert (tmp_path / "again.h5").read_bytes() == (tmp_path / "fits.h5").read_bytes()
     assert etid.Fits.read(tmp_path / "fits.h5").counts() == found.fits.counts()
@@ -352,6 +361,15 @@ CITED = {  # what a reader sees, and the key of the entry that it must have
 
 
 TWO = "maximum_likelihood + output_error"
+
+
+def test_methods_say_that_the_calibrations_chose_the_order(found, study_file):
+    with etid.read(study_file) as study:
+        settings = Settings.of(study, 6, "auto", "", etid.SkinRC())
+    section = methods_section.methods_section(dataclasses.replace(found, settings=settings))
+    assert "rational function of order 3, " in section.text
+    assert "Schwarz's criterion (1978)" in section.text
+    assert "{schwarz1978," in section.code
 
 
 @pytest.mark.parametrize("method", [*registry.names(), "joint", "online", TWO])

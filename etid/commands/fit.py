@@ -20,6 +20,7 @@ from etid.identify.jointly import identify_jointly
 from etid.recordings import hdf5
 from etid.report.html import Table
 from etid.results.study_fits import StudyFits
+from etid.results.tried_orders import AUTO, Order
 
 _SHOWN = 20  # most unsuccessful recordings to list
 
@@ -35,7 +36,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     add_circuit(parser, "circuit of the loads, default SkinRC")
     parser.add_argument(
-        "--order", type=int, default=5, help="number of poles of the driver, default 5"
+        "--order",
+        type=_order,
+        default=5,
+        metavar="N",
+        help="number of poles of the driver, or auto: the least that the calibrations support; "
+        "default 5",
     )
     parser.add_argument(
         "--driver-drift",
@@ -62,6 +68,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="ADDRESS",
         help="scheduler of a cluster that can read the file (etid[dask])",
     )
+
+
+def _order(text: str) -> Order:
+    """The value of --order; argparse reports a ValueError."""
+    return AUTO if text == AUTO else int(text)
 
 
 def run(arguments: argparse.Namespace) -> Outcome:

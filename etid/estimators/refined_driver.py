@@ -88,22 +88,22 @@ def refined_driver(
     source, estimate, calibration = jax.tree.map(
         lambda leaf: leaf[chosen], (sources, estimates, known)
     )
-    lacks = wrong = jnp.array(False)
+    wrong = jnp.array(False)
+    kind, lacks = ContinuousDriver, jnp.array(False)
     terms = jnp.asarray(m.v_out.size, m.v_out.dtype)
     if spectra is not None:
         calibrations = maximum_likelihood.Calibrations(
             source, calibration, spectra, m.sample_rate[0]
         )
-        lacks = missing_pole.is_seen(calibrations)
+        statistic = missing_pole.largest(calibrations)
+        kind = functools.partial(HarmonicDriver, spectra=spectra, missing_pole=statistic)
+        lacks = statistic > missing_pole.SEEN
         terms = 2 * jnp.sum(spectra.selected, dtype=terms.dtype)
         if r_load.size > 1:
             off = resistors.mismatch(calibrations)
             calibration = dataclasses.replace(calibration, mismatch=off)
     if calibration.mismatch is not None:
         wrong = resistors.disagree(calibration.mismatch, estimate.chi2, terms)
-    kind = (
-        ContinuousDriver if spectra is None else functools.partial(HarmonicDriver, spectra=spectra)
-    )
     return kind(
         b=baseline.num,
         a=baseline.den,

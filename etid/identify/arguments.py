@@ -17,6 +17,7 @@ from etid.recordings.preflight import Inspected, preflight
 from etid.recordings.recording import Recording, RecordingError
 from etid.recordings.study import Study
 from etid.results.driver import ContinuousDriver, Driver, HarmonicDriver
+from etid.results.tried_orders import AUTO, Order
 from etid.signals.harmonics import separates_aliases
 
 LARGEST_ORDER = 50  # ten times the order of the paper; memory grows with the square of the order
@@ -100,20 +101,25 @@ def circuit_of(value: AbstractCircuit | None) -> AbstractCircuit:
     return value
 
 
-def order_of(value: Any) -> int:
-    """The number of poles of a driver.
+def order_of(value: Any) -> Order:
+    """The number of poles of a driver, or `"auto"`.
 
     Raises:
-        RecordingError: The value is not a whole number, or it exceeds `LARGEST_ORDER`.
+        RecordingError: The value is neither a whole number nor `"auto"`, or it exceeds
+            `LARGEST_ORDER`.
     """
-    remedy = f"Pass a whole number from 2 to {LARGEST_ORDER}, as in order=5"
+    remedy = f'Pass a whole number from 2 to {LARGEST_ORDER}, as in order=5, or order="auto"'
     try:
         order = operator.index(value)
     except TypeError:
         order = None
+    if isinstance(value, str) and value == AUTO:
+        return AUTO
     if order is None or isinstance(value, bool):
         raise RecordingError(
-            f"is {reprlib.repr(value)}, must be a whole number", field="order", remedy=remedy
+            f"is {reprlib.repr(value)}, must be a whole number or 'auto'",
+            field="order",
+            remedy=remedy,
         )
     if order > LARGEST_ORDER:
         raise RecordingError(f"is {order}, too many poles", field="order", remedy=remedy)

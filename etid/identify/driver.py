@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from etid.estimators.estimator import AbstractEstimator
+from etid.estimators.estimator import AbstractEstimator, serving
 from etid.estimators.lanes import AlignedSamples, Harmonics, stacked
 from etid.estimators.registry import Method
 from etid.estimators.score_tests import resistors
@@ -23,7 +23,9 @@ from etid.recordings.recording import Recording
 from etid.recordings.repeats import repeats
 from etid.results.driver import ContinuousDriver, Driver, HarmonicDriver
 from etid.results.fits import IdentificationError
+from etid.results.tried_orders import AUTO, Order
 from etid.results.verdicts import message, verdict
+from etid.selection.driver_order import Candidate, best, evidence, next_order
 from etid.signals import mains
 from etid.signals.harmonics import Spectrum
 
@@ -34,7 +36,7 @@ PLAUSIBLE = (300.0, 300e3)
 def identify_driver(
     calibrations: Recording | Sequence[Recording],
     *,
-    order: int = 5,
+    order: Order = 5,
     method: Method | None = None,
     plausible: tuple[float, float] = PLAUSIBLE,
     driver_drift: float = 0.0,
@@ -44,7 +46,8 @@ def identify_driver(
 
     Args:
         calibrations: Recordings with `r_load`, all of the same length, sample rate and pulse rate.
-        order: Number of poles of Z_th (the paper uses 5).
+        order: Number of poles of Z_th (the paper uses 5), or `"auto"`: the least order that the
+            calibrations support, by maximum likelihood. `driver.tried` holds the evidence.
         method: `"maximum_likelihood"` (for records of several whole pulse periods),
             `"output_error"`, the paper's `"steiglitz_mcbride"`, or its first iteration,
             `"equation_error"`. An estimator with options is possible too, as in
@@ -63,7 +66,8 @@ def identify_driver(
     Raises:
         ValueError: There is no calibration, a calibration has no `r_load`, their lengths or rates
             differ, the order is below 2, `driver_drift` is not in 0 ≤ drift < 1, or the method
-            gives no standard errors that it could enter.
+            gives no standard errors that it could enter, or has no likelihood that could choose the
+            order.
         IdentificationError: The verdict is not successful and `throw` is set.
     """
     asked = estimator_of(method)
@@ -82,7 +86,7 @@ def identify_driver(
             )
         resistances.append(record.r_load)
     drift = drift_of(driver_drift, asked)
-    if order < 2:
+    if order != AUTO and order < 2:
         raise ValueError(f"order is {order}; a source impedance needs at least order 2")
     sizes = {(record.v_th.size, record.sample_rate, record.pulse_rate) for record in records}
     if len(sizes) > 1:
@@ -104,13 +108,9 @@ def identify_driver(
         text = f"calibrations show impedances of about {shown}: resistors_disagree. "
         raise IdentificationError(text + message("resistors_disagree"), None)
     estimator = for_calibrations(asked, seen)
-    driver = _driver(seen, order, estimator)
-    late = np.zeros(len(seen))
-    if isinstance(driver, ContinuousDriver):
-        late = np.asarray(driver.calibration.delay_samples)
-    if driver.verdict != "successful" and 1 < np.max(np.abs(late)) < np.inf:
-        for one, delay in zip(seen, late, strict=True):
-            one.lag += round(delay)
+    if order == AUTO:
+        driver = _of_least_order(seen, estimator)
+    else:
         driver = _driver(seen, order, estimator)
     remarks = functools.reduce(operator.or_, (one.remarks for one in seen))
     driver = dataclasses.replace(driver, remarks=np.asarray(int(remarks) | int(driver.remarks)))
@@ -128,7 +128,53 @@ def identify_driver(
     return driver
 
 
+def _of_least_order(seen: Sequence[Inspected], estimator: AbstractEstimator) -> Driver:
+    """The driver of the least order that the calibrations support.
+
+    Raises:
+        ValueError: The estimator does not keep the harmonics of the calibrations.
+    """
+    if not issubclass(estimator.driver, HarmonicDriver):
+        raise ValueError(
+            f'order="auto" needs maximum likelihood, but the method is {str(estimator)!r}; give a '
+            "number of poles, as in order=5, or record several whole pulse periods"
+        )
+    drivers: dict[int, HarmonicDriver] = {}
+    tried: list[Candidate] = []
+    while (order := next_order(tried)) is not None:
+        drivers[order] = serving(_driver(seen, order, estimator), HarmonicDriver, str(estimator))
+        tried.append(_candidate(drivers[order]))
+    return dataclasses.replace(drivers[best(tried).order], tried=evidence(tried))
+
+
+def _candidate(driver: HarmonicDriver) -> Candidate:
+    """The evidence for the order of a driver."""
+    unknowns = driver.cov.shape[0] + driver.calibration.r_load.size
+    terms = 2 * int(np.sum(np.asarray(driver.spectra.selected)))
+    return Candidate(
+        order=driver.order,
+        squares=float(driver.chi2) * (terms - unknowns),
+        unknowns=unknowns,
+        terms=terms,
+        missing_pole=float(driver.missing_pole),
+        adequate=driver.verdict == "successful",
+    )
+
+
 def _driver(seen: Sequence[Inspected], order: int, estimator: AbstractEstimator) -> Driver:
+    """The driver from calibrations that passed the pre-flight; late ones are aligned again."""
+    driver = _aligned(seen, order, estimator)
+    late = np.zeros(len(seen))
+    if isinstance(driver, ContinuousDriver):
+        late = np.asarray(driver.calibration.delay_samples)
+    if driver.verdict != "successful" and 1 < np.max(np.abs(late)) < np.inf:
+        for one, delay in zip(seen, late, strict=True):
+            one.lag += round(delay)
+        driver = _aligned(seen, order, estimator)
+    return driver
+
+
+def _aligned(seen: Sequence[Inspected], order: int, estimator: AbstractEstimator) -> Driver:
     """The driver from calibrations that passed the pre-flight, aligned by their lags."""
     r_load = jnp.asarray([one.recording.r_load for one in seen])
     aligned = [AlignedSamples.of(one) for one in seen]

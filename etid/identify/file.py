@@ -40,6 +40,7 @@ from etid.recordings.replacing import replacing
 from etid.recordings.study import Study
 from etid.results.provenance import Settings
 from etid.results.study_fits import StudyFits
+from etid.results.tried_orders import Order
 
 PART = 256  # recordings, some seconds of work; a killed run loses at most one part
 
@@ -62,14 +63,16 @@ class _Opened(NamedTuple):
     drivers: Drivers
 
 
-def _open(source: str, order: int, asked: AbstractEstimator | None, driver_drift: float) -> _Opened:
+def _open(
+    source: str, order: Order, asked: AbstractEstimator | None, driver_drift: float
+) -> _Opened:
     study = read(source)
     return _Opened(study, to_identify(study), Drivers(study, order, asked, driver_drift))
 
 
 @functools.cache
 def _kept_open(
-    source: str, stamp: int, order: int, asked: AbstractEstimator | None, driver_drift: float
+    source: str, stamp: int, order: Order, asked: AbstractEstimator | None, driver_drift: float
 ) -> _Opened:
     """`_open`, kept for the lifetime of the process: a worker gets its parts one by one."""
     del stamp
@@ -102,7 +105,7 @@ def _fit(
 def _fit_elsewhere(
     source: str,
     stamp: int,
-    order: int,
+    order: Order,
     asked: AbstractEstimator | None,
     driver_drift: float,
     circuit: AbstractCircuit,
@@ -186,7 +189,7 @@ def fit_file(
     source: str | os.PathLike[str],
     target: str | os.PathLike[str],
     *,
-    order: int = 5,
+    order: Order = 5,
     circuit: AbstractCircuit | None = None,
     method: Method | None = None,
     driver_drift: float = 0.0,

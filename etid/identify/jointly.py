@@ -51,6 +51,7 @@ from etid.results.driver import HarmonicDriver
 from etid.results.fits import Fit
 from etid.results.provenance import Settings
 from etid.results.study_fits import StudyFits
+from etid.results.tried_orders import Order
 from etid.results.verdicts import RESULTS, verdict
 
 METHOD = "joint"
@@ -213,7 +214,7 @@ def _of_both(first: _Start, second: _Start) -> _Start:
 def identify_jointly(
     study: Study,
     *,
-    order: int = 5,
+    order: Order = 5,
     circuit: AbstractCircuit | None = None,
     r_load_tolerance: float = 0.0,
     progress: bool = False,

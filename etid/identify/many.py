@@ -55,6 +55,7 @@ from etid.results.driver import Driver
 from etid.results.fits import Fit, Fits, IdentificationError, described, joined
 from etid.results.provenance import Settings
 from etid.results.study_fits import StudyFits
+from etid.results.tried_orders import Order
 from etid.results.verdicts import message
 
 LANES = 16  # lanes of one chunk; the last chunk is padded
@@ -279,7 +280,7 @@ def identify_skins(
 def identify_study(
     study: Study,
     *,
-    order: int = 5,
+    order: Order = 5,
     circuit: AbstractCircuit | None = None,
     method: Method | None = None,
     driver_drift: float = 0.0,
@@ -365,13 +366,13 @@ class Drivers:
     def __init__(
         self,
         study: Study,
-        order: int,
+        order: Order,
         asked: AbstractEstimator | None,
         driver_drift: float = 0.0,
     ):
         self.study = study
         self.driver_drift = drift_of(driver_drift, asked)
-        self.order = order
+        self.order: Order = order
         self.asked = asked
         self.calibrations = tuple(study.calibrations)
         self.found: dict[tuple[str, ...], Driver] = {}

@@ -36,6 +36,8 @@ def methods_section(found: StudyFits) -> Section:
     cited = {"etid", "fingertip", "steiglitz1965", "jax2018"}
     cited.update(key for one in (*known, *of_drivers) for key in one.cited)
     settings = found.settings
+    if settings is not None and settings.order == 0:
+        cited.add("schwarz1978")
     paragraphs = [
         _model(found),
         _driver(found),
@@ -95,14 +97,19 @@ def _driver(found: StudyFits) -> str:
     continuous = [driver for driver in drivers if isinstance(driver, ContinuousDriver)]
     known = [driver.calibration.r_load for driver in continuous]
     resistors = sorted(set(np.concatenate(known).tolist())) if known else []
-    order = found.settings.order if found.settings is not None else None
-    if order is None and drivers:
-        order = drivers[0].order
-    if order is None:
+    asked = found.settings.order if found.settings is not None else None
+    orders = sorted({driver.order for driver in drivers})
+    if not (asked or orders):
         return ""
+    order = " or ".join(map(str, [asked] if asked else orders))
     text = f"Z_th is a rational function of order {order}"
     if continuous:
         text += ", stable by its modal parameters"
+    if asked == 0:
+        text += (
+            ". The calibrations of each driver chose the order: the least one after which neither "
+            "a score test nor Schwarz's criterion (1978) asks for another pole"
+        )
     count = len(found.drivers) + len(found.failures)
     text += ". It was identified from calibrations"
     if count > 1:
@@ -202,7 +209,7 @@ def _table(found: StudyFits, settings: Settings) -> Table:
         "recordings": source,
         "method": f"asked for {settings.asked_method or 'none'}, used {found.fits.fit.method}",
         "circuit": type(found.fits.circuit).__name__,
-        "Z_th": f"order {settings.order}, drift of {100 * settings.driver_drift:g} %",
+        "Z_th": f"order {settings.order or 'auto'}, drift of {100 * settings.driver_drift:g} %",
         "R_L": f"standard deviation of {100 * settings.r_load_tolerance:g} %",
         "computed": f"in {settings.precision} on {settings.backend}",
         "versions": ", ".join(settings.versions),

@@ -20,6 +20,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Complex, Float, Int
 
 from etid.recordings.remarks import texts
+from etid.results.tried_orders import TriedOrders
 from etid.results.verdicts import RESULTS, Judged, message
 from etid.signals.filtering import StateSpace
 from etid.signals.harmonics import Spectrum
@@ -220,14 +221,14 @@ class Driver(Judged):
             f"Driver of order {self.order}: {self.verdict} in {int(self.steps)} steps "
             f"({self.method}), RRSE {100 * float(self.rrse):.3g} %, chi2 {float(self.chi2):.3g}",
             f"Z_th at 1 kHz {z.real / 1e3:.4g} {z.imag / 1e3:+.4g}j kΩ",
-            *self._resistors(),
+            *self._findings(),
         ]
         if self.verdict != "successful":
             lines.append(message(self.verdict))
         return "\n  ".join([*lines, *texts(int(self.remarks))])
 
-    def _resistors(self) -> list[str]:
-        """Lines on the known resistors that differ from the values of the other calibrations."""
+    def _findings(self) -> list[str]:
+        """Lines on the orders tried, and on known resistors and their values from the others."""
         return []
 
 
@@ -256,6 +257,7 @@ class ContinuousDriver(Driver):
         drift: Relative standard deviation of the change of each parameter of `source` between the
             calibration and the recording of a skin; None if there is no change. `cov` does not
             contain it.
+        tried: Orders that `order="auto"` tried; none if the user chose the order.
     """
 
     _: dataclasses.KW_ONLY
@@ -263,6 +265,7 @@ class ContinuousDriver(Driver):
     cov: Float[Array, "parameter parameter"]
     calibration: Calibration
     drift: Float[Array | np.ndarray, ""] | None = None
+    tried: TriedOrders = eqx.field(default_factory=TriedOrders.none)
 
     def drift_std(self) -> Float[Array, " parameter"]:
         """Standard deviations of the parameters of `source` that come from `drift` alone."""
@@ -287,11 +290,11 @@ class ContinuousDriver(Driver):
         values, unflatten = ravel_pytree(self.source)
         return log_stderr(lambda p: unflatten(p).response(frequency), values, self.cov)
 
-    def _resistors(self) -> list[str]:
-        known = self.calibration
+    def _findings(self) -> list[str]:
+        known, tried = self.calibration, [str(self.tried)] if self.tried.orders else []
         if known.mismatch is None:
-            return []
-        return [
+            return tried
+        return tried + [
             f"r_load {float(r) / 1e3:.6g} kΩ is {100 * float(np.expm1(off)):+.3g}"
             f" ± {100 * float(error):.2g} % off what the others say"
             for r, off, error in zip(known.r_load, *known.mismatch, strict=True)
@@ -306,8 +309,11 @@ class HarmonicDriver(ContinuousDriver):
         unloaded: Checksums of the unloaded records of the calibrations; None if not known. A load
             with another checksum shares no unloaded record with them. Its fit then skips the
             search for what they share, which doubles the cost.
+        missing_pole: Largest score statistic of one more section
+            (`etid.estimators.score_tests.missing_pole`).
     """
 
     _: dataclasses.KW_ONLY
     spectra: Spectrum
+    missing_pole: Float[Array, ""]
     unloaded: Int[np.ndarray, " record"] | None = None

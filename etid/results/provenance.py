@@ -9,6 +9,7 @@ import numpy as np
 
 from etid.circuits.circuit import AbstractCircuit
 from etid.recordings.study import Study
+from etid.results.tried_orders import AUTO, Order
 
 PACKAGES = ("etid", "jax", "jaxlib", "optimistix", "equinox", "numpy")
 
@@ -23,7 +24,7 @@ class Settings:
             the recordings were in memory.
         recordings: Number of recordings to identify.
         asked_method: The method that the user chose; empty if etid chose it for each recording.
-        order: Number of poles of Z_th.
+        order: Number of poles of Z_th; 0 if etid chose it from the calibrations of each driver.
         start: Typical values of the elements [SI]; fits start around them.
         r_load_tolerance: Relative standard deviation of the known resistors that is included in
             the standard errors.
@@ -50,7 +51,7 @@ class Settings:
         cls,
         study: Study,
         count: int,
-        order: int,
+        order: Order,
         method: str,
         circuit: AbstractCircuit,
         r_load_tolerance: float = 0.0,
@@ -73,7 +74,7 @@ class Settings:
             source_size=os.path.getsize(source) if source else 0,
             recordings=count,
             asked_method=method,
-            order=order,
+            order=0 if order == AUTO else order,
             start=tuple(np.asarray(circuit.values()).tolist()),
             r_load_tolerance=float(r_load_tolerance),
             driver_drift=float(driver_drift),

@@ -32,6 +32,7 @@ from etid.results.driver import (
 from etid.results.fits import SCHEMA, Fits
 from etid.results.hdf5_table import Table, opened_table, write_table
 from etid.results.provenance import Settings
+from etid.results.tried_orders import TriedOrders
 from etid.results.verdicts import verdicts_of
 
 # Errors that a damaged line of JSON may raise.
@@ -187,6 +188,7 @@ def _to_json(paths: tuple[str, ...], driver: Driver) -> str:
             "r_load": np.asarray(driver.calibration.r_load).tolist(),
             "delay_samples": np.asarray(driver.calibration.delay_samples).tolist(),
             "delay_std_samples": float(driver.calibration.delay_std_samples),
+            "tried": _lists(driver.tried),
         }
     return json.dumps(stored)
 
@@ -237,7 +239,24 @@ def _continuous(stored: Mapping[str, Any]) -> Callable[..., ContinuousDriver]:
         cov=_numbers(stored, "cov", 2, (size, size)),
         calibration=Calibration(r_load, delay, _numbers(stored, "delay_std_samples", 0)),
         drift=None if stored.get("drift") is None else _numbers(stored, "drift", 0),
+        tried=_tried(stored["tried"]) if "tried" in stored else TriedOrders.none(),
     )
+
+
+def _tried(stored: Mapping[str, Any]) -> TriedOrders:
+    """The orders that were tried.
+
+    Raises:
+        ValueError, TypeError, KeyError, OverflowError: The line is damaged.
+    """
+    shape = TriedOrders.none().bic.shape
+    bic, missing_pole = (
+        np.asarray(_numbers(stored, name, 1, shape)) for name in ("bic", "missing_pole")
+    )
+    adequate = np.asarray(stored["adequate"])
+    if adequate.dtype.kind != "b" or adequate.shape != shape:
+        raise TypeError(f"adequate is {reprlib.repr(stored['adequate'])}")
+    return TriedOrders(bic, missing_pole, adequate)
 
 
 def _numbers(

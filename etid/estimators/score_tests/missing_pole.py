@@ -16,7 +16,7 @@ enough. It is at least 116 if a lower order changes an element by five of its st
 """
 
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Complex, Float
+from jaxtyping import Array, Complex, Float
 
 from etid.estimators.maximum_likelihood.driver import Calibrations
 from etid.signals.transfer import as_complex, frequency_variable, reciprocal
@@ -38,13 +38,13 @@ def sections(
     return jnp.stack([low, x * low], axis=1)
 
 
-def is_seen(calibrations: Calibrations) -> Bool[Array, ""]:
-    """Whether the calibrations show one more section.
+def largest(calibrations: Calibrations) -> Float[Array, ""]:
+    """Largest score statistic of all sections; the calibrations show one more if above `SEEN`.
 
     Args:
         calibrations: Calibrations at the minimum of their likelihood.
     """
-    return jnp.nanmax(squares(calibrations)) > SEEN  # NaN if a section has no effect
+    return jnp.nanmax(squares(calibrations))  # NaN if a section has no effect
 
 
 def squares(calibrations: Calibrations) -> Float[Array, " section"]:

@@ -1,0 +1,152 @@
+"""Does `order="auto"` choose the order of a driver that identifies elements best?
+
+For each SNR, drivers with six poles are drawn anew (parts differ by 3 %), each with a calibration
+of 98.8 kΩ and a dry and a damp fingertip. `order="auto"` sees the calibration only. The table shows
+the orders that it chose, the root mean square of the errors of the elements in units of the
+Cramer-Rao bound, for it and for every fixed order, and how many of its 95 % intervals contain the
+truth. Fits of all verdicts count: a verdict must not flatter the numbers.
+
+A choice is right if the fixed order of this number has an error of at most `AS_GOOD` times that of
+the best fixed order. The orders chosen for the SPICE recordings are shown too, where they are
+present: their driver shows three to four poles at 60 dB, and five without noise.
+"""
+
+import argparse
+import collections
+import dataclasses
+import pathlib
+import tempfile
+from collections.abc import Iterable, Sequence
+
+import numpy as np
+from jaxtyping import Float
+from tqdm import tqdm
+
+import etid
+from benchmarks.coverage import NORMAL_95, scene
+from benchmarks.perturbed_study import PARTS, drawn_driver
+from benchmarks.spice import FOLDER, add_data
+from etid.results.tried_orders import AUTO, Order
+
+ORDERS = (3, 4, 5, 6)
+SNR_DB = (40.0, 60.0, 80.0)
+AS_GOOD = 1.1  # of 20 drivers with two skins, a root mean square is known to about 10 %
+RIGHT = 0.98  # part of the choices that must be right
+# Orders that a driver of these SPICE recordings shows.
+VISIBLE = {
+    "lab_dry": (3, 4),
+    "lab_damp": (3, 4),
+    "jitter_dry": (3, 4),
+    "jitter_damp": (3, 4),
+    "clean_dry": (5, 5),
+    "clean_damp": (5, 5),
+}
+
+
+@dataclasses.dataclass(frozen=True)
+class Draw:
+    """The fits behind one driver of a drawn scene.
+
+    Attributes:
+        order: Poles of this driver.
+        error: Relative errors of the elements, in units of their bounds.
+        z: The same in units of the standard errors.
+    """
+
+    order: int
+    error: Float[np.ndarray, "trial element"]
+    z: Float[np.ndarray, "trial element"]
+
+
+def draw(seed: int, snr_db: float, orders: Sequence[Order], samples: int) -> dict[Order, Draw]:
+    """Fits of one drawn scene by orders; nothing for an order without a driver.
+
+    Args:
+        seed: Of driver, noise and delays.
+        snr_db: Of every record [dB].
+        orders: Orders to identify the driver with.
+        samples: Length of a record [samples].
+    """
+    drawn = scene(snr_db, samples)
+    drawn = dataclasses.replace(drawn, driver=drawn_driver(seed, PARTS, drawn.driver))
+    study, bounds = drawn.simulate(seed), etid.bound(drawn)
+    found = {}
+    for order in orders:
+        calibrations = list(study.calibrations.recordings())
+        driver = etid.identify_driver(calibrations, order=order, throw=False)
+        errors, zs = [], []
+        for path, truth in ((trial.path, drawn.truth()[trial.path]) for trial in drawn.trials):
+            fit = etid.identify_skin(study[path], driver, throw=False)
+            error = np.asarray(fit.circuit.values()) - np.array(list(truth.values()))
+            errors.append(error / np.array(list(bounds[path].stderr.values())))
+            zs.append(error / np.asarray(fit.stderr.values()))
+        found[order] = Draw(driver.order, np.array(errors), np.array(zs))
+    return found
+
+
+def rms(draws: Sequence[dict[Order, Draw]], order: Order) -> float:
+    """Root mean square of the errors in units of the bound; infinite if an error is no number."""
+    squares = np.mean([one[order].error ** 2 for one in draws])
+    return float(np.sqrt(squares)) if np.isfinite(squares) else np.inf
+
+
+def right(draws: Sequence[dict[Order, Draw]], orders: Sequence[int]) -> list[bool]:
+    """Whether each choice is the best fixed order, or as good."""
+    errors = {order: rms(draws, order) for order in orders}
+    limit = AS_GOOD * min(errors.values())
+    return [errors.get(one[AUTO].order, np.inf) <= limit for one in draws]
+
+
+def spice_orders(folder: pathlib.Path, names: Iterable[str]) -> dict[str, int]:
+    """The orders chosen for the calibrations of SPICE recordings, by name."""
+    found = {}
+    for name in names:
+        with tempfile.TemporaryDirectory() as work:
+            file = pathlib.Path(work, "study.h5")
+            etid.import_file(folder / f"{name}.npz", file)
+            with etid.read(file) as study:
+                calibrations = list(study.calibrations.recordings())
+                found[name] = etid.identify_driver(calibrations, order=AUTO, throw=False).order
+    return found
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """How much is drawn, and where the SPICE recordings are."""
+    add_data(parser)
+    parser.add_argument("--snr-db", type=float, nargs="+", default=SNR_DB)
+    parser.add_argument("--orders", type=int, nargs="+", default=ORDERS)
+    parser.add_argument("--drivers", type=int, default=20, help="drawn for each SNR")
+    parser.add_argument("--samples", type=int, default=10_000)
+
+
+def main(arguments: argparse.Namespace) -> bool:
+    """Print the table; whether enough choices are right."""
+    orders = tuple(arguments.orders)
+    heads = "".join(f"{f'order {order}':>10}" for order in orders)
+    print(f"{'SNR':>6}{'auto':>8}{heads}{'covered':>10}{'right':>8}  chosen")
+    verdicts: list[bool] = []
+    for snr_db in arguments.snr_db:
+        draws = [
+            draw(seed, snr_db, (AUTO, *orders), arguments.samples)
+            for seed in tqdm(range(arguments.drivers), disable=None)
+        ]
+        good = right(draws, orders)
+        covered = np.mean([np.abs(one[AUTO].z) < NORMAL_95 for one in draws])
+        fixed = "".join(f"{rms(draws, order):10.2f}" for order in orders)
+        chosen = collections.Counter(one[AUTO].order for one in draws)
+        counts = ", ".join(f"{count} of order {order}" for order, count in sorted(chosen.items()))
+        print(
+            f"{snr_db:6.0f}{rms(draws, AUTO):8.2f}{fixed}{100 * covered:9.1f}%"
+            f"{100 * np.mean(good):7.0f}%  {counts}",
+            flush=True,
+        )
+        verdicts += good
+    folder = arguments.data / FOLDER
+    if not folder.exists():
+        print(f"no SPICE recordings at {folder}; pass their parent folder with --data")
+        return bool(np.mean(verdicts) >= RIGHT)
+    found = spice_orders(folder, VISIBLE)
+    for name, order in found.items():
+        print(f"{name}: order {order}, {VISIBLE[name][0]} to {VISIBLE[name][1]} are visible")
+    inside = all(low <= found[name] <= high for name, (low, high) in VISIBLE.items())
+    return inside and bool(np.mean(verdicts) >= RIGHT)

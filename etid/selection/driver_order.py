@@ -1,0 +1,92 @@
+"""The least order of a driver that its calibrations support.
+
+The calibrations decide; no skin is needed. Orders are fitted from the lowest one upwards. Each is
+judged by the criterion of Schwarz (1978),
+
+    BIC = Σ r² + k ln n,
+
+with k unknowns and n terms r of unit variance. One more pole costs two unknowns, 2 ln n. The score
+test for a missing pole predicts by how much one more section would lower Σ r², before a driver
+with that section is fitted. The search therefore stops at the first order where this is less than
+the price of a pole: the next order is then not even fitted.
+"""
+
+import dataclasses
+import math
+from collections.abc import Sequence
+
+import numpy as np
+
+from etid.results.tried_orders import LARGEST, LEAST, TriedOrders
+
+PER_POLE = 2  # unknowns of one more pole: its rate and its gain
+
+
+@dataclasses.dataclass(frozen=True)
+class Candidate:
+    """A fitted order.
+
+    Attributes:
+        order: Number of poles of Z_th.
+        squares: Σ r² at the minimum, with the priors.
+        unknowns: k.
+        terms: n.
+        missing_pole: Largest score statistic of one more section.
+        adequate: Whether the driver of this order is successful.
+    """
+
+    order: int
+    squares: float
+    unknowns: int
+    terms: int
+    missing_pole: float
+    adequate: bool
+
+    @property
+    def bic(self) -> float:
+        """The criterion; infinite if the fit gave no number."""
+        found = self.squares + self.unknowns * math.log(self.terms)
+        return found if math.isfinite(found) else math.inf
+
+    @property
+    def asks_for_more(self) -> bool:
+        """Whether one more section would lower Σ r² by more than a pole costs."""
+        return not self.missing_pole <= PER_POLE * math.log(self.terms)
+
+
+def best(tried: Sequence[Candidate]) -> Candidate:
+    """The adequate candidate with the smallest BIC; if none is adequate, the smallest BIC of all.
+
+    Args:
+        tried: At least one candidate, the lowest order first.
+    """
+    adequate = [one for one in tried if one.adequate]
+    return min(adequate or tried, key=lambda one: one.bic)
+
+
+def next_order(tried: Sequence[Candidate]) -> int | None:
+    """The next order to fit; None if the search is over.
+
+    A section has two poles. The search therefore ends only after two more poles without a gain.
+
+    Args:
+        tried: The candidates so far, the lowest order first.
+    """
+    if not tried:
+        return LEAST
+    last = tried[-1]
+    without_gain = last.order - min(tried, key=lambda one: one.bic).order
+    satisfied = last.adequate and not last.asks_for_more
+    if satisfied or without_gain >= 2 or last.order == LARGEST:
+        return None
+    return last.order + 1
+
+
+def evidence(tried: Sequence[Candidate]) -> TriedOrders:
+    """The evidence for all candidates, as a driver keeps it."""
+    found = TriedOrders.none()
+    bic, missing_pole, adequate = map(np.array, (found.bic, found.missing_pole, found.adequate))
+    for one in tried:
+        place = one.order - LEAST
+        bic[place], missing_pole[place], adequate[place] = one.bic, one.missing_pole, one.adequate
+    return TriedOrders(bic, missing_pole, adequate)
