@@ -35,7 +35,7 @@ from etid.estimators.estimate import (
 from etid.estimators.output_error.information import curvature, further, slopes
 from etid.estimators.output_error.prediction import (
     IMPULSE,
-    Late,
+    Change,
     Records,
     impulse_response,
     late_calibration,
@@ -208,7 +208,7 @@ def fit_circuit(
     nuisance = Nuisance(jnp.zeros(states), zero, zero)
     _, named = ravel_pytree((candidates[0], nuisance, zero))
 
-    def residual(q: Float[Array, " q"], late: Late) -> Float[Array, " term"]:
+    def residual(q: Float[Array, " q"], late: Change) -> Float[Array, " term"]:
         log_elements, nuisance, late_samples = named(q)
         change = jax.tree.map(lambda leaf: late_samples * leaf, late)
         scaled = scaled_residual(records, source, load(log_elements), nuisance, change)
@@ -216,9 +216,9 @@ def fit_circuit(
         return jnp.concatenate([scaled, delays / jnp.stack([DELAY_WIDTH, late_std])])
 
     def refine(
-        carry: tuple[Float[Array, " q"], Late], _
+        carry: tuple[Float[Array, " q"], Change], _
     ) -> tuple[
-        tuple[Float[Array, " q"], Late],
+        tuple[Float[Array, " q"], Change],
         tuple[Float[Array, ""], optx.RESULTS, Int[Array, ""]],
     ]:
         q, late = carry
@@ -232,7 +232,7 @@ def fit_circuit(
         equations = solution.stats["normal_equations"]
         return (q, late), (equations.objective, solution.result, solution.stats["num_steps"])
 
-    nothing = Late(jnp.zeros(records.hold.shape[0]), jnp.zeros(IMPULSE + 1))
+    nothing = Change(jnp.zeros(records.hold.shape[0]), jnp.zeros(IMPULSE + 1))
     q0 = jax.vmap(lambda log_elements: ravel_pytree((log_elements, nuisance, zero))[0])(candidates)
     best = best_start(lambda q: residual(q, nothing), q0)
     # First without a delay of the calibration, then with it. In one loop, only one solver is

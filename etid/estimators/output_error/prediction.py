@@ -115,16 +115,14 @@ def residual_variance(records: Records, h: Float[Array, " lag"]) -> Float[Array,
     return records.sigma_out**2 * jnp.sum(k**2) + records.sigma_th**2 * jnp.sum(h**2)
 
 
-class Late(eqx.Module):
-    """Derivatives with respect to the delay of the calibration, per sample.
+class Change(eqx.Module):
+    """Derivatives of terminal voltage [V] and impulse response with respect to a small change.
 
-    Attributes:
-        v_out: Terminal voltage [V].
-        h: Impulse response.
+    Several changes are stacked along a last axis.
     """
 
-    v_out: Float[Array, " interval"]
-    h: Float[Array, " lag"]
+    v_out: Float[Array, "interval *change"]
+    h: Float[Array, "lag *change"]
 
 
 def scaled_residual(
@@ -132,7 +130,7 @@ def scaled_residual(
     source: SourceImpedance,
     load: Rational,
     nuisance: Nuisance,
-    change: Late | None = None,
+    change: Change | None = None,
 ) -> Float[Array, " interval"]:
     """(Predicted − measured) / √s; `change` is added to the prediction."""
     system = loaded_filter(source, load, records.sample_rate)
@@ -149,7 +147,7 @@ def late_calibration(
     load: Rational,
     r_load: Float[Array, ""],
     x0: Float[Array, " state"],
-) -> Late:
+) -> Change:
     """Derivatives with respect to the delay of the calibration, without the part that is a delay.
 
     A calibration with R_L that is late by τ yields Z_th + sτ (R_L + Z_th) in place of Z_th. To
@@ -184,4 +182,4 @@ def late_calibration(
         v_out = simulate(filtered, rate(records.hold), x0_rate)[0]
         return v_out, simulate(filtered, rate(impulse()), jnp.zeros_like(x0_rate))[0]
 
-    return Late(*jax.jvp(excess, (jnp.zeros(()),), (jnp.ones(()),))[1])
+    return Change(*jax.jvp(excess, (jnp.zeros(()),), (jnp.ones(()),))[1])

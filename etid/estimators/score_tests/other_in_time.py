@@ -16,7 +16,6 @@ slopes the noise of V_th that they share with the residual, as in
 
 import dataclasses
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -25,6 +24,7 @@ from jaxtyping import Array, Complex, Float
 from etid.circuits.impedance import AbstractImpedance
 from etid.estimators.output_error.information import Slopes, bin_weights, noise_power, padded_size
 from etid.estimators.output_error.prediction import (
+    Change,
     Records,
     impulse,
     impulse_response,
@@ -46,24 +46,12 @@ PASSED = 0.5  # part of the power that the interpolation must pass
 BESIDE = 8  # bins on either side over which the power of V_th is averaged
 
 
-class Relaxed(eqx.Module):
-    """Derivatives of voltage and impulse response with respect to each ε.
-
-    Attributes:
-        v_out: Terminal voltage [V].
-        h: Impulse response.
-    """
-
-    v_out: Float[Array, "interval change"]
-    h: Float[Array, "lag change"]
-
-
 def relaxed(
     records: Records,
     source: SourceImpedance,
     impedance: AbstractImpedance,
     nuisance: Nuisance,
-) -> Relaxed:
+) -> Change:
     """Derivatives with respect to one more relaxation, for each time constant.
 
     Args:
@@ -87,7 +75,7 @@ def relaxed(
         system = hold(connected(source, StateSpace(A, B, C, load.D)), rate)
         return predict(system, records, nuisance), impulse_response(system)
 
-    return Relaxed(*jax.jacfwd(simulated)(jnp.zeros(count)))
+    return Change(*jax.jacfwd(simulated)(jnp.zeros(count)))
 
 
 def _smooth(power: Float[Array, " bin"]) -> Float[Array, " bin"]:
@@ -100,7 +88,7 @@ def _smooth(power: Float[Array, " bin"]) -> Float[Array, " bin"]:
 
 def score(
     records: Records,
-    change: Relaxed,
+    change: Change,
     at: Slopes,
     source_cov: Float[Array, "m m"],
     first: int,
