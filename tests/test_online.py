@@ -10,9 +10,11 @@ import numpy as np
 import pytest
 
 import etid
+from etid.estimators.joint.fit import fit_alone
+from etid.estimators.joint.terms import Joint
 from etid.estimators.lanes import Harmonics
-from etid.estimators.maximum_likelihood import driver as maximum_likelihood
 from etid.estimators.maximum_likelihood import given_driver
+from etid.estimators.maximum_likelihood.driver import Calibrations
 from etid.estimators.starts import harmonic_starts
 from etid.online import gain_bands
 from etid.online.tracker import MEMORY, PATIENCE, Tracker
@@ -260,14 +262,12 @@ def batch(driver, recording):
     """Elements by maximum likelihood from the harmonics of a whole record, with the same Z_th."""
     lane = Harmonics.of(Inspected(recording))
     spectrum, rate = lane.spectrum, jnp.asarray(lane.sample_rate)
-    model = maximum_likelihood.Joint(
-        etid.SkinRC(), maximum_likelihood.Calibrations.of(driver), False
-    )
+    model = Joint(etid.SkinRC(), Calibrations.of(driver), False)
     selected = spectrum.selected & (spectrum.frequency < ALIASED * RATE)
     spectrum = dataclasses.replace(spectrum, selected=selected)
     z_th = driver.response(spectrum.frequency)
     starts = harmonic_starts(spectrum, rate, z_th, etid.SkinRC())
-    own, *_ = maximum_likelihood.fit_load(model, spectrum, rate, starts)
+    own, *_ = fit_alone(model, spectrum, rate, starts)
     return np.exp(np.asarray(own.log_elements))
 
 

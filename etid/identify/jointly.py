@@ -21,10 +21,10 @@ from tqdm import tqdm
 from etid.circuits.circuit import AbstractCircuit
 from etid.estimators import judgement
 from etid.estimators.estimator import serving
-from etid.estimators.joint import fit as shared_driver
-from etid.estimators.joint.terms import Loads
+from etid.estimators.joint.fit import fit_alone, fit_together
+from etid.estimators.joint.terms import Joint, Loads
 from etid.estimators.lanes import AbstractLane, Harmonics, unstacked
-from etid.estimators.maximum_likelihood.driver import Calibrations, Joint, fit_load
+from etid.estimators.maximum_likelihood.driver import Calibrations
 from etid.estimators.maximum_likelihood.estimator import description
 from etid.estimators.registry import register_description
 from etid.estimators.score_tests.other_circuit import NO_OTHER_CIRCUIT
@@ -92,7 +92,7 @@ def _alone(lanes: Any, count: Int[Array, ""], model: Joint, driver: HarmonicDriv
         spectrum, sample_rate = lane.spectrum, lane.sample_rate
         z_th = model.calibrations.source.response(spectrum.frequency)
         starts = harmonic_starts(spectrum, sample_rate, z_th, model.circuit)
-        own, result, chi2, error, hum = fit_load(model, spectrum, sample_rate, starts)
+        own, result, chi2, error, hum = fit_alone(model, spectrum, sample_rate, starts)
         settled = RESULTS.promote(result) == RESULTS.successful
         good = settled & jnp.isfinite(chi2) & ~judgement.misses(chi2, error)
         changed = jnp.array(False) if known is None else known.differs(spectrum)
@@ -110,7 +110,7 @@ def _together(
     driver: HarmonicDriver,
     tolerance: Array,
 ) -> tuple[list[Fit], HarmonicDriver]:
-    common, cov, found = shared_driver.fit(model, groups, several)
+    common, cov, found = fit_together(model, groups, several)
     # The records determine all impedances in units of the known resistor.
     power, _ = model.circuit.scaling()
     scale = tolerance**2 * jnp.outer(power, power)

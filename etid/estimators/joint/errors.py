@@ -10,7 +10,9 @@ loads as independent, but the standard errors do not. The effect of unit noise i
 all loads is propagated to `common` and to each load. The effects are added before they are squared.
 """
 
+import dataclasses
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -18,9 +20,11 @@ import jax.numpy as jnp
 import optimistix as optx
 from jaxtyping import Array, Bool, Complex, Float
 
-from etid.estimators.estimate import Estimate
-from etid.estimators.joint.terms import DriverStudy, Loads, over
+from etid.estimators.estimate import DELAY_WIDTH, Estimate
+from etid.estimators.joint.terms import DriverStudy, Loads, in_turn
+from etid.estimators.maximum_likelihood.load import Load
 from etid.estimators.maximum_likelihood.terms import (
+    apart,
     denoised,
     excess,
     residual,
@@ -31,7 +35,7 @@ from etid.estimators.sandwich import Curvature, Linear
 from etid.estimators.score_tests import other_circuit
 from etid.estimators.unknowns import LoadUnknowns
 from etid.results.fits import complex_rrse
-from etid.signals.transfer import reciprocal
+from etid.signals.harmonics import Spectrum
 from etid.solvers.matrices import inverse
 
 _Sums = tuple[Float[Array, "record x common"], Float[Array, "common common"]]
@@ -83,7 +87,7 @@ def estimates(
     groups, model = study.groups, study.model
     owns = [own for own, _ in fitted]
     found = [
-        over(lambda load, own: _eliminated(study, load, common, own), loads, own)
+        in_turn(lambda load, own: _eliminated(study, load, common, own), loads, own)
         for loads, own in zip(groups, owns, strict=True)
     ]
     total = model.calibrations.linear(common).curvature()
@@ -137,7 +141,7 @@ def estimates(
             )
             return estimate, _is_another(study, load, common, own, eliminated, bread, total.score)
 
-        judged.append(over(one, loads, own, eliminated, results))
+        judged.append(in_turn(one, loads, own, eliminated, results))
     return cov, judged
 
 
@@ -146,23 +150,65 @@ def _of_elements(cov: Float[Array, "own own"]) -> Float[Array, "element element"
     return LoadUnknowns.of(LoadUnknowns.of(cov).log_elements.T).log_elements
 
 
-def _residual(
+class _Seen(NamedTuple):
+    """A load at its minimum.
+
+    Attributes:
+        gain: Gain.
+        known: The recording with the X that the calibrations estimate.
+        terms: Terms; the last is the prior of the delay.
+        linear: The terms, linear in (common, own).
+        rows: Derivatives of the denoised residual with respect to changes of the circuit.
+    """
+
+    gain: Complex[Array, " harmonic"]
+    known: Spectrum
+    terms: Float[Array, " term"]
+    linear: Linear
+    rows: Float[Array, "change part"]
+
+
+def _seen(
     study: DriverStudy, load: Loads, common: Float[Array, " common"], own: LoadUnknowns
-) -> Float[Array, " part"]:
-    """Residual of a load, without the prior of its delay."""
-    return study.of_load(load, common, own)[: 2 * load.spectrum.x.size]
+) -> _Seen:
+    """A load at its minimum; what the caller does not use is not computed."""
+    model, spectrum = study.model, load.spectrum
+    driver = model.around(common, spectrum.frequency)
+    q, late = jnp.concatenate([own.vector(), driver.mean]), own.delay_samples
+    g, known = study.lane(driver, load).predicted(q)
+    part = residual(known, g)
+    others, gains = model.calibrations.records, model.calibrations.gains(common)
+    (*others, clean), shares = denoised([*others, spectrum], [*gains, g])
+    if driver.records is not None:
+        stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *others)
+        driver = dataclasses.replace(driver, records=stacked)
+    lane = Load.behind(driver, model.circuit, clean, load.sample_rate)
+    slopes = apart(lane.slopes, q)
+    jacobian, o = lane.chained(q, slopes), study.owned
+    of_delay = LoadUnknowns(jnp.zeros(o - 1), jnp.asarray(1 / DELAY_WIDTH)).vector()
+    of_delay = jnp.concatenate([jnp.zeros(common.size), of_delay])
+    jacobian = jnp.concatenate([jacobian[o:], jacobian[:o]])
+    jacobian = jnp.concatenate([jacobian, of_delay[:, None]], axis=1)
+    count = jacobian.shape[1]
+    noise = weights([excess(part, spectrum.selected)], count)
+    return _Seen(
+        gain=g,
+        known=known,
+        terms=jnp.append(part, late / DELAY_WIDTH),
+        linear=Linear(jacobian, weights(shares[-1:], count), noise),
+        rows=lane.by_changes(q, slopes)[:-1],  # without the gain of V_out
+    )
 
 
 def _misfit(
     study: DriverStudy, load: Loads, common: Float[Array, " common"], own: LoadUnknowns
 ) -> tuple[Float[Array, ""], Float[Array, ""]]:
     """χ² and RRSE of a load."""
-    squares = jnp.sum(_residual(study, load, common, own) ** 2)
-    freedom = 2 * jnp.sum(load.spectrum.selected, dtype=squares.dtype) - study.owned
-    g = study.model.gain(own, common, load.spectrum, load.sample_rate)
-    return squares / freedom, complex_rrse(
-        g * load.spectrum.x, load.spectrum.y, load.spectrum.selected
-    )
+    seen, spectrum = _seen(study, load, common, own), load.spectrum
+    squares = jnp.sum(seen.terms[:-1] ** 2)
+    freedom = 2 * jnp.sum(spectrum.selected, dtype=squares.dtype) - study.owned
+    error = complex_rrse(seen.gain * spectrum.x, spectrum.y, spectrum.selected)
+    return squares / freedom, error
 
 
 def _is_another(
@@ -175,9 +221,7 @@ def _is_another(
     score: Float[Array, "common common"],
 ) -> Bool[Array, ""]:
     """Score test of one load; `bread` and `score` are those of `common` from all terms."""
-    linear = _linear(study, load, common, own)
-    rows = _by_changes(study, load, common, own)
-    terms = study.of_load(load, common, own)
+    seen = _seen(study, load, common, own)
     slope = eliminated.slope
     covariance = jnp.block(
         [
@@ -187,10 +231,10 @@ def _is_another(
     )
     spread = jnp.zeros_like(covariance).at[: bread.shape[0], : bread.shape[0]]
     found = other_circuit.scores(
-        jnp.pad(rows, ((0, 0), (0, 1))),  # no change affects the prior of the delay
-        linear,
-        terms,
-        -linear.jacobian @ terms,  # at the minimum the other terms have the opposite gradient
+        jnp.pad(seen.rows, ((0, 0), (0, 1))),  # no change affects the prior of the delay
+        seen.linear,
+        seen.terms,
+        -seen.linear.jacobian @ seen.terms,
         spread.set(score - eliminated.rest.score),
         covariance,
         slice(common.size, common.size + own.log_elements.size),
@@ -200,52 +244,11 @@ def _is_another(
     )  # a load that takes no part has its own verdict
 
 
-def _by_changes(
-    study: DriverStudy, load: Loads, common: Float[Array, " common"], own: LoadUnknowns
-) -> Float[Array, "change part"]:
-    """Derivatives of the denoised terms of a load with respect to changes of its circuit."""
-    model, f = study.model, load.spectrum.frequency
-    g = model.gain(own, common, load.spectrum, load.sample_rate)
-    z, changes = other_circuit.changes(
-        model.circuit.with_log_values(own.log_elements).impedance(), f
-    )
-    z_th = model.calibrations.z_th(common).response(f)
-    by_z = g * z_th * reciprocal(z * (z + z_th))
-    gains = [*model.calibrations.gains(common), g]
-    (*known, spectrum), _ = denoised([*model.calibrations.records, load.spectrum], gains)
-    informed = model.informed(spectrum, common, known)
-
-    def row(change: Complex[Array, " harmonic"]) -> Float[Array, " part"]:
-        return jax.jvp(lambda g: residual(informed, g), (g,), (by_z * change,))[1]
-
-    return jax.lax.map(row, changes)
-
-
-def _linear(
-    study: DriverStudy, load: Loads, common: Float[Array, " common"], own: LoadUnknowns
-) -> Linear:
-    """Terms of a load, linear in (common, own) around their minimum."""
-    model, c = study.model, common.shape[0]
-    gains = [
-        *model.calibrations.gains(common),
-        model.gain(own, common, load.spectrum, load.sample_rate),
-    ]
-    (*known, spectrum), shares = denoised([*model.calibrations.records, load.spectrum], gains)
-
-    def terms(q: Float[Array, " q"]) -> Float[Array, " term"]:
-        return model.of_load(LoadUnknowns.of(q[c:]), q[:c], spectrum, load.sample_rate, known)
-
-    jacobian = jax.jacfwd(terms)(jnp.concatenate([common, own.vector()]))
-    noise = excess(_residual(study, load, common, own), load.spectrum.selected)
-    count = jacobian.shape[0]
-    return Linear(jacobian.T, weights(shares[-1:], count), weights([noise], count))
-
-
 def _eliminated(
     study: DriverStudy, load: Loads, common: Float[Array, " common"], own: LoadUnknowns
 ) -> _Eliminated:
     """A load whose own parameters are eliminated."""
-    return _without_own(_linear(study, load, common, own).curvature(), common.shape[0])
+    return _without_own(_seen(study, load, common, own).linear.curvature(), common.shape[0])
 
 
 # --- Loads with one unloaded record --------------------------------------------------------------
@@ -263,9 +266,8 @@ def _influence(
     eliminated: _Eliminated,
 ) -> tuple[Float[Array, "x common"], Float[Array, "x own"]]:
     """Effect of unit noise in X on the score of `common`, and on the own parameters."""
-    jacobian = _linear(study, load, common, own).jacobian.T
-    known = study.model.informed(load.spectrum, common, study.model.calibrations.records)
-    g = study.model.gain(own, common, load.spectrum, load.sample_rate)
+    g, known, _, linear, _ = _seen(study, load, common, own)
+    jacobian = linear.jacobian.T
     size = jnp.where(known.selected, jnp.sqrt(known.variance_x / variance(known, g)), 0.0)
     re, im = g.real * size, g.imag * size
     real, imaginary = jacobian[: g.size], jacobian[g.size : 2 * g.size]

@@ -5,8 +5,7 @@ Schoukens, System Identification, 2012, ch. 9). A few loads at a time are evalua
 """
 
 import math
-from collections.abc import Callable, Sequence
-from typing import Any
+from collections.abc import Sequence
 
 import jax
 import jax.numpy as jnp
@@ -15,16 +14,18 @@ from jaxtyping import Array, Bool, Float
 
 from etid.estimators.estimate import DELAY_WIDTH, MAX_STEPS, SOLVER, Estimate
 from etid.estimators.joint.errors import estimates
-from etid.estimators.joint.terms import DriverStudy, Loads, over
-from etid.estimators.maximum_likelihood.driver import Joint
-from etid.estimators.maximum_likelihood.given_driver import GivenDriver, around
-from etid.estimators.maximum_likelihood.load import Load
+from etid.estimators.joint.terms import DriverStudy, Joint, Loads, in_turn
+from etid.estimators.maximum_likelihood.load import Load, refined
+from etid.estimators.maximum_likelihood.terms import shows_hum
 from etid.estimators.unknowns import LoadUnknowns
+from etid.results.fits import complex_rrse
+from etid.signals.harmonics import Spectrum
 from etid.solvers.arrowhead import Arrowhead, ArrowheadEquations, EliminationDescent, join
 from etid.solvers.levenberg_marquardt import (
     DIFFERENCE,
     LevenbergMarquardt,
     NormalEquations,
+    best_start,
     normal_equations,
     second_order,
 )
@@ -32,38 +33,15 @@ from etid.solvers.levenberg_marquardt import (
 NEAR = 0.05  # distance of all parameters together from their minimum [standard errors]
 
 
-def _around(
-    study: DriverStudy, common: Float[Array, " common"], loads: Loads, slopes: bool = True
-) -> GivenDriver:
-    """The driver with these parameters, and its derivatives, for a group of loads."""
-    model, frequency = study.model, loads.spectrum.frequency[0]
-    unit = jnp.eye(common.size)[:, : common.size if slopes else 0]
-    zero = jnp.zeros(unit.shape[1])
-    return around(model.calibrations, common, unit, frequency, model.shared, zero, jnp.diag(zero))
-
-
-def _lane(study: DriverStudy, driver: GivenDriver, load: Loads) -> Load:
-    """One load with the data that its terms need."""
-    spectrum, unloaded = driver.informed(load.spectrum)
-    return Load(driver, study.model.circuit, spectrum, unloaded, load.sample_rate)
-
-
-def _in_turn(one: Callable, *lanes: Any) -> Any:
-    """`one` over the leading axis of `lanes`; on a CPU one after the other, as `Load` expects."""
-    if jax.default_backend() == "cpu":
-        return jax.lax.map(lambda lane: one(*lane), lanes)
-    return over(one, *lanes)
-
-
 def _equations(_, y: Float[Array, " parameter"], study: DriverStudy) -> ArrowheadEquations:
     """Normal equations of a study, load by load."""
     common, parts = study.split(y)
 
     def of_group(loads: Loads, owns: LoadUnknowns) -> NormalEquations:
-        driver = _around(study, common, loads)
+        driver = study.model.around(common, loads.spectrum.frequency[0])
 
         def one(load: Loads, own: LoadUnknowns) -> NormalEquations:
-            lane = _lane(study, driver, load)
+            lane = study.lane(driver, load)
             part, jacobian = lane.jacobian(jnp.concatenate([own.vector(), driver.mean]))
             late = own.delay_samples / DELAY_WIDTH
             slope = LoadUnknowns(jnp.zeros_like(own.log_elements), jnp.asarray(1 / DELAY_WIDTH))
@@ -75,7 +53,7 @@ def _equations(_, y: Float[Array, " parameter"], study: DriverStudy) -> Arrowhea
             ).finite()
             return jax.tree.map(lambda leaf: jnp.where(load.used, leaf, 0.0), found)
 
-        return _in_turn(one, loads, owns)
+        return in_turn(one, loads, owns)
 
     found = [of_group(*group) for group in zip(study.groups, parts, strict=True)]
     loads = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *found)
@@ -105,22 +83,23 @@ def _second_order(
     (common, parts), (towards, steps) = study.split(y), study.split(step)
 
     def of_group(loads: Loads, owns: LoadUnknowns, steps: LoadUnknowns) -> Float[Array, "load q"]:
-        driver = _around(study, common, loads)
+        frequency = loads.spectrum.frequency[0]
+        driver = study.model.around(common, frequency)
         ends = [
-            (h, _around(study, common + h * towards, loads, slopes=False))
+            (h, study.model.around(common + h * towards, frequency, slopes=False))
             for h in (DIFFERENCE, -DIFFERENCE)
         ]
 
         def one(load: Loads, own: LoadUnknowns, step: LoadUnknowns) -> Float[Array, " q"]:
-            lane = _lane(study, driver, load)
+            lane = study.lane(driver, load)
             at, way = own.vector(), step.vector()
             _, jacobian = lane.jacobian(jnp.concatenate([at, driver.mean]))
             count = jacobian.shape[1]  # number of the terms that are not linear
-            bent = sum(_lane(study, end, load)(at + h * way)[:count] for h, end in ends)
+            bent = sum(study.lane(end, load)(at + h * way)[:count] for h, end in ends)
             bent = (bent - 2 * lane(at)[:count]) / DIFFERENCE**2
             return jnp.where(load.used, jacobian @ bent, 0.0)
 
-        return _in_turn(one, loads, owns, steps)
+        return in_turn(one, loads, owns, steps)
 
     found = [of_group(*group) for group in zip(study.groups, parts, steps, strict=True)]
     loads, o = jnp.concatenate(found), study.owned
@@ -128,7 +107,7 @@ def _second_order(
     return join(known + loads[:, o:].sum(0), loads[:, :o])
 
 
-def fit(
+def fit_together(
     model: Joint, groups: list[Loads], several: Sequence[int]
 ) -> tuple[
     Float[Array, " common"],
@@ -161,12 +140,17 @@ def fit(
         empty=_empty,
     )
     solution = optx.least_squares(
-        lambda y, study: study(y), solver, study.start(), study, max_steps=MAX_STEPS, throw=False
+        lambda y, _: y,  # not evaluated: the solver takes the equations
+        solver,
+        study.start(),
+        study,
+        max_steps=MAX_STEPS,
+        throw=False,
     )
     common, parts = study.split(solution.value)
     # The loads that take no part are fitted now, with the final Z_th.
     refitted = [
-        over(lambda load, own: _refit(study, load, common, own), loads, own)
+        in_turn(lambda load, own: _refit(study, load, common, own), loads, own)
         for loads, own in zip(groups, parts, strict=True)
     ]
     cov, found = estimates(study, common, refitted, several, solution)
@@ -177,11 +161,34 @@ def _refit(
     study: DriverStudy, load: Loads, common: Float[Array, " common"], own: LoadUnknowns
 ) -> tuple[LoadUnknowns, optx.RESULTS]:
     """Unknowns of a load at its minimum with this Z_th, and the result of the solver."""
-    solution = optx.least_squares(
-        lambda q, _: study.of_load(load, common, LoadUnknowns.of(q)),
-        SOLVER,
-        own.vector(),
-        max_steps=MAX_STEPS,
-        throw=False,
-    )
+    driver = study.model.around(common, load.spectrum.frequency, slopes=False)
+    solution = refined(study.lane(driver, load), own.vector())
     return LoadUnknowns.of(solution.value), solution.result
+
+
+def fit_alone(
+    model: Joint,
+    spectrum: Spectrum,
+    sample_rate: Float[Array, ""],
+    candidates: LoadUnknowns,
+) -> tuple[LoadUnknowns, optx.RESULTS, Float[Array, ""], Float[Array, ""], Bool[Array, ""]]:
+    """Identify the load of one recording; Z_th is fixed at the estimate of the calibrations.
+
+    Args:
+        model: Calibrations and structure of the circuit.
+        spectrum: The recording.
+        sample_rate: Its sampling rate [Hz].
+        candidates: Starts, stacked; the start that predicts best is refined.
+
+    Returns:
+        The unknowns, the result of the solver, χ² per degree of freedom, RRSE, and whether mains
+        hum is seen.
+    """
+    driver = model.around(model.calibrations.start(), spectrum.frequency, slopes=False)
+    load = Load.behind(driver, model.circuit, spectrum, sample_rate)
+    solution = refined(load, best_start(load, candidates.vector()))
+    squares = 2 * solution.stats["normal_equations"].objective
+    chi2 = squares / (2 * jnp.sum(spectrum.selected, dtype=squares.dtype) - load.owned)
+    g, known = load.predicted(solution.value)
+    error = complex_rrse(g * spectrum.x, spectrum.y, spectrum.selected)
+    return LoadUnknowns.of(solution.value), solution.result, chi2, error, shows_hum(known, g)

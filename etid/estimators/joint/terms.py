@@ -13,12 +13,40 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from etid.estimators.maximum_likelihood.driver import Joint
+from etid.circuits.circuit import AbstractCircuit
+from etid.estimators.maximum_likelihood.driver import Calibrations
+from etid.estimators.maximum_likelihood.given_driver import GivenDriver, around
+from etid.estimators.maximum_likelihood.load import Load
 from etid.estimators.unknowns import LoadUnknowns
 from etid.signals.harmonics import Spectrum
 from etid.solvers.arrowhead import join, split
 
 SIDE_BY_SIDE = 8  # loads in one vectorised step
+
+
+class Joint(eqx.Module):
+    """The likelihood of loads and of the calibrations of their driver.
+
+    Attributes:
+        circuit: Structure of the loads.
+        calibrations: Calibrations of the driver of the loads.
+        shared: Whether the unloaded record of a load may be that of a calibration.
+    """
+
+    circuit: AbstractCircuit
+    calibrations: Calibrations
+    shared: bool = eqx.field(static=True)
+
+    def around(
+        self,
+        common: Float[Array, " common"],
+        frequency: Float[Array, " harmonic"],
+        slopes: bool = True,
+    ) -> GivenDriver:
+        """The driver with these parameters; with `slopes`, their changes are its z."""
+        unit = jnp.eye(common.size)[:, : common.size if slopes else 0]
+        zero = jnp.zeros(unit.shape[1])
+        return around(self.calibrations, common, unit, frequency, self.shared, zero, jnp.diag(zero))
 
 
 class Loads(eqx.Module):
@@ -46,22 +74,9 @@ class DriverStudy(eqx.Module):
     model: Joint
     groups: list[Loads]
 
-    def __call__(self, y: Float[Array, " parameter"]) -> list[Float[Array, "..."]]:
-        """Terms of the calibrations, and of each group."""
-        common, parts = self.split(y)
-
-        def one(load: Loads, own: LoadUnknowns) -> Float[Array, " term"]:
-            return jnp.where(load.used, self.of_load(load, common, own), 0.0)
-
-        loaded = [jax.vmap(one)(loads, own) for loads, own in zip(self.groups, parts, strict=True)]
-        return [self.of_calibrations(common), *loaded]
-
-    def of_load(
-        self, load: Loads, common: Float[Array, " common"], own: LoadUnknowns
-    ) -> Float[Array, " term"]:
-        """Terms of one load."""
-        records = self.model.calibrations.records
-        return self.model.of_load(own, common, load.spectrum, load.sample_rate, records)
+    def lane(self, driver: GivenDriver, load: Loads) -> Load:
+        """One load behind this driver."""
+        return Load.behind(driver, self.model.circuit, load.spectrum, load.sample_rate)
 
     def of_calibrations(self, common: Float[Array, " common"]) -> Float[Array, " term"]:
         """Terms of the calibrations."""
@@ -89,7 +104,8 @@ class DriverStudy(eqx.Module):
         return len(self.model.circuit.names()) + 1
 
 
-def over(one: Callable, *lanes: Any) -> Any:
-    """`one` over the leading axis of `lanes`, a few at a time."""
+def in_turn(one: Callable, *lanes: Any) -> Any:
+    """`one` over the leading axis of `lanes`; on a CPU one after the other, as `Load` expects."""
     count = jax.tree.leaves(lanes)[0].shape[0]
-    return jax.lax.map(lambda lane: one(*lane), lanes, batch_size=min(SIDE_BY_SIDE, count))
+    together = None if jax.default_backend() == "cpu" else min(SIDE_BY_SIDE, count)
+    return jax.lax.map(lambda lane: one(*lane), lanes, batch_size=together)

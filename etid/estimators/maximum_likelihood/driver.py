@@ -1,9 +1,6 @@
-"""Maximum likelihood on the harmonics of the pulse rate: the driver, and a skin.
+"""Maximum likelihood on the harmonics of the pulse rate: the driver, from its calibrations.
 
-`etid.estimators.maximum_likelihood.terms` gives the terms. A skin is identified *jointly* with the
-calibrations of its driver. The fit uses the information of the skin's record about Z_th, and about
-the delay of a calibration, which one known resistor does not determine. `etid.estimators.joint.fit`
-does the same for many skins at once.
+`etid.estimators.maximum_likelihood.terms` gives the terms.
 """
 
 import dataclasses
@@ -14,9 +11,8 @@ import jax
 import jax.numpy as jnp
 import optimistix as optx
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Array, Bool, Complex, Float
+from jaxtyping import Array, Complex, Float
 
-from etid.circuits.circuit import AbstractCircuit
 from etid.circuits.elements import resistor
 from etid.estimators.estimate import (
     DELAY_WIDTH,
@@ -31,18 +27,16 @@ from etid.estimators.maximum_likelihood.terms import (
     delayed_gain,
     denoised,
     excess,
-    informed,
-    residual,
     residuals,
     shows_hum,
     weights,
 )
 from etid.estimators.sandwich import Linear
-from etid.estimators.unknowns import DriverUnknowns, LoadUnknowns
+from etid.estimators.unknowns import DriverUnknowns
 from etid.results.driver import Calibration, HarmonicDriver, SourceImpedance
 from etid.results.fits import complex_rrse
 from etid.signals.harmonics import Spectrum
-from etid.solvers.levenberg_marquardt import LevenbergMarquardt, best_start
+from etid.solvers.levenberg_marquardt import LevenbergMarquardt
 
 # Z_th and a delay form a curved valley; a load alone has no such valley.
 CURVED = LevenbergMarquardt(rtol=SOLVER.rtol, ftol=SOLVER.ftol, geodesic=True)
@@ -187,90 +181,3 @@ class Calibrations(eqx.Module):
         start = self.start()
         alone, now = (self.terms(c, self.records) for c in (start, common))
         return jnp.sum((now**2 - alone**2) / self.linear(start).noise)
-
-
-class Joint(eqx.Module):
-    """The likelihood of loads and of the calibrations of their driver, term by term.
-
-    In all methods `own` holds the unknowns of a load.
-
-    Attributes:
-        circuit: Structure of the loads.
-        calibrations: Calibrations of the driver of the loads.
-        shared: Whether the unloaded record of a load may be that of a calibration.
-    """
-
-    circuit: AbstractCircuit
-    calibrations: Calibrations
-    shared: bool = eqx.field(static=True)
-
-    def gain(
-        self,
-        own: LoadUnknowns,
-        common: Float[Array, " common"],
-        spectrum: Spectrum,
-        sample_rate: Float[Array, ""],
-    ) -> Complex[Array, " harmonic"]:
-        """Gain with a load, including its delay."""
-        load = self.circuit.with_log_values(own.log_elements).impedance()
-        source, frequency = self.calibrations.z_th(common), spectrum.frequency
-        return delayed_gain(source, load, frequency, own.delay_samples, sample_rate)
-
-    def of_load(
-        self,
-        own: LoadUnknowns,
-        common: Float[Array, " common"],
-        spectrum: Spectrum,
-        sample_rate: Float[Array, ""],
-        records: Sequence[Spectrum],
-    ) -> Float[Array, " term"]:
-        """Terms of one recording, given the calibrations; the last is the prior of the delay."""
-        known = self.informed(spectrum, common, records)
-        part = residual(known, self.gain(own, common, spectrum, sample_rate))
-        return jnp.append(part, own.delay_samples / DELAY_WIDTH)
-
-    def informed(
-        self, spectrum: Spectrum, common: Float[Array, " common"], records: Sequence[Spectrum]
-    ) -> Spectrum:
-        """A recording with the estimate of its X that uses the calibrations."""
-        return (
-            informed(spectrum, records, self.calibrations.gains(common))
-            if self.shared
-            else spectrum
-        )
-
-
-def fit_load(
-    model: Joint,
-    spectrum: Spectrum,
-    sample_rate: Float[Array, ""],
-    candidates: LoadUnknowns,
-) -> tuple[LoadUnknowns, optx.RESULTS, Float[Array, ""], Float[Array, ""], Bool[Array, ""]]:
-    """Identify the load of one recording; Z_th is fixed at the estimate of the calibrations.
-
-    Args:
-        model: Calibrations and structure of the circuit.
-        spectrum: The recording.
-        sample_rate: Its sampling rate [Hz].
-        candidates: Starts, stacked; the start that predicts best is refined.
-
-    Returns:
-        The unknowns, the result of the solver, χ² per degree of freedom, RRSE, and whether mains
-        hum is seen.
-    """
-    records, common = model.calibrations.records, model.calibrations.start()
-
-    def terms(q, spectrum):
-        return model.of_load(LoadUnknowns.of(q), common, spectrum, sample_rate, records)
-
-    best = best_start(lambda q: terms(q, spectrum), candidates.vector())
-    solution = optx.least_squares(
-        terms, SOLVER, best, args=spectrum, max_steps=MAX_STEPS, throw=False
-    )
-    own = LoadUnknowns.of(solution.value)
-    squares = 2 * solution.stats["normal_equations"].objective
-    chi2 = squares / (2 * jnp.sum(spectrum.selected, dtype=squares.dtype) - best.size)
-    g = model.gain(own, common, spectrum, sample_rate)
-    error = complex_rrse(g * spectrum.x, spectrum.y, spectrum.selected)
-    hum = shows_hum(model.informed(spectrum, common, records), g)
-    return own, solution.result, chi2, error, hum

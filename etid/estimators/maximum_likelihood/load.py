@@ -6,6 +6,7 @@ harmonic through three numbers: Z_L, the phase factor of the delay, and W. The c
 derivatives with respect to these three and applies the chain rule.
 """
 
+import dataclasses
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -71,6 +72,18 @@ class Load(eqx.Module):
     spectrum: Spectrum
     unloaded: UnloadedSlopes | None
     sample_rate: Float[Array, ""]
+
+    @classmethod
+    def behind(
+        cls,
+        driver: GivenDriver,
+        circuit: AbstractCircuit,
+        spectrum: Spectrum,
+        sample_rate: Float[Array, ""],
+    ) -> "Load":
+        """A recording that was made with `driver`."""
+        known, unloaded = driver.informed(spectrum)
+        return cls(driver, circuit, known, unloaded, sample_rate)
 
     @property
     def owned(self) -> int:
@@ -296,7 +309,16 @@ NO_HUM = 5.0  # standard deviations of a wrong gain, above which it may pass for
 NEAR = 4.0  # χ² of the likeliest start; below this value the other starts are not tried
 # Half a standard error for 3000 terms.
 ROUGHLY = LevenbergMarquardt(rtol=1e-2, ftol=1e-3, equations=_equations)
-TOGETHER = LevenbergMarquardt(rtol=SOLVER.rtol, ftol=SOLVER.ftol, equations=_equations)
+WELL = LevenbergMarquardt(rtol=SOLVER.rtol, ftol=SOLVER.ftol, equations=_equations)
+
+
+def refined(
+    load: Load, start: Float[Array, " q"], solver: LevenbergMarquardt = WELL
+) -> optx.Solution:
+    """The minimum over the own parameters, and over z if `start` contains it."""
+    return optx.least_squares(
+        lambda q, load: load(q), solver, start, args=load, max_steps=MAX_STEPS, throw=False
+    )
 
 
 def fit_circuit(
@@ -321,21 +343,15 @@ def fit_circuit(
         W₀ for its linear distribution. Whether the data show another circuit or another gain of
         V_out.
     """
-    known, unloaded = driver.informed(spectrum)
-    load = Load(driver, circuit, known, unloaded, sample_rate)
-
-    def solve(solver: optx.AbstractLeastSquaresSolver, start: Float[Array, " q"]) -> optx.Solution:
-        return optx.least_squares(
-            lambda q, load: load(q), solver, start, args=load, max_steps=MAX_STEPS, throw=False
-        )
+    load = Load.behind(driver, circuit, spectrum, sample_rate)
 
     # First with Z_th fixed: from a distant start, a joint fit would distort Z_th.
     starts = candidates.vector()
     likely = starts[-1]
     near = jnp.sum(load(likely) ** 2) < NEAR * 2 * jnp.sum(spectrum.selected, dtype=likely.dtype)
     start = jax.lax.cond(near, lambda: likely, lambda: best_start(load, starts))
-    alone = solve(ROUGHLY, start).value
-    solution = solve(TOGETHER, jnp.concatenate([alone, driver.mean]))
+    alone = refined(load, start, ROUGHLY).value
+    solution = refined(load, jnp.concatenate([alone, driver.mean]))
     q = solution.value
     own, z = load.split(q)
     g, known = load.predicted(q)
@@ -344,10 +360,10 @@ def fit_circuit(
 
     # The Jacobian at denoised data: noise in it would count as information.
     [clean], [share] = denoised([known], [g])
-    if unloaded is not None:  # X contains the effect of this z already
-        x = clean.x - combined(z, unloaded.x)
+    if load.unloaded is not None:  # X contains the effect of this z already
+        x = clean.x - combined(z, load.unloaded.x)
         clean = eqx.tree_at(lambda s: (s.x, s.variance_x), clean, (x, load.spectrum.variance_x))
-    clean = Load(driver, circuit, clean, unloaded, sample_rate)
+    clean = dataclasses.replace(load, spectrum=clean)
     slopes = apart(clean.slopes, q)
     jacobian = clean.chained(q, slopes)
     prior = 1 / load.widths(q) ** 2
