@@ -82,10 +82,10 @@ def log_slopes(
     z_th = driver.response(frequency)
     s = frequency_variable(frequency)
 
-    def of(circuit):
+    def of(circuit: AbstractCircuit) -> Complex[Array, "element band"]:
         logs = circuit.log_values()
 
-        def z(logs):
+        def z(logs: Float[Array, " element"]) -> Complex[Array, " band"]:
             return circuit.with_log_values(logs).impedance()(s)
 
         by_element = jax.vmap(lambda way: jax.jvp(z, (logs,), (way,))[1])(jnp.eye(logs.size))

@@ -66,7 +66,7 @@ def stored_jit(function: Callable[Parameters, Result]) -> Callable[Parameters, R
 
     @eqx.filter_jit
     @functools.wraps(function)
-    def kept(*args, **kwargs):  # runs once for each trace
+    def kept(*args: Any, **kwargs: Any) -> Any:  # runs once for each trace
         found = _trace(function, args, kwargs)
         if found is None:
             return function(*args, **kwargs)
@@ -153,7 +153,7 @@ def _export(function: Callable, args: tuple, kwargs: dict) -> tuple[jax.export.E
     places = [i for i, leaf in enumerate(leaves) if eqx.is_array(leaf)]
     shells = []
 
-    def flat(*arrays):
+    def flat(*arrays: jax.Array) -> list[jax.Array]:
         filled = list(leaves)
         for place, array in zip(places, arrays, strict=True):
             filled[place] = array

@@ -147,7 +147,7 @@ def processes(workers: int) -> Iterator[concurrent.futures.Executor]:
 class _Parts:
     """The folder of parts beside a result."""
 
-    def __init__(self, target: pathlib.Path, run: Mapping[str, Any], resume: bool):
+    def __init__(self, target: pathlib.Path, run: Mapping[str, Any], resume: bool) -> None:
         self.folder = _folder(target)
         described = self.folder / "run.json"
         if self.folder.exists() and not resume:

@@ -38,7 +38,7 @@ def _fit(
     circuit: AbstractCircuit,
     known: bool,
 ) -> Fit:
-    def residual(q, _):
+    def residual(q: Float[Array, " element"], _) -> Float[Array, " part"]:
         difference = (circuit.with_log_values(q).response(frequency) - z) / sigma.astype(z.dtype)
         return jnp.concatenate([difference.real, difference.imag])
 

@@ -20,6 +20,7 @@ from tqdm import tqdm
 
 from etid.circuits.circuit import AbstractCircuit
 from etid.estimators import judgement
+from etid.estimators.estimate import Estimate
 from etid.estimators.estimator import serving
 from etid.estimators.joint.fit import fit_alone, fit_together
 from etid.estimators.joint.terms import Joint, Loads
@@ -44,10 +45,11 @@ from etid.identify.many import (
 )
 from etid.identify.one import checksum, concluded, failed_fit, is_shared, note, repeated
 from etid.recordings.preflight import Inspected
+from etid.recordings.recording import Recording
 from etid.recordings.remarks import Remark
 from etid.recordings.repeats import Repeats, repeats
 from etid.recordings.study import Study
-from etid.results.driver import HarmonicDriver
+from etid.results.driver import Driver, HarmonicDriver
 from etid.results.fits import Fit
 from etid.results.provenance import Settings
 from etid.results.study_fits import StudyFits
@@ -88,8 +90,8 @@ class _Start(NamedTuple):
 def _alone(lanes: Any, count: Int[Array, ""], model: Joint, driver: HarmonicDriver) -> _Start:
     known = shape_of(driver, jnp.asarray(lanes.frequency)[0])
 
-    def one(lane):
-        spectrum, sample_rate = lane.spectrum, lane.sample_rate
+    def one(lane: Harmonics) -> _Start:
+        spectrum, sample_rate = lane.spectrum, jnp.asarray(lane.sample_rate)
         z_th = model.calibrations.source.response(spectrum.frequency)
         starts = harmonic_starts(spectrum, sample_rate, z_th, model.circuit)
         own, result, chi2, error, hum = fit_alone(model, spectrum, sample_rate, starts)
@@ -115,7 +117,7 @@ def _together(
     power, _ = model.circuit.scaling()
     scale = tolerance**2 * jnp.outer(power, power)
 
-    def fit(found):
+    def fit(found: tuple[Estimate, Bool[Array, ""]]) -> Fit:
         estimate, other = found
         with_scale = dataclasses.replace(
             estimate, cov=estimate.cov + scale, shared_cov=estimate.shared_cov + scale
@@ -143,7 +145,7 @@ def _together(
 class _Waiting:
     """Recordings of one driver with the same number of harmonics."""
 
-    def __init__(self, model: Joint, driver: HarmonicDriver):
+    def __init__(self, model: Joint, driver: HarmonicDriver) -> None:
         self.model = model
         self.driver = driver
         self.rows: list[int] = []
@@ -251,7 +253,7 @@ def identify_jointly(
     notes = [""] * len(paths)
     waiting: dict[tuple[str, ...], dict[Any, _Waiting]] = {}
 
-    def load(row):
+    def load(row: int) -> tuple[Recording, Driver]:
         recording = study[paths[row]]
         return recording, drivers.found[drivers.of(recording)]
 

@@ -82,10 +82,10 @@ def each(fit: Callable[[Any], Any], lanes: Any, count: int | Int[Array, ""]) -> 
     first = jax.tree.map(lambda leaf: leaf[0], lanes)
     shapes = jax.eval_shape(once, first)
 
-    def nothing(_):
+    def nothing(_) -> Any:
         return jax.tree.map(lambda of: jnp.zeros(of.shape, of.dtype), shapes)
 
-    def one(numbered):
+    def one(numbered: tuple[Int[Array, ""], Any]) -> Any:
         number, lane = numbered
         return jax.lax.cond(number < count, once, nothing, lane)
 
@@ -106,7 +106,7 @@ def _of_one_method(fits: Sequence[Fit], used: Sequence[str]) -> list[Fit]:
 class Refusal(Exception):
     """A recording cannot be fitted; holds the name of its verdict and a note."""
 
-    def __init__(self, name: str, note: str = ""):
+    def __init__(self, name: str, note: str = "") -> None:
         super().__init__(name)
         self.name = name
         self.note = note or message(name)
@@ -143,7 +143,7 @@ class _Queue:
 
     def __init__(
         self, driver: Driver, known: Any, circuit: AbstractCircuit, estimator: AbstractEstimator
-    ):
+    ) -> None:
         self.driver = driver
         self.known = known
         self.circuit = circuit
@@ -186,7 +186,9 @@ def _identify(
     otherwise = str(asked or MAXIMUM_LIKELIHOOD)
     queues: dict[tuple, _Queue] = {}
 
-    def read(row):
+    def read(
+        row: int,
+    ) -> tuple[Driver, AbstractLane, Inspected, AbstractEstimator, bool, tuple]:
         with jax.enable_x64(True):  # the setting belongs to a thread, and this runs in another one
             seen, driver, estimator = planned(functools.partial(load, row), asked)
             try:
@@ -203,7 +205,7 @@ def _identify(
         contextlib.closing(prefetch(read, count, AHEAD)) as recordings,
     ):
 
-        def run(queue):
+        def run(queue: _Queue) -> None:
             for row, fit in queue.run():
                 fits[row] = fit
                 used.append(fit.method)
@@ -369,7 +371,7 @@ class Drivers:
         order: Order,
         asked: AbstractEstimator | None,
         driver_drift: float = 0.0,
-    ):
+    ) -> None:
         self.study = study
         self.driver_drift = drift_of(driver_drift, asked)
         self.order: Order = order

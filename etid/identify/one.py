@@ -183,7 +183,7 @@ def known_of(lane: AbstractLane, driver: Driver, shared: bool, estimator: Abstra
 class _Same:
     """A driver that equals only itself: its arrays cannot be hashed."""
 
-    def __init__(self, driver: Driver):
+    def __init__(self, driver: Driver) -> None:
         self.driver = driver
 
     def __hash__(self) -> int:

@@ -43,7 +43,7 @@ class Inspected:
         recording: The recording.
     """
 
-    def __init__(self, recording: Recording):
+    def __init__(self, recording: Recording) -> None:
         self.recording = recording
 
     @functools.cached_property
