@@ -57,14 +57,6 @@ class _Eliminated(eqx.Module):
     bread: Float[Array, "own own"]
 
 
-def _without_own(of: Curvature, common: int) -> _Eliminated:
-    """Eliminate the own parameters of a load, which follow the `common` ones."""
-    bread = inverse(of.expected[common:, common:])
-    slope = -bread @ of.expected[common:, :common]
-    cov = bread @ of.score[common:, common:] @ bread
-    return _Eliminated(of.eliminate(common), cov, slope, bread)
-
-
 def estimates(
     study: DriverStudy,
     common: Float[Array, " common"],
@@ -234,21 +226,25 @@ def _is_another(
         jnp.pad(seen.rows, ((0, 0), (0, 1))),  # no change affects the prior of the delay
         seen.linear,
         seen.terms,
+        # At the minimum the other terms have the opposite gradient.
         -seen.linear.jacobian @ seen.terms,
         spread.set(score - eliminated.rest.score),
         covariance,
         slice(common.size, common.size + own.log_elements.size),
     )
-    return (
-        other_circuit.Scores.of(found).seen() & load.used
-    )  # a load that takes no part has its own verdict
+    # A load that takes no part has its own verdict.
+    return other_circuit.Scores.of(found).seen() & load.used
 
 
 def _eliminated(
     study: DriverStudy, load: Loads, common: Float[Array, " common"], own: LoadUnknowns
 ) -> _Eliminated:
-    """A load whose own parameters are eliminated."""
-    return _without_own(_seen(study, load, common, own).linear.curvature(), common.shape[0])
+    """A load whose own parameters are eliminated; they follow the `common` ones."""
+    of, c = _seen(study, load, common, own).linear.curvature(), common.shape[0]
+    bread = inverse(of.expected[c:, c:])
+    slope = -bread @ of.expected[c:, :c]
+    cov = bread @ of.score[c:, c:] @ bread
+    return _Eliminated(of.eliminate(c), cov, slope, bread)
 
 
 # --- Loads with one unloaded record --------------------------------------------------------------
