@@ -181,7 +181,7 @@ def study_fits() -> StudyFits:
         steps=jnp.array(9),
         method="maximum_likelihood",
     )
-    settings = Settings.of(etid.Study.from_recordings([]), 6, 5, "", etid.SkinRC())
+    settings = Settings.of(etid.Study.from_recordings([]), 6, 5, "", [etid.SkinRC()])
     return StudyFits(fits, {("calibration/0",): driver}, {("calibration/1",): "flat"}, settings)
 
 

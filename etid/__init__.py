@@ -40,6 +40,7 @@ from etid.identify.jointly import identify_jointly
 from etid.identify.many import identify_skins, identify_study
 from etid.identify.one import identify_samples, identify_skin
 from etid.identify.predict import predict
+from etid.identify.selecting import select_circuit
 from etid.online.tracker import Tracker
 from etid.plotting import plot
 from etid.recordings.hdf5 import check, read
@@ -49,6 +50,7 @@ from etid.results.driver import Driver
 from etid.results.fits import Fit, Fits, IdentificationError
 from etid.results.study_fits import StudyFits
 from etid.results.verdicts import RESULTS
+from etid.selection.selection import Candidate, Selection
 from etid.simulation import scenes
 from etid.simulation.bound import Bound, bound
 
@@ -73,6 +75,7 @@ __all__ = [
     "AbstractCircuit",
     "AbstractEstimator",
     "Bound",
+    "Candidate",
     "Driver",
     "EquationError",
     "Fit",
@@ -87,6 +90,7 @@ __all__ = [
     "RecordingError",
     "Resistor",
     "Samples",
+    "Selection",
     "SkinCole",
     "SkinLayers",
     "SkinRC",
@@ -122,6 +126,7 @@ __all__ = [
     "register",
     "resistor",
     "scenes",
+    "select_circuit",
     "series",
     "write_report",
 ]

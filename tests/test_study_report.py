@@ -93,7 +93,7 @@ def found(study_file, driver):
         condition=np.array([r"dry & $\hot$"] * 6),
     )
     with etid.read(study_file) as study:
-        settings = Settings.of(study, 6, 5, "", etid.SkinRC())
+        settings = Settings.of(study, 6, 5, "", [etid.SkinRC()])
     drivers = {("calibration/0",): driver}
     return StudyFits(fits, drivers, {("calibration/1",): "r_load <b>is</b> missing"}, settings)
 
@@ -365,7 +365,7 @@ TWO = "maximum_likelihood + output_error"
 
 def test_methods_say_that_the_calibrations_chose_the_order(found, study_file):
     with etid.read(study_file) as study:
-        settings = Settings.of(study, 6, "auto", "", etid.SkinRC())
+        settings = Settings.of(study, 6, "auto", "", [etid.SkinRC()])
     section = methods_section.methods_section(dataclasses.replace(found, settings=settings))
     assert "rational function of order 3, " in section.text
     assert "Schwarz's criterion (1978)" in section.text

@@ -29,7 +29,7 @@ class Names:
     Each prefix has its own counter. Neighbouring parts of different kinds get the same number.
     """
 
-    def __init__(self):
+    def __init__(self) -> None:
         self.used: dict[str, int] = {}
 
     def next(self, prefix: str) -> str:
@@ -48,7 +48,7 @@ class Netlist:
         remarks: Notes for the reader of the netlist.
     """
 
-    def __init__(self, band: tuple[float, float]):
+    def __init__(self, band: tuple[float, float]) -> None:
         self.band = band
         self.lines: list[str] = []
         self.remarks: set[str] = set()
@@ -72,7 +72,7 @@ class Notation:
         values: Values of the elements, in their order in the text.
     """
 
-    def __init__(self):
+    def __init__(self) -> None:
         self.names = Names()
         self.values: list[float] = []
 

@@ -34,7 +34,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         choices=registry.names(),
         help="default maximum_likelihood if the record allows it, else output_error",
     )
-    add_circuit(parser, "circuit of the loads, default SkinRC")
+    add_circuit(parser, "circuit of the loads, default SkinRC", automatic=True)
     parser.add_argument(
         "--order",
         type=_order,

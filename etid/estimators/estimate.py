@@ -12,6 +12,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, Int
 
 from etid.results.driver import SourceImpedance
+from etid.results.fits import Support
 from etid.solvers.levenberg_marquardt import LevenbergMarquardt
 
 MAX_STEPS = 500
@@ -40,6 +41,7 @@ class Estimate(eqx.Module):
             share it.
         strain: Increase of the Σ r² of the calibrations in a joint fit; 0 for other fits.
         hum: Whether the residual shows mains hum; a fit in time does not test for it.
+        support: How well the data support this circuit; NaN if the estimator does not compute it.
     """
 
     _: dataclasses.KW_ONLY
@@ -53,6 +55,7 @@ class Estimate(eqx.Module):
     shared_cov: Float[Array, "parameter parameter"]
     strain: Float[Array, ""] = eqx.field(default_factory=lambda: jnp.zeros(()))
     hum: Bool[Array, ""] = eqx.field(default_factory=lambda: jnp.zeros((), bool))
+    support: Support = eqx.field(default_factory=Support.unknown)
 
 
 def prior(

@@ -105,12 +105,14 @@ class AbstractEstimator(abc.ABC):
         driver: The type of driver that the estimator needs. A discrete driver must have the sample
             rate of the recording.
         any_circuit: Whether the estimator identifies circuits other than `SkinRC`.
+        chooses: Whether its fits have a `support`, by which circuits can be compared.
     """
 
     name: ClassVar[str]
     lane: ClassVar[type[AbstractLane]]
     driver: ClassVar[type[Driver]]
     any_circuit: ClassVar[bool] = True
+    chooses: ClassVar[bool] = False
 
     @abc.abstractmethod
     def fit_driver(

@@ -86,6 +86,7 @@ def judged(
         steps=estimate.steps,
         method=method,
         remarks=remarks(estimate.hum),
+        support=estimate.support,
     )
 
 

@@ -6,7 +6,7 @@ A wrong type, a wrong method or the wrong precision of JAX is refused with a mes
 import operator
 import reprlib
 from collections.abc import Iterable, Sequence
-from typing import Any
+from typing import Any, Literal
 
 import jax
 
@@ -18,15 +18,19 @@ from etid.recordings.recording import Recording, RecordingError
 from etid.recordings.study import Study
 from etid.results.driver import ContinuousDriver, Driver, HarmonicDriver
 from etid.results.tried_orders import AUTO, Order
+from etid.selection.search import CANDIDATES
 from etid.signals.harmonics import separates_aliases
 
 LARGEST_ORDER = 50  # ten times the order of the paper; memory grows with the square of the order
+
+Circuit = AbstractCircuit | Literal["auto"] | None
+"""A circuit, or `"auto"` for the simplest circuit that the data support; None for `SkinRC`."""
 
 _REMEDIES: dict[type, str] = {
     Recording: "Take one from a study, as in study['s01/dry/0'], or make one with etid.Recording",
     Driver: "Identify one with etid.identify_driver",
     Study: "Open a file with etid.read, or use etid.Study.from_recordings",
-    AbstractCircuit: "Pass a circuit, as in etid.SkinRC()",
+    AbstractCircuit: "Pass a circuit, as in etid.SkinRC(), or circuit='auto'",
 }
 
 
@@ -87,6 +91,17 @@ def recordings(field: str, value: Iterable[Recording]) -> list[Recording]:
     for number, one in enumerate(found):
         require(f"{field}[{number}]", one, Recording)
     return found
+
+
+def candidates_of(value: Circuit) -> tuple[AbstractCircuit, ...]:
+    """The circuits to choose from: those of `CANDIDATES` for `"auto"`, else one.
+
+    Raises:
+        RecordingError: The value is neither a circuit nor `"auto"`.
+    """
+    if isinstance(value, str) and value == AUTO:
+        return CANDIDATES
+    return (circuit_of(value),)  # pyright: ignore[reportArgumentType]
 
 
 def circuit_of(value: AbstractCircuit | None) -> AbstractCircuit:
@@ -151,26 +166,37 @@ def drift_of(value: float, asked: AbstractEstimator | None) -> float:
 
 
 def estimator_of(
-    method: Method | None, circuit: AbstractCircuit | None = None
+    method: Method | None, candidates: Sequence[AbstractCircuit] = ()
 ) -> AbstractEstimator | None:
     """The requested estimator; None if `method` is None, so that each recording gets its default.
 
     Raises:
-        ValueError: No estimator has this name, or the estimator cannot identify this circuit.
+        ValueError: No estimator has this name, or the estimator cannot identify these circuits, or
+            cannot choose between them.
     """
     require_float64()
     if method is None:
         return None
     estimator = method if isinstance(method, AbstractEstimator) else named(str(method))
-    if circuit is not None:
-        estimator.check_circuit(circuit)
+    check_circuits(estimator, candidates)
     return estimator
 
 
-def check_default(estimator: AbstractEstimator, circuit: AbstractCircuit) -> None:
-    """Raise ValueError if the default estimator cannot identify this circuit."""
-    try:
+def check_circuits(estimator: AbstractEstimator, candidates: Sequence[AbstractCircuit]) -> None:
+    """Raise ValueError unless an estimator can identify these circuits and choose between them."""
+    if len(candidates) > 1 and not estimator.chooses:
+        raise ValueError(
+            f"method {str(estimator)!r} computes no likelihood, which the choice of a circuit "
+            "needs; use method='maximum_likelihood'"
+        )
+    for circuit in candidates:
         estimator.check_circuit(circuit)
+
+
+def check_default(estimator: AbstractEstimator, candidates: Sequence[AbstractCircuit]) -> None:
+    """Raise ValueError if the default estimator cannot identify these circuits."""
+    try:
+        check_circuits(estimator, candidates)
     except ValueError as error:
         raise ValueError(
             "the record holds less than two whole pulse periods or begins in a pulse, or its "

@@ -32,8 +32,8 @@ from etid.circuits.circuit import AbstractCircuit
 from etid.circuits.lookup import qualified
 from etid.estimators.estimator import AbstractEstimator
 from etid.estimators.registry import Method
-from etid.identify.arguments import circuit_of, estimator_of, order_of
-from etid.identify.many import Drivers, identify_part, to_identify
+from etid.identify.arguments import Circuit, candidates_of, estimator_of, order_of
+from etid.identify.many import Drivers, common_first, identify_part, to_identify
 from etid.recordings.hdf5 import read
 from etid.recordings.recording import RecordingError
 from etid.recordings.replacing import replacing
@@ -81,7 +81,7 @@ def _kept_open(
 
 def _fit(
     opened: _Opened,
-    circuit: AbstractCircuit,
+    candidates: Sequence[AbstractCircuit],
     asked: AbstractEstimator | None,
     size: int,
     number: int,
@@ -92,7 +92,7 @@ def _fit(
     """
     study, paths, drivers = opened
     part = paths[number * size : (number + 1) * size]
-    fits = identify_part(study, part, drivers, circuit, asked)
+    fits = identify_part(study, part, drivers, candidates, asked)
     used = set()
     for path in part:
         with contextlib.suppress(RecordingError):
@@ -108,14 +108,14 @@ def _fit_elsewhere(
     order: Order,
     asked: AbstractEstimator | None,
     driver_drift: float,
-    circuit: AbstractCircuit,
+    candidates: Sequence[AbstractCircuit],
     size: int,
     number: int,
 ) -> StudyFits:
     """The fits of one part, in any process that can read the file."""
     with jax.enable_x64(True):  # a worker does not have the setting of its caller
         return _fit(
-            _kept_open(source, stamp, order, asked, driver_drift), circuit, asked, size, number
+            _kept_open(source, stamp, order, asked, driver_drift), candidates, asked, size, number
         )
 
 
@@ -190,7 +190,7 @@ def fit_file(
     target: str | os.PathLike[str],
     *,
     order: Order = 5,
-    circuit: AbstractCircuit | None = None,
+    circuit: Circuit = None,
     method: Method | None = None,
     driver_drift: float = 0.0,
     resume: bool = False,
@@ -203,7 +203,7 @@ def fit_file(
         source: File of recordings. Every process of `executor` must find it under this name.
         target: File of fits to write. Until it is complete, its parts are in `target.parts`.
         order: As in `identify_driver`.
-        circuit: As in `identify_skin`.
+        circuit: As in `identify_skins`. With `"auto"` a sample of the recordings chooses it.
         method: As in `identify_skin`.
         driver_drift: As in `identify_driver`.
         resume: Keep the parts of an earlier run that did not finish.
@@ -221,8 +221,8 @@ def fit_file(
         ValueError: The source has no loaded recording.
     """
     order = order_of(order)
-    circuit = circuit_of(circuit)
-    asked = estimator_of(method, circuit)
+    candidates = candidates_of(circuit)
+    asked = estimator_of(method, candidates)
     source, target = os.path.abspath(source), pathlib.Path(target)
     opened = _open(source, order, asked, driver_drift)
     with opened.study:
@@ -231,24 +231,25 @@ def fit_file(
             raise ValueError("the study has no loaded recording")
         numbers = range((count + PART - 1) // PART)
         stamp = os.stat(source).st_mtime_ns
+        candidates = common_first(opened.study, opened.paths, opened.drivers, candidates, asked)
         settings = Settings.of(
-            opened.study, count, order, str(asked or ""), circuit, driver_drift=driver_drift
+            opened.study, count, order, str(asked or ""), candidates, driver_drift=driver_drift
         )
         described = json.loads(json.dumps(dataclasses.asdict(settings)))  # tuples become lists
         run = {
             **{name.replace("_", " "): value for name, value in described.items()},
             "source date": stamp,
             "circuit": hashlib.sha256(
-                f"{qualified(type(circuit))} {circuit!r}".encode()
+                " ".join(f"{qualified(type(one))} {one!r}" for one in candidates).encode()
             ).hexdigest(),
             "size of a part": PART,
         }
         parts = _Parts(target, run, resume)
         left = [number for number in numbers if not parts.path(number).exists()]
-        task = functools.partial(_fit, opened, circuit, asked, PART)
+        task = functools.partial(_fit, opened, candidates, asked, PART)
         if executor is not None:
             task = functools.partial(
-                _fit_elsewhere, source, stamp, order, asked, driver_drift, circuit, PART
+                _fit_elsewhere, source, stamp, order, asked, driver_drift, candidates, PART
             )
         drivers = {}
         done = min(count, (len(numbers) - len(left)) * PART)
@@ -258,7 +259,7 @@ def fit_file(
                 drivers |= found.drivers
                 bar.update(len(found.fits))
     whole = StudyFits.concatenate(
-        StudyFits.read(parts.path(number), type(circuit)) for number in numbers
+        StudyFits.read(parts.path(number), type(candidates[0])) for number in numbers
     )
     whole.write(target)
     shutil.rmtree(parts.folder)

@@ -31,12 +31,13 @@ from etid.estimators.registry import register_description
 from etid.estimators.score_tests.other_circuit import NO_OTHER_CIRCUIT
 from etid.estimators.score_tests.unloaded import shape_of
 from etid.estimators.starts import harmonic_starts
-from etid.identify.arguments import circuit_of, order_of, require, require_float64
+from etid.identify.arguments import Circuit, candidates_of, order_of, require, require_float64
 from etid.identify.compiled import stored_jit
 from etid.identify.many import (
     LANES,
     Drivers,
     Refusal,
+    common_first,
     each,
     filled,
     planned,
@@ -217,7 +218,7 @@ def identify_jointly(
     study: Study,
     *,
     order: Order = 5,
-    circuit: AbstractCircuit | None = None,
+    circuit: Circuit = None,
     r_load_tolerance: float = 0.0,
     progress: bool = False,
 ) -> StudyFits:
@@ -230,7 +231,8 @@ def identify_jointly(
     Args:
         study: Calibrations and loaded recordings.
         order: Number of poles of Z_th.
-        circuit: Structure of the loads and its typical values; `SkinRC` if not given.
+        circuit: Structure of the loads and its typical values; `SkinRC` if not given. With
+            `"auto"` it is chosen as in `identify_skins`, from fits of single recordings.
         r_load_tolerance: Relative standard deviation of the known resistors. No record shows this
             error. It passes 1:1 into every resistance and inversely into every capacitance.
         progress: Show a progress bar.
@@ -246,9 +248,11 @@ def identify_jointly(
     require_float64()
     require("study", study, Study)
     order = order_of(order)
-    circuit = circuit_of(circuit)
+    candidates = candidates_of(circuit)
     drivers = Drivers(study, order, None)
     paths = to_identify(study)
+    candidates = common_first(study, paths, drivers, candidates, None)
+    circuit = candidates[0]
     fits: dict[int, Fit] = {}
     notes = [""] * len(paths)
     waiting: dict[tuple[str, ...], dict[Any, _Waiting]] = {}
@@ -296,7 +300,7 @@ def identify_jointly(
                 notes[row] = note(one)
     ordered = [fits[row] for row in range(len(paths))]
     outcome = table(study, paths, ordered, notes)
-    settings = Settings.of(study, len(paths), order, METHOD, circuit, r_load_tolerance)
+    settings = Settings.of(study, len(paths), order, METHOD, candidates, r_load_tolerance)
     return StudyFits(outcome, drivers.found, drivers.failures, settings)
 
 

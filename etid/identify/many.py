@@ -10,6 +10,7 @@ recording gets a verdict and a note; the other recordings are not affected.
 import contextlib
 import dataclasses
 import functools
+import math
 import threading
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any
@@ -25,8 +26,9 @@ from etid.estimators.estimator import AbstractEstimator
 from etid.estimators.lanes import AbstractLane, stacked, unstacked
 from etid.estimators.registry import MAXIMUM_LIKELIHOOD, Method
 from etid.identify.arguments import (
+    Circuit,
+    candidates_of,
     check_default,
-    circuit_of,
     drift_of,
     estimator_of,
     order_of,
@@ -37,7 +39,7 @@ from etid.identify.arguments import recordings as several
 from etid.identify.compiled import stored_jit
 from etid.identify.driver import identify_driver
 from etid.identify.one import (
-    concluded,
+    chosen_fits,
     explained,
     failed_fit,
     is_shared,
@@ -57,9 +59,12 @@ from etid.results.provenance import Settings
 from etid.results.study_fits import StudyFits
 from etid.results.tried_orders import Order
 from etid.results.verdicts import message
+from etid.selection.common import common, deserves
+from etid.selection.selection import Selection
 
 LANES = 16  # lanes of one chunk; the last chunk is padded
 AHEAD = 2 * LANES  # recordings that are read and inspected in advance
+SAMPLE = 200  # recordings that choose the circuit of a study; a second of work
 
 
 @stored_jit
@@ -142,11 +147,15 @@ class _Queue:
     """Recordings that wait until a chunk is full; they share a compiled function and a driver."""
 
     def __init__(
-        self, driver: Driver, known: Any, circuit: AbstractCircuit, estimator: AbstractEstimator
+        self,
+        driver: Driver,
+        known: Any,
+        candidates: Sequence[AbstractCircuit],
+        estimator: AbstractEstimator,
     ) -> None:
         self.driver = driver
         self.known = known
-        self.circuit = circuit
+        self.candidates = candidates
         self.estimator = estimator
         self.rows: list[int] = []
         self.lanes: list[AbstractLane] = []
@@ -158,16 +167,18 @@ class _Queue:
         self.lanes.append(lane)
         self.seen.append(seen)
 
-    def run(self) -> Iterator[tuple[int, Fit]]:
+    def run(self) -> Iterator[tuple[int, Selection]]:
         """Fit the waiting recordings and empty the queue."""
         rows, lanes, seen = self.rows, self.lanes, self.seen
         self.rows, self.lanes, self.seen = [], [], []
-        fits = refined(lanes, seen, self._fits, self.driver)
+        found = refined(lanes, seen, self._fits, self.driver, self.candidates)
         remarks = [int(one.remarks) for one in seen]
-        yield from zip(rows, concluded(fits, self.driver, remarks, repeats(seen)), strict=True)
+        of_all = chosen_fits(found, self.driver, remarks, repeats(seen))
+        for row, (fits, chosen) in zip(rows, of_all, strict=True):
+            yield row, Selection.of(fits, chosen, self.candidates)
 
-    def _fits(self, lanes: Sequence[AbstractLane]) -> list[Fit]:
-        of = self.driver, self.known, self.circuit, self.estimator
+    def _fits(self, lanes: Sequence[AbstractLane], circuit: AbstractCircuit) -> list[Fit]:
+        of = self.driver, self.known, circuit, self.estimator
         fits = jax.device_get(_chunk(filled(lanes), jnp.asarray(len(lanes)), *of))
         return unstacked(fits)[: len(lanes)]  # without the padding
 
@@ -175,12 +186,15 @@ class _Queue:
 def _identify(
     count: int,
     load: Callable[[int], tuple[Recording, Driver]],
-    circuit: AbstractCircuit,
+    candidates: Sequence[AbstractCircuit],
     asked: AbstractEstimator | None,
     progress: bool,
-) -> tuple[list[Fit], list[str]]:
-    """Fits and notes of `count` recordings. An error of `load(row)` becomes the verdict of row."""
-    fits: dict[int, Fit] = {}
+) -> tuple[list[Selection], list[str], list[str]]:
+    """Choices and notes of recordings, and names of the methods that were used.
+
+    An error of `load(row)` becomes the verdict of this row.
+    """
+    found: dict[int, Selection] = {}
     notes = [""] * count
     used: list[str] = []
     otherwise = str(asked or MAXIMUM_LIKELIHOOD)
@@ -192,7 +206,7 @@ def _identify(
         with jax.enable_x64(True):  # the setting belongs to a thread, and this runs in another one
             seen, driver, estimator = planned(functools.partial(load, row), asked)
             try:
-                check_default(estimator, circuit)
+                check_default(estimator, candidates)
             except ValueError as error:
                 raise Refusal("not_periodic", str(error)) from error
         rates = seen.recording.sample_rate, seen.recording.pulse_rate
@@ -206,23 +220,24 @@ def _identify(
     ):
 
         def run(queue: _Queue) -> None:
-            for row, fit in queue.run():
-                fits[row] = fit
-                used.append(fit.method)
-                notes[row] = note(fit)
+            for row, selection in queue.run():
+                found[row] = selection
+                used.append(selection.fit.method)
+                notes[row] = note(selection.fit)
                 bar.update()
 
         for row, prepared in enumerate(recordings):
             try:
                 driver, waiting, seen, estimator, shared, key = prepared()
             except Refusal as refusal:
-                fits[row] = failed_fit(refusal.name, circuit, otherwise)
+                fit = failed_fit(refusal.name, candidates[0], otherwise)
+                found[row] = Selection.of({0: fit}, 0, candidates)
                 notes[row] = refusal.note
                 bar.update()
                 continue
             if key not in queues:
                 known = known_of(waiting, driver, shared, estimator)
-                queues[key] = _Queue(driver, known, circuit, estimator)
+                queues[key] = _Queue(driver, known, candidates, estimator)
             queue = queues[key]
             queue.add(row, waiting, seen)
             if len(queue.rows) == LANES:
@@ -230,15 +245,54 @@ def _identify(
         for queue in queues.values():
             if queue.rows:
                 run(queue)
-    ordered = [fits[row] for row in range(count)]
-    return _of_one_method(ordered, used or [otherwise]), notes
+    return [found[row] for row in range(count)], notes, used or [otherwise]
+
+
+def _of_one_circuit(
+    count: int,
+    load: Callable[[int], tuple[Recording, Driver]],
+    candidates: Sequence[AbstractCircuit],
+    asked: AbstractEstimator | None,
+    progress: bool,
+    fixed: int | None = None,
+) -> tuple[list[Fit], list[str]]:
+    """Fits and notes of recordings, all with the same circuit.
+
+    Args:
+        count: Number of recordings.
+        load: Recording and driver of a row.
+        candidates: Circuits to choose from, by joint evidence.
+        asked: The requested estimator.
+        progress: Show a progress bar.
+        fixed: Number of the circuit, if it is chosen already. The other candidates then serve to
+            find the recordings that deserve another circuit.
+    """
+    found, notes, used = _identify(count, load, candidates, asked, progress)
+    chosen = common(found, candidates) if fixed is None else fixed
+    others = [row for row, one in enumerate(found) if one.chosen != chosen]
+    if others:
+        of_others = [candidates[chosen]], asked, False
+        again, texts, _ = _identify(len(others), lambda i: load(others[i]), *of_others)
+        for row, one, text in zip(others, again, texts, strict=True):
+            found[row], notes[row] = _otherwise(found[row], one.fit, text, chosen, candidates)
+    return _of_one_method([one.fit for one in found], used), notes
+
+
+def _otherwise(
+    found: Selection, fit: Fit, text: str, chosen: int, candidates: Sequence[AbstractCircuit]
+) -> tuple[Selection, str]:
+    """The choice and the note of a recording whose common circuit is not its own choice."""
+    if not math.isfinite(float(fit.chi2)):  # it was refused
+        return Selection.of({chosen: fit}, chosen, candidates), text
+    found = Selection.of({**found.fits, chosen: fit}, chosen, candidates)
+    return found, " ".join(filter(None, (text, deserves(found, chosen))))
 
 
 def identify_skins(
     recordings: Iterable[Recording] | Study,
     driver: Driver,
     *,
-    circuit: AbstractCircuit | None = None,
+    circuit: Circuit = None,
     method: Method | None = None,
     progress: bool = False,
 ) -> Fits:
@@ -248,7 +302,8 @@ def identify_skins(
         recordings: Recordings, or a study of loaded recordings. Lengths and sample rates may
             differ.
         driver: Identified driver.
-        circuit: As in `identify_skin`.
+        circuit: As in `identify_skin`. With `"auto"` all recordings get one circuit, chosen by
+            their joint evidence. The note of a recording that deserves another circuit says which.
         method: As in `identify_skin`.
         progress: Show a progress bar.
 
@@ -260,22 +315,24 @@ def identify_skins(
         ValueError: There is no recording, or the method cannot use this circuit.
     """
     require("driver", driver, Driver)
-    circuit = circuit_of(circuit)
-    asked = estimator_of(method, circuit)
+    candidates = candidates_of(circuit)
+    asked = estimator_of(method, candidates)
     if isinstance(recordings, Study):
         study, paths = recordings, [*recordings, *recordings.problems]
         known = [_known(study, path) for path in paths]
-        fits, notes = _identify(
-            len(paths), lambda row: (study[paths[row]], driver), circuit, asked, progress
-        )
+
+        def load(row: int) -> tuple[Recording, Driver]:
+            return study[paths[row]], driver
     else:
         records = several("recordings", recordings)
         known = [vars(record.metadata) for record in records]
-        fits, notes = _identify(
-            len(records), lambda row: (records[row], driver), circuit, asked, progress
-        )
-    if not fits:
+
+        def load(row: int) -> tuple[Recording, Driver]:
+            return records[row], driver
+
+    if not known:
         raise ValueError("there is no recording to identify")
+    fits, notes = _of_one_circuit(len(known), load, candidates, asked, progress)
     return Fits(stacked(fits), described(known), np.array(notes, dtype=str))
 
 
@@ -283,7 +340,7 @@ def identify_study(
     study: Study,
     *,
     order: Order = 5,
-    circuit: AbstractCircuit | None = None,
+    circuit: Circuit = None,
     method: Method | None = None,
     driver_drift: float = 0.0,
     progress: bool = False,
@@ -297,7 +354,7 @@ def identify_study(
     Args:
         study: Calibrations and loaded recordings.
         order: As in `identify_driver`.
-        circuit: As in `identify_skin`.
+        circuit: As in `identify_skins`.
         method: As in `identify_skin`.
         driver_drift: As in `identify_driver`.
         progress: Show a progress bar.
@@ -310,13 +367,14 @@ def identify_study(
     """
     require("study", study, Study)
     order = order_of(order)
-    circuit = circuit_of(circuit)
-    asked = estimator_of(method, circuit)
+    candidates = candidates_of(circuit)
+    asked = estimator_of(method, candidates)
     drivers = Drivers(study, order, asked, driver_drift)
     paths = to_identify(study)
-    fits = identify_part(study, paths, drivers, circuit, asked, progress)
+    candidates = common_first(study, paths, drivers, candidates, asked)
+    fits = identify_part(study, paths, drivers, candidates, asked, progress)
     settings = Settings.of(
-        study, len(paths), order, str(asked or ""), circuit, driver_drift=driver_drift
+        study, len(paths), order, str(asked or ""), candidates, driver_drift=driver_drift
     )
     return StudyFits(fits, drivers.found, drivers.failures, settings)
 
@@ -326,22 +384,48 @@ def to_identify(study: Study) -> list[str]:
     return [*study.loaded, *study.problems]
 
 
+def common_first(
+    study: Study,
+    paths: Sequence[str],
+    drivers: "Drivers",
+    candidates: Sequence[AbstractCircuit],
+    asked: AbstractEstimator | None,
+) -> tuple[AbstractCircuit, ...]:
+    """The candidates; the first one is the common circuit of a sample of the recordings."""
+    if len(candidates) == 1 or not paths:
+        return tuple(candidates)
+    step = -(-len(paths) // SAMPLE)
+    sample = paths[::step]
+    load = _loader(study, sample, drivers)
+    found, *_ = _identify(len(sample), load, candidates, asked, progress=False)
+    chosen = common(found, candidates)
+    return candidates[chosen], *(one for n, one in enumerate(candidates) if n != chosen)
+
+
 def identify_part(
     study: Study,
     paths: Sequence[str],
     drivers: "Drivers",
-    circuit: AbstractCircuit,
+    candidates: Sequence[AbstractCircuit],
     asked: AbstractEstimator | None,
     progress: bool = False,
 ) -> Fits:
-    """Fits of some recordings of a study, with its drivers."""
+    """Fits of some recordings of a study, with its drivers and the first of the candidates."""
+    if not paths:
+        raise ValueError("the study has no loaded recording")
+    load = _loader(study, paths, drivers)
+    fits, notes = _of_one_circuit(len(paths), load, candidates, asked, progress, fixed=0)
+    return table(study, paths, fits, notes)
 
+
+def _loader(
+    study: Study, paths: Sequence[str], drivers: "Drivers"
+) -> Callable[[int], tuple[Recording, Driver]]:
     def load(row: int) -> tuple[Recording, Driver]:
         recording = study[paths[row]]
         return recording, drivers.found[drivers.of(recording)]
 
-    fits, notes = _identify(len(paths), load, circuit, asked, progress)
-    return table(study, paths, fits, notes)
+    return load
 
 
 def table(study: Study, paths: Sequence[str], fits: Sequence[Fit], notes: Sequence[str]) -> Fits:

@@ -18,6 +18,8 @@ from etid.estimators.lanes import AbstractLane, Harmonics, stacked, unstacked
 from etid.estimators.registry import Method
 from etid.identify import changes
 from etid.identify.arguments import (
+    Circuit,
+    candidates_of,
     check_default,
     circuit_of,
     estimator_of,
@@ -31,8 +33,11 @@ from etid.recordings.recording import Recording
 from etid.recordings.remarks import Remark
 from etid.recordings.repeats import Repeats, repeats
 from etid.results.driver import Driver, HarmonicDriver
-from etid.results.fits import Fit, IdentificationError
+from etid.results.fits import Fit, IdentificationError, Support
 from etid.results.verdicts import message, verdict, verdicts_of
+from etid.selection.evidence import best
+from etid.selection.search import search
+from etid.selection.selection import Selection
 from etid.signals.harmonics import whole_periods
 
 KEPT = 4  # drivers, for which `known_of` is kept
@@ -44,7 +49,7 @@ def identify_skin(
     recording: Recording,
     driver: Driver,
     *,
-    circuit: AbstractCircuit | None = None,
+    circuit: Circuit = None,
     method: Method | None = None,
     throw: bool = True,
 ) -> Fit:
@@ -53,7 +58,9 @@ def identify_skin(
     Args:
         recording: Unloaded and loaded voltage.
         driver: Identified driver.
-        circuit: Structure of the load and its typical values; `SkinRC` if not given.
+        circuit: Structure of the load and its typical values; `SkinRC` if not given. With
+            `"auto"` it is the simplest circuit that the recording supports; `select_circuit` shows
+            the choice.
         method: A method of `identify_driver`, or `"non_parametric"` or
             `"harmonic_steiglitz_mcbride"`, or any registered name. `"non_parametric"` and
             `"harmonic_steiglitz_mcbride"` use the drivers of maximum likelihood.
@@ -66,29 +73,54 @@ def identify_skin(
         ValueError: The method cannot use this driver or this circuit.
         IdentificationError: The verdict is not successful and `throw` is set.
     """
+    candidates = candidates_of(circuit)
+    fits, chosen = candidate_fits(recording, driver, candidates, method)
+    fit = fits[chosen] if len(fits) == 1 else Selection.of(fits, chosen, candidates).fit
+    return successful(recording, fit) if throw else fit
+
+
+def candidate_fits(
+    recording: Recording,
+    driver: Driver,
+    candidates: Sequence[AbstractCircuit],
+    method: Method | None,
+) -> tuple[dict[int, Fit], int]:
+    """Fits of the candidates that a recording asks for, and the number of the chosen one.
+
+    Raises:
+        ValueError: The method cannot use this driver or these circuits.
+    """
     require("recording", recording, Recording)
     require("driver", driver, Driver)
-    circuit = circuit_of(circuit)
+    asked = estimator_of(method, candidates)
     seen = Inspected(recording)
-    estimator, name = plan(estimator_of(method, circuit), seen, driver)
+    estimator, name = plan(asked, seen, driver)
     if name is not None:
-        fit = failed_fit(name, circuit, str(estimator))
-    else:
-        check_default(estimator, circuit)
-        lane = estimator.lane.of(seen)
-        known = known_of(lane, driver, is_shared(seen, driver), estimator)
+        return {0: failed_fit(name, candidates[0], str(estimator))}, 0
+    check_default(estimator, candidates)
+    lane = estimator.lane.of(seen)
+    known = known_of(lane, driver, is_shared(seen, driver), estimator)
 
-        def fits(lanes: Sequence[AbstractLane]) -> list[Fit]:
-            found = [skin(lane, driver, known, circuit, estimator) for lane in lanes]
-            return jax.device_get(found)
+    def fit(lanes: Sequence[AbstractLane], circuit: AbstractCircuit) -> list[Fit]:
+        found = [skin(lane, driver, known, circuit, estimator) for lane in lanes]
+        return jax.device_get(found)
 
-        [fit] = refined([lane], [seen], fits, driver)
-        [fit] = concluded([fit], driver, [int(seen.remarks)], repeats([seen]))
-    if throw and fit.verdict != "successful":
-        why = explained(seen, "rate_mismatch") if fit.verdict == "rate_mismatch" else note(fit)
-        text = f"recording {recording.path!r}: {fit.verdict}. {why}"
-        raise IdentificationError(text, fit)
-    return fit
+    found = refined([lane], [seen], fit, driver, candidates)
+    [outcome] = chosen_fits(found, driver, [int(seen.remarks)], repeats([seen]))
+    return outcome
+
+
+def successful(recording: Recording, fit: Fit) -> Fit:
+    """The fit.
+
+    Raises:
+        IdentificationError: Its verdict is not successful.
+    """
+    if fit.verdict == "successful":
+        return fit
+    mismatch = fit.verdict == "rate_mismatch"
+    why = explained(Inspected(recording), "rate_mismatch") if mismatch else note(fit)
+    raise IdentificationError(f"recording {recording.path!r}: {fit.verdict}. {why}", fit)
 
 
 def identify_samples(
@@ -129,11 +161,11 @@ def identify_samples(
     """
     require("driver", driver, Driver)
     circuit = circuit_of(circuit)
-    estimator = estimator_of(method, circuit)
+    estimator = estimator_of(method, [circuit])
     periods = whole_periods(v_out.shape[0], sample_rate, pulse_rate)
     if estimator is None:
         estimator = for_samples(driver, periods)
-        check_default(estimator, circuit)
+        check_default(estimator, [circuit])
     estimator.check_driver(driver, sample_rate, pulse_rate)
     step = jnp.asarray(resolution, dtype=v_out.dtype)
     rate = jnp.asarray(sample_rate, dtype=v_out.dtype)
@@ -242,15 +274,46 @@ def repeated(
 def refined(
     lanes: Sequence[AbstractLane],
     seen: Sequence[Inspected],
-    fit: Callable[[Sequence[AbstractLane]], list[Fit]],
+    fit: Callable[[Sequence[AbstractLane], AbstractCircuit], list[Fit]],
     driver: Driver,
-) -> list[Fit]:
-    """`repeated` for the fits of single recordings with a known driver."""
+    candidates: Sequence[AbstractCircuit],
+) -> list[dict[int, Fit]]:
+    """`repeated` for single recordings with a known driver; each time the circuit is chosen anew.
 
-    def late_by(lane: AbstractLane, fit: Fit) -> int:
+    Args:
+        lanes: Lanes of the recordings.
+        seen: The recordings. The function corrects the lag of those that are late.
+        fit: Fits a circuit to lanes.
+        driver: The driver of the recordings.
+        candidates: Circuits to choose from.
+
+    Returns:
+        Fits of each recording, by number of the candidate.
+    """
+
+    def searched(lanes: Sequence[AbstractLane]) -> list[dict[int, Fit]]:
+        if len(candidates) == 1:
+            return [{0: one} for one in fit(lanes, candidates[0])]
+
+        def rows(number: int, rows: Sequence[int]) -> list[Fit]:
+            return fit([lanes[row] for row in rows], candidates[number])
+
+        return search(len(lanes), candidates, rows)
+
+    def late_by(lane: AbstractLane, fits: dict[int, Fit]) -> int:
+        fit = fits[_chosen(fits)]
         return lane.late_by(fit.circuit, driver) if fit.verdict == "misfit" else 0
 
-    return repeated(lanes, seen, fit, late_by, needs_another, of_both)
+    def of_all(first: dict[int, Fit], second: dict[int, Fit]) -> dict[int, Fit]:
+        other = second[_chosen(second)]
+        if of_both(first[_chosen(first)], other) is other:
+            return second
+        return {number: without_remarks(fit) for number, fit in first.items()}
+
+    def another(fits: dict[int, Fit]) -> bool:
+        return needs_another(fits[_chosen(fits)])
+
+    return repeated(lanes, seen, searched, late_by, another, of_all)
 
 
 def needs_another(fit: Fit | Driver) -> bool:
@@ -265,7 +328,41 @@ def of_both(first: _Outcome, second: _Outcome) -> _Outcome:
     """
     if second.verdict == "successful" and int(second.remarks) & Remark.mains_hum:
         return second
-    return dataclasses.replace(first, remarks=np.zeros((), int))
+    return without_remarks(first)
+
+
+def without_remarks(found: _Outcome) -> _Outcome:
+    """A fit or driver without its remarks."""
+    return dataclasses.replace(found, remarks=np.zeros((), int))
+
+
+def _chosen(fits: dict[int, Fit]) -> int:
+    """Number of the candidate to choose."""
+    return best(fits) if len(fits) > 1 else next(iter(fits))
+
+
+def chosen_fits(
+    found: Sequence[dict[int, Fit]],
+    driver: Driver,
+    remarks: Sequence[int],
+    repeats: Sequence[Repeats | None],
+) -> list[tuple[dict[int, Fit], int]]:
+    """The fits of several recordings, of which the chosen ones are `concluded`, and their numbers.
+
+    Args:
+        found: Fits of each recording, by number of the candidate.
+        driver: The driver of these fits.
+        remarks: Remarks on the recordings.
+        repeats: The periods of the recordings.
+    """
+    outcome = [(dict(fits), _chosen(fits)) for fits in found]
+    for number in {chosen for _, chosen in outcome}:  # circuits of one kind
+        rows = [row for row, (_, chosen) in enumerate(outcome) if chosen == number]
+        fits = [found[row][number] for row in rows]
+        of_rows = [remarks[row] for row in rows], [repeats[row] for row in rows]
+        for row, fit in zip(rows, concluded(fits, driver, *of_rows), strict=True):
+            outcome[row][0][number] = fit
+    return outcome
 
 
 def concluded(
@@ -288,6 +385,7 @@ def concluded(
     coarse = (remarked & Remark.coarse_converter) > 0
     names = np.where(coarse & (names == "insensitive"), "resolution", names)
     names = np.where(change.seen & np.isin(names, changes.EXPLAINED), "changed", names)
+    support = Support.unknown(len(fits)) if whole.support is None else whole.support
     return unstacked(
         dataclasses.replace(
             whole,
@@ -295,6 +393,7 @@ def concluded(
             change=change.size,
             change_stderr=change.stderr,
             result=verdicts_of(names),
+            support=support,
         )
     )
 
@@ -334,6 +433,7 @@ def failed_fit(name: str, circuit: AbstractCircuit, method: str) -> Fit:
         method=method,
         change=none.size,
         change_stderr=none.stderr,
+        support=Support.unknown(),
     )
 
 

@@ -1,8 +1,8 @@
-"""Remarks: texts about changes of a recording before its fit.
+"""Remarks: texts about a fit beside its verdict.
 
-A verdict is the result of a fit. A remark states that the recording was not used as it was
-recorded: a part was left out, a record was shifted, or the noise got another weight. A fit with a
-remark can be successful.
+Most remarks state that the recording was not used as it was recorded: a part was left out, a record
+was shifted, or the noise got another weight. One states that another circuit is likely too. A fit
+with a remark can be successful.
 """
 
 import enum
@@ -11,13 +11,14 @@ import numpy as np
 
 
 class Remark(enum.IntFlag):
-    """Changes of a recording before its fit; several remarks can apply."""
+    """What a user must know of a fit beside its verdict; several remarks can apply."""
 
     mains_hum = enum.auto()
     periods_left_out = enum.auto()
     aligned = enum.auto()
     coarse_converter = enum.auto()
     pulse_rate_counted = enum.auto()
+    circuits_close = enum.auto()
 
 
 _TEXTS = {
@@ -29,6 +30,9 @@ _TEXTS = {
     ),
     Remark.pulse_rate_counted: (
         "The distance of the pulses does not match pulse_rate; the rate was measured in the record."
+    ),
+    Remark.circuits_close: (
+        "Another circuit is likely too; the standard errors contain the difference between them."
     ),
 }
 

@@ -21,6 +21,7 @@ from etid.results.driver import ContinuousDriver
 from etid.results.fits import AND, joined
 from etid.results.provenance import Settings
 from etid.results.study_fits import StudyFits
+from etid.selection.common import LIMIT
 
 
 def methods_section(found: StudyFits) -> Section:
@@ -36,7 +37,7 @@ def methods_section(found: StudyFits) -> Section:
     cited = {"etid", "fingertip", "steiglitz1965", "jax2018"}
     cited.update(key for one in (*known, *of_drivers) for key in one.cited)
     settings = found.settings
-    if settings is not None and settings.order == 0:
+    if settings is not None and (settings.order == 0 or settings.candidates):
         cited.add("schwarz1978")
     paragraphs = [
         _model(found),
@@ -89,7 +90,15 @@ def _model(found: StudyFits) -> str:
             for (name, unit), value in zip(circuit.units().items(), settings.start, strict=True)
         )
         text += f"; fits started around the typical {typical}"
-    return text + "."
+    text += "."
+    if settings is not None and settings.candidates:
+        text += (
+            f" It was chosen among {', '.join(sorted(settings.candidates))} by the joint evidence "
+            "of a sample of the recordings, -BIC = 2 log L - p ln n for p elements and n real "
+            "numbers in the data (Schwarz, 1978); circuits that a recording contradicts lose "
+            f"{LIMIT:g}, and no recording counts more."
+        )
+    return text
 
 
 def _driver(found: StudyFits) -> str:
@@ -205,10 +214,13 @@ def _table(found: StudyFits, settings: Settings) -> Table:
     source = "in memory"
     if settings.source:
         source = f"file {settings.source} of {settings.source_size} bytes"
+    circuit = type(found.fits.circuit).__name__
+    if settings.candidates:
+        circuit += f", chosen among {', '.join(sorted(settings.candidates))}"
     rows = {
         "recordings": source,
         "method": f"asked for {settings.asked_method or 'none'}, used {found.fits.fit.method}",
-        "circuit": type(found.fits.circuit).__name__,
+        "circuit": circuit,
         "Z_th": f"order {settings.order or 'auto'}, drift of {100 * settings.driver_drift:g} %",
         "R_L": f"standard deviation of {100 * settings.r_load_tolerance:g} %",
         "computed": f"in {settings.precision} on {settings.backend}",

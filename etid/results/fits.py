@@ -66,9 +66,33 @@ class IdentificationError(RuntimeError):
         outcome: The unsuccessful fit or driver; None if there is none.
     """
 
-    def __init__(self, text: str, outcome: Any):
+    def __init__(self, text: str, outcome: Any) -> None:
         super().__init__(text)
         self.outcome = outcome
+
+
+CHANGES = 9  # changes that the score tests try: a spread, seven relaxations, a gain
+
+
+class Support(eqx.Module):
+    """How well the data of a fit support its circuit.
+
+    Attributes:
+        deviance: −2 log L at the minimum, up to a constant that depends on the data only.
+        terms: Number of real numbers in the data.
+        z: Score of each change that the circuit cannot make [standard deviations]: a spread of time
+            constants, more relaxations from slow to fast, and another gain of V_out. 0 if the
+            change is too small to matter, or if the circuit can make it itself.
+    """
+
+    deviance: Float[Array | np.ndarray, "*lane"]
+    terms: Float[Array | np.ndarray, "*lane"]
+    z: Float[Array | np.ndarray, "*lane change"]
+
+    @classmethod
+    def unknown(cls, *lane: int) -> "Support":
+        """The support of a fit whose estimator does not compute it, or of a batch of them: NaN."""
+        return cls(np.full(lane, np.nan), np.full(lane, np.nan), np.full((*lane, CHANGES), np.nan))
 
 
 class Fit(Judged):
@@ -92,6 +116,8 @@ class Fit(Judged):
             the first to the last period, or the size of the detected step. NaN if the record holds
             less than two periods; None if no change was computed.
         change_stderr: Standard errors of `change`.
+        support: How well the data support this circuit, for the choice between circuits; NaN or
+            None if the method computes no likelihood.
     """
 
     circuit: AbstractCircuit
@@ -105,6 +131,7 @@ class Fit(Judged):
     remarks: Int[Array | np.ndarray, "*lane"] = eqx.field(default_factory=lambda: np.zeros((), int))
     change: Float[Array | np.ndarray, "*lane moved"] | None = None
     change_stderr: Float[Array | np.ndarray, "*lane moved"] | None = None
+    support: Support | None = None
 
     @property
     def stderr(self) -> AbstractCircuit:
@@ -501,7 +528,7 @@ def _remarks(table: Table, texts: np.ndarray) -> np.ndarray:
         ) from None
 
 
-def _changes_of(read: Mapping[str, np.ndarray], names: Sequence[str]) -> dict[str, np.ndarray]:
+def _changes_of(read: Mapping[str, np.ndarray], names: Sequence[str]) -> dict[str, Any]:
     """The changes in a file of fits; empty for files before schema version 1.2."""
     if "change_stderr" not in read:
         return {}

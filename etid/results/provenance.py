@@ -3,6 +3,7 @@
 import dataclasses
 import importlib.metadata
 import os
+from collections.abc import Sequence
 
 import jax
 import numpy as np
@@ -26,6 +27,8 @@ class Settings:
         asked_method: The method that the user chose; empty if etid chose it for each recording.
         order: Number of poles of Z_th; 0 if etid chose it from the calibrations of each driver.
         start: Typical values of the elements [SI]; fits start around them.
+        candidates: Names of the circuits from which that of all recordings was chosen; empty if
+            the user chose it.
         r_load_tolerance: Relative standard deviation of the known resistors that is included in
             the standard errors.
         driver_drift: As in `identify_driver`.
@@ -40,6 +43,7 @@ class Settings:
     asked_method: str
     order: int
     start: tuple[float, ...]
+    candidates: tuple[str, ...]
     r_load_tolerance: float
     driver_drift: float
     precision: str
@@ -53,7 +57,7 @@ class Settings:
         count: int,
         order: Order,
         method: str,
-        circuit: AbstractCircuit,
+        candidates: Sequence[AbstractCircuit],
         r_load_tolerance: float = 0.0,
         driver_drift: float = 0.0,
     ) -> "Settings":
@@ -64,7 +68,7 @@ class Settings:
             count: Number of recordings to identify.
             order: As in `identify_driver`.
             method: Name of the estimator that the user chose; empty if none.
-            circuit: As in `identify_skin`.
+            candidates: The circuit of the fits, then the others from which it was chosen.
             r_load_tolerance: As in `identify_jointly`.
             driver_drift: As in `identify_driver`.
         """
@@ -75,7 +79,10 @@ class Settings:
             recordings=count,
             asked_method=method,
             order=0 if order == AUTO else order,
-            start=tuple(np.asarray(circuit.values()).tolist()),
+            start=tuple(np.asarray(candidates[0].values()).tolist()),
+            candidates=tuple(type(one).__name__ for one in candidates)
+            if len(candidates) > 1
+            else (),
             r_load_tolerance=float(r_load_tolerance),
             driver_drift=float(driver_drift),
             precision="float64",

@@ -69,6 +69,7 @@ class MaximumLikelihood(AbstractEstimator):
     name = "maximum_likelihood"
     lane = Harmonics
     driver = HarmonicDriver
+    chooses = True
 
     def fit_driver(
         self,

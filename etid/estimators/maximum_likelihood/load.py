@@ -31,7 +31,7 @@ from etid.estimators.maximum_likelihood.terms import (
 from etid.estimators.sandwich import Linear
 from etid.estimators.score_tests import other_circuit
 from etid.estimators.unknowns import LoadUnknowns
-from etid.results.fits import complex_rrse
+from etid.results.fits import Support, complex_rrse
 from etid.signals.harmonics import Spectrum
 from etid.signals.transfer import as_complex, frequency_variable, reciprocal, turns
 from etid.solvers.levenberg_marquardt import LevenbergMarquardt, NormalEquations, best_start
@@ -402,18 +402,21 @@ def fit_circuit(
     unknown = jnp.diagonal(elements)
     unknown = jnp.diag(jnp.where(unknown > 1, unknown, 0.0))
     change = z - driver.mean
-    freedom = 2 * jnp.sum(spectrum.selected, dtype=q.dtype) - load.owned
+    # Increase of the Σ r² of the calibrations.
+    strain = jnp.dot(change, jnp.linalg.solve(driver.cov, change))
+    squares, terms = jnp.sum(part**2), 2 * jnp.sum(spectrum.selected, dtype=q.dtype)
+    freedom = terms - load.owned
     estimate = Estimate(
         parameters=own.log_elements,
         delay_samples=own.delay_samples[None],
         cov=(by_term * (private * noise)[None, :]) @ by_term.T + of_delay + shared + unknown,
         shared_cov=shared,
-        chi2=jnp.sum(part**2) / freedom,
+        chi2=squares / freedom,
         rrse=complex_rrse(g * spectrum.x, spectrum.y, spectrum.selected),
         result=solution.result,
         steps=solution.stats["num_steps"],
-        # Increase of the Σ r² of the calibrations.
-        strain=jnp.dot(change, jnp.linalg.solve(driver.cov, change)),
+        strain=strain,
         hum=shows_hum(known, g) & ~wrong_gain,
+        support=Support(squares + strain, terms, other.relevant()),
     )
     return estimate, moved > FAR, other.seen() | other.has_other_gain()

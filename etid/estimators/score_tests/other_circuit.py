@@ -100,6 +100,10 @@ class Score(NamedTuple):
         """Whether z exceeds this limit and the change moves an element."""
         return (jnp.abs(self.z) > limit) & (self.moved > MOVED)
 
+    def relevant(self) -> Float[Array, "*change"]:
+        """z; 0 if the change moves no element or if the circuit can make it itself."""
+        return jnp.where(self.moved > MOVED, jnp.nan_to_num(self.z), 0.0)
+
     def relaxes(self) -> Bool[Array, ""]:
         """Whether one more relaxation is seen; all changes must be relaxations."""
         return jnp.any(self.exceeds(SEEN_RELAXATION))
@@ -131,6 +135,13 @@ class Scores(NamedTuple):
         """Whether the scores show another circuit."""
         spread = (jnp.abs(self.spread.z) > SEEN_SPREAD) & (jnp.abs(self.spread.size) > SPREAD)
         return spread | self.relaxation.relaxes()
+
+    def relevant(self) -> Float[Array, " change"]:
+        """Z of all changes; 0 if a change is too small to matter, or is not tested."""
+        gain = jnp.zeros_like(self.spread.z) if self.gain is None else self.gain.relevant()
+        spread = jnp.where(jnp.abs(self.spread.size) > SPREAD, self.spread.z, 0.0)
+        parts = jnp.nan_to_num(spread), self.relaxation.relevant(), gain
+        return jnp.concatenate([jnp.atleast_1d(part) for part in parts])
 
     def has_other_gain(self) -> Bool[Array, ""]:
         """Whether the score shows that V_out and V_th have different gains."""

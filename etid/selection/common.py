@@ -1,0 +1,69 @@
+"""One circuit for all recordings of a study, so that groups can be compared.
+
+The joint evidence of a circuit is the sum over the recordings. No recording counts more than
+`LIMIT`: one disturbed recording must not decide for all others.
+"""
+
+import math
+from collections.abc import Sequence
+
+from etid.circuits.circuit import AbstractCircuit
+from etid.selection.evidence import best, bic, elements, rank
+from etid.selection.selection import Selection
+
+LIMIT = 20.0  # largest loss of 2 log evidence by one recording; "very strong" begins at 10
+DESERVED = 10.0  # 2 log evidence from which on a recording deserves a circuit of its own
+
+
+def common(found: Sequence[Selection], candidates: Sequence[AbstractCircuit]) -> int:
+    """Number of the candidate with the largest joint evidence; the first one if nothing is known.
+
+    Args:
+        found: The choices of single recordings.
+        candidates: The circuits by number.
+    """
+    total = [0.0] * len(candidates)
+    for selection in found:
+        if rank(selection.fits[selection.chosen]) == 2:
+            continue  # no circuit explains this recording
+        for number, lost in enumerate(_losses(selection, candidates)):
+            total[number] -= min(lost, LIMIT)
+    return max(range(len(candidates)), key=lambda number: (total[number], -number))
+
+
+def _losses(selection: Selection, candidates: Sequence[AbstractCircuit]) -> list[float]:
+    """2 log evidence that each candidate loses against the chosen one.
+
+    A richer circuit that was not fitted is not likelier than the chosen one: it loses the penalty
+    of its elements. A simpler one that was not fitted lacks an element that is surely there.
+    """
+    fits = selection.fits
+    mine, criterion = fits[selection.chosen], bic(fits)
+    least, own = criterion[selection.chosen], elements(mine)
+    lost = []
+    for number, circuit in enumerate(candidates):
+        more = len(circuit.names()) - own
+        if number in fits:
+            contradicted = rank(fits[number]) == 2
+            lost.append(math.inf if contradicted else criterion[number] - least)
+        elif more > 0 and mine.support is not None:
+            lost.append(more * math.log(float(mine.support.terms)))
+        else:
+            lost.append(math.inf)
+    return lost
+
+
+def deserves(selection: Selection, chosen: int) -> str:
+    """A sentence if a recording deserves another circuit than the common one; otherwise empty.
+
+    Args:
+        selection: The fits of this recording, among them that of the common circuit.
+        chosen: Number of the common circuit.
+    """
+    own = best(selection.fits)
+    criterion = bic(selection.fits)
+    gained = criterion[chosen] - criterion[own]
+    name = type(selection.fits[own].circuit).__name__
+    if own == chosen or rank(selection.fits[own]) or gained < DESERVED:
+        return ""
+    return f"The recording supports {name} better: 2 log evidence +{gained:.0f}."

@@ -1,0 +1,148 @@
+"""Evidence of fitted circuits, and the choice between them.
+
+The criterion is that of Schwarz (1978), 2 log p(data | circuit) ≈ −BIC with
+
+    BIC = −2 log L + p ln n,
+
+for p elements and n real numbers in the data. It stands for Laplace's integral over the elements
+with the prior of one single datum. Unlike AICc, it allows a superfluous element once in some
+hundred fits only; unlike an integral over broad priors, its penalty does not become small when the
+noise is large. `python -m benchmarks selection` compares the three.
+
+Noise that exceeds its estimate divides −2 log L: by −2 log L / n of the best candidate, if that is
+above 1 (quasi-likelihood, Wedderburn 1974).
+
+A circuit must be adequate before it can be better. A candidate with another verdict than
+`successful` is chosen only if no candidate is successful.
+"""
+
+import math
+from collections.abc import Mapping
+
+import numpy as np
+
+from etid.results.fits import Fit, Support
+
+# The data do not determine all elements, or the driver: they do not contradict the circuit.
+_UNDETERMINED = ("insensitive", "resolution", "driver_unclear", "driver_failed")
+# Difference of BIC that is "not worth more than a bare mention" (Kass and Raftery 1995, section
+# 3.2): of circuits that are so close, the simplest is chosen.
+MENTION = 2.0
+# An exponent nearer to 1 is a capacitor: a driver of too low an order can imitate 0.006.
+NEARLY_ONE = 0.01
+
+
+def rank(fit: Fit) -> int:
+    """How far the data accept a circuit.
+
+    Returns:
+        0 for a successful fit; 1 if the data do not determine all its parts, or if a constant-phase
+        element is a capacitor; 2 if the data contradict the circuit.
+    """
+    name = fit.verdict
+    if name == "successful":
+        exponents = [name for name, unit in fit.circuit.units().items() if unit == "1"]
+        return int(any(float(getattr(fit.circuit, of)) > 1 - NEARLY_ONE for of in exponents))
+    return 1 if name in _UNDETERMINED else 2
+
+
+def bic(fits: Mapping[int, Fit]) -> dict[int, float]:
+    """BIC of each candidate; infinite if the fit has no likelihood.
+
+    Args:
+        fits: Fits of the same data, by number of the candidate.
+    """
+    support = {number: fit.support or Support.unknown() for number, fit in fits.items()}
+    deviance = {number: float(one.deviance) for number, one in support.items()}
+    terms = {number: float(one.terms) for number, one in support.items()}
+    known = [number for number in fits if math.isfinite(deviance[number])]
+    if not known:
+        return dict.fromkeys(fits, math.inf)
+    noise = max(1.0, min(deviance[number] / terms[number] for number in known))
+    return {
+        number: deviance[number] / noise + elements(fit) * math.log(terms[number])
+        if number in known
+        else math.inf
+        for number, fit in fits.items()
+    }
+
+
+def elements(fit: Fit) -> int:
+    """Number of elements of the circuit of a fit."""
+    return len(fit.circuit.names())
+
+
+def best(fits: Mapping[int, Fit]) -> int:
+    """Number of the candidate to choose.
+
+    It is the simplest of those whose evidence is largest, up to `MENTION`, among the candidates of
+    the best rank.
+    """
+    criterion, ranks = bic(fits), {number: rank(fit) for number, fit in fits.items()}
+    good = [number for number in fits if ranks[number] == min(ranks.values())]
+    least = min(criterion[number] for number in good)
+    near = [number for number in good if criterion[number] <= least + MENTION]
+    return min(near, key=lambda number: (elements(fits[number]), criterion[number]))
+
+
+def weights(fits: Mapping[int, Fit]) -> dict[int, float]:
+    """Probability of each candidate, if all are equally probable before the data are known.
+
+    Candidates that the data contradict have the weight 0, unless all are contradicted.
+    """
+    criterion, chosen = bic(fits), best(fits)
+    # Undetermined elements do not make a circuit untrue.
+    worst = max(rank(fits[chosen]), 1)
+    usable = [number for number, fit in fits.items() if rank(fit) <= worst]
+    least = min(criterion[number] for number in usable)
+    if not math.isfinite(least):
+        return {number: float(number == chosen) for number in fits}
+    share = {number: math.exp(0.5 * (least - criterion[number])) for number in usable}
+    total = math.fsum(share.values())
+    return {number: share.get(number, 0.0) / total for number in fits}
+
+
+def with_close(fits: Mapping[int, Fit], chosen: int) -> np.ndarray:
+    """Covariance of the chosen elements, with the differences to other likely circuits.
+
+    For each element that another candidate has under the same name and unit,
+
+        var = Σ_m w_m (σ_m² + (θ_m − θ)²),
+
+    with the weights w_m of `weights`, and θ of the chosen circuit. Elements that a candidate does
+    not determine are left out.
+
+    Args:
+        fits: Fits of the same data, by number of the candidate.
+        chosen: Number of the chosen circuit.
+
+    Returns:
+        Covariance [SI²], (element, element).
+    """
+    share = weights(fits)
+    mine = fits[chosen]
+    units = mine.circuit.units()
+    cov = np.array(mine.cov, float)
+    own = _determined(mine)
+    for number, fit in fits.items():
+        if number == chosen or share[number] == 0:
+            continue
+        other = _determined(fit)
+        difference, wider = np.zeros(len(units)), np.zeros(len(units))
+        for i, (name, unit) in enumerate(units.items()):
+            if name in own and name in other and fit.circuit.units()[name] == unit:
+                difference[i] = other[name][0] - own[name][0]
+                wider[i] = max(other[name][1] ** 2 - own[name][1] ** 2, 0.0)
+        cov += share[number] * (np.outer(difference, difference) + np.diag(wider))
+    return cov
+
+
+def _determined(fit: Fit) -> dict[str, tuple[float, float]]:
+    """Values and standard errors of the elements that the data determine."""
+    errors = np.sqrt(np.maximum(np.diagonal(np.asarray(fit.cov)), 0.0))
+    values = [float(np.asarray(getattr(fit.circuit, name))) for name in fit.circuit.names()]
+    return {
+        name: (value, error)
+        for name, value, error in zip(fit.circuit.names(), values, errors, strict=True)
+        if 0 < error < abs(value)
+    }

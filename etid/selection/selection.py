@@ -1,0 +1,127 @@
+"""The circuit that a recording supports, and the candidates that were compared."""
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from etid.circuits.circuit import AbstractCircuit
+from etid.recordings.remarks import Remark
+from etid.results.fits import Fit
+from etid.results.verdicts import message
+from etid.selection.evidence import bic, rank, weights, with_close
+from etid.selection.residuals import looks_like
+
+CLOSE = 0.02  # weight of another circuit from which on a remark is made
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Candidate:
+    """A circuit that was fitted.
+
+    Attributes:
+        fit: Its fit.
+        evidence: 2 log p(data | circuit), minus that of the chosen circuit.
+        weight: Probability of the circuit, if all candidates are equally probable before the data
+            are known.
+    """
+
+    fit: Fit
+    evidence: float
+    weight: float
+
+    @property
+    def name(self) -> str:
+        """Name of the circuit."""
+        return type(self.fit.circuit).__name__
+
+    @property
+    def adequate(self) -> bool:
+        """Whether the data do not contradict the circuit and determine all its elements."""
+        return rank(self.fit) == 0
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Selection:
+    """The simplest circuit that the data support.
+
+    Attributes:
+        fit: The fit of the chosen circuit. Its covariance contains the differences to other likely
+            circuits.
+        candidates: The circuits that were fitted; the chosen one first, then by evidence.
+        unasked: Names of the circuits that were not fitted, because the data did not ask for them.
+        chosen: Number of the chosen candidate.
+        fits: The fits by number of the candidate.
+    """
+
+    fit: Fit
+    candidates: tuple[Candidate, ...]
+    unasked: tuple[str, ...]
+    chosen: int
+    fits: Mapping[int, Fit]
+
+    @classmethod
+    def of(
+        cls, fits: Mapping[int, Fit], chosen: int, circuits: Sequence[AbstractCircuit]
+    ) -> "Selection":
+        """The selection from fits of some of the candidates.
+
+        Args:
+            fits: Fits of one recording, by number of the candidate.
+            chosen: Number of the chosen candidate.
+            circuits: All candidates.
+        """
+        criterion, share = bic(fits), weights(fits)
+        order = sorted(fits, key=lambda number: (number != chosen, criterion[number]))
+        unasked = [type(one).__name__ for n, one in enumerate(circuits) if n not in fits]
+        return cls(
+            _with_remark(fits, chosen, share),
+            tuple(
+                Candidate(fits[number], float(criterion[chosen] - criterion[number]), share[number])
+                for number in order
+            ),
+            tuple(unasked),
+            chosen,
+            dict(fits),
+        )
+
+    @property
+    def residual(self) -> str:
+        """What the residual looks like if no candidate is adequate; otherwise empty."""
+        return "" if self.candidates[0].adequate else looks_like(self.candidates[0].fit)
+
+    def __str__(self) -> str:
+        total = len(self.candidates) + len(self.unasked)
+        lines = [f"{self.candidates[0].name} of {total} candidates: {self.fit.verdict}"]
+        rows = [
+            (
+                one.name,
+                f"{one.evidence:.1f}",
+                f"{100 * one.weight:.1f} %",
+                f"{float(one.fit.chi2):.3f}",
+                str(one.fit.verdict),
+                ", ".join(one.fit.elements),
+            )
+            for one in self.candidates
+        ]
+        heads = ("circuit", "2 log evidence", "weight", "chi2", "verdict", "elements")
+        widths = [max(map(len, column)) for column in zip(heads, *rows, strict=True)]
+        for row in (heads, *rows):
+            cells = [cell.ljust(width) for cell, width in zip(row, widths, strict=True)]
+            lines.append("  " + "  ".join(cells).rstrip())
+        if self.unasked:
+            lines.append(f"  not fitted, the data did not ask for it: {', '.join(self.unasked)}")
+        if self.fit.verdict != "successful":
+            lines.append("  " + message(self.fit.verdict))
+        if self.residual:
+            lines.append("  " + self.residual)
+        return "\n".join(lines)
+
+
+def _with_remark(fits: Mapping[int, Fit], chosen: int, share: Mapping[int, float]) -> Fit:
+    """The chosen fit; its covariance and a remark tell of other likely circuits."""
+    fit = fits[chosen]
+    if 1 - share[chosen] < CLOSE:
+        return fit
+    remarks = np.asarray(int(fit.remarks) | Remark.circuits_close)
+    return dataclasses.replace(fit, cov=with_close(fits, chosen), remarks=remarks)

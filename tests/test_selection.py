@@ -1,0 +1,268 @@
+"""The choice of a circuit: rules on made-up fits, and the whole way on simulated recordings."""
+
+import dataclasses
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import etid
+from etid.circuits.elements import Farad, Ohm
+from etid.results.fits import CHANGES, Fit, Support
+from etid.results.verdicts import verdict
+from etid.selection.common import common, deserves
+from etid.selection.evidence import best, bic, rank, weights, with_close
+from etid.selection.search import CANDIDATES, search
+from etid.selection.selection import Selection
+from etid.simulation.scenes import Scene, Trial
+from etid.simulation.transformer import ResistorLoad
+
+TERMS = 1000.0
+LOADS = {
+    "resistor": etid.Resistor(216.6e3),
+    "parallel": etid.ParallelRC(17.4e3, 0.66e-9),
+    "dry": etid.SkinRC(33.4e3, 186e3, 0.12e-9),
+    "damp": etid.SkinRC(6.1e3, 17.4e3, 0.66e-9),
+    "cole": etid.SkinCole(33.4e3, 186e3, 22e-6, 0.9),
+    "layers": etid.SkinLayers(6.1e3, 12e3, 0.94e-9, 5.4e3, 22e-9),
+}
+# A search that leaves the usual circuit compiles others, some seconds each.
+SLOW = ("resistor", "parallel", "cole", "layers")
+SCENE = Scene(
+    trials=tuple(Trial(name, load) for name, load in LOADS.items()),
+    calibration=(Trial("calibration", ResistorLoad(98.8e3)),),
+    snr_db=50.0,
+    trigger_jitter_rms=50e-9,
+)
+
+
+def made(circuit, deviance, name="successful", z=(0.0,) * CHANGES, error=0.01):
+    """A fit of these elements, with relative standard errors `error`."""
+    size = len(circuit.names())
+    cov = np.diag((error * np.asarray(circuit.values())) ** 2)
+    return Fit(
+        circuit=circuit,
+        cov=cov,
+        shared_cov=np.zeros((size, size)),
+        rrse=np.asarray(0.01),
+        chi2=np.asarray(deviance / TERMS),
+        result=verdict(name),
+        steps=np.asarray(3),
+        method="maximum_likelihood",
+        support=Support(np.asarray(deviance), np.asarray(TERMS), np.asarray(z, float)),
+    )
+
+
+# --- Rules ----------------------------------------------------------------------------------------
+
+
+def test_a_richer_circuit_must_pay_for_its_elements():
+    skin, richer = made(etid.SkinRC(), 990.0), etid.SkinCole()
+    penalty = np.log(TERMS)
+    for gain, chosen in {
+        penalty - 1.0: 0,
+        penalty + 1.9: 0,  # not worth more than a bare mention
+        penalty + 2.1: 1,
+    }.items():
+        assert best({0: skin, 1: made(richer, 990.0 - gain)}) == chosen
+
+
+def test_noise_above_its_estimate_divides_the_evidence():
+    fits = {0: made(etid.SkinRC(), 4060.0), 1: made(etid.SkinCole(), 4000.0)}
+    found = bic(fits)
+    # 60 at four times the noise is 15.
+    assert found[0] - found[1] == pytest.approx(15.0 - np.log(TERMS))
+
+
+def test_adequate_comes_before_better():
+    fits = {
+        0: made(etid.SkinRC(), 2000.0, "misfit"),
+        1: made(etid.SkinCole(), 900.0, "insensitive"),
+        2: made(etid.SkinLayers(), 990.0),
+    }
+    assert best(fits) == 2
+    del fits[2]
+    assert best(fits) == 1
+
+
+def test_a_phase_of_a_capacitor_is_no_reason_for_a_constant_phase():
+    cole = etid.SkinCole(20e3, 100e3, 30e-6, 0.995)
+    assert rank(made(cole, 900.0)) == 1
+    assert rank(made(dataclasses.replace(cole, alpha=jnp.asarray(0.95)), 900.0)) == 0
+
+
+def test_weights_are_probabilities_of_what_the_data_allow():
+    fits = {
+        0: made(etid.SkinRC(), 1000.0),
+        1: made(etid.SkinCole(), 1000.0 - np.log(TERMS)),
+        2: made(etid.Resistor(), 900.0, "misfit"),
+    }
+    assert weights(fits) == pytest.approx({0: 0.5, 1: 0.5, 2: 0.0})
+
+
+def test_the_error_contains_the_difference_to_a_likely_circuit():
+    skin = made(etid.SkinRC(33e3, 186e3, 0.12e-9), 1000.0)
+    cole = made(etid.SkinCole(30e3, 190e3, 22e-6, 0.9), 1000.0 - np.log(TERMS), error=0.02)
+    cov = with_close({0: skin, 1: cole}, 0)
+    # Two equally likely circuits: half of the difference squared, the mean of both variances.
+    expected = 0.5 * 3e3**2 + 0.5 * ((0.01 * 33e3) ** 2 + (0.02 * 30e3) ** 2)
+    assert cov[0, 0] == pytest.approx(expected)
+    assert cov[0, 1] == pytest.approx(-0.5 * 3e3 * 4e3)
+    assert cov[2, 2] == skin.cov[2, 2]  # Cole's circuit has no c_p
+    assert np.linalg.eigvalsh(cov / np.sqrt(np.outer(np.diag(cov), np.diag(cov)))).min() > 0
+
+
+def counted(tables):
+    """A fit function from tables of made-up fits, and the numbers of fits that it has made."""
+    made_fits = []
+
+    def fit(number, rows):
+        made_fits.extend((row, number) for row in rows)
+        return [tables[row][number] for row in rows]
+
+    return fit, made_fits
+
+
+def test_an_ordinary_recording_costs_one_fit():
+    fit, done = counted([[made(circuit, 1000.0) for circuit in CANDIDATES]])
+    assert list(search(1, CANDIDATES, fit)[0]) == [0]
+    assert done == [(0, 0)]
+
+
+@pytest.mark.parametrize(
+    ("z", "tried"),
+    [
+        ((-3.0, *[0.0] * 8), [0, 3]),  # a spread: Cole first, which then suffices
+        ((3.0, *[0.0] * 8), [0]),  # a spread above a capacitor is not passive
+        ((0.0, 2.4, *[0.0] * 7), [0]),
+        ((0.0, 2.6, *[0.0] * 7), [0, 3]),
+        ((*[0.0] * 8, 9.0), [0]),  # a gain is no circuit
+    ],
+)
+def test_the_search_climbs_only_where_a_score_asks(z, tried):
+    table = [made(circuit, 1000.0) for circuit in CANDIDATES]
+    table[0] = made(CANDIDATES[0], 1030.0, z=z)
+    found = search(1, CANDIDATES, counted([table])[0])
+    assert list(found[0]) == tried
+
+
+def test_the_search_goes_on_while_the_best_circuit_still_asks():
+    asks = (0.0, 4.0, *[0.0] * 7)
+    table = [made(circuit, 1000.0) for circuit in CANDIDATES]
+    table[0] = made(CANDIDATES[0], 1300.0, "misfit", asks)
+    table[3] = made(CANDIDATES[3], 1100.0, "misfit", asks)
+    found = search(1, CANDIDATES, counted([table])[0])
+    assert list(found[0]) == [0, 3, 4]
+    assert best(found[0]) == 4
+
+
+def test_the_search_goes_down_if_an_element_is_hardly_determined():
+    table = [made(circuit, 1000.0) for circuit in CANDIDATES]
+    table[0] = made(CANDIDATES[0], 1000.0, error=0.2)
+    found = search(1, CANDIDATES, counted([table])[0])
+    assert list(found[0]) == [0, 1, 2]
+
+
+def choice(fits):
+    return Selection.of(fits, best(fits), CANDIDATES)
+
+
+def test_weak_evidence_of_many_recordings_decides_and_that_of_one_does_not():
+    plain = made(etid.SkinRC(), 1000.0)
+    weak = {0: plain, 3: made(etid.SkinCole(), 1000.0 - np.log(TERMS) - 1.0)}
+    strong = {0: made(etid.SkinRC(), 9000.0), 3: made(etid.SkinCole(), 1000.0)}
+    assert common([choice(weak)] * 3, CANDIDATES) == 3
+    assert common([choice(strong), *[choice({0: plain})] * 3], CANDIDATES) == 0
+
+
+def test_a_recording_that_deserves_another_circuit_says_so():
+    selection = choice({0: made(etid.SkinRC(), 1100.0), 3: made(etid.SkinCole(), 1000.0)})
+    assert "supports SkinCole better: 2 log evidence +93" in deserves(selection, 0)
+    assert deserves(selection, 3) == ""
+
+
+def test_a_table_shows_every_candidate():
+    fits = {
+        0: made(etid.SkinRC(), 1000.0, "insensitive"),
+        1: made(etid.ParallelRC(), 1001.0),
+        2: made(etid.Resistor(), 1500.0, "misfit"),
+    }
+    text = str(choice(fits))
+    first, heads, *rows = text.splitlines()
+    assert first == "ParallelRC of 5 candidates: successful"
+    assert "2 log evidence" in heads
+    assert [row.split()[0] for row in rows[:3]] == ["ParallelRC", "SkinRC", "Resistor"]
+    assert "not fitted, the data did not ask for it: SkinCole, SkinLayers" in text
+
+
+# --- The whole way --------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def study():
+    return SCENE.simulate(11)
+
+
+@pytest.fixture(scope="module")
+def driver(study):
+    return etid.identify_driver([study[path] for path in study.calibrations])
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["dry", "damp", *(pytest.param(name, marks=pytest.mark.slow) for name in SLOW)],
+)
+def test_the_circuit_of_a_recording_is_found(study, driver, name):
+    selection = etid.select_circuit(study[name], driver)
+    assert type(selection.fit.circuit) is type(LOADS[name])
+    assert selection.candidates[0].adequate
+    fit = etid.identify_skin(study[name], driver, circuit="auto")
+    np.testing.assert_array_equal(fit.cov, selection.fit.cov)
+    error = np.asarray(fit.circuit.values()) - np.asarray(LOADS[name].values())
+    assert (np.abs(error) < 4 * np.sqrt(np.diagonal(fit.cov))).all()
+
+
+@pytest.mark.slow
+def test_a_study_gets_one_circuit(study, driver):
+    records = [study["dry"], study["damp"], study["dry"], study["resistor"]]
+    fits = etid.identify_skins(records, driver, circuit="auto")
+    assert type(fits.circuit) is etid.SkinRC
+    assert fits.verdicts.tolist() == ["successful"] * 3 + ["insensitive"]
+    assert "supports Resistor better" in fits.notes[3]
+    alone = etid.identify_skins(records[:3], driver)
+    np.testing.assert_array_equal(fits.circuit.values()[:3], alone.circuit.values())
+    # The score of the dry skin asked for Cole's circuit, which is likely too.
+    assert (np.diagonal(fits.cov[:3] - alone.cov, axis1=1, axis2=2) >= 0).all()
+
+
+@pytest.mark.slow
+def test_without_an_adequate_candidate_the_verdict_says_what_is_left(study, driver):
+    found = etid.select_circuit(
+        study["dry"], driver, candidates=[etid.Resistor(), etid.ParallelRC()], throw=False
+    )
+    assert found.fit.verdict in ("misfit", "inconsistent")
+    assert found.residual.startswith("The residual looks like")
+
+
+class Series(etid.AbstractCircuit):
+    """The circuit of `SkinRC`, drawn differently."""
+
+    r_0: Ohm = etid.parameter("ohm", typical=120e3)
+    r_1: Ohm = etid.parameter("ohm", typical=30e3)
+    c_1: Farad = etid.parameter("farad", typical=0.3e-9)
+
+    def impedance(self):
+        branch = etid.series(etid.resistor(self.r_1), etid.capacitor(self.c_1))
+        return etid.parallel(etid.resistor(self.r_0), branch)
+
+
+@pytest.mark.slow
+def test_circuits_with_equal_impedances_are_refused(study, driver):
+    with pytest.raises(etid.RecordingError, match="SkinRC and Series, which have the same"):
+        etid.select_circuit(study["dry"], driver, candidates=[etid.SkinRC(), Series()])
+
+
+@pytest.mark.parametrize("method", ["output_error", "non_parametric"])
+def test_methods_without_a_likelihood_cannot_choose(study, driver, method):
+    with pytest.raises(ValueError, match="computes no likelihood"):
+        etid.identify_skin(study["dry"], driver, circuit="auto", method=method)
