@@ -183,7 +183,7 @@ class AbstractConnection(AbstractImpedance):
 
     parts: eqx.AbstractVar[tuple[AbstractImpedance, ...]]
 
-    def __check_init__(self):
+    def __check_init__(self) -> None:
         if not self.parts:
             raise ValueError(
                 f"{type(self).__name__.lower()}() has no arguments; give it at least one impedance"
