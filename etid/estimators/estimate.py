@@ -2,7 +2,6 @@
 
 import dataclasses
 import math
-from collections.abc import Callable
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -58,9 +57,40 @@ class Estimate(eqx.Module):
     support: Support = eqx.field(default_factory=Support.unknown)
 
 
-def prior(
-    start: SourceImpedance, sample_rate: Float[Array, ""], r_load: Float[Array, ""]
-) -> Callable[[Float[Array, " parameter"]], Float[Array, " term"]]:
+class Prior(eqx.Module):
+    """The weak prior that `prior` makes.
+
+    Attributes:
+        structure: A source with the same numbers of sections and poles.
+        centre: Centres of the parameters.
+        width: Standard deviations of the parameters.
+        frequency: Frequencies at which Re Z_th should not be negative [Hz].
+        unit: Standard deviation of a negative Re Z_th [Ω].
+    """
+
+    structure: SourceImpedance
+    centre: Float[Array, " parameter"]
+    width: Float[Array, " parameter"]
+    frequency: Float[Array, " frequency"]
+    unit: Float[Array, ""]
+
+    def __call__(self, parameters: Float[Array, " parameter"]) -> Float[Array, " term"]:
+        """The residuals."""
+        active = jnp.minimum(self._source(parameters).response(self.frequency).real, 0.0)
+        return jnp.concatenate([(parameters - self.centre) / self.width, active / self.unit])
+
+    def slopes(self, parameters: Float[Array, " parameter"]) -> Float[Array, "parameter term"]:
+        """Derivatives of the residuals."""
+        source = self._source(parameters)
+        active = source.response(self.frequency).real < 0
+        by_resistance = jnp.where(active[None, :], source.slopes(self.frequency).real, 0.0)
+        return jnp.concatenate([jnp.diag(1 / self.width), by_resistance / self.unit], axis=1)
+
+    def _source(self, parameters: Float[Array, " parameter"]) -> SourceImpedance:
+        return ravel_pytree(self.structure)[1](parameters)
+
+
+def prior(start: SourceImpedance, sample_rate: Float[Array, ""], r_load: Float[Array, ""]) -> Prior:
     """Weak prior of the modal parameters, as additional residuals.
 
     Without a prior, a pole that a noisy recording does not determine would diverge, for example to
@@ -102,14 +132,8 @@ def prior(
         gain_real=jnp.full(reals, wide),
     )
     centre, width = ravel_pytree(centre)[0], ravel_pytree(width)[0]
-    _, unflatten = ravel_pytree(start)
     frequency = jnp.asarray(PASSIVE_BAND) * sample_rate
-
-    def regularise(parameters: Float[Array, " parameter"]) -> Float[Array, " term"]:
-        active = jnp.minimum(unflatten(parameters).response(frequency).real, 0.0)
-        return jnp.concatenate([(parameters - centre) / width, active / (1e-3 * r_load)])
-
-    return regularise
+    return Prior(start, centre, width, frequency, 1e-3 * r_load)
 
 
 def delay_std(r_load: Float[Array, " record"]) -> Float[Array, ""]:

@@ -2,21 +2,23 @@
 
 import dataclasses
 import functools
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float
 
+from etid.estimators.estimate import Estimate
 from etid.estimators.judgement import MAX_STEPS_REACHED, misses, remarks, too_late
 from etid.estimators.maximum_likelihood import driver as maximum_likelihood
 from etid.estimators.output_error import fit as output_error
 from etid.estimators.output_error import prediction
+from etid.estimators.sandwich import Linear
 from etid.estimators.score_tests import missing_pole, resistors
 from etid.estimators.starts import source_starts
 from etid.estimators.steiglitz_mcbride import iteration
-from etid.results.driver import ContinuousDriver, HarmonicDriver, SourceImpedance
+from etid.results.driver import Calibration, ContinuousDriver, HarmonicDriver, SourceImpedance
 from etid.results.verdicts import RESULTS, first_verdict
 from etid.signals.harmonics import Spectrum
 from etid.signals.noise import Measurement
@@ -28,6 +30,15 @@ UNWANTED = 1e3  # added to the cost of a start that did not converge; larger tha
 # grow with opposite signs along a curved valley, so the curvature at one point is not informative.
 # `BLURRED` is added to the cost of such a start. The costs of good starts differ by 0.01.
 SPLIT, BLURRED = 0.1, 1.0
+
+
+class _Found(NamedTuple):
+    """The result of a fit from one start; `linear` are the terms if it is on harmonics."""
+
+    source: SourceImpedance
+    estimate: Estimate
+    calibration: Calibration
+    linear: Linear | None = None
 
 
 def is_split(source: SourceImpedance) -> Bool[Array, ""]:
@@ -53,26 +64,30 @@ def refined_driver(
         spectra: Harmonics of the calibrations for maximum likelihood; None for output error.
         method: Name of the estimator.
     """
-    baseline = iteration.driver_filter(m.v_th, m.v_out, r_load, order).filter
-    starts = source_starts(baseline.den, order, m.sample_rate[0], r_load.mean())
+    rate = m.sample_rate[0]
+    baseline = None
     if spectra is None:
         records = jax.vmap(prediction.prepare)(m)
+        baseline = iteration.driver_filter(m.v_th, m.v_out, r_load, order).filter
 
-        def fit(start):
-            return output_error.fit_source(records, r_load, start)
+        def fit(start: SourceImpedance) -> _Found:
+            return _Found(*output_error.fit_source(records, r_load, start))
     else:
 
-        def fit(start):
-            return maximum_likelihood.fit_source(spectra, r_load, m.sample_rate[0], start)
+        def fit(start: SourceImpedance) -> _Found:
+            return _Found(*maximum_likelihood.fit_source(spectra, r_load, rate, start))
 
+    starts = source_starts(None if baseline is None else baseline.den, order, rate, r_load.mean())
     # One start after the other. In parallel all would run as long as the slowest, and be slower.
-    sources, estimates, known = jax.lax.map(fit, starts)
-    frequency = jnp.asarray(BAND) * m.sample_rate[0]
+    found = jax.lax.map(fit, starts)
+    sources, estimates = found.source, found.estimate
+    frequency = jnp.asarray(BAND) * rate
 
-    def resistance(source, cov):
-        vector, unflatten = ravel_pytree(source)
-        slope = jax.jacfwd(lambda p: unflatten(p).response(frequency).real)(vector)
-        error = jnp.sqrt(jnp.maximum(jnp.einsum("fi,ij,fj->f", slope, cov, slope), 0.0))
+    def resistance(
+        source: SourceImpedance, cov: Float[Array, "parameter parameter"]
+    ) -> Float[Array, ""]:
+        slope = source.slopes(frequency).real
+        error = jnp.sqrt(jnp.maximum(jnp.sum(slope * (cov @ slope), axis=0), 0.0))
         return jnp.min(source.response(frequency).real + PASSIVE * error)
 
     passive = jax.vmap(resistance)(sources, estimates.cov) >= 0
@@ -85,29 +100,27 @@ def refined_driver(
     cost = cost + jnp.where(settled, 0.0, UNWANTED) + jnp.where(passive, 0.0, UNWANTED)
     cost = cost + jnp.where(jax.vmap(is_split)(sources), BLURRED, 0.0)
     chosen = jnp.argmin(jnp.where(finite, cost, jnp.inf))
-    source, estimate, calibration = jax.tree.map(
-        lambda leaf: leaf[chosen], (sources, estimates, known)
-    )
+    best = jax.tree.map(lambda leaf: leaf[chosen], found)
+    source, estimate, calibration = best.source, best.estimate, best.calibration
     wrong = jnp.array(False)
     kind, lacks = ContinuousDriver, jnp.array(False)
     terms = jnp.asarray(m.v_out.size, m.v_out.dtype)
     if spectra is not None:
-        calibrations = maximum_likelihood.Calibrations(
-            source, calibration, spectra, m.sample_rate[0]
-        )
-        statistic = missing_pole.largest(calibrations)
+        calibrations = maximum_likelihood.Calibrations(source, calibration, spectra, rate)
+        statistic = missing_pole.largest(calibrations, best.linear)
         kind = functools.partial(HarmonicDriver, spectra=spectra, missing_pole=statistic)
         lacks = statistic > missing_pole.SEEN
         terms = 2 * jnp.sum(spectra.selected, dtype=terms.dtype)
         if r_load.size > 1:
-            off = resistors.mismatch(calibrations)
+            off = resistors.mismatch(calibrations, best.linear)
             calibration = dataclasses.replace(calibration, mismatch=off)
     if calibration.mismatch is not None:
         wrong = resistors.disagree(calibration.mismatch, estimate.chi2, terms)
+    discrete = source.discrete(rate) if baseline is None else baseline
     return kind(
-        b=baseline.num,
-        a=baseline.den,
-        sample_rate=m.sample_rate[0],
+        b=discrete.num,
+        a=discrete.den,
+        sample_rate=rate,
         source=source,
         cov=estimate.cov,
         calibration=calibration,

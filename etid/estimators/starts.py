@@ -13,6 +13,10 @@ from etid.signals.harmonics import Spectrum
 from etid.signals.transfer import poles
 
 LEVELS = (1.0, 0.125, 0.5, 2.0, 8.0)  # impedance levels of the starts of a circuit
+# Starts of Z_th: frequency, relative to the sample rate, and damping ratio of two sections.
+# `FAR` is that of all further sections.
+GENERIC = (((0.1, 0.3), (0.5, 1.5)), ((0.25, 0.3), (0.5, 1.5)), ((0.1, 0.3), (0.25, 0.3)))
+FAR = (0.5, 1.5)
 START_STEPS = 8  # iterations of Steiglitz-McBride on harmonics; it converges in three to eight
 
 
@@ -58,44 +62,28 @@ def harmonic_starts(
 
 
 def source_starts(
-    baseline: Float[Array, " a"],
+    baseline: Float[Array, " a"] | None,
     order: int,
     sample_rate: Float[Array, ""],
     r_load: Float[Array, ""],
 ) -> SourceImpedance:
-    """Starts of Z_th, stacked: three generic ones, and one with the resonance of the baseline.
+    """Starts of Z_th, stacked: three generic ones, and one with the resonance of a baseline.
 
     Each start has one slow real pole, and sections with given frequencies and damping ratios. All
     gains have the size of a tenth of the known resistor.
+
+    Args:
+        baseline: Denominator of a discrete Z_th; None if there is no baseline.
+        order: Number of poles.
+        sample_rate: Sampling rate [Hz].
+        r_load: The known resistor [Ω].
     """
     sections = (order - 1) // 2
     reals = order - 2 * sections
-    turn = 2 * jnp.pi * sample_rate
-    generic = [[(0.1, 0.3), (0.5, 1.5)], [(0.25, 0.3), (0.5, 1.5)], [(0.1, 0.3), (0.25, 0.3)]]
-    far = (0.5, 1.5)  # further sections start overdamped at the edge of the sampled band
-
-    def start(pairs):
-        pairs = (pairs + [far] * sections)[:sections]
-        omega = (
-            jnp.stack([jnp.asarray(w) * jnp.ones(()) for w, _ in pairs]) if pairs else jnp.ones(0)
-        )
-        zeta = (
-            jnp.stack([jnp.asarray(z) * jnp.ones(()) for _, z in pairs]) if pairs else jnp.ones(0)
-        )
-        slow = jnp.array([3e-4] + [0.5] * (reals - 1))
-        small = 0.1 * r_load
-        return SourceImpedance(
-            log_resistance=jnp.log(0.05 * small),
-            log_omega=jnp.log(omega * turn),
-            log_zeta=jnp.log(zeta),
-            gain=jnp.full(sections, small),
-            slope=jnp.full(sections, small),
-            log_omega_real=jnp.log(slow * turn),
-            gain_real=jnp.full(reals, -0.5 * small),
-        )
-
-    starts = [start(pairs) for pairs in generic]
-    if sections:
+    # Further sections start overdamped at the edge of the sampled band.
+    pairs = [(*of, *[FAR] * sections)[:sections] for of in GENERIC]
+    places = jnp.asarray(np.reshape(list(dict.fromkeys(pairs)), (-1, sections, 2)))
+    if baseline is not None and sections:
         s = jnp.log(poles(baseline))  # s / fs of the discrete poles
         # Resonances are poles well inside the band. The least damped one is used.
         resonant = (s.imag > 0.05) & (s.imag < 0.9 * jnp.pi) & (s.real < 0)
@@ -104,5 +92,20 @@ def source_starts(
         usable = jnp.isfinite(damping[found])
         omega = jnp.where(usable, jnp.abs(s[found]) / (2 * jnp.pi), 0.1)
         zeta = jnp.where(usable, damping[found], 0.3)
-        starts.append(start([(omega, zeta)]))
-    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *starts)
+        further = jnp.asarray(np.tile(FAR, (sections, 1)))
+        places = jnp.concatenate([places, further.at[0].set(jnp.stack([omega, zeta]))[None]])
+    turn, small = 2 * jnp.pi * sample_rate, 0.1 * r_load
+    slow = jnp.array([3e-4] + [0.5] * (reals - 1))
+
+    def start(places: Float[Array, "section 2"]) -> SourceImpedance:
+        return SourceImpedance(
+            log_resistance=jnp.log(0.05 * small),
+            log_omega=jnp.log(places[:, 0] * turn),
+            log_zeta=jnp.log(places[:, 1]),
+            gain=jnp.full(sections, small),
+            slope=jnp.full(sections, small),
+            log_omega_real=jnp.log(slow * turn),
+            gain_real=jnp.full(reals, -0.5 * small),
+        )
+
+    return jax.vmap(start)(places)

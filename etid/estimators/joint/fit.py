@@ -15,6 +15,7 @@ from jaxtyping import Array, Bool, Float
 from etid.estimators.estimate import DELAY_WIDTH, MAX_STEPS, SOLVER, Estimate
 from etid.estimators.joint.errors import estimates
 from etid.estimators.joint.terms import DriverStudy, Joint, Loads, in_turn
+from etid.estimators.maximum_likelihood import driver as calibrations
 from etid.estimators.maximum_likelihood.load import Load, refined
 from etid.estimators.maximum_likelihood.terms import shows_hum
 from etid.estimators.unknowns import LoadUnknowns
@@ -26,8 +27,6 @@ from etid.solvers.levenberg_marquardt import (
     LevenbergMarquardt,
     NormalEquations,
     best_start,
-    normal_equations,
-    second_order,
 )
 
 NEAR = 0.05  # distance of all parameters together from their minimum [standard errors]
@@ -57,7 +56,7 @@ def _equations(_, y: Float[Array, " parameter"], study: DriverStudy) -> Arrowhea
 
     found = [of_group(*group) for group in zip(study.groups, parts, strict=True)]
     loads = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *found)
-    known = normal_equations(lambda q, _: study.of_calibrations(q), common)
+    known = calibrations.equations(None, common, study.model.calibrations)
     o = study.owned
     return ArrowheadEquations(
         known.objective + loads.objective.sum(),
@@ -103,7 +102,7 @@ def _second_order(
 
     found = [of_group(*group) for group in zip(study.groups, parts, steps, strict=True)]
     loads, o = jnp.concatenate(found), study.owned
-    known = second_order(lambda q, _: study.of_calibrations(q), common, towards)
+    known = calibrations.second_order(None, common, towards, study.model.calibrations)
     return join(known + loads[:, o:].sum(0), loads[:, :o])
 
 

@@ -78,10 +78,6 @@ class DriverStudy(eqx.Module):
         """One load behind this driver."""
         return Load.behind(driver, self.model.circuit, load.spectrum, load.sample_rate)
 
-    def of_calibrations(self, common: Float[Array, " common"]) -> Float[Array, " term"]:
-        """Terms of the calibrations."""
-        return self.model.calibrations.terms(common, self.model.calibrations.records)
-
     def start(self) -> Float[Array, " parameter"]:
         """The start: the driver of the calibrations, and each load identified alone."""
         own = jnp.concatenate([loads.own.vector() for loads in self.groups])

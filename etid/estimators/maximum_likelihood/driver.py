@@ -5,6 +5,7 @@
 
 import dataclasses
 from collections.abc import Sequence
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -19,11 +20,15 @@ from etid.estimators.estimate import (
     MAX_STEPS,
     SOLVER,
     Estimate,
+    Prior,
     delay_std,
     prior,
 )
 from etid.estimators.maximum_likelihood.terms import (
+    apart,
     as_list,
+    by_gains,
+    chained,
     delayed_gain,
     denoised,
     excess,
@@ -36,10 +41,39 @@ from etid.estimators.unknowns import DriverUnknowns
 from etid.results.driver import Calibration, HarmonicDriver, SourceImpedance
 from etid.results.fits import complex_rrse
 from etid.signals.harmonics import Spectrum
-from etid.solvers.levenberg_marquardt import LevenbergMarquardt
+from etid.signals.transfer import as_complex, frequency_variable, reciprocal
+from etid.solvers.levenberg_marquardt import (
+    DIFFERENCE,
+    LevenbergMarquardt,
+    NormalEquations,
+)
+
+
+def equations(_: Any, q: Float[Array, " common"], model: "Calibrations") -> NormalEquations:
+    """Normal equations of the calibrations."""
+    terms, jacobian = model.terms_and_slopes(q, model.records)
+    return NormalEquations(
+        0.5 * jnp.dot(terms, terms), jacobian @ terms, jacobian @ jacobian.T
+    ).finite()
+
+
+def second_order(
+    _: Any, q: Float[Array, " common"], step: Float[Array, " common"], model: "Calibrations"
+) -> Float[Array, " common"]:
+    """Jᵀ r″ of the calibrations; r″ as in `levenberg_marquardt.second_order`."""
+    ends = [model.terms(q + h * step, model.records) for h in (DIFFERENCE, -DIFFERENCE)]
+    terms, jacobian = model.terms_and_slopes(q, model.records)
+    return jacobian @ (ends[0] + ends[1] - 2 * terms) / DIFFERENCE**2
+
 
 # Z_th and a delay form a curved valley; a load alone has no such valley.
-CURVED = LevenbergMarquardt(rtol=SOLVER.rtol, ftol=SOLVER.ftol, geodesic=True)
+CURVED = LevenbergMarquardt(
+    rtol=SOLVER.rtol,
+    ftol=SOLVER.ftol,
+    geodesic=True,
+    equations=equations,
+    second_order=second_order,
+)
 
 
 def fit_source(
@@ -47,7 +81,7 @@ def fit_source(
     r_load: Float[Array, " record"],
     sample_rate: Float[Array, ""],
     start: SourceImpedance,
-) -> tuple[SourceImpedance, Estimate, Calibration]:
+) -> tuple[SourceImpedance, Estimate, Calibration, Linear]:
     """Identify Z_th from one or several records with known resistors.
 
     Args:
@@ -57,17 +91,23 @@ def fit_source(
         start: Initial Z_th; its structure is the order.
 
     Returns:
-        Z_th; the estimate, with parameters in the order of the flattened `start`; and the data of
-        the calibrations that a skin's fit needs.
+        Z_th; the estimate, with parameters in the order of the flattened `start`; the data of the
+        calibrations that a skin's fit needs; and the terms, linear around their minimum.
     """
     calibration = Calibration(r_load, jnp.zeros(r_load.shape), delay_std(r_load))
     model = Calibrations(start, calibration, spectra, sample_rate)
     solution = optx.least_squares(
-        model.terms, CURVED, model.start(), model.records, max_steps=MAX_STEPS, throw=False
+        lambda q, model: model.terms(q, model.records),
+        CURVED,
+        model.start(),
+        model,
+        max_steps=MAX_STEPS,
+        throw=False,
     )
     q, found = solution.value, model.named(solution.value)
     kept = found.source.size
-    cov = model.linear(q).covariance()[:kept, :kept]
+    linear = model.linear(q)
+    cov = linear.covariance()[:kept, :kept]
     freedom = 2 * jnp.sum(spectra.selected, dtype=q.dtype) - q.size
     seen = list(zip(model.records, model.gains(q), strict=True))
     errors = jnp.stack([complex_rrse(g * s.x, s.y, s.selected) for s, g in seen])
@@ -83,7 +123,7 @@ def fit_source(
         hum=jnp.stack([shows_hum(s, g) for s, g in seen]).any(),
     )
     calibration = dataclasses.replace(calibration, delay_samples=found.delay_samples)
-    return model.z_th(q), estimate, calibration
+    return model.z_th(q), estimate, calibration, linear
 
 
 class Calibrations(eqx.Module):
@@ -141,21 +181,66 @@ class Calibrations(eqx.Module):
         self, common: Float[Array, " common"], records: Sequence[Spectrum]
     ) -> Float[Array, " term"]:
         """Terms of the calibrations and of the weak priors."""
-        regularise = prior(self.source, self.rate, self.calibration.r_load.mean())
         parts = residuals(records, self.gains(common))
         of = self.named(common)
-        weak = [regularise(of.source), of.delay_samples / DELAY_WIDTH]
+        weak = [self._prior()(of.source), of.delay_samples / DELAY_WIDTH]
         return jnp.concatenate(parts + weak)
+
+    def _prior(self) -> Prior:
+        return prior(self.source, self.rate, self.calibration.r_load.mean())
 
     def linear(self, common: Float[Array, " common"]) -> Linear:
         """The terms, linear around their minimum."""
         records, gains = self.records, self.gains(common)
         clean, shares = denoised(records, gains)
-        jacobian = jax.jacfwd(lambda c: self.terms(c, clean))(common)
+        _, jacobian = self.terms_and_slopes(common, clean)
         parts = residuals(records, gains)
         noise = [excess(r, s.selected) for r, s in zip(parts, records, strict=True)]
-        count = jacobian.shape[0]
-        return Linear(jacobian.T, weights(shares, count), weights(noise, count))
+        count = jacobian.shape[1]
+        return Linear(jacobian, weights(shares, count), weights(noise, count))
+
+    def by_z(
+        self, common: Float[Array, " common"], gains: Sequence[Complex[Array, " harmonic"]]
+    ) -> list[Complex[Array, " harmonic"]]:
+        """∂G/∂Z_th = −G/(R + Z_th)."""
+        source = self.z_th(common)
+        each = zip(gains, self.calibration.r_load, self.spectra.frequency, strict=True)
+        return [-g * reciprocal(as_complex(r) + source.response(f)) for g, r, f in each]
+
+    def gain_slopes(
+        self,
+        common: Float[Array, " common"],
+        gains: Sequence[Complex[Array, " harmonic"]],
+        by_z: Sequence[Complex[Array, " harmonic"]],
+    ) -> list[Complex[Array, "common harmonic"]]:
+        """Derivatives of the gains."""
+        source, alone = self.z_th(common), jnp.eye(len(gains))
+        found = []
+        for number, (g, of_z) in enumerate(zip(gains, by_z, strict=True)):
+            frequency = self.spectra.frequency[number]
+            of_delay = -g * frequency_variable(frequency / self.rate)
+            by_source = source.slopes(frequency) * of_z[None, :]
+            by_delay = as_complex(alone[number])[:, None] * of_delay[None, :]
+            found.append(jnp.concatenate([by_source, by_delay]))
+        return found
+
+    def terms_and_slopes(
+        self, common: Float[Array, " common"], records: Sequence[Spectrum]
+    ) -> tuple[Float[Array, " term"], Float[Array, "common term"]]:
+        """The terms and their derivatives."""
+
+        def of_gains(_: Float[Array, " common"]) -> tuple[Array, Array, list[Array]]:
+            parts = jnp.concatenate(residuals(records, gains))
+            return parts, by_gains(records, gains), self.by_z(common, gains)
+
+        gains = apart(self.gains, common)
+        terms, by_gain, by_z = apart(of_gains, common)
+        by_common = apart(lambda c: self.gain_slopes(c, gains, by_z), common)
+        rows = chained(by_common, by_gain)
+        of, late = self.named(common), jnp.eye(len(gains)) / DELAY_WIDTH
+        weak = jax.scipy.linalg.block_diag(self._prior().slopes(of.source), late)
+        priors = [self._prior()(of.source), of.delay_samples / DELAY_WIDTH]
+        return jnp.concatenate([terms, *priors]), jnp.concatenate([rows, weak], axis=1)
 
     def by_gains(
         self, common: Float[Array, " common"], slopes: Sequence[Complex[Array, "row harmonic"]]
@@ -163,14 +248,9 @@ class Calibrations(eqx.Module):
         """Derivatives of the denoised terms; `slopes` are those of the gain of each record."""
         gains = self.gains(common)
         clean, _ = denoised(self.records, gains)
-
-        def row(number):
-            at = [of[number] for of in slopes]
-            part = jax.jvp(lambda g: jnp.concatenate(residuals(clean, g)), (gains,), (at,))[1]
-            priors = self.terms(common, self.records).size - part.size
-            return jnp.pad(part, (0, priors))
-
-        return jax.vmap(row)(jnp.arange(slopes[0].shape[0]))
+        rows = chained(slopes, by_gains(clean, gains))
+        priors = self.terms(common, self.records).size - rows.shape[1]
+        return jnp.pad(rows, ((0, 0), (0, priors)))
 
     def strain(self, common: Float[Array, " common"]) -> Float[Array, ""]:
         """Increase of the Σ r² of the calibrations over its value at their own minimum.

@@ -21,7 +21,6 @@ does not determine.
 """
 
 import dataclasses
-from collections.abc import Callable
 from typing import NamedTuple
 
 import equinox as eqx
@@ -127,8 +126,8 @@ def given(
     c = calibrations.start()
     linear = calibrations.linear(c)
     root = inverse_root(linear.curvature().expected)
-    value, pullback = jax.vjp(lambda c: calibrations.terms(c, calibrations.records), c)
-    mean, cov = -root.T @ pullback(value)[0], linear.along(root).curvature().score
+    terms, slopes = calibrations.terms_and_slopes(c, calibrations.records)
+    mean, cov = -root.T @ (slopes @ terms), linear.along(root).curvature().score
     if driver.drift is None:
         found = around(calibrations, c, root, frequency, shared, mean, cov)
     else:
@@ -156,41 +155,30 @@ def around(
 ) -> GivenDriver:
     """A driver around the common parameters c, with z along `directions`; like `given`."""
     resistance = calibrations.calibration.r_load.mean()
-
-    def loaded(
-        c: Float[Array, " common"], frequency: Float[Array, " harmonic"]
-    ) -> Complex[Array, " harmonic"]:
-        return calibrations.z_th(c).response(frequency) + as_complex(resistance)
-
-    def w(
-        c: Float[Array, " common"], frequency: Float[Array, " harmonic"]
-    ) -> Complex[Array, " harmonic"]:
-        return jnp.log(loaded(c, frequency))
-
-    def of_known(c: Float[Array, " common"]) -> Complex[Array, "record harmonic"]:
-        return jnp.stack(calibrations.gains(c))
-
-    def along(
-        function: Callable[[Float[Array, " common"]], Complex[Array, "..."]],
-    ) -> Complex[Array, "z ..."]:
-        return jax.vmap(lambda v: jax.jvp(function, (c,), (v,))[1])(directions.T)
-
+    source, gains = calibrations.z_th(c), calibrations.gains(c)
+    loaded = source.response(frequency) + as_complex(resistance)
+    _, by_frequency = jax.jvp(source.response, (frequency,), (frequency,))
+    by_source = source.slopes(frequency) * reciprocal(loaded)[None, :]
+    known = None
+    if shared:
+        slopes = calibrations.gain_slopes(c, gains, calibrations.by_z(c, gains))
+        known = jnp.stack([combined(directions.T, of) for of in slopes], axis=1)
     return GivenDriver(
         frequency,
-        loaded(c, frequency),
-        jax.jvp(lambda f: w(c, f), (frequency,), (frequency,))[1],
-        along(lambda c: w(c, frequency)),
+        loaded,
+        by_frequency * reciprocal(loaded),
+        combined(directions[: by_source.shape[0]].T, by_source),
         resistance,
         mean,
         cov,
         calibrations.spectra if shared else None,
-        of_known(c) if shared else None,
-        along(of_known) if shared else None,
+        jnp.stack(gains) if shared else None,
+        known,
     )
 
 
 def combined(
-    z: Float[Array, " z"], slope: Complex[Array, "z harmonic"]
-) -> Complex[Array, " harmonic"]:
+    z: Float[Array, "*row z"], slope: Complex[Array, "z harmonic"]
+) -> Complex[Array, "*row harmonic"]:
     """Σ z ∂/∂z, in real arithmetic, because complex matrix products take ten times as long."""
     return jax.lax.complex(z @ slope.real, z @ slope.imag)

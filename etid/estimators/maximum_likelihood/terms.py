@@ -184,6 +184,37 @@ def residuals(
     ]
 
 
+def by_gains(
+    spectra: Sequence[Spectrum], gains: Sequence[Complex[Array, " harmonic"]]
+) -> Float[Array, "record 2 term"]:
+    """Derivatives of `residuals` with respect to both parts of the gain of each record.
+
+    A residual depends on the gains at its own harmonic only.
+    """
+    stacked = jnp.stack(gains)
+    real = jnp.eye(len(gains), dtype=stacked.real.dtype)
+    directions = jnp.stack([as_complex(real), jax.lax.complex(jnp.zeros_like(real), real)], axis=1)
+
+    def along(direction: Complex[Array, " record"]) -> Float[Array, " term"]:
+        towards = jnp.broadcast_to(direction[:, None], stacked.shape)
+        return jax.jvp(
+            lambda g: jnp.concatenate(residuals(spectra, list(g))), (stacked,), (towards,)
+        )[1]
+
+    return jax.vmap(jax.vmap(along))(directions)
+
+
+def chained(
+    slopes: Sequence[Complex[Array, "row harmonic"]], by_gain: Float[Array, "record 2 term"]
+) -> Float[Array, "row term"]:
+    """Derivatives of residuals: `slopes` are those of each gain, `by_gain` is from `by_gains`."""
+    each = by_gain.reshape(*by_gain.shape[:2], -1, slopes[0].shape[-1])
+    rows = jnp.zeros((slopes[0].shape[0], *each.shape[2:]), by_gain.dtype)
+    for slope, (real, imaginary) in zip(slopes, each, strict=True):
+        rows = rows + slope.real[:, None] * real[None] + slope.imag[:, None] * imaginary[None]
+    return rows.reshape(rows.shape[0], -1)
+
+
 def apart(evaluate: Callable[[Array], Any], q: Float[Array, " q"]) -> Any:
     """`evaluate(q)`, computed once; NaN if `q` is not finite.
 

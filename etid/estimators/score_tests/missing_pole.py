@@ -19,6 +19,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Complex, Float
 
 from etid.estimators.maximum_likelihood.driver import Calibrations
+from etid.estimators.maximum_likelihood.terms import apart
+from etid.estimators.sandwich import Linear
 from etid.signals.transfer import as_complex, frequency_variable, reciprocal
 
 SEEN = 36.0  # χ² of two degrees of freedom; by chance one of about 100 sections has it once in 10⁶
@@ -38,28 +40,45 @@ def sections(
     return jnp.stack([low, x * low], axis=1)
 
 
-def largest(calibrations: Calibrations) -> Float[Array, ""]:
+def largest(calibrations: Calibrations, linear: Linear) -> Float[Array, ""]:
     """Largest score statistic of all sections; the calibrations show one more if above `SEEN`.
 
     Args:
         calibrations: Calibrations at the minimum of their likelihood.
+        linear: Their terms.
     """
-    return jnp.nanmax(squares(calibrations))  # NaN if a section has no effect
+    found = squares(calibrations, linear)
+    return jnp.nanmax(found)  # NaN if a section has no effect
 
 
-def squares(calibrations: Calibrations) -> Float[Array, " section"]:
+def squares(calibrations: Calibrations, linear: Linear) -> Float[Array, " section"]:
     """Score statistic of each section: χ² with two degrees of freedom if the section is absent.
 
     Args:
         calibrations: Calibrations at the minimum of their likelihood.
+        linear: Their terms.
     """
     c = calibrations.start()
-    linear = calibrations.linear(c)
-    rows = calibrations.by_gains(c, _slopes(calibrations))
-    directions = rows - linear.told(rows) @ linear.bread() @ linear.jacobian
-    score = (directions @ calibrations.terms(c, calibrations.records)).reshape(-1, 2, 1)
-    directions = directions.reshape(-1, 2, rows.shape[1])
-    variance = jnp.einsum("sit,t,sjt->sij", directions, linear.noise, directions)
+    slopes = apart(lambda _: _slopes(calibrations), c)
+    rows = apart(lambda c: calibrations.by_gains(c, slopes), c)
+    terms = calibrations.terms(c, calibrations.records)
+    # With D = rows − fitted J, the scores are D r and their covariance is D C Dᵀ. D itself is not
+    # computed, because it is large.
+    fitted = linear.told(rows) @ linear.bread()
+    score = rows @ terms - fitted @ (linear.jacobian @ terms)
+    noisy = linear.jacobian * linear.noise[None, :]
+    cross = rows @ noisy.T
+    between = cross - 0.5 * fitted @ (noisy @ linear.jacobian.T)
+    rows, fitted, between = (of.reshape(-1, 2, of.shape[1]) for of in (rows, fitted, between))
+    shared = fitted @ between.transpose(0, 2, 1)
+    one, other = rows[:, 0], rows[:, 1]
+    by_g, by_both, by_h = (
+        jnp.sum(a * b * linear.noise[None, :], axis=1)
+        for a, b in ((one, one), (one, other), (other, other))
+    )
+    own = jnp.stack([by_g, by_both, by_both, by_h], axis=1).reshape(-1, 2, 2)
+    variance = own - shared - shared.transpose(0, 2, 1)
+    score = score.reshape(-1, 2, 1)
     return jnp.sum(score * jnp.linalg.solve(variance, score), axis=(1, 2))
 
 

@@ -14,6 +14,7 @@ from jaxtyping import Array, Bool, Complex, Float
 
 from etid.estimators.maximum_likelihood.driver import Calibrations
 from etid.estimators.maximum_likelihood.terms import excess, weights
+from etid.estimators.sandwich import Linear
 from etid.recordings.preflight import Inspected
 from etid.signals.transfer import as_complex
 
@@ -30,14 +31,15 @@ EXPLAINED = 0.5
 ROUGHLY = 3.0
 
 
-def mismatch(calibrations: Calibrations) -> Float[Array, "2 record"]:
+def mismatch(calibrations: Calibrations, linear: Linear) -> Float[Array, "2 record"]:
     """Excess of each log R over the value that the other calibrations show, and its standard error.
 
     Args:
         calibrations: Two or more calibrations at the minimum of their likelihood.
+        linear: Their terms.
     """
     c, records = calibrations.start(), calibrations.records
-    linear, value = calibrations.linear(c), calibrations.terms(c, records)
+    value = calibrations.terms(c, records)
     z_th, alone = calibrations.z_th(c).response, jnp.eye(len(records))
     slopes = [
         as_complex(alone[i])[:, None] * _slope(g, r, z_th(s.frequency))[None, :]
