@@ -142,7 +142,7 @@ def test_a_choice_is_right_if_its_error_is_near_the_best():
         return benchmark.Draw(order, np.full((2, 3), error), np.zeros((2, 3)))
 
     draws = [
-        {4: drawn(4, 1.05), 5: drawn(5, 1.0), 6: drawn(6, 2.0), "auto": drawn(order, 1.0)}
-        for order in (4, 5, 6)
+        {4: drawn(4, 1.05), 5: drawn(5, 1.0), 6: drawn(6, 2.0), "auto": drawn(order, error)}
+        for order, error in ((4, 1.05), (5, 1.0), (6, 2.0), (6, 1.4))
     ]
-    assert benchmark.right(draws, (4, 5, 6)) == [True, True, False]
+    assert benchmark.right(draws, (4, 5, 6)) == [True, True, False, True]
