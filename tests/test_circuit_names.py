@@ -95,6 +95,8 @@ def test_the_command_passes_a_circuit_of_etid_on(files, options, monkeypatch, tm
     target = str(tmp_path / "new.h5")
     assert cli.main(["fit", "study.h5", "-o", target, "--circuit", "SkinCole", *options]) == DONE
     assert type(asked["circuit"]) is etid.SkinCole
+    assert cli.main(["fit", "study.h5", "-o", target, "--circuit", "auto", *options]) == DONE
+    assert asked["circuit"] == "auto"
 
 
 def test_a_file_imports_nothing_and_says_what_to_import(files, tmp_path, capsys, monkeypatch):
