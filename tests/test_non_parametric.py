@@ -135,7 +135,7 @@ def test_bias_is_taken_off_the_estimate(study, coarse, monkeypatch):
 
         with monkeypatch.context() as patched:
             patched.setattr(non_parametric, "_bias", bias)
-            estimate, off = non_parametric.fit_circuit(
+            estimate, off, _ = non_parametric.fit_circuit(
                 etid.Resistor(), coarse, spectrum, rate, start
             )
         return estimate.parameters, off

@@ -18,6 +18,7 @@ from etid.estimators.judgement import SUCCESSFUL, judged, unless
 from etid.estimators.lanes import Harmonics
 from etid.estimators.maximum_likelihood.estimator import AbstractByMaximumLikelihood
 from etid.estimators.non_parametric.fit import fit_circuit
+from etid.estimators.score_tests.other_circuit import NO_OTHER_CIRCUIT, NO_OTHER_GAIN
 from etid.estimators.score_tests.unloaded import UnloadedShape
 from etid.estimators.starts import harmonic_starts
 from etid.results.driver import Driver, HarmonicDriver
@@ -57,12 +58,13 @@ class NonParametric(AbstractByMaximumLikelihood):
         """Refine from the best of several starts."""
         spectrum, rate = lane.spectrum, jnp.asarray(lane.sample_rate)
         starts = harmonic_starts(spectrum, rate, driver.response(spectrum.frequency), circuit)
-        estimate, bias = fit_circuit(circuit, driver, spectrum, rate, starts)
+        estimate, bias, other = fit_circuit(circuit, driver, spectrum, rate, starts)
         # It needs only the harmonics of the driver, so the driver's verdict does not matter.
         fit = judged(estimate, circuit, SUCCESSFUL, str(self))
         if known is not None:
             fit = unless(fit, known.differs(spectrum), RESULTS.inconsistent)
         far = jnp.any(jnp.abs(bias) > CORRECTED * jnp.sqrt(jnp.diagonal(estimate.cov)))
+        fit = unless(fit, other.seen() | other.has_other_gain(), RESULTS.misfit)
         return unless(fit, far, RESULTS.biased)
 
     def describe(self) -> Description:
@@ -73,7 +75,7 @@ class NonParametric(AbstractByMaximumLikelihood):
             "calibrations show it at each harmonic, without a model of it, noise on all records "
             "being accounted for (Pintelon and Schoukens, 2012, ch. 9 and 10). Trigger delays were "
             "estimated with the load.",
-            conditions=(*CHECKED, DETERMINED),
+            conditions=(*CHECKED, DETERMINED, NO_OTHER_CIRCUIT, NO_OTHER_GAIN),
             errors=BY_RESIDUALS,
             refined=True,
             cited=("pintelon2012", "optimistix2024", "white1980"),
