@@ -1,8 +1,10 @@
+import copy
 import pickle
 
 import numpy as np
 import pytest
 
+from etid.recordings import hdf5
 from etid.recordings.recording import Recording, RecordingError, Samples
 from etid.recordings.study import Study
 
@@ -151,13 +153,49 @@ def test_repr_is_one_line_that_says_what_it_is():
     )
 
 
+COPIES = pytest.mark.parametrize(
+    "copied", [copy.deepcopy, lambda one: pickle.loads(pickle.dumps(one))], ids=["copy", "pickle"]
+)
+
+
+@COPIES
+def test_a_copy_of_a_recording_holds_the_same_and_cannot_be_changed(copied):
+    codes = Samples(np.array([1, -2, 3], "i2"), 0.5, 1.0)
+    one = recording(3, v_th=codes, path="s01", subject="s01", adc_range=(-1.0, 2.0))
+    again = copied(one)
+    assert again.metadata == one.metadata
+    assert again.samples["v_th"].stored.dtype == np.int16
+    np.testing.assert_array_equal(again.v_th, one.v_th)
+    np.testing.assert_array_equal(again.v_out, one.v_out)
+    with pytest.raises(ValueError, match="read-only"):
+        again.samples["v_th"].stored[0] = 1
+
+
+@COPIES
+def test_a_copy_of_a_study_in_memory_holds_the_same(copied):
+    again = copied(study())
+    assert list(again) == list(study())
+    assert again["s02/damp"].metadata == study()["s02/damp"].metadata
+    np.testing.assert_array_equal(again["s02/damp"].v_out, study()["s02/damp"].v_out)
+
+
+@COPIES
+def test_a_copy_of_a_part_of_a_file_opens_the_file_again(copied, tmp_path, monkeypatch):
+    study().write(tmp_path / "study.h5")
+    monkeypatch.chdir(tmp_path)
+    with hdf5.read("study.h5") as whole, copied(whole.where(subject="s01")) as part:
+        whole.close()
+        assert list(part) == ["s01/dry/0", "s01/dry/1"]
+        np.testing.assert_array_equal(part["s01/dry/1"].v_out, study()["s01/dry/1"].v_out)
+
+
 def test_an_error_says_where_what_and_what_to_do_and_survives_pickling():
     error = RecordingError(
         "is 0 Hz", file="a.h5", path="s01", field="sample_rate", remedy="Mend it"
     )
     assert str(error) == "a.h5, 's01', sample_rate: is 0 Hz. Mend it."
-    copy = pickle.loads(pickle.dumps(error))
-    assert (str(copy), copy.file, copy.path, copy.field, copy.remedy) == (
+    again = pickle.loads(pickle.dumps(error))
+    assert (str(again), again.file, again.path, again.field, again.remedy) == (
         str(error),
         "a.h5",
         "s01",

@@ -8,6 +8,7 @@ and the size of a quantisation step is known.
 
 import abc
 import dataclasses
+import functools
 import inspect
 from collections.abc import Hashable, Iterator, Mapping
 from types import MappingProxyType
@@ -75,6 +76,10 @@ class Samples:
     def resolution(self) -> float | None:
         """Size of one converter step in SI units [V or A]; None for samples that are not codes."""
         return abs(self.conversion) if self.stored.dtype.kind in "iu" else None
+
+    def __reduce__(self) -> tuple:
+        # By default a copy would hold an array that can be written.
+        return Samples, (self.stored, self.conversion, self.offset)
 
 
 @dataclasses.dataclass(frozen=True, eq=False, repr=False, init=False)
@@ -170,6 +175,10 @@ class Recording(AbstractFields):
             RecordingError: The new recording would be invalid.
         """
         return Recording(**{**self.samples, **vars(self.metadata), **changes})
+
+    def __reduce__(self) -> tuple:
+        # A read-only mapping cannot be pickled.
+        return functools.partial(Recording, **self.samples, **vars(self.metadata)), ()
 
     def __repr__(self) -> str:
         load = "loaded" if self.r_load is None else f"calibration with {self.r_load:g} ohm"

@@ -60,7 +60,7 @@ class Study(Mapping[str, Recording]):
     """Ordered recordings by path; recordings of a file are loaded when they are accessed.
 
     `Study.from_recordings` and `etid.read` make a study. A study from a file keeps the file open:
-    use `with`, or call `close()`.
+    use `with`, or call `close()`. A copy or a pickle of such a study opens the file again.
 
     Attributes:
         file: Path of the file; empty for a study in memory.
@@ -220,6 +220,11 @@ class Study(Mapping[str, Recording]):
             )
         write(self._sources, path)
 
+    def __reduce__(self) -> tuple:
+        if not self.file:
+            return Study, (self._sources,)
+        return _opened, (os.path.abspath(self.file), tuple(self._sources))
+
     def close(self) -> None:
         """Close the file of the study; all parts of the study use the same file."""
         if self._close is not None:
@@ -238,3 +243,12 @@ class Study(Mapping[str, Recording]):
         return (
             f"<Study{place}: {calibrations} calibrations, {len(self) - calibrations} loaded{bad}>"
         )
+
+
+def _opened(file: str, paths: Iterable[str]) -> Study:
+    """The recordings of a file at these paths; a copy or a pickle of a study becomes this."""
+    from etid.recordings.hdf5 import read  # it imports this module
+
+    whole = read(file)
+    sources = {path: whole.source(path) for path in paths}
+    return Study(sources, problems=whole.problems, file=file, close=whole.close)
