@@ -12,6 +12,7 @@ NAMES = (
     "spice",
     "coverage",
     "driver_order",
+    "delays",
     "design",
     "timing",
     "speed",

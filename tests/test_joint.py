@@ -8,6 +8,7 @@ import pytest
 
 import etid
 from benchmarks.failure_axes import Cole
+from etid.recordings.remarks import Remark
 from etid.recordings.study import Study
 from etid.simulation.scenes import Scene, Trial
 from etid.simulation.transformer import ResistorLoad, SkinLoad, TransformerDriver
@@ -25,9 +26,9 @@ def two_relaxations(f):
     return 20e3 + 1e5 / (1 + s * 1e5 * 0.12e-9) + 6e4 / (1 + s * 6e4 * 3e-9)
 
 
-def simulate(odd, seed, **options):
+def simulate(odd, seed, trigger_jitter_rms=50e-9, **options):
     """Trials and calibration; two trials have one unloaded record."""
-    scene = Scene((*TRIALS, odd), KNOWN, trigger_jitter_rms=50e-9, **options)
+    scene = Scene((*TRIALS, odd), KNOWN, trigger_jitter_rms=trigger_jitter_rms, **options)
     apart = scene.simulate(seed)
     together = dataclasses.replace(scene, shared_v_th=True).simulate(seed)
     return Study.from_recordings([(together if p in TOGETHER else apart)[p] for p in apart])
@@ -120,6 +121,22 @@ def test_the_tolerance_of_the_resistor_is_shared_and_passes_one_to_one(study, ou
         grown = (cov - before) / values[:, :, None] / values[:, None, :]
         sign = np.array([1, 1, -1])  # a resistor that is larger makes the capacitor smaller
         np.testing.assert_allclose(grown[0], 1e-4 * np.outer(sign, sign), rtol=1e-6)
+
+
+def test_delays_that_do_not_scatter_leave_smaller_errors_and_the_fits_say_so(outcome):
+    """One trigger for all records: R_s and C_p need not pay for delays that the study excludes."""
+    odd = Trial("odd", two_relaxations, condition="odd")
+    fits = etid.identify_jointly(simulate(odd, seed=3, trigger_jitter_rms=0.0)).fits
+    dry = fits.where(condition="dry").successful()
+    assert len(dry) == len(TRIALS)
+    assert (np.asarray(dry.fit.remarks) & Remark.small_delays).all()
+    assert not (np.asarray(fits.where(path="odd").fit.remarks) & Remark.small_delays).any()
+    error = np.asarray(dry.circuit.values()) - TRUTH
+    assert (np.abs(error) < SIGMAS * np.asarray(dry.stderr.values())).all()
+    scattered = outcome.fits.where(condition="dry").successful()
+    assert not (np.asarray(scattered.fit.remarks) & Remark.small_delays).any()
+    # By the bound, C_p of dry skin has 0.7 of its error then, and two studies differ by a tenth.
+    assert np.median(dry.stderr.c_p) < 0.85 * np.median(scattered.stderr.c_p)
 
 
 def test_the_summary_tells_what_varies_from_what_is_shared(outcome):

@@ -15,13 +15,14 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Int
+from jaxtyping import Array, Bool, Float, Int
 from tqdm import tqdm
 
 from etid.circuits.circuit import AbstractCircuit
 from etid.estimators import judgement
-from etid.estimators.estimate import Estimate
+from etid.estimators.estimate import DELAY_WIDTH, Estimate
 from etid.estimators.estimator import serving
+from etid.estimators.joint.errors import Delay
 from etid.estimators.joint.fit import fit_alone, fit_together
 from etid.estimators.joint.terms import Joint, Loads
 from etid.estimators.lanes import AbstractLane, Harmonics, unstacked
@@ -55,7 +56,8 @@ from etid.results.fits import Fit
 from etid.results.provenance import Settings
 from etid.results.study_fits import StudyFits
 from etid.results.tried_orders import Order
-from etid.results.verdicts import RESULTS, verdict
+from etid.results.verdicts import RESULTS, verdict, verdict_names
+from etid.selection.delays import upper_limit
 
 METHOD = "joint"
 SINGLE = (
@@ -67,7 +69,9 @@ register_description(
     description(
         "joint maximum likelihood",
         "each driver and all recordings made with it were estimated in one fit by",
-        "Z_th is common to all, each record has its own trigger delay τ.",
+        "Z_th is common to all, each record has its own trigger delay τ. Where the delays scatter "
+        "by less than their errors, the upper limit of their scatter (95 %) is the standard "
+        "deviation of their prior.",
         NO_OTHER_CIRCUIT,
     ),
 )
@@ -112,14 +116,14 @@ def _together(
     several: tuple[int, ...],
     driver: HarmonicDriver,
     tolerance: Array,
-) -> tuple[list[Fit], HarmonicDriver]:
+) -> tuple[list[Fit], HarmonicDriver, list[Delay], Float[Array, "common common"]]:
     common, cov, found = fit_together(model, groups, several)
     # The records determine all impedances in units of the known resistor.
     power, _ = model.circuit.scaling()
     scale = tolerance**2 * jnp.outer(power, power)
 
-    def fit(found: tuple[Estimate, Bool[Array, ""]]) -> Fit:
-        estimate, other = found
+    def fit(found: tuple[Estimate, Bool[Array, ""], Delay]) -> Fit:
+        estimate, other, _ = found
         with_scale = dataclasses.replace(
             estimate, cov=estimate.cov + scale, shared_cov=estimate.shared_cov + scale
         )
@@ -140,7 +144,49 @@ def _together(
             ),
         ),
     )
-    return [jax.vmap(fit)(of_group) for of_group in found], better
+    fits = [jax.vmap(fit)(of_group) for of_group in found]
+    return fits, better, [delay for _, _, delay in found], cov
+
+
+def _narrower(
+    groups: Sequence[Loads],
+    fits: Sequence[Fit],
+    delays: Sequence[Delay],
+    cov: Float[np.ndarray, "common common"],
+    rate: float,
+) -> float | None:
+    """Width of the prior of every delay [samples] that the recordings support, if it pays.
+
+    Args:
+        groups: The recordings.
+        fits: Their fits.
+        delays: Their delays.
+        cov: Covariance of the common parameters.
+        rate: Sampling rate of the calibrations [Hz].
+    """
+    good = np.concatenate([_successful(fit) for fit in fits])
+    if good.sum() < 2 or any(np.any(np.asarray(loads.sample_rate) != rate) for loads in groups):
+        return None
+    late, own, slope = (
+        np.concatenate([np.asarray(getattr(of, name)) for of in delays])[good]
+        for name in ("samples", "own_variance", "slope")
+    )
+    width = upper_limit(late, own, slope, cov, DELAY_WIDTH)
+    errors = np.sqrt(own + np.einsum("ij,jk,ik->i", slope, cov, slope))
+    return width if width < np.median(errors) else None
+
+
+def _successful(fits: Fit) -> Bool[np.ndarray, " lane"]:
+    return verdict_names(fits.result) == "successful"
+
+
+def _replaced(fits: Fit, others: Fit, where: Bool[np.ndarray, " lane"]) -> Fit:
+    """Fits of a group, some of them replaced by others."""
+
+    def one(leaf: np.ndarray, other: np.ndarray) -> np.ndarray:
+        return np.where(where.reshape(-1, *[1] * (leaf.ndim - 1)), other, leaf)
+
+    return jax.tree.map(one, fits, others)
 
 
 class _Waiting:
@@ -226,7 +272,8 @@ def identify_jointly(
 
     The method is maximum likelihood, for records of several whole pulse periods. Its cost is linear
     in the number of records. A recording that this kind of circuit does not explain does not
-    influence the driver.
+    influence the driver. If the trigger delays of all recordings scatter by less than their errors,
+    a second fit limits each delay by this scatter; the fits then have the remark `small_delays`.
 
     Args:
         study: Calibrations and loaded recordings.
@@ -284,14 +331,29 @@ def identify_jointly(
         shared = any(group.model.shared for group in lengths.values())
         tolerance = jnp.asarray(r_load_tolerance, dtype=float)
         model = _model(circuit, driver, shared)
-        found, better = _together(model, groups, several, driver, tolerance)
+        found, better, delays, cov = _together(model, groups, several, driver, tolerance)
+        found, delays, cov = jax.device_get((found, delays, cov))
+        width = _narrower(groups, found, delays, cov, float(driver.sample_rate))
+        if width is not None and better.verdict == "successful":
+            again = dataclasses.replace(Calibrations.of(better), delay_width=jnp.array(width))
+            model = dataclasses.replace(model, calibrations=again)
+            others, better, *_ = _together(model, groups, several, better, tolerance)
+            for number, (group, other) in enumerate(
+                zip(lengths.values(), jax.device_get(others), strict=True)
+            ):
+                both = _successful(found[number]) & _successful(other)
+                found[number] = _replaced(found[number], other, both)
+                group.remarks = [
+                    remarks | (Remark.small_delays if known else 0)
+                    for remarks, known in zip(group.remarks, both, strict=True)
+                ]
         # A compiled function returns JAX arrays. The checksums must stay a numpy array.
         better = dataclasses.replace(better, method=METHOD, unloaded=driver.unloaded)
         changed = any(any(group.changed) for group in lengths.values())
         if changed and not any(np.any(loads.used) for loads in groups):
             better = dataclasses.replace(better, result=verdict("inconsistent"))
         drivers.found[names] = better
-        for group, fit in zip(lengths.values(), jax.device_get(found), strict=True):
+        for group, fit in zip(lengths.values(), found, strict=True):
             of_group = zip(unstacked(fit), group.changed, strict=True)
             alone = [_of(one, changed) for one, changed in of_group]
             judged = concluded(alone, better, group.remarks, group.repeats)

@@ -19,6 +19,7 @@ class Remark(enum.IntFlag):
     coarse_converter = enum.auto()
     pulse_rate_counted = enum.auto()
     circuits_close = enum.auto()
+    small_delays = enum.auto()
 
 
 _TEXTS = {
@@ -33,6 +34,9 @@ _TEXTS = {
     ),
     Remark.circuits_close: (
         "Another circuit is likely too; the standard errors contain the difference between them."
+    ),
+    Remark.small_delays: (
+        "The trigger delays of the study scatter less than their errors; the scatter limits each."
     ),
 }
 

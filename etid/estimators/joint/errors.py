@@ -20,7 +20,7 @@ import jax.numpy as jnp
 import optimistix as optx
 from jaxtyping import Array, Bool, Complex, Float
 
-from etid.estimators.estimate import DELAY_WIDTH, Estimate
+from etid.estimators.estimate import Estimate
 from etid.estimators.joint.terms import DriverStudy, Loads, in_turn
 from etid.estimators.maximum_likelihood.load import Load
 from etid.estimators.maximum_likelihood.terms import (
@@ -57,17 +57,31 @@ class _Eliminated(eqx.Module):
     bread: Float[Array, "own own"]
 
 
+class Delay(eqx.Module):
+    """The trigger delay of a load and its error; several can be stacked.
+
+    Attributes:
+        samples: The delay [samples].
+        own_variance: Variance at given common parameters.
+        slope: Derivatives with respect to the common parameters.
+    """
+
+    samples: Float[Array, "*load"]
+    own_variance: Float[Array, "*load"]
+    slope: Float[Array, "*load common"]
+
+
 def estimates(
     study: DriverStudy,
     common: Float[Array, " common"],
     fitted: Sequence[tuple[LoadUnknowns, optx.RESULTS]],
     several: Sequence[int],
     solution: optx.Solution,
-) -> tuple[Float[Array, "common common"], list[tuple[Estimate, Bool[Array, " load"]]]]:
+) -> tuple[Float[Array, "common common"], list[tuple[Estimate, Bool[Array, " load"], Delay]]]:
     """Covariance of `common`, and the estimates of each group with their covariances.
 
     For each load it also returns whether the data show another circuit
-    (`etid.estimators.score_tests.other_circuit`).
+    (`etid.estimators.score_tests.other_circuit`), and its trigger delay.
 
     Args:
         study: Calibrations and loads.
@@ -108,7 +122,7 @@ def estimates(
             result: optx.RESULTS,
             records: int = records,
             sums_of: Float[Array, "record x common"] = sums_of,
-        ) -> tuple[Estimate, Bool[Array, ""]]:
+        ) -> tuple[Estimate, Bool[Array, ""], Delay]:
             chi2, rrse = _misfit(study, load, common, own)
             shared = eliminated.slope @ cov @ eliminated.slope.T
             private = eliminated.cov
@@ -131,7 +145,9 @@ def estimates(
                 steps=solution.stats["num_steps"],
                 strain=strain,
             )
-            return estimate, _is_another(study, load, common, own, eliminated, bread, total.score)
+            delay = Delay(own.delay_samples, private[-1, -1], eliminated.slope[-1])
+            other = _is_another(study, load, common, own, eliminated, bread, total.score)
+            return estimate, other, delay
 
         judged.append(in_turn(one, loads, own, eliminated, results))
     return cov, judged
@@ -177,7 +193,7 @@ def _seen(
     lane = Load.behind(driver, model.circuit, clean, load.sample_rate)
     slopes = apart(lane.slopes, q)
     jacobian, o = lane.chained(q, slopes), study.owned
-    of_delay = LoadUnknowns(jnp.zeros(o - 1), jnp.asarray(1 / DELAY_WIDTH)).vector()
+    of_delay = LoadUnknowns(jnp.zeros(o - 1), 1 / driver.delay_width).vector()
     of_delay = jnp.concatenate([jnp.zeros(common.size), of_delay])
     jacobian = jnp.concatenate([jacobian[o:], jacobian[:o]])
     jacobian = jnp.concatenate([jacobian, of_delay[:, None]], axis=1)
@@ -186,7 +202,7 @@ def _seen(
     return _Seen(
         gain=g,
         known=known,
-        terms=jnp.append(part, late / DELAY_WIDTH),
+        terms=jnp.append(part, late / driver.delay_width),
         linear=Linear(jacobian, weights(shares[-1:], count), noise),
         rows=lane.by_changes(q, slopes)[:-1],  # without the gain of V_out
     )

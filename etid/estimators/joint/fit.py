@@ -12,8 +12,8 @@ import jax.numpy as jnp
 import optimistix as optx
 from jaxtyping import Array, Bool, Float
 
-from etid.estimators.estimate import DELAY_WIDTH, MAX_STEPS, SOLVER, Estimate
-from etid.estimators.joint.errors import estimates
+from etid.estimators.estimate import MAX_STEPS, SOLVER, Estimate
+from etid.estimators.joint.errors import Delay, estimates
 from etid.estimators.joint.terms import DriverStudy, Joint, Loads, in_turn
 from etid.estimators.maximum_likelihood import driver as calibrations
 from etid.estimators.maximum_likelihood.load import Load, refined
@@ -38,12 +38,13 @@ def _equations(_, y: Float[Array, " parameter"], study: DriverStudy) -> Arrowhea
 
     def of_group(loads: Loads, owns: LoadUnknowns) -> NormalEquations:
         driver = study.model.around(common, loads.spectrum.frequency[0])
+        width = driver.delay_width
 
         def one(load: Loads, own: LoadUnknowns) -> NormalEquations:
             lane = study.lane(driver, load)
             part, jacobian = lane.jacobian(jnp.concatenate([own.vector(), driver.mean]))
-            late = own.delay_samples / DELAY_WIDTH
-            slope = LoadUnknowns(jnp.zeros_like(own.log_elements), jnp.asarray(1 / DELAY_WIDTH))
+            late = own.delay_samples / width
+            slope = LoadUnknowns(jnp.zeros_like(own.log_elements), 1 / width)
             slope = jnp.concatenate([slope.vector(), jnp.zeros_like(driver.mean)])
             found = NormalEquations(
                 0.5 * (jnp.dot(part, part) + late**2),
@@ -111,7 +112,7 @@ def fit_together(
 ) -> tuple[
     Float[Array, " common"],
     Float[Array, "common common"],
-    list[tuple[Estimate, Bool[Array, " load"]]],
+    list[tuple[Estimate, Bool[Array, " load"], Delay]],
 ]:
     """Identify all loads and their driver.
 
@@ -122,8 +123,9 @@ def fit_together(
 
     Returns:
         Common parameters, their covariance, and the estimates of each group, stacked, with whether
-        the data show another circuit. In the estimates, `shared_cov` is the part that several loads
-        share: from the uncertainty of `common`, and from the noise of shared unloaded records.
+        the data show another circuit, and with the delays. In the estimates, `shared_cov` is the
+        part that several loads share: from the uncertainty of `common`, and from the noise of
+        shared unloaded records.
     """
     study = DriverStudy(model, groups)
     # The sum of squares grows with the number of loads; a detectable change of it does not.

@@ -136,12 +136,14 @@ class Calibrations(eqx.Module):
         calibration: Resistors and delays of the calibrations.
         spectra: Harmonics of the calibrations.
         rate: Sampling rate of the calibrations [Hz].
+        delay_width: Prior standard deviation of every trigger delay, of loads too [samples].
     """
 
     source: SourceImpedance
     calibration: Calibration
     spectra: Spectrum
     rate: Float[Array, ""]
+    delay_width: Float[Array, ""] = eqx.field(default_factory=lambda: jnp.array(DELAY_WIDTH))
 
     @classmethod
     def of(cls, driver: HarmonicDriver) -> "Calibrations":
@@ -183,7 +185,7 @@ class Calibrations(eqx.Module):
         """Terms of the calibrations and of the weak priors."""
         parts = residuals(records, self.gains(common))
         of = self.named(common)
-        weak = [self._prior()(of.source), of.delay_samples / DELAY_WIDTH]
+        weak = [self._prior()(of.source), of.delay_samples / self.delay_width]
         return jnp.concatenate(parts + weak)
 
     def _prior(self) -> Prior:
@@ -237,9 +239,9 @@ class Calibrations(eqx.Module):
         terms, by_gain, by_z = apart(of_gains, common)
         by_common = apart(lambda c: self.gain_slopes(c, gains, by_z), common)
         rows = chained(by_common, by_gain)
-        of, late = self.named(common), jnp.eye(len(gains)) / DELAY_WIDTH
+        of, late = self.named(common), jnp.eye(len(gains)) / self.delay_width
         weak = jax.scipy.linalg.block_diag(self._prior().slopes(of.source), late)
-        priors = [self._prior()(of.source), of.delay_samples / DELAY_WIDTH]
+        priors = [self._prior()(of.source), of.delay_samples / self.delay_width]
         return jnp.concatenate([terms, *priors]), jnp.concatenate([rows, weak], axis=1)
 
     def by_gains(

@@ -28,6 +28,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Complex, Float
 
+from etid.estimators.estimate import DELAY_WIDTH
 from etid.estimators.maximum_likelihood.driver import Calibrations
 from etid.estimators.maximum_likelihood.terms import (
     as_list,
@@ -68,6 +69,7 @@ class GivenDriver(eqx.Module):
         gains: Gains of these calibrations.
         gain_slopes: Derivatives of these gains with respect to z.
         shape: Unloaded voltage of the first calibration; None if loads have other harmonics.
+        delay_width: Prior standard deviation of the trigger delay of a load [samples].
     """
 
     frequency: Float[Array, " harmonic"]
@@ -81,6 +83,7 @@ class GivenDriver(eqx.Module):
     gains: Complex[Array, "calibration known"] | None
     gain_slopes: Complex[Array, "z calibration known"] | None
     shape: UnloadedShape | None = None
+    delay_width: Float[Array, ""] = eqx.field(default_factory=lambda: jnp.array(DELAY_WIDTH))
 
     def z_th(self, w: Complex[Array, " harmonic"]) -> Complex[Array, " harmonic"]:
         """Z_th [Ω] at W₀ + w."""
@@ -174,6 +177,7 @@ def around(
         calibrations.spectra if shared else None,
         jnp.stack(gains) if shared else None,
         known,
+        delay_width=calibrations.delay_width,
     )
 
 

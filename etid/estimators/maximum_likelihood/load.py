@@ -17,7 +17,7 @@ import optimistix as optx
 from jaxtyping import Array, Bool, Complex, Float, Inexact
 
 from etid.circuits.circuit import AbstractCircuit
-from etid.estimators.estimate import DELAY_WIDTH, MAX_STEPS, SOLVER, Estimate
+from etid.estimators.estimate import MAX_STEPS, SOLVER, Estimate
 from etid.estimators.maximum_likelihood.given_driver import GivenDriver, UnloadedSlopes, combined
 from etid.estimators.maximum_likelihood.terms import (
     apart,
@@ -141,7 +141,7 @@ class Load(eqx.Module):
     def widths(self, q: Float[Array, " q"]) -> Float[Array, " q"]:
         """Prior standard deviations of the parameters."""
         free = jnp.full(self.owned - 1, jnp.inf)
-        own = LoadUnknowns(free, jnp.asarray(DELAY_WIDTH)).vector()
+        own = LoadUnknowns(free, self.driver.delay_width).vector()
         return jnp.concatenate([own, jnp.ones(q.size - self.owned)])
 
     def slopes(self, q: Float[Array, " q"]) -> _Slopes:
@@ -395,7 +395,7 @@ def fit_circuit(
     )
     private = jnp.tile(private, 2)
     by_own, by_z = load.split(elements)
-    of_delay = jnp.outer(by_own.delay_samples, by_own.delay_samples) / DELAY_WIDTH**2
+    of_delay = jnp.outer(by_own.delay_samples, by_own.delay_samples) / driver.delay_width**2
     of_driver = by_z @ driver.cov @ by_z.T
     shared = of_driver + (by_term * ((1 - private) * noise)[None, :]) @ by_term.T
     # For an element without any effect the matrix product contains only rounding errors.
