@@ -13,6 +13,7 @@ NAMES = (
     "coverage",
     "driver_order",
     "delays",
+    "selection",
     "design",
     "timing",
     "speed",

@@ -1,0 +1,155 @@
+"""From choices to rates: right and spurious circuits by three criteria, and coverage.
+
+A circuit is *decisively* supported at an SNR if 2 log evidence of the true circuit exceeds that of
+every simpler candidate by `DECISIVE` in the mean over the drivers. Richer candidates cannot enter
+this: they contain the truth, and lose ln n, about 7, for each spurious element whatever the SNR.
+
+The criteria are compared on the same fits, all candidates being fitted, with the rest of the rule
+unchanged (`etid.selection.evidence`). AICc is −2 log L + 2 p + 2 p (p + 1) / (n − p − 1). The
+evidence of Laplace is −2 log ∫ L π with normal priors of the logarithms of the elements, the
+typical value within a factor of 10, and α uniform from 0 to 1.
+"""
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from benchmarks.coverage import NORMAL_95
+from benchmarks.failure_counts import Rate, rate
+from benchmarks.selection_draws import TRUTHS, Drawn, errors
+from etid.results.fits import Fit
+from etid.selection.evidence import MENTION, bic, elements, rank
+from etid.selection.search import CANDIDATES
+
+DECISIVE = 10.0
+DECISIVE_SNR = 30.0  # [dB] at least
+QUANTITIES = ("R_s", "Z(0)", "corner")
+PRIOR = math.log(10.0)  # standard deviation of the logarithm of an element
+
+Criterion = Callable[[Mapping[int, Fit]], dict[int, float]]
+
+
+def _noise(fits: Mapping[int, Fit]) -> float:
+    """Variance of the residuals of the best candidate, 1 at least, as `bic` has it."""
+    supports = [fit.support for fit in fits.values() if fit.support is not None]
+    return max(1.0, np.nanmin([float(one.deviance) / float(one.terms) for one in supports]))
+
+
+def _penalised(penalty: Callable[[Fit, int], float]) -> Criterion:
+    def criterion(fits: Mapping[int, Fit]) -> dict[int, float]:
+        noise, found = _noise(fits), {}
+        for number, fit in fits.items():
+            assert fit.support is not None
+            value = float(fit.support.deviance) / noise + penalty(fit, number)
+            found[number] = value if math.isfinite(value) else math.inf
+        return found
+
+    return criterion
+
+
+def _aicc(fit: Fit, _: int) -> float:
+    assert fit.support is not None
+    p, n = elements(fit), float(fit.support.terms)
+    return 2 * p + 2 * p * (p + 1) / (n - p - 1)
+
+
+def _laplace(fit: Fit, number: int) -> float:
+    """−2 log of prior and of the Gaussian integral at the minimum."""
+    values, typical = (
+        np.array([float(np.asarray(getattr(one, name))) for name in one.names()])
+        for one in (fit.circuit, CANDIDATES[number])
+    )
+    uniform = np.array([unit == "1" for unit in fit.circuit.units().values()])
+    if not (values > 0).all():
+        return math.inf
+    sign, volume = np.linalg.slogdet(np.asarray(fit.cov) / np.outer(values, values))
+    if not sign > 0:
+        return math.inf
+    q = np.log(values / typical) / PRIOR
+    normal = -math.log(PRIOR * math.sqrt(2 * math.pi)) - 0.5 * q**2
+    prior = np.where(uniform, np.log(values), normal)  # dα = α d ln α
+    return -values.size * math.log(2 * math.pi) - volume - 2 * float(prior.sum())
+
+
+CRITERIA: Mapping[str, Criterion] = {
+    "BIC": bic,
+    "AICc": _penalised(_aicc),
+    "Laplace": _penalised(_laplace),
+}
+
+
+def choose(fits: Mapping[int, Fit], criterion: Criterion) -> int:
+    """Number of the candidate that `etid.selection.evidence.best` would choose by a criterion."""
+    values = criterion(fits)
+    ranks = {number: rank(fit) for number, fit in fits.items()}
+    good = [number for number in fits if ranks[number] == min(ranks.values())]
+    least = min(values[number] for number in good)
+    near = [number for number in good if values[number] <= least + MENTION]
+    return min(near, key=lambda number: (elements(fits[number]), values[number]))
+
+
+def gained(drawn: Drawn) -> float:
+    """2 log evidence of the true circuit minus the largest one of a simpler circuit."""
+    truth, evidence = TRUTHS[drawn.truth], bic(drawn.fits)
+    size = {number: len(one.names()) for number, one in enumerate(CANDIDATES)}
+    [true] = [number for number, one in enumerate(CANDIDATES) if type(one) is type(truth)]
+    simpler = [evidence[number] for number in size if size[number] < size[true]]
+    return min(simpler, default=math.inf) - evidence[true]
+
+
+def cell(drawn: Sequence[Drawn]) -> dict[str, Any]:
+    """One row of the table.
+
+    Args:
+        drawn: Recordings of one truth at one SNR.
+    """
+    first = drawn[0]
+    truth = type(TRUTHS[first.truth])
+    expected = float(np.mean([gained(one) for one in drawn]))
+    decisive = first.snr_db >= DECISIVE_SNR and expected >= DECISIVE
+    row: dict[str, Any] = {"truth": first.truth, "snr_db": first.snr_db, "drawn": len(drawn)}
+    row |= {"expected_evidence": round(expected, 1), "decisive": decisive}
+    for one in CANDIDATES:
+        row[f"chose_{type(one).__name__}"] = sum(d.chosen is type(one) for d in drawn)
+    row["richer"] = sum(is_richer(one) for one in drawn)
+    row["fits"] = float(np.mean([len(one.selection.fits) for one in drawn]))
+    for name, criterion in CRITERIA.items():
+        found = [type(CANDIDATES[choose(one.fits, criterion)]) for one in drawn]
+        row[f"{name}_right"] = sum(one is truth for one in found)
+        row[f"{name}_richer"] = sum(len(one.names()) > len(truth.names()) for one in found)
+    for name in QUANTITIES:
+        inside, drivers = covered(drawn, name)
+        row[f"{name}_intervals"] = len(inside)
+        row[f"{name}_covered"] = rate(inside, drivers).rate
+    return row
+
+
+def is_right(drawn: Drawn) -> bool:
+    """Whether the true circuit was chosen."""
+    return drawn.chosen is type(TRUTHS[drawn.truth])
+
+
+def is_richer(drawn: Drawn) -> bool:
+    """Whether a circuit with more elements than the truth was chosen."""
+    return len(drawn.chosen.names()) > len(TRUTHS[drawn.truth].names())
+
+
+def covered(drawn: Sequence[Drawn], *names: str) -> tuple[list[bool], list[int]]:
+    """For each successful choice, whether the 95 % interval holds the truth; and its driver."""
+    inside, drivers = [], []
+    for one in drawn:
+        if one.selection.fit.verdict != "successful":
+            continue
+        found = errors(one)
+        for name in names:
+            if name in found:
+                inside.append(abs(found[name]) < NORMAL_95)
+                drivers.append(one.driver)
+    return inside, drivers
+
+
+def of_all(events: Sequence[bool], drawn: Sequence[Drawn]) -> Rate:
+    """Rate of events with its interval; recordings behind one driver are not independent."""
+    return rate(events, [one.driver for one in drawn])

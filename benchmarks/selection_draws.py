@@ -1,0 +1,162 @@
+"""Recordings of known circuits, what etid chooses for them, and the fits of all candidates."""
+
+import dataclasses
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import jax
+import numpy as np
+from jaxtyping import Float
+
+import etid
+from benchmarks.ladder import LOADS
+from benchmarks.mappings import make_room
+from benchmarks.perturbed_study import DELAY, PARTS, drawn_driver
+from etid.circuits.circuit import (
+    AbstractCircuit,
+    ParallelRC,
+    Resistor,
+    SkinCole,
+    SkinLayers,
+    SkinRC,
+)
+from etid.results.fits import Fit
+from etid.selection.search import CANDIDATES
+from etid.selection.selection import Selection
+from etid.simulation.published import REFERENCE
+from etid.simulation.scenes import Scene, Trial
+from etid.simulation.transformer import ResistorLoad, TransformerDriver
+
+SNR_DB = (20, 30, 40, 50, 60, 80)
+RESISTORS = {"dry": 216.6e3, "damp": 21.62e3}  # [ohm], of the paper's Table I
+
+
+def _layers(skin: SkinRC, share: float, slower: float) -> SkinLayers:
+    """R_p in two layers; the second has this share, and is slower by this factor."""
+    r_p, tau = float(skin.r_p), float(skin.r_p * skin.c_p)
+    r_1, r_2 = (1 - share) * r_p, share * r_p
+    return SkinLayers(skin.r_s, r_1, tau / r_1, r_2, slower * tau / r_2)
+
+
+def _truths() -> dict[str, AbstractCircuit]:
+    found: dict[str, AbstractCircuit] = {}
+    for name, load in LOADS.items():
+        skin = SkinRC(load.r_s, load.r_p, load.c_p)
+        found[f"R, {name}"] = Resistor(RESISTORS[name])
+        found[f"R‖C, {name}"] = ParallelRC(skin.r_p, skin.c_p)
+        found[f"one RC, {name}"] = skin
+        for alpha in (0.96, 0.9, 0.8):
+            tau = skin.r_p * skin.c_p
+            found[f"Cole {alpha}, {name}"] = SkinCole(skin.r_s, skin.r_p, tau, alpha)
+        for share, slower in ((0.5, 4.5), (0.3, 10.0)):
+            found[f"layers {share}, {slower:g}, {name}"] = _layers(skin, share, slower)
+    order = [one.__name__ for one in (Resistor, ParallelRC, SkinRC, SkinCole, SkinLayers)]
+    return dict(sorted(found.items(), key=lambda item: order.index(type(item[1]).__name__)))
+
+
+with jax.enable_x64(True):  # of a worker process
+    TRUTHS: Mapping[str, AbstractCircuit] = _truths()
+
+
+@dataclasses.dataclass(frozen=True)
+class Drawn:
+    """One recording.
+
+    Attributes:
+        truth: Which of `TRUTHS`.
+        snr_db: Of every record [dB].
+        driver: Number of the driver.
+        selection: What etid chose.
+        fits: Fits of every candidate, by number.
+    """
+
+    truth: str
+    snr_db: float
+    driver: int
+    selection: Selection
+    fits: Mapping[int, Fit]
+
+    @property
+    def chosen(self) -> type[AbstractCircuit]:
+        """The chosen circuit."""
+        return type(self.selection.fit.circuit)
+
+
+def scene(snr_db: float, driver: int) -> Scene:
+    """A calibration and one recording of each truth behind a driver of its own."""
+    return Scene(
+        tuple(Trial(name, load) for name, load in TRUTHS.items()),
+        (Trial("calibration", ResistorLoad(REFERENCE)),),
+        drawn_driver(driver, PARTS, TransformerDriver()),
+        snr_db=snr_db,
+        trigger_jitter_rms=DELAY,
+    )
+
+
+def draws(snr_db: float, number: int) -> list[Drawn]:
+    """One recording of each truth; none if the driver is not identified.
+
+    Args:
+        snr_db: Of every record [dB].
+        number: Of the driver, and the seed of the records.
+    """
+    with jax.enable_x64(True):  # of a worker process
+        study = scene(snr_db, number).simulate(number)
+        driver = etid.identify_driver(study["calibration"], throw=False)
+        if driver.verdict != "successful":
+            return []
+        found = []
+        for name in TRUTHS:
+            selection = etid.select_circuit(study[name], driver, throw=False)
+            fits = dict(selection.fits)
+            for candidate, circuit in enumerate(CANDIDATES):
+                if candidate not in fits:
+                    fits[candidate] = etid.identify_skin(
+                        study[name], driver, circuit=circuit, throw=False
+                    )
+            found.append(Drawn(name, snr_db, number, selection, fits))
+        make_room()
+        return found
+
+
+class Quantity(NamedTuple):
+    """A number that circuits have in common, and its slope with respect to their elements."""
+
+    value: float
+    slope: Float[np.ndarray, " element"]
+
+
+def quantities(circuit: AbstractCircuit) -> dict[str, Quantity]:
+    """R_s and Z(0) [ohm], and the logarithm of the corner frequency, where a circuit has them."""
+    names = circuit.names()
+    values = np.array([float(np.asarray(getattr(circuit, name))) for name in names])
+
+    def picked(*wanted: str) -> np.ndarray:
+        return np.array([float(name in wanted) for name in names])
+
+    units = circuit.units()
+    resistances = picked(*(name for name in names if units[name] == "ohm"))
+    found = {"Z(0)": Quantity(float(resistances @ values), resistances)}
+    if "r_s" in names:
+        found["R_s"] = Quantity(float(picked("r_s") @ values), picked("r_s"))
+    for elements in (("r_p", "c_p"), ("tau",)):
+        if {*elements} <= {*names}:
+            which = picked(*elements)
+            corner = -float(which @ np.log(values)) - np.log(2 * np.pi)
+            found["corner"] = Quantity(corner, -which / values)
+    return found
+
+
+def errors(drawn: Drawn) -> dict[str, float]:
+    """Errors of what the chosen circuit and the truth have in common, in standard errors.
+
+    The standard errors are those of the chosen fit, by the delta method; for the corner frequency
+    on a logarithmic scale.
+    """
+    fit, true = drawn.selection.fit, quantities(TRUTHS[drawn.truth])
+    cov = np.asarray(fit.cov)
+    return {
+        name: (found.value - true[name].value) / float(np.sqrt(found.slope @ cov @ found.slope))
+        for name, found in quantities(fit.circuit).items()
+        if name in true
+    }

@@ -1,0 +1,135 @@
+"""The failure map with `circuit="auto"`: what is silently wrong, and what is right.
+
+Cells, drivers and trials are those of `benchmarks.failure_map`, and so is what *wrong* and *silent*
+mean. The chosen circuit is judged by the limits of its impedance: R_s = Z(∞), R_p = Z(0) − R_s, and
+1/C_p = lim |ω (Z − R_s)| at high ω. A circuit without R_s says that R_s is 0, and a resistor that
+R_p is 0. An answer is *right* if it is successful and no element is wrong.
+"""
+
+import dataclasses
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+import jax
+import numpy as np
+from jaxtyping import Float
+
+import etid
+from benchmarks.failure_axes import Cell, cells
+from benchmarks.failure_counts import rate
+from benchmarks.failure_draws import ELEMENTS, Answer, Draw, bounds, elements, seeds
+from benchmarks.mappings import make_room
+from etid.circuits.circuit import AbstractCircuit, SkinRC
+from etid.results.fits import Fit
+from etid.simulation.transformer import SkinLoad
+
+AUTO = "auto"
+OTHER_SKIN = "SNR and skin that is not one RC"
+RIGHT_SNR = ("40 dB", "60 dB", "80 dB")
+
+
+def chosen_cells() -> list[Cell]:
+    """Cells of the map in which the circuit is not given."""
+    return [cell for cell in cells() if cell.circuit is None]
+
+
+def limits(circuit: AbstractCircuit) -> tuple[np.ndarray, np.ndarray]:
+    """R_s, R_p and C_p of a circuit, and their slopes (limit, element); NaN for a missing C_p."""
+    names = circuit.names()
+    values = dict(zip(names, np.asarray(circuit.values(), float), strict=True))
+    slopes = np.zeros((3, len(names)))
+    found = np.array([0.0, 0.0, np.nan])
+
+    def add(limit: int, name: str, slope: float = 1.0) -> None:
+        slopes[limit, names.index(name)] = slope
+
+    if "r_s" in values or "r" in values:
+        series = "r_s" if "r_s" in values else "r"
+        found[0] = values[series]
+        add(0, series)
+    parallel = [name for name in ("r_p", "r_1", "r_2") if name in values]
+    found[1] = sum(values[name] for name in parallel)
+    for name in parallel:
+        add(1, name)
+    capacitors = [name for name in names if name.startswith("c_")]
+    if capacitors:
+        found[2] = 1 / sum(1 / values[name] for name in capacitors)
+        for name in capacitors:
+            add(2, name, float((found[2] / values[name]) ** 2))
+    return found, slopes
+
+
+def answer(cell: Cell, seed: int, path: str, fit: Fit, bound: np.ndarray) -> Answer:
+    """What a chosen circuit says of one trial."""
+    load = next(trial.load for trial in cell.scene.trials if trial.path == path)
+    truth = np.array(dataclasses.astuple(elements(load)))
+    found, slopes = limits(fit.circuit)
+    error = np.sqrt(np.diagonal(slopes @ np.asarray(fit.cov) @ slopes.T))
+    exact = isinstance(load, SkinLoad) and isinstance(fit.circuit, SkinRC)
+    off = found / truth - 1
+    refused = not np.isfinite(np.asarray(fit.circuit.values())).all()
+    off = np.full(3, np.nan) if refused else off
+    return Answer(AUTO, seed, path, fit.verdict, off, error / truth, bound, exact=exact)
+
+
+def _refusal(seed: int, path: str, name: str, bound: Float[np.ndarray, " element"]) -> Answer:
+    nothing = np.full(len(ELEMENTS), np.nan)
+    return Answer(AUTO, seed, path, name, nothing, nothing, bound)
+
+
+def answers(cell: Cell, drivers: int, trials: int) -> list[Answer]:
+    """All answers in a cell.
+
+    Args:
+        cell: Of the map.
+        drivers: Number of calibrations.
+        trials: Number of trials behind each.
+    """
+    with jax.enable_x64(True):  # of a worker process
+        bound = bounds(cell.scene)
+        found = []
+        for seed in seeds(cell, drivers):
+            draw = Draw(cell, seed)
+            driver = draw.driver(None)
+            for record in draw.trials[:trials]:
+                of = seed, record.path
+                if driver is None:
+                    found.append(_refusal(*of, "driver_failed", bound[record.path]))
+                    continue
+                try:
+                    fit = etid.identify_skin(record, driver, circuit="auto", throw=False)
+                except ValueError:  # no likelihood can be computed: the record is one period
+                    found.append(_refusal(*of, "not_periodic", bound[record.path]))
+                    continue
+                found.append(answer(cell, *of, fit, bound[record.path]))
+        make_room()
+        return found
+
+
+def is_right(one: Answer) -> bool:
+    """Whether an answer is successful and no element is wrong."""
+    return one.successful and not one.wrong
+
+
+def row(cell: Cell, found: Sequence[Answer]) -> dict[str, Any]:
+    """One row of the table."""
+    asked = [one for one in found if one.target]
+    drivers = len({one.seed for one in found})
+    place = {"map": cell.chart, "row": cell.row, "column": cell.column, "drivers": drivers}
+    return place | {
+        "trials": len(found),
+        "right": rate([is_right(a) for a in found], [a.seed for a in found]).rate,
+        "successful": sum(one.successful for one in found),
+        "silent": sum(one.silent for one in found),
+        "determined": len(asked),
+        "missed": sum(one.missed for one in asked),
+    }
+
+
+def right_from_40_db(
+    every: Sequence[Cell], found: Sequence[Sequence[Answer]]
+) -> Iterator[tuple[bool, int]]:
+    """Whether each answer for skin that is not one RC is right, from 40 dB on; and its seed."""
+    for cell, answered in zip(every, found, strict=True):
+        if cell.chart == OTHER_SKIN and cell.row in RIGHT_SNR:
+            yield from ((is_right(one), one.seed) for one in answered)

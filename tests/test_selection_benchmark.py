@@ -1,0 +1,128 @@
+"""The benchmark of the choice of circuits: what it counts, on made-up fits."""
+
+import csv
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import etid
+from benchmarks import selection, selection_chart, selection_map
+from benchmarks.selection_counts import CRITERIA, cell, choose, covered, gained
+from benchmarks.selection_draws import TRUTHS, Drawn, quantities
+from etid.results.fits import CHANGES, Fit, Support
+from etid.results.verdicts import verdict
+from etid.selection.evidence import best, bic
+from etid.selection.search import CANDIDATES
+from etid.selection.selection import Selection
+
+TERMS = 1000.0
+SKIN, COLE = 0, 3  # numbers of candidates
+TRUTH = "one RC, dry"
+KINDS = [type(one) for one in CANDIDATES]
+
+
+def made(circuit, deviance, error=0.01):
+    size = len(circuit.names())
+    return Fit(
+        circuit=circuit,
+        cov=np.diag((error * np.asarray(circuit.values())) ** 2),
+        shared_cov=np.zeros((size, size)),
+        rrse=np.asarray(0.01),
+        chi2=np.asarray(deviance / TERMS),
+        result=verdict("successful"),
+        steps=np.asarray(3),
+        method="maximum_likelihood",
+        support=Support(np.asarray(deviance), np.asarray(TERMS), np.zeros(CHANGES)),
+    )
+
+
+def drawn(deviances, driver=0, off=1.0, truth=TRUTH):
+    """A recording of a truth; the fit of the true circuit has elements off by a factor."""
+    circuits = dict(enumerate(CANDIDATES))
+    number = KINDS.index(type(TRUTHS[truth]))
+    true = TRUTHS[truth]
+    circuits[number] = true.with_log_values(true.log_values() + np.log(off))
+    fits = {i: made(circuits[i], of) for i, of in enumerate(deviances)}
+    return Drawn(truth, 40.0, driver, Selection.of(fits, best(fits), CANDIDATES), fits)
+
+
+def test_two_circuits_have_the_same_resistance_and_corner():
+    skin, cole = quantities(TRUTHS[TRUTH]), quantities(TRUTHS["Cole 0.9, dry"])
+    for name in ("R_s", "Z(0)", "corner"):
+        assert skin[name].value == pytest.approx(cole[name].value)
+    layers = quantities(TRUTHS["layers 0.3, 10, dry"])
+    assert layers["Z(0)"].value == pytest.approx(skin["Z(0)"].value)
+    assert "corner" not in layers
+    assert "R_s" not in quantities(TRUTHS["R‖C, dry"])
+
+
+@pytest.mark.parametrize("name", TRUTHS)
+def test_slopes_of_quantities_and_limits(name):
+    circuit = TRUTHS[name]
+    values, step = np.asarray(circuit.values()), 1e-6
+
+    def moved(i, by):
+        factors = np.where(np.arange(values.size) == i, 1 + by, 1.0)
+        return circuit.with_log_values(jnp.log(jnp.asarray(values * factors)))
+
+    for i in range(values.size):
+        up, down = moved(i, step), moved(i, -step)
+        for of, found in quantities(circuit).items():
+            slope = (quantities(up)[of].value - quantities(down)[of].value) / (2 * step * values[i])
+            np.testing.assert_allclose(found.slope[i], slope, rtol=1e-5, atol=1e-9 * abs(slope))
+        slopes = (selection_map.limits(up)[0] - selection_map.limits(down)[0]) / (
+            2 * step * values[i]
+        )
+        known = np.isfinite(slopes)
+        found = selection_map.limits(circuit)[1][:, i]
+        np.testing.assert_allclose(found[known], slopes[known], rtol=1e-5, atol=1e-9)
+
+
+def test_bic_of_the_benchmark_chooses_as_etid_does():
+    for gain in (0.0, 8.0, 10.0, 40.0):
+        fits = drawn([1000.0, 3000.0, 5000.0, 1000.0 - gain, 1000.0 - gain]).fits
+        assert choose(fits, CRITERIA["BIC"]) == best(fits)
+    # AICc asks for less: a gain of 6 pays for one element.
+    fits = drawn([1000.0, 3000.0, 5000.0, 994.0, 994.0]).fits
+    assert [choose(fits, CRITERIA[name]) for name in ("BIC", "AICc")] == [SKIN, COLE]
+
+
+def test_evidence_counts_against_simpler_circuits_only():
+    one = drawn([1000.0, 1030.0, 5000.0, 999.0, 999.0])
+    assert gained(one) == pytest.approx(30.0 - np.log(TERMS))
+    assert gained(one) == pytest.approx(bic(one.fits)[1] - bic(one.fits)[0])
+
+
+def test_a_row_counts_choices_and_intervals(tmp_path):
+    unlikely = [1000.0, 3000.0, 5000.0, 1010.0, 1010.0]
+    good, wide = drawn(unlikely, driver=0, off=1.001), drawn(unlikely, driver=1, off=1.05)
+    rich = drawn([1000.0, 3000.0, 5000.0, 900.0, 900.0], driver=2)
+    row = cell([good, wide, rich])
+    assert (row["chose_SkinRC"], row["chose_SkinCole"], row["richer"]) == (2, 1, 1)
+    assert row["decisive"]
+    inside, drivers = covered([good, wide], "R_s")
+    assert (inside, drivers) == ([True, False], [0, 1])
+    lines = selection.chosen([row], [good, wide, rich])
+    assert lines[0].found == pytest.approx(2 / 3)
+    assert not lines[0].met
+    selection_chart.draw([row], TRUTHS, tmp_path / "chart.svg", "not installed")
+    assert "one RC, dry" in (tmp_path / "chart.svg").read_text()
+    selection.write_csv(tmp_path / "table.csv", [row])
+    with (tmp_path / "table.csv").open() as file:
+        assert next(csv.DictReader(file))["truth"] == TRUTH
+
+
+def test_a_circuit_without_a_series_resistor_claims_that_it_is_zero():
+    [cell_of] = [
+        one
+        for one in selection_map.chosen_cells()
+        if (one.chart, one.row, one.column) == (selection_map.OTHER_SKIN, "60 dB", "Cole, 0.9")
+    ]
+    path, bound = cell_of.scene.trials[0].path, np.array([0.01, 0.01, np.nan])
+    fit = made(etid.ParallelRC(186e3, 0.12e-9), 1000.0)
+    said = selection_map.answer(cell_of, 0, path, fit, bound)
+    assert said.error[0] == -1
+    assert said.missed
+    cole = made(etid.SkinCole(33.4e3, 186e3, 22e-6, 0.9), 1000.0)
+    assert selection_map.is_right(selection_map.answer(cell_of, 0, path, cole, bound))
