@@ -263,8 +263,6 @@ def cells() -> Iterator[Cell]:
             yield Cell("SNR and trigger delay, rms", row, name, late)
         for name, loads in NOT_ONE_RC.items():
             yield Cell("SNR and skin that is not one RC", row, name, scene(loads, snr_db=db))
-        skin = scene(snr_db=db)
-        yield Cell("SNR and circuit fitted to skin", row, "resistor", skin, circuit=Resistor())
     for true in sorted(LOST):
         behind = scene(driver=transformer(true))
         for order in ORDERS:
@@ -280,3 +278,7 @@ def cells() -> Iterator[Cell]:
         for strength in STRENGTHS:
             change = Coloured(band, strength * sigma)
             yield Cell("coloured noise / white noise", name, f"{strength:g}", middle, change=change)
+    for snr in SNR_DB:
+        skin = scene(snr_db=float(snr))
+        chart, row = "SNR and circuit fitted to skin", f"{snr} dB"
+        yield Cell(chart, row, "resistor", skin, circuit=Resistor())

@@ -2,6 +2,7 @@
 
     python -m benchmarks failure_map            # all of it, in two processes
     python -m benchmarks failure_map --quick    # few cells, few draws, and what must hold in them
+    python -m benchmarks failure_map --only "SNR and periods"   # one map; others are kept
 
 For each method and cell: the rate of wrong answers, of those that are wrong silently, of unstable
 poles, and of iterations that did not converge, with 95 % intervals (`benchmarks.failure_draws`
@@ -21,6 +22,7 @@ what takes longer because of a higher sample rate or more periods.
 import argparse
 import collections
 import concurrent.futures
+import csv
 import itertools
 import pathlib
 from collections.abc import Iterator, Mapping, Sequence
@@ -37,6 +39,7 @@ from benchmarks.provenance import RESULTS, write_csv
 from etid.identify import file as streaming
 
 RATES, SILENT = "failures.csv", "silent_failures.csv"
+MAPS = list(dict.fromkeys(cell.chart for cell in cells()))
 TARGET = 1e-3  # silent failures of the default method
 ALL = 2 * MOST  # trials of a driver
 DRIVERS = 3  # an hour on two cores
@@ -152,34 +155,68 @@ def ranked(answers: Sequence[Answer]) -> bool:
     return holds
 
 
+def earlier(path: pathlib.Path, new: set[str]) -> list[dict[str, Any]]:
+    """Rows of a table of an earlier run, of maps that are not drawn anew."""
+    if not path.exists():
+        return []
+    with path.open(newline="") as file:
+        return [row for row in csv.DictReader(file) if row["map"] not in new]
+
+
 def write(
-    chosen: Sequence[Cell], found: Mapping[int, list[Answer]], folder: pathlib.Path
+    chosen: Sequence[Cell],
+    found: Mapping[int, list[Answer]],
+    folder: pathlib.Path,
+    kept: Mapping[str, Sequence[dict[str, Any]]],
 ) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
-    """Write and return the tables of the cells that are done: rates, and silent failures."""
+    """Write the tables: rates, and silent failures.
+
+    Args:
+        chosen: The cells of this run.
+        found: Answers in the cells that are done.
+        folder: Of the tables.
+        kept: Rows of earlier runs, by table.
+
+    Returns:
+        The rows of the cells that are done.
+    """
     done = sorted(found)
     of = [chosen[i] for i in done], [found[i] for i in done]
     rows, failures = table(*of), silent(*of)
-    write_csv(folder / RATES, rows)
-    (folder / SILENT).unlink(missing_ok=True)  # that of an earlier run
-    if failures:
-        write_csv(folder / SILENT, failures)
+    for name, new in ((RATES, rows), (SILENT, failures)):
+        every = sorted([*kept[name], *new], key=lambda row: MAPS.index(row["map"]))
+        (folder / name).unlink(missing_ok=True)  # that of an earlier run
+        if every:
+            write_csv(folder / name, every)
     return rows, failures
 
 
-def run(quick: bool, folder: pathlib.Path, workers: int, drivers: int = DRIVERS) -> bool:
+def run(
+    quick: bool,
+    folder: pathlib.Path,
+    workers: int,
+    drivers: int = DRIVERS,
+    only: Sequence[str] = (),
+) -> bool:
     """Draw, count, print, and write tables and figures into `folder`."""
-    chosen = [c for c in cells() if not quick or (c.chart, c.row, c.column) in FEW]
+    chosen = [
+        cell
+        for cell in cells()
+        if (not quick or (cell.chart, cell.row, cell.column) in FEW)
+        and (not only or cell.chart in only)
+    ]
+    kept = {name: earlier(folder / name, set(only)) if only else [] for name in (RATES, SILENT)}
     found: dict[int, list[Answer]] = {}
     rows, failures = [], []
     with tqdm(total=len(chosen), unit="cell") as bar:
         for done in draws(chosen, QUICK if quick else usual(drivers), workers):
             found |= done
-            rows, failures = write(chosen, found, folder)  # nothing that is done is lost
+            rows, failures = write(chosen, found, folder, kept)  # nothing that is done is lost
             bar.update(len(done))
     every = [answer for i in sorted(found) for answer in found[i]]
-    for number, name in enumerate(dict.fromkeys(row["map"] for row in rows), 1):
+    for name in dict.fromkeys(row["map"] for row in rows):
         of = [row for row in rows if row["map"] == name]
-        failure_chart.draw(of, folder / f"failures_{number}.svg")
+        failure_chart.draw(of, folder / f"failures_{MAPS.index(name) + 1}.svg")
     print("\n".join(summary(every)))
     for row in failures:
         if row["method"] == DEFAULT:
@@ -192,6 +229,7 @@ def run(quick: bool, folder: pathlib.Path, workers: int, drivers: int = DRIVERS)
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Size of the run."""
     parser.add_argument("--quick", action="store_true", help="few cells and draws, in a minute")
+    parser.add_argument("--only", nargs="+", choices=MAPS, default=(), help="these maps")
     parser.add_argument(
         "--workers", type=int, default=2, help="processes, each on a core of its own"
     )
@@ -203,4 +241,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def main(arguments: argparse.Namespace) -> bool:
     """Run the command."""
-    return run(arguments.quick, arguments.folder, arguments.workers, arguments.drivers)
+    return run(
+        arguments.quick, arguments.folder, arguments.workers, arguments.drivers, arguments.only
+    )

@@ -44,10 +44,10 @@ def _processor() -> str:
 
 
 def write_csv(path: pathlib.Path, rows: Sequence[Mapping[str, Any]]) -> None:
-    """Write rows, each with `provenance`."""
+    """Write rows, each with `provenance` unless it has one of an earlier run."""
     path.parent.mkdir(parents=True, exist_ok=True)
     source = provenance()
     with path.open("w", newline="") as file:
-        writer = csv.DictWriter(file, fieldnames=[*rows[0], *source])
+        writer = csv.DictWriter(file, fieldnames=list(dict.fromkeys([*rows[0], *source])))
         writer.writeheader()
-        writer.writerows({**row, **source} for row in rows)
+        writer.writerows({**source, **row} for row in rows)

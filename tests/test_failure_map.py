@@ -197,6 +197,33 @@ def test_a_resistor_fitted_to_skin_is_refused_at_20_db():
     assert not any(of.exact for of in found)
 
 
+def test_one_map_anew_keeps_the_others(tmp_path):
+    """With the commit of the run that drew them."""
+    old, new = cells_of("SNR and periods"), cells_of("SNR and sample rate")
+    nothing = {failure_map.RATES: [], failure_map.SILENT: []}
+    far = answer((0.06, 0, 0), seed=7)
+    failure_map.write(old[:2], {0: [far], 1: [far]}, tmp_path, nothing)
+    paths = {name: tmp_path / name for name in nothing}
+    for path in paths.values():
+        with path.open(newline="") as file:
+            commit = next(csv.DictReader(file))["commit"]
+        path.write_text(path.read_text().replace(commit, "earlier"))
+    kept = {
+        name: failure_map.earlier(path, {"SNR and sample rate"}) for name, path in paths.items()
+    }
+    failure_map.write(new[:1], {0: [far]}, tmp_path, kept)
+    for path in paths.values():
+        with path.open(newline="") as file:
+            rows = list(csv.DictReader(file))
+        assert [row["map"] for row in rows] == [new[0].chart, *[old[0].chart] * 2]
+        assert rows[0]["commit"] != "earlier"
+        assert rows[1]["commit"] == rows[2]["commit"] == "earlier"
+
+
+def cells_of(chart):
+    return [cell for cell in cells() if cell.chart == chart]
+
+
 @pytest.mark.slow
 def test_a_quick_map_is_drawn_and_met(tmp_path, monkeypatch):
     few = dict.fromkeys(
@@ -208,4 +235,4 @@ def test_a_quick_map_is_drawn_and_met(tmp_path, monkeypatch):
         rows = list(csv.DictReader(file))
     assert len(rows) == len(few) * len(failure_map.FEW)
     assert all(row["commit"] for row in rows)
-    assert (tmp_path / "failures_1.svg").read_text().startswith("<?xml")
+    assert (tmp_path / "failures_4.svg").read_text().startswith("<?xml")
