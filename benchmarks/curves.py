@@ -23,7 +23,7 @@ from benchmarks.problem import START, Problem, harmonics, problem, problem_of, t
 from benchmarks.provenance import write_csv
 from benchmarks.speed import pin
 from benchmarks.timing import first_and_warm
-from etid.estimators.maximum_likelihood.load import TOGETHER
+from etid.estimators.maximum_likelihood.load import WELL
 from etid.signals.filtering import lfilter
 from etid.solvers.levenberg_marquardt import normal_equations
 
@@ -58,7 +58,7 @@ def calls(one: Problem) -> dict[str, Callable[[], Any]]:
         return lfilter(b, a.at[1:4].add(q), v)[0]
 
     equations = jax.jit(lambda q, v: normal_equations(three, q, v))
-    harmonic = jax.jit(lambda q, first: TOGETHER.equations(terms, q, one.load(first)))
+    harmonic = jax.jit(lambda q, first: WELL.equations(terms, q, one.load(first)))
     refine = jax.jit(peers.one_fit(one)["ours"])
     return {
         "filter": lambda: forward(b, v),

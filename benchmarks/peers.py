@@ -23,7 +23,7 @@ from benchmarks.problem import SAMPLES, START, ByNumPy, Problem, harmonics, prob
 from benchmarks.timing import first_and_warm
 from etid.estimators.estimate import MAX_STEPS
 from etid.estimators.harmonic_steiglitz_mcbride.iteration import fit_skin
-from etid.estimators.maximum_likelihood.load import TOGETHER
+from etid.estimators.maximum_likelihood.load import WELL
 from etid.estimators.steiglitz_mcbride.iteration import iterate
 from etid.identify.many import each
 from etid.signals.filtering import lfilter
@@ -204,7 +204,7 @@ def one_fit(ten_periods: Problem) -> dict[str, Callable[[Any], Float[Array, " ow
         materialize_jac=True,
     )
     return {
-        "ours": by(TOGETHER),
+        "ours": by(WELL),
         "optimistix": by(optx.LevenbergMarquardt(rtol=1e-8, atol=1e-8)),
         "jaxopt": lambda one: rival.run(start, ten_periods.load(one)).params,
     }
