@@ -19,6 +19,7 @@ import os
 import pathlib
 import pickle
 import sys
+import threading
 import time
 import types
 import zlib
@@ -35,6 +36,7 @@ import numpy as np
 import optimistix as optx
 import scipy
 
+from etid.identify.waiting import announced_later
 from etid.recordings.errors import RecordingError
 from etid.recordings.replacing import replacing
 
@@ -45,6 +47,9 @@ Result = TypeVar("Result")
 KNOWN = {"etid", "builtins", "equinox", "jax", "jaxlib", "lineax", "numpy", "optimistix", "scipy"}
 FOLDER = "etid"  # inside the folder of the compilation cache
 LOADED = time.time()
+# XLA compiles for a processor in two thirds of the time without the emitters of fusions and with
+# fewer passes of LLVM. The programs are as fast.
+QUICKLY = {"xla_cpu_use_fusion_emitters": False, "xla_backend_optimization_level": 1}
 # Settings of JAX that do not change a program.
 UNRELATED = ("jax_compilation_cache", "jax_persistent_cache", "jax_log", "jax_dump", "jax_explain")
 
@@ -62,21 +67,43 @@ def stored_jit(function: Callable[Parameters, Result]) -> Callable[Parameters, R
     - An argument belongs to a class from outside etid, such as your own circuit: its code is not
       in the key.
     """
-    plain = eqx.filter_jit(function)
+    compiling = threading.local()  # whether this thread compiles now
 
-    @eqx.filter_jit
     @functools.wraps(function)
-    def kept(*args: Any, **kwargs: Any) -> Any:  # runs once for each trace
+    def traced(*args: Any, **kwargs: Any) -> Any:  # runs once for each trace
+        compiling.timer = announced_later()
+        return function(*args, **kwargs)
+
+    @functools.wraps(function)
+    def stored(*args: Any, **kwargs: Any) -> Any:  # runs once for each trace
+        compiling.timer = announced_later()
         found = _trace(function, args, kwargs)
         if found is None:
             return function(*args, **kwargs)
         exported, shell = found
         return _filled(shell, exported.call(*_arrays((args, kwargs))))
 
+    inner = eqx.filter_jit(function)  # part of another function, which decides how it is compiled
+
+    @functools.cache
+    def outer(stores: bool) -> Callable[..., Any]:
+        options = QUICKLY if jax.default_backend() == "cpu" else None
+        jit: Any = eqx.filter_jit  # its overloads lack the options of `jax.jit`
+        return jit(stored if stores else traced, compiler_options=options)
+
     @functools.wraps(function)
     def call(*args: Parameters.args, **kwargs: Parameters.kwargs) -> Result:
-        usable = _folder() is not None and _on_device(_arrays((args, kwargs)))
-        return (kept if usable else plain)(*args, **kwargs)
+        arrays = _arrays((args, kwargs))
+        if any(isinstance(array, jax.core.Tracer) for array in arrays):
+            return inner(*args, **kwargs)
+        compiling.timer = None
+        try:
+            # What is constant in someone's trace is computed at once.
+            with jax.ensure_compile_time_eval():
+                return outer(_folder() is not None and _on_device(arrays))(*args, **kwargs)
+        finally:
+            if compiling.timer is not None:
+                compiling.timer.cancel()
 
     return call
 
@@ -101,8 +128,6 @@ def _on_device(arrays: list[Any]) -> bool:
     """Whether all arrays hold numbers and each is on one device of the default kind."""
     platform = jax.default_backend()
     for array in arrays:
-        if isinstance(array, jax.core.Tracer):
-            return False
         if isinstance(array, jax.Array):
             devices = array.sharding.device_set
             if len(devices) > 1 or next(iter(devices)).platform != platform:

@@ -119,8 +119,8 @@ def identify_driver(
         driver = dataclasses.replace(driver, unloaded=unloaded)
     if drift and isinstance(driver, ContinuousDriver):
         driver = dataclasses.replace(driver, drift=np.asarray(drift, float))
-    driver = changes.driver_judged(driver, jnp.asarray(resistances), repeats(seen))
-    size = float(jnp.abs(driver.response(jnp.asarray(1e3))))
+    driver = changes.driver_judged(driver, jax.device_put(np.asarray(resistances)), repeats(seen))
+    size = float(_size(driver, jax.device_put(np.asarray(1e3))))
     if np.isfinite(size) and not plausible[0] <= size <= plausible[1]:
         driver = dataclasses.replace(driver, result=verdict("implausible"))
     if throw and driver.verdict != "successful":
@@ -176,7 +176,7 @@ def _driver(seen: Sequence[Inspected], order: int, estimator: AbstractEstimator)
 
 def _aligned(seen: Sequence[Inspected], order: int, estimator: AbstractEstimator) -> Driver:
     """The driver from calibrations that passed the pre-flight, aligned by their lags."""
-    r_load = jnp.asarray([one.recording.r_load for one in seen])
+    r_load = jax.device_put(np.asarray([one.recording.r_load for one in seen]))
     aligned = [AlignedSamples.of(one) for one in seen]
     if not estimator.lane.periodic:
         size = min(one.size for one in aligned)
@@ -193,9 +193,10 @@ def _aligned(seen: Sequence[Inspected], order: int, estimator: AbstractEstimator
         )
         for one, of in zip(aligned, seen, strict=True)
     ]
-    spectra = [Harmonics.of(one).spectrum for one in seen]
-    size = min(one.x.size for one in spectra)  # counted pulse rates may differ by one harmonic
-    spectra = jax.tree.map(lambda *of: jnp.stack([field[:size] for field in of]), *spectra)
+    lanes = [Harmonics.of(one) for one in seen]
+    size = min(one.size for one in lanes)  # counted pulse rates may differ by one harmonic
+    lanes = [jax.tree.map(lambda of: of[:size] if of.ndim else of, one) for one in lanes]
+    spectra = jax.device_put(stacked(lanes)).spectrum  # `jnp.asarray` would compile for each shape
     records = stacked(whole)
     driver = _identified(records, r_load, order, estimator, spectra)
     # A driver fits hum on a harmonic by a pole at that frequency, and this pole is then missing
@@ -205,6 +206,12 @@ def _aligned(seen: Sequence[Inspected], order: int, estimator: AbstractEstimator
         spectra = dataclasses.replace(spectra, selected=few)
         driver = of_both(driver, _identified(records, r_load, order, estimator, spectra))
     return driver
+
+
+@stored_jit
+def _size(driver: Driver, frequency: Float[Array, ""]) -> Float[Array, ""]:
+    """|Z_th| [Ω] at a frequency [Hz]."""
+    return jnp.abs(driver.response(frequency))
 
 
 @stored_jit
