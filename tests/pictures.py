@@ -17,14 +17,17 @@ import numpy as np
 import etid
 from etid.plotting import figure_of
 from etid.results.driver import Calibration, ContinuousDriver, Driver, SourceImpedance
-from etid.results.fits import Fit, Fits
+from etid.results.fits import CHANGES, Fit, Fits, Support
 from etid.results.verdicts import verdicts_of
-from etid.simulation.scenes import PRESETS
+from etid.selection.search import CANDIDATES
+from etid.simulation.scenes import PRESETS, Trial
 
 BASELINE = pathlib.Path(__file__).parent / "baseline"
 DPI = 60
 SKIN = etid.SkinRC(33.4e3, 186e3, 0.12e-9)
 RELATIVE = np.array([0.02, 0.005, 0.03])  # standard errors of SKIN
+SPREAD = etid.SkinCole(33.4e3, 186e3, 22e-6, 0.85)
+NEAREST = etid.SkinRC(45.7e3, 169e3, 0.117e-9)  # about what a fit of SPREAD gives
 
 
 @functools.cache
@@ -73,6 +76,34 @@ def fit(verdict: str = "successful", circuit: etid.AbstractCircuit = SKIN) -> Fi
     return Fit(circuit, cov, 0 * cov, *of, "maximum_likelihood")
 
 
+@functools.cache
+def spread() -> etid.Recording:
+    """A trial at 40 dB of skin that is not one RC."""
+    scene = PRESETS["paper_dry"](snr_db=40.0)
+    return dataclasses.replace(scene, trials=(Trial("spread", SPREAD),)).simulate(seed=4)["spread"]
+
+
+def selection(**verdicts: str) -> etid.Selection:
+    """Two candidates for that trial; the chosen one is its true circuit."""
+    found = {}
+    for number, circuit, deviance in ((0, NEAREST, 2600.0), (3, SPREAD, 2000.0)):
+        verdict = verdicts.get(type(circuit).__name__, "successful")
+        support = Support(np.array(deviance), np.array(2e3), np.zeros(CHANGES))
+        cov = jnp.diag((circuit.values() * 0.01) ** 2)
+        found[number] = Fit(
+            circuit=circuit,
+            cov=cov,
+            shared_cov=0 * cov,
+            rrse=jnp.array(1e-3),
+            chi2=jnp.array(deviance / 2e3),
+            result=verdicts_of(np.array(verdict)),
+            steps=jnp.array(5),
+            method="maximum_likelihood",
+            support=support,
+        )
+    return etid.Selection.of(found, 3, CANDIDATES)
+
+
 def fits() -> Fits:
     """Two subjects, two conditions, three trials; one of them without success, one far away."""
     rng = np.random.default_rng(1)
@@ -114,6 +145,7 @@ PICTURES: dict[str, Callable[[], tuple]] = {
     "recording": lambda: (dry(),),
     "fit": lambda: (fit(), dry(), driver()),
     "fit_without_success": lambda: (fit("misfit"), dry(), driver()),
+    "selection": lambda: (selection(SkinRC="misfit"), spread(), driver()),
     "calibration": lambda: (driver(), study()["calibration/98k8"]),
     "driver": lambda: (driver(),),
     "impedances": lambda: ({"Z_th": driver("order_too_low"), "skin": fit(), "typical": SKIN},),

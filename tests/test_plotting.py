@@ -10,9 +10,13 @@ from matplotlib.patches import Rectangle
 from matplotlib.testing.compare import compare_images
 
 import etid
+from etid.estimators.lanes import Harmonics
 from etid.plotting import figure_of
+from etid.plotting.bands import bands
+from etid.plotting.candidates import PALE
 from etid.plotting.pulses import residual_std
 from etid.plotting.style import RED, new_figure, save
+from etid.recordings.preflight import Inspected
 from tests import pictures
 
 # Root mean square of the differences of grey values, of 255. The same commands give 0; with another
@@ -101,6 +105,66 @@ def test_what_did_not_succeed_looks_so(recording, driver):
     assert "no success: order_too_low" in magnitude.get_title(loc="left")
 
 
+@pytest.fixture(scope="module")
+def found(driver):
+    """Bands of the skin that is not one RC, for its circuit and the nearest other one."""
+    lane = Harmonics.of(Inspected(pictures.spread()))
+    return [bands(lane, driver, circuit) for circuit in (pictures.SPREAD, pictures.NEAREST)]
+
+
+def test_bands_of_a_recording_deviate_from_its_circuit_by_noise_alone(found):
+    true, nearest = found
+    # 2 of 38 normal numbers exceed 2; the chance of more than 6 is 1 %.
+    assert true.deviation.size > 30
+    assert np.count_nonzero(np.abs(true.deviation) > 2) <= 6
+    assert np.abs(true.deviation).max() < 4
+    assert np.abs(nearest.deviation).max() > 5
+    for measured in found:
+        z = np.asarray(pictures.SPREAD.response(jnp.asarray(measured.frequency)))
+        off = np.log(measured.z / z)
+        sure = measured.stderr < 0.1
+        assert np.count_nonzero(sure) > 10
+        # Z_th and the delay of the nearest circuit are not those of the true one.
+        limit = 4 if measured is true else 12
+        assert (np.abs(off[sure]) < limit * measured.stderr[sure]).all()
+
+
+def test_a_selection_shows_what_is_measured_and_each_candidate(driver, found):
+    selection = pictures.selection(SkinRC="misfit")
+    magnitude, phase, of_size, of_phase = figure_of(selection, pictures.spread(), driver).axes
+    assert (magnitude.get_ylabel(), phase.get_ylabel()) == ("|Z| [kΩ]", "phase [deg]")
+    points = magnitude.lines[0]
+    lines = [line for line in magnitude.lines if not str(line.get_label()).startswith("_")]
+    np.testing.assert_allclose(
+        np.asarray(points.get_ydata()), np.abs(found[0].z[found[0].stderr <= PALE]) / 1e3
+    )
+    kilohertz, size = (np.asarray(of, float) for of in lines[0].get_data())
+    z = np.asarray(pictures.SPREAD.response(jnp.asarray(1e3 * kilohertz)))
+    np.testing.assert_allclose(size, np.abs(z) / 1e3)
+    assert [line.get_label() for line in lines] == [
+        "SkinCole, chosen",
+        "SkinRC, 2 log evidence -592, misfit",
+    ]
+    assert lines[0].get_linewidth() > lines[1].get_linewidth()
+    for part, axis in enumerate((of_size, of_phase)):
+        for line, of in zip(list(axis.lines)[1:], found, strict=True):
+            np.testing.assert_allclose(np.asarray(line.get_ydata()), of.deviation[part])
+    title = magnitude.get_title(loc="left")
+    assert "successful" in title
+    assert "alpha" in title
+
+
+def test_a_selection_without_success_or_elements_says_so(driver):
+    both = {"SkinRC": "misfit", "SkinCole": "misfit"}
+    selection = pictures.selection(**both)
+    magnitude, *_ = figure_of(selection, pictures.spread(), driver).axes
+    assert "no success: misfit" in magnitude.get_title(loc="left")
+    empty = pictures.fit("too_short", pictures.SKIN.with_log_values(jnp.full(3, jnp.nan)))
+    nothing = etid.Selection.of({0: empty}, 0, [pictures.SKIN])
+    magnitude, *_ = figure_of(nothing, pictures.spread(), driver).axes
+    assert [text.get_text() for text in magnitude.texts] == ["no elements"]
+
+
 def test_an_impedance_is_in_kilohms_and_degrees_in_a_band_of_two_standard_errors(driver):
     magnitude, phase = figure_of({"Z_th": driver}).axes
     kilohertz, size = (np.asarray(of, float) for of in magnitude.lines[0].get_data())
@@ -174,6 +238,8 @@ def test_without_axes_it_is_a_figure_of_pyplot_and_figure_of_is_none(recording, 
 def test_what_cannot_be_drawn_is_refused(recording, driver):
     with pytest.raises(TypeError, match=r"plot\(fit, recording, driver\)"):
         figure_of(pictures.fit())
+    with pytest.raises(TypeError, match=r"plot\(selection, recording, driver\)"):
+        figure_of(pictures.selection())
     with pytest.raises(TypeError, match="no r_load"):
         figure_of(driver, recording)
     with pytest.raises(TypeError, match="cannot draw str"):

@@ -1,4 +1,4 @@
-"""Pictures for a notebook or a paper: recordings, fits, impedances, studies, bounds.
+"""Pictures for a notebook or a paper: recordings, fits, circuits, impedances, studies, bounds.
 
 `plot` is for people, `figure_of` for programs that write files. The first picture imports
 matplotlib.
@@ -13,6 +13,7 @@ from etid.circuits.circuit import AbstractCircuit
 from etid.recordings.recording import Recording
 from etid.results.driver import Driver, SourceImpedance
 from etid.results.fits import Fit, Fits
+from etid.selection.selection import Selection
 from etid.simulation.bound import Bound
 
 if TYPE_CHECKING:
@@ -28,7 +29,9 @@ AnyAxes = np.ndarray | Sequence["matplotlib.axes.Axes"] | None
 @overload
 def plot(x: Recording, *, axes: AnyAxes = None) -> np.ndarray: ...
 @overload
-def plot(x: Fit, recording: Recording, driver: Driver, *, axes: AnyAxes = None) -> np.ndarray: ...
+def plot(
+    x: Fit | Selection, recording: Recording, driver: Driver, *, axes: AnyAxes = None
+) -> np.ndarray: ...
 @overload
 def plot(x: Driver, recording: Recording, *, axes: AnyAxes = None) -> np.ndarray: ...
 @overload
@@ -44,27 +47,32 @@ def plot(
     *,
     axes: AnyAxes = None,
 ) -> np.ndarray:
-    """Draw a recording, a fit, a driver, an impedance, fits or bounds.
+    """Draw a recording, a fit, a choice of circuits, a driver, an impedance, fits or bounds.
 
     | call | shows | axes |
     |---|---|---|
     | `plot(recording)` | V_th and V_out [V]: the whole record, and one pulse | 2 |
     | `plot(fit, recording, driver)` | one pulse measured and predicted [V]; residual [mV] | 2 |
+    | `plot(selection, recording, driver)` | impedance measured, and each candidate | 4 |
     | `plot(driver, calibration)` | the same two diagrams for the calibration's resistor | 2 |
     | `plot(driver)`, `plot(circuit)` | magnitude [kΩ] and phase [deg] of an impedance | 2 |
     | `plot({label: driver, fit or circuit})` | several of these in one diagram | 2 |
     | `plot(fits)` | each element by subject, conditions side by side | one per element |
     | `plot(etid.bound(scene))` | smallest relative standard errors [%] of each recording | 1 |
 
-    The band around a residual is ±2σ of the noise of both records, σ² = σ_out² + σ_th² mean |G|²
-    with G = Z_L / (Z_L + Z_th). If only noise is left, 95 % of the residual lies inside. The bands
-    around impedances are two standard errors, from the covariance of the fit or driver. Fits and
-    drivers without success have a red title, and their points are hollow.
+    The band around the residual of a pulse is ±2σ of the noise of both records, σ² = σ_out² +
+    σ_th² mean |G|² with G = Z_L / (Z_L + Z_th). If only noise is left, 95 % of the residual lies
+    inside. The bands around impedances are two standard errors, from the covariance of the fit or
+    driver. Fits and drivers without success have a red title, and their points are hollow.
+
+    The picture of a selection shows magnitude [kΩ] and phase [deg] in bands of frequency with two
+    standard errors; points are pale where the error exceeds 30 %. Below are the deviations of each
+    candidate from these points, in standard errors.
 
     Args:
         x: The object to draw.
-        recording: Recording of the fit, or calibration of the driver.
-        driver: Driver of the fit.
+        recording: Recording of the fit or selection, or calibration of the driver.
+        driver: Driver of the fit or selection.
         axes: Axes to draw on, as many as the table says. Without axes, `plot` makes a figure of
             `matplotlib.pyplot`, which a notebook shows.
 
@@ -98,18 +106,25 @@ def _draw(
 ) -> np.ndarray:
     import matplotlib as mpl
 
-    from etid.plotting import elements, impedances, pulses, style
+    from etid.plotting import candidates, elements, impedances, pulses, style
 
     with mpl.rc_context(style.PAPER):
         match x, recording, driver:
             case Fit(), Recording(), Driver():
                 return pulses.draw_fit(canvas, x, recording, driver)
+            case Selection(), Recording(), Driver():
+                return candidates.draw_selection(canvas, x, recording, driver)
             case Driver(), Recording(), None:
                 return pulses.draw_calibration(canvas, x, recording)
             case Fit(), _, _:
                 raise TypeError(
                     "to draw a fit, pass its recording and driver: plot(fit, recording, driver). "
                     'plot({"skin": fit}) draws its impedance alone'
+                )
+            case Selection(), _, _:
+                raise TypeError(
+                    "to draw a selection, pass its recording and driver: "
+                    "plot(selection, recording, driver)"
                 )
             case Recording(), None, None:
                 return pulses.draw_recording(canvas, x)
@@ -126,9 +141,9 @@ def _draw(
             case dict(), None, None if x and all(isinstance(y, Impedance) for y in x.values()):
                 return impedances.draw_bode(canvas, x)
     raise TypeError(
-        f"cannot draw {_kinds(x, recording, driver)}; plot takes a Recording, a Fit with its "
-        "recording and driver, a Driver alone or with a calibration, a circuit, Fits, a Bound, a "
-        "dictionary of bounds, or a dictionary of drivers, fits and circuits"
+        f"cannot draw {_kinds(x, recording, driver)}; plot takes a Recording, a Fit or Selection "
+        "with its recording and driver, a Driver alone or with a calibration, a circuit, Fits, a "
+        "Bound, a dictionary of bounds, or a dictionary of drivers, fits and circuits"
     )
 
 

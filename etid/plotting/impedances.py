@@ -50,13 +50,13 @@ def draw_bode(
             phase.fill_between(kilohertz, *np.degrees([angle - turn, angle + turn]), **band)
     magnitude.set(ylabel="|Z| [kΩ]", xscale="log", yscale="log")
     phase.set(xlabel="frequency [kHz]", ylabel="phase [deg]", xscale="log")
-    _frame(magnitude, phase, np.concatenate(sizes))
+    frame(magnitude, phase, np.concatenate(sizes))
     magnitude.legend(frameon=False, fontsize=8)
     titled(magnitude, failed or ["bands: two standard errors" if banded else ""], good=not failed)
     return axes
 
 
-def _frame(magnitude: Axes, phase: Axes, sizes: Float[np.ndarray, " value"]) -> None:
+def frame(magnitude: Axes, phase: Axes, sizes: Float[np.ndarray, " value"]) -> None:
     """Set limits that show the curves even if the bands are wide, and ticks at 1, 2 and 5."""
     sizes = sizes[np.isfinite(sizes)]
     if sizes.size:
