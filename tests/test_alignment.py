@@ -9,7 +9,7 @@ import etid
 from etid.estimators.lanes import Harmonics, PaddedSamples
 from etid.recordings.preflight import Inspected, preflight
 from etid.recordings.remarks import Remark
-from etid.signals.pulse_train import find_pulses, lag_of, whole_lag
+from etid.signals.pulse_train import find_pulses, lags_of, whole_lag
 from etid.simulation.scenes import Scene, Trial
 from etid.simulation.transformer import ResistorLoad, SkinLoad
 
@@ -50,7 +50,7 @@ def test_the_lag_is_found_to_less_than_a_sample_at_20_db(sample_rate, late):
     """A damp skin's own delay is 2.5 µs, half of it in the edges: half a sample at 500 kHz."""
     for name, record in simulate(late, sample_rate, snr_db=20.0, periods=1.0).items():
         train = find_pulses(record.v_th, sample_rate, PULSE)
-        lag = lag_of(record.v_th, record.v_out, train)
+        [lag] = lags_of(np.stack([record.v_th, record.v_out])[None], [train])
         assert lag is not None, name
         assert abs(lag - late) < 1.0, name
         assert (whole_lag(lag) == 0) == (late == 0.0)

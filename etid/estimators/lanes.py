@@ -21,7 +21,7 @@ from etid.circuits.circuit import AbstractCircuit
 from etid.recordings.preflight import Inspected
 from etid.results.driver import Driver
 from etid.signals import mains
-from etid.signals.harmonics import ALIASED, Spectrum, spectrum
+from etid.signals.harmonics import ALIASED, Spectrum, filled, spectrum
 from etid.signals.noise import Measurement, measure, noise, rounding_variance
 from etid.signals.pulse_train import rest, shifted
 
@@ -109,7 +109,7 @@ class Harmonics(AbstractLane):
         """Aligned harmonics of a recording; rounding is the noise of a coarse converter."""
         rate = np.asarray(seen.recording.sample_rate)
         sigmas = seen.trusted_th, seen.trusted_out
-        fields = spectrum(seen.v_th, seen.v_out, *sigmas, rate, *seen.periods)
+        fields = filled(seen.coefficients, *sigmas, rate, *seen.periods)
         frequency, x, y, variance_x, variance_y, selected = map(np.asarray, fields)
         for v, step, variance in (
             (seen.recorded_th, seen.coarse_th, variance_x),

@@ -6,7 +6,7 @@ standard errors separate the own error of a trial from the error that all trials
 """
 
 import dataclasses
-import functools
+import itertools
 from collections import Counter
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -37,15 +37,15 @@ from etid.identify.compiled import stored_jit
 from etid.identify.many import (
     LANES,
     Drivers,
-    Refusal,
+    chunked,
     common_first,
     each,
     filled,
-    planned,
     table,
     to_identify,
 )
 from etid.identify.one import checksum, concluded, failed_fit, is_shared, note, repeated
+from etid.identify.planning import Refusal, planned
 from etid.recordings.preflight import Inspected
 from etid.recordings.recording import Recording
 from etid.recordings.remarks import Remark
@@ -308,15 +308,17 @@ def identify_jointly(
         recording = study[paths[row]]
         return recording, drivers.found[drivers.of(recording)]
 
-    for row in tqdm(range(len(paths)), unit="recording", disable=not progress):
-        try:
-            seen, found, estimator = planned(functools.partial(load, row), None)
-            if not estimator.lane.periodic:
-                raise Refusal("not_periodic", SINGLE)
-        except Refusal as refusal:
-            fits[row] = failed_fit(refusal.name, circuit, METHOD)
-            notes[row] = refusal.note
+    inspected = itertools.chain.from_iterable(
+        planned(load, rows, None) for rows in chunked(len(paths))
+    )
+    for row, of in tqdm(inspected, "", len(paths), unit="recording", disable=not progress):
+        if not isinstance(of, Refusal) and not of.estimator.lane.periodic:
+            of = Refusal("not_periodic", SINGLE)
+        if isinstance(of, Refusal):
+            fits[row] = failed_fit(of.name, circuit, METHOD)
+            notes[row] = of.note
             continue
+        seen, found, estimator = of
         driver = serving(found, HarmonicDriver, str(estimator))
         lengths = waiting.setdefault(drivers.of(seen.recording), {})
         shared = is_shared(seen, driver)

@@ -9,11 +9,11 @@ recording gets a verdict and a note; the other recordings are not affected.
 
 import contextlib
 import dataclasses
-import functools
+import itertools
 import math
 import threading
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -32,7 +32,6 @@ from etid.identify.arguments import (
     drift_of,
     estimator_of,
     order_of,
-    plan,
     require,
 )
 from etid.identify.arguments import recordings as several
@@ -40,7 +39,6 @@ from etid.identify.compiled import stored_jit
 from etid.identify.driver import identify_driver
 from etid.identify.one import (
     chosen_fits,
-    explained,
     failed_fit,
     is_shared,
     known_of,
@@ -48,6 +46,7 @@ from etid.identify.one import (
     refined,
     skin_lane,
 )
+from etid.identify.planning import Planned, Refusal, planned
 from etid.identify.prefetch import prefetch
 from etid.recordings.preflight import Inspected
 from etid.recordings.recording import Recording, RecordingError
@@ -58,12 +57,11 @@ from etid.results.fits import Fit, Fits, IdentificationError, described, joined
 from etid.results.provenance import Settings
 from etid.results.study_fits import StudyFits
 from etid.results.tried_orders import Order
-from etid.results.verdicts import message
 from etid.selection.common import common, deserves
 from etid.selection.selection import Selection
 
 LANES = 16  # lanes of one chunk; the last chunk is padded
-AHEAD = 2 * LANES  # recordings that are read and inspected in advance
+AHEAD = 2  # chunks that are read and inspected in advance
 SAMPLE = 200  # recordings that choose the circuit of a study; a second of work
 
 
@@ -108,34 +106,37 @@ def _of_one_method(fits: Sequence[Fit], used: Sequence[str]) -> list[Fit]:
     return [fit if fit.method == name else dataclasses.replace(fit, method=name) for fit in arrays]
 
 
-class Refusal(Exception):
-    """A recording cannot be fitted; holds the name of its verdict and a note."""
+class _Prepared(NamedTuple):
+    """A recording that waits for a chunk, its lane, and whether `is_shared` holds."""
 
-    def __init__(self, name: str, note: str = "") -> None:
-        super().__init__(name)
-        self.name = name
-        self.note = note or message(name)
+    planned: Planned
+    lane: AbstractLane
+    shared: bool
+
+    @property
+    def key(self) -> tuple[Any, ...]:
+        """Equal for recordings that can be fitted in one chunk."""
+        seen, driver, estimator = self.planned
+        rates = seen.recording.sample_rate, seen.recording.pulse_rate
+        return id(driver), estimator, self.lane.size, self.shared, rates
 
 
-def planned(
-    load: Callable[[], tuple[Recording, Driver]], asked: AbstractEstimator | None
-) -> tuple[Inspected, Driver, AbstractEstimator]:
-    """The inspected recording, its driver and its estimator.
-
-    Raises:
-        Refusal: One of these steps failed, or pre-flight refused the recording.
-    """
+def _prepared(
+    found: Planned | Refusal, candidates: Sequence[AbstractCircuit]
+) -> _Prepared | Refusal:
+    if isinstance(found, Refusal):
+        return found
     try:
-        recording, driver = load()
-        seen = Inspected(recording)
-        estimator, name = plan(asked, seen, driver)
-    except (RecordingError, ValueError) as error:
-        raise Refusal("unreadable", str(error)) from error
-    except IdentificationError as error:
-        raise Refusal("driver_failed", str(error)) from error
-    if name is not None:
-        raise Refusal(name, explained(seen, name))
-    return seen, driver, estimator
+        check_default(found.estimator, candidates)
+    except ValueError as error:
+        return Refusal("not_periodic", str(error))
+    lane = found.estimator.lane.of(found.seen)
+    return _Prepared(found, lane, is_shared(found.seen, found.driver))
+
+
+def chunked(count: int) -> Iterator[range]:
+    """The numbers of `count` recordings, in chunks of `LANES`."""
+    return (range(first, min(first + LANES, count)) for first in range(0, count, LANES))
 
 
 def filled(lanes: Sequence[AbstractLane]) -> AbstractLane:
@@ -200,23 +201,16 @@ def _identify(
     otherwise = str(asked or MAXIMUM_LIKELIHOOD)
     queues: dict[tuple, _Queue] = {}
 
-    def read(
-        row: int,
-    ) -> tuple[Driver, AbstractLane, Inspected, AbstractEstimator, bool, tuple]:
+    chunks = tuple(chunked(count))
+
+    def read(number: int) -> list[tuple[int, _Prepared | Refusal]]:
         with jax.enable_x64(True):  # the setting belongs to a thread, and this runs in another one
-            seen, driver, estimator = planned(functools.partial(load, row), asked)
-            try:
-                check_default(estimator, candidates)
-            except ValueError as error:
-                raise Refusal("not_periodic", str(error)) from error
-        rates = seen.recording.sample_rate, seen.recording.pulse_rate
-        waiting, shared = estimator.lane.of(seen), is_shared(seen, driver)
-        key = id(driver), estimator, waiting.size, shared, rates
-        return driver, waiting, seen, estimator, shared, key
+            of_all = planned(load, chunks[number], asked)
+            return [(row, _prepared(of, candidates)) for row, of in of_all]
 
     with (
         tqdm(total=count, unit="fit", disable=not progress) as bar,
-        contextlib.closing(prefetch(read, count, AHEAD)) as recordings,
+        contextlib.closing(prefetch(read, len(chunks), AHEAD)) as recordings,
     ):
 
         def run(queue: _Queue) -> None:
@@ -226,20 +220,20 @@ def _identify(
                 notes[row] = note(selection.fit)
                 bar.update()
 
-        for row, prepared in enumerate(recordings):
-            try:
-                driver, waiting, seen, estimator, shared, key = prepared()
-            except Refusal as refusal:
-                fit = failed_fit(refusal.name, candidates[0], otherwise)
+        for row, prepared in itertools.chain.from_iterable(chunk() for chunk in recordings):
+            if isinstance(prepared, Refusal):
+                fit = failed_fit(prepared.name, candidates[0], otherwise)
                 found[row] = Selection.of({0: fit}, 0, candidates)
-                notes[row] = refusal.note
+                notes[row] = prepared.note
                 bar.update()
                 continue
+            key = prepared.key
             if key not in queues:
-                known = known_of(waiting, driver, shared, estimator)
+                _, driver, estimator = prepared.planned
+                known = known_of(prepared.lane, driver, prepared.shared, estimator)
                 queues[key] = _Queue(driver, known, candidates, estimator)
             queue = queues[key]
-            queue.add(row, waiting, seen)
+            queue.add(row, prepared.lane, prepared.planned.seen)
             if len(queue.rows) == LANES:
                 run(queue)
         for queue in queues.values():

@@ -2,27 +2,30 @@
 
 import functools
 import math
+from collections.abc import Sequence
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Complex, Float
 
 from etid.recordings.recording import Recording
 from etid.recordings.remarks import Remark
 from etid.signals.disturbances import Joint, disturbed, joint, of_source
 from etid.signals.filtering import TAPS
-from etid.signals.harmonics import ALIASED, whole_periods
+from etid.signals.harmonics import ALIASED, harmonics, whole_periods
 from etid.signals.mains import Hum, separated
-from etid.signals.noise import is_coarse, noise_std, step_of, trusted
+from etid.signals.noise import RIPPLE, is_coarse, noise_std, step_of
 from etid.signals.pulse_train import (
     CLOCK,
     PulseTrain,
     find_pulses,
-    lag_of,
+    lags_of,
     rise_time,
     shifted,
     whole_lag,
 )
 
+# A recording that is not finite is refused later; its neighbours in a group are not concerned.
+QUIETLY = functools.partial(np.errstate, invalid="ignore", over="ignore")
 SHORTEST = 4 * TAPS + 104  # [samples] edges of the interpolation, and 104 samples for the fit
 # [standard deviations] peak-to-peak value that noise alone hardly exceeds; a signal must exceed it
 FLAT = 8.0
@@ -36,79 +39,208 @@ SEAM = 3  # samples on each side of the joint between two periods
 STEP = 4.0  # [standard deviations] largest difference there; also allowed in addition to EQUAL
 
 
+class Group:
+    """Recordings of equal length and equal rates, inspected together to save time.
+
+    Each property has one entry for each recording and is computed once, when it is used. An axis of
+    length 2 holds `v_th` and `v_out`.
+
+    Args:
+        recordings: The recordings.
+    """
+
+    def __init__(self, recordings: Sequence[Recording]) -> None:
+        self.recordings = recordings
+        self.sample_rate = recordings[0].sample_rate
+        self.pulse_rate = recordings[0].pulse_rate
+        self._coefficients: dict[tuple[int, int], np.ndarray] = {}
+
+    @functools.cached_property
+    def whole(self) -> Float[np.ndarray, "recording 2 time"]:
+        """Voltages of all periods as they were recorded [V]."""
+        whole = np.stack([np.stack([one.v_th, one.v_out]) for one in self.recordings])
+        whole.flags.writeable = False
+        return whole
+
+    @functools.cached_property
+    def step(self) -> Float[np.ndarray, "recording 2"]:
+        """Converter steps [V]; 0 if unknown."""
+        samples = [(one.samples["v_th"], one.samples["v_out"]) for one in self.recordings]
+        return np.array([[one.resolution or 0.0 for one in both] for both in samples])
+
+    @functools.cached_property
+    def noise(self) -> Float[np.ndarray, "recording 2"]:
+        """Standard deviations of the noise of a sample of `whole` [V]."""
+        both = zip(self.whole, self.step, strict=True)
+        return np.array([list(map(noise_std, records, steps)) for records, steps in both])
+
+    @functools.cached_property
+    def coarse(self) -> Float[np.ndarray, "recording 2"]:
+        """Converter steps [V] that exceed the noise, else 0."""
+        both = zip(self.whole, self.step, strict=True)
+        return np.array([list(map(_coarse, records, steps)) for records, steps in both])
+
+    @functools.cached_property
+    def trains(self) -> list[PulseTrain]:
+        """Pulse trains of `v_th`."""
+        return [find_pulses(v_th, self.sample_rate, self.pulse_rate) for v_th, _ in self.whole]
+
+    @functools.cached_property
+    def whole_periods(self) -> list[tuple[int, int]]:
+        """Numbers of whole periods in each recording, and their number of samples."""
+        size = self.whole.shape[2]
+        return [whole_periods(size, self.sample_rate, train.counted) for train in self.trains]
+
+    @functools.cached_property
+    def hum(self) -> list[list[Hum | None]]:
+        """Hum that is subtracted from each record; None if there is none."""
+        rates = self.sample_rate, self.pulse_rate
+        of_all = zip(self.whole, self.noise, self.whole_periods, strict=True)
+        return [
+            [separated(v, sigma, *rates, *periods) for v, sigma in zip(records, noise, strict=True)]
+            for records, noise, periods in of_all
+        ]
+
+    @functools.cached_property
+    def quiet(self) -> Float[np.ndarray, "recording 2 time"]:
+        """Voltages of all periods without hum [V]."""
+        if all(hum is None for both in self.hum for hum in both):
+            return self.whole
+        quiet = self.whole.copy()
+        for records, both in zip(quiet, self.hum, strict=True):
+            for v, hum in zip(records, both, strict=True):
+                if hum is not None:
+                    v -= hum(v.size, self.sample_rate)
+        return quiet
+
+    @functools.cached_property
+    def limits(self) -> Float[np.ndarray, "recording 2 limit"]:
+        """Smallest and largest sample of each record in `quiet` [V]."""
+        return _limits(self.quiet)
+
+    @functools.cached_property
+    def covariance(self) -> Float[np.ndarray, "recording 2 2"]:
+        """Covariance of both voltages in `quiet` [V²]."""
+        return _covariance(self.quiet)
+
+    @functools.cached_property
+    def kept(self) -> list[Joint | None]:
+        """The periods in use if disturbed periods are left out; None if all are in use."""
+        kept: list[Joint | None] = [None] * len(self.recordings)
+        alike: dict[tuple[float, int], list[int]] = {}
+        for row, train in enumerate(self.trains):
+            if not train.mismatch:
+                alike.setdefault((train.counted, self.whole_periods[row][0]), []).append(row)
+        for (counted, periods), rows in alike.items():
+            of = self.quiet[rows], self.noise[rows], self.coarse[rows]
+            spacing = self.sample_rate / counted
+            with QUIETLY():
+                bad = disturbed(*of, spacing, periods)
+            for row in np.flatnonzero(bad.any(1)):
+                kept[rows[row]] = _kept(self.quiet[rows[row]], bad[row], spacing, self.sample_rate)
+        return kept
+
+    @functools.cached_property
+    def lags(self) -> list[float | None]:
+        """Lags of `v_out` in `quiet` [samples]; None if misaligned or if the rates are wrong."""
+        lags: list[float | None] = [None] * len(self.recordings)
+        rows = [row for row, train in enumerate(self.trains) if not train.mismatch]
+        trains = [self.trains[row] for row in rows]
+        with QUIETLY():
+            found = lags_of(self.quiet[rows], trains) if rows else []
+        for row, lag in zip(rows, found, strict=True):
+            lags[row] = lag
+        return lags
+
+    def coefficients(
+        self, periods: int, samples: int
+    ) -> Complex[np.ndarray, "recording 2 harmonic"]:
+        """Harmonics of `quiet` for these numbers from `whole_periods`."""
+        if (periods, samples) not in self._coefficients:
+            with QUIETLY():
+                found = np.asarray(harmonics(self.quiet, periods, samples))
+            self._coefficients[periods, samples] = found
+        return self._coefficients[periods, samples]
+
+
+def _limits(v: Float[np.ndarray, "*record time"]) -> Float[np.ndarray, "*record limit"]:
+    return np.stack([v.min(-1), v.max(-1)], axis=-1)
+
+
+def _covariance(v: Float[np.ndarray, "*recording 2 time"]) -> Float[np.ndarray, "*recording 2 2"]:
+    mean = v.mean(-1)
+    with QUIETLY():
+        # Not `@`, which starts BLAS threads.
+        square = np.einsum("...in,...jn->...ij", v, v) / v.shape[-1]
+        return square - mean[..., :, None] * mean[..., None, :]
+
+
+def _coarse(v: Float[np.ndarray, " time"], told: float) -> float:
+    step = told or step_of(v)
+    return step if is_coarse(v, step) else 0.0
+
+
+def _kept(
+    records: Float[np.ndarray, "2 time"],
+    bad: Bool[np.ndarray, " period"],
+    spacing: float,
+    sample_rate: float,
+) -> Joint | None:
+    """The plan to leave disturbed periods out.
+
+    Fewer than half of the periods may be left out: the others must show the shape of an undisturbed
+    period.
+    """
+    left = np.count_nonzero(~bad)
+    if not max(2, bad.size // 2 + 1) <= left < bad.size:
+        return None
+    rise = rise_time(sample_rate)
+    if any(of_source(v, bad, spacing, rise) for v in records):
+        return None
+    return joint(~bad, spacing, records.shape[1])
+
+
 class Inspected:
     """A recording and its properties that need no model; each is computed once, when it is used.
+
+    Args:
+        recording: The recording.
+        group: Recordings that are inspected together with this one; only this one if not given.
+        row: Number of the recording in the group.
 
     Attributes:
         recording: The recording.
     """
 
-    def __init__(self, recording: Recording) -> None:
+    def __init__(self, recording: Recording, group: Group | None = None, row: int = 0) -> None:
         self.recording = recording
+        self._group = group or Group([recording])
+        self._row = row
 
     @functools.cached_property
     def v_th(self) -> Float[np.ndarray, " time"]:
         """Unloaded voltage [V] of the periods in use, without hum between the harmonics."""
-        return self._joined(self.quiet_th)
+        return self._joined(self._group.quiet[self._row, 0])
 
     @functools.cached_property
     def v_out(self) -> Float[np.ndarray, " time"]:
         """Loaded voltage [V] of the periods in use, without hum between the harmonics."""
-        return self._joined(self.quiet_out)
+        return self._joined(self._group.quiet[self._row, 1])
 
     @functools.cached_property
     def recorded_th(self) -> Float[np.ndarray, " time"]:
         """Unloaded voltage of the periods in use as it was recorded [V]."""
-        return self._joined(self.whole_th)
+        return self._joined(self._group.whole[self._row, 0])
 
     @functools.cached_property
     def recorded_out(self) -> Float[np.ndarray, " time"]:
         """Loaded voltage of the periods in use as it was recorded [V]."""
-        return self._joined(self.whole_out)
-
-    @functools.cached_property
-    def whole_th(self) -> Float[np.ndarray, " time"]:
-        """Unloaded voltage of all periods as it was recorded [V]."""
-        return self.recording.v_th
-
-    @functools.cached_property
-    def whole_out(self) -> Float[np.ndarray, " time"]:
-        """Loaded voltage of all periods as it was recorded [V]."""
-        return self.recording.v_out
-
-    @functools.cached_property
-    def quiet_th(self) -> Float[np.ndarray, " time"]:
-        """Unloaded voltage of all periods without hum [V]."""
-        return self._without(self.hum_th, self.whole_th)
-
-    @functools.cached_property
-    def quiet_out(self) -> Float[np.ndarray, " time"]:
-        """Loaded voltage of all periods without hum [V]."""
-        return self._without(self.hum_out, self.whole_out)
+        return self._joined(self._group.whole[self._row, 1])
 
     @functools.cached_property
     def kept(self) -> Joint | None:
-        """The pulse periods in use if disturbed periods are left out; None if all are in use.
-
-        Fewer than half of the periods may be left out: the others must show the shape of an
-        undisturbed period.
-        """
-        if self.train.mismatch:
-            return None
-        bad = disturbed(
-            (self.quiet_th, self.quiet_out),
-            (float(self.noise_th), float(self.noise_out)),
-            (self.coarse_th, self.coarse_out),
-            self.spacing,
-            self.whole_periods[0],
-        )
-        left = np.count_nonzero(~bad)
-        if not max(2, bad.size // 2 + 1) <= left < bad.size:
-            return None
-        rise = rise_time(self.recording.sample_rate)
-        if any(of_source(v, bad, self.spacing, rise) for v in (self.quiet_th, self.quiet_out)):
-            return None
-        return joint(~bad, self.spacing, self.whole_out.size)
+        """The pulse periods in use if disturbed periods are left out; None if all are in use."""
+        return self._group.kept[self._row]
 
     def _joined(self, v: Float[np.ndarray, " time"]) -> Float[np.ndarray, " kept"]:
         return v if self.kept is None else self.kept(v)
@@ -118,36 +250,25 @@ class Inspected:
         """Start of each period of `v_th` [samples]."""
         return self.spacing * np.arange(self.periods[0]) if self.kept is None else self.kept.begins
 
-    @functools.cached_property
+    @property
     def coarse_th(self) -> float:
         """Converter step [V] of `v_th` if it exceeds the noise, else 0."""
-        return self._coarse(self.whole_th, self.step_th)
+        return self._group.coarse[self._row, 0]
 
-    @functools.cached_property
+    @property
     def coarse_out(self) -> float:
         """Converter step [V] of `v_out` if it exceeds the noise, else 0."""
-        return self._coarse(self.whole_out, self.step_out)
+        return self._group.coarse[self._row, 1]
 
-    def _coarse(self, v: Float[np.ndarray, " time"], told: float) -> float:
-        step = told or step_of(v)
-        return step if is_coarse(v, step) else 0.0
-
-    @functools.cached_property
+    @property
     def hum_th(self) -> Hum | None:
         """Hum that is subtracted from `v_th`; None if there is none."""
-        return self._hum(self.whole_th, self.noise_th)
+        return self._group.hum[self._row][0]
 
-    @functools.cached_property
+    @property
     def hum_out(self) -> Hum | None:
         """Hum that is subtracted from `v_out`; None if there is none."""
-        return self._hum(self.whole_out, self.noise_out)
-
-    def _hum(self, v: Float[np.ndarray, " time"], sigma: Float[np.ndarray, ""]) -> Hum | None:
-        of = self.recording
-        return separated(v, sigma, of.sample_rate, of.pulse_rate, *self.whole_periods)
-
-    def _without(self, hum: Hum | None, v: Float[np.ndarray, " time"]) -> np.ndarray:
-        return v if hum is None else v - hum(v.size, self.recording.sample_rate)
+        return self._group.hum[self._row][1]
 
     def covered(self, frequency: Float[np.ndarray, " harmonic"]) -> Bool[np.ndarray, " harmonic"]:
         """Whether each harmonic is unusable because of hum or aliases.
@@ -164,46 +285,58 @@ class Inspected:
     @property
     def step_th(self) -> float:
         """Converter step [V] of `v_th`; 0 if it is unknown."""
-        return self.recording.samples["v_th"].resolution or 0.0
+        return self._group.step[self._row, 0]
 
     @property
     def step_out(self) -> float:
         """Converter step [V] of `v_out`; 0 if it is unknown."""
-        return self.recording.samples["v_out"].resolution or 0.0
-
-    @functools.cached_property
-    def noise_th(self) -> Float[np.ndarray, ""]:
-        """Standard deviation of the noise of a sample of `whole_th` [V]."""
-        return np.asarray(noise_std(self.whole_th, self.step_th))
-
-    @functools.cached_property
-    def noise_out(self) -> Float[np.ndarray, ""]:
-        """Standard deviation of the noise of a sample of `whole_out` [V]."""
-        return np.asarray(noise_std(self.whole_out, self.step_out))
+        return self._group.step[self._row, 1]
 
     @functools.cached_property
     def sigma_th(self) -> Float[np.ndarray, ""]:
         """Standard deviation of the noise of a sample of `v_th` [V]."""
-        if self.kept is None:
-            return self.noise_th
-        return np.asarray(noise_std(self.recorded_th, self.step_th))
+        return self._sigma(0, self.recorded_th)
 
     @functools.cached_property
     def sigma_out(self) -> Float[np.ndarray, ""]:
         """Standard deviation of the noise of a sample of `v_out` [V]."""
+        return self._sigma(1, self.recorded_out)
+
+    def _sigma(self, which: int, recorded: Float[np.ndarray, " time"]) -> Float[np.ndarray, ""]:
         if self.kept is None:
-            return self.noise_out
-        return np.asarray(noise_std(self.recorded_out, self.step_out))
+            return np.asarray(self._group.noise[self._row, which])
+        return np.asarray(noise_std(recorded, self._group.step[self._row, which]))
+
+    @functools.cached_property
+    def _both(self) -> Float[np.ndarray, "2 time"]:
+        if self.kept is None:
+            return self._group.quiet[self._row]
+        return np.stack([self.v_th, self.v_out])
+
+    @functools.cached_property
+    def limits(self) -> Float[np.ndarray, "2 limit"]:
+        """Smallest and largest sample of `v_th` and of `v_out` [V]."""
+        return self._group.limits[self._row] if self.kept is None else _limits(self._both)
+
+    @property
+    def spans(self) -> Float[np.ndarray, "2"]:
+        """Peak-to-peak values of `v_th` and of `v_out` [V]."""
+        return self.limits[:, 1] - self.limits[:, 0]
+
+    @functools.cached_property
+    def covariance(self) -> Float[np.ndarray, "2 2"]:
+        """Covariance of `v_th` and `v_out` [V²]."""
+        return self._group.covariance[self._row] if self.kept is None else _covariance(self._both)
 
     @functools.cached_property
     def trusted_th(self) -> Float[np.ndarray, ""]:
         """`sigma_th` as far as estimators trust it: not below the error of the interpolation."""
-        return np.asarray(trusted(self.v_th, self.sigma_th))
+        return np.asarray(np.maximum(self.sigma_th, RIPPLE * self.spans[0]))
 
     @functools.cached_property
     def trusted_out(self) -> Float[np.ndarray, ""]:
         """`sigma_out` as far as estimators trust it: not below the error of the interpolation."""
-        return np.asarray(trusted(self.v_out, self.sigma_out))
+        return np.asarray(np.maximum(self.sigma_out, RIPPLE * self.spans[1]))
 
     @property
     def remarks(self) -> Remark:
@@ -220,7 +353,9 @@ class Inspected:
     @functools.cached_property
     def correlated(self) -> float | None:
         """Lag of `v_out` [samples]; the load may add up to one sample. None if misaligned."""
-        return lag_of(self.v_th, self.v_out, self.train)
+        if self.kept is None:
+            return self._group.lags[self._row]
+        return lags_of(self._both[None], [self.train])[0]
 
     @functools.cached_property
     def lag(self) -> int:
@@ -232,10 +367,10 @@ class Inspected:
         """Both voltages [V] in their overlap after the shift by `lag`."""
         return shifted(self.v_th, self.v_out, self.lag)
 
-    @functools.cached_property
+    @property
     def train(self) -> PulseTrain:
         """Pulse train of `v_th`."""
-        return find_pulses(self.whole_th, self.recording.sample_rate, self.recording.pulse_rate)
+        return self._group.trains[self._row]
 
     @functools.cached_property
     def pulse_rate(self) -> float:
@@ -247,15 +382,22 @@ class Inspected:
         """Length of a pulse period [samples], from the measured pulse rate."""
         return self.recording.sample_rate / self.pulse_rate
 
-    @functools.cached_property
+    @property
     def whole_periods(self) -> tuple[int, int]:
         """Number of whole periods in the record, and their number of samples."""
-        return whole_periods(self.whole_out.size, self.recording.sample_rate, self.pulse_rate)
+        return self._group.whole_periods[self._row]
 
     @property
     def periods(self) -> tuple[int, int]:
         """Number of periods in use, and their number of samples."""
         return self.whole_periods if self.kept is None else (self.kept.first.size, self.v_out.size)
+
+    @functools.cached_property
+    def coefficients(self) -> Complex[np.ndarray, "2 harmonic"]:
+        """Harmonics of both voltages [V]."""
+        if self.kept is None:
+            return self._group.coefficients(*self.periods)[self._row]
+        return np.asarray(harmonics(self._both, *self.periods))
 
     @functools.cached_property
     def is_periodic(self) -> bool:
@@ -285,12 +427,13 @@ def preflight(seen: Inspected, *, periodic: bool = False) -> str | None:
         seen: The recording with its properties.
         periodic: Whether the fit needs whole pulse periods.
     """
-    v_th, v_out, of = seen.v_th, seen.v_out, seen.recording
-    if v_th.size < SHORTEST:
+    of = seen.recording
+    if seen.v_th.size < SHORTEST:
         return "too_short"
-    if not (np.isfinite(v_th).all() and np.isfinite(v_out).all()):
+    if not np.isfinite(seen.limits).all():
         return "nonfinite_samples"
-    if _is_flat(v_th, seen.sigma_th) or _is_flat(v_out, seen.sigma_out):
+    noise = FLAT * np.array([seen.sigma_th, seen.sigma_out])
+    if ((seen.spans <= noise) | (seen.spans == 0)).any():
         return "flat"
     if _is_saturated(seen.recorded_th, seen.step_th, of):
         return "saturated"
@@ -300,16 +443,11 @@ def preflight(seen: Inspected, *, periodic: bool = False) -> str | None:
         return "unconnected"
     if seen.train.mismatch:
         return "rate_mismatch"
-    if np.var(v_out) > POWER * np.var(v_th) or seen.correlated is None:
+    if seen.covariance[1, 1] > POWER * seen.covariance[0, 0] or seen.correlated is None:
         return "misaligned"
     if periodic and not seen.is_periodic:
         return "not_periodic"
     return None
-
-
-def _is_flat(v: Float[np.ndarray, " time"], sigma: Float[np.ndarray, ""]) -> bool:
-    span = np.ptp(v)
-    return bool(span <= FLAT * sigma or span == 0)
 
 
 def _is_saturated(v: Float[np.ndarray, " time"], step: float, recording: Recording) -> bool:
@@ -333,12 +471,15 @@ def _is_saturated(v: Float[np.ndarray, " time"], step: float, recording: Recordi
 
 def _is_unconnected(seen: Inspected) -> bool:
     """Whether v_out equals v_th, except for noise, an offset and a delay below one sample."""
-    x, y = (v - v.mean() for v in seen.aligned)
+    covariance = _covariance(np.stack(seen.aligned)) if seen.lag else seen.covariance
     variance = seen.sigma_th**2 + seen.sigma_out**2
-    power = x @ x - x.size * seen.sigma_th**2
-    if abs((x @ y) / power - 1) > EQUAL + STEP * math.sqrt(variance / power):
+    power = covariance[0, 0] - seen.sigma_th**2
+    size = seen.aligned[0].size
+    limit = EQUAL + STEP * math.sqrt(variance / (size * power))
+    if abs(covariance[0, 1] / power - 1) > limit:
         return False
+    x, y = (v - v.mean() for v in seen.aligned)
     late = np.gradient(x)
     rest = y - x
     rest = rest - late * ((late @ rest) / (late @ late))
-    return bool(rest @ rest <= x.size * SAME * variance + LATE**2 * power)
+    return bool(rest @ rest <= size * (SAME * variance + LATE**2 * power))

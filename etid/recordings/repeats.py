@@ -120,7 +120,7 @@ def bands(sample_rate: float, pulse_rate: float, band: float) -> Bands:
     ]
     joined = np.linalg.qr(np.concatenate([transforms.real, transforms.imag]))[0].T
     polynomials = joined[:, :count] + 1j * joined[:, count:]
-    return Bands(length, size, edges, number, middle, polynomials.astype(np.complex64))
+    return Bands(length, size, edges, number, middle, polynomials.astype(np.complex64, order="C"))
 
 
 def repeats(seen: Sequence[Inspected]) -> list[Repeats | None]:
@@ -319,7 +319,9 @@ def _turns(angle: Float[np.ndarray, "lane period"], count: int) -> np.ndarray:
 
 def _without(deviation: np.ndarray, polynomials: np.ndarray) -> np.ndarray:
     """Deviations without their projection on the polynomials; changed in place."""
+    # Real and imaginary parts side by side: the real part of a product is the product of these.
+    real, basis = deviation.view(np.float32), polynomials.view(np.float32)
     # One recording after the other, because such small products start no threads.
-    for own in deviation:
-        own -= np.real(own @ polynomials.conj().T).astype(own.dtype) @ polynomials
+    for own in real:
+        own -= (own @ basis.T) @ basis
     return deviation

@@ -8,7 +8,6 @@ exceed these limits. Edges between samples and noise do not exceed them either.
 """
 
 import itertools
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -24,49 +23,61 @@ NOISE = 8.0  # limit relative to the standard deviation of a mean
 
 
 def disturbed(
-    records: Sequence[Float[np.ndarray, " time"]],
-    sigma: Sequence[float],
-    step: Sequence[float],
+    records: Float[np.ndarray, "recording 2 time"],
+    sigma: Float[np.ndarray, "recording 2"],
+    step: Float[np.ndarray, "recording 2"],
     spacing: float,
     periods: int,
-) -> Bool[np.ndarray, " period"]:
-    """Whether each period is disturbed in one of two records of equal lengths, but not in both.
+) -> Bool[np.ndarray, "recording period"]:
+    """Whether each period is disturbed in one of the two records of a recording, but not in both.
 
     What both records show, a second pulse for instance, comes from the source. The ratio of the
     records stays right. With fewer than three periods, the answer is no for all of them.
 
     Args:
-        records: Voltages [V].
+        records: Both voltages of each recording [V].
         sigma: Standard deviation of the noise of a sample of each record [V].
         step: Step of the converter of each record if it is coarse, else 0 [V].
         spacing: Length of a period [samples].
         periods: Number of whole periods in each record.
     """
-    length = int(spacing) // MERGED * MERGED
+    length, count = int(spacing) // MERGED * MERGED, len(records)
     if periods < FEWEST or length < 3 * MERGED:
-        return np.zeros(periods, bool)
-    at = np.minimum(np.rint(np.arange(periods) * spacing), records[0].size - length).astype(int)
+        return np.zeros((count, periods), bool)
+    last = records.shape[2] - length
+    at = np.minimum(np.rint(np.arange(periods) * spacing), last).astype(int)
     parts = np.arange(0, length, MERGED)
-    cut = [[np.add.reduceat(v[one : one + length], parts) for one in at] for v in records]
-    means = np.array(cut) / MERGED
+    cut = [np.add.reduceat(records[:, :, one : one + length], parts, axis=2) for one in at]
+    means = np.stack(cut, axis=2) / MERGED
     half = parts.size // 2
     # Subtract the median of each period, because the mean may drift.
-    means -= np.partition(means, half, axis=2)[:, :, half, None]
-    low, high = means.min(1), means.max(1)
-    noise = NOISE / MERGED**0.5 * np.asarray(sigma)
-    floor = np.maximum(PART * high.max(1), noise) + step
-    if not (high - low > SHARE * np.maximum(low, -high) + floor[:, None]).any():
-        return np.zeros(periods, bool)  # most records end here, in half of the time
-    usual = np.median(means, axis=1)
-    floor = np.maximum(PART * np.abs(usual).max(1), noise) + step
+    means -= np.partition(means, half, axis=3)[..., half, None]
+    low, high = means.min(2), means.max(2)
+    noise = NOISE / MERGED**0.5 * sigma
+    floor = np.maximum(PART * high.max(2), noise) + step
+    # Most records end here, in half of the time.
+    suspect = (high - low > SHARE * np.maximum(low, -high) + floor[..., None]).any((1, 2))
+    bad = np.zeros((count, periods), bool)
+    bad[suspect] = _unlike(means[suspect], noise[suspect], step[suspect])
+    return bad
+
+
+def _unlike(
+    means: Float[np.ndarray, "recording 2 period part"],
+    noise: Float[np.ndarray, "recording 2"],
+    step: Float[np.ndarray, "recording 2"],
+) -> Bool[np.ndarray, "recording period"]:
+    """Whether a period differs from the median of all periods, in one record and not in both."""
+    usual = np.median(means, axis=2)
+    floor = np.maximum(PART * np.abs(usual).max(2), noise) + step
     # The first and the last mean lie between pulses.
-    left, middle, right = usual[:, :-2], usual[:, 1:-1], usual[:, 2:]
+    left, middle, right = usual[..., :-2], usual[..., 1:-1], usual[..., 2:]
     high = np.maximum(np.maximum(left, middle), right)
     low = np.minimum(np.minimum(left, middle), right)
-    allowed = SHARE * np.maximum(high, -low) + (high - low) + floor[:, None]
-    off = np.abs(means - usual[:, None])[:, :, 1:-1]
-    unlike = np.any(off > allowed[:, None], axis=2)
-    return unlike.any(axis=0) & ~unlike.all(axis=0)
+    allowed = SHARE * np.maximum(high, -low) + (high - low) + floor[..., None]
+    off = np.abs(means - usual[:, :, None])[..., 1:-1]
+    unlike = np.any(off > allowed[:, :, None], axis=3)
+    return unlike.any(axis=1) & ~unlike.all(axis=1)
 
 
 def of_source(

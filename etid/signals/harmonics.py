@@ -141,11 +141,6 @@ def spectrum(
 ) -> tuple[Array | np.ndarray, ...]:
     """Harmonics of both records and their noise: the fields of a `Spectrum`.
 
-    Harmonics below the noise stay selected: the likelihood weights them correctly. To drop weak
-    harmonics would lose more information at 24 to 40 dB than they disturb. Padded harmonics follow
-    the last harmonic. They are not selected and almost zero; they give records of most lengths the
-    same number of harmonics.
-
     Args:
         v_th: Unloaded voltage [V].
         v_out: Loaded voltage [V].
@@ -155,18 +150,36 @@ def spectrum(
         periods: Number of periods from `whole_periods`.
         samples: Number of samples from `whole_periods`.
     """
-    of = namespace(v_out)
-    coefficients = harmonics(of.stack([v_th[:samples], v_out[:samples]]), periods, samples)
-    count = coefficients.shape[1]
+    both = namespace(v_out).stack([v_th[:samples], v_out[:samples]])
+    coefficients = harmonics(both, periods, samples)
+    return filled(coefficients, sigma_th, sigma_out, sample_rate, periods, samples)
+
+
+def filled(
+    coefficients: Complex[Array | np.ndarray, "2 harmonic"],
+    sigma_th: Float[Array | np.ndarray, ""],
+    sigma_out: Float[Array | np.ndarray, ""],
+    sample_rate: Float[Array | np.ndarray, ""],
+    periods: int,
+    samples: int,
+) -> tuple[Array | np.ndarray, ...]:
+    """The fields of a `Spectrum` from the `harmonics` of both records; arguments as in `spectrum`.
+
+    Harmonics below the noise stay selected: the likelihood weights them correctly. To drop weak
+    harmonics would lose more information at 24 to 40 dB than they disturb. Padded harmonics follow
+    the last harmonic. They are not selected and almost zero; they give records of most lengths the
+    same number of harmonics.
+    """
+    of, count = namespace(coefficients), coefficients.shape[1]
     number = np.arange(1.0, count + -count % ROOM + 1)
     frequency = number * (periods * sample_rate / samples)
     noise = of.stack([sigma_th, sigma_out])[:, None] / math.sqrt(samples)
     scale = of.where(number[None, :] <= count, noise, ABSENT * noise)
     absent = scale[:, count:].astype(coefficients.dtype)
-    filled, variance = of.concatenate([coefficients, absent], axis=1), scale**2
+    padded, variance = of.concatenate([coefficients, absent], axis=1), scale**2
     highest = 0.5 if separates_aliases(periods, samples) else ALIASED
     selected = (frequency < highest * sample_rate) & (number <= count)
-    return frequency, filled[0], filled[1], variance[0], variance[1], selected
+    return frequency, padded[0], padded[1], variance[0], variance[1], selected
 
 
 def fast_length(length: int) -> int:

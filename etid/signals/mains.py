@@ -93,7 +93,7 @@ def lines(
 
 def separated(
     v: Float[np.ndarray, " time"],
-    sigma: Float[np.ndarray, ""],
+    sigma: float,
     sample_rate: float,
     pulse_rate: float,
     periods: int,
@@ -122,7 +122,7 @@ def separated(
         rest = min(abs(periods * sample_rate / pulse_rate - samples), 0.5)
         if found < SEEN * sigma + rest * left * np.abs(v).mean():
             return None
-    return _found(v, float(sigma), sample_rate, periods) if np.isfinite(v).all() else None
+    return _found(v, sigma, sample_rate, periods) if np.isfinite(v).all() else None
 
 
 def _between(bins: Int[np.ndarray, " bin"], periods: int) -> Int[np.ndarray, " between"]:

@@ -1,0 +1,79 @@
+"""Reading and inspection of many recordings: which can be fitted, and why the others cannot."""
+
+from collections.abc import Callable, Iterable, Iterator
+from typing import NamedTuple
+
+from etid.estimators.estimator import AbstractEstimator
+from etid.identify.arguments import plan
+from etid.identify.one import explained
+from etid.recordings.preflight import Group, Inspected
+from etid.recordings.recording import Recording, RecordingError
+from etid.results.driver import Driver
+from etid.results.fits import IdentificationError
+from etid.results.verdicts import message
+
+TOGETHER = 8  # recordings that are inspected together; more do not fit the processor's cache
+ERRORS = (RecordingError, ValueError, IdentificationError)  # that a recording or a driver may raise
+
+
+class Refusal:
+    """A recording that cannot be fitted: the name of its verdict and a note."""
+
+    def __init__(self, name: str, note: str = "") -> None:
+        self.name = name
+        self.note = note or message(name)
+
+
+class Planned(NamedTuple):
+    """A recording that can be fitted, with its driver and its estimator."""
+
+    seen: Inspected
+    driver: Driver
+    estimator: AbstractEstimator
+
+
+def planned(
+    load: Callable[[int], tuple[Recording, Driver]],
+    rows: Iterable[int],
+    asked: AbstractEstimator | None,
+) -> Iterator[tuple[int, Planned | Refusal]]:
+    """Each recording with its driver and its estimator, or the reason why it cannot be fitted.
+
+    Recordings of equal length and rates are inspected together.
+
+    Args:
+        load: Reads a recording and its driver.
+        rows: Numbers of the recordings; the order of the results may differ.
+        asked: The requested estimator; None for the default of each recording.
+    """
+    loaded: dict[tuple[int, float, float], list[tuple[int, Recording, Driver]]] = {}
+    for row in rows:
+        try:
+            of, driver = load(row)
+        except ERRORS as error:
+            yield row, _refusal(error)
+        else:
+            key = of.samples["v_th"].stored.size, of.sample_rate, of.pulse_rate
+            loaded.setdefault(key, []).append((row, of, driver))
+    for alike in loaded.values():
+        for first in range(0, len(alike), TOGETHER):
+            part = alike[first : first + TOGETHER]
+            group = Group([of for _, of, _ in part])
+            for number, (row, of, driver) in enumerate(part):
+                yield row, _planned(Inspected(of, group, number), driver, asked)
+
+
+def _planned(seen: Inspected, driver: Driver, asked: AbstractEstimator | None) -> Planned | Refusal:
+    try:
+        estimator, name = plan(asked, seen, driver)
+    except ERRORS as error:
+        return _refusal(error)
+    return (
+        Planned(seen, driver, estimator) if name is None else Refusal(name, explained(seen, name))
+    )
+
+
+def _refusal(error: Exception) -> Refusal:
+    return Refusal(
+        "driver_failed" if isinstance(error, IdentificationError) else "unreadable", str(error)
+    )
