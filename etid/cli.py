@@ -37,8 +37,9 @@ from etid.commands import (
     report,
     simulate,
 )
+from etid.commands.outputs import check_outputs
 
-COMMANDS = {
+COMMANDS: dict[str, Any] = {
     "simulate": simulate,
     "import": importing,
     "check": check,
@@ -66,6 +67,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     if source is not None and _same_file(source, arguments.target):
         commands.error(f"{arguments.target} is the file to read; name another file to write")
     try:
+        if "force" in arguments:
+            check_outputs(COMMANDS[arguments.command].outputs(arguments), force=arguments.force)
         outcome = arguments.run(arguments)
     except (etid.RecordingError, etid.IdentificationError, ValueError, OSError) as error:
         text = " ".join(str(error).split())
@@ -110,6 +113,8 @@ def parser() -> argparse.ArgumentParser:
         summary = text[0].lower() + text[1:].rstrip(".")
         command = commands.add_parser(name, help=summary, description=module.__doc__)
         module.add_arguments(command)
+        if hasattr(module, "outputs"):
+            command.add_argument("--force", action="store_true", help="replace existing files")
         command.add_argument(
             "--json", action="store_true", help="print one JSON object instead of text"
         )

@@ -93,6 +93,7 @@ def test_the_command_passes_a_circuit_of_etid_on(files, options, monkeypatch, tm
 
     monkeypatch.setattr(command, "identify_jointly" if options else "fit_file", fitted)
     target = str(tmp_path / "new.h5")
+    options = (*options, "--force")
     assert cli.main(["fit", "study.h5", "-o", target, "--circuit", "SkinCole", *options]) == DONE
     assert type(asked["circuit"]) is etid.SkinCole
     assert cli.main(["fit", "study.h5", "-o", target, "--circuit", "auto", *options]) == DONE

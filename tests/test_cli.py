@@ -52,7 +52,8 @@ def study_file(tmp_path):
 def test_simulate_writes_a_study_and_its_truth_and_the_seed_decides(run, tmp_path):
     files = [tmp_path / name for name in ("a.h5", "b.h5", "c.h5")]
     for file, seed in zip(files, (1, 1, 2), strict=True):
-        options = ("--snr-db", 50, "--jitter", 1e-7, "--seed", seed, "--truth", tmp_path / "t.json")
+        options = ("--snr-db", 50, "--jitter", 1e-7, "--seed", seed, "--force")
+        options = (*options, "--truth", tmp_path / "t.json")
         assert run("simulate", "paper_dry", "-o", file, *options) == (
             DONE,
             [f"{file}: 11 recordings"],
@@ -165,7 +166,7 @@ def test_fit_joint_fits_all_recordings_together(run, study_file, tmp_path, monke
     assert asked["order"] == 4
     assert len(printed) > 1
     assert status in (DONE, WRONG_DATA)  # equation error has no success to report
-    options = ("--joint", "--method", "output_error")
+    options = ("--joint", "--method", "output_error", "--force")
     status, _, complaints = run("fit", study_file, "-o", tmp_path / "f.h5", *options)
     assert status == WRONG_DATA
     assert "--joint uses maximum_likelihood" in complaints[0]
@@ -204,7 +205,35 @@ def test_fit_without_any_success_says_so_and_lists_twenty_at_most(run, tmp_path)
         (("fit", "calibration.h5", "-o", "fits.h5"), "no loaded recording"),
         (("import", "absent.csv", "out.h5"), "absent.csv: there is no such file"),
         (("import", "table.csv", "out.h5"), "v_th: is not given"),
-        (("simulate", "paper_dry", "-o", "absent/study.h5"), "cannot be written"),
+        (("simulate", "paper_dry", "-o", "absent/s.h5"), "absent/s.h5: the folder of this file"),
+        (("simulate", "paper_dry", "-o", "s.h5", "--truth", "absent/t.json"), "absent/t.json: the"),
+        (("import", "table.csv", "absent/s.h5"), "absent/s.h5: the folder of this file"),
+        (("report", "fits.h5", "-o", "absent/page.html"), "absent/page.html: the folder of"),
+        (("export", "fits.h5", "-o", "absent/t.csv"), "absent/t.csv: the folder of this file"),
+        (("fit", "study.h5", "-o", "."), ".: this is a folder"),
+        (("fit", "study.h5", "-o", "table.csv"), "table.csv: the file is not written as .csv; "),
+        (("report", "fits.h5", "-o", "page.pdf"), "page.pdf: the file is not written as .pdf; "),
+        (("fit", "study.h5", "-o", "calibration.h5"), "this file exists; add --force to replace"),
+        (("report", "study.h5"), "run etid fit first"),
+        (("simulate", "paper_dry", "-o", "s.h5", "--jitter", "5"), "below half a pulse period"),
+        (
+            (
+                "import",
+                "table.csv",
+                "s.h5",
+                "--v-th",
+                "open",
+                "--v-out",
+                "open",
+                "--scale",
+                "1",
+                "--pulse-rate",
+                "60",
+                "--sample-rate",
+                "2e5",
+            ),
+            "v_out: is channel 'open', and so is v_th",
+        ),
         (("simulate", "paper_dry", "-o", "s.h5", "--jitter", "-1"), "must not be negative"),
     ],
 )
@@ -356,6 +385,10 @@ def test_every_command_has_a_summary_and_json(run, command):
     "arguments",
     [(), ("nonsense",), ("fit", "study.h5"), ("simulate", "nonsense", "-o", "x.h5"),
      ("fit", "a.h5", "-o", "b.h5", "--method", "guessing"), ("--completion", "sh"),
+     ("fit", "a.h5", "-o", "b.h5", "--workers", "0"),
+     ("fit", "a.h5", "-o", "b.h5", "--workers", "-1"),
+     ("fit", "a.h5", "-o", "b.h5", "--order", "50"),
+     ("fit", "a.h5", "-o", "b.h5", "--order", "many"),
      ("fit", "--json")],
 )  # fmt: skip
 def test_wrong_usage_ends_with_2(run, arguments):

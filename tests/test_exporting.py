@@ -85,6 +85,18 @@ def test_a_csv_table_has_every_digit_and_its_units_in_the_names(fits, file, part
             assert found == list(column)
 
 
+def test_no_text_of_a_csv_table_is_a_formula(fits, tmp_path):
+    """Programs for spreadsheets compute cells that begin so; `=cmd|' /C calc'!A0` even runs."""
+    texts = ["=1+1", "+1", "-1", "@SUM(A1)", "\t=1"]
+    labels = {**fits.labels, "subject": np.resize(np.array(texts, object), len(fits))}
+    Fits(fits.fit, labels, fits.notes).write(tmp_path / "fits.h5")
+    etid.export_fits(tmp_path / "fits.h5", tmp_path / "fits.csv")
+    with (tmp_path / "fits.csv").open(newline="", encoding="utf-8") as text:
+        rows = list(csv.DictReader(text))
+    assert [row["subject"] for row in rows[:5]] == [f"'{text}" for text in texts]
+    assert rows[0]["path"] == "path 0"
+
+
 def test_a_parquet_table_has_its_units_in_the_metadata(fits, file, parts, tmp_path):
     target = tmp_path / "table.parquet"
     etid.export_fits(file, target)
@@ -294,7 +306,8 @@ def test_a_missing_package_is_named_with_its_extra(
         (("absent.h5", "-o", "t.csv"), "absent.h5: there is no such file"),
         (("garbage.h5", "-o", "t.csv"), "garbage.h5: is not an HDF5 file"),
         (("study.h5", "-o", "t.csv"), "schema: is 'etid/recording', not 'etid/fits'"),
-        (("fits.h5", "-o", "t.xlsx"), "t.xlsx: fits are exported as .csv or .parquet, not '.xlsx'"),
+        (("fits.h5", "-o", "t.xlsx"), "t.xlsx: the file is not written as .xlsx; name it t.csv"),
+        (("fits.h5", "-o", "t.abc"), "t.abc: fits are exported as .csv or .parquet, not '.abc'"),
         (("fits.h5", "-o", "absent/t.csv"), "absent/t"),
         (
             ("fits.h5", "-o", "t.nwb", "--session-start", "2026-01-31T09:30Z"),
@@ -330,6 +343,8 @@ def test_what_cannot_be_exported_is_one_line(
 def test_the_command_exports_all(file, study_file, tmp_path):
     assert cli.main(["export", str(file), "-o", str(tmp_path / "t.csv")]) == 0
     assert cli.main(["export", str(file), "-o", str(tmp_path / "t.cir"), "--path", "path 1"]) == 0
+    assert cli.main(["export", str(file), "-o", str(tmp_path / "t.csv")]) == 1
+    assert cli.main(["export", str(file), "-o", str(tmp_path / "t.csv"), "--force"]) == 0
     assert ".subckt load_path_1" in (tmp_path / "t.cir").read_text("utf-8")
     start = ("--session-start", "2026-01-31T09:30:00+00:00")
     target = tmp_path / "t.nwb"

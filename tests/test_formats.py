@@ -47,6 +47,13 @@ def pair(v_th="rig/open", v_out="rig/skin", **more):
     return {**GIVEN, "v_th": {"channel": v_th}, "v_out": {"channel": v_out}, **more}
 
 
+def sweep(number):
+    return {"channel": "channel 0", "rows": number}
+
+
+SWEEPS = {**GIVEN, "v_th": sweep(0), "v_out": sweep(1)}  # both records in one channel
+
+
 def rig(path, unit="V", interval=5e-6, v_out=V_OUT, **own):
     signals = {"rig/open": (V_TH, {}), "rig/skin": (v_out, own)}
     return tdms(path / "rig.tdms", signals, unit_string=unit, wf_increment=interval)
@@ -220,9 +227,7 @@ def test_matlab_7_3_needs_no_package_and_cells_and_references_are_no_channels(
 
 def test_the_rate_of_an_abf_file_is_not_cut_to_whole_hertz(tmp_path):
     for rate in (150e3, 200e3, 33_333.0, 1e6 / 7):
-        recordings, _ = imported(
-            abf(tmp_path / "a.abf", np.stack([V_TH, V_OUT]), rate), pair("channel 0", "channel 0")
-        )
+        recordings, _ = imported(abf(tmp_path / "a.abf", np.stack([V_TH, V_OUT]), rate), SWEEPS)
         assert recordings["loaded/0"].sample_rate == pytest.approx(rate, rel=1e-7)  # a float32
 
 
@@ -231,12 +236,12 @@ def test_an_abf_file_that_was_cut_off_is_refused(tmp_path):
     whole = path.read_bytes()
     for cut in (600, len(whole) - 2100, len(whole) - 100):
         path.write_bytes(whole[:-cut])
-        refused(path, pair("channel 0", "channel 0"), "cut off|cannot be read")
+        refused(path, SWEEPS, "cut off|cannot be read")
 
 
 def test_a_channel_in_amperes_is_no_voltage(tmp_path):
     path = abf(tmp_path / "a.abf", np.stack([V_TH, V_OUT]), unit="pA")
-    refused(path, pair("channel 0", "channel 0"), r"v_th.unit: .* is in ampere \(file\)")
+    refused(path, SWEEPS, r"v_th.unit: .* is in ampere \(file\)")
 
 
 # CSV
@@ -316,9 +321,10 @@ def test_time_stamps_are_checked_in_every_part(small_parts, tmp_path):
     path = tmp_path / "t.csv"
     times = np.arange(1000) / 2e5
     for wrong in (300, 999):
-        rows = np.column_stack([np.where(np.arange(1000) >= wrong, times + 3e-6, times), V_TH])
-        np.savetxt(path, rows, "%.17g", ",", header="t [s],open [V]", comments="")
-        said = pair("open", "open", time={"channel": "t"})
+        stamps = np.where(np.arange(1000) >= wrong, times + 3e-6, times)
+        rows = np.column_stack([stamps, V_TH, V_OUT])
+        np.savetxt(path, rows, "%.17g", ",", header="t [s],open [V],skin [V]", comments="")
+        said = pair("open", "skin", time={"channel": "t"})
         refused(path, said, r"time: is not uniform: sample \d+")
 
 

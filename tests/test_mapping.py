@@ -234,5 +234,7 @@ def test_the_command_prints_what_it_used_for_what(rig, tmp_path, capsys):
         "  v_out   'rig/skin' in mV (file), divided by 0.0535",
     ]
     assert cli.main(["import", str(rig), str(target)]) == 1
+    assert "rig.h5: this file exists; add --force to replace it" in capsys.readouterr().err
+    assert cli.main(["import", str(rig), str(target), "--force"]) == 1
     complaint = capsys.readouterr().err
     assert "v_th: is not given, and is not guessed; the channels are 'rig/open', " in complaint

@@ -1,6 +1,7 @@
 """Pre-flight refuses what is broken, and nothing else. No fit is made here."""
 
 import json
+import re
 from typing import Any
 
 import numpy as np
@@ -9,7 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import etid
-from etid.recordings.preflight import SHORTEST, Inspected
+from etid.identify.one import explained
+from etid.recordings.preflight import SHORTEST, Inspected, why_misaligned
 from etid.recordings.preflight import preflight as of_inspected
 from etid.simulation.scenes import PRESETS, Scene, Trial
 from etid.simulation.transformer import OpenLoad, ResistorLoad, SkinLoad
@@ -102,6 +104,22 @@ def test_a_single_sample_at_the_known_rail_is_saturated(recording):
     assert preflight(recording.replace(v_out=v, adc_range=(-200.0, v.max()))) == "saturated"
     assert preflight(recording.replace(v_out=v, adc_range=(v.min(), 200.0))) == "saturated"
     assert preflight(recording.replace(v_out=v, adc_range=(-200.0, 200.0))) is None
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda v: 1e3 * v, "times as large as v_th. .* is one of them in mV"),
+        (lambda v: -v, "polarity of one record is reversed"),
+        (lambda v: np.roll(v, 450), "^$"),
+    ],
+)
+def test_the_cause_of_misaligned_records_is_named(recording, change, words):
+    changed = recording.replace(v_out=change(recording.v_out), adc_range=None)
+    assert preflight(changed) == "misaligned"
+    why = why_misaligned(Inspected(changed))
+    assert re.search(words, why)
+    assert explained(Inspected(changed), "misaligned").startswith(why)
 
 
 def test_swapped_records_are_misaligned(recording):

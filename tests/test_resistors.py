@@ -63,7 +63,10 @@ def test_a_resistor_in_kilohm_beside_one_in_ohm_is_seen(calibrations):
 def test_a_resistor_of_another_unit_makes_an_implausible_driver(calibrations, r_load):
     """One resistor is as good as another to chi2: what is not believed is the impedance."""
     calibration = calibrations[0].replace(r_load=r_load)
-    with pytest.raises(etid.IdentificationError, match=r"implausible.*Is r_load in ohm"):
+    with pytest.raises(
+        etid.IdentificationError,
+        match=r"implausible, \|Z_th\| is .* ohm at 1 kHz.*Is r_load in ohm",
+    ):
         etid.identify_driver(calibration)
     believed = etid.identify_driver(calibration, plausible=(0.0, np.inf))
     assert believed.verdict == "successful"

@@ -442,10 +442,12 @@ def test_the_command_writes_beside_the_fits_and_replaces_no_file_that_it_reads(
     for page in (file, study_file):
         arguments = ["report", str(file), "-o", str(page), "--recordings", str(study_file)]
         assert cli.main(arguments) == 1
-        assert "would replace a file that is read" in capsys.readouterr().err
+        assert f"{page}: the file is not written as .h5" in capsys.readouterr().err
+        with pytest.raises(ValueError, match="would replace a file that is read"):
+            etid.write_report(file, page, recordings=study_file)
     assert file.read_bytes() == before
     assert cli.main(["report", str(study_file)]) == 1
-    assert "schema: is 'etid/recording'" in capsys.readouterr().err
+    assert "run etid fit first" in capsys.readouterr().err
 
 
 def test_a_browser_shows_the_whole_page_without_complaint(page):

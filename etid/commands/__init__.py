@@ -1,8 +1,9 @@
 """The commands of `etid`, one module per command.
 
-The module of a command has two functions, `add_arguments(parser)` and `run(arguments)`. `run`
-returns an `Outcome` and prints nothing on stdout. The first line of the module's docstring is the
-help of the command.
+The module of a command has the functions `add_arguments(parser)` and `run(arguments)`. `run`
+returns an `Outcome` and prints nothing on stdout. A command that writes files also has the function
+`outputs(arguments)`, which returns them for `etid.commands.outputs.check_outputs`. The first line
+of the module's docstring is the help of the command.
 """
 
 import dataclasses

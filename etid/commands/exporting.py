@@ -10,7 +10,9 @@ import pathlib
 
 from etid.commands import Outcome
 from etid.commands.circuits import add_circuit
-from etid.files.exporting import CIRCUITS, export_circuit, export_fits, export_study
+from etid.files.exporting import CIRCUITS, TABLES, export_circuit, export_fits, export_study
+
+_FORMATS = (*TABLES, *CIRCUITS, ".nwb")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -41,6 +43,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def moment(text: str) -> datetime.datetime:
     """Date and time from a text in the format of ISO 8601."""
     return datetime.datetime.fromisoformat(text)
+
+
+def outputs(arguments: argparse.Namespace) -> dict[pathlib.Path, tuple[str, ...]]:
+    """The target; its ending chooses the format."""
+    return {arguments.target: _FORMATS}
 
 
 def run(arguments: argparse.Namespace) -> Outcome:

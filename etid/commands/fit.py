@@ -14,13 +14,17 @@ import numpy as np
 from etid.circuits.display import DISPLAY, heading
 from etid.commands import DONE, WRONG_DATA, Outcome
 from etid.commands.circuits import add_circuit
+from etid.commands.outputs import HDF5
 from etid.estimators import registry
+from etid.identify.arguments import order_of
 from etid.identify.file import fit_file, kept, processes
 from etid.identify.jointly import identify_jointly
 from etid.recordings import hdf5
+from etid.recordings.errors import RecordingError
 from etid.report.html import Table
 from etid.results.study_fits import StudyFits
-from etid.results.tried_orders import AUTO, Order
+from etid.results.tried_orders import Order
+from etid.results.verdicts import message
 
 _SHOWN = 20  # most unsuccessful recordings to list
 
@@ -59,7 +63,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     where = parser.add_mutually_exclusive_group()
     where.add_argument(
         "--workers",
-        type=int,
+        type=_workers,
         metavar="N",
         help="number of processes on this machine, one core each",
     )
@@ -71,14 +75,27 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _order(text: str) -> Order:
-    """The value of --order; argparse reports a ValueError."""
-    return AUTO if text == AUTO else int(text)
+    """The value of --order."""
+    try:
+        return order_of(int(text) if text.lstrip("-").isdecimal() else text)
+    except RecordingError as error:
+        raise argparse.ArgumentTypeError(str(error)) from error
+
+
+def _workers(text: str) -> int:
+    """The value of --workers."""
+    if not text.isdecimal() or not int(text):
+        raise argparse.ArgumentTypeError(f"{text!r} is not a number of processes, 1 or more")
+    return int(text)
+
+
+def outputs(arguments: argparse.Namespace) -> dict[pathlib.Path, tuple[str, ...]]:
+    """The file of fits."""
+    return {arguments.target: HDF5}
 
 
 def run(arguments: argparse.Namespace) -> Outcome:
     """Identify the drivers and loads, and write the file of fits."""
-    if not arguments.target.absolute().parent.is_dir():  # checked before hours of fitting
-        raise ValueError(f"{arguments.target}: the folder of this file does not exist")
     if arguments.joint and arguments.method not in (None, "maximum_likelihood"):
         raise ValueError(f"--joint uses maximum_likelihood; remove --method {arguments.method}")
     if arguments.joint and arguments.driver_drift:
@@ -145,7 +162,7 @@ def _summary(outcome: StudyFits) -> str:
             f"order {driver.order}, {driver.verdict}, "
             f"RRSE {100 * float(driver.rrse):.3g} %, chi2 {float(driver.chi2):.3g}"
         )
-        lines.append(f"driver {', '.join(paths)}: {text}")
+        lines.append(f"driver {', '.join(paths)}: {text}. {message(driver.verdict)}".rstrip(". "))
     lines += [f"driver {', '.join(paths)}: {text}" for paths, text in outcome.failures.items()]
     if "successful" in fits.counts():
         lines += [

@@ -5,6 +5,7 @@ import dataclasses
 import pathlib
 
 from etid.commands import Outcome
+from etid.commands.outputs import HDF5
 from etid.files.importing import import_file
 from etid.files.mapping import CHANNELS, FIELDS
 from etid.recordings.fields import DECLARED, SIGNALS
@@ -38,6 +39,11 @@ def _option(
 ) -> None:
     metavar = "NAME" if kind is str else "NUMBER"
     parser.add_argument(f"--{name.replace('_', '-')}", type=kind, metavar=metavar, help=help)
+
+
+def outputs(arguments: argparse.Namespace) -> dict[pathlib.Path, tuple[str, ...]]:
+    """The file of recordings."""
+    return {arguments.target: HDF5}
 
 
 def run(arguments: argparse.Namespace) -> Outcome:

@@ -27,8 +27,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_circuit(parser, "circuit of the fits, if it is not a circuit of etid")
 
 
+def outputs(arguments: argparse.Namespace) -> dict[pathlib.Path, tuple[str, ...]]:
+    """The page."""
+    return {_page(arguments): (".html", ".htm")}
+
+
+def _page(arguments: argparse.Namespace) -> pathlib.Path:
+    return arguments.page or arguments.fits.with_suffix(".html")
+
+
 def run(arguments: argparse.Namespace) -> Outcome:
     """Write the page and return its path."""
-    page = arguments.page or arguments.fits.with_suffix(".html")
+    page = _page(arguments)
     write_report(arguments.fits, page, recordings=arguments.recordings, circuit=arguments.circuit)
     return Outcome(str(page), {"fits": arguments.fits, "page": page})

@@ -5,6 +5,7 @@ import json
 import pathlib
 
 from etid.commands import Outcome
+from etid.commands.outputs import HDF5
 from etid.simulation import scenes
 
 
@@ -32,6 +33,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="FILE",
         help="also write the true elements, as JSON in SI units",
     )
+
+
+def outputs(arguments: argparse.Namespace) -> dict[pathlib.Path, tuple[str, ...]]:
+    """The file of recordings, and that of the true elements."""
+    truth = {} if arguments.truth is None else {arguments.truth: (".json",)}
+    return {arguments.target: HDF5, **truth}
 
 
 def run(arguments: argparse.Namespace) -> Outcome:

@@ -24,7 +24,11 @@ from etid.results.hdf5_table import Table, opened_table, same_length
 
 ROWS = 1 << 16  # fits in memory at a time
 
+TABLES = (".csv", ".parquet")
 CIRCUITS = (".cir", ".json")
+
+# First characters of a formula. A program for spreadsheets would compute such a text, or run it.
+_FORMULA = ("=", "+", "-", "@", "\t", "\r")
 
 _QUALITY = {"rrse": "number", "chi2": "number", "steps": "integer", "verdict": "text",
             "remarks": "text", "note": "text"}  # fmt: skip
@@ -34,7 +38,8 @@ def export_fits(source: str | os.PathLike[str], target: str | os.PathLike[str]) 
     """Write the table of a file of fits, `Fits.table()`, for other programs.
 
     - `.csv`: one line of column names, such as `r_s [ohm]` and `r_s_stderr [ohm]`, then one line
-      per fit. Numbers are in SI units with all digits. An unknown number is `nan`.
+      per fit. Numbers are in SI units with all digits. An unknown number is `nan`. A text that
+      begins as a formula does, with `=`, `+`, `-` or `@`, gets an apostrophe in front of it.
     - `.parquet`: the same columns; their names have no unit. The metadata of a column contain its
       `unit`. The metadata of the file contain `circuit`, `method` and `etid_version`. This format
       needs `pip install etid[parquet]`.
@@ -107,7 +112,13 @@ def _csv(
             name if unit in (None, "1") else f"{name} [{unit}]" for name, unit in units.items()
         )
         for part in _parts(table, columns):
-            lines.writerows(zip(*(column.tolist() for column in part.values()), strict=True))
+            cells = ([_cell(item) for item in column.tolist()] for column in part.values())
+            lines.writerows(zip(*cells, strict=True))
+
+
+def _cell(value: str | float | int) -> str | float | int:
+    """Value of a cell; a text that begins as a formula is marked as text."""
+    return f"'{value}" if isinstance(value, str) and value.startswith(_FORMULA) else value
 
 
 def _parquet(
@@ -130,7 +141,7 @@ def _parquet(
             writer.write_table(pyarrow.table(part, schema=schema))
 
 
-_WRITERS = {".csv": _csv, ".parquet": _parquet}
+_WRITERS = dict(zip(TABLES, (_csv, _parquet), strict=True))
 
 
 def export_circuit(

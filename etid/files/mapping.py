@@ -145,6 +145,13 @@ def _plan(
         chosen(names, signal.channel, name)
         if signal.scale is None and name in ("v_th", "v_out"):
             raise _missing("scale", hint="; 1 if the values are those at the terminal")
+    th, out = signals["v_th"], signals["v_out"]
+    if (th.channel, th.rows) == (out.channel, out.rows):
+        raise RecordingError(
+            f"is channel {out.channel!r}, and so is v_th",
+            field="v_out",
+            remedy=f"The channels are {listed(names)}: name another for one of the two",
+        )
     if "time" in said and "sample_rate" in said:
         raise RecordingError(
             "is given together with time: one of time and sample_rate is needed, not both",

@@ -21,7 +21,9 @@ from etid.results.tried_orders import AUTO, Order
 from etid.selection.search import CANDIDATES
 from etid.signals.harmonics import separates_aliases
 
-LARGEST_ORDER = 50  # ten times the order of the paper; memory grows with the square of the order
+# Four times the order of the paper. Calibrations determine no more poles; with 50 poles an
+# identification takes minutes and does not converge.
+LARGEST_ORDER = 20
 
 Circuit = AbstractCircuit | Literal["auto"] | None
 """A circuit, or `"auto"` for the simplest circuit that the data support; None for `SkinRC`."""

@@ -124,7 +124,8 @@ def identify_driver(
     if np.isfinite(size) and not plausible[0] <= size <= plausible[1]:
         driver = dataclasses.replace(driver, result=verdict("implausible"))
     if throw and driver.verdict != "successful":
-        raise IdentificationError(f"driver: {driver.verdict}. {message(driver.verdict)}", driver)
+        found = f"{driver.verdict}, |Z_th| is {size:.3g} ohm at 1 kHz"
+        raise IdentificationError(f"driver: {found}. {message(driver.verdict)}", driver)
     return driver
 
 

@@ -28,7 +28,7 @@ from etid.identify.arguments import (
     require,
 )
 from etid.identify.compiled import stored_jit
-from etid.recordings.preflight import Inspected
+from etid.recordings.preflight import Inspected, why_misaligned
 from etid.recordings.recording import Recording
 from etid.recordings.remarks import Remark
 from etid.recordings.repeats import Repeats, repeats
@@ -411,7 +411,11 @@ def is_shared(seen: Inspected, driver: Driver) -> bool:
 
 def explained(seen: Inspected, name: str) -> str:
     """The message of a verdict of `etid.recordings.preflight`, with the numbers found."""
-    found = seen.train.mismatch if name == "rate_mismatch" else ""
+    found = ""
+    if name == "rate_mismatch":
+        found = seen.train.mismatch
+    elif name == "misaligned":
+        found = why_misaligned(seen)
     return f"{found} {message(name)}".strip()
 
 

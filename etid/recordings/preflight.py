@@ -32,6 +32,7 @@ FLAT = 8.0
 RAIL = 3  # equal extreme samples in a row; a noisy or sloping signal does not produce them
 JUMP = 8.0  # [converter steps] a clipped signal reaches and leaves its rail in larger jumps
 POWER = 1.01  # largest variance of v_out relative to v_th: a passive load takes power
+UNIT = 30.0  # ratio of v_out to v_th beyond which their units differ, not only their order
 EQUAL = 1e-3  # largest relative difference of the amplitudes if no load is connected
 SAME = 1.5  # largest variance of their difference then, relative to the noise
 LATE = 5e-3  # fraction of the signal that a delay of 0.1 sample may leave at the edges
@@ -448,6 +449,23 @@ def preflight(seen: Inspected, *, periodic: bool = False) -> str | None:
     if periodic and not seen.is_periodic:
         return "not_periodic"
     return None
+
+
+def why_misaligned(seen: Inspected) -> str:
+    """The probable cause of the verdict `misaligned`, with numbers; empty if it is not known."""
+    ratio = float(np.std(seen.v_out) / np.std(seen.v_th))
+    if ratio > UNIT:
+        return (
+            f"v_out is {ratio:.3g} times as large as v_th. Their units or scales differ; is one of "
+            "them in mV and the other in V?"
+        )
+    reversed_lag = lag_of(seen.v_th, -seen.v_out, seen.train)
+    if seen.correlated is None and reversed_lag is not None and abs(reversed_lag) <= 1:
+        return (
+            "v_out falls where v_th rises, at the same times. The polarity of one record is "
+            "reversed; change its sign, or exchange the two wires of the probe."
+        )
+    return ""
 
 
 def _is_saturated(v: Float[np.ndarray, " time"], step: float, recording: Recording) -> bool:

@@ -160,8 +160,14 @@ def opened_table(path: str | os.PathLike[str], kind: str) -> Iterator[Table]:
         table = Table(file, name)
         found = table.attribute("schema") if "schema" in table.attributes else None
         if found != kind:
+            recordings = found == "etid/recording"
             raise RecordingError(
-                f"is {found!r}, not {kind!r}", file=name, field="schema", remedy="Name another file"
+                f"is {found!r}, not {kind!r}",
+                file=name,
+                field="schema",
+                remedy="This is a file of recordings: run etid fit first, and name the file of fits"
+                if recordings
+                else "Name another file",
             )
         yield table
 

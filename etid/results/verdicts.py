@@ -60,12 +60,15 @@ class RESULTS(optx.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]  # equi
         "Measure the resistors, and give every r_load in ohm."
     )
     implausible = (
-        "The source impedance at 1 kHz lies outside `plausible`. Is r_load in ohm, and was that "
-        "resistor connected? If the driver really is like this, set `plausible` [ohm]."
+        "The source impedance at 1 kHz lies outside `plausible`. Is r_load in ohm? With r_load in "
+        "kohm the impedance is 1000 times too small. Was that resistor connected, and do v_th and "
+        "v_out have the same unit? If not, the impedance is too large. If the driver really is "
+        "like this, set `plausible` [ohm]."
     )
     unconnected = (
         "v_out equals v_th within the noise: no load draws a current, or both are the same record. "
-        "Check the contact and the channels."
+        "Is the finger on the electrode, or in a calibration, is the resistor connected? Check the "
+        "contact and the channels."
     )
     inconsistent = (
         "The recording and the calibrations contradict each other about the source impedance, or "
@@ -89,7 +92,8 @@ class RESULTS(optx.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]  # equi
     too_short = "The record is too short to identify anything. Record a whole pulse and its tail."
     misaligned = (
         "v_out carries more power than v_th, or is not aligned with it in time. "
-        "Swap the two records, or align them on the edge of the pulse."
+        "Swap the two records, or align them on the edge of the pulse, or correct the unit or the "
+        "polarity of one of them."
     )
     rate_mismatch = (
         "The distance between the pulses of v_th contradicts sample_rate and pulse_rate. Every "

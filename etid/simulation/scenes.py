@@ -150,6 +150,11 @@ class Scene:
         for name in ("trigger_jitter_rms", "offset_rms"):
             if not getattr(self, name) >= 0:
                 raise ValueError(f"{name} is {getattr(self, name)}; it must not be negative")
+        if not self.trigger_jitter_rms * self.pulse_rate < 0.5:
+            raise ValueError(
+                f"trigger_jitter_rms is {self.trigger_jitter_rms:g} s; it must be below half a "
+                f"pulse period, {0.5 / self.pulse_rate:.3g} s"
+            )
         if self.samples < 1:
             raise ValueError(f"samples is {self.samples}; a record has at least one sample")
         if self.bits is not None and not 2 <= self.bits <= 32:
