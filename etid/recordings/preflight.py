@@ -459,7 +459,7 @@ def why_misaligned(seen: Inspected) -> str:
             f"v_out is {ratio:.3g} times as large as v_th. Their units or scales differ; is one of "
             "them in mV and the other in V?"
         )
-    reversed_lag = lag_of(seen.v_th, -seen.v_out, seen.train)
+    (reversed_lag,) = lags_of(np.stack([seen.v_th, -seen.v_out])[None], [seen.train])
     if seen.correlated is None and reversed_lag is not None and abs(reversed_lag) <= 1:
         return (
             "v_out falls where v_th rises, at the same times. The polarity of one record is "
