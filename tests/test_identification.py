@@ -178,7 +178,7 @@ def test_printing_shows_units_and_errors(study, driver, fits):
     assert "±" in text
     assert "kΩ" in text
     assert "nF" in text
-    assert "Z_th at 1 kHz" in str(driver)
+    assert "|Z_th| at 1 kHz" in str(driver)
     assert "6 fits of SkinRC: 6 successful" in str(fits)
 
 

@@ -155,13 +155,15 @@ def test_a_fit_predicts_its_record_down_to_the_noise(study, driver):
 def test_a_fit_prints_its_units():
     cov = np.diag([1e4, 1e6, 1e-14, 1e-6])
     zero = np.zeros(())
-    fit = etid.Fit(SPREAD, cov, cov, zero, zero, verdict("successful"), zero.astype(int), "m")
+    quality = {"rrse": zero, "chi2": zero, "steps": zero.astype(int)}
+    covs = {"cov": cov, "shared_cov": cov}
+    fit = etid.Fit(circuit=SPREAD, result=verdict("successful"), method="m", **covs, **quality)
     lines = str(fit).splitlines()
     assert lines[1:] == [
-        "  r_s       33.40 ± 0.10      kΩ",
-        "  r_p       186.0 ± 1.0       kΩ",
-        "  tau       22.00 ± 0.10      µs",
-        "  alpha    0.8500 ± 0.0010",
+        "  r_s     33.40 ± 0.10    kΩ",
+        "  r_p     186.0 ± 1.0     kΩ",
+        "  tau     22.00 ± 0.10    µs",
+        "  alpha  0.8500 ± 0.0010",
     ]
 
 

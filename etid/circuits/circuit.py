@@ -12,6 +12,7 @@ from typing import Any, ClassVar, TypeVar
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Complex, Float
 
 from etid.circuits.display import DISPLAY
@@ -25,6 +26,7 @@ from etid.circuits.elements import (
     resistor,
 )
 from etid.circuits.impedance import AbstractImpedance, parallel, series
+from etid.circuits.overview import Overview, Overviewed, element_rows
 from etid.signals.transfer import frequency_variable
 
 Circuit = TypeVar("Circuit", bound="AbstractCircuit")
@@ -63,7 +65,7 @@ def parameter(unit: str, *, typical: float) -> Any:
     )
 
 
-class AbstractCircuit(eqx.Module):
+class AbstractCircuit(Overviewed, eqx.Module):
     """A passive two-terminal circuit with positive parameters.
 
     Attributes:
@@ -145,6 +147,20 @@ class AbstractCircuit(eqx.Module):
         slope = jax.jacfwd(alphas)(self.log_values())
         error = jnp.sqrt(jnp.diagonal(slope @ cov @ slope.T))
         return jnp.any(alphas(self.log_values()) - 1 > ABOVE_ONE * error)
+
+    def _overview(self) -> Overview:
+        kind, values = type(self).__name__, np.asarray(self.values())
+        batch = f", batch of {values.shape[:-1]}" if values.ndim > 1 else ""
+        formula = f": {self.formula}" if self.formula else ""
+        return Overview(f"{kind}{batch}{formula}", element_rows(self.units(), values))
+
+    def __repr__(self) -> str:
+        try:
+            overview = self._overview()
+        except Exception:  # as in `Overviewed`
+            return eqx.tree_pformat(self)
+        elements = (f"{name}={text.strip()} {unit}".rstrip() for name, text, unit in overview.rows)
+        return f"{type(self).__name__}({', '.join(elements)})"
 
 
 class SkinRC(AbstractCircuit):

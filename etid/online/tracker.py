@@ -40,6 +40,7 @@ import numpy as np
 from jaxtyping import Array, Complex, Float, Int
 
 from etid.circuits.circuit import AbstractCircuit
+from etid.circuits.overview import Overview, Overviewed
 from etid.estimators.estimator import Description, serving
 from etid.estimators.judgement import (
     MAX_STEPS_REACHED,
@@ -69,7 +70,14 @@ from etid.recordings.preflight import Inspected, preflight
 from etid.recordings.recording import Recording
 from etid.results.driver import Driver, HarmonicDriver
 from etid.results.fits import Fit, Fits, IdentificationError, described
-from etid.results.verdicts import RESULTS, first_verdict, message, verdicts_of
+from etid.results.verdicts import (
+    RESULTS,
+    counted,
+    first_verdict,
+    message,
+    verdict_names,
+    verdicts_of,
+)
 from etid.signals.transfer import as_complex, power, reciprocal
 from etid.solvers.matrices import inverse, inverse_of_few
 
@@ -108,7 +116,7 @@ register_description(
 )
 
 
-class TrackerState(eqx.Module):
+class TrackerState(Overviewed, eqx.Module):
     """Estimates for every electrode after a pulse.
 
     Attributes:
@@ -135,6 +143,21 @@ class TrackerState(eqx.Module):
     chi2: Float[Array, "*lane"]
     rrse: Float[Array, "*lane"]
     result: RESULTS
+
+    def _overview(self) -> Overview:
+        names = verdict_names(self.result)
+        rows = [
+            (str(number), str(name), str(pulses), str(missed), f"{chi2:.3g}")
+            for number, (name, pulses, missed, chi2) in enumerate(
+                zip(names, *map(np.asarray, (self.pulses, self.missed, self.chi2)), strict=True)
+            )
+        ]
+        return Overview(
+            f"State of {names.size} electrodes, last pulse: {counted(names)}",
+            rows,
+            ("electrode", "verdict", "pulses", "missed in a row", "chi2"),
+            ("Tracker.read(state) gives the elements.",),
+        )
 
 
 class Tracker(eqx.Module):

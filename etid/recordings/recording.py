@@ -18,9 +18,12 @@ import numpy as np
 import numpy.typing as npt
 from jaxtyping import Float
 
+from etid.circuits.overview import Overview, Overviewed
 from etid.recordings.errors import RecordingError as RecordingError
-from etid.recordings.fields import LABELS, AbstractFields, Metadata, metadata_from
+from etid.recordings.fields import DECLARED, LABELS, AbstractFields, Metadata, metadata_from
 from etid.recordings.values import real
+
+SYMBOLS = {"hertz": "Hz", "ohm": "Ω", "volt": "V"}
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -83,7 +86,7 @@ class Samples:
 
 
 @dataclasses.dataclass(frozen=True, eq=False, repr=False, init=False)
-class Recording(AbstractFields):
+class Recording(Overviewed, AbstractFields):
     """Unloaded and loaded output of a driver on one clock. It is immutable and equals only itself.
 
     Args:
@@ -179,6 +182,21 @@ class Recording(AbstractFields):
     def __reduce__(self) -> tuple:
         # A read-only mapping cannot be pickled.
         return functools.partial(Recording, **self.samples, **vars(self.metadata)), ()
+
+    def _overview(self) -> Overview:
+        rows = [
+            ("samples", str(self.samples["v_out"].stored.size), ""),
+            ("duration", f"{self.duration:.6g}", "s"),
+            ("periods", f"{self.periods:.4g}", ""),
+        ]
+        for name, field in DECLARED.items():
+            value = getattr(self, name)
+            if value != field.empty:
+                numbers = field.type in ("number", "range")
+                items = value if isinstance(value, tuple) else (value,)
+                text = " … ".join(f"{one:g}" for one in items) if numbers else ", ".join(items)
+                rows.append((name, text, SYMBOLS.get(field.unit, field.unit)))
+        return Overview(f"Recording {self.path!r}", rows)
 
     def __repr__(self) -> str:
         load = "loaded" if self.r_load is None else f"calibration with {self.r_load:g} ohm"

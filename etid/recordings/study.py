@@ -2,11 +2,13 @@
 
 import dataclasses
 import difflib
+import itertools
 import os
 from collections.abc import Callable, Collection, Hashable, Iterable, Iterator, Mapping
 
 import numpy.typing as npt
 
+from etid.circuits.overview import ROWS, Overview, Overviewed
 from etid.recordings.fields import LABELS, Label, Metadata, wanted_labels
 from etid.recordings.recording import AbstractSource, Layout, Recording, RecordingError
 from etid.recordings.writing import write
@@ -56,7 +58,7 @@ def refuse_nested(paths: Collection[str]) -> None:
             outer = outer.rpartition("/")[0]
 
 
-class Study(Mapping[str, Recording]):
+class Study(Overviewed, Mapping[str, Recording]):
     """Ordered recordings by path; recordings of a file are loaded when they are accessed.
 
     `Study.from_recordings` and `etid.read` make a study. A study from a file keeps the file open:
@@ -235,6 +237,17 @@ class Study(Mapping[str, Recording]):
 
     def __exit__(self, *exception: object) -> None:
         self.close()
+
+    def _overview(self) -> Overview:
+        rows = []
+        for path, source in itertools.islice(self._sources.items(), ROWS):
+            of = source.metadata
+            known = "" if of.r_load is None else f"{of.r_load / 1e3:.6g} kΩ"
+            labels = [getattr(of, name) for name in LABELS]
+            rows.append((path, known, f"{of.sample_rate:g}", f"{of.pulse_rate:g}", *labels))
+        heads = ("path", "r_load", "sample_rate [Hz]", "pulse_rate [Hz]", *LABELS)
+        notes = [str(problem) for problem in self.problems.values()]
+        return Overview(repr(self).strip("<>"), rows, heads, notes[:ROWS], count=len(self))
 
     def __repr__(self) -> str:
         place = f" {self.file!r}" if self.file else ""

@@ -19,6 +19,8 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Complex, Float, Int
 
+from etid.circuits.display import plus_minus
+from etid.circuits.overview import Overview
 from etid.recordings.remarks import texts
 from etid.results.tried_orders import TriedOrders
 from etid.results.verdicts import RESULTS, Judged, message
@@ -32,10 +34,10 @@ from etid.signals.transfer import (
     multiply_polynomials,
     reciprocal,
 )
-from etid.solvers.propagation import log_stderr
 
 # Frequencies at which a discrete filter approximates Z_th, relative to the sample rate.
 SAMPLED = np.geomspace(1e-4, 0.49, 300)
+SHOWN = 1e3  # [Hz] frequency of the Z_th that `print` shows
 
 
 class SourceImpedance(eqx.Module):
@@ -275,21 +277,36 @@ class Driver(Judged):
         """
         return jnp.abs(self.response(frequency)) * self.log_response_stderr(frequency)[0]
 
-    def __str__(self) -> str:
-        z = complex(self.response(jnp.array(1e3)))
-        lines = [
-            f"Driver of order {self.order}: {self.verdict} in {int(self.steps)} steps "
-            f"({self.method}), RRSE {100 * float(self.rrse):.3g} %, chi2 {float(self.chi2):.3g}",
-            f"Z_th at 1 kHz {z.real / 1e3:.4g} {z.imag / 1e3:+.4g}j kΩ",
-            *self._findings(),
+    def _overview(self) -> Overview:
+        verdict, (at, errors) = self.verdict, _at(self, jnp.array([SHOWN]))
+        z, (of_size, of_phase) = complex(at[0]), map(float, errors[:, 0])
+        rows = [
+            (
+                f"|Z_th| at {SHOWN / 1e3:g} kHz",
+                plus_minus(abs(z) / 1e3, of_size * abs(z) / 1e3),
+                "kΩ",
+            ),
+            ("its phase", plus_minus(*np.degrees((np.angle(z), of_phase)).tolist()), "°"),
         ]
-        if self.verdict != "successful":
-            lines.append(message(self.verdict))
-        return "\n  ".join([*lines, *texts(int(self.remarks))])
+        notes = [*self._findings(), *([message(verdict)] if verdict != "successful" else [])]
+        return Overview(
+            f"Driver of order {self.order}: {verdict} in {int(self.steps)} steps "
+            f"({self.method}), RRSE {100 * float(self.rrse):.3g} %, chi2 {float(self.chi2):.3g}",
+            rows,
+            notes=[*notes, *texts(int(self.remarks))],
+        )
 
     def _findings(self) -> list[str]:
         """Lines on the orders tried, and on known resistors and their values from the others."""
         return []
+
+
+@eqx.filter_jit  # one by one, its many operations compile ten times as long
+def _at(
+    driver: Driver, frequency: Float[Array, " frequency"]
+) -> tuple[Complex[Array, " frequency"], Float[Array, "2 frequency"]]:
+    """Z_th [Ω], and the standard errors of ln |Z_th| and of the phase [rad]."""
+    return driver.response(frequency), driver.log_response_stderr(frequency)
 
 
 class DiscreteDriver(Driver):
@@ -346,9 +363,13 @@ class ContinuousDriver(Driver):
     def log_response_stderr(
         self, frequency: Float[Array, " frequency"]
     ) -> Float[Array, "2 frequency"]:
-        """Standard errors of ln |Z_th| and of its phase [rad] at real frequencies [Hz]."""
-        values, unflatten = ravel_pytree(self.source)
-        return log_stderr(lambda p: unflatten(p).response(frequency), values, self.cov)
+        """Standard errors of ln |Z_th| and of its phase [rad] at real frequencies [Hz].
+
+        var = J cov Jᵀ,    J = ∂(ln |Z_th|, arg Z_th) / ∂parameters
+        """
+        relative = self.source.slopes(frequency) * reciprocal(self.response(frequency))[None, :]
+        parts = jnp.stack([relative.real, relative.imag])
+        return jnp.sqrt(jnp.einsum("cif,ij,cjf->cf", parts, self.cov, parts))
 
     def _findings(self) -> list[str]:
         known, tried = self.calibration, [str(self.tried)] if self.tried.orders else []

@@ -2,6 +2,7 @@
 
 import dataclasses
 import importlib.metadata
+import itertools
 import os
 import reprlib
 from collections.abc import Mapping, Sequence
@@ -14,13 +15,14 @@ import numpy as np
 from jaxtyping import Array, Bool, Complex, Float, Int
 
 from etid.circuits.circuit import AbstractCircuit
-from etid.circuits.display import DISPLAY, plus_minus, quantity
+from etid.circuits.display import heading, quantity
 from etid.circuits.lookup import qualified, remembered
+from etid.circuits.overview import Overview, Overviewed, element_rows
 from etid.recordings.fields import DESCRIBING, Label, wanted_labels
 from etid.recordings.recording import RecordingError
 from etid.recordings.remarks import remarks_of, texts, words
 from etid.results.hdf5_table import Table, opened_table, same_length, write_table
-from etid.results.verdicts import RESULTS, Judged, message, verdicts_of
+from etid.results.verdicts import RESULTS, Judged, counted, counts, message, verdicts_of
 
 SCHEMA = "etid/fits"
 # Columns that describe each recording: its path, its labels, and numbers.
@@ -166,25 +168,18 @@ class Fit(Judged):
             )
         )
 
-    def __str__(self) -> str:
+    def _overview(self) -> Overview:
+        kind, verdict = type(self.circuit).__name__, self.verdict
+        values, errors = np.asarray(self.circuit.values()), np.asarray(self.stderr.values())
+        rows = element_rows(self.circuit.units(), values, errors)
         if np.ndim(self.rrse):
-            return f"{type(self.circuit).__name__} fits, batch of {np.shape(self.rrse)}"
-        kind = type(self.circuit).__name__
-        head = f"{kind}: {self.verdict} in {int(self.steps)} steps ({self.method})"
-        head += f", RRSE {100 * float(self.rrse):.3g} %, chi2 {float(self.chi2):.3g}"
-        lines = [head]
-        width = max(4, *map(len, self.circuit.names()))
-        for name, unit in self.circuit.units().items():
-            scale, symbol = DISPLAY[unit]
-            value = float(getattr(self.circuit, name)) / scale
-            error = float(getattr(self.stderr, name)) / scale
-            lines.append(f"  {name:<{width}}{plus_minus(value, error)} {symbol}".rstrip())
-        if self.verdict != "successful":
-            lines.append("  " + message(self.verdict))
-        if self.verdict == "changed":
-            lines.append("  " + self.changes)
-        lines += ["  " + text for text in texts(int(self.remarks))]
-        return "\n".join(lines)
+            batch = f"{kind} fits, batch of {np.shape(self.rrse)}: {counted(verdict)}"
+            return Overview(batch, rows)
+        title = f"{kind}: {verdict} in {int(self.steps)} steps ({self.method})"
+        title += f", RRSE {100 * float(self.rrse):.3g} %, chi2 {float(self.chi2):.3g}"
+        notes = [message(verdict)] if verdict != "successful" else []
+        notes += [self.changes] if verdict == "changed" else []
+        return Overview(title, rows, notes=[*notes, *texts(int(self.remarks))])
 
 
 def described(recordings: Sequence[Mapping[str, Any]]) -> dict[str, np.ndarray]:
@@ -203,8 +198,8 @@ def described(recordings: Sequence[Mapping[str, Any]]) -> dict[str, np.ndarray]:
     }
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
-class Fits:
+@dataclasses.dataclass(frozen=True, eq=False, repr=False)
+class Fits(Overviewed):
     """Identified circuits of many recordings, in the order of the recordings.
 
     Attributes:
@@ -287,9 +282,7 @@ class Fits:
 
     def counts(self) -> dict[str, int]:
         """How often each verdict occurs, most frequent first."""
-        names, counts = np.unique(self.verdicts, return_counts=True)
-        order = np.argsort(-counts, kind="stable")
-        return {str(names[i]): int(counts[i]) for i in order}
+        return counts(self.verdicts)
 
     def table(self) -> dict[str, np.ndarray]:
         """One column per label, element [SI], standard error, quality and verdict."""
@@ -387,18 +380,21 @@ class Fits:
                 row[f"{name}_between"] = float(np.sqrt(np.maximum(excess, 0.0)))
         return rows
 
-    def __str__(self) -> str:
-        verdicts = ", ".join(f"{count} {name}" for name, count in self.counts().items())
-        lines = [f"{len(self)} fits of {type(self.circuit).__name__}: {verdicts}"]
-        units = self.circuit.units()
-        for row in self.summary("subject", "condition"):
-            where = " ".join(filter(None, (row["subject"], row["condition"]))) or "all"
-            text = f"  {where:<20}{row['successful']:>4}/{row['fits']:<4}"
-            for name, unit in units.items():
-                scale, symbol = DISPLAY[unit]
-                text += f"  {name} {row[name] / scale:.4g} {symbol}"
-            lines.append(text)
-        return "\n".join(lines)
+    def _overview(self) -> Overview:
+        rows, units = [], self.circuit.units()
+        for group in self.summary("subject", "condition"):
+            where = " ".join(filter(None, (group["subject"], group["condition"]))) or "all"
+            values, errors = (
+                np.array([group[name + part] for name in units]) for part in ("", "_stderr")
+            )
+            elements = [text for _, text, _ in element_rows(units, values, errors)]
+            rows.append((where, f"{group['successful']}/{group['fits']}", *elements))
+        return Overview(
+            f"{len(self)} fits of {type(self.circuit).__name__}: {counted(self.verdicts)}",
+            rows,
+            ("", "successful", *itertools.starmap(heading, units.items())),
+            ("Median of the successful fits ± median standard error of one fit.",),
+        )
 
     def as_table(self) -> tuple[dict[str, np.ndarray], dict[str, str], dict[str, Any]]:
         """Columns of the file that `write` makes, their units, and its attributes."""

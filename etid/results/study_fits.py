@@ -6,6 +6,7 @@ dataset `drivers` with one line of JSON for each driver. `etid.Fits.read` ignore
 
 import dataclasses
 import functools
+import itertools
 import json
 import math
 import os
@@ -20,6 +21,7 @@ import numpy as np
 from jaxtyping import Array
 
 from etid.circuits.circuit import AbstractCircuit
+from etid.circuits.overview import ROWS, Overview, Overviewed
 from etid.recordings.recording import RecordingError
 from etid.recordings.remarks import remarks_of, words
 from etid.results.driver import (
@@ -40,8 +42,8 @@ _DAMAGED = (ValueError, TypeError, AttributeError, KeyError, OverflowError, Recu
 _SETTINGS = {field.name: field.type for field in dataclasses.fields(Settings)}
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
-class StudyFits:
+@dataclasses.dataclass(frozen=True, eq=False, repr=False)
+class StudyFits(Overviewed):
     """Fits and drivers of a study, from `identify_study`, `identify_jointly`, `fit_file` or a file.
 
     Attributes:
@@ -67,6 +69,21 @@ class StudyFits:
         failures = {paths: text for part in found for paths, text in part.failures.items()}
         fits = Fits.concatenate([part.fits for part in found])
         return cls(fits, drivers, failures, found[0].settings)
+
+    def _overview(self) -> Overview:
+        rows = [
+            (", ".join(paths), str(driver.order), driver.verdict, f"{float(driver.chi2):.3g}")
+            for paths, driver in itertools.islice(self.drivers.items(), ROWS)
+        ]
+        failures = itertools.islice(self.failures.items(), ROWS)
+        drivers = Overview(
+            f"{len(self.drivers)} drivers, {len(self.failures)} failed",
+            rows,
+            ("calibrations", "order", "verdict", "chi2"),
+            [f"{', '.join(paths)}: {text}" for paths, text in failures],
+            count=len(self.drivers),
+        )
+        return dataclasses.replace(self.fits._overview(), then=(drivers,))
 
     def write(self, path: str | os.PathLike[str]) -> None:
         """Write the fits, the drivers and the settings to an HDF5 file.

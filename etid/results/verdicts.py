@@ -13,6 +13,8 @@ import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Bool
 
+from etid.circuits.overview import Overviewed
+
 
 class RESULTS(optx.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]  # equinox enumerations extend by inheritance
     """Outcome of one identification. Only `successful` means that the result can be used.
@@ -139,7 +141,19 @@ def verdict_names(result: RESULTS) -> np.ndarray:
     return np.vectorize(_NAMES.__getitem__, otypes=[object])(values).astype(str)
 
 
-class Judged(eqx.Module):
+def counts(names: np.ndarray) -> dict[str, int]:
+    """How often each verdict occurs, most frequent first."""
+    found, number = np.unique(names, return_counts=True)
+    order = np.argsort(-number, kind="stable")
+    return {str(found[i]): int(number[i]) for i in order}
+
+
+def counted(names: np.ndarray) -> str:
+    """How often each verdict occurs, as text."""
+    return ", ".join(f"{number} {name}" for name, number in counts(names).items())
+
+
+class Judged(Overviewed, eqx.Module):
     """An outcome with a verdict, or a batch of outcomes.
 
     Attributes:

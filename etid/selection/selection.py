@@ -6,17 +6,19 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from etid.circuits.circuit import AbstractCircuit
+from etid.circuits.overview import Overview, Overviewed
 from etid.recordings.remarks import Remark
 from etid.results.fits import Fit
 from etid.results.verdicts import message
 from etid.selection.evidence import bic, rank, weights, with_close
 from etid.selection.residuals import looks_like
 
+HEADS = ("circuit", "2 log evidence", "weight", "chi2", "verdict", "elements")
 CLOSE = 0.02  # weight of another circuit from which on a remark is made
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
-class Candidate:
+@dataclasses.dataclass(frozen=True, eq=False, repr=False)
+class Candidate(Overviewed):
     """A circuit that was fitted.
 
     Attributes:
@@ -40,9 +42,24 @@ class Candidate:
         """Whether the data do not contradict the circuit and determine all its elements."""
         return rank(self.fit) == 0
 
+    @property
+    def row(self) -> tuple[str, ...]:
+        """Name, evidence, weight, χ², verdict and elements as text."""
+        return (
+            self.name,
+            f"{self.evidence:.1f}",
+            f"{100 * self.weight:.1f} %",
+            f"{float(self.fit.chi2):.3f}",
+            str(self.fit.verdict),
+            ", ".join(self.fit.elements),
+        )
 
-@dataclasses.dataclass(frozen=True, eq=False)
-class Selection:
+    def _overview(self) -> Overview:
+        return Overview(f"Candidate {self.name}", [self.row], HEADS)
+
+
+@dataclasses.dataclass(frozen=True, eq=False, repr=False)
+class Selection(Overviewed):
     """The simplest circuit that the data support.
 
     Attributes:
@@ -90,32 +107,17 @@ class Selection:
         """What the residual looks like if no candidate is adequate; otherwise empty."""
         return "" if self.candidates[0].adequate else looks_like(self.candidates[0].fit)
 
-    def __str__(self) -> str:
+    def _overview(self) -> Overview:
         total = len(self.candidates) + len(self.unasked)
-        lines = [f"{self.candidates[0].name} of {total} candidates: {self.fit.verdict}"]
-        rows = [
-            (
-                one.name,
-                f"{one.evidence:.1f}",
-                f"{100 * one.weight:.1f} %",
-                f"{float(one.fit.chi2):.3f}",
-                str(one.fit.verdict),
-                ", ".join(one.fit.elements),
-            )
-            for one in self.candidates
-        ]
-        heads = ("circuit", "2 log evidence", "weight", "chi2", "verdict", "elements")
-        widths = [max(map(len, column)) for column in zip(heads, *rows, strict=True)]
-        for row in (heads, *rows):
-            cells = [cell.ljust(width) for cell, width in zip(row, widths, strict=True)]
-            lines.append("  " + "  ".join(cells).rstrip())
+        notes = []
         if self.unasked:
-            lines.append(f"  not fitted, the data did not ask for it: {', '.join(self.unasked)}")
+            notes.append(f"not fitted, the data did not ask for it: {', '.join(self.unasked)}")
         if self.fit.verdict != "successful":
-            lines.append("  " + message(self.fit.verdict))
+            notes.append(message(self.fit.verdict))
         if self.residual:
-            lines.append("  " + self.residual)
-        return "\n".join(lines)
+            notes.append(self.residual)
+        title = f"{self.candidates[0].name} of {total} candidates: {self.fit.verdict}"
+        return Overview(title, [one.row for one in self.candidates], HEADS, notes)
 
 
 def _with_remark(fits: Mapping[int, Fit], chosen: int, share: Mapping[int, float]) -> Fit:

@@ -21,15 +21,15 @@ import numpy as np
 from jaxtyping import Complex, Float
 
 from etid.circuits.circuit import AbstractCircuit, Resistor, SkinRC
-from etid.circuits.display import DISPLAY
+from etid.circuits.overview import Overview, Overviewed, element_rows
 from etid.identify.arguments import require, require_float64
 from etid.simulation.scenes import Scene, Trial
 from etid.simulation.transformer import ResistorLoad, SkinLoad, loading
 from etid.solvers.matrices import inverse
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
-class Bound:
+@dataclasses.dataclass(frozen=True, eq=False, repr=False)
+class Bound(Overviewed):
     """The smallest standard errors for one trial of a scene.
 
     Attributes:
@@ -58,20 +58,17 @@ class Bound:
         """Elements whose bound exceeds their value."""
         return tuple(name for name, error in self.relative.items() if not error < 1)
 
-    def __str__(self) -> str:
-        lines = [f"{type(self.circuit).__name__} {self.path!r}, smallest standard errors:"]
-        units = self.circuit.units()
-        width = max(4, *map(len, units))
-        for name, error in self.relative.items():
-            scale, symbol = DISPLAY[units[name]]
-            value = float(getattr(self.circuit, name)) / scale
-            lines.append(f"  {name:<{width}}{value:10.4g} {symbol:<3} ± {100 * error:.2g} %")
+    def _overview(self) -> Overview:
+        elements = element_rows(self.circuit.units(), np.asarray(self.circuit.values()))
+        rows = [(*row, f"± {100 * self.relative[row[0]]:.2g} %") for row in elements]
+        notes = []
         if self.undetermined:
-            lines.append(
-                f"  The records do not determine {' and '.join(self.undetermined)}: record more "
+            notes.append(
+                f"The records do not determine {' and '.join(self.undetermined)}: record more "
                 "periods, with less noise or a higher sample rate, or identify a simpler circuit."
             )
-        return "\n".join(lines)
+        title = f"{type(self.circuit).__name__} {self.path!r}, smallest standard errors:"
+        return Overview(title, rows, notes=notes)
 
 
 def bound(scene: Scene, *, delays: bool = True, known_driver: bool = False) -> dict[str, Bound]:

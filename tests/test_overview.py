@@ -1,0 +1,172 @@
+"""What `print`, `repr` and a notebook show: values, errors, units and verdicts, no arrays."""
+
+import dataclasses
+import functools
+import re
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import etid
+from etid.circuits.overview import ROWS, Overview
+from etid.online.tracker import TrackerState
+from etid.results.driver import Calibration, ContinuousDriver, SourceImpedance
+from etid.results.fits import Support, described
+from etid.results.verdicts import verdict, verdicts_of
+from etid.selection.selection import Selection
+from etid.simulation.bound import Bound
+
+DRY = etid.SkinRC(33.4e3, 186e3, 0.12e-9)
+COV = np.diag([1e4, 1e6, 1e-24])
+ARRAYS = re.compile(r"[fic](32|64)\[|array\(|Array\(")
+
+
+@functools.cache
+def fit(name="successful"):
+    one = np.asarray(1.0)
+    return etid.Fit(
+        circuit=DRY,
+        cov=COV,
+        shared_cov=0 * COV,
+        rrse=one,
+        chi2=one,
+        result=verdict(name),
+        steps=np.asarray(7),
+        method="maximum_likelihood",
+        support=Support.unknown(),
+    )
+
+
+def fits():
+    batch = jax.tree.map(lambda *leaves: np.stack(leaves), fit(), fit(), fit("misfit"))
+    known = [{"subject": f"s{number}", "condition": "<b>"} for number in (1, 1, 2)]
+    return etid.Fits(batch, described(known), np.array(["", "", "why"]))
+
+
+def driver():
+    parameters = map(np.asarray, (9.0, [11.0], [0.0], [1e3], [1e3], [6.0], [1e4]))
+    source = SourceImpedance(*map(jnp.asarray, parameters))
+    one = jnp.asarray(1.0)
+    return ContinuousDriver(
+        source=source,
+        cov=1e-4 * jnp.eye(7),
+        calibration=Calibration(jnp.array([98.8e3]), jnp.zeros(1), one),
+        b=jnp.ones(3),
+        a=jnp.ones(4),
+        sample_rate=200e3,
+        rrse=one,
+        chi2=one,
+        result=verdict("successful"),
+        steps=jnp.asarray(3),
+        method="output_error",
+    )
+
+
+def study():
+    volts = np.arange(100.0)
+    rates = {"sample_rate": 200e3, "pulse_rate": 4e3}
+    known = {"path": "s01/dry", "subject": "s01", "condition": "<b>"}
+    calibration = etid.Recording(volts, volts, r_load=98.8e3, path="calibration", **rates)
+    return etid.Study.from_recordings([calibration, etid.Recording(volts, volts, **rates, **known)])
+
+
+def state():
+    own, eye = jnp.broadcast_to(jnp.zeros(4), (2, 4)), jnp.broadcast_to(jnp.eye(3), (2, 3, 3))
+    numbers, two = jnp.array([5, 6]), jnp.array([1.5, 2.5])
+    result = jax.tree.map(jnp.asarray, verdicts_of(np.array(["successful", "flat"])))
+    return TrackerState(own, eye, numbers, numbers, two, two, two, two, two, result)
+
+
+SHOWN = {
+    "fit": (
+        fit,
+        ["SkinRC: successful in 7 steps", "r_s 33.40 ± 0.10 kΩ", "c_p 0.1200 ± 0.0010 nF"],
+    ),
+    "failed fit": (lambda: fit("misfit"), ["SkinRC: misfit", "misses the recording by far more"]),
+    "batch": (lambda: fits().fit, ["2 successful, 1 misfit", "r_p 186 … 186 kΩ"]),
+    "fits": (fits, ["3 fits of SkinRC: 2 successful, 1 misfit", "s1 <b> 2/2 33.40 ± 0.10"]),
+    "circuit": (lambda: DRY, ["SkinRC", "186 kΩ", "0.12 nF"]),
+    "circuits": (lambda: fits().circuit, ["SkinRC", "186 … 186 kΩ"]),
+    "stderr": (lambda: fit().stderr, ["SkinRC", "0.1 kΩ"]),
+    "driver": (driver, ["Driver of order 3: successful", "|Z_th| at 1 kHz", "±", "kΩ"]),
+    "study fits": (
+        lambda: etid.StudyFits(fits(), {("a/b", "c"): driver()}, {("d",): "no signal"}),
+        ["3 fits of SkinRC", "1 drivers, 1 failed", "a/b, c 3 successful", "d: no signal"],
+    ),
+    "recording": (lambda: study()["s01/dry"], ["s01/dry", "200000 Hz", "<b>"]),
+    "study": (study, ["1 calibrations, 1 loaded"]),
+    "selection": (lambda: Selection.of({0: fit()}, 0, [DRY]), ["1 candidates: successful"]),
+    "candidate": (
+        lambda: Selection.of({0: fit()}, 0, [DRY]).candidates[0],
+        ["Candidate SkinRC", "100.0 %", "r_s 33.40 ± 0.10 kΩ"],
+    ),
+    "bound": (lambda: Bound("s01", DRY, 1e-4 * np.eye(3)), ["r_s 33.4 kΩ ± 1 %"]),
+    "state": (state, ["State of 2 electrodes", "1 flat, 1 successful", "1 flat 6 6 2.5"]),
+}
+
+
+@pytest.mark.parametrize(("make", "texts"), SHOWN.values(), ids=SHOWN)
+def test_numbers_have_units_and_no_array_is_printed(make, texts):
+    one = make()
+    for form in (str, repr):
+        shown = " ".join(form(one).split())
+        assert [text for text in texts if text not in shown] == []
+        assert not ARRAYS.search(shown)
+    assert str(one) == one._overview().text()
+
+
+@pytest.mark.parametrize("make", [make for make, _ in SHOWN.values()], ids=SHOWN)
+def test_a_notebook_shows_the_words_of_the_terminal_as_a_table(make):
+    one = make()
+    page = one._repr_html_()
+    words = re.sub(r"<[^>]*>", " ", page).split()
+    escaped = str(one).replace("<", "&lt;").replace(">", "&gt;").replace("'", "&#39;")
+    assert sorted(words) == sorted(escaped.split())
+    assert "<table>" in page
+
+
+def test_a_table_of_a_notebook_has_headings_and_cells():
+    page = Overview("a & b", [("  1 ", "x")], ("n", "what"), ["note"]).html()
+    assert "<b>a &amp; b</b>" in page
+    assert page.count("<th") == 2
+    assert re.findall(r"<td[^>]*>(.*?)</td>", page) == ["1", "x"]
+
+
+def test_a_long_table_is_cut():
+    rows = [(str(number),) for number in range(ROWS + 5)]
+    shown = Overview("numbers", rows)
+    assert shown.text().splitlines()[-1] == "  … and 5 more"
+    assert len(shown.text().splitlines()) == ROWS + 2
+    assert shown.html().count("<tr>") == ROWS
+    assert "… and 40 more" in Overview("numbers", rows[:ROWS], count=ROWS + 40).text()
+
+
+@pytest.mark.parametrize("make", [fit, lambda: fit().circuit, driver, state])
+def test_what_jax_traces_or_maps_can_be_shown(make):
+    seen = []
+
+    def note(one):
+        seen.extend([repr(one), str(one), str(one._repr_html_())])
+        return jnp.zeros(())
+
+    one = jax.tree.map(jnp.asarray, make())
+    jax.jit(note)(one)
+    jax.vmap(note)(jax.tree.map(lambda leaf: jnp.stack([leaf, leaf]), one))
+    jax.grad(lambda scale: note(jax.tree.map(lambda leaf: leaf * scale, DRY)))(1.0)
+    note(jax.tree.map(lambda _: None, one))
+    note(jax.eval_shape(lambda of: of, one))
+    assert all(
+        type(one).__name__ in text or text == "None" for text in seen if "SkinRC" not in text
+    )
+
+
+def test_an_undetermined_bound_says_what_to_do():
+    assert "do not determine r_s" in repr(Bound("s01", DRY, np.diag([2.0, 1e-4, 1e-4])))
+
+
+def test_a_change_of_verdict_changes_what_is_shown():
+    shown = str(dataclasses.replace(fit(), result=verdict("flat")))
+    assert "SkinRC: flat" in shown
+    assert "Check the contact" in shown
