@@ -73,6 +73,18 @@ def test_another_skin_is_a_misfit_where_chi2_does_not_show_it():
     assert fits.where(condition="dry").counts() == {"successful": len(TRIALS)}
 
 
+@pytest.mark.slow
+def test_a_wrong_gain_is_a_misfit_where_it_moves_r_p_by_a_quarter():
+    """It was called successful. At this noise, six of eight are seen."""
+    made = simulate(Trial("odd", DRY), seed=5, snr_db=40.0)
+    odd = made["odd"]
+    wrong = odd.replace(v_out=1.01 * odd.v_out, adc_range=None)
+    others = [one for one in made.recordings() if one.path != "odd"]
+    fits = etid.identify_jointly(Study.from_recordings([*others, wrong])).fits
+    assert fits.where(path="odd").counts() == {"misfit": 1}
+    assert fits.where(condition="dry").counts() == {"successful": len(TRIALS)}
+
+
 def test_elements_are_within_their_errors_and_spread_by_their_own_part(outcome):
     fits = outcome.fits.where(condition="dry").successful()
     error = np.asarray(fits.circuit.values()) - TRUTH

@@ -402,7 +402,7 @@ def test_methods_cite_what_they_name_and_say_the_settings(found, method):
 TESTS = {  # score tests that a successful fit has passed
     "maximum_likelihood": {"spread over time constants", "further relaxation", "gains"},
     "non_parametric": {"spread over time constants", "further relaxation", "gains"},
-    "joint": {"spread over time constants", "further relaxation"},
+    "joint": {"spread over time constants", "further relaxation", "gains"},
     "harmonic_steiglitz_mcbride": {"spread over time constants", "further relaxation"},
 }
 

@@ -29,7 +29,6 @@ from etid.estimators.lanes import AbstractLane, Harmonics, unstacked
 from etid.estimators.maximum_likelihood.driver import Calibrations
 from etid.estimators.maximum_likelihood.estimator import description
 from etid.estimators.registry import register_description
-from etid.estimators.score_tests.other_circuit import NO_OTHER_CIRCUIT
 from etid.estimators.score_tests.unloaded import shape_of
 from etid.estimators.starts import harmonic_starts
 from etid.identify.arguments import Circuit, candidates_of, order_of, require, require_float64
@@ -72,7 +71,6 @@ register_description(
         "Z_th is common to all, each record has its own trigger delay τ. Where the delays scatter "
         "by less than their errors, the upper limit of their scatter (95 %) is the standard "
         "deviation of their prior.",
-        NO_OTHER_CIRCUIT,
     ),
 )
 

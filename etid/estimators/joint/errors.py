@@ -80,7 +80,7 @@ def estimates(
 ) -> tuple[Float[Array, "common common"], list[tuple[Estimate, Bool[Array, " load"], Delay]]]:
     """Covariance of `common`, and the estimates of each group with their covariances.
 
-    For each load it also returns whether the data show another circuit
+    For each load it also returns whether the data show another circuit or another gain of V_out
     (`etid.estimators.score_tests.other_circuit`), and its trigger delay.
 
     Args:
@@ -204,7 +204,7 @@ def _seen(
         known=known,
         terms=jnp.append(part, late / driver.delay_width),
         linear=Linear(jacobian, weights(shares[-1:], count), noise),
-        rows=lane.by_changes(q, slopes)[:-1],  # without the gain of V_out
+        rows=lane.by_changes(q, slopes),
     )
 
 
@@ -248,8 +248,9 @@ def _is_another(
         covariance,
         slice(common.size, common.size + own.log_elements.size),
     )
+    other = other_circuit.Scores.of(found, gain=True)
     # A load that takes no part has its own verdict.
-    return other_circuit.Scores.of(found).seen() & load.used
+    return (other.seen() | other.has_other_gain()) & load.used
 
 
 def _eliminated(

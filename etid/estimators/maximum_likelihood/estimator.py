@@ -29,14 +29,13 @@ from etid.signals.harmonics import Spectrum
 from etid.signals.noise import Measurement
 
 
-def description(words: str, estimated: str, unknowns: str, *tests: str) -> Description:
+def description(words: str, estimated: str, unknowns: str) -> Description:
     """Text about fits by maximum likelihood, alone or jointly.
 
     Args:
         words: Name of the estimator in a sentence.
         estimated: What was estimated, as the start of the sentence about the residual.
         unknowns: Sentences about the unknowns.
-        *tests: The score tests that a successful fit passes.
     """
     return Description(
         words=words,
@@ -47,7 +46,8 @@ def description(words: str, estimated: str, unknowns: str, *tests: str) -> Descr
         conditions=(
             *CHECKED,
             DETERMINED,
-            *tests,
+            other_circuit.NO_OTHER_CIRCUIT,
+            other_circuit.NO_OTHER_GAIN,
             "recording and calibrations agree about Z_th (the calibrations' sum of squares grows "
             f"by at most {STRAINED:g})",
         ),
@@ -108,8 +108,6 @@ class MaximumLikelihood(AbstractEstimator):
             "Each load was estimated jointly with Z_th and the trigger delays of the calibrations, "
             "whose distribution the calibrations give. Its own trigger delay τ is one more "
             "unknown.",
-            other_circuit.NO_OTHER_CIRCUIT,
-            other_circuit.NO_OTHER_GAIN,
         )
 
 
