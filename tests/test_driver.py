@@ -9,7 +9,7 @@ from jax.flatten_util import ravel_pytree
 from etid import Resistor, SkinRC, capacitor, parallel, resistor, series
 from etid.estimators.refined_driver import is_split
 from etid.results.driver import SourceImpedance, loaded, realise
-from etid.signals.transfer import Rational, delay_variable, frequency_variable
+from etid.signals.transfer import Rational, frequency_variable
 
 FREQUENCY = jnp.geomspace(10.0, 1e6, 25)
 S = np.asarray(frequency_variable(FREQUENCY))
@@ -66,19 +66,6 @@ def test_slopes_of_the_impedance_are_its_derivatives():
     found = np.asarray(jax.jit(SourceImpedance.slopes)(SOURCE, FREQUENCY))
     scale = np.abs(expected).max(axis=1, keepdims=True)
     np.testing.assert_allclose(found / scale, expected / scale, atol=1e-12)
-
-
-def test_the_discrete_filter_has_nearly_the_response_of_the_impedance():
-    rate = jnp.array(2e6)
-    found = jax.jit(SourceImpedance.discrete)(SOURCE, rate)
-    poles = np.log(np.roots(np.asarray(found.den))) * float(rate)
-    expected = np.linalg.eigvals(np.asarray(SOURCE.state_space().A))
-    np.testing.assert_allclose(np.sort_complex(poles), np.sort_complex(expected), rtol=1e-6)
-    f = jnp.geomspace(10.0, 2e5, 25)  # a tenth of the sample rate
-    z = jax.jit(lambda: found(delay_variable(f, rate)))()
-    # A filter of order 5 bends the response of a section by some per cent, as Tustin's does.
-    np.testing.assert_allclose(z, respond(SOURCE, f), rtol=0.05)
-    np.testing.assert_allclose(z[:10], respond(SOURCE, f)[:10], rtol=1e-3)
 
 
 @pytest.mark.parametrize("shape", [(), (3,), (2, 3)])

@@ -62,18 +62,18 @@ def harmonic_starts(
 
 
 def source_starts(
-    baseline: Float[Array, " a"] | None,
+    baseline: Float[Array, " a"],
     order: int,
     sample_rate: Float[Array, ""],
     r_load: Float[Array, ""],
 ) -> SourceImpedance:
-    """Starts of Z_th, stacked: three generic ones, and one with the resonance of a baseline.
+    """Starts of Z_th, stacked: three generic ones, and one with the resonance of the baseline.
 
     Each start has one slow real pole, and sections with given frequencies and damping ratios. All
     gains have the size of a tenth of the known resistor.
 
     Args:
-        baseline: Denominator of a discrete Z_th; None if there is no baseline.
+        baseline: Denominator of a discrete Z_th.
         order: Number of poles.
         sample_rate: Sampling rate [Hz].
         r_load: The known resistor [Ω].
@@ -83,7 +83,7 @@ def source_starts(
     # Further sections start overdamped at the edge of the sampled band.
     pairs = [(*of, *[FAR] * sections)[:sections] for of in GENERIC]
     places = jnp.asarray(np.reshape(list(dict.fromkeys(pairs)), (-1, sections, 2)))
-    if baseline is not None and sections:
+    if sections:
         s = jnp.log(poles(baseline))  # s / fs of the discrete poles
         # Resonances are poles well inside the band. The least damped one is used.
         resonant = (s.imag > 0.05) & (s.imag < 0.9 * jnp.pi) & (s.real < 0)

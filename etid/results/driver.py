@@ -31,12 +31,9 @@ from etid.signals.transfer import (
     as_complex,
     delay_variable,
     frequency_variable,
-    multiply_polynomials,
     reciprocal,
 )
 
-# Frequencies at which a discrete filter approximates Z_th, relative to the sample rate.
-SAMPLED = np.geomspace(1e-4, 0.49, 300)
 SHOWN = 1e3  # [Hz] frequency of the Z_th that `print` shows
 
 
@@ -101,37 +98,6 @@ class SourceImpedance(eqx.Module):
             gain_real.append(shape)
         found = [constant, *log_omega, *log_zeta, *gain, *slope, *log_omega_real, *gain_real]
         return jnp.stack(found)
-
-    def discrete(self, sample_rate: Float[Array, ""]) -> Rational:
-        """A filter in z⁻¹ of the same order with nearly the same response (paper, eq. 4).
-
-        Its poles are e^(s/fs), with the poles s of the impedance. Its numerator fits the response
-        by least squares with the weight 1/f², like the power of a pulse. No filter of this order
-        has the response of the impedance near half the sample rate.
-
-        Args:
-            sample_rate: Sampling rate of the filter [Hz].
-        """
-        den = jnp.ones(1)
-        for log_omega, log_zeta in zip(self.log_omega, self.log_zeta, strict=True):
-            step, zeta = jnp.exp(log_omega) / sample_rate, jnp.exp(log_zeta)
-            turn = jnp.cosh(as_complex(step) * jnp.sqrt(as_complex(zeta**2 - 1))).real
-            decay = jnp.exp(-zeta * step)
-            section = jnp.stack([jnp.ones(()), -2 * decay * turn, decay**2])
-            den = multiply_polynomials(den, section)
-        for log_omega in self.log_omega_real:
-            pole = jnp.exp(-jnp.exp(log_omega) / sample_rate)
-            den = multiply_polynomials(den, jnp.stack([jnp.ones(()), -pole]))
-        frequency = jnp.asarray(SAMPLED) * sample_rate
-        z = delay_variable(frequency, sample_rate)
-        powers = jnp.arange(float(self.order))
-        columns = delay_variable(frequency[:, None] * powers[None, :], sample_rate)
-        weight = as_complex(jnp.asarray(SAMPLED**-2))
-        by_den = weight * reciprocal(jnp.polyval(as_complex(den[::-1]), z))
-        columns, wanted = columns * by_den[:, None], self.response(frequency) * weight
-        q, r = jnp.linalg.qr(jnp.concatenate([columns.real, columns.imag]))
-        told = q.T @ jnp.concatenate([wanted.real, wanted.imag])
-        return Rational(jax.scipy.linalg.solve_triangular(r, told), den)
 
     def state_space(self) -> StateSpace:
         """Realisation from current [A] to voltage drop [V], one balanced 2x2 block per section."""
@@ -224,8 +190,7 @@ class Driver(Judged):
     identified with this driver.
 
     Attributes:
-        b: Numerator α₀ … of the discrete Z_th (paper, eq. 4) [Ω]. A `HarmonicDriver` has the
-            filter of its continuous Z_th, other drivers that of Steiglitz-McBride.
+        b: Numerator α₀ … of the discrete Z_th by Steiglitz-McBride (paper, eq. 4) [Ω].
         a: Denominator 1, β₁ … of the discrete Z_th.
         sample_rate: Rate of the calibrations and of the discrete filter [Hz].
         rrse: Largest root relative squared error over the calibrations (paper, eq. 3).
