@@ -90,10 +90,12 @@ one stacked group `g`. Every other recording becomes its own group.
 OTHER_FORMATS = """\
 ## Other formats
 
-`etid import FILE study.h5 --mapping FILE.toml` converts a file of an instrument to an etid file. It
+`etid import FILE -o study.h5 --mapping FILE.toml` converts a file of an instrument to an etid file. It
 prints which channel, unit, scale and rate it used for each signal. Nothing is guessed. A channel,
 unit or rate that neither the file nor the mapping gives is an error, and the error lists the
-channels of the file. A contradiction between file and mapping is an error too.
+channels of the file. A contradiction between file and mapping is an error too. If several files
+are imported into one, each `[[recording]]` has the key `file`: the name of its file without the
+folder. A recording without a `path` is then named by its file, as in `loaded/finger`.
 
 | file | channels | the file contains | trials | install |
 |---|---|---|---|---|
@@ -154,7 +156,7 @@ For one recording, the command line is enough. Its values are in volts, amperes 
 the file contains other units:
 
 ```
-etid import table.csv study.h5 --v-th open --v-out skin --time t --pulse-rate 60 --scale 0.0535
+etid import table.csv -o study.h5 --v-th open --v-out skin --time t --pulse-rate 60 --scale 0.0535
 ```
 
 ### MATLAB

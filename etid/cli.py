@@ -63,8 +63,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     _keep_programs()
     commands = parser()
     arguments = commands.parse_args(argv)
-    source = getattr(arguments, "source", None)
-    if source is not None and _same_file(source, arguments.target):
+    source = getattr(arguments, "source", [])
+    if any(_same_file(one, arguments.target) for one in np.ravel([source])):
         commands.error(f"{arguments.target} is the file to read; name another file to write")
     try:
         if "force" in arguments:

@@ -114,7 +114,7 @@ def test_import_turns_a_table_into_a_file_that_check_accepts(run, tmp_path):
     target = tmp_path / "study.h5"
     arguments = ("--v-th", "open", "--v-out", "skin", "--sample-rate", 2e5, "--pulse-rate", 60)
     more = ("--scale", 0.0535, "--subject", "s01", "--condition", "dry")
-    assert run("import", table, target, *arguments, *more) == (
+    assert run("import", table, "-o", target, *arguments, *more) == (
         DONE,
         [
             "loaded/0: 500 samples at 200000 Hz (command), pulses at 60 Hz",
@@ -203,11 +203,11 @@ def test_fit_without_any_success_says_so_and_lists_twenty_at_most(run, tmp_path)
             "absent/fits.h5: the folder of this file does not exist",
         ),
         (("fit", "calibration.h5", "-o", "fits.h5"), "no loaded recording"),
-        (("import", "absent.csv", "out.h5"), "absent.csv: there is no such file"),
-        (("import", "table.csv", "out.h5"), "v_th: is not given"),
+        (("import", "absent.csv", "-o", "out.h5"), "absent.csv: there is no such file"),
+        (("import", "table.csv", "-o", "out.h5"), "v_th: is not given"),
         (("simulate", "paper_dry", "-o", "absent/s.h5"), "absent/s.h5: the folder of this file"),
         (("simulate", "paper_dry", "-o", "s.h5", "--truth", "absent/t.json"), "absent/t.json: the"),
-        (("import", "table.csv", "absent/s.h5"), "absent/s.h5: the folder of this file"),
+        (("import", "table.csv", "-o", "absent/s.h5"), "absent/s.h5: the folder of this file"),
         (("report", "fits.h5", "-o", "absent/page.html"), "absent/page.html: the folder of"),
         (("export", "fits.h5", "-o", "absent/t.csv"), "absent/t.csv: the folder of this file"),
         (("fit", "study.h5", "-o", "."), ".: this is a folder"),
@@ -220,6 +220,7 @@ def test_fit_without_any_success_says_so_and_lists_twenty_at_most(run, tmp_path)
             (
                 "import",
                 "table.csv",
+                "-o",
                 "s.h5",
                 "--v-th",
                 "open",
@@ -259,8 +260,7 @@ def test_check_of_a_missing_file_is_wrong_data(run, tmp_path):
 @pytest.mark.parametrize("command", ["fit", "import"])
 def test_the_file_that_is_read_is_never_replaced(run, study_file, command):
     before = study_file.read_bytes()
-    target = ("-o", study_file) if command == "fit" else (study_file,)
-    status, _, complaints = run(command, study_file, *target)
+    status, _, complaints = run(command, study_file, "-o", study_file)
     assert status == WRONG_USAGE
     assert "is the file to read; name another file to write" in complaints[-1]
     assert study_file.read_bytes() == before
@@ -328,7 +328,7 @@ def test_json_of_what_writes_a_file_names_it(run, tmp_path):
     assert (status, as_json(printed)) == (DONE, wanted)
     names = ("--v-th", "open", "--v-out", "skin", "--scale", 1)
     rates = ("--sample-rate", 2e5, "--pulse-rate", 60)
-    status, printed, _ = run("import", table, imported, *names, *rates, "--json")
+    status, printed, _ = run("import", table, "-o", imported, *names, *rates, "--json")
     wanted = {"command": "import", "status": DONE, "target": str(imported), "recordings": 1}
     assert status == DONE
     assert as_json(printed).items() >= wanted.items()
@@ -344,10 +344,11 @@ def test_keys_of_json_are_those_of_the_guide(run, study_file, tmp_path):
     table = tmp_path / "t.csv"
     np.savetxt(table, np.ones((500, 2)), delimiter=",", header="open,skin", comments="")
     names = ("--v-th", "open", "--v-out", "skin", "--scale", 1)
+    rates = ("--sample-rate", 2e5, "--pulse-rate", 60)
     calls = {
         "simulate": ("paper_dry", "-o", tmp_path / "made.h5"),
         "check": (study_file,),
-        "import": (table, tmp_path / "i.h5", *names, "--sample-rate", 2e5, "--pulse-rate", 60),
+        "import": (table, "-o", tmp_path / "i.h5", *names, *rates),
         "fit": (study_file, "-o", tmp_path / "f.h5", "--method", "equation_error", "--order", 3),
         "report": (tmp_path / "f.h5",),
         "export": (tmp_path / "f.h5", "-o", tmp_path / "f.csv"),
@@ -361,7 +362,12 @@ def test_keys_of_json_are_those_of_the_guide(run, study_file, tmp_path):
         written = {"check": "file", "report": "page"}.get(command, "target")
         assert set(found) >= {"command", "status", written}
         inner = [item for value in found.values() if isinstance(value, list) for item in value]
-        keys = {key for item in inner if "subject" not in item for key in item}
+        keys = {
+            key
+            for item in inner
+            if isinstance(item, dict) and "subject" not in item
+            for key in item
+        }
         assert keys <= told, command
 
 

@@ -63,7 +63,7 @@ mapping = {
 etid.import_file(folder / "table.csv", folder / "mapped.h5", mapping)
 options = [word for name, value in said.items()
            for word in ("--" + name.replace("_", "-"), str(value))]
-assert cli.main(["import", str(folder / "table.csv"), str(folder / "told.h5"), *options]) == 0
+assert cli.main(["import", str(folder / "table.csv"), "-o", str(folder / "told.h5"), *options]) == 0
 for name in ("mapped.h5", "told.h5"):
     with etid.read(folder / name) as study:
         assert study["loaded/0"].temperature == 305.0

@@ -227,14 +227,14 @@ def test_rows_choose_sweeps_and_their_labels_may_be_given(run, tmp_path):
 def test_the_command_prints_what_it_used_for_what(rig, tmp_path, capsys):
     mapping, target = tmp_path / "rig.toml", tmp_path / "rig.h5"
     mapping.write_text(GIVEN, encoding="utf-8")
-    assert cli.main(["import", str(rig), str(target), "--mapping", str(mapping)]) == 0
+    assert cli.main(["import", str(rig), "-o", str(target), "--mapping", str(mapping)]) == 0
     assert capsys.readouterr().out.splitlines() == [
         "loaded/0: 800 samples at 200000 Hz (file), pulses at 60 Hz",
         "  v_th    'rig/open' in mV (file), divided by 0.0535",
         "  v_out   'rig/skin' in mV (file), divided by 0.0535",
     ]
-    assert cli.main(["import", str(rig), str(target)]) == 1
+    assert cli.main(["import", str(rig), "-o", str(target)]) == 1
     assert "rig.h5: this file exists; add --force to replace it" in capsys.readouterr().err
-    assert cli.main(["import", str(rig), str(target), "--force"]) == 1
+    assert cli.main(["import", str(rig), "-o", str(target), "--force"]) == 1
     complaint = capsys.readouterr().err
     assert "v_th: is not given, and is not guessed; the channels are 'rig/open', " in complaint

@@ -2,6 +2,7 @@
 
 import argparse
 import dataclasses
+import os
 import pathlib
 
 from etid.commands import Outcome
@@ -13,8 +14,19 @@ from etid.recordings.fields import DECLARED, SIGNALS
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments: the files, the mapping, the channels, and the fields."""
-    parser.add_argument("source", type=pathlib.Path)
-    parser.add_argument("target", type=pathlib.Path)
+    parser.add_argument(
+        "source", type=pathlib.Path, nargs="+", metavar="FILE", help="files to import into one file"
+    )
+    parser.add_argument("-o", dest="target", type=pathlib.Path, required=True, metavar="STUDY")
+    parser.add_argument(
+        "--calibration",
+        dest="calibrations",
+        nargs=2,
+        action="append",
+        default=[],
+        metavar=("FILE", "OHM"),
+        help="file recorded with a known resistor, and its resistance; may be given several times",
+    )
     parser.add_argument(
         "--mapping",
         type=pathlib.Path,
@@ -49,11 +61,25 @@ def outputs(arguments: argparse.Namespace) -> dict[pathlib.Path, tuple[str, ...]
 def run(arguments: argparse.Namespace) -> Outcome:
     """Import one file, and return which channel became which signal."""
     given = {name: value for name, value in vars(arguments).items() if name in (*CHANNELS, *FIELDS)}
-    used = import_file(arguments.source, arguments.target, arguments.mapping, **given)
+    calibrations: dict[str | os.PathLike[str], float] = {
+        pathlib.Path(file): _ohm(file, text) for file, text in arguments.calibrations
+    }
+    used = import_file(
+        arguments.source, arguments.target, arguments.mapping, calibrations=calibrations, **given
+    )
     data = {
-        "source": arguments.source,
+        "source": [*arguments.source, *calibrations],
         "target": arguments.target,
         "recordings": sum(len(each.paths) for each in used),
         "imported": [dataclasses.asdict(each) for each in used],
     }
     return Outcome("\n".join(map(str, used)), data)
+
+
+def _ohm(file: str, text: str) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        raise ValueError(
+            f"{file}: its resistance is {text!r}, must be a number of ohm, as in 98.8e3"
+        ) from None

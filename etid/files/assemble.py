@@ -12,7 +12,7 @@ import numpy as np
 
 from etid.files.channel import Channel, located
 from etid.files.clock import sample_rate
-from etid.files.mapping import Plan, Signal, unit_of
+from etid.files.mapping import KINDS, Plan, Signal, unit_of
 from etid.files.units import Unit
 from etid.recordings import limits
 from etid.recordings.fields import SIGNALS, Metadata, metadata_from
@@ -20,8 +20,6 @@ from etid.recordings.recording import AbstractSource, Layout, Recording, Recordi
 
 # [pulse periods] A matrix with more trials than samples and with shorter trials must be transposed.
 _SHORTEST_STACKED = 0.1
-
-_KINDS = ("loaded", "calibration")  # default paths of recordings without a path
 
 
 @dataclasses.dataclass(frozen=True)
@@ -112,7 +110,7 @@ class _Source(AbstractSource):
     @property
     def unloaded(self) -> Hashable:
         record = self.records["v_th"]
-        return record.channel.name, record.trial
+        return self.file, record.channel.name, record.trial
 
     def blocks(self, name: str) -> Iterator[np.ndarray]:
         record = self.records[name]
@@ -179,7 +177,7 @@ def sources_of(
                 own = channels[name]
                 trial = rows[name][index if len(rows[name]) > 1 else 0]
                 records[name] = _Record(own, trial, own.conversion * factor, own.offset * factor)
-        path = f"{plan.path}/{index}" if stacked or plan.path in _KINDS else plan.path
+        path = f"{plan.path}/{index}" if stacked or plan.path in KINDS else plan.path
         metadata = metadata_from(**{**vars(common), "trial": label, "path": path})
         sources[path] = _Source(file, metadata, records)
     used = {

@@ -5,15 +5,16 @@ A reader for each format (`etid.files.readers`) lists the channels of a file. A 
 channels. The recordings are written while they are read.
 """
 
+import contextlib
 import os
 import pathlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from etid.files.assemble import Imported, Used, sources_of
 from etid.files.channel import located
 from etid.files.clock import check_spacing
-from etid.files.mapping import CHANNELS, plans, read_mapping
+from etid.files.mapping import CHANNELS, of_files, plans, read_mapping
 from etid.files.readers import abf, delimited, matlab, npz, tdms
 from etid.recordings.fields import LABELS
 from etid.recordings.recording import AbstractSource, RecordingError
@@ -29,12 +30,14 @@ _IMPLIED = {"v_th": "V", "v_out": "V", "current": "A", "time": "s"}
 
 
 def import_file(
-    source: str | os.PathLike[str],
+    source: str | os.PathLike[str] | Sequence[str | os.PathLike[str]],
     target: str | os.PathLike[str],
     mapping: str | os.PathLike[str] | Mapping[str, Any] | None = None,
+    *,
+    calibrations: Mapping[str | os.PathLike[str], float] | None = None,
     **given: Any,
 ) -> list[Imported]:
-    """Convert a file of another format into an etid file.
+    """Convert one or several files of other formats into one etid file.
 
     - `.csv`: comma-separated columns with a header line, one trial.
     - `.mat`: variables of shape (time,) or (trial, time). `a.b` is field b of structure a. MATLAB
@@ -47,15 +50,20 @@ def import_file(
     A mapping assigns channels to signals; data_schema/README.md lists its keys. For one recording,
     arguments with the same names can replace the mapping. With arguments, a channel without a unit
     in the file is in volt, ampere or second. The trials of a recording without a path become
-    `loaded/0`, … or, with `r_load`, `calibration/0`, ….
+    `loaded/0`, … or, with `r_load`, `calibration/0`, …. If several files are imported, such a
+    recording has the name of its file: `loaded/finger` from `finger.csv`. In a mapping, each
+    recording then has the key `file`, the name of its file without the folder.
 
     Only a part of a record is in memory at a time, except for MATLAB files before version 7.3 and
     for `.npz`.
 
     Args:
-        source: File to import; its suffix gives the format.
+        source: File or files to import; the suffix of a file gives its format. Of an npz file only
+            one can be imported.
         target: etid file to write. An existing file is replaced.
         mapping: TOML file, or its content as a mapping. It replaces all other arguments.
+        calibrations: More files to import, each with its known resistor, `r_load` [ohm]. All other
+            arguments apply to them too. The other recordings name them as their calibrations.
         **given: Keys of a mapping for one recording: the channel names `v_th`, `v_out`, `current`
             and `time`; `scale`; and fields such as `pulse_rate` [Hz].
 
@@ -65,52 +73,79 @@ def import_file(
     Raises:
         RecordingError: The file cannot be read, or a fact about it is missing or wrong.
     """
-    path, folder = pathlib.Path(os.fspath(source)), pathlib.Path(os.fspath(target)).parent
-    file = str(path)
-    if not path.is_file():
-        raise RecordingError("there is no such file", file=file, remedy="Check the path")
+    single = isinstance(source, str | os.PathLike)
+    paths = [pathlib.Path(os.fspath(one)) for one in ([source] if single else source)]
+    known = {pathlib.Path(os.fspath(one)): r for one, r in (calibrations or {}).items()}
+    paths = [*known, *(path for path in paths if path not in known)]  # loaded ones name the others
+    folder = pathlib.Path(os.fspath(target)).parent
+    for path in paths:
+        if not path.is_file():
+            raise RecordingError("there is no such file", file=str(path), remedy="Check the path")
     if not folder.is_dir():
         raise RecordingError("the folder of this file does not exist", file=os.fspath(target))
     given = {name: value for name, value in given.items() if value is not None}
-    suffix = path.suffix.lower()
-    if suffix == ".npz":
+    if len(paths) == 1 and paths[0].suffix.lower() == ".npz":
         own = {name for name in LABELS if name in given and name != "trial"}
         labels = {name: given.pop(name) for name in own}
-        _refuse(given | ({} if mapping is None else {"mapping": mapping}), file,
+        _refuse(given | ({} if mapping is None else {"mapping": mapping}), str(paths[0]),
                 "is not an argument for npz files, which contain it")  # fmt: skip
-        return _import_npz(path, target, {"condition": path.stem} | labels)
-    if suffix not in READERS:
-        raise RecordingError(
-            f"etid cannot import files with the suffix {path.suffix!r}",
-            file=file,
-            remedy=f"Export it as one of {', '.join(READERS)}, or write an etid file with h5py",
-        )
+        return _import_npz(paths[0], target, {"condition": paths[0].stem} | labels)
+    for path in paths:
+        if path.suffix.lower() not in READERS:
+            raise RecordingError(
+                f"etid cannot import files with the suffix {path.suffix!r}"
+                + " together with others" * (path.suffix.lower() == ".npz"),
+                file=str(path),
+                remedy=f"Export it as one of {', '.join(READERS)}, or write an etid file with h5py",
+            )
+    said: list[Mapping[str, Any]]
     if mapping is None:
-        said: Mapping[str, Any] = {
+        common = {
             name: {"channel": value} if name in CHANNELS else value for name, value in given.items()
         }
-        by, place, implied = "command", file, _IMPLIED
+        said = [common | ({"r_load": known[path]} if path in known else {}) for path in paths]
+        by, place, implied = "command", "", _IMPLIED
     else:
-        _refuse(given, file, "cannot be an argument together with a mapping")
+        more = {"calibrations": known} if known else {}
+        _refuse(given | more, str(paths[0]), "cannot be an argument together with a mapping")
         inside = isinstance(mapping, Mapping)
-        said = mapping if inside else read_mapping(mapping)
-        by, place, implied = "mapping", file if inside else f"{os.fspath(mapping)} of {file}", {}
-    with located(file), READERS[suffix](path, folder) as contents:
-        with located(place):
-            planned = plans(said, contents.names, implied)
-        contents.prepare({each.channel for plan in planned for each in plan.signals.values()})
-        sources: dict[str, AbstractSource] = {}
-        used = []
-        for plan in planned:
-            with located(file, path=plan.path if len(planned) > 1 else ""):
-                found, made_of = sources_of(plan, contents.channel, file, by)
-            for each in found.values():
-                with located(file):
-                    check_spacing(next(each.blocks("v_th")).astype(float), each.metadata)
-            sources |= found
-            used.append(made_of)
-        refuse_nested(sources)
-        Study(sources).write(target)
+        place = "" if inside else f"{os.fspath(mapping)} of "
+        with located(place + str(paths[0])):
+            said = of_files(mapping if inside else read_mapping(mapping), paths)
+        by, implied = "mapping", {}
+    sources: dict[str, AbstractSource] = {}
+    used: list[Imported] = []
+    calibrated: list[str] = []
+    with contextlib.ExitStack() as files:
+        for path, told in zip(paths, said, strict=True):
+            file = str(path)
+            if calibrated and path not in known:
+                told = {**told, "calibration": calibrated}
+            with located(file):
+                contents = files.enter_context(READERS[path.suffix.lower()](path, folder))
+                with located(place + file):
+                    name = path.stem if len(paths) > 1 else ""
+                    planned = plans(told, contents.names, implied, name)
+                wanted = {one.channel for plan in planned for one in plan.signals.values()}
+                contents.prepare(wanted)
+                for plan in planned:
+                    with located(file, path=plan.path if len(planned) > 1 else ""):
+                        found, made_of = sources_of(plan, contents.channel, file, by)
+                    for each in found.values():
+                        with located(file):
+                            check_spacing(next(each.blocks("v_th")).astype(float), each.metadata)
+                    for twice in sources.keys() & found.keys():
+                        raise RecordingError(
+                            "another recording has this path",
+                            path=twice,
+                            remedy="Rename the file, or give each recording a path in a mapping",
+                        )
+                    sources |= found
+                    calibrated += found if path in known else []
+                    used.append(made_of)
+        with located(str(paths[0])):
+            refuse_nested(sources)
+            Study(sources).write(target)
     return used
 
 

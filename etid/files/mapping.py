@@ -22,6 +22,7 @@ from etid.recordings.recording import RecordingError
 CHANNELS = (*SIGNALS, "time")
 FIELDS = (*DECLARED, "scale")
 KEYS = ("channel", "unit", "scale", "rows")  # keys of a signal
+KINDS = ("loaded", "calibration")  # default paths of recordings without a path
 _KEY = "key of a mapping"
 
 
@@ -89,8 +90,50 @@ def read_mapping(path: str | os.PathLike[str]) -> dict[str, Any]:
         raise RecordingError(f"is not TOML ({error})", file=str(file)) from error
 
 
+def of_files(mapping: Mapping[str, Any], files: Sequence[pathlib.Path]) -> list[Mapping[str, Any]]:
+    """The part of a mapping for each file: the recordings whose key `file` has its name.
+
+    Args:
+        mapping: Content of a mapping, from `read_mapping`.
+        files: The files to import.
+
+    Raises:
+        RecordingError: A recording names no file although there are several, or a file that is not
+            imported; or a file has no recording.
+    """
+    tables = mapping.get("recording", [])
+    if len(files) == 1 and not (isinstance(tables, list) and any("file" in one for one in tables)):
+        return [mapping]
+    common = {key: value for key, value in mapping.items() if key != "recording"}
+    if not isinstance(tables, list) or not all(isinstance(one, Mapping) for one in tables):
+        raise RecordingError(
+            "must be a list of tables", field="recording", remedy="Write [[recording]]"
+        )
+    named = [file.name for file in files]
+    for name in {name for name in named if named.count(name) > 1}:
+        raise RecordingError(f"two files have the name {name!r}", field="file")
+    found: dict[str, list[dict[str, Any]]] = {name: [] for name in named}
+    for table in tables:
+        if table.get("file") not in found:
+            raise RecordingError(
+                f"is {table.get('file')!r}; the files are {listed(named)}",
+                field="file",
+                remedy="Give each [[recording]] the name of one of these files",
+            )
+        found[table["file"]].append({key: table[key] for key in table if key != "file"})
+    for name in named:
+        if not found[name]:
+            raise RecordingError(
+                f"no recording is in {name!r}", field="file", remedy="Leave the file out"
+            )
+    return [{**common, "recording": found[name]} for name in named]
+
+
 def plans(
-    mapping: Mapping[str, Any], names: Sequence[str], implied: Mapping[str, str]
+    mapping: Mapping[str, Any],
+    names: Sequence[str],
+    implied: Mapping[str, str],
+    name: str = "",
 ) -> list[Plan]:
     """Plans of the recordings of a mapping.
 
@@ -98,6 +141,7 @@ def plans(
         mapping: Content of a mapping, from `read_mapping`.
         names: Names of the channels of the file; the mapping may use only these.
         implied: Unit of each signal if neither the mapping nor the file names one.
+        name: Name below `loaded` or `calibration` of a recording without a path.
 
     Raises:
         RecordingError: A key is missing, unknown, or of the wrong type.
@@ -119,7 +163,7 @@ def plans(
             raise RecordingError(
                 "is not given", field="path", remedy="Give each [[recording]] a path of its own"
             )
-        path = path or ("loaded" if said.get("r_load") is None else "calibration")
+        path = path or tidy_path(f"{KINDS[said.get('r_load') is not None]}/{name}")
         if any(plan.path == path for plan in found):
             raise RecordingError("two recordings have this path", path=path)
         try:
