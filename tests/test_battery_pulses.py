@@ -135,6 +135,19 @@ def test_all_pulses_at_25_degrees_are_fitted_as_one_batch(pulses, circuit, limit
     assert (r_0 < 50e-3).all()
 
 
+def test_all_pulses_together_ask_for_two_relaxations(pulses):
+    """BIC with one noise for all samples of a pulse; no pulse counts more than 20."""
+    _, *data = pulses
+    count = np.asarray(data[3]).sum(axis=1)
+    bic = [
+        2 * count * np.log(np.asarray(rms)) + len(circuit.names()) * np.log(count)
+        for circuit in (OneRC(), TwoRC())
+        for rms in [fit(circuit, *data)[1]]
+    ]
+    gain = np.clip(bic[0] - bic[1], -20.0, 20.0)
+    assert gain.sum() > 10 * len(count)  # Kass and Raftery: very strong, on average
+
+
 def test_one_relaxation_has_the_elements_of_an_independent_fit(pulses):
     keys, *data = pulses
     found, _, _ = fit(OneRC(), *data)

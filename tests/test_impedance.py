@@ -5,6 +5,8 @@ import numpy as np
 import pytest
 
 import etid
+from etid.selection.evidence import best
+from etid.selection.search import CANDIDATES
 
 # Fitted without weights by impedance.py's makers and by others (SOURCE.txt of the data).
 PUBLISHED = {
@@ -29,6 +31,26 @@ def test_soldered_circuits_are_those_published(reference_data, name):
     # DESIGN's half per cent: the digits of the published values and the choice of points.
     np.testing.assert_allclose(fit.circuit.values(), PUBLISHED[name], rtol=5e-3)
     assert float(fit.rrse) < 0.004  # as published, 0.30 to 0.38 %
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("replicate", [1, 2])
+@pytest.mark.parametrize("number", [1, 2])
+def test_the_rules_of_selection_choose_the_soldered_circuit(reference_data, number, replicate):
+    """Only `SkinRC` is R0 + R1 || C1; the instrument is exact to 0.6 % of Z."""
+    name = f"Circuit{number}_EIS_{replicate}.z"
+    frequency, z = zplot(reference_data("dummy_circuits_eis") / name)
+    fits = {
+        number: etid.identify_impedance(
+            frequency, z, stderr=0.006 * abs(z), circuit=circuit, throw=False
+        )
+        for number, circuit in enumerate(CANDIDATES)
+    }
+    selection = etid.Selection.of(fits, best(fits), CANDIDATES)
+    assert type(selection.fit.circuit) is etid.SkinRC
+    assert selection.candidates[0].adequate
+    # Cole's circuit is the next one; its exponent is 1, so that it gains nothing for its price.
+    assert -np.log(2 * frequency.size) < selection.candidates[1].evidence < -2.0
 
 
 def measured(circuit, sigma, seed):

@@ -14,7 +14,7 @@ import pytest
 
 ROOT = pathlib.Path(__file__).parents[1]
 NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.py"))
-SLOW = {"derivatives", "joint", "online"}  # compiled for minutes
+SLOW = {"derivatives", "joint", "online", "selection"}  # compiled for minutes
 PAGES = [
     pytest.param(path, marks=[pytest.mark.slow] if path.stem in SLOW else [])
     for path in sorted((ROOT / "docs").glob("*.md"))

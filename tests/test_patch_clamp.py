@@ -14,7 +14,7 @@ import optimistix as optx
 import pytest
 import scipy.signal
 
-from etid.circuits.circuit import SkinRC
+from etid.circuits.circuit import ParallelRC, SkinLayers, SkinRC
 from etid.results.driver import realise
 from etid.signals.filtering import StateSpace, hold, simulate
 from etid.signals.transfer import Rational, multiply_polynomials
@@ -47,10 +47,11 @@ def recorded(reference_data):
     return current.mean(axis=0), steps, floor
 
 
-def predicted_current(parameters, steps, time):
+def predicted_current(kind, parameters, steps, time):
     """Current [pA]; the command is constant between its steps, so a hold of order zero is exact."""
-    circuit = SkinRC(1.0, 1.0, 1.0).with_log_values(parameters[:3])
-    omega = 2 * jnp.pi * jnp.exp(parameters[3])
+    *elements, log_corner, delay, holding = parameters
+    circuit = kind.with_log_values(jnp.stack(elements))
+    omega = 2 * jnp.pi * jnp.exp(log_corner)
     scale = omega ** -jnp.arange(5.0)
     den = jnp.asarray(DEN[::-1].copy()) * scale
     z = circuit.impedance().rational()
@@ -59,22 +60,22 @@ def predicted_current(parameters, steps, time):
     # The first column of `hold` is the response to a constant. A step that comes `delay` after a
     # sample acts for the rest of that interval, then for whole ones.
     whole = hold(system, SAMPLE_RATE)
-    first = hold(system, SAMPLE_RATE / (1 - parameters[4]))
+    first = hold(system, SAMPLE_RATE / (1 - delay))
     columns = jnp.stack([whole.B[:, 0], first.B[:, 0]], axis=-1)
     discrete = StateSpace(whole.A, columns, system.C, jnp.zeros(2))
     n = np.arange(time)
     held = STEP * ((n > steps[1]).astype(float) - (n > steps[0]))
     kick = STEP * ((n == steps[1]).astype(float) - (n == steps[0]))
     current, _ = simulate(discrete, jnp.stack([held, kick], axis=-1), jnp.zeros_like(system.C))
-    return current / PICO + parameters[5]
+    return current / PICO + holding
 
 
 @eqx.filter_jit
-def fit(measured, steps, start):
+def fit(kind, measured, steps, start):
     solver = LevenbergMarquardt(rtol=1e-6, ftol=0.0)
 
     def residual(parameters, _):
-        return predicted_current(parameters, steps, measured.size) - measured
+        return predicted_current(kind, parameters, steps, measured.size) - measured
 
     return optx.least_squares(residual, solver, start, max_steps=200, throw=False)
 
@@ -83,7 +84,7 @@ def test_the_model_cell_is_what_its_maker_says(recorded):
     measured, steps, floor = recorded
     circuit, corner, delay, holding = START
     start = jnp.array([*circuit.log_values(), jnp.log(corner), delay, holding])
-    solution = fit(jnp.asarray(measured), tuple(int(k) for k in steps), start)
+    solution = fit(circuit, jnp.asarray(measured), tuple(int(k) for k in steps), start)
     assert solution.result == optx.RESULTS.successful
     found = circuit.with_log_values(solution.value[:3])
     assert abs(float(found.r_p) / 500e6 - 1) < 0.01  # the maker's tolerance
@@ -93,3 +94,25 @@ def test_the_model_cell_is_what_its_maker_says(recorded):
     # The two steps change by 5 % the scatter of 10 000 samples at most: nothing is left to explain.
     rms = np.sqrt(2 * float(solution.stats["normal_equations"].objective) / measured.size)
     assert rms < 1.05 * floor
+
+
+@pytest.mark.slow
+def test_its_circuit_is_chosen(recorded):
+    """BIC of circuits with a rational impedance; the fit in time cannot have Cole's."""
+    measured, steps, _ = recorded
+    _, *others = START
+    bic = {}
+    for circuit in (
+        SkinRC(30e6, 150e6, 100e-12),
+        ParallelRC(150e6, 100e-12),
+        SkinLayers(30e6, 100e6, 100e-12, 50e6, 300e-12),
+    ):
+        corner, delay, holding = others
+        start = jnp.array([*circuit.log_values(), jnp.log(corner), delay, holding])
+        solution = fit(circuit, jnp.asarray(measured), tuple(int(k) for k in steps), start)
+        squares = 2 * float(solution.stats["normal_equations"].objective)
+        count = measured.size
+        bic[type(circuit)] = count * np.log(squares / count) + start.size * np.log(count)
+    assert min(bic, key=bic.__getitem__) is SkinRC
+    assert bic[SkinLayers] - bic[SkinRC] > 10
+    assert bic[ParallelRC] - bic[SkinRC] > 1000

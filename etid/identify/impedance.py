@@ -18,7 +18,7 @@ from jaxtyping import Array, Complex, Float
 from etid.circuits.circuit import AbstractCircuit
 from etid.identify.arguments import circuit_of, require_float64
 from etid.identify.compiled import stored_jit
-from etid.results.fits import Fit, IdentificationError, complex_rrse
+from etid.results.fits import CHANGES, Fit, IdentificationError, Support, complex_rrse
 from etid.results.verdicts import RESULTS, first_verdict, message, verdict
 from etid.solvers.levenberg_marquardt import LevenbergMarquardt, best_start
 from etid.solvers.matrices import inverse
@@ -80,6 +80,9 @@ def _fit(
         ),
         steps=solution.stats["num_steps"],
         method="impedance",
+        support=Support(2 * equations.objective, jnp.asarray(2.0 * z.size), jnp.zeros(CHANGES))
+        if known
+        else None,
     )
 
 
