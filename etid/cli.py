@@ -34,6 +34,7 @@ from etid.commands import (
     exporting,
     fit,
     importing,
+    merging,
     report,
     simulate,
 )
@@ -42,6 +43,7 @@ from etid.commands.outputs import check_outputs
 COMMANDS: dict[str, Any] = {
     "simulate": simulate,
     "import": importing,
+    "merge": merging,
     "check": check,
     "fit": fit,
     "report": report,

@@ -347,6 +347,7 @@ def test_keys_of_json_are_those_of_the_guide(run, study_file, tmp_path):
     rates = ("--sample-rate", 2e5, "--pulse-rate", 60)
     calls = {
         "simulate": ("paper_dry", "-o", tmp_path / "made.h5"),
+        "merge": (study_file, "-o", tmp_path / "merged.h5"),
         "check": (study_file,),
         "import": (table, "-o", tmp_path / "i.h5", *names, *rates),
         "fit": (study_file, "-o", tmp_path / "f.h5", "--method", "equation_error", "--order", 3),
