@@ -13,7 +13,7 @@ import itertools
 import math
 import threading
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple, TypeVar, overload
 
 import jax
 import jax.numpy as jnp
@@ -21,7 +21,7 @@ import numpy as np
 from jaxtyping import Array, Int
 from tqdm import tqdm
 
-from etid.circuits.circuit import AbstractCircuit
+from etid.circuits.circuit import AbstractCircuit, SkinRC
 from etid.estimators.estimator import AbstractEstimator
 from etid.estimators.lanes import AbstractLane, stacked, unstacked
 from etid.estimators.registry import MAXIMUM_LIKELIHOOD, Method
@@ -60,6 +60,7 @@ from etid.results.tried_orders import Order
 from etid.selection.common import common, deserves
 from etid.selection.selection import Selection
 
+_Kind = TypeVar("_Kind", bound=AbstractCircuit)
 LANES = 16  # lanes of one chunk; the last chunk is padded
 AHEAD = 2  # chunks that are read and inspected in advance
 SAMPLE = 200  # recordings that choose the circuit of a study; a second of work
@@ -280,6 +281,39 @@ def _otherwise(
         return Selection.of({chosen: fit}, chosen, candidates), text
     found = Selection.of({**found.fits, chosen: fit}, chosen, candidates)
     return found, " ".join(filter(None, (text, deserves(found, chosen))))
+
+
+@overload
+def identify_skins(
+    recordings: Iterable[Recording] | Study,
+    driver: Driver,
+    *,
+    circuit: None = None,
+    method: Method | None = None,
+    progress: bool = False,
+) -> Fits[SkinRC]: ...
+
+
+@overload
+def identify_skins(
+    recordings: Iterable[Recording] | Study,
+    driver: Driver,
+    *,
+    circuit: _Kind,
+    method: Method | None = None,
+    progress: bool = False,
+) -> Fits[_Kind]: ...
+
+
+@overload
+def identify_skins(
+    recordings: Iterable[Recording] | Study,
+    driver: Driver,
+    *,
+    circuit: Literal["auto"],
+    method: Method | None = None,
+    progress: bool = False,
+) -> Fits[AbstractCircuit]: ...
 
 
 def identify_skins(

@@ -4,14 +4,14 @@ import dataclasses
 import functools
 import zlib
 from collections.abc import Callable, Sequence
-from typing import Any, TypeVar
+from typing import Any, Literal, TypeVar, overload
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from etid.circuits.circuit import AbstractCircuit
+from etid.circuits.circuit import AbstractCircuit, SkinRC
 from etid.estimators.estimator import AbstractEstimator
 from etid.estimators.judgement import MISFIT_CHI2
 from etid.estimators.lanes import AbstractLane, Harmonics, stacked, unstacked
@@ -41,8 +41,42 @@ from etid.selection.selection import Selection
 from etid.signals.harmonics import whole_periods
 
 KEPT = 4  # drivers, for which `known_of` is kept
+_Kind = TypeVar("_Kind", bound=AbstractCircuit)
 _Found = TypeVar("_Found")
 _Outcome = TypeVar("_Outcome", Fit, Driver)
+
+
+@overload
+def identify_skin(
+    recording: Recording,
+    driver: Driver,
+    *,
+    circuit: None = None,
+    method: Method | None = None,
+    throw: bool = True,
+) -> Fit[SkinRC]: ...
+
+
+@overload
+def identify_skin(
+    recording: Recording,
+    driver: Driver,
+    *,
+    circuit: _Kind,
+    method: Method | None = None,
+    throw: bool = True,
+) -> Fit[_Kind]: ...
+
+
+@overload
+def identify_skin(
+    recording: Recording,
+    driver: Driver,
+    *,
+    circuit: Literal["auto"],
+    method: Method | None = None,
+    throw: bool = True,
+) -> Fit[AbstractCircuit]: ...
 
 
 def identify_skin(

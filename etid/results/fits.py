@@ -5,8 +5,9 @@ import importlib.metadata
 import itertools
 import os
 import reprlib
+import statistics
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, Generic
 
 import equinox as eqx
 import jax
@@ -14,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Complex, Float, Int
 
-from etid.circuits.circuit import AbstractCircuit
+from etid.circuits.circuit import AbstractCircuit, Circuit
 from etid.circuits.display import heading, quantity
 from etid.circuits.lookup import qualified, remembered
 from etid.circuits.overview import Overview, Overviewed, element_rows
@@ -97,7 +98,7 @@ class Support(eqx.Module):
         return cls(np.full(lane, np.nan), np.full(lane, np.nan), np.full((*lane, CHANGES), np.nan))
 
 
-class Fit(Judged):
+class Fit(Judged, Generic[Circuit]):
     """One identified circuit, or a batch of them along a leading axis.
 
     Attributes:
@@ -122,7 +123,7 @@ class Fit(Judged):
             None if the method computes no likelihood.
     """
 
-    circuit: AbstractCircuit
+    circuit: Circuit
     cov: Float[Array | np.ndarray, "*lane parameter parameter"]
     shared_cov: Float[Array | np.ndarray, "*lane parameter parameter"]
     rrse: Float[Array | np.ndarray, "*lane"]
@@ -136,12 +137,89 @@ class Fit(Judged):
     support: Support | None = None
 
     @property
-    def stderr(self) -> AbstractCircuit:
+    def stderr(self) -> Circuit:
         """Standard errors of the elements, as a circuit of the same kind."""
         variance = jnp.diagonal(jnp.asarray(self.cov), axis1=-2, axis2=-1)
         values = jnp.sqrt(jnp.where(variance >= 0, variance, jnp.nan))
         names = self.circuit.names()
         return type(self.circuit)(**{name: values[..., i] for i, name in enumerate(names)})
+
+    @property
+    def correlation(self) -> Float[np.ndarray, "*lane parameter parameter"]:
+        """Correlation coefficients of the errors of the elements; NaN without a covariance."""
+        errors = np.asarray(self.stderr.values())
+        return np.asarray(self.cov) / (errors[..., :, None] * errors[..., None, :])
+
+    def intervals(self, level: float = 0.95) -> dict[str, tuple[float, float]]:
+        """Confidence intervals of the elements: value ± z · standard error; for one fit.
+
+        They come from the normal distribution, to which maximum likelihood leads if the standard
+        errors are small.
+
+        Args:
+            level: Probability that an interval contains the true value.
+
+        Returns:
+            Both ends [SI] by name; NaN without a covariance.
+
+        Raises:
+            ValueError: The level is not between 0 and 1, or this is a batch.
+        """
+        self._refuse_batch()
+        if not 0 < level < 1:
+            raise ValueError(f"level is {level}; it must be between 0 and 1, as in 0.95")
+        z = statistics.NormalDist().inv_cdf((1 + level) / 2)
+        values, errors = self.circuit.values().tolist(), self.stderr.values().tolist()
+        return {
+            name: (value - z * error, value + z * error)
+            for name, value, error in zip(self.circuit.names(), values, errors, strict=True)
+        }
+
+    def table(self) -> dict[str, Any]:
+        """Elements [SI], standard errors, changes, quality and verdict, by name.
+
+        Returns:
+            Numbers and texts; arrays for a batch.
+        """
+        names, stderr, change = self.circuit.names(), self.stderr, self.known_changes[0]
+        columns: dict[str, Any] = {}
+        for name in names:
+            columns[name] = getattr(self.circuit, name)
+            columns[f"{name}_stderr"] = getattr(stderr, name)
+        for i, name in enumerate((*names, "amplitude")):
+            columns[f"{name}_change"] = change[..., i]
+        remarks = np.vectorize(words, otypes=[object])(np.asarray(self.remarks))
+        columns |= {
+            "rrse": self.rrse,
+            "chi2": self.chi2,
+            "steps": self.steps,
+            "verdict": self.verdict,
+            "remarks": np.asarray(remarks).astype(str),
+        }
+        arrays = {name: np.asarray(column) for name, column in columns.items()}
+        return {name: one if one.ndim else one.item() for name, one in arrays.items()}
+
+    def write(self, path: str | os.PathLike[str]) -> None:
+        """Write the fit to an HDF5 file, as `Fits` of one; `Fits.read` reads it.
+
+        Raises:
+            ValueError: This is a batch.
+        """
+        self._refuse_batch()
+        batch = jax.tree.map(lambda leaf: np.asarray(leaf)[None], self)
+        Fits(batch, described([{}]), np.array([message(self.verdict)])).write(path)
+
+    def _refuse_batch(self) -> None:
+        if np.ndim(self.rrse):
+            raise ValueError("this is a batch of fits; take one of them, as in fits[0]")
+
+    @property
+    def known_changes(self) -> tuple[np.ndarray, np.ndarray]:
+        """`change` and `change_stderr` as arrays; NaN if none were computed."""
+        nothing = np.full((*np.shape(self.rrse), len(self.circuit.names()) + 1), np.nan)
+        if self.change is None or self.change_stderr is None:
+            return nothing, nothing
+        return np.asarray(self.change), np.asarray(self.change_stderr)
 
     @property
     def elements(self) -> tuple[str, ...]:
@@ -199,7 +277,7 @@ def described(recordings: Sequence[Mapping[str, Any]]) -> dict[str, np.ndarray]:
 
 
 @dataclasses.dataclass(frozen=True, eq=False, repr=False)
-class Fits(Overviewed):
+class Fits(Overviewed, Generic[Circuit]):
     """Identified circuits of many recordings, in the order of the recordings.
 
     Attributes:
@@ -209,12 +287,20 @@ class Fits(Overviewed):
         notes: A sentence for each fit that is not successful; empty for the others.
     """
 
-    fit: Fit
+    fit: Fit[Circuit]
     labels: Mapping[str, np.ndarray]
     notes: np.ndarray
 
-    circuit = property(lambda self: self.fit.circuit, doc="Identified elements, arrays (fit,).")
-    stderr = property(lambda self: self.fit.stderr, doc="Standard errors, arrays (fit,).")
+    @property
+    def circuit(self) -> Circuit:
+        """Identified elements, arrays (fit,)."""
+        return self.fit.circuit
+
+    @property
+    def stderr(self) -> Circuit:
+        """Standard errors, arrays (fit,)."""
+        return self.fit.stderr
+
     cov = property(lambda self: self.fit.cov, doc="Covariances, (fit, parameter, parameter).")
     rrse = property(lambda self: self.fit.rrse, doc="Root relative squared errors (fit,).")
     chi2 = property(lambda self: self.fit.chi2, doc="χ² per degree of freedom (fit,).")
@@ -223,10 +309,10 @@ class Fits(Overviewed):
     def __len__(self) -> int:
         return len(self.notes)
 
-    def __getitem__(self, index: int) -> Fit:
+    def __getitem__(self, index: int) -> Fit[Circuit]:
         return jax.tree.map(lambda leaf: leaf[index], self.fit)
 
-    def take(self, index: np.ndarray) -> "Fits":
+    def take(self, index: np.ndarray) -> "Fits[Circuit]":
         """The fits selected by an array.
 
         Args:
@@ -259,7 +345,7 @@ class Fits(Overviewed):
             np.concatenate([part.notes for part in parts]),
         )
 
-    def where(self, **labels: Label | None) -> "Fits":
+    def where(self, **labels: Label | None) -> "Fits[Circuit]":
         """The fits whose labels equal the given ones, as in `where(condition="dry")`.
 
         Args:
@@ -276,7 +362,7 @@ class Fits(Overviewed):
             chosen &= self.labels[name] == value
         return self.take(chosen)
 
-    def successful(self) -> "Fits":
+    def successful(self) -> "Fits[Circuit]":
         """The fits whose verdict is `successful`."""
         return self.take(self.verdicts == "successful")
 
@@ -286,30 +372,8 @@ class Fits(Overviewed):
 
     def table(self) -> dict[str, np.ndarray]:
         """One column per label, element [SI], standard error, quality and verdict."""
-        columns = {name: self.labels[name] for name in DESCRIBED}
-        for name in self.circuit.names():
-            columns[name] = np.asarray(getattr(self.circuit, name))
-            columns[f"{name}_stderr"] = np.asarray(getattr(self.stderr, name))
-        for i, name in enumerate((*self.circuit.names(), "amplitude")):
-            columns[f"{name}_change"] = self._changes[0][:, i]
-        columns |= {
-            "rrse": np.asarray(self.rrse),
-            "chi2": np.asarray(self.chi2),
-            "steps": np.asarray(self.fit.steps),
-            "verdict": self.verdicts,
-            "remarks": np.array([words(one) for one in np.asarray(self.fit.remarks)], dtype=str),
-            "note": self.notes,
-        }
-        return columns
-
-    @property
-    def _changes(self) -> tuple[np.ndarray, np.ndarray]:
-        """Changes during the record and their standard errors; NaN if none were computed."""
-        nothing = np.full((len(self), len(self.circuit.names()) + 1), np.nan)
-        fit = self.fit
-        if fit.change is None or fit.change_stderr is None:
-            return nothing, nothing
-        return np.asarray(fit.change), np.asarray(fit.change_stderr)
+        labels = {name: self.labels[name] for name in DESCRIBED}
+        return labels | self.fit.table() | {"note": self.notes}
 
     def to_pandas(self) -> Any:
         """The table as a pandas DataFrame.
@@ -402,7 +466,7 @@ class Fits(Overviewed):
         units |= {f"{name}_stderr": unit for name, unit in units.items()}
         units |= {name: field.unit for name, field in DESCRIBING.items() if field.unit}
         columns = self.table() | {"cov": self.cov, "shared_cov": self.fit.shared_cov}
-        columns["change_stderr"] = self._changes[1]
+        columns["change_stderr"] = self.fit.known_changes[1]
         attributes = {
             "schema": SCHEMA,
             "schema_version": "1.3",
@@ -473,7 +537,7 @@ class Fits(Overviewed):
             remarks=remarks,
             **_changes_of(read, changes),
         )
-        return cls(fit, {name: read[name] for name in DESCRIBED}, read["note"])
+        return Fits(fit, {name: read[name] for name in DESCRIBED}, read["note"])
 
 
 def _circuit(table: Table, given: type[AbstractCircuit] | None) -> type[AbstractCircuit]:

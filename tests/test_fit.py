@@ -1,0 +1,74 @@
+"""Intervals, correlation, table and file of one fit."""
+
+import jax
+import numpy as np
+import pytest
+from scipy import stats
+
+import etid
+from etid.results.verdicts import verdict
+
+VALUES = np.array([33.4e3, 186e3, 0.12e-9])
+ERRORS = np.array([100.0, 1e3, 1e-12])
+CORRELATION = np.array([[1.0, 0.5, -0.25], [0.5, 1.0, 0.0], [-0.25, 0.0, 1.0]])
+
+
+def fit(name="successful"):
+    one = np.asarray(1.5)
+    return etid.Fit(
+        circuit=etid.SkinRC(*VALUES),
+        cov=CORRELATION * np.outer(ERRORS, ERRORS),
+        shared_cov=np.zeros((3, 3)),
+        rrse=one,
+        chi2=one,
+        result=verdict(name),
+        steps=np.asarray(7),
+        method="maximum_likelihood",
+    )
+
+
+def batch():
+    return jax.tree.map(lambda *leaves: np.stack(leaves), fit(), fit("misfit"))
+
+
+def test_correlation_is_the_covariance_in_units_of_the_errors():
+    np.testing.assert_allclose(fit().correlation, CORRELATION, rtol=1e-12)
+    np.testing.assert_allclose(batch().correlation[1], CORRELATION, rtol=1e-12)
+
+
+@pytest.mark.parametrize("level", [0.5, 0.95, 0.99])
+def test_an_interval_holds_this_part_of_a_normal_distribution(level):
+    found = fit().intervals(level)
+    assert list(found) == ["r_s", "r_p", "c_p"]
+    low, high = np.transpose(list(found.values()))
+    expected = stats.norm.interval(level, VALUES, ERRORS)
+    np.testing.assert_allclose([low, high], expected, rtol=1e-12)
+    assert all(type(end) is float for ends in found.values() for end in ends)
+
+
+@pytest.mark.parametrize("level", [0.0, 1.0, 95.0, float("nan")])
+def test_a_level_outside_of_0_to_1_is_refused(level):
+    with pytest.raises(ValueError, match="between 0 and 1"):
+        fit().intervals(level)
+
+
+def test_the_table_of_a_fit_is_its_row_in_the_table_of_fits(tmp_path):
+    table = fit("misfit").table()
+    assert (table["r_s"], table["verdict"], table["steps"]) == (33.4e3, "misfit", 7)
+    np.testing.assert_allclose(table["c_p_stderr"], 1e-12)
+    fit("misfit").write(tmp_path / "fit.h5")
+    fits = etid.Fits.read(tmp_path / "fit.h5")
+    assert len(fits) == 1
+    assert "misses the recording" in fits.notes[0]
+    np.testing.assert_array_equal(fits[0].cov, fit().cov)
+    whole = fits.table()
+    for name, value in table.items():
+        np.testing.assert_array_equal(whole[name][0], value)
+
+
+@pytest.mark.parametrize(
+    "call", [lambda one, _: one.intervals(), lambda one, path: one.write(path)]
+)
+def test_a_batch_is_refused_where_one_fit_is_needed(call, tmp_path):
+    with pytest.raises(ValueError, match="take one of them"):
+        call(batch(), tmp_path / "fit.h5")
