@@ -17,7 +17,7 @@ from etid.simulation.scenes import Scene, Trial
 from etid.simulation.transformer import ResistorLoad, SkinLoad
 
 # Minima to ten digits: a difference of two of them is to be compared.
-EXACT = dataclasses.replace(single_load.TOGETHER, rtol=1e-10, ftol=1e-15)
+EXACT = dataclasses.replace(single_load.WELL, rtol=1e-10, ftol=1e-15)
 STEP = 1e-3  # of a disturbance that is small itself: the curvature costs its square
 # Differences of minima along the flat direction of the driver repeat to some 1e-9 of an element.
 REPEATED = 1e-8
@@ -34,7 +34,7 @@ class Derivatives(NamedTuple):
 
 def derivatives(load, circuit, order, monkeypatch):
     """By a disturbance of the data, and by the logarithm of the known resistor."""
-    monkeypatch.setattr(single_load, "TOGETHER", EXACT)
+    monkeypatch.setattr(single_load, "WELL", EXACT)
     known = (Trial("c", ResistorLoad(98.8e3)),)
     scene = Scene((Trial("a", load),), known, sample_rate=40e3, samples=2000)
     study = scene.simulate(seed=1)

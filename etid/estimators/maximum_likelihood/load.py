@@ -313,11 +313,15 @@ WELL = LevenbergMarquardt(rtol=SOLVER.rtol, ftol=SOLVER.ftol, equations=_equatio
 
 
 def refined(
-    load: Load, start: Float[Array, " q"], solver: LevenbergMarquardt = WELL
+    load: Load, start: Float[Array, " q"], solver: LevenbergMarquardt | None = None
 ) -> optx.Solution:
-    """The minimum over the own parameters, and over z if `start` contains it."""
+    """The minimum over the own parameters, and over z if `start` contains it; `WELL` if no solver.
+
+    The default is looked up here, so that a test of derivatives can ask for more digits.
+    """
+    with_solver = solver or WELL
     return optx.least_squares(
-        lambda q, load: load(q), solver, start, args=load, max_steps=MAX_STEPS, throw=False
+        lambda q, load: load(q), with_solver, start, args=load, max_steps=MAX_STEPS, throw=False
     )
 
 
