@@ -72,8 +72,16 @@ def as_kind(driver: Driver, kind: type[Driver]) -> Driver:
 def fit(verdict: str = "successful", circuit: etid.AbstractCircuit = SKIN) -> Fit:
     """A fit of one dry trial."""
     cov = jnp.diag((circuit.values() * RELATIVE) ** 2)
-    of = (jnp.array(1e-3), jnp.array(1.02), verdicts_of(np.array(verdict)), jnp.array(5))
-    return Fit(circuit, cov, 0 * cov, *of, "maximum_likelihood")
+    return Fit(
+        circuit=circuit,
+        cov=cov,
+        shared_cov=0 * cov,
+        rrse=jnp.array(1e-3),
+        chi2=jnp.array(1.02),
+        result=verdicts_of(np.array(verdict)),
+        steps=jnp.array(5),
+        method="maximum_likelihood",
+    )
 
 
 @functools.cache
@@ -116,9 +124,16 @@ def fits() -> Fits:
     verdicts[[1, 4]] = "misfit", "insensitive"
     cov = np.stack([np.diag((RELATIVE * one) ** 2) for one in values.T])
     found = Fit(
-        etid.SkinRC(*jnp.asarray(values)), cov, 0 * cov, np.full(count, 1e-3), np.ones(count),
-        verdicts_of(verdicts), np.full(count, 5), "maximum_likelihood", np.zeros(count, int),
-    )  # fmt: skip
+        circuit=etid.SkinRC(*jnp.asarray(values)),
+        cov=cov,
+        shared_cov=0 * cov,
+        rrse=np.full(count, 1e-3),
+        chi2=np.ones(count),
+        result=verdicts_of(verdicts),
+        steps=np.full(count, 5),
+        method="maximum_likelihood",
+        remarks=np.zeros(count, int),
+    )
     labels = {
         "path": np.array([f"recording/{i:02d}" for i in range(count)]),
         "subject": np.repeat(["s01", "s02"], 6),

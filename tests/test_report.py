@@ -81,9 +81,16 @@ def _fits(circuit, paths, elements, excess):
     cov[:, range(size), range(size)] = np.stack(list(values.values()), -1) ** 2  # 100 % error
     verdicts = np.array(["successful", "misfit"] * count)[:count]
     fit = etid.Fit(
-        circuit(**values), cov, 0 * cov, np.full(count, 0.05), np.ones(count),
-        verdicts_of(verdicts), np.ones(count, int), "output_error", np.zeros(count, int),
-    )  # fmt: skip
+        circuit=circuit(**values),
+        cov=cov,
+        shared_cov=0 * cov,
+        rrse=np.full(count, 0.05),
+        chi2=np.ones(count),
+        result=verdicts_of(verdicts),
+        steps=np.ones(count, int),
+        method="output_error",
+        remarks=np.zeros(count, int),
+    )
     names = ("path", "subject", "condition", "electrode", "trial")
     columns = {name: np.array([getattr(labels[path], name) for path in paths]) for name in names}
     return etid.Fits(fit, columns, np.full(count, ""))

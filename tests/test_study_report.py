@@ -46,10 +46,16 @@ def fits_of(values, verdicts, **labels):
     shared, own = (np.einsum("ni,ij->nij", (e * values) ** 2, np.eye(3)) for e in (SHARED, OWN))
     chi2 = np.where(np.asarray(verdicts) == "misfit", 7.0, 1.0) + 0.01 * np.arange(count)
     fit = etid.Fit(
-        etid.SkinRC(*values.T), own + shared, shared, np.full(count, 0.02), chi2,
-        verdicts_of(np.asarray(verdicts)), np.full(count, 5), "maximum_likelihood",
-        np.zeros(count, int),
-    )  # fmt: skip
+        circuit=etid.SkinRC(*values.T),
+        cov=own + shared,
+        shared_cov=shared,
+        rrse=np.full(count, 0.02),
+        chi2=chi2,
+        result=verdicts_of(np.asarray(verdicts)),
+        steps=np.full(count, 5),
+        method="maximum_likelihood",
+        remarks=np.zeros(count, int),
+    )
     default = {name: np.full(count, "") for name in ("subject", "condition", "electrode", "trial")}
     columns = {"path": np.array([f"loaded/{i}" for i in range(count)])} | default
     return etid.Fits(fit, columns | labels, np.array([message(name) for name in verdicts]))
