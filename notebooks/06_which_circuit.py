@@ -23,6 +23,7 @@ import jax
 
 jax.config.update("jax_enable_x64", True)  # before the first array: etid needs float64
 
+import os
 import pathlib
 
 import numpy as np
@@ -99,8 +100,9 @@ for path, note in zip(paths, fits.notes, strict=True):
 
 # %%
 HERE = pathlib.Path.cwd()
-FOLDERS = [folder / "shared" / "data" for folder in (HERE, *HERE.parents)]
-DATA = next((folder for folder in FOLDERS if folder.is_dir()), None)
+NEAR = [folder / "shared" / "data" for folder in (HERE, *HERE.parents)]
+GIVEN = pathlib.Path(os.environ.get("ETID_REFERENCE_DATA", NEAR[0]))
+DATA = next((folder for folder in (GIVEN, *NEAR) if folder.is_dir()), None)
 CANDIDATES = [
     etid.SkinRC(), etid.ParallelRC(), etid.Resistor(), etid.SkinCole(), etid.SkinLayers()
 ]  # fmt: skip
