@@ -1,5 +1,6 @@
 """From the files of a laboratory to a first fit: the commands of the guide."""
 
+import ast
 import pathlib
 import re
 import shlex
@@ -57,6 +58,34 @@ def test_files_are_named_by_their_stems_and_name_their_calibrations(folder, tmp_
         assert not np.array_equal(study[names[0]].v_th, study[names[1]].v_th)
     with pytest.raises(etid.RecordingError, match="together with a mapping"):
         etid.import_file(folder / "finger.csv", target, {}, calibrations=files)
+
+
+@pytest.mark.parametrize(
+    ("head", "row", "encoding", "flags"),
+    [
+        ("open;out\n", "{};{}\n", "utf-8", "--delimiter ';'"),
+        ("Zeit µs;a\n\nopen;out\n", "{};{}\n", "cp1252", "--header-line 3 --encoding 'cp1252'"),
+        ('"Model","TBS1052B"\nopen,out\n(V),(V)\n', "{},{}\n", "utf-8", "--header-line 2"),
+        ("open\tout\n", "{}\t{}\n", "utf-16", "--delimiter '\\t' --encoding 'utf-16'"),
+        ("open;out\n", "C{};{}\n", "utf-8", "--delimiter ';' --decimal ','"),
+    ],
+)
+def test_another_dialect_is_shown_and_confirmed_by_flags(head, row, encoding, flags, tmp_path):
+    values = np.random.default_rng(0).normal(size=(500, 2))
+    text = head + "".join(row.replace("C", "").format(*pair) for pair in values.tolist())
+    if "C" in row:
+        text = text.replace(".", ",")
+    file, target = tmp_path / "t.csv", tmp_path / "t.h5"
+    file.write_text(text, encoding=encoding)
+    given = {"v_th": "open", "v_out": "out", "sample_rate": 2e5, "pulse_rate": 60.0, "scale": 1.0}
+    with pytest.raises(etid.RecordingError, match="Nothing is guessed") as caught:
+        etid.import_file(file, target, **given)
+    assert flags in str(caught.value)
+    found = re.findall(r"--([a-z-]+) ('[^']*'|\d+)", str(caught.value))
+    told = {name.replace("-", "_"): ast.literal_eval(value) for name, value in found}
+    etid.import_file(file, target, **given, **told)
+    with etid.read(target) as study:
+        np.testing.assert_allclose(study["loaded/0"].v_out, values[:, 1], rtol=1e-12)
 
 
 MAPPING = """

@@ -9,6 +9,7 @@ from etid.commands import Outcome
 from etid.commands.outputs import HDF5
 from etid.files.importing import import_file
 from etid.files.mapping import CHANNELS, FIELDS
+from etid.files.readers.delimited import DIALECT
 from etid.recordings.fields import DECLARED, SIGNALS
 
 
@@ -34,6 +35,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="TOML file in place of the options below, also for several recordings "
         "(data_schema/README.md)",
     )
+    for name, kind, what in (
+        ("delimiter", str, "character between the cells, default a comma"),
+        ("decimal", str, "decimal sign, default a point"),
+        ("header_line", int, "line with the names of the columns, default 1"),
+        ("encoding", str, "encoding of the text, default UTF-8"),
+    ):
+        _option(parser, name, kind, f"for CSV: {what}")
     channel = "channel of {}; its unit is {} unless the file names a unit".format
     for name, signal in SIGNALS.items():
         _option(parser, name, help=channel(name, signal.unit))
@@ -47,7 +55,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _option(
-    parser: argparse.ArgumentParser, name: str, kind: type[str] | type[float] = str, help: str = ""
+    parser: argparse.ArgumentParser,
+    name: str,
+    kind: type[str] | type[float] | type[int] = str,
+    help: str = "",
 ) -> None:
     metavar = "NAME" if kind is str else "NUMBER"
     parser.add_argument(f"--{name.replace('_', '-')}", type=kind, metavar=metavar, help=help)
@@ -60,7 +71,11 @@ def outputs(arguments: argparse.Namespace) -> dict[pathlib.Path, tuple[str, ...]
 
 def run(arguments: argparse.Namespace) -> Outcome:
     """Import one file, and return which channel became which signal."""
-    given = {name: value for name, value in vars(arguments).items() if name in (*CHANNELS, *FIELDS)}
+    given = {
+        name: value
+        for name, value in vars(arguments).items()
+        if name in (*CHANNELS, *FIELDS, *DIALECT)
+    }
     calibrations: dict[str | os.PathLike[str], float] = {
         pathlib.Path(file): _ohm(file, text) for file, text in arguments.calibrations
     }

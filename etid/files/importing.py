@@ -64,8 +64,9 @@ def import_file(
         mapping: TOML file, or its content as a mapping. It replaces all other arguments.
         calibrations: More files to import, each with its known resistor, `r_load` [ohm]. All other
             arguments apply to them too. The other recordings name them as their calibrations.
-        **given: Keys of a mapping for one recording: the channel names `v_th`, `v_out`, `current`
-            and `time`; `scale`; and fields such as `pulse_rate` [Hz].
+        **given: Keys of a mapping for one recording: for CSV, `delimiter`, `decimal`, `header_line`
+            and `encoding` of the table if they are not `,`, `.`, 1 and UTF-8; the channel names
+            `v_th`, `v_out`, `current` and `time`; `scale`; and fields such as `pulse_rate` [Hz].
 
     Returns:
         Sources of each recording or stack of trials: channels, units and sample rate.
@@ -119,10 +120,16 @@ def import_file(
     with contextlib.ExitStack() as files:
         for path, told in zip(paths, said, strict=True):
             file = str(path)
+            written = {name: told[name] for name in delimited.DIALECT if name in told}
+            told = {name: value for name, value in told.items() if name not in written}
+            if path.suffix.lower() != ".csv":
+                _refuse(written, file, "is only for CSV tables")
             if calibrated and path not in known:
                 told = {**told, "calibration": calibrated}
             with located(file):
-                contents = files.enter_context(READERS[path.suffix.lower()](path, folder))
+                contents = files.enter_context(
+                    READERS[path.suffix.lower()](path, folder, **written)
+                )
                 with located(place + file):
                     name = path.stem if len(paths) > 1 else ""
                     planned = plans(told, contents.names, implied, name)

@@ -1,17 +1,22 @@
-"""Reader for comma-separated tables with a header line, in one pass and in bounded memory.
+"""Reader for tables of text with a header line, in one pass and in bounded memory.
+
+A table has commas between its cells, points in its numbers, and its names in the first line, unless
+the user says otherwise. A table that looks different is refused; the error says what to confirm.
 
 A column `open [mV]` or `open (mV)` has the name `open` and the unit mV. Oscilloscopes write the
 units into a second line instead, such as `(ms),(mV),(mV)`. This line contains no number.
 """
 
+import codecs
 import contextlib
 import csv
+import dataclasses
 import itertools
 import pathlib
 import re
 import tempfile
 from collections.abc import Iterable, Iterator
-from typing import BinaryIO, TextIO
+from typing import Any, BinaryIO, TextIO
 
 import numpy as np
 
@@ -19,17 +24,69 @@ from etid.files.channel import Channel, Contents
 from etid.files.units import parse_unit
 from etid.recordings.recording import RecordingError
 
+_SEEN = 1 << 16  # [bytes] start of a table that is looked at before it is read
+_LINES = 200  # lines in which the first row of numbers is searched
 ROWS = 1 << 16  # rows of text in memory at a time
 
 _WITH_UNIT = re.compile(r"(?P<name>.*\S)\s*[\[(](?P<unit>[^\[\]()]+)[\])]")
 
 
+@dataclasses.dataclass(frozen=True)
+class Dialect:
+    """How a table is written.
+
+    Attributes:
+        delimiter: Character between the cells.
+        decimal: Decimal sign of the numbers: `.` or `,`.
+        header_line: Line with the names of the columns, counted from 1; lines above are skipped.
+        encoding: Encoding of the text.
+    """
+
+    delimiter: str = ","
+    decimal: str = "."
+    header_line: int = 1
+    encoding: str = "utf-8-sig"
+
+    def __post_init__(self) -> None:
+        if len(self.delimiter) != 1 or self.decimal not in (".", ",") or self.header_line < 1:
+            raise RecordingError(f"the table cannot be written as {self}")
+
+    def cells(self, line: str) -> list[str]:
+        """Cells of a line."""
+        row = next(csv.reader([line], delimiter=self.delimiter), [])
+        return [cell.strip() for cell in row]
+
+    def is_number(self, cell: str) -> bool:
+        """Whether a cell is a number with this decimal sign."""
+        try:
+            float(cell.replace(self.decimal, "."))
+        except ValueError:
+            return False
+        return self.decimal == "." or "." not in cell
+
+
+DIALECT = tuple(field.name for field in dataclasses.fields(Dialect))
+
+
 @contextlib.contextmanager
-def opened(path: pathlib.Path, folder: pathlib.Path) -> Iterator[Contents]:
-    """Columns of a table; `prepare` copies the needed columns to temporary binary files."""
+def opened(path: pathlib.Path, folder: pathlib.Path, **told: Any) -> Iterator[Contents]:
+    """Columns of a table; `prepare` copies the needed columns to temporary binary files.
+
+    Args:
+        path: The table.
+        folder: Folder of the temporary files.
+        **told: Fields of `Dialect` that the user has given.
+
+    Raises:
+        RecordingError: The table is damaged, or nothing was told and it looks different from a
+            default table.
+    """
+    dialect = Dialect(**told)
+    if not told:
+        _refuse_another(path)
     with contextlib.ExitStack() as files:
-        with path.open(newline="", encoding="utf-8-sig") as text:
-            names, units, skipped = _header(text)
+        with path.open(newline="", encoding=dialect.encoding) as text:
+            names, units, skipped = _header(text, dialect)
 
         columns: dict[str, BinaryIO] = {}
         count = 0
@@ -38,7 +95,9 @@ def opened(path: pathlib.Path, folder: pathlib.Path) -> Iterator[Contents]:
             nonlocal count
             for name in wanted:
                 columns[name] = files.enter_context(tempfile.TemporaryFile(dir=folder))
-            count = _spool(path, skipped, {names.index(name): columns[name] for name in columns})
+            count = _spool(
+                path, dialect, skipped, {names.index(name): columns[name] for name in columns}
+            )
 
         def channel(name: str) -> Channel:
             def read(_: int, start: int, stop: int) -> np.ndarray:
@@ -51,10 +110,59 @@ def opened(path: pathlib.Path, folder: pathlib.Path) -> Iterator[Contents]:
         yield Contents(names, channel, prepare)
 
 
-def _header(text: TextIO) -> tuple[tuple[str, ...], tuple[str, ...], int]:
-    """Names, units, and the number of header lines."""
-    cells = _cells(text.readline())
-    if cells and all(_is_number(cell) for cell in cells):
+def _refuse_another(path: pathlib.Path) -> None:
+    """Raise an error that says what to confirm if a table looks different from the default."""
+    with path.open("rb") as file:
+        start = file.read(_SEEN)
+    encoding = Dialect.encoding
+    try:
+        codecs.getincrementaldecoder(encoding)().decode(start)
+    except UnicodeDecodeError:
+        encoding = "utf-16" if start[:2] in (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE) else "cp1252"
+    lines = start.decode(encoding, "replace").splitlines()[:_LINES]
+    found = _guessed(lines, encoding)
+    if found is None or found == Dialect():
+        return
+    options = {name: value for name, value in dataclasses.asdict(found).items()
+               if value != getattr(Dialect, name)}  # fmt: skip
+    flags = " ".join(
+        f"--{name.replace('_', '-')} {value if isinstance(value, int) else repr(value)}"
+        for name, value in options.items()
+    )
+    raise RecordingError(
+        "seems to be written with "
+        + ", ".join(f"{name} {value!r}" for name, value in options.items())
+        + f" and the columns {', '.join(found.cells(lines[found.header_line - 1]))}",
+        remedy=f"Nothing is guessed: if this is right, add {flags}",
+    )
+
+
+def _guessed(lines: list[str], encoding: str) -> Dialect | None:
+    """The dialect in which a table has rows of numbers; None if no dialect has them."""
+    for delimiter, decimal in (",.", ";.", ";,", "\t.", "\t,"):
+        dialect = Dialect(delimiter, decimal, encoding=encoding)
+        for number in range(1, len(lines) - 1):
+            rows = [dialect.cells(line) for line in lines[number : number + 2]]
+            width = len(rows[0])
+            if width < 2 or not all(len(row) == width and all(map(dialect.is_number, row))
+                                    for row in rows):  # fmt: skip
+                continue
+            above = [cell.strip("()[] ") for cell in dialect.cells(lines[number - 1])]
+            units = any(above) and all(not cell or parse_unit(cell) for cell in above)
+            header = max(1, number - units)
+            if all(map(dialect.is_number, dialect.cells(lines[header - 1]))):
+                return None  # no names: the reader of the header says so
+            return dataclasses.replace(dialect, header_line=header)
+    return None
+
+
+def _header(text: TextIO, dialect: Dialect) -> tuple[tuple[str, ...], tuple[str, ...], int]:
+    """Names, units, and the number of lines above the numbers."""
+    skipped = dialect.header_line - 1
+    for _ in range(skipped):
+        text.readline()
+    cells = dialect.cells(text.readline())
+    if cells and all(dialect.is_number(cell) for cell in cells):
         raise RecordingError(
             "the first line holds numbers", remedy="The first line must name the columns"
         )
@@ -62,41 +170,33 @@ def _header(text: TextIO) -> tuple[tuple[str, ...], tuple[str, ...], int]:
     known = [match if match and parse_unit(match["unit"]) else None for match in found]
     names = [match["name"] if match else cell for match, cell in zip(known, cells, strict=True)]
     units = [match["unit"].strip() if match else "" for match in known]
-    below = [cell.strip("()[] ") for cell in _cells(text.readline())]
-    if len(below) != len(names) or not any(below) or any(map(_is_number, below)):
-        return tuple(names), tuple(units), 1
+    below = [cell.strip("()[] ") for cell in dialect.cells(text.readline())]
+    if len(below) != len(names) or not any(below) or any(map(dialect.is_number, below)):
+        return tuple(names), tuple(units), skipped + 1
     if any(cell and not parse_unit(cell) for cell in below):
         return (
             tuple(names),
             tuple(units),
-            1,
+            skipped + 1,
         )  # not units: the parser of the numbers will raise the error
     both = zip(units, below, strict=True)
-    return tuple(names), tuple(above or unit for above, unit in both), 2
+    return tuple(names), tuple(above or unit for above, unit in both), skipped + 2
 
 
-def _cells(line: str) -> list[str]:
-    return [cell.strip() for cell in next(csv.reader([line]), [])]
-
-
-def _is_number(cell: str) -> bool:
-    try:
-        float(cell)
-    except ValueError:
-        return False
-    return True
-
-
-def _spool(path: pathlib.Path, skipped: int, columns: dict[int, BinaryIO]) -> int:
+def _spool(path: pathlib.Path, dialect: Dialect, skipped: int, columns: dict[int, BinaryIO]) -> int:
     """Write columns to files as real numbers, and return the number of rows."""
     rows = 0
-    with path.open(newline="", encoding="utf-8-sig") as text:
-        lines = (line for line in itertools.islice(text, skipped, None) if line.strip())
+    with path.open(newline="", encoding=dialect.encoding) as text:
+        lines = (
+            line if dialect.decimal == "." else line.replace(dialect.decimal, ".")
+            for line in itertools.islice(text, skipped, None)
+            if line.strip()
+        )
         while part := list(itertools.islice(lines, ROWS)):
             try:
                 table = np.loadtxt(
                     part,
-                    delimiter=",",
+                    delimiter=dialect.delimiter,
                     comments=None,
                     quotechar='"',
                     usecols=list(columns),
