@@ -105,6 +105,14 @@ def test_constant_skin_is_found_within_its_standard_errors_from_the_second_tenth
     assert (np.diagonal(fits.fit.shared_cov, axis1=1, axis2=2) > 0).all()
 
 
+def test_a_tracker_and_its_state_are_printed_without_arrays():
+    tracker = tracker_of(2)
+    shown = " ".join(repr(tracker).split())
+    assert "Tracker of SkinRC, driver successful electrodes 2 period" in shown
+    assert "f64[" not in shown
+    assert "State of 2 electrodes, last pulse: 2 too_short" in repr(tracker.start())
+
+
 def test_the_tracker_describes_itself_in_a_report(tmp_path):
     """And not as the default of other identifications, which it is not."""
     tracker = tracker_of(2)

@@ -160,7 +160,7 @@ class TrackerState(Overviewed, eqx.Module):
         )
 
 
-class Tracker(eqx.Module):
+class Tracker(Overviewed, eqx.Module):
     """Identifies the loads at all electrodes of a display with every pulse.
 
     Make a tracker with `Tracker.of`.
@@ -244,6 +244,15 @@ class Tracker(eqx.Module):
             electrodes=electrodes,
             period=period,
         )
+
+    def _overview(self) -> Overview:
+        kind, of_driver = type(self.model.circuit).__name__, verdict_names(self.driver_result)
+        rows = [
+            ("electrodes", str(self.electrodes), ""),
+            ("period", f"{self.period:g}", "samples"),
+            ("change", f"{float(self.change):g}", "1/√pulse"),
+        ]
+        return Overview(f"Tracker of {kind}, driver {of_driver}", rows)
 
     def start(self) -> TrackerState:
         """The state before the first pulse, without information."""
