@@ -20,7 +20,7 @@ from benchmarks.coverage import NORMAL_95
 from benchmarks.failure_counts import Rate, rate
 from benchmarks.selection_draws import TRUTHS, Drawn, errors
 from etid.results.fits import Fit
-from etid.selection.evidence import MENTION, bic, elements, rank
+from etid.selection.evidence import best, bic, elements
 from etid.selection.search import CANDIDATES
 
 DECISIVE = 10.0
@@ -81,13 +81,8 @@ CRITERIA: Mapping[str, Criterion] = {
 
 
 def choose(fits: Mapping[int, Fit], criterion: Criterion) -> int:
-    """Number of the candidate that `etid.selection.evidence.best` would choose by a criterion."""
-    values = criterion(fits)
-    ranks = {number: rank(fit) for number, fit in fits.items()}
-    good = [number for number in fits if ranks[number] == min(ranks.values())]
-    least = min(values[number] for number in good)
-    near = [number for number in good if values[number] <= least + MENTION]
-    return min(near, key=lambda number: (elements(fits[number]), values[number]))
+    """Number of the candidate that `etid.selection.evidence.best` chooses, by another criterion."""
+    return best(fits, criterion(fits))
 
 
 def gained(drawn: Drawn) -> float:

@@ -15,6 +15,7 @@ from etid.selection.common import common, deserves
 from etid.selection.evidence import best, bic, rank, weights, with_close
 from etid.selection.search import CANDIDATES, search
 from etid.selection.selection import Selection
+from etid.selection.unseen import WIDTH, posterior, unseen
 from etid.simulation.scenes import Scene, Trial
 from etid.simulation.transformer import ResistorLoad
 
@@ -37,9 +38,13 @@ SCENE = Scene(
 )
 
 
-def made(circuit, deviance, name="successful", z=(0.0,) * CHANGES, error=0.01):
-    """A fit of these elements, with relative standard errors `error`."""
+def made(circuit, deviance, name="successful", z=(0.0,) * CHANGES, error=0.01, slope=0.0):
+    """A fit of these elements, with relative standard errors `error`.
+
+    A spread has the standard error 0.1; an element has the logarithmic slope `slope`.
+    """
     size = len(circuit.names())
+    spread = np.asarray(0.1), np.full(size, slope)
     cov = np.diag((error * np.asarray(circuit.values())) ** 2)
     return Fit(
         circuit=circuit,
@@ -50,7 +55,7 @@ def made(circuit, deviance, name="successful", z=(0.0,) * CHANGES, error=0.01):
         result=verdict(name),
         steps=np.asarray(3),
         method="maximum_likelihood",
-        support=Support(np.asarray(deviance), np.asarray(TERMS), np.asarray(z, float)),
+        support=Support(np.asarray(deviance), np.asarray(TERMS), np.asarray(z, float), *spread),
     )
 
 
@@ -77,13 +82,20 @@ def test_noise_above_its_estimate_divides_the_evidence():
 
 def test_adequate_comes_before_better():
     fits = {
-        0: made(etid.SkinRC(), 2000.0, "misfit"),
-        1: made(etid.SkinCole(), 900.0, "insensitive"),
-        2: made(etid.SkinLayers(), 990.0),
+        0: made(etid.SkinRC(), 900.0, "insensitive"),
+        1: made(etid.ParallelRC(), 990.0),
+        2: made(etid.Resistor(), 2000.0, "misfit"),
     }
-    assert best(fits) == 2
-    del fits[2]
     assert best(fits) == 1
+    del fits[1]
+    assert best(fits) == 0
+
+
+@pytest.mark.parametrize("name", ["insensitive", "driver_unclear", "misfit"])
+def test_a_richer_circuit_with_less_evidence_is_no_remedy(name):
+    simple = made(etid.SkinCole(), 900.0, name)
+    assert best({0: simple, 1: made(etid.SkinLayers(), 896.0)}) == 0
+    assert best({0: simple, 1: made(etid.SkinLayers(), 880.0)}) == 1
 
 
 def test_a_phase_of_a_capacitor_is_no_reason_for_a_constant_phase():
@@ -96,7 +108,7 @@ def test_weights_are_probabilities_of_what_the_data_allow():
     fits = {
         0: made(etid.SkinRC(), 1000.0),
         1: made(etid.SkinCole(), 1000.0 - np.log(TERMS)),
-        2: made(etid.Resistor(), 900.0, "misfit"),
+        2: made(etid.Resistor(), 1020.0, "misfit"),
     }
     assert weights(fits) == pytest.approx({0: 0.5, 1: 0.5, 2: 0.0})
 
@@ -111,6 +123,36 @@ def test_the_error_contains_the_difference_to_a_likely_circuit():
     assert cov[0, 1] == pytest.approx(-0.5 * 3e3 * 4e3)
     assert cov[2, 2] == skin.cov[2, 2]  # Cole's circuit has no c_p
     assert np.linalg.eigvalsh(cov / np.sqrt(np.outer(np.diag(cov), np.diag(cov)))).min() > 0
+
+
+@pytest.mark.parametrize("z", [-2.4, 0.0, 1.5])
+def test_a_spread_that_no_test_sees_has_the_evidence_of_its_integral(z):
+    """Likelihood of ε times its prior, by a sum over a grid."""
+    sigma = 0.1
+    grid = np.linspace(-1.5, 0.0, 30_001)
+    ends = np.where(grid == 0.0, 0.5, 1.0)
+    prior = np.exp(-((grid / WIDTH) ** 2) / 2) * 2 / (np.sqrt(2 * np.pi) * WIDTH)
+    product = prior * np.exp(-((grid / sigma - z) ** 2) / 2 + z**2 / 2) * ends
+    evidence, square = posterior(z * sigma, sigma)
+    assert evidence == pytest.approx(product.sum() * (grid[1] - grid[0]), rel=1e-4)
+    assert square == pytest.approx((product * grid**2).sum() / product.sum(), rel=1e-4)
+
+
+def test_an_unseen_spread_widens_what_it_moves():
+    one = made(etid.SkinRC(), 1000.0, slope=2.0)
+    values = np.asarray(one.circuit.values())
+    added = unseen(one) / np.outer(values, values)
+    np.testing.assert_allclose(added, added[0, 0])
+    # ε of 0 ± 0.1: σ²τ² / (σ² + τ²) = 0.008, odds √0.008 / 0.2 = 0.447, 2² · 0.008 · 0.309.
+    assert added[0, 0] == pytest.approx(0.00989, rel=0.01)
+    wide = unseen(made(etid.SkinRC(), 1000.0, slope=2.0, z=(2.0, *[0.0] * 8)))
+    narrow = unseen(made(etid.SkinRC(), 1000.0, slope=2.0, z=(-2.0, *[0.0] * 8)))
+    assert wide[0, 0] > unseen(one)[0, 0] > narrow[0, 0]
+    assert not unseen(made(etid.SkinCole(), 1000.0, slope=2.0)).any()
+    averaged = Selection.of({0: one}, 0, CANDIDATES).fit
+    np.testing.assert_allclose(averaged.cov, one.cov + unseen(one))
+    alone = Selection.of({0: one}, 0, [etid.SkinRC()]).fit
+    np.testing.assert_array_equal(alone.cov, one.cov)
 
 
 def counted(tables):
@@ -133,8 +175,8 @@ def test_an_ordinary_recording_costs_one_fit():
 @pytest.mark.parametrize(
     ("z", "tried"),
     [
-        ((-3.0, *[0.0] * 8), [0, 3]),  # a spread: Cole first, which then suffices
-        ((3.0, *[0.0] * 8), [0]),  # a spread above a capacitor is not passive
+        ((3.0, *[0.0] * 8), [0, 3]),  # a spread: Cole first, which then suffices
+        ((-3.0, *[0.0] * 8), [0]),  # a spread above a capacitor is not passive
         ((0.0, 2.4, *[0.0] * 7), [0]),
         ((0.0, 2.6, *[0.0] * 7), [0, 3]),
         ((*[0.0] * 8, 9.0), [0]),  # a gain is no circuit
@@ -221,6 +263,16 @@ def test_the_circuit_of_a_recording_is_found(study, driver, name):
     np.testing.assert_array_equal(fit.cov, selection.fit.cov)
     error = np.asarray(fit.circuit.values()) - np.asarray(LOADS[name].values())
     assert (np.abs(error) < 4 * np.sqrt(np.diagonal(fit.cov))).all()
+
+
+def test_a_spread_has_a_positive_score(study, driver):
+    fit = etid.identify_skin(study["cole"], driver, throw=False)
+    assert fit.support is not None
+    assert fit.support.z[0] > 5
+    # What R_s would be at α = 0.9, to first order: nearer to the truth.
+    r_s, truth = float(fit.circuit.values()[0]), float(LOADS["cole"].values()[0])
+    at_cole = r_s * (1 - 0.1 * float(fit.support.spread_slope[0]))
+    assert abs(at_cole - truth) < 0.5 * abs(r_s - truth)
 
 
 @pytest.mark.slow

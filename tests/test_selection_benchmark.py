@@ -24,6 +24,7 @@ KINDS = [type(one) for one in CANDIDATES]
 
 def made(circuit, deviance, error=0.01):
     size = len(circuit.names())
+    unchanged = np.zeros(CHANGES), np.zeros(()), np.zeros(size)
     return Fit(
         circuit=circuit,
         cov=np.diag((error * np.asarray(circuit.values())) ** 2),
@@ -33,7 +34,7 @@ def made(circuit, deviance, error=0.01):
         result=verdict("successful"),
         steps=np.asarray(3),
         method="maximum_likelihood",
-        support=Support(np.asarray(deviance), np.asarray(TERMS), np.zeros(CHANGES)),
+        support=Support(np.asarray(deviance), np.asarray(TERMS), *unchanged),
     )
 
 

@@ -13,7 +13,7 @@ from jaxtyping import Array, Bool, Float, Int
 from etid.circuits.circuit import AbstractCircuit
 from etid.estimators.estimate import Estimate
 from etid.recordings.remarks import Remark
-from etid.results.fits import Fit
+from etid.results.fits import Fit, Support
 from etid.results.verdicts import RESULTS, first_verdict, verdict
 from etid.solvers.levenberg_marquardt import NormalEquations
 from etid.solvers.matrices import inverse
@@ -86,7 +86,7 @@ def judged(
         steps=estimate.steps,
         method=method,
         remarks=remarks(estimate.hum),
-        support=estimate.support,
+        support=estimate.support or Support.unknown(values.size),
     )
 
 

@@ -109,7 +109,7 @@ def identify_skin(
     """
     candidates = candidates_of(circuit)
     fits, chosen = candidate_fits(recording, driver, candidates, method)
-    fit = fits[chosen] if len(fits) == 1 else Selection.of(fits, chosen, candidates).fit
+    fit = Selection.of(fits, chosen, candidates).fit
     return successful(recording, fit) if throw else fit
 
 
@@ -419,7 +419,8 @@ def concluded(
     coarse = (remarked & Remark.coarse_converter) > 0
     names = np.where(coarse & (names == "insensitive"), "resolution", names)
     names = np.where(change.seen & np.isin(names, changes.EXPLAINED), "changed", names)
-    support = Support.unknown(len(fits)) if whole.support is None else whole.support
+    size = len(whole.circuit.names())
+    support = Support.unknown(size, len(fits)) if whole.support is None else whole.support
     return unstacked(
         dataclasses.replace(
             whole,
@@ -471,7 +472,7 @@ def failed_fit(name: str, circuit: AbstractCircuit, method: str) -> Fit:
         method=method,
         change=none.size,
         change_stderr=none.stderr,
-        support=Support.unknown(),
+        support=Support.unknown(size),
     )
 
 

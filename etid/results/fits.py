@@ -86,16 +86,22 @@ class Support(eqx.Module):
         z: Score of each change that the circuit cannot make [standard deviations]: a spread of time
             constants, more relaxations from slow to fast, and another gain of V_out. 0 if the
             change is too small to matter, or if the circuit can make it itself.
+        spread_stderr: Standard error of the size of the first change, the spread; 0 if the circuit
+            can make it itself.
+        spread_slope: Change of the logarithm of each element for each unit of this size.
     """
 
     deviance: Float[Array | np.ndarray, "*lane"]
     terms: Float[Array | np.ndarray, "*lane"]
     z: Float[Array | np.ndarray, "*lane change"]
+    spread_stderr: Float[Array | np.ndarray, "*lane"]
+    spread_slope: Float[Array | np.ndarray, "*lane element"]
 
     @classmethod
-    def unknown(cls, *lane: int) -> "Support":
+    def unknown(cls, elements: int, *lane: int) -> "Support":
         """The support of a fit whose estimator does not compute it, or of a batch of them: NaN."""
-        return cls(np.full(lane, np.nan), np.full(lane, np.nan), np.full((*lane, CHANGES), np.nan))
+        sizes = (), (), (CHANGES,), (), (elements,)
+        return cls(*(np.full((*lane, *size), np.nan) for size in sizes))
 
 
 class Fit(Judged, Generic[Circuit]):

@@ -13,7 +13,7 @@ Noise that exceeds its estimate divides −2 log L: by −2 log L / n of the bes
 above 1 (quasi-likelihood, Wedderburn 1974).
 
 A circuit must be adequate before it can be better. A candidate with another verdict than
-`successful` is chosen only if no candidate is successful.
+`successful` is chosen only if no candidate is successful that is simpler or has more evidence.
 """
 
 import math
@@ -52,7 +52,7 @@ def bic(fits: Mapping[int, Fit]) -> dict[int, float]:
     Args:
         fits: Fits of the same data, by number of the candidate.
     """
-    support = {number: fit.support or Support.unknown() for number, fit in fits.items()}
+    support = {number: fit.support or Support.unknown(0) for number, fit in fits.items()}
     deviance = {number: float(one.deviance) for number, one in support.items()}
     terms = {number: float(one.terms) for number, one in support.items()}
     known = [number for number in fits if math.isfinite(deviance[number])]
@@ -72,17 +72,32 @@ def elements(fit: Fit) -> int:
     return len(fit.circuit.names())
 
 
-def best(fits: Mapping[int, Fit]) -> int:
+def best(fits: Mapping[int, Fit], criterion: Mapping[int, float] | None = None) -> int:
     """Number of the candidate to choose.
 
     It is the simplest of those whose evidence is largest, up to `MENTION`, among the candidates of
-    the best rank.
+    the best rank. A candidate with less evidence than a simpler one is not chosen, whatever their
+    ranks: it is no remedy for what the simpler one lacks.
+
+    Args:
+        fits: Fits of the same data, by number of the candidate.
+        criterion: What is to be small; `bic` if not given.
     """
-    criterion, ranks = bic(fits), {number: rank(fit) for number, fit in fits.items()}
-    good = [number for number in fits if ranks[number] == min(ranks.values())]
+    criterion = criterion or bic(fits)
+    ranks = {number: rank(fit) for number, fit in fits.items()}
+    size = {number: elements(fit) for number, fit in fits.items()}
+    left = [
+        number
+        for number in fits
+        if not any(
+            size[other] < size[number] and criterion[other] < criterion[number] - MENTION
+            for other in fits
+        )
+    ]
+    good = [number for number in left if ranks[number] == min(ranks[one] for one in left)]
     least = min(criterion[number] for number in good)
     near = [number for number in good if criterion[number] <= least + MENTION]
-    return min(near, key=lambda number: (elements(fits[number]), criterion[number]))
+    return min(near, key=lambda number: (size[number], criterion[number]))
 
 
 def weights(fits: Mapping[int, Fit]) -> dict[int, float]:

@@ -82,8 +82,8 @@ def _lacks(fit: Fit) -> bool:
     if fit.support is None:
         return False
     z = np.array(fit.support.z[:-1])  # without that of a gain
-    # A spread above that of the circuit, α > 1, is not passive.
-    z[0] = min(z[0], 0.0)
+    # A negative score means less spread than a capacitor has, α > 1, which is not passive.
+    z[0] = max(z[0], 0.0)
     return rank(fit) == 2 or bool(np.nanmax(np.abs(z), initial=0.0) > ASKS)
 
 

@@ -12,6 +12,7 @@ from etid.results.fits import Fit
 from etid.results.verdicts import message
 from etid.selection.evidence import bic, rank, weights, with_close
 from etid.selection.residuals import looks_like
+from etid.selection.unseen import unseen
 
 HEADS = ("circuit", "2 log evidence", "weight", "chi2", "verdict", "elements")
 CLOSE = 0.02  # weight of another circuit from which on a remark is made
@@ -64,7 +65,7 @@ class Selection(Overviewed):
 
     Attributes:
         fit: The fit of the chosen circuit. Its covariance contains the differences to other likely
-            circuits.
+            circuits, and what changes of the circuit may do that the data cannot show.
         candidates: The circuits that were fitted; the chosen one first, then by evidence.
         unasked: Names of the circuits that were not fitted, because the data did not ask for them.
         chosen: Number of the chosen candidate.
@@ -92,7 +93,7 @@ class Selection(Overviewed):
         order = sorted(fits, key=lambda number: (number != chosen, criterion[number]))
         unasked = [type(one).__name__ for n, one in enumerate(circuits) if n not in fits]
         return cls(
-            _with_remark(fits, chosen, share),
+            _concluded(fits, chosen, share) if len(circuits) > 1 else fits[chosen],
             tuple(
                 Candidate(fits[number], float(criterion[chosen] - criterion[number]), share[number])
                 for number in order
@@ -120,10 +121,9 @@ class Selection(Overviewed):
         return Overview(title, [one.row for one in self.candidates], HEADS, notes)
 
 
-def _with_remark(fits: Mapping[int, Fit], chosen: int, share: Mapping[int, float]) -> Fit:
-    """The chosen fit; its covariance and a remark tell of other likely circuits."""
+def _concluded(fits: Mapping[int, Fit], chosen: int, share: Mapping[int, float]) -> Fit:
+    """The chosen fit; its covariance and a remark tell of other circuits."""
     fit = fits[chosen]
-    if 1 - share[chosen] < CLOSE:
-        return fit
-    remarks = np.asarray(int(fit.remarks) | Remark.circuits_close)
-    return dataclasses.replace(fit, cov=with_close(fits, chosen), remarks=remarks)
+    cov = with_close(fits, chosen) + unseen(fit)
+    close = Remark.circuits_close if 1 - share[chosen] > CLOSE else 0
+    return dataclasses.replace(fit, cov=cov, remarks=np.asarray(int(fit.remarks) | close))

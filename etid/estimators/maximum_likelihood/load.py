@@ -355,7 +355,7 @@ def fit_circuit(
     near = jnp.sum(load(likely) ** 2) < NEAR * 2 * jnp.sum(spectrum.selected, dtype=likely.dtype)
     start = jax.lax.cond(near, lambda: likely, lambda: best_start(load, starts))
     alone = refined(load, start, ROUGHLY).value
-    solution = refined(load, jnp.concatenate([alone, driver.mean]))
+    solution = refined(load, jnp.concatenate([alone, driver.mean]), WELL)
     q = solution.value
     own, z = load.split(q)
     g, known = load.predicted(q)
@@ -421,6 +421,6 @@ def fit_circuit(
         steps=solution.stats["num_steps"],
         strain=strain,
         hum=shows_hum(known, g) & ~wrong_gain,
-        support=Support(squares + strain, terms, other.relevant()),
+        support=Support(squares + strain, terms, other.relevant(), *other.spread.possible()),
     )
     return estimate, moved > FAR, other.seen() | other.has_other_gain()

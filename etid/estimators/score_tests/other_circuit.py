@@ -90,11 +90,15 @@ class Score(NamedTuple):
         z: Standard deviations; NaN if the circuit can make the change itself.
         size: Estimate of ε.
         moved: Largest change of the logarithm of an element by this ε.
+        stderr: Standard error of ε.
+        slope: Change of the logarithm of each element for each unit of ε.
     """
 
     z: Float[Array, "*change"]
     size: Float[Array, "*change"]
     moved: Float[Array, "*change"]
+    stderr: Float[Array, "*change"]
+    slope: Float[Array, "*change element"]
 
     def exceeds(self, limit: float) -> Bool[Array, "*change"]:
         """Whether z exceeds this limit and the change moves an element."""
@@ -103,6 +107,12 @@ class Score(NamedTuple):
     def relevant(self) -> Float[Array, "*change"]:
         """z; 0 if the change moves no element or if the circuit can make it itself."""
         return jnp.where(self.moved > MOVED, jnp.nan_to_num(self.z), 0.0)
+
+    def possible(self) -> tuple[Float[Array, "*change"], Float[Array, "*change element"]]:
+        """Standard errors of ε, and slopes of the elements; 0 if the circuit makes the change."""
+        tested = jnp.isfinite(self.z) & jnp.isfinite(self.stderr)
+        stderr = jnp.where(tested, self.stderr, 0.0)
+        return stderr, jnp.where(tested[..., None], self.slope, 0.0)
 
     def relaxes(self) -> Bool[Array, ""]:
         """Whether one more relaxation is seen; all changes must be relaxations."""
@@ -181,5 +191,8 @@ def scores(
     ).T + of_priors[None]
     can = curvature <= NOTHING * (rows**2 @ linear.share)
     size = score / curvature
-    moved = jnp.max(jnp.abs(others[:, elements]), axis=1)
-    return Score(jnp.where(can, jnp.nan, score / jnp.sqrt(variance)), size, jnp.abs(size) * moved)
+    slope = -others[:, elements]
+    moved = jnp.abs(size) * jnp.max(jnp.abs(slope), axis=1)
+    deviation = jnp.sqrt(variance)
+    z = jnp.where(can, jnp.nan, score / deviation)
+    return Score(z, size, moved, deviation / curvature, slope)

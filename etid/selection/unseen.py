@@ -1,0 +1,68 @@
+"""What a spread of time constants that no test sees may do to the elements of a circuit.
+
+With much noise a Cole element passes for a capacitor, and R_s is then wrong by more than its
+standard error. The score of a fit tells, without another fit, the estimate ε̂ ± σ of α − 1, and how
+the elements would move with it (`etid.estimators.score_tests.other_circuit`). Let −ε have a
+half-normal prior of width τ. Then ε is normal below 0 with
+
+    v = 1 / (1/σ² + 1/τ²),   m = v ε̂ / σ²,
+
+and the evidence for the spread, against none, is
+
+    B = 2 √v / τ · exp(m² / 2v) · Φ(−m / √v).
+
+In the mean over no spread and any spread, which are equally probable before the data are known, the
+elements θ with slopes b have
+
+    var = σ_θ² + B / (1 + B) · E(ε²) b bᵀ
+
+(Hoeting et al., Bayesian model averaging, Statistical Science 14, 1999, 382-417). This adds nothing
+where the data determine α well, σ ≪ τ.
+"""
+
+import math
+
+import numpy as np
+from jaxtyping import Float
+
+from etid.results.fits import Fit
+
+WIDTH = 0.2  # τ; 1 − α is 0.2 for dry skin (Gabriel, Lau and Gabriel 1996, see `SkinCole`)
+LARGEST = 50.0  # exponent of an evidence; more is as certain
+
+
+def unseen(fit: Fit) -> Float[np.ndarray, "element element"]:
+    """Covariance that a spread adds to that of the elements [SI²]; 0 if it is not known.
+
+    Args:
+        fit: One fit.
+    """
+    size, support = len(fit.circuit.names()), fit.support
+    if support is None or "1" in fit.circuit.units().values():
+        return np.zeros((size, size))  # another shape of the spread that it has is no candidate
+    sigma = float(support.spread_stderr)
+    if not sigma > 0:
+        return np.zeros((size, size))
+    # A positive score means α < 1.
+    evidence, square = posterior(-float(support.z[0]) * sigma, sigma)
+    values = np.array([float(np.asarray(getattr(fit.circuit, n))) for n in fit.circuit.names()])
+    moved = np.asarray(support.spread_slope, float) * values
+    return evidence / (1 + evidence) * square * np.outer(moved, moved)
+
+
+def posterior(estimate: float, sigma: float) -> tuple[float, float]:
+    """Evidence B for a spread against none, and the mean of ε².
+
+    Args:
+        estimate: Estimate of ε.
+        sigma: Its standard error.
+    """
+    variance = 1 / (1 / sigma**2 + 1 / WIDTH**2)
+    mean, deviation = variance * estimate / sigma**2, math.sqrt(variance)
+    u = -mean / deviation
+    below = 0.5 * math.erfc(-u / math.sqrt(2))
+    if below < 1e-9:  # far above a capacitor
+        return 0.0, 0.0
+    evidence = 2 * deviation / WIDTH * math.exp(min(u**2 / 2, LARGEST)) * below
+    density = math.exp(-(u**2) / 2) / math.sqrt(2 * math.pi)
+    return evidence, mean**2 + variance - mean * deviation * density / below
