@@ -96,7 +96,8 @@ def selection(**verdicts: str) -> etid.Selection:
     found = {}
     for number, circuit, deviance in ((0, NEAREST, 2600.0), (3, SPREAD, 2000.0)):
         verdict = verdicts.get(type(circuit).__name__, "successful")
-        support = Support(np.array(deviance), np.array(2e3), np.zeros(CHANGES))
+        unseen = np.zeros(CHANGES), np.array(0.0), np.zeros(len(circuit.names()))
+        support = Support(np.array(deviance), np.array(2e3), *unseen)
         cov = jnp.diag((circuit.values() * 0.01) ** 2)
         found[number] = Fit(
             circuit=circuit,

@@ -80,9 +80,15 @@ def _fit(
         ),
         steps=solution.stats["num_steps"],
         method="impedance",
-        support=Support(2 * equations.objective, jnp.asarray(2.0 * z.size), jnp.zeros(CHANGES))
-        if known
-        else None,
+        support=_support(2 * equations.objective, z.size, q.size) if known else None,
+    )
+
+
+def _support(deviance: Float[Array, ""], values: int, elements: int) -> Support:
+    """The likelihood of a fit; no changes of the circuit are tested."""
+    nothing = jnp.zeros(())
+    return Support(
+        deviance, jnp.asarray(2.0 * values), jnp.zeros(CHANGES), nothing, jnp.zeros(elements)
     )
 
 
