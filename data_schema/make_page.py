@@ -90,12 +90,12 @@ one stacked group `g`. Every other recording becomes its own group.
 OTHER_FORMATS = """\
 ## Other formats
 
-`etid import FILE -o study.h5 --mapping FILE.toml` converts a file of an instrument to an etid file. It
-prints which channel, unit, scale and rate it used for each signal. Nothing is guessed. A channel,
-unit or rate that neither the file nor the mapping gives is an error, and the error lists the
-channels of the file. A contradiction between file and mapping is an error too. If several files
-are imported into one, each `[[recording]]` has the key `file`: the name of its file without the
-folder. A recording without a `path` is then named by its file, as in `loaded/finger`.
+`etid import FILE -o study.h5 --mapping FILE.toml` converts a file of an instrument to an etid
+file. It prints which channel, unit, scale and rate it used for each signal. Nothing is guessed. A
+channel, unit or rate that neither the file nor the mapping gives is an error, and the error lists
+the channels of the file. A contradiction between file and mapping is an error too. If several
+files are imported into one, each `[[recording]]` has the key `file`: the name of its file without
+the folder. A recording without a `path` is then named by its file, as in `loaded/finger`.
 
 | file | channels | the file contains | trials | install |
 |---|---|---|---|---|

@@ -13,6 +13,7 @@ from etid.results.fits import CHANGES, Fit, Support
 from etid.results.verdicts import verdict
 from etid.selection.common import common, deserves
 from etid.selection.evidence import best, bic, rank, weights, with_close
+from etid.selection.residuals import looks_like
 from etid.selection.search import CANDIDATES, search
 from etid.selection.selection import Selection
 from etid.selection.unseen import WIDTH, posterior, unseen
@@ -222,6 +223,23 @@ def test_a_recording_that_deserves_another_circuit_says_so():
     selection = choice({0: made(etid.SkinRC(), 1100.0), 3: made(etid.SkinCole(), 1000.0)})
     assert "supports SkinCole better: 2 log evidence +93" in deserves(selection, 0)
     assert deserves(selection, 3) == ""
+
+
+@pytest.mark.parametrize(
+    ("z", "words"),
+    [
+        # Cole's circuit fitted by one relaxation: the largest score is a negative relaxation.
+        ((19.0, 0.0, 0.0, 0.0, 6.0, 3.0, -12.0, -23.0, -1.0), "a spread of time constants"),
+        ((0.0, 8.0, *[0.0] * 7), "a slow tail"),
+        ((0.0, *[0.0] * 6, 8.0, 0.0), "one more fast relaxation"),
+        ((*[0.0] * 8, -5.0), "another gain of v_out"),
+        ((*[2.9] * 9,), ""),
+    ],
+)
+def test_a_residual_looks_like_what_a_passive_circuit_can_make(z, words):
+    said = looks_like(made(etid.SkinRC(), 2000.0, "misfit", z))
+    assert words in said
+    assert bool(said) == bool(words)
 
 
 def test_a_table_shows_every_candidate():

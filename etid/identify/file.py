@@ -25,6 +25,7 @@ import signal
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 from tqdm import tqdm
 
@@ -240,7 +241,9 @@ def fit_file(
             **{name.replace("_", " "): value for name, value in described.items()},
             "source date": stamp,
             "circuit": hashlib.sha256(
-                " ".join(f"{qualified(type(one))} {one!r}" for one in candidates).encode()
+                " ".join(
+                    f"{qualified(type(one))} {eqx.tree_pformat(one)}" for one in candidates
+                ).encode()
             ).hexdigest(),
             "size of a part": PART,
         }

@@ -21,7 +21,10 @@ def looks_like(fit: Fit) -> str:
         return "The residual looks like mains hum."
     if fit.support is None:
         return ""
-    z = np.nan_to_num(np.abs(np.asarray(fit.support.z, float)))
+    z = np.nan_to_num(np.asarray(fit.support.z, float))
+    # A negative relaxation, or a spread above that of a capacitor, is not passive. A gain has no
+    # sign that it must have.
+    z = np.append(np.maximum(z[:-1], 0.0), np.abs(z[-1]))
     if z.max() < SEEN:
         return ""
     worst, last = int(np.argmax(z)), z.size - 1
