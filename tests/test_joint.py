@@ -135,6 +135,7 @@ def test_the_tolerance_of_the_resistor_is_shared_and_passes_one_to_one(study, ou
         np.testing.assert_allclose(grown[0], 1e-4 * np.outer(sign, sign), rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_delays_that_do_not_scatter_leave_smaller_errors_and_the_fits_say_so(outcome):
     """One trigger for all records: R_s and C_p need not pay for delays that the study excludes."""
     odd = Trial("odd", two_relaxations, condition="odd")

@@ -127,6 +127,7 @@ def test_hum_in_a_batch_costs_the_other_recordings_nothing(records, quiet):
     np.testing.assert_allclose(np.asarray(fits.circuit.r_p)[1], fit.circuit.r_p, rtol=2e-3)
 
 
+@pytest.mark.slow
 def test_hum_does_not_excuse_a_wrong_circuit(records, quiet):
     loud = hummed(records[1], 60.0, 0.02)
     fit = etid.identify_skin(loud, quiet[0], circuit=etid.Resistor(), throw=False)

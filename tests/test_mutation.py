@@ -69,6 +69,7 @@ def tree(tmp_path):
     return root
 
 
+@pytest.mark.slow
 def test_what_no_test_sees_survives_and_what_is_done_is_kept(tree, tmp_path, monkeypatch):
     path = tree / "etid" / "small.py"
     chosen = mutants("etid/small.py", path.read_text())

@@ -47,6 +47,7 @@ def coarse(study):
     return coarse_driver(study)
 
 
+@pytest.mark.slow
 def test_a_load_is_right_whatever_the_model_of_its_driver(study, coarse):
     assert coarse.verdict == "misfit"
     for name in LOADS:

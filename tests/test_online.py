@@ -83,6 +83,7 @@ def own_stderr(fits):
     return np.sqrt(own) / np.asarray(fits.circuit.values())
 
 
+@pytest.mark.slow
 def test_constant_skin_is_found_within_its_standard_errors_from_the_second_tenth_of_a_second_on():
     study = scene(40, trigger_jitter_rms=500e-9).simulate(seed=5)
     tracker = tracker_of(2)

@@ -35,7 +35,7 @@ def fit(name="successful"):
         result=verdict(name),
         steps=np.asarray(7),
         method="maximum_likelihood",
-        support=Support.unknown(),
+        support=Support.unknown(3),
     )
 
 

@@ -116,11 +116,13 @@ def test_one_relaxation_of_two_is_seen(study, driver):
     assert fit.verdict in ("misfit", "inconsistent")
 
 
+@pytest.mark.slow
 def test_a_second_layer_that_is_not_there_is_insensitive(study, driver):
     fit = etid.identify_skin(study["dry"], driver, circuit=etid.SkinLayers(), throw=False)
     assert fit.verdict == "insensitive"
 
 
+@pytest.mark.slow
 def test_a_spread_that_is_not_there_is_an_exponent_of_one(study, driver):
     fit = etid.identify_skin(study["dry"], driver, circuit=etid.SkinCole())
     off = np.abs(np.asarray(fit.circuit.values()) / [33.4e3, 186e3, 186e3 * 0.12e-9, 1.0] - 1)

@@ -21,6 +21,7 @@ def calibrations():
     return [study[trial.path] for trial in trials]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", [None, pytest.param("output_error", marks=pytest.mark.slow)])
 @pytest.mark.parametrize("factor", [1.0, 1.05])
 def test_of_two_resistors_one_that_is_5_percent_wrong_is_seen(calibrations, factor, method):

@@ -109,7 +109,8 @@ def identify_skin(
     """
     candidates = candidates_of(circuit)
     fits, chosen = candidate_fits(recording, driver, candidates, method)
-    fit = Selection.of(fits, chosen, candidates).fit
+    single = len(candidates) == 1
+    fit = fits[chosen] if single else Selection.of(fits, chosen, candidates).fit
     return successful(recording, fit) if throw else fit
 
 
@@ -419,8 +420,9 @@ def concluded(
     coarse = (remarked & Remark.coarse_converter) > 0
     names = np.where(coarse & (names == "insensitive"), "resolution", names)
     names = np.where(change.seen & np.isin(names, changes.EXPLAINED), "changed", names)
-    size = len(whole.circuit.names())
-    support = Support.unknown(size, len(fits)) if whole.support is None else whole.support
+    support = whole.support
+    if support is None:
+        support = Support.unknown(len(whole.circuit.names()), len(fits))
     return unstacked(
         dataclasses.replace(
             whole,
