@@ -41,10 +41,11 @@ def draw(
     figure, axes = charts.new_figure(
         1, 2 if both else 1, (12.5 if both else 7.0, 0.36 * len(truths) + 1.6), sharey=True
     )
-    columns = sorted({row["snr_db"] for row in rows})
     titles = {"chose": "etid, from recordings", "rival": "impedance.py and BIC, from exact spectra"}
     for panel, (name, title) in zip(axes.flat, titles.items(), strict=False):
-        for row in rows:
+        drawn = [row for row in rows if any(int(row[f"{name}_{key}"]) for key in KEY)]
+        columns = sorted({row["snr_db"] for row in drawn})
+        for row in drawn:
             at = columns.index(row["snr_db"]), list(truths).index(row["truth"])
             right = type(truths[row["truth"]]).__name__
             _cell(panel, at, {key: int(row[f"{name}_{key}"]) for key in KEY}, right)

@@ -1,4 +1,4 @@
-"""The estimators by name."""
+"""The estimators by name; `etid.estimators.estimator` states what an estimator must provide."""
 
 import ast
 import dataclasses

@@ -173,7 +173,11 @@ class Calibrations(eqx.Module):
         """Gains with the known resistors."""
         source = self.z_th(common)
 
-        def one(frequency, r_load, delay_samples):
+        def one(
+            frequency: Float[Array, " harmonic"],
+            r_load: Float[Array, ""],
+            delay_samples: Float[Array, ""],
+        ) -> Complex[Array, " harmonic"]:
             return delayed_gain(source, resistor(r_load), frequency, delay_samples, self.rate)
 
         late = self.named(common).delay_samples
