@@ -70,7 +70,9 @@ def on_the_command_line(folder):
     assert found["verdicts"] == {"successful": 10}, found
     assert etid.Fits.read(fits).counts() == found["verdicts"]
     command("report", fits, "-o", folder / "report.html")
-    assert "no such file" in command("fit", folder / "absent.h5", "-o", fits, status=1)["error"]
+    new = folder / "new.h5"
+    assert "no such file" in command("fit", folder / "absent.h5", "-o", new, status=1)["error"]
+    assert "--force" in command("fit", study, "-o", fits, status=1)["error"]  # it exists
     wrong = subprocess.run([PROGRAM, "fit"], capture_output=True, check=False)
     assert wrong.returncode == 2
 

@@ -49,7 +49,8 @@ class Problem(NamedTuple):
 
     def load(self, one: Any) -> Load:
         """A lane with Z_th as it is; calling it gives the terms of elements and delay."""
-        return Load(self.known, SkinRC(), one.spectrum, None, one.sample_rate)
+        rate = jnp.asarray(one.sample_rate)
+        return Load(self.known, SkinRC(), one.spectrum, None, rate)
 
 
 def terms(own: Float[Array, " own"], load: Load) -> Float[Array, " term"]:

@@ -302,7 +302,9 @@ def test_a_study_gets_one_circuit(study, driver):
     assert "supports Resistor better" in fits.notes[3]
     alone = etid.identify_skins(records[:3], driver)
     np.testing.assert_array_equal(fits.circuit.values()[:3], alone.circuit.values())
-    np.testing.assert_array_equal(fits.cov[:3], alone.cov)
+    # With several candidates the errors contain a spread that no test sees.
+    wider = np.diagonal(fits.cov[:3] - alone.cov, axis1=1, axis2=2)
+    assert (wider >= 0).all()
 
 
 @pytest.mark.slow
