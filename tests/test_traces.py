@@ -320,5 +320,6 @@ def test_fits_of_another_process_have_the_same_bits(tmp_path):
     without = run("without")
     assert run("cold", **cache) == without
     kept = {path.name.rpartition("-")[0] for path in files(tmp_path / "cache" / traces.FOLDER)}
-    assert kept == {"_identified", "known_at", "skin_lane", "_chunk", "log_slopes", "_fit"}
+    named = {"_identified", "_size", "known_at", "skin_lane", "_chunk", "log_slopes", "_fit"}
+    assert kept == named
     assert run("warm", "warm", **cache) == without

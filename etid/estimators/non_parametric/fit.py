@@ -97,8 +97,10 @@ def fit_circuit(
     noise = jnp.concatenate([noise, jnp.ones(rest + len(known))])
     own_cov = (by_term * (weights * noise)[None, :]) @ by_term.T
     shared = (by_term * ((1 - weights) * noise)[None, :]) @ by_term.T
+    drift = None
     if driver.drift is not None:
-        by_drift = by_term[:, : 2 * count] @ model.by_drift(q, clean, driver).T
+        drift = model.by_drift(q, clean, driver)
+        by_drift = by_term[:, : 2 * count] @ drift.T
         shared = shared + by_drift @ by_drift.T
     estimate = Estimate(
         parameters=(q - bias)[:elements],
@@ -113,7 +115,7 @@ def fit_circuit(
         steps=solution.stats["num_steps"],
         hum=stands_out(model.squares(q, records), records[-1]),
     )
-    return estimate, bias[:elements], _scores(model, q, records, driver.source, noise)
+    return estimate, bias[:elements], _scores(model, q, records, driver.source, noise, drift)
 
 
 def _scores(
@@ -122,8 +124,11 @@ def _scores(
     records: list[Spectrum],
     source: SourceImpedance,
     noise: Float[Array, " term"],
+    drift: Float[Array, "parameter part"] | None,
 ) -> Scores:
     """Scores of another circuit and of another gain.
+
+    What the driver may have drifted by since its calibration widens them.
 
     The derivatives are taken at the Z_th of a model. With the measured Z_th, they would contain the
     noise of the residual: z was 10 for undisturbed recordings at 60 dB. A model that is wrong makes
@@ -139,6 +144,12 @@ def _scores(
     found = other_circuit.scores(
         rows, linear, residual, nothing[0], nothing, linear.bread(), elements
     )
+    if drift is not None:
+        directions = rows - linear.told(rows) @ linear.bread() @ jacobian
+        by_drift = directions[:, : drift.shape[1]] @ drift.T
+        variance = directions**2 @ noise
+        wider = jnp.sqrt(1 + jnp.sum(by_drift**2, axis=1) / variance)
+        found = found._replace(z=found.z / wider, stderr=found.stderr * wider)
     return Scores.of(found, gain=True)
 
 
