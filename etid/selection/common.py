@@ -22,6 +22,8 @@ def common(found: Sequence[Selection], candidates: Sequence[AbstractCircuit]) ->
         found: The choices of single recordings.
         candidates: The circuits by number.
     """
+    if len(candidates) == 1:
+        return 0
     total = [0.0] * len(candidates)
     for selection in found:
         if rank(selection.fits[selection.chosen]) == 2:
@@ -60,8 +62,8 @@ def deserves(selection: Selection, chosen: int) -> str:
         selection: The fits of this recording, among them that of the common circuit.
         chosen: Number of the common circuit.
     """
-    own = best(selection.fits)
     criterion = bic(selection.fits)
+    own = best(selection.fits, criterion)
     gained = criterion[chosen] - criterion[own]
     name = type(selection.fits[own].circuit).__name__
     if own == chosen or rank(selection.fits[own]) or gained < DESERVED:

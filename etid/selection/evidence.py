@@ -20,6 +20,7 @@ import math
 from collections.abc import Mapping
 
 import numpy as np
+from jaxtyping import Float
 
 from etid.results.fits import Fit, Support
 
@@ -72,6 +73,11 @@ def elements(fit: Fit) -> int:
     return len(fit.circuit.names())
 
 
+def values_of(fit: Fit) -> Float[np.ndarray, " element"]:
+    """The elements of one fit [SI]; `circuit.values()` would make arrays of JAX."""
+    return np.array([float(np.asarray(getattr(fit.circuit, name))) for name in fit.circuit.names()])
+
+
 def best(fits: Mapping[int, Fit], criterion: Mapping[int, float] | None = None) -> int:
     """Number of the candidate to choose.
 
@@ -105,7 +111,8 @@ def weights(fits: Mapping[int, Fit]) -> dict[int, float]:
 
     Candidates that the data contradict have the weight 0, unless all are contradicted.
     """
-    criterion, chosen = bic(fits), best(fits)
+    criterion = bic(fits)
+    chosen = best(fits, criterion)
     # Undetermined elements do not make a circuit untrue.
     worst = max(rank(fits[chosen]), 1)
     usable = [number for number, fit in fits.items() if rank(fit) <= worst]
@@ -155,9 +162,8 @@ def with_close(fits: Mapping[int, Fit], chosen: int) -> np.ndarray:
 def _determined(fit: Fit) -> dict[str, tuple[float, float]]:
     """Values and standard errors of the elements that the data determine."""
     errors = np.sqrt(np.maximum(np.diagonal(np.asarray(fit.cov)), 0.0))
-    values = [float(np.asarray(getattr(fit.circuit, name))) for name in fit.circuit.names()]
     return {
-        name: (value, error)
-        for name, value, error in zip(fit.circuit.names(), values, errors, strict=True)
+        name: (float(value), error)
+        for name, value, error in zip(fit.circuit.names(), values_of(fit), errors, strict=True)
         if 0 < error < abs(value)
     }

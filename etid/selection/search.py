@@ -19,7 +19,7 @@ from etid.circuits.circuit import (
     SkinRC,
 )
 from etid.results.fits import Fit
-from etid.selection.evidence import best, rank
+from etid.selection.evidence import best, elements, rank, values_of
 
 # From the usual circuit to the unusual ones.
 CANDIDATES: tuple[AbstractCircuit, ...] = (
@@ -66,7 +66,7 @@ def _asked(fits: dict[int, Fit], candidates: Sequence[AbstractCircuit]) -> list[
         return []
     fit = fits[best(fits)]
     size = {number: len(candidates[number].names()) for number in left}
-    own = len(fit.circuit.names())
+    own = elements(fit)
     asked = []
     richer = [number for number in left if size[number] >= own]
     if richer and _lacks(fit):
@@ -89,8 +89,6 @@ def _lacks(fit: Fit) -> bool:
 
 def _is_doubtful(fit: Fit) -> bool:
     """Whether an element may be superfluous."""
-    names = fit.circuit.names()
-    values = np.array([float(np.asarray(getattr(fit.circuit, name))) for name in names])
     errors = np.sqrt(np.diagonal(np.asarray(fit.cov)))
     # An error of 0 belongs to an element without any effect.
-    return rank(fit) == 1 or not bool(((errors > 0) & (errors < DOUBTFUL * values)).all())
+    return rank(fit) == 1 or not bool(((errors > 0) & (errors < DOUBTFUL * values_of(fit))).all())

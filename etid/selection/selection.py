@@ -1,6 +1,7 @@
 """The circuit that a recording supports, and the candidates that were compared."""
 
 import dataclasses
+import functools
 from collections.abc import Mapping, Sequence
 
 import numpy as np
@@ -66,14 +67,12 @@ class Selection(Overviewed):
     Attributes:
         fit: The fit of the chosen circuit. Its covariance contains the differences to other likely
             circuits, and what changes of the circuit may do that the data cannot show.
-        candidates: The circuits that were fitted; the chosen one first, then by evidence.
         unasked: Names of the circuits that were not fitted, because the data did not ask for them.
         chosen: Number of the chosen candidate.
         fits: The fits by number of the candidate.
     """
 
     fit: Fit
-    candidates: tuple[Candidate, ...]
     unasked: tuple[str, ...]
     chosen: int
     fits: Mapping[int, Fit]
@@ -89,18 +88,22 @@ class Selection(Overviewed):
             chosen: Number of the chosen candidate.
             circuits: All candidates.
         """
-        criterion, share = bic(fits), weights(fits)
-        order = sorted(fits, key=lambda number: (number != chosen, criterion[number]))
         unasked = [type(one).__name__ for n, one in enumerate(circuits) if n not in fits]
-        return cls(
-            _concluded(fits, chosen, share) if len(circuits) > 1 else fits[chosen],
-            tuple(
-                Candidate(fits[number], float(criterion[chosen] - criterion[number]), share[number])
-                for number in order
-            ),
-            tuple(unasked),
-            chosen,
-            dict(fits),
+        fit = _concluded(fits, chosen) if len(circuits) > 1 else fits[chosen]
+        return cls(fit, tuple(unasked), chosen, dict(fits))
+
+    @functools.cached_property
+    def candidates(self) -> tuple[Candidate, ...]:
+        """The circuits that were fitted; the chosen one first, then by evidence."""
+        criterion, share = bic(self.fits), weights(self.fits)
+        order = sorted(self.fits, key=lambda number: (number != self.chosen, criterion[number]))
+        return tuple(
+            Candidate(
+                self.fits[number],
+                float(criterion[self.chosen] - criterion[number]),
+                share[number],
+            )
+            for number in order
         )
 
     @property
@@ -121,9 +124,9 @@ class Selection(Overviewed):
         return Overview(title, [one.row for one in self.candidates], HEADS, notes)
 
 
-def _concluded(fits: Mapping[int, Fit], chosen: int, share: Mapping[int, float]) -> Fit:
+def _concluded(fits: Mapping[int, Fit], chosen: int) -> Fit:
     """The chosen fit; its covariance and a remark tell of other circuits."""
-    fit = fits[chosen]
+    fit, share = fits[chosen], weights(fits)
     cov = with_close(fits, chosen) + unseen(fit)
     close = Remark.circuits_close if 1 - share[chosen] > CLOSE else 0
     return dataclasses.replace(fit, cov=cov, remarks=np.asarray(int(fit.remarks) | close))

@@ -26,6 +26,7 @@ import numpy as np
 from jaxtyping import Float
 
 from etid.results.fits import Fit
+from etid.selection.evidence import elements, values_of
 
 WIDTH = 0.2  # τ; 1 − α is 0.2 for dry skin (Gabriel, Lau and Gabriel 1996, see `SkinCole`)
 LARGEST = 50.0  # exponent of an evidence; more is as certain
@@ -37,7 +38,7 @@ def unseen(fit: Fit) -> Float[np.ndarray, "element element"]:
     Args:
         fit: One fit.
     """
-    size, support = len(fit.circuit.names()), fit.support
+    size, support = elements(fit), fit.support
     if support is None or "1" in fit.circuit.units().values():
         return np.zeros((size, size))  # another shape of the spread that it has is no candidate
     sigma = float(support.spread_stderr)
@@ -45,8 +46,7 @@ def unseen(fit: Fit) -> Float[np.ndarray, "element element"]:
         return np.zeros((size, size))
     # A positive score means α < 1.
     evidence, square = posterior(-float(support.z[0]) * sigma, sigma)
-    values = np.array([float(np.asarray(getattr(fit.circuit, n))) for n in fit.circuit.names()])
-    moved = np.asarray(support.spread_slope, float) * values
+    moved = np.asarray(support.spread_slope, float) * values_of(fit)
     return evidence / (1 + evidence) * square * np.outer(moved, moved)
 
 

@@ -138,18 +138,14 @@ def _scores(
     jacobian, rows = jax.jacfwd(model.terms)(q, smooth).T, model.changes(q, smooth)
     others = jacobian.shape[1] - rows.shape[1]
     rows = jnp.pad(rows, ((0, 0), (0, others)))
+    if drift is not None:
+        drift = jnp.pad(drift, ((0, 0), (0, others)))
     linear = Linear(jacobian, jnp.pad(share, (0, others), constant_values=1.0), noise)
     nothing, residual = jnp.zeros((q.size, q.size)), model.terms(q, records)
     elements = slice(model.named(q)[0].log_elements.size)
     found = other_circuit.scores(
-        rows, linear, residual, nothing[0], nothing, linear.bread(), elements
+        rows, linear, residual, nothing[0], nothing, linear.bread(), elements, drift
     )
-    if drift is not None:
-        directions = rows - linear.told(rows) @ linear.bread() @ jacobian
-        by_drift = directions[:, : drift.shape[1]] @ drift.T
-        variance = directions**2 @ noise
-        wider = jnp.sqrt(1 + jnp.sum(by_drift**2, axis=1) / variance)
-        found = found._replace(z=found.z / wider, stderr=found.stderr * wider)
     return Scores.of(found, gain=True)
 
 

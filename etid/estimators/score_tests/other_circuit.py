@@ -166,6 +166,7 @@ def scores(
     spread: Float[Array, "q q"],
     covariance: Float[Array, "q q"],
     elements: slice,
+    together: Float[Array, "cause term"] | None = None,
 ) -> Score:
     """Score of each change.
 
@@ -180,6 +181,8 @@ def scores(
         spread: Covariance of this gradient.
         covariance: Inverse of the information, including that of other terms.
         elements: Slice of the parameters that are the logarithms of the elements.
+        together: Effects on the terms of causes that move many terms at once, each with a standard
+            deviation of 1, such as the drift of a driver; None if there are none.
     """
     others = linear.told(rows) @ covariance
     directions = rows - others @ linear.jacobian
@@ -193,6 +196,8 @@ def scores(
     size = score / curvature
     slope = -others[:, elements]
     moved = jnp.abs(size) * jnp.max(jnp.abs(slope), axis=1)
+    if together is not None:
+        variance = variance + jnp.sum((directions @ together.T) ** 2, axis=1)
     deviation = jnp.sqrt(variance)
     z = jnp.where(can, jnp.nan, score / deviation)
     return Score(z, size, moved, deviation / curvature, slope)
