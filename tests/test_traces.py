@@ -267,6 +267,17 @@ def test_transformations_get_the_function_itself(folder):
     np.testing.assert_array_equal(jax.jit(lambda: function(X, "a").value[0])(), 2 * jnp.sin(X))
 
 
+def test_constants_of_a_program_are_no_programs_of_their_own(caplog):
+    def shifted(x):
+        return x + 3.5 * jnp.arange(7.0)
+
+    x = jnp.ones(7)
+    with jax.log_compiles():
+        stored_jit(shifted)(x)
+    compiled = [line for line in caplog.messages if "XLA compilation of" in line]
+    assert len(compiled) == 1, compiled
+
+
 def test_what_cannot_be_exported_is_traced_as_ever(folder):
     np.testing.assert_array_equal(stored_jit(with_callback)(X), X + 1)
     assert not files(folder)

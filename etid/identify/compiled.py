@@ -30,6 +30,7 @@ import equinox as eqx
 import jax
 import jax.core
 import jax.export
+import jax.numpy as jnp
 import jaxlib
 import lineax
 import numpy as np
@@ -98,14 +99,23 @@ def stored_jit(function: Callable[Parameters, Result]) -> Callable[Parameters, R
             return inner(*args, **kwargs)
         compiling.timer = None
         try:
-            # What is constant in someone's trace is computed at once.
-            with jax.ensure_compile_time_eval():
+            with _at_once():
                 return outer(_folder() is not None and _on_device(arrays))(*args, **kwargs)
         finally:
             if compiling.timer is not None:
                 compiling.timer.cancel()
 
     return call
+
+
+def _at_once() -> contextlib.AbstractContextManager[None]:
+    """Within someone's trace, a context that computes what is constant there at once.
+
+    Elsewhere it does nothing: in this context, each constant of a program to trace would be
+    compiled as a program of its own. A driver and a skin have three hundred, which take 14 s.
+    """
+    tracing = isinstance(jnp.asarray(0.0), jax.core.Tracer)
+    return jax.ensure_compile_time_eval() if tracing else contextlib.nullcontext()
 
 
 def _folder() -> pathlib.Path | None:
