@@ -114,3 +114,9 @@ def test_the_signature_of_a_recording_names_every_field():
     assert set(shown) >= {"path", *fields.DECLARED}
     assert shown["sample_rate"].default is inspect.Parameter.empty  # it is required
     assert shown["r_load"].default is None
+
+
+def test_type_checkers_know_the_names_of_all_fields():
+    assert fields.Given.__annotations__.keys() == {"path", *fields.DECLARED}
+    always = {name for name, field in fields.DECLARED.items() if field.required == "always"}
+    assert fields.Given.__required_keys__ == always

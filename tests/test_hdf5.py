@@ -557,7 +557,8 @@ studies = paths.flatmap(lambda own: st.tuples(*map(fields, ["c", "cc/1", "cc/0",
 def test_what_is_written_is_read_again(drawn, tmp_path):
     def made(one: dict[str, Any]) -> Recording:
         records = {name: Samples(*one[name]) for name in SIGNALS if name in one}
-        return Recording(**{**one, **records})
+        arguments: dict[str, Any] = {**one, **records}
+        return Recording(**arguments)
 
     study = Study.from_recordings(map(made, drawn))
     target = tmp_path / "written.h5"
@@ -578,7 +579,7 @@ def trials(count, shared, **fields):
             th if shared else Samples(CODES[0] + i, 0.5),
             Samples(CODES[1] + i, 0.5),
             **RATES,
-            **{"trial": i + 1, "path": f"s/{i}", **fields},
+            **dict[str, Any]({"trial": i + 1, "path": f"s/{i}", **fields}),
         )
         for i in range(count)
     ]

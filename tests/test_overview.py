@@ -3,6 +3,7 @@
 import dataclasses
 import functools
 import re
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -66,8 +67,8 @@ def driver():
 
 def study():
     volts = np.arange(100.0)
-    rates = {"sample_rate": 200e3, "pulse_rate": 4e3}
-    known = {"path": "s01/dry", "subject": "s01", "condition": "<b>"}
+    rates: dict[str, Any] = {"sample_rate": 200e3, "pulse_rate": 4e3}
+    known: dict[str, Any] = {"path": "s01/dry", "subject": "s01", "condition": "<b>"}
     calibration = etid.Recording(volts, volts, r_load=98.8e3, path="calibration", **rates)
     return etid.Study.from_recordings([calibration, etid.Recording(volts, volts, **rates, **known)])
 

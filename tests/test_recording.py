@@ -1,5 +1,6 @@
 import copy
 import pickle
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,7 +14,8 @@ RATES = {"sample_rate": 200e3, "pulse_rate": 60.0}
 
 def recording(length=100, **fields):
     ramp = np.arange(length, dtype=float)
-    return Recording(**{"v_th": ramp, "v_out": ramp / 2, **RATES, **fields})
+    arguments: dict[str, Any] = {"v_th": ramp, "v_out": ramp / 2, **RATES, **fields}
+    return Recording(**arguments)
 
 
 def study():

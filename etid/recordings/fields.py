@@ -8,7 +8,7 @@ change.
 
 import dataclasses
 from collections.abc import Mapping, Sequence
-from typing import Any, Literal
+from typing import Any, Literal, Required, TypedDict
 
 import numpy as np
 
@@ -244,6 +244,27 @@ DESCRIBING = {
     for name, field in DECLARED.items()
     if field.type in ("label", "number") and field.required == "optional"
 }
+
+
+Number = float | np.integer | np.floating
+
+
+class Given(TypedDict, total=False):
+    """The fields as a caller gives them, before `Field.checked`; for type checkers.
+
+    A type checker reads only names that are written out. A test compares them with the fields.
+    """
+
+    path: str
+    sample_rate: Required[Number]
+    pulse_rate: Required[Number]
+    r_load: Number | None
+    subject: Label | None
+    condition: Label | None
+    electrode: Label | None
+    trial: Label | None
+    calibration: str | Sequence[str] | None
+    adc_range: Sequence[Number] | None
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

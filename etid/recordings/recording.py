@@ -12,7 +12,7 @@ import functools
 import inspect
 from collections.abc import Hashable, Iterator, Mapping
 from types import MappingProxyType
-from typing import Any, NamedTuple, SupportsFloat
+from typing import Any, NamedTuple, SupportsFloat, Unpack
 
 import numpy as np
 import numpy.typing as npt
@@ -20,7 +20,7 @@ from jaxtyping import Float
 
 from etid.circuits.overview import Overview, Overviewed
 from etid.recordings.errors import RecordingError as RecordingError
-from etid.recordings.fields import DECLARED, LABELS, AbstractFields, Metadata, metadata_from
+from etid.recordings.fields import DECLARED, LABELS, AbstractFields, Given, Metadata, metadata_from
 from etid.recordings.values import real
 
 SYMBOLS = {"hertz": "Hz", "ohm": "Ω", "volt": "V"}
@@ -112,7 +112,7 @@ class Recording(Overviewed, AbstractFields):
         v_out: npt.ArrayLike | Samples,
         *,
         current: npt.ArrayLike | Samples | None = None,
-        **fields: Any,
+        **fields: Unpack[Given],
     ) -> None:
         try:
             samples = {"v_th": _samples("v_th", v_th), "v_out": _samples("v_out", v_out)}
@@ -177,7 +177,8 @@ class Recording(Overviewed, AbstractFields):
         Raises:
             RecordingError: The new recording would be invalid.
         """
-        return Recording(**{**self.samples, **vars(self.metadata), **changes})
+        arguments: dict[str, Any] = {**self.samples, **vars(self.metadata), **changes}
+        return Recording(**arguments)
 
     def __reduce__(self) -> tuple:
         # A read-only mapping cannot be pickled.
