@@ -84,6 +84,19 @@ def test_what_is_fitted_does_not_depend_on_whole_samples(late):
     np.testing.assert_array_equal(v_th[:size], here.v_th[begin : begin + size])
     np.testing.assert_allclose(v_out[:size], here.v_out[begin : begin + size], atol=1.01 * step)
     assert not v_out[size:].any()
+    assert padded.harmonics is not None
+    np.testing.assert_array_equal(padded.harmonics.y, harmonic.y)
+
+
+def test_samples_have_harmonics_only_of_whole_periods():
+    """The score test of output error needs them; lanes without them need another program."""
+    whole = simulate()["dry"]
+    # From the first edge on. The joint of the periods, a third of a sample apart, is then steep.
+    cut = whole.replace(v_th=whole.v_th[1360:], v_out=whole.v_out[1360:])
+    one, other = (PaddedSamples.of(Inspected(record)) for record in (whole, cut))
+    assert one.harmonics is not None
+    assert other.harmonics is None
+    assert len(one.shapes) > len(other.shapes)
 
 
 def test_elements_are_those_without_the_delay(driver):

@@ -65,8 +65,13 @@ class AbstractLane(eqx.Module):
 
     @property
     def size(self) -> int:
-        """Length of the arrays; lanes of the same size share a compiled function."""
+        """Length of the arrays."""
         return jax.tree.leaves(self)[0].shape[-1]
+
+    @property
+    def shapes(self) -> tuple[tuple[int, ...], ...]:
+        """Shapes of all arrays; lanes with the same shapes share a compiled function."""
+        return tuple(leaf.shape for leaf in jax.tree.leaves(self))
 
     def realigned(self, late: int) -> "AbstractLane":
         """The lane with `v_out` advanced by whole samples."""
@@ -180,6 +185,7 @@ class PaddedSamples(AbstractLane):
         sigma_out: Noise of `v_out` [V].
         sample_rate: Sampling rate [Hz].
         samples: Number of recorded samples; zeros follow them.
+        harmonics: Harmonics for a score test; None if the record does not hold whole periods.
     """
 
     v_th: Float[Array | np.ndarray, "*lane time"]
@@ -188,6 +194,7 @@ class PaddedSamples(AbstractLane):
     sigma_out: Float[Array | np.ndarray, "*lane"]
     sample_rate: Float[Array | np.ndarray, "*lane"]
     samples: Int[Array | np.ndarray, "*lane"]
+    harmonics: Harmonics | None = None
 
     @classmethod
     def of(cls, seen: Inspected) -> "PaddedSamples":
@@ -202,7 +209,8 @@ class PaddedSamples(AbstractLane):
             sample_rate=np.asarray(seen.recording.sample_rate),
             samples=np.asarray(size),
         )
-        return one.realigned(seen.lag)
+        one = one.realigned(seen.lag)
+        return dataclasses.replace(one, harmonics=Harmonics.of(seen) if seen.is_periodic else None)
 
     @classmethod
     def of_samples(
@@ -237,6 +245,7 @@ class PaddedSamples(AbstractLane):
             v_th=np.pad(v_th, room),
             v_out=np.pad(v_out, room),
             samples=np.asarray(v_th.size),
+            harmonics=self.harmonics and self.harmonics.realigned(late),
         )
 
     def late_by(self, circuit: AbstractCircuit, driver: Driver) -> int:

@@ -119,7 +119,7 @@ class _Prepared(NamedTuple):
         """Equal for recordings that can be fitted in one chunk."""
         seen, driver, estimator = self.planned
         rates = seen.recording.sample_rate, seen.recording.pulse_rate
-        return id(driver), estimator, self.lane.size, self.shared, rates
+        return id(driver), estimator, self.lane.shapes, self.shared, rates
 
 
 def _prepared(

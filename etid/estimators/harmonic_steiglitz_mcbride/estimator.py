@@ -1,13 +1,10 @@
 """Steiglitz-McBride on the harmonics, judged by the likelihood with a fixed Z_th."""
 
 import dataclasses
-from collections.abc import Callable
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
-from jax.flatten_util import ravel_pytree
-from jaxtyping import Array, Bool, Complex, Float
+from jaxtyping import Array, Float
 
 from etid.circuits.circuit import AbstractCircuit, SkinRC
 from etid.estimators.estimator import (
@@ -30,16 +27,12 @@ from etid.estimators.judgement import (
 from etid.estimators.lanes import Harmonics
 from etid.estimators.maximum_likelihood.estimator import AbstractByMaximumLikelihood
 from etid.estimators.maximum_likelihood.terms import (
-    apart,
     delayed_gain,
-    denoised,
     excess,
     residual,
     stands_out,
-    variance,
 )
-from etid.estimators.sandwich import Linear
-from etid.estimators.score_tests import other_circuit
+from etid.estimators.score_tests import other_circuit, other_on_harmonics
 from etid.estimators.score_tests.unloaded import UnloadedShape
 from etid.estimators.steiglitz_mcbride.iteration import check_iterations
 from etid.estimators.unknowns import LoadUnknowns
@@ -47,9 +40,7 @@ from etid.results.driver import ContinuousDriver
 from etid.results.fits import Fit
 from etid.results.verdicts import RESULTS, first_verdict
 from etid.signals.harmonics import Spectrum
-from etid.signals.transfer import as_complex, frequency_variable, reciprocal, turns
 from etid.solvers.levenberg_marquardt import normal_equations
-from etid.solvers.matrices import root
 
 
 @dataclasses.dataclass(frozen=True)
@@ -105,7 +96,7 @@ class HarmonicSteiglitzMcBride(AbstractByMaximumLikelihood):
         )
         errors = jnp.diagonal(private + shared)  # squared errors of the logarithms
         fitted = best.circuit.with_log_values(own.log_elements)
-        other = _is_another(spectrum, noise, own, sample_rate, fitted, driver)
+        other = other_on_harmonics.scores(spectrum, own, sample_rate, fitted, driver).seen()
         changed = jnp.array(False) if known is None else known.differs(spectrum)
         return Fit(
             circuit=best.circuit,
@@ -140,76 +131,3 @@ class HarmonicSteiglitzMcBride(AbstractByMaximumLikelihood):
             errors=BY_RESIDUALS,
             cited=("soderstrom2007", "white1980"),
         )
-
-
-def _is_another(
-    spectrum: Spectrum,
-    noise: Float[Array, " harmonic"],
-    own: LoadUnknowns,
-    sample_rate: Float[Array, ""],
-    circuit: SkinRC,
-    driver: ContinuousDriver,
-) -> Bool[Array, ""]:
-    """Whether the data show another circuit; Z_th may vary within its covariance.
-
-    Args:
-        spectrum: The recording.
-        noise: Variance of its noise, relative to the variance in `spectrum`.
-        own: Unknowns of the load.
-        sample_rate: Its sampling rate [Hz].
-        circuit: The circuit.
-        driver: Its driver.
-    """
-    f, elements = spectrum.frequency, own.log_elements.size
-    s = frequency_variable(f)
-    vector, unflatten = ravel_pytree(driver.source)
-    deviations = root(driver.cov).T
-
-    def along(
-        function: Callable[[Float[Array, " q"]], Complex[Array, " harmonic"]],
-        at: Float[Array, " q"],
-        directions: Float[Array, "direction q"],
-    ) -> Complex[Array, "direction harmonic"]:
-        return jax.vmap(lambda of: jax.jvp(function, (at,), (of,))[1])(directions)
-
-    def load(log_values: Float[Array, " element"]) -> Complex[Array, " harmonic"]:
-        return circuit.with_log_values(log_values).impedance()(s)
-
-    def of_gain(_) -> tuple[Complex[Array, " harmonic"], Complex[Array, "slope harmonic"]]:
-        """The gain, and its derivatives with respect to all parameters and changes."""
-        z_th = unflatten(vector).response(f)
-        z, changes = other_circuit.changes(circuit.impedance(), f)
-        total = reciprocal(z + z_th)
-        g = z * total * turns(-f[0] * own.delay_samples / sample_rate, f.size)
-        by_load = g * z_th * total * reciprocal(z)
-        by_source = along(lambda p: unflatten(p).response(f), vector, deviations)
-        by_own = [
-            by_load[None, :] * along(load, own.log_elements, jnp.eye(elements)),
-            (-g * s * as_complex(1 / sample_rate))[None, :],
-        ]
-        slopes = [*by_own, (-g * total)[None, :] * by_source, by_load[None, :] * changes]
-        return g, jnp.concatenate(slopes)
-
-    g, slopes = apart(of_gain, own.vector())
-
-    def of_residual(_) -> tuple[Float[Array, "slope part"], Float[Array, " part"]]:
-        # At the X estimated from both records: the noise of one record is in the residual too.
-        [clean], [share] = denoised([spectrum], [g])
-        weight = jnp.where(spectrum.selected, jnp.sqrt(2 / variance(spectrum, g)), 0.0)
-        rows = slopes * (-clean.x * as_complex(weight))[None, :]
-        return jnp.concatenate([rows.real, rows.imag], axis=1), share
-
-    rows, share = apart(of_residual, own.vector())
-    count = elements + 1 + vector.size
-    prior = jnp.diag(jnp.pad(jnp.ones(vector.size), (elements + 1, 0)))
-    linear = Linear(rows[:count], share, jnp.tile(noise, 2), prior)
-    found = other_circuit.scores(
-        rows[count:],
-        linear,
-        residual(spectrum, g),
-        jnp.zeros(count),
-        prior,
-        linear.bread(),
-        slice(elements),
-    )
-    return other_circuit.Scores.of(found).seen()

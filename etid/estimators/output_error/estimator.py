@@ -11,8 +11,10 @@ from etid.estimators.judgement import judged, misses, unless
 from etid.estimators.lanes import PaddedSamples
 from etid.estimators.output_error import fit, prediction
 from etid.estimators.refined_driver import refined_driver
+from etid.estimators.score_tests import other_on_harmonics
 from etid.estimators.starts import circuit_starts, has_simpler_estimate
 from etid.estimators.steiglitz_mcbride import iteration
+from etid.estimators.unknowns import LoadUnknowns
 from etid.results.driver import ContinuousDriver, Driver, HarmonicDriver
 from etid.results.fits import Fit
 from etid.results.verdicts import RESULTS
@@ -65,14 +67,20 @@ class OutputError(AbstractEstimator):
             discrete = iteration.skin_filter(m.v_th, m.v_out, z_th).filter
             simpler = iteration.skin_elements(discrete, m.sample_rate)
         starts = circuit.with_log_values(circuit_starts(circuit, simpler))
-        _, estimate, other = fit.fit_circuit(prediction.prepare(m, samples=samples), driver, starts)
+        fitted, estimate, other = fit.fit_circuit(
+            prediction.prepare(m, samples=samples), driver, starts
+        )
         found = judged(estimate, circuit, driver.result, str(self))
         off = misses(estimate.chi2, estimate.rrse, INTERPOLATED)
         found = unless(found, off, RESULTS.biased)
         if isinstance(driver, HarmonicDriver):
-            # The driver of maximum likelihood is more exact than output error. The test would take
-            # the error of output error, three standard errors, for a relaxation.
-            return found
+            # The driver of maximum likelihood is more exact than output error. In time, the test
+            # would take the error of output error, three standard errors, for a relaxation.
+            if lane.harmonics is None:
+                return found
+            own = LoadUnknowns(estimate.parameters, estimate.delay_samples[0])
+            spectrum = lane.harmonics.spectrum
+            other = other_on_harmonics.scores(spectrum, own, m.sample_rate, fitted, driver).seen()
         return unless(found, other, RESULTS.misfit)
 
     def describe(self) -> Description:
