@@ -43,6 +43,8 @@ TESTS: Mapping[str, Sequence[str]] = {
     "estimators.output_error.prediction": ("output_error", "identification"),
     "identify.changes": ("changes", "other_in_time"),
     "identify.file": ("streaming",),
+    "online.changes": ("online",),
+    "online.electrode": ("online",),
     "online.gain_bands": ("online",),
     "online.tracker": ("online",),
     "results.fits": ("recording", "joint", "identification"),

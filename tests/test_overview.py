@@ -12,7 +12,7 @@ import pytest
 
 import etid
 from etid.circuits.overview import ROWS, Overview
-from etid.online.tracker import TrackerState
+from etid.online.state import ElectrodeState, TrackerState
 from etid.results.driver import Calibration, ContinuousDriver, SourceImpedance
 from etid.results.fits import Support, described
 from etid.results.verdicts import verdict, verdicts_of
@@ -77,7 +77,25 @@ def state():
     own, eye = jnp.broadcast_to(jnp.zeros(4), (2, 4)), jnp.broadcast_to(jnp.eye(3), (2, 3, 3))
     numbers, two = jnp.array([5, 6]), jnp.array([1.5, 2.5])
     result = jax.tree.map(jnp.asarray, verdicts_of(np.array(["successful", "flat"])))
-    return TrackerState(own, eye, numbers, numbers, two, two, two, two, two, result)
+    lanes = ElectrodeState(
+        own=own,
+        information=eye,
+        pulses=numbers,
+        missed=numbers,
+        amplitude=two,
+        level=two,
+        variance=two,
+        chi2=two,
+        rrse=two,
+        result=result,
+        mean=own[:, 1:],
+        mean_cov=eye,
+        event=numbers,
+        factor=own[:, 1:],
+        element=numbers,
+        drifted=numbers,
+    )
+    return TrackerState(lanes, jnp.array(7), jnp.array(True), jnp.array(True))
 
 
 SHOWN = {

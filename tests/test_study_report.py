@@ -361,6 +361,8 @@ CITED = {  # what a reader sees, and the key of the entry that it must have
     "Söderström, 2007": "soderstrom2007",
     "White, 1980": "white1980",
     "Bell and Cathey, 1993": "bell1993",
+    "Willsky and Jones, 1976": "willsky1976",
+    "Lowry et al., 1992": "lowry1992",
     "Rader et al., 2024": "optimistix2024",
     "Bradbury et al., 2018": "jax2018",
 }

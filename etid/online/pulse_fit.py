@@ -11,7 +11,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Complex, Float
+from jaxtyping import Array, Bool, Complex, Float, Int
 
 from etid.circuits.circuit import AbstractCircuit
 from etid.estimators.estimate import DELAY_WIDTH
@@ -22,8 +22,9 @@ from etid.solvers.matrices import inverse_of_few
 
 STEP = 0.1  # [samples] spacing of the grid of delays
 DELAYS = STEP * np.arange(-15, 16)  # [samples] up to 1 by the trigger and 0.5 by the window
-# Damping of the first step, and its factors after a good and after a bad step.
+# Damping of the first step of a search, and its factors after a good and after a bad step.
 DAMPING, LOWER, RAISE = 1e-2, 0.1, 8.0
+SEARCH = 16  # largest number of steps of a search
 SETTLED = 1.0  # distance to the minimum before the last step [standard errors of one pulse]
 
 
@@ -148,20 +149,27 @@ class Equations(NamedTuple):
     matrix: Float[Array, "own own"]
 
 
+class _Search(NamedTuple):
+    """State of `searched`."""
+
+    own: Float[Array, " own"]
+    at: Equations
+    damping: Float[Array, ""]
+    steps: Int[Array, ""]
+    unsettled: Bool[Array, ""]
+
+
 def minimum(
-    equations: Callable[[Float[Array, " own"]], Equations],
-    start: Float[Array, " own"],
-    damping: Float[Array, ""],
-) -> tuple[Float[Array, " own"], Equations, Float[Array, ""], Float[Array, ""]]:
-    """One Levenberg-Marquardt step; near the minimum also one Gauss-Newton step.
+    equations: Callable[[Float[Array, " own"]], Equations], start: Float[Array, " own"]
+) -> tuple[Float[Array, " own"], Equations, Float[Array, ""]]:
+    """One Gauss-Newton step; near the minimum one more.
 
     Returns:
-        The parameters after these steps, the last normal equations that were accepted, the
-        reduction of Σ r² that these predict, and the damping for the next pulse.
+        The parameters after these steps, the last normal equations that were accepted, and the
+        reduction of Σ r² that these predict.
     """
     before = equations(start)
-    matrix = before.matrix + damping * jnp.diag(jnp.diagonal(before.matrix))
-    trial = start - inverse_of_few(matrix) @ before.gradient
+    trial = start - inverse_of_few(before.matrix) @ before.gradient
     after = equations(trial)
     better = after.objective <= before.objective
     own = jnp.where(better, trial, start)
@@ -169,7 +177,48 @@ def minimum(
     step = inverse_of_few(at.matrix) @ at.gradient
     decrement = jnp.dot(step, at.gradient)
     own = jnp.where(decrement < SETTLED**2, own - step, own)
-    return own, at, decrement, damping * jnp.where(better, LOWER, RAISE)
+    return own, at, decrement
+
+
+def searched(
+    equations: Callable[[Float[Array, " own"]], Equations],
+    start: Float[Array, " own"],
+    wanted: Bool[Array, ""],
+) -> Float[Array, " own"]:
+    """Levenberg-Marquardt steps until the next one predicts less than `SETTLED`.
+
+    Args:
+        equations: The normal equations.
+        start: Where to begin.
+        wanted: Whether the result is used; otherwise it is the start.
+
+    Returns:
+        The best parameters of at most `SEARCH` steps.
+    """
+
+    def far(at: Equations) -> Bool[Array, ""]:
+        step = inverse_of_few(at.matrix + DAMPING**2 * jnp.diag(jnp.diagonal(at.matrix)))
+        return ~(jnp.dot(at.gradient, step @ at.gradient) < SETTLED**2)
+
+    def going(carry: _Search) -> Bool[Array, ""]:
+        return carry.unsettled & (carry.steps < SEARCH)
+
+    def stepped(carry: _Search) -> _Search:
+        diagonal = jnp.diag(jnp.diagonal(carry.at.matrix))
+        trial = carry.own - inverse_of_few(carry.at.matrix + carry.damping * diagonal) @ (
+            carry.at.gradient
+        )
+        after = equations(trial)
+        better = after.objective <= carry.at.objective
+        own, at = jax.tree.map(
+            lambda new, old: jnp.where(better, new, old), (trial, after), (carry.own, carry.at)
+        )
+        damping = carry.damping * jnp.where(better, LOWER, RAISE)
+        return _Search(own, at, damping, carry.steps + 1, far(at))
+
+    at = equations(start)
+    first = _Search(start, at, jnp.asarray(DAMPING), jnp.zeros((), int), wanted & far(at))
+    return jax.lax.while_loop(going, stepped, first).own
 
 
 class Pulse(eqx.Module):

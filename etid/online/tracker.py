@@ -21,12 +21,15 @@ for a converter that runs freely, because its windows begin up to half a sample 
 model with one common delay would determine this delay better, but not ϑ: the information about ϑ
 is the same sum.
 
-**Every pulse takes the same time**: one Levenberg-Marquardt step from the best delay of a grid. An
-electrode without a good pulse also tries generic start values. In a test with 96 kinds of skin,
-each up to a factor of 3 from these values, two thirds were found after 5 pulses and all after 30.
+**A pulse takes two evaluations of the model**, from the best delay of a grid. An electrode that is
+new, or that does not fit its prediction, is fitted anew from generic start values, by up to 16
+more. `etid.online.changes` says when this is a change of the skin or of the driver.
 
-**A pulse that does not fit** changes only the verdict. The electrode starts again after several
-such pulses in a row, or if the pulses disagree with their standard errors for a long time.
+**A pulse that does not fit** even then changes only the verdict. The electrode starts again after
+several such pulses in a row, and at once if it touches nothing.
+
+**Amplitude.** V_out is divided by the amplitude of its pulse, relative to that of the unloaded
+record. The driver is linear.
 
 Z_th comes from the calibrations only; the pulses do not change it. More pulses reduce neither its
 error nor the error from the noise of the unloaded record: both are in `shared_cov`. Calibrate with
@@ -37,127 +40,40 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Complex, Float, Int
+from jaxtyping import Array, Float
 
 from etid.circuits.circuit import AbstractCircuit
 from etid.circuits.overview import Overview, Overviewed
-from etid.estimators.estimator import Description, serving
-from etid.estimators.judgement import (
-    MAX_STEPS_REACHED,
-    MISFIT_CHI2,
-    MISFIT_RRSE,
-    SUCCESSFUL,
-    misses,
-)
+from etid.estimators.estimator import serving
+from etid.estimators.judgement import SUCCESSFUL
 from etid.estimators.maximum_likelihood.given_driver import GivenDriver, combined
-from etid.estimators.registry import MAXIMUM_LIKELIHOOD, register_description
+from etid.estimators.registry import MAXIMUM_LIKELIHOOD
 from etid.estimators.starts import circuit_starts
-from etid.estimators.unknowns import LoadUnknowns
 from etid.identify.arguments import circuit_of, require_float64
 from etid.identify.compiled import stored_jit
 from etid.identify.one import explained, known_at
-from etid.online.gain_bands import cut, unloaded_bands
-from etid.online.pulse_fit import (
-    DAMPING,
-    DELAYS,
-    SETTLED,
-    GainModel,
-    Pulse,
-    minimum,
-    nearest,
+from etid.online import changes
+from etid.online.changes import Change, driver_change
+from etid.online.electrode import (
+    Measured,
+    after_pulse,
+    anew,
+    predicted,
+    suspicion,
+    tracked,
 )
+from etid.online.gain_bands import cut, unloaded_bands
+from etid.online.pulse_fit import GainModel
+from etid.online.reading import fit_of
+from etid.online.state import ElectrodeState, TrackerState
 from etid.recordings.preflight import Inspected, preflight
 from etid.recordings.recording import Recording
 from etid.results.driver import Driver, HarmonicDriver
 from etid.results.fits import Fit, Fits, IdentificationError, described
-from etid.results.verdicts import (
-    RESULTS,
-    counted,
-    first_verdict,
-    message,
-    verdict_names,
-    verdicts_of,
-)
-from etid.signals.transfer import as_complex, power, reciprocal
-from etid.solvers.matrices import inverse, inverse_of_few
+from etid.results.verdicts import RESULTS, first_verdict, message, verdict_names, verdicts_of
+from etid.signals.transfer import as_complex, power
 
-METHOD = "online"
 FLAT = 4.0  # power relative to that of noise alone; below this, the pulse is `flat`
-PATIENCE = 5  # pulses in a row that do not fit, after which an electrode starts again
-MEMORY = 30  # pulses over which `strain` is averaged
-STRAINED = 2.0  # limit of `strain`; it is 1 on average, with a standard deviation of 0.15
-
-register_description(
-    METHOD,
-    Description(
-        words="on-line tracking",
-        text="The loads were identified on-line, anew with each pulse, by an extended Kalman "
-        "filter in information form, iterated at each pulse (Bell and Cathey, 1993). In bands of "
-        "frequency of each pulse, the ratio of the loaded to the unloaded voltage was compared "
-        "with Z_L / (Z_L + Z_th) exp(-jωτ), in continuous time and with what has aliased; the "
-        "trigger delay τ of each pulse was one more unknown. The logarithms of the elements follow "
-        "a random walk. Z_th is that of the calibrations.",
-        conditions=(
-            "the last pulse passed the checks for flat, clipped and missing samples",
-            "its iteration settled",
-            "its residual does not exceed the noise (χ² per degree of freedom of at most "
-            f"{MISFIT_CHI2:g}, or an unexplained part of at most {100 * MISFIT_RRSE:g} % of the "
-            "signal)",
-            f"its trigger delay is at most {DELAYS[-1]:g} samples",
-            "pulses do not disagree with their predictions by more than their errors",
-            "every relative standard error is below 1",
-        ),
-        errors="accumulate the information of all pulses; to them the error of Z_th and of the "
-        "unloaded voltage was added, which no number of pulses lessens",
-        noise="The variance of the noise was estimated at each pulse from what a straight line "
-        "through each band leaves.",
-        cited=("bell1993",),
-    ),
-)
-
-
-class TrackerState(Overviewed, eqx.Module):
-    """Estimates for every electrode after a pulse.
-
-    Attributes:
-        own: Logarithms of the elements [SI], and the delay of the last pulse [samples].
-        information: Inverse covariance of the elements' logarithms; 0 before the first good pulse.
-        pulses: Number of pulses that contribute to `information`.
-        missed: Number of pulses in a row that did not fit.
-        damping: Damping of the next step.
-        strain: Mean squared difference between pulses and their predictions, in units of its
-            variance.
-        variance: E|noise|² of a Fourier coefficient of the last pulse [V²].
-        chi2: χ² of the last pulse.
-        rrse: RRSE of the last pulse.
-        result: Verdict on the last pulse.
-    """
-
-    own: Float[Array, "*lane own"]
-    information: Float[Array, "*lane element element"]
-    pulses: Int[Array, "*lane"]
-    missed: Int[Array, "*lane"]
-    damping: Float[Array, "*lane"]
-    strain: Float[Array, "*lane"]
-    variance: Float[Array, "*lane"]
-    chi2: Float[Array, "*lane"]
-    rrse: Float[Array, "*lane"]
-    result: RESULTS
-
-    def _overview(self) -> Overview:
-        names = verdict_names(self.result)
-        rows = [
-            (str(number), str(name), str(pulses), str(missed), f"{chi2:.3g}")
-            for number, (name, pulses, missed, chi2) in enumerate(
-                zip(names, *map(np.asarray, (self.pulses, self.missed, self.chi2)), strict=True)
-            )
-        ]
-        return Overview(
-            f"State of {names.size} electrodes, last pulse: {counted(names)}",
-            rows,
-            ("electrode", "verdict", "pulses", "missed in a row", "chi2"),
-            ("Tracker.read(state) gives the elements.",),
-        )
 
 
 class Tracker(Overviewed, eqx.Module):
@@ -169,6 +85,7 @@ class Tracker(Overviewed, eqx.Module):
         model: Model of the gain of a pulse.
         known: Z_th in the bands and its covariance, from the calibrations.
         change: Standard deviation of the random walk of the elements' logarithms [1/√pulse].
+        limit: Limit of the tests for a change [χ²].
         adc_range: Voltages at which the converter saturates [V].
         driver_result: Verdict of the driver.
         electrodes: Number of electrodes.
@@ -178,6 +95,7 @@ class Tracker(Overviewed, eqx.Module):
     model: GainModel
     known: GivenDriver
     change: Float[Array, ""]
+    limit: Float[Array, ""]
     adc_range: Float[Array, " 2"]
     driver_result: RESULTS
     electrodes: int = eqx.field(static=True)
@@ -239,6 +157,7 @@ class Tracker(Overviewed, eqx.Module):
             model=model,
             known=known,
             change=jnp.asarray(float(change)),
+            limit=jnp.asarray(changes.limit(len(model.circuit.names()), rate / period)),
             adc_range=jnp.array([low + half, high - half]),
             driver_result=driver.result,
             electrodes=electrodes,
@@ -258,19 +177,27 @@ class Tracker(Overviewed, eqx.Module):
         """The state before the first pulse, without information."""
         lanes, elements = self.electrodes, len(self.model.circuit.names())
         typical = jnp.append(self.model.circuit.log_values(), 0.0)
-        nan = jnp.full(lanes, jnp.nan)
-        return TrackerState(
+        nan, none = jnp.full(lanes, jnp.nan), jnp.zeros(lanes, int)
+        electrodes = ElectrodeState(
             own=jnp.broadcast_to(typical[None, :], (lanes, elements + 1)),
             information=jnp.zeros((lanes, elements, elements)),
-            pulses=jnp.zeros(lanes, int),
-            missed=jnp.zeros(lanes, int),
-            damping=jnp.full(lanes, DAMPING),
-            strain=jnp.zeros(lanes),
+            pulses=none,
+            missed=none,
+            amplitude=jnp.ones(lanes),
+            level=nan,
             variance=nan,
             chi2=nan,
             rrse=nan,
             result=jax.tree.map(jnp.asarray, verdicts_of(np.full(lanes, "too_short"))),
+            mean=jnp.zeros((lanes, elements)),
+            mean_cov=jnp.zeros((lanes, elements, elements)),
+            event=none,
+            factor=jnp.zeros((lanes, elements)),
+            element=none,
+            drifted=none - 1,
         )
+        no = jnp.asarray(False)
+        return TrackerState(electrodes, jnp.zeros((), int), no, no)
 
     def pulses(
         self, v_out: Float[np.ndarray, "*lane time"]
@@ -286,7 +213,10 @@ class Tracker(Overviewed, eqx.Module):
         return cut(v_out, self.period)
 
     def update(
-        self, state: TrackerState, v_out: Float[Array | np.ndarray, "lane sample"]
+        self,
+        state: TrackerState,
+        v_out: Float[Array | np.ndarray, "lane sample"],
+        amplitude: float | Float[Array | np.ndarray, " pulse"] = 1.0,
     ) -> TrackerState:
         """The state after one more pulse.
 
@@ -294,12 +224,15 @@ class Tracker(Overviewed, eqx.Module):
             state: State before this pulse; it does not change.
             v_out: Loaded voltage of one period at every electrode [V]. The windows begin between
                 two pulses.
+            amplitude: Primary amplitude of this pulse, at all electrodes or at each, relative to
+                that of the unloaded record. An electrode without a pulse has 0.
 
         Returns:
             State after this pulse.
 
         Raises:
-            ValueError: `v_out` does not hold one window of one period for each electrode.
+            ValueError: `v_out` does not hold one window of one period for each electrode, or an
+                amplitude is negative, or there is not one for each electrode.
         """
         expected = (self.electrodes, self.model.bands.samples)
         if np.shape(v_out) != expected:
@@ -307,7 +240,16 @@ class Tracker(Overviewed, eqx.Module):
                 f"v_out has shape {np.shape(v_out)}; one period at each electrode has the shape "
                 f"(electrode, sample) = {expected} (Tracker.pulses cuts longer records)"
             )
-        return _updated(self, state, jnp.asarray(v_out, dtype=float))
+        amplitude = np.asarray(amplitude, float)
+        if amplitude.shape not in ((), (self.electrodes,)):
+            raise ValueError(
+                f"amplitude has shape {amplitude.shape}; give one number, or one for each of "
+                f"{self.electrodes} electrodes"
+            )
+        if not (np.isfinite(amplitude) & (amplitude >= 0)).all():
+            raise ValueError(f"amplitude is {amplitude}; it must be finite and not negative")
+        relative = np.broadcast_to(amplitude, (self.electrodes,))
+        return _updated(self, state, jnp.asarray(v_out, dtype=float), jnp.asarray(relative))
 
     def read(self, state: TrackerState) -> Fits:
         """Elements, standard errors, χ² of the last pulse and verdict of every electrode.
@@ -330,159 +272,102 @@ class Tracker(Overviewed, eqx.Module):
         notes = np.array([message(name) for name in fit.verdict])
         return Fits(fit, described(electrodes), notes)
 
+    def changes(self, state: TrackerState) -> list[Change]:
+        """The changes that the last pulse has shown; see `etid.online.changes`.
 
-def _electrode(
-    tracker: Tracker,
-    state: TrackerState,
-    gain: Complex[Array, " band"],
-    variance: Float[Array, ""],
-    bad: RESULTS,
-    elsewhere: LoadUnknowns,
-    distance: Float[Array, ""],
-) -> TrackerState:
-    """State of one electrode after one pulse.
+        Expect one false alarm per electrode in 20 hours, and none of the driver. If the driver has
+        changed, the changes of the electrodes are not listed, and all verdicts remain
+        `inconsistent` until a new tracker starts after a new calibration.
 
-    Args:
-        tracker: The tracker.
-        state: State of this electrode before the pulse.
-        gain: Measured gain of the pulse.
-        variance: E|noise|² of a Fourier coefficient of V_out [V²].
-        bad: Verdict on the samples of the pulse.
-        elsewhere: Nearest generic start: logarithms of the elements [SI] and delay [samples].
-        distance: Distance of its gain from the measured gain.
-    """
-    before = LoadUnknowns.of(state.own)
-    logs, elements = before.log_elements, before.log_elements.size
-    running = state.pulses > 0
-    lost = inverse_of_few(jnp.eye(elements) + tracker.change**2 * state.information)
-    lost = state.information @ lost @ state.information
-    information = state.information - tracker.change**2 * lost
+        Args:
+            state: State of the tracker.
+        """
+        return changes.changes(state, self.model.circuit.names())
 
-    start, own_distance = nearest(tracker.model, gain, logs[None, :])
-    away = ~running & ~(own_distance <= distance)
-    start = jax.tree.map(lambda new, old: jnp.where(away, new, old), elsewhere, start)
-    damping = jnp.where(away, DAMPING, state.damping)
-    gain = gain - tracker.model.departure(start)
-    pulse = Pulse(tracker.model, gain, variance, logs, information)
-    own, at, decrement, damping = minimum(pulse.equations, start.vector(), damping)
-    bands = tracker.model.bands
-    selected = bands.weight > 0
-    chi2 = at.squares / (2 * jnp.sum(selected, dtype=at.squares.dtype) - own.size)
-    signal = jnp.sum(bands.weight * power(gain)) / variance
-    rrse = jnp.sqrt(at.squares / signal)
-    by_delay = at.curvature[:-1, -1]
-    told = at.curvature[:-1, :-1] - jnp.outer(by_delay, by_delay) / at.curvature[-1, -1]
-    spread = inverse_of_few(told)
+    def bad_electrodes(self, state: TrackerState) -> dict[int, str]:
+        """Electrodes that cannot be used, by number, and why.
 
-    # χ² per element of the difference between the elements of this pulse alone and the prediction.
-    found = LoadUnknowns.of(own)
-    off = found.log_elements - logs
-    pull = information @ off
-    surprise = (jnp.dot(off, pull) + jnp.dot(pull, spread @ pull)) / elements
-    share = 1 / jnp.clip(state.pulses, 1, MEMORY).astype(surprise.dtype)
-    strain = state.strain + (surprise - state.strain) * share
-    strained = running & (state.pulses >= MEMORY) & (strain > STRAINED)
+        `open` takes no current, `shorted` less than 2 % of the voltage, `dry` has more than 700 kΩ
+        at the lowest frequency, `drifting` drifted in the last 60 pulses more than `change` says.
 
-    settled, late = decrement < SETTLED**2, jnp.abs(found.delay_samples) > DELAYS[-1]
-    determined = running | jnp.all(jnp.diagonal(spread) < 1)
-    result = first_verdict(
-        (bad != SUCCESSFUL, bad),
-        (~jnp.isfinite(own).all(), RESULTS.nonphysical),
-        (~settled, MAX_STEPS_REACHED),
-        (misses(chi2, rrse) | late | strained, RESULTS.misfit),
-        (~determined, RESULTS.insensitive),
-    )
-    good = result == SUCCESSFUL
-    missed = jnp.where(good, 0, state.missed + 1)
-    again = running & ((missed >= PATIENCE) | strained)
-    kept = good | ~running & jnp.isfinite(own).all() & (bad == SUCCESSFUL)
-    return TrackerState(
-        own=jnp.where(kept, own, state.own),
-        information=jnp.where(again, 0.0, jnp.where(good, information + told, information)),
-        pulses=jnp.where(again, 0, state.pulses + jnp.where(good, 1, 0)),
-        missed=missed,
-        damping=jnp.where(again, DAMPING, jnp.where(good, 0.0, damping)).astype(own.dtype),
-        strain=jnp.where(again, 0.0, jnp.where(good & running, strain, state.strain)),
-        variance=variance,
-        chi2=chi2,
-        rrse=rrse,
-        result=result,
-    )
+        Args:
+            state: State of the tracker.
+        """
+        logs = state.electrodes.own[:, :-1]
+        lowest = self.model.bands.frequency[:1]
+        z = jax.vmap(lambda one: self.model.circuit.with_log_values(one).response(lowest)[0])(logs)
+        return changes.bad_electrodes(state, np.abs(np.asarray(z)))
 
 
 @jax.jit  # `stored_jit` and `equinox.filter_jit` would cost a tenth of a tick at every call
 def _updated(
-    tracker: Tracker, state: TrackerState, v_out: Float[Array, "lane sample"]
+    tracker: Tracker,
+    state: TrackerState,
+    v_out: Float[Array, "lane sample"],
+    amplitude: Float[Array, " lane"],
 ) -> TrackerState:
+    model, limit, number = tracker.model, tracker.limit, state.number + 1
+    before = state.electrodes
+    measured = _measured(tracker, v_out, amplitude)
+    information = jax.vmap(lambda of: predicted(of, tracker.change))(before.information)
+    found = jax.vmap(lambda *of: tracked(model, *of))(before, measured, information)
+    common = model.circuit.scaling()[0]
+    suspected = jax.vmap(lambda a, b, c: suspicion(a, b, c, common, limit))(
+        before, found, information
+    )
+    running = before.pulses > 0
+    wanted = (~running | suspected.jump | suspected.drift) & (measured.bad == SUCCESSFUL)
+    starts = circuit_starts(model.circuit, None)
+    fresh = jax.lax.cond(
+        wanted.any(),
+        jax.vmap(lambda *of: anew(model, of[0], starts, of[1])),
+        lambda *_: found,
+        measured,
+        wanted,
+    )
+    after = jax.vmap(lambda a, b, c, d, e, f: after_pulse(a, b, c, d, e, f, limit, number))(
+        before, measured, information, found, fresh, suspected
+    )
+    counts = running & (measured.bad == SUCCESSFUL)
+    event = driver_change(suspected.jump, suspected.z.T, counts)
+    return TrackerState(after, number, event, state.driver_changed | event)
+
+
+def _measured(
+    tracker: Tracker, v_out: Float[Array, "lane sample"], amplitude: Float[Array, " lane"]
+) -> Measured:
+    """Gains of a pulse, and the verdict on its samples."""
     lowest, highest = v_out.min(axis=1), v_out.max(axis=1)  # NaN if a sample is NaN
     finite = jnp.isfinite(lowest) & jnp.isfinite(highest)
     clipped = (lowest <= tracker.adc_range[0]) | (highest >= tracker.adc_range[1])
     bands = tracker.model.bands
     gains = bands.measure(jnp.where(finite[:, None], v_out, 0.0))
-    signal = power(gains.gain) @ bands.weight / gains.variance
-    flat = signal < FLAT * 2 * jnp.sum(bands.weight > 0, dtype=float)
+    signal = power(gains.gain) @ bands.weight
+    noise = 2 * jnp.sum(bands.weight > 0, dtype=float) * gains.variance
+    flat = (signal < FLAT * noise) | ~(amplitude > 0)
+    relative = jnp.where(amplitude > 0, amplitude, 1.0)
+    level = jnp.sqrt(jnp.maximum(signal - noise, 0.0) / jnp.sum(bands.weight)) / relative
     bad = jax.vmap(
-        lambda finite, clipped, flat: first_verdict(
-            (~finite, RESULTS.nonfinite_samples), (clipped, RESULTS.saturated), (flat, RESULTS.flat)
+        lambda finite, clipped, flat, unconnected: first_verdict(
+            (~finite, RESULTS.nonfinite_samples),
+            (clipped, RESULTS.saturated),
+            (flat, RESULTS.flat),
+            (unconnected, RESULTS.unconnected),
         )
-    )(finite, clipped, flat)
-    starts = circuit_starts(tracker.model.circuit, None)
-    lanes, elements = state.information.shape[:2]
-    elsewhere = jax.lax.cond(
-        (state.pulses == 0).any(),
-        jax.vmap(lambda gain: nearest(tracker.model, gain, starts)),
-        lambda _: (
-            LoadUnknowns(jnp.zeros((lanes, elements)), jnp.zeros(lanes)),
-            jnp.full(lanes, jnp.inf),
-        ),
-        gains.gain,
+    )(finite, clipped, flat, jnp.abs(level - 1) < 1 - changes.OPEN)
+    return Measured(
+        gains.gain * as_complex(1 / relative)[:, None],
+        gains.variance / relative**2,
+        level,
+        amplitude,
+        bad,
     )
-    return jax.vmap(lambda *of: _electrode(tracker, *of))(state, *gains, bad, *elsewhere)
 
 
 @stored_jit
 def _judged(tracker: Tracker, state: TrackerState) -> Fit:
-    return jax.vmap(lambda of: _fit(tracker, of))(state)
-
-
-def _fit(tracker: Tracker, state: TrackerState) -> Fit:
-    """The fit of one electrode."""
-    known, bands = tracker.known, tracker.model.bands
-    logs = LoadUnknowns.of(state.own).log_elements
-    elements = logs.size
-    model = tracker.model.undelayed(logs)
-    pulse = Pulse(
-        tracker.model, jnp.zeros_like(model), state.variance, logs, jnp.zeros((elements, elements))
-    )
-    jacobian = pulse.terms(state.own)[:-1]
-    by_term = inverse(jacobian @ jacobian.T)[:elements] @ jacobian
-    # Z_th + R = e^W, so that ∂G/∂W = −Z_L (Z_th + R) / (Z_L + Z_th)².
-    z = tracker.model.circuit.with_log_values(logs).response(bands.frequency)
-    admittance = reciprocal(z + tracker.model.source)
-    weight = jnp.sqrt(bands.weight / state.variance)
-    loaded = tracker.model.source + as_complex(known.resistance)
-    by_w = as_complex(weight) * z * loaded * admittance * admittance
-    by_z = by_w[None, :] * known.slope
-    of_z = by_term @ jnp.concatenate([by_z.real, by_z.imag], axis=1).T
-    # The noise of X is the same in every pulse. It enters Ĝ multiplied by G.
-    of_x = jnp.tile(power(model) * bands.variance_x / state.variance, 2)
-    shared = of_z @ known.cov @ of_z.T + (by_term * of_x[None, :]) @ by_term.T
-    cov = inverse(state.information) + shared
-    relative = jnp.sqrt(jnp.diagonal(cov))
-    fitted = tracker.model.circuit.with_log_values(logs)
-    scale = jnp.outer(fitted.values(), fitted.values())
-    known_at_all = state.pulses > 0
-    return Fit(
-        circuit=fitted,
-        cov=jnp.where(known_at_all, cov * scale, jnp.nan),
-        shared_cov=jnp.where(known_at_all, shared * scale, jnp.nan),
-        rrse=state.rrse,
-        chi2=state.chi2,
-        result=first_verdict(
-            (state.result != SUCCESSFUL, state.result),
-            (~jnp.all(relative < 1), RESULTS.insensitive),
-            (tracker.driver_result != SUCCESSFUL, RESULTS.driver_failed),
-        ),
-        steps=state.pulses,
-        method=METHOD,
-    )
+    return jax.vmap(
+        lambda of: fit_of(
+            tracker.model, tracker.known, tracker.driver_result, state.driver_changed, of
+        )
+    )(state.electrodes)

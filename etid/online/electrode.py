@@ -1,0 +1,254 @@
+"""One electrode at one pulse: the verdict, the changes, and the state after it."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Complex, Float, Int
+
+from etid.estimators.judgement import MAX_STEPS_REACHED, SUCCESSFUL, misses
+from etid.estimators.unknowns import LoadUnknowns
+from etid.online.changes import DRIFT, JUMP, NONE, Innovation, averaged
+from etid.online.pulse_fit import DELAYS, SETTLED, GainModel, Pulse, minimum, nearest, searched
+from etid.online.state import ElectrodeState
+from etid.results.verdicts import RESULTS, first_verdict
+from etid.signals.transfer import power
+from etid.solvers.matrices import inverse_of_few
+
+PATIENCE = 5  # pulses in a row that do not fit, after which an electrode starts again
+
+
+class Measured(NamedTuple):
+    """What a pulse shows at one electrode, or at all of them along a leading axis.
+
+    Attributes:
+        gain: Measured gain.
+        variance: E|noise|² of a Fourier coefficient of V_out [V²].
+        level: Effective value of the gain.
+        amplitude: Amplitude of the pulse, relative to that of the unloaded record.
+        bad: Verdict on the samples.
+    """
+
+    gain: Complex[Array, "*lane band"]
+    variance: Float[Array, "*lane"]
+    level: Float[Array, "*lane"]
+    amplitude: Float[Array, "*lane"]
+    bad: RESULTS
+
+
+class Attempt(NamedTuple):
+    """A fit of one pulse.
+
+    Attributes:
+        own: Logarithms of the elements [SI] and delay [samples].
+        information: Information of this pulse about the elements.
+        spread: Its inverse.
+        chi2: χ² of the pulse.
+        rrse: RRSE of the pulse.
+        result: Verdict.
+    """
+
+    own: Float[Array, "*lane own"]
+    information: Float[Array, "*lane element element"]
+    spread: Float[Array, "*lane element element"]
+    chi2: Float[Array, "*lane"]
+    rrse: Float[Array, "*lane"]
+    result: RESULTS
+
+
+def predicted(
+    information: Float[Array, "element element"], change: Float[Array, ""]
+) -> Float[Array, "element element"]:
+    """Λ⁻ = (Λ⁻¹ + q² 1)⁻¹, which also holds for a singular Λ."""
+    elements = information.shape[0]
+    lost = inverse_of_few(jnp.eye(elements) + change**2 * information)
+    return information - change**2 * (information @ lost @ information)
+
+
+def attempt(
+    model: GainModel,
+    measured: Measured,
+    start: LoadUnknowns,
+    centre: Float[Array, " element"],
+    information: Float[Array, "element element"],
+) -> Attempt:
+    """The fit of a pulse from a start near its minimum.
+
+    Args:
+        model: Model of the gain.
+        measured: The pulse.
+        start: Elements and delay at which the fit begins.
+        centre: Predicted logarithms of the elements.
+        information: Inverse covariance of `centre`.
+    """
+    gain = measured.gain - model.departure(start)
+    pulse = Pulse(model, gain, measured.variance, centre, information)
+    own, at, decrement = minimum(pulse.equations, start.vector())
+    weight = model.bands.weight
+    freedom = 2 * jnp.sum(weight > 0, dtype=at.squares.dtype) - own.size
+    chi2 = at.squares / freedom
+    rrse = jnp.sqrt(at.squares * measured.variance / jnp.sum(weight * power(gain)))
+    by_delay = at.curvature[:-1, -1]
+    told = at.curvature[:-1, :-1] - jnp.outer(by_delay, by_delay) / at.curvature[-1, -1]
+    spread = inverse_of_few(told)
+    late = jnp.abs(LoadUnknowns.of(own).delay_samples) > DELAYS[-1]
+    result = first_verdict(
+        (measured.bad != SUCCESSFUL, measured.bad),
+        (~jnp.isfinite(own).all(), RESULTS.nonphysical),
+        (~(decrement < SETTLED**2), MAX_STEPS_REACHED),
+        (misses(chi2, rrse) | late, RESULTS.misfit),
+    )
+    return Attempt(own, told, spread, chi2, rrse, result)
+
+
+def tracked(
+    model: GainModel,
+    state: ElectrodeState,
+    measured: Measured,
+    information: Float[Array, "element element"],
+) -> Attempt:
+    """The fit of a pulse, with the prediction from the pulses before it."""
+    logs = LoadUnknowns.of(state.own).log_elements
+    start, _ = nearest(model, measured.gain, logs[None, :])
+    return attempt(model, measured, start, logs, information)
+
+
+def anew(
+    model: GainModel,
+    measured: Measured,
+    starts: Float[Array, "start element"],
+    wanted: Bool[Array, ""],
+) -> Attempt:
+    """The fit of a pulse alone, from the nearest of several starts.
+
+    Args:
+        model: Model of the gain.
+        measured: The pulse.
+        starts: Logarithms of the elements.
+        wanted: Whether the result is used; otherwise the search ends at once.
+    """
+    start, _ = nearest(model, measured.gain, starts)
+    nothing = jnp.zeros((starts.shape[1], starts.shape[1]))
+    gain = measured.gain - model.departure(start)
+    pulse = Pulse(model, gain, measured.variance, start.log_elements, nothing)
+    own = LoadUnknowns.of(searched(pulse.equations, start.vector(), wanted))
+    found = attempt(model, measured, own, own.log_elements, nothing)
+    unknown = ~jnp.all(jnp.diagonal(found.spread) < 1)
+    result = first_verdict(
+        (found.result != SUCCESSFUL, found.result), (unknown, RESULTS.insensitive)
+    )
+    return found._replace(result=result)
+
+
+class Suspicion(NamedTuple):
+    """The tests of a pulse for a change.
+
+    Attributes:
+        jump: Whether the pulse does not fit its prediction.
+        drift: Whether the moving mean of the innovations is not zero.
+        mean: Moving mean of the innovations.
+        mean_cov: Its covariance.
+        element: The element that explains the drift best.
+        z: Components of innovation and moving mean along a change of Z_th [standard deviations].
+    """
+
+    jump: Bool[Array, "*lane"]
+    drift: Bool[Array, "*lane"]
+    mean: Float[Array, "*lane element"]
+    mean_cov: Float[Array, "*lane element element"]
+    element: Int[Array, "*lane"]
+    z: Float[Array, "*lane 2"]
+
+
+def suspicion(
+    state: ElectrodeState,
+    found: Attempt,
+    information: Float[Array, "element element"],
+    common: Float[Array, " element"],
+    limit: Float[Array, ""],
+) -> Suspicion:
+    """Test one pulse of an electrode; see `etid.online.changes`.
+
+    Args:
+        state: State before the pulse.
+        found: The fit of the pulse with its prediction.
+        information: Λ⁻.
+        common: Direction in which a change of Z_th moves the elements.
+        limit: Limit of both tests.
+    """
+    before, after = LoadUnknowns.of(state.own), LoadUnknowns.of(found.own)
+    off = after.log_elements - before.log_elements
+    new = Innovation.of(off + found.spread @ information @ off, found.spread, information)
+    moving = averaged(state.mean, state.mean_cov, new)
+    running, fits = state.pulses > 0, found.result == SUCCESSFUL
+    return Suspicion(
+        running & ~(fits & (new.statistic() <= limit)),
+        running & fits & (moving.statistic() > limit),
+        moving.d,
+        moving.cov,
+        moving.element(),
+        jnp.stack([new.along(common), moving.along(common)]),
+    )
+
+
+def after_pulse(
+    state: ElectrodeState,
+    measured: Measured,
+    information: Float[Array, "element element"],
+    found: Attempt,
+    fresh: Attempt,
+    suspected: Suspicion,
+    limit: Float[Array, ""],
+    number: Int[Array, ""],
+) -> ElectrodeState:
+    """State of one electrode after one pulse.
+
+    Args:
+        state: State before the pulse.
+        measured: The pulse.
+        information: Λ⁻.
+        found: Fit with the prediction.
+        fresh: Fit of the pulse alone; used if the electrode is new or suspected.
+        suspected: Tests of the pulse.
+        limit: Limit of the tests.
+        number: Number of the pulse.
+    """
+    running = state.pulses > 0
+    again = ~running | suspected.jump | suspected.drift
+    used: Attempt = jax.tree.map(lambda new, old: jnp.where(again, new, old), fresh, found)
+    good = used.result == SUCCESSFUL
+    factor = LoadUnknowns.of(used.own).log_elements - LoadUnknowns.of(state.own).log_elements
+    moved = Innovation.of(factor, used.spread, information)
+    jumped = running & suspected.jump & good & (moved.statistic() > limit)
+    drifted = running & suspected.drift & good & ~jumped
+    event = jnp.where(jumped, JUMP, jnp.where(drifted, DRIFT, NONE)).astype(int)
+    changed = jumped | drifted
+
+    missed = jnp.where(good, 0, state.missed + 1)
+    lost = running & ((missed >= PATIENCE) | (measured.bad == RESULTS.unconnected))
+    restarted = good & again
+    one = jnp.where(restarted, 1, state.pulses + 1)
+    gained = jnp.where(restarted, used.information, information + used.information)
+    followed = good & ~again
+    return ElectrodeState(
+        own=jnp.where(good, used.own, state.own),
+        information=jnp.where(lost, 0.0, jnp.where(good, gained, information)),
+        pulses=jnp.where(lost, 0, jnp.where(good, one, state.pulses)),
+        missed=missed,
+        amplitude=measured.amplitude,
+        level=measured.level,
+        variance=measured.variance,
+        chi2=used.chi2,
+        rrse=used.rrse,
+        result=used.result,
+        mean=jnp.where(followed, suspected.mean, jnp.where(good | lost, 0.0, state.mean)),
+        mean_cov=jnp.where(
+            followed, suspected.mean_cov, jnp.where(good | lost, 0.0, state.mean_cov)
+        ),
+        event=event,
+        factor=jnp.where(changed, factor, state.factor),
+        element=jnp.where(
+            jumped, moved.element(), jnp.where(drifted, suspected.element, state.element)
+        ),
+        drifted=jnp.where(drifted, number, state.drifted),
+    )
