@@ -12,14 +12,14 @@ from benchmarks.ladder import CALIBRATION, rung
 from etid.commands import fit as command
 from etid.results.driver import ContinuousDriver
 from etid.results.tried_orders import LARGEST, LEAST
-from etid.selection.driver_order import Candidate, best, evidence, next_order
+from etid.selection.driver_order import TriedOrder, best, evidence, next_order
 
 TERMS = 3000
 POLE = 2 * np.log(TERMS)  # what one more pole costs in BIC
 
 
 def candidate(order, squares, missing_pole=4.0, adequate=True):
-    return Candidate(order, squares, 2 * order + 2, TERMS, missing_pole, adequate)
+    return TriedOrder(order, squares, 2 * order + 2, TERMS, missing_pole, adequate)
 
 
 def searched(candidates):

@@ -7,7 +7,9 @@ import numpy as np
 import pytest
 
 import etid
-from etid.circuits.elements import Farad, Ohm
+from etid.circuits.elements import Farad, Ohm, PseudoCapacitance
+from etid.circuits.impedance import AbstractImpedance
+from etid.estimators.starts import circuit_starts
 from etid.report.methods import methods_section
 from etid.results.fits import CHANGES, Fit, Support
 from etid.results.verdicts import verdict
@@ -103,6 +105,24 @@ def test_a_phase_of_a_capacitor_is_no_reason_for_a_constant_phase():
     cole = etid.SkinCole(20e3, 100e3, 30e-6, 0.995)
     assert rank(made(cole, 900.0)) == 1
     assert rank(made(dataclasses.replace(cole, alpha=jnp.asarray(0.95)), 900.0)) == 0
+
+
+class Warburg(etid.AbstractCircuit):
+    """A resistor and a diffusion, whose exponent is no parameter."""
+
+    r_s: Ohm = etid.parameter("ohm", typical=20e3)
+    q: PseudoCapacitance = etid.parameter("siemens second^alpha", typical=1e-7)
+
+    def impedance(self) -> AbstractImpedance:
+        """R_s + 1 / (Q √s)."""
+        return etid.series(etid.resistor(self.r_s), etid.constant_phase(self.q, 0.5))
+
+
+def test_an_exponent_that_is_no_parameter_is_one():
+    assert Warburg().exponents() == (0.5,)
+    assert etid.SkinRC().exponents() == ()
+    assert rank(made(Warburg(), 900.0)) == 0
+    assert not unseen(made(Warburg(), 900.0, slope=2.0)).any()
 
 
 def test_weights_are_probabilities_of_what_the_data_allow():
@@ -280,6 +300,33 @@ def test_the_circuit_of_a_recording_is_found(study, driver, name):
     fit = etid.identify_skin(study[name], driver, circuit="auto")
     np.testing.assert_array_equal(fit.cov, selection.fit.cov)
     error = np.asarray(fit.circuit.values()) - np.asarray(LOADS[name].values())
+    assert (np.abs(error) < 4 * np.sqrt(np.diagonal(fit.cov))).all()
+
+
+def test_other_circuits_start_at_the_resistance_and_time_constant_of_the_estimate():
+    estimate = etid.SkinRC(33.4e3, 186e3, 0.12e-9)
+    resistance, time = 33.4e3 + 186e3, 186e3 * 0.12e-9
+    assert np.exp(circuit_starts(etid.Resistor(), estimate)[-1]) == pytest.approx(
+        resistance * 100 / 120  # typical values: 100 kΩ, and 120 kΩ of SkinRC
+    )
+    r_p, c_p = np.exp(circuit_starts(etid.ParallelRC(), estimate)[-1])
+    assert (r_p, r_p * c_p) == pytest.approx((resistance * 100 / 120, time))
+    r_s, r_p, tau, alpha = np.exp(circuit_starts(etid.SkinCole(), estimate)[-1])
+    assert (r_s + r_p, tau, alpha) == pytest.approx((resistance, time, 0.8))
+    impossible = etid.SkinRC(-33.4e3, 20e3, 0.12e-9)
+    start = circuit_starts(etid.ParallelRC(), impossible)[-1]
+    np.testing.assert_array_equal(start, etid.ParallelRC().log_values())
+
+
+@pytest.mark.slow
+def test_noise_does_not_hide_a_capacitor():
+    """Seed 4: from typical values alone, this fit ended at a capacitor of 0."""
+    load = etid.ParallelRC(186e3, 0.12e-9)
+    scene = dataclasses.replace(SCENE, trials=(Trial("parallel", load),), snr_db=20.0)
+    study = scene.simulate(4)
+    driver = etid.identify_driver([study[path] for path in study.calibrations])
+    fit = etid.identify_skin(study["parallel"], driver, circuit=etid.ParallelRC(), throw=False)
+    error = np.asarray(fit.circuit.values()) - np.asarray(load.values())
     assert (np.abs(error) < 4 * np.sqrt(np.diagonal(fit.cov))).all()
 
 

@@ -28,7 +28,7 @@ from etid.results.driver import (
 from etid.results.provenance import Settings
 from etid.results.study_fits import StudyFits
 from etid.results.verdicts import message, verdict, verdicts_of
-from etid.selection.driver_order import Candidate, evidence
+from etid.selection.driver_order import TriedOrder, evidence
 from etid.simulation.scenes import Scene, Trial
 from etid.simulation.transformer import ResistorLoad, SkinLoad
 from tests import pictures
@@ -74,7 +74,7 @@ def driver():
         rrse=jnp.array(0.003), chi2=jnp.array(1.1), result=verdict("successful"),
         steps=jnp.array(9), method="maximum_likelihood",
         tried=evidence(
-            [Candidate(4, 9e3, 10, 3000, 90.0, False), Candidate(5, 3e3, 12, 3000, 4.0, True)]
+            [TriedOrder(4, 9e3, 10, 3000, 90.0, False), TriedOrder(5, 3e3, 12, 3000, 4.0, True)]
         ),
     )  # fmt: skip
 

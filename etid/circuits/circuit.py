@@ -25,7 +25,7 @@ from etid.circuits.elements import (
     cole,
     resistor,
 )
-from etid.circuits.impedance import AbstractImpedance, parallel, series
+from etid.circuits.impedance import AbstractImpedance, Quantity, parallel, series
 from etid.circuits.overview import Overview, Overviewed, element_rows
 from etid.signals.transfer import frequency_variable
 
@@ -129,6 +129,10 @@ class AbstractCircuit(Overviewed, eqx.Module):
         """Whether the impedance is a ratio of polynomials in s."""
         return self.impedance().is_rational
 
+    def exponents(self) -> tuple[Quantity, ...]:
+        """Exponents α of the powers of s in the impedance; empty for a ratio of polynomials."""
+        return self.impedance().exponents()
+
     def is_too_steep(self, cov: Float[Array, "parameter parameter"]) -> Bool[Array, ""]:
         """Whether an exponent α exceeds 1 by more than `ABOVE_ONE` standard errors.
 
@@ -139,10 +143,10 @@ class AbstractCircuit(Overviewed, eqx.Module):
         """
 
         def alphas(log_values: Float[Array, " parameter"]) -> Float[Array, " exponent"]:
-            found = self.with_log_values(log_values).impedance().exponents()
+            found = self.with_log_values(log_values).exponents()
             return jnp.stack([jnp.asarray(alpha) for alpha in found])
 
-        if not self.impedance().exponents():
+        if not self.exponents():
             return jnp.array(False)
         slope = jax.jacfwd(alphas)(self.log_values())
         error = jnp.sqrt(jnp.diagonal(slope @ cov @ slope.T))

@@ -20,23 +20,38 @@ FAR = (0.5, 1.5)
 START_STEPS = 8  # iterations of Steiglitz-McBride on harmonics; it converges in three to eight
 
 
-def has_simpler_estimate(circuit: AbstractCircuit) -> bool:
-    """Whether Steiglitz-McBride can estimate this circuit; its estimate is then one more start."""
-    return isinstance(circuit, SkinRC)
-
-
 def circuit_starts(
-    circuit: AbstractCircuit, baseline: AbstractCircuit | None
+    circuit: AbstractCircuit, estimate: SkinRC | None
 ) -> Float[Array, "start element"]:
-    """Starts of the elements' logarithms: several impedance levels, and a simpler estimate."""
+    """Starts of the elements' logarithms: several impedance levels, and last a simpler estimate.
+
+    Other circuits than SkinRC get the resistance at low frequency and the time constant of the
+    estimate. From typical values alone, a noisy recording can lead to a capacitor of 0.
+
+    Args:
+        circuit: Structure and typical values.
+        estimate: Skin of one relaxation, as Steiglitz-McBride estimates it.
+    """
     typical = circuit.log_values()
-    power, _ = circuit.scaling()
-    starts = [typical + float(np.log(level)) * power for level in LEVELS]
-    if baseline is not None:
-        values = baseline.values()
-        usable = jnp.all(values > 0) & jnp.isfinite(values).all()
-        starts.append(jnp.where(usable, jnp.log(jnp.where(usable, values, 1.0)), typical))
+    level, time = circuit.scaling()
+    starts = [typical + float(np.log(factor)) * level for factor in LEVELS]
+    if estimate is None:
+        return jnp.stack(starts)
+    if isinstance(circuit, SkinRC):
+        found = estimate.values()
+        usable = jnp.all(found > 0) & jnp.isfinite(found).all()
+        starts.append(jnp.where(usable, jnp.log(jnp.where(usable, found, 1.0)), typical))
+    else:
+        usual, factors = _scales(SkinRC()), _scales(estimate)
+        usable = jnp.all(factors > 0) & jnp.isfinite(factors).all()
+        larger, slower = jnp.log(jnp.where(usable, factors / usual, 1.0))
+        starts.append(typical + larger * level + slower * time)
     return jnp.stack(starts)
+
+
+def _scales(skin: SkinRC) -> Float[Array, "2"]:
+    """Resistance at low frequency [Ω] and time constant [s]."""
+    return jnp.stack([skin.r_s + skin.r_p, skin.r_p * skin.c_p])
 
 
 def harmonic_starts(
@@ -53,12 +68,9 @@ def harmonic_starts(
         z_th: Source impedance at its harmonics [Ω].
         circuit: Structure and typical values.
     """
-    if not has_simpler_estimate(circuit):
-        starts = circuit_starts(circuit, None)
-        return LoadUnknowns(starts, jnp.zeros(starts.shape[0]))
-    baseline = iteration.fit_skin(spectrum, z_th, sample_rate, START_STEPS)
-    starts = circuit_starts(circuit, baseline.circuit)
-    return LoadUnknowns(starts, jnp.zeros(starts.shape[0]).at[-1].set(baseline.delay_samples))
+    estimate = iteration.fit_skin(spectrum, z_th, sample_rate, START_STEPS)
+    starts = circuit_starts(circuit, estimate.circuit)
+    return LoadUnknowns(starts, jnp.zeros(starts.shape[0]).at[-1].set(estimate.delay_samples))
 
 
 def source_starts(

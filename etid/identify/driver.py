@@ -25,7 +25,7 @@ from etid.results.driver import ContinuousDriver, Driver, HarmonicDriver
 from etid.results.fits import IdentificationError
 from etid.results.tried_orders import AUTO, Order
 from etid.results.verdicts import message, verdict
-from etid.selection.driver_order import Candidate, best, evidence, next_order
+from etid.selection.driver_order import TriedOrder, best, evidence, next_order
 from etid.signals import mains
 from etid.signals.harmonics import Spectrum
 
@@ -141,18 +141,18 @@ def _of_least_order(seen: Sequence[Inspected], estimator: AbstractEstimator) -> 
             "number of poles, as in order=5, or record several whole pulse periods"
         )
     drivers: dict[int, HarmonicDriver] = {}
-    tried: list[Candidate] = []
+    tried: list[TriedOrder] = []
     while (order := next_order(tried)) is not None:
         drivers[order] = serving(_driver(seen, order, estimator), HarmonicDriver, str(estimator))
-        tried.append(_candidate(drivers[order]))
+        tried.append(_tried_order(drivers[order]))
     return dataclasses.replace(drivers[best(tried).order], tried=evidence(tried))
 
 
-def _candidate(driver: HarmonicDriver) -> Candidate:
+def _tried_order(driver: HarmonicDriver) -> TriedOrder:
     """The evidence for the order of a driver."""
     unknowns = driver.cov.shape[0] + driver.calibration.r_load.size
     terms = 2 * int(np.sum(np.asarray(driver.spectra.selected)))
-    return Candidate(
+    return TriedOrder(
         order=driver.order,
         squares=float(driver.chi2) * (terms - unknowns),
         unknowns=unknowns,

@@ -9,12 +9,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from etid.circuits.circuit import AbstractCircuit
 from etid.circuits.display import quantity
 from etid.estimators.estimate import MAX_STEPS
 from etid.estimators.estimator import Description
 from etid.estimators.registry import MAXIMUM_LIKELIHOOD, OUTPUT_ERROR, described
-from etid.estimators.starts import has_simpler_estimate
 from etid.report import citations
 from etid.report.html import Section, Table
 from etid.results.driver import ContinuousDriver
@@ -22,6 +20,12 @@ from etid.results.fits import AND, joined
 from etid.results.provenance import Settings
 from etid.results.study_fits import StudyFits
 from etid.selection.common import LIMIT
+
+REFINED = (
+    "Minima were found by Levenberg-Marquardt, composed of the parts of optimistix (Rader et al., "
+    f"2024), in at most {MAX_STEPS} steps, from several starts around the typical elements and, "
+    "for Z_th and the load alike, from the estimate of Steiglitz and McBride (1965)."
+)
 
 
 def methods_section(found: StudyFits) -> Section:
@@ -144,20 +148,9 @@ def _estimator(found: StudyFits, used: Sequence[Description]) -> str:
         text += "Both occurred. " if method == automatic else f"Here it was {words(method)}. "
     parts = [one.text for one in used]
     if any(one.refined for one in used):
-        parts.append(_refined(found.fits.circuit))
+        parts.append(REFINED)
     parts += dict.fromkeys(one.noise for one in used)
     return text + " ".join(parts)
-
-
-def _refined(circuit: AbstractCircuit) -> str:
-    at = "around the typical elements and, for Z_th"
-    if has_simpler_estimate(circuit):
-        at += " and the load alike"
-    return (
-        "Minima were found by Levenberg-Marquardt, composed of the parts of optimistix (Rader et "
-        f"al., 2024), in at most {MAX_STEPS} steps, from several starts {at}, from "
-        "the estimate of Steiglitz and McBride (1965)."
-    )
 
 
 def _errors(used: Sequence[Description], settings: Settings | None) -> str:

@@ -23,7 +23,7 @@ PER_POLE = 2  # unknowns of one more pole: its rate and its gain
 
 
 @dataclasses.dataclass(frozen=True)
-class Candidate:
+class TriedOrder:
     """A fitted order.
 
     Attributes:
@@ -54,23 +54,23 @@ class Candidate:
         return not self.missing_pole <= PER_POLE * math.log(self.terms)
 
 
-def best(tried: Sequence[Candidate]) -> Candidate:
-    """The adequate candidate with the smallest BIC; if none is adequate, the smallest BIC of all.
+def best(tried: Sequence[TriedOrder]) -> TriedOrder:
+    """The adequate order with the smallest BIC; if none is adequate, the smallest BIC of all.
 
     Args:
-        tried: At least one candidate, the lowest order first.
+        tried: At least one order, the lowest first.
     """
     adequate = [one for one in tried if one.adequate]
     return min(adequate or tried, key=lambda one: one.bic)
 
 
-def next_order(tried: Sequence[Candidate]) -> int | None:
+def next_order(tried: Sequence[TriedOrder]) -> int | None:
     """The next order to fit; None if the search is over.
 
     A section has two poles. The search therefore ends only after two more poles without a gain.
 
     Args:
-        tried: The candidates so far, the lowest order first.
+        tried: The orders so far, the lowest first.
     """
     if not tried:
         return LEAST
@@ -82,8 +82,8 @@ def next_order(tried: Sequence[Candidate]) -> int | None:
     return last.order + 1
 
 
-def evidence(tried: Sequence[Candidate]) -> TriedOrders:
-    """The evidence for all candidates, as a driver keeps it."""
+def evidence(tried: Sequence[TriedOrder]) -> TriedOrders:
+    """The evidence for all orders, as a driver keeps it."""
     found = TriedOrders.none()
     bic, missing_pole, adequate = map(np.array, (found.bic, found.missing_pole, found.adequate))
     for one in tried:

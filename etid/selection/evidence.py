@@ -42,8 +42,7 @@ def rank(fit: Fit) -> int:
     """
     name = fit.verdict
     if name == "successful":
-        exponents = [name for name, unit in fit.circuit.units().items() if unit == "1"]
-        return int(any(float(getattr(fit.circuit, of)) > 1 - NEARLY_ONE for of in exponents))
+        return int(any(float(alpha) > 1 - NEARLY_ONE for alpha in fit.circuit.exponents()))
     return 1 if name in _UNDETERMINED else 2
 
 

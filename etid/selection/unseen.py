@@ -39,7 +39,7 @@ def unseen(fit: Fit) -> Float[np.ndarray, "element element"]:
         fit: One fit.
     """
     size, support = elements(fit), fit.support
-    if support is None or "1" in fit.circuit.units().values():
+    if support is None or fit.circuit.exponents():
         return np.zeros((size, size))  # another shape of the spread that it has is no candidate
     sigma = float(support.spread_stderr)
     if not sigma > 0:

@@ -12,7 +12,7 @@ from etid.estimators.lanes import PaddedSamples
 from etid.estimators.output_error import fit, prediction
 from etid.estimators.refined_driver import refined_driver
 from etid.estimators.score_tests import other_on_harmonics
-from etid.estimators.starts import circuit_starts, has_simpler_estimate
+from etid.estimators.starts import circuit_starts
 from etid.estimators.steiglitz_mcbride import iteration
 from etid.estimators.unknowns import LoadUnknowns
 from etid.results.driver import ContinuousDriver, Driver, HarmonicDriver
@@ -61,11 +61,8 @@ class OutputError(AbstractEstimator):
         """Refine from the best of several starts."""
         del known
         m, samples = lane.measurement, jnp.asarray(lane.samples)
-        simpler = None
-        if has_simpler_estimate(circuit):
-            z_th = Rational(driver.b, driver.a)
-            discrete = iteration.skin_filter(m.v_th, m.v_out, z_th).filter
-            simpler = iteration.skin_elements(discrete, m.sample_rate)
+        discrete = iteration.skin_filter(m.v_th, m.v_out, Rational(driver.b, driver.a)).filter
+        simpler = iteration.skin_elements(discrete, m.sample_rate)
         starts = circuit.with_log_values(circuit_starts(circuit, simpler))
         fitted, estimate, other = fit.fit_circuit(
             prediction.prepare(m, samples=samples), driver, starts
