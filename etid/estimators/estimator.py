@@ -16,6 +16,7 @@ from etid.circuits.circuit import AbstractCircuit, SkinRC
 from etid.estimators import judgement
 from etid.estimators.lanes import AbstractLane
 from etid.results.driver import ContinuousDriver, Driver
+from etid.results.feed import AbstractFeed, MeasuredCurrent
 from etid.results.fits import Fit
 from etid.signals.harmonics import Spectrum
 from etid.signals.noise import Measurement
@@ -47,7 +48,7 @@ HARMONICS = (
 )
 
 
-def serving(driver: Driver, kind: type[_Kind], method: str) -> _Kind:
+def serving(driver: AbstractFeed, kind: type[_Kind], method: str) -> _Kind:
     """The driver, with the type that `method` needs.
 
     Raises:
@@ -55,6 +56,11 @@ def serving(driver: Driver, kind: type[_Kind], method: str) -> _Kind:
     """
     if isinstance(driver, kind):
         return driver
+    if not isinstance(driver, Driver):
+        raise ValueError(
+            f"method {method!r} identifies loads of an identified driver only, not from a measured "
+            "current; use method='maximum_likelihood' or 'output_error'"
+        )
     if not isinstance(driver, ContinuousDriver):
         raise ValueError(
             f"this driver was identified by {driver.method}, which gives no continuous source "
@@ -104,6 +110,7 @@ class AbstractEstimator(abc.ABC):
             periods.
         driver: The type of driver that the estimator needs. A discrete driver must have the sample
             rate of the recording.
+        current: Whether the estimator identifies loads from a measured current, without a driver.
         any_circuit: Whether the estimator identifies circuits other than `SkinRC`.
         chooses: Whether its fits have a `support`, by which circuits can be compared.
     """
@@ -111,6 +118,7 @@ class AbstractEstimator(abc.ABC):
     name: ClassVar[str]
     lane: ClassVar[type[AbstractLane]]
     driver: ClassVar[type[Driver]]
+    current: ClassVar[bool] = False
     any_circuit: ClassVar[bool] = True
     chooses: ClassVar[bool] = False
 
@@ -166,21 +174,23 @@ class AbstractEstimator(abc.ABC):
                 "use method='maximum_likelihood'"
             )
 
-    def check_driver(self, driver: Driver, sample_rate: float, pulse_rate: float) -> None:
+    def check_driver(self, driver: AbstractFeed, sample_rate: float, pulse_rate: float) -> None:
         """Raise ValueError unless this estimator can use the driver for a recording.
 
         Args:
-            driver: The driver.
+            driver: The driver, or the measured current.
             sample_rate: Sampling rate of the recording [Hz].
             pulse_rate: Pulse rate of the recording [Hz].
         """
         del pulse_rate
-        serving(driver, self.driver, str(self))
+        if self.current and isinstance(driver, MeasuredCurrent):
+            return
+        found = serving(driver, self.driver, str(self))
         discrete = not issubclass(self.driver, ContinuousDriver)
-        if discrete and not np.isclose(float(driver.sample_rate), sample_rate):
+        if discrete and not np.isclose(float(found.sample_rate), sample_rate):
             raise ValueError(
                 f"{self} needs recording and calibration at the same sample rate; the recording "
-                f"has {sample_rate:g} Hz and the driver {float(driver.sample_rate):g} Hz; "
+                f"has {sample_rate:g} Hz and the driver {float(found.sample_rate):g} Hz; "
                 "use method='output_error'"
             )
 

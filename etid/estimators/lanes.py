@@ -19,7 +19,7 @@ from jaxtyping import Array, Bool, Complex, Float, Int
 
 from etid.circuits.circuit import AbstractCircuit
 from etid.recordings.preflight import Inspected
-from etid.results.driver import Driver
+from etid.results.feed import AbstractFeed
 from etid.signals import mains
 from etid.signals.harmonics import ALIASED, Spectrum, filled, spectrum
 from etid.signals.noise import Measurement, measure, noise, rounding_variance
@@ -78,7 +78,7 @@ class AbstractLane(eqx.Module):
         del late
         return self
 
-    def late_by(self, circuit: AbstractCircuit, driver: Driver) -> int:
+    def late_by(self, circuit: AbstractCircuit, driver: AbstractFeed) -> int:
         """Whole samples by which `v_out` is later than this load predicts; 0 for small delays.
 
         A load smooths the edges, so its record seems later than it is. If the alignment is wrong by
@@ -160,7 +160,7 @@ class Harmonics(AbstractLane):
         turn = np.exp(2j * np.pi * late / self.sample_rate * self.frequency)
         return dataclasses.replace(self, y=self.y * turn)
 
-    def late_by(self, circuit: AbstractCircuit, driver: Driver) -> int:
+    def late_by(self, circuit: AbstractCircuit, driver: AbstractFeed) -> int:
         """Whole samples by which `v_out` is later than with this load; 0 if they are few."""
         gain = _gain(circuit, driver, self.frequency)
         variance = self.variance_y + np.abs(gain) ** 2 * self.variance_x
@@ -248,7 +248,7 @@ class PaddedSamples(AbstractLane):
             harmonics=self.harmonics and self.harmonics.realigned(late),
         )
 
-    def late_by(self, circuit: AbstractCircuit, driver: Driver) -> int:
+    def late_by(self, circuit: AbstractCircuit, driver: AbstractFeed) -> int:
         """Whole samples by which `v_out` is later than with this load; 0 if they are few."""
         rate = self.sample_rate
         frequency = np.fft.rfftfreq(self.v_th.size, 1 / rate)[1:]
@@ -302,12 +302,13 @@ class AlignedSamples(AbstractLane):
 
 
 def _gain(
-    circuit: AbstractCircuit, driver: Driver, frequency: Float[Array | np.ndarray, " frequency"]
+    circuit: AbstractCircuit,
+    driver: AbstractFeed,
+    frequency: Float[Array | np.ndarray, " frequency"],
 ) -> Complex[np.ndarray, " frequency"]:
-    """Z_L / (Z_L + Z_th) at these frequencies [Hz]."""
+    """V_out per input at these frequencies [Hz]."""
     at = jnp.asarray(frequency)
-    z = np.asarray(circuit.response(at))
-    return z / (z + np.asarray(driver.response(at)))
+    return np.asarray(driver.gain(circuit.response(at), at))
 
 
 def _whole(late: float) -> int:

@@ -17,6 +17,7 @@ from etid.recordings.preflight import Inspected, preflight
 from etid.recordings.recording import Recording, RecordingError
 from etid.recordings.study import Study
 from etid.results.driver import ContinuousDriver, Driver, HarmonicDriver
+from etid.results.feed import MEASURED_CURRENT, AbstractFeed, MeasuredCurrent
 from etid.results.tried_orders import AUTO, Order
 from etid.selection.search import CANDIDATES
 from etid.signals.harmonics import separates_aliases
@@ -224,6 +225,26 @@ def for_calibrations(
     return MAXIMUM_LIKELIHOOD if several else OUTPUT_ERROR
 
 
+def fed(recording: Recording, driver: Driver | None) -> tuple[Recording, AbstractFeed]:
+    """A recording and its feed: the driver, or without a driver the measured current.
+
+    With a driver the current is not used; without one `v_th` is not used.
+
+    Raises:
+        RecordingError: The recording lacks what its feed needs.
+    """
+    if driver is None:
+        return recording.without_v_th(), MEASURED_CURRENT
+    if recording.cause != driver.recorded:
+        raise RecordingError(
+            "was not recorded, and a driver needs it",
+            path=recording.path,
+            field=driver.recorded,
+            remedy="Leave the driver out: the load is then identified from the current",
+        )
+    return recording, driver
+
+
 def for_samples(driver: Driver, periods: tuple[int, int]) -> AbstractEstimator:
     """The default estimator of arrays with this number of whole periods and samples."""
     several = isinstance(driver, HarmonicDriver) and separates_aliases(*periods)
@@ -231,7 +252,7 @@ def for_samples(driver: Driver, periods: tuple[int, int]) -> AbstractEstimator:
 
 
 def plan(
-    asked: AbstractEstimator | None, seen: Inspected, driver: Driver
+    asked: AbstractEstimator | None, seen: Inspected, driver: AbstractFeed
 ) -> tuple[AbstractEstimator, str | None]:
     """The estimator of a load, and the verdict that excludes a fit; None if it can be fitted.
 
@@ -240,7 +261,7 @@ def plan(
     """
     name = preflight(seen, periodic=asked is not None and asked.lane.periodic)
     estimator = asked or OUTPUT_ERROR
-    if name is None and isinstance(driver, HarmonicDriver):
+    if name is None and isinstance(driver, HarmonicDriver | MeasuredCurrent):
         estimator = for_calibrations(asked, [seen])
     estimator.check_driver(driver, seen.recording.sample_rate, seen.recording.pulse_rate)
     return estimator, name

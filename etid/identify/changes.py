@@ -34,6 +34,7 @@ from etid.circuits.circuit import AbstractCircuit, Resistor
 from etid.identify.compiled import stored_jit
 from etid.recordings.repeats import ALIGNED, Repeats
 from etid.results.driver import Driver
+from etid.results.feed import AbstractFeed
 from etid.results.fits import Fit
 from etid.results.verdicts import verdict
 from etid.signals.transfer import frequency_variable, reciprocal
@@ -76,10 +77,9 @@ def unknown(*shape: int) -> Change:
 
 @stored_jit
 def log_slopes(
-    circuits: AbstractCircuit, driver: Driver, frequency: Float[Array, " band"]
+    circuits: AbstractCircuit, driver: AbstractFeed, frequency: Float[Array, " band"]
 ) -> Complex[Array, "lane element band"]:
     """∂ ln G/∂ ln q of the elements of circuits along a leading axis."""
-    z_th = driver.response(frequency)
     s = frequency_variable(frequency)
 
     def of(circuit: AbstractCircuit) -> Complex[Array, "element band"]:
@@ -90,7 +90,7 @@ def log_slopes(
 
         by_element = jax.vmap(lambda way: jax.jvp(z, (logs,), (way,))[1])(jnp.eye(logs.size))
         load = z(logs)
-        return by_element * (z_th * reciprocal(load * (load + z_th)))[None, :]
+        return by_element * (driver.sensitivity(load, frequency) * reciprocal(load))[None, :]
 
     return jax.vmap(of)(circuits)
 
@@ -258,7 +258,7 @@ def _uneven(of: Repeats, course: Float[np.ndarray, "course period"]) -> np.ndarr
     return np.where(seen, largest * np.ptp(course, axis=1)[worst], 0.0)
 
 
-def of_fits(fits: Fit, driver: Driver, repeats: Sequence[Repeats | None]) -> Change:
+def of_fits(fits: Fit, driver: AbstractFeed, repeats: Sequence[Repeats | None]) -> Change:
     """The change during the record of each fit.
 
     Args:
@@ -278,7 +278,10 @@ def of_fits(fits: Fit, driver: Driver, repeats: Sequence[Repeats | None]) -> Cha
 
 
 def _slopes(
-    circuits: AbstractCircuit, count: int, driver: Driver, frequency: Float[np.ndarray, " band"]
+    circuits: AbstractCircuit,
+    count: int,
+    driver: AbstractFeed,
+    frequency: Float[np.ndarray, " band"],
 ) -> Complex[np.ndarray, "lane element band"]:
     """`log_slopes` of circuits, one at a time or `LANES` at once: two compiled sizes suffice."""
     size = 1 if count == 1 else LANES

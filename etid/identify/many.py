@@ -31,6 +31,7 @@ from etid.identify.arguments import (
     check_default,
     drift_of,
     estimator_of,
+    fed,
     order_of,
     require,
 )
@@ -53,6 +54,7 @@ from etid.recordings.recording import Recording, RecordingError
 from etid.recordings.repeats import repeats
 from etid.recordings.study import Study
 from etid.results.driver import Driver
+from etid.results.feed import MEASURED_CURRENT, AbstractFeed
 from etid.results.fits import Fit, Fits, IdentificationError, described, joined
 from etid.results.provenance import Settings
 from etid.results.study_fits import StudyFits
@@ -70,7 +72,7 @@ SAMPLE = 200  # recordings that choose the circuit of a study; a second of work
 def _chunk(
     lanes: Any,
     count: Int[Array, ""],
-    driver: Driver,
+    driver: AbstractFeed,
     known: Any,
     circuit: AbstractCircuit,
     estimator: AbstractEstimator,
@@ -150,7 +152,7 @@ class _Queue:
 
     def __init__(
         self,
-        driver: Driver,
+        driver: AbstractFeed,
         known: Any,
         candidates: Sequence[AbstractCircuit],
         estimator: AbstractEstimator,
@@ -187,7 +189,7 @@ class _Queue:
 
 def _identify(
     count: int,
-    load: Callable[[int], tuple[Recording, Driver]],
+    load: Callable[[int], tuple[Recording, AbstractFeed]],
     candidates: Sequence[AbstractCircuit],
     asked: AbstractEstimator | None,
     progress: bool,
@@ -245,7 +247,7 @@ def _identify(
 
 def _of_one_circuit(
     count: int,
-    load: Callable[[int], tuple[Recording, Driver]],
+    load: Callable[[int], tuple[Recording, AbstractFeed]],
     candidates: Sequence[AbstractCircuit],
     asked: AbstractEstimator | None,
     progress: bool,
@@ -286,7 +288,7 @@ def _otherwise(
 @overload
 def identify_skins(
     recordings: Iterable[Recording] | Study,
-    driver: Driver,
+    driver: Driver | None = None,
     *,
     circuit: None = None,
     method: Method | None = None,
@@ -297,7 +299,7 @@ def identify_skins(
 @overload
 def identify_skins(
     recordings: Iterable[Recording] | Study,
-    driver: Driver,
+    driver: Driver | None = None,
     *,
     circuit: _Kind,
     method: Method | None = None,
@@ -308,7 +310,7 @@ def identify_skins(
 @overload
 def identify_skins(
     recordings: Iterable[Recording] | Study,
-    driver: Driver,
+    driver: Driver | None = None,
     *,
     circuit: Literal["auto"],
     method: Method | None = None,
@@ -318,7 +320,7 @@ def identify_skins(
 
 def identify_skins(
     recordings: Iterable[Recording] | Study,
-    driver: Driver,
+    driver: Driver | None = None,
     *,
     circuit: Circuit = None,
     method: Method | None = None,
@@ -329,7 +331,8 @@ def identify_skins(
     Args:
         recordings: Recordings, or a study of loaded recordings. Lengths and sample rates may
             differ.
-        driver: Identified driver.
+        driver: Identified driver. Without a driver the loads are identified from the currents that
+            the recordings measured.
         circuit: As in `identify_skin`. With `"auto"` all recordings get one circuit, chosen by
             their joint evidence. The note of a recording that deserves another circuit says which.
         method: As in `identify_skin`.
@@ -342,21 +345,25 @@ def identify_skins(
     Raises:
         ValueError: There is no recording, or the method cannot use this circuit.
     """
-    require("driver", driver, Driver)
+    if driver is not None:
+        require("driver", driver, Driver)
     candidates = candidates_of(circuit)
     asked = estimator_of(method, candidates)
     if isinstance(recordings, Study):
         study, paths = recordings, [*recordings, *recordings.problems]
         known = [_known(study, path) for path in paths]
 
-        def load(row: int) -> tuple[Recording, Driver]:
-            return study[paths[row]], driver
+        def load(row: int) -> tuple[Recording, AbstractFeed]:
+            return fed(study[paths[row]], driver)
     else:
         records = several("recordings", recordings)
+        if driver is None and not any("current" in record.samples for record in records):
+            for record in records[:1]:
+                record.without_v_th()  # raises an error, because there is no current
         known = [vars(record.metadata) for record in records]
 
-        def load(row: int) -> tuple[Recording, Driver]:
-            return records[row], driver
+        def load(row: int) -> tuple[Recording, AbstractFeed]:
+            return fed(records[row], driver)
 
     if not known:
         raise ValueError("there is no recording to identify")
@@ -448,10 +455,9 @@ def identify_part(
 
 def _loader(
     study: Study, paths: Sequence[str], drivers: "Drivers"
-) -> Callable[[int], tuple[Recording, Driver]]:
-    def load(row: int) -> tuple[Recording, Driver]:
-        recording = study[paths[row]]
-        return recording, drivers.found[drivers.of(recording)]
+) -> Callable[[int], tuple[Recording, AbstractFeed]]:
+    def load(row: int) -> tuple[Recording, AbstractFeed]:
+        return drivers.fed(study[paths[row]])
 
     return load
 
@@ -492,6 +498,18 @@ class Drivers:
         self.found: dict[tuple[str, ...], Driver] = {}
         self.failures: dict[tuple[str, ...], str] = {}
         self._one_at_a_time = threading.Lock()
+
+    def fed(self, recording: Recording) -> tuple[Recording, AbstractFeed]:
+        """A recording and its driver; or its measured current, if it has no calibration.
+
+        Raises:
+            RecordingError: As in `of`.
+            IdentificationError: As in `of`.
+        """
+        calibrated = recording.calibration or self.calibrations
+        if recording.cause == "current" or ("current" in recording.samples and not calibrated):
+            return recording.without_v_th(), MEASURED_CURRENT
+        return recording, self.found[self.of(recording)]
 
     def of(self, recording: Recording) -> tuple[str, ...]:
         """Paths of the calibrations of a recording; their driver is then in `found`.

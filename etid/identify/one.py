@@ -23,16 +23,18 @@ from etid.identify.arguments import (
     check_default,
     circuit_of,
     estimator_of,
+    fed,
     for_samples,
     plan,
     require,
 )
 from etid.identify.compiled import stored_jit
-from etid.recordings.preflight import Inspected, why_misaligned
+from etid.recordings.preflight import Inspected, why_implausible, why_misaligned
 from etid.recordings.recording import Recording
 from etid.recordings.remarks import Remark
 from etid.recordings.repeats import Repeats, repeats
 from etid.results.driver import Driver, HarmonicDriver
+from etid.results.feed import AbstractFeed
 from etid.results.fits import Fit, IdentificationError, Support
 from etid.results.verdicts import message, verdict, verdicts_of
 from etid.selection.evidence import best
@@ -40,6 +42,7 @@ from etid.selection.search import search
 from etid.selection.selection import Selection
 from etid.signals.harmonics import whole_periods
 
+EXPLAINED = ("rate_mismatch", "misaligned", "wrong_unit")  # verdicts with numbers in the message
 KEPT = 4  # drivers, for which `known_of` is kept
 _Kind = TypeVar("_Kind", bound=AbstractCircuit)
 _Found = TypeVar("_Found")
@@ -49,7 +52,7 @@ _Outcome = TypeVar("_Outcome", Fit, Driver)
 @overload
 def identify_skin(
     recording: Recording,
-    driver: Driver,
+    driver: Driver | None = None,
     *,
     circuit: None = None,
     method: Method | None = None,
@@ -60,7 +63,7 @@ def identify_skin(
 @overload
 def identify_skin(
     recording: Recording,
-    driver: Driver,
+    driver: Driver | None = None,
     *,
     circuit: _Kind,
     method: Method | None = None,
@@ -71,7 +74,7 @@ def identify_skin(
 @overload
 def identify_skin(
     recording: Recording,
-    driver: Driver,
+    driver: Driver | None = None,
     *,
     circuit: Literal["auto"],
     method: Method | None = None,
@@ -81,7 +84,7 @@ def identify_skin(
 
 def identify_skin(
     recording: Recording,
-    driver: Driver,
+    driver: Driver | None = None,
     *,
     circuit: Circuit = None,
     method: Method | None = None,
@@ -91,7 +94,8 @@ def identify_skin(
 
     Args:
         recording: Unloaded and loaded voltage.
-        driver: Identified driver.
+        driver: Identified driver. Without a driver the load is identified from the current that the
+            recording measured.
         circuit: Structure of the load and its typical values; `SkinRC` if not given. With
             `"auto"` it is the simplest circuit that the recording supports; `select_circuit` shows
             the choice.
@@ -116,7 +120,7 @@ def identify_skin(
 
 def candidate_fits(
     recording: Recording,
-    driver: Driver,
+    driver: Driver | None,
     candidates: Sequence[AbstractCircuit],
     method: Method | None,
 ) -> tuple[dict[int, Fit], int]:
@@ -126,22 +130,24 @@ def candidate_fits(
         ValueError: The method cannot use this driver or these circuits.
     """
     require("recording", recording, Recording)
-    require("driver", driver, Driver)
+    if driver is not None:
+        require("driver", driver, Driver)
     asked = estimator_of(method, candidates)
+    recording, feed = fed(recording, driver)
     seen = Inspected(recording)
-    estimator, name = plan(asked, seen, driver)
+    estimator, name = plan(asked, seen, feed)
     if name is not None:
         return {0: failed_fit(name, candidates[0], str(estimator))}, 0
     check_default(estimator, candidates)
     lane = estimator.lane.of(seen)
-    known = known_of(lane, driver, is_shared(seen, driver), estimator)
+    known = known_of(lane, feed, is_shared(seen, feed), estimator)
 
     def fit(lanes: Sequence[AbstractLane], circuit: AbstractCircuit) -> list[Fit]:
-        found = [skin(lane, driver, known, circuit, estimator) for lane in lanes]
+        found = [skin(lane, feed, known, circuit, estimator) for lane in lanes]
         return jax.device_get(found)
 
-    found = refined([lane], [seen], fit, driver, candidates)
-    [outcome] = chosen_fits(found, driver, [int(seen.remarks)], repeats([seen]))
+    found = refined([lane], [seen], fit, feed, candidates)
+    [outcome] = chosen_fits(found, feed, [int(seen.remarks)], repeats([seen]))
     return outcome
 
 
@@ -153,8 +159,9 @@ def successful(recording: Recording, fit: Fit) -> Fit:
     """
     if fit.verdict == "successful":
         return fit
-    mismatch = fit.verdict == "rate_mismatch"
-    why = explained(Inspected(recording), "rate_mismatch") if mismatch else note(fit)
+    why = note(fit)
+    if fit.verdict in EXPLAINED:
+        why = explained(Inspected(recording), fit.verdict)
     raise IdentificationError(f"recording {recording.path!r}: {fit.verdict}. {why}", fit)
 
 
@@ -219,7 +226,11 @@ def identify_samples(
 
 
 def skin_lane(
-    lane: Any, driver: Driver, known: Any, circuit: AbstractCircuit, estimator: AbstractEstimator
+    lane: Any,
+    driver: AbstractFeed,
+    known: Any,
+    circuit: AbstractCircuit,
+    estimator: AbstractEstimator,
 ) -> Fit:
     """The fit of one lane. The code is differentiable; the caller compiles and batches it."""
     return estimator.fit_load(lane, driver, known, circuit)
@@ -230,13 +241,18 @@ skin = stored_jit(skin_lane)
 
 @stored_jit
 def known_at(
-    frequency: Float[Array, " harmonic"], driver: Driver, shared: bool, estimator: AbstractEstimator
+    frequency: Float[Array, " harmonic"],
+    driver: AbstractFeed,
+    shared: bool,
+    estimator: AbstractEstimator,
 ) -> Any:
     """`AbstractEstimator.known`, compiled."""
     return estimator.known(driver, frequency, shared)
 
 
-def known_of(lane: AbstractLane, driver: Driver, shared: bool, estimator: AbstractEstimator) -> Any:
+def known_of(
+    lane: AbstractLane, driver: AbstractFeed, shared: bool, estimator: AbstractEstimator
+) -> Any:
     """What an estimator must know of a driver; valid for all lanes with equal harmonics.
 
     It is kept for the next recordings: it takes as long as half a fit. None for lanes without
@@ -250,7 +266,7 @@ def known_of(lane: AbstractLane, driver: Driver, shared: bool, estimator: Abstra
 class _Same:
     """A driver that equals only itself: its arrays cannot be hashed."""
 
-    def __init__(self, driver: Driver) -> None:
+    def __init__(self, driver: AbstractFeed) -> None:
         self.driver = driver
 
     def __hash__(self) -> int:
@@ -310,7 +326,7 @@ def refined(
     lanes: Sequence[AbstractLane],
     seen: Sequence[Inspected],
     fit: Callable[[Sequence[AbstractLane], AbstractCircuit], list[Fit]],
-    driver: Driver,
+    driver: AbstractFeed,
     candidates: Sequence[AbstractCircuit],
 ) -> list[dict[int, Fit]]:
     """`repeated` for single recordings with a known driver; each time the circuit is chosen anew.
@@ -378,7 +394,7 @@ def _chosen(fits: dict[int, Fit]) -> int:
 
 def chosen_fits(
     found: Sequence[dict[int, Fit]],
-    driver: Driver,
+    driver: AbstractFeed,
     remarks: Sequence[int],
     repeats: Sequence[Repeats | None],
 ) -> list[tuple[dict[int, Fit], int]]:
@@ -402,7 +418,7 @@ def chosen_fits(
 
 def concluded(
     fits: Sequence[Fit],
-    driver: Driver,
+    driver: AbstractFeed,
     remarks: Sequence[int],
     repeats: Sequence[Repeats | None],
 ) -> list[Fit]:
@@ -440,7 +456,7 @@ def checksum(seen: Inspected) -> int:
     return zlib.crc32(seen.v_th.tobytes())
 
 
-def is_shared(seen: Inspected, driver: Driver) -> bool:
+def is_shared(seen: Inspected, driver: AbstractFeed) -> bool:
     """Whether a recording and a calibration may share one unloaded record."""
     known = driver.unloaded if isinstance(driver, HarmonicDriver) else None
     return known is None or checksum(seen) in known
@@ -453,6 +469,8 @@ def explained(seen: Inspected, name: str) -> str:
         found = seen.train.mismatch
     elif name == "misaligned":
         found = why_misaligned(seen)
+    elif name == "wrong_unit":
+        found = why_implausible(seen)
     return f"{found} {message(name)}".strip()
 
 

@@ -8,7 +8,7 @@ from etid.identify.arguments import plan
 from etid.identify.one import explained
 from etid.recordings.preflight import Group, Inspected
 from etid.recordings.recording import Recording, RecordingError
-from etid.results.driver import Driver
+from etid.results.feed import AbstractFeed
 from etid.results.fits import IdentificationError
 from etid.results.verdicts import message
 
@@ -28,12 +28,12 @@ class Planned(NamedTuple):
     """A recording that can be fitted, with its driver and its estimator."""
 
     seen: Inspected
-    driver: Driver
+    driver: AbstractFeed
     estimator: AbstractEstimator
 
 
 def planned(
-    load: Callable[[int], tuple[Recording, Driver]],
+    load: Callable[[int], tuple[Recording, AbstractFeed]],
     rows: Iterable[int],
     asked: AbstractEstimator | None,
 ) -> Iterator[tuple[int, Planned | Refusal]]:
@@ -46,14 +46,14 @@ def planned(
         rows: Numbers of the recordings; the order of the results may differ.
         asked: The requested estimator; None for the default of each recording.
     """
-    loaded: dict[tuple[int, float, float], list[tuple[int, Recording, Driver]]] = {}
+    loaded: dict[tuple[int, str, float, float], list[tuple[int, Recording, AbstractFeed]]] = {}
     for row in rows:
         try:
             of, driver = load(row)
         except ERRORS as error:
             yield row, _refusal(error)
         else:
-            key = of.samples["v_th"].stored.size, of.sample_rate, of.pulse_rate
+            key = of.samples["v_out"].stored.size, of.cause, of.sample_rate, of.pulse_rate
             loaded.setdefault(key, []).append((row, of, driver))
     for alike in loaded.values():
         for first in range(0, len(alike), TOGETHER):
@@ -63,7 +63,9 @@ def planned(
                 yield row, _planned(Inspected(of, group, number), driver, asked)
 
 
-def _planned(seen: Inspected, driver: Driver, asked: AbstractEstimator | None) -> Planned | Refusal:
+def _planned(
+    seen: Inspected, driver: AbstractFeed, asked: AbstractEstimator | None
+) -> Planned | Refusal:
     try:
         estimator, name = plan(asked, seen, driver)
     except ERRORS as error:

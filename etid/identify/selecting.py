@@ -23,7 +23,7 @@ EQUAL = 1e-6  # relative difference of two impedances that are equal; a fit reac
 
 def select_circuit(
     recording: Recording,
-    driver: Driver,
+    driver: Driver | None = None,
     *,
     candidates: Sequence[AbstractCircuit] = CANDIDATES,
     method: Method | None = None,
@@ -40,7 +40,7 @@ def select_circuit(
 
     Args:
         recording: Unloaded and loaded voltage.
-        driver: Identified driver.
+        driver: As in `identify_skin`.
         candidates: Circuits to choose from, the most usual one first. If not given: `SkinRC`,
             `ParallelRC`, `Resistor`, `SkinCole`, `SkinLayers`.
         method: An estimator that computes a likelihood, `"maximum_likelihood"`; the default for

@@ -106,7 +106,8 @@ class _Row(AbstractSource):
 
     @property
     def unloaded(self) -> Hashable:
-        common = not self.block.headers["v_th"].stacked
+        unloaded = self.block.headers.get("v_th")
+        common = unloaded is not None and not unloaded.stacked
         return (id(self.block), None if common else self.row)
 
     def blocks(self, name: str) -> Iterator[np.ndarray]:
@@ -158,7 +159,8 @@ class Scan:
                             f"{count} of {record.stored.size} samples are not finite",
                             "Record again; a fit of this recording only gives a verdict",
                         )
-                train = find_pulses(recording.v_th, recording.sample_rate, recording.pulse_rate)
+                cause = recording.samples[recording.cause].values
+                train = find_pulses(cause, recording.sample_rate, recording.pulse_rate)
                 if train.mismatch:
                     remedy = "Correct sample_rate or pulse_rate"
                     self._report(path, "pulse_rate", train.mismatch.removesuffix("."), remedy)
@@ -257,7 +259,9 @@ class Scan:
             with self._reported(path, field.name):
                 if field.name in names:
                     headers[field.name] = self._header(group, field, path)
-                elif field.required == "always":
+                elif field.required in ("always", kind) or (
+                    field.name == "v_th" and "current" not in names
+                ):
                     self._missing(path, field)
         self._near_misses(names, schema.at("dataset"), path, "")
         for name in set(names) - set(SIGNALS):

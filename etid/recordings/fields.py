@@ -120,7 +120,9 @@ SIGNALS = {
             type="samples",
             shape="(time,) or (trial, time)",
             unit="volt",
-            description="Unloaded output voltage of the driver. If `v_out` is stacked, the shape "
+            required="calibration",
+            description="Unloaded output voltage of the driver. It may be missing in a recording "
+            "with `current`. If `v_out` is stacked, the shape "
             "`(time,)` means one unloaded record for all trials.",
             example=[0, -3, 812],
         ),
@@ -140,7 +142,7 @@ SIGNALS = {
             shape="the shape of v_out",
             unit="ampere",
             required="optional",
-            description="Measured current through the load.",
+            description="Measured current through the load. A recording without `v_th` needs it.",
             example=[0.0, 0.0, 0.0011],
         ),
     )

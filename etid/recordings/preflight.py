@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Bool, Complex, Float
 
-from etid.recordings.recording import Recording
+from etid.recordings.recording import Recording, Samples
 from etid.recordings.remarks import Remark
 from etid.signals.disturbances import Joint, disturbed, joint, of_source
 from etid.signals.filtering import TAPS
@@ -33,6 +33,11 @@ RAIL = 3  # equal extreme samples in a row; a noisy or sloping signal does not p
 JUMP = 8.0  # [converter steps] a clipped signal reaches and leaves its rail in larger jumps
 POWER = 1.01  # largest variance of v_out relative to v_th: a passive load takes power
 UNIT = 30.0  # ratio of v_out to v_th beyond which their units differ, not only their order
+# [A] peak-to-peak; stimulators of nerves and skin stay below 0.1 A in each direction
+STRONGEST = 0.25
+# [Ω] ratio of the spans of v_out and current; electrodes in saline have 100 Ω, patches of membrane
+# in a pipette have 10 GΩ
+LEAST, GREATEST = 1.0, 1e12
 EQUAL = 1e-3  # largest relative difference of the amplitudes if no load is connected
 SAME = 1.5  # largest variance of their difference then, relative to the noise
 LATE = 5e-3  # fraction of the signal that a delay of 0.1 sample may leave at the edges
@@ -44,7 +49,8 @@ class Group:
     """Recordings of equal length and equal rates, inspected together to save time.
 
     Each property has one entry for each recording and is computed once, when it is used. An axis of
-    length 2 holds `v_th` and `v_out`.
+    length 2 holds `v_th` and `v_out`. In recordings of a measured current, the current is in the
+    place of `v_th`, here and below, and its unit is the ampere.
 
     Args:
         recordings: The recordings.
@@ -59,15 +65,14 @@ class Group:
     @functools.cached_property
     def whole(self) -> Float[np.ndarray, "recording 2 time"]:
         """Voltages of all periods as they were recorded [V]."""
-        whole = np.stack([np.stack([one.v_th, one.v_out]) for one in self.recordings])
+        whole = np.stack([np.stack([v.values for v in _records(one)]) for one in self.recordings])
         whole.flags.writeable = False
         return whole
 
     @functools.cached_property
     def step(self) -> Float[np.ndarray, "recording 2"]:
         """Converter steps [V]; 0 if unknown."""
-        samples = [(one.samples["v_th"], one.samples["v_out"]) for one in self.recordings]
-        return np.array([[one.resolution or 0.0 for one in both] for both in samples])
+        return np.array([[v.resolution or 0.0 for v in _records(one)] for one in self.recordings])
 
     @functools.cached_property
     def noise(self) -> Float[np.ndarray, "recording 2"]:
@@ -164,6 +169,11 @@ class Group:
         return self._coefficients[periods, samples]
 
 
+def _records(recording: Recording) -> tuple[Samples, Samples]:
+    """The cause of `v_out`, and `v_out`."""
+    return recording.samples[recording.cause], recording.samples["v_out"]
+
+
 def _limits(v: Float[np.ndarray, "*record time"]) -> Float[np.ndarray, "*record limit"]:
     return np.stack([v.min(-1), v.max(-1)], axis=-1)
 
@@ -217,6 +227,11 @@ class Inspected:
         self.recording = recording
         self._group = group or Group([recording])
         self._row = row
+
+    @property
+    def has_current(self) -> bool:
+        """Whether the load is identified from the measured current."""
+        return self.recording.cause == "current"
 
     @functools.cached_property
     def v_th(self) -> Float[np.ndarray, " time"]:
@@ -360,8 +375,12 @@ class Inspected:
 
     @functools.cached_property
     def lag(self) -> int:
-        """Lag of `v_out` in whole samples; `v_out` is shifted by it before a fit."""
-        return 0 if self.correlated is None else whole_lag(self.correlated)
+        """Lag of `v_out` in whole samples; `v_out` is shifted by it before a fit.
+
+        It is 0 for a measured current: one instrument records both, and the voltage at a capacitor
+        shows no edge where the current has one.
+        """
+        return 0 if self.has_current or self.correlated is None else whole_lag(self.correlated)
 
     @property
     def aligned(self) -> tuple[Float[np.ndarray, " overlap"], Float[np.ndarray, " overlap"]]:
@@ -421,7 +440,7 @@ class Inspected:
 def preflight(seen: Inspected, *, periodic: bool = False) -> str | None:
     """Name of the verdict that forbids a fit; None if a fit is allowed.
 
-    Verdicts: `too_short`, `nonfinite_samples`, `flat`, `saturated`, `unconnected`,
+    Verdicts: `too_short`, `nonfinite_samples`, `flat`, `saturated`, `wrong_unit`, `unconnected`,
     `rate_mismatch`, `misaligned`, `not_periodic`.
 
     Args:
@@ -440,19 +459,41 @@ def preflight(seen: Inspected, *, periodic: bool = False) -> str | None:
         return "saturated"
     if _is_saturated(seen.recorded_out, seen.step_out, of):
         return "saturated"
-    if _is_unconnected(seen):
+    if seen.has_current and not _is_plausible(seen):
+        return "wrong_unit"
+    if not seen.has_current and _is_unconnected(seen):
         return "unconnected"
     if seen.train.mismatch:
         return "rate_mismatch"
-    if seen.covariance[1, 1] > POWER * seen.covariance[0, 0] or seen.correlated is None:
+    if _is_misaligned(seen):
         return "misaligned"
     if periodic and not seen.is_periodic:
         return "not_periodic"
     return None
 
 
+def _is_plausible(seen: Inspected) -> bool:
+    """Whether current and impedance have sizes that a load at an electrode can have."""
+    current, voltage = seen.spans
+    return bool(current <= STRONGEST and LEAST <= voltage / current <= GREATEST)
+
+
+def why_implausible(seen: Inspected) -> str:
+    """The sizes that give the verdict `wrong_unit`."""
+    current, voltage = seen.spans
+    return f"v_out spans {voltage:.3g} V and current {current:.3g} A, {voltage / current:.3g} ohm."
+
+
+def _is_misaligned(seen: Inspected) -> bool:
+    if seen.has_current:  # a passive load takes power
+        return bool(seen.covariance[0, 1] <= 0)
+    return bool(seen.covariance[1, 1] > POWER * seen.covariance[0, 0] or seen.correlated is None)
+
+
 def why_misaligned(seen: Inspected) -> str:
     """The probable cause of the verdict `misaligned`, with numbers; empty if it is not known."""
+    if seen.has_current:
+        return "v_out falls where the current rises; change the sign of one of them."
     ratio = float(np.std(seen.v_out) / np.std(seen.v_th))
     if ratio > UNIT:
         return (

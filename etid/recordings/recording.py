@@ -1,16 +1,16 @@
 """Recordings of a stimulation experiment in memory.
 
-A recording is two voltages on one clock: `v_th`, the unloaded output of the driver, and `v_out`,
-its output with a load. Samples stay as the instrument stored them. Their SI values are
-`conversion * stored + offset`, as in a TimeSeries of NWB. So integer converter codes stay exact,
-and the size of a quantisation step is known.
+A recording is two records on one clock. One is `v_out`, the voltage at the load. The other is its
+cause: `v_th`, the unloaded output of the driver, or `current`, measured. Samples stay as the
+instrument stored them. Their SI values are `conversion * stored + offset`, as in a TimeSeries of
+NWB. So integer converter codes stay exact, and the size of a quantisation step is known.
 """
 
 import abc
 import dataclasses
 import functools
 import inspect
-from collections.abc import Hashable, Iterator, Mapping
+from collections.abc import Container, Hashable, Iterator, Mapping
 from types import MappingProxyType
 from typing import Any, NamedTuple, SupportsFloat, Unpack
 
@@ -20,7 +20,15 @@ from jaxtyping import Float
 
 from etid.circuits.overview import Overview, Overviewed
 from etid.recordings.errors import RecordingError as RecordingError
-from etid.recordings.fields import DECLARED, LABELS, AbstractFields, Given, Metadata, metadata_from
+from etid.recordings.fields import (
+    DECLARED,
+    LABELS,
+    SIGNALS,
+    AbstractFields,
+    Given,
+    Metadata,
+    metadata_from,
+)
 from etid.recordings.values import real
 
 SYMBOLS = {"hertz": "Hz", "ohm": "Ω", "volt": "V"}
@@ -87,12 +95,15 @@ class Samples:
 
 @dataclasses.dataclass(frozen=True, eq=False, repr=False, init=False)
 class Recording(Overviewed, AbstractFields):
-    """Unloaded and loaded output of a driver on one clock. It is immutable and equals only itself.
+    """Voltage at a load, and its cause, on one clock. It is immutable and equals only itself.
+
+    The cause is the unloaded output of a driver, or the measured current, or both are given.
 
     Args:
-        v_th: Unloaded output [V], real numbers or `Samples`.
+        v_th: Unloaded output [V], real numbers or `Samples`; not needed with `current`.
         v_out: Output with the load [V], real numbers or `Samples`.
-        current: Measured current through the load [A], optional.
+        current: Measured current through the load [A], real numbers or `Samples`; not needed with
+            `v_th`.
         **fields: All other fields, by name. `sample_rate` [Hz] and `pulse_rate` [Hz] are required.
             Optional are `path`; `r_load` [ohm], which makes the recording a calibration; the labels
             `subject`, `condition`, `electrode` and `trial`; `calibration`, the paths of its
@@ -108,16 +119,16 @@ class Recording(Overviewed, AbstractFields):
 
     def __init__(
         self,
-        v_th: npt.ArrayLike | Samples,
-        v_out: npt.ArrayLike | Samples,
+        v_th: npt.ArrayLike | Samples | None = None,
+        v_out: npt.ArrayLike | Samples | None = None,
         *,
         current: npt.ArrayLike | Samples | None = None,
         **fields: Unpack[Given],
     ) -> None:
         try:
-            samples = {"v_th": _samples("v_th", v_th), "v_out": _samples("v_out", v_out)}
-            if current is not None:
-                samples["current"] = _samples("current", current)
+            given = {"v_th": v_th, "v_out": v_out, "current": current}
+            samples = {name: _samples(name, one) for name, one in given.items() if one is not None}
+            _check_signals(samples, is_calibration=fields.get("r_load") is not None)
             lengths = {name: record.stored.size for name, record in samples.items()}
             if len(set(lengths.values())) > 1:
                 found = ", ".join(f"{name} {length}" for name, length in lengths.items())
@@ -135,8 +146,24 @@ class Recording(Overviewed, AbstractFields):
 
     @property
     def v_th(self) -> Float[np.ndarray, " time"]:
-        """Unloaded output [V]."""
+        """Unloaded output [V].
+
+        Raises:
+            RecordingError: It was not recorded.
+        """
+        if "v_th" not in self.samples:
+            raise RecordingError(
+                "was not recorded",
+                path=self.path,
+                field="v_th",
+                remedy="Use `current`, which this recording has",
+            )
         return self.samples["v_th"].values
+
+    @property
+    def cause(self) -> str:
+        """Name of the record that causes `v_out`: `v_th` if it was recorded, else `current`."""
+        return "v_th" if "v_th" in self.samples else "current"
 
     @property
     def v_out(self) -> Float[np.ndarray, " time"]:
@@ -180,6 +207,21 @@ class Recording(Overviewed, AbstractFields):
         arguments: dict[str, Any] = {**self.samples, **vars(self.metadata), **changes}
         return Recording(**arguments)
 
+    def without_v_th(self) -> "Recording":
+        """The same with the current as the cause of `v_out`.
+
+        Raises:
+            RecordingError: The current was not recorded.
+        """
+        if "current" not in self.samples:
+            raise RecordingError(
+                "was not recorded",
+                path=self.path,
+                field="current",
+                remedy="Pass the driver of this recording, from etid.identify_driver",
+            )
+        return self if "v_th" not in self.samples else self.replace(v_th=None)
+
     def __reduce__(self) -> tuple:
         # A read-only mapping cannot be pickled.
         return functools.partial(Recording, **self.samples, **vars(self.metadata)), ()
@@ -218,6 +260,18 @@ def _signature() -> inspect.Signature:
 
 # Notebooks and editors show this signature.
 setattr(Recording, "__signature__", _signature())  # noqa: B010  # pyright knows no such attribute
+
+
+def _check_signals(names: Container[str], *, is_calibration: bool) -> None:
+    """Raise RecordingError unless these records together are a recording."""
+    field, remedy = "v_out", ""
+    if "v_out" in names:
+        if "v_th" in names or ("current" in names and not is_calibration):
+            return
+        field, remedy = "v_th", "" if is_calibration else f"; or {SIGNALS['current'].expects}"
+    raise RecordingError(
+        "is not given", field=field, remedy=f"Add {SIGNALS[field].expects}{remedy}"
+    )
 
 
 def _samples(name: str, record: npt.ArrayLike | Samples) -> Samples:
@@ -268,7 +322,10 @@ class AbstractSource(abc.ABC):
     @property
     @abc.abstractmethod
     def unloaded(self) -> Hashable:
-        """Identity of `v_th`; it is equal for recordings that share one unloaded record."""
+        """Identity of `v_th`; it is equal for recordings that share one unloaded record.
+
+        A recording without `v_th` shares none, and its identity is its own.
+        """
 
     @abc.abstractmethod
     def blocks(self, name: str) -> Iterator[npt.NDArray]:

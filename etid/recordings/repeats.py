@@ -193,7 +193,7 @@ def _of_equal_periods(
     rest = unloaded.gain - amplitude[:, :, None] * unit[:, None, :]
     freedom = (2 * np.count_nonzero(weight, axis=1) - 1) * (periods - 1)
     noise = np.maximum(1.0, (weight[:, None, :] * _power(rest)).sum((1, 2)) / freedom)
-    width = [np.count_nonzero(np.abs(v) > np.abs(v).max() / 2) / periods for v, _ in records]
+    width = [_phase(v) / periods for v, _ in records]
     turn = np.exp(-2j * np.pi * own.late)
     turn -= turn.mean(1, keepdims=True)
     size = np.linalg.norm(turn, axis=1, keepdims=True)
@@ -202,6 +202,13 @@ def _of_equal_periods(
     rate, variance = np.asarray(of.sample_rate), noise / total + (CUT / np.square(width)) ** 2
     parts = own.gain, own.power, smooth, own.variance, turn, amplitude, variance
     return [Repeats(frequency, rate, *of_row) for of_row in zip(*parts, strict=True)]
+
+
+def _phase(v: Float[np.ndarray, " time"]) -> int:
+    """Number of samples in all pulses; of biphasic pulses, those in the shorter phase."""
+    half = np.abs(v).max() / 2
+    above, below = (int(np.count_nonzero(one > half)) for one in (v, -v))
+    return min(above, below) or max(above, below)
 
 
 def _smooth(mean: np.ndarray, known: Bands) -> np.ndarray:

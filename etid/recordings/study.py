@@ -35,7 +35,7 @@ class _InMemory(AbstractSource):
 
     @property
     def unloaded(self) -> Hashable:
-        return id(self.recording.samples["v_th"])
+        return id(self.recording.samples.get("v_th", self.recording))
 
     def blocks(self, name: str) -> Iterator[npt.NDArray]:
         yield self.recording.samples[name].stored

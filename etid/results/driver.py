@@ -11,6 +11,7 @@ poles passes from complex to real without a change of branch.
 
 import abc
 import dataclasses
+from typing import ClassVar
 
 import equinox as eqx
 import jax
@@ -22,8 +23,9 @@ from jaxtyping import Array, Complex, Float, Int
 from etid.circuits.display import plus_minus
 from etid.circuits.overview import Overview
 from etid.recordings.remarks import texts
+from etid.results.feed import AbstractFeed, CurrentSource
 from etid.results.tried_orders import TriedOrders
-from etid.results.verdicts import RESULTS, Judged, message
+from etid.results.verdicts import RESULTS, message
 from etid.signals.filtering import StateSpace
 from etid.signals.harmonics import Spectrum
 from etid.signals.transfer import (
@@ -116,6 +118,22 @@ class SourceImpedance(eqx.Module):
         C = C.at[j].set(self.gain_real)
         return StateSpace(A, B, C, jnp.exp(self.log_resistance)[None])
 
+    def connected(self, load: StateSpace) -> StateSpace:
+        """The system V_th → V_out with a load, from current [A] to voltage [V], at the terminal.
+
+        The current i = (V_th − C₁x₁ − C₂x₂) / (D₁ + D₂) drives both impedances. x₁ are the states
+        of the source, x₂ the states of the load.
+        """
+        z1, z2 = self.state_space(), load
+        total = z1.D[0] + z2.D[0]
+        drop = jnp.concatenate([z1.C, z2.C])
+        B = jnp.concatenate([z1.B, z2.B]) / total
+        n1, n2 = z1.C.shape[0], z2.C.shape[0]
+        A = jnp.block([[z1.A, jnp.zeros((n1, n2))], [jnp.zeros((n2, n1)), z2.A]])
+        share = z2.D[0] / total
+        C = jnp.concatenate([jnp.zeros(n1), z2.C]) - share * drop
+        return StateSpace(A - B * drop[None, :], B, C, share[None])
+
 
 def realise(impedance: Rational, rate: float | Float[Array, ""]) -> StateSpace:
     """State space of a load impedance, from current [A] to voltage [V].
@@ -140,26 +158,11 @@ def realise(impedance: Rational, rate: float | Float[Array, ""]) -> StateSpace:
     return StateSpace(rate * A, rate * B, num[:-1] - direct * den[:-1], direct[None])
 
 
-def loaded(source: SourceImpedance, load: Rational, rate: float | Float[Array, ""]) -> StateSpace:
-    """The system V_th → V_out with `load` at the terminal, in continuous time.
-
-    The current i = (V_th − C₁x₁ − C₂x₂) / (D₁ + D₂) drives both impedances. x₁ are the states of
-    the source, x₂ the states of the load.
-    """
-    return connected(source, realise(load, rate))
-
-
-def connected(source: SourceImpedance, z2: StateSpace) -> StateSpace:
-    """The same as `loaded`, with the state space of the load, from current [A] to voltage [V]."""
-    z1 = source.state_space()
-    total = z1.D[0] + z2.D[0]
-    drop = jnp.concatenate([z1.C, z2.C])
-    B = jnp.concatenate([z1.B, z2.B]) / total
-    n1, n2 = z1.C.shape[0], z2.C.shape[0]
-    A = jnp.block([[z1.A, jnp.zeros((n1, n2))], [jnp.zeros((n2, n1)), z2.A]]) - B * drop[None, :]
-    share = z2.D[0] / total
-    C = jnp.concatenate([jnp.zeros(n1), z2.C]) - share * drop
-    return StateSpace(A, B, C, share[None])
+def loaded(
+    source: SourceImpedance | CurrentSource, load: Rational, rate: float | Float[Array, ""]
+) -> StateSpace:
+    """The system input → V_out with `load` at the terminal, in continuous time."""
+    return source.connected(realise(load, rate))
 
 
 class Calibration(eqx.Module):
@@ -182,7 +185,7 @@ class Calibration(eqx.Module):
     mismatch: Float[Array, "2 record"] | None = None
 
 
-class Driver(Judged):
+class Driver(AbstractFeed):
     """An identified driver: the fields and methods that all kinds of drivers have.
 
     The kinds are `DiscreteDriver`, `ContinuousDriver` and `HarmonicDriver`. Only ratios to Z_th are
@@ -201,6 +204,7 @@ class Driver(Judged):
         remarks: Remarks on the calibrations, `etid.recordings.remarks.Remark` as an integer.
     """
 
+    recorded: ClassVar[str] = "v_th"
     _: dataclasses.KW_ONLY
     b: Float[Array, " b"]
     a: Float[Array, " a"]
@@ -216,6 +220,19 @@ class Driver(Judged):
     def order(self) -> int:
         """Number of poles."""
         return self.a.shape[0] - 1
+
+    def gain(
+        self, load: Complex[Array, "*lane frequency"], frequency: Float[Array, " frequency"]
+    ) -> Complex[Array, "*lane frequency"]:
+        """H = Z_L / (Z_L + Z_th)."""
+        return load * reciprocal(load + self.response(frequency))
+
+    def sensitivity(
+        self, load: Complex[Array, "*lane frequency"], frequency: Float[Array, " frequency"]
+    ) -> Complex[Array, "*lane frequency"]:
+        """∂ ln H / ∂ ln Z_L = Z_th / (Z_L + Z_th)."""
+        z_th = self.response(frequency)
+        return z_th * reciprocal(load + z_th)
 
     @abc.abstractmethod
     def response(self, frequency: Float[Array, "..."]) -> Complex[Array, "..."]:
@@ -320,6 +337,15 @@ class ContinuousDriver(Driver):
     def later_cov(self) -> Float[Array, "parameter parameter"]:
         """Covariance of the parameters of `source` at the time when a skin is recorded."""
         return self.cov if self.drift is None else self.cov + jnp.diag(self.drift_std() ** 2)
+
+    @property
+    def r_known(self) -> Float[Array, ""]:
+        """Resistor of the first calibration [Ω]."""
+        return self.calibration.r_load[0]
+
+    def late_std(self, sample_rate: Float[Array, ""]) -> Float[Array, ""]:
+        """Standard deviation of the delay of the calibrations [samples at this rate, in Hz]."""
+        return self.calibration.delay_std_samples * (sample_rate / self.sample_rate)
 
     def response(self, frequency: Float[Array, "..."]) -> Complex[Array, "..."]:
         """Source impedance Z_th [Ω] in continuous time at real frequencies [Hz]."""

@@ -67,6 +67,11 @@ class RESULTS(optx.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]  # equi
         "v_out have the same unit? If not, the impedance is too large. If the driver really is "
         "like this, set `plausible` [ohm]."
     )
+    wrong_unit = (
+        "The current, or v_out divided by it, has no size that a load at an electrode can have. Is "
+        "the current in ampere and not in mA, and v_out in volt? Are the two exchanged? Correct "
+        "the scale or the channel."
+    )
     unconnected = (
         "v_out equals v_th within the noise: no load draws a current, or both are the same record. "
         "Is the finger on the electrode, or in a calibration, is the resistor connected? Check the "

@@ -17,12 +17,12 @@ from etid.estimators.estimator import (
 from etid.estimators.judgement import STRAINED, judged, unless
 from etid.estimators.lanes import Harmonics
 from etid.estimators.maximum_likelihood import given_driver, load
-from etid.estimators.maximum_likelihood.given_driver import GivenDriver
+from etid.estimators.maximum_likelihood.given_driver import AbstractGiven, GivenCurrent
 from etid.estimators.refined_driver import refined_driver
 from etid.estimators.score_tests import missing_pole, other_circuit
 from etid.estimators.score_tests.unloaded import UnloadedShape, shape_of
-from etid.estimators.starts import harmonic_starts
 from etid.results.driver import Driver, HarmonicDriver
+from etid.results.feed import MeasuredCurrent
 from etid.results.fits import Fit
 from etid.results.verdicts import RESULTS
 from etid.signals.harmonics import Spectrum
@@ -69,6 +69,7 @@ class MaximumLikelihood(AbstractEstimator):
     name = "maximum_likelihood"
     lane = Harmonics
     driver = HarmonicDriver
+    current = True
     chooses = True
 
     def fit_driver(
@@ -82,18 +83,26 @@ class MaximumLikelihood(AbstractEstimator):
         return refined_driver(records, r_load, order, spectra, str(self))
 
     def known(
-        self, driver: HarmonicDriver, frequency: Float[Array, " harmonic"], shared: bool
-    ) -> GivenDriver:
-        """The distribution of Z_th at the harmonics, given the calibrations."""
+        self,
+        driver: HarmonicDriver | MeasuredCurrent,
+        frequency: Float[Array, " harmonic"],
+        shared: bool,
+    ) -> AbstractGiven:
+        """The distribution of Z_th at the harmonics, given the calibrations; or the current."""
+        if isinstance(driver, MeasuredCurrent):
+            return GivenCurrent.at(frequency)
         return given_driver.given(driver, frequency, shared)
 
     def fit_load(
-        self, lane: Harmonics, driver: HarmonicDriver, known: GivenDriver, circuit: AbstractCircuit
+        self,
+        lane: Harmonics,
+        driver: HarmonicDriver | MeasuredCurrent,
+        known: AbstractGiven,
+        circuit: AbstractCircuit,
     ) -> Fit:
         """Refine from the best of several starts, jointly with the uncertain part of the driver."""
         spectrum, rate = lane.spectrum, jnp.asarray(lane.sample_rate)
-        z_th = known.z_th(jnp.zeros_like(known.loaded))
-        starts = harmonic_starts(spectrum, rate, z_th, circuit)
+        starts = known.starts(spectrum, rate, circuit)
         estimate, far, other = load.fit_circuit(known, circuit, spectrum, rate, starts)
         fit = judged(estimate, circuit, driver.result, str(self))
         if known.shape is not None:

@@ -20,6 +20,7 @@ they are not equal. They may differ by a standard error along the direction that
 does not determine.
 """
 
+import abc
 import dataclasses
 from typing import NamedTuple
 
@@ -28,6 +29,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Complex, Float
 
+from etid.circuits.circuit import AbstractCircuit
 from etid.estimators.estimate import DELAY_WIDTH
 from etid.estimators.maximum_likelihood.driver import Calibrations
 from etid.estimators.maximum_likelihood.terms import (
@@ -35,6 +37,8 @@ from etid.estimators.maximum_likelihood.terms import (
     informed,
 )
 from etid.estimators.score_tests.unloaded import UnloadedShape, shape_of
+from etid.estimators.starts import current_starts, harmonic_starts
+from etid.estimators.unknowns import LoadUnknowns
 from etid.results.driver import HarmonicDriver
 from etid.signals.harmonics import Spectrum
 from etid.signals.transfer import as_complex, reciprocal
@@ -53,7 +57,93 @@ class UnloadedSlopes(NamedTuple):
     log_variance: Float[Array, "z harmonic"]
 
 
-class GivenDriver(eqx.Module):
+class AbstractGiven(eqx.Module):
+    """What is given of the feed of the loads: the gain to V_out, and the distribution of z.
+
+    Attributes:
+        frequency: The harmonics [Hz].
+        w_slope: ∂W₀/∂ log f.
+        slope: ∂W/∂z.
+        mean: z₀.
+        cov: Covariance of z.
+        shape: Unloaded voltage of the first calibration; None if it cannot be compared.
+        delay_width: Prior standard deviation of the trigger delay of a load [samples].
+    """
+
+    frequency: eqx.AbstractVar[Float[Array, " harmonic"]]
+    w_slope: eqx.AbstractVar[Complex[Array, " harmonic"]]
+    slope: eqx.AbstractVar[Complex[Array, "z harmonic"]]
+    mean: eqx.AbstractVar[Float[Array, " z"]]
+    cov: eqx.AbstractVar[Float[Array, "z z"]]
+    shape: eqx.AbstractVar[UnloadedShape | None]
+    delay_width: eqx.AbstractVar[Float[Array, ""]]
+
+    @abc.abstractmethod
+    def gain(
+        self, load: Complex[Array, " harmonic"], w: Complex[Array, " harmonic"]
+    ) -> Complex[Array, " harmonic"]:
+        """V_out per input at W₀ + w."""
+
+    @abc.abstractmethod
+    def informed(self, spectrum: Spectrum) -> tuple[Spectrum, UnloadedSlopes | None]:
+        """A recording with X estimated by the calibrations at z = 0, and derivatives of X."""
+
+    @abc.abstractmethod
+    def starts(
+        self, spectrum: Spectrum, sample_rate: Float[Array, ""], circuit: AbstractCircuit
+    ) -> LoadUnknowns:
+        """Starts of the fit of a recording, stacked; the likeliest is the last."""
+
+
+class GivenCurrent(AbstractGiven):
+    """A measured current: the gain is Z_L, and there is no z."""
+
+    frequency: Float[Array, " harmonic"]
+    w_slope: Complex[Array, " harmonic"]
+    slope: Complex[Array, "0 harmonic"]
+    mean: Float[Array, "0"]
+    cov: Float[Array, "0 0"]
+    delay_width: Float[Array, ""]
+    shape: UnloadedShape | None = None
+
+    @classmethod
+    def at(cls, frequency: Float[Array, " harmonic"]) -> "GivenCurrent":
+        """The measured current of loads with these harmonics [Hz]."""
+        slope = jnp.zeros((0, frequency.size), complex)
+        nothing = jnp.zeros_like(frequency, dtype=complex)
+        none, width = jnp.zeros(0), jnp.array(DELAY_WIDTH)
+        return cls(
+            frequency=frequency,
+            w_slope=nothing,
+            slope=slope,
+            mean=none,
+            cov=jnp.zeros((0, 0)),
+            delay_width=width,
+        )
+
+    def gain(
+        self, load: Complex[Array, " harmonic"], w: Complex[Array, " harmonic"]
+    ) -> Complex[Array, " harmonic"]:
+        """Z_L."""
+        del w
+        return load
+
+    def informed(self, spectrum: Spectrum) -> tuple[Spectrum, None]:
+        """The recording itself."""
+        return spectrum, None
+
+    def starts(
+        self, spectrum: Spectrum, sample_rate: Float[Array, ""], circuit: AbstractCircuit
+    ) -> LoadUnknowns:
+        """Starts at the impedance level of the records; the likeliest has the best time scale."""
+        del sample_rate
+        x, y = (jnp.where(spectrum.selected, one, 0) for one in (spectrum.x, spectrum.y))
+        variances = spectrum.variance_x, spectrum.variance_y
+        starts = current_starts(spectrum.frequency, (x, y), variances, circuit)
+        return LoadUnknowns(starts, jnp.zeros(starts.shape[0]))
+
+
+class GivenDriver(AbstractGiven):
     """The distribution of Z_th at the harmonics of the loads, given the calibrations.
 
     Attributes:
@@ -93,6 +183,19 @@ class GivenDriver(eqx.Module):
         return self.loaded * (square + half) * reciprocal(square - half) - as_complex(
             self.resistance
         )
+
+    def gain(
+        self, load: Complex[Array, " harmonic"], w: Complex[Array, " harmonic"]
+    ) -> Complex[Array, " harmonic"]:
+        """Z_L / (Z_L + Z_th) at W₀ + w."""
+        return load * reciprocal(load + self.z_th(w))
+
+    def starts(
+        self, spectrum: Spectrum, sample_rate: Float[Array, ""], circuit: AbstractCircuit
+    ) -> LoadUnknowns:
+        """Starts at several impedance levels, and a simpler estimate."""
+        z_th = self.z_th(jnp.zeros_like(self.loaded))
+        return harmonic_starts(spectrum, sample_rate, z_th, circuit)
 
     def informed(self, spectrum: Spectrum) -> tuple[Spectrum, UnloadedSlopes | None]:
         """A recording with X estimated by the calibrations at z = 0, and derivatives of X."""
@@ -167,16 +270,16 @@ def around(
         slopes = calibrations.gain_slopes(c, gains, calibrations.by_z(c, gains))
         known = jnp.stack([combined(directions.T, of) for of in slopes], axis=1)
     return GivenDriver(
-        frequency,
-        loaded,
-        by_frequency * reciprocal(loaded),
-        combined(directions[: by_source.shape[0]].T, by_source),
-        resistance,
-        mean,
-        cov,
-        calibrations.spectra if shared else None,
-        jnp.stack(gains) if shared else None,
-        known,
+        frequency=frequency,
+        loaded=loaded,
+        w_slope=by_frequency * reciprocal(loaded),
+        slope=combined(directions[: by_source.shape[0]].T, by_source),
+        resistance=resistance,
+        mean=mean,
+        cov=cov,
+        records=calibrations.spectra if shared else None,
+        gains=jnp.stack(gains) if shared else None,
+        gain_slopes=known,
         delay_width=calibrations.delay_width,
     )
 

@@ -18,7 +18,11 @@ from jaxtyping import Array, Bool, Complex, Float, Inexact
 
 from etid.circuits.circuit import AbstractCircuit
 from etid.estimators.estimate import MAX_STEPS, SOLVER, Estimate
-from etid.estimators.maximum_likelihood.given_driver import GivenDriver, UnloadedSlopes, combined
+from etid.estimators.maximum_likelihood.given_driver import (
+    AbstractGiven,
+    UnloadedSlopes,
+    combined,
+)
 from etid.estimators.maximum_likelihood.terms import (
     apart,
     denoised,
@@ -33,7 +37,7 @@ from etid.estimators.score_tests import other_circuit
 from etid.estimators.unknowns import LoadUnknowns
 from etid.results.fits import Support, complex_rrse
 from etid.signals.harmonics import Spectrum
-from etid.signals.transfer import as_complex, frequency_variable, reciprocal, turns
+from etid.signals.transfer import as_complex, frequency_variable, turns
 from etid.solvers.levenberg_marquardt import LevenbergMarquardt, NormalEquations, best_start
 
 
@@ -67,7 +71,7 @@ class Load(eqx.Module):
     The parameters `q` of the solver are those of `LoadUnknowns`, followed by z unless z = z₀.
     """
 
-    driver: GivenDriver
+    driver: AbstractGiven
     circuit: AbstractCircuit
     spectrum: Spectrum
     unloaded: UnloadedSlopes | None
@@ -76,7 +80,7 @@ class Load(eqx.Module):
     @classmethod
     def behind(
         cls,
-        driver: GivenDriver,
+        driver: AbstractGiven,
         circuit: AbstractCircuit,
         spectrum: Spectrum,
         sample_rate: Float[Array, ""],
@@ -92,8 +96,8 @@ class Load(eqx.Module):
 
     def split(self, q: Float[Array, "*row q"]) -> tuple[LoadUnknowns, Float[Array, "*row z"]]:
         """The unknowns of the load, and z; or other numbers in the same order."""
-        own = LoadUnknowns.of(q[..., : self.owned])
-        return own, q[..., self.owned :] if q.shape[-1] > self.owned else self.driver.mean
+        own, mean = LoadUnknowns.of(q[..., : self.owned]), self.driver.mean
+        return own, q[..., self.owned :] if q.shape[-1] == self.owned + mean.size else mean
 
     def load(self, log_elements: Float[Array, " element"]) -> Complex[Array, " harmonic"]:
         """Z_L."""
@@ -108,8 +112,8 @@ class Load(eqx.Module):
     def divided(
         self, load: Complex[Array, " harmonic"], w: Complex[Array, " harmonic"]
     ) -> Complex[Array, " harmonic"]:
-        """Z_L / (Z_L + Z_th) at W = W₀ + `w`."""
-        return load * reciprocal(load + self.driver.z_th(w))
+        """V_out per input at W = W₀ + `w`, without the delay."""
+        return self.driver.gain(load, w)
 
     def at(self, z: Float[Array, " z"]) -> tuple[Complex[Array, " harmonic"], Spectrum]:
         """W − W₀, and the recording with the X that the calibrations estimate."""
@@ -326,7 +330,7 @@ def refined(
 
 
 def fit_circuit(
-    driver: GivenDriver,
+    driver: AbstractGiven,
     circuit: AbstractCircuit,
     spectrum: Spectrum,
     sample_rate: Float[Array, ""],
@@ -335,7 +339,7 @@ def fit_circuit(
     """Identify the load of one recording.
 
     Args:
-        driver: Distribution of Z_th at the harmonics of the recording.
+        driver: Distribution of Z_th at the harmonics of the recording, or the measured current.
         circuit: Structure of the load.
         spectrum: The recording.
         sample_rate: Its sampling rate [Hz].

@@ -21,7 +21,8 @@ from etid.estimators.non_parametric.fit import fit_circuit
 from etid.estimators.score_tests.other_circuit import NO_OTHER_CIRCUIT, NO_OTHER_GAIN
 from etid.estimators.score_tests.unloaded import UnloadedShape
 from etid.estimators.starts import harmonic_starts
-from etid.results.driver import Driver, HarmonicDriver
+from etid.results.driver import HarmonicDriver
+from etid.results.feed import AbstractFeed
 from etid.results.fits import Fit
 from etid.results.verdicts import RESULTS
 
@@ -38,7 +39,7 @@ class NonParametric(AbstractByMaximumLikelihood):
     lane = Harmonics
     driver = HarmonicDriver
 
-    def check_driver(self, driver: Driver, sample_rate: float, pulse_rate: float) -> None:
+    def check_driver(self, driver: AbstractFeed, sample_rate: float, pulse_rate: float) -> None:
         """Raise ValueError unless a driver knows Z_th at the harmonics of the recording."""
         super().check_driver(driver, sample_rate, pulse_rate)
         known = float(serving(driver, HarmonicDriver, str(self)).spectra.frequency[0, 0])

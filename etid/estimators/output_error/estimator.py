@@ -12,10 +12,11 @@ from etid.estimators.lanes import PaddedSamples
 from etid.estimators.output_error import fit, prediction
 from etid.estimators.refined_driver import refined_driver
 from etid.estimators.score_tests import other_on_harmonics
-from etid.estimators.starts import circuit_starts
+from etid.estimators.starts import circuit_starts, current_starts
 from etid.estimators.steiglitz_mcbride import iteration
 from etid.estimators.unknowns import LoadUnknowns
 from etid.results.driver import ContinuousDriver, Driver, HarmonicDriver
+from etid.results.feed import MeasuredCurrent
 from etid.results.fits import Fit
 from etid.results.verdicts import RESULTS
 from etid.signals.harmonics import Spectrum
@@ -34,6 +35,7 @@ class OutputError(AbstractEstimator):
     name = "output_error"
     lane = PaddedSamples
     driver = ContinuousDriver
+    current = True
 
     def check_circuit(self, circuit: AbstractCircuit) -> None:
         """Raise ValueError unless the circuit is a ratio of polynomials in s."""
@@ -56,14 +58,16 @@ class OutputError(AbstractEstimator):
         return refined_driver(records, r_load, order, None, str(self))
 
     def fit_load(
-        self, lane: PaddedSamples, driver: ContinuousDriver, known: None, circuit: AbstractCircuit
+        self,
+        lane: PaddedSamples,
+        driver: ContinuousDriver | MeasuredCurrent,
+        known: None,
+        circuit: AbstractCircuit,
     ) -> Fit:
         """Refine from the best of several starts."""
         del known
         m, samples = lane.measurement, jnp.asarray(lane.samples)
-        discrete = iteration.skin_filter(m.v_th, m.v_out, Rational(driver.b, driver.a)).filter
-        simpler = iteration.skin_elements(discrete, m.sample_rate)
-        starts = circuit.with_log_values(circuit_starts(circuit, simpler))
+        starts = circuit.with_log_values(_starts(m, driver, circuit))
         fitted, estimate, other = fit.fit_circuit(
             prediction.prepare(m, samples=samples), driver, starts
         )
@@ -94,3 +98,18 @@ class OutputError(AbstractEstimator):
             refined=True,
             cited=("ljung1999", "optimistix2024"),
         )
+
+
+def _starts(
+    m: Measurement, driver: ContinuousDriver | MeasuredCurrent, circuit: AbstractCircuit
+) -> Float[Array, "start element"]:
+    """Starts of the elements' logarithms."""
+    if isinstance(driver, MeasuredCurrent):
+        size = m.v_th.shape[0]
+        frequency = jnp.fft.rfftfreq(size)[1:] * m.sample_rate
+        x, y = jnp.fft.rfft(m.v_th)[1:], jnp.fft.rfft(m.v_out)[1:]
+        of_x, of_y = (jnp.full(frequency.shape, size * of**2) for of in (m.sigma_th, m.sigma_out))
+        return current_starts(frequency, (x, y), (of_x, of_y), circuit)
+    discrete = iteration.skin_filter(m.v_th, m.v_out, Rational(driver.b, driver.a)).filter
+    simpler = iteration.skin_elements(discrete, m.sample_rate)
+    return circuit_starts(circuit, simpler)

@@ -48,6 +48,7 @@ from etid.estimators.sandwich import Curvature
 from etid.estimators.score_tests.other_in_time import relaxed, score
 from etid.estimators.unknowns import Nuisance
 from etid.results.driver import Calibration, ContinuousDriver, SourceImpedance, loaded
+from etid.results.feed import CurrentSource, MeasuredCurrent
 from etid.results.fits import rrse
 from etid.signals.transfer import Rational
 from etid.solvers.levenberg_marquardt import best_start
@@ -175,14 +176,14 @@ def _arrow(
 
 def fit_circuit(
     records: Records,
-    driver: ContinuousDriver,
+    driver: ContinuousDriver | MeasuredCurrent,
     starts: AbstractCircuit,
 ) -> tuple[AbstractCircuit, Estimate, Bool[Array, ""]]:
     """Identify the load of one recording.
 
     Args:
         records: One recording.
-        driver: Its driver.
+        driver: Its driver, or the measured current.
         starts: Candidate starts, stacked along a leading axis; the one that predicts best is
             refined.
 
@@ -190,14 +191,14 @@ def fit_circuit(
         The circuit; the estimate, whose parameters are the logarithms of the elements; and whether
         the data show another circuit.
     """
-    source, source_cov, calibration = driver.source, driver.later_cov(), driver.calibration
+    source, source_cov = driver.source, driver.later_cov()
     source_vector, unflatten = ravel_pytree(source)
     candidates = starts.log_values()
     kept, sources = candidates.shape[-1], source_vector.shape[0]
     circuit = jax.tree.map(lambda leaf: leaf[0], starts)
     states = jax.eval_shape(lambda: loaded(source, circuit.impedance().rational(), 1.0).C).shape[0]
     # [samples] of this record.
-    late_std = calibration.delay_std_samples * (records.sample_rate / driver.sample_rate)
+    late_std = driver.late_std(records.sample_rate)
 
     def load(log_elements: Float[Array, " element"]) -> Rational:
         return circuit.with_log_values(log_elements).impedance().rational()
@@ -228,7 +229,7 @@ def fit_circuit(
         q = solution.value
         log_elements, nuisance, _ = named(q)
         load_there, x0 = load(log_elements), nuisance.state
-        late = late_calibration(records, source, load_there, calibration.r_load[0], x0)
+        late = late_calibration(records, source, load_there, driver.r_known, x0)
         equations = solution.stats["normal_equations"]
         return (q, late), (equations.objective, solution.result, solution.stats["num_steps"])
 
@@ -289,7 +290,10 @@ def fit_circuit(
 
 
 def fitted_voltage(
-    records: Records, source: SourceImpedance, r_load: Float[Array, ""], load: Rational
+    records: Records,
+    source: SourceImpedance | CurrentSource,
+    r_load: Float[Array, ""],
+    load: Rational,
 ) -> Float[Array, " interval"]:
     """Terminal voltage with `load` [V], fitted to a record.
 

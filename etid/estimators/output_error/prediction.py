@@ -21,6 +21,7 @@ from jaxtyping import Array, Float, Int
 
 from etid.estimators.unknowns import Nuisance
 from etid.results.driver import SourceImpedance, loaded
+from etid.results.feed import CurrentSource
 from etid.signals.filtering import CUTOFF, TAPS, StateSpace, band_limited, hold, shiftable, simulate
 from etid.signals.noise import Measurement
 from etid.signals.transfer import Rational
@@ -71,7 +72,7 @@ def prepare(
 
 
 def loaded_filter(
-    source: SourceImpedance, load: Rational, sample_rate: Float[Array, ""]
+    source: SourceImpedance | CurrentSource, load: Rational, sample_rate: Float[Array, ""]
 ) -> StateSpace:
     """Discrete filter from the interpolated V_th to V_out."""
     return hold(loaded(source, load, sample_rate), sample_rate)
@@ -127,7 +128,7 @@ class Change(eqx.Module):
 
 def scaled_residual(
     records: Records,
-    source: SourceImpedance,
+    source: SourceImpedance | CurrentSource,
     load: Rational,
     nuisance: Nuisance,
     change: Change | None = None,
@@ -143,7 +144,7 @@ def scaled_residual(
 
 def late_calibration(
     records: Records,
-    source: SourceImpedance,
+    source: SourceImpedance | CurrentSource,
     load: Rational,
     r_load: Float[Array, ""],
     x0: Float[Array, " state"],
@@ -156,15 +157,18 @@ def late_calibration(
         Z_L + Z_th + sτ (R_L + Z_th) = (1 + sτ) (Z_L + Z_th) + sτ (R_L − Z_L).
 
     The first part is a delay, which the skin's own delay absorbs. The second is an excess
-    impedance; this function returns the derivatives with respect to it.
+    impedance; this function returns the derivatives with respect to it. They are 0 for a measured
+    current, which has no calibration.
 
     Args:
         records: One recording.
-        source: Z_th.
+        source: Z_th, or the source of a measured current.
         load: The load.
         r_load: Resistor of the calibration [Ω].
         x0: State of the loaded driver at the start of the record.
     """
+    if isinstance(source, CurrentSource):
+        return Change(jnp.zeros_like(records.v_out[:, 0]), jnp.zeros(IMPULSE + 1))
     system = loaded(source, load, records.sample_rate)
     x0_rate = (system.A @ x0 + system.B[:, 0] * records.hold[0, 0]) / records.sample_rate
 

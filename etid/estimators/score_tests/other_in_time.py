@@ -34,7 +34,8 @@ from etid.estimators.output_error.prediction import (
 from etid.estimators.sandwich import Linear
 from etid.estimators.score_tests.other_circuit import Score, relaxations, scores
 from etid.estimators.unknowns import Nuisance
-from etid.results.driver import SourceImpedance, connected, realise
+from etid.results.driver import SourceImpedance, realise
+from etid.results.feed import CurrentSource
 from etid.signals.filtering import StateSpace, hold
 from etid.signals.transfer import as_complex
 from etid.solvers.matrices import inverse
@@ -48,7 +49,7 @@ BESIDE = 8  # bins on either side over which the power of V_th is averaged
 
 def relaxed(
     records: Records,
-    source: SourceImpedance,
+    source: SourceImpedance | CurrentSource,
     impedance: AbstractImpedance,
     nuisance: Nuisance,
 ) -> Change:
@@ -56,7 +57,7 @@ def relaxed(
 
     Args:
         records: One recording.
-        source: Z_th.
+        source: Z_th, or the source of a measured current.
         impedance: The load.
         nuisance: Other unknowns of the recording.
     """
@@ -72,7 +73,7 @@ def relaxed(
         epsilon: Float[Array, " change"],
     ) -> tuple[Float[Array, " interval"], Float[Array, " lag"]]:
         C = jnp.concatenate([load.C, epsilon * level])
-        system = hold(connected(source, StateSpace(A, B, C, load.D)), rate)
+        system = hold(source.connected(StateSpace(A, B, C, load.D)), rate)
         return predict(system, records, nuisance), impulse_response(system)
 
     return Change(*jax.jacfwd(simulated)(jnp.zeros(count)))
