@@ -39,6 +39,7 @@ from etid.identify.impedance import identify_impedance
 from etid.identify.jointly import identify_jointly
 from etid.identify.many import identify_skins, identify_study
 from etid.identify.one import identify_samples, identify_skin
+from etid.identify.posterior import posterior, profile
 from etid.identify.predict import predict
 from etid.identify.selecting import select_circuit
 from etid.online.tracker import Tracker
@@ -48,6 +49,7 @@ from etid.recordings.recording import Recording, RecordingError, Samples
 from etid.recordings.study import Study
 from etid.results.driver import Driver
 from etid.results.fits import Fit, Fits, IdentificationError
+from etid.results.posterior import Posterior, Profile
 from etid.results.study_fits import StudyFits
 from etid.results.verdicts import RESULTS
 from etid.selection.selection import Candidate, Selection
@@ -86,6 +88,8 @@ __all__ = [
     "NonParametric",
     "OutputError",
     "ParallelRC",
+    "Posterior",
+    "Profile",
     "Recording",
     "RecordingError",
     "Resistor",
@@ -121,7 +125,9 @@ __all__ = [
     "parallel",
     "parameter",
     "plot",
+    "posterior",
     "predict",
+    "profile",
     "read",
     "register",
     "resistor",

@@ -157,6 +157,26 @@ def dry() -> etid.Recording:
     return study()["typical/dry/01"]
 
 
+def posterior() -> etid.Posterior:
+    """Skewed draws around that fit."""
+    rng = np.random.default_rng(2)
+    mix = np.array([[1.0, 0, 0], [-0.7, 0.7, 0], [0.3, 0, 1.0]])
+    logs = RELATIVE * 4 * (rng.normal(size=(1000, 3)) @ mix.T)
+    logs += 2 * logs**2
+    draws = etid.SkinRC(*jnp.asarray(np.asarray(SKIN.values())[:, None] * np.exp(logs.T)))
+    found = fit()
+    return etid.Posterior(
+        dataclasses.replace(found, cov=16 * found.cov), draws, np.full(1000, 1e-3)
+    )
+
+
+def profile() -> etid.Profile:
+    """A skewed profile of C_p."""
+    logs = np.linspace(-0.6, 0.6, 29)
+    values = 0.12e-9 * np.exp(logs)
+    return etid.Profile("c_p", "farad", 0.12e-9, 0.024e-9, values, (logs / 0.2 - logs**2) ** 2)
+
+
 PICTURES: dict[str, Callable[[], tuple]] = {
     "recording": lambda: (dry(),),
     "fit": lambda: (fit(), dry(), driver()),
@@ -166,6 +186,8 @@ PICTURES: dict[str, Callable[[], tuple]] = {
     "driver": lambda: (driver(),),
     "impedances": lambda: ({"Z_th": driver("order_too_low"), "skin": fit(), "typical": SKIN},),
     "fits": lambda: (fits(),),
+    "posterior": lambda: (posterior(),),
+    "profile": lambda: (profile(),),
     "bound": lambda: (bounds(),),
 }
 

@@ -187,7 +187,10 @@ def test_an_impedance_is_in_kilohms_and_degrees_in_a_band_of_two_standard_errors
 def test_fits_are_by_subject_and_failures_hollow():
     fits = pictures.fits()
     axes = figure_of(fits).axes
-    assert [axis.get_ylabel() for axis in axes] == ["r_s [kΩ]", "r_p [kΩ]", "c_p [nF]"]
+    assert [axis.get_ylabel() for axis in axes] == [
+        rf"${letter}_\mathrm{{{index}}}$ [{unit}]"
+        for letter, index, unit in (("R", "s", "kΩ"), ("R", "p", "kΩ"), ("C", "p", "nF"))
+    ]
     points = [line for line in axes[0].lines if len(np.asarray(line.get_ydata()))]
     by_face = {
         hollow: np.concatenate(

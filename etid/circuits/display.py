@@ -33,6 +33,19 @@ def plus_minus(value: float, error: float) -> str:
     return f"{value:10.{digits}f} ± {error:<9.{digits}f}"
 
 
+def between(low: float, high: float, unit: str) -> str:
+    """Both ends of an interval in the scaled unit, such as `33.29 … 33.61 kΩ`.
+
+    They are rounded to two significant digits of a quarter of the length.
+    """
+    scale, symbol = DISPLAY[unit]
+    quarter = (high - low) / (4 * scale)
+    if not (np.isfinite(quarter) and quarter > 0):
+        return f"{low / scale:.4g} … {high / scale:.4g} {symbol}".rstrip()
+    digits = int(np.clip(1 - np.floor(np.log10(quarter)), 0, 9))
+    return f"{low / scale:.{digits}f} … {high / scale:.{digits}f} {symbol}".rstrip()
+
+
 def quantity(value: float, unit: str, error: float = np.nan) -> str:
     """A parameter in its scaled unit, such as `33.40 ± 0.10 kΩ`, or `33.4 kΩ` without an error.
 

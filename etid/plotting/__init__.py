@@ -13,6 +13,7 @@ from etid.circuits.circuit import AbstractCircuit
 from etid.recordings.recording import Recording
 from etid.results.driver import Driver, SourceImpedance
 from etid.results.fits import Fit, Fits
+from etid.results.posterior import Posterior, Profile
 from etid.selection.selection import Selection
 from etid.simulation.bound import Bound
 
@@ -36,7 +37,13 @@ def plot(
 def plot(x: Driver, recording: Recording, *, axes: AnyAxes = None) -> np.ndarray: ...
 @overload
 def plot(
-    x: Impedance | Mapping[str, Impedance] | Fits | Bound | Mapping[str, Bound],
+    x: Impedance
+    | Mapping[str, Impedance]
+    | Fits
+    | Posterior
+    | Profile
+    | Bound
+    | Mapping[str, Bound],
     *,
     axes: AnyAxes = None,
 ) -> np.ndarray: ...
@@ -47,7 +54,7 @@ def plot(
     *,
     axes: AnyAxes = None,
 ) -> np.ndarray:
-    """Draw a recording, a fit, a choice of circuits, a driver, an impedance, fits or bounds.
+    """Draw a recording, a fit, a posterior, a driver, an impedance, fits, bounds and others.
 
     | call | shows | axes |
     |---|---|---|
@@ -57,6 +64,8 @@ def plot(
     | `plot(driver, calibration)` | the same two diagrams for the calibration's resistor | 2 |
     | `plot(driver)`, `plot(circuit)` | magnitude [kΩ] and phase [deg] of an impedance | 2 |
     | `plot({label: driver, fit or circuit})` | several of these in one diagram | 2 |
+    | `plot(posterior)` | each element, and each two of them, beside the errors of the fit | n² |
+    | `plot(profile)` | how much worse the fit becomes if one element has another value | 1 |
     | `plot(fits)` | each element by subject, conditions side by side | one per element |
     | `plot(etid.bound(scene))` | smallest relative standard errors [%] of each recording | 1 |
 
@@ -106,7 +115,7 @@ def _draw(
 ) -> np.ndarray:
     import matplotlib as mpl
 
-    from etid.plotting import candidates, elements, impedances, pulses, style
+    from etid.plotting import candidates, elements, impedances, posteriors, pulses, style
 
     with mpl.rc_context(style.PAPER):
         match x, recording, driver:
@@ -130,6 +139,10 @@ def _draw(
                 return pulses.draw_recording(canvas, x)
             case Fits(), None, None:
                 return elements.draw_fits(canvas, x)
+            case Posterior(), None, None:
+                return posteriors.draw_posterior(canvas, x)
+            case Profile(), None, None:
+                return posteriors.draw_profile(canvas, x)
             case Bound(), None, None:
                 return elements.draw_bounds(canvas, [x])
             case ((Driver() | SourceImpedance()), None, None):
@@ -143,7 +156,8 @@ def _draw(
     raise TypeError(
         f"cannot draw {_kinds(x, recording, driver)}; plot takes a Recording, a Fit or Selection "
         "with its recording and driver, a Driver alone or with a calibration, a circuit, Fits, a "
-        "Bound, a dictionary of bounds, or a dictionary of drivers, fits and circuits"
+        "Posterior, a Profile, a Bound, a dictionary of bounds, or a dictionary of drivers, fits "
+        "and circuits"
     )
 
 

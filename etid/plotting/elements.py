@@ -6,8 +6,8 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 
-from etid.circuits.display import DISPLAY, heading
-from etid.plotting.style import COLOURS, INK, MARKS, RED, Canvas, plain_ticks, titled
+from etid.circuits.display import DISPLAY
+from etid.plotting.style import COLOURS, INK, MARKS, RED, Canvas, plain_ticks, symbol, titled
 from etid.results.fits import Fits
 from etid.simulation.bound import Bound
 
@@ -46,7 +46,7 @@ def draw_fits(canvas: Canvas, fits: Fits) -> np.ndarray:
                 0.995, 0.97, f"{(~shown).sum()} without success outside", color=RED, fontsize=8,
                 transform=axis.transAxes, ha="right", va="top",
             )  # fmt: skip
-        axis.set_ylabel(heading(name, unit))
+        axis.set_ylabel(symbol(name, unit))
     names = [str(subject) or "-" for subject in subjects]
     turned = sum(map(len, names)) > CROWDED
     axes[-1].set_xticks(range(len(names)), names, rotation=90 if turned else 0)

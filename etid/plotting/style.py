@@ -18,12 +18,15 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullFormatter
 
+from etid.circuits.display import heading
+
 INK = "#1a1a1a"
 BLUE = "#0b62a4"
 RED = "#c0392b"
 COLOURS = (BLUE, RED, "#2e7d32", INK)
 DASHES = ("-", "--", "-.", ":", (0, (5, 1, 1, 1, 1, 1)), (0, (1, 3)))
 MARKS = ("o", "s", "^", "D", "v", "P", "X", "<", ">", "p", "h", "*")
+GREEK = ("alpha", "beta", "tau")  # names of elements
 PAPER: Any = {
     "figure.facecolor": "white",
     "axes.facecolor": "white",
@@ -96,6 +99,22 @@ def plain_ticks(axis: Axis) -> None:
     axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
     axis.set_major_formatter("{x:g}")
     axis.set_minor_formatter(NullFormatter())
+
+
+def symbol(name: str, unit: str) -> str:
+    """Label of an element: its symbol as a formula, with the scaled unit.
+
+    `r_s` becomes an R with the subscript s; a word such as `alpha` becomes a Greek letter.
+    """
+    letter, _, index = name.partition("_")
+    if letter in GREEK:
+        letter = rf"\{letter}"
+    elif len(letter) > 1:
+        return heading(name, unit)
+    else:
+        letter = letter.upper()
+    subscript = rf"_\mathrm{{{index}}}" if index.isalnum() else ""
+    return heading(f"${letter}{subscript}$", unit)
 
 
 def titled(axis: Axes, lines: Sequence[str], *, good: bool = True) -> None:

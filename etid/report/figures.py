@@ -15,9 +15,9 @@ from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from etid.circuits.display import DISPLAY, heading
+from etid.circuits.display import DISPLAY
 from etid.plotting import figure_of
-from etid.plotting.style import COLOURS, DASHES, MARKS, new_figure
+from etid.plotting.style import COLOURS, DASHES, MARKS, new_figure, symbol
 from etid.report.tables import Components, frequent
 from etid.results.driver import Driver
 from etid.results.fits import Fits
@@ -63,7 +63,7 @@ def distributions(fits: Fits) -> bytes:
             values = _positive(getattr(good.where(condition=condition).circuit, name)) / scale
             if values.size:
                 _steps(axis, values, series, f"{_short(condition) or 'all'} ({values.size})")
-        axis.set(xlabel=heading(name, unit))
+        axis.set(xlabel=symbol(name, unit))
         low, high = axis.dataLim.intervalx
         if 0 < NARROW * low < high:
             axis.set_xscale("log")
@@ -137,7 +137,7 @@ def by_subject(fits: Fits) -> bytes:
                 where, found[2], MARKS[series], color=colour, ms=4.5 * thin,
                 markerfacecolor="white", label=_short(condition) or "all",
             )  # fmt: skip
-        axis.set(yscale="log", ylabel=heading(name, unit))
+        axis.set(yscale="log", ylabel=symbol(name, unit))
         _plain(axis, "y")
     last = axes[-1, 0]
     if named:

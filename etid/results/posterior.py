@@ -1,0 +1,133 @@
+"""A second opinion on standard errors: the distribution of the elements, and their profiles."""
+
+import dataclasses
+import statistics
+from typing import Generic, TypeVar
+
+import numpy as np
+from jaxtyping import Float
+
+from etid.circuits.circuit import AbstractCircuit
+from etid.circuits.display import between, quantity
+from etid.circuits.overview import Overview, Overviewed
+from etid.results.fits import Fit
+
+Circuit = TypeVar("Circuit", bound=AbstractCircuit)
+FEW = 100.0  # effective draws; with fewer, the ends of an interval are not worth two digits
+
+
+def tails(level: float) -> tuple[float, float]:
+    """Probabilities below both ends of an interval.
+
+    Raises:
+        ValueError: The level is not between 0 and 1.
+    """
+    if not 0 < level < 1:
+        raise ValueError(f"level is {level}; it must be between 0 and 1, as in 0.95")
+    return (1 - level) / 2, (1 + level) / 2
+
+
+@dataclasses.dataclass(frozen=True, eq=False, repr=False)
+class Posterior(Overviewed, Generic[Circuit]):
+    """Weighted draws of the elements, given a recording and its driver.
+
+    Attributes:
+        fit: The fit around which the draws were made.
+        draws: Elements [SI], arrays (draw,).
+        weights: Probabilities of the draws; their sum is 1.
+    """
+
+    fit: Fit[Circuit]
+    draws: Circuit
+    weights: Float[np.ndarray, " draw"]
+
+    @property
+    def effective(self) -> float:
+        """Number of draws of equal weight that would be as good, 1 / Σ w²."""
+        return float(1 / np.sum(self.weights**2))
+
+    def intervals(self, level: float = 0.95) -> dict[str, tuple[float, float]]:
+        """Both ends [SI] of the interval of each element, by name; both tails are equal.
+
+        Args:
+            level: Probability of an interval.
+
+        Raises:
+            ValueError: The level is not between 0 and 1.
+        """
+        low, high = tails(level)
+        return {
+            name: (self.quantile(name, low), self.quantile(name, high))
+            for name in self.draws.names()
+        }
+
+    def quantile(self, name: str, probability: float) -> float:
+        """The value [SI] of an element below which the draws have this probability."""
+        values = np.asarray(getattr(self.draws, name))
+        order = np.argsort(values)
+        middles = np.cumsum(self.weights[order]) - 0.5 * self.weights[order]
+        return float(np.interp(probability, middles, values[order]))
+
+    def _overview(self) -> Overview:
+        rows = []
+        ends = self.intervals()
+        for (name, unit), text in zip(
+            self.fit.circuit.units().items(), self.fit.elements, strict=True
+        ):
+            middle = quantity(self.quantile(name, 0.5), unit)
+            rows.append((name, middle, between(*ends[name], unit), text.removeprefix(f"{name} ")))
+        notes = []
+        if self.effective < FEW:
+            notes.append(
+                "The draws represent the distribution badly; draw more, as in draws=10_000."
+            )
+        title = f"Posterior of {type(self.draws).__name__}: {self.weights.size} draws, "
+        title += f"worth {self.effective:.0f}"
+        return Overview(title, rows, ("", "median", "95 % interval", "fit"), notes)
+
+
+@dataclasses.dataclass(frozen=True, eq=False, repr=False)
+class Profile(Overviewed):
+    """How much worse a recording is explained if one element has another value.
+
+    Attributes:
+        name: The element.
+        unit: Its SI unit.
+        value: Fitted value [SI].
+        stderr: Its standard error [SI].
+        values: Values that were tried [SI], increasing.
+        deviance: −2 log L at the best other parameters, minus that of the fit; 0 at the fit.
+    """
+
+    name: str
+    unit: str
+    value: float
+    stderr: float
+    values: Float[np.ndarray, " point"]
+    deviance: Float[np.ndarray, " point"]
+
+    def interval(self, level: float = 0.95) -> tuple[float, float]:
+        """Both ends [SI]: where the deviance reaches the quantile of χ² with one degree of freedom.
+
+        Args:
+            level: Probability of the interval.
+
+        Returns:
+            The ends; infinite where no value that was tried is bad enough.
+
+        Raises:
+            ValueError: The level is not between 0 and 1.
+        """
+        z = statistics.NormalDist().inv_cdf(tails(level)[1])
+        # The signed root of the deviance is nearly a straight line.
+        root = np.sign(self.values - self.value) * np.sqrt(np.maximum(self.deviance, 0.0))
+        order = np.argsort(root, kind="stable")
+        low, high = np.interp([-z, z], root[order], self.values[order], left=-np.inf, right=np.inf)
+        return float(low), float(high)
+
+    def _overview(self) -> Overview:
+        rows = [
+            ("95 % interval", between(*self.interval(), self.unit)),
+            ("fit", quantity(self.value, self.unit, self.stderr)),
+        ]
+        return Overview(f"Profile of {self.name}: {self.values.size} values", rows)
