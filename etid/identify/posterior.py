@@ -183,7 +183,8 @@ def posterior(
     size = len(fit.circuit.names()) + 1 + known.mean.size
     normal = random.normal(size=(draws, size))
     square = random.chisquare(FREEDOM, draws) / FREEDOM
-    found, weights = map(np.asarray, _draws(lane, known, fit.circuit, cov, normal, square))
+    drawn = map(jnp.asarray, (cov, normal, square))
+    found, weights = map(np.asarray, _draws(lane, known, fit.circuit, *drawn))
     if not (np.isfinite(found).all() and np.isfinite(weights).all()):
         raise ValueError(f"the recording does not determine all elements of {fit}")
     names = fit.circuit.names()
@@ -214,9 +215,8 @@ def profile(fit: Fit, recording: Recording, driver: Driver, name: str) -> Profil
     lane, known, cov = _given(fit, recording, driver)
     number, steps = names.index(name), np.linspace(-WIDE, WIDE, POINTS)
     error = np.sqrt(cov[number, number])
-    logs, deviance = map(
-        np.asarray, _profile(lane, known, fit.circuit, jnp.asarray(number), error, steps)
-    )
+    wanted = map(jnp.asarray, (number, error, steps))
+    logs, deviance = map(np.asarray, _profile(lane, known, fit.circuit, *wanted))
     value = float(getattr(fit.circuit, name))
     return Profile(
         name=name,
