@@ -20,9 +20,9 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Complex, Float, Int
 
-from etid.signals.harmonics import harmonics, namespace
+from etid.signals.harmonics import WINDOW, harmonics, namespace
 
 # Order of the differences; the ringing after the edges, at a quarter of the rate, is still smooth
 # to them.
@@ -161,28 +161,60 @@ def rounding_variance(
 ) -> Float[np.ndarray, " harmonic"]:
     """E|error|² of the harmonics of a record [V²], from rounding and noise together."""
     rng = np.random.default_rng(SEED)
-    smooth, noise = _before(v, step, rng), noise_of_codes(v, step)
-    total = 0.0
+    noise = noise_of_codes(v, step)
+    errors = []
     for lift in (np.arange(LIFTS) + 0.5) / LIFTS * step:
-        lifted = smooth + lift
+        lifted = _before(v, step, rng.random()) + lift
         rounded = np.round((lifted + noise * rng.standard_normal(v.size)) / step) * step
-        total = total + np.abs(harmonics(rounded - lifted, periods, samples)) ** 2
+        errors.append(np.asarray(harmonics(rounded - lifted, periods, samples)))
+    found = np.asarray(errors)
+    square = np.mean(np.abs(found) ** 2, axis=0)
+    variance = square * _together(found, square, np.asarray(harmonics(v, periods, samples)))
     # The edges determine the elements, and there the rounding errors of samples are independent.
     # So the variance is at least that of white noise of this size, common to all periods.
-    return np.maximum(np.asarray(total) / LIFTS, (periods * step**2 / 12 + noise**2) / samples)
+    return np.maximum(variance, (periods * step**2 / 12 + noise**2) / samples)
 
 
-def _before(
-    v: Float[np.ndarray, " time"], step: float, rng: np.random.Generator
-) -> Float[np.ndarray, " time"]:
+def _together(
+    errors: Complex[np.ndarray, "lift harmonic"],
+    square: Float[np.ndarray, " harmonic"],
+    signal: Complex[np.ndarray, " harmonic"],
+) -> Float[np.ndarray, " harmonic"]:
+    """How much more the errors of neighbouring harmonics do together than if independent.
+
+    The error of slow parts of the signal has few independent values, and they move many harmonics
+    alike. Elements change the gain smoothly, so what counts is the sum of relative errors.
+    """
+    along = errors * np.exp(-1j * np.angle(signal))
+    together = [np.mean(_around(part) ** 2, axis=0) for part in (along.real, along.imag)]
+    return np.maximum(2 * np.maximum(*together) / _around(square), 1.0)
+
+
+def _around(of: Float[np.ndarray, "*lift harmonic"]) -> Float[np.ndarray, "*lift harmonic"]:
+    """Sums over `WINDOW` neighbouring harmonics."""
+    total = np.cumsum(np.pad(of, [(0, 0)] * (of.ndim - 1) + [(1, 0)]), axis=-1)
+    number = np.arange(of.shape[-1])
+    first = np.maximum(number - WINDOW // 2, 0)
+    return total[..., np.minimum(number + WINDOW // 2 + 1, number.size)] - total[..., first]
+
+
+def _before(v: Float[np.ndarray, " time"], step: float, place: float) -> Float[np.ndarray, " time"]:
     """The waveform before rounding: straight lines between the changes of the code.
 
-    Where the code changes by more than one, a random value that rounds to the code is used.
+    Args:
+        v: The record.
+        step: Converter step, in the unit of `v`.
+        place: Place of the waveform within a code where the record does not show it, from 0 to 1:
+            beside changes of more than one code, and at both ends. It is one number, because each
+            period ends with the same rest of its pulse. This rest makes the error of the first
+            harmonics.
     """
     jumps = np.diff(v)
     at = np.flatnonzero(np.abs(jumps) > step / 2)
-    places = np.concatenate([[0.0], at + 0.5, [v.size - 1.0]])
-    levels = np.concatenate([v[:1], (v[at] + v[at + 1]) / 2, v[-1:]])
-    line = np.interp(np.arange(v.size), places, levels)
-    fast = np.abs(line - v) > step
-    return np.where(fast, v + step * (rng.random(v.size) - 0.5), line)
+    by_one = np.abs(jumps[at]) < 1.5 * step
+    slow, fast = at[by_one], at[~by_one]
+    hidden = np.concatenate([[0], fast, fast + 1, [v.size - 1]])
+    places = np.concatenate([slow + 0.5, hidden])
+    levels = np.concatenate([(v[slow] + v[slow + 1]) / 2, v[hidden] + step * (place - 0.5)])
+    order = np.argsort(places, kind="stable")
+    return np.interp(np.arange(v.size), places[order], levels[order])

@@ -1,9 +1,11 @@
 """The Cramer-Rao bound of a scene: the smallest standard errors of any unbiased estimator.
 
 At every harmonic k the records are X_k and Y_k = G_k e^(−jω_k τ) X_k with G = Z_L / (Z_L + Z_th),
-and the same for each calibration. All records have white noise. X_k and Z_th(f_k) are unknown
-complex numbers at every harmonic, so the bound holds for every kind of driver. To project them out
-leaves the Fisher information of the elements and the trigger delays,
+and the same for each calibration. All records have white noise. The rounding error of a coarse
+converter is noise that is not white (`etid.signals.noise`): where the signal is slow, it is the
+same in each period. X_k and Z_th(f_k) are unknown complex numbers at every harmonic, so the bound
+holds for every kind of driver. To project them out leaves the Fisher information of the elements
+and the trigger delays,
 
     F = 2 Re Σ_k A_kᴴ (I − B_k B_k⁺) A_k.
 
@@ -23,6 +25,8 @@ from jaxtyping import Complex, Float
 from etid.circuits.circuit import AbstractCircuit, Resistor, SkinRC
 from etid.circuits.overview import Overview, Overviewed, element_rows
 from etid.identify.arguments import require, require_float64
+from etid.signals.harmonics import whole_periods
+from etid.signals.noise import COARSE, is_coarse, rounding_variance
 from etid.simulation.scenes import Scene, Trial
 from etid.simulation.transformer import ResistorLoad, SkinLoad, loading
 from etid.solvers.matrices import inverse
@@ -109,8 +113,9 @@ def bound(scene: Scene, *, delays: bool = True, known_driver: bool = False) -> d
         circuit = _circuit(trial)
         key = (type(circuit), *np.asarray(circuit.values()))
         if key not in found:
+            noise = _noise(scene, trial, f.size, waveform.sigma)
             found[key] = _covariance(
-                circuit, known, f, x, z_th, delays, known_driver, scene.shared_v_th
+                circuit, known, f, x, z_th, noise, delays, known_driver, scene.shared_v_th
             )
         bounds[trial.path] = Bound(trial.path, circuit, found[key])
     return bounds
@@ -129,19 +134,51 @@ def _circuit(trial: Trial) -> AbstractCircuit:
     )
 
 
+def _noise(
+    scene: Scene, trial: Trial, harmonics: int, white: float
+) -> Float[np.ndarray, "row harmonic"]:
+    """Standard deviations of the coefficients of a trial and its calibrations.
+
+    Args:
+        scene: The scene.
+        trial: One of its trials.
+        harmonics: Number of harmonics.
+        white: Standard deviation of a sample with white noise [V].
+
+    Returns:
+        Standard deviations relative to those with white noise: of V_out and then of V_th of the
+        trial and of each calibration.
+    """
+    records = 1 + len(scene.calibration)
+    relative = np.ones((2 * records, harmonics))
+    step = 0.0 if scene.bits is None else scene.full_scale / 2 ** (scene.bits - 1) / scene.scale
+    periods = whole_periods(scene.samples, scene.sample_rate, scene.pulse_rate)
+    if white**2 - step**2 / 12 >= (step / COARSE) ** 2 or periods[0] == 0:
+        return relative
+    study = dataclasses.replace(scene, trials=(trial,)).simulate(0)
+    recordings = [study[one.path] for one in (trial, *scene.calibration)]
+    voltages = [one.v_out for one in recordings] + [one.v_th for one in recordings]
+    for row, v in zip(relative, voltages, strict=True):
+        if is_coarse(v, step):
+            found = np.sqrt(rounding_variance(v, step, *periods) * periods[1]) / white
+            row[: found.size] = found[:harmonics]
+    return relative
+
+
 def _covariance(
     circuit: AbstractCircuit,
     known: list[AbstractCircuit],
     f: Float[np.ndarray, " f"],
     x: Complex[np.ndarray, " f"],
     z_th: Complex[np.ndarray, " f"],
+    noise: Float[np.ndarray, "row f"],
     delays: bool,
     known_driver: bool,
     shared_v_th: bool,
 ) -> Float[np.ndarray, "element element"]:
     """Bound of the covariance of the elements' logarithms.
 
-    `x` is in standard deviations of a coefficient.
+    `x` is in standard deviations of a coefficient with white noise; `noise` is from `_noise`.
     """
     loads = [circuit, *known]
     frequency = jnp.asarray(f)
@@ -165,6 +202,8 @@ def _covariance(
         if delays:
             a[:, i, elements + i] = -turn * g * x
     a[:, 0, :elements] = (x * z_th / (z[0] + z_th) ** 2)[:, None] * np.asarray(slope)
+    weight = 1 / noise[:rows].T[:, :, None]
+    a, b = weight * a, weight * b
     q, _ = np.linalg.qr(b)
     rest = a - q @ (np.conj(np.swapaxes(q, 1, 2)) @ a)
     flat = rest.reshape(-1, a.shape[2])
