@@ -91,7 +91,7 @@ def test_neighbouring_harmonics_err_together():
         known = noise.rounding_variance(coarse, step, 3, exact.size)
         first.append(np.abs(error[0]) ** 2 / known[0])
         # Of 25 harmonics each, of both parts, relative to the variance of independent errors.
-        together = [part[:500].reshape(-1, 25).sum(1) for part in (error.real, error.imag)]
+        together = [part[:500].reshape(-1, 25).sum(1) for part in (np.real(error), np.imag(error))]
         sums.append(2 * np.square(together) / known[:500].reshape(-1, 25).sum(1))
     assert np.mean(first) < 4  # it was 13
     assert np.mean(sums, axis=0).max() < 5  # it was 22

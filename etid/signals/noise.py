@@ -186,7 +186,7 @@ def _together(
     alike. Elements change the gain smoothly, so what counts is the sum of relative errors.
     """
     along = errors * np.exp(-1j * np.angle(signal))
-    together = [np.mean(_around(part) ** 2, axis=0) for part in (along.real, along.imag)]
+    together = [np.mean(_around(part) ** 2, axis=0) for part in (np.real(along), np.imag(along))]
     return np.maximum(2 * np.maximum(*together) / _around(square), 1.0)
 
 
