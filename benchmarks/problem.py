@@ -9,6 +9,7 @@ from jaxtyping import Array, Float
 import etid
 from etid.circuits.circuit import SkinRC
 from etid.estimators.lanes import Harmonics, stacked
+from etid.estimators.maximum_likelihood.gain import Gain
 from etid.estimators.maximum_likelihood.given_driver import GivenDriver
 from etid.estimators.maximum_likelihood.load import Load
 from etid.estimators.registry import MAXIMUM_LIKELIHOOD
@@ -50,7 +51,8 @@ class Problem(NamedTuple):
     def load(self, one: Any) -> Load:
         """A lane with Z_th as it is; calling it gives the terms of elements and delay."""
         rate = jnp.asarray(one.sample_rate)
-        return Load(self.known, SkinRC(), one.spectrum, None, rate)
+        spectrum = one.spectrum
+        return Load(Gain(self.known, SkinRC(), spectrum.frequency, rate), spectrum, None)
 
 
 def terms(own: Float[Array, " own"], load: Load) -> Float[Array, " term"]:
@@ -100,10 +102,10 @@ class ByNumPy:
         self.of_x = np.asarray(spectrum.variance_x)[used]
         self.of_y = np.asarray(spectrum.variance_y)[used]
         self.s = 2j * np.pi * np.asarray(spectrum.frequency)[used]
-        w, _ = load.at(load.driver.mean)
-        self.z_th = np.asarray(load.driver.z_th(w))[used]
-        self.rate = float(load.sample_rate)
-        self.width = float(load.widths(jnp.zeros(4))[-1])
+        driver = load.gain.driver
+        self.z_th = np.asarray(driver.z_th(load.gain.w(driver.mean)))[used]
+        self.rate = float(load.gain.sample_rate)
+        self.width = float(load.gain.widths(jnp.zeros(4))[-1])
 
     def _parts(self, q: np.ndarray):
         r_s, r_p, c_p = np.exp(q[:3])

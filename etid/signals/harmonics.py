@@ -20,6 +20,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Complex, Float
 
+from etid.signals.transfer import power
+
 WINDOW = 25  # harmonics over which power is averaged
 ALIASED = 0.35  # of the sample rate; above, aliases matter unless they fall between the harmonics
 DRIFT_DEGREE = 3  # degree of the polynomial that describes the drift of the mean
@@ -126,8 +128,8 @@ def signal_share(
     coefficients: Complex[Array, " harmonic"], variance: Float[Array, " harmonic"]
 ) -> Float[Array, " harmonic"]:
     """Fraction of the power of noisy coefficients that is signal, locally averaged; 0 to 1."""
-    power, noise = local_sum(jnp.abs(coefficients) ** 2), local_sum(variance)
-    return jnp.clip(1 - noise / jnp.where(power > 0, power, 1.0), 0.0, 1.0)
+    total, noise = local_sum(power(coefficients)), local_sum(variance)
+    return jnp.clip(1 - noise / jnp.where(total > 0, total, 1.0), 0.0, 1.0)
 
 
 def spectrum(

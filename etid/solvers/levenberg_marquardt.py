@@ -30,7 +30,6 @@ import lineax as lx
 import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
-INITIAL_DAMPING = 1e-2  # relative to the unit diagonal of the scaled Gauss-Newton matrix
 RIDGE = 1e-13  # of the scaled matrix, for directions that double precision cannot resolve
 ROUNDING = 4.0  # rounding error of the model [ε]
 IDLE_STEPS = 3  # accepted steps in a row without progress, while the steps grow fivefold
@@ -182,6 +181,7 @@ class LevenbergMarquardt(optx.AbstractLeastSquaresSolver):
         ftol: Stop when several accepted steps in a row each reduce |r|² by less than this fraction,
             and each predicted no larger reduction. A valley whose floor is flat within rounding,
             for example of a superfluous pole, never meets the two criteria above.
+        damping: Damping of the first step, relative to the unit diagonal of the scaled matrix.
         norm: Norm of the scaled step and parameters.
         geodesic: Bend each step along the curvature of the model, by its second derivative
             (Transtrum and Sethna 2012, arXiv:1201.5885). In curved valleys this takes a fraction of
@@ -197,6 +197,7 @@ class LevenbergMarquardt(optx.AbstractLeastSquaresSolver):
     rtol: float = 1e-6
     atol: float = 1e-12
     ftol: float = 1e-8
+    damping: float = 1e-2
     norm: Callable[[PyTree], Array] = optx.two_norm
     descent: optx.AbstractDescent = optx.DampedNewtonDescent(linear_solver=lx.Cholesky())
     # MINPACK's threshold, and two constants that are not powers of each other. With 10 and 1/10 the
@@ -280,12 +281,12 @@ class LevenbergMarquardt(optx.AbstractLeastSquaresSolver):
         descent_state = self.descent.query(y, info, self.descent.init(y, info))
         # If the factorisation fails, the proposed step is not finite. The next trial rejects it and
         # raises the damping.
-        proposed, _ = self.descent.step(step_size / INITIAL_DAMPING, descent_state)
+        proposed, _ = self.descent.step(step_size / self.damping, descent_state)
         if self.geodesic:
             bent = self.second_order(_value(fn), y, proposed / safe, args) / safe
             bent = eqx.tree_at(lambda e: e.gradient, scaled, bent)
             turned, _ = self.descent.step(
-                step_size / INITIAL_DAMPING,
+                step_size / self.damping,
                 self.descent.query(y, self._info(bent), descent_state),
             )
             small = 2 * self.norm(turned) <= ACCELERATION * self.norm(proposed)

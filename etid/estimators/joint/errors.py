@@ -10,7 +10,6 @@ loads as independent, but the standard errors do not. The effect of unit noise i
 all loads is propagated to `common` and to each load. The effects are added before they are squared.
 """
 
-import dataclasses
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -22,20 +21,19 @@ from jaxtyping import Array, Bool, Complex, Float
 
 from etid.estimators.estimate import Estimate
 from etid.estimators.joint.terms import DriverStudy, Loads, in_turn
-from etid.estimators.maximum_likelihood.load import Load
+from etid.estimators.maximum_likelihood.load import AtKnots
 from etid.estimators.maximum_likelihood.terms import (
     apart,
-    denoised,
     excess,
     residual,
     variance,
-    weights,
 )
 from etid.estimators.sandwich import Curvature, Linear
 from etid.estimators.score_tests import other_circuit
 from etid.estimators.unknowns import LoadUnknowns
 from etid.results.fits import complex_rrse
-from etid.signals.harmonics import Spectrum
+from etid.signals.harmonics import Spectrum, signal_share
+from etid.signals.knots import knots
 from etid.solvers.matrices import inverse
 
 _Sums = tuple[Float[Array, "record x common"], Float[Array, "common common"]]
@@ -164,48 +162,36 @@ class _Seen(NamedTuple):
     Attributes:
         gain: Gain.
         known: The recording with the X that the calibrations estimate.
-        terms: Terms; the last is the prior of the delay.
-        linear: The terms, linear in (common, own).
-        rows: Derivatives of the denoised residual with respect to changes of the circuit.
+        part: Terms of the recording.
+        sums: The recording at the knots.
+        linear: Terms at the knots, linear in (common, own); the last is the prior of the delay.
     """
 
     gain: Complex[Array, " harmonic"]
     known: Spectrum
-    terms: Float[Array, " term"]
+    part: Float[Array, " part"]
+    sums: AtKnots
     linear: Linear
-    rows: Float[Array, "change part"]
 
 
 def _seen(
     study: DriverStudy, load: Loads, common: Float[Array, " common"], own: LoadUnknowns
 ) -> _Seen:
     """A load at its minimum; what the caller does not use is not computed."""
-    model, spectrum = study.model, load.spectrum
-    driver = model.around(common, spectrum.frequency)
-    q, late = jnp.concatenate([own.vector(), driver.mean]), own.delay_samples
-    g, known = study.lane(driver, load).predicted(q)
+    driver = study.model.around(common, load.spectrum.frequency)
+    q, o = jnp.concatenate([own.vector(), driver.mean]), study.owned
+    lane = study.lane(driver, load)
+    g, known = apart(lane.predicted, q)
     part = residual(known, g)
-    others, gains = model.calibrations.records, model.calibrations.gains(common)
-    (*others, clean), shares = denoised([*others, spectrum], [*gains, g])
-    if driver.records is not None:
-        stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *others)
-        driver = dataclasses.replace(driver, records=stacked)
-    lane = Load.behind(driver, model.circuit, clean, load.sample_rate)
-    slopes = apart(lane.slopes, q)
-    jacobian, o = lane.chained(q, slopes), study.owned
+    sums = AtKnots.of(lane, q, (g, known))
     of_delay = LoadUnknowns(jnp.zeros(o - 1), 1 / driver.delay_width).vector()
     of_delay = jnp.concatenate([jnp.zeros(common.size), of_delay])
-    jacobian = jnp.concatenate([jacobian[o:], jacobian[:o]])
+    jacobian = jnp.concatenate([sums.jacobian[o:], sums.jacobian[:o]])
     jacobian = jnp.concatenate([jacobian, of_delay[:, None]], axis=1)
-    count = jacobian.shape[1]
-    noise = weights([excess(part, spectrum.selected)], count)
-    return _Seen(
-        gain=g,
-        known=known,
-        terms=jnp.append(part, late / driver.delay_width),
-        linear=Linear(jacobian, weights(shares[-1:], count), noise),
-        rows=lane.by_changes(q, slopes),
-    )
+    share = sums.mean(signal_share(sums.x, known.variance_x))
+    noise = sums.mean(excess(part, known.selected)[: g.size])
+    linear = Linear(jacobian, *(jnp.append(of, 1.0) for of in (share, noise)))
+    return _Seen(g, known, part, sums, linear)
 
 
 def _misfit(
@@ -213,7 +199,7 @@ def _misfit(
 ) -> tuple[Float[Array, ""], Float[Array, ""]]:
     """χ² and RRSE of a load."""
     seen, spectrum = _seen(study, load, common, own), load.spectrum
-    squares = jnp.sum(seen.terms[:-1] ** 2)
+    squares = jnp.sum(seen.part**2)
     freedom = 2 * jnp.sum(spectrum.selected, dtype=squares.dtype) - study.owned
     error = complex_rrse(seen.gain * spectrum.x, spectrum.y, spectrum.selected)
     return squares / freedom, error
@@ -230,7 +216,9 @@ def _is_another(
 ) -> Bool[Array, ""]:
     """Score test of one load; `bread` and `score` are those of `common` from all terms."""
     seen = _seen(study, load, common, own)
-    slope = eliminated.slope
+    slope, sums = eliminated.slope, seen.sums
+    terms = jnp.append(sums.residual, own.delay_samples / sums.gain.driver.delay_width)
+    rows = sums.rows(sums.by_changes(sums.around))
     covariance = jnp.block(
         [
             [bread, bread @ slope.T],
@@ -239,11 +227,11 @@ def _is_another(
     )
     spread = jnp.zeros_like(covariance).at[: bread.shape[0], : bread.shape[0]]
     found = other_circuit.scores(
-        jnp.pad(seen.rows, ((0, 0), (0, 1))),  # no change affects the prior of the delay
+        jnp.pad(rows, ((0, 0), (0, 1))),  # no change affects the prior of the delay
         seen.linear,
-        seen.terms,
+        terms,
         # At the minimum the other terms have the opposite gradient.
-        -seen.linear.jacobian @ seen.terms,
+        -seen.linear.jacobian @ terms,
         spread.set(score - eliminated.rest.score),
         covariance,
         slice(common.size, common.size + own.log_elements.size),
@@ -279,9 +267,10 @@ def _influence(
     eliminated: _Eliminated,
 ) -> tuple[Float[Array, "x common"], Float[Array, "x own"]]:
     """Effect of unit noise in X on the score of `common`, and on the own parameters."""
-    g, known, _, linear, _ = _seen(study, load, common, own)
-    jacobian = linear.jacobian.T
-    size = jnp.where(known.selected, jnp.sqrt(known.variance_x / variance(known, g)), 0.0)
+    seen = _seen(study, load, common, own)
+    known, every = seen.known, knots(seen.gain.size)
+    jacobian, g = seen.linear.jacobian.T, seen.sums.slopes.gain
+    size = every.at(jnp.sqrt(known.variance_x / variance(known, seen.gain)))
     re, im = g.real * size, g.imag * size
     real, imaginary = jacobian[: g.size], jacobian[g.size : 2 * g.size]
     by_x = jnp.concatenate(
@@ -307,7 +296,10 @@ def _sums(
     The second result is the covariance of the score that this correlation adds.
     """
     c = common.shape[0]
-    start = (jnp.zeros((records, 2 * loads.spectrum.x.shape[1], c)), jnp.zeros((c, c)))
+    start = (
+        jnp.zeros((records, 2 * knots(loads.spectrum.x.shape[1]).index.size, c)),
+        jnp.zeros((c, c)),
+    )
     if not records:
         return start
 

@@ -42,14 +42,14 @@ def _equations(_, y: Float[Array, " parameter"], study: DriverStudy) -> Arrowhea
 
         def one(load: Loads, own: LoadUnknowns) -> NormalEquations:
             lane = study.lane(driver, load)
-            part, jacobian = lane.jacobian(jnp.concatenate([own.vector(), driver.mean]))
+            alone = lane.equations(jnp.concatenate([own.vector(), driver.mean]))
             late = own.delay_samples / width
             slope = LoadUnknowns(jnp.zeros_like(own.log_elements), 1 / width)
             slope = jnp.concatenate([slope.vector(), jnp.zeros_like(driver.mean)])
             found = NormalEquations(
-                0.5 * (jnp.dot(part, part) + late**2),
-                jacobian @ part + late * slope,
-                jacobian @ jacobian.T + jnp.outer(slope, slope),
+                alone.objective + 0.5 * late**2,
+                alone.gradient + late * slope,
+                alone.matrix + jnp.outer(slope, slope),
             ).finite()
             return jax.tree.map(lambda leaf: jnp.where(load.used, leaf, 0.0), found)
 
@@ -93,11 +93,10 @@ def _second_order(
         def one(load: Loads, own: LoadUnknowns, step: LoadUnknowns) -> Float[Array, " q"]:
             lane = study.lane(driver, load)
             at, way = own.vector(), step.vector()
-            _, jacobian = lane.jacobian(jnp.concatenate([at, driver.mean]))
-            count = jacobian.shape[1]  # number of the terms that are not linear
-            bent = sum(study.lane(end, load)(at + h * way)[:count] for h, end in ends)
-            bent = (bent - 2 * lane(at)[:count]) / DIFFERENCE**2
-            return jnp.where(load.used, jacobian @ bent, 0.0)
+            bent = sum(study.lane(end, load).residual(at + h * way) for h, end in ends)
+            middle, pullback = jax.vjp(lane.residual, jnp.concatenate([at, driver.mean]))
+            (found,) = pullback((bent - 2 * middle) / DIFFERENCE**2)
+            return jnp.where(load.used, found, 0.0)
 
         return in_turn(one, loads, owns, steps)
 
@@ -189,7 +188,7 @@ def fit_alone(
     load = Load.behind(driver, model.circuit, spectrum, sample_rate)
     solution = refined(load, best_start(load, candidates.vector()))
     squares = 2 * solution.stats["normal_equations"].objective
-    chi2 = squares / (2 * jnp.sum(spectrum.selected, dtype=squares.dtype) - load.owned)
+    chi2 = squares / (2 * jnp.sum(spectrum.selected, dtype=squares.dtype) - load.gain.owned)
     g, known = load.predicted(solution.value)
     error = complex_rrse(g * spectrum.x, spectrum.y, spectrum.selected)
     return LoadUnknowns.of(solution.value), solution.result, chi2, error, shows_hum(known, g)

@@ -41,6 +41,7 @@ from etid.estimators.starts import current_starts, harmonic_starts
 from etid.estimators.unknowns import LoadUnknowns
 from etid.results.driver import HarmonicDriver
 from etid.signals.harmonics import Spectrum
+from etid.signals.knots import Knots
 from etid.signals.transfer import as_complex, reciprocal
 from etid.solvers.matrices import inverse_root
 
@@ -85,6 +86,10 @@ class AbstractGiven(eqx.Module):
         """V_out per input at W₀ + w."""
 
     @abc.abstractmethod
+    def at_knots(self, knots: Knots) -> "AbstractGiven":
+        """The same at the knots of the harmonics, without an estimate of X."""
+
+    @abc.abstractmethod
     def informed(self, spectrum: Spectrum) -> tuple[Spectrum, UnloadedSlopes | None]:
         """A recording with X estimated by the calibrations at z = 0, and derivatives of X."""
 
@@ -127,6 +132,10 @@ class GivenCurrent(AbstractGiven):
         """Z_L."""
         del w
         return load
+
+    def at_knots(self, knots: Knots) -> "GivenCurrent":
+        """The same at the knots of the harmonics."""
+        return GivenCurrent.at(knots.at(self.frequency))
 
     def informed(self, spectrum: Spectrum) -> tuple[Spectrum, None]:
         """The recording itself."""
@@ -196,6 +205,20 @@ class GivenDriver(AbstractGiven):
         """Starts at several impedance levels, and a simpler estimate."""
         z_th = self.z_th(jnp.zeros_like(self.loaded))
         return harmonic_starts(spectrum, sample_rate, z_th, circuit)
+
+    def at_knots(self, knots: Knots) -> "GivenDriver":
+        """The same at the knots of the harmonics, without an estimate of X."""
+        return dataclasses.replace(
+            self,
+            frequency=knots.at(self.frequency),
+            loaded=knots.at(self.loaded),
+            w_slope=knots.at(self.w_slope),
+            slope=knots.at(self.slope),
+            records=None,
+            gains=None,
+            gain_slopes=None,
+            shape=None,
+        )
 
     def informed(self, spectrum: Spectrum) -> tuple[Spectrum, UnloadedSlopes | None]:
         """A recording with X estimated by the calibrations at z = 0, and derivatives of X."""
