@@ -103,10 +103,14 @@ the folder. A recording without a `path` is then named by its file, as in `loade
 | `.mat` | variables, `a.b` for field b of structure a | nothing | rows | `etid[matlab]` |
 | `.tdms` | `group/channel` | units (`unit_string`), rate (`wf_increment`) | none | `etid[tdms]` |
 | `.abf` | ADC channels, or `channel 0`, … | units and rate | sweeps | `etid[abf]` |
+| `.npz` | arrays | nothing | rows | |
+| `.wav` | `1`, `2`, …, as fractions of full scale | rate | none | |
+| `.lvm` | columns of LabVIEW, one header per file | units, rate (`Delta_X`) | none | |
+| `.xlsx` | columns; further sheets `sheet/column` | units as in CSV | none | `etid[excel]` |
 
-The import keeps only a part of a record in memory. MATLAB files before version 7.3 are the
-exception: they are read completely, and only they need `etid[matlab]`. Integer codes stay integers
-if a straight line converts them to volts.
+The import keeps only a part of a record in memory. MATLAB files before version 7.3, `.npz` files
+and records that are split are the exceptions; only the first need `etid[matlab]`. Integer codes
+stay integers if a straight line converts them to volts.
 
 A mapping is TOML. Each `[[recording]]` is a recording or a stack of trials. Keys above the first
 `[[recording]]` hold for all of them. The keys are:
@@ -126,6 +130,8 @@ A mapping is TOML. Each `[[recording]]` is a recording or a stack of trials. Key
 - `pulse_rate` [Hz].
 - `scale`: the values of `v_th` and `v_out` divided by this are volts at the terminal. Give 1 if
   they are already volts at the terminal.
+- `split`: one long record becomes several trials. `"pulses"` splits it at the pauses between its
+  pulses, the name of a trigger channel at the rising edges of the trigger.
 - `path` of the recording in the etid file. Several trials become `path/0`, `path/1`, …. Without a
   path, a single `[[recording]]` becomes `loaded/0`, …, or with `r_load` `calibration/0`, ….
 - FIELDS: as in the tables above. `trial` may be a list with one label per trial.

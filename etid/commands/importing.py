@@ -1,4 +1,4 @@
-"""Convert a laboratory file (.csv, .mat, .tdms, .abf, .npz) into an etid file."""
+"""Convert laboratory files (.csv, .mat, .tdms, .abf, .npz, .wav, .lvm, .xlsx) to an etid file."""
 
 import argparse
 import dataclasses
@@ -47,6 +47,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         _option(parser, name, help=channel(name, signal.unit))
     _option(parser, "time", help=f"{channel('the time', 'second')}; replaces --sample-rate")
     _option(parser, "scale", float, "divisor of the voltages: volt at the terminal = value / scale")
+    _option(
+        parser,
+        "split",
+        help="split one long record into trials: 'pulses' at the pauses between its pulses, or the "
+        "channel of a trigger",
+    )
     for name, field in DECLARED.items():
         if field.type in ("number", "label"):
             unit = f" [{field.unit}]" if field.unit else ""

@@ -12,11 +12,12 @@ import numpy as np
 
 from etid.files.channel import Channel, located
 from etid.files.clock import sample_rate
-from etid.files.mapping import KINDS, Plan, Signal, unit_of
+from etid.files.mapping import KINDS, PAUSES, Plan, Signal, unit_of
 from etid.files.units import Unit
 from etid.recordings import limits
 from etid.recordings.fields import SIGNALS, Metadata, metadata_from
 from etid.recordings.recording import AbstractSource, Layout, Recording, RecordingError, Samples
+from etid.recordings.splitting import by_pauses, by_trigger
 
 # [pulse periods] A matrix with more trials than samples and with shorter trials must be transposed.
 _SHORTEST_STACKED = 0.1
@@ -167,17 +168,20 @@ def sources_of(
             field="v_out",
             remedy="Rows are trials, columns are times: transpose the variables",
         )
-    labels = _labels(plan.fields.get("trial"), trials, stacked)
+    parts = _parts(plan, channels, channel, common)
+    several = stacked or bool(parts)
+    trials = list(range(len(parts))) if parts else trials
+    labels = _labels(plan.fields.get("trial"), trials, several)
     sources: dict[str, AbstractSource] = {}
     for index, label in enumerate(labels):
         records = {}
         for name in SIGNALS:
             if name in channels:
                 factor = units[name][0].factor / (plan.signals[name].scale or 1.0)
-                own = channels[name]
+                own = channels[name].part(parts[index]) if parts else channels[name]
                 trial = rows[name][index if len(rows[name]) > 1 else 0]
                 records[name] = _Record(own, trial, own.conversion * factor, own.offset * factor)
-        path = f"{plan.path}/{index}" if stacked or plan.path in KINDS else plan.path
+        path = f"{plan.path}/{index}" if several or plan.path in KINDS else plan.path
         metadata = metadata_from(**{**vars(common), "trial": label, "path": path})
         sources[path] = _Source(file, metadata, records)
     used = {
@@ -189,7 +193,32 @@ def sources_of(
         )
         for name, signal in plan.signals.items()
     }
-    return sources, Imported(tuple(sources), length, rate, rate_by, common.pulse_rate, used)
+    samples = parts[0].stop - parts[0].start if parts else length
+    return sources, Imported(tuple(sources), samples, rate, rate_by, common.pulse_rate, used)
+
+
+def _parts(
+    plan: Plan,
+    channels: Mapping[str, Channel],
+    channel: Callable[[str], Channel],
+    common: Metadata,
+) -> list[slice]:
+    """The trials of one long record; empty if it is not to be split."""
+    if not plan.split:
+        return []
+    by_pulses = plan.split == PAUSES
+    asked = channels["v_th"] if by_pulses else channel(plan.split)
+    for one in (*channels.values(), asked):
+        if len(one.shape) != 1:
+            raise RecordingError(
+                f"channel {one.name!r} has shape {one.shape}; only a channel of shape (time,) can "
+                "be split",
+                field="split",
+            )
+    samples = np.concatenate(list(asked.blocks())).astype(float)
+    if by_pulses:
+        return by_pauses(samples, common.sample_rate, common.pulse_rate)
+    return by_trigger(samples, channels["v_out"].length)
 
 
 def _unit(name: str, signal: Signal, said: str) -> tuple[Unit, str]:

@@ -81,6 +81,16 @@ class Channel:
                 )
             yield block
 
+    def part(self, place: slice) -> "Channel":
+        """Some samples of a channel of shape (time,)."""
+        start = place.start
+
+        def read(trial: int, first: int, last: int) -> np.ndarray:
+            return self.read(trial, start + first, start + last)
+
+        name = f"{self.name}[{start}:{place.stop}]"
+        return dataclasses.replace(self, name=name, shape=(place.stop - start,), read=read)
+
 
 def _nothing(names: Iterable[str]) -> None:
     del names

@@ -15,7 +15,7 @@ from etid.files.assemble import Imported, Used, sources_of
 from etid.files.channel import located
 from etid.files.clock import check_spacing
 from etid.files.mapping import CHANNELS, of_files, plans, read_mapping
-from etid.files.readers import abf, delimited, matlab, npz, tdms
+from etid.files.readers import abf, delimited, excel, lvm, matlab, npz, tdms, wav
 from etid.recordings.fields import LABELS
 from etid.recordings.recording import AbstractSource, RecordingError
 from etid.recordings.study import Study, refuse_nested
@@ -25,6 +25,10 @@ READERS = {
     ".mat": matlab.opened,
     ".tdms": tdms.opened,
     ".abf": abf.opened,
+    ".npz": npz.opened,
+    ".wav": wav.opened,
+    ".lvm": lvm.opened,
+    ".xlsx": excel.opened,
 }
 _IMPLIED = {"v_th": "V", "v_out": "V", "current": "A", "time": "s"}
 
@@ -44,8 +48,16 @@ def import_file(
       files before version 7.3 need `pip install etid[matlab]`.
     - `.tdms`: channels `group/channel` of NI files. They need `pip install etid[tdms]`.
     - `.abf`: ADC channels of Axon files; sweeps become trials. They need `pip install etid[abf]`.
-    - `.npz`: converter codes with all fields (see `etid.files.readers.npz`). Only labels can be
-      given, without `trial`. The default condition is the name of the file.
+    - `.npz`: arrays of shape (time,) or (trial, time). If the arrays are those of
+      `etid.files.readers.npz.recordings`, the file contains all fields: only labels can be given,
+      without `trial`, and the default condition is the name of the file.
+    - `.wav`: channels `1`, `2`, …, as fractions of full scale.
+    - `.lvm`: channels of a LabVIEW measurement file.
+    - `.xlsx`: columns with a header line; `sheet/column` for the second and further sheets. They
+      need `pip install etid[excel]`.
+
+    With `split`, one long record becomes several trials: `"pulses"` splits it at the pauses between
+    its pulses, the name of a trigger channel at the rising edges of the trigger.
 
     A mapping assigns channels to signals; data_schema/README.md lists its keys. For one recording,
     arguments with the same names can replace the mapping. With arguments, a channel without a unit
@@ -54,12 +66,11 @@ def import_file(
     recording has the name of its file: `loaded/finger` from `finger.csv`. In a mapping, each
     recording then has the key `file`, the name of its file without the folder.
 
-    Only a part of a record is in memory at a time, except for MATLAB files before version 7.3 and
-    for `.npz`.
+    Only a part of a record is in memory at a time, except for MATLAB files before version 7.3,
+    `.npz`, and records that are split.
 
     Args:
-        source: File or files to import; the suffix of a file gives its format. Of an npz file only
-            one can be imported.
+        source: File or files to import; the suffix of a file gives its format.
         target: etid file to write. An existing file is replaced.
         mapping: TOML file, or its content as a mapping. It replaces all other arguments.
         calibrations: More files to import, each with its known resistor, `r_load` [ohm]. All other
@@ -85,7 +96,7 @@ def import_file(
     if not folder.is_dir():
         raise RecordingError("the folder of this file does not exist", file=os.fspath(target))
     given = {name: value for name, value in given.items() if value is not None}
-    if len(paths) == 1 and paths[0].suffix.lower() == ".npz":
+    if len(paths) == 1 and _is_complete(paths[0]):
         own = {name for name in LABELS if name in given and name != "trial"}
         labels = {name: given.pop(name) for name in own}
         _refuse(given | ({} if mapping is None else {"mapping": mapping}), str(paths[0]),
@@ -94,8 +105,7 @@ def import_file(
     for path in paths:
         if path.suffix.lower() not in READERS:
             raise RecordingError(
-                f"etid cannot import files with the suffix {path.suffix!r}"
-                + " together with others" * (path.suffix.lower() == ".npz"),
+                f"etid cannot import files with the suffix {path.suffix!r}",
                 file=str(path),
                 remedy=f"Export it as one of {', '.join(READERS)}, or write an etid file with h5py",
             )
@@ -133,8 +143,7 @@ def import_file(
                 with located(place + file):
                     name = path.stem if len(paths) > 1 else ""
                     planned = plans(told, contents.names, implied, name)
-                wanted = {one.channel for plan in planned for one in plan.signals.values()}
-                contents.prepare(wanted)
+                contents.prepare({name for plan in planned for name in plan.channels})
                 for plan in planned:
                     with located(file, path=plan.path if len(planned) > 1 else ""):
                         found, made_of = sources_of(plan, contents.channel, file, by)
@@ -154,6 +163,14 @@ def import_file(
             refuse_nested(sources)
             Study(sources).write(target)
     return used
+
+
+def _is_complete(path: pathlib.Path) -> bool:
+    """Whether a file is an npz archive that contains all fields of its recordings."""
+    if path.suffix.lower() != ".npz":
+        return False
+    with located(str(path)):
+        return npz.is_complete(path)
 
 
 def _refuse(given: Mapping[str, Any], file: str, reason: str) -> None:

@@ -20,7 +20,8 @@ from etid.recordings.fields import DECLARED, SIGNALS, check_names, tidy_path
 from etid.recordings.recording import RecordingError
 
 CHANNELS = (*SIGNALS, "time")
-FIELDS = (*DECLARED, "scale")
+FIELDS = (*DECLARED, "scale", "split")
+PAUSES = "pulses"  # a record that is split at the pauses between its pulses
 KEYS = ("channel", "unit", "scale", "rows")  # keys of a signal
 KINDS = ("loaded", "calibration")  # default paths of recordings without a path
 _KEY = "key of a mapping"
@@ -54,12 +55,21 @@ class Plan:
     Attributes:
         path: HDF5 path.
         signals: `v_th`, `v_out` and, if the mapping names them, `current` and `time`.
-        fields: All other keys of the mapping except `path` and `scale`.
+        fields: All other keys of the mapping except `path`, `scale` and `split`.
+        split: `PAUSES`, or the channel of a trigger, if trials are parts of one long record; empty
+            otherwise.
     """
 
     path: str
     signals: Mapping[str, Signal]
     fields: Mapping[str, Any]
+    split: str = ""
+
+    @property
+    def channels(self) -> set[str]:
+        """Names of all channels that are read."""
+        trigger = {self.split} - {"", PAUSES}
+        return {one.channel for one in self.signals.values()} | trigger
 
 
 def read_mapping(path: str | os.PathLike[str]) -> dict[str, Any]:
@@ -207,7 +217,14 @@ def _plan(
         for name, value in said.items()
         if name in DECLARED
     }
-    return Plan(path, signals, fields)
+    split = said.get("split", "")
+    if not isinstance(split, str):
+        raise RecordingError(
+            f"is {split!r}, must be {PAUSES!r} or the channel of a trigger", field="split"
+        )
+    if split not in ("", PAUSES):
+        chosen(names, split, "split")
+    return Plan(path, signals, fields, split)
 
 
 def _missing(name: str, known: str = "", hint: str = "") -> RecordingError:

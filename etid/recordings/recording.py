@@ -20,6 +20,7 @@ from jaxtyping import Float
 
 from etid.circuits.overview import Overview, Overviewed
 from etid.recordings.errors import RecordingError as RecordingError
+from etid.recordings.errors import located
 from etid.recordings.fields import (
     DECLARED,
     LABELS,
@@ -29,6 +30,7 @@ from etid.recordings.fields import (
     Metadata,
     metadata_from,
 )
+from etid.recordings.splitting import by_pauses, by_trigger
 from etid.recordings.values import real
 
 SYMBOLS = {"hertz": "Hz", "ohm": "Ω", "volt": "V"}
@@ -221,6 +223,39 @@ class Recording(Overviewed, AbstractFields):
                 remedy="Pass the driver of this recording, from etid.identify_driver",
             )
         return self if "v_th" not in self.samples else self.replace(v_th=None)
+
+    def split(self, trigger: npt.ArrayLike | None = None) -> "list[Recording]":
+        """The trials of one long recording.
+
+        Args:
+            trigger: Voltage of a trigger channel, as long as the records: a trial lasts from one
+                rising edge to the next. If not given, trials are the trains of pulses between
+                pauses.
+
+        Returns:
+            Recordings with the paths `PATH/0`, `PATH/1`, … and these numbers as `trial`.
+
+        Raises:
+            RecordingError: There is no pause and no edge of the trigger, or the trigger has another
+                length.
+        """
+        with located(path=self.path):
+            if trigger is None:
+                parts = by_pauses(self.v_th, self.sample_rate, self.pulse_rate)
+            else:
+                parts = by_trigger(np.asarray(trigger, float), self.v_th.size)
+        whole = self.path or self.metadata.kind
+        return [
+            self.replace(
+                **{
+                    name: Samples(of.stored[part], of.conversion, of.offset)
+                    for name, of in self.samples.items()
+                },
+                trial=number,
+                path=f"{whole}/{number}",
+            )
+            for number, part in enumerate(parts)
+        ]
 
     def __reduce__(self) -> tuple:
         # A read-only mapping cannot be pickled.

@@ -5,12 +5,14 @@ import difflib
 import itertools
 import os
 from collections.abc import Callable, Collection, Hashable, Iterable, Iterator, Mapping
+from typing import Any, Unpack
 
+import numpy as np
 import numpy.typing as npt
 
 from etid.circuits.overview import ROWS, Overview, Overviewed
-from etid.recordings.fields import LABELS, Label, Metadata, wanted_labels
-from etid.recordings.recording import AbstractSource, Layout, Recording, RecordingError
+from etid.recordings.fields import LABELS, Given, Label, Metadata, wanted_labels
+from etid.recordings.recording import AbstractSource, Layout, Recording, RecordingError, Samples
 from etid.recordings.writing import write
 
 
@@ -112,6 +114,39 @@ class Study(Overviewed, Mapping[str, Recording]):
             sources[recording.path] = _InMemory(recording)
         refuse_nested(sources)
         return cls(sources)
+
+    @classmethod
+    def from_arrays(
+        cls,
+        v_th: npt.ArrayLike,
+        v_out: npt.ArrayLike,
+        *,
+        calibrations: Mapping[float, tuple[npt.ArrayLike, npt.ArrayLike]] | None = None,
+        **fields: Unpack[Given],
+    ) -> "Study":
+        """A study in memory from arrays, as in a notebook.
+
+        Args:
+            v_th: Unloaded output of the driver [V], (trial, time), or (time,) for all trials.
+            v_out: Output with the load [V], (trial, time) or (time,).
+            calibrations: Records (v_th, v_out) of the same shapes with a known resistor, by its
+                resistance [ohm].
+            **fields: Fields of all recordings, as in `Recording`. The number of a trial is its
+                `trial`.
+
+        Returns:
+            Study of `calibration/0`, … and `loaded/0`, …, which name these calibrations.
+
+        Raises:
+            RecordingError: A field is wrong, or the arrays do not fit each other.
+        """
+        found: list[Recording] = []
+        for r_load, (th, out) in (calibrations or {}).items():
+            place = f"calibration/{len(found)}"
+            found += _trials(th, out, place, {**fields, "r_load": r_load})
+        known = tuple(one.path for one in found)
+        named: dict[str, Any] = {"calibration": known} if known else {}
+        return cls.from_recordings([*found, *_trials(v_th, v_out, "loaded", {**fields, **named})])
 
     def __getitem__(self, path: str) -> Recording:
         return self.source(path).load()
@@ -256,6 +291,29 @@ class Study(Overviewed, Mapping[str, Recording]):
         return (
             f"<Study{place}: {calibrations} calibrations, {len(self) - calibrations} loaded{bad}>"
         )
+
+
+def _trials(
+    v_th: npt.ArrayLike, v_out: npt.ArrayLike, path: str, fields: Mapping[str, Any]
+) -> list[Recording]:
+    """One recording for each row of `v_out`."""
+    th, out = np.asarray(v_th), np.asarray(v_out)
+    if out.ndim == 1 and path.startswith("calibration"):
+        return [Recording(th, out, path=path, **fields)]
+    rows = np.atleast_2d(out)
+    shared = th.ndim == 1
+    if rows.ndim != 2 or (not shared and th.shape != rows.shape):
+        raise RecordingError(
+            f"shapes do not fit each other: v_th {th.shape}, v_out {out.shape}",
+            path=path,
+            remedy="Both must be (trial, time) or (time,); v_th may be (time,) for all trials",
+        )
+    unloaded = Samples(th) if shared and th.dtype.kind == "f" else th
+    found = []
+    for number, row in enumerate(rows):
+        own: dict[str, Any] = {"trial": number, **fields, "path": f"{path}/{number}"}
+        found.append(Recording(unloaded if shared else th[number], row, **own))
+    return found
 
 
 def _opened(file: str, paths: Iterable[str]) -> Study:

@@ -95,7 +95,7 @@ def opened(path: pathlib.Path, folder: pathlib.Path, **told: Any) -> Iterator[Co
             nonlocal count
             for name in wanted:
                 columns[name] = files.enter_context(tempfile.TemporaryFile(dir=folder))
-            count = _spool(
+            count = spool(
                 path, dialect, skipped, {names.index(name): columns[name] for name in columns}
             )
 
@@ -166,10 +166,8 @@ def _header(text: TextIO, dialect: Dialect) -> tuple[tuple[str, ...], tuple[str,
         raise RecordingError(
             "the first line holds numbers", remedy="The first line must name the columns"
         )
-    found = [_WITH_UNIT.fullmatch(cell) for cell in cells]
-    known = [match if match and parse_unit(match["unit"]) else None for match in found]
-    names = [match["name"] if match else cell for match, cell in zip(known, cells, strict=True)]
-    units = [match["unit"].strip() if match else "" for match in known]
+    both = [with_unit(cell) for cell in cells]
+    names, units = [name for name, _ in both], [unit for _, unit in both]
     below = [cell.strip("()[] ") for cell in dialect.cells(text.readline())]
     if len(below) != len(names) or not any(below) or any(map(dialect.is_number, below)):
         return tuple(names), tuple(units), skipped + 1
@@ -183,7 +181,15 @@ def _header(text: TextIO, dialect: Dialect) -> tuple[tuple[str, ...], tuple[str,
     return tuple(names), tuple(above or unit for above, unit in both), skipped + 2
 
 
-def _spool(path: pathlib.Path, dialect: Dialect, skipped: int, columns: dict[int, BinaryIO]) -> int:
+def with_unit(cell: str) -> tuple[str, str]:
+    """Name and unit of a column, from `name [unit]` or `name (unit)`; the unit may be empty."""
+    match = _WITH_UNIT.fullmatch(cell)
+    if match is None or not parse_unit(match["unit"]):
+        return cell, ""
+    return match["name"], match["unit"].strip()
+
+
+def spool(path: pathlib.Path, dialect: Dialect, skipped: int, columns: dict[int, BinaryIO]) -> int:
     """Write columns to files as real numbers, and return the number of rows."""
     rows = 0
     with path.open(newline="", encoding=dialect.encoding) as text:

@@ -1,17 +1,49 @@
-"""Reader for NumPy archives with converter codes and all fields of the recordings."""
+"""Reader for NumPy archives: named arrays, or converter codes with all fields of the recordings."""
 
+import contextlib
 import math
 import pathlib
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from etid.files.channel import chosen
+from etid.files.channel import Channel, Contents, chosen, real
 from etid.recordings import limits
 from etid.recordings.recording import Recording, RecordingError, Samples
+
+KEYS = ("adc_th", "adc_out", "adc_ref", "R_ref", "fs", "f0", "lsb", "scale")
+
+
+def is_complete(path: pathlib.Path) -> bool:
+    """Whether an archive has all fields of its recordings, under the names of `recordings`."""
+    if not zipfile.is_zipfile(path):
+        raise RecordingError("is not an npz file")
+    with np.load(path, allow_pickle=False) as archive:
+        return all(key in archive.files for key in KEYS[:2])
+
+
+@contextlib.contextmanager
+def opened(path: pathlib.Path, folder: pathlib.Path) -> Iterator[Contents]:
+    """Arrays of any other archive; each is a channel of shape (time,) or (trial, time)."""
+    del folder
+    if not zipfile.is_zipfile(path):
+        raise RecordingError("is not an npz file")
+    with np.load(path, allow_pickle=False) as archive:
+
+        def channel(name: str) -> Channel:
+            _check_size(archive, name)
+            array = np.atleast_1d(archive[name])
+            real(name, array.dtype, array.shape)
+
+            def read(trial: int, start: int, stop: int) -> np.ndarray:
+                return (array if array.ndim == 1 else array[trial])[start:stop]
+
+            return Channel(name, array.shape, array.dtype, read)
+
+        yield Contents(tuple(archive.files), channel)
 
 
 def recordings(path: pathlib.Path, labels: Mapping[str, Any]) -> list[Recording]:
@@ -22,17 +54,14 @@ def recordings(path: pathlib.Path, labels: Mapping[str, Any]) -> list[Recording]
     are `calibration/0`, … and `loaded/0`, …. The archive has no unloaded records for the
     calibrations, so all calibrations share `adc_th[0]`.
     """
-    if not zipfile.is_zipfile(path):
-        raise RecordingError("is not an npz file")
     with np.load(path, allow_pickle=False) as archive:
-        keys = ("adc_th", "adc_out", "adc_ref", "R_ref", "fs", "f0", "lsb", "scale")
-        for key in keys:
+        for key in KEYS:
             chosen(archive.files, key, key)
             _check_size(archive, key)
-        held = {key: archive[key] for key in keys}
+        held = {key: archive[key] for key in KEYS}
     th, out, ref, known = (held[key] for key in ("adc_th", "adc_out", "adc_ref", "R_ref"))
     if th.ndim != 2 or th.shape != out.shape or ref.ndim != 2 or known.shape != ref.shape[:1]:
-        found = ", ".join(f"{key} {held[key].shape}" for key in keys[:4])
+        found = ", ".join(f"{key} {held[key].shape}" for key in KEYS[:4])
         raise RecordingError(
             f"shapes do not fit each other: {found}",
             remedy="adc_th and adc_out are (trial, time), adc_ref (resistor, time), "
@@ -44,7 +73,7 @@ def recordings(path: pathlib.Path, labels: Mapping[str, Any]) -> list[Recording]
                 f"has dtype {held[key].dtype}; all codes must have the same integer dtype",
                 field=key,
             )
-    rate, pulses, step, scale = (_number(held[key], key) for key in keys[4:])
+    rate, pulses, step, scale = (_number(held[key], key) for key in KEYS[4:])
     if scale == 0:
         raise RecordingError("is 0", field="scale")
     conversion = step / scale

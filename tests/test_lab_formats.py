@@ -1,0 +1,194 @@
+"""WAV, LabVIEW, Excel and npz files, arrays, and one long record that holds several trials."""
+
+import numpy as np
+import pytest
+import scipy.io.wavfile
+
+import etid
+from etid import RecordingError
+from etid.recordings import hdf5
+
+RATE, PULSES = 20e3, 60.0
+PERIOD = RATE / PULSES
+FIELDS = {"pulse_rate": PULSES, "scale": 1.0}
+
+
+def pulses(periods=6, before=0):
+    """Pulses of 48 V, and what a divider leaves of them."""
+    time = np.arange(round(periods * PERIOD)) + 0.5 * PERIOD
+    th = np.where(time % PERIOD < 0.04 * PERIOD, 48.0, 0.0)
+    th = np.concatenate([np.zeros(before), th])
+    return th, 0.75 * th
+
+
+def long_record():
+    """Three trains of 4, 6 and 5 pulses with pauses."""
+    trains = [pulses(count, before=2000)[0] for count in (4, 6, 5)]
+    th = np.concatenate([*trains, np.zeros(2000)])
+    return th, 0.75 * th
+
+
+def imported(path, **given):
+    target = path.with_suffix(".h5")
+    used = etid.import_file(path, target, **{**FIELDS, **given})
+    with hdf5.read(target) as study:
+        assert study.problems == {}
+        return list(study.recordings()), used
+
+
+@pytest.mark.parametrize("kind", [np.int16, np.int32, np.uint8, np.float32])
+def test_a_wav_file_holds_fractions_of_full_scale(kind, tmp_path):
+    th, out = pulses()
+    both = np.stack([th, out], axis=1) / 100
+    full = {np.int16: 2**15, np.int32: 2**31, np.uint8: 2**7, np.float32: 1}[kind]
+    middle = 128 if kind is np.uint8 else 0
+    codes = (both * full + middle).round(0 if full > 1 else 9).astype(kind)
+    scipy.io.wavfile.write(tmp_path / "a.wav", int(RATE), codes)
+    [recording], [used] = imported(tmp_path / "a.wav", v_th="1", v_out="2", scale=0.01)
+    assert (recording.sample_rate, used.rate_by) == (RATE, "file")
+    np.testing.assert_allclose(recording.v_th, th, atol=100 / full if full > 1 else 1e-5)
+    np.testing.assert_allclose(recording.v_out, out, atol=100 / full if full > 1 else 1e-5)
+
+
+LVM = """\
+LabVIEW Measurement\t
+Writer_Version\t2
+Separator\t{name}
+Decimal_Separator\t{decimal}
+Multi_Headings\tNo
+X_Columns\t{columns}
+***End_of_Header***\t
+\t
+Channels{s}2{s}{s}
+Samples{s}{count}{s}{count}{s}
+Y_Unit_Label{s}Volts{s}mV{s}
+X0{s}0{s}0{s}
+Delta_X{s}{step}{s}{step}{s}
+***End_of_Header***{s}{s}{s}
+X_Value{s}open{s}finger{s}Comment
+"""
+
+
+@pytest.mark.parametrize(
+    ("name", "s", "decimal", "columns"),
+    [("Tab", "\t", ".", "One"), ("Tab", "\t", ",", "No"), ("Comma", ",", ".", "One")],
+)
+def test_a_labview_file_says_how_it_is_written(name, s, decimal, columns, tmp_path):
+    th, out = pulses()
+    step = f"{1 / RATE:.6E}".replace(".", decimal)
+    text = LVM.format(name=name, s=s, decimal=decimal, columns=columns, count=th.size, step=step)
+    rows = (
+        s.join(["" if columns == "No" else f"{i / RATE:.6f}", f"{a:.6f}", f"{1e3 * b:.6f}"])
+        for i, (a, b) in enumerate(zip(th, out, strict=True))
+    )
+    text += "\n".join(row.replace(".", decimal) for row in rows) + "\n"
+    (tmp_path / "a.lvm").write_text(text)
+    [recording], [used] = imported(tmp_path / "a.lvm", v_th="open", v_out="finger")
+    np.testing.assert_allclose(recording.v_out, out, atol=1e-6)
+    np.testing.assert_allclose(recording.v_th, th, atol=1e-6)
+    assert recording.sample_rate == RATE
+    assert str(used.signals["v_out"]) == "'finger' in mV (file)"
+
+
+def test_a_file_that_is_not_of_labview_is_refused(tmp_path):
+    (tmp_path / "a.lvm").write_text("time,a,b\n0,1,2\n")
+    with pytest.raises(RecordingError, match="is not a LabVIEW measurement file"):
+        imported(tmp_path / "a.lvm", v_th="a", v_out="b")
+
+
+def test_columns_of_a_workbook_have_the_names_of_their_first_row(tmp_path):
+    openpyxl = pytest.importorskip("openpyxl")
+    th, out = pulses(2)
+    book = openpyxl.Workbook()
+    book.active.append(["t (s)", "open", "finger [mV]"])
+    for i, (a, b) in enumerate(zip(th, out, strict=True)):
+        book.active.append([i / RATE, float(a), 1e3 * float(b)])
+    other = book.create_sheet("second")
+    for row in [["open"], *([2 * float(a)] for a in th)]:
+        other.append(row)
+    book.save(tmp_path / "a.xlsx")
+    [recording], _ = imported(tmp_path / "a.xlsx", v_th="open", v_out="finger", time="t")
+    np.testing.assert_allclose(recording.v_th, th)
+    np.testing.assert_allclose(recording.v_out, out)
+    assert recording.sample_rate == pytest.approx(RATE)
+    [recording], _ = imported(tmp_path / "a.xlsx", v_th="second/open", v_out="open", time="t")
+    np.testing.assert_allclose(recording.v_th, 2 * th)
+
+
+def test_arrays_of_an_npz_file_are_channels(tmp_path):
+    th, out = pulses()
+    np.savez(tmp_path / "a.npz", open=th, finger=np.stack([out, out / 2]), note=np.array("text"))
+    recordings, _ = imported(tmp_path / "a.npz", v_th="open", v_out="finger", sample_rate=RATE)
+    assert [one.path for one in recordings] == ["loaded/0", "loaded/1"]
+    np.testing.assert_array_equal(recordings[1].v_out, out / 2)
+    np.testing.assert_array_equal(recordings[1].v_th, th)
+    with pytest.raises(RecordingError, match="the names are 'open', 'finger', 'note'"):
+        imported(tmp_path / "a.npz", v_th="opn", v_out="finger", sample_rate=RATE)
+    with pytest.raises(RecordingError, match="must be an array of real numbers"):
+        imported(tmp_path / "a.npz", v_th="note", v_out="finger", sample_rate=RATE)
+
+
+def test_a_long_record_is_split_at_its_pauses(tmp_path):
+    th, out = long_record()
+    np.savez(tmp_path / "a.npz", th=th, out=out)
+    recordings, [used] = imported(
+        tmp_path / "a.npz", v_th="th", v_out="out", sample_rate=RATE, split="pulses"
+    )
+    assert [one.trial for one in recordings] == ["0", "1", "2"]
+    assert [round(one.periods, 2) for one in recordings] == [4, 6, 5]
+    assert used.paths == ("loaded/0", "loaded/1", "loaded/2")
+    for one in recordings:
+        rises = np.count_nonzero(np.diff(one.v_th) > 10)
+        assert rises == round(one.periods)
+        np.testing.assert_array_equal(one.v_out, 0.75 * one.v_th)
+    whole = etid.Recording(th, out, sample_rate=RATE, pulse_rate=PULSES, path="long")
+    for one, other in zip(whole.split(), recordings, strict=True):
+        np.testing.assert_array_equal(one.v_th, other.v_th)
+        assert one.path == f"long/{one.trial}"
+
+
+def test_a_long_record_is_split_at_the_edges_of_a_trigger(tmp_path):
+    th, out = long_record()
+    trigger = np.zeros(th.size)
+    for start in (1900, 1900 + 3600, 1900 + 7300):
+        trigger[start : start + 50] = 5.0
+    np.savez(tmp_path / "a.npz", th=th, out=out, trig=trigger)
+    recordings, _ = imported(
+        tmp_path / "a.npz", v_th="th", v_out="out", sample_rate=RATE, split="trig"
+    )
+    assert [one.v_th.size for one in recordings] == [3600] * len(recordings)
+    np.testing.assert_array_equal(recordings[1].v_th, th[5500:9100])
+    whole = etid.Recording(th, out, sample_rate=RATE, pulse_rate=PULSES)
+    np.testing.assert_array_equal(whole.split(trigger)[1].v_th, th[5500:9100])
+    assert whole.split(trigger)[1].path == "loaded/1"
+    with pytest.raises(RecordingError, match="no rising edge"):
+        whole.split(np.zeros(th.size))
+    with pytest.raises(RecordingError, match=r"has shape \(5,\), must be"):
+        whole.split(np.zeros(5))
+    with pytest.raises(RecordingError, match="without a pause"):
+        etid.Recording(*pulses(), sample_rate=RATE, pulse_rate=PULSES).split()
+    np.savez(tmp_path / "b.npz", th=th, out=np.stack([out, out]))
+    with pytest.raises(RecordingError, match="can be split"):
+        imported(tmp_path / "b.npz", v_th="th", v_out="out", sample_rate=RATE, split="pulses")
+
+
+def test_arrays_become_a_study():
+    th, out = pulses()
+    study = etid.Study.from_arrays(
+        th,
+        np.stack([out, out / 2]),
+        calibrations={98.8e3: (th, 0.9 * th), 21.6e3: (th, 0.6 * th)},
+        sample_rate=RATE,
+        pulse_rate=PULSES,
+        subject="s01",
+    )
+    assert list(study) == ["calibration/0", "calibration/1", "loaded/0", "loaded/1"]
+    assert study["calibration/1"].r_load == 21.6e3
+    loaded = study["loaded/1"]
+    assert (loaded.subject, loaded.trial) == ("s01", "1")
+    assert loaded.calibration == ("calibration/0", "calibration/1")
+    np.testing.assert_array_equal(loaded.v_out, out / 2)
+    with pytest.raises(RecordingError, match=r"v_th \(3, 2000\), v_out \(2, 2000\)"):
+        etid.Study.from_arrays(
+            np.stack([th] * 3), np.stack([out] * 2), sample_rate=RATE, pulse_rate=PULSES
+        )
