@@ -103,6 +103,7 @@ class ByNumPy:
         self.of_y = np.asarray(spectrum.variance_y)[used]
         self.s = 2j * np.pi * np.asarray(spectrum.frequency)[used]
         driver = load.gain.driver
+        assert isinstance(driver, GivenDriver)
         self.z_th = np.asarray(driver.z_th(load.gain.w(driver.mean)))[used]
         self.rate = float(load.gain.sample_rate)
         self.width = float(load.gain.widths(jnp.zeros(4))[-1])

@@ -102,9 +102,9 @@ def harmonic_starts(
         z_th: Source impedance at its harmonics [Ω].
         circuit: Structure and typical values.
     """
-    estimate = iteration.fit_skin(spectrum, z_th, sample_rate, START_STEPS)
-    starts = circuit_starts(circuit, estimate.circuit)
-    return LoadUnknowns(starts, jnp.zeros(starts.shape[0]).at[-1].set(estimate.delay_samples))
+    skin, delay = iteration.start_of_skin(spectrum, z_th, sample_rate, START_STEPS)
+    starts = circuit_starts(circuit, skin)
+    return LoadUnknowns(starts, jnp.zeros(starts.shape[0]).at[-1].set(delay))
 
 
 def source_starts(

@@ -47,6 +47,7 @@ from etid.estimators.steiglitz_mcbride.iteration import ITERATIONS, SETTLED
 from etid.results.driver import SourceImpedance
 from etid.results.fits import complex_rrse
 from etid.signals.harmonics import Spectrum
+from etid.signals.knots import knots
 from etid.signals.transfer import as_complex, power, reciprocal, turns
 
 RATE = 3e4  # [rad/s] rate of a skin's relaxation; in this unit the coefficients are near 1
@@ -191,11 +192,47 @@ def fit_skin(
     nothing = Iterate(
         typical, zero, jnp.array(jnp.inf), jnp.array(0), jnp.array(False), jnp.array(False)
     )
-    b0, a1 = typical.r_s + typical.r_p, RATE * typical.r_p * typical.c_p
-    start = jnp.stack([b0, typical.r_s * a1, a1, zero])
-    none = jnp.ones_like(z_th)
-    (best, *_), converged = jax.lax.scan(step, (nothing, start, none), jnp.arange(iterations))
+    start = nothing, _typical(), jnp.ones_like(z_th)
+    (best, *_), converged = jax.lax.scan(step, start, jnp.arange(iterations))
     return eqx.tree_at(lambda b: b.converged, best, converged[-1])
+
+
+def start_of_skin(
+    spectrum: Spectrum,
+    z_th: Complex[Array, " harmonic"],
+    sample_rate: Float[Array, ""],
+    iterations: int,
+) -> tuple[SkinRC, Float[Array, ""]]:
+    """The last iterate with its delay [samples], from sums at the knots: a start of other fits.
+
+    The products of the records are summed once; an iteration then takes a tenth of the time.
+
+    Args:
+        spectrum: Harmonics of a recording.
+        z_th: Source impedance at these harmonics [Ω].
+        sample_rate: Sampling rate of the recording [Hz].
+        iterations: Number of iterations.
+    """
+    every, fine = knots(z_th.size), _products(spectrum, z_th)
+    parts = jnp.stack([fine.xx, fine.yy, fine.xy.real, fine.xy.imag])
+    xx, yy, real, imaginary = every.summed(jnp.where(fine.used[None, :], parts, 0.0))
+    omega = every.at(fine.omega)
+    used = jnp.ones(omega.shape, bool)
+    of = _Products(omega, used, xx, yy, jax.lax.complex(real, imaginary), every.at(z_th))
+
+    def step(q: Float[Array, " coefficient"], _: None) -> tuple[Float[Array, " coefficient"], None]:
+        turn = omega * q[3]
+        return of.solve(q, jax.lax.complex(jnp.cos(turn), jnp.sin(turn))), None
+
+    q, _ = jax.lax.scan(step, _typical(), length=iterations)
+    return _elements(q), q[3] / RATE * sample_rate
+
+
+def _typical() -> Float[Array, " coefficient"]:
+    """Coefficients of typical skin without a delay."""
+    typical = SkinRC()
+    b0, a1 = typical.r_s + typical.r_p, RATE * typical.r_p * typical.c_p
+    return jnp.stack([b0, typical.r_s * a1, a1, jnp.zeros(())])
 
 
 def covariance(

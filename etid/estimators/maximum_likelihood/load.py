@@ -14,6 +14,7 @@ information is Re Σ_k conj(∂G_k) ∂G_k P_k with P = 2 |x̂|² / σ².
 """
 
 import dataclasses
+import math
 
 import equinox as eqx
 import jax
@@ -102,8 +103,8 @@ class Load(eqx.Module):
             q: Float[Array, " q"],
         ) -> tuple[Float[Array, ""], tuple[Complex[Array, " harmonic"], Spectrum]]:
             g, known = self.predicted(q)
-            part = residual(known, g)
-            return 0.5 * jnp.dot(part, part), (g, known)
+            weight = jnp.where(known.selected, 1 / variance(known, g), 0.0)
+            return jnp.dot(weight, power(known.y - g * known.x)), (g, known)
 
         (value, at), gradient = apart(jax.value_and_grad(objective, has_aux=True), q)
         jacobian = AtKnots.of(self, q, at).jacobian
@@ -239,9 +240,10 @@ NO_HUM = 5.0  # standard deviations of a wrong gain, above which it may pass for
 NEAR = 4.0  # χ² of the likeliest start; below this value the other starts are not tried
 # Half a standard error for 3000 terms.
 ROUGHLY = LevenbergMarquardt(rtol=1e-2, ftol=1e-3, equations=_equations)
-WELL = LevenbergMarquardt(rtol=SOLVER.rtol, ftol=SOLVER.ftol, equations=_equations)
-# From the minimum at the knots: damping would only hold back what the data hardly determine.
-AT_MINIMUM = dataclasses.replace(WELL, rtol=5e-5, damping=1e-9)
+WELL = LevenbergMarquardt(rtol=1e-4, ftol=SOLVER.ftol, equations=_equations)
+SETTLED = 0.005  # [standard errors] largest distance from the minimum, for any number of harmonics
+# Next to a minimum, damping would only hold back what the data hardly determine.
+SLIGHT = 1e-9
 
 
 def refined(
@@ -289,8 +291,11 @@ def fit_circuit(
     start = jax.lax.cond(near, lambda: likely, lambda: best_start(load, starts))
     sums = AtKnots.of(load, start)
     alone = refined(sums, start, ROUGHLY).value
-    together = refined(sums, jnp.concatenate([alone, driver.mean]), AT_MINIMUM).value
-    solution = refined(load, together, AT_MINIMUM)
+    well = dataclasses.replace(
+        WELL, rtol=min(WELL.rtol, SETTLED / math.sqrt(2 * spectrum.x.size)), damping=SLIGHT
+    )
+    together = refined(sums, jnp.concatenate([alone, driver.mean]), well).value
+    solution = refined(load, together, well)
     q = solution.value
     own, z = load.gain.split(q)
     g, known = apart(load.predicted, q)
