@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 import etid
+from etid.circuits.display import quantity
 from etid.circuits.overview import ROWS, Overview
 from etid.online.state import ElectrodeState, TrackerState
 from etid.results.driver import Calibration, ContinuousDriver, SourceImpedance
@@ -189,3 +190,18 @@ def test_a_change_of_verdict_changes_what_is_shown():
     shown = str(dataclasses.replace(fit(), result=verdict("flat")))
     assert "SkinRC: flat" in shown
     assert "Check the contact" in shown
+
+
+@pytest.mark.parametrize(
+    ("value", "error", "unit", "text"),
+    [
+        (33.4e3, 77.0, "ohm", "33.400 ± 0.077 kΩ"),
+        (5.5, 0.1, "ohm", "5.50 ± 0.10 Ω"),
+        (22e6, 1e6, "ohm", "22.0 ± 1.0 MΩ"),
+        (0.12e-9, 4e-13, "farad", "0.12000 ± 0.00040 nF"),
+        (47e-6, 1e-6, "farad", "47.0 ± 1.0 µF"),
+        (0.4e-12, 1e-14, "farad", "400 ± 10 fF"),
+    ],
+)
+def test_the_prefix_of_a_unit_fits_the_value(value, error, unit, text):
+    assert quantity(value, unit, error) == text

@@ -1,7 +1,10 @@
 """The report of a study: its numbers, what it leaves out, and the page as a browser sees it."""
 
+import base64
 import dataclasses
+import hashlib
 import html.parser
+import pathlib
 import re
 import shutil
 
@@ -131,7 +134,13 @@ def test_names_and_notes_of_a_file_are_text_and_nothing_else(page):
     seen = _Read(page)
     assert EVIL in seen.text
     assert "r_load <b>is</b> missing" in seen.text
-    assert not {"script", "b", "link", "iframe"} & set(seen.elements)
+    assert not {"b", "link", "iframe"} & set(seen.elements)
+    assert seen.elements.count("script") == 1  # that of etid, and its hash allows no other
+    script = (pathlib.Path(etid.__file__).parent / "report/templates/table.js").read_text("utf-8")
+    text = page.read_text("utf-8")
+    assert f"<script>{script}</script>" in text
+    digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
+    assert f"script-src 'sha256-{digest}'\"" in text
     assert not [name for name, _ in seen.attributes if name.startswith("on")]
     targets = [value for name, value in seen.attributes if name in ("src", "href")]
     assert all(value.startswith(("data:", "#")) for value in targets)
@@ -316,21 +325,73 @@ def test_large_studies_are_condensed_and_say_so(tmp_path):
         condition=rng.choice(list("abcdefg"), count), electrode=rng.choice(list("xy"), count),
     )  # fmt: skip
     etid.write_report(fits, tmp_path / "page.html")
-    assert (tmp_path / "page.html").stat().st_size < 2e6
+    assert (tmp_path / "page.html").stat().st_size < 3e6
     page = _Read(tmp_path / "page.html")
     groups = len(fits.summary("subject", "condition"))
     assert f"{tables.ROWS} of {groups} groups are shown" in page.text
     assert f"The first {tables.BRIEF} are listed" in page.text
     assert f"Of {count // 5} subjects {figures.CROWD} are drawn" in page.text
-    assert page.elements.count("tr") < 5 * tables.ROWS
+    assert page.elements.count("tr") < 5 * tables.ROWS + tables.SINGLE
+    assert f"{tables.SINGLE} of {count} recordings are shown" in page.text
     assert "Electrodes" in page.text
 
 
 def test_no_success_at_all_and_no_fit_at_all(tmp_path):
-    etid.write_report(fits_of([np.nan], ["flat"]), tmp_path / "page.html")
+    etid.write_report(fits_of([np.nan] * 2, ["flat"] * 2), tmp_path / "page.html")
     assert "No fit is successful" in _Read(tmp_path / "page.html").text
     with pytest.raises(ValueError, match="no fit to report on"):
         etid.write_report(fits_of(np.ones(0), []), tmp_path / "page.html")
+
+
+def test_labels_in_any_script_give_no_warning(tmp_path):
+    """Warnings are errors in tests; the font of the pictures lacks these letters."""
+    subjects = np.array(["\u88ab\u9a13\u8005", "\u0633"])
+    fits = fits_of([1.0, 1.1], ["successful"] * 2, subject=subjects)
+    etid.write_report(fits, tmp_path / "page.html")
+    assert str(subjects[0]) in _Read(tmp_path / "page.html").text
+
+
+def test_every_recording_has_a_row_with_a_link_to_its_waveform(page, found):
+    text = page.read_text("utf-8")
+    table = re.search(r'<table class="searchable">.*?</table>', text, re.DOTALL)
+    assert table is not None
+    assert table[0].count("<tr>") == 1 + len(found.fits)
+    anchors = re.findall(r'<a href="#(waveform-\d)">', table[0])
+    assert sorted(anchors) == [f"waveform-{i}" for i in range(6)]
+    for anchor in anchors:
+        assert text.count(f'<figure id="{anchor}">') == 1
+    assert "33.40 ± 0.75" in table[0]
+
+
+def test_one_recording_gives_a_page_about_one_recording(tmp_path):
+    etid.write_report(fits_of([1.0], ["successful"]), tmp_path / "page.html")
+    text = _Read(tmp_path / "page.html").text
+    assert "One recording, loaded/0, identified as SkinRC" in text
+    assert "33.40 ± 0.75" in text
+    for of_many in ("Subjects", "Between recordings", "Worst fits"):
+        assert of_many not in text
+
+
+@pytest.mark.parametrize(
+    ("value", "error", "text"),
+    [
+        (186e3, 1e3, "186.0 ± 1.0"),
+        (186e3, 400e3, "not determined (± 400)"),
+        (186e3, np.nan, "186"),
+        (np.nan, np.nan, ""),
+    ],
+)
+def test_an_element_without_a_value_is_not_determined(value, error, text):
+    assert tables.element(value, error, 1e3) == text
+
+
+def test_of_many_recordings_those_without_success_are_shown():
+    count = 2 * tables.SINGLE
+    verdicts = np.full(count, "successful", dtype=object)
+    verdicts[[5, 4000]] = "misfit"
+    rows = tables.shown_rows(fits_of(np.ones(count), verdicts.tolist()))
+    assert rows.size == tables.SINGLE
+    assert {5, 4000, 0, count - 1} <= set(rows.tolist())
 
 
 def test_another_circuit_is_reported_as_itself(tmp_path):

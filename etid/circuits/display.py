@@ -15,9 +15,33 @@ DISPLAY = {
 }
 
 
-def heading(name: str, unit: str) -> str:
-    """Name and scaled unit of a parameter, such as `r_s [kΩ]`."""
-    symbol = DISPLAY[unit][1]
+BASE = {"ohm": "Ω", "farad": "F", "second": "s"}  # units that take prefixes
+PREFIXES = {
+    -15: "f", -12: "p", -9: "n", -6: "µ", -3: "m", 0: "", 3: "k", 6: "M", 9: "G", 12: "T"
+}  # fmt: skip
+USUAL = (0.01, 1e4)  # values in the unit of `DISPLAY` that are shown in this unit
+
+
+def scaled(unit: str, value: float = np.nan) -> tuple[float, str]:
+    """Size [SI] and symbol of the unit in which a value is shown.
+
+    It is that of `DISPLAY`, or one with another prefix if the number would be very small or large.
+
+    Args:
+        unit: SI unit, a key of `DISPLAY`.
+        value: The value in the SI unit.
+    """
+    size = abs(value)
+    shown = size / DISPLAY[unit][0]
+    if unit not in BASE or not (np.isfinite(shown) and shown > 0) or USUAL[0] <= shown < USUAL[1]:
+        return DISPLAY[unit]
+    power = int(np.clip(3 * np.floor(np.log10(size) / 3), min(PREFIXES), max(PREFIXES)))
+    return 10.0**power, PREFIXES[power] + BASE[unit]
+
+
+def heading(name: str, unit: str, value: float = np.nan) -> str:
+    """Name and scaled unit of a parameter of about this value [SI], such as `r_s [kΩ]`."""
+    symbol = scaled(unit, value)[1]
     return f"{name} [{symbol}]" if symbol else name
 
 
@@ -38,7 +62,7 @@ def between(low: float, high: float, unit: str) -> str:
 
     They are rounded to two significant digits of a quarter of the length.
     """
-    scale, symbol = DISPLAY[unit]
+    scale, symbol = scaled(unit, (low + high) / 2)
     quarter = (high - low) / (4 * scale)
     if not (np.isfinite(quarter) and quarter > 0):
         return f"{low / scale:.4g} … {high / scale:.4g} {symbol}".rstrip()
@@ -54,5 +78,5 @@ def quantity(value: float, unit: str, error: float = np.nan) -> str:
         unit: SI unit, a key of `DISPLAY`.
         error: Standard error in the SI unit; NaN if there is none.
     """
-    scale, symbol = DISPLAY[unit]
+    scale, symbol = scaled(unit, value)
     return " ".join([*plus_minus(value / scale, error / scale).split(), symbol]).rstrip()

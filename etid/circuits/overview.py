@@ -12,7 +12,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
-from etid.circuits.display import DISPLAY, plus_minus
+from etid.circuits.display import plus_minus, scaled
 
 ROWS = 60  # of a table; more rows are counted only
 
@@ -136,7 +136,8 @@ def element_rows(
     """
     rows = []
     for i, (name, unit) in enumerate(units.items()):
-        scale, symbol = DISPLAY[unit]
+        usual = float(values[i]) if values.ndim == 1 else np.nan
+        scale, symbol = scaled(unit, usual)
         value = values[..., i] / scale
         if values.ndim == 1:
             error = np.nan if errors is None else float(errors[i]) / scale

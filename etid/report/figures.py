@@ -6,6 +6,7 @@ for the same fits.
 
 import dataclasses
 import io
+import warnings
 from collections.abc import Mapping, Sequence
 
 import matplotlib
@@ -35,7 +36,9 @@ QUARTILES, MOST = (0.25, 0.75), (0.05, 0.95)
 def svg(figure: Figure) -> bytes:
     """A figure as SVG without dates and random names, so that equal figures give equal files."""
     buffer = io.BytesIO()
-    with matplotlib.rc_context({"svg.hashsalt": "etid"}):
+    with matplotlib.rc_context({"svg.hashsalt": "etid"}), warnings.catch_warnings():
+        # The tables show the label as it is.
+        warnings.filterwarnings("ignore", "Glyph .* missing from font")
         figure.savefig(buffer, format="svg", metadata={"Date": None})
     return buffer.getvalue()
 

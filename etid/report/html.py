@@ -1,16 +1,19 @@
 """Tables for the terminal, and one self-contained HTML page of tables and pictures.
 
-The page has no script and forbids every request. Labels and notes of a file can therefore do no
-harm, and the page looks the same with and without a network.
+The page forbids every request, and every script except its own one, which sorts and searches long
+tables. Labels and notes of a file can therefore do no harm, and the page looks the same with and
+without a network.
 """
 
 import base64
 import dataclasses
+import hashlib
+import importlib.resources
 import os
 import pathlib
 import re
 import textwrap
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import jinja2
 import numpy as np
@@ -28,12 +31,16 @@ class Table:
         rows: Rows of cells. Each row has one cell for each heading.
         groups: Headings above the headings, each with the number of columns that it spans.
         caption: Text above the table.
+        searchable: Whether the page lets the reader sort the table and search in it.
+        links: Anchors of the page for cells of the first column.
     """
 
     columns: tuple[str, ...]
     rows: tuple[tuple[str, ...], ...]
     groups: tuple[tuple[str, int], ...] = ()
     caption: str = ""
+    searchable: bool = False
+    links: Mapping[str, str] = dataclasses.field(default_factory=dict)
 
     def __post_init__(self) -> None:
         for row in self.rows:
@@ -76,12 +83,14 @@ class Picture:
         svg: The picture.
         alt: Description for readers who cannot see the picture; the caption if not given.
         whole: Whether the picture needs the whole width of the page. Two other pictures share it.
+        anchor: Name of the picture in a link; empty if there is no link to it.
     """
 
     caption: str
     svg: bytes
     alt: str = ""
     whole: bool = False
+    anchor: str = ""
 
     @property
     def source(self) -> str:
@@ -144,7 +153,17 @@ def write_page(
         trim_blocks=True,
         lstrip_blocks=True,
     )
+    searchable = any(table.searchable for section in sections for table in section.tables)
+    script = importlib.resources.files("etid.report").joinpath("templates/table.js")
+    text_of_script = script.read_text("utf-8") if searchable else ""
+    digest = base64.b64encode(hashlib.sha256(text_of_script.encode()).digest()).decode()
     page = pages.get_template("page.html").render(
-        title=title, text=text, sections=sections, LONG=LONG, MANY=MANY
+        title=title,
+        text=text,
+        sections=sections,
+        script=text_of_script,
+        allowed=f"sha256-{digest}",
+        LONG=LONG,
+        MANY=MANY,
     )
     pathlib.Path(path).write_text(page.lstrip(), encoding="utf-8")

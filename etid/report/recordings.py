@@ -87,13 +87,14 @@ class Recordings:
         if self.study is not None and self._opened:
             self.study.close()
 
-    def picture(self, path: str, fit: Fit, text: str) -> Picture | None:
+    def picture(self, path: str, fit: Fit, text: str, anchor: str = "") -> Picture | None:
         """One measured and predicted pulse; None if the recording cannot be read.
 
         Args:
             path: Path of the recording.
             fit: Fit of the recording.
             text: Text for the caption.
+            anchor: Name of the picture in a link.
         """
         if self.study is None:
             return None
@@ -106,14 +107,14 @@ class Recordings:
         names = recording.calibration or tuple(self.study.calibrations)
         figure, why = _predicted(shown, fit, self._found.drivers.get(names))
         elements = ", ".join(fit.elements)
-        about = f"{path}: {fit.verdict} ({text})."
+        about = f"{path}: {fit.verdict}{f' ({text})' if text else ''}."
         if why:
             alt = f"Measured voltages of {path}; no prediction."
             caption = f"{about} No prediction: {why}"
         else:
             alt = f"One pulse of {path}: measured, predicted and residual voltage. {elements}"
             caption = f"{about} χ² {significant(float(fit.chi2), 3)}, {elements}."
-        return Picture(caption, svg(figure), alt)
+        return Picture(caption, svg(figure), alt, anchor=anchor)
 
 
 def _predicted(recording: Recording, fit: Fit, driver: Driver | None) -> tuple[Figure, str]:

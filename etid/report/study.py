@@ -20,7 +20,9 @@ from etid.report.methods import methods_section, words
 from etid.report.worst_fits import choose, relative_stderr
 from etid.results.fits import Fits
 from etid.results.study_fits import StudyFits
+from etid.results.verdicts import message
 
+EACH = 24  # largest number of recordings whose waveforms are all drawn
 FEW = 300  # largest number of fits that are drawn one by one
 DRIVERS = 4  # largest number of drivers in one diagram
 
@@ -69,18 +71,22 @@ def write_report(
     name = "fits" if file is None else file.name
     place = Recordings(found, file, recordings)
     try:
-        groups = found.fits.summary("subject", "condition")
-        stderr = relative_stderr(found.fits)
-        sections = [
-            _verdicts(found.fits),
-            _drivers(found),
-            _elements(found.fits, groups),
-            _subjects(found.fits, groups),
-            *_electrodes(found.fits),
-            _quality(found.fits, stderr),
-            _worst(found.fits, place),
-            methods_section(found),
-        ]
+        waveforms = _waveforms(found.fits, place)
+        if len(found.fits) == 1:
+            sections = [_single(found.fits), waveforms, _drivers(found), methods_section(found)]
+        else:
+            groups = found.fits.summary("subject", "condition")
+            sections = [
+                _verdicts(found.fits),
+                _drivers(found),
+                _elements(found.fits, groups),
+                _subjects(found.fits, groups),
+                *_electrodes(found.fits),
+                _quality(found.fits, relative_stderr(found.fits)),
+                _recordings(found.fits, waveforms),
+                waveforms,
+                methods_section(found),
+            ]
     finally:
         place.close()
     write_page(page, f"Report on {name}", summary(found), sections)
@@ -93,6 +99,10 @@ def _same(one: str | os.PathLike[str], other: str | os.PathLike[str]) -> bool:
 def summary(found: StudyFits) -> str:
     """Two sentences on the study."""
     fits, settings = found.fits, found.settings
+    if len(fits) == 1:
+        path = str(fits.labels["path"][0])
+        kind, method = type(fits.circuit).__name__, words(fits.fit.method)
+        return f"One recording, {path or 'without a path'}, identified as {kind} by {method}."
     good = fits.counts().get("successful", 0)
     source = pathlib.Path(settings.source).name if settings is not None else ""
     text = f"{len(fits)} recordings{f' of {source}' if source else ''}"
@@ -262,20 +272,55 @@ def _quality(fits: Fits, stderr: np.ndarray) -> Section:
     return Section("Quality", text, tables, pictures)
 
 
-def _worst(fits: Fits, place: Any) -> Section:
+def _single(fits: Fits) -> Section:
+    """The page about one recording begins with its verdict and its elements."""
+    verdict = str(fits.verdicts[0])
+    text = message(verdict) if verdict != "successful" else "The fit is successful."
+    text += (
+        f" χ² per degree of freedom is {study_tables.significant(float(fits.chi2[0]), 3)}; it is 1 "
+        "if the residual is noise. Own error: standard error from the noise of the recording. "
+        "Shared error: standard error from the driver."
+    )
+    note = str(fits.notes[0])
+    warning = "" if note in ("", message(verdict)) else note
+    return Section("Result", text, (study_tables.single(fits),), warning=warning)
+
+
+def _recordings(fits: Fits, waveforms: Section) -> Section:
+    links = {}
+    for picture in waveforms.pictures:
+        row = int(picture.anchor.removeprefix("waveform-"))
+        links[str(fits.labels["path"][row])] = picture.anchor
+    text = "Click a heading to sort. A recording with a link has its waveform below."
+    if len(fits) > study_tables.SINGLE:
+        text += (
+            f" {study_tables.SINGLE} of {len(fits)} recordings are shown: those without success "
+            "first, then every few of the others; the file of fits has all."
+        )
+    return Section("Recordings", text, (study_tables.recordings(fits, links),))
+
+
+def _waveforms(fits: Fits, place: Any) -> Section:
     text = (
         "First fits without success: for each verdict those with the largest χ². Then successful "
         "fits with the largest χ² and with the largest standard error. One pulse of each is drawn. "
         "If the model is right, the residual is noise."
     )
+    chosen = {one.row: one.reason for one in choose(fits)}
+    if len(fits) <= EACH:
+        chosen |= {row: "" for row in range(len(fits)) if row not in chosen}
+    if len(fits) == 1:
+        text = "One pulse. If the model is right, the residual is noise."
+        chosen = {0: ""}
     pictures, missing = [], []
-    for one in choose(fits):
-        path = str(fits.labels["path"][one.row])
-        picture = place.picture(path, fits[one.row], one.reason)
+    for row, reason in chosen.items():
+        path = str(fits.labels["path"][row])
+        picture = place.picture(path, fits[row], reason, f"waveform-{row}")
         if picture is None:
-            missing.append(f"{path} ({one.reason})")
+            missing.append(f"{path} ({reason})" if reason else path)
         else:
             pictures.append(picture)
     if missing:
         text += f"\n\nThese recordings cannot be read and have no waveform: {', '.join(missing)}."
-    return Section("Worst fits", text, (), tuple(pictures), warning=place.problem)
+    heading = "Worst fits" if len(fits) > EACH else "Waveforms"
+    return Section(heading, text, (), tuple(pictures), warning=place.problem)

@@ -12,7 +12,8 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from etid.circuits.display import DISPLAY, heading, plus_minus
+from etid.circuits.display import heading, plus_minus, scaled
+from etid.recordings.fields import LABELS
 from etid.report.html import Table
 from etid.results.driver import ContinuousDriver, Driver
 from etid.results.fits import Fits
@@ -20,6 +21,7 @@ from etid.results.verdicts import message
 
 ROWS = 100  # largest number of rows of a table
 CONDITIONS = 30  # largest number of conditions in a table
+SINGLE = 3000  # largest number of rows of the table of recordings
 BRIEF = 50  # largest number of rows of a table of single recordings
 PARTS = ("between", "own", "shared")  # keys of `Fits.summary`
 
@@ -33,10 +35,16 @@ def significant(value: float, digits: int = 2) -> str:
     return np.format_float_positional(value, precision=digits, fractional=False, trim="-")
 
 
-def element(value: float, error: float, unit: str) -> str:
-    """An element with its standard error, both in the printed unit; empty if it is NaN."""
-    scale = DISPLAY[unit][0]
-    return " ".join(plus_minus(value / scale, error / scale).split()) if value == value else ""
+def element(value: float, error: float, scale: float) -> str:
+    """An element with its standard error, both divided by `scale`; empty if it is NaN.
+
+    An element whose standard error is not below its value is not determined.
+    """
+    if not math.isfinite(value):
+        return ""
+    if math.isfinite(error) and error >= abs(value):
+        return f"not determined (± {significant(error / scale)})"
+    return " ".join(plus_minus(value / scale, error / scale).split())
 
 
 def verdicts(fits: Fits) -> Table:
@@ -71,7 +79,7 @@ def drivers(
                 driver.verdict,
                 significant(100 * float(driver.rrse)),
                 significant(float(driver.chi2), 3),
-                element(abs(z), error, "ohm"),
+                element(abs(z), error, 1e3),
                 message(driver.verdict),
             )
         )
@@ -189,11 +197,11 @@ def show_components(found: Sequence[Components], units: Mapping[str, str]) -> Ta
     """The components as a table."""
     rows = []
     for one in found:
-        scale = DISPLAY[units[one.name]][0]
+        scale = scaled(units[one.name], one.median)[0]
         rows.append(
             (
                 one.condition or "all",
-                heading(one.name, units[one.name]),
+                heading(one.name, units[one.name], one.median),
                 str(one.subjects),
                 str(one.successful),
                 significant(one.median / scale, 4),
@@ -222,20 +230,84 @@ def groups(rows: Sequence[Mapping[str, Any]], by: Sequence[str], units: Mapping[
     if len(shown) > ROWS:
         worst = np.argsort([row["successful"] / row["fits"] for row in shown], kind="stable")
         shown = [shown[i] for i in sorted(worst[:ROWS])]
+    usual = {name: _typical(np.array([row[name] for row in shown], float)) for name in units}
     cells = []
     for row in shown:
         line = [str(row[name]) or "-" for name in by]
         line.append(f"{row['successful']}/{row['fits']}")
         for name, unit in units.items():
             median = row[name]
-            line.append(element(median, row[f"{name}_stderr"], unit).partition(" ±")[0])
+            scale = scaled(unit, usual[name])[0]
+            line.append(element(median, row[f"{name}_stderr"], scale).partition(" ±")[0])
             line += [significant(100 * row[f"{name}_{k}"] / median) for k in PARTS]
         cells.append(tuple(line))
     heads = [*by, "successful"]
-    for unit in units.values():
-        heads += [heading("median", unit), *(f"{part} [%]" for part in PARTS)]
+    for name, unit in units.items():
+        heads += [heading("median", unit, usual[name]), *(f"{part} [%]" for part in PARTS)]
     over = [(name, 1 + len(PARTS)) for name in units]
     return Table(tuple(heads), tuple(cells), (("", len(by) + 1), *over))
+
+
+def _typical(values: np.ndarray) -> float:
+    """Median of the values that are finite; NaN without one."""
+    known = values[np.isfinite(values)]
+    return float(np.median(known)) if known.size else math.nan
+
+
+def recordings(fits: Fits, links: Mapping[str, str]) -> Table:
+    """One row for each recording: labels, verdict, elements and quality; at most `SINGLE`.
+
+    Args:
+        fits: All fits.
+        links: Anchors of the waveforms, by path of the recording.
+    """
+    some = fits.take(shown_rows(fits))
+    units = some.circuit.units()
+    labels = [name for name in LABELS if len(set(map(str, fits.labels[name]))) > 1]
+    scales, heads = {}, ["recording", *labels, "verdict"]
+    columns = {name: np.asarray(getattr(some.circuit, name)) for name in units}
+    errors = {name: np.asarray(getattr(some.stderr, name)) for name in units}
+    for name, unit in units.items():
+        usual = _typical(columns[name])
+        scales[name] = scaled(unit, usual)[0]
+        heads.append(heading(name, unit, usual))
+    rows = []
+    for i, verdict in enumerate(some.verdicts):
+        rows.append(
+            (
+                str(some.labels["path"][i]) or "-",
+                *(str(some.labels[name][i]) or "-" for name in labels),
+                str(verdict),
+                *(element(columns[name][i], errors[name][i], scales[name]) for name in units),
+                significant(float(some.chi2[i]), 3),
+                significant(100 * float(some.rrse[i])),
+            )
+        )
+    return Table((*heads, "χ²", "RRSE [%]"), tuple(rows), searchable=True, links=links)
+
+
+def single(fits: Fits) -> Table:
+    """The elements of one fit, with the parts of their standard errors."""
+    rows = []
+    shared = np.sqrt(np.maximum(np.diagonal(fits.fit.shared_cov[0]), 0.0))
+    own = np.sqrt(np.maximum(np.diagonal(fits.cov[0] - fits.fit.shared_cov[0]), 0.0))
+    for i, (name, unit) in enumerate(fits.circuit.units().items()):
+        value = float(np.asarray(getattr(fits.circuit, name))[0])
+        error = float(np.asarray(getattr(fits.stderr, name))[0])
+        scale = scaled(unit, value)[0]
+        parts = (significant(float(part[i]) / scale) for part in (own, shared))
+        rows.append((heading(name, unit, value), element(value, error, scale), *parts))
+    return Table(("element", "value ± standard error", "own error", "shared error"), tuple(rows))
+
+
+def shown_rows(fits: Fits) -> np.ndarray:
+    """Rows of the fits in the table of recordings; of many fits those without success first."""
+    if len(fits) <= SINGLE:
+        return np.arange(len(fits))
+    bad = np.flatnonzero(fits.verdicts != "successful")[:SINGLE]
+    good = np.flatnonzero(fits.verdicts == "successful")
+    some = good[np.linspace(0, good.size - 1, SINGLE - bad.size).round().astype(int)]
+    return np.union1d(bad, some)
 
 
 def failures(fits: Fits) -> Table:
