@@ -42,7 +42,7 @@ FEW = (1, 4)  # drivers and trials of any other cell
 PAIRS = 15  # timed pairs
 COVERED = (0.93, 0.97)  # part of the 95 % intervals that is to hold the truth
 QUICK_SNR = (20, 60)
-RIVAL_DRIVERS = 1  # at most; six seconds for each recording
+RIVAL_DRIVERS, RIVAL_SNR = 1, (20, 40, 60)  # ten seconds for each recording
 
 
 class Line(NamedTuple):
@@ -178,34 +178,38 @@ def time_ratio(pairs: int) -> Line:
     return Line("time, auto / plain fit, one RC", float(middle), text, 0.0, 1.3)
 
 
-def rival(rows: list[dict[str, Any]], drivers: Sequence[int]) -> tuple[str, list[Line]]:
-    """Add the choices of the rival to the rows; why there are none, or the comparison."""
-    seconds: list[float] = []
-    for snr in sorted({row["snr_db"] for row in rows}):
-        outcome = selection_rival.choices(snr, drivers)
-        if isinstance(outcome, str):
-            return outcome, []
-        for row in rows:
-            if row["snr_db"] == snr:
-                names = outcome.names[list(TRUTHS).index(row["truth"])]
-                for one in CANDIDATES:
-                    row[f"rival_{type(one).__name__}"] = int((names == type(one).__name__).sum())
-        seconds += outcome.seconds.ravel().tolist()
-    ours, theirs = (_right_part(rows, kind) for kind in ("chose", "rival"))
-    name = "right where decisive, etid minus impedance.py"
-    text = f"{100 * ours:.2f} % against {100 * theirs:.2f} %"
-    print(f"impedance.py: {1e3 * np.median(seconds):.0f} ms for five fits (median)")
-    return "", [Line(name, ours - theirs, text, 0.0, 1.0)]
+def rival(rows: list[dict[str, Any]], drawn: Sequence[Drawn]) -> list[Line]:
+    """Add the choices of the rival to the rows, and compare right choices.
 
-
-def _right_part(rows: Sequence[dict[str, Any]], kind: str) -> float:
-    right = total = 0
+    Args:
+        rows: The table; it gets the columns `rival_NAME`.
+        drawn: The recordings for which the rival chooses too.
+    """
+    of_study = dict.fromkeys((one.snr_db, one.driver) for one in drawn)
+    theirs = selection_rival.by_impedance_py([selection_rival.measured(*of) for of in of_study])
     for row in rows:
-        if row["decisive"]:
-            counts = {type(one): row[f"{kind}_{type(one).__name__}"] for one in CANDIDATES}
-            right += counts[type(TRUTHS[row["truth"]])]
-            total += sum(counts.values())
-    return right / max(total, 1)
+        here = [snr == row["snr_db"] for snr, _ in of_study]
+        names = theirs.names[list(TRUTHS).index(row["truth"]), here]
+        for one in CANDIDATES:
+            row[f"rival_{type(one).__name__}"] = int((names == type(one).__name__).sum())
+    ours = np.array([selection_counts.is_right(one) for one in drawn])
+    lines = [_compared("same recordings", ours, selection_rival.right(theirs))]
+    print(f"impedance.py: {1e3 * np.median(theirs.seconds):.0f} ms for five fits (median)")
+
+    easier = [selection_rival.exact(*of) for of in of_study]
+    ours_too = selection_rival.by_etid(easier)
+    rights = [
+        selection_rival.right(of) for of in (ours_too, selection_rival.by_impedance_py(easier))
+    ]
+    lines.append(_compared("same exact spectra", *rights))
+    print(f"etid, identify_impedance: {1e3 * np.median(ours_too.seconds):.0f} ms for five fits")
+    return lines
+
+
+def _compared(name: str, ours: np.ndarray, theirs: np.ndarray) -> Line:
+    """Right choices of etid minus those of the rival."""
+    text = f"{ours.sum()} against {theirs.sum()} of {ours.size}"
+    return Line(f"right, {name}", ours.mean() - theirs.mean(), text, 0.0, 1.0)
 
 
 def select_time(number: int) -> float:
@@ -237,10 +241,12 @@ def main(arguments: argparse.Namespace) -> bool:
     criteria(rows)
     lines = chosen(rows, drawn)
 
-    missing, compared = rival(rows, numbers[:RIVAL_DRIVERS])
-    lines += compared
+    missing = selection_rival.missing()
     if missing:
         print(f"impedance.py: {missing}")
+    else:
+        few = numbers[:RIVAL_DRIVERS]
+        lines += rival(rows, [d for d in drawn if d.driver in few and d.snr_db in RIVAL_SNR])
     write_csv(arguments.folder / "selection.csv", rows)
     selection_chart.draw(rows, TRUTHS, arguments.folder / "selection.svg", missing)
     print(f"etid: {1e3 * select_time(FIRST):.0f} ms for a choice (median)")

@@ -41,7 +41,10 @@ def draw(
     figure, axes = charts.new_figure(
         1, 2 if both else 1, (12.5 if both else 7.0, 0.36 * len(truths) + 1.6), sharey=True
     )
-    titles = {"chose": "etid, from recordings", "rival": "impedance.py and BIC, from exact spectra"}
+    titles = {
+        "chose": "etid",
+        "rival": "impedance.py and BIC, from spectra of the same recordings",
+    }
     for panel, (name, title) in zip(axes.flat, titles.items(), strict=False):
         drawn = [row for row in rows if any(int(row[f"{name}_{key}"]) for key in KEY)]
         columns = sorted({row["snr_db"] for row in drawn})

@@ -1,11 +1,15 @@
-"""The same choice by impedance.py, from the exact impedance spectrum with the scene's own noise.
+"""The same choice by impedance.py: five fits to an impedance spectrum, and the smallest BIC.
 
-It is given more than a recording holds: Z_th without error, and no trigger delay. Its spectrum is
+Two kinds of spectra are given to it:
 
-    Z + noise,   σ_Z = σ |Z_th| √(|X|² + |Y|²) / |X − Y|²,
+- `measured`: from the recordings that etid chooses for, by the harmonics, the noise and the Z_th
+  that etid finds in them,
 
-for coefficients X of V_th and Y of V_out with noise σ, to first order. It fits all five circuits;
-the one with the smallest BIC is taken.
+      Z = Z_th Y / (X − Y),   σ_Z = |Z_th| √(σ_x² |Y|² + σ_y² |X|²) / |X − Y|²,
+
+  for the coefficients X of V_th and Y of V_out, to first order in their noise;
+- `exact`: with the noise of the scene, but without an error of Z_th and without a trigger delay,
+  which no recording gives. etid's `identify_impedance` and its rule choose for these, too.
 """
 
 import dataclasses
@@ -14,41 +18,65 @@ import os
 import pathlib
 import subprocess
 import tempfile
+import time
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Bool, Complex, Float
 
+import etid
 from benchmarks.rivals import ONE_THREAD, ROOT, install, python_of
 from benchmarks.rivals.records import ALIASED
 from benchmarks.selection_draws import TRUTHS, scene
+from etid.estimators.lanes import Harmonics
+from etid.recordings.preflight import Inspected
+from etid.selection.evidence import best
 from etid.selection.search import CANDIDATES
 
 ENVIRONMENT_OF = "impedance_py"  # of `benchmarks.rivals.roster`
 WORKER = "benchmarks.rivals.circuits_by_impedance_py"
+NAMES = np.array([type(one).__name__ for one in CANDIDATES])
+
+
+class Spectra(NamedTuple):
+    """One impedance spectrum for each truth.
+
+    Attributes:
+        f: Frequencies [Hz].
+        z: Noisy impedances [ohm].
+        sigma: Their noise √E|·|² [ohm].
+        used: Harmonics that stand out of the noise.
+    """
+
+    f: Float[np.ndarray, " harmonic"]
+    z: Complex[np.ndarray, "truth harmonic"]
+    sigma: Float[np.ndarray, "truth harmonic"]
+    used: Bool[np.ndarray, "truth harmonic"]
 
 
 @dataclasses.dataclass(frozen=True)
 class Chosen:
-    """What the rival chose.
+    """What was chosen for some spectra.
 
     Attributes:
-        names: Names of the chosen circuits, (truth, driver).
-        seconds: Of each choice, (truth, driver).
+        names: Names of the chosen circuits, (truth, spectra).
+        seconds: Of each choice, (truth, spectra).
     """
 
     names: np.ndarray
     seconds: np.ndarray
 
 
-def spectra(snr_db: float, driver: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Frequencies [Hz], and for each truth the noisy impedances and their noise √E|·|² [ohm]."""
-    drawn = scene(snr_db, driver)
+def exact(snr_db: float, number: int) -> Spectra:
+    """Spectra with the noise of a scene alone."""
+    drawn = scene(snr_db, number)
     known = drawn.waveform()
     use = known.f < ALIASED * drawn.sample_rate
     f, x, z_th = known.f[use], known.v_th[use], known.z_th[use]
     sigma = known.sigma / math.sqrt(drawn.samples)
-    rng = np.random.default_rng([driver, round(snr_db), *b"rival"])
+    rng = np.random.default_rng([number, round(snr_db), *b"rival"])
     noisy, spread = [], []
     for load in TRUTHS.values():
         z = np.asarray(load.response(jnp.asarray(f)))
@@ -57,35 +85,74 @@ def spectra(snr_db: float, driver: int) -> tuple[np.ndarray, np.ndarray, np.ndar
         noise = rng.standard_normal((2, f.size)) / math.sqrt(2)
         noisy.append(z + of * (noise[0] + 1j * noise[1]))
         spread.append(of)
-    return f, np.array(noisy), np.array(spread)
+    return Spectra(f, np.array(noisy), np.array(spread), np.ones((len(noisy), f.size), bool))
 
 
-def choices(snr_db: float, drivers: Sequence[int]) -> Chosen | str:
-    """What the rival chooses at one SNR, or why it does not."""
-    failed = install([ENVIRONMENT_OF])
-    if failed:
-        return next(iter(failed.values()))
-    every = [spectra(snr_db, number) for number in drivers]
+def measured(snr_db: float, number: int) -> Spectra:
+    """Spectra from the recordings of `benchmarks.selection_draws.draws`."""
+    study = scene(snr_db, number).simulate(number)
+    driver = etid.identify_driver(study["calibration"])
+    lanes = [Harmonics.of(Inspected(study[name])) for name in TRUTHS]
+    f = np.asarray(lanes[0].spectrum.frequency)
+    z_th = np.asarray(driver.response(jnp.asarray(f)))
+    found = []
+    for lane in lanes:
+        of = lane.spectrum
+        x, y = np.asarray(of.x), np.asarray(of.y)
+        used = np.asarray(of.selected) & (f < ALIASED * float(np.asarray(lane.sample_rate)))
+        rest = np.where(used, x - y, 1.0)
+        noise = of.variance_x * np.abs(y) ** 2 + of.variance_y * np.abs(x) ** 2
+        sigma = np.abs(z_th) * np.sqrt(np.asarray(noise)) / np.abs(rest) ** 2
+        found.append((z_th * y / rest, np.where(used, sigma, 1.0), used))
+    z, sigma, used = (np.array(one) for one in zip(*found, strict=True))
+    return Spectra(f, z, sigma, used)
+
+
+def by_etid(every: Sequence[Spectra]) -> Chosen:
+    """What `identify_impedance` and the rule of `etid.selection` choose, all candidates fitted."""
+    names, seconds = [], []
+    for spectra in every:
+        for z, sigma, used in zip(*spectra[1:], strict=True):
+            begin = time.perf_counter()
+            stderr = sigma[used] / math.sqrt(2)  # of each of both parts
+            fits = {
+                number: etid.identify_impedance(
+                    spectra.f[used], z[used], stderr=stderr, circuit=circuit, throw=False
+                )
+                for number, circuit in enumerate(CANDIDATES)
+            }
+            names.append(NAMES[best(fits)])
+            seconds.append(time.perf_counter() - begin)
+    return _by_truth(names, seconds)
+
+
+def missing() -> str:
+    """Why there is no rival; empty if it is installed."""
+    return next(iter(install([ENVIRONMENT_OF]).values()), "")
+
+
+def by_impedance_py(every: Sequence[Spectra]) -> Chosen:
+    """What the rival chooses."""
     with tempfile.TemporaryDirectory() as folder:
         given, found = pathlib.Path(folder, "problem.npz"), pathlib.Path(folder, "result.npz")
-        np.savez(
-            given,
-            f=every[0][0],
-            z=np.concatenate([z for _, z, _ in every]),
-            sigma=np.concatenate([sigma for _, _, sigma in every]),
-        )
-        done = subprocess.run(
+        z, sigma, used = (np.concatenate([one[i] for one in every]) for i in (1, 2, 3))
+        np.savez(given, f=every[0].f, z=z, sigma=sigma, used=used)
+        subprocess.run(
             [python_of("common"), "-m", WORKER, given, found],
             cwd=ROOT,
             env={**os.environ, **ONE_THREAD},
-            capture_output=True,
-            text=True,
-            check=False,
+            check=True,
         )
-        if done.returncode:
-            return (done.stderr.strip().splitlines() or ["no message"])[-1]
         with np.load(found) as file:
-            bic, seconds = file["bic"], file["seconds"]
-    names = np.array([type(one).__name__ for one in CANDIDATES])
-    shape = len(drivers), len(TRUTHS)
-    return Chosen(names[np.argmin(bic, axis=1)].reshape(shape).T, seconds.reshape(shape).T)
+            return _by_truth(NAMES[np.argmin(file["bic"], axis=1)], file["seconds"])
+
+
+def right(chosen: Chosen) -> np.ndarray:
+    """Whether each chosen circuit is the true one, (truth, spectra)."""
+    true = np.array([type(load).__name__ for load in TRUTHS.values()])
+    return chosen.names == true[:, None]
+
+
+def _by_truth(names: Sequence[str] | np.ndarray, seconds: Sequence[float] | np.ndarray) -> Chosen:
+    shape = -1, len(TRUTHS)
+    return Chosen(np.reshape(names, shape).T, np.reshape(seconds, shape).T)

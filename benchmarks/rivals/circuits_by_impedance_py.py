@@ -1,10 +1,10 @@
 """impedance.py fits five circuits to impedance spectra: `python -m ... PROBLEM RESULT`.
 
-PROBLEM holds `f` (harmonic,) [Hz], `z` [ohm] and its noise `sigma` = √E|noise|² [ohm], both
-(spectrum, harmonic). RESULT gets the Schwarz criterion `bic` (spectrum, circuit), infinite where
-the package gave up, and `seconds` (spectrum,) for all five fits. Units are MHz, kΩ and nF; the fits
-start at the typical values of etid. With the package's own tolerance, 1e-13, and 1e5 steps, the
-criteria are the same and a spectrum takes two to three times as long.
+PROBLEM holds `f` (harmonic,) [Hz]; `z` [ohm], its noise `sigma` = √E|noise|² [ohm] and whether a
+harmonic is `used`, all (spectrum, harmonic). RESULT gets the Schwarz criterion `bic` (spectrum,
+circuit), infinite where the package gave up, and `seconds` (spectrum,) for all five fits. Units are
+MHz, kΩ and nF; the fits start at the typical values of etid. With the package's own tolerance,
+1e-13, and 1e5 steps, the criteria are the same and a spectrum takes two to three times as long.
 """
 
 import sys
@@ -47,12 +47,13 @@ def main(problem_path, result_path):
     """Fit all circuits to all spectra and write what was found."""
     with np.load(problem_path) as file:
         f, z, sigma = file["f"] / MEGA, file["z"] / KILO, file["sigma"] / KILO
+        used = file["used"]
     found, seconds = np.full((len(z), len(CIRCUITS)), np.inf), np.zeros(len(z))
-    criterion("SkinRC", f, z[0], sigma[0])  # what a first call costs is not counted
-    for row, (one, spread) in enumerate(zip(z, sigma, strict=True)):
+    criterion("Resistor", f, z[0], sigma[0])  # what a first call costs is not counted
+    for row, (one, spread, of) in enumerate(zip(z, sigma, used, strict=True)):
         begin = time.perf_counter()
         for column, name in enumerate(CIRCUITS):
-            found[row, column] = criterion(name, f, one, spread)
+            found[row, column] = criterion(name, f[of], one[of], spread[of])
         seconds[row] = time.perf_counter() - begin
     np.savez(result_path, bic=found, seconds=seconds)
 
