@@ -105,3 +105,17 @@ def test_what_the_data_do_not_show_is_insensitive():
 def test_bad_input_is_named(frequency, z, text):
     with pytest.raises(ValueError, match=text):
         etid.identify_impedance(frequency, z)
+
+
+def test_two_layers_do_not_end_as_one():
+    """From the best start alone, this fit ended with an infinite r_2 and χ² 6.9."""
+    truth = etid.SkinLayers(6.1e3, 8.7e3, 1.32e-9, 8.7e3, 5.94e-9)
+    frequency = 60.0 * np.arange(1, 1167)
+    z = np.asarray(truth.response(jnp.asarray(frequency)))
+    sigma = 23.5 * (1 + frequency / 1e3)
+    rng = np.random.default_rng(0)
+    parts = rng.standard_normal((2, frequency.size))
+    z = z + sigma * (parts[0] + 1j * parts[1])
+    fit = etid.identify_impedance(frequency, z, stderr=sigma, circuit=etid.SkinLayers())
+    error = np.asarray(fit.circuit.values()) - np.asarray(truth.values())
+    assert (np.abs(error) < 4 * np.sqrt(np.diagonal(fit.cov))).all()

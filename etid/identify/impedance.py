@@ -5,10 +5,12 @@ minimises
 
     Σ_k |Z(jω_k) − Z_k|² / σ_k²
 
-over the logarithms of the elements. It starts at the best point of a grid of impedance levels and
-corner frequencies that spans the data.
+over the logarithms of the elements. It starts at several corner frequencies that span the data,
+each with the best of several impedance levels, and keeps the best minimum. From a single start, two
+layers sometimes ended as one.
 """
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import numpy.typing as npt
@@ -25,8 +27,8 @@ from etid.solvers.matrices import inverse
 
 MAX_STEPS = 500
 MISFIT_CHI2 = 1.5  # a standard error of a measured impedance is seldom known to better than 20 %
-LEVELS = np.geomspace(0.1, 10.0, 5)  # impedance levels of the grid, relative to the data
-CORNERS = 9  # corner frequencies of the grid, between the lowest and the highest frequency
+LEVELS = np.geomspace(0.1, 10.0, 5)  # impedance levels of the starts, relative to the data
+CORNERS = 5  # corner frequencies of the starts, from the lowest to the highest frequency
 SOLVER = LevenbergMarquardt()
 
 
@@ -52,11 +54,16 @@ def _fit(
     shortest = jnp.where(slow, times, jnp.inf).min()
     corner = jnp.where(slow.any(), 1 / (2 * jnp.pi * jnp.exp(shortest)), 1.0)  # [Hz], roughly
     corners = jnp.exp(jnp.linspace(jnp.log(frequency.min()), jnp.log(frequency.max()), CORNERS))
-    level, faster = jnp.meshgrid(size + jnp.log(jnp.asarray(LEVELS)), jnp.log(corners / corner))
-    level, faster = level.reshape(-1, 1), faster.reshape(-1, 1)
-    starts = typical[None, :] + of_level[None, :] * level - of_time[None, :] * faster
-    q0 = best_start(lambda q: residual(q, None), starts)
-    solution = optx.least_squares(residual, SOLVER, q0, max_steps=MAX_STEPS, throw=False)
+    levels = size + jnp.log(jnp.asarray(LEVELS))
+
+    def from_corner(faster: Float[Array, ""]) -> optx.Solution:
+        starts = (typical - of_time * faster)[None, :] + levels[:, None] * of_level[None, :]
+        q0 = best_start(lambda q: residual(q, None), starts)
+        return optx.least_squares(residual, SOLVER, q0, max_steps=MAX_STEPS, throw=False)
+
+    every = jax.lax.map(from_corner, jnp.log(corners / corner))
+    likeliest = jnp.nanargmin(every.stats["normal_equations"].objective)
+    solution = jax.tree.map(lambda one: one[likeliest], every)
     q = solution.value
     equations = solution.stats["normal_equations"]
     chi2 = 2 * equations.objective / (2 * z.size - q.size)
