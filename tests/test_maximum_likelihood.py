@@ -179,7 +179,7 @@ def test_a_driver_that_is_followed_too_far_is_no_success():
     known = (Trial("c", ResistorLoad(98.8e3)),)
     scene = Scene(trials, known, samples=SAMPLES, snr_db=24.0, trigger_jitter_rms=50e-9)
     verdicts = []
-    for seed in (1, 19, 20):
+    for seed in (1, 74, 126):
         study = scene.simulate(seed=seed)
         driver = etid.identify_driver(study["c"], throw=False)
         fits = etid.identify_skins(study.loaded, driver)

@@ -15,13 +15,14 @@ In the map of failures (`python -m benchmarks failure_map`) it is at most 15 if 
 enough. It is at least 116 if a lower order changes an element by five of its standard errors.
 """
 
+import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Complex, Float
 
 from etid.estimators.maximum_likelihood.driver import Calibrations
-from etid.estimators.maximum_likelihood.terms import apart
+from etid.estimators.maximum_likelihood.terms import apart, by_gains, denoised
 from etid.estimators.sandwich import Linear
-from etid.signals.transfer import as_complex, frequency_variable, reciprocal
 
 SEEN = 36.0  # χ² of two degrees of freedom; by chance one of about 100 sections has it once in 10⁶
 DAMPINGS = (0.1, 0.3, 1.0)
@@ -29,15 +30,68 @@ GRID = 36  # frequencies, eight per decade
 BEYOND = 3.0  # factor by which the grid exceeds the band; poles beyond the band still have effect
 
 
-def sections(
-    frequency: Float[Array, " harmonic"], lowest: Float[Array, ""], highest: Float[Array, ""]
-) -> Complex[Array, "section 2 harmonic"]:
-    """∂Z_th/∂g and ∂Z_th/∂h of all sections, for a band [Hz]."""
-    omega = 2 * jnp.pi * jnp.geomspace(lowest / BEYOND, highest * BEYOND, GRID)
-    omega, zeta = (of.ravel() for of in jnp.meshgrid(omega, jnp.asarray(DAMPINGS)))
-    x = frequency_variable(frequency)[None, :] * as_complex(1 / omega)[:, None]
-    low = reciprocal(1 + (as_complex(2 * zeta)[:, None] + x) * x)
-    return jnp.stack([low, x * low], axis=1)
+class Sections(eqx.Module):
+    """1 / (1 + 2ζx + x²) of all sections at the harmonics of the calibrations.
+
+    With D for it, ∂Z_th/∂g = D and ∂Z_th/∂h = D s/ω. The derivatives of the terms with respect to g
+    and h are not computed, because they are large. Only their products are.
+
+    Attributes:
+        frequency: The harmonics [Hz].
+        omega: ω of each section / 2π [Hz].
+        real: Re D.
+        imaginary: Im D.
+        effect: e; a change of Z_th changes the terms by Re(e ∂Z_th).
+    """
+
+    frequency: Float[Array, " harmonic"]
+    omega: Float[Array, " section"]
+    real: Float[Array, "section harmonic"]
+    imaginary: Float[Array, "section harmonic"]
+    effect: Complex[Array, "part harmonic"]
+
+    @classmethod
+    def of(
+        cls,
+        frequency: Float[Array, " harmonic"],
+        ends: tuple[Float[Array, ""], Float[Array, ""]],
+        effect: Complex[Array, "part harmonic"],
+    ) -> "Sections":
+        """The sections for the band between `ends` [Hz]."""
+        grid = jnp.geomspace(ends[0] / BEYOND, ends[1] * BEYOND, GRID)
+        omega, zeta = (of.ravel() for of in jnp.meshgrid(grid, jnp.asarray(DAMPINGS)))
+        x = frequency[None, :] / omega[:, None]
+        real, imaginary = 1 - x * x, 2 * zeta[:, None] * x
+        scale = 1 / (real * real + imaginary * imaginary)
+        return cls(frequency, omega, real * scale, -imaginary * scale, effect)
+
+    def times(self, vectors: Float[Array, "column term"]) -> Float[Array, "2 section column"]:
+        """Products of the derivatives with respect to g and h with vectors of all terms."""
+        parts = vectors.reshape(vectors.shape[0], *self.effect.shape)
+        real, imaginary = (jnp.sum(of[None] * parts, axis=1) for of in _parts(self.effect))
+        f = self.frequency[None, :]
+        by_g = self.real @ real.T - self.imaginary @ imaginary.T
+        by_h = self.real @ (f * imaginary).T + self.imaginary @ (f * real).T
+        return jnp.stack([by_g, -by_h / self.omega[:, None]])
+
+    def squares(self, weight: Float[Array, " term"]) -> list[Float[Array, " section"]]:
+        """Weighted sums, over the terms, of a², a b and b²: the derivatives a by g and b by h."""
+        weight, f, (e, d) = weight.reshape(self.effect.shape), self.frequency, _parts(self.effect)
+        ee, ed, dd = (jnp.sum(weight * of, axis=0) for of in (e * e, e * d, d * d))
+        of_sections = self.real**2, self.real * self.imaginary, self.imaginary**2
+        aa, ab, bb = (
+            sum((one @ of for one, of in zip(of_sections, weights, strict=True)), jnp.zeros(()))
+            for weights in (
+                (ee, -2 * ed, dd),
+                (f * ed, f * (ee - dd), -f * ed),
+                (f * f * dd, 2 * f * f * ed, f * f * ee),
+            )
+        )
+        return [aa, -ab / self.omega, bb / self.omega**2]
+
+
+def _parts(z: Complex[Array, "*_"]) -> tuple[Float[Array, "*_"], Float[Array, "*_"]]:
+    return z.real, z.imag
 
 
 def largest(calibrations: Calibrations, linear: Linear) -> Float[Array, ""]:
@@ -58,39 +112,36 @@ def squares(calibrations: Calibrations, linear: Linear) -> Float[Array, " sectio
         calibrations: Calibrations at the minimum of their likelihood.
         linear: Their terms.
     """
-    c = calibrations.start()
-    slopes = apart(lambda _: _slopes(calibrations), c)
-    rows = apart(lambda c: calibrations.by_gains(c, slopes), c)
+    c, jacobian = calibrations.start(), linear.jacobian
+    sections, used = apart(lambda _: _sections(calibrations), c), 2 * calibrations.spectra.x.size
     terms = calibrations.terms(c, calibrations.records)
-    # With D = rows − fitted J, the scores are D r and their covariance is D C Dᵀ. D itself is not
-    # computed, because it is large.
-    fitted = linear.told(rows) @ linear.bread()
-    score = rows @ terms - fitted @ (linear.jacobian @ terms)
-    noisy = linear.jacobian * linear.noise[None, :]
-    cross = rows @ noisy.T
-    between = cross - 0.5 * fitted @ (noisy @ linear.jacobian.T)
-    rows, fitted, between = (of.reshape(-1, 2, of.shape[1]) for of in (rows, fitted, between))
-    shared = fitted @ between.transpose(0, 2, 1)
-    one, other = rows[:, 0], rows[:, 1]
-    by_g, by_both, by_h = (
-        jnp.sum(a * b * linear.noise[None, :], axis=1)
-        for a, b in ((one, one), (one, other), (other, other))
+    # With D = rows − fitted J, the scores are D r and their covariance is D C Dᵀ, where `rows` are
+    # the derivatives of the terms.
+    count, noisy = jacobian.shape[0], jacobian * linear.noise[None, :]
+    columns = jnp.concatenate([jacobian * linear.share[None, :], noisy, terms[None, :]])
+    products = sections.times(columns[:, :used])  # g and h do not affect the priors
+    fitted, cross = products[:, :, :count] @ linear.bread(), products[:, :, count:-1]
+    s, t = products[:, :, -1] - fitted @ (jacobian @ terms)  # of g and of h
+    between = cross - 0.5 * fitted @ (noisy @ jacobian.T)
+    aa, ab, bb = (
+        own - jnp.sum(fitted[i] * between[j] + fitted[j] * between[i], axis=1)
+        for own, (i, j) in zip(
+            sections.squares(linear.noise[:used]), ((0, 0), (0, 1), (1, 1)), strict=True
+        )
     )
-    own = jnp.stack([by_g, by_both, by_both, by_h], axis=1).reshape(-1, 2, 2)
-    variance = own - shared - shared.transpose(0, 2, 1)
-    score = score.reshape(-1, 2, 1)
-    return jnp.sum(score * jnp.linalg.solve(variance, score), axis=(1, 2))
+    return (s * s * bb - 2 * s * t * ab + t * t * aa) / (aa * bb - ab * ab)
 
 
-def _slopes(calibrations: Calibrations) -> list[Complex[Array, "row harmonic"]]:
-    """Derivatives of the gains G = R/(R + Z_th) with respect to g and h of all sections."""
-    spectra, gains = calibrations.spectra, calibrations.gains(calibrations.start())
-    lowest = spectra.frequency[0, 0]
-    highest = jnp.max(jnp.where(spectra.selected, spectra.frequency, lowest))
-    found = []
-    for number, (r, g) in enumerate(zip(calibrations.calibration.r_load, gains, strict=True)):
-        frequency = spectra.frequency[number]
-        of_z = -g * reciprocal(as_complex(r) + calibrations.source.response(frequency))
-        by_z = sections(frequency, lowest, highest)
-        found.append((by_z * of_z[None, None, :]).reshape(-1, frequency.size))
-    return found
+def _sections(calibrations: Calibrations) -> Sections:
+    """The sections, and their effect on the denoised terms."""
+    c, spectra = calibrations.start(), calibrations.spectra
+    gains = calibrations.gains(c)
+    clean, _ = denoised(calibrations.records, gains)
+    real, imaginary = jnp.moveaxis(by_gains(clean, gains), 1, 0)
+    # The harmonics of the records differ so little that the sections are equal.
+    frequency = spectra.frequency[0]
+    by_z = jnp.stack(calibrations.by_z(c, gains))[:, None, :]
+    shape = len(gains), -1, frequency.size
+    effect = jax.lax.complex(real, -imaginary).reshape(shape) * by_z
+    highest = jnp.max(jnp.where(spectra.selected, spectra.frequency, frequency[0]))
+    return Sections.of(frequency, (frequency[0], highest), effect.sum(0))
