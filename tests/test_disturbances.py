@@ -52,6 +52,24 @@ def test_a_disturbed_period_is_left_out_and_the_elements_are_right(driver, load,
     assert np.abs(off(fits, load)).max() < 4.0  # one of 12 normal numbers in 1300
 
 
+def test_a_disturbance_over_a_joint_disturbs_both_periods():
+    """Its rest in the second period was kept: R_p 3 % wrong, six standard errors, at 40 dB."""
+    six = rung("dry", snr_db=40.0, samples=20_000).simulate(1)[TRIAL]
+    long = with_spike(six, 2.12, width=5e-3, which="v_th")  # from 2.72 to 3.02 periods
+    kept = Inspected(long).kept
+    assert kept is not None
+    np.testing.assert_array_equal(kept.first, [0, 3333, 13_334, 16_667])
+    # Of three periods one would remain, so the period with the larger part is left out.
+    three = with_spike(rung("dry").simulate(1)[TRIAL], 0.12, 0.2, "v_th", 5e-3)
+    assert Inspected(three).periods[0] == 2
+
+
+def test_an_unloaded_voltage_that_differs_where_it_is_large_is_disturbed():
+    """In the overshoot, 3 V of a pulse of 64 V, a spike of 1.9 V was kept."""
+    six = rung("dry", snr_db=40.0, samples=20_000).simulate(1)[TRIAL]
+    assert Inspected(with_spike(six, 1.5, width=5e-3, which="v_th")).kept is not None
+
+
 def test_both_voltages_and_what_is_known_of_them_are_of_the_same_periods():
     recording = rung("dry").simulate(1)[TRIAL]
     seen = Inspected(with_spike(recording, 1, 1.0))

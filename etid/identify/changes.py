@@ -39,7 +39,7 @@ from etid.results.fits import Fit
 from etid.results.verdicts import verdict
 from etid.signals.transfer import frequency_variable, reciprocal
 
-ALARM = 1e-5  # probability of a false alarm in a record without a change
+ALARM = 1e-3  # probability of a false alarm in a record without a change
 CLEAN = 0.03  # of the sample rate; below, there are no aliases
 UNEQUAL = 5e-4  # largest change of the amplitude of V_th; cuts between samples cause 1e-4
 EXPLAINED = (

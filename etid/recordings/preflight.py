@@ -9,7 +9,7 @@ from jaxtyping import Bool, Complex, Float
 
 from etid.recordings.recording import Recording, Samples
 from etid.recordings.remarks import Remark
-from etid.signals.disturbances import Joint, disturbed, joint, of_source
+from etid.signals.disturbances import Joint, disturbed, enough, joint, of_source
 from etid.signals.filtering import TAPS
 from etid.signals.harmonics import ALIASED, harmonics, whole_periods
 from etid.signals.mains import Hum, separated
@@ -202,8 +202,7 @@ def _kept(
     Fewer than half of the periods may be left out: the others must show the shape of an undisturbed
     period.
     """
-    left = np.count_nonzero(~bad)
-    if not max(2, bad.size // 2 + 1) <= left < bad.size:
+    if not bad.any() or not enough(bad):
         return None
     rise = rise_time(sample_rate)
     if any(of_source(v, bad, spacing, rise) for v in records):

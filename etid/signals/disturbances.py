@@ -4,7 +4,8 @@ A movement of the hand can spoil one of several periods, and with it the average
 Each period is compared with the median of all periods, after averaging over `MERGED` samples. A
 period is *disturbed* if it differs by more than `PART` of the largest value and by more than
 `SHARE` of the value at the same place. A load that changes by less than a factor of two does not
-exceed these limits. Edges between samples and noise do not exceed them either.
+exceed these limits. Edges between samples and noise do not exceed them either. If a disturbance
+lasts to the end of its period or from its start, the period beside it is disturbed too.
 """
 
 import itertools
@@ -17,7 +18,9 @@ MERGED = 16  # samples that are averaged
 STEEP = 0.3  # of the steepest rise of a pulse
 BESIDE = 10  # times the samples over which edges rise, in which there is one edge
 FEWEST = 3  # periods that are needed to recognise a disturbed one
-PART = 0.02  # limit relative to the largest value: 0.05 V at the converter in records of 2.5 V
+# Limits relative to the largest value, of the unloaded and of the loaded voltage: 0.0125 and 0.05 V
+# at the converter in records of 2.5 V. A load cannot change the unloaded voltage.
+PART = np.array([0.005, 0.02])
 SHARE = 0.5  # limit relative to the value at the same place
 NOISE = 8.0  # limit relative to the standard deviation of a mean
 
@@ -67,7 +70,10 @@ def _unlike(
     noise: Float[np.ndarray, "recording 2"],
     step: Float[np.ndarray, "recording 2"],
 ) -> Bool[np.ndarray, "recording period"]:
-    """Whether a period differs from the median of all periods, in one record and not in both."""
+    """Whether a period differs from the median of all periods, in one record and not in both.
+
+    A period beside one that differs up to their joint counts as well if enough periods remain.
+    """
     usual = np.median(means, axis=2)
     floor = np.maximum(PART * np.abs(usual).max(2), noise) + step
     # The first and the last mean lie between pulses.
@@ -77,7 +83,18 @@ def _unlike(
     allowed = SHARE * np.maximum(high, -low) + (high - low) + floor[..., None]
     off = np.abs(means - usual[:, :, None])[..., 1:-1]
     unlike = np.any(off > allowed[:, :, None], axis=3)
-    return unlike.any(axis=1) & ~unlike.all(axis=1)
+    bad = unlike.any(axis=1) & ~unlike.all(axis=1)
+    at_joints = np.abs(means - usual[:, :, None])[..., [0, -1]] > (noise + step)[..., None, None]
+    first, last = np.moveaxis(at_joints.any(axis=1) & bad[..., None], -1, 0)
+    longer = bad.copy()
+    longer[:, :-1] |= first[:, 1:]
+    longer[:, 1:] |= last[:, :-1]
+    return np.where(enough(longer)[:, None], longer, bad)
+
+
+def enough(bad: Bool[np.ndarray, "*recording period"]) -> Bool[np.ndarray, "*recording"]:
+    """Whether more than half of the periods, and at least two, are not disturbed."""
+    return np.asarray(np.sum(~bad, axis=-1) >= max(2, bad.shape[-1] // 2 + 1))
 
 
 def of_source(
