@@ -20,6 +20,7 @@ NAMES = (
     "curves",
     "scale",
     "online",
+    "control",
     "speed_accuracy",
     "which",
     "paper",

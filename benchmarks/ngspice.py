@@ -53,6 +53,8 @@ SETTLING = 0.1  # [s] before the recorded periods; the slowest time constant is 
 SETTLED = 1e-5  # largest difference between the last two periods, relative to the peak
 FINE = 8  # points of the interpolated period per period of the highest harmonic asked for
 
+OPTIONS = f".options method=trap trtol=1 reltol={RELTOL!r} abstol=1e-12 vntol=1e-9 chgtol=1e-11"
+
 # Parts by their name in `PARTS`, from the source to the terminal o, with the nodes they connect.
 NODES = {
     "Rsrc": "source p",
@@ -95,10 +97,43 @@ def netlist(driver: TransformerDriver, load: Impedance | AbstractCircuit, pulse_
             f"edge is {driver.edge:g} s, width {driver.width:g} s; ngspice needs 0 < edge < width"
         )
     period = 1 / pulse_rate
-    pulse = (0.0, driver.amplitude, driver.lead_in, driver.edge, driver.edge)
     settled = math.ceil(SETTLING * pulse_rate) * period
     run = (LONGEST_STEP, settled + 2 * period, settled - 2 * LONGEST_STEP, LONGEST_STEP)
     lines = [
+        *_circuit(driver, period),
+        *_load(load),
+        OPTIONS,
+        ".save v(o)",
+        f".tran {_text(*run)}",
+        ".end",
+    ]
+    return "\n".join(lines) + "\n"
+
+
+def single_pulse(driver: TransformerDriver, load: Impedance, duration: float) -> str:
+    """The same circuit from rest, with one pulse; the current through the load is saved as well.
+
+    Args:
+        driver: The pulse transformer.
+        load: A resistor or skin.
+        duration: Time that is solved [s].
+    """
+    lines = [
+        *_circuit(driver, 10 * duration),
+        "Vload o load 0",
+        *(line.replace(" o ", " load ", 1) for line in _load(load)),
+        OPTIONS,
+        ".save v(o) i(Vload)",
+        f".tran {_text(LONGEST_STEP, duration, 0.0, LONGEST_STEP)}",
+        ".end",
+    ]
+    return "\n".join(lines) + "\n"
+
+
+def _circuit(driver: TransformerDriver, period: float) -> list[str]:
+    """Source and transformer, up to the terminal o."""
+    pulse = (0.0, driver.amplitude, driver.lead_in, driver.edge, driver.edge)
+    return [
         "Pulse transformer of etid.simulation.transformer with a load at node o",
         f"Vp source 0 PULSE({_text(*pulse, driver.width - driver.edge, period)})",
         *(f"{name} {nodes} {_text(getattr(driver, PARTS[name]))}" for name, nodes in NODES.items()),
@@ -106,13 +141,7 @@ def netlist(driver: TransformerDriver, load: Impedance | AbstractCircuit, pulse_
         f"En turn 0 m 0 {_text(driver.turns)}",
         "Vi turn w 0",
         f"Fn m 0 Vi {_text(driver.turns)}",
-        *_load(load),
-        f".options method=trap trtol=1 reltol={RELTOL!r} abstol=1e-12 vntol=1e-9 chgtol=1e-11",
-        ".save v(o)",
-        f".tran {_text(*run)}",
-        ".end",
     ]
-    return "\n".join(lines) + "\n"
 
 
 def _load(load: Impedance | AbstractCircuit) -> list[str]:
@@ -184,8 +213,10 @@ def harmonics(netlist: str, pulse_rate: float, count: int) -> Complex[np.ndarray
     return np.fft.rfft(wave)[1 : count + 1] / points
 
 
-def solve(netlist: str) -> tuple[Float[np.ndarray, " step"], Float[np.ndarray, " step"]]:
-    """Times [s] and the voltage at node o [V] at the steps of ngspice, from `CACHE` if known.
+def solve(netlist: str) -> Float[np.ndarray, "row step"]:
+    """Times [s] and what is saved, such as v(o) [V], at the steps of ngspice.
+
+    They come from `CACHE` if known.
 
     Raises:
         NgspiceError: ngspice is not installed or failed.
@@ -193,23 +224,22 @@ def solve(netlist: str) -> tuple[Float[np.ndarray, " step"], Float[np.ndarray, "
     name = hashlib.sha256(f"{_version()}\n{netlist}".encode()).hexdigest()[:32]
     kept = CACHE / f"{name}.npy"
     if kept.exists():
-        time, v = np.load(kept)
-        return time, v
+        return np.load(kept)
     with tempfile.TemporaryDirectory() as folder:
         circuit, raw = pathlib.Path(folder, "circuit.cir"), pathlib.Path(folder, "out.raw")
         circuit.write_text(netlist)
         said = _ngspice("-b", "-n", "-r", str(raw), str(circuit))
         if not raw.exists():
             raise NgspiceError(f"ngspice wrote no waveform; it says:\n{said}")
-        time, v = waveform(raw.read_bytes())
+        found = waveform(raw.read_bytes())
     CACHE.mkdir(parents=True, exist_ok=True)
     with replacing(kept) as partial:
-        np.save(partial, np.stack([time, v]))
-    return time, v
+        np.save(partial, found)
+    return found
 
 
-def waveform(raw: bytes) -> tuple[Float[np.ndarray, " step"], Float[np.ndarray, " step"]]:
-    """Time [s] and the one voltage [V] of a binary raw file of ngspice.
+def waveform(raw: bytes) -> Float[np.ndarray, "row step"]:
+    """Time [s] and the voltages [V] or currents [A] of a binary raw file of ngspice.
 
     Raises:
         NgspiceError: It is no such file, or not whole.
@@ -219,13 +249,12 @@ def waveform(raw: bytes) -> tuple[Float[np.ndarray, " step"], Float[np.ndarray, 
         line.split(":", 1) for line in io.StringIO(head.decode(errors="replace")) if ":" in line
     )
     points, variables = (int(fields.get(name, "0")) for name in ("No. Points", "No. Variables"))
-    if not mark or variables != 2 or points < 2 or len(body) < 16 * points:
+    if not mark or variables < 2 or points < 2 or len(body) < 8 * variables * points:
         raise NgspiceError(
             f"the raw file has {points} points of {variables} variables in {len(body)} bytes; "
-            "expected two variables, time and v(o)"
+            "expected time and at least one more variable"
         )
-    time, v = np.frombuffer(body, count=2 * points).reshape(points, 2).T
-    return time, v
+    return np.frombuffer(body, count=variables * points).reshape(points, variables).T
 
 
 @functools.cache

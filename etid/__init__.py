@@ -42,6 +42,7 @@ from etid.identify.one import identify_samples, identify_skin
 from etid.identify.posterior import posterior, profile
 from etid.identify.predict import predict
 from etid.identify.selecting import select_circuit
+from etid.online.controller import Controller
 from etid.online.tracker import Tracker
 from etid.plotting import plot
 from etid.recordings.hdf5 import check, read
@@ -78,6 +79,7 @@ __all__ = [
     "AbstractEstimator",
     "Bound",
     "Candidate",
+    "Controller",
     "Driver",
     "EquationError",
     "Fit",

@@ -23,7 +23,7 @@ from etid.recordings.preflight import Inspected
 from etid.results.driver import ContinuousDriver
 from etid.signals.harmonics import ALIASED
 from etid.simulation.scenes import Scene, Trial
-from etid.simulation.transformer import ResistorLoad, SkinLoad, loading
+from etid.simulation.transformer import ResistorLoad, Sampler, SkinLoad, loading
 from tests import pictures
 
 DRY = SkinLoad(r_s=33.4e3, r_p=186e3, c_p=0.12e-9)
@@ -584,16 +584,46 @@ def test_a_change_of_a_few_electrodes_is_theirs_and_one_of_all_the_driver_s():
 def test_an_amplitude_that_is_told_is_no_change():
     tracker, state, clean = ten()
     amplitude = np.linspace(0.5, 2.0, TEN)
+    lanes = dataclasses.replace(state.electrodes, amplitude=jnp.asarray(amplitude))
+    state = dataclasses.replace(state, electrodes=lanes)
     found = tracker.update(state, with_noise(clean[8] * amplitude[:, None], 2), amplitude)
     assert tracker.changes(found) == []
     assert set(tracker.read(found).verdicts) == {"successful"}
     none = tracker.update(state, with_noise(0 * clean[8], 2), 0.0)
-    assert set(tracker.read(none).verdicts) == {"flat"}
+    assert set(tracker.read(none).verdicts) == {"successful"}
+    np.testing.assert_array_equal(none.electrodes.own, state.electrodes.own)
     for wrong in (-1.0, np.nan):
         with pytest.raises(ValueError, match="finite and not negative"):
             tracker.update(state, clean[8], wrong)
     with pytest.raises(ValueError, match=r"shape \(3,\)"):
         tracker.update(state, clean[8], np.ones(3))
+
+
+@pytest.mark.parametrize(("before", "now"), [(1.0, 0.2), (0.3, 1.0), (0.0, 1.0)])
+def test_the_first_pulse_of_another_amplitude_lacks_a_tail_which_is_no_misfit(before, now):
+    """A pulse alone: one in two periods, so that the second of them is what it leaves behind."""
+    tracker = tracker_of(2)
+    whole = scene(1)
+    driver, corner = whole.driver, whole.antialias * RATE
+    sampler = Sampler(RATE, PULSES / 2, corner)
+    v_th = driver.v_th_spectrum(sampler.f) * PULSES / 2
+    z_th = driver.z_th(sampler.f)
+    alone = [v_th * loading(load(sampler.f), z_th) for load in LOADS.values()]
+    first, second = (
+        np.stack([sampler.sample(v, 3333, start) for v in alone]) for start in (0.0, 1 / PULSES)
+    )
+    state = followed(tracker, with_noise(tracker.pulses(loaded(quiet()))[:6], seed=1))
+    lanes = dataclasses.replace(state.electrodes, amplitude=jnp.full(2, before))
+    state = dataclasses.replace(state, electrodes=lanes)
+    v_out = with_noise(now * first + before * second, seed=3)
+    state = tracker.update(state, v_out, now)
+    fits = tracker.read(state)
+    assert list(fits.verdicts) == ["successful"] * 2
+    assert tracker.changes(state) == []
+    assert (fits.fit.steps == 7).all()
+    blind = dataclasses.replace(lanes, amplitude=jnp.full(2, now))
+    blind = dataclasses.replace(state, electrodes=blind)
+    assert set(tracker.read(tracker.update(blind, v_out, now)).verdicts) == {"misfit"}
 
 
 def test_bad_electrodes_are_listed_with_the_reason():

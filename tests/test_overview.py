@@ -84,6 +84,7 @@ def state():
         pulses=numbers,
         missed=numbers,
         amplitude=two,
+        offset=two,
         level=two,
         variance=two,
         chi2=two,

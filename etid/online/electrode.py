@@ -24,15 +24,21 @@ class Measured(NamedTuple):
     Attributes:
         gain: Measured gain.
         variance: E|noise|² of a Fourier coefficient of V_out [V²].
+        weight: Weight of |Ĝ − G|² in each band.
         level: Effective value of the gain.
         amplitude: Amplitude of the pulse, relative to that of the unloaded record.
+        offset: Offset of the converter [V].
+        steady: Whether the amplitude is nearly that of the pulse before.
         bad: Verdict on the samples.
     """
 
     gain: Complex[Array, "*lane band"]
     variance: Float[Array, "*lane"]
+    weight: Float[Array, "*lane band"]
     level: Float[Array, "*lane"]
     amplitude: Float[Array, "*lane"]
+    offset: Float[Array, "*lane"]
+    steady: Bool[Array, "*lane"]
     bad: RESULTS
 
 
@@ -82,7 +88,7 @@ def attempt(
         information: Inverse covariance of `centre`.
     """
     gain = measured.gain - model.departure(start)
-    pulse = Pulse(model, gain, measured.variance, centre, information)
+    pulse = Pulse(model, gain, measured.weight, centre, information)
     own, at, decrement = minimum(pulse.equations, start.vector())
     weight = model.bands.weight
     freedom = 2 * jnp.sum(weight > 0, dtype=at.squares.dtype) - own.size
@@ -118,6 +124,7 @@ def anew(
     measured: Measured,
     starts: Float[Array, "start element"],
     wanted: Bool[Array, ""],
+    logs: Float[Array, " element"],
 ) -> Attempt:
     """The fit of a pulse alone, from the nearest of several starts.
 
@@ -126,11 +133,12 @@ def anew(
         measured: The pulse.
         starts: Logarithms of the elements.
         wanted: Whether the result is used; otherwise the search ends at once.
+        logs: One more start: a search that has not settled continues with the next pulse.
     """
-    start, _ = nearest(model, measured.gain, starts)
+    start, _ = nearest(model, measured.gain, jnp.concatenate([starts, logs[None, :]]))
     nothing = jnp.zeros((starts.shape[1], starts.shape[1]))
     gain = measured.gain - model.departure(start)
-    pulse = Pulse(model, gain, measured.variance, start.log_elements, nothing)
+    pulse = Pulse(model, gain, measured.weight, start.log_elements, nothing)
     own = LoadUnknowns.of(searched(pulse.equations, start.vector(), wanted))
     found = attempt(model, measured, own, own.log_elements, nothing)
     unknown = ~jnp.all(jnp.diagonal(found.spread) < 1)
@@ -224,23 +232,26 @@ def after_pulse(
     event = jnp.where(jumped, JUMP, jnp.where(drifted, DRIFT, NONE)).astype(int)
     changed = jumped | drifted
 
-    missed = jnp.where(good, 0, state.missed + 1)
+    silent = measured.amplitude == 0
+    missed = jnp.where(good, 0, state.missed + jnp.where(silent, 0, 1))
     lost = running & ((missed >= PATIENCE) | (measured.bad == RESULTS.unconnected))
     restarted = good & again
     one = jnp.where(restarted, 1, state.pulses + 1)
+    begun = ~running & (used.result == MAX_STEPS_REACHED)
     gained = jnp.where(restarted, used.information, information + used.information)
     followed = good & ~again
     return ElectrodeState(
-        own=jnp.where(good, used.own, state.own),
+        own=jnp.where(good | begun, used.own, state.own),
         information=jnp.where(lost, 0.0, jnp.where(good, gained, information)),
         pulses=jnp.where(lost, 0, jnp.where(good, one, state.pulses)),
         missed=missed,
         amplitude=measured.amplitude,
-        level=measured.level,
-        variance=measured.variance,
-        chi2=used.chi2,
-        rrse=used.rrse,
-        result=used.result,
+        offset=measured.offset,
+        level=jnp.where(silent, state.level, measured.level),
+        variance=jnp.where(silent, state.variance, measured.variance),
+        chi2=jnp.where(silent, state.chi2, used.chi2),
+        rrse=jnp.where(silent, state.rrse, used.rrse),
+        result=RESULTS.where(silent, state.result, used.result),
         mean=jnp.where(followed, suspected.mean, jnp.where(good | lost, 0.0, state.mean)),
         mean_cov=jnp.where(
             followed, suspected.mean_cov, jnp.where(good | lost, 0.0, state.mean_cov)

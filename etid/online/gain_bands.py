@@ -19,6 +19,12 @@ The bands reduce the numbers to be fitted to a fifth, without loss of informatio
 number of samples, each period is sampled at a different phase φ [samples] and contains
 X(f) + e^(−j2πφ) X(f − fs). An unloaded record of several periods therefore separates X from its
 aliases, and predicts the aliases behind a load.
+
+**The tail** of the pulse before reaches into a window, because the transformer is not at rest after
+one period. If the amplitude has changed from B to A, the window lacks (A − B) / A of the tail that
+it would have in the steady state. The tail decays exponentially, with the time constant τ of the
+unloaded record; its value is what the window itself has at its end. With a step from 0.3 to 0.75
+this part is 0.2 % of the pulse, which is far above the noise.
 """
 
 import math
@@ -38,6 +44,9 @@ RELATIVE = 16  # frequency of a band over its width
 WIDEST = 16  # [bins] largest width of a band
 REACH = 1e-3  # fraction of a period that the transform may leave out
 PRESENT = 0.5  # minimum fraction of a band's power in X that must be signal
+TAIL_SPREAD = 0.2  # of the rate of the tail, by the load, relative to that of the unloaded record
+TAIL_ERROR = 0.2  # of the tail that an amplitude lacks after it has changed
+LAST = 1 / 26  # fraction of a period at its end whose mean is the tail
 DIVERSE = 0.9  # |mean e^(−j2πφ)| above which the sampling phases are too similar
 
 
@@ -78,10 +87,12 @@ class Gains(NamedTuple):
     Attributes:
         gain: Ĝ in each band; it includes the phase of the trigger delay.
         variance: E|noise|² of a Fourier coefficient of V_out [V²].
+        weight: Weight of |Ĝ − G|².
     """
 
     gain: Complex[Array, "lane band"]
     variance: Float[Array, " lane"]
+    weight: Float[Array, "lane band"]
 
 
 class Bands(eqx.Module):
@@ -104,6 +115,10 @@ class Bands(eqx.Module):
         spread: Coefficient of the part that is proportional to the squared delay, per squared
             sample of delay and divided by −½ [rad²].
         alias: Σ X̄(f) X(f − fs) / Σ |X|², the alias per unit of gain at fs − f; 0 if it is unknown.
+        tail: Σ X̄ E / Σ (|X|² − σ_x²), where E is the spectrum of the tail of the pulse before, per
+            volt of the mean over the last samples of a window [1/V]; and its derivative with
+            respect to the logarithm of the rate of decay. 0 if it is unknown.
+        tail_left: Part of the tail that is left after one period.
         floor: Smallest variance that is accepted for a coefficient of V_out [V²].
         sample_rate: Samples per second [Hz].
         samples: Length of a window [samples].
@@ -123,6 +138,8 @@ class Bands(eqx.Module):
     turned: Float[Array, "3 band"]
     spread: Float[Array, " band"]
     alias: Complex[Array, " band"]
+    tail: Complex[Array, "2 band"]
+    tail_left: Float[Array, ""]
     floor: Float[Array, ""]
     sample_rate: float = eqx.field(static=True)
     samples: int = eqx.field(static=True)
@@ -154,11 +171,18 @@ class Bands(eqx.Module):
         factor = jax.lax.complex(self.bent, -delay * self.turned)
         return jnp.sum(factor * values, axis=0) - as_complex(0.5 * delay**2 * self.spread) * gain
 
-    def measure(self, v_out: Float[Array, "lane sample"]) -> Gains:
-        """Gains and noise of one pulse at all electrodes.
+    def measure(
+        self,
+        v_out: Float[Array, "lane sample"],
+        lacking: Float[Array, " lane"],
+        offset: Float[Array, " lane"],
+    ) -> Gains:
+        """Gains and noise of one pulse at all electrodes, as if its amplitude had been constant.
 
         Args:
             v_out: One window per electrode [V].
+            lacking: (A − B) / A, for a pulse of amplitude A after one of amplitude B.
+            offset: Offset of the converter [V].
         """
         # Single precision takes two thirds of the time. Its error is 2e-8 of the peak, a
         # five-hundredth of the smallest noise that etid accepts for a record.
@@ -172,7 +196,36 @@ class Bands(eqx.Module):
         rest = jnp.where(wide[None, :], self.summed(power(y)) - explained, 0.0)
         freedom = sum((width - 2) * count for _, width, count in self.groups if width > 1)
         variance = jnp.maximum(rest.sum(-1) / max(freedom, 1), self.floor)
-        return Gains(level / as_complex(self.signal)[None, :], variance)
+        tail = self._lacking_tail(v_out, lacking, offset, variance)
+        unsure = self.weight[None, :] * power(TAIL_ERROR * tail) / 2
+        weight = self.weight[None, :] / (variance[:, None] + unsure)
+        return Gains(level / as_complex(self.signal)[None, :] + tail, variance, weight)
+
+    def _lacking_tail(
+        self,
+        v_out: Float[Array, "lane sample"],
+        lacking: Float[Array, " lane"],
+        offset: Float[Array, " lane"],
+        variance: Float[Array, " lane"],
+    ) -> Complex[Array, "lane band"]:
+        """What the tail of the pulse before would add to the gain in the steady state.
+
+        In the steady state, the mean over the last samples is late / (1 − lacking ρ). ρ is the part
+        of the tail that is left after one period.
+        """
+        last, middle = round(LAST * self.samples), self.samples // 2
+        late = v_out[:, -last:].mean(axis=1) - offset
+        left = late / (1 - lacking * self.tail_left)
+        # The rate of the loaded driver, as far as the noise lets it be seen.
+        early = v_out[:, middle : middle + last].mean(axis=1) - offset
+        decay = -jnp.log(self.tail_left) * (1 - (middle + last) / self.samples)
+        ratio = early / late
+        rate = jnp.log(jnp.where(ratio > 1, ratio, 1.0)) / decay - 1
+        noise = variance / self.size / last * (1 / early**2 + 1 / late**2) / decay**2
+        rate = rate * TAIL_SPREAD**2 / (TAIL_SPREAD**2 + noise)
+        rate = jnp.where((ratio > 1) & jnp.isfinite(rate), rate, 0.0)
+        shape = self.tail[0][None, :] + as_complex(rate)[:, None] * self.tail[1][None, :]
+        return as_complex(lacking * left)[:, None] * shape
 
 
 def _transform(v: Array, size: int, bins: int) -> Array:
@@ -206,7 +259,22 @@ def _slopes(
     both = before + after
     first = [-after / before / both, (after - before) / before / after, before / after / both]
     second = [2 / before / both, -2 / before / after, 2 / after / both]
-    return np.pad(first, ((0, 0), (1, 1))), np.pad(second, ((0, 0), (1, 1)))
+    slopes = np.zeros((2, 3, x.size))
+    slopes[:, :, 1:-1] = first, second
+    return slopes[0], slopes[1]
+
+
+def _tail_rate(v: Float[np.ndarray, " sample"]) -> float:
+    """Rate at which the end of an unloaded window decays [1/sample]; 0 if it does not.
+
+    Args:
+        v: The window [V].
+    """
+    v = v - v.mean()
+    last, middle = round(LAST * v.size), v.size // 2
+    early, late = v[middle : middle + last].mean(), v[-last:].mean()
+    ratio = early / late if late else 0.0
+    return math.log(ratio) / (v.size - last - middle) if ratio > 1 else 0.0
 
 
 def unloaded_bands(
@@ -258,6 +326,12 @@ def unloaded_bands(
     width = np.where(wide > 1, summed(np.abs(x) ** 2 * offset**2), 0.0)
     signal = strength - wide * variance
     present = signal > PRESENT * strength
+    divisor = np.where(present, signal, strength)
+    rate = _tail_rate(windows.mean(axis=0))
+    # From the middle of the last samples to each sample of the next window.
+    later = rate * (np.arange(samples) + round(LAST * samples) / 2)
+    tail = np.exp(-later) if rate > 0 else np.zeros(samples)
+    tails = np.asarray(_transform(jnp.asarray([tail, -later * tail]), size, bins))
     spread = width / strength * (2 * np.pi / size) ** 2
     first, second = _slopes(angle)
     return Bands(
@@ -266,13 +340,15 @@ def unloaded_bands(
         offset=jnp.asarray(offset),
         frequency=jnp.asarray(centre * sample_rate / size),
         strength=jnp.asarray(strength),
-        signal=jnp.asarray(np.where(present, signal, strength)),
+        signal=jnp.asarray(divisor),
         weight=jnp.asarray(np.where(present, 2 * signal**2 / strength, 0.0)),
         width=jnp.asarray(width),
         bent=jnp.asarray(0.5 * spread * second),
         turned=jnp.asarray(spread * first),
         spread=jnp.asarray(spread),
         alias=jnp.asarray(summed(x.conj() * aliased) / strength),
+        tail=jnp.asarray(np.stack([summed(x.conj() * one) for one in tails]) / divisor),
+        tail_left=jnp.asarray(np.exp(-rate * samples) if rate > 0 else 0.0),
         floor=jnp.asarray(size * (RIPPLE * np.ptp(v_th)) ** 2),
         sample_rate=sample_rate,
         samples=samples,

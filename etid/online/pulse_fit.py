@@ -227,21 +227,21 @@ class Pulse(eqx.Module):
     Attributes:
         model: Model of the gain.
         gain: Measured gain, without aliases and curvature.
-        variance: E|noise|² of a Fourier coefficient of V_out [V²].
+        weight: Weight of |Ĝ − G|² in each band.
         centre: Logarithms of the elements before the pulse [SI].
         information: Inverse covariance of `centre`.
     """
 
     model: GainModel
     gain: Complex[Array, " band"]
-    variance: Float[Array, ""]
+    weight: Float[Array, " band"]
     centre: Float[Array, " element"]
     information: Float[Array, "element element"]
 
     def terms(self, q: Float[Array, " own"]) -> Float[Array, "own1 part"]:
         """Derivatives of the residual and, as the last row, the residual [standard deviations]."""
         of, own = self.model, LoadUnknowns.of(q)
-        weight = as_complex(jnp.sqrt(of.bands.weight / self.variance))
+        weight = as_complex(jnp.sqrt(self.weight))
         model, slope = of.gain(own.log_elements)
         # The derivative with respect to the delay is jω Ĝ e^(jωτ). Here the model replaces Ĝ:
         # otherwise the noise of Ĝ would count as information.

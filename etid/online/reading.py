@@ -69,15 +69,15 @@ def fit_of(
     elements = logs.size
     gain = model.undelayed(logs)
     nothing = jnp.zeros((elements, elements))
-    pulse = Pulse(model, jnp.zeros_like(gain), state.variance, logs, nothing)
+    weight = bands.weight / state.variance
+    pulse = Pulse(model, jnp.zeros_like(gain), weight, logs, nothing)
     jacobian = pulse.terms(state.own)[:-1]
     by_term = inverse(jacobian @ jacobian.T)[:elements] @ jacobian
     # Z_th + R = e^W, so that ∂G/∂W = −Z_L (Z_th + R) / (Z_L + Z_th)².
     z = model.circuit.with_log_values(logs).response(bands.frequency)
     admittance = reciprocal(z + model.source)
-    weight = jnp.sqrt(bands.weight / state.variance)
     loaded = model.source + as_complex(known.resistance)
-    by_w = as_complex(weight) * z * loaded * admittance * admittance
+    by_w = as_complex(jnp.sqrt(weight)) * z * loaded * admittance * admittance
     by_z = by_w[None, :] * known.slope
     of_z = by_term @ jnp.concatenate([by_z.real, by_z.imag], axis=1).T
     # The noise of X is the same in every pulse. It enters Ĝ multiplied by G.

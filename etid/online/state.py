@@ -16,7 +16,9 @@ class ElectrodeState(eqx.Module):
         information: Inverse covariance of the elements' logarithms; 0 before the first good pulse.
         pulses: Number of pulses that contribute to `information`.
         missed: Number of pulses in a row that did not fit.
-        amplitude: Amplitude of the last pulse, relative to that of the unloaded record.
+        amplitude: Amplitude of the last pulse, relative to that of the unloaded record;
+            NaN before the first pulse.
+        offset: Offset of the converter [V].
         level: Effective value of the gain of the last pulse; 1 if the electrode is open.
         variance: E|noise|² of a Fourier coefficient of the last pulse [V²].
         chi2: χ² of the last pulse.
@@ -35,6 +37,7 @@ class ElectrodeState(eqx.Module):
     pulses: Int[Array, "*lane"]
     missed: Int[Array, "*lane"]
     amplitude: Float[Array, "*lane"]
+    offset: Float[Array, "*lane"]
     level: Float[Array, "*lane"]
     variance: Float[Array, "*lane"]
     chi2: Float[Array, "*lane"]

@@ -49,6 +49,7 @@ from etid.estimators.judgement import SUCCESSFUL
 from etid.estimators.maximum_likelihood.given_driver import GivenDriver, combined
 from etid.estimators.registry import MAXIMUM_LIKELIHOOD
 from etid.estimators.starts import circuit_starts
+from etid.estimators.unknowns import LoadUnknowns
 from etid.identify.arguments import circuit_of, require_float64
 from etid.identify.compiled import stored_jit
 from etid.identify.one import explained, known_at
@@ -73,6 +74,7 @@ from etid.results.fits import Fit, Fits, IdentificationError, described
 from etid.results.verdicts import RESULTS, first_verdict, message, verdict_names, verdicts_of
 from etid.signals.transfer import as_complex, power
 
+STEADY = 0.1  # relative change of amplitude up to which the mean of a window is its offset
 FLAT = 4.0  # power relative to that of noise alone; below this, the pulse is `flat`
 
 
@@ -183,7 +185,8 @@ class Tracker(Overviewed, eqx.Module):
             information=jnp.zeros((lanes, elements, elements)),
             pulses=none,
             missed=none,
-            amplitude=jnp.ones(lanes),
+            amplitude=nan,
+            offset=nan,
             level=nan,
             variance=nan,
             chi2=nan,
@@ -225,7 +228,7 @@ class Tracker(Overviewed, eqx.Module):
             v_out: Loaded voltage of one period at every electrode [V]. The windows begin between
                 two pulses.
             amplitude: Primary amplitude of this pulse, at all electrodes or at each, relative to
-                that of the unloaded record. An electrode without a pulse has 0.
+                that of the unloaded record. An electrode without a pulse has 0; its state remains.
 
         Returns:
             State after this pulse.
@@ -308,7 +311,7 @@ def _updated(
 ) -> TrackerState:
     model, limit, number = tracker.model, tracker.limit, state.number + 1
     before = state.electrodes
-    measured = _measured(tracker, v_out, amplitude)
+    measured = _measured(tracker, v_out, amplitude, before)
     information = jax.vmap(lambda of: predicted(of, tracker.change))(before.information)
     found = jax.vmap(lambda *of: tracked(model, *of))(before, measured, information)
     common = model.circuit.scaling()[0]
@@ -320,32 +323,50 @@ def _updated(
     starts = circuit_starts(model.circuit, None)
     fresh = jax.lax.cond(
         wanted.any(),
-        jax.vmap(lambda *of: anew(model, of[0], starts, of[1])),
+        jax.vmap(lambda of, want, logs: anew(model, of, starts, want, logs)),
         lambda *_: found,
         measured,
         wanted,
+        LoadUnknowns.of(before.own).log_elements,
     )
     after = jax.vmap(lambda a, b, c, d, e, f: after_pulse(a, b, c, d, e, f, limit, number))(
         before, measured, information, found, fresh, suspected
     )
-    counts = running & (measured.bad == SUCCESSFUL)
+    counts = running & measured.steady & (measured.bad == SUCCESSFUL)
     event = driver_change(suspected.jump, suspected.z.T, counts)
     return TrackerState(after, number, event, state.driver_changed | event)
 
 
 def _measured(
-    tracker: Tracker, v_out: Float[Array, "lane sample"], amplitude: Float[Array, " lane"]
+    tracker: Tracker,
+    v_out: Float[Array, "lane sample"],
+    amplitude: Float[Array, " lane"],
+    before: ElectrodeState,
 ) -> Measured:
-    """Gains of a pulse, and the verdict on its samples."""
+    """Gains of a pulse, and the verdict on its samples.
+
+    Args:
+        tracker: The tracker.
+        v_out: One window per electrode [V].
+        amplitude: Relative amplitude of the pulse.
+        before: State before the pulse.
+    """
+    relative = jnp.where(amplitude > 0, amplitude, 1.0)
+    known = jnp.isfinite(before.amplitude)
+    lacking = jnp.where(known, (relative - before.amplitude) / relative, 0.0)
+    # In the steady state the mean of V_out is 0: a transformer passes no direct voltage.
+    mean = v_out.mean(axis=1)
+    steady = jnp.abs(lacking) < STEADY
+    first = ~jnp.isfinite(before.offset)
+    offset = jnp.where(jnp.isfinite(mean) & (steady | first), mean, before.offset)
     lowest, highest = v_out.min(axis=1), v_out.max(axis=1)  # NaN if a sample is NaN
     finite = jnp.isfinite(lowest) & jnp.isfinite(highest)
     clipped = (lowest <= tracker.adc_range[0]) | (highest >= tracker.adc_range[1])
     bands = tracker.model.bands
-    gains = bands.measure(jnp.where(finite[:, None], v_out, 0.0))
+    gains = bands.measure(jnp.where(finite[:, None], v_out, 0.0), lacking, offset)
     signal = power(gains.gain) @ bands.weight
     noise = 2 * jnp.sum(bands.weight > 0, dtype=float) * gains.variance
     flat = (signal < FLAT * noise) | ~(amplitude > 0)
-    relative = jnp.where(amplitude > 0, amplitude, 1.0)
     level = jnp.sqrt(jnp.maximum(signal - noise, 0.0) / jnp.sum(bands.weight)) / relative
     bad = jax.vmap(
         lambda finite, clipped, flat, unconnected: first_verdict(
@@ -356,11 +377,14 @@ def _measured(
         )
     )(finite, clipped, flat, jnp.abs(level - 1) < 1 - changes.OPEN)
     return Measured(
-        gains.gain * as_complex(1 / relative)[:, None],
-        gains.variance / relative**2,
-        level,
-        amplitude,
-        bad,
+        gain=gains.gain * as_complex(1 / relative)[:, None],
+        variance=gains.variance / relative**2,
+        weight=gains.weight * relative[:, None] ** 2,
+        level=level,
+        amplitude=amplitude,
+        offset=offset,
+        steady=steady,
+        bad=bad,
     )
 
 

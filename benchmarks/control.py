@@ -1,0 +1,277 @@
+"""Closed loop: the charge at 98 electrodes under a fingertip that changes, against ngspice.
+
+The plant is `benchmarks.control_plant`. Some electrodes stay dry, some become wet within 100 ms at
+different times, some sweat slowly, and one is lifted off and put back. The driver is identified
+from records of ngspice with the same noise and delays. Every controller has the same task.
+
+* etid: `etid.Tracker` and `etid.Controller`.
+* constant voltage: the terminal voltage is regulated to that of a typical dry fingertip.
+* constant amplitude: calibrated once, at the tenth pulse, with the true charge.
+* integral: A += k (Q* − Q) / q₀ with the true charge Q of the last pulse, as from a perfect sensor,
+  and q₀ of typical dry skin; k = 0.25 is stable up to eight times this q₀.
+* model reference: direct model-reference adaptive control with a feed-forward gain and the MIT
+  rule (Åström and Wittenmark 1995, chapter 5), normalised, once per pulse, with the true charge. Of
+  Shen, Gregory and Xi (2014) only the abstract was available: a direct model-reference adaptive
+  controller whose current follows a pulsed reference. Their controller acts within the pulse.
+"""
+
+import argparse
+import dataclasses
+import pathlib
+from collections.abc import Callable
+
+import numpy as np
+from jaxtyping import Float
+from tqdm import tqdm
+
+import etid
+from benchmarks import ngspice
+from benchmarks.charts import COLOURS, new_figure, save
+from benchmarks.control_plant import OPEN, Plant
+from benchmarks.provenance import ROOT
+from etid.simulation.published import REFERENCE, TYPICAL
+from etid.simulation.scenes import Scene, Trial
+from etid.simulation.transformer import ResistorLoad, SkinLoad
+
+DRY, DAMP = TYPICAL["dry"], TYPICAL["damp"]
+WANTED = 80e-9  # [C] per phase
+CAP = 5e-3  # [A]
+FALLBACK = 0.3  # of the amplitude of the unloaded record
+CHANGE = 3e-3  # random walk that the tracker expects [1/√pulse]
+SPOTS, SPREAD = 7, 0.3  # different places of the fingertip, and the spread of their elements
+WETTING = 6  # pulses from dry to damp
+LIFTED, BACK = 70, 90  # pulses between which the last electrode touches nothing
+SETTLED = 2  # pulses after a change that do not count: the target begins with the third
+TARGET = 0.02
+GAIN, REFERENCE_POLE, ADAPTATION = 0.25, 0.5, 0.5
+
+STYLES = {
+    "etid": "-",
+    "constant voltage": "--",
+    "constant amplitude": "-.",
+    "integral": ":",
+    "model reference": "--",
+}
+
+Command = Callable[[int, np.ndarray, np.ndarray, np.ndarray], np.ndarray]
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Size, noise, where the picture goes."""
+    parser.add_argument("--electrodes", type=int, default=98)
+    parser.add_argument("--pulses", type=int, default=120)
+    parser.add_argument("--snr", type=float, nargs="+", default=[60.0, 40.0], help="dB")
+    parser.add_argument("-o", "--output", type=pathlib.Path, default=ROOT / "results/control.svg")
+
+
+def main(arguments: argparse.Namespace) -> bool:
+    """Print the errors of all controllers and draw them; whether etid meets the targets."""
+    fingertip = Fingertip(arguments.electrodes, arguments.pulses)
+    runs, met = {}, True
+    for snr in arguments.snr:
+        loop = Loop(fingertip, snr)
+        found = {"etid": loop.etid()}
+        if not runs:
+            found |= {name: loop.blind(one) for name, one in rivals(loop).items()}
+        for name, run in found.items():
+            print(f"{snr:g} dB  {name:<20}{report(run, fingertip)}", flush=True)
+        met &= good(found["etid"], fingertip)
+        runs |= {f"{name}, {snr:g} dB": run for name, run in found.items()}
+    draw(runs, fingertip, arguments.output)
+    return met
+
+
+class Fingertip:
+    """The skin at each electrode and pulse.
+
+    Args:
+        electrodes: Number of electrodes.
+        pulses: Number of pulses.
+    """
+
+    def __init__(self, electrodes: int, pulses: int) -> None:
+        rng = np.random.default_rng(0)
+        spots = np.exp(SPREAD * rng.standard_normal((SPOTS, 3)))
+        self.kinds = ["dry", "wetting", "sweating"]
+        self.kind = [self.kinds[at % 3] for at in range(electrodes)]
+        self.kind[-1] = "lifted"
+        dry, damp = (np.array(dataclasses.astuple(one)) for one in (DRY, DAMP))
+        self.loads: list[list[SkinLoad | ResistorLoad]] = []
+        changed = np.zeros((pulses, electrodes), bool)
+        changed[0] = True
+        begin = 30 + 3 * (np.arange(electrodes) // 3 % 4)
+        for pulse in range(pulses):
+            row: list[SkinLoad | ResistorLoad] = []
+            for at, kind in enumerate(self.kind):
+                # Fewer places sweat: each pulse of them is another run of ngspice.
+                spot, wet = spots[at // 3 % (2 if kind == "sweating" else SPOTS)], 0.0
+                if kind == "wetting":
+                    wet = np.clip((pulse - begin[at] + 1) / WETTING, 0, 1)
+                    changed[pulse, at] |= begin[at] <= pulse < begin[at] + WETTING
+                if kind == "sweating":  # a third of the way to damp skin
+                    wet = pulse / pulses / 3
+                values = spot * dry ** (1 - wet) * damp**wet
+                lifted = kind == "lifted" and LIFTED <= pulse < BACK
+                row.append(OPEN if lifted else SkinLoad(*map(float, values)))
+                if kind == "lifted":
+                    changed[pulse, at] |= LIFTED <= pulse <= BACK
+            self.loads.append(row)
+        # Pulses that count: neither a change nor one of the two pulses that follow it.
+        after = changed.copy()
+        for later in range(1, SETTLED + 1):
+            after[later:] |= changed[:-later]
+        self.counts = ~after
+
+
+@dataclasses.dataclass(frozen=True)
+class Run:
+    """What a controller has delivered (pulse, electrode).
+
+    Attributes:
+        charge: Charge in the phase [C].
+        peak: Largest current [A].
+        fallback: Whether the amplitude was the fallback.
+    """
+
+    charge: Float[np.ndarray, "pulse lane"]
+    peak: Float[np.ndarray, "pulse lane"]
+    fallback: Float[np.ndarray, "pulse lane"]
+
+
+class Loop:
+    """One driver, one noise, all controllers.
+
+    Args:
+        fingertip: The skin.
+        snr: Signal-to-noise ratio [dB].
+    """
+
+    def __init__(self, fingertip: Fingertip, snr: float) -> None:
+        self.fingertip = fingertip
+        resistors = enumerate((REFERENCE, 21.62e3))
+        calibration = tuple(Trial(f"calibration/{i}", ResistorLoad(r)) for i, r in resistors)
+        self.scene = Scene((), calibration, samples=40_000, snr_db=snr, trigger_jitter_rms=100e-9)
+        self.lanes = len(fingertip.kind)
+        self.typical = Plant(self.scene, 0).response(DRY)
+
+    def etid(self) -> Run:
+        """The tracker and the controller."""
+        records = list(ngspice.record(self.scene, 0).calibrations.recordings())
+        driver = etid.identify_driver(records)
+        tracker = etid.Tracker.of(driver, records[0], electrodes=self.lanes, change=CHANGE)
+        controller = etid.Controller.of(tracker, current_cap=CAP, fallback=FALLBACK)
+        plant, state = Plant(self.scene, 1), tracker.start()
+        samples = tracker.model.bands.samples
+        before, rows = np.zeros(self.lanes), []
+        for pulse, loads in enumerate(tqdm(self.fingertip.loads, leave=False)):
+            command = controller.command(state, charge=WANTED)
+            charge, peak, _ = plant.delivered(loads, command.amplitude, before)
+            v_out = plant.windows(pulse, samples, loads, command.amplitude, before)
+            state = tracker.update(state, v_out, command.amplitude)
+            rows.append((charge, peak, command.reason == "fallback"))
+            before = command.amplitude
+        return Run(*(np.array(column) for column in zip(*rows, strict=True)))
+
+    def blind(self, command: Command) -> Run:
+        """A controller that sees charge and voltage of the last pulse, without noise."""
+        plant = Plant(self.scene, 1)
+        amplitude, before = np.full(self.lanes, FALLBACK), np.zeros(self.lanes)
+        rows = []
+        for pulse, loads in enumerate(self.fingertip.loads):
+            charge, peak, voltage = plant.delivered(loads, amplitude, before)
+            rows.append((charge, peak, np.zeros(self.lanes, bool)))
+            before, amplitude = amplitude, command(pulse, amplitude, charge, voltage)
+        return Run(*(np.array(column) for column in zip(*rows, strict=True)))
+
+
+def rivals(loop: Loop) -> dict[str, Command]:
+    """The controllers that identify nothing."""
+    nominal = WANTED / loop.typical.charge[0]  # amplitude for typical dry skin
+    held = loop.typical.mean * nominal
+    gain, model = np.full(loop.lanes, nominal / WANTED), np.zeros(loop.lanes)
+
+    def voltage(pulse: int, amplitude: np.ndarray, charge: np.ndarray, v: np.ndarray) -> np.ndarray:
+        return amplitude * held / v
+
+    def constant(
+        pulse: int, amplitude: np.ndarray, charge: np.ndarray, v: np.ndarray
+    ) -> np.ndarray:
+        return amplitude * WANTED / charge if pulse == 9 else amplitude
+
+    def integral(
+        pulse: int, amplitude: np.ndarray, charge: np.ndarray, v: np.ndarray
+    ) -> np.ndarray:
+        return np.maximum(amplitude + GAIN * (WANTED - charge) / loop.typical.charge[0], 0.0)
+
+    def adaptive(
+        pulse: int, amplitude: np.ndarray, charge: np.ndarray, v: np.ndarray
+    ) -> np.ndarray:
+        model[:] = REFERENCE_POLE * model + (1 - REFERENCE_POLE) * WANTED
+        normal = ADAPTATION * model / (WANTED**2 + charge**2)
+        gain[:] = np.maximum(gain - normal * (charge - model) * nominal / WANTED, 0.0)
+        return gain * WANTED
+
+    return {
+        "constant voltage": voltage,
+        "constant amplitude": constant,
+        "integral": integral,
+        "model reference": adaptive,
+    }
+
+
+def errors(run: Run, fingertip: Fingertip) -> Float[np.ndarray, " counted"]:
+    """Relative errors of the charge from the third pulse after a change on."""
+    return np.abs(run.charge / WANTED - 1)[fingertip.counts]
+
+
+def report(run: Run, fingertip: Fingertip) -> str:
+    """One line: errors, the largest current, commands from a failed fit."""
+    error = errors(run, fingertip)
+    return (
+        f"median {np.median(error):7.2%}  p99 {np.percentile(error, 99):7.2%}  worst "
+        f"{error.max():7.2%}  within {TARGET:.0%}: {np.mean(error <= TARGET):6.1%}  largest charge "
+        f"{run.charge.max() / WANTED:.1f} times the wanted, current {1e3 * run.peak.max():.2f} mA  "
+        f"fallback {np.mean(run.fallback & fingertip.counts):.2%}"
+    )
+
+
+def good(run: Run, fingertip: Fingertip) -> bool:
+    """Whether the charge is within the target and the current below its cap."""
+    return bool(errors(run, fingertip).max() <= TARGET and run.peak.max() <= CAP)
+
+
+def draw(runs: dict[str, Run], fingertip: Fingertip, path: pathlib.Path) -> None:
+    """Charge against pulse: one panel for each kind of skin, one line for each controller."""
+    kinds = {
+        "dry": "dry",
+        "wetting": "wetting within 100 ms",
+        "sweating": "sweating slowly",
+        "lifted": "lifted off and put back",
+    }
+    figure, grid = new_figure(len(kinds), 1, (7.2, 8.6), sharex=True)
+    panels = grid[:, 0]
+    colours = {name: COLOURS[at % len(COLOURS)] for at, name in enumerate(STYLES)}
+    for panel, (kind, title) in zip(panels, kinds.items(), strict=True):
+        at = fingertip.kind.index(kind)
+        for name, run in runs.items():
+            plain = name.split(",", maxsplit=1)[0]
+            own = plain == "etid"
+            panel.semilogy(
+                np.maximum(run.charge[:, at] / WANTED, 1e-3),
+                STYLES[plain],
+                color=colours[plain],
+                alpha=0.6 if own and run is not runs[next(iter(runs))] else 1.0,
+                linewidth=1.8 if own else 1.0,
+                zorder=3 if own else 2,
+                label=name if own else plain,
+            )
+        panel.axhspan(1 - TARGET, 1 + TARGET, color="0.85", zorder=0)
+        panel.set_ylim(0.2, 15)
+        panel.set_yticks([0.5, 1, 2, 5, 10], ["0.5", "1", "2", "5", "10"])
+        panel.minorticks_off()
+        panel.set_title(title, loc="left", fontsize="medium")
+        panel.set_ylabel("charge / wanted")
+    panels[-1].set_xlabel("pulse")
+    handles, labels = panels[0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside upper center", ncols=3, frameon=False)
+    save(figure, path)

@@ -1,0 +1,138 @@
+"""A display under a fingertip that changes, from waveforms of ngspice.
+
+ngspice solves driver and skin from rest, with one pulse, over two periods. The circuit is linear:
+a pulse of amplitude A after one of amplitude B is A u(t) + B u(t + T). The older pulses have
+decayed to e^(-8) of the tail of the last one. Where skin changes between two pulses, the tail of
+the pulse before is that of the new skin; it is 0.3 % of the pulse.
+
+Each window has its own delay, sampling phase, noise and rounding by the converter.
+"""
+
+import dataclasses
+from collections.abc import Sequence
+
+import numpy as np
+import scipy.interpolate
+from jaxtyping import Float
+
+from benchmarks import ngspice
+from etid.simulation.scenes import Scene
+from etid.simulation.transformer import OpenLoad, ResistorLoad, SkinLoad
+
+OPEN = ResistorLoad(1e12)
+FINE = 16  # points per sample of the waveform that is sampled
+CORNER = 0.4  # of the sample rate, of the 4th-order Butterworth anti-alias filter
+
+
+@dataclasses.dataclass(frozen=True)
+class Response:
+    """One skin, a pulse of unit amplitude: this period, and what it leaves to the next.
+
+    Attributes:
+        voltage: Terminal voltage after the anti-alias filter [V] by time from the start [s].
+        charge: Charge in the phase, of the pulse and of the pulse before [C].
+        peak: Largest current of either sign [A].
+        mean: Mean terminal voltage in the phase [V].
+    """
+
+    voltage: scipy.interpolate.CubicSpline
+    charge: Float[np.ndarray, " 2"]
+    peak: float
+    mean: float
+
+
+class Plant:
+    """Gives the windows of all electrodes, and the true charge and current.
+
+    Args:
+        scene: Driver and converter.
+        seed: Seed of noise and delays.
+    """
+
+    def __init__(self, scene: Scene, seed: int) -> None:
+        self.scene, self.rng = scene, np.random.default_rng(seed)
+        self.known: dict[SkinLoad | ResistorLoad | OpenLoad, Response] = {}
+        self.period = 1 / scene.pulse_rate
+        time, v, _ = self._solved(OPEN)
+        top = int(np.argmax(v))
+        below = np.flatnonzero(v <= 0)
+        self.phase = time[below[below < top].max()], time[below[below > top].min()]
+        snr = scene.snr_db
+        rms = np.sqrt(np.trapezoid(v**2, time) / self.period)
+        self.sigma = 0.0 if snr is None else float(rms * 10 ** (-snr / 20))
+
+    def _solved(self, load: SkinLoad | ResistorLoad) -> Float[np.ndarray, "3 step"]:
+        text = ngspice.single_pulse(self.scene.driver, load, 2 * self.period)
+        return ngspice.solve(text)
+
+    def response(self, load: SkinLoad | ResistorLoad) -> Response:
+        """The waveforms of one load."""
+        if load not in self.known:
+            self.known[load] = self._response(load)
+        return self.known[load]
+
+    def _response(self, load: SkinLoad | ResistorLoad) -> Response:
+        time, v, i = self._solved(load)
+        rate = self.scene.sample_rate * FINE
+        grid = np.arange(round(2 * self.period * rate)) / rate
+        even = scipy.interpolate.CubicSpline(time, v)(grid)
+        s = 1j * np.fft.rfftfreq(grid.size, 1 / rate) / (CORNER * self.scene.sample_rate)
+        for odd in (1, 3):
+            even = np.fft.irfft(
+                np.fft.rfft(even) / (s**2 + 2 * np.sin(np.pi * odd / 8) * s + 1), grid.size
+            )
+        whole = scipy.interpolate.CubicSpline(time, i).antiderivative()
+        begin, end = self.phase
+        charge = [float(whole(end + shift) - whole(begin + shift)) for shift in (0.0, self.period)]
+        inside = (time > begin) & (time < end)
+        mean = float(np.trapezoid(v[inside], time[inside]) / (end - begin))
+        first = time < self.period
+        return Response(
+            scipy.interpolate.CubicSpline(grid, even),
+            np.array(charge),
+            float(np.abs(i[first]).max()),
+            mean,
+        )
+
+    def delivered(
+        self,
+        loads: Sequence[SkinLoad | ResistorLoad],
+        amplitude: Float[np.ndarray, " lane"],
+        before: Float[np.ndarray, " lane"],
+    ) -> tuple[Float[np.ndarray, " lane"], Float[np.ndarray, " lane"], Float[np.ndarray, " lane"]]:
+        """True charge [C], largest current [A] and mean voltage in the phase [V] of a pulse.
+
+        Args:
+            loads: The skin at each electrode.
+            amplitude: Relative amplitudes of this pulse.
+            before: Those of the pulse before.
+        """
+        found = [self.response(load) for load in loads]
+        charge = np.array([one.charge for one in found])
+        q = charge[:, 0] * amplitude + charge[:, 1] * before
+        peak = np.array([one.peak for one in found]) * amplitude
+        return q, peak, np.array([one.mean for one in found]) * amplitude
+
+    def windows(
+        self,
+        number: int,
+        samples: int,
+        loads: Sequence[SkinLoad | ResistorLoad],
+        amplitude: Float[np.ndarray, " lane"],
+        before: Float[np.ndarray, " lane"],
+    ) -> Float[np.ndarray, "lane sample"]:
+        """What the converter records of pulse `number` [V]; the other arguments as `delivered`."""
+        rate, scene = self.scene.sample_rate, self.scene
+        begin = round(number * self.period * rate) / rate - number * self.period
+        rows = []
+        for load, now, then in zip(loads, amplitude, before, strict=True):
+            delay = begin + scene.trigger_jitter_rms * self.rng.standard_normal()
+            at = np.arange(samples) / rate + delay
+            spline = self.response(load).voltage
+            # The end of the second period continues at its beginning in the filtered waveform.
+            v = now * spline(np.maximum(at, 0.0)) + then * spline(
+                np.minimum(at + self.period, 2 * self.period - 1 / rate)
+            )
+            rows.append(v + self.sigma * self.rng.standard_normal(samples))
+        step = scene.full_scale / 2 ** (16 - 1) / scene.scale
+        return step * np.rint(np.array(rows) / step)

@@ -1,0 +1,277 @@
+"""Control of the stimulation: the amplitude of the next pulse at every electrode.
+
+    controller = etid.Controller.of(tracker, probability=0.999)
+    command = controller.command(state, charge=100e-9)
+    ... give the pulses with command.amplitude, record v_out ...
+    state = tracker.update(state, v_out, command.amplitude)
+
+All amplitudes are primary amplitudes relative to that of the tracker's unloaded record; the driver
+is linear. For a wanted charge Q the amplitude is Q / q, where q is the charge per unit of amplitude
+that the elements and Z_th predict (`etid.online.current`). The limits are applied in this order:
+
+| limit | amplitude at most |
+|---|---|
+| `peak` | cap / (p + k σ_p), the cap on the current |
+| `charge` | cap / (q + k σ_q), the cap on the charge per phase |
+| `guard` | cap / p_s, with the peak current p_s through a short circuit |
+| `voltage` | cap / largest unloaded voltage |
+| `slew` | amplitude before + slew |
+
+k is the quantile of the normal distribution for the stated probability; σ contains the noise of the
+pulses, the random walk of the skin until the next pulse, and the error of the calibration.
+
+**Limits that hold whatever the estimate says** are `guard`, `voltage` and `slew`. The skin may
+become wet between two pulses, and no controller can know this before the pulse. Through a passive
+load of resistors and capacitors that follow a series resistor, the largest current is that through
+a short circuit. An amplitude below the guard therefore keeps the current below its cap even at the
+first pulse after a change. The *charge* of this pulse is too large by the factor by which the skin
+has changed.
+
+**An electrode whose verdict is not good** gets the fallback amplitude, or less if a limit says so.
+The command says `fallback` for it, and its charge is NaN.
+"""
+
+import dataclasses
+import math
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import scipy.special
+from jaxtyping import Array, Float, Int
+
+from etid.circuits.overview import Overview, Overviewed
+from etid.estimators.judgement import SUCCESSFUL
+from etid.estimators.unknowns import LoadUnknowns
+from etid.online.current import CurrentModel
+from etid.online.electrode import predicted
+from etid.online.state import ElectrodeState, TrackerState
+from etid.online.tracker import Tracker
+from etid.results.verdicts import counts
+from etid.solvers.matrices import inverse_of_few
+
+REASONS = ("wanted", "peak", "charge", "guard", "voltage", "slew", "fallback")
+CURRENT_CAP = 5e-3  # [A] the paper's limit for the fingertip
+
+
+class _Commands(eqx.Module):
+    amplitude: Float[Array, "*lane"]
+    charge: Float[Array, "*lane"]
+    charge_stderr: Float[Array, "*lane"]
+    peak: Float[Array, "*lane"]
+    reason: Int[Array, "*lane"]
+
+
+@dataclasses.dataclass(frozen=True)
+class Command(Overviewed):
+    """What to give at the next pulse.
+
+    Attributes:
+        amplitude: Primary amplitude at each electrode, relative to that of the unloaded record.
+        charge: Expected charge per phase [C]; NaN where the amplitude is the fallback.
+        charge_stderr: Its standard error [C].
+        peak: Expected largest current [A]; NaN where the amplitude is the fallback.
+        reason: What determined the amplitude: `wanted`, the name of a limit, or `fallback`.
+    """
+
+    amplitude: Float[np.ndarray, " lane"]
+    charge: Float[np.ndarray, " lane"]
+    charge_stderr: Float[np.ndarray, " lane"]
+    peak: Float[np.ndarray, " lane"]
+    reason: np.ndarray
+
+    def _overview(self) -> Overview:
+        found = ", ".join(f"{number} {name}" for name, number in counts(self.reason).items())
+        rows = [
+            (str(at), str(reason), f"{amplitude:.3f}", f"{1e9 * charge:.1f}", f"{1e3 * peak:.2f}")
+            for at, (reason, amplitude, charge, peak) in enumerate(
+                zip(self.reason, self.amplitude, self.charge, self.peak, strict=True)
+            )
+        ]
+        heads = ("electrode", "reason", "amplitude", "charge / nC", "peak / mA")
+        return Overview(f"Command for {self.reason.size} electrodes: {found}", rows, heads)
+
+
+class Controller(Overviewed, eqx.Module):
+    """Finds the amplitude of every pulse for a wanted charge or current.
+
+    Make a controller with `Controller.of`.
+
+    Attributes:
+        tracker: The tracker whose states are used.
+        model: Charge and current from an admittance.
+        current_cap: Largest current of either sign [A].
+        charge_cap: Largest charge per phase [C].
+        quantile: k, in standard errors.
+        guard: Amplitude at which a short circuit carries `current_cap`.
+        ceiling: Amplitude at which the unloaded voltage reaches its cap.
+        slew: Largest increase of the amplitude from pulse to pulse.
+        fallback: Amplitude for an electrode whose verdict is not good.
+    """
+
+    tracker: Tracker
+    model: CurrentModel
+    current_cap: Float[Array, ""]
+    charge_cap: Float[Array, ""]
+    quantile: Float[Array, ""]
+    guard: Float[Array, ""]
+    ceiling: Float[Array, ""]
+    slew: Float[Array, ""]
+    fallback: Float[Array, ""]
+
+    @classmethod
+    def of(
+        cls,
+        tracker: Tracker,
+        *,
+        current_cap: float = CURRENT_CAP,
+        charge_cap: float = math.inf,
+        voltage_cap: float = math.inf,
+        slew: float = math.inf,
+        fallback: float = 0.1,
+        probability: float = 0.999,
+    ) -> "Controller":
+        """A controller for the electrodes of a tracker.
+
+        Args:
+            tracker: The tracker.
+            current_cap: Largest current of either sign [A].
+            charge_cap: Largest charge per phase [C].
+            voltage_cap: Compliance: largest unloaded voltage at the terminal [V].
+            slew: Largest increase of the relative amplitude from one pulse to the next. A decrease
+                is never limited.
+            fallback: Relative amplitude for an electrode whose verdict is not good. It must be
+                large enough for the tracker to identify the skin.
+            probability: Probability with which the caps on current and charge hold while the skin
+                varies as the tracker expects.
+
+        Raises:
+            ValueError: A limit is not positive, the probability is not between ½ and 1, or the
+                driver of the tracker is not good.
+        """
+        limits = {
+            "current_cap": current_cap,
+            "charge_cap": charge_cap,
+            "voltage_cap": voltage_cap,
+            "slew": slew,
+            "fallback": fallback,
+        }
+        for name, value in limits.items():
+            if not value > 0:
+                raise ValueError(f"{name} is {value}; it must be positive")
+        if not 0.5 <= probability < 1:
+            raise ValueError(f"probability is {probability}; give at least 0.5 and less than 1")
+        if tracker.driver_result != SUCCESSFUL:
+            raise ValueError(
+                "the driver of the tracker was not identified successfully, so that no limit of "
+                "the current would hold; repeat the calibration"
+            )
+        model = CurrentModel.of(tracker.model.bands, tracker.model.source, tracker.known)
+        of = tracker.model.bands
+        spectrum = np.concatenate([[0], of.x, np.zeros(of.size // 2 - of.x.size)])
+        unloaded = float(np.abs(np.fft.irfft(spectrum, of.size)).max())
+        return cls(
+            tracker=tracker,
+            model=model,
+            current_cap=jnp.asarray(float(current_cap)),
+            charge_cap=jnp.asarray(float(charge_cap)),
+            quantile=jnp.asarray(float(scipy.special.ndtri(probability))),
+            guard=current_cap / jnp.abs(model.short_circuit()).max(),
+            ceiling=jnp.asarray(float(voltage_cap) / unloaded),
+            slew=jnp.asarray(float(slew)),
+            fallback=jnp.asarray(float(fallback)),
+        )
+
+    def _overview(self) -> Overview:
+        rows = [
+            ("current_cap", f"{1e3 * float(self.current_cap):g}", "mA"),
+            ("charge_cap", f"{1e9 * float(self.charge_cap):g}", "nC"),
+            ("guard", f"{float(self.guard):.3f}", "of the unloaded record"),
+            ("fallback", f"{float(self.fallback):g}", "of the unloaded record"),
+        ]
+        return Overview(f"Controller of {self.tracker.electrodes} electrodes", rows)
+
+    def command(
+        self,
+        state: TrackerState,
+        *,
+        charge: float | Float[np.ndarray, " wanted"] | None = None,
+        current: float | Float[np.ndarray, " wanted"] | None = None,
+    ) -> Command:
+        """The amplitudes of the next pulse.
+
+        Args:
+            state: State of the tracker after the last pulse.
+            charge: Wanted charge per phase, at all electrodes or at each [C].
+            current: Wanted mean current during the phase, instead of a charge [A].
+
+        Raises:
+            ValueError: Not exactly one of `charge` and `current` is given, or a number is negative
+                or not finite, or there is not one for each electrode.
+        """
+        if (charge is None) == (current is None):
+            raise ValueError("give either charge or current")
+        given = np.asarray(charge if current is None else current, float)
+        if given.shape not in ((), (self.tracker.electrodes,)):
+            raise ValueError(
+                f"the wanted numbers have shape {given.shape}; give one, or one for each of "
+                f"{self.tracker.electrodes} electrodes"
+            )
+        if not (np.isfinite(given) & (given >= 0)).all():
+            raise ValueError(f"{given} is wanted; it must be finite and not negative")
+        wanted = given if current is None else given * self.model.phase
+        wanted = np.broadcast_to(wanted, (self.tracker.electrodes,))
+        found = jax.tree.map(np.asarray, _commanded(self, state, jnp.asarray(wanted)))
+        reason = np.array(REASONS)[found.reason]
+        return Command(found.amplitude, found.charge, found.charge_stderr, found.peak, reason)
+
+
+@jax.jit  # as `etid.online.tracker`
+def _commanded(
+    controller: Controller, state: TrackerState, wanted: Float[Array, " lane"]
+) -> _Commands:
+    usable = (controller.tracker.driver_result == SUCCESSFUL) & ~state.driver_changed
+    return jax.vmap(lambda lane, want: _electrode(controller, lane, want, usable))(
+        state.electrodes, wanted
+    )
+
+
+def _electrode(
+    controller: Controller,
+    state: ElectrodeState,
+    wanted: Float[Array, ""],
+    usable: Array,
+) -> _Commands:
+    """The command for one electrode."""
+    change = controller.tracker.change
+    information = predicted(state.information, change)
+    cov = inverse_of_few(information)
+    logs = LoadUnknowns.of(state.own).log_elements
+    now = controller.model.current(controller.tracker.model.circuit, logs, cov)
+    k = controller.quantile
+    good = usable & (state.result == SUCCESSFUL) & (state.pulses > 0)
+    good = good & (now.charge > 0) & (now.charge_stderr < now.charge)
+    limits = jnp.stack(
+        [
+            wanted / now.charge,
+            controller.current_cap / (now.peak + k * now.peak_stderr),
+            controller.charge_cap / (now.charge + k * now.charge_stderr),
+            controller.guard,
+            controller.ceiling,
+            jnp.nan_to_num(state.amplitude) + controller.slew,
+        ]
+    )
+    first = jnp.where(wanted > 0, controller.fallback, 0.0)
+    safe = jnp.concatenate([first[None], jnp.full(2, jnp.inf), limits[3:]])
+    applied = jnp.where(good, limits, safe)
+    reason = jnp.argmin(applied)
+    amplitude = applied[reason]
+    reason = jnp.where(good, reason, len(REASONS) - 1)
+    return _Commands(
+        amplitude,
+        jnp.where(good, amplitude * now.charge, jnp.nan),
+        jnp.where(good, amplitude * now.charge_stderr, jnp.nan),
+        jnp.where(good, amplitude * now.peak, jnp.nan),
+        reason,
+    )

@@ -1,0 +1,167 @@
+"""The current through an electrode at each pulse: charge per phase and peak, from the elements.
+
+With the symbols of `etid.online.tracker`, the current at frequency f is
+
+    I(f) = X(f) / (Z_L(f) + Z_th(f)),
+
+for a pulse of the amplitude of the unloaded record. Every number that is linear in the current is
+therefore a sum over frequencies. The charge per phase is ∫ i dt between the two times t₀ and t₁ at
+which the unloaded voltage crosses zero around its maximum; the current at a time t is such a sum as
+well. The admittance between the centres of two bands is interpolated linearly, so that the sums run
+over bands.
+
+**Errors.** The tracker knows the gain G of the pulses better than the elements and Z_th apart. With
+G fixed, I = X (1 − G) / Z_th: an error δ log Z_th of the calibration makes an error −I δ log Z_th
+of the current. The noise of the pulses adds ∂I/∂ϑ = −X Y² ∂Z_L/∂ϑ, with Y = 1/(Z_L + Z_th).
+
+The unloaded record has the bandwidth of its converter. A spike at an edge that is shorter than two
+samples is higher than its peak here.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Complex, Float
+
+from etid.circuits.circuit import AbstractCircuit
+from etid.estimators.maximum_likelihood.given_driver import GivenDriver
+from etid.online.gain_bands import Bands
+from etid.signals.transfer import as_complex, reciprocal
+
+EDGE = 24  # [samples] after each edge that are looked at in steps of `FINE`
+FINE = 0.5  # [samples]
+COARSE = 8.0  # [samples] between the other times of the pulse
+
+
+class Current(eqx.Module):
+    """Charge and peak current of a pulse, and their errors, per unit of relative amplitude.
+
+    Attributes:
+        charge: Charge per phase [C].
+        charge_stderr: Its standard error [C].
+        peak: Largest current of either sign [A].
+        peak_stderr: Its standard error [A].
+    """
+
+    charge: Float[Array, "*lane"]
+    charge_stderr: Float[Array, "*lane"]
+    peak: Float[Array, "*lane"]
+    peak_stderr: Float[Array, "*lane"]
+
+
+class CurrentModel(eqx.Module):
+    """Sums over bands that turn an admittance into charge and current.
+
+    Attributes:
+        frequency: Centres of the bands [Hz].
+        source: Z_th in each band [Ω].
+        by_source: ∂ log Z_th / ∂z for the directions z of the calibrations' errors.
+        source_cov: Covariance of z.
+        sums: Weights of the real and imaginary parts of the admittance: row 0 for the charge [C Ω],
+            the others for the current at `times` [A Ω].
+        times: Times of the other rows after the start of the window [s].
+        phase: Duration of a phase, t₁ − t₀ [s].
+    """
+
+    frequency: Float[Array, " band"]
+    source: Complex[Array, " band"]
+    by_source: Complex[Array, "z band"]
+    source_cov: Float[Array, "z z"]
+    sums: Float[Array, "row part"]
+    times: Float[Array, " time"]
+    phase: float = eqx.field(static=True)
+
+    @classmethod
+    def of(
+        cls, bands: Bands, source: Complex[Array, " band"], known: GivenDriver
+    ) -> "CurrentModel":
+        """The model.
+
+        Args:
+            bands: The unloaded pulse.
+            source: Z_th in its bands [Ω].
+            known: Distribution of Z_th in its bands.
+        """
+        x, rate = np.asarray(bands.x), bands.sample_rate
+        number = np.arange(1.0, x.size + 1)
+        spectrum = np.concatenate([[0], x, np.zeros(bands.size // 2 - x.size)])
+        begin, end = _phase(np.fft.irfft(spectrum, bands.size))
+        edges = [np.arange(-2.0, EDGE, FINE) + edge for edge in (begin, end)]
+        times = np.concatenate([edges[0], np.arange(begin + EDGE, end - 2, COARSE), edges[1]])
+        omega = 2 * np.pi * number / bands.size  # per sample
+        integral = (np.exp(1j * omega * end) - np.exp(1j * omega * begin)) / (1j * omega * rate)
+        rows = np.concatenate([integral[None, :], np.exp(1j * np.outer(times, omega))])
+        rows = 2 / bands.size * rows * x
+        by_band = rows @ _interpolation(number, np.asarray(bands.frequency) * bands.size / rate)
+        # Re Σ w Y = Σ Re w Re Y − Im w Im Y.
+        sums = np.concatenate([by_band.real, -by_band.imag], axis=1)
+        loaded = source + as_complex(known.resistance)
+        return cls(
+            frequency=bands.frequency,
+            source=source,
+            by_source=known.slope * (loaded * reciprocal(source))[None, :],
+            source_cov=known.cov,
+            sums=jnp.asarray(sums),
+            times=jnp.asarray(times / rate),
+            phase=float((end - begin) / rate),
+        )
+
+    def waveform(self, circuit: AbstractCircuit) -> Float[Array, " time"]:
+        """Current through a load at `times`, per unit of relative amplitude [A]."""
+        admittance = reciprocal(circuit.response(self.frequency) + self.source)
+        return self.sums[1:] @ _parts(admittance)
+
+    def short_circuit(self) -> Float[Array, " time"]:
+        """Current through a short circuit at `times`, per unit of relative amplitude [A]."""
+        return self.sums[1:] @ _parts(reciprocal(self.source))
+
+    def current(
+        self,
+        circuit: AbstractCircuit,
+        logs: Float[Array, " element"],
+        cov: Float[Array, "element element"],
+    ) -> Current:
+        """Charge and peak current for one electrode.
+
+        Args:
+            circuit: Structure of the load.
+            logs: Logarithms of its elements [SI].
+            cov: Covariance of `logs` from the noise of the pulses.
+        """
+
+        def load(logs: Float[Array, " element"]) -> Complex[Array, " band"]:
+            return circuit.with_log_values(logs).response(self.frequency)
+
+        admittance = reciprocal(load(logs) + self.source)
+        found = self.sums @ _parts(admittance)
+        at = 1 + jnp.argmax(jnp.abs(found[1:]))
+        rows = jnp.stack([self.sums[0], self.sums[at]])
+        by_element = jax.vmap(lambda v: jax.jvp(load, (logs,), (v,))[1])(jnp.eye(logs.size))
+        own = rows @ _parts(by_element * (admittance * admittance)[None, :]).T
+        shared = rows @ _parts(self.by_source * admittance[None, :]).T
+        variance = jnp.sum((own @ cov) * own, axis=1)
+        variance = variance + jnp.sum((shared @ self.source_cov) * shared, axis=1)
+        charge_stderr, peak_stderr = jnp.sqrt(variance)
+        return Current(found[0], charge_stderr, jnp.abs(found[at]), peak_stderr)
+
+
+def _parts(values: Complex[Array, "*row band"]) -> Float[Array, "*row part"]:
+    """Real and imaginary parts, one after the other."""
+    return jnp.concatenate([values.real, values.imag], axis=-1)
+
+
+def _phase(v: Float[np.ndarray, " sample"]) -> tuple[float, float]:
+    """Zero crossings around the maximum [samples]."""
+    top = int(np.argmax(v))
+    below = np.flatnonzero(v <= 0)
+    before, after = below[below < top].max(), below[below > top].min()
+    begin = before + v[before] / (v[before] - v[before + 1])
+    return begin, after - v[after] / (v[after] - v[after - 1])
+
+
+def _interpolation(
+    bins: Float[np.ndarray, " bin"], centres: Float[np.ndarray, " band"]
+) -> Float[np.ndarray, "bin band"]:
+    """Weights of linear interpolation from the centres of bands to bins; constant at the ends."""
+    return np.stack([np.interp(bins, centres, one) for one in np.eye(centres.size)], axis=1)

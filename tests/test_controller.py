@@ -1,0 +1,174 @@
+"""The controller: the wanted charge, limits that hold, and no command without its reason."""
+
+import dataclasses
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import etid
+from etid.online.current import CurrentModel
+from etid.results.verdicts import verdict
+from etid.simulation.transformer import SkinLoad, TransformerDriver
+from tests.test_online import DAMP, DRY, PULSES, followed, loaded, quiet, tracker_of, with_noise
+
+HARMONICS = 60.0 * np.arange(1, 30_001)  # to 1.8 MHz
+POINTS = 1 << 16
+
+
+def true_current(load):
+    """One period of the current in the steady state, from the circuit of the transformer [A]."""
+    driver = TransformerDriver()
+    i = driver.v_th_spectrum(HARMONICS) * PULSES / (load(HARMONICS) + driver.z_th(HARMONICS))
+    return np.fft.irfft(np.concatenate([[0], i, np.zeros(POINTS // 2 - i.size)]), POINTS) * POINTS
+
+
+@functools.cache
+def tracked():
+    tracker = tracker_of(2)
+    return followed(tracker, with_noise(tracker.pulses(loaded(quiet()))[:10], seed=2))
+
+
+def controlled(**limits):
+    """A controller for a dry and a damp electrode, and the state after ten pulses."""
+    return etid.Controller.of(tracker_of(2), **limits), tracked()
+
+
+def true_charge(load):
+    """Charge in the phase of the unloaded voltage [C]."""
+    driver = TransformerDriver()
+    v = driver.v_th_spectrum(HARMONICS) * PULSES
+    v = np.fft.irfft(np.concatenate([[0], v, np.zeros(POINTS // 2 - v.size)]), POINTS)
+    below = np.flatnonzero(v <= 0)
+    top = int(np.argmax(v))
+    inside = slice(below[below < top].max(), below[below > top].min())
+    return true_current(load)[inside].sum() / POINTS / PULSES
+
+
+def test_the_charge_of_the_commanded_pulse_is_the_wanted_one():
+    controller, state = controlled()
+    command = controller.command(state, charge=80e-9)
+    assert list(command.reason) == ["wanted", "wanted"]
+    delivered = command.amplitude * np.array([true_charge(DRY), true_charge(DAMP)])
+    # The driver has one error for both; two standard errors, and 0.1 % by the finite bandwidth.
+    assert (np.abs(delivered - 80e-9) < 2 * command.charge_stderr + 0.08e-9).all()
+    np.testing.assert_allclose(command.charge, 80e-9, rtol=1e-12)
+    by_current = controller.command(state, current=80e-9 / controller.model.phase)
+    np.testing.assert_allclose(by_current.amplitude, command.amplitude, rtol=1e-12)
+
+
+def test_the_standard_error_of_the_charge_is_what_other_calibrations_and_noise_make_of_it():
+    """Noise: the derivative. Calibration: Z_th along z, with the gain of the pulses fixed."""
+    controller, _ = controlled()
+    model, circuit = controller.model, etid.SkinRC(*dataclasses.astuple(DRY))
+    logs, step = circuit.log_values(), 1e-5
+    nothing = jnp.zeros((3, 3))
+    alone = dataclasses.replace(model, source_cov=0 * model.source_cov)
+    for i in range(3):
+        low, high = (
+            float(alone.current(circuit, logs.at[i].add(s), nothing).charge) for s in (-step, step)
+        )
+        one = alone.current(circuit, logs, nothing.at[i, i].set(1.0))
+        # A central difference of a smooth function: error of the order of step².
+        np.testing.assert_allclose(one.charge_stderr, abs(high - low) / 2 / step, rtol=1e-6)
+    cov = jnp.zeros_like(model.source_cov).at[0, 0].set(1.0)
+    one = dataclasses.replace(model, source_cov=cov).current(circuit, logs, nothing)
+    # I = X (1 - G) / Z_th with G fixed: the admittance changes by -δ log Z_th.
+    admittance = 1 / (circuit.response(model.frequency) + model.source)
+    parts = admittance * model.by_source[0]
+    shift = model.sums[0] @ jnp.concatenate([parts.real, parts.imag])
+    np.testing.assert_allclose(one.charge_stderr, jnp.abs(shift), rtol=1e-9)
+
+
+def test_no_skin_carries_more_than_the_guard_lets_a_short_circuit_carry():
+    """Skins over many decades, from the circuit of the transformer itself."""
+    controller, _ = controlled(current_cap=4e-3)
+    rng = np.random.default_rng(3)
+    for _ in range(40):
+        logs = rng.uniform(np.log([1.0, 10.0, 1e-11]), np.log([1e5, 1e6, 1e-7]))
+        peak = np.abs(true_current(SkinLoad(*np.exp(logs)))).max()
+        assert float(controller.guard) * peak <= 4e-3
+
+
+@pytest.mark.parametrize(
+    ("limits", "reason"),
+    [
+        ({"current_cap": 1e-3}, "guard"),
+        ({"charge_cap": 50e-9}, "charge"),
+        ({"voltage_cap": 10.0}, "voltage"),
+    ],
+)
+def test_limits_hold_and_are_named(limits, reason):
+    controller, state = controlled(**limits)
+    command = controller.command(state, charge=400e-9)
+    assert command.reason[0] == reason
+    peaks = np.array([np.abs(true_current(load)).max() for load in (DRY, DAMP)])
+    assert (command.amplitude * peaks <= limits.get("current_cap", np.inf)).all()
+    # The caps on what is delivered hold with a margin of k standard errors.
+    assert (command.charge < limits.get("charge_cap", np.inf)).all()
+
+
+def test_the_cap_of_the_estimate_holds_as_often_as_it_should():
+    """Of estimates that scatter as their standard errors say; the true peak is that of the mean."""
+    controller, state = controlled(charge_cap=50e-9, probability=0.9)
+    draws, rng = 300, np.random.default_rng(5)
+    logs = state.electrodes.own[1, :3]
+    cov = np.linalg.inv(np.asarray(state.electrodes.information[1]))
+    model = dataclasses.replace(controller.model, source_cov=0 * controller.model.source_cov)
+    circuit = controller.tracker.model.circuit
+    true = float(model.current(circuit, logs, jnp.zeros((3, 3))).charge)
+    drawn = np.asarray(logs)[None, :] + rng.standard_normal((draws, 3)) @ np.linalg.cholesky(cov).T
+    found = jax.vmap(lambda one: model.current(circuit, one, jnp.asarray(cov)))(drawn)
+    amplitude = 50e-9 / (found.charge + controller.quantile * found.charge_stderr)
+    share = float(np.mean(np.asarray(amplitude) * true > 50e-9))
+    # Three standard deviations of a binomial share.
+    assert abs(share - 0.1) < 3 * np.sqrt(0.09 / draws), share
+
+
+def test_an_electrode_that_is_not_good_gets_the_fallback_and_says_so():
+    controller, state = controlled(fallback=0.2)
+    tracker = controller.tracker
+    first = controller.command(tracker.start(), charge=80e-9)
+    assert list(first.reason) == ["fallback"] * 2
+    assert (first.amplitude == 0.2).all()
+    assert np.isnan(first.charge).all()
+    pulse = with_noise(tracker.pulses(loaded(quiet()))[10], seed=1)
+    pulse[0] = np.nan
+    command = controller.command(tracker.update(state, pulse), charge=80e-9)
+    assert list(command.reason) == ["fallback", "wanted"]
+    assert "1 fallback" in str(command)
+    changed = dataclasses.replace(state, driver_changed=jnp.asarray(True))
+    assert list(controller.command(changed, charge=80e-9).reason) == ["fallback"] * 2
+
+
+def test_the_fallback_obeys_the_limits_and_nothing_wanted_is_nothing_given():
+    controller, state = controlled(fallback=0.5, slew=0.01)
+    first = controller.command(controller.tracker.start(), charge=np.array([80e-9, 0.0]))
+    np.testing.assert_allclose(first.amplitude, [0.01, 0.0])
+    lanes = dataclasses.replace(state.electrodes, amplitude=jnp.full(2, 0.1))
+    command = controller.command(dataclasses.replace(state, electrodes=lanes), charge=400e-9)
+    np.testing.assert_allclose(command.amplitude, 0.11)
+    assert list(command.reason) == ["slew"] * 2
+
+
+def test_what_cannot_be_commanded_is_refused_with_a_reason():
+    controller, state = controlled()
+    for name in ("current_cap", "charge_cap", "voltage_cap", "slew", "fallback"):
+        with pytest.raises(ValueError, match=f"{name} is 0"):
+            etid.Controller.of(controller.tracker, **{name: 0.0})
+    with pytest.raises(ValueError, match="probability is 1"):
+        etid.Controller.of(controller.tracker, probability=1.0)
+    with pytest.raises(ValueError, match="either charge or current"):
+        controller.command(state)
+    with pytest.raises(ValueError, match="finite and not negative"):
+        controller.command(state, charge=-1e-9)
+    with pytest.raises(ValueError, match=r"shape \(3,\)"):
+        controller.command(state, current=np.ones(3))
+    bad = jax.tree.map(jnp.asarray, verdict("misfit"))
+    failed = dataclasses.replace(controller.tracker, driver_result=bad)
+    with pytest.raises(ValueError, match="driver of the tracker was not identified"):
+        etid.Controller.of(failed)
+    assert "guard" in str(controller)
+    assert isinstance(controller.model, CurrentModel)
