@@ -26,6 +26,7 @@ from etid.circuits.circuit import (
 from etid.circuits.elements import capacitor, cole, constant_phase, resistor
 from etid.circuits.impedance import parallel, series
 from etid.circuits.netlist import circuit_string, netlist
+from etid.circuits.written import circuit
 from etid.estimators.estimator import AbstractEstimator
 from etid.estimators.harmonic_steiglitz_mcbride.estimator import HarmonicSteiglitzMcBride
 from etid.estimators.maximum_likelihood.estimator import MaximumLikelihood
@@ -37,6 +38,7 @@ from etid.identify.driver import identify_driver
 from etid.identify.file import fit_file
 from etid.identify.impedance import identify_impedance
 from etid.identify.jointly import identify_jointly
+from etid.identify.kramers_kronig import KramersKronig, kramers_kronig
 from etid.identify.many import identify_skins, identify_study
 from etid.identify.one import identify_samples, identify_skin
 from etid.identify.posterior import posterior, profile
@@ -86,6 +88,7 @@ __all__ = [
     "Fits",
     "HarmonicSteiglitzMcBride",
     "IdentificationError",
+    "KramersKronig",
     "MaximumLikelihood",
     "NonParametric",
     "OutputError",
@@ -108,6 +111,7 @@ __all__ = [
     "bound",
     "capacitor",
     "check",
+    "circuit",
     "circuit_string",
     "cole",
     "constant_phase",
@@ -123,6 +127,7 @@ __all__ = [
     "identify_skins",
     "identify_study",
     "import_file",
+    "kramers_kronig",
     "netlist",
     "parallel",
     "parameter",

@@ -16,6 +16,7 @@ from etid.identify.waiting import COMPILING
 from tests.conftest import REFERENCE_DATA
 
 ROOT = pathlib.Path(__file__).parents[1]
+CONCLUSIONS = ROOT / "tests" / "conclusions"  # what must hold after each notebook
 NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.py"))
 SLOW = {"derivatives", "joint", "online", "selection"}  # compiled for minutes
 PAGES = [
@@ -59,6 +60,8 @@ def test_notebook_runs_from_top_to_bottom_and_shows_its_figures(path, tmp_path, 
         from nbclient import NotebookClient
 
         notebook = jupytext.read(path)
+        held = (CONCLUSIONS / path.name).read_text("utf-8")
+        notebook.cells.append(nbformat.v4.new_code_cell(held))
         client = NotebookClient(
             notebook,
             timeout=300,
@@ -68,6 +71,7 @@ def test_notebook_runs_from_top_to_bottom_and_shows_its_figures(path, tmp_path, 
         begun = time.perf_counter()
         client.execute()
         notebook.metadata["etid"] = {"seconds": time.perf_counter() - begun}
+    del notebook.cells[-1]  # for readers, the notebook ends with its conclusion
     nbformat.validate(notebook)
     cells = [cell for cell in notebook.cells if cell.cell_type == "code"]
     outputs = [output for cell in cells for output in cell.outputs]

@@ -10,6 +10,7 @@ import reprlib
 from collections.abc import Iterator
 
 from etid.circuits import circuit as circuits
+from etid.circuits import written
 from etid.circuits.circuit import AbstractCircuit
 
 _NAME = re.compile(r"([A-Za-z_]\w*(?:\.\w+)*):(?:[\w<>]+\.)*(\w+)", flags=re.ASCII)
@@ -17,7 +18,8 @@ _NAME = re.compile(r"([A-Za-z_]\w*(?:\.\w+)*):(?:[\w<>]+\.)*(\w+)", flags=re.ASC
 
 def qualified(kind: type[AbstractCircuit]) -> str:
     """Name of a circuit in a file of fits, such as `etid:SkinRC`."""
-    module = "etid" if kind.__module__ == circuits.__name__ else kind.__module__
+    own = kind.__module__ in (circuits.__name__, written.MODULE)
+    module = "etid" if own else kind.__module__
     return f"{module}:{kind.__qualname__}"
 
 
@@ -37,7 +39,15 @@ def remembered(stored: str, given: type[AbstractCircuit] | None = None) -> type[
         LookupError: No class has this name, or `given` has a different name. The message says what
             to do.
     """
+    string = stored.removeprefix("etid:")
+    if given is None and written.is_written(string):
+        try:
+            return written.kind_of(string)
+        except ValueError as error:
+            raise LookupError(str(error)) from None
     found = _NAME.fullmatch(stored)
+    if found is None and given is not None and qualified(given) == stored:
+        return given
     if found is None:
         raise LookupError("This is not a name of a circuit: fit the recordings again")
     module, name = found.groups()
@@ -69,11 +79,13 @@ def imported(name: str) -> type[AbstractCircuit]:
     """Circuit class that the user names; its module is imported.
 
     Args:
-        name: `Class` for a circuit of etid, else `module:Class`.
+        name: `Class` for a circuit of etid, a circuit string, or `module:Class`.
 
     Raises:
-        ValueError: The module cannot be imported or has no such circuit.
+        ValueError: The module cannot be imported or has no such circuit, or the string is none.
     """
+    if written.is_written(name):
+        return written.kind_of(name)
     module, _, attribute = name.rpartition(":")
     if not module:
         known = built_in()

@@ -10,7 +10,7 @@ from etid.plotting.style import BLUE, INK, RED, Canvas, titled
 from etid.recordings.fields import LABELS
 from etid.recordings.recording import Recording
 from etid.results.driver import Driver
-from etid.results.fits import Fit, rrse
+from etid.results.fits import Fit
 from etid.signals.noise import noise
 from etid.simulation.transformer import loading
 
@@ -84,12 +84,13 @@ def draw_calibration(canvas: Canvas, driver: Driver, recording: Recording) -> np
 
 
 def headline(recording: Recording, found: Fit | Driver) -> str:
-    """Path of the recording, verdict and χ², for a title."""
+    """Path of the recording, verdict, χ² and RRSE, for a title."""
     verdict = found.verdict
     verdict = verdict if verdict == "successful" else f"no success: {verdict}"
     quality = f"chi2 {float(found.chi2):.3g}" if np.isfinite(float(found.chi2)) else ""
+    error = f"RRSE {100 * float(found.rrse):.3g} %" if np.isfinite(float(found.rrse)) else ""
     where = f"{recording.path}: " if recording.path else ""
-    return where + ", ".join(filter(None, (verdict, quality)))
+    return where + ", ".join(filter(None, (verdict, quality, error)))
 
 
 def draw_pulse(
@@ -107,12 +108,7 @@ def draw_pulse(
     predicted = predict(recording, driver, circuit)
     part = _measured(upper, recording)
     milliseconds = 1e3 * recording.time[part]
-    known = np.isfinite(predicted)
-    error = float(rrse(jnp.asarray(predicted[known]), jnp.asarray(recording.v_out[known])))
-    upper.plot(
-        milliseconds, predicted[part], "--", color=RED, lw=1.2,
-        label=f"predicted, RRSE {100 * error:.2g} %",
-    )  # fmt: skip
+    upper.plot(milliseconds, predicted[part], "--", color=RED, lw=1.2, label="predicted")
     upper.legend(frameon=False, fontsize=8)
     sigma = 1e3 * residual_std(recording, driver, circuit)
     residual = 1e3 * (predicted - recording.v_out)

@@ -1,0 +1,88 @@
+"""Circuits from strings, and the Kramers-Kronig test of a measured impedance."""
+
+import copy
+import pickle
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import etid
+from etid.circuits.lookup import imported, qualified, remembered
+
+F = jnp.geomspace(10.0, 1e5, 40)
+
+
+def test_a_string_has_the_impedance_of_its_elements():
+    kind = type(etid.circuit("R0-p(R1,C1)"))
+    assert kind.names() == ("r_0", "r_1", "c_1")
+    written = kind(**{"r_0": 33.4e3, "r_1": 186e3, "c_1": 0.12e-9})
+    skin = etid.SkinRC(33.4e3, 186e3, 0.12e-9)
+    np.testing.assert_allclose(written.response(F), skin.response(F), rtol=1e-12)
+    assert type(etid.circuit(" R0 - p(R1, C1)")) is kind
+    assert etid.circuit_string(written) == ("R0-p(R1,C1)", [33.4e3, 186e3, 0.12e-9])
+
+
+def test_strings_nest_and_know_constant_phases():
+    nested = etid.circuit("R0-p(R1-p(R2,CPE2),C1)-C3")
+    s = 2j * np.pi * np.asarray(F)
+    of = {name: float(getattr(nested, name)) for name in nested.names()}
+    inner = of["r_1"] + 1 / (1 / of["r_2"] + of["q_2"] * s ** of["alpha_2"])
+    whole = of["r_0"] + 1 / (1 / inner + s * of["c_1"]) + 1 / (s * of["c_3"])
+    np.testing.assert_allclose(nested.response(F), whole, rtol=1e-10)
+
+
+@pytest.mark.parametrize(
+    "string", ["", "R0-", "R0--C1", "p(R1)", "p(R1,C1", "R0-p(R1,C1))", "L0", "R", "R0 C1", "R0+C1"]
+)
+def test_what_is_no_circuit_is_refused(string):
+    with pytest.raises(ValueError, match="is no circuit: cannot read"):
+        etid.circuit(string)
+
+
+def test_an_element_occurs_once():
+    with pytest.raises(ValueError, match="has R1 twice"):
+        etid.circuit("R1-p(R1,C1)")
+
+
+def test_a_written_circuit_is_found_by_its_name_and_copied():
+    one = etid.circuit("R0-p(R1,C1)")
+    assert qualified(type(one)) == "etid:R0-p(R1,C1)"
+    assert remembered("etid:R0-p(R1,C1)") is type(one) is imported("R0-p(R1,C1)")
+    with pytest.raises(LookupError, match="is no circuit"):
+        remembered("etid:R0-p(R1,C1")
+    for again in (pickle.loads(pickle.dumps(one)), copy.deepcopy(one)):
+        assert type(again) is type(one)
+        np.testing.assert_array_equal(again.values(), one.values())
+    assert "r_0" in str(one)
+
+
+def test_a_written_circuit_is_fitted():
+    truth = etid.SkinRC(33.4e3, 186e3, 0.12e-9)
+    z = np.asarray(truth.response(F))
+    fit = etid.identify_impedance(F, z, stderr=100.0, circuit=etid.circuit("R0-p(R1,C1)"))
+    np.testing.assert_allclose(fit.circuit.values(), truth.values(), rtol=1e-4)
+
+
+def test_passive_circuits_pass_kramers_and_kronig_and_a_drift_does_not():
+    for circuit in (etid.SkinRC(33.4e3, 186e3, 0.12e-9), etid.SkinCole(), etid.SkinLayers()):
+        z = np.asarray(circuit.response(F))
+        found = etid.kramers_kronig(F, z)
+        assert found.passed, circuit
+    rng = np.random.default_rng(0)
+    noise = 0.001 * np.abs(z) * (rng.normal(size=40) + 1j * rng.normal(size=40))
+    noisy = etid.kramers_kronig(F, z + noise)
+    assert noisy.passed
+    assert noisy.relaxations < 40  # it does not describe the noise
+    # The imaginary part of one circuit and the real part of another are no circuit.
+    other = np.asarray(etid.SkinRC(10e3, 300e3, 1e-9).response(F))
+    mixed = etid.kramers_kronig(F, np.real(other) + 1j * np.imag(z))
+    assert not mixed.passed
+    assert "not passed" in str(mixed)
+
+
+def test_wrong_arguments_of_the_test_are_refused():
+    with pytest.raises(ValueError, match="both must be"):
+        etid.kramers_kronig([1.0, 2.0], [1.0, 2.0])
+    with pytest.raises(ValueError, match="frequencies > 0"):
+        etid.kramers_kronig(np.arange(6.0), np.ones(6))
