@@ -6,7 +6,7 @@ not: its pulses have zeros. A sum of products of both needs the smooth function 
     Σ_k v_k g(f_k) ≈ Σ_b g(f_b) Σ_k φ_b(k) v_k,
 
 where φ_b is 1 at knot b and falls to 0 at the knots beside it. A function of log f that bends by
-1 is wrong by 5e-4 between two knots.
+1 is wrong by 1e-4 between two knots.
 """
 
 import dataclasses
@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Inexact, Int
 
-RELATIVE = 16  # smallest number of a harmonic over the distance of the knots around it
+RELATIVE = 32  # smallest number of a harmonic over the distance of the knots around it
 
 
 @dataclasses.dataclass(frozen=True)

@@ -21,7 +21,7 @@ from jaxtyping import Array, Bool, Complex, Float
 
 from etid.estimators.estimate import Estimate
 from etid.estimators.joint.terms import DriverStudy, Loads, in_turn
-from etid.estimators.maximum_likelihood.load import AtKnots
+from etid.estimators.maximum_likelihood.load import Around
 from etid.estimators.maximum_likelihood.terms import (
     apart,
     excess,
@@ -163,14 +163,14 @@ class _Seen(NamedTuple):
         gain: Gain.
         known: The recording with the X that the calibrations estimate.
         part: Terms of the recording.
-        sums: The recording at the knots.
+        around: The recording at the knots.
         linear: Terms at the knots, linear in (common, own); the last is the prior of the delay.
     """
 
     gain: Complex[Array, " harmonic"]
     known: Spectrum
     part: Float[Array, " part"]
-    sums: AtKnots
+    around: Around
     linear: Linear
 
 
@@ -180,18 +180,18 @@ def _seen(
     """A load at its minimum; what the caller does not use is not computed."""
     driver = study.model.around(common, load.spectrum.frequency)
     q, o = jnp.concatenate([own.vector(), driver.mean]), study.owned
-    lane = study.lane(driver, load)
+    lane = study.whole(driver, load)
     g, known = apart(lane.predicted, q)
     part = residual(known, g)
-    sums = AtKnots.of(lane, q, (g, known))
+    around = Around.of(lane, q, (g, known))
     of_delay = LoadUnknowns(jnp.zeros(o - 1), 1 / driver.delay_width).vector()
     of_delay = jnp.concatenate([jnp.zeros(common.size), of_delay])
-    jacobian = jnp.concatenate([sums.jacobian[o:], sums.jacobian[:o]])
+    jacobian = jnp.concatenate([around.jacobian[o:], around.jacobian[:o]])
     jacobian = jnp.concatenate([jacobian, of_delay[:, None]], axis=1)
-    share = sums.mean(signal_share(sums.x, known.variance_x))
-    noise = sums.mean(excess(part, known.selected)[: g.size])
+    share = around.mean(signal_share(around.x, known.variance_x))
+    noise = around.mean(excess(part, known.selected)[: g.size])
     linear = Linear(jacobian, *(jnp.append(of, 1.0) for of in (share, noise)))
-    return _Seen(g, known, part, sums, linear)
+    return _Seen(g, known, part, around, linear)
 
 
 def _misfit(
@@ -216,9 +216,9 @@ def _is_another(
 ) -> Bool[Array, ""]:
     """Score test of one load; `bread` and `score` are those of `common` from all terms."""
     seen = _seen(study, load, common, own)
-    slope, sums = eliminated.slope, seen.sums
-    terms = jnp.append(sums.residual, own.delay_samples / sums.gain.driver.delay_width)
-    rows = sums.rows(sums.by_changes(sums.around))
+    slope, around = eliminated.slope, seen.around
+    terms = jnp.append(around.part, own.delay_samples / around.at.gain.driver.delay_width)
+    rows = around.at.rows(around.by_changes())
     covariance = jnp.block(
         [
             [bread, bread @ slope.T],
@@ -269,7 +269,7 @@ def _influence(
     """Effect of unit noise in X on the score of `common`, and on the own parameters."""
     seen = _seen(study, load, common, own)
     known, every = seen.known, knots(seen.gain.size)
-    jacobian, g = seen.linear.jacobian.T, seen.sums.slopes.gain
+    jacobian, g = seen.linear.jacobian.T, seen.around.slopes.gain
     size = every.at(jnp.sqrt(known.variance_x / variance(known, seen.gain)))
     re, im = g.real * size, g.imag * size
     real, imaginary = jacobian[: g.size], jacobian[g.size : 2 * g.size]

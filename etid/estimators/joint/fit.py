@@ -4,6 +4,7 @@ The matrix of the normal equations is an arrowhead (`etid.solvers.arrowhead`; Pi
 Schoukens, System Identification, 2012, ch. 9). A few loads at a time are evaluated in parallel.
 """
 
+import dataclasses
 import math
 from collections.abc import Sequence
 
@@ -16,7 +17,7 @@ from etid.estimators.estimate import MAX_STEPS, SOLVER, Estimate
 from etid.estimators.joint.errors import Delay, estimates
 from etid.estimators.joint.terms import DriverStudy, Joint, Loads, in_turn
 from etid.estimators.maximum_likelihood import driver as calibrations
-from etid.estimators.maximum_likelihood.load import Load, refined
+from etid.estimators.maximum_likelihood.load import SLIGHT, Load, refined
 from etid.estimators.maximum_likelihood.terms import shows_hum
 from etid.estimators.unknowns import LoadUnknowns
 from etid.results.fits import complex_rrse
@@ -37,11 +38,11 @@ def _equations(_, y: Float[Array, " parameter"], study: DriverStudy) -> Arrowhea
     common, parts = study.split(y)
 
     def of_group(loads: Loads, owns: LoadUnknowns) -> NormalEquations:
-        driver = study.model.around(common, loads.spectrum.frequency[0])
+        driver = study.model.around(common, loads.frequency[0])
         width = driver.delay_width
 
         def one(load: Loads, own: LoadUnknowns) -> NormalEquations:
-            lane = study.lane(driver, load)
+            lane = study.lane(common, driver, load)
             alone = lane.equations(jnp.concatenate([own.vector(), driver.mean]))
             late = own.delay_samples / width
             slope = LoadUnknowns(jnp.zeros_like(own.log_elements), 1 / width)
@@ -83,17 +84,17 @@ def _second_order(
     (common, parts), (towards, steps) = study.split(y), study.split(step)
 
     def of_group(loads: Loads, owns: LoadUnknowns, steps: LoadUnknowns) -> Float[Array, "load q"]:
-        frequency = loads.spectrum.frequency[0]
+        frequency = loads.frequency[0]
         driver = study.model.around(common, frequency)
-        ends = [
-            (h, study.model.around(common + h * towards, frequency, slopes=False))
-            for h in (DIFFERENCE, -DIFFERENCE)
-        ]
+        ends = []
+        for h in (DIFFERENCE, -DIFFERENCE):
+            there = common + h * towards
+            ends.append((h, there, study.model.around(there, frequency, slopes=False)))
 
         def one(load: Loads, own: LoadUnknowns, step: LoadUnknowns) -> Float[Array, " q"]:
-            lane = study.lane(driver, load)
+            lane = study.lane(common, driver, load)
             at, way = own.vector(), step.vector()
-            bent = sum(study.lane(end, load).residual(at + h * way) for h, end in ends)
+            bent = sum(study.lane(c, end, load).residual(at + h * way) for h, c, end in ends)
             middle, pullback = jax.vjp(lane.residual, jnp.concatenate([at, driver.mean]))
             (found,) = pullback((bent - 2 * middle) / DIFFERENCE**2)
             return jnp.where(load.used, found, 0.0)
@@ -139,14 +140,10 @@ def fit_together(
         second_order=_second_order,
         empty=_empty,
     )
-    solution = optx.least_squares(
-        lambda y, _: y,  # not evaluated: the solver takes the equations
-        solver,
-        study.start(),
-        study,
-        max_steps=MAX_STEPS,
-        throw=False,
-    )
+    # At the knots a step takes a tenth of the time. All harmonics then need two or three steps.
+    near = _solved(solver, study.at_knots(), study.start())
+    slight = dataclasses.replace(solver, damping=SLIGHT)
+    solution = _solved(slight, study, near.value)
     common, parts = study.split(solution.value)
     # The loads that take no part are fitted now, with the final Z_th.
     refitted = [
@@ -157,12 +154,25 @@ def fit_together(
     return common, cov, found
 
 
+def _solved(
+    solver: LevenbergMarquardt, study: DriverStudy, start: Float[Array, " parameter"]
+) -> optx.Solution:
+    return optx.least_squares(
+        lambda y, _: y,  # not evaluated: the solver takes the equations
+        solver,
+        start,
+        study,
+        max_steps=MAX_STEPS,
+        throw=False,
+    )
+
+
 def _refit(
     study: DriverStudy, load: Loads, common: Float[Array, " common"], own: LoadUnknowns
 ) -> tuple[LoadUnknowns, optx.RESULTS]:
     """Unknowns of a load at its minimum with this Z_th, and the result of the solver."""
     driver = study.model.around(common, load.spectrum.frequency, slopes=False)
-    solution = refined(study.lane(driver, load), own.vector())
+    solution = refined(study.whole(driver, load), own.vector())
     return LoadUnknowns.of(solution.value), solution.result
 
 

@@ -4,6 +4,7 @@ All loads share Z_th and the delays of the calibrations, `common`. The elements 
 load, `own`, appear only in the terms of this load.
 """
 
+import dataclasses
 import itertools
 from collections.abc import Callable
 from typing import Any
@@ -15,10 +16,12 @@ from jaxtyping import Array, Bool, Float, Int
 
 from etid.circuits.circuit import AbstractCircuit
 from etid.estimators.maximum_likelihood.driver import Calibrations
-from etid.estimators.maximum_likelihood.given_driver import GivenDriver, around
-from etid.estimators.maximum_likelihood.load import Load
+from etid.estimators.maximum_likelihood.gain import Gain
+from etid.estimators.maximum_likelihood.given_driver import GivenDriver, around, combined
+from etid.estimators.maximum_likelihood.load import Around, AtKnots, Load, Sums
 from etid.estimators.unknowns import LoadUnknowns
 from etid.signals.harmonics import Spectrum
+from etid.signals.knots import knots
 from etid.solvers.arrowhead import join, split
 
 SIDE_BY_SIDE = 8  # loads in one vectorised step
@@ -59,6 +62,7 @@ class Loads(eqx.Module):
         used: Whether the recording takes part. The others are fitted, but do not affect Z_th.
         unloaded: Index of the unloaded record among those that several loads share; −1 if no other
             load has it.
+        sums: The recordings at the knots, around the start; None for all harmonics.
     """
 
     spectrum: Spectrum
@@ -66,6 +70,13 @@ class Loads(eqx.Module):
     own: LoadUnknowns
     used: Bool[Array, "*load"]
     unloaded: Int[Array, "*load"]
+    sums: Sums | None = None
+
+    @property
+    def frequency(self) -> Float[Array, "*load frequency"]:
+        """Frequencies of the terms [Hz]."""
+        every = self.spectrum.frequency
+        return every if self.sums is None else knots(every.shape[-1]).at(every)
 
 
 class DriverStudy(eqx.Module):
@@ -74,9 +85,37 @@ class DriverStudy(eqx.Module):
     model: Joint
     groups: list[Loads]
 
-    def lane(self, driver: GivenDriver, load: Loads) -> Load:
-        """One load behind this driver."""
+    def lane(
+        self, common: Float[Array, " common"], driver: GivenDriver, load: Loads
+    ) -> Load | AtKnots:
+        """One load behind this driver, which has these parameters."""
+        if load.sums is None:
+            return self.whole(driver, load)
+        gain = Gain(driver, self.model.circuit, load.frequency, load.sample_rate)
+        sums = load.sums
+        if sums.by_z is not None:
+            moved = combined(common - self.model.calibrations.start(), sums.by_z)
+            sums = dataclasses.replace(sums, shift=moved)
+        return AtKnots(gain, sums)
+
+    def whole(self, driver: GivenDriver, load: Loads) -> Load:
+        """One load behind this driver, with all harmonics."""
         return Load.behind(driver, self.model.circuit, load.spectrum, load.sample_rate)
+
+    def at_knots(self) -> "DriverStudy":
+        """The study with all loads at the knots, around its start."""
+        common = self.model.calibrations.start()
+
+        def of_group(loads: Loads) -> Loads:
+            driver = self.model.around(common, loads.frequency[0])
+
+            def one(load: Loads) -> Sums:
+                q = jnp.concatenate([load.own.vector(), driver.mean])
+                return Around.of(self.whole(driver, load), q).at.sums
+
+            return dataclasses.replace(loads, sums=in_turn(one, loads))
+
+        return DriverStudy(self.model, [of_group(loads) for loads in self.groups])
 
     def start(self) -> Float[Array, " parameter"]:
         """The start: the driver of the calibrations, and each load identified alone."""

@@ -107,32 +107,94 @@ class Load(eqx.Module):
             return jnp.dot(weight, power(known.y - g * known.x)), (g, known)
 
         (value, at), gradient = apart(jax.value_and_grad(objective, has_aux=True), q)
-        jacobian = AtKnots.of(self, q, at).jacobian
+        jacobian = Around.of(self, q, at).jacobian
         return NormalEquations(value, gradient, jacobian @ jacobian.T)
 
 
-class AtKnots(eqx.Module):
-    """The terms of a recording around q₀, summed at the knots.
+class Sums(eqx.Module):
+    """What the fit of a recording needs around q₀, summed at the knots.
 
     Attributes:
-        gain: The gain at the knots.
-        around: q₀.
-        slopes: The gain and its derivatives at q₀.
+        gain: The gain at q₀.
         score: ρ.
         power: P.
         by_z: Relative derivatives of X with respect to z; None if X does not depend on z.
-        x: x̂ at all harmonics.
-        powers: P at all harmonics.
+        shift: Relative difference of X between z = 0 and q₀.
+    """
+
+    gain: Complex[Array, "*load knot"]
+    score: Complex[Array, "*load knot"]
+    power: Float[Array, "*load knot"]
+    by_z: Complex[Array, "*load z knot"] | None
+    shift: Complex[Array, "*load knot"] | None
+
+
+class AtKnots(eqx.Module):
+    """The terms of a recording near q₀; they are as good as those of `Load` for small steps.
+
+    Attributes:
+        gain: The gain at the knots.
+        sums: The recording at the knots.
     """
 
     gain: Gain
-    around: Float[Array, " q"]
+    sums: Sums
+
+    def rows(self, slopes: Complex[Array, "row knot"]) -> Float[Array, "row part"]:
+        """Derivatives of the terms, from those of the gain."""
+        rows = slopes * as_complex(jnp.sqrt(self.sums.power))[None, :]
+        return -jnp.concatenate([rows.real, rows.imag], axis=1)
+
+    def by_unknown(self, slopes: Slopes) -> Complex[Array, "q knot"]:
+        """Derivatives of G X/x̂ with respect to the parameters."""
+        own, by_z = self.gain.owned, self.sums.by_z
+        if by_z is None or slopes.by_unknown.shape[0] == own:
+            return slopes.by_unknown
+        of_x = jnp.pad(slopes.gain[None, :] * by_z, ((own, 0), (0, 0)))
+        return slopes.by_unknown + of_x
+
+    def residual(self, q: Float[Array, " q"]) -> Float[Array, " part"]:
+        """Terms at `q`."""
+        return self._residual(q, self.gain(q))
+
+    def _residual(
+        self, q: Float[Array, " q"], gain: Complex[Array, " knot"]
+    ) -> Float[Array, " part"]:
+        of, z = self.sums, self.gain.split(q)[1]
+        change = gain - of.gain
+        if of.by_z is not None and of.shift is not None:
+            change = change + gain * (of.shift + (combined(z, of.by_z) if z.size else 0.0))
+        score = of.score * as_complex(1 / jnp.sqrt(jnp.where(of.power > 0, of.power, 1.0)))
+        return jnp.concatenate([score.real, score.imag]) + self.rows(change[None, :])[0]
+
+    def __call__(self, q: Float[Array, " q"]) -> Float[Array, " term"]:
+        """Terms at `q` and the priors."""
+        prior = 1 / self.gain.widths(q)
+        return jnp.concatenate([self.residual(q), prior * (q - self.gain.centre(q))])
+
+    def equations(self, q: Float[Array, " q"]) -> NormalEquations:
+        """Normal equations of the recording alone."""
+        slopes = apart(self.gain.slopes, q)
+        part, jacobian = self._residual(q, slopes.gain), self.rows(self.by_unknown(slopes))
+        return NormalEquations(0.5 * jnp.dot(part, part), jacobian @ part, jacobian @ jacobian.T)
+
+
+class Around(eqx.Module):
+    """The terms at one point q, linear in the parameters, without the noise of X.
+
+    Attributes:
+        at: The terms at the knots.
+        q: q.
+        slopes: The gain and its derivatives at the knots.
+        x: x̂ at all harmonics.
+        power: P at all harmonics.
+    """
+
+    at: AtKnots
+    q: Float[Array, " q"]
     slopes: Slopes
-    score: Complex[Array, " knot"]
-    power: Float[Array, " knot"]
-    by_z: Complex[Array, "z knot"] | None
     x: Complex[Array, " harmonic"]
-    powers: Float[Array, " harmonic"]
+    power: Float[Array, " harmonic"]
 
     @classmethod
     def of(
@@ -140,7 +202,7 @@ class AtKnots(eqx.Module):
         load: Load,
         q: Float[Array, " q"],
         at: tuple[Complex[Array, " harmonic"], Spectrum] | None = None,
-    ) -> "AtKnots":
+    ) -> "Around":
         """The terms of `load` around `q`; `at` is `load.predicted(q)` if it is known already."""
         g, known = apart(load.predicted, q) if at is None else at
         of, every = load.gain, load.knots
@@ -155,70 +217,40 @@ class AtKnots(eqx.Module):
         score = as_complex(weight) * jnp.conj(x) * error
         parts = jnp.stack([score.real, score.imag, weight * power(x)])
         real, imaginary, total = every.summed(parts)
-        by_z = None
+        gain = Gain(of.driver.at_knots(every), of.circuit, every.at(of.frequency), of.sample_rate)
+        by_z = shift = None
         if load.unloaded is not None:
             by_z = every.summed((as_complex(parts[2]) * reciprocal(x))[None, :] * load.unloaded.x)
             by_z = by_z * as_complex(1 / jnp.where(total > 0, total, 1.0))[None, :]
-        driver = of.driver.at_knots(every)
-        gain = Gain(driver, of.circuit, every.at(of.frequency), of.sample_rate)
-        score = jax.lax.complex(real, imaginary)
-        return cls(gain, q, apart(gain.slopes, q), score, total, by_z, x, parts[2])
-
-    def mean(self, values: Float[Array, " harmonic"]) -> Float[Array, " part"]:
-        """Means of `values` around the knots, weighted with P."""
-        sums = knots(values.size).summed(values * self.powers)
-        return jnp.tile(sums / jnp.where(self.power > 0, self.power, 1.0), 2)
-
-    def rows(self, slopes: Complex[Array, "row knot"]) -> Float[Array, "row part"]:
-        """Derivatives of the terms, from those of the gain."""
-        rows = slopes * as_complex(jnp.sqrt(self.power))[None, :]
-        return -jnp.concatenate([rows.real, rows.imag], axis=1)
-
-    def by_unknown(self, slopes: Slopes) -> Complex[Array, "q knot"]:
-        """Derivatives of G X/x̂ with respect to the parameters."""
-        if self.by_z is None or slopes.by_unknown.shape[0] == self.gain.owned:
-            return slopes.by_unknown
-        of_x = slopes.gain[None, :] * self.by_z
-        return slopes.by_unknown + jnp.pad(of_x, ((self.gain.owned, 0), (0, 0)))
+            shift = -combined(of.split(q)[1], by_z)
+        slopes = apart(gain.slopes, q)
+        sums = Sums(slopes.gain, jax.lax.complex(real, imaginary), total, by_z, shift)
+        return cls(AtKnots(gain, sums), q, slopes, x, parts[2])
 
     @property
     def jacobian(self) -> Float[Array, "q part"]:
-        """Transposed Jacobian at q₀, without the noise of the residual."""
-        return self.rows(self.by_unknown(self.slopes))
+        """Transposed Jacobian."""
+        return self.at.rows(self.at.by_unknown(self.slopes))
 
     @property
-    def residual(self) -> Float[Array, " part"]:
-        """The terms at q₀."""
-        root = jnp.sqrt(jnp.where(self.power > 0, self.power, 1.0))
-        score = self.score * as_complex(1 / root)
-        return jnp.concatenate([score.real, score.imag])
+    def part(self) -> Float[Array, " part"]:
+        """The terms."""
+        return self.at.residual(self.q)
 
-    def __call__(self, q: Float[Array, " q"]) -> Float[Array, " term"]:
-        """Terms at `q` and the priors."""
-        prior = 1 / self.gain.widths(q)
-        return jnp.concatenate([self._moved(q, self.gain(q)), prior * (q - self.gain.centre(q))])
+    def mean(self, values: Float[Array, " harmonic"]) -> Float[Array, " part"]:
+        """Means of `values` around the knots, weighted with P."""
+        total, sums = self.at.sums.power, knots(values.size).summed(values * self.power)
+        return jnp.tile(sums / jnp.where(total > 0, total, 1.0), 2)
 
-    def equations(self, q: Float[Array, " q"]) -> NormalEquations:
-        """Normal equations of the recording alone."""
-        slopes = apart(self.gain.slopes, q)
-        part, jacobian = self._moved(q, slopes.gain), self.rows(self.by_unknown(slopes))
-        return NormalEquations(0.5 * jnp.dot(part, part), jacobian @ part, jacobian @ jacobian.T)
-
-    def _moved(self, q: Float[Array, " q"], gain: Complex[Array, " knot"]) -> Float[Array, " part"]:
-        change = gain - self.slopes.gain
-        if self.by_z is not None:
-            towards = self.gain.split(q)[1] - self.gain.split(self.around)[1]
-            change = change + gain * combined(towards, self.by_z)
-        return self.residual + self.rows(change[None, :])[0]
-
-    def by_changes(self, q: Float[Array, " q"]) -> Complex[Array, "change knot"]:
+    def by_changes(self) -> Complex[Array, "change knot"]:
         """Derivatives of the gain with respect to changes of the circuit and, last, to a gain.
 
         The changes are those of `etid.estimators.score_tests.other_circuit`. The gain is that of
         V_out alone. If it is 1 % too large, R_p of dry skin is wrong by a quarter, and χ² shows
         this only at 60 dB.
         """
-        _, changes = other_circuit.changes(self.gain.impedance(q), self.gain.frequency)
+        of = self.at.gain
+        _, changes = other_circuit.changes(of.impedance(self.q), of.frequency)
         return jnp.concatenate([changes * self.slopes.by_load[None, :], self.slopes.gain[None, :]])
 
 
@@ -289,12 +321,12 @@ def fit_circuit(
     likely = starts[-1]
     near = jnp.sum(load(likely) ** 2) < NEAR * 2 * jnp.sum(spectrum.selected, dtype=likely.dtype)
     start = jax.lax.cond(near, lambda: likely, lambda: best_start(load, starts))
-    sums = AtKnots.of(load, start)
-    alone = refined(sums, start, ROUGHLY).value
+    near_start = Around.of(load, start).at
+    alone = refined(near_start, start, ROUGHLY).value
     well = dataclasses.replace(
         WELL, rtol=min(WELL.rtol, SETTLED / math.sqrt(2 * spectrum.x.size)), damping=SLIGHT
     )
-    together = refined(sums, jnp.concatenate([alone, driver.mean]), well).value
+    together = refined(near_start, jnp.concatenate([alone, driver.mean]), well).value
     solution = refined(load, together, well)
     q = solution.value
     own, z = load.gain.split(q)
@@ -302,21 +334,21 @@ def fit_circuit(
     part = residual(known, g)
     moved = jnp.max(jnp.where(spectrum.selected, jnp.abs(load.gain.w(z)), 0.0))
 
-    sums = AtKnots.of(load, q, (g, known))
-    jacobian = sums.jacobian
+    around = Around.of(load, q, (g, known))
+    jacobian = around.jacobian
     prior = 1 / load.gain.widths(q) ** 2
     noise = excess(part, spectrum.selected)[: g.size]
-    share = signal_share(sums.x, known.variance_x)
-    linear = Linear(jacobian, sums.mean(share), sums.mean(noise), jnp.diag(prior))
+    share = signal_share(around.x, known.variance_x)
+    linear = Linear(jacobian, around.mean(share), around.mean(noise), jnp.diag(prior))
     information, count = linear.bread(), own.log_elements.size
     elements = information[:count]
     by_term = elements @ jacobian
-    changes = sums.by_changes(q)
-    rows = sums.rows(changes)
+    changes = around.by_changes()
+    rows = around.at.rows(changes)
     found = other_circuit.scores(
         rows,
         linear,
-        sums.residual,
+        around.part,
         prior * (q - load.gain.centre(q)),
         jax.scipy.linalg.block_diag(jnp.diag(prior[: load.gain.owned]), driver.cov),
         information,
@@ -325,9 +357,9 @@ def fit_circuit(
     other = other_circuit.Scores.of(found, gain=True)
     # If a wrong gain explains the excess of the low harmonics, the excess is no hum.
     others = linear.told(rows[-1:])[0] @ information
-    gain = changes[-1] - combined(others, sums.by_unknown(sums.slopes))
+    gain = changes[-1] - combined(others, around.at.by_unknown(around.slopes))
     weight = jnp.where(known.selected, jnp.sqrt(2 / variance(known, g)), 0.0)
-    explained = as_complex(found.size[-1] * weight) * sums.x * load.knots.between(gain)
+    explained = as_complex(found.size[-1] * weight) * around.x * load.knots.between(gain)
     rest = part + jnp.concatenate([explained.real, explained.imag])
     rest = jnp.sum(rest.reshape(2, -1) ** 2, axis=0) / 2
     wrong_gain = (jnp.abs(found.z[-1]) > NO_HUM) & ~stands_out(rest, known)
@@ -337,7 +369,7 @@ def fit_circuit(
         spectrum.variance_y / variance(known, g),
         1.0,
     )
-    own_noise = sums.mean(private * noise)
+    own_noise = around.mean(private * noise)
     by_own, by_z = load.gain.split(elements)
     of_delay = jnp.outer(by_own.delay_samples, by_own.delay_samples) / driver.delay_width**2
     of_driver = by_z @ driver.cov @ by_z.T
