@@ -23,6 +23,7 @@ from etid.circuits.circuit import (
     SkinRC,
     parameter,
 )
+from etid.circuits.current_dependent import SkinCurrent, current_dependent_resistor
 from etid.circuits.elements import capacitor, cole, constant_phase, resistor
 from etid.circuits.impedance import parallel, series
 from etid.circuits.netlist import circuit_string, netlist
@@ -34,6 +35,7 @@ from etid.estimators.non_parametric.estimator import NonParametric
 from etid.estimators.output_error.estimator import OutputError
 from etid.estimators.registry import register
 from etid.estimators.steiglitz_mcbride.estimator import EquationError, SteiglitzMcBride
+from etid.identify.amplitudes import identify_amplitudes
 from etid.identify.driver import identify_driver
 from etid.identify.file import fit_file
 from etid.identify.impedance import identify_impedance
@@ -101,6 +103,7 @@ __all__ = [
     "Samples",
     "Selection",
     "SkinCole",
+    "SkinCurrent",
     "SkinLayers",
     "SkinRC",
     "SteiglitzMcBride",
@@ -115,10 +118,12 @@ __all__ = [
     "circuit_string",
     "cole",
     "constant_phase",
+    "current_dependent_resistor",
     "export_circuit",
     "export_fits",
     "export_study",
     "fit_file",
+    "identify_amplitudes",
     "identify_driver",
     "identify_impedance",
     "identify_jointly",

@@ -35,6 +35,7 @@ SCALING = {
     "ohm": (1.0, 0.0),
     "farad": (-1.0, 1.0),
     "second": (0.0, 1.0),
+    "ampere": (-1.0, 0.0),
     "siemens second^alpha": (-1.0, 0.8),  # for a typical α; used only for the start of a fit
     "1": (0.0, 0.0),
 }
@@ -48,8 +49,8 @@ def parameter(unit: str, *, typical: float) -> Any:
     """Declare a positive circuit parameter.
 
     Args:
-        unit: `"ohm"`, `"farad"`, `"second"`, `"siemens second^alpha"` for the Q of a constant-phase
-            element, or `"1"` for its exponent.
+        unit: `"ohm"`, `"farad"`, `"second"`, `"ampere"`, `"siemens second^alpha"` for the Q of a
+            constant-phase element, or `"1"` for its exponent.
         typical: Expected magnitude in the SI unit; a fit may start at this value.
 
     Returns:

@@ -9,6 +9,7 @@ import numpy as np
 DISPLAY = {
     "ohm": (1e3, "kΩ"),
     "farad": (1e-9, "nF"),
+    "ampere": (1e-3, "mA"),
     "second": (1e-6, "µs"),
     "siemens second^alpha": (1e-9, "nS·s^alpha"),
     "1": (1.0, ""),

@@ -11,6 +11,7 @@ from typing import Any, Literal
 import jax
 
 from etid.circuits.circuit import AbstractCircuit, SkinRC
+from etid.circuits.current_dependent import current_dependent
 from etid.estimators.estimator import AbstractEstimator
 from etid.estimators.registry import MAXIMUM_LIKELIHOOD, OUTPUT_ERROR, Method, named
 from etid.recordings.preflight import Inspected, preflight
@@ -100,11 +101,18 @@ def candidates_of(value: Circuit) -> tuple[AbstractCircuit, ...]:
     """The circuits to choose from: those of `CANDIDATES` for `"auto"`, else one.
 
     Raises:
-        RecordingError: The value is neither a circuit nor `"auto"`.
+        RecordingError: The value is neither a linear circuit nor `"auto"`.
     """
     if isinstance(value, str) and value == AUTO:
         return CANDIDATES
-    return (circuit_of(value),)  # pyright: ignore[reportArgumentType]
+    circuit = circuit_of(value)  # pyright: ignore[reportArgumentType]
+    if current_dependent(circuit.impedance()) is not None:
+        raise RecordingError(
+            f"is {type(circuit).__name__}, which is not linear: it depends on its current",
+            field="circuit",
+            remedy="Use etid.identify_amplitudes",
+        )
+    return (circuit,)
 
 
 def circuit_of(value: AbstractCircuit | None) -> AbstractCircuit:

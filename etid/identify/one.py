@@ -21,7 +21,6 @@ from etid.identify.arguments import (
     Circuit,
     candidates_of,
     check_default,
-    circuit_of,
     estimator_of,
     fed,
     for_samples,
@@ -29,6 +28,7 @@ from etid.identify.arguments import (
     require,
 )
 from etid.identify.compiled import stored_jit
+from etid.identify.current_dependence import falls_with_current
 from etid.recordings.preflight import Inspected, why_implausible, why_misaligned
 from etid.recordings.recording import Recording
 from etid.recordings.remarks import Remark
@@ -202,7 +202,7 @@ def identify_samples(
         ValueError: The method cannot use this driver or this circuit.
     """
     require("driver", driver, Driver)
-    circuit = circuit_of(circuit)
+    [circuit] = candidates_of(circuit)
     estimator = estimator_of(method, [circuit])
     periods = whole_periods(v_out.shape[0], sample_rate, pulse_rate)
     if estimator is None:
@@ -364,7 +364,22 @@ def refined(
     def another(fits: dict[int, Fit]) -> bool:
         return needs_another(fits[_chosen(fits)])
 
-    return repeated(lanes, seen, searched, late_by, another, of_all)
+    found = repeated(lanes, seen, searched, late_by, another, of_all)
+    for one, fits in zip(seen, found, strict=True):
+        number = _chosen(fits)
+        fits[number] = _with_cause(fits[number], one, type(lanes[0]), driver)
+    return found
+
+
+def _with_cause(fit: Fit, seen: Inspected, kind: type[AbstractLane], driver: AbstractFeed) -> Fit:
+    """The fit; a misfit has a remark if the residual looks like a dependence on the current."""
+    if fit.verdict != "misfit":
+        return fit
+    lane = kind.of(seen)  # again, because `repeated` may have aligned it
+    if not falls_with_current(lane, driver, fit.circuit):
+        return fit
+    remarks = np.asarray(fit.remarks | int(Remark.falls_with_current))
+    return dataclasses.replace(fit, remarks=remarks)
 
 
 def needs_another(fit: Fit | Driver) -> bool:

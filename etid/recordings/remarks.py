@@ -20,6 +20,7 @@ class Remark(enum.IntFlag):
     pulse_rate_counted = enum.auto()
     circuits_close = enum.auto()
     small_delays = enum.auto()
+    falls_with_current = enum.auto()
 
 
 _TEXTS = {
@@ -37,6 +38,10 @@ _TEXTS = {
     ),
     Remark.small_delays: (
         "The trigger delays of the study scatter less than their errors; the scatter limits each."
+    ),
+    Remark.falls_with_current: (
+        "The residual looks like a resistance that falls with the current, a dependence on the "
+        "amplitude; record several amplitudes and use identify_amplitudes."
     ),
 }
 

@@ -1,0 +1,191 @@
+"""A resistor that falls with its current, and what the rest of a circuit is for it.
+
+Skin conducts better the more current flows. Kaczmarek and Webster (1989, "Voltage-current
+characteristics of the electrotactile skin-electrode interface", Proc. IEEE EMBS 11) measured a
+fall of the resistance to a thirtieth up to 25 mA:
+
+    R(i) = 895 Ω + 60.1 kΩ ‖ (60.1 kΩ · 0.585 mA / |i|) = R_s + R_p / (1 + |i| / I_0).
+"""
+
+from collections.abc import Callable
+from functools import reduce
+from typing import NamedTuple
+
+import jax.numpy as jnp
+from jaxtyping import Array, Complex, Float
+
+from etid.circuits.circuit import AbstractCircuit, parameter
+from etid.circuits.elements import Farad, Ohm, Resistance, capacitor, resistor
+from etid.circuits.impedance import (
+    AbstractImpedance,
+    Netlist,
+    Notation,
+    Parallel,
+    Quantity,
+    Series,
+    parallel,
+    series,
+)
+from etid.signals.transfer import reciprocal
+
+Ampere = Quantity
+
+
+class CurrentDependentResistance(Resistance):
+    """A resistor R / (1 + |i| / I_0); its impedance is that at small currents, R."""
+
+    i_0: Ampere
+
+    def current(
+        self, wave: Float[Array, " time"], resistance: Float[Array, ""]
+    ) -> Float[Array, " time"]:
+        """The current i [A] at which u(i) + R′ i is the given wave, with the voltage u(i) [V].
+
+        Args:
+            wave: u + R′ i [V].
+            resistance: R′ [Ω].
+        """
+        size, r, i_0 = jnp.abs(wave), jnp.asarray(self.r), jnp.asarray(self.i_0)
+        half = r + resistance - size / i_0
+        root = jnp.sqrt(half**2 + 4 * resistance * size / i_0)
+        rising = half > 0  # of the two forms of the root of a quadratic, the one without a loss
+        small = 2 * size / (jnp.where(rising, half, 0.0) + root)
+        return jnp.sign(wave) * jnp.where(rising, small, (root - half) * i_0 / (2 * resistance))
+
+    def typical_slope(self, size: Float[Array, ""]) -> Float[Array, ""]:
+        """Geometric mean of the smallest and the largest slope u′ [Ω] for currents up to `size`."""
+        return jnp.asarray(self.r) / (1 + size / jnp.asarray(self.i_0))
+
+    def connect(self, netlist: Netlist, plus: str, minus: str) -> None:
+        """Raise ValueError: a netlist of resistors and capacitors has no such part."""
+        raise ValueError(
+            "a resistor that depends on its current cannot be written as resistors and capacitors"
+        )
+
+    def text(self, notation: Notation) -> str:
+        """Raise ValueError: impedance.py has no such element."""
+        raise ValueError("impedance.py has no element for a resistor that depends on its current")
+
+
+def current_dependent_resistor(r: Ohm, i_0: Ampere) -> CurrentDependentResistance:
+    """A resistor that falls with its own current, R / (1 + |i| / I_0) [Ω].
+
+    Source: Kaczmarek and Webster 1989, with R = 60.1 kΩ and I_0 = 0.585 mA for skin under a
+    stimulation electrode.
+
+    Args:
+        r: R [Ω], at small currents.
+        i_0: I_0 [A], the current at which the resistance has fallen to a half.
+
+    Returns:
+        An impedance, to be connected with others. A circuit has at most one such element.
+    """
+    return CurrentDependentResistance(r, i_0)
+
+
+class SkinCurrent(AbstractCircuit):
+    """Skin whose parallel resistance falls with its current, R_s + (R_p / (1 + |i|/I_0)) ‖ C_p.
+
+    The typical I_0 is that of Kaczmarek and Webster (1989); the other typical values are those of
+    `SkinRC`.
+    """
+
+    formula = "R_s + R_p / (1 + |i| / I_0 + s R_p C_p)"
+    r_s: Ohm = parameter("ohm", typical=20e3)
+    r_p: Ohm = parameter("ohm", typical=100e3)
+    c_p: Farad = parameter("farad", typical=0.3e-9)
+    i_0: Ampere = parameter("ampere", typical=0.585e-3)
+
+    def impedance(self) -> AbstractImpedance:
+        """The circuit; as a function of s it is the impedance at small currents."""
+        return series(
+            resistor(self.r_s),
+            parallel(current_dependent_resistor(self.r_p, self.i_0), capacitor(self.c_p)),
+        )
+
+
+class Norton(NamedTuple):
+    """A source with its admittance, at each frequency.
+
+    Attributes:
+        current: Short-circuit current J [A].
+        admittance: Y [S].
+    """
+
+    current: Complex[Array, " frequency"]
+    admittance: Complex[Array, " frequency"]
+
+
+class Signals(NamedTuple):
+    """Voltage and current of a part at each frequency.
+
+    Attributes:
+        voltage: Voltage across the part [V].
+        current: Current into the part [A].
+    """
+
+    voltage: Complex[Array, " frequency"]
+    current: Complex[Array, " frequency"]
+
+
+class Port(NamedTuple):
+    """A source as the current-dependent resistor of a circuit sees it.
+
+    Attributes:
+        element: The resistor.
+        source: The source together with the rest of the circuit.
+        outwards: Signals at the terminals of the circuit, from those of the resistor.
+    """
+
+    element: CurrentDependentResistance
+    source: Norton
+    outwards: Callable[[Signals], Signals]
+
+
+def current_dependent(impedance: AbstractImpedance) -> CurrentDependentResistance | None:
+    """The resistor of a circuit that depends on its current; None if there is none.
+
+    Raises:
+        ValueError: There are several.
+    """
+    if isinstance(impedance, CurrentDependentResistance):
+        return impedance
+    parts = impedance.parts if isinstance(impedance, Series | Parallel) else ()
+    found = [one for one in map(current_dependent, parts) if one is not None]
+    if len(found) > 1:
+        raise ValueError(
+            f"a circuit has {len(found)} resistors that depend on their current; use one"
+        )
+    return found[0] if found else None
+
+
+def port(impedance: AbstractImpedance, source: Norton, s: Complex[Array, " frequency"]) -> Port:
+    """The source behind everything between it and the resistor that depends on its current.
+
+    Args:
+        impedance: The circuit, with one such resistor.
+        source: The source at its terminals.
+        s: Frequency variable [rad/s].
+    """
+    if isinstance(impedance, CurrentDependentResistance):
+        return Port(impedance, source, lambda signals: signals)
+    assert isinstance(impedance, Series | Parallel)
+    inner = [part for part in impedance.parts if current_dependent(part) is not None]
+    others = [part for part in impedance.parts if part is not inner[0]]
+    if isinstance(impedance, Series):
+        z = reduce(jnp.add, [part(s) for part in others], jnp.zeros_like(s))
+        loss = reciprocal(1 + source.admittance * z)
+        found = port(inner[0], Norton(source.current * loss, source.admittance * loss), s)
+
+        def outwards(signals: Signals) -> Signals:
+            voltage, current = found.outwards(signals)
+            return Signals(voltage + z * current, current)
+    else:
+        y = reduce(jnp.add, [part.admittance(s) for part in others], jnp.zeros_like(s))
+        found = port(inner[0], Norton(source.current, source.admittance + y), s)
+
+        def outwards(signals: Signals) -> Signals:
+            voltage, current = found.outwards(signals)
+            return Signals(voltage, current + y * voltage)
+
+    return found._replace(outwards=outwards)

@@ -1,0 +1,148 @@
+"""One load, recorded at several amplitudes; its resistance may fall with the current."""
+
+from collections.abc import Iterable, Sequence
+
+import jax
+import jax.numpy as jnp
+
+from etid.circuits.circuit import AbstractCircuit
+from etid.circuits.current_dependent import SkinCurrent, current_dependent
+from etid.estimators import judgement
+from etid.estimators.amplitudes.fit import fit_amplitudes
+from etid.estimators.amplitudes.terms import Amplitudes
+from etid.estimators.estimator import serving
+from etid.estimators.lanes import Harmonics, stacked
+from etid.estimators.maximum_likelihood.estimator import description
+from etid.estimators.maximum_likelihood.given_driver import AbstractGiven
+from etid.estimators.registry import MAXIMUM_LIKELIHOOD, register_description
+from etid.identify.arguments import circuit_of, fed, plan, require, require_float64
+from etid.identify.arguments import recordings as list_of
+from etid.identify.compiled import stored_jit
+from etid.identify.one import failed_fit, known_of, successful
+from etid.recordings.preflight import Inspected
+from etid.recordings.recording import Recording, RecordingError
+from etid.results.driver import Driver, HarmonicDriver
+from etid.results.feed import MEASURED_CURRENT, MeasuredCurrent
+from etid.results.fits import Fit
+from etid.results.verdicts import RESULTS
+
+METHOD = "amplitudes"
+register_description(
+    METHOD,
+    description(
+        "maximum likelihood for several amplitudes",
+        "the load was estimated from all its recordings together by",
+        "The response of a resistor that depends on its current was computed by harmonic balance. "
+        "Z_th and the trigger delays were estimated with the load; each record has its own delay.",
+    ),
+)
+
+
+@stored_jit
+def _fit(
+    lanes: Harmonics,
+    known: AbstractGiven,
+    feed: HarmonicDriver | MeasuredCurrent,
+    circuit: AbstractCircuit,
+) -> Fit:
+    rate = jnp.asarray(lanes.sample_rate)[0]
+    of = Amplitudes(known, feed, circuit, lanes.spectrum, rate)
+    estimate = fit_amplitudes(of)
+    fit = judgement.judged(estimate, circuit, feed.result, METHOD)
+    unsure = [
+        error > judgement.NO_CURRENT
+        for error, unit in zip(
+            jnp.sqrt(jnp.diagonal(estimate.cov)), circuit.units().values(), strict=True
+        )
+        if unit == "ampere"
+    ]
+    return judgement.unless(fit, jnp.any(jnp.array(unsure, bool)), RESULTS.insensitive)
+
+
+def identify_amplitudes(
+    recordings: Iterable[Recording],
+    driver: Driver | None = None,
+    *,
+    circuit: AbstractCircuit | None = None,
+    throw: bool = True,
+) -> Fit:
+    """Identify one load from recordings at several amplitudes; it may depend on its current.
+
+    All recordings have the same elements. The method is maximum likelihood on the harmonics; the
+    response of a resistor that depends on its current is computed by harmonic balance, from the
+    record of V_th or of the current. Two things make I_0 and R_s wrong that a linear load does not
+    notice. An anti-alias filter that changes the edges of the record inside the band: with the
+    values of Kaczmarek and Webster at 60 dB, I_0 is wrong by 1 % and R_s by 8 % at 200 kHz, and
+    both by less than 0.1 % at 500 kHz. A measured current with a direct component, which the
+    harmonics do not contain: stimulate with charge-balanced pulses.
+
+    Args:
+        recordings: Recordings of the same load, of equal length and sample rate, each of several
+            whole pulse periods. Amplitudes that differ by a factor of five determine I_0 well.
+        driver: Driver identified by maximum likelihood. None for recordings of the current.
+        circuit: Structure of the load and its typical values; `SkinCurrent` if not given. Any other
+            circuit is fitted to all recordings together.
+        throw: Raise an error if the verdict is not successful.
+
+    Returns:
+        Elements, standard errors and verdict. χ² and RRSE are those of the worst recording. The
+        verdict is `insensitive` if the error of I_0 exceeds a third of it: as far as the recordings
+        show, the load is linear.
+
+    Raises:
+        RecordingError: There is no recording, the recordings have different lengths or rates, or
+            they lack V_th or the current.
+        ValueError: The driver was identified by another method, or the circuit has several
+            resistors that depend on their current.
+        IdentificationError: The verdict is not successful and `throw` is set.
+    """
+    require_float64()
+    if driver is not None:
+        require("driver", driver, Driver)
+    circuit = SkinCurrent() if circuit is None else circuit_of(circuit)
+    current_dependent(circuit.impedance())
+    feed = (
+        MEASURED_CURRENT
+        if driver is None
+        else serving(driver, HarmonicDriver, str(MAXIMUM_LIKELIHOOD))
+    )
+    of = _alike(list_of("recordings", recordings))
+    seen = [Inspected(fed(one, driver)[0]) for one in of]
+    for one in seen:
+        _, name = plan(MAXIMUM_LIKELIHOOD, one, feed)
+        if name is not None:
+            fit = failed_fit(name, circuit, METHOD)
+            return successful(one.recording, fit) if throw else fit
+    lanes = [Harmonics.of(one) for one in seen]
+    known = known_of(lanes[0], feed, False, MAXIMUM_LIKELIHOOD)
+    fit = jax.device_get(_fit(stacked(lanes), known, feed, circuit))
+    return successful(seen[0].recording, fit) if throw else fit
+
+
+def _alike(of: Sequence[Recording]) -> Sequence[Recording]:
+    """The recordings.
+
+    Raises:
+        RecordingError: There is none, or they have different lengths or rates.
+    """
+    if not of:
+        raise RecordingError(
+            "is empty", field="recordings", remedy="Pass the recordings of one load in a list"
+        )
+    first = of[0]
+    for number, one in enumerate(of):
+        for field in ("sample_rate", "pulse_rate"):
+            if getattr(one, field) != getattr(first, field):
+                raise RecordingError(
+                    f"has {field} {getattr(one, field):g} Hz, the first {getattr(first, field):g}",
+                    field=f"recordings[{number}]",
+                    remedy="Record all amplitudes with the same settings",
+                )
+        sizes = [of.samples["v_out"].stored.size for of in (one, first)]
+        if sizes[0] != sizes[1]:
+            raise RecordingError(
+                f"has {sizes[0]} samples, the first {sizes[1]}",
+                field=f"recordings[{number}]",
+                remedy="Cut all recordings to the same number of samples",
+            )
+    return of

@@ -1,0 +1,153 @@
+"""One load at several amplitudes, whose resistance may fall with its current.
+
+The truth is a differential equation of the skin under a current source, solved by a stiff method
+in time; harmonic balance and fits know nothing of it.
+"""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+from scipy.special import erf
+
+import etid
+from etid.circuits.current_dependent import Norton, Signals, current_dependent_resistor, port
+from etid.signals.transfer import frequency_variable
+from etid.solvers.harmonic_balance import steady_state, to_harmonics, to_time
+
+SAMPLE_RATE, PULSE_RATE = 200e3, 60.0
+SKIN = etid.SkinCurrent(r_s=895.0, r_p=60.1e3, c_p=1e-9, i_0=0.585e-3)  # Kaczmarek and Webster 1989
+
+
+def pulses(t: np.ndarray) -> np.ndarray:
+    """A charge-balanced pulse of height 1 in every period, with edges of 40 µs."""
+    at = np.mod(t, 1 / PULSE_RATE)
+    edges = (erf((at - start) / 40e-6) / 2 for start in (0.4e-3, 0.7e-3, 1e-3))
+    first, second, third = edges
+    return first - 2 * second + third
+
+
+def stepped(amplitude: float, t: np.ndarray, skin: etid.SkinCurrent = SKIN) -> np.ndarray:
+    """Voltage across the skin [V] at these times, by Radau's method."""
+    r_s, r_p, c_p, i_0 = skin.values().tolist()
+
+    def slope(t: float, u: np.ndarray) -> np.ndarray:
+        through = u / (r_p * (1 - np.abs(u) / (r_p * i_0)))
+        return (amplitude * pulses(np.asarray(t)) - through) / c_p
+
+    # It is at rest long before the end of a period.
+    found = solve_ivp(
+        slope, (0, 2e-3), [0.0], method="Radau", rtol=1e-8, atol=1e-9, max_step=4e-6,
+        dense_output=True,
+    )  # fmt: skip
+    at = np.mod(t, 1 / PULSE_RATE)
+    u = np.where(at < 2e-3, found.sol(np.minimum(at, 2e-3))[0], 0.0)
+    return u + r_s * amplitude * pulses(t)
+
+
+def recording(amplitude: float, seed: int, skin: etid.SkinCurrent = SKIN) -> etid.Recording:
+    """Three periods of current and voltage at 60 dB."""
+    t = np.arange(10_000) / SAMPLE_RATE
+    rng = np.random.default_rng([seed, round(1e6 * amplitude)])
+
+    def noisy(v: np.ndarray) -> etid.Samples:
+        return etid.Samples(v + 1e-3 * np.sqrt(np.mean(v**2)) * rng.standard_normal(v.size))
+
+    return etid.Recording(
+        v_out=noisy(stepped(amplitude, t, skin)),
+        current=noisy(amplitude * pulses(t)),
+        sample_rate=SAMPLE_RATE,
+        pulse_rate=PULSE_RATE,
+    )
+
+
+def test_the_current_of_the_resistor_solves_its_equation():
+    element = current_dependent_resistor(60.1e3, 0.585e-3)
+    wave = jnp.concatenate([-jnp.geomspace(1e-9, 1e4, 40), jnp.geomspace(1e-9, 1e4, 40)])
+    for resistance in (1e2, 1e4, 1e6):
+        i = element.current(wave, jnp.array(resistance))
+        u = 60.1e3 * i / (1 + jnp.abs(i) / 0.585e-3)
+        np.testing.assert_allclose(u + resistance * i, wave, rtol=1e-12)
+
+
+def test_harmonic_balance_agrees_with_steps_in_time():
+    points = 8192
+    t = np.arange(points) / points / PULSE_RATE
+    frequency = jnp.arange(points // 2 + 1.0).at[0].set(1e-6) * PULSE_RATE
+    source = Norton(to_harmonics(jnp.asarray(1e-3 * pulses(t))), jnp.zeros(frequency.size, complex))
+    at = port(SKIN.impedance(), source, frequency_variable(frequency))
+    balance = steady_state(
+        at.element.current, at.element.typical_slope(jnp.array(1e-3)), *at.source
+    )
+    v = to_time(at.outwards(Signals(*balance)).voltage, points)
+    exact = stepped(1e-3, t)
+    # 1e-5 of the peak: u(i) bends within 8 µs, four points of the grid, so harmonics are cut off.
+    np.testing.assert_allclose(v, exact, atol=1e-5 * np.abs(exact).max())
+
+
+def test_a_large_i_0_is_a_linear_load():
+    frequency = jnp.arange(2049.0).at[0].set(1e-6) * PULSE_RATE
+    s = frequency_variable(frequency)
+    z_th = 12e3 + 0.1 * s
+    source = Norton(to_harmonics(jnp.asarray(pulses(np.arange(4096) / 4096 / 60))) / z_th, 1 / z_th)
+    skin = etid.SkinCurrent(r_s=20e3, r_p=100e3, c_p=0.3e-9, i_0=1e6)
+    at = port(skin.impedance(), source, s)
+    balance = steady_state(at.element.current, jnp.array(100e3), *at.source)
+    signals = at.outwards(Signals(*balance))
+    z = etid.SkinRC(r_s=20e3, r_p=100e3, c_p=0.3e-9).response(frequency)
+    linear = source.current * z / (1 + source.admittance * z)
+    # 1e-7: the tolerance of the balance is 1e-8 of the largest value
+    peak = np.abs(np.asarray(linear)).max()
+    np.testing.assert_allclose(signals.voltage, linear, atol=1e-7 * peak)
+    np.testing.assert_allclose(signals.current * z, linear, atol=1e-7 * peak)
+
+
+def test_what_cannot_be_fitted_is_refused_at_once():
+    one, other = recording(1e-4, 0), recording(1e-4, 1)
+    with pytest.raises(etid.RecordingError, match="identify_amplitudes"):
+        etid.identify_skin(one, circuit=etid.SkinCurrent())
+    with pytest.raises(etid.RecordingError, match="is empty"):
+        etid.identify_amplitudes([])
+    short = etid.Recording(
+        v_out=etid.Samples(other.v_out[:9_000]),
+        current=etid.Samples(np.asarray(other.current)[:9_000]),
+        sample_rate=SAMPLE_RATE,
+        pulse_rate=PULSE_RATE,
+    )
+    with pytest.raises(etid.RecordingError, match=r"recordings\[1\].*9000 samples"):
+        etid.identify_amplitudes([one, short])
+
+    class Twice(etid.AbstractCircuit):
+        r: float = etid.parameter("ohm", typical=1e5)
+        i_0: float = etid.parameter("ampere", typical=1e-3)
+
+        def impedance(self):
+            part = etid.current_dependent_resistor(self.r, self.i_0)
+            return etid.series(part, part)
+
+    with pytest.raises(ValueError, match="2 resistors that depend on their current"):
+        etid.identify_amplitudes([one], circuit=Twice())
+
+
+@pytest.mark.slow
+def test_five_amplitudes_give_the_values_of_kaczmarek_and_webster():
+    amplitudes = (0.1e-3, 0.3e-3, 1e-3, 2.5e-3, 5e-3)
+    fit = etid.identify_amplitudes([recording(one, 3) for one in amplitudes])
+    error = np.asarray(fit.circuit.values()) / np.asarray(SKIN.values()) - 1
+    assert np.abs(error).max() < 0.02, error
+    stderr = np.sqrt(np.diag(fit.cov)) / np.asarray(SKIN.values())
+    assert np.all(np.abs(error) < 4 * stderr), error / stderr  # one of 4 elements in 4 000 fits
+
+
+@pytest.mark.slow
+def test_a_linear_skin_has_no_i_0():
+    linear = etid.SkinCurrent(r_s=895.0, r_p=60.1e3, c_p=1e-9, i_0=1e3)
+    of = [recording(one, 5, linear) for one in (0.1e-3, 0.5e-3)]
+    assert etid.identify_amplitudes(of, throw=False).verdict in ("insensitive", "max_steps_reached")
+
+
+@pytest.mark.slow
+def test_a_linear_fit_of_skin_that_falls_with_its_current_says_so():
+    fit = etid.identify_skin(recording(0.2e-3, 7), throw=False)
+    assert fit.verdict == "misfit"
+    assert "identify_amplitudes" in str(fit)
