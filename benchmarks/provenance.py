@@ -25,13 +25,16 @@ def provenance() -> dict[str, str]:
 
 
 def _commit() -> str:
-    """The commit, with a + if the working tree differs from it."""
-    command = ["git", "describe", "--always", "--abbrev=12", "--dirty=+", "--exclude=*"]
+    """The commit, with a + if the working tree differs from it, other than by results of a run."""
+    changed = ["git", "diff", "--name-only", "HEAD", "--", ".", f":!{RESULTS}"]
     try:
-        done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True)
+        commit, names = (
+            subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True).stdout
+            for command in (["git", "rev-parse", "--short=12", "HEAD"], changed)
+        )
     except (OSError, subprocess.CalledProcessError):
         return "unknown"
-    return done.stdout.strip()
+    return commit.strip() + "+" * bool(names)
 
 
 def _processor() -> str:

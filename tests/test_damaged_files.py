@@ -1,5 +1,6 @@
 """Damaged files end in an answer or in one error of etid's own: no crash, no hang, no memory."""
 
+import gc
 import re
 
 import h5py
@@ -83,6 +84,37 @@ def test_a_heap_that_declares_more_than_the_file_holds_is_an_error_before_it_is_
     data[heap + 8 : heap + 16] = (2 << 30).to_bytes(8, "little")
     texts.write_bytes(data)
     assert "the heap of texts" in hdf5.check(texts)[0].message
+
+
+@pytest.mark.parametrize("libver", ["earliest", "latest"])
+@pytest.mark.parametrize(
+    ("kind", "lost"),  # lost: the address of the heap, too
+    [("attribute", False), ("attribute", True), ("attributes", True)],
+)
+def test_a_text_that_is_said_to_be_long_is_refused_before_its_length_is_allocated(
+    tmp_path, libver, kind, lost
+):
+    path = tmp_path / "texts.h5"
+    texts = ["calibration/0", "s01"]
+    with h5py.File(path, "w", libver=libver) as file:
+        file.attrs["named"] = texts if kind == "attributes" else texts[0]
+
+    def read():
+        with untrusted.guarded(str(path)) as file:
+            return file.attrs["named"]
+
+    assert np.size(read()) == (2 if kind == "attributes" else 1)
+    data = bytearray(path.read_bytes())
+    heap = data.find(b"GCOL\x01")
+    descriptor = np.array([len(texts[0]), heap, 0], "u4").tobytes()
+    at = data.find(descriptor)
+    assert at > 0
+    data[at : at + 4] = (2**31 - 1).to_bytes(4, "little")
+    if lost:
+        data[at + 4 : at + 12] = (heap + 1).to_bytes(8, "little")
+    path.write_bytes(data)
+    with pytest.raises(etid.RecordingError, match="a text of 2147483647 bytes"):
+        read()
 
 
 def declared(texts, shape, chunks):
@@ -218,6 +250,24 @@ def test_matlab_5_of_an_unknown_type_is_refused_before_scipy_ends_the_process(ki
     path.write_bytes(data)
     with pytest.raises(etid.RecordingError, match="of type 8, which does not exist"):
         mat5.check(path)
+
+
+def test_a_damaged_archive_is_closed(tmp_path):
+    """Warnings are errors: a file that is left open would be one."""
+    path = tmp_path / "codes.npz"
+    np.savez(path, v_th=np.zeros(10), v_out=np.zeros(10))
+    path.write_bytes(path.read_bytes().replace(b"PK\x01\x02", b"PK\x01\x03"))
+    with pytest.raises(etid.RecordingError):
+        etid.import_file(path, tmp_path / "a.h5")
+    gc.collect()
+
+
+def test_samples_near_the_largest_number_give_no_warning(tmp_path):
+    v = np.where(np.arange(4000) % 1000 < 20, 1e308, -1e308)
+    recording = etid.Recording(v, v, sample_rate=200e3, pulse_rate=60.0, path="a")
+    path = tmp_path / "a.h5"
+    etid.Study.from_recordings([recording]).write(path)
+    hdf5.check(path)
 
 
 def test_an_archive_that_declares_more_than_it_holds_is_refused(kinds, tmp_path):

@@ -160,7 +160,8 @@ class Scan:
                             "Record again; a fit of this recording only gives a verdict",
                         )
                 cause = recording.samples[recording.cause].values
-                train = find_pulses(cause, recording.sample_rate, recording.pulse_rate)
+                with np.errstate(over="ignore", invalid="ignore"):  # of samples like 1e308
+                    train = find_pulses(cause, recording.sample_rate, recording.pulse_rate)
                 if train.mismatch:
                     remedy = "Correct sample_rate or pulse_rate"
                     self._report(path, "pulse_rate", train.mismatch.removesuffix("."), remedy)

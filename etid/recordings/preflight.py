@@ -89,7 +89,8 @@ class Group:
     @functools.cached_property
     def trains(self) -> list[PulseTrain]:
         """Pulse trains of `v_th`."""
-        return [find_pulses(v_th, self.sample_rate, self.pulse_rate) for v_th, _ in self.whole]
+        with QUIETLY():
+            return [find_pulses(v_th, self.sample_rate, self.pulse_rate) for v_th, _ in self.whole]
 
     @functools.cached_property
     def whole_periods(self) -> list[tuple[int, int]]:

@@ -4,8 +4,11 @@ For most damaged files the HDF5 library raises an error. There is one exception.
 texts of variable length, and the size of each object leads to the next object. If a free object has
 size 0, the library loops forever in C, and Python cannot stop it. A `Guarded` file therefore
 follows the objects of a heap itself before the library reads the heap. All hangs that
-`python -m benchmarks fuzz` has found were of this kind. The guard needs a Python call for each
-read. So samples, and all metadata of files that etid has written, are read without it.
+`python -m benchmarks fuzz` has found were of this kind. For each text, the file also holds a
+descriptor: its length, the address of its heap, and the number of its object. The library allocates
+this length before it looks for the object. The guard finds the descriptors of attributes in what
+the library reads. The guard needs a Python call for each read. So samples, and all metadata of
+files that etid has written, are read without it.
 """
 
 import contextlib
@@ -13,6 +16,7 @@ import functools
 import io
 import math
 import os
+import re
 import struct
 from collections.abc import Iterator
 from typing import Any
@@ -41,6 +45,13 @@ _PLAIN = 4096  # [bytes] largest number or text that is read without a further c
 _HEAP = b"GCOL\x01\0\0\0"
 _HEAP_HEAD = 16  # [bytes] signature, version, size of the collection
 _OBJECT = struct.Struct("<HH4xQ")  # index, reference count, size
+_TEXT = struct.Struct("<IQI")  # length, address of the heap, index of the object
+# Message of an attribute: version, flags, sizes of its name, type and shape.
+_MESSAGE = struct.Struct("<BxHHH")
+_VERSION = re.compile(rb"(?=[\x01-\x03][\x00-\x03])")
+# Start of a type of variable length, by version, and the size of its values.
+_VARIABLE, _DESCRIPTOR = (b"\x19", b"\x39", b"\x49"), struct.pack("<I", _TEXT.size)
+_DESCRIBED = 1 << 21  # [bytes] larger reads are samples
 _SIZES = {0: 13, 1: 13, 2: 9, 3: 9}  # offset of the sizes of numbers, by version of the superblock
 
 
@@ -51,14 +62,19 @@ translated = functools.partial(
 
 
 class Guarded(io.FileIO):
-    """A file for the HDF5 library that refuses a damaged global heap: a loop, or a wrong size."""
+    """A file for the HDF5 library that refuses a damaged global heap, and texts that are too long.
+
+    A heap is damaged if its objects are a loop or its size is wrong.
+    """
 
     def readinto(self, buffer: Any) -> int:
         """Fill the buffer, after a check of the heaps that begin in it."""
         start = self.tell()
-        before = min(start, len(_HEAP) - 1)  # a signature may begin in the previous read
+        before = min(start, _TEXT.size)  # a signature or text may begin in the previous read
         self.seek(start - before)
-        seen = self.read(before + len(buffer) + len(_HEAP) - 1)
+        seen = self.read(before + len(buffer) + _TEXT.size)
+        if len(seen) <= _DESCRIBED:
+            self._check_texts(seen)
         place = seen.find(_HEAP)
         while place >= 0:
             self._follow(start - before + place)
@@ -67,6 +83,13 @@ class Guarded(io.FileIO):
         buffer[: len(part)] = part
         self.seek(start + len(part))
         return len(part)
+
+    def _check_texts(self, seen: bytes) -> None:
+        """Raise OSError if an attribute in these bytes has a text that is too long."""
+        size = os.fstat(self.fileno()).st_size
+        longest = max(_lengths(seen), default=0)
+        if longest > min(size, limits.ATTRIBUTE):
+            raise OSError(f"it has a text of {longest} bytes")
 
     def _follow(self, heap: int) -> None:
         """Raise OSError if a heap exceeds the file, or an object does not lead to the next."""
@@ -83,6 +106,25 @@ class Guarded(io.FileIO):
             if step == 0:
                 raise damaged
             place += step
+
+
+def _lengths(seen: bytes) -> Iterator[int]:
+    """Lengths of the texts of variable length in messages of attributes."""
+    for match in _VERSION.finditer(seen, 0, max(len(seen) - _MESSAGE.size, 0)):
+        version, name, kind, space = _MESSAGE.unpack_from(seen, match.start())
+        unit = 8 if version == 1 else 1  # to which the parts are padded
+        name, kind, space = (-(-part // unit) * unit for part in (name, kind, space))
+        of_type = match.start() + _MESSAGE.size + (version == 3) + name
+        first = of_type + kind + space
+        described = seen[of_type : of_type + 8]
+        if described[:1] not in _VARIABLE or described[4:] != _DESCRIPTOR:
+            continue
+        sides = seen[of_type + kind : first]
+        rank, begin = sides[1] if len(sides) > 1 else 0, 8 if sides[:1] == bytes([1]) else 4
+        shape = sides[begin:][: 8 * rank]
+        shape = struct.unpack_from(f"<{len(shape) // 8}Q", shape)
+        for at in range(first, len(seen) - _TEXT.size + 1, _TEXT.size)[: math.prod(shape)]:
+            yield _TEXT.unpack_from(seen, at)[0]
 
 
 @contextlib.contextmanager

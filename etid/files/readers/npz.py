@@ -17,11 +17,18 @@ from etid.recordings.recording import Recording, RecordingError, Samples
 KEYS = ("adc_th", "adc_out", "adc_ref", "R_ref", "fs", "f0", "lsb", "scale")
 
 
+@contextlib.contextmanager
+def _archive(path: pathlib.Path) -> Iterator[Any]:
+    """The archive; `np.load` would leave a damaged file open."""
+    with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
+        yield archive
+
+
 def is_complete(path: pathlib.Path) -> bool:
     """Whether an archive has all fields of its recordings, under the names of `recordings`."""
     if not zipfile.is_zipfile(path):
         raise RecordingError("is not an npz file")
-    with np.load(path, allow_pickle=False) as archive:
+    with _archive(path) as archive:
         return all(key in archive.files for key in KEYS[:2])
 
 
@@ -31,7 +38,7 @@ def opened(path: pathlib.Path, folder: pathlib.Path) -> Iterator[Contents]:
     del folder
     if not zipfile.is_zipfile(path):
         raise RecordingError("is not an npz file")
-    with np.load(path, allow_pickle=False) as archive:
+    with _archive(path) as archive:
 
         def channel(name: str) -> Channel:
             _check_size(archive, name)
@@ -54,7 +61,7 @@ def recordings(path: pathlib.Path, labels: Mapping[str, Any]) -> list[Recording]
     are `calibration/0`, … and `loaded/0`, …. The archive has no unloaded records for the
     calibrations, so all calibrations share `adc_th[0]`.
     """
-    with np.load(path, allow_pickle=False) as archive:
+    with _archive(path) as archive:
         for key in KEYS:
             chosen(archive.files, key, key)
             _check_size(archive, key)
