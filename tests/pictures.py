@@ -181,6 +181,8 @@ PICTURES: dict[str, Callable[[], tuple]] = {
     "recording": lambda: (dry(),),
     "fit": lambda: (fit(), dry(), driver()),
     "fit_without_success": lambda: (fit("misfit"), dry(), driver()),
+    "fit_impedance": lambda: (fit(), dry(), driver(), "impedance"),
+    "fit_residual": lambda: (fit(), dry(), driver(), "residual"),
     "selection": lambda: (selection(SkinRC="misfit"), spread(), driver()),
     "calibration": lambda: (driver(), study()["calibration/98k8"]),
     "driver": lambda: (driver(),),

@@ -5,6 +5,7 @@ import dataclasses
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from matplotlib.collections import LineCollection
 from matplotlib.colors import to_hex
 from matplotlib.patches import Rectangle
 from matplotlib.testing.compare import compare_images
@@ -262,3 +263,40 @@ def test_equal_figures_are_equal_files(recording, tmp_path):
         assert b"<dc:date>" not in files[0].read_bytes()
     with pytest.raises(ValueError, match=r"\.png or \.svg"):
         save(figures[0], tmp_path / "figure.pdf")
+
+
+def test_a_fit_is_shown_beside_the_impedance_that_is_measured(recording, driver):
+    nyquist, magnitude, phase = figure_of(pictures.fit(), recording, driver, show="impedance").axes
+    re, im = (np.asarray(of, float) for of in nyquist.lines[1].get_data())
+    size = np.asarray(magnitude.lines[1].get_ydata(), float)
+    np.testing.assert_allclose(np.hypot(re, im), size, rtol=1e-12)
+    kilohertz, angle = (np.asarray(of, float) for of in phase.lines[1].get_data())
+    z = np.asarray(pictures.SKIN.response(jnp.asarray(1e3 * kilohertz))) / 1e3
+    np.testing.assert_allclose(size, np.abs(z), rtol=0.2)
+    np.testing.assert_allclose(angle, np.degrees(np.angle(z)), atol=12)
+
+
+def _segments(axis):
+    (lines,) = axis.collections
+    assert isinstance(lines, LineCollection)
+    return lines.get_segments()
+
+
+def test_the_residual_of_a_wrong_circuit_correlates_with_the_unloaded_voltage(recording, driver):
+    outside = []
+    for circuit in (pictures.SKIN, etid.SkinRC(30e3, 150e3, 0.2e-9)):
+        fit = pictures.fit(circuit=circuit)
+        _, own, with_input = figure_of(fit, recording, driver, show="residual").axes
+        (band,) = with_input.patches
+        assert isinstance(band, Rectangle)
+        limit = band.get_height() / 2
+        lines = np.array([segment[1][1] for segment in _segments(with_input)])
+        outside.append(np.mean(np.abs(lines) > limit))
+        middle = np.array([segment[1] for segment in _segments(own)])
+        assert middle[middle[:, 0] == 0, 1] == pytest.approx(1.0)
+    assert outside[0] < 0.05 < 0.5 < outside[1]
+
+
+def test_only_fits_have_several_pictures(driver):
+    with pytest.raises(ValueError, match="it is for fits, and one of 'pulse', 'impedance'"):
+        figure_of(driver, show="residual")

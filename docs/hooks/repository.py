@@ -28,6 +28,7 @@ SHOWN = (
     "data_schema/recording-1.json",
     "benchmarks/results/*.svg",
     "benchmarks/results/*.csv",
+    "tests/baseline/*.png",
 )
 LINK = re.compile(r"(?<=\]\()(?!\w+:|#)([^)#\s]+)")
 FETCHED = {"script": "src", "img": "src", "iframe": "src", "source": "src"}

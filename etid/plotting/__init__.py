@@ -5,7 +5,7 @@ matplotlib.
 """
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any, overload
+from typing import TYPE_CHECKING, Any, Literal, get_args, overload
 
 import numpy as np
 
@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from etid.plotting.style import Canvas
 
 Impedance = Driver | Fit | AbstractCircuit | SourceImpedance
+Shown = Literal["pulse", "impedance", "residual"]
 AnyAxes = np.ndarray | Sequence["matplotlib.axes.Axes"] | None
 
 
@@ -31,7 +32,11 @@ AnyAxes = np.ndarray | Sequence["matplotlib.axes.Axes"] | None
 def plot(x: Recording, *, axes: AnyAxes = None) -> np.ndarray: ...
 @overload
 def plot(
-    x: Fit | Selection, recording: Recording, driver: Driver, *, axes: AnyAxes = None
+    x: Fit, recording: Recording, driver: Driver, *, axes: AnyAxes = None, show: Shown = "pulse"
+) -> np.ndarray: ...
+@overload
+def plot(
+    x: Selection, recording: Recording, driver: Driver, *, axes: AnyAxes = None
 ) -> np.ndarray: ...
 @overload
 def plot(x: Driver, recording: Recording, *, axes: AnyAxes = None) -> np.ndarray: ...
@@ -53,6 +58,7 @@ def plot(
     driver: Driver | None = None,
     *,
     axes: AnyAxes = None,
+    show: Shown = "pulse",
 ) -> np.ndarray:
     """Draw a recording, a fit, a posterior, a driver, an impedance, fits, bounds and others.
 
@@ -60,6 +66,8 @@ def plot(
     |---|---|---|
     | `plot(recording)` | V_th and V_out [V]: the whole record, and one pulse | 2 |
     | `plot(fit, recording, driver)` | one pulse measured and predicted [V]; residual [mV] | 2 |
+    | `plot(fit, recording, driver, show="impedance")` | Nyquist and Bode: fit, measured | 3 |
+    | `plot(fit, recording, driver, show="residual")` | residual [mV], its correlations | 3 |
     | `plot(selection, recording, driver)` | impedance measured, and each candidate | 4 |
     | `plot(driver, calibration)` | the same two diagrams for the calibration's resistor | 2 |
     | `plot(driver)`, `plot(circuit)` | magnitude [kΩ] and phase [deg] of an impedance | 2 |
@@ -74,6 +82,10 @@ def plot(
     inside. The bands around impedances are two standard errors, from the covariance of the fit or
     driver. Fits and drivers without success have a red title, and their points are hollow.
 
+    The points of `show="impedance"` are what the recording measures in bands of frequency, with two
+    standard errors. `show="residual"` adds the autocorrelation of the residual and its
+    cross-correlation with V_th; of white noise, 99 % lie in the band.
+
     The picture of a selection shows magnitude [kΩ] and phase [deg] in bands of frequency with two
     standard errors; points are pale where the error exceeds 30 %. Below are the deviations of each
     candidate from these points, in standard errors.
@@ -82,6 +94,7 @@ def plot(
         x: The object to draw.
         recording: Recording of the fit or selection, or calibration of the driver.
         driver: Driver of the fit or selection.
+        show: What to draw of a fit: `"pulse"`, `"impedance"` or `"residual"`.
         axes: Axes to draw on, as many as the table says. Without axes, `plot` makes a figure of
             `matplotlib.pyplot`, which a notebook shows.
 
@@ -95,11 +108,14 @@ def plot(
     from etid.plotting import style
 
     canvas = style.on_pyplot if axes is None else style.on_axes(axes)
-    return _draw(canvas, x, recording, driver)
+    return _draw(canvas, x, recording, driver, show)
 
 
 def figure_of(
-    x: Any, recording: Recording | None = None, driver: Driver | None = None
+    x: Any,
+    recording: Recording | None = None,
+    driver: Driver | None = None,
+    show: Shown = "pulse",
 ) -> "matplotlib.figure.Figure":
     """The picture of `plot`, on a figure outside of `matplotlib.pyplot`; same arguments."""
     from etid.plotting import style
@@ -107,18 +123,26 @@ def figure_of(
     def canvas(*layout: Any, **options: Any) -> np.ndarray:
         return style.new_figure(*layout, **options)[1]
 
-    return _draw(canvas, x, recording, driver)[0].figure
+    return _draw(canvas, x, recording, driver, show)[0].figure
 
 
 def _draw(
-    canvas: "Canvas", x: Any, recording: Recording | None, driver: Driver | None
+    canvas: "Canvas", x: Any, recording: Recording | None, driver: Driver | None, show: Shown
 ) -> np.ndarray:
     import matplotlib as mpl
 
-    from etid.plotting import candidates, elements, impedances, posteriors, pulses, style
+    from etid.plotting import candidates, elements, impedances, judging, posteriors, pulses, style
 
+    if show not in get_args(Shown) or (show != "pulse" and not isinstance(x, Fit)):
+        raise ValueError(
+            f"show is {show!r}; it is for fits, and one of {', '.join(map(repr, get_args(Shown)))}"
+        )
     with mpl.rc_context(style.PAPER):
         match x, recording, driver:
+            case Fit(), Recording(), Driver() if show == "impedance":
+                return judging.draw_impedance(canvas, x, recording, driver)
+            case Fit(), Recording(), Driver() if show == "residual":
+                return judging.draw_residual(canvas, x, recording, driver)
             case Fit(), Recording(), Driver():
                 return pulses.draw_fit(canvas, x, recording, driver)
             case Selection(), Recording(), Driver():

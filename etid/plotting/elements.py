@@ -11,6 +11,7 @@ from etid.plotting.style import COLOURS, INK, MARKS, RED, Canvas, plain_ticks, s
 from etid.results.fits import Fits
 from etid.simulation.bound import Bound
 
+NAMED = 40  # largest number of fits whose trials are written beside them
 CROWDED = 60  # letters below an axis; longer rows of labels are turned
 UNDETERMINED = 1.0  # relative standard error (see Bound.undetermined)
 
@@ -46,6 +47,12 @@ def draw_fits(canvas: Canvas, fits: Fits) -> np.ndarray:
                 0.995, 0.97, f"{(~shown).sum()} without success outside", color=RED, fontsize=8,
                 transform=axis.transAxes, ha="right", va="top",
             )  # fmt: skip
+        if len(fits) <= NAMED:
+            for row in np.flatnonzero(shown & drawable):
+                axis.annotate(
+                    str(fits.labels["trial"][row]), (x[row], values[row]), xytext=(4, 3),
+                    textcoords="offset points", fontsize=7, color="0.35",
+                )  # fmt: skip
         axis.set_ylabel(symbol(name, unit))
     names = [str(subject) or "-" for subject in subjects]
     turned = sum(map(len, names)) > CROWDED

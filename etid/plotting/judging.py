@@ -1,0 +1,97 @@
+"""Pictures that judge a fit: its impedance beside the measured one, and its residual."""
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+from matplotlib.axes import Axes
+
+from etid.estimators.estimator import serving
+from etid.estimators.lanes import Harmonics
+from etid.estimators.registry import MAXIMUM_LIKELIHOOD
+from etid.identify.predict import predict
+from etid.plotting.bands import bands
+from etid.plotting.impedances import POINTS, frame
+from etid.plotting.pulses import headline
+from etid.plotting.style import BLUE, INK, RED, Canvas, titled
+from etid.recordings.preflight import Inspected
+from etid.recordings.recording import Recording
+from etid.results.driver import ContinuousDriver, Driver
+from etid.results.fits import Fit
+
+SURE = 0.3  # relative standard error of a point; others are not drawn
+LAGS = 60  # samples in the diagrams of correlation
+BAND = 2.58  # standard deviations of a correlation that 99 % of white noise does not exceed
+
+
+def draw_impedance(canvas: Canvas, fit: Fit, recording: Recording, driver: Driver) -> np.ndarray:
+    """Nyquist and Bode diagrams: the impedance that the recording measures, and the fit."""
+    nyquist, magnitude, phase = axes = canvas(1, 3, (12.0, 3.8)).ravel()
+    known = serving(driver, ContinuousDriver, MAXIMUM_LIKELIHOOD.name)
+    measured = bands(Harmonics.of(Inspected(recording)), known, fit.circuit)
+    sure = measured.stderr <= SURE
+    z, error = measured.z[sure] / 1e3, measured.stderr[sure]
+    kilohertz = measured.frequency[sure] / 1e3
+    smooth = np.geomspace(kilohertz.min() / 1.3, kilohertz.max() * 1.3, POINTS)
+    fitted = np.asarray(fit.circuit.response(jnp.asarray(1e3 * smooth))) / 1e3
+    curve = {"color": RED, "lw": 1.3, "label": "fit"}
+    point = {
+        "fmt": "o",
+        "ms": 4,
+        "lw": 0.8,
+        "color": BLUE,
+        "label": "measured, ± 2 standard errors",
+    }
+    nyquist.plot(np.real(fitted), -np.imag(fitted), **curve)
+    size = 2 * error * np.abs(z)
+    nyquist.errorbar(np.real(z), -np.imag(z), yerr=size, xerr=size, **point)
+    nyquist.set(xlabel="Re Z [kΩ]", ylabel="-Im Z [kΩ]")
+    nyquist.set_aspect("equal", adjustable="datalim")
+    magnitude.plot(smooth, np.abs(fitted), **curve)
+    magnitude.errorbar(kilohertz, np.abs(z), size, **point)
+    magnitude.set(xlabel="frequency [kHz]", ylabel="|Z| [kΩ]", xscale="log", yscale="log")
+    phase.plot(smooth, np.degrees(np.angle(fitted)), **curve)
+    phase.errorbar(kilohertz, np.degrees(np.angle(z)), np.degrees(2 * error), **point)
+    phase.set(xlabel="frequency [kHz]", ylabel="phase [deg]", xscale="log")
+    frame(magnitude, phase, np.abs(z))
+    magnitude.xaxis.set_major_formatter("{x:g}")
+    magnitude.legend(frameon=False, fontsize=8)
+    good = fit.verdict == "successful"
+    titled(nyquist, [headline(recording, fit)], good=good)
+    titled(magnitude, [",  ".join(fit.elements)], good=good)
+    return axes
+
+
+def draw_residual(canvas: Canvas, fit: Fit, recording: Recording, driver: Driver) -> np.ndarray:
+    """The residual, its autocorrelation, and its cross-correlation with V_th.
+
+    A residual of white noise has correlations within the band at 99 % of the lags.
+    """
+    whole, own, with_input = axes = canvas(1, 3, (12.0, 3.4)).ravel()
+    residual = predict(recording, driver, fit.circuit) - recording.v_out
+    known = np.isfinite(residual)
+    whole.plot(1e3 * recording.time, 1e3 * residual, color=BLUE, lw=0.5)
+    whole.set(xlabel="time [ms]", ylabel="residual [mV]")
+    clean, v_th = residual[known], recording.v_th[known]
+    _correlation(own, clean, clean, "autocorrelation of the residual")
+    _correlation(with_input, clean, v_th, "correlation with earlier V_th")
+    titled(whole, [headline(recording, fit)], good=fit.verdict == "successful")
+    titled(own, ["band: 99 % of white noise"])
+    return axes
+
+
+def _correlation(
+    axis: Axes, one: Float[np.ndarray, " time"], other: Float[np.ndarray, " time"], label: str
+) -> None:
+    """Correlation coefficients of `one` with `other` at earlier times, over the lag."""
+    one, other = one - one.mean(), other - other.mean()
+    lags = np.arange(-LAGS, LAGS + 1)
+    norm = np.sqrt(np.sum(one**2) * np.sum(other**2))
+    size = one.size
+    found = [
+        np.dot(one[max(lag, 0) : size + min(lag, 0)], other[max(-lag, 0) : size - max(lag, 0)])
+        for lag in lags
+    ]
+    band = BAND / np.sqrt(size)
+    axis.axhspan(-band, band, color="0.85", lw=0)
+    axis.vlines(lags, 0.0, np.array(found) / norm, color=INK, lw=0.9)
+    axis.set(xlabel="lag [samples]", ylabel=label)
