@@ -123,7 +123,7 @@ def by_etid(every: Sequence[Spectra]) -> Chosen:
             }
             names.append(NAMES[best(fits)])
             seconds.append(time.perf_counter() - begin)
-    return _by_truth(names, seconds)
+    return by_truth(names, seconds)
 
 
 def missing() -> str:
@@ -144,7 +144,7 @@ def by_impedance_py(every: Sequence[Spectra]) -> Chosen:
             check=True,
         )
         with np.load(found) as file:
-            return _by_truth(NAMES[np.argmin(file["bic"], axis=1)], file["seconds"])
+            return by_truth(NAMES[np.argmin(file["bic"], axis=1)], file["seconds"])
 
 
 def right(chosen: Chosen) -> np.ndarray:
@@ -153,6 +153,7 @@ def right(chosen: Chosen) -> np.ndarray:
     return chosen.names == true[:, None]
 
 
-def _by_truth(names: Sequence[str] | np.ndarray, seconds: Sequence[float] | np.ndarray) -> Chosen:
+def by_truth(names: Sequence[str] | np.ndarray, seconds: Sequence[float] | np.ndarray) -> Chosen:
+    """Choices in the order of the spectra, all truths of one after the other."""
     shape = -1, len(TRUTHS)
     return Chosen(np.reshape(names, shape).T, np.reshape(seconds, shape).T)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import etid
-from benchmarks import selection, selection_chart, selection_map
+from benchmarks import selection, selection_chart, selection_map, selection_rival
 from benchmarks.selection_counts import CRITERIA, cell, choose, covered, gained
 from benchmarks.selection_draws import TRUTHS, Drawn, quantities
 from etid.results.fits import CHANGES, Fit, Support
@@ -127,3 +127,24 @@ def test_a_circuit_without_a_series_resistor_claims_that_it_is_zero():
     assert said.missed
     cole = made(etid.SkinCole(33.4e3, 186e3, 22e-6, 0.9), 1000.0)
     assert selection_map.is_right(selection_map.answer(cell_of, 0, path, cole, bound))
+
+
+def test_the_noise_of_exact_spectra_is_what_the_rival_is_told():
+    f, z, sigma, used = selection_rival.exact(40.0, selection.FIRST)
+    assert used.all()
+    for row, circuit in enumerate(TRUTHS.values()):
+        error = z[row] - np.asarray(circuit.response(jnp.asarray(f)))
+        square = np.mean(np.abs(error / sigma[row]) ** 2)
+        # |noise|² / σ² is exponential, with deviation 1; four deviations of the mean.
+        assert square == pytest.approx(1.0, abs=4 / np.sqrt(f.size))
+
+
+def test_choices_of_the_rival_are_counted_by_truth():
+    names = np.array([type(circuit).__name__ for circuit in TRUTHS.values()])
+    wrong = names.copy()
+    wrong[0] = "SkinLayers"
+    found = selection_rival.by_truth(np.concatenate([names, wrong]), np.zeros(2 * names.size))
+    right = selection_rival.right(found)
+    assert right.shape == (names.size, 2)
+    assert right[:, 0].all()
+    assert right[:, 1].tolist() == [False] + [True] * (names.size - 1)

@@ -147,3 +147,28 @@ def test_the_papers_method_says_that_its_noisy_fits_are_none(spice):
     result, _ = spice("paper_noise_built", method="steiglitz_mcbride")
     assert "successful" not in result.fits.counts()
     assert sum(result.fits.counts().values()) == 23
+
+
+# Scenes of the length of `clean_dry`, and of three others, which compile for long.
+PERIODIC = (
+    "clean_dry clean_damp clean_resistors lab_built lab_dry lab_damp paper_noise_built noisy_dry "
+    "jitter_dry jitter_damp subjects_dry subjects_damp offset_drift_built noisy_dry_averaged "
+    "fast_damp"
+).split()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", PERIODIC)
+def test_the_circuit_of_every_recording_is_chosen(reference_data, tmp_path, name):
+    """148 recordings: skin of one relaxation from 24 dB on, and five resistors."""
+    folder, file = reference_data("spice_recordings"), tmp_path / "study.h5"
+    truth = json.loads((folder / "truth.json").read_text())["scenes"][name]["trials"]
+    true = etid.Resistor if "R" in truth[0]["elements"] else etid.SkinRC
+    etid.import_file(folder / f"{name}.npz", file)
+    with etid.read(file) as study:
+        driver = etid.identify_driver(list(study.calibrations.recordings()))
+        fits = [
+            etid.identify_skin(record, driver, circuit="auto")
+            for record in study.loaded.recordings()
+        ]
+    assert [type(fit.circuit) for fit in fits] == [true] * len(truth)
