@@ -64,6 +64,7 @@ from etid.simulation.bound import Bound, bound
 if TYPE_CHECKING:
     from etid.files.exporting import export_circuit, export_fits, export_study
     from etid.files.importing import import_file
+    from etid.plotting.interactive import interactive
     from etid.report.study import write_report
 
 # Files of others and reports are imported when they are first used: a fit needs none of them.
@@ -72,6 +73,7 @@ _LATER = {
     "export_fits": "etid.files.exporting",
     "export_study": "etid.files.exporting",
     "import_file": "etid.files.importing",
+    "interactive": "etid.plotting.interactive",
     "write_report": "etid.report.study",
 }
 
@@ -132,6 +134,7 @@ __all__ = [
     "identify_skins",
     "identify_study",
     "import_file",
+    "interactive",
     "kramers_kronig",
     "netlist",
     "parallel",
