@@ -51,11 +51,15 @@ LOADED = time.time()
 # XLA compiles for a processor in two thirds of the time without the emitters of fusions and with
 # fewer passes of LLVM. The programs are as fast.
 QUICKLY = {"xla_cpu_use_fusion_emitters": False, "xla_backend_optimization_level": 1}
+# Without any passes it takes half of that time, and the programs take twice the time.
+AT_ONCE = {**QUICKLY, "xla_backend_optimization_level": 0}
 # Settings of JAX that do not change a program.
 UNRELATED = ("jax_compilation_cache", "jax_persistent_cache", "jax_log", "jax_dump", "jax_explain")
 
 
-def stored_jit(function: Callable[Parameters, Result]) -> Callable[Parameters, Result]:
+def stored_jit(
+    function: Callable[Parameters, Result], *, rare: bool = False
+) -> Callable[Parameters, Result]:
     """`equinox.filter_jit` that stores the traced function in the compilation cache of JAX.
 
     In these cases it is plain `equinox.filter_jit`:
@@ -67,6 +71,10 @@ def stored_jit(function: Callable[Parameters, Result]) -> Callable[Parameters, R
       `jax_debug_nans`).
     - An argument belongs to a class from outside etid, such as your own circuit: its code is not
       in the key.
+
+    Args:
+        function: Function of arrays and of anything else that can be hashed.
+        rare: Whether it runs so rarely that its compilation matters more than its run time.
     """
     compiling = threading.local()  # whether this thread compiles now
 
@@ -88,7 +96,7 @@ def stored_jit(function: Callable[Parameters, Result]) -> Callable[Parameters, R
 
     @functools.cache
     def outer(stores: bool) -> Callable[..., Any]:
-        options = QUICKLY if jax.default_backend() == "cpu" else None
+        options = (AT_ONCE if rare else QUICKLY) if jax.default_backend() == "cpu" else None
         jit: Any = eqx.filter_jit  # its overloads lack the options of `jax.jit`
         return jit(stored if stores else traced, compiler_options=options)
 

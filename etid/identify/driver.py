@@ -209,7 +209,7 @@ def _aligned(seen: Sequence[Inspected], order: int, estimator: AbstractEstimator
     return driver
 
 
-@stored_jit
+@functools.partial(stored_jit, rare=True)
 def _size(driver: Driver, frequency: Float[Array, ""]) -> Float[Array, ""]:
     """|Z_th| [Ω] at a frequency [Hz]."""
     return jnp.abs(driver.response(frequency))

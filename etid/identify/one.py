@@ -239,7 +239,7 @@ def skin_lane(
 skin = stored_jit(skin_lane)
 
 
-@stored_jit
+@functools.partial(stored_jit, rare=True)  # once for each driver
 def known_at(
     frequency: Float[Array, " harmonic"],
     driver: AbstractFeed,

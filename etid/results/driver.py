@@ -81,25 +81,34 @@ class SourceImpedance(eqx.Module):
         self, frequency: Float[Array, " frequency"]
     ) -> Complex[Array, "parameter frequency"]:
         """Derivatives of the impedance [Ω] with respect to the parameters, in field order."""
-        s = frequency_variable(frequency)
-        constant = as_complex(jnp.full(frequency.shape, jnp.exp(self.log_resistance)))
-        log_omega, log_zeta, gain, slope, log_omega_real, gain_real = ([] for _ in range(6))
-        for k in range(self.log_omega.shape[0]):
-            x = s * as_complex(jnp.exp(-self.log_omega[k]))
-            damping, steep = as_complex(2 * jnp.exp(self.log_zeta[k])), as_complex(self.slope[k])
-            shape = reciprocal(1 + (damping + x) * x)
-            section = (as_complex(self.gain[k]) + steep * x) * shape
-            log_omega.append((section * (damping + 2 * x) - steep) * x * shape)
-            log_zeta.append(-section * damping * x * shape)
-            gain.append(shape)
-            slope.append(x * shape)
-        for j in range(self.log_omega_real.shape[0]):
-            x = s * as_complex(jnp.exp(-self.log_omega_real[j]))
-            shape = reciprocal(1 + x)
-            log_omega_real.append(as_complex(self.gain_real[j]) * x * shape * shape)
-            gain_real.append(shape)
-        found = [constant, *log_omega, *log_zeta, *gain, *slope, *log_omega_real, *gain_real]
-        return jnp.stack(found)
+        omega = 2 * jnp.pi * frequency[None, :]
+        gain, slope, gain_real = (
+            as_complex(of)[:, None] for of in (self.gain, self.slope, self.gain_real)
+        )
+        # 1 / (1 + 2ζx + x²) in real arithmetic, which takes half the time.
+        turn = omega * jnp.exp(-self.log_omega)[:, None]
+        damping = 2 * jnp.exp(self.log_zeta)[:, None]
+        real, imaginary = 1 - turn * turn, damping * turn
+        scale = 1 / (real * real + imaginary * imaginary)
+        shape = jax.lax.complex(real * scale, -imaginary * scale)
+        x, damping = jax.lax.complex(jnp.zeros_like(turn), turn), as_complex(damping)
+        section = (gain + slope * x) * shape
+        turn = omega * jnp.exp(-self.log_omega_real)[:, None]
+        scale = 1 / (1 + turn * turn)
+        shape_real = jax.lax.complex(scale, -turn * scale)
+        constant = as_complex(jnp.full((1, frequency.size), jnp.exp(self.log_resistance)))
+        by_omega_real = jax.lax.complex(jnp.zeros_like(turn), turn) * shape_real * shape_real
+        return jnp.concatenate(
+            [
+                constant,
+                (section * (damping + 2 * x) - slope) * x * shape,
+                -section * damping * x * shape,
+                shape,
+                x * shape,
+                gain_real * by_omega_real,
+                shape_real,
+            ]
+        )
 
     def state_space(self) -> StateSpace:
         """Realisation from current [A] to voltage drop [V], one balanced 2x2 block per section."""
