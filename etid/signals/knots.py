@@ -6,7 +6,7 @@ not: its pulses have zeros. A sum of products of both needs the smooth function 
     Σ_k v_k g(f_k) ≈ Σ_b g(f_b) Σ_k φ_b(k) v_k,
 
 where φ_b is 1 at knot b and falls to 0 at the knots beside it. A function of log f that bends by
-1 is wrong by 1e-4 between two knots.
+1 is wrong by 5e-4 between two knots.
 """
 
 import dataclasses
@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Inexact, Int
 
-RELATIVE = 32  # smallest number of a harmonic over the distance of the knots around it
+RELATIVE = 16  # number of a harmonic over the distance of the knots around it
 
 
 @dataclasses.dataclass(frozen=True)
@@ -80,13 +80,18 @@ def _shares(of: _Group, values: Inexact[Array, "*row interval _"]) -> Inexact[Ar
 
 
 @functools.lru_cache(maxsize=16)
-def knots(harmonics: int) -> Knots:
-    """Knots of so many harmonics, the first of which is the pulse rate."""
+def knots(harmonics: int, relative: int = RELATIVE) -> Knots:
+    """Knots of so many harmonics, the first of which is the pulse rate.
+
+    Args:
+        harmonics: Number of harmonics.
+        relative: Smallest number of a harmonic over the distance of the knots around it.
+    """
     groups: list[_Group] = []
     first, width, last = 0, 1, harmonics - 1
     while first + width <= last:
-        # The distance doubles at the harmonic whose number is 2 · `RELATIVE` distances.
-        count = (min(2 * RELATIVE * width - 1, last) - first) // width
+        # The distance doubles at the harmonic whose number is 2 · `relative` distances.
+        count = (min(2 * relative * width - 1, last) - first) // width
         if count:
             groups.append(_Group(first, width, count))
             first = groups[-1].end

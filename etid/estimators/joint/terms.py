@@ -25,6 +25,7 @@ from etid.signals.knots import knots
 from etid.solvers.arrowhead import join, split
 
 SIDE_BY_SIDE = 8  # loads in one vectorised step
+DENSE = 32  # density of the knots: the floor of the driver's valley is flat
 
 
 class Joint(eqx.Module):
@@ -76,7 +77,7 @@ class Loads(eqx.Module):
     def frequency(self) -> Float[Array, "*load frequency"]:
         """Frequencies of the terms [Hz]."""
         every = self.spectrum.frequency
-        return every if self.sums is None else knots(every.shape[-1]).at(every)
+        return every if self.sums is None else knots(every.shape[-1], DENSE).at(every)
 
 
 class DriverStudy(eqx.Module):
@@ -111,7 +112,8 @@ class DriverStudy(eqx.Module):
 
             def one(load: Loads) -> Sums:
                 q = jnp.concatenate([load.own.vector(), driver.mean])
-                return Around.of(self.whole(driver, load), q).at.sums
+                every = knots(load.spectrum.x.size, DENSE)
+                return Around.of(self.whole(driver, load), q, every=every).at.sums
 
             return dataclasses.replace(loads, sums=in_turn(one, loads))
 

@@ -202,10 +202,18 @@ class Around(eqx.Module):
         load: Load,
         q: Float[Array, " q"],
         at: tuple[Complex[Array, " harmonic"], Spectrum] | None = None,
+        every: Knots | None = None,
     ) -> "Around":
-        """The terms of `load` around `q`; `at` is `load.predicted(q)` if it is known already."""
+        """The terms of `load` around `q`.
+
+        Args:
+            load: The recording.
+            q: The point.
+            at: `load.predicted(q)` if it is known already.
+            every: The knots if they are not those of `load`.
+        """
         g, known = apart(load.predicted, q) if at is None else at
-        of, every = load.gain, load.knots
+        of, every = load.gain, every or load.knots
 
         def of_harmonics(_) -> tuple[Array, Array, Array]:
             weight = jnp.where(known.selected, 2 / variance(known, g), 0.0)
