@@ -19,6 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 import scipy.signal
 
+import etid
 from benchmarks import peers
 from benchmarks.peers import A, B
 from benchmarks.problem import LOAD, SAMPLES, Problem, harmonics, problem
@@ -138,10 +139,27 @@ def _from_samples(ten_periods: Problem, repeats: int) -> list[Line]:
         lambda: peers.numpy_steiglitz_mcbride(v_th, v_out, b, a, ITERATIONS), repeats
     )
     return [
-        _costs(f"raw to judged fit / scipy lfilter, {lanes} lanes", ours, reference, 0.5),
+        _costs(f"raw to judged fit / scipy lfilter, {lanes} lanes", ours, reference, 1.5),
         _gains("lfilter, lstsq SM / SM on harmonics", on_harmonics, theirs, 15.0),
         _gains("the same / SM from samples", on_harmonics + of_samples, theirs, 15.0),
     ]
+
+
+def _joint(ten_periods: Problem, repeats: int) -> Line:
+    """All trials and their driver in one fit, beside the fits of single trials."""
+    every = np.arange(len(ten_periods.records))
+    alone = median_time(lambda: peers.judged(ten_periods)(every), repeats) / every.size
+    found = median_time(lambda: etid.identify_jointly(ten_periods.study), repeats) / every.size
+    return Line("joint fit of a trial [ms] / alone", found, alone, 1e3 * found, 3.0, False)
+
+
+def _limits(ten_periods: Problem, repeats: int) -> str:
+    """What no fit can be faster than on this machine."""
+    record = ten_periods.records[0]
+    stored = [record.samples[name] for name in ("v_th", "v_out")]
+    reading = median_time(lambda: [of.values for of in stored], 5 * repeats)
+    transform = median_time(lambda: np.fft.rfft(record.v_out), 5 * repeats)
+    return f"reading both records {1e3 * reading:.2f} ms, one rfft {1e3 * transform:.2f} ms"
 
 
 _WARM = """
@@ -199,6 +217,7 @@ def run(quick: bool, asked: Sequence[int], output: pathlib.Path | None) -> bool:
         *_filters(5 * repeats),
         *_solvers(ten_periods, repeats),
         *_from_samples(ten_periods, repeats),
+        _joint(ten_periods, repeats),
     ]
     print(f"{'':<46}{'ours ms':>10}{'theirs ms':>11}{'ratio':>8}   target")
     for line in lines:
@@ -208,7 +227,7 @@ def run(quick: bool, asked: Sequence[int], output: pathlib.Path | None) -> bool:
             f"{line.name:<46}{1e3 * line.ours:10.2f}{1e3 * line.theirs:11.2f}"
             f"{line.ratio:8.2f}   {sign} {line.target:g}{mark}"
         )
-    print()
+    print(f"limits: {_limits(ten_periods, repeats)}\n")
     several = asked or ((1, lanes) if quick else peers.LANES)
     limit = math.inf if asked else peers.LIMIT
     table = peers.show(peers.rows(lanes, several, 1 if quick else 3, limit))
