@@ -4,7 +4,6 @@ import dataclasses
 import importlib.metadata
 import itertools
 import os
-import reprlib
 import statistics
 from collections.abc import Mapping, Sequence
 from typing import Any, Generic
@@ -17,20 +16,14 @@ from jaxtyping import Array, Bool, Complex, Float, Int
 
 from etid.circuits.circuit import AbstractCircuit, Circuit
 from etid.circuits.display import heading, quantity
-from etid.circuits.lookup import qualified, remembered
+from etid.circuits.lookup import qualified
 from etid.circuits.overview import Overview, Overviewed, element_rows
 from etid.recordings.fields import DESCRIBING, Label, wanted_labels
-from etid.recordings.recording import RecordingError
-from etid.recordings.remarks import remarks_of, texts, words
-from etid.results.hdf5_table import Table, opened_table, same_length, write_table
-from etid.results.verdicts import RESULTS, Judged, counted, counts, message, verdicts_of
-
-SCHEMA = "etid/fits"
-# Columns that describe each recording: its path, its labels, and numbers.
-DESCRIBED = {"path": "text"} | {
-    name: "text" if field.type == "label" else "number" for name, field in DESCRIBING.items()
-}
-LABELS = tuple(name for name, kind in DESCRIBED.items() if kind == "text")
+from etid.recordings.remarks import texts, words
+from etid.results.fits_columns import DESCRIBED, LABELS, SCHEMA, columns_of, described
+from etid.results.hdf5_table import Table, opened_table, write_table
+from etid.results.summary import summary
+from etid.results.verdicts import RESULTS, Judged, counted, counts, message
 
 
 def rrse(predicted: Float[Array, " time"], measured: Float[Array, " time"]) -> Float[Array, ""]:
@@ -266,22 +259,6 @@ class Fit(Judged, Generic[Circuit]):
         return Overview(title, rows, notes=[*notes, *texts(int(self.remarks))])
 
 
-def described(recordings: Sequence[Mapping[str, Any]]) -> dict[str, np.ndarray]:
-    """The columns of `Fits.labels`.
-
-    Args:
-        recordings: Fields of each recording by name. A missing label becomes empty, a missing
-            number NaN.
-    """
-    columns = {name: [one.get(name) for one in recordings] for name in DESCRIBED}
-    return {
-        name: np.array([value or "" for value in column], str)
-        if DESCRIBED[name] == "text"
-        else np.array(column, float)
-        for name, column in columns.items()
-    }
-
-
 @dataclasses.dataclass(frozen=True, eq=False, repr=False)
 class Fits(Overviewed, Generic[Circuit]):
     """Identified circuits of many recordings, in the order of the recordings.
@@ -416,39 +393,7 @@ class Fits(Overviewed, Generic[Circuit]):
             A row for each group, sorted by the labels. Numbers are in SI units; they are NaN if the
             group has no successful fit.
         """
-        columns = [map(str, self.labels[name].tolist()) for name in by]
-        keys = list(zip(*columns, strict=True)) if by else [()] * len(self)
-        groups = sorted(set(keys))
-        number = {key: i for i, key in enumerate(groups)}
-        place = np.array([number[key] for key in keys], int)
-        good = self.successful()
-        place_good = place[self.verdicts == "successful"]
-        order = np.argsort(place_good, kind="stable")
-        ends = np.searchsorted(place_good[order], np.arange(len(groups) + 1))
-        rows: list[dict[str, Any]] = [
-            dict(zip(by, key, strict=True)) | {"fits": int(count), "successful": int(size)}
-            for key, count, size in zip(
-                groups, np.bincount(place, minlength=len(groups)), np.diff(ends), strict=True
-            )
-        ]
-        for i, name in enumerate(self.circuit.names()):
-            total, common = good.cov[:, i, i], good.fit.shared_cov[:, i, i]
-            parts = {
-                "": np.asarray(getattr(good.circuit, name)),
-                "_stderr": np.asarray(getattr(good.stderr, name)),
-                "_own": np.sqrt(np.maximum(total - common, 0.0)),
-                "_shared": np.sqrt(np.where(common >= 0, common, np.nan)),
-            }
-            for row, start, end in zip(rows, ends[:-1], ends[1:], strict=True):
-                chosen = order[start:end]
-                for part, values in parts.items():
-                    row[name + part] = float(np.median(values[chosen])) if end > start else np.nan
-                several, values = chosen.size > 1, parts[""][chosen]
-                row[f"{name}_spread"] = float(np.std(values, ddof=1)) if several else np.nan
-                noise = float(np.mean(parts["_own"][chosen] ** 2)) if several else np.nan
-                excess = row[f"{name}_spread"] ** 2 - noise
-                row[f"{name}_between"] = float(np.sqrt(np.maximum(excess, 0.0)))
-        return rows
+        return summary(self, by)
 
     def _overview(self) -> Overview:
         rows, units = [], self.circuit.units()
@@ -512,91 +457,6 @@ class Fits(Overviewed, Generic[Circuit]):
         Raises:
             RecordingError: A column or an attribute is missing or invalid.
         """
-        kind = _circuit(table, circuit)
-        size = len(kind.names())
-        kinds = DESCRIBED | {"verdict": "text", "note": "text"}
-        columns = {name: table.column(name, kind) for name, kind in kinds.items()}
-        columns |= {name: table.column(name, "number") for name in (*kind.names(), "rrse", "chi2")}
-        columns["steps"] = table.column("steps", "integer")
-        for name in ("cov", "shared_cov"):
-            columns[name] = table.column(name, "number", (size, size))
-        if "remarks" in table:  # not in files of schema version 1.0
-            columns["remarks"] = table.column("remarks", "text")
-        changes = [f"{name}_change" for name in (*kind.names(), "amplitude")]
-        if "change_stderr" in table:  # not before schema version 1.2
-            columns |= {name: table.column(name, "number") for name in changes}
-            columns["change_stderr"] = table.column("change_stderr", "number", (size + 1,))
-        count = same_length(table, columns)
-        read = {name: table.read(column) for name, column in columns.items()}
-        remarks = _remarks(table, read.get("remarks", np.full(count, "")))
-        numbers = (*kind.names(), "rrse", "chi2", "cov", "shared_cov")
-        real = {name: read[name].astype(float) for name in numbers}
-        fit = Fit(
-            circuit=kind(**{name: real[name] for name in kind.names()}),
-            cov=real["cov"],
-            shared_cov=real["shared_cov"],
-            rrse=real["rrse"],
-            chi2=real["chi2"],
-            result=_verdicts(table, read["verdict"]),
-            steps=read["steps"],
-            method=table.text("method"),
-            remarks=remarks,
-            **_changes_of(read, changes),
-        )
-        return Fits(fit, {name: read[name] for name in DESCRIBED}, read["note"])
-
-
-def _circuit(table: Table, given: type[AbstractCircuit] | None) -> type[AbstractCircuit]:
-    """The class of the circuits in a file. The file cannot make etid import a module."""
-    stored = table.text("circuit")
-    try:
-        kind = remembered(stored, given)
-    except LookupError as error:
-        raise RecordingError(
-            f"is {reprlib.repr(stored)}",
-            file=table.name,
-            field="circuit",
-            remedy=str(error),
-        ) from None
-    parameters = table.attribute("parameters")
-    names = parameters if isinstance(parameters, list) else [parameters]
-    if tuple(names) != kind.names():
-        raise RecordingError(
-            f"is {reprlib.repr(names)}, but {kind.__name__} has {', '.join(kind.names())}",
-            file=table.name,
-            field="parameters",
-            remedy="Pass the class as it was when the fits were made, or fit the recordings again",
-        )
-    return kind
-
-
-def _verdicts(table: Table, names: np.ndarray) -> RESULTS:
-    try:
-        return verdicts_of(names)
-    except KeyError as error:
-        raise RecordingError(
-            f"{error} is not a verdict of this version of etid",
-            file=table.name,
-            field="verdict",
-            remedy="Read it with the etid that wrote it",
-        ) from None
-
-
-def _remarks(table: Table, texts: np.ndarray) -> np.ndarray:
-    try:
-        return np.array([remarks_of(str(one)) for one in texts], int)
-    except ValueError as error:
-        raise RecordingError(
-            str(error),
-            file=table.name,
-            field="remarks",
-            remedy="Read it with the etid that wrote it",
-        ) from None
-
-
-def _changes_of(read: Mapping[str, np.ndarray], names: Sequence[str]) -> dict[str, Any]:
-    """The changes in a file of fits; empty for files before schema version 1.2."""
-    if "change_stderr" not in read:
-        return {}
-    change = np.stack([read[name].astype(float) for name in names], axis=1)
-    return {"change": change, "change_stderr": read["change_stderr"].astype(float)}
+        kind, fields, labels, notes = columns_of(table, circuit)
+        numbers = {name: fields.pop(name) for name in kind.names()}
+        return Fits(Fit(circuit=kind(**numbers), **fields), labels, notes)

@@ -1,0 +1,131 @@
+"""Columns of a file of fits: what describes each recording, and checks of what is read."""
+
+import reprlib
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from etid.circuits.circuit import AbstractCircuit
+from etid.circuits.lookup import remembered
+from etid.recordings.fields import DESCRIBING
+from etid.recordings.recording import RecordingError
+from etid.recordings.remarks import remarks_of
+from etid.results.hdf5_table import Table, same_length
+from etid.results.verdicts import RESULTS, verdicts_of
+
+SCHEMA = "etid/fits"
+# Columns that describe each recording: its path, its labels, and numbers.
+DESCRIBED = {"path": "text"} | {
+    name: "text" if field.type == "label" else "number" for name, field in DESCRIBING.items()
+}
+LABELS = tuple(name for name, kind in DESCRIBED.items() if kind == "text")
+
+
+def described(recordings: Sequence[Mapping[str, Any]]) -> dict[str, np.ndarray]:
+    """The columns of `Fits.labels`.
+
+    Args:
+        recordings: Fields of each recording by name. A missing label becomes empty, a missing
+            number NaN.
+    """
+    columns = {name: [one.get(name) for one in recordings] for name in DESCRIBED}
+    return {
+        name: np.array([value or "" for value in column], str)
+        if DESCRIBED[name] == "text"
+        else np.array(column, float)
+        for name, column in columns.items()
+    }
+
+
+def columns_of(
+    table: Table, circuit: type[AbstractCircuit] | None
+) -> tuple[type[AbstractCircuit], dict[str, Any], dict[str, np.ndarray], np.ndarray]:
+    """The class of the circuits, the elements and the other fields of a `Fit`, labels and notes.
+
+    Raises:
+        RecordingError: A column or an attribute is missing or invalid.
+    """
+    kind = _circuit(table, circuit)
+    size = len(kind.names())
+    kinds = DESCRIBED | {"verdict": "text", "note": "text"}
+    columns = {name: table.column(name, kind) for name, kind in kinds.items()}
+    columns |= {name: table.column(name, "number") for name in (*kind.names(), "rrse", "chi2")}
+    columns["steps"] = table.column("steps", "integer")
+    for name in ("cov", "shared_cov"):
+        columns[name] = table.column(name, "number", (size, size))
+    if "remarks" in table:  # not in files of schema version 1.0
+        columns["remarks"] = table.column("remarks", "text")
+    changes = [f"{name}_change" for name in (*kind.names(), "amplitude")]
+    if "change_stderr" in table:  # not before schema version 1.2
+        columns |= {name: table.column(name, "number") for name in changes}
+        columns["change_stderr"] = table.column("change_stderr", "number", (size + 1,))
+    count = same_length(table, columns)
+    read = {name: table.read(column) for name, column in columns.items()}
+    remarks = _remarks(table, read.get("remarks", np.full(count, "")))
+    numbers = (*kind.names(), "rrse", "chi2", "cov", "shared_cov")
+    real = {name: read[name].astype(float) for name in numbers}
+    fields = {name: real[name] for name in numbers} | {
+        "result": _verdicts(table, read["verdict"]),
+        "steps": read["steps"],
+        "method": table.text("method"),
+        "remarks": remarks,
+    }
+    labels = {name: read[name] for name in DESCRIBED}
+    return kind, fields | _changes_of(read, changes), labels, read["note"]
+
+
+def _circuit(table: Table, given: type[AbstractCircuit] | None) -> type[AbstractCircuit]:
+    """The class of the circuits in a file. The file cannot make etid import a module."""
+    stored = table.text("circuit")
+    try:
+        kind = remembered(stored, given)
+    except LookupError as error:
+        raise RecordingError(
+            f"is {reprlib.repr(stored)}",
+            file=table.name,
+            field="circuit",
+            remedy=str(error),
+        ) from None
+    parameters = table.attribute("parameters")
+    names = parameters if isinstance(parameters, list) else [parameters]
+    if tuple(names) != kind.names():
+        raise RecordingError(
+            f"is {reprlib.repr(names)}, but {kind.__name__} has {', '.join(kind.names())}",
+            file=table.name,
+            field="parameters",
+            remedy="Pass the class as it was when the fits were made, or fit the recordings again",
+        )
+    return kind
+
+
+def _verdicts(table: Table, names: np.ndarray) -> RESULTS:
+    try:
+        return verdicts_of(names)
+    except KeyError as error:
+        raise RecordingError(
+            f"{error} is not a verdict of this version of etid",
+            file=table.name,
+            field="verdict",
+            remedy="Read it with the etid that wrote it",
+        ) from None
+
+
+def _remarks(table: Table, texts: np.ndarray) -> np.ndarray:
+    try:
+        return np.array([remarks_of(str(one)) for one in texts], int)
+    except ValueError as error:
+        raise RecordingError(
+            str(error),
+            file=table.name,
+            field="remarks",
+            remedy="Read it with the etid that wrote it",
+        ) from None
+
+
+def _changes_of(read: Mapping[str, np.ndarray], names: Sequence[str]) -> dict[str, Any]:
+    """The changes in a file of fits; empty for files before schema version 1.2."""
+    if "change_stderr" not in read:
+        return {}
+    change = np.stack([read[name].astype(float) for name in names], axis=1)
+    return {"change": change, "change_stderr": read["change_stderr"].astype(float)}
