@@ -59,7 +59,7 @@ calls = {
     "etid.bound(study)": "scene",
     "etid.bound(None)": "scene",
     "etid.predict(v, d)": "recording",
-    "etid.predict(rec, None)": "driver",
+    "etid.predict(rec, None, etid.SkinRC())": "current",
     "etid.predict(rec, d, etid.SkinRC)": "circuit",
     "etid.identify_samples(v, v, None, sample_rate=2e5, pulse_rate=60.0)": "driver",
     "study.where(subject=1.5)": "subject",

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 import etid
+from etid.plotting import figure_of
 from etid.results.feed import MEASURED_CURRENT
 
 RATE, PULSES = 200e3, 60.0
@@ -57,10 +58,87 @@ def test_a_constant_phase_is_identified_and_chosen():
     assert np.abs(off(selection.fit, COLE)).max() < WITHIN
 
 
+@pytest.mark.parametrize("periods", [3.0, 1.1])
+def test_a_fixed_element_keeps_its_value_and_helps_the_others(skin, periods):
+    recording = skin if periods == 3.0 else recorded(SKIN, periods=periods)
+    free = etid.identify_skin(recording)
+    fixed = etid.identify_skin(recording, fixed={"r_s": 33e3})
+    np.testing.assert_allclose(fixed.circuit.r_s, 33e3, rtol=1e-8)
+    assert fixed.stderr.r_s < 1e-8 * 33e3
+    assert fixed.stderr.r_p < 0.9 * free.stderr.r_p
+    errors = np.asarray(fixed.circuit.values() - SKIN.values())[1:]
+    assert (np.abs(errors) < WITHIN * np.asarray(fixed.stderr.values())[1:]).all()
+
+
+def test_a_prior_is_one_more_measurement(skin):
+    free = etid.identify_skin(skin)
+    r_s, error = float(free.circuit.r_s), float(free.stderr.r_s)
+    # As exact as the record, and two standard errors off: the estimate is half way.
+    told = etid.identify_skin(skin, prior={"r_s": (r_s + 2 * error, error)})
+    assert abs(told.circuit.r_s - (r_s + error)) < 0.05 * error  # linear to 2 % of an error
+    np.testing.assert_allclose(told.stderr.r_s, error / np.sqrt(2), rtol=0.02)
+
+
+@pytest.mark.parametrize(
+    ("known", "words"),
+    [
+        ({"fixed": {"r_x": 1.0}}, "'r_x' is no element of SkinRC; its elements are r_s, r_p, c_p"),
+        ({"fixed": {"r_s": -1.0}}, "must be positive"),
+        ({"prior": {"r_s": (5e2, 5e1)}, "fixed": {"r_s": 5e2}}, "r_s is fixed and has a prior"),
+    ],
+)
+def test_a_wrong_known_element_is_refused(skin, known, words):
+    with pytest.raises(ValueError, match=words):
+        etid.identify_skin(skin, **known)
+
+
 def test_a_single_pulse_is_identified_in_time():
     fit = etid.identify_skin(recorded(SKIN, periods=1.1, delay=5e-7))
     assert fit.method == "output_error"
     assert np.abs(off(fit, SKIN)).max() < WITHIN
+
+
+def test_a_single_pulse_on_a_constant_phase_is_identified_and_chosen_in_time():
+    selection = etid.select_circuit(recorded(COLE, periods=1.1, snr_db=50))
+    assert selection.fit.method == "output_error"
+    assert type(selection.fit.circuit) is etid.SkinCole
+    assert np.abs(off(selection.fit, COLE)).max() < WITHIN
+
+
+@pytest.mark.parametrize("alpha", [0.4, 0.85, 0.99])
+@pytest.mark.parametrize("samples", [300, 30_000])
+def test_the_ladder_of_a_constant_phase_has_its_impedance(alpha, samples):
+    circuit = etid.SkinCole(2e3, 27e3, 1e-3, alpha)
+    system = circuit.impedance().state_space(RATE, samples)
+    f = np.geomspace(1 / samples, np.pi, 100) * RATE / (2 * np.pi)
+    a, b, c = np.asarray(system.A), np.asarray(system.B)[:, 0], np.asarray(system.C)
+    z = [c @ np.linalg.solve(2j * np.pi * one * np.eye(b.size) - a, b) for one in f]
+    expected = np.asarray(circuit.response(jnp.asarray(f)))
+    np.testing.assert_allclose(np.array(z) + np.asarray(system.D)[0], expected, rtol=1e-4)
+
+
+def test_capacitors_and_resistors_in_parallel_have_their_impedance_in_time():
+    skin = SKIN.impedance()
+    exact, system = skin.rational(), skin.state_space(RATE, 1000)
+    s = 2j * np.pi * np.geomspace(1, 1e5, 20)
+    a, b, c = np.asarray(system.A), np.asarray(system.B)[:, 0], np.asarray(system.C)
+    z = [c @ np.linalg.solve(one * np.eye(b.size) - a, b) for one in s]
+    np.testing.assert_allclose(
+        np.array(z) + np.asarray(system.D)[0], exact(jnp.asarray(s)), rtol=1e-12
+    )
+
+
+def test_a_prediction_from_the_current_misses_by_the_noise(skin):
+    rest = etid.predict(skin, circuit=SKIN) - skin.v_out
+    # The noise of both channels is 1e-3 of each; that of the current passes the skin.
+    assert np.nanstd(rest) < 2e-3 * np.std(skin.v_out)
+    cole = recorded(COLE, periods=1.1)
+    assert np.nanstd(etid.predict(cole, circuit=COLE) - cole.v_out) < 2e-3 * np.std(cole.v_out)
+
+
+def test_a_fit_from_a_current_is_drawn(skin):
+    figure = figure_of(etid.identify_skin(skin), skin)
+    assert "r_s" in figure.axes[0].get_title(loc="left")
 
 
 def test_a_batch_gives_the_fits_of_single_recordings(skin):

@@ -108,6 +108,27 @@ def test_a_picture_has_its_parameters():
     assert "tau " in title
 
 
+def test_a_record_for_which_no_default_is_left_says_what_to_do():
+    """In a single period the default is output error, which does not know its response."""
+    recording, driver, _ = fitted()
+    v_th, v_out = recording.v_th[:3_334], recording.v_out[:3_334]
+    single, circuit = recording.replace(v_th=v_th, v_out=v_out), SkinDavidsonCole()
+    says = "Record three periods or more .* or ask for method='maximum_likelihood'"
+    with pytest.raises(ValueError, match=says):
+        etid.identify_skin(single, driver, circuit=circuit)
+    fits = etid.identify_skins([single], driver, circuit=circuit)
+    assert fits.counts() == {"not_periodic": 1}
+    assert "needs a ratio of polynomials" in str(fits.notes[0])
+    with pytest.raises(ValueError, match=says):
+        etid.identify_samples(
+            jnp.asarray(v_th), jnp.asarray(v_out), driver,
+            sample_rate=200e3, pulse_rate=60.0, circuit=circuit,
+        )  # fmt: skip
+    short = recording.replace(v_th=v_th[:3_000], v_out=v_out[:3_000])
+    with pytest.raises(ValueError, match="holds no whole pulse period"):
+        etid.predict(short, driver, TRUTH)
+
+
 def test_what_it_cannot_do_is_said():
     recording, driver, _ = fitted()
     circuit = SkinDavidsonCole()

@@ -22,7 +22,7 @@ from typing import ClassVar
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Complex
+from jaxtyping import Array, Complex, Float
 
 from etid.circuits.impedance import (
     AbstractImpedance,
@@ -34,6 +34,7 @@ from etid.circuits.impedance import (
     parallel,
     series,
 )
+from etid.signals.filtering import StateSpace
 from etid.signals.transfer import Rational, as_complex, reciprocal
 
 Ohm = Quantity
@@ -42,6 +43,8 @@ Second = Quantity
 Exponent = Quantity
 PseudoCapacitance = Quantity
 
+# A ladder in time is exact from SLOWEST/N to FASTEST, times the sample rate, for N samples [rad].
+SLOWEST, FASTEST = 0.3, 10.0
 LADDER_ERROR = 1e-4  # largest relative error of the impedance in the band
 STEP = 0.95  # step h of ln x; the relative error of the trapezoidal rule is then 6e-5
 BEYOND = np.log(600.0)  # margin of ln x beyond the band: the ends are exact to first order only
@@ -114,6 +117,33 @@ class ConstantPhase(AbstractIrrational):
     def exponents(self) -> tuple[Exponent, ...]:
         """Exponent α."""
         return (self.alpha,)
+
+    @property
+    def has_response(self) -> bool:
+        """True: its ladder of relaxations is known."""
+        return True
+
+    def state_space(self, rate: float | Float[Array, ""], samples: int) -> StateSpace:
+        """The ladder of relaxations from below the slowest to above the fastest time of a record.
+
+        R_k and C_k of the pairs cover eight decades. The states are scaled so that the system stays
+        nearly symmetric in a loop with a source; its matrix exponential loses no digits then.
+        """
+        low, high = np.log(SLOWEST / samples) - BEYOND, np.log(FASTEST) + BEYOND
+        x = jnp.asarray(np.exp(np.arange(low, high + STEP, STEP))) * rate
+        alpha, q = jnp.asarray(self.alpha), jnp.asarray(self.q)
+        level = jnp.sinc(1 - alpha) * STEP / q  # sin(πα) h / (πQ), without the factor 1 − α
+        slower = level * x[0] ** (1 - alpha) * (1 - alpha) / jnp.expm1(STEP * (1 - alpha))
+        faster = level * x[-1] ** -alpha * (1 - alpha) / jnp.expm1(STEP * alpha)
+        rises = jnp.append(level * x ** (1 - alpha), slower)  # R_k x_k and 1/C [Ω/s]
+        unit = 1 / (q * rate ** (1 + alpha))  # |Z| at the sample rate, divided by it [Ω s]
+        share = jnp.append(jnp.full(x.shape, 1 - alpha), 1.0)
+        return StateSpace(
+            jnp.diag(jnp.append(-x, 0.0)),
+            jnp.sqrt(rises / unit)[:, None],
+            jnp.sqrt(rises * unit) * share,
+            faster[None],
+        )
 
     def connect(self, netlist: Netlist, plus: str, minus: str) -> None:
         """Write the ladder that replaces the element into the netlist."""

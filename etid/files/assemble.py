@@ -110,7 +110,9 @@ class _Source(AbstractSource):
 
     @property
     def unloaded(self) -> Hashable:
-        record = self.records["v_th"]
+        record = self.records.get("v_th")
+        if record is None:
+            return id(self)
         return self.file, record.channel.name, record.trial
 
     def blocks(self, name: str) -> Iterator[np.ndarray]:
@@ -207,7 +209,8 @@ def _parts(
     if not plan.split:
         return []
     by_pulses = plan.split == PAUSES
-    asked = channels["v_th"] if by_pulses else channel(plan.split)
+    cause = "v_th" if "v_th" in channels else "current"
+    asked = channels[cause] if by_pulses else channel(plan.split)
     for one in (*channels.values(), asked):
         if len(one.shape) != 1:
             raise RecordingError(

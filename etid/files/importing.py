@@ -149,7 +149,9 @@ def import_file(
                         found, made_of = sources_of(plan, contents.channel, file, by)
                     for each in found.values():
                         with located(file):
-                            check_spacing(next(each.blocks("v_th")).astype(float), each.metadata)
+                            names = {record.name for record in each.layout}
+                            cause = "v_th" if "v_th" in names else "current"
+                            check_spacing(next(each.blocks(cause)).astype(float), each.metadata)
                     for twice in sources.keys() & found.keys():
                         raise RecordingError(
                             "another recording has this path",
@@ -185,7 +187,7 @@ def _import_npz(
         recordings = npz.recordings(path, labels)
         study = Study.from_recordings(recordings)
         for recording in study.recordings():
-            check_spacing(recording.v_th, recording.metadata)
+            check_spacing(recording.samples[recording.cause].values, recording.metadata)
         study.write(target)
     used = []
     for part, channel in (study.calibrations, "adc_ref"), (study.loaded, "adc_out"):

@@ -54,7 +54,7 @@ class Plan:
 
     Attributes:
         path: HDF5 path.
-        signals: `v_th`, `v_out` and, if the mapping names them, `current` and `time`.
+        signals: `v_out`, `v_th` or `current` or both, and `time` if the mapping names it.
         fields: All other keys of the mapping except `path`, `scale` and `split`.
         split: `PAUSES`, or the channel of a trigger, if trials are parts of one long record; empty
             otherwise.
@@ -186,8 +186,9 @@ def plans(
 def _plan(
     path: str, said: Mapping[str, Any], names: Sequence[str], implied: Mapping[str, str]
 ) -> Plan:
+    by_current = "current" in said and "r_load" not in said  # a load that needs no v_th
     for name in ("v_th", "v_out", "pulse_rate"):
-        if name not in said:
+        if name not in said and not (name == "v_th" and by_current):
             known = f"; the channels are {listed(names)}" if name != "pulse_rate" else ""
             raise _missing(name, known)
     signals = {
@@ -199,8 +200,8 @@ def _plan(
         chosen(names, signal.channel, name)
         if signal.scale is None and name in ("v_th", "v_out"):
             raise _missing("scale", hint="; 1 if the values are those at the terminal")
-    th, out = signals["v_th"], signals["v_out"]
-    if (th.channel, th.rows) == (out.channel, out.rows):
+    th, out = signals.get("v_th"), signals["v_out"]
+    if th is not None and (th.channel, th.rows) == (out.channel, out.rows):
         raise RecordingError(
             f"is channel {out.channel!r}, and so is v_th",
             field="v_out",

@@ -3,16 +3,20 @@
 A wrong type, a wrong method or the wrong precision of JAX is refused with a message.
 """
 
+import dataclasses
 import operator
 import reprlib
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, Literal
 
 import jax
 
 from etid.circuits.circuit import AbstractCircuit, SkinRC
 from etid.circuits.current_dependent import current_dependent
+from etid.estimators.element_prior import Known
 from etid.estimators.estimator import AbstractEstimator
+from etid.estimators.maximum_likelihood.estimator import MaximumLikelihood
+from etid.estimators.output_error.estimator import OutputError
 from etid.estimators.registry import MAXIMUM_LIKELIHOOD, OUTPUT_ERROR, Method, named
 from etid.recordings.preflight import Inspected, preflight
 from etid.recordings.recording import Recording, RecordingError
@@ -193,6 +197,45 @@ def estimator_of(
     return estimator
 
 
+def informed(
+    fixed: Mapping[str, float] | None, prior: Mapping[str, tuple[float, float]] | None
+) -> Known:
+    """The elements that are known before a fit, from the arguments of a caller.
+
+    Raises:
+        RecordingError: An element is both fixed and has a prior, or a value is no number.
+    """
+    fixed, prior = dict(fixed or {}), dict(prior or {})
+    for name in fixed.keys() & prior.keys():
+        raise RecordingError(f"{name} is fixed and has a prior", field="prior", remedy="Remove one")
+    try:
+        known = [(str(name), float(value), 0.0) for name, value in fixed.items()]
+        known += [(str(name), float(mean), float(std)) for name, (mean, std) in prior.items()]
+    except (TypeError, ValueError):
+        raise RecordingError(
+            "must be numbers [SI]",
+            field="prior" if prior else "fixed",
+            remedy='Pass fixed={"r_s": 500.0} or prior={"r_s": (500.0, 50.0)}',
+        ) from None
+    return tuple(known)
+
+
+def with_known(estimator: AbstractEstimator, known: Known) -> AbstractEstimator:
+    """The estimator with elements that are known.
+
+    Raises:
+        ValueError: It takes no known elements.
+    """
+    if not known:
+        return estimator
+    if not isinstance(estimator, MaximumLikelihood | OutputError):
+        raise ValueError(
+            f"method {str(estimator)!r} takes no known elements; use method='maximum_likelihood' "
+            "or 'output_error'"
+        )
+    return dataclasses.replace(estimator, known_elements=known)
+
+
 def check_circuits(estimator: AbstractEstimator, candidates: Sequence[AbstractCircuit]) -> None:
     """Raise ValueError unless an estimator can identify these circuits and choose between them."""
     if len(candidates) > 1 and not estimator.chooses:
@@ -260,7 +303,7 @@ def for_samples(driver: Driver, periods: tuple[int, int]) -> AbstractEstimator:
 
 
 def plan(
-    asked: AbstractEstimator | None, seen: Inspected, driver: AbstractFeed
+    asked: AbstractEstimator | None, seen: Inspected, driver: AbstractFeed, known: Known = ()
 ) -> tuple[AbstractEstimator, str | None]:
     """The estimator of a load, and the verdict that excludes a fit; None if it can be fitted.
 
@@ -272,4 +315,4 @@ def plan(
     if name is None and isinstance(driver, HarmonicDriver | MeasuredCurrent):
         estimator = for_calibrations(asked, [seen])
     estimator.check_driver(driver, seen.recording.sample_rate, seen.recording.pulse_rate)
-    return estimator, name
+    return with_known(estimator, known), name

@@ -3,7 +3,7 @@
 import dataclasses
 import functools
 import zlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Literal, TypeVar, overload
 
 import jax
@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from etid.circuits.circuit import AbstractCircuit, SkinRC
+from etid.estimators.element_prior import Known, checked
 from etid.estimators.estimator import AbstractEstimator
 from etid.estimators.judgement import MISFIT_CHI2
 from etid.estimators.lanes import AbstractLane, Harmonics, stacked, unstacked
@@ -24,6 +25,7 @@ from etid.identify.arguments import (
     estimator_of,
     fed,
     for_samples,
+    informed,
     plan,
     require,
 )
@@ -56,6 +58,8 @@ def identify_skin(
     *,
     circuit: None = None,
     method: Method | None = None,
+    fixed: Mapping[str, float] | None = None,
+    prior: Mapping[str, tuple[float, float]] | None = None,
     throw: bool = True,
 ) -> Fit[SkinRC]: ...
 
@@ -67,6 +71,8 @@ def identify_skin(
     *,
     circuit: _Kind,
     method: Method | None = None,
+    fixed: Mapping[str, float] | None = None,
+    prior: Mapping[str, tuple[float, float]] | None = None,
     throw: bool = True,
 ) -> Fit[_Kind]: ...
 
@@ -78,6 +84,8 @@ def identify_skin(
     *,
     circuit: Literal["auto"],
     method: Method | None = None,
+    fixed: Mapping[str, float] | None = None,
+    prior: Mapping[str, tuple[float, float]] | None = None,
     throw: bool = True,
 ) -> Fit[AbstractCircuit]: ...
 
@@ -88,6 +96,8 @@ def identify_skin(
     *,
     circuit: Circuit = None,
     method: Method | None = None,
+    fixed: Mapping[str, float] | None = None,
+    prior: Mapping[str, tuple[float, float]] | None = None,
     throw: bool = True,
 ) -> Fit:
     """Identify the circuit that is connected to the driver in one recording.
@@ -102,6 +112,11 @@ def identify_skin(
         method: A method of `identify_driver`, or `"non_parametric"` or
             `"harmonic_steiglitz_mcbride"`, or any registered name. `"non_parametric"` and
             `"harmonic_steiglitz_mcbride"` use the drivers of maximum likelihood.
+        fixed: Known values of elements by name [SI], as in `{"r_s": 500.0}`. Their standard errors
+            are 0.
+        prior: Values of elements with their standard deviations, as in `{"r_s": (500.0, 50.0)}`;
+            the standard errors of the fit contain this knowledge. Each set of values compiles a
+            program of its own. Maximum likelihood and output error take known elements.
         throw: Raise an error if the verdict is not successful.
 
     Returns:
@@ -112,7 +127,8 @@ def identify_skin(
         IdentificationError: The verdict is not successful and `throw` is set.
     """
     candidates = candidates_of(circuit)
-    fits, chosen = candidate_fits(recording, driver, candidates, method)
+    known = informed(fixed, prior)
+    fits, chosen = candidate_fits(recording, driver, candidates, method, known)
     single = len(candidates) == 1
     fit = fits[chosen] if single else Selection.of(fits, chosen, candidates).fit
     return successful(recording, fit) if throw else fit
@@ -123,6 +139,7 @@ def candidate_fits(
     driver: Driver | None,
     candidates: Sequence[AbstractCircuit],
     method: Method | None,
+    known_elements: Known = (),
 ) -> tuple[dict[int, Fit], int]:
     """Fits of the candidates that a recording asks for, and the number of the chosen one.
 
@@ -133,9 +150,11 @@ def candidate_fits(
     if driver is not None:
         require("driver", driver, Driver)
     asked = estimator_of(method, candidates)
+    for circuit in candidates if known_elements else ():
+        checked(known_elements, circuit)
     recording, feed = fed(recording, driver)
     seen = Inspected(recording)
-    estimator, name = plan(asked, seen, feed)
+    estimator, name = plan(asked, seen, feed, known_elements)
     if name is not None:
         return {0: failed_fit(name, candidates[0], str(estimator))}, 0
     check_default(estimator, candidates)

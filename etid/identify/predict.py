@@ -11,28 +11,27 @@ from etid.estimators.lanes import AlignedSamples
 from etid.estimators.output_error import fit as output_error
 from etid.estimators.output_error import prediction
 from etid.estimators.registry import OUTPUT_ERROR
-from etid.identify.arguments import circuit_of, require, require_float64
+from etid.identify.arguments import circuit_of, fed, require, require_float64
 from etid.identify.compiled import stored_jit
 from etid.identify.steady_state import periodic_voltage
 from etid.recordings.preflight import Inspected
 from etid.recordings.recording import Recording
 from etid.results.driver import ContinuousDriver, Driver
+from etid.results.feed import MeasuredCurrent
 from etid.signals.filtering import TAPS
 
 
 @stored_jit
 def _fitted(
-    samples: AlignedSamples, driver: ContinuousDriver, circuit: AbstractCircuit
+    samples: AlignedSamples, driver: ContinuousDriver | MeasuredCurrent, circuit: AbstractCircuit
 ) -> Float[Array, " interval"]:
     records = prediction.prepare(samples.measure(), cutoff=0.5)  # the whole band of the record
-    r_load = driver.calibration.r_load[0]
-    return output_error.fitted_voltage(
-        records, driver.source, r_load, circuit.impedance().rational()
-    )
+    load = circuit.impedance().in_time(records.sample_rate, records.hold.shape[0])
+    return output_error.fitted_voltage(records, driver.source, driver.r_known, load)
 
 
 def predict(
-    recording: Recording, driver: Driver, circuit: AbstractCircuit | None = None
+    recording: Recording, driver: Driver | None = None, circuit: AbstractCircuit | None = None
 ) -> Float[np.ndarray, " time"]:
     """Predict the terminal voltage [V] of a recording, for plots and residuals.
 
@@ -40,33 +39,39 @@ def predict(
 
     Args:
         recording: Unloaded and loaded voltage.
-        driver: Driver with a continuous source impedance.
+        driver: Driver with a continuous source impedance. Without a driver the voltage is predicted
+            from the measured current.
         circuit: The load. If not given, it is the known resistor of the calibration.
 
     Returns:
         Predicted voltage [V]. It is NaN at both edges, where the interpolation lacks neighbours.
-        For a circuit that is not a ratio of polynomials in s, it is NaN only after the last whole
-        period.
+        With a driver, a circuit that is not a ratio of polynomials in s, and whole periods, it is
+        NaN only after the last whole period.
 
     Raises:
         ValueError: There is no circuit, or the driver has no continuous source impedance, or the
-            circuit is not a ratio of polynomials in s and the record holds no whole period.
+            response of the circuit in time is not known and the record holds no whole period.
     """
     require_float64()
     require("recording", recording, Recording)
-    require("driver", driver, Driver)
+    if driver is not None:
+        require("driver", driver, Driver)
     if circuit is not None:
         circuit = circuit_of(circuit)
     else:
         if recording.r_load is None:
             raise ValueError("give the circuit: this recording has no known resistor")
         circuit = Resistor(recording.r_load)
-    driver = serving(driver, ContinuousDriver, str(OUTPUT_ERROR))
-    if not circuit.is_rational:
-        return _predict_periods(recording, driver, circuit)
-    seen = Inspected(recording)
+    recording, feed = fed(recording, driver)
+    if not isinstance(feed, MeasuredCurrent):
+        feed = serving(feed, ContinuousDriver, str(OUTPUT_ERROR))
+    seen, simulated = Inspected(recording), circuit.impedance().has_response
+    if not circuit.is_rational and (seen.whole_periods[0] > 0 or not simulated):
+        if isinstance(feed, ContinuousDriver):
+            return _predict_periods(recording, feed, circuit)
+        OUTPUT_ERROR.check_circuit(circuit)
     seen.kept = None  # disturbed periods are predicted too
-    inner = np.asarray(_fitted(jax.tree.map(jnp.asarray, AlignedSamples.of(seen)), driver, circuit))
+    inner = np.asarray(_fitted(jax.tree.map(jnp.asarray, AlignedSamples.of(seen)), feed, circuit))
     predicted = np.full(recording.v_out.size, np.nan)
     first = TAPS - 1 + max(seen.lag, 0)
     predicted[first : first + inner.size] = inner
@@ -82,8 +87,8 @@ def _predict_periods(
     if periods == 0:
         raise ValueError(
             f"recording {recording.path!r} holds no whole pulse period; the voltage at "
-            f"{type(circuit).__name__}, whose impedance is no ratio of polynomials in s, is "
-            "predicted for whole periods"
+            f"{type(circuit).__name__}, whose response in time is not known, is predicted for "
+            "whole periods"
         )
     frequency = jnp.asarray(np.fft.rfftfreq(samples, 1 / rate)[1:])
     predicted = np.full(recording.v_out.size, np.nan)

@@ -68,6 +68,7 @@ def plot(
     | `plot(fit, recording, driver)` | one pulse measured and predicted [V]; residual [mV] | 2 |
     | `plot(fit, recording, driver, show="impedance")` | Nyquist and Bode: fit, measured | 3 |
     | `plot(fit, recording, driver, show="residual")` | residual [mV], its correlations | 3 |
+    | `plot(fit, recording)` | the same for a fit from a measured current | 2 |
     | `plot(selection, recording, driver)` | impedance measured, and each candidate | 4 |
     | `plot(driver, calibration)` | the same two diagrams for the calibration's resistor | 2 |
     | `plot(driver)`, `plot(circuit)` | magnitude [kΩ] and phase [deg] of an impedance | 2 |
@@ -144,6 +145,8 @@ def _draw(
             case Fit(), Recording(), Driver() if show == "residual":
                 return judging.draw_residual(canvas, x, recording, driver)
             case Fit(), Recording(), Driver():
+                return pulses.draw_fit(canvas, x, recording, driver)
+            case Fit(), Recording(), None if show == "pulse" and "current" in recording.samples:
                 return pulses.draw_fit(canvas, x, recording, driver)
             case Selection(), Recording(), Driver():
                 return candidates.draw_selection(canvas, x, recording, driver)

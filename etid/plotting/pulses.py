@@ -5,6 +5,7 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from etid.circuits.circuit import AbstractCircuit, Resistor
+from etid.identify.arguments import fed
 from etid.identify.predict import predict
 from etid.plotting.style import BLUE, INK, RED, Canvas, titled
 from etid.recordings.fields import LABELS
@@ -12,7 +13,6 @@ from etid.recordings.recording import Recording
 from etid.results.driver import Driver
 from etid.results.fits import Fit
 from etid.signals.noise import noise
-from etid.simulation.transformer import loading
 
 BEFORE, AFTER = 0.15e-3, 1.2e-3  # [s] time shown before and after the first edge of a pulse
 FREQUENCIES = 2048  # for the mean of |G|²; features of G are wider than 1/1000 of the band
@@ -21,8 +21,8 @@ PAIR = {"sharex": True, "gridspec_kw": {"height_ratios": [3, 1.2]}}  # axes of p
 
 def pulse(recording: Recording) -> slice:
     """Samples of one pulse: around the first edge that is far enough from both ends."""
-    step = np.nan_to_num(np.diff(recording.v_th))  # a missing sample must not hide an edge
-    size = recording.v_th.size
+    cause = recording.samples[recording.cause].values
+    step, size = np.nan_to_num(np.diff(cause)), cause.size  # a missing sample must not hide an edge
     before = int(BEFORE * recording.sample_rate)
     after = int(AFTER * recording.sample_rate)
     rising = np.flatnonzero((step > 0.5 * np.abs(step).max(initial=0.0)) & (step > 0))
@@ -36,7 +36,8 @@ def draw_recording(canvas: Canvas, recording: Recording) -> np.ndarray:
     whole, one = axes = canvas(1, 2, (9.0, 3.2)).ravel()
     milliseconds = 1e3 * recording.time
     for axis, part in ((whole, slice(None)), (one, pulse(recording))):
-        axis.plot(milliseconds[part], recording.v_th[part], color=INK, lw=0.9, label="V_th")
+        if recording.cause == "v_th":
+            axis.plot(milliseconds[part], recording.v_th[part], color=INK, lw=0.9, label="V_th")
         axis.plot(
             milliseconds[part], recording.v_out[part], "--", color=BLUE, lw=1.1, label="V_out"
         )
@@ -50,7 +51,7 @@ def draw_recording(canvas: Canvas, recording: Recording) -> np.ndarray:
     return axes
 
 
-def draw_fit(canvas: Canvas, fit: Fit, recording: Recording, driver: Driver) -> np.ndarray:
+def draw_fit(canvas: Canvas, fit: Fit, recording: Recording, driver: Driver | None) -> np.ndarray:
     """Measured and predicted pulse, the residual, and the verdict of the fit as title."""
     if np.ndim(fit.rrse):
         raise TypeError(
@@ -94,7 +95,7 @@ def headline(recording: Recording, found: Fit | Driver) -> str:
 
 
 def draw_pulse(
-    upper: Axes, lower: Axes, recording: Recording, driver: Driver, circuit: AbstractCircuit
+    upper: Axes, lower: Axes, recording: Recording, driver: Driver | None, circuit: AbstractCircuit
 ) -> None:
     """Draw one pulse, measured and predicted, and the residual with ±2σ of the noise.
 
@@ -102,7 +103,7 @@ def draw_pulse(
         upper: Axes of the pulse.
         lower: Axes of the residual.
         recording: The measured voltages.
-        driver: Driver with a continuous source impedance.
+        driver: Driver with a continuous source impedance; None for a measured current.
         circuit: The load.
     """
     predicted = predict(recording, driver, circuit)
@@ -122,7 +123,8 @@ def draw_pulse(
 def _measured(upper: Axes, recording: Recording) -> slice:
     part = pulse(recording)
     milliseconds = 1e3 * recording.time[part]
-    upper.plot(milliseconds, recording.v_th[part], ":", color="0.55", lw=1.0, label="V_th")
+    if recording.cause == "v_th":
+        upper.plot(milliseconds, recording.v_th[part], ":", color="0.55", lw=1.0, label="V_th")
     upper.plot(milliseconds, recording.v_out[part], color=INK, lw=1.4, label="V_out measured")
     upper.set(ylabel="voltage [V]")
     return part
@@ -138,20 +140,21 @@ def _unpredicted(upper: Axes, lower: Axes, recording: Recording) -> None:
     lower.set(xlabel="time [ms]", ylabel="residual [mV]", yticks=[])
 
 
-def residual_std(recording: Recording, driver: Driver, circuit: AbstractCircuit) -> float:
+def residual_std(recording: Recording, driver: Driver | None, circuit: AbstractCircuit) -> float:
     """Standard deviation of predicted − measured voltage if only noise is left [V].
 
-    The noise of V_th reaches the residual through the loaded driver G = Z_L / (Z_L + Z_th),
+    The noise of V_th reaches the residual through the loaded driver G = Z_L / (Z_L + Z_th), that of
+    a measured current through G = Z_L,
 
         σ² = σ_out² + σ_th² mean |G|²,    the mean from 0 to half the sample rate (Parseval).
     """
     half = recording.sample_rate / 2
     frequency = jnp.asarray((np.arange(FREQUENCIES) + 0.5) * half / FREQUENCIES)
-    z_load, z_th = (np.asarray(z.response(frequency)) for z in (circuit, driver))
-    gain = np.mean(np.abs(loading(z_load, z_th)) ** 2)
-    steps = (recording.samples[name].resolution or 0.0 for name in ("v_th", "v_out"))
+    recording, feed = fed(recording, driver)
+    size = np.abs(np.asarray(feed.gain(circuit.response(frequency), frequency)))
+    gain = np.mean(size**2)
+    both = (recording.samples[name] for name in (recording.cause, "v_out"))
     sigma_th, sigma_out = (
-        float(noise(v, np.asarray(step)))
-        for v, step in zip((recording.v_th, recording.v_out), steps, strict=True)
+        float(noise(one.values, np.asarray(one.resolution or 0.0))) for one in both
     )
     return float(np.sqrt(sigma_out**2 + sigma_th**2 * gain))

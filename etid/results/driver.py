@@ -21,6 +21,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Complex, Float, Int
 
 from etid.circuits.display import plus_minus
+from etid.circuits.impedance import realise
 from etid.circuits.overview import Overview
 from etid.recordings.remarks import texts
 from etid.results.feed import AbstractFeed, CurrentSource
@@ -144,34 +145,13 @@ class SourceImpedance(eqx.Module):
         return StateSpace(A - B * drop[None, :], B, C, share[None])
 
 
-def realise(impedance: Rational, rate: float | Float[Array, ""]) -> StateSpace:
-    """State space of a load impedance, from current [A] to voltage [V].
-
-    Args:
-        impedance: Proper rational function of s [rad/s].
-        rate: Typical rate [1/s] that scales the states. It does not change the impedance.
-    """
-    order = impedance.den.shape[0] - 1
-    if impedance.num.shape[0] > order + 1:
-        raise ValueError(
-            "the impedance of the load grows without bound at high frequency (an inductor in "
-            "series?); a load must stay finite: put a resistor in parallel"
-        )
-    scale = jnp.array([rate**k for k in range(order + 1)])
-    num = jnp.pad(impedance.num, (0, order + 1 - impedance.num.shape[0])) * scale
-    den = impedance.den * scale
-    num, den = num / den[-1], den / den[-1]
-    direct = num[-1]
-    A = jnp.eye(order, k=1).at[order - 1 :, :].set(-den[:-1]) if order else jnp.zeros((0, 0))
-    B = jnp.eye(order, 1, k=1 - order) if order else jnp.zeros((0, 1))
-    return StateSpace(rate * A, rate * B, num[:-1] - direct * den[:-1], direct[None])
-
-
 def loaded(
-    source: SourceImpedance | CurrentSource, load: Rational, rate: float | Float[Array, ""]
+    source: SourceImpedance | CurrentSource,
+    load: Rational | StateSpace,
+    rate: float | Float[Array, ""],
 ) -> StateSpace:
     """The system input → V_out with `load` at the terminal, in continuous time."""
-    return source.connected(realise(load, rate))
+    return source.connected(load if isinstance(load, StateSpace) else realise(load, rate))
 
 
 class Calibration(eqx.Module):

@@ -6,6 +6,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from etid.circuits.circuit import AbstractCircuit
+from etid.estimators.element_prior import ElementPrior, Known, stated
 from etid.estimators.estimator import (
     BY_RESIDUALS,
     CHECKED,
@@ -64,8 +65,14 @@ def description(words: str, estimated: str, unknowns: str) -> Description:
 
 @dataclasses.dataclass(frozen=True)
 class MaximumLikelihood(AbstractEstimator):
-    """Maximum likelihood with noise on both records, on the harmonics of whole pulse periods."""
+    """Maximum likelihood with noise on both records, on the harmonics of whole pulse periods.
 
+    Attributes:
+        known_elements: Elements that are known: name, value and standard deviation [SI]; 0 fixes
+            one.
+    """
+
+    known_elements: Known = ()
     name = "maximum_likelihood"
     lane = Harmonics
     driver = HarmonicDriver
@@ -103,7 +110,8 @@ class MaximumLikelihood(AbstractEstimator):
         """Refine from the best of several starts, jointly with the uncertain part of the driver."""
         spectrum, rate = lane.spectrum, jnp.asarray(lane.sample_rate)
         starts = known.starts(spectrum, rate, circuit)
-        estimate, far, other = load.fit_circuit(known, circuit, spectrum, rate, starts)
+        prior = ElementPrior.of(self.known_elements, circuit) if self.known_elements else None
+        estimate, far, other = load.fit_circuit(known, circuit, spectrum, rate, starts, prior)
         fit = judged(estimate, circuit, driver.result, str(self))
         if known.shape is not None:
             fit = unless(fit, known.shape.differs(spectrum), RESULTS.inconsistent)
@@ -116,7 +124,7 @@ class MaximumLikelihood(AbstractEstimator):
             "the load was estimated by",
             "Each load was estimated jointly with Z_th and the trigger delays of the calibrations, "
             "whose distribution the calibrations give. Its own trigger delay τ is one more "
-            "unknown.",
+            f"unknown.{stated(self.known_elements)}",
         )
 
 

@@ -11,6 +11,7 @@ from jaxtyping import Array, Complex, Float
 
 from etid.circuits.circuit import AbstractCircuit
 from etid.circuits.impedance import AbstractImpedance
+from etid.estimators.element_prior import ElementPrior
 from etid.estimators.maximum_likelihood.given_driver import AbstractGiven, combined
 from etid.estimators.maximum_likelihood.terms import apart
 from etid.estimators.unknowns import LoadUnknowns
@@ -46,12 +47,14 @@ class Gain(eqx.Module):
         frequency: The frequencies [Hz]. They may differ from those of the driver by a small common
             factor.
         sample_rate: Sampling rate [Hz].
+        prior: Prior of the elements; None without one.
     """
 
     driver: AbstractGiven
     circuit: AbstractCircuit
     frequency: Float[Array, " frequency"]
     sample_rate: Float[Array, ""]
+    prior: ElementPrior | None = None
 
     @property
     def owned(self) -> int:
@@ -65,12 +68,15 @@ class Gain(eqx.Module):
 
     def centre(self, q: Float[Array, " q"]) -> Float[Array, " q"]:
         """Prior means of the parameters."""
-        return jnp.concatenate([jnp.zeros(self.owned), self.driver.mean])[: q.size]
+        own = jnp.zeros(self.owned)
+        if self.prior is not None:
+            own = LoadUnknowns(self.prior.centre, jnp.zeros(())).vector()
+        return jnp.concatenate([own, self.driver.mean])[: q.size]
 
     def widths(self, q: Float[Array, " q"]) -> Float[Array, " q"]:
         """Prior standard deviations of the parameters."""
-        free = jnp.full(self.owned - 1, jnp.inf)
-        own = LoadUnknowns(free, self.driver.delay_width).vector()
+        width = jnp.full(self.owned - 1, jnp.inf) if self.prior is None else self.prior.width
+        own = LoadUnknowns(width, self.driver.delay_width).vector()
         return jnp.concatenate([own, jnp.ones(q.size - self.owned)])
 
     def impedance(self, q: Float[Array, " q"]) -> AbstractImpedance:

@@ -23,6 +23,7 @@ import optimistix as optx
 from jaxtyping import Array, Bool, Complex, Float
 
 from etid.circuits.circuit import AbstractCircuit
+from etid.estimators.element_prior import ElementPrior
 from etid.estimators.estimate import MAX_STEPS, SOLVER, Estimate
 from etid.estimators.maximum_likelihood.gain import Gain, Slopes
 from etid.estimators.maximum_likelihood.given_driver import AbstractGiven, UnloadedSlopes, combined
@@ -64,10 +65,12 @@ class Load(eqx.Module):
         circuit: AbstractCircuit,
         spectrum: Spectrum,
         sample_rate: Float[Array, ""],
+        prior: ElementPrior | None = None,
     ) -> "Load":
-        """A recording that was made with `driver`."""
+        """A recording that was made with `driver`, and a prior of the elements if there is one."""
         known, unloaded = driver.informed(spectrum)
-        return cls(Gain(driver, circuit, spectrum.frequency, sample_rate), known, unloaded)
+        gain = Gain(driver, circuit, spectrum.frequency, sample_rate, prior)
+        return cls(gain, known, unloaded)
 
     @property
     def knots(self) -> Knots:
@@ -225,7 +228,8 @@ class Around(eqx.Module):
         score = as_complex(weight) * jnp.conj(x) * error
         parts = jnp.stack([score.real, score.imag, weight * power(x)])
         real, imaginary, total = every.summed(parts)
-        gain = Gain(of.driver.at_knots(every), of.circuit, every.at(of.frequency), of.sample_rate)
+        driver, frequency = of.driver.at_knots(every), every.at(of.frequency)
+        gain = Gain(driver, of.circuit, frequency, of.sample_rate, of.prior)
         by_z = shift = None
         if load.unloaded is not None:
             by_z = every.summed((as_complex(parts[2]) * reciprocal(x))[None, :] * load.unloaded.x)
@@ -305,6 +309,7 @@ def fit_circuit(
     spectrum: Spectrum,
     sample_rate: Float[Array, ""],
     candidates: LoadUnknowns,
+    element_prior: ElementPrior | None = None,
 ) -> tuple[Estimate, Bool[Array, ""], Bool[Array, ""]]:
     """Identify the load of one recording.
 
@@ -315,13 +320,17 @@ def fit_circuit(
         sample_rate: Its sampling rate [Hz].
         candidates: Starts, stacked; the likeliest is the last. The start that predicts best is
             refined.
+        element_prior: Prior of the elements; None without one.
 
     Returns:
         The estimate, whose parameters are the logarithms of the elements. Whether W is too far from
         W₀ for its linear distribution. Whether the data show another circuit or another gain of
         V_out.
     """
-    load = Load.behind(driver, circuit, spectrum, sample_rate)
+    load = Load.behind(driver, circuit, spectrum, sample_rate, element_prior)
+    if element_prior is not None:
+        placed = element_prior.placed(candidates.log_elements)
+        candidates = LoadUnknowns(placed, candidates.delay_samples)
 
     # First at the knots of one point, and with Z_th fixed: from a distant start, a joint fit would
     # distort Z_th.
@@ -380,6 +389,9 @@ def fit_circuit(
     own_noise = around.mean(private * noise)
     by_own, by_z = load.gain.split(elements)
     of_delay = jnp.outer(by_own.delay_samples, by_own.delay_samples) / driver.delay_width**2
+    if element_prior is not None:
+        weighed = by_own.log_elements * element_prior.precision[None, :]
+        of_delay = of_delay + weighed @ by_own.log_elements.T
     of_driver = by_z @ driver.cov @ by_z.T
     shared = of_driver + (by_term * (linear.noise - own_noise)[None, :]) @ by_term.T
     # For an element without any effect the matrix product contains only rounding errors.

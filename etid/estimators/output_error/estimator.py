@@ -6,6 +6,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from etid.circuits.circuit import AbstractCircuit
+from etid.estimators.element_prior import ElementPrior, Known, stated
 from etid.estimators.estimator import CHECKED, DETERMINED, AbstractEstimator, Description
 from etid.estimators.judgement import judged, misses, unless
 from etid.estimators.lanes import PaddedSamples
@@ -30,18 +31,25 @@ INTERPOLATED = 3e-4
 
 @dataclasses.dataclass(frozen=True)
 class OutputError(AbstractEstimator):
-    """Output error in continuous time; a record need not hold a whole pulse period."""
+    """Output error in continuous time; a record need not hold a whole pulse period.
 
+    Attributes:
+        known_elements: Elements that are known: name, value and standard deviation [SI]; 0 fixes
+            one.
+    """
+
+    known_elements: Known = ()
     name = "output_error"
     lane = PaddedSamples
     driver = ContinuousDriver
     current = True
+    chooses = True
 
     def check_circuit(self, circuit: AbstractCircuit) -> None:
-        """Raise ValueError unless the circuit is a ratio of polynomials in s."""
-        if not circuit.is_rational:
+        """Raise ValueError unless the response of the circuit in time is known."""
+        if not circuit.impedance().has_response:
             raise ValueError(
-                f"method {str(self)!r} needs a ratio of polynomials in s, which "
+                f"method {str(self)!r} needs a ratio of polynomials in s or constant phases, which "
                 f"the impedance of {type(circuit).__name__} is not; "
                 "use method='maximum_likelihood'"
             )
@@ -68,8 +76,9 @@ class OutputError(AbstractEstimator):
         del known
         m, samples = lane.measurement, jnp.asarray(lane.samples)
         starts = circuit.with_log_values(_starts(m, driver, circuit))
+        prior = ElementPrior.of(self.known_elements, circuit) if self.known_elements else None
         fitted, estimate, other = fit.fit_circuit(
-            prediction.prepare(m, samples=samples), driver, starts
+            prediction.prepare(m, samples=samples), driver, starts, prior
         )
         found = judged(estimate, circuit, driver.result, str(self))
         off = misses(estimate.chi2, estimate.rrse, INTERPOLATED)
@@ -92,7 +101,7 @@ class OutputError(AbstractEstimator):
             "predicted in continuous time from the band-limited unloaded record, and its "
             "difference to the loaded record, weighted by the noise of both, was minimised. The "
             "state at the start of the record, an offset and the trigger delay were estimated with "
-            "the load.",
+            f"the load.{stated(self.known_elements)}",
             conditions=(*CHECKED, DETERMINED),
             errors="were multiplied by the square root of χ² where the residual exceeds the noise",
             refined=True,

@@ -24,6 +24,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from etid.circuits.circuit import AbstractCircuit
 from etid.circuits.elements import resistor
+from etid.estimators.element_prior import ElementPrior
 from etid.estimators.estimate import (
     DELAY_WIDTH,
     MAX_STEPS,
@@ -42,14 +43,18 @@ from etid.estimators.output_error.prediction import (
     loaded_filter,
     measured,
     predict,
+    scaled,
+    scaled_back,
     scaled_residual,
+    state_scale,
 )
 from etid.estimators.sandwich import Curvature
 from etid.estimators.score_tests.other_in_time import relaxed, score
 from etid.estimators.unknowns import Nuisance
 from etid.results.driver import Calibration, ContinuousDriver, SourceImpedance, loaded
 from etid.results.feed import CurrentSource, MeasuredCurrent
-from etid.results.fits import rrse
+from etid.results.fits import CHANGES, Support, rrse
+from etid.signals.filtering import CUTOFF, StateSpace
 from etid.signals.transfer import Rational
 from etid.solvers.levenberg_marquardt import best_start
 from etid.solvers.matrices import inverse
@@ -178,6 +183,7 @@ def fit_circuit(
     records: Records,
     driver: ContinuousDriver | MeasuredCurrent,
     starts: AbstractCircuit,
+    element_prior: ElementPrior | None = None,
 ) -> tuple[AbstractCircuit, Estimate, Bool[Array, ""]]:
     """Identify the load of one recording.
 
@@ -186,6 +192,7 @@ def fit_circuit(
         driver: Its driver, or the measured current.
         starts: Candidate starts, stacked along a leading axis; the one that predicts best is
             refined.
+        element_prior: Prior of the elements; None without one.
 
     Returns:
         The circuit; the estimate, whose parameters are the logarithms of the elements; and whether
@@ -194,27 +201,43 @@ def fit_circuit(
     source, source_cov = driver.source, driver.later_cov()
     source_vector, unflatten = ravel_pytree(source)
     candidates = starts.log_values()
+    if element_prior is not None:
+        candidates = element_prior.placed(candidates)
     kept, sources = candidates.shape[-1], source_vector.shape[0]
     circuit = jax.tree.map(lambda leaf: leaf[0], starts)
-    states = jax.eval_shape(lambda: loaded(source, circuit.impedance().rational(), 1.0).C).shape[0]
     # [samples] of this record.
     late_std = driver.late_std(records.sample_rate)
 
-    def load(log_elements: Float[Array, " element"]) -> Rational:
-        return circuit.with_log_values(log_elements).impedance().rational()
+    def load(log_elements: Float[Array, " element"]) -> Rational | StateSpace:
+        impedance = circuit.with_log_values(log_elements).impedance()
+        return impedance.in_time(records.sample_rate, records.hold.shape[0])
 
     # Logarithms of the elements, the nuisances of the record, and the delay of the calibration.
     # Voltage and impulse response are linear in this delay.
     zero = jnp.zeros(())
-    nuisance = Nuisance(jnp.zeros(states), zero, zero)
-    _, named = ravel_pytree((candidates[0], nuisance, zero))
+    nuisance = Nuisance(jnp.zeros_like(loaded(source, load(candidates[0]), 1.0).C), zero, zero)
+    best = best_start(
+        lambda logs: scaled_residual(records, source, load(logs), nuisance), candidates
+    )
+    start_scale = state_scale(records, source, load(best))
+    q0, named_scaled = ravel_pytree((best, nuisance, zero))
+
+    def named(q: Float[Array, " q"]) -> tuple[Float[Array, " element"], Nuisance, Float[Array, ""]]:
+        log_elements, nuisance, late_samples = named_scaled(q)
+        return log_elements, scaled_back(nuisance, start_scale), late_samples
 
     def residual(q: Float[Array, " q"], late: Change) -> Float[Array, " term"]:
         log_elements, nuisance, late_samples = named(q)
         change = jax.tree.map(lambda leaf: late_samples * leaf, late)
-        scaled = scaled_residual(records, source, load(log_elements), nuisance, change)
+        terms = scaled_residual(records, source, load(log_elements), nuisance, change)
         delays = jnp.stack([nuisance.delay_samples, late_samples])
-        return jnp.concatenate([scaled, delays / jnp.stack([DELAY_WIDTH, late_std])])
+        priors = delays / jnp.stack([DELAY_WIDTH, late_std])
+        if element_prior is not None:
+            rest = (log_elements - element_prior.centre) / element_prior.width
+            priors = jnp.concatenate([priors, rest])
+        if start_scale is not None:
+            priors = jnp.concatenate([priors, start_scale.known * named_scaled(q)[1].state])
+        return jnp.concatenate([terms, priors])
 
     def refine(
         carry: tuple[Float[Array, " q"], Change], _
@@ -234,11 +257,9 @@ def fit_circuit(
         return (q, late), (equations.objective, solution.result, solution.stats["num_steps"])
 
     nothing = Change(jnp.zeros(records.hold.shape[0]), jnp.zeros(IMPULSE + 1))
-    q0 = jax.vmap(lambda log_elements: ravel_pytree((log_elements, nuisance, zero))[0])(candidates)
-    best = best_start(lambda q: residual(q, nothing), q0)
     # First without a delay of the calibration, then with it. In one loop, only one solver is
     # compiled.
-    (q, late), outcomes = jax.lax.scan(refine, (best, nothing), length=PASSES)
+    (q, late), outcomes = jax.lax.scan(refine, (q0, nothing), length=PASSES)
     objective, result, steps = outcomes
     result = jax.tree.map(lambda leaf: leaf[-1], result)
     log_elements, nuisance, late_samples = named(q)
@@ -246,10 +267,15 @@ def fit_circuit(
 
     # Curvature over elements, delay of the calibration, source and nuisances, in this order.
     both = kept + 1 + sources
-    at, named_all = ravel_pytree((log_elements, late_samples, source_vector, nuisance))
+    # The directions of the state are orthogonal at these elements, not at those of the start.
+    scale = state_scale(records, source, load(log_elements))
+    at, named_all = ravel_pytree(
+        (log_elements, late_samples, source_vector, scaled(nuisance, scale))
+    )
 
     def of_all(p: Float[Array, " p"]) -> Float[Array, " interval"]:
         log_elements, late_samples, vector, nuisance = named_all(p)
+        nuisance = scaled_back(nuisance, scale)
         change = jax.tree.map(lambda leaf: late_samples * leaf, late)
         return scaled_residual(records, unflatten(vector), load(log_elements), nuisance, change)
 
@@ -258,15 +284,18 @@ def fit_circuit(
         system = loaded_filter(unflatten(vector), load(log_elements), records.sample_rate)
         return impulse_response(system) + late_samples * late.h
 
-    open_delay = Nuisance(jnp.zeros(states), zero, jnp.asarray(1 / DELAY_WIDTH**2))
-    priors = (jnp.zeros(kept), 1 / late_std**2, jnp.zeros(sources), open_delay)
+    of_state = jnp.zeros_like(nuisance.state) if scale is None else scale.known
+    open_delay = Nuisance(of_state, zero, jnp.asarray(1 / DELAY_WIDTH**2))
+    free = jnp.zeros(kept)
+    known = free if element_prior is None else element_prior.precision
+    priors = (known, 1 / late_std**2, jnp.zeros(sources), open_delay)
     precision, _ = ravel_pytree(priors)
+    centre = free if element_prior is None else element_prior.centre
+    rest = precision * (at - jnp.pad(centre, (0, at.size - kept)))
     derivatives = slopes(of_all, response, at)
     full = curvature(records, derivatives, precision).eliminate(both)
     change = relaxed(records, source, fitted.impedance(), nuisance)
-    found = score(
-        records, change, derivatives, source_cov, kept + 1, precision * at, precision, kept
-    )
+    found = score(records, change, derivatives, source_cov, kept + 1, rest, precision, kept)
     own = inverse(full.expected[: kept + 1, : kept + 1])
     chi2 = 2 * objective[-1] / (records.intervals - q.size)
     inherited = (-own @ full.expected[: kept + 1, kept + 1 :])[:kept]
@@ -285,15 +314,32 @@ def fit_circuit(
         rrse=rrse(jnp.where(used, predicted, mean), jnp.where(used, seen, mean)),
         result=result,
         steps=steps.sum(),
+        support=_support(objective[-1], records, kept),
     )
     return fitted, estimate, found.relaxes()
+
+
+def _support(objective: Float[Array, ""], records: Records, elements: int) -> Support:
+    """The support of a circuit. The interpolation leaves a part 2 · `CUTOFF` of the numbers free.
+
+    The scores of other circuits are not on the scale of those on harmonics; a fit that they
+    contradict has the verdict `misfit`.
+    """
+    free, nothing = 2 * CUTOFF, jnp.zeros(())
+    return Support(
+        2 * objective * free,
+        records.intervals * free,
+        jnp.zeros(CHANGES),
+        nothing,
+        jnp.zeros(elements),
+    )
 
 
 def fitted_voltage(
     records: Records,
     source: SourceImpedance | CurrentSource,
     r_load: Float[Array, ""],
-    load: Rational,
+    load: Rational | StateSpace,
 ) -> Float[Array, " interval"]:
     """Terminal voltage with `load` [V], fitted to a record.
 

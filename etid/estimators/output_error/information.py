@@ -94,8 +94,8 @@ def curvature(records: Records, at: Slopes, precision: Float[Array, " n"]) -> Cu
     spectrum = jnp.fft.rfft(jacobian, size, axis=0)
     real, imaginary = spectrum.real, spectrum.imag
     score = real.T @ (weight[:, None] * real) + imaginary.T @ (weight[:, None] * imaginary)
-    information = jacobian.T @ jacobian
-    return Curvature(information - samples * noise + jnp.diag(precision), score / s)
+    information, prior = jacobian.T @ jacobian, jnp.diag(precision)
+    return Curvature(information - samples * noise + prior, score / s + prior)
 
 
 def further(

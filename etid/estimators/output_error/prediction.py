@@ -72,7 +72,9 @@ def prepare(
 
 
 def loaded_filter(
-    source: SourceImpedance | CurrentSource, load: Rational, sample_rate: Float[Array, ""]
+    source: SourceImpedance | CurrentSource,
+    load: Rational | StateSpace,
+    sample_rate: Float[Array, ""],
 ) -> StateSpace:
     """Discrete filter from the interpolated V_th to V_out."""
     return hold(loaded(source, load, sample_rate), sample_rate)
@@ -93,6 +95,61 @@ def measured(records: Records, delay_samples: Float[Array, ""]) -> Float[Array, 
     for k in range(records.v_out.shape[1] - 2, -1, -1):  # Horner
         value = value * late + records.v_out[:, k]
     return value
+
+
+class StateScale(eqx.Module):
+    """Unknowns η that stand for the state at the start of a record, so that all are determined.
+
+    A record does not determine all states of a ladder of relaxations: together they would be
+    singular to 1e-16. Before the record, each has seen a current like that of the record, for as
+    long. This is the prior of a state, with a standard deviation of 1 for η. The directions of η
+    are orthogonal in their effects on the record.
+
+    Attributes:
+        directions: State for each η.
+        known: Precision of the prior of each η; 0 for the states of the source, which have none.
+    """
+
+    directions: Float[Array, "state state"]
+    known: Float[Array, " state"]
+
+
+def state_scale(
+    records: Records, source: SourceImpedance | CurrentSource, load: Rational | StateSpace
+) -> StateScale | None:
+    """The unknowns for the state of a loaded ladder; None for a ratio of polynomials."""
+    if isinstance(load, Rational):
+        return None
+    system, count = loaded(source, load, records.sample_rate), load.C.size
+    first, zero = system.C.size - count, jnp.zeros(())
+    largest = jnp.max(jnp.abs(records.hold[:, 0]) * records.used)
+    least = records.sample_rate / records.intervals
+    rate = jnp.maximum(jnp.abs(jnp.diagonal(system.A)), least)
+    width = (jnp.abs(system.B[:, 0]) * largest / rate)[first:]
+
+    def effect(state: Float[Array, " state"]) -> Float[Array, " interval"]:
+        both = jnp.concatenate([jnp.zeros(first), width * state])
+        return scaled_residual(records, source, load, Nuisance(both, zero, zero))
+
+    effects = jax.jacfwd(effect)(jnp.zeros(count))
+    turned = jnp.linalg.svd(jnp.linalg.qr(effects)[1])[2].T
+    directions = jax.scipy.linalg.block_diag(jnp.eye(first), width[:, None] * turned)
+    return StateScale(directions, (jnp.arange(system.C.size) >= first).astype(width.dtype))
+
+
+def scaled_back(nuisance: Nuisance, scale: StateScale | None) -> Nuisance:
+    """The nuisances with the state that η stands for."""
+    if scale is None:
+        return nuisance
+    return eqx.tree_at(lambda one: one.state, nuisance, scale.directions @ nuisance.state)
+
+
+def scaled(nuisance: Nuisance, scale: StateScale | None) -> Nuisance:
+    """The inverse of `scaled_back`."""
+    if scale is None:
+        return nuisance
+    state = jnp.linalg.solve(scale.directions, nuisance.state)
+    return eqx.tree_at(lambda one: one.state, nuisance, state)
 
 
 def impulse_response(system: StateSpace) -> Float[Array, " lag"]:
@@ -116,6 +173,13 @@ def residual_variance(records: Records, h: Float[Array, " lag"]) -> Float[Array,
     return records.sigma_out**2 * jnp.sum(k**2) + records.sigma_th**2 * jnp.sum(h**2)
 
 
+def _times(load: Rational | StateSpace, factor: Float[Array, ""]) -> Rational | StateSpace:
+    """The load with its impedance multiplied by a factor."""
+    if isinstance(load, Rational):
+        return Rational(factor * load.num, load.den)
+    return StateSpace(load.A, load.B, factor * load.C, factor * load.D)
+
+
 class Change(eqx.Module):
     """Derivatives of terminal voltage [V] and impulse response with respect to a small change.
 
@@ -129,7 +193,7 @@ class Change(eqx.Module):
 def scaled_residual(
     records: Records,
     source: SourceImpedance | CurrentSource,
-    load: Rational,
+    load: Rational | StateSpace,
     nuisance: Nuisance,
     change: Change | None = None,
 ) -> Float[Array, " interval"]:
@@ -145,7 +209,7 @@ def scaled_residual(
 def late_calibration(
     records: Records,
     source: SourceImpedance | CurrentSource,
-    load: Rational,
+    load: Rational | StateSpace,
     r_load: Float[Array, ""],
     x0: Float[Array, " state"],
 ) -> Change:
@@ -181,7 +245,7 @@ def late_calibration(
     def excess(epsilon: Float[Array, ""]) -> tuple[Float[Array, " interval"], Float[Array, " lag"]]:
         shifted = jnp.log(jnp.exp(source.log_resistance) + epsilon * r_load)
         altered = eqx.tree_at(lambda z: z.log_resistance, source, shifted)
-        reduced = Rational((1 - epsilon) * load.num, load.den)
+        reduced = _times(load, 1 - epsilon)
         filtered = loaded_filter(altered, reduced, records.sample_rate)
         v_out = simulate(filtered, rate(records.hold), x0_rate)[0]
         return v_out, simulate(filtered, rate(impulse()), jnp.zeros_like(x0_rate))[0]

@@ -21,7 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float
 
-from etid.circuits.impedance import AbstractImpedance
+from etid.circuits.impedance import AbstractImpedance, realise
 from etid.estimators.output_error.information import Slopes, bin_weights, noise_power, padded_size
 from etid.estimators.output_error.prediction import (
     Change,
@@ -34,7 +34,7 @@ from etid.estimators.output_error.prediction import (
 from etid.estimators.sandwich import Linear
 from etid.estimators.score_tests.other_circuit import Score, relaxations, scores
 from etid.estimators.unknowns import Nuisance
-from etid.results.driver import SourceImpedance, realise
+from etid.results.driver import SourceImpedance
 from etid.results.feed import CurrentSource
 from etid.signals.filtering import StateSpace, hold
 from etid.signals.transfer import as_complex
@@ -63,7 +63,8 @@ def relaxed(
     """
     rate = records.sample_rate
     corner, level = relaxations(impedance, rate / records.intervals, jnp.asarray(HIGHEST))
-    load, count = realise(impedance.rational(), rate), corner.size
+    load, count = impedance.in_time(rate, records.hold.shape[0]), corner.size
+    load = load if isinstance(load, StateSpace) else realise(load, rate)
     A = jax.scipy.linalg.block_diag(load.A, -jnp.diag(corner))
     B = jnp.concatenate([load.B, corner[:, None]])
     state = jnp.concatenate([nuisance.state, jnp.zeros(count)])

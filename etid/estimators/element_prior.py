@@ -1,0 +1,77 @@
+"""What is known of elements before a fit: priors, of which a fixed element is the limit.
+
+A value m ± s of an element becomes a normal prior of its logarithm, ln m ± s/m, one more residual
+of the fit. Standard errors contain it like any measurement. A fixed element has s = 0.
+"""
+
+from collections.abc import Sequence
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from etid.circuits.circuit import AbstractCircuit
+
+FIXED = 1e-9  # standard deviation of the logarithm of a fixed element, below all errors of a fit
+
+Known = tuple[tuple[str, float, float], ...]
+"""Elements that are known: name, value and standard deviation [SI]; 0 for a fixed element."""
+
+
+class ElementPrior(eqx.Module):
+    """Prior of the logarithms of the elements.
+
+    Attributes:
+        centre: Means; 0 for elements without a prior.
+        width: Standard deviations; infinite for elements without a prior.
+    """
+
+    centre: Float[Array, " element"]
+    width: Float[Array, " element"]
+
+    @classmethod
+    def of(cls, known: Known, circuit: AbstractCircuit) -> "ElementPrior":
+        """The prior of the elements of a circuit; raises as `checked` does."""
+        checked(known, circuit)
+        names = circuit.names()
+        centre, width = jnp.zeros(len(names)), jnp.full(len(names), jnp.inf)
+        for name, mean, deviation in known:
+            row = names.index(name)
+            centre = centre.at[row].set(jnp.log(mean))
+            width = width.at[row].set(max(deviation / mean, FIXED))
+        return cls(centre, width)
+
+    @property
+    def precision(self) -> Float[Array, " element"]:
+        """1/width²."""
+        return 1 / self.width**2
+
+    def placed(self, logs: Float[Array, "*start element"]) -> Float[Array, "*start element"]:
+        """Starts with the known elements at their means."""
+        return jnp.where(jnp.isfinite(self.width), self.centre, logs)
+
+
+def checked(known: Sequence[Sequence], circuit: AbstractCircuit) -> None:
+    """Raise ValueError unless these are elements of the circuit with sensible values."""
+    for one in known:
+        name, mean, deviation = one
+        if name not in circuit.names():
+            raise ValueError(
+                f"{name!r} is no element of {type(circuit).__name__}; its elements are "
+                f"{', '.join(circuit.names())}"
+            )
+        if not (0 < mean < float("inf") and 0 <= deviation < float("inf")):
+            raise ValueError(
+                f"the known value of {name} is {mean:g} ± {deviation:g}; it must be positive, and "
+                "its standard deviation must not be negative"
+            )
+
+
+def stated(known: Known) -> str:
+    """A sentence for a methods section; empty if no element is known."""
+    if not known:
+        return ""
+    each = [
+        f"{name} = {mean:g} {f'± {error:g}' if error else '(fixed)'}" for name, mean, error in known
+    ]
+    return f" Known before the fit [SI]: {'; '.join(each)}."
