@@ -216,7 +216,7 @@ def test_other_methods_see_none_where_there_is_none(method, snr_db):
 
 
 def test_a_wrong_gain_is_seen_where_it_moves_r_p_by_a_quarter():
-    """At 40 dB, 1 % is five standard deviations of the gain: 93 % exceed 3.5, half exceed 5."""
+    """At 40 dB, 1 % is five standard deviations of the gain: 97 % exceed 3, half exceed 5."""
     study = etid.scenes.paper_dry(snr_db=40.0).simulate(seed=3)
     driver = etid.identify_driver(study["calibration/98k8"])
     right = list(study.loaded.recordings())
