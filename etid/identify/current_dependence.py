@@ -56,7 +56,8 @@ def falls_with_current(lane: AbstractLane, feed: AbstractFeed, circuit: Abstract
     row = _parts(weight * shape)
     row = row - basis @ (basis.T @ row)
     residual = _parts(r)
-    score = row @ residual / np.linalg.norm(row)
+    size = np.linalg.norm(row)  # 0 for a resistor in series only
+    score = row @ residual / size if size > 0 else 0.0
     excess = residual @ residual - 2 * np.sum(lane.selected)
     return bool(score > SEEN and score**2 > SHARE * excess)
 
