@@ -64,6 +64,7 @@ from etid.simulation.bound import Bound, bound
 if TYPE_CHECKING:
     from etid.files.exporting import export_circuit, export_fits, export_study
     from etid.files.importing import import_file
+    from etid.files.measured_impedance import read_impedance
     from etid.plotting.interactive import interactive
     from etid.report.study import write_report
 
@@ -74,6 +75,7 @@ _LATER = {
     "export_study": "etid.files.exporting",
     "import_file": "etid.files.importing",
     "interactive": "etid.plotting.interactive",
+    "read_impedance": "etid.files.measured_impedance",
     "write_report": "etid.report.study",
 }
 
@@ -144,6 +146,7 @@ __all__ = [
     "predict",
     "profile",
     "read",
+    "read_impedance",
     "register",
     "resistor",
     "scenes",

@@ -1,0 +1,39 @@
+"""Files of measured impedances, read by impedance.py."""
+
+import numpy as np
+import pytest
+
+import etid
+from etid import RecordingError
+
+F = np.geomspace(10.0, 1e5, 30)
+Z = 33.4e3 + 186e3 / (1 + 2j * np.pi * F * 186e3 * 0.12e-9)
+
+
+def test_a_table_of_impedances_is_read_and_fitted(tmp_path):
+    pytest.importorskip("impedance")
+    np.savetxt(tmp_path / "z.csv", np.stack([F, np.real(Z), np.imag(Z)], axis=1), delimiter=",")
+    frequency, impedance = etid.read_impedance(tmp_path / "z.csv")
+    np.testing.assert_allclose(frequency, F)
+    np.testing.assert_allclose(impedance, Z)
+    with pytest.raises(RecordingError, match=r"cannot be read|holds no impedances"):
+        etid.read_impedance(tmp_path / "z.csv", "gamry")
+
+
+def test_a_file_of_zplot_is_read(tmp_path):
+    pytest.importorskip("impedance")
+    rows = "\n".join(
+        f"{f:.6e}, 0, 0, 0, {np.real(z):.6e}, {np.imag(z):.6e}" for f, z in zip(F, Z, strict=True)
+    )
+    head = "\"ZPLOT2 ASCII\"\nFreq(Hz)\tAmpl\tBias\tTime(Sec)\tZ'(a)\tZ''(b)\nEnd Comments\n"
+    (tmp_path / "z.z").write_text(head + rows.replace(", ", "\t") + "\n")
+    frequency, impedance = etid.read_impedance(tmp_path / "z.z", "zplot")
+    np.testing.assert_allclose(frequency, F, rtol=1e-5)
+    np.testing.assert_allclose(impedance, Z, rtol=1e-5)
+
+
+def test_what_is_missing_is_named(tmp_path):
+    with pytest.raises(RecordingError, match="Use one of gamry"):
+        etid.read_impedance(tmp_path / "z.csv", "gamri")
+    with pytest.raises(RecordingError, match="no such file"):
+        etid.read_impedance(tmp_path / "z.csv")
