@@ -19,7 +19,6 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-import scipy.optimize
 from jaxtyping import Array, Bool, Complex, Float, Int
 
 from etid.signals.harmonics import namespace
@@ -193,6 +192,7 @@ def _found(
     weak = np.ptp(v) / unit
     seen = np.concatenate([seen, np.zeros(2 * MULTIPLES)])
     prior = np.eye(2 * MULTIPLES, 2 * MULTIPLES + others.shape[1])
+    import scipy.optimize  # takes a third of a second, which only recordings with hum need
 
     def fitted(frequency: float) -> tuple[float, Complex[np.ndarray, " multiple"]]:
         places = frequency * seconds * np.arange(1, MULTIPLES + 1)[None, :]
