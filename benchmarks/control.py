@@ -27,7 +27,7 @@ from tqdm import tqdm
 import etid
 from benchmarks import ngspice
 from benchmarks.charts import COLOURS, new_figure, save
-from benchmarks.control_plant import OPEN, Plant
+from benchmarks.control_plant import OPEN, Plant, Response
 from benchmarks.provenance import ROOT
 from etid.simulation.published import REFERENCE, TYPICAL
 from etid.simulation.scenes import Scene, Trial
@@ -68,8 +68,9 @@ def main(arguments: argparse.Namespace) -> bool:
     """Print the errors of all controllers and draw them; whether etid meets the targets."""
     fingertip = Fingertip(arguments.electrodes, arguments.pulses)
     runs, met = {}, True
+    known: dict[SkinLoad | ResistorLoad, Response] = {}
     for snr in arguments.snr:
-        loop = Loop(fingertip, snr)
+        loop = Loop(fingertip, snr, known)
         found = {"etid": loop.etid()}
         if not runs:
             found |= {name: loop.blind(one) for name, one in rivals(loop).items()}
@@ -144,15 +145,21 @@ class Loop:
     Args:
         fingertip: The skin.
         snr: Signal-to-noise ratio [dB].
+        known: Responses of the plant, which do not depend on the noise.
     """
 
-    def __init__(self, fingertip: Fingertip, snr: float) -> None:
-        self.fingertip = fingertip
+    def __init__(
+        self,
+        fingertip: Fingertip,
+        snr: float,
+        known: dict[SkinLoad | ResistorLoad, Response],
+    ) -> None:
+        self.fingertip, self.known = fingertip, known
         resistors = enumerate((REFERENCE, 21.62e3))
         calibration = tuple(Trial(f"calibration/{i}", ResistorLoad(r)) for i, r in resistors)
         self.scene = Scene((), calibration, samples=40_000, snr_db=snr, trigger_jitter_rms=100e-9)
         self.lanes = len(fingertip.kind)
-        self.typical = Plant(self.scene, 0).response(DRY)
+        self.typical = Plant(self.scene, 0, known).response(DRY)
 
     def etid(self) -> Run:
         """The tracker and the controller."""
@@ -160,7 +167,7 @@ class Loop:
         driver = etid.identify_driver(records)
         tracker = etid.Tracker.of(driver, records[0], electrodes=self.lanes, change=CHANGE)
         controller = etid.Controller.of(tracker, current_cap=CAP, fallback=FALLBACK)
-        plant, state = Plant(self.scene, 1), tracker.start()
+        plant, state = Plant(self.scene, 1, self.known), tracker.start()
         samples = tracker.model.bands.samples
         before, rows = np.zeros(self.lanes), []
         for pulse, loads in enumerate(tqdm(self.fingertip.loads, leave=False)):
@@ -174,7 +181,7 @@ class Loop:
 
     def blind(self, command: Command) -> Run:
         """A controller that sees charge and voltage of the last pulse, without noise."""
-        plant = Plant(self.scene, 1)
+        plant = Plant(self.scene, 1, self.known)
         amplitude, before = np.full(self.lanes, FALLBACK), np.zeros(self.lanes)
         rows = []
         for pulse, loads in enumerate(self.fingertip.loads):

@@ -17,7 +17,7 @@ from jaxtyping import Float
 
 from benchmarks import ngspice
 from etid.simulation.scenes import Scene
-from etid.simulation.transformer import OpenLoad, ResistorLoad, SkinLoad
+from etid.simulation.transformer import ResistorLoad, SkinLoad
 
 OPEN = ResistorLoad(1e12)
 FINE = 16  # points per sample of the waveform that is sampled
@@ -47,11 +47,13 @@ class Plant:
     Args:
         scene: Driver and converter.
         seed: Seed of noise and delays.
+        known: Responses of this driver and converter, which are added to.
     """
 
-    def __init__(self, scene: Scene, seed: int) -> None:
-        self.scene, self.rng = scene, np.random.default_rng(seed)
-        self.known: dict[SkinLoad | ResistorLoad | OpenLoad, Response] = {}
+    def __init__(
+        self, scene: Scene, seed: int, known: dict[SkinLoad | ResistorLoad, Response]
+    ) -> None:
+        self.scene, self.rng, self.known = scene, np.random.default_rng(seed), known
         self.period = 1 / scene.pulse_rate
         time, v, _ = self._solved(OPEN)
         top = int(np.argmax(v))

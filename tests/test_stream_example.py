@@ -1,0 +1,94 @@
+"""The example of a stream: whole windows from any blocks, and losses that are counted."""
+
+import importlib.util
+import pathlib
+import socket
+import sys
+import threading
+
+import h5py
+import numpy as np
+import pytest
+
+from tests.test_online import DRY, calibrated, loaded, scene
+
+PATH = pathlib.Path(__file__).parents[1] / "examples" / "stream_display.py"
+
+
+@pytest.fixture(scope="module")
+def example():
+    spec = importlib.util.spec_from_file_location("stream_display", PATH)
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[spec.name] = module
+    spec.loader.exec_module(module)
+    return module
+
+
+def blocks(v, size, without=()):
+    for number, first in enumerate(range(0, v.shape[1], size)):
+        if number not in without:
+            yield first, v[:, first : first + size]
+
+
+@pytest.mark.parametrize("size", [7, 33, 34, 100, 1000])
+def test_windows_do_not_depend_on_the_blocks(example, size):
+    v = np.arange(2 * 1000.0).reshape(2, 1000)
+    pulses = example.Pulses(33.4, 33, 2)
+    found = [(number, window.copy()) for number, window in pulses.cut(blocks(v, size))]
+    assert [number for number, _ in found] == list(range(29 + (round(29 * 33.4) + 33 <= 1000)))
+    for number, window in found:
+        begin = round(number * 33.4)
+        np.testing.assert_array_equal(window, v[:, begin : begin + 33])
+    assert (pulses.late, pulses.missing) == (0, 0)
+
+
+def test_missing_and_late_blocks_are_counted_and_only_their_pulses_suffer(example):
+    v = np.ones((2, 1000))
+    pulses = example.Pulses(33.4, 33, 2)
+    kept = list(blocks(v, 50, without=(4,)))
+    late = [*kept[:8], (200, v[:, 200:250]), *kept[8:]]
+    bad = [number for number, w in pulses.cut(late) if np.isnan(w).any()]
+    assert bad == [6, 7]  # samples 200 to 249
+    assert (pulses.late, pulses.missing) == (1, 2)
+    with pytest.raises(ValueError, match="3 electrodes, not 2"):
+        list(pulses.cut([(0, np.ones((3, 50)))]))
+
+
+def test_blocks_come_through_a_socket(example):
+    v = np.random.default_rng(0).standard_normal((2, 300))
+    with socket.create_server(("127.0.0.1", 0)) as server:
+
+        def serve():
+            line, _ = server.accept()
+            with line:
+                for first, block in blocks(v, 100):
+                    line.sendall(np.array([first, *block.shape], "<i8").tobytes())
+                    line.sendall(np.ascontiguousarray(block, "<f8").tobytes())
+                line.sendall(b"half a header")
+
+        thread = threading.Thread(target=serve)
+        thread.start()
+        found = list(example.received(f"127.0.0.1:{server.getsockname()[1]}"))
+        thread.join()
+    assert [first for first, _ in found] == [0, 100, 200]
+    np.testing.assert_array_equal(np.concatenate([block for _, block in found], axis=1), v)
+
+
+def test_a_file_is_played_to_its_end_and_logged(example, tmp_path, capsys):
+    _, study = calibrated()
+    study.write(tmp_path / "calibration.h5")
+    v_out = loaded(scene(20).simulate(seed=5))
+    with h5py.File(tmp_path / "pulses.h5", "w") as file:
+        file["v_out"] = v_out
+    arguments = [str(tmp_path / "calibration.h5"), "--file", str(tmp_path / "pulses.h5")]
+    arguments += ["--electrodes", "2", "--speed", "1000", "--log", str(tmp_path / "log.h5")]
+    example.main(arguments)
+    said = capsys.readouterr().out
+    assert said.startswith("..\npulse 15, 0 incomplete, 0 late blocks")
+    with h5py.File(tmp_path / "log.h5") as log:
+        r_p, verdict = (np.asarray(log[name]) for name in ("r_p", "verdict"))
+    assert r_p.shape == (20, 2)
+    np.testing.assert_allclose(r_p[-1, 0], DRY.r_p, rtol=0.01)  # ten standard errors
+    assert (verdict == 0).all()
