@@ -167,7 +167,7 @@ class Loop:
         driver = etid.identify_driver(records)
         tracker = etid.Tracker.of(driver, records[0], electrodes=self.lanes, change=CHANGE)
         controller = etid.Controller.of(tracker, current_cap=CAP, fallback=FALLBACK)
-        plant, state = Plant(self.scene, 1, self.known), tracker.start()
+        plant, state = Plant(self.scene, 1, self.known), tracker.start(at_rest=True)
         samples = tracker.model.bands.samples
         before, rows = np.zeros(self.lanes), []
         for pulse, loads in enumerate(tqdm(self.fingertip.loads, leave=False)):
@@ -255,7 +255,7 @@ def draw(runs: dict[str, Run], fingertip: Fingertip, path: pathlib.Path) -> None
         "sweating": "sweating slowly",
         "lifted": "lifted off and put back",
     }
-    figure, grid = new_figure(len(kinds), 1, (7.2, 8.6), sharex=True)
+    figure, grid = new_figure(len(kinds), 1, (7.2, 8.0), sharex=True)
     panels = grid[:, 0]
     colours = {name: COLOURS[at % len(COLOURS)] for at, name in enumerate(STYLES)}
     for panel, (kind, title) in zip(panels, kinds.items(), strict=True):

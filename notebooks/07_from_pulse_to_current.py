@@ -92,7 +92,7 @@ def recorded(pulse: int, amplitude: np.ndarray, before: np.ndarray) -> np.ndarra
     return np.stack(rows) + NOISE * RNG.standard_normal((2, samples))
 
 
-state = tracker.start()
+state = tracker.start(at_rest=True)
 amplitudes, reasons, found = [np.zeros(2)], [], []
 for pulse in range(24):
     command = controller.command(state, charge=WANTED)

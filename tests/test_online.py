@@ -599,6 +599,14 @@ def test_an_amplitude_that_is_told_is_no_change():
         tracker.update(state, clean[8], np.ones(3))
 
 
+def test_a_display_at_rest_is_identified_from_the_second_pulse_on():
+    tracker = tracker_of(2)
+    pulses = with_noise(tracker.pulses(loaded(quiet()))[:2], seed=1)
+    state = tracker.update(tracker.start(at_rest=True), pulses[0])
+    assert set(tracker.read(state).verdicts) == {"too_short"}
+    assert set(tracker.read(tracker.update(state, pulses[1])).verdicts) == {"successful"}
+
+
 @pytest.mark.parametrize(("before", "now"), [(1.0, 0.2), (0.3, 1.0), (0.0, 1.0)])
 def test_the_first_pulse_of_another_amplitude_lacks_a_tail_which_is_no_misfit(before, now):
     """A pulse alone: one in two periods, so that the second of them is what it leaves behind."""

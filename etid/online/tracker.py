@@ -175,8 +175,14 @@ class Tracker(Overviewed, eqx.Module):
         ]
         return Overview(f"Tracker of {kind}, driver {of_driver}", rows)
 
-    def start(self) -> TrackerState:
-        """The state before the first pulse, without information."""
+    def start(self, *, at_rest: bool = False) -> TrackerState:
+        """The state before the first pulse, without information.
+
+        Args:
+            at_rest: Whether there was no pulse before the first one. Otherwise that pulse had the
+                amplitude of the first one. A display at rest is identified from the second pulse
+                on, whose amplitude should be that of the first one.
+        """
         lanes, elements = self.electrodes, len(self.model.circuit.names())
         typical = jnp.append(self.model.circuit.log_values(), 0.0)
         nan, none = jnp.full(lanes, jnp.nan), jnp.zeros(lanes, int)
@@ -185,7 +191,7 @@ class Tracker(Overviewed, eqx.Module):
             information=jnp.zeros((lanes, elements, elements)),
             pulses=none,
             missed=none,
-            amplitude=nan,
+            amplitude=jnp.zeros(lanes) if at_rest else nan,
             offset=nan,
             level=nan,
             variance=nan,
@@ -357,25 +363,28 @@ def _measured(
     # In the steady state the mean of V_out is 0: a transformer passes no direct voltage.
     mean = v_out.mean(axis=1)
     steady = jnp.abs(lacking) < STEADY
-    first = ~jnp.isfinite(before.offset)
-    offset = jnp.where(jnp.isfinite(mean) & (steady | first), mean, before.offset)
+    offset = jnp.where(jnp.isfinite(mean) & steady, mean, before.offset)
+    unknown = ~jnp.isfinite(offset)
     lowest, highest = v_out.min(axis=1), v_out.max(axis=1)  # NaN if a sample is NaN
     finite = jnp.isfinite(lowest) & jnp.isfinite(highest)
     clipped = (lowest <= tracker.adc_range[0]) | (highest >= tracker.adc_range[1])
     bands = tracker.model.bands
-    gains = bands.measure(jnp.where(finite[:, None], v_out, 0.0), lacking, offset)
+    gains = bands.measure(
+        jnp.where(finite[:, None], v_out, 0.0), lacking, jnp.where(unknown, 0.0, offset)
+    )
     signal = power(gains.gain) @ bands.weight
     noise = 2 * jnp.sum(bands.weight > 0, dtype=float) * gains.variance
     flat = (signal < FLAT * noise) | ~(amplitude > 0)
     level = jnp.sqrt(jnp.maximum(signal - noise, 0.0) / jnp.sum(bands.weight)) / relative
     bad = jax.vmap(
-        lambda finite, clipped, flat, unconnected: first_verdict(
+        lambda finite, clipped, unknown, flat, unconnected: first_verdict(
             (~finite, RESULTS.nonfinite_samples),
             (clipped, RESULTS.saturated),
+            (unknown, RESULTS.too_short),
             (flat, RESULTS.flat),
             (unconnected, RESULTS.unconnected),
         )
-    )(finite, clipped, flat, jnp.abs(level - 1) < 1 - changes.OPEN)
+    )(finite, clipped, unknown, flat, jnp.abs(level - 1) < 1 - changes.OPEN)
     return Measured(
         gain=gains.gain * as_complex(1 / relative)[:, None],
         variance=gains.variance / relative**2,
