@@ -209,6 +209,12 @@ def _parts(
     if not plan.split:
         return []
     by_pulses = plan.split == PAUSES
+    if by_pulses and "v_th" not in channels:
+        raise RecordingError(
+            "needs v_th, whose pauses separate the trials",
+            field="split",
+            remedy="Name the channel of a trigger",
+        )
     cause = "v_th" if "v_th" in channels else "current"
     asked = channels[cause] if by_pulses else channel(plan.split)
     for one in (*channels.values(), asked):

@@ -243,7 +243,7 @@ class Recording(Overviewed, AbstractFields):
             if trigger is None:
                 parts = by_pauses(self.v_th, self.sample_rate, self.pulse_rate)
             else:
-                parts = by_trigger(np.asarray(trigger, float), self.v_th.size)
+                parts = by_trigger(np.asarray(trigger, float), self.v_out.size)
         whole = self.path or self.metadata.kind
         return [
             self.replace(
