@@ -3,10 +3,13 @@
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import scipy.io
 
 import etid
 from etid.plotting import figure_of
+from etid.recordings.preflight import Inspected, preflight
 from etid.results.feed import MEASURED_CURRENT
+from tests.conftest import REFERENCE_DATA
 
 RATE, PULSES = 200e3, 60.0
 SKIN = etid.SkinRC(33e3, 186e3, 0.12e-9)
@@ -210,3 +213,38 @@ def test_an_estimator_that_needs_a_driver_says_so(skin, method):
 
 def test_a_measured_current_prints_itself():
     assert repr(MEASURED_CURRENT) == "Measured current"
+
+
+def test_a_current_that_its_source_holds_is_not_clipped(skin):
+    phase = skin.time % (1 / PULSES)
+    held = np.where((phase > 1e-3) & (phase < 2e-3), STRENGTH, 0.0)
+    assert preflight(Inspected(skin.replace(current=held, v_out=1e4 * held + skin.v_out))) is None
+
+
+ECOG = REFERENCE_DATA / "ecog_stim" / "20f8a3_stimOutput.mat"
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not ECOG.exists(), reason="reference data are not here")
+def test_electrodes_on_tissue_have_a_constant_phase_and_a_misfit():
+    """Platinum electrodes, 500 µA for 1.2 ms in each direction, as commanded."""
+    rate, rest, phase = 24414.0625, 40, 1.2e-3  # `rest` samples before the pulse replace the pause
+    found = scipy.io.loadmat(ECOG, squeeze_me=True, struct_as_record=False)["dataStruct"]
+    for name in found._fieldnames:
+        pair = getattr(found, name)
+        mean = pair.stim_data.mean(1)
+        v_out = np.concatenate([np.full(rest, mean[:18].mean()), mean])
+        since = np.arange(v_out.size) / rate - rest / rate + pair.time_vec[0] * 1e-3
+        on = [(since >= k * phase) & (since < (k + 1) * phase) for k in range(2)]
+        current = pair.stim_current * 1e-6 * (on[0].astype(float) - on[1])
+        recording = etid.Recording(
+            v_out=v_out, current=current, sample_rate=rate, pulse_rate=rate / v_out.size
+        )
+        selection = etid.select_circuit(
+            recording,
+            candidates=[etid.SkinRC(), etid.SkinCole()],
+            method="output_error",
+            throw=False,
+        )
+        assert type(selection.fit.circuit) is etid.SkinCole
+        assert selection.fit.verdict == "misfit"

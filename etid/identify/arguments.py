@@ -4,6 +4,7 @@ A wrong type, a wrong method or the wrong precision of JAX is refused with a mes
 """
 
 import dataclasses
+import functools
 import operator
 import reprlib
 from collections.abc import Iterable, Mapping, Sequence
@@ -110,13 +111,19 @@ def candidates_of(value: Circuit) -> tuple[AbstractCircuit, ...]:
     if isinstance(value, str) and value == AUTO:
         return CANDIDATES
     circuit = circuit_of(value)  # pyright: ignore[reportArgumentType]
-    if current_dependent(circuit.impedance()) is not None:
+    if _depends_on_current(type(circuit)):
         raise RecordingError(
             f"is {type(circuit).__name__}, which is not linear: it depends on its current",
             field="circuit",
             remedy="Use etid.identify_amplitudes",
         )
     return (circuit,)
+
+
+@functools.cache
+def _depends_on_current(kind: type[AbstractCircuit]) -> bool:
+    """Whether circuits of a class are not linear; kept, because every fit asks."""
+    return current_dependent(kind().impedance()) is not None
 
 
 def circuit_of(value: AbstractCircuit | None) -> AbstractCircuit:

@@ -455,7 +455,8 @@ def preflight(seen: Inspected, *, periodic: bool = False) -> str | None:
     noise = FLAT * np.array([seen.sigma_th, seen.sigma_out])
     if ((seen.spans <= noise) | (seen.spans == 0)).any():
         return "flat"
-    if _is_saturated(seen.recorded_th, seen.step_th, of):
+    # A current source holds its current, so a flat top of the current is no fault.
+    if not seen.has_current and _is_saturated(seen.recorded_th, seen.step_th, of):
         return "saturated"
     if _is_saturated(seen.recorded_out, seen.step_out, of):
         return "saturated"
