@@ -27,10 +27,11 @@ that explains most is reported.
 
 **Driver.** A change of Z_th by a factor moves the elements of all electrodes along one direction a,
 the powers of impedance to which the elements are proportional. z = aᵀS⁻¹d / √(aᵀS⁻¹a) is a normal
-variable for each electrode. The median of z over n electrodes has the standard deviation
-√(π/2n), and fewer than half of the electrodes cannot move it far. A change is the driver's if this
-median, or that of the moving means, exceeds `DRIVER` of its standard deviations, or if more than
-half of the electrodes jump at once. Skin that changes at all electrodes at once looks the same.
+variable for each electrode. Its deciles over n electrodes are ±1.282, with the standard deviation
+1.709/√n. A change is the driver's if nine tenths of the z lie on one side: if the lower decile
+of z, or of the z of the moving means, is `DRIVER` standard deviations above −1.282, or the
+upper one as far below 1.282. Half of the electrodes cannot do this. It is also the driver's if more than half of
+the electrodes jump at once. Skin that changes at all electrodes at once looks the same.
 """
 
 import dataclasses
@@ -48,7 +49,7 @@ from etid.solvers.matrices import inverse_of_few
 
 FALSE_ALARMS = 0.05  # per electrode and hour, expected if T and Q have exactly their distributions
 WEIGHT = 0.1  # λ, of the newest innovation in the moving mean
-DRIVER = 7.0  # standard deviations; one false alarm in 10^6 hours
+DRIVER = 9.0  # standard deviations; no false alarm is expected in a year
 COMMON = 8  # electrodes that are needed to tell the driver from the skin
 OPEN = 0.99  # effective gain above which an electrode touches nothing
 SHORTED = 0.02  # effective gain below which an electrode is shorted
@@ -131,9 +132,10 @@ def driver_change(
         counts: Electrodes that have a prediction and touch something.
     """
     number = jnp.sum(counts, dtype=float)
-    deviation = jnp.sqrt(math.pi / 2 / jnp.maximum(number, 1.0))
-    median = jnp.nanmedian(jnp.where(counts[None, :] & jnp.isfinite(z), z, jnp.nan), axis=1)
-    moved = jnp.any(jnp.abs(median) > DRIVER * deviation)
+    limit = DRIVER * 1.709 / jnp.sqrt(jnp.maximum(number, 1.0)) - 1.282
+    z = jnp.where(counts[None, :] & jnp.isfinite(z), z, jnp.nan)
+    low, high = jnp.nanquantile(z, 0.1, axis=1), jnp.nanquantile(z, 0.9, axis=1)
+    moved = jnp.any((low > limit) | (high < -limit))
     return (number >= COMMON) & (moved | (jnp.sum(jumped & counts, dtype=float) > number / 2))
 
 
