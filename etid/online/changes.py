@@ -29,9 +29,9 @@ that explains most is reported.
 the powers of impedance to which the elements are proportional. z = aᵀS⁻¹d / √(aᵀS⁻¹a) is a normal
 variable for each electrode. Its deciles over n electrodes are ±1.282, with the standard deviation
 1.709/√n. A change is the driver's if nine tenths of the z lie on one side: if the lower decile
-of z, or of the z of the moving means, is `DRIVER` standard deviations above −1.282, or the
-upper one as far below 1.282. Half of the electrodes cannot do this. It is also the driver's if more than half of
-the electrodes jump at once. Skin that changes at all electrodes at once looks the same.
+of z, or of the z of the moving means, is `DRIVER` standard deviations above −1.282, or the upper
+one as far below 1.282. Half of the electrodes cannot do this. It is also the driver's if more than
+half of the electrodes jump at once. Skin that changes at all electrodes at once looks the same.
 """
 
 import dataclasses
