@@ -7,6 +7,7 @@ derives everything else from the circuit: filter, fit, covariance, text with uni
 
 import abc
 import dataclasses
+import functools
 from typing import Any, ClassVar, TypeVar
 
 import equinox as eqx
@@ -132,7 +133,7 @@ class AbstractCircuit(Overviewed, eqx.Module):
 
     def exponents(self) -> tuple[Quantity, ...]:
         """Exponents α of the powers of s in the impedance; empty for a ratio of polynomials."""
-        return self.impedance().exponents()
+        return self.impedance().exponents() if _has_exponents(type(self)) else ()
 
     def is_too_steep(self, cov: Float[Array, "parameter parameter"]) -> Bool[Array, ""]:
         """Whether an exponent α exceeds 1 by more than `ABOVE_ONE` standard errors.
@@ -166,6 +167,12 @@ class AbstractCircuit(Overviewed, eqx.Module):
             return eqx.tree_pformat(self)
         elements = (f"{name}={text.strip()} {unit}".rstrip() for name, text, unit in overview.rows)
         return f"{type(self).__name__}({', '.join(elements)})"
+
+
+@functools.cache
+def _has_exponents(kind: type[AbstractCircuit]) -> bool:
+    """Whether the impedance of a class has exponents; building an impedance takes long."""
+    return bool(kind().impedance().exponents())
 
 
 class SkinRC(AbstractCircuit):
