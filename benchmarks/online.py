@@ -67,7 +67,7 @@ def _problem(electrodes: int, lifted: int) -> tuple[etid.Tracker, np.ndarray]:
     records = list(study.loaded.recordings())
     v_out = np.stack([r.v_th if i < lifted else r.v_out for i, r in enumerate(records)])
     three = tracker.pulses(v_out)
-    noise = np.random.default_rng(1).standard_normal((KINDS // 3, 3, 1, three.shape[-1]))
-    # As much noise again as the records have; the same at all electrodes, which time does not know.
+    noise = np.random.default_rng(1).standard_normal((KINDS // 3, *three.shape))
+    # As much noise again as the records have. Common noise would look like the driver.
     many = three[None] + 0.01 * noise
     return tracker, many.reshape(-1, *three.shape[1:])
