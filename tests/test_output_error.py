@@ -108,6 +108,7 @@ def test_the_noise_of_a_record_is_no_information():
     for sigma, of in ((0.7, k), (0.3, h0)):
         moved = np.stack([np.correlate(np.pad(c, of.size), of, "valid") for c in slope.T])
         score += sigma**2 * moved @ moved.T / s
+    score += np.diag(precision)  # what is drawn from its prior
     np.testing.assert_allclose(found.score, score, rtol=1e-9, atol=1e-9 * np.abs(score).max())
 
 

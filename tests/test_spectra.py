@@ -124,7 +124,8 @@ def test_the_share_of_signal_of_one_lane_does_not_depend_on_the_others():
         box = np.ones(25)
         share = 1 - np.convolve(noise, box, "same") / np.convolve(power, box, "same")
         np.testing.assert_allclose(alone, np.clip(share, 0, 1), rtol=1e-12)
-        np.testing.assert_array_equal(together[lane], alone)
+        # A batch may add the same numbers in another order.
+        np.testing.assert_allclose(together[lane], alone, rtol=1e-14)
 
 
 BUSY = """
