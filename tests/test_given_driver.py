@@ -8,6 +8,7 @@ from jax.flatten_util import ravel_pytree
 
 import etid
 from etid.estimators.estimate import DELAY_WIDTH, prior
+from etid.estimators.maximum_likelihood.given_driver import GivenDriver
 from etid.estimators.registry import MAXIMUM_LIKELIHOOD
 from etid.signals.harmonics import spectrum
 from etid.signals.noise import noise
@@ -71,6 +72,7 @@ def test_what_a_calibration_tells_is_one_standard_deviation_along_each_direction
     """z is scaled by the information, so that its covariance is 1, and its mean next to 0."""
     frequency = driver.spectra.frequency[0]
     known = MAXIMUM_LIKELIHOOD.known(driver, frequency, False)
+    assert isinstance(known, GivenDriver)
     of = np.linalg.eigvalsh(np.asarray(known.cov))
     assert of.min() > 0.8, of
     assert of.max() < 1.6, of
