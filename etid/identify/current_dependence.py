@@ -51,8 +51,9 @@ def falls_with_current(lane: AbstractLane, feed: AbstractFeed, circuit: Abstract
     points = np.fft.irfft(np.append(0.0, u), norm="forward")
     added = np.fft.rfft(-np.abs(points) * points, norm="forward")[1 : u.size + 1]
     shape = sensitivity * (z - z[-1].real) * added
-    columns = [_parts(weight * of) for of in nuisances]
-    basis = np.linalg.qr(np.stack([of / np.linalg.norm(of) for of in columns], axis=1))[0]
+    columns = np.stack([_parts(weight * of) for of in nuisances], axis=1)
+    sizes = np.linalg.norm(columns, axis=0)  # 0 for an element without any effect
+    basis = np.linalg.qr(columns[:, sizes > 0] / sizes[sizes > 0])[0]
     row = _parts(weight * shape)
     row = row - basis @ (basis.T @ row)
     residual = _parts(r)
