@@ -20,6 +20,14 @@ DRIVERS = {
 }
 
 
+# JAX has eigenvalues on GPUs, but does not promise that their files stay readable.
+UNSTABLE = [jax.export.DisabledSafetyCheck.custom_call("cuhybrid_eig_real")]
+
+
+class _Missing(BaseException):
+    """An operation of a program is not there."""
+
+
 class _Lowered(BaseException):
     """A program was lowered. It need not be compiled and run: that takes ten times as long."""
 
@@ -47,7 +55,11 @@ def lowered(tmp_path, monkeypatch):
     def export(function, **options):
         def on(*shapes):
             if function.__name__ in awaited:
-                assert for_here(function, platforms=("cuda",))(*shapes).platforms == ("cuda",)
+                lower = for_here(function, platforms=("cuda",), disabled_checks=UNSTABLE)
+                try:
+                    lower(*shapes)
+                except Exception as error:  # the store would go on without a file
+                    raise _Missing(str(error)) from error
                 raise _Lowered
             return for_here(function, **options)(*shapes)
 

@@ -246,7 +246,10 @@ def attribute(owner: h5py.HLObject, name: str) -> Any:
     size = math.prod(stored.shape or ()) * stored.dtype.itemsize
     if size > limits.ATTRIBUTE:
         raise ValueError(f"it has {size} bytes, at most {limits.ATTRIBUTE} are read")
-    return owner.attrs[name]
+    value = owner.attrs[name]
+    if isinstance(value, str):  # damaged bytes; a text with them could not be written again
+        return value.encode("utf-8", "surrogateescape").decode("utf-8", "replace")
+    return value
 
 
 def check_size(dataset: h5py.Dataset) -> None:

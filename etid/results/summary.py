@@ -9,6 +9,7 @@ if TYPE_CHECKING:
     from etid.results.fits import Fits
 
 
+@np.errstate(over="ignore", invalid="ignore")  # of a damaged file
 def summary(fits: "Fits", by: Sequence[str]) -> list[dict[str, Any]]:
     """The rows of `Fits.summary`."""
     columns = [map(str, fits.labels[name].tolist()) for name in by]
