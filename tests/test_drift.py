@@ -82,7 +82,9 @@ def test_standard_errors_hold_what_the_parts_of_the_driver_drift_by(driver, name
         recordings.append(scene.simulate(seed=number + 10)[trial.path])
     fits = etid.identify_skins(recordings, driver)
     # What has drifted by several times 1 % is seen: 11 of 200.
-    assert set(fits.counts()) <= {"successful", "inconsistent"}
+    assert set(fits.counts()) <= {"successful", "inconsistent", "changed"}
+    # One recording of a thousand seems to change; three of 200 are as rare as one in a thousand.
+    assert fits.counts().get("changed", 0) < 3
     good = fits.successful()
     assert len(good) > 0.9 * DRIVERS
     error = np.asarray(good.circuit.values()) - np.array(dataclasses.astuple(LOADS[name]))
