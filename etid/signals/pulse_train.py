@@ -100,6 +100,7 @@ def _counted(rate: float) -> str:
     return f"{float(f'{rate:.4g}'):.9g}"
 
 
+@np.errstate(over="ignore", invalid="ignore")  # of a damaged file
 def find_pulses(v: Float[np.ndarray, " time"], sample_rate: float, pulse_rate: float) -> PulseTrain:
     """Find the pulses of an unloaded record.
 
@@ -115,8 +116,7 @@ def find_pulses(v: Float[np.ndarray, " time"], sample_rate: float, pulse_rate: f
     period = sample_rate / pulse_rate
     step = max(1, int(period / COARSE))
     whole = v.size // step * step
-    with np.errstate(over="ignore", invalid="ignore"):  # of a damaged file
-        coarse = np.add.reduceat(v[:whole], np.arange(0, whole, step)) / step if whole else v[:0]
+    coarse = np.add.reduceat(v[:whole], np.arange(0, whole, step)) / step if whole else v[:0]
     if coarse.size == 0 or not np.isfinite(coarse).all():
         return PulseTrain(np.zeros(0, int), None, v.size, sample_rate, pulse_rate)
     coarse = coarse - coarse.mean()
