@@ -9,7 +9,7 @@ from etid.circuits.circuit import AbstractCircuit
 from etid.circuits.current_dependent import SkinCurrent, current_dependent
 from etid.estimators import judgement
 from etid.estimators.amplitudes.fit import fit_amplitudes
-from etid.estimators.amplitudes.terms import Amplitudes
+from etid.estimators.amplitudes.terms import Amplitudes, currents
 from etid.estimators.estimator import serving
 from etid.estimators.lanes import Harmonics, stacked
 from etid.estimators.maximum_likelihood.estimator import description
@@ -49,14 +49,8 @@ def _fit(
     of = Amplitudes(known, feed, circuit, lanes.spectrum, rate)
     estimate = fit_amplitudes(of)
     fit = judgement.judged(estimate, circuit, feed.result, METHOD)
-    unsure = [
-        error > judgement.NO_CURRENT
-        for error, unit in zip(
-            jnp.sqrt(jnp.diagonal(estimate.cov)), circuit.units().values(), strict=True
-        )
-        if unit == "ampere"
-    ]
-    return judgement.unless(fit, jnp.any(jnp.array(unsure, bool)), RESULTS.insensitive)
+    unsure = jnp.sqrt(jnp.diagonal(estimate.cov)) > judgement.NO_CURRENT
+    return judgement.unless(fit, jnp.any(unsure & currents(circuit)), RESULTS.insensitive)
 
 
 def identify_amplitudes(

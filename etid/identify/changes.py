@@ -37,6 +37,7 @@ from etid.results.driver import Driver
 from etid.results.feed import AbstractFeed
 from etid.results.fits import Fit
 from etid.results.verdicts import verdict
+from etid.signals.harmonics import real_parts
 from etid.signals.transfer import frequency_variable, reciprocal
 
 ALARM = 1e-3  # probability of a false alarm in a record without a change
@@ -203,7 +204,7 @@ def _equations(
     rows = np.concatenate([slopes, nuisance], axis=1)
     # As for the deviations, polynomials are projected out.
     smooth = np.real(rows @ of.smooth.conj().swapaxes(1, 2)) @ of.smooth
-    rows = _real(rows - smooth / of.power[:, None])
+    rows = real_parts(rows - smooth / of.power[:, None])
     weight = np.tile(1 / of.variance, 2)[:, None]
     unit = np.sqrt((rows**2 * weight).sum(2))
     unit = np.where(unit > 0, unit, 1.0)
@@ -211,14 +212,9 @@ def _equations(
     weighted = (rows * weight).swapaxes(1, 2)
     below = np.tile(~high, 2)[:, None]
     low, whole = np.where(below, rows, 0.0) @ weighted, rows @ weighted
-    deviation = _real(np.where(high[:, None], turned, plain))
+    deviation = real_parts(np.where(high[:, None], turned, plain))
     total = (deviation**2 * weight).sum(2)
-    return low, whole, deviation @ weighted, _real(plain) @ weighted, unit, total
-
-
-def _real(values: np.ndarray) -> np.ndarray:
-    """Real parts, then imaginary parts."""
-    return np.concatenate([np.real(values), np.imag(values)], axis=-1)
+    return low, whole, deviation @ weighted, real_parts(plain) @ weighted, unit, total
 
 
 def _solved(

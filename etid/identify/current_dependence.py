@@ -7,11 +7,12 @@ finds this signal in a misfit, and it explains half of the excess of χ², the f
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Complex, Float
+from jaxtyping import Complex
 
 from etid.circuits.circuit import AbstractCircuit
 from etid.estimators.lanes import AbstractLane, Harmonics
 from etid.results.feed import AbstractFeed
+from etid.signals.harmonics import real_parts
 from etid.signals.pulse_train import rest
 
 SEEN = 5.0  # standard deviations
@@ -51,17 +52,13 @@ def falls_with_current(lane: AbstractLane, feed: AbstractFeed, circuit: Abstract
     points = np.fft.irfft(np.append(0.0, u), norm="forward")
     added = np.fft.rfft(-np.abs(points) * points, norm="forward")[1 : u.size + 1]
     shape = sensitivity * (z - z[-1].real) * added
-    columns = np.stack([_parts(weight * of) for of in nuisances], axis=1)
+    columns = np.stack([real_parts(weight * of) for of in nuisances], axis=1)
     sizes = np.linalg.norm(columns, axis=0)  # 0 for an element without any effect
     basis = np.linalg.qr(columns[:, sizes > 0] / sizes[sizes > 0])[0]
-    row = _parts(weight * shape)
+    row = real_parts(weight * shape)
     row = row - basis @ (basis.T @ row)
-    residual = _parts(r)
+    residual = real_parts(r)
     size = np.linalg.norm(row)  # 0 for a resistor in series only
     score = row @ residual / size if size > 0 else 0.0
     excess = residual @ residual - 2 * np.sum(lane.selected)
     return bool(score > SEEN and score**2 > SHARE * excess)
-
-
-def _parts(value: Complex[np.ndarray, " harmonic"]) -> Float[np.ndarray, " part"]:
-    return np.concatenate([np.real(value), np.imag(value)])

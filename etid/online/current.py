@@ -27,6 +27,7 @@ from jaxtyping import Array, Complex, Float
 from etid.circuits.circuit import AbstractCircuit
 from etid.estimators.maximum_likelihood.given_driver import GivenDriver
 from etid.online.gain_bands import Bands
+from etid.signals.harmonics import real_parts
 from etid.signals.transfer import as_complex, reciprocal
 
 EDGE = 24  # [samples] after each edge that are looked at in steps of `FINE`
@@ -110,11 +111,11 @@ class CurrentModel(eqx.Module):
     def waveform(self, circuit: AbstractCircuit) -> Float[Array, " time"]:
         """Current through a load at `times`, per unit of relative amplitude [A]."""
         admittance = reciprocal(circuit.response(self.frequency) + self.source)
-        return self.sums[1:] @ _parts(admittance)
+        return self.sums[1:] @ real_parts(admittance)
 
     def short_circuit(self) -> Float[Array, " time"]:
         """Current through a short circuit at `times`, per unit of relative amplitude [A]."""
-        return self.sums[1:] @ _parts(reciprocal(self.source))
+        return self.sums[1:] @ real_parts(reciprocal(self.source))
 
     def current(
         self,
@@ -134,21 +135,16 @@ class CurrentModel(eqx.Module):
             return circuit.with_log_values(logs).response(self.frequency)
 
         admittance = reciprocal(load(logs) + self.source)
-        found = self.sums @ _parts(admittance)
+        found = self.sums @ real_parts(admittance)
         at = 1 + jnp.argmax(jnp.abs(found[1:]))
         rows = jnp.stack([self.sums[0], self.sums[at]])
         by_element = jax.vmap(lambda v: jax.jvp(load, (logs,), (v,))[1])(jnp.eye(logs.size))
-        own = rows @ _parts(by_element * (admittance * admittance)[None, :]).T
-        shared = rows @ _parts(self.by_source * admittance[None, :]).T
+        own = rows @ real_parts(by_element * (admittance * admittance)[None, :]).T
+        shared = rows @ real_parts(self.by_source * admittance[None, :]).T
         variance = jnp.sum((own @ cov) * own, axis=1)
         variance = variance + jnp.sum((shared @ self.source_cov) * shared, axis=1)
         charge_stderr, peak_stderr = jnp.sqrt(variance)
         return Current(found[0], charge_stderr, jnp.abs(found[at]), peak_stderr)
-
-
-def _parts(values: Complex[Array, "*row band"]) -> Float[Array, "*row part"]:
-    """Real and imaginary parts, one after the other."""
-    return jnp.concatenate([values.real, values.imag], axis=-1)
 
 
 def _phase(v: Float[np.ndarray, " sample"]) -> tuple[float, float]:

@@ -12,6 +12,7 @@ from etid.online.pulse_fit import DELAYS, GainModel, Pulse
 from etid.online.state import ElectrodeState
 from etid.results.fits import Fit
 from etid.results.verdicts import RESULTS, first_verdict
+from etid.signals.harmonics import real_parts
 from etid.signals.transfer import as_complex, power, reciprocal
 from etid.solvers.matrices import inverse
 
@@ -79,7 +80,7 @@ def fit_of(
     loaded = model.source + as_complex(known.resistance)
     by_w = as_complex(jnp.sqrt(weight)) * z * loaded * admittance * admittance
     by_z = by_w[None, :] * known.slope
-    of_z = by_term @ jnp.concatenate([by_z.real, by_z.imag], axis=1).T
+    of_z = by_term @ real_parts(by_z).T
     # The noise of X is the same in every pulse. It enters Ĝ multiplied by G.
     of_x = jnp.tile(power(gain) * bands.variance_x / state.variance, 2)
     shared = of_z @ known.cov @ of_z.T + (by_term * of_x[None, :]) @ by_term.T

@@ -13,6 +13,7 @@ because anti-alias filters are imperfect there.
 import functools
 import math
 from types import ModuleType
+from typing import TypeVar
 
 import equinox as eqx
 import jax
@@ -21,6 +22,8 @@ import numpy as np
 from jaxtyping import Array, Bool, Complex, Float
 
 from etid.signals.transfer import power
+
+Values = TypeVar("Values", Array, np.ndarray)
 
 WINDOW = 25  # harmonics over which power is averaged
 ALIASED = 0.35  # of the sample rate; above, aliases matter unless they fall between the harmonics
@@ -92,6 +95,12 @@ def harmonics(
 def namespace(v: Array | np.ndarray) -> ModuleType:
     """NumPy for NumPy arrays, so that nothing is compiled for each shape; JAX for all others."""
     return np if isinstance(v, np.ndarray) else jnp
+
+
+def real_parts(values: Values) -> Values:
+    """Real parts, then imaginary parts, along the last axis."""
+    of = namespace(values)
+    return of.concatenate([of.real(values), of.imag(values)], axis=-1)
 
 
 def _sums(v: Array | np.ndarray, periods: int) -> Array | np.ndarray:

@@ -5,13 +5,15 @@ import dataclasses
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Float
 
-from etid.estimators.amplitudes.terms import Amplitudes
+from etid.estimators.amplitudes.terms import Amplitudes, currents
 from etid.estimators.estimate import MAX_STEPS, SOLVER, Estimate
 from etid.estimators.maximum_likelihood.terms import denoised, excess, residual
 from etid.estimators.sandwich import Curvature, Linear
+from etid.estimators.unknowns import LoadUnknowns
 from etid.results.fits import complex_rrse
 from etid.signals.harmonics import Spectrum
 from etid.solvers.levenberg_marquardt import LevenbergMarquardt, NormalEquations, best_start
@@ -40,12 +42,13 @@ def starts(of: Amplitudes) -> Float[Array, "start q"]:
     starts = of.given.starts(spectrum, of.sample_rate, of.circuit).log_elements
 
     def linear(log_elements: Float[Array, " element"]) -> Float[Array, " part"]:
-        return residual(spectrum, of.gain(log_elements, of.given.mean, spectrum))
+        own = LoadUnknowns(log_elements, jnp.zeros(())).vector()
+        return residual(spectrum, of.gain(spectrum)(own))
 
     likely = best_start(linear, starts)
-    currents = [unit == "ampere" for unit in of.circuit.units().values()]
-    levels = CURRENTS if any(currents) else CURRENTS[:1]
-    by_current = jnp.log(jnp.array(levels))[:, None] * jnp.array(currents, float)[None, :]
+    of_current = currents(of.circuit)
+    levels = CURRENTS if of_current.any() else CURRENTS[:1]
+    by_current = jnp.asarray(np.outer(np.log(levels), of_current))
     return jax.vmap(lambda by: of.start(likely + by))(by_current)
 
 
@@ -69,16 +72,16 @@ def fit_amplitudes(of: Amplitudes) -> Estimate:
     log_elements, late, z = of.split(q)
 
     # The derivatives at denoised data: noise in them would count as information.
-    def clean(each: tuple[Array, Spectrum]) -> tuple[Spectrum, Array, Array]:
-        late, spectrum = each
-        [quiet], [share] = denoised([spectrum], [of.gain(log_elements, z, spectrum)])
+    def clean(each: tuple[Array, Spectrum]) -> tuple[Spectrum, Array]:
+        own, spectrum = each
+        [quiet], [share] = denoised([spectrum], [of.gain(spectrum).undelayed(own)])
         quiet = eqx.tree_at(lambda s: s.x, spectrum, quiet.x)
-        y = of.predicted(q, late, quiet)
-        return eqx.tree_at(lambda s: s.y, quiet, y), share, of.predicted(q, late, spectrum)
+        return eqx.tree_at(lambda s: s.y, quiet, of.predicted(own, quiet)), share
 
-    quiet, share, predicted = jax.lax.map(clean, (late, of.spectra))
+    quiet, share = jax.lax.map(clean, (of.own(q), of.spectra))
     _, slopes = dataclasses.replace(of, spectra=quiet).slopes(q)
-    part = of.terms(q)
+    predicted = jax.lax.map(lambda each: of.predicted(*each), (of.own(q), of.spectra))
+    part = of.scaled(q, predicted)
     noise = jax.vmap(excess)(part, of.spectra.selected)
     parts = jax.vmap(lambda *linear: Linear(*linear).curvature())(slopes, share, noise)
     prior = 1 / of.widths(q) ** 2

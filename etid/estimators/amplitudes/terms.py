@@ -12,16 +12,19 @@ is small, so that the linear gain at small currents weights it.
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Complex, Float
+import numpy as np
+from jaxtyping import Array, Bool, Complex, Float
 
 from etid.circuits.circuit import AbstractCircuit
 from etid.circuits.current_dependent import Norton, Signals, current_dependent, port
-from etid.estimators.maximum_likelihood.given_driver import AbstractGiven, GivenDriver, combined
+from etid.estimators.maximum_likelihood.gain import Gain
+from etid.estimators.maximum_likelihood.given_driver import AbstractGiven, GivenDriver
 from etid.estimators.maximum_likelihood.terms import variance
+from etid.estimators.unknowns import LoadUnknowns
 from etid.results.driver import HarmonicDriver
 from etid.results.feed import MeasuredCurrent
-from etid.signals.harmonics import Spectrum
-from etid.signals.transfer import as_complex, frequency_variable, reciprocal, turns
+from etid.signals.harmonics import Spectrum, real_parts
+from etid.signals.transfer import as_complex, frequency_variable, reciprocal
 from etid.solvers.harmonic_balance import steady_state, to_time
 
 BEYOND = 2  # harmonics of the balance, as a multiple of those of the records
@@ -78,49 +81,47 @@ class Amplitudes(eqx.Module):
 
     def widths(self, q: Float[Array, " q"]) -> Float[Array, " q"]:
         """Prior standard deviations of the unknowns."""
-        units = self.circuit.units().values()
-        own = [CURRENT_WIDTH if unit == "ampere" else jnp.inf for unit in units]
+        own = jnp.where(currents(self.circuit), CURRENT_WIDTH, jnp.inf)
         delays = jnp.broadcast_to(self.given.delay_width, (self.count,))
         rest = jnp.ones(q.size - self.elements - self.count)
-        return jnp.concatenate([jnp.array(own), delays, rest])
+        return jnp.concatenate([own, delays, rest])
 
-    def w(
-        self, z: Float[Array, " z"], frequency: Float[Array, " harmonic"]
-    ) -> Complex[Array, " harmonic"]:
-        """W − W₀ at the harmonics of a record."""
-        off = jnp.log(frequency[0] / self.given.frequency[0])
-        return as_complex(off) * self.given.w_slope + combined(z, self.given.slope)
+    def own(self, q: Float[Array, " q"]) -> Float[Array, "record own"]:
+        """The unknowns of each record, in the order of `Gain`."""
+        log_elements, late, z = self.split(q)
 
-    def gain(
-        self, log_elements: Float[Array, " element"], z: Float[Array, " z"], spectrum: Spectrum
-    ) -> Complex[Array, " harmonic"]:
-        """Linear gain at small currents."""
-        load = self.circuit.with_log_values(log_elements).response(spectrum.frequency)
-        return self.given.gain(load, self.w(z, spectrum.frequency))
+        def one(late: Float[Array, ""]) -> Float[Array, " own"]:
+            return jnp.concatenate([LoadUnknowns(log_elements, late).vector(), z])
+
+        return jax.vmap(one)(late)
+
+    def gain(self, spectrum: Spectrum) -> Gain:
+        """Linear gain of a record at small currents."""
+        return Gain(self.given, self.circuit, spectrum.frequency, self.sample_rate)
 
     def source(
-        self, z: Float[Array, " z"], spectrum: Spectrum, frequency: Float[Array, " wide"]
+        self, own: Float[Array, " own"], spectrum: Spectrum, frequency: Float[Array, " wide"]
     ) -> Norton:
         """The source of a record, at all frequencies of the balance."""
         known, room = spectrum.frequency.size, frequency.size - spectrum.frequency.size - 1
         x = jnp.pad(jnp.where(spectrum.selected, spectrum.x, 0.0), (1, room))
         if not isinstance(self.given, GivenDriver) or isinstance(self.feed, MeasuredCurrent):
             return Norton(x, jnp.zeros_like(x))
-        near = self.given.z_th(self.w(z, spectrum.frequency))
+        gain = self.gain(spectrum)
+        near = self.given.z_th(gain.w(gain.split(own)[1]))
         admittance = reciprocal(self.feed.response(frequency).at[1 : known + 1].set(near))
         return Norton(x * admittance, admittance)
 
-    def loaded(
-        self, log_elements: Float[Array, " element"], z: Float[Array, " z"], spectrum: Spectrum
-    ) -> Complex[Array, " harmonic"]:
+    def loaded(self, own: Float[Array, " own"], spectrum: Spectrum) -> Complex[Array, " harmonic"]:
         """Fourier coefficients of V_out [V], without delay."""
-        impedance = self.circuit.with_log_values(log_elements).impedance()
+        gain = self.gain(spectrum)
+        impedance = gain.impedance(own)
         if current_dependent(impedance) is None:
-            return self.gain(log_elements, z, spectrum) * spectrum.x
+            return gain.undelayed(own) * spectrum.x
         known = spectrum.frequency.size
         number = jnp.arange(BEYOND * known + 1.0).at[0].set(STILL)
         frequency = spectrum.frequency[0] * number
-        source = self.source(z, spectrum, frequency)
+        source = self.source(own, spectrum, frequency)
         at = port(impedance, source, frequency_variable(frequency))
         r = as_complex(jnp.asarray(at.element.r))
         small = at.source.current * reciprocal(1 + at.source.admittance * r)
@@ -130,30 +131,32 @@ class Amplitudes(eqx.Module):
         return at.outwards(signals).voltage[1 : known + 1]
 
     def predicted(
-        self, q: Float[Array, " q"], late: Float[Array, ""], spectrum: Spectrum
+        self, own: Float[Array, " own"], spectrum: Spectrum
     ) -> Complex[Array, " harmonic"]:
-        """Fourier coefficients of V_out [V] of a record with this delay [samples]."""
-        log_elements, _, z = self.split(q)
-        f = spectrum.frequency
-        delay = turns(-f[0] * late / self.sample_rate, f.size)
-        return self.loaded(log_elements, z, spectrum) * delay
+        """Fourier coefficients of V_out [V] of a record."""
+        return self.gain(spectrum).turned(own, self.loaded(own, spectrum))
 
-    def weight(self, q: Float[Array, " q"], spectrum: Spectrum) -> Complex[Array, " harmonic"]:
+    def weight(self, own: Float[Array, " own"], spectrum: Spectrum) -> Complex[Array, " harmonic"]:
         """1/σ of both parts of a term; 0 where a harmonic is not used."""
-        log_elements, _, z = self.split(q)
-        expected = variance(spectrum, self.gain(log_elements, z, spectrum))
+        expected = variance(spectrum, self.gain(spectrum).undelayed(own))
         return as_complex(jnp.where(spectrum.selected, jnp.sqrt(2 / expected), 0.0))
 
     def residual(
-        self, q: Float[Array, " q"], late: Float[Array, ""], spectrum: Spectrum
+        self, own: Float[Array, " own"], spectrum: Spectrum
     ) -> Complex[Array, " harmonic"]:
         """Terms of one record."""
-        return (spectrum.y - self.predicted(q, late, spectrum)) * self.weight(q, spectrum)
+        return (spectrum.y - self.predicted(own, spectrum)) * self.weight(own, spectrum)
 
     def terms(self, q: Float[Array, " q"]) -> Float[Array, "record part"]:
         """Terms of all records."""
-        late = self.split(q)[1]
-        return jax.lax.map(lambda of: _parts(self.residual(q, *of)), (late, self.spectra))
+        return jax.lax.map(lambda of: real_parts(self.residual(*of)), (self.own(q), self.spectra))
+
+    def scaled(
+        self, q: Float[Array, " q"], predicted: Complex[Array, "record harmonic"]
+    ) -> Float[Array, "record part"]:
+        """The same, from predictions that are known already."""
+        weight = jax.vmap(self.weight)(self.own(q), self.spectra)
+        return real_parts((self.spectra.y - predicted) * weight)
 
     def __call__(self, q: Float[Array, " q"]) -> Float[Array, " term"]:
         """All terms."""
@@ -164,26 +167,27 @@ class Amplitudes(eqx.Module):
     ) -> tuple[Float[Array, "record part"], Float[Array, "record q part"]]:
         """Terms of each record, and their derivatives with respect to all unknowns."""
         first, last = self.elements, self.elements + self.count
+        others = jnp.delete(q, slice(first, last))  # all but the delays
 
         def one(of: tuple[Array, Array, Spectrum]) -> tuple[Array, Array]:
-            number, late, spectrum = of
+            number, own, spectrum = of
 
-            def along(rest: Float[Array, " rest"]) -> tuple[Array, Array]:
-                there = jnp.concatenate([rest[:first], q[first:last], rest[first:]])
-                part = self.residual(there, late, spectrum)
+            def along(others: Float[Array, " other"]) -> tuple[Array, Array]:
+                there = jnp.concatenate([others[:first], q[first:last], others[first:]])
+                part = self.residual(self.own(there)[number], spectrum)
                 return part, part
 
-            by_rest, part = jax.jacfwd(along, has_aux=True)(jnp.delete(q, slice(first, last)))
-            turned = self.predicted(q, late, spectrum) * self.weight(q, spectrum)
-            by_delay = turned * as_complex(2 * jnp.pi * spectrum.frequency / self.sample_rate) * 1j
+            by_other, part = jax.jacfwd(along, has_aux=True)(others)
+            weighted = spectrum.y * self.weight(own, spectrum) - part  # the prediction
+            s = frequency_variable(spectrum.frequency)
+            by_delay = weighted * s * as_complex(1 / self.sample_rate)
             rows = jnp.zeros((self.count, by_delay.size), by_delay.dtype).at[number].set(by_delay)
-            whole = jnp.concatenate([by_rest.T[:first], rows, by_rest.T[first:]])
-            return _parts(part), _parts(whole)
+            whole = jnp.concatenate([by_other.T[:first], rows, by_other.T[first:]])
+            return real_parts(part), real_parts(whole)
 
-        late = self.split(q)[1]
-        return jax.lax.map(one, (jnp.arange(self.count), late, self.spectra))
+        return jax.lax.map(one, (jnp.arange(self.count), self.own(q), self.spectra))
 
 
-def _parts(value: Complex[Array, "*row harmonic"]) -> Float[Array, "*row part"]:
-    """Real and imaginary parts along the last axis."""
-    return jnp.concatenate([value.real, value.imag], axis=-1)
+def currents(circuit: AbstractCircuit) -> Bool[np.ndarray, " element"]:
+    """Which elements of a circuit are currents."""
+    return np.array([unit == "ampere" for unit in circuit.units().values()])

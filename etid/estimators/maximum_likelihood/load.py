@@ -39,7 +39,7 @@ from etid.estimators.sandwich import Linear
 from etid.estimators.score_tests import other_circuit
 from etid.estimators.unknowns import LoadUnknowns
 from etid.results.fits import Support, complex_rrse
-from etid.signals.harmonics import Spectrum, signal_share
+from etid.signals.harmonics import Spectrum, real_parts, signal_share
 from etid.signals.knots import Knots, knots
 from etid.signals.transfer import as_complex, power, reciprocal, turns
 from etid.solvers.levenberg_marquardt import LevenbergMarquardt, NormalEquations, best_start
@@ -146,7 +146,7 @@ class AtKnots(eqx.Module):
     def rows(self, slopes: Complex[Array, "row knot"]) -> Float[Array, "row part"]:
         """Derivatives of the terms, from those of the gain."""
         rows = slopes * as_complex(jnp.sqrt(self.sums.power))[None, :]
-        return -jnp.concatenate([rows.real, rows.imag], axis=1)
+        return -real_parts(rows)
 
     def by_unknown(self, slopes: Slopes) -> Complex[Array, "q knot"]:
         """Derivatives of G X/x̂ with respect to the parameters."""
@@ -168,7 +168,7 @@ class AtKnots(eqx.Module):
         if of.by_z is not None and of.shift is not None:
             change = change + gain * (of.shift + (combined(z, of.by_z) if z.size else 0.0))
         score = of.score * as_complex(1 / jnp.sqrt(jnp.where(of.power > 0, of.power, 1.0)))
-        return jnp.concatenate([score.real, score.imag]) + self.rows(change[None, :])[0]
+        return real_parts(score) + self.rows(change[None, :])[0]
 
     def __call__(self, q: Float[Array, " q"]) -> Float[Array, " term"]:
         """Terms at `q` and the priors."""
@@ -377,7 +377,7 @@ def fit_circuit(
     gain = changes[-1] - combined(others, around.at.by_unknown(around.slopes))
     weight = jnp.where(known.selected, jnp.sqrt(2 / variance(known, g)), 0.0)
     explained = as_complex(found.size[-1] * weight) * around.x * load.knots.between(gain)
-    rest = part + jnp.concatenate([explained.real, explained.imag])
+    rest = part + real_parts(explained)
     rest = jnp.sum(rest.reshape(2, -1) ** 2, axis=0) / 2
     wrong_gain = (jnp.abs(found.z[-1]) > NO_HUM) & ~stands_out(rest, known)
     # Part of the noise that only this trial has: all, or that of V_out if V_th is shared.

@@ -18,7 +18,7 @@ from etid.estimators.sandwich import Linear
 from etid.estimators.score_tests import other_circuit
 from etid.estimators.unknowns import LoadUnknowns
 from etid.results.driver import ContinuousDriver
-from etid.signals.harmonics import Spectrum
+from etid.signals.harmonics import Spectrum, real_parts
 from etid.signals.transfer import as_complex, frequency_variable, reciprocal, turns
 from etid.solvers.matrices import root
 
@@ -76,7 +76,7 @@ def scores(
         [clean], [share] = denoised([spectrum], [g])
         weight = jnp.where(spectrum.selected, jnp.sqrt(2 / variance(spectrum, g)), 0.0)
         rows = slopes * (-clean.x * as_complex(weight))[None, :]
-        return jnp.concatenate([rows.real, rows.imag], axis=1), share
+        return real_parts(rows), share
 
     rows, share = apart(of_residual, own.vector())
     count = elements + 1 + vector.size
