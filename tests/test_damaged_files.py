@@ -2,6 +2,7 @@
 
 import gc
 import re
+import tracemalloc
 
 import h5py
 import numpy as np
@@ -228,7 +229,41 @@ def test_a_wrong_attribute_is_one_error_that_names_it(fits, name, value, message
         StudyFits.read(fits)
 
 
+@pytest.mark.parametrize("rows", [1, 6])
+def test_a_column_whose_texts_are_said_to_be_long_is_refused_before_it_is_read(fits, rows):
+    with h5py.File(fits) as file:
+        start = file["path"].id.get_offset()
+    data = bytearray(fits.read_bytes())
+    for row in range(rows):  # each is shorter than the file, all of them are not
+        at = start + 16 * row
+        length = 2**31 - 1 if rows == 1 else len(data) // 3
+        data[at : at + 4] = length.to_bytes(4, "little")
+    fits.write_bytes(data)
+    with pytest.raises(etid.RecordingError, match="path: declares texts of") as caught:
+        StudyFits.read(fits)
+    assert caught.value.remedy
+
+
+def test_a_column_whose_texts_are_in_parts_is_refused(fits):
+    with h5py.File(fits, "r+") as file:
+        del file["path"]
+        file.create_dataset("path", data=["loaded/0"] * 6, dtype=h5py.string_dtype(), chunks=(2,))
+    with pytest.raises(etid.RecordingError, match="path: its texts are not stored in one block"):
+        StudyFits.read(fits)
+
+
 # Files of other formats
+
+
+@pytest.mark.parametrize("seed", [2010688, 2010930, 2014648])
+def test_tdms_that_declares_long_texts_allocates_no_more_than_the_file_holds(kinds, tmp_path, seed):
+    path = fuzz.damage(tmp_path, kinds["tdms"], seed)
+    tracemalloc.start()
+    try:
+        assert fuzz.judge(path, kinds["tdms"], seed)[0] == "refused"
+        assert tracemalloc.get_traced_memory()[1] < 1 << 26
+    finally:
+        tracemalloc.stop()
 
 
 def test_matlab_that_declares_a_huge_shape_is_refused_at_once(kinds, tmp_path):

@@ -7,8 +7,8 @@ follows the objects of a heap itself before the library reads the heap. All hang
 `python -m benchmarks fuzz` has found were of this kind. For each text, the file also holds a
 descriptor: its length, the address of its heap, and the number of its object. The library allocates
 this length before it looks for the object. The guard finds the descriptors of attributes in what
-the library reads. The guard needs a Python call for each read. So samples, and all metadata of
-files that etid has written, are read without it.
+the library reads; `check_texts` reads those of a dataset. The guard needs a Python call for each
+read. So samples, and all metadata of files that etid has written, are read without it.
 """
 
 import contextlib
@@ -46,6 +46,7 @@ _HEAP = b"GCOL\x01\0\0\0"
 _HEAP_HEAD = 16  # [bytes] signature, version, size of the collection
 _OBJECT = struct.Struct("<HH4xQ")  # index, reference count, size
 _TEXT = struct.Struct("<IQI")  # length, address of the heap, index of the object
+_DESCRIPTORS = np.dtype([("length", "<u4"), ("address", "<u8"), ("index", "<u4")])  # many of them
 # Message of an attribute: version, flags, sizes of its name, type and shape.
 _MESSAGE = struct.Struct("<BxHHH")
 _VERSION = re.compile(rb"(?=[\x01-\x03][\x00-\x03])")
@@ -280,6 +281,30 @@ def check_size(dataset: h5py.Dataset) -> None:
         raise RecordingError(
             f"declares {declared} bytes, but only {held} bytes are stored",
             remedy=DAMAGED,
+        )
+
+
+def check_texts(dataset: h5py.Dataset, path: str) -> None:
+    """Raise an error if the texts of a dataset are longer than its file, before they are read.
+
+    Args:
+        dataset: Texts of variable length.
+        path: Path of its file.
+
+    Raises:
+        RecordingError: The descriptors are not stored in one block, or declare too many bytes.
+    """
+    rows, size = int(dataset.size or 0), os.path.getsize(path)
+    if rows == 0:
+        return
+    start = dataset.id.get_offset()
+    if start is None or start + rows * _TEXT.size > size:
+        raise RecordingError("its texts are not stored in one block of the file", remedy=DAMAGED)
+    texts = np.memmap(path, _DESCRIPTORS, "r", start, (rows,))
+    declared = int(texts["length"].sum(dtype=np.uint64))
+    if declared > size:  # each text has its own bytes in the file
+        raise RecordingError(
+            f"declares texts of {declared} bytes, the file has {size}", remedy=DAMAGED
         )
 
 

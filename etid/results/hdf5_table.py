@@ -11,7 +11,14 @@ import numpy as np
 from etid.recordings import limits
 from etid.recordings.errors import RecordingError
 from etid.recordings.replacing import replacing
-from etid.recordings.untrusted import attribute, check_size, guarded, local_link, translated
+from etid.recordings.untrusted import (
+    attribute,
+    check_size,
+    check_texts,
+    guarded,
+    local_link,
+    translated,
+)
 
 
 def write_table(
@@ -118,16 +125,18 @@ class Table:
                 )
             if column.shape[0] > limits.FITS:
                 raise RecordingError(f"has {column.shape[0]} rows, at most {limits.FITS} are read")
-            text = h5py.check_string_dtype(column.dtype) is not None
+            text = h5py.check_string_dtype(column.dtype)
             fits = {
-                "text": text,
+                "text": text is not None,
                 "number": column.dtype.kind in "iuf" and column.dtype.itemsize <= 8,
                 "integer": column.dtype.kind in "iu",
             }
             if not fits[kind]:
-                what = "text" if text else f"of type {column.dtype}"
+                what = f"of type {column.dtype}" if text is None else "text"
                 raise RecordingError(f"is {what}, must be {kind}", remedy=_REMEDY)
             check_size(column)
+            if text is not None and text.length is None:
+                check_texts(column, self.name)
         return column
 
     def read(self, column: h5py.Dataset, rows: Any = ()) -> np.ndarray:
