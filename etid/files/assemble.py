@@ -215,8 +215,7 @@ def _parts(
             field="split",
             remedy="Name the channel of a trigger",
         )
-    cause = "v_th" if "v_th" in channels else "current"
-    asked = channels[cause] if by_pulses else channel(plan.split)
+    asked = channels["v_th"] if by_pulses else channel(plan.split)
     for one in (*channels.values(), asked):
         if len(one.shape) != 1:
             raise RecordingError(
