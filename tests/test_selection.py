@@ -220,6 +220,14 @@ def test_the_search_goes_on_while_the_best_circuit_still_asks():
     assert best(found[0]) == 4
 
 
+@pytest.mark.parametrize(("z", "tried"), [(3.4, [0, 3]), (3.6, [0, 3, 4])])
+def test_two_more_elements_need_a_larger_score(z, tried):
+    """SkinLayers must lower −2 ln L by 2 ln n, so that a score below 2.5 √2 asks for Cole only."""
+    table = [made(circuit, 1000.0) for circuit in CANDIDATES]
+    table[0] = made(CANDIDATES[0], 1000.0, z=(0.0, z, *[0.0] * 7))
+    assert list(search(1, CANDIDATES, counted([table])[0])[0]) == tried
+
+
 def test_the_search_goes_down_if_an_element_is_hardly_determined():
     table = [made(circuit, 1000.0) for circuit in CANDIDATES]
     table[0] = made(CANDIDATES[0], 1000.0, error=0.2)

@@ -371,21 +371,21 @@ def refined(
         return search(len(lanes), candidates, rows)
 
     def late_by(lane: AbstractLane, fits: dict[int, Fit]) -> int:
-        fit = fits[_chosen(fits)]
+        fit = fits[best(fits)]
         return lane.late_by(fit.circuit, driver) if fit.verdict == "misfit" else 0
 
     def of_all(first: dict[int, Fit], second: dict[int, Fit]) -> dict[int, Fit]:
-        other = second[_chosen(second)]
-        if of_both(first[_chosen(first)], other) is other:
+        other = second[best(second)]
+        if of_both(first[best(first)], other) is other:
             return second
         return {number: without_remarks(fit) for number, fit in first.items()}
 
     def another(fits: dict[int, Fit]) -> bool:
-        return needs_another(fits[_chosen(fits)])
+        return needs_another(fits[best(fits)])
 
     found = repeated(lanes, seen, searched, late_by, another, of_all)
     for one, fits in zip(seen, found, strict=True):
-        number = _chosen(fits)
+        number = best(fits)
         fits[number] = _with_cause(fits[number], one, type(lanes[0]), driver)
     return found
 
@@ -421,11 +421,6 @@ def without_remarks(found: _Outcome) -> _Outcome:
     return dataclasses.replace(found, remarks=np.zeros((), int))
 
 
-def _chosen(fits: dict[int, Fit]) -> int:
-    """Number of the candidate to choose."""
-    return best(fits) if len(fits) > 1 else next(iter(fits))
-
-
 def chosen_fits(
     found: Sequence[dict[int, Fit]],
     driver: AbstractFeed,
@@ -440,7 +435,7 @@ def chosen_fits(
         remarks: Remarks on the recordings.
         repeats: The periods of the recordings.
     """
-    outcome = [(dict(fits), _chosen(fits)) for fits in found]
+    outcome = [(dict(fits), best(fits)) for fits in found]
     for number in {chosen for _, chosen in outcome}:  # circuits of one kind
         rows = [row for row, (_, chosen) in enumerate(outcome) if chosen == number]
         fits = [found[row][number] for row in rows]

@@ -22,8 +22,8 @@ def common(found: Sequence[Selection], candidates: Sequence[AbstractCircuit]) ->
         found: The choices of single recordings.
         candidates: The circuits by number.
     """
-    if len(candidates) == 1:
-        return 0
+    if all(len(selection.fits) == 1 for selection in found):
+        return 0  # no recording asked for another circuit than the first
     total = [0.0] * len(candidates)
     for selection in found:
         if rank(selection.fits[selection.chosen]) == 2:
@@ -34,7 +34,7 @@ def common(found: Sequence[Selection], candidates: Sequence[AbstractCircuit]) ->
 
 
 def _losses(selection: Selection, candidates: Sequence[AbstractCircuit]) -> list[float]:
-    """2 log evidence that each candidate loses against the chosen one.
+    """2 log evidence that each candidate loses against the chosen one, which is not contradicted.
 
     A richer circuit that was not fitted is not likelier than the chosen one: it loses the penalty
     of its elements. A simpler one that was not fitted lacks an element that is surely there.
@@ -46,7 +46,7 @@ def _losses(selection: Selection, candidates: Sequence[AbstractCircuit]) -> list
     for number, circuit in enumerate(candidates):
         more = len(circuit.names()) - own
         if number in fits:
-            contradicted = rank(fits[number]) == 2
+            contradicted = number != selection.chosen and rank(fits[number]) == 2
             lost.append(math.inf if contradicted else criterion[number] - least)
         elif more > 0 and mine.support is not None:
             lost.append(more * math.log(float(mine.support.terms)))

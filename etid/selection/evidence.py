@@ -88,6 +88,8 @@ def best(fits: Mapping[int, Fit], criterion: Mapping[int, float] | None = None) 
         fits: Fits of the same data, by number of the candidate.
         criterion: What is to be small; `bic` if not given.
     """
+    if len(fits) == 1:
+        return next(iter(fits))
     criterion = criterion or bic(fits)
     ranks = {number: rank(fit) for number, fit in fits.items()}
     size = {number: elements(fit) for number, fit in fits.items()}
@@ -110,6 +112,8 @@ def weights(fits: Mapping[int, Fit]) -> dict[int, float]:
 
     Candidates that the data contradict have the weight 0, unless all are contradicted.
     """
+    if len(fits) == 1:
+        return dict.fromkeys(fits, 1.0)
     criterion = bic(fits)
     chosen = best(fits, criterion)
     # Undetermined elements do not make a circuit untrue.
@@ -142,12 +146,14 @@ def with_close(fits: Mapping[int, Fit], chosen: int) -> np.ndarray:
     """
     share = weights(fits)
     mine = fits[chosen]
-    units = mine.circuit.units()
     cov = np.array(mine.cov, float)
+    others = [number for number in fits if number != chosen and share[number] > 0]
+    if not others:
+        return cov
+    units = mine.circuit.units()
     own = _determined(mine)
-    for number, fit in fits.items():
-        if number == chosen or share[number] == 0:
-            continue
+    for number in others:
+        fit = fits[number]
         other = _determined(fit)
         difference, wider = np.zeros(len(units)), np.zeros(len(units))
         for i, (name, unit) in enumerate(units.items()):

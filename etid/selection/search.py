@@ -6,6 +6,7 @@ the fewest elements. A simpler one is fitted if an element is hardly determined.
 recording thus needs one fit.
 """
 
+import math
 from collections.abc import Callable, Sequence
 
 import numpy as np
@@ -19,7 +20,7 @@ from etid.circuits.circuit import (
     SkinRC,
 )
 from etid.results.fits import Fit
-from etid.selection.evidence import best, elements, rank, values_of
+from etid.selection.evidence import best, rank, values_of
 
 # From the usual circuit to the unusual ones.
 CANDIDATES: tuple[AbstractCircuit, ...] = (
@@ -29,8 +30,8 @@ CANDIDATES: tuple[AbstractCircuit, ...] = (
     SkinCole(),
     SkinLayers(),
 )
-# Standard deviations of a score that asks for a richer circuit. The evidence needs 2.8 for one more
-# element; the score is not the ratio of likelihoods exactly.
+# Standard deviations of a score that asks for one more element, times √m for m more. The evidence
+# needs 2.8 √m; the score is not the ratio of likelihoods exactly.
 ASKS = 2.5
 # Relative standard error of an element that asks for a simpler circuit: an element of seven
 # standard errors has the evidence 49, more than its penalty by far.
@@ -46,11 +47,12 @@ def search(count: int, candidates: Sequence[AbstractCircuit], fit: FitRows) -> l
         candidates: Circuits; the search starts at the first one.
         fit: Fits the candidate of a number to some recordings.
     """
+    size = [len(circuit.names()) for circuit in candidates]
     found = [{0: one} for one in fit(0, range(count))]
     while True:
         wanted: dict[int, list[int]] = {}
         for row, fits in enumerate(found):
-            for number in _asked(fits, candidates):
+            for number in _asked(fits, size):
                 wanted.setdefault(number, []).append(row)
         if not wanted:
             return found
@@ -59,36 +61,41 @@ def search(count: int, candidates: Sequence[AbstractCircuit], fit: FitRows) -> l
                 found[row][number] = one
 
 
-def _asked(fits: dict[int, Fit], candidates: Sequence[AbstractCircuit]) -> list[int]:
-    """Numbers of the candidates to fit next; none if the search ends."""
-    left = [number for number in range(len(candidates)) if number not in fits]
+def _asked(fits: dict[int, Fit], size: Sequence[int]) -> list[int]:
+    """Numbers of the candidates to fit next; none if the search ends.
+
+    Args:
+        fits: The fits so far, by number of the candidate.
+        size: Number of elements of each candidate.
+    """
+    left = [number for number in range(len(size)) if number not in fits]
     if not left:
         return []
-    fit = fits[best(fits)]
-    size = {number: len(candidates[number].names()) for number in left}
-    own = elements(fit)
+    number = best(fits)
+    fit, own = fits[number], size[number]
+    accepted = rank(fit)
     asked = []
-    richer = [number for number in left if size[number] >= own]
-    if richer and _lacks(fit):
-        least = min(size[number] for number in richer)
-        asked += [number for number in richer if size[number] == least]
-    if _is_doubtful(fit):
+    least = min((size[number] for number in left if size[number] >= own), default=0)
+    more = max(least - own, 1)
+    if least and (accepted == 2 or _lacks(fit) > ASKS * math.sqrt(more)):
+        asked += [number for number in left if size[number] == least]
+    if accepted == 1 or _is_doubtful(fit):
         asked += [number for number in left if size[number] < own]
     return asked
 
 
-def _lacks(fit: Fit) -> bool:
-    """Whether the scores show a change that the circuit cannot make."""
+def _lacks(fit: Fit) -> float:
+    """Largest score of the changes that the circuit cannot make [standard deviations]."""
     if fit.support is None:
-        return False
+        return 0.0
     z = np.array(fit.support.z[:-1])  # without that of a gain
     # A negative score means less spread than a capacitor has, α > 1, which is not passive.
     z[0] = max(z[0], 0.0)
-    return rank(fit) == 2 or bool(np.nanmax(np.abs(z), initial=0.0) > ASKS)
+    return float(np.nanmax(np.abs(z), initial=0.0))
 
 
 def _is_doubtful(fit: Fit) -> bool:
     """Whether an element may be superfluous."""
     errors = np.sqrt(np.diagonal(np.asarray(fit.cov)))
     # An error of 0 belongs to an element without any effect.
-    return rank(fit) == 1 or not bool(((errors > 0) & (errors < DOUBTFUL * values_of(fit))).all())
+    return not bool(((errors > 0) & (errors < DOUBTFUL * values_of(fit))).all())
