@@ -2,7 +2,8 @@
 
 Each repetition draws fresh noise, quantisation and trigger delays for the calibrations, a dry and a
 damp trial, and identifies a driver of its own: trials that share a driver share its error, and
-would not be independent draws. With `--parts` the parts of the driver are drawn anew as well.
+would not be independent draws. With `--parts` the parts of the driver are drawn anew as well. With
+`--current-snr-db` the loads are identified from the current alone, without calibrations.
 
 Printed are, beside the bound, the part of the 95 % intervals that hold the truth and the root mean
 square of z = error / standard error, each with the range that 99 of 100 runs with right standard
@@ -82,6 +83,7 @@ def scene(
     jitter: float = 50e-9,
     shared_v_th: bool = False,
     more: int = 0,
+    current_snr_db: float | None = None,
 ) -> Scene:
     """A dry and a damp fingertip behind the default transformer, and `more` trials of each."""
     trials = [Trial(name, load) for name, load in LOADS.items()]
@@ -91,6 +93,7 @@ def scene(
         tuple(Trial(f"calibration/{i}", ResistorLoad(r)) for i, r in enumerate(resistors)),
         samples=samples,
         snr_db=snr_db,
+        current_snr_db=current_snr_db,
         trigger_jitter_rms=jitter,
         shared_v_th=shared_v_th,
     )
@@ -143,7 +146,7 @@ def monte_carlo(
 
 
 def _identify(study: etid.Study, paths: Sequence[str], method: str | None) -> dict[str, etid.Fit]:
-    """Fits by path; none if there is no driver."""
+    """Fits by path; none if the driver of the calibrations failed."""
     if method == JOINT:
         fits = etid.identify_jointly(study).fits
         found = list(fits.labels["path"])
@@ -151,7 +154,9 @@ def _identify(study: etid.Study, paths: Sequence[str], method: str | None) -> di
     given = method
     calibrations = list(study.calibrations.recordings())
     try:
-        driver = etid.identify_driver(calibrations, method=given, throw=False)
+        driver = None
+        if calibrations:
+            driver = etid.identify_driver(calibrations, method=given, throw=False)
     except etid.IdentificationError:
         return {}
     return {
@@ -198,6 +203,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--repetitions", type=int, default=200)
     parser.add_argument("--jitter", type=float, default=50e-9, help="rms trigger delay [s]")
     parser.add_argument("--resistors", type=float, nargs="+", default=[REFERENCE], help="[ohm]")
+    parser.add_argument(
+        "--current-snr-db",
+        type=float,
+        help="identify from a measured current with this noise, without calibrations",
+    )
     parser.add_argument("--shared", action="store_true", help="one unloaded record for all")
     parser.add_argument("--method", choices=ESTIMATORS, help="default: that of the records")
     parser.add_argument("--more", type=int, default=0, help="further trials, for a joint fit")
@@ -216,10 +226,11 @@ def main(arguments: argparse.Namespace) -> bool:
         drawn = scene(
             arguments.snr_db,
             arguments.samples,
-            arguments.resistors,
+            arguments.resistors if arguments.current_snr_db is None else (),
             arguments.jitter,
             arguments.shared,
             arguments.more,
+            arguments.current_snr_db,
         )
     run(drawn, arguments.repetitions, arguments.method, arguments.parts)
     return True

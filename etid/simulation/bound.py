@@ -4,8 +4,10 @@ At every harmonic k the records are X_k and Y_k = G_k e^(−jω_k τ) X_k with G
 and the same for each calibration. All records have white noise. The rounding error of a coarse
 converter is noise that is not white (`etid.signals.noise`): where the signal is slow, it is the
 same in each period. X_k and Z_th(f_k) are unknown complex numbers at every harmonic, so the bound
-holds for every kind of driver. To project them out leaves the Fisher information of the elements
-and the trigger delays,
+holds for every kind of driver. A recorded current I_k = X_k / (Z_L + Z_th), with a delay of its
+own, is one more record. Without a calibration V_th tells nothing about the load, and the bound is
+that of Y_k = Z_L e^(−jω_k τ) I_k. To project the unknown numbers out leaves the Fisher information
+of the elements and the trigger delays,
 
     F = 2 Re Σ_k A_kᴴ (I − B_k B_k⁺) A_k.
 
@@ -27,7 +29,7 @@ from etid.circuits.overview import Overview, Overviewed, element_rows
 from etid.identify.arguments import require, require_float64
 from etid.signals.harmonics import whole_periods
 from etid.signals.noise import COARSE, is_coarse, rounding_variance
-from etid.simulation.scenes import Scene, Trial
+from etid.simulation.scenes import Scene, Trial, Waveform
 from etid.simulation.transformer import ResistorLoad, SkinLoad, loading
 from etid.solvers.matrices import inverse
 
@@ -78,7 +80,8 @@ class Bound(Overviewed):
 def bound(scene: Scene, *, delays: bool = True, known_driver: bool = False) -> dict[str, Bound]:
     """Predict the smallest standard errors of each trial of a scene before it is recorded.
 
-    The bound of a trial uses this trial and all calibrations of the scene, but no other trial. The
+    The bound of a trial uses this trial and all calibrations of the scene, but no other trial. If
+    the scene records the current, the bound uses it too, and the scene needs no calibration. The
     information is proportional to the length of a record: half a period has half the information of
     a whole period.
 
@@ -92,14 +95,18 @@ def bound(scene: Scene, *, delays: bool = True, known_driver: bool = False) -> d
 
     Raises:
         ValueError: The load of a trial has no elements. Or the scene has neither noise nor a
-            converter. Or it has no calibration and the driver is not known.
+            converter. Or it has neither a calibration nor a current, and the driver is not known.
     """
     require_float64()
     require(
         "scene", scene, Scene, "Make one with etid.scenes.Scene, or use a preset of etid.scenes"
     )
-    if not (scene.calibration or known_driver):
-        raise ValueError("the scene has no calibration; its driver would have to be known")
+    measured = scene.current_snr_db is not None
+    if not (scene.calibration or known_driver or measured):
+        raise ValueError(
+            "the scene has no calibration; its driver would have to be known, or the current "
+            "recorded (current_snr_db)"
+        )
     waveform = scene.waveform()
     if waveform.sigma == 0:
         raise ValueError("the scene has neither noise nor a converter; every bound is zero")
@@ -114,8 +121,9 @@ def bound(scene: Scene, *, delays: bool = True, known_driver: bool = False) -> d
         key = (type(circuit), *np.asarray(circuit.values()))
         if key not in found:
             noise = _noise(scene, trial, f.size, waveform.sigma)
+            current = _current_noise(scene, circuit, waveform) if measured else None
             found[key] = _covariance(
-                circuit, known, f, x, z_th, noise, delays, known_driver, scene.shared_v_th
+                circuit, known, f, x, z_th, noise, current, delays, known_driver, scene.shared_v_th
             )
         bounds[trial.path] = Bound(trial.path, circuit, found[key])
     return bounds
@@ -165,6 +173,12 @@ def _noise(
     return relative
 
 
+def _current_noise(scene: Scene, circuit: AbstractCircuit, waveform: Waveform) -> float:
+    """Standard deviation of the recorded current [A] relative to that of a voltage [V]."""
+    load = np.asarray(circuit.response(jnp.asarray(waveform.f)))
+    return scene.current_noise(waveform.v_th / (load + waveform.z_th)) / waveform.sigma
+
+
 def _covariance(
     circuit: AbstractCircuit,
     known: list[AbstractCircuit],
@@ -172,13 +186,15 @@ def _covariance(
     x: Complex[np.ndarray, " f"],
     z_th: Complex[np.ndarray, " f"],
     noise: Float[np.ndarray, "row f"],
+    current: float | None,
     delays: bool,
     known_driver: bool,
     shared_v_th: bool,
 ) -> Float[np.ndarray, "element element"]:
     """Bound of the covariance of the elements' logarithms.
 
-    `x` is in standard deviations of a coefficient with white noise; `noise` is from `_noise`.
+    `x` is in standard deviations of a coefficient with white noise; `noise` is from `_noise`, and
+    `current` from `_current_noise`.
     """
     loads = [circuit, *known]
     frequency = jnp.asarray(f)
@@ -188,22 +204,33 @@ def _covariance(
         circuit.log_values()
     )
     elements, records = slope.shape[1], len(loads)
+    uses_v_th = known_driver or bool(known)
     turn = 2j * np.pi * f * 1e-6  # delays in microseconds
-    # Rows: the loaded records, then the unloaded ones.
+    # Rows: the loaded records, the unloaded ones, and the current.
     unloaded = [0] * records if shared_v_th else list(range(records))
     rows = records + max(unloaded) + 1
-    a = np.zeros((f.size, rows, elements + (records if delays else 0)), complex)
-    b = np.zeros((f.size, rows, rows - records + (0 if known_driver else 1)), complex)
+    a = np.zeros((f.size, rows + 1, elements + records + 1), complex)
+    b = np.zeros((f.size, rows + 1, rows - records + 1), complex)
     for i, (z_load, g) in enumerate(zip(z, gains, strict=True)):
         b[:, i, unloaded[i]] = g
         b[:, records + unloaded[i], unloaded[i]] = 1
-        if not known_driver:
-            b[:, i, -1] = -g * x / (z_load + z_th)
-        if delays:
-            a[:, i, elements + i] = -turn * g * x
+        b[:, i, -1] = -g * x / (z_load + z_th)
+        a[:, i, elements + i] = -turn * g * x
     a[:, 0, :elements] = (x * z_th / (z[0] + z_th) ** 2)[:, None] * np.asarray(slope)
-    weight = 1 / noise[:rows].T[:, :, None]
-    a, b = weight * a, weight * b
+    weight = np.zeros((f.size, rows + 1, 1))
+    weight[:, :rows, 0] = 1 / noise[:rows].T
+    if current is not None:
+        flowing = 1 / (z[0] + z_th)
+        b[:, rows, 0], b[:, rows, -1] = flowing, -(flowing**2) * x
+        a[:, rows, :elements] = (-(flowing**2) * x)[:, None] * np.asarray(slope)
+        a[:, rows, -1] = -turn * flowing * x
+        weight[:, rows] = 1 / current
+    if not uses_v_th:
+        weight[:, records:rows] = 0
+    # Without V_th only the delay between V_out and the current matters.
+    timed = elements + records + (current is not None and uses_v_th)
+    a = weight * a[:, :, : timed if delays else elements]
+    b = weight * (b[:, :, :-1] if known_driver or not uses_v_th else b)
     q, _ = np.linalg.qr(b)
     rest = a - q @ (np.conj(np.swapaxes(q, 1, 2)) @ a)
     flat = rest.reshape(-1, a.shape[2])

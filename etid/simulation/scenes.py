@@ -13,6 +13,9 @@ record. The chain from circuit to file is
 
     exact periodic waveform → anti-alias filter → sampling at start + delay + n / sample_rate
     → · scale → + offset + white noise → rounding to a code, clipped at the full scale.
+
+A scene may also record the current through the load of each trial, with a delay and white noise of
+its own.
 """
 
 import collections
@@ -106,6 +109,8 @@ class Scene:
         antialias: Corner of the 4th-order Butterworth anti-alias filter, relative to `sample_rate`.
         snr_db: Effective value of the unloaded voltage over one period, after the anti-alias
             filter, relative to that of the white noise of every record [dB]; None for no noise.
+        current_snr_db: The same ratio for the current through each trial, which is then recorded;
+            None if it is not. The current is not rounded.
         trigger_jitter_rms: Standard deviation of the delay, drawn for each record [s]. A positive
             delay means late sampling.
         offset_rms: Standard deviation of the offset, drawn for each record [V at the converter].
@@ -125,6 +130,7 @@ class Scene:
     start: float = 0.0
     antialias: float = 0.4
     snr_db: float | None = 60.0
+    current_snr_db: float | None = None
     trigger_jitter_rms: float = 0.0
     offset_rms: float = 0.0
     shared_v_th: bool = False
@@ -211,13 +217,18 @@ class Scene:
         common = np.random.default_rng([seed, *b"v_th"])
         unloaded = self._convert(sampler, v_th, sigma, common) if self.shared_v_th else None
         for trial in self.calibration + self.trials:
-            draws = np.random.default_rng([seed, *trial.path.encode()]).spawn(2)
+            draws = np.random.default_rng([seed, *trial.path.encode()]).spawn(3)
             r_load = resistances.get(trial.path)
             v_out = voltage(trial, sampler.f)
+            current = None
+            if self.current_snr_db is not None and r_load is None:
+                flowing = v_out / _impedance(trial, sampler.f)
+                current = self._measured_current(sampler, flowing, draws[2])
             recordings.append(
                 Recording(
                     unloaded or self._convert(sampler, v_th, sigma, draws[0]),
                     self._convert(sampler, v_out, sigma, draws[1]),
+                    current=current,
                     sample_rate=self.sample_rate,
                     pulse_rate=self.pulse_rate,
                     r_load=r_load,
@@ -238,6 +249,29 @@ class Scene:
         step = self._converter()[0] if self.bits is not None else 0.0
         total = math.hypot(sigma, step / math.sqrt(12)) / self.scale
         return Waveform(sampler.f, v_th * sampler.antialias, z_th, total)
+
+    def current_noise(self, current: Complex[np.ndarray, " f"]) -> float:
+        """Standard deviation of the noise of a recorded current.
+
+        Args:
+            current: Fourier coefficients of the current after the anti-alias filter [A].
+
+        Raises:
+            ValueError: The scene records no current.
+        """
+        if self.current_snr_db is None:
+            raise ValueError("the scene records no current; set current_snr_db")
+        effective = np.sqrt(2 * np.sum(np.abs(current) ** 2))
+        return float(effective) * 10 ** (-self.current_snr_db / 20)
+
+    def _measured_current(
+        self, sampler: Sampler, coefficients: Complex[np.ndarray, " f"], rng: np.random.Generator
+    ) -> Float[np.ndarray, " samples"]:
+        """A record of the current [A] from its Fourier coefficients."""
+        delay = self.trigger_jitter_rms * rng.standard_normal()
+        noise = self.current_noise(coefficients * sampler.antialias)
+        exact = sampler.sample(coefficients, self.samples, self.start + delay)
+        return exact + noise * rng.standard_normal(self.samples)
 
     def _exact(self) -> tuple[Sampler, np.ndarray, np.ndarray, float]:
         """Sampler, Fourier coefficients of V_th [V], Z_th [ohm] and noise [V at the converter]."""
