@@ -112,6 +112,18 @@ def test_lengths_and_rates_may_be_mixed(study, driver):
     assert (np.abs(error) < SIGMAS * np.asarray(fits.stderr.values())).all()
 
 
+def test_ragged_lengths_fill_lanes_of_one_shape(study):
+    recording = study["s01/dry/0"]
+    lanes = [
+        PaddedSamples.of(
+            Inspected(recording.replace(v_th=recording.v_th[:n], v_out=recording.v_out[:n]))
+        )
+        for n in range(2900, LENGTH, 61)
+    ]
+    assert len({lane.shapes for lane in lanes}) == 1
+
+
+@pytest.mark.slow
 def test_a_study_of_ragged_lengths_compiles_for_few(study, driver, monkeypatch):
     traced = []
 

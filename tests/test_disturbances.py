@@ -39,7 +39,7 @@ def driver():
 
 
 @pytest.mark.parametrize("load", LOADS)
-@pytest.mark.parametrize("samples", [10_000, 20_000])
+@pytest.mark.parametrize("samples", [pytest.param(10_000, marks=pytest.mark.slow), 20_000])
 def test_a_disturbed_period_is_left_out_and_the_elements_are_right(driver, load, samples):
     scene = rung(load, samples=samples)
     records = [

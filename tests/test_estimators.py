@@ -125,12 +125,10 @@ def test_options_are_fields_which_fits_and_their_methods_section_keep(study):
 
 
 def test_the_instance_of_a_name_is_the_same_method(study):
+    assert arguments.estimator_of("equation_error") == etid.EquationError()
     driver = etid.identify_driver(study["calibration/0"], method=etid.EquationError(), throw=False)
     assert driver.method == "equation_error"
     records = [study[path] for path in study.loaded]
-    named = etid.identify_skins(records, driver, method="equation_error")
-    given = etid.identify_skins(records, driver, method=etid.EquationError())
-    np.testing.assert_array_equal(named.circuit.r_p, given.circuit.r_p)
     few = etid.SteiglitzMcBride(iterations=3)
     fits = etid.identify_skins(records, driver, method=few)
     assert fits.fit.method == str(few) == "steiglitz_mcbride(iterations=3)"
@@ -138,9 +136,11 @@ def test_the_instance_of_a_name_is_the_same_method(study):
     assert "by at most 3 iterations" in methods_section(StudyFits(fits, {}, {})).text
 
 
+@pytest.mark.usefixtures("_registered")
 def test_what_no_module_has_registered_is_not_described(study):
-    driver = etid.identify_driver(study["calibration/0"], method="equation_error", throw=False)
-    fits = etid.identify_skins(study.loaded, driver, method="equation_error")
+    driver = etid.identify_driver(study["calibration/0"], method="proportion")
+    options = {"circuit": Resistor(), "method": "proportion"}
+    fits = etid.identify_skins(study.loaded, driver, **options)
     unknown = dataclasses.replace(fits, fit=dataclasses.replace(fits.fit, method="by_hand"))
     section = methods_section(StudyFits(unknown, {}, {}))
     assert "The estimator 'by_hand' is not registered" in section.warning

@@ -266,24 +266,24 @@ def test_interpolation_removes_what_lies_above_its_cutoff():
 @pytest.mark.parametrize("precision", [jnp.float64, jnp.float32])
 def test_rounding_stays_that_of_the_last_digits(sample_rate, precision):
     """Driver and skin in blocks, against the same recursion with 64 bits of mantissa."""
-    system = hold(
-        loaded(SOURCE, SkinRC(33e3, 186e3, 0.12e-9).impedance().rational(), sample_rate),
-        sample_rate,
-    )
+    system = held(SOURCE, SkinRC(33e3, 186e3, 0.12e-9).impedance().rational(), sample_rate)
     v = np.zeros(4000)
     v[200:1500] = 50.0
     v += np.random.default_rng(3).normal(scale=0.05, size=v.size)
     system = jax.tree.map(lambda leaf: leaf.astype(precision), system)
-    u = band_limited(jnp.asarray(v)).astype(precision)
+    u = interpolate(jnp.asarray(v)).astype(precision)
     A, B, C, D = (np.asarray(of, np.longdouble) for of in (system.A, system.B, system.C, system.D))
     x, expected = np.zeros(C.size, np.longdouble), []
     for now in np.asarray(u, np.longdouble):
         expected.append(C @ x + D @ now)
         x = A @ x + B @ now
-    y, _ = simulate(system, u, jnp.zeros(C.size, precision))
+    y, _ = run(system, u, jnp.zeros(C.size, precision))
     error = np.abs(np.asarray(y) - expected).max() / np.abs(expected).max()
     # Sums of 40 products in a block; the states' own rounding decays with them.
     assert error < 10 * np.finfo(precision).eps
+
+
+EXPONENTIAL = jax.jit(filtering._expm)  # operation by operation, it takes seconds
 
 
 @pytest.mark.parametrize("size", [1e-6, 1.0, 300.0, 1e6])
@@ -293,5 +293,5 @@ def test_the_matrix_exponential_is_that_of_scipy(size):
     matrix[:4, :4] = np.diag([-1e-3, -0.3, -1.0, -size]) + np.diag([0.1, 0.2, 0.3], 1)
     matrix[:4, 4] = 1.0
     matrix[np.arange(4, 9), np.arange(5, 10)] = 1.0
-    found = filtering._expm(jnp.asarray(matrix))
+    found = EXPONENTIAL(jnp.asarray(matrix))
     np.testing.assert_allclose(found, scipy.linalg.expm(matrix), rtol=0, atol=ROUNDING)
