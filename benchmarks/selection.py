@@ -1,6 +1,6 @@
 """Is the simplest circuit found that a recording supports, and are the intervals honest after it?
 
-    python -m benchmarks selection            # all of it, an hour on one core
+    python -m benchmarks selection            # all of it, half an hour on one core
     python -m benchmarks selection --quick    # few drivers and cells, a minute or two
 
 Recordings of five kinds of circuits, dry and damp, behind drivers drawn anew, from 20 to 80 dB
@@ -25,21 +25,23 @@ from tqdm import tqdm
 import etid
 from benchmarks import selection_chart, selection_counts, selection_map, selection_rival
 from benchmarks.failure_axes import Cell
-from benchmarks.failure_counts import Rate, rate
+from benchmarks.failure_counts import Rate, clopper_pearson, rate
 from benchmarks.failure_draws import Answer
 from benchmarks.perturbed_study import DELAY
 from benchmarks.provenance import RESULTS, write_csv
 from benchmarks.selection_draws import SNR_DB, TRUTHS, Drawn, draws, scene
 from benchmarks.speed import median_time
 from etid.identify import file as streaming
+from etid.identify.arguments import Circuit
 from etid.selection.search import CANDIDATES
 from etid.simulation import scenes
 
 DRIVERS = 25
 FIRST = 1000  # number of the first driver; those of other benchmarks are smaller
-MAP_DRIVERS = 3  # of a cell of skin that is not one RC, with ten trials each
-FEW = (1, 4)  # drivers and trials of any other cell
+MAP = (7, 10)  # drivers of a cell of the map, and trials behind each: 20 000 determined elements
+FEW = (1, 4)  # the same of a quick run
 PAIRS = 15  # timed pairs
+SINGLES = 16  # recordings of a pair that are identified one at a time
 COVERED = (0.93, 0.97)  # part of the 95 % intervals that is to hold the truth
 QUICK_SNR = (20, 60)
 RIVAL_DRIVERS, RIVAL_SNR = 1, (20, 40, 60)  # ten seconds for each recording
@@ -146,8 +148,16 @@ def criteria(rows: Sequence[dict[str, Any]]) -> None:
 def failures(every: Sequence[Cell], found: Sequence[Sequence[Answer]]) -> list[Line]:
     """Silent failures over the map, and right answers for skin that is not one RC."""
     asked = [one for answered in found for one in answered if one.target]
-    silent = rate([one.missed for one in asked], [one.seed for one in asked])
-    lines = [_share("silent over the failure map", silent, len(asked), most=2e-4)]
+    silent, elements = selection_map.missed_elements(asked)
+    low, high = clopper_pearson(silent, elements)
+    text = f"{silent} of {elements} elements ({100 * low:.3f} to {100 * high:.3f} %)"
+    lines = [Line("silent over the failure map", silent / max(elements, 1), text, 0.0, 2e-4)]
+    drivers = len({one.seed for one in asked})
+    print(f"determined elements: {elements} in {len(asked)} answers behind {drivers} drivers")
+    for cell, answered in zip(every, found, strict=True):
+        for one in answered:
+            if one.missed:
+                print(f"silent: {cell.chart}, {cell.row}, {cell.column}: {one.path}, {one.seed}")
     right = list(selection_map.right_from_40_db(every, found))
     if right:
         of = rate([one for one, _ in right], [seed for _, seed in right])
@@ -155,27 +165,41 @@ def failures(every: Sequence[Cell], found: Sequence[Sequence[Answer]]) -> list[L
     return lines
 
 
-def time_ratio(pairs: int) -> Line:
-    """Time of `identify_skins`, `circuit="auto"` against the plain fit, on recordings of one RC.
+def time_ratios(pairs: int) -> list[Line]:
+    """Time of `circuit="auto"` against the plain fit, on recordings of one RC.
 
-    Both are timed in turns; the median of the ratios counts.
+    Both are timed in turns, in seconds of the processor; the median of the ratios counts.
     """
-    ratios = []
+    batch, single = [], []
     for snr in (40.0, 60.0):
         study = scenes.paper_subjects(snr_db=snr, trigger_jitter_rms=DELAY).simulate(5)
         driver = etid.identify_driver(list(study.calibrations.recordings())[:1], throw=False)
         records = list(study.loaded.recordings())[:64]
-        for number in range(pairs + 1):
-            seconds = []
-            for circuit in (None, "auto"):
-                begin = time.perf_counter()
-                etid.identify_skins(records, driver, circuit=circuit)
-                seconds.append(time.perf_counter() - begin)
-            if number:  # the first pair compiles
-                ratios.append(seconds[1] / seconds[0])
+        one = functools.partial(etid.identify_skin, driver=driver, throw=False)
+
+        def in_batch(circuit: Circuit, records=records, driver=driver) -> None:
+            etid.identify_skins(records, driver, circuit=circuit)
+
+        def one_by_one(circuit: Circuit, records=records[:SINGLES], one=one) -> None:
+            for record in records:
+                one(record, circuit=circuit)
+
+        for ratios, call in ((batch, in_batch), (single, one_by_one)):
+            for number in range(pairs + 1):
+                seconds = []
+                for circuit in (None, "auto"):
+                    begin = time.process_time()
+                    call(circuit)
+                    seconds.append(time.process_time() - begin)
+                if number:  # the first pair compiles
+                    ratios.append(seconds[1] / seconds[0])
+    return [_ratio("batch", batch), _ratio("single recordings", single)]
+
+
+def _ratio(name: str, ratios: Sequence[float]) -> Line:
     low, middle, high = np.quantile(ratios, (0.25, 0.5, 0.75))
     text = f"{middle:.2f} (quartiles {low:.2f} to {high:.2f}) of {len(ratios)} pairs"
-    return Line("time, auto / plain fit, one RC", float(middle), text, 0.0, 1.3)
+    return Line(f"time, auto / plain fit, one RC, {name}", float(middle), text, 0.0, 1.3)
 
 
 def rival(rows: list[dict[str, Any]], drawn: Sequence[Drawn]) -> list[Line]:
@@ -250,21 +274,16 @@ def main(arguments: argparse.Namespace) -> bool:
     write_csv(arguments.folder / "selection.csv", rows)
     selection_chart.draw(rows, TRUTHS, arguments.folder / "selection.svg", missing)
     print(f"etid: {1e3 * select_time(FIRST):.0f} ms for a choice (median)")
-    lines.append(time_ratio(3 if quick else PAIRS))
+    lines += time_ratios(3 if quick else PAIRS)
 
     every = selection_map.chosen_cells()[:: 20 if quick else 1]
-    of_map = [_map_task(cell, quick) for cell in every]
+    of_map = [(cell, *(FEW if quick else MAP)) for cell in every]
     answered = dict(spread(selection_map.answers, of_map, workers, "cell"))
     found = [answered[number] for number in range(len(every))]
     table = [selection_map.row(*one) for one in zip(every, found, strict=True)]
     write_csv(arguments.folder / "selection_map.csv", table)
     lines += failures(every, found)
     return report(lines)
-
-
-def _map_task(cell: Cell, quick: bool) -> tuple[Cell, int, int]:
-    whole = cell.chart == selection_map.OTHER_SKIN and not quick
-    return (cell, MAP_DRIVERS, 10) if whole else (cell, *FEW)
 
 
 def report(lines: Sequence[Line]) -> bool:

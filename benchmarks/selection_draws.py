@@ -1,7 +1,7 @@
 """Recordings of known circuits, what etid chooses for them, and the fits of all candidates."""
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import jax
@@ -20,6 +20,8 @@ from etid.circuits.circuit import (
     SkinLayers,
     SkinRC,
 )
+from etid.identify import many
+from etid.identify.arguments import fed
 from etid.results.fits import Fit
 from etid.selection.search import CANDIDATES
 from etid.selection.selection import Selection
@@ -93,6 +95,14 @@ def scene(snr_db: float, driver: int) -> Scene:
     )
 
 
+def choices(records: Sequence[etid.Recording], driver: etid.Driver) -> list[Selection]:
+    """What etid chooses for each recording alone, as `select_circuit` does, in batches."""
+    found, _, _ = many.choices(
+        len(records), lambda row: fed(records[row], driver), CANDIDATES, None, False
+    )
+    return found
+
+
 def draws(snr_db: float, number: int) -> list[Drawn]:
     """One recording of each truth; none if the driver is not identified.
 
@@ -105,18 +115,18 @@ def draws(snr_db: float, number: int) -> list[Drawn]:
         driver = etid.identify_driver(study["calibration"], throw=False)
         if driver.verdict != "successful":
             return []
-        found = []
-        for name in TRUTHS:
-            selection = etid.select_circuit(study[name], driver, throw=False)
-            fits = dict(selection.fits)
-            for candidate, circuit in enumerate(CANDIDATES):
-                if candidate not in fits:
-                    fits[candidate] = etid.identify_skin(
-                        study[name], driver, circuit=circuit, throw=False
-                    )
-            found.append(Drawn(name, snr_db, number, selection, fits))
+        records = [study[name] for name in TRUTHS]
+        chosen = choices(records, driver)
+        fits = [dict(one.fits) for one in chosen]
+        for candidate, circuit in enumerate(CANDIDATES):
+            rows = [row for row, of in enumerate(fits) if candidate not in of]
+            if rows:
+                more = etid.identify_skins([records[row] for row in rows], driver, circuit=circuit)
+                for place, row in enumerate(rows):
+                    fits[row][candidate] = more[place]
         make_room()
-        return found
+        of_all = zip(TRUTHS, chosen, fits, strict=True)
+        return [Drawn(name, snr_db, number, one, of) for name, one, of in of_all]
 
 
 class Quantity(NamedTuple):

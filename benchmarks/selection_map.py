@@ -14,11 +14,11 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-import etid
 from benchmarks.failure_axes import Cell, cells
 from benchmarks.failure_counts import rate
-from benchmarks.failure_draws import ELEMENTS, Answer, Draw, bounds, elements, seeds
+from benchmarks.failure_draws import DETERMINED, ELEMENTS, Answer, Draw, bounds, elements, seeds
 from benchmarks.mappings import make_room
+from benchmarks.selection_draws import choices
 from etid.circuits.circuit import AbstractCircuit, SkinRC
 from etid.results.fits import Fit
 from etid.simulation.transformer import SkinLoad
@@ -95,18 +95,14 @@ def answers(cell: Cell, drivers: int, trials: int) -> list[Answer]:
         found = []
         for seed in seeds(cell, drivers):
             draw = Draw(cell, seed)
-            driver = draw.driver(None)
-            for record in draw.trials[:trials]:
-                of = seed, record.path
-                if driver is None:
-                    found.append(_refusal(*of, "driver_failed", bound[record.path]))
-                    continue
-                try:
-                    fit = etid.identify_skin(record, driver, circuit="auto", throw=False)
-                except ValueError:  # no likelihood can be computed: the record is one period
-                    found.append(_refusal(*of, "not_periodic", bound[record.path]))
-                    continue
-                found.append(answer(cell, *of, fit, bound[record.path]))
+            driver, records = draw.driver(None), draw.trials[:trials]
+            if driver is None:
+                paths = (record.path for record in records)
+                found += [_refusal(seed, path, "driver_failed", bound[path]) for path in paths]
+                continue
+            for record, one in zip(records, choices(records, driver), strict=True):
+                path = record.path
+                found.append(answer(cell, seed, path, one.fit, bound[path]))
         make_room()
         return found
 
@@ -114,6 +110,13 @@ def answers(cell: Cell, drivers: int, trials: int) -> list[Answer]:
 def is_right(one: Answer) -> bool:
     """Whether an answer is successful and no element is wrong."""
     return one.successful and not one.wrong
+
+
+def missed_elements(answers: Sequence[Answer]) -> tuple[int, int]:
+    """Elements determined to 10 % that are silently wrong, and number of all such elements."""
+    determined = [one.bound <= DETERMINED for one in answers]
+    missed = [one.silent_elements & of for one, of in zip(answers, determined, strict=True)]
+    return int(np.sum(missed)), int(np.sum(determined))
 
 
 def row(cell: Cell, found: Sequence[Answer]) -> dict[str, Any]:
@@ -128,6 +131,7 @@ def row(cell: Cell, found: Sequence[Answer]) -> dict[str, Any]:
         "silent": sum(one.silent for one in found),
         "determined": len(asked),
         "missed": sum(one.missed for one in asked),
+        "determined_elements": missed_elements(asked)[1],
     }
 
 

@@ -187,16 +187,21 @@ class _Queue:
         return unstacked(fits)[: len(lanes)]  # without the padding
 
 
-def _identify(
+def choices(
     count: int,
     load: Callable[[int], tuple[Recording, AbstractFeed]],
     candidates: Sequence[AbstractCircuit],
     asked: AbstractEstimator | None,
     progress: bool,
 ) -> tuple[list[Selection], list[str], list[str]]:
-    """Choices and notes of recordings, and names of the methods that were used.
+    """A choice for each recording alone, notes, and names of the methods that were used.
 
-    An error of `load(row)` becomes the verdict of this row.
+    Args:
+        count: Number of recordings.
+        load: Recording and driver of a row. Its error becomes the verdict of this row.
+        candidates: Circuits to choose from.
+        asked: The requested estimator.
+        progress: Show a progress bar.
     """
     found: dict[int, Selection] = {}
     notes = [""] * count
@@ -264,12 +269,12 @@ def _of_one_circuit(
         fixed: Number of the circuit, if it is chosen already. The other candidates then serve to
             find the recordings that deserve another circuit.
     """
-    found, notes, used = _identify(count, load, candidates, asked, progress)
+    found, notes, used = choices(count, load, candidates, asked, progress)
     chosen = common(found, candidates) if fixed is None else fixed
     others = [row for row, one in enumerate(found) if one.chosen != chosen]
     if others:
         of_others = [candidates[chosen]], asked, False
-        again, texts, _ = _identify(len(others), lambda i: load(others[i]), *of_others)
+        again, texts, _ = choices(len(others), lambda i: load(others[i]), *of_others)
         for row, one, text in zip(others, again, texts, strict=True):
             found[row], notes[row] = _otherwise(found[row], one.fit, text, chosen, candidates)
     return _of_one_method([one.fit for one in found], used), notes
@@ -432,7 +437,7 @@ def common_first(
     step = -(-len(paths) // SAMPLE)
     sample = paths[::step]
     load = _loader(study, sample, drivers)
-    found, *_ = _identify(len(sample), load, candidates, asked, progress=False)
+    found, *_ = choices(len(sample), load, candidates, asked, progress=False)
     chosen = common(found, candidates)
     return candidates[chosen], *(one for n, one in enumerate(candidates) if n != chosen)
 
