@@ -162,6 +162,24 @@ def test_what_does_not_change_raises_no_alarm(name):
             assert (np.abs(change.size) < 6 * change.stderr).all()
 
 
+@pytest.mark.parametrize("rate", [100e3, 200e3])
+def test_cuts_between_samples_leave_the_amplitude_of_v_th_alone(rate):
+    """Thirds of a sample; sums of four samples had 1.4e-3 at 200 kHz, and 12 times the alarms."""
+    scene = rung("dry", snr_db=100.0, sample_rate=rate, samples=round(rate / 20))
+    [of] = repeats([Inspected(scene.simulate(0)[TRIAL])])
+    assert of is not None
+    assert np.abs(of.unloaded).max() < np.sqrt(of.unloaded_variance) < changes.UNEQUAL
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("snr_db", [20.0, 30.0, 80.0])
+def test_false_alarms_are_as_rare_as_they_are_said_to_be(snr_db):
+    """One is expected in this many recordings; more than six have a probability of 8e-5."""
+    scene, count = rung("dry", snr_db=snr_db), round(1 / changes.ALARM)
+    seen = (change_of(scene.simulate(seed)[TRIAL], scene, LOADS["dry"]) for seed in range(count))
+    assert sum(bool(one.seen) for one in seen) <= 6
+
+
 @pytest.mark.parametrize("frequency", [1.0, 50.0])
 def test_hum_and_wander_are_no_change_of_the_skin(frequency):
     scene, skin = rung("dry"), LOADS["dry"]

@@ -40,8 +40,9 @@ SINGLE = 12  # number of lowest harmonics that each form a band
 RATIO = 1.08  # ratio of the edges of the bands above these harmonics
 ALIGNED = 1e-3  # [samples] a smaller delay changes the gain in proportion
 PASSES = 5  # iterations to align periods; a clock error of 200 ppm needs three
-MERGED = 4  # number of samples of V_th that are added to one
-LOW = 0.5  # lower fraction of the remaining band, in which such sums are as good as samples
+# The same for V_th, of which only the amplitude is wanted. Without the samples between, the aliases
+# of its edges would look like another amplitude in each period: 1e-3 if every fourth remains.
+UNLOADED = 1 / 32
 TINY = 1e-30  # replaces the power of a record of zeros
 # Because cuts fall between samples, the amplitude of V_th differs by this number divided by the
 # square of the pulse width in samples: by 1e-4 for 133 samples, by 0.03 for 8 samples.
@@ -179,11 +180,9 @@ def _of_equal_periods(
     loaded = [_turned(v, one) for one, (_, v) in zip(group, records, strict=True)]
     own = _deviations(loaded, at, known, sigma)
     sigma = np.array([one.sigma_th for one in group])
-    merged = bands(of.sample_rate / MERGED, of.pulse_rate, PLAIN)
-    sums = [_merged(v_th) for v_th, _ in records]
-    unloaded = _deviations(sums, at / MERGED, merged, sigma * math.sqrt(MERGED))
-    weight = np.where(merged.middle < LOW * merged.middle[-1], 1 / unloaded.variance, 0.0)
-    smooth = _smooth(unloaded.mean, merged)
+    low = bands(of.sample_rate, of.pulse_rate, UNLOADED)
+    unloaded = _deviations([v_th for v_th, _ in records], at, low, sigma)
+    weight, smooth = 1 / unloaded.variance, _smooth(unloaded.mean, low)
     # Effect of an amplitude change by 1 after the projection of the polynomials.
     unit = 1 - (np.real(smooth.sum(2))[:, :, None] * smooth).sum(1) / unloaded.power
     total = (weight * _power(unit)).sum(1)
@@ -191,7 +190,7 @@ def _of_equal_periods(
     amplitude, smooth = along / total[:, None], _smooth(own.mean, known)
     # Coloured noise does not look like an amplitude change: the rest measures its size.
     rest = unloaded.gain - amplitude[:, :, None] * unit[:, None, :]
-    freedom = (2 * np.count_nonzero(weight, axis=1) - 1) * (periods - 1)
+    freedom = (2 * low.middle.size - 1) * (periods - 1)
     noise = np.maximum(1.0, (weight[:, None, :] * _power(rest)).sum((1, 2)) / freedom)
     width = [_phase(v) / periods for v, _ in records]
     turn = np.exp(-2j * np.pi * own.late)
@@ -230,12 +229,6 @@ class _Deviations(NamedTuple):
     variance: np.ndarray
     mean: np.ndarray
     late: np.ndarray
-
-
-def _merged(v: Float[np.ndarray, " time"]) -> Float[np.ndarray, " part"]:
-    """Sums of `MERGED` samples; they are sufficient for the amplitude at low frequencies."""
-    whole = v[: v.size // MERGED * MERGED]
-    return functools.reduce(np.add, (whole[first::MERGED] for first in range(MERGED)))
 
 
 def _deviations(
