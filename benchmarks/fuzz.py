@@ -34,7 +34,7 @@ from benchmarks import specimens
 MEMORY = 1 << 30  # bytes that a process may have in memory
 SAFETY = 4 << 30  # bytes of addresses beside those after the imports, for the sake of this machine
 PATIENCE = 6  # a file may take so many times the limit if others use the processor meanwhile
-START = 120.0  # seconds until a child has made its good files
+START = 120.0  # seconds until a child has made its good files, or damaged one
 SHARES = {"recordings": 8, "fits": 5, "mapping": 2, "csv": 1, "npz": 1, "matlab": 2,
           "matlab5": 1, "tdms": 1, "abf": 1}  # fmt: skip
 FINE = ("read", "refused")
@@ -128,7 +128,7 @@ class _Child:
         assert self.process.stdin is not None
         self.process.stdin.write(json.dumps([kind, seed]).encode() + b"\n")
         # What a file that has once been damaged takes to be damaged is not the reader's time.
-        began = self._answer(START) is not None
+        began = self._answer(PATIENCE * START, START) is not None
         answer = self._answer(PATIENCE * limit, limit) if began else None
         if answer is not None:
             return found | answer
