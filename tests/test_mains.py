@@ -95,7 +95,8 @@ def test_no_hum_is_seen_where_there_is_none(settings, snr_db):
 def test_a_record_that_is_not_finite_has_no_hum(value):
     v = np.sin(np.arange(10_000.0))
     v[7] = value
-    assert mains.separated(v, 0.01, 200e3, 60.0, 3, 10_000) is None
+    assert not mains.suspected(v[None], np.array([0.01]), 200e3, 60.0, 3, 10_000).any()
+    assert mains.separated(v, 0.01, 200e3, 3, 10_000) is None
 
 
 def test_a_drift_is_no_hum(records):

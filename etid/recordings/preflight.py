@@ -2,7 +2,8 @@
 
 import functools
 import math
-from collections.abc import Sequence
+from collections.abc import Hashable, Sequence
+from typing import TypeVar
 
 import numpy as np
 from jaxtyping import Bool, Complex, Float
@@ -12,13 +13,13 @@ from etid.recordings.remarks import Remark
 from etid.signals.disturbances import Joint, disturbed, enough, joint, of_source
 from etid.signals.filtering import TAPS
 from etid.signals.harmonics import ALIASED, harmonics, whole_periods
-from etid.signals.mains import Hum, separated
-from etid.signals.noise import RIPPLE, is_coarse, noise_std, step_of
+from etid.signals.mains import Hum, separated, suspected
+from etid.signals.noise import RIPPLE, VISIBLE, is_coarse, noise_std, shows_few, step_of
 from etid.signals.pulse_train import (
     CLOCK,
     PulseTrain,
-    find_pulses,
     lags_of,
+    pulse_trains,
     rise_time,
     shifted,
     whole_lag,
@@ -26,6 +27,7 @@ from etid.signals.pulse_train import (
 
 # A recording that is not finite is refused later; its neighbours in a group are not concerned.
 QUIETLY = functools.partial(np.errstate, invalid="ignore", over="ignore")
+_Key = TypeVar("_Key", bound=Hashable)
 SHORTEST = 4 * TAPS + 104  # [samples] edges of the interpolation, and 104 samples for the fit
 # [standard deviations] peak-to-peak value that noise alone hardly exceeds; a signal must exceed it
 FLAT = 8.0
@@ -65,7 +67,11 @@ class Group:
     @functools.cached_property
     def whole(self) -> Float[np.ndarray, "recording 2 time"]:
         """Voltages of all periods as they were recorded [V]."""
-        whole = np.stack([np.stack([v.values for v in _records(one)]) for one in self.recordings])
+        size = self.recordings[0].samples["v_out"].stored.size
+        whole = np.empty((len(self.recordings), 2, size))
+        for records, one in zip(whole, self.recordings, strict=True):
+            for v, record in zip(records, _records(one), strict=True):
+                v[:] = record.values
         whole.flags.writeable = False
         return whole
 
@@ -77,20 +83,25 @@ class Group:
     @functools.cached_property
     def noise(self) -> Float[np.ndarray, "recording 2"]:
         """Standard deviations of the noise of a sample of `whole` [V]."""
-        both = zip(self.whole, self.step, strict=True)
-        return np.array([list(map(noise_std, records, steps)) for records, steps in both])
+        with QUIETLY():
+            return np.asarray(noise_std(self.whole, self.step))
 
     @functools.cached_property
     def coarse(self) -> Float[np.ndarray, "recording 2"]:
         """Converter steps [V] that exceed the noise, else 0."""
-        both = zip(self.whole, self.step, strict=True)
-        return np.array([list(map(_coarse, records, steps)) for records, steps in both])
+        found = np.zeros(self.step.shape)
+        spans = np.ptp(self.recorded_limits, axis=-1)
+        visible = (self.step > VISIBLE * spans) | ((self.step == 0) & shows_few(self.whole))
+        for row, which in np.argwhere(visible):
+            v = self.whole[row, which]
+            step = float(self.step[row, which]) or step_of(v)
+            found[row, which] = step if is_coarse(v, step) else 0.0
+        return found
 
     @functools.cached_property
     def trains(self) -> list[PulseTrain]:
         """Pulse trains of `v_th`."""
-        with QUIETLY():
-            return [find_pulses(v_th, self.sample_rate, self.pulse_rate) for v_th, _ in self.whole]
+        return pulse_trains(self.whole[:, 0], self.sample_rate, self.pulse_rate)
 
     @functools.cached_property
     def whole_periods(self) -> list[tuple[int, int]]:
@@ -101,12 +112,16 @@ class Group:
     @functools.cached_property
     def hum(self) -> list[list[Hum | None]]:
         """Hum that is subtracted from each record; None if there is none."""
+        found: list[list[Hum | None]] = [[None, None] for _ in self.recordings]
         rates = self.sample_rate, self.pulse_rate
-        of_all = zip(self.whole, self.noise, self.whole_periods, strict=True)
-        return [
-            [separated(v, sigma, *rates, *periods) for v, sigma in zip(records, noise, strict=True)]
-            for records, noise, periods in of_all
-        ]
+        for of, rows in _alike(self.whole_periods).items():
+            with QUIETLY():
+                suspect = suspected(_part(self.whole, rows), self.noise[rows], *rates, *of)
+            for number, which in np.argwhere(suspect):
+                row = rows[number]
+                known = self.whole[row, which], float(self.noise[row, which]), self.sample_rate
+                found[row][which] = separated(*known, *of)
+        return found
 
     @functools.cached_property
     def quiet(self) -> Float[np.ndarray, "recording 2 time"]:
@@ -121,9 +136,14 @@ class Group:
         return quiet
 
     @functools.cached_property
+    def recorded_limits(self) -> Float[np.ndarray, "recording 2 limit"]:
+        """Smallest and largest sample of each record in `whole` [V]."""
+        return _limits(self.whole)
+
+    @functools.cached_property
     def limits(self) -> Float[np.ndarray, "recording 2 limit"]:
         """Smallest and largest sample of each record in `quiet` [V]."""
-        return _limits(self.quiet)
+        return self.recorded_limits if self.quiet is self.whole else _limits(self.quiet)
 
     @functools.cached_property
     def covariance(self) -> Float[np.ndarray, "recording 2 2"]:
@@ -134,12 +154,15 @@ class Group:
     def kept(self) -> list[Joint | None]:
         """The periods in use if disturbed periods are left out; None if all are in use."""
         kept: list[Joint | None] = [None] * len(self.recordings)
-        alike: dict[tuple[float, int], list[int]] = {}
-        for row, train in enumerate(self.trains):
-            if not train.mismatch:
-                alike.setdefault((train.counted, self.whole_periods[row][0]), []).append(row)
-        for (counted, periods), rows in alike.items():
-            of = self.quiet[rows], self.noise[rows], self.coarse[rows]
+        of_all = [
+            None if train.mismatch else (train.counted, periods)
+            for train, (periods, _) in zip(self.trains, self.whole_periods, strict=True)
+        ]
+        for key, rows in _alike(of_all).items():
+            if key is None:
+                continue
+            counted, periods = key
+            of = _part(self.quiet, rows), self.noise[rows], self.coarse[rows]
             spacing = self.sample_rate / counted
             with QUIETLY():
                 bad = disturbed(*of, spacing, periods)
@@ -154,7 +177,7 @@ class Group:
         rows = [row for row, train in enumerate(self.trains) if not train.mismatch]
         trains = [self.trains[row] for row in rows]
         with QUIETLY():
-            found = lags_of(self.quiet[rows], trains) if rows else []
+            found = lags_of(_part(self.quiet, rows), trains) if rows else []
         for row, lag in zip(rows, found, strict=True):
             lags[row] = lag
         return lags
@@ -175,6 +198,21 @@ def _records(recording: Recording) -> tuple[Samples, Samples]:
     return recording.samples[recording.cause], recording.samples["v_out"]
 
 
+def _alike(keys: Sequence[_Key]) -> dict[_Key, list[int]]:
+    """The rows of each key."""
+    rows: dict[_Key, list[int]] = {}
+    for row, key in enumerate(keys):
+        rows.setdefault(key, []).append(row)
+    return rows
+
+
+def _part(
+    records: Float[np.ndarray, "recording 2 time"], rows: Sequence[int]
+) -> Float[np.ndarray, "row 2 time"]:
+    """The rows of `records`; no copy if these are all."""
+    return records if len(rows) == len(records) else records[np.asarray(rows)]
+
+
 def _limits(v: Float[np.ndarray, "*record time"]) -> Float[np.ndarray, "*record limit"]:
     return np.stack([v.min(-1), v.max(-1)], axis=-1)
 
@@ -185,11 +223,6 @@ def _covariance(v: Float[np.ndarray, "*recording 2 time"]) -> Float[np.ndarray, 
         # Not `@`, which starts BLAS threads.
         square = np.einsum("...in,...jn->...ij", v, v) / v.shape[-1]
         return square - mean[..., :, None] * mean[..., None, :]
-
-
-def _coarse(v: Float[np.ndarray, " time"], told: float) -> float:
-    step = told or step_of(v)
-    return step if is_coarse(v, step) else 0.0
 
 
 def _kept(
@@ -329,6 +362,13 @@ class Inspected:
             return self._group.quiet[self._row]
         return np.stack([self.v_th, self.v_out])
 
+    @property
+    def recorded_limits(self) -> Float[np.ndarray, "2 limit"]:
+        """Smallest and largest sample of each voltage as it was recorded [V]."""
+        if self.kept is None:
+            return self._group.recorded_limits[self._row]
+        return _limits(np.stack([self.recorded_th, self.recorded_out]))
+
     @functools.cached_property
     def limits(self) -> Float[np.ndarray, "2 limit"]:
         """Smallest and largest sample of `v_th` and of `v_out` [V]."""
@@ -448,7 +488,7 @@ def preflight(seen: Inspected, *, periodic: bool = False) -> str | None:
         periodic: Whether the fit needs whole pulse periods.
     """
     of = seen.recording
-    if seen.v_th.size < SHORTEST:
+    if of.samples["v_out"].stored.size < SHORTEST or seen.v_th.size < SHORTEST:
         return "too_short"
     if not np.isfinite(seen.limits).all():
         return "nonfinite_samples"
@@ -456,9 +496,10 @@ def preflight(seen: Inspected, *, periodic: bool = False) -> str | None:
     if ((seen.spans <= noise) | (seen.spans == 0)).any():
         return "flat"
     # A current source holds its current, so a flat top of the current is no fault.
-    if not seen.has_current and _is_saturated(seen.recorded_th, seen.step_th, of):
+    th, out = seen.recorded_limits
+    if not seen.has_current and _is_saturated(seen.recorded_th, th, seen.step_th, of):
         return "saturated"
-    if _is_saturated(seen.recorded_out, seen.step_out, of):
+    if _is_saturated(seen.recorded_out, out, seen.step_out, of):
         return "saturated"
     if seen.has_current and not _is_plausible(seen):
         return "wrong_unit"
@@ -510,19 +551,26 @@ def why_misaligned(seen: Inspected) -> str:
     return ""
 
 
-def _is_saturated(v: Float[np.ndarray, " time"], step: float, recording: Recording) -> bool:
+def _is_saturated(
+    v: Float[np.ndarray, " time"],
+    limits: Float[np.ndarray, " limit"],
+    step: float,
+    recording: Recording,
+) -> bool:
     """Whether samples are at a limit of the converter, or a flat top begins and ends in jumps."""
     if recording.adc_range is not None:
         low, high = recording.adc_range
-        return bool((v <= low + step / 2).any() or (v >= high - step / 2).any())
-    for extreme in (v.max(), v.min()):
+        return bool(limits[0] <= low + step / 2 or limits[1] >= high - step / 2)
+    for extreme in limits:
         at_rail = v == extreme
+        if np.count_nonzero(at_rail) < RAIL:
+            continue
         edges = np.flatnonzero(np.diff(np.concatenate([[0], at_rail.astype(np.int8), [0]])))
         for start, stop in edges.reshape(-1, 2):
             inside = start > 0 and stop < v.size
             if stop - start < RAIL or not inside:
                 continue
-            floor = step if step > 0 else np.ptp(v) / 2**16
+            floor = step if step > 0 else (limits[1] - limits[0]) / 2**16
             jump = min(abs(v[start - 1] - extreme), abs(v[stop] - extreme))
             if jump > JUMP * floor:
                 return True

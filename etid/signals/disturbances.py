@@ -58,9 +58,14 @@ def disturbed(
     low, high = means.min(2), means.max(2)
     noise = NOISE / MERGED**0.5 * sigma
     floor = np.maximum(PART * high.max(2), noise) + step
-    # Most records end here, in half of the time.
-    suspect = (high - low > SHARE * np.maximum(low, -high) + floor[..., None]).any((1, 2))
+    # Most records end here, in half of the time: the median of the periods, to which `_unlike`
+    # compares them, lies between `low` and `high`.
+    least, most = _highest_beside(low), -_highest_beside(-high)
+    allowed = SHARE * np.maximum(least, -most) + np.maximum(least - most, 0) + floor[..., None]
+    suspect = ((high - low)[..., 1:-1] > allowed).any((1, 2))
     bad = np.zeros((count, periods), bool)
+    if not suspect.any():
+        return bad
     bad[suspect] = _unlike(means[suspect], noise[suspect], step[suspect])
     return bad
 
@@ -77,9 +82,7 @@ def _unlike(
     usual = np.median(means, axis=2)
     floor = np.maximum(PART * np.abs(usual).max(2), noise) + step
     # The first and the last mean lie between pulses.
-    left, middle, right = usual[..., :-2], usual[..., 1:-1], usual[..., 2:]
-    high = np.maximum(np.maximum(left, middle), right)
-    low = np.minimum(np.minimum(left, middle), right)
+    high, low = _highest_beside(usual), -_highest_beside(-usual)
     allowed = SHARE * np.maximum(high, -low) + (high - low) + floor[..., None]
     off = np.abs(means - usual[:, :, None])[..., 1:-1]
     unlike = np.any(off > allowed[:, :, None], axis=3)
@@ -90,6 +93,11 @@ def _unlike(
     longer[:, :-1] |= first[:, 1:]
     longer[:, 1:] |= last[:, :-1]
     return np.where(enough(longer)[:, None], longer, bad)
+
+
+def _highest_beside(means: Float[np.ndarray, "*record part"]) -> Float[np.ndarray, "*record _"]:
+    """The highest of each mean and the means beside it; not for the first and the last mean."""
+    return np.maximum(np.maximum(means[..., :-2], means[..., 1:-1]), means[..., 2:])
 
 
 def enough(bad: Bool[np.ndarray, "*recording period"]) -> Bool[np.ndarray, "*recording"]:

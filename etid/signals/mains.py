@@ -90,13 +90,36 @@ def lines(
     return found
 
 
-def separated(
-    v: Float[np.ndarray, " time"],
-    sigma: float,
+def suspected(
+    records: Float[np.ndarray, "*record time"],
+    sigma: Float[np.ndarray, "*record"],
     sample_rate: float,
     pulse_rate: float,
     periods: int,
     samples: int,
+) -> Bool[np.ndarray, "*record"]:
+    """Whether records may have hum between the harmonics, by a quick look; most records do not.
+
+    Arguments as in `separated`, for several records.
+    """
+    if periods < 2:
+        return np.zeros(sigma.shape, bool)
+    if samples > PROBED:
+        return sigma > 0
+    probes, left = _probes(sample_rate, periods, samples)
+    # Not `@`, which starts BLAS threads.
+    found = np.abs(np.einsum("...n,pn->...p", records[..., :samples], probes)).max(-1)
+    # A record that is not finite is refused later.
+    humming = (sigma > 0) & (found >= SEEN * sigma) & (found < np.inf)
+    rest = min(abs(periods * sample_rate / pulse_rate - samples), 0.5)
+    if rest > 0 and humming.any():
+        leaked = rest * left * np.abs(records[humming, :samples]).mean(-1)
+        humming[humming] = found[humming] >= SEEN * sigma[humming] + leaked
+    return humming
+
+
+def separated(
+    v: Float[np.ndarray, " time"], sigma: float, sample_rate: float, periods: int, samples: int
 ) -> Hum | None:
     """Hum in the bins between the harmonics; None if there is none.
 
@@ -106,21 +129,10 @@ def separated(
         v: Voltage of the record [V].
         sigma: Standard deviation of the noise of a sample [V].
         sample_rate: Sampling rate [Hz].
-        pulse_rate: Nominal pulses per second [Hz].
-        periods: Number of periods from `etid.signals.harmonics.whole_periods`.
+        periods: Number of periods from `etid.signals.harmonics.whole_periods`, at least 2.
         samples: Number of samples from `etid.signals.harmonics.whole_periods`.
     """
-    if periods < 2 or not sigma > 0:
-        return None
     v = v[:samples]
-    if samples <= PROBED:
-        probes, left = _probes(sample_rate, periods, samples)
-        found = np.abs(np.einsum("pn,n->p", probes, v)).max()
-        if not SEEN * sigma <= found < math.inf:
-            return None  # most records end here, and records that are not finite
-        rest = min(abs(periods * sample_rate / pulse_rate - samples), 0.5)
-        if found < SEEN * sigma + rest * left * np.abs(v).mean():
-            return None
     return _found(v, sigma, sample_rate, periods) if np.isfinite(v).all() else None
 
 

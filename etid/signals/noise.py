@@ -20,7 +20,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Complex, Float, Int
+from jaxtyping import Array, Bool, Complex, Float, Int
 
 from etid.signals.harmonics import WINDOW, harmonics, namespace
 
@@ -62,21 +62,25 @@ def _median(x: Float[Array, " sample"]) -> Float[Array, ""]:
 
 
 def noise_std(
-    v: Float[Array | np.ndarray, " time"],
-    resolution: Float[Array | np.ndarray, ""] | float = 0.0,
-) -> Float[Array | np.ndarray, ""]:
+    v: Float[Array | np.ndarray, "*record time"],
+    resolution: Float[Array | np.ndarray, "*record"] | float = 0.0,
+) -> Float[Array | np.ndarray, "*record"]:
     """Standard deviation of the white noise in `v`, in the unit of `v`.
 
     Args:
-        v: Samples of the record.
+        v: Samples of the record, or of several records as an array of NumPy.
         resolution: Step of the converter, in the unit of `v`; 0 if it is not known.
     """
     difference = np.array([(-1.0) ** k * math.comb(ORDER, k) for k in range(ORDER + 1)])
     gain = math.sqrt(np.sum(difference**2))
     floor = resolution / math.sqrt(12.0)
     if isinstance(v, np.ndarray):  # nothing is compiled; `np.median` takes ten times as long
-        size, half = np.abs(np.convolve(v, difference, "valid")), (v.size - ORDER) // 2
-        return np.asarray(max(MEDIAN_TO_SIGMA / gain * np.partition(size, half)[half], floor))
+        # All records at once; the values at their joints, from two records, are left out.
+        size = np.convolve(v.ravel(), difference, "same").reshape(v.shape)
+        size = np.abs(size[..., ORDER // 2 : -ORDER // 2])
+        half = size.shape[-1] // 2
+        size.partition(half, axis=-1)
+        return np.asarray(np.maximum(MEDIAN_TO_SIGMA / gain * size[..., half], floor))
     size = jnp.abs(jnp.diff(v, ORDER))
     return jnp.maximum(MEDIAN_TO_SIGMA / gain * _median(size), floor)
 
@@ -129,9 +133,15 @@ def trusted(
 # --- Coarse converters ---------------------------------------------------------------------------
 
 
+def shows_few(v: Float[np.ndarray, "*record time"]) -> Bool[np.ndarray, "*record"]:
+    """Whether the first samples have few values, as those of a converter without noise."""
+    first = np.sort(v[..., :FEW], axis=-1)
+    return np.asarray(np.count_nonzero(np.diff(first), axis=-1) < FEW // 2)
+
+
 def step_of(v: Float[np.ndarray, " time"]) -> float:
     """Step of the converter; 0 if the values are not multiples of one step."""
-    if np.unique(v[:FEW]).size > FEW // 2:
+    if not shows_few(v):
         return 0.0
     values = np.unique(v)
     steps = np.diff(values)

@@ -7,10 +7,11 @@ the elements. This module uses NumPy only, because it runs before anything is fi
 
 import dataclasses
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 import scipy.fft
-from jaxtyping import Complex, Float, Int
+from jaxtyping import Bool, Complex, Float, Int
 
 from etid.signals.harmonics import fast_length
 
@@ -100,62 +101,97 @@ def _counted(rate: float) -> str:
     return f"{float(f'{rate:.4g}'):.9g}"
 
 
-@np.errstate(over="ignore", invalid="ignore")  # of a damaged file
 def find_pulses(v: Float[np.ndarray, " time"], sample_rate: float, pulse_rate: float) -> PulseTrain:
-    """Find the pulses of an unloaded record.
+    """The pulses of an unloaded record, as `pulse_trains` finds them."""
+    (found,) = pulse_trains(v[None], sample_rate, pulse_rate)
+    return found
 
-    The record is averaged over a five-hundredth of a period. A pulse begins and ends where the
+
+@np.errstate(over="ignore", invalid="ignore")  # of a damaged file
+def pulse_trains(
+    records: Float[np.ndarray, "record time"], sample_rate: float, pulse_rate: float
+) -> list[PulseTrain]:
+    """Find the pulses of unloaded records.
+
+    Each record is averaged over a five-hundredth of a period. A pulse begins and ends where the
     average crosses half of its highest value, such as 25 V of 50 V. Noise at 20 dB (1 V), hum and
     drift do not reach this level.
 
     Args:
-        v: Unloaded voltage [V].
+        records: Unloaded voltages [V].
         sample_rate: Samples per second [Hz].
         pulse_rate: Pulses per second [Hz]; may be wrong by an order of magnitude.
     """
-    period = sample_rate / pulse_rate
+    size, period = records.shape[1], sample_rate / pulse_rate
     step = max(1, int(period / COARSE))
-    whole = v.size // step * step
-    coarse = np.add.reduceat(v[:whole], np.arange(0, whole, step)) / step if whole else v[:0]
-    if coarse.size == 0 or not np.isfinite(coarse).all():
-        return PulseTrain(np.zeros(0, int), None, v.size, sample_rate, pulse_rate)
-    coarse = coarse - coarse.mean()
-    top = coarse[np.argmax(np.abs(coarse))]
-    above = coarse / top > HALF if top != 0 else np.zeros(coarse.size, bool)
+    number = size // step
+    coarse = records[:, : number * step].reshape(len(records), number, step)
+    coarse = np.einsum("rps->rp", coarse) / step
+    nothing = PulseTrain(np.zeros(0, int), None, size, sample_rate, pulse_rate)
+    found = [nothing] * len(records)
+    usable = np.isfinite(coarse).all(1) & (number > 0)
+    if not usable.any():
+        return found
+    coarse = coarse[usable]
+    coarse = coarse - coarse.mean(1, keepdims=True)
+    top = np.take_along_axis(coarse, np.argmax(np.abs(coarse), axis=1)[:, None], axis=1)
+    above = coarse / np.where(top != 0, top, 1.0) > np.where(top != 0, HALF, np.inf)
+    # The pulses of most records begin at the same places. These records are processed together.
+    alike: dict[bytes, list[int]] = {}
+    for row, key in enumerate(np.packbits(above, axis=1)):
+        alike.setdefault(key.tobytes(), []).append(row)
+    rows = np.flatnonzero(usable)
+    for same in alike.values():
+        edges = _edges_of(above[same[0]], period / step) * step
+        gaps = np.diff(edges)
+        even = gaps.size > 0 and np.ptp(gaps) <= EVEN * gaps.mean()
+        several = rows[same]
+        spacings = _spacings(records[several], edges, step, sample_rate) if even else None
+        for number, row in enumerate(several):
+            spacing = None if spacings is None else float(spacings[number])
+            found[row] = PulseTrain(edges, spacing, size, sample_rate, pulse_rate)
+    return found
+
+
+def _edges_of(above: Bool[np.ndarray, " place"], period: float) -> Int[np.ndarray, " pulse"]:
+    """Starts of the pulses, or their ends if there are more ends; none without a whole pulse."""
     turns = np.flatnonzero(np.diff(above)) + 1
     begins, ends = turns[above[turns]], turns[~above[turns]]
-    apart = max(1.0, RINGING * period / step)
+    apart = max(1.0, RINGING * period)
     begins = begins[np.diff(begins, prepend=-np.inf) > apart]
     ends = ends[np.diff(ends, append=np.inf) > apart]
+    if not begins.size or not ends.size:
+        return begins[:0]
     # A pulse that is cut by an end of the record has only one edge.
-    edges = (begins if begins.size >= ends.size else ends) * step
-    whole = begins.size > 0 and ends.size > 0  # a record without both has no pulse
-    found = PulseTrain(edges if whole else edges[:0], None, v.size, sample_rate, pulse_rate)
-    gaps = np.diff(found.edges)
-    if gaps.size == 0 or np.ptp(gaps) > EVEN * gaps.mean():
-        return found
-    return dataclasses.replace(found, spacing=_spacing(v, found, step))
+    return begins if begins.size >= ends.size else ends
 
 
-def _spacing(v: Float[np.ndarray, " time"], found: PulseTrain, step: int) -> float:
+def _spacings(
+    records: Float[np.ndarray, "record time"],
+    edges: Int[np.ndarray, " pulse"],
+    step: int,
+    sample_rate: float,
+) -> Float[np.ndarray, " record"]:
     """Spacing of the pulses [samples], from the first and the last edge."""
-    first, last = int(found.edges[0]), int(found.edges[-1])
+    first, last, size = int(edges[0]), int(edges[-1]), records.shape[1]
     off = 2 * step + 2  # [samples] error of the coarse edges
-    rise = rise_time(found.sample_rate)
-    room = min(first, v.size - last - rise)
+    rise = rise_time(sample_rate)
+    room = min(first, size - last - rise)
     width = min(8 * step + 4 * rise, (last - first) // 4)
     before = max(0, min(width, room - off))
-    after = max(1, min(width, v.size - last - off - rise))
-    template = rises(v[first - before : first + after + rise], rise)
+    after = max(1, min(width, size - last - off - rise))
+    template = rises(records[:, first - before : first + after + rise], rise)
     start = max(0, last - before - off)
-    where = rises(v[start : last + after + off + rise], rise)
-    if where.size < template.size:  # the last edge is at the end of the record
-        return (last - first) / (found.edges.size - 1)
+    where = rises(records[:, start : last + after + off + rise], rise)
+    between = edges.size - 1
+    if where.shape[1] < template.shape[1]:  # the last edge is at the end of the record
+        return np.full(len(records), (last - first) / between)
     # Least squares of the difference. The correlation alone is biased towards the steepest part of
     # a slow edge.
-    power = np.convolve(where**2, np.ones(template.size), "valid")
-    lag = highest(np.correlate(where, template, "valid") - power / 2)
-    return (start + lag - (first - before)) / (found.edges.size - 1)
+    parts = np.lib.stride_tricks.sliding_window_view(where, template.shape[1], axis=1)
+    power = np.einsum("rls,rls->rl", parts, parts)
+    lag = highest(np.einsum("rls,rs->rl", parts, template) - power / 2)
+    return (start + lag - (first - before)) / between
 
 
 def rise_time(sample_rate: float) -> int:
@@ -163,19 +199,21 @@ def rise_time(sample_rate: float) -> int:
     return max(1, round(EDGE * sample_rate))
 
 
-def rises(v: Float[np.ndarray, " time"], rise: int) -> Float[np.ndarray, " sample"]:
+def rises(v: Float[np.ndarray, "*record time"], rise: int) -> Float[np.ndarray, "*record sample"]:
     """Rise of `v` over `rise` samples; edges exceed noise and droop at any sample rate."""
-    return v[rise:] - v[:-rise]
+    return v[..., rise:] - v[..., :-rise]
 
 
-def highest(correlation: Float[np.ndarray, " lag"]) -> float:
+def highest(correlation: Float[np.ndarray, "*record lag"]) -> Float[np.ndarray, "*record"]:
     """Position of the maximum [samples], interpolated by a parabola."""
-    top = int(np.argmax(correlation))
-    if not 0 < top < correlation.size - 1:
-        return float(top)
-    left, middle, right = correlation[top - 1 : top + 2]
+    top = np.argmax(correlation, axis=-1)
+    last = correlation.shape[-1] - 1
+    at = np.clip(top[..., None] + np.arange(-1, 2), 0, last)
+    left, middle, right = np.moveaxis(np.take_along_axis(correlation, at, axis=-1), -1, 0)
     bend = left - 2 * middle + right
-    return top if bend == 0 else top + 0.5 * float((left - right) / bend)
+    inside = (top > 0) & (top < last) & (bend != 0)
+    beside = np.where(inside, 0.5 * (left - right) / np.where(inside, bend, 1.0), 0.0)
+    return np.asarray(top + beside)
 
 
 # --- Lag between two records ----------------------------------------------------------------------
@@ -195,48 +233,64 @@ def lags_of(
     Returns:
         The lags [samples]; None if both records have opposite polarity or are too far apart.
     """
-    parts = [_edges(both[0], both[1], train) for both, train in zip(records, trains, strict=True)]
-    size = fast_length(max(where.size for where, _ in parts))
-    # Single precision suffices, and its transforms take a fourth of the time.
-    both = np.zeros((len(parts), 2, size), np.float32)
-    for row, (where, template) in enumerate(parts):
-        both[row, 0, : where.size], both[row, 1, : template.size] = where, template
-    transforms = np.asarray(scipy.fft.rfft(both))
-    products = scipy.fft.irfft(transforms[:, 0] * np.conj(transforms[:, 1]), size)
-    return [_lag(*parts) for parts in zip(np.asarray(products), trains, strict=True)]
+    lags: list[float | None] = [None] * len(records)
+    alike: dict[_Window, list[int]] = {}
+    for row, train in enumerate(trains):
+        alike.setdefault(_window(records[row, 0], train), []).append(row)
+    for window, rows in alike.items():
+        for row, lag in zip(rows, _lags(records[rows], window), strict=True):
+            lags[row] = float(lag) if abs(lag) <= min(LAGS, PART * _period(trains[row])) else None
+    return lags
+
+
+class _Window(NamedTuple):
+    """Which samples are correlated.
+
+    Attributes:
+        first: First sample of the template.
+        last: Sample after the template, with the rise.
+        reach: Largest lag that is searched [samples].
+        rise: Samples over which edges rise.
+    """
+
+    first: int
+    last: int
+    reach: int
+    rise: int
 
 
 def _period(train: PulseTrain) -> float:
     return train.spacing or train.sample_rate / train.pulse_rate
 
 
-def _edges(
-    v_th: Float[np.ndarray, " time"], v_out: Float[np.ndarray, " time"], train: PulseTrain
-) -> tuple[Float[np.ndarray, " place"], Float[np.ndarray, " template"]]:
-    """Rises of `v_out` half a period around an edge, and rises of `v_th` at the edge."""
+def _window(v_th: Float[np.ndarray, " time"], train: PulseTrain) -> _Window:
+    """The samples around an edge of `v_th`, and half a period on both sides."""
     period = _period(train)
     rise, edges = rise_time(train.sample_rate), train.edges[train.edges < v_th.size]
-    edge = edges[edges.size // 2] if edges.size else np.argmax(np.abs(rises(v_th, rise)))
-    first = max(0, int(edge) - int(AROUND * period))
-    template = rises(v_th[first : int(edge) + int(AROUND * period) + rise], rise)
-    reach = int(period / 2)
-    where = np.zeros(template.size + 2 * reach)
-    start = max(0, first - reach)
-    found = rises(v_out[start : first + reach + template.size + rise], rise)
-    begin = start - (first - reach)
-    where[begin : begin + found.size] = found
-    return where, template
+    edge = int(edges[edges.size // 2] if edges.size else np.argmax(np.abs(rises(v_th, rise))))
+    around = int(AROUND * period)
+    first, last = max(0, edge - around), min(edge + around + rise, v_th.size)
+    return _Window(first, last, int(period / 2), rise)
 
 
-def _lag(correlation: Float[np.ndarray, " place"], train: PulseTrain) -> float | None:
-    """The lag with the highest correlation; None if it is too large or the polarity is wrong."""
-    period = _period(train)
-    reach = int(period / 2)
-    correlation = correlation[: 2 * reach + 1]
-    if correlation.max() <= -correlation.min():
-        return None
-    lag = highest(correlation) - reach
-    return lag if abs(lag) <= min(LAGS, PART * period) else None
+def _lags(
+    records: Float[np.ndarray, "recording 2 time"], of: _Window
+) -> Float[np.ndarray, " recording"]:
+    """The lags with the highest correlation; infinite if the polarity is wrong."""
+    template = rises(records[:, 0, of.first : of.last], of.rise)
+    begin = of.first - of.reach
+    start = max(0, begin)
+    found = rises(records[:, 1, start : of.last + of.reach], of.rise)
+    size = fast_length(template.shape[1] + 2 * of.reach)
+    # Single precision suffices, and its transforms take a fourth of the time.
+    both = np.zeros((len(records), 2, size), np.float32)
+    both[:, 0, start - begin : start - begin + found.shape[1]] = found
+    both[:, 1, : template.shape[1]] = template
+    transforms = np.asarray(scipy.fft.rfft(both))
+    products = scipy.fft.irfft(transforms[:, 0] * np.conj(transforms[:, 1]), size)
+    correlation = np.asarray(products)[:, : 2 * of.reach + 1]
+    lag = highest(correlation) - of.reach
+    return np.where(correlation.max(1) > -correlation.min(1), lag, np.inf)
 
 
 def whole_lag(lag: float) -> int:
@@ -272,4 +326,4 @@ def rest(
     for _ in range(round(2 * NEAR / FINE) + 1):
         correlation.append(turned.sum().real)
         turned = turned * step
-    return FINE * highest(np.array(correlation)) - NEAR
+    return FINE * float(highest(np.array(correlation))) - NEAR
