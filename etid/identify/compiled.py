@@ -49,8 +49,13 @@ KNOWN = {"etid", "builtins", "equinox", "jax", "jaxlib", "lineax", "numpy", "opt
 FOLDER = "etid"  # inside the folder of the compilation cache
 LOADED = time.time()
 # XLA compiles for a processor in two thirds of the time without the emitters of fusions and with
-# fewer passes of LLVM. The programs are as fast.
-QUICKLY = {"xla_cpu_use_fusion_emitters": False, "xla_backend_optimization_level": 1}
+# fewer passes of LLVM, and in 85 % of that time if each sum is one kernel, not a tree of three. The
+# programs are as fast.
+QUICKLY = {
+    "xla_cpu_use_fusion_emitters": False,
+    "xla_backend_optimization_level": 1,
+    "xla_disable_hlo_passes": "tree_reduction_rewriter",
+}
 # Without any passes it takes half of that time, and the programs take twice the time.
 AT_ONCE = {**QUICKLY, "xla_backend_optimization_level": 0}
 # Settings of JAX that do not change a program.
