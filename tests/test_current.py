@@ -6,6 +6,7 @@ import pytest
 import scipy.io
 
 import etid
+from etid import cli
 from etid.plotting import figure_of
 from etid.recordings.preflight import Inspected, preflight
 from etid.results.feed import MEASURED_CURRENT
@@ -151,6 +152,63 @@ def test_a_batch_gives_the_fits_of_single_recordings(skin):
         np.asarray(fits.circuit.r_p)[0], etid.identify_skin(skin).circuit.r_p, rtol=1e-9
     )
     assert (fits.verdicts == "successful").all()
+
+
+KNOWN = {"fixed": {"r_s": 33e3}, "prior": {"c_p": (0.12e-9, 1e-13)}}
+
+
+def test_a_batch_takes_known_elements(skin):
+    fits = etid.identify_skins([skin], **KNOWN)
+    np.testing.assert_allclose(np.asarray(fits.circuit.r_s), 33e3, rtol=1e-8)
+    assert fits.stderr.c_p < 1e-13
+    assert np.abs(off(fits[0], SKIN))[1:].max() < WITHIN
+    assert fits.verdicts == ["successful"]
+    assert "known_elements" in fits.fit.method
+
+
+def test_a_wrong_known_element_of_a_batch_is_refused(skin):
+    with pytest.raises(ValueError, match="'r_x' is no element of SkinRC"):
+        etid.identify_skins([skin], fixed={"r_x": 1.0})
+
+
+def test_a_joint_fit_leaves_recordings_of_a_current_to_fits_of_their_own(skin):
+    joint = etid.identify_jointly(etid.Study.from_recordings([skin.replace(path="s01/0")]))
+    fit, alone = joint.fits[0], etid.identify_skin(skin)
+    assert (joint.drivers, fit.verdict, fit.method) == ({}, "successful", "joint")
+    np.testing.assert_allclose(fit.circuit.values(), alone.circuit.values(), rtol=1e-9)
+
+
+def test_one_load_is_identified_from_several_recordings_of_its_current(skin):
+    several = [skin, *(recorded(SKIN, seed=seed, delay=seed * 1e-6) for seed in (1, 2, 3))]
+    fit = etid.identify_amplitudes(several, circuit=etid.SkinRC())
+    assert np.abs(off(fit, SKIN)).max() < WITHIN
+    alone = etid.identify_skin(skin)
+    # Four recordings with equal noise, whose level is estimated to a few per cent.
+    np.testing.assert_allclose(fit.stderr.r_p, alone.stderr.r_p / 2, rtol=0.1)
+
+
+def test_known_elements_on_the_command_line(skin, tmp_path, capsys):
+    study = tmp_path / "study.h5"
+    etid.Study.from_recordings([skin.replace(path="s01/0")]).write(study)
+    command = ["fit", str(study), "-o", str(tmp_path / "fits.h5"), "--force"]
+    assert cli.main([*command, "--fix", "r_s=33e3", "--prior", "c_p=120e-12,1e-13"]) == 0
+    fit = etid.Fits.read(tmp_path / "fits.h5")[0]
+    np.testing.assert_allclose(fit.circuit.r_s, 33e3, rtol=1e-8)
+    assert fit.stderr.c_p < 1e-13
+    etid.write_report(tmp_path / "fits.h5", tmp_path / "page.html")
+    assert "r_s = 33000 (fixed)" in (tmp_path / "page.html").read_text("utf-8")
+    for options, words in (
+        (["--fix", "r_s=1,2"], "--fix r_s has 2 numbers; write --fix r_s=500"),
+        (["--fix", "r_s=1", "--fix", "r_s=2"], "names an element twice: r_s, r_s"),
+        (["--fix", "r_x=1"], "'r_x' is no element of SkinRC"),
+        (["--joint", "--fix", "r_s=1"], "remove --fix and --prior"),
+    ):
+        capsys.readouterr()
+        assert cli.main([*command, *options]) == 1
+        assert words in capsys.readouterr().err
+    with pytest.raises(SystemExit):
+        cli.main([*command, "--prior", "r_s=much"])
+    assert "write --fix r_s=500 or --prior r_s=500,50" in capsys.readouterr().err
 
 
 def test_a_study_of_currents_needs_no_calibration(skin, tmp_path):

@@ -129,7 +129,10 @@ def short(study):
 def test_a_record_without_a_whole_period_is_told_so_or_goes_to_output_error(short, driver):
     with pytest.raises(etid.IdentificationError, match="not_periodic"):
         etid.identify_skin(short, driver, method="maximum_likelihood")
-    assert arguments.plan(None, Inspected(short), driver) == (registry.OUTPUT_ERROR, None)
+    assert arguments.plan(arguments.Asked(), Inspected(short), driver) == (
+        registry.OUTPUT_ERROR,
+        None,
+    )
 
 
 @pytest.mark.slow

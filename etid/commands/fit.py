@@ -48,6 +48,23 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "default 5",
     )
     parser.add_argument(
+        "--fix",
+        type=_known,
+        action="append",
+        default=[],
+        metavar="ELEMENT=VALUE",
+        help="known value of an element [SI], such as r_s=500; may be repeated",
+    )
+    parser.add_argument(
+        "--prior",
+        type=_known,
+        action="append",
+        default=[],
+        metavar="ELEMENT=VALUE,ERROR",
+        help="value of an element with its standard deviation [SI], such as r_s=500,50; may be "
+        "repeated",
+    )
+    parser.add_argument(
         "--driver-drift",
         type=float,
         default=0.0,
@@ -82,6 +99,29 @@ def _order(text: str) -> Order:
         raise argparse.ArgumentTypeError(str(error)) from error
 
 
+def _known(text: str) -> tuple[str, list[float]]:
+    """Name and numbers of a known element, from --fix or --prior."""
+    name, _, numbers = text.partition("=")
+    try:
+        return name, [float(number) for number in numbers.split(",")]
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(
+            f"{text!r} is no known element; write --fix r_s=500 or --prior r_s=500,50"
+        ) from error
+
+
+def _several(option: str, known: list[tuple[str, list[float]]], count: int) -> dict[str, Any]:
+    """The known elements of an option by name; each has one number, or value and error."""
+    for name, numbers in known:
+        if len(numbers) != count:
+            right = "--fix r_s=500" if count == 1 else "--prior r_s=500,50"
+            raise ValueError(f"{option} {name} has {len(numbers)} numbers; write {right}")
+    names = [name for name, _ in known]
+    if len(set(names)) < len(names):
+        raise ValueError(f"{option} names an element twice: {', '.join(names)}")
+    return {name: numbers[0] if count == 1 else tuple(numbers) for name, numbers in known}
+
+
 def _workers(text: str) -> int:
     """The value of --workers."""
     if not text.isdecimal() or not int(text):
@@ -100,6 +140,9 @@ def run(arguments: argparse.Namespace) -> Outcome:
         raise ValueError(f"--joint uses maximum_likelihood; remove --method {arguments.method}")
     if arguments.joint and arguments.driver_drift:
         raise ValueError("--joint identifies the driver itself; remove --driver-drift")
+    fixed, prior = _several("--fix", arguments.fix, 1), _several("--prior", arguments.prior, 2)
+    if arguments.joint and (fixed or prior):
+        raise ValueError("--joint takes no known elements; remove --fix and --prior")
     circuit = None if arguments.circuit is None else arguments.circuit()
     progress = sys.stderr.isatty()
     if arguments.joint:
@@ -118,6 +161,8 @@ def run(arguments: argparse.Namespace) -> Outcome:
                 order=arguments.order,
                 circuit=circuit,
                 method=arguments.method,
+                fixed=fixed,
+                prior=prior,
                 driver_drift=arguments.driver_drift,
                 resume=arguments.resume,
                 executor=executor,

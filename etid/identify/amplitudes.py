@@ -15,7 +15,7 @@ from etid.estimators.lanes import Harmonics, stacked
 from etid.estimators.maximum_likelihood.estimator import description
 from etid.estimators.maximum_likelihood.given_driver import AbstractGiven
 from etid.estimators.registry import MAXIMUM_LIKELIHOOD, register_description
-from etid.identify.arguments import circuit_of, fed, plan, require, require_float64
+from etid.identify.arguments import Asked, circuit_of, fed, plan, require, require_float64
 from etid.identify.arguments import recordings as list_of
 from etid.identify.compiled import stored_jit
 from etid.identify.one import failed_fit, known_of, successful
@@ -103,7 +103,7 @@ def identify_amplitudes(
     of = _alike(list_of("recordings", recordings))
     seen = [Inspected(fed(one, driver)[0]) for one in of]
     for one in seen:
-        _, name = plan(MAXIMUM_LIKELIHOOD, one, feed)
+        _, name = plan(Asked(MAXIMUM_LIKELIHOOD), one, feed)
         if name is not None:
             fit = failed_fit(name, circuit, METHOD)
             return successful(one.recording, fit) if throw else fit

@@ -8,13 +8,13 @@ import functools
 import operator
 import reprlib
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import jax
 
 from etid.circuits.circuit import AbstractCircuit, SkinRC
 from etid.circuits.current_dependent import current_dependent
-from etid.estimators.element_prior import Known
+from etid.estimators.element_prior import Known, checked
 from etid.estimators.estimator import AbstractEstimator
 from etid.estimators.maximum_likelihood.estimator import MaximumLikelihood
 from etid.estimators.output_error.estimator import OutputError
@@ -243,6 +243,38 @@ def with_known(estimator: AbstractEstimator, known: Known) -> AbstractEstimator:
     return dataclasses.replace(estimator, known_elements=known)
 
 
+class Asked(NamedTuple):
+    """What a caller asks for.
+
+    Attributes:
+        estimator: The requested estimator; None for the default of each recording.
+        known: Elements that are known.
+    """
+
+    estimator: AbstractEstimator | None = None
+    known: Known = ()
+
+
+def asked_of(
+    method: Method | None,
+    candidates: Sequence[AbstractCircuit],
+    fixed: Mapping[str, float] | None,
+    prior: Mapping[str, tuple[float, float]] | None,
+) -> Asked:
+    """What the arguments of a caller ask for.
+
+    Raises:
+        ValueError: As `estimator_of`, `informed` and `with_known`; or a known element is no element
+            of these circuits.
+    """
+    asked = Asked(estimator_of(method, candidates), informed(fixed, prior))
+    if asked.estimator is not None:
+        with_known(asked.estimator, asked.known)
+    for circuit in candidates if asked.known else ():
+        checked(asked.known, circuit)
+    return asked
+
+
 def check_circuits(estimator: AbstractEstimator, candidates: Sequence[AbstractCircuit]) -> None:
     """Raise ValueError unless an estimator can identify these circuits and choose between them."""
     if len(candidates) > 1 and not estimator.chooses:
@@ -310,16 +342,17 @@ def for_samples(driver: Driver, periods: tuple[int, int]) -> AbstractEstimator:
 
 
 def plan(
-    asked: AbstractEstimator | None, seen: Inspected, driver: AbstractFeed, known: Known = ()
+    asked: Asked, seen: Inspected, driver: AbstractFeed
 ) -> tuple[AbstractEstimator, str | None]:
     """The estimator of a load, and the verdict that excludes a fit; None if it can be fitted.
 
     Raises:
         ValueError: The estimator cannot use this driver.
     """
-    name = preflight(seen, periodic=asked is not None and asked.lane.periodic)
-    estimator = asked or OUTPUT_ERROR
+    of_caller = asked.estimator
+    name = preflight(seen, periodic=of_caller is not None and of_caller.lane.periodic)
+    estimator = of_caller or OUTPUT_ERROR
     if name is None and isinstance(driver, HarmonicDriver | MeasuredCurrent):
-        estimator = for_calibrations(asked, [seen])
+        estimator = for_calibrations(of_caller, [seen])
     estimator.check_driver(driver, seen.recording.sample_rate, seen.recording.pulse_rate)
-    return with_known(estimator, known), name
+    return with_known(estimator, asked.known), name

@@ -31,9 +31,8 @@ from tqdm import tqdm
 
 from etid.circuits.circuit import AbstractCircuit
 from etid.circuits.lookup import qualified
-from etid.estimators.estimator import AbstractEstimator
 from etid.estimators.registry import Method
-from etid.identify.arguments import Circuit, candidates_of, estimator_of, order_of
+from etid.identify.arguments import Asked, Circuit, asked_of, candidates_of, order_of
 from etid.identify.many import Drivers, common_first, identify_part, to_identify
 from etid.recordings.hdf5 import read
 from etid.recordings.recording import RecordingError
@@ -64,17 +63,13 @@ class _Opened(NamedTuple):
     drivers: Drivers
 
 
-def _open(
-    source: str, order: Order, asked: AbstractEstimator | None, driver_drift: float
-) -> _Opened:
+def _open(source: str, order: Order, asked: Asked, driver_drift: float) -> _Opened:
     study = read(source)
-    return _Opened(study, to_identify(study), Drivers(study, order, asked, driver_drift))
+    return _Opened(study, to_identify(study), Drivers(study, order, asked.estimator, driver_drift))
 
 
 @functools.cache
-def _kept_open(
-    source: str, stamp: int, order: Order, asked: AbstractEstimator | None, driver_drift: float
-) -> _Opened:
+def _kept_open(source: str, stamp: int, order: Order, asked: Asked, driver_drift: float) -> _Opened:
     """`_open`, kept for the lifetime of the process: a worker gets its parts one by one."""
     del stamp
     return _open(source, order, asked, driver_drift)
@@ -83,7 +78,7 @@ def _kept_open(
 def _fit(
     opened: _Opened,
     candidates: Sequence[AbstractCircuit],
-    asked: AbstractEstimator | None,
+    asked: Asked,
     size: int,
     number: int,
 ) -> StudyFits:
@@ -107,7 +102,7 @@ def _fit_elsewhere(
     source: str,
     stamp: int,
     order: Order,
-    asked: AbstractEstimator | None,
+    asked: Asked,
     driver_drift: float,
     candidates: Sequence[AbstractCircuit],
     size: int,
@@ -193,6 +188,8 @@ def fit_file(
     order: Order = 5,
     circuit: Circuit = None,
     method: Method | None = None,
+    fixed: Mapping[str, float] | None = None,
+    prior: Mapping[str, tuple[float, float]] | None = None,
     driver_drift: float = 0.0,
     resume: bool = False,
     executor: concurrent.futures.Executor | None = None,
@@ -206,6 +203,8 @@ def fit_file(
         order: As in `identify_driver`.
         circuit: As in `identify_skins`. With `"auto"` a sample of the recordings chooses it.
         method: As in `identify_skin`.
+        fixed: As in `identify_skin`, for all recordings.
+        prior: As in `identify_skin`, for all recordings.
         driver_drift: As in `identify_driver`.
         resume: Keep the parts of an earlier run that did not finish.
         executor: Executor that fits the parts. If not given, this process fits them.
@@ -223,7 +222,7 @@ def fit_file(
     """
     order = order_of(order)
     candidates = candidates_of(circuit)
-    asked = estimator_of(method, candidates)
+    asked = asked_of(method, candidates, fixed, prior)
     source, target = os.path.abspath(source), pathlib.Path(target)
     opened = _open(source, order, asked, driver_drift)
     with opened.study:
@@ -234,7 +233,12 @@ def fit_file(
         stamp = os.stat(source).st_mtime_ns
         candidates = common_first(opened.study, opened.paths, opened.drivers, candidates, asked)
         settings = Settings.of(
-            opened.study, count, order, str(asked or ""), candidates, driver_drift=driver_drift
+            opened.study,
+            count,
+            order,
+            str(asked.estimator or ""),
+            candidates,
+            driver_drift=driver_drift,
         )
         described = json.loads(json.dumps(dataclasses.asdict(settings)))  # tuples become lists
         run = {
@@ -245,6 +249,7 @@ def fit_file(
                     f"{qualified(type(one))} {eqx.tree_pformat(one)}" for one in candidates
                 ).encode()
             ).hexdigest(),
+            "known elements": repr(asked.known),
             "size of a part": PART,
         }
         parts = _Parts(target, run, resume)

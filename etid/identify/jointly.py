@@ -28,10 +28,17 @@ from etid.estimators.joint.terms import Joint, Loads
 from etid.estimators.lanes import AbstractLane, Harmonics, unstacked
 from etid.estimators.maximum_likelihood.driver import Calibrations
 from etid.estimators.maximum_likelihood.estimator import description
-from etid.estimators.registry import register_description
+from etid.estimators.registry import MAXIMUM_LIKELIHOOD, register_description
 from etid.estimators.score_tests.unloaded import shape_of
 from etid.estimators.starts import harmonic_starts
-from etid.identify.arguments import Circuit, candidates_of, order_of, require, require_float64
+from etid.identify.arguments import (
+    Asked,
+    Circuit,
+    candidates_of,
+    order_of,
+    require,
+    require_float64,
+)
 from etid.identify.compiled import stored_jit
 from etid.identify.many import (
     LANES,
@@ -40,6 +47,7 @@ from etid.identify.many import (
     common_first,
     each,
     filled,
+    identify_part,
     table,
     to_identify,
 )
@@ -50,7 +58,8 @@ from etid.recordings.recording import Recording
 from etid.recordings.remarks import Remark
 from etid.recordings.repeats import Repeats, repeats
 from etid.recordings.study import Study
-from etid.results.driver import Driver, HarmonicDriver
+from etid.results.driver import HarmonicDriver
+from etid.results.feed import AbstractFeed, MeasuredCurrent
 from etid.results.fits import Fit
 from etid.results.provenance import Settings
 from etid.results.study_fits import StudyFits
@@ -70,7 +79,8 @@ register_description(
         "each driver and all recordings made with it were estimated in one fit by",
         "Z_th is common to all, each record has its own trigger delay τ. Where the delays scatter "
         "by less than their errors, the upper limit of their scatter (95 %) is the standard "
-        "deviation of their prior.",
+        "deviation of their prior. A load with a measured current needs no Z_th and was estimated "
+        "alone.",
     ),
 )
 
@@ -272,6 +282,8 @@ def identify_jointly(
     in the number of records. A recording that this kind of circuit does not explain does not
     influence the driver. If the trigger delays of all recordings scatter by less than their errors,
     a second fit limits each delay by this scatter; the fits then have the remark `small_delays`.
+    Recordings of a measured current share no driver; each is fitted alone. `identify_amplitudes`
+    fits one load to several recordings.
 
     Args:
         study: Calibrations and loaded recordings.
@@ -296,18 +308,19 @@ def identify_jointly(
     candidates = candidates_of(circuit)
     drivers = Drivers(study, order, None)
     paths = to_identify(study)
-    candidates = common_first(study, paths, drivers, candidates, None)
+    candidates = common_first(study, paths, drivers, candidates, Asked())
     circuit = candidates[0]
     fits: dict[int, Fit] = {}
     notes = [""] * len(paths)
     waiting: dict[tuple[str, ...], dict[Any, _Waiting]] = {}
 
-    def load(row: int) -> tuple[Recording, Driver]:
-        recording = study[paths[row]]
-        return recording, drivers.found[drivers.of(recording)]
+    by_current: list[int] = []
+
+    def load(row: int) -> tuple[Recording, AbstractFeed]:
+        return drivers.fed(study[paths[row]])
 
     inspected = itertools.chain.from_iterable(
-        planned(load, rows, None) for rows in chunked(len(paths))
+        planned(load, rows, Asked()) for rows in chunked(len(paths))
     )
     for row, of in tqdm(inspected, "", len(paths), unit="recording", disable=not progress):
         if not isinstance(of, Refusal) and not of.estimator.lane.periodic:
@@ -317,6 +330,9 @@ def identify_jointly(
             notes[row] = of.note
             continue
         seen, found, estimator = of
+        if isinstance(found, MeasuredCurrent):
+            by_current.append(row)
+            continue
         driver = serving(found, HarmonicDriver, str(estimator))
         lengths = waiting.setdefault(drivers.of(seen.recording), {})
         shared = is_shared(seen, driver)
@@ -360,6 +376,12 @@ def identify_jointly(
             for row, one in zip(group.rows, judged, strict=True):
                 fits[row] = one
                 notes[row] = note(one)
+    if by_current:
+        own = [paths[row] for row in by_current]
+        alone = identify_part(study, own, drivers, [circuit], Asked(MAXIMUM_LIKELIHOOD))
+        as_joint = unstacked(dataclasses.replace(alone.fit, method=METHOD))
+        for row, fit, text in zip(by_current, as_joint, alone.notes, strict=True):
+            fits[row], notes[row] = fit, str(text)
     ordered = [fits[row] for row in range(len(paths))]
     outcome = table(study, paths, ordered, notes)
     settings = Settings.of(study, len(paths), order, METHOD, candidates, r_load_tolerance)

@@ -12,7 +12,7 @@ import dataclasses
 import itertools
 import math
 import threading
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any, Literal, NamedTuple, TypeVar, overload
 
 import jax
@@ -26,11 +26,12 @@ from etid.estimators.estimator import AbstractEstimator
 from etid.estimators.lanes import AbstractLane, stacked, unstacked
 from etid.estimators.registry import MAXIMUM_LIKELIHOOD, Method
 from etid.identify.arguments import (
+    Asked,
     Circuit,
+    asked_of,
     candidates_of,
     check_default,
     drift_of,
-    estimator_of,
     fed,
     order_of,
     require,
@@ -191,7 +192,7 @@ def choices(
     count: int,
     load: Callable[[int], tuple[Recording, AbstractFeed]],
     candidates: Sequence[AbstractCircuit],
-    asked: AbstractEstimator | None,
+    asked: Asked,
     progress: bool,
 ) -> tuple[list[Selection], list[str], list[str]]:
     """A choice for each recording alone, notes, and names of the methods that were used.
@@ -206,7 +207,7 @@ def choices(
     found: dict[int, Selection] = {}
     notes = [""] * count
     used: list[str] = []
-    otherwise = str(asked or MAXIMUM_LIKELIHOOD)
+    otherwise = str(asked.estimator or MAXIMUM_LIKELIHOOD)
     queues: dict[tuple, _Queue] = {}
 
     chunks = tuple(chunked(count))
@@ -254,7 +255,7 @@ def _of_one_circuit(
     count: int,
     load: Callable[[int], tuple[Recording, AbstractFeed]],
     candidates: Sequence[AbstractCircuit],
-    asked: AbstractEstimator | None,
+    asked: Asked,
     progress: bool,
     fixed: int | None = None,
 ) -> tuple[list[Fit], list[str]]:
@@ -264,7 +265,7 @@ def _of_one_circuit(
         count: Number of recordings.
         load: Recording and driver of a row.
         candidates: Circuits to choose from, by joint evidence.
-        asked: The requested estimator.
+        asked: What the caller asks for.
         progress: Show a progress bar.
         fixed: Number of the circuit, if it is chosen already. The other candidates then serve to
             find the recordings that deserve another circuit.
@@ -297,6 +298,8 @@ def identify_skins(
     *,
     circuit: None = None,
     method: Method | None = None,
+    fixed: Mapping[str, float] | None = None,
+    prior: Mapping[str, tuple[float, float]] | None = None,
     progress: bool = False,
 ) -> Fits[SkinRC]: ...
 
@@ -308,6 +311,8 @@ def identify_skins(
     *,
     circuit: _Kind,
     method: Method | None = None,
+    fixed: Mapping[str, float] | None = None,
+    prior: Mapping[str, tuple[float, float]] | None = None,
     progress: bool = False,
 ) -> Fits[_Kind]: ...
 
@@ -319,6 +324,8 @@ def identify_skins(
     *,
     circuit: Literal["auto"],
     method: Method | None = None,
+    fixed: Mapping[str, float] | None = None,
+    prior: Mapping[str, tuple[float, float]] | None = None,
     progress: bool = False,
 ) -> Fits[AbstractCircuit]: ...
 
@@ -329,6 +336,8 @@ def identify_skins(
     *,
     circuit: Circuit = None,
     method: Method | None = None,
+    fixed: Mapping[str, float] | None = None,
+    prior: Mapping[str, tuple[float, float]] | None = None,
     progress: bool = False,
 ) -> Fits:
     """Identify many recordings that were made with one driver.
@@ -341,6 +350,8 @@ def identify_skins(
         circuit: As in `identify_skin`. With `"auto"` all recordings get one circuit, chosen by
             their joint evidence. The note of a recording that deserves another circuit says which.
         method: As in `identify_skin`.
+        fixed: As in `identify_skin`, for all recordings.
+        prior: As in `identify_skin`, for all recordings.
         progress: Show a progress bar.
 
     Returns:
@@ -353,7 +364,7 @@ def identify_skins(
     if driver is not None:
         require("driver", driver, Driver)
     candidates = candidates_of(circuit)
-    asked = estimator_of(method, candidates)
+    asked = asked_of(method, candidates, fixed, prior)
     if isinstance(recordings, Study):
         study, paths = recordings, [*recordings, *recordings.problems]
         known = [_known(study, path) for path in paths]
@@ -382,6 +393,8 @@ def identify_study(
     order: Order = 5,
     circuit: Circuit = None,
     method: Method | None = None,
+    fixed: Mapping[str, float] | None = None,
+    prior: Mapping[str, tuple[float, float]] | None = None,
     driver_drift: float = 0.0,
     progress: bool = False,
 ) -> StudyFits:
@@ -396,6 +409,8 @@ def identify_study(
         order: As in `identify_driver`.
         circuit: As in `identify_skins`.
         method: As in `identify_skin`.
+        fixed: As in `identify_skin`, for all recordings.
+        prior: As in `identify_skin`, for all recordings.
         driver_drift: As in `identify_driver`.
         progress: Show a progress bar.
 
@@ -408,13 +423,13 @@ def identify_study(
     require("study", study, Study)
     order = order_of(order)
     candidates = candidates_of(circuit)
-    asked = estimator_of(method, candidates)
-    drivers = Drivers(study, order, asked, driver_drift)
+    asked = asked_of(method, candidates, fixed, prior)
+    drivers = Drivers(study, order, asked.estimator, driver_drift)
     paths = to_identify(study)
     candidates = common_first(study, paths, drivers, candidates, asked)
     fits = identify_part(study, paths, drivers, candidates, asked, progress)
     settings = Settings.of(
-        study, len(paths), order, str(asked or ""), candidates, driver_drift=driver_drift
+        study, len(paths), order, str(asked.estimator or ""), candidates, driver_drift=driver_drift
     )
     return StudyFits(fits, drivers.found, drivers.failures, settings)
 
@@ -429,7 +444,7 @@ def common_first(
     paths: Sequence[str],
     drivers: "Drivers",
     candidates: Sequence[AbstractCircuit],
-    asked: AbstractEstimator | None,
+    asked: Asked,
 ) -> tuple[AbstractCircuit, ...]:
     """The candidates; the first one is the common circuit of a sample of the recordings."""
     if len(candidates) == 1 or not paths:
@@ -447,7 +462,7 @@ def identify_part(
     paths: Sequence[str],
     drivers: "Drivers",
     candidates: Sequence[AbstractCircuit],
-    asked: AbstractEstimator | None,
+    asked: Asked,
     progress: bool = False,
 ) -> Fits:
     """Fits of some recordings of a study, with its drivers and the first of the candidates."""

@@ -12,20 +12,20 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from etid.circuits.circuit import AbstractCircuit, SkinRC
-from etid.estimators.element_prior import Known, checked
 from etid.estimators.estimator import AbstractEstimator
 from etid.estimators.judgement import MISFIT_CHI2
 from etid.estimators.lanes import AbstractLane, Harmonics, stacked, unstacked
 from etid.estimators.registry import Method
 from etid.identify import changes
 from etid.identify.arguments import (
+    Asked,
     Circuit,
+    asked_of,
     candidates_of,
     check_default,
     estimator_of,
     fed,
     for_samples,
-    informed,
     plan,
     require,
 )
@@ -127,8 +127,8 @@ def identify_skin(
         IdentificationError: The verdict is not successful and `throw` is set.
     """
     candidates = candidates_of(circuit)
-    known = informed(fixed, prior)
-    fits, chosen = candidate_fits(recording, driver, candidates, method, known)
+    asked = asked_of(method, candidates, fixed, prior)
+    fits, chosen = candidate_fits(recording, driver, candidates, asked)
     single = len(candidates) == 1
     fit = fits[chosen] if single else Selection.of(fits, chosen, candidates).fit
     return successful(recording, fit) if throw else fit
@@ -138,23 +138,19 @@ def candidate_fits(
     recording: Recording,
     driver: Driver | None,
     candidates: Sequence[AbstractCircuit],
-    method: Method | None,
-    known_elements: Known = (),
+    asked: Asked,
 ) -> tuple[dict[int, Fit], int]:
     """Fits of the candidates that a recording asks for, and the number of the chosen one.
 
     Raises:
-        ValueError: The method cannot use this driver or these circuits.
+        ValueError: The method cannot use this driver.
     """
     require("recording", recording, Recording)
     if driver is not None:
         require("driver", driver, Driver)
-    asked = estimator_of(method, candidates)
-    for circuit in candidates if known_elements else ():
-        checked(known_elements, circuit)
     recording, feed = fed(recording, driver)
     seen = Inspected(recording)
-    estimator, name = plan(asked, seen, feed, known_elements)
+    estimator, name = plan(asked, seen, feed)
     if name is not None:
         return {0: failed_fit(name, candidates[0], str(estimator))}, 0
     check_default(estimator, candidates)

@@ -4,7 +4,7 @@ from collections.abc import Callable, Iterable, Iterator
 from typing import NamedTuple
 
 from etid.estimators.estimator import AbstractEstimator
-from etid.identify.arguments import plan
+from etid.identify.arguments import Asked, plan
 from etid.identify.one import explained
 from etid.recordings.preflight import Group, Inspected
 from etid.recordings.recording import Recording, RecordingError
@@ -35,7 +35,7 @@ class Planned(NamedTuple):
 def planned(
     load: Callable[[int], tuple[Recording, AbstractFeed]],
     rows: Iterable[int],
-    asked: AbstractEstimator | None,
+    asked: Asked,
 ) -> Iterator[tuple[int, Planned | Refusal]]:
     """Each recording with its driver and its estimator, or the reason why it cannot be fitted.
 
@@ -44,7 +44,7 @@ def planned(
     Args:
         load: Reads a recording and its driver.
         rows: Numbers of the recordings; the order of the results may differ.
-        asked: The requested estimator; None for the default of each recording.
+        asked: What the caller asks for.
     """
     loaded: dict[tuple[int, str, float, float], list[tuple[int, Recording, AbstractFeed]]] = {}
     for row in rows:
@@ -63,9 +63,7 @@ def planned(
                 yield row, _planned(Inspected(of, group, number), driver, asked)
 
 
-def _planned(
-    seen: Inspected, driver: AbstractFeed, asked: AbstractEstimator | None
-) -> Planned | Refusal:
+def _planned(seen: Inspected, driver: AbstractFeed, asked: Asked) -> Planned | Refusal:
     try:
         estimator, name = plan(asked, seen, driver)
     except ERRORS as error:

@@ -9,7 +9,7 @@ import numpy as np
 
 from etid.circuits.circuit import AbstractCircuit
 from etid.estimators.registry import Method
-from etid.identify.arguments import require
+from etid.identify.arguments import Asked, estimator_of, require
 from etid.identify.impedance import identify_impedance
 from etid.identify.one import candidate_fits, successful
 from etid.recordings.recording import Recording, RecordingError
@@ -58,7 +58,8 @@ def select_circuit(
         IdentificationError: The verdict is not successful and `throw` is set.
     """
     candidates = checked(candidates)
-    fits, chosen = candidate_fits(recording, driver, candidates, method)
+    asked = Asked(estimator_of(method, candidates))
+    fits, chosen = candidate_fits(recording, driver, candidates, asked)
     selection = Selection.of(fits, chosen, candidates)
     if throw:
         successful(recording, selection.fit)
