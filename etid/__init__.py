@@ -35,6 +35,7 @@ from etid.estimators.non_parametric.estimator import NonParametric
 from etid.estimators.output_error.estimator import OutputError
 from etid.estimators.registry import register
 from etid.estimators.steiglitz_mcbride.estimator import EquationError, SteiglitzMcBride
+from etid.identify import posterior as _posterior
 from etid.identify.amplitudes import identify_amplitudes
 from etid.identify.driver import identify_driver
 from etid.identify.file import fit_file
@@ -43,7 +44,6 @@ from etid.identify.jointly import identify_jointly
 from etid.identify.kramers_kronig import KramersKronig, kramers_kronig
 from etid.identify.many import identify_skins, identify_study
 from etid.identify.one import identify_samples, identify_skin
-from etid.identify.posterior import posterior, profile
 from etid.identify.predict import predict
 from etid.identify.selecting import select_circuit
 from etid.online.controller import Controller
@@ -52,6 +52,7 @@ from etid.plotting import plot
 from etid.recordings.hdf5 import check, read
 from etid.recordings.recording import Recording, RecordingError, Samples
 from etid.recordings.study import Study
+from etid.results.data import provide as _provide
 from etid.results.driver import Driver
 from etid.results.fits import Fit, Fits, IdentificationError
 from etid.results.posterior import Posterior, Profile
@@ -78,6 +79,8 @@ _LATER = {
     "read_impedance": "etid.files.measured_impedance",
     "write_report": "etid.report.study",
 }
+
+_provide(plot=plot, posterior=_posterior.posterior, profile=_posterior.profile)
 
 __version__ = "0.1.0"
 
@@ -142,9 +145,7 @@ __all__ = [
     "parallel",
     "parameter",
     "plot",
-    "posterior",
     "predict",
-    "profile",
     "read",
     "read_impedance",
     "register",

@@ -165,9 +165,7 @@ def posterior() -> etid.Posterior:
     logs += 2 * logs**2
     draws = etid.SkinRC(*jnp.asarray(np.asarray(SKIN.values())[:, None] * np.exp(logs.T)))
     found = fit()
-    return etid.Posterior(
-        dataclasses.replace(found, cov=16 * found.cov), draws, np.full(1000, 1e-3)
-    )
+    return etid.Posterior(found.circuit, 16 * np.asarray(found.cov), draws, np.full(1000, 1e-3))
 
 
 def profile() -> etid.Profile:

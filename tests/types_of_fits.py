@@ -11,6 +11,7 @@ def fits(recording: etid.Recording, driver: etid.Driver) -> None:
     assert_type(skin.circuit, etid.SkinRC)
     assert_type(skin.stderr, etid.SkinRC)
     void = skin.circuit.r_s, skin.circuit.f_c
+    assert_type(skin.posterior().draws, etid.SkinRC)
     one = etid.identify_skin(recording, driver, circuit=etid.Resistor())
     assert_type(one.circuit, etid.Resistor)
     void = one.circuit.r, one.stderr.r

@@ -35,6 +35,7 @@ from etid.recordings.preflight import Inspected, why_implausible, why_misaligned
 from etid.recordings.recording import Recording
 from etid.recordings.remarks import Remark
 from etid.recordings.repeats import Repeats, repeats
+from etid.results.data import with_data
 from etid.results.driver import Driver, HarmonicDriver
 from etid.results.feed import AbstractFeed
 from etid.results.fits import Fit, IdentificationError, Support
@@ -120,7 +121,8 @@ def identify_skin(
         throw: Raise an error if the verdict is not successful.
 
     Returns:
-        Elements, standard errors and verdict.
+        Elements, standard errors and verdict. The fit knows its recording and its driver, so that
+        `fit.plot()`, `fit.posterior()` and `fit.profile("c_p")` need no arguments.
 
     Raises:
         ValueError: The method cannot use this driver or this circuit.
@@ -131,6 +133,7 @@ def identify_skin(
     fits, chosen = candidate_fits(recording, driver, candidates, asked)
     single = len(candidates) == 1
     fit = fits[chosen] if single else Selection.of(fits, chosen, candidates).fit
+    fit = with_data(fit, recording, driver)
     return successful(recording, fit) if throw else fit
 
 

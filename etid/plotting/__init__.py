@@ -4,13 +4,14 @@
 matplotlib.
 """
 
-from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any, Literal, get_args, overload
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any, get_args, overload
 
 import numpy as np
 
 from etid.circuits.circuit import AbstractCircuit
 from etid.recordings.recording import Recording
+from etid.results.data import AnyAxes, Shown
 from etid.results.driver import Driver, SourceImpedance
 from etid.results.fits import Fit, Fits
 from etid.results.posterior import Posterior, Profile
@@ -24,15 +25,18 @@ if TYPE_CHECKING:
     from etid.plotting.style import Canvas
 
 Impedance = Driver | Fit | AbstractCircuit | SourceImpedance
-Shown = Literal["pulse", "impedance", "residual"]
-AnyAxes = np.ndarray | Sequence["matplotlib.axes.Axes"] | None
 
 
 @overload
 def plot(x: Recording, *, axes: AnyAxes = None) -> np.ndarray: ...
 @overload
 def plot(
-    x: Fit, recording: Recording, driver: Driver, *, axes: AnyAxes = None, show: Shown = "pulse"
+    x: Fit,
+    recording: Recording | None = None,
+    driver: Driver | None = None,
+    *,
+    axes: AnyAxes = None,
+    show: Shown = "pulse",
 ) -> np.ndarray: ...
 @overload
 def plot(
@@ -65,10 +69,11 @@ def plot(
     | call | shows | axes |
     |---|---|---|
     | `plot(recording)` | V_th and V_out [V]: the whole record, and one pulse | 2 |
-    | `plot(fit, recording, driver)` | one pulse measured and predicted [V]; residual [mV] | 2 |
-    | `plot(fit, recording, driver, show="impedance")` | Nyquist and Bode: fit, measured | 3 |
-    | `plot(fit, recording, driver, show="residual")` | residual [mV], its correlations | 3 |
-    | `plot(fit, recording)` | the same for a fit from a measured current | 2 |
+    | `plot(fit)` | one pulse measured and predicted [V]; residual [mV] | 2 |
+    | `plot(fit, show="impedance")` | Nyquist and Bode: fit, measured | 3 |
+    | `plot(fit, show="residual")` | residual [mV], its correlations | 3 |
+    | `plot(fits[0], recording, driver)` | the same for one of several fits | 2 |
+    | `plot(fits[0], recording)` | the same for a fit from a measured current | 2 |
     | `plot(selection, recording, driver)` | impedance measured, and each candidate | 4 |
     | `plot(driver, calibration)` | the same two diagrams for the calibration's resistor | 2 |
     | `plot(driver)`, `plot(circuit)` | magnitude [kΩ] and phase [deg] of an impedance | 2 |
@@ -93,8 +98,9 @@ def plot(
 
     Args:
         x: The object to draw.
-        recording: Recording of the fit or selection, or calibration of the driver.
-        driver: Driver of the fit or selection.
+        recording: Recording of the selection, or calibration of the driver. A fit by
+            `identify_skin` knows its recording and its driver; one of several fits does not.
+        driver: Driver of the fit or selection, if `recording` is given.
         show: What to draw of a fit: `"pulse"`, `"impedance"` or `"residual"`.
         axes: Axes to draw on, as many as the table says. Without axes, `plot` makes a figure of
             `matplotlib.pyplot`, which a notebook shows.
@@ -138,6 +144,8 @@ def _draw(
         raise ValueError(
             f"show is {show!r}; it is for fits, and one of {', '.join(map(repr, get_args(Shown)))}"
         )
+    if isinstance(x, Fit):
+        recording, driver = x.made_from(recording, driver)
     with mpl.rc_context(style.PAPER):
         match x, recording, driver:
             case Fit(), Recording(), Driver() if show == "impedance":
@@ -154,7 +162,7 @@ def _draw(
                 return pulses.draw_calibration(canvas, x, recording)
             case Fit(), _, _:
                 raise TypeError(
-                    "to draw a fit, pass its recording and driver: plot(fit, recording, driver). "
+                    "this fit does not know its recording: plot(fit, recording, driver). "
                     'plot({"skin": fit}) draws its impedance alone'
                 )
             case Selection(), _, _:

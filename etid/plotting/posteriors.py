@@ -18,15 +18,15 @@ ROUND = np.linspace(0.0, 2 * np.pi, 200)
 
 def draw_posterior(canvas: Canvas, posterior: Posterior) -> np.ndarray:
     """Histograms of the elements, diagrams of each two, and the normal distribution of the fit."""
-    units = posterior.fit.circuit.units()
+    units = posterior.circuit.units()
     count = len(units)
     grid = canvas(count, count, (2.4 * count + 0.6, 2.2 * count + 0.4))
     scales = np.array([DISPLAY[unit][0] for unit in units.values()])
     draws = (
         np.stack([np.asarray(getattr(posterior.draws, name)) for name in units]) / scales[:, None]
     )
-    centre = np.asarray(posterior.fit.circuit.values()) / scales
-    cov = np.asarray(posterior.fit.cov) / np.outer(scales, scales)
+    centre = np.asarray(posterior.circuit.values()) / scales
+    cov = posterior.cov / np.outer(scales, scales)
     random = np.random.default_rng(0)
     some = random.choice(posterior.weights.size, SHOWN, p=posterior.weights)
     ranges = [_range(values[some]) for values in draws]

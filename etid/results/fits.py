@@ -20,6 +20,7 @@ from etid.circuits.lookup import qualified
 from etid.circuits.overview import Overview, Overviewed, element_rows
 from etid.recordings.fields import DESCRIBING, Label, wanted_labels
 from etid.recordings.remarks import texts, words
+from etid.results.data import WithData
 from etid.results.fits_columns import DESCRIBED, LABELS, SCHEMA, columns_of, described
 from etid.results.hdf5_table import Table, opened_table, write_table
 from etid.results.summary import summary
@@ -97,7 +98,7 @@ class Support(eqx.Module):
         return cls(*(np.full((*lane, *size), np.nan) for size in sizes))
 
 
-class Fit(Judged, Generic[Circuit]):
+class Fit(Judged, WithData[Circuit]):
     """One identified circuit, or a batch of them along a leading axis.
 
     Attributes:

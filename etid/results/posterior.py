@@ -10,7 +10,6 @@ from jaxtyping import Float
 from etid.circuits.circuit import AbstractCircuit
 from etid.circuits.display import between, quantity
 from etid.circuits.overview import Overview, Overviewed
-from etid.results.fits import Fit
 
 Circuit = TypeVar("Circuit", bound=AbstractCircuit)
 FEW = 100.0  # effective draws; with fewer, the ends of an interval are not worth two digits
@@ -27,24 +26,31 @@ def tails(level: float) -> tuple[float, float]:
     return (1 - level) / 2, (1 + level) / 2
 
 
+def effective(weights: Float[np.ndarray, " draw"]) -> float:
+    """Number of draws of equal weight that would be as good, 1 / Σ w²."""
+    return float(1 / np.sum(weights**2))
+
+
 @dataclasses.dataclass(frozen=True, eq=False, repr=False)
 class Posterior(Overviewed, Generic[Circuit]):
     """Weighted draws of the elements, given a recording and its driver.
 
     Attributes:
-        fit: The fit around which the draws were made.
+        circuit: Fitted elements [SI].
+        cov: Their covariance.
         draws: Elements [SI], arrays (draw,).
         weights: Probabilities of the draws; their sum is 1.
     """
 
-    fit: Fit[Circuit]
+    circuit: Circuit
+    cov: Float[np.ndarray, "parameter parameter"]
     draws: Circuit
     weights: Float[np.ndarray, " draw"]
 
     @property
     def effective(self) -> float:
         """Number of draws of equal weight that would be as good, 1 / Σ w²."""
-        return float(1 / np.sum(self.weights**2))
+        return effective(self.weights)
 
     def intervals(self, level: float = 0.95) -> dict[str, tuple[float, float]]:
         """Both ends [SI] of the interval of each element, by name; both tails are equal.
@@ -71,11 +77,11 @@ class Posterior(Overviewed, Generic[Circuit]):
     def _overview(self) -> Overview:
         rows = []
         ends = self.intervals()
-        for (name, unit), text in zip(
-            self.fit.circuit.units().items(), self.fit.elements, strict=True
-        ):
+        errors = np.sqrt(np.diag(self.cov))
+        for (name, unit), error in zip(self.circuit.units().items(), errors, strict=True):
             middle = quantity(self.quantile(name, 0.5), unit)
-            rows.append((name, middle, between(*ends[name], unit), text.removeprefix(f"{name} ")))
+            fitted = quantity(float(getattr(self.circuit, name)), unit, float(error))
+            rows.append((name, middle, between(*ends[name], unit), fitted))
         notes = []
         if self.effective < FEW:
             notes.append(

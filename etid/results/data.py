@@ -1,0 +1,143 @@
+"""What a fit was made from, and what can be done with it.
+
+Pictures, draws and profiles belong to higher layers, which this one must not import. `etid` itself,
+above all layers, hands their functions over with `provide`, so that a fit has them as methods.
+"""
+
+import dataclasses
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Any, Generic, Literal, TypeVar
+
+import numpy as np
+
+from etid.circuits.circuit import Circuit
+from etid.recordings.recording import Recording
+from etid.results.driver import Driver
+from etid.results.posterior import Posterior, Profile
+
+if TYPE_CHECKING:
+    import matplotlib.axes
+
+Shown = Literal["pulse", "impedance", "residual"]
+AnyAxes = np.ndarray | Sequence["matplotlib.axes.Axes"] | None
+_Kind = TypeVar("_Kind", bound="WithData")
+_PROVIDED: dict[str, Callable[..., Any]] = {}
+
+
+def provide(**functions: Callable[..., Any]) -> None:
+    """Make functions the methods of these names; their first argument is the fit."""
+    _PROVIDED.update(functions)
+
+
+class WithData(Generic[Circuit]):
+    """A result that may know its recording and its driver.
+
+    Both are no fields, so JAX does not see them. A result that JAX or `dataclasses.replace` makes
+    from another one has none.
+    """
+
+    __slots__ = ("_data",)  # equinox would make an entry of `__dict__` part of the tree structure
+
+    @property
+    def recording(self) -> Recording | None:
+        """The recording; None if it is not known."""
+        return getattr(self, "_data", (None, None))[0]
+
+    @property
+    def driver(self) -> Driver | None:
+        """The driver of the recording; None if there is none, or if it is not known."""
+        return getattr(self, "_data", (None, None))[1]
+
+    def __getstate__(self) -> tuple[dict[str, Any], Any]:
+        return self.__dict__, (self.recording, self.driver)
+
+    def __setstate__(self, state: tuple[dict[str, Any], Any]) -> None:
+        fields, data = state
+        self.__dict__.update(fields)
+        object.__setattr__(self, "_data", data)
+
+    def made_from(
+        self, recording: Recording | None, driver: Driver | None
+    ) -> tuple[Recording | None, Driver | None]:
+        """The arguments if there is a recording among them, else what the result knows."""
+        return (self.recording, self.driver) if recording is None else (recording, driver)
+
+    def plot(
+        self,
+        recording: Recording | None = None,
+        driver: Driver | None = None,
+        *,
+        show: Shown = "pulse",
+        axes: AnyAxes = None,
+    ) -> np.ndarray:
+        """Draw the fit; the same as `etid.plot(fit)`.
+
+        Args:
+            recording: Its recording. `identify_skin` tells it to the fit; one of several fits, as
+                in `fits[0]`, does not know it.
+            driver: Its driver, if `recording` is given.
+            show: `"pulse"`, `"impedance"` or `"residual"`.
+            axes: As in `etid.plot`.
+
+        Returns:
+            The axes of the picture, (axis,), for further changes.
+
+        Raises:
+            TypeError: The recording is not known.
+        """
+        return _PROVIDED["plot"](self, recording, driver, show=show, axes=axes)
+
+    def posterior(
+        self,
+        recording: Recording | None = None,
+        driver: Driver | None = None,
+        *,
+        draws: int = 1000,
+        seed: int = 0,
+    ) -> Posterior[Circuit]:
+        """The distribution of the elements, by importance sampling around the fit.
+
+        The prior is uniform in the logarithms of the elements. The trigger delay and the uncertain
+        part of Z_th are drawn too. If the recording does not exclude that an element is 0, the
+        draws cover the surroundings of the fit.
+
+        Args:
+            recording: As in `plot`.
+            driver: As in `plot`.
+            draws: Number of draws. 1000 take a tenth of a second; `effective` says what they are
+                worth.
+            seed: Seed of the draws.
+
+        Returns:
+            Weighted draws, with intervals.
+
+        Raises:
+            ValueError: The recording is not known, or the fit is a batch, or comes from another
+                method than maximum likelihood, or its data do not determine all elements.
+        """
+        return _PROVIDED["posterior"](self, recording, driver, draws=draws, seed=seed)
+
+    def profile(
+        self, name: str, recording: Recording | None = None, driver: Driver | None = None
+    ) -> Profile:
+        """The deviance as a function of one element; all other parameters are fitted again.
+
+        Args:
+            name: The element, as in `"c_p"`.
+            recording: As in `plot`.
+            driver: As in `plot`.
+
+        Returns:
+            The profile, with an interval.
+
+        Raises:
+            ValueError: The circuit has no such element, or as in `posterior`.
+        """
+        return _PROVIDED["profile"](self, recording, driver, name)
+
+
+def with_data(result: _Kind, recording: Recording, driver: Driver | None) -> _Kind:
+    """The same result, which knows its recording and its driver."""
+    known = dataclasses.replace(result)  # pyright: ignore[reportArgumentType]  # a module of equinox
+    object.__setattr__(known, "_data", (recording, driver))
+    return known
