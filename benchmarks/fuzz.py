@@ -33,7 +33,7 @@ from benchmarks import specimens
 
 MEMORY = 1 << 30  # bytes that a process may have in memory
 SAFETY = 4 << 30  # bytes of addresses beside those after the imports, for the sake of this machine
-PATIENCE = 6  # a file may take so many times the limit if others use the processor meanwhile
+PATIENCE = 60  # a file may take so many times the limit if others use the processor meanwhile
 START = 120.0  # seconds until a child has made its good files, or damaged one
 SHARES = {"recordings": 8, "fits": 5, "mapping": 2, "csv": 1, "npz": 1, "matlab": 2,
           "matlab5": 1, "tdms": 1, "abf": 1}  # fmt: skip

@@ -5,7 +5,7 @@ import io
 import json
 import pathlib
 import zipfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import h5py
@@ -108,9 +108,27 @@ def restructure(path: pathlib.Path, rng: Rng) -> None:
 
 
 def _any(file: h5py.File, rng: Rng, kind: type) -> Any:
-    found: list[Any] = [file] if kind is not h5py.Dataset else []
-    file.visititems(lambda _, item: found.append(item) if isinstance(item, kind) else None)
+    found = [item for item in _items(file) if isinstance(item, kind)]
     return found[int(rng.integers(len(found)))]
+
+
+def _items(file: h5py.File) -> Iterator[h5py.HLObject]:
+    """Each object once, parents first, then by name.
+
+    `visititems` looks each of them up from the root: two seconds where 1500 groups are nested.
+    """
+    left: list[Any] = [file]
+    seen = set()
+    while left:
+        item = left.pop()
+        place = h5py.h5o.get_info(item.id).addr
+        if place in seen:
+            continue
+        seen.add(place)
+        yield item
+        if isinstance(item, h5py.Group):
+            names = [one for one in item if isinstance(item.get(one, getlink=True), h5py.HardLink)]
+            left += [item[one] for one in reversed(names)]
 
 
 def _replaced(dataset: h5py.Dataset, **made: Any) -> None:
@@ -163,14 +181,8 @@ def _values(file: h5py.File, rng: Rng) -> None:
 
 def _json(file: h5py.File, rng: Rng) -> None:
     """Change the text of drivers, or of any other dataset of texts."""
-    texts: list[h5py.Dataset] = []
-    file.visititems(
-        lambda _, item: (
-            texts.append(item)
-            if isinstance(item, h5py.Dataset) and h5py.check_string_dtype(item.dtype)
-            else None
-        )
-    )
+    datasets = [item for item in _items(file) if isinstance(item, h5py.Dataset)]
+    texts = [item for item in datasets if h5py.check_string_dtype(item.dtype)]
     named = [each for each in texts if each.name == "/drivers"] or texts
     dataset: Any = named[int(rng.integers(len(named)))]
     row = int(rng.integers(len(dataset)))
