@@ -40,6 +40,7 @@ class Estimate(eqx.Module):
             share it.
         strain: Increase of the Σ r² of the calibrations in a joint fit; 0 for other fits.
         hum: Whether the residual shows mains hum; a fit in time does not test for it.
+        falls: Whether a resistance that falls with its current explains most of the misfit.
         support: How well the data support this circuit; None if the estimator does not compute it.
     """
 
@@ -54,6 +55,7 @@ class Estimate(eqx.Module):
     shared_cov: Float[Array, "parameter parameter"]
     strain: Float[Array, ""] = eqx.field(default_factory=lambda: jnp.zeros(()))
     hum: Bool[Array, ""] = eqx.field(default_factory=lambda: jnp.zeros((), bool))
+    falls: Bool[Array, ""] = eqx.field(default_factory=lambda: jnp.zeros((), bool))
     support: Support | None = None
 
 

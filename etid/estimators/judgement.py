@@ -81,6 +81,7 @@ def judged(
             (fitted.is_too_steep(estimate.cov), RESULTS.nonphysical),
             (~settled, MAX_STEPS_REACHED),
             (misses(estimate.chi2, estimate.rrse) | too_late(estimate), RESULTS.misfit),
+            (estimate.falls, RESULTS.misfit),  # which can pass for a change of the driver
             (estimate.strain > STRAINED, RESULTS.inconsistent),
             # An error of 0 also fails: the element has no effect.
             (~jnp.all((errors > 0) & (errors < 1)), RESULTS.insensitive),
@@ -88,14 +89,15 @@ def judged(
         ),
         steps=estimate.steps,
         method=method,
-        remarks=remarks(estimate.hum),
+        remarks=remarks(estimate.hum, estimate.falls),
         support=estimate.support or Support.unknown(values.size),
     )
 
 
-def remarks(hum: Bool[Array, ""]) -> Int[Array, ""]:
-    """The remark `mains_hum` if `hum` is true; otherwise 0."""
-    return jnp.where(hum, jnp.array(int(Remark.mains_hum)), 0)
+def remarks(hum: Bool[Array, ""], falls: Bool[Array, ""] | bool = False) -> Int[Array, ""]:
+    """The remarks `mains_hum` and `falls_with_current`, each if its argument is true."""
+    both = (hum, Remark.mains_hum), (falls, Remark.falls_with_current)
+    return sum((jnp.where(on, int(one), 0) for on, one in both), jnp.zeros((), int))
 
 
 def unless(fit: Fit, bad: Bool[Array, ""], result: RESULTS) -> Fit:

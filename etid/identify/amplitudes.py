@@ -34,6 +34,7 @@ register_description(
         "the load was estimated from all its recordings together by",
         "The response of a resistor that depends on its current was computed by harmonic balance. "
         "Z_th and the trigger delays were estimated with the load; each record has its own delay.",
+        (),
     ),
 )
 

@@ -29,6 +29,7 @@ from etid.estimators.lanes import AbstractLane, Harmonics, unstacked
 from etid.estimators.maximum_likelihood.driver import Calibrations
 from etid.estimators.maximum_likelihood.estimator import description
 from etid.estimators.registry import MAXIMUM_LIKELIHOOD, register_description
+from etid.estimators.score_tests.other_circuit import NO_OTHER_CIRCUIT, NO_OTHER_GAIN
 from etid.estimators.score_tests.unloaded import shape_of
 from etid.estimators.starts import harmonic_starts
 from etid.identify.arguments import (
@@ -81,6 +82,7 @@ register_description(
         "by less than their errors, the upper limit of their scatter (95 %) is the standard "
         "deviation of their prior. A load with a measured current needs no Z_th and was estimated "
         "alone.",
+        (NO_OTHER_CIRCUIT, NO_OTHER_GAIN),
     ),
 )
 

@@ -30,7 +30,6 @@ from etid.identify.arguments import (
     require,
 )
 from etid.identify.compiled import stored_jit
-from etid.identify.current_dependence import falls_with_current
 from etid.recordings.preflight import Inspected, why_implausible, why_misaligned
 from etid.recordings.recording import Recording
 from etid.recordings.remarks import Remark
@@ -237,7 +236,7 @@ def identify_samples(
     )
     fit = skin_lane(lane, driver, known, circuit, estimator)
     # No harmonic is left out here, so a remark about hum would be untrue.
-    return dataclasses.replace(fit, remarks=jnp.zeros_like(fit.remarks))
+    return dataclasses.replace(fit, remarks=fit.remarks & ~int(Remark.mains_hum))
 
 
 # --- Steps that one recording and batches share ---------------------------------------------------
@@ -377,27 +376,12 @@ def refined(
         other = second[best(second)]
         if of_both(first[best(first)], other) is other:
             return second
-        return {number: without_remarks(fit) for number, fit in first.items()}
+        return {number: without_hum(fit) for number, fit in first.items()}
 
     def another(fits: dict[int, Fit]) -> bool:
         return needs_another(fits[best(fits)])
 
-    found = repeated(lanes, seen, searched, late_by, another, of_all)
-    for one, fits in zip(seen, found, strict=True):
-        number = best(fits)
-        fits[number] = _with_cause(fits[number], one, type(lanes[0]), driver)
-    return found
-
-
-def _with_cause(fit: Fit, seen: Inspected, kind: type[AbstractLane], driver: AbstractFeed) -> Fit:
-    """The fit; a misfit has a remark if the residual looks like a dependence on the current."""
-    if fit.verdict != "misfit":
-        return fit
-    lane = kind.of(seen)  # again, because `repeated` may have aligned it
-    if not falls_with_current(lane, driver, fit.circuit):
-        return fit
-    remarks = np.asarray(fit.remarks | int(Remark.falls_with_current))
-    return dataclasses.replace(fit, remarks=remarks)
+    return repeated(lanes, seen, searched, late_by, another, of_all)
 
 
 def needs_another(fit: Fit | Driver) -> bool:
@@ -406,18 +390,18 @@ def needs_another(fit: Fit | Driver) -> bool:
 
 
 def of_both(first: _Outcome, second: _Outcome) -> _Outcome:
-    """The second fit if it is successful and shows hum, else the first fit without its remarks.
+    """The second fit if it is successful and shows hum, else the first fit without that remark.
 
     The second fit is the one without the mains harmonics.
     """
     if second.verdict == "successful" and int(second.remarks) & Remark.mains_hum:
         return second
-    return without_remarks(first)
+    return without_hum(first)
 
 
-def without_remarks(found: _Outcome) -> _Outcome:
-    """A fit or driver without its remarks."""
-    return dataclasses.replace(found, remarks=np.zeros((), int))
+def without_hum(found: _Outcome) -> _Outcome:
+    """A fit or driver without the remark `mains_hum`."""
+    return dataclasses.replace(found, remarks=np.asarray(found.remarks & ~int(Remark.mains_hum)))
 
 
 def chosen_fits(

@@ -43,7 +43,8 @@ class RESULTS(optx.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]  # equi
     )
     misfit = (
         "The prediction misses the recording by far more than its noise (chi2), or the residual "
-        "looks like one more relaxation, or like a relaxation that is spread over time constants. "
+        "looks like one more relaxation, like a relaxation that is spread over time constants, or "
+        "like a resistance that falls with the current. "
         "The circuit is wrong, or the trigger moved between the records, or the signal drifted or "
         "clipped, or the method is output error and the record has mains hum."
     )

@@ -20,7 +20,9 @@ from etid.estimators.lanes import Harmonics
 from etid.estimators.maximum_likelihood import given_driver, load
 from etid.estimators.maximum_likelihood.given_driver import AbstractGiven, GivenCurrent
 from etid.estimators.refined_driver import refined_driver
-from etid.estimators.score_tests import missing_pole, other_circuit
+from etid.estimators.score_tests import missing_pole
+from etid.estimators.score_tests.falling_resistance import NO_FALL
+from etid.estimators.score_tests.other_circuit import NO_OTHER_CIRCUIT, NO_OTHER_GAIN
 from etid.estimators.score_tests.unloaded import UnloadedShape, shape_of
 from etid.results.driver import Driver, HarmonicDriver
 from etid.results.feed import MeasuredCurrent
@@ -30,13 +32,14 @@ from etid.signals.harmonics import Spectrum
 from etid.signals.noise import Measurement
 
 
-def description(words: str, estimated: str, unknowns: str) -> Description:
+def description(words: str, estimated: str, unknowns: str, tests: tuple[str, ...]) -> Description:
     """Text about fits by maximum likelihood, alone or jointly.
 
     Args:
         words: Name of the estimator in a sentence.
         estimated: What was estimated, as the start of the sentence about the residual.
         unknowns: Sentences about the unknowns.
+        tests: Score tests that a successful fit has passed.
     """
     return Description(
         words=words,
@@ -47,8 +50,7 @@ def description(words: str, estimated: str, unknowns: str) -> Description:
         conditions=(
             *CHECKED,
             DETERMINED,
-            other_circuit.NO_OTHER_CIRCUIT,
-            other_circuit.NO_OTHER_GAIN,
+            *tests,
             "recording and calibrations agree about Z_th (the calibrations' sum of squares grows "
             f"by at most {STRAINED:g})",
         ),
@@ -125,6 +127,7 @@ class MaximumLikelihood(AbstractEstimator):
             "Each load was estimated jointly with Z_th and the trigger delays of the calibrations, "
             "whose distribution the calibrations give. Its own trigger delay τ is one more "
             f"unknown.{stated(self.known_elements)}",
+            (NO_OTHER_CIRCUIT, NO_OTHER_GAIN, NO_FALL),
         )
 
 

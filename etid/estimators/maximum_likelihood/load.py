@@ -36,12 +36,12 @@ from etid.estimators.maximum_likelihood.terms import (
     variance,
 )
 from etid.estimators.sandwich import Linear
-from etid.estimators.score_tests import other_circuit
+from etid.estimators.score_tests import falling_resistance, other_circuit
 from etid.estimators.unknowns import LoadUnknowns
 from etid.results.fits import Support, complex_rrse
 from etid.signals.harmonics import Spectrum, real_parts, signal_share
 from etid.signals.knots import Knots, knots
-from etid.signals.transfer import as_complex, power, reciprocal, turns
+from etid.signals.transfer import as_complex, frequency_variable, power, reciprocal, turns
 from etid.solvers.levenberg_marquardt import LevenbergMarquardt, NormalEquations, best_start
 
 
@@ -254,6 +254,14 @@ class Around(eqx.Module):
         total, sums = self.at.sums.power, knots(values.size).summed(values * self.power)
         return jnp.tile(sums / jnp.where(total > 0, total, 1.0), 2)
 
+    def by_falling(self) -> Complex[Array, " harmonic"]:
+        """What a resistance that falls with its current adds to V_out [V²]."""
+        every, of = knots(self.x.size), self.at.gain
+        z = of.impedance(self.q)(frequency_variable(of.frequency))
+        sensitivity = self.slopes.by_load * z * reciprocal(self.slopes.gain)
+        v_out = every.between(self.slopes.gain) * self.x
+        return falling_resistance.added_voltage(v_out, z, sensitivity, every)
+
     def by_changes(self) -> Complex[Array, "change knot"]:
         """Derivatives of the gain with respect to changes of the circuit and, last, to a gain.
 
@@ -324,8 +332,8 @@ def fit_circuit(
 
     Returns:
         The estimate, whose parameters are the logarithms of the elements. Whether W is too far from
-        W₀ for its linear distribution. Whether the data show another circuit or another gain of
-        V_out.
+        W₀ for its linear distribution. Whether the data show another circuit, another gain of
+        V_out, or a resistance that falls with its current.
     """
     load = Load.behind(driver, circuit, spectrum, sample_rate, element_prior)
     if element_prior is not None:
@@ -362,24 +370,31 @@ def fit_circuit(
     by_term = elements @ jacobian
     changes = around.by_changes()
     rows = around.at.rows(changes)
-    found = other_circuit.scores(
-        rows,
-        linear,
-        around.part,
-        prior * (q - load.gain.centre(q)),
-        jax.scipy.linalg.block_diag(jnp.diag(prior[: load.gain.owned]), driver.cov),
-        information,
-        slice(count),
-    )
+    rest = prior * (q - load.gain.centre(q))
+    spread = jax.scipy.linalg.block_diag(jnp.diag(prior[: load.gain.owned]), driver.cov)
+    found = other_circuit.scores(rows, linear, around.part, rest, spread, information, slice(count))
     other = other_circuit.Scores.of(found, gain=True)
+    weight = jnp.where(known.selected, 2 / variance(known, g), 0.0)
+    falling = falling_resistance.score(
+        around.by_falling(),
+        known.y - g * known.x,
+        weight,
+        share,
+        noise,
+        around.x,
+        around.at.by_unknown(around.slopes),
+        load.knots,
+        rest,
+        spread,
+        information,
+        count,
+    )
     # If a wrong gain explains the excess of the low harmonics, the excess is no hum.
     others = linear.told(rows[-1:])[0] @ information
     gain = changes[-1] - combined(others, around.at.by_unknown(around.slopes))
-    weight = jnp.where(known.selected, jnp.sqrt(2 / variance(known, g)), 0.0)
-    explained = as_complex(found.size[-1] * weight) * around.x * load.knots.between(gain)
-    rest = part + real_parts(explained)
-    rest = jnp.sum(rest.reshape(2, -1) ** 2, axis=0) / 2
-    wrong_gain = (jnp.abs(found.z[-1]) > NO_HUM) & ~stands_out(rest, known)
+    explained = as_complex(found.size[-1] * jnp.sqrt(weight)) * around.x * load.knots.between(gain)
+    unexplained = jnp.sum((part + real_parts(explained)).reshape(2, -1) ** 2, axis=0) / 2
+    wrong_gain = (jnp.abs(found.z[-1]) > NO_HUM) & ~stands_out(unexplained, known)
     # Part of the noise that only this trial has: all, or that of V_out if V_th is shared.
     private = jnp.where(
         jnp.any(known.variance_x != spectrum.variance_x),
@@ -413,6 +428,7 @@ def fit_circuit(
         steps=solution.stats["num_steps"],
         strain=strain,
         hum=shows_hum(known, g) & ~wrong_gain,
+        falls=falling.causes(squares, terms, other.relevant()),
         support=Support(squares + strain, terms, other.relevant(), *other.spread.possible()),
     )
-    return estimate, moved > FAR, other.seen() | other.has_other_gain()
+    return estimate, moved > FAR, other.seen() | other.has_other_gain() | falling.seen()

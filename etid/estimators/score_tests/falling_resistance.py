@@ -1,0 +1,133 @@
+"""Score test whether the resistance of a load falls with its current.
+
+To first order in 1/I_0, a resistor R / (1 + |i|/I_0) adds the voltage −|u| u / (R I_0) to its own
+voltage u. The rest of the circuit filters it like the voltage of the relaxations, and the feed
+like a change of Z_L. This signal is no change of an impedance: harmonics mix. The test asks whether
+the residual correlates with the part of it that no unknown of the fit can make (Rao's score test,
+as in `etid.estimators.score_tests.other_circuit`).
+
+The current is that of the pulse, whose shape the first harmonics give.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Complex, Float
+
+from etid.estimators.score_tests.other_circuit import MOVED
+from etid.signals.knots import Knots
+from etid.signals.transfer import as_complex, power, reciprocal
+
+# Standard deviations; one-sided, so that a linear load exceeds it once in 30 000.
+SEEN = 4.0
+NO_FALL = (  # for a methods section
+    "a score test finds no resistance of the load that falls with its current (at most "
+    f"{SEEN:g} standard deviations)"
+)
+SHARE = 0.5  # of the excess of χ², from which on the current is named as the cause of a misfit
+UNSURE = 4.0  # standard deviations of χ² that are no excess
+HARMONICS = 512  # that the pulse needs, up to 30 kHz; without the rest z is a few per cent smaller
+FINE = 2  # points of the grid in time, relative to twice the number of these harmonics
+
+
+class Falling(NamedTuple):
+    """Score of a resistance that falls with its current.
+
+    Attributes:
+        z: Standard deviations, positive for a fall; NaN if the circuit can make the change itself.
+        moved: Largest change of the logarithm of an element by the fall.
+        explained: Part of Σ r² that the fall explains.
+    """
+
+    z: Float[Array, ""]
+    moved: Float[Array, ""]
+    explained: Float[Array, ""]
+
+    def seen(self) -> Bool[Array, ""]:
+        """Whether the resistance falls, and the fall moves an element."""
+        return (self.z > SEEN) & (self.moved > MOVED)
+
+    def causes(
+        self, squares: Float[Array, ""], terms: Float[Array, ""], others: Float[Array, " change"]
+    ) -> Bool[Array, ""]:
+        """Whether the fall is seen and explains most of a misfit.
+
+        Args:
+            squares: Σ r².
+            terms: Its expected value.
+            others: Scores of the other changes [standard deviations].
+        """
+        excess = squares - terms - UNSURE * jnp.sqrt(2 * terms)
+        most = self.z >= jnp.max(jnp.abs(others))
+        return self.seen() & most & (self.explained > SHARE * excess)
+
+
+def added_voltage(
+    v_out: Complex[Array, " harmonic"],
+    z: Complex[Array, " knot"],
+    sensitivity: Complex[Array, " knot"],
+    knots: Knots,
+) -> Complex[Array, " harmonic"]:
+    """What a falling resistance adds to V_out, for 1 / (R I_0) = 1 / V.
+
+    Args:
+        v_out: V_out [V] at the harmonics.
+        z: Z_L [Ω] at the knots.
+        sensitivity: ∂ ln H / ∂ ln Z_L at the knots, H = V_out per input.
+        knots: The knots of the harmonics.
+    """
+    relaxing = z - as_complex(z[-1].real)  # without the series resistor
+    count = min(HARMONICS, v_out.size)
+    u = (v_out * knots.between(relaxing * reciprocal(z)))[:count]
+    # There is no direct voltage behind a transformer, or with charge-balanced pulses.
+    points = jnp.fft.irfft(jnp.pad(u, (1, 0)), 2 * FINE * count, norm="forward")
+    added = jnp.fft.rfft(-jnp.abs(points) * points, norm="forward")[1 : count + 1]
+    return jnp.pad(added, (0, v_out.size - count)) * knots.between(sensitivity * relaxing)
+
+
+def score(
+    added: Complex[Array, " harmonic"],
+    error: Complex[Array, " harmonic"],
+    weight: Float[Array, " harmonic"],
+    share: Float[Array, " harmonic"],
+    noise: Float[Array, " harmonic"],
+    x: Complex[Array, " harmonic"],
+    slopes: Complex[Array, "q knot"],
+    knots: Knots,
+    rest: Float[Array, " q"],
+    spread: Float[Array, "q q"],
+    covariance: Float[Array, "q q"],
+    elements: int,
+) -> Falling:
+    """Score of a change of V_out.
+
+    Args:
+        added: ∂V_out/∂ε [V].
+        error: Y − G X [V].
+        weight: 1/σ² of each of its two parts; 0 where a harmonic is not used [1/V²].
+        share: Share of signal in the power of X.
+        noise: Variance of the residual relative to σ².
+        x: X without noise [V].
+        slopes: Derivatives of G with respect to the parameters at the knots.
+        knots: The knots of the harmonics.
+        rest: Gradient of the priors.
+        spread: Covariance of this gradient.
+        covariance: Inverse of the information.
+        elements: Number of elements, which are the first parameters.
+    """
+    product = jnp.conj(added) * x * as_complex(weight * share)
+    parts = knots.summed(jnp.stack([product.real, product.imag]))
+    others = (slopes.real @ parts[0] - slopes.imag @ parts[1]) @ covariance
+    made = jax.lax.complex(others @ slopes.real, others @ slopes.imag)
+    direction = added - x * knots.between(made)
+    total = jnp.dot(weight, (jnp.conj(direction) * error).real) + jnp.dot(others, rest)
+    of_priors = others @ spread @ others
+    squares = weight * power(direction)
+    variance = jnp.dot(squares, noise) + of_priors
+    curvature = jnp.dot(squares, share) + of_priors
+    return Falling(
+        total / jnp.sqrt(variance),
+        jnp.abs(total) / curvature * jnp.max(jnp.abs(others[:elements])),
+        total**2 / curvature,
+    )

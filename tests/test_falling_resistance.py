@@ -1,0 +1,106 @@
+"""Score test of a resistance that falls with its current: statistics, false alarms, power."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import etid
+from benchmarks.perturbation_list import PERTURBATIONS
+from benchmarks.perturbed_study import undisturbed
+from etid.estimators.score_tests.falling_resistance import SEEN, added_voltage, score
+from etid.recordings.remarks import Remark
+from etid.signals.harmonics import real_parts
+from etid.signals.knots import knots
+
+SKIN = etid.SkinRC(33.4e3, 186e3, 0.12e-9)
+PULSE_RATE, HARMONICS = 60.0, 1600
+SEEDS = 130  # of each of 40 cases
+
+
+def answers(name: str, number: int, snr_db: float, seeds: int):
+    """Fits of dry and damp skin behind one driver."""
+    study = PERTURBATIONS[name](undisturbed(number, snr_db))
+    driver = etid.identify_driver([of.recording(number) for of in study.calibrations])
+    records = [of.recording(1000 + seed) for of in study.trials for seed in range(seeds)]
+    return etid.identify_skins(records, driver)
+
+
+def fallen(fits) -> np.ndarray:
+    """Whether each fit says that its resistance falls."""
+    return (np.asarray(fits.fit.remarks) & int(Remark.falls_with_current)) > 0
+
+
+def test_what_is_added_is_what_a_falling_resistance_adds():
+    """Against a fixed point of R (1 − |u|/U) in the place of R, under a current source."""
+    _, r_p, c_p = SKIN.values().tolist()
+    points, largest = 16 * HARMONICS, 1e6  # V: R_p falls by 1e-5
+    t = np.arange(points) / points / PULSE_RATE
+    edges = np.tanh((t - 1e-3) / 2e-5) - np.tanh((t - 1.7e-3) / 2e-5)
+    current = 1e-4 * np.fft.rfft(edges - edges.mean(), norm="forward")
+    f = PULSE_RATE * np.arange(current.size)
+    parallel = r_p / (1 + 2j * np.pi * f * r_p * c_p)
+    u = linear = np.fft.irfft(parallel * current, norm="forward")
+    for _ in range(3):
+        more = np.abs(u) / largest / (1 - np.abs(u) / largest) * u / r_p
+        u = linear - np.fft.irfft(parallel * np.fft.rfft(more, norm="forward"), norm="forward")
+    expected = largest * np.fft.rfft(u - linear, norm="forward")[1 : HARMONICS + 1]
+    # The fixed point has a direct voltage, which a charge-balanced pulse has not.
+    every = knots(HARMONICS)
+    z = SKIN.response(jnp.asarray(f[1 : HARMONICS + 1]))
+    added = jax.jit(
+        lambda z, i: added_voltage(z * i, every.at(z), jnp.ones_like(every.at(z)), every)
+    )
+    found = np.asarray(added(z, current[1 : HARMONICS + 1])) / r_p
+    # 2 %: straight lines between the knots, and Z at the last harmonic in the place of R_s.
+    assert np.linalg.norm(found - expected) < 0.02 * np.linalg.norm(expected)
+
+
+def test_what_counts_is_what_the_parameters_cannot_do():
+    rng = np.random.default_rng(2)
+    every = knots(HARMONICS)
+    f = jnp.asarray(PULSE_RATE * (every.index + 1))
+    by_element = jax.jit(jax.jacfwd(lambda logs: SKIN.with_log_values(logs).response(f)))
+    slopes = by_element(SKIN.log_values()).T
+    x, added, error = (
+        jnp.asarray(rng.standard_normal(HARMONICS) + 1j * rng.standard_normal(HARMONICS))
+        for _ in range(3)
+    )
+    rows = jax.jit(lambda x, slopes: real_parts(x[None, :] * every.between(slopes)))(x, slopes)
+    rows, row, residual = (np.asarray(of) for of in (rows, real_parts(added), real_parts(error)))
+    rest = row - np.linalg.lstsq(rows.T, row, rcond=None)[0] @ rows
+    ones, none = jnp.ones(HARMONICS), jnp.zeros((3, 3))
+    covariance = jnp.asarray(np.linalg.inv(rows @ rows.T))
+    found = jax.jit(
+        lambda added, error: score(
+            added, error, ones, ones, ones, x, slopes, every, jnp.zeros(3), none, covariance, 3
+        )
+    )(added, error)
+    expected = rest @ residual / np.linalg.norm(rest)
+    assert float(found.z) == pytest.approx(expected)
+    assert float(found.explained) == pytest.approx(expected**2)
+
+
+def test_a_resistor_alone_has_no_such_voltage():
+    every = knots(200)
+    z = jnp.full(every.index.size, 1e5 + 0j)
+    assert not np.any(jax.jit(lambda v: added_voltage(v, z, z, every))(jnp.ones(200, complex)))
+
+
+def test_skin_that_loses_a_fifth_of_its_resistance_is_a_misfit_at_40_db():
+    fits = answers("Rp_nonlinear_0.2", 1, 40.0, 3)
+    assert fits.counts() == {"misfit": 6}
+    assert fallen(fits).all()
+    assert "depend" in str(fits[0])
+
+
+@pytest.mark.slow
+def test_linear_skin_is_not_called_nonlinear():
+    """Of 5 200 fits none; the normal distribution has 0.2 above the limit."""
+    fits = [
+        answers("base", number, snr, SEEDS)
+        for number in range(5)
+        for snr in (30.0, 40.0, 60.0, 80.0)
+    ]
+    assert SEEN == 4.0
+    assert sum(fallen(one).sum() for one in fits) == 0
