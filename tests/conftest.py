@@ -19,7 +19,11 @@ settings.load_profile("etid")
 
 # XLA compiles the programs of these tests in half the time: code of fusions without MLIR, and fewer
 # passes of LLVM. No pass at all (level 0) compiles faster still, but runs twice as long.
-COMPILE_FAST = "--xla_cpu_use_fusion_emitters=false --xla_backend_optimization_level=1"
+# Parts that are compiled one beside the other cost more on one core.
+COMPILE_FAST = (
+    "--xla_cpu_use_fusion_emitters=false --xla_backend_optimization_level=1"
+    " --xla_cpu_parallel_codegen_split_count=1"
+)
 
 REFERENCE_DATA = pathlib.Path(__file__).parents[2] / "shared" / "data"
 
@@ -35,6 +39,8 @@ def pytest_configure(config):
         os.environ["XLA_FLAGS"] = f"{COMPILE_FAST} {flags}"
     os.environ["JAX_COMPILATION_CACHE_DIR"] = str(config.cache.mkdir("xla"))  # for notebooks
     jax.config.update("jax_compilation_cache_dir", os.environ["JAX_COMPILATION_CACHE_DIR"])
+    # To read a program of one operation takes a third of the time of its compilation.
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
     worker = os.environ.get("PYTEST_XDIST_WORKER")
     if worker is not None and hasattr(os, "sched_setaffinity"):
         cores = sorted(os.sched_getaffinity(0))

@@ -56,6 +56,7 @@ def test_a_load_is_identified_from_whole_periods_of_current_and_voltage(skin):
     assert fit.stderr.r_p < 1e-3 * fit.circuit.r_p
 
 
+@pytest.mark.slow
 def test_a_constant_phase_is_identified_and_chosen():
     selection = etid.select_circuit(recorded(COLE))
     assert type(selection.fit.circuit) is etid.SkinCole

@@ -7,7 +7,7 @@ import pytest
 from etid.signals.knots import knots
 
 
-@pytest.mark.parametrize("harmonics", [1, 2, 31, 64, 833, 1728])
+@pytest.mark.parametrize("harmonics", [1, 2, 31, 1728])
 def test_products_with_straight_lines_are_summed_exactly(harmonics):
     """Also for a line that bends at a knot: the sum of each knot is what its hat function sees."""
     values = np.random.default_rng(0).normal(size=(2, harmonics))

@@ -18,7 +18,7 @@ from tests.conftest import REFERENCE_DATA
 ROOT = pathlib.Path(__file__).parents[1]
 CONCLUSIONS = ROOT / "tests" / "conclusions"  # what must hold after each notebook
 NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.py"))
-SLOW = {"derivatives", "joint", "online", "selection"}  # compiled for minutes
+SLOW = {"circuits", "derivatives", "joint", "online", "selection"}  # compiled for minutes
 PAGES = [
     pytest.param(path, marks=[pytest.mark.slow] if path.stem in SLOW else [])
     for path in sorted((ROOT / "docs").glob("*.md"))

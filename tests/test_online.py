@@ -78,6 +78,15 @@ def followed(tracker, pulses):
     return state
 
 
+def after_amplitude(state, amplitude):
+    """The state after pulses of this amplitude, with the types for which `update` is compiled."""
+    of = state.electrodes.amplitude
+    given = jax.device_put(jnp.full_like(of, amplitude), of.sharding)
+    return dataclasses.replace(
+        state, electrodes=dataclasses.replace(state.electrodes, amplitude=given)
+    )
+
+
 def own_stderr(fits):
     """Relative standard errors by the noise of the pulses alone."""
     own = np.diagonal(fits.cov - fits.fit.shared_cov, axis1=1, axis2=2)
@@ -105,6 +114,16 @@ def test_constant_skin_is_found_within_its_standard_errors_from_the_second_tenth
     gain = np.sqrt((fits.fit.steps - 30) / fits.fit.steps)
     np.testing.assert_allclose(widths[-1], widths[-31] * gain[:, None], rtol=0.1)
     assert (np.diagonal(fits.fit.shared_cov, axis1=1, axis2=2) > 0).all()
+
+
+def test_the_second_pulse_compiles_nothing():
+    tracker = tracker_of(2)
+    first = tracker.start(), tracker.start(at_rest=True)
+    after = tracker.update(first[0], tracker.pulses(loaded(quiet()))[0])
+    for state in first:
+        for one, other in zip(jax.tree.leaves(state), jax.tree.leaves(after), strict=True):
+            assert one.aval == other.aval  # shape, type, and whether the type is weak
+            assert (one.sharding, one.committed) == (other.sharding, other.committed)
 
 
 def test_a_tracker_and_its_state_are_printed_without_arrays():
@@ -179,7 +198,7 @@ def anew(state):
     lanes = dataclasses.replace(
         lanes,
         information=1e-9 * lanes.information,
-        pulses=jnp.ones_like(lanes.pulses),
+        pulses=0 * lanes.pulses + 1,
         mean=0 * lanes.mean,
         mean_cov=0 * lanes.mean_cov,
     )
@@ -584,8 +603,7 @@ def test_a_change_of_a_few_electrodes_is_theirs_and_one_of_all_the_driver_s():
 def test_an_amplitude_that_is_told_is_no_change():
     tracker, state, clean = ten()
     amplitude = np.linspace(0.5, 2.0, TEN)
-    lanes = dataclasses.replace(state.electrodes, amplitude=jnp.asarray(amplitude))
-    state = dataclasses.replace(state, electrodes=lanes)
+    state = after_amplitude(state, amplitude)
     found = tracker.update(state, with_noise(clean[8] * amplitude[:, None], 2), amplitude)
     assert tracker.changes(found) == []
     assert set(tracker.read(found).verdicts) == {"successful"}
@@ -621,16 +639,15 @@ def test_the_first_pulse_of_another_amplitude_lacks_a_tail_which_is_no_misfit(be
         np.stack([sampler.sample(v, 3333, start) for v in alone]) for start in (0.0, 1 / PULSES)
     )
     state = followed(tracker, with_noise(tracker.pulses(loaded(quiet()))[:6], seed=1))
-    lanes = dataclasses.replace(state.electrodes, amplitude=jnp.full(2, before))
-    state = dataclasses.replace(state, electrodes=lanes)
+    known = after_amplitude(state, before)
     v_out = with_noise(now * first + before * second, seed=3)
-    state = tracker.update(state, v_out, now)
+    state = tracker.update(known, v_out, now)
     fits = tracker.read(state)
     assert list(fits.verdicts) == ["successful"] * 2
     assert tracker.changes(state) == []
     assert (fits.fit.steps == 7).all()
-    blind = dataclasses.replace(lanes, amplitude=jnp.full(2, now))
-    blind = dataclasses.replace(state, electrodes=blind)
+    blind = dataclasses.replace(state, electrodes=known.electrodes)
+    blind = after_amplitude(blind, now)
     assert set(tracker.read(tracker.update(blind, v_out, now)).verdicts) == {"misfit"}
 
 

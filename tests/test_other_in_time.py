@@ -31,6 +31,7 @@ from etid.signals.noise import Measurement
 from etid.simulation.scenes import Trial
 
 RATE = 200e3
+prepared = eqx.filter_jit(prepare)  # operation by operation, it takes seconds
 NONE = jnp.zeros(0)
 R, POLE = jnp.log(jnp.asarray(5e3)), jnp.log(jnp.array([2e4]))
 SOURCE = SourceImpedance(R, NONE, NONE, NONE, NONE, POLE, jnp.array([9e3]))
@@ -41,7 +42,7 @@ def records(sigma: float = 1e-3, count: int = 600) -> Records:
     """A pulse, of which nothing is measured."""
     v_th = jnp.exp(-(((jnp.arange(float(count)) - 150) / 20) ** 2))
     noise = jnp.asarray(sigma)
-    return prepare(Measurement(v_th, 0 * v_th, noise, noise, jnp.asarray(RATE)))
+    return prepared(Measurement(v_th, 0 * v_th, noise, noise, jnp.asarray(RATE)))
 
 
 @pytest.mark.slow

@@ -36,6 +36,7 @@ from etid.simulation.scenes import Scene, Trial
 from etid.simulation.transformer import ResistorLoad, SkinLoad
 
 RATE = 200e3
+prepared = eqx.filter_jit(prepare)  # operation by operation, it takes seconds
 
 
 @pytest.mark.parametrize(
@@ -71,9 +72,11 @@ def test_a_late_calibration_is_an_excess_impedance_and_a_delay(z_load):
     The second part is a delay, which is fitted besides.
     """
     r_load, r, omega = 98.8e3, 15e3, 0.2
-    records = prepare(measurement(jnp.sin(omega * jnp.arange(400.0))))
+    records = prepared(measurement(jnp.sin(omega * jnp.arange(400.0))))
     load = resistor(jnp.asarray(z_load)).rational()
-    late = late_calibration(records, plain(r), load, jnp.asarray(r_load), jnp.zeros(1))
+    late = eqx.filter_jit(late_calibration)(
+        records, plain(r), load, jnp.asarray(r_load), jnp.zeros(1)
+    )
     v_th = np.asarray(records.hold[:, 0])  # where the interpolation has it
     slope = omega * np.sqrt(1 - v_th**2) * np.sign(np.gradient(v_th))
     expected = -z_load / (z_load + r) * ((r_load - z_load) / (z_load + r) + 1) * slope
@@ -84,7 +87,7 @@ def test_a_late_calibration_is_an_excess_impedance_and_a_delay(z_load):
 
 def test_the_noise_of_a_record_is_no_information():
     """H = JᵀJ − N (what noise alone puts into it), by sums as they are written down."""
-    records = prepare(measurement(jnp.zeros(600)))
+    records = prepared(measurement(jnp.zeros(600)))
     records = eqx.tree_at(
         lambda r: (r.sigma_th, r.sigma_out), records, (jnp.asarray(0.3), jnp.asarray(0.7))
     )

@@ -184,6 +184,7 @@ def test_a_method_that_cannot_says_which_can(study, driver, method, says):
         etid.identify_skin(study["spread"], driver, circuit=etid.SkinCole(), method=method)
 
 
+@pytest.mark.slow
 def test_a_constant_phase_is_identified_and_predicted_in_less_than_a_period(driver):
     short = scene(samples=3_000).simulate(3)["spread"]
     fit = etid.identify_skin(short, driver, circuit=etid.SkinCole())

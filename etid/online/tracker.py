@@ -206,7 +206,10 @@ class Tracker(Overviewed, eqx.Module):
             drifted=none - 1,
         )
         no = jnp.asarray(False)
-        return TrackerState(electrodes, jnp.zeros((), int), no, no)
+        state = TrackerState(electrodes, jnp.zeros((), int), no, no)
+        # Types and device of a state that `update` returns: with others, it would compile twice.
+        state = jax.tree.map(lambda leaf: leaf.astype(leaf.dtype), state)
+        return jax.device_put(state, self.model.source.sharding)
 
     def pulses(
         self, v_out: Float[np.ndarray, "*lane time"]
