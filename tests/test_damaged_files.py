@@ -10,8 +10,10 @@ import pytest
 
 import etid
 from benchmarks import fuzz, specimens
+from benchmarks.ladder import TRIAL, rung
 from etid.files.readers import mat5
 from etid.recordings import hdf5, limits, untrusted
+from etid.recordings.preflight import Inspected, preflight
 from etid.results.study_fits import StudyFits
 
 FEW = 4  # files of each kind in the ordinary tests
@@ -295,6 +297,11 @@ def test_a_damaged_archive_is_closed(tmp_path):
     with pytest.raises(etid.RecordingError):
         etid.import_file(path, tmp_path / "a.h5")
     gc.collect()
+
+
+def test_samples_whose_squares_are_zero_give_no_warning():
+    recording = rung("dry", samples=3_334).simulate(0)[TRIAL]
+    preflight(Inspected(recording.replace(v_th=1e-306 * recording.v_th)), periodic=True)
 
 
 def test_samples_near_the_largest_number_give_no_warning(tmp_path):

@@ -582,6 +582,8 @@ def _is_unconnected(seen: Inspected) -> bool:
     covariance = _covariance(np.stack(seen.aligned)) if seen.lag else seen.covariance
     variance = seen.sigma_th**2 + seen.sigma_out**2
     power = covariance[0, 0] - seen.sigma_th**2
+    if power <= 0:  # nothing but noise; or squares that are too small for a number
+        return False
     size = seen.aligned[0].size
     limit = EQUAL + STEP * math.sqrt(variance / (size * power))
     if abs(covariance[0, 1] / power - 1) > limit:
