@@ -30,7 +30,7 @@ import numpy as np
 import scipy.special
 from jaxtyping import Array, Bool, Complex, Float
 
-from etid.circuits.circuit import AbstractCircuit, Resistor
+from etid.circuits.circuit import AbstractCircuit
 from etid.identify.compiled import stored_jit
 from etid.recordings.repeats import ALIGNED, Repeats
 from etid.results.driver import Driver
@@ -267,10 +267,8 @@ def of_fits(fits: Fit, driver: AbstractFeed, repeats: Sequence[Repeats | None]) 
     variance = np.diagonal(np.asarray(fits.cov), axis1=1, axis2=2)
     usable = np.isfinite(values) & (values != 0) & (variance >= 0)
     allowed = np.sqrt(np.where(usable, variance, 0.0)) / np.where(usable, np.abs(values), 1.0)
-    slopes = None
-    frequency = next((of.frequency for of in repeats if of is not None), None)
-    if frequency is not None:
-        slopes = _slopes(fits.circuit, len(values), driver, frequency)
+    frequency = bands(repeats)
+    slopes = _slopes(fits.circuit, len(values), driver, frequency) if frequency.size else None
     return found(repeats, slopes, allowed)
 
 
@@ -291,7 +289,10 @@ def _slopes(
 
 
 def driver_judged(
-    driver: Driver, r_load: Float[Array, " record"], repeats: Sequence[Repeats | None]
+    driver: Driver,
+    r_load: Float[np.ndarray, " record"],
+    repeats: Sequence[Repeats | None],
+    z_th: Complex[np.ndarray, " band"],
 ) -> Driver:
     """The driver, with the verdict `changed` if it or its pulses changed during a calibration.
 
@@ -299,12 +300,17 @@ def driver_judged(
         driver: The driver.
         r_load: The resistors of its calibrations [Ω].
         repeats: The periods of its calibrations.
+        z_th: Source impedance at the `bands` of these periods [Ω].
     """
-    frequency = next((of.frequency for of in repeats if of is not None), None)
-    if frequency is None or driver.verdict != "successful":
+    if not z_th.size or driver.verdict != "successful":
         return driver
-    slopes = np.asarray(log_slopes(Resistor(r_load), driver, jnp.asarray(frequency)))
-    changes = found(repeats, slopes, np.full((len(repeats), 1), DRIVER))
+    slopes = z_th / (r_load[:, None] + z_th)  # ∂ ln G/∂ ln R
+    changes = found(repeats, slopes[:, None, :], np.full((len(repeats), 1), DRIVER))
     if changes.seen.any():
         return dataclasses.replace(driver, result=verdict("changed"))
     return driver
+
+
+def bands(repeats: Sequence[Repeats | None]) -> Float[np.ndarray, " band"]:
+    """Middle frequencies of the bands of records [Hz]; none if no record has several periods."""
+    return next((np.asarray(of.frequency) for of in repeats if of is not None), np.zeros(0))

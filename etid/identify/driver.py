@@ -6,9 +6,8 @@ import operator
 from collections.abc import Sequence
 
 import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Complex, Float
 
 from etid.estimators.estimator import AbstractEstimator, serving
 from etid.estimators.lanes import AlignedSamples, Harmonics, stacked
@@ -119,8 +118,11 @@ def identify_driver(
         driver = dataclasses.replace(driver, unloaded=unloaded)
     if drift and isinstance(driver, ContinuousDriver):
         driver = dataclasses.replace(driver, drift=np.asarray(drift, float))
-    driver = changes.driver_judged(driver, jax.device_put(np.asarray(resistances)), repeats(seen))
-    size = float(_size(driver, jax.device_put(np.asarray(1e3))))
+    periods = repeats(seen)
+    at = np.append(changes.bands(periods), 1e3)
+    *z_th, at_1_khz = np.asarray(_response(driver, jax.device_put(at)))
+    driver = changes.driver_judged(driver, np.asarray(resistances), periods, np.array(z_th))
+    size = abs(at_1_khz)
     if np.isfinite(size) and not plausible[0] <= size <= plausible[1]:
         driver = dataclasses.replace(driver, result=verdict("implausible"))
     if throw and driver.verdict != "successful":
@@ -210,9 +212,11 @@ def _aligned(seen: Sequence[Inspected], order: int, estimator: AbstractEstimator
 
 
 @functools.partial(stored_jit, rare=True)
-def _size(driver: Driver, frequency: Float[Array, ""]) -> Float[Array, ""]:
-    """|Z_th| [Ω] at a frequency [Hz]."""
-    return jnp.abs(driver.response(frequency))
+def _response(
+    driver: Driver, frequency: Float[Array, " frequency"]
+) -> Complex[Array, " frequency"]:
+    """Z_th [Ω] at these frequencies [Hz]."""
+    return driver.response(frequency)
 
 
 @stored_jit

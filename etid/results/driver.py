@@ -33,7 +33,6 @@ from etid.signals.transfer import (
     Rational,
     as_complex,
     delay_variable,
-    frequency_variable,
     reciprocal,
 )
 
@@ -66,17 +65,22 @@ class SourceImpedance(eqx.Module):
 
     def response(self, frequency: Float[Array, "..."]) -> Complex[Array, "..."]:
         """Impedance [Ω] at real frequencies [Hz]."""
-        s = frequency_variable(jnp.asarray(frequency))
-        z = as_complex(jnp.exp(self.log_resistance))
+        # In real arithmetic, which takes half the time to compile and to run.
+        omega = 2 * jnp.pi * jnp.asarray(frequency)
+        real = jnp.broadcast_to(jnp.exp(self.log_resistance), omega.shape)
+        imaginary = jnp.zeros_like(omega)
         for k in range(self.log_omega.shape[0]):
-            x = s * as_complex(jnp.exp(-self.log_omega[k]))
-            damping = as_complex(2 * jnp.exp(self.log_zeta[k]))
-            gain = as_complex(self.gain[k]) + as_complex(self.slope[k]) * x
-            z = z + gain * reciprocal(1 + (damping + x) * x)
+            turn = omega * jnp.exp(-self.log_omega[k])
+            below, damped = 1 - turn * turn, 2 * jnp.exp(self.log_zeta[k]) * turn
+            scale = 1 / (below * below + damped * damped)
+            gain, slope = self.gain[k] * scale, self.slope[k] * turn * scale
+            real = real + gain * below + slope * damped
+            imaginary = imaginary + slope * below - gain * damped
         for j in range(self.log_omega_real.shape[0]):
-            x = s * as_complex(jnp.exp(-self.log_omega_real[j]))
-            z = z + as_complex(self.gain_real[j]) * reciprocal(1 + x)
-        return z
+            turn = omega * jnp.exp(-self.log_omega_real[j])
+            gain = self.gain_real[j] / (1 + turn * turn)
+            real, imaginary = real + gain, imaginary - gain * turn
+        return jax.lax.complex(real, imaginary)
 
     def slopes(
         self, frequency: Float[Array, " frequency"]

@@ -139,8 +139,10 @@ class Fit(Judged, WithData[Circuit]):
     @property
     def stderr(self) -> Circuit:
         """Standard errors of the elements, as a circuit of the same kind."""
-        variance = jnp.diagonal(jnp.asarray(self.cov), axis1=-2, axis2=-1)
-        values = jnp.sqrt(jnp.where(variance >= 0, variance, jnp.nan))
+        # The fits of `identify_skin` hold NumPy arrays. With `jnp`, six programs would compile.
+        xp = self.cov.__array_namespace__()
+        variance = xp.diagonal(self.cov, axis1=-2, axis2=-1)
+        values = xp.sqrt(xp.where(variance >= 0, variance, xp.nan))
         names = self.circuit.names()
         return type(self.circuit)(**{name: values[..., i] for i, name in enumerate(names)})
 

@@ -46,8 +46,7 @@ class Knots:
 
     def at(self, values: Inexact[Array, "*row harmonic"]) -> Inexact[Array, "*row knot"]:
         """Values at the knots."""
-        parts = [values[..., of.first : of.end : of.width] for of in self.groups]
-        return jnp.concatenate([*parts, values[..., -1:]], axis=-1)
+        return jnp.take(values, self.index, axis=-1, mode="clip")
 
     def summed(self, values: Inexact[Array, "*row harmonic"]) -> Inexact[Array, "*row knot"]:
         """Σ_k φ_b(k) v_k for each knot b."""

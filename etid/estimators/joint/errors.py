@@ -188,9 +188,10 @@ def _seen(
     of_delay = jnp.concatenate([jnp.zeros(common.size), of_delay])
     jacobian = jnp.concatenate([around.jacobian[o:], around.jacobian[:o]])
     jacobian = jnp.concatenate([jacobian, of_delay[:, None]], axis=1)
-    share = around.mean(signal_share(around.x, known.variance_x))
-    noise = around.mean(excess(part, known.selected)[: g.size])
-    linear = Linear(jacobian, *(jnp.append(of, 1.0) for of in (share, noise)))
+    share = signal_share(around.x, known.variance_x)
+    noise = excess(part, known.selected)[: g.size]
+    means = around.mean(jnp.stack([share, noise]))
+    linear = Linear(jacobian, *jnp.concatenate([means, jnp.ones((2, 1))], axis=1))
     return _Seen(g, known, part, around, linear)
 
 

@@ -42,7 +42,7 @@ from etid.results.fits import Support, complex_rrse
 from etid.signals.harmonics import Spectrum, real_parts, signal_share
 from etid.signals.knots import Knots, knots
 from etid.signals.transfer import as_complex, frequency_variable, power, reciprocal, turns
-from etid.solvers.levenberg_marquardt import LevenbergMarquardt, NormalEquations, best_start
+from etid.solvers.levenberg_marquardt import LevenbergMarquardt, NormalEquations
 
 
 class Load(eqx.Module):
@@ -249,10 +249,11 @@ class Around(eqx.Module):
         """The terms."""
         return self.at.residual(self.q)
 
-    def mean(self, values: Float[Array, " harmonic"]) -> Float[Array, " part"]:
+    def mean(self, values: Float[Array, "row harmonic"]) -> Float[Array, "row part"]:
         """Means of `values` around the knots, weighted with P."""
-        total, sums = self.at.sums.power, knots(values.size).summed(values * self.power)
-        return jnp.tile(sums / jnp.where(total > 0, total, 1.0), 2)
+        total = self.at.sums.power
+        sums = knots(values.shape[1]).summed(values * self.power[None, :])
+        return jnp.tile(sums / jnp.where(total > 0, total, 1.0)[None, :], (1, 2))
 
     def by_falling(self) -> Complex[Array, " harmonic"]:
         """What a resistance that falls with its current adds to V_out [V²]."""
@@ -311,6 +312,31 @@ def refined(
     )
 
 
+def _chosen(load: Load, starts: Float[Array, "start q"]) -> Float[Array, " q"]:
+    """The likeliest start, which is the last, or the best of all if χ² of the likeliest is large.
+
+    One loop holds the only copy of the terms: each copy compiles for 0.2 s.
+    """
+    # The minimum does not depend on its start, and a loop of unknown length has no gradient.
+    load, starts = jax.lax.stop_gradient((load, starts))
+    limit = NEAR * 2 * jnp.sum(load.spectrum.selected, dtype=starts.dtype)
+    likeliest = starts.shape[0] - 1
+
+    def goes_on(state: tuple[Array, Array, Array]) -> Bool[Array, ""]:
+        number, _, least = state
+        return (number >= 0) & ((number != likeliest - 1) | ~(least < limit))
+
+    def tried(state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+        number, best, least = state
+        squares = jnp.sum(load(starts[number]) ** 2)
+        squares = jnp.where(jnp.isfinite(squares), squares, jnp.inf)
+        better = squares <= least
+        return number - 1, jnp.where(better, number, best), jnp.minimum(squares, least)
+
+    first = jnp.array(likeliest), jnp.array(likeliest), jnp.array(jnp.inf, starts.dtype)
+    return starts[jax.lax.while_loop(goes_on, tried, first)[1]]
+
+
 def fit_circuit(
     driver: AbstractGiven,
     circuit: AbstractCircuit,
@@ -342,10 +368,7 @@ def fit_circuit(
 
     # First at the knots of one point, and with Z_th fixed: from a distant start, a joint fit would
     # distort Z_th.
-    starts = candidates.vector()
-    likely = starts[-1]
-    near = jnp.sum(load(likely) ** 2) < NEAR * 2 * jnp.sum(spectrum.selected, dtype=likely.dtype)
-    start = jax.lax.cond(near, lambda: likely, lambda: best_start(load, starts))
+    start = _chosen(load, candidates.vector())
     near_start = Around.of(load, start).at
     alone = refined(near_start, start, ROUGHLY).value
     well = dataclasses.replace(
@@ -363,8 +386,15 @@ def fit_circuit(
     jacobian = around.jacobian
     prior = 1 / load.gain.widths(q) ** 2
     noise = excess(part, spectrum.selected)[: g.size]
+    # Part of the noise that only this trial has: all, or that of V_out if V_th is shared.
+    private = jnp.where(
+        jnp.any(known.variance_x != spectrum.variance_x),
+        spectrum.variance_y / variance(known, g),
+        1.0,
+    )
     share = signal_share(around.x, known.variance_x)
-    linear = Linear(jacobian, around.mean(share), around.mean(noise), jnp.diag(prior))
+    mean_share, mean_noise, own_noise = around.mean(jnp.stack([share, noise, private * noise]))
+    linear = Linear(jacobian, mean_share, mean_noise, jnp.diag(prior))
     information, count = linear.bread(), own.log_elements.size
     elements = information[:count]
     by_term = elements @ jacobian
@@ -395,13 +425,6 @@ def fit_circuit(
     explained = as_complex(found.size[-1] * jnp.sqrt(weight)) * around.x * load.knots.between(gain)
     unexplained = jnp.sum((part + real_parts(explained)).reshape(2, -1) ** 2, axis=0) / 2
     wrong_gain = (jnp.abs(found.z[-1]) > NO_HUM) & ~stands_out(unexplained, known)
-    # Part of the noise that only this trial has: all, or that of V_out if V_th is shared.
-    private = jnp.where(
-        jnp.any(known.variance_x != spectrum.variance_x),
-        spectrum.variance_y / variance(known, g),
-        1.0,
-    )
-    own_noise = around.mean(private * noise)
     by_own, by_z = load.gain.split(elements)
     of_delay = jnp.outer(by_own.delay_samples, by_own.delay_samples) / driver.delay_width**2
     if element_prior is not None:
