@@ -13,6 +13,7 @@ NAMES = (
     "coverage",
     "driver_order",
     "delays",
+    "noise",
     "selection",
     "design",
     "timing",

@@ -36,7 +36,8 @@ NEAR_MINIMUM = (
 )
 NOISE = (
     "The variances of the noise were estimated from each record by the median of its differences "
-    "of sixth order."
+    "of sixth order; fits at harmonics add 1/f noise where the bins between the harmonics surely "
+    "show it."
 )
 BY_RESIDUALS = (
     "were made with the variance that the residuals have around each harmonic where that exceeds "

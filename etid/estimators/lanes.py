@@ -22,7 +22,7 @@ from etid.recordings.preflight import Inspected
 from etid.results.feed import AbstractFeed
 from etid.signals import mains
 from etid.signals.harmonics import ALIASED, Spectrum, filled, spectrum
-from etid.signals.noise import Measurement, measure, noise, rounding_variance
+from etid.signals.noise import Measurement, coloured, measure, noise, rounding_variance
 from etid.signals.pulse_train import rest, shifted
 
 LEFT = 0.75  # samples; a larger delay needs a second fit. The prior of a delay is 0.5 wide
@@ -111,18 +111,20 @@ class Harmonics(AbstractLane):
 
     @classmethod
     def of(cls, seen: Inspected) -> "Harmonics":
-        """Aligned harmonics of a recording; rounding is the noise of a coarse converter."""
+        """Aligned harmonics of a recording; its noise may be 1/f or rounding too."""
         rate = np.asarray(seen.recording.sample_rate)
         sigmas = seen.trusted_th, seen.trusted_out
         fields = filled(seen.coefficients, *sigmas, rate, *seen.periods)
         frequency, x, y, variance_x, variance_y, selected = map(np.asarray, fields)
-        for v, step, variance in (
-            (seen.recorded_th, seen.coarse_th, variance_x),
-            (seen.recorded_out, seen.coarse_out, variance_y),
+        for v, recorded, sigma, step, variance in (
+            (seen.v_th, seen.recorded_th, sigmas[0], seen.coarse_th, variance_x),
+            (seen.v_out, seen.recorded_out, sigmas[1], seen.coarse_out, variance_y),
         ):
             if step > 0:
-                rounded = rounding_variance(v, step, *seen.periods)
+                rounded = rounding_variance(recorded, step, *seen.periods)
                 variance[: rounded.size] = rounded
+            elif seen.kept is None:  # joints between periods look like noise
+                variance *= coloured(v, float(sigma), frequency, float(rate), *seen.periods)
         selected = selected & ~seen.covered(frequency)
         one = cls(frequency, x, y, variance_x, variance_y, selected, rate)
         return one.realigned(seen.lag)

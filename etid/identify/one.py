@@ -369,17 +369,17 @@ def refined(
         return search(len(lanes), candidates, rows)
 
     def late_by(lane: AbstractLane, fits: dict[int, Fit]) -> int:
-        fit = fits[best(fits)]
+        fit = fits[_chosen(fits)]
         return lane.late_by(fit.circuit, driver) if fit.verdict == "misfit" else 0
 
     def of_all(first: dict[int, Fit], second: dict[int, Fit]) -> dict[int, Fit]:
-        other = second[best(second)]
-        if of_both(first[best(first)], other) is other:
+        other = second[_chosen(second)]
+        if of_both(first[_chosen(first)], other) is other:
             return second
         return {number: without_hum(fit) for number, fit in first.items()}
 
     def another(fits: dict[int, Fit]) -> bool:
-        return needs_another(fits[best(fits)])
+        return needs_another(fits[_chosen(fits)])
 
     return repeated(lanes, seen, searched, late_by, another, of_all)
 
@@ -404,6 +404,11 @@ def without_hum(found: _Outcome) -> _Outcome:
     return dataclasses.replace(found, remarks=np.asarray(found.remarks & ~int(Remark.mains_hum)))
 
 
+def _chosen(fits: dict[int, Fit]) -> int:
+    """Number of the candidate to choose; without a choice, no reader needs to know how it goes."""
+    return best(fits) if len(fits) > 1 else next(iter(fits))
+
+
 def chosen_fits(
     found: Sequence[dict[int, Fit]],
     driver: AbstractFeed,
@@ -418,7 +423,7 @@ def chosen_fits(
         remarks: Remarks on the recordings.
         repeats: The periods of the recordings.
     """
-    outcome = [(dict(fits), best(fits)) for fits in found]
+    outcome = [(dict(fits), _chosen(fits)) for fits in found]
     for number in {chosen for _, chosen in outcome}:  # circuits of one kind
         rows = [row for row, (_, chosen) in enumerate(outcome) if chosen == number]
         fits = [found[row][number] for row in rows]

@@ -1,0 +1,157 @@
+"""What does noise that is not white, or not equal in both records, cost, and are intervals honest?
+
+Dry and damp skin behind drivers drawn anew, as `benchmarks.perturbed_study.undisturbed` has them;
+all records, those of the calibration too, get noise in addition to the white one: 1/f noise with a
+corner frequency, where both are equal, in both records or in that of V_out alone; white noise of
+three times the size in V_out; and mains hum. For each, the verdicts, the median χ², the part of the
+95 % intervals that contain the truth, and the median standard errors of R_s, R_p and C_p, relative
+to those with white noise.
+"""
+
+import argparse
+import collections
+import dataclasses
+from collections.abc import Callable, Mapping
+
+import numpy as np
+from jaxtyping import Float
+
+import etid
+from benchmarks.coverage import NORMAL_95
+from benchmarks.disturbances import Hum
+from benchmarks.failure_counts import rate
+from benchmarks.laboratory import Record
+from benchmarks.perturbed_study import all_records, both, out, undisturbed
+
+FIRST = 2000  # number of the first driver
+COVERED = (0.93, 0.97)  # part of the 95 % intervals that is to contain the truth
+HUM = 0.01  # [V at the converter]
+
+
+@dataclasses.dataclass(frozen=True)
+class Flicker:
+    """Noise of the power σ² f_c/f, which equals that of white noise at the corner frequency f_c.
+
+    Args:
+        sigma: Standard deviation of a sample of the white noise [V at the converter].
+        corner: f_c [Hz].
+    """
+
+    sigma: float
+    corner: float
+
+    def __call__(
+        self, time: Float[np.ndarray, " time"], rng: np.random.Generator
+    ) -> Float[np.ndarray, " time"]:
+        """Volts at these times [s]."""
+        white = np.fft.rfft(self.sigma * rng.standard_normal(time.size))
+        white[0] = 0.0
+        white[1:] *= np.sqrt(self.corner / np.fft.rfftfreq(time.size, time[1])[1:])
+        return np.fft.irfft(white, time.size)
+
+
+@dataclasses.dataclass(frozen=True)
+class White:
+    """More white noise.
+
+    Args:
+        sigma: Standard deviation of a sample [V at the converter].
+    """
+
+    sigma: float
+
+    def __call__(
+        self, time: Float[np.ndarray, " time"], rng: np.random.Generator
+    ) -> Float[np.ndarray, " time"]:
+        """Volts at these times [s]."""
+        return self.sigma * rng.standard_normal(time.size)
+
+
+KINDS: Mapping[str, Callable[[Record], Record]] = {
+    "white": lambda of: of,
+    "1/f, 1 kHz": lambda of: both(added=(Flicker(of.sigma, 1e3),))(of),
+    "1/f, 10 kHz": lambda of: both(added=(Flicker(of.sigma, 1e4),))(of),
+    "1/f, 10 kHz, V_out only": lambda of: out(added=(Flicker(of.sigma, 1e4),))(of),
+    "V_out three times as loud": lambda of: out(added=(White(8**0.5 * of.sigma),))(of),
+    "hum of 50 Hz": lambda of: both(added=(Hum(50.0, HUM),))(of),
+    "hum of 60 Hz": lambda of: both(added=(Hum(60.0, HUM),))(of),
+}
+
+
+@dataclasses.dataclass(frozen=True)
+class Found:
+    """Fits with one kind of noise.
+
+    Attributes:
+        verdicts: How often each occurs; `driver_failed` where there is no driver.
+        chi2: Of all fits.
+        z: Errors of the successful fits in standard errors, (fit, element).
+        stderr: Their relative standard errors, (fit, element).
+        dry: Whether each successful fit is of dry skin.
+        driver: Number of its driver.
+    """
+
+    verdicts: Mapping[str, int]
+    chi2: np.ndarray
+    z: np.ndarray
+    stderr: np.ndarray
+    dry: np.ndarray
+    driver: np.ndarray
+
+
+def found(change: Callable[[Record], Record], snr_db: float, drivers: int) -> Found:
+    """Fits of a dry and a damp recording behind each driver."""
+    verdicts: collections.Counter[str] = collections.Counter()
+    rows, chi2 = [], []
+    for number in range(FIRST, FIRST + drivers):
+        study = all_records(change)(undisturbed(number, snr_db))
+        calibrations = [one.recording(number) for one in study.calibrations]
+        try:
+            driver = etid.identify_driver(calibrations, throw=False)
+        except etid.IdentificationError:
+            verdicts["driver_failed"] += len(study.trials)
+            continue
+        fits = etid.identify_skins([one.recording(number) for one in study.trials], driver)
+        verdicts.update(map(str, fits.verdicts))
+        for one, fit in zip(study.trials, (fits[i] for i in range(len(fits))), strict=True):
+            chi2.append(float(fit.chi2))
+            if fit.verdict == "successful":
+                truth = study.truths[one.path].low
+                error = np.asarray(fit.stderr.values())
+                z = (np.asarray(fit.circuit.values()) - truth) / error
+                rows.append((z, error / truth, one.path == "dry", number))
+    columns = [np.array(column) for column in zip(*rows, strict=True)]
+    return Found(verdicts, np.array(chi2), *columns)
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """How much is drawn."""
+    parser.add_argument("--snr-db", type=float, nargs="+", default=(40.0, 60.0))
+    parser.add_argument("--drivers", type=int, default=30)
+    parser.add_argument("--only", nargs="+", choices=KINDS, help="kinds of noise")
+
+
+def main(arguments: argparse.Namespace) -> bool:
+    """Print the table; whether no interval of a coverage lies outside 93 to 97 %."""
+    good = True
+    for snr_db in arguments.snr_db:
+        usual = None
+        for name in arguments.only or KINDS:
+            one = found(KINDS[name], snr_db, arguments.drivers)
+            inside = np.abs(one.z) < NORMAL_95
+            of = rate(inside.ravel().tolist(), np.repeat(one.driver, inside.shape[1]))
+            good &= of.low <= COVERED[1] and of.high >= COVERED[0]
+            errors = [np.median(one.stderr[one.dry == dry], axis=0) for dry in (True, False)]
+            usual = errors if usual is None else usual
+            wider = "; ".join(
+                ", ".join(f"{ratio:.2f}" for ratio in mine / white)
+                for mine, white in zip(errors, usual, strict=True)
+            )
+            said = ", ".join(f"{count} {verdict}" for verdict, count in one.verdicts.items())
+            print(
+                f"{snr_db:g} dB, {name}: covered {100 * of.rate:.1f} % ({100 * of.low:.1f} to "
+                f"{100 * of.high:.1f}), chi2 {np.nanmedian(one.chi2):.3f}, standard errors dry; "
+                f"damp {wider}; {said}",
+                flush=True,
+            )
+    return bool(good)
