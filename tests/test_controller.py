@@ -2,11 +2,14 @@
 
 import dataclasses
 import functools
+import math
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
 
 import etid
 from etid.online.current import CurrentModel
@@ -151,6 +154,43 @@ def test_the_fallback_obeys_the_limits_and_nothing_wanted_is_nothing_given():
     command = controller.command(dataclasses.replace(state, electrodes=lanes), charge=400e-9)
     np.testing.assert_allclose(command.amplitude, 0.11)
     assert list(command.reason) == ["slew"] * 2
+
+
+ANY = st.floats(allow_nan=True, allow_infinity=True)
+
+
+NEGATIVE = [-59.5, -69.3, -16.2, -69.3, -10.3, -42.1, -16.2, -42.1, -14.9]  # variances
+
+
+@settings(max_examples=20)
+@given(
+    own=st.lists(ANY | st.floats(-40, 40), min_size=8, max_size=8),
+    information=st.lists(ANY | st.floats(-1e8, 1e8), min_size=18, max_size=18),
+    before=st.lists(st.floats(0, 1e3) | st.just(math.nan), min_size=2, max_size=2),
+    result=st.sampled_from(["successful", "misfit", "unstable", "unconnected"]),
+    wanted=st.floats(0, 1e300),
+)
+@example(
+    own=[10.42, 12.13, -22.85, -0.06] * 2,
+    information=NEGATIVE * 2,
+    before=[1.0, 1.0],
+    result="successful",
+    wanted=80e-9,
+)
+def test_limits_hold_whatever_the_estimate_says(own, information, before, result, wanted):
+    """A not-a-number in a limit was the amplitude."""
+    controller, state = controlled(voltage_cap=30.0, slew=0.5)
+    hostile = dataclasses.replace(
+        state.electrodes,
+        own=jnp.array(own).reshape(2, 4),
+        information=jnp.array(information).reshape(2, 3, 3),
+        amplitude=jnp.array(before),
+        result=jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (2,)), verdict(result)),
+    )
+    command = controller.command(dataclasses.replace(state, electrodes=hostile), charge=wanted)
+    most = min(float(controller.guard), float(controller.ceiling))
+    assert (command.amplitude >= 0).all()
+    assert (command.amplitude <= np.minimum(most, np.nan_to_num(before) + 0.5)).all()
 
 
 def test_what_cannot_be_commanded_is_refused_with_a_reason():

@@ -262,6 +262,7 @@ def _electrode(
             jnp.nan_to_num(state.amplitude) + controller.slew,
         ]
     )
+    good = good & ~jnp.isnan(limits).any()  # the smallest of some numbers and a NaN is NaN
     first = jnp.where(wanted > 0, controller.fallback, 0.0)
     safe = jnp.concatenate([first[None], jnp.full(2, jnp.inf), limits[3:]])
     applied = jnp.where(good, limits, safe)

@@ -139,12 +139,23 @@ class CurrentModel(eqx.Module):
         at = 1 + jnp.argmax(jnp.abs(found[1:]))
         rows = jnp.stack([self.sums[0], self.sums[at]])
         by_element = jax.vmap(lambda v: jax.jvp(load, (logs,), (v,))[1])(jnp.eye(logs.size))
-        own = rows @ real_parts(by_element * (admittance * admittance)[None, :]).T
-        shared = rows @ real_parts(self.by_source * admittance[None, :]).T
+        # The rows times Y, not the derivatives: `by_source` is the same matrix at all electrodes.
+        rows = _times(rows, admittance)
+        shared = rows @ real_parts(self.by_source).T
+        own = _times(rows, admittance) @ real_parts(by_element).T
         variance = jnp.sum((own @ cov) * own, axis=1)
         variance = variance + jnp.sum((shared @ self.source_cov) * shared, axis=1)
         charge_stderr, peak_stderr = jnp.sqrt(variance)
         return Current(found[0], charge_stderr, jnp.abs(found[at]), peak_stderr)
+
+
+def _times(
+    rows: Float[Array, "row part"], factor: Complex[Array, " band"]
+) -> Float[Array, "row part"]:
+    """Weights of Re Σ w · factor · value, from those of Re Σ w · value."""
+    real, imaginary = jnp.split(rows, 2, axis=1)  # Re w and −Im w
+    a, b = factor.real[None, :], factor.imag[None, :]
+    return jnp.concatenate([real * a + imaginary * b, imaginary * a - real * b], axis=1)
 
 
 def _phase(v: Float[np.ndarray, " sample"]) -> tuple[float, float]:
