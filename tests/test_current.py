@@ -179,6 +179,7 @@ def test_a_joint_fit_leaves_recordings_of_a_current_to_fits_of_their_own(skin):
     np.testing.assert_allclose(fit.circuit.values(), alone.circuit.values(), rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_one_load_is_identified_from_several_recordings_of_its_current(skin):
     several = [skin, *(recorded(SKIN, seed=seed, delay=seed * 1e-6) for seed in (1, 2, 3))]
     fit = etid.identify_amplitudes(several, circuit=etid.SkinRC())
@@ -287,16 +288,23 @@ ECOG = REFERENCE_DATA / "ecog_stim" / "20f8a3_stimOutput.mat"
 @pytest.mark.slow
 @pytest.mark.skipif(not ECOG.exists(), reason="reference data are not here")
 def test_electrodes_on_tissue_have_a_constant_phase_and_a_misfit():
-    """Platinum electrodes, 500 µA for 1.2 ms in each direction, as commanded."""
-    rate, rest, phase = 24414.0625, 40, 1.2e-3  # `rest` samples before the pulse replace the pause
+    """Platinum electrodes, 500 µA in each direction, as commanded.
+
+    The voltage jumps where the current does. The commanded 1.2 ms are 29.3 samples, but each phase
+    lasts 29. A current of 30 and 29 samples, which the command suggests, leaves 7 to 9 %.
+    """
+    rate, rest = 24414.0625, 40  # `rest` samples before the pulse replace the pause
     found = scipy.io.loadmat(ECOG, squeeze_me=True, struct_as_record=False)["dataStruct"]
     for name in found._fieldnames:
         pair = getattr(found, name)
         mean = pair.stim_data.mean(1)
+        start, middle, end = np.sort(np.argsort(np.abs(np.diff(mean)))[-3:]) + 1 + rest
+        assert middle - start == end - middle == 29
         v_out = np.concatenate([np.full(rest, mean[:18].mean()), mean])
-        since = np.arange(v_out.size) / rate - rest / rate + pair.time_vec[0] * 1e-3
-        on = [(since >= k * phase) & (since < (k + 1) * phase) for k in range(2)]
-        current = pair.stim_current * 1e-6 * (on[0].astype(float) - on[1])
+        current = np.zeros(v_out.size)
+        current[start:middle], current[middle:end] = (
+            sign * pair.stim_current * 1e-6 for sign in (1, -1)
+        )
         recording = etid.Recording(
             v_out=v_out, current=current, sample_rate=rate, pulse_rate=rate / v_out.size
         )
@@ -308,3 +316,5 @@ def test_electrodes_on_tissue_have_a_constant_phase_and_a_misfit():
         )
         assert type(selection.fit.circuit) is etid.SkinCole
         assert selection.fit.verdict == "misfit"
+        # Others found 0.7 to 1.4 % in three of the pairs, without the samples at the edges.
+        assert selection.fit.rrse < 0.017

@@ -99,6 +99,12 @@ def test_a_record_that_is_not_finite_has_no_hum(value):
     assert mains.separated(v, 0.01, 200e3, 3, 10_000) is None
 
 
+def test_between_the_harmonics_of_10_hz_is_no_hum():
+    """50 and 60 Hz and their multiples are harmonics: no bin between them is left to look at."""
+    v = np.random.default_rng(0).standard_normal((1, 60_000))
+    assert not mains.suspected(v, np.array([1.0]), 200e3, 10.0, 3, 60_000).any()
+
+
 def test_a_drift_is_no_hum(records):
     of = records[1]
     time = np.arange(of.v_th.size) / of.sample_rate

@@ -169,7 +169,8 @@ def _probes(
         mixtures[0] += wave
         mixtures[1] += wave if number % 4 < 2 else -wave
     probes = np.concatenate([np.real(mixtures), np.imag(mixtures)])
-    norm = math.sqrt(bins.size * samples / 2)
+    # At 10 Hz all mains frequencies are harmonics: no bin is left, and the probes are 0.
+    norm = math.sqrt(max(bins.size, 1) * samples / 2)
     return probes / norm, samples / norm * math.sqrt(np.sum(left**2))
 
 
