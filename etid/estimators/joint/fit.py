@@ -31,6 +31,7 @@ from etid.solvers.levenberg_marquardt import (
 )
 
 NEAR = 0.05  # distance of all parameters together from their minimum [standard errors]
+ROUNDS = 2  # fits at knots, each around the minimum of the last one
 
 
 def _equations(_, y: Float[Array, " parameter"], study: DriverStudy) -> ArrowheadEquations:
@@ -140,10 +141,15 @@ def fit_together(
         second_order=_second_order,
         empty=_empty,
     )
-    # At the knots a step takes a tenth of the time. All harmonics then need two or three steps.
-    near = _solved(solver, study.at_knots(), study.start())
-    slight = dataclasses.replace(solver, damping=SLIGHT)
-    solution = _solved(slight, study, near.value)
+    # At the knots a step takes a tenth of the time. The knots around the first minimum are so close
+    # to the last one that all harmonics then need one or two plain steps.
+
+    def near(y: Float[Array, " parameter"], _: None) -> tuple[Float[Array, " parameter"], None]:
+        return _solved(solver, study.at_knots(y), y).value, None
+
+    start, _ = jax.lax.scan(near, study.start(), length=ROUNDS)
+    plain = dataclasses.replace(solver, damping=SLIGHT, geodesic=False)
+    solution = _solved(plain, study, start)
     common, parts = study.split(solution.value)
     # The loads that take no part are fitted now, with the final Z_th.
     refitted = [

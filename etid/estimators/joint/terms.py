@@ -63,7 +63,7 @@ class Loads(eqx.Module):
         used: Whether the recording takes part. The others are fitted, but do not affect Z_th.
         unloaded: Index of the unloaded record among those that several loads share; −1 if no other
             load has it.
-        sums: The recordings at the knots, around the start; None for all harmonics.
+        sums: The recordings at the knots; None for all harmonics.
     """
 
     spectrum: Spectrum
@@ -81,21 +81,29 @@ class Loads(eqx.Module):
 
 
 class DriverStudy(eqx.Module):
-    """All data of the fit of a driver and its loads."""
+    """All data of the fit of a driver and its loads.
+
+    Attributes:
+        model: Calibrations and structure of the loads.
+        groups: The loads, one group for each length.
+        centre: The common parameters around which the loads are at the knots; None for all
+            harmonics.
+    """
 
     model: Joint
     groups: list[Loads]
+    centre: Float[Array, " common"] | None = None
 
     def lane(
         self, common: Float[Array, " common"], driver: GivenDriver, load: Loads
     ) -> Load | AtKnots:
         """One load behind this driver, which has these parameters."""
-        if load.sums is None:
+        if load.sums is None or self.centre is None:
             return self.whole(driver, load)
         gain = Gain(driver, self.model.circuit, load.frequency, load.sample_rate)
         sums = load.sums
         if sums.by_z is not None:
-            moved = combined(common - self.model.calibrations.start(), sums.by_z)
+            moved = combined(common - self.centre, sums.by_z)
             sums = dataclasses.replace(sums, shift=moved)
         return AtKnots(gain, sums)
 
@@ -103,21 +111,22 @@ class DriverStudy(eqx.Module):
         """One load behind this driver, with all harmonics."""
         return Load.behind(driver, self.model.circuit, load.spectrum, load.sample_rate)
 
-    def at_knots(self) -> "DriverStudy":
-        """The study with all loads at the knots, around its start."""
-        common = self.model.calibrations.start()
+    def at_knots(self, y: Float[Array, " parameter"]) -> "DriverStudy":
+        """The study with all loads at the knots, around `y`."""
+        common, parts = self.split(y)
 
-        def of_group(loads: Loads) -> Loads:
+        def of_group(loads: Loads, owns: LoadUnknowns) -> Loads:
             driver = self.model.around(common, loads.frequency[0])
 
-            def one(load: Loads) -> Sums:
-                q = jnp.concatenate([load.own.vector(), driver.mean])
+            def one(load: Loads, own: LoadUnknowns) -> Sums:
+                q = jnp.concatenate([own.vector(), driver.mean])
                 every = knots(load.spectrum.x.size, DENSE)
                 return Around.of(self.whole(driver, load), q, every=every).at.sums
 
-            return dataclasses.replace(loads, sums=in_turn(one, loads))
+            return dataclasses.replace(loads, sums=in_turn(one, loads, owns))
 
-        return DriverStudy(self.model, [of_group(loads) for loads in self.groups])
+        groups = [of_group(*group) for group in zip(self.groups, parts, strict=True)]
+        return DriverStudy(self.model, groups, common)
 
     def start(self) -> Float[Array, " parameter"]:
         """The start: the driver of the calibrations, and each load identified alone."""
