@@ -121,7 +121,9 @@ def identify_driver(
     periods = repeats(seen)
     at = np.append(changes.bands(periods), 1e3)
     *z_th, at_1_khz = np.asarray(_response(driver, jax.device_put(at)))
-    driver = changes.driver_judged(driver, np.asarray(resistances), periods, np.array(z_th, complex))
+    driver = changes.driver_judged(
+        driver, np.asarray(resistances), periods, np.array(z_th, complex)
+    )
     size = abs(at_1_khz)
     if np.isfinite(size) and not plausible[0] <= size <= plausible[1]:
         driver = dataclasses.replace(driver, result=verdict("implausible"))
