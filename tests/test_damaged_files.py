@@ -1,5 +1,6 @@
 """Damaged files end in an answer or in one error of etid's own: no crash, no hang, no memory."""
 
+import dataclasses
 import gc
 import re
 import tracemalloc
@@ -14,6 +15,7 @@ from benchmarks.ladder import TRIAL, rung
 from etid.files.readers import mat5
 from etid.recordings import hdf5, limits, untrusted
 from etid.recordings.preflight import Inspected, preflight
+from etid.report import figures
 from etid.results.study_fits import StudyFits
 
 FEW = 4  # files of each kind in the ordinary tests
@@ -254,6 +256,13 @@ def test_a_column_whose_texts_are_in_parts_is_refused(fits):
         StudyFits.read(fits)
 
 
+def test_elements_that_are_too_large_for_the_unit_of_an_axis_are_not_drawn():
+    found = specimens.study_fits().fits
+    c_p = np.where(np.arange(len(found)) == 2, 1e300, found.circuit.c_p)
+    fit = dataclasses.replace(found.fit, circuit=dataclasses.replace(found.circuit, c_p=c_p))
+    assert figures.distributions(dataclasses.replace(found, fit=fit)).startswith(b"<?xml")
+
+
 # Files of other formats
 
 
@@ -302,6 +311,12 @@ def test_a_damaged_archive_is_closed(tmp_path):
 def test_samples_whose_squares_are_zero_give_no_warning():
     recording = rung("dry", samples=3_334).simulate(0)[TRIAL]
     preflight(Inspected(recording.replace(v_th=1e-306 * recording.v_th)), periodic=True)
+
+
+def test_a_record_that_is_shorter_than_an_edge_is_too_short():
+    """Its sample rate is wrong by a factor of a million."""
+    recording = rung("dry", samples=3_334).simulate(0)[TRIAL].replace(sample_rate=2e11)
+    assert preflight(Inspected(recording)) == "too_short"
 
 
 def test_samples_near_the_largest_number_give_no_warning(tmp_path):

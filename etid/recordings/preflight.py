@@ -488,7 +488,8 @@ def preflight(seen: Inspected, *, periodic: bool = False) -> str | None:
         periodic: Whether the fit needs whole pulse periods.
     """
     of = seen.recording
-    if of.samples["v_out"].stored.size < SHORTEST or seen.v_th.size < SHORTEST:
+    shortest = max(SHORTEST, rise_time(of.sample_rate) + 1)
+    if of.samples["v_out"].stored.size < shortest or seen.v_th.size < shortest:
         return "too_short"
     if not np.isfinite(seen.limits).all():
         return "nonfinite_samples"

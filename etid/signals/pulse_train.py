@@ -231,9 +231,12 @@ def lags_of(
         trains: The pulses of each `v_th`.
 
     Returns:
-        The lags [samples]; None if both records have opposite polarity or are too far apart.
+        The lags [samples]; None if both records have opposite polarity, are too far apart, or are
+        shorter than an edge.
     """
     lags: list[float | None] = [None] * len(records)
+    if not trains or records.shape[2] <= rise_time(trains[0].sample_rate):
+        return lags
     alike: dict[_Window, list[int]] = {}
     for row, train in enumerate(trains):
         alike.setdefault(_window(records[row, 0], train), []).append(row)
