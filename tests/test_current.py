@@ -7,7 +7,9 @@ import scipy.io
 
 import etid
 from etid import cli
+from etid.estimators.lanes import Harmonics
 from etid.plotting import figure_of
+from etid.plotting.bands import bands
 from etid.recordings.preflight import Inspected, preflight
 from etid.results.feed import MEASURED_CURRENT
 from tests.conftest import REFERENCE_DATA
@@ -58,7 +60,9 @@ def test_a_load_is_identified_from_whole_periods_of_current_and_voltage(skin):
 
 @pytest.mark.slow
 def test_a_constant_phase_is_identified_and_chosen():
-    selection = etid.select_circuit(recorded(COLE))
+    recording = recorded(COLE)
+    selection = etid.select_circuit(recording)
+    assert all(axes.has_data() for axes in figure_of(selection, recording).axes)
     assert type(selection.fit.circuit) is etid.SkinCole
     assert np.abs(off(selection.fit, COLE)).max() < WITHIN
 
@@ -142,9 +146,42 @@ def test_a_prediction_from_the_current_misses_by_the_noise(skin):
     assert np.nanstd(etid.predict(cole, circuit=COLE) - cole.v_out) < 2e-3 * np.std(cole.v_out)
 
 
-def test_a_fit_from_a_current_is_drawn(skin):
-    figure = figure_of(etid.identify_skin(skin), skin)
-    assert "r_s" in figure.axes[0].get_title(loc="left")
+@pytest.mark.parametrize("show", ["pulse", "impedance", "residual"])
+def test_a_fit_from_a_current_is_drawn(skin, show):
+    figure = figure_of(etid.identify_skin(skin), skin, show=show)
+    assert all(axes.has_data() for axes in figure.axes)
+
+
+def test_the_bands_of_a_current_have_the_impedance_of_the_load(skin):
+    lane = Harmonics.of(Inspected(skin))
+    found = bands(lane, MEASURED_CURRENT, etid.identify_skin(skin).circuit)
+    truth = np.asarray(SKIN.response(jnp.asarray(found.frequency)))
+    sure = found.stderr < 0.1
+    assert sure.sum() > 10
+    off = np.abs(np.log(np.abs(found.z[sure] / truth[sure]))) / found.stderr[sure]
+    assert off.max() < WITHIN
+
+
+def test_draws_and_profile_of_a_fit_from_a_current_have_its_errors(skin):
+    fit = etid.identify_skin(skin)
+    draws = fit.posterior()
+    assert draws.effective > 800  # of 1000: the likelihood is normal at 60 dB
+    error = float(fit.stderr.r_p)
+    for interval in (draws.intervals()["r_p"], fit.profile("r_p").interval()):
+        # 1000 draws give an end of the interval to a tenth of a standard error.
+        expected = float(fit.circuit.r_p) + np.array([-1.96, 1.96]) * error
+        np.testing.assert_allclose(interval, expected, rtol=0, atol=0.3 * error)
+
+
+def test_the_report_of_a_study_of_currents_speaks_of_no_driver(skin, tmp_path):
+    etid.Study.from_recordings([skin.replace(path="s01/0")]).write(tmp_path / "study.h5")
+    etid.fit_file(tmp_path / "study.h5", tmp_path / "fits.h5")
+    etid.write_report(tmp_path / "fits.h5", tmp_path / "page.html")
+    page = (tmp_path / "page.html").read_text("utf-8")
+    assert "measured currents, which needs no driver" in page
+    assert "V_out = Z_L I" in page
+    assert "Z_th is a rational function" not in page
+    assert "do not say with which driver" not in page
 
 
 def test_a_batch_gives_the_fits_of_single_recordings(skin):

@@ -35,10 +35,10 @@ from scipy.special import softmax
 
 from etid.circuits.circuit import AbstractCircuit, Circuit
 from etid.estimators.lanes import Harmonics
-from etid.estimators.maximum_likelihood.given_driver import GivenDriver
+from etid.estimators.maximum_likelihood.given_driver import AbstractGiven
 from etid.estimators.maximum_likelihood.load import Load, refined
 from etid.estimators.registry import MAXIMUM_LIKELIHOOD
-from etid.identify.arguments import require
+from etid.identify.arguments import fed, require
 from etid.identify.compiled import stored_jit
 from etid.identify.one import is_shared, known_of
 from etid.recordings.preflight import Inspected
@@ -74,7 +74,7 @@ class _Minimum(eqx.Module):
     cov: Float[Array, "q q"]
 
     @classmethod
-    def of(cls, lane: Harmonics, known: GivenDriver, circuit: AbstractCircuit) -> "_Minimum":
+    def of(cls, lane: Harmonics, known: AbstractGiven, circuit: AbstractCircuit) -> "_Minimum":
         terms = Load.behind(known, circuit, lane.spectrum, jnp.asarray(lane.sample_rate))
         start = jnp.concatenate([circuit.log_values(), jnp.zeros(1), known.mean])
         q = refined(terms, start).value
@@ -107,7 +107,7 @@ def _least(
 
 @stored_jit
 def _minimum(
-    lane: Harmonics, known: GivenDriver, circuit: AbstractCircuit
+    lane: Harmonics, known: AbstractGiven, circuit: AbstractCircuit
 ) -> tuple[Float[Array, " q"], Float[Array, "q q"]]:
     """The minimum of F, and H⁻¹."""
     least = _Minimum.of(lane, known, circuit)
@@ -116,7 +116,7 @@ def _minimum(
 
 @stored_jit
 def _costs(
-    lane: Harmonics, known: GivenDriver, circuit: AbstractCircuit, q: Float[Array, "draw q"]
+    lane: Harmonics, known: AbstractGiven, circuit: AbstractCircuit, q: Float[Array, "draw q"]
 ) -> Float[Array, " draw"]:
     """F of each draw."""
     terms = Load.behind(known, circuit, lane.spectrum, jnp.asarray(lane.sample_rate))
@@ -177,7 +177,7 @@ def _flattened(log_weight: Float[np.ndarray, " draw"], enough: float) -> Float[n
 @stored_jit
 def _profile(
     lane: Harmonics,
-    known: GivenDriver,
+    known: AbstractGiven,
     circuit: AbstractCircuit,
     number: Int[Array, ""],
     stretched: Float[Array, ""],
@@ -262,7 +262,7 @@ def profile(fit: Fit, recording: Recording | None, driver: Driver | None, name: 
 
 def _given(
     fit: Fit, recording: Recording | None, driver: Driver | None
-) -> tuple[Harmonics, GivenDriver, Float[np.ndarray, "element element"]]:
+) -> tuple[Harmonics, AbstractGiven, Float[np.ndarray, "element element"]]:
     """The harmonics of a fit, its driver, and the covariance of the logarithms of its elements.
 
     Raises:
@@ -270,13 +270,15 @@ def _given(
     """
     require("fit", fit, Fit)
     recording, driver = fit.made_from(recording, driver)
-    if recording is None or driver is None:
+    if recording is None:
         raise ValueError(
             "this fit does not know its recording and its driver; pass both, as in "
             "fit.posterior(recording, driver)"
         )
     require("recording", recording, Recording)
-    require("driver", driver, Driver)
+    if driver is not None:
+        require("driver", driver, Driver)
+    recording, feed = fed(recording, driver)
     if np.ndim(fit.rrse):
         raise ValueError("this is a batch of fits; take one of them, as in fits[0]")
     if fit.method != MAXIMUM_LIKELIHOOD.name:
@@ -290,10 +292,10 @@ def _given(
         raise ValueError(f"the recording does not determine all elements of {fit}")
     seen = Inspected(recording)
     lane = Harmonics.of(seen)
-    late = lane.late_by(fit.circuit, driver)  # as `etid.identify.one.repeated` does it
+    late = lane.late_by(fit.circuit, feed)  # as `etid.identify.one.repeated` does it
     seen.lag += late
     lane = lane.realigned(late)
     if int(fit.remarks) & Remark.mains_hum:
         lane = lane.without_mains() or lane
-    known = known_of(lane, driver, is_shared(seen, driver), MAXIMUM_LIKELIHOOD)
+    known = known_of(lane, feed, is_shared(seen, feed), MAXIMUM_LIKELIHOOD)
     return lane, known, cov

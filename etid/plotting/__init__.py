@@ -146,17 +146,17 @@ def _draw(
         )
     if isinstance(x, Fit):
         recording, driver = x.made_from(recording, driver)
+    with_current = recording is not None and "current" in recording.samples
     with mpl.rc_context(style.PAPER):
         match x, recording, driver:
-            case Fit(), Recording(), Driver() if show == "impedance":
-                return judging.draw_impedance(canvas, x, recording, driver)
-            case Fit(), Recording(), Driver() if show == "residual":
-                return judging.draw_residual(canvas, x, recording, driver)
-            case Fit(), Recording(), Driver():
-                return pulses.draw_fit(canvas, x, recording, driver)
-            case Fit(), Recording(), None if show == "pulse" and "current" in recording.samples:
-                return pulses.draw_fit(canvas, x, recording, driver)
-            case Selection(), Recording(), Driver():
+            case Fit(), Recording(), _ if driver is not None or with_current:
+                draw = {
+                    "impedance": judging.draw_impedance,
+                    "residual": judging.draw_residual,
+                    "pulse": pulses.draw_fit,
+                }[show]
+                return draw(canvas, x, recording, driver)
+            case Selection(), Recording(), _ if driver is not None or with_current:
                 return candidates.draw_selection(canvas, x, recording, driver)
             case Driver(), Recording(), None:
                 return pulses.draw_calibration(canvas, x, recording)

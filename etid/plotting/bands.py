@@ -10,7 +10,8 @@ averaged with the weights 2 |G X (1 − G)|² / var e, the reciprocal variance o
 estimated from both records, (σ_y² X + σ_x² G* Y) / (σ_y² + |G|² σ_x²): its noise is independent of
 that of e, so that noise does not bias the average.
 
-As in the fit, the trigger delay is free, and the parameters of Z_th move within their covariance.
+With a measured current G = Z, and 1 takes the place of 1 − G. As in the fit, the trigger delay is
+free, and the parameters of Z_th move within their covariance.
 """
 
 import dataclasses
@@ -26,6 +27,7 @@ from etid.estimators.estimate import DELAY_WIDTH
 from etid.estimators.lanes import Harmonics
 from etid.identify.compiled import stored_jit
 from etid.results.driver import ContinuousDriver, SourceImpedance
+from etid.results.feed import MeasuredCurrent
 
 PER_DECADE = 6  # bands
 ITERATIONS = 6  # of Gauss and Newton; the terms are almost linear
@@ -49,20 +51,23 @@ class Bands:
     deviation: Float[np.ndarray, "2 band"]
 
 
-def bands(lane: Harmonics, driver: ContinuousDriver, circuit: AbstractCircuit) -> Bands:
+def bands(
+    lane: Harmonics, feed: ContinuousDriver | MeasuredCurrent, circuit: AbstractCircuit
+) -> Bands:
     """The impedance that a recording measures, next to that of a circuit.
 
     Args:
         lane: Harmonics of the recording.
-        driver: Driver with its covariance.
+        feed: Driver with its covariance, or the measured current.
         circuit: Fitted circuit.
     """
-    terms = _Terms.of(lane, driver, circuit)
+    terms = _Terms.of(lane, feed, circuit)
     p = terms.fitted()
     gain, turned, z_th = terms.at(p)
     var = lane.variance_y + np.abs(turned) ** 2 * lane.variance_x
     known = (lane.variance_y * lane.x + lane.variance_x * np.conj(turned) * lane.y) / var
-    slope = turned * known * (1 - gain)
+    by_load = np.ones_like(gain) if z_th is None else 1 - gain  # ∂ ln G/∂ ln Z
+    slope = turned * known * by_load
     weight = np.where(lane.selected, 2 * np.abs(slope) ** 2 / var, 0.0)
     rest = lane.y - turned * lane.x
     score = np.where(lane.selected, 2 * rest * np.conj(slope) / var, 0.0)
@@ -78,14 +83,18 @@ def bands(lane: Harmonics, driver: ContinuousDriver, circuit: AbstractCircuit) -
 
     centre = np.exp(mean(weight * np.log(frequency)))
     off = mean(np.real(score)) + 1j * mean(np.imag(score))
-    source = np.interp(centre, frequency, z_th)
     z = np.asarray(circuit.response(jnp.asarray(centre)))
-    # Large deviations are exact for the gain, not for the impedance.
-    at = z / (z + source)
-    measured = at * (1 + off * (1 - at))
+    if z_th is None:
+        impedance = z * (1 + off)
+    else:
+        source = np.interp(centre, frequency, z_th)
+        # Large deviations are exact for the gain, not for the impedance.
+        at = z / (z + source)
+        measured = at * (1 + off * (1 - at))
+        impedance = source * measured / (1 - measured)
     return Bands(
         centre,
-        source * measured / (1 - measured),
+        impedance,
         1 / np.sqrt(total),
         np.stack([off.real, off.imag]) * np.sqrt(total),
     )
@@ -113,29 +122,38 @@ class _Terms:
     Attributes:
         lane: Harmonics of the recording.
         z: Impedance of the load [Ω].
-        z_th: Source impedance [Ω].
+        z_th: Source impedance [Ω]; None for a measured current.
         slopes: Derivatives of Z_th with respect to its changes [Ω].
     """
 
     lane: Harmonics
     z: Complex[np.ndarray, " harmonic"]
-    z_th: Complex[np.ndarray, " harmonic"]
+    z_th: Complex[np.ndarray, " harmonic"] | None
     slopes: Complex[np.ndarray, "change harmonic"]
 
     @classmethod
-    def of(cls, lane: Harmonics, driver: ContinuousDriver, circuit: AbstractCircuit) -> "_Terms":
+    def of(
+        cls, lane: Harmonics, feed: ContinuousDriver | MeasuredCurrent, circuit: AbstractCircuit
+    ) -> "_Terms":
         frequency = jnp.asarray(lane.frequency)
-        z_th, slopes = map(np.asarray, _source(driver.source, frequency))
-        size, turn = np.linalg.eigh(np.asarray(driver.later_cov()))
+        z = np.asarray(circuit.response(frequency))
+        if isinstance(feed, MeasuredCurrent):
+            return cls(lane, z, None, np.zeros((0, z.size), complex))
+        z_th, slopes = map(np.asarray, _source(feed.source, frequency))
+        size, turn = np.linalg.eigh(np.asarray(feed.later_cov()))
         root = turn * np.sqrt(np.maximum(size, 0.0))
-        return cls(lane, np.asarray(circuit.response(frequency)), z_th, root.T @ slopes)
+        return cls(lane, z, z_th, root.T @ slopes)
 
     def at(
         self, p: Float[np.ndarray, " parameter"]
-    ) -> tuple[Complex[np.ndarray, " harmonic"], ...]:
+    ) -> tuple[
+        Complex[np.ndarray, " harmonic"],
+        Complex[np.ndarray, " harmonic"],
+        Complex[np.ndarray, " harmonic"] | None,
+    ]:
         """G, G e^(−jωτ) and Z_th."""
-        z_th = self.z_th + p[1:] @ self.slopes
-        gain = self.z / (self.z + z_th)
+        z_th = None if self.z_th is None else self.z_th + p[1:] @ self.slopes
+        gain = self.z if z_th is None else self.z / (self.z + z_th)
         return gain, gain * np.exp(-1j * p[0] * self._turn), z_th
 
     @property
@@ -150,7 +168,7 @@ class _Terms:
         _, turned, z_th = self.at(p)
         var = lane.variance_y + np.abs(turned) ** 2 * lane.variance_x
         scale = np.where(lane.selected, np.sqrt(2 / var), 0.0)
-        by_z_th = -self.slopes / (self.z + z_th)
+        by_z_th = self.slopes if z_th is None else -self.slopes / (self.z + z_th)
         by = np.concatenate([-1j * self._turn[None], by_z_th]) * (turned * lane.x * -scale)
         rest = (lane.y - turned * lane.x) * scale
         prior = np.diag(np.append(1 / DELAY_WIDTH, np.ones(p.size - 1)))

@@ -7,17 +7,16 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.ticker import FixedLocator, NullLocator
 
-from etid.estimators.estimator import serving
 from etid.estimators.lanes import Harmonics
-from etid.estimators.registry import MAXIMUM_LIKELIHOOD
 from etid.plotting.bands import Bands, bands
 from etid.plotting.impedances import POINTS, frame
+from etid.plotting.judging import in_bands
 from etid.plotting.pulses import headline
 from etid.plotting.style import COLOURS, DASHES, INK, MARKS, RED, Canvas, titled
 from etid.recordings.preflight import Inspected
 from etid.recordings.recording import Recording
 from etid.recordings.remarks import Remark
-from etid.results.driver import ContinuousDriver, Driver
+from etid.results.driver import Driver
 from etid.selection.selection import Candidate, Selection
 
 LAYOUT: dict[str, Any] = {"sharex": True, "gridspec_kw": {"height_ratios": [3, 1.6]}}
@@ -28,7 +27,7 @@ TICKS = (2.0, 10.0, 100.0, 1000.0, 10000.0)  # of the deviations, with both sign
 
 
 def draw_selection(
-    canvas: Canvas, selection: Selection, recording: Recording, driver: Driver
+    canvas: Canvas, selection: Selection, recording: Recording, driver: Driver | None
 ) -> np.ndarray:
     """Magnitude and phase with all candidates, and below them the deviation of each candidate."""
     axes = canvas(2, 2, (9.0, 5.2), **LAYOUT).ravel()
@@ -40,9 +39,9 @@ def draw_selection(
         axes[0].text(0.5, 0.5, "no elements", color=RED, transform=axes[0].transAxes, ha="center")
         titled(axes[0], lines[:1], good=False)
         return axes
-    known = serving(driver, ContinuousDriver, str(MAXIMUM_LIKELIHOOD))
+    recording, known = in_bands(recording, driver)
     lane = Harmonics.of(Inspected(recording))
-    lane = lane.realigned(lane.late_by(chosen.fit.circuit, driver))
+    lane = lane.realigned(lane.late_by(chosen.fit.circuit, known))
     if int(chosen.fit.remarks) & Remark.mains_hum:
         lane = lane.without_mains() or lane
     found = [bands(lane, known, one.fit.circuit) for one in fitted]

@@ -8,6 +8,7 @@ from matplotlib.axes import Axes
 from etid.estimators.estimator import serving
 from etid.estimators.lanes import Harmonics
 from etid.estimators.registry import MAXIMUM_LIKELIHOOD
+from etid.identify.arguments import fed
 from etid.identify.predict import predict
 from etid.plotting.bands import bands
 from etid.plotting.impedances import POINTS, frame
@@ -16,6 +17,7 @@ from etid.plotting.style import BLUE, INK, RED, Canvas, titled
 from etid.recordings.preflight import Inspected
 from etid.recordings.recording import Recording
 from etid.results.driver import ContinuousDriver, Driver
+from etid.results.feed import MeasuredCurrent
 from etid.results.fits import Fit
 
 SURE = 0.3  # relative standard error of a point; others are not drawn
@@ -23,10 +25,12 @@ LAGS = 60  # samples in the diagrams of correlation
 BAND = 2.58  # standard deviations of a correlation that 99 % of white noise does not exceed
 
 
-def draw_impedance(canvas: Canvas, fit: Fit, recording: Recording, driver: Driver) -> np.ndarray:
+def draw_impedance(
+    canvas: Canvas, fit: Fit, recording: Recording, driver: Driver | None
+) -> np.ndarray:
     """Nyquist and Bode diagrams: the impedance that the recording measures, and the fit."""
     nyquist, magnitude, phase = axes = canvas(1, 3, (12.0, 3.8)).ravel()
-    known = serving(driver, ContinuousDriver, MAXIMUM_LIKELIHOOD.name)
+    recording, known = in_bands(recording, driver)
     measured = bands(Harmonics.of(Inspected(recording)), known, fit.circuit)
     sure = measured.stderr <= SURE
     z, error = measured.z[sure] / 1e3, measured.stderr[sure]
@@ -61,8 +65,25 @@ def draw_impedance(canvas: Canvas, fit: Fit, recording: Recording, driver: Drive
     return axes
 
 
-def draw_residual(canvas: Canvas, fit: Fit, recording: Recording, driver: Driver) -> np.ndarray:
-    """The residual, its autocorrelation, and its cross-correlation with V_th.
+def in_bands(
+    recording: Recording, driver: Driver | None
+) -> tuple[Recording, ContinuousDriver | MeasuredCurrent]:
+    """A recording and its feed, for the impedance that it measures.
+
+    Raises:
+        ValueError: The driver has no continuous source impedance.
+        RecordingError: The recording lacks what its feed needs.
+    """
+    recording, feed = fed(recording, driver)
+    if isinstance(feed, MeasuredCurrent):
+        return recording, feed
+    return recording, serving(feed, ContinuousDriver, MAXIMUM_LIKELIHOOD.name)
+
+
+def draw_residual(
+    canvas: Canvas, fit: Fit, recording: Recording, driver: Driver | None
+) -> np.ndarray:
+    """The residual, its autocorrelation, and its cross-correlation with V_th or the current.
 
     A residual of white noise has correlations within the band at 99 % of the lags.
     """
@@ -71,9 +92,11 @@ def draw_residual(canvas: Canvas, fit: Fit, recording: Recording, driver: Driver
     known = np.isfinite(residual)
     whole.plot(1e3 * recording.time, 1e3 * residual, color=BLUE, lw=0.5)
     whole.set(xlabel="time [ms]", ylabel="residual [mV]")
-    clean, v_th = residual[known], recording.v_th[known]
+    cause = fed(recording, driver)[0].cause
+    clean, cause_known = residual[known], recording.samples[cause].values[known]
     _correlation(own, clean, clean, "autocorrelation of the residual")
-    _correlation(with_input, clean, v_th, "correlation with earlier V_th")
+    name = "V_th" if cause == "v_th" else "current"
+    _correlation(with_input, clean, cause_known, f"correlation with earlier {name}")
     titled(whole, [headline(recording, fit)], good=fit.verdict == "successful")
     titled(own, ["band: 99 % of white noise"])
     return axes

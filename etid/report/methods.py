@@ -83,8 +83,12 @@ def _model(found: StudyFits) -> str:
     which = f"{len(fits)} recordings"
     if settings is not None and settings.source:
         which += f" of {pathlib.Path(settings.source).name}"
-    text = f"The {which} were identified with etid as loads of a driver with source impedance Z_th,"
-    text += " V_out = V_th Z_L / (Z_L + Z_th). "
+    text = f"The {which} were identified with etid "
+    if found.by_current:
+        text += "from the measured current I through each load, V_out = Z_L I; in what follows I "
+        text += "takes the place of the unloaded record, and G = Z_L. "
+    else:
+        text += "as loads of a driver with source impedance Z_th, V_out = V_th Z_L / (Z_L + Z_th). "
     text += f"The load is the circuit {type(circuit).__name__}"
     if circuit.formula:
         text += f", Z_L = {circuit.formula}"
@@ -112,7 +116,7 @@ def _driver(found: StudyFits) -> str:
     resistors = sorted(set(np.concatenate(known).tolist())) if known else []
     asked = found.settings.order if found.settings is not None else None
     orders = sorted({driver.order for driver in drivers})
-    if not (asked or orders):
+    if found.by_current or not (asked or orders):
         return ""
     order = " or ".join(map(str, [asked] if asked else orders))
     text = f"Z_th is a rational function of order {order}"
@@ -219,5 +223,7 @@ def _table(found: StudyFits, settings: Settings) -> Table:
         "computed": f"in {settings.precision} on {settings.backend}",
         "versions": ", ".join(settings.versions),
     }
+    if found.by_current:
+        del rows["Z_th"], rows["R_L"]
     shown = tuple(rows.items())
     return Table(("setting", "value"), shown, caption="Settings")

@@ -128,6 +128,9 @@ def _verdicts(fits: Fits) -> Section:
 def _drivers(found: StudyFits) -> Section:
     from etid.report import figures
 
+    if found.by_current:
+        text = "The loads were identified from their measured currents, which needs no driver."
+        return Section("Drivers", text)
     if not (found.drivers or found.failures):
         text = "These fits do not say with which driver they were made."
         return Section("Drivers", warning=text)

@@ -61,6 +61,11 @@ class StudyFits(Overviewed):
     failures: Mapping[tuple[str, ...], str]
     settings: Settings | None = None
 
+    @property
+    def by_current(self) -> bool:
+        """Whether the run needed no driver: all recordings measured their current."""
+        return self.settings is not None and not (self.drivers or self.failures)
+
     @classmethod
     def concatenate(cls, parts: Iterable["StudyFits"]) -> "StudyFits":
         """One result from the parts of a study. All parts must have equal settings."""
