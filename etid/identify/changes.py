@@ -50,7 +50,7 @@ EXPLAINED = (
     "inconsistent",
     "biased",
 )  # verdicts that a change may cause
-LANES = 16  # circuits of one call
+LANES = 64  # circuits of one call
 RIDGE = 1e-10  # added to the diagonal, for elements without effect
 LARGEST = 20.0  # limit on the change of a logarithm; an undetermined change can be arbitrary
 DRIVER = 2e-3  # allowed change of a driver, expressed as a change of the calibration resistor

@@ -1,10 +1,10 @@
 """Identification of many recordings in chunks, and of whole studies.
 
-Recordings of one length share one compiled function. It takes a chunk of `LANES` recordings, so
-that memory is bounded. A CPU fits the recordings of a chunk one after the other: side by side
-(`vmap`), all would take as many steps as the slowest, which costs 50 % more time. Accelerators fit
-them side by side. During the fit of a chunk, a thread reads the recordings of the next chunk. A bad
-recording gets a verdict and a note; the other recordings are not affected.
+Recordings of one length share one compiled function. It takes up to `LANES` recordings, so that
+memory is bounded. A CPU fits them one after the other: side by side (`vmap`) they take twice the
+time, even with equal numbers of steps. Accelerators fit them side by side. During a fit, a thread
+reads the next recordings in chunks. A bad recording gets a verdict and a note; the other recordings
+are not affected.
 """
 
 import contextlib
@@ -64,7 +64,9 @@ from etid.selection.common import common, deserves
 from etid.selection.selection import Selection
 
 _Kind = TypeVar("_Kind", bound=AbstractCircuit)
-LANES = 16  # lanes of one chunk; the last chunk is padded
+LANES = 64  # lanes of one call; the last call is padded
+READ = 16  # recordings of a chunk, which are read and inspected together
+HELD = 2**21  # samples of waiting recordings; above, a call has fewer lanes, but at least a chunk
 AHEAD = 2  # chunks that are read and inspected in advance
 SAMPLE = 200  # recordings that choose the circuit of a study; a second of work
 
@@ -139,17 +141,17 @@ def _prepared(
 
 
 def chunked(count: int) -> Iterator[range]:
-    """The numbers of `count` recordings, in chunks of `LANES`."""
-    return (range(first, min(first + LANES, count)) for first in range(0, count, LANES))
+    """The numbers of `count` recordings, in chunks of `READ`."""
+    return (range(first, min(first + READ, count)) for first in range(0, count, READ))
 
 
 def filled(lanes: Sequence[AbstractLane]) -> AbstractLane:
-    """A chunk of `LANES` lanes, padded with copies of the last lane."""
+    """`LANES` lanes, padded with copies of the last lane."""
     return stacked([*lanes, *[lanes[-1]] * (LANES - len(lanes))])
 
 
 class _Queue:
-    """Recordings that wait until a chunk is full; they share a compiled function and a driver."""
+    """Recordings that wait for a call; they share a compiled function and a driver."""
 
     def __init__(
         self,
@@ -171,6 +173,12 @@ class _Queue:
         self.rows.append(row)
         self.lanes.append(lane)
         self.seen.append(seen)
+
+    @property
+    def full(self) -> bool:
+        """Whether a call has its lanes, or the waiting recordings take much memory."""
+        held = sum(one.recording.samples["v_out"].stored.size for one in self.seen)
+        return len(self.rows) == LANES or (len(self.rows) >= READ and held >= HELD)
 
     def run(self) -> Iterator[tuple[int, Selection]]:
         """Fit the waiting recordings and empty the queue."""
@@ -243,7 +251,7 @@ def choices(
                 queues[key] = _Queue(driver, known, candidates, estimator)
             queue = queues[key]
             queue.add(row, prepared.lane, prepared.planned.seen)
-            if len(queue.rows) == LANES:
+            if queue.full:
                 run(queue)
         for queue in queues.values():
             if queue.rows:

@@ -12,7 +12,7 @@ from etid.results.feed import AbstractFeed
 from etid.results.fits import IdentificationError
 from etid.results.verdicts import message
 
-TOGETHER = 8  # recordings that are inspected together; more do not fit the processor's cache
+TOGETHER = 300_000  # samples that are inspected together; more do not fit the processor's cache
 ERRORS = (RecordingError, ValueError, IdentificationError)  # that a recording or a driver may raise
 
 
@@ -55,9 +55,10 @@ def planned(
         else:
             key = of.samples["v_out"].stored.size, of.cause, of.sample_rate, of.pulse_rate
             loaded.setdefault(key, []).append((row, of, driver))
-    for alike in loaded.values():
-        for first in range(0, len(alike), TOGETHER):
-            part = alike[first : first + TOGETHER]
+    for (size, *_), alike in loaded.items():
+        together = max(1, TOGETHER // max(1, size))
+        for first in range(0, len(alike), together):
+            part = alike[first : first + together]
             group = Group([of for _, of, _ in part])
             for number, (row, of, driver) in enumerate(part):
                 yield row, _planned(Inspected(of, group, number), driver, asked)

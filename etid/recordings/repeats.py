@@ -205,8 +205,10 @@ def _of_equal_periods(
 
 def _phase(v: Float[np.ndarray, " time"]) -> int:
     """Number of samples in all pulses; of biphasic pulses, those in the shorter phase."""
-    half = np.abs(v).max() / 2
-    above, below = (int(np.count_nonzero(one > half)) for one in (v, -v))
+    low, high = v.min(), v.max()
+    half = max(-low, high) / 2
+    above = int(np.count_nonzero(v > half)) if high > half else 0
+    below = int(np.count_nonzero(v < -half)) if low < -half else 0
     return min(above, below) or max(above, below)
 
 
@@ -305,7 +307,9 @@ def _compared(
     deviation = _without(aligned, known.polynomials)
     weight = np.maximum(np.add.reduceat(_power(mean), known.edges, axis=1).astype(float), TINY)
     sums = np.add.reduceat(np.conj(mean)[:, None, :] * deviation, known.edges, axis=2)
-    return _power(deviation).sum(1), mean, weight, sums / weight[:, None, :]
+    parts = deviation.view(np.float32)
+    square = np.einsum("lpk,lpk->lk", parts, parts)
+    return square[:, ::2] + square[:, 1::2], mean, weight, sums / weight[:, None, :]
 
 
 def _turns(angle: Float[np.ndarray, "lane period"], count: int) -> np.ndarray:

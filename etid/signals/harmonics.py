@@ -86,12 +86,10 @@ def harmonics(
     transform = np.asarray(scipy.fft.rfft(folded)) if of is np else jnp.fft.rfft(folded)
     basis, fit = _drift(periods, samples)
     # The transform is linear: the drift needs only the transforms of the powers of time.
-    # `einsum` instead of `@`, which starts BLAS threads for each recording. These threads wait for
-    # each other.
     drift = of.einsum("dp,...p->...d", fit, _sums(v[..., :samples], periods))
     step = periods // parts
     at_harmonics = transform[..., step : (folded.shape[-1] + 1) // 2 : step] / samples
-    return at_harmonics - of.einsum("...d,dh->...h", drift.astype(at_harmonics.dtype), basis)
+    return at_harmonics - drift.astype(at_harmonics.dtype) @ basis
 
 
 def namespace(v: Array | np.ndarray) -> ModuleType:
