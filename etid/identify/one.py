@@ -470,7 +470,7 @@ def concluded(
 
 
 def checksum(seen: Inspected) -> int:
-    """Checksum that identifies an unloaded record, by its noise: a part of the samples is enough."""
+    """Checksum that identifies an unloaded record; a part of its noise is enough."""
     return zlib.crc32(seen.v_th[::SPARSE].tobytes())
 
 
