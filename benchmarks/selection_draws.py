@@ -21,7 +21,7 @@ from etid.circuits.circuit import (
     SkinRC,
 )
 from etid.identify import many
-from etid.identify.arguments import fed
+from etid.identify.arguments import Asked, fed
 from etid.results.fits import Fit
 from etid.selection.search import CANDIDATES
 from etid.selection.selection import Selection
@@ -98,7 +98,7 @@ def scene(snr_db: float, driver: int) -> Scene:
 def choices(records: Sequence[etid.Recording], driver: etid.Driver) -> list[Selection]:
     """What etid chooses for each recording alone, as `select_circuit` does, in batches."""
     found, _, _ = many.choices(
-        len(records), lambda row: fed(records[row], driver), CANDIDATES, None, False
+        len(records), lambda row: fed(records[row], driver), CANDIDATES, Asked(), False
     )
     return found
 
