@@ -28,6 +28,7 @@ NAMES = (
     "failure_map",
     "perturbations",
     "rivals",
+    "referee",
     "fuzz",
     "mutation",
 )

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import etid
-from etid.identify.posterior import _drawn
+from etid.identify.posterior import drawn
 from etid.results.posterior import Profile, effective
 
 TRUTH = etid.SkinRC(33.4e3, 186e3, 0.12e-9)
@@ -142,7 +142,7 @@ def test_further_rounds_find_a_distribution_that_the_first_draws_miss():
         rounds.append(len(q))
         return 0.5 * np.sum((q @ precision) * q, axis=1)
 
-    q, weights = _drawn(costs, np.full(size, 0.5), np.eye(size), draws, rng)
+    q, weights = drawn(costs, np.full(size, 0.5), np.eye(size), draws, rng)
     assert 1 < len(rounds) <= 6
     assert effective(weights) > 300  # 23 in the first round
     # 300 draws know the means to 0.06 and the deviations to 0.04 (one sigma).

@@ -91,19 +91,22 @@ def install(names: Iterable[str]) -> dict[str, str]:
     Returns:
         By environment why it could not be made; empty where it could.
     """
-    failed = {}
-    for environment in dict.fromkeys(RIVALS[name].environment for name in names):
-        if installed(environment):
-            continue
-        wanted, made = _requirements(environment)
-        venv.create(ENVIRONMENTS / environment, clear=True, with_pip=True)
-        command = [python_of(environment), "-m", "pip", "install", "--quiet", "-r", wanted]
-        done = subprocess.run(command, capture_output=True, text=True, check=False)
-        if done.returncode == 0:
-            shutil.copy(wanted, made)
-        else:
-            failed[environment] = f"failed to install: {_last_error(done.stderr)}"
-    return failed
+    made = {name: make(name) for name in dict.fromkeys(RIVALS[one].environment for one in names)}
+    return {environment: why for environment, why in made.items() if why}
+
+
+def make(environment: str) -> str:
+    """Make an environment; why it could not be made, or nothing."""
+    if installed(environment):
+        return ""
+    wanted, made = _requirements(environment)
+    venv.create(ENVIRONMENTS / environment, clear=True, with_pip=True)
+    command = [python_of(environment), "-m", "pip", "install", "--quiet", "-r", wanted]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    if done.returncode != 0:
+        return f"failed to install: {_last_error(done.stderr)}"
+    shutil.copy(wanted, made)
+    return ""
 
 
 def run(

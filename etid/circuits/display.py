@@ -71,6 +71,11 @@ def between(low: float, high: float, unit: str) -> str:
     return f"{low / scale:.{digits}f} … {high / scale:.{digits}f} {symbol}".rstrip()
 
 
+def several(count: int, noun: str) -> str:
+    """A number of things, such as `1 recording` or `2 recordings`."""
+    return f"{count} {noun}" if count == 1 else f"{count} {noun}s"
+
+
 def quantity(value: float, unit: str, error: float = np.nan) -> str:
     """A parameter in its scaled unit, such as `33.40 ± 0.10 kΩ`, or `33.4 kΩ` without an error.
 

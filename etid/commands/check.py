@@ -3,6 +3,7 @@
 import argparse
 import pathlib
 
+from etid.circuits.display import several
 from etid.commands import DONE, WRONG_DATA, Outcome
 from etid.recordings import hdf5
 
@@ -24,4 +25,6 @@ def run(arguments: argparse.Namespace) -> Outcome:
         return Outcome("\n".join(map(str, problems)), data, WRONG_DATA)
     with hdf5.read(arguments.file) as study:
         data["recordings"] = len(study)
-    return Outcome(f"{arguments.file}: {data['recordings']} recordings, no faults", data, DONE)
+    return Outcome(
+        f"{arguments.file}: {several(data['recordings'], 'recording')}, no faults", data, DONE
+    )

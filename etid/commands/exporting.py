@@ -65,4 +65,4 @@ def run(arguments: argparse.Namespace) -> Outcome:
         export_circuit(source, target, arguments.path, circuit=arguments.circuit)
     else:
         export_fits(source, target)
-    return Outcome(data={"source": source, "target": target})
+    return Outcome(str(target), {"source": source, "target": target})

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from etid.circuits.display import DISPLAY, heading
+from etid.circuits.display import DISPLAY, heading, several
 from etid.commands import DONE, WRONG_DATA, Outcome
 from etid.commands.circuits import add_circuit
 from etid.commands.outputs import HDF5
@@ -201,7 +201,7 @@ def _summary(outcome: StudyFits) -> str:
     """Text for people: verdicts, drivers, medians, and the recordings without success."""
     fits = outcome.fits
     verdicts = ", ".join(f"{count} {name}" for name, count in fits.counts().items())
-    lines = [f"{len(fits)} recordings by {fits.fit.method}: {verdicts}"]
+    lines = [f"{several(len(fits), 'recording')} by {fits.fit.method}: {verdicts}"]
     for paths, driver in outcome.drivers.items():
         text = (
             f"order {driver.order}, {driver.verdict}, "
@@ -209,7 +209,9 @@ def _summary(outcome: StudyFits) -> str:
         )
         lines.append(f"driver {', '.join(paths)}: {text}. {message(driver.verdict)}".rstrip(". "))
     lines += [f"driver {', '.join(paths)}: {text}" for paths, text in outcome.failures.items()]
-    if "successful" in fits.counts():
+    if len(fits) == 1 and "successful" in fits.counts():
+        lines += ["", str(fits[0])]
+    elif "successful" in fits.counts():
         lines += [
             "",
             "medians of the successful fits (spread between recordings; median standard error)",
@@ -218,7 +220,7 @@ def _summary(outcome: StudyFits) -> str:
     failed = np.flatnonzero(fits.verdicts != "successful")
     wrong = [f"{fits.labels['path'][i]}: {fits.verdicts[i]}. {fits.notes[i]}" for i in failed]
     if wrong:
-        lines += ["", f"without success: {len(wrong)} recordings"]
+        lines += ["", f"without success: {several(len(wrong), 'recording')}"]
         lines += [" ".join(line.split()) for line in wrong[:_SHOWN]]
     if len(wrong) > _SHOWN:
         lines.append(
@@ -277,4 +279,5 @@ def _medians(outcome: StudyFits) -> Table:
 def _cell(value: float, spread: float, error: float) -> str:
     """Three numbers in one unit, rounded to two significant digits of the standard error."""
     digits = max(0, 1 - math.floor(math.log10(error))) if 0 < error < math.inf else 3
-    return f"{value:.{digits}f} ({spread:.{digits}f}; {error:.{digits}f})"
+    texts = ("-" if math.isnan(one) else f"{one:.{digits}f}" for one in (spread, error))
+    return f"{value:.{digits}f} ({'; '.join(texts)})"

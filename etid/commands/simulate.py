@@ -4,6 +4,7 @@ import argparse
 import json
 import pathlib
 
+from etid.circuits.display import several
 from etid.commands import Outcome
 from etid.commands.outputs import HDF5
 from etid.simulation import scenes
@@ -50,5 +51,5 @@ def run(arguments: argparse.Namespace) -> Outcome:
     study.write(arguments.target)
     if arguments.truth is not None:
         arguments.truth.write_text(json.dumps(scene.truth(), indent=1) + "\n", encoding="utf-8")
-    text = f"{arguments.target}: {len(study)} recordings"
+    text = f"{arguments.target}: {several(len(study), 'recording')}"
     return Outcome(text, {"target": arguments.target, "recordings": len(study)})

@@ -75,13 +75,19 @@ class _Minimum(eqx.Module):
 
     @classmethod
     def of(cls, lane: Harmonics, known: AbstractGiven, circuit: AbstractCircuit) -> "_Minimum":
-        terms = Load.behind(known, circuit, lane.spectrum, jnp.asarray(lane.sample_rate))
+        terms = terms_of(lane, known, circuit)
         start = jnp.concatenate([circuit.log_values(), jnp.zeros(1), known.mean])
         q = refined(terms, start).value
-        return cls(terms, q, inverse(jax.hessian(lambda q: _cost(terms, q))(q)))
+        return cls(terms, q, inverse(jax.hessian(lambda q: cost(terms, q))(q)))
 
 
-def _cost(terms: Load, q: Float[Array, " q"]) -> Float[Array, ""]:
+def terms_of(lane: Harmonics, known: AbstractGiven, circuit: AbstractCircuit) -> Load:
+    """The residuals of a recording."""
+    return Load.behind(known, circuit, lane.spectrum, jnp.asarray(lane.sample_rate))
+
+
+def cost(terms: Load, q: Float[Array, " q"]) -> Float[Array, ""]:
+    """F(q)."""
     return 0.5 * jnp.sum(terms(q) ** 2)
 
 
@@ -106,7 +112,7 @@ def _least(
 
 
 @stored_jit
-def _minimum(
+def minimum(
     lane: Harmonics, known: AbstractGiven, circuit: AbstractCircuit
 ) -> tuple[Float[Array, " q"], Float[Array, "q q"]]:
     """The minimum of F, and H⁻¹."""
@@ -119,11 +125,11 @@ def _costs(
     lane: Harmonics, known: AbstractGiven, circuit: AbstractCircuit, q: Float[Array, "draw q"]
 ) -> Float[Array, " draw"]:
     """F of each draw."""
-    terms = Load.behind(known, circuit, lane.spectrum, jnp.asarray(lane.sample_rate))
-    return jax.lax.map(lambda at: _cost(terms, at), q, batch_size=AT_ONCE)
+    terms = terms_of(lane, known, circuit)
+    return jax.lax.map(lambda at: cost(terms, at), q, batch_size=AT_ONCE)
 
 
-def _drawn(
+def drawn(
     costs: Callable[[np.ndarray], np.ndarray],
     mean: Float[np.ndarray, " q"],
     cov: Float[np.ndarray, "q q"],
@@ -174,6 +180,25 @@ def _flattened(log_weight: Float[np.ndarray, " draw"], enough: float) -> Float[n
     return softmax(low * log_weight)
 
 
+def stretched(
+    q: Float[np.ndarray, "draw q"],
+    mean: Float[np.ndarray, " q"],
+    cov: Float[np.ndarray, "q q"],
+    wanted: Float[np.ndarray, "element element"],
+) -> Float[np.ndarray, "draw element"]:
+    """Logarithms of the elements, stretched around the minimum.
+
+    Args:
+        q: Draws.
+        mean: The minimum of F.
+        cov: H⁻¹.
+        wanted: Covariance of the logarithms of the elements, from the fit.
+    """
+    size = len(wanted)
+    stretch = np.linalg.cholesky(wanted) @ np.linalg.inv(np.linalg.cholesky(cov[:size, :size]))
+    return mean[:size] + (q[:, :size] - mean[:size]) @ stretch.T
+
+
 @stored_jit
 def _profile(
     lane: Harmonics,
@@ -201,10 +226,10 @@ def _profile(
 
     def deviance(step: Float[Array, ""]) -> Float[Array, ""]:
         start = least.q + least.cov[:, number] / error * step
-        return 2 * _cost(least.terms, _least(least.terms, start, free))
+        return 2 * cost(least.terms, _least(least.terms, start, free))
 
     found = jax.lax.map(deviance, steps)
-    return least.q[number] + stretched * steps, found - 2 * _cost(least.terms, least.q)
+    return least.q[number] + stretched * steps, found - 2 * cost(least.terms, least.q)
 
 
 def posterior(
@@ -218,20 +243,18 @@ def posterior(
     """`Fit.posterior`."""
     if draws < 1:
         raise ValueError(f"draws is {draws}; it must be at least 1, as in 1000")
-    lane, known, cov = _given(fit, recording, driver)
-    least, own = map(np.asarray, _minimum(lane, known, fit.circuit))
+    lane, known, cov = given(fit, recording, driver)
+    least, own = map(np.asarray, minimum(lane, known, fit.circuit))
     if not np.isfinite(own).all():
         raise ValueError(f"the recording does not determine all elements of {fit}")
 
     def costs(q: Float[np.ndarray, "draw q"]) -> Float[np.ndarray, " draw"]:
         return np.asarray(_costs(lane, known, fit.circuit, jnp.asarray(q)))
 
-    q, weights = _drawn(costs, least, own, draws, np.random.default_rng(seed))
+    q, weights = drawn(costs, least, own, draws, np.random.default_rng(seed))
     if not np.isfinite(weights).all():
         raise ValueError(f"the recording does not determine all elements of {fit}")
-    size = cov.shape[0]
-    stretch = np.linalg.cholesky(cov) @ np.linalg.inv(np.linalg.cholesky(own[:size, :size]))
-    found = least[:size] + (q[:, :size] - least[:size]) @ stretch.T
+    found = stretched(q, least, own, cov)
     names = fit.circuit.names()
     circuit = type(fit.circuit)(**dict(zip(names, np.exp(found.T), strict=True)))
     return Posterior(fit.circuit, np.asarray(fit.cov), circuit, weights)
@@ -244,7 +267,7 @@ def profile(fit: Fit, recording: Recording | None, driver: Driver | None, name: 
         raise ValueError(
             f"{type(fit.circuit).__name__} has no element {name!r}; it has {', '.join(names)}"
         )
-    lane, known, cov = _given(fit, recording, driver)
+    lane, known, cov = given(fit, recording, driver)
     number, steps = names.index(name), np.linspace(-WIDE, WIDE, POINTS)
     error = np.sqrt(cov[number, number])
     wanted = map(jnp.asarray, (number, error, steps))
@@ -260,7 +283,7 @@ def profile(fit: Fit, recording: Recording | None, driver: Driver | None, name: 
     )
 
 
-def _given(
+def given(
     fit: Fit, recording: Recording | None, driver: Driver | None
 ) -> tuple[Harmonics, AbstractGiven, Float[np.ndarray, "element element"]]:
     """The harmonics of a fit, its driver, and the covariance of the logarithms of its elements.

@@ -198,7 +198,7 @@ def components(found: Sequence[Components], conditions: Sequence[str]) -> bytes:
                     sizes[shown], np.arange(len(parts))[shown] + shift, MARKS[series],
                     color=COLOURS[series], ms=6, label=_short(condition) or "all",
                 )  # fmt: skip
-        axis.set(xscale="log", xlabel=f"{name}: part of the median [%]")
+        axis.set(xscale="log", xlabel=f"{symbol(name, '1')}: part of the median [%]")
         low, high = axis.dataLim.intervalx
         if 0 < low <= high < np.inf:
             axis.set_xlim(low / NARROW, high * NARROW)

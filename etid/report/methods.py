@@ -80,15 +80,16 @@ def _model(found: StudyFits) -> str:
     fits = found.fits
     settings = found.settings
     circuit = fits.circuit
-    which = f"{len(fits)} recordings"
+    which = "recording" if len(fits) == 1 else f"{len(fits)} recordings"
     if settings is not None and settings.source:
         which += f" of {pathlib.Path(settings.source).name}"
-    text = f"The {which} were identified with etid "
+    were = "was" if len(fits) == 1 else "were"
+    text = f"The {which} {were} identified with etid "
     if found.by_current:
         text += "from the measured current I through each load, V_out = Z_L I; in what follows I "
         text += "takes the place of the unloaded record, and G = Z_L. "
     else:
-        text += "as loads of a driver with source impedance Z_th, V_out = V_th Z_L / (Z_L + Z_th). "
+        text += "behind a driver with source impedance Z_th, V_out = V_th Z_L / (Z_L + Z_th). "
     text += f"The load is the circuit {type(circuit).__name__}"
     if circuit.formula:
         text += f", Z_L = {circuit.formula}"

@@ -303,17 +303,22 @@ def _recordings(fits: Fits, waveforms: Section) -> Section:
     return Section("Recordings", text, (study_tables.recordings(fits, links),))
 
 
+NOISE = (
+    "If the model is right, the residual is noise. At the edges of a pulse it also contains "
+    "frequencies near half the sample rate, which are aliased and not fitted."
+)
+
+
 def _waveforms(fits: Fits, place: Any) -> Section:
     text = (
         "First fits without success: for each verdict those with the largest χ². Then successful "
-        "fits with the largest χ² and with the largest standard error. One pulse of each is drawn. "
-        "If the model is right, the residual is noise."
+        f"fits with the largest χ² and with the largest standard error. One pulse of each. {NOISE}"
     )
     chosen = {one.row: one.reason for one in choose(fits)}
     if len(fits) <= EACH:
         chosen |= {row: "" for row in range(len(fits)) if row not in chosen}
     if len(fits) == 1:
-        text = "One pulse. If the model is right, the residual is noise."
+        text = f"One pulse. {NOISE}"
         chosen = {0: ""}
     pictures, missing = [], []
     for row, reason in chosen.items():

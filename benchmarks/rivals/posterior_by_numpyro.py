@@ -1,0 +1,79 @@
+"""numpyro's NUTS draws from the posterior of etid: `python -m ... RESULT SNR_DB FITS`.
+
+NUTS gets F of `etid.identify.posterior` as its potential function, so there is no second copy of
+the likelihood. Both samples of the elements are stretched in the same way. RESULT gets, for each
+fit and element, the difference of the means in standard deviations, the ratio of the standard
+deviations, and the effective draws of NUTS; and the seconds of each.
+"""
+
+import sys
+import time
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from numpyro.diagnostics import (  # pyright: ignore[reportMissingImports]  # see lmfit_leastsq
+    effective_sample_size,
+)
+from numpyro.infer import MCMC, NUTS  # pyright: ignore[reportMissingImports]  # see lmfit_leastsq
+
+import etid
+from etid.identify import posterior
+
+DRAWS = 4000
+WARM_UP = 500
+ACCEPTED = 0.9  # of the proposals
+
+
+def drawn_by_nuts(pieces, mean, cov, seed):
+    """Draws of q, in coordinates in which Laplace's approximation is a standard normal."""
+    terms = posterior.terms_of(*pieces)
+    root = jnp.linalg.cholesky(cov)
+    kernel = NUTS(
+        potential_fn=lambda u: posterior.cost(terms, mean + root @ u),
+        target_accept_prob=ACCEPTED,
+    )
+    chain = MCMC(kernel, num_warmup=WARM_UP, num_samples=DRAWS, progress_bar=False)
+    chain.run(jax.random.key(seed), init_params=jnp.zeros(mean.size))
+    return mean + np.asarray(chain.get_samples()) @ np.asarray(root).T
+
+
+def compared(snr_db, seed):
+    """One row of the result; None if the fit is not successful."""
+    study = etid.scenes.paper_dry(snr_db=snr_db).simulate(seed)
+    driver = etid.identify_driver(study["calibration/98k8"], order=5, throw=False)
+    fit = etid.identify_skin(study["typical/dry/01"], driver, throw=False)
+    if fit.verdict != "successful":
+        return None
+    fit.posterior()  # compiles
+    started = time.perf_counter()
+    ours = fit.posterior(draws=DRAWS)
+    between = time.perf_counter()
+    lane, known, wanted = posterior.given(fit, None, None)
+    pieces = lane, known, fit.circuit
+    mean, cov = map(np.asarray, posterior.minimum(*pieces))
+    q = drawn_by_nuts(pieces, mean, cov, seed)
+    theirs = posterior.stretched(q, mean, cov, wanted)
+    ended = time.perf_counter()
+    logs = np.log(np.asarray(ours.draws.values()))
+    centre = ours.weights @ logs
+    spread = np.sqrt(ours.weights @ (logs - centre) ** 2)
+    worth = [float(effective_sample_size(column[None])) for column in theirs.T]
+    return [
+        (centre - theirs.mean(0)) / theirs.std(0),
+        spread / theirs.std(0),
+        np.array(worth),
+        np.array([between - started, ended - between, ours.effective]),
+    ]
+
+
+def main(path, snr_db, fits):
+    """Compare some fits and write what was found."""
+    jax.config.update("jax_enable_x64", True)
+    rows = [row for seed in range(fits) if (row := compared(snr_db, seed)) is not None]
+    shift, ratio, worth, seconds = (np.stack(of) for of in zip(*rows, strict=True))
+    np.savez(path, shift=shift, ratio=ratio, worth=worth, seconds=seconds)
+
+
+if __name__ == "__main__":
+    main(sys.argv[1], float(sys.argv[2]), int(sys.argv[3]))
