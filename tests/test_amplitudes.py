@@ -12,6 +12,8 @@ from scipy.special import erf
 
 import etid
 from etid.circuits.current_dependent import Norton, Signals, current_dependent_resistor, port
+from etid.recordings.preflight import Inspected
+from etid.recordings.remarks import Remark
 from etid.signals.transfer import frequency_variable
 from etid.solvers.harmonic_balance import steady_state, to_harmonics, to_time
 
@@ -139,11 +141,58 @@ def test_five_amplitudes_give_the_values_of_kaczmarek_and_webster():
     assert np.all(np.abs(error) < 4 * stderr), error / stderr  # one of 4 elements in 4 000 fits
 
 
+def following(amplitude: float, t: np.ndarray) -> np.ndarray:
+    """Voltage [V] if the fall follows the current in 46.7 µs, and recovers in 52.8 and 642.6 µs.
+
+    These are the times of Kaczmarek and Webster; half of the fall recovers with each.
+    """
+    r_s, r_p, c_p, i_0 = SKIN.values().tolist()
+    rise, recovery = 46.7e-6, np.array([52.8e-6, 642.6e-6])
+
+    def slope(t: float, state: np.ndarray) -> np.ndarray:
+        u, fall = state[0], state[1:]
+        through = u * (1 + fall.mean()) / r_p
+        towards = np.abs(through) / i_0 - fall
+        by_fall = towards / np.where(towards > 0, rise, recovery)
+        return np.append((amplitude * pulses(np.asarray(t)) - through) / c_p, by_fall)
+
+    at = np.mod(t, 1 / PULSE_RATE)
+    grid = np.arange(0, 6e-3, 1e-6)
+    found = solve_ivp(slope, (0, 6e-3), np.zeros(3), rtol=1e-6, max_step=4e-6, t_eval=grid)
+    return np.interp(at, grid, found.y[0], right=0.0) + r_s * amplitude * pulses(t)
+
+
 @pytest.mark.slow
-def test_a_linear_skin_has_no_i_0():
+def test_a_linear_skin_has_no_i_0_and_remarks_on_its_recordings_are_told(monkeypatch):
     linear = etid.SkinCurrent(r_s=895.0, r_p=60.1e3, c_p=1e-9, i_0=1e3)
     of = [recording(one, 5, linear) for one in (0.1e-3, 0.5e-3)]
-    assert etid.identify_amplitudes(of, throw=False).verdict in ("insensitive", "max_steps_reached")
+    remarks = iter([Remark.coarse_converter, Remark.pulse_rate_counted])
+    monkeypatch.setattr(Inspected, "remarks", property(lambda _: next(remarks)))
+    fit = etid.identify_amplitudes(of, throw=False)
+    assert fit.verdict in ("insensitive", "max_steps_reached")
+    assert int(fit.remarks) == Remark.coarse_converter | Remark.pulse_rate_counted
+
+
+@pytest.mark.slow
+def test_skin_that_recovers_slowly_is_a_misfit():
+    """Not an answer: R_p is 9 % and I_0 18 % too small, R_s eight times too large."""
+    t = np.arange(10_000) / SAMPLE_RATE
+    of = []
+    for amplitude in (0.1e-3, 0.3e-3, 1e-3):
+        rng = np.random.default_rng([9, round(1e6 * amplitude)])
+        volts, current = following(amplitude, t), amplitude * pulses(t)
+        noisy = (
+            etid.Samples(v + 1e-2 * np.sqrt(np.mean(v**2)) * rng.standard_normal(v.size))
+            for v in (volts, current)
+        )
+        v_out, i = noisy
+        of.append(
+            etid.Recording(v_out=v_out, current=i, sample_rate=SAMPLE_RATE, pulse_rate=PULSE_RATE)
+        )
+    fit = etid.identify_amplitudes(of, throw=False)
+    assert fit.verdict == "misfit"
+    wrong = np.asarray(fit.circuit.values()) / np.asarray(SKIN.values()) - 1
+    np.testing.assert_allclose(wrong[[1, 3]], [-0.09, -0.18], atol=0.02)
 
 
 @pytest.mark.slow

@@ -1,9 +1,13 @@
 """One load, recorded at several amplitudes; its resistance may fall with the current."""
 
+import dataclasses
+import functools
+import operator
 from collections.abc import Iterable, Sequence
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from etid.circuits.circuit import AbstractCircuit
 from etid.circuits.current_dependent import SkinCurrent, current_dependent
@@ -80,9 +84,9 @@ def identify_amplitudes(
         throw: Raise an error if the verdict is not successful.
 
     Returns:
-        Elements, standard errors and verdict. χ² and RRSE are those of the worst recording. The
-        verdict is `insensitive` if the error of I_0 exceeds a third of it: as far as the recordings
-        show, the load is linear.
+        Elements, standard errors, verdict, and the remarks on all recordings. χ² and RRSE are those
+        of the worst recording. The verdict is `insensitive` if the error of I_0 exceeds a third of
+        it: as far as the recordings show, the load is linear.
 
     Raises:
         RecordingError: There is no recording, the recordings have different lengths or rates, or
@@ -111,6 +115,8 @@ def identify_amplitudes(
     lanes = [Harmonics.of(one) for one in seen]
     known = known_of(lanes[0], feed, False, MAXIMUM_LIKELIHOOD)
     fit = jax.device_get(_fit(stacked(lanes), known, feed, circuit))
+    of_records = functools.reduce(operator.or_, (int(one.remarks) for one in seen))
+    fit = dataclasses.replace(fit, remarks=np.asarray(fit.remarks | of_records))
     return successful(seen[0].recording, fit) if throw else fit
 
 
