@@ -1,12 +1,14 @@
 """Traced functions on disk: found again without tracing, never in the way."""
 
 import collections
+import json
 import pathlib
 import shutil
 import subprocess
 import sys
 import threading
 import time
+import zlib
 from typing import Any
 
 import equinox as eqx
@@ -17,6 +19,7 @@ import pytest
 
 import etid
 from etid.identify import compiled as traces
+from etid.identify import program_files
 from etid.identify.compiled import stored_jit
 from etid.results.verdicts import RESULTS, first_verdict, verdict
 
@@ -49,7 +52,8 @@ def with_callback(x):
 @pytest.fixture
 def folder(tmp_path, monkeypatch):
     """A compilation cache of its own; code of this file counts as known."""
-    monkeypatch.setattr(traces, "KNOWN", {*traces.KNOWN, __name__.partition(".")[0]})
+    known = {*program_files.KNOWN, __name__.partition(".")[0]}
+    monkeypatch.setattr(program_files, "KNOWN", known)
     # Whoever edits a source while the tests run does not break them.
     monkeypatch.setattr(traces, "_sources", lambda: "as they are")
     config: Any = jax.config
@@ -226,6 +230,21 @@ def test_a_damaged_file_is_ignored_and_written_anew(folder, damage):
         assert path.read_bytes()[:32] == content[:32]
 
 
+def test_a_file_is_json_and_a_module_and_names_no_class_from_elsewhere(folder, monkeypatch):
+    anew()(X, "a")
+    [path] = files(folder)
+    header, _, module = zlib.decompress(path.read_bytes()[32:]).partition(b"\n")
+    _, shell = json.loads(header)
+    assert shell["object"][0] == f"{__name__}:Scaled"
+    assert module.startswith(b"ML\xefR")  # bytecode of MLIR
+    assert program_files.read(path) is not None
+    monkeypatch.setattr(program_files, "KNOWN", {"etid"})
+    assert program_files.read(path) is None
+    for name in ("etid.cli:main", "os:system"):  # a function, and another package
+        with pytest.raises(TypeError):
+            program_files._class(name)
+
+
 def test_a_folder_that_cannot_be_written_does_no_harm(folder):
     folder.parent.rmdir()
     folder.parent.write_text("a file where the cache should be")
@@ -297,6 +316,7 @@ jax.config.update("jax_enable_x64", True)
 import numpy as np
 import etid
 from etid.identify import compiled as traces
+from etid.identify import program_files
 if "warm" in sys.argv:
     traces._export = lambda *arguments: os._exit(3)  # everything is to be found
 study = etid.scenes.paper_dry(snr_db=60.0).simulate(seed=0)

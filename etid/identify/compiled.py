@@ -7,8 +7,8 @@ file depends on all that determines the program: the source files and module con
 versions of the packages that it uses, the settings of JAX, the platform, and the arguments: their
 structure, their static parts, and the shapes and types of their arrays.
 
-Files are written completely or not at all. A damaged file counts as absent. The files are pickles:
-trust a folder as you trust the compilation cache itself, whose executables run unchecked.
+`etid.identify.program_files` reads and writes the files. Trust a folder as you trust the
+compilation cache itself, whose executables run unchecked.
 """
 
 import contextlib
@@ -18,12 +18,10 @@ import gc
 import hashlib
 import os
 import pathlib
-import pickle
 import sys
 import threading
 import time
 import types
-import zlib
 from collections.abc import Callable, Iterator
 from typing import Any, ParamSpec, TypeVar
 
@@ -38,15 +36,13 @@ import numpy as np
 import optimistix as optx
 import scipy
 
+from etid.identify import program_files
+from etid.identify.program_files import Slot, filled
 from etid.identify.waiting import announced_later
-from etid.recordings.errors import RecordingError
-from etid.recordings.replacing import replacing
 
 Parameters = ParamSpec("Parameters")
 Result = TypeVar("Result")
 
-# Packages whose code the key knows: etid by its source files, all others by their versions.
-KNOWN = {"etid", "builtins", "equinox", "jax", "jaxlib", "lineax", "numpy", "optimistix", "scipy"}
 FOLDER = "etid"  # inside the folder of the compilation cache
 LOADED = time.time()
 # XLA compiles for a processor in two thirds of the time without the emitters of fusions and with
@@ -96,7 +92,7 @@ def stored_jit(
         if found is None:
             return function(*args, **kwargs)
         exported, shell = found
-        return _filled(shell, exported.call(*_arrays((args, kwargs))))
+        return filled(shell, exported.call(*_arrays((args, kwargs))))
 
     inner = eqx.filter_jit(function)  # part of another function, which decides how it is compiled
 
@@ -171,20 +167,6 @@ def _on_device(arrays: list[Any]) -> bool:
     return True
 
 
-@dataclasses.dataclass(frozen=True)
-class _Slot:
-    """Place of an array in the result of an exported function."""
-
-    index: int
-
-
-def _filled(shell: Any, arrays: Any) -> Any:
-    leaves, tree = jax.tree.flatten(shell)
-    return tree.unflatten(
-        [arrays[leaf.index] if isinstance(leaf, _Slot) else leaf for leaf in leaves]
-    )
-
-
 def _trace(function: Callable, args: tuple, kwargs: dict) -> tuple[jax.export.Exported, Any] | None:
     """The exported function and the shell of its result; None if there is no export."""
     folder = _folder()
@@ -195,17 +177,16 @@ def _trace(function: Callable, args: tuple, kwargs: dict) -> tuple[jax.export.Ex
     if folder is None or key is None:
         return None
     path = folder / f"{function.__name__}-{key}"
-    found = _read(path)
+    found = program_files.read(path)
     if found is not None:
         return found
     try:
         found = _export(function, args, kwargs)
-        content = pickle.dumps(found)
+        program_files.write(path, *found)
     # Errors of any kind: a callback or a custom call that a file cannot hold, a result without a
     # name. The function is then traced in the ordinary way. Its own errors are raised there.
     except Exception:
         return None
-    _write(path, content)
     return found
 
 
@@ -221,7 +202,7 @@ def _export(function: Callable, args: tuple, kwargs: dict) -> tuple[jax.export.E
         args, kwargs = tree.unflatten(filled)
         found, structure = jax.tree.flatten(function(*args, **kwargs))
         dynamic = [i for i, leaf in enumerate(found) if eqx.is_array(leaf)]
-        slots = {i: _Slot(index) for index, i in enumerate(dynamic)}
+        slots = {i: Slot(index) for index, i in enumerate(dynamic)}
         shells.append(structure.unflatten([slots.get(i, leaf) for i, leaf in enumerate(found)]))
         return [found[i] for i in dynamic]
 
@@ -237,33 +218,6 @@ def _export(function: Callable, args: tuple, kwargs: dict) -> tuple[jax.export.E
 
 def _is_weak(array: Any) -> bool:
     return getattr(array, "weak_type", False)
-
-
-# --- Files ---------------------------------------------------------------------------------------
-
-
-def _read(path: pathlib.Path) -> Any:
-    """Content of a file; None if the file is missing or damaged."""
-    try:
-        content = path.read_bytes()
-        checksum, packed = content[:32], content[32:]
-        if hashlib.sha256(path.name.encode() + packed).digest() != checksum:
-            return None
-        return pickle.loads(zlib.decompress(packed))
-    # A pickle that was made for something else may raise any exception.
-    except Exception:
-        return None
-
-
-def _write(path: pathlib.Path, content: bytes) -> None:
-    """Write a file completely or not at all: several processes may write the same file."""
-    packed = zlib.compress(content, 1)
-    checksum = hashlib.sha256(path.name.encode() + packed).digest()
-    # A folder that cannot be written can still be read.
-    with contextlib.suppress(OSError, RecordingError):
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with replacing(path) as partial:
-            partial.write_bytes(checksum + packed)
 
 
 # --- Key -----------------------------------------------------------------------------------------
@@ -343,7 +297,7 @@ def _constants(module: types.ModuleType, seen: set[str]) -> Iterator[tuple[str, 
             home = str(value.__module__)
             yield f"{module.__name__}.{name}", f"{home}.{value.__qualname__}"
             origin = home.partition(".")[0]
-            known = origin in KNOWN or origin in sys.stdlib_module_names
+            known = origin in program_files.KNOWN or origin in sys.stdlib_module_names
             if isinstance(value, types.FunctionType) and not known:
                 raise _Unknown(name)
         else:
@@ -374,7 +328,10 @@ def _described(node: Any, by_value: bool = False) -> Any:
         content = hashlib.sha256(np.asarray(node).tobytes()).hexdigest() if by_value else ""
         return "array", node.shape, str(node.dtype), _is_weak(node), content
     if isinstance(node, type | types.FunctionType):
-        if str(node.__module__).partition(".")[0] not in KNOWN or "<lambda>" in node.__qualname__:
+        if (
+            str(node.__module__).partition(".")[0] not in program_files.KNOWN
+            or "<lambda>" in node.__qualname__
+        ):
             raise _Unknown(node)
         return f"{node.__module__}.{node.__qualname__}"
     if isinstance(node, tuple | list):
