@@ -36,7 +36,7 @@ notebooks: .venv/tools
 	$(BIN)/python -m pytest tests/test_notebooks.py -m notebook --numprocesses auto
 
 docs: .venv/docs
-	$(COMPILED) NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build
+	$(COMPILED) $(BIN)/python -m properdocs build -f mkdocs.yml
 
 wheel-test: .venv/tools
 	$(BIN)/python .ci/wheel.py --python $(PYTHONS) --dependencies $(DEPENDENCIES)

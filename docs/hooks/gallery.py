@@ -15,8 +15,8 @@ import jupytext
 import nbclient
 import nbconvert
 import nbformat
-from mkdocs.plugins import event_priority, get_plugin_logger
-from mkdocs.structure.files import File
+from properdocs.plugins import event_priority, get_plugin_logger
+from properdocs.structure.files import File
 
 ROOT = pathlib.Path(__file__).parents[2]
 MARK = "<!-- gallery -->"

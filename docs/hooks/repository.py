@@ -10,8 +10,8 @@ import pathlib
 import posixpath
 import re
 
-from mkdocs.exceptions import PluginError
-from mkdocs.structure.files import File
+from properdocs.exceptions import PluginError
+from properdocs.structure.files import File
 
 ROOT = pathlib.Path(__file__).parents[2]
 PAGES = (
