@@ -43,11 +43,8 @@ def svg(figure: Figure) -> bytes:
     return buffer.getvalue()
 
 
-def _positive(values: np.ndarray, unit: float = 1.0) -> Float[np.ndarray, " value"]:
-    """Those values that are finite and positive in this unit."""
-    with np.errstate(over="ignore"):
-        found = np.asarray(values) / unit
-    return found[np.isfinite(found) & (found > 0)]
+def _positive(values: np.ndarray) -> Float[np.ndarray, " value"]:
+    return np.asarray(values)[np.isfinite(values) & (np.asarray(values) > 0)]
 
 
 def _steps(axis: Axes, values: np.ndarray, series: int, label: str) -> None:
@@ -66,7 +63,7 @@ def distributions(fits: Fits) -> bytes:
     for axis, (name, unit) in zip(axes[0], units.items(), strict=True):
         scale = DISPLAY[unit][0]
         for series, condition in enumerate(frequent(fits, SERIES)):
-            values = _positive(getattr(good.where(condition=condition).circuit, name), scale)
+            values = _positive(getattr(good.where(condition=condition).circuit, name)) / scale
             if values.size:
                 _steps(axis, values, series, f"{_short(condition) or 'all'} ({values.size})")
         axis.set(xlabel=symbol(name, unit))
@@ -99,8 +96,8 @@ def quality(chi2: Float[np.ndarray, " fit"], stderr: Float[np.ndarray, " fit"]) 
     left.axvline(1.0, color=COLOURS[3], lw=1.0, ls=":")
     left.set(xlabel="χ² per degree of freedom", ylabel="fits")
     right.set(xlabel="largest relative standard error [%]", ylabel="fits")
-    for axis, values, unit in ((left, chi2, 1.0), (right, stderr, 0.01)):
-        known = _positive(values, unit)
+    for axis, values in ((left, chi2), (right, 100 * stderr)):
+        known = _positive(values)
         if known.size:
             wide = known.max() > NARROW * known.min()
             space = np.geomspace if wide else np.linspace

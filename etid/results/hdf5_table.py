@@ -143,11 +143,19 @@ class Table:
         """Some or all rows of a column.
 
         Raises:
-            RecordingError: The file is damaged.
+            RecordingError: The file is damaged, or holds a number that is too large.
         """
         with translated(self.name, field=str(column.name).strip("/")):
-            text = h5py.check_string_dtype(column.dtype)
-            return np.asarray(column.asstr()[rows] if text else column[rows])
+            if h5py.check_string_dtype(column.dtype):
+                return np.asarray(column.asstr()[rows])
+            values = np.asarray(column[rows])
+            large = np.isfinite(values) & (np.abs(values) > limits.LARGEST)
+            if large.any():
+                raise RecordingError(
+                    f"holds {values[large][0]:g}, at most {limits.LARGEST:g} is read",
+                    remedy=_REMEDY,
+                )
+            return values
 
 
 _REMEDY = "Fit the recordings again"
