@@ -118,13 +118,12 @@ def _items(file: h5py.File) -> Iterator[h5py.HLObject]:
     `visititems` looks each of them up from the root: two seconds where 1500 groups are nested.
     """
     left: list[Any] = [file]
-    seen = set()
+    seen: set[h5py.HLObject] = set()  # equal if they are the same object of the file
     while left:
         item = left.pop()
-        place = h5py.h5o.get_info(item.id).addr
-        if place in seen:
+        if item in seen:
             continue
-        seen.add(place)
+        seen.add(item)
         yield item
         if isinstance(item, h5py.Group):
             names = [one for one in item if isinstance(item.get(one, getlink=True), h5py.HardLink)]
