@@ -63,6 +63,7 @@ calls = {
     "etid.predict(rec, d, etid.SkinRC)": "circuit",
     "etid.identify_samples(v, v, None, sample_rate=2e5, pulse_rate=60.0)": "driver",
     "study.where(subject=1.5)": "subject",
+    "study[0]": "path",
     "fits.fits.where(subjct='s01')": "subjct",
     "fits.fits.where(subject=['s01'])": "subject",
 }

@@ -170,9 +170,16 @@ class Study(Overviewed, Mapping[str, Recording]):
         """Source of the recording at a path; it gives metadata without reading samples.
 
         Raises:
-            RecordingError: The recording at this path cannot be read.
+            RecordingError: `path` is no text, or the recording at this path cannot be read.
             KeyError: There is no recording at this path; the message suggests similar paths.
         """
+        if not isinstance(path, str):
+            first = next(iter(self._sources), "s01/dry/0")
+            raise RecordingError(
+                f"is {path!r}, must be the path of a recording",
+                field="path",
+                remedy=f"Write study[{first!r}]; list(study) has all paths",
+            )
         tidy = path.strip("/")
         if tidy in self._sources:
             return self._sources[tidy]
