@@ -32,6 +32,15 @@ def test_a_damaged_file_is_read_or_refused(kinds, name, tmp_path):
         assert fuzz.judge(path, kinds[name], seed)[0] in fuzz.FINE, seed
 
 
+@pytest.mark.parametrize(
+    ("name", "seed"),
+    [("fits", 3028246), ("matlab5", 3031157)],  # damaged bytes in a list of texts; no such class
+)
+def test_a_damaged_file_that_once_was_a_foreign_error_is_not(kinds, name, seed, tmp_path):
+    path = fuzz.damage(tmp_path, kinds[name], seed)
+    assert fuzz.judge(path, kinds[name], seed)[0] in fuzz.FINE
+
+
 @pytest.mark.slow
 def test_a_thousand_damaged_files_neither_crash_nor_hang():
     cases = [(fuzz.kind_of(seed), seed) for seed in range(MANY)]

@@ -248,9 +248,17 @@ def attribute(owner: h5py.HLObject, name: str) -> Any:
     if size > limits.ATTRIBUTE:
         raise ValueError(f"it has {size} bytes, at most {limits.ATTRIBUTE} are read")
     value = owner.attrs[name]
-    if isinstance(value, str):  # damaged bytes; a text with them could not be written again
-        return value.encode("utf-8", "surrogateescape").decode("utf-8", "replace")
+    if isinstance(value, str):
+        return _clean(value)
+    if isinstance(value, np.ndarray) and value.dtype.hasobject:
+        items = [_clean(one) if isinstance(one, str) else one for one in value.ravel()]
+        return np.array(items, object).reshape(value.shape)
     return value
+
+
+def _clean(text: str) -> str:
+    """A text without damaged bytes; with them it could not be written again."""
+    return text.encode("utf-8", "surrogateescape").decode("utf-8", "replace")
 
 
 def check_size(dataset: h5py.Dataset) -> None:

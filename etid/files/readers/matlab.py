@@ -94,7 +94,7 @@ def _whole(path: pathlib.Path) -> Contents:
     mat5.check(path)
     try:
         content = _flat(pymatreader.read_mat(path))
-    except MatReadError as error:
+    except (MatReadError, UnboundLocalError) as error:  # SciPy knows not all classes of arrays
         raise RecordingError(f"cannot be read ({error})") from error
 
     def channel(name: str) -> Channel:
