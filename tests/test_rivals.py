@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import scipy.signal
 
-from benchmarks import rivals
+from benchmarks import referee, rivals
 from benchmarks.ladder import START, rung
 from benchmarks.rivals import harmonic_fit, problem, records, table
 from benchmarks.rivals.roster import RIVALS, SCENES
@@ -264,3 +264,14 @@ def test_every_rival_works_somewhere(name):
     )
     line, works = table.line(name, outcome, TRUTH)
     assert works, line
+
+
+@pytest.mark.slow
+def test_the_referee_agrees_with_the_posterior_of_a_fit():
+    if not rivals.installed(referee.ENVIRONMENT):
+        pytest.skip("its environment is not made: python -m benchmarks referee")
+    found = referee.compared(40.0, 1)
+    assert found["worth"].min() > referee.ENDED
+    # 2000 effective draws of each know a mean to 0.03 standard deviations, a deviation to 2 %.
+    assert np.abs(found["shift"]).max() < 0.15
+    assert np.abs(found["ratio"] - 1).max() < 0.1
