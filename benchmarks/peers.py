@@ -87,7 +87,7 @@ def stages(ten_periods: Problem) -> list[Stage]:
         _steiglitz_mcbride(ten_periods),
         Stage("SM iteration on harmonics", {"ours": harmonic_steiglitz_mcbride(ten_periods, 1)}),
         Stage("LM fit", solvers(ten_periods)),
-        _raw_to_fit(ten_periods),
+        samples_to_fit(ten_periods),
         Stage("samples to judged joint fit", {"ours": judged(ten_periods)}),
     ]
 
@@ -249,7 +249,7 @@ def solvers(ten_periods: Problem) -> dict[str, Run]:
     }
 
 
-def _raw_to_fit(ten_periods: Problem) -> Stage:
+def samples_to_fit(ten_periods: Problem) -> Stage:
     """The same from the samples on, whose harmonics are made alike for all."""
     found = solvers(ten_periods)
 
