@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 import etid
+from benchmarks.selection_draws import choices
 from etid.circuits.elements import Farad, Ohm, PseudoCapacitance
 from etid.circuits.impedance import AbstractImpedance
 from etid.estimators.starts import circuit_starts
@@ -309,6 +310,15 @@ def test_the_circuit_of_a_recording_is_found(study, driver, name):
     np.testing.assert_array_equal(fit.cov, selection.fit.cov)
     error = np.asarray(fit.circuit.values()) - np.asarray(LOADS[name].values())
     assert (np.abs(error) < 4 * np.sqrt(np.diagonal(fit.cov))).all()
+
+
+def test_recordings_of_a_batch_are_chosen_for_alone(study, driver):
+    """As `select_circuit` chooses for each of them; the benchmark chooses so."""
+    records = [study["dry"], study["damp"]]
+    for record, found in zip(records, choices(records, driver), strict=True):
+        one = etid.select_circuit(record, driver)
+        assert type(found.fit.circuit) is type(one.fit.circuit)
+        np.testing.assert_allclose(found.fit.circuit.values(), one.fit.circuit.values(), rtol=1e-9)
 
 
 def test_other_circuits_start_at_the_resistance_and_time_constant_of_the_estimate():

@@ -9,13 +9,12 @@ import pytest
 import etid
 from benchmarks import selection, selection_chart, selection_map, selection_rival
 from benchmarks.selection_counts import CRITERIA, cell, choose, covered, gained
-from benchmarks.selection_draws import TRUTHS, Drawn, choices, quantities
+from benchmarks.selection_draws import TRUTHS, Drawn, quantities
 from etid.results.fits import CHANGES, Fit, Support
 from etid.results.verdicts import verdict
 from etid.selection.evidence import best, bic
 from etid.selection.search import CANDIDATES
 from etid.selection.selection import Selection
-from etid.simulation import scenes
 
 TERMS = 1000.0
 SKIN, COLE = 0, 3  # numbers of candidates
@@ -113,17 +112,6 @@ def test_a_row_counts_choices_and_intervals(tmp_path):
     selection.write_csv(tmp_path / "table.csv", [row])
     with (tmp_path / "table.csv").open() as file:
         assert next(csv.DictReader(file))["truth"] == TRUTH
-
-
-def test_recordings_of_a_batch_are_chosen_for_alone():
-    """As `select_circuit` chooses for each of them."""
-    study = scenes.paper_dry(snr_db=60.0).simulate(1)
-    driver = etid.identify_driver(list(study.calibrations.recordings()))
-    records = list(study.loaded.recordings())[:2]
-    for record, found in zip(records, choices(records, driver), strict=True):
-        one = etid.select_circuit(record, driver)
-        assert type(found.fit.circuit) is type(one.fit.circuit)
-        np.testing.assert_allclose(found.fit.circuit.values(), one.fit.circuit.values(), rtol=1e-9)
 
 
 def test_a_circuit_without_a_series_resistor_claims_that_it_is_zero():
