@@ -38,7 +38,7 @@ from etid.simulation import scenes
 
 DRIVERS = 25
 FIRST = 1000  # number of the first driver; those of other benchmarks are smaller
-MAP = (7, 10)  # drivers of a cell of the map, and trials behind each: 20 000 determined elements
+MAP = (7, 10)  # drivers of a cell of the map, and trials behind each
 FEW = (1, 4)  # the same of a quick run
 PAIRS = 15  # timed pairs
 SINGLES = 16  # recordings of a pair that are identified one at a time
