@@ -316,7 +316,6 @@ jax.config.update("jax_enable_x64", True)
 import numpy as np
 import etid
 from etid.identify import compiled as traces
-from etid.identify import program_files
 if "warm" in sys.argv:
     traces._export = lambda *arguments: os._exit(3)  # everything is to be found
 study = etid.scenes.paper_dry(snr_db=60.0).simulate(seed=0)
@@ -351,6 +350,6 @@ def test_fits_of_another_process_have_the_same_bits(tmp_path):
     without = run("without")
     assert run("cold", **cache) == without
     kept = {path.name.rpartition("-")[0] for path in files(tmp_path / "cache" / traces.FOLDER)}
-    named = {"_identified", "_size", "known_at", "skin_lane", "_chunk", "log_slopes", "_fit"}
+    named = {"_identified", "_response", "known_at", "skin_lane", "_chunk", "log_slopes", "_fit"}
     assert kept == named
     assert run("warm", "warm", **cache) == without
