@@ -174,6 +174,34 @@ def test_a_linear_skin_has_no_i_0_and_remarks_on_its_recordings_are_told(monkeyp
 
 
 @pytest.mark.slow
+def test_linear_skin_is_called_nonlinear_as_rarely_as_stated():
+    """1 of 2 000 by the limit; of 600, more than 3 would come by chance once in 4 000 times."""
+    rate = 20e3  # few harmonics, so that a fit takes 80 ms
+    t, f = np.arange(1000) / rate, np.fft.rfftfreq(1000, 1 / rate)
+    pulse = pulses(t / 8 % (1 / PULSE_RATE / 8))  # eight times as long
+    volts = np.fft.irfft(np.fft.rfft(pulse) * (5e3 + 60e3 / (1 + 2j * np.pi * f * 6e-4)))
+    verdicts = []
+    for seed in range(600):
+        rng = np.random.default_rng([seed, 11])
+
+        def noisy(v: np.ndarray, rng: np.random.Generator = rng) -> etid.Samples:
+            return etid.Samples(v + 1e-2 * np.sqrt(np.mean(v**2)) * rng.standard_normal(v.size))
+
+        of = [
+            etid.Recording(
+                v_out=noisy(amplitude * volts),
+                current=noisy(amplitude * pulse),
+                sample_rate=rate,
+                pulse_rate=PULSE_RATE,
+            )
+            for amplitude in (1e-4, 5e-4)
+        ]
+        verdicts.append(etid.identify_amplitudes(of, throw=False).verdict)
+    assert verdicts.count("successful") <= 3
+    assert verdicts.count("insensitive") >= 590
+
+
+@pytest.mark.slow
 def test_skin_that_recovers_slowly_is_a_misfit():
     """Not an answer: R_p is 9 % and I_0 18 % too small, R_s eight times too large."""
     t = np.arange(10_000) / SAMPLE_RATE
