@@ -18,8 +18,7 @@ settings.register_profile("etid", deadline=None, derandomize=True, max_examples=
 settings.load_profile("etid")
 
 # XLA compiles the programs of these tests in half the time: code of fusions without MLIR, and fewer
-# passes of LLVM. No pass at all (level 0) compiles faster still, but runs twice as long.
-# Parts that are compiled one beside the other cost more on one core.
+# passes of LLVM. Parts that are compiled one beside the other cost more on one core.
 COMPILE_FAST = (
     "--xla_cpu_use_fusion_emitters=false --xla_backend_optimization_level=1"
     " --xla_cpu_parallel_codegen_split_count=1"
@@ -50,6 +49,17 @@ def pytest_configure(config):
 def pytest_xdist_auto_num_workers():
     """One worker for each core that these tests may use, which may be fewer than there are."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else None
+
+
+@pytest.fixture(autouse=True, scope="session")
+def _programs_at_once(request):
+    """Compile etid's programs without passes of LLVM: half the time, and most run once or twice."""
+    with pytest.MonkeyPatch.context() as patch:
+        if request.config.option.markexpr in request.config.getini("addopts"):
+            from etid.identify import compiled  # here, for the type checker wraps what it imports
+
+            patch.setattr(compiled, "QUICKLY", compiled.AT_ONCE)
+        yield
 
 
 @pytest.fixture(autouse=True, scope="module")

@@ -17,12 +17,13 @@ from etid.recordings.preflight import Inspected
 from etid.simulation.scenes import Scene, Trial
 from etid.simulation.transformer import ResistorLoad, SkinLoad
 
-LENGTH = 3334
+LENGTH = 10_000
+PULSE = 3334  # samples of one period, which output error fits
 DRY = SkinLoad(r_s=33.4e3, r_p=186e3, c_p=0.12e-9)
 TRUTH = np.array([33.4e3, 186e3, 0.12e-9])
 SIGMAS = 5.0  # one in 2 million for a normal error, which the coverage test measures
 FEW = 16  # lanes of a call, so that few recordings need several calls
-MANY = 2 * FEW + 1
+MANY = FEW + 2
 
 
 def simulate(count=1, calibrations=1, seed=0, samples=LENGTH, **options):
@@ -55,6 +56,10 @@ def driver(study):
 @pytest.fixture(scope="module")
 def fits(study, driver):
     return etid.identify_skins(study.loaded, driver)
+
+
+def cut(recording, size=PULSE):
+    return recording.replace(v_th=recording.v_th[:size], v_out=recording.v_out[:size])
 
 
 def rows(fits, paths):
@@ -108,11 +113,9 @@ def test_a_recording_that_cannot_be_fitted_changes_no_bit_of_its_neighbours(stud
 
 @pytest.mark.slow
 def test_lengths_and_rates_may_be_mixed(study, driver):
-    recording = study["s01/dry/0"]
-    slow = simulate(sample_rate=150e3, seed=3)["s01/dry/0"].replace(path="slow")
-    short = recording.replace(
-        v_th=recording.v_th[:1500], v_out=recording.v_out[:1500], path="short"
-    )
+    recording = cut(study["s01/dry/0"])
+    slow = simulate(samples=PULSE, sample_rate=150e3, seed=3)["s01/dry/0"].replace(path="slow")
+    short = cut(recording, 1500).replace(path="short")
     fits = etid.identify_skins([short, recording, slow], driver)
     assert fits.labels["path"].tolist() == ["short", "s01/dry/0", "slow"]
     assert fits.counts() == {"successful": 3}
@@ -122,12 +125,7 @@ def test_lengths_and_rates_may_be_mixed(study, driver):
 
 def test_ragged_lengths_fill_lanes_of_one_shape(study):
     recording = study["s01/dry/0"]
-    lanes = [
-        PaddedSamples.of(
-            Inspected(recording.replace(v_th=recording.v_th[:n], v_out=recording.v_out[:n]))
-        )
-        for n in range(2900, LENGTH, 61)
-    ]
+    lanes = [PaddedSamples.of(Inspected(cut(recording, n))) for n in range(2900, PULSE, 61)]
     assert len({lane.shapes for lane in lanes}) == 1
 
 
@@ -141,8 +139,8 @@ def test_a_study_of_ragged_lengths_compiles_for_few(study, driver, monkeypatch):
 
     monkeypatch.setattr(batch, "skin_lane", counted)
     records = [
-        record.replace(v_th=record.v_th[:size], v_out=record.v_out[:size])
-        for record, size in zip(study.loaded.recordings(), range(2900, LENGTH, 13), strict=False)
+        cut(record, size)
+        for record, size in zip(study.loaded.recordings(), range(2900, PULSE, 13), strict=False)
     ]
     fits = etid.identify_skins(records, driver)
     assert len({record.v_th.size for record in records}) == MANY
@@ -156,7 +154,7 @@ def test_a_study_of_ragged_lengths_compiles_for_few(study, driver, monkeypatch):
 @pytest.mark.slow
 def test_what_fills_a_record_up_changes_no_digit(study, driver):
     """The same samples in a longer lane."""
-    recording = study["s01/dry/0"]
+    recording = cut(study["s01/dry/0"])
     lane = jax.tree.map(jax.numpy.asarray, PaddedSamples.of(Inspected(recording)))
     fit = OUTPUT_ERROR.fit_load(lane, driver, None, etid.SkinRC())
     v_th, v_out = (jax.numpy.pad(v, (0, 555)) for v in (lane.v_th, lane.v_out))
@@ -317,7 +315,7 @@ def test_failures_survive_a_file_with_units(mixed, tmp_path):
     with h5py.File(file) as content:
         assert content["c_p"].attrs["unit"] == "farad"
         assert content["r_s_stderr"].attrs["unit"] == "ohm"
-        assert content.attrs["method"] == "output_error"
+        assert content.attrs["method"] == "maximum_likelihood"
         assert content.attrs["etid_version"] == etid.__version__
 
 

@@ -67,7 +67,8 @@ def test_a_constant_phase_is_identified_and_chosen():
     assert np.abs(off(selection.fit, COLE)).max() < WITHIN
 
 
-@pytest.mark.parametrize("periods", [3.0, pytest.param(1.1, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("periods", [3.0, 1.1])
 def test_a_fixed_element_keeps_its_value_and_helps_the_others(skin, periods):
     recording = skin if periods == 3.0 else recorded(SKIN, periods=periods)
     free = etid.identify_skin(recording)

@@ -1,5 +1,3 @@
-import warnings
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -71,17 +69,6 @@ def test_minimum_is_that_of_scipy(residual, start):
     np.testing.assert_allclose(solution.value, expected.x, atol=atol)
     objective = float(solution.stats["normal_equations"].objective)
     assert objective <= expected.cost * (1 + 1e-10) + 1e-12
-
-
-def test_minimum_is_that_of_jaxopt():
-    with warnings.catch_warnings():
-        # jaxopt is no longer maintained and says so when it is imported.
-        warnings.simplefilter("ignore", DeprecationWarning)
-        import jaxopt
-    with jax.numpy_dtype_promotion("standard"):  # it multiplies truth values by floats
-        peer = jaxopt.LevenbergMarquardt(decay, tol=1e-10, maxiter=200, xtol=1e-12, gtol=1e-12)
-        expected = peer.run(START).params
-    np.testing.assert_allclose(solve(decay, START).value, expected, atol=AGREE)
 
 
 def test_statistics_are_the_normal_equations_at_the_solution():

@@ -167,11 +167,11 @@ def test_one_unloaded_record_for_calibration_and_trial_tells_of_its_voltage_twic
     trials, known = (Trial("a", DRY),), (Trial("c", ResistorLoad(98.8e3)),)
     scene = Scene(trials, known, samples=SAMPLES, snr_db=60.0, shared_v_th=True)
     study = scene.simulate(seed=2)
-    fit = etid.identify_skin(study["a"], etid.identify_driver(study["c"]))
+    fits = etid.identify_skins([study["a"]], etid.identify_driver(study["c"]))
     bound = etid.bound(scene)["a"]
-    found = np.asarray(fit.stderr.values())[1] / bound.stderr["r_p"]
+    found = fits.stderr.r_p[0] / bound.stderr["r_p"]
     np.testing.assert_allclose(found, 1.0, atol=0.1)  # without it 1.2
-    assert (np.abs(error(fit)) < SIGMAS * np.asarray(fit.stderr.values())).all()
+    assert (np.abs(error(fits)) < SIGMAS * np.asarray(fits.stderr.values())).all()
 
 
 def test_a_driver_that_is_followed_too_far_is_no_success():

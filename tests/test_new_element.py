@@ -69,11 +69,14 @@ TRUTH = SkinDavidsonCole(33.4e3, 186e3, 40e-6, 0.7)
 
 @functools.cache
 def fitted():
-    """A recording, its driver, and the circuit that was found in it."""
+    """A recording, its driver, and the circuit that was found in its impedance."""
     trials = (Trial("skin", TRUTH),)
     study = dataclasses.replace(rung("dry"), trials=trials).simulate(3)
     driver = etid.identify_driver(study[CALIBRATION])
-    fit = etid.identify_skin(study["skin"], driver, circuit=SkinDavidsonCole())
+    rng, sigma, f = np.random.default_rng(1), 100.0, np.geomspace(10, 1e6, 60)
+    noise = sigma * (rng.normal(size=60) + 1j * rng.normal(size=60))
+    z = np.asarray(TRUTH.response(jnp.asarray(f))) + noise
+    fit = etid.identify_impedance(f, z, stderr=sigma, circuit=SkinDavidsonCole())
     return study["skin"], driver, fit
 
 
@@ -87,8 +90,17 @@ def test_its_impedance_is_its_formula():
     np.testing.assert_allclose(TRUTH.response(jnp.asarray(FREQUENCY)), expected, rtol=1e-12)
 
 
+def test_it_is_fitted():
+    is_found(fitted()[2])
+
+
+@pytest.mark.slow
 def test_it_is_fitted_at_the_harmonics():
-    _, _, fit = fitted()
+    recording, driver, _ = fitted()
+    is_found(etid.identify_skin(recording, driver, circuit=SkinDavidsonCole()))
+
+
+def is_found(fit):
     assert fit.verdict == "successful"
     error = np.asarray(fit.circuit.values() - TRUTH.values())
     assert (np.abs(error) < SIGMAS * np.asarray(fit.stderr.values())).all()

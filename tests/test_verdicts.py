@@ -13,7 +13,7 @@ from etid.results.verdicts import RESULTS, message, verdict, verdict_names, verd
 from etid.simulation.scenes import Scene, Trial
 from etid.simulation.transformer import ResistorLoad, SkinLoad
 
-LENGTH = 3334
+LENGTH = 10_000
 DRY = SkinLoad(r_s=33.4e3, r_p=186e3, c_p=0.12e-9)
 
 
