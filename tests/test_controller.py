@@ -4,6 +4,7 @@ import dataclasses
 import functools
 import math
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -69,7 +70,7 @@ def test_the_standard_error_of_the_charge_is_what_other_calibrations_and_noise_m
     logs, step = circuit.log_values(), 1e-5
     nothing = jnp.zeros((3, 3))
     alone = dataclasses.replace(model, source_cov=0 * model.source_cov)
-    current = jax.jit(alone.current)
+    current = eqx.filter_jit(alone.current)
     for i in range(3):
         low, high = (
             float(current(circuit, logs.at[i].add(s), nothing).charge) for s in (-step, step)
@@ -122,9 +123,11 @@ def test_the_cap_of_the_estimate_holds_as_often_as_it_should():
     cov = np.linalg.inv(np.asarray(state.electrodes.information[1]))
     model = dataclasses.replace(controller.model, source_cov=0 * controller.model.source_cov)
     circuit = controller.tracker.model.circuit
-    true = float(jax.jit(model.current)(circuit, logs, jnp.zeros((3, 3))).charge)
+    true = float(eqx.filter_jit(model.current)(circuit, logs, jnp.zeros((3, 3))).charge)
     drawn = np.asarray(logs)[None, :] + rng.standard_normal((draws, 3)) @ np.linalg.cholesky(cov).T
-    found = jax.jit(jax.vmap(lambda one: model.current(circuit, one, jnp.asarray(cov))))(drawn)
+    found = eqx.filter_jit(jax.vmap(lambda one: model.current(circuit, one, jnp.asarray(cov))))(
+        drawn
+    )
     amplitude = 50e-9 / (found.charge + controller.quantile * found.charge_stderr)
     share = float(np.mean(np.asarray(amplitude) * true > 50e-9))
     # Three standard deviations of a binomial share.

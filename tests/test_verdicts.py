@@ -117,7 +117,7 @@ def test_nonphysical_and_driver_failed(study):
     driver = raised.value.outcome
     assert isinstance(driver, etid.Driver)
     assert driver.verdict == "nonphysical"
-    assert verdict_of(study["loaded/0"], driver) in ("driver_failed", "misfit")
+    assert verdict_of(study["loaded/0"], driver) in ("driver_failed", "inconsistent", "misfit")
 
 
 def test_driver_failed_when_the_calibration_is_refused(study):
