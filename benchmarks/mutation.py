@@ -47,8 +47,11 @@ TESTS: Mapping[str, Sequence[str]] = {
     "online.electrode": ("online",),
     "online.gain_bands": ("online",),
     "online.tracker": ("online",),
+    "results.driver": ("driver",),
     "results.fits": ("recording", "joint", "identification"),
     "results.hdf5_table": ("exporting", "cli"),
+    "results.summary": ("batch",),
+    "results.verdicts": ("judging", "verdicts"),
     "signals.harmonics": ("spectra",),
     "solvers.arrowhead": ("arrowhead",),
     "solvers.levenberg_marquardt": ("levenberg_marquardt",),
@@ -71,11 +74,16 @@ def copied(root: pathlib.Path, folder: pathlib.Path) -> None:
 def passes(folder: pathlib.Path, tests: Sequence[str], limit: float) -> bool | None:
     """Whether the tests pass; None if they take too long."""
     files = [f"tests/test_{name}.py" for name in tests]
-    # What is compiled for tests without a mutant is found again; what is traced is not kept.
+    # What is compiled for tests without a mutant is found again, by Python and by XLA.
     options = ("-q", "-x", "-o", f"cache_dir={ROOT / '.pytest_cache'}")
-    command = [sys.executable, "-B", "-m", "pytest", *options, *files]
-    places = {"PYTHONPATH": str(folder), "XDG_CACHE_HOME": str(folder.parent / "cache")}
-    environment = {**os.environ, **places, "PYTHONDONTWRITEBYTECODE": "1"}
+    command = [sys.executable, "-m", "pytest", *options, *files]
+    places = {
+        "PYTHONPATH": str(folder),
+        "PYTHONPYCACHEPREFIX": str(folder.parent / "bytecode"),
+        "XDG_CACHE_HOME": str(folder.parent / "cache"),
+    }
+    environment = {**os.environ, **places}
+    environment.pop("PYTHONDONTWRITEBYTECODE", None)
     with subprocess.Popen(
         command, cwd=folder, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
     ) as process:

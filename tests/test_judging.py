@@ -6,20 +6,27 @@ import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
 import pytest
+import scipy.stats
 
 import etid
 from etid.estimators.estimate import Estimate
 from etid.estimators.judgement import (
     MISFIT_CHI2,
     MISFIT_RRSE,
+    NO_CURRENT,
+    STRAINED,
     SUCCESSFUL,
+    distance_to_minimum,
     judged,
     misses,
+    remarks,
     too_late,
     unless,
 )
 from etid.estimators.output_error.estimator import INTERPOLATED
+from etid.recordings.remarks import Remark
 from etid.results.verdicts import RESULTS, verdict
+from etid.solvers.levenberg_marquardt import NormalEquations
 
 
 def estimate(
@@ -98,6 +105,7 @@ def test_a_delay_of_any_record_counts():
         ({"chi2": np.nan}, "unstable"),
         ({"parameters": (10.0, np.nan, -23.0)}, "nonphysical"),
         ({"result": optx.RESULTS.nonlinear_max_steps_reached}, "max_steps_reached"),
+        ({"falls": jnp.asarray(True)}, "misfit"),
         ({"strain": jnp.asarray(38.0)}, "successful"),
         ({"strain": jnp.asarray(40.0)}, "inconsistent"),
         ({"relative": (0.01, 0.99, 0.01)}, "successful"),
@@ -110,6 +118,42 @@ def test_a_delay_of_any_record_counts():
 )
 def test_every_reason_has_its_verdict(change, expected):
     assert name(estimate(**change)) == expected
+
+
+def test_limits_are_exceeded_by_chance_as_often_as_they_say():
+    assert scipy.stats.chi2.sf(STRAINED, 12) == pytest.approx(1e-4, rel=0.1)
+    assert scipy.stats.norm.sf(1 / NO_CURRENT) == pytest.approx(1 / 2000, rel=0.1)
+
+
+@pytest.mark.parametrize(("alpha", "expected"), [(1.02, "successful"), (1.1, "nonphysical")])
+def test_an_exponent_far_above_one_is_no_circuit(alpha, expected):
+    """Of 1 % standard error: what a passive network cannot do is then no accident."""
+    of = estimate()
+    logs, cov = jnp.log(jnp.array([33e3, 186e3, 22e-6, alpha])), 1e-4 * jnp.eye(4)
+    of = Estimate(**{**vars(of), "parameters": logs, "cov": cov, "shared_cov": 0 * cov})
+    assert judged(of, etid.SkinCole(), SUCCESSFUL, "a method").verdict == expected
+
+
+@pytest.mark.parametrize("hum", [True, False])
+@pytest.mark.parametrize("falls", [True, False])
+def test_hum_and_a_falling_resistance_are_remarks(hum, falls):
+    expected = Remark.mains_hum * hum + Remark.falls_with_current * falls
+    assert int(remarks(jnp.asarray(hum), jnp.asarray(falls))) == int(expected)
+    fit = judged(
+        estimate(hum=jnp.asarray(hum), falls=jnp.asarray(falls)),
+        etid.SkinRC(),
+        SUCCESSFUL,
+        "a method",
+    )
+    assert int(fit.remarks) == int(expected)
+    assert int(remarks(jnp.asarray(hum))) == int(Remark.mains_hum * hum)
+
+
+def test_the_distance_to_the_minimum_is_in_standard_errors():
+    """Of a parabola with its minimum at 0: at y the gradient is H y, and the square yᵀ H y."""
+    matrix, y = np.array([[4.0, 1.0], [1.0, 9.0]]), np.array([0.5, -2.0])
+    equations = NormalEquations(*map(jnp.asarray, (0.5 * y @ matrix @ y, matrix @ y, matrix)))
+    np.testing.assert_allclose(distance_to_minimum(equations), y @ matrix @ y, rtol=1e-12)
 
 
 def test_a_failed_driver_comes_last():

@@ -172,6 +172,28 @@ def test_harmonics_that_aliases_reach_are_left_out(samples, highest):
     assert used.size == round(used.max() / PULSE)  # and none below is
 
 
+def test_real_parts_come_before_imaginary_parts():
+    values = np.array([[1 + 2j, 3 + 4j], [5 + 6j, 7 + 8j]])
+    expected = [[1, 3, 2, 4], [5, 7, 6, 8]]
+    np.testing.assert_array_equal(spectra.real_parts(values), expected)
+    np.testing.assert_array_equal(spectra.real_parts(jnp.asarray(values)), expected)
+
+
+@pytest.mark.parametrize("length", [1, 2, 7, 13, 97, 3334, 9999])
+def test_a_fast_length_is_the_next_one_of_small_factors(length):
+    small = {2**a * 3**b * 5**c for a in range(15) for b in range(10) for c in range(7)}
+    assert spectra.fast_length(length) == min(size for size in small if size >= length)
+
+
+def test_a_cubic_drift_is_not_in_the_harmonics():
+    """Of six periods; a polynomial of the fourth degree is no drift, and stays."""
+    periods, samples = 6, 20_000
+    ramp = np.linspace(-1, 1, samples)
+    found = harmonics(np.stack([ramp**3, ramp**4 - ramp**2]), periods, samples)
+    assert np.abs(found[0]).max() < 1e-12
+    assert np.abs(found[1]).max() > 1e-5
+
+
 def test_aliases_are_told_from_harmonics_where_a_period_is_no_whole_number_of_samples():
     assert spectra.separates_aliases(3, 10_000)
     assert not spectra.separates_aliases(1, 3333)
