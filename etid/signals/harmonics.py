@@ -89,7 +89,8 @@ def harmonics(
     drift = of.einsum("dp,...p->...d", fit, _sums(v[..., :samples], periods))
     step = periods // parts
     at_harmonics = transform[..., step : (folded.shape[-1] + 1) // 2 : step] / samples
-    return at_harmonics - drift.astype(at_harmonics.dtype) @ basis
+    # `@` would start BLAS threads for each recording, and these threads wait for each other.
+    return at_harmonics - of.einsum("...d,dh->...h", drift.astype(at_harmonics.dtype), basis)
 
 
 def namespace(v: Array | np.ndarray) -> ModuleType:
