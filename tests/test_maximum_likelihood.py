@@ -25,7 +25,7 @@ DRY = SkinLoad(r_s=33.4e3, r_p=186e3, c_p=0.12e-9)
 SAMPLES = 10_000
 SHORT = 3332  # less than a period; filled up like those of a period, which other tests fit
 SIGMAS = 5.0  # one in 2 million for a normal error
-FILES = 15  # that a reader of `identify_skin` opens at most
+FILES = 16  # that a reader of `identify_skin` opens at most; the last one tells the fit its data
 
 
 def simulate(trials=1, resistors=(98.8e3,), samples=SAMPLES, seed=0, **options):
