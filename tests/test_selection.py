@@ -11,6 +11,7 @@ from benchmarks.selection_draws import choices
 from etid.circuits.elements import Farad, Ohm, PseudoCapacitance
 from etid.circuits.impedance import AbstractImpedance
 from etid.estimators.starts import circuit_starts
+from etid.recordings.remarks import Remark
 from etid.report.methods import methods_section
 from etid.results.fits import CHANGES, Fit, Support
 from etid.results.verdicts import verdict
@@ -19,7 +20,7 @@ from etid.selection.evidence import best, bic, rank, weights, with_close
 from etid.selection.residuals import looks_like
 from etid.selection.search import CANDIDATES, search
 from etid.selection.selection import Selection
-from etid.selection.unseen import WIDTH, posterior, unseen
+from etid.selection.unseen import WIDTH, hidden, posterior, unseen
 from etid.simulation.scenes import Scene, Trial
 from etid.simulation.transformer import ResistorLoad
 
@@ -138,13 +139,27 @@ def test_weights_are_probabilities_of_what_the_data_allow():
 def test_the_error_contains_the_difference_to_a_likely_circuit():
     skin = made(etid.SkinRC(33e3, 186e3, 0.12e-9), 1000.0)
     cole = made(etid.SkinCole(30e3, 190e3, 22e-6, 0.9), 1000.0 - np.log(TERMS), error=0.02)
-    cov = with_close({0: skin, 1: cole}, 0)
+    cov = with_close({0: skin, 1: cole}, 0, {0: 0.5, 1: 0.5})
     # Two equally likely circuits: half of the difference squared, the mean of both variances.
     expected = 0.5 * 3e3**2 + 0.5 * ((0.01 * 33e3) ** 2 + (0.02 * 30e3) ** 2)
     assert cov[0, 0] == pytest.approx(expected)
     assert cov[0, 1] == pytest.approx(-0.5 * 3e3 * 4e3)
     assert cov[2, 2] == skin.cov[2, 2]  # Cole's circuit has no c_p
     assert np.linalg.eigvalsh(cov / np.sqrt(np.outer(np.diag(cov), np.diag(cov)))).min() > 0
+
+
+def test_series_resistance_that_noise_hides_widens_the_error_of_r_p():
+    parallel = made(etid.ParallelRC(13e3, 1.7e-9), 1000.0)
+    skin = made(etid.SkinRC(2e3, 11e3, 1.9e-9), 1000.0, error=0.4)
+    fits = {0: skin, 1: parallel, 2: made(etid.Resistor(12e3), 1300.0, "misfit")}
+    # R_s of 2.5 standard errors: the weight is 0.1 by BIC, and most of 1 by the prior of skin.
+    assert weights(fits)[0] < 0.1
+    assert hidden(fits, 1).keys() == {0}
+    assert hidden(fits, 1)[0] > 0.6
+    assert hidden(fits, 0) == hidden(fits, 2) == {}
+    found = Selection.of(fits, 1, CANDIDATES[:3])
+    assert found.fit.stderr.r_p > 1.5e3
+    assert found.fit.remarks & Remark.circuits_close
 
 
 @pytest.mark.parametrize("z", [-2.4, 0.0, 1.5])

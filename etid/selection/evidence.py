@@ -127,24 +127,24 @@ def weights(fits: Mapping[int, Fit]) -> dict[int, float]:
     return {number: share.get(number, 0.0) / total for number in fits}
 
 
-def with_close(fits: Mapping[int, Fit], chosen: int) -> np.ndarray:
+def with_close(fits: Mapping[int, Fit], chosen: int, share: Mapping[int, float]) -> np.ndarray:
     """Covariance of the chosen elements, with the differences to other likely circuits.
 
     For each element that another candidate has under the same name and unit,
 
         var = Σ_m w_m (σ_m² + (θ_m − θ)²),
 
-    with the weights w_m of `weights`, and θ of the chosen circuit. Elements that a candidate does
-    not determine are left out.
+    with the weights w_m, and θ of the chosen circuit. Elements that a candidate does not determine
+    are left out.
 
     Args:
         fits: Fits of the same data, by number of the candidate.
         chosen: Number of the chosen circuit.
+        share: Probability of each candidate.
 
     Returns:
         Covariance [SI²], (element, element).
     """
-    share = weights(fits)
     mine = fits[chosen]
     cov = np.array(mine.cov, float)
     others = [number for number in fits if number != chosen and share[number] > 0]

@@ -13,7 +13,7 @@ from etid.results.fits import Fit
 from etid.results.verdicts import message
 from etid.selection.evidence import bic, rank, weights, with_close
 from etid.selection.residuals import looks_like
-from etid.selection.unseen import unseen
+from etid.selection.unseen import hidden, unseen
 
 HEADS = ("circuit", "2 log evidence", "weight", "chi2", "verdict", "elements")
 CLOSE = 0.02  # weight of another circuit from which on a remark is made
@@ -126,7 +126,8 @@ class Selection(Overviewed):
 
 def _concluded(fits: Mapping[int, Fit], chosen: int) -> Fit:
     """The chosen fit; its covariance and a remark tell of other circuits."""
-    fit, share = fits[chosen], weights(fits)
-    cov = with_close(fits, chosen) + unseen(fit)
-    close = Remark.circuits_close if 1 - share[chosen] > CLOSE else 0
+    fit, share = fits[chosen], weights(fits) | hidden(fits, chosen)
+    cov = with_close(fits, chosen, share) + unseen(fit)
+    others = sum(probable for number, probable in share.items() if number != chosen)
+    close = Remark.circuits_close if others > CLOSE else 0
     return dataclasses.replace(fit, cov=cov, remarks=np.asarray(int(fit.remarks) | close))

@@ -1,4 +1,4 @@
-"""What a spread of time constants that no test sees may do to the elements of a circuit.
+"""What may be there unseen, and would change the elements: a spread of time constants, and R_s.
 
 With much noise a Cole element passes for a capacitor, and R_s is then wrong by more than its
 standard error. The score of a fit tells, without another fit, the estimate ε̂ ± σ of α − 1, and how
@@ -18,9 +18,14 @@ elements θ with slopes b have
 
 (Hoeting et al., Bayesian model averaging, Statistical Science 14, 1999, 382-417). This adds nothing
 where the data determine α well, σ ≪ τ.
+
+R_s is treated alike. Where noise hides it, R ‖ C is chosen, whose R_p is then R_s + R_p. The share
+of R_s in this sum has a prior of the same width. BIC has the prior of one single datum, which gives
+R_s of two standard errors the weight 0.1 at most, although skin is expected to have it.
 """
 
 import math
+from collections.abc import Mapping
 
 import numpy as np
 from jaxtyping import Float
@@ -28,7 +33,10 @@ from jaxtyping import Float
 from etid.results.fits import Fit
 from etid.selection.evidence import elements, values_of
 
-WIDTH = 0.2  # τ; 1 − α is 0.2 for dry skin (Gabriel, Lau and Gabriel 1996, see `SkinCole`)
+# τ; 1 − α is 0.2 for dry skin (Gabriel, Lau and Gabriel 1996, see `SkinCole`), and the share of R_s
+# is 0.15 for the dry and 0.26 for the damp skin of the paper.
+WIDTH = 0.2
+SERIES = "r_s"
 LARGEST = 50.0  # exponent of an evidence; more is as certain
 
 
@@ -48,6 +56,27 @@ def unseen(fit: Fit) -> Float[np.ndarray, "element element"]:
     evidence, square = posterior(-float(support.z[0]) * sigma, sigma)
     moved = np.asarray(support.spread_slope, float) * values_of(fit)
     return evidence / (1 + evidence) * square * np.outer(moved, moved)
+
+
+def hidden(fits: Mapping[int, Fit], chosen: int) -> dict[int, float]:
+    """Probability of the candidate that is the chosen circuit and R_s; empty if there is none.
+
+    Args:
+        fits: Fits of the same data, by number of the candidate.
+        chosen: Number of the chosen circuit.
+    """
+    own = dict(zip(fits[chosen].circuit.names(), values_of(fits[chosen]), strict=True))
+    found = {}
+    for number, fit in fits.items():
+        names = fit.circuit.names()
+        if "r_p" not in own or SERIES in own or set(names) != {*own, SERIES}:
+            continue
+        at = names.index(SERIES)
+        sigma = math.sqrt(max(float(np.asarray(fit.cov)[at, at]), 0.0)) / own["r_p"]
+        if sigma > 0:
+            evidence, _ = posterior(-float(values_of(fit)[at]) / own["r_p"], sigma)
+            found[number] = evidence / (1 + evidence)
+    return found
 
 
 def posterior(estimate: float, sigma: float) -> tuple[float, float]:
