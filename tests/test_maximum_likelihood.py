@@ -169,7 +169,7 @@ def test_one_unloaded_record_for_calibration_and_trial_tells_of_its_voltage_twic
     study = scene.simulate(seed=2)
     fits = etid.identify_skins([study["a"]], etid.identify_driver(study["c"]))
     bound = etid.bound(scene)["a"]
-    found = fits.stderr.r_p[0] / bound.stderr["r_p"]
+    found = fits[0].stderr.r_p / bound.stderr["r_p"]
     np.testing.assert_allclose(found, 1.0, atol=0.1)  # without it 1.2
     assert (np.abs(error(fits)) < SIGMAS * np.asarray(fits.stderr.values())).all()
 
