@@ -223,6 +223,11 @@ def test_a_wrong_column_is_one_error_that_names_file_column_and_remedy(fits, nam
     assert caught.value.remedy
 
 
+def test_a_column_in_single_precision_is_read(fits):
+    replaced(fits, "c_p", np.full(6, 1e-9, np.float32))
+    assert StudyFits.read(fits).fits.circuit.c_p == pytest.approx(1e-9, rel=1e-7)
+
+
 @pytest.mark.parametrize(
     ("name", "value", "message"),
     [

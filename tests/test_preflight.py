@@ -89,6 +89,7 @@ def test_reference_recordings_pass_but_the_clipped_ones(reference_data, tmp_path
         (lambda v: np.random.default_rng(1).normal(size=v.size), "flat"),
         (lambda v: np.where(np.arange(v.size) == 5, np.nan, v), "nonfinite_samples"),
         (lambda v: np.where(np.arange(v.size) == 5, -np.inf, v), "nonfinite_samples"),
+        (lambda v: np.where(np.arange(v.size) < 5, np.inf, v), "nonfinite_samples"),
         (lambda v: np.minimum(v, 0.7 * v.max()), "saturated"),
         (lambda v: np.roll(v, 450), "misaligned"),  # 2.25 ms, an eighth of a period
         (lambda v: -v, "misaligned"),

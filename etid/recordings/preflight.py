@@ -90,8 +90,9 @@ class Group:
     def coarse(self) -> Float[np.ndarray, "recording 2"]:
         """Converter steps [V] that exceed the noise, else 0."""
         found = np.zeros(self.step.shape)
-        spans = np.ptp(self.recorded_limits, axis=-1)
-        visible = (self.step > VISIBLE * spans) | ((self.step == 0) & shows_few(self.whole))
+        with QUIETLY():
+            spans = np.ptp(self.recorded_limits, axis=-1)
+            visible = (self.step > VISIBLE * spans) | ((self.step == 0) & shows_few(self.whole))
         for row, which in np.argwhere(visible):
             v = self.whole[row, which]
             step = float(self.step[row, which]) or step_of(v)

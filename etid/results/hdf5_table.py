@@ -149,7 +149,8 @@ class Table:
             if h5py.check_string_dtype(column.dtype):
                 return np.asarray(column.asstr()[rows])
             values = np.asarray(column[rows])
-            large = np.isfinite(values) & (np.abs(values) > limits.LARGEST)
+            size = np.abs(values).astype(float)  # the limit is beyond single precision
+            large = np.isfinite(size) & (size > limits.LARGEST)
             if large.any():
                 raise RecordingError(
                     f"holds {values[large][0]:g}, at most {limits.LARGEST:g} is read",
