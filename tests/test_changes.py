@@ -93,6 +93,22 @@ def test_a_step_and_a_single_period_are_seen_as_well_as_a_line():
         assert abs(change.size[1] + 0.1) < 4 * change.stderr[1] + 0.005
 
 
+def test_a_change_matters_from_the_size_that_is_allowed_on():
+    scene, skin = rung("dry"), LOADS["dry"]
+    recording = recorded(scene, falling(skin, "r_p", 0.1))
+    assert change_of(recording, scene, skin, allowed=0.08).seen
+    assert not change_of(recording, scene, skin, allowed=0.13).seen
+
+
+def test_courses_are_a_line_each_step_and_each_single_period():
+    inner = [np.arange(5) == one for one in (1, 2, 3)]
+    steps = [np.arange(5) >= first for first in (1, 2, 3, 4)]
+    expected = np.array([np.arange(5), *steps, *inner], float)
+    expected -= expected.mean(axis=1, keepdims=True)
+    expected /= np.linalg.norm(expected, axis=1, keepdims=True)
+    np.testing.assert_allclose(changes.courses(5), expected)
+
+
 def test_an_element_that_moves_alone_is_seen_where_all_together_hide_it():
     """One of the records at 40 dB in which R_p falls by 5 % and χ² of all four is too small."""
     scene, skin = rung("dry", snr_db=40.0), LOADS["dry"]
