@@ -76,7 +76,7 @@ def test_notebook_runs_from_top_to_bottom_and_shows_its_figures(path, tmp_path, 
     cells = [cell for cell in notebook.cells if cell.cell_type == "code"]
     outputs = [output for cell in cells for output in cell.outputs]
     pictures = [output for output in outputs if "image/png" in output.get("data", {})]
-    wanted = [cell for cell in cells if re.search(r"etid\.plot\(|plt\.subplots\(", cell.source)]
+    wanted = [cell for cell in cells if re.search(r"\.plot\(|plt\.subplots\(", cell.source)]
     assert len(pictures) == len(wanted) > 0
     warned = [output.text for output in outputs if output.get("name") == "stderr"]
     assert all(text.startswith(COMPILING) for text in warned)
