@@ -1,6 +1,6 @@
 """Is the simplest circuit found that a recording supports, and are the intervals honest after it?
 
-    python -m benchmarks selection            # all of it, half an hour on one core
+    python -m benchmarks selection            # all of it, 45 minutes of processor time
     python -m benchmarks selection --quick    # few drivers and cells, a minute or two
 
 Recordings of five kinds of circuits, dry and damp, behind drivers drawn anew, from 20 to 80 dB
