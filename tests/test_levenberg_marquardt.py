@@ -8,7 +8,12 @@ import scipy.optimize
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from etid.solvers.levenberg_marquardt import LevenbergMarquardt, NormalEquations, normal_equations
+from etid.solvers.levenberg_marquardt import (
+    LevenbergMarquardt,
+    NormalEquations,
+    normal_equations,
+    second_order,
+)
 
 TIME = np.linspace(0.0, 5.0, 60)
 TRUTH = np.array([3.0, 1.7, 0.8])
@@ -254,3 +259,22 @@ def test_the_solution_differentiates_with_respect_to_the_data():
     step = 1e-4  # differences: step² of the third derivative; the fits' own 1e-8 over the step
     numeric = (rate(DATA + step * direction) - rate(DATA - step * direction)) / (2 * step)
     np.testing.assert_allclose(gradient @ direction, numeric, rtol=1e-3)
+
+
+def test_the_second_derivative_along_a_step_is_that_of_a_parabola():
+    y, step = jnp.array([-1.2, 1.0]), jnp.array([0.3, 0.1])
+    found = second_order(lambda y, _: rosenbrock(y), y, step)
+    # r″ = (−20 s₀², 0), and the first row of J is (−20 y₀, 10). Differences round.
+    expected = -20 * 0.3**2 * np.array([-20 * -1.2, 10.0])
+    np.testing.assert_allclose(found, expected, rtol=1e-5)
+
+
+def test_bent_steps_follow_a_curved_valley():
+    """Rosenbrock's valley is a parabola; steps without its curvature leave it."""
+    start = jnp.array([-1.2, 1.0])
+    plain, bent = (
+        solve(rosenbrock, start, solver=LevenbergMarquardt(rtol=1e-7, ftol=0.0, geodesic=of))
+        for of in (False, True)
+    )
+    np.testing.assert_allclose(bent.value, 1.0, rtol=AGREE)
+    assert int(bent.stats["num_steps"]) < 0.8 * int(plain.stats["num_steps"])
