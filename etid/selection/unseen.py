@@ -67,9 +67,11 @@ def hidden(fits: Mapping[int, Fit], chosen: int) -> dict[int, float]:
     """
     own = dict(zip(fits[chosen].circuit.names(), values_of(fits[chosen]), strict=True))
     found = {}
+    if "r_p" not in own or SERIES in own:
+        return found
     for number, fit in fits.items():
         names = fit.circuit.names()
-        if "r_p" not in own or SERIES in own or set(names) != {*own, SERIES}:
+        if set(names) != {*own, SERIES}:
             continue
         at = names.index(SERIES)
         sigma = math.sqrt(max(float(np.asarray(fit.cov)[at, at]), 0.0)) / own["r_p"]
@@ -80,7 +82,7 @@ def hidden(fits: Mapping[int, Fit], chosen: int) -> dict[int, float]:
 
 
 def posterior(estimate: float, sigma: float) -> tuple[float, float]:
-    """Evidence B for a spread against none, and the mean of ε².
+    """Evidence B for ε against none, and the mean of ε².
 
     Args:
         estimate: Estimate of ε.
