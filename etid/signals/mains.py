@@ -21,7 +21,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Array, Bool, Complex, Float, Int
 
-from etid.signals.harmonics import namespace
+from etid.signals.harmonics import mixtures, namespace
 
 MAINS = (50.0, 60.0)  # [Hz]
 MULTIPLES = 7  # higher multiples are a thousandth of the first in most laboratories
@@ -153,8 +153,7 @@ def _probes(
 ) -> tuple[Float[np.ndarray, "probe time"], float]:
     """Four probes for hum, and their response to pulses.
 
-    A probe is a mixture of the bins beside the first three multiples, with a square sum of 1. Four
-    products per record replace a transform, at a tenth of its cost.
+    They are `mixtures` of the bins beside the first three multiples.
 
     Returns:
         The probes, and the response of a probe to pulses of mean 1 if the record is one sample
@@ -163,15 +162,9 @@ def _probes(
     places = _multiples(samples / sample_rate)[:, :3].ravel()
     bins = _between(np.concatenate([np.floor(places), np.ceil(places)]).astype(int), periods)
     left = 2 * np.pi * bins / (periods * samples * np.abs(np.exp(2j * np.pi * bins / periods) - 1))
-    mixtures = np.zeros((2, samples), dtype=complex)
-    for number, m in enumerate(bins):
-        wave = np.exp(2j * np.pi * (m * np.arange(samples) % samples) / samples)
-        mixtures[0] += wave
-        mixtures[1] += wave if number % 4 < 2 else -wave
-    probes = np.concatenate([np.real(mixtures), np.imag(mixtures)])
     # At 10 Hz all mains frequencies are harmonics: no bin is left, and the probes are 0.
-    norm = math.sqrt(max(bins.size, 1) * samples / 2)
-    return probes / norm, samples / norm * math.sqrt(np.sum(left**2))
+    response = math.sqrt(2 * samples / max(bins.size, 1) * np.sum(left**2))
+    return mixtures(bins, np.arange(bins.size) % 4 >= 2, samples), response
 
 
 @functools.lru_cache(maxsize=8)

@@ -37,7 +37,7 @@ import numpy as np
 import scipy.fft
 from jaxtyping import Array, Bool, Complex, Float, Int
 
-from etid.signals.harmonics import DRIFT_DEGREE, WINDOW, harmonics, namespace
+from etid.signals.harmonics import DRIFT_DEGREE, WINDOW, harmonics, mixtures, namespace
 
 # Order of the differences; the ringing after the edges, at a quarter of the rate, is still smooth
 # to them.
@@ -327,11 +327,6 @@ def _bins(
 
 @functools.lru_cache(maxsize=8)
 def _probes(periods: int, samples: int) -> Float[np.ndarray, "probe time"]:
-    """Four mixtures of the lowest bins, with a square sum of 1: a tenth of a transform."""
-    turns = np.arange(samples) / samples
+    """`mixtures` of the lowest bins between the harmonics."""
     low = [number for number in range(1, 2 * LOWEST) if number % periods][:LOWEST]
-    mixed = np.zeros((2, samples), complex)
-    for place, number in enumerate(low):
-        wave = np.exp(2j * np.pi * number * turns)
-        mixed += np.stack([wave, -wave if place % 2 else wave])
-    return np.concatenate([np.real(mixed), np.imag(mixed)]) / math.sqrt(len(low) * samples / 2)
+    return mixtures(np.array(low), np.arange(len(low)) % 2 == 1, samples)
