@@ -19,7 +19,7 @@ from etid.estimators.lanes import Harmonics, stacked
 from etid.estimators.maximum_likelihood.estimator import description
 from etid.estimators.maximum_likelihood.given_driver import AbstractGiven
 from etid.estimators.registry import MAXIMUM_LIKELIHOOD, register_description
-from etid.identify.arguments import Asked, circuit_of, fed, plan, require, require_float64
+from etid.identify.arguments import Asked, circuit_of, driver_of, fed, plan, require_float64
 from etid.identify.arguments import recordings as list_of
 from etid.identify.compiled import stored_jit
 from etid.identify.one import failed_fit, known_of, successful
@@ -96,8 +96,7 @@ def identify_amplitudes(
         IdentificationError: The verdict is not successful and `throw` is set.
     """
     require_float64()
-    if driver is not None:
-        require("driver", driver, Driver)
+    driver = driver_of(driver)
     circuit = SkinCurrent() if circuit is None else circuit_of(circuit)
     current_dependent(circuit.impedance())
     feed = (

@@ -19,6 +19,7 @@ from etid.estimators.estimator import AbstractEstimator
 from etid.estimators.maximum_likelihood.estimator import MaximumLikelihood
 from etid.estimators.output_error.estimator import OutputError
 from etid.estimators.registry import MAXIMUM_LIKELIHOOD, OUTPUT_ERROR, Method, named
+from etid.recordings.errors import not_recorded
 from etid.recordings.preflight import Inspected, preflight
 from etid.recordings.recording import Recording, RecordingError
 from etid.recordings.study import Study
@@ -315,23 +316,32 @@ def for_calibrations(
     return MAXIMUM_LIKELIHOOD if several else OUTPUT_ERROR
 
 
+def driver_of(value: Driver | None) -> Driver | None:
+    """The given driver, or None.
+
+    Raises:
+        RecordingError: The value is neither.
+    """
+    if value is not None:
+        require("driver", value, Driver)
+    return value
+
+
 def fed(recording: Recording, driver: Driver | None) -> tuple[Recording, AbstractFeed]:
     """A recording and its feed: the driver, or without a driver the measured current.
 
     With a driver the current is not used; without one `v_th` is not used.
 
     Raises:
-        RecordingError: The recording lacks what its feed needs.
+        RecordingError: An argument has another type, or the recording lacks what its feed needs.
     """
+    require("recording", recording, Recording)
+    driver = driver_of(driver)
     if driver is None:
         return recording.without_v_th(), MEASURED_CURRENT
     if recording.cause != driver.recorded:
-        raise RecordingError(
-            "was not recorded, and a driver needs it",
-            path=recording.path,
-            field=driver.recorded,
-            remedy="Leave the driver out: the load is then identified from the current",
-        )
+        remedy = "Leave the driver out: the load is then identified from the current"
+        raise not_recorded(recording.path, driver.recorded, remedy)
     return recording, driver
 
 

@@ -32,6 +32,7 @@ from etid.identify.arguments import (
     candidates_of,
     check_default,
     drift_of,
+    driver_of,
     fed,
     order_of,
     require,
@@ -369,8 +370,7 @@ def identify_skins(
     Raises:
         ValueError: There is no recording, or the method cannot use this circuit.
     """
-    if driver is not None:
-        require("driver", driver, Driver)
+    driver = driver_of(driver)
     candidates = candidates_of(circuit)
     asked = asked_of(method, candidates, fixed, prior)
     if isinstance(recordings, Study):

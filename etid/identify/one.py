@@ -148,9 +148,6 @@ def candidate_fits(
     Raises:
         ValueError: The method cannot use this driver.
     """
-    require("recording", recording, Recording)
-    if driver is not None:
-        require("driver", driver, Driver)
     recording, feed = fed(recording, driver)
     seen = Inspected(recording)
     estimator, name = plan(asked, seen, feed)

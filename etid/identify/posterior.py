@@ -298,9 +298,6 @@ def given(
             "this fit does not know its recording and its driver; pass both, as in "
             "fit.posterior(recording, driver)"
         )
-    require("recording", recording, Recording)
-    if driver is not None:
-        require("driver", driver, Driver)
     recording, feed = fed(recording, driver)
     if np.ndim(fit.rrse):
         raise ValueError("this is a batch of fits; take one of them, as in fits[0]")

@@ -11,7 +11,7 @@ from etid.estimators.lanes import AlignedSamples
 from etid.estimators.output_error import fit as output_error
 from etid.estimators.output_error import prediction
 from etid.estimators.registry import OUTPUT_ERROR
-from etid.identify.arguments import circuit_of, fed, require, require_float64
+from etid.identify.arguments import circuit_of, fed, require_float64
 from etid.identify.compiled import stored_jit
 from etid.identify.steady_state import periodic_voltage
 from etid.recordings.preflight import Inspected
@@ -53,16 +53,13 @@ def predict(
             response of the circuit in time is not known and the record holds no whole period.
     """
     require_float64()
-    require("recording", recording, Recording)
-    if driver is not None:
-        require("driver", driver, Driver)
+    recording, feed = fed(recording, driver)
     if circuit is not None:
         circuit = circuit_of(circuit)
     else:
         if recording.r_load is None:
             raise ValueError("give the circuit: this recording has no known resistor")
         circuit = Resistor(recording.r_load)
-    recording, feed = fed(recording, driver)
     if not isinstance(feed, MeasuredCurrent):
         feed = serving(feed, ContinuousDriver, str(OUTPUT_ERROR))
     seen, simulated = Inspected(recording), circuit.impedance().has_response

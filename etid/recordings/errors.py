@@ -49,6 +49,17 @@ class RecordingError(ValueError):
         )
 
 
+def not_recorded(path: str, field: str, remedy: str) -> RecordingError:
+    """The error for a record that a recording does not have.
+
+    Args:
+        path: HDF5 path of the recording.
+        field: Name of the record.
+        remedy: What the user can do.
+    """
+    return RecordingError("was not recorded", path=path, field=field, remedy=remedy)
+
+
 def _rebuild_error(message: str, file: str, path: str, field: str, remedy: str) -> RecordingError:
     return RecordingError(message, file=file, path=path, field=field, remedy=remedy)
 

@@ -20,7 +20,7 @@ from jaxtyping import Float
 
 from etid.circuits.overview import Overview, Overviewed
 from etid.recordings.errors import RecordingError as RecordingError
-from etid.recordings.errors import located
+from etid.recordings.errors import located, not_recorded
 from etid.recordings.fields import (
     DECLARED,
     LABELS,
@@ -154,12 +154,7 @@ class Recording(Overviewed, AbstractFields):
             RecordingError: It was not recorded.
         """
         if "v_th" not in self.samples:
-            raise RecordingError(
-                "was not recorded",
-                path=self.path,
-                field="v_th",
-                remedy="Use `current`, which this recording has",
-            )
+            raise not_recorded(self.path, "v_th", "Use `current`, which this recording has")
         return self.samples["v_th"].values
 
     @property
@@ -216,12 +211,8 @@ class Recording(Overviewed, AbstractFields):
             RecordingError: The current was not recorded.
         """
         if "current" not in self.samples:
-            raise RecordingError(
-                "was not recorded",
-                path=self.path,
-                field="current",
-                remedy="Pass the driver of this recording, from etid.identify_driver",
-            )
+            remedy = "Pass the driver of this recording, from etid.identify_driver"
+            raise not_recorded(self.path, "current", remedy)
         return self if "v_th" not in self.samples else self.replace(v_th=None)
 
     def split(self, trigger: npt.ArrayLike | None = None) -> "list[Recording]":
