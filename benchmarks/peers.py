@@ -25,7 +25,7 @@ from etid.estimators.estimate import MAX_STEPS
 from etid.estimators.harmonic_steiglitz_mcbride.iteration import fit_skin
 from etid.estimators.maximum_likelihood.load import WELL
 from etid.estimators.steiglitz_mcbride.iteration import iterate
-from etid.identify.many import each
+from etid.identify.batches import each
 from etid.signals.filtering import lfilter
 from etid.signals.transfer import Rational
 from etid.solvers.levenberg_marquardt import normal_equations

@@ -20,7 +20,7 @@ from etid.circuits.circuit import (
     SkinLayers,
     SkinRC,
 )
-from etid.identify import many
+from etid.identify import batches
 from etid.identify.arguments import Asked, fed
 from etid.results.fits import Fit
 from etid.selection.search import CANDIDATES
@@ -97,7 +97,7 @@ def scene(snr_db: float, driver: int) -> Scene:
 
 def choices(records: Sequence[etid.Recording], driver: etid.Driver) -> list[Selection]:
     """What etid chooses for each recording alone, as `select_circuit` does, in batches."""
-    found, _, _ = many.choices(
+    found, _, _ = batches.choices(
         len(records), lambda row: fed(records[row], driver), CANDIDATES, Asked(), False
     )
     return found

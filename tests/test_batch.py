@@ -11,7 +11,7 @@ import pytest
 import etid
 from etid.estimators.lanes import PaddedSamples
 from etid.estimators.registry import OUTPUT_ERROR
-from etid.identify import many as batch
+from etid.identify import batches
 from etid.identify.one import skin_lane
 from etid.recordings.preflight import Inspected
 from etid.simulation.scenes import Scene, Trial
@@ -39,7 +39,7 @@ def simulate(count=1, calibrations=1, seed=0, samples=LENGTH, **options):
 @pytest.fixture(scope="module", autouse=True)
 def several_calls():
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(batch, "LANES", FEW)
+        patch.setattr(batches, "LANES", FEW)
         yield
 
 
@@ -137,7 +137,7 @@ def test_a_study_of_ragged_lengths_compiles_for_few(study, driver, monkeypatch):
         traced.append(arguments)
         return skin_lane(*arguments)
 
-    monkeypatch.setattr(batch, "skin_lane", counted)
+    monkeypatch.setattr(batches, "skin_lane", counted)
     records = [
         cut(record, size)
         for record, size in zip(study.loaded.recordings(), range(2900, PULSE, 13), strict=False)
@@ -169,7 +169,7 @@ def test_one_function_per_length_serves_all_drivers(study, driver, monkeypatch):
     other = etid.identify_driver(simulate(seed=5)["calibration/0"])
     records = [study[path] for path in list(study.loaded)[:9]]
     etid.identify_skins(records, driver)
-    monkeypatch.setattr(batch, "skin_lane", None)  # of which another trace would have need
+    monkeypatch.setattr(batches, "skin_lane", None)  # of which another trace would have need
     assert etid.identify_skins(records[:7], other).counts() == {"successful": 7}
 
 

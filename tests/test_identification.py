@@ -256,7 +256,7 @@ def test_fits_are_a_table(fits):
 
 
 def test_a_chunk_compiles_once_per_length(study, driver, monkeypatch):
-    from etid.identify import many as batch
+    from etid.identify import batches
 
     traces = []
 
@@ -264,7 +264,7 @@ def test_a_chunk_compiles_once_per_length(study, driver, monkeypatch):
         traces.append(arguments)
         return skin_lane(*arguments)
 
-    monkeypatch.setattr(batch, "skin_lane", counted)
+    monkeypatch.setattr(batches, "skin_lane", counted)
     other = etid.SkinRC(10e3, 50e3, 1e-9)  # typical values are data, not structure
     records = list(study.loaded.recordings())
     etid.identify_skins(records[:5], driver)

@@ -14,8 +14,7 @@ from etid.circuits.circuit import SkinRC
 from etid.circuits.elements import resistor
 from etid.estimators import registry
 from etid.estimators.maximum_likelihood import terms as likelihood
-from etid.identify import arguments, one
-from etid.identify import many as batch
+from etid.identify import arguments, batches, one
 from etid.identify.one import known_at, skin_lane
 from etid.recordings.preflight import Inspected
 from etid.simulation.scenes import Scene, Trial
@@ -202,7 +201,7 @@ def test_a_study_of_ragged_lengths_compiles_once(study, driver, monkeypatch):
         traced.append(arguments)
         return skin_lane(*arguments)
 
-    monkeypatch.setattr(batch, "skin_lane", counted)
+    monkeypatch.setattr(batches, "skin_lane", counted)
     records = [
         record.replace(v_th=record.v_th[:size], v_out=record.v_out[:size])
         for record in study.loaded.recordings()

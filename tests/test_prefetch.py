@@ -5,7 +5,7 @@ import threading
 import pytest
 
 import etid
-from etid.identify import many as batch
+from etid.identify import study_drivers
 from etid.identify.prefetch import prefetch
 from etid.simulation.scenes import Scene, Trial
 from etid.simulation.transformer import ResistorLoad, SkinLoad
@@ -84,8 +84,8 @@ def test_a_driver_is_identified_once_by_threads_that_ask_together(monkeypatch):
             together.wait(0.2)  # the other must not come here
         raise etid.IdentificationError("no driver", None)
 
-    monkeypatch.setattr(batch, "identify_driver", slow)
-    drivers = batch.Drivers(study, 5, None)
+    monkeypatch.setattr(study_drivers, "identify_driver", slow)
+    drivers = study_drivers.Drivers(study, 5, None)
     refused = []
 
     def ask():

@@ -33,7 +33,8 @@ from etid.circuits.circuit import AbstractCircuit
 from etid.circuits.lookup import qualified
 from etid.estimators.registry import Method
 from etid.identify.arguments import Asked, Circuit, asked_of, candidates_of, order_of
-from etid.identify.many import Drivers, common_first, identify_part, to_identify
+from etid.identify.many import common_first, identify_part, to_identify
+from etid.identify.study_drivers import Drivers
 from etid.recordings.hdf5 import read
 from etid.recordings.recording import RecordingError
 from etid.recordings.replacing import replacing

@@ -40,20 +40,12 @@ from etid.identify.arguments import (
     require,
     require_float64,
 )
+from etid.identify.batches import LANES, chunked, each, filled
 from etid.identify.compiled import stored_jit
-from etid.identify.many import (
-    LANES,
-    Drivers,
-    chunked,
-    common_first,
-    each,
-    filled,
-    identify_part,
-    table,
-    to_identify,
-)
+from etid.identify.many import common_first, identify_part, table, to_identify
 from etid.identify.one import checksum, concluded, failed_fit, is_shared, note, repeated
 from etid.identify.planning import Refusal, planned
+from etid.identify.study_drivers import Drivers
 from etid.recordings.preflight import Inspected
 from etid.recordings.recording import Recording
 from etid.recordings.remarks import Remark
