@@ -1,5 +1,7 @@
 """Loads identified from a measured current: accuracy, delays, batches, and wrong input."""
 
+from typing import Any
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -8,6 +10,7 @@ import scipy.io
 import etid
 from etid import cli
 from etid.estimators.lanes import Harmonics
+from etid.identify import file as fit_file
 from etid.plotting import figure_of
 from etid.plotting.bands import bands
 from etid.recordings.preflight import Inspected, preflight
@@ -193,7 +196,7 @@ def test_a_batch_gives_the_fits_of_single_recordings(skin):
     assert (fits.verdicts == "successful").all()
 
 
-KNOWN = {"fixed": {"r_s": 33e3}, "prior": {"c_p": (0.12e-9, 1e-13)}}
+KNOWN: dict[str, Any] = {"fixed": {"r_s": 33e3}, "prior": {"c_p": (0.12e-9, 1e-13)}}
 
 
 def test_a_batch_takes_known_elements(skin):
@@ -210,6 +213,57 @@ def test_a_wrong_known_element_of_a_batch_is_refused(skin):
         etid.identify_skins([skin], fixed={"r_x": 1.0})
 
 
+def test_draws_of_a_fit_with_known_elements_keep_to_them(skin):
+    fit = etid.identify_skin(skin, **KNOWN)
+    draws = fit.posterior()
+    assert draws.effective > 800  # of 1000: the likelihood is normal at 60 dB
+    np.testing.assert_allclose(draws.draws.r_s, 33e3, rtol=1e-7)
+    free = etid.identify_skin(skin)
+    for name in ("r_p", "c_p"):
+        error = float(getattr(fit.stderr, name))
+        assert error < 0.95 * float(getattr(free.stderr, name))
+        expected = float(getattr(fit.circuit, name)) + np.array([-1.96, 1.96]) * error
+        for interval in (draws.intervals()[name], fit.profile(name).interval()):
+            # 1000 draws give an end of the interval to a tenth of a standard error.
+            np.testing.assert_allclose(interval, expected, rtol=0, atol=0.3 * error)
+    with pytest.raises(ValueError, match="r_s is fixed, so it has no profile"):
+        fit.profile("r_s")
+
+
+def test_a_choice_among_circuits_takes_elements_that_all_of_them_have(skin):
+    few = [etid.SkinRC(), etid.SkinCole()]
+    selection = etid.select_circuit(skin, candidates=few, fixed={"r_s": 33e3})
+    np.testing.assert_allclose(selection.fit.circuit.r_s, 33e3, rtol=1e-8)
+    for choose in (
+        lambda: etid.identify_skin(skin, circuit="auto", fixed={"r_s": 33e3}),
+        lambda: etid.select_circuit(skin, fixed={"r_s": 33e3}),
+    ):
+        with pytest.raises(ValueError, match="r_s is known, but ParallelRC and Resistor have no"):
+            choose()
+
+
+def test_a_run_with_other_known_elements_is_not_resumed(skin, tmp_path, monkeypatch):
+    source, target = tmp_path / "study.h5", tmp_path / "fits.h5"
+    etid.Study.from_recordings([skin.replace(path="s01/0")]).write(source)
+
+    def interrupted(*_):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(fit_file, "_fit", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            etid.fit_file(source, target, **KNOWN)
+    with pytest.raises(fit_file.ResumeError, match="another fixed"):
+        etid.fit_file(source, target, fixed={"r_s": 34e3}, prior=KNOWN["prior"], resume=True)
+    with pytest.raises(fit_file.ResumeError, match="another prior"):
+        etid.fit_file(source, target, fixed=KNOWN["fixed"], resume=True)
+    found = etid.fit_file(source, target, **KNOWN, resume=True)
+    settings = etid.StudyFits.read(target).settings
+    assert settings is not None
+    assert (found.settings, settings.fixed) == (settings, ("r_s 33000.0",))
+    assert settings.prior == ("c_p 1.2e-10 ± 1e-13",)
+
+
 def test_a_joint_fit_leaves_recordings_of_a_current_to_fits_of_their_own(skin):
     joint = etid.identify_jointly(etid.Study.from_recordings([skin.replace(path="s01/0")]))
     fit, alone = joint.fits[0], etid.identify_skin(skin)
@@ -222,6 +276,11 @@ def test_one_load_is_identified_from_several_recordings_of_its_current(skin):
     several = [skin, *(recorded(SKIN, seed=seed, delay=seed * 1e-6) for seed in (1, 2, 3))]
     fit = etid.identify_amplitudes(several, circuit=etid.SkinRC())
     assert np.abs(off(fit, SKIN)).max() < WITHIN
+    known = etid.identify_amplitudes(several, circuit=etid.SkinRC(), **KNOWN)
+    np.testing.assert_allclose(known.circuit.r_s, 33e3, rtol=1e-8)
+    assert known.stderr.c_p < 1e-13
+    assert known.stderr.r_p < 0.95 * fit.stderr.r_p
+    assert np.abs(off(known, SKIN))[1:].max() < WITHIN
     alone = etid.identify_skin(skin)
     # Four recordings with equal noise, whose level is estimated to a few per cent.
     np.testing.assert_allclose(fit.stderr.r_p, alone.stderr.r_p / 2, rtol=0.1)
@@ -241,7 +300,7 @@ def test_known_elements_on_the_command_line(skin, tmp_path, capsys):
         (["--fix", "r_s=1,2"], "--fix r_s has 2 numbers; write --fix r_s=500"),
         (["--fix", "r_s=1", "--fix", "r_s=2"], "names an element twice: r_s, r_s"),
         (["--fix", "r_x=1"], "'r_x' is no element of SkinRC"),
-        (["--joint", "--fix", "r_s=1"], "remove --fix and --prior"),
+        (["--joint", "--fix", "r_x=1"], "'r_x' is no element of SkinRC"),
     ):
         capsys.readouterr()
         assert cli.main([*command, *options]) == 1

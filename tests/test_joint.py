@@ -60,6 +60,24 @@ def test_every_recording_has_its_verdict_and_a_bad_one_costs_itself_alone(study,
     assert outcome.fits.fit.method == "joint"
 
 
+@pytest.mark.slow
+def test_known_elements_of_a_joint_fit_help_the_others(study, outcome):
+    few = Study.from_recordings([study[path] for path in ("calibration/0", *TOGETHER)])
+    free = outcome.fits.where(path=TOGETHER[0])[0]
+    fixed = etid.identify_jointly(few, fixed={"r_s": DRY.r_s}, r_load_tolerance=0.01)
+    for fit in fixed.fits:
+        assert fit.verdict == "successful"
+        np.testing.assert_allclose(fit.circuit.r_s, DRY.r_s, rtol=1e-8)
+        assert fit.stderr.r_s < 1e-8 * DRY.r_s  # the tolerance of R_L does not reach it
+        off = np.asarray(fit.circuit.values() - TRUTH)[1:]
+        assert (np.abs(off) < SIGMAS * np.asarray(fit.stderr.values())[1:]).all()
+    assert fixed.settings is not None
+    assert fixed.settings.fixed == ("r_s 33400.0",)
+    told = etid.identify_jointly(few, prior={"r_p": (DRY.r_p, 10.0)}).fits[0]
+    assert told.stderr.r_p < 10.0 < 0.1 * free.stderr.r_p
+    assert told.stderr.r_s < free.stderr.r_s
+
+
 def test_another_skin_is_a_misfit_where_chi2_does_not_show_it():
     """R_s would be wrong by more than five of its standard errors and called successful."""
     odd = Trial("odd", Cole(DRY, alpha=0.9), condition="odd")

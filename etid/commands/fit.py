@@ -141,8 +141,6 @@ def run(arguments: argparse.Namespace) -> Outcome:
     if arguments.joint and arguments.driver_drift:
         raise ValueError("--joint identifies the driver itself; remove --driver-drift")
     fixed, prior = _several("--fix", arguments.fix, 1), _several("--prior", arguments.prior, 2)
-    if arguments.joint and (fixed or prior):
-        raise ValueError("--joint takes no known elements; remove --fix and --prior")
     circuit = None if arguments.circuit is None else arguments.circuit()
     progress = sys.stderr.isatty()
     if arguments.joint:
@@ -150,7 +148,12 @@ def run(arguments: argparse.Namespace) -> Outcome:
             raise ValueError("--joint is one fit per driver; remove --resume, --workers and --dask")
         with hdf5.read(arguments.source) as study:
             outcome = identify_jointly(
-                study, order=arguments.order, circuit=circuit, progress=progress
+                study,
+                order=arguments.order,
+                circuit=circuit,
+                fixed=fixed,
+                prior=prior,
+                progress=progress,
             )
         outcome.write(arguments.target)
     else:

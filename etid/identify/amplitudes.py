@@ -3,7 +3,7 @@
 import dataclasses
 import functools
 import operator
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 
 import jax
 import jax.numpy as jnp
@@ -14,12 +14,13 @@ from etid.circuits.current_dependent import SkinCurrent, current_dependent
 from etid.estimators import judgement
 from etid.estimators.amplitudes.fit import fit_amplitudes
 from etid.estimators.amplitudes.terms import Amplitudes, currents
+from etid.estimators.element_prior import ElementPrior
 from etid.estimators.estimator import serving
 from etid.estimators.lanes import Harmonics, stacked
 from etid.estimators.maximum_likelihood.estimator import description
 from etid.estimators.maximum_likelihood.given_driver import AbstractGiven
 from etid.estimators.registry import MAXIMUM_LIKELIHOOD, register_description
-from etid.identify.arguments import Asked, circuit_of, driver_of, fed, plan, require_float64
+from etid.identify.arguments import asked_of, circuit_of, driver_of, fed, plan, require_float64
 from etid.identify.arguments import recordings as list_of
 from etid.identify.compiled import stored_jit
 from etid.identify.one import failed_fit, known_of, successful
@@ -49,9 +50,10 @@ def _fit(
     known: AbstractGiven,
     feed: HarmonicDriver | MeasuredCurrent,
     circuit: AbstractCircuit,
+    prior: ElementPrior | None,
 ) -> Fit:
     rate = jnp.asarray(lanes.sample_rate)[0]
-    of = Amplitudes(known, feed, circuit, lanes.spectrum, rate)
+    of = Amplitudes(known, feed, circuit, lanes.spectrum, rate, prior)
     estimate = fit_amplitudes(of)
     fit = judgement.judged(estimate, circuit, feed.result, METHOD)
     unsure = jnp.sqrt(jnp.diagonal(estimate.cov)) > judgement.NO_CURRENT
@@ -63,6 +65,8 @@ def identify_amplitudes(
     driver: Driver | None = None,
     *,
     circuit: AbstractCircuit | None = None,
+    fixed: Mapping[str, float] | None = None,
+    prior: Mapping[str, tuple[float, float]] | None = None,
     throw: bool = True,
 ) -> Fit:
     """Identify one load from recordings at several amplitudes; it may depend on its current.
@@ -81,6 +85,8 @@ def identify_amplitudes(
         driver: Driver identified by maximum likelihood. None for recordings of the current.
         circuit: Structure of the load and its typical values; `SkinCurrent` if not given. Any other
             circuit is fitted to all recordings together.
+        fixed: As in `identify_skin`.
+        prior: As in `identify_skin`; also for a current I_0.
         throw: Raise an error if the verdict is not successful.
 
     Returns:
@@ -99,6 +105,8 @@ def identify_amplitudes(
     driver = driver_of(driver)
     circuit = SkinCurrent() if circuit is None else circuit_of(circuit)
     current_dependent(circuit.impedance())
+    asked = asked_of(MAXIMUM_LIKELIHOOD, [circuit], fixed, prior)
+    of_elements = ElementPrior.of(asked.known, circuit) if asked.known else None
     feed = (
         MEASURED_CURRENT
         if driver is None
@@ -107,13 +115,13 @@ def identify_amplitudes(
     of = _alike(list_of("recordings", recordings))
     seen = [Inspected(fed(one, driver)[0]) for one in of]
     for one in seen:
-        _, name = plan(Asked(MAXIMUM_LIKELIHOOD), one, feed)
+        _, name = plan(asked, one, feed)
         if name is not None:
             fit = failed_fit(name, circuit, METHOD)
             return successful(one.recording, fit) if throw else fit
     lanes = [Harmonics.of(one) for one in seen]
     known = known_of(lanes[0], feed, False, MAXIMUM_LIKELIHOOD)
-    fit = jax.device_get(_fit(stacked(lanes), known, feed, circuit))
+    fit = jax.device_get(_fit(stacked(lanes), known, feed, circuit, of_elements))
     of_records = functools.reduce(operator.or_, (int(one.remarks) for one in seen))
     fit = dataclasses.replace(fit, remarks=np.asarray(fit.remarks | of_records))
     return successful(seen[0].recording, fit) if throw else fit

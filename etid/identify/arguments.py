@@ -266,11 +266,19 @@ def asked_of(
 
     Raises:
         ValueError: As `estimator_of`, `informed` and `with_known`; or a known element is no element
-            of these circuits.
+            of one of these circuits.
     """
     asked = Asked(estimator_of(method, candidates), informed(fixed, prior))
     if asked.estimator is not None:
         with_known(asked.estimator, asked.known)
+    for name, *_ in asked.known if len(candidates) > 1 else ():
+        without = [type(one).__name__ for one in candidates if name not in one.names()]
+        if without:
+            raise ValueError(
+                f"{name} is known, but {' and '.join(without)} have no such element, so the choice "
+                "would compare circuits with different knowledge; pass one circuit, or call "
+                "select_circuit with candidates that all have it"
+            )
     for circuit in candidates if asked.known else ():
         checked(asked.known, circuit)
     return asked

@@ -240,6 +240,7 @@ def fit_file(
             str(asked.estimator or ""),
             candidates,
             driver_drift=driver_drift,
+            known=asked.known,
         )
         described = json.loads(json.dumps(dataclasses.asdict(settings)))  # tuples become lists
         run = {
@@ -250,7 +251,6 @@ def fit_file(
                     f"{qualified(type(one))} {eqx.tree_pformat(one)}" for one in candidates
                 ).encode()
             ).hexdigest(),
-            "known elements": repr(asked.known),
             "size of a part": PART,
         }
         parts = _Parts(target, run, resume)

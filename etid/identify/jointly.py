@@ -8,7 +8,7 @@ standard errors separate the own error of a trial from the error that all trials
 import dataclasses
 import itertools
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -20,6 +20,7 @@ from tqdm import tqdm
 
 from etid.circuits.circuit import AbstractCircuit
 from etid.estimators import judgement
+from etid.estimators.element_prior import ElementPrior
 from etid.estimators.estimate import DELAY_WIDTH, Estimate
 from etid.estimators.estimator import serving
 from etid.estimators.joint.errors import Delay
@@ -35,6 +36,7 @@ from etid.estimators.starts import harmonic_starts
 from etid.identify.arguments import (
     Asked,
     Circuit,
+    asked_of,
     candidates_of,
     order_of,
     require,
@@ -122,10 +124,13 @@ def _together(
     common, cov, found = fit_together(model, groups, several)
     # The records determine all impedances in units of the known resistor.
     power, _ = model.circuit.scaling()
-    scale = tolerance**2 * jnp.outer(power, power)
 
     def fit(found: tuple[Estimate, Bool[Array, ""], Delay]) -> Fit:
         estimate, other, _ = found
+        moved = power
+        if model.prior is not None:  # a prior holds the elements back
+            moved = power - estimate.cov @ (model.prior.precision * power)
+        scale = tolerance**2 * jnp.outer(moved, moved)
         with_scale = dataclasses.replace(
             estimate, cov=estimate.cov + scale, shared_cov=estimate.shared_cov + scale
         )
@@ -267,6 +272,8 @@ def identify_jointly(
     *,
     order: Order = 5,
     circuit: Circuit = None,
+    fixed: Mapping[str, float] | None = None,
+    prior: Mapping[str, tuple[float, float]] | None = None,
     r_load_tolerance: float = 0.0,
     progress: bool = False,
 ) -> StudyFits:
@@ -284,6 +291,8 @@ def identify_jointly(
         order: Number of poles of Z_th.
         circuit: Structure of the loads and its typical values; `SkinRC` if not given. With
             `"auto"` it is chosen as in `identify_skins`, from fits of single recordings.
+        fixed: As in `identify_skin`, for all recordings.
+        prior: As in `identify_skin`, for all recordings.
         r_load_tolerance: Relative standard deviation of the known resistors. No record shows this
             error. It passes 1:1 into every resistance and inversely into every capacitance.
         progress: Show a progress bar.
@@ -300,10 +309,12 @@ def identify_jointly(
     require("study", study, Study)
     order = order_of(order)
     candidates = candidates_of(circuit)
+    asked = asked_of(None, candidates, fixed, prior)
     drivers = Drivers(study, order, None)
     paths = to_identify(study)
-    candidates = common_first(study, paths, drivers, candidates, Asked())
+    candidates = common_first(study, paths, drivers, candidates, asked)
     circuit = candidates[0]
+    known = ElementPrior.of(asked.known, circuit) if asked.known else None
     fits: dict[int, Fit] = {}
     notes = [""] * len(paths)
     waiting: dict[tuple[str, ...], dict[Any, _Waiting]] = {}
@@ -332,7 +343,7 @@ def identify_jointly(
         shared = is_shared(seen, driver)
         key = seen.v_th.size, shared, seen.recording.sample_rate, seen.recording.pulse_rate
         if key not in lengths:
-            lengths[key] = _Waiting(_model(circuit, driver, shared), driver)
+            lengths[key] = _Waiting(_model(circuit, driver, shared, known), driver)
         lengths[key].add(row, seen)
     for names, lengths in tqdm(waiting.items(), unit="driver", disable=not progress):
         driver = next(iter(lengths.values())).driver
@@ -340,7 +351,7 @@ def identify_jointly(
         several = tuple(len(group.several()) for group in lengths.values())
         shared = any(group.model.shared for group in lengths.values())
         tolerance = jnp.asarray(r_load_tolerance, dtype=float)
-        model = _model(circuit, driver, shared)
+        model = _model(circuit, driver, shared, known)
         found, better, delays, cov = _together(model, groups, several, driver, tolerance)
         found, delays, cov = jax.device_get((found, delays, cov))
         width = _narrower(groups, found, delays, cov, float(driver.sample_rate))
@@ -372,13 +383,16 @@ def identify_jointly(
                 notes[row] = note(one)
     if by_current:
         own = [paths[row] for row in by_current]
-        alone = identify_part(study, own, drivers, [circuit], Asked(MAXIMUM_LIKELIHOOD))
+        of_each = Asked(MAXIMUM_LIKELIHOOD, asked.known)
+        alone = identify_part(study, own, drivers, [circuit], of_each)
         as_joint = unstacked(dataclasses.replace(alone.fit, method=METHOD))
         for row, fit, text in zip(by_current, as_joint, alone.notes, strict=True):
             fits[row], notes[row] = fit, str(text)
     ordered = [fits[row] for row in range(len(paths))]
     outcome = table(study, paths, ordered, notes)
-    settings = Settings.of(study, len(paths), order, METHOD, candidates, r_load_tolerance)
+    settings = Settings.of(
+        study, len(paths), order, METHOD, candidates, r_load_tolerance, known=asked.known
+    )
     return StudyFits(outcome, drivers.found, drivers.failures, settings)
 
 
@@ -390,5 +404,7 @@ def _of(fit: Fit, changed: bool) -> Fit:
     return dataclasses.replace(fit, result=verdict("inconsistent")) if explained else fit
 
 
-def _model(circuit: AbstractCircuit, driver: HarmonicDriver, shared: bool) -> Joint:
-    return Joint(circuit, Calibrations.of(driver), shared)
+def _model(
+    circuit: AbstractCircuit, driver: HarmonicDriver, shared: bool, prior: ElementPrior | None
+) -> Joint:
+    return Joint(circuit, Calibrations.of(driver), shared, prior)

@@ -171,7 +171,13 @@ def identify_study(
     candidates = common_first(study, paths, drivers, candidates, asked)
     fits = identify_part(study, paths, drivers, candidates, asked, progress)
     settings = Settings.of(
-        study, len(paths), order, str(asked.estimator or ""), candidates, driver_drift=driver_drift
+        study,
+        len(paths),
+        order,
+        str(asked.estimator or ""),
+        candidates,
+        driver_drift=driver_drift,
+        known=asked.known,
     )
     return StudyFits(fits, drivers.found, drivers.failures, settings)
 

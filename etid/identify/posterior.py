@@ -12,9 +12,9 @@ at 20 dB, less than 15 are effective in one fit of 20. Further rounds therefore 
 and the covariance of the weighted draws (population Monte Carlo; Cappé, Guillin, Marin and Robert
 2004). If few draws are effective, their weights are flattened for this: all get a power below 1.
 
-The prior is uniform in the logarithms. If a recording does not exclude that an element is 0, as R_s
-at 20 dB, the tail of the posterior towards 0 never ends. The draws then cover the surroundings of
-the fit.
+The prior is uniform in the logarithms, times the priors of the fit. If a recording does not
+exclude that an element is 0, as R_s at 20 dB, the tail of the posterior towards 0 never ends. The
+draws then cover the surroundings of the fit.
 
 **Curvature.** The unknown true spectrum of V_th is eliminated from F. Below 40 dB F is therefore
 too narrow: noise in the unloaded record counts as information (Neyman and Scott 1948). The
@@ -24,6 +24,7 @@ that their curvature there is that covariance (Chandler and Bate 2007; Ribatet, 
 """
 
 from collections.abc import Callable
+from typing import cast
 
 import equinox as eqx
 import jax
@@ -34,10 +35,12 @@ from jaxtyping import Array, Float, Int
 from scipy.special import softmax
 
 from etid.circuits.circuit import AbstractCircuit, Circuit
+from etid.estimators.element_prior import FIXED, ElementPrior
 from etid.estimators.lanes import Harmonics
+from etid.estimators.maximum_likelihood.estimator import MaximumLikelihood
 from etid.estimators.maximum_likelihood.given_driver import AbstractGiven
 from etid.estimators.maximum_likelihood.load import Load, refined
-from etid.estimators.registry import MAXIMUM_LIKELIHOOD
+from etid.estimators.registry import MAXIMUM_LIKELIHOOD, named
 from etid.identify.arguments import fed, require
 from etid.identify.compiled import stored_jit
 from etid.identify.one import is_shared, known_of
@@ -60,6 +63,18 @@ ENOUGH = 0.3  # effective part of the draws that ends the rounds
 SEVERAL = 10.0  # effective draws for each parameter, from which a covariance is estimated
 
 
+class Known(eqx.Module):
+    """What is known besides the recording.
+
+    Attributes:
+        driver: Distribution of Z_th, or the measured current.
+        elements: Prior of the elements; None without one.
+    """
+
+    driver: AbstractGiven
+    elements: ElementPrior | None
+
+
 class _Minimum(eqx.Module):
     """The likelihood of a recording, and its minimum.
 
@@ -74,16 +89,17 @@ class _Minimum(eqx.Module):
     cov: Float[Array, "q q"]
 
     @classmethod
-    def of(cls, lane: Harmonics, known: AbstractGiven, circuit: AbstractCircuit) -> "_Minimum":
+    def of(cls, lane: Harmonics, known: Known, circuit: AbstractCircuit) -> "_Minimum":
         terms = terms_of(lane, known, circuit)
-        start = jnp.concatenate([circuit.log_values(), jnp.zeros(1), known.mean])
+        start = jnp.concatenate([circuit.log_values(), jnp.zeros(1), known.driver.mean])
         q = refined(terms, start).value
         return cls(terms, q, inverse(jax.hessian(lambda q: cost(terms, q))(q)))
 
 
-def terms_of(lane: Harmonics, known: AbstractGiven, circuit: AbstractCircuit) -> Load:
+def terms_of(lane: Harmonics, known: Known, circuit: AbstractCircuit) -> Load:
     """The residuals of a recording."""
-    return Load.behind(known, circuit, lane.spectrum, jnp.asarray(lane.sample_rate))
+    rate = jnp.asarray(lane.sample_rate)
+    return Load.behind(known.driver, circuit, lane.spectrum, rate, known.elements)
 
 
 def cost(terms: Load, q: Float[Array, " q"]) -> Float[Array, ""]:
@@ -113,7 +129,7 @@ def _least(
 
 @stored_jit
 def minimum(
-    lane: Harmonics, known: AbstractGiven, circuit: AbstractCircuit
+    lane: Harmonics, known: Known, circuit: AbstractCircuit
 ) -> tuple[Float[Array, " q"], Float[Array, "q q"]]:
     """The minimum of F, and H⁻¹."""
     least = _Minimum.of(lane, known, circuit)
@@ -122,7 +138,7 @@ def minimum(
 
 @stored_jit
 def _costs(
-    lane: Harmonics, known: AbstractGiven, circuit: AbstractCircuit, q: Float[Array, "draw q"]
+    lane: Harmonics, known: Known, circuit: AbstractCircuit, q: Float[Array, "draw q"]
 ) -> Float[Array, " draw"]:
     """F of each draw."""
     terms = terms_of(lane, known, circuit)
@@ -202,7 +218,7 @@ def stretched(
 @stored_jit
 def _profile(
     lane: Harmonics,
-    known: AbstractGiven,
+    known: Known,
     circuit: AbstractCircuit,
     number: Int[Array, ""],
     stretched: Float[Array, ""],
@@ -212,7 +228,7 @@ def _profile(
 
     Args:
         lane: Harmonics of the recording.
-        known: Its driver.
+        known: What is known besides.
         circuit: The fitted circuit.
         number: Number of the element.
         stretched: Standard error of the logarithm of the element, from the fit.
@@ -269,6 +285,8 @@ def profile(fit: Fit, recording: Recording | None, driver: Driver | None, name: 
         )
     lane, known, cov = given(fit, recording, driver)
     number, steps = names.index(name), np.linspace(-WIDE, WIDE, POINTS)
+    if known.elements is not None and known.elements.width[number] <= FIXED:
+        raise ValueError(f"{name} is fixed, so it has no profile; take another element")
     error = np.sqrt(cov[number, number])
     wanted = map(jnp.asarray, (number, error, steps))
     logs, deviance = map(np.asarray, _profile(lane, known, fit.circuit, *wanted))
@@ -285,8 +303,8 @@ def profile(fit: Fit, recording: Recording | None, driver: Driver | None, name: 
 
 def given(
     fit: Fit, recording: Recording | None, driver: Driver | None
-) -> tuple[Harmonics, AbstractGiven, Float[np.ndarray, "element element"]]:
-    """The harmonics of a fit, its driver, and the covariance of the logarithms of its elements.
+) -> tuple[Harmonics, Known, Float[np.ndarray, "element element"]]:
+    """The harmonics of a fit, what is known besides, and the covariance of the log elements.
 
     Raises:
         ValueError: As in `Fit.posterior`.
@@ -301,7 +319,7 @@ def given(
     recording, feed = fed(recording, driver)
     if np.ndim(fit.rrse):
         raise ValueError("this is a batch of fits; take one of them, as in fits[0]")
-    if fit.method != MAXIMUM_LIKELIHOOD.name:
+    if fit.method.partition("(")[0] != MAXIMUM_LIKELIHOOD.name:
         raise ValueError(
             f"this fit was made by {fit.method}; identify the recording with "
             f"method={MAXIMUM_LIKELIHOOD.name!r}"
@@ -318,4 +336,6 @@ def given(
     if int(fit.remarks) & Remark.mains_hum:
         lane = lane.without_mains() or lane
     known = known_of(lane, feed, is_shared(seen, feed), MAXIMUM_LIKELIHOOD)
-    return lane, known, cov
+    told = cast(MaximumLikelihood, named(fit.method)).known_elements
+    elements = ElementPrior.of(told, fit.circuit) if told else None
+    return lane, Known(known, elements), cov

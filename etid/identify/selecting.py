@@ -2,14 +2,14 @@
 
 import itertools
 import reprlib
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 
 import jax.numpy as jnp
 import numpy as np
 
 from etid.circuits.circuit import AbstractCircuit
 from etid.estimators.registry import Method
-from etid.identify.arguments import Asked, estimator_of, require
+from etid.identify.arguments import asked_of, require
 from etid.identify.impedance import identify_impedance
 from etid.identify.one import candidate_fits, successful
 from etid.recordings.recording import Recording, RecordingError
@@ -27,6 +27,8 @@ def select_circuit(
     *,
     candidates: Sequence[AbstractCircuit] = CANDIDATES,
     method: Method | None = None,
+    fixed: Mapping[str, float] | None = None,
+    prior: Mapping[str, tuple[float, float]] | None = None,
     throw: bool = True,
 ) -> Selection:
     """The simplest circuit that a recording supports.
@@ -45,6 +47,8 @@ def select_circuit(
             `ParallelRC`, `Resistor`, `SkinCole`, `SkinLayers`.
         method: An estimator that computes a likelihood, `"maximum_likelihood"`; the default for
             records of several whole periods.
+        fixed: As in `identify_skin`; every candidate must have these elements.
+        prior: As in `identify_skin`; every candidate must have these elements.
         throw: Raise an error if the verdict of the chosen circuit is not successful.
 
     Returns:
@@ -54,11 +58,12 @@ def select_circuit(
     Raises:
         RecordingError: There is no candidate, one of them is no circuit, or no data can tell two of
             them apart.
-        ValueError: The method cannot use this driver, or cannot compare circuits.
+        ValueError: The method cannot use this driver, or cannot compare circuits, or a known
+            element is no element of a candidate.
         IdentificationError: The verdict is not successful and `throw` is set.
     """
     candidates = checked(candidates)
-    asked = Asked(estimator_of(method, candidates))
+    asked = asked_of(method, candidates, fixed, prior)
     fits, chosen = candidate_fits(recording, driver, candidates, asked)
     selection = Selection.of(fits, chosen, candidates)
     if throw:

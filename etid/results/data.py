@@ -97,9 +97,9 @@ class WithData(Generic[Circuit]):
     ) -> Posterior[Circuit]:
         """The distribution of the elements, by importance sampling around the fit.
 
-        The prior is uniform in the logarithms of the elements. The trigger delay and the uncertain
-        part of Z_th are drawn too. If the recording does not exclude that an element is 0, the
-        draws cover the surroundings of the fit.
+        The prior is uniform in the logarithms of the elements, times the priors of the fit. The
+        trigger delay and the uncertain part of Z_th are drawn too. If the recording does not
+        exclude that an element is 0, the draws cover the surroundings of the fit.
 
         Args:
             recording: As in `plot`.

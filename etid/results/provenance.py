@@ -32,6 +32,9 @@ class Settings:
         r_load_tolerance: Relative standard deviation of the known resistors that is included in
             the standard errors.
         driver_drift: As in `identify_driver`.
+        fixed: Known elements and their values [SI], such as `"r_s 500.0"`.
+        prior: Elements with a prior, values and standard deviations [SI], such as
+            `"r_s 500.0 ± 50.0"`.
         precision: Floating-point type of the computation.
         backend: Backend of JAX, such as `"cpu"`.
         versions: Packages and their versions, such as `"jax 0.10.2"`.
@@ -46,6 +49,8 @@ class Settings:
     candidates: tuple[str, ...]
     r_load_tolerance: float
     driver_drift: float
+    fixed: tuple[str, ...]
+    prior: tuple[str, ...]
     precision: str
     backend: str
     versions: tuple[str, ...]
@@ -60,6 +65,7 @@ class Settings:
         candidates: Sequence[AbstractCircuit],
         r_load_tolerance: float = 0.0,
         driver_drift: float = 0.0,
+        known: Sequence[tuple[str, float, float]] = (),
     ) -> "Settings":
         """The settings of a run in this process.
 
@@ -71,6 +77,8 @@ class Settings:
             candidates: The circuit of the fits, then the others from which it was chosen.
             r_load_tolerance: As in `identify_jointly`.
             driver_drift: As in `identify_driver`.
+            known: Names, values and standard deviations of known elements [SI]; the standard
+                deviation of a fixed element is 0.
         """
         source = os.path.abspath(study.file) if study.file else ""
         return cls(
@@ -85,6 +93,8 @@ class Settings:
             else (),
             r_load_tolerance=float(r_load_tolerance),
             driver_drift=float(driver_drift),
+            fixed=tuple(f"{name} {value!r}" for name, value, error in known if not error),
+            prior=tuple(f"{name} {value!r} ± {error!r}" for name, value, error in known if error),
             precision="float64",
             backend=jax.default_backend(),
             versions=tuple(f"{name} {importlib.metadata.version(name)}" for name in PACKAGES),

@@ -49,7 +49,8 @@ def starts(of: Amplitudes) -> Float[Array, "start q"]:
     of_current = currents(of.circuit)
     levels = CURRENTS if of_current.any() else CURRENTS[:1]
     by_current = jnp.asarray(np.outer(np.log(levels), of_current))
-    return jax.vmap(lambda by: of.start(likely + by))(by_current)
+    levels = likely[None, :] + by_current
+    return jax.vmap(of.start)(levels if of.prior is None else of.prior.placed(levels))
 
 
 def fit_amplitudes(of: Amplitudes) -> Estimate:

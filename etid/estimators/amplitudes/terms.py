@@ -17,6 +17,7 @@ from jaxtyping import Array, Bool, Complex, Float
 
 from etid.circuits.circuit import AbstractCircuit
 from etid.circuits.current_dependent import Norton, Signals, current_dependent, port
+from etid.estimators.element_prior import ElementPrior
 from etid.estimators.maximum_likelihood.gain import Gain
 from etid.estimators.maximum_likelihood.given_driver import AbstractGiven, GivenDriver
 from etid.estimators.maximum_likelihood.terms import variance
@@ -45,6 +46,7 @@ class Amplitudes(eqx.Module):
         circuit: Structure of the load and its typical values.
         spectra: The records.
         sample_rate: Their sampling rate [Hz].
+        prior: Prior of the elements; None without one.
     """
 
     given: AbstractGiven
@@ -52,6 +54,7 @@ class Amplitudes(eqx.Module):
     circuit: AbstractCircuit
     spectra: Spectrum
     sample_rate: Float[Array, ""]
+    prior: ElementPrior | None = None
 
     @property
     def count(self) -> int:
@@ -76,12 +79,15 @@ class Amplitudes(eqx.Module):
 
     def priors(self, q: Float[Array, " q"]) -> Float[Array, " q"]:
         """Terms of the priors."""
-        centre = jnp.concatenate([self.start(self.circuit.log_values()), self.given.mean])
+        own = self.circuit.log_values()
+        own = own if self.prior is None else self.prior.placed(own)
+        centre = jnp.concatenate([self.start(own), self.given.mean])
         return (q - centre[: q.size]) / self.widths(q)
 
     def widths(self, q: Float[Array, " q"]) -> Float[Array, " q"]:
         """Prior standard deviations of the unknowns."""
         own = jnp.where(currents(self.circuit), CURRENT_WIDTH, jnp.inf)
+        own = own if self.prior is None else jnp.minimum(own, self.prior.width)
         delays = jnp.broadcast_to(self.given.delay_width, (self.count,))
         rest = jnp.ones(q.size - self.elements - self.count)
         return jnp.concatenate([own, delays, rest])

@@ -164,7 +164,7 @@ class _Seen(NamedTuple):
         known: The recording with the X that the calibrations estimate.
         part: Terms of the recording.
         around: The recording at the knots.
-        linear: Terms at the knots, linear in (common, own); the last is the prior of the delay.
+        linear: Terms at the knots, linear in (common, own); the last are the priors of the own.
     """
 
     gain: Complex[Array, " harmonic"]
@@ -184,14 +184,14 @@ def _seen(
     g, known = apart(lane.predicted, q)
     part = residual(known, g)
     around = Around.of(lane, q, (g, known))
-    of_delay = LoadUnknowns(jnp.zeros(o - 1), 1 / driver.delay_width).vector()
-    of_delay = jnp.concatenate([jnp.zeros(common.size), of_delay])
+    of_own = jnp.diag(1 / lane.gain.widths(q[:o]))
+    of_priors = jnp.concatenate([jnp.zeros((common.size, o)), of_own])
     jacobian = jnp.concatenate([around.jacobian[o:], around.jacobian[:o]])
-    jacobian = jnp.concatenate([jacobian, of_delay[:, None]], axis=1)
+    jacobian = jnp.concatenate([jacobian, of_priors], axis=1)
     share = signal_share(around.x, known.variance_x)
     noise = excess(part, known.selected)[: g.size]
     means = around.mean(jnp.stack([share, noise]))
-    linear = Linear(jacobian, *jnp.concatenate([means, jnp.ones((2, 1))], axis=1))
+    linear = Linear(jacobian, *jnp.concatenate([means, jnp.ones((2, o))], axis=1))
     return _Seen(g, known, part, around, linear)
 
 
@@ -218,7 +218,8 @@ def _is_another(
     """Score test of one load; `bread` and `score` are those of `common` from all terms."""
     seen = _seen(study, load, common, own)
     slope, around = eliminated.slope, seen.around
-    terms = jnp.append(around.part, own.delay_samples / around.at.gain.driver.delay_width)
+    q, gain = own.vector(), around.at.gain
+    terms = jnp.concatenate([around.part, (q - gain.centre(q)) / gain.widths(q)])
     rows = around.at.rows(around.by_changes())
     covariance = jnp.block(
         [
@@ -228,7 +229,7 @@ def _is_another(
     )
     spread = jnp.zeros_like(covariance).at[: bread.shape[0], : bread.shape[0]]
     found = other_circuit.scores(
-        jnp.pad(rows, ((0, 0), (0, 1))),  # no change affects the prior of the delay
+        jnp.pad(rows, ((0, 0), (0, q.size))),  # no change affects the priors
         seen.linear,
         terms,
         # At the minimum the other terms have the opposite gradient.

@@ -40,18 +40,17 @@ def _equations(_, y: Float[Array, " parameter"], study: DriverStudy) -> Arrowhea
 
     def of_group(loads: Loads, owns: LoadUnknowns) -> NormalEquations:
         driver = study.model.around(common, loads.frequency[0])
-        width = driver.delay_width
 
         def one(load: Loads, own: LoadUnknowns) -> NormalEquations:
             lane = study.lane(common, driver, load)
-            alone = lane.equations(jnp.concatenate([own.vector(), driver.mean]))
-            late = own.delay_samples / width
-            slope = LoadUnknowns(jnp.zeros_like(own.log_elements), 1 / width)
-            slope = jnp.concatenate([slope.vector(), jnp.zeros_like(driver.mean)])
+            q = own.vector()
+            alone = lane.equations(jnp.concatenate([q, driver.mean]))
+            prior = 1 / lane.gain.widths(q)
+            rest, others = prior * (q - lane.gain.centre(q)), (0, driver.mean.size)
             found = NormalEquations(
-                alone.objective + 0.5 * late**2,
-                alone.gradient + late * slope,
-                alone.matrix + jnp.outer(slope, slope),
+                alone.objective + 0.5 * jnp.dot(rest, rest),
+                alone.gradient + jnp.pad(prior * rest, others),
+                alone.matrix + jnp.diag(jnp.pad(prior**2, others)),
             ).finite()
             return jax.tree.map(lambda leaf: jnp.where(load.used, leaf, 0.0), found)
 
@@ -202,7 +201,10 @@ def fit_alone(
         hum is seen.
     """
     driver = model.around(model.calibrations.start(), spectrum.frequency, slopes=False)
-    load = Load.behind(driver, model.circuit, spectrum, sample_rate)
+    load = Load.behind(driver, model.circuit, spectrum, sample_rate, model.prior)
+    if model.prior is not None:
+        placed = model.prior.placed(candidates.log_elements)
+        candidates = LoadUnknowns(placed, candidates.delay_samples)
     solution = refined(load, best_start(load, candidates.vector()))
     squares = 2 * solution.stats["normal_equations"].objective
     chi2 = squares / (2 * jnp.sum(spectrum.selected, dtype=squares.dtype) - load.gain.owned)

@@ -15,6 +15,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from etid.circuits.circuit import AbstractCircuit
+from etid.estimators.element_prior import ElementPrior
 from etid.estimators.maximum_likelihood.driver import Calibrations
 from etid.estimators.maximum_likelihood.gain import Gain
 from etid.estimators.maximum_likelihood.given_driver import GivenDriver, around, combined
@@ -35,11 +36,13 @@ class Joint(eqx.Module):
         circuit: Structure of the loads.
         calibrations: Calibrations of the driver of the loads.
         shared: Whether the unloaded record of a load may be that of a calibration.
+        prior: Prior of the elements of every load; None without one.
     """
 
     circuit: AbstractCircuit
     calibrations: Calibrations
     shared: bool = eqx.field(static=True)
+    prior: ElementPrior | None = None
 
     def around(
         self,
@@ -100,7 +103,8 @@ class DriverStudy(eqx.Module):
         """One load behind this driver, which has these parameters."""
         if load.sums is None or self.centre is None:
             return self.whole(driver, load)
-        gain = Gain(driver, self.model.circuit, load.frequency, load.sample_rate)
+        model = self.model
+        gain = Gain(driver, model.circuit, load.frequency, load.sample_rate, model.prior)
         sums = load.sums
         if sums.by_z is not None:
             moved = combined(common - self.centre, sums.by_z)
@@ -109,7 +113,8 @@ class DriverStudy(eqx.Module):
 
     def whole(self, driver: GivenDriver, load: Loads) -> Load:
         """One load behind this driver, with all harmonics."""
-        return Load.behind(driver, self.model.circuit, load.spectrum, load.sample_rate)
+        model = self.model
+        return Load.behind(driver, model.circuit, load.spectrum, load.sample_rate, model.prior)
 
     def at_knots(self, y: Float[Array, " parameter"]) -> "DriverStudy":
         """The study with all loads at the knots, around `y`."""

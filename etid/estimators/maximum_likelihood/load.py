@@ -427,7 +427,9 @@ def fit_circuit(
     wrong_gain = (jnp.abs(found.z[-1]) > NO_HUM) & ~stands_out(unexplained, known)
     by_own, by_z = load.gain.split(elements)
     of_delay = jnp.outer(by_own.delay_samples, by_own.delay_samples) / driver.delay_width**2
+    beside = jnp.zeros(())  # Σ r² of the priors of elements, which a choice of circuits must weigh
     if element_prior is not None:
+        beside = jnp.sum(((own.log_elements - element_prior.centre) / element_prior.width) ** 2)
         weighed = by_own.log_elements * element_prior.precision[None, :]
         of_delay = of_delay + weighed @ by_own.log_elements.T
     of_driver = by_z @ driver.cov @ by_z.T
@@ -439,7 +441,7 @@ def fit_circuit(
     # Increase of the Σ r² of the calibrations.
     strain = jnp.dot(change, jnp.linalg.solve(driver.cov, change))
     squares, terms = jnp.sum(part**2), 2 * jnp.sum(spectrum.selected, dtype=q.dtype)
-    freedom = terms - load.gain.owned
+    freedom, deviance = terms - load.gain.owned, squares + strain + beside
     estimate = Estimate(
         parameters=own.log_elements,
         delay_samples=own.delay_samples[None],
@@ -452,6 +454,6 @@ def fit_circuit(
         strain=strain,
         hum=shows_hum(known, g) & ~wrong_gain,
         falls=falling.causes(squares, terms, other.relevant()),
-        support=Support(squares + strain, terms, other.relevant(), *other.spread.possible()),
+        support=Support(deviance, terms, other.relevant(), *other.spread.possible()),
     )
     return estimate, moved > FAR, other.seen() | other.has_other_gain() | falling.seen()
