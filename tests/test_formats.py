@@ -239,6 +239,14 @@ def test_an_abf_file_that_was_cut_off_is_refused(tmp_path):
         refused(path, SWEEPS, "cut off|cannot be read")
 
 
+def test_an_abf_file_that_declares_more_tags_than_it_has_bytes_is_refused(tmp_path):
+    path = abf(tmp_path / "a.abf", np.stack([V_TH, V_OUT]))
+    content = bytearray(path.read_bytes())
+    content[48:52] = (2**30).to_bytes(4, "little")  # its list alone would take 8 GB
+    path.write_bytes(content)
+    refused(path, SWEEPS, f"declares {2**30} entries")
+
+
 def test_a_channel_in_amperes_is_no_voltage(tmp_path):
     path = abf(tmp_path / "a.abf", np.stack([V_TH, V_OUT]), unit="pA")
     refused(path, SWEEPS, r"v_th.unit: .* is in ampere \(file\)")

@@ -7,6 +7,7 @@ import html.parser
 import pathlib
 import re
 import shutil
+import warnings
 
 import h5py
 import jax.numpy as jnp
@@ -306,6 +307,21 @@ def test_the_worst_are_of_every_verdict_and_of_every_reason():
     assert rows[6:9] == [19, 18, 17]  # the largest χ² among the successful
     assert sorted(rows[9:]) == [5, 6, 7]  # the largest standard errors
     assert worst_fits.choose(fits_of([1.0], ["successful"]))[0].row == 0
+
+
+def test_an_endless_label_is_drawn_without_a_warning(tmp_path):
+    fits = fits_of(np.ones(3), ["successful"] * 3, trial=np.array(["1" * 1300, "2", "3"]))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        etid.write_report(fits, tmp_path / "page.html")
+
+
+def test_a_file_with_an_element_of_zero_is_refused(tmp_path):
+    fits_of(np.ones(3), ["successful"] * 3).write(tmp_path / "fits.h5")
+    with h5py.File(tmp_path / "fits.h5", "r+") as file:
+        file["r_s"][1] = 0.0
+    with pytest.raises(etid.RecordingError, match=r"fits.h5, r_s: 0 is no value of an element"):
+        etid.Fits.read(tmp_path / "fits.h5")
 
 
 @pytest.mark.parametrize(

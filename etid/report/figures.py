@@ -210,7 +210,7 @@ def each_fit(fits: Fits) -> bytes:
     """Each fit with its standard error, by subject."""
     labels = {
         name: np.array([_short(str(label)) for label in fits.labels[name]])
-        for name in ("subject", "condition")
+        for name in ("subject", "condition", "electrode", "trial")
     }
     return svg(figure_of(dataclasses.replace(fits, labels={**fits.labels, **labels})))
 

@@ -65,6 +65,14 @@ def columns_of(
     remarks = _remarks(table, read.get("remarks", np.full(count, "")))
     numbers = (*kind.names(), "rrse", "chi2", "cov", "shared_cov")
     real = {name: read[name].astype(float) for name in numbers}
+    for name in kind.names():
+        if np.any(real[name] <= 0.0):  # NaN where a fit failed
+            raise RecordingError(
+                f"{np.nanmin(real[name]):g} is no value of an element: they are positive",
+                file=table.name,
+                field=name,
+                remedy="The file is damaged: copy it again, or fit the recordings again",
+            )
     fields = {name: real[name] for name in numbers} | {
         "result": _verdicts(table, read["verdict"]),
         "steps": read["steps"],

@@ -7,6 +7,7 @@ empty or not unique, the name is `channel 0`, …. Several sweeps become trials.
 
 import contextlib
 import pathlib
+import struct
 from collections.abc import Iterator
 from typing import Any
 
@@ -16,6 +17,9 @@ from etid.files.channel import Channel, Contents, needs, rate_of
 from etid.recordings.recording import RecordingError
 
 _PRECISION = 1e-6  # relative precision of a sample interval in float32
+# [byte] where the header of each version has numbers of entries, 32 bits each: of tags, and of the
+# sections of version 2
+_COUNTS = {b"ABF ": (48,), b"ABF2": tuple(range(84, 368, 16))}
 
 
 @contextlib.contextmanager
@@ -27,6 +31,7 @@ def opened(path: pathlib.Path, folder: pathlib.Path) -> Iterator[Contents]:
     except ImportError:
         raise needs("pyabf", "abf", str(path)) from None
 
+    _check_counts(path)
     abf: Any = pyabf.ABF(path, loadData=False)
     dtype = np.dtype(abf._dtype).newbyteorder("<")
     sweeps, length, count = abf.sweepCount, abf.sweepPointCount, abf.channelCount
@@ -73,3 +78,19 @@ def opened(path: pathlib.Path, folder: pathlib.Path) -> Iterator[Contents]:
         )
 
     yield Contents(tuple(names), channel)
+
+
+def _check_counts(path: pathlib.Path) -> None:
+    """Refuse numbers of entries that the file cannot hold; pyabf makes lists of these lengths."""
+    size = path.stat().st_size
+    with path.open("rb") as file:
+        header = file.read(512)
+    for place in _COUNTS.get(header[:4], ()):
+        if place + 4 > len(header):
+            break
+        (count,) = struct.unpack_from("<i", header, place)
+        if count > size:
+            raise RecordingError(
+                f"is damaged: it declares {count} entries and has {size} bytes",
+                remedy="Copy it again",
+            )
