@@ -3,6 +3,9 @@
 A mutant is one changed expression or statement: another operator, comparison or constant, a dropped
 term, a negated condition, swapped arguments, a deleted statement. Annotations, docstrings, texts,
 `assert`s for the type checker and decorators are left alone: what they change no test should see.
+Nor is anything done that changes nothing by construction. The arguments of a function that does not
+know their order are not swapped. `zip(..., strict=True)` stays, as only a bug would notice it.
+Three times a tiny constant is as tiny, so it becomes 1.
 """
 
 import ast
@@ -35,6 +38,9 @@ COMPARISONS: dict[type[ast.cmpop], type[ast.cmpop]] = {
     ast.In: ast.NotIn,
     ast.NotIn: ast.In,
 }
+# Functions that do not know the order of their arguments.
+SYMMETRIC = {"array_equal", "gcd", "hypot", "lcm", "logaddexp", "max", "maximum", "min", "minimum"}
+TINY = 1e-12
 
 
 @dataclasses.dataclass(frozen=True)
@@ -89,11 +95,12 @@ def _changed(node: ast.AST) -> Iterator[tuple[str, ast.AST]]:
         case ast.Constant(value=int() as value):
             yield "constant", ast.Constant(value + 1)
         case ast.Constant(value=float() as value):
-            yield "constant", ast.Constant(3 * value if value else 1.0)
+            yield "constant", ast.Constant(3 * value if abs(value) > TINY else 1.0)
         case ast.Call(func=func, args=[first, second, *rest], keywords=keywords) if not (
             isinstance(first, ast.Starred) or isinstance(second, ast.Starred)
         ):
-            if ast.dump(first) != ast.dump(second):
+            name = func.attr if isinstance(func, ast.Attribute) else getattr(func, "id", "")
+            if name not in SYMMETRIC and ast.dump(first) != ast.dump(second):
                 yield "arguments swapped", ast.Call(func, [second, first, *rest], keywords)
         case ast.If(test=test):
             yield "condition negated", ast.UnaryOp(ast.Not(), test)
@@ -112,9 +119,18 @@ def _parts(node: ast.AST) -> Iterator[ast.AST]:
         if name in ("annotation", "returns", "decorator_list", "type_params"):
             continue
         for part in value if isinstance(value, list) else [value]:
-            silent = isinstance(part, ast.Assert | ast.Raise | ast.Import | ast.ImportFrom)
-            if isinstance(part, ast.AST) and not silent and not isinstance(part, ast.JoinedStr):
+            if isinstance(part, ast.AST) and not _is_silent(part):
                 yield from _parts(part)
+
+
+def _is_silent(node: ast.AST) -> bool:
+    match node:
+        case ast.Assert() | ast.Raise() | ast.Import() | ast.ImportFrom() | ast.JoinedStr():
+            return True
+        case ast.keyword(arg="strict"):
+            return True
+        case _:
+            return False
 
 
 def mutants(path: str, source: str) -> list[Mutant]:
@@ -154,7 +170,7 @@ def _compiles(source: str) -> bool:
 
 
 def drawn(every: list[Mutant], count: int, seed: int) -> list[Mutant]:
-    """As many of them as were asked for, in their order; a larger number holds a smaller one's."""
+    """As many of them as were asked for; the first of them are what a smaller number draws."""
     order = list(range(len(every)))
     random.Random(seed).shuffle(order)
-    return [every[i] for i in sorted(order[:count])]
+    return [every[i] for i in order[:count]]

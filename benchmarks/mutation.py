@@ -4,8 +4,10 @@
 
 A mutant that all tests let pass has survived. Some are no bug at all: another start of an
 iteration, a tolerance that nothing depends on; they are counted all the same. Mutants are drawn by
-a seed from a copy of the working tree, and each outcome is kept at once in `mutation.jsonl`: the
-same command goes on where it was interrupted.
+a seed from a copy of the working tree. Tests that killed a mutant of the same module come first,
+those of the nearest lines before the others. Each outcome is kept at once in `mutation.jsonl`: the
+same command goes on where it was interrupted, and as the mutants are done in the order in which
+they were drawn, what is done is a fair sample. The table is `mutation.csv`.
 """
 
 import argparse
@@ -14,19 +16,21 @@ import json
 import os
 import pathlib
 import shutil
-import subprocess
-import sys
 import tempfile
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 from benchmarks.failure_counts import clopper_pearson
+from benchmarks.mutant_tests import Runner
 from benchmarks.mutants import Mutant, drawn, mutants
-from benchmarks.provenance import ROOT
+from benchmarks.provenance import ROOT, write_csv
 
 TARGET = 0.1  # part of the mutants that may survive
-COPIED = ("etid", "tests", "benchmarks", "data_schema", "docs", "notebooks", ".ci")
+COPIED = (
+    *("etid", "tests", "benchmarks", "data_schema", "docs", "notebooks", ".ci"),
+    ".pytest_cache",  # what was compiled for tests without a mutant
+)
 LIMIT = 300.0  # [s] of a mutant; an endless loop is seen, too
 # The tests of each module, the cheapest first.
 TESTS: Mapping[str, Sequence[str]] = {
@@ -71,27 +75,14 @@ def copied(root: pathlib.Path, folder: pathlib.Path) -> None:
         (folder.parent / "shared").symlink_to(shared.resolve())
 
 
-def passes(folder: pathlib.Path, tests: Sequence[str], limit: float) -> bool | None:
-    """Whether the tests pass; None if they take too long."""
-    files = [f"tests/test_{name}.py" for name in tests]
-    # What is compiled for tests without a mutant is found again, by Python and by XLA.
-    options = ("-q", "-x", "-o", f"cache_dir={ROOT / '.pytest_cache'}")
-    command = [sys.executable, "-m", "pytest", *options, *files]
-    places = {
-        "PYTHONPATH": str(folder),
-        "PYTHONPYCACHEPREFIX": str(folder.parent / "bytecode"),
-        "XDG_CACHE_HOME": str(folder.parent / "cache"),
-    }
-    environment = {**os.environ, **places}
-    environment.pop("PYTHONDONTWRITEBYTECODE", None)
-    with subprocess.Popen(
-        command, cwd=folder, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
-    ) as process:
-        try:
-            return process.wait(limit) == 0
-        except subprocess.TimeoutExpired:
-            process.kill()
-            return None
+def nearest(rows: Sequence[Mapping[str, Any]], module: str, line: int) -> list[str]:
+    """Tests that killed a mutant of this module, those of the nearest lines first."""
+    distance = {}
+    for row in rows:
+        if row["module"] == module and row["killer"]:
+            far = abs(int(row["place"].rpartition(":")[2]) - line)
+            distance[row["killer"]] = min(far, distance.get(row["killer"], far))
+    return sorted(distance, key=lambda killer: distance[killer])
 
 
 def outcomes(
@@ -121,20 +112,25 @@ def outcomes(
         folder = pathlib.Path(place, "tree")
         folder.mkdir()
         copied(root, folder)
+        run = Runner(folder)
         sound: set[str] = set()
-        for mutant in chosen:
+        for index, mutant in enumerate(chosen):
             if mutant.key in before:
                 yield before[mutant.key]
                 continue
             name = mutant.path.removeprefix("etid/").removesuffix(".py").replace("/", ".")
-            if name not in sound and passes(folder, tests[name], 10 * limit) is not True:
-                raise SystemExit(f"the tests of {mutant.path} fail without any mutant")
-            sound.add(name)
+            for test in set(tests[name]) - sound:
+                if run([test], f"etid.{name}", 10 * limit).passed is not True:
+                    raise SystemExit(f"tests/test_{test}.py fails without any mutant")
+                sound.add(test)
             path = folder / mutant.path
             source = path.read_text("utf-8")
             path.write_text(mutant.applied(source), "utf-8")
+            # Python takes bytecode for that of a source of the same length and time.
+            os.utime(path, (index, index))
             begun = time.perf_counter()
-            passed = passes(folder, tests[name], limit)
+            first = nearest(list(before.values()), name, mutant.line)
+            passed, killer = run(tests[name], f"etid.{name}", limit, first)
             path.write_text(source, "utf-8")
             row = {
                 "key": mutant.key,
@@ -144,11 +140,18 @@ def outcomes(
                 "before": mutant.before,
                 "after": mutant.after,
                 "outcome": {True: "survived", False: "killed", None: "too long"}[passed],
+                "killer": killer,
                 "seconds": round(time.perf_counter() - begun, 1),
             }
+            before[mutant.key] = row
             with kept.open("a", encoding="utf-8") as file:
                 file.write(json.dumps(row) + "\n")
             yield row
+
+
+def _on_one_line(row: Mapping[str, Any]) -> dict[str, Any]:
+    code = {name: " ".join(row[name].split()) for name in ("before", "after")}
+    return {name: value for name, value in row.items() if name != "key"} | code
 
 
 def show(rows: Sequence[Mapping[str, Any]]) -> float:
@@ -191,5 +194,8 @@ def main(arguments: argparse.Namespace) -> bool:
     rows = []
     for row in outcomes(ROOT, TESTS, chosen, arguments.output, arguments.limit):
         rows.append(row)
-        print(f"{row['place']:<52}{row['kind']:<20}{row['outcome']}", flush=True)
+        what = f"{row['place']:<52}{row['kind']:<20}{row['outcome']:<10}"
+        print(f"{what}{row['seconds']:6.1f} s", flush=True)
+    table = [{"seed": arguments.seed, **row} for row in rows]
+    write_csv(arguments.output.with_suffix(".csv"), [_on_one_line(row) for row in table])
     return show(rows) <= TARGET

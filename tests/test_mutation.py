@@ -1,10 +1,14 @@
 """Bugs that are put in: each is one, no test sees what cannot matter, and none is done twice."""
 
+import argparse
 import ast
+import csv
+import types
 
 import pytest
 
-from benchmarks import mutation
+from benchmarks import mutant_tests, mutation
+from benchmarks.mutant_tests import Outcome
 from benchmarks.mutants import drawn, mutants
 from benchmarks.provenance import ROOT
 
@@ -18,7 +22,7 @@ def small(a: int, b: int = 3) -> int:
     assert a is not None
     if a > b and not b == 1:
         a += 1
-    total = a * 2 + max(a, b)
+    total = a * 2 + pow(a, b)
     return -total if a else b
 '''
 
@@ -47,11 +51,18 @@ def test_a_text_of_several_bytes_a_letter_is_cut_where_it_should():
     assert mutant.applied('name = "Ω"; value = 2 + 1\n') == 'name = "Ω"; value = (2)\n'
 
 
+def test_what_changes_nothing_by_construction_is_no_mutant():
+    source = "n = math.gcd(a, b)\nk = np.maximum(a, b)\npairs = zip(a, a, strict=True)\n"
+    assert mutants("small.py", source) == []
+    [tiny] = mutants("small.py", "guard = 1e-300\n")
+    assert tiny.after == "(1.0)"
+
+
 def test_draws_are_seeded_and_larger_ones_hold_the_smaller():
     found = mutants("small.py", SOURCE)
     few, many = drawn(found, 4, 1), drawn(found, 9, 1)
     assert drawn(found, 4, 1) == few
-    assert set(few) <= set(many)
+    assert many[:4] == few  # what is done of an interrupted run is a draw, too
     assert drawn(found, 9, 2) != many
 
 
@@ -64,7 +75,8 @@ def tree(tmp_path):
     (root / "etid" / "__init__.py").touch()
     (root / "etid" / "small.py").write_text("UNUSED = 5\n\n\ndef add(a, b):\n    return a + b\n")
     (root / "tests" / "test_small.py").write_text(
-        "from etid.small import add\n\n\ndef test_sum():\n    assert add(2, 1) == 3\n"
+        "from etid.small import add\n\n\ndef test_nothing():\n    pass\n"
+        "\n\ndef test_sum():\n    assert add(2, 1) == 3\n"
     )
     return root
 
@@ -78,8 +90,9 @@ def test_what_no_test_sees_survives_and_what_is_done_is_kept(tree, tmp_path, mon
     tests = {"small": ("small",)}
     rows = list(mutation.outcomes(tree, tests, chosen[:2], kept, 60.0))
     assert [row["outcome"] for row in rows] == ["survived", "killed"]
+    assert [row["killer"] for row in rows] == ["", "tests/test_small.py::test_sum"]
     assert path.read_text().startswith("UNUSED = 5")
-    monkeypatch.setattr(mutation, "passes", None)  # or it would be called
+    monkeypatch.setattr(mutation, "Runner", lambda _: None)  # nothing that could be called
     assert list(mutation.outcomes(tree, tests, chosen[:2], kept, 60.0)) == rows
 
 
@@ -98,8 +111,14 @@ def test_the_copy_that_is_broken_has_every_module(tmp_path):
         assert (folder / path.relative_to(ROOT)).exists()
 
 
+ROW = {
+    "key": "k", "module": "a", "place": "etid/a.py:7", "kind": "sign", "before": "-\\\n x",
+    "after": "(x)", "killer": "", "seconds": 1.0,
+}  # fmt: skip
+
+
 def test_survivors_are_shown_with_their_place(capsys):
-    row = {"module": "a", "place": "etid/a.py:7", "kind": "sign", "before": "-x", "after": "(x)"}
+    row = {**ROW, "before": "-x"}
     share = mutation.show([{**row, "outcome": "survived"}, {**row, "outcome": "killed"}])
     assert share == 0.5
     text = capsys.readouterr().out
@@ -107,8 +126,40 @@ def test_survivors_are_shown_with_their_place(capsys):
     assert "etid/a.py:7: sign: -x  ->  (x)" in text
 
 
+def test_tests_that_killed_a_mutant_nearby_come_first():
+    kills = ((7, "near"), (90, "far"), (90, "near"), (5, ""), (41, "between"))
+    rows = [{"module": "a", "place": f"etid/a.py:{n}", "killer": name} for n, name in kills]
+    rows.append({"module": "b", "place": "etid/b.py:10", "killer": "other"})
+    assert mutation.nearest(rows, "a", 10) == ["near", "between", "far"]
+
+
+def test_files_whose_tests_come_first_stay_together():
+    names = ("a::1", "a::2", "b::1", "b::2", "c::1")
+    items = [types.SimpleNamespace(nodeid=name, path=name[0]) for name in names]
+    order = mutant_tests._Order(["b::2", "c::1"])
+    order.pytest_collection_modifyitems(items)
+    assert [item.nodeid for item in items] == ["b::2", "b::1", "c::1", "a::1", "a::2"]
+    for name, failed in (("a::1", False), ("a::2", True)):
+        order.pytest_runtest_logreport(types.SimpleNamespace(nodeid=name, failed=failed))
+    assert order.failed == "a::2"
+
+
+def test_the_table_of_mutants_tells_seed_and_commit(tmp_path, monkeypatch):
+    row = {**ROW, "outcome": "killed"}
+    monkeypatch.setattr(mutation, "outcomes", lambda *_: [row])
+    kept = tmp_path / "mutation.jsonl"
+    arguments = argparse.ArgumentParser()
+    mutation.add_arguments(arguments)
+    options = ["--modules", "results.verdicts", "--seed", "3", "--output", str(kept)]
+    assert mutation.main(arguments.parse_args(options))
+    with kept.with_suffix(".csv").open() as file:
+        [found] = csv.DictReader(file)
+    assert (found["seed"], found["outcome"], found["before"]) == ("3", "killed", "-\\ x")
+    assert found["commit"]
+
+
 def test_tests_that_fail_by_themselves_are_no_judge(tree, tmp_path, monkeypatch):
-    monkeypatch.setattr(mutation, "passes", lambda *_: False)
+    monkeypatch.setattr(mutation, "Runner", lambda _: lambda *_: Outcome(False, ""))
     chosen = mutants("etid/small.py", (tree / "etid" / "small.py").read_text())
-    with pytest.raises(SystemExit, match="fail without any mutant"):
+    with pytest.raises(SystemExit, match="fails without any mutant"):
         next(mutation.outcomes(tree, {"small": ("small",)}, chosen, tmp_path / "k.jsonl", 60.0))
