@@ -10,7 +10,7 @@ from etid.estimators.judgement import MISFIT_CHI2
 from etid.recordings.preflight import Inspected
 from etid.recordings.recording import Samples
 from etid.recordings.remarks import Remark
-from etid.signals import mains
+from etid.signals import mains, quick_looks
 from etid.simulation import scenes
 from etid.simulation.scenes import Scene
 
@@ -95,14 +95,14 @@ def test_no_hum_is_seen_where_there_is_none(settings, snr_db):
 def test_a_record_that_is_not_finite_has_no_hum(value):
     v = np.sin(np.arange(10_000.0))
     v[7] = value
-    assert not mains.suspected(v[None], np.array([0.01]), 200e3, 60.0, 3, 10_000).any()
+    assert not quick_looks.humming(v[None], np.array([0.01]), 200e3, 60.0, 3, 10_000).any()
     assert mains.separated(v, 0.01, 200e3, 3, 10_000) is None
 
 
 def test_between_the_harmonics_of_10_hz_is_no_hum():
     """50 and 60 Hz and their multiples are harmonics: no bin between them is left to look at."""
     v = np.random.default_rng(0).standard_normal((1, 60_000))
-    assert not mains.suspected(v, np.array([1.0]), 200e3, 10.0, 3, 60_000).any()
+    assert not quick_looks.humming(v, np.array([1.0]), 200e3, 10.0, 3, 60_000).any()
 
 
 def test_a_drift_is_no_hum(records):

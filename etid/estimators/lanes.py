@@ -116,14 +116,15 @@ class Harmonics(AbstractLane):
         sigmas = seen.trusted_th, seen.trusted_out
         fields = filled(seen.coefficients, *sigmas, rate, *seen.periods)
         frequency, x, y, variance_x, variance_y, selected = map(np.asarray, fields)
-        for v, recorded, sigma, step, variance in (
-            (seen.v_th, seen.recorded_th, sigmas[0], seen.coarse_th, variance_x),
-            (seen.v_out, seen.recorded_out, sigmas[1], seen.coarse_out, variance_y),
+        of_th = seen.v_th, seen.recorded_th, sigmas[0], seen.coarse_th, variance_x
+        of_out = seen.v_out, seen.recorded_out, sigmas[1], seen.coarse_out, variance_y
+        for (v, recorded, sigma, step, variance), flickers in zip(
+            (of_th, of_out), seen.flickers, strict=True
         ):
             if step > 0:
                 rounded = rounding_variance(recorded, step, *seen.periods)
                 variance[: rounded.size] = rounded
-            elif seen.kept is None:  # joints between periods look like noise
+            elif flickers:
                 variance *= coloured(v, float(sigma), frequency, float(rate), *seen.periods)
         selected = selected & ~seen.covered(frequency)
         one = cls(frequency, x, y, variance_x, variance_y, selected, rate)

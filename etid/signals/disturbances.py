@@ -14,15 +14,10 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-MERGED = 16  # samples that are averaged
+from etid.signals.quick_looks import MERGED, NOISE, PART, SHARE, highest_beside, period_means
+
 STEEP = 0.3  # of the steepest rise of a pulse
 BESIDE = 10  # times the samples over which edges rise, in which there is one edge
-FEWEST = 3  # periods that are needed to recognise a disturbed one
-# Limits relative to the largest value, of the unloaded and of the loaded voltage: 0.0125 and 0.05 V
-# at the converter in records of 2.5 V. A load cannot change the unloaded voltage.
-PART = np.array([0.005, 0.02])
-SHARE = 0.5  # limit relative to the value at the same place
-NOISE = 8.0  # limit relative to the standard deviation of a mean
 
 
 def disturbed(
@@ -35,54 +30,21 @@ def disturbed(
     """Whether each period is disturbed in one of the two records of a recording, but not in both.
 
     What both records show, a second pulse for instance, comes from the source. The ratio of the
-    records stays right. With fewer than three periods, the answer is no for all of them.
+    records stays right. A period beside one that differs up to their joint counts as well if enough
+    periods remain.
 
     Args:
-        records: Both voltages of each recording [V].
+        records: Both voltages of each recording [V], which `uneven` suspects.
         sigma: Standard deviation of the noise of a sample of each record [V].
         step: Step of the converter of each record if it is coarse, else 0 [V].
         spacing: Length of a period [samples].
         periods: Number of whole periods in each record.
     """
-    length, count = int(spacing) // MERGED * MERGED, len(records)
-    if periods < FEWEST or length < 3 * MERGED:
-        return np.zeros((count, periods), bool)
-    last = records.shape[2] - length
-    at = np.minimum(np.rint(np.arange(periods) * spacing), last).astype(int)
-    parts = np.arange(0, length, MERGED)
-    cut = [np.add.reduceat(records[:, :, one : one + length], parts, axis=2) for one in at]
-    means = np.stack(cut, axis=2) / MERGED
-    half = parts.size // 2
-    # Subtract the median of each period, because the mean may drift.
-    means -= np.partition(means, half, axis=3)[..., half, None]
-    low, high = means.min(2), means.max(2)
-    noise = NOISE / MERGED**0.5 * sigma
-    floor = np.maximum(PART * high.max(2), noise) + step
-    # Most records end here, in half of the time: the median of the periods, to which `_unlike`
-    # compares them, lies between `low` and `high`.
-    least, most = _highest_beside(low), -_highest_beside(-high)
-    allowed = SHARE * np.maximum(least, -most) + np.maximum(least - most, 0) + floor[..., None]
-    suspect = ((high - low)[..., 1:-1] > allowed).any((1, 2))
-    bad = np.zeros((count, periods), bool)
-    if not suspect.any():
-        return bad
-    bad[suspect] = _unlike(means[suspect], noise[suspect], step[suspect])
-    return bad
-
-
-def _unlike(
-    means: Float[np.ndarray, "recording 2 period part"],
-    noise: Float[np.ndarray, "recording 2"],
-    step: Float[np.ndarray, "recording 2"],
-) -> Bool[np.ndarray, "recording period"]:
-    """Whether a period differs from the median of all periods, in one record and not in both.
-
-    A period beside one that differs up to their joint counts as well if enough periods remain.
-    """
+    means, noise = period_means(records, spacing, periods), NOISE / MERGED**0.5 * sigma
     usual = np.median(means, axis=2)
     floor = np.maximum(PART * np.abs(usual).max(2), noise) + step
     # The first and the last mean lie between pulses.
-    high, low = _highest_beside(usual), -_highest_beside(-usual)
+    high, low = highest_beside(usual), -highest_beside(-usual)
     allowed = SHARE * np.maximum(high, -low) + (high - low) + floor[..., None]
     off = np.abs(means - usual[:, :, None])[..., 1:-1]
     unlike = np.any(off > allowed[:, :, None], axis=3)
@@ -93,11 +55,6 @@ def _unlike(
     longer[:, :-1] |= first[:, 1:]
     longer[:, 1:] |= last[:, :-1]
     return np.where(enough(longer)[:, None], longer, bad)
-
-
-def _highest_beside(means: Float[np.ndarray, "*record part"]) -> Float[np.ndarray, "*record _"]:
-    """The highest of each mean and the means beside it; not for the first and the last mean."""
-    return np.maximum(np.maximum(means[..., :-2], means[..., 1:-1]), means[..., 2:])
 
 
 def enough(bad: Bool[np.ndarray, "*recording period"]) -> Bool[np.ndarray, "*recording"]:

@@ -20,7 +20,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy.fft
-from jaxtyping import Array, Bool, Complex, Float, Int
+from jaxtyping import Array, Bool, Complex, Float
 
 from etid.signals.transfer import power
 
@@ -102,23 +102,6 @@ def real_parts(values: Values) -> Values:
     """Real parts, then imaginary parts, along the last axis."""
     of = namespace(values)
     return of.concatenate([of.real(values), of.imag(values)], axis=-1)
-
-
-def mixtures(
-    bins: Int[np.ndarray, " bin"], flipped: Bool[np.ndarray, " bin"], samples: int
-) -> Float[np.ndarray, "probe time"]:
-    """Four probes for bins of a transform, each with a square sum of 1; 0 without any bin.
-
-    They are real and imaginary parts of two sums of the bins. In the second, those that are
-    `flipped` have the other sign. Four products with a record take a tenth of a transform.
-    """
-    mixed = np.zeros((2, samples), dtype=complex)
-    for m, other in zip(bins, flipped, strict=True):
-        wave = np.exp(2j * np.pi * (m * np.arange(samples) % samples) / samples)
-        mixed[0] += wave
-        mixed[1] += -wave if other else wave
-    probes = np.concatenate([np.real(mixed), np.imag(mixed)])
-    return probes / math.sqrt(max(bins.size, 1) * samples / 2)
 
 
 def _sums(v: Array | np.ndarray, periods: int) -> Array | np.ndarray:

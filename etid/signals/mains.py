@@ -21,7 +21,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Array, Bool, Complex, Float, Int
 
-from etid.signals.harmonics import mixtures, namespace
+from etid.signals.harmonics import namespace
 
 MAINS = (50.0, 60.0)  # [Hz]
 MULTIPLES = 7  # higher multiples are a thousandth of the first in most laboratories
@@ -29,9 +29,7 @@ NEAR = 0.02  # largest distance of a harmonic from a multiple, relative to the m
 OFF = 2e-3  # largest relative error of the mains frequency
 BESIDE = 20  # bins on both sides of a multiple that the sinusoids must explain
 DRIFT = 3  # degree of the polynomial that describes the drift
-SEEN = 6.0  # standard deviations of a probe above which sinusoids are fitted
 SURE = 80.0  # required fall of χ²; noise and 15 parameters exceed it once in 10⁹
-PROBED = 200_000  # longest record [samples] whose probes are kept in memory
 MISSED = 0.05  # fraction of the leakage of pulses that `_pulses` may fail to describe
 LEFT = 0.1  # largest fraction of the excess over noise that sinusoids may leave
 
@@ -90,34 +88,6 @@ def lines(
     return found
 
 
-def suspected(
-    records: Float[np.ndarray, "*record time"],
-    sigma: Float[np.ndarray, "*record"],
-    sample_rate: float,
-    pulse_rate: float,
-    periods: int,
-    samples: int,
-) -> Bool[np.ndarray, "*record"]:
-    """Whether records may have hum between the harmonics, by a quick look; most records do not.
-
-    Arguments as in `separated`, for several records.
-    """
-    if periods < 2:
-        return np.zeros(sigma.shape, bool)
-    if samples > PROBED:
-        return sigma > 0
-    probes, left = _probes(sample_rate, periods, samples)
-    # Not `@`, which starts BLAS threads.
-    found = np.abs(np.einsum("...n,pn->...p", records[..., :samples], probes)).max(-1)
-    # A record that is not finite is refused later.
-    humming = (sigma > 0) & (found >= SEEN * sigma) & (found < np.inf)
-    rest = min(abs(periods * sample_rate / pulse_rate - samples), 0.5)
-    if rest > 0 and humming.any():
-        leaked = rest * left * np.abs(records[humming, :samples]).mean(-1)
-        humming[humming] = found[humming] >= SEEN * sigma[humming] + leaked
-    return humming
-
-
 def separated(
     v: Float[np.ndarray, " time"], sigma: float, sample_rate: float, periods: int, samples: int
 ) -> Hum | None:
@@ -136,35 +106,15 @@ def separated(
     return _found(v, sigma, sample_rate, periods) if np.isfinite(v).all() else None
 
 
-def _between(bins: Int[np.ndarray, " bin"], periods: int) -> Int[np.ndarray, " between"]:
+def between(bins: Int[np.ndarray, " bin"], periods: int) -> Int[np.ndarray, " between"]:
     """The bins that are not harmonics, sorted."""
     bins = np.unique(bins)
     return bins[(bins % periods != 0) & (bins > 0)]
 
 
-def _multiples(seconds: float) -> Float[np.ndarray, "mains multiple"]:
+def multiples(seconds: float) -> Float[np.ndarray, "mains multiple"]:
     """Multiples of the mains in units of a bin, for a record of `seconds`."""
     return np.outer(MAINS, np.arange(1, MULTIPLES + 1)) * seconds
-
-
-@functools.lru_cache(maxsize=8)
-def _probes(
-    sample_rate: float, periods: int, samples: int
-) -> tuple[Float[np.ndarray, "probe time"], float]:
-    """Four probes for hum, and their response to pulses.
-
-    They are `mixtures` of the bins beside the first three multiples.
-
-    Returns:
-        The probes, and the response of a probe to pulses of mean 1 if the record is one sample
-        longer than its periods (see `_pulses`).
-    """
-    places = _multiples(samples / sample_rate)[:, :3].ravel()
-    bins = _between(np.concatenate([np.floor(places), np.ceil(places)]).astype(int), periods)
-    left = 2 * np.pi * bins / (periods * samples * np.abs(np.exp(2j * np.pi * bins / periods) - 1))
-    # At 10 Hz all mains frequencies are harmonics: no bin is left, and the probes are 0.
-    response = math.sqrt(2 * samples / max(bins.size, 1) * np.sum(left**2))
-    return mixtures(bins, np.arange(bins.size) % 4 >= 2, samples), response
 
 
 @functools.lru_cache(maxsize=8)
@@ -172,9 +122,9 @@ def _near(
     sample_rate: float, periods: int, samples: int
 ) -> tuple[Int[np.ndarray, " bin"], Complex[np.ndarray, "bin degree"]]:
     """Bins near multiples of the mains, without harmonics, and the powers of time in these bins."""
-    around = np.round(_multiples(samples / sample_rate)).astype(int).ravel()
+    around = np.round(multiples(samples / sample_rate)).astype(int).ravel()
     near = around[:, None] + np.arange(-BESIDE, BESIDE + 1)[None, :]
-    bins = _between(near[near < samples // 2 - periods], periods)
+    bins = between(near[near < samples // 2 - periods], periods)
     powers = np.linspace(-1, 1, samples)[:, None] ** np.arange(1, DRIFT + 1)[None, :]
     return bins, np.fft.rfft(powers, axis=0)[bins]
 

@@ -37,11 +37,15 @@ import numpy as np
 import scipy.fft
 from jaxtyping import Array, Bool, Complex, Float, Int
 
-from etid.signals.harmonics import DRIFT_DEGREE, WINDOW, harmonics, mixtures, namespace
+from etid.signals.harmonics import DRIFT_DEGREE, WINDOW, harmonics, namespace
 
 # Order of the differences; the ringing after the edges, at a quarter of the rate, is still smooth
 # to them.
 ORDER = 6
+DIFFERENCE = np.array([(-1.0) ** k * math.comb(ORDER, k) for k in range(ORDER + 1)])
+GAIN = math.sqrt(np.sum(DIFFERENCE**2))  # noise of a difference over noise of a sample
+ROW, PIECE = 24, 32  # samples of a row, and rows of one product
+IN_CACHE = 2**15  # samples whose differences are computed together
 # Bisection to 1e-12 of the largest difference, which is at most 1e5 times the noise (at an edge).
 HALVINGS = 40
 MEDIAN_TO_SIGMA = 1.482602218505602  # standard deviation over median |x|, for a normal x
@@ -60,9 +64,6 @@ SURE = 16.0
 CORNERS = np.geomspace(10.0, 1e6, 101)[:, None, None]  # [Hz]
 # Mean of sample rate / f over the band of sixth differences: they see 1/f noise too.
 BY_DIFFERENCES = 2.37
-LOWEST = 12  # bins of a quick look
-LOOKED = 2.5  # standard deviations of a quick look: 5 % of all white records exceed it
-LONG = 200_000  # [samples] longer records get no quick look, which would fill the memory
 
 
 def _median(x: Float[Array, " sample"]) -> Float[Array, ""]:
@@ -92,22 +93,64 @@ def noise_std(
 ) -> Float[Array | np.ndarray, "*record"]:
     """Standard deviation of the white noise in `v`, in the unit of `v`.
 
+    It comes from every second difference, in half of the time of all. Neighbouring differences
+    share most of their samples, so the standard error grows from 0.93 to 1.01 % only (33 330
+    samples). A weight, a standard error or the limit of a test does not need more.
+
     Args:
         v: Samples of the record, or of several records as an array of NumPy.
         resolution: Step of the converter, in the unit of `v`; 0 if it is not known.
     """
-    difference = np.array([(-1.0) ** k * math.comb(ORDER, k) for k in range(ORDER + 1)])
-    gain = math.sqrt(np.sum(difference**2))
     floor = resolution / math.sqrt(12.0)
     if isinstance(v, np.ndarray):  # nothing is compiled; `np.median` takes ten times as long
-        # All records at once; the values at their joints, from two records, are left out.
-        size = np.convolve(v.ravel(), difference, "same").reshape(v.shape)
-        size = np.abs(size[..., ORDER // 2 : -ORDER // 2])
-        half = size.shape[-1] // 2
-        size.partition(half, axis=-1)
-        return np.asarray(np.maximum(MEDIAN_TO_SIGMA / gain * size[..., half], floor))
-    size = jnp.abs(jnp.diff(v, ORDER))
-    return jnp.maximum(MEDIAN_TO_SIGMA / gain * _median(size), floor)
+        records = v.reshape(-1, v.shape[-1])
+        together = max(1, IN_CACHE // v.shape[-1])
+        parts = [
+            _middle(_differences(records[first : first + together]))
+            for first in range(0, len(records), together)
+        ]
+        middle = np.concatenate(parts).reshape(v.shape[:-1])
+        return np.asarray(np.maximum(MEDIAN_TO_SIGMA / GAIN * middle, floor))
+    size = jnp.abs(jnp.diff(v, ORDER)[::2])
+    return jnp.maximum(MEDIAN_TO_SIGMA / GAIN * _median(size), floor)
+
+
+def _middle(size: Float[np.ndarray, "record difference"]) -> Float[np.ndarray, " record"]:
+    """The median of each record; changes the order of `size`."""
+    half = size.shape[1] // 2
+    size.partition(half, axis=1)
+    return size[:, half]
+
+
+def _differences(
+    v: Float[np.ndarray, "record time"],
+) -> Float[np.ndarray, "record difference"]:
+    """Size of every second difference of the order `ORDER`.
+
+    A product with a matrix takes a fourth of the time of a convolution. `PIECE` rows of `ROW`
+    samples are one product, which is too small for BLAS to start threads.
+    """
+    own, beyond = _matrices()
+    pieces = max(0, v.shape[1] - ROW) // (ROW * PIECE)
+    size, shape = pieces * ROW * PIECE, (len(v), pieces, PIECE, ROW)
+    found = v[:, :size].reshape(shape) @ own
+    # The last differences of a row need the first samples of the next row.
+    found[..., ROW // 2 - ORDER // 2 :] += (
+        v[:, ROW : ROW + size].reshape(shape)[..., :ORDER] @ beyond
+    )
+    rest = np.diff(v[:, size:], ORDER)[:, ::2]
+    found = np.concatenate([found.reshape(len(v), -1), rest], axis=1)
+    return np.abs(found, out=found)
+
+
+@functools.cache
+def _matrices() -> tuple[Float[np.ndarray, "sample place"], Float[np.ndarray, "next last"]]:
+    """Weights of the samples of a row, and of the first samples of the next, in the differences."""
+    weights = np.zeros((ROW + ORDER, ROW // 2))
+    for place in range(ROW // 2):
+        weights[2 * place : 2 * place + ORDER + 1, place] = DIFFERENCE
+    beyond = weights[ROW:]
+    return weights[:ROW].copy(), beyond[:, beyond.any(0)].copy()
 
 
 class Measurement(eqx.Module):
@@ -290,10 +333,6 @@ def corner(
     if periods < 2 or not sigma > 0:
         return 0.0
     v = v[:samples]
-    if samples <= LONG:  # not `@`, which starts BLAS threads
-        looked = np.einsum("pn,n->p", _probes(periods, samples), v)
-        if not np.abs(looked).max() > LOOKED * sigma:
-            return 0.0
     bins, white, pink = _bins(periods, samples)
     late = int(np.argmax(np.abs(v[: samples // periods])))
     means = v[: samples // periods * periods].reshape(periods, -1).mean(1)
@@ -323,10 +362,3 @@ def _bins(
     bins = periods * np.arange(count)[:, None] + np.arange(1, periods)[None, :]
     white, pink = (one[:-2] + 4 * one[1:-1] + one[2:] for one in (bins**4.0, bins**3.0))
     return bins, white, pink
-
-
-@functools.lru_cache(maxsize=8)
-def _probes(periods: int, samples: int) -> Float[np.ndarray, "probe time"]:
-    """`mixtures` of the lowest bins between the harmonics."""
-    low = [number for number in range(1, 2 * LOWEST) if number % periods][:LOWEST]
-    return mixtures(np.array(low), np.arange(len(low)) % 2 == 1, samples)

@@ -146,7 +146,7 @@ def pulse_trains(
         gaps = np.diff(edges)
         even = gaps.size > 0 and np.ptp(gaps) <= EVEN * gaps.mean()
         several = rows[same]
-        spacings = _spacings(records[several], edges, step, sample_rate) if even else None
+        spacings = _spacings(records, several, edges, step, sample_rate) if even else None
         for number, row in enumerate(several):
             spacing = None if spacings is None else float(spacings[number])
             found[row] = PulseTrain(edges, spacing, size, sample_rate, pulse_rate)
@@ -168,11 +168,12 @@ def _edges_of(above: Bool[np.ndarray, " place"], period: float) -> Int[np.ndarra
 
 def _spacings(
     records: Float[np.ndarray, "record time"],
+    rows: Int[np.ndarray, " row"],
     edges: Int[np.ndarray, " pulse"],
     step: int,
     sample_rate: float,
-) -> Float[np.ndarray, " record"]:
-    """Spacing of the pulses [samples], from the first and the last edge."""
+) -> Float[np.ndarray, " row"]:
+    """Spacing of the pulses of some records [samples], from the first and the last edge."""
     first, last, size = int(edges[0]), int(edges[-1]), records.shape[1]
     off = 2 * step + 2  # [samples] error of the coarse edges
     rise = rise_time(sample_rate)
@@ -180,12 +181,12 @@ def _spacings(
     width = min(8 * step + 4 * rise, (last - first) // 4)
     before = max(0, min(width, room - off))
     after = max(1, min(width, size - last - off - rise))
-    template = rises(records[:, first - before : first + after + rise], rise)
+    template = rises(records[rows, first - before : first + after + rise], rise)
     start = max(0, last - before - off)
-    where = rises(records[:, start : last + after + off + rise], rise)
+    where = rises(records[rows, start : last + after + off + rise], rise)
     between = edges.size - 1
     if where.shape[1] < template.shape[1]:  # the last edge is at the end of the record
-        return np.full(len(records), (last - first) / between)
+        return np.full(rows.size, (last - first) / between)
     # Least squares of the difference. The correlation alone is biased towards the steepest part of
     # a slow edge.
     parts = np.lib.stride_tricks.sliding_window_view(where, template.shape[1], axis=1)
@@ -241,7 +242,7 @@ def lags_of(
     for row, train in enumerate(trains):
         alike.setdefault(_window(records[row, 0], train), []).append(row)
     for window, rows in alike.items():
-        for row, lag in zip(rows, _lags(records[rows], window), strict=True):
+        for row, lag in zip(rows, _lags(records, rows, window), strict=True):
             lags[row] = float(lag) if abs(lag) <= min(LAGS, PART * _period(trains[row])) else None
     return lags
 
@@ -277,16 +278,16 @@ def _window(v_th: Float[np.ndarray, " time"], train: PulseTrain) -> _Window:
 
 
 def _lags(
-    records: Float[np.ndarray, "recording 2 time"], of: _Window
-) -> Float[np.ndarray, " recording"]:
+    records: Float[np.ndarray, "recording 2 time"], rows: Sequence[int], of: _Window
+) -> Float[np.ndarray, " row"]:
     """The lags with the highest correlation; infinite if the polarity is wrong."""
-    template = rises(records[:, 0, of.first : of.last], of.rise)
+    template = rises(records[rows, 0, of.first : of.last], of.rise)
     begin = of.first - of.reach
     start = max(0, begin)
-    found = rises(records[:, 1, start : of.last + of.reach], of.rise)
+    found = rises(records[rows, 1, start : of.last + of.reach], of.rise)
     size = fast_length(template.shape[1] + 2 * of.reach)
     # Single precision suffices, and its transforms take a fourth of the time.
-    both = np.zeros((len(records), 2, size), np.float32)
+    both = np.zeros((len(rows), 2, size), np.float32)
     both[:, 0, start - begin : start - begin + found.shape[1]] = found
     both[:, 1, : template.shape[1]] = template
     transforms = np.asarray(scipy.fft.rfft(both))

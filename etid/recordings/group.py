@@ -1,0 +1,237 @@
+"""Recordings of equal length and equal rates, inspected together."""
+
+import functools
+from collections.abc import Hashable, Sequence
+from typing import TypeVar
+
+import numpy as np
+from jaxtyping import Bool, Complex, Float
+
+from etid.recordings.recording import Recording, Samples
+from etid.signals.disturbances import Joint, disturbed, enough, joint, of_source
+from etid.signals.harmonics import harmonics, whole_periods
+from etid.signals.mains import Hum, separated
+from etid.signals.noise import RIPPLE, VISIBLE, is_coarse, noise_std, shows_few, step_of
+from etid.signals.pulse_train import PulseTrain, lags_of, pulse_trains, rise_time
+from etid.signals.quick_looks import flickering, humming, uneven
+
+# A recording that is not finite is refused later; its neighbours in a group are not concerned.
+QUIETLY = functools.partial(np.errstate, invalid="ignore", over="ignore")
+_Key = TypeVar("_Key", bound=Hashable)
+
+
+class Group:
+    """Recordings of equal length and equal rates, inspected together to save time.
+
+    Each property has one entry for each recording and is computed once, when it is used. An axis of
+    length 2 holds `v_th` and `v_out`. In recordings of a measured current, the current is in the
+    place of `v_th`, here and below, and its unit is the ampere.
+
+    Args:
+        recordings: The recordings.
+    """
+
+    def __init__(self, recordings: Sequence[Recording]) -> None:
+        self.recordings = recordings
+        self.sample_rate = recordings[0].sample_rate
+        self.pulse_rate = recordings[0].pulse_rate
+        self._coefficients: dict[tuple[int, int], np.ndarray] = {}
+
+    @functools.cached_property
+    def whole(self) -> Float[np.ndarray, "recording 2 time"]:
+        """Voltages of all periods as they were recorded [V]."""
+        size = self.recordings[0].samples["v_out"].stored.size
+        whole = np.empty((len(self.recordings), 2, size))
+        for records, one in zip(whole, self.recordings, strict=True):
+            for v, record in zip(records, _records(one), strict=True):
+                v[:] = record.values
+        whole.flags.writeable = False
+        return whole
+
+    @functools.cached_property
+    def step(self) -> Float[np.ndarray, "recording 2"]:
+        """Converter steps [V]; 0 if unknown."""
+        return np.array([[v.resolution or 0.0 for v in _records(one)] for one in self.recordings])
+
+    @functools.cached_property
+    def noise(self) -> Float[np.ndarray, "recording 2"]:
+        """Standard deviations of the noise of a sample of `whole` [V]."""
+        with QUIETLY():
+            return np.asarray(noise_std(self.whole, self.step))
+
+    @functools.cached_property
+    def coarse(self) -> Float[np.ndarray, "recording 2"]:
+        """Converter steps [V] that exceed the noise, else 0."""
+        found = np.zeros(self.step.shape)
+        with QUIETLY():
+            spans = np.ptp(self.recorded_limits, axis=-1)
+            visible = (self.step > VISIBLE * spans) | ((self.step == 0) & shows_few(self.whole))
+        for row, which in np.argwhere(visible):
+            v = self.whole[row, which]
+            step = float(self.step[row, which]) or step_of(v)
+            found[row, which] = step if is_coarse(v, step) else 0.0
+        return found
+
+    @functools.cached_property
+    def trains(self) -> list[PulseTrain]:
+        """Pulse trains of `v_th`."""
+        return pulse_trains(self.whole[:, 0], self.sample_rate, self.pulse_rate)
+
+    @functools.cached_property
+    def whole_periods(self) -> list[tuple[int, int]]:
+        """Numbers of whole periods in each recording, and their number of samples."""
+        size = self.whole.shape[2]
+        return [whole_periods(size, self.sample_rate, train.counted) for train in self.trains]
+
+    @functools.cached_property
+    def hum(self) -> list[list[Hum | None]]:
+        """Hum that is subtracted from each record; None if there is none."""
+        found: list[list[Hum | None]] = [[None, None] for _ in self.recordings]
+        rates = self.sample_rate, self.pulse_rate
+        for of, rows in _alike(self.whole_periods).items():
+            with QUIETLY():
+                suspect = humming(_part(self.whole, rows), self.noise[rows], *rates, *of)
+            for number, which in np.argwhere(suspect):
+                row = rows[number]
+                known = self.whole[row, which], float(self.noise[row, which]), self.sample_rate
+                found[row][which] = separated(*known, *of)
+        return found
+
+    @functools.cached_property
+    def quiet(self) -> Float[np.ndarray, "recording 2 time"]:
+        """Voltages of all periods without hum [V]."""
+        if all(hum is None for both in self.hum for hum in both):
+            return self.whole
+        quiet = self.whole.copy()
+        for records, both in zip(quiet, self.hum, strict=True):
+            for v, hum in zip(records, both, strict=True):
+                if hum is not None:
+                    v -= hum(v.size, self.sample_rate)
+        return quiet
+
+    @functools.cached_property
+    def recorded_limits(self) -> Float[np.ndarray, "recording 2 limit"]:
+        """Smallest and largest sample of each record in `whole` [V]."""
+        return limits_of(self.whole)
+
+    @functools.cached_property
+    def limits(self) -> Float[np.ndarray, "recording 2 limit"]:
+        """Smallest and largest sample of each record in `quiet` [V]."""
+        return self.recorded_limits if self.quiet is self.whole else limits_of(self.quiet)
+
+    @functools.cached_property
+    def covariance(self) -> Float[np.ndarray, "recording 2 2"]:
+        """Covariance of both voltages in `quiet` [V²]."""
+        return covariance_of(self.quiet)
+
+    @functools.cached_property
+    def kept(self) -> list[Joint | None]:
+        """The periods in use if disturbed periods are left out; None if all are in use."""
+        kept: list[Joint | None] = [None] * len(self.recordings)
+        of_all = [
+            None if train.mismatch else (train.counted, periods)
+            for train, (periods, _) in zip(self.trains, self.whole_periods, strict=True)
+        ]
+        for key, rows in _alike(of_all).items():
+            if key is None:
+                continue
+            counted, periods = key
+            of = _part(self.quiet, rows), self.noise[rows], self.coarse[rows]
+            spacing = self.sample_rate / counted
+            with QUIETLY():
+                suspect = np.flatnonzero(uneven(*of, spacing, periods))
+                for row in suspect:
+                    records, sigma, step = (part[[row]] for part in of)
+                    (bad,) = disturbed(records, sigma, step, spacing, periods)
+                    known = self.quiet[rows[row]], bad, spacing, self.sample_rate
+                    kept[rows[row]] = _kept(*known)
+        return kept
+
+    @functools.cached_property
+    def lags(self) -> list[float | None]:
+        """Lags of `v_out` in `quiet` [samples]; None if misaligned or if the rates are wrong."""
+        lags: list[float | None] = [None] * len(self.recordings)
+        rows = [row for row, train in enumerate(self.trains) if not train.mismatch]
+        trains = [self.trains[row] for row in rows]
+        with QUIETLY():
+            found = lags_of(_part(self.quiet, rows), trains) if rows else []
+        for row, lag in zip(rows, found, strict=True):
+            lags[row] = lag
+        return lags
+
+    @functools.cached_property
+    def trusted(self) -> Float[np.ndarray, "recording 2"]:
+        """`noise` as far as estimators trust it: not below the error of the interpolation."""
+        return np.maximum(self.noise, RIPPLE * np.ptp(self.limits, axis=-1))
+
+    @functools.cached_property
+    def flickers(self) -> Bool[np.ndarray, "recording 2"]:
+        """Whether each record in `quiet` may have 1/f noise, by a quick look."""
+        found = np.zeros(self.noise.shape, bool)
+        for of, rows in _alike(self.whole_periods).items():
+            with QUIETLY():
+                found[rows] = flickering(_part(self.quiet, rows), self.trusted[rows], *of)
+        return found
+
+    def coefficients(
+        self, periods: int, samples: int
+    ) -> Complex[np.ndarray, "recording 2 harmonic"]:
+        """Harmonics of `quiet` for these numbers from `whole_periods`."""
+        if (periods, samples) not in self._coefficients:
+            with QUIETLY():
+                found = np.asarray(harmonics(self.quiet, periods, samples))
+            self._coefficients[periods, samples] = found
+        return self._coefficients[periods, samples]
+
+
+def _records(recording: Recording) -> tuple[Samples, Samples]:
+    """The cause of `v_out`, and `v_out`."""
+    return recording.samples[recording.cause], recording.samples["v_out"]
+
+
+def _alike(keys: Sequence[_Key]) -> dict[_Key, list[int]]:
+    """The rows of each key."""
+    rows: dict[_Key, list[int]] = {}
+    for row, key in enumerate(keys):
+        rows.setdefault(key, []).append(row)
+    return rows
+
+
+def _part(
+    records: Float[np.ndarray, "recording 2 time"], rows: Sequence[int]
+) -> Float[np.ndarray, "row 2 time"]:
+    """The rows of `records`; no copy if these are all."""
+    return records if len(rows) == len(records) else records[np.asarray(rows)]
+
+
+def limits_of(v: Float[np.ndarray, "*record time"]) -> Float[np.ndarray, "*record limit"]:
+    """Smallest and largest sample of each record."""
+    return np.stack([v.min(-1), v.max(-1)], axis=-1)
+
+
+def covariance_of(v: Float[np.ndarray, "*recording 2 time"]) -> Float[np.ndarray, "*recording 2 2"]:
+    """Covariance of both voltages of each recording."""
+    mean = v.mean(-1)
+    with QUIETLY():
+        # Not `@`, which starts BLAS threads.
+        square = np.einsum("...in,...jn->...ij", v, v) / v.shape[-1]
+        return square - mean[..., :, None] * mean[..., None, :]
+
+
+def _kept(
+    records: Float[np.ndarray, "2 time"],
+    bad: Bool[np.ndarray, " period"],
+    spacing: float,
+    sample_rate: float,
+) -> Joint | None:
+    """The plan to leave disturbed periods out.
+
+    Fewer than half of the periods may be left out: the others must show the shape of an undisturbed
+    period.
+    """
+    if not bad.any() or not enough(bad):
+        return None
+    rise = rise_time(sample_rate)
+    if any(of_source(v, bad, spacing, rise) for v in records):
+        return None
+    return joint(~bad, spacing, records.shape[1])

@@ -1,0 +1,174 @@
+"""Quick looks at records: which may have mains hum, 1/f noise or disturbed periods.
+
+Most records have none of these. A look is a few products or means of all samples; what it suspects
+is examined by `etid.signals.mains`, `etid.signals.noise` and `etid.signals.disturbances`. Records
+of equal length and rates are looked at together.
+"""
+
+import functools
+import math
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from etid.signals.mains import between, multiples
+
+HUM = 6.0  # standard deviations of a probe above which sinusoids are fitted
+LOWEST = 12  # bins of a look for 1/f noise
+FLICKER = 2.5  # standard deviations of such a probe: 5 % of all white records exceed it
+PROBED = 200_000  # [samples] longer records are not looked at: the probes would fill the memory
+USED = 1024  # samples of one product with the probes
+MERGED = 16  # samples that are averaged to compare periods
+FEWEST = 3  # periods that are needed to recognise a disturbed one
+# Limits relative to the largest value, of the unloaded and of the loaded voltage: 0.0125 and 0.05 V
+# at the converter in records of 2.5 V. A load cannot change the unloaded voltage.
+PART = np.array([0.005, 0.02])
+SHARE = 0.5  # limit relative to the value at the same place
+NOISE = 8.0  # limit relative to the standard deviation of a mean
+
+
+def humming(
+    records: Float[np.ndarray, "*record time"],
+    sigma: Float[np.ndarray, "*record"],
+    sample_rate: float,
+    pulse_rate: float,
+    periods: int,
+    samples: int,
+) -> Bool[np.ndarray, "*record"]:
+    """Whether records may have mains hum between the harmonics of the pulse rate.
+
+    Args:
+        records: Voltages [V].
+        sigma: Standard deviation of the noise of a sample of each record [V].
+        sample_rate: Samples per second [Hz].
+        pulse_rate: Pulses per second [Hz].
+        periods: Number of periods from `etid.signals.harmonics.whole_periods`.
+        samples: Number of samples from `etid.signals.harmonics.whole_periods`.
+    """
+    if periods < 2:
+        return np.zeros(sigma.shape, bool)
+    if samples > PROBED:
+        return sigma > 0
+    probes, left = _hum_probes(sample_rate, periods, samples)
+    found = np.abs(_products(records, probes)).max(-1)
+    # A record that is not finite is refused later.
+    seen = (sigma > 0) & (found >= HUM * sigma) & (found < np.inf)
+    rest = min(abs(periods * sample_rate / pulse_rate - samples), 0.5)
+    if rest > 0 and seen.any():
+        leaked = rest * left * np.abs(records[seen, :samples]).mean(-1)
+        seen[seen] = found[seen] >= HUM * sigma[seen] + leaked
+    return seen
+
+
+def flickering(
+    records: Float[np.ndarray, "*record time"],
+    sigma: Float[np.ndarray, "*record"],
+    periods: int,
+    samples: int,
+) -> Bool[np.ndarray, "*record"]:
+    """Whether records may have 1/f noise; arguments as in `humming`."""
+    if periods < 2 or samples > PROBED:
+        return (sigma > 0) & (periods > 1)
+    found = np.abs(_products(records, _flicker_probes(periods, samples))).max(-1)
+    return (sigma > 0) & (found > FLICKER * sigma)
+
+
+def uneven(
+    records: Float[np.ndarray, "recording 2 time"],
+    sigma: Float[np.ndarray, "recording 2"],
+    step: Float[np.ndarray, "recording 2"],
+    spacing: float,
+    periods: int,
+) -> Bool[np.ndarray, " recording"]:
+    """Whether recordings may have disturbed periods; arguments as in `disturbed`.
+
+    The median of the periods, to which `disturbed` compares them, lies between the lowest and the
+    highest of them. With fewer than three periods, the answer is no.
+    """
+    if periods < FEWEST or spacing < 3 * MERGED:
+        return np.zeros(len(records), bool)
+    means = period_means(records, spacing, periods)
+    low, high = means.min(2), means.max(2)
+    floor = np.maximum(PART * high.max(2), NOISE / MERGED**0.5 * sigma) + step
+    least, most = highest_beside(low), -highest_beside(-high)
+    allowed = SHARE * np.maximum(least, -most) + np.maximum(least - most, 0) + floor[..., None]
+    return ((high - low)[..., 1:-1] > allowed).any((1, 2))
+
+
+def period_means(
+    records: Float[np.ndarray, "recording 2 time"], spacing: float, periods: int
+) -> Float[np.ndarray, "recording 2 period part"]:
+    """Means of `MERGED` samples, less the median of their period, because the mean may drift."""
+    length = int(spacing) // MERGED * MERGED
+    last = records.shape[2] - length
+    at = np.minimum(np.rint(np.arange(periods) * spacing), last).astype(int)
+    parts = np.arange(0, length, MERGED)
+    cut = [np.add.reduceat(records[:, :, one : one + length], parts, axis=2) for one in at]
+    means = np.stack(cut, axis=2) / MERGED
+    means -= np.partition(means, parts.size // 2, axis=3)[..., parts.size // 2, None]
+    return means
+
+
+def highest_beside(means: Float[np.ndarray, "*record part"]) -> Float[np.ndarray, "*record _"]:
+    """The highest of each mean and the means beside it; not for the first and the last mean."""
+    return np.maximum(np.maximum(means[..., :-2], means[..., 1:-1]), means[..., 2:])
+
+
+def _mixtures(
+    bins: Int[np.ndarray, " bin"], flipped: Bool[np.ndarray, " bin"], samples: int
+) -> Float[np.ndarray, "probe time"]:
+    """Four probes for bins of a transform, each with a square sum of 1; 0 without any bin.
+
+    They are real and imaginary parts of two sums of the bins. In the second, those that are
+    `flipped` have the other sign. Four products with a record take a tenth of a transform.
+    """
+    mixed = np.zeros((2, samples), dtype=complex)
+    for m, other in zip(bins, flipped, strict=True):
+        wave = np.exp(2j * np.pi * (m * np.arange(samples) % samples) / samples)
+        mixed[0] += wave
+        mixed[1] += -wave if other else wave
+    probes = np.concatenate([np.real(mixed), np.imag(mixed)])
+    return probes / math.sqrt(max(bins.size, 1) * samples / 2)
+
+
+def _products(
+    records: Float[np.ndarray, "*record time"], probes: Float[np.ndarray, "probe used"]
+) -> Float[np.ndarray, "*record probe"]:
+    """Products of records with `_mixtures`; samples beyond the probes are not used.
+
+    A matrix product takes a tenth of the time of `einsum`. Its parts are so small that BLAS starts
+    no threads.
+    """
+    flat = records.reshape(-1, records.shape[-1])
+    found = np.zeros((len(flat), len(probes)))
+    for first in range(0, probes.shape[1], USED):
+        part = probes[:, first : first + USED]
+        found += flat[:, first : first + part.shape[1]] @ part.T
+    return found.reshape(*records.shape[:-1], -1)
+
+
+@functools.lru_cache(maxsize=8)
+def _hum_probes(
+    sample_rate: float, periods: int, samples: int
+) -> tuple[Float[np.ndarray, "probe time"], float]:
+    """Four probes for hum, and their response to pulses.
+
+    They are `_mixtures` of the bins beside the first three multiples.
+
+    Returns:
+        The probes, and the response of a probe to pulses of mean 1 if the record is one sample
+        longer than its periods (see `etid.signals.mains`).
+    """
+    places = multiples(samples / sample_rate)[:, :3].ravel()
+    bins = between(np.concatenate([np.floor(places), np.ceil(places)]).astype(int), periods)
+    left = 2 * np.pi * bins / (periods * samples * np.abs(np.exp(2j * np.pi * bins / periods) - 1))
+    # At 10 Hz all mains frequencies are harmonics: no bin is left, and the probes are 0.
+    response = math.sqrt(2 * samples / max(bins.size, 1) * np.sum(left**2))
+    return _mixtures(bins, np.arange(bins.size) % 4 >= 2, samples), response
+
+
+@functools.lru_cache(maxsize=8)
+def _flicker_probes(periods: int, samples: int) -> Float[np.ndarray, "probe time"]:
+    """`_mixtures` of the lowest bins between the harmonics."""
+    low = [number for number in range(1, 2 * LOWEST) if number % periods][:LOWEST]
+    return _mixtures(np.array(low), np.arange(len(low)) % 2 == 1, samples)
