@@ -116,7 +116,8 @@ A mapping is TOML. Each `[[recording]]` is a recording or a stack of trials. Key
 `[[recording]]` hold for all of them. The keys are:
 
 - `v_th`, `v_out`: unloaded output, and output with the load. Each is a table with these keys:
-    - `channel`: its name in the file;
+    - `channel`: its name in the file; `FILE:NAME` is channel `NAME` of another file, whose path
+      begins in the current folder;
     - `unit` of its values: `V`, `A` or `s`, with the prefix `k`, `m`, `u` or `µ`, `n`, `p`, or in
       words; needed unless the file contains it;
     - `scale` of this channel alone;
@@ -131,7 +132,8 @@ A mapping is TOML. Each `[[recording]]` is a recording or a stack of trials. Key
 - `scale`: the values of `v_th` and `v_out` divided by this are volts at the terminal. Give 1 if
   they are already volts at the terminal.
 - `split`: one long record becomes several trials. `"pulses"` splits it at the pauses between its
-  pulses, the name of a trigger channel at the rising edges of the trigger.
+  pulses, the name of a trigger channel at the rising edges of the trigger. A trial then has the
+  pulses from one edge to the next, up to the first pause.
 - `path` of the recording in the etid file. Several trials become `path/0`, `path/1`, …. Without a
   path, a single `[[recording]]` becomes `loaded/0`, …, or with `r_load` `calibration/0`, ….
 - FIELDS: as in the tables above. `trial` may be a list with one label per trial.

@@ -88,6 +88,39 @@ def test_another_dialect_is_shown_and_confirmed_by_flags(head, row, encoding, fl
         np.testing.assert_allclose(study["loaded/0"].v_out, values[:, 1], rtol=1e-12)
 
 
+def test_a_tab_is_written_on_a_command_line_as_the_error_shows_it(tmp_path, capsys):
+    file, target = tmp_path / "t.csv", tmp_path / "t.h5"
+    file.write_text("open\tout\n" + "1.5\t2.5\n" * 500, encoding="utf-8")
+    command = ["import", str(file), "-o", str(target), "--v-th", "open", "--v-out", "out",
+               "--sample-rate", "2e5", "--pulse-rate", "60", "--scale", "1"]  # fmt: skip
+    assert cli.main(command) == 1
+    flags = capsys.readouterr().err.partition("add ")[2].strip().rstrip(".")
+    assert cli.main([*command, *shlex.split(flags)]) == 0
+
+
+def test_a_calibration_is_not_split_as_the_trials_are(folder, tmp_path):
+    target, table = tmp_path / "study.h5", np.genfromtxt(folder / "finger.csv", delimiter=",")[1:]
+    rest, trigger = np.zeros((4000, 3)), np.arange(len(table)) < 100
+    trial = np.column_stack([table, 5.0 * trigger])
+    np.savetxt(
+        tmp_path / "long.csv",
+        np.concatenate([rest, trial, rest, trial, rest]),
+        "%.9g",
+        ",",
+        header="open,out,trigger",
+        comments="",
+    )
+    given = {"v_th": "open", "v_out": "out", "sample_rate": 2e5, "pulse_rate": 60.0, "scale": 1.0}
+    for split in ("pulses", "trigger"):
+        calibrations = {folder / "calib.csv": 98.8e3}
+        etid.import_file(
+            tmp_path / "long.csv", target, calibrations=calibrations, split=split, **given
+        )
+        with etid.read(target) as study:
+            assert set(study) == {"calibration/calib", "loaded/long/0", "loaded/long/1"}
+            assert study["loaded/long/1"].periods == pytest.approx(3, abs=1e-3)
+
+
 MAPPING = """
 v_th = {channel = "open", unit = "V"}
 v_out = {channel = "out", unit = "V"}

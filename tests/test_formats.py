@@ -47,6 +47,12 @@ def pair(v_th="rig/open", v_out="rig/skin", **more):
     return {**GIVEN, "v_th": {"channel": v_th}, "v_out": {"channel": v_out}, **more}
 
 
+def columns(v_th, v_out, **more):
+    """A mapping of columns in volts without a unit in the file."""
+    both = {"v_th": v_th, "v_out": v_out}
+    return {**GIVEN, **{key: {"channel": name, "unit": "V"} for key, name in both.items()}, **more}
+
+
 def sweep(number):
     return {"channel": "channel 0", "rows": number}
 
@@ -276,7 +282,59 @@ def test_a_bracket_that_holds_no_unit_belongs_to_the_name(tmp_path):
 def test_a_table_without_names_is_refused(tmp_path):
     path = tmp_path / "t.csv"
     path.write_text("1,2\n3,4\n", encoding="utf-8")
-    refused(path, pair("1", "2", sample_rate=2e5), "the first line holds numbers")
+    refused(path, pair("1", "2", sample_rate=2e5), "line 1 holds numbers, .* add --header-line 0")
+
+
+def test_a_table_without_names_has_numbered_columns(tmp_path):
+    path = tmp_path / "t.csv"
+    path.write_text("1,2\n3,4\n5,6\n", encoding="utf-8")
+    refused(path, pair("1", "2", sample_rate=2e5), r"the columns 1, 2\. .* add --header-line 0")
+    recordings, _ = imported(path, columns("1", "2", sample_rate=2e5, header_line=0))
+    np.testing.assert_allclose(recordings["loaded/0"].v_out, np.array([2, 4, 6]) / 0.0535)
+
+
+def test_a_preamble_may_stand_beside_the_numbers(tmp_path):
+    path = tmp_path / "tds.csv"  # as of Tektronix TDS
+    beside = ["Record Length,3,s", "Sample Interval,5e-6,s", "Source,CH1,", ",,", ",,"]
+    rows = [f"{text},{i / 2e5:.6e},{i},{2 * i},\n" for i, text in enumerate(beside)]
+    path.write_text("".join(rows), encoding="utf-8")
+    refused(path, pair("CH1", "CH2", sample_rate=2e5), "columns 1, 2, 3, 4, 5, 6, 7.*header-line 0")
+    told = columns("5", "6", time={"channel": "4", "unit": "s"}, header_line=0)
+    recordings, _ = imported(path, told)
+    np.testing.assert_allclose(recordings["loaded/0"].v_out, np.arange(0, 10, 2) / 0.0535)
+
+
+def test_the_clock_may_start_beside_the_units(tmp_path):
+    path = tmp_path / "rigol.csv"
+    path.write_text(
+        "X,CH1,CH2,Start,Increment,\nSequence,VOLT,VOLT,-6e-3,5e-6\n0,1,2,\n1,3,4,\n2,5,6,\n",
+        encoding="utf-8",
+    )
+    told = {**GIVEN, "sample_rate": 2e5, "v_th": {"channel": "CH1"}, "v_out": {"channel": "CH2"}}
+    recordings, [used] = imported(path, told)
+    np.testing.assert_allclose(recordings["loaded/0"].v_out, np.array([2, 4, 6]) / 0.0535)
+    assert str(used.signals["v_out"]).startswith("'CH2' in VOLT (file)")
+    path.with_suffix(".h5").unlink()
+    del told["sample_rate"]
+    refused(path, {**told, "time": {"channel": "X"}}, "the file says 'Sequence' of channel 'X'")
+
+
+def test_v_th_may_be_a_channel_of_another_file(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    told = columns("open.csv:a", "skin", sample_rate=2e5)
+    pathlib.Path("open.csv").write_text("a\n1\n2\n3\n", encoding="utf-8")
+    finger = tmp_path / "finger.csv"
+    finger.write_text("skin\n4\n5\n6\n", encoding="utf-8")
+    recordings, [used] = imported(finger, told)
+    np.testing.assert_allclose(recordings["loaded/0"].v_th, np.array([1, 2, 3]) / 0.0535)
+    np.testing.assert_allclose(recordings["loaded/0"].v_out, np.array([4, 5, 6]) / 0.0535)
+    assert str(used.signals["v_th"]).startswith("'open.csv:a' in V")
+    finger.with_suffix(".h5").unlink()
+    wrong = columns("open.csv:b", "skin", sample_rate=2e5)
+    refused(finger, wrong, "the names are 'skin', 'open.csv:a'")
+    pathlib.Path("open.csv").write_text("a\n1\n2\nx\n", encoding="utf-8")
+    with pytest.raises(RecordingError, match=r"^open\.csv: cannot be read"):
+        etid.import_file(finger, "t.h5", told)
 
 
 def test_columns_that_are_not_asked_for_may_hold_anything(tmp_path):

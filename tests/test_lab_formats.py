@@ -150,21 +150,24 @@ def test_a_long_record_is_split_at_its_pauses(tmp_path):
 def test_a_long_record_is_split_at_the_edges_of_a_trigger(tmp_path):
     th, out = long_record()
     trigger = np.zeros(th.size)
-    for start in (1900, 1900 + 3600, 1900 + 7300):
+    for start in (1900, 1900 + 3600, 1900 + 7300):  # before the trains, which begin with a rest
         trigger[start : start + 50] = 5.0
     np.savez(tmp_path / "a.npz", th=th, out=out, trig=trigger)
     recordings, _ = imported(
         tmp_path / "a.npz", v_th="th", v_out="out", sample_rate=RATE, split="trig"
     )
-    assert [one.v_th.size for one in recordings] == [3600] * len(recordings)
-    np.testing.assert_array_equal(recordings[1].v_th, th[5500:9100])
     whole = etid.Recording(th, out, sample_rate=RATE, pulse_rate=PULSES)
-    np.testing.assert_array_equal(whole.split(trigger)[1].v_th, th[5500:9100])
-    assert whole.split(trigger)[1].path == "loaded/1"
+    # As by the pauses: a trial has whole periods, without the pause after them.
+    for one, by_edge, by_pause in zip(recordings, whole.split(trigger), whole.split(), strict=True):
+        np.testing.assert_array_equal(one.v_th, by_pause.v_th)
+        np.testing.assert_array_equal(by_edge.v_th, by_pause.v_th)
+        assert by_edge.path == by_pause.path
     with pytest.raises(RecordingError, match="no rising edge"):
         whole.split(np.zeros(th.size))
     with pytest.raises(RecordingError, match=r"has shape \(5,\), must be"):
         whole.split(np.zeros(5))
+    with pytest.raises(RecordingError, match="no pulse follows a rising edge"):
+        whole.split(np.arange(th.size) > th.size - 100)
     with pytest.raises(RecordingError, match="without a pause"):
         etid.Recording(*pulses(), sample_rate=RATE, pulse_rate=PULSES).split()
     np.savez(tmp_path / "b.npz", th=th, out=np.stack([out, out]))

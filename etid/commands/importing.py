@@ -4,6 +4,7 @@ import argparse
 import dataclasses
 import os
 import pathlib
+from collections.abc import Callable
 
 from etid.commands import Outcome
 from etid.commands.outputs import HDF5
@@ -36,22 +37,23 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "(data_schema/README.md)",
     )
     for name, kind, what in (
-        ("delimiter", str, "character between the cells, default a comma"),
+        ("delimiter", _delimiter, "character between the cells, default a comma; '\\t': a tab"),
         ("decimal", str, "decimal sign, default a point"),
-        ("header_line", int, "line with the names of the columns, default 1"),
+        ("header_line", int, "line with the names of the columns, default 1; 0: they are 1, 2, …"),
         ("encoding", str, "encoding of the text, default UTF-8"),
     ):
         _option(parser, name, kind, f"for CSV: {what}")
     channel = "channel of {}; its unit is {} unless the file names a unit".format
     for name, signal in SIGNALS.items():
-        _option(parser, name, help=channel(name, signal.unit))
+        other = "; FILE:NAME for a channel of another file" if name == "v_th" else ""
+        _option(parser, name, help=channel(name, signal.unit) + other)
     _option(parser, "time", help=f"{channel('the time', 'second')}; replaces --sample-rate")
     _option(parser, "scale", float, "divisor of the voltages: volt at the terminal = value / scale")
     _option(
         parser,
         "split",
         help="split one long record into trials: 'pulses' at the pauses between its pulses, or the "
-        "channel of a trigger",
+        "channel of a trigger; files of --calibration are not split",
     )
     for name, field in DECLARED.items():
         if field.type in ("number", "label"):
@@ -63,10 +65,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def _option(
     parser: argparse.ArgumentParser,
     name: str,
-    kind: type[str] | type[float] | type[int] = str,
+    kind: Callable[[str], object] = str,
     help: str = "",
 ) -> None:
-    metavar = "NAME" if kind is str else "NUMBER"
+    metavar = "NUMBER" if kind in (int, float) else "NAME"
     parser.add_argument(f"--{name.replace('_', '-')}", type=kind, metavar=metavar, help=help)
 
 
@@ -95,6 +97,11 @@ def run(arguments: argparse.Namespace) -> Outcome:
         "imported": [dataclasses.asdict(each) for each in used],
     }
     return Outcome("\n".join(map(str, used)), data)
+
+
+def _delimiter(text: str) -> str:
+    r"""The value of --delimiter; a shell passes `'\t'` as two characters."""
+    return "\t" if text == r"\t" else text
 
 
 def _ohm(file: str, text: str) -> float:

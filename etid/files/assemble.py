@@ -223,10 +223,15 @@ def _parts(
                 "be split",
                 field="split",
             )
-    samples = np.concatenate(list(asked.blocks())).astype(float)
+
+    def samples(one: Channel) -> np.ndarray:
+        return np.concatenate(list(one.blocks())).astype(float)
+
+    rates = common.sample_rate, common.pulse_rate
     if by_pulses:
-        return by_pauses(samples, common.sample_rate, common.pulse_rate)
-    return by_trigger(samples, channels["v_out"].length)
+        return by_pauses(samples(asked), *rates)
+    cause = channels["v_th"] if "v_th" in channels else channels["current"]
+    return by_trigger(samples(asked), samples(cause), *rates)
 
 
 def _unit(name: str, signal: Signal, said: str) -> tuple[Unit, str]:

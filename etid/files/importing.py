@@ -12,9 +12,10 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from etid.files.assemble import Imported, Used, sources_of
-from etid.files.channel import located
+from etid.files.channel import Contents, located
 from etid.files.clock import check_spacing
 from etid.files.mapping import CHANNELS, of_files, plans, read_mapping
+from etid.files.others import with_others
 from etid.files.readers import abf, delimited, excel, lvm, matlab, npz, tdms, wav
 from etid.recordings.fields import LABELS
 from etid.recordings.recording import AbstractSource, RecordingError
@@ -57,7 +58,11 @@ def import_file(
       need `pip install etid[excel]`.
 
     With `split`, one long record becomes several trials: `"pulses"` splits it at the pauses between
-    its pulses, the name of a trigger channel at the rising edges of the trigger.
+    its pulses, the name of a trigger channel at the rising edges of the trigger. Files of
+    `calibrations` are not split.
+
+    A channel may be in another file, as when V_th was recorded once for all trials: `FILE:NAME` is
+    channel `NAME` of `FILE`, a path from the current folder.
 
     A mapping assigns channels to signals; data_schema/README.md lists its keys. For one recording,
     arguments with the same names can replace the mapping. With arguments, a channel without a unit
@@ -103,18 +108,14 @@ def import_file(
                 "is not an argument for npz files, which contain it")  # fmt: skip
         return _import_npz(paths[0], target, {"condition": paths[0].stem} | labels)
     for path in paths:
-        if path.suffix.lower() not in READERS:
-            raise RecordingError(
-                f"etid cannot import files with the suffix {path.suffix!r}",
-                file=str(path),
-                remedy=f"Export it as one of {', '.join(READERS)}, or write an etid file with h5py",
-            )
+        _check_suffix(path)
     said: list[Mapping[str, Any]]
     if mapping is None:
         common = {
             name: {"channel": value} if name in CHANNELS else value for name, value in given.items()
         }
-        said = [common | ({"r_load": known[path]} if path in known else {}) for path in paths]
+        whole = {name: value for name, value in common.items() if name != "split"}
+        said = [whole | {"r_load": known[path]} if path in known else common for path in paths]
         by, place, implied = "command", "", _IMPLIED
     else:
         more = {"calibrations": known} if known else {}
@@ -137,9 +138,13 @@ def import_file(
             if calibrated and path not in known:
                 told = {**told, "calibration": calibrated}
             with located(file):
-                contents = files.enter_context(
-                    READERS[path.suffix.lower()](path, folder, **written)
-                )
+
+                def opened(one: pathlib.Path, written: Mapping[str, Any] = written) -> Contents:
+                    _check_suffix(one)
+                    own = written if one.suffix.lower() == ".csv" else {}
+                    return files.enter_context(READERS[one.suffix.lower()](one, folder, **own))
+
+                contents = with_others(opened(path), told, opened)
                 with located(place + file):
                     name = path.stem if len(paths) > 1 else ""
                     planned = plans(told, contents.names, implied, name)
@@ -165,6 +170,16 @@ def import_file(
             refuse_nested(sources)
             Study(sources).write(target)
     return used
+
+
+def _check_suffix(path: pathlib.Path) -> None:
+    """Raise an error if no reader reads files with this suffix."""
+    if path.suffix.lower() not in READERS:
+        raise RecordingError(
+            f"etid cannot import files with the suffix {path.suffix!r}",
+            file=str(path),
+            remedy=f"Export it as one of {', '.join(READERS)}, or write an etid file with h5py",
+        )
 
 
 def _is_complete(path: pathlib.Path) -> bool:

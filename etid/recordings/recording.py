@@ -219,9 +219,9 @@ class Recording(Overviewed, AbstractFields):
         """The trials of one long recording.
 
         Args:
-            trigger: Voltage of a trigger channel, as long as the records: a trial lasts from one
-                rising edge to the next. If not given, trials are the trains of pulses between
-                pauses.
+            trigger: Voltage of a trigger channel, as long as the records: a trial has the pulses
+                from one rising edge to the next, up to the first pause. If not given, trials are
+                the trains of pulses between pauses.
 
         Returns:
             Recordings with the paths `PATH/0`, `PATH/1`, … and these numbers as `trial`.
@@ -234,7 +234,9 @@ class Recording(Overviewed, AbstractFields):
             if trigger is None:
                 parts = by_pauses(self.v_th, self.sample_rate, self.pulse_rate)
             else:
-                parts = by_trigger(np.asarray(trigger, float), self.v_out.size)
+                cause = self.samples[self.cause].values
+                given = np.asarray(trigger, float)
+                parts = by_trigger(given, cause, self.sample_rate, self.pulse_rate)
         whole = self.path or self.metadata.kind
         return [
             self.replace(

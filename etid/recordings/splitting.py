@@ -1,13 +1,14 @@
 """Parts of one long record: by pauses between its pulses, or by a trigger channel."""
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from etid.recordings.errors import RecordingError
 from etid.signals.pulse_train import find_pulses
 
 PAUSE = 1.5  # [pulse periods] from one pulse to the next; a longer distance is a pause
 BEFORE = 0.2  # [pulse periods] rest that a part has before its first pulse
+EARLY = 0.1  # [pulse periods] by which a pulse may precede the trigger that starts it
 
 
 def by_pauses(
@@ -25,41 +26,62 @@ def by_pauses(
     """
     period = sample_rate / pulse_rate
     edges = find_pulses(v_th, sample_rate, pulse_rate).edges
-    parts = np.split(edges, np.flatnonzero(np.diff(edges) > PAUSE * period) + 1)
-    if len(parts) < 2:
+    trains = _trains(edges, period)
+    if len(trains) < 2:
         raise RecordingError(
             f"has {edges.size} pulses without a pause between them",
             field="v_th",
             remedy="Name a trigger channel, or do not split the record",
         )
-    found = []
-    for part in parts:
-        start = int(part[0] - round(BEFORE * period))
-        stop = start + round(part.size * period)
-        if start >= 0 and stop <= v_th.size:  # parts that an end of the record cuts are left out
-            found.append(slice(start, stop))
-    return found
+    return _parts(trains, period, v_th.size)
 
 
-def by_trigger(trigger: Float[np.ndarray, " time"], samples: int) -> list[slice]:
-    """The parts of a record from each rising edge of a trigger to the next; all are equally long.
+def by_trigger(
+    trigger: Float[np.ndarray, " time"],
+    cause: Float[np.ndarray, " sample"],
+    sample_rate: float,
+    pulse_rate: float,
+) -> list[slice]:
+    """The parts of a record that begin at the rising edges of a trigger, each with whole periods.
 
-    An edge is where the trigger rises through the middle of its range. The last part is left out if
-    it is shorter than the others.
+    An edge is where the trigger rises through the middle of its range. A part has the pulses from
+    one edge to the next, up to the first pause.
 
     Args:
         trigger: Voltage of the trigger, in any unit.
-        samples: Number of samples of the record.
+        cause: Unloaded voltage, or the current if there is none, in any unit.
+        sample_rate: Samples per second [Hz].
+        pulse_rate: Pulses per second [Hz].
 
     Raises:
-        RecordingError: The trigger has no edge, or another length.
+        RecordingError: The trigger has no edge, or another length, or no pulse follows it.
     """
-    if trigger.shape != (samples,):
-        raise RecordingError(f"has shape {trigger.shape}, must be ({samples},)", field="trigger")
+    if trigger.shape != cause.shape:
+        raise RecordingError(f"has shape {trigger.shape}, must be {cause.shape}", field="trigger")
     low, high = float(np.min(trigger)), float(np.max(trigger))
     above = trigger > (low + high) / 2
     starts = np.flatnonzero(above[1:] & ~above[:-1]) + 1
     if not np.isfinite(high - low) or starts.size == 0:
         raise RecordingError("has no rising edge", field="trigger", remedy="Name another channel")
-    length = int(np.diff(starts).min()) if starts.size > 1 else trigger.size - int(starts[0])
-    return [slice(int(at), int(at) + length) for at in starts if at + length <= trigger.size]
+    period = sample_rate / pulse_rate
+    edges = find_pulses(cause, sample_rate, pulse_rate).edges
+    _, *between = np.split(edges, np.searchsorted(edges, starts - EARLY * period))
+    trains = [_trains(some, period)[0] for some in between if some.size]
+    if not trains:
+        raise RecordingError(
+            "no pulse follows a rising edge", field="trigger", remedy="Name another channel"
+        )
+    return _parts(trains, period, cause.size)
+
+
+def _trains(edges: Int[np.ndarray, " edge"], period: float) -> list[Int[np.ndarray, " _"]]:
+    """Pulses without a pause between them, from the places where pulses begin."""
+    return np.split(edges, np.flatnonzero(np.diff(edges) > PAUSE * period) + 1)
+
+
+def _parts(trains: list[Int[np.ndarray, " _"]], period: float, samples: int) -> list[slice]:
+    """Whole periods around trains of pulses; without those that an end of the record cuts."""
+    starts = [int(train[0] - round(BEFORE * period)) for train in trains]
+    stops = [at + round(len(train) * period) for at, train in zip(starts, trains, strict=True)]
+    both = zip(starts, stops, strict=True)
+    return [slice(start, stop) for start, stop in both if start >= 0 and stop <= samples]

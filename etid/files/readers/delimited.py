@@ -4,7 +4,10 @@ A table has commas between its cells, points in its numbers, and its names in th
 the user says otherwise. A table that looks different is refused; the error says what to confirm.
 
 A column `open [mV]` or `open (mV)` has the name `open` and the unit mV. Oscilloscopes write the
-units into a second line instead, such as `(ms),(mV),(mV)`. This line contains no number.
+units into a second line instead, such as `(ms),(mV),(mV)` or `Sequence,VOLT,VOLT,-6e-3,5e-6`.
+
+A table without names has the columns `1`, `2`, …; `header_line` is then 0. Some oscilloscopes
+write such tables, with a preamble in the first columns of the first rows.
 """
 
 import codecs
@@ -15,7 +18,7 @@ import itertools
 import pathlib
 import re
 import tempfile
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Any, BinaryIO, TextIO
 
 import numpy as np
@@ -26,6 +29,8 @@ from etid.recordings.recording import RecordingError
 
 _SEEN = 1 << 16  # [bytes] start of a table that is looked at before it is read
 _LINES = 200  # lines in which the first row of numbers is searched
+_BESIDE = 3  # rows in which numbers beside a preamble are searched
+_DIALECTS = (",.", ";.", ";,", "\t.", "\t,")  # delimiters and decimal signs that are tried
 ROWS = 1 << 16  # rows of text in memory at a time
 
 _WITH_UNIT = re.compile(r"(?P<name>.*\S)\s*[\[(](?P<unit>[^\[\]()]+)[\])]")
@@ -39,6 +44,7 @@ class Dialect:
         delimiter: Character between the cells.
         decimal: Decimal sign of the numbers: `.` or `,`.
         header_line: Line with the names of the columns, counted from 1; lines above are skipped.
+            0: no line names them.
         encoding: Encoding of the text.
     """
 
@@ -48,13 +54,24 @@ class Dialect:
     encoding: str = "utf-8-sig"
 
     def __post_init__(self) -> None:
-        if len(self.delimiter) != 1 or self.decimal not in (".", ",") or self.header_line < 1:
+        if len(self.delimiter) != 1 or self.decimal not in (".", ",") or self.header_line < 0:
             raise RecordingError(f"the table cannot be written as {self}")
 
     def cells(self, line: str) -> list[str]:
         """Cells of a line."""
         row = next(csv.reader([line], delimiter=self.delimiter), [])
         return [cell.strip() for cell in row]
+
+    def units(self, cells: Sequence[str], count: int) -> tuple[str, ...] | None:
+        """The units of `count` columns if a line of cells holds units; None if it holds none.
+
+        An oscilloscope writes the start of its clock into the cells beside the units.
+        """
+        cells = [cell.strip("()[] ") for cell in cells]
+        if len(cells) > count or not any(map(parse_unit, cells)):
+            return None
+        found = ["" if self.is_number(cell) else cell for cell in cells]
+        return (*found, *[""] * (count - len(found)))
 
     def is_number(self, cell: str) -> bool:
         """Whether a cell is a number with this decimal sign."""
@@ -63,6 +80,13 @@ class Dialect:
         except ValueError:
             return False
         return self.decimal == "." or "." not in cell
+
+    def are_numbers(self, cells: Sequence[str]) -> bool:
+        """Whether all cells are numbers; empty ones at the end do not count."""
+        filled = len(cells)
+        while filled and not cells[filled - 1]:
+            filled -= 1
+        return filled > 0 and all(map(self.is_number, cells[:filled]))
 
 
 DIALECT = tuple(field.name for field in dataclasses.fields(Dialect))
@@ -132,28 +156,40 @@ def _refuse_another(path: pathlib.Path) -> None:
     raise RecordingError(
         "seems to be written with "
         + ", ".join(f"{name} {value!r}" for name, value in options.items())
-        + f" and the columns {', '.join(found.cells(lines[found.header_line - 1]))}",
+        + f" and the columns {', '.join(_names(found, lines[max(found.header_line - 1, 0)]))}",
         remedy=f"Nothing is guessed: if this is right, add {flags}",
     )
 
 
 def _guessed(lines: list[str], encoding: str) -> Dialect | None:
     """The dialect in which a table has rows of numbers; None if no dialect has them."""
-    for delimiter, decimal in (",.", ";.", ";,", "\t.", "\t,"):
+    filled = [number for number, line in enumerate(lines, 1) if line.strip()]
+    for delimiter, decimal in _DIALECTS:
         dialect = Dialect(delimiter, decimal, encoding=encoding)
-        for number in range(1, len(lines) - 1):
-            rows = [dialect.cells(line) for line in lines[number : number + 2]]
-            width = len(rows[0])
-            if width < 2 or not all(len(row) == width and all(map(dialect.is_number, row))
-                                    for row in rows):  # fmt: skip
+        cells = [dialect.cells(lines[number - 1]) for number in filled]
+        for row in range(1, len(cells) - 1):
+            width = len(cells[row])
+            if width < 2 or not all(
+                len(one) == width and dialect.are_numbers(one) for one in cells[row : row + 2]
+            ):
                 continue
-            above = [cell.strip("()[] ") for cell in dialect.cells(lines[number - 1])]
-            units = any(above) and all(not cell or parse_unit(cell) for cell in above)
-            header = max(1, number - units)
-            if all(map(dialect.is_number, dialect.cells(lines[header - 1]))):
-                return None  # no names: the reader of the header says so
-            return dataclasses.replace(dialect, header_line=header)
+            units = dialect.units(cells[row - 1], len(cells[row - 1])) is not None
+            header = max(0, row - 1 - units)
+            named = not dialect.are_numbers(cells[header])
+            return dataclasses.replace(dialect, header_line=filled[header] if named else 0)
+    for delimiter, decimal in _DIALECTS:
+        dialect = Dialect(delimiter, decimal, 0, encoding)
+        rows = [dialect.cells(line) for line in lines[:_BESIDE]]
+        columns = [all(map(dialect.is_number, column)) for column in zip(*rows, strict=False)]
+        if len(rows) == _BESIDE and sum(columns) > 1:
+            return dialect
     return None
+
+
+def _names(dialect: Dialect, line: str) -> list[str]:
+    """Names of the columns, from the line with the names or from the first row."""
+    cells = dialect.cells(line)
+    return cells if dialect.header_line else [str(i) for i in range(1, len(cells) + 1)]
 
 
 def _header(text: TextIO, dialect: Dialect) -> tuple[tuple[str, ...], tuple[str, ...], int]:
@@ -161,24 +197,21 @@ def _header(text: TextIO, dialect: Dialect) -> tuple[tuple[str, ...], tuple[str,
     skipped = dialect.header_line - 1
     for _ in range(skipped):
         text.readline()
-    cells = dialect.cells(text.readline())
-    if cells and all(dialect.is_number(cell) for cell in cells):
+    line = text.readline()
+    cells = _names(dialect, line)
+    if not dialect.header_line:
+        return tuple(cells), ("",) * len(cells), 0
+    if dialect.are_numbers(cells):
         raise RecordingError(
-            "the first line holds numbers", remedy="The first line must name the columns"
+            f"line {dialect.header_line} holds numbers, not the names of the columns",
+            remedy="If no line names them, add --header-line 0; the columns are then 1, 2, …",
         )
-    both = [with_unit(cell) for cell in cells]
-    names, units = [name for name, _ in both], [unit for _, unit in both]
-    below = [cell.strip("()[] ") for cell in dialect.cells(text.readline())]
-    if len(below) != len(names) or not any(below) or any(map(dialect.is_number, below)):
-        return tuple(names), tuple(units), skipped + 1
-    if any(cell and not parse_unit(cell) for cell in below):
-        return (
-            tuple(names),
-            tuple(units),
-            skipped + 1,
-        )  # not units: the parser of the numbers will raise the error
-    both = zip(units, below, strict=True)
-    return tuple(names), tuple(above or unit for above, unit in both), skipped + 2
+    names, units = zip(*map(with_unit, cells), strict=True) if cells else ((), ())
+    below = dialect.units(dialect.cells(text.readline()), len(names))
+    if below is None:
+        return names, units, skipped + 1
+    units = tuple(above or unit for above, unit in zip(units, below, strict=True))
+    return names, units, skipped + 2
 
 
 def with_unit(cell: str) -> tuple[str, str]:
