@@ -335,7 +335,7 @@ TROUBLES = {
 
 @pytest.mark.parametrize("trouble", TROUBLES)
 def test_an_electrode_in_trouble_says_so_at_once_and_recovers(trouble):
-    tracker = dataclasses.replace(tracker_of(2), adc_range=jnp.array([-HIGHEST, HIGHEST]))
+    tracker = dataclasses.replace(tracker_of(2), adc_range=np.array([-HIGHEST, HIGHEST]))
     clean = np.tile(tracker.pulses(loaded(quiet())), (3, 1, 1))
     pulses = with_noise(clean, seed=2)
     first, last = 12, 24
@@ -488,9 +488,60 @@ def test_intervals_of_drifting_skin_contain_it_in_95_per_cent():
 
 def test_bands_end_where_aliases_begin():
     of = tracker_of(2).model.bands
-    last = of.x.size / of.size  # of the sample rate
-    assert ALIASED - 2 * gain_bands.WIDEST / of.size < last < ALIASED + gain_bands.WIDEST / of.size
-    assert float(of.frequency[-1]) < ALIASED * RATE
+    last = of.x.size / of.samples  # of the sample rate
+    assert ALIASED - 1 / of.samples < last <= ALIASED
+    middle = ALIASED - gain_bands.LAST_BAND / 2 / of.samples
+    assert abs(float(of.frequency[-1]) / RATE - middle) < 2 / of.samples
+
+
+@functools.cache
+def noise_alone():
+    tracker = tracker_of(2)
+    noise = NOISE * np.random.default_rng(9).standard_normal((4000, 3333))
+    return tracker, tracker.projection.seen(noise, np.array([-np.inf, np.inf]))
+
+
+def test_noise_of_a_pulse_is_that_of_its_samples():
+    """Its mean, and its scatter: about a thousand numbers, as the tests for changes assume."""
+    tracker, seen = noise_alone()
+    relative = np.asarray(seen.variance) / tracker.model.bands.samples / NOISE**2
+    assert abs(relative.mean() - 1) < 4 * relative.std() / np.sqrt(relative.size)
+    assert 1000 < 2 / relative.var() < 1200
+
+
+def test_weights_are_those_of_the_noise_in_the_bands():
+    """And slopes that are alike in neighbouring bands have the stated information."""
+    tracker, seen = noise_alone()
+    bands = tracker.model.bands
+    gain = np.stack(np.split(np.asarray(seen.gain), 2, axis=1))
+    weight = np.asarray(bands.weight) / (bands.samples * NOISE**2)
+    each = (gain**2).mean(axis=(0, 1)) * weight
+    # A row of weights does not say what neighbours share; the last two bands share most.
+    assert (each[:-2] > 0.8).all()
+    assert (each < 1.2).all()
+    step = 6
+    for first in range(0, weight.size - step, step):
+        of = slice(first, first + step)
+        sums = (gain[:, :, of] * weight[of]).sum(axis=2)
+        told = (sums**2).mean() / weight[of].sum()
+        assert abs(told - 1) < 0.08, (first, told)  # five standard errors of 8000 draws
+
+
+def test_bands_of_a_pulse_are_those_of_its_transform():
+    """Σ X̄ Y / Σ |X|², where means of blocks have replaced the samples between the pulses."""
+    tracker = tracker_of(2)
+    bands = tracker.model.bands
+    pulses = tracker.pulses(loaded(quiet()))[0]
+    seen = tracker.projection.seen(pulses, np.array([-np.inf, np.inf]))
+    real, imaginary = np.split(np.asarray(seen.gain), 2, axis=1)
+    edges = gain_bands._edges(bands.x.size)
+    y, x = np.fft.rfft(pulses)[:, 1 : bands.x.size + 1], np.asarray(bands.x)
+    power = np.add.reduceat(np.abs(x) ** 2, edges[:-1] - 1)
+    power -= np.diff(edges) * float(bands.variance_x)
+    expected = np.add.reduceat(x.conj() * y, edges[:-1] - 1, axis=1) / power
+    error = np.abs(real + 1j * imaginary - expected)
+    one = np.sqrt(2 * bands.samples * NOISE**2 / np.asarray(bands.weight))  # of a pulse at 60 dB
+    assert (error < 0.1 * one).all(), (error / one).max()
 
 
 def test_windows_are_those_next_to_each_period():

@@ -169,8 +169,7 @@ class Controller(Overviewed, eqx.Module):
             )
         model = CurrentModel.of(tracker.model.bands, tracker.model.source, tracker.known)
         of = tracker.model.bands
-        spectrum = np.concatenate([[0], of.x, np.zeros(of.size // 2 - of.x.size)])
-        unloaded = float(np.abs(np.fft.irfft(spectrum, of.size)).max())
+        unloaded = float(np.abs(of.waveform()).max())
         return cls(
             tracker=tracker,
             model=model,

@@ -86,15 +86,14 @@ class CurrentModel(eqx.Module):
         """
         x, rate = np.asarray(bands.x), bands.sample_rate
         number = np.arange(1.0, x.size + 1)
-        spectrum = np.concatenate([[0], x, np.zeros(bands.size // 2 - x.size)])
-        begin, end = _phase(np.fft.irfft(spectrum, bands.size))
+        begin, end = _phase(bands.waveform())
         edges = [np.arange(-2.0, EDGE, FINE) + edge for edge in (begin, end)]
         times = np.concatenate([edges[0], np.arange(begin + EDGE, end - 2, COARSE), edges[1]])
-        omega = 2 * np.pi * number / bands.size  # per sample
+        omega = 2 * np.pi * number / bands.samples  # per sample
         integral = (np.exp(1j * omega * end) - np.exp(1j * omega * begin)) / (1j * omega * rate)
         rows = np.concatenate([integral[None, :], np.exp(1j * np.outer(times, omega))])
-        rows = 2 / bands.size * rows * x
-        by_band = rows @ _interpolation(number, np.asarray(bands.frequency) * bands.size / rate)
+        rows = 2 / bands.samples * rows * x
+        by_band = rows @ _interpolation(number, np.asarray(bands.frequency) * bands.samples / rate)
         # Re Σ w Y = Σ Re w Re Y − Im w Im Y.
         sums = np.concatenate([by_band.real, -by_band.imag], axis=1)
         loaded = source + as_complex(known.resistance)

@@ -42,8 +42,8 @@ register_description(
         ),
         errors="accumulate the information of all pulses; to them the error of Z_th and of the "
         "unloaded voltage was added, which no number of pulses lessens",
-        noise="The variance of the noise was estimated at each pulse from what a straight line "
-        "through each band leaves.",
+        noise="The variance of the noise was estimated at each pulse from the quiet between two "
+        "pulses, at six frequencies and without a parabola through each block.",
         cited=("bell1993", "willsky1976", "lowry1992"),
     ),
 )

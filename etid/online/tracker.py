@@ -63,7 +63,7 @@ from etid.online.electrode import (
     suspicion,
     tracked,
 )
-from etid.online.gain_bands import cut, unloaded_bands
+from etid.online.gain_bands import Bands, Projection, Seen, cut, unloaded_bands
 from etid.online.pulse_fit import GainModel
 from etid.online.reading import fit_of
 from etid.online.state import ElectrodeState, TrackerState
@@ -85,6 +85,7 @@ class Tracker(Overviewed, eqx.Module):
 
     Attributes:
         model: Model of the gain of a pulse.
+        projection: What makes bands of the samples of a pulse.
         known: Z_th in the bands and its covariance, from the calibrations.
         change: Standard deviation of the random walk of the elements' logarithms [1/√pulse].
         limit: Limit of the tests for a change [χ²].
@@ -95,10 +96,11 @@ class Tracker(Overviewed, eqx.Module):
     """
 
     model: GainModel
+    projection: Projection = eqx.field(static=True)
     known: GivenDriver
     change: Float[Array, ""]
     limit: Float[Array, ""]
-    adc_range: Float[Array, " 2"]
+    adc_range: Float[np.ndarray, " 2"]
     driver_result: RESULTS
     electrodes: int = eqx.field(static=True)
     period: float = eqx.field(static=True)
@@ -145,7 +147,12 @@ class Tracker(Overviewed, eqx.Module):
             raise IdentificationError(text, None)
         rate = unloaded.sample_rate
         period = rate / seen.train.counted
-        bands = unloaded_bands(seen.v_th, float(seen.sigma_th), rate, period)
+        try:
+            bands, projection = unloaded_bands(seen.v_th, float(seen.sigma_th), rate, period)
+        except ValueError as error:
+            raise IdentificationError(
+                f"unloaded recording {unloaded.path!r}: {error}", None
+            ) from None
         known = known_at(bands.frequency, driver, False, MAXIMUM_LIKELIHOOD)
         low, high = unloaded.adc_range or (-np.inf, np.inf)
         half = seen.step_th / 2
@@ -157,10 +164,11 @@ class Tracker(Overviewed, eqx.Module):
         )
         return cls(
             model=model,
+            projection=projection,
             known=known,
             change=jnp.asarray(float(change)),
             limit=jnp.asarray(changes.limit(len(model.circuit.names()), rate / period)),
-            adc_range=jnp.array([low + half, high - half]),
+            adc_range=np.array([low + half, high - half]),
             driver_result=driver.result,
             electrodes=electrodes,
             period=period,
@@ -261,7 +269,8 @@ class Tracker(Overviewed, eqx.Module):
         if not (np.isfinite(amplitude) & (amplitude >= 0)).all():
             raise ValueError(f"amplitude is {amplitude}; it must be finite and not negative")
         relative = np.broadcast_to(amplitude, (self.electrodes,))
-        return _updated(self, state, jnp.asarray(v_out, dtype=float), jnp.asarray(relative))
+        found = self.projection.seen(np.asarray(v_out, float), self.adc_range)
+        return _updated(self.model, self.change, self.limit, state, found, relative)
 
     def read(self, state: TrackerState) -> Fits:
         """Elements, standard errors, χ² of the last pulse and verdict of every electrode.
@@ -276,7 +285,8 @@ class Tracker(Overviewed, eqx.Module):
         Returns:
             One fit per electrode, in the order of the electrodes, with the label `electrode`.
         """
-        fit = jax.tree.map(np.asarray, _judged(self, state))
+        found = _judged(self.model, self.known, self.driver_result, state)
+        fit = jax.tree.map(np.asarray, found)
         electrodes = [
             {"path": f"electrode/{number}", "electrode": str(number)}
             for number in range(self.electrodes)
@@ -313,15 +323,16 @@ class Tracker(Overviewed, eqx.Module):
 
 @jax.jit  # `stored_jit` and `equinox.filter_jit` would cost a tenth of a tick at every call
 def _updated(
-    tracker: Tracker,
+    model: GainModel,
+    change: Float[Array, ""],
+    limit: Float[Array, ""],
     state: TrackerState,
-    v_out: Float[Array, "lane sample"],
+    seen: Seen,
     amplitude: Float[Array, " lane"],
 ) -> TrackerState:
-    model, limit, number = tracker.model, tracker.limit, state.number + 1
-    before = state.electrodes
-    measured = _measured(tracker, v_out, amplitude, before)
-    information = jax.vmap(lambda of: predicted(of, tracker.change))(before.information)
+    before, number = state.electrodes, state.number + 1
+    measured = _measured(model.bands, seen, amplitude, before)
+    information = jax.vmap(lambda of: predicted(of, change))(before.information)
     found = jax.vmap(lambda *of: tracked(model, *of))(before, measured, information)
     common = model.circuit.scaling()[0]
     suspected = jax.vmap(lambda a, b, c: suspicion(a, b, c, common, limit))(
@@ -347,16 +358,13 @@ def _updated(
 
 
 def _measured(
-    tracker: Tracker,
-    v_out: Float[Array, "lane sample"],
-    amplitude: Float[Array, " lane"],
-    before: ElectrodeState,
+    bands: Bands, seen: Seen, amplitude: Float[Array, " lane"], before: ElectrodeState
 ) -> Measured:
     """Gains of a pulse, and the verdict on its samples.
 
     Args:
-        tracker: The tracker.
-        v_out: One window per electrode [V].
+        bands: The unloaded pulse.
+        seen: The bands of the windows.
         amplitude: Relative amplitude of the pulse.
         before: State before the pulse.
     """
@@ -364,17 +372,11 @@ def _measured(
     known = jnp.isfinite(before.amplitude)
     lacking = jnp.where(known, (relative - before.amplitude) / relative, 0.0)
     # In the steady state the mean of V_out is 0: a transformer passes no direct voltage.
-    mean = v_out.mean(axis=1)
+    finite = jnp.isfinite(seen.mean) & jnp.isfinite(seen.variance)
     steady = jnp.abs(lacking) < STEADY
-    offset = jnp.where(jnp.isfinite(mean) & steady, mean, before.offset)
+    offset = jnp.where(finite & steady, seen.mean, before.offset)
     unknown = ~jnp.isfinite(offset)
-    lowest, highest = v_out.min(axis=1), v_out.max(axis=1)  # NaN if a sample is NaN
-    finite = jnp.isfinite(lowest) & jnp.isfinite(highest)
-    clipped = (lowest <= tracker.adc_range[0]) | (highest >= tracker.adc_range[1])
-    bands = tracker.model.bands
-    gains = bands.measure(
-        jnp.where(finite[:, None], v_out, 0.0), lacking, jnp.where(unknown, 0.0, offset)
-    )
+    gains = bands.measure(seen, lacking, jnp.where(unknown, 0.0, offset))
     signal = power(gains.gain) @ bands.weight
     noise = 2 * jnp.sum(bands.weight > 0, dtype=float) * gains.variance
     flat = (signal < FLAT * noise) | ~(amplitude > 0)
@@ -387,7 +389,7 @@ def _measured(
             (flat, RESULTS.flat),
             (unconnected, RESULTS.unconnected),
         )
-    )(finite, clipped, unknown, flat, jnp.abs(level - 1) < 1 - changes.OPEN)
+    )(finite, seen.clipped, unknown, flat, jnp.abs(level - 1) < 1 - changes.OPEN)
     return Measured(
         gain=gains.gain * as_complex(1 / relative)[:, None],
         variance=gains.variance / relative**2,
@@ -401,9 +403,9 @@ def _measured(
 
 
 @stored_jit
-def _judged(tracker: Tracker, state: TrackerState) -> Fit:
-    return jax.vmap(
-        lambda of: fit_of(
-            tracker.model, tracker.known, tracker.driver_result, state.driver_changed, of
-        )
-    )(state.electrodes)
+def _judged(
+    model: GainModel, known: GivenDriver, driver_result: RESULTS, state: TrackerState
+) -> Fit:
+    return jax.vmap(lambda of: fit_of(model, known, driver_result, state.driver_changed, of))(
+        state.electrodes
+    )
