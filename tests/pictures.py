@@ -31,6 +31,16 @@ NEAREST = etid.SkinRC(45.7e3, 169e3, 0.117e-9)  # about what a fit of SPREAD giv
 
 
 @functools.cache
+def measured() -> Fit:
+    """A fit to an impedance that an instrument measured with 2 % of noise."""
+    frequency = jnp.geomspace(60.0, 1e5, 25)
+    z = np.asarray(SKIN.response(frequency))
+    rng = np.random.default_rng(0)
+    noise = 0.02 * np.abs(z) * (rng.normal(size=25) + 1j * rng.normal(size=25))
+    return etid.identify_impedance(frequency, z + noise, stderr=0.02 * np.abs(z))
+
+
+@functools.cache
 def study() -> etid.Study:
     """A calibration and dry trials at 40 dB."""
     return PRESETS["paper_dry"](snr_db=40.0).simulate(seed=3)
@@ -179,6 +189,7 @@ PICTURES: dict[str, Callable[[], tuple]] = {
     "recording": lambda: (dry(),),
     "fit": lambda: (fit(), dry(), driver()),
     "fit_without_success": lambda: (fit("misfit"), dry(), driver()),
+    "measured_impedance": lambda: (measured(),),
     "fit_impedance": lambda: (fit(), dry(), driver(), "impedance"),
     "fit_residual": lambda: (fit(), dry(), driver(), "residual"),
     "selection": lambda: (selection(SkinRC="misfit"), spread(), driver()),

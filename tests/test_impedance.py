@@ -1,8 +1,11 @@
 """Circuits from measured impedance: soldered ones, and simulated ones with known noise."""
 
+import pickle
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 
 import etid
 from etid.selection.evidence import best
@@ -119,3 +122,19 @@ def test_two_layers_do_not_end_as_one():
     fit = etid.identify_impedance(frequency, z, stderr=sigma, circuit=etid.SkinLayers())
     error = np.asarray(fit.circuit.values()) - np.asarray(truth.values())
     assert (np.abs(error) < 4 * np.sqrt(np.diagonal(fit.cov))).all()
+
+
+def test_a_fit_to_an_impedance_is_drawn_with_its_points():
+    frequency = jnp.geomspace(60.0, 1e5, 20)
+    z = np.asarray(DRY.response(frequency))
+    fit = pickle.loads(pickle.dumps(etid.identify_impedance(frequency, z)))
+    for show in ("pulse", "impedance"):  # the first is the default
+        nyquist, magnitude, _ = fit.plot(show=show, axes=Figure().subplots(1, 3))
+        points = nyquist.containers[0].lines[0]
+        np.testing.assert_allclose(
+            points.get_xydata(), np.stack([np.real(z), -np.imag(z)], 1) / 1e3
+        )
+        labels = [text.get_text() for text in magnitude.get_legend().get_texts()]
+        assert labels == ["fit", "measured"]  # no standard errors are known
+    with pytest.raises(ValueError, match="no residual in time"):
+        fit.plot(show="residual")

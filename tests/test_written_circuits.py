@@ -81,8 +81,40 @@ def test_passive_circuits_pass_kramers_and_kronig_and_a_drift_does_not():
     assert "not passed" in str(mixed)
 
 
+@pytest.mark.parametrize("relative", [0.0005, 0.05])
+def test_known_noise_decides_the_test_of_kramers_and_kronig(relative):
+    z = np.asarray(etid.SkinRC(33.4e3, 186e3, 0.12e-9).response(F))
+    rng = np.random.default_rng(1)
+    sigma = relative * np.abs(z)
+    noisy = z + sigma * (rng.normal(size=40) + 1j * rng.normal(size=40))
+    found = etid.kramers_kronig(F, noisy, stderr=sigma)
+    assert found.passed
+    assert "standard errors" in str(found)
+    # A gain that wanders by 0.7 % during the sweep is hidden by 5 % of noise, not by 0.05 %.
+    wandering = 0.007 * np.sin(np.log(np.asarray(F)))
+    swept = noisy + wandering * z
+    assert etid.kramers_kronig(F, swept, stderr=sigma).passed == (relative > 0.01)
+    # Without standard errors the limit is 1 %, and the test says so.
+    blind = etid.kramers_kronig(F, noisy)
+    assert blind.passed == (relative < 0.01)
+    assert "no residual may exceed 1 %" in str(blind)
+    with pytest.raises(ValueError, match="stderr must be"):
+        etid.kramers_kronig(F, z, stderr=0.0)
+
+
+def test_right_measurements_with_right_errors_pass():
+    rng = np.random.default_rng(2)
+    f = F[::3]  # so few that a chain of fewer relaxations than frequencies describes no circuit
+    z = np.asarray(etid.SkinRC(33.4e3, 186e3, 0.12e-9).response(f))
+    noise = 300.0 * (rng.normal(size=(300, f.size)) + 1j * rng.normal(size=(300, f.size)))
+    failed = sum(not etid.kramers_kronig(f, z + one, stderr=300.0).passed for one in noise)
+    assert failed <= 3  # 1 in 1000 by chance; more than 3 of 300 in 1 of 3 000 runs
+
+
 def test_wrong_arguments_of_the_test_are_refused():
     with pytest.raises(ValueError, match="both must be"):
         etid.kramers_kronig([1.0, 2.0], [1.0, 2.0])
     with pytest.raises(ValueError, match="frequencies > 0"):
         etid.kramers_kronig(np.arange(6.0), np.ones(6))
+    with pytest.raises(ValueError, match="6 frequencies in 3 decades; the test needs at least 3"):
+        etid.kramers_kronig(np.geomspace(1.0, 1e3, 6), np.ones(6))

@@ -20,6 +20,7 @@ from jaxtyping import Array, Complex, Float
 from etid.circuits.circuit import AbstractCircuit
 from etid.identify.arguments import circuit_of, require_float64
 from etid.identify.compiled import stored_jit
+from etid.results.data import MeasuredImpedance, with_data
 from etid.results.fits import CHANGES, Fit, IdentificationError, Support, complex_rrse
 from etid.results.verdicts import RESULTS, first_verdict, message, verdict
 from etid.solvers.levenberg_marquardt import LevenbergMarquardt, best_start
@@ -119,7 +120,7 @@ def identify_impedance(
         throw: Raise an error if the verdict is not successful.
 
     Returns:
-        Elements, standard errors and verdict.
+        Elements, standard errors and verdict. `fit.plot()` draws the fit and the measured points.
 
     Raises:
         ValueError: The shapes of the arrays differ, there are too few impedances for the elements,
@@ -142,7 +143,8 @@ def identify_impedance(
     if not np.isfinite(z).all():
         raise ValueError(f"{np.sum(~np.isfinite(z))} impedances are not finite; leave them out")
     arrays = (jnp.asarray(f), jnp.asarray(z), jnp.asarray(sigma))
-    fit = _fit(*arrays, circuit, stderr is not None)
+    known = MeasuredImpedance(f, z, None if stderr is None else sigma)
+    fit = with_data(_fit(*arrays, circuit, stderr is not None), known)
     if throw and fit.verdict != "successful":
         raise IdentificationError(f"impedance: {fit.verdict}. {message(fit.verdict)}", fit)
     return fit

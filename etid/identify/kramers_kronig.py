@@ -8,6 +8,9 @@ which meets the Kramers-Kronig relations for all R_k. The parameters enter linea
 relaxations is the smallest whose mean square residual per degree of freedom is near the least one:
 more would describe noise. An impedance that drifts during its measurement, or that is not linear,
 leaves residuals that are not noise.
+
+With standard errors σ_k the residuals are weighted by 1/σ_k, and χ² decides. Without them they are
+weighted by 1/|Z|, and none may exceed 1 %.
 """
 
 import dataclasses
@@ -15,13 +18,19 @@ import dataclasses
 import numpy as np
 import numpy.typing as npt
 from jaxtyping import Complex, Float
+from scipy.special import chdtri
 
 from etid.circuits.overview import Overview, Overviewed
+from etid.identify.impedance import MISFIT_CHI2
 
 NEAR = 1.2  # times the least mean square; no data tell such models apart
 EXACT = 1e-4  # relative residual that is as good as none
 _COLUMNS = 3  # of a chain without relaxations
+_FREE = 4  # least degrees of freedom of a residual that is judged
+_DENSE = 5.0  # relaxations per decade that describe any circuit to better than 0.1 %
+_SPARSE = 3.0  # least frequencies per decade
 FAIL = 0.01  # relative residual above which a measurement without known errors is suspect
+FALSE_ALARMS = 1e-3  # share of right measurements with right standard errors that do not pass
 
 
 @dataclasses.dataclass(frozen=True, eq=False, repr=False)
@@ -33,12 +42,18 @@ class KramersKronig(Overviewed):
         fitted: Impedance that meets the relations [Ω].
         residual: (measured − fitted) / |fitted|.
         relaxations: Number of relaxations.
+        chi2: Mean square residual per degree of freedom, in units of the standard errors; None if
+            they are not known.
+        limit: Largest `chi2` of a measurement that passes, or largest relative residual if the
+            standard errors are not known.
     """
 
     frequency: Float[np.ndarray, " frequency"]
     fitted: Complex[np.ndarray, " frequency"]
     residual: Complex[np.ndarray, " frequency"]
     relaxations: int
+    chi2: float | None
+    limit: float
 
     @property
     def largest(self) -> float:
@@ -47,8 +62,8 @@ class KramersKronig(Overviewed):
 
     @property
     def passed(self) -> bool:
-        """Whether no residual exceeds 1 %."""
-        return self.largest <= FAIL
+        """Whether the residuals are noise, or without standard errors: whether none exceeds 1 %."""
+        return (self.largest if self.chi2 is None else self.chi2) <= self.limit
 
     def _overview(self) -> Overview:
         rms = float(np.sqrt(np.mean(np.abs(self.residual) ** 2 / 2)))
@@ -59,22 +74,34 @@ class KramersKronig(Overviewed):
             ("rms residual", f"{100 * rms:.2g} %", ""),
             ("relaxations", str(self.relaxations), ""),
         ]
-        return Overview(f"Kramers-Kronig test: {verdict}", rows)
+        if self.chi2 is None:
+            noise = f"Without standard errors, no residual may exceed {100 * self.limit:g} %."
+        else:
+            rows.append(("chi2", f"{self.chi2:.3g}", f"may reach {self.limit:.3g}"))
+            noise = "The residuals are compared with the standard errors."
+        return Overview(f"Kramers-Kronig test: {verdict}", rows, notes=(noise,))
 
 
-def kramers_kronig(frequency: npt.ArrayLike, impedance: npt.ArrayLike) -> KramersKronig:
+def kramers_kronig(
+    frequency: npt.ArrayLike,
+    impedance: npt.ArrayLike,
+    *,
+    stderr: float | npt.ArrayLike | None = None,
+) -> KramersKronig:
     """Test whether a measured impedance meets the Kramers-Kronig relations.
 
     Args:
         frequency: Frequencies [Hz], > 0.
         impedance: Complex impedance [Ω] at each frequency.
+        stderr: Standard error [Ω] of the real and of the imaginary part: one number, or one for
+            each frequency. If not given, no residual may exceed 1 %, whatever the noise.
 
     Returns:
         Residuals and verdict.
 
     Raises:
-        ValueError: The shapes differ, a number is not finite, a frequency is not positive, or there
-            are fewer than five frequencies.
+        ValueError: The shapes differ, a number is not finite, a frequency or a standard error is
+            not positive, or there are fewer than five frequencies, or than three in each decade.
     """
     f, z = np.asarray(frequency, float), np.asarray(impedance, complex)
     if f.ndim != 1 or z.shape != f.shape or f.size < 5:
@@ -83,25 +110,45 @@ def kramers_kronig(frequency: npt.ArrayLike, impedance: npt.ArrayLike) -> Kramer
         )
     if not (np.isfinite(z).all() and np.isfinite(f).all() and (f > 0).all()):
         raise ValueError("all numbers must be finite, and all frequencies > 0")
-    tried = [_fitted(f, z, count) for count in range(1, f.size - 2)]
+    sigma = np.abs(z) if stderr is None else np.broadcast_to(np.asarray(stderr, float), f.shape)
+    if not (np.isfinite(sigma).all() and (sigma > 0).all()):
+        raise ValueError("stderr must be finite and > 0 everywhere")
+    decades = np.log10(f.max() / f.min())
+    if f.size < _SPARSE * decades:
+        raise ValueError(
+            f"there are {f.size} frequencies in {decades:.2g} decades; the test needs at least "
+            f"{_SPARSE:g} in each"
+        )
+    most = min(2 * f.size - _COLUMNS - _FREE, int(_DENSE * decades) + 2)
+    counts = range(1, max(f.size - _COLUMNS, most) + 1)
+    tried = [_fitted(f, z, sigma, count) for count in counts]
+    degrees = [2 * f.size - _COLUMNS - count for count in counts]
     squares = [
-        np.sum(np.abs(one / z - 1) ** 2) / (2 * f.size - _COLUMNS - count)
-        for count, one in enumerate(tried, 1)
+        float(np.sum(np.abs((one - z) / sigma) ** 2)) / free
+        for one, free in zip(tried, degrees, strict=True)
     ]
-    limit = max(NEAR * min(squares), EXACT**2)
-    chosen = next(number for number, square in enumerate(squares) if square <= limit)
+    near = max(NEAR * min(squares), EXACT**2 if stderr is None else 1.0)
+    chosen = next(number for number, square in enumerate(squares) if square <= near)
     fitted = tried[chosen]
-    return KramersKronig(f, fitted, (z - fitted) / np.abs(fitted), chosen + 1)
+    residual = (z - fitted) / np.abs(fitted)
+    if stderr is None:
+        return KramersKronig(f, fitted, residual, chosen + 1, None, FAIL)
+    by_chance = float(chdtri(degrees[chosen], FALSE_ALARMS)) / degrees[chosen]
+    limit = max(MISFIT_CHI2, by_chance)
+    return KramersKronig(f, fitted, residual, chosen + 1, squares[chosen], limit)
 
 
 def _fitted(
-    f: Float[np.ndarray, " frequency"], z: Complex[np.ndarray, " frequency"], count: int
+    f: Float[np.ndarray, " frequency"],
+    z: Complex[np.ndarray, " frequency"],
+    sigma: Float[np.ndarray, " frequency"],
+    count: int,
 ) -> Complex[np.ndarray, " frequency"]:
-    """The impedance of the best chain with `count` relaxations."""
+    """The impedance of the best chain with `count` relaxations, weighted by 1 / sigma."""
     s = 2j * np.pi * f
     tau = np.geomspace(1 / s.imag.max(), 1 / s.imag.min(), count)
     columns = [np.ones_like(s), s / s.imag.max(), s.imag.min() / s]
     model = np.stack([*columns, *(1 / (1 + s * one) for one in tau)], axis=1)
-    weight = np.tile(1 / np.abs(z), 2)
+    weight = np.tile(1 / sigma, 2)
     rows = np.concatenate([np.real(model), np.imag(model)]) * weight[:, None]
     return model @ np.linalg.lstsq(rows, np.concatenate([np.real(z), np.imag(z)]) * weight)[0]

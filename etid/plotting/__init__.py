@@ -11,7 +11,7 @@ import numpy as np
 
 from etid.circuits.circuit import AbstractCircuit
 from etid.recordings.recording import Recording
-from etid.results.data import AnyAxes, Shown
+from etid.results.data import AnyAxes, MeasuredImpedance, Shown
 from etid.results.driver import Driver, SourceImpedance
 from etid.results.fits import Fit, Fits
 from etid.results.posterior import Posterior, Profile
@@ -72,6 +72,7 @@ def plot(
     | `plot(fit)` | one pulse measured and predicted [V]; residual [mV] | 2 |
     | `plot(fit, show="impedance")` | Nyquist and Bode: fit, measured | 3 |
     | `plot(fit, show="residual")` | residual [mV], its correlations | 3 |
+    | `plot(fit)` of `identify_impedance` | Nyquist and Bode: fit, measured | 3 |
     | `plot(fits[0], recording, driver)` | the same for one of several fits | 2 |
     | `plot(fits[0], recording)` | the same for a fit from a measured current | 2 |
     | `plot(selection, recording, driver)` | impedance measured, and each candidate | 4 |
@@ -146,6 +147,8 @@ def _draw(
         )
     if isinstance(x, Fit):
         recording, driver = x.made_from(recording, driver)
+        if recording is None and x.measured is not None and show == "residual":
+            raise ValueError("a fit to a measured impedance has no residual in time")
     with_current = recording is not None and "current" in recording.samples
     with mpl.rc_context(style.PAPER):
         match x, recording, driver:
@@ -160,6 +163,8 @@ def _draw(
                 return candidates.draw_selection(canvas, x, recording, driver)
             case Driver(), Recording(), None:
                 return pulses.draw_calibration(canvas, x, recording)
+            case Fit(measured=MeasuredImpedance() as measured), None, _:
+                return judging.draw_measured(canvas, x, measured)
             case Fit(), _, _:
                 raise TypeError(
                     "this fit does not know its recording: plot(fit, recording, driver). "

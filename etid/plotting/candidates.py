@@ -33,7 +33,11 @@ def draw_selection(
     axes = canvas(2, 2, (9.0, 5.2), **LAYOUT).ravel()
     chosen = selection.candidates[0]
     good = chosen.fit.verdict == "successful"
-    lines = [headline(recording, selection.fit), chosen.name, ",  ".join(selection.fit.elements)]
+    lines = [
+        headline(recording.path, selection.fit),
+        chosen.name,
+        ",  ".join(selection.fit.elements),
+    ]
     fitted = [one for one in selection.candidates if _has_elements(one)]
     if not fitted or fitted[0] is not chosen:
         axes[0].text(0.5, 0.5, "no elements", color=RED, transform=axes[0].transAxes, ha="center")

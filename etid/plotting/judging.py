@@ -2,7 +2,7 @@
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Complex, Float
 from matplotlib.axes import Axes
 
 from etid.estimators.estimator import serving
@@ -16,6 +16,7 @@ from etid.plotting.pulses import headline
 from etid.plotting.style import BLUE, INK, RED, Canvas, titled
 from etid.recordings.preflight import Inspected
 from etid.recordings.recording import Recording
+from etid.results.data import MeasuredImpedance
 from etid.results.driver import ContinuousDriver, Driver
 from etid.results.feed import MeasuredCurrent
 from etid.results.fits import Fit
@@ -29,38 +30,54 @@ def draw_impedance(
     canvas: Canvas, fit: Fit, recording: Recording, driver: Driver | None
 ) -> np.ndarray:
     """Nyquist and Bode diagrams: the impedance that the recording measures, and the fit."""
-    nyquist, magnitude, phase = axes = canvas(1, 3, (12.0, 3.8)).ravel()
     recording, known = in_bands(recording, driver)
     measured = bands(Harmonics.of(Inspected(recording)), known, fit.circuit)
     sure = measured.stderr <= SURE
-    z, error = measured.z[sure] / 1e3, measured.stderr[sure]
-    kilohertz = measured.frequency[sure] / 1e3
+    points = measured.frequency[sure], measured.z[sure], measured.stderr[sure]
+    return _diagrams(canvas, fit, headline(recording.path, fit), *points)
+
+
+def draw_measured(canvas: Canvas, fit: Fit, measured: MeasuredImpedance) -> np.ndarray:
+    """Nyquist and Bode diagrams: the impedance that an instrument measured, and the fit."""
+    error = None if measured.stderr is None else measured.stderr / np.abs(measured.z)
+    return _diagrams(canvas, fit, headline("", fit), measured.frequency, measured.z, error)
+
+
+def _diagrams(
+    canvas: Canvas,
+    fit: Fit,
+    title: str,
+    frequency: Float[np.ndarray, " point"],
+    z: Complex[np.ndarray, " point"],
+    stderr: Float[np.ndarray, " point"] | None,
+) -> np.ndarray:
+    """Nyquist and Bode diagrams of measured points, with standard errors of ln Z, and of a fit."""
+    nyquist, magnitude, phase = axes = canvas(1, 3, (12.0, 3.8)).ravel()
+    kilohertz, kiloohm = frequency / 1e3, z / 1e3
     smooth = np.geomspace(kilohertz.min() / 1.3, kilohertz.max() * 1.3, POINTS)
     fitted = np.asarray(fit.circuit.response(jnp.asarray(1e3 * smooth))) / 1e3
     curve = {"color": RED, "lw": 1.3, "label": "fit"}
-    point = {
-        "fmt": "o",
-        "ms": 4,
-        "lw": 0.8,
-        "color": BLUE,
-        "label": "measured, ± 2 standard errors",
-    }
+    label = "measured" if stderr is None else "measured, ± 2 standard errors"
+    point = {"fmt": "o", "ms": 4, "lw": 0.8, "color": BLUE, "label": label}
+    turn = None if stderr is None else 2 * stderr
+    size = None if turn is None else turn * np.abs(kiloohm)
     nyquist.plot(np.real(fitted), -np.imag(fitted), **curve)
-    size = 2 * error * np.abs(z)
-    nyquist.errorbar(np.real(z), -np.imag(z), yerr=size, xerr=size, **point)
+    nyquist.errorbar(np.real(kiloohm), -np.imag(kiloohm), yerr=size, xerr=size, **point)
     nyquist.set(xlabel="Re Z [kΩ]", ylabel="-Im Z [kΩ]")
     nyquist.set_aspect("equal", adjustable="datalim")
     magnitude.plot(smooth, np.abs(fitted), **curve)
-    magnitude.errorbar(kilohertz, np.abs(z), size, **point)
+    magnitude.errorbar(kilohertz, np.abs(kiloohm), size, **point)
     magnitude.set(xlabel="frequency [kHz]", ylabel="|Z| [kΩ]", xscale="log", yscale="log")
     phase.plot(smooth, np.degrees(np.angle(fitted)), **curve)
-    phase.errorbar(kilohertz, np.degrees(np.angle(z)), np.degrees(2 * error), **point)
+    phase.errorbar(
+        kilohertz, np.degrees(np.angle(z)), None if turn is None else np.degrees(turn), **point
+    )
     phase.set(xlabel="frequency [kHz]", ylabel="phase [deg]", xscale="log")
-    frame(magnitude, phase, np.abs(z))
+    frame(magnitude, phase, np.abs(kiloohm))
     magnitude.xaxis.set_major_formatter("{x:g}")
     magnitude.legend(frameon=False, fontsize=8)
     good = fit.verdict == "successful"
-    titled(nyquist, [headline(recording, fit)], good=good)
+    titled(nyquist, [title], good=good)
     titled(magnitude, [",  ".join(fit.elements)], good=good)
     return axes
 
@@ -97,7 +114,7 @@ def draw_residual(
     _correlation(own, clean, clean, "autocorrelation of the residual")
     name = "V_th" if cause == "v_th" else "current"
     _correlation(with_input, clean, cause_known, f"correlation with earlier {name}")
-    titled(whole, [headline(recording, fit)], good=fit.verdict == "successful")
+    titled(whole, [headline(recording.path, fit)], good=fit.verdict == "successful")
     titled(own, ["band: 99 % of white noise"])
     return axes
 

@@ -62,10 +62,10 @@ def draw_fit(canvas: Canvas, fit: Fit, recording: Recording, driver: Driver | No
     good = fit.verdict == "successful"
     if not np.isfinite(np.asarray(fit.circuit.values())).all():
         _unpredicted(axes[0], axes[1], recording)
-        titled(axes[0], [headline(recording, fit)], good=good)
+        titled(axes[0], [headline(recording.path, fit)], good=good)
         return axes
     draw_pulse(axes[0], axes[1], recording, driver, fit.circuit)
-    titled(axes[0], [headline(recording, fit), ",  ".join(fit.elements)], good=good)
+    titled(axes[0], [headline(recording.path, fit), ",  ".join(fit.elements)], good=good)
     return axes
 
 
@@ -78,19 +78,19 @@ def draw_calibration(canvas: Canvas, driver: Driver, recording: Recording) -> np
         )
     axes = canvas(2, 1, (6.0, 4.8), **PAIR).ravel()
     draw_pulse(axes[0], axes[1], recording, driver, Resistor(recording.r_load))
-    lines = [headline(recording, driver), f"driver of order {driver.order}, "]
+    lines = [headline(recording.path, driver), f"driver of order {driver.order}, "]
     lines[1] += f"known load {recording.r_load / 1e3:g} kΩ"
     titled(axes[0], lines, good=driver.verdict == "successful")
     return axes
 
 
-def headline(recording: Recording, found: Fit | Driver) -> str:
-    """Path of the recording, verdict, χ² and RRSE, for a title."""
+def headline(path: str, found: Fit | Driver) -> str:
+    """Path of the recording if it has one, verdict, χ² and RRSE, for a title."""
     verdict = found.verdict
     verdict = verdict if verdict == "successful" else f"no success: {verdict}"
     quality = f"chi2 {float(found.chi2):.3g}" if np.isfinite(float(found.chi2)) else ""
     error = f"RRSE {100 * float(found.rrse):.3g} %" if np.isfinite(float(found.rrse)) else ""
-    where = f"{recording.path}: " if recording.path else ""
+    where = f"{path}: " if path else ""
     return where + ", ".join(filter(None, (verdict, quality, error)))
 
 

@@ -9,6 +9,7 @@ from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any, Generic, Literal, TypeVar
 
 import numpy as np
+from jaxtyping import Complex, Float
 
 from etid.circuits.circuit import Circuit
 from etid.recordings.recording import Recording
@@ -29,10 +30,25 @@ def provide(**functions: Callable[..., Any]) -> None:
     _PROVIDED.update(functions)
 
 
-class WithData(Generic[Circuit]):
-    """A result that may know its recording and its driver.
+@dataclasses.dataclass(frozen=True, eq=False)
+class MeasuredImpedance:
+    """An impedance as an instrument measured it.
 
-    Both are no fields, so JAX does not see them. A result that JAX or `dataclasses.replace` makes
+    Attributes:
+        frequency: Frequencies [Hz].
+        z: Impedance [Ω].
+        stderr: Standard errors of the real and of the imaginary part [Ω]; None if not known.
+    """
+
+    frequency: Float[np.ndarray, " frequency"]
+    z: Complex[np.ndarray, " frequency"]
+    stderr: Float[np.ndarray, " frequency"] | None
+
+
+class WithData(Generic[Circuit]):
+    """A result that may know its recording and its driver, or its measured impedance.
+
+    They are no fields, so JAX does not see them. A result that JAX or `dataclasses.replace` makes
     from another one has none.
     """
 
@@ -41,7 +57,14 @@ class WithData(Generic[Circuit]):
     @property
     def recording(self) -> Recording | None:
         """The recording; None if it is not known."""
-        return getattr(self, "_data", (None, None))[0]
+        known = getattr(self, "_data", (None, None))[0]
+        return known if isinstance(known, Recording) else None
+
+    @property
+    def measured(self) -> MeasuredImpedance | None:
+        """The impedance of `identify_impedance`; None for all other fits."""
+        known = getattr(self, "_data", (None, None))[0]
+        return known if isinstance(known, MeasuredImpedance) else None
 
     @property
     def driver(self) -> Driver | None:
@@ -49,7 +72,7 @@ class WithData(Generic[Circuit]):
         return getattr(self, "_data", (None, None))[1]
 
     def __getstate__(self) -> tuple[dict[str, Any], Any]:
-        return self.__dict__, (self.recording, self.driver)
+        return self.__dict__, (self.recording or self.measured, self.driver)
 
     def __setstate__(self, state: tuple[dict[str, Any], Any]) -> None:
         fields, data = state
@@ -76,7 +99,8 @@ class WithData(Generic[Circuit]):
             recording: Its recording. `identify_skin` tells it to the fit; one of several fits, as
                 in `fits[0]`, does not know it.
             driver: Its driver, if `recording` is given.
-            show: `"pulse"`, `"impedance"` or `"residual"`.
+            show: `"pulse"`, `"impedance"` or `"residual"`. A fit of `identify_impedance` has only
+                the picture of its impedance.
             axes: As in `etid.plot`.
 
         Returns:
@@ -136,8 +160,10 @@ class WithData(Generic[Circuit]):
         return _PROVIDED["profile"](self, recording, driver, name)
 
 
-def with_data(result: _Kind, recording: Recording, driver: Driver | None) -> _Kind:
-    """The same result, which knows its recording and its driver."""
+def with_data(
+    result: _Kind, source: Recording | MeasuredImpedance, driver: Driver | None = None
+) -> _Kind:
+    """The same result, which knows its recording and its driver, or its measured impedance."""
     known = dataclasses.replace(result)  # pyright: ignore[reportArgumentType]  # a module of equinox
-    object.__setattr__(known, "_data", (recording, driver))
+    object.__setattr__(known, "_data", (source, driver))
     return known
