@@ -288,13 +288,13 @@ def test_what_varies_is_the_spread_less_the_noise_of_all_recordings(mixed):
     noise = np.where(np.arange(count) % 3 < 2, 0.01, 0.1)
     many = mixed.successful().take(np.zeros(count, int))
     r_p = 1 + varies * rng.standard_normal(count) + noise * rng.standard_normal(count)
-    cov = np.zeros((count, 3, 3))
-    cov[:, 1, 1] = noise**2
-    fit = eqx.tree_at(
-        lambda f: (f.circuit.r_p, f.cov, f.shared_cov), many.fit, (r_p, cov, np.zeros_like(cov))
-    )
+    cov, shared = np.zeros((2, count, 3, 3))
+    shared[:, 1, 1] = 0.02**2
+    cov[:, 1, 1] = noise**2 + shared[:, 1, 1]
+    fit = eqx.tree_at(lambda f: (f.circuit.r_p, f.cov, f.shared_cov), many.fit, (r_p, cov, shared))
     [row] = dataclasses.replace(many, fit=fit).summary()
     assert row["r_p_own"] == pytest.approx(0.01)
+    assert row["r_p_shared"] == pytest.approx(0.02)
     # The variance of the spread is known to 2 %, three times what varies.
     assert row["r_p_between"] == pytest.approx(varies, rel=0.15)
 
