@@ -1,11 +1,13 @@
 """Intervals, correlation, table and file of one fit."""
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy import stats
 
 import etid
+from etid.results.fits import complex_rrse
 from etid.results.verdicts import verdict
 
 VALUES = np.array([33.4e3, 186e3, 0.12e-9])
@@ -72,3 +74,11 @@ def test_the_table_of_a_fit_is_its_row_in_the_table_of_fits(tmp_path):
 def test_a_batch_is_refused_where_one_fit_is_needed(call, tmp_path):
     with pytest.raises(ValueError, match="take one of them"):
         call(batch(), tmp_path / "fit.h5")
+
+
+def test_the_error_of_complex_values_counts_those_that_are_used():
+    measured = jnp.array([3.0 + 4.0j, 1.0j, 2.0 + 0j])
+    predicted = jnp.array([3.0 + 3.0j, 9.0j, 4.0 + 0j])
+    used = jnp.array([True, False, True])
+    assert complex_rrse(predicted, measured, used) == pytest.approx(np.sqrt(5.0 / 29.0))
+    assert complex_rrse(predicted, measured) == pytest.approx(np.sqrt(69.0 / 30.0))

@@ -1,19 +1,22 @@
 """Bands of the gain: their closed forms, for pulses whose gain, noise and tail are known."""
 
+import itertools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from etid.online import gain_bands
-from etid.online.gain_bands import RELATIVE, WIDEST, Bands, unloaded_bands
+from etid.online.gain_bands import LAST_BAND, RELATIVE, WIDEST, Bands, unloaded_bands
 from etid.signals.harmonics import ALIASED
 from etid.signals.noise import RIPPLE
 
-SIZE, RATE, SIGMA = 2048, 120e3, 6.0
+SIZE, RATE, SIGMA = 2048, 120e3, 12.0
 DECAY = 1.0 / SIZE  # [1/sample] of the tail: a third of it is left after a period
 ROUNDING = 1e-9  # sums of 2000 numbers
-DESCRIBED = ("strength", "frequency", "signal", "weight", "width", "spread")
+DESCRIBED = ("frequency", "weight", "spread")
+UNLIMITED = np.array([-np.inf, np.inf])
 
 
 def window():
@@ -24,49 +27,35 @@ def window():
     return v - v.sum() * pulse / pulse.sum()
 
 
-@pytest.fixture(scope="module")
-def of():
-    noise = SIGMA * np.random.default_rng(0).standard_normal(3 * SIZE)
-    return unloaded_bands(np.tile(window(), 3) + noise, SIGMA, RATE, float(SIZE))
+def unloaded(noise):
+    rng = np.random.default_rng(0)
+    v_th = np.tile(window(), 3) + noise * rng.standard_normal(3 * SIZE)
+    return unloaded_bands(v_th, noise, RATE, float(SIZE))
 
 
 @pytest.fixture(scope="module")
 def exact():
-    return unloaded_bands(np.tile(window(), 3), 0.0, RATE, float(SIZE))
+    return unloaded(0.0)
 
 
 def bands_of(of):
     """The bins of each band, counted from 1."""
-    return [
-        np.arange(first + i * width, first + (i + 1) * width)
-        for first, width, count in of.groups
-        for i in range(count)
-    ]
+    edges = gain_bands._edges(of.x.size)
+    return [np.arange(*ends) for ends in itertools.pairwise(edges)]
 
 
 measured = jax.jit(Bands.measure)
 lacking_tail = jax.jit(Bands._lacking_tail)
 
 
-@pytest.mark.parametrize("bins", [20, 31, 32, 100, 333, 1000])
-def test_bands_follow_each_other_and_are_a_sixteenth_of_their_frequency(bins):
-    groups = gain_bands._groups(bins)
-    following = 1
-    for i, (first, width, count) in enumerate(groups):
-        assert (first, width) == (following, 2**i)
-        assert count > 0
-        assert width == 1 or width * RELATIVE <= first
-        following = first + width * count
-        if i + 1 < len(groups):  # the next width is allowed here, and not before
-            assert 0 <= following - 2 * RELATIVE * width < width
-    assert 0 <= following - 1 - bins < groups[-1][1]
-    assert max(width for _, width, _ in groups) <= WIDEST
-    assert len(groups) == 1 + sum(bins >= 2 * RELATIVE * 2**i for i in range(4))
-
-
-def test_the_transform_has_the_smallest_largest_factor_within_a_thousandth():
-    cheap = {3333: 3332, 2003: 2002, 1000: 1000, 2050: 2048, 2051: 2050, 4100: 4096, 49: 49}
-    assert {size: gain_bands._cheap_size(size) for size in cheap} == cheap
+@pytest.mark.parametrize("bins", [40, 100, 333, 1000])
+def test_bands_follow_each_other_and_are_an_eighth_of_their_frequency(bins):
+    edges = gain_bands._edges(bins)
+    width = np.diff(edges)
+    assert (edges[0], edges[-1], width[-1]) == (1, bins + 1, LAST_BAND)
+    for first, wide in zip(edges[:-2], width[:-2], strict=False):
+        assert wide == min(max(first // RELATIVE, 1), WIDEST)
+    assert 0 < width[-2] <= min(max(edges[-3] // RELATIVE, 1), WIDEST)
 
 
 def test_slopes_are_those_of_a_parabola_through_three_points():
@@ -89,134 +78,140 @@ def test_the_rate_of_a_tail_is_found_and_is_zero_where_nothing_decays():
     assert gain_bands._tail_rate(growing) == 0.0
 
 
-def test_a_band_is_described_by_the_sums_over_its_bins(of):
-    assert of.size == of.samples == SIZE
-    bands = bands_of(of)
-    bins = bands[-1][-1]
-    assert of.x.shape == (bins,)
-    assert bins - WIDEST < int(ALIASED * SIZE) <= bins
+def test_a_band_is_described_by_the_sums_over_its_bins():
+    of, projection = unloaded(SIGMA)
+    assert of.samples == SIZE
+    bins = of.x.size
+    assert bins == int(ALIASED * SIZE)
     variance = SIZE * SIGMA**2 / 3  # of the mean of three periods
     assert of.variance_x == pytest.approx(variance)
-    known = {name: np.asarray(getattr(of, name)) for name in ("x", "offset", *DESCRIBED)}
-    alone = 0
-    for i, k in enumerate(bands):
+    known = {name: np.asarray(getattr(of, name)) for name in ("x", *DESCRIBED)}
+    drowned = []
+    for i, k in enumerate(bands_of(of)):
         x = known["x"][k - 1]
         strength = (abs(x) ** 2).sum()
         centre = (abs(x) ** 2 * k).sum() / strength
         squares = (abs(x) ** 2 * (k - centre) ** 2).sum()
         signal = strength - k.size * variance
-        drowned = signal <= 0.5 * strength
-        alone += drowned
-        expected = {
-            "strength": strength,
-            "frequency": centre * RATE / SIZE,
-            "signal": strength if drowned else signal,
-            "weight": 0.0 if drowned else 2 * signal**2 / strength,
-            "width": squares if k.size > 1 else 0.0,
-            "spread": squares / strength * (2 * np.pi / SIZE) ** 2 if k.size > 1 else 0.0,
-        }
-        for name, value in expected.items():
-            assert known[name][i] == pytest.approx(value, rel=1e-9), (name, i)
-        np.testing.assert_allclose(known["offset"][k - 1], k - centre, rtol=1e-9, atol=1e-9)
-    assert 0 < alone < len(bands)  # both cases are there
+        drowned.append(signal <= 0.5 * strength)
+        assert known["frequency"][i] == pytest.approx(centre * RATE / SIZE, rel=ROUNDING)
+        spread = squares / strength * (2 * np.pi / SIZE) ** 2
+        assert known["spread"][i] == pytest.approx(spread, rel=1e-6, abs=1e-18)
+        # What neighbours share makes it smaller; blocks drop a part of the noise in X.
+        low, high = (0.0, 0.0) if drowned[-1] else (1.6 * signal**2 / strength, 2.1 * strength)
+        assert low <= known["weight"][i] <= high, i
+    assert any(drowned)
+    assert not all(drowned)
     assert not np.asarray(of.alias).any()  # each period is sampled at the same phase
-    assert of.floor == pytest.approx(SIZE * (RIPPLE * np.ptp(window())) ** 2, rel=0.1)
-    whole = jnp.fft.rfft(jnp.asarray(window()))[1 : bins + 1]
+    assert projection.floor == pytest.approx(SIZE * (RIPPLE * np.ptp(window())) ** 2, rel=0.1)
+    whole = np.fft.rfft(window())[1 : bins + 1]
     np.testing.assert_allclose(of.x, whole, atol=6 * np.sqrt(variance))
 
 
 def test_a_bent_and_delayed_gain_departs_from_its_value_at_the_centre(exact):
     """½ s² (G″ − 2jτ G′ − τ² G) is exact in the coefficients for a parabola."""
-    angle = 2 * np.pi * np.asarray(exact.frequency) / RATE
+    of, _ = exact
+    angle = 2 * np.pi * np.asarray(of.frequency) / RATE
     a, b, c, delay = 0.4 - 0.1j, -0.3 + 0.2j, 0.5 + 0.7j, 1.7
     gain = a + b * angle + c * angle**2
     bend = 2 * c - 2j * delay * (b + 2 * c * angle) - delay**2 * gain
-    found = exact.departure(jnp.asarray(gain), jnp.asarray(delay))
-    expected = 0.5 * np.asarray(exact.spread) * bend
+    found = of.departure(jnp.asarray(gain), jnp.asarray(delay))
+    expected = 0.5 * np.asarray(of.spread) * bend
     np.testing.assert_allclose(found[1:-1], expected[1:-1], rtol=1e-6, atol=1e-12)
 
 
-def loaded(gain, noise):
-    """Windows behind a gain that is a straight line in frequency, and nothing lacks."""
-    number = np.arange(SIZE // 2 + 1)
-    v = np.fft.irfft(np.fft.rfft(window()) * gain(number), SIZE)
-    return v + noise * np.random.default_rng(1).standard_normal((3, SIZE))
-
-
-def line(number):
-    return 0.5 - 1e-4 * number + 1e-4j * number
-
-
 def test_gain_and_noise_are_those_of_a_straight_line_in_each_band(exact):
-    v_out = loaded(line, 1.0)
-    found = measured(exact, v_out, np.zeros(3), np.zeros(3))
-    y = np.fft.rfft(v_out)
-    squares, freedom = 0.0, 0
-    for i, k in enumerate(bands_of(exact)):
-        x = np.fft.rfft(window())[k]
-        columns = np.stack([x, x * np.asarray(exact.offset)[k - 1]], axis=1)[:, : min(k.size, 2)]
-        straight, _, _, _ = np.linalg.lstsq(columns, y[:, k].T)
-        np.testing.assert_allclose(found.gain[:, i], straight[0], rtol=1e-4)  # single precision
-        if k.size > 1:
-            squares += (abs(y[:, k].T - columns @ straight) ** 2).sum(0)
-            freedom += k.size - 2
-    np.testing.assert_allclose(found.variance, squares / freedom, rtol=1e-4)
-    weight = np.asarray(exact.weight) / np.asarray(found.variance)[:, None]
-    np.testing.assert_allclose(found.weight, weight, rtol=1e-6)
+    of, projection = exact
+    rng, noise = np.random.default_rng(1), 3.0
+    number = np.arange(SIZE // 2 + 1)
+    gain = 0.5 - 1e-4 * number + 1e-4j * number
+    v_out = np.fft.irfft(np.fft.rfft(window()) * gain, SIZE)[None, :].repeat(100, axis=0)
+    seen = projection.seen(v_out, UNLIMITED)
+    assert seen.variance == pytest.approx(projection.floor)
+    assert not seen.clipped.any()
+    found = measured(of, seen, np.zeros(100), np.zeros(100))
+    centre = np.asarray(of.frequency) * SIZE / RATE
+    # Blocks are exact to a thousandth of a standard error, numbers are in single precision.
+    expected = 0.5 - 1e-4 * centre + 1e-4j * centre
+    np.testing.assert_allclose(found.gain[0], expected, atol=1e-4)
+    np.testing.assert_allclose(found.weight[0], of.weight / projection.floor, rtol=1e-6)
+
+    noisy = projection.seen(v_out + noise * rng.standard_normal(v_out.shape), UNLIMITED)
+    freedom = sum(count for _, count in projection.runs) * (projection.within.shape[1] - 1)
+    uncertain = 5 * np.sqrt(2 / freedom / 100)
+    assert np.mean(noisy.variance) == pytest.approx(SIZE * noise**2, rel=uncertain)
+    found = measured(of, noisy, np.zeros(100), np.zeros(100))
+    # χ² of all gains: 100 lanes, two numbers for each band, and the noise is known to a tenth.
+    squares = np.asarray(found.weight) * abs(np.asarray(found.gain) - expected) ** 2
+    count = squares.size
+    assert squares.sum() == pytest.approx(2 * count, rel=5 * np.sqrt(1 / count) + 0.1)
 
 
-def test_without_noise_the_variance_is_the_floor(exact):
-    found = measured(exact, loaded(lambda number: 0.5 + 0 * number, 0.0), np.zeros(3), np.zeros(3))
-    np.testing.assert_allclose(found.variance, exact.floor)
-    np.testing.assert_allclose(found.gain, 0.5, rtol=1e-4)
+def test_a_sample_at_the_end_of_the_range_is_clipped(exact):
+    _, projection = exact
+    low, high = window().min(), window().max()
+    for ends, clipped in (
+        ((low, np.inf), True),
+        ((-np.inf, high), True),
+        ((low - 1e-6, high + 1e-6), False),
+    ):
+        seen = projection.seen(window()[None, :], np.array(ends))
+        assert seen.clipped.tolist() == [clipped]
 
 
 def test_what_a_window_lacks_of_the_tail_is_added_to_the_gain(exact):
     """Amplitude 1 after 1 − lacking: the tail of the pulse before is smaller by this part."""
+    of, projection = exact
     lacking = np.array([0.5, -0.8, 0.0])
     tail = 3.0 * np.exp(-DECAY * (SIZE + np.arange(SIZE)))
     offset = np.array([0.3, 0.0, -0.2])
     v_out = 0.5 * (window() - lacking[:, None] * tail) + offset[:, None]
-    found = measured(exact, v_out, lacking, offset)
-    before = measured(exact, v_out, np.zeros(3), offset)
+    seen = projection.seen(v_out, UNLIMITED)
+    found = measured(of, seen, lacking, offset)
+    before = measured(of, seen, np.zeros(3), offset)
     error = abs(np.asarray(found.gain) - 0.5).max(1)
     without = abs(np.asarray(before.gain) - 0.5).max(1)
     # The mean of the last samples is not quite their middle, and numbers are in single precision.
-    assert (error[:2] < 2e-3 * without[:2]).all(), error / without
+    assert (error[:2] < 1e-2 * without[:2]).all(), error / without
     assert (without[:2] > 1e-3).all()
     np.testing.assert_array_equal(found.gain[2], before.gain[2])
-    unsure = np.asarray(exact.weight) * abs(0.2 * np.asarray(found.gain - before.gain)) ** 2 / 2
-    expected = np.asarray(exact.weight) / (np.asarray(found.variance)[:, None] + unsure)
-    np.testing.assert_allclose(found.weight, expected, rtol=1e-3)
+    unsure = np.asarray(of.weight) * abs(0.2 * np.asarray(found.gain - before.gain)) ** 2 / 2
+    expected = np.asarray(of.weight) / (np.asarray(found.variance)[:, None] + unsure)
+    np.testing.assert_allclose(found.weight, expected, rtol=1e-6)
 
 
 def test_the_tail_of_a_load_has_its_own_rate_as_far_as_noise_lets_it_be_seen(exact):
+    of, projection = exact
     t, lacking = np.arange(SIZE), np.full(4, 0.5)
-    faster = 1.01 * DECAY
-    v_out = np.stack([np.exp(-faster * t)] * 3 + [np.exp(-DECAY * t[::-1])])
-    last = round(gain_bands.LAST * SIZE)
-    middle = SIZE // 2
-    early, late = v_out[0, middle : middle + last].mean(), v_out[0, -last:].mean()
+    v_out = np.stack([np.exp(-1.01 * DECAY * t)] * 3 + [np.exp(-DECAY * t[::-1])])
+    last, middle = round(gain_bands.LAST * SIZE), SIZE // 2
+    early, late = v_out[:, middle : middle + last].mean(1), v_out[:, -last:].mean(1)
     span = DECAY * (SIZE - last - middle)
     # Noise by which the logarithm of the rate is as uncertain as loads make it.
-    equal = (0.2 * span) ** 2 * SIZE * last / (early**-2 + late**-2)
+    equal = (0.2 * span) ** 2 * SIZE * last / (early[0] ** -2 + late[0] ** -2)
+    seen = projection.seen(v_out, UNLIMITED)
+    np.testing.assert_allclose(seen.middle, early, rtol=1e-6)
+    np.testing.assert_allclose(seen.late, late, rtol=1e-6)
+    np.testing.assert_allclose(seen.mean, v_out.mean(1), rtol=1e-6)
     variance = np.array([0.0, equal, 1e9 * equal, 0.0])
-    found = np.asarray(lacking_tail(exact, v_out, lacking, np.zeros(4), variance))
-    left = v_out[:, -last:].mean(1) / (1 - 0.5 * np.exp(-1.0))
-    shape, by_rate = np.asarray(exact.tail)
+    seen = seen._replace(middle=early, late=late, variance=variance)
+    found = np.asarray(lacking_tail(of, seen, lacking, np.zeros(4)))
+    left = late / (1 - 0.5 * np.exp(-1.0))
+    shape, by_rate = np.asarray(of.tail)
     for i, part in enumerate((0.01, 0.005, 0.0, 0.0)):
         expected = 0.5 * left[i] * (shape + part * by_rate)
         np.testing.assert_allclose(found[i], expected, atol=1e-6 * abs(expected).max())
     # The second row of the tail is the derivative with respect to the logarithm of the rate.
     later = np.arange(SIZE) + last / 2
-    x = np.asarray(exact.x)
+    x = np.asarray(of.x)
 
     def projected(rate):
         e = np.fft.rfft(np.exp(-rate * later))[1 : x.size + 1] * x.conj()
-        return np.array([e[k - 1].sum() for k in bands_of(exact)]) / np.asarray(exact.signal)
+        strengths = [(abs(x[k - 1]) ** 2).sum() for k in bands_of(of)]
+        return np.array([e[k - 1].sum() for k in bands_of(of)]) / strengths
 
-    np.testing.assert_allclose(shape, projected(DECAY), rtol=1e-6)
+    np.testing.assert_allclose(shape, projected(DECAY), atol=1e-6 * abs(shape).max())
     step = 1e-4
     slope = (projected(DECAY * (1 + step)) - projected(DECAY * (1 - step))) / (2 * step)
     np.testing.assert_allclose(by_rate, slope, atol=1e-6 * abs(slope).max())
-    assert exact.tail_left == pytest.approx(np.exp(-1.0), rel=1e-6)
+    assert of.tail_left == pytest.approx(np.exp(-1.0), rel=1e-6)
