@@ -6,6 +6,8 @@ import sys
 
 import pytest
 
+from etid import cli
+
 # The process waits where the signal is to come, after it has said so. A process that a shell starts
 # in the background ignores Ctrl-C, and so do those that it starts, were it not for the second line.
 WAITS = """
@@ -76,6 +78,15 @@ def test_ctrl_c_says_what_was_kept_and_how_to_go_on(interrupted):
             "to continue, add --resume to the same command"
         ],
     )
+    assert (folder / "fit.h5.parts" / "000000.h5").exists()
+
+
+def test_what_was_kept_is_not_thrown_away_unasked(interrupted, capsys):
+    _, _, folder = interrupted["fit"]
+    assert cli.main(["fit", str(folder / "study.h5"), "-o", str(folder / "fit.h5")]) == 1
+    error = capsys.readouterr().err
+    assert "6 of 14 recordings are fitted and kept" in error
+    assert error.endswith("add --resume to continue, or --force to begin again\n")
     assert (folder / "fit.h5.parts" / "000000.h5").exists()
 
 

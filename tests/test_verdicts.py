@@ -142,6 +142,8 @@ def test_unreadable_without_a_calibration(study):
     )
     assert result.fits.counts() == {"unreadable": 1}
     assert "names no calibration" in result.fits.notes[0]
+    alone = etid.identify_study(etid.Study.from_recordings([lost]))
+    assert "etid import --calibration FILE OHM" in alone.fits.notes[0]
 
 
 @pytest.fixture(scope="module")

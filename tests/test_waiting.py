@@ -7,6 +7,7 @@ import time
 
 import jax.numpy as jnp
 import pytest
+from tqdm import tqdm
 
 from etid.identify import waiting
 from etid.identify.compiled import stored_jit
@@ -45,6 +46,16 @@ def slowly_traced():
 def test_a_long_compilation_is_announced_once(said):
     text = said(lambda: [slowly_traced()(jnp.zeros(3)) for _ in range(2)], Screen())
     assert text.count("JAX compiles") == 1
+
+
+def test_the_line_does_not_continue_a_progress_bar(said):
+    def call():
+        with tqdm(total=3, file=sys.stderr, ncols=60):
+            slowly_traced()(jnp.zeros(3))
+
+    before, _, _ = said(call, Screen()).partition("etid: JAX compiles")
+    assert before.endswith("\r")  # the bar is wiped out, and drawn again below
+    assert not before.rstrip("\r").rpartition("\r")[2].strip()
 
 
 def test_nothing_is_said_when_nothing_compiles(said):

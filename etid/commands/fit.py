@@ -157,6 +157,9 @@ def run(arguments: argparse.Namespace) -> Outcome:
             )
         outcome.write(arguments.target)
     else:
+        unfinished = "" if arguments.resume or arguments.force else kept(arguments.target)
+        if unfinished:
+            raise ValueError(f"{unfinished}; add --resume to continue, or --force to begin again")
         with _executor(arguments) as executor:
             outcome = fit_file(
                 arguments.source,

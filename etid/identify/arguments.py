@@ -40,7 +40,8 @@ _REMEDIES: dict[type, str] = {
     Recording: "Take one from a study, as in study['s01/dry/0'], or make one with etid.Recording",
     Driver: "Identify one with etid.identify_driver",
     Study: "Open a file with etid.read, or use etid.Study.from_recordings",
-    AbstractCircuit: "Pass a circuit, as in etid.SkinRC(), or circuit='auto'",
+    AbstractCircuit: "Pass a circuit, as in etid.SkinRC() or etid.circuit('R0-p(R1,C1)'), or "
+    "circuit='auto'",
 }
 
 

@@ -81,7 +81,8 @@ def identify_driver(
     for record in records:
         if record.r_load is None:
             raise ValueError(
-                f"recording {record.path!r} has no r_load; a calibration needs its resistor [ohm]"
+                f"recording {record.path!r} has no r_load; a calibration needs its resistor [ohm]. "
+                "The calibrations of a study are study.calibrations"
             )
         resistances.append(record.r_load)
     drift = drift_of(driver_drift, asked)

@@ -64,7 +64,9 @@ class Drivers:
                 f"names no calibration and the study has {len(self.calibrations)}",
                 path=recording.path,
                 field="calibration",
-                remedy="Write the path of its calibration into the attribute 'calibration'",
+                remedy="Write the path of its calibration into the attribute 'calibration'"
+                if self.calibrations
+                else "Add a recording of a known resistor: etid import --calibration FILE OHM",
             )
         with self._one_at_a_time:
             if names not in self.found and names not in self.failures:

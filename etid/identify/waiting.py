@@ -4,6 +4,7 @@ import sys
 import threading
 
 import jax
+from tqdm import tqdm
 
 PATIENCE = 1.0  # [s] waiting time without a word
 COMPILING = "etid: JAX compiles the fit, once in each process."
@@ -28,4 +29,4 @@ def _tell() -> None:
     if person and not _told.is_set():
         _told.set()
         kept = jax.config.jax_compilation_cache_dir  # pyright: ignore[reportAttributeAccessIssue]
-        print(COMPILING + ("" if kept else KEEP), file=sys.stderr, flush=True)
+        tqdm.write(COMPILING + ("" if kept else KEEP), file=sys.stderr)  # not into a progress bar
