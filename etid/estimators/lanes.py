@@ -21,7 +21,7 @@ from etid.circuits.circuit import AbstractCircuit
 from etid.recordings.preflight import Inspected
 from etid.results.feed import AbstractFeed
 from etid.signals import mains
-from etid.signals.harmonics import ALIASED, Spectrum, filled, spectrum
+from etid.signals.harmonics import ALIASED, Spectrum, spectrum
 from etid.signals.noise import Measurement, coloured, measure, noise, rounding_variance
 from etid.signals.pulse_train import rest, shifted
 
@@ -42,6 +42,11 @@ class AbstractLane(eqx.Module):
     @abc.abstractmethod
     def of(cls, seen: Inspected) -> "AbstractLane":
         """The lane of a recording that has passed the preflight checks."""
+
+    @classmethod
+    def of_several(cls, seen: Sequence[Inspected]) -> "list[AbstractLane]":
+        """The lane of each recording."""
+        return [cls.of(one) for one in seen]
 
     @classmethod
     @abc.abstractmethod
@@ -112,10 +117,25 @@ class Harmonics(AbstractLane):
     @classmethod
     def of(cls, seen: Inspected) -> "Harmonics":
         """Aligned harmonics of a recording; its noise may be 1/f or rounding too."""
+        return cls(*cls._fields(seen))
+
+    @classmethod
+    def of_several(cls, seen: Sequence[Inspected]) -> "list[AbstractLane]":
+        """The lane of each recording.
+
+        They are made from the structure of the first one: the constructor takes a third of the time
+        of all that `_fields` computes.
+        """
+        fields = [cls._fields(one) for one in seen]
+        structure = jax.tree.structure(cls(*fields[0]))
+        return [structure.unflatten(one) for one in fields]
+
+    @staticmethod
+    def _fields(seen: Inspected) -> tuple[np.ndarray, ...]:
+        """The fields of a lane, in their order."""
         rate = np.asarray(seen.recording.sample_rate)
         sigmas = seen.trusted_th, seen.trusted_out
-        fields = filled(seen.coefficients, *sigmas, rate, *seen.periods)
-        frequency, x, y, variance_x, variance_y, selected = map(np.asarray, fields)
+        frequency, x, y, variance_x, variance_y, selected = map(np.asarray, seen.spectrum)
         of_th = seen.v_th, seen.recorded_th, sigmas[0], seen.coarse_th, variance_x
         of_out = seen.v_out, seen.recorded_out, sigmas[1], seen.coarse_out, variance_y
         for (v, recorded, sigma, step, variance), flickers in zip(
@@ -127,8 +147,8 @@ class Harmonics(AbstractLane):
             elif flickers:
                 variance *= coloured(v, float(sigma), frequency, float(rate), *seen.periods)
         selected = selected & ~seen.covered(frequency)
-        one = cls(frequency, x, y, variance_x, variance_y, selected, rate)
-        return one.realigned(seen.lag)
+        y = y * _turn(frequency, rate, seen.lag) if seen.lag else y
+        return frequency, x, y, variance_x, variance_y, selected, rate
 
     @classmethod
     def of_samples(
@@ -160,8 +180,7 @@ class Harmonics(AbstractLane):
         """The lane with `v_out` advanced by whole samples: multiplied by e^(jω late / fs)."""
         if late == 0:
             return self
-        turn = np.exp(2j * np.pi * late / self.sample_rate * self.frequency)
-        return dataclasses.replace(self, y=self.y * turn)
+        return dataclasses.replace(self, y=self.y * _turn(self.frequency, self.sample_rate, late))
 
     def late_by(self, circuit: AbstractCircuit, driver: AbstractFeed) -> int:
         """Whole samples by which `v_out` is later than with this load; 0 if they are few."""
@@ -312,6 +331,15 @@ def _gain(
     """V_out per input at these frequencies [Hz]."""
     at = jnp.asarray(frequency)
     return np.asarray(driver.gain(circuit.response(at), at))
+
+
+def _turn(
+    frequency: Float[Array | np.ndarray, " harmonic"],
+    sample_rate: Float[Array | np.ndarray, ""],
+    late: int,
+) -> Complex[np.ndarray, " harmonic"]:
+    """Factor that advances a record by whole samples."""
+    return np.exp(2j * np.pi * late / sample_rate * frequency)
 
 
 def _whole(late: float) -> int:

@@ -11,12 +11,11 @@ import contextlib
 import dataclasses
 import itertools
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Int
 from tqdm import tqdm
 
@@ -83,13 +82,9 @@ def each(fit: Callable[[Any], Any], lanes: Any, count: int | Int[Array, ""]) -> 
 
 
 def _of_one_method(fits: Sequence[Fit], used: Sequence[str]) -> list[Fit]:
-    """The fits as numpy arrays, all with one method name: a batch has a single name.
-
-    The name lists all methods that were used.
-    """
+    """The fits with one method name, because a batch has a single name: all that were used."""
     name = joined(used)
-    arrays = [jax.tree.map(np.asarray, fit) for fit in fits]
-    return [fit if fit.method == name else dataclasses.replace(fit, method=name) for fit in arrays]
+    return [fit if fit.method == name else dataclasses.replace(fit, method=name) for fit in fits]
 
 
 class _Prepared(NamedTuple):
@@ -108,16 +103,27 @@ class _Prepared(NamedTuple):
 
 
 def _prepared(
-    found: Planned | Refusal, candidates: Sequence[AbstractCircuit]
-) -> _Prepared | Refusal:
-    if isinstance(found, Refusal):
-        return found
-    try:
-        check_default(found.estimator, candidates)
-    except ValueError as error:
-        return Refusal("not_periodic", str(error))
-    lane = found.estimator.lane.of(found.seen)
-    return _Prepared(found, lane, is_shared(found.seen, found.driver))
+    of_all: Iterable[tuple[int, Planned | Refusal]], candidates: Sequence[AbstractCircuit]
+) -> list[tuple[int, _Prepared | Refusal]]:
+    """The recordings of a chunk with their lanes, which those of one kind get together."""
+    prepared: list[tuple[int, _Prepared | Refusal]] = []
+    alike: dict[type[AbstractLane], list[tuple[int, Planned]]] = {}
+    for row, found in of_all:
+        if isinstance(found, Refusal):
+            prepared.append((row, found))
+            continue
+        try:
+            check_default(found.estimator, candidates)
+        except ValueError as error:
+            prepared.append((row, Refusal("not_periodic", str(error))))
+        else:
+            alike.setdefault(found.estimator.lane, []).append((row, found))
+    for kind, several in alike.items():
+        lanes = kind.of_several([found.seen for _, found in several])
+        for (row, found), lane in zip(several, lanes, strict=True):
+            shared = is_shared(found.seen, found.driver)
+            prepared.append((row, _Prepared(found, lane, shared)))
+    return prepared
 
 
 def chunked(count: int) -> Iterator[range]:
@@ -147,23 +153,24 @@ class _Queue:
         self.rows: list[int] = []
         self.lanes: list[AbstractLane] = []
         self.seen: list[Inspected] = []
+        self.held = 0
 
     def add(self, row: int, lane: AbstractLane, seen: Inspected) -> None:
         """Append a recording."""
         self.rows.append(row)
         self.lanes.append(lane)
         self.seen.append(seen)
+        self.held += seen.recording.samples["v_out"].stored.size
 
     @property
     def full(self) -> bool:
         """Whether a call has its lanes, or the waiting recordings take much memory."""
-        held = sum(one.recording.samples["v_out"].stored.size for one in self.seen)
-        return len(self.rows) == LANES or (len(self.rows) >= READ and held >= HELD)
+        return len(self.rows) == LANES or (len(self.rows) >= READ and self.held >= HELD)
 
     def run(self) -> Iterator[tuple[int, Selection]]:
         """Fit the waiting recordings and empty the queue."""
         rows, lanes, seen = self.rows, self.lanes, self.seen
-        self.rows, self.lanes, self.seen = [], [], []
+        self.rows, self.lanes, self.seen, self.held = [], [], [], 0
         found = refined(lanes, seen, self._fits, self.driver, self.candidates)
         remarks = [int(one.remarks) for one in seen]
         of_all = chosen_fits(found, self.driver, remarks, repeats(seen))
@@ -202,8 +209,7 @@ def choices(
 
     def read(number: int) -> list[tuple[int, _Prepared | Refusal]]:
         with jax.enable_x64(True):  # the setting belongs to a thread, and this runs in another one
-            of_all = planned(load, chunks[number], asked)
-            return [(row, _prepared(of, candidates)) for row, of in of_all]
+            return _prepared(planned(load, chunks[number], asked), candidates)
 
     with (
         tqdm(total=count, unit="fit", disable=not progress) as bar,

@@ -496,7 +496,7 @@ def failed_fit(name: str, circuit: AbstractCircuit, method: str) -> Fit:
     empty = circuit.with_log_values(jnp.full(size, jnp.nan))
     scalar = np.asarray(np.nan)
     none = changes.unknown(size)
-    return Fit(
+    fit = Fit(
         circuit=empty,
         cov=nan,
         shared_cov=nan,
@@ -509,6 +509,7 @@ def failed_fit(name: str, circuit: AbstractCircuit, method: str) -> Fit:
         change_stderr=none.stderr,
         support=Support.unknown(size),
     )
+    return jax.tree.map(np.asarray, fit)
 
 
 def note(fit: Fit) -> str:

@@ -5,11 +5,11 @@ from collections.abc import Hashable, Sequence
 from typing import TypeVar
 
 import numpy as np
-from jaxtyping import Bool, Complex, Float
+from jaxtyping import Bool, Float
 
 from etid.recordings.recording import Recording, Samples
 from etid.signals.disturbances import Joint, disturbed, enough, joint, of_source
-from etid.signals.harmonics import harmonics, whole_periods
+from etid.signals.harmonics import filled, harmonics, whole_periods
 from etid.signals.mains import Hum, separated
 from etid.signals.noise import RIPPLE, VISIBLE, is_coarse, noise_std, shows_few, step_of
 from etid.signals.pulse_train import PulseTrain, lags_of, pulse_trains, rise_time
@@ -35,7 +35,7 @@ class Group:
         self.recordings = recordings
         self.sample_rate = recordings[0].sample_rate
         self.pulse_rate = recordings[0].pulse_rate
-        self._coefficients: dict[tuple[int, int], np.ndarray] = {}
+        self._spectra: dict[tuple[int, int], tuple[np.ndarray, ...]] = {}
 
     @functools.cached_property
     def whole(self) -> Float[np.ndarray, "recording 2 time"]:
@@ -173,15 +173,14 @@ class Group:
                 found[rows] = flickering(_part(self.quiet, rows), self.trusted[rows], *of)
         return found
 
-    def coefficients(
-        self, periods: int, samples: int
-    ) -> Complex[np.ndarray, "recording 2 harmonic"]:
-        """Harmonics of `quiet` for these numbers from `whole_periods`."""
-        if (periods, samples) not in self._coefficients:
+    def spectra(self, periods: int, samples: int) -> tuple[np.ndarray, ...]:
+        """`etid.signals.harmonics.filled` for `quiet` and numbers from `whole_periods`."""
+        if (periods, samples) not in self._spectra:
             with QUIETLY():
                 found = np.asarray(harmonics(self.quiet, periods, samples))
-            self._coefficients[periods, samples] = found
-        return self._coefficients[periods, samples]
+                fields = filled(found, self.trusted, self.sample_rate, periods, samples)
+            self._spectra[periods, samples] = tuple(map(np.asarray, fields))
+        return self._spectra[periods, samples]
 
 
 def _records(recording: Recording) -> tuple[Samples, Samples]:

@@ -4,14 +4,14 @@ import functools
 import math
 
 import numpy as np
-from jaxtyping import Bool, Complex, Float
+from jaxtyping import Bool, Float
 
 from etid.recordings.group import Group, covariance_of, limits_of
 from etid.recordings.recording import Recording
 from etid.recordings.remarks import Remark
 from etid.signals.disturbances import Joint
 from etid.signals.filtering import TAPS
-from etid.signals.harmonics import ALIASED, harmonics
+from etid.signals.harmonics import ALIASED, filled, harmonics
 from etid.signals.mains import Hum
 from etid.signals.noise import RIPPLE, noise_std
 from etid.signals.pulse_train import (
@@ -255,12 +255,16 @@ class Inspected:
         """Number of periods in use, and their number of samples."""
         return self.whole_periods if self.kept is None else (self.kept.first.size, self.v_out.size)
 
-    @functools.cached_property
-    def coefficients(self) -> Complex[np.ndarray, "2 harmonic"]:
-        """Harmonics of both voltages [V]."""
+    @property
+    def spectrum(self) -> tuple[np.ndarray, ...]:
+        """The fields of an `etid.signals.harmonics.Spectrum` of both voltages; white noise."""
+        rate = self.recording.sample_rate
         if self.kept is None:
-            return self._group.coefficients(*self.periods)[self._row]
-        return np.asarray(harmonics(self._both, *self.periods))
+            frequency, *of_rows, selected = self._group.spectra(*self.periods)
+            return frequency, *(field[self._row].copy() for field in of_rows), selected
+        sigma = np.stack([self.trusted_th, self.trusted_out])
+        fields = filled(harmonics(self._both, *self.periods), sigma, rate, *self.periods)
+        return tuple(map(np.asarray, fields))
 
     @functools.cached_property
     def is_periodic(self) -> bool:

@@ -24,7 +24,7 @@ from typing import NamedTuple
 
 import numpy as np
 import scipy.fft
-from jaxtyping import Complex, Float
+from jaxtyping import Complex, Float, Int
 
 from etid.recordings.preflight import Inspected
 from etid.signals.harmonics import fast_length
@@ -240,20 +240,14 @@ def _deviations(
     sigma: Float[np.ndarray, " lane"],
 ) -> "_Deviations":
     """Deviations of the periods with the starts `at` [samples]."""
-    lanes, periods = at.shape
+    periods = at.shape[1]
     last = np.array([v.size - known.length for v in records])
     starts = np.minimum(np.rint(at), last[:, None]).astype(int)
     late = starts - at
-    cut = np.empty((lanes, periods, known.length), np.float32)
-    for lane, v in enumerate(records):
-        for row, start in enumerate(starts[lane]):
-            cut[lane, row] = v[start : start + known.length]
-    sigma = np.maximum(sigma, RIPPLE * np.ptp(cut[:, 0], axis=1))
-    cut -= cut.mean((1, 2), keepdims=True)
-    count = int(known.number.sum())
-    # In single precision, this is four times as fast as the transform of NumPy.
-    raw = np.asarray(scipy.fft.rfft(cut, known.size))[:, :, 1 : count + 1]
-    power, mean, weight, gain = _compared(raw, late, known)
+    first = zip(records, starts[:, 0], strict=True)
+    spans = [np.ptp(v[start : start + known.length]) for v, start in first]
+    sigma = np.maximum(sigma, RIPPLE * np.array(spans))
+    power, mean, weight, gain = _compared(records, starts, late, known)
     for _ in range(PASSES):
         # Least-squares estimate of a delay, η = jωτ; it is approximate if the gain changes too.
         of_delay = known.middle * weight
@@ -264,7 +258,10 @@ def _deviations(
         if not moved.any():
             break
         late = late + np.where(moved[:, None], more, 0.0)
-        power, mean, weight, gain = _compared(raw, late, known)
+        rows = np.flatnonzero(moved).tolist()
+        again = _compared([records[row] for row in rows], starts[rows], late[rows], known)
+        for whole, part in zip((power, mean, weight, gain), again, strict=True):
+            whole[rows] = part
     # The part that no change of the gain explains is noise.
     rest = np.add.reduceat(power, known.edges, axis=1) - weight * _power(gain).sum(1)
     freedom = 2 * (known.number - 1) * (periods - 1)
@@ -298,17 +295,32 @@ def _power(values: np.ndarray) -> np.ndarray:
 
 
 def _compared(
-    raw: np.ndarray, late: Float[np.ndarray, "lane period"], known: Bands
+    records: Sequence[Float[np.ndarray, "_"]],
+    starts: Int[np.ndarray, "lane period"],
+    late: Float[np.ndarray, "lane period"],
+    known: Bands,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Power of the deviations, mean, its power, and `gain`, for periods with these delays."""
-    aligned = raw * _turns(late * (2 * np.pi / known.size), raw.shape[2])
-    mean = aligned.mean(1)
-    aligned -= mean[:, None, :]
-    deviation = _without(aligned, known.polynomials)
+    cut = np.zeros((*starts.shape, known.size), np.float32)
+    used = cut[..., : known.length]  # the zeros after it make the transform fast
+    for v, own, places in zip(records, used, starts, strict=True):
+        for period, start in zip(own, places, strict=True):
+            period[:] = v[start : start + known.length]
+    used -= used.mean((1, 2), keepdims=True)
+    count = int(known.number.sum())
+    # In single precision, this is four times as fast as the transform of NumPy.
+    aligned = np.asarray(scipy.fft.rfft(cut))[:, :, 1 : count + 1]
+    # Most recordings of a batch are cut alike.
+    alike = late[:1] if (late == late[0]).all() else late
+    deviation = aligned * _turns(alike * (2 * np.pi / known.size), count)
+    mean = np.einsum("lpk->lk", deviation) / starts.shape[1]  # faster than `mean`
+    deviation -= mean[:, None, :]
+    deviation = _without(deviation, known.polynomials)
     weight = np.maximum(np.add.reduceat(_power(mean), known.edges, axis=1).astype(float), TINY)
-    sums = np.add.reduceat(np.conj(mean)[:, None, :] * deviation, known.edges, axis=2)
     parts = deviation.view(np.float32)
     square = np.einsum("lpk,lpk->lk", parts, parts)
+    deviation *= np.conj(mean)[:, None, :]
+    sums = np.add.reduceat(deviation, known.edges, axis=2)
     return square[:, ::2] + square[:, 1::2], mean, weight, sums / weight[:, None, :]
 
 

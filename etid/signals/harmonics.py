@@ -164,34 +164,36 @@ def spectrum(
     """
     both = namespace(v_out).stack([v_th[:samples], v_out[:samples]])
     coefficients = harmonics(both, periods, samples)
-    return filled(coefficients, sigma_th, sigma_out, sample_rate, periods, samples)
+    sigma = namespace(v_out).stack([sigma_th, sigma_out])
+    return filled(coefficients, sigma, sample_rate, periods, samples)
 
 
 def filled(
-    coefficients: Complex[Array | np.ndarray, "2 harmonic"],
-    sigma_th: Float[Array | np.ndarray, ""],
-    sigma_out: Float[Array | np.ndarray, ""],
-    sample_rate: Float[Array | np.ndarray, ""],
+    coefficients: Complex[Array | np.ndarray, "*recording 2 harmonic"],
+    sigma: Float[Array | np.ndarray, "*recording 2"],
+    sample_rate: Float[Array | np.ndarray, ""] | float,
     periods: int,
     samples: int,
 ) -> tuple[Array | np.ndarray, ...]:
-    """The fields of a `Spectrum` from the `harmonics` of both records; arguments as in `spectrum`.
+    """The fields of a `Spectrum` from the `harmonics` of both records and their noise.
 
     Harmonics below the noise stay selected: the likelihood weights them correctly. To drop weak
     harmonics would lose more information at 24 to 40 dB than they disturb. Padded harmonics follow
     the last harmonic. They are not selected and almost zero; they give records of most lengths the
-    same number of harmonics.
+    same number of harmonics. Other arguments as in `spectrum`; several recordings of equal length
+    share `frequency` and `selected`.
     """
-    of, count = namespace(coefficients), coefficients.shape[1]
+    of, count = namespace(coefficients), coefficients.shape[-1]
     number = np.arange(1.0, count + -count % ROOM + 1)
     frequency = number * (periods * sample_rate / samples)
-    noise = of.stack([sigma_th, sigma_out])[:, None] / math.sqrt(samples)
-    scale = of.where(number[None, :] <= count, noise, ABSENT * noise)
-    absent = scale[:, count:].astype(coefficients.dtype)
-    padded, variance = of.concatenate([coefficients, absent], axis=1), scale**2
+    noise = sigma[..., None] / math.sqrt(samples)
+    scale = of.where(number <= count, noise, ABSENT * noise)
+    absent = scale[..., count:].astype(coefficients.dtype)
+    padded, variance = of.concatenate([coefficients, absent], axis=-1), scale**2
+    (x, y), (variance_x, variance_y) = (of.moveaxis(both, -2, 0) for both in (padded, variance))
     highest = 0.5 if separates_aliases(periods, samples) else ALIASED
     selected = (frequency < highest * sample_rate) & (number <= count)
-    return frequency, padded[0], padded[1], variance[0], variance[1], selected
+    return frequency, x, y, variance_x, variance_y, selected
 
 
 def fast_length(length: int) -> int:

@@ -45,6 +45,7 @@ ORDER = 6
 DIFFERENCE = np.array([(-1.0) ** k * math.comb(ORDER, k) for k in range(ORDER + 1)])
 GAIN = math.sqrt(np.sum(DIFFERENCE**2))  # noise of a difference over noise of a sample
 ROW, PIECE = 24, 32  # samples of a row, and rows of one product
+LONG = 30_000  # samples from which on every second difference suffices
 IN_CACHE = 2**15  # samples whose differences are computed together
 # Bisection to 1e-12 of the largest difference, which is at most 1e5 times the noise (at an edge).
 HALVINGS = 40
@@ -93,9 +94,10 @@ def noise_std(
 ) -> Float[Array | np.ndarray, "*record"]:
     """Standard deviation of the white noise in `v`, in the unit of `v`.
 
-    It comes from every second difference, in half of the time of all. Neighbouring differences
-    share most of their samples, so the standard error grows from 0.93 to 1.01 % only (33 330
-    samples). A weight, a standard error or the limit of a test does not need more.
+    In records of more than `LONG` samples it comes from every second difference, in half of the
+    time. Neighbouring differences share most of their samples, so the standard error grows from
+    0.94 to 1.02 % only (33 330 samples). It is a weight, and enters standard errors and limits of
+    tests in proportion.
 
     Args:
         v: Samples of the record, or of several records as an array of NumPy.
@@ -111,7 +113,7 @@ def noise_std(
         ]
         middle = np.concatenate(parts).reshape(v.shape[:-1])
         return np.asarray(np.maximum(MEDIAN_TO_SIGMA / GAIN * middle, floor))
-    size = jnp.abs(jnp.diff(v, ORDER)[::2])
+    size = jnp.abs(jnp.diff(v, ORDER)[:: _every(v.shape[0])])
     return jnp.maximum(MEDIAN_TO_SIGMA / GAIN * _median(size), floor)
 
 
@@ -125,30 +127,37 @@ def _middle(size: Float[np.ndarray, "record difference"]) -> Float[np.ndarray, "
 def _differences(
     v: Float[np.ndarray, "record time"],
 ) -> Float[np.ndarray, "record difference"]:
-    """Size of every second difference of the order `ORDER`.
+    """Size of all differences of the order `ORDER`, or of every second one.
 
     A product with a matrix takes a fourth of the time of a convolution. `PIECE` rows of `ROW`
     samples are one product, which is too small for BLAS to start threads.
     """
-    own, beyond = _matrices()
+    every = _every(v.shape[1])
+    own, beyond = _matrices(every)
     pieces = max(0, v.shape[1] - ROW) // (ROW * PIECE)
     size, shape = pieces * ROW * PIECE, (len(v), pieces, PIECE, ROW)
     found = v[:, :size].reshape(shape) @ own
     # The last differences of a row need the first samples of the next row.
-    found[..., ROW // 2 - ORDER // 2 :] += (
-        v[:, ROW : ROW + size].reshape(shape)[..., :ORDER] @ beyond
-    )
-    rest = np.diff(v[:, size:], ORDER)[:, ::2]
+    after = v[:, ROW : ROW + size].reshape(shape)[..., :ORDER]
+    found[..., -beyond.shape[1] :] += after @ beyond
+    rest = np.diff(v[:, size:], ORDER)[:, ::every]
     found = np.concatenate([found.reshape(len(v), -1), rest], axis=1)
     return np.abs(found, out=found)
 
 
+def _every(samples: int) -> int:
+    """Step from one difference to the next."""
+    return 2 if samples > LONG else 1
+
+
 @functools.cache
-def _matrices() -> tuple[Float[np.ndarray, "sample place"], Float[np.ndarray, "next last"]]:
+def _matrices(
+    every: int,
+) -> tuple[Float[np.ndarray, "sample place"], Float[np.ndarray, "next last"]]:
     """Weights of the samples of a row, and of the first samples of the next, in the differences."""
-    weights = np.zeros((ROW + ORDER, ROW // 2))
-    for place in range(ROW // 2):
-        weights[2 * place : 2 * place + ORDER + 1, place] = DIFFERENCE
+    weights = np.zeros((ROW + ORDER, ROW // every))
+    for place in range(ROW // every):
+        weights[every * place : every * place + ORDER + 1, place] = DIFFERENCE
     beyond = weights[ROW:]
     return weights[:ROW].copy(), beyond[:, beyond.any(0)].copy()
 
@@ -333,32 +342,55 @@ def corner(
     if periods < 2 or not sigma > 0:
         return 0.0
     v = v[:samples]
-    bins, white, pink = _bins(periods, samples)
+    bins, white = _bins(periods, samples)
     late = int(np.argmax(np.abs(v[: samples // periods])))
     means = v[: samples // periods * periods].reshape(periods, -1).mean(1)
-    middle, degree = (np.arange(periods) + 0.5) / periods, min(periods - 1, DRIFT_DEGREE)
-    drift = np.polyval(np.polyfit(middle, means, degree), np.arange(samples) / samples)
+    drift = np.polyval(_polynomial(periods) @ means, np.arange(samples) / samples)
     transform = np.asarray(scipy.fft.rfft(v - drift))[bins]
     found = transform * (bins**2 * np.exp(2j * np.pi * bins * late / samples))
     bend = found[:-2] - 2 * found[1:-1] + found[2:]
     ratio = (np.square(np.real(bend)) + np.square(np.imag(bend))) / (white * samples * sigma**2)
-    mean = 1 + CORNERS * (pink / white * (samples / sample_rate))
-    mean = mean / (1 + CORNERS * BY_DIFFERENCES / sample_rate)
-    gained = np.sum(ratio - np.log(mean) - ratio / mean, axis=(1, 2))
+    weight, log_mean = _means(periods, samples, sample_rate)
+    gained = np.einsum("chb,hb->c", weight, ratio) - log_mean  # not `@`, which starts BLAS threads
     best = int(np.argmax(gained))
     return float(CORNERS[best, 0, 0]) if gained[best] > SURE else 0.0
+
+
+@functools.lru_cache(maxsize=64)
+def _polynomial(periods: int) -> Float[np.ndarray, "degree period"]:
+    """Matrix from the means of periods to the polynomial of the drift, for `numpy.polyval`."""
+    middle = (np.arange(periods) + 0.5) / periods
+    return np.linalg.pinv(np.vander(middle, min(periods, DRIFT_DEGREE + 1)))
 
 
 @functools.lru_cache(maxsize=8)
 def _bins(
     periods: int, samples: int
-) -> tuple[
-    Int[np.ndarray, "harmonic between"],
-    Float[np.ndarray, "difference between"],
-    Float[np.ndarray, "difference between"],
-]:
-    """Bins k P + r, and the mean of |b|² for white noise and for the power 1/bin."""
+) -> tuple[Int[np.ndarray, "harmonic between"], Float[np.ndarray, "difference between"]]:
+    """Bins k P + r, and the mean of |b|² for white noise."""
     count = min(HARMONICS, samples // 2 // periods)
     bins = periods * np.arange(count)[:, None] + np.arange(1, periods)[None, :]
-    white, pink = (one[:-2] + 4 * one[1:-1] + one[2:] for one in (bins**4.0, bins**3.0))
-    return bins, white, pink
+    return bins, _of_differences(bins**4.0)
+
+
+def _of_differences(
+    power: Float[np.ndarray, "harmonic between"],
+) -> Float[np.ndarray, "difference between"]:
+    """Mean of the squares of second differences of numbers with these mean squares."""
+    return power[:-2] + 4 * power[1:-1] + power[2:]
+
+
+@functools.lru_cache(maxsize=8)
+def _means(
+    periods: int, samples: int, sample_rate: float
+) -> tuple[Float[np.ndarray, "corner difference between"], Float[np.ndarray, " corner"]]:
+    """What 1/f noise of each of `CORNERS` makes of the means of |b|².
+
+    Returns:
+        1 − 1/m and Σ ln m, where m is the mean relative to that of white noise. A record with
+        ratios r is exp(Σ (1 − 1/m) r − Σ ln m) times as likely with this noise.
+    """
+    bins, white = _bins(periods, samples)
+    mean = 1 + CORNERS * (_of_differences(bins**3.0) / white * (samples / sample_rate))
+    mean = mean / (1 + CORNERS * BY_DIFFERENCES / sample_rate)
+    return 1 - 1 / mean, np.log(mean).sum((1, 2))

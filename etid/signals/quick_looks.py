@@ -102,10 +102,11 @@ def period_means(
     length = int(spacing) // MERGED * MERGED
     last = records.shape[2] - length
     at = np.minimum(np.rint(np.arange(periods) * spacing), last).astype(int)
-    parts = np.arange(0, length, MERGED)
-    cut = [np.add.reduceat(records[:, :, one : one + length], parts, axis=2) for one in at]
-    means = np.stack(cut, axis=2) / MERGED
-    means -= np.partition(means, parts.size // 2, axis=3)[..., parts.size // 2, None]
+    shape = (*records.shape[:2], -1, MERGED)
+    cut = [records[:, :, first : first + length].reshape(shape) for first in at]
+    means = np.stack([np.einsum("rvps->rvp", one) for one in cut], axis=2) / MERGED
+    half = means.shape[3] // 2
+    means -= np.partition(means, half, axis=3)[..., half, None]
     return means
 
 
