@@ -158,17 +158,17 @@ class AtKnots(eqx.Module):
 
     def residual(self, q: Float[Array, " q"]) -> Float[Array, " part"]:
         """Terms at `q`."""
-        return self._residual(q, self.gain(q))
+        return self.rows(self._change(q, self.gain(q))[None, :])[0]
 
-    def _residual(
+    def _change(
         self, q: Float[Array, " q"], gain: Complex[Array, " knot"]
-    ) -> Float[Array, " part"]:
+    ) -> Complex[Array, " knot"]:
+        """Change of G X/x̂ from the gain that would leave no residual."""
         of, z = self.sums, self.gain.split(q)[1]
         change = gain - of.gain
         if of.by_z is not None and of.shift is not None:
             change = change + gain * (of.shift + (combined(z, of.by_z) if z.size else 0.0))
-        score = of.score * as_complex(1 / jnp.sqrt(jnp.where(of.power > 0, of.power, 1.0)))
-        return real_parts(score) + self.rows(change[None, :])[0]
+        return change - of.score * as_complex(1 / jnp.where(of.power > 0, of.power, 1.0))
 
     def __call__(self, q: Float[Array, " q"]) -> Float[Array, " term"]:
         """Terms at `q` and the priors."""
@@ -178,8 +178,38 @@ class AtKnots(eqx.Module):
     def equations(self, q: Float[Array, " q"]) -> NormalEquations:
         """Normal equations of the recording alone."""
         slopes = apart(self.gain.slopes, q)
-        part, jacobian = self._residual(q, slopes.gain), self.rows(self.by_unknown(slopes))
-        return NormalEquations(0.5 * jnp.dot(part, part), jacobian @ part, jacobian @ jacobian.T)
+        change = self._change(q, slopes.gain)
+        # One matrix product gives all sums.
+        rows = self.rows(jnp.concatenate([self.by_unknown(slopes), change[None, :]]))
+        products = rows @ rows.T
+        return NormalEquations(0.5 * products[-1, -1], products[:-1, -1], products[:-1, :-1])
+
+
+class _Some(eqx.Module):
+    """Terms at the knots of which some parameters are fixed.
+
+    Attributes:
+        terms: The terms.
+        free: Which parameters are not fixed.
+    """
+
+    terms: AtKnots
+    free: Bool[Array, " q"]
+
+    @property
+    def gain(self) -> Gain:
+        """The gain at the knots."""
+        return self.terms.gain
+
+    def __call__(self, q: Float[Array, " q"]) -> Float[Array, " term"]:
+        """Terms at `q` and the priors."""
+        return self.terms(q)
+
+    def equations(self, q: Float[Array, " q"]) -> NormalEquations:
+        """Normal equations of the recording alone."""
+        of, free = self.terms.equations(q), self.free
+        matrix = jnp.where(free[:, None] & free[None, :], of.matrix, 0.0)
+        return NormalEquations(of.objective, jnp.where(free, of.gradient, 0.0), matrix)
 
 
 class Around(eqx.Module):
@@ -275,7 +305,7 @@ class Around(eqx.Module):
         return jnp.concatenate([changes * self.slopes.by_load[None, :], self.slopes.gain[None, :]])
 
 
-def _equations(_, q: Float[Array, " q"], problem: Load | AtKnots) -> NormalEquations:
+def _equations(_, q: Float[Array, " q"], problem: Load | AtKnots | _Some) -> NormalEquations:
     """Normal equations of a load, with the priors."""
     found, prior = problem.equations(q), 1 / problem.gain.widths(q)
     rest = prior * (q - problem.gain.centre(q))
@@ -300,7 +330,9 @@ SLIGHT = 1e-9
 
 
 def refined(
-    load: Load | AtKnots, start: Float[Array, " q"], solver: LevenbergMarquardt | None = None
+    load: Load | AtKnots | _Some,
+    start: Float[Array, " q"],
+    solver: LevenbergMarquardt | None = None,
 ) -> optx.Solution:
     """The minimum over the own parameters, and over z if `start` contains it; `WELL` if no solver.
 
@@ -337,6 +369,25 @@ def _chosen(load: Load, starts: Float[Array, "start q"]) -> Float[Array, " q"]:
     return starts[jax.lax.while_loop(goes_on, tried, first)[1]]
 
 
+def _near(load: Load, start: Float[Array, " own"], well: LevenbergMarquardt) -> Float[Array, " q"]:
+    """The minimum at the knots of `start`: first over the own parameters, then over all."""
+    load, start = jax.lax.stop_gradient((load, start))
+    terms, owned = Around.of(load, start).at, start.size
+    q = jnp.concatenate([start, load.gain.driver.mean])
+    # One loop for both, because each loop compiles for half a second.
+    fields = [jnp.array([of.rtol, of.ftol, of.damping]) for of in (ROUGHLY, well)]
+
+    def stage(
+        q: Float[Array, " q"], of: tuple[Float[Array, "3"], Bool[Array, " q"]]
+    ) -> tuple[Float[Array, " q"], None]:
+        (rtol, ftol, damping), free = of
+        solver = dataclasses.replace(well, rtol=rtol, ftol=ftol, damping=damping)
+        return refined(_Some(terms, free), q, solver).value, None
+
+    free = jnp.stack([jnp.arange(q.size) < owned, jnp.ones(q.size, bool)])
+    return jax.lax.scan(stage, q, (jnp.stack(fields), free))[0]
+
+
 def fit_circuit(
     driver: AbstractGiven,
     circuit: AbstractCircuit,
@@ -369,13 +420,10 @@ def fit_circuit(
     # First at the knots of one point, and with Z_th fixed: from a distant start, a joint fit would
     # distort Z_th.
     start = _chosen(load, candidates.vector())
-    near_start = Around.of(load, start).at
-    alone = refined(near_start, start, ROUGHLY).value
     well = dataclasses.replace(
         WELL, rtol=min(WELL.rtol, SETTLED / math.sqrt(2 * spectrum.x.size)), damping=SLIGHT
     )
-    together = refined(near_start, jnp.concatenate([alone, driver.mean]), well).value
-    solution = refined(load, together, well)
+    solution = refined(load, _near(load, start, well), well)
     q = solution.value
     own, z = load.gain.split(q)
     g, known = apart(load.predicted, q)
