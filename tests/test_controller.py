@@ -150,6 +150,21 @@ def test_an_electrode_that_is_not_good_gets_the_fallback_and_says_so():
     assert list(controller.command(changed, charge=80e-9).reason) == ["fallback"] * 2
 
 
+def test_one_bad_pulse_does_not_raise_the_amplitude_of_wet_skin():
+    """The fallback is three times what damp skin needs; a new electrode gets it."""
+    controller, state = controlled(fallback=0.3)
+    lanes = dataclasses.replace(
+        state.electrodes,
+        amplitude=jnp.array([0.1, 0.6]),
+        result=jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (2,)), verdict("misfit")),
+    )
+    bad = dataclasses.replace(state, electrodes=lanes)
+    np.testing.assert_allclose(controller.command(bad, charge=80e-9).amplitude, [0.1, 0.3])
+    lanes = dataclasses.replace(lanes, pulses=0 * lanes.pulses)
+    lost = dataclasses.replace(state, electrodes=lanes)
+    np.testing.assert_allclose(controller.command(lost, charge=80e-9).amplitude, 0.3)
+
+
 def test_the_fallback_obeys_the_limits_and_nothing_wanted_is_nothing_given():
     controller, state = controlled(fallback=0.5, slew=0.01)
     first = controller.command(controller.tracker.start(), charge=np.array([80e-9, 0.0]))

@@ -28,7 +28,8 @@ first pulse after a change. The *charge* of this pulse is too large by the facto
 has changed.
 
 **An electrode whose verdict is not good** gets the fallback amplitude, or less if a limit says so.
-The command says `fallback` for it, and its charge is NaN.
+Until it starts again, it gets no more than at the last pulse. The command says `fallback` for it,
+and its charge is NaN.
 """
 
 import dataclasses
@@ -262,7 +263,10 @@ def _electrode(
         ]
     )
     good = good & ~jnp.isnan(limits).any()  # the smallest of some numbers and a NaN is NaN
-    first = jnp.where(wanted > 0, controller.fallback, 0.0)
+    # One bad pulse must not raise the amplitude of wet skin. A new electrode may need more.
+    held = (state.pulses > 0) & (state.amplitude > 0)
+    most = jnp.where(held, state.amplitude, jnp.inf)
+    first = jnp.where(wanted > 0, jnp.minimum(controller.fallback, most), 0.0)
     safe = jnp.concatenate([first[None], jnp.full(2, jnp.inf), limits[3:]])
     applied = jnp.where(good, limits, safe)
     reason = jnp.argmin(applied)

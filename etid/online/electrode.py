@@ -15,6 +15,7 @@ from etid.results.verdicts import RESULTS, first_verdict
 from etid.signals.transfer import power
 from etid.solvers.matrices import inverse_of_few
 
+NOISY = 5.2  # standard deviations of a pulse's χ² that noise exceeds once in 10⁷ pulses
 PATIENCE = 5  # pulses in a row that do not fit, after which an electrode starts again
 
 
@@ -93,6 +94,9 @@ def attempt(
     weight = model.bands.weight
     freedom = 2 * jnp.sum(weight > 0, dtype=at.squares.dtype) - own.size
     chi2 = at.squares / freedom
+    # The cube root of χ² is nearly normal (Wilson and Hilferty 1931).
+    width = 2 / 9 * (1 / freedom + 1 / model.noise_freedom)
+    noisy = chi2 < (1 - width + NOISY * jnp.sqrt(width)) ** 3
     rrse = jnp.sqrt(at.squares * measured.variance / jnp.sum(weight * power(gain)))
     by_delay = at.curvature[:-1, -1]
     told = at.curvature[:-1, :-1] - jnp.outer(by_delay, by_delay) / at.curvature[-1, -1]
@@ -102,7 +106,7 @@ def attempt(
         (measured.bad != SUCCESSFUL, measured.bad),
         (~jnp.isfinite(own).all(), RESULTS.nonphysical),
         (~(decrement < SETTLED**2), MAX_STEPS_REACHED),
-        (misses(chi2, rrse) | late, RESULTS.misfit),
+        (misses(chi2, rrse) & ~noisy | late, RESULTS.misfit),
     )
     return Attempt(own, told, spread, chi2, rrse, result)
 

@@ -176,6 +176,10 @@ class Projection:
         means = sum(count for _, count in self.runs)
         return np.concatenate([np.ones(samples), np.full(means, 1 / self.block)])
 
+    def freedom(self) -> int:
+        """Degrees of freedom of the variance of the noise."""
+        return sum(count for _, count in self.runs) * (self.within.shape[1] - 1)
+
     def single(self) -> "Projection":
         """The projection with its rows in single precision."""
         return dataclasses.replace(self, rows=self.rows.astype(np.float32))
@@ -192,8 +196,7 @@ class Projection:
         with np.errstate(invalid="ignore", over="ignore"):  # samples that are not numbers
             kept, squares = self._condensed(v_out)
             found = (kept @ self.rows).astype(float)
-        freedom = sum(count for _, count in self.runs) * (self.within.shape[1] - 1)
-        variance = np.maximum(self.samples * squares / freedom, self.floor)
+        variance = np.maximum(self.samples * squares / self.freedom(), self.floor)
         low, high = adc_range
         clipped = np.zeros(len(v_out), bool)
         if np.isfinite(low) or np.isfinite(high):

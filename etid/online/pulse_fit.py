@@ -24,7 +24,7 @@ STEP = 0.1  # [samples] spacing of the grid of delays
 DELAYS = STEP * np.arange(-15, 16)  # [samples] up to 1 by the trigger and 0.5 by the window
 # Damping of the first step of a search, and its factors after a good and after a bad step.
 DAMPING, LOWER, RAISE = 1e-2, 0.1, 8.0
-SEARCH = 16  # largest number of steps of a search
+SEARCH = 40  # largest number of steps of a search
 SETTLED = 1.0  # distance to the minimum before the last step [standard errors of one pulse]
 
 
@@ -43,6 +43,7 @@ class GainModel(eqx.Module):
         source_alias: Z_th at the frequency from which the aliases of a band come [Ω].
         turn: Phase of a delay of one sample [rad].
         turns: e^(jωτ) for each delay of `DELAYS`.
+        noise_freedom: Degrees of freedom of the variance of the noise.
     """
 
     circuit: AbstractCircuit
@@ -51,6 +52,7 @@ class GainModel(eqx.Module):
     source_alias: Complex[Array, " band"]
     turn: Float[Array, " band"]
     turns: Complex[Array, "delay band"]
+    noise_freedom: Float[Array, ""]
 
     @classmethod
     def of(
@@ -59,11 +61,13 @@ class GainModel(eqx.Module):
         bands: Bands,
         source: Complex[Array, " band"],
         source_alias: Complex[Array, " band"],
+        noise_freedom: int,
     ) -> "GainModel":
         """The model, with the phases of all `DELAYS`."""
         turn = 2 * jnp.pi * bands.frequency / bands.sample_rate
         turns = _unit(jnp.asarray(DELAYS)[:, None] * turn[None, :])
-        return cls(circuit, bands, source, source_alias, turn, turns)
+        freedom = jnp.asarray(float(noise_freedom))
+        return cls(circuit, bands, source, source_alias, turn, turns, freedom)
 
     def gain(
         self, logs: Float[Array, " element"]

@@ -34,8 +34,8 @@ register_description(
             "the last pulse passed the checks for flat, clipped and missing samples",
             "its iteration settled",
             "its residual does not exceed the noise (χ² per degree of freedom of at most "
-            f"{MISFIT_CHI2:g}, or an unexplained part of at most {100 * MISFIT_RRSE:g} % of the "
-            "signal)",
+            f"{MISFIT_CHI2:g} or of what noise exceeds once in ten million pulses, or an "
+            f"unexplained part of at most {100 * MISFIT_RRSE:g} % of the signal)",
             f"its trigger delay is at most {DELAYS[-1]:g} samples",
             "no change of the driver was seen since the calibrations",
             "every relative standard error is below 1",

@@ -22,7 +22,7 @@ model with one common delay would determine this delay better, but not ϑ: the i
 is the same sum.
 
 **A pulse takes two evaluations of the model**, from the best delay of a grid. An electrode that is
-new, or that does not fit its prediction, is fitted anew from generic start values, by up to 16
+new, or that does not fit its prediction, is fitted anew from generic start values, by up to 40
 more. `etid.online.changes` says when this is a change of the skin or of the driver.
 
 **A pulse that does not fit** even then changes only the verdict. The electrode starts again after
@@ -161,6 +161,7 @@ class Tracker(Overviewed, eqx.Module):
             bands,
             known.z_th(combined(known.mean, known.slope)),
             driver.source.response(rate - bands.frequency),
+            projection.freedom(),
         )
         return cls(
             model=model,
