@@ -188,7 +188,10 @@ def test_fit_without_any_success_says_so_and_lists_twenty_at_most(run, tmp_path)
     assert status == WRONG_DATA
     assert printed[0] == "23 recordings by maximum_likelihood: 23 driver_failed"
     assert printed[1].startswith("driver calibration/98k8: order is 1")
-    assert sum(line.startswith("built/") for line in printed) == 20
+    assert sum(line.startswith("  built/") for line in printed) == 20
+    explained = [line for line in printed if line.startswith("driver_failed. ")]
+    assert len(explained) == 1  # not once for each recording
+    assert "order is 1" in explained[0]
     assert printed[-1].startswith("and 3 more")
     assert len(etid.Fits.read(target)) == 23
 

@@ -9,7 +9,7 @@ import pytest
 
 import etid
 from etid.circuits.elements import Ohm
-from etid.results.verdicts import RESULTS, message, verdict, verdict_names, verdicts_of
+from etid.results.verdicts import RESULTS, message, own_part, verdict, verdict_names, verdicts_of
 from etid.simulation.scenes import Scene, Trial
 from etid.simulation.transformer import ResistorLoad, SkinLoad
 
@@ -201,3 +201,12 @@ def test_names_and_values_are_inverse():
 @pytest.mark.parametrize("name", sorted(RESULTS._name_to_item))
 def test_every_failure_says_what_it_is(name):
     assert (name == "successful") == (message(name) == "")
+
+
+def test_a_note_beyond_the_message_of_its_verdict():
+    changed = message("changed")
+    assert own_part("changed", f"{changed} During the record: r_p -20 ± 1 %") == (
+        "During the record: r_p -20 ± 1 %"
+    )
+    assert own_part("unconnected", message("unconnected")) == ""
+    assert own_part("successful", "aligned by 3 samples") == "aligned by 3 samples"

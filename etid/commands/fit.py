@@ -6,7 +6,7 @@ import contextlib
 import math
 import pathlib
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -24,7 +24,7 @@ from etid.recordings.errors import RecordingError
 from etid.report.html import Table
 from etid.results.study_fits import StudyFits
 from etid.results.tried_orders import Order
-from etid.results.verdicts import message
+from etid.results.verdicts import message, own_part
 
 _SHOWN = 20  # most unsuccessful recordings to list
 
@@ -224,15 +224,28 @@ def _summary(outcome: StudyFits) -> str:
             str(_medians(outcome)),
         ]
     failed = np.flatnonzero(fits.verdicts != "successful")
-    wrong = [f"{fits.labels['path'][i]}: {fits.verdicts[i]}. {fits.notes[i]}" for i in failed]
-    if wrong:
-        lines += ["", f"without success: {several(len(wrong), 'recording')}"]
-        lines += [" ".join(line.split()) for line in wrong[:_SHOWN]]
-    if len(wrong) > _SHOWN:
+    if failed.size:
+        lines += ["", f"without success: {several(failed.size, 'recording')}"]
+    for verdict in dict.fromkeys(fits.verdicts[failed[:_SHOWN]].tolist()):
+        same = [i for i in failed[:_SHOWN] if fits.verdicts[i] == verdict]
+        paths, notes = fits.labels["path"][same].tolist(), fits.notes[same].tolist()
+        lines += _explained(verdict, paths, notes)
+    if failed.size > _SHOWN:
         lines.append(
-            f"and {len(wrong) - _SHOWN} more; the file of fits contains a note for each fit"
+            f"and {failed.size - _SHOWN} more; the file of fits contains a note for each fit"
         )
     return "\n".join(lines)
+
+
+def _explained(verdict: str, paths: Sequence[str], notes: Sequence[str]) -> list[str]:
+    """Lines on recordings with the same verdict; what their notes have in common is said once."""
+    if len(paths) == 1:
+        return [f"{paths[0]}: {verdict}. {' '.join(notes[0].split())}"]
+    own = [own_part(verdict, note) for note in notes]
+    if len(set(own)) == 1:
+        return [f"{verdict}. {message(verdict)} {own[0]}".rstrip(), *(f"  {one}" for one in paths)]
+    each = [f"  {path}: {text}".rstrip(": ") for path, text in zip(paths, own, strict=True)]
+    return [f"{verdict}. {message(verdict)}", *each]
 
 
 def _data(outcome: StudyFits) -> dict[str, Any]:

@@ -20,7 +20,7 @@ from etid.report.methods import methods_section, words
 from etid.report.worst_fits import choose, relative_stderr
 from etid.results.fits import Fits
 from etid.results.study_fits import StudyFits
-from etid.results.verdicts import message
+from etid.results.verdicts import message, own_part
 
 EACH = 24  # largest number of recordings whose waveforms are all drawn
 FEW = 300  # largest number of fits that are drawn one by one
@@ -284,8 +284,7 @@ def _single(fits: Fits) -> Section:
         "if the residual is noise. Own error: standard error from the noise of the recording. "
         "Shared error: standard error from the driver."
     )
-    note = str(fits.notes[0])
-    warning = "" if note in ("", message(verdict)) else note
+    warning = own_part(verdict, str(fits.notes[0]))
     return Section("Result", text, (study_tables.single(fits),), warning=warning)
 
 
@@ -297,8 +296,8 @@ def _recordings(fits: Fits, waveforms: Section) -> Section:
     text = "Click a heading to sort. A recording with a link has its waveform below."
     if len(fits) > study_tables.SINGLE:
         text += (
-            f" {study_tables.SINGLE} of {len(fits)} recordings are shown: those without success "
-            "first, then every few of the others; the file of fits has all."
+            f" {study_tables.SINGLE} of {len(fits)} recordings are shown: those without success, "
+            "and every few of the others. The file of fits has all."
         )
     return Section("Recordings", text, (study_tables.recordings(fits, links),))
 

@@ -17,7 +17,7 @@ from etid.recordings.fields import LABELS
 from etid.report.html import Table
 from etid.results.driver import ContinuousDriver, Driver
 from etid.results.fits import Fits
-from etid.results.verdicts import message
+from etid.results.verdicts import message, own_part
 
 ROWS = 100  # largest number of rows of a table
 CONDITIONS = 30  # largest number of conditions in a table
@@ -316,14 +316,13 @@ def failures(fits: Fits) -> Table:
     some = fits.take(chosen)
     rows = []
     for i, verdict in enumerate(some.verdicts):
-        note = str(some.notes[i])
         rows.append(
             (
                 *(str(some.labels[name][i]) or "-" for name in ("path", "subject", "condition")),
                 str(verdict),
                 significant(float(some.chi2[i]), 3),
                 significant(100 * float(some.rrse[i])),
-                "" if note == message(str(verdict)) else note,
+                own_part(str(verdict), str(some.notes[i])),
             )
         )
     heads = ("recording", "subject", "condition", "verdict", "χ²", "RRSE [%]", "note")

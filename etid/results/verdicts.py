@@ -184,6 +184,12 @@ def verdicts_of(names: np.ndarray) -> RESULTS:
 
 
 @functools.cache
+def own_part(verdict: str, note: str) -> str:
+    """What a note says beyond the message of its verdict."""
+    common = message(verdict)
+    return " ".join((note.replace(common, " ") if common else note).split())
+
+
 def message(name: str) -> str:
     """Meaning and remedy of a verdict; empty for `successful`."""
     return _MESSAGES.get(name, RESULTS[RESULTS._name_to_item[name]])
