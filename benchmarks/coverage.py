@@ -3,7 +3,8 @@
 Each repetition draws fresh noise, quantisation and trigger delays for the calibrations, a dry and a
 damp trial, and identifies a driver of its own: trials that share a driver share its error, and
 would not be independent draws. With `--parts` the parts of the driver are drawn anew as well. With
-`--current-snr-db` the loads are identified from the current alone, without calibrations.
+`--current-snr-db` the loads are identified from the current alone, without calibrations; with
+`--resistors` too, from driver and current at once.
 
 Printed are, beside the bound, the part of the 95 % intervals that hold the truth and the root mean
 square of z = error / standard error, each with the range that 99 of 100 runs with right standard
@@ -202,11 +203,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--samples", type=int, default=10_000)
     parser.add_argument("--repetitions", type=int, default=200)
     parser.add_argument("--jitter", type=float, default=50e-9, help="rms trigger delay [s]")
-    parser.add_argument("--resistors", type=float, nargs="+", default=[REFERENCE], help="[ohm]")
+    parser.add_argument("--resistors", type=float, nargs="+", help="of the calibrations [ohm]")
     parser.add_argument(
         "--current-snr-db",
         type=float,
-        help="identify from a measured current with this noise, without calibrations",
+        help="identify from a measured current with this noise; with --resistors from both",
     )
     parser.add_argument("--shared", action="store_true", help="one unloaded record for all")
     parser.add_argument("--method", choices=ESTIMATORS, help="default: that of the records")
@@ -226,7 +227,7 @@ def main(arguments: argparse.Namespace) -> bool:
         drawn = scene(
             arguments.snr_db,
             arguments.samples,
-            arguments.resistors if arguments.current_snr_db is None else (),
+            arguments.resistors or ([REFERENCE] if arguments.current_snr_db is None else []),
             arguments.jitter,
             arguments.shared,
             arguments.more,

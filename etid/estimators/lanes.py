@@ -197,6 +197,51 @@ class Harmonics(AbstractLane):
         return dataclasses.replace(self, selected=self.selected & ~suspect)
 
 
+class HarmonicsWithCurrent(Harmonics):
+    """The same with the measured current, of recordings that have both.
+
+    Attributes:
+        i: Fourier coefficients of the current [A].
+        variance_i: E|noise|² of each of them [A²].
+    """
+
+    i: Complex[Array | np.ndarray, "*lane harmonic"]
+    variance_i: Float[Array | np.ndarray, "*lane harmonic"]
+
+    @staticmethod
+    def _fields(seen: Inspected) -> tuple[np.ndarray, ...]:
+        """The fields of a lane, in their order; the current is shifted like `v_out`.
+
+        Raises:
+            ValueError: The recording lacks `v_th` or the current.
+        """
+        if seen.by_current is None:
+            raise ValueError(f"recording {seen.recording.path!r} has not both v_th and current")
+        *of_voltages, selected, rate = Harmonics._fields(seen)
+        _, i, _, variance_i, _, usable, _ = Harmonics._fields(seen.by_current)
+        turned = i * _turn(of_voltages[0], rate, seen.lag)
+        return *of_voltages, selected & usable, rate, turned, variance_i
+
+    @classmethod
+    def of_samples(
+        cls,
+        v_th: Float[Array, " time"],
+        v_out: Float[Array, " time"],
+        resolution: Float[Array, ""],
+        sample_rate: Float[Array, ""],
+        periods: tuple[int, int],
+    ) -> "HarmonicsWithCurrent":
+        """Refused: bare arrays have no current."""
+        raise ValueError("arrays have no current; use method='maximum_likelihood'")
+
+    def realigned(self, late: int) -> "HarmonicsWithCurrent":
+        """The lane with `v_out` and the current advanced by whole samples."""
+        if late == 0:
+            return self
+        turn = _turn(self.frequency, self.sample_rate, late)
+        return dataclasses.replace(self, y=self.y * turn, i=self.i * turn)
+
+
 class PaddedSamples(AbstractLane):
     """Samples, padded with zeros to one of a few lengths.
 

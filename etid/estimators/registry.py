@@ -12,6 +12,7 @@ from etid.estimators.steiglitz_mcbride.estimator import EquationError, Steiglitz
 
 Method = str | AbstractEstimator  # a name in the registry, or an estimator with its options
 MAXIMUM_LIKELIHOOD = MaximumLikelihood()
+WITH_CURRENT = MaximumLikelihood(with_current=True)
 OUTPUT_ERROR = OutputError()
 
 _ESTIMATORS: dict[str, AbstractEstimator] = {}

@@ -18,7 +18,7 @@ from etid.estimators.element_prior import Known, checked
 from etid.estimators.estimator import AbstractEstimator
 from etid.estimators.maximum_likelihood.estimator import MaximumLikelihood
 from etid.estimators.output_error.estimator import OutputError
-from etid.estimators.registry import MAXIMUM_LIKELIHOOD, OUTPUT_ERROR, Method, named
+from etid.estimators.registry import MAXIMUM_LIKELIHOOD, OUTPUT_ERROR, WITH_CURRENT, Method, named
 from etid.recordings.errors import not_recorded
 from etid.recordings.preflight import Inspected, preflight
 from etid.recordings.recording import Recording, RecordingError
@@ -339,7 +339,7 @@ def driver_of(value: Driver | None) -> Driver | None:
 def fed(recording: Recording, driver: Driver | None) -> tuple[Recording, AbstractFeed]:
     """A recording and its feed: the driver, or without a driver the measured current.
 
-    With a driver the current is not used; without one `v_th` is not used.
+    Without a driver `v_th` is not used.
 
     Raises:
         RecordingError: An argument has another type, or the recording lacks what its feed needs.
@@ -373,5 +373,14 @@ def plan(
     estimator = of_caller or OUTPUT_ERROR
     if name is None and isinstance(driver, HarmonicDriver | MeasuredCurrent):
         estimator = for_calibrations(of_caller, [seen])
+        if of_caller is None and estimator is MAXIMUM_LIKELIHOOD and seen.by_current is not None:
+            name = preflight(seen.by_current, periodic=True)
+            estimator = WITH_CURRENT if name is not None or seen.has_all else estimator
+    if name is None and isinstance(estimator, MaximumLikelihood) and estimator.with_current:
+        if not seen.has_all:
+            raise ValueError(
+                f"recording {seen.recording.path!r}: method {str(estimator)!r} needs a driver and "
+                "a current, and no disturbed periods; use method='maximum_likelihood'"
+            )
     estimator.check_driver(driver, seen.recording.sample_rate, seen.recording.pulse_rate)
     return with_known(estimator, asked.known), name

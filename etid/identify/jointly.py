@@ -322,7 +322,9 @@ def identify_jointly(
     by_current: list[int] = []
 
     def load(row: int) -> tuple[Recording, AbstractFeed]:
-        return drivers.fed(study[paths[row]])
+        of, feed = drivers.fed(study[paths[row]])
+        alone = of.cause == "current" or "current" not in of.samples
+        return (of if alone else of.replace(current=None)), feed
 
     inspected = itertools.chain.from_iterable(
         planned(load, rows, Asked()) for rows in chunked(len(paths))

@@ -106,7 +106,7 @@ def identify_skin(
     Args:
         recording: Unloaded and loaded voltage.
         driver: Identified driver. Without a driver the load is identified from the current that the
-            recording measured.
+            recording measured. With a driver, the default method uses a measured current too.
         circuit: Structure of the load and its typical values; `SkinRC` if not given. With
             `"auto"` it is the simplest circuit that the recording supports; `select_circuit` shows
             the choice.
@@ -485,7 +485,7 @@ def explained(seen: Inspected, name: str) -> str:
     elif name == "misaligned":
         found = why_misaligned(seen)
     elif name == "wrong_unit":
-        found = why_implausible(seen)
+        found = why_implausible(seen.by_current or seen)
     return f"{found} {message(name)}".strip()
 
 

@@ -36,10 +36,12 @@ from scipy.special import softmax
 
 from etid.circuits.circuit import AbstractCircuit, Circuit
 from etid.estimators.element_prior import FIXED, ElementPrior
-from etid.estimators.lanes import Harmonics
+from etid.estimators.lanes import Harmonics, HarmonicsWithCurrent
+from etid.estimators.maximum_likelihood import with_current
 from etid.estimators.maximum_likelihood.estimator import MaximumLikelihood
-from etid.estimators.maximum_likelihood.given_driver import AbstractGiven
+from etid.estimators.maximum_likelihood.given_driver import AbstractGiven, GivenDriver
 from etid.estimators.maximum_likelihood.load import Load, refined
+from etid.estimators.maximum_likelihood.with_current import LoadWithCurrent
 from etid.estimators.registry import MAXIMUM_LIKELIHOOD, named
 from etid.identify.arguments import fed, require
 from etid.identify.compiled import stored_jit
@@ -84,31 +86,37 @@ class _Minimum(eqx.Module):
         cov: H⁻¹.
     """
 
-    terms: Load
+    terms: Load | LoadWithCurrent
     q: Float[Array, " q"]
     cov: Float[Array, "q q"]
 
     @classmethod
     def of(cls, lane: Harmonics, known: Known, circuit: AbstractCircuit) -> "_Minimum":
         terms = terms_of(lane, known, circuit)
-        start = jnp.concatenate([circuit.log_values(), jnp.zeros(1), known.driver.mean])
-        q = refined(terms, start).value
+        alone = isinstance(terms, Load)
+        delays = jnp.zeros(1 if alone else 2)
+        start = jnp.concatenate([circuit.log_values(), delays, known.driver.mean])
+        q = (refined(terms, start) if alone else with_current.refined(terms, start)).value
         return cls(terms, q, inverse(jax.hessian(lambda q: cost(terms, q))(q)))
 
 
-def terms_of(lane: Harmonics, known: Known, circuit: AbstractCircuit) -> Load:
+def terms_of(lane: Harmonics, known: Known, circuit: AbstractCircuit) -> Load | LoadWithCurrent:
     """The residuals of a recording."""
     rate = jnp.asarray(lane.sample_rate)
+    if isinstance(lane, HarmonicsWithCurrent) and isinstance(known.driver, GivenDriver):
+        current = jnp.asarray(lane.i), jnp.asarray(lane.variance_i)
+        of = lane.spectrum, current, rate, known.elements
+        return LoadWithCurrent.behind(known.driver, circuit, *of)
     return Load.behind(known.driver, circuit, lane.spectrum, rate, known.elements)
 
 
-def cost(terms: Load, q: Float[Array, " q"]) -> Float[Array, ""]:
+def cost(terms: Load | LoadWithCurrent, q: Float[Array, " q"]) -> Float[Array, ""]:
     """F(q)."""
     return 0.5 * jnp.sum(terms(q) ** 2)
 
 
 def _least(
-    terms: Load, start: Float[Array, " q"], free: Float[Array, "q free"]
+    terms: Load | LoadWithCurrent, start: Float[Array, " q"], free: Float[Array, "q free"]
 ) -> Float[Array, " q"]:
     """The minimum of F among `start` + `free` @ r."""
 
@@ -329,13 +337,14 @@ def given(
     if not (np.isfinite(cov).all() and (np.linalg.eigvalsh(cov) > 0).all()):
         raise ValueError(f"the recording does not determine all elements of {fit}")
     seen = Inspected(recording)
-    lane = Harmonics.of(seen)
+    estimator = cast(MaximumLikelihood, named(fit.method))
+    lane = (HarmonicsWithCurrent if estimator.with_current else Harmonics).of(seen)
     late = lane.late_by(fit.circuit, feed)  # as `etid.identify.one.repeated` does it
     seen.lag += late
     lane = lane.realigned(late)
     if int(fit.remarks) & Remark.mains_hum:
         lane = lane.without_mains() or lane
     known = known_of(lane, feed, is_shared(seen, feed), MAXIMUM_LIKELIHOOD)
-    told = cast(MaximumLikelihood, named(fit.method)).known_elements
+    told = estimator.known_elements
     elements = ElementPrior.of(told, fit.circuit) if told else None
     return lane, Known(known, elements), cov

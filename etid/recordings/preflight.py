@@ -65,6 +65,21 @@ class Inspected:
         return self.recording.cause == "current"
 
     @functools.cached_property
+    def by_current(self) -> "Inspected | None":
+        """The recording without `v_th`, with the current as the cause; None if it has not both."""
+        of = self.recording
+        both = not self.has_current and "current" in of.samples
+        return Inspected(of.without_v_th()) if both else None
+
+    @property
+    def has_all(self) -> bool:
+        """Whether `v_th`, `v_out` and the current have the same periods, all in use."""
+        other = self.by_current
+        if other is None or self.kept is not None or other.kept is not None:
+            return False
+        return self.periods == other.periods
+
+    @functools.cached_property
     def v_th(self) -> Float[np.ndarray, " time"]:
         """Unloaded voltage [V] of the periods in use, without hum between the harmonics."""
         return self._joined(self._group.quiet[self._row, 0])

@@ -46,7 +46,8 @@ class RESULTS(optx.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]  # equi
         "looks like one more relaxation, like a relaxation that is spread over time constants, or "
         "like a resistance that falls with the current. "
         "The circuit is wrong, or the trigger moved between the records, or the signal drifted or "
-        "clipped, or the method is output error and the record has mains hum."
+        "clipped, or the method is output error and the record has mains hum. If the recording has "
+        "a current too, it may contradict the driver."
     )
     changed = (
         "The load or the driver changed during the record: the pulse periods differ by more than "
@@ -81,7 +82,8 @@ class RESULTS(optx.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]  # equi
     inconsistent = (
         "The recording and the calibrations contradict each other about the source impedance, or "
         "their unloaded voltages differ by more than amplitude and delay. "
-        "The driver changed in between, or r_load is wrong. Calibrate again."
+        "The driver changed in between, or r_load is wrong: calibrate again. If the recording has "
+        "a current too, its scale may be wrong; to leave it out, use replace(current=None)."
     )
     driver_unclear = (
         "The calibrations are too noisy: this recording moves the source impedance further than "

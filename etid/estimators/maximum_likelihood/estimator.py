@@ -16,9 +16,9 @@ from etid.estimators.estimator import (
     Description,
 )
 from etid.estimators.judgement import STRAINED, judged, unless
-from etid.estimators.lanes import Harmonics
-from etid.estimators.maximum_likelihood import given_driver, load
-from etid.estimators.maximum_likelihood.given_driver import AbstractGiven, GivenCurrent
+from etid.estimators.lanes import Harmonics, HarmonicsWithCurrent
+from etid.estimators.maximum_likelihood import given_driver, load, with_current
+from etid.estimators.maximum_likelihood.given_driver import AbstractGiven, GivenCurrent, GivenDriver
 from etid.estimators.refined_driver import refined_driver
 from etid.estimators.score_tests import missing_pole
 from etid.estimators.score_tests.falling_resistance import NO_FALL
@@ -65,6 +65,12 @@ def description(words: str, estimated: str, unknowns: str, tests: tuple[str, ...
     )
 
 
+_BOTH = (
+    " The measured current I = X / (Z_L + Z_th), with a delay of its own, was the second equation "
+    "for each harmonic; the covariance of both residuals is that of the noise of the three records."
+)
+
+
 @dataclasses.dataclass(frozen=True)
 class MaximumLikelihood(AbstractEstimator):
     """Maximum likelihood with noise on both records, on the harmonics of whole pulse periods.
@@ -72,14 +78,21 @@ class MaximumLikelihood(AbstractEstimator):
     Attributes:
         known_elements: Elements that are known: name, value and standard deviation [SI]; 0 fixes
             one.
+        with_current: Whether the measured current is used together with the driver. The default
+            method does so for recordings that have both.
     """
 
     known_elements: Known = ()
+    with_current: bool = False
     name = "maximum_likelihood"
     lane = Harmonics
     driver = HarmonicDriver
     current = True
     chooses = True
+
+    def __post_init__(self) -> None:
+        if self.with_current:
+            object.__setattr__(self, "lane", HarmonicsWithCurrent)
 
     def fit_driver(
         self,
@@ -111,10 +124,18 @@ class MaximumLikelihood(AbstractEstimator):
     ) -> Fit:
         """Refine from the best of several starts, jointly with the uncertain part of the driver."""
         spectrum, rate = lane.spectrum, jnp.asarray(lane.sample_rate)
-        starts = known.starts(spectrum, rate, circuit)
         prior = ElementPrior.of(self.known_elements, circuit) if self.known_elements else None
-        estimate, far, other = load.fit_circuit(known, circuit, spectrum, rate, starts, prior)
-        fit = judged(estimate, circuit, driver.result, str(self))
+        if isinstance(lane, HarmonicsWithCurrent) and isinstance(known, GivenDriver):
+            current = jnp.asarray(lane.i), jnp.asarray(lane.variance_i)
+            found = with_current.fit_circuit(known, circuit, spectrum, current, rate, prior)
+            estimate, far, other, disagrees = found
+            fit = judged(estimate, circuit, driver.result, str(self))
+            fit = unless(fit, disagrees, RESULTS.inconsistent)
+        else:
+            starts = known.starts(spectrum, rate, circuit)
+            found = load.fit_circuit(known, circuit, spectrum, rate, starts, prior)
+            estimate, far, other = found
+            fit = judged(estimate, circuit, driver.result, str(self))
         if known.shape is not None:
             fit = unless(fit, known.shape.differs(spectrum), RESULTS.inconsistent)
         return unless(unless(fit, far, RESULTS.driver_unclear), other, RESULTS.misfit)
@@ -126,7 +147,7 @@ class MaximumLikelihood(AbstractEstimator):
             "the load was estimated by",
             "Each load was estimated jointly with Z_th and the trigger delays of the calibrations, "
             "whose distribution the calibrations give. Its own trigger delay τ is one more "
-            f"unknown.{stated(self.known_elements)}",
+            f"unknown.{_BOTH if self.with_current else ''}{stated(self.known_elements)}",
             (NO_OTHER_CIRCUIT, NO_OTHER_GAIN, NO_FALL),
         )
 

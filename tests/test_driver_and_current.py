@@ -1,0 +1,195 @@
+"""Loads identified from V_th, V_out and the current at once, with a driver."""
+
+import dataclasses
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import etid
+from etid.recordings.remarks import Remark
+from etid.simulation.scenes import Scene, Trial
+from etid.simulation.transformer import ResistorLoad, TransformerDriver
+
+SKIN = etid.SkinRC(r_s=33.4e3, r_p=186e3, c_p=0.12e-9)
+METHOD = "maximum_likelihood(with_current=True)"
+WITHIN = 4.0  # standard errors; by chance one estimate of 16 000 is not
+
+
+def scene(circuit: etid.AbstractCircuit = SKIN, snr_db=60.0, current_snr_db=40.0, **fields):
+    known = (Trial("calibration/0", ResistorLoad(98.8e3)),)
+    return Scene(
+        (Trial("loaded/0", circuit), Trial("loaded/1", circuit)),
+        known,
+        snr_db=snr_db,
+        current_snr_db=current_snr_db,
+        trigger_jitter_rms=50e-9,
+        **fields,
+    )
+
+
+@pytest.fixture(scope="module")
+def study():
+    return scene().simulate(seed=2)
+
+
+@pytest.fixture(scope="module")
+def driver(study):
+    return etid.identify_driver(study["calibration/0"], order=5)
+
+
+@pytest.fixture(scope="module")
+def recording(study):
+    return study["loaded/0"]
+
+
+@pytest.fixture(scope="module")
+def both(recording, driver):
+    return etid.identify_skin(recording, driver)
+
+
+def relative(fit):
+    return np.sqrt(np.diagonal(fit.cov)) / np.asarray(fit.circuit.values())
+
+
+def off(fit, truth: etid.AbstractCircuit = SKIN):
+    """Differences from the truth [standard errors]."""
+    difference = np.asarray(fit.circuit.values()) - np.asarray(truth.values())
+    return difference / np.sqrt(np.diagonal(fit.cov))
+
+
+def test_driver_and_current_together_reach_the_bound(recording, driver, both):
+    assert (both.verdict, both.method) == ("successful", METHOD)
+    assert np.abs(off(both)).max() < WITHIN
+    bound = np.array(list(etid.bound(scene())["loaded/0"].relative.values()))
+    # 1.01 to 1.02 in 60 draws: the calibration has fewer parameters than the bound, but noise.
+    np.testing.assert_allclose(relative(both), bound, rtol=0.05)
+    by_current = etid.identify_skin(recording)
+    assert (relative(both) < 0.97 * relative(by_current)).all()
+
+
+def test_the_current_is_left_out_on_request(recording, driver, both):
+    alone = etid.identify_skin(recording, driver, method="maximum_likelihood")
+    without = etid.identify_skin(recording.replace(current=None), driver)
+    np.testing.assert_array_equal(alone.circuit.values(), without.circuit.values())
+    assert (relative(both) < 0.5 * relative(alone)).all()
+    with pytest.raises(ValueError, match="needs a driver and a current"):
+        etid.identify_skin(recording.replace(current=None), driver, method=METHOD)
+    with pytest.raises(ValueError, match="needs a driver and a current"):
+        etid.identify_skin(recording, method=METHOD)
+    v_th, v_out = jnp.asarray(recording.v_th), jnp.asarray(recording.v_out)
+    rates = {"sample_rate": recording.sample_rate, "pulse_rate": recording.pulse_rate}
+    with pytest.raises(ValueError, match="arrays have no current"):
+        etid.identify_samples(v_th, v_out, driver, method=METHOD, **rates)
+
+
+@pytest.mark.parametrize(
+    ("change", "verdicts"),
+    [
+        (lambda one: {"current": 1.05 * one.current}, ("misfit", "inconsistent")),
+        (lambda one: {"current": 0.98 * one.current}, ("misfit", "inconsistent")),
+        (lambda one: {"current": 1.003 * one.current}, ("inconsistent",)),
+        (lambda one: {"current": one.current + one.v_out / 2e6}, ("misfit", "inconsistent")),
+        (lambda one: {"v_out": 1.02 * one.v_out}, ("misfit", "inconsistent")),
+        (lambda one: {"current": np.roll(one.current, 3)}, ("misfit",)),
+        (lambda one: {"current": -one.current}, ("misaligned",)),
+        (lambda one: {"current": 1e3 * one.current}, ("wrong_unit",)),
+        (lambda one: {"current": 0 * one.current}, ("flat",)),
+        (
+            lambda one: {"current": np.where(np.arange(one.v_out.size) == 5, np.nan, one.current)},
+            ("nonfinite_samples",),
+        ),
+    ],
+)
+def test_a_current_that_contradicts_the_driver_is_never_averaged(
+    recording, driver, both, change, verdicts
+):
+    fit = etid.identify_skin(recording.replace(**change(recording)), driver, throw=False)
+    assert fit.verdict in verdicts
+
+
+def test_a_wrong_unit_is_told_with_the_numbers_of_the_current(recording, driver):
+    with pytest.raises(etid.IdentificationError, match=r"current .* A, .* ohm"):
+        etid.identify_skin(recording.replace(current=1e3 * recording.current), driver)
+
+
+def test_a_driver_that_has_changed_is_told(driver, both):
+    usual = TransformerDriver()
+    changed = dataclasses.replace(usual, r_protection=1.05 * usual.r_protection)
+    recording = scene(driver=changed).simulate(seed=3)["loaded/0"]
+    fit = etid.identify_skin(recording, driver, throw=False)
+    assert fit.verdict in ("misfit", "inconsistent")
+
+
+def test_an_offset_and_a_common_delay_are_no_contradiction(recording, driver):
+    shifted = {name: np.roll(getattr(recording, name), 3) for name in ("v_out", "current")}
+    late = recording.replace(v_out=shifted["v_out"], current=shifted["current"] + 1e-4)
+    fit = etid.identify_skin(late, driver)
+    assert int(fit.remarks) == Remark.aligned
+    assert np.abs(off(fit)).max() < WITHIN
+
+
+def test_a_file_and_its_report_use_both_where_both_were_recorded(study, both, tmp_path):
+    of = [study["calibration/0"], study["loaded/0"], study["loaded/1"].replace(current=None)]
+    etid.Study.from_recordings(of).write(tmp_path / "study.h5")
+    fits = etid.fit_file(tmp_path / "study.h5", tmp_path / "fits.h5").fits
+    assert (fits.verdicts == "successful").all()
+    assert fits.fit.method == f"maximum_likelihood + {METHOD}"
+    # The driver of the file was identified again; its last digits differ.
+    np.testing.assert_allclose(fits[0].circuit.values(), both.circuit.values(), rtol=1e-6)
+    assert (relative(fits[0]) < 0.5 * relative(fits[1])).all()
+    etid.write_report(tmp_path / "fits.h5", tmp_path / "page.html")
+    page = (tmp_path / "page.html").read_text("utf-8")
+    assert "The measured current I = X / (Z_L + Z_th)" in page
+
+
+@pytest.mark.slow
+def test_draws_of_a_fit_with_both_have_its_errors(both):
+    draws = both.posterior()
+    assert draws.effective > 800  # of 1000: the likelihood is normal at 60 dB
+    error = float(both.stderr.r_p)
+    for interval in (draws.intervals()["r_p"], both.profile("r_p").interval()):
+        # 1000 draws give an end of the interval to a tenth of a standard error.
+        expected = float(both.circuit.r_p) + np.array([-1.96, 1.96]) * error
+        np.testing.assert_allclose(interval, expected, rtol=0, atol=0.3 * error)
+
+
+@pytest.mark.slow
+def test_another_circuit_is_seen_and_chosen(driver):
+    cole = etid.SkinCole(33.4e3, 186e3, 22e-6, 0.9)
+    recording = scene(cole).simulate(seed=4)["loaded/0"]
+    assert etid.identify_skin(recording, driver, throw=False).verdict == "misfit"
+    fit = etid.identify_skin(recording, driver, circuit="auto")
+    assert type(fit.circuit) is etid.SkinCole
+    assert np.abs(off(fit, cole)).max() < WITHIN
+
+
+@pytest.mark.slow
+def test_a_joint_fit_leaves_the_current_out(study):
+    """A current that contradicts the driver does not matter to it."""
+    wrong = study["loaded/0"].replace(current=0 * study["loaded/0"].v_out)
+    joint = etid.identify_jointly(etid.Study.from_recordings([study["calibration/0"], wrong]))
+    assert joint.fits.verdicts == ["successful"]
+
+
+@pytest.mark.slow
+def test_estimates_are_efficient_and_their_intervals_true():
+    """320 draws, each with its own calibration; the bound knows no more than the fits."""
+    damp = etid.SkinRC(r_s=6.1e3, r_p=17.4e3, c_p=0.66e-9)
+    squares, covered = [], []
+    for circuit, current_snr_db in ((SKIN, 40.0), (damp, 30.0)):
+        of = scene(circuit, current_snr_db=current_snr_db)
+        bound = np.array(list(etid.bound(of)["loaded/0"].relative.values()))
+        for seed in range(160):
+            drawn = of.simulate(seed + 1000)
+            driver = etid.identify_driver(drawn["calibration/0"], order=5, throw=False)
+            fit = etid.identify_skin(drawn["loaded/0"], driver, throw=False)
+            assert fit.verdict in ("successful", "inconsistent", "changed"), seed
+            if fit.verdict == "successful":
+                error = np.asarray(fit.circuit.values()) / np.asarray(circuit.values()) - 1
+                squares.append((error / bound) ** 2)
+                covered.append(np.abs(error) < 1.96 * relative(fit))
+    assert len(squares) >= 315
+    # 320 squares of normal errors have a mean that is known to 8 %.
+    assert (np.mean(squares, axis=0) < 1.25).all()
+    assert 0.93 < np.mean(covered) < 0.97
