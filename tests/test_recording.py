@@ -119,6 +119,7 @@ def test_nan_samples_are_left_to_the_preflight():
         ({"pulse_rate": -60.0}, "pulse_rate: is -60 hertz"),
         ({"pulse_rate": float("inf")}, "pulse_rate: is inf"),
         ({"pulse_rate": 100e3}, "pulse_rate: is 100000 Hz, must be below half the sample rate"),
+        ({"pulse_rate": 1e-310}, "pulse_rate: is 1e-310 Hz; .* longer than a record may be"),
         ({"r_load": 0.0}, "r_load: is 0 ohm"),
         ({"r_load": float("inf")}, "r_load: is inf"),
         ({"adc_range": (1.0, -1.0)}, "adc_range: .*increasing"),

@@ -12,6 +12,7 @@ from typing import Any, Literal, Required, TypedDict
 
 import numpy as np
 
+from etid.recordings import limits
 from etid.recordings.errors import RecordingError, near_miss
 from etid.recordings.values import Type, real, several, stored, text
 
@@ -278,6 +279,12 @@ class Metadata(AbstractFields):
             raise RecordingError(
                 f"is {self.pulse_rate:g} Hz, must be below half the sample rate of "
                 f"{self.sample_rate:g} Hz",
+                field="pulse_rate",
+            )
+        if self.sample_rate > limits.SAMPLES * self.pulse_rate:
+            raise RecordingError(
+                f"is {self.pulse_rate:g} Hz; at {self.sample_rate:g} Hz one period would be longer "
+                f"than a record may be ({limits.SAMPLES} samples)",
                 field="pulse_rate",
             )
         if self.r_load is not None and self.calibration:
