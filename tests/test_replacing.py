@@ -2,6 +2,8 @@
 
 import pytest
 
+import etid
+from benchmarks.specimens import study_fits
 from etid.recordings.recording import RecordingError
 from etid.recordings.replacing import replacing
 
@@ -38,3 +40,10 @@ def test_two_processes_may_write_one_file_at_once(tmp_path):
         first.write_text("first")
         second.write_text("second")
     assert target.read_text() == "first"  # the outer block ends last
+
+
+def test_results_are_not_written_under_the_name_of_another_format(tmp_path):
+    for result in (study_fits().fits, study_fits(), etid.Study({})):
+        with pytest.raises(RecordingError, match=r"not written as \.csv; name it all\.h5"):
+            result.write(tmp_path / "all.csv")
+    assert list(tmp_path.iterdir()) == []

@@ -91,8 +91,8 @@ def imported(name: str) -> type[AbstractCircuit]:
         known = built_in()
         if name not in known:
             raise ValueError(
-                f"there is no circuit {name!r} in etid; use one of {', '.join(sorted(known))}, or "
-                "module:Class for a circuit of your own"
+                f"there is no circuit {name!r} in etid; use one of {', '.join(sorted(known))}, "
+                "a string as R0-p(R1,C1), or module:Class for a circuit of your own"
             )
         return known[name]
     try:

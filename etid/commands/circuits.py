@@ -19,7 +19,7 @@ def add_circuit(parser: argparse.ArgumentParser, purpose: str, *, automatic: boo
         purpose: Purpose of the circuit, the first words of the help.
         automatic: Whether the command can choose the circuit, with `--circuit auto`.
     """
-    names = f"{', '.join(lookup.built_in())}, or module:Class"
+    names = f"{', '.join(lookup.built_in())}, a string as R0-p(R1,C1), or module:Class"
     parser.add_argument(
         "--circuit",
         type=_circuit_or_auto if automatic else _circuit,

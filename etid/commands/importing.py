@@ -7,11 +7,11 @@ import pathlib
 from collections.abc import Callable
 
 from etid.commands import Outcome
-from etid.commands.outputs import HDF5
 from etid.files.importing import import_file
 from etid.files.mapping import CHANNELS, FIELDS
 from etid.files.readers.delimited import DIALECT
 from etid.recordings.fields import DECLARED, SIGNALS
+from etid.recordings.replacing import HDF5
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -4,8 +4,8 @@ import argparse
 import pathlib
 
 from etid.commands import Outcome
-from etid.commands.outputs import HDF5
 from etid.files.merging import merge_files
+from etid.recordings.replacing import HDF5
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -3,13 +3,7 @@
 import pathlib
 from collections.abc import Mapping
 
-HDF5 = (".h5", ".hdf5", ".hdf")
-
-# Endings of the formats that etid reads or writes, and of formats that people expect of it.
-_FORMATS = {
-    *(*HDF5, ".csv", ".txt", ".json", ".toml", ".parquet", ".nwb", ".cir", ".html", ".htm", ".pdf"),
-    *(".mat", ".tdms", ".abf", ".npz", ".npy", ".wav", ".lvm", ".xls", ".xlsx", ".png", ".svg"),
-}
+from etid.recordings.replacing import check_ending
 
 
 def check_outputs(outputs: Mapping[pathlib.Path, tuple[str, ...]], *, force: bool) -> None:
@@ -29,9 +23,6 @@ def check_outputs(outputs: Mapping[pathlib.Path, tuple[str, ...]], *, force: boo
             raise ValueError(f"{path}: this is a folder; name a file")
         if not path.absolute().parent.is_dir():
             raise ValueError(f"{path}: the folder of this file does not exist")
-        suffix = path.suffix.lower()
-        if suffix in _FORMATS and suffix not in endings:
-            name = path.with_suffix(endings[0]).name
-            raise ValueError(f"{path}: the file is not written as {suffix}; name it {name}")
+        check_ending(path, endings)
         if path.exists() and not force:
             raise ValueError(f"{path}: this file exists; add --force to replace it")

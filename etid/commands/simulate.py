@@ -6,7 +6,7 @@ import pathlib
 
 from etid.circuits.display import several
 from etid.commands import Outcome
-from etid.commands.outputs import HDF5
+from etid.recordings.replacing import HDF5
 from etid.simulation import scenes
 
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from etid.recordings import schema
 from etid.recordings.recording import AbstractSource, RecordingError
-from etid.recordings.replacing import replacing
+from etid.recordings.replacing import check_ending, replacing
 
 
 def write(sources: Mapping[str, AbstractSource], path: str | os.PathLike[str]) -> None:
@@ -18,6 +18,7 @@ def write(sources: Mapping[str, AbstractSource], path: str | os.PathLike[str]) -
 
     Only one block of a recording is in memory at a time; its source chooses the size of a block.
     """
+    check_ending(path)
     for own, source in sources.items():
         for calibration in source.metadata.calibration:
             if calibration not in sources or sources[calibration].metadata.kind != "calibration":

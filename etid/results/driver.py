@@ -20,7 +20,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Complex, Float, Int
 
-from etid.circuits.display import plus_minus
+from etid.circuits.display import plus_minus, several
 from etid.circuits.impedance import realise
 from etid.circuits.overview import Overview
 from etid.recordings.remarks import texts
@@ -265,7 +265,7 @@ class Driver(AbstractFeed):
         ]
         notes = [*self._findings(), *([message(verdict)] if verdict != "successful" else [])]
         return Overview(
-            f"Driver of order {self.order}: {verdict} in {int(self.steps)} steps "
+            f"Driver of order {self.order}: {verdict} in {several(int(self.steps), 'step')} "
             f"({self.method}), RRSE {100 * float(self.rrse):.3g} %, chi2 {float(self.chi2):.3g}",
             rows,
             notes=[*notes, *texts(int(self.remarks))],

@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Complex, Float, Int
 
 from etid.circuits.circuit import AbstractCircuit, Circuit
-from etid.circuits.display import heading, quantity
+from etid.circuits.display import heading, quantity, several
 from etid.circuits.lookup import qualified
 from etid.circuits.overview import Overview, Overviewed, element_rows
 from etid.recordings.fields import DESCRIBING, Label, wanted_labels
@@ -255,7 +255,7 @@ class Fit(Judged, WithData[Circuit]):
         if np.ndim(self.rrse):
             batch = f"{kind} fits, batch of {np.shape(self.rrse)}: {counted(verdict)}"
             return Overview(batch, rows)
-        title = f"{kind}: {verdict} in {int(self.steps)} steps ({self.method})"
+        title = f"{kind}: {verdict} in {several(int(self.steps), 'step')} ({self.method})"
         title += f", RRSE {100 * float(self.rrse):.3g} %, chi2 {float(self.chi2):.3g}"
         notes = [message(verdict)] if verdict != "successful" else []
         notes += [self.changes] if verdict == "changed" else []

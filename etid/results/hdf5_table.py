@@ -10,7 +10,7 @@ import numpy as np
 
 from etid.recordings import limits
 from etid.recordings.errors import RecordingError
-from etid.recordings.replacing import replacing
+from etid.recordings.replacing import check_ending, replacing
 from etid.recordings.untrusted import (
     attribute,
     check_size,
@@ -35,7 +35,11 @@ def write_table(
         columns: Arrays of equal length along their first axis. Text is stored as UTF-8.
         units: SI units of the columns that have one. They are stored as attribute `unit`.
         attributes: Attributes of the file.
+
+    Raises:
+        RecordingError: The name of the file says another format.
     """
+    check_ending(path)
     with replacing(path) as partial, h5py.File(partial, "w") as file:
         file.attrs.update(attributes)
         for name, column in columns.items():
