@@ -174,6 +174,11 @@ def test_delays_that_do_not_scatter_leave_smaller_errors_and_the_fits_say_so(out
     assert np.median(dry.stderr.c_p) < 0.85 * np.median(scattered.stderr.c_p)
 
 
+def test_the_minimum_is_found_before_the_loads_are_evaluated_in_full(outcome):
+    """The driver's valley takes dozens of steps; none of them may need all harmonics of a load."""
+    assert (np.asarray(outcome.fits.where(condition="dry").fit.steps) <= 2).all()
+
+
 def test_the_summary_tells_what_varies_from_what_is_shared(outcome):
     row = next(r for r in outcome.fits.summary("condition") if r["condition"] == "dry")
     for name in ("r_s", "r_p", "c_p"):

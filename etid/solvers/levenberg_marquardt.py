@@ -284,16 +284,6 @@ class LevenbergMarquardt(optx.AbstractLeastSquaresSolver):
         # The step without damping, of which the tests below ask, is solved at once with it.
         sizes = jnp.stack([step_size / self.damping, jnp.asarray(1 / RIDGE, y.dtype)])
         proposed, newton = jax.vmap(lambda size: self.descent.step(size, descent_state)[0])(sizes)
-        if self.geodesic:
-            bent = self.second_order(_value(fn), y, proposed / safe, args) / safe
-            bent = eqx.tree_at(lambda e: e.gradient, scaled, bent)
-            turned, _ = self.descent.step(
-                step_size / self.damping,
-                self.descent.query(y, self._info(bent), descent_state),
-            )
-            small = 2 * self.norm(turned) <= ACCELERATION * self.norm(proposed)
-            proposed = proposed + jnp.where(small, 0.5 * turned, 0.0)
-
         size = self.norm(safe * y)
         offset = -jnp.dot(newton, scaled.gradient)  # |Q₁ᵀ r|²
         squares = 2 * accepted.objective
@@ -311,6 +301,19 @@ class LevenbergMarquardt(optx.AbstractLeastSquaresSolver):
         result = optx.RESULTS.where(
             failed, optx.RESULTS.nonlinear_divergence, optx.RESULTS.successful
         )
+        if self.geodesic:
+
+            def bend() -> Array:
+                bent = self.second_order(_value(fn), y, proposed / safe, args) / safe
+                bent = eqx.tree_at(lambda e: e.gradient, scaled, bent)
+                turned, _ = self.descent.step(
+                    step_size / self.damping,
+                    self.descent.query(y, self._info(bent), descent_state),
+                )
+                small = 2 * self.norm(turned) <= ACCELERATION * self.norm(proposed)
+                return proposed + jnp.where(small, 0.5 * turned, 0.0)
+
+            proposed = jax.lax.cond(terminate, lambda: proposed, bend)
         state = _State(
             first_step=jnp.array(False),
             y_eval=y + proposed / safe,

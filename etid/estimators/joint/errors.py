@@ -121,7 +121,8 @@ def estimates(
             records: int = records,
             sums_of: Float[Array, "record x common"] = sums_of,
         ) -> tuple[Estimate, Bool[Array, ""], Delay]:
-            chi2, rrse = _misfit(study, load, common, own)
+            seen = _seen(study, load, common, own)
+            chi2, rrse = _misfit(study, load, seen)
             shared = eliminated.slope @ cov @ eliminated.slope.T
             private = eliminated.cov
             if records:
@@ -144,7 +145,7 @@ def estimates(
                 strain=strain,
             )
             delay = Delay(own.delay_samples, private[-1, -1], eliminated.slope[-1])
-            other = _is_another(study, load, common, own, eliminated, bread, total.score)
+            other = _is_another(seen, load, own, eliminated, bread, total.score)
             return estimate, other, delay
 
         judged.append(in_turn(one, loads, own, eliminated, results))
@@ -180,7 +181,7 @@ def _seen(
     """A load at its minimum; what the caller does not use is not computed."""
     driver = study.model.around(common, load.spectrum.frequency)
     q, o = jnp.concatenate([own.vector(), driver.mean]), study.owned
-    lane = study.whole(driver, load)
+    lane = study.lane(driver, load)
     g, known = apart(lane.predicted, q)
     part = residual(known, g)
     around = Around.of(lane, q, (g, known))
@@ -196,10 +197,10 @@ def _seen(
 
 
 def _misfit(
-    study: DriverStudy, load: Loads, common: Float[Array, " common"], own: LoadUnknowns
+    study: DriverStudy, load: Loads, seen: _Seen
 ) -> tuple[Float[Array, ""], Float[Array, ""]]:
     """χ² and RRSE of a load."""
-    seen, spectrum = _seen(study, load, common, own), load.spectrum
+    spectrum = load.spectrum
     squares = jnp.sum(seen.part**2)
     freedom = 2 * jnp.sum(spectrum.selected, dtype=squares.dtype) - study.owned
     error = complex_rrse(seen.gain * spectrum.x, spectrum.y, spectrum.selected)
@@ -207,16 +208,14 @@ def _misfit(
 
 
 def _is_another(
-    study: DriverStudy,
+    seen: _Seen,
     load: Loads,
-    common: Float[Array, " common"],
     own: LoadUnknowns,
     eliminated: _Eliminated,
     bread: Float[Array, "common common"],
     score: Float[Array, "common common"],
 ) -> Bool[Array, ""]:
     """Score test of one load; `bread` and `score` are those of `common` from all terms."""
-    seen = _seen(study, load, common, own)
     slope, around = eliminated.slope, seen.around
     q, gain = own.vector(), around.at.gain
     terms = jnp.concatenate([around.part, (q - gain.centre(q)) / gain.widths(q)])
@@ -236,7 +235,7 @@ def _is_another(
         -seen.linear.jacobian @ terms,
         spread.set(score - eliminated.rest.score),
         covariance,
-        slice(common.size, common.size + own.log_elements.size),
+        slice(bread.shape[0], bread.shape[0] + own.log_elements.size),
     )
     other = other_circuit.Scores.of(found, gain=True)
     # A load that takes no part has its own verdict.

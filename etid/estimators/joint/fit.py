@@ -1,10 +1,11 @@
 """Joint maximum-likelihood fit of one driver and many loads; its time is linear in the loads.
 
-The matrix of the normal equations is an arrowhead (`etid.solvers.arrowhead`; Pintelon and
-Schoukens, System Identification, 2012, ch. 9). A few loads at a time are evaluated in parallel.
+`etid.estimators.joint.near` finds a point close to the minimum. From there the solver takes all
+parameters and harmonics, mostly in one step. The matrix of its normal equations is an arrowhead
+(`etid.solvers.arrowhead`; Pintelon and Schoukens, System Identification, 2012, ch. 9). A few loads
+at a time are evaluated in parallel.
 """
 
-import dataclasses
 import math
 from collections.abc import Sequence
 
@@ -15,6 +16,7 @@ from jaxtyping import Array, Bool, Float
 
 from etid.estimators.estimate import MAX_STEPS, SOLVER, Estimate
 from etid.estimators.joint.errors import Delay, estimates
+from etid.estimators.joint.near import approached
 from etid.estimators.joint.terms import DriverStudy, Joint, Loads, in_turn
 from etid.estimators.maximum_likelihood import driver as calibrations
 from etid.estimators.maximum_likelihood.load import SLIGHT, Load, refined
@@ -31,7 +33,7 @@ from etid.solvers.levenberg_marquardt import (
 )
 
 NEAR = 0.05  # distance of all parameters together from their minimum [standard errors]
-ROUNDS = 2  # fits at knots, each around the minimum of the last one
+WITHIN = 0.2  # of this distance, for the fit that leads there
 
 
 def _equations(_, y: Float[Array, " parameter"], study: DriverStudy) -> ArrowheadEquations:
@@ -42,7 +44,7 @@ def _equations(_, y: Float[Array, " parameter"], study: DriverStudy) -> Arrowhea
         driver = study.model.around(common, loads.frequency[0])
 
         def one(load: Loads, own: LoadUnknowns) -> NormalEquations:
-            lane = study.lane(common, driver, load)
+            lane = study.lane(driver, load)
             q = own.vector()
             alone = lane.equations(jnp.concatenate([q, driver.mean]))
             prior = 1 / lane.gain.widths(q)
@@ -88,13 +90,13 @@ def _second_order(
         driver = study.model.around(common, frequency)
         ends = []
         for h in (DIFFERENCE, -DIFFERENCE):
-            there = common + h * towards
-            ends.append((h, there, study.model.around(there, frequency, slopes=False)))
+            end = study.model.around(common + h * towards, frequency, slopes=False)
+            ends.append((h, end))
 
         def one(load: Loads, own: LoadUnknowns, step: LoadUnknowns) -> Float[Array, " q"]:
-            lane = study.lane(common, driver, load)
+            lane = study.lane(driver, load)
             at, way = own.vector(), step.vector()
-            bent = sum(study.lane(c, end, load).residual(at + h * way) for h, c, end in ends)
+            bent = sum(study.lane(end, load).residual(at + h * way) for h, end in ends)
             middle, pullback = jax.vjp(lane.residual, jnp.concatenate([at, driver.mean]))
             (found,) = pullback((bent - 2 * middle) / DIFFERENCE**2)
             return jnp.where(load.used, found, 0.0)
@@ -131,25 +133,29 @@ def fit_together(
     # The sum of squares grows with the number of loads; a detectable change of it does not.
     terms = sum(2 * loads.spectrum.x.size for loads in groups)
     count = sum(loads.sample_rate.shape[0] for loads in groups)
+    near = NEAR / math.sqrt(terms)
+    ftol = SOLVER.ftol / (1 + count)
+    inner = LevenbergMarquardt(rtol=WITHIN * near, ftol=WITHIN**2 * ftol, geodesic=True)
+    # With plain instead of bent last steps, 4 of 40 studies whose trials share an unloaded record
+    # did not converge.
     solver = LevenbergMarquardt(
-        rtol=NEAR / math.sqrt(terms),
-        ftol=SOLVER.ftol / (1 + count),
+        rtol=near,
+        ftol=ftol,
+        damping=SLIGHT,
         geodesic=True,
         descent=EliminationDescent(),
         equations=_equations,
         second_order=_second_order,
         empty=_empty,
     )
-    # At the knots a step takes a tenth of the time. The knots around the first minimum are so close
-    # to the last one that all harmonics then need few steps. With plain instead of bent steps, 4 of
-    # 40 studies whose trials share an unloaded record did not converge.
-
-    def near(y: Float[Array, " parameter"], _: None) -> tuple[Float[Array, " parameter"], None]:
-        return _solved(solver, study.at_knots(y), y).value, None
-
-    start, _ = jax.lax.scan(near, study.start(), length=ROUNDS)
-    slight = dataclasses.replace(solver, damping=SLIGHT)
-    solution = _solved(slight, study, start)
+    solution = optx.least_squares(
+        lambda y, _: y,  # not evaluated: the solver takes the equations
+        solver,
+        approached(study, study.start(), inner),
+        study,
+        max_steps=MAX_STEPS,
+        throw=False,
+    )
     common, parts = study.split(solution.value)
     # The loads that take no part are fitted now, with the final Z_th.
     refitted = [
@@ -160,25 +166,12 @@ def fit_together(
     return common, cov, found
 
 
-def _solved(
-    solver: LevenbergMarquardt, study: DriverStudy, start: Float[Array, " parameter"]
-) -> optx.Solution:
-    return optx.least_squares(
-        lambda y, _: y,  # not evaluated: the solver takes the equations
-        solver,
-        start,
-        study,
-        max_steps=MAX_STEPS,
-        throw=False,
-    )
-
-
 def _refit(
     study: DriverStudy, load: Loads, common: Float[Array, " common"], own: LoadUnknowns
 ) -> tuple[LoadUnknowns, optx.RESULTS]:
     """Unknowns of a load at its minimum with this Z_th, and the result of the solver."""
     driver = study.model.around(common, load.spectrum.frequency, slopes=False)
-    solution = refined(study.whole(driver, load), own.vector())
+    solution = refined(study.lane(driver, load), own.vector())
     return LoadUnknowns.of(solution.value), solution.result
 
 

@@ -4,7 +4,6 @@ All loads share Z_th and the delays of the calibrations, `common`. The elements 
 load, `own`, appear only in the terms of this load.
 """
 
-import dataclasses
 import itertools
 from collections.abc import Callable
 from typing import Any
@@ -17,16 +16,13 @@ from jaxtyping import Array, Bool, Float, Int
 from etid.circuits.circuit import AbstractCircuit
 from etid.estimators.element_prior import ElementPrior
 from etid.estimators.maximum_likelihood.driver import Calibrations
-from etid.estimators.maximum_likelihood.gain import Gain
-from etid.estimators.maximum_likelihood.given_driver import GivenDriver, around, combined
-from etid.estimators.maximum_likelihood.load import Around, AtKnots, Load, Sums
+from etid.estimators.maximum_likelihood.given_driver import GivenDriver, around
+from etid.estimators.maximum_likelihood.load import Load
 from etid.estimators.unknowns import LoadUnknowns
 from etid.signals.harmonics import Spectrum
-from etid.signals.knots import knots
 from etid.solvers.arrowhead import join, split
 
 SIDE_BY_SIDE = 8  # loads in one vectorised step
-DENSE = 32  # density of the knots: the floor of the driver's valley is flat
 
 
 class Joint(eqx.Module):
@@ -66,7 +62,6 @@ class Loads(eqx.Module):
         used: Whether the recording takes part. The others are fitted, but do not affect Z_th.
         unloaded: Index of the unloaded record among those that several loads share; −1 if no other
             load has it.
-        sums: The recordings at the knots; None for all harmonics.
     """
 
     spectrum: Spectrum
@@ -74,13 +69,11 @@ class Loads(eqx.Module):
     own: LoadUnknowns
     used: Bool[Array, "*load"]
     unloaded: Int[Array, "*load"]
-    sums: Sums | None = None
 
     @property
-    def frequency(self) -> Float[Array, "*load frequency"]:
-        """Frequencies of the terms [Hz]."""
-        every = self.spectrum.frequency
-        return every if self.sums is None else knots(every.shape[-1], DENSE).at(every)
+    def frequency(self) -> Float[Array, "*load harmonic"]:
+        """Harmonics [Hz]."""
+        return self.spectrum.frequency
 
 
 class DriverStudy(eqx.Module):
@@ -89,49 +82,15 @@ class DriverStudy(eqx.Module):
     Attributes:
         model: Calibrations and structure of the loads.
         groups: The loads, one group for each length.
-        centre: The common parameters around which the loads are at the knots; None for all
-            harmonics.
     """
 
     model: Joint
     groups: list[Loads]
-    centre: Float[Array, " common"] | None = None
 
-    def lane(
-        self, common: Float[Array, " common"], driver: GivenDriver, load: Loads
-    ) -> Load | AtKnots:
-        """One load behind this driver, which has these parameters."""
-        if load.sums is None or self.centre is None:
-            return self.whole(driver, load)
-        model = self.model
-        gain = Gain(driver, model.circuit, load.frequency, load.sample_rate, model.prior)
-        sums = load.sums
-        if sums.by_z is not None:
-            moved = combined(common - self.centre, sums.by_z)
-            sums = dataclasses.replace(sums, shift=moved)
-        return AtKnots(gain, sums)
-
-    def whole(self, driver: GivenDriver, load: Loads) -> Load:
-        """One load behind this driver, with all harmonics."""
+    def lane(self, driver: GivenDriver, load: Loads) -> Load:
+        """One load behind this driver."""
         model = self.model
         return Load.behind(driver, model.circuit, load.spectrum, load.sample_rate, model.prior)
-
-    def at_knots(self, y: Float[Array, " parameter"]) -> "DriverStudy":
-        """The study with all loads at the knots, around `y`."""
-        common, parts = self.split(y)
-
-        def of_group(loads: Loads, owns: LoadUnknowns) -> Loads:
-            driver = self.model.around(common, loads.frequency[0])
-
-            def one(load: Loads, own: LoadUnknowns) -> Sums:
-                q = jnp.concatenate([own.vector(), driver.mean])
-                every = knots(load.spectrum.x.size, DENSE)
-                return Around.of(self.whole(driver, load), q, every=every).at.sums
-
-            return dataclasses.replace(loads, sums=in_turn(one, loads, owns))
-
-        groups = [of_group(*group) for group in zip(self.groups, parts, strict=True)]
-        return DriverStudy(self.model, groups, common)
 
     def start(self) -> Float[Array, " parameter"]:
         """The start: the driver of the calibrations, and each load identified alone."""

@@ -200,6 +200,16 @@ class Calibrations(eqx.Module):
         weak = [self._prior()(of.source), of.delay_samples / self.delay_width]
         return jnp.concatenate(parts + weak)
 
+    def weak(
+        self, common: Float[Array, " common"]
+    ) -> tuple[Float[Array, " term"], Float[Array, "common term"]]:
+        """The terms of the weak priors and their derivatives."""
+        of = self.named(common)
+        late = jnp.eye(of.delay_samples.size) / self.delay_width
+        terms = [self._prior()(of.source), of.delay_samples / self.delay_width]
+        rows = jax.scipy.linalg.block_diag(self._prior().slopes(of.source), late)
+        return jnp.concatenate(terms), rows
+
     def _prior(self) -> Prior:
         return prior(self.source, self.rate, self.calibration.r_load.mean())
 
@@ -251,10 +261,8 @@ class Calibrations(eqx.Module):
         terms, by_gain, by_z = apart(of_gains, common)
         by_common = apart(lambda c: self.gain_slopes(c, gains, by_z), common)
         rows = chained(by_common, by_gain)
-        of, late = self.named(common), jnp.eye(len(gains)) / self.delay_width
-        weak = jax.scipy.linalg.block_diag(self._prior().slopes(of.source), late)
-        priors = [self._prior()(of.source), of.delay_samples / self.delay_width]
-        return jnp.concatenate([terms, *priors]), jnp.concatenate([rows, weak], axis=1)
+        weak, by_common = self.weak(common)
+        return jnp.concatenate([terms, weak]), jnp.concatenate([rows, by_common], axis=1)
 
     def by_gains(
         self, common: Float[Array, " common"], slopes: Sequence[Complex[Array, "row harmonic"]]
