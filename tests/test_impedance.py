@@ -136,5 +136,8 @@ def test_a_fit_to_an_impedance_is_drawn_with_its_points():
         )
         labels = [text.get_text() for text in magnitude.get_legend().get_texts()]
         assert labels == ["fit", "measured"]  # no standard errors are known
+    assert "chi2" not in str(fit)  # there is none
+    with pytest.raises(ValueError, match="a measured impedance has no draws and no profiles"):
+        fit.posterior()
     with pytest.raises(ValueError, match="no residual in time"):
         fit.plot(show="residual")

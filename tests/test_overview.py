@@ -114,10 +114,10 @@ SHOWN = {
     "driver": (driver, ["Driver of order 3: successful", "|Z_th| at 1 kHz", "±", "kΩ"]),
     "study fits": (
         lambda: etid.StudyFits(fits(), {("a/b", "c"): driver()}, {("d",): "no signal"}),
-        ["3 fits of SkinRC", "1 drivers, 1 failed", "a/b, c 3 successful", "d: no signal"],
+        ["3 fits of SkinRC", "1 driver, 1 failed", "a/b, c 3 successful", "d: no signal"],
     ),
     "recording": (lambda: study()["s01/dry"], ["s01/dry", "200000 Hz", "<b>"]),
-    "study": (study, ["1 calibrations, 1 loaded"]),
+    "study": (study, ["1 calibration, 1 loaded"]),
     "selection": (lambda: Selection.of({0: fit()}, 0, [DRY]), ["1 candidates: successful"]),
     "candidate": (
         lambda: Selection.of({0: fit()}, 0, [DRY]).candidates[0],

@@ -214,7 +214,7 @@ def test_a_study_is_an_ordered_mapping_of_paths():
     assert "/s02/damp/" in study()
     assert "s02" not in study()
     assert study()["/s02/damp"].electrode == "E17"
-    assert repr(study()) == "<Study: 1 calibrations, 3 loaded>"
+    assert repr(study()) == "<Study: 1 calibration, 3 loaded>"
 
 
 def test_where_selects_by_labels_and_keeps_the_order():

@@ -319,6 +319,8 @@ def given(
     """
     require("fit", fit, Fit)
     recording, driver = fit.made_from(recording, driver)
+    if recording is None and fit.measured is not None:
+        raise ValueError("a fit to a measured impedance has no draws and no profiles")
     if recording is None:
         raise ValueError(
             "this fit does not know its recording and its driver; pass both, as in "

@@ -10,6 +10,7 @@ from typing import Any, Unpack
 import numpy as np
 import numpy.typing as npt
 
+from etid.circuits.display import several
 from etid.circuits.overview import ROWS, Overview, Overviewed
 from etid.recordings.fields import LABELS, Given, Label, Metadata, wanted_labels
 from etid.recordings.recording import AbstractSource, Layout, Recording, RecordingError, Samples
@@ -295,9 +296,8 @@ class Study(Overviewed, Mapping[str, Recording]):
         place = f" {self.file!r}" if self.file else ""
         bad = f", {len(self.problems)} that cannot be read" if self.problems else ""
         calibrations = sum(s.metadata.kind == "calibration" for s in self._sources.values())
-        return (
-            f"<Study{place}: {calibrations} calibrations, {len(self) - calibrations} loaded{bad}>"
-        )
+        known, loaded = several(calibrations, "calibration"), len(self) - calibrations
+        return f"<Study{place}: {known}, {loaded} loaded{bad}>"
 
 
 def _trials(

@@ -256,7 +256,9 @@ class Fit(Judged, WithData[Circuit]):
             batch = f"{kind} fits, batch of {np.shape(self.rrse)}: {counted(verdict)}"
             return Overview(batch, rows)
         title = f"{kind}: {verdict} in {several(int(self.steps), 'step')} ({self.method})"
-        title += f", RRSE {100 * float(self.rrse):.3g} %, chi2 {float(self.chi2):.3g}"
+        title += f", RRSE {100 * float(self.rrse):.3g} %"
+        if self.measured is None or self.measured.stderr is not None:
+            title += f", chi2 {float(self.chi2):.3g}"  # without standard errors there is none
         notes = [message(verdict)] if verdict != "successful" else []
         notes += [self.changes] if verdict == "changed" else []
         return Overview(title, rows, notes=[*notes, *texts(int(self.remarks))])

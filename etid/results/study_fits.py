@@ -21,6 +21,7 @@ import numpy as np
 from jaxtyping import Array
 
 from etid.circuits.circuit import AbstractCircuit
+from etid.circuits.display import several
 from etid.circuits.overview import ROWS, Overview, Overviewed
 from etid.recordings.recording import RecordingError
 from etid.recordings.remarks import remarks_of, words
@@ -82,7 +83,7 @@ class StudyFits(Overviewed):
         ]
         failures = itertools.islice(self.failures.items(), ROWS)
         drivers = Overview(
-            f"{len(self.drivers)} drivers, {len(self.failures)} failed",
+            f"{several(len(self.drivers), 'driver')}, {len(self.failures)} failed",
             rows,
             ("calibrations", "order", "verdict", "chi2"),
             [f"{', '.join(paths)}: {text}" for paths, text in failures],
