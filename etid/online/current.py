@@ -27,7 +27,6 @@ from jaxtyping import Array, Complex, Float
 from etid.circuits.circuit import AbstractCircuit
 from etid.estimators.maximum_likelihood.given_driver import GivenDriver
 from etid.online.gain_bands import Bands
-from etid.signals.harmonics import real_parts
 from etid.signals.transfer import as_complex, reciprocal
 
 EDGE = 24  # [samples] after each edge that are looked at in steps of `FINE`
@@ -59,8 +58,8 @@ class CurrentModel(eqx.Module):
         source: Z_th in each band [Ω].
         by_source: ∂ log Z_th / ∂z for the directions z of the calibrations' errors.
         source_cov: Covariance of z.
-        sums: Weights of the real and imaginary parts of the admittance: row 0 for the charge [C Ω],
-            the others for the current at `times` [A Ω].
+        sums: Weights w of the admittance in Re Σ w Y: row 0 for the charge [C Ω], the others for
+            the current at `times` [A Ω].
         times: Times of the other rows after the start of the window [s].
         phase: Duration of a phase, t₁ − t₀ [s].
     """
@@ -69,7 +68,7 @@ class CurrentModel(eqx.Module):
     source: Complex[Array, " band"]
     by_source: Complex[Array, "z band"]
     source_cov: Float[Array, "z z"]
-    sums: Float[Array, "row part"]
+    sums: Complex[Array, "row band"]
     times: Float[Array, " time"]
     phase: float = eqx.field(static=True)
 
@@ -94,15 +93,13 @@ class CurrentModel(eqx.Module):
         rows = np.concatenate([integral[None, :], np.exp(1j * np.outer(times, omega))])
         rows = 2 / bands.samples * rows * x
         by_band = rows @ _interpolation(number, np.asarray(bands.frequency) * bands.samples / rate)
-        # Re Σ w Y = Σ Re w Re Y − Im w Im Y.
-        sums = np.concatenate([by_band.real, -by_band.imag], axis=1)
         loaded = source + as_complex(known.resistance)
         return cls(
             frequency=bands.frequency,
             source=source,
             by_source=known.slope * (loaded * reciprocal(source))[None, :],
             source_cov=known.cov,
-            sums=jnp.asarray(sums),
+            sums=jnp.asarray(by_band),
             times=jnp.asarray(times / rate),
             phase=float((end - begin) / rate),
         )
@@ -110,11 +107,11 @@ class CurrentModel(eqx.Module):
     def waveform(self, circuit: AbstractCircuit) -> Float[Array, " time"]:
         """Current through a load at `times`, per unit of relative amplitude [A]."""
         admittance = reciprocal(circuit.response(self.frequency) + self.source)
-        return self.sums[1:] @ real_parts(admittance)
+        return _real(self.sums[1:], admittance)
 
     def short_circuit(self) -> Float[Array, " time"]:
         """Current through a short circuit at `times`, per unit of relative amplitude [A]."""
-        return self.sums[1:] @ real_parts(reciprocal(self.source))
+        return _real(self.sums[1:], reciprocal(self.source))
 
     def current(
         self,
@@ -134,27 +131,23 @@ class CurrentModel(eqx.Module):
             return circuit.with_log_values(logs).response(self.frequency)
 
         admittance = reciprocal(load(logs) + self.source)
-        found = self.sums @ real_parts(admittance)
+        found = _real(self.sums, admittance)
         at = 1 + jnp.argmax(jnp.abs(found[1:]))
         rows = jnp.stack([self.sums[0], self.sums[at]])
         by_element = jax.vmap(lambda v: jax.jvp(load, (logs,), (v,))[1])(jnp.eye(logs.size))
         # The rows times Y, not the derivatives: `by_source` is the same matrix at all electrodes.
-        rows = _times(rows, admittance)
-        shared = rows @ real_parts(self.by_source).T
-        own = _times(rows, admittance) @ real_parts(by_element).T
+        rows = rows * admittance[None, :]
+        shared = _real(rows, self.by_source.T)
+        own = _real(rows * admittance[None, :], by_element.T)
         variance = jnp.sum((own @ cov) * own, axis=1)
         variance = variance + jnp.sum((shared @ self.source_cov) * shared, axis=1)
         charge_stderr, peak_stderr = jnp.sqrt(variance)
         return Current(found[0], charge_stderr, jnp.abs(found[at]), peak_stderr)
 
 
-def _times(
-    rows: Float[Array, "row part"], factor: Complex[Array, " band"]
-) -> Float[Array, "row part"]:
-    """Weights of Re Σ w · factor · value, from those of Re Σ w · value."""
-    real, imaginary = jnp.split(rows, 2, axis=1)  # Re w and −Im w
-    a, b = factor.real[None, :], factor.imag[None, :]
-    return jnp.concatenate([real * a + imaginary * b, imaginary * a - real * b], axis=1)
+def _real(weights: Complex[Array, "row band"], values: Complex[Array, "..."]) -> Array:
+    """Re(weights @ values), at half the cost of a complex product."""
+    return weights.real @ values.real - weights.imag @ values.imag
 
 
 def _phase(v: Float[np.ndarray, " sample"]) -> tuple[float, float]:

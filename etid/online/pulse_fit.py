@@ -225,6 +225,13 @@ def searched(
     return jax.lax.while_loop(going, stepped, first).own
 
 
+def _products(
+    a: Complex[Array, "row band"], b: Complex[Array, "column band"]
+) -> Float[Array, "row column"]:
+    """Scalar products of rows: the real part of a bᴴ."""
+    return a.real @ b.real.T + a.imag @ b.imag.T
+
+
 class Pulse(eqx.Module):
     """The objective for one electrode at one pulse.
 
@@ -242,8 +249,15 @@ class Pulse(eqx.Module):
     centre: Float[Array, " element"]
     information: Float[Array, "element element"]
 
-    def terms(self, q: Float[Array, " own"]) -> Float[Array, "own1 part"]:
-        """Derivatives of the residual and, as the last row, the residual [standard deviations]."""
+    def rows(
+        self, q: Float[Array, " own"]
+    ) -> tuple[Complex[Array, "element band"], Complex[Array, "2 band"]]:
+        """Residual and its derivatives [standard deviations].
+
+        Returns:
+            Derivatives with respect to the elements; the derivative with respect to the delay, and
+            the residual.
+        """
         of, own = self.model, LoadUnknowns.of(q)
         weight = as_complex(jnp.sqrt(self.weight))
         model, slope = of.gain(own.log_elements)
@@ -251,13 +265,16 @@ class Pulse(eqx.Module):
         # otherwise the noise of Ĝ would count as information.
         by_delay = model * jax.lax.complex(jnp.zeros_like(of.turn), of.turn)
         residual = self.gain * of.turned(own.delay_samples) - model
-        rows = jnp.concatenate([-slope, by_delay[None, :], residual[None, :]]) * weight[None, :]
-        return jnp.concatenate([rows.real, rows.imag], axis=1)
+        return -slope * weight[None, :], jnp.stack([by_delay, residual]) * weight[None, :]
 
     def equations(self, q: Float[Array, " own"]) -> Equations:
         """Normal equations of the pulse and of the prior."""
-        terms = self.terms(q)
-        products = terms @ terms.T
+        # Blocks, because XLA would evaluate the model again for every row of one matrix.
+        by_element, others = self.rows(q)
+        mixed = _products(by_element, others)
+        upper = jnp.concatenate([_products(by_element, by_element), mixed], axis=1)
+        lower = jnp.concatenate([mixed.T, _products(others, others)], axis=1)
+        products = jnp.concatenate([upper, lower])
         own = LoadUnknowns.of(q)
         off = LoadUnknowns(own.log_elements - self.centre, own.delay_samples)
         pull = LoadUnknowns(

@@ -72,7 +72,8 @@ def fit_of(
     nothing = jnp.zeros((elements, elements))
     weight = bands.weight / state.variance
     pulse = Pulse(model, jnp.zeros_like(gain), weight, logs, nothing)
-    jacobian = pulse.terms(state.own)[:-1]
+    by_element, others = pulse.rows(state.own)
+    jacobian = real_parts(jnp.concatenate([by_element, others[:1]]))
     by_term = inverse(jacobian @ jacobian.T)[:elements] @ jacobian
     # Z_th + R = e^W, so that ∂G/∂W = −Z_L (Z_th + R) / (Z_L + Z_th)².
     z = model.circuit.with_log_values(logs).response(bands.frequency)
