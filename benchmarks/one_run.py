@@ -62,8 +62,13 @@ def fit(job: dict[str, Any]) -> dict[str, Any]:
         call = lambda: streaming.fit_file(  # noqa: E731 - used once, below
             job["file"], job["target"], resume=job["resume"], **arguments
         )
+        before = time.process_time()
         outcome, seconds = _timed(call)
-    return {"start": start, "seconds": seconds, "verdicts": outcome.fits.counts()}
+        cpu = time.process_time() - before
+    # Of workers, which have ended here, it contains their start.
+    workers = resource.getrusage(resource.RUSAGE_CHILDREN)
+    cpu += workers.ru_utime + workers.ru_stime
+    return {"start": start, "seconds": seconds, "cpu": cpu, "verdicts": outcome.fits.counts()}
 
 
 def _log_parts(log: str) -> None:

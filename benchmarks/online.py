@@ -12,11 +12,13 @@ import importlib.util
 import time
 
 import numpy as np
+from jaxtyping import Float
 from tqdm import tqdm
 
 import etid
 from benchmarks.online_rival import Rival
-from benchmarks.speed import pin
+from benchmarks.timing import pin
+from etid.online.state import TrackerState
 from etid.simulation.published import REFERENCE, TYPICAL
 from etid.simulation.scenes import Scene, Trial
 from etid.simulation.transformer import ResistorLoad
@@ -40,19 +42,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def main(arguments: argparse.Namespace) -> bool:
     """Print the times; whether the target is met."""
     pin()
-    tracker, pulses = _problem(arguments.electrodes, arguments.lifted)
-    controller = etid.Controller.of(tracker)
-    state, seconds = tracker.start(), []
-    gc.collect()
-    gc.freeze()  # the garbage collector does not search again what exists now
-    for number in tqdm(range(WARM + arguments.ticks)):
-        v_out = pulses[number % len(pulses)]
-        begin = time.perf_counter(), time.process_time()
-        state = tracker.update(state, v_out)
-        controller.command(state, charge=CHARGE)
-        seconds.append((time.perf_counter() - begin[0], time.process_time() - begin[1]))
+    tracker, pulses = problem(arguments.electrodes, arguments.lifted)
     period = tracker.period / tracker.model.bands.sample_rate
-    ratios, busy = np.array(seconds[WARM:]).T / period
+    state, ratios, busy = timed(tracker, pulses, arguments.ticks)
     print(f"{arguments.electrodes} electrodes, {len(ratios)} ticks: {tracker.read(state).counts()}")
     # The processor's own time is less where other programs take turns on that core.
     print(f"{'':<8}{'ms':>8}{'of the period':>16}{'processor':>12}   target")
@@ -73,6 +65,24 @@ def main(arguments: argparse.Namespace) -> bool:
     return met and factor >= FASTER
 
 
+def timed(
+    tracker: etid.Tracker, pulses: np.ndarray, ticks: int
+) -> tuple[TrackerState, Float[np.ndarray, " tick"], Float[np.ndarray, " tick"]]:
+    """The last state, and the wall time and processor time of each tick, in pulse periods."""
+    controller = etid.Controller.of(tracker)
+    state, seconds = tracker.start(), []
+    gc.collect()
+    gc.freeze()  # the garbage collector does not search again what exists now
+    for number in tqdm(range(WARM + ticks)):
+        v_out = pulses[number % len(pulses)]
+        begin = time.perf_counter(), time.process_time()
+        state = tracker.update(state, v_out)
+        controller.command(state, charge=CHARGE)
+        seconds.append((time.perf_counter() - begin[0], time.process_time() - begin[1]))
+    wall, busy = np.array(seconds[WARM:]).T * tracker.model.bands.sample_rate / tracker.period
+    return state, wall, busy
+
+
 def _rival(tracker: etid.Tracker, pulses: np.ndarray, logs: np.ndarray) -> float:
     """Median processor time of filterpy for one pulse, the bands apart [s].
 
@@ -91,7 +101,7 @@ def _rival(tracker: etid.Tracker, pulses: np.ndarray, logs: np.ndarray) -> float
     return float(np.median(seconds))
 
 
-def _problem(electrodes: int, lifted: int) -> tuple[etid.Tracker, np.ndarray]:
+def problem(electrodes: int, lifted: int) -> tuple[etid.Tracker, np.ndarray]:
     """A tracker, and pulses for it (pulse, electrode, sample)."""
     trials = tuple(Trial(f"loaded/{i}", LOADS[i % len(LOADS)]) for i in range(electrodes))
     resistors = (REFERENCE, 21.62e3)

@@ -1,7 +1,8 @@
 """A file of 10^5 recordings: how long reading and fitting take, in how much memory, and `kill -9`.
 
 Every measurement runs in a process of its own. The file lies in the page cache, which flatters
-reading; reading alone is h5py, recording after recording. Compilation is in no time but `start`.
+reading; reading alone is h5py, recording after recording. Compilation is in no time but `start`
+and the CPU time of workers, which tells of other work on the machine.
 """
 
 import argparse
@@ -107,6 +108,7 @@ def _row(plan: Plan, name: str, layout: str, workers: int, found: dict[str, Any]
         "workers": workers,
         "recordings": plan.recordings,
         "seconds": found["seconds"],
+        "cpu_seconds": found.get("cpu", 0.0),
         "us_per_recording": 1e6 * found["seconds"] / plan.recordings,
         "start_seconds": found.get("start", 0.0),
         "memory_mb": found["memory"] / 1e6,
@@ -201,7 +203,7 @@ def _bits(column: np.ndarray) -> Any:
 def run(plan: Plan, output: pathlib.Path | None) -> bool:
     """Print the table, write it as CSV; whether every target is met."""
     print(f"{plan.recordings} recordings in {plan.folder}, parts of {plan.part}")
-    heads = ("us each", "of reading", "start s", "MB", "MB/worker", "successful")
+    heads = ("CPU s", "us each", "of reading", "start s", "MB", "MB/worker", "successful")
     print(f"{'':<30}{'layout':<12}{'workers':>7}{'s':>9}" + "".join(f"{h:>11}" for h in heads))
     table: list[dict[str, Any]] = []
     for row in rows(plan):
@@ -210,7 +212,7 @@ def run(plan: Plan, output: pathlib.Path | None) -> bool:
         row["of_reading"] = row["seconds"] / alone["seconds"]
         print(
             f"{row['what']:<30}{row['layout']:<12}{row['workers']:>7}{row['seconds']:9.2f}"
-            f"{row['us_per_recording']:11.1f}{row['of_reading']:11.1f}{row['start_seconds']:11.1f}"
+            f"{row['cpu_seconds']:11.1f}{row['us_per_recording']:11.1f}{row['of_reading']:11.1f}{row['start_seconds']:11.1f}"
             f"{row['memory_mb']:11.0f}{row['worker_memory_mb']:11.0f}{row['successful']:11}",
             flush=True,
         )

@@ -19,8 +19,8 @@ from benchmarks.estimators import DEFAULT, OURS, Drivers, Result, Score, draw, o
 from benchmarks.ladder import SOURCES, ladder
 from benchmarks.mappings import make_room
 from benchmarks.provenance import RESULTS, write_csv
-from benchmarks.speed import pin
 from benchmarks.speed_accuracy_chart import chart
+from benchmarks.timing import pin
 from etid.circuits.circuit import SkinRC
 
 FILE = "speed_accuracy.csv"

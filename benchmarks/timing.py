@@ -2,6 +2,7 @@
 
 import argparse
 import functools
+import os
 import subprocess
 import sys
 import time
@@ -15,6 +16,12 @@ import etid
 from etid.estimators.registry import names
 
 REPEATS = 7
+
+
+def pin() -> None:
+    """One core for this process, before JAX counts them."""
+    if hasattr(os, "sched_setaffinity"):
+        os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
 
 
 def import_time(module: str) -> float:

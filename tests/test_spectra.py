@@ -133,11 +133,19 @@ import os, time
 os.sched_setaffinity(0, range(os.cpu_count()))  # a test may have been given one core
 import numpy as np
 from etid.signals.harmonics import harmonics
+from etid.signals.noise import noise_std
+from etid.signals.quick_looks import flickering
 v = np.random.default_rng(0).normal(size=10_000)
-harmonics(v, 3, v.size)
-everyone, own = time.process_time(), time.thread_time()
-for _ in range(200):
+long = np.random.default_rng(0).normal(size=(16, 2, 33_330))
+def call():
     harmonics(v, 3, v.size)
+    noise_std(v)
+    noise_std(long)
+    flickering(long, np.ones((16, 2)), 9, 30_000)
+call()
+everyone, own = time.process_time(), time.thread_time()
+for _ in range(40):
+    call()
 own = time.thread_time() - own
 print((time.process_time() - everyone - own) / own)
 """
@@ -145,7 +153,7 @@ print((time.process_time() - everyone - own) / own)
 
 @pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="needs the cores of Linux")
 @pytest.mark.skipif(os.cpu_count() == 1, reason="one core has one thread")
-def test_harmonics_start_no_threads():
+def test_what_each_record_needs_starts_no_threads():
     run = subprocess.run([sys.executable, "-c", BUSY], capture_output=True, text=True, check=True)
     # Time of other threads over that of this one. Those of BLAS wait actively: one took 0.5 to 3.
     assert float(run.stdout) < 0.05

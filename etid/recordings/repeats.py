@@ -28,7 +28,6 @@ from jaxtyping import Complex, Float, Int
 
 from etid.recordings.preflight import Inspected
 from etid.signals.harmonics import fast_length
-from etid.signals.noise import RIPPLE
 from etid.signals.pulse_train import RATE
 
 BAND = 0.4  # largest frequency relative to the sample rate
@@ -90,6 +89,7 @@ class Bands(NamedTuple):
         middle: Centre of each band [radian per sample].
         polynomials: Transforms of polynomials at the harmonics. As real vectors of real and
             imaginary parts they are orthonormal.
+        constant: Transform of a period of ones at the harmonics.
     """
 
     length: int
@@ -98,6 +98,7 @@ class Bands(NamedTuple):
     number: np.ndarray
     middle: np.ndarray
     polynomials: np.ndarray
+    constant: np.ndarray
 
 
 @functools.lru_cache(maxsize=16)
@@ -121,7 +122,9 @@ def bands(sample_rate: float, pulse_rate: float, band: float) -> Bands:
     ]
     joined = np.linalg.qr(np.concatenate([transforms.real, transforms.imag]))[0].T
     polynomials = joined[:, :count] + 1j * joined[:, count:]
-    return Bands(length, size, edges, number, middle, polynomials.astype(np.complex64, order="C"))
+    constant = transforms[:, 0].astype(np.complex64)  # the polynomial of degree 0
+    polynomials = polynomials.astype(np.complex64, order="C")
+    return Bands(length, size, edges, number, middle, polynomials, constant)
 
 
 def repeats(seen: Sequence[Inspected]) -> list[Repeats | None]:
@@ -175,11 +178,11 @@ def _of_equal_periods(
     of, (periods, _) = group[0].recording, group[0].periods
     at = np.stack([one.begins for one in group])
     known = bands(of.sample_rate, of.pulse_rate, BAND)
-    sigma = np.array([one.sigma_out for one in group])
+    sigma = np.array([one.trusted_out for one in group])
     # Without this shift, a late record would be cut within its pulses.
     loaded = [_turned(v, one) for one, (_, v) in zip(group, records, strict=True)]
     own = _deviations(loaded, at, known, sigma)
-    sigma = np.array([one.sigma_th for one in group])
+    sigma = np.array([one.trusted_th for one in group])
     low = bands(of.sample_rate, of.pulse_rate, UNLOADED)
     unloaded = _deviations([v_th for v_th, _ in records], at, low, sigma)
     weight, smooth = 1 / unloaded.variance, _smooth(unloaded.mean, low)
@@ -192,7 +195,8 @@ def _of_equal_periods(
     rest = unloaded.gain - amplitude[:, :, None] * unit[:, None, :]
     freedom = (2 * low.middle.size - 1) * (periods - 1)
     noise = np.maximum(1.0, (weight[:, None, :] * _power(rest)).sum((1, 2)) / freedom)
-    width = [_phase(v) / periods for v, _ in records]
+    pulses = zip(group, records, strict=True)
+    width = [_phase(v, *one.limits[0]) / periods for one, (v, _) in pulses]
     turn = np.exp(-2j * np.pi * own.late)
     turn -= turn.mean(1, keepdims=True)
     size = np.linalg.norm(turn, axis=1, keepdims=True)
@@ -203,9 +207,14 @@ def _of_equal_periods(
     return [Repeats(frequency, rate, *of_row) for of_row in zip(*parts, strict=True)]
 
 
-def _phase(v: Float[np.ndarray, " time"]) -> int:
-    """Number of samples in all pulses; of biphasic pulses, those in the shorter phase."""
-    low, high = v.min(), v.max()
+def _phase(v: Float[np.ndarray, " time"], low: float, high: float) -> int:
+    """Number of samples in all pulses; of biphasic pulses, those in the shorter phase.
+
+    Args:
+        v: Unloaded voltage [V].
+        low: Its smallest sample.
+        high: Its largest sample.
+    """
     half = max(-low, high) / 2
     above = int(np.count_nonzero(v > half)) if high > half else 0
     below = int(np.count_nonzero(v < -half)) if low < -half else 0
@@ -244,10 +253,8 @@ def _deviations(
     last = np.array([v.size - known.length for v in records])
     starts = np.minimum(np.rint(at), last[:, None]).astype(int)
     late = starts - at
-    first = zip(records, starts[:, 0], strict=True)
-    spans = [np.ptp(v[start : start + known.length]) for v, start in first]
-    sigma = np.maximum(sigma, RIPPLE * np.array(spans))
-    power, mean, weight, gain = _compared(records, starts, late, known)
+    raw = _transforms(records, starts, known)
+    power, mean, weight, gain = _compared(raw, late, known)
     for _ in range(PASSES):
         # Least-squares estimate of a delay, η = jωτ; it is approximate if the gain changes too.
         of_delay = known.middle * weight
@@ -258,10 +265,9 @@ def _deviations(
         if not moved.any():
             break
         late = late + np.where(moved[:, None], more, 0.0)
-        rows = np.flatnonzero(moved).tolist()
-        again = _compared([records[row] for row in rows], starts[rows], late[rows], known)
+        again = _compared(raw[moved], late[moved], known)
         for whole, part in zip((power, mean, weight, gain), again, strict=True):
-            whole[rows] = part
+            whole[moved] = part
     # The part that no change of the gain explains is noise.
     rest = np.add.reduceat(power, known.edges, axis=1) - weight * _power(gain).sum(1)
     freedom = 2 * (known.number - 1) * (periods - 1)
@@ -294,26 +300,31 @@ def _power(values: np.ndarray) -> np.ndarray:
     return np.real(values) ** 2 + np.imag(values) ** 2
 
 
-def _compared(
-    records: Sequence[Float[np.ndarray, "_"]],
-    starts: Int[np.ndarray, "lane period"],
-    late: Float[np.ndarray, "lane period"],
-    known: Bands,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Power of the deviations, mean, its power, and `gain`, for periods with these delays."""
+def _transforms(
+    records: Sequence[Float[np.ndarray, "_"]], starts: Int[np.ndarray, "lane period"], known: Bands
+) -> np.ndarray:
+    """Harmonics of each period, without the mean of the record."""
     cut = np.zeros((*starts.shape, known.size), np.float32)
     used = cut[..., : known.length]  # the zeros after it make the transform fast
-    for v, own, places in zip(records, used, starts, strict=True):
+    for v, own, places in zip(records, used, starts.tolist(), strict=True):
         for period, start in zip(own, places, strict=True):
             period[:] = v[start : start + known.length]
-    used -= used.mean((1, 2), keepdims=True)
-    count = int(known.number.sum())
     # In single precision, this is four times as fast as the transform of NumPy.
-    aligned = np.asarray(scipy.fft.rfft(cut))[:, :, 1 : count + 1]
+    transform = np.asarray(scipy.fft.rfft(cut))
+    mean = np.real(transform[:, :, 0]).mean(1) / known.length
+    raw = transform[:, :, 1 : len(known.constant) + 1]
+    raw -= mean[:, None, None] * known.constant
+    return raw
+
+
+def _compared(
+    raw: np.ndarray, late: Float[np.ndarray, "lane period"], known: Bands
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Power of the deviations, mean, its power, and `gain`, for periods with these delays."""
     # Most recordings of a batch are cut alike.
     alike = late[:1] if (late == late[0]).all() else late
-    deviation = aligned * _turns(alike * (2 * np.pi / known.size), count)
-    mean = np.einsum("lpk->lk", deviation) / starts.shape[1]  # faster than `mean`
+    deviation = raw * _turns(alike * (2 * np.pi / known.size), raw.shape[2])
+    mean = np.einsum("lpk->lk", deviation) / raw.shape[1]  # faster than `mean`
     deviation -= mean[:, None, :]
     deviation = _without(deviation, known.polynomials)
     weight = np.maximum(np.add.reduceat(_power(mean), known.edges, axis=1).astype(float), TINY)
