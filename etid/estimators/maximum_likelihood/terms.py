@@ -221,9 +221,11 @@ def apart(evaluate: Callable[[Array], Any], q: Float[Array, " q"]) -> Any:
     XLA repeats a computation in every loop that reads its result, here a dozen times. It computes
     the result of a branch only once.
     """
-    shapes = jax.eval_shape(evaluate, q)
+    # JAX remembers the trace of this function, so that branches within branches are traced once.
+    once = jax.jit(lambda q: evaluate(q))
+    shapes = jax.eval_shape(once, q)
 
     def nothing(_) -> Any:
         return jax.tree.map(lambda of: jnp.full(of.shape, jnp.nan, of.dtype), shapes)
 
-    return jax.lax.cond(jnp.isfinite(q).all(), lambda q: evaluate(q), nothing, q)
+    return jax.lax.cond(jnp.isfinite(q).all(), once, nothing, q)
