@@ -90,6 +90,10 @@ def test_a_prior_is_one_more_measurement(skin):
     told = etid.identify_skin(skin, prior={"r_s": (r_s + 2 * error, error)})
     assert abs(told.circuit.r_s - (r_s + error)) < 0.05 * error  # linear to 2 % of an error
     np.testing.assert_allclose(told.stderr.r_s, error / np.sqrt(2), rtol=0.02)
+    # One standard error from the record, and one from the prior.
+    assert told.support is not None
+    assert free.support is not None
+    assert told.support.deviance - free.support.deviance == pytest.approx(2.0, abs=0.1)
 
 
 @pytest.mark.parametrize(

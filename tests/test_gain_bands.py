@@ -108,6 +108,20 @@ def test_a_band_is_described_by_the_sums_over_its_bins():
     np.testing.assert_allclose(of.x, whole, atol=6 * np.sqrt(variance))
 
 
+def test_edges_are_what_stands_out_of_the_noise_of_the_mean_period():
+    sigma = 25.0
+    noise = sigma * np.random.default_rng(2).standard_normal(3 * SIZE)
+    v_th = np.tile(window(), 3) + noise
+    _, projection = unloaded_bands(v_th, sigma, RATE, float(SIZE))
+    mean = v_th.reshape(3, SIZE).mean(0)
+    found = {
+        of: tuple(gain_bands._partition(mean, of, projection.block)[0])
+        for of in (sigma / np.sqrt(3), sigma * np.sqrt(3))
+    }
+    assert projection.pieces == found[sigma / np.sqrt(3)]
+    assert projection.pieces != found[sigma * np.sqrt(3)]
+
+
 def test_a_bent_and_delayed_gain_departs_from_its_value_at_the_centre(exact):
     """½ s² (G″ − 2jτ G′ − τ² G) is exact in the coefficients for a parabola."""
     of, _ = exact

@@ -161,16 +161,21 @@ def test_a_batch_of_both_kinds_is_mixed_and_each_is_right(study, driver):
     assert fits.counts() == {"successful": 2}
 
 
-def test_one_unloaded_record_for_calibration_and_trial_tells_of_its_voltage_twice():
+def test_one_unloaded_record_for_calibration_and_trial_tells_of_its_voltage_twice(study, driver):
     """As much as the bound of such a scene says, a fifth more of R_p than with two."""
     trials, known = (Trial("a", DRY),), (Trial("c", ResistorLoad(98.8e3)),)
     scene = Scene(trials, known, samples=SAMPLES, snr_db=60.0, shared_v_th=True)
-    study = scene.simulate(seed=2)
-    fits = etid.identify_skins([study["a"]], etid.identify_driver(study["c"]))
+    both = scene.simulate(seed=2)
+    fits = etid.identify_skins([both["a"]], etid.identify_driver(both["c"]))
     bound = etid.bound(scene)["a"]
     found = fits[0].stderr.r_p / bound.stderr["r_p"]
     np.testing.assert_allclose(found, 1.0, atol=0.1)  # without it 1.2
     assert (np.abs(error(fits)) < SIGMAS * np.asarray(fits.stderr.values())).all()
+    # Only the noise of V_out is the trial's own: half of it or more, as V_out is smaller.
+    apart = etid.identify_skins([study["loaded/0"]], driver)
+    own = [np.diagonal(of.cov[0] - of.fit.shared_cov[0]) for of in (fits, apart)]
+    assert (own[0] > 0.45 * own[1]).all()
+    assert (own[0] < 0.85 * own[1]).all()
 
 
 def test_a_driver_that_is_followed_too_far_is_no_success():

@@ -16,7 +16,7 @@ from etid.circuits.overview import ROWS, Overview
 from etid.online.state import ElectrodeState, TrackerState
 from etid.results.driver import Calibration, ContinuousDriver, SourceImpedance
 from etid.results.fits import Support, described
-from etid.results.verdicts import verdict, verdicts_of
+from etid.results.verdicts import message, verdict, verdicts_of
 from etid.selection.selection import Selection
 from etid.simulation.bound import Bound
 
@@ -206,3 +206,10 @@ def test_a_change_of_verdict_changes_what_is_shown():
 )
 def test_the_prefix_of_a_unit_fits_the_value(value, error, unit, text):
     assert quantity(value, unit, error) == text
+
+
+def test_a_driver_says_what_went_wrong_and_nothing_of_a_success():
+    good = driver()
+    assert message("successful") not in str(good)
+    text = " ".join(str(dataclasses.replace(good, result=verdict("unstable"))).split())
+    assert " ".join(message("unstable").split()) in text
