@@ -5,7 +5,8 @@ term, a negated condition, swapped arguments, a deleted statement. Annotations, 
 `assert`s for the type checker and decorators are left alone: what they change no test should see.
 Nor is anything done that changes nothing by construction. The arguments of a function that does not
 know their order are not swapped. `zip(..., strict=True)` stays, as only a bug would notice it.
-Three times a tiny constant is as tiny, so it becomes 1.
+Three times a tiny constant is as tiny, so it becomes 1. `os.sched_setaffinity` is left alone, too:
+a mutant of it could act on other processes of this machine.
 """
 
 import ast
@@ -128,6 +129,8 @@ def _is_silent(node: ast.AST) -> bool:
         case ast.Assert() | ast.Raise() | ast.Import() | ast.ImportFrom() | ast.JoinedStr():
             return True
         case ast.keyword(arg="strict"):
+            return True
+        case ast.Call(func=ast.Attribute(attr="sched_setaffinity")):
             return True
         case _:
             return False

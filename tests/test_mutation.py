@@ -54,6 +54,8 @@ def test_a_text_of_several_bytes_a_letter_is_cut_where_it_should():
 def test_what_changes_nothing_by_construction_is_no_mutant():
     source = "n = math.gcd(a, b)\nk = np.maximum(a, b)\npairs = zip(a, a, strict=True)\n"
     assert mutants("small.py", source) == []
+    [alone] = mutants("small.py", "os.sched_setaffinity(0, cores)\n")  # acts on processes
+    assert alone.kind == "statement deleted"
     [tiny] = mutants("small.py", "guard = 1e-300\n")
     assert tiny.after == "(1.0)"
 

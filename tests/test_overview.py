@@ -208,8 +208,6 @@ def test_the_prefix_of_a_unit_fits_the_value(value, error, unit, text):
     assert quantity(value, unit, error) == text
 
 
-def test_a_driver_says_what_went_wrong_and_nothing_of_a_success():
-    good = driver()
-    assert message("successful") not in str(good)
-    text = " ".join(str(dataclasses.replace(good, result=verdict("unstable"))).split())
+def test_a_driver_says_what_went_wrong():
+    text = " ".join(str(dataclasses.replace(driver(), result=verdict("unstable"))).split())
     assert " ".join(message("unstable").split()) in text
