@@ -1,5 +1,7 @@
 """Standard errors of loads that share an unloaded record: effects are added, then squared."""
 
+import types
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -48,3 +50,24 @@ def test_the_sum_over_a_shared_record_adds_what_its_loads_have_in_common(monkeyp
     np.testing.assert_allclose(added, expected, atol=1e-12)
     _, none = errors._sums(*arguments, 0)
     np.testing.assert_array_equal(none, np.zeros((COMMON, COMMON)))
+
+
+def test_the_misfit_of_a_load_knows_its_own_unknowns(monkeypatch):
+    """χ² is Σ r² over two numbers for each harmonic that is used, less the unknowns."""
+    part = jnp.array([3.0, 1.0, 0.0, 2.0, 0.0, 1.0])
+    line, wave = jnp.ones(3), jnp.ones(3, complex)
+    used = jnp.array([True, True, False])
+    own = LoadUnknowns(jnp.zeros(2), jnp.zeros(()))
+    load = Loads(
+        spectrum=Spectrum(line, wave, 2.0 * wave, line, line, used),
+        sample_rate=jnp.asarray(1.0),
+        own=own,
+        used=jnp.asarray(True),
+        unloaded=jnp.asarray(-1),
+    )
+    seen = types.SimpleNamespace(part=part, gain=1.5 * wave)
+    monkeypatch.setattr(errors, "_seen", lambda *_: seen)
+    monkeypatch.setattr(DriverStudy, "owned", property(lambda _: 3))
+    chi2, rrse = errors._misfit(object.__new__(DriverStudy), load, jnp.zeros(COMMON), own)
+    assert float(chi2) == 15.0 / (2 * 2 - 3)
+    np.testing.assert_allclose(rrse, 0.5 / 2.0)

@@ -4,6 +4,7 @@ import concurrent.futures
 import contextlib
 import os
 import pathlib
+import queue
 import signal
 import subprocess
 import sys
@@ -223,3 +224,13 @@ def _arm(marker: pathlib.Path) -> None:
         return real(*arguments)
 
     streaming.identify_part = deadly
+
+
+def test_a_worker_binds_itself_to_its_core_and_leaves_ctrl_c_to_its_parent(monkeypatch):
+    cores, bound, handlers = queue.SimpleQueue(), [], []
+    cores.put(3)
+    monkeypatch.setattr(os, "sched_setaffinity", lambda *asked: bound.append(asked), raising=False)
+    monkeypatch.setattr(signal, "signal", lambda *asked: handlers.append(asked))
+    streaming._pin(cores)
+    assert bound == [(0, {3})]  # 0 is the process itself
+    assert handlers == [(signal.SIGINT, signal.SIG_DFL)]
