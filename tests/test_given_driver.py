@@ -101,7 +101,7 @@ def test_what_drifts_after_the_calibration_is_one_more_z_for_each_parameter(driv
     std, old = np.asarray(later.drift_std()), before.mean.size
     np.testing.assert_allclose(known.mean, [*before.mean, *(0 * std)], atol=1e-9)
     expected = scipy.linalg.block_diag(before.cov, np.eye(std.size))
-    np.testing.assert_allclose(known.cov, expected, atol=1e-9)
+    np.testing.assert_allclose(known.cov, np.asarray(expected), atol=1e-9)
     parameters, unflatten = ravel_pytree(later.source)
     slope = jax.jacfwd(lambda p: unflatten(p).response(frequency))(parameters)
     loaded = np.asarray(later.response(frequency)) + R_LOAD

@@ -1,6 +1,6 @@
 """Standard errors of loads that share an unloaded record: effects are added, then squared."""
 
-import types
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -65,9 +65,9 @@ def test_the_misfit_of_a_load_knows_its_own_unknowns(monkeypatch):
         used=jnp.asarray(True),
         unloaded=jnp.asarray(-1),
     )
-    seen = types.SimpleNamespace(part=part, gain=1.5 * wave)
-    monkeypatch.setattr(errors, "_seen", lambda *_: seen)
+    unread: Any = None
+    seen = errors._Seen(1.5 * wave, load.spectrum, part, unread, unread)
     monkeypatch.setattr(DriverStudy, "owned", property(lambda _: 3))
-    chi2, rrse = errors._misfit(object.__new__(DriverStudy), load, jnp.zeros(COMMON), own)
+    chi2, rrse = errors._misfit(object.__new__(DriverStudy), load, seen)
     assert float(chi2) == 15.0 / (2 * 2 - 3)
     np.testing.assert_allclose(rrse, 0.5 / 2.0)
