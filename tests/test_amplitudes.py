@@ -228,3 +228,27 @@ def test_a_linear_fit_of_skin_that_falls_with_its_current_says_so():
     fit = etid.identify_skin(recording(0.2e-3, 7), throw=False)
     assert fit.verdict == "misfit"
     assert "identify_amplitudes" in str(fit)
+
+
+@pytest.mark.slow
+def test_rounding_of_unknown_steps_is_a_misfit_however_small_it_is():
+    """It was successful: the rounding is less than a thousandth of the signal, and χ² is 40."""
+    t = np.arange(10_000) / SAMPLE_RATE
+    of = []
+    for amplitude in (0.1e-3, 0.3e-3, 1e-3):
+        rng = np.random.default_rng([1, round(1e6 * amplitude)])
+        current, v_out = amplitude * pulses(t), stepped(amplitude, t)
+        current = current + 1e-4 * np.std(current) * rng.standard_normal(t.size)
+        v_out = v_out + 1e-4 * rng.standard_normal(t.size)
+        one = etid.Recording(
+            v_out=np.round(v_out / 0.01) * 0.01,
+            current=current,
+            sample_rate=SAMPLE_RATE,
+            pulse_rate=PULSE_RATE,
+            adc_range=(-400.0, 400.0),
+        )
+        of.append(one)
+    fit = etid.identify_amplitudes(of, throw=False)
+    assert fit.chi2 > 4
+    assert fit.rrse < 1e-3
+    assert fit.verdict == "misfit"
