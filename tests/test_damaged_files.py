@@ -320,8 +320,8 @@ def test_samples_whose_squares_are_zero_give_no_warning():
 
 
 def test_a_record_that_is_shorter_than_an_edge_is_too_short():
-    """Its sample rate is wrong by a factor of a million."""
-    recording = rung("dry", samples=3_334).simulate(0)[TRIAL].replace(sample_rate=2e11)
+    """Its sample rate is wrong by a factor of ten thousand."""
+    recording = rung("dry", samples=3_334).simulate(0)[TRIAL].replace(sample_rate=2e9)
     assert preflight(Inspected(recording)) == "too_short"
 
 
