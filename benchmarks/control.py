@@ -28,7 +28,7 @@ import etid
 from benchmarks import ngspice
 from benchmarks.charts import COLOURS, new_figure, save
 from benchmarks.control_plant import OPEN, Plant, Response
-from benchmarks.provenance import ROOT
+from benchmarks.provenance import RESULTS
 from etid.simulation.published import REFERENCE, TYPICAL
 from etid.simulation.scenes import Scene, Trial
 from etid.simulation.transformer import ResistorLoad, SkinLoad
@@ -61,7 +61,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--electrodes", type=int, default=98)
     parser.add_argument("--pulses", type=int, default=120)
     parser.add_argument("--snr", type=float, nargs="+", default=[60.0, 40.0], help="dB")
-    parser.add_argument("-o", "--output", type=pathlib.Path, default=ROOT / "results/control.svg")
+    parser.add_argument("-o", "--output", type=pathlib.Path, default=RESULTS / "control.svg")
 
 
 def main(arguments: argparse.Namespace) -> bool:

@@ -270,7 +270,9 @@ def test_the_error_of_the_driver_is_what_another_z_th_makes_of_the_elements():
     assert (np.diagonal(shared(jnp.zeros_like(known.cov)), axis1=1, axis2=2) > 0).all()  # of X
 
 
-SAME = 0.2  # standard errors: both weigh the noise of V_th, but not in the same way
+# Standard errors. Both weigh the noise of V_th, but not in the same way. Bands and blocks leave out
+# about 1 % of the information, so that the estimates differ by 0.1; four times this.
+SAME = 0.4
 
 
 @pytest.mark.slow
