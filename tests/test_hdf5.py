@@ -534,7 +534,7 @@ def fields(draw, path):
             for name in ("v_th", "v_out", *draw(st.sampled_from([(), ("current",)])))
         },
         "sample_rate": draw(st.floats(1e3, 1e7)),
-        "pulse_rate": draw(st.floats(1e-3, 400)),
+        "pulse_rate": draw(st.floats(0.1, 400)),  # a period no longer than a record may be
         "r_load": draw(st.floats(1e-3, 1e9)) if calibration else None,
         "subject": draw(text),
         "condition": draw(text),

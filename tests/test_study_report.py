@@ -8,6 +8,7 @@ import pathlib
 import re
 import shutil
 import warnings
+from typing import cast
 
 import h5py
 import jax.numpy as jnp
@@ -319,7 +320,7 @@ def test_an_endless_label_is_drawn_without_a_warning():
 def test_a_file_with_an_element_of_zero_is_refused(tmp_path):
     fits_of(np.ones(3), ["successful"] * 3).write(tmp_path / "fits.h5")
     with h5py.File(tmp_path / "fits.h5", "r+") as file:
-        file["r_s"][1] = 0.0
+        cast(h5py.Dataset, file["r_s"])[1] = 0.0
     with pytest.raises(etid.RecordingError, match=r"fits.h5, r_s: 0 is no value of an element"):
         etid.Fits.read(tmp_path / "fits.h5")
 

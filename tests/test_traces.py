@@ -253,6 +253,9 @@ def test_a_folder_that_cannot_be_written_does_no_harm(folder):
     folder.parent.mkdir()
 
 
+# JAX writes its own compiled programs in place: another thread may find half of one. It says so,
+# and compiles.
+@pytest.mark.filterwarnings("ignore:Error reading persistent compilation cache entry")
 def test_many_may_write_at_once(folder):
     failures = []
 
