@@ -60,7 +60,7 @@ from etid.results.study_fits import StudyFits
 from etid.results.verdicts import RESULTS
 from etid.selection.selection import Candidate, Selection
 from etid.simulation import scenes
-from etid.simulation.bound import Bound, bound
+from etid.simulation.bound import Bound, Bounds, bound
 
 if TYPE_CHECKING:
     from etid.files.exporting import export_circuit, export_fits, export_study
@@ -89,6 +89,7 @@ __all__ = [
     "AbstractCircuit",
     "AbstractEstimator",
     "Bound",
+    "Bounds",
     "Candidate",
     "Controller",
     "Driver",

@@ -61,6 +61,16 @@ def test_an_element_that_is_not_determined_is_named():
     assert "do not determine" not in str(etid.bound(etid.scenes.paper_dry())["typical/dry/01"])
 
 
+def test_the_bounds_of_a_scene_are_a_table():
+    loads = (Trial("a/dry", SkinLoad(33.4e3, 186e3, 0.12e-9)), Trial("b", ResistorLoad(55.2e3)))
+    bounds = etid.bound(Scene(loads, KNOWN))
+    _, skin, resistor = str(bounds).splitlines()
+    of = f"± {100 * bounds['a/dry'].relative['r_s']:.2g} %"
+    assert skin.split()[:7] == ["a/dry", "SkinRC", "r_s", "33.4", "kΩ", *of.split()[:2]]
+    assert resistor.split()[:5] == ["b", "Resistor", "r", "55.2", "kΩ"]
+    assert "<td" in (bounds._repr_html_() or "")
+
+
 def test_a_resistor_has_a_bound_too_in_ohm():
     scene = Scene((Trial("a", ResistorLoad(55.2e3)),), KNOWN)
     bound = etid.bound(scene)["a"]

@@ -64,9 +64,12 @@ class Bound(Overviewed):
         """Elements whose bound exceeds their value."""
         return tuple(name for name, error in self.relative.items() if not error < 1)
 
-    def _overview(self) -> Overview:
+    def _rows(self) -> list[tuple[str, ...]]:
         elements = element_rows(self.circuit.units(), np.asarray(self.circuit.values()))
-        rows = [(*row, f"± {100 * self.relative[row[0]]:.2g} %") for row in elements]
+        return [(*row, f"± {100 * self.relative[row[0]]:.2g} %") for row in elements]
+
+    def _overview(self) -> Overview:
+        rows = self._rows()
         notes = []
         if self.undetermined:
             notes.append(
@@ -77,7 +80,22 @@ class Bound(Overviewed):
         return Overview(title, rows, notes=notes)
 
 
-def bound(scene: Scene, *, delays: bool = True, known_driver: bool = False) -> dict[str, Bound]:
+class Bounds(Overviewed, dict[str, Bound]):
+    """The bound of each trial of a scene, by path."""
+
+    def _overview(self) -> Overview:
+        elements = [
+            [" ".join(" ".join(row).split()) for row in one._rows()] for one in self.values()
+        ]
+        most = max(map(len, elements))
+        rows = [
+            (path, type(one.circuit).__name__, *texts, *[""] * (most - len(texts)))
+            for (path, one), texts in zip(self.items(), elements, strict=True)
+        ]
+        return Overview("Smallest standard errors of each trial:", rows)
+
+
+def bound(scene: Scene, *, delays: bool = True, known_driver: bool = False) -> Bounds:
     """Predict the smallest standard errors of each trial of a scene before it is recorded.
 
     The bound of a trial uses this trial and all calibrations of the scene, but no other trial. If
@@ -115,7 +133,7 @@ def bound(scene: Scene, *, delays: bool = True, known_driver: bool = False) -> d
     x = waveform.v_th[inside] * math.sqrt(scene.samples) / waveform.sigma
     known = [] if known_driver else [_circuit(trial) for trial in scene.calibration]
     found: dict[tuple, Float[np.ndarray, "n n"]] = {}  # trials with the same load share a bound
-    bounds = {}
+    bounds = Bounds()
     for trial in scene.trials:
         circuit = _circuit(trial)
         key = (type(circuit), *np.asarray(circuit.values()))
