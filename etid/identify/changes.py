@@ -151,19 +151,20 @@ def _changes(of: Repeats, slopes: np.ndarray, allowed: np.ndarray) -> Change:
     share = np.where(share > ALIGNED, share, 0.0)[:, :, None, None]
     normal = low[:, None] + share * (whole - low)[:, None]
     tested = elements + 1  # and the amplitude; not the delays
-    theta, cov, square, explained = _solved(normal, right, tested)
+    fitted = _solved(normal, right, tested)
     # Coloured noise differs from period to period too, but not as an element does. The residual of
     # the parameters gives its size.
     freedom = 2 * of.frequency.shape[1] - right.shape[-1]
-    noise = np.maximum(1.0, (total - explained) / freedom)
+    noise = np.maximum(1.0, (total - fitted.explained) / freedom)
     # Half of the false alarms are allowed to elements that change alone: a test of four elements
     # together would hide such a change.
-    alone = (_alone(normal, right, tested) / noise[..., None]).max((1, 2))
-    seen = (square / noise).max(1) > threshold(tested, 2 * len(course))
+    alone = (fitted.alone / noise[..., None]).max((1, 2))
+    seen = (fitted.square / noise).max(1) > threshold(tested, 2 * len(course))
     seen |= alone > threshold(1, 2 * len(course) * tested)
-    cov = cov * noise[..., None, None]
+    cov = np.broadcast_to(fitted.cov, (*noise.shape, tested, tested)) * noise[..., None, None]
     # Without aliases the courses do not mix: the course that fits best is the most likely one.
-    best = np.where(seen, np.argmax(_solved(whole[:, None], plain, tested)[2], axis=1), 0)
+    likely = np.argmax(_solved(whole[:, None], plain, tested).square, axis=1)
+    best = np.where(seen, likely, 0)
     lane, reach = np.arange(len(best)), np.ptp(course, axis=1)[best][:, None]
     # How far the elements move if they are fitted without the amplitude.
     others = np.arange(normal.shape[-1]) != elements
@@ -177,7 +178,7 @@ def _changes(of: Repeats, slopes: np.ndarray, allowed: np.ndarray) -> Change:
     matters = seen & (moved > allowed).any(1)
     matters |= (uneven > UNEQUAL) & (other > allowed).any(1)
     units = unit[:, :tested]
-    log = theta[lane, best] / units * reach
+    log = fitted.theta[lane, best] / units * reach
     factor = np.exp(np.clip(log, -LARGEST, LARGEST))
     error = np.sqrt(np.diagonal(cov[lane, best], axis1=1, axis2=2)) / units * reach
     return Change(factor - 1, factor * error, matters)
@@ -218,32 +219,38 @@ def _equations(
     return low, whole, deviation @ weighted, real_parts(plain) @ weighted, unit, total
 
 
-def _solved(
-    normal: np.ndarray, right: np.ndarray, tested: int
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """The first parameters, their covariance and their χ², for each recording and course.
+class _Fitted(NamedTuple):
+    """Least squares of each recording and course.
 
-    The last value is the reduction of Σ η² / variance by all parameters.
+    Attributes:
+        theta: The first parameters.
+        cov: Their covariance.
+        square: Their χ².
+        alone: χ² of each of them if it changes alone; the other parameters, the delays, are fitted
+            with it.
+        explained: Reduction of Σ η² / variance by all parameters.
     """
-    cov = np.linalg.inv(normal + RIDGE * np.eye(right.shape[-1]))
-    theta = cov @ right[..., None]
-    explained = (theta[..., 0] * right).sum(-1)
-    theta, cov = theta[..., :tested, :], cov[..., :tested, :tested]
-    square = (theta * np.linalg.solve(cov, theta)).sum((-1, -2))
-    cov = np.broadcast_to(cov, (*theta.shape[:-1], tested))
-    return theta[..., 0], cov, square, explained
+
+    theta: np.ndarray
+    cov: np.ndarray
+    square: np.ndarray
+    alone: np.ndarray
+    explained: np.ndarray
 
 
-def _alone(normal: np.ndarray, right: np.ndarray, tested: int) -> np.ndarray:
-    """χ² of each of the first parameters if it changes alone, for each recording and course.
-
-    The other parameters, the delays, are fitted with it.
-    """
-    cross, others = normal[..., :tested, tested:], normal[..., tested:, tested:]
-    solved = cross @ np.linalg.inv(others + RIDGE * np.eye(others.shape[-1]))
-    score = right[..., :tested] - (solved * right[..., None, tested:]).sum(-1)
-    own = np.diagonal(normal, axis1=-2, axis2=-1)[..., :tested] - (solved * cross).sum(-1)
-    return score**2 / np.maximum(own, RIDGE)
+def _solved(normal: np.ndarray, right: np.ndarray, tested: int) -> _Fitted:
+    """Solve normal equations; the parameters after the first `tested` ones are eliminated."""
+    normal = normal + RIDGE * np.eye(right.shape[-1])
+    cross, others = normal[..., :tested, tested:], np.linalg.inv(normal[..., tested:, tested:])
+    removed, of_others = cross @ others, right[..., None, tested:]
+    own = normal[..., :tested, :tested] - removed @ cross.swapaxes(-1, -2)
+    score = right[..., :tested] - (removed * of_others).sum(-1)
+    cov = np.linalg.inv(own)
+    theta = (cov * score[..., None, :]).sum(-1)
+    square = (theta * score).sum(-1)
+    alone = score**2 / np.maximum(np.diagonal(own, axis1=-2, axis2=-1), RIDGE)
+    explained = square + ((of_others @ others)[..., 0, :] * of_others[..., 0, :]).sum(-1)
+    return _Fitted(theta, cov, square, alone, explained)
 
 
 def _uneven(of: Repeats, course: Float[np.ndarray, "course period"]) -> np.ndarray:

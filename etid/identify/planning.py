@@ -12,7 +12,7 @@ from etid.results.feed import AbstractFeed
 from etid.results.fits import IdentificationError
 from etid.results.verdicts import message
 
-TOGETHER = 300_000  # samples that are inspected together; more do not fit the processor's cache
+TOGETHER = 600_000  # samples that are inspected together; their arrays take tens of MB
 ERRORS = (RecordingError, ValueError, IdentificationError)  # that a recording or a driver may raise
 
 

@@ -89,7 +89,6 @@ class Bands(NamedTuple):
         middle: Centre of each band [radian per sample].
         polynomials: Transforms of polynomials at the harmonics. As real vectors of real and
             imaginary parts they are orthonormal.
-        constant: Transform of a period of ones at the harmonics.
     """
 
     length: int
@@ -98,7 +97,6 @@ class Bands(NamedTuple):
     number: np.ndarray
     middle: np.ndarray
     polynomials: np.ndarray
-    constant: np.ndarray
 
 
 @functools.lru_cache(maxsize=16)
@@ -122,9 +120,8 @@ def bands(sample_rate: float, pulse_rate: float, band: float) -> Bands:
     ]
     joined = np.linalg.qr(np.concatenate([transforms.real, transforms.imag]))[0].T
     polynomials = joined[:, :count] + 1j * joined[:, count:]
-    constant = transforms[:, 0].astype(np.complex64)  # the polynomial of degree 0
     polynomials = polynomials.astype(np.complex64, order="C")
-    return Bands(length, size, edges, number, middle, polynomials, constant)
+    return Bands(length, size, edges, number, middle, polynomials)
 
 
 def repeats(seen: Sequence[Inspected]) -> list[Repeats | None]:
@@ -309,12 +306,10 @@ def _transforms(
     for v, own, places in zip(records, used, starts.tolist(), strict=True):
         for period, start in zip(own, places, strict=True):
             period[:] = v[start : start + known.length]
+    used -= used.mean((1, 2), keepdims=True)
     # In single precision, this is four times as fast as the transform of NumPy.
     transform = np.asarray(scipy.fft.rfft(cut))
-    mean = np.real(transform[:, :, 0]).mean(1) / known.length
-    raw = transform[:, :, 1 : len(known.constant) + 1]
-    raw -= mean[:, None, None] * known.constant
-    return raw
+    return transform[:, :, 1 : known.polynomials.shape[1] + 1]
 
 
 def _compared(

@@ -192,6 +192,7 @@ def own_part(verdict: str, note: str) -> str:
     return " ".join((note.replace(common, " ") if common else note).split())
 
 
+@functools.cache
 def message(name: str) -> str:
     """Meaning and remedy of a verdict; empty for `successful`."""
     return _MESSAGES.get(name, RESULTS[RESULTS._name_to_item[name]])

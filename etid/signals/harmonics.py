@@ -80,17 +80,17 @@ def harmonics(
     # Only bins that are multiples of `parts` are needed. They are the bins of the sum of so many
     # equal parts of the record, which is shorter.
     parts = math.gcd(periods, samples)
-    folded = v[..., :samples].reshape(*v.shape[:-1], parts, -1).sum(-2)
-    of = namespace(v)
+    of, v = namespace(v), v[..., :samples]
+    folded = v.reshape(*v.shape[:-1], parts, -1).sum(-2) / samples
     # SciPy transforms several records side by side; one transform takes as long as with NumPy.
     transform = np.asarray(scipy.fft.rfft(folded)) if of is np else jnp.fft.rfft(folded)
     basis, fit = _drift(periods, samples)
     # The transform is linear: the drift needs only the transforms of the powers of time.
-    drift = of.einsum("dp,...p->...d", fit, _sums(v[..., :samples], periods))
+    drift = of.einsum("dp,...p->...d", fit, _sums(v, periods))
     step = periods // parts
-    at_harmonics = transform[..., step : (folded.shape[-1] + 1) // 2 : step] / samples
+    at_harmonics = transform[..., step : (folded.shape[-1] + 1) // 2 : step]
     # `@` would start BLAS threads for each recording, and these threads wait for each other.
-    return at_harmonics - of.einsum("...d,dh->...h", drift.astype(at_harmonics.dtype), basis)
+    return at_harmonics - of.einsum("...d,dh->...h", drift.astype(basis.dtype), basis)
 
 
 def namespace(v: Array | np.ndarray) -> ModuleType:

@@ -345,8 +345,7 @@ def corner(
     bins, white = _bins(periods, samples)
     late = int(np.argmax(np.abs(v[: samples // periods])))
     means = v[: samples // periods * periods].reshape(periods, -1).mean(1)
-    drift = np.polyval(_polynomial(periods) @ means, np.arange(samples) / samples)
-    transform = np.asarray(scipy.fft.rfft(v - drift))[bins]
+    transform = np.asarray(scipy.fft.rfft(v))[bins] - _drifts(periods, samples) @ means
     found = transform * (bins**2 * np.exp(2j * np.pi * bins * late / samples))
     bend = found[:-2] - 2 * found[1:-1] + found[2:]
     ratio = (np.square(np.real(bend)) + np.square(np.imag(bend))) / (white * samples * sigma**2)
@@ -356,11 +355,13 @@ def corner(
     return float(CORNERS[best, 0, 0]) if gained[best] > SURE else 0.0
 
 
-@functools.lru_cache(maxsize=64)
-def _polynomial(periods: int) -> Float[np.ndarray, "degree period"]:
-    """Matrix from the means of periods to the polynomial of the drift, for `numpy.polyval`."""
-    middle = (np.arange(periods) + 0.5) / periods
-    return np.linalg.pinv(np.vander(middle, min(periods, DRIFT_DEGREE + 1)))
+@functools.lru_cache(maxsize=8)
+def _drifts(periods: int, samples: int) -> Complex[np.ndarray, "harmonic between period"]:
+    """Transforms, at `_bins`, of the drift that follows from each mean of a period."""
+    degrees = min(periods, DRIFT_DEGREE + 1)
+    fit = np.linalg.pinv(np.vander((np.arange(periods) + 0.5) / periods, degrees))
+    powers = np.fft.rfft(np.vander(np.arange(samples) / samples, degrees), axis=0)
+    return powers[_bins(periods, samples)[0]] @ fit
 
 
 @functools.lru_cache(maxsize=8)
