@@ -4,6 +4,7 @@ import dataclasses
 import pathlib
 import sys
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -13,9 +14,12 @@ import etid
 from etid.circuits.circuit import SkinRC
 from etid.circuits.elements import resistor
 from etid.estimators import registry
+from etid.estimators.lanes import Harmonics
 from etid.estimators.maximum_likelihood import terms as likelihood
+from etid.estimators.maximum_likelihood.load import Load
+from etid.estimators.registry import MAXIMUM_LIKELIHOOD
 from etid.identify import arguments, batches, one
-from etid.identify.one import known_at, skin_lane
+from etid.identify.one import known_at, known_of, skin_lane
 from etid.recordings.preflight import Inspected
 from etid.simulation.scenes import Scene, Trial
 from etid.simulation.transformer import ResistorLoad, SkinLoad
@@ -176,6 +180,27 @@ def test_one_unloaded_record_for_calibration_and_trial_tells_of_its_voltage_twic
     own = [np.diagonal(of.cov[0] - of.fit.shared_cov[0]) for of in (fits, apart)]
     assert (own[0] > 0.45 * own[1]).all()
     assert (own[0] < 0.85 * own[1]).all()
+
+
+@pytest.mark.parametrize("shared", [False, True])
+def test_the_gradient_of_a_load_is_that_of_its_sum_of_squares(study, driver, shared):
+    """Far from the minimum, where every part of it counts: elements, delay, z, and X by z."""
+    lane = Harmonics.of(Inspected(study["loaded/0"]))
+    known = known_of(lane, driver, shared, MAXIMUM_LIKELIHOOD)
+    start = jnp.log(jnp.array([30e3, 150e3, 0.2e-9]))
+    z = known.mean + 0.1 * jnp.arange(1.0 * known.mean.size)
+    q = jnp.concatenate([start, jnp.array([0.3]), z])
+
+    @jax.jit
+    def both(q, lane):
+        of = Load.behind(known, SkinRC(), lane.spectrum, lane.sample_rate)
+        by_jax = jax.value_and_grad(lambda q: 0.5 * jnp.sum(of.residual(q) ** 2))(q)
+        found = of.equations(q)
+        return by_jax, (found.objective, found.gradient)
+
+    expected, found = both(q, jax.tree.map(jnp.asarray, lane))
+    np.testing.assert_allclose(found[0], expected[0], rtol=1e-10)
+    np.testing.assert_allclose(found[1], expected[1], rtol=1e-8)  # sums of 3456 terms
 
 
 def test_a_driver_that_is_followed_too_far_is_no_success():

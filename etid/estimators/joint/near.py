@@ -28,19 +28,17 @@ from etid.estimators.estimate import MAX_STEPS
 from etid.estimators.joint.terms import DriverStudy, Loads, in_turn
 from etid.estimators.maximum_likelihood.driver import Calibrations
 from etid.estimators.maximum_likelihood.given_driver import GivenDriver
-from etid.estimators.maximum_likelihood.load import Around, Load
+from etid.estimators.maximum_likelihood.load import Around
 from etid.estimators.maximum_likelihood.terms import (
     apart,
     by_gains,
     denoised,
     residual,
     residuals,
-    variance,
 )
 from etid.estimators.unknowns import LoadUnknowns
-from etid.signals.harmonics import Spectrum
 from etid.signals.knots import Knots, knots
-from etid.signals.transfer import as_complex, power, reciprocal
+from etid.signals.transfer import as_complex, reciprocal
 from etid.solvers.arrowhead import join
 from etid.solvers.levenberg_marquardt import DIFFERENCE, LevenbergMarquardt, NormalEquations
 from etid.solvers.matrices import inverse_root
@@ -212,20 +210,6 @@ def _by_signals(driver: GivenDriver, shared: bool) -> GivenDriver:
     )
 
 
-def _by_unloaded(
-    lane: Load, at: tuple[Complex[Array, " harmonic"], Spectrum]
-) -> Float[Array, "signal harmonic"]:
-    """Derivatives of ½ r² at each harmonic with respect to the signals that X depends on."""
-    (g, known), slopes = at, lane.unloaded
-    if slopes is None:
-        return jnp.zeros((W, g.size))
-    weight = jnp.where(known.selected, 1 / variance(known, g), 0.0)
-    error = known.y - g * known.x
-    by_x = as_complex(2 * weight) * jnp.conj(error) * g
-    by_log = weight**2 * power(error) * power(g) * known.variance_x
-    return -(by_x[None, :] * slopes.x).real - by_log[None, :] * slopes.log_variance
-
-
 def _of_group(
     study: DriverStudy, common: Float[Array, " common"], loads: Loads, owns: LoadUnknowns
 ) -> tuple[_Part, Float[Array, "load own own"]]:
@@ -246,7 +230,7 @@ def _of_group(
         by_own, by_signal = jacobian[:o], jacobian[o:]
         pull = jnp.einsum("sck,ck->sk", by_signal, part)
         if lane.unloaded is not None:  # X is not smooth in frequency
-            of_x = apart(lambda _: _by_unloaded(lane, at), q)
+            of_x = apart(lambda _: lane.by_unloaded(at), q)
             pull = jnp.concatenate([pull[:W], every.summed(of_x[W:])])
         told = jnp.einsum("ock,pck->op", by_own, by_own)
         root = inverse_root(told + jnp.diag(prior**2))

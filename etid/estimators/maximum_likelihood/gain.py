@@ -105,7 +105,7 @@ class Gain(eqx.Module):
 
     def slopes(self, q: Float[Array, " q"]) -> Slopes:
         """The gain and its derivatives."""
-        own, z = self.split(q)
+        own, _ = self.split(q)
         s = frequency_variable(self.frequency)
 
         def load(logs: Float[Array, " element"]) -> Complex[Array, " frequency"]:
@@ -123,16 +123,52 @@ class Gain(eqx.Module):
             return load(logs), by_element(jnp.eye(logs.size)), self.turned(q, jnp.ones_like(s))
 
         z_load, by_element, turned = apart(of_load, q)
-
-        def of_gain(_) -> tuple[Complex[Array, " frequency"], ...]:
-            w, gain = self.w(z), self.driver.gain
-            value, by_load = jax.jvp(lambda at: gain(at, w), (z_load,), (jnp.ones_like(z_load),))
-            by_w = jax.jvp(lambda at: gain(z_load, at), (w,), (jnp.ones_like(w),))[1]
-            return value * turned, by_load * turned, by_w * turned
-
-        gain, by_load, by_w = apart(of_gain, q)
-        by_delay = -s * as_complex(1 / self.sample_rate) * gain
+        gain, by_load, by_w = apart(lambda q: self.by_acting(q, z_load, turned), q)
+        by_delay = self._by_delay(gain)
         rows = [by_element * by_load[None, :], by_delay[None, :]]
         if q.size > self.owned:
             rows.append(self.driver.slope * by_w[None, :])
         return Slopes(gain, by_load, jnp.concatenate(rows))
+
+    def by_acting(
+        self,
+        q: Float[Array, " q"],
+        z_load: Complex[Array, " frequency"],
+        turned: Complex[Array, " frequency"],
+    ) -> tuple[Complex[Array, " frequency"], ...]:
+        """The gain, and its derivatives with respect to Z_L and W, from Z_L and e^(−jωτ)."""
+        w, gain, one = self.w(self.split(q)[1]), self.driver.gain, jnp.ones_like(z_load)
+        value, by_load = jax.jvp(lambda at: gain(at, w), (z_load,), (one,))
+        by_w = jax.jvp(lambda at: gain(z_load, at), (w,), (one,))[1]
+        return value * turned, by_load * turned, by_w * turned
+
+    def pulled(
+        self,
+        q: Float[Array, " q"],
+        by_gain: Complex[Array, " frequency"],
+        acting: tuple[Complex[Array, " frequency"], ...],
+    ) -> Float[Array, " q"]:
+        """Gradient of a real number with respect to the parameters.
+
+        Args:
+            q: The parameters.
+            by_gain: Its derivative D with respect to the gain: its change is Σ Re (D ΔG).
+            acting: `by_acting` at these parameters.
+        """
+        gain, by_load, by_w = acting
+        own, s = self.split(q)[0], frequency_variable(self.frequency)
+
+        def load(logs: Float[Array, " element"]) -> Complex[Array, " frequency"]:
+            return self.circuit.with_log_values(logs).impedance()(s)
+
+        (by_element,) = jax.vjp(load, own.log_elements)[1](by_gain * by_load)
+        by_delay = jnp.sum((by_gain * self._by_delay(gain)).real)
+        rows = [by_element, by_delay[None]]
+        if q.size > self.owned:
+            towards, slope = by_gain * by_w, self.driver.slope
+            rows.append(slope.real @ towards.real - slope.imag @ towards.imag)
+        return jnp.concatenate(rows)
+
+    def _by_delay(self, gain: Complex[Array, " frequency"]) -> Complex[Array, " frequency"]:
+        """Derivative of the gain with respect to the delay [samples]."""
+        return -frequency_variable(self.frequency) * as_complex(1 / self.sample_rate) * gain

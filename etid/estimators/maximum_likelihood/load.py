@@ -79,15 +79,23 @@ class Load(eqx.Module):
 
     def predicted(self, q: Float[Array, " q"]) -> tuple[Complex[Array, " harmonic"], Spectrum]:
         """Gain, and the recording with the X that the calibrations estimate."""
+        z_load, turned, known = self._acting(q)
+        return self.gain.driver.gain(z_load, self.gain.w(self.gain.split(q)[1])) * turned, known
+
+    def _acting(
+        self, q: Float[Array, " q"]
+    ) -> tuple[Complex[Array, " harmonic"], Complex[Array, " harmonic"], Spectrum]:
+        """Z_L, e^(−jωτ), and the recording with the X that the calibrations estimate."""
         own, z = self.gain.split(q)
         f = self.spectrum.frequency
+        z_load = self.gain.impedance(q)(frequency_variable(f))
         turned = turns(-f[0] * own.delay_samples / self.gain.sample_rate, f.size)
-        g = self.gain.undelayed(q) * turned
         if self.unloaded is None:
-            return g, self.spectrum
+            return z_load, turned, self.spectrum
         x = self.spectrum.x + combined(z, self.unloaded.x)
         variance = self.spectrum.variance_x * jnp.exp(z @ self.unloaded.log_variance)
-        return g, eqx.tree_at(lambda s: (s.x, s.variance_x), self.spectrum, (x, variance))
+        known = eqx.tree_at(lambda s: (s.x, s.variance_x), self.spectrum, (x, variance))
+        return z_load, turned, known
 
     def __call__(self, q: Float[Array, " q"]) -> Float[Array, " term"]:
         """Terms of the recording, and the priors of its delay and of z."""
@@ -101,17 +109,29 @@ class Load(eqx.Module):
 
     def equations(self, q: Float[Array, " q"]) -> NormalEquations:
         """Normal equations of the recording alone; the matrix is its information."""
+        of = self.gain
+        z_load, turned, known = apart(self._acting, q)
+        acting = apart(lambda q: of.by_acting(q, z_load, turned), q)
+        around = Around.of(self, q, (acting[0], known))
+        gradient = of.pulled(q, -jnp.conj(around.score), acting)
+        if self.unloaded is not None:
+            by_x = self.by_unloaded((acting[0], known)).sum(-1)
+            gradient = gradient + jnp.pad(by_x, (of.owned, 0))[: q.size]
+        jacobian = around.jacobian
+        return NormalEquations(around.objective, gradient, jacobian @ jacobian.T)
 
-        def objective(
-            q: Float[Array, " q"],
-        ) -> tuple[Float[Array, ""], tuple[Complex[Array, " harmonic"], Spectrum]]:
-            g, known = self.predicted(q)
-            weight = jnp.where(known.selected, 1 / variance(known, g), 0.0)
-            return jnp.dot(weight, power(known.y - g * known.x)), (g, known)
-
-        (value, at), gradient = apart(jax.value_and_grad(objective, has_aux=True), q)
-        jacobian = Around.of(self, q, at).jacobian
-        return NormalEquations(value, gradient, jacobian @ jacobian.T)
+    def by_unloaded(
+        self, at: tuple[Complex[Array, " harmonic"], Spectrum]
+    ) -> Float[Array, "z harmonic"]:
+        """Derivatives of ½ r² at each harmonic with respect to the z that X depends on."""
+        (g, known), slopes = at, self.unloaded
+        if slopes is None:
+            return jnp.zeros((self.gain.driver.mean.size, g.size))
+        weight = jnp.where(known.selected, 1 / variance(known, g), 0.0)
+        error = known.y - g * known.x
+        by_x = as_complex(2 * weight) * jnp.conj(error) * g
+        by_log = weight**2 * power(error) * power(g) * known.variance_x
+        return -(by_x[None, :] * slopes.x).real - by_log[None, :] * slopes.log_variance
 
 
 class Sums(eqx.Module):
@@ -221,6 +241,8 @@ class Around(eqx.Module):
         slopes: The gain and its derivatives at the knots.
         x: x̂ at all harmonics.
         power: P at all harmonics.
+        score: ρ at all harmonics.
+        objective: ½ Σ r².
     """
 
     at: AtKnots
@@ -228,6 +250,8 @@ class Around(eqx.Module):
     slopes: Slopes
     x: Complex[Array, " harmonic"]
     power: Float[Array, " harmonic"]
+    score: Complex[Array, " harmonic"]
+    objective: Float[Array, ""]
 
     @classmethod
     def of(
@@ -248,26 +272,26 @@ class Around(eqx.Module):
         g, known = apart(load.predicted, q) if at is None else at
         of, every = load.gain, every or load.knots
 
-        def of_harmonics(_) -> tuple[Array, Array, Array]:
+        def of_harmonics(_) -> tuple[Array, Array, Array, Array]:
             weight = jnp.where(known.selected, 2 / variance(known, g), 0.0)
             error = known.y - g * known.x
             share = as_complex(0.5 * weight * known.variance_x)
-            return weight, error, known.x + jnp.conj(g) * share * error
+            x = known.x + jnp.conj(g) * share * error
+            score = as_complex(weight) * jnp.conj(x) * error
+            return x, score, weight * power(x), 0.5 * jnp.dot(weight, power(error))
 
-        weight, error, x = apart(of_harmonics, q)
-        score = as_complex(weight) * jnp.conj(x) * error
-        parts = jnp.stack([score.real, score.imag, weight * power(x)])
-        real, imaginary, total = every.summed(parts)
+        x, score, size, objective = apart(of_harmonics, q)
+        real, imaginary, total = every.summed(jnp.stack([score.real, score.imag, size]))
         driver, frequency = of.driver.at_knots(every), every.at(of.frequency)
         gain = Gain(driver, of.circuit, frequency, of.sample_rate, of.prior)
         by_z = shift = None
         if load.unloaded is not None:
-            by_z = every.summed((as_complex(parts[2]) * reciprocal(x))[None, :] * load.unloaded.x)
+            by_z = every.summed((as_complex(size) * reciprocal(x))[None, :] * load.unloaded.x)
             by_z = by_z * as_complex(1 / jnp.where(total > 0, total, 1.0))[None, :]
             shift = -combined(of.split(q)[1], by_z)
         slopes = apart(gain.slopes, q)
         sums = Sums(slopes.gain, jax.lax.complex(real, imaginary), total, by_z, shift)
-        return cls(AtKnots(gain, sums), q, slopes, x, parts[2])
+        return cls(AtKnots(gain, sums), q, slopes, x, size, score, objective)
 
     @property
     def jacobian(self) -> Float[Array, "q part"]:
