@@ -14,7 +14,7 @@ from etid.recordings.preflight import Inspected
 from etid.recordings.repeats import repeats
 from etid.results.fits import Fits
 from etid.simulation.scenes import Scene, Trial
-from tests import pictures
+from tests import kept_numbers, pictures
 
 NAMES = ("r_s", "r_p", "c_p")
 
@@ -81,6 +81,27 @@ def test_the_element_that_moves_is_named(load, name):
     expected = np.array([-0.1 * (one == name) for one in (*NAMES, "amplitude")])
     # Four standard errors, and what is not linear in a change of 10 %: half its square.
     assert (np.abs(change.size - expected) < 4 * change.stderr + 0.005).all()
+
+
+@pytest.mark.parametrize("load", LOADS)
+def test_sizes_of_changes_are_those_of_before(load):
+    """Of nothing, of a line, and of a step; what was found, and what noise makes of nothing."""
+    scene, skin, numbers = rung(load, samples=16_667), LOADS[load], {}
+    other = dataclasses.replace(skin, r_p=0.9 * skin.r_p)
+    courses = {
+        "nothing": [skin] * 5,
+        "line": falling(skin, "c_p", 0.1, 5),
+        "step": [skin] * 2 + [other] * 3,
+        "period": [skin] * 3 + [other] + [skin],
+    }
+    for name, loads in courses.items():
+        change = change_of(recorded(scene, loads), scene, skin)
+        for field, value in change._asdict().items():
+            at = None if value is None else np.asarray(value)
+            if at is not None:
+                of = kept_numbers.Number(at, 1e-6, 1e-9)
+                numbers[f"{name}_{field}"] = of
+    kept_numbers.check(f"changes_{load}", numbers)
 
 
 def test_a_step_and_a_single_period_are_seen_as_well_as_a_line():

@@ -15,6 +15,7 @@ from etid.plotting import figure_of
 from etid.plotting.bands import bands
 from etid.recordings.preflight import Inspected, preflight
 from etid.results.feed import MEASURED_CURRENT
+from tests import kept_numbers
 from tests.conftest import REFERENCE_DATA
 
 RATE, PULSES = 200e3, 60.0
@@ -59,6 +60,7 @@ def test_a_load_is_identified_from_whole_periods_of_current_and_voltage(skin):
     assert fit.method == "maximum_likelihood"
     assert np.abs(off(fit, SKIN)).max() < WITHIN
     assert fit.stderr.r_p < 1e-3 * fit.circuit.r_p
+    kept_numbers.check("current", kept_numbers.of_fit(fit))
 
 
 @pytest.mark.slow
@@ -94,6 +96,7 @@ def test_a_prior_is_one_more_measurement(skin):
     assert told.support is not None
     assert free.support is not None
     assert told.support.deviance - free.support.deviance == pytest.approx(2.0, abs=0.1)
+    kept_numbers.check("current_with_prior", kept_numbers.of_fit(told))
 
 
 @pytest.mark.parametrize(
@@ -113,6 +116,7 @@ def test_a_single_pulse_is_identified_in_time():
     fit = etid.identify_skin(recorded(SKIN, periods=1.1, delay=5e-7))
     assert fit.method == "output_error"
     assert np.abs(off(fit, SKIN)).max() < WITHIN
+    kept_numbers.check("current_in_time", kept_numbers.of_fit(fit))
 
 
 @pytest.mark.slow

@@ -34,9 +34,13 @@ def test_a_damaged_file_is_read_or_refused(kinds, name, tmp_path):
 
 @pytest.mark.parametrize(
     ("name", "seed"),
-    [("fits", 3028246), ("matlab5", 3031157)],  # damaged bytes in a list of texts; no such class
+    [
+        ("fits", 3028246),  # damaged bytes in a list of texts
+        ("matlab5", 3031157),  # no such class
+        ("recordings", 6001032),  # a dataset that looks virtual, with a heap that is a loop
+    ],
 )
-def test_a_damaged_file_that_once_was_a_foreign_error_is_not(kinds, name, seed, tmp_path):
+def test_a_damaged_file_that_once_was_a_foreign_error_or_a_hang_is_not(kinds, name, seed, tmp_path):
     path = fuzz.damage(tmp_path, kinds[name], seed)
     assert fuzz.judge(path, kinds[name], seed)[0] in fuzz.FINE
 

@@ -11,6 +11,7 @@ from etid.online import gain_bands
 from etid.online.gain_bands import LAST_BAND, RELATIVE, WIDEST, Bands, unloaded_bands
 from etid.signals.harmonics import ALIASED
 from etid.signals.noise import RIPPLE
+from tests import kept_numbers
 
 SIZE, RATE, SIGMA = 2048, 120e3, 12.0
 DECAY = 1.0 / SIZE  # [1/sample] of the tail: a third of it is left after a period
@@ -229,3 +230,48 @@ def test_the_tail_of_a_load_has_its_own_rate_as_far_as_noise_lets_it_be_seen(exa
     slope = (projected(DECAY * (1 + step)) - projected(DECAY * (1 - step))) / (2 * step)
     np.testing.assert_allclose(by_rate, slope, atol=1e-6 * abs(slope).max())
     assert of.tail_left == pytest.approx(np.exp(-1.0), rel=1e-6)
+
+
+def test_bands_and_rows_are_those_of_before():
+    """Of whole samples, and of periods that are sampled at three phases, with their aliases."""
+    rng, thirds = np.random.default_rng(5), SIZE + 1 / 3
+    t = (np.arange(9 * SIZE) % thirds) - 40
+    sharp = np.exp(-0.5 * (t / 0.9) ** 2) + 0.3 * np.exp(-DECAY * (t + 40))
+    records = {
+        "whole": (np.tile(window(), 3) + SIGMA * rng.standard_normal(3 * SIZE), SIGMA, float(SIZE)),
+        "thirds": (sharp - sharp.mean() + 1e-3 * rng.standard_normal(t.size), 1e-3, thirds),
+    }
+    numbers = {}
+    for name, (v_th, sigma, period) in records.items():
+        of, projection = unloaded_bands(v_th, sigma, RATE, period)
+        found = {
+            field: getattr(of, field) for field in ("variance_x", *DESCRIBED, "bent", "turned")
+        } | {field: getattr(of, field) for field in ("alias", "tail", "tail_left")}
+        found["x"] = np.asarray(of.x)[::50]
+        probe = np.cos(np.arange(len(projection.rows)))
+        found |= {"rows": probe @ projection.rows, "within": projection.within[::5]}
+        found |= {"shares": projection.shares()[::20], "floor": projection.floor}
+        found |= {"waveform": of.waveform()[::100]}
+        for field, value in found.items():
+            largest = np.abs(np.asarray(value)).max()
+            # The rows are in single precision.
+            numbers[f"{name}_{field}"] = kept_numbers.Number(value, 1e-6, 1e-6 * largest)
+        whole = (projection.pieces, projection.runs)
+        for field, value in zip(("pieces", "runs"), whole, strict=True):
+            numbers[f"{name}_{field}"] = kept_numbers.Number(np.array(value))
+        numbers[f"{name}_block"] = kept_numbers.Number([projection.block, projection.freedom()])
+    kept_numbers.check("gain_bands", numbers)
+
+
+def test_measured_gains_are_those_of_before(exact):
+    of, projection = exact
+    rng = np.random.default_rng(3)
+    tail = 3.0 * np.exp(-1.02 * DECAY * np.arange(SIZE))
+    v_out = np.stack([0.5 * window() - part * tail for part in (0.0, 0.2, -0.3)])
+    seen = projection.seen(v_out + 0.1 * rng.standard_normal(v_out.shape) + 0.05, UNLIMITED)
+    found = measured(of, seen, np.array([0.0, 0.4, -0.6]), np.array([0.05, 0.05, 0.0]))
+    numbers = {}
+    for name, value in (seen._asdict() | found._asdict()).items():
+        largest = np.abs(np.asarray(value)).max()
+        numbers[name] = kept_numbers.Number(value, 1e-5, 1e-5 * largest)
+    kept_numbers.check("measured_gains", numbers)

@@ -10,6 +10,7 @@ import etid
 from etid.identify.one import skin_lane
 from etid.simulation.scenes import Scene, Trial
 from etid.simulation.transformer import ResistorLoad, SkinLoad
+from tests import kept_numbers
 
 LENGTH = 3334
 LOADS = {
@@ -56,6 +57,7 @@ def elements(fits):
 def test_driver_is_the_transformers_impedance_within_its_error(driver):
     assert driver.verdict == "successful"
     assert driver.order == 5
+    kept_numbers.check("driver_of_one_resistor", kept_numbers.of_driver(driver))
     frequency = jnp.array([600.0, 5e3, 2e4, 4e4])
     true = np.abs(scene().driver.z_th(np.asarray(frequency)))
     error = np.abs(np.asarray(driver.response(frequency))) - true

@@ -2,16 +2,27 @@
 
 import dataclasses
 
+import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import etid
 from benchmarks.failure_axes import Cole
+from etid.estimators.estimate import DELAY_WIDTH
+from etid.estimators.joint.fit import fit_alone
+from etid.estimators.joint.terms import Joint
+from etid.estimators.lanes import Harmonics
+from etid.estimators.maximum_likelihood.driver import Calibrations
+from etid.estimators.starts import harmonic_starts
+from etid.recordings.preflight import Inspected
 from etid.recordings.remarks import Remark
 from etid.recordings.study import Study
+from etid.results.driver import HarmonicDriver
 from etid.simulation.scenes import Scene, Trial
 from etid.simulation.transformer import ResistorLoad, SkinLoad, TransformerDriver
+from tests import kept_numbers
 
 DRY = SkinLoad(r_s=33.4e3, r_p=186e3, c_p=0.12e-9)
 TRUTH = np.array(dataclasses.astuple(DRY))
@@ -58,6 +69,35 @@ def test_every_recording_has_its_verdict_and_a_bad_one_costs_itself_alone(study,
     assert verdicts["broken"] == "nonfinite_samples"
     assert set(verdicts) == set(study.loaded)
     assert outcome.fits.fit.method == "joint"
+
+
+def test_numbers_of_joint_fits_are_those_of_before(outcome):
+    kept_numbers.check("joint", kept_numbers.of_fit(outcome.fits.fit))
+    [driver] = outcome.drivers.values()
+    kept_numbers.check("joint_driver", kept_numbers.of_driver(driver))
+
+
+def test_a_load_that_is_fitted_alone_has_the_misfit_of_its_residual(study):
+    """χ² = Σ 2 |Y − G X|² / (σ_y² + |G|² σ_x²), and the prior of the delay, over what is left."""
+    calibrated = etid.identify_driver(study["calibration/0"])
+    assert isinstance(calibrated, HarmonicDriver)
+    lane = Harmonics.of(Inspected(study["odd"]))
+    of, rate = lane.spectrum, jnp.asarray(lane.sample_rate)
+    starts = harmonic_starts(of, rate, calibrated.response(of.frequency), etid.SkinRC())
+    model = Joint(etid.SkinRC(), Calibrations.of(calibrated), False)
+    own, _, chi2, rrse, hum = eqx.filter_jit(fit_alone)(model, of, rate, starts)
+    f, x, y, var_x, var_y, used = (np.asarray(leaf) for leaf in jax.tree.leaves(of))
+    z = np.asarray(etid.SkinRC(*np.exp(own.log_elements)).response(of.frequency))
+    z_th = np.asarray(calibrated.response(of.frequency))
+    delay = float(own.delay_samples)
+    g = z / (z + z_th) * np.exp(-2j * np.pi * f * delay / float(rate))
+    error = abs(y - g * x) ** 2 / (var_y + abs(g) ** 2 * var_x)
+    squares = 2 * error[used].sum() + (delay / DELAY_WIDTH) ** 2
+    assert float(chi2) > 1.5  # it is another circuit
+    np.testing.assert_allclose(chi2, squares / (2 * used.sum() - 4), rtol=1e-6)
+    missed = (abs(y - g * x) ** 2)[used].sum() / (abs(y) ** 2)[used].sum()
+    np.testing.assert_allclose(rrse, np.sqrt(missed), rtol=1e-9)
+    assert not bool(hum)
 
 
 @pytest.mark.slow

@@ -13,6 +13,7 @@ from etid.recordings.remarks import Remark
 from etid.signals import mains, quick_looks
 from etid.simulation import scenes
 from etid.simulation.scenes import Scene
+from tests import kept_numbers
 
 SCALE = Scene().scale
 DRY = scenes.paper_dry()
@@ -122,6 +123,7 @@ def test_elements_are_those_without_hum(records, quiet, frequency):
     assert in_errors(fit, quiet[1]).max() < 1
     assert (np.diag(fit.cov) / np.diag(quiet[1].cov)).max() < 1.6
     assert int(driver.remarks) == int(fit.remarks) == Remark.mains_hum
+    kept_numbers.check(f"hum_{frequency:g}_hz", kept_numbers.of_fit(fit))
 
 
 def test_hum_in_a_batch_costs_the_other_recordings_nothing(records, quiet):
@@ -152,6 +154,7 @@ def test_a_wrong_gain_is_no_hum(records, quiet):
     """It is more on the low harmonics than noise explains, as hum is, but on all alike."""
     fit = etid.identify_skin(louder(records[1], 1.01), quiet[0], throw=False)
     assert fit.verdict == "inconsistent"
+    kept_numbers.check("wrong_gain", kept_numbers.of_fit(fit))
     assert int(fit.remarks) == 0
 
 
@@ -161,6 +164,7 @@ def test_a_wrong_gain_is_a_misfit_where_chi2_does_not_show_it():
     driver = etid.identify_driver(calibration)
     assert etid.identify_skin(skin, driver).verdict == "successful"
     fit = etid.identify_skin(louder(skin, 1.02), driver, throw=False)
+    kept_numbers.check("wrong_gain_noisy", kept_numbers.of_fit(fit))
     assert fit.verdict == "misfit"
     assert fit.chi2 < MISFIT_CHI2
 

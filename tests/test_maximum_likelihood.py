@@ -23,6 +23,7 @@ from etid.identify.one import known_at, known_of, skin_lane
 from etid.recordings.preflight import Inspected
 from etid.simulation.scenes import Scene, Trial
 from etid.simulation.transformer import ResistorLoad, SkinLoad
+from tests import kept_numbers
 
 DRY = SkinLoad(r_s=33.4e3, r_p=186e3, c_p=0.12e-9)
 SAMPLES = 10_000
@@ -66,6 +67,16 @@ def test_trigger_delays_of_a_tenth_of_a_sample_leave_every_trial_within_its_erro
     assert (np.abs(wrong) < SIGMAS * np.asarray(fits.stderr.values())).all()
     # In units of the elements: 500 ns would otherwise spread R_s by 93 %.
     assert (np.abs(wrong) / np.array(dataclasses.astuple(DRY)) < 0.02).all()
+
+
+def test_numbers_of_fits_are_those_of_before(study, driver):
+    """One of them does not fit: its RRSE is large enough to say of which voltage it is a part."""
+    last = study["loaded/3"]
+    records = [study[f"loaded/{i}"] for i in range(3)]
+    fits = etid.identify_skins([*records, last.replace(v_out=0.8 * last.v_out)], driver)
+    assert fits.verdicts[-1] != "successful"
+    kept_numbers.check("skins", kept_numbers.of_fit(fits.fit))
+    kept_numbers.check("calibrated", kept_numbers.of_driver(driver))
 
 
 def test_a_fit_passes_through_few_files(study, driver):
@@ -175,6 +186,7 @@ def test_one_unloaded_record_for_calibration_and_trial_tells_of_its_voltage_twic
     found = fits[0].stderr.r_p / bound.stderr["r_p"]
     np.testing.assert_allclose(found, 1.0, atol=0.1)  # without it 1.2
     assert (np.abs(error(fits)) < SIGMAS * np.asarray(fits.stderr.values())).all()
+    kept_numbers.check("shared_v_th", kept_numbers.of_fit(fits.fit))
     # Only the noise of V_out is the trial's own: half of it or more, as V_out is smaller.
     apart = etid.identify_skins([study["loaded/0"]], driver)
     own = [np.diagonal(of.cov[0] - of.fit.shared_cov[0]) for of in (fits, apart)]

@@ -18,6 +18,7 @@ from etid.results.driver import HarmonicDriver
 from etid.results.verdicts import verdict
 from etid.signals.harmonics import Spectrum
 from etid.signals.transfer import as_complex
+from tests import kept_numbers
 
 RESISTORS = (98.8e3, 21.62e3)
 SIGMAS = 5.0  # one in 2 million for a normal error
@@ -64,6 +65,7 @@ def test_its_errors_are_the_bound(study, coarse):
         relative = np.asarray(fit.stderr.values()) / np.asarray(fit.circuit.values())
         np.testing.assert_allclose(relative, list(bounds[name].relative.values()), rtol=0.1)
         assert (np.diagonal(fit.shared_cov) < np.diagonal(fit.cov)).all()
+        kept_numbers.check(f"non_parametric_{name}", kept_numbers.of_fit(fit))
 
 
 def test_noise_that_shifts_it_too_far_is_told():
@@ -72,6 +74,7 @@ def test_noise_that_shifts_it_too_far_is_told():
     for name in LOADS:
         fit = etid.identify_skin(noisy[name], driver, method="non_parametric", throw=False)
         assert fit.verdict == "biased"
+        kept_numbers.check(f"non_parametric_noisy_{name}", kept_numbers.of_fit(fit))
 
 
 def test_other_pulse_rates_than_the_calibration_s_have_no_z_th(study, coarse):

@@ -24,7 +24,7 @@ from etid.results.driver import ContinuousDriver
 from etid.signals.harmonics import ALIASED
 from etid.simulation.scenes import Scene, Trial
 from etid.simulation.transformer import ResistorLoad, Sampler, SkinLoad, loading
-from tests import pictures
+from tests import kept_numbers, pictures
 
 DRY = SkinLoad(r_s=33.4e3, r_p=186e3, c_p=0.12e-9)
 DAMP = SkinLoad(r_s=6.1e3, r_p=17.4e3, c_p=0.66e-9)
@@ -728,3 +728,41 @@ def test_bad_electrodes_are_listed_with_the_reason():
     logs = state.electrodes.own.at[0, :3].add(np.log(4.0))
     state = dataclasses.replace(state, electrodes=dataclasses.replace(state.electrodes, own=logs))
     assert tracker.bad_electrodes(state)[0] == "dry"
+
+
+FIELDS = ("level", "variance", "chi2", "rrse", "offset", "amplitude", "mean_cov", "information")
+
+
+def numbers_of(tracker, state):
+    """What a state says, and what it holds."""
+    fits, held = tracker.read(state), state.electrodes
+    numbers = kept_numbers.of_fit(fits.fit)
+    for name in FIELDS:
+        values = np.asarray(getattr(held, name))
+        # A matrix may be anything where it is next to nothing.
+        largest = 1e-4 * abs(values).max(axis=-1, keepdims=True) if values.ndim > 1 else 0.0
+        numbers[name] = kept_numbers.Number(values, 1e-4, largest)
+    errors = own_stderr(fits)
+    delay = np.asarray(held.own)[:, -1]
+    numbers["delay"] = kept_numbers.Number(delay, absolute=1e-4)
+    for name in ("mean", "factor"):
+        numbers[name] = kept_numbers.Number(getattr(held, name), absolute=0.02 * errors)
+    for name in ("pulses", "missed", "event", "element", "drifted"):
+        numbers[name] = kept_numbers.Number(getattr(held, name))
+    return numbers
+
+
+def test_numbers_of_a_tracker_are_those_of_before():
+    """Followed, in another amplitude, and after a jump of some and a misfit of one."""
+    tracker, state, clean = ten()
+    kept_numbers.check("tracked", numbers_of(tracker, state))
+    pulse = with_noise(clean, seed=6)[8]
+    some = pulse.copy()
+    some[:4] = pulse[1:5]
+    some[7] = pulse[7] + 0.3 * abs(pulse[7]).max() * np.sin(np.arange(pulse[7].size) / 5)
+    some[8] = np.nan
+    found = tracker.update(state, some)
+    kept_numbers.check("tracked_after_a_jump", numbers_of(tracker, found))
+    amplitude = np.linspace(0.5, 2.0, TEN)
+    found = tracker.update(state, pulse * amplitude[:, None], amplitude)
+    kept_numbers.check("tracked_amplitudes", numbers_of(tracker, found))

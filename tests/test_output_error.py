@@ -34,6 +34,7 @@ from etid.results.driver import SourceImpedance
 from etid.signals.noise import Measurement
 from etid.simulation.scenes import Scene, Trial
 from etid.simulation.transformer import ResistorLoad, SkinLoad
+from tests import kept_numbers
 
 RATE = 200e3
 prepared = eqx.filter_jit(prepare)  # operation by operation, it takes seconds
@@ -143,6 +144,7 @@ def fitted():
         samples=3334,
     ).simulate(seed=11)
     driver = etid.identify_driver(study["c"])
+    kept_numbers.check("driver_in_time", kept_numbers.of_driver(driver))
 
     def of(scale):
         lane = PaddedSamples.of(Inspected(study["a"]))
@@ -158,6 +160,7 @@ def fitted():
 def test_if_the_noise_is_larger_than_it_is_said_to_be_the_errors_are_as_large(fitted):
     """χ² grows as the noise that is assumed falls, and the errors by it remain."""
     third, tenth = fitted(1 / 3), fitted(1 / 10)
+    kept_numbers.check("in_time_too_noisy", kept_numbers.of_fit(third))
     assert float(third.chi2) > 5
     np.testing.assert_allclose(tenth.chi2 / third.chi2, 100 / 9, rtol=1e-3)
     own = [np.asarray(fit.cov - fit.shared_cov) for fit in (third, tenth)]
@@ -168,6 +171,7 @@ def test_if_the_noise_is_larger_than_it_is_said_to_be_the_errors_are_as_large(fi
 
 def test_if_the_noise_is_smaller_the_errors_are_what_it_is_said_to_be(fitted):
     once, twice = fitted(1.5), fitted(3.0)
+    kept_numbers.check("in_time", kept_numbers.of_fit(once))
     assert float(once.chi2) < 1
     own = [np.asarray(fit.cov - fit.shared_cov) for fit in (once, twice)]
     np.testing.assert_allclose(np.diagonal(own[1]), 4 * np.diagonal(own[0]), rtol=0.1)

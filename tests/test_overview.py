@@ -14,11 +14,13 @@ import etid
 from etid.circuits.display import quantity
 from etid.circuits.overview import ROWS, Overview
 from etid.online.state import ElectrodeState, TrackerState
+from etid.recordings.remarks import Remark
 from etid.results.driver import Calibration, ContinuousDriver, SourceImpedance
 from etid.results.fits import Support, described
 from etid.results.verdicts import message, verdict, verdicts_of
 from etid.selection.selection import Selection
 from etid.simulation.bound import Bound
+from tests import kept_numbers
 
 DRY = etid.SkinRC(33.4e3, 186e3, 0.12e-9)
 COV = np.diag([1e4, 1e6, 1e-24])
@@ -100,12 +102,40 @@ def state():
     return TrackerState(lanes, jnp.array(7), jnp.array(True), jnp.array(True))
 
 
+def found_driver():
+    """A driver that says all it can: known resistors that disagree, a drift, a remark, a misfit."""
+    of = driver()
+    known = Calibration(
+        r_load=jnp.array([98.8e3, 21.62e3]),
+        delay_samples=jnp.array([0.2, -0.1]),
+        delay_std_samples=jnp.array(0.5),
+        mismatch=jnp.array([[0.02, -0.03], [0.001, 0.002]]),
+    )
+    return dataclasses.replace(
+        of,
+        calibration=known,
+        chi2=jnp.asarray(7.654321),
+        rrse=jnp.asarray(0.0123456),
+        drift=np.asarray(0.02),
+        remarks=np.asarray(int(Remark.mains_hum)),
+        result=verdict("misfit"),
+    )
+
+
+def changed():
+    """A fit of a load that changed."""
+    moved = np.array([0.01, -0.2, 0.003, 0.0001])
+    return dataclasses.replace(fit("changed"), change=moved, change_stderr=0.1 * abs(moved))
+
+
 SHOWN = {
     "fit": (
         fit,
         ["SkinRC: successful in 7 steps", "r_s 33.40 ± 0.10 kΩ", "c_p 0.1200 ± 0.0010 nF"],
     ),
     "failed fit": (lambda: fit("misfit"), ["SkinRC: misfit", "misses the recording by far more"]),
+    "changed fit": (changed, ["During the record: r_s +1 ± 0.1 %, r_p -20 ± 2 %"]),
+    "driver with findings": (found_driver, ["r_load 98.8 kΩ is +2.02 ± 0.1 % off", "misfit"]),
     "batch": (lambda: fits().fit, ["2 successful, 1 misfit", "r_p 186 … 186 kΩ"]),
     "fits": (fits, ["3 fits of SkinRC: 2 successful, 1 misfit", "s1 <b> 2/2 33.40 ± 0.10"]),
     "circuit": (lambda: DRY, ["SkinRC", "186 kΩ", "0.12 nF"]),
@@ -136,6 +166,53 @@ def test_numbers_have_units_and_no_array_is_printed(make, texts):
         assert [text for text in texts if text not in shown] == []
         assert not ARRAYS.search(shown)
     assert str(one) == one._overview().text()
+
+
+def test_texts_are_those_of_before():
+    """Of the results, without the sentence that explains a verdict."""
+    results = ("fit", "changed fit", "driver", "driver with findings", "batch", "fits")
+    texts = {name: str(SHOWN[name][0]()) for name in results}
+    texts["changed fit"] = texts["changed fit"].replace(message("changed"), "")
+    texts["driver with findings"] = texts["driver with findings"].replace(message("misfit"), "")
+    kept_numbers.check("texts", {name: kept_numbers.Number(text) for name, text in texts.items()})
+
+
+def test_tables_of_fits_are_those_of_before():
+    many, numbers = fits(), {}
+    many = dataclasses.replace(many, fit=dataclasses.replace(many.fit, rrse=np.arange(3.0)))
+    columns, units, attributes = many.as_table()
+    attributes.pop("etid_version")
+    for name, value in (columns | units | attributes).items():
+        numbers[name] = kept_numbers.Number(np.asarray(value), 1e-12)
+    for number, row in enumerate([*many.summary("subject"), *many.summary()]):
+        for name, value in row.items():
+            numbers[f"{number}_{name}"] = kept_numbers.Number(np.asarray(value), 1e-12)
+    for name, ends in many[0].intervals(0.9).items():
+        numbers[f"{name}_interval"] = kept_numbers.Number(np.array(ends), 1e-12)
+    numbers["correlation"] = kept_numbers.Number(many.fit.correlation, 1e-12)
+    kept_numbers.check("tables", numbers)
+
+
+def test_what_a_driver_computes_is_as_before():
+    of, f = found_driver(), jnp.array([600.0, 2e4])
+    load = DRY.response(f)
+    numbers = {
+        "order": of.order,
+        "r_known": of.r_known,
+        "late_std": of.late_std(jnp.asarray(50e3)),
+        "drift_std": of.drift_std(),
+        "later_cov": jnp.diagonal(of.later_cov()),
+        "gain": of.gain(load, f),
+        "sensitivity": of.sensitivity(load, f),
+        "log_response_stderr": of.log_response_stderr(f),
+        "response_stderr": of.response_stderr(f),
+    }
+    kept_numbers.check(
+        "driver", {name: kept_numbers.Number(value, 1e-9) for name, value in numbers.items()}
+    )
+    assert driver().later_cov() is driver().cov or (driver().later_cov() == driver().cov).all()
+    np.testing.assert_allclose(of.drift_std()[3], 0.02 * 1e3)  # a gain changes in proportion
+    np.testing.assert_allclose(of.drift_std()[0], 0.02)  # a logarithm by as much
 
 
 @pytest.mark.parametrize("make", [make for make, _ in SHOWN.values()], ids=SHOWN)

@@ -14,6 +14,7 @@ from etid.signals.harmonics import Spectrum, harmonics, signal_share, whole_peri
 from etid.signals.pulse_train import find_pulses
 from etid.simulation.scenes import Scene, Trial
 from etid.simulation.transformer import ResistorLoad
+from tests import kept_numbers
 
 spectrum = jax.jit(spectra.spectrum, static_argnums=(5, 6))
 RATE, PULSE = 200e3, 60.0
@@ -206,3 +207,29 @@ def test_aliases_are_told_from_harmonics_where_a_period_is_no_whole_number_of_sa
     assert spectra.separates_aliases(3, 10_000)
     assert not spectra.separates_aliases(1, 3333)
     assert not spectra.separates_aliases(3, 9_999)
+
+
+@pytest.mark.parametrize(("periods", "samples"), [(1, 3333), (3, 10_000), (2, 6667), (4, 8000)])
+def test_spectra_are_those_of_before(periods, samples):
+    """Fields, their noise, what is padded, and the local share of the signal."""
+    rng = np.random.default_rng(8)
+    v, w = np.cumsum(rng.normal(size=(2, samples)), axis=1)
+    quiet, loud, rate = (np.asarray(s) for s in (0.1, 2.0, RATE))
+    fields = spectra.spectrum(v, w, quiet, loud, rate, periods, samples)
+    names = ("frequency", "x", "y", "variance_x", "variance_y", "selected")
+    numbers = {}
+    for name, value in zip(names, fields, strict=True):
+        some = np.concatenate([np.asarray(value)[:4], np.asarray(value)[::97], value[-4:]])
+        numbers[name] = kept_numbers.Number(some, 1e-9, 1e-12)
+        numbers[f"{name}_size"] = kept_numbers.Number(np.size(value))
+    numbers["used"] = kept_numbers.Number(int(np.sum(fields[-1])))
+    share = signal_share(jnp.asarray(fields[2]), jnp.asarray(fields[4]))
+    numbers["share"] = kept_numbers.Number(np.asarray(share)[::29], 1e-9, 1e-12)
+    numbers["apart"] = kept_numbers.Number(spectra.separates_aliases(periods, samples))
+    kept_numbers.check(f"spectrum_{periods}_{samples}", numbers)
+
+
+@pytest.mark.parametrize("past", [-1, 0, 1])
+def test_half_a_sample_may_be_missing_from_the_last_period(past):
+    """2.5 samples to a period: 5 samples are two periods, as are 4.6, and 4.4 are one."""
+    assert whole_periods(5 + past, 5.0, 2.0) == {-1: (1, 2), 0: (2, 5), 1: (2, 5)}[past]

@@ -313,6 +313,7 @@ class Scan:
         """Shape, dtype and scale of a dataset; its samples must be in this file."""
         link = local_link(group, field.name)
         remedy = "Copy the samples into the file"
+        self._stored.check_layout(group, field.name)
         if group.get(field.name) is None:
             target = getattr(link, "path", "")
             raise RecordingError(f"is a dangling link to {target!r}", remedy="Repair the link")

@@ -4,7 +4,8 @@ For most damaged files the HDF5 library raises an error. There is one exception.
 texts of variable length, and the size of each object leads to the next object. If a free object has
 size 0, the library loops forever in C, and Python cannot stop it. A `Guarded` file therefore
 follows the objects of a heap itself before the library reads the heap. All hangs that
-`python -m benchmarks fuzz` has found were of this kind. For each text, the file also holds a
+`python -m benchmarks fuzz` has found were of this kind; in one of them a damaged dataset looked
+like a virtual one, whose parts a heap describes. For each text, the file also holds a
 descriptor: its length, the address of its heap, and the number of its object. The library allocates
 this length before it looks for the object. The guard finds the descriptors of attributes in what
 the library reads; `check_texts` reads those of a dataset. The guard needs a Python call for each
@@ -23,6 +24,7 @@ from typing import Any
 
 import h5py
 import numpy as np
+from h5py import h5l  # type: ignore[attr-defined]  # compiled, without stubs
 
 from etid.recordings import limits
 from etid.recordings.errors import RecordingError, located
@@ -52,6 +54,8 @@ _MESSAGE = struct.Struct("<BxHHH")
 _VERSION = re.compile(rb"(?=[\x01-\x03][\x00-\x03])")
 # Start of a type of variable length, by version, and the size of its values.
 _VARIABLE, _DESCRIPTOR = (b"\x19", b"\x39", b"\x49"), struct.pack("<I", _TEXT.size)
+# Version and class of the layout of a virtual dataset, near the begin of the header of an object.
+_VIRTUAL, _HEADER = (b"\x03\x03", b"\x04\x03"), 512
 _DESCRIBED = 1 << 21  # [bytes] larger reads are samples
 _SIZES = {0: 13, 1: 13, 2: 9, 3: 9}  # offset of the sizes of numbers, by version of the superblock
 
@@ -179,8 +183,8 @@ def _check_numbers(raw: io.FileIO) -> None:
 class Attributes:
     """Attributes of the objects of one file, read after a check of type and size.
 
-    Texts of variable length are read through a guard, from a second handle of the file. This handle
-    is opened when the first such text is found.
+    What needs a guard is read from a second handle of the file: texts of variable length, and
+    datasets that may be virtual. This handle is opened for the first of them.
     """
 
     def __init__(self, path: str) -> None:
@@ -221,10 +225,28 @@ class Attributes:
         if not dtype.hasobject and math.prod(stored.shape or ()) * dtype.itemsize <= _PLAIN:
             return attributes[name]  # etid writes all attributes in this way
         if in_a_heap(dtype):
-            if self._second is None:
-                self._second = self._open.enter_context(guarded(self._path))
-            owner = self._second[owner.name]
+            owner = self._guarded()[owner.name]
         return attribute(owner, name)
+
+    def check_layout(self, group: h5py.Group, name: str) -> None:
+        """Open a member through the guard first if it may be a virtual dataset.
+
+        Raises:
+            Exception: One of `LIBRARY_ERRORS`: its heap is damaged.
+        """
+        link = group.id.links.get_info(name.encode())
+        head = b""
+        if link.type == h5l.TYPE_HARD:  # a soft link does not tell the address
+            with open(self._path, "rb") as raw:
+                raw.seek(link.u + group.file.userblock_size)
+                head = raw.read(_HEADER)
+        if not head or any(layout in head for layout in _VIRTUAL):
+            self._guarded().get(f"{group.name}/{name}")
+
+    def _guarded(self) -> h5py.File:
+        if self._second is None:
+            self._second = self._open.enter_context(guarded(self._path))
+        return self._second
 
 
 def in_a_heap(dtype: np.dtype) -> bool:

@@ -1,0 +1,272 @@
+"""The state of one electrode after a pulse, against the same rules written for one electrode."""
+
+import itertools
+import types
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from etid.estimators.judgement import MAX_STEPS_REACHED, SUCCESSFUL
+from etid.estimators.unknowns import LoadUnknowns
+from etid.online.changes import DRIFT, JUMP, NONE
+from etid.online.electrode import (
+    PATIENCE,
+    Attempt,
+    Measured,
+    Suspicion,
+    after_pulse,
+    attempt,
+    predicted,
+    suspicion,
+)
+from etid.online.pulse_fit import GainModel
+from etid.online.state import ElectrodeState
+from etid.results.verdicts import RESULTS, first_verdict, verdict_names
+
+NUMBER, LIMIT = 77, 10.0
+OLD, FOUND, FRESH = np.array([1.0, 2.0, 0.1]), np.array([1.1, 2.1, 0.2]), np.array([7.0, 2.2, 0.3])
+BEFORE = np.array([[50.0, 5.0], [5.0, 40.0]])
+TOLD, ALONE = np.array([[30.0, 2.0], [2.0, 20.0]]), np.array([[60.0, 3.0], [3.0, 70.0]])
+GOOD, BAD, LATE = SUCCESSFUL, RESULTS.misfit, MAX_STEPS_REACHED
+
+
+class Case(NamedTuple):
+    """What may be so or otherwise."""
+
+    running: bool
+    jump: bool
+    drift: bool
+    found: bool
+    fresh: str
+    silent: bool
+    missed: int
+    off: bool
+    near: bool
+
+
+CASES = [
+    Case(*one)
+    for one in itertools.product(
+        (True, False),
+        (True, False),
+        (True, False),
+        (True, False),
+        ("good", "bad", "late"),
+        (True, False),
+        (0, PATIENCE - 1),
+        (True, False),
+        (True, False),
+    )
+    if one[0] or not (one[1] or one[2])  # an electrode that does not run is not suspected
+]
+# NumPy's arrays stand in the place of JAX's.
+MEASURED: Any = Measured
+ATTEMPT: Any = Attempt
+SUSPICION: Any = Suspicion
+RESULT = {"good": GOOD, "bad": BAD, "late": LATE}
+
+
+def electrode(of: Case) -> tuple[Any, ...]:
+    """The arguments of `after_pulse`."""
+    state = dict(
+        own=OLD,
+        information=9 * BEFORE,
+        pulses=12 if of.running else 0,
+        missed=of.missed,
+        amplitude=0.5,
+        offset=0.25,
+        level=0.3,
+        variance=0.4,
+        chi2=0.9,
+        rrse=0.01,
+        result=RESULTS.insensitive,
+        mean=np.array([0.2, 0.3]),
+        mean_cov=0.01 * BEFORE,
+        event=DRIFT,
+        factor=np.array([0.5, 0.6]),
+        element=1,
+        drifted=5,
+    )
+    measured = MEASURED(
+        gain=np.zeros(1, complex),
+        variance=1.4,
+        weight=np.zeros(1),
+        level=1.3,
+        amplitude=0.0 if of.silent else 2.0,
+        offset=1.25,
+        steady=True,
+        bad=RESULTS.unconnected if of.off else SUCCESSFUL,
+    )
+    found = ATTEMPT(FOUND, TOLD, np.linalg.inv(TOLD), 1.9, 1.01, GOOD if of.found else BAD)
+    own = np.array([*(OLD[:2] + 1e-3), 0.3]) if of.near else FRESH
+    fresh = ATTEMPT(own, ALONE, np.linalg.inv(ALONE), 2.9, 2.01, RESULT[of.fresh])
+    z = np.array([0.1, 0.2])
+    suspected = SUSPICION(of.jump, of.drift, np.array([0.7, 0.8]), 0.02 * BEFORE, 0, z)
+    return state, measured, BEFORE, found, fresh, suspected, LIMIT, NUMBER
+
+
+def expected(of: Case) -> dict[str, Any]:
+    """The rules, one electrode at a time."""
+    state, measured, before, found, fresh, suspected, limit, number = electrode(of)
+    again = not of.running or of.jump or of.drift
+    used = fresh if again else found
+    good = of.fresh == "good" if again else of.found
+    factor = (used.own - state["own"])[:2]
+    # T = δᵀ (Λ⁻¹ + spread)⁻¹ δ, and the element that explains most of it alone.
+    cov = np.linalg.inv(before) + used.spread
+    inverse = np.linalg.inv(cov)
+    statistic = factor @ inverse @ factor
+    jumped = of.running and of.jump and good and bool(statistic > limit)
+    drifted = of.running and of.drift and good and not jumped
+    missed = 0 if good else of.missed + (0 if of.silent else 1)
+    lost = of.running and (missed >= PATIENCE or of.off)
+    information, pulses = before, state["pulses"]
+    if good:
+        information = used.information + (0 if again else before)
+        pulses = 1 if again else state["pulses"] + 1
+    mean, mean_cov = state["mean"], state["mean_cov"]
+    if good and not again:
+        mean, mean_cov = suspected.mean, suspected.mean_cov
+    elif good or lost:
+        mean, mean_cov = 0 * mean, 0 * mean_cov
+    begun = not of.running and of.fresh == "late"
+    which = int(np.argmax((inverse @ factor) ** 2 / np.diagonal(inverse)))
+    shown = {
+        name: state[name] if of.silent else getattr(source, name)
+        for name, source in (
+            ("level", measured),
+            ("variance", measured),
+            ("chi2", used),
+            ("rrse", used),
+        )
+    }
+    return shown | {
+        "own": used.own if good or begun else state["own"],
+        "information": 0 * before if lost else information,
+        "pulses": 0 if lost else pulses,
+        "missed": missed,
+        "amplitude": measured.amplitude,
+        "offset": measured.offset,
+        "mean": mean,
+        "mean_cov": mean_cov,
+        "event": JUMP if jumped else DRIFT if drifted else NONE,
+        "factor": factor if jumped or drifted else state["factor"],
+        "element": which if jumped else 0 if drifted else state["element"],
+        "drifted": number if drifted else state["drifted"],
+        "result": state["result"] if of.silent else used.result,
+    }
+
+
+def test_the_state_after_a_pulse_follows_its_rules_in_every_case():
+    lanes = jax.tree.map(lambda *leaves: jnp.asarray(np.stack(leaves)), *map(electrode, CASES))
+    after = jax.jit(jax.vmap(after_pulse))(ElectrodeState(**lanes[0]), *lanes[1:])
+    found = {name: np.asarray(getattr(after, name)) for name in vars(after) if name != "result"}
+    found["result"] = verdict_names(after.result)
+    wrong = []
+    for lane, of in enumerate(CASES):
+        for name, value in expected(of).items():
+            one = found[name][lane]
+            if name == "result":
+                same = one == verdict_names(value)
+            else:
+                same = np.allclose(one, value, rtol=1e-12, atol=1e-12)
+            if not same:
+                wrong.append((of, name, one, value))
+    assert not wrong, (len(wrong), wrong[:3])
+
+
+def test_what_is_known_after_a_walk_is_the_sum_of_covariances():
+    found = predicted(jnp.asarray(BEFORE), jnp.asarray(0.3))
+    inverse = np.linalg.inv(np.linalg.inv(BEFORE) + 0.3**2 * np.eye(2))
+    np.testing.assert_allclose(found, inverse, rtol=1e-12)
+
+
+@pytest.mark.parametrize("limit", [0.5, 2.0])
+def test_a_pulse_is_suspected_by_the_distance_from_its_prediction(limit):
+    """T = δᵀ (Λ⁻¹ + cov)⁻¹ δ of the fit of the pulse alone, δ = δ₊ + cov Λ δ₊."""
+    of = Case(True, True, True, True, "good", False, 0, False, False)
+    state, _, before, found, *_ = electrode(of)
+    off = (found.own - state["own"])[:2]
+    alone = off + found.spread @ before @ off
+    statistic = alone @ np.linalg.inv(np.linalg.inv(before) + found.spread) @ alone
+
+    def suspected(running, good, part):
+        pulses = {"pulses": 12 if running else 0}
+        of = ElectrodeState(**jax.tree.map(jnp.asarray, state | pulses))
+        fit = found._replace(result=GOOD if good else BAD)
+        fit = jax.tree.map(jnp.asarray, fit)
+        arguments = jnp.asarray(before), jnp.array([0.6, 0.8]), jnp.asarray(part * statistic)
+        return jax.jit(suspicion)(of, fit, *arguments)
+
+    assert bool(suspected(True, True, limit).jump) == (limit < 1)
+    assert bool(suspected(True, False, limit).jump)
+    assert not bool(suspected(True, False, limit).drift)
+    assert not bool(suspected(False, True, limit).jump)
+    assert not bool(suspected(False, False, limit).drift)
+
+
+class Minimum(NamedTuple):
+    """What is found at the minimum of a pulse."""
+
+    squares: Any
+    curvature: Any
+
+
+CURVED = np.array([[50.0, 4.0, 3.0], [4.0, 40.0, -2.0], [3.0, -2.0, 9.0]])
+
+
+@pytest.mark.parametrize(
+    ("bad", "own", "decrement", "squares", "verdict"),
+    [
+        (SUCCESSFUL, 0.1, 0.1, 3.0, SUCCESSFUL),
+        (RESULTS.saturated, 0.1, 0.1, 3.0, RESULTS.saturated),
+        (RESULTS.saturated, np.nan, 5.0, 9e9, RESULTS.saturated),
+        (SUCCESSFUL, np.nan, 5.0, 9e9, RESULTS.nonphysical),
+        (SUCCESSFUL, 0.1, 5.0, 9e9, MAX_STEPS_REACHED),
+        (SUCCESSFUL, 0.1, np.nan, 3.0, MAX_STEPS_REACHED),
+        (SUCCESSFUL, 0.1, 0.1, 9e9, RESULTS.misfit),
+        (SUCCESSFUL, 1.7, 0.1, 3.0, RESULTS.misfit),
+        (SUCCESSFUL, -1.7, 0.1, 3.0, RESULTS.misfit),
+        (SUCCESSFUL, 1.4, 0.1, 3.0, SUCCESSFUL),
+    ],
+)
+def test_the_worst_that_a_pulse_shows_is_its_verdict(
+    monkeypatch, bad, own, decrement, squares, verdict
+):
+    """Bad samples, then no number, then no minimum, then a misfit or a delay out of its range."""
+    logs = np.array([1.0, 2.0, own])
+    at = Minimum(jnp.asarray(squares), jnp.asarray(CURVED))
+    monkeypatch.setattr(
+        "etid.online.electrode.minimum",
+        lambda *_: (jnp.asarray(logs), at, jnp.asarray(decrement)),
+    )
+    unread = types.SimpleNamespace(equations=None)
+    monkeypatch.setattr("etid.online.electrode.Pulse", lambda *_: unread)
+    weight, gain = np.array([3.0, 2.0, 0.0]), np.array([1 + 1j, 2j, 5.0])
+    measured = Measured(
+        gain=jnp.asarray(gain),
+        variance=jnp.asarray(0.01),
+        weight=jnp.asarray(weight),
+        level=jnp.asarray(0.5),
+        amplitude=jnp.asarray(1.0),
+        offset=jnp.asarray(0.0),
+        steady=jnp.asarray(True),
+        bad=first_verdict((jnp.asarray(True), bad)),
+    )
+    monkeypatch.setattr(GainModel, "departure", lambda *_: jnp.zeros(3, complex))
+    model = object.__new__(GainModel)  # only these two fields are read
+    object.__setattr__(model, "bands", types.SimpleNamespace(weight=jnp.asarray(weight)))
+    object.__setattr__(model, "noise_freedom", jnp.asarray(1000.0))
+    start = LoadUnknowns.of(jnp.asarray(logs))
+    found = attempt(model, measured, start, jnp.zeros(2), jnp.zeros((2, 2)))
+    assert bool(found.result == verdict)
+    # Two bands have two numbers each, and three are fitted.
+    np.testing.assert_allclose(found.chi2, squares / (2 * 2 - 3))
+    power = (weight * abs(gain) ** 2).sum()
+    np.testing.assert_allclose(found.rrse, np.sqrt(squares * 0.01 / power))
+    told = np.linalg.inv(np.linalg.inv(CURVED)[:2, :2])  # the delay is free
+    np.testing.assert_allclose(found.information, told)
+    np.testing.assert_allclose(found.spread, np.linalg.inv(told))
