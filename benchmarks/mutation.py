@@ -60,7 +60,7 @@ TESTS: Mapping[str, Sequence[str]] = {
     "online.changes": ("electrode", "online"),
     "online.electrode": ("electrode", "online"),
     "online.gain_bands": ("gain_bands", "online"),
-    "online.tracker": ("online",),
+    "online.tracker": ("electrode", "online"),
     "results.driver": ("driver", "overview", "given_driver"),
     "results.fits": ("overview", "fit", "exporting", "recording", "identification"),
     "results.hdf5_table": ("tables", "exporting", "cli"),

@@ -130,6 +130,6 @@ def _same(before: Any, now: Number) -> bool:
     if value.dtype.kind != "f":
         return bool((was == value).all())
     allowed = now.relative * np.abs(was) + now.absolute
-    # Where the tolerance is not a number, only the digits of the file count.
-    near = np.abs(value - was) <= np.where(allowed > 0, allowed, WRITTEN * np.abs(was))
+    # Where the tolerance is smaller or not a number, only the digits of the file count.
+    near = np.abs(value - was) <= np.fmax(allowed, WRITTEN * np.abs(was))
     return bool((near | (value == was) | (np.isnan(was) & np.isnan(value))).all())

@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import scipy.stats
 
 import etid
 from benchmarks.ladder import CALIBRATION, LOADS, TRIAL, rung
@@ -37,8 +38,8 @@ def falling(load, name, share, periods=3):
     return [dataclasses.replace(load, **{name: value * (1 - part)}) for part in parts]
 
 
-def change_of(recording, scene, load, allowed=0.0):
-    """The change with the true driver and load, without any fit."""
+def prepared_change(recording, scene, load):
+    """Changes for the largest that do not matter, with the true driver and load, without a fit."""
     [of] = repeats([Inspected(recording)])
     assert of is not None
     z_th = scene.driver.z_th(of.frequency)
@@ -47,7 +48,12 @@ def change_of(recording, scene, load, allowed=0.0):
     for name in NAMES:
         more = dataclasses.replace(load, **{name: getattr(load, name) * (1 + 1e-6)})
         by.append((more(of.frequency) - z) / 1e-6 * z_th / (z * (z + z_th)))
-    found = changes.found([of], np.array([by]), np.full((1, 3), allowed))
+    return lambda allowed: changes.found([of], np.array([by]), allowed)
+
+
+def change_of(recording, scene, load, allowed=0.0):
+    """The change with the true driver and load, without any fit."""
+    found = prepared_change(recording, scene, load)(np.full((1, 3), allowed))
     return changes.Change(*(part[0] for part in found))
 
 
@@ -101,6 +107,62 @@ def test_sizes_of_changes_are_those_of_before(load):
         numbers[f"{name}_stderr"] = kept_numbers.Number(change.stderr, kept_numbers.ERRORS)
         numbers[f"{name}_seen"] = kept_numbers.Number(change.seen)
     kept_numbers.check(f"changes_{load}", numbers)
+
+
+def level(fires, low=1e-9, high=1e9):
+    """The limit, between two, up to which a test fires."""
+    assert fires(low)
+    assert not fires(high)
+    for _ in range(30):
+        middle = np.sqrt(low * high)
+        low, high = (middle, high) if fires(middle) else (low, middle)
+    return low
+
+
+def test_tests_for_changes_have_the_statistics_of_before(monkeypatch):
+    """The limits up to which each of them fires; all others are infinite then."""
+    scene, skin, numbers = rung("damp", samples=16_667), LOADS["damp"], {}
+    nothing = recorded(scene, [skin] * 5)
+    ramp = 1 + 0.002 * np.arange(nothing.v_th.size) / nothing.v_th.size
+    records = {
+        "nothing": nothing,
+        "line": recorded(scene, falling(skin, "c_p", 0.1, 5)),
+        "amplitude": nothing.replace(v_th=nothing.v_th * ramp, v_out=nothing.v_out * ramp),
+        "unloaded": nothing.replace(v_th=nothing.v_th * ramp),
+    }
+    freedoms, both = set(), {(4, 16): 0.0, (1, 64): 0.0}
+    for name, record in records.items():
+        prepared = prepared_change(record, scene, skin)
+
+        def fires(limits, allowed, prepared=prepared):
+            def threshold(freedom, count):
+                freedoms.add((freedom, count))
+                return limits.get((freedom, count), np.inf)
+
+            with monkeypatch.context() as patch:
+                patch.setattr(changes, "threshold", threshold)
+                return bool(prepared(np.array([allowed])).seen[0])
+
+        for of in both:
+            numbers[f"{name}_{of[0]}"] = level(lambda x, of=of: fires({of: x}, [0.0] * 3))
+        for i, element in enumerate(NAMES):
+            allowed = np.full(3, np.inf)
+
+            def moves(x, i=i, allowed=allowed):
+                return fires(both, np.where(np.arange(3) == i, x, allowed))
+
+            numbers[f"{name}_{element}"] = level(moves)
+        if name in ("amplitude", "unloaded"):
+            numbers[f"{name}_uneven"] = level(lambda x: fires({(1, 8): x}, [0.0] * 3))
+    assert freedoms == {(4, 16), (1, 64), (1, 8)}
+    kept = {name: kept_numbers.Number(value, 1e-2) for name, value in numbers.items()}
+    kept_numbers.check("change_limits", kept)
+
+
+def test_a_threshold_is_exceeded_as_rarely_as_it_says():
+    for freedom, count in ((1, 3), (4, 16)):
+        rare = scipy.stats.chi2.sf(changes.threshold(freedom, count), freedom)
+        np.testing.assert_allclose(rare, changes.ALARM / count, rtol=1e-6)
 
 
 def test_a_step_and_a_single_period_are_seen_as_well_as_a_line():

@@ -1,5 +1,6 @@
 """The state of one electrode after a pulse, against the same rules written for one electrode."""
 
+import dataclasses
 import itertools
 import types
 from typing import Any, NamedTuple
@@ -11,6 +12,8 @@ import pytest
 
 from etid.estimators.judgement import MAX_STEPS_REACHED, SUCCESSFUL
 from etid.estimators.unknowns import LoadUnknowns
+from etid.online import changes, tracker
+from etid.online import electrode as online
 from etid.online.changes import DRIFT, JUMP, NONE
 from etid.online.electrode import (
     PATIENCE,
@@ -18,13 +21,15 @@ from etid.online.electrode import (
     Measured,
     Suspicion,
     after_pulse,
+    anew,
     attempt,
     predicted,
     suspicion,
 )
+from etid.online.gain_bands import Bands, Gains, Seen
 from etid.online.pulse_fit import GainModel
-from etid.online.state import ElectrodeState
-from etid.results.verdicts import RESULTS, first_verdict, verdict_names
+from etid.online.state import ElectrodeState, TrackerState
+from etid.results.verdicts import RESULTS, first_verdict, verdict_names, verdicts_of
 
 NUMBER, LIMIT = 77, 10.0
 OLD, FOUND, FRESH = np.array([1.0, 2.0, 0.1]), np.array([1.1, 2.1, 0.2]), np.array([7.0, 2.2, 0.3])
@@ -270,3 +275,212 @@ def test_the_worst_that_a_pulse_shows_is_its_verdict(
     told = np.linalg.inv(np.linalg.inv(CURVED)[:2, :2])  # the delay is free
     np.testing.assert_allclose(found.information, told)
     np.testing.assert_allclose(found.spread, np.linalg.inv(told))
+
+
+# --- changes --------------------------------------------------------------------------------------
+
+
+def test_an_innovation_and_its_moving_mean_are_those_of_their_formulas():
+    d, direction = np.array([0.3, -0.2]), np.array([1.0, -2.0])
+    spread = np.linalg.inv(TOLD)
+    new = changes.Innovation.of(*map(jnp.asarray, (d, spread, BEFORE)))
+    cov = spread + np.linalg.inv(BEFORE)
+    weight = np.linalg.inv(cov)
+    np.testing.assert_allclose(new.cov, cov)
+    np.testing.assert_allclose(new.statistic(), d @ weight @ d)
+    along = direction @ weight @ d / np.sqrt(direction @ weight @ direction)
+    np.testing.assert_allclose(new.along(jnp.asarray(direction)), along)
+    mean = np.array([0.1, 0.4])
+    moving = changes.averaged(jnp.asarray(mean), jnp.asarray(BEFORE / 1e4), new)
+    np.testing.assert_allclose(moving.d, 0.9 * mean + 0.1 * d)
+    np.testing.assert_allclose(moving.cov, 0.81 * BEFORE / 1e4 + 0.01 * cov)
+    np.testing.assert_allclose(moving.weight, np.linalg.inv(moving.cov))
+
+
+LANES = 20
+SURE = changes.DRIVER * 1.709 / np.sqrt(LANES) - 1.282  # nine tenths of z beyond it: the driver
+
+
+@pytest.mark.parametrize(
+    ("z", "jumps", "counted", "expected"),
+    [
+        (0.0, 0, LANES, False),
+        (SURE + 0.01, 0, LANES, True),
+        (SURE - 0.01, 0, LANES, False),
+        (-SURE - 0.01, 0, LANES, True),
+        (-SURE + 0.01, 0, LANES, False),
+        (0.0, LANES // 2, LANES, False),
+        (0.0, LANES // 2 + 1, LANES, True),
+        (0.0, 4, changes.COMMON, False),
+        (0.0, 5, changes.COMMON, True),
+        (0.0, 7, changes.COMMON - 1, False),
+        (99.0, 0, changes.COMMON, True),
+        (99.0, 0, changes.COMMON - 1, False),
+        (99.0, 0, 0, False),
+    ],
+)
+@pytest.mark.parametrize("test", [0, 1])
+def test_the_driver_has_changed_if_most_electrodes_move_one_way(z, jumps, counted, expected, test):
+    """Those that do not count may move or be anything; one in ten may move the other way."""
+    values = np.zeros((2, LANES))
+    values[test] = z
+    values[test, :1] = -z
+    values[:, counted:] = -99.0
+    values[test, counted + 1 :] = np.nan
+    jumped, counts = np.arange(LANES) < jumps, np.arange(LANES) < counted
+    jumped[counted:] = True
+    found = changes.driver_change(*map(jnp.asarray, (jumped, values, counts)))
+    assert bool(found) == expected
+
+
+def state_of(**fields: Any) -> TrackerState:
+    """A state after pulse 100 of as many electrodes as a field has."""
+    count = max(len(value) for value in fields.values())
+    one = electrode(Case(True, False, False, True, "good", False, 0, False, False))[0]
+    lanes: dict[str, Any] = {
+        name: jnp.asarray(np.stack([value] * count))
+        for name, value in one.items()
+        if name != "result"
+    }
+    verdicts = fields.pop("verdicts", ["successful"] * count)
+    lanes["result"] = jax.tree.map(jnp.asarray, verdicts_of(np.array(verdicts)))
+    lanes |= {name: jnp.asarray(value) for name, value in fields.items()}
+    no = jnp.asarray(False)
+    return TrackerState(ElectrodeState(**lanes), jnp.asarray(100), no, no)
+
+
+def test_what_a_pulse_has_shown_is_listed():
+    factor = np.log([[2.0, 3.0], [4.0, 5.0], [6.0, 7.0]])
+    state = state_of(
+        event=np.array([NONE, JUMP, DRIFT]), element=np.array([0, 1, 0]), factor=factor
+    )
+    jump, drift = changes.changes(state, ("r_s", "r_p"))
+    assert (jump.pulse, jump.electrode, jump.kind, jump.element) == (100, 1, "jump", "r_p")
+    assert (drift.electrode, drift.kind, drift.element) == (2, "drift", "r_s")
+    np.testing.assert_allclose([jump.factor, drift.factor], [5.0, 6.0])
+    driver = dataclasses.replace(state, driver_event=jnp.asarray(True))
+    [found] = changes.changes(driver, ("r_s", "r_p"))
+    assert (found.pulse, found.electrode, found.kind, found.element) == (100, None, "driver", "")
+    assert np.isnan(found.factor)
+
+
+def test_an_electrode_that_cannot_be_used_has_the_first_reason_that_applies():
+    last = 100 - changes.RECENT
+    cases = [  # level, impedance, pulses, drifted, verdict, reason
+        (0.5, 1e3, 9, -1, "successful", None),
+        (0.5, 1e3, 9, -1, "unconnected", "open"),
+        (0.0199, 1e3, 9, -1, "unconnected", "open"),
+        (0.0199, 1e3, 0, -1, "flat", "shorted"),
+        (0.0201, 1e3, 0, -1, "flat", None),
+        (0.5, 701e3, 1, -1, "misfit", "dry"),
+        (0.5, 699e3, 1, -1, "misfit", None),
+        (0.5, 701e3, 0, -1, "misfit", None),
+        (0.5, 1e3, 9, last, "successful", None),
+        (0.5, 1e3, 9, last + 1, "successful", "drifting"),
+        (0.5, 701e3, 9, 100, "successful", "dry"),
+    ]
+    level, impedance, pulses, drifted, verdicts, reasons = map(list, zip(*cases, strict=True))
+    state = state_of(
+        level=np.array(level), pulses=np.array(pulses), drifted=np.array(drifted), verdicts=verdicts
+    )
+    found = changes.bad_electrodes(state, np.array(impedance))
+    assert found == {number: why for number, why in enumerate(reasons) if why}
+    early = dataclasses.replace(state, number=jnp.asarray(5))  # none has drifted yet
+    early = changes.bad_electrodes(
+        dataclasses.replace(
+            early,
+            electrodes=state_of(drifted=np.array([-1, 0]), pulses=np.array([1, 1])).electrodes,
+        ),
+        np.array([1e3, 1e3]),
+    )
+    assert early == {1: "drifting"}
+
+
+# --- what a pulse shows ---------------------------------------------------------------------------
+
+
+def test_the_size_of_a_pulse_and_its_samples_are_judged_by_the_rules(monkeypatch):
+    """Level, offset and amplitude, and the first verdict that applies, from the measured gains."""
+    weight = np.array([3.0, 2.0, 0.0])
+    rows = [  # amplitude, amplitude before, mean, gain, variance, clipped, offset before, verdict
+        (1.0, 1.0, 0.1, 0.5, 1e-3, False, 0.2, "successful"),
+        (2.0, 1.0, 0.1, 0.5, 1e-3, False, 0.2, "successful"),
+        (2.0, np.nan, 0.1, 0.5, 1e-3, False, 0.2, "successful"),
+        (1.0, 0.905, 0.1, 0.5, 1e-3, False, 0.2, "successful"),
+        (1.0, 0.895, 0.1, 0.5, 1e-3, False, 0.2, "successful"),
+        (1.0, 1.0, 0.1, 0.5, np.nan, True, 0.2, "nonfinite_samples"),
+        (1.0, 1.0, np.nan, 0.5, 1e-3, True, 0.2, "nonfinite_samples"),
+        (1.0, 2.0, 0.1, 0.5, 1e-3, True, np.nan, "saturated"),
+        (1.0, 2.0, 0.1, 1e-3, 1e-1, False, np.nan, "too_short"),
+        (1.0, 1.0, 0.1, 1e-3, 1e-1, False, 0.2, "flat"),
+        (0.0, 1.0, 0.1, 0.995, 1e-3, False, 0.2, "flat"),
+        (1.0, 1.0, 0.1, 0.9902, 1e-6, False, 0.2, "unconnected"),
+        (1.0, 1.0, 0.1, 0.9898, 1e-6, False, 0.2, "successful"),
+        (1.0, 1.0, 0.1, 1.0098, 1e-6, False, 0.2, "unconnected"),
+        (1.0, 1.0, 0.1, 1.0102, 1e-6, False, 0.2, "successful"),
+        (4.0, 4.0, 0.1, 4 * 0.9902, 1e-6, False, 0.2, "unconnected"),
+        (1.0, 1.0, 0.1, np.sqrt(3.99e-2 * 4 / 5), 1e-2, False, 0.2, "flat"),
+        (1.0, 1.0, 0.1, np.sqrt(4.01e-2 * 4 / 5), 1e-2, False, 0.2, "successful"),
+    ]
+    columns = [np.array(column) for column in zip(*rows, strict=True)]
+    amplitude, before, mean, gain, variance, clipped, offset, verdict = columns
+    used = []
+
+    def measure(self, seen, lacking, offset):
+        used.append((np.asarray(lacking), np.asarray(offset)))
+        wide = jnp.asarray(gain[:, None] * np.exp(1j * np.arange(3))[None, :])
+        return Gains(wide, jnp.asarray(variance), jnp.ones((len(rows), 3)))
+
+    monkeypatch.setattr(Bands, "measure", measure)
+    bands = object.__new__(Bands)  # only its weights are read
+    object.__setattr__(bands, "weight", jnp.asarray(weight))
+    zero = np.zeros(len(rows))
+    seen = Seen(np.zeros((len(rows), 6)), mean, zero, zero, variance, clipped)
+    state = state_of(amplitude=before, offset=offset).electrodes
+    found = tracker._measured(bands, seen, jnp.asarray(amplitude), state)
+    relative = np.where(amplitude > 0, amplitude, 1.0)
+    lacking = np.where(np.isnan(before), 0.0, (relative - before) / relative)
+    steady = abs(lacking) < tracker.STEADY
+    known = np.where(np.isfinite(mean) & np.isfinite(variance) & steady, mean, offset)
+    np.testing.assert_allclose(used[0][0], lacking)
+    np.testing.assert_allclose(used[0][1], np.where(np.isnan(known), 0.0, known))
+    np.testing.assert_array_equal(found.steady, steady)
+    np.testing.assert_array_equal(found.offset, known)
+    np.testing.assert_array_equal(found.amplitude, amplitude)
+    np.testing.assert_allclose(found.variance, variance / relative**2)
+    np.testing.assert_allclose(found.weight, np.repeat(relative[:, None] ** 2, 3, axis=1))
+    np.testing.assert_allclose(abs(np.asarray(found.gain))[:, 0], gain / relative)
+    # Two bands tell something, each by two numbers.
+    power = np.maximum(gain**2 * weight.sum() - 4 * variance, 0.0) / weight.sum()
+    np.testing.assert_allclose(found.level, np.sqrt(power) / relative)
+    assert verdict_names(found.bad).tolist() == verdict.tolist()
+
+
+@pytest.mark.parametrize(
+    ("spread", "result", "verdict"),
+    [
+        ([0.5, 0.9], GOOD, "successful"),
+        ([0.5, 1.1], GOOD, "insensitive"),
+        ([1.1, 0.5], GOOD, "insensitive"),
+        ([np.nan, 0.5], GOOD, "insensitive"),
+        ([1.1, 0.5], BAD, "misfit"),
+    ],
+)
+def test_a_pulse_alone_tells_elements_or_says_that_it_does_not(
+    monkeypatch, spread, result, verdict
+):
+    zero, two = jnp.zeros(()), jnp.zeros(2)
+    start = LoadUnknowns(two, zero)
+    monkeypatch.setattr(online, "nearest", lambda *_: (start, zero))
+    monkeypatch.setattr(online, "searched", lambda *_: jnp.zeros(3))
+    monkeypatch.setattr(online, "Pulse", lambda *_: types.SimpleNamespace(equations=None))
+    monkeypatch.setattr(GainModel, "departure", lambda *_: jnp.zeros(3, complex))
+    fit = ATTEMPT(
+        jnp.zeros(3), two, jnp.diag(jnp.array(spread)), zero, zero,
+        first_verdict((jnp.asarray(True), result)),
+    )  # fmt: skip
+    monkeypatch.setattr(online, "attempt", lambda *_: fit)
+    measured = MEASURED(jnp.zeros(3, complex), zero, jnp.ones(3), *[zero] * 5)
+    model = object.__new__(GainModel)
+    found = anew(model, measured, jnp.zeros((1, 2)), jnp.asarray(True), two)
+    assert str(verdict_names(found.result)) == verdict

@@ -15,12 +15,14 @@ from etid.circuits.circuit import SkinRC
 from etid.circuits.elements import resistor
 from etid.estimators import registry
 from etid.estimators.lanes import Harmonics
+from etid.estimators.maximum_likelihood import load
 from etid.estimators.maximum_likelihood import terms as likelihood
 from etid.estimators.maximum_likelihood.load import Load
 from etid.estimators.registry import MAXIMUM_LIKELIHOOD
 from etid.identify import arguments, batches, one
 from etid.identify.one import known_at, known_of, skin_lane
 from etid.recordings.preflight import Inspected
+from etid.signals.harmonics import Spectrum
 from etid.simulation.scenes import Scene, Trial
 from etid.simulation.transformer import ResistorLoad, SkinLoad
 from tests import kept_numbers
@@ -108,6 +110,31 @@ def test_what_is_known_of_a_driver_is_kept(study, driver, monkeypatch):
     first, second = (etid.identify_skin(study["loaded/0"], other) for _ in range(2))
     assert len(computed) == 1
     np.testing.assert_array_equal(first.cov, second.cov)
+
+
+@pytest.mark.parametrize(
+    ("starts", "best"),
+    [
+        ([1.0, 2.0, 0.5, 3.0], 3.0),  # 9 is less than 4 times the 10 numbers of 5 harmonics
+        ([7.0, 9.0, 6.4, 6.2], 6.2),
+        ([1.0, 2.0, 0.5, 6.4], 0.5),
+        ([0.5, 2.0, 7.0, 6.4], 0.5),
+        ([7.0, 9.0, 8.0, 6.4], 6.4),
+        ([1.0, 2.0, 0.5, np.nan], 0.5),
+        ([np.nan, 7.0, np.nan, np.nan], 7.0),
+        ([np.inf, np.nan, 8.0, 9.0], 8.0),
+        ([8.0], 8.0),
+    ],
+)
+def test_the_likeliest_start_is_taken_unless_it_is_bad(monkeypatch, starts, best):
+    monkeypatch.setattr(load.Load, "__call__", lambda _, q: q)  # Σ r² is q²
+    of = object.__new__(load.Load)
+    line = jnp.ones(8)
+    wave = line.astype(complex)
+    spectrum = Spectrum(line, wave, wave, line, line, jnp.arange(8) < 5)
+    for name, value in {"gain": None, "spectrum": spectrum, "unloaded": None}.items():
+        object.__setattr__(of, name, value)
+    assert float(load._chosen(of, jnp.array(starts)[:, None])[0]) == best
 
 
 def test_the_gain_is_that_of_the_divider(driver):
