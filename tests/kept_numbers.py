@@ -49,7 +49,7 @@ def of_fit(fit: Fit) -> dict[str, Number]:
     change, change_stderr = fit.known_changes
     found = {
         "verdict": Number(np.asarray(fit.verdict)),
-        "method": Number(np.asarray(fit.method)),
+        "method": Number(fit.method.partition("(")[0]),  # without numbers
         "elements": Number(values, absolute=SHIFT * errors),
         "stderr": Number(errors, ERRORS),
         "correlation": Number(fit.correlation, absolute=4 * ERRORS),
