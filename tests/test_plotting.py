@@ -231,12 +231,14 @@ def test_given_axes_are_drawn_on_and_returned(driver):
 def test_without_axes_it_is_a_figure_of_pyplot_and_figure_of_is_none(recording, monkeypatch):
     import matplotlib.pyplot as plt
 
+    before = plt.get_fignums()
     figure_of(recording)
-    assert plt.get_fignums() == []
+    assert plt.get_fignums() == before
     monkeypatch.setattr(plt, "show", lambda: None)
     axes = etid.plot(recording)
-    assert plt.figure(plt.get_fignums()[0]) is axes[0].figure
-    plt.close("all")
+    [new] = set(plt.get_fignums()) - set(before)
+    assert plt.figure(new) is axes[0].figure
+    plt.close(new)
 
 
 def test_what_cannot_be_drawn_is_refused(recording, driver):
