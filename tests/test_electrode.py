@@ -27,7 +27,7 @@ from etid.online.electrode import (
     suspicion,
 )
 from etid.online.gain_bands import Bands, Gains, Seen
-from etid.online.pulse_fit import GainModel
+from etid.online.pulse_fit import Expected, GainModel
 from etid.online.state import ElectrodeState, TrackerState
 from etid.results.verdicts import RESULTS, first_verdict, verdict_names, verdicts_of
 
@@ -248,8 +248,7 @@ def test_the_worst_that_a_pulse_shows_is_its_verdict(
         "etid.online.electrode.minimum",
         lambda *_: (jnp.asarray(logs), at, jnp.asarray(decrement)),
     )
-    unread = types.SimpleNamespace(equations=None)
-    monkeypatch.setattr("etid.online.electrode.Pulse", lambda *_: unread)
+    monkeypatch.setattr("etid.online.electrode.Pulse", lambda *_: None)
     weight, gain = np.array([3.0, 2.0, 0.0]), np.array([1 + 1j, 2j, 5.0])
     measured = Measured(
         gain=jnp.asarray(gain),
@@ -266,7 +265,9 @@ def test_the_worst_that_a_pulse_shows_is_its_verdict(
     object.__setattr__(model, "bands", types.SimpleNamespace(weight=jnp.asarray(weight)))
     object.__setattr__(model, "noise_freedom", jnp.asarray(1000.0))
     start = LoadUnknowns.of(jnp.asarray(logs))
-    found = attempt(model, measured, start, jnp.zeros(2), jnp.zeros((2, 2)))
+    none = jnp.zeros(3, complex)
+    expected = Expected(none, jnp.zeros((2, 3), complex), none)
+    found = attempt(model, measured, start, expected, jnp.zeros(2), jnp.zeros((2, 2)))
     assert bool(found.result == verdict)
     # Two bands have two numbers each, and three are fitted.
     np.testing.assert_allclose(found.chi2, squares / (2 * 2 - 3))
@@ -470,11 +471,11 @@ def test_a_pulse_alone_tells_elements_or_says_that_it_does_not(
     monkeypatch, spread, result, verdict
 ):
     zero, two = jnp.zeros(()), jnp.zeros(2)
-    start = LoadUnknowns(two, zero)
-    monkeypatch.setattr(online, "nearest", lambda *_: (start, zero))
+    monkeypatch.setattr(online, "nearest_delay", lambda *_: (zero, zero))
     monkeypatch.setattr(online, "searched", lambda *_: jnp.zeros(3))
-    monkeypatch.setattr(online, "Pulse", lambda *_: types.SimpleNamespace(equations=None))
-    monkeypatch.setattr(GainModel, "departure", lambda *_: jnp.zeros(3, complex))
+    monkeypatch.setattr(online, "Pulse", lambda *_: types.SimpleNamespace(equations_at=None))
+    for name in ("departure", "undelayed", "expected"):
+        monkeypatch.setattr(GainModel, name, lambda *_: jnp.zeros(3, complex))
     fit = ATTEMPT(
         jnp.zeros(3), two, jnp.diag(jnp.array(spread)), zero, zero,
         first_verdict((jnp.asarray(True), result)),

@@ -133,9 +133,10 @@ def driver_change(
     """
     number = jnp.sum(counts, dtype=float)
     limit = DRIVER * 1.709 / jnp.sqrt(jnp.maximum(number, 1.0)) - 1.282
-    z = jnp.where(counts[None, :] & jnp.isfinite(z), z, jnp.nan)
-    low, high = jnp.nanquantile(z, 0.1, axis=1), jnp.nanquantile(z, 0.9, axis=1)
-    moved = jnp.any((low > limit) | (high < -limit))
+    above, below = (
+        jnp.sum(counts[None, :] & of, axis=1, dtype=float) for of in (z > limit, z < -limit)
+    )
+    moved = jnp.any(jnp.maximum(above, below) >= jnp.floor(0.9 * number))
     return (number >= COMMON) & (moved | (jnp.sum(jumped & counts, dtype=float) > number / 2))
 
 

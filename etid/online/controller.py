@@ -222,14 +222,14 @@ class Controller(Overviewed, eqx.Module):
             raise ValueError(f"{given} is wanted; it must be finite and not negative")
         wanted = given if current is None else given * self.model.phase
         wanted = np.broadcast_to(wanted, (self.tracker.electrodes,))
-        found = jax.tree.map(np.asarray, _commanded(self, state, jnp.asarray(wanted)))
+        found = jax.tree.map(np.asarray, _commanded(self, state, wanted))
         reason = np.array(REASONS)[found.reason]
         return Command(found.amplitude, found.charge, found.charge_stderr, found.peak, reason)
 
 
 @jax.jit  # as `etid.online.tracker`
 def _commanded(
-    controller: Controller, state: TrackerState, wanted: Float[Array, " lane"]
+    controller: Controller, state: TrackerState, wanted: Float[Array | np.ndarray, " lane"]
 ) -> _Commands:
     usable = (controller.tracker.driver_result == SUCCESSFUL) & ~state.driver_changed
     return jax.vmap(lambda lane, want: _electrode(controller, lane, want, usable))(

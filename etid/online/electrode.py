@@ -9,7 +9,16 @@ from jaxtyping import Array, Bool, Complex, Float, Int
 from etid.estimators.judgement import MAX_STEPS_REACHED, SUCCESSFUL, misses
 from etid.estimators.unknowns import LoadUnknowns
 from etid.online.changes import DRIFT, JUMP, NONE, Innovation, averaged
-from etid.online.pulse_fit import DELAYS, SETTLED, GainModel, Pulse, minimum, nearest, searched
+from etid.online.pulse_fit import (
+    DELAYS,
+    SETTLED,
+    Expected,
+    GainModel,
+    Pulse,
+    minimum,
+    nearest_delay,
+    searched,
+)
 from etid.online.state import ElectrodeState
 from etid.results.verdicts import RESULTS, first_verdict
 from etid.signals.transfer import power
@@ -76,6 +85,7 @@ def attempt(
     model: GainModel,
     measured: Measured,
     start: LoadUnknowns,
+    expected: Expected,
     centre: Float[Array, " element"],
     information: Float[Array, "element element"],
 ) -> Attempt:
@@ -85,12 +95,13 @@ def attempt(
         model: Model of the gain.
         measured: The pulse.
         start: Elements and delay at which the fit begins.
+        expected: The gain of these elements.
         centre: Predicted logarithms of the elements.
         information: Inverse covariance of `centre`.
     """
-    gain = measured.gain - model.departure(start)
+    gain = measured.gain - model.departure(expected, start.delay_samples)
     pulse = Pulse(model, gain, measured.weight, centre, information)
-    own, at, decrement = minimum(pulse.equations, start.vector())
+    own, at, decrement = minimum(pulse, start, expected)
     weight = model.bands.weight
     freedom = 2 * jnp.sum(weight > 0, dtype=at.squares.dtype) - own.size
     chi2 = at.squares / freedom
@@ -115,12 +126,21 @@ def tracked(
     model: GainModel,
     state: ElectrodeState,
     measured: Measured,
+    expected: Expected,
     information: Float[Array, "element element"],
 ) -> Attempt:
-    """The fit of a pulse, with the prediction from the pulses before it."""
+    """The fit of a pulse, with the prediction from the pulses before it.
+
+    Args:
+        model: Model of the gain.
+        state: State before the pulse.
+        measured: The pulse.
+        expected: The gain of the predicted elements.
+        information: Λ⁻.
+    """
     logs = LoadUnknowns.of(state.own).log_elements
-    start, _ = nearest(model, measured.gain, logs[None, :])
-    return attempt(model, measured, start, logs, information)
+    delay, _ = nearest_delay(model, measured.gain, expected.gain)
+    return attempt(model, measured, LoadUnknowns(logs, delay), expected, logs, information)
 
 
 def anew(
@@ -139,12 +159,17 @@ def anew(
         wanted: Whether the result is used; otherwise the search ends at once.
         logs: One more start: a search that has not settled continues with the next pulse.
     """
-    start, _ = nearest(model, measured.gain, jnp.concatenate([starts, logs[None, :]]))
+    logs = jnp.concatenate([starts, logs[None, :]])
+    gains = jax.vmap(model.undelayed)(logs)
+    delays, distances = jax.vmap(lambda one: nearest_delay(model, measured.gain, one))(gains)
+    number = jnp.argmin(distances)
+    start, delay = logs[number], delays[number]
     nothing = jnp.zeros((starts.shape[1], starts.shape[1]))
-    gain = measured.gain - model.departure(start)
-    pulse = Pulse(model, gain, measured.weight, start.log_elements, nothing)
-    own = LoadUnknowns.of(searched(pulse.equations, start.vector(), wanted))
-    found = attempt(model, measured, own, own.log_elements, nothing)
+    gain = measured.gain - model.departure(model.expected(start), delay)
+    pulse = Pulse(model, gain, measured.weight, start, nothing)
+    own = LoadUnknowns.of(searched(pulse.equations_at, LoadUnknowns(start, delay).vector(), wanted))
+    expected = model.expected(own.log_elements)
+    found = attempt(model, measured, own, expected, own.log_elements, nothing)
     unknown = ~jnp.all(jnp.diagonal(found.spread) < 1)
     result = first_verdict(
         (found.result != SUCCESSFUL, found.result), (unknown, RESULTS.insensitive)

@@ -61,6 +61,7 @@ CLEAR = 12.0  # the same relative to the noise of the unloaded pulse
 LEAD, FOLLOW = 8, 12  # blocks before the first edge and after the last that are kept as samples
 NOISE_FREQUENCIES = 6  # at which the noise of a block is measured
 QUIET = 40  # smallest number of blocks times frequencies
+TOGETHER = 25  # electrodes whose samples fit in the cache of a core and are read only once
 PRESENT = 0.5  # minimum fraction of a band's power in X that must be signal
 TAIL_SPREAD = 0.2  # of the rate of the tail, by the load, relative to that of the unloaded record
 TAIL_ERROR = 0.2  # of the tail that an amplitude lacks after it has changed
@@ -193,22 +194,27 @@ class Projection:
             v_out: One window per electrode [V].
             adc_range: Voltages at which the converter saturates [V].
         """
+        lanes = len(v_out)
+        kept = np.empty((lanes, len(self.rows)), self.rows.dtype)
+        squares, clipped = np.empty(lanes), np.zeros(lanes, bool)
+        low, high = adc_range
+        limited = np.isfinite(low) or np.isfinite(high)
         with np.errstate(invalid="ignore", over="ignore"):  # samples that are not numbers
-            kept, squares = self._condensed(v_out)
+            for first in range(0, lanes, TOGETHER):
+                of = slice(first, first + TOGETHER)
+                some = v_out[of]
+                squares[of] = self._condensed(some, kept[of])
+                if limited:
+                    clipped[of] = (some.min(axis=1) <= low) | (some.max(axis=1) >= high)
             found = (kept @ self.rows).astype(float)
         variance = np.maximum(self.samples * squares / self.freedom(), self.floor)
-        low, high = adc_range
-        clipped = np.zeros(len(v_out), bool)
-        if np.isfinite(low) or np.isfinite(high):
-            clipped = (v_out.min(axis=1) <= low) | (v_out.max(axis=1) >= high)
         return Seen(found[:, :-3], found[:, -3], found[:, -2], found[:, -1], variance, clipped)
 
     def _condensed(
-        self, v_out: Float[np.ndarray, "lane sample"]
-    ) -> tuple[Float[np.ndarray, "lane kept"], Float[np.ndarray, " lane"]]:
-        """Samples and means of blocks [V], and the sum of squares of their noise [V²]."""
+        self, v_out: Float[np.ndarray, "lane sample"], kept: Float[np.ndarray, "lane kept"]
+    ) -> Float[np.ndarray, " lane"]:
+        """Fill `kept` with samples and means of blocks [V]; the sum of squares of noise [V²]."""
         lanes = len(v_out)
-        kept = np.empty((lanes, len(self.rows)), self.rows.dtype)
         squares, at = np.zeros(lanes), 0
         for begin, end in self.pieces:
             kept[:, at : at + end - begin] = v_out[:, begin:end]
@@ -223,9 +229,11 @@ class Projection:
             )
             of = blocks @ self.within
             kept[:, at : at + count] = of[..., 0]
-            squares += np.einsum("ijk,ijk->i", of[..., 1:], of[..., 1:])
+            of[..., 0] = 0.0
+            noise = of.reshape(lanes, -1)
+            squares += np.einsum("ij,ij->i", noise, noise)
             at += count
-        return kept, squares
+        return squares
 
 
 class Gains(NamedTuple):

@@ -1,7 +1,10 @@
-"""The fit of one pulse at one electrode: the best delay of a grid, and one step from there.
+"""The fit of one pulse at one electrode: the best delay of a grid, and two steps from there.
 
 The gain in a band is Ĝ = G e^(−jωτ) + aliases + the effect of the curvature of G over the band. The
 last two terms are small. They are computed with the start values and subtracted before the fit.
+
+Both steps use the derivatives at the start. If the start is off by ε, the first step leaves an
+error of the order of ε², and the second one of ε³.
 """
 
 from collections.abc import Callable
@@ -17,6 +20,7 @@ from etid.circuits.circuit import AbstractCircuit
 from etid.estimators.estimate import DELAY_WIDTH
 from etid.estimators.unknowns import LoadUnknowns
 from etid.online.gain_bands import Bands
+from etid.signals.harmonics import real_parts
 from etid.signals.transfer import as_complex, power, reciprocal
 from etid.solvers.matrices import inverse_of_few
 
@@ -31,6 +35,20 @@ SETTLED = 1.0  # distance to the minimum before the last step [standard errors o
 def _unit(angle: Float[Array, "..."]) -> Complex[Array, "..."]:
     """e^(j angle)."""
     return jax.lax.complex(jnp.cos(angle), jnp.sin(angle))
+
+
+class Expected(NamedTuple):
+    """What a load makes of the pulse, without a delay.
+
+    Attributes:
+        gain: G in each band.
+        slope: Its derivatives with respect to the logarithms of the elements.
+        aliased: Aliases, for a delay of 0.
+    """
+
+    gain: Complex[Array, "*lane band"]
+    slope: Complex[Array, "*lane element band"]
+    aliased: Complex[Array, "*lane band"]
 
 
 class GainModel(eqx.Module):
@@ -69,10 +87,8 @@ class GainModel(eqx.Module):
         freedom = jnp.asarray(float(noise_freedom))
         return cls(circuit, bands, source, source_alias, turn, turns, freedom)
 
-    def gain(
-        self, logs: Float[Array, " element"]
-    ) -> tuple[Complex[Array, " band"], Complex[Array, "element band"]]:
-        """G and its derivatives with respect to the logarithms of the elements."""
+    def expected(self, logs: Float[Array, " element"]) -> "Expected":
+        """The gain of a load, and its derivatives."""
 
         def load(logs: Float[Array, " element"]) -> Complex[Array, " band"]:
             return self.circuit.with_log_values(logs).response(self.bands.frequency)
@@ -80,15 +96,17 @@ class GainModel(eqx.Module):
         z = load(logs)
         by_element = jax.vmap(lambda v: jax.jvp(load, (logs,), (v,))[1])(jnp.eye(logs.size))
         admittance = reciprocal(z + self.source)
-        return z * admittance, by_element * (self.source * admittance * admittance)[None, :]
-
-    def departure(self, own: LoadUnknowns) -> Complex[Array, " band"]:
-        """Ĝ − G e^(−jωτ): aliases, and the effect of the curvature of G over a band."""
-        load, delay = self.circuit.with_log_values(own.log_elements), own.delay_samples
-        above = load.response(self.bands.sample_rate - self.bands.frequency)
+        slope = by_element * (self.source * admittance * admittance)[None, :]
+        above = self.circuit.with_log_values(logs).response(
+            self.bands.sample_rate - self.bands.frequency
+        )
         aliased = jnp.conj(above * reciprocal(above + self.source_alias)) * self.bands.alias
-        departure = aliased * _unit(2 * jnp.pi * delay)
-        departure = departure + self.bands.departure(self.undelayed(own.log_elements), delay)
+        return Expected(z * admittance, slope, aliased)
+
+    def departure(self, at: "Expected", delay: Float[Array, ""]) -> Complex[Array, " band"]:
+        """Ĝ − G e^(−jωτ): aliases, and the effect of the curvature of G over a band."""
+        departure = at.aliased * _unit(2 * jnp.pi * delay)
+        departure = departure + self.bands.departure(at.gain, delay)
         return departure * jnp.conj(self.turned(delay))
 
     def turned(self, delay: Float[Array, ""]) -> Complex[Array, " band"]:
@@ -100,43 +118,39 @@ class GainModel(eqx.Module):
         sine = angle * (1 - square / 6 * (1 - square / 20 * (1 - square / 42)))
         return self.turns[near] * jax.lax.complex(cosine, sine)
 
-    def distances(
-        self, gain: Complex[Array, " band"], expected: Complex[Array, " band"]
-    ) -> Float[Array, " delay"]:
-        """Weighted squared distance of `gain` from `expected` for each delay of `DELAYS`.
-
-        A constant is left out: the weighted square of `gain`.
-        """
-        product = as_complex(self.bands.weight) * jnp.conj(expected) * gain
-        parts = jnp.concatenate([product.real, -product.imag])
-        turns = jnp.concatenate([self.turns.real, self.turns.imag], axis=1)
-        return jnp.sum(self.bands.weight * power(expected)) - 2 * turns @ parts
-
     def undelayed(self, logs: Float[Array, " element"]) -> Complex[Array, " band"]:
         """The gain without a delay."""
         z = self.circuit.with_log_values(logs).response(self.bands.frequency)
         return z * reciprocal(z + self.source)
 
 
-def nearest(
-    model: GainModel, gain: Complex[Array, " band"], logs: Float[Array, "start element"]
-) -> tuple[LoadUnknowns, Float[Array, ""]]:
-    """The start whose gain is nearest to `gain`, with its delay [samples], and the distance."""
-    distances = jax.vmap(lambda one: model.distances(gain, model.undelayed(one)))(logs)
-    best = jnp.argmin(distances)
-    start, at = best // DELAYS.size, best % DELAYS.size
-    # A parabola through three distances: a step of the grid, 0.1 samples, is a hundred standard
+def nearest_delay(
+    model: GainModel, gain: Complex[Array, " band"], expected: Complex[Array, " band"]
+) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    """The delay at which an expected gain is nearest to `gain` [samples], and the distance there.
+
+    The distance is weighted and squared, without a constant: the weighted square of `gain`.
+    """
+    product = as_complex(model.bands.weight) * jnp.conj(expected) * gain
+    turns = jnp.concatenate([model.turns.real, -model.turns.imag], axis=1)
+    alike = turns @ jnp.concatenate([product.real, product.imag])
+    largest = alike.max()
+    # XLA takes five times as long for the argument of a maximum.
+    at = jnp.min(jnp.where(alike == largest, jnp.arange(DELAYS.size), DELAYS.size - 1))
+    # A parabola through three values: a step of the grid, 0.1 samples, is a hundred standard
     # errors.
-    around = distances[start, jnp.clip(at, 1, DELAYS.size - 2) + jnp.arange(-1, 2)]
+    around = alike[jnp.clip(at, 1, DELAYS.size - 2) + jnp.arange(-1, 2)]
     curved = around[0] - 2 * around[1] + around[2]
     delay = DELAYS[0] + STEP * (at.astype(around.dtype) + 0.5 * (around[0] - around[2]) / curved)
-    inside = (at > 0) & (at < DELAYS.size - 1) & (curved > 0)
-    delay = jnp.where(inside, delay, jnp.asarray(DELAYS)[at])
-    return LoadUnknowns(logs[start], delay), distances.reshape(-1)[best]
+    inside = (at > 0) & (at < DELAYS.size - 1) & (curved < 0)
+    distance = jnp.sum(model.bands.weight * power(expected)) - 2 * largest
+    return jnp.where(inside, delay, jnp.asarray(DELAYS)[at]), distance
 
 
 class Equations(NamedTuple):
     """Normal equations of a pulse and of the prior from the pulses before it.
+
+    `J` are the derivatives of the residual r.
 
     Attributes:
         objective: Σ r² of pulse and prior.
@@ -164,21 +178,37 @@ class _Search(NamedTuple):
 
 
 def minimum(
-    equations: Callable[[Float[Array, " own"]], Equations], start: Float[Array, " own"]
+    pulse: "Pulse", start: LoadUnknowns, expected: Expected
 ) -> tuple[Float[Array, " own"], Equations, Float[Array, ""]]:
-    """One Gauss-Newton step; near the minimum one more.
+    """One Gauss-Newton step; near the minimum one more, with the same derivatives.
+
+    Args:
+        pulse: The objective.
+        start: Where to begin.
+        expected: The gain at `start`.
 
     Returns:
         The parameters after these steps, the last normal equations that were accepted, and the
         reduction of Σ r² that these predict.
     """
-    before = equations(start)
-    trial = start - inverse_of_few(before.matrix) @ before.gradient
-    after = equations(trial)
-    better = after.objective <= before.objective
-    own = jnp.where(better, trial, start)
-    at = jax.tree.map(lambda new, old: jnp.where(better, new, old), after, before)
-    step = inverse_of_few(at.matrix) @ at.gradient
+    own = start.vector()
+    jacobian = pulse.jacobian(expected)
+    before = pulse.equations(start, jacobian, expected.gain)
+    inverse = inverse_of_few(before.matrix)
+    trial = own - inverse @ before.gradient
+    reached = LoadUnknowns.of(trial)
+    residual = pulse.residual(pulse.model.undelayed(reached.log_elements), reached.delay_samples)
+    pull = pulse.pull(reached)
+    squares = jnp.dot(residual, residual)
+    objective = squares + jnp.dot(pull, pulse.off(reached))
+    better = objective <= before.objective
+    own = jnp.where(better, trial, own)
+    at = before._replace(
+        objective=jnp.where(better, objective, before.objective),
+        squares=jnp.where(better, squares, before.squares),
+        gradient=jnp.where(better, jacobian @ residual + pull, before.gradient),
+    )
+    step = inverse @ at.gradient
     decrement = jnp.dot(step, at.gradient)
     own = jnp.where(decrement < SETTLED**2, own - step, own)
     return own, at, decrement
@@ -225,13 +255,6 @@ def searched(
     return jax.lax.while_loop(going, stepped, first).own
 
 
-def _products(
-    a: Complex[Array, "row band"], b: Complex[Array, "column band"]
-) -> Float[Array, "row column"]:
-    """Scalar products of rows: the real part of a bᴴ."""
-    return a.real @ b.real.T + a.imag @ b.imag.T
-
-
 class Pulse(eqx.Module):
     """The objective for one electrode at one pulse.
 
@@ -249,43 +272,58 @@ class Pulse(eqx.Module):
     centre: Float[Array, " element"]
     information: Float[Array, "element element"]
 
-    def rows(
-        self, q: Float[Array, " own"]
-    ) -> tuple[Complex[Array, "element band"], Complex[Array, "2 band"]]:
-        """Residual and its derivatives [standard deviations].
-
-        Returns:
-            Derivatives with respect to the elements; the derivative with respect to the delay, and
-            the residual.
-        """
-        of, own = self.model, LoadUnknowns.of(q)
-        weight = as_complex(jnp.sqrt(self.weight))
-        model, slope = of.gain(own.log_elements)
+    def jacobian(self, expected: Expected) -> Float[Array, "own part"]:
+        """Derivatives of the residual with respect to the elements and the delay."""
+        turn = self.model.turn
         # The derivative with respect to the delay is jω Ĝ e^(jωτ). Here the model replaces Ĝ:
         # otherwise the noise of Ĝ would count as information.
-        by_delay = model * jax.lax.complex(jnp.zeros_like(of.turn), of.turn)
-        residual = self.gain * of.turned(own.delay_samples) - model
-        return -slope * weight[None, :], jnp.stack([by_delay, residual]) * weight[None, :]
+        by_delay = expected.gain * jax.lax.complex(jnp.zeros_like(turn), turn)
+        rows = jnp.concatenate([-expected.slope, by_delay[None, :]])
+        return real_parts(rows * as_complex(jnp.sqrt(self.weight))[None, :])
 
-    def equations(self, q: Float[Array, " own"]) -> Equations:
-        """Normal equations of the pulse and of the prior."""
-        # Blocks, because XLA would evaluate the model again for every row of one matrix.
-        by_element, others = self.rows(q)
-        mixed = _products(by_element, others)
-        upper = jnp.concatenate([_products(by_element, by_element), mixed], axis=1)
-        lower = jnp.concatenate([mixed.T, _products(others, others)], axis=1)
-        products = jnp.concatenate([upper, lower])
-        own = LoadUnknowns.of(q)
-        off = LoadUnknowns(own.log_elements - self.centre, own.delay_samples)
-        pull = LoadUnknowns(
-            self.information @ off.log_elements, off.delay_samples / DELAY_WIDTH**2
-        ).vector()
-        squares, curvature = products[-1, -1], products[:-1, :-1]
+    def residual(
+        self, expected: Complex[Array, " band"], delay: Float[Array, ""]
+    ) -> Float[Array, " part"]:
+        """Measured minus expected gain [standard deviations], for a delay [samples]."""
+        weight = as_complex(jnp.sqrt(self.weight))
+        return real_parts((self.gain * self.model.turned(delay) - expected) * weight)
+
+    def off(self, own: LoadUnknowns) -> Float[Array, " own"]:
+        """Distance from what is known before the pulse."""
+        return LoadUnknowns(own.log_elements - self.centre, own.delay_samples).vector()
+
+    def pull(self, own: LoadUnknowns) -> Float[Array, " own"]:
+        """Half the gradient of what is known before the pulse."""
+        at = self.information @ (own.log_elements - self.centre)
+        return LoadUnknowns(at, own.delay_samples / DELAY_WIDTH**2).vector()
+
+    def equations(
+        self,
+        own: LoadUnknowns,
+        jacobian: Float[Array, "own part"],
+        expected: Complex[Array, " band"],
+    ) -> Equations:
+        """Normal equations of the pulse and of the prior.
+
+        Args:
+            own: Where they are wanted.
+            jacobian: Derivatives of the residual there.
+            expected: Gain there.
+        """
+        residual = self.residual(expected, own.delay_samples)
+        pull, squares = self.pull(own), jnp.dot(residual, residual)
+        curvature = jacobian @ jacobian.T
         prior = jnp.pad(self.information, (0, 1)).at[-1, -1].set(1 / DELAY_WIDTH**2)
         return Equations(
-            squares + jnp.dot(pull, off.vector()),
+            squares + jnp.dot(pull, self.off(own)),
             squares,
-            products[:-1, -1] + pull,
+            jacobian @ residual + pull,
             curvature,
             curvature + prior,
         )
+
+    def equations_at(self, q: Float[Array, " own"]) -> Equations:
+        """Normal equations with the derivatives at `q`."""
+        own = LoadUnknowns.of(q)
+        expected = self.model.expected(own.log_elements)
+        return self.equations(own, self.jacobian(expected), expected.gain)

@@ -68,12 +68,11 @@ def fit_of(
     bands = model.bands
     logs = LoadUnknowns.of(state.own).log_elements
     elements = logs.size
-    gain = model.undelayed(logs)
+    expected = model.expected(logs)
     nothing = jnp.zeros((elements, elements))
     weight = bands.weight / state.variance
-    pulse = Pulse(model, jnp.zeros_like(gain), weight, logs, nothing)
-    by_element, others = pulse.rows(state.own)
-    jacobian = real_parts(jnp.concatenate([by_element, others[:1]]))
+    pulse = Pulse(model, jnp.zeros_like(expected.gain), weight, logs, nothing)
+    jacobian = pulse.jacobian(expected)
     by_term = inverse(jacobian @ jacobian.T)[:elements] @ jacobian
     # Z_th + R = e^W, so that ∂G/∂W = −Z_L (Z_th + R) / (Z_L + Z_th)².
     z = model.circuit.with_log_values(logs).response(bands.frequency)
@@ -83,7 +82,7 @@ def fit_of(
     by_z = by_w[None, :] * known.slope
     of_z = by_term @ real_parts(by_z).T
     # The noise of X is the same in every pulse. It enters Ĝ multiplied by G.
-    of_x = jnp.tile(power(gain) * bands.variance_x / state.variance, 2)
+    of_x = jnp.tile(power(expected.gain) * bands.variance_x / state.variance, 2)
     shared = of_z @ known.cov @ of_z.T + (by_term * of_x[None, :]) @ by_term.T
     cov = inverse(state.information) + shared
     relative = jnp.sqrt(jnp.diagonal(cov))

@@ -21,7 +21,8 @@ for a converter that runs freely, because its windows begin up to half a sample 
 model with one common delay would determine this delay better, but not ϑ: the information about ϑ
 is the same sum.
 
-**A pulse takes two evaluations of the model**, from the best delay of a grid. An electrode that is
+**A pulse takes two evaluations of the model**, the first with derivatives, from the best delay of
+a grid. An electrode that is
 new, or that does not fit its prediction, is fitted anew from generic start values, by up to 40
 more. `etid.online.changes` says when this is a change of the skin or of the driver.
 
@@ -40,7 +41,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from etid.circuits.circuit import AbstractCircuit
 from etid.circuits.overview import Overview, Overviewed
@@ -64,7 +65,7 @@ from etid.online.electrode import (
     tracked,
 )
 from etid.online.gain_bands import Bands, Projection, Seen, cut, unloaded_bands
-from etid.online.pulse_fit import GainModel
+from etid.online.pulse_fit import Expected, GainModel
 from etid.online.reading import fit_of
 from etid.online.state import ElectrodeState, TrackerState
 from etid.recordings.preflight import Inspected, preflight
@@ -334,7 +335,9 @@ def _updated(
     before, number = state.electrodes, state.number + 1
     measured = _measured(model.bands, seen, amplitude, before)
     information = jax.vmap(lambda of: predicted(of, change))(before.information)
-    found = jax.vmap(lambda *of: tracked(model, *of))(before, measured, information)
+    logs = LoadUnknowns.of(before.own).log_elements
+    expected = _expected(model, logs, number)
+    found = jax.vmap(lambda *of: tracked(model, *of))(before, measured, expected, information)
     common = model.circuit.scaling()[0]
     suspected = jax.vmap(lambda a, b, c: suspicion(a, b, c, common, limit))(
         before, found, information
@@ -348,7 +351,7 @@ def _updated(
         lambda *_: found,
         measured,
         wanted,
-        LoadUnknowns.of(before.own).log_elements,
+        logs,
     )
     after = jax.vmap(lambda a, b, c, d, e, f: after_pulse(a, b, c, d, e, f, limit, number))(
         before, measured, information, found, fresh, suspected
@@ -356,6 +359,24 @@ def _updated(
     counts = running & measured.steady & (measured.bad == SUCCESSFUL)
     event = driver_change(suspected.jump, suspected.z.T, counts)
     return TrackerState(after, number, event, state.driver_changed | event)
+
+
+def _expected(
+    model: GainModel, logs: Float[Array, "lane element"], number: Int[Array, ""]
+) -> Expected:
+    """The expected gains, computed once.
+
+    XLA repeats a computation in every loop that reads its result, here a dozen times. It computes
+    the result of a branch only once. `number` is positive, which XLA does not know.
+    """
+    evaluate = jax.vmap(model.expected)
+    shapes = jax.eval_shape(evaluate, logs)
+    return jax.lax.cond(
+        number > 0,
+        evaluate,
+        lambda _: jax.tree.map(lambda of: jnp.zeros(of.shape, of.dtype), shapes),
+        logs,
+    )
 
 
 def _measured(
