@@ -97,7 +97,7 @@ def scene(snr_db: float, driver: int) -> Scene:
 
 def choices(records: Sequence[etid.Recording], driver: etid.Driver) -> list[Selection]:
     """What etid chooses for each recording alone, as `select_circuit` does, in batches."""
-    found, _, _ = batches.choices(
+    found, _ = batches.choices(
         len(records), lambda row: fed(records[row], driver), CANDIDATES, Asked(), False
     )
     return found

@@ -43,8 +43,9 @@ from etid.identify.impedance import identify_impedance
 from etid.identify.jointly import identify_jointly
 from etid.identify.kramers_kronig import KramersKronig, kramers_kronig
 from etid.identify.many import identify_skins, identify_study
-from etid.identify.one import identify_samples, identify_skin
+from etid.identify.one import identify_skin
 from etid.identify.predict import predict
+from etid.identify.samples import identify_samples
 from etid.identify.selecting import select_circuit
 from etid.online.controller import Controller
 from etid.online.tracker import Tracker

@@ -400,6 +400,22 @@ def stacked(parts: Sequence[_Tree]) -> _Tree:
     return jax.tree.map(lambda *fields: np.stack(fields), *parts)
 
 
+def taken(whole: _Tree, rows: int | Sequence[int] | np.ndarray) -> _Tree:
+    """One of the lanes or fits along the leading axis, or several."""
+    return jax.tree.map(lambda leaf: np.asarray(leaf[rows]), whole)
+
+
+def replaced(whole: _Tree, rows: Sequence[int], others: _Tree) -> _Tree:
+    """The lanes or fits along the leading axis, some of them replaced."""
+
+    def one(leaf: np.ndarray, other: np.ndarray) -> np.ndarray:
+        leaf = np.array(leaf)
+        leaf[rows] = other
+        return leaf
+
+    return jax.tree.map(one, whole, others)
+
+
 def unstacked(whole: _Tree) -> list[_Tree]:
     """The lanes or fits along the leading axis, as arrays of NumPy."""
     leaves, structure = jax.tree.flatten(whole)

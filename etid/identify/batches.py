@@ -16,21 +16,23 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Int
 from tqdm import tqdm
 
 from etid.circuits.circuit import AbstractCircuit
 from etid.estimators.estimator import AbstractEstimator
-from etid.estimators.lanes import AbstractLane, stacked, unstacked
+from etid.estimators.lanes import AbstractLane, stacked, taken, unstacked
 from etid.estimators.registry import MAXIMUM_LIKELIHOOD
 from etid.identify.arguments import Asked, check_default
 from etid.identify.compiled import stored_jit
 from etid.identify.one import (
-    chosen_fits,
+    Tried,
     failed_fit,
     is_shared,
     known_of,
     note,
+    notes_of,
     refined,
     skin_lane,
 )
@@ -81,10 +83,15 @@ def each(fit: Callable[[Any], Any], lanes: Any, count: int | Int[Array, ""]) -> 
     return jax.lax.map(one, (jnp.arange(size), lanes))
 
 
-def _of_one_method(fits: Sequence[Fit], used: Sequence[str]) -> list[Fit]:
-    """The fits with one method name, because a batch has a single name: all that were used."""
-    name = joined(used)
-    return [fit if fit.method == name else dataclasses.replace(fit, method=name) for fit in fits]
+def concatenated(fits: Sequence[Fit]) -> Fit:
+    """Fits of several parts; a batch has a single name of the method: all that were used.
+
+    A recording that was refused has no χ².
+    """
+    used = [one.method for one in fits if np.isfinite(one.chi2).any()]
+    name = joined(used or [one.method for one in fits])
+    named = [one if one.method == name else dataclasses.replace(one, method=name) for one in fits]
+    return jax.tree.map(lambda *leaves: np.concatenate(leaves), *named)
 
 
 class _Prepared(NamedTuple):
@@ -167,44 +174,38 @@ class _Queue:
         """Whether a call has its lanes, or the waiting recordings take much memory."""
         return len(self.rows) == LANES or (len(self.rows) >= READ and self.held >= HELD)
 
-    def run(self) -> Iterator[tuple[int, Selection]]:
+    def run(self) -> "_Part":
         """Fit the waiting recordings and empty the queue."""
         rows, lanes, seen = self.rows, self.lanes, self.seen
         self.rows, self.lanes, self.seen, self.held = [], [], [], 0
         found = refined(lanes, seen, self._fits, self.driver, self.candidates)
         remarks = [int(one.remarks) for one in seen]
-        of_all = chosen_fits(found, self.driver, remarks, repeats(seen))
-        for row, (fits, chosen) in zip(rows, of_all, strict=True):
-            yield row, Selection.of(fits, chosen, self.candidates)
+        return _Part(rows, found.concluded(self.driver, remarks, repeats(seen)))
 
-    def _fits(self, lanes: Sequence[AbstractLane], circuit: AbstractCircuit) -> list[Fit]:
+    def _fits(self, lanes: Sequence[AbstractLane], circuit: AbstractCircuit) -> Fit:
         of = self.driver, self.known, circuit, self.estimator
         fits = jax.device_get(_chunk(filled(lanes), jnp.asarray(len(lanes)), *of))
-        return unstacked(fits)[: len(lanes)]  # without the padding
+        return taken(fits, np.arange(len(lanes)))  # without the padding
 
 
-def choices(
+class _Part(NamedTuple):
+    """Fits of some recordings, and why they were refused if they were."""
+
+    rows: list[int]
+    found: Tried
+    note: str = ""
+
+
+def _parts(
     count: int,
     load: Callable[[int], tuple[Recording, AbstractFeed]],
     candidates: Sequence[AbstractCircuit],
     asked: Asked,
     progress: bool,
-) -> tuple[list[Selection], list[str], list[str]]:
-    """A choice for each recording alone, notes, and names of the methods that were used.
-
-    Args:
-        count: Number of recordings.
-        load: Recording and driver of a row. Its error becomes the verdict of this row.
-        candidates: Circuits to choose from.
-        asked: The requested estimator.
-        progress: Show a progress bar.
-    """
-    found: dict[int, Selection] = {}
-    notes = [""] * count
-    used: list[str] = []
+) -> Iterator[_Part]:
+    """Fits of all recordings, in parts; arguments as in `choices`."""
     otherwise = str(asked.estimator or MAXIMUM_LIKELIHOOD)
     queues: dict[tuple, _Queue] = {}
-
     chunks = tuple(chunked(count))
 
     def read(number: int) -> list[tuple[int, _Prepared | Refusal]]:
@@ -215,19 +216,10 @@ def choices(
         tqdm(total=count, unit="fit", disable=not progress) as bar,
         contextlib.closing(prefetch(read, len(chunks), AHEAD)) as recordings,
     ):
-
-        def run(queue: _Queue) -> None:
-            for row, selection in queue.run():
-                found[row] = selection
-                used.append(selection.fit.method)
-                notes[row] = note(selection.fit)
-                bar.update()
-
         for row, prepared in itertools.chain.from_iterable(chunk() for chunk in recordings):
             if isinstance(prepared, Refusal):
                 fit = failed_fit(prepared.name, candidates[0], otherwise)
-                found[row] = Selection.of({0: fit}, 0, candidates)
-                notes[row] = prepared.note
+                yield _Part([row], Tried(stacked([fit])), prepared.note)
                 bar.update()
                 continue
             key = prepared.key
@@ -238,11 +230,53 @@ def choices(
             queue = queues[key]
             queue.add(row, prepared.lane, prepared.planned.seen)
             if queue.full:
-                run(queue)
+                bar.update(len(queue.rows))
+                yield queue.run()
         for queue in queues.values():
             if queue.rows:
-                run(queue)
-    return [found[row] for row in range(count)], notes, used or [otherwise]
+                bar.update(len(queue.rows))
+                yield queue.run()
+
+
+def choices(
+    count: int,
+    load: Callable[[int], tuple[Recording, AbstractFeed]],
+    candidates: Sequence[AbstractCircuit],
+    asked: Asked,
+    progress: bool,
+) -> tuple[list[Selection], list[str]]:
+    """A choice for each recording alone, and notes.
+
+    Args:
+        count: Number of recordings.
+        load: Recording and driver of a row. Its error becomes the verdict of this row.
+        candidates: Circuits to choose from.
+        asked: The requested estimator.
+        progress: Show a progress bar.
+    """
+    found: dict[int, Selection] = {}
+    notes = [""] * count
+    for part in _parts(count, load, candidates, asked, progress):
+        for number, row in enumerate(part.rows):
+            found[row] = Selection.of(part.found[number], part.found.chosen(number), candidates)
+            notes[row] = part.note or note(found[row].fit)
+    return [found[row] for row in range(count)], notes
+
+
+def _fits(
+    count: int,
+    load: Callable[[int], tuple[Recording, AbstractFeed]],
+    circuit: AbstractCircuit,
+    asked: Asked,
+    progress: bool,
+) -> tuple[Fit, list[str]]:
+    """The fit of one circuit to each recording, stacked, and notes; arguments as in `choices`."""
+    parts = list(_parts(count, load, [circuit], asked, progress))
+    of_parts = [[part.note] if part.note else notes_of(part.found.only) for part in parts]
+    order = np.argsort([row for part in parts for row in part.rows])
+    fits = taken(concatenated([part.found.only for part in parts]), order)
+    texts = list(itertools.chain.from_iterable(of_parts))
+    return fits, [texts[place] for place in order]
 
 
 def of_one_circuit(
@@ -252,8 +286,8 @@ def of_one_circuit(
     asked: Asked,
     progress: bool,
     fixed: int | None = None,
-) -> tuple[list[Fit], list[str]]:
-    """Fits and notes of recordings, all with the same circuit.
+) -> tuple[Fit, list[str]]:
+    """Fits, stacked, and notes of recordings, all with the same circuit.
 
     Args:
         count: Number of recordings.
@@ -264,15 +298,18 @@ def of_one_circuit(
         fixed: Number of the circuit, if it is chosen already. The other candidates then serve to
             find the recordings that deserve another circuit.
     """
-    found, notes, used = choices(count, load, candidates, asked, progress)
+    if len(candidates) == 1:
+        return _fits(count, load, candidates[0], asked, progress)
+    found, notes = choices(count, load, candidates, asked, progress)
     chosen = common(found, candidates) if fixed is None else fixed
     others = [row for row, one in enumerate(found) if one.chosen != chosen]
     if others:
-        of_others = [candidates[chosen]], asked, False
-        again, texts, _ = choices(len(others), lambda i: load(others[i]), *of_others)
-        for row, one, text in zip(others, again, texts, strict=True):
-            found[row], notes[row] = _otherwise(found[row], one.fit, text, chosen, candidates)
-    return _of_one_method([one.fit for one in found], used), notes
+        again, texts = _fits(
+            len(others), lambda i: load(others[i]), candidates[chosen], asked, False
+        )
+        for row, one, text in zip(others, unstacked(again), texts, strict=True):
+            found[row], notes[row] = _otherwise(found[row], one, text, chosen, candidates)
+    return concatenated([stacked([one.fit]) for one in found]), notes
 
 
 def _otherwise(

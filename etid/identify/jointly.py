@@ -26,7 +26,7 @@ from etid.estimators.estimator import serving
 from etid.estimators.joint.errors import Delay
 from etid.estimators.joint.fit import fit_alone, fit_together
 from etid.estimators.joint.terms import Joint, Loads
-from etid.estimators.lanes import AbstractLane, Harmonics, unstacked
+from etid.estimators.lanes import AbstractLane, Harmonics, stacked, unstacked
 from etid.estimators.maximum_likelihood.driver import Calibrations
 from etid.estimators.maximum_likelihood.estimator import description
 from etid.estimators.registry import MAXIMUM_LIKELIHOOD, register_description
@@ -45,7 +45,14 @@ from etid.identify.arguments import (
 from etid.identify.batches import LANES, chunked, each, filled
 from etid.identify.compiled import stored_jit
 from etid.identify.many import common_first, identify_part, table, to_identify
-from etid.identify.one import checksum, concluded, failed_fit, is_shared, note, repeated
+from etid.identify.one import (
+    checksum,
+    concluded,
+    failed_fit,
+    is_shared,
+    notes_of,
+    repeated,
+)
 from etid.identify.planning import Refusal, planned
 from etid.identify.study_drivers import Drivers
 from etid.recordings.preflight import Inspected
@@ -59,7 +66,7 @@ from etid.results.fits import Fit
 from etid.results.provenance import Settings
 from etid.results.study_fits import StudyFits
 from etid.results.tried_orders import Order
-from etid.results.verdicts import RESULTS, verdict, verdict_names
+from etid.results.verdicts import RESULTS, verdict, verdict_names, verdicts_of
 from etid.selection.delays import upper_limit
 
 METHOD = "joint"
@@ -221,7 +228,7 @@ class _Waiting:
     def run(self) -> None:
         if not self.lanes:
             return
-        starts = repeated(self.lanes, self.seen, self._alone, _late_by, _needs_another, _of_both)
+        starts = repeated(self.lanes, self.seen, self._alone, _late_by, _need_another, _of_both)
         for start, seen in zip(starts, self.seen, strict=True):
             self.remarks.append(int(seen.remarks | (Remark.mains_hum if start.hum else 0)))
         self.starts += starts
@@ -251,14 +258,15 @@ class _Waiting:
         return eqx.tree_at(lambda of: of.unloaded, loads, unloaded)
 
 
-def _late_by(lane: AbstractLane, start: _Start) -> int:
-    del lane
-    late = float(start.loads.own.delay_samples)
-    return round(late) if 1 < abs(late) < np.inf else 0  # a fit allows for one sample
+def _late_by(lanes: Sequence[AbstractLane], starts: Sequence[_Start]) -> dict[int, int]:
+    del lanes
+    late = [float(start.loads.own.delay_samples) for start in starts]
+    # A fit allows for one sample.
+    return {row: round(by) for row, by in enumerate(late) if 1 < abs(by) < np.inf}
 
 
-def _needs_another(start: _Start) -> bool:
-    return bool(start.hum) or not start.loads.used
+def _need_another(starts: Sequence[_Start]) -> list[int]:
+    return [row for row, one in enumerate(starts) if one.hum or not one.loads.used]
 
 
 def _of_both(first: _Start, second: _Start) -> _Start:
@@ -312,6 +320,8 @@ def identify_jointly(
     asked = asked_of(None, candidates, fixed, prior)
     drivers = Drivers(study, order, None)
     paths = to_identify(study)
+    if not paths:
+        raise ValueError("the study has no loaded recording")
     candidates = common_first(study, paths, drivers, candidates, asked)
     circuit = candidates[0]
     known = ElementPrior.of(asked.known, circuit) if asked.known else None
@@ -377,12 +387,11 @@ def identify_jointly(
             better = dataclasses.replace(better, result=verdict("inconsistent"))
         drivers.found[names] = better
         for group, fit in zip(lengths.values(), found, strict=True):
-            of_group = zip(unstacked(fit), group.changed, strict=True)
-            alone = [_of(one, changed) for one, changed in of_group]
+            alone = _alone_judged(fit, group.changed)
             judged = concluded(alone, better, group.remarks, group.repeats)
-            for row, one in zip(group.rows, judged, strict=True):
-                fits[row] = one
-                notes[row] = note(one)
+            of_group = zip(group.rows, unstacked(judged), notes_of(judged), strict=True)
+            for row, one, text in of_group:
+                fits[row], notes[row] = one, text
     if by_current:
         own = [paths[row] for row in by_current]
         of_each = Asked(MAXIMUM_LIKELIHOOD, asked.known)
@@ -390,7 +399,7 @@ def identify_jointly(
         as_joint = unstacked(dataclasses.replace(alone.fit, method=METHOD))
         for row, fit, text in zip(by_current, as_joint, alone.notes, strict=True):
             fits[row], notes[row] = fit, str(text)
-    ordered = [fits[row] for row in range(len(paths))]
+    ordered = stacked([fits[row] for row in range(len(paths))])
     outcome = table(study, paths, ordered, notes)
     settings = Settings.of(
         study, len(paths), order, METHOD, candidates, r_load_tolerance, known=asked.known
@@ -398,12 +407,13 @@ def identify_jointly(
     return StudyFits(outcome, drivers.found, drivers.failures, settings)
 
 
-def _of(fit: Fit, changed: bool) -> Fit:
-    """The fit without remarks; its verdict is `inconsistent` if the driver has changed."""
-    explained = changed and fit.verdict in ("successful", "misfit")
+def _alone_judged(fits: Fit, changed: Sequence[bool]) -> Fit:
+    """Fits without remarks; their verdict is `inconsistent` where the driver has changed."""
+    names = fits.verdict
+    explained = np.asarray(changed) & np.isin(names, ("successful", "misfit"))
+    result = verdicts_of(np.where(explained, "inconsistent", names))
     # The fit of each recording alone decides whether hum is left out.
-    fit = dataclasses.replace(fit, remarks=np.zeros((), int))
-    return dataclasses.replace(fit, result=verdict("inconsistent")) if explained else fit
+    return dataclasses.replace(fits, remarks=np.zeros(len(names), int), result=result)
 
 
 def _model(

@@ -6,7 +6,6 @@ from typing import Any, Literal, TypeVar, overload
 import numpy as np
 
 from etid.circuits.circuit import AbstractCircuit, SkinRC
-from etid.estimators.lanes import stacked
 from etid.estimators.registry import Method
 from etid.identify.arguments import (
     Asked,
@@ -125,8 +124,8 @@ def identify_skins(
 
     if not known:
         raise ValueError("there is no recording to identify")
-    fits, notes = of_one_circuit(len(known), load, candidates, asked, progress)
-    return Fits(stacked(fits), described(known), np.array(notes, dtype=str))
+    fit, notes = of_one_circuit(len(known), load, candidates, asked, progress)
+    return Fits(fit, described(known), np.array(notes, dtype=str))
 
 
 def identify_study(
@@ -200,7 +199,7 @@ def common_first(
     step = -(-len(paths) // SAMPLE)
     sample = paths[::step]
     load = _loader(study, sample, drivers)
-    found, *_ = choices(len(sample), load, candidates, asked, progress=False)
+    found, _ = choices(len(sample), load, candidates, asked, progress=False)
     chosen = common(found, candidates)
     return candidates[chosen], *(one for n, one in enumerate(candidates) if n != chosen)
 
@@ -217,8 +216,8 @@ def identify_part(
     if not paths:
         raise ValueError("the study has no loaded recording")
     load = _loader(study, paths, drivers)
-    fits, notes = of_one_circuit(len(paths), load, candidates, asked, progress, fixed=0)
-    return table(study, paths, fits, notes)
+    fit, notes = of_one_circuit(len(paths), load, candidates, asked, progress, fixed=0)
+    return table(study, paths, fit, notes)
 
 
 def _loader(
@@ -230,16 +229,10 @@ def _loader(
     return load
 
 
-def table(study: Study, paths: Sequence[str], fits: Sequence[Fit], notes: Sequence[str]) -> Fits:
-    """Fits of some recordings of a study, with their labels.
-
-    Raises:
-        ValueError: There is no fit.
-    """
-    if not fits:
-        raise ValueError("the study has no loaded recording")
+def table(study: Study, paths: Sequence[str], fit: Fit, notes: Sequence[str]) -> Fits:
+    """Fits of some recordings of a study, stacked, with their labels."""
     known = [_known(study, path) for path in paths]
-    return Fits(stacked(fits), described(known), np.array(notes, dtype=str))
+    return Fits(fit, described(known), np.array(notes, dtype=str))
 
 
 def _known(study: Study, path: str) -> dict[str, Any]:

@@ -3,18 +3,18 @@
 import dataclasses
 import functools
 import zlib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, Literal, TypeVar, overload
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from etid.circuits.circuit import AbstractCircuit, SkinRC
 from etid.estimators.estimator import AbstractEstimator
 from etid.estimators.judgement import MISFIT_CHI2
-from etid.estimators.lanes import AbstractLane, Harmonics, stacked, unstacked
+from etid.estimators.lanes import AbstractLane, Harmonics, replaced, stacked, taken, unstacked
 from etid.estimators.registry import Method
 from etid.identify import changes
 from etid.identify.arguments import (
@@ -23,11 +23,8 @@ from etid.identify.arguments import (
     asked_of,
     candidates_of,
     check_default,
-    estimator_of,
     fed,
-    for_samples,
     plan,
-    require,
 )
 from etid.identify.compiled import stored_jit
 from etid.recordings.preflight import Inspected, why_implausible, why_misaligned
@@ -42,13 +39,11 @@ from etid.results.verdicts import message, verdict, verdicts_of
 from etid.selection.evidence import best
 from etid.selection.search import search
 from etid.selection.selection import Selection
-from etid.signals.harmonics import whole_periods
 
 EXPLAINED = ("rate_mismatch", "misaligned", "wrong_unit")  # verdicts with numbers in the message
 SPARSE = 16  # every 16th sample enters a checksum
 KEPT = 4  # drivers, for which `known_of` is kept
 _Kind = TypeVar("_Kind", bound=AbstractCircuit)
-_Found = TypeVar("_Found")
 _Outcome = TypeVar("_Outcome", Fit, Driver)
 
 
@@ -157,13 +152,13 @@ def candidate_fits(
     lane = estimator.lane.of(seen)
     known = known_of(lane, feed, is_shared(seen, feed), estimator)
 
-    def fit(lanes: Sequence[AbstractLane], circuit: AbstractCircuit) -> list[Fit]:
+    def fit(lanes: Sequence[AbstractLane], circuit: AbstractCircuit) -> Fit:
         found = [skin(lane, feed, known, circuit, estimator) for lane in lanes]
-        return jax.device_get(found)
+        return stacked(jax.device_get(found))
 
     found = refined([lane], [seen], fit, feed, candidates)
-    [outcome] = chosen_fits(found, feed, [int(seen.remarks)], repeats([seen]))
-    return outcome
+    found = found.concluded(feed, [int(seen.remarks)], repeats([seen]))
+    return found[0], found.chosen(0)
 
 
 def successful(recording: Recording, fit: Fit) -> Fit:
@@ -178,63 +173,6 @@ def successful(recording: Recording, fit: Fit) -> Fit:
     if fit.verdict in EXPLAINED:
         why = explained(Inspected(recording), fit.verdict)
     raise IdentificationError(f"recording {recording.path!r}: {fit.verdict}. {why}", fit)
-
-
-def identify_samples(
-    v_th: Float[Array, " time"],
-    v_out: Float[Array, " time"],
-    driver: Driver,
-    *,
-    sample_rate: float,
-    pulse_rate: float,
-    resolution: float = 0.0,
-    circuit: AbstractCircuit | None = None,
-    method: Method | None = None,
-) -> Fit:
-    """`identify_skin` for plain arrays; `jax.grad`, `jax.jit` and `jax.vmap` can transform it.
-
-    The elements are differentiable with respect to both records and to every number in `driver`,
-    for example its resistors `driver.calibration.r_load`. The derivatives come from implicit
-    differentiation of the minimum. They are as accurate as the minimum itself: a thousandth of a
-    standard error. There is no pre-flight, but there is a verdict.
-
-    Args:
-        v_th: Unloaded voltage [V].
-        v_out: Loaded voltage [V].
-        driver: Identified driver.
-        sample_rate: Samples per second [Hz].
-        pulse_rate: Pulses per second [Hz].
-        resolution: Step of the converter [V] at the terminal; 0 if not known.
-        circuit: As in `identify_skin`.
-        method: As in `identify_driver`. If not given, maximum likelihood for several whole
-            periods, else output error. The function does not check that the periods begin between
-            pulses.
-
-    Returns:
-        Elements, standard errors and verdict, as arrays that JAX can trace.
-
-    Raises:
-        ValueError: The method cannot use this driver or this circuit.
-    """
-    require("driver", driver, Driver)
-    [circuit] = candidates_of(circuit)
-    estimator = estimator_of(method, [circuit])
-    periods = whole_periods(v_out.shape[0], sample_rate, pulse_rate)
-    if estimator is None:
-        estimator = for_samples(driver, periods)
-        check_default(estimator, [circuit])
-    estimator.check_driver(driver, sample_rate, pulse_rate)
-    step = jnp.asarray(resolution, dtype=v_out.dtype)
-    rate = jnp.asarray(sample_rate, dtype=v_out.dtype)
-    lane = estimator.lane.of_samples(v_th, v_out, step, rate, periods)
-    known = (
-        estimator.known(driver, jnp.asarray(lane.frequency), True)
-        if isinstance(lane, Harmonics)
-        else None
-    )
-    fit = skin_lane(lane, driver, known, circuit, estimator)
-    # No harmonic is left out here, so a remark about hum would be untrue.
-    return dataclasses.replace(fit, remarks=fit.remarks & ~int(Remark.mains_hum))
 
 
 # --- Steps that one recording and batches share ---------------------------------------------------
@@ -296,14 +234,78 @@ def _known_of(driver: _Same, frequency: bytes, shared: bool, estimator: Abstract
     return known_at(jnp.asarray(np.frombuffer(frequency)), driver.driver, shared, estimator)
 
 
+@dataclasses.dataclass
+class Tried:
+    """Fits of several recordings.
+
+    Attributes:
+        first: Fits of the first candidate to each recording, stacked.
+        own: Fits by number of the candidate, for the recordings that do not have this fit only.
+    """
+
+    first: Fit
+    own: dict[int, dict[int, Fit]] = dataclasses.field(default_factory=dict)
+
+    def __len__(self) -> int:
+        return len(self.first.chi2)
+
+    def __getitem__(self, row: int) -> dict[int, Fit]:
+        """Fits of a recording, by number of the candidate."""
+        return self.own[row] if row in self.own else {0: taken(self.first, row)}
+
+    def __setitem__(self, row: int, fits: dict[int, Fit]) -> None:
+        self.own[row] = fits
+
+    def chosen(self, row: int) -> int:
+        """Number of the chosen candidate of a recording."""
+        return _chosen(self.own[row]) if row in self.own else 0
+
+    def where(self, test: Callable[[Fit], Bool[np.ndarray, "*lane"]]) -> list[int]:
+        """Recordings whose chosen fit passes a test."""
+        passed = np.array(test(self.first))
+        for row, fits in self.own.items():
+            passed[row] = test(fits[_chosen(fits)])
+        return np.flatnonzero(passed).tolist()
+
+    def concluded(
+        self, driver: AbstractFeed, remarks: Sequence[int], repeats: Sequence[Repeats | None]
+    ) -> "Tried":
+        """The same; the chosen fits are `concluded`.
+
+        Args:
+            driver: The driver of these fits.
+            remarks: Remarks on the recordings.
+            repeats: The periods of the recordings.
+        """
+        first, own = concluded(self.first, driver, remarks, repeats), dict(self.own)
+        of_number: dict[int, list[int]] = {}
+        for row in own:
+            of_number.setdefault(self.chosen(row), []).append(row)
+        for number, rows in of_number.items():  # circuits of one kind
+            of_rows = [remarks[row] for row in rows], [repeats[row] for row in rows]
+            fits = concluded(stacked([own[row][number] for row in rows]), driver, *of_rows)
+            for place, row in enumerate(rows):
+                own[row] = {**own[row], number: taken(fits, place)}
+        return Tried(first, own)
+
+    @property
+    def only(self) -> Fit:
+        """The fits, stacked, if there is only one candidate."""
+        rows, fits = list(self.own), [fits[0] for fits in self.own.values()]
+        return replaced(self.first, rows, stacked(fits)) if rows else self.first
+
+
+_Several = TypeVar("_Several", Tried, list[Any])
+
+
 def repeated(
     lanes: Sequence[AbstractLane],
     seen: Sequence[Inspected],
-    fit: Callable[[Sequence[AbstractLane]], list[_Found]],
-    late_by: Callable[[AbstractLane, _Found], int],
-    needs_another: Callable[[_Found], bool],
-    of_both: Callable[[_Found, _Found], _Found],
-) -> list[_Found]:
+    fit: Callable[[Sequence[AbstractLane]], _Several],
+    late_by: Callable[[Sequence[AbstractLane], _Several], Mapping[int, int]],
+    need_another: Callable[[_Several], Iterable[int]],
+    of_both: Callable[[Any, Any], Any],
+) -> _Several:
     """Fits of lanes, some of them fitted again.
 
     A lane that is late is realigned and fitted again. A lane with hum is fitted again without the
@@ -312,63 +314,66 @@ def repeated(
     Args:
         lanes: Lanes of the recordings.
         seen: The recordings. The function corrects the lag of those that are late.
-        fit: Fits lanes.
-        late_by: Lag of a lane behind its fit [whole samples].
-        needs_another: Whether the fit shows hum, or hum may explain the fit.
-        of_both: The better of two fits; the second is without the mains harmonics.
+        fit: Fits lanes. Each lane can be read from the result and written into it by its number.
+        late_by: Lags of lanes behind their fits [whole samples], by number; only those that are
+            late.
+        need_another: Numbers of the lanes whose fits show hum, or that hum may explain.
+        of_both: The better of two fits of a lane; the second is without the mains harmonics.
     """
     lanes = list(lanes)
     found = fit(lanes)
-    late = {row: by for row, lane in enumerate(lanes) if (by := late_by(lane, found[row]))}
+    late = late_by(lanes, found)
     for row, by in late.items():
         seen[row].lag += by
         lanes[row] = lanes[row].realigned(by)
     if late:
-        for row, again in zip(late, fit([lanes[row] for row in late]), strict=True):
-            found[row] = again
+        again = fit([lanes[row] for row in late])
+        for number, row in enumerate(late):
+            found[row] = again[number]
     few = {
-        row: less
-        for row, lane in enumerate(lanes)
-        if needs_another(found[row]) and (less := lane.without_mains()) is not None
+        row: less for row in need_another(found) if (less := lanes[row].without_mains()) is not None
     }
     if few:
-        for row, second in zip(few, fit(list(few.values())), strict=True):
-            found[row] = of_both(found[row], second)
+        again = fit(list(few.values()))
+        for number, row in enumerate(few):
+            found[row] = of_both(found[row], again[number])
     return found
 
 
 def refined(
     lanes: Sequence[AbstractLane],
     seen: Sequence[Inspected],
-    fit: Callable[[Sequence[AbstractLane], AbstractCircuit], list[Fit]],
+    fit: Callable[[Sequence[AbstractLane], AbstractCircuit], Fit],
     driver: AbstractFeed,
     candidates: Sequence[AbstractCircuit],
-) -> list[dict[int, Fit]]:
-    """`repeated` for single recordings with a known driver; each time the circuit is chosen anew.
+) -> Tried:
+    """`repeated` for recordings with a known driver; each time the circuit is chosen anew.
 
     Args:
         lanes: Lanes of the recordings.
         seen: The recordings. The function corrects the lag of those that are late.
-        fit: Fits a circuit to lanes.
+        fit: Fits a circuit to lanes; the fits are stacked.
         driver: The driver of the recordings.
         candidates: Circuits to choose from.
-
-    Returns:
-        Fits of each recording, by number of the candidate.
     """
 
-    def searched(lanes: Sequence[AbstractLane]) -> list[dict[int, Fit]]:
+    def searched(lanes: Sequence[AbstractLane]) -> Tried:
         if len(candidates) == 1:
-            return [{0: one} for one in fit(lanes, candidates[0])]
+            return Tried(fit(lanes, candidates[0]))
 
         def rows(number: int, rows: Sequence[int]) -> list[Fit]:
-            return fit([lanes[row] for row in rows], candidates[number])
+            return unstacked(fit([lanes[row] for row in rows], candidates[number]))
 
-        return search(len(lanes), candidates, rows)
+        found = search(len(lanes), candidates, rows)
+        several = {row: fits for row, fits in enumerate(found) if len(fits) > 1}
+        return Tried(stacked([fits[0] for fits in found]), several)
 
-    def late_by(lane: AbstractLane, fits: dict[int, Fit]) -> int:
-        fit = fits[_chosen(fits)]
-        return lane.late_by(fit.circuit, driver) if fit.verdict == "misfit" else 0
+    def late_by(lanes: Sequence[AbstractLane], found: Tried) -> dict[int, int]:
+        late = {}
+        for row in found.where(lambda fit: np.asarray(fit.verdict) == "misfit"):
+            circuit = found[row][found.chosen(row)].circuit
+            late[row] = lanes[row].late_by(circuit, driver)
+        return {row: by for row, by in late.items() if by}
 
     def of_all(first: dict[int, Fit], second: dict[int, Fit]) -> dict[int, Fit]:
         other = second[_chosen(second)]
@@ -376,15 +381,16 @@ def refined(
             return second
         return {number: without_hum(fit) for number, fit in first.items()}
 
-    def another(fits: dict[int, Fit]) -> bool:
-        return needs_another(fits[_chosen(fits)])
+    def need_another(found: Tried) -> list[int]:
+        return found.where(needs_another)
 
-    return repeated(lanes, seen, searched, late_by, another, of_all)
+    return repeated(lanes, seen, searched, late_by, need_another, of_all)
 
 
-def needs_another(fit: Fit | Driver) -> bool:
+def needs_another(fit: Fit | Driver) -> Bool[np.ndarray, "*lane"]:
     """Whether a fit shows hum, or misses the recording for any reason."""
-    return bool(int(fit.remarks) & Remark.mains_hum) or not fit.chi2 < MISFIT_CHI2
+    hum = (np.asarray(fit.remarks) & Remark.mains_hum) > 0
+    return np.asarray(hum | ~(np.asarray(fit.chi2) < MISFIT_CHI2))
 
 
 def of_both(first: _Outcome, second: _Outcome) -> _Outcome:
@@ -407,63 +413,48 @@ def _chosen(fits: dict[int, Fit]) -> int:
     return best(fits) if len(fits) > 1 else next(iter(fits))
 
 
-def chosen_fits(
-    found: Sequence[dict[int, Fit]],
-    driver: AbstractFeed,
-    remarks: Sequence[int],
-    repeats: Sequence[Repeats | None],
-) -> list[tuple[dict[int, Fit], int]]:
-    """The fits of several recordings, of which the chosen ones are `concluded`, and their numbers.
-
-    Args:
-        found: Fits of each recording, by number of the candidate.
-        driver: The driver of these fits.
-        remarks: Remarks on the recordings.
-        repeats: The periods of the recordings.
-    """
-    outcome = [(dict(fits), _chosen(fits)) for fits in found]
-    for number in {chosen for _, chosen in outcome}:  # circuits of one kind
-        rows = [row for row, (_, chosen) in enumerate(outcome) if chosen == number]
-        fits = [found[row][number] for row in rows]
-        of_rows = [remarks[row] for row in rows], [repeats[row] for row in rows]
-        for row, fit in zip(rows, concluded(fits, driver, *of_rows), strict=True):
-            outcome[row][0][number] = fit
-    return outcome
-
-
 def concluded(
-    fits: Sequence[Fit],
-    driver: AbstractFeed,
-    remarks: Sequence[int],
-    repeats: Sequence[Repeats | None],
-) -> list[Fit]:
+    fits: Fit, driver: AbstractFeed, remarks: Sequence[int], repeats: Sequence[Repeats | None]
+) -> Fit:
     """Fits with the remarks on their recordings and the changes during the records.
 
     Args:
-        fits: Fits of circuits of one kind; they may have remarks already.
+        fits: Fits of circuits of one kind, stacked; they may have remarks already.
         driver: The driver of these fits.
         remarks: Remarks on the recordings.
         repeats: The periods of the recordings.
     """
-    whole = stacked(fits)
-    change = changes.of_fits(whole, driver, repeats)
-    names, remarked = whole.verdict, whole.remarks | np.asarray(remarks, int)
+    change = changes.of_fits(fits, driver, repeats)
+    names, remarked = fits.verdict, fits.remarks | np.asarray(remarks, int)
     coarse = (remarked & Remark.coarse_converter) > 0
     names = np.where(coarse & (names == "insensitive"), "resolution", names)
     names = np.where(change.seen & np.isin(names, changes.EXPLAINED), "changed", names)
-    support = whole.support
+    support = fits.support
     if support is None:
-        support = Support.unknown(len(whole.circuit.names()), len(fits))
-    return unstacked(
-        dataclasses.replace(
-            whole,
-            remarks=remarked,
-            change=change.size,
-            change_stderr=change.stderr,
-            result=verdicts_of(names),
-            support=support,
-        )
+        support = Support.unknown(len(fits.circuit.names()), len(names))
+    return dataclasses.replace(
+        fits,
+        remarks=remarked,
+        change=change.size,
+        change_stderr=change.stderr,
+        result=verdicts_of(names),
+        support=support,
     )
+
+
+def note(fit: Fit) -> str:
+    """The message of the verdict of a fit; for `changed` also the changes."""
+    text = message(fit.verdict)
+    return f"{text} {fit.changes}" if fit.verdict == "changed" else text
+
+
+def notes_of(fits: Fit) -> list[str]:
+    """`note` of each of several fits."""
+    names = fits.verdict.tolist()
+    return [
+        note(taken(fits, row)) if name == "changed" else message(name)
+        for row, name in enumerate(names)
+    ]
 
 
 def checksum(seen: Inspected) -> int:
@@ -510,9 +501,3 @@ def failed_fit(name: str, circuit: AbstractCircuit, method: str) -> Fit:
         support=Support.unknown(size),
     )
     return jax.tree.map(np.asarray, fit)
-
-
-def note(fit: Fit) -> str:
-    """The message of the verdict of a fit; for `changed` also the changes."""
-    text = message(fit.verdict)
-    return f"{text} {fit.changes}" if fit.verdict == "changed" else text
