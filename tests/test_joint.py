@@ -118,6 +118,21 @@ def test_known_elements_of_a_joint_fit_help_the_others(study, outcome):
     assert told.stderr.r_s < free.stderr.r_s
 
 
+@pytest.mark.slow
+def test_bounds_of_a_joint_fit_leave_the_driver_as_it_is(study, outcome):
+    free = outcome.fits.where(path=TOGETHER[0])
+    low = float(free.circuit.r_s[0] + free.stderr.r_s[0])
+    told = etid.identify_jointly(study, bounds={"r_s": (low, None)})
+    fit = told.fits.where(path=TOGETHER[0])
+    assert int(fit.fit.remarks[0]) & Remark.at_bound
+    assert fit.circuit.r_s[0] > low
+    # Of a normal distribution, one standard deviation above its mean, 0.446 is left.
+    np.testing.assert_allclose(fit.stderr.r_s[0] / free.stderr.r_s[0], 0.446, rtol=0.01)
+    assert fit.fit.shared_cov[0, 0, 0] < fit.cov[0, 0, 0]
+    for of, other in zip(told.drivers.values(), outcome.drivers.values(), strict=True):
+        np.testing.assert_allclose(of.b, other.b, rtol=1e-6)
+
+
 def test_another_skin_is_a_misfit_where_chi2_does_not_show_it():
     """R_s would be wrong by more than five of its standard errors and called successful."""
     odd = Trial("odd", Cole(DRY, alpha=0.9), condition="odd")

@@ -65,6 +65,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "repeated",
     )
     parser.add_argument(
+        "--bound",
+        type=_bound,
+        action="append",
+        default=[],
+        metavar="ELEMENT=LOWER:UPPER",
+        help="bounds of an element [SI], such as r_s=100:2000, or r_s=100: without an upper one; "
+        "may be repeated",
+    )
+    parser.add_argument(
         "--driver-drift",
         type=float,
         default=0.0,
@@ -110,7 +119,19 @@ def _known(text: str) -> tuple[str, list[float]]:
         ) from error
 
 
-def _several(option: str, known: list[tuple[str, list[float]]], count: int) -> dict[str, Any]:
+def _bound(text: str) -> tuple[str, list[float | None]]:
+    """Name and both bounds of an element, from --bound; None where there is none."""
+    name, _, ends = text.partition("=")
+    try:
+        low, high = (float(end) if end else None for end in ends.split(":"))
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(
+            f"{text!r} is no bound of an element; write --bound r_s=100:2000 or r_s=100:"
+        ) from error
+    return name, [low, high]
+
+
+def _several(option: str, known: list[tuple[str, list[Any]]], count: int) -> dict[str, Any]:
     """The known elements of an option by name; each has one number, or value and error."""
     for name, numbers in known:
         if len(numbers) != count:
@@ -141,6 +162,7 @@ def run(arguments: argparse.Namespace) -> Outcome:
     if arguments.joint and arguments.driver_drift:
         raise ValueError("--joint identifies the driver itself; remove --driver-drift")
     fixed, prior = _several("--fix", arguments.fix, 1), _several("--prior", arguments.prior, 2)
+    bounds = _several("--bound", arguments.bound, 2)
     circuit = None if arguments.circuit is None else arguments.circuit()
     progress = sys.stderr.isatty()
     if arguments.joint:
@@ -153,6 +175,7 @@ def run(arguments: argparse.Namespace) -> Outcome:
                 circuit=circuit,
                 fixed=fixed,
                 prior=prior,
+                bounds=bounds,
                 progress=progress,
             )
         outcome.write(arguments.target)
@@ -169,6 +192,7 @@ def run(arguments: argparse.Namespace) -> Outcome:
                 method=arguments.method,
                 fixed=fixed,
                 prior=prior,
+                bounds=bounds,
                 driver_drift=arguments.driver_drift,
                 resume=arguments.resume,
                 executor=executor,

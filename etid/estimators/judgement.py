@@ -11,6 +11,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from etid.circuits.circuit import AbstractCircuit
+from etid.estimators.bounds import Bounds, within
 from etid.estimators.estimate import Estimate
 from etid.recordings.remarks import Remark
 from etid.results.fits import Fit, Support
@@ -55,7 +56,11 @@ def too_late(estimate: Estimate) -> Bool[Array, ""]:
 
 
 def judged(
-    estimate: Estimate, circuit: AbstractCircuit, driver_result: RESULTS, method: str
+    estimate: Estimate,
+    circuit: AbstractCircuit,
+    driver_result: RESULTS,
+    method: str,
+    bounds: Bounds = (),
 ) -> Fit:
     """The fit of an estimate, with its verdict.
 
@@ -64,15 +69,23 @@ def judged(
         circuit: Structure of the load.
         driver_result: Verdict of the driver.
         method: Name of the estimator.
+        bounds: Bounds of elements.
     """
     fitted = circuit.with_log_values(estimate.parameters)
     values = fitted.values()
     errors = jnp.sqrt(jnp.diagonal(estimate.cov))  # of the logarithms, so they are relative
+    cov, shared_cov = (of * jnp.outer(values, values) for of in (estimate.cov, estimate.shared_cov))
+    beyond, contradicted = jnp.array(False), jnp.array(False)
+    if bounds:
+        inside, cov, shared_cov, beyond, contradicted = within(fitted, cov, shared_cov, bounds)
+        errors = jnp.sqrt(jnp.diagonal(cov)) / inside
+        values = jnp.where(jnp.isfinite(inside), inside, values)
+        fitted = circuit.with_log_values(jnp.log(values))
     settled = RESULTS.promote(estimate.result) == RESULTS.successful
     return Fit(
         circuit=fitted,
-        cov=estimate.cov * jnp.outer(values, values),
-        shared_cov=estimate.shared_cov * jnp.outer(values, values),
+        cov=cov,
+        shared_cov=shared_cov,
         rrse=estimate.rrse,
         chi2=estimate.chi2,
         result=first_verdict(
@@ -83,13 +96,14 @@ def judged(
             (misses(estimate.chi2, estimate.rrse) | too_late(estimate), RESULTS.misfit),
             (estimate.falls, RESULTS.misfit),  # which can pass for a change of the driver
             (estimate.strain > STRAINED, RESULTS.inconsistent),
+            (contradicted, RESULTS.out_of_bounds),
             # An error of 0 also fails: the element has no effect.
             (~jnp.all((errors > 0) & (errors < 1)), RESULTS.insensitive),
             (driver_result != SUCCESSFUL, RESULTS.driver_failed),
         ),
         steps=estimate.steps,
         method=method,
-        remarks=remarks(estimate.hum, estimate.falls),
+        remarks=remarks(estimate.hum, estimate.falls) + jnp.where(beyond, int(Remark.at_bound), 0),
         support=estimate.support or Support.unknown(values.size),
     )
 

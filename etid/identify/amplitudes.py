@@ -14,13 +14,22 @@ from etid.circuits.current_dependent import SkinCurrent, current_dependent
 from etid.estimators import judgement
 from etid.estimators.amplitudes.fit import fit_amplitudes
 from etid.estimators.amplitudes.terms import Amplitudes, currents
+from etid.estimators.bounds import Bounds
 from etid.estimators.element_prior import ElementPrior
 from etid.estimators.estimator import serving
 from etid.estimators.lanes import Harmonics, stacked
 from etid.estimators.maximum_likelihood.estimator import description
 from etid.estimators.maximum_likelihood.given_driver import AbstractGiven
 from etid.estimators.registry import MAXIMUM_LIKELIHOOD, register_description
-from etid.identify.arguments import asked_of, circuit_of, driver_of, fed, plan, require_float64
+from etid.identify.arguments import (
+    Interval,
+    asked_of,
+    circuit_of,
+    driver_of,
+    fed,
+    plan,
+    require_float64,
+)
 from etid.identify.arguments import recordings as list_of
 from etid.identify.compiled import stored_jit
 from etid.identify.one import failed_fit, known_of, successful
@@ -55,13 +64,14 @@ def _fit(
     feed: HarmonicDriver | MeasuredCurrent,
     circuit: AbstractCircuit,
     prior: ElementPrior | None,
+    bounds: Bounds,
 ) -> Fit:
     rate = jnp.asarray(lanes.sample_rate)[0]
     of = Amplitudes(known, feed, circuit, lanes.spectrum, rate, prior)
     estimate = fit_amplitudes(of)
-    fit = judgement.judged(estimate, circuit, feed.result, METHOD)
+    fit = judgement.judged(estimate, circuit, feed.result, METHOD, bounds)
     fit = judgement.unless(fit, estimate.chi2 > UNEXPLAINED, RESULTS.misfit)
-    unsure = jnp.sqrt(jnp.diagonal(estimate.cov)) > judgement.NO_CURRENT
+    unsure = fit.stderr.values() > judgement.NO_CURRENT * fit.circuit.values()
     return judgement.unless(fit, jnp.any(unsure & currents(circuit)), RESULTS.insensitive)
 
 
@@ -72,6 +82,7 @@ def identify_amplitudes(
     circuit: AbstractCircuit | None = None,
     fixed: Mapping[str, float] | None = None,
     prior: Mapping[str, tuple[float, float]] | None = None,
+    bounds: Mapping[str, Interval] | None = None,
     throw: bool = True,
 ) -> Fit:
     """Identify one load from recordings at several amplitudes; it may depend on its current.
@@ -92,6 +103,7 @@ def identify_amplitudes(
             circuit is fitted to all recordings together.
         fixed: As in `identify_skin`.
         prior: As in `identify_skin`; also for a current I_0.
+        bounds: As in `identify_skin`; also for a current I_0.
         throw: Raise an error if the verdict is not successful.
 
     Returns:
@@ -110,7 +122,7 @@ def identify_amplitudes(
     driver = driver_of(driver)
     circuit = SkinCurrent() if circuit is None else circuit_of(circuit)
     current_dependent(circuit.impedance())
-    asked = asked_of(MAXIMUM_LIKELIHOOD, [circuit], fixed, prior)
+    asked = asked_of(MAXIMUM_LIKELIHOOD, [circuit], fixed, prior, bounds)
     of_elements = ElementPrior.of(asked.known, circuit) if asked.known else None
     feed = (
         MEASURED_CURRENT
@@ -126,7 +138,7 @@ def identify_amplitudes(
             return successful(one.recording, fit) if throw else fit
     lanes = [Harmonics.of(one) for one in seen]
     known = known_of(lanes[0], feed, False, MAXIMUM_LIKELIHOOD)
-    fit = jax.device_get(_fit(stacked(lanes), known, feed, circuit, of_elements))
+    fit = jax.device_get(_fit(stacked(lanes), known, feed, circuit, of_elements, asked.bounds))
     of_records = functools.reduce(operator.or_, (int(one.remarks) for one in seen))
     fit = dataclasses.replace(fit, remarks=np.asarray(fit.remarks | of_records))
     return successful(seen[0].recording, fit) if throw else fit

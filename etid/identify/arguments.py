@@ -5,6 +5,7 @@ A wrong type, a wrong method or the wrong precision of JAX is refused with a mes
 
 import dataclasses
 import functools
+import math
 import operator
 import reprlib
 from collections.abc import Iterable, Mapping, Sequence
@@ -14,6 +15,7 @@ import jax
 
 from etid.circuits.circuit import AbstractCircuit, SkinRC
 from etid.circuits.current_dependent import current_dependent
+from etid.estimators.bounds import Bounds, checked_bounds
 from etid.estimators.element_prior import Known, checked
 from etid.estimators.estimator import AbstractEstimator
 from etid.estimators.maximum_likelihood.estimator import MaximumLikelihood
@@ -35,6 +37,9 @@ LARGEST_ORDER = 20
 
 Circuit = AbstractCircuit | Literal["auto"] | None
 """A circuit, or `"auto"` for the simplest circuit that the data support; None for `SkinRC`."""
+
+Interval = tuple[float | None, float | None]
+"""Lower and upper bound of an element [SI]; None if there is none."""
 
 _REMEDIES: dict[type, str] = {
     Recording: "Take one from a study, as in study['s01/dry/0'], or make one with etid.Recording",
@@ -229,20 +234,42 @@ def informed(
     return tuple(known)
 
 
-def with_known(estimator: AbstractEstimator, known: Known) -> AbstractEstimator:
-    """The estimator with elements that are known.
+def bounded(bounds: Mapping[str, Interval] | None) -> Bounds:
+    """The bounds of elements, from the argument of a caller. Elements are positive.
+
+    Raises:
+        RecordingError: A bound is no number.
+    """
+    try:
+        ends = [(str(name), low, high) for name, (low, high) in dict(bounds or {}).items()]
+        return tuple(
+            (name, float(low or 0.0), None if high is None or high == math.inf else float(high))
+            for name, low, high in ends
+        )
+    except (TypeError, ValueError):
+        raise RecordingError(
+            "must be pairs of numbers [SI] or None",
+            field="bounds",
+            remedy='Pass bounds={"r_s": (100.0, 2e3)}, or (100.0, None) without an upper bound',
+        ) from None
+
+
+def with_known(
+    estimator: AbstractEstimator, known: Known, bounds: Bounds = ()
+) -> AbstractEstimator:
+    """The estimator with elements that are known, and with bounds.
 
     Raises:
         ValueError: It takes no known elements.
     """
-    if not known:
+    if not known and not bounds:
         return estimator
     if not isinstance(estimator, MaximumLikelihood | OutputError):
         raise ValueError(
-            f"method {str(estimator)!r} takes no known elements; use method='maximum_likelihood' "
-            "or 'output_error'"
+            f"method {str(estimator)!r} takes no known elements and no bounds; use "
+            "method='maximum_likelihood' or 'output_error'"
         )
-    return dataclasses.replace(estimator, known_elements=known)
+    return dataclasses.replace(estimator, known_elements=known, bounds=bounds)
 
 
 class Asked(NamedTuple):
@@ -251,10 +278,12 @@ class Asked(NamedTuple):
     Attributes:
         estimator: The requested estimator; None for the default of each recording.
         known: Elements that are known.
+        bounds: Elements with bounds.
     """
 
     estimator: AbstractEstimator | None = None
     known: Known = ()
+    bounds: Bounds = ()
 
 
 def asked_of(
@@ -262,17 +291,18 @@ def asked_of(
     candidates: Sequence[AbstractCircuit],
     fixed: Mapping[str, float] | None,
     prior: Mapping[str, tuple[float, float]] | None,
+    bounds: Mapping[str, Interval] | None,
 ) -> Asked:
     """What the arguments of a caller ask for.
 
     Raises:
-        ValueError: As `estimator_of`, `informed` and `with_known`; or a known element is no element
-            of one of these circuits.
+        ValueError: As `estimator_of`, `informed`, `bounded` and `with_known`; or a known element is
+            no element of one of these circuits, or its bounds are impossible.
     """
-    asked = Asked(estimator_of(method, candidates), informed(fixed, prior))
+    asked = Asked(estimator_of(method, candidates), informed(fixed, prior), bounded(bounds))
     if asked.estimator is not None:
-        with_known(asked.estimator, asked.known)
-    for name, *_ in asked.known if len(candidates) > 1 else ():
+        with_known(asked.estimator, asked.known, asked.bounds)
+    for name, *_ in (*asked.known, *asked.bounds) if len(candidates) > 1 else ():
         without = [type(one).__name__ for one in candidates if name not in one.names()]
         if without:
             raise ValueError(
@@ -280,8 +310,9 @@ def asked_of(
                 "would compare circuits with different knowledge; pass one circuit, or call "
                 "select_circuit with candidates that all have it"
             )
-    for circuit in candidates if asked.known else ():
+    for circuit in candidates:
         checked(asked.known, circuit)
+        checked_bounds(asked.bounds, asked.known, circuit)
     return asked
 
 
@@ -383,4 +414,4 @@ def plan(
                 "a current, and no disturbed periods; use method='maximum_likelihood'"
             )
     estimator.check_driver(driver, seen.recording.sample_rate, seen.recording.pulse_rate)
-    return with_known(estimator, asked.known), name
+    return with_known(estimator, asked.known, asked.bounds), name

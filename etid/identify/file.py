@@ -32,7 +32,7 @@ from tqdm import tqdm
 from etid.circuits.circuit import AbstractCircuit
 from etid.circuits.lookup import qualified
 from etid.estimators.registry import Method
-from etid.identify.arguments import Asked, Circuit, asked_of, candidates_of, order_of
+from etid.identify.arguments import Asked, Circuit, Interval, asked_of, candidates_of, order_of
 from etid.identify.many import common_first, identify_part, to_identify
 from etid.identify.study_drivers import Drivers
 from etid.recordings.hdf5 import read
@@ -191,6 +191,7 @@ def fit_file(
     method: Method | None = None,
     fixed: Mapping[str, float] | None = None,
     prior: Mapping[str, tuple[float, float]] | None = None,
+    bounds: Mapping[str, Interval] | None = None,
     driver_drift: float = 0.0,
     resume: bool = False,
     executor: concurrent.futures.Executor | None = None,
@@ -206,6 +207,7 @@ def fit_file(
         method: As in `identify_skin`.
         fixed: As in `identify_skin`, for all recordings.
         prior: As in `identify_skin`, for all recordings.
+        bounds: As in `identify_skin`, for all recordings.
         driver_drift: As in `identify_driver`.
         resume: Keep the parts of an earlier run that did not finish.
         executor: Executor that fits the parts. If not given, this process fits them.
@@ -223,7 +225,7 @@ def fit_file(
     """
     order = order_of(order)
     candidates = candidates_of(circuit)
-    asked = asked_of(method, candidates, fixed, prior)
+    asked = asked_of(method, candidates, fixed, prior, bounds)
     source, target = os.path.abspath(source), pathlib.Path(target)
     opened = _open(source, order, asked, driver_drift)
     with opened.study:
@@ -241,6 +243,7 @@ def fit_file(
             candidates,
             driver_drift=driver_drift,
             known=asked.known,
+            bounds=asked.bounds,
         )
         described = json.loads(json.dumps(dataclasses.asdict(settings)))  # tuples become lists
         run = {

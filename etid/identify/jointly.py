@@ -20,6 +20,7 @@ from tqdm import tqdm
 
 from etid.circuits.circuit import AbstractCircuit
 from etid.estimators import judgement
+from etid.estimators.bounds import Bounds
 from etid.estimators.element_prior import ElementPrior
 from etid.estimators.estimate import DELAY_WIDTH, Estimate
 from etid.estimators.estimator import serving
@@ -36,6 +37,7 @@ from etid.estimators.starts import harmonic_starts
 from etid.identify.arguments import (
     Asked,
     Circuit,
+    Interval,
     asked_of,
     candidates_of,
     order_of,
@@ -141,7 +143,7 @@ def _together(
         with_scale = dataclasses.replace(
             estimate, cov=estimate.cov + scale, shared_cov=estimate.shared_cov + scale
         )
-        fit = judgement.judged(with_scale, model.circuit, driver.result, METHOD)
+        fit = judgement.judged(with_scale, model.circuit, driver.result, METHOD, model.bounds)
         return judgement.unless(fit, other, RESULTS.misfit)
 
     of_driver = model.calibrations.named(common)
@@ -282,6 +284,7 @@ def identify_jointly(
     circuit: Circuit = None,
     fixed: Mapping[str, float] | None = None,
     prior: Mapping[str, tuple[float, float]] | None = None,
+    bounds: Mapping[str, Interval] | None = None,
     r_load_tolerance: float = 0.0,
     progress: bool = False,
 ) -> StudyFits:
@@ -301,6 +304,7 @@ def identify_jointly(
             `"auto"` it is chosen as in `identify_skins`, from fits of single recordings.
         fixed: As in `identify_skin`, for all recordings.
         prior: As in `identify_skin`, for all recordings.
+        bounds: As in `identify_skin`, for all recordings.
         r_load_tolerance: Relative standard deviation of the known resistors. No record shows this
             error. It passes 1:1 into every resistance and inversely into every capacitance.
         progress: Show a progress bar.
@@ -317,7 +321,7 @@ def identify_jointly(
     require("study", study, Study)
     order = order_of(order)
     candidates = candidates_of(circuit)
-    asked = asked_of(None, candidates, fixed, prior)
+    asked = asked_of(None, candidates, fixed, prior, bounds)
     drivers = Drivers(study, order, None)
     paths = to_identify(study)
     if not paths:
@@ -355,7 +359,7 @@ def identify_jointly(
         shared = is_shared(seen, driver)
         key = seen.v_th.size, shared, seen.recording.sample_rate, seen.recording.pulse_rate
         if key not in lengths:
-            lengths[key] = _Waiting(_model(circuit, driver, shared, known), driver)
+            lengths[key] = _Waiting(_model(circuit, driver, shared, known, asked.bounds), driver)
         lengths[key].add(row, seen)
     for names, lengths in tqdm(waiting.items(), unit="driver", disable=not progress):
         driver = next(iter(lengths.values())).driver
@@ -363,7 +367,7 @@ def identify_jointly(
         several = tuple(len(group.several()) for group in lengths.values())
         shared = any(group.model.shared for group in lengths.values())
         tolerance = jnp.asarray(r_load_tolerance, dtype=float)
-        model = _model(circuit, driver, shared, known)
+        model = _model(circuit, driver, shared, known, asked.bounds)
         found, better, delays, cov = _together(model, groups, several, driver, tolerance)
         found, delays, cov = jax.device_get((found, delays, cov))
         width = _narrower(groups, found, delays, cov, float(driver.sample_rate))
@@ -394,7 +398,7 @@ def identify_jointly(
                 fits[row], notes[row] = one, text
     if by_current:
         own = [paths[row] for row in by_current]
-        of_each = Asked(MAXIMUM_LIKELIHOOD, asked.known)
+        of_each = Asked(MAXIMUM_LIKELIHOOD, asked.known, asked.bounds)
         alone = identify_part(study, own, drivers, [circuit], of_each)
         as_joint = unstacked(dataclasses.replace(alone.fit, method=METHOD))
         for row, fit, text in zip(by_current, as_joint, alone.notes, strict=True):
@@ -402,21 +406,32 @@ def identify_jointly(
     ordered = stacked([fits[row] for row in range(len(paths))])
     outcome = table(study, paths, ordered, notes)
     settings = Settings.of(
-        study, len(paths), order, METHOD, candidates, r_load_tolerance, known=asked.known
+        study,
+        len(paths),
+        order,
+        METHOD,
+        candidates,
+        r_load_tolerance,
+        known=asked.known,
+        bounds=asked.bounds,
     )
     return StudyFits(outcome, drivers.found, drivers.failures, settings)
 
 
 def _alone_judged(fits: Fit, changed: Sequence[bool]) -> Fit:
-    """Fits without remarks; their verdict is `inconsistent` where the driver has changed."""
+    """Fits without remarks on hum; their verdict is `inconsistent` where the driver has changed."""
     names = fits.verdict
     explained = np.asarray(changed) & np.isin(names, ("successful", "misfit"))
     result = verdicts_of(np.where(explained, "inconsistent", names))
     # The fit of each recording alone decides whether hum is left out.
-    return dataclasses.replace(fits, remarks=np.zeros(len(names), int), result=result)
+    return dataclasses.replace(fits, remarks=fits.remarks & int(Remark.at_bound), result=result)
 
 
 def _model(
-    circuit: AbstractCircuit, driver: HarmonicDriver, shared: bool, prior: ElementPrior | None
+    circuit: AbstractCircuit,
+    driver: HarmonicDriver,
+    shared: bool,
+    prior: ElementPrior | None,
+    bounds: Bounds,
 ) -> Joint:
-    return Joint(circuit, Calibrations.of(driver), shared, prior)
+    return Joint(circuit, Calibrations.of(driver), shared, prior, bounds)

@@ -10,6 +10,7 @@ from etid.estimators.registry import Method
 from etid.identify.arguments import (
     Asked,
     Circuit,
+    Interval,
     asked_of,
     candidates_of,
     driver_of,
@@ -43,6 +44,7 @@ def identify_skins(
     method: Method | None = None,
     fixed: Mapping[str, float] | None = None,
     prior: Mapping[str, tuple[float, float]] | None = None,
+    bounds: Mapping[str, Interval] | None = None,
     progress: bool = False,
 ) -> Fits[SkinRC]: ...
 
@@ -56,6 +58,7 @@ def identify_skins(
     method: Method | None = None,
     fixed: Mapping[str, float] | None = None,
     prior: Mapping[str, tuple[float, float]] | None = None,
+    bounds: Mapping[str, Interval] | None = None,
     progress: bool = False,
 ) -> Fits[_Kind]: ...
 
@@ -69,6 +72,7 @@ def identify_skins(
     method: Method | None = None,
     fixed: Mapping[str, float] | None = None,
     prior: Mapping[str, tuple[float, float]] | None = None,
+    bounds: Mapping[str, Interval] | None = None,
     progress: bool = False,
 ) -> Fits[AbstractCircuit]: ...
 
@@ -81,6 +85,7 @@ def identify_skins(
     method: Method | None = None,
     fixed: Mapping[str, float] | None = None,
     prior: Mapping[str, tuple[float, float]] | None = None,
+    bounds: Mapping[str, Interval] | None = None,
     progress: bool = False,
 ) -> Fits:
     """Identify many recordings that were made with one driver.
@@ -95,6 +100,7 @@ def identify_skins(
         method: As in `identify_skin`.
         fixed: As in `identify_skin`, for all recordings.
         prior: As in `identify_skin`, for all recordings.
+        bounds: As in `identify_skin`, for all recordings.
         progress: Show a progress bar.
 
     Returns:
@@ -106,7 +112,7 @@ def identify_skins(
     """
     driver = driver_of(driver)
     candidates = candidates_of(circuit)
-    asked = asked_of(method, candidates, fixed, prior)
+    asked = asked_of(method, candidates, fixed, prior, bounds)
     if isinstance(recordings, Study):
         study, paths = recordings, [*recordings, *recordings.problems]
         known = [_known(study, path) for path in paths]
@@ -136,6 +142,7 @@ def identify_study(
     method: Method | None = None,
     fixed: Mapping[str, float] | None = None,
     prior: Mapping[str, tuple[float, float]] | None = None,
+    bounds: Mapping[str, Interval] | None = None,
     driver_drift: float = 0.0,
     progress: bool = False,
 ) -> StudyFits:
@@ -152,6 +159,7 @@ def identify_study(
         method: As in `identify_skin`.
         fixed: As in `identify_skin`, for all recordings.
         prior: As in `identify_skin`, for all recordings.
+        bounds: As in `identify_skin`, for all recordings.
         driver_drift: As in `identify_driver`.
         progress: Show a progress bar.
 
@@ -164,7 +172,7 @@ def identify_study(
     require("study", study, Study)
     order = order_of(order)
     candidates = candidates_of(circuit)
-    asked = asked_of(method, candidates, fixed, prior)
+    asked = asked_of(method, candidates, fixed, prior, bounds)
     drivers = Drivers(study, order, asked.estimator, driver_drift)
     paths = to_identify(study)
     candidates = common_first(study, paths, drivers, candidates, asked)
@@ -177,6 +185,7 @@ def identify_study(
         candidates,
         driver_drift=driver_drift,
         known=asked.known,
+        bounds=asked.bounds,
     )
     return StudyFits(fits, drivers.found, drivers.failures, settings)
 

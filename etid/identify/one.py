@@ -20,6 +20,7 @@ from etid.identify import changes
 from etid.identify.arguments import (
     Asked,
     Circuit,
+    Interval,
     asked_of,
     candidates_of,
     check_default,
@@ -56,6 +57,7 @@ def identify_skin(
     method: Method | None = None,
     fixed: Mapping[str, float] | None = None,
     prior: Mapping[str, tuple[float, float]] | None = None,
+    bounds: Mapping[str, Interval] | None = None,
     throw: bool = True,
 ) -> Fit[SkinRC]: ...
 
@@ -69,6 +71,7 @@ def identify_skin(
     method: Method | None = None,
     fixed: Mapping[str, float] | None = None,
     prior: Mapping[str, tuple[float, float]] | None = None,
+    bounds: Mapping[str, Interval] | None = None,
     throw: bool = True,
 ) -> Fit[_Kind]: ...
 
@@ -82,6 +85,7 @@ def identify_skin(
     method: Method | None = None,
     fixed: Mapping[str, float] | None = None,
     prior: Mapping[str, tuple[float, float]] | None = None,
+    bounds: Mapping[str, Interval] | None = None,
     throw: bool = True,
 ) -> Fit[AbstractCircuit]: ...
 
@@ -94,6 +98,7 @@ def identify_skin(
     method: Method | None = None,
     fixed: Mapping[str, float] | None = None,
     prior: Mapping[str, tuple[float, float]] | None = None,
+    bounds: Mapping[str, Interval] | None = None,
     throw: bool = True,
 ) -> Fit:
     """Identify the circuit that is connected to the driver in one recording.
@@ -113,6 +118,11 @@ def identify_skin(
         prior: Values of elements with their standard deviations, as in `{"r_s": (500.0, 50.0)}`;
             the standard errors of the fit contain this knowledge. Each set of values compiles a
             program of its own. Maximum likelihood and output error take known elements.
+        bounds: Least and largest possible values of elements [SI], as in `{"r_s": (100.0, 2e3)}`;
+            None where there is none. The estimate is the mean of what the likelihood leaves inside,
+            and the standard errors are its own. The remark `at_bound` says that an element would
+            lie outside without its bounds; the verdict `out_of_bounds` that they contradict the
+            recording. They take the methods that take known elements.
         throw: Raise an error if the verdict is not successful.
 
     Returns:
@@ -124,7 +134,7 @@ def identify_skin(
         IdentificationError: The verdict is not successful and `throw` is set.
     """
     candidates = candidates_of(circuit)
-    asked = asked_of(method, candidates, fixed, prior)
+    asked = asked_of(method, candidates, fixed, prior, bounds)
     fits, chosen = candidate_fits(recording, driver, candidates, asked)
     single = len(candidates) == 1
     fit = fits[chosen] if single else Selection.of(fits, chosen, candidates).fit

@@ -12,9 +12,9 @@ at 20 dB, less than 15 are effective in one fit of 20. Further rounds therefore 
 and the covariance of the weighted draws (population Monte Carlo; Cappé, Guillin, Marin and Robert
 2004). If few draws are effective, their weights are flattened for this: all get a power below 1.
 
-The prior is uniform in the logarithms, times the priors of the fit. If a recording does not
-exclude that an element is 0, as R_s at 20 dB, the tail of the posterior towards 0 never ends. The
-draws then cover the surroundings of the fit.
+The prior is uniform in the logarithms, times the priors of the fit, and 0 outside its bounds. If a
+recording does not exclude that an element is 0, as R_s at 20 dB, the tail of the posterior towards
+0 never ends. The draws then cover the surroundings of the fit.
 
 **Curvature.** The unknown true spectrum of V_th is eliminated from F. Below 40 dB F is therefore
 too narrow: noise in the unloaded record counts as information (Neyman and Scott 1948). The
@@ -23,6 +23,7 @@ that their curvature there is that covariance (Chandler and Bate 2007; Ribatet, 
 2012). At 20 dB this factor is 1.2 to 1.4, and without it 95 % intervals contain the truth in 85 %.
 """
 
+import dataclasses
 from collections.abc import Callable
 from typing import cast
 
@@ -35,6 +36,7 @@ from jaxtyping import Array, Float, Int
 from scipy.special import softmax
 
 from etid.circuits.circuit import AbstractCircuit, Circuit
+from etid.estimators.bounds import Bounds
 from etid.estimators.element_prior import FIXED, ElementPrior
 from etid.estimators.lanes import Harmonics, HarmonicsWithCurrent
 from etid.estimators.maximum_likelihood import with_current
@@ -45,7 +47,7 @@ from etid.estimators.maximum_likelihood.with_current import LoadWithCurrent
 from etid.estimators.registry import MAXIMUM_LIKELIHOOD, named
 from etid.identify.arguments import fed, require
 from etid.identify.compiled import stored_jit
-from etid.identify.one import is_shared, known_of
+from etid.identify.one import is_shared, known_of, skin
 from etid.recordings.preflight import Inspected
 from etid.recordings.recording import Recording
 from etid.recordings.remarks import Remark
@@ -71,10 +73,12 @@ class Known(eqx.Module):
     Attributes:
         driver: Distribution of Z_th, or the measured current.
         elements: Prior of the elements; None without one.
+        bounds: Bounds of elements.
     """
 
     driver: AbstractGiven
     elements: ElementPrior | None
+    bounds: Bounds = eqx.field(static=True, default=())
 
 
 class _Minimum(eqx.Module):
@@ -201,7 +205,7 @@ def _flattened(log_weight: Float[np.ndarray, " draw"], enough: float) -> Float[n
             high = middle
         else:
             low = middle
-    return softmax(low * log_weight)
+    return softmax(np.where(np.isfinite(log_weight), low * log_weight, -np.inf))
 
 
 def stretched(
@@ -219,8 +223,35 @@ def stretched(
         wanted: Covariance of the logarithms of the elements, from the fit.
     """
     size = len(wanted)
-    stretch = np.linalg.cholesky(wanted) @ np.linalg.inv(np.linalg.cholesky(cov[:size, :size]))
-    return mean[:size] + (q[:, :size] - mean[:size]) @ stretch.T
+    return mean[:size] + (q[:, :size] - mean[:size]) @ _stretch(cov, wanted).T
+
+
+def _stretch(
+    cov: Float[np.ndarray, "q q"], wanted: Float[np.ndarray, "element element"]
+) -> Float[np.ndarray, "element element"]:
+    size = len(wanted)
+    return np.linalg.cholesky(wanted) @ np.linalg.inv(np.linalg.cholesky(cov[:size, :size]))
+
+
+def _inside(
+    fit: Fit,
+    mean: Float[np.ndarray, " q"],
+    cov: Float[np.ndarray, "q q"],
+    wanted: Float[np.ndarray, "element element"],
+) -> tuple[Float[np.ndarray, " q"], Float[np.ndarray, "q q"]]:
+    """Mean and covariance of all parameters, if the elements have those of a fit with bounds.
+
+    Args:
+        fit: The fit with bounds.
+        mean: The minimum of F, without bounds.
+        cov: H⁻¹.
+        wanted: As in `stretched`.
+    """
+    size, back = len(wanted), np.linalg.inv(_stretch(cov, wanted))
+    slope = cov[:, :size] @ np.linalg.inv(cov[:size, :size])
+    moved = back @ (np.asarray(fit.circuit.log_values()) - mean[:size])
+    less = cov[:size, :size] - back @ _determined(fit) @ back.T
+    return mean + slope @ moved, cov - slope @ less @ slope.T
 
 
 @stored_jit
@@ -272,14 +303,21 @@ def posterior(
     if not np.isfinite(own).all():
         raise ValueError(f"the recording does not determine all elements of {fit}")
 
-    def costs(q: Float[np.ndarray, "draw q"]) -> Float[np.ndarray, " draw"]:
-        return np.asarray(_costs(lane, known, fit.circuit, jnp.asarray(q)))
+    names = fit.circuit.names()
 
-    q, weights = drawn(costs, least, own, draws, np.random.default_rng(seed))
+    def costs(q: Float[np.ndarray, "draw q"]) -> Float[np.ndarray, " draw"]:
+        found = np.array(_costs(lane, known, fit.circuit, jnp.asarray(q)))
+        elements = np.exp(stretched(q, least, own, cov))
+        for name, low, high in known.bounds:
+            value = elements[:, names.index(name)]
+            found[(value < low) | (value > (np.inf if high is None else high))] = np.inf
+        return found
+
+    begin = _inside(fit, least, own, cov) if known.bounds else (least, own)
+    q, weights = drawn(costs, *begin, draws, np.random.default_rng(seed))
     if not np.isfinite(weights).all():
         raise ValueError(f"the recording does not determine all elements of {fit}")
     found = stretched(q, least, own, cov)
-    names = fit.circuit.names()
     circuit = type(fit.circuit)(**dict(zip(names, np.exp(found.T), strict=True)))
     return Posterior(fit.circuit, np.asarray(fit.cov), circuit, weights)
 
@@ -292,6 +330,11 @@ def profile(fit: Fit, recording: Recording | None, driver: Driver | None, name: 
             f"{type(fit.circuit).__name__} has no element {name!r}; it has {', '.join(names)}"
         )
     lane, known, cov = given(fit, recording, driver)
+    if known.bounds:
+        raise ValueError(
+            "a fit with bounds has no profiles, which go beyond them; use fit.posterior(), whose "
+            "draws keep to the bounds, or fit without bounds"
+        )
     number, steps = names.index(name), np.linspace(-WIDE, WIDE, POINTS)
     if known.elements is not None and known.elements.width[number] <= FIXED:
         raise ValueError(f"{name} is fixed, so it has no profile; take another element")
@@ -334,10 +377,7 @@ def given(
             f"this fit was made by {fit.method}; identify the recording with "
             f"method={MAXIMUM_LIKELIHOOD.name!r}"
         )
-    values = np.asarray(fit.circuit.values())
-    cov = np.asarray(fit.cov) / np.outer(values, values)
-    if not (np.isfinite(cov).all() and (np.linalg.eigvalsh(cov) > 0).all()):
-        raise ValueError(f"the recording does not determine all elements of {fit}")
+    cov = _determined(fit)
     seen = Inspected(recording)
     estimator = cast(MaximumLikelihood, named(fit.method))
     lane = (HarmonicsWithCurrent if estimator.with_current else Harmonics).of(seen)
@@ -349,4 +389,21 @@ def given(
     known = known_of(lane, feed, is_shared(seen, feed), MAXIMUM_LIKELIHOOD)
     told = estimator.known_elements
     elements = ElementPrior.of(told, fit.circuit) if told else None
-    return lane, Known(known, elements), cov
+    if estimator.bounds:  # the draws begin with those of the same fit without bounds
+        unbounded = dataclasses.replace(estimator, bounds=())
+        of = jax.device_get(skin(lane, feed, known, fit.circuit, unbounded))
+        cov = _determined(of)
+    return lane, Known(known, elements, estimator.bounds), cov
+
+
+def _determined(fit: Fit) -> Float[np.ndarray, "element element"]:
+    """The covariance of the logarithms of the elements.
+
+    Raises:
+        ValueError: The recording does not determine all elements.
+    """
+    values = np.asarray(fit.circuit.values())
+    cov = np.asarray(fit.cov) / np.outer(values, values)
+    if not (np.isfinite(cov).all() and (np.linalg.eigvalsh(cov) > 0).all()):
+        raise ValueError(f"the recording does not determine all elements of {fit}")
+    return cov

@@ -9,7 +9,7 @@ import numpy as np
 
 from etid.circuits.circuit import AbstractCircuit
 from etid.estimators.registry import Method
-from etid.identify.arguments import asked_of, require
+from etid.identify.arguments import Interval, asked_of, require
 from etid.identify.impedance import identify_impedance
 from etid.identify.one import candidate_fits, successful
 from etid.recordings.recording import Recording, RecordingError
@@ -29,6 +29,7 @@ def select_circuit(
     method: Method | None = None,
     fixed: Mapping[str, float] | None = None,
     prior: Mapping[str, tuple[float, float]] | None = None,
+    bounds: Mapping[str, Interval] | None = None,
     throw: bool = True,
 ) -> Selection:
     """The simplest circuit that a recording supports.
@@ -49,6 +50,7 @@ def select_circuit(
             records of several whole periods.
         fixed: As in `identify_skin`; every candidate must have these elements.
         prior: As in `identify_skin`; every candidate must have these elements.
+        bounds: As in `identify_skin`; every candidate must have these elements.
         throw: Raise an error if the verdict of the chosen circuit is not successful.
 
     Returns:
@@ -63,7 +65,7 @@ def select_circuit(
         IdentificationError: The verdict is not successful and `throw` is set.
     """
     candidates = checked(candidates)
-    asked = asked_of(method, candidates, fixed, prior)
+    asked = asked_of(method, candidates, fixed, prior, bounds)
     fits, chosen = candidate_fits(recording, driver, candidates, asked)
     selection = Selection.of(fits, chosen, candidates)
     if throw:

@@ -21,6 +21,7 @@ class Remark(enum.IntFlag):
     circuits_close = enum.auto()
     small_delays = enum.auto()
     falls_with_current = enum.auto()
+    at_bound = enum.auto()
 
 
 _TEXTS = {
@@ -42,6 +43,10 @@ _TEXTS = {
     Remark.falls_with_current: (
         "The residual looks like a resistance that falls with the current, a dependence on the "
         "amplitude; record several amplitudes and use identify_amplitudes."
+    ),
+    Remark.at_bound: (
+        "An element would lie beyond its bound without it. The estimate is the mean of what the "
+        "bounds leave; its distribution is not symmetric, and fit.posterior() shows it."
     ),
 }
 

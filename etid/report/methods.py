@@ -221,7 +221,7 @@ def _table(found: StudyFits, settings: Settings) -> Table:
         "circuit": circuit,
         "Z_th": f"order {settings.order or 'auto'}, drift of {100 * settings.driver_drift:g} %",
         "R_L": f"standard deviation of {100 * settings.r_load_tolerance:g} %",
-        "known elements": ", ".join(settings.fixed + settings.prior) or "none",
+        "known elements": ", ".join(settings.fixed + settings.prior + settings.bounds) or "none",
         "computed": f"in {settings.precision} on {settings.backend}",
         "versions": ", ".join(settings.versions),
     }

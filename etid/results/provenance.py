@@ -35,6 +35,7 @@ class Settings:
         fixed: Known elements and their values [SI], such as `"r_s 500.0"`.
         prior: Elements with a prior, values and standard deviations [SI], such as
             `"r_s 500.0 ± 50.0"`.
+        bounds: Elements with bounds [SI], such as `"r_s 100.0 to 2000.0"`.
         precision: Floating-point type of the computation.
         backend: Backend of JAX, such as `"cpu"`.
         versions: Packages and their versions, such as `"jax 0.10.2"`.
@@ -51,6 +52,7 @@ class Settings:
     driver_drift: float
     fixed: tuple[str, ...]
     prior: tuple[str, ...]
+    bounds: tuple[str, ...]
     precision: str
     backend: str
     versions: tuple[str, ...]
@@ -66,6 +68,7 @@ class Settings:
         r_load_tolerance: float = 0.0,
         driver_drift: float = 0.0,
         known: Sequence[tuple[str, float, float]] = (),
+        bounds: Sequence[tuple[str, float, float | None]] = (),
     ) -> "Settings":
         """The settings of a run in this process.
 
@@ -79,6 +82,7 @@ class Settings:
             driver_drift: As in `identify_driver`.
             known: Names, values and standard deviations of known elements [SI]; the standard
                 deviation of a fixed element is 0.
+            bounds: Names, lower and upper bounds of elements [SI]; None for no upper bound.
         """
         source = os.path.abspath(study.file) if study.file else ""
         return cls(
@@ -95,6 +99,7 @@ class Settings:
             driver_drift=float(driver_drift),
             fixed=tuple(f"{name} {value!r}" for name, value, error in known if not error),
             prior=tuple(f"{name} {value!r} ± {error!r}" for name, value, error in known if error),
+            bounds=tuple(f"{name} {low!r} to {high!r}" for name, low, high in bounds),
             precision="float64",
             backend=jax.default_backend(),
             versions=tuple(f"{name} {importlib.metadata.version(name)}" for name in PACKAGES),

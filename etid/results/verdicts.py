@@ -85,6 +85,10 @@ class RESULTS(optx.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]  # equi
         "The driver changed in between, or r_load is wrong: calibrate again. If the recording has "
         "a current too, its scale may be wrong; to leave it out, use replace(current=None)."
     )
+    out_of_bounds = (
+        "Recording and bounds contradict each other: without its bounds an element lies more than "
+        "three standard errors outside. Correct the bounds, or fit another circuit."
+    )
     driver_unclear = (
         "The calibrations are too noisy: this recording moves the source impedance further than "
         "the fit can follow them. Repeat the calibrations with less noise, more periods or a "

@@ -14,6 +14,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from etid.circuits.circuit import AbstractCircuit
+from etid.estimators.bounds import Bounds
 from etid.estimators.element_prior import ElementPrior
 from etid.estimators.maximum_likelihood.driver import Calibrations
 from etid.estimators.maximum_likelihood.given_driver import GivenDriver, around
@@ -33,12 +34,14 @@ class Joint(eqx.Module):
         calibrations: Calibrations of the driver of the loads.
         shared: Whether the unloaded record of a load may be that of a calibration.
         prior: Prior of the elements of every load; None without one.
+        bounds: Bounds of the elements of every load, which do not affect Z_th.
     """
 
     circuit: AbstractCircuit
     calibrations: Calibrations
     shared: bool = eqx.field(static=True)
     prior: ElementPrior | None = None
+    bounds: Bounds = eqx.field(static=True, default=())
 
     def around(
         self,

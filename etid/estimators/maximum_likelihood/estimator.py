@@ -6,6 +6,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from etid.circuits.circuit import AbstractCircuit
+from etid.estimators.bounds import Bounds, stated_bounds
 from etid.estimators.element_prior import ElementPrior, Known, stated
 from etid.estimators.estimator import (
     BY_RESIDUALS,
@@ -78,11 +79,13 @@ class MaximumLikelihood(AbstractEstimator):
     Attributes:
         known_elements: Elements that are known: name, value and standard deviation [SI]; 0 fixes
             one.
+        bounds: Bounds of elements: name, lower and upper bound [SI].
         with_current: Whether the measured current is used together with the driver. The default
             method does so for recordings that have both.
     """
 
     known_elements: Known = ()
+    bounds: Bounds = ()
     with_current: bool = False
     name = "maximum_likelihood"
     lane = Harmonics
@@ -129,13 +132,13 @@ class MaximumLikelihood(AbstractEstimator):
             current = jnp.asarray(lane.i), jnp.asarray(lane.variance_i)
             found = with_current.fit_circuit(known, circuit, spectrum, current, rate, prior)
             estimate, far, other, disagrees = found
-            fit = judged(estimate, circuit, driver.result, str(self))
+            fit = judged(estimate, circuit, driver.result, str(self), self.bounds)
             fit = unless(fit, disagrees, RESULTS.inconsistent)
         else:
             starts = known.starts(spectrum, rate, circuit)
             found = load.fit_circuit(known, circuit, spectrum, rate, starts, prior)
             estimate, far, other = found
-            fit = judged(estimate, circuit, driver.result, str(self))
+            fit = judged(estimate, circuit, driver.result, str(self), self.bounds)
         if known.shape is not None:
             fit = unless(fit, known.shape.differs(spectrum), RESULTS.inconsistent)
         return unless(unless(fit, far, RESULTS.driver_unclear), other, RESULTS.misfit)
@@ -147,7 +150,8 @@ class MaximumLikelihood(AbstractEstimator):
             "the load was estimated by",
             "Each load was estimated jointly with Z_th and the trigger delays of the calibrations, "
             "whose distribution the calibrations give. Its own trigger delay τ is one more "
-            f"unknown.{_BOTH if self.with_current else ''}{stated(self.known_elements)}",
+            f"unknown.{_BOTH if self.with_current else ''}{stated(self.known_elements)}"
+            f"{stated_bounds(self.bounds)}",
             (NO_OTHER_CIRCUIT, NO_OTHER_GAIN, NO_FALL),
         )
 

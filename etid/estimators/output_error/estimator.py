@@ -6,6 +6,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from etid.circuits.circuit import AbstractCircuit
+from etid.estimators.bounds import Bounds, stated_bounds
 from etid.estimators.element_prior import ElementPrior, Known, stated
 from etid.estimators.estimator import CHECKED, DETERMINED, AbstractEstimator, Description
 from etid.estimators.judgement import judged, misses, unless
@@ -36,9 +37,11 @@ class OutputError(AbstractEstimator):
     Attributes:
         known_elements: Elements that are known: name, value and standard deviation [SI]; 0 fixes
             one.
+        bounds: Bounds of elements: name, lower and upper bound [SI].
     """
 
     known_elements: Known = ()
+    bounds: Bounds = ()
     name = "output_error"
     lane = PaddedSamples
     driver = ContinuousDriver
@@ -82,7 +85,7 @@ class OutputError(AbstractEstimator):
         fitted, estimate, other = fit.fit_circuit(
             prediction.prepare(m, samples=samples), driver, starts, prior
         )
-        found = judged(estimate, circuit, driver.result, str(self))
+        found = judged(estimate, circuit, driver.result, str(self), self.bounds)
         off = misses(estimate.chi2, estimate.rrse, INTERPOLATED)
         found = unless(found, off, RESULTS.biased)
         if isinstance(driver, HarmonicDriver):
@@ -103,7 +106,8 @@ class OutputError(AbstractEstimator):
             "predicted in continuous time from the band-limited unloaded record, and its "
             "difference to the loaded record, weighted by the noise of both, was minimised. The "
             "state at the start of the record, an offset and the trigger delay were estimated with "
-            f"the load.{stated(self.known_elements)}",
+            f"the load.{stated(self.known_elements)}"
+            f"{stated_bounds(self.bounds)}",
             conditions=(*CHECKED, DETERMINED),
             errors="were multiplied by the square root of χ² where the residual exceeds the noise",
             refined=True,

@@ -1,0 +1,220 @@
+"""Elements with bounds: estimates, errors and their coverage, files, commands, and wrong bounds."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.stats
+
+import etid
+from etid import cli
+from etid.estimators.bounds import truncated, within
+from etid.estimators.judgement import SUCCESSFUL, judged
+from etid.recordings.remarks import Remark
+from etid.results.verdicts import verdict
+from tests.test_current import SKIN, recorded
+from tests.test_judging import estimate
+
+
+@pytest.fixture(scope="module")
+def noisy():
+    """R_s has an error of 8 %."""
+    return recorded(SKIN, snr_db=20.0, seed=3)
+
+
+@pytest.fixture(scope="module")
+def free(noisy):
+    return etid.identify_skin(noisy)
+
+
+@pytest.fixture(scope="module")
+def beyond(noisy, free):
+    """A fit whose free estimate lies one standard error below its bound."""
+    return etid.identify_skin(noisy, bounds={"r_s": (above(free, 1.0), None)})
+
+
+def above(fit, errors):
+    """A value of R_s this many standard errors above a fit [Ω]."""
+    return float(fit.circuit.r_s + errors * fit.stderr.r_s)
+
+
+@pytest.mark.parametrize(
+    ("low", "high"), [(-1.0, 2.0), (0.5, np.inf), (3.0, 3.001), (-9.0, -8.0), (30.0, np.inf)]
+)
+def test_moments_of_a_truncated_normal_are_those_of_scipy(low, high):
+    mean, deviation = 5.0, 2.0
+    ends = (jnp.asarray(mean + deviation * end) for end in (low, high))
+    found = truncated(jnp.asarray(mean), jnp.asarray(deviation), *ends)
+    # SciPy's own moments lose digits far out, so the integral is compared: by its density.
+    x = np.linspace(low, min(high, low + 10.0), 200_001)
+    weight = np.exp(scipy.stats.norm.logpdf(x) - scipy.stats.norm.logpdf(x).max())
+    centre = np.trapezoid(weight * x, x) / np.trapezoid(weight, x)
+    variance = np.trapezoid(weight * (x - centre) ** 2, x) / np.trapezoid(weight, x)
+    # The sum of 200 000 steps has the integral to 10⁻⁸.
+    np.testing.assert_allclose(found[0], mean + deviation * centre, rtol=1e-7)
+    np.testing.assert_allclose(found[1], deviation**2 * variance, rtol=1e-5)
+
+
+def test_several_bounded_elements_are_those_of_draws_inside_the_box():
+    circuit, deviation = etid.SkinRC(30e3, 180e3, 0.1e-9), np.array([6e3, 5e3, 4e-12])
+    related = np.array([[1, -0.9, 0.5], [-0.9, 1, -0.4], [0.5, -0.4, 1]])
+    cov = related * np.outer(deviation, deviation)
+    bounds = (("r_s", 33e3, None), ("r_p", 170e3, 182e3))
+    found = within(circuit, jnp.asarray(cov), jnp.asarray(0.5 * cov), bounds)
+    x = np.random.default_rng(2).multivariate_normal(circuit.values(), cov, 100_000)
+    x = x[(x[:, 0] > 33e3) & (x[:, 1] > 170e3) & (x[:, 1] < 182e3)]
+    # Expectation propagation is not exact for several elements; a tenth of an error is no harm.
+    assert np.abs((found.values - x.mean(0)) / x.std(0)).max() < 0.1
+    np.testing.assert_allclose(np.sqrt(np.diagonal(found.cov)), x.std(0), rtol=0.1)
+    assert bool(found.beyond)
+    assert not bool(found.contradicted)
+    own = np.linalg.eigvalsh((found.cov - found.shared_cov) / np.outer(deviation, deviation))
+    assert own.min() > 0
+
+
+@pytest.mark.parametrize("from_bound", [0.0, 0.5, 1.0, 2.0, 4.0])
+def test_intervals_contain_the_truth_as_often_as_they_say_near_and_far_from_a_bound(from_bound):
+    """Between 94.2 and 97.3 % by quadrature; three standard deviations of 10 000 draws are 0.7."""
+    truth, error = np.array([30e3, 180e3, 0.1e-9]), np.array([3e3, 3e3, 3e-12])
+    related = np.array([[1, -0.8, 0.5], [-0.8, 1, -0.4], [0.5, -0.4, 1]])
+    cov = jnp.asarray(related * np.outer(error, error))
+    bounds = (("r_s", float(truth[0] - from_bound * error[0]), 60e3),)
+    drawn = np.random.default_rng(1).multivariate_normal(truth, cov, 10_000)
+
+    def one(values):
+        found = within(etid.SkinRC(*values), cov, cov, bounds)
+        return found.values, jnp.sqrt(jnp.diagonal(found.cov))
+
+    values, errors = jax.jit(jax.vmap(one))(jnp.asarray(drawn))
+    covered = np.mean(np.abs(np.asarray(values) - truth) < 1.96 * np.asarray(errors), axis=0)
+    assert 0.935 < covered[0] < 0.98
+    # An element that is related to it is covered worst if the truth is the bound itself: 90 %.
+    assert ((covered > 0.89 if from_bound == 0 else covered > 0.93) & (covered < 0.98)).all(), (
+        covered
+    )
+
+
+def test_bounds_far_away_change_nothing_and_those_that_contradict_the_data_are_no_success():
+    of = estimate(relative=(0.05, 0.02, 0.03))
+    free = judged(of, etid.SkinRC(), SUCCESSFUL, "a method")
+
+    def bounded(errors):
+        bounds = (("r_s", above(free, errors), None),)
+        return judged(of, etid.SkinRC(), SUCCESSFUL, "a method", bounds)
+
+    far = bounded(-10.0)
+    np.testing.assert_allclose(far.circuit.values(), free.circuit.values(), rtol=1e-9)
+    np.testing.assert_allclose(far.cov, free.cov, rtol=1e-9)
+    assert (far.verdict, int(far.remarks)) == ("successful", 0)
+    assert (bounded(3.2).verdict, int(bounded(3.2).remarks)) == ("successful", Remark.at_bound)
+    assert bounded(3.5).verdict == "out_of_bounds"
+
+
+def test_an_element_that_only_its_bounds_determine_is_no_more_insensitive():
+    of = estimate(relative=(1.5, 0.02, 0.03))
+    assert judged(of, etid.SkinRC(), SUCCESSFUL, "a method").verdict == "insensitive"
+    known = judged(of, etid.SkinRC(), SUCCESSFUL, "a method", (("r_s", 1e4, 3e4),))
+    assert known.verdict == "successful"
+    failed = judged(of, etid.SkinRC(), verdict("nonphysical"), "a method", (("r_s", 1e4, 3e4),))
+    assert failed.verdict == "driver_failed"
+
+
+def test_an_element_beyond_its_bound_is_said_and_has_the_error_of_what_is_left(free, beyond):
+    assert beyond.verdict == "successful"
+    assert int(beyond.remarks) & Remark.at_bound
+    assert "would lie beyond its bound" in str(beyond)
+    left = scipy.stats.truncnorm(1.0, np.inf, float(free.circuit.r_s), float(free.stderr.r_s))
+    np.testing.assert_allclose(beyond.circuit.r_s, left.mean(), rtol=1e-9)
+    np.testing.assert_allclose(beyond.stderr.r_s, left.std(), rtol=1e-9)
+    # R_s + R_p is known well, so the other elements follow, with smaller errors.
+    assert beyond.circuit.r_p < free.circuit.r_p
+    assert beyond.stderr.r_p < 0.7 * free.stderr.r_p
+
+
+def test_draws_keep_to_the_bounds_and_agree_with_the_fit(free, beyond):
+    posterior = beyond.posterior(draws=2000)
+    inside = posterior.weights[np.asarray(posterior.draws.r_s) < above(free, 1.0)]
+    assert inside.sum() == 0.0
+    assert posterior.effective > 400
+    # The likelihood is skewed at 20 dB: its mean differs by a quarter of a standard error.
+    mean = posterior.weights @ np.asarray(posterior.draws.r_s)
+    assert abs(mean - beyond.circuit.r_s) < 0.4 * beyond.stderr.r_s
+    with pytest.raises(ValueError, match="a fit with bounds has no profiles"):
+        beyond.profile("c_p")
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"bounds": {"r_s": (2e3, 1e3)}}, "bounds of r_s are 2000 and 1000"),
+        ({"bounds": {"r_s": (1e3, 1e3)}}, "the upper one must be larger"),
+        ({"bounds": {"r_s": (-1.0, 1e3)}}, "must not be negative"),
+        ({"bounds": {"r_s": (np.nan, 1e3)}}, "bounds of r_s are nan"),
+        ({"bounds": {"r_s": (0.0, 0.0)}}, "bounds of r_s are 0 and 0"),
+        ({"bounds": {"r_x": (1.0, 2.0)}}, "'r_x' has bounds, but is no element of SkinRC"),
+        ({"bounds": {"r_s": (1.0, 1e3)}, "fixed": {"r_s": 5.0}}, "r_s is fixed and has bounds"),
+        (
+            {"bounds": {"r_s": (1.0, 1e3)}, "method": "non_parametric"},
+            "'non_parametric' takes no known elements and no bounds",
+        ),
+        (
+            {"bounds": {"r_s": (1.0, 1e3)}, "circuit": "auto"},
+            "r_s is known, but ParallelRC and Resistor have no such element",
+        ),
+    ],
+)
+def test_impossible_bounds_are_refused(noisy, options, words):
+    with pytest.raises(ValueError, match=words):
+        etid.identify_skin(noisy, **options)
+
+
+def test_bounds_on_the_command_line_in_batches_and_reports(noisy, beyond, free, tmp_path, capsys):
+    study, target = tmp_path / "study.h5", tmp_path / "fits.h5"
+    etid.Study.from_recordings([noisy.replace(path="s01/0")]).write(study)
+    bound = repr(above(free, 1.0))
+    command = ["fit", str(study), "-o", str(target), "--force"]
+    assert cli.main([*command, "--bound", f"r_s={bound}:"]) == 0
+    found = etid.StudyFits.read(target)
+    fit = found.fits[0]
+    np.testing.assert_allclose(fit.circuit.values(), beyond.circuit.values(), rtol=1e-7)
+    assert int(fit.remarks) & Remark.at_bound
+    assert found.settings is not None
+    assert found.settings.bounds == (f"r_s {bound} to None",)
+    etid.write_report(target, tmp_path / "page.html")
+    assert f"r_s ≥ {float(bound):g}" in (tmp_path / "page.html").read_text("utf-8")
+    capsys.readouterr()
+    assert cli.main([*command, "--bound", "r_s=2:1"]) == 1
+    assert "bounds of r_s are 2 and 1" in capsys.readouterr().err
+    with pytest.raises(SystemExit):
+        cli.main([*command, "--bound", "r_s=2"])
+    assert "write --bound r_s=100:2000" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_bounds_in_time_and_at_several_amplitudes(noisy, free):
+    bounds = {"r_s": (above(free, 1.0), None)}
+    single = recorded(SKIN, periods=1.1, snr_db=20.0)
+    alone = etid.identify_skin(single)
+    fit = etid.identify_skin(single, bounds={"r_s": (above(alone, 1.0), None)})
+    assert (fit.method[:12], int(fit.remarks)) == ("output_error", Remark.at_bound)
+    np.testing.assert_allclose(fit.stderr.r_s / alone.stderr.r_s, 0.446, rtol=0.01)  # of a normal
+    several = etid.identify_amplitudes([noisy], circuit=etid.SkinRC(), bounds=bounds)
+    assert int(several.remarks) & Remark.at_bound
+    assert several.circuit.r_s > bounds["r_s"][0]
+
+
+@pytest.mark.slow
+def test_intervals_of_bounded_fits_contain_the_truth():
+    """R_s known to a sixth, in the range of the paper; three deviations of 400 are 3.3 %."""
+    rng = np.random.default_rng(1)
+    truth = rng.uniform(19e3, 70e3, 400)
+    recordings = [
+        recorded(etid.SkinRC(r_s, 186e3, 0.12e-9), snr_db=14.0, seed=seed)
+        for seed, r_s in enumerate(truth)
+    ]
+    fits = etid.identify_skins(recordings, bounds={"r_s": (19e3, 70e3)})
+    covered = np.abs(np.asarray(fits.circuit.r_s) - truth) < 1.96 * np.asarray(fits.stderr.r_s)
+    assert 0.917 < covered.mean() < 0.983
+    ends = np.minimum(truth - 19e3, 70e3 - truth) < 5e3
+    assert covered[ends].mean() > 0.88
+    assert (fits.verdicts == "successful").mean() > 0.98
