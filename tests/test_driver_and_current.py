@@ -73,6 +73,9 @@ def test_the_current_is_left_out_on_request(recording, driver, both):
     without = etid.identify_skin(recording.replace(current=None), driver)
     np.testing.assert_array_equal(alone.circuit.values(), without.circuit.values())
     assert (relative(both) < 0.5 * relative(alone)).all()
+    said = [int(fit.remarks) & Remark.current_unused for fit in (both, alone, without)]
+    assert said == [0, Remark.current_unused, 0]
+    assert "does not use it" in str(alone)
     with pytest.raises(ValueError, match="needs a driver and a current"):
         etid.identify_skin(recording.replace(current=None), driver, method=METHOD)
     with pytest.raises(ValueError, match="needs a driver and a current"):
@@ -170,6 +173,7 @@ def test_a_joint_fit_leaves_the_current_out(study):
     wrong = study["loaded/0"].replace(current=0 * study["loaded/0"].v_out)
     joint = etid.identify_jointly(etid.Study.from_recordings([study["calibration/0"], wrong]))
     assert joint.fits.verdicts == ["successful"]
+    assert int(joint.fits.fit.remarks[0]) & Remark.current_unused
 
 
 @pytest.mark.slow

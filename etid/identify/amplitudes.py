@@ -32,7 +32,7 @@ from etid.identify.arguments import (
 )
 from etid.identify.arguments import recordings as list_of
 from etid.identify.compiled import stored_jit
-from etid.identify.one import failed_fit, known_of, successful
+from etid.identify.one import failed_fit, known_of, remarks_on, successful
 from etid.recordings.preflight import Inspected
 from etid.recordings.recording import Recording, RecordingError
 from etid.results.driver import Driver, HarmonicDriver
@@ -139,7 +139,9 @@ def identify_amplitudes(
     lanes = [Harmonics.of(one) for one in seen]
     known = known_of(lanes[0], feed, False, MAXIMUM_LIKELIHOOD)
     fit = jax.device_get(_fit(stacked(lanes), known, feed, circuit, of_elements, asked.bounds))
-    of_records = functools.reduce(operator.or_, (int(one.remarks) for one in seen))
+    of_records = functools.reduce(
+        operator.or_, (remarks_on(one, MAXIMUM_LIKELIHOOD) for one in seen)
+    )
     fit = dataclasses.replace(fit, remarks=np.asarray(fit.remarks | of_records))
     return successful(seen[0].recording, fit) if throw else fit
 

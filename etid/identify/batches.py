@@ -34,6 +34,7 @@ from etid.identify.one import (
     note,
     notes_of,
     refined,
+    remarks_on,
     skin_lane,
 )
 from etid.identify.planning import Planned, Refusal, planned
@@ -179,7 +180,7 @@ class _Queue:
         rows, lanes, seen = self.rows, self.lanes, self.seen
         self.rows, self.lanes, self.seen, self.held = [], [], [], 0
         found = refined(lanes, seen, self._fits, self.driver, self.candidates)
-        remarks = [int(one.remarks) for one in seen]
+        remarks = [remarks_on(one, self.estimator) for one in seen]
         return _Part(rows, found.concluded(self.driver, remarks, repeats(seen)))
 
     def _fits(self, lanes: Sequence[AbstractLane], circuit: AbstractCircuit) -> Fit:

@@ -295,7 +295,8 @@ def identify_jointly(
     influence the driver. If the trigger delays of all recordings scatter by less than their errors,
     a second fit limits each delay by this scatter; the fits then have the remark `small_delays`.
     Recordings of a measured current share no driver; each is fitted alone. `identify_amplitudes`
-    fits one load to several recordings.
+    fits one load to several recordings. A current beside `v_th` is not used, and the fit says so
+    (`current_unused`).
 
     Args:
         study: Calibrations and loaded recordings.
@@ -334,11 +335,14 @@ def identify_jointly(
     waiting: dict[tuple[str, ...], dict[Any, _Waiting]] = {}
 
     by_current: list[int] = []
+    unused: set[int] = set()  # recordings whose current is left out
 
     def load(row: int) -> tuple[Recording, AbstractFeed]:
         of, feed = drivers.fed(study[paths[row]])
-        alone = of.cause == "current" or "current" not in of.samples
-        return (of if alone else of.replace(current=None)), feed
+        if of.cause == "current" or "current" not in of.samples:
+            return of, feed
+        unused.add(row)
+        return of.replace(current=None), feed
 
     inspected = itertools.chain.from_iterable(
         planned(load, rows, Asked()) for rows in chunked(len(paths))
@@ -392,7 +396,11 @@ def identify_jointly(
         drivers.found[names] = better
         for group, fit in zip(lengths.values(), found, strict=True):
             alone = _alone_judged(fit, group.changed)
-            judged = concluded(alone, better, group.remarks, group.repeats)
+            remarks = [
+                one | (Remark.current_unused if row in unused else 0)
+                for row, one in zip(group.rows, group.remarks, strict=True)
+            ]
+            judged = concluded(alone, better, remarks, group.repeats)
             of_group = zip(group.rows, unstacked(judged), notes_of(judged), strict=True)
             for row, one, text in of_group:
                 fits[row], notes[row] = one, text

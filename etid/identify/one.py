@@ -15,6 +15,7 @@ from etid.circuits.circuit import AbstractCircuit, SkinRC
 from etid.estimators.estimator import AbstractEstimator
 from etid.estimators.judgement import MISFIT_CHI2
 from etid.estimators.lanes import AbstractLane, Harmonics, replaced, stacked, taken, unstacked
+from etid.estimators.maximum_likelihood.estimator import MaximumLikelihood
 from etid.estimators.registry import Method
 from etid.identify import changes
 from etid.identify.arguments import (
@@ -167,7 +168,7 @@ def candidate_fits(
         return stacked(jax.device_get(found))
 
     found = refined([lane], [seen], fit, feed, candidates)
-    found = found.concluded(feed, [int(seen.remarks)], repeats([seen]))
+    found = found.concluded(feed, [remarks_on(seen, estimator)], repeats([seen]))
     return found[0], found.chosen(0)
 
 
@@ -465,6 +466,13 @@ def notes_of(fits: Fit) -> list[str]:
         note(taken(fits, row)) if name == "changed" else message(name)
         for row, name in enumerate(names)
     ]
+
+
+def remarks_on(seen: Inspected, estimator: AbstractEstimator) -> int:
+    """Remarks on a recording, also that the estimator leaves out a current beside a driver."""
+    uses = isinstance(estimator, MaximumLikelihood) and estimator.with_current
+    unused = seen.by_current is not None and not uses
+    return int(seen.remarks | (Remark.current_unused if unused else 0))
 
 
 def checksum(seen: Inspected) -> int:

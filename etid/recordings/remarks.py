@@ -22,6 +22,7 @@ class Remark(enum.IntFlag):
     small_delays = enum.auto()
     falls_with_current = enum.auto()
     at_bound = enum.auto()
+    current_unused = enum.auto()
 
 
 _TEXTS = {
@@ -47,6 +48,10 @@ _TEXTS = {
     Remark.at_bound: (
         "An element would lie beyond its bound without it. The estimate is the mean of what the "
         "bounds leave; its distribution is not symmetric, and fit.posterior() shows it."
+    ),
+    Remark.current_unused: (
+        "A current was recorded too, and this fit does not use it; identify_skin without a method "
+        "uses driver and current at once."
     ),
 }
 
