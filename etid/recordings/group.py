@@ -18,6 +18,8 @@ from etid.signals.quick_looks import flickering, humming, uneven
 # A recording that is not finite is refused later; its neighbours in a group are not concerned.
 QUIETLY = functools.partial(np.errstate, invalid="ignore", over="ignore")
 _Key = TypeVar("_Key", bound=Hashable)
+SEAM = 3  # samples on each side of the joint between two periods
+STEP = 4.0  # [standard deviations] largest difference that noise makes, there and elsewhere
 
 
 class Group:
@@ -44,7 +46,7 @@ class Group:
         whole = np.empty((len(self.recordings), 2, size))
         for records, one in zip(whole, self.recordings, strict=True):
             for v, record in zip(records, _records(one), strict=True):
-                v[:] = record.values
+                record.write_to(v)
         whole.flags.writeable = False
         return whole
 
@@ -165,6 +167,19 @@ class Group:
         return np.maximum(self.noise, RIPPLE * np.ptp(self.limits, axis=-1))
 
     @functools.cached_property
+    def periodic(self) -> Bool[np.ndarray, " recording"]:
+        """`is_periodic` of each recording in `quiet`, with all its periods."""
+        found = np.zeros(len(self.recordings), bool)
+        for (periods, samples), rows in _alike(self.whole_periods).items():
+            if periods > 0:
+                counted = np.array([self.trains[row].counted for row in rows])
+                rest = np.abs(periods * self.sample_rate / counted - samples)
+                of = _part(self.quiet, rows), self.trusted[rows]
+                with QUIETLY():
+                    found[rows] = is_periodic(*of, rest, samples)
+        return found
+
+    @functools.cached_property
     def flickers(self) -> Bool[np.ndarray, "recording 2"]:
         """Whether each record in `quiet` may have 1/f noise, by a quick look."""
         found = np.zeros(self.noise.shape, bool)
@@ -215,6 +230,28 @@ def covariance_of(v: Float[np.ndarray, "*recording 2 time"]) -> Float[np.ndarray
         # Not `@`, which starts BLAS threads.
         square = np.einsum("...in,...jn->...ij", v, v) / v.shape[-1]
         return square - mean[..., :, None] * mean[..., None, :]
+
+
+def is_periodic(
+    records: Float[np.ndarray, "*recording 2 time"],
+    sigma: Float[np.ndarray, "*recording 2"],
+    rest: Float[np.ndarray, "*recording"],
+    samples: int,
+) -> Bool[np.ndarray, "*recording"]:
+    """Whether whole periods have no step from their end to their start.
+
+    The length of the periods differs from whole samples by up to half a sample. This makes a step
+    if the signal is steep at the joint.
+
+    Args:
+        records: Voltages [V].
+        sigma: Standard deviation of the noise of a sample of each record [V].
+        rest: Difference between the length of the periods and `samples` [samples].
+        samples: Number of samples of the periods.
+    """
+    joint = np.concatenate([records[..., samples - SEAM : samples], records[..., :SEAM]], axis=-1)
+    step = rest[..., None] * np.abs(np.diff(joint)).max(-1)
+    return np.asarray(~(step > STEP * sigma).any(-1))
 
 
 def _kept(

@@ -6,7 +6,7 @@ import math
 import numpy as np
 from jaxtyping import Bool, Float
 
-from etid.recordings.group import Group, covariance_of, limits_of
+from etid.recordings.group import STEP, Group, covariance_of, is_periodic, limits_of
 from etid.recordings.recording import Recording
 from etid.recordings.remarks import Remark
 from etid.signals.disturbances import Joint
@@ -38,8 +38,6 @@ LEAST, GREATEST = 1.0, 1e12
 EQUAL = 1e-3  # largest relative difference of the amplitudes if no load is connected
 SAME = 1.5  # largest variance of their difference then, relative to the noise
 LATE = 5e-3  # fraction of the signal that a delay of 0.1 sample may leave at the edges
-SEAM = 3  # samples on each side of the joint between two periods
-STEP = 4.0  # [standard deviations] largest difference there; also allowed in addition to EQUAL
 
 
 class Inspected:
@@ -285,18 +283,12 @@ class Inspected:
     def is_periodic(self) -> bool:
         """Whether the record holds whole pulse periods, without a step from its end to its start.
 
-        The length of the periods differs from whole samples by up to half a sample. This makes a
-        step if the signal is steep at the joint.
+        If periods are left out, each begins at a whole sample, up to one sample from its place.
         """
-        periods, samples = self.periods
-        if periods == 0:
-            return False
-        rest = abs(periods * self.spacing - samples) if self.kept is None else 1.0
-        for v, sigma in ((self.v_th, self.trusted_th), (self.v_out, self.trusted_out)):
-            joint = np.concatenate([v[samples - SEAM : samples], v[:SEAM]])
-            if rest * np.abs(np.diff(joint)).max() > STEP * sigma:
-                return False
-        return True
+        if self.kept is None:
+            return bool(self._group.periodic[self._row])
+        sigma = np.stack([self.trusted_th, self.trusted_out])
+        return bool(is_periodic(self._both, sigma, np.asarray(1.0), self.periods[1]))
 
 
 def preflight(seen: Inspected, *, periodic: bool = False) -> str | None:

@@ -78,12 +78,19 @@ class Samples:
         """The samples in SI units [V or A], read-only."""
         if self.conversion == 1 and self.offset == 0 and self.stored.dtype == np.float64:
             return self.stored
-        values = self.stored.astype(np.float64)
-        with np.errstate(over="ignore", invalid="ignore"):  # infinite samples get a verdict
-            values *= self.conversion
-            values += self.offset
+        values = np.empty(self.stored.shape)
+        self.write_to(values)
         values.flags.writeable = False
         return values
+
+    def write_to(self, values: Float[np.ndarray, "..."]) -> None:
+        """Write the samples in SI units [V or A] into an array of their shape."""
+        values[...] = self.stored
+        with np.errstate(over="ignore", invalid="ignore"):  # infinite samples get a verdict
+            if self.conversion != 1:
+                values *= self.conversion
+            if self.offset != 0:
+                values += self.offset
 
     @property
     def resolution(self) -> float | None:

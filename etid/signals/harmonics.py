@@ -90,7 +90,9 @@ def harmonics(
     step = periods // parts
     at_harmonics = transform[..., step : (folded.shape[-1] + 1) // 2 : step]
     # `@` would start BLAS threads for each recording, and these threads wait for each other.
-    return at_harmonics - of.einsum("...d,dh->...h", drift.astype(basis.dtype), basis)
+    if of is np:  # real and imaginary parts are real products
+        return at_harmonics - np.einsum("...d,dh->...h", drift, basis.view(float)).view(complex)
+    return at_harmonics - jnp.einsum("...d,dh->...h", drift.astype(basis.dtype), basis)
 
 
 def namespace(v: Array | np.ndarray) -> ModuleType:
