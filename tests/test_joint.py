@@ -11,10 +11,12 @@ import pytest
 import etid
 from benchmarks.failure_axes import Cole
 from etid.estimators.estimate import DELAY_WIDTH
+from etid.estimators.joint import near
 from etid.estimators.joint.fit import fit_alone
 from etid.estimators.joint.terms import Joint
 from etid.estimators.lanes import Harmonics
 from etid.estimators.maximum_likelihood.driver import Calibrations
+from etid.estimators.maximum_likelihood.given_driver import GivenDriver
 from etid.estimators.starts import harmonic_starts
 from etid.recordings.preflight import Inspected
 from etid.recordings.remarks import Remark
@@ -98,6 +100,23 @@ def test_a_load_that_is_fitted_alone_has_the_misfit_of_its_residual(study):
     missed = (abs(y - g * x) ** 2)[used].sum() / (abs(y) ** 2)[used].sum()
     np.testing.assert_allclose(rrse, np.sqrt(missed), rtol=1e-9)
     assert not bool(hum)
+
+
+def test_gains_of_calibrations_with_the_same_unloaded_record_are_signals_of_their_own():
+    """Each signal has a real and an imaginary part: those of W first, then those of each gain."""
+    of_one, w, gains = jnp.ones(3), jnp.ones(3, complex), jnp.ones((2, 3), complex)
+    z, known = jnp.zeros(1), jnp.zeros((1, 2, 3), complex)
+    calibrated = GivenDriver(
+        of_one, w, w, w[None], jnp.array(1e4), z, z[:, None], None, gains, known
+    )
+    found = near._by_signals(calibrated, True)
+    parts = np.array([1, 1j])
+    expected = np.zeros((3, 2, 3), complex)  # signal, part, what it moves
+    for i in range(3):
+        expected[i, :, i] = parts
+    told = np.concatenate([found.slope[:, None], found.gain_slopes], axis=1)  # of each harmonic
+    np.testing.assert_array_equal(told, np.repeat(expected.reshape(6, 3, 1), 3, axis=2))
+    assert found.mean.shape == (6,)
 
 
 @pytest.mark.slow

@@ -196,7 +196,7 @@ def _by_signals(driver: GivenDriver, shared: bool) -> GivenDriver:
     if shared and driver.gains is not None:
         count, size = driver.gains.shape
         slope = jnp.pad(slope, ((0, 2 * count), (0, 0)))
-        alone = jnp.pad(jnp.kron(jnp.eye(count), unit), ((W, 0), (0, 0)))
+        alone = jnp.pad(jnp.kron(jnp.eye(count, dtype=unit.dtype), unit), ((W, 0), (0, 0)))
         known = jnp.tile(alone[:, :, None], (1, 1, size))
     zero = jnp.zeros(slope.shape[0])
     return dataclasses.replace(
