@@ -107,13 +107,23 @@ def test_gains_of_calibrations_with_the_same_unloaded_record_are_signals_of_thei
     of_one, w, gains = jnp.ones(3), jnp.ones(3, complex), jnp.ones((2, 3), complex)
     z, known = jnp.zeros(1), jnp.zeros((1, 2, 3), complex)
     calibrated = GivenDriver(
-        of_one, w, w, w[None], jnp.array(1e4), z, z[:, None], None, gains, known
+        frequency=of_one,
+        loaded=w,
+        w_slope=w,
+        slope=w[None],
+        resistance=jnp.array(1e4),
+        mean=z,
+        cov=z[:, None],
+        records=None,
+        gains=gains,
+        gain_slopes=known,
     )
     found = near._by_signals(calibrated, True)
     parts = np.array([1, 1j])
     expected = np.zeros((3, 2, 3), complex)  # signal, part, what it moves
     for i in range(3):
         expected[i, :, i] = parts
+    assert found.gain_slopes is not None
     told = np.concatenate([found.slope[:, None], found.gain_slopes], axis=1)  # of each harmonic
     np.testing.assert_array_equal(told, np.repeat(expected.reshape(6, 3, 1), 3, axis=2))
     assert found.mean.shape == (6,)
