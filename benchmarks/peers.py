@@ -24,7 +24,7 @@ from benchmarks.timing import first_and_warm
 from etid.estimators.estimate import MAX_STEPS
 from etid.estimators.harmonic_steiglitz_mcbride.iteration import fit_skin
 from etid.estimators.maximum_likelihood.load import WELL
-from etid.estimators.steiglitz_mcbride.iteration import iterate
+from etid.estimators.steiglitz_mcbride.iteration import in_time, iterate
 from etid.identify.batches import each
 from etid.signals.filtering import lfilter
 from etid.signals.transfer import Rational
@@ -150,7 +150,7 @@ def _steiglitz_mcbride(ten_periods: Problem) -> Stage:
         def unjudged(_):
             return jnp.zeros(()), jnp.array(True)
 
-        return iterate(x[None], w[None], 1, 1, unjudged, 1).filter.num
+        return iterate(in_time(x[None], w[None], 1, 1), 1, 1, unjudged, 1).filter.num
 
     def by_scipy(records):
         return numpy_steiglitz_mcbride(records[0], records[1], b, a, 1)[0]

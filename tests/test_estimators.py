@@ -12,7 +12,7 @@ import etid
 from etid.circuits.circuit import Resistor
 from etid.estimators import registry
 from etid.estimators.estimator import AbstractEstimator, Description
-from etid.estimators.lanes import AlignedSamples
+from etid.estimators.lanes import AlignedSamples, Harmonics
 from etid.identify import arguments
 from etid.report.methods import methods_section
 from etid.results.driver import DiscreteDriver, Driver
@@ -39,7 +39,7 @@ class Proportion(AbstractEstimator):
         x, y = (v - v.mean(-1, keepdims=True) if self.offset else v for v in (m.v_th, m.v_out))
         return jnp.sum(x * y, -1) / jnp.sum(x * x, -1)
 
-    def fit_driver(self, records, r_load, order, spectra):
+    def fit_driver(self, records, r_load, order):
         r_th = jnp.mean(r_load * (1 / self.ratio(records) - 1))
         nothing, one = jnp.asarray(0.0), jnp.asarray(1.0)
         return DiscreteDriver(
@@ -65,6 +65,19 @@ class Proportion(AbstractEstimator):
             text=f"The load was estimated by the proportion of both voltages, the mean {kept}.",
             errors="are one per cent",
         )
+
+
+class Given(Exception):
+    """The shapes that an estimator was given."""
+
+
+class Shapes(Proportion):
+    """What is traced for a driver on harmonics."""
+
+    lane = Harmonics
+
+    def fit_driver(self, records, r_load, order):
+        raise Given(records.shapes)
 
 
 @pytest.fixture
@@ -122,6 +135,17 @@ def test_options_are_fields_which_fits_and_their_methods_section_keep(study):
     text = methods_section(StudyFits(both, {}, {})).text
     assert "the mean kept" in text
     assert "the mean taken out" in text
+
+
+def test_a_driver_on_harmonics_is_compiled_once_for_records_of_all_lengths():
+    known = (Trial("calibration/0", ResistorLoad(R_LOAD)),)
+    given = []
+    for samples in (10_000, 20_000, 34_000):
+        study = Scene((), known, samples=samples).simulate(seed=1)
+        with pytest.raises(Given) as shapes:
+            etid.identify_driver(study["calibration/0"], method=Shapes())
+        given.append(shapes.value.args[0])
+    assert given[0] == given[1] == given[2]
 
 
 def test_the_instance_of_a_name_is_the_same_method(study):

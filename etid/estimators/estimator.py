@@ -18,8 +18,6 @@ from etid.estimators.lanes import AbstractLane
 from etid.results.driver import ContinuousDriver, Driver
 from etid.results.feed import AbstractFeed, MeasuredCurrent
 from etid.results.fits import Fit
-from etid.signals.harmonics import Spectrum
-from etid.signals.noise import Measurement
 
 CHECKED = (
     "the records passed the checks for flat, clipped, missing and misplaced samples",
@@ -126,18 +124,17 @@ class AbstractEstimator(abc.ABC):
     @abc.abstractmethod
     def fit_driver(
         self,
-        records: Measurement,
+        records: Any,
         r_load: Float[Array, " record"],
         order: int,
-        spectra: Spectrum | None,
     ) -> Driver:
         """Identify a driver.
 
         Args:
-            records: Calibrations, stacked along a leading axis.
+            records: Calibrations, stacked along a leading axis: their `Harmonics` if the lanes of
+                this estimator are `periodic`, else their `Measurement`.
             r_load: Resistor of each calibration [Ω].
             order: Number of poles of Z_th.
-            spectra: Harmonics of the calibrations, if the lanes of this estimator are `periodic`.
         """
 
     @abc.abstractmethod

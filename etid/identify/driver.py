@@ -26,7 +26,6 @@ from etid.results.tried_orders import AUTO, Order
 from etid.results.verdicts import message, verdict
 from etid.selection.driver_order import TriedOrder, best, evidence, next_order
 from etid.signals import mains
-from etid.signals.harmonics import Spectrum
 
 # |Z_th| [Ω] at 1 kHz: from the transformer of a microphone to the transformer of a tube.
 PLAUSIBLE = (300.0, 300e3)
@@ -183,34 +182,25 @@ def _driver(seen: Sequence[Inspected], order: int, estimator: AbstractEstimator)
 def _aligned(seen: Sequence[Inspected], order: int, estimator: AbstractEstimator) -> Driver:
     """The driver from calibrations that passed the pre-flight, aligned by their lags."""
     r_load = jax.device_put(np.asarray([one.recording.r_load for one in seen]))
-    aligned = [AlignedSamples.of(one) for one in seen]
     if not estimator.lane.periodic:
+        aligned = [AlignedSamples.of(one) for one in seen]
         size = min(one.size for one in aligned)
         cut = [
             dataclasses.replace(one, v_th=one.v_th[:size], v_out=one.v_out[:size])
             for one in aligned
         ]
-        return _identified(stacked(cut), r_load, order, estimator, None)
-    # The samples give the starts only. One length lets all records use one compiled function.
-    shortest = min(one.v_th.size for one in seen)  # disturbed periods may be left out of some
-    whole = [
-        dataclasses.replace(
-            one, v_th=of.v_th[:shortest], v_out=np.roll(of.v_out, -of.lag)[:shortest]
-        )
-        for one, of in zip(aligned, seen, strict=True)
-    ]
+        return _identified(stacked(cut), r_load, order, estimator)
     lanes = [Harmonics.of(one) for one in seen]
     size = min(one.size for one in lanes)  # counted pulse rates may differ by one harmonic
     lanes = [jax.tree.map(lambda of: of[:size] if of.ndim else of, one) for one in lanes]
-    spectra = jax.device_put(stacked(lanes)).spectrum  # `jnp.asarray` would compile for each shape
-    records = stacked(whole)
-    driver = _identified(records, r_load, order, estimator, spectra)
+    records = stacked(lanes)
+    driver = _identified(records, r_load, order, estimator)
     # A driver fits hum on a harmonic by a pole at that frequency, and this pole is then missing
     # elsewhere.
     if needs_another(driver) or driver.verdict != "successful":
-        few = spectra.selected & ~mains.lines(spectra.frequency)
-        spectra = dataclasses.replace(spectra, selected=few)
-        driver = of_both(driver, _identified(records, r_load, order, estimator, spectra))
+        few = records.selected & ~mains.lines(records.frequency)
+        records = dataclasses.replace(records, selected=few)
+        driver = of_both(driver, _identified(records, r_load, order, estimator))
     return driver
 
 
@@ -224,11 +214,11 @@ def _response(
 
 @stored_jit
 def _identified(
-    samples: AlignedSamples,
+    lanes: AlignedSamples | Harmonics,
     r_load: Float[Array, " record"],
     order: int,
     estimator: AbstractEstimator,
-    spectra: Spectrum | None,
 ) -> Driver:
-    records = jax.vmap(AlignedSamples.measure)(samples)
-    return estimator.fit_driver(records, r_load, order, spectra)
+    samples = isinstance(lanes, AlignedSamples)
+    records = jax.vmap(AlignedSamples.measure)(lanes) if samples else lanes
+    return estimator.fit_driver(records, r_load, order)

@@ -5,14 +5,14 @@
 
 import dataclasses
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import optimistix as optx
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Array, Complex, Float
+from jaxtyping import Array, Bool, Complex, Float, Int
 
 from etid.circuits.elements import resistor
 from etid.estimators.estimate import (
@@ -34,13 +34,13 @@ from etid.estimators.maximum_likelihood.terms import (
     excess,
     residuals,
     shows_hum,
+    variance,
     weights,
 )
 from etid.estimators.sandwich import Linear
 from etid.estimators.unknowns import DriverUnknowns
 from etid.results.driver import Calibration, HarmonicDriver, SourceImpedance
 from etid.results.fits import complex_rrse
-from etid.signals.bands import banded
 from etid.signals.harmonics import Spectrum
 from etid.signals.transfer import as_complex, frequency_variable, reciprocal
 from etid.solvers.levenberg_marquardt import (
@@ -48,6 +48,7 @@ from etid.solvers.levenberg_marquardt import (
     LevenbergMarquardt,
     NormalEquations,
 )
+from etid.solvers.matrices import inverse
 
 
 def equations(_: Any, q: Float[Array, " common"], model: "Calibrations") -> NormalEquations:
@@ -88,31 +89,119 @@ def refined(
     )
 
 
+class Rough(NamedTuple):
+    """The minimum with bands of harmonics (`etid.signals.bands`), near that with all harmonics.
+
+    Attributes:
+        source: Z_th.
+        delay_samples: Trigger delay of each record [samples].
+        cov: Covariance of the parameters of `source`.
+        cost: −2 ln likelihood per degree of freedom, but for a constant.
+        steps: Trial steps of the solver.
+    """
+
+    source: SourceImpedance
+    delay_samples: Float[Array, " record"]
+    cov: Float[Array, "parameter parameter"]
+    cost: Float[Array, ""]
+    steps: Int[Array, ""]
+
+
+def rough_source(
+    spectra: Spectrum,
+    bands: Spectrum,
+    r_load: Float[Array, " record"],
+    sample_rate: Float[Array, ""],
+    start: SourceImpedance,
+) -> Rough:
+    """Identify Z_th from bands of harmonics.
+
+    Args:
+        spectra: Harmonics of the records, stacked along a leading axis.
+        bands: Their bands.
+        r_load: Resistor of each record [Ω].
+        sample_rate: Sampling rate [Hz].
+        start: Initial Z_th; its structure is the order.
+    """
+    calibration = Calibration(r_load, jnp.zeros(r_load.shape), delay_std(r_load))
+    model = Calibrations(start, calibration, bands, sample_rate)
+    solution = refined(model, model.start(), ROUGHLY)
+    q, equations = solution.value, solution.stats["normal_equations"]
+    kept = model.named(q).source.size
+    # A spurious resonance fits noise, so that it lowers Σ r²; but it raises the variances.
+    every = dataclasses.replace(model, spectra=spectra)
+    logs = [
+        jnp.sum(jnp.where(one.selected, jnp.log(variance(one, g)), 0.0))
+        for one, g in zip(every.records, every.gains(q), strict=True)
+    ]
+    terms = jnp.sum(spectra.selected, dtype=q.dtype)
+    return Rough(
+        source=model.z_th(q),
+        delay_samples=model.named(q).delay_samples,
+        cov=inverse(equations.matrix)[:kept, :kept],
+        cost=(equations.objective + sum(logs, jnp.zeros(()))) / terms,
+        steps=solution.stats["num_steps"],
+    )
+
+
+class _Tried(eqx.Module):
+    """How many fits with all harmonics were tried, and the result of the first that converged.
+
+    If none has converged, the result is that of the best start.
+    """
+
+    count: Int[Array, ""]
+    common: Float[Array, " common"]
+    squares: Float[Array, ""]
+    steps: Int[Array, ""]
+    settled: Bool[Array, ""]
+
+
 def fit_source(
     spectra: Spectrum,
     r_load: Float[Array, " record"],
     sample_rate: Float[Array, ""],
-    start: SourceImpedance,
+    near: Rough,
 ) -> tuple[SourceImpedance, Estimate, Calibration, Linear]:
     """Identify Z_th from one or several records with known resistors.
-
-    The fit starts with bands of harmonics (`etid.signals.bands`) and ends with all harmonics.
 
     Args:
         spectra: Harmonics of the records, stacked along a leading axis.
         r_load: Resistor of each record [Ω].
         sample_rate: Sampling rate [Hz].
-        start: Initial Z_th; its structure is the order.
+        near: Starts, stacked, the best first. The others are tried only if it does not converge.
 
     Returns:
-        Z_th; the estimate, with parameters in the order of the flattened `start`; the data of the
+        Z_th; the estimate, with parameters in the order of the flattened source; the data of the
         calibrations that a skin's fit needs; and the terms, linear around their minimum.
     """
-    calibration = Calibration(r_load, jnp.zeros(r_load.shape), delay_std(r_load))
-    model = Calibrations(start, calibration, spectra, sample_rate)
-    near = refined(dataclasses.replace(model, spectra=banded(spectra)), model.start(), ROUGHLY)
-    solution = refined(model, near.value, WELL)
-    q, found = solution.value, model.named(solution.value)
+    best = jax.tree.map(lambda leaf: leaf[0], near)
+    calibration = Calibration(r_load, best.delay_samples, delay_std(r_load))
+    model = Calibrations(best.source, calibration, spectra, sample_rate)
+
+    def fit(tried: _Tried) -> _Tried:
+        start = jax.tree.map(lambda leaf: leaf[tried.count], near)
+        q = DriverUnknowns(ravel_pytree(start.source)[0], start.delay_samples).vector()
+        solution = refined(model, q, WELL)
+        new = _Tried(
+            count=tried.count + 1,
+            common=solution.value,
+            squares=2 * solution.stats["normal_equations"].objective,
+            steps=start.steps + solution.stats["num_steps"],
+            settled=solution.result == optx.RESULTS.successful,
+        )
+        kept = new.settled | (tried.count == 0)
+        old = dataclasses.replace(tried, count=new.count)
+        return jax.tree.map(lambda one, other: jnp.where(kept, one, other), new, old)
+
+    nothing = jnp.zeros(())
+    tried = _Tried(
+        jnp.array(0), model.start(), nothing, jnp.zeros_like(best.steps), jnp.array(False)
+    )
+    tried = jax.lax.while_loop(
+        lambda tried: ~tried.settled & (tried.count < near.cost.size), fit, tried
+    )
+    q, found = tried.common, model.named(tried.common)
     kept = found.source.size
     linear = model.linear(q)
     cov = linear.covariance()[:kept, :kept]
@@ -124,10 +213,12 @@ def fit_source(
         delay_samples=found.delay_samples,
         cov=cov,
         shared_cov=jnp.zeros_like(cov),
-        chi2=2 * solution.stats["normal_equations"].objective / freedom,
+        chi2=tried.squares / freedom,
         rrse=errors.max(),
-        result=solution.result,
-        steps=near.stats["num_steps"] + solution.stats["num_steps"],
+        result=optx.RESULTS.where(
+            tried.settled, optx.RESULTS.successful, optx.RESULTS.nonlinear_max_steps_reached
+        ),
+        steps=tried.steps,
         hum=jnp.stack([shows_hum(s, g) for s, g in seen]).any(),
     )
     calibration = dataclasses.replace(calibration, delay_samples=found.delay_samples)

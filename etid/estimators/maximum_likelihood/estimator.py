@@ -20,7 +20,7 @@ from etid.estimators.judgement import STRAINED, judged, unless
 from etid.estimators.lanes import Harmonics, HarmonicsWithCurrent
 from etid.estimators.maximum_likelihood import given_driver, load, with_current
 from etid.estimators.maximum_likelihood.given_driver import AbstractGiven, GivenCurrent, GivenDriver
-from etid.estimators.refined_driver import refined_driver
+from etid.estimators.refined_driver import from_harmonics
 from etid.estimators.score_tests import missing_pole
 from etid.estimators.score_tests.falling_resistance import NO_FALL
 from etid.estimators.score_tests.other_circuit import NO_OTHER_CIRCUIT, NO_OTHER_GAIN
@@ -29,8 +29,6 @@ from etid.results.driver import Driver, HarmonicDriver
 from etid.results.feed import MeasuredCurrent
 from etid.results.fits import Fit
 from etid.results.verdicts import RESULTS
-from etid.signals.harmonics import Spectrum
-from etid.signals.noise import Measurement
 
 
 def description(words: str, estimated: str, unknowns: str, tests: tuple[str, ...]) -> Description:
@@ -99,13 +97,12 @@ class MaximumLikelihood(AbstractEstimator):
 
     def fit_driver(
         self,
-        records: Measurement,
+        records: Harmonics,
         r_load: Float[Array, " record"],
         order: int,
-        spectra: Spectrum | None,
     ) -> Driver:
         """Identify a driver: Z_th and the trigger delays of its calibrations."""
-        return refined_driver(records, r_load, order, spectra, str(self))
+        return from_harmonics(records, r_load, order, str(self))
 
     def known(
         self,
@@ -162,13 +159,12 @@ class AbstractByMaximumLikelihood(AbstractEstimator):
 
     def fit_driver(
         self,
-        records: Measurement,
+        records: Harmonics,
         r_load: Float[Array, " record"],
         order: int,
-        spectra: Spectrum | None,
     ) -> Driver:
         """Identify a driver by maximum likelihood."""
-        return MaximumLikelihood().fit_driver(records, r_load, order, spectra)
+        return MaximumLikelihood().fit_driver(records, r_load, order)
 
     def known(
         self, driver: Driver, frequency: Float[Array, " harmonic"], shared: bool

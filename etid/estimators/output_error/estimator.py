@@ -12,7 +12,7 @@ from etid.estimators.estimator import CHECKED, DETERMINED, AbstractEstimator, De
 from etid.estimators.judgement import judged, misses, unless
 from etid.estimators.lanes import PaddedSamples
 from etid.estimators.output_error import fit, prediction
-from etid.estimators.refined_driver import refined_driver
+from etid.estimators.refined_driver import from_samples
 from etid.estimators.score_tests import other_on_harmonics
 from etid.estimators.starts import circuit_starts, current_starts
 from etid.estimators.steiglitz_mcbride import iteration
@@ -21,7 +21,6 @@ from etid.results.driver import ContinuousDriver, Driver, HarmonicDriver
 from etid.results.feed import MeasuredCurrent
 from etid.results.fits import Fit
 from etid.results.verdicts import RESULTS
-from etid.signals.harmonics import Spectrum
 from etid.signals.noise import Measurement
 from etid.signals.transfer import Rational
 
@@ -62,11 +61,9 @@ class OutputError(AbstractEstimator):
         records: Measurement,
         r_load: Float[Array, " record"],
         order: int,
-        spectra: Spectrum | None,
     ) -> Driver:
         """Identify a driver: Z_th in continuous time."""
-        del spectra
-        return refined_driver(records, r_load, order, None, str(self))
+        return from_samples(records, r_load, order, str(self))
 
     def fit_load(
         self,

@@ -19,7 +19,6 @@ from etid.estimators.steiglitz_mcbride import iteration
 from etid.results.driver import DiscreteDriver, Driver
 from etid.results.fits import Fit
 from etid.results.verdicts import RESULTS, first_verdict
-from etid.signals.harmonics import Spectrum
 from etid.signals.noise import Measurement
 from etid.signals.transfer import Rational
 from etid.solvers.levenberg_marquardt import normal_equations
@@ -67,10 +66,8 @@ class SteiglitzMcBride(AbstractEstimator):
         records: Measurement,
         r_load: Float[Array, " record"],
         order: int,
-        spectra: Spectrum | None,
     ) -> Driver:
         """The paper's estimate of Z_th (eqs. 4-6)."""
-        del spectra
         best = iteration.driver_filter(records.v_th, records.v_out, r_load, order, self.iterations)
         free = best.filter.num.size
 

@@ -70,12 +70,28 @@ def check_iterations(iterations: int) -> None:
         raise ValueError(f"iterations is {iterations}; use at least one")
 
 
-_Carry = tuple[Iterate, Float[Array, " a"], Float[Array, " a"]]
+def least_squares(columns: Float[Array, "row column"], poles: int) -> Rational:
+    """N/D by linear least squares.
+
+    Args:
+        columns: X z⁻ᵏ for each coefficient of N, −W z⁻ᵏ for those of D but the first, and W.
+        poles: Order of D.
+    """
+    length = jnp.linalg.norm(columns[:, :-1], axis=0)
+    length = jnp.where(length > 0, length, 1.0)
+    # The last column of R holds Qᵀ W; to compute Q itself would double the time.
+    scaled = jnp.concatenate([columns[:, :-1] / length[None, :], columns[:, -1:]], axis=1)
+    r = jnp.linalg.qr(scaled, mode="r")
+    coefficients = jax.scipy.linalg.solve_triangular(r[:-1, :-1], r[:-1, -1]) / length
+    one = jnp.ones(1, columns.dtype)
+    return Rational(coefficients[:-poles], jnp.concatenate([one, coefficients[-poles:]]))
+
+
+_Carry = tuple[Iterate, Float[Array, " a"]]
 
 
 def iterate(
-    x: Float[Array, "record time"],
-    w: Float[Array, "record time"],
+    solve: Callable[[Float[Array, " a"]], Rational],
     zeros: int,
     poles: int,
     assess: Callable[[Rational], tuple[Float[Array, ""], Bool[Array, ""]]],
@@ -84,35 +100,17 @@ def iterate(
     """Fit N/D with X N/D = W over one or several records (eqs. 1, 2).
 
     Args:
-        x: Input records X.
-        w: Output records W.
+        solve: Function that returns N_i/D_i, given D_{i−1}.
         zeros: Order of N.
         poles: Order of D.
         assess: Function that returns the RRSE of the voltage that a candidate predicts, and
             whether its closed loop is stable.
         iterations: Number of iterations; 1 is equation error.
     """
-    one = jnp.ones(1, x.dtype)
-
-    def solve(prefilter: Float[Array, " a"]) -> Rational:
-        both = jnp.concatenate([x, w])  # filtered at once, which takes less time
-        xf, wf = jnp.split(jax.vmap(lambda v: lfilter(one, prefilter, v)[0])(both), 2)
-        columns = jnp.concatenate(
-            [_delayed(xf, range(zeros + 1)), -_delayed(wf, range(1, poles + 1))], axis=-1
-        ).reshape(-1, zeros + 1 + poles)
-        length = jnp.linalg.norm(columns, axis=0)
-        length = jnp.where(length > 0, length, 1.0)
-        # The last column of R holds Qᵀ W; to compute Q itself would double the time.
-        scaled = jnp.concatenate([columns / length[None, :], wf.reshape(-1, 1)], axis=1)
-        r = jnp.linalg.qr(scaled, mode="r")
-        coefficients = jax.scipy.linalg.solve_triangular(r[:-1, :-1], r[:-1, -1]) / length
-        return Rational(
-            coefficients[: zeros + 1], jnp.concatenate([one, coefficients[zeros + 1 :]])
-        )
 
     def step(carry: _Carry, iteration: Int[Array, ""]) -> tuple[_Carry, Float[Array, ""]]:
-        best, prefilter, previous = carry
-        candidate = solve(prefilter)
+        best, previous = carry
+        candidate = solve(previous)
         error, closed_loop_stable = assess(candidate)
         change = jnp.linalg.norm(candidate.den - previous) / jnp.linalg.norm(candidate.den)
         stable = is_stable(candidate.den)
@@ -120,21 +118,37 @@ def iterate(
         # While no iterate can be simulated, keep the latest.
         better = (error < best.rrse) | ~jnp.isfinite(best.rrse)
         best = jax.tree.map(lambda new, old: jnp.where(better, new, old), current, best)
-        # A prefilter must be stable. Reflected poles give the same magnitude response.
-        reflected = reflect_poles(jnp.where(jnp.isfinite(candidate.den), candidate.den, prefilter))
-        return (best, jnp.where(stable, candidate.den, reflected), candidate.den), change
+        finite = jnp.isfinite(candidate.den).all()
+        return (best, jnp.where(finite, candidate.den, previous)), change
 
     nothing = Iterate(
-        Rational(jnp.zeros(zeros + 1, x.dtype), jnp.zeros(poles + 1, x.dtype).at[0].set(1.0)),
-        jnp.array(jnp.inf, x.dtype),
+        Rational(jnp.zeros(zeros + 1), jnp.zeros(poles + 1).at[0].set(1.0)),
+        jnp.array(jnp.inf),
         jnp.array(0),
         jnp.array(False),
         jnp.array(False),
         jnp.array(False),
     )
-    start = nothing.filter.den
-    (best, _, _), changes = jax.lax.scan(step, (nothing, start, start), jnp.arange(iterations))
+    (best, _), changes = jax.lax.scan(step, (nothing, nothing.filter.den), jnp.arange(iterations))
     return eqx.tree_at(lambda b: b.converged, best, changes[-1] < SETTLED)
+
+
+def in_time(
+    x: Float[Array, "record time"], w: Float[Array, "record time"], zeros: int, poles: int
+) -> Callable[[Float[Array, " a"]], Rational]:
+    """The step of the iteration for records X and W."""
+    one = jnp.ones(1, x.dtype)
+
+    def solve(previous: Float[Array, " a"]) -> Rational:
+        # A prefilter must be stable. Reflected poles give the same magnitude response.
+        prefilter = jnp.where(is_stable(previous), previous, reflect_poles(previous))
+        both = jnp.concatenate([x, w])  # filtered at once, which takes less time
+        xf, wf = jnp.split(jax.vmap(lambda v: lfilter(one, prefilter, v)[0])(both), 2)
+        delayed = [_delayed(xf, range(zeros + 1)), -_delayed(wf, range(1, poles + 1))]
+        columns = jnp.concatenate([*delayed, wf[..., None]], axis=-1)
+        return least_squares(columns.reshape(-1, zeros + poles + 2), poles)
+
+    return solve
 
 
 def terminal_voltage(
@@ -183,7 +197,7 @@ def driver_filter(
         return jnp.where(jnp.isfinite(error), error, jnp.inf), stable.all()
 
     w = r_load[:, None] * (v_th - v_out)
-    return iterate(v_out, w, order - 1, order, assess, iterations)
+    return iterate(in_time(v_out, w, order - 1, order), order - 1, order, assess, iterations)
 
 
 def skin_filter(
@@ -207,7 +221,7 @@ def skin_filter(
         return jnp.where(jnp.isfinite(error), error, jnp.inf), stable
 
     w = lfilter(z_th.num, z_th.den, v_out)[0]
-    return iterate((v_th - v_out)[None], w[None], 1, 1, assess, iterations)
+    return iterate(in_time((v_th - v_out)[None], w[None], 1, 1), 1, 1, assess, iterations)
 
 
 def skin_elements(
