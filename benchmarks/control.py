@@ -13,6 +13,11 @@ from records of ngspice with the same noise and delays. Every controller has the
   rule (Åström and Wittenmark 1995, chapter 5), normalised, once per pulse, with the true charge. Of
   Shen, Gregory and Xi (2014) only the abstract was available: a direct model-reference adaptive
   controller whose current follows a pulsed reference. Their controller acts within the pulse.
+
+**What noise allows.** An amplitude is given before its pulse. Skin that sweats changes its charge
+by g until then; noise and calibration leave a standard error σ of the charge of the last pulse.
+The target is to miss 2 % no more often than normal errors with mean g and this σ. σ comes from the
+information of the tracker; `tests/test_online.py` compares it with the scatter of errors.
 """
 
 import argparse
@@ -20,8 +25,11 @@ import dataclasses
 import pathlib
 from collections.abc import Callable
 
+import equinox as eqx
+import jax
 import numpy as np
-from jaxtyping import Float
+import scipy.special
+from jaxtyping import Array, Float
 from tqdm import tqdm
 
 import etid
@@ -29,9 +37,12 @@ from benchmarks import ngspice
 from benchmarks.charts import COLOURS, new_figure, save
 from benchmarks.control_plant import OPEN, Plant, Response
 from benchmarks.provenance import RESULTS
+from etid.estimators.unknowns import LoadUnknowns
+from etid.online.state import ElectrodeState, TrackerState
 from etid.simulation.published import REFERENCE, TYPICAL
 from etid.simulation.scenes import Scene, Trial
 from etid.simulation.transformer import ResistorLoad, SkinLoad
+from etid.solvers.matrices import inverse_of_few
 
 DRY, DAMP = TYPICAL["dry"], TYPICAL["damp"]
 WANTED = 80e-9  # [C] per phase
@@ -132,11 +143,13 @@ class Run:
         charge: Charge in the phase [C].
         peak: Largest current [A].
         fallback: Whether the amplitude was the fallback.
+        allowed: Probability that noise alone misses the target.
     """
 
     charge: Float[np.ndarray, "pulse lane"]
     peak: Float[np.ndarray, "pulse lane"]
     fallback: Float[np.ndarray, "pulse lane"]
+    allowed: Float[np.ndarray, "pulse lane"]
 
 
 class Loop:
@@ -170,13 +183,16 @@ class Loop:
         plant, state = Plant(self.scene, 1, self.known), tracker.start(at_rest=True)
         samples = tracker.model.bands.samples
         before, rows = np.zeros(self.lanes), []
+        last = np.full(self.lanes, np.nan)  # charge per unit of amplitude, at the pulse before
         for pulse, loads in enumerate(tqdm(self.fingertip.loads, leave=False)):
-            command = controller.command(state, charge=WANTED)
+            command, noise = controller.command(state, charge=WANTED), stderr(controller, state)
             charge, peak, _ = plant.delivered(loads, command.amplitude, before)
             v_out = plant.windows(pulse, samples, loads, command.amplitude, before)
             state = tracker.update(state, v_out, command.amplitude)
-            rows.append((charge, peak, command.reason == "fallback"))
-            before = command.amplitude
+            now = np.array([plant.response(load).charge[0] for load in loads])
+            allowed = missing(now / last - 1, noise)
+            rows.append((charge, peak, command.reason == "fallback", allowed))
+            before, last = command.amplitude, now
         return Run(*(np.array(column) for column in zip(*rows, strict=True)))
 
     def blind(self, command: Command) -> Run:
@@ -186,7 +202,7 @@ class Loop:
         rows = []
         for pulse, loads in enumerate(self.fingertip.loads):
             charge, peak, voltage = plant.delivered(loads, amplitude, before)
-            rows.append((charge, peak, np.zeros(self.lanes, bool)))
+            rows.append((charge, peak, np.zeros(self.lanes, bool), np.zeros(self.lanes)))
             before, amplitude = amplitude, command(pulse, amplitude, charge, voltage)
         return Run(*(np.array(column) for column in zip(*rows, strict=True)))
 
@@ -226,6 +242,28 @@ def rivals(loop: Loop) -> dict[str, Command]:
     }
 
 
+@eqx.filter_jit
+def stderr(controller: etid.Controller, state: TrackerState) -> Float[Array, " lane"]:
+    """Relative standard error of the charge of the last pulse."""
+    circuit = controller.tracker.model.circuit
+
+    def of(lane: ElectrodeState) -> Float[Array, ""]:
+        logs = LoadUnknowns.of(lane.own).log_elements
+        found = controller.model.current(circuit, logs, inverse_of_few(lane.information))
+        return found.charge_stderr / found.charge
+
+    return jax.vmap(of)(state.electrodes)
+
+
+def missing(
+    mean: Float[np.ndarray, " lane"], sigma: Float[Array, " lane"]
+) -> Float[np.ndarray, " lane"]:
+    """Probability that a normal error misses the target; 0 where there is no estimate."""
+    width = np.asarray(sigma)
+    tails = (-TARGET - mean) / width, (mean - TARGET) / width
+    return np.nan_to_num(sum(scipy.special.ndtr(tail) for tail in tails))
+
+
 def errors(run: Run, fingertip: Fingertip) -> Float[np.ndarray, " counted"]:
     """Relative errors of the charge from the third pulse after a change on."""
     return np.abs(run.charge / WANTED - 1)[fingertip.counts]
@@ -236,15 +274,20 @@ def report(run: Run, fingertip: Fingertip) -> str:
     error = errors(run, fingertip)
     return (
         f"median {np.median(error):7.2%}  p99 {np.percentile(error, 99):7.2%}  worst "
-        f"{error.max():7.2%}  within {TARGET:.0%}: {np.mean(error <= TARGET):6.1%}  largest charge "
+        f"{error.max():7.2%}  within {TARGET:.0%}: {np.mean(error <= TARGET):6.1%}  missed "
+        f"{np.sum(error > TARGET)} of {error.size} (noise alone "
+        f"{run.allowed[fingertip.counts].sum():.1f})  largest charge "
         f"{run.charge.max() / WANTED:.1f} times the wanted, current {1e3 * run.peak.max():.2f} mA  "
         f"fallback {np.mean(run.fallback & fingertip.counts):.2%}"
     )
 
 
 def good(run: Run, fingertip: Fingertip) -> bool:
-    """Whether the charge is within the target and the current below its cap."""
-    return bool(errors(run, fingertip).max() <= TARGET and run.peak.max() <= CAP)
+    """Whether the charge misses the target no more often than by noise, and the cap holds."""
+    missed = np.sum(errors(run, fingertip) > TARGET)
+    allowed = run.allowed[fingertip.counts].sum()
+    # Three standard deviations of the number of rare independent events.
+    return bool(missed <= allowed + 3 * np.sqrt(allowed) and run.peak.max() <= CAP)
 
 
 def draw(runs: dict[str, Run], fingertip: Fingertip, path: pathlib.Path) -> None:
