@@ -115,7 +115,7 @@ def check(name: str, numbers: Mapping[str, Number]) -> None:
 
 def _written(value: np.ndarray) -> Any:
     if np.iscomplexobj(value):
-        value = np.stack([value.real, value.imag])
+        value = np.stack([np.real(value), np.imag(value)])
     if value.dtype.kind == "f":
         value = np.array([float(f"{x:.{DIGITS}g}") for x in value.ravel()]).reshape(value.shape)
     return value.tolist()
@@ -124,7 +124,7 @@ def _written(value: np.ndarray) -> Any:
 def _same(before: Any, now: Number) -> bool:
     was, value = np.array(before), np.asarray(now.value)
     if np.iscomplexobj(value):
-        value = np.stack([value.real, value.imag])
+        value = np.stack([np.real(value), np.imag(value)])
     if was.shape != value.shape:
         return False
     if value.dtype.kind != "f":

@@ -11,13 +11,15 @@ import pytest
 import etid
 from benchmarks.failure_axes import Cole
 from etid.estimators.estimate import DELAY_WIDTH
+from etid.estimators.joint import fit as joint_fit
 from etid.estimators.joint import near
 from etid.estimators.joint.fit import fit_alone
-from etid.estimators.joint.terms import Joint
+from etid.estimators.joint.terms import DriverStudy, Joint, Loads
 from etid.estimators.lanes import Harmonics
 from etid.estimators.maximum_likelihood.driver import Calibrations
 from etid.estimators.maximum_likelihood.given_driver import GivenDriver
 from etid.estimators.starts import harmonic_starts
+from etid.estimators.unknowns import LoadUnknowns
 from etid.recordings.preflight import Inspected
 from etid.recordings.remarks import Remark
 from etid.recordings.study import Study
@@ -127,6 +129,31 @@ def test_gains_of_calibrations_with_the_same_unloaded_record_are_signals_of_thei
     told = np.concatenate([found.slope[:, None], found.gain_slopes], axis=1)  # of each harmonic
     np.testing.assert_array_equal(told, np.repeat(expected.reshape(6, 3, 1), 3, axis=2))
     assert found.mean.shape == (6,)
+
+
+def test_equations_of_a_study_are_those_of_its_sum_of_squares(study):
+    """Objective and gradient by differences, of calibrations and loads; unused loads have none."""
+    calibrated = etid.identify_driver(study["calibration/0"])
+    assert isinstance(calibrated, HarmonicDriver)
+    lanes = [Harmonics.of(Inspected(study[path])) for path in (*TOGETHER, "odd")]
+    own = [LoadUnknowns(jnp.log(TRUTH * (1 + 0.01 * i)), jnp.asarray(0.1 * i)) for i in range(3)]
+    loads = Loads(
+        jax.tree.map(lambda *leaves: jnp.stack(leaves), *(lane.spectrum for lane in lanes)),
+        jnp.array([lane.sample_rate for lane in lanes]),
+        jax.tree.map(lambda *leaves: jnp.stack(leaves), *own),
+        jnp.array([True, True, False]),
+        jnp.full(3, -1),
+    )
+    model = Joint(etid.SkinRC(), Calibrations.of(calibrated), False)
+    whole = DriverStudy(model, [loads])
+    y = whole.start()
+    way = jnp.asarray(1e-3 * np.random.default_rng(0).standard_normal(y.size))
+    of = eqx.filter_jit(lambda y: joint_fit._equations(None, y, whole))
+    middle, ahead, behind = of(y), of(y + 1e-3 * way), of(y - 1e-3 * way)
+    slope = (ahead.objective - behind.objective) / 2e-3
+    np.testing.assert_allclose(middle.gradient @ way, slope, rtol=1e-4)
+    [unused] = whole.split(middle.gradient)[1]
+    np.testing.assert_array_equal(unused.vector()[2], 0.0)
 
 
 @pytest.mark.slow
