@@ -270,10 +270,10 @@ def test_the_error_of_the_driver_is_what_another_z_th_makes_of_the_elements():
     assert (np.diagonal(shared(jnp.zeros_like(known.cov)), axis1=1, axis2=2) > 0).all()  # of X
 
 
-# Standard errors. Both weigh the noise of V_th, but not in the same way, and neighbouring bands share
-# noise of the blocks. Over six seeds the estimates differ by 0.22, 0.27 and 0.13 (standard deviation
-# of R_s, R_p, C_p), with means below 0.12: one leaves out some 6 % of the information about R_p. The
-# seed is fixed; 1.5 of these deviations.
+# Standard errors. Both weigh the noise of V_th, but not in the same way, and neighbouring bands
+# share noise of the blocks. Over six seeds the estimates differ by 0.22, 0.27 and 0.13 (standard
+# deviation of R_s, R_p, C_p), with means below 0.12: one leaves out some 6 % of the information
+# about R_p. The seed is fixed; 1.5 of these deviations.
 SAME = 0.4
 
 
