@@ -20,6 +20,7 @@ Three properties make the method independent of the scale of parameters and resi
 """
 
 import abc
+import dataclasses
 from collections.abc import Callable
 from typing import Any
 
@@ -82,9 +83,7 @@ class NormalEquations(AbstractNormalEquations):
         A point whose slope is not finite is useless too: no step can start from it.
         """
         finite = jnp.isfinite(self.objective) & jnp.isfinite(self.gradient).all()
-        return NormalEquations(
-            jnp.where(finite, self.objective, jnp.inf), self.gradient, self.matrix
-        )
+        return dataclasses.replace(self, objective=jnp.where(finite, self.objective, jnp.inf))
 
     def hessian(self) -> lx.AbstractLinearOperator:
         """JᵀJ as an operator."""

@@ -109,6 +109,10 @@ class Load(eqx.Module):
 
     def equations(self, q: Float[Array, " q"]) -> NormalEquations:
         """Normal equations of the recording alone; the matrix is its information."""
+        return self.evaluated(q)[0]
+
+    def evaluated(self, q: Float[Array, " q"]) -> "tuple[NormalEquations, Around]":
+        """Normal equations of the recording alone, and the terms from which they are computed."""
         of = self.gain
         z_load, turned, known = apart(self._acting, q)
         acting = apart(lambda q: of.by_acting(q, z_load, turned), q)
@@ -118,7 +122,16 @@ class Load(eqx.Module):
             by_x = self.by_unloaded((acting[0], known)).sum(-1)
             gradient = gradient + jnp.pad(by_x, (of.owned, 0))[: q.size]
         jacobian = around.jacobian
-        return NormalEquations(around.objective, gradient, jacobian @ jacobian.T)
+        return NormalEquations(around.objective, gradient, jacobian @ jacobian.T), around
+
+    def at_knots(self, every: Knots) -> Gain:
+        """The gain at knots."""
+        of, frequency = self.gain, every.at(self.gain.frequency)
+        return Gain(of.driver.at_knots(every), of.circuit, frequency, of.sample_rate, of.prior)
+
+    def known(self, q: Float[Array, " q"]) -> Spectrum:
+        """The recording with the X that the calibrations estimate."""
+        return self.spectrum if self.unloaded is None else self._acting(q)[2]
 
     def by_unloaded(
         self, at: tuple[Complex[Array, " harmonic"], Spectrum]
@@ -239,6 +252,7 @@ class Around(eqx.Module):
         at: The terms at the knots.
         q: q.
         slopes: The gain and its derivatives at the knots.
+        gain: The gain at all harmonics.
         x: x̂ at all harmonics.
         power: P at all harmonics.
         score: ρ at all harmonics.
@@ -248,6 +262,7 @@ class Around(eqx.Module):
     at: AtKnots
     q: Float[Array, " q"]
     slopes: Slopes
+    gain: Complex[Array, " harmonic"]
     x: Complex[Array, " harmonic"]
     power: Float[Array, " harmonic"]
     score: Complex[Array, " harmonic"]
@@ -270,7 +285,7 @@ class Around(eqx.Module):
             every: The knots if they are not those of `load`.
         """
         g, known = apart(load.predicted, q) if at is None else at
-        of, every = load.gain, every or load.knots
+        every = every or load.knots
 
         def of_harmonics(_) -> tuple[Array, Array, Array, Array]:
             weight = jnp.where(known.selected, 2 / variance(known, g), 0.0)
@@ -282,16 +297,15 @@ class Around(eqx.Module):
 
         x, score, size, objective = apart(of_harmonics, q)
         real, imaginary, total = every.summed(jnp.stack([score.real, score.imag, size]))
-        driver, frequency = of.driver.at_knots(every), every.at(of.frequency)
-        gain = Gain(driver, of.circuit, frequency, of.sample_rate, of.prior)
+        gain = load.at_knots(every)
         by_z = shift = None
         if load.unloaded is not None:
             by_z = every.summed((as_complex(size) * reciprocal(x))[None, :] * load.unloaded.x)
             by_z = by_z * as_complex(1 / jnp.where(total > 0, total, 1.0))[None, :]
-            shift = -combined(of.split(q)[1], by_z)
+            shift = -combined(gain.split(q)[1], by_z)
         slopes = apart(gain.slopes, q)
         sums = Sums(slopes.gain, jax.lax.complex(real, imaginary), total, by_z, shift)
-        return cls(AtKnots(gain, sums), q, slopes, x, size, score, objective)
+        return cls(AtKnots(gain, sums), q, slopes, g, x, size, score, objective)
 
     @property
     def jacobian(self) -> Float[Array, "q part"]:
@@ -331,13 +345,43 @@ class Around(eqx.Module):
 
 def _equations(_, q: Float[Array, " q"], problem: Load | AtKnots | _Some) -> NormalEquations:
     """Normal equations of a load, with the priors."""
-    found, prior = problem.equations(q), 1 / problem.gain.widths(q)
-    rest = prior * (q - problem.gain.centre(q))
+    return _with_priors(problem.equations(q), q, problem.gain)
+
+
+def _with_priors(found: NormalEquations, q: Float[Array, " q"], of: Gain) -> NormalEquations:
+    prior = 1 / of.widths(q)
+    rest = prior * (q - of.centre(q))
     return NormalEquations(
         found.objective + 0.5 * jnp.dot(rest, rest),
         found.gradient + prior * rest,
         found.matrix + jnp.diag(prior**2),
     ).finite()
+
+
+class _Evaluated(NormalEquations):
+    """Normal equations with what the standard errors and tests need at the same point.
+
+    The last point of a fit then need not be evaluated again.
+
+    Attributes:
+        around: The terms, without constants and ρ.
+    """
+
+    around: Around
+
+    @classmethod
+    def at(cls, _, q: Float[Array, " q"], load: Load) -> "_Evaluated":
+        """Evaluate a load with the priors."""
+        found, around = load.evaluated(q)
+        of = _with_priors(found, q, load.gain)
+        around = eqx.tree_at(lambda a: (a.at.gain, a.score), around, (None, None))
+        return cls(of.objective, of.gradient, of.matrix, around)
+
+    @classmethod
+    def empty(cls, q: Float[Array, " q"], load: Load) -> "_Evaluated":
+        """Zeros of the same shapes."""
+        shapes = eqx.filter_eval_shape(lambda q: cls.at(None, q, load), q)
+        return jax.tree.map(lambda of: jnp.zeros(of.shape, of.dtype), shapes)
 
 
 # Largest change of W, which is uncertain by 0.1 at 40 dB. At 24 dB one fit of 30 exceeds it. Two of
@@ -349,6 +393,8 @@ NEAR = 4.0  # χ² of the likeliest start; below this value the other starts are
 ROUGHLY = LevenbergMarquardt(rtol=1e-2, ftol=1e-3, equations=_equations)
 WELL = LevenbergMarquardt(rtol=1e-4, ftol=SOLVER.ftol, equations=_equations)
 SETTLED = 0.005  # [standard errors] largest distance from the minimum, for any number of harmonics
+BEFORE = 0.05  # [standard errors] the same before the last step of a fit, that of Newton
+LAST = 1.0  # [standard errors] longest last step; a fit that stopped farther away did not settle
 # Next to a minimum, damping would only hold back what the data hardly determine.
 SLIGHT = 1e-9
 
@@ -447,14 +493,19 @@ def fit_circuit(
     well = dataclasses.replace(
         WELL, rtol=min(WELL.rtol, SETTLED / math.sqrt(2 * spectrum.x.size)), damping=SLIGHT
     )
-    solution = refined(load, _near(load, start, well), well)
-    q = solution.value
-    own, z = load.gain.split(q)
-    g, known = apart(load.predicted, q)
+    whole = dataclasses.replace(
+        well,
+        rtol=BEFORE / SETTLED * well.rtol,
+        equations=_Evaluated.at,
+        empty=_Evaluated.empty,
+    )
+    solution = refined(load, _near(load, start, well), whole)
+    q, last = solution.value, solution.stats["normal_equations"]
+    around = eqx.tree_at(
+        lambda a: a.at.gain, last.around, load.at_knots(load.knots), is_leaf=lambda a: a is None
+    )
+    g, known = around.gain, load.known(q)
     part = residual(known, g)
-    moved = jnp.max(jnp.where(spectrum.selected, jnp.abs(load.gain.w(z)), 0.0))
-
-    around = Around.of(load, q, (g, known))
     jacobian = around.jacobian
     prior = 1 / load.gain.widths(q) ** 2
     noise = excess(part, spectrum.selected)[: g.size]
@@ -467,8 +518,14 @@ def fit_circuit(
     share = signal_share(around.x, known.variance_x)
     mean_share, mean_noise, own_noise = around.mean(jnp.stack([share, noise, private * noise]))
     linear = Linear(jacobian, mean_share, mean_noise, jnp.diag(prior))
-    information, count = linear.bread(), own.log_elements.size
+    information, count = linear.bread(), load.gain.owned - 1
     elements = information[:count]
+    # Standard errors and tests are those of the last point; they do not change in a short step.
+    step = jax.lax.stop_gradient(information @ last.gradient)
+    gained = jnp.dot(step, last.gradient)
+    step, gained = (jnp.where(gained < LAST**2, of, 0.0) for of in (step, gained))
+    own, z = load.gain.split(q - step)
+    moved = jnp.max(jnp.where(spectrum.selected, jnp.abs(load.gain.w(z)), 0.0))
     by_term = elements @ jacobian
     changes = around.by_changes()
     rows = around.at.rows(changes)
@@ -509,11 +566,11 @@ def fit_circuit(
     # For an element without any effect the matrix product contains only rounding errors.
     unknown = jnp.diagonal(elements)
     unknown = jnp.diag(jnp.where(unknown > 1, unknown, 0.0))
-    change = z - driver.mean
+    change = load.gain.split(q)[1] - driver.mean
     # Increase of the Σ r² of the calibrations.
     strain = jnp.dot(change, jnp.linalg.solve(driver.cov, change))
     squares, terms = jnp.sum(part**2), 2 * jnp.sum(spectrum.selected, dtype=q.dtype)
-    freedom, deviance = terms - load.gain.owned, squares + strain + beside
+    freedom, deviance = terms - load.gain.owned, squares + strain + beside - gained
     estimate = Estimate(
         parameters=own.log_elements,
         delay_samples=own.delay_samples[None],
