@@ -13,7 +13,7 @@ import dataclasses
 import equinox as eqx
 from jaxtyping import Array, Float
 
-from etid.solvers.matrices import inverse
+from etid.solvers.matrices import inverse, inverse_root
 
 
 class Curvature(eqx.Module):
@@ -65,8 +65,9 @@ class Linear(eqx.Module):
         return Curvature(self._expected(), (self.jacobian * self.noise[None, :]) @ self.jacobian.T)
 
     def bread(self) -> Float[Array, "q q"]:
-        """H⁻¹."""
-        return inverse(self._expected())
+        """H⁻¹, by Cholesky's factors: eigenvectors take five times as long."""
+        root = inverse_root(self._expected())
+        return root @ root.T
 
     def covariance(self) -> Float[Array, "q q"]:
         """The sandwich, from the effect of each term on the parameters: loses fewest digits."""

@@ -19,7 +19,7 @@ GENERIC = (((0.1, 0.3), (0.5, 1.5)), ((0.25, 0.3), (0.5, 1.5)), ((0.1, 0.3), (0.
 FAR = (0.5, 1.5)
 # Time constants of the starts with a measured current, relative to the typical ones.
 TIME_SCALES = tuple(np.geomspace(1e-3, 1e5, 17).tolist())
-START_STEPS = 8  # iterations of Steiglitz-McBride on harmonics; it converges in three to eight
+START_STEPS = 5  # iterations of Steiglitz-McBride on harmonics; more of them spare a fit no steps
 
 
 def circuit_starts(

@@ -25,6 +25,7 @@ from etid.results.fits_columns import DESCRIBED, LABELS, SCHEMA, columns_of, des
 from etid.results.hdf5_table import Table, opened_table, write_table
 from etid.results.summary import summary
 from etid.results.verdicts import RESULTS, Judged, counted, counts, message
+from etid.signals.transfer import power
 
 
 def rrse(predicted: Float[Array, " time"], measured: Float[Array, " time"]) -> Float[Array, ""]:
@@ -44,8 +45,8 @@ def complex_rrse(
     used: Bool[Array, " value"] | bool = True,
 ) -> Float[Array, ""]:
     """RRSE of the harmonics or impedances that are used; their mean is not subtracted."""
-    missed = jnp.sum(jnp.where(used, jnp.abs(measured - predicted) ** 2, 0.0))
-    return jnp.sqrt(missed / jnp.sum(jnp.where(used, jnp.abs(measured) ** 2, 0.0)))
+    missed = jnp.sum(jnp.where(used, power(measured - predicted), 0.0))
+    return jnp.sqrt(missed / jnp.sum(jnp.where(used, power(measured), 0.0)))
 
 
 AND = " + "  # between the names of estimators

@@ -28,6 +28,7 @@ from etid.estimators.estimate import MAX_STEPS, SOLVER, Estimate
 from etid.estimators.maximum_likelihood.gain import Gain, Slopes
 from etid.estimators.maximum_likelihood.given_driver import AbstractGiven, UnloadedSlopes, combined
 from etid.estimators.maximum_likelihood.terms import (
+    LOW,
     apart,
     excess,
     residual,
@@ -43,6 +44,7 @@ from etid.signals.harmonics import Spectrum, real_parts, signal_share
 from etid.signals.knots import Knots, knots
 from etid.signals.transfer import as_complex, frequency_variable, power, reciprocal, turns
 from etid.solvers.levenberg_marquardt import LevenbergMarquardt, NormalEquations
+from etid.solvers.matrices import inverse_root
 
 
 class Load(eqx.Module):
@@ -525,7 +527,8 @@ def fit_circuit(
     gained = jnp.dot(step, last.gradient)
     step, gained = (jnp.where(gained < LAST**2, of, 0.0) for of in (step, gained))
     own, z = load.gain.split(q - step)
-    moved = jnp.max(jnp.where(spectrum.selected, jnp.abs(load.gain.w(z)), 0.0))
+    used = spectrum.selected[load.knots.index]
+    moved = jnp.sqrt(jnp.max(jnp.where(used, power(around.at.gain.w(z)), 0.0)))
     by_term = elements @ jacobian
     changes = around.by_changes()
     rows = around.at.rows(changes)
@@ -551,8 +554,8 @@ def fit_circuit(
     # If a wrong gain explains the excess of the low harmonics, the excess is no hum.
     others = linear.told(rows[-1:])[0] @ information
     gain = changes[-1] - combined(others, around.at.by_unknown(around.slopes))
-    explained = as_complex(found.size[-1] * jnp.sqrt(weight)) * around.x * load.knots.between(gain)
-    unexplained = jnp.sum((part + real_parts(explained)).reshape(2, -1) ** 2, axis=0) / 2
+    explained = as_complex(found.size[-1]) * around.x * load.knots.between(gain)
+    unexplained = (0.5 * weight * power(known.y - g * known.x + explained))[:LOW]
     wrong_gain = (jnp.abs(found.z[-1]) > NO_HUM) & ~stands_out(unexplained, known)
     by_own, by_z = load.gain.split(elements)
     of_delay = jnp.outer(by_own.delay_samples, by_own.delay_samples) / driver.delay_width**2
@@ -568,7 +571,7 @@ def fit_circuit(
     unknown = jnp.diag(jnp.where(unknown > 1, unknown, 0.0))
     change = load.gain.split(q)[1] - driver.mean
     # Increase of the Σ r² of the calibrations.
-    strain = jnp.dot(change, jnp.linalg.solve(driver.cov, change))
+    strain = jnp.sum((change @ inverse_root(driver.cov)) ** 2)
     squares, terms = jnp.sum(part**2), 2 * jnp.sum(spectrum.selected, dtype=q.dtype)
     freedom, deviance = terms - load.gain.owned, squares + strain + beside - gained
     estimate = Estimate(
