@@ -310,7 +310,7 @@ def asked_of(
                 "would compare circuits with different knowledge; pass one circuit, or call "
                 "select_circuit with candidates that all have it"
             )
-    for circuit in candidates:
+    for circuit in candidates if asked.known or asked.bounds else ():
         checked(asked.known, circuit)
         checked_bounds(asked.bounds, asked.known, circuit)
     return asked
