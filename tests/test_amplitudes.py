@@ -12,6 +12,7 @@ from scipy.special import erf
 
 import etid
 from etid.circuits.current_dependent import Norton, Signals, current_dependent_resistor, port
+from etid.identify.amplitudes import leaves_much
 from etid.recordings.preflight import Inspected
 from etid.recordings.remarks import Remark
 from etid.signals.transfer import frequency_variable
@@ -252,3 +253,11 @@ def test_rounding_of_unknown_steps_is_a_misfit_however_small_it_is():
     assert fit.chi2 > 4
     assert fit.rrse < 1e-3
     assert fit.verdict == "misfit"
+
+
+@pytest.mark.parametrize(
+    ("chi2", "rrse", "much"), [(1.0, 0.1, False), (0.26, 0.78, True), (5.0, 1e-3, True)]
+)
+def test_a_small_chi2_excuses_no_large_residual(chi2, rrse, much):
+    """At a large gain the noise of V_th would explain any residual."""
+    assert bool(leaves_much(jnp.array(chi2), jnp.array(rrse))) is much
