@@ -23,7 +23,7 @@ from etid.circuits.circuit import (
 from etid.identify import batches
 from etid.identify.arguments import Asked, fed
 from etid.results.fits import Fit
-from etid.selection.search import CANDIDATES
+from etid.selection.search import usual_circuits
 from etid.selection.selection import Selection
 from etid.simulation.published import REFERENCE
 from etid.simulation.scenes import Scene, Trial
@@ -98,7 +98,7 @@ def scene(snr_db: float, driver: int) -> Scene:
 def choices(records: Sequence[etid.Recording], driver: etid.Driver) -> list[Selection]:
     """What etid chooses for each recording alone, as `select_circuit` does, in batches."""
     found, _ = batches.choices(
-        len(records), lambda row: fed(records[row], driver), CANDIDATES, Asked(), False
+        len(records), lambda row: fed(records[row], driver), usual_circuits(), Asked(), False
     )
     return found
 
@@ -118,7 +118,7 @@ def draws(snr_db: float, number: int) -> list[Drawn]:
         records = [study[name] for name in TRUTHS]
         chosen = choices(records, driver)
         fits = [dict(one.fits) for one in chosen]
-        for candidate, circuit in enumerate(CANDIDATES):
+        for candidate, circuit in enumerate(usual_circuits()):
             rows = [row for row, of in enumerate(fits) if candidate not in of]
             if rows:
                 more = etid.identify_skins([records[row] for row in rows], driver, circuit=circuit)

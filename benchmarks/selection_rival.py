@@ -33,11 +33,11 @@ from benchmarks.selection_draws import TRUTHS, scene
 from etid.estimators.lanes import Harmonics
 from etid.recordings.preflight import Inspected
 from etid.selection.evidence import best
-from etid.selection.search import CANDIDATES
+from etid.selection.search import usual_circuits
 
 ENVIRONMENT_OF = "impedance_py"  # of `benchmarks.rivals.roster`
 WORKER = "benchmarks.rivals.circuits_by_impedance_py"
-NAMES = np.array([type(one).__name__ for one in CANDIDATES])
+NAMES = np.array([type(one).__name__ for one in usual_circuits()])
 
 
 class Spectra(NamedTuple):
@@ -119,7 +119,7 @@ def by_etid(every: Sequence[Spectra]) -> Chosen:
                 number: etid.identify_impedance(
                     spectra.f[used], z[used], stderr=stderr, circuit=circuit, throw=False
                 )
-                for number, circuit in enumerate(CANDIDATES)
+                for number, circuit in enumerate(usual_circuits())
             }
             names.append(NAMES[best(fits)])
             seconds.append(time.perf_counter() - begin)

@@ -19,7 +19,7 @@ from etid.plotting import figure_of
 from etid.results.driver import Calibration, ContinuousDriver, Driver, SourceImpedance
 from etid.results.fits import CHANGES, Fit, Fits, Support
 from etid.results.verdicts import verdicts_of
-from etid.selection.search import CANDIDATES
+from etid.selection.search import usual_circuits
 from etid.simulation.scenes import PRESETS, Trial
 
 BASELINE = pathlib.Path(__file__).parent / "baseline"
@@ -120,7 +120,7 @@ def selection(**verdicts: str) -> etid.Selection:
             method="maximum_likelihood",
             support=support,
         )
-    return etid.Selection.of(found, 3, CANDIDATES)
+    return etid.Selection.of(found, 3, usual_circuits())
 
 
 def fits() -> Fits:

@@ -18,8 +18,11 @@ def test_importing_prints_nothing_and_changes_no_setting():
 import jax
 before = dict(jax.config.values)
 import sys, etid
+from jax._src import xla_bridge
 assert dict(jax.config.values) == before
 assert not {"matplotlib", "pandas", "jaxopt", "pyarrow", "pynwb"} & set(sys.modules), "too much"
+assert not xla_bridge._backends, "JAX has started: a later choice of its platform would be lost"
+assert not {"scipy.stats", "scipy.optimize", "scipy.interpolate"} & set(sys.modules), "slow ones"
 """
     done = run(code)
     assert (done.returncode, done.stdout, done.stderr) == (0, "", "")

@@ -18,11 +18,13 @@ from etid.results.verdicts import verdict
 from etid.selection.common import common, deserves
 from etid.selection.evidence import best, bic, rank, weights, with_close
 from etid.selection.residuals import looks_like
-from etid.selection.search import CANDIDATES, search
+from etid.selection.search import search, usual_circuits
 from etid.selection.selection import Selection
 from etid.selection.unseen import WIDTH, hidden, posterior, unseen
 from etid.simulation.scenes import Scene, Trial
 from etid.simulation.transformer import ResistorLoad
+
+CANDIDATES = usual_circuits()
 
 TERMS = 1000.0
 LOADS = {

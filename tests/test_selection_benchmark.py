@@ -13,8 +13,10 @@ from benchmarks.selection_draws import TRUTHS, Drawn, quantities
 from etid.results.fits import CHANGES, Fit, Support
 from etid.results.verdicts import verdict
 from etid.selection.evidence import best, bic
-from etid.selection.search import CANDIDATES
+from etid.selection.search import usual_circuits
 from etid.selection.selection import Selection
+
+CANDIDATES = usual_circuits()
 
 TERMS = 1000.0
 SKIN, COLE = 0, 3  # numbers of candidates

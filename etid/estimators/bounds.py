@@ -17,7 +17,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-import scipy.stats
+import scipy.special
 from jaxtyping import Array, Bool, Float
 
 from etid.circuits.circuit import AbstractCircuit
@@ -111,7 +111,7 @@ def within(
     def scaled(matrix: Float[Array, "element element"]) -> Float[Array, "element element"]:
         return jnp.where(sound, matrix * jnp.outer(scale, scale), jnp.nan)
 
-    limit = scipy.stats.chi2.isf(scipy.stats.chi2.sf(CONTRADICTED, 1), rows.size)
+    limit = scipy.special.chdtri(rows.size, scipy.special.chdtrc(1, CONTRADICTED))
     return Within(
         values=jnp.where(sound, values, jnp.nan),
         cov=scaled(step @ whole),

@@ -28,7 +28,7 @@ from etid.recordings.study import Study
 from etid.results.driver import ContinuousDriver, Driver, HarmonicDriver
 from etid.results.feed import MEASURED_CURRENT, AbstractFeed, MeasuredCurrent
 from etid.results.tried_orders import AUTO, Order
-from etid.selection.search import CANDIDATES
+from etid.selection.search import usual_circuits
 from etid.signals.harmonics import separates_aliases
 
 # Four times the order of the paper. Calibrations determine no more poles; with 50 poles an
@@ -110,13 +110,13 @@ def recordings(field: str, value: Iterable[Recording]) -> list[Recording]:
 
 
 def candidates_of(value: Circuit) -> tuple[AbstractCircuit, ...]:
-    """The circuits to choose from: those of `CANDIDATES` for `"auto"`, else one.
+    """The circuits to choose from: `usual_circuits` for `"auto"`, else one.
 
     Raises:
         RecordingError: The value is neither a linear circuit nor `"auto"`.
     """
     if isinstance(value, str) and value == AUTO:
-        return CANDIDATES
+        return usual_circuits()
     circuit = circuit_of(value)  # pyright: ignore[reportArgumentType]
     if _depends_on_current(type(circuit)):
         raise RecordingError(

@@ -14,7 +14,7 @@ from etid.identify.impedance import identify_impedance
 from etid.identify.one import candidate_fits, successful
 from etid.recordings.recording import Recording, RecordingError
 from etid.results.driver import Driver
-from etid.selection.search import CANDIDATES
+from etid.selection.search import usual_circuits
 from etid.selection.selection import Selection
 
 FREQUENCY = np.geomspace(1.0, 1e7, 57)  # [Hz], where two impedances are compared
@@ -25,7 +25,7 @@ def select_circuit(
     recording: Recording,
     driver: Driver | None = None,
     *,
-    candidates: Sequence[AbstractCircuit] = CANDIDATES,
+    candidates: Sequence[AbstractCircuit] | None = None,
     method: Method | None = None,
     fixed: Mapping[str, float] | None = None,
     prior: Mapping[str, tuple[float, float]] | None = None,
@@ -64,7 +64,7 @@ def select_circuit(
             element is no element of a candidate.
         IdentificationError: The verdict is not successful and `throw` is set.
     """
-    candidates = checked(candidates)
+    candidates = usual_circuits() if candidates is None else checked(candidates)
     asked = asked_of(method, candidates, fixed, prior, bounds)
     fits, chosen = candidate_fits(recording, driver, candidates, asked)
     selection = Selection.of(fits, chosen, candidates)

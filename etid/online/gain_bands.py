@@ -44,7 +44,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import scipy.interpolate
 from jaxtyping import Array, Bool, Complex, Float, Int
 
 from etid.signals.harmonics import ALIASED
@@ -381,6 +380,8 @@ def _partition(
 
 def _smooth(count: int, block: int) -> Float[np.ndarray, "sample block"]:
     """The smooth curve through means of blocks: the derivative of a cubic spline of their sums."""
+    import scipy.interpolate  # takes a quarter of a second, which only trackers need
+
     ends = block * np.arange(count + 1)
     sums = np.concatenate([np.zeros((1, count)), np.cumsum(block * np.eye(count), axis=0)])
     spline = scipy.interpolate.CubicSpline(ends, sums)

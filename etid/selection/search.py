@@ -22,14 +22,9 @@ from etid.circuits.circuit import (
 from etid.results.fits import Fit
 from etid.selection.evidence import best, rank, values_of
 
-# From the usual circuit to the unusual ones.
-CANDIDATES: tuple[AbstractCircuit, ...] = (
-    SkinRC(),
-    ParallelRC(),
-    Resistor(),
-    SkinCole(),
-    SkinLayers(),
-)
+# From the usual circuit to the unusual ones. Classes, because the elements of a circuit are arrays:
+# to make one starts JAX, which no import may do.
+USUAL: tuple[type[AbstractCircuit], ...] = (SkinRC, ParallelRC, Resistor, SkinCole, SkinLayers)
 # Standard deviations of a score that asks for one more element, times √m for m more. The evidence
 # needs 2.8 √m; the score is not the ratio of likelihoods exactly.
 ASKS = 2.5
@@ -37,6 +32,11 @@ ASKS = 2.5
 # standard errors has the evidence 49, more than its penalty by far.
 DOUBTFUL = 1 / 7
 FitRows = Callable[[int, Sequence[int]], Sequence[Fit]]
+
+
+def usual_circuits() -> tuple[AbstractCircuit, ...]:
+    """The candidates of a choice that names none."""
+    return tuple(kind() for kind in USUAL)
 
 
 def search(count: int, candidates: Sequence[AbstractCircuit], fit: FitRows) -> list[dict[int, Fit]]:
