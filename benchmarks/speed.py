@@ -6,7 +6,6 @@ Each line is a ratio of medians with its target; a missed target makes the comma
 import argparse
 import dataclasses
 import math
-import os
 import pathlib
 import subprocess
 import sys
@@ -24,7 +23,7 @@ from benchmarks import online, peers
 from benchmarks.peers import A, B
 from benchmarks.problem import LOAD, SAMPLES, Problem, harmonics, problem
 from benchmarks.provenance import write_csv
-from benchmarks.timing import first_and_warm, import_time, pin
+from benchmarks.timing import first_and_warm, import_time, interpreter, pin
 from etid.estimators.steiglitz_mcbride.iteration import ITERATIONS
 from etid.signals.filtering import lfilter
 from etid.signals.noise import noise_std
@@ -226,7 +225,7 @@ def _imports() -> Line:
 def _first_fits() -> list[Line]:
     """First driver and skin of a process, without programs on disk and with them."""
     with tempfile.TemporaryDirectory() as cache:
-        environment = os.environ | {
+        environment = interpreter() | {
             "JAX_COMPILATION_CACHE_DIR": cache,
             "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
         }
