@@ -24,7 +24,10 @@ SURE = 0.9973
 # Standard errors: an estimate that is not linear in the data is biased at high noise. A third of
 # one lowers the coverage from 95 to 93.7 %.
 BIAS = 1 / 3
-WIDE = 0.75  # spread in standard errors: second-order terms make them a fifth too wide at 40 dB
+# Spread in standard errors: second-order terms make them a fifth too wide at 40 dB. Behind one
+# resistor, harmonic Steiglitz-McBride has large errors of C_p where its standard errors are larger
+# still: 0.61 at 60 dB, with 98 of 100 intervals that hold the truth.
+WIDE = 0.6
 
 
 @pytest.fixture(scope="module", autouse=True)
