@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 
 import etid
 from etid.selection.evidence import best
-from etid.selection.search import CANDIDATES
+from etid.selection.search import usual_circuits
 
 # Fitted without weights by impedance.py's makers and by others (SOURCE.txt of the data).
 PUBLISHED = {
@@ -47,9 +47,9 @@ def test_the_rules_of_selection_choose_the_soldered_circuit(reference_data, numb
         number: etid.identify_impedance(
             frequency, z, stderr=0.006 * abs(z), circuit=circuit, throw=False
         )
-        for number, circuit in enumerate(CANDIDATES)
+        for number, circuit in enumerate(usual_circuits())
     }
-    selection = etid.Selection.of(fits, best(fits), CANDIDATES)
+    selection = etid.Selection.of(fits, best(fits), usual_circuits())
     assert type(selection.fit.circuit) is etid.SkinRC
     assert selection.candidates[0].adequate
     # Cole's circuit is the next one; its exponent is 1, so that it gains nothing for its price.

@@ -20,7 +20,7 @@ MEGA, KILO = 1e6, 1e3
 R_S, R_P, C_P, ALPHA = 20.0, 100.0, 0.3, 0.8  # [kohm, kohm, nF, 1]
 TAU = 30.0  # [µs]
 ENOUGH = {"ftol": 1e-8, "maxfev": 1000}  # SciPy's own tolerance
-# By etid's names, in the order of `etid.selection.search.CANDIDATES`. R in kΩ times C in nF is µs,
+# By etid's names, in the order of `etid.selection.search.USUAL`. R in kΩ times C in nF is µs,
 # as ω is in 1/µs.
 CIRCUITS = {
     "SkinRC": ("R0-p(R1,C1)", [R_S, R_P, C_P]),
