@@ -52,7 +52,6 @@ calls = {
     "etid.select_circuit(rec, d, candidates=[])": "candidates",
     "etid.select_circuit(rec, d, candidates='auto')": "candidates",
     "etid.select_circuit(rec, d, candidates=etid.SkinRC())": "candidates",
-    "etid.select_circuit(rec, d, candidates=None)": "candidates",
     "etid.select_circuit(rec, d, candidates=[etid.SkinRC(), 3])": "candidates[1]",
     "etid.select_circuit(rec, d, candidates=[etid.SkinRC])": "candidates[0]",
     "etid.select_circuit(rec, d, candidates=[etid.SkinRC(), etid.SkinRC()])": "candidates",

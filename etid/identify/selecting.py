@@ -44,7 +44,7 @@ def select_circuit(
     Args:
         recording: Unloaded and loaded voltage.
         driver: As in `identify_skin`.
-        candidates: Circuits to choose from, the most usual one first. If not given: `SkinRC`,
+        candidates: Circuits to choose from, the most usual one first. If None: `SkinRC`,
             `ParallelRC`, `Resistor`, `SkinCole`, `SkinLayers`.
         method: An estimator that computes a likelihood, `"maximum_likelihood"`; the default for
             records of several whole periods.
