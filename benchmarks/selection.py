@@ -33,7 +33,7 @@ from benchmarks.selection_draws import SNR_DB, TRUTHS, Drawn, draws, scene
 from benchmarks.speed import median_time
 from etid.identify import file as streaming
 from etid.identify.arguments import Circuit
-from etid.selection.search import usual_circuits
+from etid.selection.search import USUAL
 from etid.simulation import scenes
 
 DRIVERS = 25
@@ -214,8 +214,8 @@ def rival(rows: list[dict[str, Any]], drawn: Sequence[Drawn]) -> list[Line]:
     for row in rows:
         here = [snr == row["snr_db"] for snr, _ in of_study]
         names = theirs.names[list(TRUTHS).index(row["truth"]), here]
-        for one in usual_circuits():
-            row[f"rival_{type(one).__name__}"] = int((names == type(one).__name__).sum())
+        for kind in USUAL:
+            row[f"rival_{kind.__name__}"] = int((names == kind.__name__).sum())
     ours = np.array([selection_counts.is_right(one) for one in drawn])
     lines = [_compared("same recordings", ours, selection_rival.right(theirs))]
     print(f"impedance.py: {1e3 * np.median(theirs.seconds):.0f} ms for five fits (median)")

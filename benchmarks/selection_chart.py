@@ -9,7 +9,7 @@ from matplotlib.patches import Patch, Rectangle
 
 from benchmarks import charts
 from etid.circuits.circuit import AbstractCircuit
-from etid.selection.search import usual_circuits
+from etid.selection.search import USUAL
 
 # Letters and colours of the circuits, from the simplest to the richest.
 KEY = {
@@ -72,7 +72,7 @@ def draw(
 
 def _cell(panel: Axes, at: tuple[int, int], counts: Mapping[str, int], right: str) -> None:
     """A bar of the shares of the chosen circuits, and the share of the right one."""
-    assert {*counts} == {type(one).__name__ for one in usual_circuits()}
+    assert {*counts} == {kind.__name__ for kind in USUAL}
     total, (column, row) = sum(counts.values()), at
     if not total:
         return

@@ -21,7 +21,7 @@ from benchmarks.failure_counts import Rate, rate
 from benchmarks.selection_draws import TRUTHS, Drawn, errors
 from etid.results.fits import Fit
 from etid.selection.evidence import best, bic, elements
-from etid.selection.search import usual_circuits
+from etid.selection.search import USUAL
 
 DECISIVE = 10.0
 DECISIVE_SNR = 30.0  # [dB] at least
@@ -59,7 +59,7 @@ def _laplace(fit: Fit, number: int) -> float:
     """−2 log of prior and of the Gaussian integral at the minimum."""
     values, typical = (
         np.array([float(np.asarray(getattr(one, name))) for name in one.names()])
-        for one in (fit.circuit, usual_circuits()[number])
+        for one in (fit.circuit, USUAL[number]())
     )
     uniform = np.array([unit == "1" for unit in fit.circuit.units().values()])
     if not (values > 0).all():
@@ -88,8 +88,8 @@ def choose(fits: Mapping[int, Fit], criterion: Criterion) -> int:
 def gained(drawn: Drawn) -> float:
     """2 log evidence of the true circuit minus the largest one of a simpler circuit."""
     truth, evidence = TRUTHS[drawn.truth], bic(drawn.fits)
-    size = {number: len(one.names()) for number, one in enumerate(usual_circuits())}
-    [true] = [number for number, one in enumerate(usual_circuits()) if type(one) is type(truth)]
+    size = {number: len(kind.names()) for number, kind in enumerate(USUAL)}
+    true = USUAL.index(type(truth))
     simpler = [evidence[number] for number in size if size[number] < size[true]]
     return min(simpler, default=math.inf) - evidence[true]
 
@@ -106,12 +106,12 @@ def cell(drawn: Sequence[Drawn]) -> dict[str, Any]:
     decisive = first.snr_db >= DECISIVE_SNR and expected >= DECISIVE
     row: dict[str, Any] = {"truth": first.truth, "snr_db": first.snr_db, "drawn": len(drawn)}
     row |= {"expected_evidence": round(expected, 1), "decisive": decisive}
-    for one in usual_circuits():
-        row[f"chose_{type(one).__name__}"] = sum(d.chosen is type(one) for d in drawn)
+    for kind in USUAL:
+        row[f"chose_{kind.__name__}"] = sum(one.chosen is kind for one in drawn)
     row["richer"] = sum(is_richer(one) for one in drawn)
     row["fits"] = float(np.mean([len(one.selection.fits) for one in drawn]))
     for name, criterion in CRITERIA.items():
-        found = [type(usual_circuits()[choose(one.fits, criterion)]) for one in drawn]
+        found = [USUAL[choose(one.fits, criterion)] for one in drawn]
         row[f"{name}_right"] = sum(one is truth for one in found)
         row[f"{name}_richer"] = sum(len(one.names()) > len(truth.names()) for one in found)
     for name in QUANTITIES:

@@ -33,11 +33,11 @@ from benchmarks.selection_draws import TRUTHS, scene
 from etid.estimators.lanes import Harmonics
 from etid.recordings.preflight import Inspected
 from etid.selection.evidence import best
-from etid.selection.search import usual_circuits
+from etid.selection.search import USUAL, usual_circuits
 
 ENVIRONMENT_OF = "impedance_py"  # of `benchmarks.rivals.roster`
 WORKER = "benchmarks.rivals.circuits_by_impedance_py"
-NAMES = np.array([type(one).__name__ for one in usual_circuits()])
+NAMES = np.array([kind.__name__ for kind in USUAL])
 
 
 class Spectra(NamedTuple):
@@ -110,7 +110,7 @@ def measured(snr_db: float, number: int) -> Spectra:
 
 def by_etid(every: Sequence[Spectra]) -> Chosen:
     """What `identify_impedance` and the rule of `etid.selection` choose, all candidates fitted."""
-    names, seconds = [], []
+    names, seconds, circuits = [], [], usual_circuits()
     for spectra in every:
         for z, sigma, used in zip(*spectra[1:], strict=True):
             begin = time.perf_counter()
@@ -119,7 +119,7 @@ def by_etid(every: Sequence[Spectra]) -> Chosen:
                 number: etid.identify_impedance(
                     spectra.f[used], z[used], stderr=stderr, circuit=circuit, throw=False
                 )
-                for number, circuit in enumerate(usual_circuits())
+                for number, circuit in enumerate(circuits)
             }
             names.append(NAMES[best(fits)])
             seconds.append(time.perf_counter() - begin)
