@@ -51,15 +51,20 @@ class ElementPrior(eqx.Module):
         return jnp.where(jnp.isfinite(self.width), self.centre, logs)
 
 
+def require_element(name: str, circuit: AbstractCircuit) -> None:
+    """Raise ValueError unless the circuit has an element of this name."""
+    if name not in circuit.names():
+        raise ValueError(
+            f"{name!r} is no element of {type(circuit).__name__}; its elements are "
+            f"{', '.join(circuit.names())}"
+        )
+
+
 def checked(known: Sequence[Sequence], circuit: AbstractCircuit) -> None:
     """Raise ValueError unless these are elements of the circuit with sensible values."""
     for one in known:
         name, mean, deviation = one
-        if name not in circuit.names():
-            raise ValueError(
-                f"{name!r} is no element of {type(circuit).__name__}; its elements are "
-                f"{', '.join(circuit.names())}"
-            )
+        require_element(name, circuit)
         if not (0 < mean < float("inf") and 0 <= deviation < float("inf")):
             raise ValueError(
                 f"the known value of {name} is {mean:g} ± {deviation:g}; it must be positive, and "

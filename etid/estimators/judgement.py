@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from etid.circuits.circuit import AbstractCircuit
-from etid.estimators.bounds import Bounds, within
+from etid.estimators.element_limits import Limits, within
 from etid.estimators.estimate import Estimate
 from etid.recordings.remarks import Remark
 from etid.results.fits import Fit, Support
@@ -60,7 +60,7 @@ def judged(
     circuit: AbstractCircuit,
     driver_result: RESULTS,
     method: str,
-    bounds: Bounds = (),
+    bounds: Limits = (),
 ) -> Fit:
     """The fit of an estimate, with its verdict.
 

@@ -2,6 +2,7 @@
 
 import ast
 import dataclasses
+import math
 
 from etid.estimators.estimator import AbstractEstimator, Description
 from etid.estimators.harmonic_steiglitz_mcbride.estimator import HarmonicSteiglitzMcBride
@@ -64,10 +65,18 @@ def named(method: str) -> AbstractEstimator:
     try:
         call = ast.parse(f"dict({options}", mode="eval").body
         keywords = call.keywords if isinstance(call, ast.Call) else []
-        given = {str(one.arg): ast.literal_eval(one.value) for one in keywords}
+        given = {str(one.arg): ast.literal_eval(_Infinite().visit(one.value)) for one in keywords}
         return dataclasses.replace(_ESTIMATORS[name], **given)
     except (SyntaxError, ValueError, TypeError, RecursionError) as error:
         raise ValueError(f"method {method!r}: {name} has no such options") from error
+
+
+class _Infinite(ast.NodeTransformer):
+    """Reads `inf`, which is no literal of Python, as a number."""
+
+    def visit_Name(self, node: ast.Name) -> ast.expr:
+        """The number for the name `inf`; other names are left."""
+        return ast.Constant(math.inf) if node.id == "inf" else node
 
 
 def described(method: str) -> Description | None:

@@ -15,7 +15,7 @@ from etid.circuits.current_dependent import SkinCurrent, current_dependent
 from etid.estimators import judgement
 from etid.estimators.amplitudes.fit import fit_amplitudes
 from etid.estimators.amplitudes.terms import Amplitudes, currents
-from etid.estimators.bounds import Bounds
+from etid.estimators.element_limits import Limits
 from etid.estimators.element_prior import ElementPrior
 from etid.estimators.estimator import serving
 from etid.estimators.lanes import Harmonics, stacked
@@ -73,7 +73,7 @@ def _fit(
     feed: HarmonicDriver | MeasuredCurrent,
     circuit: AbstractCircuit,
     prior: ElementPrior | None,
-    bounds: Bounds,
+    bounds: Limits,
 ) -> Fit:
     rate = jnp.asarray(lanes.sample_rate)[0]
     of = Amplitudes(known, feed, circuit, lanes.spectrum, rate, prior)

@@ -15,7 +15,7 @@ import jax
 
 from etid.circuits.circuit import AbstractCircuit, SkinRC
 from etid.circuits.current_dependent import current_dependent
-from etid.estimators.bounds import Bounds, checked_bounds
+from etid.estimators.element_limits import Limits, checked_limits
 from etid.estimators.element_prior import Known, checked
 from etid.estimators.estimator import AbstractEstimator
 from etid.estimators.maximum_likelihood.estimator import MaximumLikelihood
@@ -234,7 +234,7 @@ def informed(
     return tuple(known)
 
 
-def bounded(bounds: Mapping[str, Interval] | None) -> Bounds:
+def bounded(bounds: Mapping[str, Interval] | None) -> Limits:
     """The bounds of elements, from the argument of a caller. Elements are positive.
 
     Raises:
@@ -243,7 +243,7 @@ def bounded(bounds: Mapping[str, Interval] | None) -> Bounds:
     try:
         ends = [(str(name), low, high) for name, (low, high) in dict(bounds or {}).items()]
         return tuple(
-            (name, float(low or 0.0), None if high is None or high == math.inf else float(high))
+            (name, float(low or 0.0), math.inf if high is None else float(high))
             for name, low, high in ends
         )
     except (TypeError, ValueError):
@@ -255,7 +255,7 @@ def bounded(bounds: Mapping[str, Interval] | None) -> Bounds:
 
 
 def with_known(
-    estimator: AbstractEstimator, known: Known, bounds: Bounds = ()
+    estimator: AbstractEstimator, known: Known, bounds: Limits = ()
 ) -> AbstractEstimator:
     """The estimator with elements that are known, and with bounds.
 
@@ -283,7 +283,7 @@ class Asked(NamedTuple):
 
     estimator: AbstractEstimator | None = None
     known: Known = ()
-    bounds: Bounds = ()
+    bounds: Limits = ()
 
 
 def asked_of(
@@ -312,7 +312,7 @@ def asked_of(
             )
     for circuit in candidates if asked.known or asked.bounds else ():
         checked(asked.known, circuit)
-        checked_bounds(asked.bounds, asked.known, circuit)
+        checked_limits(asked.bounds, asked.known, circuit)
     return asked
 
 

@@ -20,7 +20,7 @@ from tqdm import tqdm
 
 from etid.circuits.circuit import AbstractCircuit
 from etid.estimators import judgement
-from etid.estimators.bounds import Bounds
+from etid.estimators.element_limits import Limits
 from etid.estimators.element_prior import ElementPrior
 from etid.estimators.estimate import DELAY_WIDTH, Estimate
 from etid.estimators.estimator import serving
@@ -440,6 +440,6 @@ def _model(
     driver: HarmonicDriver,
     shared: bool,
     prior: ElementPrior | None,
-    bounds: Bounds,
+    bounds: Limits,
 ) -> Joint:
     return Joint(circuit, Calibrations.of(driver), shared, prior, bounds)

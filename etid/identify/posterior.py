@@ -36,8 +36,8 @@ from jaxtyping import Array, Float, Int
 from scipy.special import softmax
 
 from etid.circuits.circuit import AbstractCircuit, Circuit
-from etid.estimators.bounds import Bounds
-from etid.estimators.element_prior import FIXED, ElementPrior
+from etid.estimators.element_limits import Limits
+from etid.estimators.element_prior import FIXED, ElementPrior, require_element
 from etid.estimators.lanes import Harmonics, HarmonicsWithCurrent
 from etid.estimators.maximum_likelihood import with_current
 from etid.estimators.maximum_likelihood.estimator import MaximumLikelihood
@@ -78,7 +78,7 @@ class Known(eqx.Module):
 
     driver: AbstractGiven
     elements: ElementPrior | None
-    bounds: Bounds = eqx.field(static=True, default=())
+    bounds: Limits = eqx.field(static=True, default=())
 
 
 class _Minimum(eqx.Module):
@@ -310,7 +310,7 @@ def posterior(
         elements = np.exp(stretched(q, least, own, cov))
         for name, low, high in known.bounds:
             value = elements[:, names.index(name)]
-            found[(value < low) | (value > (np.inf if high is None else high))] = np.inf
+            found[(value < low) | (value > high)] = np.inf
         return found
 
     begin = _inside(fit, least, own, cov) if known.bounds else (least, own)
@@ -325,10 +325,7 @@ def posterior(
 def profile(fit: Fit, recording: Recording | None, driver: Driver | None, name: str) -> Profile:
     """`Fit.profile`."""
     names = fit.circuit.names()
-    if name not in names:
-        raise ValueError(
-            f"{type(fit.circuit).__name__} has no element {name!r}; it has {', '.join(names)}"
-        )
+    require_element(name, fit.circuit)
     lane, known, cov = given(fit, recording, driver)
     if known.bounds:
         raise ValueError(

@@ -2,6 +2,7 @@
 
 import dataclasses
 import importlib.metadata
+import math
 import os
 from collections.abc import Sequence
 
@@ -35,7 +36,8 @@ class Settings:
         fixed: Known elements and their values [SI], such as `"r_s 500.0"`.
         prior: Elements with a prior, values and standard deviations [SI], such as
             `"r_s 500.0 ± 50.0"`.
-        bounds: Elements with bounds [SI], such as `"r_s 100.0 to 2000.0"`.
+        bounds: Elements with bounds [SI], such as `"r_s 100.0 to 2000.0"` or
+            `"r_s above 100.0"`.
         precision: Floating-point type of the computation.
         backend: Backend of JAX, such as `"cpu"`.
         versions: Packages and their versions, such as `"jax 0.10.2"`.
@@ -68,7 +70,7 @@ class Settings:
         r_load_tolerance: float = 0.0,
         driver_drift: float = 0.0,
         known: Sequence[tuple[str, float, float]] = (),
-        bounds: Sequence[tuple[str, float, float | None]] = (),
+        bounds: Sequence[tuple[str, float, float]] = (),
     ) -> "Settings":
         """The settings of a run in this process.
 
@@ -82,7 +84,8 @@ class Settings:
             driver_drift: As in `identify_driver`.
             known: Names, values and standard deviations of known elements [SI]; the standard
                 deviation of a fixed element is 0.
-            bounds: Names, lower and upper bounds of elements [SI]; None for no upper bound.
+            bounds: Names, lower and upper bounds of elements [SI]; infinity for no upper
+                bound.
         """
         source = os.path.abspath(study.file) if study.file else ""
         return cls(
@@ -99,7 +102,10 @@ class Settings:
             driver_drift=float(driver_drift),
             fixed=tuple(f"{name} {value!r}" for name, value, error in known if not error),
             prior=tuple(f"{name} {value!r} ± {error!r}" for name, value, error in known if error),
-            bounds=tuple(f"{name} {low!r} to {high!r}" for name, low, high in bounds),
+            bounds=tuple(
+                f"{name} above {low!r}" if high == math.inf else f"{name} {low!r} to {high!r}"
+                for name, low, high in bounds
+            ),
             precision="float64",
             backend=jax.default_backend(),
             versions=tuple(f"{name} {importlib.metadata.version(name)}" for name in PACKAGES),

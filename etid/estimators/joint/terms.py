@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from etid.circuits.circuit import AbstractCircuit
-from etid.estimators.bounds import Bounds
+from etid.estimators.element_limits import Limits
 from etid.estimators.element_prior import ElementPrior
 from etid.estimators.maximum_likelihood.driver import Calibrations
 from etid.estimators.maximum_likelihood.given_driver import GivenDriver, around
@@ -41,7 +41,7 @@ class Joint(eqx.Module):
     calibrations: Calibrations
     shared: bool = eqx.field(static=True)
     prior: ElementPrior | None = None
-    bounds: Bounds = eqx.field(static=True, default=())
+    bounds: Limits = eqx.field(static=True, default=())
 
     def around(
         self,

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from etid.circuits.circuit import AbstractCircuit
-from etid.estimators.bounds import Bounds, stated_bounds
+from etid.estimators.element_limits import Limits, stated_limits
 from etid.estimators.element_prior import ElementPrior, Known, stated
 from etid.estimators.estimator import (
     BY_RESIDUALS,
@@ -83,7 +83,7 @@ class MaximumLikelihood(AbstractEstimator):
     """
 
     known_elements: Known = ()
-    bounds: Bounds = ()
+    bounds: Limits = ()
     with_current: bool = False
     name = "maximum_likelihood"
     lane = Harmonics
@@ -148,7 +148,7 @@ class MaximumLikelihood(AbstractEstimator):
             "Each load was estimated jointly with Z_th and the trigger delays of the calibrations, "
             "whose distribution the calibrations give. Its own trigger delay τ is one more "
             f"unknown.{_BOTH if self.with_current else ''}{stated(self.known_elements)}"
-            f"{stated_bounds(self.bounds)}",
+            f"{stated_limits(self.bounds)}",
             (NO_OTHER_CIRCUIT, NO_OTHER_GAIN, NO_FALL),
         )
 

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from etid.circuits.circuit import AbstractCircuit
-from etid.estimators.bounds import Bounds, stated_bounds
+from etid.estimators.element_limits import Limits, stated_limits
 from etid.estimators.element_prior import ElementPrior, Known, stated
 from etid.estimators.estimator import CHECKED, DETERMINED, AbstractEstimator, Description
 from etid.estimators.judgement import judged, misses, unless
@@ -40,7 +40,7 @@ class OutputError(AbstractEstimator):
     """
 
     known_elements: Known = ()
-    bounds: Bounds = ()
+    bounds: Limits = ()
     name = "output_error"
     lane = PaddedSamples
     driver = ContinuousDriver
@@ -104,7 +104,7 @@ class OutputError(AbstractEstimator):
             "difference to the loaded record, weighted by the noise of both, was minimised. The "
             "state at the start of the record, an offset and the trigger delay were estimated with "
             f"the load.{stated(self.known_elements)}"
-            f"{stated_bounds(self.bounds)}",
+            f"{stated_limits(self.bounds)}",
             conditions=(*CHECKED, DETERMINED),
             errors="were multiplied by the square root of χ² where the residual exceeds the noise",
             refined=True,

@@ -11,7 +11,7 @@ the truth in 94.2 to 97.3 % wherever it lies, if the bounds are four standard er
 The point of the largest likelihood would often lie on a bound, and have no standard error there.
 """
 
-from collections.abc import Sequence
+import math
 from typing import NamedTuple
 
 import jax
@@ -21,10 +21,10 @@ import scipy.special
 from jaxtyping import Array, Bool, Float
 
 from etid.circuits.circuit import AbstractCircuit
-from etid.estimators.element_prior import Known
+from etid.estimators.element_prior import Known, require_element
 
-Bounds = tuple[tuple[str, float, float | None], ...]
-"""Elements with bounds: name, lower and upper bound [SI]; no upper bound is None."""
+Limits = tuple[tuple[str, float, float], ...]
+"""Elements with bounds: name, lower and upper bound [SI]; infinity without an upper bound."""
 
 # Squared distance from the estimate of a free fit to that inside the bounds [standard errors]. An
 # element whose true value is its bound exceeds it once in 2000, 3.3 standard errors from the bound.
@@ -56,7 +56,7 @@ def within(
     circuit: AbstractCircuit,
     cov: Float[Array, "element element"],
     shared_cov: Float[Array, "element element"],
-    bounds: Bounds,
+    bounds: Limits,
 ) -> Within:
     """The elements of a free fit inside their bounds.
 
@@ -71,7 +71,7 @@ def within(
     """
     rows = np.array([circuit.names().index(name) for name, *_ in bounds])
     lower = jnp.array([low for _, low, _ in bounds])
-    upper = jnp.array([jnp.inf if high is None else high for *_, high in bounds])
+    upper = jnp.array([high for *_, high in bounds])
     free, scale = circuit.values(), jnp.sqrt(jnp.diagonal(cov))
     # In standard errors, from the free estimate.
     low, high = (lower - free[rows]) / scale[rows], (upper - free[rows]) / scale[rows]
@@ -143,30 +143,25 @@ def truncated(
     return mean + deviation * (mode + centre), deviation**2 * (weight @ (t - centre) ** 2)
 
 
-def checked_bounds(bounds: Bounds, known: Known, circuit: AbstractCircuit) -> None:
+def checked_limits(bounds: Limits, known: Known, circuit: AbstractCircuit) -> None:
     """Raise ValueError unless these are possible bounds of elements of the circuit."""
     for name, low, high in bounds:
-        if name not in circuit.names():
-            raise ValueError(
-                f"{name!r} has bounds, but is no element of {type(circuit).__name__}; its elements "
-                f"are {', '.join(circuit.names())}"
-            )
+        require_element(name, circuit)
         if any(name == one and not error for one, _, error in known):
             raise ValueError(f"{name} is fixed and has bounds; remove one of them")
-        upper = np.inf if high is None else high
-        if not 0 <= low < upper:
+        if not 0 <= low < high:
             raise ValueError(
-                f"the bounds of {name} are {low:g} and {upper:g}; the lower one must not be "
+                f"the bounds of {name} are {low:g} and {high:g}; the lower one must not be "
                 "negative, and the upper one must be larger"
             )
 
 
-def stated_bounds(bounds: Sequence[tuple[str, float, float | None]]) -> str:
+def stated_limits(bounds: Limits) -> str:
     """A sentence for a methods section; empty without bounds."""
     if not bounds:
         return ""
     each = [
-        f"{name} ≥ {low:g}" if high is None else f"{name} from {low:g} to {high:g}"
+        f"{name} ≥ {low:g}" if high == math.inf else f"{name} from {low:g} to {high:g}"
         for name, low, high in bounds
     ]
     return (
