@@ -307,7 +307,8 @@ def batch(driver, recording):
     spectrum = dataclasses.replace(spectrum, selected=selected)
     z_th = driver.response(spectrum.frequency)
     starts = harmonic_starts(spectrum, rate, z_th, etid.SkinRC())
-    own, *_ = fit_alone(model, spectrum, rate, starts)
+    given = model.around(model.calibrations.start(), spectrum.frequency, slopes=False)
+    own, *_ = fit_alone(model, given, spectrum, rate, starts)
     return np.exp(np.asarray(own.log_elements))
 
 

@@ -33,7 +33,6 @@ from etid.estimators.maximum_likelihood.estimator import description
 from etid.estimators.registry import MAXIMUM_LIKELIHOOD, register_description
 from etid.estimators.score_tests.other_circuit import NO_OTHER_CIRCUIT, NO_OTHER_GAIN
 from etid.estimators.score_tests.unloaded import shape_of
-from etid.estimators.starts import harmonic_starts
 from etid.identify.arguments import (
     Asked,
     Circuit,
@@ -106,13 +105,14 @@ class _Start(NamedTuple):
 
 @stored_jit
 def _alone(lanes: Any, count: Int[Array, ""], model: Joint, driver: HarmonicDriver) -> _Start:
-    known = shape_of(driver, jnp.asarray(lanes.frequency)[0])
+    frequency = jnp.asarray(lanes.frequency)[0]
+    known = shape_of(driver, frequency)
+    given = model.around(model.calibrations.start(), frequency, slopes=False)
 
     def one(lane: Harmonics) -> _Start:
         spectrum, sample_rate = lane.spectrum, jnp.asarray(lane.sample_rate)
-        z_th = model.calibrations.source.response(spectrum.frequency)
-        starts = harmonic_starts(spectrum, sample_rate, z_th, model.circuit)
-        own, result, chi2, error, hum = fit_alone(model, spectrum, sample_rate, starts)
+        starts = given.starts(spectrum, sample_rate, model.circuit)
+        own, result, chi2, error, hum = fit_alone(model, given, spectrum, sample_rate, starts)
         settled = RESULTS.promote(result) == RESULTS.successful
         good = settled & jnp.isfinite(chi2) & ~judgement.misses(chi2, error)
         changed = jnp.array(False) if known is None else known.differs(spectrum)

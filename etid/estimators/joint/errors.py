@@ -91,42 +91,40 @@ def estimates(
     groups, model = study.groups, study.model
     owns = [own for own, _ in fitted]
     found = [
-        in_turn(lambda load, own: _eliminated(study, load, common, own), loads, own)
-        for loads, own in zip(groups, owns, strict=True)
+        _of_group(study, loads, common, own, several=count > 0)
+        for loads, own, count in zip(groups, owns, several, strict=True)
     ]
     total = model.calibrations.linear(common).curvature()
-    for loads, eliminated in zip(groups, found, strict=True):
+    for loads, (eliminated, _) in zip(groups, found, strict=True):
         used = jax.tree.map(
             lambda leaf, loads=loads: jnp.where(loads.used[:, None, None], leaf, 0.0).sum(0),
             eliminated.rest,
         )
         total = jax.tree.map(jnp.add, total, used)
     bread = inverse(total.expected)
-    lanes = list(zip(groups, owns, found, several, strict=True))
-    sums = [_sums(study, common, *lane) for lane in lanes]
+    sums = [
+        _sums(loads, seen.by_x, count, common.size)
+        for loads, (_, seen), count in zip(groups, found, several, strict=True)
+    ]
     score = total.score + sum((more for _, more in sums), start=jnp.zeros_like(total.score))
     cov = bread @ score @ bread
 
     strain = model.calibrations.strain(common)
     judged = []
-    for (loads, own, eliminated, records), (sums_of, _), (_, results) in zip(
-        lanes, sums, fitted, strict=True
-    ):
+    for loads, (own, results), each, (sums_of, _) in zip(groups, fitted, found, sums, strict=True):
 
         def one(
             load: Loads,
             own: LoadUnknowns,
             eliminated: _Eliminated,
+            seen: _Seen,
             result: optx.RESULTS,
-            records: int = records,
             sums_of: Float[Array, "record x common"] = sums_of,
         ) -> tuple[Estimate, Bool[Array, ""], Delay]:
-            seen = _seen(study, load, common, own)
-            chi2, rrse = _misfit(study, load, seen)
             shared = eliminated.slope @ cov @ eliminated.slope.T
             private = eliminated.cov
-            if records:
-                by_x, cross = _by_x(study, common, load, own, eliminated, sums_of)
+            if seen.by_x is not None:
+                by_x, cross = _by_x(load, seen.by_x, sums_of)
                 cross = cross @ bread @ eliminated.slope.T
                 shared = shared + by_x + cross + cross.T
                 private = private - by_x
@@ -136,8 +134,8 @@ def estimates(
                 delay_samples=own.delay_samples[None],
                 cov=_of_elements(whole),
                 shared_cov=_of_elements(shared),
-                chi2=chi2,
-                rrse=rrse,
+                chi2=seen.chi2,
+                rrse=seen.rrse,
                 result=optx.RESULTS.where(
                     result == optx.RESULTS.successful, solution.result, result
                 ),
@@ -148,7 +146,7 @@ def estimates(
             other = _is_another(seen, load, own, eliminated, bread, total.score)
             return estimate, other, delay
 
-        judged.append(in_turn(one, loads, own, eliminated, results))
+        judged.append(in_turn(one, loads, own, *each, results))
     return cov, judged
 
 
@@ -157,54 +155,94 @@ def _of_elements(cov: Float[Array, "own own"]) -> Float[Array, "element element"
     return LoadUnknowns.of(LoadUnknowns.of(cov).log_elements.T).log_elements
 
 
+class _ByX(NamedTuple):
+    """Effect of unit noise in the X of a load, which has two numbers at each knot.
+
+    Attributes:
+        of_common: On the score of `common`.
+        of_own: On the own parameters.
+    """
+
+    of_common: Float[Array, "*load x common"]
+    of_own: Float[Array, "*load x own"]
+
+
 class _Seen(NamedTuple):
     """A load at its minimum.
 
     Attributes:
-        gain: Gain.
-        known: The recording with the X that the calibrations estimate.
-        part: Terms of the recording.
-        around: The recording at the knots.
-        linear: Terms at the knots, linear in (common, own); the last are the priors of the own.
+        chi2: χ² per degree of freedom.
+        rrse: Relative root sum of squared errors.
+        terms: Terms at the knots, and the priors of the own parameters.
+        linear: The same, linear in (common, own).
+        changes: Derivatives of the terms with respect to changes of the circuit and to a gain.
+        by_x: Effect of the noise of X; None if no load shares its unloaded record.
     """
 
-    gain: Complex[Array, " harmonic"]
-    known: Spectrum
-    part: Float[Array, " part"]
-    around: Around
+    chi2: Float[Array, "*load"]
+    rrse: Float[Array, "*load"]
+    terms: Float[Array, "*load term"]
     linear: Linear
+    changes: Float[Array, "*load change term"]
+    by_x: _ByX | None
 
 
-def _seen(
-    study: DriverStudy, load: Loads, common: Float[Array, " common"], own: LoadUnknowns
-) -> _Seen:
-    """A load at its minimum; what the caller does not use is not computed."""
-    driver = study.model.around(common, load.spectrum.frequency)
-    q, o = jnp.concatenate([own.vector(), driver.mean]), study.owned
-    lane = study.lane(driver, load)
-    g, known = apart(lane.predicted, q)
-    part = residual(known, g)
-    around = Around.of(lane, q, (g, known))
-    of_own = jnp.diag(1 / lane.gain.widths(q[:o]))
-    of_priors = jnp.concatenate([jnp.zeros((common.size, o)), of_own])
-    jacobian = jnp.concatenate([around.jacobian[o:], around.jacobian[:o]])
+def _of_group(
+    study: DriverStudy,
+    loads: Loads,
+    common: Float[Array, " common"],
+    owns: LoadUnknowns,
+    several: bool,
+) -> tuple[_Eliminated, _Seen]:
+    """Each load of a group at its minimum, evaluated once."""
+    driver = study.model.around(common, loads.frequency[0])
+
+    def one(load: Loads, own: LoadUnknowns) -> tuple[_Eliminated, _Seen]:
+        lane, o = study.lane(driver, load), study.owned
+        q = jnp.concatenate([own.vector(), driver.mean])
+        g, known = apart(lane.predicted, q)
+        part = residual(known, g)
+        around = Around.of(lane, q, (g, known))
+        linear = _linear(around, known, part, o)
+        eliminated = _eliminated(linear, common.size)
+        gain = around.at.gain
+        priors = (q[:o] - gain.centre(q[:o])) / gain.widths(q[:o])
+        rows = around.at.rows(around.by_changes())
+        chi2, rrse = _misfit(load, g, part, o)
+        seen = _Seen(
+            chi2,
+            rrse,
+            terms=jnp.concatenate([around.part, priors]),
+            linear=linear,
+            changes=jnp.pad(rows, ((0, 0), (0, o))),  # no change affects the priors
+            by_x=_influence(around, known, g, linear, eliminated) if several else None,
+        )
+        return eliminated, seen
+
+    return in_turn(one, loads, owns)
+
+
+def _linear(around: Around, known: Spectrum, part: Float[Array, " part"], owned: int) -> Linear:
+    """Terms at the knots, linear in (common, own); the last are the priors of the own."""
+    jacobian, q = around.jacobian, around.q
+    of_own = jnp.diag(1 / around.at.gain.widths(q[:owned]))
+    of_priors = jnp.concatenate([jnp.zeros((q.size - owned, owned)), of_own])
+    jacobian = jnp.concatenate([jacobian[owned:], jacobian[:owned]])
     jacobian = jnp.concatenate([jacobian, of_priors], axis=1)
     share = signal_share(around.x, known.variance_x)
-    noise = excess(part, known.selected)[: g.size]
+    noise = excess(part, known.selected)[: share.size]
     means = around.mean(jnp.stack([share, noise]))
-    linear = Linear(jacobian, *jnp.concatenate([means, jnp.ones((2, o))], axis=1))
-    return _Seen(g, known, part, around, linear)
+    return Linear(jacobian, *jnp.concatenate([means, jnp.ones((2, owned))], axis=1))
 
 
 def _misfit(
-    study: DriverStudy, load: Loads, seen: _Seen
+    load: Loads, gain: Complex[Array, " harmonic"], part: Float[Array, " part"], owned: int
 ) -> tuple[Float[Array, ""], Float[Array, ""]]:
-    """χ² and RRSE of a load."""
+    """χ² and RRSE of a load, from its gain and the terms of its recording."""
     spectrum = load.spectrum
-    squares = jnp.sum(seen.part**2)
-    freedom = 2 * jnp.sum(spectrum.selected, dtype=squares.dtype) - study.owned
-    error = complex_rrse(seen.gain * spectrum.x, spectrum.y, spectrum.selected)
-    return squares / freedom, error
+    squares = jnp.sum(part**2)
+    freedom = 2 * jnp.sum(spectrum.selected, dtype=squares.dtype) - owned
+    return squares / freedom, complex_rrse(gain * spectrum.x, spectrum.y, spectrum.selected)
 
 
 def _is_another(
@@ -216,10 +254,7 @@ def _is_another(
     score: Float[Array, "common common"],
 ) -> Bool[Array, ""]:
     """Score test of one load; `bread` and `score` are those of `common` from all terms."""
-    slope, around = eliminated.slope, seen.around
-    q, gain = own.vector(), around.at.gain
-    terms = jnp.concatenate([around.part, (q - gain.centre(q)) / gain.widths(q)])
-    rows = around.at.rows(around.by_changes())
+    slope, linear = eliminated.slope, seen.linear
     covariance = jnp.block(
         [
             [bread, bread @ slope.T],
@@ -228,11 +263,11 @@ def _is_another(
     )
     spread = jnp.zeros_like(covariance).at[: bread.shape[0], : bread.shape[0]]
     found = other_circuit.scores(
-        jnp.pad(rows, ((0, 0), (0, q.size))),  # no change affects the priors
-        seen.linear,
-        terms,
+        seen.changes,
+        linear,
+        seen.terms,
         # At the minimum the other terms have the opposite gradient.
-        -seen.linear.jacobian @ terms,
+        -linear.jacobian @ seen.terms,
         spread.set(score - eliminated.rest.score),
         covariance,
         slice(bread.shape[0], bread.shape[0] + own.log_elements.size),
@@ -242,11 +277,9 @@ def _is_another(
     return (other.seen() | other.has_other_gain()) & load.used
 
 
-def _eliminated(
-    study: DriverStudy, load: Loads, common: Float[Array, " common"], own: LoadUnknowns
-) -> _Eliminated:
-    """A load whose own parameters are eliminated; they follow the `common` ones."""
-    of, c = _seen(study, load, common, own).linear.curvature(), common.shape[0]
+def _eliminated(linear: Linear, c: int) -> _Eliminated:
+    """A load whose own parameters are eliminated; they follow the `c` common ones."""
+    of = linear.curvature()
     bread = inverse(of.expected[c:, c:])
     slope = -bread @ of.expected[c:, :c]
     cov = bread @ of.score[c:, c:] @ bread
@@ -261,17 +294,15 @@ def _eliminated(
 
 
 def _influence(
-    study: DriverStudy,
-    common: Float[Array, " common"],
-    load: Loads,
-    own: LoadUnknowns,
+    around: Around,
+    known: Spectrum,
+    gain: Complex[Array, " harmonic"],
+    linear: Linear,
     eliminated: _Eliminated,
-) -> tuple[Float[Array, "x common"], Float[Array, "x own"]]:
+) -> _ByX:
     """Effect of unit noise in X on the score of `common`, and on the own parameters."""
-    seen = _seen(study, load, common, own)
-    known, every = seen.known, knots(seen.gain.size)
-    jacobian, g = seen.linear.jacobian.T, seen.around.slopes.gain
-    size = every.at(jnp.sqrt(known.variance_x / variance(known, seen.gain)))
+    jacobian, g = linear.jacobian.T, around.slopes.gain
+    size = knots(gain.size).at(jnp.sqrt(known.variance_x / variance(known, gain)))
     re, im = g.real * size, g.imag * size
     real, imaginary = jacobian[: g.size], jacobian[g.size : 2 * g.size]
     by_x = jnp.concatenate(
@@ -280,58 +311,35 @@ def _influence(
             re[:, None] * imaginary - im[:, None] * real,
         ]
     )
-    c = common.shape[0]
-    return by_x[:, :c] + by_x[:, c:] @ eliminated.slope, by_x[:, c:] @ eliminated.bread
+    c = jacobian.shape[1] - eliminated.bread.shape[0]
+    return _ByX(by_x[:, :c] + by_x[:, c:] @ eliminated.slope, by_x[:, c:] @ eliminated.bread)
 
 
-def _sums(
-    study: DriverStudy,
-    common: Float[Array, " common"],
-    loads: Loads,
-    owns: LoadUnknowns,
-    found: _Eliminated,
-    records: int,
-) -> _Sums:
+def _sums(loads: Loads, by_x: _ByX | None, records: int, common: int) -> _Sums:
     """Sum of the effects of each shared record on the score of `common`.
 
     The second result is the covariance of the score that this correlation adds.
     """
-    c = common.shape[0]
-    start = (
-        jnp.zeros((records, 2 * knots(loads.spectrum.x.shape[1]).index.size, c)),
-        jnp.zeros((c, c)),
-    )
-    if not records:
-        return start
-
-    def add(carry: _Sums, lane: tuple[Loads, LoadUnknowns, _Eliminated]) -> tuple[_Sums, None]:
-        load, own, eliminated = lane
-        sums, alone = carry
-        mine, _ = _influence(study, common, load, own, eliminated)
-        mine = jnp.where(load.used & (load.unloaded >= 0), mine, 0.0)
-        return (sums.at[load.unloaded].add(mine), alone + mine.T @ mine), None
-
-    (sums, alone), _ = jax.lax.scan(add, start, (loads, owns, found))
+    if by_x is None:
+        return jnp.zeros((0, 0, common)), jnp.zeros((common, common))
+    takes_part = loads.used & (loads.unloaded >= 0)
+    mine = jnp.where(takes_part[:, None, None], by_x.of_common, 0.0)
+    sums = jnp.zeros((records, *mine.shape[1:])).at[loads.unloaded].add(mine)
+    alone = jnp.einsum("lxc,lxd->cd", mine, mine)
     return sums, jnp.einsum("rxc,rxd->cd", sums, sums) - alone
 
 
 def _by_x(
-    study: DriverStudy,
-    common: Float[Array, " common"],
-    load: Loads,
-    own: LoadUnknowns,
-    eliminated: _Eliminated,
-    sums: Float[Array, "record x common"],
+    load: Loads, by_x: _ByX, sums: Float[Array, "record x common"]
 ) -> tuple[Float[Array, "own own"], Float[Array, "own common"]]:
     """Covariance of the own parameters of a load by the noise of a shared X.
 
     The second result is their covariance with the effect of this noise on the score of `common`
     through the other loads.
     """
-    mine, of_own = _influence(study, common, load, own, eliminated)
-    others = sums[load.unloaded] - jnp.where(load.used, mine, 0.0)
+    others = sums[load.unloaded] - jnp.where(load.used, by_x.of_common, 0.0)
     several = load.unloaded >= 0
     return (
-        jnp.where(several, of_own.T @ of_own, 0.0),
-        jnp.where(several, of_own.T @ others, 0.0),
+        jnp.where(several, by_x.of_own.T @ by_x.of_own, 0.0),
+        jnp.where(several, by_x.of_own.T @ others, 0.0),
     )

@@ -19,6 +19,7 @@ from etid.estimators.joint.errors import Delay, estimates
 from etid.estimators.joint.near import approached
 from etid.estimators.joint.terms import DriverStudy, Joint, Loads, in_turn
 from etid.estimators.maximum_likelihood import driver as calibrations
+from etid.estimators.maximum_likelihood.given_driver import GivenDriver
 from etid.estimators.maximum_likelihood.load import SLIGHT, Load, refined
 from etid.estimators.maximum_likelihood.terms import shows_hum
 from etid.estimators.unknowns import LoadUnknowns
@@ -158,33 +159,36 @@ def fit_together(
     )
     common, parts = study.split(solution.value)
     # The loads that take no part are fitted now, with the final Z_th.
-    refitted = [
-        in_turn(lambda load, own: _refit(study, load, common, own), loads, own)
-        for loads, own in zip(groups, parts, strict=True)
-    ]
+    refitted = [_refitted(study, common, *group) for group in zip(groups, parts, strict=True)]
     cov, found = estimates(study, common, refitted, several, solution)
     return common, cov, found
 
 
-def _refit(
-    study: DriverStudy, load: Loads, common: Float[Array, " common"], own: LoadUnknowns
+def _refitted(
+    study: DriverStudy, common: Float[Array, " common"], loads: Loads, owns: LoadUnknowns
 ) -> tuple[LoadUnknowns, optx.RESULTS]:
-    """Unknowns of a load at its minimum with this Z_th, and the result of the solver."""
-    driver = study.model.around(common, load.spectrum.frequency, slopes=False)
-    solution = refined(study.lane(driver, load), own.vector())
-    return LoadUnknowns.of(solution.value), solution.result
+    """Unknowns of each load at its minimum with this Z_th, and the results of the solver."""
+    driver = study.model.around(common, loads.frequency[0], slopes=False)
+
+    def one(load: Loads, own: LoadUnknowns) -> tuple[LoadUnknowns, optx.RESULTS]:
+        solution = refined(study.lane(driver, load), own.vector())
+        return LoadUnknowns.of(solution.value), solution.result
+
+    return in_turn(one, loads, owns)
 
 
 def fit_alone(
     model: Joint,
+    driver: GivenDriver,
     spectrum: Spectrum,
     sample_rate: Float[Array, ""],
     candidates: LoadUnknowns,
 ) -> tuple[LoadUnknowns, optx.RESULTS, Float[Array, ""], Float[Array, ""], Bool[Array, ""]]:
-    """Identify the load of one recording; Z_th is fixed at the estimate of the calibrations.
+    """Identify the load of one recording; Z_th is fixed.
 
     Args:
-        model: Calibrations and structure of the circuit.
+        model: Structure of the circuit and its prior.
+        driver: The driver at the harmonics of the recording, without z.
         spectrum: The recording.
         sample_rate: Its sampling rate [Hz].
         candidates: Starts, stacked; the start that predicts best is refined.
@@ -193,7 +197,6 @@ def fit_alone(
         The unknowns, the result of the solver, χ² per degree of freedom, RRSE, and whether mains
         hum is seen.
     """
-    driver = model.around(model.calibrations.start(), spectrum.frequency, slopes=False)
     load = Load.behind(driver, model.circuit, spectrum, sample_rate, model.prior)
     if model.prior is not None:
         placed = model.prior.placed(candidates.log_elements)
