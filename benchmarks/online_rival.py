@@ -1,90 +1,63 @@
-"""The extended Kalman filter of filterpy with the model of `etid.Tracker`, for its time.
+"""The time of filterpy's extended Kalman filter, with the model and the pulses of the tracker."""
 
-Same bands, same circuit, same random walk, derivatives in closed form, one filter for each
-electrode as filterpy is made for. It is told the sampling phase of each pulse: an extended Kalman
-filter has no search over delays. It has no tests for changes and no verdicts.
-"""
-
-import importlib
-import time
+import os
+import pathlib
+import subprocess
+import tempfile
 
 import numpy as np
-from jaxtyping import Complex, Float
+from jaxtyping import Float
 
 import etid
+from benchmarks.rivals import ONE_THREAD, ROOT, make, python_of
 
-DELAY = 0.1  # [samples] standard deviation of a pulse's delay besides its sampling phase
+ENVIRONMENT = "filterpy"
+WORKER = "benchmarks.rivals.kalman_by_filterpy"
+OFF = 0.05  # of the elements, by which its start differs from what the tracker has found
 
 
-class Rival:
-    """One filter for each electrode.
+def seconds(
+    tracker: etid.Tracker,
+    pulses: Float[np.ndarray, "pulse lane sample"],
+    logs: Float[np.ndarray, "lane element"],
+) -> float | str:
+    """Median processor time of filterpy for one pulse at all electrodes, the bands apart [s].
 
     Args:
         tracker: Tracker of `SkinRC` whose model is used.
-        start: Logarithms of the elements at which each filter starts.
+        pulses: Windows of the first pulses after a start [V].
+        logs: Logarithms of the elements that the tracker has found.
 
-    Raises:
-        ImportError: filterpy is not installed (`pip install etid[bench]`).
+    Returns:
+        The time; why there is none, if filterpy cannot be installed.
     """
-
-    def __init__(self, tracker: etid.Tracker, start: Float[np.ndarray, "lane element"]) -> None:
-        filterpy = importlib.import_module("filterpy.kalman")
-        bands = tracker.model.bands
-        self.tracker = tracker
-        self.s = 2j * np.pi * np.asarray(bands.frequency)
-        self.turn = np.asarray(tracker.model.turn)
-        self.source, self.weight = np.asarray(tracker.model.source), np.asarray(bands.weight)
-        self.filters = []
-        for logs in start:
-            one = filterpy.ExtendedKalmanFilter(dim_x=4, dim_z=2 * self.s.size)
-            one.x, one.P = np.append(logs, 0.0), np.diag([0.1, 0.1, 0.1, DELAY]) ** 2
-            self.filters.append(one)
-        self.walk = np.diag([float(tracker.change)] * 3 + [0.0]) ** 2
-
-    def update(self, v_out: Float[np.ndarray, "lane sample"], phase: float) -> float:
-        """One pulse at all electrodes.
-
-        Args:
-            v_out: One window per electrode [V].
-            phase: Known part of the delay [samples].
-
-        Returns:
-            Processor's time without that of the bands [s].
-        """
-        seen = self.tracker.projection.seen(v_out, self.tracker.adc_range)
-        begin = time.process_time()
-        real, imaginary = np.split(np.asarray(seen.gain), 2, axis=1)
-        gains = (real + 1j * imaginary) * np.exp(1j * self.turn * phase)
-        for one, gain, variance in zip(self.filters, gains, np.asarray(seen.variance), strict=True):
-            # Each pulse has a delay of its own.
-            one.x[3], one.P[3], one.P[:, 3], one.P[3, 3] = 0.0, 0.0, 0.0, DELAY**2
-            one.P = one.P + self.walk
-            one.R = np.diag(np.tile(variance / self.weight, 2))
-            one.update(_parts(gain), self._slope, self._expected)
-        return time.process_time() - begin
-
-    def _load(self, x: np.ndarray) -> tuple[Complex[np.ndarray, " band"], list[np.ndarray]]:
-        """Z_L and its derivatives with respect to the logarithms of R_s, R_p, C_p."""
-        r_s, r_p, c_p = np.exp(x[:3])
-        low = 1 / (1 + self.s * r_p * c_p)
-        return r_s + r_p * low, [
-            np.full(self.s.size, r_s + 0j),
-            r_p * low**2,
-            -self.s * c_p * (r_p * low) ** 2,
-        ]
-
-    def _expected(self, x: np.ndarray) -> Float[np.ndarray, " part"]:
-        z, _ = self._load(x)
-        return _parts(z / (z + self.source) * np.exp(-1j * self.turn * x[3]))
-
-    def _slope(self, x: np.ndarray) -> Float[np.ndarray, "part own"]:
-        z, by_element = self._load(x)
-        delayed = np.exp(-1j * self.turn * x[3])
-        slope = self.source / (z + self.source) ** 2 * delayed
-        by_delay = -1j * self.turn * z / (z + self.source) * delayed
-        return np.stack([_parts(slope * one) for one in by_element] + [_parts(by_delay)], axis=1)
-
-
-def _parts(values: Complex[np.ndarray, " band"]) -> Float[np.ndarray, " part"]:
-    """Real parts, then imaginary parts."""
-    return np.concatenate([np.real(values), np.imag(values)])
+    missing = make(ENVIRONMENT)
+    if missing:
+        return missing
+    seen = [tracker.projection.seen(v_out, tracker.adc_range) for v_out in pulses]
+    real, imaginary = np.split(np.stack([np.asarray(one.gain) for one in seen]), 2, axis=2)
+    variance = np.stack([np.asarray(one.variance) for one in seen])
+    begins = np.arange(len(pulses)) % 3 * tracker.period
+    with tempfile.TemporaryDirectory() as folder:
+        given, found = pathlib.Path(folder, "problem.npz"), pathlib.Path(folder, "result.npz")
+        np.savez(
+            given,
+            gains=real + 1j * imaginary,
+            variances=variance[:, :, None] / np.asarray(tracker.model.bands.weight),
+            delays=begins - np.round(begins),
+            frequency=np.asarray(tracker.model.bands.frequency),
+            turn=np.asarray(tracker.model.turn),
+            source=np.asarray(tracker.model.source),
+            change=np.asarray(tracker.change),
+            start=logs + OFF,
+        )
+        subprocess.run(
+            [python_of(ENVIRONMENT), "-m", WORKER, given, found],
+            cwd=ROOT,
+            env={**os.environ, **ONE_THREAD},
+            check=True,
+        )
+        with np.load(found) as file:
+            apart = np.abs(file["logs"] - logs).max()
+            print(f"filterpy    differs by at most {apart:.1%} in an element")
+            return float(np.median(file["seconds"]))

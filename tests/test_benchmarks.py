@@ -1,6 +1,7 @@
 """The benchmarks themselves: what they measure on, and that each runs and says what it should."""
 
 import csv
+import dataclasses
 
 import h5py
 import jax
@@ -9,8 +10,9 @@ import pytest
 import scipy.signal
 
 import etid
-from benchmarks import curves, peers, scale
+from benchmarks import curves, online, peers, scale
 from benchmarks.large_file import LAYOUTS, SAMPLES, large_file
+from benchmarks.online_alarms import Alarms
 from benchmarks.problem import START, ByNumPy, problem
 from benchmarks.provenance import write_csv
 
@@ -162,3 +164,18 @@ def test_curves_are_measured_and_drawn(tmp_path, monkeypatch):
     assert {row["against"] for row in rows} == {"samples", "lanes", "workers"}
     assert all(float(row["seconds"]) > 0 for row in rows)
     assert (tmp_path / "curves.svg").read_text().startswith("<?xml")
+
+
+def test_no_false_alarm_in_three_hours_is_at_most_one_per_hour():
+    """The rule of three: exp(−rate · hours) = 0.05."""
+    found = Alarms(hours=-np.log(0.05), false=0, driver=0, changes=8, found=6)
+    np.testing.assert_allclose(found.hourly(), 1.0)
+    assert found.soon() == 0.75
+    assert dataclasses.replace(found, false=1).hourly() > 1
+
+
+def test_a_number_that_could_not_be_had_misses_its_target():
+    assert not online.Line("rival", np.nan, least=10.0).met()
+    assert not online.Line("tick", 0.2, most=0.1).met()
+    assert online.Line("tick", 0.05, most=0.1).met()
+    assert online.Line("hours", np.nan).met()

@@ -1,0 +1,134 @@
+"""False alarms of the tracker on skin that does not change, and how soon wet skin is found.
+
+The noise of every pulse and electrode is drawn anew; the delays are those of `DRAWS` triggers, and
+the sampling phase is that of the pulse. The skin does not change, and the tracker expects that: its
+statistics then have the distribution of the tests. `pytest tests/test_online.py -k innovations`
+does the same for skin that varies, in a linear scene.
+"""
+
+import dataclasses
+from collections.abc import Iterator
+
+import jax
+import numpy as np
+import scipy.special
+from jaxtyping import Float
+from tqdm import tqdm
+
+import etid
+from etid.simulation.published import REFERENCE, TYPICAL
+from etid.simulation.scenes import Scene, Trial
+from etid.simulation.transformer import ResistorLoad
+
+LOADS = tuple(TYPICAL.values())
+JITTER = 50e-9  # [s]
+UNLOADED = 40_000  # samples of the unloaded record: twelve periods
+LOADED = 10_000  # samples of the simulated windows: three, one of each sampling phase
+DRAWS = 24  # triggers of each load
+SETTLING = 60  # pulses before the first that counts
+WET, TIMES = 0.4, 25  # part of the electrodes that become wet at once, and how often
+SOON = 2  # pulses within which the change must be found
+
+
+@dataclasses.dataclass(frozen=True)
+class Alarms:
+    """What the tests for changes have shown.
+
+    Attributes:
+        hours: Electrode hours without a change.
+        false: Changes of electrodes found in them.
+        driver: Changes of the driver found in them.
+        changes: Electrodes that have become wet.
+        found: How many of them were found within `SOON` pulses.
+    """
+
+    hours: float
+    false: int
+    driver: int
+    changes: int
+    found: int
+
+    def hourly(self) -> float:
+        """Largest rate of false alarms per electrode and hour that 95 % confidence allows."""
+        return float(scipy.special.gammaincinv(self.false + 1, 0.95)) / self.hours
+
+    def soon(self) -> float:
+        """Part of the electrodes that became wet that was found within `SOON` pulses."""
+        return self.found / self.changes
+
+
+class Fingertip:
+    """Pulses of a display at one noise.
+
+    Args:
+        electrodes: Number of electrodes.
+        snr_db: Signal-to-noise ratio [dB].
+    """
+
+    def __init__(self, electrodes: int, snr_db: float) -> None:
+        resistors = enumerate((REFERENCE, 21.62e3))
+        calibration = tuple(Trial(f"calibration/{i}", ResistorLoad(r)) for i, r in resistors)
+        noisy = Scene((), calibration, snr_db=snr_db, trigger_jitter_rms=JITTER, samples=UNLOADED)
+        calibrations = list(noisy.simulate(seed=0).calibrations.recordings())
+        driver = etid.identify_driver(calibrations)
+        self.tracker = etid.Tracker.of(driver, calibrations[0], electrodes=electrodes)
+        self.sigma = noisy.waveform().sigma
+        trials = [
+            Trial(f"{at}/{draw}", load) for at, load in enumerate(LOADS) for draw in range(DRAWS)
+        ]
+        exact = dataclasses.replace(
+            noisy, trials=tuple(trials), calibration=(), samples=LOADED, snr_db=None, bits=None
+        ).simulate(seed=1)
+        records = np.stack([one.v_out for one in exact.recordings()])
+        windows = self.tracker.pulses(records)
+        self.windows = windows.reshape(len(windows), len(LOADS), DRAWS, -1)
+        self.rng = np.random.default_rng(2)
+
+    def pulse(self, number: int, loads: np.ndarray) -> Float[np.ndarray, "lane sample"]:
+        """The next pulse, for the number of the load at each electrode [V]."""
+        draws = self.rng.integers(DRAWS, size=loads.size)
+        clean = self.windows[number % len(self.windows), loads, draws]
+        return clean + self.sigma * self.rng.standard_normal(clean.shape, np.float32)
+
+    def pulses(self, loads: np.ndarray, number: int) -> Iterator[Float[np.ndarray, "lane sample"]]:
+        """The first pulses."""
+        return (self.pulse(at, loads) for at in range(number))
+
+
+def alarms(electrodes: int, snr_db: float, hours: float) -> Alarms:
+    """Simulate a display.
+
+    Args:
+        electrodes: Number of electrodes.
+        snr_db: Signal-to-noise ratio [dB].
+        hours: Electrode hours without a change.
+    """
+    display = Fingertip(electrodes, snr_db)
+    tracker = display.tracker
+    loads = np.arange(electrodes) % len(LOADS)
+    hourly = 3600 * tracker.model.bands.sample_rate / tracker.period
+    pulses = SETTLING + int(np.ceil(hours * hourly / electrodes))
+    state, false, driver, settled = tracker.start(), 0, 0, None
+    for number, v_out in enumerate(tqdm(display.pulses(loads, pulses), total=pulses)):
+        state = tracker.update(state, v_out)
+        if number < SETTLING:
+            settled = state
+            continue
+        for change in tracker.changes(state):
+            false += change.electrode is not None
+            driver += change.electrode is None
+    assert settled is not None
+    dry = np.flatnonzero(loads == 0)
+    wet = dry[: int(WET * electrodes)]
+    after = loads.copy()
+    after[wet] = 1
+    found = 0
+    for _ in range(TIMES):
+        seen, state = set(), settled
+        for later in range(SOON):
+            state = tracker.update(state, display.pulse(SETTLING + later, after))
+            seen |= {one.electrode for one in tracker.changes(state)}
+        found += len(seen & {*wet.tolist()})
+    jax.block_until_ready(state)
+    counted = (pulses - SETTLING) * electrodes / hourly
+    return Alarms(counted, false, driver, TIMES * wet.size, found)
