@@ -182,8 +182,9 @@ def judge(path: pathlib.Path, kind: specimens.Kind, seed: int) -> tuple[str, str
     try:
         kind.use(path, seed)
     except etid.RecordingError as error:
-        if _of_memory(error):
-            return "memory", "".join(traceback.format_exception(error))
+        hidden = [one for one in _chain(error) if isinstance(one, MemoryError | Warning)]
+        if hidden:
+            return type(hidden[0]).__name__, "".join(traceback.format_exception(error))
         # One line that says which file.
         place = path.name in str(error) or path.stem in str(error)
         return ("refused", str(error)) if place else ("unnamed", str(error))
@@ -192,13 +193,11 @@ def judge(path: pathlib.Path, kind: specimens.Kind, seed: int) -> tuple[str, str
     return "read", ""
 
 
-def _of_memory(error: BaseException | None) -> bool:
-    """Whether an error goes back to memory that could not be had."""
+def _chain(error: BaseException | None) -> Iterator[BaseException]:
+    """An error and those of which it came."""
     while error is not None:
-        if isinstance(error, MemoryError):
-            return True
+        yield error
         error = error.__cause__ or error.__context__
-    return False
 
 
 def _status(name: str) -> int:

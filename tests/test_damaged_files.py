@@ -94,6 +94,31 @@ def test_a_heap_whose_objects_go_in_a_circle_is_an_error_and_no_hang(texts):
             untrusted.attribute(file["s02/dry"], "kind")
 
 
+def test_whatever_needs_a_damaged_heap_is_an_error_and_no_hang(texts):
+    """Not only what the schema knows: this dataset was once opened without a guard."""
+    with h5py.File(texts, "r+") as file:
+        layout = h5py.VirtualLayout((4,), "f8")
+        layout[...] = h5py.VirtualSource("elsewhere.h5", "part", (4,))
+        file.create_virtual_dataset("other", layout)
+    data = bytearray(texts.read_bytes())
+    heap = data.rfind(b"GCOL\x01", 0, data.find(b"elsewhere.h5"))
+    data[heap + 16 : heap + 32] = bytes(16)  # as above
+    texts.write_bytes(data)
+    assert any("the heap of texts" in problem.message for problem in hdf5.check(texts))
+    with etid.read(texts) as study:
+        assert "other" in study.problems
+
+
+def test_whatever_the_library_raises_is_one_error_that_names_the_file(texts, monkeypatch):
+    def raises(*_):
+        raise IndexError("of the library")
+
+    monkeypatch.setattr(h5py.AttributeManager, "__iter__", raises)
+    (problem,) = hdf5.check(texts)
+    assert (problem.file, problem.remedy) == (str(texts), untrusted.DAMAGED)
+    assert "IndexError: of the library" in problem.message
+
+
 def test_a_heap_that_declares_more_than_the_file_holds_is_an_error_before_it_is_allocated(texts):
     data = bytearray(texts.read_bytes())
     heap = data.find(b"GCOL\x01")

@@ -1,37 +1,16 @@
 """Named channels of a file of another format; their samples are read later."""
 
-import csv
 import dataclasses
 import functools
-import struct
-import tokenize
-import zipfile
-import zlib
 from collections.abc import Callable, Iterable, Iterator
 
 import numpy as np
 
 from etid.recordings import errors
 from etid.recordings.recording import RecordingError
-from etid.recordings.untrusted import LIBRARY_ERRORS
 
 BLOCK = 1 << 20  # [samples] size of a block in memory, 8 MB of real numbers
 LISTED = 30  # most names in an error message
-
-# Errors that readers of damaged files raise; the kind depends on the place of the damage.
-_READ_ERRORS = (
-    *LIBRARY_ERRORS,
-    ArithmeticError,
-    AssertionError,
-    EOFError,
-    SyntaxError,
-    LookupError,
-    csv.Error,
-    struct.error,
-    tokenize.TokenError,
-    zipfile.BadZipFile,
-    zlib.error,
-)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -150,7 +129,7 @@ def rate_of(interval: float, precision: float) -> float:
 
 
 # For a block that reads a file of another format: its errors become a RecordingError of this place.
-located = functools.partial(errors.located, foreign=_READ_ERRORS)
+located = functools.partial(errors.located, foreign=Exception)
 
 
 def needs(package: str, extra: str, file: str) -> RecordingError:

@@ -43,7 +43,7 @@ def read_impedance(
     except ImportError:
         raise needs("impedance", "eis", str(file)) from None
     # The readers raise any error for a file of another instrument, even UnboundLocalError.
-    with located(str(file), foreign=(Exception,), remedy="Name its instrument"):
+    with located(str(file), foreign=Exception, remedy="Name its instrument"):
         frequency, impedance = readers.readFile(str(file), instrument)
         found = np.asarray(frequency, float), np.asarray(impedance, complex)
         if found[0].size == 0 or found[0].shape != found[1].shape:

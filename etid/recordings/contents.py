@@ -19,7 +19,13 @@ from etid.recordings import limits, schema
 from etid.recordings.errors import near_miss
 from etid.recordings.fields import SIGNALS, Field, Metadata, metadata_from, tidy_path
 from etid.recordings.recording import AbstractSource, Layout, Recording, RecordingError, Samples
-from etid.recordings.untrusted import LIBRARY_ERRORS, Attributes, check_size, local_link, translated
+from etid.recordings.untrusted import (
+    attribute,
+    attribute_names,
+    check_size,
+    local_link,
+    translated,
+)
 from etid.signals.pulse_train import find_pulses
 
 _DIGITS = 1000  # most digits of a number in a name; Python does not convert much longer numbers
@@ -121,9 +127,15 @@ class _Row(AbstractSource):
 
 
 class Scan:
-    """Recording groups of a file, and the faults of the others."""
+    """Recording groups of a file, and the faults of the others.
 
-    def __init__(self, file: h5py.File, name: str) -> None:
+    Args:
+        guarded: The file behind a guard; it is read here only.
+        file: The same file without a guard; samples are read from it later.
+        name: Path of the file.
+    """
+
+    def __init__(self, guarded: h5py.File, file: h5py.File, name: str) -> None:
         self.file = file
         self.name = name
         # To open a stack takes as long as to read a row, but an open stack keeps megabytes of
@@ -133,8 +145,7 @@ class Scan:
         self.problems: list[RecordingError] = []
         self._kinds: dict[str, str] = {}
         self._seen: dict[int, str] = {}
-        with Attributes(name) as self._stored:
-            self._walk(file, "")
+        self._walk(guarded, "")
         for path, block in self.blocks.items():
             for calibration in block.metadata.calibration:
                 self._check_calibration(path, calibration)
@@ -193,7 +204,7 @@ class Scan:
                     f"lies more than {limits.DEPTH} groups deep",
                     remedy="Use a path such as 's01/dry/03'",
                 )
-            attributes = self._stored.names(group)
+            attributes = attribute_names(group)
             near = "kind" in attributes or near_miss("kind", attributes)
             names = sorted(group, key=_natural)
             if near or "v_out" in names:
@@ -239,7 +250,7 @@ class Scan:
             return self._report(path, "kind", "the root of a file cannot be a recording", remedy)
         with self._reported(path, "path"):
             tidy_path(path)
-        present = self._stored.names(group)
+        present = attribute_names(group)
         found = self._attributes(group, schema.at("group attribute"), path, "")
         kind = found.get("kind", "")
         self._kinds[path] = kind
@@ -294,12 +305,12 @@ class Scan:
     ) -> dict[str, Any]:
         """Parsed values of the attributes in the schema; invalid values are reported."""
         found: dict[str, Any] = {}
-        for name in self._stored.names(owner):
+        for name in attribute_names(owner):
             if name not in known:
                 continue
             try:
-                value = self._stored.value(owner, name)
-            except LIBRARY_ERRORS as error:
+                value = attribute(owner, name)
+            except Exception as error:
                 self._report(path, f"{of}{name}", f"cannot be read ({error})", "Write it again")
                 continue
             try:
@@ -313,7 +324,6 @@ class Scan:
         """Shape, dtype and scale of a dataset; its samples must be in this file."""
         link = local_link(group, field.name)
         remedy = "Copy the samples into the file"
-        self._stored.check_layout(group, field.name)
         if group.get(field.name) is None:
             target = getattr(link, "path", "")
             raise RecordingError(f"is a dangling link to {target!r}", remedy="Repair the link")
@@ -321,7 +331,7 @@ class Scan:
         if not isinstance(dataset, h5py.Dataset):
             what = "group" if isinstance(dataset, h5py.Group) else "datatype"
             raise RecordingError(f"is a {what}", remedy=f"Add {field.expects} as a dataset")
-        here = h5o.get_info(self.file.id).fileno
+        here = h5o.get_info(group.id).fileno
         if h5o.get_info(dataset.id).fileno != here or dataset.external or dataset.is_virtual:
             raise RecordingError("its samples are in another file", remedy=remedy)
         if dataset.dtype.kind not in "iuf" or dataset.dtype.itemsize > 8:
@@ -343,7 +353,7 @@ class Scan:
         before = len(self.problems)
         known, of = schema.at("dataset attribute"), f"{field.name}."
         found = self._attributes(dataset, known, path, of)
-        self._near_misses(self._stored.names(dataset), known, path, of)
+        self._near_misses(attribute_names(dataset), known, path, of)
         if len(self.problems) == before and found.get("unit") != field.unit:
             what = f"is {found['unit']!r}" if "unit" in found else "is missing"
             raise RecordingError(

@@ -70,7 +70,7 @@ def located(
     path: str = "",
     field: str = "",
     *,
-    foreign: tuple[type[Exception], ...] = (),
+    foreign: type[Exception] | tuple[type[Exception], ...] = (),
     message: str = "cannot be read",
     remedy: str = "",
 ) -> Iterator[None]:

@@ -14,7 +14,7 @@ from etid.recordings.contents import Scan
 from etid.recordings.errors import near_miss
 from etid.recordings.recording import RecordingError
 from etid.recordings.study import Study
-from etid.recordings.untrusted import Attributes, check_file, translated
+from etid.recordings.untrusted import attribute, attribute_names, guarded, translated
 
 
 def read(path: str | os.PathLike[str]) -> Study:
@@ -30,12 +30,14 @@ def read(path: str | os.PathLike[str]) -> Study:
         RecordingError: The file is missing, damaged or of another schema.
     """
     name = os.fspath(path)
-    file = _open(name)
-    try:
-        scan = Scan(file, name)
-    except BaseException:
-        file.close()
-        raise
+    with guarded(name) as metadata:
+        file = h5py.File(name, "r")
+        try:
+            _check_root(metadata, name)
+            scan = Scan(metadata, file, name)
+        except BaseException:
+            file.close()
+            raise
     first: dict[str, RecordingError] = {}
     for problem in scan.problems:
         first.setdefault(problem.path, problem)
@@ -56,39 +58,26 @@ def check(path: str | os.PathLike[str]) -> list[RecordingError]:
     """
     name = os.fspath(path)
     try:
-        with _open(name) as file:
-            scan = Scan(file, name)
+        with guarded(name) as metadata, h5py.File(name, "r") as file:
+            _check_root(metadata, name)
+            scan = Scan(metadata, file, name)
             scan.check_samples()
     except RecordingError as problem:
         return [problem]
     return scan.problems
 
 
-def _open(name: str) -> h5py.File:
-    """Open file, if its root has the attributes of the schema."""
-    check_file(name)
-    with translated(name):
-        file = h5py.File(name, "r")
-    try:
-        with Attributes(name) as attributes:
-            _check_root(file, name, attributes)
-    except BaseException:
-        file.close()
-        raise
-    return file
-
-
-def _check_root(file: h5py.File, name: str, attributes: Attributes) -> None:
+def _check_root(file: h5py.File, name: str) -> None:
     found: dict[str, str] = {}
     for field in schema.at("file attribute").values():
         remedy = f"The file needs the attributes schema={schema.NAME!r} and schema_version"
         with translated(name, field=field.name):
             if field.name not in file.attrs:
-                near = near_miss(field.name, attributes.names(file))
+                near = near_miss(field.name, attribute_names(file))
                 hint = f", did you mean {field.name} by {near}?" if near else ""
                 raise RecordingError(f"is missing{hint}", remedy=remedy)
             try:
-                found[field.name] = field.parse(attributes.value(file, field.name))
+                found[field.name] = field.parse(attribute(file, field.name))
             except ValueError as error:
                 raise RecordingError(str(error), remedy=remedy) from None
     problem = schema.version_problem(found["schema_version"])

@@ -1,15 +1,17 @@
 """Reading of HDF5 files from other sources: types and sizes are checked before data are read.
 
-For most damaged files the HDF5 library raises an error. There is one exception. A global heap holds
-texts of variable length, and the size of each object leads to the next object. If a free object has
-size 0, the library loops forever in C, and Python cannot stop it. A `Guarded` file therefore
-follows the objects of a heap itself before the library reads the heap. All hangs that
-`python -m benchmarks fuzz` has found were of this kind; in one of them a damaged dataset looked
-like a virtual one, whose parts a heap describes. For each text, the file also holds a
-descriptor: its length, the address of its heap, and the number of its object. The library allocates
-this length before it looks for the object. The guard finds the descriptors of attributes in what
-the library reads; `check_texts` reads those of a dataset. The guard needs a Python call for each
-read. So samples, and all metadata of files that etid has written, are read without it.
+For most damaged files the HDF5 library raises an error, of any type. There is one exception. A
+global heap holds texts of variable length and the parts of virtual datasets, and the size of each
+object leads to the next object. If a free object has size 0, the library loops forever in C, and
+Python cannot stop it. A `Guarded` file therefore follows the objects of a heap itself before the
+library reads the heap. All hangs that `python -m benchmarks fuzz` has found were of this kind. For
+each text, the file also holds a descriptor: its length, the address of its heap, and the number of
+its object. The library allocates this length before it looks for the object. The guard finds the
+descriptors of attributes in what the library reads; `check_texts` reads those of a dataset.
+
+All metadata of all files are read through the guard, because damage may turn any object into one
+that needs a heap. The samples of a recording are read without it, from a second handle of the file:
+there the library repeats what it has done behind the guard, and reads numbers.
 """
 
 import contextlib
@@ -24,26 +26,12 @@ from typing import Any
 
 import h5py
 import numpy as np
-from h5py import h5l  # type: ignore[attr-defined]  # compiled, without stubs
 
 from etid.recordings import limits
 from etid.recordings.errors import RecordingError, located
 
-# Errors that h5py raises for damaged files; the kind depends on the place of the damage.
-LIBRARY_ERRORS = (
-    OSError,
-    RuntimeError,
-    ValueError,
-    TypeError,
-    KeyError,
-    AttributeError,
-    OverflowError,
-    MemoryError,
-)
-
 DAMAGED = "The file is damaged or was not closed: copy or record it again"
 
-_PLAIN = 4096  # [bytes] largest number or text that is read without a further check
 _HEAP = b"GCOL\x01\0\0\0"
 _HEAP_HEAD = 16  # [bytes] signature, version, size of the collection
 _OBJECT = struct.Struct("<HH4xQ")  # index, reference count, size
@@ -52,17 +40,17 @@ _DESCRIPTORS = np.dtype([("length", "<u4"), ("address", "<u8"), ("index", "<u4")
 # Message of an attribute: version, flags, sizes of its name, type and shape.
 _MESSAGE = struct.Struct("<BxHHH")
 _VERSION = re.compile(rb"(?=[\x01-\x03][\x00-\x03])")
-# Start of a type of variable length, by version, and the size of its values.
-_VARIABLE, _DESCRIPTOR = (b"\x19", b"\x39", b"\x49"), struct.pack("<I", _TEXT.size)
-# Version and class of the layout of a virtual dataset, near the begin of the header of an object.
-_VIRTUAL, _HEADER = (b"\x03\x03", b"\x04\x03"), 512
+# Start of the type of a text of variable length: version and class, kind, and the size of `_TEXT`.
+_VARIABLE = re.compile(
+    rb"[\x19\x29\x39\x49\x59][%b]..\x10\0\0\0" % bytes(range(1, 256, 16)), re.DOTALL
+)
 _DESCRIBED = 1 << 21  # [bytes] larger reads are samples
 _SIZES = {0: 13, 1: 13, 2: 9, 3: 9}  # offset of the sizes of numbers, by version of the superblock
 
 
-# For a block that reads an HDF5 file: its errors become a RecordingError of this place.
+# For a block that reads an HDF5 file: all its errors become a RecordingError of this place.
 translated = functools.partial(
-    located, foreign=LIBRARY_ERRORS, message="the HDF5 library cannot read it", remedy=DAMAGED
+    located, foreign=Exception, message="the HDF5 library cannot read it", remedy=DAMAGED
 )
 
 
@@ -78,7 +66,7 @@ class Guarded(io.FileIO):
         before = min(start, _TEXT.size)  # a signature or text may begin in the previous read
         self.seek(start - before)
         seen = self.read(before + len(buffer) + _TEXT.size)
-        if len(seen) <= _DESCRIBED:
+        if len(seen) <= _DESCRIBED and _VARIABLE.search(seen):
             self._check_texts(seen)
         place = seen.find(_HEAP)
         while place >= 0:
@@ -121,8 +109,7 @@ def _lengths(seen: bytes) -> Iterator[int]:
         name, kind, space = (-(-part // unit) * unit for part in (name, kind, space))
         of_type = match.start() + _MESSAGE.size + (version == 3) + name
         first = of_type + kind + space
-        described = seen[of_type : of_type + 8]
-        if described[:1] not in _VARIABLE or described[4:] != _DESCRIPTOR:
+        if not _VARIABLE.match(seen, of_type):
             continue
         sides = seen[of_type + kind : first]
         rank, begin = sides[1] if len(sides) > 1 else 0, 8 if sides[:1] == bytes([1]) else 4
@@ -180,93 +167,35 @@ def _check_numbers(raw: io.FileIO) -> None:
     raw.seek(0)
 
 
-class Attributes:
-    """Attributes of the objects of one file, read after a check of type and size.
+def attribute_names(owner: h5py.HLObject) -> list[str]:
+    """Names of the attributes of a group or dataset.
 
-    What needs a guard is read from a second handle of the file: texts of variable length, and
-    datasets that may be virtual. This handle is opened for the first of them.
+    Raises:
+        RecordingError: There are too many attributes.
     """
-
-    def __init__(self, path: str) -> None:
-        self._path = path
-        self._second: h5py.File | None = None
-        self._open = contextlib.ExitStack()
-
-    def __enter__(self) -> "Attributes":
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._open.close()
-        self._second = None
-
-    def names(self, owner: h5py.HLObject) -> list[str]:
-        """Names of the attributes of a group or dataset.
-
-        Raises:
-            RecordingError: There are too many attributes.
-        """
-        names = list(owner.attrs)
-        if len(names) > limits.ATTRIBUTES:
-            raise RecordingError(
-                f"has {len(names)} attributes, at most {limits.ATTRIBUTES} are read",
-                remedy="Remove attributes that are not in the schema",
-            )
-        return names
-
-    def value(self, owner: h5py.HLObject, name: str) -> Any:
-        """Value of an attribute.
-
-        Raises:
-            Exception: One of `LIBRARY_ERRORS`: the value cannot be read or is too large.
-        """
-        attributes = owner.attrs
-        stored = attributes.get_id(name)
-        dtype = stored.dtype
-        if not dtype.hasobject and math.prod(stored.shape or ()) * dtype.itemsize <= _PLAIN:
-            return attributes[name]  # etid writes all attributes in this way
-        if in_a_heap(dtype):
-            owner = self._guarded()[owner.name]
-        return attribute(owner, name)
-
-    def check_layout(self, group: h5py.Group, name: str) -> None:
-        """Open a member through the guard first if it may be a virtual dataset.
-
-        Raises:
-            Exception: One of `LIBRARY_ERRORS`: its heap is damaged.
-        """
-        link = group.id.links.get_info(name.encode())
-        head = b""
-        if link.type == h5l.TYPE_HARD:  # a soft link does not tell the address
-            with open(self._path, "rb") as raw:
-                raw.seek(link.u + group.file.userblock_size)
-                head = raw.read(_HEADER)
-        if not head or any(layout in head for layout in _VIRTUAL):
-            self._guarded().get(f"{group.name}/{name}")
-
-    def _guarded(self) -> h5py.File:
-        if self._second is None:
-            self._second = self._open.enter_context(guarded(self._path))
-        return self._second
-
-
-def in_a_heap(dtype: np.dtype) -> bool:
-    """Whether a global heap holds the values of a type: texts of variable length, regions."""
-    return dtype.hasobject and h5py.check_ref_dtype(dtype) is not h5py.Reference
+    names = list(owner.attrs)
+    if len(names) > limits.ATTRIBUTES:
+        raise RecordingError(
+            f"has {len(names)} attributes, at most {limits.ATTRIBUTES} are read",
+            remedy="Remove attributes that are not in the schema",
+        )
+    return names
 
 
 def attribute(owner: h5py.HLObject, name: str) -> Any:
     """Value of an attribute, after a check of its type and size.
 
-    No schema contains a sequence of variable length. A damaged text may look like one, and the
-    library would crash.
+    Of the types of variable length only text and references are read. No schema contains another,
+    and a damaged text may look like one, for which the library would crash.
 
     Raises:
-        Exception: One of `LIBRARY_ERRORS`: the value cannot be read or is too large.
+        Exception: The value cannot be read or is too large.
     """
     stored = owner.attrs.get_id(name)
-    if h5py.check_vlen_dtype(stored.dtype) not in (None, str, bytes):
+    dtype = stored.dtype
+    if dtype.hasobject and not (h5py.check_string_dtype(dtype) or h5py.check_ref_dtype(dtype)):
         raise TypeError("it is a sequence of variable length")
-    size = math.prod(stored.shape or ()) * stored.dtype.itemsize
+    size = math.prod(stored.shape or ()) * dtype.itemsize
     if size > limits.ATTRIBUTE:
         raise ValueError(f"it has {size} bytes, at most {limits.ATTRIBUTE} are read")
     value = owner.attrs[name]

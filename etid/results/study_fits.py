@@ -38,8 +38,6 @@ from etid.results.provenance import Settings
 from etid.results.tried_orders import TriedOrders
 from etid.results.verdicts import verdicts_of
 
-# Errors that a damaged line of JSON may raise.
-_DAMAGED = (ValueError, TypeError, AttributeError, KeyError, OverflowError, RecursionError)
 _SETTINGS = {field.name: field.type for field in dataclasses.fields(Settings)}
 
 
@@ -132,7 +130,7 @@ class StudyFits(Overviewed):
         for number, line in enumerate(lines):
             try:
                 paths, found = _of_line(line)
-            except _DAMAGED as error:
+            except Exception as error:  # the line of JSON is damaged
                 raise RecordingError(
                     f"holds a driver that cannot be read ({type(error).__name__}: {error})",
                     file=os.fspath(path),
