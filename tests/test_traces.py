@@ -19,13 +19,14 @@ import pytest
 
 import etid
 from etid.identify import compiled as traces
-from etid.identify import program_files
+from etid.identify import program_files, program_key
 from etid.identify.compiled import stored_jit
 from etid.results.verdicts import RESULTS, first_verdict, verdict
 
 X = jnp.linspace(1.0, 2.0, 5)
 FACTOR = 2.0
-unpatched = traces._sources.__wrapped__  # without its cache
+TABLE: dict[str, float] = {}
+unpatched = program_key._sources.__wrapped__  # without its cache
 SUCCESSFUL = verdict("successful")
 executed = collections.deque()  # one entry for each trace; a list would be a constant in the key
 
@@ -55,7 +56,7 @@ def folder(tmp_path, monkeypatch):
     known = {*program_files.KNOWN, __name__.partition(".")[0]}
     monkeypatch.setattr(program_files, "KNOWN", known)
     # Whoever edits a source while the tests run does not break them.
-    monkeypatch.setattr(traces, "_sources", lambda: "as they are")
+    monkeypatch.setattr(program_key, "_sources", lambda: "as they are")
     config: Any = jax.config
     before = config.jax_compilation_cache_dir
     jax.config.update("jax_compilation_cache_dir", str(tmp_path))
@@ -138,7 +139,7 @@ def test_the_key_holds_what_determines_the_trace(folder, monkeypatch):
         with jax.default_matmul_precision("float32"):
             anew()(X, "a")
         assert len(files(folder)) == len(calls) + 1
-        monkeypatch.setattr(traces, "_sources", lambda: "edited")
+        monkeypatch.setattr(program_key, "_sources", lambda: "edited")
         anew()(X, "a")
         assert len(files(folder)) == len(calls) + 2
 
@@ -149,6 +150,19 @@ def test_a_constant_that_was_set_is_another_key(folder, monkeypatch):
     jax.clear_caches()
     after = anew()(X, "a")
     np.testing.assert_allclose(after.value[0], 2 * before.value[0], rtol=1e-15)
+    assert len(files(folder)) == 2
+
+
+def test_a_constant_that_was_changed_in_place_is_another_key(folder):
+    """The key remembers what nobody can change; a table is looked at again."""
+    anew()(X, "a")
+    TABLE["changed"] = 1.0
+    try:
+        anew()(X, "a")
+    finally:
+        del TABLE["changed"]
+    assert len(files(folder)) == 2
+    anew()(X, "a")
     assert len(files(folder)) == 2
 
 
@@ -169,11 +183,11 @@ def test_a_class_from_elsewhere_is_not_stored(folder, monkeypatch):
 
 def test_sources_that_changed_after_they_were_loaded_are_in_no_key(folder, monkeypatch):
     newest = max(path.stat().st_mtime for path in pathlib.Path(etid.__file__).parent.rglob("*.py"))
-    monkeypatch.setattr(traces, "LOADED", newest + 1)
+    monkeypatch.setattr(program_key, "LOADED", newest + 1)
     assert unpatched() == unpatched()
     assert unpatched() is not None
-    monkeypatch.setattr(traces, "LOADED", newest - 3600)
-    monkeypatch.setattr(traces, "_sources", unpatched)
+    monkeypatch.setattr(program_key, "LOADED", newest - 3600)
+    monkeypatch.setattr(program_key, "_sources", unpatched)
     anew()(X, "a")
     assert not files(folder)
 
@@ -185,7 +199,7 @@ def test_a_file_of_any_sub_package_is_in_the_key(tmp_path, monkeypatch):
         pathlib.Path(etid.__file__).parent, package, ignore=shutil.ignore_patterns("__pycache__")
     )
     monkeypatch.setattr(etid, "__file__", str(package / "__init__.py"))
-    monkeypatch.setattr(traces, "LOADED", time.time() + 3600)  # what is edited below is older
+    monkeypatch.setattr(program_key, "LOADED", time.time() + 3600)  # what is edited below is older
     folders = sorted({path.parent for path in package.rglob("*.py")})
     assert len(folders) > 1
     keys = [unpatched()]

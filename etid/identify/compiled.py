@@ -3,9 +3,7 @@
 The persistent compilation cache of JAX stores the programs that XLA compiles. Its key is the traced
 and lowered program, so every process must trace its first fit again. This takes seconds. If that
 cache has a folder, this module stores the lowered program (`jax.export`) there too. The name of the
-file depends on all that determines the program: the source files and module constants of etid, the
-versions of the packages that it uses, the settings of JAX, the platform, and the arguments: their
-structure, their static parts, and the shapes and types of their arrays.
+file has the key of `etid.identify.program_key`, a digest of all that determines the program.
 
 `etid.identify.program_files` reads and writes the files. Trust a folder as you trust the
 compilation cache itself, whose executables run unchecked.
@@ -15,13 +13,8 @@ import contextlib
 import dataclasses
 import functools
 import gc
-import hashlib
-import os
 import pathlib
-import sys
 import threading
-import time
-import types
 from collections.abc import Callable, Iterator
 from typing import Any, ParamSpec, TypeVar
 
@@ -30,21 +23,16 @@ import jax
 import jax.core
 import jax.export
 import jax.numpy as jnp
-import jaxlib
-import lineax
-import numpy as np
-import optimistix as optx
-import scipy
 
 from etid.identify import program_files
 from etid.identify.program_files import Slot, filled
+from etid.identify.program_key import Unknown, is_weak, key_of
 from etid.identify.waiting import announced_later
 
 Parameters = ParamSpec("Parameters")
 Result = TypeVar("Result")
 
 FOLDER = "etid"  # inside the folder of the compilation cache
-LOADED = time.time()
 # XLA compiles for a processor in two thirds of the time without the emitters of fusions and with
 # fewer passes of LLVM, and in 85 % of that time if each sum is one kernel, not a tree of three. The
 # programs are as fast.
@@ -55,8 +43,6 @@ QUICKLY = {
 }
 # Without any passes it takes half of that time, and the programs take twice the time.
 AT_ONCE = {**QUICKLY, "xla_backend_optimization_level": 0}
-# Settings of JAX that do not change a program.
-UNRELATED = ("jax_compilation_cache", "jax_persistent_cache", "jax_log", "jax_dump", "jax_explain")
 
 
 def stored_jit(
@@ -171,8 +157,8 @@ def _trace(function: Callable, args: tuple, kwargs: dict) -> tuple[jax.export.Ex
     """The exported function and the shell of its result; None if there is no export."""
     folder = _folder()
     try:
-        key = _key(function, args, kwargs)
-    except _Unknown:
+        key = key_of(function, args, kwargs)
+    except Unknown:
         return None
     if folder is None or key is None:
         return None
@@ -208,137 +194,9 @@ def _export(function: Callable, args: tuple, kwargs: dict) -> tuple[jax.export.E
 
     flat.__name__ = flat.__qualname__ = function.__name__
     shapes = [
-        jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, weak_type=_is_weak(leaf))
+        jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, weak_type=is_weak(leaf))
         for leaf in map(leaves.__getitem__, places)
     ]
     exported = jax.export.export(jax.jit(flat))(*shapes)
     # The derivative is a Python function, and a stored program is not differentiated.
     return dataclasses.replace(exported, _get_vjp=None), shells[0]
-
-
-def _is_weak(array: Any) -> bool:
-    return getattr(array, "weak_type", False)
-
-
-# --- Key -----------------------------------------------------------------------------------------
-
-
-class _Unknown(Exception):
-    """A value or a function that the key does not describe."""
-
-
-def _key(function: Callable, args: tuple, kwargs: dict) -> str | None:
-    sources = _sources()
-    if sources is None:
-        return None
-    parts = (
-        sources,
-        _platform(),
-        _settings(),
-        _described(function),
-        list(_constants(sys.modules[function.__module__], set())),
-        _described((args, kwargs)),
-    )
-    return hashlib.sha256(repr(parts).encode()).hexdigest()
-
-
-@functools.cache
-def _sources() -> str | None:
-    """Digest of all files of the package; None if they may have changed since they were loaded."""
-    digest = hashlib.sha256()
-    # The whole package, because a program may be traced through any of its files.
-    package = pathlib.Path(str(sys.modules[__name__.partition(".")[0]].__file__)).parent
-    paths = sorted(package.rglob("*.py"))
-    try:
-        if not paths or max(path.stat().st_mtime for path in paths) > LOADED:
-            return None
-        for path in paths:
-            name = path.relative_to(package).as_posix()
-            digest.update(name.encode() + b"\0" + path.read_bytes() + b"\0")
-    except OSError:
-        return None
-    return digest.hexdigest()
-
-
-@functools.cache
-def _platform() -> tuple[str, ...]:
-    packages = (jax, jaxlib, eqx, optx, lineax, np, scipy)
-    device = jax.devices()[0]
-    return (
-        sys.version,
-        *(package.__version__ for package in packages),
-        f"{jax.device_count()} {device.platform} {device.device_kind}",
-    )
-
-
-def _settings() -> list[str]:
-    """Settings of JAX and equinox that may change a program."""
-    values = jax.config.values
-    return [os.environ.get("EQX_ON_ERROR", "")] + [
-        f"{name}={getattr(jax.config, name, values[name])}"  # includes context managers
-        for name in sorted(values)
-        if not name.startswith(UNRELATED)
-    ]
-
-
-def _constants(module: types.ModuleType, seen: set[str]) -> Iterator[tuple[str, Any]]:
-    """Constants of a module and of the modules of etid that it uses: a user may have changed them.
-
-    Raises:
-        _Unknown: A function was replaced by a function of another package.
-    """
-    seen.add(module.__name__)
-    for name, value in sorted(vars(module).items()):
-        if name.startswith("__"):
-            continue
-        if isinstance(value, types.ModuleType):
-            home = value.__name__
-        elif isinstance(value, type | types.FunctionType):
-            home = str(value.__module__)
-            yield f"{module.__name__}.{name}", f"{home}.{value.__qualname__}"
-            origin = home.partition(".")[0]
-            known = origin in program_files.KNOWN or origin in sys.stdlib_module_names
-            if isinstance(value, types.FunctionType) and not known:
-                raise _Unknown(name)
-        else:
-            home = ""
-            try:
-                yield f"{module.__name__}.{name}", _described(value, by_value=True)
-            except _Unknown:
-                pass  # types, loggers and similar values
-        if home.startswith("etid.") and home not in (*seen, __name__) and home in sys.modules:
-            yield from _constants(sys.modules[home], seen)
-
-
-def _described(node: Any, by_value: bool = False) -> Any:
-    """Description of a value that is the same in every process.
-
-    Args:
-        node: Arguments of a function, or a constant.
-        by_value: Whether the numbers in an array matter, or only its shape and type.
-
-    Raises:
-        _Unknown: The value contains a class or a function of another package.
-    """
-    kind = type(node)
-    inner = functools.partial(_described, by_value=by_value)
-    if node is None or kind in (bool, int, float, complex, str, bytes):
-        return kind.__name__, repr(node)
-    if eqx.is_array(node):
-        content = hashlib.sha256(np.asarray(node).tobytes()).hexdigest() if by_value else ""
-        return "array", node.shape, str(node.dtype), _is_weak(node), content
-    if isinstance(node, type | types.FunctionType):
-        if (
-            str(node.__module__).partition(".")[0] not in program_files.KNOWN
-            or "<lambda>" in node.__qualname__
-        ):
-            raise _Unknown(node)
-        return f"{node.__module__}.{node.__qualname__}"
-    if isinstance(node, tuple | list):
-        return inner(kind), [inner(item) for item in node]
-    if isinstance(node, dict):
-        return inner(kind), [(inner(name), inner(item)) for name, item in node.items()]
-    if dataclasses.is_dataclass(node):
-        fields = [(f.name, getattr(node, f.name, None)) for f in dataclasses.fields(node)]
-        return inner(kind), [(name, inner(item)) for name, item in fields]
-    raise _Unknown(node)
