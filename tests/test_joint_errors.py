@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from etid.estimators.joint import errors
+from etid.estimators.joint import errors, seen
 from etid.estimators.joint.terms import Loads
 from etid.estimators.unknowns import LoadUnknowns
 from etid.signals.harmonics import Spectrum
@@ -44,13 +44,7 @@ def test_the_misfit_of_a_load_knows_its_own_unknowns():
     part = jnp.array([3.0, 1.0, 0.0, 2.0, 0.0, 1.0])
     line, wave = jnp.ones(3), jnp.ones(3, complex)
     used = jnp.array([True, True, False])
-    load = Loads(
-        spectrum=Spectrum(line, wave, 2.0 * wave, line, line, used),
-        sample_rate=jnp.asarray(1.0),
-        own=LoadUnknowns(jnp.zeros(2), jnp.zeros(())),
-        used=jnp.asarray(True),
-        unloaded=jnp.asarray(-1),
-    )
-    chi2, rrse = errors._misfit(load, 1.5 * wave, part, 3)
+    spectrum = Spectrum(line, wave, 2.0 * wave, line, line, used)
+    chi2, rrse = seen._misfit(spectrum, 1.5 * wave, part, 3)
     assert float(chi2) == 15.0 / (2 * 2 - 3)
     np.testing.assert_allclose(rrse, 0.5 / 2.0)

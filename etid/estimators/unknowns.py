@@ -29,6 +29,30 @@ class LoadUnknowns(eqx.Module):
         return jnp.concatenate([self.log_elements, self.delay_samples[..., None]], axis=-1)
 
 
+class LoadWithCurrentUnknowns(eqx.Module):
+    """Unknowns of a load and a recording that measured the current beside V_th.
+
+    Attributes:
+        log_elements: Logarithms of the elements of the circuit [SI].
+        delay_samples: Trigger delay of V_out [samples].
+        current_delay_samples: Trigger delay of the current [samples].
+    """
+
+    log_elements: Float[Array, "*lane element"]
+    delay_samples: Float[Array, "*lane"]
+    current_delay_samples: Float[Array, "*lane"]
+
+    @classmethod
+    def of(cls, vector: Float[Array, "*lane own"]) -> "LoadWithCurrentUnknowns":
+        """The unknowns, or other numbers by name, from a vector in the solver's order."""
+        return cls(vector[..., :-2], vector[..., -2], vector[..., -1])
+
+    def vector(self) -> Float[Array, "*lane own"]:
+        """The vector for a solver."""
+        delays = jnp.stack([self.delay_samples, self.current_delay_samples], axis=-1)
+        return jnp.concatenate([self.log_elements, delays], axis=-1)
+
+
 class Nuisance(eqx.Module):
     """Unknowns of a recording in time, without those of its load; several can be stacked.
 

@@ -22,12 +22,18 @@ from etid.circuits.circuit import AbstractCircuit
 from etid.estimators import judgement
 from etid.estimators.element_limits import Limits
 from etid.estimators.element_prior import ElementPrior
-from etid.estimators.estimate import DELAY_WIDTH, Estimate
-from etid.estimators.estimator import serving
-from etid.estimators.joint.errors import Delay
+from etid.estimators.estimate import DELAY_WIDTH
+from etid.estimators.estimator import AbstractEstimator, serving
+from etid.estimators.joint.errors import Delay, Found
 from etid.estimators.joint.fit import fit_alone, fit_together
 from etid.estimators.joint.terms import Joint, Loads
-from etid.estimators.lanes import AbstractLane, Harmonics, stacked, unstacked
+from etid.estimators.lanes import (
+    AbstractLane,
+    Harmonics,
+    HarmonicsWithCurrent,
+    stacked,
+    unstacked,
+)
 from etid.estimators.maximum_likelihood.driver import Calibrations
 from etid.estimators.maximum_likelihood.estimator import description
 from etid.estimators.registry import MAXIMUM_LIKELIHOOD, register_description
@@ -52,6 +58,7 @@ from etid.identify.one import (
     failed_fit,
     is_shared,
     notes_of,
+    remarks_on,
     repeated,
 )
 from etid.identify.planning import Refusal, planned
@@ -82,8 +89,9 @@ register_description(
         "each driver and all recordings made with it were estimated in one fit by",
         "Z_th is common to all, each record has its own trigger delay τ. Where the delays scatter "
         "by less than their errors, the upper limit of their scatter (95 %) is the standard "
-        "deviation of their prior. A load with a measured current needs no Z_th and was estimated "
-        "alone.",
+        "deviation of their prior. Where the current was measured beside V_th, I = X / (Z_L + "
+        "Z_th), with a delay of its own, was the second equation for each harmonic. A load with a "
+        "measured current alone needs no Z_th and was estimated alone.",
         (NO_OTHER_CIRCUIT, NO_OTHER_GAIN),
     ),
 )
@@ -112,11 +120,15 @@ def _alone(lanes: Any, count: Int[Array, ""], model: Joint, driver: HarmonicDriv
     def one(lane: Harmonics) -> _Start:
         spectrum, sample_rate = lane.spectrum, jnp.asarray(lane.sample_rate)
         starts = given.starts(spectrum, sample_rate, model.circuit)
-        own, result, chi2, error, hum = fit_alone(model, given, spectrum, sample_rate, starts)
+        current = None
+        if isinstance(lane, HarmonicsWithCurrent):
+            current = jnp.asarray(lane.i), jnp.asarray(lane.variance_i)
+        found = fit_alone(model, given, spectrum, sample_rate, starts, current)
+        own, result, chi2, error, hum = found
         settled = RESULTS.promote(result) == RESULTS.successful
         good = settled & jnp.isfinite(chi2) & ~judgement.misses(chi2, error)
         changed = jnp.array(False) if known is None else known.differs(spectrum)
-        loads = Loads(spectrum, sample_rate, own, good & ~changed, jnp.array(-1))
+        loads = Loads(spectrum, sample_rate, own, good & ~changed, jnp.array(-1), current)
         return _Start(loads, hum, changed)
 
     return each(one, lanes, count)
@@ -131,20 +143,21 @@ def _together(
     tolerance: Array,
 ) -> tuple[list[Fit], HarmonicDriver, list[Delay], Float[Array, "common common"]]:
     common, cov, found = fit_together(model, groups, several)
-    # The records determine all impedances in units of the known resistor.
+    # Voltages determine all impedances in units of the known resistor, currents in ohms.
     power, _ = model.circuit.scaling()
 
-    def fit(found: tuple[Estimate, Bool[Array, ""], Delay]) -> Fit:
-        estimate, other, _ = found
-        moved = power
-        if model.prior is not None:  # a prior holds the elements back
-            moved = power - estimate.cov @ (model.prior.precision * power)
+    def fit(found: Found) -> Fit:
+        estimate, wrong = found.estimate, found.wrong
+        moved = power + found.by_scale  # a measured current holds the elements back, or a prior
+        if model.prior is not None:
+            moved = moved - estimate.cov @ (model.prior.precision * power)
         scale = tolerance**2 * jnp.outer(moved, moved)
         with_scale = dataclasses.replace(
             estimate, cov=estimate.cov + scale, shared_cov=estimate.shared_cov + scale
         )
         fit = judgement.judged(with_scale, model.circuit, driver.result, METHOD, model.bounds)
-        return judgement.unless(fit, other, RESULTS.misfit)
+        fit = judgement.unless(fit, wrong.scale, RESULTS.inconsistent)
+        return judgement.unless(fit, wrong.other, RESULTS.misfit)
 
     of_driver = model.calibrations.named(common)
     kept = of_driver.source.size
@@ -156,12 +169,14 @@ def _together(
             cov[:kept, :kept],
             of_driver.delay_samples,
             RESULTS.where(
-                found[0][0].strain[0] > judgement.STRAINED, RESULTS.inconsistent, driver.result
+                found[0].estimate.strain[0] > judgement.STRAINED,
+                RESULTS.inconsistent,
+                driver.result,
             ),
         ),
     )
     fits = [jax.vmap(fit)(of_group) for of_group in found]
-    return fits, better, [delay for _, _, delay in found], cov
+    return fits, better, [of.delay for of in found], cov
 
 
 def _narrower(
@@ -206,13 +221,14 @@ def _replaced(fits: Fit, others: Fit, where: Bool[np.ndarray, " lane"]) -> Fit:
 
 
 class _Waiting:
-    """Recordings of one driver with the same number of harmonics."""
+    """Recordings of one driver with the same number of harmonics, fitted by one estimator."""
 
-    def __init__(self, model: Joint, driver: HarmonicDriver) -> None:
+    def __init__(self, model: Joint, driver: HarmonicDriver, estimator: AbstractEstimator) -> None:
         self.model = model
         self.driver = driver
+        self.estimator = estimator
         self.rows: list[int] = []
-        self.lanes: list[Harmonics] = []
+        self.lanes: list[AbstractLane] = []
         self.seen: list[Inspected] = []  # the recordings of `lanes`
         self.starts: list[_Start] = []
         self.remarks: list[int] = []
@@ -223,7 +239,7 @@ class _Waiting:
         self.rows.append(row)
         self.unloaded.append(checksum(seen))
         self.seen.append(seen)
-        self.lanes.append(Harmonics.of(seen))
+        self.lanes.append(self.estimator.lane.of(seen))
         if len(self.lanes) == LANES:
             self.run()
 
@@ -232,7 +248,8 @@ class _Waiting:
             return
         starts = repeated(self.lanes, self.seen, self._alone, _late_by, _need_another, _of_both)
         for start, seen in zip(starts, self.seen, strict=True):
-            self.remarks.append(int(seen.remarks | (Remark.mains_hum if start.hum else 0)))
+            hum = Remark.mains_hum if start.hum else 0
+            self.remarks.append(remarks_on(seen, self.estimator) | hum)
         self.starts += starts
         self.repeats += repeats(self.seen)
         self.lanes, self.seen = [], []
@@ -295,8 +312,8 @@ def identify_jointly(
     influence the driver. If the trigger delays of all recordings scatter by less than their errors,
     a second fit limits each delay by this scatter; the fits then have the remark `small_delays`.
     Recordings of a measured current share no driver; each is fitted alone. `identify_amplitudes`
-    fits one load to several recordings. A current beside `v_th` is not used, and the fit says so
-    (`current_unused`).
+    fits one load to several recordings. A current that a recording measured beside `v_th` is used
+    too, as in `identify_skin`.
 
     Args:
         study: Calibrations and loaded recordings.
@@ -335,14 +352,9 @@ def identify_jointly(
     waiting: dict[tuple[str, ...], dict[Any, _Waiting]] = {}
 
     by_current: list[int] = []
-    unused: set[int] = set()  # recordings whose current is left out
 
     def load(row: int) -> tuple[Recording, AbstractFeed]:
-        of, feed = drivers.fed(study[paths[row]])
-        if of.cause == "current" or "current" not in of.samples:
-            return of, feed
-        unused.add(row)
-        return of.replace(current=None), feed
+        return drivers.fed(study[paths[row]])
 
     inspected = itertools.chain.from_iterable(
         planned(load, rows, Asked()) for rows in chunked(len(paths))
@@ -361,9 +373,11 @@ def identify_jointly(
         driver = serving(found, HarmonicDriver, str(estimator))
         lengths = waiting.setdefault(drivers.of(seen.recording), {})
         shared = is_shared(seen, driver)
-        key = seen.v_th.size, shared, seen.recording.sample_rate, seen.recording.pulse_rate
+        rates = seen.recording.sample_rate, seen.recording.pulse_rate
+        key = seen.v_th.size, shared, *rates, estimator
         if key not in lengths:
-            lengths[key] = _Waiting(_model(circuit, driver, shared, known, asked.bounds), driver)
+            model = _model(circuit, driver, shared, known, asked.bounds)
+            lengths[key] = _Waiting(model, driver, estimator)
         lengths[key].add(row, seen)
     for names, lengths in tqdm(waiting.items(), unit="driver", disable=not progress):
         driver = next(iter(lengths.values())).driver
@@ -396,11 +410,7 @@ def identify_jointly(
         drivers.found[names] = better
         for group, fit in zip(lengths.values(), found, strict=True):
             alone = _alone_judged(fit, group.changed)
-            remarks = [
-                one | (Remark.current_unused if row in unused else 0)
-                for row, one in zip(group.rows, group.remarks, strict=True)
-            ]
-            judged = concluded(alone, better, remarks, group.repeats)
+            judged = concluded(alone, better, group.remarks, group.repeats)
             of_group = zip(group.rows, unstacked(judged), notes_of(judged), strict=True)
             for row, one, text in of_group:
                 fits[row], notes[row] = one, text

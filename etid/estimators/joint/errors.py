@@ -17,23 +17,14 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import optimistix as optx
-from jaxtyping import Array, Bool, Complex, Float
+from jaxtyping import Array, Bool, Float
 
 from etid.estimators.estimate import Estimate
-from etid.estimators.joint.terms import DriverStudy, Loads, in_turn
-from etid.estimators.maximum_likelihood.load import Around
-from etid.estimators.maximum_likelihood.terms import (
-    apart,
-    excess,
-    residual,
-    variance,
-)
-from etid.estimators.sandwich import Curvature, Linear
+from etid.estimators.joint.seen import Seen, seen_at
+from etid.estimators.joint.terms import DriverStudy, Loads, Own, in_turn
+from etid.estimators.maximum_likelihood.with_current import disagrees
+from etid.estimators.sandwich import Curvature
 from etid.estimators.score_tests import other_circuit
-from etid.estimators.unknowns import LoadUnknowns
-from etid.results.fits import complex_rrse
-from etid.signals.harmonics import Spectrum, signal_share
-from etid.signals.knots import knots
 from etid.solvers.matrices import inverse
 
 _Sums = tuple[Float[Array, "record x common"], Float[Array, "common common"]]
@@ -47,12 +38,16 @@ class _Eliminated(eqx.Module):
         cov: Covariance of the own parameters at a given `common`.
         slope: Derivative of the minimum over the own parameters with respect to `common`.
         bread: Inverse of the curvature over the own parameters.
+        pull: Pull of another scale of the current on `common`, the own parameters following.
+        own_pull: Change of the own parameters by it at a given `common`.
     """
 
     rest: Curvature
     cov: Float[Array, "own own"]
     slope: Float[Array, "own common"]
     bread: Float[Array, "own own"]
+    pull: Float[Array, " common"]
+    own_pull: Float[Array, " own"]
 
 
 class Delay(eqx.Module):
@@ -69,17 +64,43 @@ class Delay(eqx.Module):
     slope: Float[Array, "*load common"]
 
 
+class Contradictions(NamedTuple):
+    """What the score tests of a load show; several can be stacked.
+
+    Attributes:
+        other: Another circuit or another gain of V_out.
+        scale: Another scale of the current.
+    """
+
+    other: Bool[Array, "*load"]
+    scale: Bool[Array, "*load"]
+
+
+class Found(NamedTuple):
+    """What is found of a load; several can be stacked.
+
+    Attributes:
+        estimate: The estimate.
+        wrong: What its data contradict.
+        delay: Its trigger delay.
+        by_scale: Derivatives of the logarithms of the elements with respect to that of a scale of
+            all measured currents.
+    """
+
+    estimate: Estimate
+    wrong: Contradictions
+    delay: Delay
+    by_scale: Float[Array, "*load element"]
+
+
 def estimates(
     study: DriverStudy,
     common: Float[Array, " common"],
-    fitted: Sequence[tuple[LoadUnknowns, optx.RESULTS]],
+    fitted: Sequence[tuple[Own, optx.RESULTS]],
     several: Sequence[int],
     solution: optx.Solution,
-) -> tuple[Float[Array, "common common"], list[tuple[Estimate, Bool[Array, " load"], Delay]]]:
+) -> tuple[Float[Array, "common common"], list[Found]]:
     """Covariance of `common`, and the estimates of each group with their covariances.
-
-    For each load it also returns whether the data show another circuit or another gain of V_out
-    (`etid.estimators.score_tests.other_circuit`), and its trigger delay.
 
     Args:
         study: Calibrations and loads.
@@ -94,17 +115,18 @@ def estimates(
         _of_group(study, loads, common, own, several=count > 0)
         for loads, own, count in zip(groups, owns, several, strict=True)
     ]
-    total = model.calibrations.linear(common).curvature()
-    for loads, (eliminated, _) in zip(groups, found, strict=True):
+    total, pull = model.calibrations.linear(common).curvature(), jnp.zeros_like(common)
+    for loads, (eliminated, *_) in zip(groups, found, strict=True):
         used = jax.tree.map(
             lambda leaf, loads=loads: jnp.where(loads.used[:, None, None], leaf, 0.0).sum(0),
             eliminated.rest,
         )
         total = jax.tree.map(jnp.add, total, used)
+        pull = pull + jnp.where(loads.used[:, None], eliminated.pull, 0.0).sum(0)
     bread = inverse(total.expected)
     sums = [
-        _sums(loads, seen.by_x, count, common.size)
-        for loads, (_, seen), count in zip(groups, found, several, strict=True)
+        _sums(loads, by_x, count, common.size)
+        for loads, (*_, by_x), count in zip(groups, found, several, strict=True)
     ]
     score = total.score + sum((more for _, more in sums), start=jnp.zeros_like(total.score))
     cov = bread @ score @ bread
@@ -115,25 +137,27 @@ def estimates(
 
         def one(
             load: Loads,
-            own: LoadUnknowns,
+            own: Own,
             eliminated: _Eliminated,
-            seen: _Seen,
+            seen: Seen,
+            by_x: _ByX | None,
             result: optx.RESULTS,
             sums_of: Float[Array, "record x common"] = sums_of,
-        ) -> tuple[Estimate, Bool[Array, ""], Delay]:
+        ) -> Found:
             shared = eliminated.slope @ cov @ eliminated.slope.T
             private = eliminated.cov
-            if seen.by_x is not None:
-                by_x, cross = _by_x(load, seen.by_x, sums_of)
+            if by_x is not None:
+                of_x, cross = _by_x(load, by_x, sums_of)
                 cross = cross @ bread @ eliminated.slope.T
-                shared = shared + by_x + cross + cross.T
-                private = private - by_x
+                shared = shared + of_x + cross + cross.T
+                private = private - of_x
             whole = private + shared
+            e = own.log_elements.size
             estimate = Estimate(
                 parameters=own.log_elements,
-                delay_samples=own.delay_samples[None],
-                cov=_of_elements(whole),
-                shared_cov=_of_elements(shared),
+                delay_samples=own.vector()[e:],
+                cov=whole[:e, :e],
+                shared_cov=shared[:e, :e],
                 chi2=seen.chi2,
                 rrse=seen.rrse,
                 result=optx.RESULTS.where(
@@ -142,21 +166,17 @@ def estimates(
                 steps=solution.stats["num_steps"],
                 strain=strain,
             )
-            delay = Delay(own.delay_samples, private[-1, -1], eliminated.slope[-1])
-            other = _is_another(seen, load, own, eliminated, bread, total.score)
-            return estimate, other, delay
+            delay = Delay(own.delay_samples, private[e, e], eliminated.slope[e])
+            wrong = _contradictions(seen, load, own, eliminated, bread, total.score)
+            moved = eliminated.own_pull + eliminated.slope @ (bread @ pull)
+            return Found(estimate, wrong, delay, moved[:e])
 
         judged.append(in_turn(one, loads, own, *each, results))
     return cov, judged
 
 
-def _of_elements(cov: Float[Array, "own own"]) -> Float[Array, "element element"]:
-    """Covariance of the elements alone, without the delay."""
-    return LoadUnknowns.of(LoadUnknowns.of(cov).log_elements.T).log_elements
-
-
 class _ByX(NamedTuple):
-    """Effect of unit noise in the X of a load, which has two numbers at each knot.
+    """Effect of unit noise in the X of a load, which has two numbers at each of its places.
 
     Attributes:
         of_common: On the score of `common`.
@@ -167,93 +187,33 @@ class _ByX(NamedTuple):
     of_own: Float[Array, "*load x own"]
 
 
-class _Seen(NamedTuple):
-    """A load at its minimum.
-
-    Attributes:
-        chi2: χ² per degree of freedom.
-        rrse: Relative root sum of squared errors.
-        terms: Terms at the knots, and the priors of the own parameters.
-        linear: The same, linear in (common, own).
-        changes: Derivatives of the terms with respect to changes of the circuit and to a gain.
-        by_x: Effect of the noise of X; None if no load shares its unloaded record.
-    """
-
-    chi2: Float[Array, "*load"]
-    rrse: Float[Array, "*load"]
-    terms: Float[Array, "*load term"]
-    linear: Linear
-    changes: Float[Array, "*load change term"]
-    by_x: _ByX | None
-
-
 def _of_group(
     study: DriverStudy,
     loads: Loads,
     common: Float[Array, " common"],
-    owns: LoadUnknowns,
+    owns: Own,
     several: bool,
-) -> tuple[_Eliminated, _Seen]:
+) -> tuple[_Eliminated, Seen, _ByX | None]:
     """Each load of a group at its minimum, evaluated once."""
     driver = study.model.around(common, loads.frequency[0])
 
-    def one(load: Loads, own: LoadUnknowns) -> tuple[_Eliminated, _Seen]:
-        lane, o = study.lane(driver, load), study.owned
-        q = jnp.concatenate([own.vector(), driver.mean])
-        g, known = apart(lane.predicted, q)
-        part = residual(known, g)
-        around = Around.of(lane, q, (g, known))
-        linear = _linear(around, known, part, o)
-        eliminated = _eliminated(linear, common.size)
-        gain = around.at.gain
-        priors = (q[:o] - gain.centre(q[:o])) / gain.widths(q[:o])
-        rows = around.at.rows(around.by_changes())
-        chi2, rrse = _misfit(load, g, part, o)
-        seen = _Seen(
-            chi2,
-            rrse,
-            terms=jnp.concatenate([around.part, priors]),
-            linear=linear,
-            changes=jnp.pad(rows, ((0, 0), (0, o))),  # no change affects the priors
-            by_x=_influence(around, known, g, linear, eliminated) if several else None,
-        )
-        return eliminated, seen
+    def one(load: Loads, own: Own) -> tuple[_Eliminated, Seen, _ByX | None]:
+        seen, by_x = seen_at(study, driver, load, own)
+        eliminated = _eliminated(seen, common.size)
+        return eliminated, seen, _influence(by_x, eliminated) if several else None
 
     return in_turn(one, loads, owns)
 
 
-def _linear(around: Around, known: Spectrum, part: Float[Array, " part"], owned: int) -> Linear:
-    """Terms at the knots, linear in (common, own); the last are the priors of the own."""
-    jacobian, q = around.jacobian, around.q
-    of_own = jnp.diag(1 / around.at.gain.widths(q[:owned]))
-    of_priors = jnp.concatenate([jnp.zeros((q.size - owned, owned)), of_own])
-    jacobian = jnp.concatenate([jacobian[owned:], jacobian[:owned]])
-    jacobian = jnp.concatenate([jacobian, of_priors], axis=1)
-    share = signal_share(around.x, known.variance_x)
-    noise = excess(part, known.selected)[: share.size]
-    means = around.mean(jnp.stack([share, noise]))
-    return Linear(jacobian, *jnp.concatenate([means, jnp.ones((2, owned))], axis=1))
-
-
-def _misfit(
-    load: Loads, gain: Complex[Array, " harmonic"], part: Float[Array, " part"], owned: int
-) -> tuple[Float[Array, ""], Float[Array, ""]]:
-    """χ² and RRSE of a load, from its gain and the terms of its recording."""
-    spectrum = load.spectrum
-    squares = jnp.sum(part**2)
-    freedom = 2 * jnp.sum(spectrum.selected, dtype=squares.dtype) - owned
-    return squares / freedom, complex_rrse(gain * spectrum.x, spectrum.y, spectrum.selected)
-
-
-def _is_another(
-    seen: _Seen,
+def _contradictions(
+    seen: Seen,
     load: Loads,
-    own: LoadUnknowns,
+    own: Own,
     eliminated: _Eliminated,
     bread: Float[Array, "common common"],
     score: Float[Array, "common common"],
-) -> Bool[Array, ""]:
-    """Score test of one load; `bread` and `score` are those of `common` from all terms."""
+) -> Contradictions:
+    """Score tests of one load; `bread` and `score` are those of `common` from all terms."""
     slope, linear = eliminated.slope, seen.linear
     covariance = jnp.block(
         [
@@ -272,18 +232,25 @@ def _is_another(
         covariance,
         slice(bread.shape[0], bread.shape[0] + own.log_elements.size),
     )
+    scale = jnp.asarray(False)
+    if load.current is not None:
+        found, of_current = (
+            jax.tree.map(lambda leaf, part=part: leaf[part], found) for part in (slice(-1), -1)
+        )
+        scale = disagrees(of_current)
     other = other_circuit.Scores.of(found, gain=True)
     # A load that takes no part has its own verdict.
-    return (other.seen() | other.has_other_gain()) & load.used
+    return Contradictions((other.seen() | other.has_other_gain()) & load.used, scale & load.used)
 
 
-def _eliminated(linear: Linear, c: int) -> _Eliminated:
+def _eliminated(seen: Seen, c: int) -> _Eliminated:
     """A load whose own parameters are eliminated; they follow the `c` common ones."""
-    of = linear.curvature()
+    of = seen.linear.curvature()
     bread = inverse(of.expected[c:, c:])
     slope = -bread @ of.expected[c:, :c]
     cov = bread @ of.score[c:, c:] @ bread
-    return _Eliminated(of.eliminate(c), cov, slope, bread)
+    pull = seen.by_scale[:c] + slope.T @ seen.by_scale[c:]
+    return _Eliminated(of.eliminate(c), cov, slope, bread, pull, bread @ seen.by_scale[c:])
 
 
 # --- Loads with one unloaded record --------------------------------------------------------------
@@ -293,25 +260,9 @@ def _eliminated(linear: Linear, c: int) -> _Eliminated:
 # on the terms is propagated to `common` and to every load.
 
 
-def _influence(
-    around: Around,
-    known: Spectrum,
-    gain: Complex[Array, " harmonic"],
-    linear: Linear,
-    eliminated: _Eliminated,
-) -> _ByX:
+def _influence(by_x: Float[Array, "x parameter"], eliminated: _Eliminated) -> _ByX:
     """Effect of unit noise in X on the score of `common`, and on the own parameters."""
-    jacobian, g = linear.jacobian.T, around.slopes.gain
-    size = knots(gain.size).at(jnp.sqrt(known.variance_x / variance(known, gain)))
-    re, im = g.real * size, g.imag * size
-    real, imaginary = jacobian[: g.size], jacobian[g.size : 2 * g.size]
-    by_x = jnp.concatenate(
-        [
-            re[:, None] * real + im[:, None] * imaginary,
-            re[:, None] * imaginary - im[:, None] * real,
-        ]
-    )
-    c = jacobian.shape[1] - eliminated.bread.shape[0]
+    c = by_x.shape[1] - eliminated.bread.shape[0]
     return _ByX(by_x[:, :c] + by_x[:, c:] @ eliminated.slope, by_x[:, c:] @ eliminated.bread)
 
 

@@ -11,18 +11,22 @@ from collections.abc import Sequence
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Bool, Float
 
-from etid.estimators.estimate import MAX_STEPS, SOLVER, Estimate
-from etid.estimators.joint.errors import Delay, estimates
+from etid.estimators.estimate import MAX_STEPS, SOLVER
+from etid.estimators.joint.errors import Found, estimates
 from etid.estimators.joint.near import approached
-from etid.estimators.joint.terms import DriverStudy, Joint, Loads, in_turn
+from etid.estimators.joint.terms import Current, DriverStudy, Joint, Loads, Own, in_turn
 from etid.estimators.maximum_likelihood import driver as calibrations
+from etid.estimators.maximum_likelihood import load as of_load
+from etid.estimators.maximum_likelihood import with_current
 from etid.estimators.maximum_likelihood.given_driver import GivenDriver
-from etid.estimators.maximum_likelihood.load import SLIGHT, Load, refined
+from etid.estimators.maximum_likelihood.load import SLIGHT
 from etid.estimators.maximum_likelihood.terms import shows_hum
-from etid.estimators.unknowns import LoadUnknowns
+from etid.estimators.maximum_likelihood.with_current import LoadWithCurrent
+from etid.estimators.unknowns import LoadUnknowns, LoadWithCurrentUnknowns
 from etid.results.fits import complex_rrse
 from etid.signals.harmonics import Spectrum
 from etid.solvers.arrowhead import Arrowhead, ArrowheadEquations, EliminationDescent, join
@@ -41,20 +45,21 @@ def _equations(_, y: Float[Array, " parameter"], study: DriverStudy) -> Arrowhea
     """Normal equations of a study, load by load."""
     common, parts = study.split(y)
 
-    def of_group(loads: Loads, owns: LoadUnknowns) -> NormalEquations:
+    def of_group(loads: Loads, owns: Own) -> NormalEquations:
         driver = study.model.around(common, loads.frequency[0])
 
-        def one(load: Loads, own: LoadUnknowns) -> NormalEquations:
+        def one(load: Loads, own: Own) -> NormalEquations:
             lane = study.lane(driver, load)
             q = own.vector()
             alone = lane.equations(jnp.concatenate([q, driver.mean]))
-            prior = 1 / lane.gain.widths(q)
-            rest, others = prior * (q - lane.gain.centre(q)), (0, driver.mean.size)
+            prior = 1 / lane.widths(q)
+            rest, others = prior * (q - lane.centre(q)), (0, driver.mean.size)
             found = NormalEquations(
                 alone.objective + 0.5 * jnp.dot(rest, rest),
                 alone.gradient + jnp.pad(prior * rest, others),
                 alone.matrix + jnp.diag(jnp.pad(prior**2, others)),
             ).finite()
+            found = _with_room(found, q.size, study.owned)
             return jax.tree.map(lambda leaf: jnp.where(load.used, leaf, 0.0), found)
 
         return in_turn(one, loads, owns)
@@ -74,6 +79,15 @@ def _equations(_, y: Float[Array, " parameter"], study: DriverStudy) -> Arrowhea
     )
 
 
+def _with_room(found: NormalEquations, own: int, room: int) -> NormalEquations:
+    """Equations in (own, common) with room for own parameters that only other loads have."""
+    if room == own:
+        return found
+    at = np.full(room - own, own)
+    matrix = jnp.insert(jnp.insert(found.matrix, at, 0.0, axis=0), at, 0.0, axis=1)
+    return NormalEquations(found.objective, jnp.insert(found.gradient, at, 0.0), matrix)
+
+
 def _empty(y: Float[Array, " parameter"], study: DriverStudy) -> ArrowheadEquations:
     """Normal equations of the same shapes with zeros."""
     shapes = jax.eval_shape(lambda: _equations(None, y, study))
@@ -86,7 +100,7 @@ def _second_order(
     """Jᵀ r″ of a study, load by load; r″ as in `levenberg_marquardt.second_order`."""
     (common, parts), (towards, steps) = study.split(y), study.split(step)
 
-    def of_group(loads: Loads, owns: LoadUnknowns, steps: LoadUnknowns) -> Float[Array, "load q"]:
+    def of_group(loads: Loads, owns: Own, steps: Own) -> Float[Array, "load q"]:
         frequency = loads.frequency[0]
         driver = study.model.around(common, frequency)
         ends = []
@@ -94,13 +108,14 @@ def _second_order(
             end = study.model.around(common + h * towards, frequency, slopes=False)
             ends.append((h, end))
 
-        def one(load: Loads, own: LoadUnknowns, step: LoadUnknowns) -> Float[Array, " q"]:
+        def one(load: Loads, own: Own, step: Own) -> Float[Array, " q"]:
             lane = study.lane(driver, load)
             at, way = own.vector(), step.vector()
             bent = sum(study.lane(end, load).residual(at + h * way) for h, end in ends)
             middle, pullback = jax.vjp(lane.residual, jnp.concatenate([at, driver.mean]))
             (found,) = pullback((bent - 2 * middle) / DIFFERENCE**2)
-            return jnp.where(load.used, found, 0.0)
+            own_part = study.widened(found[: at.size])
+            return jnp.where(load.used, jnp.concatenate([own_part, found[at.size :]]), 0.0)
 
         return in_turn(one, loads, owns, steps)
 
@@ -115,7 +130,7 @@ def fit_together(
 ) -> tuple[
     Float[Array, " common"],
     Float[Array, "common common"],
-    list[tuple[Estimate, Bool[Array, " load"], Delay]],
+    list[Found],
 ]:
     """Identify all loads and their driver.
 
@@ -125,8 +140,8 @@ def fit_together(
         several: Number of unloaded records in each group that several loads share.
 
     Returns:
-        Common parameters, their covariance, and the estimates of each group, stacked, with whether
-        the data show another circuit, and with the delays. In the estimates, `shared_cov` is the
+        Common parameters, their covariance, and what is found of the loads of each group, stacked.
+        In the estimates, `shared_cov` is the
         part that several loads share: from the uncertainty of `common`, and from the noise of
         shared unloaded records.
     """
@@ -165,14 +180,18 @@ def fit_together(
 
 
 def _refitted(
-    study: DriverStudy, common: Float[Array, " common"], loads: Loads, owns: LoadUnknowns
-) -> tuple[LoadUnknowns, optx.RESULTS]:
+    study: DriverStudy, common: Float[Array, " common"], loads: Loads, owns: Own
+) -> tuple[Own, optx.RESULTS]:
     """Unknowns of each load at its minimum with this Z_th, and the results of the solver."""
     driver = study.model.around(common, loads.frequency[0], slopes=False)
 
-    def one(load: Loads, own: LoadUnknowns) -> tuple[LoadUnknowns, optx.RESULTS]:
-        solution = refined(study.lane(driver, load), own.vector())
-        return LoadUnknowns.of(solution.value), solution.result
+    def one(load: Loads, own: Own) -> tuple[Own, optx.RESULTS]:
+        lane, start = study.lane(driver, load), own.vector()
+        if isinstance(lane, LoadWithCurrent):
+            solution = with_current.refined(lane, start)
+        else:
+            solution = of_load.refined(lane, start)
+        return type(own).of(solution.value), solution.result
 
     return in_turn(one, loads, owns)
 
@@ -183,7 +202,8 @@ def fit_alone(
     spectrum: Spectrum,
     sample_rate: Float[Array, ""],
     candidates: LoadUnknowns,
-) -> tuple[LoadUnknowns, optx.RESULTS, Float[Array, ""], Float[Array, ""], Bool[Array, ""]]:
+    current: Current | None = None,
+) -> tuple[Own, optx.RESULTS, Float[Array, ""], Float[Array, ""], Bool[Array, ""]]:
     """Identify the load of one recording; Z_th is fixed.
 
     Args:
@@ -192,18 +212,27 @@ def fit_alone(
         spectrum: The recording.
         sample_rate: Its sampling rate [Hz].
         candidates: Starts, stacked; the start that predicts best is refined.
+        current: Harmonics of the measured current [A], and their variances [A²].
 
     Returns:
         The unknowns, the result of the solver, χ² per degree of freedom, RRSE, and whether mains
         hum is seen.
     """
-    load = Load.behind(driver, model.circuit, spectrum, sample_rate, model.prior)
+    lane = model.lane(driver, spectrum, sample_rate, current)
     if model.prior is not None:
         placed = model.prior.placed(candidates.log_elements)
         candidates = LoadUnknowns(placed, candidates.delay_samples)
-    solution = refined(load, best_start(load, candidates.vector()))
+    terms = 2 * jnp.sum(spectrum.selected, dtype=candidates.log_elements.dtype)
+    if isinstance(lane, LoadWithCurrent):
+        start = best_start(lane, jnp.pad(candidates.vector(), ((0, 0), (0, 1))))
+        start = with_current.refined(lane, start, with_current.ROUGHLY).value
+        solution = with_current.refined(lane, start)
+        own, seen = LoadWithCurrentUnknowns.of(solution.value), lane.seen(solution.value)
+        terms, error, hum = 2 * terms, lane.rrse(seen), seen.shows_hum()
+    else:
+        solution = of_load.refined(lane, best_start(lane, candidates.vector()))
+        own, (g, known) = LoadUnknowns.of(solution.value), lane.predicted(solution.value)
+        error = complex_rrse(g * spectrum.x, spectrum.y, spectrum.selected)
+        hum = shows_hum(known, g)
     squares = 2 * solution.stats["normal_equations"].objective
-    chi2 = squares / (2 * jnp.sum(spectrum.selected, dtype=squares.dtype) - load.gain.owned)
-    g, known = load.predicted(solution.value)
-    error = complex_rrse(g * spectrum.x, spectrum.y, spectrum.selected)
-    return LoadUnknowns.of(solution.value), solution.result, chi2, error, shows_hum(known, g)
+    return own, solution.result, squares / (terms - solution.value.size), error, hum

@@ -25,7 +25,7 @@ import optimistix as optx
 from jaxtyping import Array, Bool, Complex, Float, Int
 
 from etid.estimators.estimate import MAX_STEPS
-from etid.estimators.joint.terms import DriverStudy, Loads, in_turn
+from etid.estimators.joint.terms import DriverStudy, Loads, Own, in_turn
 from etid.estimators.maximum_likelihood.driver import Calibrations
 from etid.estimators.maximum_likelihood.given_driver import GivenDriver
 from etid.estimators.maximum_likelihood.load import Around
@@ -36,7 +36,7 @@ from etid.estimators.maximum_likelihood.terms import (
     residual,
     residuals,
 )
-from etid.estimators.unknowns import LoadUnknowns
+from etid.estimators.maximum_likelihood.with_current import LoadWithCurrent
 from etid.signals.knots import Knots, knots
 from etid.signals.transfer import as_complex, reciprocal
 from etid.solvers.arrowhead import join
@@ -211,34 +211,45 @@ def _by_signals(driver: GivenDriver, shared: bool) -> GivenDriver:
 
 
 def _of_group(
-    study: DriverStudy, common: Float[Array, " common"], loads: Loads, owns: LoadUnknowns
+    study: DriverStudy, common: Float[Array, " common"], loads: Loads, owns: Own
 ) -> tuple[_Part, Float[Array, "load own own"]]:
     """A group of loads as a function of the signals, and L of each load."""
-    every, o = knots(loads.spectrum.x.shape[-1], DENSE), study.owned
+    every, o = knots(loads.spectrum.x.shape[-1], DENSE), loads.owned
     same_size = loads.spectrum.x.shape[-1] == study.model.calibrations.spectra.x.shape[-1]
     driver = study.model.around(common, loads.frequency[0], slopes=False)
     driver = _by_signals(driver, study.model.shared and same_size)
 
-    def one(load: Loads, own: LoadUnknowns) -> tuple[_Part, Float[Array, "own own"]]:
+    def one(load: Loads, own: Own) -> tuple[_Part, Float[Array, "own own"]]:
         lane = study.lane(driver, load)
         q = jnp.concatenate([own.vector(), driver.mean])
-        at = apart(lane.predicted, q)
-        around = Around.of(lane, q, at, every)
-        prior = 1 / lane.gain.widths(own.vector())
-        rest = prior * (own.vector() - lane.gain.centre(own.vector()))
-        part, jacobian = around.part.reshape(2, -1), around.jacobian.reshape(q.size, 2, -1)
+        prior = 1 / lane.widths(own.vector())
+        rest, of_x = prior * (own.vector() - lane.centre(own.vector())), None
+        if isinstance(lane, LoadWithCurrent):  # at all harmonics
+            seen = apart(lane.seen, q)
+            x, part = seen.true_x().x, seen.parts().reshape(4, -1)
+            squares = jnp.sum(part**2)
+            jacobian = apart(lambda q: seen.scaled(lane.slopes(q, x)), q).reshape(q.size, 4, -1)
+        else:
+            at = apart(lane.predicted, q)
+            around, squares = Around.of(lane, q, at, every), jnp.sum(residual(at[1], at[0]) ** 2)
+            part, jacobian = around.part.reshape(2, -1), around.jacobian.reshape(q.size, 2, -1)
+            if lane.unloaded is not None:  # X is not smooth in frequency
+                of_x = apart(lambda _: lane.by_unloaded(at), q)
         by_own, by_signal = jacobian[:o], jacobian[o:]
-        pull = jnp.einsum("sck,ck->sk", by_signal, part)
-        if lane.unloaded is not None:  # X is not smooth in frequency
-            of_x = apart(lambda _: lane.by_unloaded(at), q)
-            pull = jnp.concatenate([pull[:W], every.summed(of_x[W:])])
         told = jnp.einsum("ock,pck->op", by_own, by_own)
         root = inverse_root(told + jnp.diag(prior**2))
+        pull = jnp.einsum("sck,ck->sk", by_signal, part)
+        curvature = jnp.einsum("sck,tck->stk", by_signal, by_signal)
+        following = jnp.einsum("po,pck,sck->osk", root, by_own, by_signal)
+        if isinstance(lane, LoadWithCurrent):
+            pull, curvature, following = map(every.summed, (pull, curvature, following))
+        elif of_x is not None:
+            pull = jnp.concatenate([pull[:W], every.summed(of_x[W:])])
         found = _Part(
-            objective=0.5 * (jnp.sum(residual(at[1], at[0]) ** 2) + jnp.dot(rest, rest)),
+            objective=0.5 * (squares + jnp.dot(rest, rest)),
             pull=pull,
-            curvature=jnp.einsum("sck,tck->stk", by_signal, by_signal),
-            following=jnp.einsum("po,pck,sck->osk", root, by_own, by_signal),
+            curvature=curvature,
+            following=following,
             rest=root.T @ (jnp.einsum("ock,ck->o", by_own, part) + prior * rest),
         )
         return jax.tree.map(lambda leaf: jnp.where(load.used, leaf, 0.0), found), root
@@ -325,7 +336,8 @@ def _next(
     )
     changes, own = near.changes(solution.value)[1:], []
     for (part, root), change, before in zip(groups, changes, parts, strict=True):
-        own.append(before.vector() - jnp.einsum("lop,lp->lo", root, part.own(change)))
+        found = before.vector() - jnp.einsum("lop,lp->lo", root, part.own(change))
+        own.append(study.widened(found))
     weak, _ = near.calibrations.weak(common)
     value = 0.5 * jnp.dot(weak, weak) + sum(part.objective for part in near.parts)
     promised = value - solution.stats["normal_equations"].objective

@@ -1,7 +1,8 @@
 """The terms of one driver and its many loads.
 
-All loads share Z_th and the delays of the calibrations, `common`. The elements and the delay of a
-load, `own`, appear only in the terms of this load.
+All loads share Z_th and the delays of the calibrations, `common`. The elements and the delays of a
+load, `own`, appear only in the terms of this load. A load whose current was measured has two
+equations for each harmonic (`etid.estimators.maximum_likelihood.with_current`).
 """
 
 import itertools
@@ -11,7 +12,7 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Complex, Float, Int
 
 from etid.circuits.circuit import AbstractCircuit
 from etid.estimators.element_limits import Limits
@@ -19,11 +20,15 @@ from etid.estimators.element_prior import ElementPrior
 from etid.estimators.maximum_likelihood.driver import Calibrations
 from etid.estimators.maximum_likelihood.given_driver import GivenDriver, around
 from etid.estimators.maximum_likelihood.load import Load
-from etid.estimators.unknowns import LoadUnknowns
+from etid.estimators.maximum_likelihood.with_current import LoadWithCurrent
+from etid.estimators.unknowns import LoadUnknowns, LoadWithCurrentUnknowns
 from etid.signals.harmonics import Spectrum
 from etid.solvers.arrowhead import join, split
 
 SIDE_BY_SIDE = 8  # loads in one vectorised step
+
+Current = tuple[Complex[Array, "*load harmonic"], Float[Array, "*load harmonic"]]
+Own = LoadUnknowns | LoadWithCurrentUnknowns
 
 
 class Joint(eqx.Module):
@@ -54,6 +59,19 @@ class Joint(eqx.Module):
         zero = jnp.zeros(unit.shape[1])
         return around(self.calibrations, common, unit, frequency, self.shared, zero, jnp.diag(zero))
 
+    def lane(
+        self,
+        driver: GivenDriver,
+        spectrum: Spectrum,
+        sample_rate: Float[Array, ""],
+        current: Current | None,
+    ) -> Load | LoadWithCurrent:
+        """One load behind this driver."""
+        of = driver, self.circuit, spectrum
+        if current is None:
+            return Load.behind(*of, sample_rate, self.prior)
+        return LoadWithCurrent.behind(*of, current, sample_rate, self.prior)
+
 
 class Loads(eqx.Module):
     """Recordings of one length with one driver, stacked along a leading axis.
@@ -65,18 +83,25 @@ class Loads(eqx.Module):
         used: Whether the recording takes part. The others are fitted, but do not affect Z_th.
         unloaded: Index of the unloaded record among those that several loads share; −1 if no other
             load has it.
+        current: Harmonics of the measured currents [A], and their variances [A²]; None without.
     """
 
     spectrum: Spectrum
     sample_rate: Float[Array, "*load"]
-    own: LoadUnknowns
+    own: Own
     used: Bool[Array, "*load"]
     unloaded: Int[Array, "*load"]
+    current: Current | None = None
 
     @property
     def frequency(self) -> Float[Array, "*load harmonic"]:
         """Harmonics [Hz]."""
         return self.spectrum.frequency
+
+    @property
+    def owned(self) -> int:
+        """Number of own parameters of each load."""
+        return jax.eval_shape(self.own.vector).shape[-1]
 
 
 class DriverStudy(eqx.Module):
@@ -90,31 +115,33 @@ class DriverStudy(eqx.Module):
     model: Joint
     groups: list[Loads]
 
-    def lane(self, driver: GivenDriver, load: Loads) -> Load:
+    def lane(self, driver: GivenDriver, load: Loads) -> Load | LoadWithCurrent:
         """One load behind this driver."""
-        model = self.model
-        return Load.behind(driver, model.circuit, load.spectrum, load.sample_rate, model.prior)
+        return self.model.lane(driver, load.spectrum, load.sample_rate, load.current)
 
     def start(self) -> Float[Array, " parameter"]:
         """The start: the driver of the calibrations, and each load identified alone."""
-        own = jnp.concatenate([loads.own.vector() for loads in self.groups])
+        own = jnp.concatenate([self.widened(loads.own.vector()) for loads in self.groups])
         return join(self.model.calibrations.start(), own)
 
-    def split(
-        self, y: Float[Array, " parameter"]
-    ) -> tuple[Float[Array, " common"], list[LoadUnknowns]]:
+    def split(self, y: Float[Array, " parameter"]) -> tuple[Float[Array, " common"], list[Own]]:
         """The common parameters, and the unknowns of the loads of each group."""
         counts = [loads.used.size for loads in self.groups]
         common, own = split(y, sum(counts), self.owned)
         ends = itertools.accumulate(counts)
         return common, [
-            LoadUnknowns.of(own[end - count : end]) for end, count in zip(ends, counts, strict=True)
+            type(loads.own).of(own[end - loads.used.size : end, : loads.owned])
+            for end, loads in zip(ends, self.groups, strict=True)
         ]
 
     @property
     def owned(self) -> int:
-        """Number of own parameters of a load."""
-        return len(self.model.circuit.names()) + 1
+        """Largest number of own parameters of a load; all loads take as much room."""
+        return max(loads.owned for loads in self.groups)
+
+    def widened(self, own: Float[Array, "*load own"]) -> Float[Array, "*load room"]:
+        """Own parameters with the room of those that other loads have."""
+        return jnp.pad(own, [(0, 0)] * (own.ndim - 1) + [(0, self.owned - own.shape[-1])])
 
 
 def in_turn(one: Callable, *lanes: Any) -> Any:

@@ -79,6 +79,14 @@ class Load(eqx.Module):
         """Knots of the harmonics."""
         return knots(self.spectrum.frequency.size)
 
+    def centre(self, q: Float[Array, " q"]) -> Float[Array, " q"]:
+        """Prior means of the parameters."""
+        return self.gain.centre(q)
+
+    def widths(self, q: Float[Array, " q"]) -> Float[Array, " q"]:
+        """Prior standard deviations of the parameters."""
+        return self.gain.widths(q)
+
     def predicted(self, q: Float[Array, " q"]) -> tuple[Complex[Array, " harmonic"], Spectrum]:
         """Gain, and the recording with the X that the calibrations estimate."""
         z_load, turned, known = self._acting(q)

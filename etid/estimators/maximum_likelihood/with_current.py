@@ -26,7 +26,7 @@ from jaxtyping import Array, Bool, Complex, Float
 
 from etid.circuits.circuit import AbstractCircuit
 from etid.estimators.element_prior import ElementPrior
-from etid.estimators.estimate import MAX_STEPS, SOLVER, Estimate
+from etid.estimators.estimate import DELAY_WIDTH, MAX_STEPS, SOLVER, Estimate
 from etid.estimators.maximum_likelihood.gain import Gain
 from etid.estimators.maximum_likelihood.given_driver import GivenDriver
 from etid.estimators.maximum_likelihood.load import FAR, SETTLED, SLIGHT, Load
@@ -57,7 +57,7 @@ class _CurrentOf(GivenDriver):
         return reciprocal(load + self.z_th(w))
 
 
-class _Seen(eqx.Module):
+class Seen(eqx.Module):
     """The records at some parameters.
 
     Attributes:
@@ -69,6 +69,14 @@ class _Seen(eqx.Module):
     gains: Complex[Array, "2 harmonic"]
     first: Spectrum
     second: Spectrum
+
+    def shows_hum(self) -> Bool[Array, ""]:
+        """Whether Y or I shows mains hum."""
+        return shows_hum(self.first, self.gains[0]) | shows_hum(self.second, self.gains[1])
+
+    def true_x(self) -> Spectrum:
+        """X as all three records estimate it, and its variance."""
+        return informed(self.second, [self.second], [self.gains[1]])
 
     def parts(self) -> Float[Array, "2 part"]:
         """Terms of Y and of I."""
@@ -116,6 +124,8 @@ class LoadWithCurrent(eqx.Module):
         """A recording that was made with `driver`, its current, and a prior of the elements."""
         load = Load.behind(driver, circuit, spectrum, sample_rate, prior)
         fields = {one.name: getattr(driver, one.name) for one in dataclasses.fields(driver)}
+        # How little the delays of V_out scatter tells nothing about those of the current.
+        fields["delay_width"] = jnp.array(DELAY_WIDTH)
         of_current = dataclasses.replace(load.gain, driver=_CurrentOf(**fields))
         return cls(load, of_current, *current)
 
@@ -138,18 +148,44 @@ class LoadWithCurrent(eqx.Module):
         of_y, of_i = (self.load.gain.widths(one) for one in self.each(q))
         return jnp.insert(of_y, self.elements + 1, of_i[self.elements])
 
-    def seen(self, q: Float[Array, " q"]) -> _Seen:
+    def seen(self, q: Float[Array, " q"]) -> Seen:
         """The records at these parameters."""
         of_y, of_i = self.each(q)
         g, first = self.load.predicted(of_y)
         learned = informed(first, [first], [g])
         second = dataclasses.replace(learned, y=self.i, variance_y=self.variance_i)
-        return _Seen(jnp.stack([g, self.current(of_i)]), first, second)
+        return Seen(jnp.stack([g, self.current(of_i)]), first, second)
 
     def __call__(self, q: Float[Array, " q"]) -> Float[Array, " term"]:
         """Terms of the records and the priors."""
         rest = (q - self.centre(q)) / self.widths(q)
-        return jnp.concatenate([apart(self.seen, q).parts().ravel(), rest])
+        return jnp.concatenate([self.residual(q), rest])
+
+    def residual(self, q: Float[Array, " q"]) -> Float[Array, " part"]:
+        """Terms of the records alone."""
+        return apart(self.seen, q).parts().ravel()
+
+    def rrse(self, seen: Seen) -> Float[Array, ""]:
+        """RRSE of the record that is predicted worse."""
+        predicted = seen.gains * seen.first.x[None, :]
+        y, i = (
+            complex_rrse(one, record, seen.first.selected)
+            for one, record in zip(predicted, (seen.first.y, self.i), strict=True)
+        )
+        return jnp.maximum(y, i)
+
+    def equations(self, q: Float[Array, " q"]) -> NormalEquations:
+        """Normal equations of the records alone; the matrix is their information."""
+
+        def objective(
+            q: Float[Array, " q"],
+        ) -> tuple[Float[Array, ""], Complex[Array, " harmonic"]]:
+            seen = self.seen(q)
+            return 0.5 * jnp.sum(seen.parts() ** 2), seen.true_x().x
+
+        (value, x), gradient = apart(jax.value_and_grad(objective, has_aux=True), q)
+        jacobian = apart(lambda q: self.seen(q).scaled(self.slopes(q, x)), q)
+        return NormalEquations(value, gradient, jacobian @ jacobian.T)
 
     def slopes(
         self, q: Float[Array, " q"], x: Complex[Array, " harmonic"]
@@ -168,24 +204,14 @@ class LoadWithCurrent(eqx.Module):
         return found.at[e + 2 :].add(moved)
 
 
-def _true_x(seen: _Seen) -> Spectrum:
-    """X as all three records estimate it, and its variance."""
-    return informed(seen.second, [seen.second], [seen.gains[1]])
-
-
 def _equations(_, q: Float[Array, " q"], of: LoadWithCurrent) -> NormalEquations:
-    def objective(q: Float[Array, " q"]) -> tuple[Float[Array, ""], Complex[Array, " harmonic"]]:
-        seen = of.seen(q)
-        return 0.5 * jnp.sum(seen.parts() ** 2), _true_x(seen).x
-
-    (value, x), gradient = apart(jax.value_and_grad(objective, has_aux=True), q)
-    jacobian = apart(lambda q: of.seen(q).scaled(of.slopes(q, x)), q)
+    found = of.equations(q)
     prior = 1 / of.widths(q)
     rest = prior * (q - of.centre(q))
     return NormalEquations(
-        value + 0.5 * jnp.dot(rest, rest),
-        gradient + prior * rest,
-        jacobian @ jacobian.T + jnp.diag(prior**2),
+        found.objective + 0.5 * jnp.dot(rest, rest),
+        found.gradient + prior * rest,
+        found.matrix + jnp.diag(prior**2),
     ).finite()
 
 
@@ -244,10 +270,10 @@ def fit_circuit(
     q = solution.value
     own, z = q[: count + 2], q[count + 2 :]
     seen = apart(of.seen, q)
-    (g, h), part = seen.gains, seen.parts()
+    part = seen.parts()
     moved = jnp.max(jnp.where(spectrum.selected, jnp.abs(of.load.gain.w(z)), 0.0))
 
-    true = _true_x(seen)
+    true = seen.true_x()
     rows = apart(lambda q: seen.scaled(of.slopes(q, true.x)), q)
     prior = 1 / of.widths(q) ** 2
     share = jnp.tile(signal_share(true.x, true.variance_x), 4)
@@ -257,9 +283,9 @@ def fit_circuit(
     rest = prior * (q - of.centre(q))
     spread = jax.scipy.linalg.block_diag(jnp.diag(prior[: count + 2]), driver.cov)
 
-    changes = seen.scaled(_changes(of, driver, q, seen, true.x))
+    rows_of_changes = seen.scaled(changes(of, driver, q, seen, true.x))
     told = rest, spread, information, slice(count)
-    found = other_circuit.scores(changes, linear, part.ravel(), *told)
+    found = other_circuit.scores(rows_of_changes, linear, part.ravel(), *told)
     other = other_circuit.Scores.of(_part(found, slice(-2)), gain=True)
     of_current, falls = _part(found, -2), _part(found, -1)
 
@@ -275,41 +301,40 @@ def fit_circuit(
     change = z - driver.mean
     strain = jnp.dot(change, jnp.linalg.solve(driver.cov, change))
     beside = jnp.sum((rest**2 / jnp.where(prior > 0, prior, 1.0))[:count])
-    predicted = seen.gains * seen.first.x[None, :]
-    errors = [
-        complex_rrse(one, record, spectrum.selected)
-        for one, record in zip(predicted, (spectrum.y, of.i), strict=True)
-    ]
     estimate = Estimate(
         parameters=own[:count],
         delay_samples=own[count:],
         cov=(by_term * noise[None, :]) @ by_term.T + of_own + of_driver,
         shared_cov=of_driver,
         chi2=chi2,
-        rrse=jnp.maximum(*errors),
+        rrse=of.rrse(seen),
         result=solution.result,
         steps=solution.stats["num_steps"],
         strain=strain,
-        hum=shows_hum(seen.first, g) | shows_hum(seen.second, h),
+        hum=seen.shows_hum(),
         falls=falling.causes(squares, terms, other.relevant()),
         support=Support(
             squares + strain + beside, terms, other.relevant(), *other.spread.possible()
         ),
     )
-    disagrees = (jnp.abs(of_current.z) > DISAGREES) & (of_current.moved > SCALE)
     wrong = other.seen() | other.has_other_gain() | falling.seen()
-    return estimate, moved > FAR, wrong, disagrees
+    return estimate, moved > FAR, wrong, disagrees(of_current)
+
+
+def disagrees(scale: other_circuit.Score) -> Bool[Array, ""]:
+    """Whether the score of the scale of the current shows that it is wrong."""
+    return (jnp.abs(scale.z) > DISAGREES) & (scale.moved > SCALE)
 
 
 def _part(scores: other_circuit.Score, which: int | slice) -> other_circuit.Score:
     return jax.tree.map(lambda leaf: leaf[which], scores)
 
 
-def _changes(
+def changes(
     of: LoadWithCurrent,
     driver: GivenDriver,
     q: Float[Array, " q"],
-    seen: _Seen,
+    seen: Seen,
     x: Complex[Array, " harmonic"],
 ) -> Complex[Array, "change 2 harmonic"]:
     """Changes of Y and I by another circuit, gains of V_out and I, and a falling resistance."""

@@ -1,0 +1,209 @@
+"""Joint fits of recordings that measured the current beside V_th."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import etid
+from etid.recordings.remarks import Remark
+from etid.simulation.transformer import loading
+from tests.test_driver_and_current import SKIN, WITHIN, off, relative, scene
+
+DAMP = etid.SkinRC(r_s=6.1e3, r_p=17.4e3, c_p=0.66e-9)
+
+
+def jointly(recordings, **options):
+    return etid.identify_jointly(etid.Study.from_recordings(recordings), **options)
+
+
+@pytest.fixture(scope="module")
+def drawn():
+    return scene().simulate(seed=2)
+
+
+@pytest.fixture(scope="module")
+def pair(drawn):
+    """A calibration and one recording."""
+    return [drawn["calibration/0"], drawn["loaded/0"]]
+
+
+@pytest.fixture(scope="module")
+def joint(pair):
+    return jointly(pair)
+
+
+def bound_of(of):
+    return np.array(list(etid.bound(of)["loaded/0"].relative.values()))
+
+
+def test_the_current_makes_a_joint_fit_as_much_more_precise_as_the_bound_says(pair, joint):
+    fit = joint.fits[0]
+    assert (fit.verdict, fit.method, int(fit.remarks)) == ("successful", "joint", 0)
+    assert np.abs(off(fit)).max() < WITHIN
+    calibration, recording = pair
+    driver = etid.identify_driver(calibration, order=5)
+    # One trial: a joint fit has the same data as a single fit.
+    without = etid.identify_skin(recording.replace(current=None), driver)
+    gained = bound_of(scene()) / bound_of(scene(current_snr_db=None))
+    # The bound holds for every kind of driver. Without a current, C_p profits by a tenth from the
+    # knowledge that the driver has five poles.
+    np.testing.assert_allclose(relative(fit) / relative(without), gained, rtol=0.15)
+    np.testing.assert_allclose(relative(fit), bound_of(scene()), rtol=0.05)
+    both = etid.identify_skin(recording, driver)
+    # The single fit takes Z_th as linear around the calibrations; that is a tenth of an error.
+    assert (np.abs(np.subtract(*map(values, (fit, both)))) < 0.1 * errors(both)).all()
+
+
+def values(fit):
+    return np.asarray(fit.circuit.values())
+
+
+def errors(fit):
+    return np.sqrt(np.diagonal(fit.cov))
+
+
+@pytest.mark.parametrize(
+    ("change", "verdict"),
+    [
+        (lambda one: 1.003 * one.current, "inconsistent"),
+        (lambda one: 0 * one.current, "flat"),
+        (lambda one: -one.current, "misaligned"),
+    ],
+)
+def test_a_current_that_contradicts_the_driver_is_told(pair, joint, change, verdict):
+    calibration, recording = pair
+    found = jointly([calibration, recording.replace(current=change(recording))])
+    assert found.fits.verdicts.tolist() == [verdict]
+
+
+def test_the_tolerance_of_the_known_resistor_is_what_the_current_leaves_of_it(pair, joint):
+    """Its effect is that of another resistor; without a current it is 1 : 1."""
+    calibration, recording = pair
+    wrong = 3e-3
+    other = calibration.replace(r_load=(1 + wrong) * calibration.r_load)
+    moved = values(jointly([other, recording]).fits[0]) / values(joint.fits[0]) - 1
+    doubtful = jointly(pair, r_load_tolerance=wrong).fits[0]
+    added = np.diagonal(doubtful.cov - joint.fits[0].cov) / values(doubtful) ** 2
+    # 2nd order of a change of 0.3 %, whose own effect the fits find to a few per cent.
+    np.testing.assert_allclose(np.sqrt(added), np.abs(moved), rtol=0.05, atol=1e-5)
+    assert (np.sqrt(added) < 0.9 * wrong).all()
+    np.testing.assert_allclose(
+        np.diagonal(doubtful.shared_cov - joint.fits[0].shared_cov) / values(doubtful) ** 2,
+        added,
+        rtol=1e-6,
+    )
+
+
+def joint_bound(of):
+    """Bound of the relative errors of all elements, (trial, element), if all records count.
+
+    X of each record and Z_th are unknown at every harmonic, as in `etid.bound`.
+    """
+    waveform = of.waveform()
+    inside = waveform.f < of.sample_rate / 2
+    f, z_th = waveform.f[inside], waveform.z_th[inside]
+    x = waveform.v_th[inside] * np.sqrt(of.samples) / waveform.sigma
+    circuits = [trial.load for trial in of.trials]
+    known = [etid.Resistor(trial.load.r) for trial in of.calibration]
+    n, e, m = len(circuits), len(SKIN.names()), len(circuits) + len(known)
+    unloaded = [0] * m if of.shared_v_th else list(range(m))
+    u = max(unloaded) + 1
+    a = np.zeros((f.size, m + u + n, n * e + m + n), complex)
+    b = np.zeros((f.size, m + u + n, u + 1), complex)
+    turn = 2j * np.pi * f * 1e-6
+    b[:, m + np.arange(u), np.arange(u)] = 1
+    for i, circuit in enumerate([*circuits, *known]):
+        z = np.asarray(circuit.response(jnp.asarray(f)))
+        g, flowing = loading(z, z_th), 1 / (z + z_th)
+        b[:, i, unloaded[i]], b[:, i, -1] = g, -g * x * flowing
+        a[:, i, n * e + i] = -turn * g * x
+        if i >= n:
+            continue
+        slope = np.asarray(
+            jax.jacfwd(lambda log, c=circuit: c.with_log_values(log).response(jnp.asarray(f)))(
+                circuit.log_values()
+            )
+        )
+        own = slice(i * e, (i + 1) * e)
+        a[:, i, own] = (x * z_th * flowing**2)[:, None] * slope
+        if of.current_snr_db is None:
+            continue
+        noise = of.current_noise(waveform.v_th / (z_of(circuit, waveform.f) + waveform.z_th))
+        weight = waveform.sigma / noise
+        row = m + u + i
+        b[:, row, unloaded[i]], b[:, row, -1] = weight * flowing, -weight * flowing**2 * x
+        a[:, row, own] = (-weight * flowing**2 * x)[:, None] * slope
+        a[:, row, n * e + m + i] = -turn * weight * flowing * x
+    used = np.abs(a).any((0, 1))
+    a = a[:, :, used]
+    q, _ = np.linalg.qr(b)
+    rest = a - q @ (np.conj(np.swapaxes(q, 1, 2)) @ a)
+    flat = rest.reshape(-1, a.shape[2])
+    information = 2 * np.real(np.conj(flat.T) @ flat)
+    scale = np.sqrt(np.diagonal(information))
+    cov = np.linalg.inv(information / np.outer(scale, scale)) / np.outer(scale, scale)
+    return np.sqrt(np.diagonal(cov)[: n * e]).reshape(n, e)
+
+
+def z_of(circuit, f):
+    return np.asarray(circuit.response(jnp.asarray(f)))
+
+
+def test_the_bound_of_one_trial_is_that_of_etid(drawn):
+    one = dataclasses.replace(scene(), trials=scene().trials[:1])
+    np.testing.assert_allclose(joint_bound(one)[0], bound_of(one), rtol=1e-4)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("shared_v_th", [False, True])
+@pytest.mark.parametrize(("circuit", "current_snr_db"), [(SKIN, 40.0), (DAMP, 30.0)])
+def test_joint_estimates_are_efficient_and_their_intervals_true(
+    circuit, current_snr_db, shared_v_th
+):
+    of = scene(circuit, current_snr_db=current_snr_db, shared_v_th=shared_v_th)
+    bound = joint_bound(of)
+    squares, covered = [], []
+    for seed in range(100):
+        fits = etid.identify_jointly(of.simulate(seed + 2000)).fits
+        assert set(fits.verdicts) <= {"successful", "inconsistent", "changed"}, seed
+        if (fits.verdicts == "successful").all():
+            error = np.stack([values(fit) for fit in map(fits.__getitem__, range(2))])
+            error = error / np.asarray(circuit.values()) - 1
+            squares.append((error / bound) ** 2)
+            covered.append(
+                np.abs(error) < 1.96 * np.stack([relative(fits[row]) for row in range(2)])
+            )
+    assert len(squares) >= 97
+    # 200 squares of normal errors have a mean that is known to 10 %.
+    assert (np.mean(squares, axis=(0, 1)) < 1.35).all(), np.mean(squares, axis=(0, 1))
+    assert 0.92 < np.mean(covered) < 0.98
+
+
+@pytest.mark.slow
+def test_a_current_helps_the_recordings_without_one(drawn):
+    paths = "calibration/0", "loaded/0", "loaded/1"
+    calibration, first, second = (drawn[path] for path in paths)
+    mixed = jointly([calibration, first, second.replace(current=None)]).fits
+    without = jointly([calibration, *(one.replace(current=None) for one in (first, second))]).fits
+    assert (mixed.verdicts == "successful").all()
+    assert max(np.abs(off(mixed[row])).max() for row in range(2)) < WITHIN
+    gained = [relative(mixed[row]) / relative(without[row]) for row in range(2)]
+    assert (gained[0] < 0.6).all()
+    # It determines Z_th, of whose error the second trial has its share.
+    assert (gained[1] < 0.95).all()
+    assert (gained[1] > gained[0]).all()
+
+
+@pytest.mark.slow
+def test_a_record_with_a_disturbed_period_leaves_its_current_out_and_says_so(pair, joint):
+    calibration, recording = pair
+    spike = np.array(recording.current)
+    spike[1500:1503] += 30 * np.ptp(spike)
+    fit = jointly([calibration, recording.replace(current=spike)]).fits[0]
+    if fit.verdict == "successful":
+        assert int(fit.remarks) & Remark.current_unused
+    else:
+        assert fit.verdict in ("misfit", "inconsistent", "saturated", "wrong_unit")
