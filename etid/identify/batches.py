@@ -9,6 +9,7 @@ are not affected.
 
 import contextlib
 import dataclasses
+import functools
 import itertools
 import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -53,7 +54,7 @@ HELD = 2**21  # samples of waiting recordings; above, a call has fewer lanes, bu
 AHEAD = 2  # chunks that are read and inspected in advance
 
 
-@stored_jit
+@functools.partial(stored_jit, batch=True)
 def _chunk(
     lanes: Any,
     count: Int[Array, ""],

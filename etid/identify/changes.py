@@ -27,7 +27,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-import scipy.special
+import scipy
 from jaxtyping import Array, Bool, Complex, Float
 
 from etid.circuits.circuit import AbstractCircuit
@@ -291,7 +291,7 @@ def _slopes(
     for first in range(0, count, size):
         rows = np.minimum(np.arange(first, first + size), count - 1)  # padded with the last one
         part = jax.tree.map(lambda leaf, rows=rows: np.asarray(leaf)[rows], circuits)
-        parts.append(np.asarray(log_slopes(part, driver, jnp.asarray(frequency))))
+        parts.append(np.asarray(log_slopes(part, driver, jax.device_put(frequency))))
     return np.concatenate(parts)[:count]
 
 

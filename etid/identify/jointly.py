@@ -6,6 +6,7 @@ standard errors separate the own error of a trial from the error that all trials
 """
 
 import dataclasses
+import functools
 import itertools
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -111,7 +112,7 @@ class _Start(NamedTuple):
     changed: Bool[Array | np.ndarray, "*lane"]
 
 
-@stored_jit
+@functools.partial(stored_jit, batch=True)
 def _alone(lanes: Any, count: Int[Array, ""], model: Joint, driver: HarmonicDriver) -> _Start:
     frequency = jnp.asarray(lanes.frequency)[0]
     known = shape_of(driver, frequency)
@@ -134,7 +135,7 @@ def _alone(lanes: Any, count: Int[Array, ""], model: Joint, driver: HarmonicDriv
     return each(one, lanes, count)
 
 
-@stored_jit
+@functools.partial(stored_jit, batch=True)
 def _together(
     model: Joint,
     groups: list[Loads],

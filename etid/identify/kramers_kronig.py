@@ -17,8 +17,8 @@ import dataclasses
 
 import numpy as np
 import numpy.typing as npt
+import scipy
 from jaxtyping import Complex, Float
-from scipy.special import chdtri
 
 from etid.circuits.overview import Overview, Overviewed
 from etid.identify.impedance import MISFIT_CHI2
@@ -133,7 +133,7 @@ def kramers_kronig(
     residual = (z - fitted) / np.abs(fitted)
     if stderr is None:
         return KramersKronig(f, fitted, residual, chosen + 1, None, FAIL)
-    by_chance = float(chdtri(degrees[chosen], FALSE_ALARMS)) / degrees[chosen]
+    by_chance = float(scipy.special.chdtri(degrees[chosen], FALSE_ALARMS)) / degrees[chosen]
     limit = max(MISFIT_CHI2, by_chance)
     return KramersKronig(f, fitted, residual, chosen + 1, squares[chosen], limit)
 

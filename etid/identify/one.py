@@ -242,7 +242,7 @@ class _Same:
 
 @functools.lru_cache(maxsize=KEPT)
 def _known_of(driver: _Same, frequency: bytes, shared: bool, estimator: AbstractEstimator) -> Any:
-    return known_at(jnp.asarray(np.frombuffer(frequency)), driver.driver, shared, estimator)
+    return known_at(jax.device_put(np.frombuffer(frequency)), driver.driver, shared, estimator)
 
 
 @dataclasses.dataclass

@@ -32,8 +32,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
+import scipy
 from jaxtyping import Array, Float, Int
-from scipy.special import softmax
 
 from etid.circuits.circuit import AbstractCircuit, Circuit
 from etid.estimators.element_limits import Limits
@@ -182,7 +182,7 @@ def drawn(
         density = -0.5 * (FREEDOM + mean.size) * np.log1p(np.sum(t**2, axis=1) / FREEDOM)
         log_weight = -costs(q) - density
         log_weight = np.where(np.isfinite(log_weight), log_weight, -np.inf)
-        weights = softmax(log_weight)
+        weights = scipy.special.softmax(log_weight)
         found = effective(weights)
         if found > most:
             best, most = (q, weights), found
@@ -197,15 +197,15 @@ def drawn(
 def _flattened(log_weight: Float[np.ndarray, " draw"], enough: float) -> Float[np.ndarray, " draw"]:
     """Weights to the largest power up to 1 that leaves `enough` effective draws."""
     low, high = 0.0, 1.0
-    if effective(softmax(log_weight)) >= enough:
-        return softmax(log_weight)
+    if effective(scipy.special.softmax(log_weight)) >= enough:
+        return scipy.special.softmax(log_weight)
     for _ in range(20):
         middle = (low + high) / 2
-        if effective(softmax(middle * log_weight)) < enough:
+        if effective(scipy.special.softmax(middle * log_weight)) < enough:
             high = middle
         else:
             low = middle
-    return softmax(np.where(np.isfinite(log_weight), low * log_weight, -np.inf))
+    return scipy.special.softmax(np.where(np.isfinite(log_weight), low * log_weight, -np.inf))
 
 
 def stretched(

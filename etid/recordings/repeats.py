@@ -23,7 +23,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-import scipy.fft
+import scipy
 from jaxtyping import Complex, Float, Int
 
 from etid.recordings.preflight import Inspected

@@ -14,7 +14,7 @@ honest, however far the true delays scatter.
 import math
 
 import numpy as np
-import scipy.special
+import scipy
 from jaxtyping import Float
 
 CHANCE = 0.05

@@ -34,7 +34,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import scipy.fft
+import scipy
 from jaxtyping import Array, Bool, Complex, Float, Int
 
 from etid.signals.harmonics import DRIFT_DEGREE, WINDOW, harmonics, namespace

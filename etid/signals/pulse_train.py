@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-import scipy.fft
+import scipy
 from jaxtyping import Bool, Complex, Float, Int
 
 from etid.signals.harmonics import fast_length
