@@ -371,3 +371,38 @@ def test_a_file_of_fits_keeps_changes(tmp_path):
     np.testing.assert_array_equal(back.fit.change, size)
     np.testing.assert_array_equal(back.fit.change_stderr, size**2)
     np.testing.assert_array_equal(back.table()["amplitude_change"], size[:, 3])
+
+
+def driven(loads, current_factor=(1.0, 1.0, 1.0)):
+    """V_out and current of loads behind the transformer, another one in each period."""
+    scenes = [
+        Scene((Trial(TRIAL, load),), snr_db=40.0, current_snr_db=40.0, trigger_jitter_rms=50e-9)
+        for load in loads
+    ]
+    records = [scene.simulate(seed=1)[TRIAL].without_v_th() for scene in scenes]
+    period = np.clip((records[0].time * records[0].pulse_rate).astype(int), 0, 2)
+    v_out, current = (
+        np.choose(period, [getattr(record, name) for record in records])
+        for name in ("v_out", "current")
+    )
+    return records[0].replace(v_out=v_out, current=current * np.take(current_factor, period))
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_an_element_that_moves_behind_a_measured_current_is_named(name):
+    """Behind a source impedance, the current changes with the load; V_out alone hides it."""
+    fit = etid.identify_skin(driven(falling(LOADS["dry"], name, 0.1)), throw=False)
+    assert fit.verdict == "changed"
+    change, error = (np.asarray(of) for of in (fit.change, fit.change_stderr))
+    expected = np.array([-0.1 * (one == name) for one in (*NAMES, "amplitude")])
+    # Four standard errors, and what is not linear in a change of 10 %: half its square.
+    assert (np.abs(change - expected) < 4 * error + 0.005).all()
+
+
+def test_a_driver_that_changes_moves_no_load_behind_a_measured_current():
+    """The current probe loses gain in one recording, both channels in another one."""
+    steady = [LOADS["dry"]] * 3
+    assert etid.identify_skin(driven(steady, (1, 1, 0.98)), throw=False).verdict == "changed"
+    record = driven(steady, (1, 1, 0.8))
+    both = record.replace(v_out=np.where(record.time < 2 / 60, 1, 0.8) * record.v_out)
+    assert etid.identify_skin(both).verdict == "successful"

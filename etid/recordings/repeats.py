@@ -13,6 +13,10 @@ rotation of the phase corrects the remaining fraction. Smooth parts of a deviati
 pulses but from a drift of the mean or from mains hum of 50 Hz. They are projected out as a
 polynomial over the period.
 
+A driver with a source impedance turns a change of the load into one of a measured current X too.
+Both are recorded at once, so the module then compares X̄ Y_p − Ȳ X_p, which no change of the driver
+moves. Its projection on X̄ Ȳ, weighted by the noise, is the change of the logarithm of Y / X.
+
 **Aliases** rotate by e^(−j2πδ) if a cut is late by a fraction δ of a sample; the rest does not.
 `turn` is the direction of this rotation. A deviation in this direction proves nothing.
 """
@@ -144,7 +148,7 @@ def repeats(seen: Sequence[Inspected]) -> list[Repeats | None]:
         coarse = one.coarse_th > 0 or one.coarse_out > 0
         if one.periods[0] > 1 and one.is_periodic and not coarse:
             of = one.recording
-            key = one.periods[0], of.sample_rate, of.pulse_rate
+            key = one.has_current, one.periods[0], of.sample_rate, of.pulse_rate
             alike.setdefault(key, []).append(number)
     for numbers in alike.values():
         group = [seen[number] for number in numbers]
@@ -180,6 +184,9 @@ def _of_equal_periods(
     loaded = [_turned(v, one) for one, (_, v) in zip(group, records, strict=True)]
     own = _deviations(loaded, at, known, sigma)
     sigma = np.array([one.trusted_th for one in group])
+    if group[0].has_current:
+        currents = [current for current, _ in records]
+        return _of_currents(group[0], known, loaded, currents, own, sigma, at)
     low = bands(of.sample_rate, of.pulse_rate, UNLOADED)
     unloaded = _deviations([v_th for v_th, _ in records], at, low, sigma)
     weight, smooth = 1 / unloaded.variance, _smooth(unloaded.mean, low)
@@ -194,14 +201,72 @@ def _of_equal_periods(
     noise = np.maximum(1.0, (weight[:, None, :] * _power(rest)).sum((1, 2)) / freedom)
     pulses = zip(group, records, strict=True)
     width = [_phase(v, *one.limits[0]) / periods for one, (v, _) in pulses]
-    turn = np.exp(-2j * np.pi * own.late)
+    variance = noise / total + (CUT / np.square(width)) ** 2
+    parts = own.gain, own.power, smooth, own.variance, _turn(own.late), amplitude, variance
+    return _rows(of.sample_rate, known, parts)
+
+
+def _rows(sample_rate: float, known: Bands, parts: tuple[np.ndarray, ...]) -> list[Repeats]:
+    """The rows of the fields after `sample_rate`."""
+    frequency = known.middle * (sample_rate / (2 * np.pi))
+    rate = np.asarray(sample_rate)
+    return [Repeats(frequency, rate, *of_row) for of_row in zip(*parts, strict=True)]
+
+
+def _turn(late: Float[np.ndarray, "lane period"]) -> Complex[np.ndarray, "lane period"]:
+    """Direction of the aliases of cuts with these delays [samples]."""
+    turn = np.exp(-2j * np.pi * late)
     turn -= turn.mean(1, keepdims=True)
     size = np.linalg.norm(turn, axis=1, keepdims=True)
-    turn = np.where(size > ALIGNED, turn / np.maximum(size, ALIGNED), 0)
-    frequency = known.middle * (of.sample_rate / (2 * np.pi))
-    rate, variance = np.asarray(of.sample_rate), noise / total + (CUT / np.square(width)) ** 2
-    parts = own.gain, own.power, smooth, own.variance, turn, amplitude, variance
-    return [Repeats(frequency, rate, *of_row) for of_row in zip(*parts, strict=True)]
+    return np.where(size > ALIGNED, turn / np.maximum(size, ALIGNED), 0)
+
+
+def _of_currents(
+    first: Inspected,
+    known: Bands,
+    loaded: Sequence[Float[np.ndarray, "_"]],
+    currents: Sequence[Float[np.ndarray, "_"]],
+    own: "_Deviations",
+    sigma: Float[np.ndarray, " lane"],
+    at: Float[np.ndarray, "lane period"],
+) -> list[Repeats]:
+    """Deviations of the quotients of voltage and current.
+
+    Args:
+        first: One of the recordings; all have equal rates.
+        known: The bands.
+        loaded: Voltages.
+        currents: Currents.
+        own: Deviations of the voltages.
+        sigma: Noise of the currents.
+        at: Start of each period [samples].
+    """
+    other = _deviations(currents, at, known, sigma)
+    pairs = []
+    for records, of in ((loaded, own), (currents, other)):
+        raw = _transforms(records, _starts(records, at, known), known)
+        unit = np.sqrt(of.power.sum(1))  # squares of small currents would underflow
+        turned = raw * _turns(own.late * (2 * np.pi / known.size), raw.shape[2])  # one clock
+        turned = turned / unit[:, None, None]
+        noise = np.repeat(of.variance * of.power / unit[:, None] ** 2, known.number, axis=1)
+        pairs.append((turned, turned.mean(1), noise))
+    (y, y_mean, y_noise), (x, x_mean, x_noise) = pairs
+    white = 1 / np.sqrt(_power(x_mean) * y_noise + _power(y_mean) * x_noise)
+    mean, by_y, by_x = white * x_mean * y_mean, white * x_mean, white * y_mean
+    deviation = by_y[:, None] * y - by_x[:, None] * x
+    power = np.maximum(np.add.reduceat(_power(mean), known.edges, axis=1), TINY)
+    smooth, gain = [], []
+    # A drift of either channel is a polynomial times the mean of the other one.
+    for row in range(len(mean)):
+        drifts = np.concatenate([by_y[row] * known.polynomials, by_x[row] * known.polynomials])
+        stacked = np.linalg.qr(np.concatenate([np.real(drifts), np.imag(drifts)], axis=1).T)[0].T
+        basis = stacked[:, : mean.shape[1]] + 1j * stacked[:, mean.shape[1] :]
+        rest = deviation[row] - np.real(deviation[row] @ basis.conj().T) @ basis
+        gain.append(np.add.reduceat(rest * mean[row].conj(), known.edges, axis=1) / power[row])
+        smooth.append(np.add.reduceat(mean[row].conj() * basis, known.edges, axis=1))
+    none = np.zeros(at.shape)  # an amplitude that changes in both records does no harm
+    parts = np.stack(gain), power, np.stack(smooth), 1 / power, _turn(own.late)
+    return _rows(first.recording.sample_rate, known, (*parts, none, np.ones(len(none))))
 
 
 def _phase(v: Float[np.ndarray, " time"], low: float, high: float) -> int:
@@ -247,8 +312,7 @@ def _deviations(
 ) -> "_Deviations":
     """Deviations of the periods with the starts `at` [samples]."""
     periods = at.shape[1]
-    last = np.array([v.size - known.length for v in records])
-    starts = np.minimum(np.rint(at), last[:, None]).astype(int)
+    starts = _starts(records, at, known)
     late = starts - at
     raw = _transforms(records, starts, known)
     power, mean, weight, gain = _compared(raw, late, known)
@@ -280,6 +344,14 @@ def _deviations(
         sure = low > overall[:, 0] * (1 + SURE * math.sqrt(2 / ((single - 2) * (periods - 1))))
         noise[:, :single] = np.where(sure, low, overall[:, 0])[:, None]
     return _Deviations(gain, weight, noise / weight, mean, late)
+
+
+def _starts(
+    records: Sequence[Float[np.ndarray, "_"]], at: Float[np.ndarray, "lane period"], known: Bands
+) -> Int[np.ndarray, "lane period"]:
+    """The sample at which each period is cut."""
+    last = np.array([v.size - known.length for v in records])
+    return np.minimum(np.rint(at), last[:, None]).astype(int)
 
 
 def _noise_of_single(gain: np.ndarray, weight: np.ndarray) -> np.ndarray:
