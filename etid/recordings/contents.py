@@ -204,11 +204,11 @@ class Scan:
                     f"lies more than {limits.DEPTH} groups deep",
                     remedy="Use a path such as 's01/dry/03'",
                 )
-            attributes = attribute_names(group)
-            near = "kind" in attributes or near_miss("kind", attributes)
+            present = attribute_names(group)
+            near = "kind" in present or near_miss("kind", present)
             names = sorted(group, key=_natural)
             if near or "v_out" in names:
-                return self._inspect(group, path, names)
+                return self._inspect(group, path, names, present)
             for name in names:
                 child = f"{path}/{name}".lstrip("/")
                 with self._reported(child):
@@ -219,11 +219,12 @@ class Scan:
         """Continue the walk in a member of a group that is not a recording."""
         link = local_link(group, name)
         if isinstance(link, h5py.SoftLink):
-            if group.get(name) is None:
+            member = group.get(name)
+            if member is None:
                 raise RecordingError(
                     f"is a dangling link to {link.path!r}", remedy="Remove or repair it"
                 )
-            if isinstance(group[name], h5py.Group):
+            if isinstance(member, h5py.Group):
                 raise RecordingError(
                     f"is a soft link to the group {link.path!r}", remedy="Remove the link"
                 )
@@ -242,7 +243,7 @@ class Scan:
                 remedy="Make it a group with the datasets v_th and v_out",
             )
 
-    def _inspect(self, group: h5py.Group, path: str, names: list[str]) -> None:
+    def _inspect(self, group: h5py.Group, path: str, names: list[str], present: list[str]) -> None:
         """Check a recording group against the schema, field by field."""
         before = len(self.problems)
         if not path:
@@ -250,8 +251,7 @@ class Scan:
             return self._report(path, "kind", "the root of a file cannot be a recording", remedy)
         with self._reported(path, "path"):
             tidy_path(path)
-        present = attribute_names(group)
-        found = self._attributes(group, schema.at("group attribute"), path, "")
+        found = self._attributes(group, present, schema.at("group attribute"), path, "")
         kind = found.get("kind", "")
         self._kinds[path] = kind
         for field in schema.at("group attribute").values():
@@ -301,11 +301,11 @@ class Scan:
                 self._report(path, f"{of}{name}", message, "Rename it")
 
     def _attributes(
-        self, owner: h5py.HLObject, known: dict[str, Field], path: str, of: str
+        self, owner: h5py.HLObject, names: list[str], known: dict[str, Field], path: str, of: str
     ) -> dict[str, Any]:
         """Parsed values of the attributes in the schema; invalid values are reported."""
         found: dict[str, Any] = {}
-        for name in attribute_names(owner):
+        for name in names:
             if name not in known:
                 continue
             try:
@@ -324,10 +324,10 @@ class Scan:
         """Shape, dtype and scale of a dataset; its samples must be in this file."""
         link = local_link(group, field.name)
         remedy = "Copy the samples into the file"
-        if group.get(field.name) is None:
+        dataset = group.get(field.name)
+        if dataset is None:
             target = getattr(link, "path", "")
             raise RecordingError(f"is a dangling link to {target!r}", remedy="Repair the link")
-        dataset = group[field.name]
         if not isinstance(dataset, h5py.Dataset):
             what = "group" if isinstance(dataset, h5py.Group) else "datatype"
             raise RecordingError(f"is a {what}", remedy=f"Add {field.expects} as a dataset")
@@ -352,8 +352,9 @@ class Scan:
         check_size(dataset)
         before = len(self.problems)
         known, of = schema.at("dataset attribute"), f"{field.name}."
-        found = self._attributes(dataset, known, path, of)
-        self._near_misses(attribute_names(dataset), known, path, of)
+        present = attribute_names(dataset)
+        found = self._attributes(dataset, present, known, path, of)
+        self._near_misses(present, known, path, of)
         if len(self.problems) == before and found.get("unit") != field.unit:
             what = f"is {found['unit']!r}" if "unit" in found else "is missing"
             raise RecordingError(
