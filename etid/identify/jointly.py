@@ -35,6 +35,7 @@ from etid.estimators.lanes import (
     stacked,
     unstacked,
 )
+from etid.estimators.maximum_likelihood import given_driver
 from etid.estimators.maximum_likelihood.driver import Calibrations
 from etid.estimators.maximum_likelihood.estimator import description
 from etid.estimators.registry import MAXIMUM_LIKELIHOOD, register_description
@@ -99,7 +100,7 @@ register_description(
 
 
 class _Start(NamedTuple):
-    """Loads identified one by one with a fixed Z_th; a joint fit starts from them.
+    """Loads identified one by one (`fit_alone`); a joint fit starts from them.
 
     Attributes:
         loads: The loads.
@@ -116,7 +117,10 @@ class _Start(NamedTuple):
 def _alone(lanes: Any, count: Int[Array, ""], model: Joint, driver: HarmonicDriver) -> _Start:
     frequency = jnp.asarray(lanes.frequency)[0]
     known = shape_of(driver, frequency)
-    given = model.around(model.calibrations.start(), frequency, slopes=False)
+    if isinstance(lanes, HarmonicsWithCurrent):
+        given = given_driver.given(driver, frequency, model.shared)
+    else:
+        given = model.around(model.calibrations.start(), frequency, slopes=False)
 
     def one(lane: Harmonics) -> _Start:
         spectrum, sample_rate = lane.spectrum, jnp.asarray(lane.sample_rate)

@@ -206,9 +206,12 @@ def fit_alone(
 ) -> tuple[Own, optx.RESULTS, Float[Array, ""], Float[Array, ""], Bool[Array, ""]]:
     """Identify the load of one recording; Z_th is fixed.
 
+    With a current Z_th is not fixed: the three records may know it better than the calibrations,
+    whose error would be a misfit.
+
     Args:
         model: Structure of the circuit and its prior.
-        driver: The driver at the harmonics of the recording, without z.
+        driver: The driver at the harmonics of the recording, with z only if there is a current.
         spectrum: The recording.
         sample_rate: Its sampling rate [Hz].
         candidates: Starts, stacked; the start that predicts best is refined.
@@ -226,8 +229,9 @@ def fit_alone(
     if isinstance(lane, LoadWithCurrent):
         start = best_start(lane, jnp.pad(candidates.vector(), ((0, 0), (0, 1))))
         start = with_current.refined(lane, start, with_current.ROUGHLY).value
-        solution = with_current.refined(lane, start)
-        own, seen = LoadWithCurrentUnknowns.of(solution.value), lane.seen(solution.value)
+        solution = with_current.refined(lane, jnp.concatenate([start, driver.mean]))
+        own = LoadWithCurrentUnknowns.of(solution.value[: start.size])
+        seen = lane.seen(solution.value)
         terms, error, hum = 2 * terms, lane.rrse(seen), seen.shows_hum()
     else:
         solution = of_load.refined(lane, best_start(lane, candidates.vector()))
@@ -235,4 +239,4 @@ def fit_alone(
         error = complex_rrse(g * spectrum.x, spectrum.y, spectrum.selected)
         hum = shows_hum(known, g)
     squares = 2 * solution.stats["normal_equations"].objective
-    return own, solution.result, squares / (terms - solution.value.size), error, hum
+    return own, solution.result, squares / (terms - own.vector().size), error, hum
