@@ -126,6 +126,15 @@ def test_a_driver_that_has_changed_is_told(driver, both):
     assert fit.verdict in ("misfit", "inconsistent")
 
 
+def test_a_current_whose_gain_drifts_is_told(recording, driver):
+    """By 1 % over the record. At 40 dB, R_p was seven standard errors off, and successful."""
+    drift = 1 + 0.01 * np.arange(recording.v_out.size) / recording.v_out.size
+    fit = etid.identify_skin(
+        recording.replace(current=drift * recording.current), driver, throw=False
+    )
+    assert fit.verdict == "changed"
+
+
 def test_an_offset_and_a_common_delay_are_no_contradiction(recording, driver):
     shifted = {name: np.roll(getattr(recording, name), 3) for name in ("v_out", "current")}
     late = recording.replace(v_out=shifted["v_out"], current=shifted["current"] + 1e-4)

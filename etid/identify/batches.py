@@ -31,18 +31,17 @@ from etid.identify.one import (
     Tried,
     failed_fit,
     is_shared,
+    judged,
     known_of,
     note,
     notes_of,
     refined,
-    remarks_on,
     skin_lane,
 )
 from etid.identify.planning import Planned, Refusal, planned
 from etid.identify.prefetch import prefetch
 from etid.recordings.preflight import Inspected
 from etid.recordings.recording import Recording
-from etid.recordings.repeats import repeats
 from etid.results.feed import AbstractFeed
 from etid.results.fits import Fit, joined
 from etid.selection.common import common, deserves
@@ -181,8 +180,7 @@ class _Queue:
         rows, lanes, seen = self.rows, self.lanes, self.seen
         self.rows, self.lanes, self.seen, self.held = [], [], [], 0
         found = refined(lanes, seen, self._fits, self.driver, self.candidates)
-        remarks = [remarks_on(one, self.estimator) for one in seen]
-        return _Part(rows, found.concluded(self.driver, remarks, repeats(seen)))
+        return _Part(rows, judged(found, self.driver, seen, self.estimator))
 
     def _fits(self, lanes: Sequence[AbstractLane], circuit: AbstractCircuit) -> Fit:
         of = self.driver, self.known, circuit, self.estimator

@@ -35,7 +35,7 @@ from etid.recordings.remarks import Remark
 from etid.recordings.repeats import Repeats, repeats
 from etid.results.data import with_data
 from etid.results.driver import Driver, HarmonicDriver
-from etid.results.feed import AbstractFeed
+from etid.results.feed import MEASURED_CURRENT, AbstractFeed
 from etid.results.fits import Fit, IdentificationError, Support
 from etid.results.verdicts import message, verdict, verdicts_of
 from etid.selection.evidence import best
@@ -168,7 +168,7 @@ def candidate_fits(
         return stacked(jax.device_get(found))
 
     found = refined([lane], [seen], fit, feed, candidates)
-    found = found.concluded(feed, [remarks_on(seen, estimator)], repeats([seen]))
+    found = judged(found, feed, [seen], estimator)
     return found[0], found.chosen(0)
 
 
@@ -424,18 +424,36 @@ def _chosen(fits: dict[int, Fit]) -> int:
     return best(fits) if len(fits) > 1 else next(iter(fits))
 
 
+def judged(
+    found: Tried, driver: AbstractFeed, seen: Sequence[Inspected], estimator: AbstractEstimator
+) -> Tried:
+    """Fits with remarks, and with changes during the records; see `concluded`.
+
+    A current that is used beside the driver shows smaller changes of the load than the driver does,
+    and changes of its own gain.
+    """
+    remarks = [remarks_on(one, estimator) for one in seen]
+    found = found.concluded(driver, remarks, repeats(seen))
+    if not (isinstance(estimator, MaximumLikelihood) and estimator.with_current):
+        return found
+    by_current = [of for one in seen if (of := one.by_current) is not None]
+    return found.concluded(MEASURED_CURRENT, remarks, repeats(by_current))
+
+
 def concluded(
     fits: Fit, driver: AbstractFeed, remarks: Sequence[int], repeats: Sequence[Repeats | None]
 ) -> Fit:
     """Fits with the remarks on their recordings and the changes during the records.
 
     Args:
-        fits: Fits of circuits of one kind, stacked; they may have remarks already.
+        fits: Fits of circuits of one kind, stacked; they may have remarks and changes already.
         driver: The driver of these fits.
         remarks: Remarks on the recordings.
         repeats: The periods of the recordings.
     """
     change = changes.of_fits(fits, driver, repeats)
+    before = (fits.verdict == "changed")[:, None]
+    known, known_stderr = fits.known_changes
     names, remarked = fits.verdict, fits.remarks | np.asarray(remarks, int)
     coarse = (remarked & Remark.coarse_converter) > 0
     names = np.where(coarse & (names == "insensitive"), "resolution", names)
@@ -446,8 +464,8 @@ def concluded(
     return dataclasses.replace(
         fits,
         remarks=remarked,
-        change=change.size,
-        change_stderr=change.stderr,
+        change=np.where(before, known, change.size),
+        change_stderr=np.where(before, known_stderr, change.stderr),
         result=verdicts_of(names),
         support=support,
     )

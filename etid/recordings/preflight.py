@@ -28,6 +28,7 @@ SHORTEST = 4 * TAPS + 104  # [samples] edges of the interpolation, and 104 sampl
 FLAT = 8.0
 RAIL = 3  # equal extreme samples in a row; a noisy or sloping signal does not produce them
 JUMP = 8.0  # [converter steps] a clipped signal reaches and leaves its rail in larger jumps
+HELD = 1e-5  # noise over the span of a record, below which equal samples in a row are no fault
 POWER = 1.01  # largest variance of v_out relative to v_th: a passive load takes power
 UNIT = 30.0  # ratio of v_out to v_th beyond which their units differ, not only their order
 # [A] peak-to-peak; stimulators of nerves and skin stay below 0.1 A in each direction
@@ -310,11 +311,13 @@ def preflight(seen: Inspected, *, periodic: bool = False) -> str | None:
     noise = FLAT * np.array([seen.sigma_th, seen.sigma_out])
     if ((seen.spans <= noise) | (seen.spans == 0)).any():
         return "flat"
-    # A current source holds its current, so a flat top of the current is no fault.
+    # A current source holds its current, so a flat top of the current is no fault without noise.
     th, out = seen.recorded_limits
-    if not seen.has_current and _is_saturated(seen.recorded_th, th, seen.step_th, of):
+    volts = None if seen.has_current else of.adc_range
+    held = seen.has_current and seen.sigma_th <= max(seen.step_th, HELD * seen.spans[0])
+    if not held and _is_saturated(seen.recorded_th, th, seen.step_th, volts):
         return "saturated"
-    if _is_saturated(seen.recorded_out, out, seen.step_out, of):
+    if _is_saturated(seen.recorded_out, out, seen.step_out, of.adc_range):
         return "saturated"
     if seen.has_current and not _is_plausible(seen):
         return "wrong_unit"
@@ -370,11 +373,11 @@ def _is_saturated(
     v: Float[np.ndarray, " time"],
     limits: Float[np.ndarray, " limit"],
     step: float,
-    recording: Recording,
+    adc_range: tuple[float, float] | None,
 ) -> bool:
     """Whether samples are at a limit of the converter, or a flat top begins and ends in jumps."""
-    if recording.adc_range is not None:
-        low, high = recording.adc_range
+    if adc_range is not None:
+        low, high = adc_range
         return bool(limits[0] <= low + step / 2 or limits[1] >= high - step / 2)
     for extreme in limits:
         at_rail = v == extreme
