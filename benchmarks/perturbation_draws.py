@@ -59,8 +59,13 @@ class Answer:
 
     @property
     def stderrs(self) -> Float[np.ndarray, " element"]:
-        """Errors in standard errors; in bounds, where the method gives no standard error."""
-        return np.abs(self.error) / np.where(self.stderr > 0, self.stderr, self.bound)
+        """Errors in standard errors; in bounds, where the method gives no standard error.
+
+        An infinite element is infinitely far off, although its standard error is infinite, too.
+        """
+        far = np.abs(self.error)
+        size = np.where(self.stderr > 0, self.stderr, self.bound)
+        return np.divide(far, size, out=far.copy(), where=np.isfinite(far))
 
     @property
     def wrong_elements(self) -> np.ndarray:

@@ -243,6 +243,7 @@ def answer(error, verdict="successful", stderr=0.01, bound=0.01, **more) -> Answ
         (answer((0.25, 0, 0), words=True), "silent"),
         (answer((0.06, 0, 0), stderr=np.nan), "silent"),  # a method without standard errors
         (answer(NOTHING, "saturated"), "said"),
+        (answer((np.inf, 0, 0), stderr=(np.inf, 0.1, 0.1), bound=0.5), "silent"),
     ],
 )
 def test_an_answer_is_right_or_refused_or_says_so_or_is_silent(of, kind):
