@@ -142,6 +142,43 @@ def test_five_amplitudes_give_the_values_of_kaczmarek_and_webster():
     assert np.all(np.abs(error) < 4 * stderr), error / stderr  # one of 4 elements in 4 000 fits
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "amplitudes",
+    [(0.1e-3, 0.3e-3, 1e-3, 2.5e-3, 5e-3), (1e-3, 3e-3, 5e-3), (0.5e-3, 5e-3)],
+)
+def test_elements_and_intervals_are_right_at_any_amplitudes(amplitudes):
+    """At 1, 3 and 5 mA the resistance is far below R_p in every record.
+
+    Before, such fits ended where the noise of the current explained everything.
+    """
+    rate, slower, draws = 20e3, 8, 30  # everything slower: few harmonics, so that a fit is cheap
+    truth = np.array([895.0, 60.1e3, slower * 1e-9, 0.585e-3])
+    at = np.arange(1000) / rate % (1 / PULSE_RATE) / slower
+    volts = [stepped(one, at) for one in amplitudes]
+    verdicts, off = [], []
+    for seed in range(draws):
+        rng = np.random.default_rng([seed, 17])
+
+        def noisy(v: np.ndarray, rng: np.random.Generator = rng) -> etid.Samples:
+            return etid.Samples(v + 1e-3 * np.sqrt(np.mean(v**2)) * rng.standard_normal(v.size))
+
+        of = [
+            etid.Recording(
+                v_out=noisy(v), current=noisy(one * pulses(at)), sample_rate=rate, pulse_rate=60.0
+            )
+            for one, v in zip(amplitudes, volts, strict=True)
+        ]
+        fit = etid.identify_amplitudes(of, throw=False)
+        verdicts.append(fit.verdict)
+        error = np.asarray(fit.circuit.values()) - truth
+        assert np.abs(error / truth).max() < 0.02
+        off.append(np.abs(error) / np.sqrt(np.diag(fit.cov)))
+    assert verdicts.count("successful") == draws
+    # Of 120 intervals that depend on each other within a fit, fewer are right once in 1 000 times.
+    assert np.mean(np.array(off) < 1.96) > 0.85
+
+
 def following(amplitude: float, t: np.ndarray) -> np.ndarray:
     """Voltage [V] if the fall follows the current in 46.7 µs, and recovers in 52.8 and 642.6 µs.
 
@@ -204,7 +241,7 @@ def test_linear_skin_is_called_nonlinear_as_rarely_as_stated():
 
 @pytest.mark.slow
 def test_skin_that_recovers_slowly_is_a_misfit():
-    """Not an answer: R_p is 9 % and I_0 18 % too small, R_s eight times too large."""
+    """Not an answer: R_p is 8 % and I_0 14 % too small, R_s eight times too large."""
     t = np.arange(10_000) / SAMPLE_RATE
     of = []
     for amplitude in (0.1e-3, 0.3e-3, 1e-3):
@@ -221,7 +258,7 @@ def test_skin_that_recovers_slowly_is_a_misfit():
     fit = etid.identify_amplitudes(of, throw=False)
     assert fit.verdict == "misfit"
     wrong = np.asarray(fit.circuit.values()) / np.asarray(SKIN.values()) - 1
-    np.testing.assert_allclose(wrong[[1, 3]], [-0.09, -0.18], atol=0.02)
+    np.testing.assert_allclose(wrong[[1, 3]], [-0.08, -0.14], atol=0.02)
 
 
 @pytest.mark.slow

@@ -5,9 +5,14 @@ are those of `etid.estimators.maximum_likelihood.terms`, but the load need not b
 
     Y_k − V_k(X) e^(−jω_k τ),      V_k(X) = Z_L / (Z_L + Z_th) X_k for a linear load.
 
-If the load has a resistor that depends on its current, harmonic balance gives V(X). The noise of X
-is small, so that the linear gain at small currents weights it.
+If the load has a resistor that depends on its current, harmonic balance gives V(X).
+
+The weights are constant: a fit gets the variances of the terms from earlier estimates. If they
+followed the parameters, elements with a large gain would explain any residual by the noise of X,
+because a saturated V(X) hardly changes with them.
 """
+
+import dataclasses
 
 import equinox as eqx
 import jax
@@ -16,7 +21,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Complex, Float
 
 from etid.circuits.circuit import AbstractCircuit
-from etid.circuits.current_dependent import Norton, Signals, current_dependent, port
+from etid.circuits.current_dependent import Norton, Port, Signals, current_dependent, port
 from etid.estimators.element_prior import ElementPrior
 from etid.estimators.maximum_likelihood.gain import Gain
 from etid.estimators.maximum_likelihood.given_driver import AbstractGiven, GivenDriver
@@ -47,6 +52,7 @@ class Amplitudes(eqx.Module):
         spectra: The records.
         sample_rate: Their sampling rate [Hz].
         prior: Prior of the elements; None without one.
+        expected: Variances of the terms by the noise; None before the first estimate.
     """
 
     given: AbstractGiven
@@ -55,6 +61,18 @@ class Amplitudes(eqx.Module):
     spectra: Spectrum
     sample_rate: Float[Array, ""]
     prior: ElementPrior | None = None
+    expected: Float[Array, "record harmonic"] | None = None
+
+    def weighted(self, own: Float[Array, "record own"]) -> "Amplitudes":
+        """The same with the variances at these unknowns, by the linear gain at small currents.
+
+        That gain is right for most of a period: there is little current between the pulses.
+        """
+
+        def one(own: Float[Array, " own"], spectrum: Spectrum) -> Float[Array, " harmonic"]:
+            return variance(spectrum, self.gain(spectrum).undelayed(own))
+
+        return dataclasses.replace(self, expected=jax.vmap(one)(own, self.spectra))
 
     @property
     def count(self) -> int:
@@ -118,23 +136,30 @@ class Amplitudes(eqx.Module):
         admittance = reciprocal(self.feed.response(frequency).at[1 : known + 1].set(near))
         return Norton(x * admittance, admittance)
 
-    def loaded(self, own: Float[Array, " own"], spectrum: Spectrum) -> Complex[Array, " harmonic"]:
-        """Fourier coefficients of V_out [V], without delay."""
-        gain = self.gain(spectrum)
-        impedance = gain.impedance(own)
-        if current_dependent(impedance) is None:
-            return gain.undelayed(own) * spectrum.x
+    def port(self, own: Float[Array, " own"], spectrum: Spectrum) -> tuple[Port, Float[Array, ""]]:
+        """The source of the resistor that depends on its current, and its largest current [A].
+
+        The current is that of the resistance at small currents.
+        """
         known = spectrum.frequency.size
         number = jnp.arange(BEYOND * known + 1.0).at[0].set(STILL)
         frequency = spectrum.frequency[0] * number
         source = self.source(own, spectrum, frequency)
+        impedance = self.gain(spectrum).impedance(own)
         at = port(impedance, source, frequency_variable(frequency))
         r = as_complex(jnp.asarray(at.element.r))
         small = at.source.current * reciprocal(1 + at.source.admittance * r)
-        size = jnp.max(jnp.abs(to_time(small, 2 * BEYOND * known)))
+        return at, jnp.max(jnp.abs(to_time(small, 2 * BEYOND * known)))
+
+    def loaded(self, own: Float[Array, " own"], spectrum: Spectrum) -> Complex[Array, " harmonic"]:
+        """Fourier coefficients of V_out [V], without delay."""
+        gain = self.gain(spectrum)
+        if current_dependent(gain.impedance(own)) is None:
+            return gain.undelayed(own) * spectrum.x
+        at, size = self.port(own, spectrum)
         slope = at.element.typical_slope(2 * size)
         signals = Signals(*steady_state(at.element.current, slope, *at.source))
-        return at.outwards(signals).voltage[1 : known + 1]
+        return at.outwards(signals).voltage[1 : spectrum.frequency.size + 1]
 
     def predicted(
         self, own: Float[Array, " own"], spectrum: Spectrum
@@ -142,27 +167,19 @@ class Amplitudes(eqx.Module):
         """Fourier coefficients of V_out [V] of a record."""
         return self.gain(spectrum).turned(own, self.loaded(own, spectrum))
 
-    def weight(self, own: Float[Array, " own"], spectrum: Spectrum) -> Complex[Array, " harmonic"]:
-        """1/σ of both parts of a term; 0 where a harmonic is not used."""
-        expected = variance(spectrum, self.gain(spectrum).undelayed(own))
-        return as_complex(jnp.where(spectrum.selected, jnp.sqrt(2 / expected), 0.0))
-
-    def residual(
-        self, own: Float[Array, " own"], spectrum: Spectrum
-    ) -> Complex[Array, " harmonic"]:
-        """Terms of one record."""
-        return (spectrum.y - self.predicted(own, spectrum)) * self.weight(own, spectrum)
+    @property
+    def weight(self) -> Float[Array, "record harmonic"]:
+        """1/σ of both parts of each term; 0 where a harmonic is not used."""
+        assert self.expected is not None
+        return jnp.where(self.spectra.selected, jnp.sqrt(2 / self.expected), 0.0)
 
     def terms(self, q: Float[Array, " q"]) -> Float[Array, "record part"]:
         """Terms of all records."""
-        return jax.lax.map(lambda of: real_parts(self.residual(*of)), (self.own(q), self.spectra))
+        return self.scaled(jax.lax.map(lambda of: self.predicted(*of), (self.own(q), self.spectra)))
 
-    def scaled(
-        self, q: Float[Array, " q"], predicted: Complex[Array, "record harmonic"]
-    ) -> Float[Array, "record part"]:
+    def scaled(self, predicted: Complex[Array, "record harmonic"]) -> Float[Array, "record part"]:
         """The same, from predictions that are known already."""
-        weight = jax.vmap(self.weight)(self.own(q), self.spectra)
-        return real_parts((self.spectra.y - predicted) * weight)
+        return real_parts((self.spectra.y - predicted) * as_complex(self.weight))
 
     def __call__(self, q: Float[Array, " q"]) -> Float[Array, " term"]:
         """All terms."""
@@ -170,28 +187,26 @@ class Amplitudes(eqx.Module):
 
     def slopes(
         self, q: Float[Array, " q"]
-    ) -> tuple[Float[Array, "record part"], Float[Array, "record q part"]]:
-        """Terms of each record, and their derivatives with respect to all unknowns."""
+    ) -> tuple[Complex[Array, "record harmonic"], Complex[Array, "record q harmonic"]]:
+        """Predictions, and their derivatives with respect to all unknowns."""
         first, last = self.elements, self.elements + self.count
         others = jnp.delete(q, slice(first, last))  # all but the delays
 
-        def one(of: tuple[Array, Array, Spectrum]) -> tuple[Array, Array]:
-            number, own, spectrum = of
+        def one(of: tuple[Array, Spectrum]) -> tuple[Array, Array]:
+            number, spectrum = of
 
             def along(others: Float[Array, " other"]) -> tuple[Array, Array]:
                 there = jnp.concatenate([others[:first], q[first:last], others[first:]])
-                part = self.residual(self.own(there)[number], spectrum)
-                return part, part
+                value = self.predicted(self.own(there)[number], spectrum)
+                return value, value
 
-            by_other, part = jax.jacfwd(along, has_aux=True)(others)
-            weighted = spectrum.y * self.weight(own, spectrum) - part  # the prediction
+            by_other, value = jax.jacfwd(along, has_aux=True)(others)
             s = frequency_variable(spectrum.frequency)
-            by_delay = weighted * s * as_complex(1 / self.sample_rate)
+            by_delay = -value * s * as_complex(1 / self.sample_rate)
             rows = jnp.zeros((self.count, by_delay.size), by_delay.dtype).at[number].set(by_delay)
-            whole = jnp.concatenate([by_other.T[:first], rows, by_other.T[first:]])
-            return real_parts(part), real_parts(whole)
+            return value, jnp.concatenate([by_other.T[:first], rows, by_other.T[first:]])
 
-        return jax.lax.map(one, (jnp.arange(self.count), self.own(q), self.spectra))
+        return jax.lax.map(one, (jnp.arange(self.count), self.spectra))
 
 
 def currents(circuit: AbstractCircuit) -> Bool[np.ndarray, " element"]:
