@@ -22,7 +22,7 @@ from benchmarks.large_file import large_file
 from benchmarks.problem import START, Problem, harmonics, problem, problem_of, terms
 from benchmarks.provenance import write_csv
 from benchmarks.timing import first_and_warm, pin
-from etid.estimators.maximum_likelihood.load import WELL
+from etid.estimators.maximum_likelihood.load_fit import WELL
 from etid.signals.filtering import lfilter
 from etid.solvers.levenberg_marquardt import normal_equations
 

@@ -50,6 +50,13 @@ TESTS: Mapping[str, Sequence[str]] = {
         "other_circuit",
         "mains",
     ),
+    "estimators.maximum_likelihood.load_fit": (
+        "maximum_likelihood",
+        "own_circuits",
+        "current",
+        "other_circuit",
+        "mains",
+    ),
     "estimators.maximum_likelihood.terms": ("maximum_likelihood", "mains"),
     "estimators.non_parametric.fit": ("non_parametric",),
     "estimators.output_error.fit": ("output_error", "current", "identification"),

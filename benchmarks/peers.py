@@ -23,7 +23,7 @@ from benchmarks.problem import SAMPLES, START, ByNumPy, Problem, harmonics, prob
 from benchmarks.timing import first_and_warm
 from etid.estimators.estimate import MAX_STEPS
 from etid.estimators.harmonic_steiglitz_mcbride.iteration import fit_skin
-from etid.estimators.maximum_likelihood.load import WELL
+from etid.estimators.maximum_likelihood.load_fit import WELL
 from etid.estimators.steiglitz_mcbride.iteration import in_time, iterate
 from etid.identify.batches import each
 from etid.signals.filtering import lfilter

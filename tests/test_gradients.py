@@ -11,7 +11,7 @@ import pytest
 from jaxtyping import Array
 
 import etid
-from etid.estimators.maximum_likelihood import load as single_load
+from etid.estimators.maximum_likelihood import load_fit as single_load
 from etid.results.driver import ContinuousDriver
 from etid.simulation.scenes import Scene, Trial
 from etid.simulation.transformer import ResistorLoad, SkinLoad

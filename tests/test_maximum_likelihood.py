@@ -15,7 +15,7 @@ from etid.circuits.circuit import SkinRC
 from etid.circuits.elements import resistor
 from etid.estimators import registry
 from etid.estimators.lanes import Harmonics
-from etid.estimators.maximum_likelihood import load
+from etid.estimators.maximum_likelihood import load, load_fit
 from etid.estimators.maximum_likelihood import terms as likelihood
 from etid.estimators.maximum_likelihood.load import Load
 from etid.estimators.registry import MAXIMUM_LIKELIHOOD
@@ -134,7 +134,7 @@ def test_the_likeliest_start_is_taken_unless_it_is_bad(monkeypatch, starts, best
     spectrum = Spectrum(line, wave, wave, line, line, jnp.arange(8) < 5)
     for name, value in {"gain": None, "spectrum": spectrum, "unloaded": None}.items():
         object.__setattr__(of, name, value)
-    assert float(load._chosen(of, jnp.array(starts)[:, None])[0]) == best
+    assert float(load_fit._chosen(of, jnp.array(starts)[:, None])[0]) == best
 
 
 def test_the_gain_is_that_of_the_divider(driver):

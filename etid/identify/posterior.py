@@ -42,7 +42,8 @@ from etid.estimators.lanes import Harmonics, HarmonicsWithCurrent
 from etid.estimators.maximum_likelihood import with_current
 from etid.estimators.maximum_likelihood.estimator import MaximumLikelihood
 from etid.estimators.maximum_likelihood.given_driver import AbstractGiven, GivenDriver
-from etid.estimators.maximum_likelihood.load import Load, refined
+from etid.estimators.maximum_likelihood.load import Load
+from etid.estimators.maximum_likelihood.load_fit import refined
 from etid.estimators.maximum_likelihood.with_current import LoadWithCurrent
 from etid.estimators.registry import MAXIMUM_LIKELIHOOD, named
 from etid.identify.arguments import fed, require

@@ -20,10 +20,9 @@ from etid.estimators.joint.errors import Found, estimates
 from etid.estimators.joint.near import approached
 from etid.estimators.joint.terms import Current, DriverStudy, Joint, Loads, Own, in_turn
 from etid.estimators.maximum_likelihood import driver as calibrations
-from etid.estimators.maximum_likelihood import load as of_load
-from etid.estimators.maximum_likelihood import with_current
+from etid.estimators.maximum_likelihood import load_fit, with_current
 from etid.estimators.maximum_likelihood.given_driver import GivenDriver
-from etid.estimators.maximum_likelihood.load import SLIGHT
+from etid.estimators.maximum_likelihood.load_fit import SLIGHT
 from etid.estimators.maximum_likelihood.terms import shows_hum
 from etid.estimators.maximum_likelihood.with_current import LoadWithCurrent
 from etid.estimators.unknowns import LoadUnknowns, LoadWithCurrentUnknowns
@@ -190,7 +189,7 @@ def _refitted(
         if isinstance(lane, LoadWithCurrent):
             solution = with_current.refined(lane, start)
         else:
-            solution = of_load.refined(lane, start)
+            solution = load_fit.refined(lane, start)
         return type(own).of(solution.value), solution.result
 
     return in_turn(one, loads, owns)
@@ -234,7 +233,7 @@ def fit_alone(
         seen = lane.seen(solution.value)
         terms, error, hum = 2 * terms, lane.rrse(seen), seen.shows_hum()
     else:
-        solution = of_load.refined(lane, best_start(lane, candidates.vector()))
+        solution = load_fit.refined(lane, best_start(lane, candidates.vector()))
         own, (g, known) = LoadUnknowns.of(solution.value), lane.predicted(solution.value)
         error = complex_rrse(g * spectrum.x, spectrum.y, spectrum.selected)
         hum = shows_hum(known, g)

@@ -18,7 +18,7 @@ from etid.estimators.estimator import (
 )
 from etid.estimators.judgement import STRAINED, judged, unless
 from etid.estimators.lanes import Harmonics, HarmonicsWithCurrent
-from etid.estimators.maximum_likelihood import given_driver, load, with_current
+from etid.estimators.maximum_likelihood import given_driver, load_fit, with_current
 from etid.estimators.maximum_likelihood.given_driver import AbstractGiven, GivenCurrent, GivenDriver
 from etid.estimators.refined_driver import from_harmonics
 from etid.estimators.score_tests import missing_pole
@@ -133,7 +133,7 @@ class MaximumLikelihood(AbstractEstimator):
             fit = unless(fit, disagrees, RESULTS.inconsistent)
         else:
             starts = known.starts(spectrum, rate, circuit)
-            found = load.fit_circuit(known, circuit, spectrum, rate, starts, prior)
+            found = load_fit.fit_circuit(known, circuit, spectrum, rate, starts, prior)
             estimate, far, other = found
             fit = judged(estimate, circuit, driver.result, str(self), self.bounds)
         if known.shape is not None:

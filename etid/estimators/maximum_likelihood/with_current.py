@@ -29,7 +29,8 @@ from etid.estimators.element_prior import ElementPrior
 from etid.estimators.estimate import DELAY_WIDTH, MAX_STEPS, SOLVER, Estimate
 from etid.estimators.maximum_likelihood.gain import Gain
 from etid.estimators.maximum_likelihood.given_driver import GivenDriver
-from etid.estimators.maximum_likelihood.load import FAR, SETTLED, SLIGHT, Load
+from etid.estimators.maximum_likelihood.load import Load
+from etid.estimators.maximum_likelihood.load_fit import FAR, SETTLED, SLIGHT
 from etid.estimators.maximum_likelihood.terms import (
     apart,
     excess,
@@ -251,7 +252,7 @@ def fit_circuit(
         element_prior: Prior of the elements; None without one.
 
     Returns:
-        As `etid.estimators.maximum_likelihood.load.fit_circuit`, and whether the scale of the
+        As `etid.estimators.maximum_likelihood.load_fit.fit_circuit`, and whether the scale of the
         current contradicts the driver. χ² is that of both equations, RRSE that of the record that
         is predicted worse.
     """
