@@ -95,6 +95,14 @@ def test_skin_that_loses_a_fifth_of_its_resistance_is_a_misfit_at_40_db():
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("snr_db", [50.0, 60.0, 80.0])
+def test_the_same_is_a_misfit_with_less_noise(snr_db):
+    fits = answers("Rp_nonlinear_0.2", 1, snr_db, 3)
+    assert fits.counts() == {"misfit": 6}
+    assert fallen(fits).all()
+
+
+@pytest.mark.slow
 def test_linear_skin_is_not_called_nonlinear():
     """Of 5 200 fits none; the normal distribution has 0.2 above the limit."""
     fits = [
