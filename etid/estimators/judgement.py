@@ -37,7 +37,10 @@ BIASED = 16.0  # squared standard errors from an estimate to the minimum of its 
 
 
 def misses(
-    chi2: Float[Array, ""], error: Float[Array, ""], least: float = MISFIT_RRSE
+    chi2: Float[Array, ""],
+    error: Float[Array, ""],
+    least: float = MISFIT_RRSE,
+    limit: float = MISFIT_CHI2,
 ) -> Bool[Array, ""]:
     """Whether the residual exceeds the noise, both in standard deviations and in volts.
 
@@ -45,9 +48,10 @@ def misses(
         chi2: χ² per degree of freedom of the fit.
         error: RRSE of the fit.
         least: Part of the signal that may remain unexplained.
+        limit: Largest χ² that noise explains.
     """
     excess = error * jnp.sqrt(jnp.maximum(1 - 1 / chi2, 0.0))
-    return (chi2 > MISFIT_CHI2) & (excess > least)
+    return (chi2 > limit) & (excess > least)
 
 
 def too_late(estimate: Estimate) -> Bool[Array, ""]:
