@@ -11,7 +11,8 @@ import pytest
 import etid
 from etid.estimators.lanes import PaddedSamples
 from etid.estimators.registry import OUTPUT_ERROR
-from etid.identify import batches
+from etid.identify import batches, planning
+from etid.identify.arguments import Asked
 from etid.identify.one import skin_lane
 from etid.recordings.preflight import Inspected
 from etid.simulation.scenes import Scene, Trial
@@ -70,6 +71,26 @@ def rows(fits, paths):
 def assert_same(one, other):
     for a, b in zip(jax.tree.leaves(one.fit), jax.tree.leaves(other.fit), strict=True):
         np.testing.assert_array_equal(a, b)
+
+
+@pytest.mark.parametrize(
+    ("fewest", "most", "taken"), [(3, 64, [5, 5, 5, 3]), (3, 4, [4, 4, 4, 4, 2])]
+)
+def test_many_short_recordings_are_read_at_once_and_few_long_ones(
+    study, driver, monkeypatch, fewest, most, taken
+):
+    """Five recordings have as many samples as are inspected together."""
+    records = list(study.loaded.recordings())
+    size = records[0].samples["v_out"].stored.size
+    for name, value in (("FEWEST", fewest), ("MOST", most), ("TOGETHER", 5 * size)):
+        monkeypatch.setattr(planning, name, value)
+    rows = iter(range(MANY))
+    found = [
+        list(planning.planned(lambda row: (records[row], driver), rows, Asked()))
+        for _ in planning.calls(MANY)
+    ]
+    assert [len(part) for part in found if part] == taken
+    assert [row for part in found for row, _ in part] == list(range(MANY))
 
 
 def test_more_than_a_chunk_keeps_the_order(study, fits):

@@ -38,7 +38,7 @@ from etid.identify.one import (
     refined,
     skin_lane,
 )
-from etid.identify.planning import Planned, Refusal, planned
+from etid.identify.planning import FEWEST, Planned, Refusal, calls, planned
 from etid.identify.prefetch import prefetch
 from etid.recordings.preflight import Inspected
 from etid.recordings.recording import Recording
@@ -48,8 +48,7 @@ from etid.selection.common import common, deserves
 from etid.selection.selection import Selection
 
 LANES = 64  # lanes of one call; the last call is padded
-READ = 16  # recordings of a chunk, which are read and inspected together
-HELD = 2**21  # samples of waiting recordings; above, a call has fewer lanes, but at least a chunk
+HELD = 2**21  # samples of waiting recordings; above, a call has fewer lanes, but at least `FEWEST`
 AHEAD = 2  # chunks that are read and inspected in advance
 
 
@@ -134,11 +133,6 @@ def _prepared(
     return prepared
 
 
-def chunked(count: int) -> Iterator[range]:
-    """The numbers of `count` recordings, in chunks of `READ`."""
-    return (range(first, min(first + READ, count)) for first in range(0, count, READ))
-
-
 def filled(lanes: Sequence[AbstractLane]) -> AbstractLane:
     """`LANES` lanes, padded with copies of the last lane."""
     return stacked([*lanes, *[lanes[-1]] * (LANES - len(lanes))])
@@ -173,7 +167,7 @@ class _Queue:
     @property
     def full(self) -> bool:
         """Whether a call has its lanes, or the waiting recordings take much memory."""
-        return len(self.rows) == LANES or (len(self.rows) >= READ and self.held >= HELD)
+        return len(self.rows) == LANES or (len(self.rows) >= FEWEST and self.held >= HELD)
 
     def run(self) -> "_Part":
         """Fit the waiting recordings and empty the queue."""
@@ -206,15 +200,15 @@ def _parts(
     """Fits of all recordings, in parts; arguments as in `choices`."""
     otherwise = str(asked.estimator or MAXIMUM_LIKELIHOOD)
     queues: dict[tuple, _Queue] = {}
-    chunks = tuple(chunked(count))
+    rows = iter(range(count))
 
-    def read(number: int) -> list[tuple[int, _Prepared | Refusal]]:
+    def read(_: int) -> list[tuple[int, _Prepared | Refusal]]:
         with jax.enable_x64(True):  # the setting belongs to a thread, and this runs in another one
-            return _prepared(planned(load, chunks[number], asked), candidates)
+            return _prepared(planned(load, rows, asked), candidates)
 
     with (
         tqdm(total=count, unit="fit", disable=not progress) as bar,
-        contextlib.closing(prefetch(read, len(chunks), AHEAD)) as recordings,
+        contextlib.closing(prefetch(read, len(calls(count)), AHEAD)) as recordings,
     ):
         for row, prepared in itertools.chain.from_iterable(chunk() for chunk in recordings):
             if isinstance(prepared, Refusal):

@@ -51,7 +51,7 @@ from etid.identify.arguments import (
     require,
     require_float64,
 )
-from etid.identify.batches import LANES, chunked, each, filled
+from etid.identify.batches import LANES, each, filled
 from etid.identify.compiled import stored_jit
 from etid.identify.many import common_first, identify_part, table, to_identify
 from etid.identify.one import (
@@ -63,7 +63,7 @@ from etid.identify.one import (
     remarks_on,
     repeated,
 )
-from etid.identify.planning import Refusal, planned
+from etid.identify.planning import Refusal, calls, planned
 from etid.identify.study_drivers import Drivers
 from etid.recordings.preflight import Inspected
 from etid.recordings.recording import Recording
@@ -233,8 +233,7 @@ class _Waiting:
         self.driver = driver
         self.estimator = estimator
         self.rows: list[int] = []
-        self.lanes: list[AbstractLane] = []
-        self.seen: list[Inspected] = []  # the recordings of `lanes`
+        self.seen: list[Inspected] = []  # the recordings that wait for their first fits
         self.starts: list[_Start] = []
         self.remarks: list[int] = []
         self.unloaded: list[int] = []
@@ -244,20 +243,20 @@ class _Waiting:
         self.rows.append(row)
         self.unloaded.append(checksum(seen))
         self.seen.append(seen)
-        self.lanes.append(self.estimator.lane.of(seen))
-        if len(self.lanes) == LANES:
+        if len(self.seen) == LANES:
             self.run()
 
     def run(self) -> None:
-        if not self.lanes:
+        if not self.seen:
             return
-        starts = repeated(self.lanes, self.seen, self._alone, _late_by, _need_another, _of_both)
+        lanes = self.estimator.lane.of_several(self.seen)
+        starts = repeated(lanes, self.seen, self._alone, _late_by, _need_another, _of_both)
         for start, seen in zip(starts, self.seen, strict=True):
             hum = Remark.mains_hum if start.hum else 0
             self.remarks.append(remarks_on(seen, self.estimator) | hum)
         self.starts += starts
         self.repeats += repeats(self.seen)
-        self.lanes, self.seen = [], []
+        self.seen = []
 
     def _alone(self, lanes: Sequence[AbstractLane]) -> list[_Start]:
         of = self.model, self.driver
@@ -361,8 +360,9 @@ def identify_jointly(
     def load(row: int) -> tuple[Recording, AbstractFeed]:
         return drivers.fed(study[paths[row]])
 
+    rows = iter(range(len(paths)))
     inspected = itertools.chain.from_iterable(
-        planned(load, rows, Asked()) for rows in chunked(len(paths))
+        planned(load, rows, Asked()) for _ in calls(len(paths))
     )
     for row, of in tqdm(inspected, "", len(paths), unit="recording", disable=not progress):
         if not isinstance(of, Refusal) and not of.estimator.lane.periodic:

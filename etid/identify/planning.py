@@ -1,6 +1,7 @@
 """Reading and inspection of many recordings: which can be fitted, and why the others cannot."""
 
-from collections.abc import Callable, Iterable, Iterator
+import itertools
+from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
 from etid.estimators.estimator import AbstractEstimator
@@ -13,6 +14,8 @@ from etid.results.fits import IdentificationError
 from etid.results.verdicts import message
 
 TOGETHER = 600_000  # samples that are inspected together; their arrays take tens of MB
+FEWEST = 16  # recordings that are read at once, however long they are
+MOST = 64  # recordings that are read at once if they are short; many more save little time
 ERRORS = (RecordingError, ValueError, IdentificationError)  # that a recording or a driver may raise
 
 
@@ -34,12 +37,13 @@ class Planned(NamedTuple):
 
 def planned(
     load: Callable[[int], tuple[Recording, AbstractFeed]],
-    rows: Iterable[int],
+    rows: Iterator[int],
     asked: Asked,
 ) -> Iterator[tuple[int, Planned | Refusal]]:
-    """Each recording with its driver and its estimator, or the reason why it cannot be fitted.
+    """Some recordings with their drivers and estimators, or the reason why they cannot be fitted.
 
-    Recordings of equal length and rates are inspected together.
+    Recordings of equal length and rates are inspected together. At least `FEWEST` recordings are
+    taken from `rows`, and up to `MOST` as long as they have no more than `TOGETHER` samples.
 
     Args:
         load: Reads a recording and its driver.
@@ -47,7 +51,8 @@ def planned(
         asked: What the caller asks for.
     """
     loaded: dict[tuple[int, str, float, float], list[tuple[int, Recording, AbstractFeed]]] = {}
-    for row in rows:
+    held = 0
+    for number, row in enumerate(itertools.islice(rows, MOST), 1):
         try:
             of, driver = load(row)
         except ERRORS as error:
@@ -55,6 +60,9 @@ def planned(
         else:
             key = of.samples["v_out"].stored.size, of.cause, of.sample_rate, of.pulse_rate
             loaded.setdefault(key, []).append((row, of, driver))
+            held += key[0]
+            if number >= FEWEST and held + key[0] > TOGETHER:
+                break
     for (size, *_), alike in loaded.items():
         together = max(1, TOGETHER // max(1, size))
         for first in range(0, len(alike), together):
@@ -62,6 +70,11 @@ def planned(
             group = Group([of for _, of, _ in part])
             for number, (row, of, driver) in enumerate(part):
                 yield row, _planned(Inspected(of, group, number), driver, asked)
+
+
+def calls(count: int) -> range:
+    """Numbers of the calls of `planned` that take `count` recordings; the last may take none."""
+    return range(-(-count // FEWEST))
 
 
 def _planned(seen: Inspected, driver: AbstractFeed, asked: Asked) -> Planned | Refusal:

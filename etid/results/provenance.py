@@ -1,6 +1,7 @@
 """Settings of a run: the facts that a methods section needs and that a file of fits stores."""
 
 import dataclasses
+import functools
 import importlib.metadata
 import math
 import os
@@ -108,5 +109,11 @@ class Settings:
             ),
             precision="float64",
             backend=jax.default_backend(),
-            versions=tuple(f"{name} {importlib.metadata.version(name)}" for name in PACKAGES),
+            versions=_versions(),
         )
+
+
+@functools.cache
+def _versions() -> tuple[str, ...]:
+    """Packages and their versions; to look them up on disk takes as long as three skins."""
+    return tuple(f"{name} {importlib.metadata.version(name)}" for name in PACKAGES)

@@ -198,6 +198,7 @@ def filled(
     return frequency, x, y, variance_x, variance_y, selected
 
 
+@functools.lru_cache(maxsize=64)
 def fast_length(length: int) -> int:
     """The next number without a prime factor above 5."""
     size = length
