@@ -1,16 +1,21 @@
 """Elements with bounds: estimates, errors and their coverage, files, commands, and wrong bounds."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import scipy.optimize
 import scipy.stats
 
 import etid
 from etid import cli
-from etid.estimators.element_limits import truncated, within
+from etid.circuits.display import quantity
+from etid.estimators.element_limits import _nearest, truncated, within
 from etid.estimators.judgement import SUCCESSFUL, judged
 from etid.recordings.remarks import Remark
+from etid.results.fits import Support
 from etid.results.verdicts import verdict
 from tests.test_current import SKIN, recorded
 from tests.test_judging import estimate
@@ -66,7 +71,7 @@ def test_several_bounded_elements_are_those_of_draws_inside_the_box():
     # Expectation propagation is not exact for several elements; a tenth of an error is no harm.
     assert np.abs((found.values - x.mean(0)) / x.std(0)).max() < 0.1
     np.testing.assert_allclose(np.sqrt(np.diagonal(found.cov)), x.std(0), rtol=0.1)
-    assert bool(found.beyond)
+    assert float(found.outside[0]) < 0
     assert not bool(found.contradicted)
     own = np.linalg.eigvalsh((found.cov - found.shared_cov) / np.outer(deviation, deviation))
     assert own.min() > 0
@@ -122,7 +127,7 @@ def test_an_element_that_only_its_bounds_determine_is_no_more_insensitive():
 def test_an_element_beyond_its_bound_is_said_and_has_the_error_of_what_is_left(free, beyond):
     assert beyond.verdict == "successful"
     assert int(beyond.remarks) & Remark.at_bound
-    assert "would lie beyond its bound" in str(beyond)
+    assert "would lie outside" in str(beyond)
     left = scipy.stats.truncnorm(1.0, np.inf, float(free.circuit.r_s), float(free.stderr.r_s))
     np.testing.assert_allclose(beyond.circuit.r_s, left.mean(), rtol=1e-9)
     np.testing.assert_allclose(beyond.stderr.r_s, left.std(), rtol=1e-9)
@@ -139,8 +144,92 @@ def test_draws_keep_to_the_bounds_and_agree_with_the_fit(free, beyond):
     # The likelihood is skewed at 20 dB: its mean differs by a quarter of a standard error.
     mean = posterior.weights @ np.asarray(posterior.draws.r_s)
     assert abs(mean - beyond.circuit.r_s) < 0.4 * beyond.stderr.r_s
-    with pytest.raises(ValueError, match="a fit with bounds has no profiles"):
-        beyond.profile("c_p")
+    # An interval of the normal distribution, cut at the bound, has its probability all the same.
+    for name, (low, high) in beyond.intervals().items():
+        draws = np.asarray(getattr(posterior.draws, name))
+        assert posterior.weights[(draws >= low) & (draws <= high)].sum() > 0.92
+    assert beyond.intervals()["r_s"][0] == above(free, 1.0)
+
+
+def test_profiles_keep_to_the_bounds(free, beyond):
+    bound = above(free, 1.0)
+    own, other = beyond.profile("r_s"), beyond.profile("r_p")
+    np.testing.assert_allclose(own.values[0], bound, rtol=1e-9)
+    # The likeliest value inside is the bound; r_p follows, and without bounds it does not.
+    np.testing.assert_allclose(own.deviance[0], 0.0, atol=1e-3)
+    assert np.all(np.diff(own.deviance) > 0)
+    assert own.interval()[0] == bound
+    assert other.deviance.min() > -1e-3
+    # That of a normal distribution of R_p at the bound of R_s, up to the skew at 20 dB.
+    cov = np.asarray(free.cov)
+    middle = float(free.circuit.r_p) + cov[0, 1] / cov[0, 0] * (bound - float(free.circuit.r_s))
+    error = np.sqrt(cov[1, 1] - cov[0, 1] ** 2 / cov[0, 0])
+    likeliest = other.values[np.argmin(other.deviance)]
+    ends = likeliest, other.interval()[1]
+    np.testing.assert_allclose(ends, [middle, middle + 1.96 * error], rtol=0, atol=0.4 * error)
+
+
+def test_bounds_far_away_leave_intervals_and_profiles_as_they_are(noisy, free):
+    fit = etid.identify_skin(noisy, bounds={"r_s": (1.0, 1e9)})
+    for name, ends in fit.intervals().items():
+        np.testing.assert_allclose(ends, free.intervals()[name], rtol=1e-6)
+    wide, usual = fit.profile("r_s"), free.profile("r_s")
+    np.testing.assert_allclose(wide.interval(), usual.interval(), rtol=1e-3)
+
+
+def test_a_choice_compares_each_circuit_inside_its_own_bounds(noisy, free):
+    """R_p of the true circuit is forbidden; another circuit has no such element."""
+    candidates = [etid.SkinRC(), etid.Resistor()]
+    inside = {"r_p": (0.5 * float(free.circuit.r_p), 2.0 * float(free.circuit.r_p))}
+    chosen = etid.select_circuit(noisy, candidates=candidates, bounds=inside)
+    assert type(chosen.fit.circuit) is etid.SkinRC
+    of = estimate(relative=(0.05, 0.02, 0.03))
+    support = Support(jnp.array(10.0), jnp.array(100.0), jnp.zeros(9), jnp.zeros(()), jnp.zeros(3))
+    of = dataclasses.replace(of, support=support)
+    alone = judged(of, etid.SkinRC(), SUCCESSFUL, "a method")
+    bounds = ("r_s", above(alone, 2.0), np.inf), ("r", 1.0, 2.0)
+    told = judged(of, etid.SkinRC(), SUCCESSFUL, "a method", bounds)
+    assert told.support is not None
+    # The likeliest point inside is two standard errors away.
+    np.testing.assert_allclose(told.support.deviance, 14.0, rtol=1e-6)
+
+
+def test_the_likeliest_point_inside_several_bounds_is_that_of_scipy():
+    related = np.array([[1, -0.9, 0.5], [-0.9, 1, -0.4], [0.5, -0.4, 1]])
+    low, high = np.array([1.0, 0.3, -2.0]), np.array([np.inf, 4.0, -0.5])
+    found = _nearest(jnp.asarray(related), jnp.asarray(low), jnp.asarray(high))
+    precision = np.linalg.inv(related)
+    ends = list(zip(low, high, strict=True))
+    best = scipy.optimize.minimize(
+        lambda x: x @ precision @ x, np.array([1.5, 1.0, -1.0]), bounds=ends, tol=1e-12
+    )
+    np.testing.assert_allclose(found, best.fun, rtol=1e-5)  # of SciPy's search
+
+
+def test_an_element_outside_and_its_bound_are_named_wherever_verdicts_are(
+    noisy, free, beyond, tmp_path
+):
+    bound = quantity(above(free, 1.0), "ohm")
+    words = f"Without bounds, r_s would be 1.0 standard errors below {bound}."
+    assert beyond.outside == words
+    assert words in str(beyond)
+    assert beyond.table()["at_bound"] == words
+    beyond.write(tmp_path / "fit.h5")
+    read = etid.Fits.read(tmp_path / "fit.h5")
+    assert read[0].outside == words
+    assert read[0].intervals() == beyond.intervals()
+    assert read.table()["at_bound"].tolist() == [words]
+    assert "at_bound" not in free.table()
+    free.write(tmp_path / "free.h5")
+    both = etid.Fits.concatenate([read, etid.Fits.read(tmp_path / "free.h5")])
+    assert [both[0].outside, both[1].outside] == [words, ""]
+    with pytest.raises(etid.IdentificationError, match=r"out_of_bounds.* r_s would be 4\.0"):
+        etid.identify_skin(noisy, bounds={"r_s": (above(free, 4.0), None)})
+    flat = noisy.replace(v_out=0 * noisy.v_out)
+    fits = etid.identify_skins([noisy, flat], bounds={"r_s": (above(free, 4.0), None)})
+    assert fits.verdicts.tolist() == ["out_of_bounds", "flat"]
+    assert "r_s would be 4.0" in fits.notes[0]
+    assert fits[1].outside == ""
 
 
 @pytest.mark.parametrize(
@@ -157,10 +246,7 @@ def test_draws_keep_to_the_bounds_and_agree_with_the_fit(free, beyond):
             {"bounds": {"r_s": (1.0, 1e3)}, "method": "non_parametric"},
             "'non_parametric' takes no known elements and no bounds",
         ),
-        (
-            {"bounds": {"r_s": (1.0, 1e3)}, "circuit": "auto"},
-            "r_s is known, but ParallelRC and Resistor have no such element",
-        ),
+        ({"bounds": {"r_x": (1.0, 1e3)}, "circuit": "auto"}, "'r_x' is no element of SkinRC"),
     ],
 )
 def test_impossible_bounds_are_refused(noisy, options, words):
@@ -181,7 +267,9 @@ def test_bounds_on_the_command_line_in_batches_and_reports(noisy, beyond, free, 
     assert found.settings is not None
     assert found.settings.bounds == (f"r_s above {bound}",)
     etid.write_report(target, tmp_path / "page.html")
-    assert f"r_s ≥ {float(bound):g}" in (tmp_path / "page.html").read_text("utf-8")
+    page = (tmp_path / "page.html").read_text("utf-8")
+    assert f"r_s ≥ {float(bound):g}" in page
+    assert "Without bounds, r_s would be 1.0 standard errors below" in page
     capsys.readouterr()
     assert cli.main([*command, "--bound", "r_s=2:1"]) == 1
     assert "bounds of r_s are 2 and 1" in capsys.readouterr().err

@@ -98,7 +98,7 @@ def test_what_has_no_likelihood_is_refused(clear):
     other = dataclasses.replace(fit, method="output_error")
     with pytest.raises(ValueError, match="method='maximum_likelihood'"):
         other.posterior(recording, driver)
-    with pytest.raises(ValueError, match="no element 'cp'; it has r_s, r_p, c_p"):
+    with pytest.raises(ValueError, match="'cp' is no element of SkinRC"):
         fit.profile("cp")
     with pytest.raises(ValueError, match="at least 1"):
         fit.posterior(draws=0)

@@ -12,6 +12,7 @@ The point of the largest likelihood would often lie on a bound, and have no stan
 """
 
 import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import jax
@@ -22,6 +23,7 @@ from jaxtyping import Array, Bool, Float
 
 from etid.circuits.circuit import AbstractCircuit
 from etid.estimators.element_prior import Known, require_element
+from etid.results.limited import Limited
 
 Limits = tuple[tuple[str, float, float], ...]
 """Elements with bounds: name, lower and upper bound [SI]; infinity without an upper bound."""
@@ -41,14 +43,17 @@ class Within(NamedTuple):
         values: Their mean [SI].
         cov: Their covariance.
         shared_cov: The part of it that comes from the driver.
-        beyond: Whether the free estimate of an element lies outside its bounds.
+        outside: Distance of the free estimate of each element from its bounds [standard errors];
+            negative below the lower one, 0 inside.
+        deviance: Increase of −2 log L from the free estimate to the likeliest point inside.
         contradicted: Whether the bounds are no longer credible.
     """
 
     values: Float[Array, " element"]
     cov: Float[Array, "element element"]
     shared_cov: Float[Array, "element element"]
-    beyond: Bool[Array, ""]
+    outside: Float[Array, " element"]
+    deviance: Float[Array, ""]
     contradicted: Bool[Array, ""]
 
 
@@ -116,9 +121,28 @@ def within(
         values=jnp.where(sound, values, jnp.nan),
         cov=scaled(step @ whole),
         shared_cov=scaled(step @ (shared_cov / jnp.outer(scale, scale)) @ step.T),
-        beyond=jnp.any((low > 0) | (high < 0)),
+        outside=jnp.zeros_like(free).at[rows].set(-jnp.clip(0.0, low, high)),
+        deviance=_nearest(some[rows], low, high),
         contradicted=sound & (u @ some[rows] @ u > limit),
     )
+
+
+def _nearest(
+    cov: Float[Array, "bound bound"], low: Float[Array, " bound"], high: Float[Array, " bound"]
+) -> Float[Array, ""]:
+    """Squared distance [standard errors] from 0 to the nearest point between the bounds.
+
+    Each element in turn moves to its best place; the others follow by their correlations.
+    """
+    precision = jnp.linalg.inv(cov)
+
+    def move(step: Array, x: Float[Array, " bound"]) -> Float[Array, " bound"]:
+        i = step % x.size
+        best = x[i] - precision[i] @ x / precision[i, i]
+        return x.at[i].set(jnp.clip(best, low[i], high[i]))
+
+    x = jax.lax.fori_loop(0, SWEEPS * low.size, move, jnp.clip(0.0, low, high))
+    return x @ precision @ x
 
 
 def truncated(
@@ -143,10 +167,36 @@ def truncated(
     return mean + deviation * (mode + centre), deviation**2 * (weight @ (t - centre) ** 2)
 
 
-def checked_limits(bounds: Limits, known: Known, circuit: AbstractCircuit) -> None:
-    """Raise ValueError unless these are possible bounds of elements of the circuit."""
+def of_circuit(bounds: Limits, circuit: AbstractCircuit) -> Limits:
+    """The bounds of those elements that a circuit has."""
+    return tuple(one for one in bounds if one[0] in circuit.names())
+
+
+def limited(
+    circuit: AbstractCircuit, bounds: Limits, outside: Float[Array, " element"] | None = None
+) -> Limited | None:
+    """The bounds of the elements of a fit; None without bounds.
+
+    Args:
+        circuit: The circuit.
+        bounds: Bounds of its elements.
+        outside: As in `Within`; None if the recording was not fitted.
+    """
+    if not bounds:
+        return None
+    ends = {name: (low, high) for name, low, high in bounds}
+    both = np.array([ends.get(name, (0.0, np.inf)) for name in circuit.names()])
+    return Limited(both[:, 0], both[:, 1], np.zeros(len(both)) if outside is None else outside)
+
+
+def checked_limits(bounds: Limits, known: Known, circuits: Sequence[AbstractCircuit]) -> None:
+    """Raise ValueError unless these are possible bounds of elements of some of the circuits.
+
+    A choice of circuits compares each one inside its own bounds, so a circuit may lack an element.
+    """
     for name, low, high in bounds:
-        require_element(name, circuit)
+        if not any(name in one.names() for one in circuits):
+            require_element(name, circuits[0])
         if any(name == one and not error for one, _, error in known):
             raise ValueError(f"{name} is fixed and has bounds; remove one of them")
         if not 0 <= low < high:

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from etid.circuits.circuit import AbstractCircuit
-from etid.estimators.element_limits import Limits, within
+from etid.estimators.element_limits import Limits, limited, of_circuit, within
 from etid.estimators.estimate import Estimate
 from etid.recordings.remarks import Remark
 from etid.results.fits import Fit, Support
@@ -73,18 +73,25 @@ def judged(
         circuit: Structure of the load.
         driver_result: Verdict of the driver.
         method: Name of the estimator.
-        bounds: Bounds of elements.
+        bounds: Bounds of elements; those of elements that the circuit lacks do not count.
     """
     fitted = circuit.with_log_values(estimate.parameters)
     values = fitted.values()
     errors = jnp.sqrt(jnp.diagonal(estimate.cov))  # of the logarithms, so they are relative
     cov, shared_cov = (of * jnp.outer(values, values) for of in (estimate.cov, estimate.shared_cov))
-    beyond, contradicted = jnp.array(False), jnp.array(False)
-    if bounds:
-        inside, cov, shared_cov, beyond, contradicted = within(fitted, cov, shared_cov, bounds)
+    own, outside, contradicted = of_circuit(bounds, circuit), None, jnp.array(False)
+    support = estimate.support
+    if own:
+        found = within(fitted, cov, shared_cov, own)
+        inside, cov, shared_cov, outside, deviance, contradicted = found
+        if support is not None:  # bounds are a part of what a choice of circuits compares
+            support = dataclasses.replace(support, deviance=support.deviance + deviance)
         errors = jnp.sqrt(jnp.diagonal(cov)) / inside
         values = jnp.where(jnp.isfinite(inside), inside, values)
         fitted = circuit.with_log_values(jnp.log(values))
+    at_bound = 0
+    if outside is not None:
+        at_bound = jnp.where(jnp.any(outside != 0), int(Remark.at_bound), 0)
     settled = RESULTS.promote(estimate.result) == RESULTS.successful
     return Fit(
         circuit=fitted,
@@ -107,8 +114,9 @@ def judged(
         ),
         steps=estimate.steps,
         method=method,
-        remarks=remarks(estimate.hum, estimate.falls) + jnp.where(beyond, int(Remark.at_bound), 0),
-        support=estimate.support or Support.unknown(values.size),
+        remarks=remarks(estimate.hum, estimate.falls) + at_bound,
+        support=support or Support.unknown(values.size),
+        limits=limited(circuit, own, outside),
     )
 
 

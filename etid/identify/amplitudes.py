@@ -143,7 +143,7 @@ def identify_amplitudes(
     for one in seen:
         _, name = plan(asked, one, feed)
         if name is not None:
-            fit = failed_fit(name, circuit, METHOD)
+            fit = failed_fit(name, circuit, METHOD, asked.bounds)
             return successful(one.recording, fit) if throw else fit
     lanes = [Harmonics.of(one) for one in seen]
     known = known_of(lanes[0], feed, False, MAXIMUM_LIKELIHOOD)

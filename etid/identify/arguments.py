@@ -302,7 +302,7 @@ def asked_of(
     asked = Asked(estimator_of(method, candidates), informed(fixed, prior), bounded(bounds))
     if asked.estimator is not None:
         with_known(asked.estimator, asked.known, asked.bounds)
-    for name, *_ in (*asked.known, *asked.bounds) if len(candidates) > 1 else ():
+    for name, *_ in asked.known if len(candidates) > 1 else ():
         without = [type(one).__name__ for one in candidates if name not in one.names()]
         if without:
             raise ValueError(
@@ -310,9 +310,9 @@ def asked_of(
                 "would compare circuits with different knowledge; pass one circuit, or call "
                 "select_circuit with candidates that all have it"
             )
-    for circuit in candidates if asked.known or asked.bounds else ():
+    for circuit in candidates:
         checked(asked.known, circuit)
-        checked_limits(asked.bounds, asked.known, circuit)
+    checked_limits(asked.bounds, asked.known, candidates)
     return asked
 
 

@@ -212,7 +212,7 @@ def _parts(
     ):
         for row, prepared in itertools.chain.from_iterable(chunk() for chunk in recordings):
             if isinstance(prepared, Refusal):
-                fit = failed_fit(prepared.name, candidates[0], otherwise)
+                fit = failed_fit(prepared.name, candidates[0], otherwise, asked.bounds)
                 yield _Part([row], Tried(stacked([fit])), prepared.note)
                 bar.update()
                 continue

@@ -368,7 +368,7 @@ def identify_jointly(
         if not isinstance(of, Refusal) and not of.estimator.lane.periodic:
             of = Refusal("not_periodic", SINGLE)
         if isinstance(of, Refusal):
-            fits[row] = failed_fit(of.name, circuit, METHOD)
+            fits[row] = failed_fit(of.name, circuit, METHOD, asked.bounds)
             notes[row] = of.note
             continue
         seen, found, estimator = of

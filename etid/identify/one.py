@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from etid.circuits.circuit import AbstractCircuit, SkinRC
+from etid.estimators.element_limits import Limits, limited, of_circuit
 from etid.estimators.estimator import AbstractEstimator
 from etid.estimators.judgement import MISFIT_CHI2
 from etid.estimators.lanes import AbstractLane, Harmonics, replaced, stacked, taken, unstacked
@@ -43,6 +44,7 @@ from etid.selection.search import search
 from etid.selection.selection import Selection
 
 EXPLAINED = ("rate_mismatch", "misaligned", "wrong_unit")  # verdicts with numbers in the message
+NOTED = ("changed", "out_of_bounds")  # verdicts to which `note` adds numbers
 SPARSE = 16  # every 16th sample enters a checksum
 KEPT = 4  # drivers, for which `known_of` is kept
 _Kind = TypeVar("_Kind", bound=AbstractCircuit)
@@ -158,7 +160,7 @@ def candidate_fits(
     seen = Inspected(recording)
     estimator, name = plan(asked, seen, feed)
     if name is not None:
-        return {0: failed_fit(name, candidates[0], str(estimator))}, 0
+        return {0: failed_fit(name, candidates[0], str(estimator), asked.bounds)}, 0
     check_default(estimator, candidates)
     lane = estimator.lane.of(seen)
     known = known_of(lane, feed, is_shared(seen, feed), estimator)
@@ -472,17 +474,16 @@ def concluded(
 
 
 def note(fit: Fit) -> str:
-    """The message of the verdict of a fit; for `changed` also the changes."""
-    text = message(fit.verdict)
-    return f"{text} {fit.changes}" if fit.verdict == "changed" else text
+    """The message of the verdict of a fit; for `changed` also the changes, and elements outside."""
+    own = {"changed": fit.changes, "out_of_bounds": fit.outside}.get(fit.verdict, "")
+    return f"{message(fit.verdict)} {own}".strip()
 
 
 def notes_of(fits: Fit) -> list[str]:
     """`note` of each of several fits."""
     names = fits.verdict.tolist()
     return [
-        note(taken(fits, row)) if name == "changed" else message(name)
-        for row, name in enumerate(names)
+        note(taken(fits, row)) if name in NOTED else message(name) for row, name in enumerate(names)
     ]
 
 
@@ -516,7 +517,7 @@ def explained(seen: Inspected, name: str) -> str:
     return f"{found} {message(name)}".strip()
 
 
-def failed_fit(name: str, circuit: AbstractCircuit, method: str) -> Fit:
+def failed_fit(name: str, circuit: AbstractCircuit, method: str, bounds: Limits = ()) -> Fit:
     """A fit without numbers, for a recording that was not fitted."""
     size = len(circuit.names())
     nan = np.full((size, size), np.nan)
@@ -535,5 +536,6 @@ def failed_fit(name: str, circuit: AbstractCircuit, method: str) -> Fit:
         change=none.size,
         change_stderr=none.stderr,
         support=Support.unknown(size),
+        limits=limited(circuit, of_circuit(bounds, circuit)),
     )
     return jax.tree.map(np.asarray, fit)

@@ -36,7 +36,7 @@ import scipy
 from jaxtyping import Array, Float, Int
 
 from etid.circuits.circuit import AbstractCircuit, Circuit
-from etid.estimators.element_limits import Limits
+from etid.estimators.element_limits import Limits, of_circuit
 from etid.estimators.element_prior import FIXED, ElementPrior, require_element
 from etid.estimators.lanes import Harmonics, HarmonicsWithCurrent
 from etid.estimators.maximum_likelihood import with_current
@@ -61,6 +61,7 @@ from etid.solvers.matrices import inverse
 FREEDOM = 30.0  # of Student's t: 16 unknowns; with 8 half of the draws are lost, with ∞ the tails
 WIDE = 3.5  # [standard errors] range of a profile to each side
 POINTS = 29  # of a profile
+STEEP = 1e3  # standard deviations of a residual one standard error outside a bound
 MAX_STEPS = 200
 AT_ONCE = 16  # draws in one vectorised evaluation
 ROUNDS = 6  # of draws, at most
@@ -120,13 +121,37 @@ def cost(terms: Load | LoadWithCurrent, q: Float[Array, " q"]) -> Float[Array, "
     return 0.5 * jnp.sum(terms(q) ** 2)
 
 
+class _Walls(eqx.Module):
+    """Bounds of the logarithms of the elements, as steep residuals outside.
+
+    Attributes:
+        low: Lower bounds; −∞ without one.
+        high: Upper bounds; ∞ without one.
+        error: Standard errors of the elements.
+    """
+
+    low: Float[Array, " element"]
+    high: Float[Array, " element"]
+    error: Float[Array, " element"]
+
+    def __call__(self, q: Float[Array, " q"]) -> Float[Array, " element"]:
+        """Distances outside, in a small part of a standard error."""
+        own = q[: self.low.size]
+        outside = jnp.maximum(self.low - own, 0.0) + jnp.maximum(own - self.high, 0.0)
+        return STEEP * outside / self.error
+
+
 def _least(
-    terms: Load | LoadWithCurrent, start: Float[Array, " q"], free: Float[Array, "q free"]
+    terms: Load | LoadWithCurrent,
+    walls: _Walls,
+    start: Float[Array, " q"],
+    free: Float[Array, "q free"],
 ) -> Float[Array, " q"]:
-    """The minimum of F among `start` + `free` @ r."""
+    """The minimum of F among `start` + `free` @ r, inside the walls."""
 
     def residual(r: Float[Array, " free"], _) -> Float[Array, " term"]:
-        return terms(start + free @ r)
+        q = start + free @ r
+        return jnp.concatenate([terms(q), walls(q)])
 
     def equations(_, r: Float[Array, " free"], __) -> NormalEquations:
         value, jacobian = residual(r, None), jax.jacfwd(residual)(r, None)
@@ -261,8 +286,7 @@ def _profile(
     known: Known,
     circuit: AbstractCircuit,
     number: Int[Array, ""],
-    stretched: Float[Array, ""],
-    steps: Float[Array, " point"],
+    stretched: Float[Array, " element"],
 ) -> tuple[Float[Array, " point"], Float[Array, " point"]]:
     """Logarithms of an element, and the deviance there.
 
@@ -271,21 +295,34 @@ def _profile(
         known: What is known besides.
         circuit: The fitted circuit.
         number: Number of the element.
-        stretched: Standard error of the logarithm of the element, from the fit.
-        steps: Distances from the minimum [standard errors].
+        stretched: Standard errors of the logarithms of the elements, from the fit.
     """
     least = _Minimum.of(lane, known, circuit)
-    size = least.q.size
+    size, count = least.q.size, stretched.size
+    errors = jnp.sqrt(jnp.diagonal(least.cov))[:count]
+    names, ends = circuit.names(), np.tile([-np.inf, np.inf], (count, 1))
+    for name, low, high in known.bounds:
+        ends[names.index(name)] = np.log(low) if low > 0 else -np.inf, np.log(high)
+    own = least.q[:count]
+    low, high = ((jnp.asarray(end) - own) / stretched for end in ends.T)  # from the minimum
+    walls = _Walls(own + low * errors, own + high * errors, errors)
+    middle = jnp.clip(0.0, low[number], high[number])
+    steps = jnp.linspace(
+        jnp.maximum(middle - WIDE, low[number]), jnp.minimum(middle + WIDE, high[number]), POINTS
+    )
     others = jnp.where(jnp.arange(size - 1) < number, jnp.arange(size - 1), jnp.arange(1, size))
     free = jnp.eye(size)[:, others]
-    error = jnp.sqrt(least.cov[number, number])
+    towards = least.cov[:, number] / errors[number]
 
     def deviance(step: Float[Array, ""]) -> Float[Array, ""]:
-        start = least.q + least.cov[:, number] / error * step
-        return 2 * cost(least.terms, _least(least.terms, start, free))
+        found = _least(least.terms, walls, least.q + towards * step, free)
+        return 2 * cost(least.terms, found)
 
+    best = least.q
+    if known.bounds:
+        best = _least(least.terms, walls, least.q + towards * middle, jnp.eye(size))
     found = jax.lax.map(deviance, steps)
-    return least.q[number] + stretched * steps, found - 2 * cost(least.terms, least.q)
+    return least.q[number] + stretched[number] * steps, found - 2 * cost(least.terms, best)
 
 
 def posterior(
@@ -328,25 +365,20 @@ def profile(fit: Fit, recording: Recording | None, driver: Driver | None, name: 
     names = fit.circuit.names()
     require_element(name, fit.circuit)
     lane, known, cov = given(fit, recording, driver)
-    if known.bounds:
-        raise ValueError(
-            "a fit with bounds has no profiles, which go beyond them; use fit.posterior(), whose "
-            "draws keep to the bounds, or fit without bounds"
-        )
-    number, steps = names.index(name), np.linspace(-WIDE, WIDE, POINTS)
+    number = names.index(name)
     if known.elements is not None and known.elements.width[number] <= FIXED:
         raise ValueError(f"{name} is fixed, so it has no profile; take another element")
-    error = np.sqrt(cov[number, number])
-    wanted = map(jnp.asarray, (number, error, steps))
+    wanted = jnp.asarray(number), jnp.sqrt(jnp.diagonal(jnp.asarray(cov)))
     logs, deviance = map(np.asarray, _profile(lane, known, fit.circuit, *wanted))
-    value = float(getattr(fit.circuit, name))
+    ends = {one: (low, high) for one, low, high in known.bounds}
     return Profile(
         name=name,
         unit=fit.circuit.units()[name],
-        value=value,
-        stderr=value * float(error),
+        value=float(getattr(fit.circuit, name)),
+        stderr=float(getattr(fit.stderr, name)),
         values=np.exp(logs),
         deviance=deviance,
+        bounds=ends.get(name, (-np.inf, np.inf)),
     )
 
 
@@ -391,7 +423,7 @@ def given(
         unbounded = dataclasses.replace(estimator, bounds=())
         of = jax.device_get(skin(lane, feed, known, fit.circuit, unbounded))
         cov = _determined(of)
-    return lane, Known(known, elements, estimator.bounds), cov
+    return lane, Known(known, elements, of_circuit(estimator.bounds, fit.circuit)), cov
 
 
 def _determined(fit: Fit) -> Float[np.ndarray, "element element"]:

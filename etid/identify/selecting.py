@@ -50,7 +50,7 @@ def select_circuit(
             records of several whole periods.
         fixed: As in `identify_skin`; every candidate must have these elements.
         prior: As in `identify_skin`; every candidate must have these elements.
-        bounds: As in `identify_skin`; every candidate must have these elements.
+        bounds: As in `identify_skin`; each candidate is fitted inside the bounds of its elements.
         throw: Raise an error if the verdict of the chosen circuit is not successful.
 
     Returns:

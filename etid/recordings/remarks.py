@@ -46,7 +46,7 @@ _TEXTS = {
         "amplitude; record several amplitudes and use identify_amplitudes."
     ),
     Remark.at_bound: (
-        "An element would lie beyond its bound without it. The estimate is the mean of what the "
+        "Without its bounds an element would lie outside. The estimate is the mean of what the "
         "bounds leave; its distribution is not symmetric, and fit.posterior() shows it."
     ),
     Remark.current_unused: (

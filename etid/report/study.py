@@ -284,6 +284,8 @@ def _single(fits: Fits) -> Section:
         "if the residual is noise. Own error: standard error from the noise of the recording. "
         "Shared error: standard error from the driver."
     )
+    if verdict == "successful":
+        text = f"{text} {fits[0].outside}".strip()  # in a note of `out_of_bounds` it stands already
     warning = own_part(verdict, str(fits.notes[0]))
     return Section("Result", text, (study_tables.single(fits),), warning=warning)
 

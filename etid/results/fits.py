@@ -21,8 +21,9 @@ from etid.circuits.overview import Overview, Overviewed, element_rows
 from etid.recordings.fields import DESCRIBING, Label, wanted_labels
 from etid.recordings.remarks import texts, words
 from etid.results.data import WithData
-from etid.results.fits_columns import DESCRIBED, LABELS, SCHEMA, columns_of, described
+from etid.results.fits_columns import DESCRIBED, LABELS, LIMITS, SCHEMA, columns_of, described
 from etid.results.hdf5_table import Table, opened_table, write_table
+from etid.results.limited import Limited
 from etid.results.summary import summary
 from etid.results.verdicts import RESULTS, Judged, counted, counts, message
 from etid.signals.transfer import power
@@ -122,6 +123,7 @@ class Fit(Judged, WithData[Circuit]):
         change_stderr: Standard errors of `change`.
         support: How well the data support this circuit, for the choice between circuits; NaN or
             None if the method computes no likelihood.
+        limits: Bounds of the elements; None without bounds.
     """
 
     circuit: Circuit
@@ -136,6 +138,7 @@ class Fit(Judged, WithData[Circuit]):
     change: Float[Array | np.ndarray, "*lane moved"] | None = None
     change_stderr: Float[Array | np.ndarray, "*lane moved"] | None = None
     support: Support | None = None
+    limits: Limited | None = None
 
     @property
     def stderr(self) -> Circuit:
@@ -157,7 +160,9 @@ class Fit(Judged, WithData[Circuit]):
         """Confidence intervals of the elements: value ± z · standard error; for one fit.
 
         They come from the normal distribution, to which maximum likelihood leads if the standard
-        errors are small.
+        errors are small. A bound ends an interval. The distribution inside the bounds is not
+        normal; its part in an interval of 95 % is 94.8 % or more (a bound far beyond which the
+        estimate would lie), and all of it between close bounds.
 
         Args:
             level: Probability that an interval contains the true value.
@@ -172,11 +177,12 @@ class Fit(Judged, WithData[Circuit]):
         if not 0 < level < 1:
             raise ValueError(f"level is {level}; it must be between 0 and 1, as in 0.95")
         z = statistics.NormalDist().inv_cdf((1 + level) / 2)
-        values, errors = self.circuit.values().tolist(), self.stderr.values().tolist()
-        return {
-            name: (value - z * error, value + z * error)
-            for name, value, error in zip(self.circuit.names(), values, errors, strict=True)
-        }
+        values, errors = np.asarray(self.circuit.values()), np.asarray(self.stderr.values())
+        low, high = values - z * errors, values + z * errors
+        if self.limits is not None:
+            low, high = (np.clip(end, self.limits.lower, self.limits.upper) for end in (low, high))
+        ends = zip(low.tolist(), high.tolist(), strict=True)
+        return dict(zip(self.circuit.names(), ends, strict=True))
 
     def table(self) -> dict[str, Any]:
         """Elements [SI], standard errors, changes, quality and verdict, by name.
@@ -199,6 +205,8 @@ class Fit(Judged, WithData[Circuit]):
             "verdict": self.verdict,
             "remarks": np.asarray(remarks).astype(str),
         }
+        if self.limits is not None:
+            columns["at_bound"] = self._outside()
         arrays = {name: np.asarray(column) for name, column in columns.items()}
         return {name: one if one.ndim else one.item() for name, one in arrays.items()}
 
@@ -215,6 +223,29 @@ class Fit(Judged, WithData[Circuit]):
     def _refuse_batch(self) -> None:
         if np.ndim(self.rrse):
             raise ValueError("this is a batch of fits; take one of them, as in fits[0]")
+
+    def _outside(self) -> np.ndarray:
+        """A sentence on the elements that would lie outside their bounds, for each fit."""
+        if self.limits is None:
+            return np.full(np.shape(self.rrse), "")
+        units = self.circuit.units()
+        if not np.ndim(self.rrse):
+            return np.asarray(self.limits.text(units))
+        rows = range(len(self.rrse))
+        each = [jax.tree.map(lambda leaf, row=row: leaf[row], self.limits) for row in rows]
+        return np.array([one.text(units) for one in each], str)
+
+    @property
+    def outside(self) -> str:
+        """A sentence that names the elements that would lie outside their bounds; for one fit."""
+        self._refuse_batch()
+        return str(self._outside())
+
+    @property
+    def all_limits(self) -> Limited:
+        """`limits`; without bounds those that every value meets."""
+        none = np.zeros(np.shape(self.circuit.values()))
+        return self.limits or Limited(none, none + np.inf, none)
 
     @property
     def known_changes(self) -> tuple[np.ndarray, np.ndarray]:
@@ -262,6 +293,7 @@ class Fit(Judged, WithData[Circuit]):
             title += f", chi2 {float(self.chi2):.3g}"  # without standard errors there is none
         notes = [message(verdict)] if verdict != "successful" else []
         notes += [self.changes] if verdict == "changed" else []
+        notes += [self.outside] if self.outside else []
         return Overview(title, rows, notes=[*notes, *texts(int(self.remarks))])
 
 
@@ -328,6 +360,8 @@ class Fits(Overviewed, Generic[Circuit]):
         """
         method = joined([part.fit.method for part in parts])
         fits = [dataclasses.replace(part.fit, method=method) for part in parts]
+        if any(fit.limits is not None for fit in fits):
+            fits = [dataclasses.replace(fit, limits=fit.all_limits) for fit in fits]
         return cls(
             jax.tree.map(lambda *leaves: np.concatenate(leaves), *fits),
             {name: np.concatenate([part.labels[name] for part in parts]) for name in DESCRIBED},
@@ -424,9 +458,11 @@ class Fits(Overviewed, Generic[Circuit]):
         units |= {name: field.unit for name, field in DESCRIBING.items() if field.unit}
         columns = self.table() | {"cov": self.cov, "shared_cov": self.fit.shared_cov}
         columns["change_stderr"] = self.fit.known_changes[1]
+        if self.fit.limits is not None:
+            columns |= {name: np.asarray(getattr(self.fit.limits, name)) for name in LIMITS}
         attributes = {
             "schema": SCHEMA,
-            "schema_version": "1.3",
+            "schema_version": "1.4",
             "etid_version": importlib.metadata.version("etid"),
             "circuit": qualified(type(self.circuit)),
             "parameters": list(self.circuit.names()),

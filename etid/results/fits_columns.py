@@ -1,5 +1,6 @@
 """Columns of a file of fits: what describes each recording, and checks of what is read."""
 
+import dataclasses
 import reprlib
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -12,6 +13,7 @@ from etid.recordings.fields import DESCRIBING
 from etid.recordings.recording import RecordingError
 from etid.recordings.remarks import remarks_of
 from etid.results.hdf5_table import Table, same_length
+from etid.results.limited import Limited
 from etid.results.verdicts import RESULTS, verdicts_of
 
 SCHEMA = "etid/fits"
@@ -19,6 +21,7 @@ SCHEMA = "etid/fits"
 DESCRIBED = {"path": "text"} | {
     name: "text" if field.type == "label" else "number" for name, field in DESCRIBING.items()
 }
+LIMITS = tuple(field.name for field in dataclasses.fields(Limited))
 LABELS = tuple(name for name, kind in DESCRIBED.items() if kind == "text")
 
 
@@ -60,6 +63,8 @@ def columns_of(
     if "change_stderr" in table:  # not before schema version 1.2
         columns |= {name: table.column(name, "number") for name in changes}
         columns["change_stderr"] = table.column("change_stderr", "number", (size + 1,))
+    if "outside" in table:  # only for fits with bounds, and not before schema version 1.4
+        columns |= {name: table.column(name, "number", (size,)) for name in LIMITS}
     count = same_length(table, columns)
     read = {name: table.read(column) for name, column in columns.items()}
     remarks = _remarks(table, read.get("remarks", np.full(count, "")))
@@ -79,6 +84,8 @@ def columns_of(
         "method": table.text("method"),
         "remarks": remarks,
     }
+    if "outside" in read:
+        fields["limits"] = Limited(**{name: read[name].astype(float) for name in LIMITS})
     labels = {name: read[name] for name in DESCRIBED}
     return kind, fields | _changes_of(read, changes), labels, read["note"]
 

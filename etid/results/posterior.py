@@ -102,7 +102,9 @@ class Profile(Overviewed):
         value: Fitted value [SI].
         stderr: Its standard error [SI].
         values: Values that were tried [SI], increasing.
-        deviance: −2 log L at the best other parameters, minus that of the fit; 0 at the fit.
+        deviance: −2 log L at the best other parameters, minus its minimum. All parameters keep to
+            the bounds of the fit.
+        bounds: Bounds of the element [SI]; infinite without one.
     """
 
     name: str
@@ -111,6 +113,7 @@ class Profile(Overviewed):
     stderr: float
     values: Float[np.ndarray, " point"]
     deviance: Float[np.ndarray, " point"]
+    bounds: tuple[float, float] = (-np.inf, np.inf)
 
     def interval(self, level: float = 0.95) -> tuple[float, float]:
         """Both ends [SI]: where the deviance reaches the quantile of χ² with one degree of freedom.
@@ -119,16 +122,18 @@ class Profile(Overviewed):
             level: Probability of the interval.
 
         Returns:
-            The ends; infinite where no value that was tried is bad enough.
+            The ends; a bound, or infinite, where no value that was tried is bad enough.
 
         Raises:
             ValueError: The level is not between 0 and 1.
         """
         z = statistics.NormalDist().inv_cdf(tails(level)[1])
         # The signed root of the deviance is nearly a straight line.
-        root = np.sign(self.values - self.value) * np.sqrt(np.maximum(self.deviance, 0.0))
+        best = self.values[np.argmin(self.deviance)]
+        root = np.sign(self.values - best) * np.sqrt(np.maximum(self.deviance, 0.0))
         order = np.argsort(root, kind="stable")
-        low, high = np.interp([-z, z], root[order], self.values[order], left=-np.inf, right=np.inf)
+        left, right = self.bounds
+        low, high = np.interp([-z, z], root[order], self.values[order], left=left, right=right)
         return float(low), float(high)
 
     def _overview(self) -> Overview:
