@@ -67,6 +67,8 @@ TESTS: Mapping[str, Sequence[str]] = {
     "online.changes": ("electrode", "online"),
     "online.electrode": ("electrode", "online"),
     "online.gain_bands": ("gain_bands", "online"),
+    "online.projection": ("gain_bands", "online"),
+    "online.tick": ("electrode", "online"),
     "online.tracker": ("electrode", "online"),
     "results.driver": ("driver", "overview", "given_driver"),
     "results.fits": ("overview", "fit", "exporting", "recording", "identification"),

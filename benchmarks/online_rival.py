@@ -35,14 +35,13 @@ def seconds(
     if missing:
         return missing
     seen = [tracker.projection.seen(v_out, tracker.adc_range) for v_out in pulses]
-    real, imaginary = np.split(np.stack([np.asarray(one.gain) for one in seen]), 2, axis=2)
     variance = np.stack([np.asarray(one.variance) for one in seen])
     begins = np.arange(len(pulses)) % 3 * tracker.period
     with tempfile.TemporaryDirectory() as folder:
         given, found = pathlib.Path(folder, "problem.npz"), pathlib.Path(folder, "result.npz")
         np.savez(
             given,
-            gains=real + 1j * imaginary,
+            gains=np.stack([np.asarray(one.gain()) for one in seen]),
             variances=variance[:, :, None] / np.asarray(tracker.model.bands.weight),
             delays=begins - np.round(begins),
             frequency=np.asarray(tracker.model.bands.frequency),

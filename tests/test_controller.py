@@ -94,7 +94,7 @@ def test_no_skin_carries_more_than_the_guard_lets_a_short_circuit_carry():
     for _ in range(40):
         logs = rng.uniform(np.log([1.0, 10.0, 1e-11]), np.log([1e5, 1e6, 1e-7]))
         peak = np.abs(true_current(SkinLoad(*np.exp(logs)))).max()
-        assert float(controller.guard) * peak <= 4e-3
+        assert float(controller.limits.guard) * peak <= 4e-3
 
 
 @pytest.mark.parametrize(
@@ -128,7 +128,7 @@ def test_the_cap_of_the_estimate_holds_as_often_as_it_should():
     found = eqx.filter_jit(jax.vmap(lambda one: model.current(circuit, one, jnp.asarray(cov))))(
         drawn
     )
-    amplitude = 50e-9 / (found.charge + controller.quantile * found.charge_stderr)
+    amplitude = 50e-9 / (found.charge + controller.limits.quantile * found.charge_stderr)
     share = float(np.mean(np.asarray(amplitude) * true > 50e-9))
     # Three standard deviations of a binomial share.
     assert abs(share - 0.1) < 3 * np.sqrt(0.09 / draws), share
@@ -207,7 +207,7 @@ def test_limits_hold_whatever_the_estimate_says(own, information, before, result
         result=jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (2,)), verdict(result)),
     )
     command = controller.command(dataclasses.replace(state, electrodes=hostile), charge=wanted)
-    most = min(float(controller.guard), float(controller.ceiling))
+    most = min(float(controller.limits.guard), float(controller.limits.ceiling))
     assert (command.amplitude >= 0).all()
     assert (command.amplitude <= np.minimum(most, np.nan_to_num(before) + 0.5)).all()
 

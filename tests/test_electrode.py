@@ -12,7 +12,7 @@ import pytest
 
 from etid.estimators.judgement import MAX_STEPS_REACHED, SUCCESSFUL
 from etid.estimators.unknowns import LoadUnknowns
-from etid.online import changes, tracker
+from etid.online import changes, tick
 from etid.online import electrode as online
 from etid.online.changes import DRIFT, JUMP, NONE
 from etid.online.electrode import (
@@ -26,7 +26,8 @@ from etid.online.electrode import (
     predicted,
     suspicion,
 )
-from etid.online.gain_bands import Bands, Gains, Seen
+from etid.online.gain_bands import Bands, Gains
+from etid.online.projection import Seen
 from etid.online.pulse_fit import Expected, GainModel
 from etid.online.state import ElectrodeState, TrackerState
 from etid.results.verdicts import RESULTS, first_verdict, verdict_names, verdicts_of
@@ -436,12 +437,13 @@ def test_the_size_of_a_pulse_and_its_samples_are_judged_by_the_rules(monkeypatch
     bands = object.__new__(Bands)  # only its weights are read
     object.__setattr__(bands, "weight", jnp.asarray(weight))
     zero = np.zeros(len(rows))
-    seen = Seen(np.zeros((len(rows), 6)), mean, zero, zero, variance, clipped)
+    sums = np.stack([*np.zeros((6, len(rows))), mean, zero, zero], axis=1)
+    seen = Seen(sums, variance, clipped)
     state = state_of(amplitude=before, offset=offset).electrodes
-    found = tracker._measured(bands, seen, jnp.asarray(amplitude), state)
+    found = tick.measured_pulse(bands, seen, jnp.asarray(amplitude), state)
     relative = np.where(amplitude > 0, amplitude, 1.0)
     lacking = np.where(np.isnan(before), 0.0, (relative - before) / relative)
-    steady = abs(lacking) < tracker.STEADY
+    steady = abs(lacking) < tick.STEADY
     known = np.where(np.isfinite(mean) & np.isfinite(variance) & steady, mean, offset)
     np.testing.assert_allclose(used[0][0], lacking)
     np.testing.assert_allclose(used[0][1], np.where(np.isnan(known), 0.0, known))

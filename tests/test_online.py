@@ -518,7 +518,7 @@ def test_weights_are_those_of_the_noise_in_the_bands():
     """And slopes that are alike in neighbouring bands have the stated information."""
     tracker, seen = noise_alone()
     bands = tracker.model.bands
-    gain = np.stack(np.split(np.asarray(seen.gain), 2, axis=1))
+    gain = np.stack([np.real(seen.gain()), np.imag(seen.gain())])
     weight = np.asarray(bands.weight) / (bands.samples * NOISE**2)
     each = (gain**2).mean(axis=(0, 1)) * weight
     # A row of weights does not say what neighbours share; the last two bands share most.
@@ -538,13 +538,12 @@ def test_bands_of_a_pulse_are_those_of_its_transform():
     bands = tracker.model.bands
     pulses = tracker.pulses(loaded(quiet()))[0]
     seen = tracker.projection.seen(pulses, np.array([-np.inf, np.inf]))
-    real, imaginary = np.split(np.asarray(seen.gain), 2, axis=1)
     edges = gain_bands._edges(bands.x.size)
     y, x = np.fft.rfft(pulses)[:, 1 : bands.x.size + 1], np.asarray(bands.x)
     power = np.add.reduceat(np.abs(x) ** 2, edges[:-1] - 1)
     power -= np.diff(edges) * float(bands.variance_x)
     expected = np.add.reduceat(x.conj() * y, edges[:-1] - 1, axis=1) / power
-    error = np.abs(real + 1j * imaginary - expected)
+    error = np.abs(np.asarray(seen.gain()) - expected)
     one = np.sqrt(2 * bands.samples * NOISE**2 / np.asarray(bands.weight))  # of a pulse at 60 dB
     assert (error < 0.1 * one).all(), (error / one).max()
 

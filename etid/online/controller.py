@@ -34,34 +34,27 @@ and its charge is NaN.
 
 import dataclasses
 import math
+from typing import NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float
 
+from etid.circuits.circuit import AbstractCircuit
 from etid.circuits.overview import Overview, Overviewed
 from etid.estimators.judgement import SUCCESSFUL
 from etid.estimators.unknowns import LoadUnknowns
-from etid.online.current import CurrentModel
+from etid.online.current import Current, CurrentModel
 from etid.online.electrode import predicted
 from etid.online.state import ElectrodeState, TrackerState
 from etid.online.tracker import Tracker
 from etid.results.verdicts import counts
 from etid.solvers.matrices import inverse_of_few
 
-REASONS = ("wanted", "peak", "charge", "guard", "voltage", "slew", "fallback")
+REASONS = np.array(["wanted", "peak", "charge", "guard", "voltage", "slew", "fallback"])
 CURRENT_CAP = 5e-3  # [A] the paper's limit for the fingertip
-
-
-class _Commands(eqx.Module):
-    amplitude: Float[Array, "*lane"]
-    charge: Float[Array, "*lane"]
-    charge_stderr: Float[Array, "*lane"]
-    peak: Float[Array, "*lane"]
-    reason: Int[Array, "*lane"]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -94,14 +87,10 @@ class Command(Overviewed):
         return Overview(f"Command for {self.reason.size} electrodes: {found}", rows, heads)
 
 
-class Controller(Overviewed, eqx.Module):
-    """Finds the amplitude of every pulse for a wanted charge or current.
-
-    Make a controller with `Controller.of`.
+class Limits(NamedTuple):
+    """Limits of the amplitude, and the fallback.
 
     Attributes:
-        tracker: The tracker whose states are used.
-        model: Charge and current from an admittance.
         current_cap: Largest current of either sign [A].
         charge_cap: Largest charge per phase [C].
         quantile: k, in standard errors.
@@ -111,8 +100,6 @@ class Controller(Overviewed, eqx.Module):
         fallback: Amplitude for an electrode whose verdict is not good.
     """
 
-    tracker: Tracker
-    model: CurrentModel
     current_cap: Float[Array, ""]
     charge_cap: Float[Array, ""]
     quantile: Float[Array, ""]
@@ -120,6 +107,23 @@ class Controller(Overviewed, eqx.Module):
     ceiling: Float[Array, ""]
     slew: Float[Array, ""]
     fallback: Float[Array, ""]
+
+
+@dataclasses.dataclass(frozen=True, eq=False, repr=False)  # as `etid.online.tracker.Tracker`
+class Controller(Overviewed):
+    """Finds the amplitude of every pulse for a wanted charge or current.
+
+    Make a controller with `Controller.of`.
+
+    Attributes:
+        tracker: The tracker whose states are used.
+        model: Charge and current from an admittance.
+        limits: Limits of the amplitude.
+    """
+
+    tracker: Tracker
+    model: CurrentModel
+    limits: Limits
 
     @classmethod
     def of(
@@ -151,14 +155,14 @@ class Controller(Overviewed, eqx.Module):
             ValueError: A limit is not positive, the probability is not between ½ and 1, or the
                 driver of the tracker is not good.
         """
-        limits = {
+        given = {
             "current_cap": current_cap,
             "charge_cap": charge_cap,
             "voltage_cap": voltage_cap,
             "slew": slew,
             "fallback": fallback,
         }
-        for name, value in limits.items():
+        for name, value in given.items():
             if not value > 0:
                 raise ValueError(f"{name} is {value}; it must be positive")
         if not 0.5 <= probability < 1:
@@ -171,9 +175,7 @@ class Controller(Overviewed, eqx.Module):
         model = CurrentModel.of(tracker.model.bands, tracker.model.source, tracker.known)
         of = tracker.model.bands
         unloaded = float(np.abs(of.waveform()).max())
-        return cls(
-            tracker=tracker,
-            model=model,
+        limits = Limits(
             current_cap=jnp.asarray(float(current_cap)),
             charge_cap=jnp.asarray(float(charge_cap)),
             quantile=jnp.asarray(float(scipy.special.ndtri(probability))),
@@ -182,13 +184,14 @@ class Controller(Overviewed, eqx.Module):
             slew=jnp.asarray(float(slew)),
             fallback=jnp.asarray(float(fallback)),
         )
+        return cls(tracker, model, limits)
 
     def _overview(self) -> Overview:
         rows = [
-            ("current_cap", f"{1e3 * float(self.current_cap):g}", "mA"),
-            ("charge_cap", f"{1e9 * float(self.charge_cap):g}", "nC"),
-            ("guard", f"{float(self.guard):.3f}", "of the unloaded record"),
-            ("fallback", f"{float(self.fallback):g}", "of the unloaded record"),
+            ("current_cap", f"{1e3 * float(self.limits.current_cap):g}", "mA"),
+            ("charge_cap", f"{1e9 * float(self.limits.charge_cap):g}", "nC"),
+            ("guard", f"{float(self.limits.guard):.3f}", "of the unloaded record"),
+            ("fallback", f"{float(self.limits.fallback):g}", "of the unloaded record"),
         ]
         return Overview(f"Controller of {self.tracker.electrodes} electrodes", rows)
 
@@ -221,61 +224,77 @@ class Controller(Overviewed, eqx.Module):
         if not (np.isfinite(given) & (given >= 0)).all():
             raise ValueError(f"{given} is wanted; it must be finite and not negative")
         wanted = given if current is None else given * self.model.phase
-        wanted = np.broadcast_to(wanted, (self.tracker.electrodes,))
-        found = jax.tree.map(np.asarray, _commanded(self, state, wanted))
-        reason = np.array(REASONS)[found.reason]
-        return Command(found.amplitude, found.charge, found.charge_stderr, found.peak, reason)
+        wanted = np.full(self.tracker.electrodes, wanted)
+        amplitude, expected, stderr, peak, reason = np.array(
+            _commanded(
+                self.tracker.model.circuit,
+                self.tracker.change,
+                self.model,
+                self.limits,
+                state,
+                wanted,
+            )
+        )
+        return Command(amplitude, expected, stderr, peak, REASONS[reason.astype(int)])
 
 
 @jax.jit  # as `etid.online.tracker`
 def _commanded(
-    controller: Controller, state: TrackerState, wanted: Float[Array | np.ndarray, " lane"]
-) -> _Commands:
-    usable = (controller.tracker.driver_result == SUCCESSFUL) & ~state.driver_changed
-    return jax.vmap(lambda lane, want: _electrode(controller, lane, want, usable))(
-        state.electrodes, wanted
-    )
+    circuit: AbstractCircuit,
+    change: Float[Array, ""],
+    model: CurrentModel,
+    limits: Limits,
+    state: TrackerState,
+    wanted: Float[Array | np.ndarray, " lane"],
+) -> Float[Array, "row lane"]:
+    """The fields of `Command` as rows of one array: each array of a result costs time."""
+
+    def electrode(lane: ElectrodeState, wanted: Float[Array, ""]) -> Float[Array, " row"]:
+        cov = inverse_of_few(predicted(lane.information, change))
+        now = model.current(circuit, LoadUnknowns.of(lane.own).log_elements, cov)
+        return _electrode(limits, lane, now, wanted, ~state.driver_changed)
+
+    return jax.vmap(electrode, out_axes=1)(state.electrodes, jnp.asarray(wanted))
 
 
 def _electrode(
-    controller: Controller,
+    limits: Limits,
     state: ElectrodeState,
+    now: Current,
     wanted: Float[Array, ""],
     usable: Array,
-) -> _Commands:
-    """The command for one electrode."""
-    change = controller.tracker.change
-    information = predicted(state.information, change)
-    cov = inverse_of_few(information)
-    logs = LoadUnknowns.of(state.own).log_elements
-    now = controller.model.current(controller.tracker.model.circuit, logs, cov)
-    k = controller.quantile
+) -> Float[Array, " row"]:
+    """The command for one electrode, with the number of its reason.
+
+    Args:
+        limits: The limits.
+        state: State of the electrode.
+        now: Current through it per unit of amplitude.
+        wanted: Wanted charge [C].
+        usable: Whether the driver has not changed.
+    """
+    k = limits.quantile
     good = usable & (state.result == SUCCESSFUL) & (state.pulses > 0)
     good = good & (now.charge > 0) & (now.charge_stderr < now.charge)
-    limits = jnp.stack(
+    most = jnp.stack(
         [
             wanted / now.charge,
-            controller.current_cap / (now.peak + k * now.peak_stderr),
-            controller.charge_cap / (now.charge + k * now.charge_stderr),
-            controller.guard,
-            controller.ceiling,
-            jnp.nan_to_num(state.amplitude) + controller.slew,
+            limits.current_cap / (now.peak + k * now.peak_stderr),
+            limits.charge_cap / (now.charge + k * now.charge_stderr),
+            limits.guard,
+            limits.ceiling,
+            jnp.nan_to_num(state.amplitude) + limits.slew,
         ]
     )
-    good = good & ~jnp.isnan(limits).any()  # the smallest of some numbers and a NaN is NaN
+    good = good & ~jnp.isnan(most).any()  # the smallest of some numbers and a NaN is NaN
     # One bad pulse must not raise the amplitude of wet skin. A new electrode may need more.
     held = (state.pulses > 0) & (state.amplitude > 0)
-    most = jnp.where(held, state.amplitude, jnp.inf)
-    first = jnp.where(wanted > 0, jnp.minimum(controller.fallback, most), 0.0)
-    safe = jnp.concatenate([first[None], jnp.full(2, jnp.inf), limits[3:]])
-    applied = jnp.where(good, limits, safe)
+    last = jnp.where(held, state.amplitude, jnp.inf)
+    first = jnp.where(wanted > 0, jnp.minimum(limits.fallback, last), 0.0)
+    safe = jnp.concatenate([first[None], jnp.full(2, jnp.inf), most[3:]])
+    applied = jnp.where(good, most, safe)
     reason = jnp.argmin(applied)
     amplitude = applied[reason]
-    reason = jnp.where(good, reason, len(REASONS) - 1)
-    return _Commands(
-        amplitude,
-        jnp.where(good, amplitude * now.charge, jnp.nan),
-        jnp.where(good, amplitude * now.charge_stderr, jnp.nan),
-        jnp.where(good, amplitude * now.peak, jnp.nan),
-        reason,
-    )
+    expected = amplitude * jnp.stack([now.charge, now.charge_stderr, now.peak])
+    reason = jnp.where(good, reason, len(REASONS) - 1).astype(amplitude.dtype)
+    return jnp.concatenate([amplitude[None], jnp.where(good, expected, jnp.nan), reason[None]])

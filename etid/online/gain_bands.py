@@ -11,17 +11,8 @@ the gain is nearly linear. The pulse determines it as
 
     Ĝ = Σ X̄_k Y_k / Σ (|X_k|² − σ_x²)    at    f = Σ |X_k|² f_k / Σ |X_k|².
 
-The bands reduce the numbers to be fitted to a twentieth. They lose 0.2 % of the information.
-
-**No transform.** Σ X̄_k Y_k is a scalar product of the samples and a row of weights (Parseval).
-`Projection` has these rows, so that a pulse takes one matrix product. Between the edges of two
-pulses the voltage is smooth, and blocks of samples are replaced by their means there. The row of a
-band is multiplied by the smooth curve through these means; this is exact to 10⁻³ standard errors of
-a pulse. Neighbouring bands share a little noise because of it. Their weights are divided by the sum
-of the correlations.
-
-**Noise** is what the blocks contain besides a parabola, at six frequencies of the bands. This needs
-no model of the load.
+`etid.online.projection` makes Ĝ of the samples. The bands reduce the numbers to be fitted to a
+twentieth. They lose 0.2 % of the information.
 
 **Aliases**, X(f − fs), cannot be distinguished from X(f) in one period. If a period is not a whole
 number of samples, each period is sampled at a different phase φ [samples] and contains
@@ -35,8 +26,6 @@ unloaded record; its value is what the window itself has at its end. With a step
 this part is 0.2 % of the pulse, which is far above the noise.
 """
 
-import dataclasses
-import itertools
 import math
 from typing import NamedTuple
 
@@ -44,8 +33,9 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Complex, Float, Int
+from jaxtyping import Array, Complex, Float, Int
 
+from etid.online.projection import Projection, Seen
 from etid.signals.harmonics import ALIASED
 from etid.signals.noise import RIPPLE
 from etid.signals.transfer import as_complex, power
@@ -53,14 +43,6 @@ from etid.signals.transfer import as_complex, power
 RELATIVE = 8  # frequency of a band over its width
 WIDEST = 64  # [bins] largest width of a band
 LAST_BAND = 8  # [bins] width of the last band, which has no neighbour to show its curvature
-BLOCKS = 208  # blocks in a period, if there were no pulse
-SHORTEST = 8  # [samples] smallest length of a block
-EDGE = 1e-2  # second difference over a block that is an edge, relative to the largest one
-CLEAR = 12.0  # the same relative to the noise of the unloaded pulse
-LEAD, FOLLOW = 8, 12  # blocks before the first edge and after the last that are kept as samples
-NOISE_FREQUENCIES = 6  # at which the noise of a block is measured
-QUIET = 40  # smallest number of blocks times frequencies
-TOGETHER = 25  # electrodes whose samples fit in the cache of a core and are read only once
 PRESENT = 0.5  # minimum fraction of a band's power in X that must be signal
 TAIL_SPREAD = 0.2  # of the rate of the tail, by the load, relative to that of the unloaded record
 TAIL_ERROR = 0.2  # of the tail that an amplitude lacks after it has changed
@@ -94,145 +76,6 @@ def _edges(bins: int) -> Int[np.ndarray, " band1"]:
         width = min(max(first[-1] // RELATIVE, 1), WIDEST)
         first.append(min(first[-1] + width, inner))
     return np.array([*first, bins + 1])
-
-
-class Seen(NamedTuple):
-    """What one pulse shows at all electrodes, before its amplitude is considered.
-
-    Attributes:
-        gain: Ĝ in each band for the samples as they are; it includes the phase of the delay.
-        mean: Mean of the window [V].
-        middle: Mean of `LAST` of the window after its middle [V].
-        late: Mean of the last samples of the window [V].
-        variance: E|noise|² of a Fourier coefficient of V_out [V²].
-        clipped: Whether a sample reached the end of the converter's range.
-    """
-
-    gain: Float[Array | np.ndarray, "lane part"]
-    mean: Float[Array | np.ndarray, " lane"]
-    middle: Float[Array | np.ndarray, " lane"]
-    late: Float[Array | np.ndarray, " lane"]
-    variance: Float[Array | np.ndarray, " lane"]
-    clipped: Bool[Array | np.ndarray, " lane"]
-
-
-@dataclasses.dataclass(frozen=True, eq=False)
-class Projection:
-    """The matrix product that makes bands of samples; NumPy, without a copy to the device.
-
-    Attributes:
-        samples: Length of a window [samples].
-        pieces: Intervals that are kept as samples: (first sample, sample after the last).
-        runs: Intervals that are replaced by blocks: (first sample, number of blocks).
-        block: Length of a block [samples].
-        within: Columns that make of a block its mean, and its noise at each frequency.
-        rows: Columns that make of samples and means: the real and imaginary parts of Ĝ, and the
-            means of `Seen`. Single precision takes half the time. Its error is 2e-8 of the peak, a
-            five-hundredth of the smallest noise that etid accepts for a record.
-        floor: Smallest variance that is accepted for a coefficient of V_out [V²].
-    """
-
-    samples: int
-    pieces: tuple[tuple[int, int], ...]
-    runs: tuple[tuple[int, int], ...]
-    block: int
-    within: Float[np.ndarray, "sample column"]
-    rows: Float[np.ndarray, "kept row"]
-    floor: float
-
-    @classmethod
-    def of(
-        cls,
-        x: Float[np.ndarray, " sample"],
-        sigma: float,
-        rows: Float[np.ndarray, "row sample"],
-        floor: float,
-    ) -> "Projection":
-        """The projection.
-
-        Args:
-            x: The unloaded pulse [V].
-            sigma: Standard deviation of its noise [V].
-            rows: Weights of the samples of a whole window.
-            floor: Smallest variance that is accepted for a coefficient of V_out [V²].
-
-        Raises:
-            ValueError: The quiet between two pulses is too short.
-        """
-        block = max(x.size // BLOCKS, SHORTEST)
-        pieces, runs = _partition(x, sigma, block)
-        columns = [rows[:, begin:end] for begin, end in pieces]
-        for begin, count in runs:
-            columns.append(rows[:, begin : begin + block * count] @ _smooth(count, block))
-        within = _within(block)
-        if sum(count for _, count in runs) * (within.shape[1] - 1) < QUIET:
-            raise ValueError("the quiet between two pulses is too short for its noise to be known")
-        kept = np.ascontiguousarray(np.concatenate(columns, axis=1).T)
-        return cls(x.size, tuple(pieces), tuple(runs), block, within, kept, floor)
-
-    def shares(self) -> Float[np.ndarray, " kept"]:
-        """Variance of each sample and mean, relative to that of a sample."""
-        samples = sum(end - begin for begin, end in self.pieces)
-        means = sum(count for _, count in self.runs)
-        return np.concatenate([np.ones(samples), np.full(means, 1 / self.block)])
-
-    def freedom(self) -> int:
-        """Degrees of freedom of the variance of the noise."""
-        return sum(count for _, count in self.runs) * (self.within.shape[1] - 1)
-
-    def single(self) -> "Projection":
-        """The projection with its rows in single precision."""
-        return dataclasses.replace(self, rows=self.rows.astype(np.float32))
-
-    def seen(
-        self, v_out: Float[np.ndarray, "lane sample"], adc_range: Float[np.ndarray, " 2"]
-    ) -> Seen:
-        """Bands and noise of one pulse.
-
-        Args:
-            v_out: One window per electrode [V].
-            adc_range: Voltages at which the converter saturates [V].
-        """
-        lanes = len(v_out)
-        kept = np.empty((lanes, len(self.rows)), self.rows.dtype)
-        squares, clipped = np.empty(lanes), np.zeros(lanes, bool)
-        low, high = adc_range
-        limited = np.isfinite(low) or np.isfinite(high)
-        with np.errstate(invalid="ignore", over="ignore"):  # samples that are not numbers
-            for first in range(0, lanes, TOGETHER):
-                of = slice(first, first + TOGETHER)
-                some = v_out[of]
-                squares[of] = self._condensed(some, kept[of])
-                if limited:
-                    clipped[of] = (some.min(axis=1) <= low) | (some.max(axis=1) >= high)
-            found = (kept @ self.rows).astype(float)
-        variance = np.maximum(self.samples * squares / self.freedom(), self.floor)
-        return Seen(found[:, :-3], found[:, -3], found[:, -2], found[:, -1], variance, clipped)
-
-    def _condensed(
-        self, v_out: Float[np.ndarray, "lane sample"], kept: Float[np.ndarray, "lane kept"]
-    ) -> Float[np.ndarray, " lane"]:
-        """Fill `kept` with samples and means of blocks [V]; the sum of squares of noise [V²]."""
-        lanes = len(v_out)
-        squares, at = np.zeros(lanes), 0
-        for begin, end in self.pieces:
-            kept[:, at : at + end - begin] = v_out[:, begin:end]
-            at += end - begin
-        for begin, count in self.runs:
-            lane, sample = v_out.strides
-            blocks = np.lib.stride_tricks.as_strided(
-                v_out[:, begin:],
-                (lanes, count, self.block),
-                (lane, self.block * sample, sample),
-                writeable=False,
-            )
-            of = blocks @ self.within
-            kept[:, at : at + count] = of[..., 0]
-            of[..., 0] = 0.0
-            noise = of.reshape(lanes, -1)
-            squares += np.einsum("ij,ij->i", noise, noise)
-            at += count
-        return squares
 
 
 class Gains(NamedTuple):
@@ -319,7 +162,7 @@ class Bands(eqx.Module):
             lacking: (A − B) / A, for a pulse of amplitude A after one of amplitude B.
             offset: Offset of the converter [V].
         """
-        gain = jax.lax.complex(*jnp.split(seen.gain, 2, axis=1))
+        gain = seen.gain()
         tail = self._lacking_tail(seen, lacking, offset)
         unsure = self.weight[None, :] * power(TAIL_ERROR * tail) / 2
         weight = self.weight[None, :] / (seen.variance[:, None] + unsure)
@@ -334,10 +177,11 @@ class Bands(eqx.Module):
         of the tail that is left after one period.
         """
         last, middle = round(LAST * self.samples), self.samples // 2
-        late = seen.late - offset
+        means = seen.means()
+        late = means.late - offset
         left = late / (1 - lacking * self.tail_left)
         # The rate of the loaded driver, as far as the noise lets it be seen.
-        early = seen.middle - offset
+        early = means.middle - offset
         decay = -jnp.log(self.tail_left) * (1 - (middle + last) / self.samples)
         ratio = early / late
         rate = jnp.log(jnp.where(ratio > 1, ratio, 1.0)) / decay - 1
@@ -346,56 +190,6 @@ class Bands(eqx.Module):
         rate = jnp.where((ratio > 1) & jnp.isfinite(rate), rate, 0.0)
         shape = self.tail[0][None, :] + as_complex(rate)[:, None] * self.tail[1][None, :]
         return as_complex(lacking * left)[:, None] * shape
-
-
-def _partition(
-    x: Float[np.ndarray, " sample"], sigma: float, block: int
-) -> tuple[list[tuple[int, int]], list[tuple[int, int]]]:
-    """Intervals of a window that are kept as samples, and those that are replaced by blocks.
-
-    Args:
-        x: The unloaded pulse [V].
-        sigma: Standard deviation of its noise [V].
-        block: Length of a block [samples].
-
-    Returns:
-        (first sample, sample after the last) of each piece, (first sample, blocks) of each run.
-    """
-    half = block // 2
-    bend = np.abs(np.roll(x, half) - 2 * x + np.roll(x, -half))
-    sharp = np.flatnonzero(bend > max(EDGE * bend.max(), CLEAR * sigma))
-    near = np.arange(-LEAD * block, FOLLOW * block + 1)
-    kept = np.zeros(x.size, bool)
-    kept[(sharp[:, None] + near) % x.size] = True
-    pieces, runs = [], []
-    for piece, samples in itertools.groupby(range(x.size), lambda at: bool(kept[at])):
-        of = list(samples)
-        count = 0 if piece else len(of) // block
-        if count:
-            runs.append((of[0], count))
-        if len(of) > count * block:
-            pieces.append((of[0] + count * block, of[-1] + 1))
-    return pieces, runs
-
-
-def _smooth(count: int, block: int) -> Float[np.ndarray, "sample block"]:
-    """The smooth curve through means of blocks: the derivative of a cubic spline of their sums."""
-    import scipy.interpolate  # takes a quarter of a second, which only trackers need
-
-    ends = block * np.arange(count + 1)
-    sums = np.concatenate([np.zeros((1, count)), np.cumsum(block * np.eye(count), axis=0)])
-    spline = scipy.interpolate.CubicSpline(ends, sums)
-    return np.diff(spline(np.arange(block * count + 1)), axis=0)
-
-
-def _within(block: int) -> Float[np.ndarray, "sample column"]:
-    """The mean of a block, and unit vectors at right angles to a parabola at some frequencies."""
-    at = (np.arange(block) + 0.5) / block
-    highest = round(2 * ALIASED * block)  # half periods in a block
-    waves = np.unique(np.linspace(4, highest, NOISE_FREQUENCIES).round())
-    smooth = np.stack([at**0, at, at**2], axis=1)
-    basis, _ = np.linalg.qr(np.concatenate([smooth, np.cos(np.pi * np.outer(at, waves))], axis=1))
-    return np.concatenate([np.full((block, 1), 1 / block), basis[:, 3:]], axis=1)
 
 
 def _slopes(

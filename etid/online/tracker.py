@@ -37,49 +37,39 @@ error nor the error from the noise of the unloaded record: both are in `shared_c
 two resistors. One resistor leaves a delay open, which makes an error of one or two per cent in C_p.
 """
 
-import equinox as eqx
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float
 
 from etid.circuits.circuit import AbstractCircuit
 from etid.circuits.overview import Overview, Overviewed
 from etid.estimators.estimator import serving
-from etid.estimators.judgement import SUCCESSFUL
 from etid.estimators.maximum_likelihood.given_driver import GivenDriver, combined
 from etid.estimators.registry import MAXIMUM_LIKELIHOOD
-from etid.estimators.starts import circuit_starts
-from etid.estimators.unknowns import LoadUnknowns
 from etid.identify.arguments import circuit_of, require_float64
 from etid.identify.compiled import stored_jit
 from etid.identify.one import explained, known_at
 from etid.online import changes
-from etid.online.changes import Change, driver_change
-from etid.online.electrode import (
-    Measured,
-    after_pulse,
-    anew,
-    predicted,
-    suspicion,
-    tracked,
-)
-from etid.online.gain_bands import Bands, Projection, Seen, cut, unloaded_bands
-from etid.online.pulse_fit import Expected, GainModel
+from etid.online.changes import Change
+from etid.online.gain_bands import cut, unloaded_bands
+from etid.online.projection import Projection
+from etid.online.pulse_fit import GainModel
 from etid.online.reading import fit_of
 from etid.online.state import ElectrodeState, TrackerState
+from etid.online.tick import updated
 from etid.recordings.preflight import Inspected, preflight
 from etid.recordings.recording import Recording
 from etid.results.driver import Driver, HarmonicDriver
 from etid.results.fits import Fit, Fits, IdentificationError, described
-from etid.results.verdicts import RESULTS, first_verdict, message, verdict_names, verdicts_of
-from etid.signals.transfer import as_complex, power
-
-STEADY = 0.1  # relative change of amplitude up to which the mean of a window is its offset
-FLAT = 4.0  # power relative to that of noise alone; below this, the pulse is `flat`
+from etid.results.verdicts import RESULTS, message, verdict_names, verdicts_of
 
 
-class Tracker(Overviewed, eqx.Module):
+# No `equinox.Module`: its methods would cost a twentieth of a tick at every call.
+@dataclasses.dataclass(frozen=True, eq=False, repr=False)
+class Tracker(Overviewed):
     """Identifies the loads at all electrodes of a display with every pulse.
 
     Make a tracker with `Tracker.of`.
@@ -97,14 +87,14 @@ class Tracker(Overviewed, eqx.Module):
     """
 
     model: GainModel
-    projection: Projection = eqx.field(static=True)
+    projection: Projection
     known: GivenDriver
     change: Float[Array, ""]
     limit: Float[Array, ""]
     adc_range: Float[np.ndarray, " 2"]
     driver_result: RESULTS
-    electrodes: int = eqx.field(static=True)
-    period: float = eqx.field(static=True)
+    electrodes: int
+    period: float
 
     @classmethod
     def of(
@@ -270,9 +260,9 @@ class Tracker(Overviewed, eqx.Module):
             )
         if not (np.isfinite(amplitude) & (amplitude >= 0)).all():
             raise ValueError(f"amplitude is {amplitude}; it must be finite and not negative")
-        relative = np.broadcast_to(amplitude, (self.electrodes,))
+        relative = np.full(self.electrodes, amplitude)
         found = self.projection.seen(np.asarray(v_out, float), self.adc_range)
-        return _updated(self.model, self.change, self.limit, state, found, relative)
+        return updated(self.model, self.change, self.limit, state, found, relative)
 
     def read(self, state: TrackerState) -> Fits:
         """Elements, standard errors, χ² of the last pulse and verdict of every electrode.
@@ -321,107 +311,6 @@ class Tracker(Overviewed, eqx.Module):
         lowest = self.model.bands.frequency[:1]
         z = jax.vmap(lambda one: self.model.circuit.with_log_values(one).response(lowest)[0])(logs)
         return changes.bad_electrodes(state, np.abs(np.asarray(z)))
-
-
-@jax.jit  # `stored_jit` and `equinox.filter_jit` would cost a tenth of a tick at every call
-def _updated(
-    model: GainModel,
-    change: Float[Array, ""],
-    limit: Float[Array, ""],
-    state: TrackerState,
-    seen: Seen,
-    amplitude: Float[Array, " lane"],
-) -> TrackerState:
-    before, number = state.electrodes, state.number + 1
-    measured = _measured(model.bands, seen, amplitude, before)
-    information = jax.vmap(lambda of: predicted(of, change))(before.information)
-    logs = LoadUnknowns.of(before.own).log_elements
-    expected = _expected(model, logs, number)
-    found = jax.vmap(lambda *of: tracked(model, *of))(before, measured, expected, information)
-    common = model.circuit.scaling()[0]
-    suspected = jax.vmap(lambda a, b, c: suspicion(a, b, c, common, limit))(
-        before, found, information
-    )
-    running = before.pulses > 0
-    wanted = (~running | suspected.jump | suspected.drift) & (measured.bad == SUCCESSFUL)
-    starts = circuit_starts(model.circuit, None)
-    fresh = jax.lax.cond(
-        wanted.any(),
-        jax.vmap(lambda of, want, logs: anew(model, of, starts, want, logs)),
-        lambda *_: found,
-        measured,
-        wanted,
-        logs,
-    )
-    after = jax.vmap(lambda a, b, c, d, e, f: after_pulse(a, b, c, d, e, f, limit, number))(
-        before, measured, information, found, fresh, suspected
-    )
-    counts = running & measured.steady & (measured.bad == SUCCESSFUL)
-    event = driver_change(suspected.jump, suspected.z.T, counts)
-    return TrackerState(after, number, event, state.driver_changed | event)
-
-
-def _expected(
-    model: GainModel, logs: Float[Array, "lane element"], number: Int[Array, ""]
-) -> Expected:
-    """The expected gains, computed once.
-
-    XLA repeats a computation in every loop that reads its result, here a dozen times. It computes
-    the result of a branch only once. `number` is positive, which XLA does not know.
-    """
-    evaluate = jax.vmap(model.expected)
-    shapes = jax.eval_shape(evaluate, logs)
-    return jax.lax.cond(
-        number > 0,
-        evaluate,
-        lambda _: jax.tree.map(lambda of: jnp.zeros(of.shape, of.dtype), shapes),
-        logs,
-    )
-
-
-def _measured(
-    bands: Bands, seen: Seen, amplitude: Float[Array, " lane"], before: ElectrodeState
-) -> Measured:
-    """Gains of a pulse, and the verdict on its samples.
-
-    Args:
-        bands: The unloaded pulse.
-        seen: The bands of the windows.
-        amplitude: Relative amplitude of the pulse.
-        before: State before the pulse.
-    """
-    relative = jnp.where(amplitude > 0, amplitude, 1.0)
-    known = jnp.isfinite(before.amplitude)
-    lacking = jnp.where(known, (relative - before.amplitude) / relative, 0.0)
-    # In the steady state the mean of V_out is 0: a transformer passes no direct voltage.
-    finite = jnp.isfinite(seen.mean) & jnp.isfinite(seen.variance)
-    steady = jnp.abs(lacking) < STEADY
-    offset = jnp.where(finite & steady, seen.mean, before.offset)
-    unknown = ~jnp.isfinite(offset)
-    gains = bands.measure(seen, lacking, jnp.where(unknown, 0.0, offset))
-    signal = power(gains.gain) @ bands.weight
-    noise = 2 * jnp.sum(bands.weight > 0, dtype=float) * gains.variance
-    flat = (signal < FLAT * noise) | ~(amplitude > 0)
-    level = jnp.sqrt(jnp.maximum(signal - noise, 0.0) / jnp.sum(bands.weight)) / relative
-    bad = jax.vmap(
-        lambda finite, clipped, unknown, flat, unconnected: first_verdict(
-            (~finite, RESULTS.nonfinite_samples),
-            (clipped, RESULTS.saturated),
-            (unknown, RESULTS.too_short),
-            (flat, RESULTS.flat),
-            (unconnected, RESULTS.unconnected),
-        )
-    )(finite, seen.clipped, unknown, flat, jnp.abs(level - 1) < 1 - changes.OPEN)
-    return Measured(
-        gain=gains.gain * as_complex(1 / relative)[:, None],
-        variance=gains.variance / relative**2,
-        weight=gains.weight * relative[:, None] ** 2,
-        level=level,
-        amplitude=amplitude,
-        offset=offset,
-        steady=steady,
-        bad=bad,
-    )
 
 
 @stored_jit
