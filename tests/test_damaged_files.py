@@ -14,6 +14,7 @@ from benchmarks.ladder import TRIAL, rung
 from etid.files.readers import mat5
 from etid.recordings import hdf5, limits, untrusted
 from etid.recordings.preflight import Inspected, preflight
+from etid.report import figures
 from etid.results.study_fits import StudyFits
 
 FEW = 4  # files of each kind in the ordinary tests
@@ -296,6 +297,10 @@ def test_a_column_whose_texts_are_in_parts_is_refused(fits):
         file.create_dataset("path", data=["loaded/0"] * 6, dtype=h5py.string_dtype(), chunks=(2,))
     with pytest.raises(etid.RecordingError, match="path: its texts are not stored in one block"):
         StudyFits.read(fits)
+
+
+def test_numbers_beyond_any_axis_are_left_out_of_the_report_without_a_warning():
+    figures.quality(np.geomspace(1.0, 10.0, 3), np.array([1e-300, 1e-3, 1e290]))
 
 
 # Files of other formats

@@ -7,7 +7,17 @@ from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 
 from etid.circuits.display import DISPLAY
-from etid.plotting.style import COLOURS, INK, MARKS, RED, Canvas, plain_ticks, symbol, titled
+from etid.plotting.style import (
+    COLOURS,
+    INK,
+    MARKS,
+    RED,
+    Canvas,
+    drawable,
+    plain_ticks,
+    symbol,
+    titled,
+)
 from etid.results.fits import Fits
 from etid.simulation.bound import Bound
 
@@ -30,25 +40,25 @@ def draw_fits(canvas: Canvas, fits: Fits) -> np.ndarray:
         scale = DISPLAY[unit][0]
         values = np.asarray(getattr(fits.circuit, name)) / scale
         errors = np.asarray(getattr(fits.stderr, name)) / scale
-        drawable = np.isfinite(values) & (values > 0)
+        known = drawable(values)
         for i, condition in enumerate(conditions):
-            of = drawable & (fits.labels["condition"] == condition)
+            of = known & (fits.labels["condition"] == condition)
             _points(axis, x, values, errors, of & good, i, condition, hollow=False)
             _points(axis, x, values, errors, of & ~good, i, condition, hollow=True)
         axis.set_yscale("log")
         plain_ticks(axis.yaxis)
-        shown = drawable
-        if good.any():  # an undetermined element may lie decades away
-            low, high = values[good].min() / 2, values[good].max() * 2
+        shown = known
+        if (good & known).any():  # an undetermined element may lie decades away
+            low, high = values[good & known].min() / 2, values[good & known].max() * 2
             axis.set_ylim(low, high)
-            shown = drawable & (values > low) & (values < high)
+            shown = known & (values > low) & (values < high)
         if not shown.all():
             axis.text(
                 0.995, 0.97, f"{(~shown).sum()} without success outside", color=RED, fontsize=8,
                 transform=axis.transAxes, ha="right", va="top",
             )  # fmt: skip
         if len(fits) <= NAMED:
-            for row in np.flatnonzero(shown & drawable):
+            for row in np.flatnonzero(shown):
                 axis.annotate(
                     str(fits.labels["trial"][row]), (x[row], values[row]), xytext=(4, 3),
                     textcoords="offset points", fontsize=7, color="0.35",

@@ -94,6 +94,12 @@ def _subplots(figure: Figure, rows: int, columns: int, options: dict[str, Any]) 
     return axes
 
 
+def drawable(values: np.ndarray) -> np.ndarray:
+    """Whether a logarithmic axis can show the values: beyond, the ends of the axis overflow."""
+    values = np.asarray(values)
+    return (values > 1e-100) & (values < 1e100)
+
+
 def plain_ticks(axis: Axis) -> None:
     """Numbers at 1, 2 and 5 of each decade of a logarithmic axis."""
     axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))

@@ -18,7 +18,7 @@ from matplotlib.figure import Figure
 
 from etid.circuits.display import DISPLAY
 from etid.plotting import figure_of
-from etid.plotting.style import COLOURS, DASHES, MARKS, new_figure, symbol
+from etid.plotting.style import COLOURS, DASHES, MARKS, drawable, new_figure, symbol
 from etid.report.tables import Components, frequent
 from etid.results.driver import Driver
 from etid.results.fits import Fits
@@ -43,8 +43,8 @@ def svg(figure: Figure) -> bytes:
     return buffer.getvalue()
 
 
-def _positive(values: np.ndarray) -> Float[np.ndarray, " value"]:
-    return np.asarray(values)[np.isfinite(values) & (np.asarray(values) > 0)]
+def _drawable(values: np.ndarray) -> Float[np.ndarray, " value"]:
+    return np.asarray(values)[drawable(values)]
 
 
 def _steps(axis: Axes, values: np.ndarray, series: int, label: str) -> None:
@@ -63,7 +63,7 @@ def distributions(fits: Fits) -> bytes:
     for axis, (name, unit) in zip(axes[0], units.items(), strict=True):
         scale = DISPLAY[unit][0]
         for series, condition in enumerate(frequent(fits, SERIES)):
-            values = _positive(getattr(good.where(condition=condition).circuit, name)) / scale
+            values = _drawable(getattr(good.where(condition=condition).circuit, name)) / scale
             if values.size:
                 _steps(axis, values, series, f"{_short(condition) or 'all'} ({values.size})")
         axis.set(xlabel=symbol(name, unit))
@@ -97,7 +97,7 @@ def quality(chi2: Float[np.ndarray, " fit"], stderr: Float[np.ndarray, " fit"]) 
     left.set(xlabel="χ² per degree of freedom", ylabel="fits")
     right.set(xlabel="largest relative standard error [%]", ylabel="fits")
     for axis, values in ((left, chi2), (right, 100 * stderr)):
-        known = _positive(values)
+        known = _drawable(values)
         if known.size:
             wide = known.max() > NARROW * known.min()
             space = np.geomspace if wide else np.linspace
