@@ -3,6 +3,7 @@ import sys
 
 import numpy as np
 import pytest
+import scipy.io
 
 from etid.files.importing import import_file
 from etid.recordings import hdf5
@@ -234,6 +235,17 @@ def test_matlab_variables_that_cannot_be_records_are_explained(variables, messag
     path = matlab(tmp_path / "m.mat", 5, **variables)
     with pytest.raises(RecordingError, match=message):
         import_file(path, tmp_path / "a.h5", **TABLE)
+
+
+def test_matlab_4_files_of_a_vax_are_refused_and_the_library_is_silent(tmp_path, recwarn):
+    path = tmp_path / "m.mat"
+    scipy.io.savemat(path, {"th": TH, "out": TH / 2}, format="4")
+    data = bytearray(path.read_bytes())
+    data[:4] = (2000).to_bytes(4, "little")  # the order of bytes of a VAX
+    path.write_bytes(data)
+    with pytest.raises(RecordingError, match="VAX or Cray"):
+        import_file(path, tmp_path / "a.h5", **TABLE)
+    assert not recwarn.list
 
 
 @pytest.mark.parametrize("name", ["a.npz", "a.csv", "a.mat"])

@@ -6,6 +6,7 @@ structure a is the channel `a.b`. Rows are trials, columns are times.
 
 import contextlib
 import pathlib
+import warnings
 from collections.abc import Iterator
 from typing import Any
 
@@ -93,9 +94,17 @@ def _whole(path: pathlib.Path) -> Contents:
 
     mat5.check(path)
     try:
-        content = _flat(pymatreader.read_mat(path))
+        # Variables that SciPy leaves out are named where they are asked for.
+        with warnings.catch_warnings(record=True) as said:
+            warnings.simplefilter("always")
+            content = _flat(pymatreader.read_mat(path))
     except (MatReadError, UnboundLocalError) as error:  # SciPy knows not all classes of arrays
         raise RecordingError(f"cannot be read ({error})") from error
+    if any("byte ordering" in str(one.message) for one in said):
+        raise RecordingError(
+            "contains numbers of a VAX or Cray (MATLAB 4), which are read wrong",
+            remedy="Save it again in MATLAB: save('file.mat', '-v7.3')",
+        )
 
     def channel(name: str) -> Channel:
         array = content[name]
