@@ -310,9 +310,10 @@ def asked_of(
                 "would compare circuits with different knowledge; pass one circuit, or call "
                 "select_circuit with candidates that all have it"
             )
-    for circuit in candidates:
+    for circuit in candidates if asked.known else ():
         checked(asked.known, circuit)
-    checked_limits(asked.bounds, asked.known, candidates)
+    if asked.bounds:
+        checked_limits(asked.bounds, asked.known, candidates)
     return asked
 
 

@@ -455,14 +455,15 @@ def concluded(
     """
     change = changes.of_fits(fits, driver, repeats)
     before = (fits.verdict == "changed")[:, None]
-    known, known_stderr = fits.known_changes
+    # Few fits have changes of their own; those of the others are not asked for.
+    known, known_stderr = fits.known_changes if before.any() else (change.size, change.stderr)
     names, remarked = fits.verdict, fits.remarks | np.asarray(remarks, int)
     coarse = (remarked & Remark.coarse_converter) > 0
     names = np.where(coarse & (names == "insensitive"), "resolution", names)
     names = np.where(change.seen & np.isin(names, changes.EXPLAINED), "changed", names)
     support = fits.support
     if support is None:
-        support = Support.unknown(len(fits.circuit.names()), len(names))
+        support = Support.unknown(change.size.shape[1], len(names))
     return dataclasses.replace(
         fits,
         remarks=remarked,
