@@ -12,6 +12,8 @@ from etid.recordings.remarks import Remark
 from etid.simulation.transformer import loading
 from tests.test_driver_and_current import SKIN, WITHIN, off, relative, scene
 
+pytestmark = pytest.mark.slow  # the program of a joint fit with currents compiles for a minute
+
 DAMP = etid.SkinRC(r_s=6.1e3, r_p=17.4e3, c_p=0.66e-9)
 
 
@@ -157,7 +159,6 @@ def test_the_bound_of_one_trial_is_that_of_etid(drawn):
     np.testing.assert_allclose(joint_bound(one)[0], bound_of(one), rtol=1e-4)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("shared_v_th", [False, True])
 @pytest.mark.parametrize(("circuit", "current_snr_db"), [(SKIN, 40.0), (DAMP, 30.0)])
 def test_joint_estimates_are_efficient_and_their_intervals_true(
@@ -182,7 +183,6 @@ def test_joint_estimates_are_efficient_and_their_intervals_true(
     assert 0.92 < np.mean(covered) < 0.98
 
 
-@pytest.mark.slow
 def test_a_current_helps_the_recordings_without_one(drawn):
     paths = "calibration/0", "loaded/0", "loaded/1"
     calibration, first, second = (drawn[path] for path in paths)
@@ -197,7 +197,6 @@ def test_a_current_helps_the_recordings_without_one(drawn):
     assert (gained[1] > gained[0]).all()
 
 
-@pytest.mark.slow
 def test_a_record_with_a_disturbed_period_leaves_its_current_out_and_says_so(pair, joint):
     calibration, recording = pair
     spike = np.array(recording.current)
