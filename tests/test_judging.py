@@ -136,11 +136,14 @@ def test_an_exponent_far_above_one_is_no_circuit(alpha, expected):
 
 @pytest.mark.parametrize("hum", [True, False])
 @pytest.mark.parametrize("falls", [True, False])
-def test_hum_and_a_falling_resistance_are_remarks(hum, falls):
-    expected = Remark.mains_hum * hum + Remark.falls_with_current * falls
-    assert int(remarks(jnp.asarray(hum), jnp.asarray(falls))) == int(expected)
+@pytest.mark.parametrize("late", [True, False])
+def test_hum_and_a_falling_or_late_resistance_are_remarks(hum, falls, late):
+    expected = (
+        Remark.mains_hum * hum + Remark.falls_with_current * falls + Remark.follows_late * late
+    )
+    assert int(remarks(*(jnp.asarray(one) for one in (hum, falls, late)))) == int(expected)
     fit = judged(
-        estimate(hum=jnp.asarray(hum), falls=jnp.asarray(falls)),
+        estimate(hum=jnp.asarray(hum), falls=jnp.asarray(falls), late=jnp.asarray(late)),
         etid.SkinRC(),
         SUCCESSFUL,
         "a method",

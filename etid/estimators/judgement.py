@@ -114,16 +114,24 @@ def judged(
         ),
         steps=estimate.steps,
         method=method,
-        remarks=remarks(estimate.hum, estimate.falls) + at_bound,
+        remarks=remarks(estimate.hum, estimate.falls, estimate.late) + at_bound,
         support=support or Support.unknown(values.size),
         limits=limited(circuit, own, outside),
     )
 
 
-def remarks(hum: Bool[Array, ""], falls: Bool[Array, ""] | bool = False) -> Int[Array, ""]:
-    """The remarks `mains_hum` and `falls_with_current`, each if its argument is true."""
-    both = (hum, Remark.mains_hum), (falls, Remark.falls_with_current)
-    return sum((jnp.where(on, int(one), 0) for on, one in both), jnp.zeros((), int))
+def remarks(
+    hum: Bool[Array, ""],
+    falls: Bool[Array, ""] | bool = False,
+    late: Bool[Array, ""] | bool = False,
+) -> Int[Array, ""]:
+    """`mains_hum`, `falls_with_current` and `follows_late`, each if its argument is true."""
+    of = (
+        (hum, Remark.mains_hum),
+        (falls, Remark.falls_with_current),
+        (late, Remark.follows_late),
+    )
+    return sum((jnp.where(on, int(one), 0) for on, one in of), jnp.zeros((), int))
 
 
 def unless(fit: Fit, bad: Bool[Array, ""], result: RESULTS) -> Fit:

@@ -23,6 +23,7 @@ class Remark(enum.IntFlag):
     falls_with_current = enum.auto()
     at_bound = enum.auto()
     current_unused = enum.auto()
+    follows_late = enum.auto()
 
 
 _TEXTS = {
@@ -52,6 +53,10 @@ _TEXTS = {
     Remark.current_unused: (
         "A current was recorded too, and this fit does not use it; identify_skin without a method "
         "uses driver and current at once."
+    ),
+    Remark.follows_late: (
+        "The residual looks like a resistance that follows its current late, as of skin whose "
+        "recovery after a pulse is slower than its fall; etid has no model of it."
     ),
 }
 

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import optimistix as optx
 from jaxtyping import Array, Complex, Float
 
+from etid.estimators.amplitudes.late import follows_late
 from etid.estimators.amplitudes.starts import likeliest, starts
 from etid.estimators.amplitudes.terms import Amplitudes
 from etid.estimators.estimate import MAX_STEPS, SOLVER, Estimate
@@ -61,8 +62,9 @@ def fit_amplitudes(of: Amplitudes) -> Estimate:
     solution = refined(of, jnp.concatenate([rough, of.given.mean]), WELL)
     q = solution.value
     predicted = jax.lax.map(lambda each: of.predicted(*each), (of.own(q), of.spectra))
-    curvature = _curvature(of, q, predicted)
+    curvature, slopes = _curvature(of, q, predicted)
     part = of.scaled(predicted)
+    lags = follows_late(of, q, slopes, part)
     terms = 2 * jnp.sum(of.spectra.selected, axis=-1, dtype=q.dtype)
     freedom = terms - (of.elements / of.count + 1)
     rrse = jax.vmap(complex_rrse)(predicted, of.spectra.y, of.spectra.selected)
@@ -84,6 +86,7 @@ def fit_amplitudes(of: Amplitudes) -> Estimate:
         result=solution.result,
         steps=solution.stats["num_steps"],
         strain=change @ jnp.linalg.solve(of.given.cov, change),
+        late=lags,
     )
 
 
@@ -105,8 +108,10 @@ def _amplified(q: Float[Array, " q"], of: Amplitudes) -> Float[Array, ""]:
 
 def _curvature(
     of: Amplitudes, q: Float[Array, " q"], predicted: Complex[Array, "record harmonic"]
-) -> Curvature:
+) -> tuple[Curvature, Complex[Array, "record q harmonic"]]:
     """Information of the records and the priors, and covariance of the gradient by the records.
+
+    Beside them the derivatives of the predictions, times the weights.
 
     The noise of X acts on V(X) through the slope of a resistor that depends on its current: little
     within a pulse, and most between the pulses, where the derivatives of the terms are 0.
@@ -147,4 +152,4 @@ def _curvature(
     rows = real_parts(slopes)
     expected = jnp.einsum("rqt,rt,rpt->qp", rows, jnp.tile(share, 2), rows)
     prior = jnp.diag(1 / of.widths(q) ** 2)
-    return Curvature(expected + prior, scores.sum(0))
+    return Curvature(expected + prior, scores.sum(0)), slopes
