@@ -338,6 +338,30 @@ def test_matlab_5_of_an_unknown_type_is_refused_before_scipy_ends_the_process(ki
         mat5.check(path)
 
 
+@pytest.mark.parametrize(
+    ("place", "value"),
+    [
+        (145, 0x08),  # says that it is complex: what follows would be its imaginary part
+        (144, 5),  # says that it is sparse: the same
+    ],
+)
+def test_matlab_5_without_its_numbers_is_refused_before_scipy_ends_the_process(
+    kinds, place, value, tmp_path
+):
+    path = tmp_path / "rig.mat"
+    data = bytearray(kinds["matlab5"].good[0])
+    assert data[144:146] == b"\x06\x00"  # a real double
+    mat5.check(_written(path, data))
+    data[place] = value
+    with pytest.raises(etid.RecordingError, match="without its numbers"):
+        mat5.check(_written(path, data))
+
+
+def _written(path, data):
+    path.write_bytes(data)
+    return path
+
+
 def test_a_damaged_archive_is_closed(tmp_path):
     """Warnings are errors: a file that is left open would be one."""
     path = tmp_path / "codes.npz"

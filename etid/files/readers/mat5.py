@@ -1,8 +1,10 @@
 """Check of MATLAB files of version 5 before SciPy reads them.
 
-SciPy does not check these files. An element of an unknown type crashes the process, and SciPy
-allocates a cell array with its declared size. A file is a sequence of elements (type, size, bytes);
-a matrix contains further elements (MathWorks, MAT-File Format, chapter 1).
+SciPy does not check these files. An element of an unknown type crashes the process, as does one
+that is no number where SciPy reads numbers, for instance after an array that says that it is
+complex and is not. SciPy allocates a cell array with its declared size. A file is a sequence of
+elements (type, size, bytes); a matrix contains further elements (MathWorks, MAT-File Format,
+chapter 1).
 """
 
 import math
@@ -17,6 +19,10 @@ _HEAD = 128  # [bytes]
 _MATRIX, _COMPRESSED = 14, 15
 _NUMBERS = {1, 2, 3, 4, 5, 6, 7, 9, 12, 13, 16, 17, 18}  # types of elements: integers, reals, texts
 _MADE_WHOLE = {1, 2, 3}  # cells, structures, objects: SciPy makes arrays of Python objects
+_NAMED = 3  # elements of a matrix before its numbers: flags, shape, name
+_COMPLEX = set(range(5, 16))  # classes that may have an imaginary part: sparse, real and integer
+_IS_COMPLEX = 0x800
+_NUMBERS_OF = {4: 1, 5: 3, **dict.fromkeys(range(6, 16), 1)}  # elements of numbers by class
 
 
 def check(path: pathlib.Path) -> None:
@@ -80,11 +86,20 @@ def _unpacked(body: memoryview) -> memoryview:
 
 
 def _check_matrix(parts: list[tuple[int, memoryview]], order: str, size: int) -> None:
-    """Raise an error if a matrix declares more cells than its bytes can hold."""
-    if len(parts) < 2 or len(parts[0][1]) < 4:
-        return  # empty, or without a size that SciPy allocates
+    """Raise an error if a matrix lacks numbers, or declares more cells than its bytes can hold."""
+    if not parts:
+        return  # empty
+    if len(parts[0][1]) < 8:
+        raise _error("has an array without a class")
     (flags,) = struct.unpack_from(f"{order}I", parts[0][1])
-    if flags & 0xFF not in _MADE_WHOLE:
+    kind = flags & 0xFF
+    numbers = _NUMBERS_OF.get(kind, 0)
+    if kind in _COMPLEX and flags & _IS_COMPLEX:
+        numbers += 1
+    values = parts[_NAMED : _NAMED + numbers]
+    if len(values) < numbers or any(one not in _NUMBERS for one, _ in values):
+        raise _error("has an array without its numbers")
+    if kind not in _MADE_WHOLE or len(parts) < _NAMED:
         return
     count = len(parts[1][1]) // 4
     shape = struct.unpack_from(f"{order}{count}i", parts[1][1])
