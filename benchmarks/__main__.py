@@ -20,6 +20,7 @@ NAMES = (
     "speed",
     "curves",
     "scale",
+    "amplitudes",
     "online",
     "control",
     "speed_accuracy",

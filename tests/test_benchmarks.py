@@ -1,5 +1,6 @@
 """The benchmarks themselves: what they measure on, and that each runs and says what it should."""
 
+import argparse
 import csv
 import dataclasses
 
@@ -10,11 +11,12 @@ import pytest
 import scipy.signal
 
 import etid
-from benchmarks import curves, online, peers, scale
+from benchmarks import amplitudes, curves, online, peers, scale
 from benchmarks.large_file import LAYOUTS, SAMPLES, large_file
 from benchmarks.online_alarms import Alarms
 from benchmarks.problem import START, ByNumPy, problem
 from benchmarks.provenance import write_csv
+from benchmarks.rivals import installed, python_of
 
 FEW = 12  # recordings
 
@@ -179,3 +181,52 @@ def test_a_number_that_could_not_be_had_misses_its_target():
     assert not online.Line("tick", 0.2, most=0.1).met()
     assert online.Line("tick", 0.05, most=0.1).met()
     assert online.Line("hours", np.nan).met()
+
+
+CASES = [one.name for one in amplitudes.cases(8)]
+EXACT = 1e-8  # of the peak; DOP853 has tolerances of 1e-9
+
+
+@pytest.mark.parametrize("number", range(2), ids=CASES)
+def test_the_reference_of_a_linear_skin_is_its_closed_form(number):
+    case = amplitudes.cases(834)[number]
+    case = case._replace(skin=etid.SkinCurrent(**{**named(case), "i_0": 1e6}))
+    linear = {name: of for name, of in named(case).items() if name != "i_0"}
+    points = 16 * case.samples  # so that nothing of the current pulses aliases
+    t = np.arange(points) / points / amplitudes.PULSE_RATE
+    s = 2j * np.pi * amplitudes.PULSE_RATE * np.arange(points // 2 + 1)
+    z = linear["r_s"] + linear["r_p"] / (1 + s * linear["r_p"] * linear["c_p"])
+    if case.v_th is None:
+        voltage = np.fft.rfft(amplitudes.pulses(t)) * z
+    else:
+        z_th = amplitudes.RESISTANCE + amplitudes.INDUCTANCE * s
+        voltage = np.fft.rfft(case.fine(16)) * z / (z + z_th)
+    expected = np.fft.irfft(voltage)[::16]
+    found = amplitudes.reference(case)
+    np.testing.assert_allclose(found, expected, atol=EXACT * np.abs(expected).max())
+
+
+def named(case: amplitudes.Case) -> dict[str, float]:
+    """The elements of its skin."""
+    return dict(zip(case.skin.names(), case.skin.values().tolist(), strict=True))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("number", range(2), ids=CASES)
+def test_harmonic_balance_and_diffrax_find_the_same_response(number):
+    case = amplitudes.cases()[number]
+    truth = amplitudes.reference(case)
+    lines = [amplitudes.by_balance(case, truth, 4)]
+    if installed(amplitudes.ENVIRONMENT):
+        lines.append(amplitudes.by_diffrax(case, truth, python_of(amplitudes.ENVIRONMENT))[2])
+    assert all(line.error < 1e-4 for line in lines), lines  # a record at 80 dB tells no more
+
+
+def test_a_rival_that_is_not_installed_is_said(monkeypatch, capsys):
+    monkeypatch.setattr(amplitudes, "make", lambda _: "failed to install")
+    monkeypatch.setattr(amplitudes, "pin", lambda: None)
+    monkeypatch.setattr(jax.config, "update", lambda *_: None)
+    monkeypatch.setattr(amplitudes, "by_balance", lambda *_: amplitudes.Line("ours", 0, 1, 2, 3))
+    monkeypatch.setattr(amplitudes, "reference", lambda _: np.ones(8))
+    assert not amplitudes.main(argparse.Namespace(samples=8))
+    assert "diffrax: failed to install" in capsys.readouterr().out
