@@ -279,16 +279,19 @@ def test_bounds_on_the_command_line_in_batches_and_reports(noisy, beyond, free, 
 
 
 @pytest.mark.slow
-def test_bounds_in_time_and_at_several_amplitudes(noisy, free):
-    bounds = {"r_s": (above(free, 1.0), None)}
+def test_bounds_in_time_and_at_several_amplitudes(noisy):
     single = recorded(SKIN, periods=1.1, snr_db=40.0)
     alone = etid.identify_skin(single)
     fit = etid.identify_skin(single, bounds={"r_s": (above(alone, 1.0), None)})
     assert (fit.method[:12], int(fit.remarks)) == ("output_error", Remark.at_bound)
     np.testing.assert_allclose(fit.stderr.r_s / alone.stderr.r_s, 0.446, rtol=0.01)  # of a normal
-    several = etid.identify_amplitudes([noisy], circuit=etid.SkinRC(), bounds=bounds)
+    alone = etid.identify_amplitudes([noisy], circuit=etid.SkinRC())
+    lowest = above(alone, 1.0)
+    several = etid.identify_amplitudes(
+        [noisy], circuit=etid.SkinRC(), bounds={"r_s": (lowest, None)}
+    )
     assert int(several.remarks) & Remark.at_bound
-    assert several.circuit.r_s > bounds["r_s"][0]
+    assert several.circuit.r_s > lowest
 
 
 @pytest.mark.slow
