@@ -275,6 +275,13 @@ def test_one_recording_of_one_subject_tells_no_spread():
         assert row[6:] == ("", "", "1", "2")
 
 
+def test_an_infinite_element_of_a_damaged_file_tells_no_spread():
+    """Warnings are errors."""
+    fits = fits_of([1.0, np.inf], ["successful"] * 2, subject=np.array(["a", "b"]))
+    for one in tables.components(fits, fits.summary("subject", "condition")):
+        assert np.isnan(one.between_subjects)
+
+
 def test_summary_is_that_of_each_group_by_itself():
     rng = np.random.default_rng(0)
     verdicts = rng.choice(["successful", "misfit"], 200, p=[0.8, 0.2])

@@ -150,6 +150,7 @@ def frequent(fits: Fits, count: int) -> list[str]:
     return sorted(names[np.argsort(-counts, kind="stable")[:count]].tolist())
 
 
+@np.errstate(over="ignore", invalid="ignore")  # of a damaged file
 def components(fits: Fits, groups: Sequence[Mapping[str, Any]]) -> list[Components]:
     """Variations and errors of each element, for the `CONDITIONS` most frequent conditions.
 
