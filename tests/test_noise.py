@@ -3,7 +3,7 @@ import numpy as np
 import pytest
 import scipy.signal
 
-from etid.signals.noise import noise_std
+from etid.signals.noise import noise_std, shows_few
 from etid.simulation import scenes
 
 
@@ -53,3 +53,9 @@ def test_converter_steps_are_a_floor():
 
 def test_a_smooth_curve_has_no_noise():
     assert float(noise_std(np.sin(np.arange(500) / 50.0))) < 1e-8
+
+
+def test_infinite_samples_are_one_value_of_a_converter():
+    """Warnings are errors: the difference of two infinite samples would be one."""
+    assert shows_few(np.full(4096, np.inf))
+    assert not shows_few(np.append(np.arange(4094.0), [np.inf, np.inf]))

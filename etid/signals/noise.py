@@ -213,7 +213,7 @@ def trusted(
 def shows_few(v: Float[np.ndarray, "*record time"]) -> Bool[np.ndarray, "*record"]:
     """Whether the first samples have few values, as those of a converter without noise."""
     first = np.sort(v[..., :FEW], axis=-1)
-    return np.asarray(np.count_nonzero(np.diff(first), axis=-1) < FEW // 2)
+    return np.asarray(np.count_nonzero(first[..., 1:] != first[..., :-1], axis=-1) < FEW // 2)
 
 
 def step_of(v: Float[np.ndarray, " time"]) -> float:
