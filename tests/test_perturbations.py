@@ -5,6 +5,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+from numpy.typing import ArrayLike
 
 from benchmarks import perturbations, visibility
 from benchmarks.disturbances import Hum, Leaky, Nonlinear, Pink, Spike
@@ -222,7 +223,7 @@ def test_a_nonlinear_skin_obeys_its_circuit():
 NOTHING = np.full(3, np.nan)
 
 
-def answer(error, verdict="successful", stderr=0.01, bound=0.01, **more) -> Answer:
+def answer(error, verdict="successful", stderr: ArrayLike = 0.01, bound=0.01, **more) -> Answer:
     arrays = [np.broadcast_to(np.asarray(x, float), 3) for x in (error, stderr, bound)]
     return Answer(
         "base", 60.0, "dry", "default", 0, verdict, arrays[0], arrays[1], arrays[2], **more
