@@ -463,7 +463,7 @@ def concluded(
     names = np.where(change.seen & np.isin(names, changes.EXPLAINED), "changed", names)
     support = fits.support
     if support is None:
-        support = Support.unknown(change.size.shape[1], len(names))
+        support = Support.unknown(fits.cov.shape[-1], len(names))
     return dataclasses.replace(
         fits,
         remarks=remarked,
