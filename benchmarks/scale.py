@@ -1,8 +1,9 @@
 """A file of 10^5 recordings: how long reading and fitting take, in how much memory, and `kill -9`.
 
-Every measurement runs in a process of its own. The file lies in the page cache, which flatters
-reading; reading alone is h5py, recording after recording. Compilation is in no time but `start`
-and the CPU time of workers, which tells of other work on the machine.
+Every measurement runs in a process of its own, on as many cores as it has workers. The file lies
+in the page cache, which flatters reading; reading alone is h5py, recording after recording.
+Compilation is in no time but `start` and the CPU time of workers, which tells of other work on the
+machine.
 """
 
 import argparse
@@ -24,12 +25,14 @@ import numpy as np
 
 from benchmarks.large_file import LAYOUTS, large_file
 from benchmarks.provenance import ROOT, write_csv
+from benchmarks.timing import cores
 from etid.estimators.registry import names
 from etid.identify import file as streaming
 
 FILES = pathlib.Path(tempfile.gettempdir()) / "etid-scale"
-WITHIN = 2.0  # reading and fitting, of reading alone
-MEMORY = 1.5e9  # [B]
+EACH = 2e-4  # [s] reading and fitting one recording on one core
+TWICE = 1.9  # speed of two workers, relative to one
+MEMORY = 1.2e9  # [B]
 KILLS = 3
 SEED = 9
 WORKERS = (1, 2)  # 1 is the process itself
@@ -78,9 +81,10 @@ def _environment(folder: pathlib.Path) -> dict[str, str]:
 
 def measured(folder: pathlib.Path, job: dict[str, Any]) -> dict[str, Any]:
     """Do one job in a process of its own."""
-    done = subprocess.run(
-        _command(job), cwd=ROOT, env=_environment(folder), stdout=subprocess.PIPE, check=True
-    )
+    with cores(job.get("workers", 1)):
+        done = subprocess.run(
+            _command(job), cwd=ROOT, env=_environment(folder), stdout=subprocess.PIPE, check=True
+        )
     return json.loads(done.stdout)
 
 
@@ -227,13 +231,20 @@ def run(plan: Plan, output: pathlib.Path | None) -> bool:
     )
     if output is not None:
         write_csv(output, table)
-    fits = [row for row in table if row["what"].startswith("fit") and row["workers"] == 1]
-    slow = [row["of_reading"] for row in fits if row["of_reading"] > WITHIN]
+    for text, met in _targets(table):
+        print(f"{text}: {'met' if met else 'missed'}")
+    return all(met for _, met in _targets(table)) and resumed.passed
+
+
+def _targets(table: Sequence[dict[str, Any]]) -> Iterable[tuple[str, bool]]:
+    """What is wanted of the last method in contiguous datasets, and whether it is so."""
+    fits = [row for row in table if row["what"].startswith("fit")]
+    alone, two = [row for row in fits if row["layout"] == "contiguous"][-len(WORKERS) :]
+    each, gain = alone["us_per_recording"], alone["seconds"] / two["seconds"]
     most = max(row["memory_mb"] for row in fits)
-    print(f"within {WITHIN:g} times of reading alone: {'missed' if slow else 'met'}")
-    small = most <= MEMORY / 1e6
-    print(f"peak memory {most:.0f} MB <= {MEMORY / 1e6:.0f}: {'met' if small else 'missed'}")
-    return not slow and small and resumed.passed
+    yield f"{each:.0f} us a recording <= {1e6 * EACH:.0f}", each <= 1e6 * EACH
+    yield f"two workers {gain:.2f} times as fast >= {TWICE}", gain >= TWICE
+    yield f"peak memory {most:.0f} MB <= {MEMORY / 1e6:.0f}", most <= MEMORY / 1e6
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

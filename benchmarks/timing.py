@@ -1,12 +1,13 @@
 """Import, first call and warm time of one fit and of a batch: medians, compilation apart."""
 
 import argparse
+import contextlib
 import functools
 import os
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import jax
@@ -22,6 +23,20 @@ def pin() -> None:
     """One core for this process, before JAX counts them."""
     if hasattr(os, "sched_setaffinity"):
         os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
+
+
+@contextlib.contextmanager
+def cores(count: int) -> Iterator[None]:
+    """So many cores, if there are, for the processes that begin here."""
+    if not hasattr(os, "sched_setaffinity"):
+        yield
+        return
+    own = os.sched_getaffinity(0)
+    os.sched_setaffinity(0, sorted(own)[:count])
+    try:
+        yield
+    finally:
+        os.sched_setaffinity(0, own)
 
 
 def interpreter() -> dict[str, str]:

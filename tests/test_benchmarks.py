@@ -3,6 +3,9 @@
 import argparse
 import csv
 import dataclasses
+import os
+import subprocess
+import sys
 
 import h5py
 import jax
@@ -11,7 +14,7 @@ import pytest
 import scipy.signal
 
 import etid
-from benchmarks import amplitudes, curves, online, peers, scale
+from benchmarks import amplitudes, curves, online, peers, scale, timing
 from benchmarks.large_file import LAYOUTS, SAMPLES, large_file
 from benchmarks.online_alarms import Alarms
 from benchmarks.problem import START, ByNumPy, problem
@@ -62,6 +65,15 @@ def test_a_table_says_where_it_comes_from(tmp_path):
     assert (row["what"], row["seconds"], row["etid"]) == ("a, b", "1.5", etid.__version__)
     assert row["commit"]
     assert row["machine"]
+
+
+@pytest.mark.skipif(not hasattr(os, "sched_getaffinity"), reason="needs Linux")
+def test_processes_begin_on_as_many_cores_as_they_have_workers():
+    own = os.sched_getaffinity(0)
+    with timing.cores(1):
+        count = [sys.executable, "-c", "import os; print(len(os.sched_getaffinity(0)))"]
+        assert int(subprocess.run(count, capture_output=True, check=True).stdout) == 1
+    assert os.sched_getaffinity(0) == own
 
 
 @pytest.mark.slow
