@@ -36,6 +36,7 @@ from etid.estimators.output_error.estimator import OutputError
 from etid.estimators.registry import register
 from etid.estimators.steiglitz_mcbride.estimator import EquationError, SteiglitzMcBride
 from etid.identify import posterior as _posterior
+from etid.identify import profile as _profile
 from etid.identify.amplitudes import identify_amplitudes
 from etid.identify.driver import identify_driver
 from etid.identify.file import fit_file
@@ -81,7 +82,7 @@ _LATER = {
     "write_report": "etid.report.study",
 }
 
-_provide(plot=plot, posterior=_posterior.posterior, profile=_posterior.profile)
+_provide(plot=plot, posterior=_posterior.posterior, profile=_profile.profile)
 
 __version__ = "0.1.0"
 

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 import etid
-from etid.identify.posterior import drawn
-from etid.results.posterior import Profile, effective
+from etid.results.posterior import Profile
+from etid.solvers.importance_sampling import drawn, effective
 
 TRUTH = etid.SkinRC(33.4e3, 186e3, 0.12e-9)
 

@@ -10,6 +10,7 @@ from jaxtyping import Float
 from etid.circuits.circuit import AbstractCircuit
 from etid.circuits.display import between, quantity
 from etid.circuits.overview import Overview, Overviewed
+from etid.solvers.importance_sampling import effective
 
 Circuit = TypeVar("Circuit", bound=AbstractCircuit)
 FEW = 100.0  # effective draws; with fewer, the ends of an interval are not worth two digits
@@ -24,11 +25,6 @@ def tails(level: float) -> tuple[float, float]:
     if not 0 < level < 1:
         raise ValueError(f"level is {level}; it must be between 0 and 1, as in 0.95")
     return (1 - level) / 2, (1 + level) / 2
-
-
-def effective(weights: Float[np.ndarray, " draw"]) -> float:
-    """Number of draws of equal weight that would be as good, 1 / Σ w²."""
-    return float(1 / np.sum(weights**2))
 
 
 @dataclasses.dataclass(frozen=True, eq=False, repr=False)
