@@ -30,7 +30,10 @@ LEAD, FOLLOW = 8, 12  # blocks before the first edge and after the last that are
 NOISE_FREQUENCIES = 6  # at which the noise of a block is measured
 QUIET = 40  # smallest number of blocks times frequencies
 RESOLUTION = 1e-6  # relative, larger than that of single precision
-TOGETHER = 25  # electrodes whose samples fit in the cache of a core and are read only once
+TOGETHER = 50  # electrodes whose samples fit in the cache of a core and are read only once
+# Multiplications of a matrix product from which OpenBLAS starts threads. If other programs keep the
+# cores busy, these threads wait for each other for tens of milliseconds.
+THREADED = 1 << 18
 
 
 class Seen(NamedTuple):
@@ -84,8 +87,9 @@ class Projection:
         block: Length of a block [samples].
         within: Columns that make of a block its mean, and its noise at each frequency.
         rows: Columns that make of samples and means: the real and imaginary parts of Ĝ, and the
-            means of `Means`. Single precision takes half the time. Its error is 2e-8 of the peak, a
-            five-hundredth of the smallest noise that etid accepts for a record.
+            means of `Means`. Single precision takes half the time, here and in `within`. Its error
+            is 2e-8 of the peak, a five-hundredth of the smallest noise that etid accepts for a
+            record.
         floor: Smallest variance that is accepted for a coefficient of V_out [V²].
     """
 
@@ -138,8 +142,9 @@ class Projection:
         return sum(count for _, count in self.runs) * (self.within.shape[1] - 1)
 
     def single(self) -> "Projection":
-        """The projection with its rows in single precision."""
-        return dataclasses.replace(self, rows=self.rows.astype(np.float32))
+        """The projection in single precision."""
+        within, rows = self.within.astype(np.float32), self.rows.astype(np.float32)
+        return dataclasses.replace(self, within=within, rows=rows)
 
     def seen(
         self, v_out: Float[np.ndarray, "lane sample"], adc_range: Float[np.ndarray, " 2"]
@@ -150,49 +155,54 @@ class Projection:
             v_out: One window per electrode [V].
             adc_range: Voltages at which the converter saturates [V].
         """
-        lanes = len(v_out)
-        kept = np.empty((lanes, len(self.rows)), self.rows.dtype)
-        squares, clipped = np.empty(lanes), np.zeros(lanes, bool)
+        found, squares, clipped = [], [], []
         low, high = adc_range
         margin = RESOLUTION * np.abs(adc_range[np.isfinite(adc_range)]).max(initial=0.0)
         with np.errstate(invalid="ignore", over="ignore"):  # samples that are not numbers
-            for first in range(0, lanes, TOGETHER):
-                of = slice(first, first + TOGETHER)
-                squares[of], lowest, highest = self._condensed(v_out[of], kept[of])
-                if np.isfinite(adc_range).any():
-                    clipped[of] = (lowest <= low + margin) | (highest >= high - margin)
-            if clipped.any():
-                near = v_out[clipped]
-                clipped[clipped] = (near.min(axis=1) <= low) | (near.max(axis=1) >= high)
-            found = kept @ self.rows
-        variance = np.maximum(self.samples * squares / self.freedom(), self.floor)
-        return Seen(found, variance, clipped)
+            for first in range(0, len(v_out), TOGETHER):
+                samples = v_out[first : first + TOGETHER].astype(self.rows.dtype)
+                kept, of_noise = self._condensed(samples)
+                found.append(_product(kept, self.rows))
+                squares.append(of_noise)
+                near = np.zeros(len(samples), bool)
+                if np.isfinite(low):
+                    near |= samples.min(axis=1) <= low + margin
+                if np.isfinite(high):
+                    near |= samples.max(axis=1) >= high - margin
+                clipped.append(near)
+            at = np.concatenate(clipped)
+            if at.any():
+                near = v_out[at]
+                at[at] = (near.min(axis=1) <= low) | (near.max(axis=1) >= high)
+        variance = self.samples * np.concatenate(squares) / self.freedom()
+        return Seen(np.concatenate(found), np.maximum(variance, self.floor), at)
 
     def _condensed(
-        self, v_out: Float[np.ndarray, "lane sample"], kept: Float[np.ndarray, "lane kept"]
-    ) -> Float[np.ndarray, "3 lane"]:
-        """Fill `kept` with samples and means of blocks [V].
-
-        Returns:
-            The sum of squares of noise [V²], the lowest and the highest sample, not more exact
-            than `kept` [V].
-        """
-        lanes, at = len(v_out), 0
-        for begin, end in self.pieces:
-            kept[:, at : at + end - begin] = v_out[:, begin:end]
-            at += end - begin
-        found = np.array([np.zeros(lanes), kept[:, :at].min(axis=1), kept[:, :at].max(axis=1)])
+        self, samples: Float[np.ndarray, "lane sample"]
+    ) -> tuple[Float[np.ndarray, "lane kept"], Float[np.ndarray, " lane"]]:
+        """Samples and means of blocks [V], and the sum of squares of the noise [V²]."""
+        parts = [samples[:, begin:end] for begin, end in self.pieces]
+        squares = np.zeros(len(samples))
         for begin, count in self.runs:
-            smooth = v_out[:, begin : begin + count * self.block].astype(self.within.dtype)
-            np.minimum(found[1], smooth.min(axis=1), out=found[1])
-            np.maximum(found[2], smooth.max(axis=1), out=found[2])
-            of = (smooth.reshape(-1, self.block) @ self.within).reshape(lanes, count, -1)
-            kept[:, at : at + count] = of[..., 0]
+            blocks = samples[:, begin : begin + count * self.block]
+            of = blocks.reshape(len(samples), count, self.block) @ self.within
+            parts.append(of[..., 0].copy())
             of[..., 0] = 0.0
-            noise = of.reshape(lanes, -1)
-            found[0] += np.einsum("ij,ij->i", noise, noise)
-            at += count
-        return found
+            noise = of.reshape(len(samples), -1)
+            squares += np.vecdot(noise, noise)
+        return np.concatenate(parts, axis=1), squares
+
+
+def _product(
+    kept: Float[np.ndarray, "lane kept"], rows: Float[np.ndarray, "kept row"]
+) -> Float[np.ndarray, "lane row"]:
+    """`kept @ rows`, in parts for which BLAS starts no threads."""
+    step = max(THREADED // (len(kept) * rows.shape[1]), 1)
+    found = kept[:, :step] @ rows[:step]
+    for first in range(step, len(rows), step):
+        of = slice(first, first + step)
+        found += kept[:, of] @ rows[of]
+    return found
 
 
 def _partition(
