@@ -51,7 +51,7 @@ lacking_tail = jax.jit(Bands._lacking_tail)
 
 
 @pytest.mark.parametrize("bins", [40, 100, 333, 1000])
-def test_bands_follow_each_other_and_are_an_eighth_of_their_frequency(bins):
+def test_bands_follow_each_other_and_are_a_quarter_of_their_frequency(bins):
     edges = gain_bands._edges(bins)
     width = np.diff(edges)
     assert (edges[0], edges[-1], width[-1]) == (1, bins + 1, LAST_BAND)

@@ -707,17 +707,17 @@ def test_the_first_pulse_of_another_amplitude_lacks_a_tail_which_is_no_misfit(be
 
 
 def test_a_residual_that_noise_makes_once_in_a_thousand_pulses_is_no_misfit():
-    """A pulse has 112 degrees of freedom: its χ² exceeds 1.5 in one of ten thousand."""
+    """A pulse has 74 degrees of freedom: its χ² exceeds 1.5 in one of three hundred."""
     tracker, state, clean = ten()
     noise = 10 * (with_noise(clean[8], seed=5) - clean[8])  # 40 dB
     verdicts = {}
-    for factor in (1.3, 2.2):
+    for factor in (1.2, 2.5):
         of_pulse = np.where(np.arange(3333) < 400, factor, 1.0)
         found = tracker.update(state, clean[8] + of_pulse * noise)
         verdicts[factor] = list(tracker.read(found).verdicts)
         assert (found.electrodes.chi2 > 1.5).any()
-    assert verdicts[1.3] == ["successful"] * TEN
-    assert verdicts[2.2] == ["misfit"] * TEN
+    assert verdicts[1.2] == ["successful"] * TEN
+    assert verdicts[2.5] == ["misfit"] * TEN
 
 
 def test_bad_electrodes_are_listed_with_the_reason():

@@ -6,13 +6,15 @@ exactly harmonics. With 3333 samples for a period of 3333⅓, the bias of an ele
 tenth of the standard error of 100 pulses at 60 dB. To fill a window up to 3360 samples gave a bias
 of 1.5 times this standard error, because the voltage between two pulses is not at rest.
 
-**A band** is a few neighbouring bins k, at most an eighth of their frequency wide. Over a band
+**A band** is a few neighbouring bins k, at most a quarter of their frequency wide. Over a band
 the gain is nearly linear. The pulse determines it as
 
     Ĝ = Σ X̄_k Y_k / Σ (|X_k|² − σ_x²)    at    f = Σ |X_k|² f_k / Σ |X_k|².
 
 `etid.online.projection` makes Ĝ of the samples. The bands reduce the numbers to be fitted to a
-twentieth. They lose 0.2 % of the information.
+thirtieth. For the skin of Tables II and III and a delay of up to one sample, they bias no gain by
+more than 0.05 standard errors of a pulse at 60 dB, and lose at most 0.7 % of the information about
+an element.
 
 **Aliases**, X(f − fs), cannot be distinguished from X(f) in one period. If a period is not a whole
 number of samples, each period is sampled at a different phase φ [samples] and contains
@@ -40,7 +42,7 @@ from etid.signals.harmonics import ALIASED
 from etid.signals.noise import RIPPLE
 from etid.signals.transfer import as_complex, power
 
-RELATIVE = 8  # frequency of a band over its width
+RELATIVE = 4  # frequency of a band over its width
 WIDEST = 64  # [bins] largest width of a band
 LAST_BAND = 8  # [bins] width of the last band, which has no neighbour to show its curvature
 PRESENT = 0.5  # minimum fraction of a band's power in X that must be signal
