@@ -47,7 +47,6 @@ from etid.circuits.overview import Overview, Overviewed
 from etid.estimators.judgement import SUCCESSFUL
 from etid.estimators.unknowns import LoadUnknowns
 from etid.online.current import Current, CurrentModel
-from etid.online.electrode import predicted
 from etid.online.state import ElectrodeState, TrackerState
 from etid.online.tracker import Tracker
 from etid.results.verdicts import counts
@@ -250,7 +249,8 @@ def _commanded(
     """The fields of `Command` as rows of one array: each array of a result costs time."""
 
     def electrode(lane: ElectrodeState, wanted: Float[Array, ""]) -> Float[Array, " row"]:
-        cov = inverse_of_few(predicted(lane.information, change))
+        # The inverse of `predicted`, in one step.
+        cov = inverse_of_few(lane.information) + change**2 * jnp.eye(lane.information.shape[0])
         now = model.current(circuit, LoadUnknowns.of(lane.own).log_elements, cov)
         return _electrode(limits, lane, now, wanted, ~state.driver_changed)
 

@@ -61,8 +61,8 @@ class CurrentModel(eqx.Module):
         source_cov: Covariance of z.
         sums: Weights w of the admittance in Re Σ w Y: row 0 for the charge [C Ω], the others for
             the current at `times` [A Ω].
-        search: Rows 1 and following of `sums`, real parts beside negative imaginary parts, in
-            single precision. They find the time of the peak in half the time.
+        search: Rows 1 and following of `sums` as columns, real parts above negative imaginary
+            parts, in single precision. They find the time of the peak in half the time.
         times: Times of the other rows after the start of the window [s].
         phase: Duration of a phase, t₁ − t₀ [s].
     """
@@ -72,7 +72,7 @@ class CurrentModel(eqx.Module):
     by_source: Complex[Array, "z band"]
     source_cov: Float[Array, "z z"]
     sums: Complex[Array, "row band"]
-    search: Float[Array, "time part"]
+    search: Float[Array, "part time"]
     times: Float[Array, " time"]
     phase: float = eqx.field(static=True)
 
@@ -104,7 +104,7 @@ class CurrentModel(eqx.Module):
             by_source=known.slope * (loaded * reciprocal(source))[None, :],
             source_cov=known.cov,
             sums=jnp.asarray(by_band),
-            search=jnp.asarray(np.concatenate([by_band.real, -by_band.imag], axis=1)[1:], "f4"),
+            search=jnp.asarray(np.concatenate([by_band.real, -by_band.imag], axis=1)[1:].T, "f4"),
             times=jnp.asarray(times / rate),
             phase=float((end - begin) / rate),
         )
@@ -135,18 +135,19 @@ class CurrentModel(eqx.Module):
         def load(logs: Float[Array, " element"]) -> Complex[Array, " band"]:
             return circuit.with_log_values(logs).response(self.frequency)
 
-        admittance = reciprocal(load(logs) + self.source)
-        current = jnp.abs(self.search @ real_parts(admittance).astype(self.search.dtype))
+        z, pulled = jax.vjp(load, logs)
+        admittance = reciprocal(z + self.source)
+        current = jnp.abs(real_parts(admittance).astype(self.search.dtype) @ self.search)
         # XLA takes five times as long for the argument of a maximum.
-        last = current.size - 1
-        at = jnp.min(jnp.where(current == current.max(), jnp.arange(last + 1), last))
+        number = jnp.arange(current.size, dtype=current.dtype)
+        at = jnp.min(jnp.where(current == current.max(), number, number[-1])).astype(int)
         rows = jnp.stack([self.sums[0], self.sums[1 + at]])
-        by_element = jax.vmap(lambda v: jax.jvp(load, (logs,), (v,))[1])(jnp.eye(logs.size))
         # The rows times Y, not the derivatives: `by_source` is the same matrix at all electrodes.
         rows = rows * admittance[None, :]
         charge, peak = rows.real.sum(axis=1)
         shared = _real(rows, self.by_source.T)
-        own = _real(rows * admittance[None, :], by_element.T)
+        # Re Σ row Y² ∂Z/∂ϑ
+        (own,) = jax.vmap(pulled)(rows * admittance[None, :])
         variance = jnp.sum((own @ cov) * own, axis=1)
         variance = variance + jnp.sum((shared @ self.source_cov) * shared, axis=1)
         charge_stderr, peak_stderr = jnp.sqrt(variance)
