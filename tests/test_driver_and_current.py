@@ -96,7 +96,8 @@ def test_the_current_is_left_out_on_request(recording, driver, both):
         (lambda one: {"current": 1.003 * one.current}, ("inconsistent",)),
         (lambda one: {"current": one.current + one.v_out / 2e6}, ("misfit", "inconsistent")),
         (lambda one: {"v_out": 1.02 * one.v_out}, ("misfit", "inconsistent")),
-        (lambda one: {"current": np.roll(one.current, 3)}, ("misfit",)),
+        # Out of reach of the search for a lag; three samples are found and taken off.
+        (lambda one: {"current": np.roll(one.current, 60)}, ("misfit", "max_steps_reached")),
         (lambda one: {"current": -one.current}, ("misaligned",)),
         (lambda one: {"current": 1e3 * one.current}, ("wrong_unit",)),
         (lambda one: {"current": 0 * one.current}, ("flat",)),
@@ -143,6 +144,61 @@ def test_an_offset_and_a_common_delay_are_no_contradiction(recording, driver):
     assert np.abs(off(fit)).max() < WITHIN
 
 
+LATE = (1.0, 2.3, 3.0)  # samples
+DAMP = etid.SkinRC(r_s=6.1e3, r_p=17.4e3, c_p=0.66e-9)
+
+
+def late_record(name: str, late: float, circuit=SKIN, seed=2, **fields) -> etid.Recording:
+    """A recording, one record of which is late by so many samples."""
+    of = [scene(circuit, start=0.01 - by, **fields) for by in (0.0, late / 200e3)]
+    early, other = (one.simulate(seed)["loaded/0"] for one in of)
+    return early.replace(**{name: other.samples[name]})
+
+
+@pytest.mark.parametrize("snr_db", [40.0, 60.0])
+def test_a_lag_of_one_record_is_taken_off(snr_db):
+    """It was a misfit: v_out and the current were aligned together with v_th, never each alone."""
+    levels = {"snr_db": snr_db, "current_snr_db": snr_db}
+    known = scene(**levels).simulate(seed=7)["calibration/0"]
+    driver = etid.identify_driver(known, order=5)
+    truths = [circuit for circuit in (SKIN, DAMP) for _ in range(2 * len(LATE))]
+    of = [
+        late_record(name, late, circuit, seed, **levels)
+        for seed, circuit in enumerate((SKIN, DAMP))
+        for name in ("current", "v_out")
+        for late in LATE
+    ]
+    fits = etid.identify_skins(of, driver)
+    assert fits.counts() == {"successful": len(of)}
+    for row, (truth, late) in enumerate(zip(truths, LATE * 4, strict=True)):
+        assert np.abs(off(fits[row], truth)).max() < WITHIN
+        if late > 1:  # the delay of a trigger decides whether one sample is more than one sample
+            assert int(fits[row].remarks) == Remark.aligned
+
+
+@pytest.mark.parametrize("name", ["current", "v_out"])
+def test_a_single_fit_takes_a_lag_off_as_a_batch_does(driver, name):
+    late = late_record(name, 2.3)
+    fit = etid.identify_skin(late, driver)
+    (other,) = etid.identify_skins([late], driver)
+    assert int(fit.remarks) == int(other.remarks) == Remark.aligned
+    assert "were aligned" in str(fit)
+    # The same minimum, by two programs.
+    np.testing.assert_allclose(fit.circuit.values(), other.circuit.values(), rtol=1e-6)
+
+
+@pytest.mark.slow
+def test_draws_are_those_of_the_records_in_line(driver):
+    fit = etid.identify_skin(late_record("current", 2.3), driver)
+    draws = fit.posterior()
+    assert draws.effective > 800
+    ends = float(fit.circuit.r_p) + np.array([-1.96, 1.96]) * float(fit.stderr.r_p)
+    # 1000 draws give an end of the interval to a tenth of a standard error.
+    np.testing.assert_allclose(
+        draws.intervals()["r_p"], ends, rtol=0, atol=0.3 * float(fit.stderr.r_p)
+    )
+
+
 def test_a_file_and_its_report_use_both_where_both_were_recorded(study, both, tmp_path):
     of = [study["calibration/0"], study["loaded/0"], study["loaded/1"].replace(current=None)]
     etid.Study.from_recordings(of).write(tmp_path / "study.h5")
@@ -181,9 +237,8 @@ def test_another_circuit_is_seen_and_chosen(driver):
 @pytest.mark.slow
 def test_estimates_are_efficient_and_their_intervals_true():
     """320 draws, each with its own calibration; the bound knows no more than the fits."""
-    damp = etid.SkinRC(r_s=6.1e3, r_p=17.4e3, c_p=0.66e-9)
     squares, covered = [], []
-    for circuit, current_snr_db in ((SKIN, 40.0), (damp, 30.0)):
+    for circuit, current_snr_db in ((SKIN, 40.0), (DAMP, 30.0)):
         of = scene(circuit, current_snr_db=current_snr_db)
         bound = np.array(list(etid.bound(of)["loaded/0"].relative.values()))
         for seed in range(160):

@@ -10,11 +10,18 @@ import pytest
 import etid
 from etid.recordings.remarks import Remark
 from etid.simulation.transformer import loading
-from tests.test_driver_and_current import SKIN, WITHIN, off, relative, scene
+from tests.test_driver_and_current import (
+    DAMP,
+    LATE,
+    SKIN,
+    WITHIN,
+    late_record,
+    off,
+    relative,
+    scene,
+)
 
 pytestmark = pytest.mark.slow  # the program of a joint fit with currents compiles for a minute
-
-DAMP = etid.SkinRC(r_s=6.1e3, r_p=17.4e3, c_p=0.66e-9)
 
 
 def jointly(recordings, **options):
@@ -79,6 +86,16 @@ def test_a_current_that_contradicts_the_driver_is_told(pair, joint, change, verd
     calibration, recording = pair
     found = jointly([calibration, recording.replace(current=change(recording))])
     assert found.fits.verdicts.tolist() == [verdict]
+
+
+@pytest.mark.parametrize("name", ["current", "v_out"])
+@pytest.mark.parametrize("late", LATE)
+def test_a_lag_of_one_record_is_taken_off(pair, name, late):
+    fit = jointly([pair[0], late_record(name, late)]).fits[0]
+    assert fit.verdict == "successful"
+    assert np.abs(off(fit)).max() < WITHIN
+    if late > 1:
+        assert int(fit.remarks) == Remark.aligned
 
 
 def test_the_tolerance_of_the_known_resistor_is_what_the_current_leaves_of_it(pair, joint):

@@ -9,7 +9,7 @@ import abc
 import dataclasses
 import math
 from collections.abc import Sequence
-from typing import ClassVar, TypeVar
+from typing import ClassVar, NamedTuple, TypeVar
 
 import equinox as eqx
 import jax
@@ -27,6 +27,26 @@ from etid.signals.pulse_train import rest, shifted
 
 LEFT = 0.75  # samples; a larger delay needs a second fit. The prior of a delay is 0.5 wide
 STEPS = 4  # lengths per octave; the padding is at most a fifth
+
+
+class Lags(NamedTuple):
+    """Lags behind `v_th`, or `v_out` behind the current if that is the cause [whole samples].
+
+    Attributes:
+        v_out: Lag of `v_out`.
+        current: Lag of a current that was measured beside `v_th`.
+    """
+
+    v_out: int
+    current: int = 0
+
+    @classmethod
+    def of(cls, *late: float) -> "Lags":
+        """Delays rounded to whole samples; 0 up to `LEFT`."""
+        return cls(*(round(by) if abs(by) > LEFT else 0 for by in late))
+
+
+IN_TIME = Lags(0)
 
 
 class AbstractLane(eqx.Module):
@@ -78,19 +98,19 @@ class AbstractLane(eqx.Module):
         """Shapes of all arrays; lanes with the same shapes share a compiled function."""
         return tuple(leaf.shape for leaf in jax.tree.leaves(self))
 
-    def realigned(self, late: int) -> "AbstractLane":
-        """The lane with `v_out` advanced by whole samples."""
+    def realigned(self, late: Lags) -> "AbstractLane":
+        """The lane with its records advanced by whole samples."""
         del late
         return self
 
-    def late_by(self, circuit: AbstractCircuit, driver: AbstractFeed) -> int:
-        """Whole samples by which `v_out` is later than this load predicts; 0 for small delays.
+    def late_by(self, circuit: AbstractCircuit, driver: AbstractFeed) -> Lags:
+        """Whole samples by which records are later than this load predicts; 0 for small delays.
 
         A load smooths the edges, so its record seems later than it is. If the alignment is wrong by
         a sample or more, the fit finds the elements, but its verdict is `misfit`.
         """
         del circuit, driver
-        return 0
+        return IN_TIME
 
     def without_mains(self) -> "AbstractLane | None":
         """The same without the harmonics on which mains hum may fall; None if there is none."""
@@ -176,18 +196,28 @@ class Harmonics(AbstractLane):
         fields = (self.frequency, self.x, self.y, self.variance_x, self.variance_y, self.selected)
         return Spectrum(*map(jnp.asarray, fields))
 
-    def realigned(self, late: int) -> "Harmonics":
+    def realigned(self, late: Lags) -> "Harmonics":
         """The lane with `v_out` advanced by whole samples: multiplied by e^(jω late / fs)."""
-        if late == 0:
+        if late.v_out == 0:
             return self
-        return dataclasses.replace(self, y=self.y * _turn(self.frequency, self.sample_rate, late))
+        turn = _turn(self.frequency, self.sample_rate, late.v_out)
+        return dataclasses.replace(self, y=self.y * turn)
 
-    def late_by(self, circuit: AbstractCircuit, driver: AbstractFeed) -> int:
+    def late_by(self, circuit: AbstractCircuit, driver: AbstractFeed) -> Lags:
         """Whole samples by which `v_out` is later than with this load; 0 if they are few."""
         gain = _gain(circuit, driver, self.frequency)
-        variance = self.variance_y + np.abs(gain) ** 2 * self.variance_x
-        weight, turn = self.selected / variance, 2 * np.pi * self.frequency / self.sample_rate
-        return _whole(rest(gain * self.x, *map(np.asarray, (self.y, weight, turn))))
+        return Lags.of(self._behind(gain, self.y, self.variance_y))
+
+    def _behind(
+        self,
+        gain: Complex[np.ndarray, " harmonic"],
+        record: Complex[Array | np.ndarray, " harmonic"],
+        variance: Float[Array | np.ndarray, " harmonic"],
+    ) -> float:
+        """Lag [samples] of a record with this noise behind `gain` times X."""
+        weight = self.selected / (variance + np.abs(gain) ** 2 * self.variance_x)
+        turn = 2 * np.pi * self.frequency / self.sample_rate
+        return rest(gain * self.x, *map(np.asarray, (record, weight, turn)))
 
     def without_mains(self) -> "Harmonics | None":
         """The same without the harmonics on which mains hum may fall; None if there is none."""
@@ -210,7 +240,7 @@ class HarmonicsWithCurrent(Harmonics):
 
     @staticmethod
     def _fields(seen: Inspected) -> tuple[np.ndarray, ...]:
-        """The fields of a lane, in their order; the current is shifted like `v_out`.
+        """The fields of a lane, in their order; `v_out` and the current are aligned with `v_th`.
 
         Raises:
             ValueError: The recording lacks `v_th` or the current.
@@ -219,7 +249,7 @@ class HarmonicsWithCurrent(Harmonics):
             raise ValueError(f"recording {seen.recording.path!r} has not both v_th and current")
         *of_voltages, selected, rate = Harmonics._fields(seen)
         _, i, _, variance_i, _, usable, _ = Harmonics._fields(seen.by_current)
-        turned = i * _turn(of_voltages[0], rate, seen.lag)
+        turned = i * _turn(of_voltages[0], rate, seen.current_lag)
         return *of_voltages, selected & usable, rate, turned, variance_i
 
     @classmethod
@@ -234,12 +264,22 @@ class HarmonicsWithCurrent(Harmonics):
         """Refused: bare arrays have no current."""
         raise ValueError("arrays have no current; use method='maximum_likelihood'")
 
-    def realigned(self, late: int) -> "HarmonicsWithCurrent":
-        """The lane with `v_out` and the current advanced by whole samples."""
-        if late == 0:
+    def realigned(self, late: Lags) -> "HarmonicsWithCurrent":
+        """The lane with `v_out` and the current advanced by whole samples, each by its own lag."""
+        if not any(late):
             return self
-        turn = _turn(self.frequency, self.sample_rate, late)
-        return dataclasses.replace(self, y=self.y * turn, i=self.i * turn)
+        y, i = (
+            record * _turn(self.frequency, self.sample_rate, by)
+            for record, by in ((self.y, late.v_out), (self.i, late.current))
+        )
+        return dataclasses.replace(self, y=y, i=i)
+
+    def late_by(self, circuit: AbstractCircuit, driver: AbstractFeed) -> Lags:
+        """Whole samples by which `v_out` and the current are later than with this load."""
+        gain = _gain(circuit, driver, self.frequency)
+        flowing = gain / np.asarray(circuit.response(jnp.asarray(self.frequency)))  # I / V_th
+        of_current = self._behind(flowing, self.i, self.variance_i)
+        return Lags.of(self._behind(gain, self.y, self.variance_y), of_current)
 
 
 class PaddedSamples(AbstractLane):
@@ -276,7 +316,7 @@ class PaddedSamples(AbstractLane):
             sample_rate=np.asarray(seen.recording.sample_rate),
             samples=np.asarray(size),
         )
-        one = one.realigned(seen.lag)
+        one = one.realigned(Lags(seen.lag))
         return dataclasses.replace(one, harmonics=Harmonics.of(seen) if seen.is_periodic else None)
 
     @classmethod
@@ -299,13 +339,13 @@ class PaddedSamples(AbstractLane):
         fields = (self.v_th, self.v_out, self.sigma_th, self.sigma_out, self.sample_rate)
         return Measurement(*map(jnp.asarray, fields))
 
-    def realigned(self, late: int) -> "PaddedSamples":
+    def realigned(self, late: Lags) -> "PaddedSamples":
         """The overlap of both records, with `v_out` advanced by whole samples."""
-        if late == 0:
+        if late.v_out == 0:
             return self
         samples = int(self.samples)
         v_th, v_out = (np.asarray(v)[:samples] for v in (self.v_th, self.v_out))
-        v_th, v_out = shifted(v_th, v_out, late)
+        v_th, v_out = shifted(v_th, v_out, late.v_out)
         room = (0, self.v_th.size - v_th.size)
         return dataclasses.replace(
             self,
@@ -315,7 +355,7 @@ class PaddedSamples(AbstractLane):
             harmonics=self.harmonics and self.harmonics.realigned(late),
         )
 
-    def late_by(self, circuit: AbstractCircuit, driver: AbstractFeed) -> int:
+    def late_by(self, circuit: AbstractCircuit, driver: AbstractFeed) -> Lags:
         """Whole samples by which `v_out` is later than with this load; 0 if they are few."""
         rate = self.sample_rate
         frequency = np.fft.rfftfreq(self.v_th.size, 1 / rate)[1:]
@@ -323,7 +363,7 @@ class PaddedSamples(AbstractLane):
         gain = _gain(circuit, driver, frequency)
         # The weight emphasises the edges, like a derivative of both records.
         weight = (frequency < ALIASED * rate) / (frequency**-2.0 * (1 + np.abs(gain) ** 2))
-        return _whole(rest(gain * x, y, weight, 2 * np.pi * frequency / rate))
+        return Lags.of(rest(gain * x, y, weight, 2 * np.pi * frequency / rate))
 
 
 class AlignedSamples(AbstractLane):
@@ -385,11 +425,6 @@ def _turn(
 ) -> Complex[np.ndarray, " harmonic"]:
     """Factor that advances a record by whole samples."""
     return np.exp(2j * np.pi * late / sample_rate * frequency)
-
-
-def _whole(late: float) -> int:
-    """A delay rounded to whole samples; 0 up to `LEFT`."""
-    return round(late) if abs(late) > LEFT else 0
 
 
 _Tree = TypeVar("_Tree")

@@ -28,6 +28,10 @@ class LoadUnknowns(eqx.Module):
         """The vector for a solver."""
         return jnp.concatenate([self.log_elements, self.delay_samples[..., None]], axis=-1)
 
+    def delays(self) -> tuple[float, ...]:
+        """The delay of one recording, that is not traced [samples]."""
+        return (float(self.delay_samples),)
+
 
 class LoadWithCurrentUnknowns(eqx.Module):
     """Unknowns of a load and a recording that measured the current beside V_th.
@@ -51,6 +55,10 @@ class LoadWithCurrentUnknowns(eqx.Module):
         """The vector for a solver."""
         delays = jnp.stack([self.delay_samples, self.current_delay_samples], axis=-1)
         return jnp.concatenate([self.log_elements, delays], axis=-1)
+
+    def delays(self) -> tuple[float, ...]:
+        """The delays of one recording, of V_out and of the current; they are not traced."""
+        return float(self.delay_samples), float(self.current_delay_samples)
 
 
 class Nuisance(eqx.Module):

@@ -32,6 +32,7 @@ from etid.estimators.lanes import (
     AbstractLane,
     Harmonics,
     HarmonicsWithCurrent,
+    Lags,
     stacked,
     unstacked,
 )
@@ -281,11 +282,14 @@ class _Waiting:
         return eqx.tree_at(lambda of: of.unloaded, loads, unloaded)
 
 
-def _late_by(lanes: Sequence[AbstractLane], starts: Sequence[_Start]) -> dict[int, int]:
+def _late_by(lanes: Sequence[AbstractLane], starts: Sequence[_Start]) -> dict[int, Lags]:
     del lanes
-    late = [float(start.loads.own.delay_samples) for start in starts]
     # A fit allows for one sample.
-    return {row: round(by) for row, by in enumerate(late) if 1 < abs(by) < np.inf}
+    late = {
+        row: Lags(*(round(by) if 1 < abs(by) < np.inf else 0 for by in start.loads.own.delays()))
+        for row, start in enumerate(starts)
+    }
+    return {row: by for row, by in late.items() if any(by)}
 
 
 def _need_another(starts: Sequence[_Start]) -> list[int]:

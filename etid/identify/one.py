@@ -15,7 +15,15 @@ from etid.circuits.circuit import AbstractCircuit, SkinRC
 from etid.estimators.element_limits import Limits, limited, of_circuit
 from etid.estimators.estimator import AbstractEstimator
 from etid.estimators.judgement import MISFIT_CHI2
-from etid.estimators.lanes import AbstractLane, Harmonics, replaced, stacked, taken, unstacked
+from etid.estimators.lanes import (
+    AbstractLane,
+    Harmonics,
+    Lags,
+    replaced,
+    stacked,
+    taken,
+    unstacked,
+)
 from etid.estimators.maximum_likelihood.estimator import MaximumLikelihood
 from etid.estimators.registry import Method
 from etid.identify import changes
@@ -315,7 +323,7 @@ def repeated(
     lanes: Sequence[AbstractLane],
     seen: Sequence[Inspected],
     fit: Callable[[Sequence[AbstractLane]], _Several],
-    late_by: Callable[[Sequence[AbstractLane], _Several], Mapping[int, int]],
+    late_by: Callable[[Sequence[AbstractLane], _Several], Mapping[int, Lags]],
     need_another: Callable[[_Several], Iterable[int]],
     of_both: Callable[[Any, Any], Any],
 ) -> _Several:
@@ -328,8 +336,7 @@ def repeated(
         lanes: Lanes of the recordings.
         seen: The recordings. The function corrects the lag of those that are late.
         fit: Fits lanes. Each lane can be read from the result and written into it by its number.
-        late_by: Lags of lanes behind their fits [whole samples], by number; only those that are
-            late.
+        late_by: Lags of lanes behind their fits, by number; only those that are late.
         need_another: Numbers of the lanes whose fits show hum, or that hum may explain.
         of_both: The better of two fits of a lane; the second is without the mains harmonics.
     """
@@ -337,7 +344,7 @@ def repeated(
     found = fit(lanes)
     late = late_by(lanes, found)
     for row, by in late.items():
-        seen[row].lag += by
+        seen[row].realign(*by)
         lanes[row] = lanes[row].realigned(by)
     if late:
         again = fit([lanes[row] for row in late])
@@ -381,12 +388,12 @@ def refined(
         several = {row: fits for row, fits in enumerate(found) if len(fits) > 1}
         return Tried(stacked([fits[0] for fits in found]), several)
 
-    def late_by(lanes: Sequence[AbstractLane], found: Tried) -> dict[int, int]:
+    def late_by(lanes: Sequence[AbstractLane], found: Tried) -> dict[int, Lags]:
         late = {}
         for row in found.where(lambda fit: np.asarray(fit.verdict) == "misfit"):
             circuit = found[row][found.chosen(row)].circuit
             late[row] = lanes[row].late_by(circuit, driver)
-        return {row: by for row, by in late.items() if by}
+        return {row: by for row, by in late.items() if any(by)}
 
     def of_all(first: dict[int, Fit], second: dict[int, Fit]) -> dict[int, Fit]:
         other = second[_chosen(second)]

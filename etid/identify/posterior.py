@@ -237,7 +237,7 @@ def given(
     estimator = cast(MaximumLikelihood, named(fit.method))
     lane = (HarmonicsWithCurrent if estimator.with_current else Harmonics).of(seen)
     late = lane.late_by(fit.circuit, feed)  # as `etid.identify.one.repeated` does it
-    seen.lag += late
+    seen.realign(*late)
     lane = lane.realigned(late)
     if int(fit.remarks) & Remark.mains_hum:
         lane = lane.without_mains() or lane

@@ -220,7 +220,7 @@ class Inspected:
         found = Remark.mains_hum if hum else Remark(0)
         found |= Remark.periods_left_out if self.kept is not None else Remark(0)
         found |= Remark.coarse_converter if coarse else Remark(0)
-        found |= Remark.aligned if self.lag else Remark(0)
+        found |= Remark.aligned if self.lag or self.current_lag else Remark(0)
         return found | (Remark.pulse_rate_counted if off else Remark(0))
 
     @functools.cached_property
@@ -238,6 +238,20 @@ class Inspected:
         shows no edge where the current has one.
         """
         return 0 if self.has_current or self.correlated is None else whole_lag(self.correlated)
+
+    @property
+    def current_lag(self) -> int:
+        """Lag of the current behind `v_th` [whole samples].
+
+        It is that of `v_out`: one instrument records both. A fit finds what is left (`realign`).
+        """
+        return self.lag - (self.by_current.lag if self.by_current is not None else 0)
+
+    def realign(self, v_out: int, current: int) -> None:
+        """Add whole samples to the lags of `v_out` and of a current beside it."""
+        if self.by_current is not None:
+            self.by_current.lag += v_out - current
+        self.lag += v_out
 
     @property
     def aligned(self) -> tuple[Float[np.ndarray, " overlap"], Float[np.ndarray, " overlap"]]:

@@ -29,7 +29,9 @@ class Remark(enum.IntFlag):
 _TEXTS = {
     Remark.mains_hum: "Mains hum was found; its harmonics were left out.",
     Remark.periods_left_out: "A disturbed pulse period was found; it was left out.",
-    Remark.aligned: "v_out was more than one sample late or early; it was aligned with v_th.",
+    Remark.aligned: (
+        "v_out or the current was more than one sample late or early; the records were aligned."
+    ),
     Remark.coarse_converter: (
         "The steps of the converter exceed the noise; the fit weighted the rounding errors by size."
     ),
