@@ -145,6 +145,18 @@ def test_the_gain_is_that_of_the_divider(driver):
 
 
 @pytest.mark.slow
+def test_a_single_fit_without_optimisation_equals_its_lane_of_an_optimised_batch(study, driver):
+    """Both take the same steps. 1e-9 is far above rounding, and far below one step of a fit."""
+    fits = etid.identify_skins(study.loaded, driver)
+    for row, path in enumerate(fits.labels["path"]):
+        fit, lane = etid.identify_skin(study[path], driver), fits[row]
+        assert fit.verdict == lane.verdict
+        for one_of, other in ((fit.circuit, lane.circuit), (fit.stderr, lane.stderr)):
+            np.testing.assert_allclose(one_of.values(), other.values(), rtol=1e-9)
+        np.testing.assert_allclose([fit.chi2, fit.rrse], [lane.chi2, lane.rrse], rtol=1e-9)
+
+
+@pytest.mark.slow
 def test_a_skin_tells_more_of_its_elements_with_its_calibration_than_after_it(study, driver):
     """Joint estimation uses what the skin's record says about Z_th: no error may grow by it."""
     joint = etid.identify_skin(study["loaded/0"], driver)

@@ -210,7 +210,20 @@ def skin_lane(
     return estimator.fit_load(lane, driver, known, circuit)
 
 
-skin = stored_jit(skin_lane)
+_brief_skin = stored_jit(skin_lane, rare=True)
+_skin = stored_jit(skin_lane)
+
+
+def skin(
+    lane: Any,
+    driver: AbstractFeed,
+    known: Any,
+    circuit: AbstractCircuit,
+    estimator: AbstractEstimator,
+) -> Fit:
+    """`skin_lane`, compiled. In a notebook, compilation takes longer than all fits."""
+    fit = _brief_skin if estimator.brief else _skin
+    return fit(lane, driver, known, circuit, estimator)
 
 
 @functools.partial(stored_jit, rare=True)  # once for each driver

@@ -55,6 +55,7 @@ class HarmonicSteiglitzMcBride(AbstractByMaximumLikelihood):
     lane = Harmonics
     driver = ContinuousDriver
     any_circuit = False
+    brief = True
 
     iterations: int = iteration.ITERATIONS
 
