@@ -71,6 +71,7 @@ TESTS: Mapping[str, Sequence[str]] = {
     "online.tick": ("electrode", "online"),
     "online.tracker": ("electrode", "online"),
     "results.driver": ("driver", "overview", "given_driver"),
+    "results.fit": ("overview", "fit", "exporting", "recording", "identification"),
     "results.fits": ("overview", "fit", "exporting", "recording", "identification"),
     "results.hdf5_table": ("tables", "exporting", "cli"),
     "results.summary": ("overview", "batch"),

@@ -19,7 +19,7 @@ import numpy as np
 from benchmarks.coverage import NORMAL_95
 from benchmarks.failure_counts import Rate, rate
 from benchmarks.selection_draws import TRUTHS, Drawn, errors
-from etid.results.fits import Fit
+from etid.results.fit import Fit
 from etid.selection.evidence import best, bic, elements
 from etid.selection.search import USUAL
 

@@ -22,7 +22,7 @@ from etid.circuits.circuit import (
 )
 from etid.identify import batches
 from etid.identify.arguments import Asked, fed
-from etid.results.fits import Fit
+from etid.results.fit import Fit
 from etid.selection.search import usual_circuits
 from etid.selection.selection import Selection
 from etid.simulation.published import REFERENCE

@@ -20,7 +20,7 @@ from benchmarks.failure_draws import DETERMINED, ELEMENTS, Answer, Draw, bounds,
 from benchmarks.mappings import make_room
 from benchmarks.selection_draws import choices
 from etid.circuits.circuit import AbstractCircuit, SkinRC
-from etid.results.fits import Fit
+from etid.results.fit import Fit
 from etid.simulation.transformer import SkinLoad
 
 AUTO = "auto"

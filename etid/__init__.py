@@ -56,7 +56,8 @@ from etid.recordings.recording import Recording, RecordingError, Samples
 from etid.recordings.study import Study
 from etid.results.data import provide as _provide
 from etid.results.driver import Driver
-from etid.results.fits import Fit, Fits, IdentificationError
+from etid.results.fit import Fit, IdentificationError
+from etid.results.fits import Fits
 from etid.results.posterior import Posterior, Profile
 from etid.results.study_fits import StudyFits
 from etid.results.verdicts import RESULTS

@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 
 from etid.results.driver import ContinuousDriver, Driver
-from etid.results.fits import Fit
+from etid.results.fit import Fit
 
 BASELINE = pathlib.Path(__file__).parent / "baseline"
 SHIFT = 0.05  # of an estimate [standard errors]

@@ -17,7 +17,8 @@ import numpy as np
 import etid
 from etid.plotting import figure_of
 from etid.results.driver import Calibration, ContinuousDriver, Driver, SourceImpedance
-from etid.results.fits import CHANGES, Fit, Fits, Support
+from etid.results.fit import CHANGES, Fit, Support
+from etid.results.fits import Fits
 from etid.results.verdicts import verdicts_of
 from etid.selection.search import usual_circuits
 from etid.simulation.scenes import PRESETS, Trial

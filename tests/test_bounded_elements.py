@@ -15,7 +15,7 @@ from etid.circuits.display import quantity
 from etid.estimators.element_limits import _nearest, truncated, within
 from etid.estimators.judgement import SUCCESSFUL, judged
 from etid.recordings.remarks import Remark
-from etid.results.fits import Support
+from etid.results.fit import Support
 from etid.results.verdicts import verdict
 from tests.test_current import SKIN, recorded
 from tests.test_judging import estimate

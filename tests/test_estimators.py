@@ -16,7 +16,7 @@ from etid.estimators.lanes import AlignedSamples, Harmonics
 from etid.identify import arguments
 from etid.report.methods import methods_section
 from etid.results.driver import DiscreteDriver, Driver
-from etid.results.fits import Fit
+from etid.results.fit import Fit
 from etid.results.study_fits import StudyFits
 from etid.results.verdicts import verdict
 from etid.simulation.scenes import Scene, Trial

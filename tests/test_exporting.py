@@ -21,7 +21,8 @@ import etid
 from etid import cli
 from etid.files import exporting
 from etid.recordings.remarks import Remark
-from etid.results.fits import Fit, Fits
+from etid.results.fit import Fit
+from etid.results.fits import Fits
 from etid.results.verdicts import verdicts_of
 
 START = datetime.datetime(2026, 1, 31, 9, 30, tzinfo=datetime.UTC)

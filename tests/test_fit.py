@@ -7,7 +7,7 @@ import pytest
 from scipy import stats
 
 import etid
-from etid.results.fits import complex_rrse
+from etid.results.fit import complex_rrse
 from etid.results.verdicts import verdict
 
 VALUES = np.array([33.4e3, 186e3, 0.12e-9])

@@ -16,7 +16,8 @@ from etid.circuits.overview import ROWS, Overview
 from etid.online.state import ElectrodeState, TrackerState
 from etid.recordings.remarks import Remark
 from etid.results.driver import Calibration, ContinuousDriver, SourceImpedance
-from etid.results.fits import Support, described
+from etid.results.fit import Support
+from etid.results.fits_columns import described
 from etid.results.verdicts import message, verdict, verdicts_of
 from etid.selection.selection import Selection
 from etid.simulation.bound import Bound

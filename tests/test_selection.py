@@ -13,7 +13,7 @@ from etid.circuits.impedance import AbstractImpedance
 from etid.estimators.starts import circuit_starts
 from etid.recordings.remarks import Remark
 from etid.report.methods import methods_section
-from etid.results.fits import CHANGES, Fit, Support
+from etid.results.fit import CHANGES, Fit, Support
 from etid.results.verdicts import verdict
 from etid.selection.common import common, deserves
 from etid.selection.evidence import best, bic, rank, weights, with_close

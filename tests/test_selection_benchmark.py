@@ -10,7 +10,7 @@ import etid
 from benchmarks import selection, selection_chart, selection_map, selection_rival
 from benchmarks.selection_counts import CRITERIA, cell, choose, covered, gained
 from benchmarks.selection_draws import TRUTHS, Drawn, quantities
-from etid.results.fits import CHANGES, Fit, Support
+from etid.results.fit import CHANGES, Fit, Support
 from etid.results.verdicts import verdict
 from etid.selection.evidence import best, bic
 from etid.selection.search import usual_circuits

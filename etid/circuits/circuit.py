@@ -30,7 +30,7 @@ from etid.circuits.impedance import AbstractImpedance, Quantity, parallel, serie
 from etid.circuits.overview import Overview, Overviewed, element_rows
 from etid.signals.transfer import frequency_variable
 
-Circuit = TypeVar("Circuit", bound="AbstractCircuit")
+_Same = TypeVar("_Same", bound="AbstractCircuit")
 # A parameter is proportional to these powers of the impedance and the time scale of its circuit.
 SCALING = {
     "ohm": (1.0, 0.0),
@@ -114,7 +114,7 @@ class AbstractCircuit(Overviewed, eqx.Module):
         """Natural logarithms of the parameters in SI units."""
         return jnp.log(self.values())
 
-    def with_log_values(self: Circuit, log_values: Float[Array, "*lane parameter"]) -> Circuit:
+    def with_log_values(self: _Same, log_values: Float[Array, "*lane parameter"]) -> _Same:
         """A circuit of the same class with other parameters.
 
         Args:
@@ -167,6 +167,9 @@ class AbstractCircuit(Overviewed, eqx.Module):
             return eqx.tree_pformat(self)
         elements = (f"{name}={text.strip()} {unit}".rstrip() for name, text, unit in overview.rows)
         return f"{type(self).__name__}({', '.join(elements)})"
+
+
+Circuit = TypeVar("Circuit", bound=AbstractCircuit)
 
 
 @functools.cache

@@ -11,7 +11,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, Int
 
 from etid.results.driver import SourceImpedance
-from etid.results.fits import Support
+from etid.results.fit import Support
 from etid.solvers.levenberg_marquardt import LevenbergMarquardt
 
 MAX_STEPS = 500

@@ -17,7 +17,7 @@ from etid.estimators import judgement
 from etid.estimators.lanes import AbstractLane
 from etid.results.driver import ContinuousDriver, Driver
 from etid.results.feed import AbstractFeed, MeasuredCurrent
-from etid.results.fits import Fit
+from etid.results.fit import Fit
 
 CHECKED = (
     "the records passed the checks for flat, clipped, missing and misplaced samples",

@@ -14,7 +14,7 @@ from etid.circuits.circuit import AbstractCircuit
 from etid.estimators.element_limits import Limits, limited, of_circuit, within
 from etid.estimators.estimate import Estimate
 from etid.recordings.remarks import Remark
-from etid.results.fits import Fit, Support
+from etid.results.fit import Fit, Support
 from etid.results.verdicts import RESULTS, first_verdict, verdict
 from etid.solvers.levenberg_marquardt import NormalEquations
 from etid.solvers.matrices import inverse

@@ -19,7 +19,8 @@ from etid.recordings import limits
 from etid.recordings.recording import RecordingError
 from etid.recordings.replacing import replacing
 from etid.recordings.untrusted import attribute, translated
-from etid.results.fits import DESCRIBED, SCHEMA, Fit, Fits
+from etid.results.fit import Fit
+from etid.results.fits import DESCRIBED, SCHEMA, Fits
 from etid.results.hdf5_table import Table, opened_table, same_length
 
 ROWS = 1 << 16  # fits in memory at a time

@@ -38,7 +38,7 @@ from etid.recordings.preflight import Inspected
 from etid.recordings.recording import Recording, RecordingError
 from etid.results.driver import Driver, HarmonicDriver
 from etid.results.feed import MEASURED_CURRENT, MeasuredCurrent
-from etid.results.fits import Fit
+from etid.results.fit import Fit
 from etid.results.verdicts import RESULTS
 
 METHOD = "amplitudes"

@@ -43,7 +43,8 @@ from etid.identify.prefetch import prefetch
 from etid.recordings.preflight import Inspected
 from etid.recordings.recording import Recording
 from etid.results.feed import AbstractFeed
-from etid.results.fits import Fit, joined
+from etid.results.fit import Fit
+from etid.results.fits import joined
 from etid.selection.common import common, deserves
 from etid.selection.selection import Selection
 

@@ -35,7 +35,7 @@ from etid.identify.compiled import stored_jit
 from etid.recordings.repeats import ALIGNED, Repeats
 from etid.results.driver import Driver
 from etid.results.feed import AbstractFeed
-from etid.results.fits import Fit
+from etid.results.fit import Fit
 from etid.results.verdicts import verdict
 from etid.signals.harmonics import real_parts
 from etid.signals.transfer import frequency_variable, reciprocal

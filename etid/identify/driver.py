@@ -21,7 +21,7 @@ from etid.recordings.preflight import Inspected, preflight
 from etid.recordings.recording import Recording
 from etid.recordings.repeats import repeats
 from etid.results.driver import ContinuousDriver, Driver, HarmonicDriver
-from etid.results.fits import IdentificationError
+from etid.results.fit import IdentificationError
 from etid.results.tried_orders import AUTO, Order
 from etid.results.verdicts import message, verdict
 from etid.selection.driver_order import TriedOrder, best, evidence, next_order

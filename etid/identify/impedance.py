@@ -21,7 +21,7 @@ from etid.circuits.circuit import AbstractCircuit
 from etid.identify.arguments import circuit_of, require_float64
 from etid.identify.compiled import stored_jit
 from etid.results.data import MeasuredImpedance, with_data
-from etid.results.fits import CHANGES, Fit, IdentificationError, Support, complex_rrse
+from etid.results.fit import CHANGES, Fit, IdentificationError, Support, complex_rrse
 from etid.results.verdicts import RESULTS, first_verdict, message, verdict
 from etid.solvers.levenberg_marquardt import LevenbergMarquardt, best_start
 from etid.solvers.matrices import inverse

@@ -73,7 +73,7 @@ from etid.recordings.repeats import Repeats, repeats
 from etid.recordings.study import Study
 from etid.results.driver import HarmonicDriver
 from etid.results.feed import AbstractFeed, MeasuredCurrent
-from etid.results.fits import Fit
+from etid.results.fit import Fit
 from etid.results.provenance import Settings
 from etid.results.study_fits import StudyFits
 from etid.results.tried_orders import Order

@@ -25,7 +25,9 @@ from etid.recordings.recording import Recording, RecordingError
 from etid.recordings.study import Study
 from etid.results.driver import Driver
 from etid.results.feed import AbstractFeed
-from etid.results.fits import Fit, Fits, described
+from etid.results.fit import Fit
+from etid.results.fits import Fits
+from etid.results.fits_columns import described
 from etid.results.provenance import Settings
 from etid.results.study_fits import StudyFits
 from etid.results.tried_orders import Order

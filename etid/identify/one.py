@@ -45,7 +45,7 @@ from etid.recordings.repeats import Repeats, repeats
 from etid.results.data import with_data
 from etid.results.driver import Driver, HarmonicDriver
 from etid.results.feed import MEASURED_CURRENT, AbstractFeed
-from etid.results.fits import Fit, IdentificationError, Support
+from etid.results.fit import Fit, IdentificationError, Support
 from etid.results.verdicts import message, verdict, verdicts_of
 from etid.selection.evidence import best
 from etid.selection.search import search

@@ -10,7 +10,7 @@ from etid.identify.one import explained
 from etid.recordings.preflight import Group, Inspected
 from etid.recordings.recording import Recording, RecordingError
 from etid.results.feed import AbstractFeed
-from etid.results.fits import IdentificationError
+from etid.results.fit import IdentificationError
 from etid.results.verdicts import message
 
 TOGETHER = 600_000  # samples that are inspected together; their arrays take tens of MB

@@ -20,7 +20,7 @@ from etid.identify.compiled import stored_jit
 from etid.identify.posterior import Known, Minimum, cost, given
 from etid.recordings.recording import Recording
 from etid.results.driver import Driver
-from etid.results.fits import Fit
+from etid.results.fit import Fit
 from etid.results.posterior import Profile
 from etid.solvers.levenberg_marquardt import LevenbergMarquardt, NormalEquations
 

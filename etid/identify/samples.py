@@ -18,7 +18,7 @@ from etid.identify.arguments import (
 from etid.identify.one import skin_lane
 from etid.recordings.remarks import Remark
 from etid.results.driver import Driver
-from etid.results.fits import Fit
+from etid.results.fit import Fit
 from etid.signals.harmonics import whole_periods
 
 

@@ -9,7 +9,7 @@ from etid.recordings.recording import Recording, RecordingError
 from etid.recordings.study import Study
 from etid.results.driver import Driver
 from etid.results.feed import MEASURED_CURRENT, AbstractFeed
-from etid.results.fits import IdentificationError
+from etid.results.fit import IdentificationError
 from etid.results.tried_orders import Order
 
 

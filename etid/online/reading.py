@@ -10,7 +10,7 @@ from etid.estimators.registry import register_description
 from etid.estimators.unknowns import LoadUnknowns
 from etid.online.pulse_fit import DELAYS, GainModel, Pulse
 from etid.online.state import ElectrodeState
-from etid.results.fits import Fit
+from etid.results.fit import Fit
 from etid.results.verdicts import RESULTS, first_verdict
 from etid.signals.harmonics import real_parts
 from etid.signals.transfer import as_complex, power, reciprocal

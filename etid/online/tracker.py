@@ -63,7 +63,9 @@ from etid.online.tick import updated
 from etid.recordings.preflight import Inspected, preflight
 from etid.recordings.recording import Recording
 from etid.results.driver import Driver, HarmonicDriver
-from etid.results.fits import Fit, Fits, IdentificationError, described
+from etid.results.fit import Fit, IdentificationError
+from etid.results.fits import Fits
+from etid.results.fits_columns import described
 from etid.results.verdicts import RESULTS, message, verdict_names, verdicts_of
 
 

@@ -13,7 +13,8 @@ from etid.circuits.circuit import AbstractCircuit
 from etid.recordings.recording import Recording
 from etid.results.data import AnyAxes, MeasuredImpedance, Shown
 from etid.results.driver import Driver, SourceImpedance
-from etid.results.fits import Fit, Fits
+from etid.results.fit import Fit
+from etid.results.fits import Fits
 from etid.results.posterior import Posterior, Profile
 from etid.selection.selection import Selection
 from etid.simulation.bound import Bound

@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 from etid.circuits.circuit import AbstractCircuit
 from etid.plotting.style import COLOURS, DASHES, Canvas, plain_ticks, titled
 from etid.results.driver import Driver, SourceImpedance
-from etid.results.fits import Fit
+from etid.results.fit import Fit
 from etid.solvers.propagation import log_stderr
 
 LOWEST, HIGHEST = 60.0, 100e3  # [Hz] the paper's pulse rate and half its sample rate

@@ -19,7 +19,7 @@ from etid.recordings.recording import Recording
 from etid.results.data import MeasuredImpedance
 from etid.results.driver import ContinuousDriver, Driver
 from etid.results.feed import MeasuredCurrent
-from etid.results.fits import Fit
+from etid.results.fit import Fit
 
 SURE = 0.3  # relative standard error of a point; others are not drawn
 LAGS = 60  # samples in the diagrams of correlation

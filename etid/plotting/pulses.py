@@ -11,7 +11,7 @@ from etid.plotting.style import BLUE, INK, RED, Canvas, titled
 from etid.recordings.fields import LABELS
 from etid.recordings.recording import Recording
 from etid.results.driver import Driver
-from etid.results.fits import Fit
+from etid.results.fit import Fit
 from etid.signals.noise import noise
 
 BEFORE, AFTER = 0.15e-3, 1.2e-3  # [s] time shown before and after the first edge of a pulse

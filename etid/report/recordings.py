@@ -15,7 +15,7 @@ from etid.report.figures import plain, svg
 from etid.report.html import Picture
 from etid.report.tables import significant
 from etid.results.driver import Driver
-from etid.results.fits import Fit
+from etid.results.fit import Fit
 from etid.results.study_fits import StudyFits
 
 

@@ -22,7 +22,7 @@ from collections.abc import Mapping
 import numpy as np
 from jaxtyping import Float
 
-from etid.results.fits import Fit, Support
+from etid.results.fit import Fit, Support
 
 # The data do not determine all elements, or the driver: they do not contradict the circuit.
 _UNDETERMINED = ("insensitive", "resolution", "driver_unclear", "driver_failed")

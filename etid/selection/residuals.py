@@ -3,7 +3,7 @@
 import numpy as np
 
 from etid.recordings.remarks import Remark
-from etid.results.fits import Fit
+from etid.results.fit import Fit
 
 SEEN = 3.0  # standard deviations; below, the residual does not look like any of the changes
 _SLOW, _FAST = 2, 3  # number of relaxations at either end of the band

@@ -19,7 +19,7 @@ from etid.circuits.circuit import (
     SkinLayers,
     SkinRC,
 )
-from etid.results.fits import Fit
+from etid.results.fit import Fit
 from etid.selection.evidence import best, rank, values_of
 
 # From the usual circuit to the unusual ones. Classes, because the elements of a circuit are arrays:

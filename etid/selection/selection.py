@@ -9,7 +9,7 @@ import numpy as np
 from etid.circuits.circuit import AbstractCircuit
 from etid.circuits.overview import Overview, Overviewed
 from etid.recordings.remarks import Remark
-from etid.results.fits import Fit
+from etid.results.fit import Fit
 from etid.results.verdicts import message
 from etid.selection.evidence import bic, rank, weights, with_close
 from etid.selection.residuals import looks_like

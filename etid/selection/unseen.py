@@ -30,7 +30,7 @@ from collections.abc import Mapping
 import numpy as np
 from jaxtyping import Float
 
-from etid.results.fits import Fit
+from etid.results.fit import Fit
 from etid.selection.evidence import elements, values_of
 
 # τ; 1 − α is 0.2 for dry skin (Gabriel, Lau and Gabriel 1996, see `SkinCole`), and the share of R_s

@@ -14,7 +14,7 @@ from etid.estimators.amplitudes.terms import Amplitudes
 from etid.estimators.estimate import MAX_STEPS, SOLVER, Estimate
 from etid.estimators.maximum_likelihood.terms import excess
 from etid.estimators.sandwich import Curvature
-from etid.results.fits import complex_rrse
+from etid.results.fit import complex_rrse
 from etid.signals.harmonics import Spectrum, real_parts, signal_share
 from etid.signals.transfer import as_complex, power
 from etid.solvers.levenberg_marquardt import LevenbergMarquardt, NormalEquations, best_start

@@ -37,7 +37,7 @@ from etid.estimators.score_tests.unloaded import UnloadedShape
 from etid.estimators.steiglitz_mcbride.iteration import check_iterations
 from etid.estimators.unknowns import LoadUnknowns
 from etid.results.driver import ContinuousDriver
-from etid.results.fits import Fit
+from etid.results.fit import Fit
 from etid.results.verdicts import RESULTS, first_verdict
 from etid.signals.harmonics import Spectrum
 from etid.solvers.levenberg_marquardt import normal_equations

@@ -45,7 +45,7 @@ from jaxtyping import Array, Bool, Complex, Float, Int
 from etid.circuits.circuit import SkinRC
 from etid.estimators.steiglitz_mcbride.iteration import ITERATIONS, SETTLED
 from etid.results.driver import SourceImpedance
-from etid.results.fits import complex_rrse
+from etid.results.fit import complex_rrse
 from etid.signals.harmonics import Spectrum
 from etid.signals.knots import knots
 from etid.signals.transfer import as_complex, power, reciprocal, turns

@@ -26,7 +26,7 @@ from etid.estimators.maximum_likelihood.load_fit import SLIGHT
 from etid.estimators.maximum_likelihood.terms import shows_hum
 from etid.estimators.maximum_likelihood.with_current import LoadWithCurrent
 from etid.estimators.unknowns import LoadUnknowns, LoadWithCurrentUnknowns
-from etid.results.fits import complex_rrse
+from etid.results.fit import complex_rrse
 from etid.signals.harmonics import Spectrum
 from etid.solvers.arrowhead import Arrowhead, ArrowheadEquations, EliminationDescent, join
 from etid.solvers.levenberg_marquardt import (

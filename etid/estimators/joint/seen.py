@@ -17,7 +17,7 @@ from etid.estimators.maximum_likelihood.load import Around, Load
 from etid.estimators.maximum_likelihood.terms import apart, excess, residual, variance
 from etid.estimators.maximum_likelihood.with_current import LoadWithCurrent
 from etid.estimators.sandwich import Linear
-from etid.results.fits import complex_rrse
+from etid.results.fit import complex_rrse
 from etid.signals.harmonics import Spectrum, signal_share
 from etid.signals.knots import knots
 from etid.signals.transfer import as_complex

@@ -40,7 +40,7 @@ from etid.estimators.maximum_likelihood.terms import (
 from etid.estimators.sandwich import Linear
 from etid.estimators.unknowns import DriverUnknowns
 from etid.results.driver import Calibration, HarmonicDriver, SourceImpedance
-from etid.results.fits import complex_rrse
+from etid.results.fit import complex_rrse
 from etid.signals.harmonics import Spectrum
 from etid.signals.transfer import as_complex, frequency_variable, reciprocal
 from etid.solvers.levenberg_marquardt import (

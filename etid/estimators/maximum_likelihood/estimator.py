@@ -27,7 +27,7 @@ from etid.estimators.score_tests.other_circuit import NO_OTHER_CIRCUIT, NO_OTHER
 from etid.estimators.score_tests.unloaded import UnloadedShape, shape_of
 from etid.results.driver import Driver, HarmonicDriver
 from etid.results.feed import MeasuredCurrent
-from etid.results.fits import Fit
+from etid.results.fit import Fit
 from etid.results.verdicts import RESULTS
 
 

@@ -30,7 +30,7 @@ from etid.estimators.maximum_likelihood.terms import (
 from etid.estimators.sandwich import Linear
 from etid.estimators.score_tests import falling_resistance, other_circuit
 from etid.estimators.unknowns import LoadUnknowns
-from etid.results.fits import Support, complex_rrse
+from etid.results.fit import Support, complex_rrse
 from etid.signals.harmonics import Spectrum, signal_share
 from etid.signals.transfer import as_complex, power
 from etid.solvers.levenberg_marquardt import LevenbergMarquardt, NormalEquations

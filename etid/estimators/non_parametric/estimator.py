@@ -23,7 +23,7 @@ from etid.estimators.score_tests.unloaded import UnloadedShape
 from etid.estimators.starts import harmonic_starts
 from etid.results.driver import HarmonicDriver
 from etid.results.feed import AbstractFeed
-from etid.results.fits import Fit
+from etid.results.fit import Fit
 from etid.results.verdicts import RESULTS
 
 SAME_PULSE_RATE = 1e-3  # relative difference of pulse rates that is allowed, as Z_th is smooth

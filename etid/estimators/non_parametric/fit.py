@@ -31,7 +31,7 @@ from etid.estimators.score_tests import other_circuit
 from etid.estimators.score_tests.other_circuit import Scores
 from etid.estimators.unknowns import LoadUnknowns
 from etid.results.driver import HarmonicDriver, SourceImpedance
-from etid.results.fits import complex_rrse
+from etid.results.fit import complex_rrse
 from etid.signals.harmonics import Spectrum
 from etid.signals.transfer import as_complex
 from etid.solvers.levenberg_marquardt import best_start

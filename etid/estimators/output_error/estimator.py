@@ -19,7 +19,7 @@ from etid.estimators.steiglitz_mcbride import iteration
 from etid.estimators.unknowns import LoadUnknowns
 from etid.results.driver import ContinuousDriver, Driver, HarmonicDriver
 from etid.results.feed import MeasuredCurrent
-from etid.results.fits import Fit
+from etid.results.fit import Fit
 from etid.results.verdicts import RESULTS
 from etid.signals.noise import Measurement
 from etid.signals.transfer import Rational

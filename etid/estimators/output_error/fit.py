@@ -53,7 +53,7 @@ from etid.estimators.score_tests.other_in_time import relaxed, score
 from etid.estimators.unknowns import Nuisance
 from etid.results.driver import Calibration, ContinuousDriver, SourceImpedance, loaded
 from etid.results.feed import CurrentSource, MeasuredCurrent
-from etid.results.fits import CHANGES, Support, rrse
+from etid.results.fit import CHANGES, Support, rrse
 from etid.signals.filtering import CUTOFF, StateSpace
 from etid.signals.transfer import Rational
 from etid.solvers.levenberg_marquardt import best_start

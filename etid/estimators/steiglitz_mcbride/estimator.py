@@ -17,7 +17,7 @@ from etid.estimators.judgement import BIASED, MAX_STEPS_REACHED, distance_to_min
 from etid.estimators.lanes import AlignedSamples
 from etid.estimators.steiglitz_mcbride import iteration
 from etid.results.driver import DiscreteDriver, Driver
-from etid.results.fits import Fit
+from etid.results.fit import Fit
 from etid.results.verdicts import RESULTS, first_verdict
 from etid.signals.noise import Measurement
 from etid.signals.transfer import Rational

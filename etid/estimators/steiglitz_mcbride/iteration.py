@@ -24,7 +24,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from etid.circuits.circuit import SkinRC
-from etid.results.fits import rrse
+from etid.results.fit import rrse
 from etid.signals.filtering import lfilter
 from etid.signals.transfer import (
     Rational,

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from etid.estimators.steiglitz_mcbride.iteration import Iterate, iterate, least_squares
-from etid.results.fits import complex_rrse
+from etid.results.fit import complex_rrse
 from etid.signals.harmonics import Spectrum
 from etid.signals.transfer import (
     Rational,

@@ -1,0 +1,282 @@
+"""One fit of a circuit: elements, standard errors, verdict, and what else the data support."""
+
+import os
+import statistics
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Complex, Float, Int
+
+from etid.circuits.circuit import Circuit
+from etid.circuits.display import quantity, several
+from etid.circuits.overview import Overview, element_rows
+from etid.recordings.remarks import texts, words
+from etid.results.data import WithData
+from etid.results.fits_columns import described
+from etid.results.limited import Limited
+from etid.results.verdicts import RESULTS, Judged, counted, message
+from etid.signals.transfer import power
+
+CHANGES = 9  # changes that the score tests try: a spread, seven relaxations, a gain
+
+
+def rrse(predicted: Float[Array, " time"], measured: Float[Array, " time"]) -> Float[Array, ""]:
+    """Root relative squared error, sqrt(Σ (V − W)² / Σ (W − mean W)²)   (paper, eq. 3).
+
+    The RRSE does not show errors of the circuit: 2.73 % is as common with a correct C_p as with a
+    C_p that is wrong by 85 %. Judge a fit by χ² and the standard errors.
+    """
+    return jnp.sqrt(
+        jnp.sum((predicted - measured) ** 2) / jnp.sum((measured - jnp.mean(measured)) ** 2)
+    )
+
+
+def complex_rrse(
+    predicted: Complex[Array, " value"],
+    measured: Complex[Array, " value"],
+    used: Bool[Array, " value"] | bool = True,
+) -> Float[Array, ""]:
+    """RRSE of the harmonics or impedances that are used; their mean is not subtracted."""
+    missed = jnp.sum(jnp.where(used, power(measured - predicted), 0.0))
+    return jnp.sqrt(missed / jnp.sum(jnp.where(used, power(measured), 0.0)))
+
+
+class IdentificationError(RuntimeError):
+    """An identification was not successful.
+
+    Attributes:
+        outcome: The unsuccessful fit or driver; None if there is none.
+    """
+
+    def __init__(self, text: str, outcome: Any) -> None:
+        super().__init__(text)
+        self.outcome = outcome
+
+
+class Support(eqx.Module):
+    """How well the data of a fit support its circuit.
+
+    Attributes:
+        deviance: −2 log L at the minimum, up to a constant that depends on the data only.
+        terms: Number of real numbers in the data.
+        z: Score of each change that the circuit cannot make [standard deviations]: a spread of time
+            constants, more relaxations from slow to fast, and another gain of V_out. 0 if the
+            change is too small to matter, or if the circuit can make it itself.
+        spread_stderr: Standard error of the size of the first change, the spread; 0 if the circuit
+            can make it itself.
+        spread_slope: Change of the logarithm of each element for each unit of this size.
+    """
+
+    deviance: Float[Array | np.ndarray, "*lane"]
+    terms: Float[Array | np.ndarray, "*lane"]
+    z: Float[Array | np.ndarray, "*lane change"]
+    spread_stderr: Float[Array | np.ndarray, "*lane"]
+    spread_slope: Float[Array | np.ndarray, "*lane element"]
+
+    @classmethod
+    def unknown(cls, elements: int, *lane: int) -> "Support":
+        """The support of a fit whose estimator does not compute it, or of a batch of them: NaN."""
+        sizes = (), (), (CHANGES,), (), (elements,)
+        return cls(*(np.full((*lane, *size), np.nan) for size in sizes))
+
+
+class Fit(Judged, WithData[Circuit]):
+    """One identified circuit, or a batch of them along a leading axis.
+
+    Attributes:
+        circuit: Identified elements in SI units.
+        cov: Covariance of the elements in SI units; NaN if the method gives none. It does not
+            contain the tolerance of the calibration resistor, which passes 1:1 into every
+            resistance. The fits of `identify_jointly` contain its `r_load_tolerance`.
+        shared_cov: The part of `cov` that comes from the driver. All fits with this driver share
+            it, so the spread between trials does not show it.
+        rrse: Root relative squared error of V_out (paper, eq. 3).
+        chi2: Σ residual² / expected variance, per degree of freedom; 1 if the model is right.
+        result: Verdict.
+        steps: Iterations of the solver.
+        method: Name of the estimator with the options that are not the default. A batch has all
+            names, joined by " + ".
+        remarks: Remarks on the recording, `etid.recordings.remarks.Remark` as integers.
+        change: Relative change of each element and, last, of the amplitude during the record: from
+            the first to the last period, or the size of the detected step. NaN if the record holds
+            less than two periods; None if no change was computed.
+        change_stderr: Standard errors of `change`.
+        support: How well the data support this circuit, for the choice between circuits; NaN or
+            None if the method computes no likelihood.
+        limits: Bounds of the elements; None without bounds.
+    """
+
+    circuit: Circuit
+    cov: Float[Array | np.ndarray, "*lane parameter parameter"]
+    shared_cov: Float[Array | np.ndarray, "*lane parameter parameter"]
+    rrse: Float[Array | np.ndarray, "*lane"]
+    chi2: Float[Array | np.ndarray, "*lane"]
+    result: RESULTS
+    steps: Int[Array | np.ndarray, "*lane"]
+    method: str = eqx.field(static=True)
+    remarks: Int[Array | np.ndarray, "*lane"] = eqx.field(default_factory=lambda: np.zeros((), int))
+    change: Float[Array | np.ndarray, "*lane moved"] | None = None
+    change_stderr: Float[Array | np.ndarray, "*lane moved"] | None = None
+    support: Support | None = None
+    limits: Limited | None = None
+
+    @property
+    def stderr(self) -> Circuit:
+        """Standard errors of the elements, as a circuit of the same kind."""
+        # The fits of `identify_skin` hold NumPy arrays. With `jnp`, six programs would compile.
+        xp = self.cov.__array_namespace__()
+        variance = xp.diagonal(self.cov, axis1=-2, axis2=-1)
+        values = xp.sqrt(xp.where(variance >= 0, variance, xp.nan))
+        names = self.circuit.names()
+        return type(self.circuit)(**{name: values[..., i] for i, name in enumerate(names)})
+
+    @property
+    def correlation(self) -> Float[np.ndarray, "*lane parameter parameter"]:
+        """Correlation coefficients of the errors of the elements; NaN without a covariance."""
+        errors = np.asarray(self.stderr.values())
+        return np.asarray(self.cov) / (errors[..., :, None] * errors[..., None, :])
+
+    def intervals(self, level: float = 0.95) -> dict[str, tuple[float, float]]:
+        """Confidence intervals of the elements: value ± z · standard error; for one fit.
+
+        They come from the normal distribution, to which maximum likelihood leads if the standard
+        errors are small. A bound ends an interval. The distribution inside the bounds is not
+        normal; its part in an interval of 95 % is 94.8 % or more (a bound far beyond which the
+        estimate would lie), and all of it between close bounds.
+
+        Args:
+            level: Probability that an interval contains the true value.
+
+        Returns:
+            Both ends [SI] by name; NaN without a covariance.
+
+        Raises:
+            ValueError: The level is not between 0 and 1, or this is a batch.
+        """
+        self._refuse_batch()
+        if not 0 < level < 1:
+            raise ValueError(f"level is {level}; it must be between 0 and 1, as in 0.95")
+        z = statistics.NormalDist().inv_cdf((1 + level) / 2)
+        values, errors = np.asarray(self.circuit.values()), np.asarray(self.stderr.values())
+        low, high = values - z * errors, values + z * errors
+        if self.limits is not None:
+            low, high = (np.clip(end, self.limits.lower, self.limits.upper) for end in (low, high))
+        ends = zip(low.tolist(), high.tolist(), strict=True)
+        return dict(zip(self.circuit.names(), ends, strict=True))
+
+    def table(self) -> dict[str, Any]:
+        """Elements [SI], standard errors, changes, quality and verdict, by name.
+
+        Returns:
+            Numbers and texts; arrays for a batch.
+        """
+        names, stderr, change = self.circuit.names(), self.stderr, self.known_changes[0]
+        columns: dict[str, Any] = {}
+        for name in names:
+            columns[name] = getattr(self.circuit, name)
+            columns[f"{name}_stderr"] = getattr(stderr, name)
+        for i, name in enumerate((*names, "amplitude")):
+            columns[f"{name}_change"] = change[..., i]
+        remarks = np.vectorize(words, otypes=[object])(np.asarray(self.remarks))
+        columns |= {
+            "rrse": self.rrse,
+            "chi2": self.chi2,
+            "steps": self.steps,
+            "verdict": self.verdict,
+            "remarks": np.asarray(remarks).astype(str),
+        }
+        if self.limits is not None:
+            columns["at_bound"] = self._outside()
+        arrays = {name: np.asarray(column) for name, column in columns.items()}
+        return {name: one if one.ndim else one.item() for name, one in arrays.items()}
+
+    def write(self, path: str | os.PathLike[str]) -> None:
+        """Write the fit to an HDF5 file, as `Fits` of one; `Fits.read` reads it.
+
+        Raises:
+            ValueError: This is a batch.
+        """
+        from etid.results.fits import Fits  # a table of this class
+
+        self._refuse_batch()
+        batch = jax.tree.map(lambda leaf: np.asarray(leaf)[None], self)
+        Fits(batch, described([{}]), np.array([message(self.verdict)])).write(path)
+
+    def _refuse_batch(self) -> None:
+        if np.ndim(self.rrse):
+            raise ValueError("this is a batch of fits; take one of them, as in fits[0]")
+
+    def _outside(self) -> np.ndarray:
+        """A sentence on the elements that would lie outside their bounds, for each fit."""
+        if self.limits is None:
+            return np.full(np.shape(self.rrse), "")
+        units = self.circuit.units()
+        if not np.ndim(self.rrse):
+            return np.asarray(self.limits.text(units))
+        rows = range(len(self.rrse))
+        each = [jax.tree.map(lambda leaf, row=row: leaf[row], self.limits) for row in rows]
+        return np.array([one.text(units) for one in each], str)
+
+    @property
+    def outside(self) -> str:
+        """A sentence that names the elements that would lie outside their bounds; for one fit."""
+        self._refuse_batch()
+        return str(self._outside())
+
+    @property
+    def all_limits(self) -> Limited:
+        """`limits`; without bounds those that every value meets."""
+        none = np.zeros(np.shape(self.circuit.values()))
+        return self.limits or Limited(none, none + np.inf, none)
+
+    @property
+    def known_changes(self) -> tuple[np.ndarray, np.ndarray]:
+        """`change` and `change_stderr` as arrays; NaN if none were computed."""
+        nothing = np.full((*np.shape(self.rrse), len(self.circuit.names()) + 1), np.nan)
+        if self.change is None or self.change_stderr is None:
+            return nothing, nothing
+        return np.asarray(self.change), np.asarray(self.change_stderr)
+
+    @property
+    def elements(self) -> tuple[str, ...]:
+        """Each element as text, with standard error and unit; for one fit."""
+        return tuple(
+            f"{name} {quantity(float(value), unit, float(error))}"
+            for (name, unit), value, error in zip(
+                self.circuit.units().items(),
+                self.circuit.values(),
+                self.stderr.values(),
+                strict=True,
+            )
+        )
+
+    @property
+    def changes(self) -> str:
+        """A sentence on the change of each element and of the amplitude; for one fit."""
+        if self.change is None or self.change_stderr is None:
+            return ""
+        return "During the record: " + ", ".join(
+            f"{name} {100 * float(size):+.2g} ± {100 * float(error):.1g} %"
+            for name, size, error in zip(
+                (*self.circuit.names(), "amplitude"), self.change, self.change_stderr, strict=True
+            )
+        )
+
+    def _overview(self) -> Overview:
+        kind, verdict = type(self.circuit).__name__, self.verdict
+        values, errors = np.asarray(self.circuit.values()), np.asarray(self.stderr.values())
+        rows = element_rows(self.circuit.units(), values, errors)
+        if np.ndim(self.rrse):
+            batch = f"{kind} fits, batch of {np.shape(self.rrse)}: {counted(verdict)}"
+            return Overview(batch, rows)
+        title = f"{kind}: {verdict} in {several(int(self.steps), 'step')} ({self.method})"
+        title += f", RRSE {100 * float(self.rrse):.3g} %"
+        if self.measured is None or self.measured.stderr is not None:
+            title += f", chi2 {float(self.chi2):.3g}"  # without standard errors there is none
+        notes = [message(verdict)] if verdict != "successful" else []
+        notes += [self.changes] if verdict == "changed" else []
+        notes += [self.outside] if self.outside else []
+        return Overview(title, rows, notes=[*notes, *texts(int(self.remarks))])
