@@ -18,6 +18,7 @@ from benchmarks.specimens import study_fits
 v = np.ones(1000)
 rec = etid.Recording(v, v, sample_rate=2e5, pulse_rate=60.0)
 cal = rec.replace(r_load=1e5)
+of_current = etid.Recording(v_out=v, current=v, sample_rate=2e5, pulse_rate=60.0)
 study = etid.Study.from_recordings([cal, rec])
 fits = study_fits()
 d = fits.drivers["calibration/0",]
@@ -61,6 +62,16 @@ calls = {
     "etid.predict(rec, None, etid.SkinRC())": "current",
     "etid.predict(rec, d, etid.SkinRC)": "circuit",
     "etid.identify_samples(v, v, None, sample_rate=2e5, pulse_rate=60.0)": "driver",
+    "etid.identify_skin(rec, d, fixed=['r_s'])": "fixed",
+    "etid.identify_skin(rec, d, prior='r_s=1')": "prior",
+    "etid.identify_driver([cal, cal])": "calibrations[1]",
+    "etid.identify_amplitudes([of_current, of_current])": "recordings[1]",
+    "etid.Tracker.of(None, cal, electrodes=2)": "driver",
+    "etid.Tracker.of(d, v, electrodes=2)": "unloaded",
+    "etid.Tracker.of(d, of_current, electrodes=2)": "v_th",
+    "etid.Tracker.of(d, cal, electrodes='98')": "electrodes",
+    "etid.Tracker.of(d, cal, electrodes=2, change='slow')": "change",
+    "etid.Controller.of(d)": "tracker",
     "study.where(subject=1.5)": "subject",
     "study[0]": "path",
     "fits.fits.where(subjct='s01')": "subjct",
@@ -95,6 +106,13 @@ def test_a_class_in_place_of_its_instance_is_told_apart():
 
 def test_an_order_of_numpy_is_an_order():
     assert arguments.order_of(np.int64(5)) == 5
+
+
+@pytest.mark.parametrize("value", ["5 mA", None, [1.0, 2.0], 1j])
+def test_what_is_no_number_is_refused(value):
+    with pytest.raises(etid.RecordingError, match=r"current_cap: is .*, must be a number\. Give"):
+        arguments.number_of("current_cap", value)
+    assert arguments.number_of("current_cap", np.float32(0.5)) == 0.5
 
 
 def test_labels_choose_fits_as_text_or_integer():

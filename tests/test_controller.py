@@ -187,7 +187,7 @@ NEGATIVE = [-59.5, -69.3, -16.2, -69.3, -10.3, -42.1, -16.2, -42.1, -14.9]  # va
     information=st.lists(ANY | st.floats(-1e8, 1e8), min_size=18, max_size=18),
     before=st.lists(st.floats(0, 1e3) | st.just(math.nan), min_size=2, max_size=2),
     result=st.sampled_from(["successful", "misfit", "unstable", "unconnected"]),
-    wanted=st.floats(0, 1e300),
+    wanted=st.floats(0, 3e-6),  # what the cap of 5 mA carries in a phase
 )
 @example(
     own=[10.42, 12.13, -22.85, -0.06] * 2,
@@ -231,3 +231,34 @@ def test_what_cannot_be_commanded_is_refused_with_a_reason():
         etid.Controller.of(failed)
     assert "guard" in str(controller)
     assert isinstance(controller.model, CurrentModel)
+
+
+def test_limits_and_wishes_in_other_units_are_refused():
+    """5 A in place of 5 mA would raise every limit a thousandfold; 200 C would never act."""
+    controller, state = controlled()
+    tracker = controller.tracker
+    for limits, text in (
+        ({"current_cap": 5.0}, "ampere"),
+        ({"current_cap": np.inf}, "ampere"),
+        ({"charge_cap": 200.0}, "never act"),
+        ({"fallback": np.inf}, "infinite"),
+    ):
+        with pytest.raises(ValueError, match=text):
+            etid.Controller.of(tracker, **limits)
+    for wanted in ({"charge": 80.0}, {"current": 1.0}, {"current": np.array([1e-4, 6e-3])}):
+        with pytest.raises(ValueError, match="is wanted; current_cap carries"):
+            controller.command(state, **wanted)
+
+
+def test_a_state_of_another_tracker_is_refused():
+    controller, state = controlled()
+    one = jax.tree.map(lambda leaf: leaf[:1], state.electrodes)
+    other = dataclasses.replace(state, electrodes=one)
+    window = np.zeros((2, controller.tracker.model.bands.samples))
+    for call in (
+        lambda state: controller.command(state, charge=80e-9),
+        lambda state: controller.tracker.update(state, window),
+        controller.tracker.read,
+    ):
+        with pytest.raises(ValueError, match="1 electrodes of 3 elements, the tracker 2 of 3"):
+            call(other)

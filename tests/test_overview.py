@@ -282,6 +282,7 @@ def test_a_change_of_verdict_changes_what_is_shown():
     [
         (33.4e3, 77.0, "ohm", "33.400 ± 0.077 kΩ"),
         (5.5, 0.1, "ohm", "5.50 ± 0.10 Ω"),
+        (33.4e3, 33.4e-6, "ohm", "33.4 ± 0 kΩ"),  # a fixed element
         (22e6, 1e6, "ohm", "22.0 ± 1.0 MΩ"),
         (0.12e-9, 4e-13, "farad", "0.12000 ± 0.00040 nF"),
         (47e-6, 1e-6, "farad", "47.0 ± 1.0 µF"),

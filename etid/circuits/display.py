@@ -20,6 +20,7 @@ BASE = {"ohm": "Ω", "farad": "F", "second": "s"}  # units that take prefixes
 PREFIXES = {
     -15: "f", -12: "p", -9: "n", -6: "µ", -3: "m", 0: "", 3: "k", 6: "M", 9: "G", 12: "T"
 }  # fmt: skip
+NOTHING = 1e-8  # standard error over value, below which it is shown as 0
 USUAL = (0.01, 1e4)  # values in the unit of `DISPLAY` that are shown in this unit
 
 
@@ -50,10 +51,12 @@ def plus_minus(value: float, error: float) -> str:
     """A value with its standard error, padded for a column.
 
     Both are rounded to two significant digits of the error. Without an error, the value has four
-    significant digits.
+    significant digits. The error of a fixed element, 1e-9 of it, is shown as 0.
     """
     if not np.isfinite(error) or error <= 0:
         return f"{value:10.4g}            "
+    if error < NOTHING * abs(value):
+        return f"{value:10.7g} ± {0:<9}"
     digits = int(np.clip(1 - np.floor(np.log10(error)), 0, 9))
     return f"{value:10.{digits}f} ± {error:<9.{digits}f}"
 

@@ -190,7 +190,8 @@ def _plan(
     for name in ("v_th", "v_out", "pulse_rate"):
         if name not in said and not (name == "v_th" and by_current):
             known = f"; the channels are {listed(names)}" if name != "pulse_rate" else ""
-            raise _missing(name, known)
+            hint = "; or name the measured current, with --current" if name == "v_th" else ""
+            raise _missing(name, known, hint)
     signals = {
         name: _signal(name, said[name], said.get("scale"), implied.get(name, ""))
         for name in CHANNELS

@@ -25,6 +25,7 @@ from etid.estimators.registry import MAXIMUM_LIKELIHOOD, register_description
 from etid.identify.arguments import (
     Interval,
     asked_of,
+    check_distinct,
     circuit_of,
     driver_of,
     fed,
@@ -121,8 +122,8 @@ def identify_amplitudes(
         it: as far as the recordings show, the load is linear.
 
     Raises:
-        RecordingError: There is no recording, the recordings have different lengths or rates, or
-            they lack V_th or the current.
+        RecordingError: There is no recording, one is given twice, the recordings have different
+            lengths or rates, or they lack V_th or the current.
         ValueError: The driver was identified by another method, or the circuit has several
             resistors that depend on their current.
         IdentificationError: The verdict is not successful and `throw` is set.
@@ -139,7 +140,9 @@ def identify_amplitudes(
         else serving(driver, HarmonicDriver, str(MAXIMUM_LIKELIHOOD))
     )
     of = _alike(list_of("recordings", recordings))
-    seen = [Inspected(fed(one, driver)[0]) for one in of]
+    fed_by = [fed(one, driver)[0] for one in of]
+    check_distinct("recordings", of)
+    seen = [Inspected(one) for one in fed_by]
     for one in seen:
         _, name = plan(asked, one, feed)
         if name is not None:

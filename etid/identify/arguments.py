@@ -109,6 +109,24 @@ def recordings(field: str, value: Iterable[Recording]) -> list[Recording]:
     return found
 
 
+def check_distinct(field: str, recordings: Sequence[Recording]) -> None:
+    """Refuse a recording that is given twice: its noise would count as two measurements.
+
+    Raises:
+        RecordingError: Two recordings have the same samples of `v_out`.
+    """
+    first: dict[bytes, int] = {}
+    for number, one in enumerate(recordings):
+        same = first.setdefault(one.v_out.tobytes(), number)
+        if same != number:
+            raise RecordingError(
+                f"has the same samples as {field}[{same}]",
+                path=one.path,
+                field=f"{field}[{number}]",
+                remedy="Pass each recording once",
+            )
+
+
 def candidates_of(value: Circuit) -> tuple[AbstractCircuit, ...]:
     """The circuits to choose from: `usual_circuits` for `"auto"`, else one.
 
@@ -170,6 +188,22 @@ def order_of(value: Any) -> Order:
     return order  # `identify_driver` refuses an order below 2
 
 
+def number_of(field: str, value: Any) -> float:
+    """The given real number.
+
+    Raises:
+        RecordingError: The value is a text, an array of several numbers, or nothing.
+    """
+    try:
+        if not isinstance(value, str):
+            return float(value)
+    except (TypeError, ValueError):
+        pass
+    raise RecordingError(
+        f"is {reprlib.repr(value)}, must be a number", field=field, remedy="Give one number [SI]"
+    )
+
+
 def drift_of(value: float, asked: AbstractEstimator | None) -> float:
     """The drift of a driver.
 
@@ -217,8 +251,16 @@ def informed(
     """The elements that are known before a fit, from the arguments of a caller.
 
     Raises:
-        RecordingError: An element is both fixed and has a prior, or a value is no number.
+        RecordingError: An argument is no mapping, an element is both fixed and has a prior, or a
+            value is no number.
     """
+    for field, value in (("fixed", fixed), ("prior", prior)):
+        if not isinstance(value, Mapping | None):
+            raise RecordingError(
+                f"is {reprlib.repr(value)}, must name the elements",
+                field=field,
+                remedy='Pass fixed={"r_s": 500.0} or prior={"r_s": (500.0, 50.0)}',
+            )
     fixed, prior = dict(fixed or {}), dict(prior or {})
     for name in fixed.keys() & prior.keys():
         raise RecordingError(f"{name} is fixed and has a prior", field="prior", remedy="Remove one")

@@ -14,7 +14,14 @@ from etid.estimators.lanes import AlignedSamples, Harmonics, stacked
 from etid.estimators.registry import Method
 from etid.estimators.score_tests import resistors
 from etid.identify import changes
-from etid.identify.arguments import drift_of, estimator_of, for_calibrations, order_of, recordings
+from etid.identify.arguments import (
+    check_distinct,
+    drift_of,
+    estimator_of,
+    for_calibrations,
+    order_of,
+    recordings,
+)
 from etid.identify.compiled import stored_jit
 from etid.identify.one import checksum, explained, needs_another, of_both
 from etid.recordings.preflight import Inspected, preflight
@@ -62,10 +69,10 @@ def identify_driver(
         The driver, with its verdict.
 
     Raises:
-        ValueError: There is no calibration, a calibration has no `r_load`, their lengths or rates
-            differ, the order is below 2, `driver_drift` is not in 0 ≤ drift < 1, or the method
-            gives no standard errors that it could enter, or has no likelihood that could choose the
-            order.
+        ValueError: There is no calibration, a calibration has no `r_load`, one is given twice,
+            their lengths or rates differ, the order is below 2, `driver_drift` is not in
+            0 ≤ drift < 1, or the method gives no standard errors that it could enter, or has no
+            likelihood that could choose the order.
         IdentificationError: The verdict is not successful and `throw` is set.
     """
     asked = estimator_of(method)
@@ -93,6 +100,7 @@ def identify_driver(
             f"calibrations differ in (samples, sample rate, pulse rate): {sorted(sizes)}; "
             "cut them to one length"
         )
+    check_distinct("calibrations", records)
     seen = [Inspected(record) for record in records]
     for one in seen:
         name = preflight(one, periodic=asked is not None and asked.lane.periodic)

@@ -46,6 +46,7 @@ from etid.circuits.circuit import AbstractCircuit
 from etid.circuits.overview import Overview, Overviewed
 from etid.estimators.judgement import SUCCESSFUL
 from etid.estimators.unknowns import LoadUnknowns
+from etid.identify.arguments import number_of, require
 from etid.online.current import Current, CurrentModel
 from etid.online.state import ElectrodeState, TrackerState
 from etid.online.tracker import Tracker
@@ -54,6 +55,7 @@ from etid.solvers.matrices import inverse_of_few
 
 REASONS = np.array(["wanted", "peak", "charge", "guard", "voltage", "slew", "fallback"])
 CURRENT_CAP = 5e-3  # [A] the paper's limit for the fingertip
+LARGEST_CAP = 0.1  # [A] stimulators of nerves and skin stay below it
 
 
 @dataclasses.dataclass(frozen=True)
@@ -118,11 +120,13 @@ class Controller(Overviewed):
         tracker: The tracker whose states are used.
         model: Charge and current from an admittance.
         limits: Limits of the amplitude.
+        most: Charge of a phase whose current is `current_cap` throughout [C].
     """
 
     tracker: Tracker
     model: CurrentModel
     limits: Limits
+    most: float
 
     @classmethod
     def of(
@@ -151,9 +155,12 @@ class Controller(Overviewed):
                 varies as the tracker expects.
 
         Raises:
-            ValueError: A limit is not positive, the probability is not between ½ and 1, or the
-                driver of the tracker is not good.
+            RecordingError: A limit is no number.
+            ValueError: A limit is not positive, `current_cap` exceeds 0.1 A, `charge_cap` exceeds
+                what `current_cap` carries in a phase, `fallback` is infinite, the probability is
+                not between ½ and 1, or the driver of the tracker is not good.
         """
+        require("tracker", tracker, Tracker, "Make one with etid.Tracker.of")
         given = {
             "current_cap": current_cap,
             "charge_cap": charge_cap,
@@ -162,9 +169,16 @@ class Controller(Overviewed):
             "fallback": fallback,
         }
         for name, value in given.items():
-            if not value > 0:
+            if not number_of(name, value) > 0:
                 raise ValueError(f"{name} is {value}; it must be positive")
-        if not 0.5 <= probability < 1:
+        if current_cap > LARGEST_CAP:
+            raise ValueError(
+                f"current_cap is {current_cap:g} A, more than {LARGEST_CAP:g} A; is it in ampere "
+                "and not in mA?"
+            )
+        if math.isinf(fallback):
+            raise ValueError("fallback is infinite; give an amplitude")
+        if not 0.5 <= number_of("probability", probability) < 1:
             raise ValueError(f"probability is {probability}; give at least 0.5 and less than 1")
         if tracker.driver_result != SUCCESSFUL:
             raise ValueError(
@@ -172,6 +186,12 @@ class Controller(Overviewed):
                 "the current would hold; repeat the calibration"
             )
         model = CurrentModel.of(tracker.model.bands, tracker.model.source, tracker.known)
+        most = float(current_cap) * model.phase
+        if most < charge_cap < math.inf:
+            raise ValueError(
+                f"charge_cap is {charge_cap:g} C; current_cap carries {most:.3g} C in a phase, so "
+                "that charge_cap would never act. Is it in coulomb and not in nC?"
+            )
         of = tracker.model.bands
         unloaded = float(np.abs(of.waveform()).max())
         limits = Limits(
@@ -183,7 +203,7 @@ class Controller(Overviewed):
             slew=jnp.asarray(float(slew)),
             fallback=jnp.asarray(float(fallback)),
         )
-        return cls(tracker, model, limits)
+        return cls(tracker, model, limits, most)
 
     def _overview(self) -> Overview:
         rows = [
@@ -209,9 +229,12 @@ class Controller(Overviewed):
             current: Wanted mean current during the phase, instead of a charge [A].
 
         Raises:
-            ValueError: Not exactly one of `charge` and `current` is given, or a number is negative
-                or not finite, or there is not one for each electrode.
+            RecordingError: `state` is no state of a tracker.
+            ValueError: Not exactly one of `charge` and `current` is given, or a number is negative,
+                not finite, or more than a current of `current_cap` gives in a phase, or there is
+                not one for each electrode, or the state is that of another tracker.
         """
+        self.tracker.check(state)
         if (charge is None) == (current is None):
             raise ValueError("give either charge or current")
         given = np.asarray(charge if current is None else current, float)
@@ -223,6 +246,12 @@ class Controller(Overviewed):
         if not (np.isfinite(given) & (given >= 0)).all():
             raise ValueError(f"{given} is wanted; it must be finite and not negative")
         wanted = given if current is None else given * self.model.phase
+        if (wanted > self.most).any():
+            raise ValueError(
+                f"{given.max():g} {'C' if current is None else 'A'} is wanted; current_cap carries "
+                f"{self.most:.3g} C in a phase. Are the numbers in coulomb or ampere, and not in "
+                "nC or mA?"
+            )
         wanted = np.full(self.tracker.electrodes, wanted)
         amplitude, expected, stderr, peak, reason = np.array(
             _commanded(

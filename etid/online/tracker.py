@@ -49,7 +49,7 @@ from etid.circuits.overview import Overview, Overviewed
 from etid.estimators.estimator import serving
 from etid.estimators.maximum_likelihood.given_driver import GivenDriver, combined
 from etid.estimators.registry import MAXIMUM_LIKELIHOOD
-from etid.identify.arguments import circuit_of, require_float64
+from etid.identify.arguments import circuit_of, number_of, require, require_float64
 from etid.identify.compiled import stored_jit
 from etid.identify.one import explained, known_at
 from etid.online import changes
@@ -60,6 +60,7 @@ from etid.online.pulse_fit import GainModel
 from etid.online.reading import fit_of
 from etid.online.state import ElectrodeState, TrackerState
 from etid.online.tick import updated
+from etid.recordings.errors import not_recorded
 from etid.recordings.preflight import Inspected, preflight
 from etid.recordings.recording import Recording
 from etid.results.driver import Driver, HarmonicDriver
@@ -67,6 +68,13 @@ from etid.results.fit import Fit, IdentificationError
 from etid.results.fits import Fits
 from etid.results.fits_columns import described
 from etid.results.verdicts import RESULTS, message, verdict_names, verdicts_of
+
+# A window has faults that a record of several periods has not, and others have other remedies.
+NOTES = {
+    "too_short": "No pulse was identified yet; the elements are typical values, not estimates.",
+    "max_steps_reached": "No load of this circuit gives this pulse. Does the window begin between "
+    "two pulses, is `amplitude` that of the pulse, and is v_out in volt at the terminal?",
+}
 
 
 # No `equinox.Module`: its methods would cost a twentieth of a tick at every call.
@@ -124,15 +132,23 @@ class Tracker(Overviewed):
             The tracker. It does not change; its states hold the estimates.
 
         Raises:
+            RecordingError: An argument has another type, or the recording has no `v_th`.
             ValueError: The driver has no harmonics of its calibrations, or a number is too small.
             IdentificationError: The recording cannot be used; the message says why.
         """
         require_float64()
-        driver = serving(driver, HarmonicDriver, str(MAXIMUM_LIKELIHOOD))
-        if electrodes < 1:
-            raise ValueError(f"electrodes is {electrodes}; a display has at least one electrode")
+        require("driver", driver, Driver)
+        require("unloaded", unloaded, Recording)
+        if unloaded.cause != driver.recorded:
+            remedy = "Take a calibration, or record the unloaded voltage"
+            raise not_recorded(unloaded.path, driver.recorded, remedy)
+        electrodes, given = int(number_of("electrodes", electrodes)), electrodes
+        if electrodes < 1 or electrodes != given:
+            raise ValueError(f"electrodes is {given}; a display has one electrode or more")
+        change = number_of("change", change)
         if not (np.isfinite(change) and change >= 0):
             raise ValueError(f"change is {change}; it must be finite and not negative")
+        driver = serving(driver, HarmonicDriver, str(MAXIMUM_LIKELIHOOD))
         seen = Inspected(unloaded)
         name = preflight(seen, periodic=True)
         if name is not None:
@@ -213,6 +229,21 @@ class Tracker(Overviewed):
         state = jax.tree.map(lambda leaf: leaf.astype(leaf.dtype), state)
         return jax.device_put(state, self.model.source.sharding)
 
+    def check(self, state: TrackerState) -> None:
+        """Refuse what is no state of this tracker.
+
+        Raises:
+            RecordingError: `state` has another type.
+            ValueError: `state` has another number of electrodes or elements.
+        """
+        require("state", state, TrackerState, "Take that of Tracker.start or Tracker.update")
+        found, own = state.electrodes.own.shape, len(self.model.circuit.names()) + 1
+        if found != (self.electrodes, own):
+            raise ValueError(
+                f"state has {found[0]} electrodes of {found[1] - 1} elements, the tracker "
+                f"{self.electrodes} of {own - 1}; it is the state of another tracker"
+            )
+
     def pulses(
         self, v_out: Float[np.ndarray, "*lane time"]
     ) -> Float[np.ndarray, "pulse *lane sample"]:
@@ -224,7 +255,7 @@ class Tracker(Overviewed):
         Returns:
             The windows [V]. Samples after the last whole window are left out.
         """
-        return cut(v_out, self.period)
+        return cut(np.asarray(v_out), self.period)
 
     def update(
         self,
@@ -245,9 +276,12 @@ class Tracker(Overviewed):
             State after this pulse.
 
         Raises:
+            RecordingError: `state` is no state of a tracker.
             ValueError: `v_out` does not hold one window of one period for each electrode, or an
-                amplitude is negative, or there is not one for each electrode.
+                amplitude is negative, or there is not one for each electrode, or the state is that
+                of another tracker.
         """
+        self.check(state)
         expected = (self.electrodes, self.model.bands.samples)
         if np.shape(v_out) != expected:
             raise ValueError(
@@ -278,14 +312,18 @@ class Tracker(Overviewed):
 
         Returns:
             One fit per electrode, in the order of the electrodes, with the label `electrode`.
+
+        Raises:
+            RecordingError: `state` is no state of a tracker.
         """
+        self.check(state)
         found = _judged(self.model, self.known, self.driver_result, state)
         fit = jax.tree.map(np.asarray, found)
         electrodes = [
             {"path": f"electrode/{number}", "electrode": str(number)}
             for number in range(self.electrodes)
         ]
-        notes = np.array([message(name) for name in fit.verdict])
+        notes = np.array([NOTES.get(name) or message(name) for name in fit.verdict])
         return Fits(fit, described(electrodes), notes)
 
     def changes(self, state: TrackerState) -> list[Change]:

@@ -47,7 +47,8 @@ class RESULTS(optx.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]  # equi
         "like a resistance that falls with the current. "
         "The circuit is wrong, or the trigger moved between the records, or the signal drifted or "
         "clipped, or the method is output error and the record has mains hum. If the recording has "
-        "a current too, it may contradict the driver."
+        "a current too, it may contradict the driver. If elements are fixed or have a prior, these "
+        "values may be wrong; are they in SI units?"
     )
     changed = (
         "The load or the driver changed during the record: the pulse periods differ by more than "
@@ -105,13 +106,14 @@ class RESULTS(optx.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]  # equi
     nonfinite_samples = "A record contains NaN or infinite samples. Cut them out or record again."
     too_short = "The record is too short to identify anything. Record a whole pulse and its tail."
     misaligned = (
-        "v_out carries more power than v_th, or is not aligned with it in time. "
+        "v_out carries more power than v_th, or is not aligned in time with v_th or the current. "
         "Swap the two records, or align them on the edge of the pulse, or correct the unit or the "
         "polarity of one of them."
     )
     rate_mismatch = (
-        "The distance between the pulses of v_th contradicts sample_rate and pulse_rate. Every "
-        "time constant would be wrong by the same factor. Correct the wrong number."
+        "The distance between the pulses of v_th or the current contradicts sample_rate and "
+        "pulse_rate. Every time constant would be wrong by the same factor. Correct the wrong "
+        "number."
     )
     not_periodic = (
         "The record holds no whole pulse period, or begins in the middle of an edge. "
