@@ -48,11 +48,12 @@ def chart(rows: Sequence[Mapping[str, Any]], path: pathlib.Path) -> None:
     names = list(dict.fromkeys(row["scene"] for row in rows))
     down = -(-len(names) // COLUMNS)
     figure, axes = charts.new_figure(
-        down, min(COLUMNS, len(names)), (11.5, 3.4 * down + 0.9), sharex=True, sharey=True
+        down, min(COLUMNS, len(names)), (11.5, 4.0 * down + 0.9), sharex=True, sharey=True
     )
     for panel, name in zip(axes.flat, names, strict=False):
-        _panel(panel, [row for row in rows if row["scene"] == name])
-        panel.set_title(name, fontsize=10)
+        absent = _panel(panel, [row for row in rows if row["scene"] == name])
+        note = f" (no answer: {', '.join(absent)})" if absent else ""
+        panel.set_title("\n".join(textwrap.wrap(name + note, 58)), fontsize=9)
     for panel in axes.flat[len(names) :]:
         panel.set_visible(False)
     for panel in axes[:, 0]:
@@ -75,10 +76,11 @@ def chart(rows: Sequence[Mapping[str, Any]], path: pathlib.Path) -> None:
     charts.save(figure, path)
 
 
-def _panel(axes: Axes, rows: Sequence[Mapping[str, Any]]) -> None:
+def _panel(axes: Axes, rows: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Draw one scene; the estimators that have no answer there."""
     axes.set(xscale="log", yscale="log")
     axes.axhline(0.89, color="0.7", linewidth=3, zorder=0)
-    texts, absent = [], []
+    texts, marks, absent = [], [], []
     same = {row["error"] for row in rows if row["estimator"] == "default"}
     for name in dict.fromkeys(row["estimator"] for row in rows):
         if (
@@ -95,10 +97,10 @@ def _panel(axes: Axes, rows: Sequence[Mapping[str, Any]]) -> None:
         error = min(best["error"], WORST)
         theirs = best["mode"] == "rival"
         if "alone" in of and "batched" in of:
-            axes.plot(
+            marks += axes.plot(
                 [of["alone"]["ms"], best["ms"]], [error, error], color=charts.INK, linewidth=0.8
             )
-        axes.plot(
+        marks += axes.plot(
             best["ms"],
             error,
             marker="^" if best["error"] > WORST else "o",
@@ -112,15 +114,13 @@ def _panel(axes: Axes, rows: Sequence[Mapping[str, Any]]) -> None:
     front = sorted((row["ms"], min(row["error"], WORST)) for row in rows if row["on_front"])
     if front:
         axes.step(*zip(*front, strict=True), where="post", color="0.4", linestyle="--", zorder=1)
-    if absent:
-        note = "no answer: " + ", ".join(absent)
-        axes.text(
-            0.98,
-            0.98,
-            "\n".join(textwrap.wrap(note, 44)),
-            transform=axes.transAxes,
-            ha="right",
-            va="top",
-            fontsize=7,
-        )
-    adjust_text(texts, ax=axes, arrowprops={"arrowstyle": "-", "color": "0.6", "linewidth": 0.5})
+    adjust_text(
+        texts,
+        ax=axes,
+        objects=marks,
+        expand=(1.2, 1.6),
+        force_text=(0.3, 0.6),
+        force_static=(0.3, 0.6),
+        arrowprops={"arrowstyle": "-", "color": "0.6", "linewidth": 0.5},
+    )
+    return absent
