@@ -12,7 +12,8 @@ A block is the number of its first sample since the start, and the voltages (ele
   electrodes, samples), then the voltages as float64, electrode by electrode.
 
 Blocks that are missing or late cost the pulses that they belong to: these electrodes keep their
-elements, and the number of lost pulses is shown. The log has one row per pulse.
+elements, and the number of lost pulses is shown. The log has one row per pulse; it never replaces
+a file. Ctrl-C ends the program, and the log is complete up to there.
 """
 
 import argparse
@@ -35,20 +36,33 @@ BLOCK = 500  # samples of a block that is played back
 COLUMNS = 14  # electrodes in a row of the view
 SHOWN = 15  # pulses from one view to the next
 MARKS = {"open": "o", "shorted": "!", "dry": "d", "drifting": "~", "fallback": "?", "wanted": "."}
+GAP = 60  # lost pulses in a row that are given to the tracker one by one
+LARGEST = 10**8  # voltages in a block; a header that says more is out of step
 Block = tuple[int, np.ndarray]
 
 
-def played(path: pathlib.Path, sample_rate: float, speed: float) -> Iterator[Block]:
+def played(
+    path: pathlib.Path, electrodes: int, sample_rate: float, speed: float
+) -> Iterator[Block]:
     """Blocks of a file, each at the time at which a converter would have delivered it.
 
     Args:
         path: HDF5 file with the dataset `v_out` (electrode, sample) [V].
+        electrodes: Number of electrodes.
         sample_rate: Samples per second [Hz].
         speed: 1 for real time.
     """
+    if not speed > 0:
+        raise ValueError(f"--speed is {speed}; it must be positive")
     with h5py.File(path, "r") as file:
-        v_out = file["v_out"]
-        assert isinstance(v_out, h5py.Dataset)
+        v_out = file.get("v_out")
+        if not isinstance(v_out, h5py.Dataset):
+            raise ValueError(f"{path} has no dataset v_out; store the voltages there")
+        if v_out.ndim != 2 or v_out.shape[0] != electrodes or v_out.dtype.kind != "f":
+            raise ValueError(
+                f"{path}, v_out: is {v_out.dtype} of shape {v_out.shape}; store volts as floats "
+                f"(electrode, sample), with as many electrodes as --electrodes, {electrodes}"
+            )
         begin = time.monotonic()
         for first in range(0, v_out.shape[1], BLOCK):
             block = v_out[:, first : first + BLOCK]
@@ -59,16 +73,23 @@ def played(path: pathlib.Path, sample_rate: float, speed: float) -> Iterator[Blo
 
 def received(address: str) -> Iterator[Block]:
     """Blocks from a server, until it closes the connection."""
-    host, port = address.rsplit(":", 1)
+    host, _, port = address.rpartition(":")
+    if not (host and port.isdigit()):
+        raise ValueError(f"--socket is {address!r}; write host:port")
     with socket.create_connection((host, int(port))) as line, line.makefile("rb") as stream:
         while header := stream.read(24):
             if len(header) < 24:
                 return
-            first, electrodes, samples = np.frombuffer(header, "<i8")
+            first, electrodes, samples = (int(one) for one in np.frombuffer(header, "<i8"))
+            if not (0 < electrodes <= LARGEST and 0 < samples <= LARGEST // electrodes):
+                raise ValueError(
+                    f"a block has {electrodes} electrodes and {samples} samples; is its header "
+                    "three little-endian integers of 64 bits?"
+                )
             body = stream.read(8 * electrodes * samples)
             if len(body) < 8 * electrodes * samples:
                 return
-            yield int(first), np.frombuffer(body, "<f8").reshape(electrodes, samples)
+            yield first, np.frombuffer(body, "<f8").reshape(electrodes, samples)
 
 
 @dataclasses.dataclass
@@ -106,6 +127,11 @@ class Pulses:
             if first + block.shape[1] <= self.begin(self.number):
                 self.late += 1
                 continue
+            lost = int(first / self.period) - self.number - 1
+            if lost > GAP:  # a long pause
+                self.missing += lost
+                self.number += lost
+                self.window = np.full_like(self.window, np.nan)
             while True:
                 begin = self.begin(self.number)
                 low, high = max(first, begin), min(first + block.shape[1], begin + self.samples)
@@ -125,17 +151,23 @@ class Log:
     """One row per pulse in an HDF5 file, which is readable after a crash up to the last view.
 
     Args:
-        path: The file.
+        path: The file; it must not exist.
         names: Names of the elements.
         electrodes: Number of electrodes.
     """
 
     def __init__(self, path: pathlib.Path, names: tuple[str, ...], electrodes: int) -> None:
-        self.file = h5py.File(path, "w")
+        self.file = h5py.File(path, "x")
         self.rows: dict[str, h5py.Dataset] = {}
-        columns = {"amplitude": float, "charge": float, "seconds": float, "verdict": int}
+        columns = {
+            "pulse": int,
+            "amplitude": float,
+            "charge": float,
+            "seconds": float,
+            "verdict": int,
+        }
         for name, kind in (dict.fromkeys(names, float) | columns).items():
-            shape = () if name == "seconds" else (electrodes,)
+            shape = () if name in ("seconds", "pulse") else (electrodes,)
             self.rows[name] = self.file.create_dataset(
                 name, (0, *shape), kind, maxshape=(None, *shape)
             )
@@ -175,6 +207,8 @@ def send(amplitude: np.ndarray) -> None:
 
 def run(arguments: argparse.Namespace) -> Pulses:
     """Follow the stream to its end."""
+    if arguments.log.exists():
+        raise ValueError(f"{arguments.log} exists; name another file with --log")
     with etid.read(arguments.calibration) as study:
         calibrations = list(study.calibrations.recordings())
     driver = etid.identify_driver(calibrations)
@@ -186,38 +220,48 @@ def run(arguments: argparse.Namespace) -> Pulses:
     blocks = (
         received(arguments.socket)
         if arguments.socket
-        else played(arguments.file, unloaded.sample_rate, arguments.speed)
+        else played(arguments.file, arguments.electrodes, unloaded.sample_rate, arguments.speed)
     )
     pulses = Pulses(tracker.period, tracker.model.bands.samples, arguments.electrodes)
     names = tracker.model.circuit.names()
+    state, worst, number = tracker.start(), 0.0, -1
+    command = controller.command(tracker.update(state, pulses.window), charge=arguments.charge)
+
+    def show() -> None:
+        bad = tracker.bad_electrodes(state)
+        reasons = [bad.get(at, str(reason)) for at, reason in enumerate(command.reason)]
+        marks = [MARKS.get(reason, "+") for reason in reasons]
+        print(view(number + 1, marks, pulses, worst), flush=True)
+
+    show()  # it compiles, as the command before did
     log = Log(arguments.log, names, arguments.electrodes)
-    state, worst = tracker.start(), 0.0
-    controller.command(tracker.update(state, pulses.window), charge=arguments.charge)  # compile
-    for number, window in pulses.cut(blocks):
-        begin = time.perf_counter()
-        # A recorded file has pulses of constant amplitude; a stimulator has that of the command.
-        state = tracker.update(state, window)
-        command = controller.command(state, charge=arguments.charge)
-        send(command.amplitude)
-        seconds = time.perf_counter() - begin
-        worst = max(worst, seconds)
-        elements = np.exp(np.asarray(state.electrodes.own))
-        log.add(
-            **{name: elements[:, at] for at, name in enumerate(names)},
-            amplitude=command.amplitude,
-            charge=command.charge,
-            seconds=seconds,
-            verdict=np.asarray(state.electrodes.result._value),
-        )
-        for change in tracker.changes(state):
-            log.tell(change)
-        if number % SHOWN == SHOWN - 1:
-            log.file.flush()
-            bad = tracker.bad_electrodes(state)
-            reasons = [bad.get(at, str(reason)) for at, reason in enumerate(command.reason)]
-            marks = [MARKS.get(reason, "+") for reason in reasons]
-            print(view(number + 1, marks, pulses, worst), flush=True)
-    log.file.close()
+    try:
+        for number, window in pulses.cut(blocks):
+            begin = time.perf_counter()
+            # A recorded file has pulses of constant amplitude, a stimulator that of the command.
+            state = tracker.update(state, window)
+            command = controller.command(state, charge=arguments.charge)
+            send(command.amplitude)
+            seconds = time.perf_counter() - begin
+            worst = max(worst, seconds)
+            elements = np.exp(np.asarray(state.electrodes.own))
+            log.add(
+                pulse=number,
+                **{name: elements[:, at] for at, name in enumerate(names)},
+                amplitude=command.amplitude,
+                charge=command.charge,
+                seconds=seconds,
+                verdict=np.asarray(state.electrodes.result._value),
+            )
+            for change in tracker.changes(state):
+                log.tell(change)
+                print(change)
+            if number % SHOWN == SHOWN - 1:
+                log.file.flush()
+                show()
+    finally:
+        log.file.close()
+    show()
     return pulses
 
 
@@ -237,4 +281,9 @@ def main(arguments: list[str]) -> None:
 
 
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    try:
+        main(sys.argv[1:])
+    except KeyboardInterrupt:
+        sys.exit("interrupted; the log is complete up to here")
+    except (OSError, ValueError, etid.IdentificationError) as error:
+        sys.exit(f"error: {error}")

@@ -86,9 +86,59 @@ def test_a_file_is_played_to_its_end_and_logged(example, tmp_path, capsys):
     arguments += ["--electrodes", "2", "--speed", "1000", "--log", str(tmp_path / "log.h5")]
     example.main(arguments)
     said = capsys.readouterr().out
-    assert said.startswith("..\npulse 15, 0 incomplete, 0 late blocks")
+    assert said.startswith("??\npulse 0, 0 incomplete, 0 late blocks")
+    assert "..\npulse 15, 0 incomplete, 0 late blocks" in said
+    assert "..\npulse 20, 0 incomplete, 0 late blocks" in said
     with h5py.File(tmp_path / "log.h5") as log:
-        r_p, verdict = (np.asarray(log[name]) for name in ("r_p", "verdict"))
+        r_p, verdict, pulse = (np.asarray(log[name]) for name in ("r_p", "verdict", "pulse"))
     assert r_p.shape == (20, 2)
     np.testing.assert_allclose(r_p[-1, 0], DRY.r_p, rtol=0.01)  # ten standard errors
+    np.testing.assert_array_equal(pulse, range(20))
     assert (verdict == 0).all()
+    with pytest.raises(
+        ValueError, match="log.h5 exists"
+    ):  # the log of a run is not lost by another
+        example.main(arguments)
+
+
+def test_a_long_pause_is_counted_and_not_given_pulse_by_pulse(example):
+    pulses = example.Pulses(10.0, 10, 2)
+    blocks = [(0, np.ones((2, 10))), (10**12, np.ones((2, 10)))]
+    found = [(number, np.isnan(window).all()) for number, window in pulses.cut(blocks)]
+    assert found == [(0, False), (10**11 - 1, True), (10**11, False)]
+    assert pulses.missing == 10**11 - 1
+
+
+@pytest.mark.parametrize(
+    ("stored", "text"),
+    [
+        (None, "has no dataset v_out"),
+        (np.zeros(50), r"v_out: is float64 of shape \(50,\)"),
+        (np.zeros((50, 2)), r"shape \(50, 2\)"),
+        (np.zeros((2, 50), "i2"), "is int16"),
+    ],
+)
+def test_a_file_that_cannot_be_played_is_refused(example, tmp_path, stored, text):
+    with h5py.File(tmp_path / "pulses.h5", "w") as file:
+        file["other" if stored is None else "v_out"] = 0.0 if stored is None else stored
+    with pytest.raises(ValueError, match=text):
+        next(example.played(tmp_path / "pulses.h5", 2, 200e3, 1.0))
+
+
+def test_a_header_out_of_step_is_refused(example):
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        port = server.getsockname()[1]
+        stream = example.received(f"127.0.0.1:{port}")
+
+        def serve():
+            line, _ = server.accept()
+            with line:
+                line.sendall(b"\xff" * 24)
+
+        thread = threading.Thread(target=serve)
+        thread.start()
+        with pytest.raises(ValueError, match="-1 electrodes and -1 samples"):
+            next(stream)
+        thread.join()
+    with pytest.raises(ValueError, match="write host:port"):
+        next(example.received("localhost"))
