@@ -95,9 +95,7 @@ def test_a_file_is_played_to_its_end_and_logged(example, tmp_path, capsys):
     np.testing.assert_allclose(r_p[-1, 0], DRY.r_p, rtol=0.01)  # ten standard errors
     np.testing.assert_array_equal(pulse, range(20))
     assert (verdict == 0).all()
-    with pytest.raises(
-        ValueError, match="log.h5 exists"
-    ):  # the log of a run is not lost by another
+    with pytest.raises(ValueError, match=r"log\.h5 exists"):  # no run loses the log of another
         example.main(arguments)
 
 
