@@ -356,13 +356,13 @@ def test_without_a_driver_the_unloaded_voltage_is_not_used(skin):
     [
         (lambda one: {"current": 1e3 * one.current}, "wrong_unit", "in ampere and not in mA"),
         (lambda one: {"current": one.v_out, "v_out": one.current}, "wrong_unit", "exchanged"),
-        (lambda one: {"current": 0 * one.current}, "flat", "no signal"),
-        (lambda one: {"current": 0 * one.current + 1e-3}, "flat", "no signal"),
+        (lambda one: {"current": 0 * one.current}, "flat", "is in current"),
+        (lambda one: {"v_out": 0 * one.v_out}, "flat", "is in v_out"),
         (lambda one: {"current": -one.current}, "misaligned", "change the sign"),
         (
             lambda one: {"current": np.where(np.arange(one.v_out.size) == 5, np.nan, one.current)},
             "nonfinite_samples",
-            "NaN",
+            "is in current",
         ),
     ],
 )

@@ -38,7 +38,13 @@ from etid.identify.arguments import (
     plan,
 )
 from etid.identify.compiled import stored_jit
-from etid.recordings.preflight import Inspected, why_implausible, why_misaligned
+from etid.recordings.preflight import (
+    FLAT,
+    Inspected,
+    preflight,
+    why_implausible,
+    why_misaligned,
+)
 from etid.recordings.recording import Recording
 from etid.recordings.remarks import Remark
 from etid.recordings.repeats import Repeats, repeats
@@ -51,7 +57,8 @@ from etid.selection.evidence import best
 from etid.selection.search import search
 from etid.selection.selection import Selection
 
-EXPLAINED = ("rate_mismatch", "misaligned", "wrong_unit")  # verdicts with numbers in the message
+# Verdicts whose message says more of a recording.
+EXPLAINED = ("rate_mismatch", "misaligned", "wrong_unit", "flat", "nonfinite_samples")
 NOTED = ("changed", "out_of_bounds")  # verdicts to which `note` adds numbers
 SPARSE = 16  # every 16th sample enters a checksum
 KEPT = 4  # drivers, for which `known_of` is kept
@@ -529,13 +536,27 @@ def is_shared(seen: Inspected, driver: AbstractFeed) -> bool:
 def explained(seen: Inspected, name: str) -> str:
     """The message of a verdict of `etid.recordings.preflight`, with the numbers found."""
     found = ""
+    if seen.by_current is not None and name in EXPLAINED and preflight(seen) != name:
+        seen = seen.by_current  # the fault is in the current
     if name == "rate_mismatch":
         found = seen.train.mismatch
     elif name == "misaligned":
         found = why_misaligned(seen)
     elif name == "wrong_unit":
         found = why_implausible(seen.by_current or seen)
+    elif name in ("flat", "nonfinite_samples"):
+        found = f"The fault is in {' and '.join(_faulty(seen, name))}."
     return f"{found} {message(name)}".strip()
+
+
+def _faulty(seen: Inspected, name: str) -> list[str]:
+    """Names of the records that are flat, or that hold numbers that are not finite."""
+    records = {seen.recording.cause: seen.sigma_th, "v_out": seen.sigma_out}
+    if name == "flat":
+        faults = (seen.spans <= FLAT * np.array([*records.values()])) | (seen.spans == 0)
+    else:
+        faults = [not np.isfinite(seen.recording.samples[one].values).all() for one in records]
+    return [one for one, fault in zip(records, faults, strict=True) if fault]
 
 
 def failed_fit(name: str, circuit: AbstractCircuit, method: str, bounds: Limits = ()) -> Fit:
