@@ -34,11 +34,12 @@ from tqdm import tqdm
 
 import etid
 from benchmarks import ngspice
-from benchmarks.charts import COLOURS, new_figure, save
+from benchmarks.charts import INK, new_figure, save
 from benchmarks.control_plant import OPEN, Plant, Response
 from benchmarks.provenance import RESULTS
 from etid.estimators.unknowns import LoadUnknowns
 from etid.online.state import ElectrodeState, TrackerState
+from etid.plotting.style import BLUE, RED
 from etid.simulation.published import REFERENCE, TYPICAL
 from etid.simulation.scenes import Scene, Trial
 from etid.simulation.transformer import ResistorLoad, SkinLoad
@@ -56,13 +57,15 @@ SETTLED = 2  # pulses after a change that do not count: the target begins with t
 TARGET = 0.02
 GAIN, REFERENCE_POLE, ADAPTATION = 0.25, 0.5, 0.5
 
+# Dashes and colour of a line.
 STYLES = {
-    "etid": "-",
-    "constant voltage": "--",
-    "constant amplitude": "-.",
-    "integral": ":",
-    "model reference": "--",
+    "etid": ("-", BLUE),
+    "constant voltage": ("--", RED),
+    "constant amplitude": ("-.", "#2e7d32"),
+    "integral": (":", INK),
+    "model reference": ((0, (4, 1)), "#8e44ad"),
 }
+NOISIER = "#f39c12"  # of etid with more noise
 
 Command = Callable[[int, np.ndarray, np.ndarray, np.ndarray], np.ndarray]
 
@@ -300,19 +303,18 @@ def draw(runs: dict[str, Run], fingertip: Fingertip, path: pathlib.Path) -> None
     }
     figure, grid = new_figure(len(kinds), 1, (7.2, 8.0), sharex=True)
     panels = grid[:, 0]
-    colours = {name: COLOURS[at % len(COLOURS)] for at, name in enumerate(STYLES)}
     for panel, (kind, title) in zip(panels, kinds.items(), strict=True):
         at = fingertip.kind.index(kind)
         for name, run in runs.items():
             plain = name.split(",", maxsplit=1)[0]
-            own = plain == "etid"
+            own, first = plain == "etid", run is runs[next(iter(runs))]
+            dashes, colour = STYLES[plain]
             panel.semilogy(
                 np.maximum(run.charge[:, at] / WANTED, 1e-3),
-                STYLES[plain],
-                color=colours[plain],
-                alpha=0.6 if own and run is not runs[next(iter(runs))] else 1.0,
-                linewidth=1.8 if own else 1.0,
-                zorder=3 if own else 2,
+                linestyle=dashes,
+                color=colour if first or not own else NOISIER,
+                linewidth=2.4 if own and first else 1.2,
+                zorder=2 if own and first else 3,
                 label=name if own else plain,
             )
         panel.axhspan(1 - TARGET, 1 + TARGET, color="0.85", zorder=0)
