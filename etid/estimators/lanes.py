@@ -155,20 +155,21 @@ class Harmonics(AbstractLane):
         """The fields of a lane, in their order."""
         rate = np.asarray(seen.recording.sample_rate)
         sigmas = seen.trusted_th, seen.trusted_out
-        frequency, x, y, variance_x, variance_y, selected = map(np.asarray, seen.spectrum)
-        of_th = seen.v_th, seen.recorded_th, sigmas[0], seen.coarse_th, variance_x
-        of_out = seen.v_out, seen.recorded_out, sigmas[1], seen.coarse_out, variance_y
-        for (v, recorded, sigma, step, variance), flickers in zip(
-            (of_th, of_out), seen.flickers, strict=True
+        frequency, x, y, *variances, selected = seen.spectrum
+        of_th = seen.v_th, seen.recorded_th, sigmas[0], seen.coarse_th
+        of_out = seen.v_out, seen.recorded_out, sigmas[1], seen.coarse_out
+        for number, ((v, recorded, sigma, step), flickers) in enumerate(
+            zip((of_th, of_out), seen.flickers, strict=True)
         ):
             if step > 0:
                 rounded = rounding_variance(recorded, step, *seen.periods)
-                variance[: rounded.size] = rounded
+                variances[number] = np.append(rounded, variances[number][rounded.size :])
             elif flickers:
-                variance *= coloured(v, float(sigma), frequency, float(rate), *seen.periods)
+                of = v, float(sigma), frequency, float(rate)
+                variances[number] = variances[number] * coloured(*of, *seen.periods)
         selected = selected & ~seen.covered(frequency)
         y = y * _turn(frequency, rate, seen.lag) if seen.lag else y
-        return frequency, x, y, variance_x, variance_y, selected, rate
+        return frequency, x, y, *variances, selected, rate
 
     @classmethod
     def of_samples(

@@ -18,7 +18,14 @@ from h5py import h5o  # type: ignore[attr-defined]  # compiled, without stubs
 from etid.recordings import limits, schema
 from etid.recordings.errors import near_miss
 from etid.recordings.fields import SIGNALS, Field, Metadata, metadata_from, tidy_path
-from etid.recordings.recording import AbstractSource, Layout, Recording, RecordingError, Samples
+from etid.recordings.recording import (
+    AbstractSource,
+    Layout,
+    Recording,
+    RecordingError,
+    Samples,
+    of_checked,
+)
 from etid.recordings.untrusted import (
     attribute,
     attribute_names,
@@ -101,7 +108,7 @@ class _Row(AbstractSource):
         if self.row is None:
             return common
         trial = self.block.trials[self.row] if self.block.trials else ""
-        return dataclasses.replace(common, path=f"{common.path}/{self.row}", trial=trial)
+        return common.of_trial(f"{common.path}/{self.row}", trial)
 
     @property
     def layout(self) -> tuple[Layout, ...]:
@@ -120,10 +127,8 @@ class _Row(AbstractSource):
         yield self.block.samples(name, self.row).stored
 
     def load(self) -> Recording:
-        records: dict[str, Any] = {
-            name: self.block.samples(name, self.row) for name in self.block.headers
-        }
-        return Recording(**records, **vars(self.metadata))
+        samples = {name: self.block.samples(name, self.row) for name in self.block.headers}
+        return of_checked(samples, self.metadata)
 
 
 class Scan:

@@ -293,6 +293,12 @@ class Metadata(AbstractFields):
                 field="calibration",
             )
 
+    def of_trial(self, path: str, trial: str) -> "Metadata":
+        """The same with the path and the label of a trial, which no check concerns."""
+        made = object.__new__(Metadata)
+        vars(made).update(vars(self), path=path, trial=trial)
+        return made
+
     @property
     def kind(self) -> str:
         """`calibration` or `loaded`."""

@@ -7,7 +7,7 @@ from typing import TypeVar
 import numpy as np
 from jaxtyping import Bool, Float
 
-from etid.recordings.recording import Recording, Samples
+from etid.recordings.recording import QUIETLY, Recording, Samples
 from etid.signals.disturbances import Joint, disturbed, enough, joint, of_source
 from etid.signals.harmonics import filled, harmonics, whole_periods
 from etid.signals.mains import Hum, separated
@@ -15,10 +15,9 @@ from etid.signals.noise import RIPPLE, VISIBLE, is_coarse, noise_std, shows_few,
 from etid.signals.pulse_train import PulseTrain, lags_of, pulse_trains, rise_time
 from etid.signals.quick_looks import flickering, humming, uneven
 
-# A recording that is not finite is refused later; its neighbours in a group are not concerned.
-QUIETLY = functools.partial(np.errstate, invalid="ignore", over="ignore")
 _Key = TypeVar("_Key", bound=Hashable)
 SEAM = 3  # samples on each side of the joint between two periods
+USED = 8192  # samples of one product
 STEP = 4.0  # [standard deviations] largest difference that noise makes, there and elsewhere
 
 
@@ -44,9 +43,10 @@ class Group:
         """Voltages of all periods as they were recorded [V]."""
         size = self.recordings[0].samples["v_out"].stored.size
         whole = np.empty((len(self.recordings), 2, size))
-        for records, one in zip(whole, self.recordings, strict=True):
-            for v, record in zip(records, _records(one), strict=True):
-                record.write_to(v)
+        with QUIETLY():
+            for records, one in zip(whole, self.recordings, strict=True):
+                for v, record in zip(records, _records(one), strict=True):
+                    record.write_to(v)
         whole.flags.writeable = False
         return whole
 
@@ -225,11 +225,12 @@ def limits_of(v: Float[np.ndarray, "*record time"]) -> Float[np.ndarray, "*recor
 
 def covariance_of(v: Float[np.ndarray, "*recording 2 time"]) -> Float[np.ndarray, "*recording 2 2"]:
     """Covariance of both voltages of each recording."""
-    mean = v.mean(-1)
+    mean, square = v.mean(-1), np.zeros((*v.shape[:-1], 2))
     with QUIETLY():
-        # Not `@`, which starts BLAS threads.
-        square = np.einsum("...in,...jn->...ij", v, v) / v.shape[-1]
-        return square - mean[..., :, None] * mean[..., None, :]
+        for first in range(0, v.shape[-1], USED):  # longer products start BLAS threads
+            part = v[..., first : first + USED]
+            square += np.vecdot(part[..., :, None, :], part[..., None, :, :])
+        return square / v.shape[-1] - mean[..., :, None] * mean[..., None, :]
 
 
 def is_periodic(

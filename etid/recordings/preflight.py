@@ -289,7 +289,7 @@ class Inspected:
         rate = self.recording.sample_rate
         if self.kept is None:
             frequency, *of_rows, selected = self._group.spectra(*self.periods)
-            return frequency, *(field[self._row].copy() for field in of_rows), selected
+            return frequency, *(field[self._row] for field in of_rows), selected
         sigma = np.stack([self.trusted_th, self.trusted_out])
         fields = filled(harmonics(self._both, *self.periods), sigma, rate, *self.periods)
         return tuple(map(np.asarray, fields))

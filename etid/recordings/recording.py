@@ -33,6 +33,8 @@ from etid.recordings.fields import (
 from etid.recordings.splitting import by_pauses, by_trigger
 from etid.recordings.values import real
 
+# Infinite samples get a verdict; neighbours of a damaged recording are not concerned.
+QUIETLY = functools.partial(np.errstate, invalid="ignore", over="ignore")
 SYMBOLS = {"hertz": "Hz", "ohm": "Ω", "volt": "V"}
 
 
@@ -79,18 +81,22 @@ class Samples:
         if self.conversion == 1 and self.offset == 0 and self.stored.dtype == np.float64:
             return self.stored
         values = np.empty(self.stored.shape)
-        self.write_to(values)
+        with QUIETLY():
+            self.write_to(values)
         values.flags.writeable = False
         return values
 
     def write_to(self, values: Float[np.ndarray, "..."]) -> None:
-        """Write the samples in SI units [V or A] into an array of their shape."""
+        """Write the samples in SI units [V or A] into an array of their shape.
+
+        The caller decides on warnings of infinite samples; `QUIETLY` for each record takes longer
+        than short records do.
+        """
         values[...] = self.stored
-        with np.errstate(over="ignore", invalid="ignore"):  # infinite samples get a verdict
-            if self.conversion != 1:
-                values *= self.conversion
-            if self.offset != 0:
-                values += self.offset
+        if self.conversion != 1:
+            values *= self.conversion
+        if self.offset != 0:
+            values += self.offset
 
     @property
     def resolution(self) -> float | None:
@@ -148,10 +154,7 @@ class Recording(Overviewed, AbstractFields):
             metadata = metadata_from(**fields)
         except RecordingError as error:
             raise error.located(path=str(fields.get("path", ""))) from None
-        object.__setattr__(self, "samples", MappingProxyType(samples))
-        object.__setattr__(self, "metadata", metadata)
-        for name, value in vars(metadata).items():
-            object.__setattr__(self, name, value)
+        _fill(self, samples, metadata)
 
     @property
     def v_th(self) -> Float[np.ndarray, " time"]:
@@ -284,6 +287,18 @@ class Recording(Overviewed, AbstractFields):
             f"<Recording {self.path!r}: {load}, {size} samples at {self.sample_rate:g} Hz, "
             f"{self.periods:.4g} periods of {self.pulse_rate:g} Hz{', ' if labels else ''}{labels}>"
         )
+
+
+def of_checked(samples: dict[str, Samples], metadata: Metadata) -> Recording:
+    """A recording of parts that were checked before, as those of a file are when it is opened."""
+    made = object.__new__(Recording)
+    _fill(made, samples, metadata)
+    return made
+
+
+def _fill(recording: Recording, samples: dict[str, Samples], metadata: Metadata) -> None:
+    fields = vars(metadata) | {"samples": MappingProxyType(samples), "metadata": metadata}
+    vars(recording).update(fields)  # its attributes cannot be set
 
 
 def _signature() -> inspect.Signature:
