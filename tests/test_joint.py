@@ -75,6 +75,16 @@ def test_every_recording_has_its_verdict_and_a_bad_one_costs_itself_alone(study,
     assert outcome.fits.fit.method == "joint"
 
 
+def test_a_recording_that_is_given_twice_is_refused(study):
+    """Its noise would count twice: the errors of the driver would be too small."""
+    again = study["loaded/0"].replace(path="again")
+    with pytest.raises(etid.RecordingError, match=r"same samples as .*\. Pass each") as caught:
+        etid.identify_jointly(Study.from_recordings([*study.recordings(), again]))
+    assert caught.value.path == "again"
+    assert caught.value.field == "study['again']"
+    assert "study['loaded/0']" in caught.value.message
+
+
 def test_numbers_of_joint_fits_are_those_of_before(outcome):
     kept_numbers.check("joint", kept_numbers.of_fit(outcome.fits.fit))
     [driver] = outcome.drivers.values()

@@ -5,6 +5,7 @@ A wrong type, a wrong method or the wrong precision of JAX is refused with a mes
 
 import dataclasses
 import functools
+import hashlib
 import math
 import operator
 import reprlib
@@ -115,16 +116,30 @@ def check_distinct(field: str, recordings: Sequence[Recording]) -> None:
     Raises:
         RecordingError: Two recordings have the same samples of `v_out`.
     """
-    first: dict[bytes, int] = {}
+    first: dict[bytes, str] = {}
     for number, one in enumerate(recordings):
-        same = first.setdefault(one.v_out.tobytes(), number)
-        if same != number:
-            raise RecordingError(
-                f"has the same samples as {field}[{same}]",
-                path=one.path,
-                field=f"{field}[{number}]",
-                remedy="Pass each recording once",
-            )
+        check_new(f"{field}[{number}]", one, first)
+
+
+def check_new(field: str, recording: Recording, first: dict[bytes, str]) -> None:
+    """Refuse a recording with the samples of an earlier one; `check_distinct` for a stream.
+
+    Args:
+        field: Name of the recording in the message.
+        recording: The recording.
+        first: Digest of the samples of each earlier recording, and its name; grows by this one.
+
+    Raises:
+        RecordingError: An earlier recording has the same samples of `v_out`.
+    """
+    same = first.setdefault(hashlib.sha256(recording.v_out.tobytes()).digest(), field)
+    if same != field:
+        raise RecordingError(
+            f"has the same samples as {same}",
+            path=recording.path,
+            field=field,
+            remedy="Pass each recording once",
+        )
 
 
 def candidates_of(value: Circuit) -> tuple[AbstractCircuit, ...]:

@@ -48,6 +48,7 @@ from etid.identify.arguments import (
     Interval,
     asked_of,
     candidates_of,
+    check_new,
     order_of,
     require,
     require_float64,
@@ -342,6 +343,7 @@ def identify_jointly(
 
     Raises:
         ValueError: The study has no loaded recording.
+        RecordingError: Two recordings with a driver have the same samples of `v_out`.
     """
     require_float64()
     require("study", study, Study)
@@ -360,6 +362,7 @@ def identify_jointly(
     waiting: dict[tuple[str, ...], dict[Any, _Waiting]] = {}
 
     by_current: list[int] = []
+    first: dict[bytes, str] = {}
 
     def load(row: int) -> tuple[Recording, AbstractFeed]:
         return drivers.fed(study[paths[row]])
@@ -379,6 +382,7 @@ def identify_jointly(
         if isinstance(found, MeasuredCurrent):
             by_current.append(row)
             continue
+        check_new(f"study[{paths[row]!r}]", seen.recording, first)
         driver = serving(found, HarmonicDriver, str(estimator))
         lengths = waiting.setdefault(drivers.of(seen.recording), {})
         shared = is_shared(seen, driver)
