@@ -1,5 +1,6 @@
 """Loads identified from a measured current: accuracy, delays, batches, and wrong input."""
 
+import re
 from typing import Any
 
 import jax.numpy as jnp
@@ -13,6 +14,7 @@ from etid.estimators.lanes import Harmonics
 from etid.identify import file as fit_file
 from etid.plotting import figure_of
 from etid.plotting.bands import bands
+from etid.recordings.causes import why_misaligned
 from etid.recordings.preflight import Inspected, preflight
 from etid.results.feed import MEASURED_CURRENT
 from etid.simulation.transformer import Sampler
@@ -370,6 +372,32 @@ def test_a_wrong_current_gets_one_clear_verdict(skin, change, verdict, words):
     with pytest.raises(etid.IdentificationError, match=words) as error:
         etid.identify_skin(skin.replace(**change(skin)))
     assert str(error.value).startswith(f"recording '': {verdict}.")
+
+
+@pytest.mark.parametrize("snr_db", [60.0, 20.0])
+@pytest.mark.parametrize("load", [SKIN, COLE, etid.SkinRC(1e3, 1e5, 1e-6)], ids=repr)
+def test_the_cause_of_a_misaligned_current_is_named(load, snr_db):
+    """A phase of the pulse has 40 samples: v_out that late falls where the current rises."""
+    right = recorded(load, snr_db=snr_db)
+    v, n = right.v_out, right.v_out.size
+    sign = "v_out falls where the current rises; change the sign of one of them."
+    other = recorded(load, snr_db=snr_db, seed=1, periods=4.0).v_out[1600 : 1600 + n]
+    for v_out, words in (
+        (-v, f"^{sign}$"),
+        (np.roll(v, 40), r"^v_out is late by 4[01] samples \(0\.0002\d* s\); shift .*records\.$"),
+        (-np.roll(v, -300), rf"^v_out is early by (299|300) samples .*records\. {sign}$"),
+        (other, "^The cause is not clear"),  # half a period away
+    ):
+        assert re.search(words, why_misaligned(Inspected(right.replace(v_out=v_out))))
+
+
+@pytest.mark.parametrize("late", [1, 5, 40])
+def test_a_late_capacitor_is_not_mistaken_for_a_wrong_sign(late):
+    """Its voltage then falls with the current at every frequency, as with the wrong sign."""
+    right = recorded(etid.SkinRC(10.0, 1e6, 1e-7))
+    seen = Inspected(right.replace(v_out=np.roll(right.v_out, late)))
+    assert preflight(seen) == "misaligned"
+    assert why_misaligned(seen).startswith("The cause is not clear")
 
 
 def test_a_recording_needs_what_it_is_identified_from(skin):

@@ -11,7 +11,8 @@ from hypothesis import strategies as st
 
 import etid
 from etid.identify.one import explained
-from etid.recordings.preflight import SHORTEST, Inspected, why_misaligned
+from etid.recordings.causes import why_misaligned
+from etid.recordings.preflight import SHORTEST, Inspected
 from etid.recordings.preflight import preflight as of_inspected
 from etid.simulation.scenes import PRESETS, Scene, Trial
 from etid.simulation.transformer import OpenLoad, ResistorLoad, SkinLoad

@@ -38,13 +38,8 @@ from etid.identify.arguments import (
     plan,
 )
 from etid.identify.compiled import stored_jit
-from etid.recordings.preflight import (
-    FLAT,
-    Inspected,
-    preflight,
-    why_implausible,
-    why_misaligned,
-)
+from etid.recordings.causes import why_implausible, why_misaligned
+from etid.recordings.preflight import FLAT, Inspected, preflight
 from etid.recordings.recording import Recording
 from etid.recordings.remarks import Remark
 from etid.recordings.repeats import Repeats, repeats

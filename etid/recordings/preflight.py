@@ -30,7 +30,6 @@ RAIL = 3  # equal extreme samples in a row; a noisy or sloping signal does not p
 JUMP = 8.0  # [converter steps] a clipped signal reaches and leaves its rail in larger jumps
 HELD = 1e-5  # noise over the span of a record, below which equal samples in a row are no fault
 POWER = 1.01  # largest variance of v_out relative to v_th: a passive load takes power
-UNIT = 30.0  # ratio of v_out to v_th beyond which their units differ, not only their order
 # [A] peak-to-peak; stimulators of nerves and skin stay below 0.1 A in each direction
 STRONGEST = 0.25
 # [Ω] ratio of the spans of v_out and current; electrodes in saline have 100 Ω, patches of membrane
@@ -352,35 +351,10 @@ def _is_plausible(seen: Inspected) -> bool:
     return bool(current <= STRONGEST and LEAST <= voltage / current <= GREATEST)
 
 
-def why_implausible(seen: Inspected) -> str:
-    """The sizes that give the verdict `wrong_unit`."""
-    current, voltage = seen.spans
-    return f"v_out spans {voltage:.3g} V and current {current:.3g} A, {voltage / current:.3g} ohm."
-
-
 def _is_misaligned(seen: Inspected) -> bool:
     if seen.has_current:  # a passive load takes power
         return bool(seen.covariance[0, 1] <= 0)
     return bool(seen.covariance[1, 1] > POWER * seen.covariance[0, 0] or seen.correlated is None)
-
-
-def why_misaligned(seen: Inspected) -> str:
-    """The probable cause of the verdict `misaligned`, with numbers; empty if it is not known."""
-    if seen.has_current:
-        return "v_out falls where the current rises; change the sign of one of them."
-    ratio = float(np.std(seen.v_out) / np.std(seen.v_th))
-    if ratio > UNIT:
-        return (
-            f"v_out is {ratio:.3g} times as large as v_th. Their units or scales differ; is one of "
-            "them in mV and the other in V?"
-        )
-    (reversed_lag,) = lags_of(np.stack([seen.v_th, -seen.v_out])[None], [seen.train])
-    if seen.correlated is None and reversed_lag is not None and abs(reversed_lag) <= 1:
-        return (
-            "v_out falls where v_th rises, at the same times. The polarity of one record is "
-            "reversed; change its sign, or exchange the two wires of the probe."
-        )
-    return ""
 
 
 def _is_saturated(
