@@ -168,6 +168,12 @@ def dry() -> etid.Recording:
     return study()["typical/dry/01"]
 
 
+def with_current() -> etid.Recording:
+    """One dry trial with its current at 40 dB."""
+    scene = dataclasses.replace(PRESETS["paper_dry"](snr_db=40.0), current_snr_db=40.0)
+    return scene.simulate(seed=3)["typical/dry/01"]
+
+
 def posterior() -> etid.Posterior:
     """Skewed draws around that fit."""
     rng = np.random.default_rng(2)
@@ -188,6 +194,7 @@ def profile() -> etid.Profile:
 
 PICTURES: dict[str, Callable[[], tuple]] = {
     "recording": lambda: (dry(),),
+    "recording_with_current": lambda: (with_current(),),
     "fit": lambda: (fit(), dry(), driver()),
     "fit_without_success": lambda: (fit("misfit"), dry(), driver()),
     "measured_impedance": lambda: (measured(),),

@@ -342,8 +342,10 @@ def test_a_study_of_currents_needs_no_calibration(skin, tmp_path):
     with etid.read(tmp_path / "study.h5") as again:
         np.testing.assert_array_equal(again["s01/1"].current, skin.current)
         found = etid.identify_study(again)
+        etid.write_report(found, tmp_path / "study.html", recordings=again)
     assert found.drivers == {}
     assert (found.fits.verdicts == "successful").all()
+    assert "No prediction" not in (tmp_path / "study.html").read_text()
 
 
 def test_without_a_driver_the_unloaded_voltage_is_not_used(skin):

@@ -15,7 +15,7 @@ from etid.estimators.lanes import Harmonics
 from etid.plotting import figure_of
 from etid.plotting.bands import bands
 from etid.plotting.candidates import PALE
-from etid.plotting.pulses import residual_std
+from etid.plotting.pulses import pulse, residual_std
 from etid.plotting.style import RED, new_figure, save
 from etid.recordings.preflight import Inspected
 from tests import pictures
@@ -61,6 +61,49 @@ def test_a_recording_is_shown_whole_and_by_one_pulse(recording):
     assert {axis.get_xlabel() for axis in (whole, one)} == {"time [ms]"}
     assert {axis.get_ylabel() for axis in (whole, one)} == {"voltage [V]"}
     assert "typical/dry/01" in whole.get_title(loc="left")
+
+
+def test_a_current_is_shown_below_the_voltages_over_the_same_time():
+    recording = pictures.with_current()
+    amperes = recording.samples["current"].values
+    voltage, one, current, one_current = figure_of(recording).axes
+    assert [line.get_label() for line in one.lines] == ["V_th", "V_out"]
+    assert current.get_ylabel() == one_current.get_ylabel() == "current [mA]"
+    np.testing.assert_allclose(np.asarray(current.lines[0].get_ydata()), 1e3 * amperes)
+    assert voltage.get_shared_x_axes().joined(voltage, current)
+    assert one.get_shared_x_axes().joined(one, one_current)
+    alone = recording.without_v_th().replace(current=1e-6 * amperes)  # as of a patch clamp
+    _, one, current, _ = figure_of(alone).axes
+    assert [line.get_label() for line in one.lines] == ["V_out"]
+    assert current.get_ylabel() == "current [pA]"
+
+
+def test_one_pulse_of_two_phases_is_shown_from_its_beginning():
+    """Its largest step is between the phases, and twice as large as the first."""
+    current = np.zeros(10_000)
+    for start in (100, 3433, 6767):
+        current[start : start + 40], current[start + 40 : start + 80] = 1e-3, -1e-3
+
+    def shown(current):
+        return pulse(
+            etid.Recording(v_out=current, current=current, sample_rate=200e3, pulse_rate=60.0)
+        )
+
+    for sign in (1, -1):
+        part = shown(sign * current)
+        assert 3433 - 40 <= part.start < 3433
+        assert current[part].sum() == 0
+        assert np.abs(current[part]).sum() == pytest.approx(80e-3)
+    assert shown(current[120:]).start > 3000  # this record begins in a pulse
+
+
+def test_the_legend_of_a_residual_is_above_its_axes(recording, driver):
+    figure = figure_of(pictures.fit(), recording, driver)
+    figure.draw_without_rendering()
+    lower = figure.axes[1]
+    legend = lower.get_legend()
+    assert legend is not None
+    assert legend.get_window_extent().y0 >= lower.get_window_extent().y1 - 1  # [pixel]
 
 
 def test_a_fit_shows_its_residual_in_millivolts_in_a_band_of_two_sigma(recording, driver):

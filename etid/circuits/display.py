@@ -16,7 +16,7 @@ DISPLAY = {
 }
 
 
-BASE = {"ohm": "Ω", "farad": "F", "second": "s"}  # units that take prefixes
+BASE = {"ohm": "Ω", "farad": "F", "second": "s", "ampere": "A"}  # units that take prefixes
 PREFIXES = {
     -15: "f", -12: "p", -9: "n", -6: "µ", -3: "m", 0: "", 3: "k", 6: "M", 9: "G", 12: "T"
 }  # fmt: skip

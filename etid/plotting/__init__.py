@@ -70,6 +70,7 @@ def plot(
     | call | shows | axes |
     |---|---|---|
     | `plot(recording)` | V_th and V_out [V]: the whole record, and one pulse | 2 |
+    | `plot(recording)` with a current | below them the current, over the same time | 4 |
     | `plot(fit)` | one pulse measured and predicted [V]; residual [mV] | 2 |
     | `plot(fit, show="impedance")` | Nyquist and Bode: fit, measured | 3 |
     | `plot(fit, show="residual")` | residual [mV], its correlations | 3 |

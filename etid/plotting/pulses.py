@@ -5,6 +5,7 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from etid.circuits.circuit import AbstractCircuit, Resistor
+from etid.circuits.display import heading, scaled
 from etid.identify.arguments import fed
 from etid.identify.predict import predict
 from etid.plotting.style import BLUE, INK, RED, Canvas, titled
@@ -15,40 +16,53 @@ from etid.results.fit import Fit
 from etid.signals.noise import noise
 
 BEFORE, AFTER = 0.15e-3, 1.2e-3  # [s] time shown before and after the first edge of a pulse
+EDGE = 0.3  # of the largest step; the edges of a biphasic pulse are half of that between its phases
 FREQUENCIES = 2048  # for the mean of |G|²; features of G are wider than 1/1000 of the band
 PAIR = {"sharex": True, "gridspec_kw": {"height_ratios": [3, 1.2]}}  # axes of pulse and residual
 
 
 def pulse(recording: Recording) -> slice:
-    """Samples of one pulse: around the first edge that is far enough from both ends."""
+    """Samples of one pulse: around its first edge, if both are far enough from both ends."""
     cause = recording.samples[recording.cause].values
     step, size = np.nan_to_num(np.diff(cause)), cause.size  # a missing sample must not hide an edge
     before = int(BEFORE * recording.sample_rate)
     after = int(AFTER * recording.sample_rate)
-    rising = np.flatnonzero((step > 0.5 * np.abs(step).max(initial=0.0)) & (step > 0))
-    inside = rising[(rising >= before) & (rising + after < size)]
+    edges = np.flatnonzero(np.abs(step) > EDGE * np.abs(step).max(initial=0.0))
+    # The rest before a pulse is longer than its phases. A record may begin in a pulse.
+    rest = np.diff(edges, prepend=0)
+    first = edges[rest > 0.5 * rest.max(initial=0)]
+    inside = first[(first >= before) & (first + after < size)]
     start = int(inside[0]) if inside.size else int(np.argmax(np.append(np.abs(step), 0.0)))
     return slice(max(0, start - before), min(size, start + after))
 
 
 def draw_recording(canvas: Canvas, recording: Recording) -> np.ndarray:
-    """Unloaded and loaded voltage: the whole record, and one pulse."""
-    whole, one = axes = canvas(1, 2, (9.0, 3.2)).ravel()
+    """Voltages, and the current if there is one: the whole record, and one pulse."""
+    current = recording.samples.get("current")
+    rows = 1 if current is None else 2
+    axes = canvas(rows, 2, (9.0, 3.2 if rows == 1 else 4.8), sharex="col")
     milliseconds = 1e3 * recording.time
-    for axis, part in ((whole, slice(None)), (one, pulse(recording))):
-        if recording.cause == "v_th":
-            axis.plot(milliseconds[part], recording.v_th[part], color=INK, lw=0.9, label="V_th")
-        axis.plot(
-            milliseconds[part], recording.v_out[part], "--", color=BLUE, lw=1.1, label="V_out"
-        )
-        axis.set(xlabel="time [ms]", ylabel="voltage [V]")
+    for column, part in enumerate((slice(None), pulse(recording))):
+        time, axis = milliseconds[part], axes[0, column]
+        both = recording.cause == "v_th"
+        if both:
+            axis.plot(time, recording.v_th[part], color=INK, lw=0.9, label="V_th")
+        style = "--" if both else "-"
+        axis.plot(time, recording.v_out[part], style, color=BLUE, lw=1.1, label="V_out")
+        axis.set(ylabel="voltage [V]")
+        if current is not None:
+            finite = current.values[np.isfinite(current.values)]
+            size, _ = scaled("ampere", largest := float(np.abs(finite).max(initial=0.0)))
+            axes[1, column].plot(time, current.values[part] / size, color=INK, lw=0.9)
+            axes[1, column].set(ylabel=heading("current", "ampere", largest))
+        axes[-1, column].set(xlabel="time [ms]")
     labels = [f"{name} {value}" for name in LABELS if (value := getattr(recording, name))]
     if recording.r_load is not None:
         labels.append(f"calibration with {recording.r_load / 1e3:g} kΩ")
-    titled(whole, [recording.path, ", ".join(labels)])
-    titled(one, ["one pulse"])
-    one.legend(frameon=False)
-    return axes
+    titled(axes[0, 0], [recording.path, ", ".join(labels)])
+    titled(axes[0, 1], ["one pulse"])
+    axes[0, 1].legend(frameon=False)
+    return axes.ravel()
 
 
 def draw_fit(canvas: Canvas, fit: Fit, recording: Recording, driver: Driver | None) -> np.ndarray:
@@ -117,7 +131,10 @@ def draw_pulse(
     lower.axhline(0.0, color="0.6", lw=0.6)
     lower.plot(milliseconds, residual[part], color=BLUE, lw=0.8)
     lower.set(xlabel="time [ms]", ylabel="residual [mV]")
-    lower.legend(frameon=False, fontsize=8)
+    # Noise fills these axes, so the legend is above them.
+    lower.legend(
+        frameon=False, fontsize=8, loc="lower right", bbox_to_anchor=(1.0, 1.0), borderaxespad=0.0
+    )
 
 
 def _measured(upper: Axes, recording: Recording) -> slice:

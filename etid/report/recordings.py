@@ -105,7 +105,9 @@ class Recordings:
         names = ("path", *LABELS)
         shown = recording.replace(**{name: plain(getattr(recording, name)) for name in names})
         names = recording.calibration or tuple(self.study.calibrations)
-        figure, why = _predicted(shown, fit, self._found.drivers.get(names))
+        by_current = recording.cause == "current"  # the fit needs no driver then
+        driver = None if by_current else self._found.drivers.get(names)
+        figure, why = _predicted(shown, fit, driver)
         elements = ", ".join(fit.elements)
         about = f"{path}: {fit.verdict}{f' ({text})' if text else ''}."
         if why:
@@ -120,7 +122,7 @@ class Recordings:
 def _predicted(recording: Recording, fit: Fit, driver: Driver | None) -> tuple[Figure, str]:
     """A figure of one pulse, with its prediction or the reason why there is none."""
     values = np.asarray(fit.circuit.values())
-    if driver is None:
+    if driver is None and recording.cause == "v_th":
         return figure_of(recording), "the fits hold no driver for it."
     if (values <= 0).any():
         return figure_of(recording), "an element is not positive."
