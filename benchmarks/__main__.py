@@ -21,6 +21,7 @@ NAMES = (
     "curves",
     "scale",
     "amplitudes",
+    "amplitude_errors",
     "online",
     "control",
     "speed_accuracy",

@@ -214,7 +214,7 @@ def test_a_linear_skin_has_no_i_0_and_remarks_on_its_recordings_are_told(monkeyp
 @pytest.mark.slow
 def test_linear_skin_is_called_nonlinear_as_rarely_as_stated():
     """1 of 2 000 by the limit; of 600, more than 3 would come by chance once in 4 000 times."""
-    rate = 20e3  # few harmonics, so that a fit takes 80 ms
+    rate = 20e3  # few harmonics, so that a fit takes 0.2 s
     t, f = np.arange(1000) / rate, np.fft.rfftfreq(1000, 1 / rate)
     pulse = pulses(t / 8 % (1 / PULSE_RATE / 8))  # eight times as long
     volts = np.fft.irfft(np.fft.rfft(pulse) * (5e3 + 60e3 / (1 + 2j * np.pi * f * 6e-4)))
@@ -241,7 +241,7 @@ def test_linear_skin_is_called_nonlinear_as_rarely_as_stated():
 
 @pytest.mark.slow
 def test_skin_that_recovers_slowly_is_a_misfit():
-    """Not an answer: R_p is 8 % and I_0 14 % too small, R_s eight times too large."""
+    """Not an answer: R_p is 12 % and I_0 43 % too small."""
     t = np.arange(10_000) / SAMPLE_RATE
     of = []
     for amplitude in (0.1e-3, 0.3e-3, 1e-3):
@@ -259,7 +259,7 @@ def test_skin_that_recovers_slowly_is_a_misfit():
     assert fit.verdict == "misfit"
     assert "recovery after a pulse is slower" in str(fit)
     wrong = np.asarray(fit.circuit.values()) / np.asarray(SKIN.values()) - 1
-    np.testing.assert_allclose(wrong[[1, 3]], [-0.08, -0.14], atol=0.02)
+    np.testing.assert_allclose(wrong[[1, 3]], [-0.12, -0.43], atol=0.02)
 
 
 def layered(amplitude: float, t: np.ndarray, skin: etid.SkinCurrent = SKIN) -> np.ndarray:

@@ -9,7 +9,8 @@ If the load has a resistor that depends on its current, harmonic balance gives V
 
 The weights are constant: a fit gets the variances of the terms from earlier estimates. If they
 followed the parameters, elements with a large gain would explain any residual by the noise of X,
-because a saturated V(X) hardly changes with them.
+because a saturated V(X) hardly changes with them. The terms are treated as independent, which the
+last step corrects (`etid.estimators.amplitudes.last_step`).
 """
 
 import dataclasses
