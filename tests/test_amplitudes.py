@@ -317,6 +317,12 @@ def test_a_linear_fit_of_skin_that_falls_with_its_current_says_so():
     fit = etid.identify_skin(recording(0.2e-3, 7), throw=False)
     assert fit.verdict == "misfit"
     assert "identify_amplitudes" in str(fit)
+    for amplitude in (1e-3, 3e-3):  # far above I_0 the remark is missing, the refusal is not
+        assert etid.identify_skin(recording(amplitude, 7), throw=False).verdict in (
+            "misfit",
+            "max_steps_reached",
+            "nonphysical",
+        )
 
 
 @pytest.mark.slow
