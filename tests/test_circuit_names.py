@@ -58,6 +58,20 @@ def files(folder, monkeypatch):
     return folder
 
 
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [
+        ("SkinCurrent", "depends on its current.* call etid.identify_amplitudes"),
+        ("skinrc", "there is no circuit 'skinrc' in etid; did you mean SkinRC\\? Or use one of"),
+        ("SkinCol", "did you mean SkinCole\\?"),
+        ("Battery", "there is no circuit 'Battery' in etid; use one of ParallelRC, "),
+    ],
+)
+def test_an_unknown_circuit_is_told_the_near_one_or_who_fits_it(name, words):
+    with pytest.raises(ValueError, match=words):
+        lookup.imported(name)
+
+
 def test_the_command_fits_a_circuit_of_ones_own(files):
     fits = etid.Fits.read("fits.h5")
     assert type(fits.circuit).__module__ == "lab_skins"
@@ -156,7 +170,7 @@ def test_a_circuit_that_has_changed_is_refused(files, tmp_path):
     [
         (
             "SkinOil",
-            "no circuit 'SkinOil' in etid; use one of ParallelRC, Resistor, SkinCole",
+            "no circuit 'SkinOil' in etid; did you mean SkinCole? Or use one of ParallelRC, ",
         ),
         ("absent_lab:Mine", "cannot import absent_lab: ModuleNotFoundError"),
         ("lab_skins:Other", "Other of lab_skins is None, not a subclass of etid.AbstractCircuit"),

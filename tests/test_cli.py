@@ -107,6 +107,37 @@ def test_check_names_every_wrong_field(run, study_file):
         assert any(path in line and field in line for line in printed), (path, field)
 
 
+def test_check_names_a_constant_current_and_remarks_on_an_implausible_one(run, tmp_path):
+    """A unit cannot be told for sure, so it is a remark, with the sizes found."""
+    i = 1e-3 * np.sin(2 * np.pi * 60 * np.arange(10_000) / 200e3)
+    records = {"right": i, "milli": 1e3 * i, "swapped": 5e4 * i, "constant": 0 * i + 1e-3}
+    recordings = {
+        name: etid.Recording(
+            v_out=i if name == "swapped" else 5e4 * i,
+            current=current,
+            sample_rate=200e3,
+            pulse_rate=60.0,
+            path=name,
+        )
+        for name, current in records.items()
+    }
+    constant = recordings.pop("constant")
+    file = tmp_path / "remarks.h5"
+    etid.Study.from_recordings(recordings.values()).write(file)
+    status, printed, _ = run("check", file)
+    assert status == DONE
+    first, milli, swapped = printed
+    assert first == f"{file}: 3 recordings, no faults"
+    assert milli.startswith("milli: v_out spans 100 V and current 2 A, 50 ohm. ")
+    assert "in ampere and not in mA" in milli
+    assert swapped.startswith("swapped: v_out spans 0.002 V and current 100 A, 2e-05 ohm. ")
+    etid.Study.from_recordings([*recordings.values(), constant]).write(tmp_path / "fault.h5")
+    status, printed, _ = run("check", tmp_path / "fault.h5")
+    assert status == WRONG_DATA
+    (line,) = printed
+    assert "'constant', current: is constant, 0.001 A. Record the current" in line
+
+
 def test_import_turns_a_table_into_a_file_that_check_accepts(run, tmp_path):
     table = tmp_path / "table.csv"
     values = np.random.default_rng(0).normal(size=(500, 2))
@@ -337,7 +368,7 @@ def test_json_of_what_writes_a_file_names_it(run, tmp_path):
     assert as_json(printed).items() >= wanted.items()
     status, printed, _ = run("check", made, "--json")
     wanted = {"command": "check", "status": DONE, "file": str(made), "recordings": 11}
-    assert (status, as_json(printed)) == (DONE, {**wanted, "problems": []})
+    assert (status, as_json(printed)) == (DONE, {**wanted, "problems": [], "remarks": []})
 
 
 def test_keys_of_json_are_those_of_the_guide(run, study_file, tmp_path):

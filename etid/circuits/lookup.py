@@ -4,14 +4,16 @@ The name is `module:Class`, and `etid:Class` for the circuits of etid. A name fr
 causes an import: etid searches for it only among the classes that are already defined.
 """
 
+import difflib
 import importlib
 import re
 import reprlib
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 
 from etid.circuits import circuit as circuits
 from etid.circuits import written
 from etid.circuits.circuit import AbstractCircuit
+from etid.circuits.current_dependent import SkinCurrent
 
 _NAME = re.compile(r"([A-Za-z_]\w*(?:\.\w+)*):(?:[\w<>]+\.)*(\w+)", flags=re.ASCII)
 
@@ -90,10 +92,7 @@ def imported(name: str) -> type[AbstractCircuit]:
     if not module:
         known = built_in()
         if name not in known:
-            raise ValueError(
-                f"there is no circuit {name!r} in etid; use one of {', '.join(sorted(known))}, "
-                "a string as R0-p(R1,C1), or module:Class for a circuit of your own"
-            )
+            raise ValueError(_unknown(name, known))
         return known[name]
     try:
         found = getattr(importlib.import_module(module), attribute, None)
@@ -105,6 +104,22 @@ def imported(name: str) -> type[AbstractCircuit]:
             "etid.AbstractCircuit"
         )
     return found
+
+
+def _unknown(name: str, known: Iterable[str]) -> str:
+    """Why a command has no circuit of this name, and what to do."""
+    if name == SkinCurrent.__name__:
+        return (
+            f"{name} depends on its current, and no command fits such a circuit; call "
+            "etid.identify_amplitudes(recordings), which fits it to several amplitudes"
+        )
+    simple = {other.lower(): other for other in known}
+    near = difflib.get_close_matches(name.lower(), simple, n=1)
+    hint = f"; did you mean {simple[near[0]]}? Or" if near else ";"
+    return (
+        f"there is no circuit {name!r} in etid{hint} use one of {', '.join(sorted(known))}, "
+        "a string as R0-p(R1,C1), or module:Class for a circuit of your own"
+    )
 
 
 def _defined(of: type[AbstractCircuit] = AbstractCircuit) -> Iterator[type[AbstractCircuit]]:

@@ -3,9 +3,15 @@
 import argparse
 import pathlib
 
+import numpy as np
+
 from etid.circuits.display import several
 from etid.commands import DONE, WRONG_DATA, Outcome
 from etid.recordings import hdf5
+from etid.recordings.causes import sizes
+from etid.recordings.preflight import is_plausible
+from etid.recordings.study import Study
+from etid.results.verdicts import message
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -14,17 +20,31 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> Outcome:
-    """Return all faults of the file."""
+    """Return all faults of the file, or remarks on recordings without a fault."""
     problems = hdf5.check(arguments.file)
     places = [
         {"path": each.path, "field": each.field, "message": each.message, "remedy": each.remedy}
         for each in problems
     ]
-    data = {"file": arguments.file, "recordings": None, "problems": places}
+    data = {"file": arguments.file, "recordings": None, "problems": places, "remarks": []}
     if problems:
         return Outcome("\n".join(map(str, problems)), data, WRONG_DATA)
     with hdf5.read(arguments.file) as study:
         data["recordings"] = len(study)
-    return Outcome(
-        f"{arguments.file}: {several(data['recordings'], 'recording')}, no faults", data, DONE
-    )
+        found = data["remarks"] = _remarks(study)
+    lines = [f"{arguments.file}: {several(data['recordings'], 'recording')}, no faults"]
+    lines += [f"{one['path']}: {one['message']}" for one in found]
+    return Outcome("\n".join(lines), data, DONE)
+
+
+def _remarks(study: Study) -> list[dict[str, str]]:
+    """Path and text for each recording whose current or impedance no load at an electrode has."""
+    found = []
+    for path in study:
+        if all(of.name != "current" for of in study.source(path).layout):
+            continue
+        samples = study[path].samples
+        spans = [float(np.ptp(samples[name].values)) for name in ("v_out", "current")]
+        if not is_plausible(*spans):
+            found.append({"path": path, "message": f"{sizes(*spans)} {message('wrong_unit')}"})
+    return found

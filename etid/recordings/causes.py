@@ -20,6 +20,11 @@ RELATED = 0.2
 def why_implausible(seen: Inspected) -> str:
     """The sizes that give the verdict `wrong_unit`."""
     current, voltage = seen.spans
+    return sizes(voltage, current)
+
+
+def sizes(voltage: float, current: float) -> str:
+    """Peak-to-peak v_out [V] and current [A], and their ratio, as a sentence."""
     return f"v_out spans {voltage:.3g} V and current {current:.3g} A, {voltage / current:.3g} ohm."
 
 

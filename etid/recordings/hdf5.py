@@ -6,8 +6,10 @@ fault of one recording is stored in `Study.problems`.
 """
 
 import os
+from collections.abc import Iterator
 
 import h5py
+import numpy as np
 
 from etid.recordings import schema
 from etid.recordings.contents import Scan
@@ -47,8 +49,8 @@ def read(path: str | os.PathLike[str]) -> Study:
 def check(path: str | os.PathLike[str]) -> list[RecordingError]:
     """All faults of a file, field by field.
 
-    Faults are also samples that are not finite, and a distance between the pulses that does not
-    match the sample rate and the pulse rate.
+    Faults are also samples that are not finite, a constant current, and a distance between the
+    pulses that does not match the sample rate and the pulse rate.
 
     Args:
         path: Path of the file.
@@ -62,9 +64,27 @@ def check(path: str | os.PathLike[str]) -> list[RecordingError]:
             _check_root(metadata, name)
             scan = Scan(metadata, file, name)
             scan.check_samples()
+            constant = [*_constant_currents(scan, name)]
     except RecordingError as problem:
         return [problem]
-    return scan.problems
+    return scan.problems + constant
+
+
+def _constant_currents(scan: Scan, name: str) -> Iterator[RecordingError]:
+    """The fault of each recording whose current has no pulses."""
+    broken = {problem.path for problem in scan.problems}
+    for path, source in scan.sources().items():
+        if path in broken or all(of.name != "current" for of in source.layout):
+            continue
+        current = source.load().samples["current"].values
+        if np.ptp(current) == 0:
+            yield RecordingError(
+                f"is constant, {current[0]:g} A",
+                file=name,
+                path=path,
+                field="current",
+                remedy="Record the current of the pulses, or remove the dataset",
+            )
 
 
 def _check_root(file: h5py.File, name: str) -> None:

@@ -332,7 +332,7 @@ def preflight(seen: Inspected, *, periodic: bool = False) -> str | None:
         return "saturated"
     if _is_saturated(seen.recorded_out, out, seen.step_out, of.adc_range):
         return "saturated"
-    if seen.has_current and not _is_plausible(seen):
+    if seen.has_current and not is_plausible(seen.spans[1], seen.spans[0]):
         return "wrong_unit"
     if not seen.has_current and _is_unconnected(seen):
         return "unconnected"
@@ -345,9 +345,8 @@ def preflight(seen: Inspected, *, periodic: bool = False) -> str | None:
     return None
 
 
-def _is_plausible(seen: Inspected) -> bool:
-    """Whether current and impedance have sizes that a load at an electrode can have."""
-    current, voltage = seen.spans
+def is_plausible(voltage: float, current: float) -> bool:
+    """Whether the peak-to-peak v_out [V] and current [A] are those of a load at an electrode."""
     return bool(current <= STRONGEST and LEAST <= voltage / current <= GREATEST)
 
 
