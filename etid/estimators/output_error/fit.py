@@ -49,7 +49,8 @@ from etid.estimators.output_error.prediction import (
     state_scale,
 )
 from etid.estimators.sandwich import Curvature
-from etid.estimators.score_tests.other_in_time import relaxed, score
+from etid.estimators.score_tests.bends_in_time import bends
+from etid.estimators.score_tests.other_in_time import EXACT, Shown, relaxed, score
 from etid.estimators.unknowns import Nuisance
 from etid.results.driver import Calibration, ContinuousDriver, SourceImpedance, loaded
 from etid.results.feed import CurrentSource, MeasuredCurrent
@@ -295,6 +296,10 @@ def fit_circuit(
     derivatives = slopes(of_all, response, at)
     full = curvature(records, derivatives, precision).eliminate(both)
     change = relaxed(records, source, fitted.impedance(), nuisance)
+    behind_current = isinstance(source, CurrentSource)
+    if behind_current:
+        more = bends(records, fitted.impedance(), nuisance, derivatives)
+        change = jax.tree.map(lambda *of: jnp.concatenate(of, axis=1), change, more)
     found = score(records, change, derivatives, source_cov, kept + 1, rest, precision, kept)
     own = inverse(full.expected[: kept + 1, : kept + 1])
     chi2 = 2 * objective[-1] / (records.intervals - q.size)
@@ -305,18 +310,25 @@ def fit_circuit(
     predicted = predict(system, records, nuisance) + late_samples * late.v_out
     seen, used = measured(records, nuisance.delay_samples), records.used > 0
     mean = jnp.sum(seen * records.used) / records.intervals
+    cov = cov * jnp.maximum(chi2, 1.0) + shared
+    error = rrse(jnp.where(used, predicted, mean), jnp.where(used, seen, mean))
+    shown = Shown(found.relaxes(), jnp.zeros((), bool))
+    if behind_current:
+        least = EXACT * jnp.sqrt(records.intervals) / error
+        shown = Shown.behind_current(found, jnp.sqrt(jnp.diagonal(cov)), chi2, least)
     estimate = Estimate(
         parameters=log_elements,
         delay_samples=nuisance.delay_samples[None],
-        cov=cov * jnp.maximum(chi2, 1.0) + shared,
+        cov=cov,
         shared_cov=shared,
         chi2=chi2,
-        rrse=rrse(jnp.where(used, predicted, mean), jnp.where(used, seen, mean)),
+        falls=shown.falls,
+        rrse=error,
         result=result,
         steps=steps.sum(),
         support=_support(objective[-1], records, kept),
     )
-    return fitted, estimate, found.relaxes()
+    return fitted, estimate, shown.other
 
 
 def _support(objective: Float[Array, ""], records: Records, elements: int) -> Support:
