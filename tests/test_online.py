@@ -6,6 +6,7 @@ import html
 
 import jax
 import jax.numpy as jnp
+import jaxtyping
 import numpy as np
 import pytest
 import scipy.stats
@@ -563,6 +564,14 @@ def test_a_circuit_of_ones_own_is_tracked():
     fits = tracker.read(followed(tracker, np.tile(pulses, (3, 1, 1))))
     assert list(fits.verdicts) == ["successful"]
     np.testing.assert_allclose(fits.circuit.r, 21.62e3, rtol=5e-3)
+
+
+@pytest.mark.parametrize("kind", [np.int16, bool, complex])
+def test_codes_of_a_converter_are_not_taken_for_volts(kind, monkeypatch):
+    monkeypatch.setattr(jaxtyping.config, "jaxtyping_disable", True)  # a user has no type checker
+    tracker = tracker_of(2)
+    with pytest.raises(etid.RecordingError, match=r"v_out: has dtype .*by volts per code"):
+        tracker.update(tracker.start(), np.zeros((2, 3333), kind))
 
 
 def test_what_cannot_be_tracked_is_refused_with_a_reason():

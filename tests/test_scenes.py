@@ -463,6 +463,8 @@ def test_subjects_lie_in_the_published_ranges_and_differ(condition, ranges):
         ({"trigger_jitter_rms": -1e-9}, "must not be negative"),
         ({"samples": 0}, "at least one"),
         ({"bits": 1}, "2 to 32"),
+        ({"snr_db": np.nan}, "snr_db is nan"),
+        ({"current_snr_db": np.nan}, "current_snr_db is nan"),
     ],
 )
 def test_impossible_scenes_are_refused(settings, message):

@@ -62,7 +62,7 @@ from etid.online.state import ElectrodeState, TrackerState
 from etid.online.tick import updated
 from etid.recordings.errors import not_recorded
 from etid.recordings.preflight import Inspected, preflight
-from etid.recordings.recording import Recording
+from etid.recordings.recording import Recording, RecordingError
 from etid.results.driver import Driver, HarmonicDriver
 from etid.results.fit import Fit, IdentificationError
 from etid.results.fits import Fits
@@ -276,7 +276,8 @@ class Tracker(Overviewed):
             State after this pulse.
 
         Raises:
-            RecordingError: `state` is no state of a tracker.
+            RecordingError: `state` is no state of a tracker, or `v_out` holds no real numbers, or
+                integers without a scale.
             ValueError: `v_out` does not hold one window of one period for each electrode, or an
                 amplitude is negative, or there is not one for each electrode, or the state is that
                 of another tracker.
@@ -288,6 +289,13 @@ class Tracker(Overviewed):
                 f"v_out has shape {np.shape(v_out)}; one period at each electrode has the shape "
                 f"(electrode, sample) = {expected} (Tracker.pulses cuts longer records)"
             )
+        v_out = np.asarray(v_out)
+        if v_out.dtype.kind != "f":
+            raise RecordingError(
+                f"has dtype {v_out.dtype}, must be voltages as real numbers",
+                field="v_out",
+                remedy="Multiply converter codes by volts per code; convert voltages to floats",
+            )
         amplitude = np.asarray(amplitude, float)
         if amplitude.shape not in ((), (self.electrodes,)):
             raise ValueError(
@@ -297,7 +305,7 @@ class Tracker(Overviewed):
         if not (np.isfinite(amplitude) & (amplitude >= 0)).all():
             raise ValueError(f"amplitude is {amplitude}; it must be finite and not negative")
         relative = np.full(self.electrodes, amplitude)
-        found = self.projection.seen(np.asarray(v_out, float), self.adc_range)
+        found = self.projection.seen(v_out.astype(float, copy=False), self.adc_range)
         return updated(self.model, self.change, self.limit, state, found, relative)
 
     def read(self, state: TrackerState) -> Fits:

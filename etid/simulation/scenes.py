@@ -153,6 +153,10 @@ class Scene:
             value = getattr(self, name)
             if not (value > 0 and math.isfinite(value)):
                 raise ValueError(f"{name} is {value}; it must be positive and finite")
+        for name in ("snr_db", "current_snr_db"):
+            value = getattr(self, name)
+            if value is not None and not value > -math.inf:
+                raise ValueError(f"{name} is {value}; give a number, or None")
         for name in ("trigger_jitter_rms", "offset_rms"):
             if not getattr(self, name) >= 0:
                 raise ValueError(f"{name} is {getattr(self, name)}; it must not be negative")
