@@ -3,6 +3,7 @@
 import argparse
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -10,6 +11,7 @@ import etid
 from benchmarks import driver_order as benchmark
 from benchmarks.ladder import CALIBRATION, rung
 from etid.commands import fit as command
+from etid.estimators.starts import source_starts
 from etid.results.driver import ContinuousDriver
 from etid.results.tried_orders import LARGEST, LEAST
 from etid.selection.driver_order import TriedOrder, best, evidence, next_order
@@ -146,3 +148,10 @@ def test_a_choice_is_right_if_its_error_is_near_the_best():
         for order, error in ((4, 1.05), (5, 1.0), (6, 2.0), (6, 1.4))
     ]
     assert benchmark.right(draws, (4, 5, 6)) == [True, True, False, True]
+
+
+def test_a_driver_of_two_poles_has_starts():
+    """Order 2 has no section beside its real poles; the fit stopped with an error of numpy."""
+    number = jnp.asarray
+    starts = source_starts(number([1.0, -1.5, 0.6]), 2, number(200e3), number(98.8e3))
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(starts))

@@ -127,8 +127,8 @@ def source_starts(
     sections = (order - 1) // 2
     reals = order - 2 * sections
     # Further sections start overdamped at the edge of the sampled band.
-    pairs = [(*of, *[FAR] * sections)[:sections] for of in GENERIC]
-    places = jnp.asarray(np.reshape(list(dict.fromkeys(pairs)), (-1, sections, 2)))
+    pairs = dict.fromkeys((*of, *[FAR] * sections)[:sections] for of in GENERIC)
+    places = jnp.asarray(np.reshape([*pairs], (len(pairs), sections, 2)))
     if sections:
         s = jnp.log(poles(baseline))  # s / fs of the discrete poles
         # Resonances are poles well inside the band. The least damped one is used.
