@@ -11,6 +11,7 @@ from scipy.integrate import solve_ivp
 from scipy.special import erf
 
 import etid
+from benchmarks import amplitudes as amplitudes_benchmark
 from etid.circuits.current_dependent import Norton, Signals, current_dependent_resistor, port
 from etid.identify.amplitudes import leaves_much
 from etid.recordings.preflight import Inspected
@@ -310,6 +311,45 @@ def test_slow_recovery_is_told_from_other_misfits(name, snr_db):
         assert late == (name == "recovers slowly"), fit
         if name in ("recovers slowly", "two layers", "two linear layers"):
             assert fit.verdict != "successful"
+
+
+@pytest.mark.slow
+def test_skin_that_falls_with_its_current_is_identified_behind_a_driver():
+    """Against DOP853 in time. At 60 dB the edges beyond half the sample rate would be seen."""
+    _, case = amplitudes_benchmark.cases()
+    # The skin of that case is the start of the fit.
+    case = case._replace(skin=etid.SkinCurrent(r_s=12e3, r_p=150e3, c_p=0.2e-9, i_0=0.3e-3))
+    samples = case.samples
+    assert case.v_th is not None
+    rng = np.random.default_rng(3)
+
+    def noisy(v: np.ndarray) -> np.ndarray:
+        return np.tile(v, 3) + 1e-2 * np.std(v) * rng.standard_normal(3 * v.size)
+
+    def recorded(v_th: np.ndarray, v_out: np.ndarray, **fields: float) -> etid.Recording:
+        rates = {"sample_rate": samples * PULSE_RATE, "pulse_rate": PULSE_RATE}
+        return etid.Recording(noisy(v_th), noisy(v_out), **rates, **fields)  # pyright: ignore[reportArgumentType]
+
+    def wave(spectrum: np.ndarray) -> np.ndarray:
+        return np.fft.irfft(spectrum, samples, norm="forward")
+
+    f = PULSE_RATE * np.arange(case.v_th.size)
+    z_th = amplitudes_benchmark.RESISTANCE + 2j * np.pi * f * amplitudes_benchmark.INDUCTANCE
+    calibrations = [
+        recorded(wave(case.v_th), wave(case.v_th * r / (r + z_th)), r_load=r)
+        for r in (98.8e3, 21.6e3)
+    ]
+    driver = etid.identify_driver(calibrations, order=3, method="maximum_likelihood")
+    of = []
+    for amplitude in (0.1, 0.4, 1.0):
+        one = case._replace(v_th=amplitude * case.v_th)
+        v_out = amplitudes_benchmark.reference(one)
+        of.append(recorded(wave(amplitude * case.v_th), v_out))
+    fit = etid.identify_amplitudes(of, driver)
+    truth = np.asarray(case.skin.values())
+    error = np.asarray(fit.circuit.values()) - truth
+    assert np.all(np.abs(error) < 0.05 * truth), error / truth
+    assert np.all(np.abs(error) < 4 * np.sqrt(np.diag(fit.cov)))  # one of 4 elements in 4 000 fits
 
 
 @pytest.mark.slow
