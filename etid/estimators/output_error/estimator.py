@@ -3,7 +3,7 @@
 import dataclasses
 
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float, Int
 
 from etid.circuits.circuit import AbstractCircuit
 from etid.estimators.element_limits import Limits, stated_limits
@@ -12,6 +12,7 @@ from etid.estimators.estimator import CHECKED, DETERMINED, AbstractEstimator, De
 from etid.estimators.judgement import MISFIT_CHI2, judged, misses, unless
 from etid.estimators.lanes import PaddedSamples
 from etid.estimators.output_error import fit, prediction
+from etid.estimators.output_error.sample_rate import has_aliases, leaves_out
 from etid.estimators.refined_driver import from_samples
 from etid.estimators.score_tests import other_on_harmonics
 from etid.estimators.starts import circuit_starts, current_starts
@@ -30,11 +31,6 @@ INTERPOLATED = 3e-4
 # Limit of χ² behind a measured current. It was 0.98 ± 0.06 in 320 single pulses. Edges of a current
 # that are shorter than a sample shift R_s by six standard errors at 1.3.
 EDGES = 1.25
-# A current has aliases if its power next to half the sample rate is surely above the noise, and
-# above this part of its power at a third of the rate. Steps have 0.03 to 0.16 after a filter of
-# fourth order at 0.4 of the rate, and at most 0.007 after one of eighth order at 0.3.
-ALIASES, SURE = 0.015, 5.0
-TAPER = 48  # samples at each end of a record that a jump there does not reach
 
 
 @dataclasses.dataclass(frozen=True)
@@ -94,9 +90,9 @@ class OutputError(AbstractEstimator):
         limit = EDGES if isinstance(driver, MeasuredCurrent) else MISFIT_CHI2
         off = misses(estimate.chi2, estimate.rrse, INTERPOLATED, limit)
         if isinstance(driver, MeasuredCurrent):
-            found = unless(found, other & ~_has_aliases(m, samples), RESULTS.misfit)
+            found = unless(found, other & ~has_aliases(m, samples), RESULTS.misfit)
             return unless(found, off | other, RESULTS.biased)
-        found = unless(found, off, RESULTS.biased)
+        found = unless(found, off | leaves_out(m, samples), RESULTS.biased)
         if isinstance(driver, HarmonicDriver):
             # The driver of maximum likelihood is more exact than output error. In time, the test
             # would take the error of output error, three standard errors, for a relaxation.
@@ -122,27 +118,6 @@ class OutputError(AbstractEstimator):
             refined=True,
             cited=("ljung1999", "optimistix2024"),
         )
-
-
-def _has_aliases(m: Measurement, samples: Int[Array, ""]) -> Bool[Array, ""]:
-    """Whether the current has aliases: edges that the sample rate does not resolve.
-
-    No filter lets pass what it sees next to half the sample rate and stops all that lies above.
-    """
-    middle = jnp.arange(float(m.v_th.shape[0])) + 0.5
-    to_end = jnp.minimum(middle, samples.astype(float) - middle)
-    window = jnp.sin(jnp.pi / 2 * jnp.clip(to_end / TAPER, 0.0, 1.0)) ** 2
-    power = jnp.abs(jnp.fft.rfft(m.v_th * window)) ** 2 / jnp.sum(window**2)
-    at = jnp.fft.rfftfreq(m.v_th.shape[0])
-
-    def signal(low: float) -> tuple[Float[Array, ""], Float[Array, ""]]:
-        """Power of the signal per sample in a band of 0.05 of the sample rate, and its error."""
-        band = ((at >= low) & (at < low + 0.05)).astype(float)
-        noise, count = m.sigma_th**2, jnp.sum(band)
-        return band @ power / count - noise, noise / jnp.sqrt(count)
-
-    (last, error), (before, _) = signal(0.45), signal(0.3)
-    return (last > SURE * error) & (last > ALIASES * before)
 
 
 def _at_rest(m: Measurement, samples: Int[Array, ""]) -> Measurement:

@@ -241,26 +241,26 @@ def fit_circuit(
         return jnp.concatenate([terms, priors])
 
     def refine(
-        carry: tuple[Float[Array, " q"], Change], _
+        carry: tuple[Float[Array, " q"], Change], late_counts: Float[Array, ""]
     ) -> tuple[
         tuple[Float[Array, " q"], Change],
         tuple[Float[Array, ""], optx.RESULTS, Int[Array, ""]],
     ]:
-        q, late = carry
+        log_elements, nuisance, _ = named(carry[0])
+        late = late_calibration(records, source, load(log_elements), driver.r_known, nuisance.state)
+        late = jax.tree.map(lambda leaf: late_counts * leaf, late)
         solution = optx.least_squares(
-            residual, SOLVER, q, args=late, max_steps=MAX_STEPS, throw=False
+            residual, SOLVER, carry[0], args=late, max_steps=MAX_STEPS, throw=False
         )
-        q = solution.value
-        log_elements, nuisance, _ = named(q)
-        load_there, x0 = load(log_elements), nuisance.state
-        late = late_calibration(records, source, load_there, driver.r_known, x0)
         equations = solution.stats["normal_equations"]
-        return (q, late), (equations.objective, solution.result, solution.stats["num_steps"])
+        outcome = equations.objective, solution.result, solution.stats["num_steps"]
+        return (solution.value, late), outcome
 
     nothing = Change(jnp.zeros(records.hold.shape[0]), jnp.zeros(IMPULSE + 1))
     # First without a delay of the calibration, then with it. In one loop, only one solver is
     # compiled.
-    (q, late), outcomes = jax.lax.scan(refine, (q0, nothing), length=PASSES)
+    counts = jnp.arange(PASSES) > 0
+    (q, late), outcomes = jax.lax.scan(refine, (q0, nothing), counts.astype(float))
     objective, result, steps = outcomes
     result = jax.tree.map(lambda leaf: leaf[-1], result)
     log_elements, nuisance, late_samples = named(q)
