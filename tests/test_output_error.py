@@ -199,11 +199,11 @@ def test_errors_of_a_driver_that_misses_its_calibration_are_as_large_as_it_does(
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("sample_rate", "snr_db", "worst"), [(100e3, 80.0, 5), (100e3, 60.0, 2.5), (150e3, 80.0, 4)]
+    ("sample_rate", "snr_db", "worst"), [(100e3, 80.0, 5), (100e3, 60.0, 3.5), (150e3, 80.0, 4)]
 )
 def test_a_sample_rate_that_is_too_low_for_the_interpolation_is_told(sample_rate, snr_db, worst):
-    """chi2 does not show it: it is 4.5, 1.2 and 1.3. The elements are 8, 5 and 7 errors off."""
-    fit = _in_time(sample_rate, snr_db)
+    """chi2 does not show it: it is 4.5, 1.2 and 1.3. The elements are 9, 5 and 6 errors off."""
+    fit = _in_time(sample_rate, snr_db, seed=1)
     off = (np.array(fit.circuit.values()) - _values(LOADS["dry"])) / np.array(fit.stderr.values())
     assert np.max(np.abs(off)) > worst
     assert fit.verdict == "biased"
@@ -212,7 +212,7 @@ def test_a_sample_rate_that_is_too_low_for_the_interpolation_is_told(sample_rate
 @pytest.mark.slow
 @pytest.mark.parametrize(("sample_rate", "snr_db"), [(200e3, 80.0), (150e3, 50.0)])
 def test_a_sample_rate_that_suffices_is_not_blamed(sample_rate, snr_db):
-    fit = _in_time(sample_rate, snr_db)
+    fit = _in_time(sample_rate, snr_db, seed=1)
     off = (np.array(fit.circuit.values()) - _values(LOADS["dry"])) / np.array(fit.stderr.values())
     assert np.max(np.abs(off)) < 4  # standard errors; three elements
     assert fit.verdict == "successful"
@@ -221,14 +221,14 @@ def test_a_sample_rate_that_suffices_is_not_blamed(sample_rate, snr_db):
 @pytest.mark.slow
 def test_the_rrse_is_that_of_the_noise():
     """The delay of the calibration is large here: its first order depends on where it is taken."""
-    fit = _in_time(125e3, 40.0)
+    fit = _in_time(125e3, 40.0, seed=0)
     assert 0.9 < fit.chi2 < 1.1
     assert fit.rrse < 0.02  # noise of 1 % in both records; it was 5 from another point
 
 
-def _in_time(sample_rate, snr_db):
+def _in_time(sample_rate, snr_db, seed):
     samples = round(0.05 * sample_rate) + 1
-    study = rung("dry", snr_db=snr_db, sample_rate=sample_rate, samples=samples).simulate(0)
+    study = rung("dry", snr_db=snr_db, sample_rate=sample_rate, samples=samples).simulate(seed)
     driver = etid.identify_driver(study[CALIBRATION], method="output_error")
     return etid.identify_skin(study[TRIAL], driver, method="output_error", throw=False)
 
