@@ -124,9 +124,9 @@ def symbol(name: str, unit: str) -> str:
 
 
 def titled(axis: Axes, lines: Sequence[str], *, good: bool = True) -> None:
-    """Set a title on the left; red and bold if the picture does not show a valid result."""
-    look: dict[str, Any] = {"color": INK} if good else {"color": RED, "fontweight": "bold"}
-    axis.set_title("\n".join(filter(None, lines)), loc="left", fontsize=9, **look)
+    """Set a title on the left; red if the picture does not show a valid result."""
+    color = INK if good else RED
+    axis.set_title("\n".join(filter(None, lines)), loc="left", fontsize=9, color=color)
 
 
 def save(figure: Figure, path: str | os.PathLike[str]) -> None:
