@@ -6,6 +6,7 @@ with a remark can be successful.
 """
 
 import enum
+import functools
 
 import numpy as np
 
@@ -65,7 +66,12 @@ _TEXTS = {
 
 def words(remarks: int | np.integer) -> str:
     """Names of the remarks, separated by spaces; empty if there is none."""
-    return " ".join(str(one.name) for one in Remark if one & int(remarks))
+    return _words(int(remarks))
+
+
+@functools.cache  # files hold few combinations, 10^5 times each
+def _words(remarks: int) -> str:
+    return " ".join(str(one.name) for one in Remark if one & remarks)
 
 
 def texts(remarks: int | np.integer) -> list[str]:
@@ -73,6 +79,7 @@ def texts(remarks: int | np.integer) -> list[str]:
     return [_TEXTS[one] for one in Remark if one & int(remarks)]
 
 
+@functools.cache
 def remarks_of(text: str) -> int:
     """Remarks from a text of `words`.
 
