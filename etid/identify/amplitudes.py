@@ -34,7 +34,8 @@ from etid.identify.arguments import (
 )
 from etid.identify.arguments import recordings as list_of
 from etid.identify.compiled import stored_jit
-from etid.identify.one import failed_fit, known_of, remarks_on, successful
+from etid.identify.one import known_of, remarks_on, successful
+from etid.identify.unfitted import failed_fit
 from etid.recordings.preflight import Inspected
 from etid.recordings.recording import Recording, RecordingError
 from etid.results.driver import Driver, HarmonicDriver

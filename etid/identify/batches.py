@@ -29,7 +29,6 @@ from etid.identify.arguments import Asked, check_default
 from etid.identify.compiled import stored_jit
 from etid.identify.one import (
     Tried,
-    failed_fit,
     is_shared,
     judged,
     known_of,
@@ -40,6 +39,7 @@ from etid.identify.one import (
 )
 from etid.identify.planning import FEWEST, Planned, Refusal, calls, planned
 from etid.identify.prefetch import prefetch
+from etid.identify.unfitted import failed_fit
 from etid.recordings.preflight import Inspected
 from etid.recordings.recording import Recording
 from etid.results.feed import AbstractFeed

@@ -23,7 +23,8 @@ from etid.identify.arguments import (
     recordings,
 )
 from etid.identify.compiled import stored_jit
-from etid.identify.one import checksum, explained, needs_another, of_both
+from etid.identify.one import checksum, needs_another, of_both
+from etid.identify.unfitted import explained
 from etid.recordings.preflight import Inspected, preflight
 from etid.recordings.recording import Recording
 from etid.recordings.repeats import repeats

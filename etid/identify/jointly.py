@@ -59,7 +59,6 @@ from etid.identify.many import common_first, identify_part, table, to_identify
 from etid.identify.one import (
     checksum,
     concluded,
-    failed_fit,
     is_shared,
     notes_of,
     remarks_on,
@@ -67,6 +66,7 @@ from etid.identify.one import (
 )
 from etid.identify.planning import Refusal, calls, planned
 from etid.identify.study_drivers import Drivers
+from etid.identify.unfitted import failed_fit
 from etid.recordings.preflight import Inspected
 from etid.recordings.recording import Recording
 from etid.recordings.remarks import Remark

@@ -7,12 +7,10 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, Literal, TypeVar, overload
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from etid.circuits.circuit import AbstractCircuit, SkinRC
-from etid.estimators.element_limits import Limits, limited, of_circuit
 from etid.estimators.estimator import AbstractEstimator
 from etid.estimators.judgement import MISFIT_CHI2
 from etid.estimators.lanes import (
@@ -38,8 +36,8 @@ from etid.identify.arguments import (
     plan,
 )
 from etid.identify.compiled import stored_jit
-from etid.recordings.causes import why_implausible, why_misaligned
-from etid.recordings.preflight import FLAT, Inspected, preflight
+from etid.identify.unfitted import EXPLAINED, explained, failed_fit
+from etid.recordings.preflight import Inspected
 from etid.recordings.recording import Recording
 from etid.recordings.remarks import Remark
 from etid.recordings.repeats import Repeats, repeats
@@ -47,13 +45,11 @@ from etid.results.data import with_data
 from etid.results.driver import Driver, HarmonicDriver
 from etid.results.feed import MEASURED_CURRENT, AbstractFeed
 from etid.results.fit import Fit, IdentificationError, Support
-from etid.results.verdicts import message, verdict, verdicts_of
+from etid.results.verdicts import message, verdicts_of
 from etid.selection.evidence import best
 from etid.selection.search import search
 from etid.selection.selection import Selection
 
-# Verdicts whose message says more of a recording.
-EXPLAINED = ("rate_mismatch", "misaligned", "wrong_unit", "flat", "nonfinite_samples")
 NOTED = ("changed", "out_of_bounds")  # verdicts to which `note` adds numbers
 SPARSE = 16  # every 16th sample enters a checksum
 KEPT = 4  # drivers, for which `known_of` is kept
@@ -526,53 +522,3 @@ def is_shared(seen: Inspected, driver: AbstractFeed) -> bool:
     """Whether a recording and a calibration may share one unloaded record."""
     known = driver.unloaded if isinstance(driver, HarmonicDriver) else None
     return known is None or checksum(seen) in known
-
-
-def explained(seen: Inspected, name: str) -> str:
-    """The message of a verdict of `etid.recordings.preflight`, with the numbers found."""
-    found = ""
-    if seen.by_current is not None and name in EXPLAINED and preflight(seen) != name:
-        seen = seen.by_current  # the fault is in the current
-    if name == "rate_mismatch":
-        found = seen.train.mismatch
-    elif name == "misaligned":
-        found = why_misaligned(seen)
-    elif name == "wrong_unit":
-        found = why_implausible(seen.by_current or seen)
-    elif name in ("flat", "nonfinite_samples"):
-        found = f"The fault is in {' and '.join(_faulty(seen, name))}."
-    return f"{found} {message(name)}".strip()
-
-
-def _faulty(seen: Inspected, name: str) -> list[str]:
-    """Names of the records that are flat, or that hold numbers that are not finite."""
-    records = {seen.recording.cause: seen.sigma_th, "v_out": seen.sigma_out}
-    if name == "flat":
-        faults = (seen.spans <= FLAT * np.array([*records.values()])) | (seen.spans == 0)
-    else:
-        faults = [not np.isfinite(seen.recording.samples[one].values).all() for one in records]
-    return [one for one, fault in zip(records, faults, strict=True) if fault]
-
-
-def failed_fit(name: str, circuit: AbstractCircuit, method: str, bounds: Limits = ()) -> Fit:
-    """A fit without numbers, for a recording that was not fitted."""
-    size = len(circuit.names())
-    nan = np.full((size, size), np.nan)
-    empty = circuit.with_log_values(jnp.full(size, jnp.nan))
-    scalar = np.asarray(np.nan)
-    none = changes.unknown(size)
-    fit = Fit(
-        circuit=empty,
-        cov=nan,
-        shared_cov=nan,
-        rrse=scalar,
-        chi2=scalar,
-        result=verdict(name),
-        steps=np.asarray(0),
-        method=method,
-        change=none.size,
-        change_stderr=none.stderr,
-        support=Support.unknown(size),
-        limits=limited(circuit, of_circuit(bounds, circuit)),
-    )
-    return jax.tree.map(np.asarray, fit)

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 from etid.estimators.estimator import AbstractEstimator
 from etid.identify.arguments import Asked, plan
-from etid.identify.one import explained
+from etid.identify.unfitted import explained
 from etid.recordings.preflight import Group, Inspected
 from etid.recordings.recording import Recording, RecordingError
 from etid.results.feed import AbstractFeed

@@ -51,7 +51,8 @@ from etid.estimators.maximum_likelihood.given_driver import GivenDriver, combine
 from etid.estimators.registry import MAXIMUM_LIKELIHOOD
 from etid.identify.arguments import circuit_of, number_of, require, require_float64
 from etid.identify.compiled import stored_jit
-from etid.identify.one import explained, known_at
+from etid.identify.one import known_at
+from etid.identify.unfitted import explained
 from etid.online import changes
 from etid.online.changes import Change
 from etid.online.gain_bands import cut, unloaded_bands
