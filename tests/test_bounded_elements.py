@@ -206,6 +206,7 @@ def test_the_likeliest_point_inside_several_bounds_is_that_of_scipy():
     np.testing.assert_allclose(found, best.fun, rtol=1e-5)  # of SciPy's search
 
 
+@pytest.mark.slow
 def test_an_element_outside_and_its_bound_are_named_wherever_verdicts_are(
     noisy, free, beyond, tmp_path
 ):

@@ -239,6 +239,7 @@ def test_a_wrong_known_element_of_a_batch_is_refused(skin):
         etid.identify_skins([skin], fixed={"r_x": 1.0})
 
 
+@pytest.mark.slow
 def test_draws_of_a_fit_with_known_elements_keep_to_them(skin):
     fit = etid.identify_skin(skin, **KNOWN)
     draws = fit.posterior()

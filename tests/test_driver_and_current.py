@@ -155,7 +155,7 @@ def late_record(name: str, late: float, circuit=SKIN, seed=2, **fields) -> etid.
     return early.replace(**{name: other.samples[name]})
 
 
-@pytest.mark.parametrize("snr_db", [40.0, 60.0])
+@pytest.mark.parametrize("snr_db", [pytest.param(40.0, marks=pytest.mark.slow), 60.0])
 def test_a_lag_of_one_record_is_taken_off(snr_db):
     """It was a misfit: v_out and the current were aligned together with v_th, never each alone."""
     levels = {"snr_db": snr_db, "current_snr_db": snr_db}

@@ -89,6 +89,7 @@ def test_what_a_calibration_tells_is_one_standard_deviation_along_each_direction
     np.testing.assert_allclose(moved, (z + R_LOAD) * np.exp(0.1 + 0.05j) - R_LOAD, rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_what_drifts_after_the_calibration_is_one_more_z_for_each_parameter(driver):
     """∂W/∂z = σ ∂Z_th/∂p / (Z_th + R); the calibrations tell nothing about it."""
     later, frequency = (

@@ -76,6 +76,7 @@ def test_skins_are_right_within_their_errors(fits):
     assert (np.abs(np.asarray(fits.chi2) - 1) < 0.25).all()
 
 
+@pytest.mark.slow
 def test_with_rounding_alone_the_bias_is_below_half_a_per_cent():
     """One period with its trigger delay fitted; three reach 0.2 % in test_spice_recordings."""
     clean = scene(snr_db=None).simulate(seed=0)
@@ -120,6 +121,7 @@ def test_scaling_all_voltages_changes_nothing(study, driver):
     np.testing.assert_allclose(again.circuit.values(), fit.circuit.values(), rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_ten_decibels_of_noise_give_the_root_of_ten_in_the_errors():
     """Noisy enough that what one period leaves undetermined (delay, C_p) is noise's doing."""
     errors = []
@@ -162,6 +164,7 @@ def test_several_calibrations_leave_every_element_within_its_error():
         assert (np.abs(error) < SIGMAS * np.asarray(fits.stderr.values())[i]).all()
 
 
+@pytest.mark.slow
 def test_the_papers_method_never_calls_its_bias_successful(study):
     driver = etid.identify_driver(
         study["calibration/98k8"], method="steiglitz_mcbride", throw=False

@@ -85,7 +85,10 @@ def test_hum_between_the_harmonics_is_subtracted(frequency, samples):
     assert np.abs(left[far])[10:].max() < noise
 
 
-@pytest.mark.parametrize("settings", [{}, {"pulse_rate_ppm": 150.0}, {"samples": 16_667}])
+@pytest.mark.parametrize(
+    "settings",
+    [{}, pytest.param({"pulse_rate_ppm": 150.0}, marks=pytest.mark.slow), {"samples": 16_667}],
+)
 @pytest.mark.parametrize("snr_db", [20.0, 40.0, 80.0])
 def test_no_hum_is_seen_where_there_is_none(settings, snr_db):
     for recording in study_of(snr_db=snr_db, offset_rms=0.1, **settings).values():

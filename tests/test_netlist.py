@@ -169,6 +169,7 @@ def test_an_exponent_above_one_has_no_passive_network():
 # --- ngspice --------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(
     shutil.which("ngspice") is None, reason="ngspice is not installed; Debian package ngspice"
 )
