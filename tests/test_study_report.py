@@ -324,6 +324,17 @@ def test_an_endless_label_is_drawn_without_a_warning():
         assert b"<svg" in figures.each_fit(fits)
 
 
+@pytest.mark.parametrize("value", [0.0, -3e4])
+def test_only_successful_fits_need_positive_elements(tmp_path, value):
+    """A resistor has no C_p, and Steiglitz-McBride gives negative elements; both say so."""
+    verdicts = ["successful", "insensitive", "unstable"]
+    fits_of([1.0, value, value], verdicts).write(tmp_path / "fits.h5")
+    again = etid.Fits.read(tmp_path / "fits.h5")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        etid.write_report(again, tmp_path / "page.html")
+
+
 def test_a_file_with_an_element_of_zero_is_refused(tmp_path):
     fits_of(np.ones(3), ["successful"] * 3).write(tmp_path / "fits.h5")
     with h5py.File(tmp_path / "fits.h5", "r+") as file:

@@ -24,12 +24,15 @@ class Worst:
 
 
 def relative_stderr(fits: Fits) -> np.ndarray:
-    """Largest relative standard error of the elements of each fit; NaN if one is NaN."""
-    ratios = [
-        np.asarray(getattr(fits.stderr, name)) / np.abs(np.asarray(getattr(fits.circuit, name)))
-        for name in fits.circuit.names()
-    ]
-    stacked = np.stack(ratios)
+    """Largest relative standard error of the elements of each fit; NaN if one is NaN or both 0."""
+    with np.errstate(divide="ignore", invalid="ignore"):  # an element without effect may be 0
+        stacked = np.stack(
+            [
+                np.asarray(getattr(fits.stderr, name))
+                / np.abs(np.asarray(getattr(fits.circuit, name)))
+                for name in fits.circuit.names()
+            ]
+        )
     return np.where(np.isnan(stacked).any(axis=0), np.nan, stacked.max(axis=0))
 
 

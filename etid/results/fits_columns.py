@@ -70,10 +70,14 @@ def columns_of(
     remarks = _remarks(table, read.get("remarks", np.full(count, "")))
     numbers = (*kind.names(), "rrse", "chi2", "cov", "shared_cov")
     real = {name: read[name].astype(float) for name in numbers}
+    # Steiglitz-McBride may give others negative elements, and an element without effect may be 0.
+    successful = read["verdict"] == "successful"
     for name in kind.names():
-        if np.any(real[name] <= 0.0):  # NaN where a fit failed
+        wrong = successful & ~(real[name] > 0.0)
+        if wrong.any():
             raise RecordingError(
-                f"{np.nanmin(real[name]):g} is no value of an element: they are positive",
+                f"{real[name][wrong][0]:g} is no value of an element: a successful fit has "
+                "positive ones",
                 file=table.name,
                 field=name,
                 remedy="The file is damaged: copy it again, or fit the recordings again",
