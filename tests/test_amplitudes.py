@@ -4,6 +4,8 @@ The truth is a differential equation of the skin under a current source, solved 
 in time; harmonic balance and fits know nothing of it.
 """
 
+import dataclasses
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -13,9 +15,14 @@ from scipy.special import erf
 import etid
 from benchmarks import amplitudes as amplitudes_benchmark
 from etid.circuits.current_dependent import Norton, Signals, current_dependent_resistor, port
+from etid.estimators.amplitudes.terms import Amplitudes
+from etid.estimators.lanes import Harmonics, stacked
+from etid.estimators.registry import MAXIMUM_LIKELIHOOD
 from etid.identify.amplitudes import leaves_much
+from etid.identify.one import known_of
 from etid.recordings.preflight import Inspected
 from etid.recordings.remarks import Remark
+from etid.results.feed import MEASURED_CURRENT
 from etid.signals.transfer import frequency_variable
 from etid.solvers.harmonic_balance import steady_state, to_harmonics, to_time
 
@@ -104,6 +111,18 @@ def test_a_large_i_0_is_a_linear_load():
     peak = np.abs(np.asarray(linear)).max()
     np.testing.assert_allclose(signals.voltage, linear, atol=1e-7 * peak)
     np.testing.assert_allclose(signals.current * z, linear, atol=1e-7 * peak)
+
+
+def test_harmonics_that_are_not_fitted_act_on_the_skin():
+    """Aliases or hum keep them from the fit; zeros in their place would be another stimulus."""
+    lane = Harmonics.of(Inspected(recording(1e-3, 0)))
+    known = known_of(lane, MEASURED_CURRENT, False, MAXIMUM_LIKELIHOOD)
+    rate = jnp.array(SAMPLE_RATE)
+    of = Amplitudes(known, MEASURED_CURRENT, SKIN, stacked([lane]).spectrum, rate)
+    (own,) = of.own(of.start(SKIN.log_values()))
+    few = dataclasses.replace(lane.spectrum, selected=lane.spectrum.frequency > 400.0)
+    all_fitted, few_fitted = (of.loaded(own, one) for one in (lane.spectrum, few))
+    np.testing.assert_array_equal(few_fitted, all_fitted)
 
 
 def test_what_cannot_be_fitted_is_refused_at_once():
@@ -315,7 +334,12 @@ def test_slow_recovery_is_told_from_other_misfits(name, snr_db):
 
 @pytest.mark.slow
 def test_skin_that_falls_with_its_current_is_identified_behind_a_driver():
-    """Against DOP853 in time. At 60 dB the edges beyond half the sample rate would be seen."""
+    """Against DOP853 in time, with an anti-alias filter and a whole number of samples per period.
+
+    Before, the harmonics that are not fitted then were not in the source of the skin either: R_s
+    was 25 standard errors too small here, and 3 to 6 with the skin of that case, in successful
+    fits.
+    """
     _, case = amplitudes_benchmark.cases()
     # The skin of that case is the start of the fit.
     case = case._replace(skin=etid.SkinCurrent(r_s=12e3, r_p=150e3, c_p=0.2e-9, i_0=0.3e-3))
@@ -324,7 +348,7 @@ def test_skin_that_falls_with_its_current_is_identified_behind_a_driver():
     rng = np.random.default_rng(3)
 
     def noisy(v: np.ndarray) -> np.ndarray:
-        return np.tile(v, 3) + 1e-2 * np.std(v) * rng.standard_normal(3 * v.size)
+        return np.tile(v, 3) + 1e-3 * np.std(v) * rng.standard_normal(3 * v.size)
 
     def recorded(v_th: np.ndarray, v_out: np.ndarray, **fields: float) -> etid.Recording:
         rates = {"sample_rate": samples * PULSE_RATE, "pulse_rate": PULSE_RATE}
@@ -342,14 +366,15 @@ def test_skin_that_falls_with_its_current_is_identified_behind_a_driver():
     driver = etid.identify_driver(calibrations, order=3, method="maximum_likelihood")
     of = []
     for amplitude in (0.1, 0.4, 1.0):
-        one = case._replace(v_th=amplitude * case.v_th)
-        v_out = amplitudes_benchmark.reference(one)
-        of.append(recorded(wave(amplitude * case.v_th), v_out))
+        one = case._replace(v_th=amplitude * case.v_th, samples=4 * samples)
+        v_out = np.fft.rfft(amplitudes_benchmark.reference(one), norm="forward")
+        of.append(recorded(wave(amplitude * case.v_th), wave(v_out[: f.size - 1])))
     fit = etid.identify_amplitudes(of, driver)
     truth = np.asarray(case.skin.values())
     error = np.asarray(fit.circuit.values()) - truth
-    assert np.all(np.abs(error) < 0.05 * truth), error / truth
-    assert np.all(np.abs(error) < 4 * np.sqrt(np.diag(fit.cov)))  # one of 4 elements in 4 000 fits
+    assert np.all(np.abs(error) < 0.01 * truth), error / truth
+    stderr = np.sqrt(np.diag(fit.cov))
+    assert np.all(np.abs(error) < 4 * stderr), error / stderr  # one of 4 elements in 4 000 fits
 
 
 @pytest.mark.slow

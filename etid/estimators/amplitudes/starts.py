@@ -70,7 +70,7 @@ def _seen(
         own, spectrum = each
         still = STILL * spectrum.frequency[:1]
         source = of.source(own, spectrum, jnp.concatenate([still, spectrum.frequency]))
-        y = jnp.pad(jnp.where(spectrum.selected, spectrum.y, 0.0), (1, 0))
+        y = jnp.pad(spectrum.y, (1, 0))  # of all harmonics, like the source
         points = 2 * spectrum.frequency.size
         i = to_time(source.current - source.admittance * y, points)
         squares = jnp.sum(i**2)

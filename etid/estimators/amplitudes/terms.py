@@ -129,7 +129,8 @@ class Amplitudes(eqx.Module):
     ) -> Norton:
         """The source of a record, at all frequencies of the balance."""
         known, room = spectrum.frequency.size, frequency.size - spectrum.frequency.size - 1
-        x = jnp.pad(jnp.where(spectrum.selected, spectrum.x, 0.0), (1, room))
+        # Harmonics that are not fitted are a part of the stimulus too.
+        x = jnp.pad(spectrum.x, (1, room))
         if not isinstance(self.given, GivenDriver) or isinstance(self.feed, MeasuredCurrent):
             return Norton(x, jnp.zeros_like(x))
         gain = self.gain(spectrum)
