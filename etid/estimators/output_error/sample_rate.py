@@ -14,10 +14,11 @@ NEAR_NYQUIST = 0.45  # of the sample rate
 # part of its power at a third of the rate. Steps have 0.03 to 0.16 after a filter of fourth order
 # at 0.4 of the rate, and at most 0.007 after one of eighth order at 0.3.
 ALIASES, SURE = 0.015, 5.0
-# The interpolation leaves out a thirtieth of the part of V_th above NEAR_NYQUIST. Between 40 and
-# 80 dB and 100 and 1000 kHz, elements are three and more standard errors off where this is more
-# than a fifth of the noise and more than 1e-4 of the signal.
-LEFT_OUT, HARMLESS, HIDDEN = 1 / 30, 1e-4, 0.2
+# The interpolation leaves out a thirtieth of the part of V_th above NEAR_NYQUIST. What this shifts,
+# in standard errors, grows with the root of the number of samples. Between 40 and 80 dB and 100 and
+# 1000 kHz, elements were three and more standard errors off only where this part is more than 15
+# times the noise over that root, and more than 1e-4 of the signal.
+LEFT_OUT, HARMLESS, HIDDEN = 1 / 30, 1e-4, 15.0
 TAPER = 48  # samples at each end of a record that a jump there does not reach
 
 
@@ -62,7 +63,7 @@ def leaves_out(m: Measurement, samples: Int[Array, ""]) -> Bool[Array, ""]:
     high = jnp.sum(jnp.where(above, jnp.abs(jnp.fft.rfft(v_th)) ** 2, 0.0)) * 2 / v_th.size
     signal = high - (1 - 2 * NEAR_NYQUIST) * m.sigma_th**2 * count
     part = LEFT_OUT * jnp.sqrt(jnp.maximum(signal, 0.0) / jnp.sum(v_th**2))
-    noise = jnp.sqrt((m.sigma_th**2 + m.sigma_out**2) * count / jnp.sum(v_out**2))
+    noise = jnp.sqrt((m.sigma_th**2 + m.sigma_out**2) / jnp.sum(v_out**2))
     return part > jnp.maximum(HARMLESS, HIDDEN * noise)
 
 
