@@ -30,8 +30,8 @@ from jaxtyping import Array, Complex, Float
 from etid.estimators.amplitudes.terms import Amplitudes
 from etid.estimators.maximum_likelihood.terms import excess, variance
 from etid.estimators.sandwich import Curvature
-from etid.signals.harmonics import Spectrum, real_parts, signal_share
-from etid.signals.transfer import as_complex
+from etid.signals.harmonics import ALIASED, Spectrum, real_parts, signal_share
+from etid.signals.transfer import as_complex, power
 
 # Relative error of conjugate gradients, and most iterations. The standard errors are within 0.2 %
 # of those with 1 %; with 10 % they would be 1 % larger.
@@ -94,12 +94,14 @@ def last_step(of: Amplitudes, q: Float[Array, " q"]) -> Step:
         last = of.elements + of.count
         acting = jnp.r_[: of.elements, of.elements + number, last : q.size]  # no other delay
         rows, of_signal = real_parts(rows[acting]), real_parts(of_signal[acting])
-        around = _around(of, own, quiet, weight)
+        around = _around(of, own, _unknown_hum(of, quiet), weight)
+        # Without hum: it is no random error, and its size would hide that of the noise.
+        noise = _around(of, own, quiet, weight)
         rest = real_parts((noisy.y - around.predicted) * as_complex(weight))
         rest = rest - around.along(real_parts(noisy.x - quiet.x))
         b = jax.vmap(around.solved)(rows)
         inflated = b * jnp.sqrt(excess(rest, noisy.selected))[None]
-        score = jax.vmap(around.covariance)(inflated) @ inflated.T
+        score = jax.vmap(noise.covariance)(inflated) @ inflated.T
         matrix, where = jnp.zeros((q.size, q.size)), jnp.ix_(acting, acting)
         gradient = jnp.zeros(q.size).at[acting].set(b @ rest)
         return matrix.at[where].set(b @ of_signal.T), matrix.at[where].set(score), gradient
@@ -122,13 +124,20 @@ def _likeliest(
     weight: Float[Array, " harmonic"],
 ) -> tuple[Complex[Array, " harmonic"], Float[Array, " harmonic"]]:
     """The likeliest X of both records to first order, and the share of signal in its power."""
-    around = _around(of, own, spectrum, weight)
+    around = _around(of, own, _unknown_hum(of, spectrum), weight)
     rest = real_parts((spectrum.y - around.predicted) * as_complex(weight))
     change = around.back(around.solved(rest))
     count = spectrum.x.size
     x = spectrum.x + jax.lax.complex(change[:count], change[count:])
     total = variance(spectrum, of.gain(spectrum)(own))
     return x, signal_share(x, spectrum.variance_x * spectrum.variance_y / total)
+
+
+def _unknown_hum(of: Amplitudes, spectrum: Spectrum) -> Spectrum:
+    """The same with an X of unknown size where mains hum covers it, below the aliases."""
+    covered = ~spectrum.selected & (spectrum.frequency < ALIASED * of.sample_rate)
+    variance_x = jnp.where(covered, power(spectrum.x), spectrum.variance_x)
+    return eqx.tree_at(lambda s: s.variance_x, spectrum, variance_x)
 
 
 def _around(
