@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Complex, Float
 
 import etid
-from benchmarks.coverage import NORMAL_95, SILENT
+from benchmarks.coverage import NORMAL_95, SILENT, expected_covered
 from etid.results.verdicts import counted
 
 POINTS = 61  # one shape for all faults: a program is compiled for each
@@ -255,7 +255,8 @@ def main(arguments: argparse.Namespace) -> bool:
         refused = int((~np.isin(verdicts, ACCEPTED)).sum())
         covered, rms = np.mean(np.abs(z) < NORMAL_95), np.sqrt(np.mean(z**2))
         met &= refused <= max(REFUSED * len(answers), 1)
-        met &= COVERED[0] <= covered <= COVERED[1]
+        low, high = expected_covered(z.size)  # few draws scatter more
+        met &= min(COVERED[0], low) <= covered <= max(COVERED[1], high)
         silent += sum(one.silent for one in answers)
         print(
             f"good, {points:>3}      {counted(verdicts)}; refused: {refused}; "

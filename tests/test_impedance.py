@@ -206,7 +206,9 @@ def test_the_order_of_the_frequencies_does_not_matter():
     ]
     assert fits[0].verdict == fits[1].verdict == "misfit"
     np.testing.assert_allclose(*(fit.cov for fit in fits), rtol=1e-9)
-    np.testing.assert_array_equal(fits[1].measured.frequency, frequency[mixed])
+    known = fits[1].measured
+    assert known is not None
+    np.testing.assert_array_equal(known.frequency, frequency[mixed])
 
 
 def test_exact_impedances_have_no_remark():

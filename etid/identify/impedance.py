@@ -42,9 +42,9 @@ MAX_STEPS = 500
 LEVELS = np.geomspace(0.1, 10.0, 5)  # impedance levels of the starts, relative to the data
 CORNERS = 5  # corner frequencies of the starts, from the lowest to the highest frequency
 SOLVER = LevenbergMarquardt()
-LACK = 1e-4  # by chance, of a right circuit; the choice of the chain makes it three times as likely
+LACK = 1e-4  # by chance, if the chain is given; its choice makes it three times as likely
 RUNS = 3.5  # standard deviations of the autocorrelation of white noise: 1 spectrum in 4 000
-TAILS = 2.5  # rms over what the median says; of 40 normal numbers below 2.0 in 3 000 draws
+TAILS = 2.5  # rms over what the median says; of 40 normal numbers in 5 of 1 000 000 draws
 MEDIAN = 0.6745  # of the size of a normal number
 
 
