@@ -29,6 +29,7 @@ NAMES = (
     "paper",
     "failure_map",
     "perturbations",
+    "spectra",
     "rivals",
     "referee",
     "fuzz",

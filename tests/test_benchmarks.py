@@ -14,7 +14,7 @@ import pytest
 import scipy.signal
 
 import etid
-from benchmarks import amplitudes, curves, online, peers, scale, timing
+from benchmarks import amplitudes, curves, online, peers, scale, spectra, timing
 from benchmarks.large_file import LAYOUTS, SAMPLES, large_file
 from benchmarks.online_alarms import Alarms
 from benchmarks.problem import START, ByNumPy, problem
@@ -243,3 +243,21 @@ def test_a_rival_that_is_not_installed_is_said(monkeypatch, capsys):
     monkeypatch.setattr(amplitudes, "reference", lambda _: np.ones(8))
     assert not amplitudes.main(argparse.Namespace(samples=8))
     assert "diffrax: failed to install" in capsys.readouterr().out
+
+
+@pytest.mark.slow
+def test_a_spectrum_with_a_fault_is_never_called_successful_and_wrong(capsys):
+    assert spectra.main(argparse.Namespace(spectra=15, good=15, seed=1))
+    printed = capsys.readouterr().out
+    assert printed.count("silent: 0") == len(spectra.FAULTS)
+    assert printed.count("misfit") >= len(spectra.FAULTS)
+
+
+def test_an_answer_that_is_wrong_beyond_its_errors_is_silent():
+    right = spectra.good(np.random.default_rng(0))
+    name = next(iter(right.truth))
+    low = right.truth[name][0]
+    moved = dataclasses.replace(right, truth={**right.truth, name: (1.5 * low, 1.5 * low)})
+    assert not spectra.answer(right).silent
+    assert spectra.answer(moved).silent
+    assert spectra.answer(dataclasses.replace(right, truth={})).silent

@@ -110,6 +110,118 @@ def test_bad_input_is_named(frequency, z, text):
         etid.identify_impedance(frequency, z)
 
 
+def relative(circuit, size, seed):
+    """A spectrum with noise that is a part of |Z|."""
+    frequency, z = measured(circuit, 0.0, seed)
+    parts = np.random.default_rng(seed).normal(size=(2, 50))
+    return frequency, z + size * np.abs(z) * (parts[0] + 1j * parts[1])
+
+
+def refused(frequency, z, circuit=None):
+    """The text of a misfit, without given standard errors."""
+    with pytest.raises(etid.IdentificationError, match="misfit") as error:
+        etid.identify_impedance(frequency, z, circuit=circuit)
+    return str(error.value)
+
+
+@pytest.mark.parametrize("size", [1e-3, 3e-2])
+def test_without_given_errors_the_noise_is_a_part_of_z(size):
+    """Of 100 draws: 95 % coverage within 3 standard deviations, and no remark."""
+    inside = []
+    for seed in range(100):
+        fit = etid.identify_impedance(*relative(DRY, size, seed))
+        assert int(fit.remarks) == 0
+        error = np.asarray(fit.circuit.values()) - np.asarray(DRY.values())
+        inside.append(np.abs(error) < 1.96 * np.asarray(fit.stderr.values()))
+    assert (np.abs(np.mean(inside, 0) - 0.95) < 3 * np.sqrt(0.95 * 0.05 / 100)).all()
+
+
+def test_the_wrong_sign_of_the_imaginary_part_is_named():
+    frequency, z = relative(DRY, 0.005, 0)
+    assert "Im Z is positive" in refused(frequency, np.conj(z))
+    assert "Im Z" not in str(etid.identify_impedance(frequency, z))
+
+
+def test_a_magnitude_without_phase_is_named():
+    frequency, z = relative(DRY, 0.005, 0)
+    assert "Z is real" in refused(frequency, np.abs(z))
+
+
+def test_another_circuit_is_a_misfit_without_given_errors():
+    cole = etid.SkinCole(33.4e3, 186e3, 22.3e-6, 0.8)
+    for truth, circuit in ((cole, etid.SkinRC()), (DRY, etid.ParallelRC())):
+        assert "not white noise" in refused(*relative(truth, 0.005, 0), circuit)
+    etid.identify_impedance(*relative(cole, 0.005, 0), circuit=etid.SkinCole())
+
+
+def test_a_meter_beyond_its_range_has_no_series_resistance():
+    """200 kΩ and 100 pF in parallel, and a meter that shows at least 40 kΩ, at the right phase."""
+    frequency, z = relative(etid.ParallelRC(200e3, 100e-12), 0.005, 0)
+    limited = z * np.hypot(1.0, 40e3 / np.abs(z))
+    for circuit in (etid.SkinRC(), etid.ParallelRC()):
+        refused(frequency, limited, circuit)
+
+
+@pytest.mark.parametrize("first", [1, 20, 45])
+def test_kiloohm_in_a_part_of_a_file_are_a_misfit(first):
+    frequency, z = relative(DRY, 0.005, 0)
+    refused(frequency, np.where(np.arange(50) < first, z / 1e3, z))
+
+
+def test_errors_of_calibration_widen_the_standard_errors():
+    """A gain that wanders by 0.5 % over the sweep is no noise; the truth stays inside."""
+    frequency, z = relative(DRY, 2e-4, 0)
+    for phase in np.linspace(0.0, 5.0, 6):
+        fit = etid.identify_impedance(
+            frequency, z * (1 + 0.005 * np.sin(np.log(frequency) + phase))
+        )
+        assert "not white noise" in str(fit)
+        error = np.asarray(fit.circuit.values()) - np.asarray(DRY.values())
+        # 2 standard errors are 95 %, of 18 numbers that are not drawn by chance.
+        assert (np.abs(error) < 2 * np.asarray(fit.stderr.values())).all()
+        assert (np.asarray(fit.stderr.values()) < 0.03 * np.asarray(DRY.values())).all()
+
+
+def test_soldered_circuits_are_explained_to_one_per_cent(reference_data):
+    """Errors of the instrument reach 3 % at the highest frequencies, in phase."""
+    for name in PUBLISHED:
+        frequency, z = zplot(reference_data("dummy_circuits_eis") / f"{name}.z")
+        assert "not white noise" in str(etid.identify_impedance(frequency, z))
+        refused(frequency, z, etid.ParallelRC())
+
+
+def test_one_impedance_far_off_is_a_misfit():
+    frequency, z = relative(DRY, 0.002, 0)
+    z[30] *= 1.5
+    assert "a few impedances" in refused(frequency, z)
+
+
+def test_the_order_of_the_frequencies_does_not_matter():
+    cole = etid.SkinCole(33.4e3, 186e3, 22.3e-6, 0.9)
+    frequency, z = relative(cole, 0.02, 0)
+    mixed = np.random.default_rng(0).permutation(50)
+    fits = [
+        etid.identify_impedance(frequency[order], z[order], throw=False)
+        for order in (slice(None), mixed)
+    ]
+    assert fits[0].verdict == fits[1].verdict == "misfit"
+    np.testing.assert_allclose(*(fit.cov for fit in fits), rtol=1e-9)
+    known = fits[1].measured
+    assert known is not None
+    np.testing.assert_array_equal(known.frequency, frequency[mixed])
+
+
+def test_exact_impedances_have_no_remark():
+    for circuit in (DRY, etid.Resistor()):
+        fit = etid.identify_impedance(*measured(circuit, 0.0, 0), circuit=circuit)
+        assert int(fit.remarks) == 0
+
+
+def test_an_impedance_of_zero_has_no_relative_noise():
+    with pytest.raises(ValueError, match="impedance is 0"):
+        etid.identify_impedance([1.0, 2.0, 3.0], [1.0, 0.0, 3.0])
+
+
 def test_two_layers_do_not_end_as_one():
     """From the best start alone, this fit ended with an infinite r_2 and χ² 6.9."""
     truth = etid.SkinLayers(6.1e3, 8.7e3, 1.32e-9, 8.7e3, 5.94e-9)

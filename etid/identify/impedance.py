@@ -1,25 +1,37 @@
 """Identification of a circuit from its measured impedance: frequency, Z, standard error.
 
-Potentiostats and impedance analysers measure Z itself, without a driver in between. The fit
-minimises
+Potentiostats and impedance analysers measure Z itself, without a driver in between. With standard
+errors σ_k the fit minimises
 
     Σ_k |Z(jω_k) − Z_k|² / σ_k²
 
-over the logarithms of the elements. It starts at several corner frequencies that span the data,
-each with the best of several impedance levels, and keeps the best minimum. From a single start, two
-layers sometimes ended as one.
+over the logarithms of the elements. Files of instruments have no standard errors. Then noise is
+taken to be a part of |Z|, and the fit minimises Σ_k |ln(Z(jω_k) / Z_k)|²: the relative error of the
+magnitude and the error of the phase. It has no weights, which would come from noisy impedances.
+
+The fit starts at several corner frequencies that span the data, each with the best of several
+impedance levels, and keeps the best minimum. From a single start, two layers sometimes ended as
+one.
+
+Without standard errors the residual alone says whether the circuit is right; `_judged` does.
 """
 
+from typing import NamedTuple
+
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import numpy.typing as npt
 import optimistix as optx
+import scipy
 from jaxtyping import Array, Complex, Float
 
 from etid.circuits.circuit import AbstractCircuit
 from etid.identify.arguments import circuit_of, require_float64
 from etid.identify.compiled import stored_jit
+from etid.identify.kramers_kronig import EXACT, FAIL, MISFIT_CHI2, kramers_kronig
+from etid.recordings.remarks import Remark, texts
 from etid.results.data import MeasuredImpedance, with_data
 from etid.results.fit import CHANGES, Fit, IdentificationError, Support, complex_rrse
 from etid.results.verdicts import RESULTS, first_verdict, message, verdict
@@ -27,23 +39,42 @@ from etid.solvers.levenberg_marquardt import LevenbergMarquardt, best_start
 from etid.solvers.matrices import inverse
 
 MAX_STEPS = 500
-MISFIT_CHI2 = 1.5  # a standard error of a measured impedance is seldom known to better than 20 %
 LEVELS = np.geomspace(0.1, 10.0, 5)  # impedance levels of the starts, relative to the data
 CORNERS = 5  # corner frequencies of the starts, from the lowest to the highest frequency
 SOLVER = LevenbergMarquardt()
+LACK = 1e-4  # by chance, if the chain is given; its choice makes it three times as likely
+RUNS = 3.5  # standard deviations of the autocorrelation of white noise: 1 spectrum in 4 000
+TAILS = 2.5  # rms over what the median says; of 40 normal numbers in 5 of 1 000 000 draws
+MEDIAN = 0.6745  # of the size of a normal number
+
+
+class PassiveFit(NamedTuple):
+    """What the chain of the Kramers-Kronig test leaves; it can be any passive circuit.
+
+    Attributes:
+        square: Mean square residual per degree of freedom.
+        most: Sum of squares of a right circuit, which chance exceeds in `LACK` (F test).
+    """
+
+    square: float | Float[Array, ""]
+    most: float | Float[Array, ""]
 
 
 @stored_jit
 def _fit(
     frequency: Float[Array, " frequency"],
     z: Complex[Array, " frequency"],
-    sigma: Float[Array, " frequency"],
+    noise: Float[Array, " frequency"] | PassiveFit,
     circuit: AbstractCircuit,
-    known: bool,
 ) -> Fit:
+    passive = noise if isinstance(noise, PassiveFit) else None
+    sigma = None if isinstance(noise, PassiveFit) else noise
+    known = passive is None
+
     def residual(q: Float[Array, " element"], _) -> Float[Array, " part"]:
-        difference = (circuit.with_log_values(q).response(frequency) - z) / sigma.astype(z.dtype)
-        return jnp.concatenate([difference.real, difference.imag])
+        fitted = circuit.with_log_values(q).response(frequency)
+        missed = jnp.log(fitted / z) if sigma is None else (fitted - z) / sigma.astype(z.dtype)
+        return jnp.concatenate([missed.real, missed.imag])
 
     # If a circuit is scaled in impedance by g and in frequency by t, R becomes R·g, C becomes
     # C/(g t).
@@ -68,8 +99,12 @@ def _fit(
     q = solution.value
     equations = solution.stats["normal_equations"]
     chi2 = 2 * equations.objective / (2 * z.size - q.size)
-    scale = jnp.maximum(chi2, 1.0) if known else chi2
-    cov = inverse(equations.matrix) * scale
+    if passive is None:
+        cov = inverse(equations.matrix) * jnp.maximum(chi2, 1.0)
+        misfit, remark = chi2 > MISFIT_CHI2, jnp.zeros((), int)
+    else:
+        cov, excess = _judged(residual(q, None), jax.jacfwd(residual)(q, None), passive)
+        misfit, remark = excess > FAIL, jnp.where(excess > EXACT, int(Remark.not_noise), 0)
     fitted = circuit.with_log_values(q)
     values = fitted.values()
     settled = RESULTS.promote(solution.result) == verdict("successful")
@@ -83,13 +118,71 @@ def _fit(
             (~jnp.isfinite(values).all(), RESULTS.nonphysical),
             (fitted.is_too_steep(cov), RESULTS.nonphysical),
             (~settled, verdict("max_steps_reached")),
-            ((chi2 > MISFIT_CHI2) & known, RESULTS.misfit),
+            (misfit, RESULTS.misfit),
             (~(jnp.sqrt(jnp.diagonal(cov)) < 1).all(), RESULTS.insensitive),
         ),
         steps=solution.stats["num_steps"],
         method="impedance",
+        remarks=remark,
         support=_support(2 * equations.objective, z.size, q.size) if known else None,
     )
+
+
+def _judged(
+    e: Float[Array, " part"], slope: Float[Array, "part element"], passive: PassiveFit
+) -> tuple[Float[Array, "element element"], Float[Array, ""]]:
+    """Covariance of the logarithms, and the rms part of the residual that is not noise.
+
+    Three signs show a residual that is not white noise, each of which says how large the noise is:
+
+    - runs: neighbours miss alike. With autocorrelation ρ, (1 − ρ) of the mean square is noise
+      (von Neumann 1941);
+    - another passive circuit misses by less: an F test against the Kramers-Kronig chain;
+    - tails: a few impedances make most of the mean square, and the median does not see them.
+
+    The covariance is the larger one, element by element, of two: that of equal noise at all
+    frequencies, and the sandwich of the jackknife (MacKinnon and White 1985), which needs no equal
+    noise and contains the effect of each single impedance. A residual that is not noise has fewer
+    independent values, by (1 − ρ) / (1 + ρ) (Bartlett 1935), but one at least.
+    """
+    n, p = slope.shape
+    parts = e.reshape(2, -1)
+    square = jnp.sum(e**2) / (n - p)
+    of_steps = jnp.mean((parts[:, 1:] - parts[:, :-1]) ** 2) / 2
+    rho = 1 - of_steps / jnp.where(square > 0, square, 1.0)
+    usual = (jnp.median(jnp.abs(e)) / MEDIAN) ** 2
+    signs = [rho > RUNS / n**0.5, jnp.sum(e**2) > passive.most, square > TAILS**2 * usual]
+    noise = jnp.stack([of_steps, passive.square, usual])
+    excess = jnp.sqrt(jnp.max(jnp.where(jnp.stack(signs), square - noise, 0.0)))
+    equal = inverse(slope.T @ slope)
+    alone = slope * (e / (1 - jnp.sum((slope @ equal) * slope, axis=1)))[:, None]
+    cov = equal @ (alone.T @ alone) @ equal
+    grown = jnp.fmax(square * jnp.diagonal(equal) / jnp.diagonal(cov), 1.0)  # NaN if all are 0
+    grown *= jnp.where(excess > 0, jnp.clip((1 + rho) / (1 - rho), 1.0, n), 1.0)
+    return cov * jnp.sqrt(jnp.outer(grown, grown)), excess
+
+
+def _passive_fit(
+    f: Float[np.ndarray, " frequency"], z: Complex[np.ndarray, " frequency"], elements: int
+) -> PassiveFit:
+    """The residual of the Kramers-Kronig test; without limit if there are too few frequencies."""
+    try:
+        found = kramers_kronig(f, z)
+    except ValueError:
+        return PassiveFit(np.inf, np.inf)
+    missed = float(np.sum(np.abs(np.log(found.fitted / z)) ** 2))
+    free, more = 2 * f.size - found.parameters, found.parameters - elements
+    if more <= 0:
+        return PassiveFit(missed / free, np.inf)
+    ratio = float(scipy.special.fdtri(more, free, 1 - LACK))
+    return PassiveFit(missed / free, missed * (1 + ratio * more / free))
+
+
+def _remarks(z: Complex[np.ndarray, " frequency"]) -> Remark:
+    """Obvious causes of a fit that is not successful."""
+    if not np.imag(z).any():
+        return Remark.no_phase
+    return Remark.positive_imaginary if np.median(np.imag(z)) > 0 else Remark(0)
 
 
 def _support(deviance: Float[Array, ""], values: int, elements: int) -> Support:
@@ -114,8 +207,9 @@ def identify_impedance(
         frequency: Frequencies [Hz], > 0.
         impedance: Complex impedance [Ω] at each frequency.
         stderr: Standard error [Ω] of the real and of the imaginary part: one number, or one for
-            each frequency. If not given, the fit estimates one number from the residual. χ² is
-            then NaN, and the fit cannot detect a wrong circuit.
+            each frequency. If not given, the noise is taken to be a part of |Z|, which the residual
+            shows. χ² is then NaN. A residual that is not noise is a `misfit` where it exceeds 1 %
+            of |Z|, and else widens the standard errors, with the remark `not_noise`.
         circuit: Structure of the circuit; `SkinRC` if not given. Its values matter little.
         throw: Raise an error if the verdict is not successful.
 
@@ -130,7 +224,7 @@ def identify_impedance(
     require_float64()
     circuit = circuit_of(circuit)
     f, z = np.asarray(frequency, float), np.asarray(impedance, complex)
-    sigma = np.broadcast_to(np.asarray(1.0 if stderr is None else stderr, float), f.shape)
+    sigma = None if stderr is None else np.broadcast_to(np.asarray(stderr, float), f.shape)
     if f.ndim != 1 or z.shape != f.shape:
         raise ValueError(
             f"frequency has shape {f.shape} and impedance {z.shape}; both must be (n,)"
@@ -138,13 +232,22 @@ def identify_impedance(
     if 2 * f.size <= len(circuit.names()):
         raise ValueError(f"{f.size} impedances cannot determine {len(circuit.names())} elements")
     for name, values in {"frequency": f, "stderr": sigma}.items():
-        if not (np.isfinite(values).all() and (values > 0).all()):
+        if values is not None and not (np.isfinite(values).all() and (values > 0).all()):
             raise ValueError(f"{name} must be finite and > 0 everywhere")
     if not np.isfinite(z).all():
         raise ValueError(f"{np.sum(~np.isfinite(z))} impedances are not finite; leave them out")
-    arrays = (jnp.asarray(f), jnp.asarray(z), jnp.asarray(sigma))
-    known = MeasuredImpedance(f, z, None if stderr is None else sigma)
-    fit = with_data(_fit(*arrays, circuit, stderr is not None), known)
+    if sigma is None and not z.all():
+        raise ValueError("impedance is 0 somewhere; leave it out, or give stderr")
+    rising = np.argsort(f, kind="stable")  # neighbours are compared
+    noise = (
+        _passive_fit(f[rising], z[rising], len(circuit.names())) if sigma is None else sigma[rising]
+    )
+    noise = jax.tree.map(jnp.asarray, noise)
+    fit = _fit(jnp.asarray(f[rising]), jnp.asarray(z[rising]), noise, circuit)
+    if fit.verdict != "successful":
+        fit = eqx.tree_at(lambda one: one.remarks, fit, fit.remarks | int(_remarks(z)))
+    fit = with_data(fit, MeasuredImpedance(f, z, sigma))
     if throw and fit.verdict != "successful":
-        raise IdentificationError(f"impedance: {fit.verdict}. {message(fit.verdict)}", fit)
+        causes = " ".join([message(fit.verdict), *texts(int(fit.remarks))])
+        raise IdentificationError(f"impedance: {fit.verdict}. {causes}", fit)
     return fit

@@ -21,8 +21,8 @@ import scipy
 from jaxtyping import Complex, Float
 
 from etid.circuits.overview import Overview, Overviewed
-from etid.identify.impedance import MISFIT_CHI2
 
+MISFIT_CHI2 = 1.5  # a standard error of a measured impedance is seldom known to better than 20 %
 NEAR = 1.2  # times the least mean square; no data tell such models apart
 EXACT = 1e-4  # relative residual that is as good as none
 _COLUMNS = 3  # of a chain without relaxations
@@ -54,6 +54,11 @@ class KramersKronig(Overviewed):
     relaxations: int
     chi2: float | None
     limit: float
+
+    @property
+    def parameters(self) -> int:
+        """Number of fitted parameters."""
+        return _COLUMNS + self.relaxations
 
     @property
     def largest(self) -> float:

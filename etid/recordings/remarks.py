@@ -25,6 +25,9 @@ class Remark(enum.IntFlag):
     at_bound = enum.auto()
     current_unused = enum.auto()
     follows_late = enum.auto()
+    not_noise = enum.auto()
+    positive_imaginary = enum.auto()
+    no_phase = enum.auto()
 
 
 _TEXTS = {
@@ -60,6 +63,19 @@ _TEXTS = {
     Remark.follows_late: (
         "The residual looks like a resistance that follows its current late, as of skin whose "
         "recovery after a pulse is slower than its fall; etid has no model of it."
+    ),
+    Remark.not_noise: (
+        "The residual is not white noise: neighbouring impedances miss alike, or another passive "
+        "circuit misses by less, or a few impedances miss by far the most (leave them out, or give "
+        "stderr). Up to 1 % of Z, as by errors of calibration, this widens the standard errors; "
+        "above, it is a misfit."
+    ),
+    Remark.positive_imaginary: (
+        "Im Z is positive at most frequencies, as of an inductance. If the file holds -Im Z, give "
+        "the complex conjugate."
+    ),
+    Remark.no_phase: (
+        "Z is real at all frequencies. If it is the magnitude alone, give |Z| exp(i phase)."
     ),
 }
 

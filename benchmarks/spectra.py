@@ -1,0 +1,266 @@
+"""Measured impedances without standard errors: good ones, and ones with a fault that must be told.
+
+Every spectrum has 61 frequencies in 3 to 6 decades around the corners of a drawn circuit, with
+white noise of 0.1 to 3 % of |Z|. `FAULTS` are what instruments, cables and people do to it. A fit
+that is called successful is *silent* if an element is wrong by more than five standard errors and
+by more than 2 %, or if the spectrum is none (the sign of Im Z is wrong, or the phase is missing).
+
+Of a circuit that is fitted to another one, the elements that both have are compared. An element
+that drifts during the sweep has every value that it passes. Good spectra have 20, 61 and 100
+frequencies; printed are the refused ones and the part of the 95 % intervals that hold the truth.
+"""
+
+import argparse
+import dataclasses
+from collections.abc import Callable, Mapping
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Complex, Float
+
+import etid
+from benchmarks.coverage import NORMAL_95, SILENT, expected_covered
+from etid.results.verdicts import counted
+
+POINTS = 61  # one shape for all faults: a program is compiled for each
+GOOD_POINTS = (20, POINTS, 100)
+NOISE = (1e-3, 3e-2)  # of |Z|, in the real and in the imaginary part
+NOTICED = 0.02  # relative error of an element that counts
+COVERED = (0.93, 0.97)
+REFUSED = 1e-3  # largest part of the good spectra
+ACCEPTED = ("successful", "insensitive")  # layers that noise hides are not determined
+LAYERS = ("r_1", "c_1", "c_2", "r_2")  # the other way round are those of the other one
+
+
+@dataclasses.dataclass(frozen=True)
+class Spectrum:
+    """A drawn spectrum.
+
+    Attributes:
+        frequency: From high to low, as instruments sweep [Hz].
+        z: With noise [Ω].
+        circuit: What is fitted.
+        truth: Smallest and largest right value of each element that has one; empty if there is no
+            right answer.
+    """
+
+    frequency: Float[np.ndarray, " frequency"]
+    z: Complex[np.ndarray, " frequency"]
+    circuit: etid.AbstractCircuit
+    truth: Mapping[str, tuple[float, float]]
+
+
+def response(circuit: etid.AbstractCircuit, f: np.ndarray) -> Complex[np.ndarray, " frequency"]:
+    """The impedance, by NumPy; elements may have one value for each frequency."""
+    of, s = {name: np.asarray(getattr(circuit, name)) for name in circuit.names()}, 2j * np.pi * f
+    if isinstance(circuit, etid.SkinCole):
+        return of["r_s"] + of["r_p"] / (1 + (s * of["tau"]) ** of["alpha"])
+    if isinstance(circuit, etid.SkinLayers):
+        first, second = (of[f"r_{i}"] / (1 + s * of[f"r_{i}"] * of[f"c_{i}"]) for i in (1, 2))
+        return of["r_s"] + first + second
+    return of.get("r_s", np.zeros(())) + of["r_p"] / (1 + s * of["r_p"] * of["c_p"])
+
+
+def one_rc(rng: np.random.Generator) -> etid.SkinRC:
+    """Dry to damp skin."""
+    total, share = np.exp(rng.uniform(np.log(2e4), np.log(6e5))), rng.uniform(0.05, 0.4)
+    corner = np.exp(rng.uniform(np.log(2e3), np.log(3e4)))
+    r_p = (1 - share) * total
+    return etid.SkinRC(share * total, r_p, 1 / (2 * np.pi * corner * r_p))
+
+
+def no_series(rng: np.random.Generator) -> etid.ParallelRC:
+    """Skin without R_s."""
+    skin = one_rc(rng)
+    return etid.ParallelRC(skin.r_p, skin.c_p)
+
+
+def spread(rng: np.random.Generator, alpha: tuple[float, float] = (0.6, 0.95)) -> etid.SkinCole:
+    """Skin with a spread of time constants."""
+    skin = one_rc(rng)
+    return etid.SkinCole(skin.r_s, skin.r_p, skin.r_p * skin.c_p, rng.uniform(*alpha))
+
+
+def layers(rng: np.random.Generator) -> etid.SkinLayers:
+    """Skin of two layers whose time constants differ by a factor of 5 to 20."""
+    skin, part, times = one_rc(rng), rng.uniform(0.3, 0.7), np.exp(rng.uniform(1.6, 3.0))
+    r_1, r_2 = part * skin.r_p, (1 - part) * skin.r_p
+    tau = skin.r_p * skin.c_p
+    return etid.SkinLayers(skin.r_s, r_1, tau / r_1, r_2, times * tau / r_2)
+
+
+def frequencies(rng: np.random.Generator, points: int = POINTS) -> Float[np.ndarray, " frequency"]:
+    """A sweep of 3 to 6 decades, from high to low, around the middle of the corners."""
+    decades, middle = rng.uniform(3.0, 6.0), np.log10(8e3) + rng.uniform(-0.5, 0.5)
+    return np.logspace(middle + decades / 2, middle - decades / 2, points)
+
+
+def noisy(z: np.ndarray, rng: np.random.Generator) -> Complex[np.ndarray, " frequency"]:
+    """With white noise, a part of |Z|."""
+    size = np.exp(rng.uniform(*np.log(NOISE)))
+    parts = rng.standard_normal((2, z.size))
+    return z + size * np.abs(z) * (parts[0] + 1j * parts[1])
+
+
+def exact(circuit: etid.AbstractCircuit) -> dict[str, tuple[float, float]]:
+    """Elements that have one right value."""
+    values = {name: float(getattr(circuit, name)) for name in circuit.names()}
+    return {name: (value, value) for name, value in values.items()}
+
+
+def good(rng: np.random.Generator, points: int = POINTS) -> Spectrum:
+    """A spectrum without a fault, and its circuit."""
+    circuit = (one_rc, no_series, spread, layers)[rng.integers(4)](rng)
+    f = frequencies(rng, points)
+    return Spectrum(f, noisy(response(circuit, f), rng), type(circuit)(), exact(circuit))
+
+
+def wrong_sign(rng: np.random.Generator) -> Spectrum:
+    """−Im Z, as it is drawn, in place of Im Z."""
+    of = good(rng)
+    return dataclasses.replace(of, z=np.conj(of.z), truth={})
+
+
+def no_phase(rng: np.random.Generator) -> Spectrum:
+    """|Z| in place of Z."""
+    of = good(rng)
+    return dataclasses.replace(of, z=np.abs(of.z).astype(complex), truth={})
+
+
+def wrong_unit(rng: np.random.Generator) -> Spectrum:
+    """Ω for kΩ, or kΩ for Ω, from one frequency to another."""
+    of = good(rng)
+    first, last = np.sort(rng.choice(POINTS + 1, 2, replace=False))
+    scale = np.ones(POINTS)
+    scale[first:last] = 10.0 ** rng.choice([-3, 3])
+    if last - first > POINTS // 2:  # most of the file is right
+        scale /= scale[first]
+    return dataclasses.replace(of, z=of.z * scale)
+
+
+def wrong_circuit(rng: np.random.Generator) -> Spectrum:
+    """Another circuit than the one that is fitted."""
+    kind, f = rng.integers(5), frequencies(rng)
+    if kind <= 1:
+        of = spread(rng, (0.6, 1.0) if kind else (0.9, 1.0))
+        c_p = float(of.tau / of.r_p)
+        truth = {**exact(of), "c_p": (c_p, c_p)}
+        return Spectrum(f, noisy(response(of, f), rng), etid.SkinRC(), truth)
+    if kind == 2:
+        of = layers(rng)
+        total = float(of.r_1 + of.r_2)
+        truth = {"r_s": exact(of)["r_s"], "r_p": (total, total)}
+        return Spectrum(f, noisy(response(of, f), rng), etid.SkinRC(), truth)
+    of = one_rc(rng)
+    z, total = noisy(response(of, f), rng), float(of.r_s + of.r_p)
+    if kind == 3:
+        truth = {**exact(of), "r_p": (float(of.r_p), total)}
+        return Spectrum(f, z, etid.ParallelRC(), truth)
+    return Spectrum(f, z, etid.Resistor(), {"r": (total, total)})
+
+
+def drift(rng: np.random.Generator) -> Spectrum:
+    """Skin that changes during the sweep: both resistances by one factor, or R_p alone."""
+    f, before = frequencies(rng), one_rc(rng)
+    change, alone = np.exp(rng.uniform(-0.7, 0.7)), rng.random() < 0.5
+    by = np.linspace(1.0, change, POINTS)
+    during = etid.SkinRC(before.r_s * (1.0 if alone else by), before.r_p * by, before.c_p)
+    values = {name: np.asarray(getattr(during, name)) for name in during.names()}
+    truth = {name: (float(of.min()), float(of.max())) for name, of in values.items()}
+    return Spectrum(f, noisy(response(during, f), rng), etid.SkinRC(), truth)
+
+
+def outliers(rng: np.random.Generator) -> Spectrum:
+    """One to six impedances that are wrong by 10 to 300 %."""
+    of = good(rng)
+    z, where = of.z.copy(), rng.choice(POINTS, rng.integers(1, 7), replace=False)
+    size = np.exp(rng.uniform(np.log(0.1), np.log(3.0), where.size))
+    z[where] *= 1 + size * np.exp(2j * np.pi * rng.random(where.size))
+    return dataclasses.replace(of, z=z)
+
+
+def beyond_range(rng: np.random.Generator) -> Spectrum:
+    """A meter whose current is limited: |Z| does not fall further, its phase stays right."""
+    of = good(rng)
+    size = np.abs(of.z)
+    least = size.min() * (size.max() / size.min()) ** rng.uniform(0.2, 0.8)
+    return dataclasses.replace(of, z=of.z * np.hypot(size, least) / size)
+
+
+FAULTS: Mapping[str, Callable[[np.random.Generator], Spectrum]] = {
+    "wrong sign": wrong_sign,
+    "no phase": no_phase,
+    "wrong unit": wrong_unit,
+    "wrong circuit": wrong_circuit,
+    "drift": drift,
+    "outliers": outliers,
+    "beyond range": beyond_range,
+}
+
+
+class Answer(NamedTuple):
+    """What a fit says of a spectrum.
+
+    Attributes:
+        verdict: Of the fit.
+        z: Errors of the elements that have right values, in standard errors.
+        silent: Whether the fit is called successful, and is wrong.
+        rrse: Of the fit.
+    """
+
+    verdict: str
+    z: Float[np.ndarray, " element"]
+    silent: bool
+    rrse: float
+
+
+def answer(of: Spectrum) -> Answer:
+    """The answer of `identify_impedance` without standard errors."""
+    fit = etid.identify_impedance(of.frequency, of.z, circuit=of.circuit, throw=False)
+    found = {name: float(getattr(fit.circuit, name)) for name in fit.circuit.names()}
+    names = {name: name for name in of.truth if name in found}
+    if isinstance(fit.circuit, etid.SkinLayers) and names:  # the fit may exchange the two
+        first, second = (found[f"r_{i}"] * found[f"c_{i}"] for i in (1, 2))
+        names |= dict(zip(LAYERS, LAYERS[::-1], strict=True)) if first > second else {}
+    value = np.array([found[name] for name in names.values()])
+    stderr = np.array([float(getattr(fit.stderr, name)) for name in names.values()])
+    right = np.clip(value, *np.reshape([of.truth[name] for name in names], (-1, 2)).T)
+    z, relative = (value - right) / stderr, (value - right) / right
+    wrong = ((np.abs(z) > SILENT) & (np.abs(relative) > NOTICED)).any() or not names
+    return Answer(fit.verdict, z, fit.verdict == "successful" and bool(wrong), float(fit.rrse))
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Size of the run."""
+    parser.add_argument("--spectra", type=int, default=300, help="of each fault")
+    parser.add_argument("--good", type=int, default=1000, help="of each number of frequencies")
+    parser.add_argument("--seed", type=int, default=0)
+
+
+def main(arguments: argparse.Namespace) -> bool:
+    """Print verdicts and coverage; whether nothing is silent, and good spectra are accepted."""
+    silent, met = 0, True
+    for fault, (name, draw) in enumerate(FAULTS.items()):
+        seeds = [(arguments.seed, fault, number) for number in range(arguments.spectra)]
+        answers = [answer(draw(np.random.default_rng(seed))) for seed in seeds]
+        wrong = [seed for seed, one in zip(seeds, answers, strict=True) if one.silent]
+        silent += len(wrong)
+        counts = counted(np.array([one.verdict for one in answers]))
+        print(f"{name:<15}{counts}; silent: {len(wrong)} {wrong or ''}", flush=True)
+    for points in GOOD_POINTS:
+        seeds = [(arguments.seed, points, number) for number in range(arguments.good)]
+        answers = [answer(good(np.random.default_rng(seed), points)) for seed in seeds]
+        verdicts = np.array([one.verdict for one in answers])
+        z = np.concatenate([one.z for one in answers if one.verdict == "successful"])
+        refused = int((~np.isin(verdicts, ACCEPTED)).sum())
+        covered, rms = np.mean(np.abs(z) < NORMAL_95), np.sqrt(np.mean(z**2))
+        met &= refused <= max(REFUSED * len(answers), 1)
+        low, high = expected_covered(z.size)  # few draws scatter more
+        met &= min(COVERED[0], low) <= covered <= max(COVERED[1], high)
+        silent += sum(one.silent for one in answers)
+        print(
+            f"good, {points:>3}      {counted(verdicts)}; refused: {refused}; "
+            f"covered {covered:.4f}, rms z {rms:.3f}, max |z| {np.abs(z).max():.1f}",
+            flush=True,
+        )
+    return bool(met and not silent)
