@@ -1,6 +1,7 @@
 # Everything runs in .venv, with the versions of constraints.txt.
 #   make demo    simulate the paper's experiments, identify them, print the tables: demo/index.html
 #   make test    the ordinary tests
+#   make test-portable  the tests that compare with stored numbers, with the instructions of an old processor
 #   make slow    the other tests: statistics, and what compiles long
 #   make ranking the benchmarks in short: which estimator is better, and is any wrong silently
 #   make notebooks  executes the notebooks: notebooks/*.ipynb, with their figures
@@ -17,13 +18,18 @@ DEPENDENCIES ?= newest
 # What notebooks compile is kept where the tests keep it.
 COMPILED := JAX_COMPILATION_CACHE_DIR=$(CURDIR)/.pytest_cache/d/xla JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS=0
 
-.PHONY: demo test slow ranking notebooks docs wheel-test lint types clean
+.PHONY: demo test test-portable slow ranking notebooks docs wheel-test lint types clean
 
 demo: .venv/package
 	$(BIN)/python -m etid.paper.demo demo/
 
 test: .venv/tools
 	$(BIN)/python -m pytest --numprocesses auto --dist loadfile
+
+# Another order of sums must stay within the tolerances.
+test-portable: .venv/tools
+	XLA_FLAGS=--xla_cpu_max_isa=SSE4_2 OPENBLAS_CORETYPE=Nehalem $(BIN)/python -m pytest \
+		--numprocesses auto --dist loadfile -m "stored and not slow" $$(grep -l kept_numbers tests/test_*.py)
 
 slow: .venv/tools
 	$(BIN)/python -m pytest -m slow --numprocesses auto --dist loadfile

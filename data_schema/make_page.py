@@ -93,9 +93,13 @@ OTHER_FORMATS = """\
 `etid import FILE -o study.h5 --mapping FILE.toml` converts a file of an instrument to an etid
 file. It prints which channel, unit, scale and rate it used for each signal. Nothing is guessed. A
 channel, unit or rate that neither the file nor the mapping gives is an error, and the error lists
-the channels of the file. A contradiction between file and mapping is an error too. If several
-files are imported into one, each `[[recording]]` has the key `file`: the name of its file without
-the folder. A recording without a `path` is then named by its file, as in `loaded/finger`.
+the channels of the file. A contradiction between file and mapping is an error too, and one inside
+the file: two units or sample rates of one channel, rows of a table with different numbers of cells,
+fewer samples than the file declares. If the file may be incomplete, but not certainly, a note is
+printed: an oscilloscope's preamble declares more samples than the table has rows, or a table ends
+inside a number. If several files are imported into one, each `[[recording]]` has the key `file`:
+the name of its file without the folder. A recording without a `path` is then named by its file, as
+in `loaded/finger`.
 
 | file | channels | the file contains | trials | install |
 |---|---|---|---|---|
@@ -107,6 +111,9 @@ the folder. A recording without a `path` is then named by its file, as in `loade
 | `.wav` | `1`, `2`, …, as fractions of full scale | rate | none | |
 | `.lvm` | columns of LabVIEW, one header per file | units, rate (`Delta_X`) | none | |
 | `.xlsx` | columns; further sheets `sheet/column` | units as in CSV | none | `etid[excel]` |
+
+A table contains its rate if a preamble of an oscilloscope has a `Sample Interval`. In all formats a
+name such as `open [mV]` contains a unit.
 
 The import keeps only a part of a record in memory. MATLAB files before version 7.3, `.npz` files
 and records that are split are the exceptions; only the first need `etid[matlab]`. Integer codes

@@ -34,7 +34,7 @@ def pytest_configure(config):
     down sixfold. Slow tests and notebooks are compiled as users' programs are.
     """
     flags = os.environ.get("XLA_FLAGS", "")  # JAX has not read them yet
-    if config.option.markexpr in config.getini("addopts") and COMPILE_FAST not in flags:
+    if _is_ordinary(config) and COMPILE_FAST not in flags:
         os.environ["XLA_FLAGS"] = f"{COMPILE_FAST} {flags}"
     os.environ["JAX_COMPILATION_CACHE_DIR"] = str(config.cache.mkdir("xla"))  # for notebooks
     jax.config.update("jax_compilation_cache_dir", os.environ["JAX_COMPILATION_CACHE_DIR"])
@@ -46,6 +46,18 @@ def pytest_configure(config):
         os.sched_setaffinity(0, {cores[int(worker.removeprefix("gw")) % len(cores)]})
 
 
+def _is_ordinary(config):
+    """Whether neither slow tests nor notebooks run."""
+    return "not slow" in config.option.markexpr
+
+
+def pytest_collection_modifyitems(items):
+    """Mark the tests that compare with stored numbers; `make test-portable` runs them."""
+    for item in items:
+        if isinstance(item, pytest.Function) and "kept_numbers" in item.function.__code__.co_names:
+            item.add_marker("stored")
+
+
 def pytest_xdist_auto_num_workers():
     """One worker for each core that these tests may use, which may be fewer than there are."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else None
@@ -55,7 +67,7 @@ def pytest_xdist_auto_num_workers():
 def _programs_at_once(request):
     """Compile etid's programs without passes of LLVM: half the time, and most run once or twice."""
     with pytest.MonkeyPatch.context() as patch:
-        if request.config.option.markexpr in request.config.getini("addopts"):
+        if _is_ordinary(request.config):
             from etid.identify import compiled  # here, for the type checker wraps what it imports
 
             patch.setattr(compiled, "QUICKLY", compiled.AT_ONCE)

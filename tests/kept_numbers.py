@@ -4,8 +4,9 @@
 test writes it and fails. Delete a file to make it anew, look at what has changed, and say in the
 commit why it has.
 
-A fit stops within 0.01 standard errors of its minimum, where χ² is stationary. Tolerances are a few
-times what this lets another machine or another order of a sum change.
+Processors add numbers in different orders, and a fit stops within 0.01 standard errors of its
+minimum. So tolerances are fractions of a standard error, a few times what this changes. A tolerance
+that is not a number is an error of the test: it would compare nothing, or digits.
 """
 
 import json
@@ -23,7 +24,7 @@ from etid.results.fit import Fit
 BASELINE = pathlib.Path(__file__).parent / "baseline"
 SHIFT = 0.05  # of an estimate [standard errors]
 ERRORS = 5e-3  # of a standard error, relative
-CHI2 = 2e-4  # of χ² and of the RRSE, relative
+TERMS = 1000  # degrees of freedom of χ² where a fit does not count its terms; a record has more
 FREQUENCY = (120.0, 1e3, 5e3, 2e4, 6e4)  # [Hz] at which drivers are compared
 DIGITS, WRITTEN = 10, 1e-8  # that are written, and their rounding, relative
 
@@ -33,40 +34,53 @@ class Number(NamedTuple):
 
     Attributes:
         value: Numbers or texts.
-        relative: Tolerance relative to the value.
+        relative: Tolerance relative to the value, one for all or one for each.
         absolute: Tolerance, one for all or one for each.
     """
 
     value: Any
-    relative: float = 0.0
+    relative: Any = 0.0
     absolute: Any = 0.0
 
 
-def of_fit(fit: Fit) -> dict[str, Number]:
-    """Every field of a fit or of a batch of them."""
+def of_spread(freedom: Any) -> Any:
+    """Tolerance of a variance or χ² with this many degrees of freedom, relative."""
+    return SHIFT * np.sqrt(2 / np.asarray(freedom, float))
+
+
+def of_fit(fit: Fit, freedom: int = TERMS) -> dict[str, Number]:
+    """Every field of a fit or of a batch of them; `freedom` is that of χ² if it has no support."""
     values, errors = np.asarray(fit.circuit.values()), np.asarray(fit.stderr.values())
     private = np.diagonal(np.asarray(fit.cov) - fit.shared_cov, axis1=-2, axis2=-1)
     change, change_stderr = fit.known_changes
+    terms = freedom if fit.support is None else fit.support.terms
+    of_chi2 = of_spread(np.where(np.isnan(terms), freedom, terms))
+    # The curvature at a minimum that leaves a residual changes with the estimate, as its residual.
+    wide = np.sqrt(np.maximum(fit.chi2, 1.0))
+    of_each, of_cov = wide[..., None], wide[..., None, None]
     found = {
         "verdict": Number(np.asarray(fit.verdict)),
         "method": Number(fit.method.partition("(")[0]),  # without numbers
         "elements": Number(values, absolute=SHIFT * errors),
-        "stderr": Number(errors, ERRORS),
-        "correlation": Number(fit.correlation, absolute=4 * ERRORS),
-        "private": Number(private, 4 * ERRORS),
-        "rrse": Number(fit.rrse, CHI2),
-        "chi2": Number(fit.chi2, CHI2),
+        "stderr": Number(errors, ERRORS * of_each),
+        "correlation": Number(fit.correlation, absolute=4 * ERRORS * of_cov),
+        "private": Number(private, 4 * ERRORS * of_each),
+        "rrse": Number(fit.rrse, of_chi2 / 2),
+        "chi2": Number(fit.chi2, of_chi2),
         "remarks": Number(fit.remarks),
         "change": Number(change, absolute=SHIFT * change_stderr),
         "change_stderr": Number(change_stderr, ERRORS),
     }
     if fit.support is not None:
         found |= {
-            "deviance": Number(fit.support.deviance, CHI2),
+            # It is a sum of as many squares as there are terms, up to a constant.
+            "deviance": Number(fit.support.deviance, absolute=SHIFT * np.sqrt(2 * terms)),
             "terms": Number(fit.support.terms),
-            "z": Number(fit.support.z, absolute=SHIFT),
-            "spread_stderr": Number(fit.support.spread_stderr, 4 * ERRORS),
-            "spread_slope": Number(fit.support.spread_slope, 4 * ERRORS, 4 * ERRORS),
+            "z": Number(fit.support.z, absolute=SHIFT * of_each),
+            "spread_stderr": Number(fit.support.spread_stderr, 4 * ERRORS * wide),
+            "spread_slope": Number(
+                fit.support.spread_slope, 4 * ERRORS * of_each, 4 * ERRORS * of_each
+            ),
         }
     return found
 
@@ -79,8 +93,8 @@ def of_driver(driver: Driver) -> dict[str, Number]:
     found = {
         "verdict": Number(np.asarray(driver.verdict)),
         "order": Number(driver.order),
-        "chi2": Number(driver.chi2, CHI2),
-        "rrse": Number(driver.rrse, CHI2),
+        "chi2": Number(driver.chi2, of_spread(TERMS)),
+        "rrse": Number(driver.rrse, of_spread(TERMS) / 2),
         "log_size": Number(np.log(np.abs(z_th)), absolute=SHIFT * errors[0]),
         "phase": Number(np.angle(z_th), absolute=SHIFT * errors[1]),
         "errors": Number(errors, ERRORS),
@@ -129,7 +143,9 @@ def _same(before: Any, now: Number) -> bool:
         return False
     if value.dtype.kind != "f":
         return bool((was == value).all())
-    allowed = now.relative * np.abs(was) + now.absolute
-    # Where the tolerance is smaller or not a number, only the digits of the file count.
-    near = np.abs(value - was) <= np.fmax(allowed, WRITTEN * np.abs(was))
-    return bool((near | (value == was) | (np.isnan(was) & np.isnan(value))).all())
+    missing = np.isnan(was)
+    allowed = np.where(missing, 0.0, now.relative * np.abs(was) + now.absolute)
+    assert np.isfinite(allowed).all(), f"tolerances that are no numbers: {now}"
+    # Where the tolerance is smaller, the digits of the file count.
+    near = np.abs(value - was) <= np.maximum(allowed, WRITTEN * np.abs(was))
+    return bool((near | (value == was) | (missing & np.isnan(value))).all())

@@ -12,7 +12,7 @@ from nptdms import ChannelObject, TdmsWriter
 
 import etid
 from etid.files import channel as channels
-from etid.files.readers import delimited
+from etid.files.readers import rows as text_rows
 from etid.files.units import UNITS, parse_unit
 from etid.recordings import hdf5
 from etid.recordings.recording import RecordingError
@@ -351,7 +351,7 @@ def test_columns_that_are_not_asked_for_may_hold_anything(tmp_path):
 def small_parts(monkeypatch):
     """Records of a thousand samples are read in 143 parts."""
     monkeypatch.setattr(channels, "BLOCK", 7)
-    monkeypatch.setattr(delimited, "ROWS", 13)
+    monkeypatch.setattr(text_rows, "ROWS", 13)
 
 
 @pytest.mark.parametrize("format", ["csv", "mat", "tdms", "abf"])

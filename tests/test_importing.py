@@ -173,7 +173,7 @@ def test_a_wrong_argument_is_explained(changes, message, table, tmp_path):
         ("th,out\n", "the table has no rows"),
         ("th,out\n1,2\n3,x\n", "cannot be read .*'x'"),
         ("th,out\n1,2\n3,\n", "cannot be read"),
-        ("th,out\n1,2\n3\n", "cannot be read"),
+        ("th,out\n1,2\n3\n", "line 3 has 1 cells"),
         ("th;out\n1;2\n", "there is no 'th'; the names are 'th;out'"),
         ("th,out,th\n1,2,3\n", "two channels have the name 'th'"),
         ("th,out\n1,2\n\xff", "cannot be read"),

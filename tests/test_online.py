@@ -741,28 +741,40 @@ def test_bad_electrodes_are_listed_with_the_reason():
     assert tracker.bad_electrodes(state)[0] == "dry"
 
 
-FIELDS = ("level", "variance", "chi2", "rrse", "offset", "amplitude", "mean_cov", "information")
-# Samples are summed in single precision, in an order that depends on the processor. Its error is
-# less than a hundredth of what noise makes of a gain.
-ROUNDED = {"chi2": (1e-3, 0.0), "rrse": (1e-3, 0.0), "offset": (1e-4, 2e-6)}
-
-
 def numbers_of(tracker, state):
-    """What a state says, and what it holds."""
+    """What a state says, and what it holds.
+
+    Samples are summed in single precision, in an order that depends on the processor. Its error is
+    a hundredth of what noise makes of a gain. Standard errors are those of the state, which holds
+    them also for an electrode whose last pulse has no samples.
+    """
+    Number, shift = kept_numbers.Number, kept_numbers.SHIFT
     fits, held = tracker.read(state), state.electrodes
-    numbers = kept_numbers.of_fit(fits.fit)
-    for name in FIELDS:
-        values = np.asarray(getattr(held, name))
-        # A matrix may be anything where it is next to nothing.
-        largest = 1e-4 * abs(values).max(axis=-1, keepdims=True) if values.ndim > 1 else 0.0
-        numbers[name] = kept_numbers.Number(values, *ROUNDED.get(name, (1e-4, largest)))
-    errors = own_stderr(fits)
-    delay = np.asarray(held.own)[:, -1]
-    numbers["delay"] = kept_numbers.Number(delay, absolute=1e-4)
-    for name in ("mean", "factor"):
-        numbers[name] = kept_numbers.Number(getattr(held, name), absolute=0.02 * errors)
+    freedom = 2 * np.count_nonzero(tracker.model.bands.weight > 0) - held.own.shape[-1]
+    squares = kept_numbers.of_spread(tracker.model.noise_freedom)
+    own = np.sqrt(np.diagonal(np.linalg.inv(held.information), axis1=1, axis2=2))  # of logarithms
+    of_gain = np.asarray(held.rrse) / np.sqrt(freedom)  # of one pulse, relative
+    of_mean = np.sqrt(np.diagonal(held.mean_cov, axis1=1, axis2=2))
+    elements, delay = np.asarray(fits.circuit.values()), np.asarray(held.own)[:, -1]
+
+    def matrix(values):
+        scale = np.sqrt(np.diagonal(values, axis1=1, axis2=2))
+        return Number(values, absolute=squares * scale[:, :, None] * scale[:, None, :])
+
+    numbers = kept_numbers.of_fit(fits.fit, freedom) | {
+        "elements": Number(elements, absolute=shift * own * elements),
+        "level": Number(held.level, shift * of_gain),
+        "variance": Number(held.variance, squares),
+        "offset": Number(held.offset, absolute=shift * NOISE / np.sqrt(PERIOD)),
+        "amplitude": Number(held.amplitude),  # given
+        "mean_cov": matrix(held.mean_cov),
+        "information": matrix(held.information),
+        "delay": Number(delay, absolute=shift * np.std(delay)),  # the same for all electrodes
+        "mean": Number(held.mean, absolute=shift * of_mean),
+        "factor": Number(held.factor, absolute=shift * own),
+    }
     for name in ("pulses", "missed", "event", "element", "drifted"):
-        numbers[name] = kept_numbers.Number(getattr(held, name))
+        numbers[name] = Number(getattr(held, name))
     return numbers
 
 

@@ -5,6 +5,7 @@ an error if the file and the mapping disagree.
 """
 
 import dataclasses
+import math
 from collections.abc import Callable, Hashable, Iterator, Mapping
 from typing import Any
 
@@ -55,6 +56,7 @@ class Imported:
         rate_by: Source of the sample rate: `file`, `mapping`, both, or the `time` channel.
         pulse_rate: Pulses per second [Hz].
         signals: Channel of each signal.
+        notices: Signs that the file is not whole; empty if there are none.
     """
 
     paths: tuple[str, ...]
@@ -63,6 +65,7 @@ class Imported:
     rate_by: str
     pulse_rate: float
     signals: Mapping[str, Used]
+    notices: tuple[str, ...] = ()
 
     def __str__(self) -> str:
         ends = self.paths if len(self.paths) < 3 else (self.paths[0], self.paths[-1])
@@ -70,7 +73,8 @@ class Imported:
             f"{' … '.join(ends)}: {self.samples} samples at {self.sample_rate:.9g} Hz "
             f"({self.rate_by}), pulses at {self.pulse_rate:.9g} Hz"
         ]
-        return "\n".join(lines + [f"  {name:<8}{used}" for name, used in self.signals.items()])
+        lines += [f"  {name:<8}{used}" for name, used in self.signals.items()]
+        return "\n".join(lines + [f"  note: {notice}" for notice in self.notices])
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -182,7 +186,8 @@ def sources_of(
                 factor = units[name][0].factor / (plan.signals[name].scale or 1.0)
                 own = channels[name].part(parts[index]) if parts else channels[name]
                 trial = rows[name][index if len(rows[name]) > 1 else 0]
-                records[name] = _Record(own, trial, own.conversion * factor, own.offset * factor)
+                with located("", field=name):
+                    records[name] = _record(own, trial, factor)
         path = f"{plan.path}/{index}" if several or plan.path in KINDS else plan.path
         metadata = metadata_from(**{**vars(common), "trial": label, "path": path})
         sources[path] = _Source(file, metadata, records)
@@ -196,7 +201,22 @@ def sources_of(
         for name, signal in plan.signals.items()
     }
     samples = parts[0].stop - parts[0].start if parts else length
-    return sources, Imported(tuple(sources), samples, rate, rate_by, common.pulse_rate, used)
+    notices = tuple(dict.fromkeys(own.notice for own in channels.values() if own.notice))
+    return sources, Imported(
+        tuple(sources), samples, rate, rate_by, common.pulse_rate, used, notices
+    )
+
+
+def _record(channel: Channel, trial: int, factor: float) -> _Record:
+    """A trial in SI units; an error if the file scales its samples to nothing."""
+    conversion, offset = channel.conversion * factor, channel.offset * factor
+    if not math.isfinite(conversion) or conversion == 0 or not math.isfinite(offset):
+        raise RecordingError(
+            f"channel {channel.name!r} is scaled with slope {channel.conversion:g} and offset "
+            f"{channel.offset:g}, from which no samples follow",
+            remedy="Correct the scaling in the file, or the scale",
+        )
+    return _Record(channel, trial, conversion, offset)
 
 
 def _parts(

@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterable, Iterator
 
 import numpy as np
 
+from etid.files.units import one_unit, parse_unit, with_unit
 from etid.recordings import errors
 from etid.recordings.recording import RecordingError
 
@@ -28,6 +29,11 @@ class Channel:
         sample_rate: Samples per second [Hz]; None if the file does not contain it.
         conversion: Units per stored unit.
         offset: Value of a stored zero, in the unit.
+        declared: Number of samples that the file declares; programs may have appended more.
+        notice: What a user must know of the samples although they are read; usually empty.
+
+    Raises:
+        RecordingError: The file contradicts itself: in the unit, or in the number of samples.
     """
 
     name: str
@@ -38,6 +44,17 @@ class Channel:
     sample_rate: float | None = None
     conversion: float = 1.0
     offset: float = 0.0
+    declared: int = 0
+    notice: str = ""
+
+    def __post_init__(self) -> None:
+        unit = one_unit(self.name, self.unit, with_unit(self.name)[1])
+        object.__setattr__(self, "unit", unit)
+        if self.length < self.declared:
+            raise RecordingError(
+                f"{self.name!r} has {self.length} samples, the file declares {self.declared}",
+                remedy="Copy or record it again; if this part is enough, correct the number in it",
+            )
 
     @property
     def length(self) -> int:
@@ -68,7 +85,8 @@ class Channel:
             return self.read(trial, start + first, start + last)
 
         name = f"{self.name}[{start}:{place.stop}]"
-        return dataclasses.replace(self, name=name, shape=(place.stop - start,), read=read)
+        shape = (place.stop - start,)
+        return dataclasses.replace(self, name=name, shape=shape, read=read, declared=0)
 
 
 def _nothing(names: Iterable[str]) -> None:
@@ -122,9 +140,27 @@ def real(name: str, dtype: np.dtype, shape: tuple[int, ...]) -> None:
         raise RecordingError(f"{name!r} is empty, of shape {shape}")
 
 
-def rate_of(interval: float, precision: float) -> float:
-    """Sample rate [Hz] from an interval [s]; a whole number if the precision allows it."""
-    rate = 1 / interval
+def rate_of(interval: float, precision: float, unit: str = "s") -> float | None:
+    """Sample rate [Hz] from an interval; a whole number if the precision allows it.
+
+    Args:
+        interval: Time between two samples, in the unit; None is returned if it is not positive.
+        precision: Relative precision of the interval.
+        unit: Unit of the interval in the spelling of the file.
+
+    Raises:
+        RecordingError: The unit is not one of time, as in the file of a spectrum.
+    """
+    known = parse_unit(unit)
+    if known is None or known.si != "second":
+        raise RecordingError(
+            f"has a sample every {interval:g} {unit!r}, which is not a time",
+            field="sample_rate",
+            remedy="Import a record over time",
+        )
+    if not interval > 0:
+        return None
+    rate = 1 / (interval * known.factor)
     return float(round(rate)) if abs(rate - round(rate)) <= precision * rate else rate
 
 

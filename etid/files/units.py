@@ -1,6 +1,11 @@
 """Units of voltage, current and time in the spellings of instrument files."""
 
+import re
 from typing import NamedTuple
+
+from etid.recordings.errors import RecordingError
+
+_WITH_UNIT = re.compile(r"(?P<name>.*\S)\s*[\[(](?P<unit>[^\[\]()]+)[\])]")
 
 _SYMBOLS = {"V": "volt", "A": "ampere", "s": "second"}
 _WORDS = {
@@ -55,3 +60,26 @@ def parse_unit(text: str) -> Unit | None:
     name = text.strip()
     found = UNITS.get(name) or UNITS.get(name.lower() if len(name) > 2 else name)
     return None if found is None else Unit(*found)
+
+
+def with_unit(name: str) -> tuple[str, str]:
+    """Name and unit of a channel, from `name [unit]` or `name (unit)`; the unit may be empty."""
+    match = _WITH_UNIT.fullmatch(name)
+    if match is None or not parse_unit(match["unit"]):
+        return name, ""
+    return match["name"], match["unit"].strip()
+
+
+def one_unit(name: str, *said: str) -> str:
+    """The unit of a channel that a file names in several places; empty if it names none.
+
+    Raises:
+        RecordingError: The places disagree.
+    """
+    found = {parse_unit(unit) or unit.strip(): unit.strip() for unit in said if unit.strip()}
+    if len(found) > 1:
+        raise RecordingError(
+            f"the file says {' and '.join(map(repr, found.values()))} of channel {name!r}",
+            remedy="Correct the one that is wrong in the file",
+        )
+    return next(iter(found.values()), "")

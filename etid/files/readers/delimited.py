@@ -7,87 +7,35 @@ A column `open [mV]` or `open (mV)` has the name `open` and the unit mV. Oscillo
 units into a second line instead, such as `(ms),(mV),(mV)` or `Sequence,VOLT,VOLT,-6e-3,5e-6`.
 
 A table without names has the columns `1`, `2`, …; `header_line` is then 0. Some oscilloscopes
-write such tables, with a preamble in the first columns of the first rows.
+write such tables, with a preamble in the first columns of the first rows. If a preamble names the
+number of samples or their interval, the table is compared with it.
 """
 
 import codecs
 import contextlib
-import csv
 import dataclasses
 import itertools
 import pathlib
-import re
 import tempfile
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from typing import Any, BinaryIO, TextIO
 
 import numpy as np
 
-from etid.files.channel import Channel, Contents
-from etid.files.units import parse_unit
+from etid.files.channel import Channel, Contents, rate_of
+from etid.files.readers.rows import Dialect, spool
+from etid.files.units import one_unit, parse_unit, with_unit
 from etid.recordings.recording import RecordingError
 
 _SEEN = 1 << 16  # [bytes] start of a table that is looked at before it is read
 _LINES = 200  # lines in which the first row of numbers is searched
 _BESIDE = 3  # rows in which numbers beside a preamble are searched
 _DIALECTS = (",.", ";.", ";,", "\t.", "\t,")  # delimiters and decimal signs that are tried
-ROWS = 1 << 16  # rows of text in memory at a time
 
-_WITH_UNIT = re.compile(r"(?P<name>.*\S)\s*[\[(](?P<unit>[^\[\]()]+)[\])]")
-
-
-@dataclasses.dataclass(frozen=True)
-class Dialect:
-    """How a table is written.
-
-    Attributes:
-        delimiter: Character between the cells.
-        decimal: Decimal sign of the numbers: `.` or `,`.
-        header_line: Line with the names of the columns, counted from 1; lines above are skipped.
-            0: no line names them.
-        encoding: Encoding of the text.
-    """
-
-    delimiter: str = ","
-    decimal: str = "."
-    header_line: int = 1
-    encoding: str = "utf-8-sig"
-
-    def __post_init__(self) -> None:
-        if len(self.delimiter) != 1 or self.decimal not in (".", ",") or self.header_line < 0:
-            raise RecordingError(f"the table cannot be written as {self}")
-
-    def cells(self, line: str) -> list[str]:
-        """Cells of a line."""
-        row = next(csv.reader([line], delimiter=self.delimiter), [])
-        return [cell.strip() for cell in row]
-
-    def units(self, cells: Sequence[str], count: int) -> tuple[str, ...] | None:
-        """The units of `count` columns if a line of cells holds units; None if it holds none.
-
-        An oscilloscope writes the start of its clock into the cells beside the units.
-        """
-        cells = [cell.strip("()[] ") for cell in cells]
-        if len(cells) > count or not any(map(parse_unit, cells)):
-            return None
-        found = ["" if self.is_number(cell) else cell for cell in cells]
-        return (*found, *[""] * (count - len(found)))
-
-    def is_number(self, cell: str) -> bool:
-        """Whether a cell is a number with this decimal sign."""
-        try:
-            float(cell.replace(self.decimal, "."))
-        except ValueError:
-            return False
-        return self.decimal == "." or "." not in cell
-
-    def are_numbers(self, cells: Sequence[str]) -> bool:
-        """Whether all cells are numbers; empty ones at the end do not count."""
-        filled = len(cells)
-        while filled and not cells[filled - 1]:
-            filled -= 1
-        return filled > 0 and all(map(self.is_number, cells[:filled]))
-
+# How the first cell of a line names the number of samples and their interval in preambles of
+# oscilloscopes; the value is in the second cell.
+_LENGTHS = {"record length", "memory length", "number of samples", "points"}
+_INTERVALS = {"sample interval", "sampling period"}
 
 DIALECT = tuple(field.name for field in dataclasses.fields(Dialect))
 
@@ -111,17 +59,20 @@ def opened(path: pathlib.Path, folder: pathlib.Path, **told: Any) -> Iterator[Co
     with contextlib.ExitStack() as files:
         with path.open(newline="", encoding=dialect.encoding) as text:
             names, units, skipped = _header(text, dialect)
+        length, rate = _preamble(path, dialect)
 
         columns: dict[str, BinaryIO] = {}
-        count = 0
+        count, notice = 0, ""
 
         def prepare(wanted: Iterable[str]) -> None:
-            nonlocal count
+            nonlocal count, notice
             for name in wanted:
                 columns[name] = files.enter_context(tempfile.TemporaryFile(dir=folder))
-            count = spool(
-                path, dialect, skipped, {names.index(name): columns[name] for name in columns}
-            )
+            places = {names.index(name): columns[name] for name in columns}
+            width = max(number for number, name in enumerate(names, 1) if name)
+            count, notice = spool(path, dialect, skipped, width, places)
+            if length > count:  # an oscilloscope may have written a part of its record
+                notice = f"the table has {count} rows, its preamble declares {length:g} samples"
 
         def channel(name: str) -> Channel:
             def read(_: int, start: int, stop: int) -> np.ndarray:
@@ -129,7 +80,7 @@ def opened(path: pathlib.Path, folder: pathlib.Path, **told: Any) -> Iterator[Co
                 return np.frombuffer(columns[name].read(8 * (stop - start)))
 
             unit = units[names.index(name)]
-            return Channel(name, (count,), np.dtype(np.float64), read, unit)
+            return Channel(name, (count,), np.dtype(np.float64), read, unit, rate, notice=notice)
 
         yield Contents(names, channel, prepare)
 
@@ -210,43 +161,20 @@ def _header(text: TextIO, dialect: Dialect) -> tuple[tuple[str, ...], tuple[str,
     below = dialect.units(dialect.cells(text.readline()), len(names))
     if below is None:
         return names, units, skipped + 1
-    units = tuple(above or unit for above, unit in zip(units, below, strict=True))
-    return names, units, skipped + 2
+    return names, tuple(map(one_unit, names, units, below)), skipped + 2
 
 
-def with_unit(cell: str) -> tuple[str, str]:
-    """Name and unit of a column, from `name [unit]` or `name (unit)`; the unit may be empty."""
-    match = _WITH_UNIT.fullmatch(cell)
-    if match is None or not parse_unit(match["unit"]):
-        return cell, ""
-    return match["name"], match["unit"].strip()
-
-
-def spool(path: pathlib.Path, dialect: Dialect, skipped: int, columns: dict[int, BinaryIO]) -> int:
-    """Write columns to files as real numbers, and return the number of rows."""
-    rows = 0
+def _preamble(path: pathlib.Path, dialect: Dialect) -> tuple[float, float | None]:
+    """Number of samples and sample rate [Hz] in a preamble; 0 and None if it names none."""
+    length, rate = 0.0, None
     with path.open(newline="", encoding=dialect.encoding) as text:
-        lines = (
-            line if dialect.decimal == "." else line.replace(dialect.decimal, ".")
-            for line in itertools.islice(text, skipped, None)
-            if line.strip()
-        )
-        while part := list(itertools.islice(lines, ROWS)):
-            try:
-                table = np.loadtxt(
-                    part,
-                    delimiter=dialect.delimiter,
-                    comments=None,
-                    quotechar='"',
-                    usecols=list(columns),
-                    ndmin=2,
-                )
-            except ValueError as error:
-                beyond = f", counted from row {rows + 1}" * bool(rows)
-                raise RecordingError(f"cannot be read ({error}{beyond})") from None
-            for file, column in zip(columns.values(), table.T, strict=True):
-                file.write(np.ascontiguousarray(column).data)
-            rows += len(table)
-    if not rows:
-        raise RecordingError("the table has no rows")
-    return rows
+        for line in itertools.islice(text, _LINES):
+            cell, value, unit, *_ = (*dialect.cells(line), "", "", "")
+            if not dialect.is_number(value):
+                continue
+            number, name = float(value.replace(dialect.decimal, ".")), cell.strip(":").lower()
+            if name in _LENGTHS:
+                length = number
+            elif name in _INTERVALS:
+                rate = rate_of(number, 1e-6, unit if parse_unit(unit) else "s")
+    return length, rate

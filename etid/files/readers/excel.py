@@ -13,7 +13,8 @@ from typing import Any, BinaryIO
 import numpy as np
 
 from etid.files.channel import Channel, Contents, needs
-from etid.files.readers.delimited import ROWS, with_unit
+from etid.files.readers.rows import ROWS
+from etid.files.units import with_unit
 from etid.recordings.recording import RecordingError
 
 
@@ -29,13 +30,15 @@ def opened(path: pathlib.Path, folder: pathlib.Path) -> Iterator[Contents]:
             stack.enter_context(path.open("rb")), read_only=True, data_only=True
         )
         stack.callback(book.close)
+        names: list[str] = []  # several columns may have one name
         places: dict[str, tuple[Any, int, str]] = {}
         for number, sheet in enumerate(book.worksheets):
             head = next(sheet.iter_rows(max_row=1, values_only=True), ())
             for column, cell in enumerate(head):
                 if cell is not None:
                     name, unit = with_unit(str(cell).strip())
-                    places[f"{sheet.title}/{name}" * bool(number) or name] = sheet, column, unit
+                    names.append(f"{sheet.title}/{name}" * bool(number) or name)
+                    places[names[-1]] = sheet, column, unit
         files: dict[str, BinaryIO] = {}
         counts: dict[str, int] = {}
 
@@ -51,7 +54,7 @@ def opened(path: pathlib.Path, folder: pathlib.Path) -> Iterator[Contents]:
 
             return Channel(name, (counts[name],), np.dtype(np.float64), read, places[name][2])
 
-        yield Contents(tuple(places), channel, prepare)
+        yield Contents(tuple(names), channel, prepare)
 
 
 def _spool(sheet: Any, column: int, file: BinaryIO) -> int:

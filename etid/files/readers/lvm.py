@@ -1,8 +1,8 @@
 """Reader for LabVIEW measurement files (.lvm), which are text with a header of their own.
 
 The header says how the numbers are written, the interval between samples, and the names and units
-of the channels. The first column may be the time, which the interval replaces. Files of several
-segments, each with a header, are refused: each is another record.
+of the channels. The first column may be the time; it must fit the interval, which replaces it.
+Files of several segments, each with a header, are refused: each is another record.
 """
 
 import contextlib
@@ -15,11 +15,12 @@ from typing import BinaryIO
 import numpy as np
 
 from etid.files.channel import Channel, Contents, rate_of
-from etid.files.readers.delimited import Dialect, spool
+from etid.files.readers.rows import Dialect, spool
 from etid.recordings.recording import RecordingError
 
 _LINES = 200  # of a header
 _END = "***End_of_Header***"
+_CLOCK = 1e-4  # largest relative error of a quartz clock
 _SEPARATORS = {"Tab": "\t", "Comma": ",", "Semicolon": ";"}
 
 
@@ -48,40 +49,68 @@ def opened(path: pathlib.Path, folder: pathlib.Path) -> Iterator[Contents]:
     names = [cell.strip() for cell in lines[ends[1] + 1].split(separator)]
     if names[-1] == "Comment":
         names.pop()
-    times = {"No": 0, "One": 1}.get(_first(said, "X_Columns", "One"))
-    if times is None:
+    if _first(said, "X_Columns", "One") not in ("No", "One"):
         raise RecordingError(
             "has a column of times for each channel",
             field="X_Columns",
             remedy="Write one time column, or none",
         )
     channels = names[1:]  # the column X_Value exists even if it is empty
+    timed = lines[ends[1] + 2].split(separator)[0].strip() != ""
     intervals = {float(cell.replace(decimal, ".")) for cell in own.get("Delta_X", []) if cell}
     if len(intervals) > 1:
         raise RecordingError("has channels with different intervals", field="Delta_X")
     interval = intervals.pop() if intervals else 0.0
+    rate = rate_of(interval, 1e-6, _first(own, "X_Unit_Label", "s"))
     units = dict(zip(channels, own.get("Y_Unit_Label", []), strict=False))
+    lengths = dict(zip(channels, own.get("Samples", []), strict=False))
     files: dict[str, BinaryIO] = {}
-    count = 0
+    count, notice = 0, ""
     with contextlib.ExitStack() as stack:
 
         def prepare(wanted: Iterable[str]) -> None:
-            nonlocal count
-            for name in wanted:
+            nonlocal count, notice
+            for name in {*wanted, names[0]} if timed else wanted:
                 files[name] = stack.enter_context(tempfile.TemporaryFile(dir=folder))
             columns = {names.index(name): files[name] for name in files}
-            count = spool(path, dialect, ends[1] + 2, columns)
+            count, notice = spool(path, dialect, ends[1] + 2, len(names) + 1, columns)
+            if timed and rate:
+                _check_times(stored(names[0], 0, count), rate)
+
+        def stored(name: str, start: int, stop: int) -> np.ndarray:
+            files[name].seek(8 * start)
+            return np.frombuffer(files[name].read(8 * (stop - start)))
 
         def channel(name: str) -> Channel:
-            def read(_: int, start: int, stop: int) -> np.ndarray:
-                files[name].seek(8 * start)
-                return np.frombuffer(files[name].read(8 * (stop - start)))
-
-            rate = rate_of(interval, 1e-6) if interval > 0 else None
-            unit = units.get(name, "").strip()
-            return Channel(name, (count,), np.dtype(np.float64), read, unit, rate)
+            return Channel(
+                name,
+                (count,),
+                np.dtype(np.float64),
+                lambda _, start, stop: stored(name, start, stop),
+                units.get(name, "").strip(),
+                rate,
+                declared=int(lengths.get(name, "").strip() or 0),
+                notice=notice,
+            )
 
         yield Contents(tuple(channels), channel, prepare)
+
+
+def _check_times(times: np.ndarray, rate: float) -> None:
+    """Raise an error if a column of times contradicts the sample rate [Hz].
+
+    Times may be printed with few digits; their smallest step shows with how many. Where LabVIEW
+    has appended to a file, they may begin again at 0.
+    """
+    steps = np.diff(times)
+    steps = steps[steps >= 0]
+    rounding = 2 * np.min(steps, initial=np.inf, where=steps > 0)
+    if abs(steps.sum() - steps.size / rate) > max(rounding, _CLOCK * steps.sum(), 2 / rate):
+        raise RecordingError(
+            f"is {1 / rate:g} s, but the column of times has steps of {steps.mean():g} s",
+            field="Delta_X",
+            remedy="Correct the one that is wrong in the file",
+        )
 
 
 def _first(said: dict[str, list[str]], key: str, default: str) -> str:

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from etid.files.channel import Channel, Contents, needs, rate_of, real
+from etid.files.units import one_unit
 from etid.recordings.recording import RecordingError
 
 # Scalings that turn a voltage into a voltage. For an unknown scaling npTDMS returns raw codes.
@@ -104,21 +105,19 @@ def _channel(name: str, channel: Any) -> Channel:
         )
     real(name, channel.dtype, (len(channel),))
     raw = np.dtype(getattr(channel.data_type, "nptype", None) or "V8")
-    codes = raw.kind in "iu"
-    slope, intercept = _line(own) if codes else (1.0, 0.0)
-    scaled = channel.dtype != raw and (slope, intercept) == (1.0, 0.0)
+    slope, intercept = _line(own) if raw.kind in "iuf" else (1.0, 0.0)
+    scaled = (slope, intercept) == (1.0, 0.0)
 
     def read(_: int, start: int, stop: int) -> np.ndarray:
         return channel.read_data(start, stop - start, scaled=scaled)
 
-    interval = own.get("wf_increment", 0.0)
     return Channel(
         name,
         (len(channel),),
         channel.dtype if scaled else raw,
         read,
-        unit=next((str(own[key]) for key in _UNITS if own.get(key)), ""),
-        sample_rate=rate_of(interval, 1e-12) if interval > 0 else None,
+        unit=one_unit(name, *(str(own.get(key, "")) for key in _UNITS)),
+        sample_rate=rate_of(own.get("wf_increment", 0.0), 1e-12, own.get("wf_xunit_string") or "s"),
         conversion=slope,
         offset=intercept,
     )

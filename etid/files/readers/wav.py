@@ -6,6 +6,7 @@ scale of a mapping is this fraction at 1 V at the terminal.
 
 import contextlib
 import pathlib
+import struct
 import warnings
 from collections.abc import Iterator
 
@@ -20,14 +21,14 @@ from etid.recordings.recording import RecordingError
 def opened(path: pathlib.Path, folder: pathlib.Path) -> Iterator[Contents]:
     """Channels of a WAV file."""
     del folder
+    _check_length(path)
     with warnings.catch_warnings():
-        # A file that was not closed, or chunks that SciPy does not know.
-        warnings.simplefilter("error", scipy.io.wavfile.WavFileWarning)
+        # SciPy warns of chunks that it does not know; they hold no samples.
+        warnings.simplefilter("ignore", scipy.io.wavfile.WavFileWarning)
         try:
             rate, samples = scipy.io.wavfile.read(path, mmap=True)
-        except (scipy.io.wavfile.WavFileWarning, ValueError):
-            warnings.simplefilter("ignore", scipy.io.wavfile.WavFileWarning)
-            rate, samples = scipy.io.wavfile.read(path)  # 24 bits, or more chunks
+        except ValueError:
+            rate, samples = scipy.io.wavfile.read(path)  # 24 bits
     if samples.size == 0:
         raise RecordingError("the file has no samples")
     columns = samples.reshape(samples.shape[0], -1)
@@ -53,3 +54,22 @@ def opened(path: pathlib.Path, folder: pathlib.Path) -> Iterator[Contents]:
         )
 
     yield Contents(names, channel)
+
+
+def _check_length(path: pathlib.Path) -> None:
+    """Raise an error if a file ends before its samples do; SciPy would read those that exist."""
+    size, position, long = path.stat().st_size, 12, 0
+    with path.open("rb") as file:
+        order = ">" if file.read(4) == b"RIFX" else "<"
+        while position + 8 <= size:
+            file.seek(position)
+            name, length = struct.unpack(f"{order}4sI", file.read(8))
+            if name == b"ds64":  # files of more than 4 GB: lengths of the file and of the samples
+                _, long = struct.unpack("<QQ", file.read(16))
+            end = position + 8 + (long or length)
+            if name == b"data" and end > size:
+                raise RecordingError(
+                    f"is truncated: its samples end at byte {end}, the file at byte {size}",
+                    remedy="Copy it again, or record it again if the recording program crashed",
+                )
+            position += 8 + length + length % 2

@@ -1,0 +1,280 @@
+"""Files that contradict themselves or are cut off: refused, or taken with a notice."""
+
+import re
+import wave
+
+import numpy as np
+import pytest
+import scipy.io.wavfile
+
+import etid
+from etid import RecordingError
+from etid.recordings import hdf5
+from tests.lab_files import tdms
+
+COUNT = 30
+V_TH = np.round(np.random.default_rng(8).normal(size=COUNT), 3)
+V_OUT = V_TH / 2
+GIVEN = {"v_th": "open", "v_out": "skin", "pulse_rate": 60.0, "scale": 1.0}
+RATE = {"sample_rate": 200e3}
+
+
+def imported(path, **given):
+    """The recording of a file, and the notices."""
+    target = path.with_suffix(".h5")
+    [used] = etid.import_file(path, target, **{**GIVEN, **given})
+    with hdf5.read(target) as study:
+        assert study.problems == {}
+        return next(study.recordings()), used.notices
+
+
+def refused(path, message, **given):
+    with pytest.raises(RecordingError, match=message) as caught:
+        etid.import_file(path, path.with_suffix(".h5"), **{**GIVEN, **given})
+    assert caught.value.file == str(path)
+    assert caught.value.remedy
+    assert not path.with_suffix(".h5").exists()
+
+
+def table(path, text):
+    file = path / "a.csv"
+    file.write_text(text, encoding="utf-8")
+    return file
+
+
+def rows(sign=".", between=",", end=""):
+    """Times, V_th and V_out in text."""
+    lines = [
+        between.join(f"{x:.6f}".replace(".", sign) for x in (i * 5e-6, a, b)) + end
+        for i, (a, b) in enumerate(zip(V_TH, V_OUT, strict=True))
+    ]
+    return [f"{line}\n" for line in lines]
+
+
+# Tables
+
+
+def test_two_columns_of_a_workbook_with_one_name_are_not_chosen_from(tmp_path):
+    openpyxl = pytest.importorskip("openpyxl")
+    book = openpyxl.Workbook()
+    book.active.append(["open", "skin", "skin [mV]"])
+    for a, b in zip(V_TH, V_OUT, strict=True):
+        book.active.append([float(a), float(b), 0.0])
+    book.save(tmp_path / "a.xlsx")
+    refused(tmp_path / "a.xlsx", "v_out: two channels have the name 'skin'", **RATE)
+
+
+@pytest.mark.parametrize("cell", ["1.234", "-12.345.678", "0.5"])
+def test_a_point_is_no_decimal_sign_beside_decimal_commas(cell, tmp_path):
+    lines = rows(",", ";")
+    lines[7] = f"0,000035;{cell};1,5\n"
+    path = table(tmp_path, "t [s];open;skin\n" + "".join(lines))
+    told = {"delimiter": ";", "decimal": ","}
+    refused(path, f"line 9 has the cell '{cell}', but the decimal sign is a comma", **told, **RATE)
+
+
+def test_points_in_columns_that_are_not_asked_for_change_nothing(tmp_path):
+    dated = "".join(f"12.03.2024;{line}" for line in rows(",", ";"))
+    path = table(tmp_path, f"date;t [s];open;skin\n{dated}")
+    one, notices = imported(path, time="t", delimiter=";", decimal=",")
+    np.testing.assert_array_equal(one.v_th, V_TH)
+    assert notices == ()
+
+
+@pytest.mark.parametrize(
+    ("row", "cells"), [("0.0,-1,23,4,56", 5), ("0.0,1,5,2.5", 4), ("-1.23,4.56", 2)]
+)
+@pytest.mark.parametrize("end", ["", ","])
+def test_a_row_whose_cells_are_shifted_is_named(row, cells, end, tmp_path):
+    lines = rows(end=end)
+    lines[20] = row + "\n"
+    path = table(tmp_path, f"t,open,skin{end}\n" + "".join(lines))
+    refused(path, f"line 22 has {cells} cells; the table has", **RATE)
+
+
+def test_a_cell_that_the_rows_lost_in_the_middle_is_no_other_cell(tmp_path):
+    lines = [line[:-1] + ",37.0\n" for line in rows()]
+    lines[4] = lines[4].partition(",")[2]  # what is left of it are three numbers
+    path = table(tmp_path, "t,open,skin,temperature\n" + "".join(lines))
+    refused(path, "line 6 has 3 cells; the table has 4 columns, and numbers in 4", **RATE)
+
+
+def test_notes_quotes_and_delimiters_at_the_end_are_no_fault(tmp_path):
+    ends = ["\n", ",\n", ",fine\n", ',"fine, though"\n', ",,\n"]
+    lines = [line[:-1] + ends[i % len(ends)] for i, line in enumerate(rows())]
+    lines = [re.sub(r"^([^,]*)", r'"\1"', line) if i % 3 else line for i, line in enumerate(lines)]
+    one, notices = imported(table(tmp_path, "t,open,skin,note\n" + "".join(lines)), time="t")
+    np.testing.assert_array_equal(one.v_th, V_TH)
+    np.testing.assert_allclose(one.v_out, V_OUT, rtol=0, atol=1e-12)
+    assert notices == ()
+
+
+@pytest.mark.parametrize(("sign", "between", "end"), [(".", ",", ""), (",", ";", ";")])
+def test_a_table_that_ends_inside_a_number_is_taken_with_a_notice(sign, between, end, tmp_path):
+    told = {} if sign == "." else {"delimiter": between, "decimal": sign}
+    text = between.join(["t", "open", "skin"]) + end + "\n" + "".join(rows(sign, between, end))
+    whole = text.rstrip(end + "\n")
+    for shown in (text, whole):  # a line break is often missing
+        assert imported(table(tmp_path, shown), **told, **RATE)[1] == ()
+    one, [notice] = imported(table(tmp_path, whole[:-4]), **told, **RATE)
+    last = whole[:-4].rpartition(between)[2]
+    assert notice.startswith(f"the last number, '{last}', is shorter than those above")
+    assert one.v_out[-1] == float(last.replace(",", "."))
+    refused_end = whole.rpartition(between)[0]
+    tmp_path.joinpath("a.h5").unlink()
+    refused(table(tmp_path, refused_end), "has 2 cells; the table has", **told, **RATE)
+
+
+def test_the_preamble_of_an_oscilloscope_is_compared_with_its_table(tmp_path):
+    body = "t [s],open [V],skin [V]\n" + "".join(rows())
+
+    def scope(length, interval):
+        said = f"Model,DPO\nRecord Length,{length}\nSample Interval,{interval}\n"
+        return table(tmp_path, said + body)
+
+    told = {"time": "t", "header_line": 4}
+    assert imported(scope(30, "5e-06,s"), **told)[1] == ()
+    assert imported(scope("3.0e+01", "5,us"), **told)[1] == ()
+    without, _ = imported(scope(30, "5e-06"), header_line=4)
+    assert without.sample_rate == 200e3
+    _, [notice] = imported(scope(40, "5e-06"), **told)
+    assert notice == "the table has 30 rows, its preamble declares 40 samples"
+    [used] = etid.import_file(tmp_path / "a.csv", tmp_path / "a.h5", **{**GIVEN, **told})
+    assert str(used).endswith(f"\n  note: {notice}")
+    tmp_path.joinpath("a.h5").unlink()
+    refused(scope(30, "1e-05"), "is 200000 Hz from the time 't', but 100000 Hz from the f", **told)
+
+
+def test_two_units_of_one_column_are_not_chosen_from(tmp_path):
+    path = table(tmp_path, "open [mV],skin [mV]\nmV,V\n" + "1,2\n3,4\n")
+    refused(path, "the file says 'mV' and 'V' of channel 'skin'", **RATE)
+    path = table(tmp_path, "open [mV],skin (V)\n(millivolts),\n" + "1,2\n3,4\n")
+    one, _ = imported(path, **RATE)  # two spellings of one unit
+    np.testing.assert_allclose(one.v_th, [1e-3, 3e-3])
+
+
+# Other formats
+
+
+LVM = """\
+LabVIEW Measurement\t
+Separator\tTab
+Decimal_Separator\t.
+X_Columns\tOne
+***End_of_Header***\t
+\t
+Channels\t2\t\t
+Samples\t{count}\t{count}\t
+Y_Unit_Label\tVolts\tVolts\t
+Delta_X\t{step}\t{step}\t
+***End_of_Header***\t\t\t
+X_Value\t{name}\tskin\tComment
+"""
+
+
+def labview(path, count=COUNT, step=5e-6, name="open", times=None):
+    times = [f"{i * 5e-6:.6f}" for i in range(COUNT)] if times is None else times
+    lines = (f"{t}\t{a:.3f}\t{b:.4f}\t\n" for t, a, b in zip(times, V_TH, V_OUT, strict=True))
+    path = path / "a.lvm"
+    path.write_text(LVM.format(count=count, step=step, name=name) + "".join(lines))
+    return path
+
+
+def test_a_labview_file_that_ends_early_is_refused(tmp_path):
+    refused(labview(tmp_path, count=31), "'open' has 30 samples, the file declares 31")
+    # LabVIEW appends to a file without changing its header.
+    one, _ = imported(labview(tmp_path, count=10))
+    np.testing.assert_array_equal(one.v_th, V_TH)
+    path = labview(tmp_path)
+    path.write_text(path.read_text()[:-5])
+    assert "the last number" in imported(path)[1][0]
+
+
+def test_the_interval_of_a_labview_file_fits_its_times(tmp_path):
+    refused(labview(tmp_path, step=1e-5), "Delta_X: is 1e-05 s, but the column of times has steps")
+    refused(labview(tmp_path, step=2.5e-6), "Delta_X: is 2.5e-06 s, but the column of")
+    coarse = [f"{i * 5e-6:.5f}" for i in range(COUNT)]
+    again = [f"{i % 10 * 5e-6:.6f}" for i in range(COUNT)]  # appended three times
+    for times in ([""] * COUNT, coarse, again):
+        assert imported(labview(tmp_path, times=times))[0].sample_rate == 200e3
+
+
+def test_a_unit_in_the_name_of_a_channel_is_its_unit(tmp_path):
+    path = labview(tmp_path, name="open [mV]")
+    said = r"v_th: the file says 'Volts' and 'mV' of channel 'open \[mV\]'"
+    refused(path, said, v_th="open [mV]")
+    path = tmp_path / "a.npz"
+    np.savez(path, skin=V_OUT, **{"open [mV]": V_TH})  # pyright: ignore[reportArgumentType]
+    one, _ = imported(path, v_th="open [mV]", **RATE)
+    np.testing.assert_allclose(one.v_th, V_TH * 1e-3)
+
+
+def sound(path, kind):
+    """A WAV file of two channels; its samples begin at byte 44, or 58 for float32."""
+    both = np.stack([V_TH, V_OUT], 1) / 10
+    if kind == "24 bits":
+        with wave.open(str(path), "wb") as file:
+            file.setnchannels(2)
+            file.setsampwidth(3)
+            file.setframerate(200_000)
+            file.writeframes(bytes(6 * COUNT))
+    else:
+        codes = both if kind == "float32" else both * 2**15
+        scipy.io.wavfile.write(path, 200_000, codes.astype(kind))
+    return path.read_bytes()
+
+
+@pytest.mark.parametrize("kind", ["int16", "float32", "24 bits"])
+def test_a_wav_file_that_was_cut_off_is_refused_wherever_it_was(kind, tmp_path):
+    path, given = tmp_path / "a.wav", {"v_th": "1", "v_out": "2"}
+    whole = sound(path, kind)
+    for cut in (1, 2, 3, 4, 40, 119):
+        path.write_bytes(whole[:-cut])
+        refused(path, rf"is truncated: its samples end at byte {len(whole)}, the file", **given)
+    text = b"LIST" + (4).to_bytes(4, "little") + b"INFO"
+    path.write_bytes(whole + text)  # as sound editors append it
+    assert imported(path, **given)[0].sample_rate == 200e3
+
+
+def rig(path, v_out=V_OUT, **own):
+    signals = {"rig/open": (V_TH, {}), "rig/skin": (v_out, own)}
+    return tdms(path / "rig.tdms", signals, unit_string="V", wf_increment=5e-6)
+
+
+RIG = {"v_th": "rig/open", "v_out": "rig/skin"}
+LINE = {"NI_Number_Of_Scales": 1, "NI_Scale[0]_Scale_Type": "Linear",
+        "NI_Scale[0]_Linear_Slope": 2e-3, "NI_Scale[0]_Linear_Y_Intercept": 0.5}  # fmt: skip
+
+
+@pytest.mark.parametrize("kind", ["i2", "f4", "f8"])
+def test_a_scaling_that_leaves_no_samples_is_refused(kind, tmp_path):
+    codes = np.arange(COUNT).astype(kind)
+    for name, value in (("Slope", 0.0), ("Slope", np.nan), ("Y_Intercept", np.inf)):
+        path = rig(tmp_path, codes, **LINE | {f"NI_Scale[0]_Linear_{name}": value})
+        refused(path, "v_out: channel 'rig/skin' is scaled with slope", **RIG)
+    one, _ = imported(rig(tmp_path, codes, **LINE), **RIG)
+    np.testing.assert_allclose(one.v_out, 0.5 + 2e-3 * np.arange(COUNT), rtol=1e-15)
+
+
+@pytest.mark.parametrize("kind", ["f4", "f8"])
+def test_a_scaling_of_real_numbers_is_applied(kind, tmp_path):
+    square = {"NI_Number_Of_Scales": 1, "NI_Scale[0]_Scale_Type": "Polynomial",
+              "NI_Scale[0]_Polynomial_Coefficients_Size": 3,
+              **{f"NI_Scale[0]_Polynomial_Coefficients[{i}]": c
+                 for i, c in enumerate((0.5, 2e-3, 1e-7))}}  # fmt: skip
+    one, _ = imported(rig(tmp_path, np.arange(COUNT).astype(kind), **square), **RIG)
+    n = np.arange(COUNT)
+    np.testing.assert_allclose(one.v_out, 0.5 + 2e-3 * n + 1e-7 * n**2, rtol=1e-15)
+
+
+def test_two_units_of_a_tdms_channel_are_not_chosen_from(tmp_path):
+    said = "v_out: the file says 'V' and 'mV' of channel 'rig/skin'"
+    refused(rig(tmp_path, NI_UnitDescription="mV"), said, **RIG)
+    one, _ = imported(rig(tmp_path, NI_UnitDescription="Volts"), **RIG)
+    np.testing.assert_array_equal(one.v_out, V_OUT)
+
+
+def test_the_steps_of_a_tdms_channel_have_a_unit(tmp_path):
+    refused(rig(tmp_path, wf_xunit_string="Hz"), "a sample every 5e-06 'Hz', which is not a", **RIG)
+    path = rig(tmp_path, wf_increment=5.0, wf_xunit_string="us")
+    assert imported(path, **RIG)[0].sample_rate == pytest.approx(200e3, rel=1e-12)
