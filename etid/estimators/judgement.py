@@ -101,7 +101,8 @@ def judged(
         chi2=estimate.chi2,
         result=first_verdict(
             (~jnp.isfinite(estimate.chi2), RESULTS.unstable),
-            (~jnp.isfinite(values).all(), RESULTS.nonphysical),
+            # exp() of a far parameter is 0, which a file of fits refuses in a successful fit.
+            (~((values > 0) & jnp.isfinite(values)).all(), RESULTS.nonphysical),
             (fitted.is_too_steep(estimate.cov), RESULTS.nonphysical),
             (~settled, MAX_STEPS_REACHED),
             (misses(estimate.chi2, estimate.rrse) | too_late(estimate), RESULTS.misfit),
