@@ -37,7 +37,7 @@ from etid.identify.many import common_first, identify_part, to_identify
 from etid.identify.study_drivers import Drivers
 from etid.recordings.hdf5 import read
 from etid.recordings.recording import RecordingError
-from etid.recordings.replacing import replacing
+from etid.recordings.replacing import replace_text
 from etid.recordings.study import Study
 from etid.results.provenance import Settings
 from etid.results.study_fits import StudyFits
@@ -158,8 +158,7 @@ class _Parts:
                     f"{self.folder}: the earlier run had another {' and '.join(changed)}; "
                     "leave out resume to start again"
                 )
-        with replacing(described) as partial:
-            partial.write_text(json.dumps(run), "utf-8")
+        replace_text(described, json.dumps(run))
 
     def path(self, number: int) -> pathlib.Path:
         """File of one part."""

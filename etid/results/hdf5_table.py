@@ -10,7 +10,7 @@ import numpy as np
 
 from etid.recordings import limits
 from etid.recordings.errors import RecordingError
-from etid.recordings.replacing import check_ending, replacing
+from etid.recordings.replacing import check_ending, replacing_hdf5
 from etid.recordings.untrusted import (
     attribute,
     check_size,
@@ -40,7 +40,7 @@ def write_table(
         RecordingError: The name of the file says another format.
     """
     check_ending(path)
-    with replacing(path) as partial, h5py.File(partial, "w") as file:
+    with replacing_hdf5(path) as file:
         file.attrs.update(attributes)
         for name, column in columns.items():
             text = np.asarray(column).dtype.kind in "OU"
