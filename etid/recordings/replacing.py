@@ -37,6 +37,15 @@ def check_ending(path: str | os.PathLike[str], endings: tuple[str, ...] = HDF5) 
         raise RecordingError(f"the file is not written as {suffix}; name it {name}", file=str(file))
 
 
+def unwritable(path: str | os.PathLike[str], error: OSError) -> RecordingError:
+    """The error for a file that the operating system does not let us write."""
+    return RecordingError(
+        f"cannot be written ({error})",
+        file=os.fspath(path),
+        remedy="Check folder, permissions and disk space",
+    )
+
+
 @contextlib.contextmanager
 def replacing(path: str | os.PathLike[str]) -> Iterator[pathlib.Path]:
     """Path of a temporary file for the block; it replaces the target when the block succeeds.
@@ -60,11 +69,7 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[pathlib.Path]:
             os.fsync(written)  # some file systems say only now that they are full
         os.replace(partial, target)
     except OSError as error:
-        raise RecordingError(
-            f"cannot be written ({error})",
-            file=name,
-            remedy="Check folder, permissions and disk space",
-        ) from error
+        raise unwritable(name, error) from error
     finally:
         with contextlib.suppress(OSError):  # the file may not exist
             partial.unlink(missing_ok=True)
