@@ -1,6 +1,7 @@
 """A fit that failed may hold any number: what etid writes it reads, shows and exports."""
 
 import dataclasses
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -76,7 +77,7 @@ METHODS = {
 
 def nonsense(v_th, rng):
     """A terminal voltage that has to do with V_th, and with no circuit."""
-    v_out = v_th * 10 ** rng.uniform(-3, 1)
+    v_out: Any = v_th * 10 ** rng.uniform(-3, 1)
     for _ in range(rng.integers(3)):
         pole = rng.choice([-1, 1]) * rng.uniform(0.5, 0.9999)
         v_out = scipy.signal.lfilter([1 - pole, rng.normal()], [1, -pole], v_out)
@@ -85,7 +86,7 @@ def nonsense(v_th, rng):
     if rng.random() < 0.3:
         v_out = v_out * np.linspace(1, rng.normal(), v_out.size)
     v_out = np.roll(v_out, rng.integers(-3, 4)) * rng.choice([1, 1, 1, -1])
-    return v_out + np.ptp(v_out) * 10 ** rng.uniform(-6, 0) * rng.normal(size=v_out.size)
+    return v_out + np.ptp(v_out) * 10 ** rng.uniform(-6, 0) * rng.normal(size=v_th.size)
 
 
 @pytest.fixture(scope="module")

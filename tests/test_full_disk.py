@@ -63,12 +63,13 @@ def on_disk_of():
         text=True,
         env=environment,
     ) as process:
-        assert process.stdin is not None
-        assert process.stdout is not None
+        to, back = process.stdin, process.stdout
+        assert to is not None
+        assert back is not None
 
         def run(size, *arguments):
-            print(json.dumps([size, [*map(str, arguments)]]), file=process.stdin, flush=True)
-            return tuple(json.loads(process.stdout.readline()))
+            print(json.dumps([size, [*map(str, arguments)]]), file=to, flush=True)
+            return tuple(json.loads(back.readline()))
 
         yield run
         _, errors = process.communicate()
@@ -167,3 +168,19 @@ def test_a_device_is_not_replaced_by_a_file(capsys):
     assert cli.main(["simulate", "paper_dry", "-o", os.devnull, "--force"]) == 1
     assert "this is a device or a pipe; name a file" in capsys.readouterr().err
     assert not pathlib.Path(os.devnull).is_file()
+
+
+@pytest.mark.skipif(not os.path.exists("/dev/full"), reason="this system has no /dev/full")
+def test_an_output_that_cannot_be_printed_is_one_line(study):
+    with open("/dev/full", "w") as full:
+        done = subprocess.run(
+            [sys.executable, "-m", "etid", "check", study],
+            stdout=full,
+            stderr=subprocess.PIPE,
+            text=True,
+            check=False,
+        )
+    assert done.returncode == 1
+    assert done.stderr == (
+        "etid: error: the output cannot be written ([Errno 28] No space left on device)\n"
+    )
