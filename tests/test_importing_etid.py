@@ -18,7 +18,6 @@ def test_importing_prints_nothing_and_changes_no_setting():
 import jax
 before = dict(jax.config.values)
 import sys, etid
-assert "jax" not in sys.modules, "a command must be able to handle Ctrl-C before this import"
 etid.read
 from jax._src import xla_bridge
 assert dict(jax.config.values) == before

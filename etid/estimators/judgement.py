@@ -101,16 +101,16 @@ def judged(
         chi2=estimate.chi2,
         result=first_verdict(
             (~jnp.isfinite(estimate.chi2), RESULTS.unstable),
-            # exp() of a far parameter is 0, which a file of fits refuses in a successful fit.
-            (~((values > 0) & jnp.isfinite(values)).all(), RESULTS.nonphysical),
+            (~jnp.isfinite(values).all(), RESULTS.nonphysical),
             (fitted.is_too_steep(estimate.cov), RESULTS.nonphysical),
             (~settled, MAX_STEPS_REACHED),
             (misses(estimate.chi2, estimate.rrse) | too_late(estimate), RESULTS.misfit),
             (estimate.falls, RESULTS.misfit),  # which can pass for a change of the driver
             (estimate.strain > STRAINED, RESULTS.inconsistent),
             (contradicted, RESULTS.out_of_bounds),
-            # An error of 0 also fails: the element has no effect.
-            (~jnp.all((errors > 0) & (errors < 1)), RESULTS.insensitive),
+            # An error of 0 also fails: the element has no effect. So does a value of 0, exp() of a
+            # far parameter: files of fits hold positive elements where a fit is successful.
+            (~jnp.all((errors > 0) & (errors < 1) & (values > 0)), RESULTS.insensitive),
             (driver_result != SUCCESSFUL, RESULTS.driver_failed),
         ),
         steps=estimate.steps,
