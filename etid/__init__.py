@@ -14,63 +14,17 @@ print(fit)
 import importlib
 from typing import TYPE_CHECKING, Any
 
-from etid.circuits.circuit import (
-    AbstractCircuit,
-    ParallelRC,
-    Resistor,
-    SkinCole,
-    SkinLayers,
-    SkinRC,
-    parameter,
-)
-from etid.circuits.current_dependent import SkinCurrent, current_dependent_resistor
-from etid.circuits.elements import capacitor, cole, constant_phase, resistor
-from etid.circuits.impedance import parallel, series
-from etid.circuits.netlist import circuit_string, netlist
-from etid.circuits.written import circuit
-from etid.estimators.estimator import AbstractEstimator
-from etid.estimators.harmonic_steiglitz_mcbride.estimator import HarmonicSteiglitzMcBride
-from etid.estimators.maximum_likelihood.estimator import MaximumLikelihood
-from etid.estimators.non_parametric.estimator import NonParametric
-from etid.estimators.output_error.estimator import OutputError
-from etid.estimators.registry import register
-from etid.estimators.steiglitz_mcbride.estimator import EquationError, SteiglitzMcBride
-from etid.identify import posterior as _posterior
-from etid.identify import profile as _profile
-from etid.identify.amplitudes import identify_amplitudes
-from etid.identify.driver import identify_driver
-from etid.identify.file import fit_file
-from etid.identify.impedance import identify_impedance
-from etid.identify.jointly import identify_jointly
-from etid.identify.kramers_kronig import KramersKronig, kramers_kronig
-from etid.identify.many import identify_skins, identify_study
-from etid.identify.one import identify_skin
-from etid.identify.predict import predict
-from etid.identify.samples import identify_samples
-from etid.identify.selecting import select_circuit
-from etid.online.controller import Controller
-from etid.online.tracker import Tracker
-from etid.plotting import plot
-from etid.recordings.hdf5 import check, read
-from etid.recordings.recording import Recording, RecordingError, Samples
-from etid.recordings.study import Study
-from etid.results.data import provide as _provide
-from etid.results.driver import Driver
-from etid.results.fit import Fit, IdentificationError
-from etid.results.fits import Fits
-from etid.results.posterior import Posterior, Profile
-from etid.results.study_fits import StudyFits
-from etid.results.verdicts import RESULTS
-from etid.selection.selection import Candidate, Selection
-from etid.simulation import scenes
-from etid.simulation.bound import Bound, Bounds, bound
-
 if TYPE_CHECKING:
-    from etid.files.exporting import export_circuit, export_fits, export_study
-    from etid.files.importing import import_file
-    from etid.files.measured_impedance import read_impedance
-    from etid.plotting.interactive import interactive
-    from etid.report.study import write_report
+    from etid.files.exporting import export_circuit as export_circuit
+    from etid.files.exporting import export_fits as export_fits
+    from etid.files.exporting import export_study as export_study
+    from etid.files.importing import import_file as import_file
+    from etid.files.measured_impedance import read_impedance as read_impedance
+    from etid.plotting.interactive import interactive as interactive
+    from etid.public import *  # noqa: F403 - it states its names in `__all__`
+    from etid.report.study import write_report as write_report
+
+__version__ = "0.1.0"
 
 # Files of others and reports are imported when they are first used: a fit needs none of them.
 _LATER = {
@@ -83,89 +37,24 @@ _LATER = {
     "write_report": "etid.report.study",
 }
 
-_provide(plot=plot, posterior=_posterior.posterior, profile=_profile.profile)
 
-__version__ = "0.1.0"
-
-__all__ = [
-    "RESULTS",
-    "AbstractCircuit",
-    "AbstractEstimator",
-    "Bound",
-    "Bounds",
-    "Candidate",
-    "Controller",
-    "Driver",
-    "EquationError",
-    "Fit",
-    "Fits",
-    "HarmonicSteiglitzMcBride",
-    "IdentificationError",
-    "KramersKronig",
-    "MaximumLikelihood",
-    "NonParametric",
-    "OutputError",
-    "ParallelRC",
-    "Posterior",
-    "Profile",
-    "Recording",
-    "RecordingError",
-    "Resistor",
-    "Samples",
-    "Selection",
-    "SkinCole",
-    "SkinCurrent",
-    "SkinLayers",
-    "SkinRC",
-    "SteiglitzMcBride",
-    "Study",
-    "StudyFits",
-    "Tracker",
-    "__version__",
-    "bound",
-    "capacitor",
-    "check",
-    "circuit",
-    "circuit_string",
-    "cole",
-    "constant_phase",
-    "current_dependent_resistor",
-    "export_circuit",
-    "export_fits",
-    "export_study",
-    "fit_file",
-    "identify_amplitudes",
-    "identify_driver",
-    "identify_impedance",
-    "identify_jointly",
-    "identify_samples",
-    "identify_skin",
-    "identify_skins",
-    "identify_study",
-    "import_file",
-    "interactive",
-    "kramers_kronig",
-    "netlist",
-    "parallel",
-    "parameter",
-    "plot",
-    "predict",
-    "read",
-    "read_impedance",
-    "register",
-    "resistor",
-    "scenes",
-    "select_circuit",
-    "series",
-    "write_report",
-]
-
-
+# The import of JAX and of all layers takes a second: a command must first be able to handle Ctrl-C.
 def __getattr__(name: str) -> Any:
-    if name not in _LATER:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(importlib.import_module(_LATER[name]), name)
+    if name in _LATER:
+        return getattr(importlib.import_module(_LATER[name]), name)
+    if name == "__all__":
+        return [*_public().__all__, *_LATER, "__version__"]
+    if not name.startswith("__"):
+        if name in _public().__all__:
+            return getattr(_public(), name)
+        if name in globals():  # a package of etid, which `public` has imported
+            return globals()[name]
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
 
 def __dir__() -> list[str]:
-    return sorted(__all__)
+    return sorted(__getattr__("__all__"))
+
+
+def _public() -> Any:
+    return importlib.import_module("etid.public")

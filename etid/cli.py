@@ -25,8 +25,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-import etid
+import etid.public
 from etid.commands import (
+    DONE,
     INTERRUPTED,
     WRONG_DATA,
     Outcome,
@@ -83,8 +84,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     if arguments.json:
         data = {"command": arguments.command, "status": outcome.status, **outcome.data}
         text = json.dumps(_plain(data), ensure_ascii=False, allow_nan=False)
-    _print(text)
-    return outcome.status
+    return max(outcome.status, _print(text))
 
 
 def _after_interrupt(arguments: argparse.Namespace) -> str:
@@ -159,15 +159,23 @@ def _complete_paths(parser: argparse.ArgumentParser, how: Any) -> None:
                 _complete_paths(command, how)
 
 
-def _print(text: str) -> None:
-    """Print a text unless it is empty; a closed pipe, as after `| head`, is no error."""
+def _print(text: str) -> int:
+    """Print a text unless it is empty; a closed pipe, as after `| head`, is no error.
+
+    Returns:
+        Exit status.
+    """
     try:
         if text:
             print(text, flush=True)
-    except BrokenPipeError:
+    except OSError as error:
         os.dup2(
             os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno()
         )  # Python flushes stdout at exit
+        if not isinstance(error, BrokenPipeError):
+            print(f"etid: error: the output cannot be written ({error})", file=sys.stderr)
+            return WRONG_DATA
+    return DONE
 
 
 def _keep_programs() -> None:
@@ -205,7 +213,3 @@ def _plain(value: Any) -> Any:
     if isinstance(value, float) and not math.isfinite(value):
         return None
     return str(value) if isinstance(value, pathlib.Path) else value
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -440,7 +440,7 @@ def test_wrong_usage_ends_with_2(run, arguments):
 
 def test_the_program_starts_in_float64_and_knows_its_version(tmp_path):
     """In a process of its own: this one has float64 switched on already."""
-    command = [sys.executable, "-m", "etid.cli"]
+    command = [sys.executable, "-m", "etid"]
     version = subprocess.run([*command, "--version"], capture_output=True, text=True, check=True)
     backend = jax.default_backend()
     told = f"etid {etid.__version__}, JAX {jax.__version__}, {backend}, float64\n"
@@ -461,7 +461,7 @@ def test_a_reader_that_has_gone_is_no_error(tmp_path):
     read, write = os.pipe()
     os.close(read)
     etid.scenes.paper_calibration().simulate(seed=0).write(tmp_path / "study.h5")
-    command = [sys.executable, "-m", "etid.cli", "check", tmp_path / "study.h5"]
+    command = [sys.executable, "-m", "etid", "check", tmp_path / "study.h5"]
     done = subprocess.run(command, stdout=write, stderr=subprocess.PIPE, check=False)
     os.close(write)
     assert (done.returncode, done.stderr) == (DONE, b"")

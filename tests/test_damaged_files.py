@@ -238,7 +238,6 @@ def replaced(fits, name, values):
         ("steps", np.zeros(6), "steps: is of type float64, must be integer"),
         ("path", np.zeros(6), "path: is of type float64, must be text"),
         ("cov", np.zeros((6, 2, 2)), "cov: has shape"),
-        ("c_p", [1e-9] * 5 + [1e300], "c_p: holds 1e\\+300, at most"),
         ("verdict", ["fine"] * 6, "verdict: 'fine' is not a verdict"),
         ("drivers", ["{"], r"drivers\[0\]: holds a driver that cannot be read"),
         ("drivers", ["[" * 10**5], r"drivers\[0\]: holds a driver .*RecursionError"),

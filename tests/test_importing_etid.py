@@ -18,6 +18,7 @@ def test_importing_prints_nothing_and_changes_no_setting():
 import jax
 before = dict(jax.config.values)
 import sys, etid
+etid.read
 from jax._src import xla_bridge
 assert dict(jax.config.values) == before
 assert not {"matplotlib", "pandas", "jaxopt", "pyarrow", "pynwb"} & set(sys.modules), "too much"

@@ -83,19 +83,13 @@ def test_a_wrong_column_is_one_error_that_names_it(path, name, kind, shape, word
         assert raised.value.file == str(path)
 
 
-def test_more_rows_or_larger_numbers_than_are_read_are_refused(path, monkeypatch):
+def test_more_rows_than_are_read_are_refused(path, monkeypatch):
     with opened_table(path, KIND) as table:
         monkeypatch.setattr(limits, "FITS", 3)
-        size = table.column("size", "number")
+        table.column("size", "number")
         monkeypatch.setattr(limits, "FITS", 2)
         with pytest.raises(RecordingError, match="has 3 rows, at most 2 are read"):
             table.column("size", "number")
-        monkeypatch.setattr(limits, "LARGEST", 1.5)
-        np.testing.assert_array_equal(table.read(size), COLUMNS["size"])
-        monkeypatch.setattr(limits, "LARGEST", 1.4)
-        with pytest.raises(RecordingError, match=r"holds 1.5, at most 1.4 is read") as raised:
-            table.read(size)
-        assert raised.value.field == "size"
 
 
 def test_a_wrong_attribute_is_one_error_that_names_it(path):

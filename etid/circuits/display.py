@@ -20,6 +20,7 @@ BASE = {"ohm": "Ω", "farad": "F", "second": "s", "ampere": "A"}  # units that t
 PREFIXES = {
     -15: "f", -12: "p", -9: "n", -6: "µ", -3: "m", 0: "", 3: "k", 6: "M", 9: "G", 12: "T"
 }  # fmt: skip
+LONG = 1e10  # from here on, a value or its error is shown as a power of ten
 NOTHING = 1e-8  # standard error over value, below which it is shown as 0
 USUAL = (0.01, 1e4)  # values in the unit of `DISPLAY` that are shown in this unit
 
@@ -57,6 +58,8 @@ def plus_minus(value: float, error: float) -> str:
         return f"{value:10.4g}            "
     if error < NOTHING * abs(value):
         return f"{value:10.7g} ± {0:<9}"
+    if max(abs(value), error) >= LONG:
+        return f"{value:10.4g} ± {error:<9.2g}"
     digits = int(np.clip(1 - np.floor(np.log10(error)), 0, 9))
     return f"{value:10.{digits}f} ± {error:<9.{digits}f}"
 

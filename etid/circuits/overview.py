@@ -122,6 +122,7 @@ class Overviewed(abc.ABC):
             return None
 
 
+@np.errstate(over="ignore")  # a fit that failed may hold any number
 def element_rows(
     units: Mapping[str, str],
     values: Float[np.ndarray, "*lane element"],

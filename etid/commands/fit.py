@@ -19,6 +19,7 @@ from etid.identify.arguments import order_of
 from etid.identify.file import fit_file, kept, processes
 from etid.identify.jointly import identify_jointly
 from etid.recordings import hdf5
+from etid.recordings.claiming import claimed
 from etid.recordings.errors import RecordingError
 from etid.recordings.replacing import HDF5
 from etid.report.html import Table
@@ -168,7 +169,7 @@ def run(arguments: argparse.Namespace) -> Outcome:
     if arguments.joint:
         if arguments.resume or arguments.workers or arguments.dask:
             raise ValueError("--joint is one fit per driver; remove --resume, --workers and --dask")
-        with hdf5.read(arguments.source) as study:
+        with hdf5.read(arguments.source) as study, claimed(arguments.target):
             outcome = identify_jointly(
                 study,
                 order=arguments.order,
@@ -178,9 +179,10 @@ def run(arguments: argparse.Namespace) -> Outcome:
                 bounds=bounds,
                 progress=progress,
             )
-        outcome.write(arguments.target)
+            outcome.write(arguments.target)
     else:
-        unfinished = "" if arguments.resume or arguments.force else kept(arguments.target)
+        with claimed(arguments.target):  # a run that goes on is not unfinished
+            unfinished = "" if arguments.resume or arguments.force else kept(arguments.target)
         if unfinished:
             raise ValueError(f"{unfinished}; add --resume to continue, or --force to begin again")
         with _executor(arguments) as executor:

@@ -21,6 +21,8 @@ def check_outputs(outputs: Mapping[pathlib.Path, tuple[str, ...]], *, force: boo
     for path, endings in outputs.items():
         if path.is_dir():
             raise ValueError(f"{path}: this is a folder; name a file")
+        if path.exists() and not path.is_file():  # it would be replaced
+            raise ValueError(f"{path}: this is a device or a pipe; name a file")
         if not path.absolute().parent.is_dir():
             raise ValueError(f"{path}: the folder of this file does not exist")
         check_ending(path, endings)

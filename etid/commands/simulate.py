@@ -6,7 +6,7 @@ import pathlib
 
 from etid.circuits.display import several
 from etid.commands import Outcome
-from etid.recordings.replacing import HDF5
+from etid.recordings.replacing import HDF5, replace_text
 from etid.simulation import scenes
 
 
@@ -50,6 +50,6 @@ def run(arguments: argparse.Namespace) -> Outcome:
     study = scene.simulate(arguments.seed)
     study.write(arguments.target)
     if arguments.truth is not None:
-        arguments.truth.write_text(json.dumps(scene.truth(), indent=1) + "\n", encoding="utf-8")
+        replace_text(arguments.truth, json.dumps(scene.truth(), indent=1) + "\n")
     text = f"{arguments.target}: {several(len(study), 'recording')}"
     return Outcome(text, {"target": arguments.target, "recordings": len(study)})

@@ -108,8 +108,9 @@ def judged(
             (estimate.falls, RESULTS.misfit),  # which can pass for a change of the driver
             (estimate.strain > STRAINED, RESULTS.inconsistent),
             (contradicted, RESULTS.out_of_bounds),
-            # An error of 0 also fails: the element has no effect.
-            (~jnp.all((errors > 0) & (errors < 1)), RESULTS.insensitive),
+            # An error of 0 also fails: the element has no effect. So does a value of 0, exp() of a
+            # far parameter: files of fits hold positive elements where a fit is successful.
+            (~jnp.all((errors > 0) & (errors < 1) & (values > 0)), RESULTS.insensitive),
             (driver_result != SUCCESSFUL, RESULTS.driver_failed),
         ),
         steps=estimate.steps,

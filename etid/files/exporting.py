@@ -17,7 +17,7 @@ from etid.circuits.netlist import circuit_string, netlist
 from etid.files.channel import listed, needs
 from etid.recordings import limits
 from etid.recordings.recording import RecordingError
-from etid.recordings.replacing import replacing
+from etid.recordings.replacing import replace_text, replacing
 from etid.recordings.untrusted import attribute, translated
 from etid.results.fit import Fit
 from etid.results.fits import DESCRIBED, SCHEMA, Fits
@@ -190,8 +190,7 @@ def export_circuit(
         text = _written(fit, paths[index], suffix)
     except ValueError as error:  # an element is 0 or not finite
         raise RecordingError(str(error), file=os.fspath(source), path=paths[index]) from error
-    with replacing(target) as partial:
-        partial.write_text(text, encoding="utf-8")
+    replace_text(target, text)
 
 
 def _written(fit: Fit, path: str, suffix: str) -> str:

@@ -19,7 +19,7 @@ from etid.recordings import schema
 from etid.recordings.fields import DECLARED, SIGNALS
 from etid.recordings.hdf5 import read
 from etid.recordings.recording import AbstractSource, Layout, RecordingError
-from etid.recordings.replacing import replacing
+from etid.recordings.replacing import replacing_hdf5
 
 # pynwb declares its arguments with a decorator that hides them from the type checker.
 _nwb: Any = pynwb
@@ -63,7 +63,10 @@ def write_nwb(
             name="recordings", description="One line per recording", columns=columns
         )
         file.add_acquisition(table)
-        with replacing(target) as partial, _nwb.NWBHDF5IO(partial, "w") as output:
+        with (
+            replacing_hdf5(target) as written,
+            _nwb.NWBHDF5IO(file=written, mode="w") as output,
+        ):
             output.write(file)
 
 

@@ -35,9 +35,10 @@ from etid.estimators.registry import Method
 from etid.identify.arguments import Asked, Circuit, Interval, asked_of, candidates_of, order_of
 from etid.identify.many import common_first, identify_part, to_identify
 from etid.identify.study_drivers import Drivers
+from etid.recordings.claiming import claimed
 from etid.recordings.hdf5 import read
 from etid.recordings.recording import RecordingError
-from etid.recordings.replacing import replacing
+from etid.recordings.replacing import replace_text
 from etid.recordings.study import Study
 from etid.results.provenance import Settings
 from etid.results.study_fits import StudyFits
@@ -158,8 +159,7 @@ class _Parts:
                     f"{self.folder}: the earlier run had another {' and '.join(changed)}; "
                     "leave out resume to start again"
                 )
-        with replacing(described) as partial:
-            partial.write_text(json.dumps(run), "utf-8")
+        replace_text(described, json.dumps(run))
 
     def path(self, number: int) -> pathlib.Path:
         """File of one part."""
@@ -220,7 +220,8 @@ def fit_file(
     Raises:
         ResumeError: The earlier run had other settings, the source has changed since, or a worker
             was lost.
-        RecordingError: The source as a whole is missing, damaged or of another schema.
+        RecordingError: The source as a whole is missing, damaged or of another schema, or another
+            process is writing the target.
         ValueError: The source has no loaded recording.
     """
     order = order_of(order)
@@ -228,7 +229,7 @@ def fit_file(
     asked = asked_of(method, candidates, fixed, prior, bounds)
     source, target = os.path.abspath(source), pathlib.Path(target)
     opened = _open(source, order, asked, driver_drift)
-    with opened.study:
+    with opened.study, claimed(target):
         count = len(opened.paths)
         if not count:
             raise ValueError("the study has no loaded recording")
@@ -270,12 +271,12 @@ def fit_file(
                 dataclasses.replace(found, settings=settings).write(parts.path(number))
                 drivers |= found.drivers
                 bar.update(len(found.fits))
-    whole = StudyFits.concatenate(
-        StudyFits.read(parts.path(number), type(candidates[0])) for number in numbers
-    )
-    whole.write(target)
-    shutil.rmtree(parts.folder)
-    return dataclasses.replace(whole, drivers={**whole.drivers, **drivers})
+        whole = StudyFits.concatenate(
+            StudyFits.read(parts.path(number), type(candidates[0])) for number in numbers
+        )
+        whole.write(target)
+        shutil.rmtree(parts.folder)
+        return dataclasses.replace(whole, drivers={**whole.drivers, **drivers})
 
 
 def _results(

@@ -36,6 +36,7 @@ from etid.paper.tables import (
 )
 from etid.plotting import figure_of
 from etid.plotting.style import save
+from etid.recordings.replacing import replace_text
 from etid.report.html import Picture, Section, Table, number, write_page
 from etid.simulation.published import FINGERTIPS, RRSE, TABLE_1, TABLE_4
 
@@ -216,7 +217,7 @@ def main(argv: Sequence[str] | None = None) -> None:
                 outcomes.append(outcome)
             if laboratory == "quiet":
                 drawn = figures(folder / "figures", study, outcomes[0])
-    (folder / "truth.json").write_text(json.dumps(truth, indent=1) + "\n", encoding="utf-8")
+    replace_text(folder / "truth.json", json.dumps(truth, indent=1) + "\n")
 
     sections = [
         Section(

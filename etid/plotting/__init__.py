@@ -136,6 +136,7 @@ def figure_of(
     return _draw(canvas, x, recording, driver, show)[0].figure
 
 
+@np.errstate(all="ignore")  # a fit that failed may hold any number
 def _draw(
     canvas: "Canvas", x: Any, recording: Recording | None, driver: Driver | None, show: Shown
 ) -> np.ndarray:

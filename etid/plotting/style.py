@@ -19,6 +19,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullFormatter
 
 from etid.circuits.display import heading
+from etid.recordings.replacing import replacing
 
 INK = "#1a1a1a"
 BLUE = "#0b62a4"
@@ -134,4 +135,5 @@ def save(figure: Figure, path: str | os.PathLike[str]) -> None:
     suffix = pathlib.Path(path).suffix.lower()
     if suffix not in (".png", ".svg"):
         raise ValueError(f"{path}: use the suffix .png or .svg instead of {suffix or 'none'}")
-    figure.savefig(path, dpi=150, metadata={"Date": None} if suffix == ".svg" else {})
+    with replacing(path) as partial:
+        figure.savefig(partial, dpi=150, metadata={"Date": None} if suffix == ".svg" else {})

@@ -20,4 +20,3 @@ ATTRIBUTE = 1 << 24  # [bytes] size of one attribute: the labels of TRIALS trial
 COLUMNS = 1000  # columns of a table
 MAPPING = 1 << 22  # [bytes] size of a mapping file
 FITS = 1 << 24  # rows of a file of fits
-LARGEST = 1e290  # finite number in a file of fits; in scaled units, such as pF, it is still finite

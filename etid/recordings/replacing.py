@@ -5,6 +5,9 @@ import os
 import pathlib
 import secrets
 from collections.abc import Iterator
+from typing import Any
+
+import h5py
 
 from etid.recordings.errors import RecordingError
 
@@ -34,6 +37,15 @@ def check_ending(path: str | os.PathLike[str], endings: tuple[str, ...] = HDF5) 
         raise RecordingError(f"the file is not written as {suffix}; name it {name}", file=str(file))
 
 
+def unwritable(path: str | os.PathLike[str], error: OSError) -> RecordingError:
+    """The error for a file that the operating system does not let us write."""
+    return RecordingError(
+        f"cannot be written ({error})",
+        file=os.fspath(path),
+        remedy="Check folder, permissions and disk space",
+    )
+
+
 @contextlib.contextmanager
 def replacing(path: str | os.PathLike[str]) -> Iterator[pathlib.Path]:
     """Path of a temporary file for the block; it replaces the target when the block succeeds.
@@ -53,13 +65,43 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[pathlib.Path]:
     partial = target.with_name(f".{target.stem}.{secrets.token_hex(4)}.partial{target.suffix}")
     try:
         yield partial
+        with open(partial, "rb+") as written:
+            os.fsync(written)  # some file systems say only now that they are full
         os.replace(partial, target)
     except OSError as error:
-        raise RecordingError(
-            f"cannot be written ({error})",
-            file=name,
-            remedy="Check folder, permissions and disk space",
-        ) from error
+        raise unwritable(name, error) from error
     finally:
         with contextlib.suppress(OSError):  # the file may not exist
             partial.unlink(missing_ok=True)
+
+
+@contextlib.contextmanager
+def replacing_hdf5(path: str | os.PathLike[str], **options: Any) -> Iterator[h5py.File]:
+    """An HDF5 file to write; it replaces the target when the block succeeds.
+
+    The library writes through a file of Python. If a write to a file of its own fails, it cannot
+    close that file any more, and ends the process with a segmentation fault.
+
+    Args:
+        path: Path of the target. An existing file is replaced at the end.
+        **options: Options of `h5py.File`.
+
+    Raises:
+        RecordingError: As `replacing`.
+    """
+    with (
+        replacing(path) as partial,
+        open(partial, "xb+") as raw,
+        h5py.File(raw, "w", **options) as file,
+    ):
+        yield file
+
+
+def replace_text(path: str | os.PathLike[str], text: str) -> None:
+    """Write a text as a file; an existing file is replaced at the end.
+
+    Raises:
+        RecordingError: As `replacing`.
+    """
+    with replacing(path) as partial:
+        partial.write_text(text, encoding="utf-8")

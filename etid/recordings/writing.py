@@ -10,7 +10,7 @@ import numpy as np
 
 from etid.recordings import schema
 from etid.recordings.recording import AbstractSource, RecordingError
-from etid.recordings.replacing import check_ending, replacing
+from etid.recordings.replacing import check_ending, replacing_hdf5
 
 
 def write(sources: Mapping[str, AbstractSource], path: str | os.PathLike[str]) -> None:
@@ -30,7 +30,7 @@ def write(sources: Mapping[str, AbstractSource], path: str | os.PathLike[str]) -
                 )
     # v108 has checksums for everything except samples, and allows the labels of large stacks
     libver = ("v108", "latest")
-    with replacing(path) as partial, h5py.File(partial, "x", libver=libver) as file:
+    with replacing_hdf5(path, libver=libver) as file:
         _write_attribute(file, "schema", schema.NAME)
         _write_attribute(file, "schema_version", schema.VERSION)
         for group, members in _stacks(sources).items():

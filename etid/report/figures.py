@@ -74,7 +74,8 @@ def distributions(fits: Fits) -> bytes:
         else:
             axis.xaxis.set_major_locator(matplotlib.ticker.MaxNLocator(5))
     axes[0, 0].set_ylabel("fits below [%]")
-    axes[0, 0].legend(frameon=False, fontsize=8)
+    if axes[0, 0].lines:
+        axes[0, 0].legend(frameon=False, fontsize=8)
     return svg(figure)
 
 
@@ -190,7 +191,7 @@ def components(found: Sequence[Components], conditions: Sequence[str]) -> bytes:
             for one in chosen:
                 sizes = 100 * np.array(list(one.parts.values()))
                 shift = 0.15 * (series - (len(conditions) - 1) / 2)
-                shown = np.isfinite(sizes) & (sizes > 0)
+                shown = drawable(sizes)
                 axis.plot(
                     sizes[shown], np.arange(len(parts))[shown] + shift, MARKS[series],
                     color=COLOURS[series], ms=6, label=_short(condition) or "all",

@@ -10,13 +10,14 @@ import dataclasses
 import hashlib
 import importlib.resources
 import os
-import pathlib
 import re
 import textwrap
 from collections.abc import Mapping, Sequence
 
 import jinja2
 import numpy as np
+
+from etid.recordings.replacing import replace_text
 
 LONG = 60  # characters; a longer cell is broken into lines
 MANY = 12  # rows; a longer table is below the pictures
@@ -166,4 +167,4 @@ def write_page(
         LONG=LONG,
         MANY=MANY,
     )
-    pathlib.Path(path).write_text(page.lstrip(), encoding="utf-8")
+    replace_text(path, page.lstrip())

@@ -27,6 +27,7 @@ FEW = 300  # largest number of fits that are drawn one by one
 DRIVERS = 4  # largest number of drivers in one diagram
 
 
+@np.errstate(all="ignore")  # a fit that failed may hold any number
 def write_report(
     fits: str | os.PathLike[str] | StudyFits | Fits,
     page: str | os.PathLike[str],

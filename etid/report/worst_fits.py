@@ -25,7 +25,7 @@ class Worst:
 
 def relative_stderr(fits: Fits) -> np.ndarray:
     """Largest relative standard error of the elements of each fit; NaN if one is NaN or both 0."""
-    with np.errstate(divide="ignore", invalid="ignore"):  # an element without effect may be 0
+    with np.errstate(all="ignore"):  # an element without effect may be 0, a failed fit anything
         stacked = np.stack(
             [
                 np.asarray(getattr(fits.stderr, name))

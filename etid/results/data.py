@@ -1,10 +1,11 @@
 """What a fit was made from, and what can be done with it.
 
-Pictures, draws and profiles belong to higher layers, which this one must not import. `etid` itself,
+Pictures, draws and profiles belong to higher layers, which this one must not import. `etid.public`,
 above all layers, hands their functions over with `provide`, so that a fit has them as methods.
 """
 
 import dataclasses
+import importlib
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any, Generic, Literal, TypeVar
 
@@ -28,6 +29,12 @@ _PROVIDED: dict[str, Callable[..., Any]] = {}
 def provide(**functions: Callable[..., Any]) -> None:
     """Make functions the methods of these names; their first argument is the fit."""
     _PROVIDED.update(functions)
+
+
+def _provided(name: str) -> Callable[..., Any]:
+    if name not in _PROVIDED:  # only modules of etid were imported so far, not its public names
+        importlib.import_module("etid.public")
+    return _PROVIDED[name]
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -109,7 +116,7 @@ class WithData(Generic[Circuit]):
         Raises:
             TypeError: The recording is not known.
         """
-        return _PROVIDED["plot"](self, recording, driver, show=show, axes=axes)
+        return _provided("plot")(self, recording, driver, show=show, axes=axes)
 
     def posterior(
         self,
@@ -139,7 +146,7 @@ class WithData(Generic[Circuit]):
             ValueError: The recording is not known, or the fit is a batch, or comes from another
                 method than maximum likelihood, or its data do not determine all elements.
         """
-        return _PROVIDED["posterior"](self, recording, driver, draws=draws, seed=seed)
+        return _provided("posterior")(self, recording, driver, draws=draws, seed=seed)
 
     def profile(
         self, name: str, recording: Recording | None = None, driver: Driver | None = None
@@ -157,7 +164,7 @@ class WithData(Generic[Circuit]):
         Raises:
             ValueError: The circuit has no such element, or as in `posterior`.
         """
-        return _PROVIDED["profile"](self, recording, driver, name)
+        return _provided("profile")(self, recording, driver, name)
 
 
 def with_data(

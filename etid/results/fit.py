@@ -134,6 +134,7 @@ class Fit(Judged, WithData[Circuit]):
         return type(self.circuit)(**{name: values[..., i] for i, name in enumerate(names)})
 
     @property
+    @np.errstate(all="ignore")  # a fit that failed may hold any number
     def correlation(self) -> Float[np.ndarray, "*lane parameter parameter"]:
         """Correlation coefficients of the errors of the elements; NaN without a covariance."""
         errors = np.asarray(self.stderr.values())

@@ -10,7 +10,7 @@ import numpy as np
 
 from etid.recordings import limits
 from etid.recordings.errors import RecordingError
-from etid.recordings.replacing import check_ending, replacing
+from etid.recordings.replacing import check_ending, replacing_hdf5
 from etid.recordings.untrusted import (
     attribute,
     check_size,
@@ -40,7 +40,7 @@ def write_table(
         RecordingError: The name of the file says another format.
     """
     check_ending(path)
-    with replacing(path) as partial, h5py.File(partial, "w") as file:
+    with replacing_hdf5(path) as file:
         file.attrs.update(attributes)
         for name, column in columns.items():
             text = np.asarray(column).dtype.kind in "OU"
@@ -146,21 +146,15 @@ class Table:
     def read(self, column: h5py.Dataset, rows: Any = ()) -> np.ndarray:
         """Some or all rows of a column.
 
+        A number may be as large as it likes: a fit that did not converge may hold any.
+
         Raises:
-            RecordingError: The file is damaged, or holds a number that is too large.
+            RecordingError: The file is damaged.
         """
         with translated(self.name, field=str(column.name).strip("/")):
             if h5py.check_string_dtype(column.dtype):
                 return np.asarray(column.asstr()[rows])
-            values = np.asarray(column[rows])
-            size = np.abs(values).astype(float)  # the limit is beyond single precision
-            large = np.isfinite(size) & (size > limits.LARGEST)
-            if large.any():
-                raise RecordingError(
-                    f"holds {values[large][0]:g}, at most {limits.LARGEST:g} is read",
-                    remedy=_REMEDY,
-                )
-            return values
+            return np.asarray(column[rows])
 
 
 _REMEDY = "Fit the recordings again"

@@ -42,6 +42,6 @@ def summary(fits: "Fits", by: Sequence[str]) -> list[dict[str, Any]]:
             several, values = chosen.size > 1, parts[""][chosen]
             row[f"{name}_spread"] = float(np.std(values, ddof=1)) if several else np.nan
             noise = float(np.mean(parts["_own"][chosen] ** 2)) if several else np.nan
-            excess = row[f"{name}_spread"] ** 2 - noise
+            excess = np.square(row[f"{name}_spread"]) - noise
             row[f"{name}_between"] = float(np.sqrt(np.maximum(excess, 0.0)))
     return rows

@@ -42,6 +42,7 @@ class TriedOrders(eqx.Module):
         """The orders that were tried."""
         return (LEAST + np.flatnonzero(~np.isnan(self.bic))).tolist()
 
+    @np.errstate(over="ignore", invalid="ignore")  # a driver that failed may hold any number
     def __str__(self) -> str:
         """One line; empty if no order was tried."""
         if not self.orders:

@@ -1,0 +1,43 @@
+"""The program `etid`, which is also `python -m etid`."""
+
+import os
+import signal
+import sys
+from types import FrameType
+from typing import NoReturn
+
+
+def main() -> int:
+    """Run the command of this process; see `etid.cli`.
+
+    The imports take a second. A KeyboardInterrupt during them may be lost, because JAX is called
+    by the garbage collector, which ignores exceptions. Nothing has begun yet, so the process ends.
+
+    Returns:
+        Exit status.
+    """
+    usual = signal.getsignal(signal.SIGINT)
+    if usual is signal.default_int_handler:  # a program in the background ignores the signal
+        signal.signal(signal.SIGINT, _end)
+    from etid import cli
+
+    try:
+        signal.signal(signal.SIGINT, usual)
+        return cli.main()
+    except KeyboardInterrupt:  # before or after the command itself
+        print("etid: interrupted", file=sys.stderr)
+        return _INTERRUPTED
+
+
+def _end(number: int, frame: FrameType | None) -> NoReturn:
+    """End the process with one line."""
+    del number, frame
+    os.write(2, b"etid: interrupted: nothing was changed\n")
+    os._exit(_INTERRUPTED)
+
+
+_INTERRUPTED = 128 + signal.SIGINT  # as shells report it
+
+
+if __name__ == "__main__":
+    sys.exit(main())

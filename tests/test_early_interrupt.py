@@ -1,0 +1,60 @@
+"""Ctrl-C while the command is still imported: one line, status 130, every time."""
+
+import subprocess
+import sys
+
+import pytest
+
+# Interrupts itself when a module is imported, as the user would. With `lost` it does so within a
+# callback of the garbage collector, where Python ignores exceptions.
+EARLY = """
+import gc, os, signal, sys
+signal.signal(signal.SIGINT, signal.default_int_handler)
+
+class Finder:
+    def find_spec(self, name, path=None, target=None):
+        if name == sys.argv[1]:
+            if sys.argv[2] == "lost":
+                gc.callbacks.append(lambda *_: os.kill(os.getpid(), signal.SIGINT))
+                gc.collect()
+            else:
+                os.kill(os.getpid(), signal.SIGINT)
+
+sys.meta_path.insert(0, Finder())
+from etid.__main__ import main
+sys.exit(main())
+"""
+
+
+@pytest.mark.parametrize("how", ["raised", "lost"])
+@pytest.mark.parametrize("module", ["jax", "etid.commands.report"])
+def test_ctrl_c_during_the_imports_is_one_line(module, how):
+    done = subprocess.run(
+        [sys.executable, "-c", EARLY, module, how], capture_output=True, text=True, check=False
+    )
+    assert (done.returncode, done.stdout) == (130, "")
+    assert done.stderr == "etid: interrupted: nothing was changed\n"
+
+
+def test_the_program_begins_without_the_imports_that_take_long():
+    """What is imported before the command can handle Ctrl-C."""
+    code = """
+import sys
+from etid.__main__ import main
+assert not {"jax", "numpy", "h5py", "scipy", "equinox"} & set(sys.modules)
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr) == (0, "")
+
+
+def test_a_program_in_the_background_is_not_interrupted():
+    """A shell lets a program in the background ignore Ctrl-C."""
+    code = EARLY.replace("signal.default_int_handler", "signal.SIG_IGN")
+    done = subprocess.run(
+        [sys.executable, "-c", code, "jax", "raised"],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 2  # `jax` is no command
+    assert done.stderr.startswith("usage: etid")
