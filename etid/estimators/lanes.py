@@ -22,7 +22,7 @@ from etid.recordings.preflight import Inspected
 from etid.results.feed import AbstractFeed
 from etid.signals import mains
 from etid.signals.aliases import aliases
-from etid.signals.harmonics import ALIASED, Spectrum, separates_aliases, spectrum
+from etid.signals.harmonics import ALIASED, Spectrum, joins_aliases, spectrum
 from etid.signals.noise import Measurement, coloured, measure, noise, rounding_variance
 from etid.signals.pulse_train import rest, shifted
 
@@ -168,7 +168,7 @@ class Harmonics(AbstractLane):
             elif flickers:
                 of = v, float(sigma), frequency, float(rate)
                 variances[number] = variances[number] * coloured(*of, *seen.periods)
-        if not separates_aliases(*seen.periods):
+        if joins_aliases(*seen.periods):
             of_both = zip((x, y), variances, strict=True)
             variances = [v + aliases(of, v, *seen.periods).variance for of, v in of_both]
         selected = selected & ~seen.covered(frequency)
@@ -194,7 +194,7 @@ class Harmonics(AbstractLane):
         sigmas = noise(v_th, resolution), noise(v_out, resolution)
         fields = map(jnp.asarray, spectrum(v_th, v_out, *sigmas, sample_rate, *periods))
         frequency, x, y, of_x, of_y, selected = fields
-        if not separates_aliases(*periods):
+        if joins_aliases(*periods):
             of_x = of_x + aliases(x, of_x, *periods).variance
             of_y = of_y + aliases(y, of_y, *periods).variance
         return cls(frequency, x, y, of_x, of_y, selected, sample_rate)

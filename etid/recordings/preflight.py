@@ -12,7 +12,7 @@ from etid.recordings.remarks import Remark
 from etid.signals.aliases import aliases
 from etid.signals.disturbances import Joint
 from etid.signals.filtering import TAPS
-from etid.signals.harmonics import ALIASED, filled, harmonics, separates_aliases
+from etid.signals.harmonics import ALIASED, filled, harmonics, joins_aliases
 from etid.signals.mains import Hum
 from etid.signals.noise import RIPPLE, noise_std
 from etid.signals.pulse_train import (
@@ -297,10 +297,10 @@ class Inspected:
     @property
     def is_aliased(self) -> bool:
         """Whether aliases of unknown size fall on the harmonics of `v_th`, above its noise."""
-        if separates_aliases(*self.periods):
+        if not joins_aliases(*self.periods):
             return False
         _, x, _, variance, *_ = self.spectrum
-        return bool(aliases(x, variance, *self.periods).are_unknown(variance))
+        return aliases(x, variance, *self.periods).are_unknown(variance)
 
     @functools.cached_property
     def is_periodic(self) -> bool:

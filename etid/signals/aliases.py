@@ -19,7 +19,7 @@ of the variance n |A|². This variance adds to that of the noise.
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Array, Bool, Complex, Float
+from jaxtyping import Array, Complex, Float
 
 from etid.signals.harmonics import ALIASED, namespace
 
@@ -52,15 +52,13 @@ class Aliases(NamedTuple):
         """Variance of independent errors that stand for A [V²]."""
         return self.harmonics * self.power
 
-    def are_unknown(
-        self, variance: Float[Array | np.ndarray, " harmonic"]
-    ) -> Bool[Array | np.ndarray, ""]:
-        """Whether A may exceed noise of this variance, and the record does not show how large it is.
+    def are_unknown(self, variance: Float[np.ndarray, " harmonic"]) -> bool:
+        """Whether A exceeds noise of this variance, and its size does not follow from the record.
 
         A is compared at the highest harmonic of a fit, where it is largest.
         """
         last = int(ALIASED * self.harmonics / COHERENT) - 1
-        return (self.variance[last] > variance[last]) & (self.fall < SLOWEST)
+        return bool(self.variance[last] > variance[last] and self.fall < SLOWEST)
 
 
 def aliases(
