@@ -107,6 +107,11 @@ def study(filtered):
     return etid.Study.from_recordings([bench.calibration(), *map(bench.loaded, SKINS)])
 
 
+def each(fits):
+    """The fits of the skins with their names."""
+    return [(fits[number], name) for number, name in enumerate(SKINS)]
+
+
 def off(fit, name):
     """Errors in standard errors."""
     values, errors = (np.asarray(of.values()) for of in (fit.circuit, fit.stderr))
@@ -116,7 +121,7 @@ def off(fit, name):
 def test_the_default_is_maximum_likelihood_and_right():
     """It was output error, whose errors did not know of the aliases."""
     fits = etid.identify_study(study(True)).fits
-    for fit, name in zip(fits, SKINS, strict=True):
+    for fit, name in each(fits):
         assert fit.verdict == "successful"
         assert fit.method == "maximum_likelihood"
         assert np.abs(off(fit, name)).max() < SIGMAS
@@ -125,7 +130,7 @@ def test_the_default_is_maximum_likelihood_and_right():
 def test_a_joint_fit_takes_such_records():
     """It refused them: they 'do not hold several whole pulse periods'."""
     fits = etid.identify_jointly(study(True)).fits
-    for fit, name in zip(fits, SKINS, strict=True):
+    for fit, name in each(fits):
         assert fit.verdict == "successful", fit
         assert np.abs(off(fit, name)).max() < SIGMAS
 
@@ -141,9 +146,9 @@ def test_a_tracker_takes_the_default_driver():
         part = slice(pulse * size, (pulse + 1) * size)
         state = tracker.update(state, np.stack([skin.v_out[part] for skin in skins]))
     fits = tracker.read(state)
-    for number, name in enumerate(SKINS):
-        assert fits[number].verdict == "successful"
-        assert np.abs(off(fits[number], name)).max() < SIGMAS
+    for fit, name in each(fits):
+        assert fit.verdict == "successful"
+        assert np.abs(off(fit, name)).max() < SIGMAS
 
 
 def test_without_a_filter_the_records_are_biased():
@@ -237,7 +242,7 @@ def drawn(number, method=None, **settings):
             others += [str(error).split(": ")[1].split(".")[0].split(",")[0]] * len(SKINS)
             continue
         fits = etid.identify_skins([bench.loaded(name) for name in SKINS], driver, method=method)
-        for fit, name in zip(fits, SKINS, strict=True):
+        for fit, name in each(fits):
             if fit.verdict == "successful":
                 errors.append(off(fit, name))
             else:
