@@ -393,7 +393,8 @@ def check_default(estimator: AbstractEstimator, candidates: Sequence[AbstractCir
             "the record holds less than two whole pulse periods or begins in a pulse, or its "
             f"driver was identified without harmonics; {str(error).partition(';')[0]}. Record "
             "three periods or more and identify the driver with method='maximum_likelihood', or "
-            "ask for method='maximum_likelihood'"
+            "ask for method='maximum_likelihood', whose standard errors do not include the "
+            "effect of aliases in a single period"
         ) from error
 
 
@@ -403,7 +404,7 @@ def for_calibrations(
     """The requested estimator, or the default estimator of calibrations.
 
     The default is maximum likelihood if all records hold several periods. Otherwise it is output
-    error, which needs no whole period.
+    error: in a single period the aliases are not in the standard errors of maximum likelihood.
     """
     if asked is not None:
         return asked
