@@ -25,7 +25,7 @@ from etid.simulation.scenes import Scene
 from etid.simulation.transformer import Impedance, OpenLoad, Sampler, TransformerDriver, loading
 
 SCALE = Scene().scale  # volts at the converter per volt at the terminal
-CORNER = Scene().antialias  # of the anti-alias filter, relative to the sample rate
+CORNER = Scene().antialias  # of the usual anti-alias filter, relative to the sample rate
 TAYLOR = 3  # terms of a voltage at jittered times: the next is 1e-4 of a step at half a sample
 
 Added = Callable[[Float[np.ndarray, " time"], np.random.Generator], Float[np.ndarray, " time"]]
@@ -46,6 +46,7 @@ class Output:
         delay: Of this record [s]; positive samples late.
         gain: Of the amplifier.
         lowpass: Corner of a further filter of first order before the converter [Hz], if any.
+        antialias: Corner of the anti-alias filter, relative to the sample rate.
         sampling_jitter: Standard deviation of the time of every single sample [s].
         added: Voltages that are added at the converter.
         voltage: Coefficients of the terminal voltage by sampler, where the load is not linear.
@@ -59,13 +60,14 @@ class Output:
     delay: float = 0.0
     gain: float = 1.0
     lowpass: float | None = None
+    antialias: float = CORNER
     sampling_jitter: float = 0.0
     added: tuple[Added, ...] = ()
     voltage: Callable[[TransformerDriver, Sampler], Complex[np.ndarray, " f"]] | None = None
 
     def sampler(self, sample_rate: float) -> Sampler:
         """Samples its waveform."""
-        return _sampler(sample_rate, self.pulse_rate / self.over)
+        return _sampler(sample_rate, self.pulse_rate / self.over, self.antialias)
 
     def coefficients(self, load: Impedance, sampler: Sampler) -> Complex[np.ndarray, " f"]:
         """Fourier coefficients [V] with a load, before the anti-alias filter."""
@@ -195,8 +197,8 @@ class Record:
 
 
 @functools.lru_cache(maxsize=16)
-def _sampler(sample_rate: float, pulse_rate: float) -> Sampler:
-    return Sampler(sample_rate, pulse_rate, CORNER * sample_rate)
+def _sampler(sample_rate: float, pulse_rate: float, antialias: float = CORNER) -> Sampler:
+    return Sampler(sample_rate, pulse_rate, antialias * sample_rate)
 
 
 @functools.lru_cache(maxsize=64)

@@ -25,6 +25,7 @@ from benchmarks.perturbed_study import (
     both,
     calibrations,
     changing,
+    coherent,
     crosstalk,
     late,
     leaking,
@@ -49,6 +50,7 @@ UNDISTURBED: Mapping[str, Change] = {
     "base_no_delay": lambda study: all_records(both(delay=0.0))(study),
     "base_six_periods": longer(),
     "base_two_resistors": second_resistor(1.0),
+    "base_whole_samples_per_period": coherent(),
 }
 """Studies in which all is well: hardly any of them may be refused."""
 
@@ -89,6 +91,7 @@ CONVERTERS: Mapping[str, Change] = {
     "bits8_4V_nonoise": all_records(record(bits=8, full_scale=4.0, sigma=0.0)),
     "bits8_4V_float": all_records(record(bits=8, full_scale=4.0, codes=False)),
     "bits10_10V_nonoise_float": all_records(record(bits=10, sigma=0.0, codes=False)),
+    "whole_samples_per_period_unfiltered": coherent(antialias=4.0),
     "adc_jitter_500ns": all_records(both(sampling_jitter=500e-9)),
     "slow_adc_filter_out": all_records(out(lowpass=30e3)),
     "slow_adc_filter_out_skin_only": trials(out(lowpass=30e3)),

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float
 
 from benchmarks.disturbances import Leaky, Nonlinear, Pink
-from benchmarks.laboratory import Crosstalk, Output, Record, noise
+from benchmarks.laboratory import CORNER, Crosstalk, Output, Record, noise
 from benchmarks.ladder import LOADS
 from etid.simulation.published import REFERENCE
 from etid.simulation.transformer import Impedance, ResistorLoad, SkinLoad, TransformerDriver
@@ -24,6 +24,7 @@ PARTS = 0.03  # standard deviation of the logarithm of every part of a driver
 FIXED = ("amplitude", "width", "edge", "lead_in", "turns")
 PERIODS = 3
 SAMPLE = 5e-6  # [s]
+COHERENT_RATE = 240e3  # [Hz] 4000 samples in a period of 60 Hz
 
 
 @dataclasses.dataclass(frozen=True)
@@ -275,6 +276,30 @@ def skin_for_resistor(study: Study) -> Study:
 def longer(change: Change = lambda study: study) -> Change:
     """Record six periods."""
     return lambda study: change(all_records(record(samples=20_000))(study))
+
+
+def coherent(antialias: float = CORNER) -> Change:
+    """Record with a whole number of samples in each period, 240 kHz at 60 Hz.
+
+    Args:
+        antialias: Corner of the anti-alias filter, relative to the sample rate.
+    """
+
+    def change(study: Study) -> Study:
+        # Where between two samples the pulses begin is the phase of the aliases.
+        start = np.random.default_rng([study.number, *b"start"]).uniform() / COHERENT_RATE
+
+        def changed(of: Record) -> Record:
+            th, out = (
+                dataclasses.replace(one, delay=one.delay + start, antialias=antialias)
+                for one in (of.th, of.out)
+            )
+            rate = {"sample_rate": COHERENT_RATE, "samples": round(PERIODS * COHERENT_RATE / 60)}
+            return dataclasses.replace(of, th=th, out=out, **rate)
+
+        return all_records(changed)(study)
+
+    return change
 
 
 def pink(of: Record) -> Record:

@@ -21,7 +21,8 @@ from etid.circuits.circuit import AbstractCircuit
 from etid.recordings.preflight import Inspected
 from etid.results.feed import AbstractFeed
 from etid.signals import mains
-from etid.signals.harmonics import ALIASED, Spectrum, spectrum
+from etid.signals.aliases import aliases
+from etid.signals.harmonics import ALIASED, Spectrum, joins_aliases, spectrum
 from etid.signals.noise import Measurement, coloured, measure, noise, rounding_variance
 from etid.signals.pulse_train import rest, shifted
 
@@ -167,6 +168,9 @@ class Harmonics(AbstractLane):
             elif flickers:
                 of = v, float(sigma), frequency, float(rate)
                 variances[number] = variances[number] * coloured(*of, *seen.periods)
+        if joins_aliases(*seen.periods):
+            of_both = zip((x, y), variances, strict=True)
+            variances = [v + aliases(of, v, *seen.periods).variance for of, v in of_both]
         selected = selected & ~seen.covered(frequency)
         y = y * _turn(frequency, rate, seen.lag) if seen.lag else y
         return frequency, x, y, *variances, selected, rate
@@ -189,7 +193,11 @@ class Harmonics(AbstractLane):
             raise ValueError(f"{v_out.shape[0]} samples hold no whole pulse period")
         sigmas = noise(v_th, resolution), noise(v_out, resolution)
         fields = map(jnp.asarray, spectrum(v_th, v_out, *sigmas, sample_rate, *periods))
-        return cls(*fields, sample_rate)  # pyright: ignore[reportCallIssue]
+        frequency, x, y, of_x, of_y, selected = fields
+        if joins_aliases(*periods):
+            of_x = of_x + aliases(x, of_x, *periods).variance
+            of_y = of_y + aliases(y, of_y, *periods).variance
+        return cls(frequency, x, y, of_x, of_y, selected, sample_rate)
 
     @property
     def spectrum(self) -> Spectrum:

@@ -30,7 +30,6 @@ from etid.results.driver import ContinuousDriver, Driver, HarmonicDriver
 from etid.results.feed import MEASURED_CURRENT, AbstractFeed, MeasuredCurrent
 from etid.results.tried_orders import AUTO, Order
 from etid.selection.search import usual_circuits
-from etid.signals.harmonics import separates_aliases
 
 # Four times the order of the paper. Calibrations determine no more poles; with 50 poles an
 # identification takes minutes and does not converge.
@@ -405,12 +404,11 @@ def for_calibrations(
     """The requested estimator, or the default estimator of calibrations.
 
     The default is maximum likelihood if all records hold several periods. Otherwise it is output
-    error. If aliases and harmonics cannot be separated, as in a single period, the bias of maximum
-    likelihood exceeds its standard errors.
+    error: in a single period the aliases are not in the standard errors of maximum likelihood.
     """
     if asked is not None:
         return asked
-    several = all(separates_aliases(*seen.periods) and seen.is_periodic for seen in recordings)
+    several = all(seen.periods[0] > 1 and seen.is_periodic for seen in recordings)
     return MAXIMUM_LIKELIHOOD if several else OUTPUT_ERROR
 
 
@@ -445,7 +443,7 @@ def fed(recording: Recording, driver: Driver | None) -> tuple[Recording, Abstrac
 
 def for_samples(driver: Driver, periods: tuple[int, int]) -> AbstractEstimator:
     """The default estimator of arrays with this number of whole periods and samples."""
-    several = isinstance(driver, HarmonicDriver) and separates_aliases(*periods)
+    several = isinstance(driver, HarmonicDriver) and periods[0] > 1
     return MAXIMUM_LIKELIHOOD if several else OUTPUT_ERROR
 
 
@@ -471,5 +469,9 @@ def plan(
                 f"recording {seen.recording.path!r}: method {str(estimator)!r} needs a driver and "
                 "a current, and no disturbed periods; use method='maximum_likelihood'"
             )
+        if seen.by_current is not None and seen.by_current.is_aliased:
+            name = "biased"
+    if name is None and estimator.lane.periodic and seen.is_aliased:
+        name = "biased"
     estimator.check_driver(driver, seen.recording.sample_rate, seen.recording.pulse_rate)
     return with_known(estimator, asked.known, asked.bounds), name

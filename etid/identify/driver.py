@@ -104,10 +104,7 @@ def identify_driver(
     check_distinct("calibrations", records)
     seen = [Inspected(record) for record in records]
     for one in seen:
-        name = preflight(one, periodic=asked is not None and asked.lane.periodic)
-        if name is not None:
-            text = f"calibration {one.recording.path!r}: {name}. {explained(one, name)}"
-            raise IdentificationError(text, None)
+        _refused(one, preflight(one, periodic=asked is not None and asked.lane.periodic))
     rough = [resistors.rough_impedance(*one) for one in zip(seen, resistances, strict=True)]
     if max(rough) > resistors.ROUGHLY * min(rough):
         shown = ", ".join(
@@ -116,6 +113,8 @@ def identify_driver(
         text = f"calibrations show impedances of about {shown}: resistors_disagree. "
         raise IdentificationError(text + message("resistors_disagree"), None)
     estimator = for_calibrations(asked, seen)
+    for one in seen:
+        _refused(one, "biased" if estimator.lane.periodic and one.is_aliased else None)
     if order == AUTO:
         driver = _of_least_order(seen, estimator)
     else:
@@ -140,6 +139,13 @@ def identify_driver(
         found = f"{driver.verdict}, |Z_th| is {size:.3g} ohm at 1 kHz"
         raise IdentificationError(f"driver: {found}. {message(driver.verdict)}", driver)
     return driver
+
+
+def _refused(seen: Inspected, name: str | None) -> None:
+    """Raise IdentificationError if there is a verdict that forbids a fit of this calibration."""
+    if name is not None:
+        text = f"calibration {seen.recording.path!r}: {name}. {explained(seen, name)}"
+        raise IdentificationError(text, None)
 
 
 def _of_least_order(seen: Sequence[Inspected], estimator: AbstractEstimator) -> Driver:

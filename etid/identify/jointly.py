@@ -83,8 +83,8 @@ from etid.selection.delays import upper_limit
 
 METHOD = "joint"
 SINGLE = (
-    "The record or its calibration does not hold several whole pulse periods. A joint fit needs "
-    "them. Record more periods, or identify the recording alone."
+    "The record or its calibration holds less than two whole pulse periods, or begins in an edge. "
+    "A joint fit needs whole periods. Record more of them, or identify the recording alone."
 )
 register_description(
     METHOD,

@@ -151,7 +151,7 @@ class Tracker(Overviewed):
             raise ValueError(f"change is {change}; it must be finite and not negative")
         driver = serving(driver, HarmonicDriver, str(MAXIMUM_LIKELIHOOD))
         seen = Inspected(unloaded)
-        name = preflight(seen, periodic=True)
+        name = preflight(seen, periodic=True) or ("biased" if seen.is_aliased else None)
         if name is not None:
             text = f"unloaded recording {unloaded.path!r}: {name}. {explained(seen, name)}"
             raise IdentificationError(text, None)

@@ -9,9 +9,10 @@ from jaxtyping import Bool, Float
 from etid.recordings.group import STEP, Group, covariance_of, is_periodic, limits_of
 from etid.recordings.recording import Recording
 from etid.recordings.remarks import Remark
+from etid.signals.aliases import aliases
 from etid.signals.disturbances import Joint
 from etid.signals.filtering import TAPS
-from etid.signals.harmonics import ALIASED, filled, harmonics
+from etid.signals.harmonics import ALIASED, filled, harmonics, joins_aliases
 from etid.signals.mains import Hum
 from etid.signals.noise import RIPPLE, noise_std
 from etid.signals.pulse_train import (
@@ -292,6 +293,14 @@ class Inspected:
         sigma = np.stack([self.trusted_th, self.trusted_out])
         fields = filled(harmonics(self._both, *self.periods), sigma, rate, *self.periods)
         return tuple(map(np.asarray, fields))
+
+    @property
+    def is_aliased(self) -> bool:
+        """Whether aliases of unknown size fall on the harmonics of `v_th`, above its noise."""
+        if not joins_aliases(*self.periods):
+            return False
+        _, x, _, variance, *_ = self.spectrum
+        return aliases(x, variance, *self.periods).are_unknown(variance)
 
     @functools.cached_property
     def is_periodic(self) -> bool:

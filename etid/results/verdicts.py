@@ -99,7 +99,10 @@ class RESULTS(optx.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]  # equi
         "Noise has shifted the estimate by several standard errors: with Steiglitz-McBride from "
         "the minimum of its own model, with a non-parametric fit from the estimate without noise. "
         "Or the sample rate is too low for the interpolation of output error, which misses the "
-        "recording by more than its noise. Use the default method."
+        "recording by more than its noise. Use the default method. With the default method: a "
+        "pulse period is a whole number of samples, so that aliases fall on the harmonics, and the "
+        "power near half the sample rate says that they are large. Use an anti-alias filter, a "
+        "higher sample rate, or a pulse rate whose period is not a whole number of samples."
     )
     flat = "A record carries no signal above its noise. Check the contact and the channel."
     saturated = "The converter clipped. Lower the gain or the stimulus and record again."

@@ -7,7 +7,7 @@ Y(f) = G(f) X(f) at any frequency.
 
 Aliases, k f0 − fs, fall into the bins between the harmonics. There are two exceptions: a period of
 a whole number of samples, and a record of one period. Then the upper part of the band is not used,
-because anti-alias filters are imperfect there.
+because anti-alias filters are imperfect there; `etid.signals.aliases` is about those on the rest.
 """
 
 import functools
@@ -68,6 +68,11 @@ def whole_periods(samples: int, sample_rate: float, pulse_rate: float) -> tuple[
 def separates_aliases(periods: int, samples: int) -> bool:
     """Whether aliases fall between the bins of the harmonics."""
     return periods > 1 and samples % periods != 0
+
+
+def joins_aliases(periods: int, samples: int) -> bool:
+    """Whether aliases fall on the harmonics in all of several periods alike."""
+    return periods > 1 and samples % periods == 0
 
 
 def harmonics(
