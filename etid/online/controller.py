@@ -100,7 +100,8 @@ class Limits(NamedTuple):
         charge_cap: Largest charge per phase [C].
         rest: Charge of a pulse after a pause, at most, relative to that in the steady state.
         quantile: k, in standard errors.
-        short: Amplitude at which a short circuit carries `charge_cap`.
+        short: Amplitude without a confirmed estimate; `RAISE` times as much carries `charge_cap`
+            through a short circuit.
         guard: Amplitude at which a short circuit carries `current_cap`.
         ceiling: Amplitude at which the unloaded voltage reaches its cap.
         slew: Largest increase of the amplitude from pulse to pulse.
@@ -206,12 +207,12 @@ class Controller(Overviewed):
             )
         quantile = float(scipy.special.ndtri(probability))
         short = float(model.short_charge(jnp.asarray(quantile)))
-        allowed = float(charge_cap) / short
+        allowed = float(charge_cap) / short / RAISE
         if fallback is not None and fallback > allowed:
             raise ValueError(
-                f"fallback is {fallback:g}; a short circuit carries {fallback * short:.3g} C with "
-                f"it, more than charge_cap. Give at most {math.floor(1e4 * allowed) / 1e4:g}, or "
-                "none"
+                f"fallback is {fallback:g}, which carries up to {fallback * short:.3g} C through a "
+                f"short circuit; charge_cap allows {charge_cap / RAISE:.3g} C there. Give at most "
+                f"{math.floor(1e4 * allowed) / 1e4:g}, or none"
             )
         of = tracker.model.bands
         unloaded = float(np.abs(of.waveform()).max())

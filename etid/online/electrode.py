@@ -281,7 +281,7 @@ def after_pulse(
         amplitude=measured.amplitude,
         offset=measured.offset,
         shown=jnp.stack([measured.shown, state.shown[0]]),
-        confirmed=jnp.where(fits, reached, jnp.where(good | lost, 0.0, state.confirmed)),
+        confirmed=jnp.where(fits, reached, jnp.where(silent, state.confirmed, 0.0)),
         level=jnp.where(silent, state.level, measured.level),
         variance=jnp.where(silent, state.variance, measured.variance),
         chi2=jnp.where(silent, state.chi2, used.chi2),

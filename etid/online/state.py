@@ -20,8 +20,8 @@ class ElectrodeState(eqx.Module):
             NaN before the first pulse.
         offset: Offset of the converter [V].
         shown: A number that two different windows never share, of the last two windows.
-        confirmed: Largest amplitude of a pulse that fitted the prediction of the elements since
-            these were identified anew; 0 if there was none.
+        confirmed: Largest amplitude of a pulse that fitted its prediction, since the last pulse
+            that did not; 0 if there was none.
         level: Effective value of the gain of the last pulse; 1 if the electrode is open.
         variance: E|noise|² of a Fourier coefficient of the last pulse [V²].
         chi2: χ² of the last pulse.
