@@ -1,7 +1,7 @@
 """A display whose loads change at every pulse, in NumPy: the windows, and the charge that flows.
 
 Nothing here is shared with what `etid.online` predicts. The response of each load to one pulse from
-rest is computed over six periods, from the circuit of the transformer at 144 000 frequencies. The
+rest is computed over six periods, from the circuit of the transformer at 120 000 frequencies. The
 circuit is linear: a pulse of amplitude A after pulses of amplitude B and C is
 A u(t) + B u(t + T) + C u(t + 2T). The charge is the integral of the current over the phase of the
 unloaded voltage, on a grid of 0.4 µs. Where a load changes, the tails of the pulses before are
@@ -9,7 +9,6 @@ those of the new load.
 """
 
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
 
 import numpy as np
 import scipy.integrate
@@ -25,20 +24,12 @@ DELAYS = np.array([-1e-7, 0.0, 1e-7])  # [s] of the trigger, drawn for each wind
 Load = Callable[[Float[np.ndarray, " f"]], Complex[np.ndarray, " f"]]
 
 
-class Given(NamedTuple):
-    """What a pulse does at every electrode.
-
-    Attributes:
-        charge: Charge in the phase [C].
-        v_out: Windows of the converter [V].
-    """
-
-    charge: Float[np.ndarray, " lane"]
-    v_out: Float[np.ndarray, "lane sample"]
-
-
 class Display:
     """A display at 60 Hz and 200 kHz.
+
+    Attributes:
+        charge: Charge of a pulse of unit amplitude from rest in its own phase and in the next ones,
+            through each load [C].
 
     Args:
         scene: Driver and converter.
@@ -60,13 +51,13 @@ class Display:
 
         unloaded = np.fft.irfft(v, points)
         top, below = int(np.argmax(unloaded)), np.flatnonzero(unloaded <= 0)
-        self.phase = time[below[below < top].max()], time[below[below > top].min()]
+        phase = time[below[below < top].max()], time[below[below > top].min()]
         rms = np.sqrt(np.mean(np.fft.irfft(v * filtered, points) ** 2) * PERIODS)
         self.sigma = 0.0 if scene.snr_db is None else rms * 10 ** (-scene.snr_db / 20)
 
-        ends = np.array(self.phase)[:, None] + np.arange(OLDER) / scene.pulse_rate
+        ends = np.array(phase)[:, None] + np.arange(OLDER) / scene.pulse_rate
         charges: list[np.ndarray] = []
-        self.windows: list[np.ndarray] = []
+        self.voltage: list[np.ndarray] = []
         # Window k periods after a pulse, whose first sample is `third` thirds of a sample late.
         third, k = np.arange(-1, 2)[:, None], np.arange(OLDER)
         first = np.rint(k * period * FINE + third * FINE / 3).astype(int)
@@ -81,26 +72,30 @@ class Display:
             )
             charges.append(np.diff(np.interp(ends, time, charge), axis=0)[0])
             late = voltage * np.exp(2j * np.pi * f * DELAYS[:, None])
-            self.windows.append(np.fft.irfft(late, points)[:, at].astype(np.float32))
+            self.voltage.append(np.fft.irfft(late, points)[:, at].astype(np.float32))
         self.charge = np.array(charges)
 
-    def given(
+    def charges(
+        self, load: Int[np.ndarray, " lane"], amplitude: Float[np.ndarray, "older lane"]
+    ) -> Float[np.ndarray, " lane"]:
+        """Charge of a pulse at every electrode [C].
+
+        Args:
+            load: Number of the load at each electrode.
+            amplitude: Amplitudes of this pulse and of those before, the newest first.
+        """
+        return np.sum(self.charge[load].T * amplitude, axis=0)
+
+    def windows(
         self,
         number: int,
         load: Int[np.ndarray, " lane"],
         amplitude: Float[np.ndarray, "older lane"],
-    ) -> Given:
-        """One pulse.
-
-        Args:
-            number: Number of the pulse, from 0 on.
-            load: Number of the load at each electrode.
-            amplitude: Amplitudes of this pulse and of those before, the newest first.
-        """
-        charge = np.sum(self.charge[load].T * amplitude, axis=0)
+    ) -> Float[np.ndarray, "lane sample"]:
+        """What the converter records of pulse `number` [V]; the other arguments as `charges`."""
         third = (1, 0, 2)[number % 3]  # a window begins at the sample nearest to its period
         delay = self.rng.integers(DELAYS.size, size=load.size)
         v = self.sigma * self.rng.standard_normal((load.size, self.size), dtype=np.float32)
         for at in range(load.size):
-            v[at] += amplitude[:, at].astype(np.float32) @ self.windows[load[at]][delay[at], third]
-        return Given(charge, self.step * np.rint(v / self.step))
+            v[at] += amplitude[:, at].astype(np.float32) @ self.voltage[load[at]][delay[at], third]
+        return (self.step * np.rint(v / self.step)).astype(float)

@@ -53,7 +53,9 @@ from etid.online.tracker import Tracker
 from etid.results.verdicts import counts
 from etid.solvers.matrices import inverse_of_few
 
-REASONS = np.array(["wanted", "peak", "charge", "confirmed", "guard", "voltage", "slew", "fallback"])
+REASONS = np.array(
+    ["wanted", "peak", "charge", "confirmed", "guard", "voltage", "slew", "fallback"]
+)
 CURRENT_CAP = 5e-3  # [A] the paper's limit for the fingertip
 LARGEST_CAP = 0.1  # [A] stimulators of nerves and skin stay below it
 FALLBACK = 0.1  # unless `charge_cap` allows less
@@ -171,7 +173,8 @@ class Controller(Overviewed):
             RecordingError: A limit is no number.
             ValueError: A limit is not positive, `current_cap` exceeds 0.1 A, `charge_cap` exceeds
                 what `current_cap` carries in a phase, `fallback` is infinite or exceeds what
-                `charge_cap` allows, the probability is not between ½ and 1, or the driver of the tracker is not good.
+                `charge_cap` allows, the probability is not between ½ and 1, or the driver of the
+                tracker is not good.
         """
         require("tracker", tracker, Tracker, "Make one with etid.Tracker.of")
         given = {
