@@ -336,6 +336,8 @@ TROUBLES = {
     "not a number": {"nonfinite_samples"},
     "clipped": {"saturated"},
     "unplugged": {"flat"},
+    "frozen": {"repeated"},
+    "frozen, two buffers in turn": {"repeated"},
 }
 
 
@@ -352,6 +354,8 @@ def test_an_electrode_in_trouble_says_so_at_once_and_recovers(trouble):
         "not a number": np.full_like(bad, np.nan),
         "clipped": np.minimum(4 * bad, HIGHEST),
         "unplugged": 1e-4 * with_noise(np.zeros_like(bad), seed=3),
+        "frozen": pulses[first - 1, 0],
+        "frozen, two buffers in turn": np.resize(pulses[first - 2 : first, 0], bad.shape),
     }[trouble]
     state = tracker.start()
     for number, v_out in enumerate(pulses):
@@ -745,6 +749,20 @@ FIELDS = ("level", "variance", "chi2", "rrse", "offset", "amplitude", "mean_cov"
 # Samples are summed in single precision, in an order that depends on the processor. Its error is
 # less than a hundredth of what noise makes of a gain.
 ROUNDED = {"chi2": (1e-3, 0.0), "rrse": (1e-3, 0.0), "offset": (1e-4, 2e-6)}
+
+
+def test_the_last_code_of_the_converter_is_clipped_and_the_one_before_is_not():
+    """The range in the record is the truth: samples at its ends may have been any voltage."""
+    tracker, study = tracker_of(2), calibrated()[1]
+    low, high = study["cal/0"].adc_range
+    step = 2 * high / 2**16
+    pulse = with_noise(tracker.pulses(loaded(quiet()))[3], seed=1)
+    for end, inner in ((low, step), (high, -step)):
+        for sample, clipped in ((end, True), (end + inner, False)):
+            pulse[1, 200] = sample
+            verdicts = tracker.read(tracker.update(tracker.start(), pulse)).verdicts
+            assert (verdicts[1] == "saturated") == clipped, (end, sample)
+            assert verdicts[0] == "successful"
 
 
 def numbers_of(tracker, state):
