@@ -78,8 +78,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--electrodes", type=int, default=98)
     parser.add_argument("--pulses", type=int, default=120)
     parser.add_argument("--snr", type=float, nargs="+", default=[60.0, 40.0], help="dB")
-    parser.add_argument("--hazard-electrodes", type=int, default=996)
-    parser.add_argument("--hazard-pulses", type=int, default=504)
+    parser.add_argument("--hazard-electrodes", type=int, default=96)
+    parser.add_argument("--hazard-pulses", type=int, default=5210)
     parser.add_argument("-o", "--output", type=pathlib.Path, default=RESULTS / "control.svg")
 
 
