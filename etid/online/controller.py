@@ -12,24 +12,33 @@ that the elements and Z_th predict (`etid.online.current`). The limits are appli
 | limit | amplitude at most |
 |---|---|
 | `peak` | cap / (p + k σ_p), the cap on the current |
-| `charge` | cap / (q + k σ_q), the cap on the charge per phase |
+| `charge` | cap / r (q + k σ_q), the cap on the charge per phase |
+| `confirmed` | the larger of a_s, and 1.25 times the amplitude that a pulse has confirmed |
 | `guard` | cap / p_s, with the peak current p_s through a short circuit |
 | `voltage` | cap / largest unloaded voltage |
 | `slew` | amplitude before + slew |
 
 k is the quantile of the normal distribution for the stated probability; σ contains the noise of the
-pulses, the random walk of the skin until the next pulse, and the error of the calibration.
+pulses, the random walk of the skin until the next pulse, and the error of the calibration. A pulse
+after a pause lacks the tail of the pulse before, whose current has the other sign. A transformer
+passes no direct current, and the tail decays, so that the charge is at most r = T / (T − phase) of
+that in the steady state.
 
 **Limits that hold whatever the estimate says** are `guard`, `voltage` and `slew`. The skin may
 become wet between two pulses, and no controller can know this before the pulse. Through a passive
 load of resistors and capacitors that follow a series resistor, the largest current is that through
 a short circuit. An amplitude below the guard therefore keeps the current below its cap even at the
-first pulse after a change. The *charge* of this pulse is too large by the factor by which the skin
-has changed.
+first pulse after a change. The *charge* of this pulse is at most `Command.worst`, that through a
+short circuit.
 
-**An electrode whose verdict is not good** gets the fallback amplitude, or less if a limit says so.
-Until it starts again, it gets no more than at the last pulse. The command says `fallback` for it,
-and its charge is NaN.
+**The cap on the charge** holds at all other pulses, also if records are wrong. With a_s, a short
+circuit carries 1/1.25 of the cap. An electrode gets more only after pulses that fitted their
+prediction, 1.25 times as much at each. The first raise is still safe with a short circuit. It
+shows whether the record follows the amplitude of its own electrode: another channel does not.
+
+**An electrode whose verdict is not good** gets the fallback amplitude, which is at most a_s, or
+less if a limit says so. Until it starts again, it gets no more than at the last pulse. The command
+says `fallback` for it, and its charge is NaN.
 """
 
 import dataclasses
