@@ -501,7 +501,7 @@ def test_a_pulse_alone_tells_elements_or_says_that_it_does_not(
         first_verdict((jnp.asarray(True), result)),
     )  # fmt: skip
     monkeypatch.setattr(online, "attempt", lambda *_: fit)
-    measured = MEASURED(jnp.zeros(3, complex), zero, jnp.ones(3), *[zero] * 5)
+    measured = MEASURED(jnp.zeros(3, complex), zero, jnp.ones(3), *[zero] * 6)
     model = object.__new__(GainModel)
     found = anew(model, measured, jnp.zeros((1, 2)), jnp.asarray(True), two)
     assert str(verdict_names(found.result)) == verdict
