@@ -1,4 +1,7 @@
-"""Closed loop: the charge at 98 electrodes under a fingertip that changes, against ngspice.
+"""Closed loop: the charge at 98 electrodes under a fingertip that changes, and the cap on it.
+
+`benchmarks.control_hazards` counts the pulses above the cap, with loads from a short circuit to
+none and with wrong records. The rest is the charge against ngspice.
 
 The plant is `benchmarks.control_plant`. Some electrodes stay dry, some become wet within 100 ms at
 different times, some sweat slowly, and one is lifted off and put back. The driver is identified
@@ -33,10 +36,10 @@ from jaxtyping import Array, Float
 from tqdm import tqdm
 
 import etid
-from benchmarks import ngspice
+from benchmarks import control_hazards, ngspice
 from benchmarks.charts import INK, new_figure, save
 from benchmarks.control_plant import OPEN, Plant, Response
-from benchmarks.provenance import RESULTS
+from benchmarks.provenance import RESULTS, write_csv
 from etid.estimators.unknowns import LoadUnknowns
 from etid.online.state import ElectrodeState, TrackerState
 from etid.plotting.style import BLUE, RED
@@ -75,13 +78,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--electrodes", type=int, default=98)
     parser.add_argument("--pulses", type=int, default=120)
     parser.add_argument("--snr", type=float, nargs="+", default=[60.0, 40.0], help="dB")
+    parser.add_argument("--hazard-electrodes", type=int, default=96)
+    parser.add_argument("--hazard-pulses", type=int, default=5210)
     parser.add_argument("-o", "--output", type=pathlib.Path, default=RESULTS / "control.svg")
 
 
 def main(arguments: argparse.Namespace) -> bool:
     """Print the errors of all controllers and draw them; whether etid meets the targets."""
+    met = hazards(arguments)
     fingertip = Fingertip(arguments.electrodes, arguments.pulses)
-    runs, met = {}, True
+    runs = {}
     known: dict[SkinLoad | ResistorLoad, Response] = {}
     for snr in arguments.snr:
         loop = Loop(fingertip, snr, known)
@@ -94,6 +100,20 @@ def main(arguments: argparse.Namespace) -> bool:
         runs |= {f"{name}, {snr:g} dB": run for name, run in found.items()}
     draw(runs, fingertip, arguments.output)
     return met
+
+
+def hazards(arguments: argparse.Namespace) -> bool:
+    """Print and write the pulses above the cap; whether there are none but the excused ones."""
+    rows = []
+    for seed, snr in enumerate(arguments.snr):
+        found = control_hazards.Hazards(snr, seed)
+        controller = found.controller(arguments.hazard_electrodes)
+        given = found.given(controller, control_hazards.CELLS, arguments.hazard_pulses)
+        rows += [control_hazards.row(snr, cell, of) for cell, of in given.items()]
+    for row in rows:
+        print("  ".join(f"{name} {value}" for name, value in row.items()), flush=True)
+    write_csv(arguments.output.with_suffix(".csv"), rows)
+    return all(map(control_hazards.good, rows))
 
 
 class Fingertip:

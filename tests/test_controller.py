@@ -13,6 +13,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 import etid
+from etid.online.controller import RAISE
 from etid.online.current import CurrentModel
 from etid.results.verdicts import verdict
 from etid.simulation.transformer import SkinLoad, TransformerDriver
@@ -95,6 +96,61 @@ def test_no_skin_carries_more_than_the_guard_lets_a_short_circuit_carry():
         logs = rng.uniform(np.log([1.0, 10.0, 1e-11]), np.log([1e5, 1e6, 1e-7]))
         peak = np.abs(true_current(SkinLoad(*np.exp(logs)))).max()
         assert float(controller.limits.guard) * peak <= 4e-3
+
+
+def test_a_transformer_with_exchanged_ends_changes_no_limit():
+    """All voltages change their sign, and so does the largest current through a short circuit."""
+    controller, state = controlled(charge_cap=120e-9)
+    model = controller.tracker.model
+    bands = dataclasses.replace(model.bands, x=-model.bands.x)
+    tracker = dataclasses.replace(controller.tracker, model=dataclasses.replace(model, bands=bands))
+    turned = etid.Controller.of(tracker, charge_cap=120e-9)
+    for one, other in zip(controller.limits, turned.limits, strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-12)
+    assert turned.short == pytest.approx(controller.short, rel=1e-12)
+    before, after = (of.command(state, charge=80e-9) for of in (controller, turned))
+    np.testing.assert_allclose(before.amplitude, after.amplitude, rtol=1e-12)
+
+
+@pytest.mark.parametrize("cap", [20e-9, 120e-9])
+def test_the_fallback_is_what_a_short_circuit_may_carry_or_is_refused(cap):
+    """The charge through a short circuit is that of the circuit of the transformer itself."""
+    controller, state = controlled(charge_cap=cap)
+    new = controller.command(controller.tracker.start(), charge=80e-9)
+    delivered = new.amplitude * true_charge(SkinLoad(1e-3, 1e-3, 1e-12))
+    # RAISE for the first pulse that is raised, 4.2 % for a pulse from rest, 1 % of calibration.
+    assert (delivered < cap / RAISE).all()
+    assert (delivered > 0.94 * cap / RAISE).all()
+    np.testing.assert_allclose(new.worst, new.amplitude * controller.short)
+    etid.Controller.of(controller.tracker, charge_cap=cap, fallback=0.99 * new.amplitude[0])
+    with pytest.raises(ValueError, match=r"charge_cap allows .* Give at most"):
+        etid.Controller.of(controller.tracker, charge_cap=cap, fallback=1.01 * new.amplitude[0])
+    assert (controller.command(state, charge=80e-9).worst >= cap).all()
+
+
+@pytest.mark.parametrize(
+    ("confirmed", "before", "allowed"),
+    [
+        (1.0, 0.2, math.inf),  # a smaller amplitude since then does not count
+        (0.1, 0.1, 0.1 * RAISE),
+        (0.0, 0.1, 0.0),  # the last pulse was a jump, or the first one
+        (1.0, 0.0, 0.0),  # there was no pulse: nothing was seen
+    ],
+)
+def test_the_amplitude_rises_from_what_a_pulse_has_confirmed(confirmed, before, allowed):
+    controller, state = controlled(charge_cap=120e-9)
+    lanes = dataclasses.replace(
+        state.electrodes, confirmed=jnp.full(2, confirmed), amplitude=jnp.full(2, before)
+    )
+    command = controller.command(dataclasses.replace(state, electrodes=lanes), charge=110e-9)
+    most = max(allowed, float(controller.limits.short))
+    free = 110e-9 / np.array([true_charge(DRY), true_charge(DAMP)])
+    # 1 % by the calibration; the second electrode is damp and may need less than it is allowed.
+    np.testing.assert_allclose(command.amplitude, np.minimum(free, most), rtol=0.01)
+    assert set(command.reason) <= {"wanted", "confirmed"}
+    without, _ = controlled()
+    command = without.command(dataclasses.replace(state, electrodes=lanes), charge=110e-9)
+    assert list(command.reason) == ["wanted"] * 2  # there is no cap that could be exceeded
 
 
 @pytest.mark.parametrize(
@@ -188,6 +244,7 @@ NEGATIVE = [-59.5, -69.3, -16.2, -69.3, -10.3, -42.1, -16.2, -42.1, -14.9]  # va
     before=st.lists(st.floats(0, 1e3) | st.just(math.nan), min_size=2, max_size=2),
     result=st.sampled_from(["successful", "misfit", "unstable", "unconnected"]),
     wanted=st.floats(0, 3e-6),  # what the cap of 5 mA carries in a phase
+    confirmed=st.sampled_from([0.0, 1e3]),
 )
 @example(
     own=[10.42, 12.13, -22.85, -0.06] * 2,
@@ -195,21 +252,27 @@ NEGATIVE = [-59.5, -69.3, -16.2, -69.3, -10.3, -42.1, -16.2, -42.1, -14.9]  # va
     before=[1.0, 1.0],
     result="successful",
     wanted=80e-9,
+    confirmed=1e3,
 )
-def test_limits_hold_whatever_the_estimate_says(own, information, before, result, wanted):
+def test_limits_hold_whatever_the_estimate_says(
+    own, information, before, result, wanted, confirmed
+):
     """A not-a-number in a limit was the amplitude."""
-    controller, state = controlled(voltage_cap=30.0, slew=0.5)
+    controller, state = controlled(voltage_cap=30.0, slew=0.5, charge_cap=120e-9)
     hostile = dataclasses.replace(
         state.electrodes,
         own=jnp.array(own).reshape(2, 4),
         information=jnp.array(information).reshape(2, 3, 3),
         amplitude=jnp.array(before),
+        confirmed=jnp.full(2, confirmed),
         result=jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (2,)), verdict(result)),
     )
     command = controller.command(dataclasses.replace(state, electrodes=hostile), charge=wanted)
     most = min(float(controller.limits.guard), float(controller.limits.ceiling))
     assert (command.amplitude >= 0).all()
     assert (command.amplitude <= np.minimum(most, np.nan_to_num(before) + 0.5)).all()
+    if confirmed == 0 or result != "successful":
+        assert (command.amplitude * true_charge(SkinLoad(1e-3, 1e-3, 1e-12)) <= 120e-9).all()
 
 
 def test_what_cannot_be_commanded_is_refused_with_a_reason():

@@ -84,6 +84,8 @@ def electrode(of: Case) -> tuple[Any, ...]:
         missed=of.missed,
         amplitude=0.5,
         offset=0.25,
+        shown=np.array([5.0, 6.0]),
+        confirmed=0.7,
         level=0.3,
         variance=0.4,
         chi2=0.9,
@@ -104,6 +106,7 @@ def electrode(of: Case) -> tuple[Any, ...]:
         amplitude=0.0 if of.silent else 2.0,
         offset=1.25,
         steady=True,
+        shown=4.0,
         bad=RESULTS.unconnected if of.off else SUCCESSFUL,
     )
     found = ATTEMPT(FOUND, TOLD, np.linalg.inv(TOLD), 1.9, 1.01, GOOD if of.found else BAD)
@@ -139,6 +142,9 @@ def expected(of: Case) -> dict[str, Any]:
     elif good or lost:
         mean, mean_cov = 0 * mean, 0 * mean_cov
     begun = not of.running and of.fresh == "late"
+    confirmed = state["confirmed"] if of.silent else 0.0
+    if of.running and good and not of.jump:
+        confirmed = max(state["confirmed"], measured.amplitude)
     which = int(np.argmax((inverse @ factor) ** 2 / np.diagonal(inverse)))
     shown = {
         name: state[name] if of.silent else getattr(source, name)
@@ -156,6 +162,8 @@ def expected(of: Case) -> dict[str, Any]:
         "missed": missed,
         "amplitude": measured.amplitude,
         "offset": measured.offset,
+        "shown": [4.0, 5.0],
+        "confirmed": confirmed,
         "mean": mean,
         "mean_cov": mean_cov,
         "event": JUMP if jumped else DRIFT if drifted else NONE,
@@ -259,6 +267,7 @@ def test_the_worst_that_a_pulse_shows_is_its_verdict(
         amplitude=jnp.asarray(1.0),
         offset=jnp.asarray(0.0),
         steady=jnp.asarray(True),
+        shown=jnp.asarray(4.0),
         bad=first_verdict((jnp.asarray(True), bad)),
     )
     monkeypatch.setattr(GainModel, "departure", lambda *_: jnp.zeros(3, complex))
@@ -331,8 +340,17 @@ def test_the_driver_has_changed_if_most_electrodes_move_one_way(z, jumps, counte
     values[test, counted + 1 :] = np.nan
     jumped, counts = np.arange(LANES) < jumps, np.arange(LANES) < counted
     jumped[counted:] = True
-    found = changes.driver_change(*map(jnp.asarray, (jumped, values, counts)))
+    running = np.arange(LANES) < 2 * counted - 1  # those that count are more than half of them
+    found = changes.driver_change(*map(jnp.asarray, (jumped, values, counts, running)))
     assert bool(found) == expected
+
+
+def test_a_few_electrodes_in_trouble_are_not_the_driver_while_the_others_change_their_amplitude():
+    counts, running = np.arange(LANES) < changes.COMMON, np.arange(LANES) < 2 * changes.COMMON
+    values = np.where(counts, 99.0, 0.0) * np.ones((2, 1))
+    for jumped in (counts, ~counts):
+        found = changes.driver_change(*map(jnp.asarray, (jumped, values, counts, running)))
+        assert not bool(found)
 
 
 def state_of(**fields: Any) -> TrackerState:
@@ -483,7 +501,7 @@ def test_a_pulse_alone_tells_elements_or_says_that_it_does_not(
         first_verdict((jnp.asarray(True), result)),
     )  # fmt: skip
     monkeypatch.setattr(online, "attempt", lambda *_: fit)
-    measured = MEASURED(jnp.zeros(3, complex), zero, jnp.ones(3), *[zero] * 5)
+    measured = MEASURED(jnp.zeros(3, complex), zero, jnp.ones(3), *[zero] * 6)
     model = object.__new__(GainModel)
     found = anew(model, measured, jnp.zeros((1, 2)), jnp.asarray(True), two)
     assert str(verdict_names(found.result)) == verdict

@@ -212,7 +212,8 @@ def test_without_noise_it_is_biased_by_less_than_a_tenth_of_the_noise_of_100_pul
     start = anew(followed(tracker, with_noise(pulses[:8], seed=4)))
     with_the_noise = tracker.update(start, with_noise(pulses, seed=5)[8])
     hundred = own_stderr(tracker.read(with_the_noise)) / 10
-    state = anew(followed(tracker, pulses[:8]))
+    # Nine, because windows without noise repeat after three: the next is not one of the last two.
+    state = anew(followed(tracker, pulses[:9]))
     for v_out in pulses:
         state = tracker.update(state, v_out)
     found = np.asarray(tracker.read(state).circuit.values())
@@ -336,6 +337,8 @@ TROUBLES = {
     "not a number": {"nonfinite_samples"},
     "clipped": {"saturated"},
     "unplugged": {"flat"},
+    "frozen": {"repeated"},
+    "frozen, two buffers in turn": {"repeated"},
 }
 
 
@@ -352,6 +355,8 @@ def test_an_electrode_in_trouble_says_so_at_once_and_recovers(trouble):
         "not a number": np.full_like(bad, np.nan),
         "clipped": np.minimum(4 * bad, HIGHEST),
         "unplugged": 1e-4 * with_noise(np.zeros_like(bad), seed=3),
+        "frozen": pulses[first - 1, 0],
+        "frozen, two buffers in turn": np.resize(pulses[first - 2 : first, 0], bad.shape),
     }[trouble]
     state = tracker.start()
     for number, v_out in enumerate(pulses):
@@ -739,6 +744,20 @@ def test_bad_electrodes_are_listed_with_the_reason():
     logs = state.electrodes.own.at[0, :3].add(np.log(4.0))
     state = dataclasses.replace(state, electrodes=dataclasses.replace(state.electrodes, own=logs))
     assert tracker.bad_electrodes(state)[0] == "dry"
+
+
+def test_the_last_code_of_the_converter_is_clipped_and_the_one_before_is_not():
+    """The range in the record is the truth: samples at its ends may have been any voltage."""
+    tracker, study = tracker_of(2), calibrated()[1]
+    low, high = study["cal/0"].adc_range
+    step = 2 * high / 2**16
+    pulse = with_noise(tracker.pulses(loaded(quiet()))[3], seed=1)
+    for end, inner in ((low, step), (high, -step)):
+        for sample, clipped in ((end, True), (end + inner, False)):
+            pulse[1, 200] = sample
+            verdicts = tracker.read(tracker.update(tracker.start(), pulse)).verdicts
+            assert (verdicts[1] == "saturated") == clipped, (end, sample)
+            assert verdicts[0] == "successful"
 
 
 def numbers_of(tracker, state):

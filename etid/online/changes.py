@@ -122,14 +122,19 @@ def averaged(
 
 
 def driver_change(
-    jumped: Bool[Array, " lane"], z: Float[Array, "test lane"], counts: Bool[Array, " lane"]
+    jumped: Bool[Array, " lane"],
+    z: Float[Array, "test lane"],
+    counts: Bool[Array, " lane"],
+    running: Bool[Array, " lane"],
 ) -> Bool[Array, ""]:
     """Whether the electrodes have changed together.
 
     Args:
         jumped: Electrodes that have jumped.
         z: z of the innovation and of the moving mean.
-        counts: Electrodes that have a prediction and touch something.
+        counts: Electrodes that have a prediction, touch something, and keep their amplitude.
+        running: Electrodes that have a prediction. If only a few of them count, these are the ones
+            in trouble while the amplitude of the others rises.
     """
     number = jnp.sum(counts, dtype=float)
     limit = DRIVER * 1.709 / jnp.sqrt(jnp.maximum(number, 1.0)) - 1.282
@@ -137,7 +142,8 @@ def driver_change(
         jnp.sum(counts[None, :] & of, axis=1, dtype=float) for of in (z > limit, z < -limit)
     )
     moved = jnp.any(jnp.maximum(above, below) >= jnp.floor(0.9 * number))
-    return (number >= COMMON) & (moved | (jnp.sum(jumped & counts, dtype=float) > number / 2))
+    enough = (number >= COMMON) & (number > jnp.sum(running, dtype=float) / 2)
+    return enough & (moved | (jnp.sum(jumped & counts, dtype=float) > number / 2))
 
 
 @dataclasses.dataclass(frozen=True)

@@ -12,24 +12,33 @@ that the elements and Z_th predict (`etid.online.current`). The limits are appli
 | limit | amplitude at most |
 |---|---|
 | `peak` | cap / (p + k σ_p), the cap on the current |
-| `charge` | cap / (q + k σ_q), the cap on the charge per phase |
+| `charge` | cap / r (q + k σ_q), the cap on the charge per phase |
+| `confirmed` | the larger of a_s, and 1.25 times the amplitude that a pulse has confirmed |
 | `guard` | cap / p_s, with the peak current p_s through a short circuit |
 | `voltage` | cap / largest unloaded voltage |
 | `slew` | amplitude before + slew |
 
 k is the quantile of the normal distribution for the stated probability; σ contains the noise of the
-pulses, the random walk of the skin until the next pulse, and the error of the calibration.
+pulses, the random walk of the skin until the next pulse, and the error of the calibration. A pulse
+after a pause lacks the tail of the pulse before, whose current has the other sign. A transformer
+passes no direct current, and the tail decays, so that the charge is at most r = T / (T − phase) of
+that in the steady state.
 
 **Limits that hold whatever the estimate says** are `guard`, `voltage` and `slew`. The skin may
 become wet between two pulses, and no controller can know this before the pulse. Through a passive
 load of resistors and capacitors that follow a series resistor, the largest current is that through
 a short circuit. An amplitude below the guard therefore keeps the current below its cap even at the
-first pulse after a change. The *charge* of this pulse is too large by the factor by which the skin
-has changed.
+first pulse after a change. The *charge* of this pulse is at most `Command.worst`, that through a
+short circuit.
 
-**An electrode whose verdict is not good** gets the fallback amplitude, or less if a limit says so.
-Until it starts again, it gets no more than at the last pulse. The command says `fallback` for it,
-and its charge is NaN.
+**The cap on the charge** holds at all other pulses, also if records are wrong. With a_s, a short
+circuit carries 1/1.25 of the cap. An electrode gets more only after pulses that fitted their
+prediction, 1.25 times as much at each. The first raise is still safe with a short circuit. It
+shows whether the record follows the amplitude of its own electrode: another channel does not.
+
+**An electrode whose verdict is not good** gets the fallback amplitude, which is at most a_s, or
+less if a limit says so. Until it starts again, it gets no more than at the last pulse. The command
+says `fallback` for it, and its charge is NaN.
 """
 
 import dataclasses
@@ -53,9 +62,13 @@ from etid.online.tracker import Tracker
 from etid.results.verdicts import counts
 from etid.solvers.matrices import inverse_of_few
 
-REASONS = np.array(["wanted", "peak", "charge", "guard", "voltage", "slew", "fallback"])
+REASONS = np.array(
+    ["wanted", "peak", "charge", "confirmed", "guard", "voltage", "slew", "fallback"]
+)
 CURRENT_CAP = 5e-3  # [A] the paper's limit for the fingertip
 LARGEST_CAP = 0.1  # [A] stimulators of nerves and skin stay below it
+FALLBACK = 0.1  # unless `charge_cap` allows less
+RAISE = 1.25  # of an amplitude that a pulse has confirmed, to the next pulse
 
 
 @dataclasses.dataclass(frozen=True)
@@ -67,6 +80,7 @@ class Command(Overviewed):
         charge: Expected charge per phase [C]; NaN where the amplitude is the fallback.
         charge_stderr: Its standard error [C].
         peak: Expected largest current [A]; NaN where the amplitude is the fallback.
+        worst: Charge if the load has become a short circuit since the last pulse [C].
         reason: What determined the amplitude: `wanted`, the name of a limit, or `fallback`.
     """
 
@@ -74,6 +88,7 @@ class Command(Overviewed):
     charge: Float[np.ndarray, " lane"]
     charge_stderr: Float[np.ndarray, " lane"]
     peak: Float[np.ndarray, " lane"]
+    worst: Float[np.ndarray, " lane"]
     reason: np.ndarray
 
     def _overview(self) -> Overview:
@@ -94,7 +109,10 @@ class Limits(NamedTuple):
     Attributes:
         current_cap: Largest current of either sign [A].
         charge_cap: Largest charge per phase [C].
+        rest: Charge of a pulse after a pause, at most, relative to that in the steady state.
         quantile: k, in standard errors.
+        short: Amplitude without a confirmed estimate; `RAISE` times as much carries `charge_cap`
+            through a short circuit.
         guard: Amplitude at which a short circuit carries `current_cap`.
         ceiling: Amplitude at which the unloaded voltage reaches its cap.
         slew: Largest increase of the amplitude from pulse to pulse.
@@ -103,7 +121,9 @@ class Limits(NamedTuple):
 
     current_cap: Float[Array, ""]
     charge_cap: Float[Array, ""]
+    rest: Float[Array, ""]
     quantile: Float[Array, ""]
+    short: Float[Array, ""]
     guard: Float[Array, ""]
     ceiling: Float[Array, ""]
     slew: Float[Array, ""]
@@ -121,12 +141,14 @@ class Controller(Overviewed):
         model: Charge and current from an admittance.
         limits: Limits of the amplitude.
         most: Charge of a phase whose current is `current_cap` throughout [C].
+        short: Charge through a short circuit per unit of amplitude, at most [C].
     """
 
     tracker: Tracker
     model: CurrentModel
     limits: Limits
     most: float
+    short: float
 
     @classmethod
     def of(
@@ -137,8 +159,8 @@ class Controller(Overviewed):
         charge_cap: float = math.inf,
         voltage_cap: float = math.inf,
         slew: float = math.inf,
-        fallback: float = 0.1,
-        probability: float = 0.999,
+        fallback: float | None = None,
+        probability: float = 1 - 1e-9,
     ) -> "Controller":
         """A controller for the electrodes of a tracker.
 
@@ -150,15 +172,18 @@ class Controller(Overviewed):
             slew: Largest increase of the relative amplitude from one pulse to the next. A decrease
                 is never limited.
             fallback: Relative amplitude for an electrode whose verdict is not good. It must be
-                large enough for the tracker to identify the skin.
-            probability: Probability with which the caps on current and charge hold while the skin
-                varies as the tracker expects.
+                large enough for the tracker to identify the skin, and so small that a short
+                circuit carries no more than `charge_cap`. 0.1, or the largest amplitude that
+                `charge_cap` allows if this is smaller, if it is not given.
+            probability: Probability with which the caps on current and charge hold at a pulse while
+                the skin varies as the tracker expects.
 
         Raises:
             RecordingError: A limit is no number.
             ValueError: A limit is not positive, `current_cap` exceeds 0.1 A, `charge_cap` exceeds
-                what `current_cap` carries in a phase, `fallback` is infinite, the probability is
-                not between ½ and 1, or the driver of the tracker is not good.
+                what `current_cap` carries in a phase, `fallback` is infinite or exceeds what
+                `charge_cap` allows, the probability is not between ½ and 1, or the driver of the
+                tracker is not good.
         """
         require("tracker", tracker, Tracker, "Make one with etid.Tracker.of")
         given = {
@@ -166,7 +191,7 @@ class Controller(Overviewed):
             "charge_cap": charge_cap,
             "voltage_cap": voltage_cap,
             "slew": slew,
-            "fallback": fallback,
+            "fallback": FALLBACK if fallback is None else fallback,
         }
         for name, value in given.items():
             if not number_of(name, value) > 0:
@@ -176,7 +201,7 @@ class Controller(Overviewed):
                 f"current_cap is {current_cap:g} A, more than {LARGEST_CAP:g} A; is it in ampere "
                 "and not in mA?"
             )
-        if math.isinf(fallback):
+        if math.isinf(given["fallback"]):
             raise ValueError("fallback is infinite; give an amplitude")
         if not 0.5 <= number_of("probability", probability) < 1:
             raise ValueError(f"probability is {probability}; give at least 0.5 and less than 1")
@@ -192,25 +217,37 @@ class Controller(Overviewed):
                 f"charge_cap is {charge_cap:g} C; current_cap carries {most:.3g} C in a phase, so "
                 "that charge_cap would never act. Is it in coulomb and not in nC?"
             )
+        quantile = float(scipy.special.ndtri(probability))
+        short = float(model.short_charge(jnp.asarray(quantile)))
+        allowed = float(charge_cap) / short / RAISE
+        if fallback is not None and fallback > allowed:
+            raise ValueError(
+                f"fallback is {fallback:g}, which carries up to {fallback * short:.3g} C through a "
+                f"short circuit; charge_cap allows {charge_cap / RAISE:.3g} C there. Give at most "
+                f"{math.floor(1e4 * allowed) / 1e4:g}, or none"
+            )
         of = tracker.model.bands
         unloaded = float(np.abs(of.waveform()).max())
         limits = Limits(
             current_cap=jnp.asarray(float(current_cap)),
             charge_cap=jnp.asarray(float(charge_cap)),
-            quantile=jnp.asarray(float(scipy.special.ndtri(probability))),
+            rest=jnp.asarray(model.rest),
+            quantile=jnp.asarray(quantile),
+            short=jnp.asarray(allowed),
             guard=current_cap / jnp.abs(model.short_circuit()).max(),
             ceiling=jnp.asarray(float(voltage_cap) / unloaded),
             slew=jnp.asarray(float(slew)),
-            fallback=jnp.asarray(float(fallback)),
+            fallback=jnp.asarray(min(float(given["fallback"]), allowed)),
         )
-        return cls(tracker, model, limits, most)
+        return cls(tracker, model, limits, most, short)
 
     def _overview(self) -> Overview:
         rows = [
             ("current_cap", f"{1e3 * float(self.limits.current_cap):g}", "mA"),
             ("charge_cap", f"{1e9 * float(self.limits.charge_cap):g}", "nC"),
             ("guard", f"{float(self.limits.guard):.3f}", "of the unloaded record"),
-            ("fallback", f"{float(self.limits.fallback):g}", "of the unloaded record"),
+            ("fallback", f"{float(self.limits.fallback):.3g}", "of the unloaded record"),
+            ("worst pulse", f"{1e9 * self.short * float(self.limits.guard):.0f}", "nC"),
         ]
         return Overview(f"Controller of {self.tracker.electrodes} electrodes", rows)
 
@@ -263,7 +300,8 @@ class Controller(Overviewed):
                 wanted,
             )
         )
-        return Command(amplitude, expected, stderr, peak, REASONS[reason.astype(int)])
+        worst = self.short * amplitude
+        return Command(amplitude, expected, stderr, peak, worst, REASONS[reason.astype(int)])
 
 
 @jax.jit  # as `etid.online.tracker`
@@ -309,7 +347,8 @@ def _electrode(
         [
             wanted / now.charge,
             limits.current_cap / (now.peak + k * now.peak_stderr),
-            limits.charge_cap / (now.charge + k * now.charge_stderr),
+            limits.charge_cap / limits.rest / (now.charge + k * now.charge_stderr),
+            jnp.maximum(limits.short, jnp.where(state.amplitude > 0, RAISE * state.confirmed, 0)),
             limits.guard,
             limits.ceiling,
             jnp.nan_to_num(state.amplitude) + limits.slew,
@@ -320,7 +359,7 @@ def _electrode(
     held = (state.pulses > 0) & (state.amplitude > 0)
     last = jnp.where(held, state.amplitude, jnp.inf)
     first = jnp.where(wanted > 0, jnp.minimum(limits.fallback, last), 0.0)
-    safe = jnp.concatenate([first[None], jnp.full(2, jnp.inf), most[3:]])
+    safe = jnp.concatenate([first[None], jnp.full(2, jnp.inf), limits.short[None], most[4:]])
     applied = jnp.where(good, most, safe)
     reason = jnp.argmin(applied)
     amplitude = applied[reason]

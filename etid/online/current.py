@@ -65,6 +65,7 @@ class CurrentModel(eqx.Module):
             parts, in single precision. They find the time of the peak in half the time.
         times: Times of the other rows after the start of the window [s].
         phase: Duration of a phase, t₁ − t₀ [s].
+        rest: Upper bound of the charge of a pulse after a pause, relative to `Current.charge`.
     """
 
     frequency: Float[Array, " band"]
@@ -75,6 +76,7 @@ class CurrentModel(eqx.Module):
     search: Float[Array, "part time"]
     times: Float[Array, " time"]
     phase: float = eqx.field(static=True)
+    rest: float = eqx.field(static=True)
 
     @classmethod
     def of(
@@ -89,11 +91,14 @@ class CurrentModel(eqx.Module):
         """
         x, rate = np.asarray(bands.x), bands.sample_rate
         number = np.arange(1.0, x.size + 1)
-        begin, end = _phase(bands.waveform())
+        v = bands.waveform()
+        polarity = np.sign(v[np.argmax(np.abs(v))])
+        begin, end = _phase(polarity * v)
         edges = [np.arange(-2.0, EDGE, FINE) + edge for edge in (begin, end)]
         times = np.concatenate([edges[0], np.arange(begin + EDGE, end - 2, COARSE), edges[1]])
         omega = 2 * np.pi * number / bands.samples  # per sample
         integral = (np.exp(1j * omega * end) - np.exp(1j * omega * begin)) / (1j * omega * rate)
+        integral *= polarity
         rows = np.concatenate([integral[None, :], np.exp(1j * np.outer(times, omega))])
         rows = 2 / bands.samples * rows * x
         by_band = rows @ _interpolation(number, np.asarray(bands.frequency) * bands.samples / rate)
@@ -107,6 +112,7 @@ class CurrentModel(eqx.Module):
             search=jnp.asarray(np.concatenate([by_band.real, -by_band.imag], axis=1)[1:].T, "f4"),
             times=jnp.asarray(times / rate),
             phase=float((end - begin) / rate),
+            rest=float(bands.samples / (bands.samples - (end - begin))),
         )
 
     def waveform(self, circuit: AbstractCircuit) -> Float[Array, " time"]:
@@ -117,6 +123,17 @@ class CurrentModel(eqx.Module):
     def short_circuit(self) -> Float[Array, " time"]:
         """Current through a short circuit at `times`, per unit of relative amplitude [A]."""
         return _real(self.sums[1:], reciprocal(self.source))
+
+    def short_charge(self, quantile: Float[Array, ""]) -> Float[Array, ""]:
+        """Upper bound of the charge of a pulse through a short circuit, per unit of amplitude [C].
+
+        Args:
+            quantile: Standard errors by the calibrations that are added.
+        """
+        row = self.sums[:1] * reciprocal(self.source)[None, :]
+        shift = _real(row, self.by_source.T)[0]
+        stderr = jnp.sqrt(shift @ self.source_cov @ shift)
+        return self.rest * (row.real.sum() + quantile * stderr)
 
     def current(
         self,

@@ -39,6 +39,7 @@ class Measured(NamedTuple):
         amplitude: Amplitude of the pulse, relative to that of the unloaded record.
         offset: Offset of the converter [V].
         steady: Whether the amplitude is nearly that of the pulse before.
+        shown: A number that two different windows never share.
         bad: Verdict on the samples.
     """
 
@@ -49,6 +50,7 @@ class Measured(NamedTuple):
     amplitude: Float[Array, "*lane"]
     offset: Float[Array, "*lane"]
     steady: Bool[Array, "*lane"]
+    shown: Float[Array, "*lane"]
     bad: RESULTS
 
 
@@ -266,6 +268,8 @@ def after_pulse(
     lost = running & ((missed >= PATIENCE) | (measured.bad == RESULTS.unconnected))
     restarted = good & again
     one = jnp.where(restarted, 1, state.pulses + 1)
+    fits = running & good & ~suspected.jump
+    reached = jnp.maximum(state.confirmed, measured.amplitude)
     begun = ~running & (used.result == MAX_STEPS_REACHED)
     gained = jnp.where(restarted, used.information, information + used.information)
     followed = good & ~again
@@ -276,6 +280,8 @@ def after_pulse(
         missed=missed,
         amplitude=measured.amplitude,
         offset=measured.offset,
+        shown=jnp.stack([measured.shown, state.shown[0]]),
+        confirmed=jnp.where(fits, reached, jnp.where(silent, state.confirmed, 0.0)),
         level=jnp.where(silent, state.level, measured.level),
         variance=jnp.where(silent, state.variance, measured.variance),
         chi2=jnp.where(silent, state.chi2, used.chi2),

@@ -19,6 +19,9 @@ class ElectrodeState(eqx.Module):
         amplitude: Amplitude of the last pulse, relative to that of the unloaded record;
             NaN before the first pulse.
         offset: Offset of the converter [V].
+        shown: A number that two different windows never share, of the last two windows.
+        confirmed: Largest amplitude of a pulse that fitted its prediction, since the last pulse
+            that did not; 0 if there was none.
         level: Effective value of the gain of the last pulse; 1 if the electrode is open.
         variance: E|noise|² of a Fourier coefficient of the last pulse [V²].
         chi2: χ² of the last pulse.
@@ -38,6 +41,8 @@ class ElectrodeState(eqx.Module):
     missed: Int[Array, "*lane"]
     amplitude: Float[Array, "*lane"]
     offset: Float[Array, "*lane"]
+    shown: Float[Array, "*lane 2"]
+    confirmed: Float[Array, "*lane"]
     level: Float[Array, "*lane"]
     variance: Float[Array, "*lane"]
     chi2: Float[Array, "*lane"]

@@ -72,7 +72,7 @@ def updated(
         before, measured, information, found, fresh, suspected
     )
     counts = running & measured.steady & (measured.bad == SUCCESSFUL)
-    event = driver_change(suspected.jump, suspected.z.T, counts)
+    event = driver_change(suspected.jump, suspected.z.T, counts, running)
     return TrackerState(after, number, event, state.driver_changed | event)
 
 
@@ -119,15 +119,18 @@ def measured_pulse(
     noise = 2 * jnp.sum(bands.weight > 0, dtype=float) * gains.variance
     flat = (signal < FLAT * noise) | ~(amplitude > 0)
     level = jnp.sqrt(jnp.maximum(signal - noise, 0.0) / jnp.sum(bands.weight)) / relative
+    shown = power(seen.gain()) @ bands.weight  # of the samples alone
+    repeated = jnp.any(shown[:, None] == before.shown, axis=1)
     bad = jax.vmap(
-        lambda finite, clipped, unknown, flat, unconnected: first_verdict(
+        lambda finite, clipped, unknown, flat, repeated, unconnected: first_verdict(
             (~finite, RESULTS.nonfinite_samples),
             (clipped, RESULTS.saturated),
             (unknown, RESULTS.too_short),
             (flat, RESULTS.flat),
+            (repeated, RESULTS.repeated),
             (unconnected, RESULTS.unconnected),
         )
-    )(finite, seen.clipped, unknown, flat, jnp.abs(level - 1) < 1 - changes.OPEN)
+    )(finite, seen.clipped, unknown, flat, repeated, jnp.abs(level - 1) < 1 - changes.OPEN)
     return Measured(
         gain=gains.gain * as_complex(1 / relative)[:, None],
         variance=gains.variance / relative**2,
@@ -136,5 +139,6 @@ def measured_pulse(
         amplitude=amplitude,
         offset=offset,
         steady=steady,
+        shown=shown,
         bad=bad,
     )

@@ -212,6 +212,8 @@ class Tracker(Overviewed):
             missed=none,
             amplitude=jnp.zeros(lanes) if at_rest else nan,
             offset=nan,
+            shown=jnp.full((lanes, 2), jnp.nan),
+            confirmed=jnp.zeros(lanes),
             level=nan,
             variance=nan,
             chi2=nan,

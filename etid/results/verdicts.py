@@ -106,6 +106,10 @@ class RESULTS(optx.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]  # equi
     )
     flat = "A record carries no signal above its noise. Check the contact and the channel."
     saturated = "The converter clipped. Lower the gain or the stimulus and record again."
+    repeated = (
+        "The samples are exactly those of one of the two pulses before. Noise never repeats, so "
+        "this buffer was not filled anew. Check the acquisition."
+    )
     nonfinite_samples = "A record contains NaN or infinite samples. Cut them out or record again."
     too_short = "The record is too short to identify anything. Record a whole pulse and its tail."
     misaligned = (
