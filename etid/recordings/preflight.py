@@ -9,6 +9,7 @@ from jaxtyping import Bool, Float
 from etid.recordings.group import STEP, Group, covariance_of, is_periodic, limits_of
 from etid.recordings.recording import Recording
 from etid.recordings.remarks import Remark
+from etid.signals.clipping import HELD, is_clipped
 from etid.signals.disturbances import Joint
 from etid.signals.filtering import TAPS
 from etid.signals.harmonics import ALIASED, filled, harmonics
@@ -26,9 +27,6 @@ from etid.signals.pulse_train import (
 SHORTEST = 4 * TAPS + 104  # [samples] edges of the interpolation, and 104 samples for the fit
 # [standard deviations] peak-to-peak value that noise alone hardly exceeds; a signal must exceed it
 FLAT = 8.0
-RAIL = 3  # equal extreme samples in a row; a noisy or sloping signal does not produce them
-JUMP = 8.0  # [converter steps] a clipped signal reaches and leaves its rail in larger jumps
-HELD = 1e-5  # noise over the span of a record, below which equal samples in a row are no fault
 POWER = 1.01  # largest variance of v_out relative to v_th: a passive load takes power
 # [A] peak-to-peak; stimulators of nerves and skin stay below 0.1 A in each direction
 STRONGEST = 0.25
@@ -362,24 +360,11 @@ def _is_saturated(
     step: float,
     adc_range: tuple[float, float] | None,
 ) -> bool:
-    """Whether samples are at a limit of the converter, or a flat top begins and ends in jumps."""
+    """Whether samples are at a limit of the converter, or at a rail if its range is unknown."""
     if adc_range is not None:
         low, high = adc_range
         return bool(limits[0] <= low + step / 2 or limits[1] >= high - step / 2)
-    for extreme in limits:
-        at_rail = v == extreme
-        if np.count_nonzero(at_rail) < RAIL:
-            continue
-        edges = np.flatnonzero(np.diff(np.concatenate([[0], at_rail.astype(np.int8), [0]])))
-        for start, stop in edges.reshape(-1, 2):
-            inside = start > 0 and stop < v.size
-            if stop - start < RAIL or not inside:
-                continue
-            floor = step if step > 0 else (limits[1] - limits[0]) / 2**16
-            jump = min(abs(v[start - 1] - extreme), abs(v[stop] - extreme))
-            if jump > JUMP * floor:
-                return True
-    return False
+    return is_clipped(v, step)
 
 
 def _is_unconnected(seen: Inspected) -> bool:
