@@ -25,6 +25,7 @@ class Remark(enum.IntFlag):
     at_bound = enum.auto()
     current_unused = enum.auto()
     follows_late = enum.auto()
+    periods_shifted = enum.auto()
 
 
 _TEXTS = {
@@ -60,6 +61,10 @@ _TEXTS = {
     Remark.follows_late: (
         "The residual looks like a resistance that follows its current late, as of skin whose "
         "recovery after a pulse is slower than its fall; etid has no model of it."
+    ),
+    Remark.periods_shifted: (
+        "From one pulse period to another, v_out is shifted by whole samples: a sample was lost or "
+        "recorded twice. The periods were aligned; check the recorder."
     ),
 }
 
