@@ -26,6 +26,7 @@ from etid.signals.quick_looks import flickering, humming, uneven
 _Key = TypeVar("_Key", bound=Hashable)
 SEAM = 3  # samples on each side of the joint between two periods
 USED = 8192  # samples of one product
+JITTER = 0.2  # [samples] cuts between samples are known this well from samples beside them
 STEP = 4.0  # [standard deviations] largest difference that noise makes, there and elsewhere
 
 
@@ -195,6 +196,10 @@ class Group:
                 of = _part(self.quiet, rows), self.trusted[rows]
                 with QUIETLY():
                     found[rows] = is_periodic(*of, rest, samples)
+                    on_edge = found[rows] & ~is_periodic(*of, np.ones(len(rows)), samples)
+                for row in np.flatnonzero(on_edge):
+                    spacing = self.sample_rate / counted[row]
+                    found[rows[row]] = _repeats(*(part[row] for part in of), spacing, samples)
         return found
 
     @functools.cached_property
@@ -273,6 +278,32 @@ def is_periodic(
     return np.asarray(~(step > STEP * sigma).any(-1))
 
 
+def _repeats(
+    records: Float[np.ndarray, "2 time"],
+    sigma: Float[np.ndarray, "2"],
+    spacing: float,
+    samples: int,
+) -> bool:
+    """Whether a record that begins on an edge has the same edge at the end of all its periods.
+
+    If the clock of the pulses jitters, the end of the record does not continue at its start.
+
+    Args:
+        records: Voltages [V].
+        sigma: Standard deviation of the noise of a sample of each record [V].
+        spacing: Length of a period [samples].
+        samples: Number of samples of the periods.
+    """
+    ends = np.arange(1, round(samples / spacing)) * spacing
+    cuts = np.rint(ends).astype(int)
+    around = np.concatenate([np.arange(samples - SEAM, samples), np.arange(SEAM)])
+    inside = records[:, cuts[:, None] + np.arange(-SEAM, SEAM)]
+    apart = np.abs(inside - records[:, None, around]).max(-1)
+    step = np.abs(np.diff(inside)).max(-1)  # of a jitter of one sample
+    allowed = (np.abs(cuts - ends) + JITTER) * step + STEP * sigma[:, None]
+    return bool((apart <= allowed).all())
+
+
 def _kept(
     records: Float[np.ndarray, "2 time"],
     sigma: Float[np.ndarray, "2"],
@@ -286,7 +317,7 @@ def _kept(
     period.
     """
     rise = rise_time(sample_rate)
-    if any(of_source(v, bad, spacing, rise) for v in records if bad.any()) or not enough(bad):
+    if not enough(bad) or (bad.any() and any(of_source(v, bad, spacing, rise) for v in records)):
         bad = np.zeros_like(bad)
     found = shifts(records, sigma, spacing, bad.size, rise)
     late = np.zeros(bad.size, int) if found is None else found.late
