@@ -32,7 +32,10 @@ def sizes(voltage: float, current: float) -> str:
 def why_misaligned(seen: Inspected) -> str:
     """The probable cause of the verdict `misaligned`, with numbers; empty if it is not known."""
     if seen.shifts is not None and seen.kept is None:
-        return f"{how_shifted(seen)} Too few periods without a fault remain."
+        return (
+            f"v_out or {seen.recording.cause} lost or doubled samples within pulses, and too few "
+            "pulses without a fault remain."
+        )
     if seen.has_current:
         return _why_no_power(seen)
     ratio = float(np.std(seen.v_out) / np.std(seen.v_th))

@@ -193,13 +193,13 @@ class Group:
             if periods > 0:
                 counted = np.array([self.trains[row].counted for row in rows])
                 rest = np.abs(periods * self.sample_rate / counted - samples)
-                of = _part(self.quiet, rows), self.trusted[rows]
+                records, sigma = _part(self.quiet, rows), self.trusted[rows]
                 with QUIETLY():
-                    found[rows] = is_periodic(*of, rest, samples)
-                    on_edge = found[rows] & ~is_periodic(*of, np.ones(len(rows)), samples)
-                for row in np.flatnonzero(on_edge):
+                    found[rows] = is_periodic(records, sigma, rest, samples)
+                    on_edge = ~is_periodic(records, sigma, np.ones(len(rows)), samples)
+                for row in np.flatnonzero(found[rows] & on_edge):
                     spacing = self.sample_rate / counted[row]
-                    found[rows[row]] = _repeats(*(part[row] for part in of), spacing, samples)
+                    found[rows[row]] = _repeats(records[row], sigma[row], spacing, samples)
         return found
 
     @functools.cached_property

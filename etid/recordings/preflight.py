@@ -197,7 +197,9 @@ class Inspected:
     @functools.cached_property
     def covariance(self) -> Float[np.ndarray, "2 2"]:
         """Covariance of `v_th` and `v_out` [V²]."""
-        return self._group.covariance[self._row] if self.kept is None else covariance_of(self._quiet)
+        return (
+            self._group.covariance[self._row] if self.kept is None else covariance_of(self._quiet)
+        )
 
     @functools.cached_property
     def trusted_th(self) -> Float[np.ndarray, ""]:

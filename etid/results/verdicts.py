@@ -103,8 +103,8 @@ class RESULTS(optx.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]  # equi
     )
     flat = "A record carries no signal above its noise. Check the contact and the channel."
     saturated = (
-        "The converter clipped. Lower the gain or the stimulus and record again. If nothing clipped, "
-        "state the converter's range (adc_range)."
+        "The converter clipped. Lower the gain or the stimulus and record again. If nothing "
+        "clipped, state the range of the converter (adc_range)."
     )
     nonfinite_samples = "A record contains NaN or infinite samples. Cut them out or record again."
     too_short = "The record is too short to identify anything. Record a whole pulse and its tail."

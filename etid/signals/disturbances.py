@@ -1,4 +1,4 @@
-"""Disturbed and shifted pulse periods: those with a spike or a burst, and those after a lost sample.
+"""Disturbed pulse periods, with a spike or a burst, and shifted ones, after a lost sample.
 
 A movement of the hand can spoil one of several periods, and with it the average of all periods.
 Each period is compared with the median of all periods, after averaging over `MERGED` samples. A
@@ -156,7 +156,7 @@ def _most(numbers: Int[np.ndarray, " number"]) -> int:
 def _lags_of_edges(
     v: Float[np.ndarray, " time"], sigma: float, spacing: float, periods: int, rise: int
 ) -> Float[np.ndarray, "period 2"] | None:
-    """Lags of the first and the last edge of each period behind those of the first period [samples].
+    """Lags of the first and last edge of each period behind those of the first period [samples].
 
     None if an edge does not look alike in all periods, or if noise hides its place.
     """

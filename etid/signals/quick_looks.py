@@ -25,8 +25,8 @@ FEWEST = 3  # periods that are needed to recognise a disturbed one
 PART = np.array([0.005, 0.02])
 SHARE = 0.5  # limit relative to the value at the same place
 NOISE = 8.0  # limit relative to the standard deviation of a mean
-# [samples] In these means, cuts between samples seem to move periods by up to 0.09. A sample that is
-# lost between pulses moves them by 0.67 or more, one in the last pulse by 0.27.
+# [samples] In these means, cuts between samples seem to move periods by up to 0.09. A sample that
+# is lost between pulses moves them by 0.67 or more, one in the last pulse by 0.27.
 MOVED = 0.18
 MOVED_NOISE = 3.0  # the same relative to its standard deviation
 
