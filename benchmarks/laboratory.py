@@ -50,6 +50,8 @@ class Output:
         sampling_jitter: Standard deviation of the time of every single sample [s].
         added: Voltages that are added at the converter.
         voltage: Coefficients of the terminal voltage by sampler, where the load is not linear.
+        lost: Number of a sample that the recorder loses; all later ones are one early.
+        doubled: Number of a sample that it stores twice; all later ones are one late.
     """
 
     driver: TransformerDriver
@@ -64,6 +66,8 @@ class Output:
     sampling_jitter: float = 0.0
     added: tuple[Added, ...] = ()
     voltage: Callable[[TransformerDriver, Sampler], Complex[np.ndarray, " f"]] | None = None
+    lost: int | None = None
+    doubled: int | None = None
 
     def sampler(self, sample_rate: float) -> Sampler:
         """Samples its waveform."""
@@ -87,6 +91,12 @@ class Output:
         self, sample_rate: float, samples: int, rng: np.random.Generator
     ) -> Float[np.ndarray, " time"]:
         """Voltage at the converter [V], without noise."""
+        if self.lost is not None:
+            whole = dataclasses.replace(self, lost=None).volts(sample_rate, samples + 1, rng)
+            return np.delete(whole, self.lost)
+        if self.doubled is not None:
+            whole = dataclasses.replace(self, doubled=None).volts(sample_rate, samples, rng)
+            return np.insert(whole, self.doubled, whole[self.doubled])[:samples]
         sampler, time = self.sampler(sample_rate), np.arange(samples) / sample_rate
         early = self.sampling_jitter * rng.standard_normal(samples)
         of_load = []
@@ -175,14 +185,13 @@ class Record:
             th, out = out, th
         half = 2.0 ** (self.bits - 1)
         step = self.full_scale / half / SCALE
-        said = {"sample_rate": self.sample_rate, "pulse_rate": 60.0, "r_load": self.r_load}
-        return Recording(
-            th,
-            out,
-            **{**said, **self.told},
-            adc_range=(-half * step, (half - 1) * step),
-            path=self.path,
-        )
+        said = {
+            "sample_rate": self.sample_rate,
+            "pulse_rate": 60.0,
+            "r_load": self.r_load,
+            "adc_range": (-half * step, (half - 1) * step),
+        }
+        return Recording(th, out, **{**said, **self.told}, path=self.path)
 
     def _stored(self, output: Output, rng: np.random.Generator) -> Samples:
         noise, other = rng.spawn(2)

@@ -32,6 +32,7 @@ from benchmarks.perturbed_study import (
     longer,
     louder,
     nonlinear,
+    on_edge,
     out,
     parts,
     pink,
@@ -92,6 +93,12 @@ CONVERTERS: Mapping[str, Change] = {
     "bits8_4V_float": all_records(record(bits=8, full_scale=4.0, codes=False)),
     "bits10_10V_nonoise_float": all_records(record(bits=10, sigma=0.0, codes=False)),
     "whole_samples_per_period_unfiltered": coherent(antialias=4.0),
+    **{
+        f"bits{bits}_10V_float_no_range": all_records(
+            record(bits=bits, codes=False, told={"adc_range": None})
+        )
+        for bits in (12, 14)
+    },
     "adc_jitter_500ns": all_records(both(sampling_jitter=500e-9)),
     "slow_adc_filter_out": all_records(out(lowpass=30e3)),
     "slow_adc_filter_out_skin_only": trials(out(lowpass=30e3)),
@@ -113,6 +120,14 @@ CLOCKS: Mapping[str, Change] = {
     "missing_pulse_both": trials(both(**pulses(*_MISSING))),
     "double_pulse_out": trials(out(**pulses(*_DOUBLE))),
     "double_pulse_both": trials(both(**pulses(*_DOUBLE))),
+    **{
+        f"{fault}_sample_{name}": trials(change(**{fault: 5000}))
+        for fault in ("lost", "doubled")
+        for name, change in (("out", out), ("th", th))
+    },
+    "lost_sample_in_pulse_out": trials(out(lost=3420)),
+    "lost_sample_out_six_periods": longer(trials(out(lost=12_000))),
+    "edge_at_the_joint_pulses_jitter": trials(on_edge),
     "rate_0.1%_all": all_records(both(pulse_rate=60.06)),
     "rate_100ppm_all": all_records(both(pulse_rate=60.006)),
     "rate_0.1%_skin_only": trials(both(pulse_rate=60.06)),

@@ -25,6 +25,7 @@ FIXED = ("amplitude", "width", "edge", "lead_in", "turns")
 PERIODS = 3
 SAMPLE = 5e-6  # [s]
 COHERENT_RATE = 240e3  # [Hz] 4000 samples in a period of 60 Hz
+PULSE_RATE = 60.0  # [Hz]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -244,6 +245,19 @@ def nonlinear(fall: float) -> Change:
 def pulses(*places: tuple[float, float]) -> dict[str, Any]:
     """Fields of a voltage with these pulses in a record of three periods."""
     return {"pulses": places, "over": PERIODS}
+
+
+def on_edge(of: Record) -> Record:
+    """Begin both records on an edge, and let the last pulse of three come one sample late."""
+    driver, late = of.th.driver, PULSE_RATE * SAMPLE
+    earlier = driver.lead_in + driver.edge / 2
+    moved = (
+        dataclasses.replace(
+            one, delay=one.delay + earlier, **pulses((0, 1.0), (1, 1.0), (2 + late, 1.0))
+        )
+        for one in (of.th, of.out)
+    )
+    return record(**dict(zip(("th", "out"), moved, strict=True)))(of)
 
 
 def second_resistor(factor: float) -> Change:

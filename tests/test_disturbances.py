@@ -93,7 +93,7 @@ def test_a_record_of_the_periods_that_are_kept_is_as_long_as_one_of_so_many(spac
     for bad in ([0], [1], [4], [0, 2], [1, 2]):
         kept = np.isin(np.arange(5), bad, invert=True)
         size = round(5 * spacing)
-        of = joint(kept, spacing, size)
+        of = joint(kept, np.zeros(5, int), spacing, size)
         assert of.lengths.sum() == round(kept.sum() * spacing)
         assert (of.first >= 0).all()
         assert (of.first + of.lengths <= size).all()

@@ -8,8 +8,8 @@ import numpy as np
 from etid.circuits.display import several
 from etid.commands import DONE, WRONG_DATA, Outcome
 from etid.recordings import hdf5
-from etid.recordings.causes import sizes
-from etid.recordings.preflight import is_plausible
+from etid.recordings.causes import how_shifted, sizes
+from etid.recordings.preflight import Inspected, is_plausible
 from etid.recordings.study import Study
 from etid.results.verdicts import message
 
@@ -38,9 +38,11 @@ def run(arguments: argparse.Namespace) -> Outcome:
 
 
 def _remarks(study: Study) -> list[dict[str, str]]:
-    """Path and text for each recording whose current or impedance no load at an electrode has."""
+    """Path and text for each recording that lost samples, or whose impedance no electrode has."""
     found = []
     for path in study:
+        if shifted := how_shifted(Inspected(study[path])):
+            found.append({"path": path, "message": shifted})
         if all(of.name != "current" for of in study.source(path).layout):
             continue
         samples = study[path].samples

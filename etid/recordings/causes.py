@@ -3,6 +3,7 @@
 import numpy as np
 from jaxtyping import Float
 
+from etid.circuits.display import several
 from etid.recordings.preflight import Inspected
 from etid.signals.pulse_train import lags_of, shifted, whole_lag
 
@@ -30,6 +31,11 @@ def sizes(voltage: float, current: float) -> str:
 
 def why_misaligned(seen: Inspected) -> str:
     """The probable cause of the verdict `misaligned`, with numbers; empty if it is not known."""
+    if seen.shifts is not None and seen.kept is None:
+        return (
+            f"v_out or {seen.recording.cause} lost or doubled samples within pulses, and too few "
+            "pulses without a fault remain."
+        )
     if seen.has_current:
         return _why_no_power(seen)
     ratio = float(np.std(seen.v_out) / np.std(seen.v_th))
@@ -45,6 +51,23 @@ def why_misaligned(seen: Inspected) -> str:
             "reversed; change its sign, or exchange the two wires of the probe."
         )
     return ""
+
+
+def how_shifted(seen: Inspected) -> str:
+    """Which periods of v_out are shifted, and by how much; empty if none is."""
+    if seen.shifts is None:
+        return ""
+    found, before = [], None
+    for number, (late, bad) in enumerate(zip(*seen.shifts, strict=True), start=1):
+        if bad:
+            found.append(f"the fault is in the pulse of period {number}")
+            continue
+        if before is not None and late != before:
+            count = several(int(abs(late - before)), "sample")
+            word = "later" if late > before else "earlier"
+            found.append(f"from period {number} on, v_out is {count} {word}")
+        before = late
+    return f"v_out or {seen.recording.cause} lost or doubled samples: {'; '.join(found)}."
 
 
 def _why_no_power(seen: Inspected) -> str:

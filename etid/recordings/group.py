@@ -8,7 +8,15 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from etid.recordings.recording import QUIETLY, Recording, Samples
-from etid.signals.disturbances import Joint, disturbed, enough, joint, of_source
+from etid.signals.disturbances import (
+    Joint,
+    Shifts,
+    disturbed,
+    enough,
+    joint,
+    of_source,
+    shifts,
+)
 from etid.signals.harmonics import filled, harmonics, whole_periods
 from etid.signals.mains import Hum, separated
 from etid.signals.noise import RIPPLE, VISIBLE, is_coarse, noise_std, shows_few, step_of
@@ -18,6 +26,7 @@ from etid.signals.quick_looks import flickering, humming, uneven
 _Key = TypeVar("_Key", bound=Hashable)
 SEAM = 3  # samples on each side of the joint between two periods
 USED = 8192  # samples of one product
+JITTER = 0.2  # [samples] cuts between samples are known this well from samples beside them
 STEP = 4.0  # [standard deviations] largest difference that noise makes, there and elsewhere
 
 
@@ -126,10 +135,20 @@ class Group:
         """Covariance of both voltages in `quiet` [V²]."""
         return covariance_of(self.quiet)
 
-    @functools.cached_property
+    @property
     def kept(self) -> list[Joint | None]:
-        """The periods in use if disturbed periods are left out; None if all are in use."""
-        kept: list[Joint | None] = [None] * len(self.recordings)
+        """The periods in use if some are left out or aligned; None if all are used as they are."""
+        return [kept for kept, _ in self._periods]
+
+    @property
+    def shifts(self) -> list[Shifts | None]:
+        """The shifts of the periods of `v_out` against those of `v_th`; None if there are none."""
+        return [found for _, found in self._periods]
+
+    @functools.cached_property
+    def _periods(self) -> list[tuple[Joint | None, Shifts | None]]:
+        """`kept` and `shifts`."""
+        found: list[tuple[Joint | None, Shifts | None]] = [(None, None)] * len(self.recordings)
         of_all = [
             None if train.mismatch else (train.counted, periods)
             for train, (periods, _) in zip(self.trains, self.whole_periods, strict=True)
@@ -145,9 +164,9 @@ class Group:
                 for row in suspect:
                     records, sigma, step = (part[[row]] for part in of)
                     (bad,) = disturbed(records, sigma, step, spacing, periods)
-                    known = self.quiet[rows[row]], bad, spacing, self.sample_rate
-                    kept[rows[row]] = _kept(*known)
-        return kept
+                    known = records[0], sigma[0], bad, spacing, self.sample_rate
+                    found[rows[row]] = _kept(*known)
+        return found
 
     @functools.cached_property
     def lags(self) -> list[float | None]:
@@ -174,9 +193,13 @@ class Group:
             if periods > 0:
                 counted = np.array([self.trains[row].counted for row in rows])
                 rest = np.abs(periods * self.sample_rate / counted - samples)
-                of = _part(self.quiet, rows), self.trusted[rows]
+                records, sigma = _part(self.quiet, rows), self.trusted[rows]
                 with QUIETLY():
-                    found[rows] = is_periodic(*of, rest, samples)
+                    found[rows] = is_periodic(records, sigma, rest, samples)
+                    on_edge = ~is_periodic(records, sigma, np.ones(len(rows)), samples)
+                for row in np.flatnonzero(found[rows] & on_edge):
+                    spacing = self.sample_rate / counted[row]
+                    found[rows[row]] = _repeats(records[row], sigma[row], spacing, samples)
         return found
 
     @functools.cached_property
@@ -255,20 +278,50 @@ def is_periodic(
     return np.asarray(~(step > STEP * sigma).any(-1))
 
 
+def _repeats(
+    records: Float[np.ndarray, "2 time"],
+    sigma: Float[np.ndarray, "2"],
+    spacing: float,
+    samples: int,
+) -> bool:
+    """Whether a record that begins on an edge has the same edge at the end of all its periods.
+
+    If the clock of the pulses jitters, the end of the record does not continue at its start.
+
+    Args:
+        records: Voltages [V].
+        sigma: Standard deviation of the noise of a sample of each record [V].
+        spacing: Length of a period [samples].
+        samples: Number of samples of the periods.
+    """
+    ends = np.arange(1, round(samples / spacing)) * spacing
+    cuts = np.rint(ends).astype(int)
+    around = np.concatenate([np.arange(samples - SEAM, samples), np.arange(SEAM)])
+    inside = records[:, cuts[:, None] + np.arange(-SEAM, SEAM)]
+    apart = np.abs(inside - records[:, None, around]).max(-1)
+    step = np.abs(np.diff(inside)).max(-1)  # of a jitter of one sample
+    allowed = (np.abs(cuts - ends) + JITTER) * step + STEP * sigma[:, None]
+    return bool((apart <= allowed).all())
+
+
 def _kept(
     records: Float[np.ndarray, "2 time"],
+    sigma: Float[np.ndarray, "2"],
     bad: Bool[np.ndarray, " period"],
     spacing: float,
     sample_rate: float,
-) -> Joint | None:
-    """The plan to leave disturbed periods out.
+) -> tuple[Joint | None, Shifts | None]:
+    """The plan to leave disturbed periods out and to align shifted ones, and their shifts.
 
     Fewer than half of the periods may be left out: the others must show the shape of an undisturbed
     period.
     """
-    if not bad.any() or not enough(bad):
-        return None
     rise = rise_time(sample_rate)
-    if any(of_source(v, bad, spacing, rise) for v in records):
-        return None
-    return joint(~bad, spacing, records.shape[1])
+    if not enough(bad) or (bad.any() and any(of_source(v, bad, spacing, rise) for v in records)):
+        bad = np.zeros_like(bad)
+    found = shifts(records, sigma, spacing, bad.size, rise)
+    late = np.zeros(bad.size, int) if found is None else found.late
+    bad = bad if found is None else bad | found.bad
+    if not (bad.any() or late.any()) or not enough(bad):
+        return None, found
+    return joint(~bad, late, spacing, records.shape[1]), found

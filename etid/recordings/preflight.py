@@ -10,7 +10,8 @@ from etid.recordings.group import STEP, Group, covariance_of, is_periodic, limit
 from etid.recordings.recording import Recording
 from etid.recordings.remarks import Remark
 from etid.signals.aliases import aliases
-from etid.signals.disturbances import Joint
+from etid.signals.clipping import HELD, is_clipped
+from etid.signals.disturbances import Joint, Shifts
 from etid.signals.filtering import TAPS
 from etid.signals.harmonics import ALIASED, filled, harmonics, joins_aliases
 from etid.signals.mains import Hum
@@ -27,9 +28,6 @@ from etid.signals.pulse_train import (
 SHORTEST = 4 * TAPS + 104  # [samples] edges of the interpolation, and 104 samples for the fit
 # [standard deviations] peak-to-peak value that noise alone hardly exceeds; a signal must exceed it
 FLAT = 8.0
-RAIL = 3  # equal extreme samples in a row; a noisy or sloping signal does not produce them
-JUMP = 8.0  # [converter steps] a clipped signal reaches and leaves its rail in larger jumps
-HELD = 1e-5  # noise over the span of a record, below which equal samples in a row are no fault
 POWER = 1.01  # largest variance of v_out relative to v_th: a passive load takes power
 # [A] peak-to-peak; stimulators of nerves and skin stay below 0.1 A in each direction
 STRONGEST = 0.25
@@ -81,30 +79,42 @@ class Inspected:
     @functools.cached_property
     def v_th(self) -> Float[np.ndarray, " time"]:
         """Unloaded voltage [V] of the periods in use, without hum between the harmonics."""
-        return self._joined(self._group.quiet[self._row, 0])
+        return self._quiet[0]
 
     @functools.cached_property
     def v_out(self) -> Float[np.ndarray, " time"]:
         """Loaded voltage [V] of the periods in use, without hum between the harmonics."""
-        return self._joined(self._group.quiet[self._row, 1])
+        return self._quiet[1]
 
     @functools.cached_property
     def recorded_th(self) -> Float[np.ndarray, " time"]:
         """Unloaded voltage of the periods in use as it was recorded [V]."""
-        return self._joined(self._group.whole[self._row, 0])
+        return self._recorded[0]
 
     @functools.cached_property
     def recorded_out(self) -> Float[np.ndarray, " time"]:
         """Loaded voltage of the periods in use as it was recorded [V]."""
-        return self._joined(self._group.whole[self._row, 1])
+        return self._recorded[1]
 
     @functools.cached_property
     def kept(self) -> Joint | None:
-        """The pulse periods in use if disturbed periods are left out; None if all are in use."""
+        """The pulse periods in use if some are left out or aligned; None if all are used."""
         return self._group.kept[self._row]
 
-    def _joined(self, v: Float[np.ndarray, " time"]) -> Float[np.ndarray, " kept"]:
-        return v if self.kept is None else self.kept(v)
+    @property
+    def shifts(self) -> Shifts | None:
+        """The shifts of the periods of `v_out` against those of `v_th`; None if there are none."""
+        return self._group.shifts[self._row]
+
+    @functools.cached_property
+    def _quiet(self) -> Float[np.ndarray, "2 time"]:
+        quiet = self._group.quiet[self._row]
+        return quiet if self.kept is None else self.kept(quiet)
+
+    @functools.cached_property
+    def _recorded(self) -> Float[np.ndarray, "2 time"]:
+        whole = self._group.whole[self._row]
+        return whole if self.kept is None else self.kept(whole)
 
     @property
     def begins(self) -> Float[np.ndarray, " period"]:
@@ -168,23 +178,17 @@ class Inspected:
             return np.asarray(self._group.noise[self._row, which])
         return np.asarray(noise_std(recorded, self._group.step[self._row, which]))
 
-    @functools.cached_property
-    def _both(self) -> Float[np.ndarray, "2 time"]:
-        if self.kept is None:
-            return self._group.quiet[self._row]
-        return np.stack([self.v_th, self.v_out])
-
     @property
     def recorded_limits(self) -> Float[np.ndarray, "2 limit"]:
         """Smallest and largest sample of each voltage as it was recorded [V]."""
         if self.kept is None:
             return self._group.recorded_limits[self._row]
-        return limits_of(np.stack([self.recorded_th, self.recorded_out]))
+        return limits_of(self._recorded)
 
     @functools.cached_property
     def limits(self) -> Float[np.ndarray, "2 limit"]:
         """Smallest and largest sample of `v_th` and of `v_out` [V]."""
-        return self._group.limits[self._row] if self.kept is None else limits_of(self._both)
+        return self._group.limits[self._row] if self.kept is None else limits_of(self._quiet)
 
     @property
     def spans(self) -> Float[np.ndarray, "2"]:
@@ -194,7 +198,9 @@ class Inspected:
     @functools.cached_property
     def covariance(self) -> Float[np.ndarray, "2 2"]:
         """Covariance of `v_th` and `v_out` [V²]."""
-        return self._group.covariance[self._row] if self.kept is None else covariance_of(self._both)
+        return (
+            self._group.covariance[self._row] if self.kept is None else covariance_of(self._quiet)
+        )
 
     @functools.cached_property
     def trusted_th(self) -> Float[np.ndarray, ""]:
@@ -218,7 +224,9 @@ class Inspected:
         coarse = self.coarse_th > 0 or self.coarse_out > 0
         off = abs(self.train.counted / self.recording.pulse_rate - 1) > CLOCK
         found = Remark.mains_hum if hum else Remark(0)
-        found |= Remark.periods_left_out if self.kept is not None else Remark(0)
+        fewer = self.periods[0] < self.whole_periods[0]
+        found |= Remark.periods_left_out if fewer else Remark(0)
+        found |= Remark.periods_shifted if self.shifts is not None else Remark(0)
         found |= Remark.coarse_converter if coarse else Remark(0)
         found |= Remark.aligned if self.lag or self.current_lag else Remark(0)
         return found | (Remark.pulse_rate_counted if off else Remark(0))
@@ -228,7 +236,7 @@ class Inspected:
         """Lag of `v_out` [samples]; the load may add up to one sample. None if misaligned."""
         if self.kept is None:
             return self._group.lags[self._row]
-        return lags_of(self._both[None], [self.train])[0]
+        return lags_of(self._quiet[None], [self.train])[0]
 
     @functools.cached_property
     def lag(self) -> int:
@@ -291,7 +299,7 @@ class Inspected:
             frequency, *of_rows, selected = self._group.spectra(*self.periods)
             return frequency, *(field[self._row] for field in of_rows), selected
         sigma = np.stack([self.trusted_th, self.trusted_out])
-        fields = filled(harmonics(self._both, *self.periods), sigma, rate, *self.periods)
+        fields = filled(harmonics(self._quiet, *self.periods), sigma, rate, *self.periods)
         return tuple(map(np.asarray, fields))
 
     @property
@@ -311,7 +319,7 @@ class Inspected:
         if self.kept is None:
             return bool(self._group.periodic[self._row])
         sigma = np.stack([self.trusted_th, self.trusted_out])
-        return bool(is_periodic(self._both, sigma, np.asarray(1.0), self.periods[1]))
+        return bool(is_periodic(self._quiet, sigma, np.asarray(1.0), self.periods[1]))
 
 
 def preflight(seen: Inspected, *, periodic: bool = False) -> str | None:
@@ -347,7 +355,7 @@ def preflight(seen: Inspected, *, periodic: bool = False) -> str | None:
         return "unconnected"
     if seen.train.mismatch:
         return "rate_mismatch"
-    if _is_misaligned(seen):
+    if _is_misaligned(seen) or (seen.shifts is not None and seen.kept is None):
         return "misaligned"
     if periodic and not seen.is_periodic:
         return "not_periodic"
@@ -371,24 +379,11 @@ def _is_saturated(
     step: float,
     adc_range: tuple[float, float] | None,
 ) -> bool:
-    """Whether samples are at a limit of the converter, or a flat top begins and ends in jumps."""
+    """Whether samples are at a limit of the converter, or at a rail if its range is unknown."""
     if adc_range is not None:
         low, high = adc_range
         return bool(limits[0] <= low + step / 2 or limits[1] >= high - step / 2)
-    for extreme in limits:
-        at_rail = v == extreme
-        if np.count_nonzero(at_rail) < RAIL:
-            continue
-        edges = np.flatnonzero(np.diff(np.concatenate([[0], at_rail.astype(np.int8), [0]])))
-        for start, stop in edges.reshape(-1, 2):
-            inside = start > 0 and stop < v.size
-            if stop - start < RAIL or not inside:
-                continue
-            floor = step if step > 0 else (limits[1] - limits[0]) / 2**16
-            jump = min(abs(v[start - 1] - extreme), abs(v[stop] - extreme))
-            if jump > JUMP * floor:
-                return True
-    return False
+    return is_clipped(v, step)
 
 
 def _is_unconnected(seen: Inspected) -> bool:

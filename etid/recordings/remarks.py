@@ -28,6 +28,7 @@ class Remark(enum.IntFlag):
     not_noise = enum.auto()
     positive_imaginary = enum.auto()
     no_phase = enum.auto()
+    periods_shifted = enum.auto()
 
 
 _TEXTS = {
@@ -76,6 +77,10 @@ _TEXTS = {
     ),
     Remark.no_phase: (
         "Z is real at all frequencies. If it is the magnitude alone, give |Z| exp(i phase)."
+    ),
+    Remark.periods_shifted: (
+        "From one pulse period to another, v_out is shifted by whole samples: a sample was lost or "
+        "recorded twice. The periods were aligned; check the recorder."
     ),
 }
 

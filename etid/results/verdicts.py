@@ -105,15 +105,19 @@ class RESULTS(optx.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]  # equi
         "higher sample rate, or a pulse rate whose period is not a whole number of samples."
     )
     flat = "A record carries no signal above its noise. Check the contact and the channel."
-    saturated = "The converter clipped. Lower the gain or the stimulus and record again."
     repeated = (
         "The samples are exactly those of one of the two pulses before. Noise never repeats, so "
         "this buffer was not filled anew. Check the acquisition."
     )
+    saturated = (
+        "The converter clipped. Lower the gain or the stimulus and record again. If nothing "
+        "clipped, state the range of the converter (adc_range)."
+    )
     nonfinite_samples = "A record contains NaN or infinite samples. Cut them out or record again."
     too_short = "The record is too short to identify anything. Record a whole pulse and its tail."
     misaligned = (
-        "v_out carries more power than v_th, or is not aligned in time with v_th or the current. "
+        "v_out carries more power than v_th, or is not aligned in time with v_th or the current in "
+        "all periods. "
         "Swap the two records, or align them on the edge of the pulse, or correct the unit or the "
         "polarity of one of them."
     )

@@ -1,4 +1,4 @@
-"""Disturbed pulse periods of a record: periods with a spike or a burst.
+"""Disturbed pulse periods, with a spike or a burst, and shifted ones, after a lost sample.
 
 A movement of the hand can spoil one of several periods, and with it the average of all periods.
 Each period is compared with the median of all periods, after averaging over `MERGED` samples. A
@@ -6,6 +6,11 @@ period is *disturbed* if it differs by more than `PART` of the largest value and
 `SHARE` of the value at the same place. A load that changes by less than a factor of two does not
 exceed these limits. Edges between samples and noise do not exceed them either. If a disturbance
 lasts to the end of its period or from its start, the period beside it is disturbed too.
+
+A converter that loses a sample, or writes one twice, moves all later samples of its record by one.
+The edges of each period are compared with those of the first period. Where the lag of V_out changes
+by whole samples from one period to the next, the periods are *shifted*; they are aligned. A period
+whose first and last edge are shifted differently is disturbed: the sample was lost in its pulse.
 """
 
 import itertools
@@ -14,10 +19,15 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from etid.signals.pulse_train import highest, rises
 from etid.signals.quick_looks import MERGED, NOISE, PART, SHARE, highest_beside, period_means
 
 STEEP = 0.3  # of the steepest rise of a pulse
 BESIDE = 10  # times the samples over which edges rise, in which there is one edge
+FARTHEST = 8  # [samples] largest shift that is searched
+WHOLE = 0.3  # [samples] a shift is this near a whole number of samples
+SURE = 0.1  # [samples] standard error of a shift that is believed
+ALIKE = 0.5  # fraction of the power of an edge in which it may differ from the same edge elsewhere
 
 
 def disturbed(
@@ -91,6 +101,88 @@ def of_source(
     return bool(((ratio < 0.5) | ((ratio > 1.5) & (ratio < 2.5))).any())
 
 
+class Shifts(NamedTuple):
+    """By how much the periods of a recording are shifted.
+
+    Attributes:
+        late: Lag of `v_out` in each period relative to the lag in most periods [whole samples].
+        bad: Periods in which it changes during the pulse.
+    """
+
+    late: Int[np.ndarray, " period"]
+    bad: Bool[np.ndarray, " period"]
+
+
+def shifts(
+    records: Float[np.ndarray, "2 time"],
+    sigma: Float[np.ndarray, "2"],
+    spacing: float,
+    periods: int,
+    rise: int,
+) -> Shifts | None:
+    """The shifts of `v_out` against `v_th` from period to period; None if there are none.
+
+    What shifts both records alike, as the pulses do when their clock jitters, does no harm.
+
+    Args:
+        records: Both voltages [V].
+        sigma: Standard deviation of the noise of a sample of each record [V].
+        spacing: Length of a period [samples].
+        periods: Number of whole periods.
+        rise: Samples over which edges rise.
+    """
+    known = zip(records, sigma, strict=True)
+    lags = [_lags_of_edges(v, float(of), spacing, periods, rise) for v, of in known]
+    if lags[0] is None or lags[1] is None:
+        return None
+    lag = lags[1] - lags[0]
+    # The first period, too, may be the one in which a sample is lost.
+    usual = np.angle(np.exp(2j * np.pi * lag).mean(0)) / (2 * np.pi)
+    whole = np.rint(lag - usual).astype(int)
+    within = whole[:, 1] - whole[:, 0]
+    bad = (within != _most(within)) | (np.abs(lag - usual - whole) > WHOLE).any(1)
+    late = whole[:, 0] - _most(whole[~bad, 0]) if not bad.all() else whole[:, 0]
+    if (within == within[0]).all() and (late[~bad] == 0).all():
+        return None
+    return Shifts(late, bad)
+
+
+def _most(numbers: Int[np.ndarray, " number"]) -> int:
+    """The most frequent number."""
+    values, counts = np.unique(numbers, return_counts=True)
+    return int(values[np.argmax(counts)])
+
+
+def _lags_of_edges(
+    v: Float[np.ndarray, " time"], sigma: float, spacing: float, periods: int, rise: int
+) -> Float[np.ndarray, "period 2"] | None:
+    """Lags of the first and last edge of each period behind those of the first period [samples].
+
+    None if an edge does not look alike in all periods, or if noise hides its place.
+    """
+    at = np.rint(np.arange(periods) * spacing).astype(int)
+    slope, width = rises(v, rise), BESIDE * rise
+    room = min(int(spacing), slope.size - at[-1]) - width - FARTHEST
+    mean = np.abs(sum(slope[first : first + max(room, 0)] for first in at))
+    steep = np.flatnonzero(mean > STEEP * mean.max(initial=0.0))
+    if not steep.size:
+        return None
+    found = np.zeros((periods, 2))
+    for number, edge in enumerate(steep[[0, -1]]):
+        first = max(edge - width, 0)
+        template = slope[first : edge + width]
+        begin = at[1:, None] + first + np.arange(-FARTHEST, FARTHEST + 1)
+        parts = np.lib.stride_tricks.sliding_window_view(slope, template.size)[begin]
+        rest = np.square(parts - template).sum(-1)
+        # Noise has 2 σ² in the differences of a template and 6 σ² in theirs.
+        bend = np.square(np.diff(template)).sum() - 6 * sigma**2 * template.size
+        unsure = 4 * sigma**2 > SURE**2 * bend
+        if unsure or (rest.min(1) > ALIKE * (template @ template)).any():
+            return None
+        found[1:, number] = highest(-rest) - FARTHEST
+    return found
+
+
 class Joint(NamedTuple):
     """A plan to join the periods that are kept to one record.
 
@@ -100,31 +192,45 @@ class Joint(NamedTuple):
     joints.
 
     Attributes:
-        first: First sample of each period in the whole record.
+        first: First sample of each period of `v_th` in the whole record.
+        late: By how much the period of `v_out` begins later [samples].
         lengths: Number of samples of each period.
         begins: Start of each period in the joined record [samples].
     """
 
     first: Int[np.ndarray, " kept"]
+    late: Int[np.ndarray, " kept"]
     lengths: Int[np.ndarray, " kept"]
     begins: Float[np.ndarray, " kept"]
 
-    def __call__(self, v: Float[np.ndarray, " time"]) -> Float[np.ndarray, " kept"]:
-        """The joined record of a voltage."""
-        parts = zip(self.first, self.lengths, strict=True)
-        return np.concatenate([v[first : first + length] for first, length in parts])
+    def __call__(self, records: Float[np.ndarray, "2 time"]) -> Float[np.ndarray, "2 kept"]:
+        """The joined records of both voltages.
+
+        A shifted period may begin before the record or end after it. The sample at that end stands
+        for those that are missing; the voltage is at rest there.
+        """
+        inside = np.concatenate([np.arange(length) for length in self.lengths])
+        v_th = np.repeat(self.first, self.lengths) + inside
+        both = np.stack([v_th, v_th + np.repeat(self.late, self.lengths)])
+        return np.take_along_axis(records, np.clip(both, 0, records.shape[1] - 1), axis=1)
 
 
-def joint(kept: Bool[np.ndarray, " period"], spacing: float, size: int) -> Joint:
+def joint(
+    kept: Bool[np.ndarray, " period"],
+    late: Int[np.ndarray, " period"],
+    spacing: float,
+    size: int,
+) -> Joint:
     """The plan to join the periods that are kept.
 
     Args:
         kept: Whether each period is kept.
+        late: By how much `v_out` is later than usual in each period [samples].
         spacing: Length of a period [samples].
         size: Number of samples of the record.
     """
-    number = np.flatnonzero(kept)
+    number, late = np.flatnonzero(kept), late[kept]
     ends = np.rint(np.arange(number.size + 1) * spacing).astype(int)
     before = (number - np.arange(number.size)) * spacing  # samples that are left out
     skipped = np.minimum(np.rint(before), size - ends[-1]).astype(int)
-    return Joint(ends[:-1] + skipped, np.diff(ends), number * spacing - skipped)
+    return Joint(ends[:-1] + skipped, late, np.diff(ends), number * spacing - skipped)

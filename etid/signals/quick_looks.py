@@ -1,4 +1,4 @@
-"""Quick looks at records: which may have mains hum, 1/f noise or disturbed periods.
+"""Quick looks at records: which may have mains hum, 1/f noise, disturbed or shifted periods.
 
 Most records have none of these. A look is a few products or means of all samples; what it suspects
 is examined by `etid.signals.mains`, `etid.signals.noise` and `etid.signals.disturbances`. Records
@@ -25,6 +25,10 @@ FEWEST = 3  # periods that are needed to recognise a disturbed one
 PART = np.array([0.005, 0.02])
 SHARE = 0.5  # limit relative to the value at the same place
 NOISE = 8.0  # limit relative to the standard deviation of a mean
+# [samples] In these means, cuts between samples seem to move periods by up to 0.09. A sample that
+# is lost between pulses moves them by 0.67 or more, one in the last pulse by 0.27.
+MOVED = 0.18
+MOVED_NOISE = 3.0  # the same relative to its standard deviation
 
 
 def humming(
@@ -80,28 +84,60 @@ def uneven(
     spacing: float,
     periods: int,
 ) -> Bool[np.ndarray, " recording"]:
-    """Whether recordings may have disturbed periods; arguments as in `disturbed`.
+    """Whether recordings may have disturbed or shifted periods; arguments as in `disturbed`.
 
     The median of the periods, to which `disturbed` compares them, lies between the lowest and the
-    highest of them. With fewer than three periods, the answer is no.
+    highest of them. With fewer than three periods, none is disturbed.
     """
-    if periods < FEWEST or spacing < 3 * MERGED:
+    if periods < 2 or spacing < 3 * MERGED:
         return np.zeros(len(records), bool)
     means = period_means(records, spacing, periods)
+    shifted = _moved(records, means, sigma, spacing)
+    if periods < FEWEST:
+        return shifted
     low, high = means.min(2), means.max(2)
     floor = np.maximum(PART * high.max(2), NOISE / MERGED**0.5 * sigma) + step
     least, most = highest_beside(low), -highest_beside(-high)
     allowed = SHARE * np.maximum(least, -most) + np.maximum(least - most, 0) + floor[..., None]
-    return ((high - low)[..., 1:-1] > allowed).any((1, 2))
+    return ((high - low)[..., 1:-1] > allowed).any((1, 2)) | shifted
+
+
+def _moved(
+    records: Float[np.ndarray, "recording 2 time"],
+    means: Float[np.ndarray, "recording 2 period part"],
+    sigma: Float[np.ndarray, "recording 2"],
+    spacing: float,
+) -> Bool[np.ndarray, " recording"]:
+    """Whether periods of `v_out` may be shifted against those of `v_th`.
+
+    Args:
+        records: Both voltages of each recording [V].
+        means: Their `period_means`.
+        sigma: Standard deviation of the noise of a sample of each record [V].
+        spacing: Length of a period [samples].
+    """
+    # Least-squares lag of each period. A shift by one sample changes a mean by a difference.
+    at, length = _cuts(records.shape[2], spacing, means.shape[2])
+    ends = sum(records[:, :, first : first + length : MERGED] for first in at) / len(at)
+    change = np.diff(ends) / MERGED
+    power = np.vecdot(change, change)
+    power = np.where(power > 0, power, np.inf)
+    lag = np.einsum("rvps,rvs->rvp", means[..., :-1], change) / power[..., None]
+    apart = np.ptp(lag[:, 1] - lag[:, 0], axis=1)
+    return apart > MOVED + MOVED_NOISE * np.sqrt((sigma**2 / power).sum(1) / MERGED)
+
+
+def _cuts(size: int, spacing: float, periods: int) -> tuple[Int[np.ndarray, " period"], int]:
+    """First sample of each period, and the number of samples that are averaged."""
+    length = int(spacing) // MERGED * MERGED
+    return np.minimum(np.rint(np.arange(periods) * spacing), size - length).astype(int), length
 
 
 def period_means(
     records: Float[np.ndarray, "recording 2 time"], spacing: float, periods: int
 ) -> Float[np.ndarray, "recording 2 period part"]:
     """Means of `MERGED` samples, less the median of their period, because the mean may drift."""
-    length = int(spacing) // MERGED * MERGED
-    last = records.shape[2] - length
-    at = np.minimum(np.rint(np.arange(periods) * spacing), last).astype(int)
+    at, length = _cuts(records.shape[2], spacing, periods)
     shape = (*records.shape[:2], -1, MERGED)
     cut = [records[:, :, first : first + length].reshape(shape) for first in at]
     means = np.stack([np.einsum("rvps->rvp", one) for one in cut], axis=2) / MERGED
