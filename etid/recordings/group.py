@@ -197,7 +197,9 @@ class Group:
                 with QUIETLY():
                     found[rows] = is_periodic(records, sigma, rest, samples)
                     on_edge = ~is_periodic(records, sigma, np.ones(len(rows)), samples)
-                for row in np.flatnonzero(found[rows] & on_edge):
+                # Jitter of the last pulse looks like another pulse rate.
+                on_edge &= found[rows] & (counted != self.pulse_rate)
+                for row in np.flatnonzero(on_edge):
                     spacing = self.sample_rate / counted[row]
                     found[rows[row]] = _repeats(records[row], sigma[row], spacing, samples)
         return found

@@ -140,7 +140,10 @@ def shifts(
     usual = np.angle(np.exp(2j * np.pi * lag).mean(0)) / (2 * np.pi)
     whole = np.rint(lag - usual).astype(int)
     within = whole[:, 1] - whole[:, 0]
-    bad = (within != _most(within)) | (np.abs(lag - usual - whole) > WHOLE).any(1)
+    between = (np.abs(lag - usual - whole) > WHOLE).any(1)
+    if np.count_nonzero(between) > 1:  # no lost sample, but pulses at any time
+        return None
+    bad = (within != _most(within)) | between
     late = whole[:, 0] - _most(whole[~bad, 0]) if not bad.all() else whole[:, 0]
     if (within == within[0]).all() and (late[~bad] == 0).all():
         return None
