@@ -451,7 +451,7 @@ def test_the_program_starts_in_float64_and_knows_its_version(tmp_path):
     environment = {**os.environ, "XDG_CACHE_HOME": str(tmp_path / "cache")}
     environment.pop("JAX_COMPILATION_CACHE_DIR", None)
     ended = subprocess.run(arguments, capture_output=True, text=True, check=False, env=environment)
-    assert any((tmp_path / "cache" / "etid").iterdir())  # for the next process
+    assert (tmp_path / "cache" / "etid").is_dir()  # for what a large batch compiles
     assert ended.returncode == WRONG_DATA
     assert "float64" not in ended.stdout + ended.stderr
     assert ended.stderr == ""  # no progress bar where there is no terminal

@@ -63,8 +63,16 @@ def parameter(unit: str, *, typical: float) -> Any:
     if unit not in DISPLAY:
         raise ValueError(f"unit {unit!r} is not known; use one of {sorted(DISPLAY)}")
     return eqx.field(
-        default=typical, converter=jnp.asarray, metadata={"unit": unit, "typical": typical}
+        default=typical, converter=_numbers, metadata={"unit": unit, "typical": typical}
     )
+
+
+def _numbers(value: Any) -> Any:
+    """The value of a parameter as an array; `jnp.asarray` of a number would compile a program."""
+    if isinstance(value, jax.Array):
+        return value
+    numbers = np.asarray(value)
+    return jax.device_put(numbers.astype(float) if numbers.dtype.kind in "biu" else numbers)
 
 
 class AbstractCircuit(Overviewed, eqx.Module):

@@ -19,7 +19,7 @@ from jaxtyping import Array, Complex, Float
 
 from etid.circuits.circuit import AbstractCircuit
 from etid.identify.arguments import circuit_of, require_float64
-from etid.identify.compiled import stored_jit
+from etid.numpy_tier.tiers import program
 from etid.results.data import MeasuredImpedance, with_data
 from etid.results.fit import CHANGES, Fit, IdentificationError, Support, complex_rrse
 from etid.results.verdicts import RESULTS, first_verdict, message, verdict
@@ -33,7 +33,7 @@ CORNERS = 5  # corner frequencies of the starts, from the lowest to the highest 
 SOLVER = LevenbergMarquardt()
 
 
-@stored_jit
+@program
 def _fit(
     frequency: Float[Array, " frequency"],
     z: Complex[Array, " frequency"],

@@ -54,7 +54,6 @@ from etid.identify.arguments import (
     require_float64,
 )
 from etid.identify.batches import LANES, each, filled
-from etid.identify.compiled import stored_jit
 from etid.identify.many import common_first, identify_part, table, to_identify
 from etid.identify.one import (
     checksum,
@@ -67,6 +66,7 @@ from etid.identify.one import (
 from etid.identify.planning import Refusal, calls, planned
 from etid.identify.study_drivers import Drivers
 from etid.identify.unfitted import failed_fit
+from etid.numpy_tier.tiers import program
 from etid.recordings.preflight import Inspected
 from etid.recordings.recording import Recording
 from etid.recordings.remarks import Remark
@@ -115,7 +115,7 @@ class _Start(NamedTuple):
     changed: Bool[Array | np.ndarray, "*lane"]
 
 
-@functools.partial(stored_jit, batch=True)
+@functools.partial(program, batch=True)
 def _alone(lanes: Any, count: Int[Array, ""], model: Joint, driver: HarmonicDriver) -> _Start:
     frequency = jnp.asarray(lanes.frequency)[0]
     known = shape_of(driver, frequency)
@@ -141,7 +141,7 @@ def _alone(lanes: Any, count: Int[Array, ""], model: Joint, driver: HarmonicDriv
     return each(one, lanes, count)
 
 
-@functools.partial(stored_jit, batch=True)
+@functools.partial(program, batch=True)
 def _together(
     model: Joint,
     groups: list[Loads],
@@ -430,7 +430,7 @@ def identify_jointly(
     if by_current:
         own = [paths[row] for row in by_current]
         of_each = Asked(MAXIMUM_LIKELIHOOD, asked.known, asked.bounds)
-        alone = identify_part(study, own, drivers, [circuit], of_each)
+        alone = identify_part(study, own, drivers, [circuit], of_each, len(own))
         as_joint = unstacked(dataclasses.replace(alone.fit, method=METHOD))
         for row, fit, text in zip(by_current, as_joint, alone.notes, strict=True):
             fits[row], notes[row] = fit, str(text)

@@ -16,8 +16,8 @@ from etid.estimators.element_prior import FIXED, require_element
 from etid.estimators.lanes import Harmonics
 from etid.estimators.maximum_likelihood.load import Load
 from etid.estimators.maximum_likelihood.with_current import LoadWithCurrent
-from etid.identify.compiled import stored_jit
 from etid.identify.posterior import Known, Minimum, cost, given
+from etid.numpy_tier.tiers import program
 from etid.recordings.recording import Recording
 from etid.results.driver import Driver
 from etid.results.fit import Fit
@@ -74,7 +74,7 @@ def _least(
     return start + free @ found.value
 
 
-@stored_jit
+@program
 def _profile(
     lane: Harmonics,
     known: Known,

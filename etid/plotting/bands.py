@@ -25,7 +25,7 @@ from jaxtyping import Array, Complex, Float
 from etid.circuits.circuit import AbstractCircuit
 from etid.estimators.estimate import DELAY_WIDTH
 from etid.estimators.lanes import Harmonics
-from etid.identify.compiled import stored_jit
+from etid.numpy_tier.tiers import program
 from etid.results.driver import ContinuousDriver, SourceImpedance
 from etid.results.feed import MeasuredCurrent
 
@@ -100,7 +100,7 @@ def bands(
     )
 
 
-@stored_jit
+@program
 def _source(
     source: SourceImpedance, frequency: Float[Array, " harmonic"]
 ) -> tuple[Complex[Array, " harmonic"], Complex[Array, "parameter harmonic"]]:

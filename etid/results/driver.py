@@ -23,6 +23,7 @@ from jaxtyping import Array, Complex, Float, Int
 from etid.circuits.display import plus_minus, several
 from etid.circuits.impedance import realise
 from etid.circuits.overview import Overview
+from etid.numpy_tier.tiers import program
 from etid.recordings.remarks import texts
 from etid.results.feed import AbstractFeed, CurrentSource
 from etid.results.tried_orders import TriedOrders
@@ -253,7 +254,10 @@ class Driver(AbstractFeed):
         return jnp.abs(self.response(frequency)) * self.log_response_stderr(frequency)[0]
 
     def _overview(self) -> Overview:
-        verdict, (at, errors) = self.verdict, _at(self, jnp.array([SHOWN]))
+        verdict, (at, errors) = (
+            self.verdict,
+            jax.device_get(_at(self, jax.device_put(np.array([SHOWN])))),
+        )
         z, (of_size, of_phase) = complex(at[0]), map(float, errors[:, 0])
         rows = [
             (
@@ -276,7 +280,7 @@ class Driver(AbstractFeed):
         return []
 
 
-@eqx.filter_jit  # one by one, its many operations compile ten times as long
+@program
 def _at(
     driver: Driver, frequency: Float[Array, " frequency"]
 ) -> tuple[Complex[Array, " frequency"], Float[Array, "2 frequency"]]:

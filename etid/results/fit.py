@@ -267,7 +267,11 @@ class Fit(Judged, WithData[Circuit]):
 
     def _overview(self) -> Overview:
         kind, verdict = type(self.circuit).__name__, self.verdict
-        values, errors = np.asarray(self.circuit.values()), np.asarray(self.stderr.values())
+        names = self.circuit.names()
+        values, errors = (
+            np.stack([np.asarray(getattr(of, name)) for name in names], axis=-1)
+            for of in (self.circuit, self.stderr)
+        )
         rows = element_rows(self.circuit.units(), values, errors)
         if np.ndim(self.rrse):
             batch = f"{kind} fits, batch of {np.shape(self.rrse)}: {counted(verdict)}"
