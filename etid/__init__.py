@@ -39,16 +39,16 @@ _LATER = {
 
 
 # The import of JAX and of all layers takes a second: a command must first be able to handle Ctrl-C.
+# Each name is looked up once, and is then a name of this module.
 def __getattr__(name: str) -> Any:
-    if name in _LATER:
-        return getattr(importlib.import_module(_LATER[name]), name)
     if name == "__all__":
         return [*_public().__all__, *_LATER, "__version__"]
-    if not name.startswith("__"):
-        if name in _public().__all__:
-            return getattr(_public(), name)
-        if name in globals():  # a package of etid, which `public` has imported
-            return globals()[name]
+    if name in _LATER:
+        globals()[name] = getattr(importlib.import_module(_LATER[name]), name)
+    elif not name.startswith("__") and name in _public().__all__:
+        globals()[name] = getattr(_public(), name)
+    if name in globals():  # also a package of etid, which `public` has imported
+        return globals()[name]
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
 

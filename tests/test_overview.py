@@ -88,6 +88,8 @@ def state():
         missed=numbers,
         amplitude=two,
         offset=two,
+        shown=jnp.stack([two, two], axis=-1),
+        confirmed=two,
         level=two,
         variance=two,
         chi2=two,
