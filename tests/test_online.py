@@ -749,7 +749,9 @@ def test_bad_electrodes_are_listed_with_the_reason():
 def test_the_last_code_of_the_converter_is_clipped_and_the_one_before_is_not():
     """The range in the record is the truth: samples at its ends may have been any voltage."""
     tracker, study = tracker_of(2), calibrated()[1]
-    low, high = study["cal/0"].adc_range
+    limits = study["cal/0"].adc_range
+    assert limits is not None
+    low, high = limits
     step = 2 * high / 2**16
     pulse = with_noise(tracker.pulses(loaded(quiet()))[3], seed=1)
     for end, inner in ((low, step), (high, -step)):
