@@ -20,7 +20,6 @@ if TYPE_CHECKING:
     from etid.files.exporting import export_study as export_study
     from etid.files.importing import import_file as import_file
     from etid.files.measured_impedance import read_impedance as read_impedance
-    from etid.plotting.interactive import interactive as interactive
     from etid.public import *  # noqa: F403 - it states its names in `__all__`
     from etid.report.study import write_report as write_report
 
@@ -32,7 +31,6 @@ _LATER = {
     "export_fits": "etid.files.exporting",
     "export_study": "etid.files.exporting",
     "import_file": "etid.files.importing",
-    "interactive": "etid.plotting.interactive",
     "read_impedance": "etid.files.measured_impedance",
     "write_report": "etid.report.study",
 }

@@ -76,3 +76,11 @@ def test_the_cap_holds_at_a_hundred_thousand_pulses(snr):
     controller = found.controller(20 * len(CELLS))
     for cell, one in found.given(controller, CELLS, pulses).items():
         assert good(row(snr, cell, one)), row(snr, cell, one)
+
+
+@pytest.mark.slow
+def test_an_amplitude_told_a_tenth_too_small_does_not_pass_for_drier_skin():
+    """Without a test of the gain, pulses 731 to 753 of one electrode carry up to 128 nC."""
+    found, cell = Hazards(40.0, seed=1), "wrong amplitude"
+    one = found.given(found.controller(96), [cell], 760)[cell]
+    assert good(row(40.0, cell, one)), row(40.0, cell, one)

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from etid.estimators.judgement import MAX_STEPS_REACHED, SUCCESSFUL
+from etid.estimators.score_tests.other_circuit import MOVED
 from etid.estimators.unknowns import LoadUnknowns
 from etid.online import changes, tick
 from etid.online import electrode as online
@@ -27,6 +28,7 @@ from etid.online.electrode import (
     suspicion,
 )
 from etid.online.gain_bands import Bands, Gains
+from etid.online.gain_test import SEEN_GAIN, GainScore
 from etid.online.projection import Seen
 from etid.online.pulse_fit import Expected, GainModel
 from etid.online.state import ElectrodeState, TrackerState
@@ -51,6 +53,7 @@ class Case(NamedTuple):
     missed: int
     off: bool
     near: bool
+    gain: bool
 
 
 CASES = [
@@ -65,12 +68,14 @@ CASES = [
         (0, PATIENCE - 1),
         (True, False),
         (True, False),
+        (True, False),
     )
     if one[0] or not (one[1] or one[2])  # an electrode that does not run is not suspected
 ]
 # NumPy's arrays stand in the place of JAX's.
 MEASURED: Any = Measured
 ATTEMPT: Any = Attempt
+GAIN_SCORE: Any = GainScore
 SUSPICION: Any = Suspicion
 RESULT = {"good": GOOD, "bad": BAD, "late": LATE}
 
@@ -85,6 +90,7 @@ def electrode(of: Case) -> tuple[Any, ...]:
         amplitude=0.5,
         offset=0.25,
         shown=np.array([5.0, 6.0]),
+        gain=np.array([30.0, 100.0, 1.0]),
         confirmed=0.7,
         level=0.3,
         variance=0.4,
@@ -109,9 +115,10 @@ def electrode(of: Case) -> tuple[Any, ...]:
         shown=4.0,
         bad=RESULTS.unconnected if of.off else SUCCESSFUL,
     )
-    found = ATTEMPT(FOUND, TOLD, np.linalg.inv(TOLD), 1.9, 1.01, GOOD if of.found else BAD)
+    score = GAIN_SCORE(np.array([-150.0 if of.gain else 1.0, 90.0, 2.0]), np.array([0.5, -8.0]))
+    found = ATTEMPT(FOUND, TOLD, np.linalg.inv(TOLD), 1.9, 1.01, GOOD if of.found else BAD, score)
     own = np.array([*(OLD[:2] + 1e-3), 0.3]) if of.near else FRESH
-    fresh = ATTEMPT(own, ALONE, np.linalg.inv(ALONE), 2.9, 2.01, RESULT[of.fresh])
+    fresh = ATTEMPT(own, ALONE, np.linalg.inv(ALONE), 2.9, 2.01, RESULT[of.fresh], score)
     z = np.array([0.1, 0.2])
     suspected = SUSPICION(of.jump, of.drift, np.array([0.7, 0.8]), 0.02 * BEFORE, 0, z)
     return state, measured, BEFORE, found, fresh, suspected, LIMIT, NUMBER
@@ -142,8 +149,12 @@ def expected(of: Case) -> dict[str, Any]:
     elif good or lost:
         mean, mean_cov = 0 * mean, 0 * mean_cov
     begun = not of.running and of.fresh == "late"
+    gain = state["gain"]
+    if good:
+        gain = used.gain.sums + (0 if again else gain)
+    wrong_gain = good and of.gain  # by far, and by chance never
     confirmed = state["confirmed"] if of.silent else 0.0
-    if of.running and good and not of.jump:
+    if of.running and good and not of.jump and not wrong_gain:
         confirmed = max(state["confirmed"], measured.amplitude)
     which = int(np.argmax((inverse @ factor) ** 2 / np.diagonal(inverse)))
     shown = {
@@ -164,13 +175,14 @@ def expected(of: Case) -> dict[str, Any]:
         "offset": measured.offset,
         "shown": [4.0, 5.0],
         "confirmed": confirmed,
+        "gain": gain,
         "mean": mean,
         "mean_cov": mean_cov,
         "event": JUMP if jumped else DRIFT if drifted else NONE,
         "factor": factor if jumped or drifted else state["factor"],
         "element": which if jumped else 0 if drifted else state["element"],
         "drifted": number if drifted else state["drifted"],
-        "result": state["result"] if of.silent else used.result,
+        "result": state["result"] if of.silent else BAD if wrong_gain else used.result,
     }
 
 
@@ -201,7 +213,7 @@ def test_what_is_known_after_a_walk_is_the_sum_of_covariances():
 @pytest.mark.parametrize("limit", [0.5, 2.0])
 def test_a_pulse_is_suspected_by_the_distance_from_its_prediction(limit):
     """T = δᵀ (Λ⁻¹ + cov)⁻¹ δ of the fit of the pulse alone, δ = δ₊ + cov Λ δ₊."""
-    of = Case(True, True, True, True, "good", False, 0, False, False)
+    of = Case(True, True, True, True, "good", False, 0, False, False, False)
     state, _, before, found, *_ = electrode(of)
     off = (found.own - state["own"])[:2]
     alone = off + found.spread @ before @ off
@@ -255,8 +267,10 @@ def test_the_worst_that_a_pulse_shows_is_its_verdict(
     at = Minimum(jnp.asarray(squares), jnp.asarray(CURVED))
     monkeypatch.setattr(
         "etid.online.electrode.minimum",
-        lambda *_: (jnp.asarray(logs), at, jnp.asarray(decrement)),
+        lambda *_: (jnp.asarray(logs), at, jnp.asarray(decrement), jnp.zeros(6)),
     )
+    nothing = GainScore(jnp.zeros(3), jnp.zeros(2))
+    monkeypatch.setattr(GainScore, "of", lambda *_: nothing)
     monkeypatch.setattr("etid.online.electrode.Pulse", lambda *_: None)
     weight, gain = np.array([3.0, 2.0, 0.0]), np.array([1 + 1j, 2j, 5.0])
     measured = Measured(
@@ -286,6 +300,23 @@ def test_the_worst_that_a_pulse_shows_is_its_verdict(
     told = np.linalg.inv(np.linalg.inv(CURVED)[:2, :2])  # the delay is free
     np.testing.assert_allclose(found.information, told)
     np.testing.assert_allclose(found.spread, np.linalg.inv(told))
+
+
+@pytest.mark.parametrize(
+    ("score", "moved", "wrong"),
+    [
+        (SEEN_GAIN * 5.01, [0.0, 9.0], True),
+        (-SEEN_GAIN * 5.01, [-9.0, 0.0], True),
+        (SEEN_GAIN * 4.99, [0.0, 9.0], False),
+        (SEEN_GAIN * 5.01, [0.0, 1.01 * MOVED / SEEN_GAIN / 5.01 * 16], True),
+        (SEEN_GAIN * 5.01, [0.0, 0.99 * MOVED / SEEN_GAIN / 5.01 * 16], False),
+        (np.nan, [0.0, 9.0], False),
+    ],
+)
+def test_a_gain_is_wrong_if_it_is_seen_beside_all_noise_and_moves_an_element(score, moved, wrong):
+    """The variance is 16 by the pulses and 3² by the calibrations."""
+    found = GainScore(jnp.array([score, 16.0, 3.0]), jnp.array(moved))
+    assert bool(found.wrong()) == wrong
 
 
 # --- changes --------------------------------------------------------------------------------------
@@ -356,7 +387,7 @@ def test_a_few_electrodes_in_trouble_are_not_the_driver_while_the_others_change_
 def state_of(**fields: Any) -> TrackerState:
     """A state after pulse 100 of as many electrodes as a field has."""
     count = max(len(value) for value in fields.values())
-    one = electrode(Case(True, False, False, True, "good", False, 0, False, False))[0]
+    one = electrode(Case(True, False, False, True, "good", False, 0, False, False, False))[0]
     lanes: dict[str, Any] = {
         name: jnp.asarray(np.stack([value] * count))
         for name, value in one.items()
@@ -498,7 +529,7 @@ def test_a_pulse_alone_tells_elements_or_says_that_it_does_not(
         monkeypatch.setattr(GainModel, name, lambda *_: jnp.zeros(3, complex))
     fit = ATTEMPT(
         jnp.zeros(3), two, jnp.diag(jnp.array(spread)), zero, zero,
-        first_verdict((jnp.asarray(True), result)),
+        first_verdict((jnp.asarray(True), result)), GainScore(jnp.zeros(3), two),
     )  # fmt: skip
     monkeypatch.setattr(online, "attempt", lambda *_: fit)
     measured = MEASURED(jnp.zeros(3, complex), zero, jnp.ones(3), *[zero] * 6)

@@ -669,6 +669,18 @@ def test_a_change_of_a_few_electrodes_is_theirs_and_one_of_all_the_driver_s():
     assert set(tracker.read(tracker.update(found, pulse)).verdicts) == {"inconsistent"}
 
 
+def test_an_electrode_whose_search_diverged_is_identified_by_the_next_pulse():
+    """e^800 is no number: behind a short circuit a search goes there."""
+    tracker, _, clean = ten()
+    start = tracker.start()
+    far = np.array(start.electrodes.own)
+    far[:3, :3], far[3, :3] = 800.0, np.nan
+    own = jax.device_put(jnp.asarray(far), start.electrodes.own.sharding)
+    start = dataclasses.replace(start, electrodes=dataclasses.replace(start.electrodes, own=own))
+    found = tracker.read(tracker.update(start, with_noise(clean[8], seed=2)))
+    assert set(found.verdicts) == {"successful"}
+
+
 def test_an_amplitude_that_is_told_is_no_change():
     tracker, state, clean = ten()
     amplitude = np.linspace(0.5, 2.0, TEN)
@@ -811,5 +823,7 @@ def test_numbers_of_a_tracker_are_those_of_before():
     found = tracker.update(state, some)
     kept_numbers.check("tracked_after_a_jump", numbers_of(tracker, found))
     amplitude = np.linspace(0.5, 2.0, TEN)
+    # The windows are those of a steady state, so that the pulse before had the same amplitude.
+    state = after_amplitude(state, amplitude)
     found = tracker.update(state, pulse * amplitude[:, None], amplitude)
     kept_numbers.check("tracked_amplitudes", numbers_of(tracker, found))

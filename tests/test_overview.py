@@ -89,6 +89,7 @@ def state():
         amplitude=two,
         offset=two,
         shown=jnp.stack([two, two], axis=-1),
+        gain=own[:, 1:],
         confirmed=two,
         level=two,
         variance=two,

@@ -47,14 +47,29 @@ def test_a_fine_converter_is_not_coarse(snr_db, bits):
         assert Inspected(as_float(recording)).remarks == Remark(0)
 
 
-def test_noise_below_a_step_is_seen_in_the_codes():
+def test_noise_of_any_size_is_seen_through_the_steps():
     rng = np.random.default_rng(1)
     ramp, step = np.linspace(0.0, 7.0, 20_000), 1.0
     for sigma in (0.0, 0.1, 0.3):
         v = np.round(ramp + sigma * rng.standard_normal(ramp.size))
         # 2 200 and 6 700 changes of the code, known to 2 %; at 0.3 steps the zones in which it
         # changes begin to overlap, and two changes in one direction are not counted.
-        assert noise.noise_of_codes(v, step) == pytest.approx(sigma, rel=0.08, abs=0.001)
+        assert noise.noise_before(v, step) == pytest.approx(sigma, rel=0.08, abs=0.001)
+    for sigma in (0.7, 1.0, 2.0, 5.0):
+        v = np.round(ramp + sigma * rng.standard_normal(ramp.size))
+        # The median of sixth differences of codes is a whole number, which makes steps of 0.05.
+        assert noise.noise_before(v, step) == pytest.approx(sigma, rel=0.02, abs=0.05)
+        assert not noise.is_coarse(v, step)
+
+
+@pytest.mark.parametrize("codes", [True, False])
+def test_a_converter_whose_noise_is_a_step_is_weighed_by_its_noise(codes):
+    """12 bits of ±10 V at 40 dB: the noise is as large as a step, and was overlooked."""
+    for study in (study_of(bits=12, snr_db=40.0), study_of(bits=8, snr_db=20.0)):
+        for recording in study.values():
+            seen = Inspected(recording if codes else as_float(recording))
+            assert seen.coarse_th == seen.coarse_out == 0.0
+            assert seen.remarks == Remark(0)
 
 
 @pytest.mark.parametrize("samples", [10_000, 9999])  # nor does it fold what repeats exactly

@@ -9,6 +9,7 @@ from jaxtyping import Array, Bool, Complex, Float, Int
 from etid.estimators.judgement import MAX_STEPS_REACHED, SUCCESSFUL, misses
 from etid.estimators.unknowns import LoadUnknowns
 from etid.online.changes import DRIFT, JUMP, NONE, Innovation, averaged
+from etid.online.gain_test import GainScore
 from etid.online.pulse_fit import (
     DELAYS,
     SETTLED,
@@ -64,6 +65,7 @@ class Attempt(NamedTuple):
         chi2: χ² of the pulse.
         rrse: RRSE of the pulse.
         result: Verdict.
+        gain: Score of the gain.
     """
 
     own: Float[Array, "*lane own"]
@@ -72,6 +74,7 @@ class Attempt(NamedTuple):
     chi2: Float[Array, "*lane"]
     rrse: Float[Array, "*lane"]
     result: RESULTS
+    gain: GainScore
 
 
 def predicted(
@@ -103,7 +106,7 @@ def attempt(
     """
     gain = measured.gain - model.departure(expected, start.delay_samples)
     pulse = Pulse(model, gain, measured.weight, centre, information)
-    own, at, decrement = minimum(pulse, start, expected)
+    own, at, decrement, residual = minimum(pulse, start, expected)
     weight = model.bands.weight
     freedom = 2 * jnp.sum(weight > 0, dtype=at.squares.dtype) - own.size
     chi2 = at.squares / freedom
@@ -113,7 +116,8 @@ def attempt(
     rrse = jnp.sqrt(at.squares * measured.variance / jnp.sum(weight * power(gain)))
     by_delay = at.curvature[:-1, -1]
     told = at.curvature[:-1, :-1] - jnp.outer(by_delay, by_delay) / at.curvature[-1, -1]
-    spread = inverse_of_few(told)
+    inverse = inverse_of_few(at.curvature)
+    score = GainScore.of(pulse, measured.variance, expected, residual, inverse)
     late = jnp.abs(LoadUnknowns.of(own).delay_samples) > DELAYS[-1]
     result = first_verdict(
         (measured.bad != SUCCESSFUL, measured.bad),
@@ -121,7 +125,7 @@ def attempt(
         (~(decrement < SETTLED**2), MAX_STEPS_REACHED),
         (misses(chi2, rrse) & ~noisy | late, RESULTS.misfit),
     )
-    return Attempt(own, told, spread, chi2, rrse, result)
+    return Attempt(own, told, inverse[:-1, :-1], chi2, rrse, result, score)
 
 
 def tracked(
@@ -164,7 +168,8 @@ def anew(
     logs = jnp.concatenate([starts, logs[None, :]])
     gains = jax.vmap(model.undelayed)(logs)
     delays, distances = jax.vmap(lambda one: nearest_delay(model, measured.gain, one))(gains)
-    number = jnp.argmin(distances)
+    # `argmin` would take a start without a number: a search that diverged would never end.
+    number = jnp.argmin(jnp.where(jnp.isfinite(distances), distances, jnp.inf))
     start, delay = logs[number], delays[number]
     nothing = jnp.zeros((starts.shape[1], starts.shape[1]))
     gain = measured.gain - model.departure(model.expected(start), delay)
@@ -268,7 +273,10 @@ def after_pulse(
     lost = running & ((missed >= PATIENCE) | (measured.bad == RESULTS.unconnected))
     restarted = good & again
     one = jnp.where(restarted, 1, state.pulses + 1)
-    fits = running & good & ~suspected.jump
+    gain = used.gain.sums + jnp.where(restarted, 0.0, state.gain)
+    gain = jnp.where(good, gain, state.gain)
+    wrong_gain = good & used.gain._replace(sums=gain).wrong()
+    fits = running & good & ~suspected.jump & ~wrong_gain
     reached = jnp.maximum(state.confirmed, measured.amplitude)
     begun = ~running & (used.result == MAX_STEPS_REACHED)
     gained = jnp.where(restarted, used.information, information + used.information)
@@ -282,11 +290,14 @@ def after_pulse(
         offset=measured.offset,
         shown=jnp.stack([measured.shown, state.shown[0]]),
         confirmed=jnp.where(fits, reached, jnp.where(silent, state.confirmed, 0.0)),
+        gain=gain,
         level=jnp.where(silent, state.level, measured.level),
         variance=jnp.where(silent, state.variance, measured.variance),
         chi2=jnp.where(silent, state.chi2, used.chi2),
         rrse=jnp.where(silent, state.rrse, used.rrse),
-        result=RESULTS.where(silent, state.result, used.result),
+        result=RESULTS.where(
+            silent, state.result, RESULTS.where(wrong_gain, RESULTS.misfit, used.result)
+        ),
         mean=jnp.where(followed, suspected.mean, jnp.where(good | lost, 0.0, state.mean)),
         mean_cov=jnp.where(
             followed, suspected.mean_cov, jnp.where(good | lost, 0.0, state.mean_cov)

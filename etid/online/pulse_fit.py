@@ -18,11 +18,12 @@ from jaxtyping import Array, Bool, Complex, Float, Int
 
 from etid.circuits.circuit import AbstractCircuit
 from etid.estimators.estimate import DELAY_WIDTH
+from etid.estimators.maximum_likelihood.given_driver import GivenDriver, combined
 from etid.estimators.unknowns import LoadUnknowns
 from etid.online.gain_bands import Bands
 from etid.signals.harmonics import real_parts
 from etid.signals.transfer import as_complex, power, reciprocal
-from etid.solvers.matrices import inverse_of_few
+from etid.solvers.matrices import inverse_of_few, root
 
 STEP = 0.1  # [samples] spacing of the grid of delays
 DELAYS = STEP * np.arange(-15, 16)  # [samples] up to 1 by the trigger and 0.5 by the window
@@ -62,6 +63,8 @@ class GainModel(eqx.Module):
         turn: Phase of a delay of one sample [rad].
         turns: e^(jωτ) for each delay of `DELAYS`.
         noise_freedom: Degrees of freedom of the variance of the noise.
+        source_error: Errors of log Z_th by the calibrations: independent ones, each for a standard
+            deviation of 1.
     """
 
     circuit: AbstractCircuit
@@ -71,21 +74,26 @@ class GainModel(eqx.Module):
     turn: Float[Array, " band"]
     turns: Complex[Array, "delay band"]
     noise_freedom: Float[Array, ""]
+    source_error: Complex[Array, "z band"]
 
     @classmethod
     def of(
         cls,
         circuit: AbstractCircuit,
         bands: Bands,
-        source: Complex[Array, " band"],
+        known: GivenDriver,
         source_alias: Complex[Array, " band"],
         noise_freedom: int,
     ) -> "GainModel":
-        """The model, with the phases of all `DELAYS`."""
+        """The model of loads behind the driver `known`, with the phases of all `DELAYS`."""
+        source = known.z_th(combined(known.mean, known.slope))
         turn = 2 * jnp.pi * bands.frequency / bands.sample_rate
         turns = _unit(jnp.asarray(DELAYS)[:, None] * turn[None, :])
         freedom = jnp.asarray(float(noise_freedom))
-        return cls(circuit, bands, source, source_alias, turn, turns, freedom)
+        loaded = source + as_complex(known.resistance)
+        by_source = known.slope * (loaded * reciprocal(source))[None, :]
+        error = combined(root(known.cov).T, by_source)
+        return cls(circuit, bands, source, source_alias, turn, turns, freedom, error)
 
     def expected(self, logs: Float[Array, " element"]) -> "Expected":
         """The gain of a load, and its derivatives."""
@@ -179,7 +187,7 @@ class _Search(NamedTuple):
 
 def minimum(
     pulse: "Pulse", start: LoadUnknowns, expected: Expected
-) -> tuple[Float[Array, " own"], Equations, Float[Array, ""]]:
+) -> tuple[Float[Array, " own"], Equations, Float[Array, ""], Float[Array, " part"]]:
     """One Gauss-Newton step; near the minimum one more, with the same derivatives.
 
     Args:
@@ -188,12 +196,13 @@ def minimum(
         expected: The gain at `start`.
 
     Returns:
-        The parameters after these steps, the last normal equations that were accepted, and the
-        reduction of Σ r² that these predict.
+        The parameters after these steps, the last normal equations that were accepted, the
+        reduction of Σ r² that these predict, and the residual of these equations.
     """
     own = start.vector()
     jacobian = pulse.jacobian(expected)
     before = pulse.equations(start, jacobian, expected.gain)
+    first = pulse.residual(expected.gain, start.delay_samples)
     inverse = inverse_of_few(before.matrix)
     trial = own - inverse @ before.gradient
     reached = LoadUnknowns.of(trial)
@@ -211,7 +220,7 @@ def minimum(
     step = inverse @ at.gradient
     decrement = jnp.dot(step, at.gradient)
     own = jnp.where(decrement < SETTLED**2, own - step, own)
-    return own, at, decrement
+    return own, at, decrement, jnp.where(better, residual, first)
 
 
 def searched(

@@ -8,6 +8,7 @@ from etid.estimators.judgement import MISFIT_CHI2, MISFIT_RRSE, SUCCESSFUL
 from etid.estimators.maximum_likelihood.given_driver import GivenDriver
 from etid.estimators.registry import register_description
 from etid.estimators.unknowns import LoadUnknowns
+from etid.online.gain_test import SEEN_GAIN
 from etid.online.pulse_fit import DELAYS, GainModel, Pulse
 from etid.online.state import ElectrodeState
 from etid.results.fit import Fit
@@ -36,6 +37,9 @@ register_description(
             "its residual does not exceed the noise (χ² per degree of freedom of at most "
             f"{MISFIT_CHI2:g} or of what noise exceeds once in ten million pulses, or an "
             f"unexplained part of at most {100 * MISFIT_RRSE:g} % of the signal)",
+            "a score test, summed over the pulses since the electrode began anew, finds no "
+            "difference between the gains of the two records (at most "
+            f"{SEEN_GAIN:g} standard deviations)",
             f"its trigger delay is at most {DELAYS[-1]:g} samples",
             "no change of the driver was seen since the calibrations",
             "every relative standard error is below 1",

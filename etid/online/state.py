@@ -22,6 +22,7 @@ class ElectrodeState(eqx.Module):
         shown: A number that two different windows never share, of the last two windows.
         confirmed: Largest amplitude of a pulse that fitted its prediction, since the last pulse
             that did not; 0 if there was none.
+        gain: Sums of the test of the gain since the electrode began anew, `GainScore.sums`.
         level: Effective value of the gain of the last pulse; 1 if the electrode is open.
         variance: E|noise|² of a Fourier coefficient of the last pulse [V²].
         chi2: χ² of the last pulse.
@@ -43,6 +44,7 @@ class ElectrodeState(eqx.Module):
     offset: Float[Array, "*lane"]
     shown: Float[Array, "*lane 2"]
     confirmed: Float[Array, "*lane"]
+    gain: Float[Array, "*lane 3"]
     level: Float[Array, "*lane"]
     variance: Float[Array, "*lane"]
     chi2: Float[Array, "*lane"]

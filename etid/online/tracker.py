@@ -30,7 +30,7 @@ more. `etid.online.changes` says when this is a change of the skin or of the dri
 several such pulses in a row, and at once if it touches nothing.
 
 **Amplitude.** V_out is divided by the amplitude of its pulse, relative to that of the unloaded
-record. The driver is linear.
+record. The driver is linear. `etid.online.gain_test` says when the gain or the amplitude is wrong.
 
 Z_th comes from the calibrations only; the pulses do not change it. More pulses reduce neither its
 error nor the error from the noise of the unloaded record: both are in `shared_cov`. Calibrate with
@@ -47,7 +47,7 @@ from jaxtyping import Array, Float
 from etid.circuits.circuit import AbstractCircuit
 from etid.circuits.overview import Overview, Overviewed
 from etid.estimators.estimator import serving
-from etid.estimators.maximum_likelihood.given_driver import GivenDriver, combined
+from etid.estimators.maximum_likelihood.given_driver import GivenDriver
 from etid.estimators.registry import MAXIMUM_LIKELIHOOD
 from etid.identify.arguments import circuit_of, number_of, require, require_float64
 from etid.identify.compiled import stored_jit
@@ -75,6 +75,7 @@ NOTES = {
     "too_short": "No pulse was identified yet; the elements are typical values, not estimates.",
     "max_steps_reached": "No load of this circuit gives this pulse. Does the window begin between "
     "two pulses, is `amplitude` that of the pulse, and is v_out in volt at the terminal?",
+    "misfit": f"{message('misfit')} Is `amplitude` that of the pulse, and the gain of v_out right?",
 }
 
 
@@ -169,7 +170,7 @@ class Tracker(Overviewed):
         model = GainModel.of(
             circuit_of(circuit),
             bands,
-            known.z_th(combined(known.mean, known.slope)),
+            known,
             driver.source.response(rate - bands.frequency),
             projection.freedom(),
         )
@@ -213,6 +214,7 @@ class Tracker(Overviewed):
             amplitude=jnp.zeros(lanes) if at_rest else nan,
             offset=nan,
             shown=jnp.full((lanes, 2), jnp.nan),
+            gain=jnp.zeros((lanes, 3)),
             confirmed=jnp.zeros(lanes),
             level=nan,
             variance=nan,

@@ -211,17 +211,23 @@ def step_of(v: Float[np.ndarray, " time"]) -> float:
     return step if np.abs(count - np.round(count)).max() < EQUAL * count.max() else 0.0
 
 
-def noise_of_codes(v: Float[np.ndarray, " time"], step: float) -> float:
-    """Noise from how often the code goes back and forth; valid for noise below half a step."""
+def noise_before(v: Float[np.ndarray, " time"], step: float) -> float:
+    """Noise before the rounding [V].
+
+    Noise below half a step shows in how often the code goes back and forth. Larger noise jumps over
+    codes, but makes the rounding error white, so that differences show both.
+    """
     jumps = np.diff(v)
     jumps = jumps[np.abs(jumps) > step / 2]
     back = (jumps[1:] * jumps[:-1] < 0) & (np.abs(jumps[1:]) < 1.5 * step)
-    return float(step / FLICKER * np.count_nonzero(back) / v.size)
+    of_codes = step / FLICKER * np.count_nonzero(back) / v.size
+    of_differences = math.sqrt(max(float(noise_std(v)) ** 2 - step**2 / 12, 0.0))
+    return max(float(of_codes), of_differences)
 
 
 def is_coarse(v: Float[np.ndarray, " time"], step: float) -> bool:
     """Whether the rounding error is large and not white: its size is `rounding_variance`."""
-    return bool(step > VISIBLE * np.ptp(v) and step > COARSE * noise_of_codes(v, step))
+    return bool(step > VISIBLE * np.ptp(v) and step > COARSE * noise_before(v, step))
 
 
 def rounding_variance(
@@ -229,7 +235,7 @@ def rounding_variance(
 ) -> Float[np.ndarray, " harmonic"]:
     """E|error|² of the harmonics of a record [V²], from rounding and noise together."""
     rng = np.random.default_rng(SEED)
-    noise = noise_of_codes(v, step)
+    noise = noise_before(v, step)
     errors = []
     for lift in (np.arange(LIFTS) + 0.5) / LIFTS * step:
         lifted = _before(v, step, rng.random()) + lift

@@ -1,0 +1,97 @@
+"""A gain of V_out or an amplitude that is not the stated one, pulse by pulse."""
+
+import dataclasses
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from benchmarks.online_alarms import LOADS, Fingertip
+from etid.results.verdicts import verdict_names
+from tests.test_online import TEN, after_amplitude, followed, ten, with_noise
+
+SOON = 2  # pulses after which 1 % must be refused at 60 dB
+
+
+def verdicts_of_pulses(tracker, pulses, amplitude=1.0):
+    """Verdicts after each pulse (pulse, electrode), and the last state."""
+    state, found = after_amplitude(tracker.start(), amplitude), []
+    for v_out in pulses:
+        state = tracker.update(state, v_out, amplitude)
+        found.append(verdict_names(state.electrodes.result))
+    return np.array(found), state
+
+
+@pytest.mark.parametrize("factor", [0.98, 0.99, 1.01, 1.02])
+@pytest.mark.parametrize("told", [False, True])
+def test_one_per_cent_of_gain_or_amplitude_is_refused_within_two_pulses(factor, told):
+    """R_p of dry skin would be 20 % wrong, at a χ² that noise alone can have."""
+    tracker, _, clean = ten()
+    amplitude = 1 / factor if told else 1.0
+    pulses = with_noise((1.0 if told else factor) * clean, seed=3)
+    found, _ = verdicts_of_pulses(tracker, pulses, amplitude)
+    assert (found[SOON - 1 :] != "successful").all()
+
+
+@pytest.mark.parametrize("factor", [0.99, 1.01])
+def test_a_gain_that_changes_under_way_is_refused_and_the_old_one_is_good_again(factor):
+    """At some electrodes: at all of them it would be the driver."""
+    tracker, state, clean = ten()
+    some = np.where(np.arange(TEN) < 3, factor, 1.0)[:, None]
+    pulses = with_noise(clean[: 2 * SOON + 1], seed=4)
+    for v_out in some * pulses[:SOON]:
+        state = tracker.update(state, v_out)
+    for v_out in some * pulses[SOON : 2 * SOON]:
+        state = tracker.update(state, v_out)
+        wrong = verdict_names(state.electrodes.result) != "successful"
+        np.testing.assert_array_equal(wrong, np.arange(TEN) < 3)
+        confirmed = np.asarray(state.electrodes.confirmed) > 0
+        np.testing.assert_array_equal(confirmed, ~wrong)
+    state = tracker.update(state, pulses[2 * SOON])
+    assert set(verdict_names(state.electrodes.result)) == {"successful"}
+
+
+def of_gain(tracker, pulses):
+    """Sums of the test after some pulses: s, I and c of each electrode."""
+    return np.asarray(followed(tracker, pulses).electrodes.gain).T
+
+
+def test_the_score_is_that_of_the_gain_and_its_error_that_of_the_driver():
+    """Against other pulses and another Z_th, in small steps."""
+    (tracker, _, clean), step = ten(), 1e-4
+    pulses = with_noise(clean[:4], seed=4)
+    score, information, common = of_gain(tracker, pulses)
+    more, less = (of_gain(tracker, factor * pulses)[0] for factor in (1 + step, 1 - step))
+    np.testing.assert_allclose((more - less) / (2 * step), information, rtol=0.02)
+
+    def with_model(**fields):
+        return dataclasses.replace(tracker, model=dataclasses.replace(tracker.model, **fields))
+
+    def shifted(error):
+        source = tracker.model.source
+        sides = (of_gain(with_model(source=source * (1 + by)), pulses)[0] for by in (error, -error))
+        return np.subtract(*sides) / (2 * step)
+
+    by_source = np.stack([shifted(step * error) for error in tracker.model.source_error])
+    expected = np.sqrt((by_source**2).sum(axis=0))
+    without = dataclasses.replace(tracker.model.bands, variance_x=jnp.zeros(()))
+    of_source = of_gain(with_model(bands=without), pulses)[2]
+    np.testing.assert_allclose(of_source, expected, rtol=0.05)
+    assert (common > of_source).all()  # by the noise of the unloaded record
+    assert (score**2 < 16 * (information + common**2)).all()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("snr_db", [60.0, 40.0])
+def test_undisturbed_electrodes_are_never_refused_at_a_hundred_thousand_pulses(snr_db):
+    """The limit is one in ten million for each."""
+    electrodes, squares = 96, []
+    display = Fingertip(electrodes, snr_db)
+    state = display.tracker.start()
+    for v_out in display.pulses(np.arange(electrodes) % len(LOADS), 1050):
+        state = display.tracker.update(state, v_out)
+        assert set(verdict_names(state.electrodes.result)) == {"successful"}
+        score, information, common = np.asarray(state.electrodes.gain).T
+        squares.append(score**2 / (information + common**2))
+    # All have the error of one calibration, so that their z are nearly one number.
+    assert np.mean(squares) < 3**2
