@@ -88,7 +88,8 @@ class Joint(eqx.Module):
         if isinstance(lane, Load):
             return dataclasses.replace(spectrum, passed=lane.spectrum.passed), None
         known = dataclasses.replace(spectrum, passed=lane.load.spectrum.passed)
-        return known, (lane.i, lane.variance_i, lane.passed_i)
+        fields = lane.i, lane.variance_i, lane.passed_i
+        return known, tuple(of for of in fields if of is not None)
 
 
 class Loads(eqx.Module):
