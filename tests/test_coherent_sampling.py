@@ -7,15 +7,14 @@ number of samples of a period. Driver, loads and filter are formulas, so the tru
 import dataclasses
 import functools
 
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import etid
 from etid.identify import arguments
 from etid.recordings.preflight import Inspected
-from etid.signals.aliases import FILTERED, aliases
-from etid.signals.harmonics import ALIASED, Spectrum
+from etid.signals.aliases import aliases
+from etid.signals.harmonics import ALIASED
 from etid.simulation.transformer import TransformerDriver
 
 SKINS = {
@@ -126,9 +125,6 @@ def test_the_default_is_maximum_likelihood_and_right():
         assert fit.verdict == "successful"
         assert fit.method == "maximum_likelihood"
         assert np.abs(off(fit, name)).max() < SIGMAS
-        # χ² was 0.02, and R_s had an error of 0.9 and 1.1 %: four times the errors of such fits.
-        assert 0.3 < float(fit.chi2) < 1.3
-        assert float(fit.stderr.r_s / fit.circuit.r_s) < 0.005
 
 
 def test_a_joint_fit_takes_such_records():
@@ -137,7 +133,6 @@ def test_a_joint_fit_takes_such_records():
     for fit, name in each(fits):
         assert fit.verdict == "successful", fit
         assert np.abs(off(fit, name)).max() < SIGMAS
-        assert 0.3 < float(fit.chi2) < 1.3
 
 
 def test_a_tracker_takes_the_default_driver():
@@ -179,29 +174,6 @@ def test_noise_above_the_aliases_needs_no_filter():
     assert quiet.is_aliased
 
 
-@pytest.mark.parametrize("late", [0.0, 0.4])
-def test_a_load_leaves_the_part_of_the_aliases_that_it_changes(late):
-    """|Y − G X|² is |conj G(fs − f) − G(f)|² |A|² at each harmonic; there is no noise."""
-    bench = Bench(seed=4)
-    x = np.where(bench.f < bench.rate, bench.x, 0.0)  # higher ones would be aliases of aliases
-    driver = TransformerDriver()
-
-    def gain(f):
-        z = impedance(SKINS["damp"], np.asarray(f))
-        z_th = driver.z_th(np.asarray(f))
-        return jnp.asarray(z / (z + z_th) * np.exp(-2j * np.pi * np.asarray(f) / RATE * late))
-
-    (found, true), (y, _) = (exact(bench, of) for of in (x, x * np.asarray(gain(bench.f))))
-    f = bench.f[: found.size]
-    left = np.abs(y - np.asarray(gain(f)) * found) ** 2
-    none = np.zeros(found.size)
-    fields = map(jnp.asarray, (f, found, y, none, none, none == 0, np.abs(found - true) ** 2))
-    spectrum = Spectrum(*fields)
-    known = spectrum.behind(gain, jnp.asarray(RATE))
-    np.testing.assert_allclose(known.error_y, left, rtol=1e-6, atol=1e-9 * left.max())
-    assert np.sum(spectrum.error_y) > np.sum(left)  # as long as the load is not known
-
-
 def exact(bench, coefficients):
     """Fourier coefficients of a period, with aliases and without, below half the rate."""
     size = round(bench.rate / bench.pulses)
@@ -212,12 +184,16 @@ def exact(bench, coefficients):
 
 
 @pytest.mark.parametrize(("rate", "pulses"), [(200e3, 50.0), (240e3, 60.0), (500e3, 50.0)])
-def test_aliases_behind_a_filter_are_as_large_as_estimated(rate, pulses):
-    """Where that is surely a filter, by its fall; else they could be larger."""
-    ratios, falls = [], []
+@pytest.mark.parametrize("load", ["open", *SKINS])
+def test_aliases_behind_a_filter_are_not_larger_than_estimated(rate, pulses, load):
+    """Nor are they more than 20 times smaller where they matter most, at the highest harmonics."""
     for seed in range(10):
         bench = Bench(seed, rate, pulses)
-        found, true = exact(bench, bench.x)
+        x = bench.x
+        if load != "open":
+            z = impedance(SKINS[load], bench.f)
+            x = x * z / (z + bench.z_th)
+        found, true = exact(bench, x)
         size = round(rate / pulses)
         quiet = np.full(found.shape, 1e-12 * np.abs(found[-1]) ** 2)
         of = aliases(found, quiet, 3, 3 * size)
@@ -225,13 +201,8 @@ def test_aliases_behind_a_filter_are_as_large_as_estimated(rate, pulses):
             # 25 harmonics hold a whole lobe of the spectrum of a pulse.
             around = slice(round(part * size) - 25, round(part * size) + 25)
             ratio = np.mean(of.power[around]) / np.mean(np.abs(found - true)[around] ** 2)
-            assert ratio > 1 / 3
-            ratios.append(ratio)
-        falls.append(of.fall)
-    ratios = np.asarray(ratios)
-    sure = ratios[np.repeat(falls, 4) >= FILTERED]
-    assert sure.max() < 4
-    assert 0.8 < np.exp(np.mean(np.log(sure))) < 2.5
+            assert ratio > 1
+        assert ratio < 20
 
 
 def test_a_spectrum_that_ends_in_the_noise_has_no_aliases():
@@ -257,17 +228,7 @@ def test_a_spectrum_that_falls_with_a_power_has_the_aliases_of_this_power():
     of = aliases(u**-7.0 + 0j, np.full(u.size, 1e-9), 5, 5 * size)
     # A spectrum as steep as this changes by a factor of five over a band, whose mean lies higher.
     np.testing.assert_allclose(of.fall, 14.0, rtol=0.03)
-    # Behind a filter it falls faster and faster; 0.425 is the middle of the upper band.
-    beyond = (0.425 / (1 - u[:1400])) ** 3.0
-    np.testing.assert_allclose(of.power[:1400], (1 - u[:1400]) ** -14.0 * beyond, rtol=0.15)
-
-
-def test_a_spectrum_that_falls_slowly_is_not_behind_a_filter():
-    size = 4000
-    u = np.arange(1, 2000) / size
-    of = aliases(u**-4.0 + 0j, np.full(u.size, 1e-9), 5, 5 * size)
-    np.testing.assert_allclose(of.power[:1400], (1 - u[:1400]) ** -8.0, rtol=0.15)
-    assert of.are_unknown(np.full(u.size, 1e-9))
+    np.testing.assert_allclose(of.power[:1400], (1 - u[:1400]) ** -14.0, rtol=0.15)
 
 
 def drawn(number, method=None, **settings):
@@ -299,10 +260,7 @@ def test_behind_a_filter_the_elements_are_within_their_errors(rate, pulses, peri
     errors, others = drawn(50, **of)
     assert len(others) <= 2
     assert np.abs(errors).max() < SIGMAS
-    # 1 ± 0.05 without any aliases; their size is known to a factor of two.
-    rms = np.sqrt(np.mean(errors**2, axis=0))
-    assert rms.max() < 1.3
-    assert rms.min() > 0.6
+    assert np.sqrt(np.mean(errors**2, axis=0)).max() < 1.15  # 1 ± 0.05 without any aliases
 
 
 @pytest.mark.slow
@@ -324,8 +282,7 @@ def test_100_khz_are_too_slow_for_edges_that_ring_at_60_khz(snr_db):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("method", ["non_parametric", "harmonic_steiglitz_mcbride"])
-def test_other_methods_take_the_records_that_the_default_takes(method):
-    """They were `biased` in 16 of 20, because they took aliases for noise."""
-    errors, others = drawn(20, method, rate=240e3, pulses=60.0)
-    assert len(others) <= 0.2 * 40
-    assert np.abs(errors).max() < SIGMAS
+def test_methods_that_take_aliases_for_noise_say_that_they_are_biased(method):
+    errors, others = drawn(10, method, rate=240e3, pulses=60.0)
+    assert others.count("biased") > len(errors)
+    assert not errors.size or np.abs(errors).max() < SIGMAS

@@ -23,7 +23,7 @@ from etid.estimators.unknowns import LoadUnknowns
 from etid.recordings.preflight import Inspected
 from etid.recordings.remarks import Remark
 from etid.recordings.study import Study
-from etid.results.driver import HarmonicDriver, SourceImpedance
+from etid.results.driver import HarmonicDriver
 from etid.simulation.scenes import Scene, Trial
 from etid.simulation.transformer import ResistorLoad, SkinLoad, TransformerDriver
 from tests import kept_numbers
@@ -120,7 +120,6 @@ def test_gains_of_calibrations_with_the_same_unloaded_record_are_signals_of_thei
     of_one, w, gains = jnp.ones(3), jnp.ones(3, complex), jnp.ones((2, 3), complex)
     z, known = jnp.zeros(1), jnp.zeros((1, 2, 3), complex)
     calibrated = GivenDriver(
-        source=SourceImpedance(jnp.zeros(()), *[jnp.zeros(1)] * 6),
         frequency=of_one,
         loaded=w,
         w_slope=w,

@@ -51,6 +51,16 @@ def test_a_gain_that_changes_under_way_is_refused_and_the_old_one_is_good_again(
     assert set(verdict_names(state.electrodes.result)) == {"successful"}
 
 
+def test_a_gain_that_does_not_matter_is_never_refused():
+    """0.09 % moves R_p of dry skin by 1.8 %; many pulses show it, and the limit is 2 %."""
+    tracker, _, clean = ten()
+    pulses = with_noise(0.9991 * np.concatenate([clean] * 4), seed=5)
+    found, state = verdicts_of_pulses(tracker, pulses)
+    score, information, common = np.asarray(state.electrodes.gain).T
+    assert (score**2 > 25 * (information + common**2)).any()
+    assert set(found.ravel()) == {"successful"}
+
+
 def of_gain(tracker, pulses):
     """Sums of the test after some pulses: s, I and c of each electrode."""
     return np.asarray(followed(tracker, pulses).electrodes.gain).T

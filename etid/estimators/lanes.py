@@ -9,7 +9,7 @@ import abc
 import dataclasses
 import math
 from collections.abc import Sequence
-from typing import Any, ClassVar, NamedTuple, TypeVar
+from typing import ClassVar, NamedTuple, TypeVar
 
 import equinox as eqx
 import jax
@@ -133,7 +133,6 @@ class Harmonics(AbstractLane):
     variance_x: Float[Array | np.ndarray, "*lane harmonic"]
     variance_y: Float[Array | np.ndarray, "*lane harmonic"]
     selected: Bool[Array | np.ndarray, "*lane harmonic"]
-    alias: Float[Array | np.ndarray, "*lane harmonic"] | None
     sample_rate: Float[Array | np.ndarray, "*lane"]
 
     @classmethod
@@ -149,13 +148,11 @@ class Harmonics(AbstractLane):
         of all that `_fields` computes.
         """
         fields = [cls._fields(one) for one in seen]
-        leaves = [[of for of in one if of is not None] for one in fields]
-        kinds = {len(one): cls(*of) for one, of in zip(leaves, fields, strict=True)}
-        structures = {size: jax.tree.structure(one) for size, one in kinds.items()}
-        return [structures[len(one)].unflatten(one) for one in leaves]
+        structure = jax.tree.structure(cls(*fields[0]))
+        return [structure.unflatten(one) for one in fields]
 
     @staticmethod
-    def _fields(seen: Inspected) -> tuple[Any, ...]:
+    def _fields(seen: Inspected) -> tuple[np.ndarray, ...]:
         """The fields of a lane, in their order."""
         rate = np.asarray(seen.recording.sample_rate)
         sigmas = seen.trusted_th, seen.trusted_out
@@ -171,10 +168,12 @@ class Harmonics(AbstractLane):
             elif flickers:
                 of = v, float(sigma), frequency, float(rate)
                 variances[number] = variances[number] * coloured(*of, *seen.periods)
-        alias = _alias(x, variances[0], seen.periods)
+        if joins_aliases(*seen.periods):
+            of_both = zip((x, y), variances, strict=True)
+            variances = [v + aliases(of, v, *seen.periods).variance for of, v in of_both]
         selected = selected & ~seen.covered(frequency)
         y = y * _turn(frequency, rate, seen.lag) if seen.lag else y
-        return frequency, x, y, *variances, selected, alias, rate
+        return frequency, x, y, *variances, selected, rate
 
     @classmethod
     def of_samples(
@@ -195,15 +194,16 @@ class Harmonics(AbstractLane):
         sigmas = noise(v_th, resolution), noise(v_out, resolution)
         fields = map(jnp.asarray, spectrum(v_th, v_out, *sigmas, sample_rate, *periods))
         frequency, x, y, of_x, of_y, selected = fields
-        alias = _alias(x, of_x, periods)
-        return cls(frequency, x, y, of_x, of_y, selected, alias, sample_rate)
+        if joins_aliases(*periods):
+            of_x = of_x + aliases(x, of_x, *periods).variance
+            of_y = of_y + aliases(y, of_y, *periods).variance
+        return cls(frequency, x, y, of_x, of_y, selected, sample_rate)
 
     @property
     def spectrum(self) -> Spectrum:
         """The harmonics without the sample rate, as arrays of JAX."""
         fields = (self.frequency, self.x, self.y, self.variance_x, self.variance_y, self.selected)
-        alias = None if self.alias is None else jnp.asarray(self.alias)
-        return Spectrum(*map(jnp.asarray, fields), alias=alias)
+        return Spectrum(*map(jnp.asarray, fields))
 
     def realigned(self, late: Lags) -> "Harmonics":
         """The lane with `v_out` advanced by whole samples: multiplied by e^(jω late / fs)."""
@@ -215,12 +215,7 @@ class Harmonics(AbstractLane):
     def late_by(self, circuit: AbstractCircuit, driver: AbstractFeed) -> Lags:
         """Whole samples by which `v_out` is later than with this load; 0 if they are few."""
         gain = _gain(circuit, driver, self.frequency)
-        return Lags.of(self._behind(gain, self.y, self._error_y))
-
-    @property
-    def _error_y(self) -> Float[np.ndarray, " harmonic"]:
-        """Variance of Y by noise and aliases, without a call of JAX where there are none."""
-        return np.asarray(self.variance_y if self.alias is None else self.spectrum.error_y)
+        return Lags.of(self._behind(gain, self.y, self.variance_y))
 
     def _behind(
         self,
@@ -253,7 +248,7 @@ class HarmonicsWithCurrent(Harmonics):
     variance_i: Float[Array | np.ndarray, "*lane harmonic"]
 
     @staticmethod
-    def _fields(seen: Inspected) -> tuple[Any, ...]:
+    def _fields(seen: Inspected) -> tuple[np.ndarray, ...]:
         """The fields of a lane, in their order; `v_out` and the current are aligned with `v_th`.
 
         Raises:
@@ -261,10 +256,10 @@ class HarmonicsWithCurrent(Harmonics):
         """
         if seen.by_current is None:
             raise ValueError(f"recording {seen.recording.path!r} has not both v_th and current")
-        *of_voltages, selected, alias, rate = Harmonics._fields(seen)
-        _, i, _, variance_i, _, usable, *_ = Harmonics._fields(seen.by_current)
+        *of_voltages, selected, rate = Harmonics._fields(seen)
+        _, i, _, variance_i, _, usable, _ = Harmonics._fields(seen.by_current)
         turned = i * _turn(of_voltages[0], rate, seen.current_lag)
-        return *of_voltages, selected & usable, alias, rate, turned, variance_i
+        return *of_voltages, selected & usable, rate, turned, variance_i
 
     @classmethod
     def of_samples(
@@ -293,7 +288,7 @@ class HarmonicsWithCurrent(Harmonics):
         gain = _gain(circuit, driver, self.frequency)
         flowing = gain / np.asarray(circuit.response(jnp.asarray(self.frequency)))  # I / V_th
         of_current = self._behind(flowing, self.i, self.variance_i)
-        return Lags.of(self._behind(gain, self.y, self._error_y), of_current)
+        return Lags.of(self._behind(gain, self.y, self.variance_y), of_current)
 
 
 class PaddedSamples(AbstractLane):
@@ -420,15 +415,6 @@ class AlignedSamples(AbstractLane):
         """Both records and the noise that JAX estimates from them."""
         fields = self.v_th, self.v_out, self.resolution_th, self.resolution_out, self.sample_rate
         return measure(*map(jnp.asarray, fields))
-
-
-def _alias(
-    x: Complex[Array | np.ndarray, " harmonic"],
-    variance: Float[Array | np.ndarray, " harmonic"],
-    periods: tuple[int, int],
-) -> Float[Array | np.ndarray, " harmonic"] | None:
-    """Variance that stands for the aliases in X [V²]; None if they fall between the harmonics."""
-    return aliases(x, variance, *periods).variance if joins_aliases(*periods) else None
 
 
 def _gain(

@@ -67,8 +67,6 @@ def from_harmonics(
         spectra, r_load, rate, near
     )
     calibrations = maximum_likelihood.Calibrations(source, calibration, spectra, rate)
-    spectra = calibrations.before()
-    calibrations = dataclasses.replace(calibrations, spectra=spectra)
     statistic = missing_pole.largest(calibrations, linear)
     if r_load.size > 1:
         off = resistors.mismatch(calibrations, linear)

@@ -208,13 +208,6 @@ def _aligned(seen: Sequence[Inspected], order: int, estimator: AbstractEstimator
     lanes = [Harmonics.of(one) for one in seen]
     size = min(one.size for one in lanes)  # counted pulse rates may differ by one harmonic
     lanes = [jax.tree.map(lambda of: of[:size] if of.ndim else of, one) for one in lanes]
-    if any(one.alias is not None for one in lanes):  # in some, if counted pulse rates differ
-        lanes = [
-            dataclasses.replace(one, alias=np.zeros_like(one.variance_x))
-            if one.alias is None
-            else one
-            for one in lanes
-        ]
     records = stacked(lanes)
     driver = _identified(records, r_load, order, estimator)
     # A driver fits hum on a harmonic by a pole at that frequency, and this pole is then missing

@@ -80,7 +80,6 @@ from etid.results.study_fits import StudyFits
 from etid.results.tried_orders import Order
 from etid.results.verdicts import RESULTS, verdict, verdict_names, verdicts_of
 from etid.selection.delays import upper_limit
-from etid.signals.harmonics import joins_aliases
 
 METHOD = "joint"
 SINGLE = (
@@ -136,7 +135,6 @@ def _alone(lanes: Any, count: Int[Array, ""], model: Joint, driver: HarmonicDriv
         settled = RESULTS.promote(result) == RESULTS.successful
         good = settled & jnp.isfinite(chi2) & ~judgement.misses(chi2, error)
         changed = jnp.array(False) if known is None else known.differs(spectrum)
-        spectrum, current = model.before(given, own, spectrum, sample_rate, current)
         loads = Loads(spectrum, sample_rate, own, good & ~changed, jnp.array(-1), current)
         return _Start(loads, hum, changed)
 
@@ -389,7 +387,7 @@ def identify_jointly(
         lengths = waiting.setdefault(drivers.of(seen.recording), {})
         shared = is_shared(seen, driver)
         rates = seen.recording.sample_rate, seen.recording.pulse_rate
-        key = seen.v_th.size, shared, *rates, estimator, joins_aliases(*seen.periods)
+        key = seen.v_th.size, shared, *rates, estimator
         if key not in lengths:
             model = _model(circuit, driver, shared, known, asked.bounds)
             lengths[key] = _Waiting(model, driver, estimator)

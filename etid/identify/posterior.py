@@ -86,30 +86,21 @@ class Minimum(eqx.Module):
     def of(cls, lane: Harmonics, known: Known, circuit: AbstractCircuit) -> "Minimum":
         """The minimum near a fitted circuit."""
         terms = terms_of(lane, known, circuit)
-        q = _near(terms, known, circuit)
+        alone = isinstance(terms, Load)
+        delays = jnp.zeros(1 if alone else 2)
+        start = jnp.concatenate([circuit.log_values(), delays, known.driver.mean])
+        q = (refined(terms, start) if alone else with_current.refined(terms, start)).value
         return cls(terms, q, inverse(jax.hessian(lambda q: cost(terms, q))(q)))
 
 
 def terms_of(lane: Harmonics, known: Known, circuit: AbstractCircuit) -> Load | LoadWithCurrent:
-    """The residuals of a recording; aliases are weighed as near the fitted circuit."""
+    """The residuals of a recording."""
     rate = jnp.asarray(lane.sample_rate)
     if isinstance(lane, HarmonicsWithCurrent) and isinstance(known.driver, GivenDriver):
         current = jnp.asarray(lane.i), jnp.asarray(lane.variance_i)
         of = lane.spectrum, current, rate, known.elements
-        terms = LoadWithCurrent.behind(known.driver, circuit, *of)
-    else:
-        terms = Load.behind(known.driver, circuit, lane.spectrum, rate, known.elements)
-    return terms if lane.alias is None else terms.before(_near(terms, known, circuit))
-
-
-def _near(
-    terms: Load | LoadWithCurrent, known: Known, circuit: AbstractCircuit
-) -> Float[Array, " q"]:
-    """The minimum near a fitted circuit."""
-    alone = isinstance(terms, Load)
-    delays = jnp.zeros(1 if alone else 2)
-    start = jnp.concatenate([circuit.log_values(), delays, known.driver.mean])
-    return (refined(terms, start) if alone else with_current.refined(terms, start)).value
+        return LoadWithCurrent.behind(known.driver, circuit, *of)
+    return Load.behind(known.driver, circuit, lane.spectrum, rate, known.elements)
 
 
 def cost(terms: Load | LoadWithCurrent, q: Float[Array, " q"]) -> Float[Array, ""]:

@@ -15,9 +15,13 @@ pulses since the electrode began anew,
 
     z² = (Σs)² / (ΣI + (Σc)²)
 
-has at most the distribution χ² with one degree of freedom. As in a fit of a whole record
-(`etid.estimators.score_tests.other_circuit`), a gain is wrong if z exceeds its limit and ĝ = Σs/ΣI
-moves an element by more than `MOVED`. The batch fit, too, calls this a `misfit`.
+has at most the distribution χ² with one degree of freedom. A gain g₀ that moves an element by
+`MOVED` does not matter (`etid.estimators.score_tests.other_circuit`), and instruments have smaller
+ones, which many pulses show. So a gain is wrong if it exceeds this one:
+
+    |Σs| − g₀ ΣI  >  SEEN_GAIN √(ΣI + (Σc)²).
+
+As in a fit of a whole record, the verdict is then `misfit`.
 """
 
 from typing import NamedTuple
@@ -83,5 +87,6 @@ class GainScore(NamedTuple):
     def wrong(self) -> Bool[Array, ""]:
         """Whether sums over pulses show another gain that matters."""
         score, information, common = self.sums
-        seen = score**2 > SEEN_GAIN**2 * (information + common**2)
-        return seen & (jnp.abs(score) * jnp.max(jnp.abs(self.moved)) > MOVED * information)
+        scatter = jnp.sqrt(information + common**2)
+        moved = jnp.max(jnp.abs(self.moved))
+        return moved * (jnp.abs(score) - SEEN_GAIN * scatter) > MOVED * information

@@ -64,9 +64,8 @@ def bands(
     terms = _Terms.of(lane, feed, circuit)
     p = terms.fitted()
     gain, turned, z_th = terms.at(p)
-    error_y = np.asarray(lane.spectrum.error_y)
-    var = error_y + np.abs(turned) ** 2 * lane.variance_x
-    known = (error_y * lane.x + lane.variance_x * np.conj(turned) * lane.y) / var
+    var = lane.variance_y + np.abs(turned) ** 2 * lane.variance_x
+    known = (lane.variance_y * lane.x + lane.variance_x * np.conj(turned) * lane.y) / var
     by_load = np.ones_like(gain) if z_th is None else 1 - gain  # ∂ ln G/∂ ln Z
     slope = turned * known * by_load
     weight = np.where(lane.selected, 2 * np.abs(slope) ** 2 / var, 0.0)
@@ -167,7 +166,7 @@ class _Terms:
         """Terms with the priors, and their derivatives without those of the variance."""
         lane = self.lane
         _, turned, z_th = self.at(p)
-        var = np.asarray(lane.spectrum.error_y) + np.abs(turned) ** 2 * lane.variance_x
+        var = lane.variance_y + np.abs(turned) ** 2 * lane.variance_x
         scale = np.where(lane.selected, np.sqrt(2 / var), 0.0)
         by_z_th = self.slopes if z_th is None else -self.slopes / (self.z + z_th)
         by = np.concatenate([-1j * self._turn[None], by_z_th]) * (turned * lane.x * -scale)

@@ -64,6 +64,6 @@ def banded(spectrum: Spectrum) -> Spectrum:
             filled(summed(product.imag) / level, 0.0),
         ),
         variance_x=variance(spectrum.variance_x),
-        variance_y=variance(spectrum.error_y),
+        variance_y=variance(spectrum.variance_y),
         selected=present,
     )

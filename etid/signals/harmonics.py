@@ -10,10 +10,8 @@ a whole number of samples, and a record of one period. Then the upper part of th
 because anti-alias filters are imperfect there; `etid.signals.aliases` is about those on the rest.
 """
 
-import dataclasses
 import functools
 import math
-from collections.abc import Callable
 from types import ModuleType
 from typing import TypeVar
 
@@ -32,7 +30,6 @@ WINDOW = 25  # harmonics over which power is averaged
 ALIASED = 0.35  # of the sample rate; above, aliases matter unless they fall between the harmonics
 DRIFT_DEGREE = 3  # degree of the polynomial that describes the drift of the mean
 ROOM = 64  # harmonic counts are padded to a multiple of this, so that compiled programs are shared
-UNLIKE = 2.0  # |conj G(fs − f) − G(f)|² if both gains have the size 1 and independent phases
 ABSENT = 1e-6  # [standard deviations] coefficient and noise of a padded harmonic
 
 
@@ -46,9 +43,6 @@ class Spectrum(eqx.Module):
         variance_x: E|noise|² of each coefficient of `x` [V²].
         variance_y: E|noise|² of each coefficient of `y` [V²].
         selected: Harmonics that are used; all of them if aliases fall between them.
-        alias: Variance of independent errors that stand for the aliases A in `x` [V²]
-            (`etid.signals.aliases`); None if no aliases fall on the harmonics.
-        passed: |conj G(fs − f) − G(f)|², the part of |A|² in Y − G X; None if G is not known yet.
     """
 
     frequency: Float[Array, "*lane harmonic"]
@@ -57,48 +51,6 @@ class Spectrum(eqx.Module):
     variance_x: Float[Array, "*lane harmonic"]
     variance_y: Float[Array, "*lane harmonic"]
     selected: Bool[Array, "*lane harmonic"]
-    alias: Float[Array, "*lane harmonic"] | None = None
-    passed: Float[Array, "*lane harmonic"] | None = None
-
-    @property
-    def error_x(self) -> Float[Array, "*lane harmonic"]:
-        """Variance of each coefficient of X, if `x` is compared with that of a later record [V²].
-
-        A delay turns A by 2π for each sample, so that the aliases of two records are unlike.
-        """
-        return self.variance_x if self.alias is None else self.variance_x + UNLIKE * self.alias
-
-    @property
-    def error_y(self) -> Float[Array, "*lane harmonic"]:
-        """Variance of each coefficient of `y`, given G and `x` with its aliases [V²]."""
-        if self.alias is None:
-            return self.variance_y
-        passed = UNLIKE if self.passed is None else self.passed
-        return self.variance_y + passed * self.alias
-
-    @property
-    def unaliased(self) -> Float[Array, "*lane harmonic"] | float:
-        """Part of the variance of both coefficients that is noise; 1 if nothing aliases."""
-        if self.alias is None:
-            return 1.0
-        return (self.variance_x + self.variance_y) / (self.variance_x + self.error_y)
-
-    def behind(
-        self,
-        gain: Callable[[Float[Array, " harmonic"]], Complex[Array, " harmonic"]],
-        sample_rate: Float[Array, ""],
-    ) -> "Spectrum":
-        """One recording, with the part of the aliases in Y − G X for this estimate of G.
-
-        Args:
-            gain: G with its delay at frequencies [Hz], also above half the sample rate.
-            sample_rate: Its sampling rate [Hz].
-        """
-        if self.alias is None:
-            return self
-        mirrored = jnp.conj(gain(sample_rate - self.frequency))
-        passed = power(mirrored - gain(self.frequency))
-        return dataclasses.replace(self, passed=jax.lax.stop_gradient(passed))
 
 
 def whole_periods(samples: int, sample_rate: float, pulse_rate: float) -> tuple[int, int]:

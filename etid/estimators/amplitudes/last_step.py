@@ -130,7 +130,7 @@ def _likeliest(
     count = spectrum.x.size
     x = spectrum.x + jax.lax.complex(change[:count], change[count:])
     total = variance(spectrum, of.gain(spectrum)(own))
-    return x, signal_share(x, spectrum.variance_x * spectrum.error_y / total)
+    return x, signal_share(x, spectrum.variance_x * spectrum.variance_y / total)
 
 
 def _unknown_hum(of: Amplitudes, spectrum: Spectrum) -> Spectrum:
@@ -149,7 +149,7 @@ def _around(
     """The terms of a record around its X."""
     count = spectrum.x.size
     scale = jnp.tile(weight, 2)
-    of_x, of_y = (jnp.tile(0.5 * v, 2) for v in (spectrum.variance_x, spectrum.error_y))
+    of_x, of_y = (jnp.tile(0.5 * v, 2) for v in (spectrum.variance_x, spectrum.variance_y))
 
     def terms(x: Parts) -> Parts:
         there = eqx.tree_at(lambda s: s.x, spectrum, jax.lax.complex(x[:count], x[count:]))

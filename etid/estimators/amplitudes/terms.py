@@ -70,15 +70,10 @@ class Amplitudes(eqx.Module):
         That gain is right for most of a period: there is little current between the pulses.
         """
 
-        def one(
-            own: Float[Array, " own"], spectrum: Spectrum
-        ) -> tuple[Spectrum, Float[Array, " harmonic"]]:
-            gain = self.gain(spectrum)
-            spectrum = gain.before(spectrum, own)
-            return spectrum, variance(spectrum, gain.undelayed(own))
+        def one(own: Float[Array, " own"], spectrum: Spectrum) -> Float[Array, " harmonic"]:
+            return variance(spectrum, self.gain(spectrum).undelayed(own))
 
-        spectra, expected = jax.vmap(one)(own, self.spectra)
-        return dataclasses.replace(self, spectra=spectra, expected=expected)
+        return dataclasses.replace(self, expected=jax.vmap(one)(own, self.spectra))
 
     @property
     def count(self) -> int:

@@ -74,11 +74,6 @@ class HarmonicSteiglitzMcBride(AbstractByMaximumLikelihood):
         spectrum, sample_rate = lane.spectrum, jnp.asarray(lane.sample_rate)
         source, source_cov = driver.source, driver.later_cov()
         z_th = source.response(spectrum.frequency)
-        if spectrum.alias is not None:
-            skin, late = iteration.start_of_skin(spectrum, z_th, sample_rate, self.iterations)
-            spectrum = spectrum.behind(
-                lambda f: delayed_gain(source, skin.impedance(), f, late, sample_rate), sample_rate
-            )
         best = iteration.fit_skin(spectrum, z_th, sample_rate, self.iterations)
         values, late = best.circuit.values(), best.delay_samples
         physical = jnp.isfinite(best.rrse)  # if not, the elements do not matter

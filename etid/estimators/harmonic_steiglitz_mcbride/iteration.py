@@ -78,7 +78,6 @@ class _Products(NamedTuple):
 
     omega: Float[Array, " harmonic"]
     used: Bool[Array, " harmonic"]
-    trust: Float[Array, " harmonic"] | float
     xx: Float[Array, " harmonic"]
     yy: Float[Array, " harmonic"]
     xy: Complex[Array, " harmonic"]
@@ -97,7 +96,7 @@ class _Products(NamedTuple):
         self, q: Float[Array, " coefficient"], turn: Complex[Array, " harmonic"]
     ) -> Float[Array, " coefficient"]:
         """b₀, b₁, a₁ and τ of the next iteration."""
-        omega, used, _, xx, yy, xy, z_th = self
+        omega, used, xx, yy, xy, z_th = self
         v = xy * turn - as_complex(yy)
         k = self.loaded(q)[1]
         zv, kv = z_th * v, k * v
@@ -108,7 +107,7 @@ class _Products(NamedTuple):
         terms += [square * both, -square * zv.real, -square * kv.real]
         terms += [square * yy * power(z_th), square * yy * zk.real, square * yy * power(k)]
         terms += [omega * yy * zk.imag]
-        weight = jnp.where(used, self.trust / (1 + (omega * q[2]) ** 2), 0.0)
+        weight = jnp.where(used, 1 / (1 + (omega * q[2]) ** 2), 0.0)
         p0, h0, z0, k0, p2, z1, k1, zz, kz, kk, hk = jnp.stack(terms) @ weight
         # Schur complements of b₀ and b₁; their right sides are h0 and z0.
         zz, kz, kk = (
@@ -124,11 +123,10 @@ class _Products(NamedTuple):
 
 
 def _products(spectrum: Spectrum, z_th: Complex[Array, " harmonic"]) -> _Products:
-    """The products without the variance of the noise; those with aliases weigh less."""
+    """The products without the variance of the noise."""
     return _Products(
         2 * jnp.pi / RATE * spectrum.frequency,
         spectrum.selected,
-        spectrum.unaliased,
         power(spectrum.x) - spectrum.variance_x,
         power(spectrum.y) - spectrum.variance_y,
         jnp.conj(spectrum.x) * spectrum.y,
@@ -217,11 +215,10 @@ def start_of_skin(
     """
     every, fine = knots(z_th.size), _products(spectrum, z_th)
     parts = jnp.stack([fine.xx, fine.yy, fine.xy.real, fine.xy.imag])
-    parts = parts * jnp.atleast_2d(fine.trust)
     xx, yy, real, imaginary = every.summed(jnp.where(fine.used[None, :], parts, 0.0))
     omega = every.at(fine.omega)
     used = jnp.ones(omega.shape, bool)
-    of = _Products(omega, used, 1.0, xx, yy, jax.lax.complex(real, imaginary), every.at(z_th))
+    of = _Products(omega, used, xx, yy, jax.lax.complex(real, imaginary), every.at(z_th))
 
     def step(q: Float[Array, " coefficient"], _: None) -> tuple[Float[Array, " coefficient"], None]:
         turn = omega * q[3]
@@ -291,5 +288,5 @@ def covariance(
         # Half of the variance is in each of both parts.
         return jnp.einsum("ipk,jpk,k->ij", slope, slope, variance / 2)
 
-    own = of_noise(by_x, noise * spectrum.variance_x) + of_noise(by_y, noise * spectrum.error_y)
+    own = of_noise(by_x, noise * spectrum.variance_x) + of_noise(by_y, noise * spectrum.variance_y)
     return own, by_source @ source_cov @ by_source.T

@@ -228,15 +228,12 @@ def fit_alone(
     if isinstance(lane, LoadWithCurrent):
         start = best_start(lane, jnp.pad(candidates.vector(), ((0, 0), (0, 1))))
         start = with_current.refined(lane, start, with_current.ROUGHLY).value
-        lane = lane.before(start)
         solution = with_current.refined(lane, jnp.concatenate([start, driver.mean]))
         own = LoadWithCurrentUnknowns.of(solution.value[: start.size])
         seen = lane.seen(solution.value)
         terms, error, hum = 2 * terms, lane.rrse(seen), seen.shows_hum()
     else:
-        start = best_start(lane, candidates.vector())
-        lane = lane.before(start)
-        solution = load_fit.refined(lane, start)
+        solution = load_fit.refined(lane, best_start(lane, candidates.vector()))
         own, (g, known) = LoadUnknowns.of(solution.value), lane.predicted(solution.value)
         error = complex_rrse(g * spectrum.x, spectrum.y, spectrum.selected)
         hum = shows_hum(known, g)

@@ -105,7 +105,7 @@ def _with_current(
     # Where Y tells more of X than X itself, the noise of X hardly affects the term of the current.
     first, of_y = seen.first, variance(seen.first, g)
     by_y = g * as_complex(jnp.sqrt(first.variance_x / of_y))
-    left = first.error_y / of_y * jnp.sqrt(first.variance_x / variance(seen.second, h))
+    left = first.variance_y / of_y * jnp.sqrt(first.variance_x / variance(seen.second, h))
     by_x = _by_noise(linear, 0, by_y) + _by_noise(linear, 2 * g.size, h * as_complex(left))
     squares = jnp.sum(part**2)
     found = Seen(

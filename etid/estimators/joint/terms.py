@@ -5,7 +5,6 @@ load, `own`, appear only in the terms of this load. A load whose current was mea
 equations for each harmonic (`etid.estimators.maximum_likelihood.with_current`).
 """
 
-import dataclasses
 import itertools
 from collections.abc import Callable
 from typing import Any
@@ -13,7 +12,7 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Complex, Float, Int
 
 from etid.circuits.circuit import AbstractCircuit
 from etid.estimators.element_limits import Limits
@@ -28,7 +27,7 @@ from etid.solvers.arrowhead import join, split
 
 SIDE_BY_SIDE = 8  # loads in one vectorised step
 
-Current = tuple[Array, ...]
+Current = tuple[Complex[Array, "*load harmonic"], Float[Array, "*load harmonic"]]
 Own = LoadUnknowns | LoadWithCurrentUnknowns
 
 
@@ -73,24 +72,6 @@ class Joint(eqx.Module):
             return Load.behind(*of, sample_rate, self.prior)
         return LoadWithCurrent.behind(*of, current, sample_rate, self.prior)
 
-    def before(
-        self,
-        driver: GivenDriver,
-        own: Own,
-        spectrum: Spectrum,
-        sample_rate: Float[Array, ""],
-        current: Current | None,
-    ) -> tuple[Spectrum, Current | None]:
-        """The records with the parts of the aliases in V_out and the current, for this load."""
-        if spectrum.alias is None:
-            return spectrum, current
-        lane = self.lane(driver, spectrum, sample_rate, current).before(own.vector())
-        if isinstance(lane, Load):
-            return dataclasses.replace(spectrum, passed=lane.spectrum.passed), None
-        known = dataclasses.replace(spectrum, passed=lane.load.spectrum.passed)
-        fields = lane.i, lane.variance_i, lane.passed_i
-        return known, tuple(of for of in fields if of is not None)
-
 
 class Loads(eqx.Module):
     """Recordings of one length with one driver, stacked along a leading axis.
@@ -102,8 +83,7 @@ class Loads(eqx.Module):
         used: Whether the recording takes part. The others are fitted, but do not affect Z_th.
         unloaded: Index of the unloaded record among those that several loads share; −1 if no other
             load has it.
-        current: Harmonics of the measured currents [A], their variances [A²], and the part of
-            the aliases in them if there are aliases; None without currents.
+        current: Harmonics of the measured currents [A], and their variances [A²]; None without.
     """
 
     spectrum: Spectrum

@@ -178,8 +178,6 @@ def fit_source(
     best = jax.tree.map(lambda leaf: leaf[0], near)
     calibration = Calibration(r_load, best.delay_samples, delay_std(r_load))
     model = Calibrations(best.source, calibration, spectra, sample_rate)
-    model = dataclasses.replace(model, spectra=model.before())
-    spectra = model.spectra
 
     def fit(tried: _Tried) -> _Tried:
         start = jax.tree.map(lambda leaf: leaf[tried.count], near)
@@ -315,17 +313,6 @@ class Calibrations(eqx.Module):
         noise = [excess(r, s.selected) for r, s in zip(parts, records, strict=True)]
         count = jacobian.shape[1]
         return Linear(jacobian, weights(shares, count), weights(noise, count))
-
-    def before(self) -> Spectrum:
-        """The calibrations with the part of their aliases in Y − G X, for the G of `start`."""
-
-        def one(spectrum: Spectrum, r_load: Float[Array, ""], late: Float[Array, ""]) -> Spectrum:
-            def gain(frequency: Float[Array, " harmonic"]) -> Complex[Array, " harmonic"]:
-                return delayed_gain(self.source, resistor(r_load), frequency, late, self.rate)
-
-            return spectrum.behind(gain, self.rate)
-
-        return jax.vmap(one)(self.spectra, self.calibration.r_load, self.calibration.delay_samples)
 
     def by_z(
         self, common: Float[Array, " common"], gains: Sequence[Complex[Array, " harmonic"]]

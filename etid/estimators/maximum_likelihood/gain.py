@@ -15,7 +15,6 @@ from etid.estimators.element_prior import ElementPrior
 from etid.estimators.maximum_likelihood.given_driver import AbstractGiven, combined
 from etid.estimators.maximum_likelihood.terms import apart
 from etid.estimators.unknowns import LoadUnknowns
-from etid.signals.harmonics import Spectrum
 from etid.signals.transfer import (
     as_complex,
     delayed,
@@ -103,16 +102,6 @@ class Gain(eqx.Module):
     ) -> Complex[Array, " frequency"]:
         """`values` · e^(−jωτ)."""
         return delayed(values, self.frequency, self.split(q)[0].delay_samples, self.sample_rate)
-
-    def before(self, spectrum: Spectrum, q: Float[Array, " q"]) -> Spectrum:
-        """A recording with the part of its aliases in Y − G X, for G at these parameters."""
-        own, load = self.split(q)[0], self.impedance(q)
-
-        def gain(frequency: Float[Array, " frequency"]) -> Complex[Array, " frequency"]:
-            found = self.driver.anywhere(load(frequency_variable(frequency)), frequency)
-            return delayed(found, frequency, own.delay_samples, self.sample_rate)
-
-        return spectrum.behind(gain, self.sample_rate)
 
     def slopes(self, q: Float[Array, " q"]) -> Slopes:
         """The gain and its derivatives."""

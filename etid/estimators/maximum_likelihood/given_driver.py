@@ -39,7 +39,7 @@ from etid.estimators.maximum_likelihood.terms import (
 from etid.estimators.score_tests.unloaded import UnloadedShape, shape_of
 from etid.estimators.starts import current_starts, harmonic_starts
 from etid.estimators.unknowns import LoadUnknowns
-from etid.results.driver import HarmonicDriver, SourceImpedance
+from etid.results.driver import HarmonicDriver
 from etid.signals.harmonics import Spectrum
 from etid.signals.knots import Knots
 from etid.signals.transfer import as_complex, reciprocal
@@ -84,12 +84,6 @@ class AbstractGiven(eqx.Module):
         self, load: Complex[Array, " harmonic"], w: Complex[Array, " harmonic"]
     ) -> Complex[Array, " harmonic"]:
         """V_out per input at W₀ + w."""
-
-    @abc.abstractmethod
-    def anywhere(
-        self, load: Complex[Array, " frequency"], frequency: Float[Array, " frequency"]
-    ) -> Complex[Array, " frequency"]:
-        """V_out per input at W₀ and other frequencies [Hz]."""
 
     @abc.abstractmethod
     def at_knots(self, knots: Knots) -> "AbstractGiven":
@@ -139,13 +133,6 @@ class GivenCurrent(AbstractGiven):
         del w
         return load
 
-    def anywhere(
-        self, load: Complex[Array, " frequency"], frequency: Float[Array, " frequency"]
-    ) -> Complex[Array, " frequency"]:
-        """Z_L."""
-        del frequency
-        return load
-
     def at_knots(self, knots: Knots) -> "GivenCurrent":
         """The same at the knots of the harmonics."""
         return GivenCurrent.at(knots.at(self.frequency))
@@ -169,7 +156,6 @@ class GivenDriver(AbstractGiven):
     """The distribution of Z_th at the harmonics of the loads, given the calibrations.
 
     Attributes:
-        source: Z_th at W₀.
         frequency: The harmonics [Hz]. The harmonics of a load may differ from them by a small
             common factor, because of clocks and of records cut to a whole number of samples.
         loaded: Z_th + R [Ω] at W₀.
@@ -185,7 +171,6 @@ class GivenDriver(AbstractGiven):
         delay_width: Prior standard deviation of the trigger delay of a load [samples].
     """
 
-    source: SourceImpedance
     frequency: Float[Array, " harmonic"]
     loaded: Complex[Array, " harmonic"]
     w_slope: Complex[Array, " harmonic"]
@@ -213,12 +198,6 @@ class GivenDriver(AbstractGiven):
     ) -> Complex[Array, " harmonic"]:
         """Z_L / (Z_L + Z_th) at W₀ + w."""
         return load * reciprocal(load + self.z_th(w))
-
-    def anywhere(
-        self, load: Complex[Array, " frequency"], frequency: Float[Array, " frequency"]
-    ) -> Complex[Array, " frequency"]:
-        """Z_L / (Z_L + Z_th) at W₀."""
-        return load * reciprocal(load + self.source.response(frequency))
 
     def starts(
         self, spectrum: Spectrum, sample_rate: Float[Array, ""], circuit: AbstractCircuit
@@ -314,7 +293,6 @@ def around(
         slopes = calibrations.gain_slopes(c, gains, calibrations.by_z(c, gains))
         known = jnp.stack([combined(directions.T, of) for of in slopes], axis=1)
     return GivenDriver(
-        source=source,
         frequency=frequency,
         loaded=loaded,
         w_slope=by_frequency * reciprocal(loaded),

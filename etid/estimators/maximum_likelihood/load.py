@@ -13,8 +13,6 @@ the gradient of ½ Σ r² is −Re Σ_k conj(∂G_k) ρ_k with ρ = 2 conj(x̂) 
 information is Re Σ_k conj(∂G_k) ∂G_k P_k with P = 2 |x̂|² / σ².
 """
 
-import dataclasses
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -62,10 +60,6 @@ class Load(eqx.Module):
         known, unloaded = driver.informed(spectrum)
         gain = Gain(driver, circuit, spectrum.frequency, sample_rate, prior)
         return cls(gain, known, unloaded)
-
-    def before(self, q: Float[Array, " q"]) -> "Load":
-        """The same with the part of the aliases in Y − G X, for G at these parameters."""
-        return dataclasses.replace(self, spectrum=self.gain.before(self.spectrum, q))
 
     @property
     def knots(self) -> Knots:

@@ -220,9 +220,7 @@ def fit_circuit(
         equations=_Evaluated.at,
         empty=_Evaluated.empty,
     )
-    near = _near(load, start, well)
-    load = load.before(near)
-    solution = refined(load, near, whole)
+    solution = refined(load, _near(load, start, well), whole)
     q, last = solution.value, solution.stats["normal_equations"]
     around = eqx.tree_at(
         lambda a: a.at.gain, last.around, load.at_knots(load.knots), is_leaf=lambda a: a is None
@@ -235,7 +233,7 @@ def fit_circuit(
     # Part of the noise that only this trial has: all, or that of V_out if V_th is shared.
     private = jnp.where(
         jnp.any(known.variance_x != spectrum.variance_x),
-        known.error_y / variance(known, g),
+        spectrum.variance_y / variance(known, g),
         1.0,
     )
     share = signal_share(around.x, known.variance_x)

@@ -54,8 +54,8 @@ def delayed_gain(
 
 
 def variance(spectrum: Spectrum, g: Complex[Array, " harmonic"]) -> Float[Array, " harmonic"]:
-    """Variance E|Y − g X|² by the noise and by aliases."""
-    return spectrum.error_y + power(g) * spectrum.variance_x
+    """Variance E|Y − g X|² by the noise."""
+    return spectrum.variance_y + power(g) * spectrum.variance_x
 
 
 def residual(spectrum: Spectrum, g: Complex[Array, " harmonic"]) -> Float[Array, " part"]:
@@ -91,11 +91,11 @@ def _learn(
     same: Bool[Array, ""] | bool,
 ) -> Spectrum:
     """`spectrum` with X updated by Y = `g` X of another record, if both have the same X."""
-    total = other.error_y + power(g) * spectrum.variance_x
+    total = other.variance_y + power(g) * spectrum.variance_x
     used = other.selected & same
     share = jnp.where(used, spectrum.variance_x / total, 0.0)
     x = spectrum.x + jnp.conj(g) * as_complex(share) * (other.y - g * spectrum.x)
-    variance = jnp.where(used, share * other.error_y, spectrum.variance_x)
+    variance = jnp.where(used, share * other.variance_y, spectrum.variance_x)
     return eqx.tree_at(lambda s: (s.x, s.variance_x), spectrum, (x, variance))
 
 

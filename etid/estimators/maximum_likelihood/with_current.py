@@ -57,12 +57,6 @@ class _CurrentOf(GivenDriver):
         """1 / (Z_L + Z_th) at W₀ + w [S]."""
         return reciprocal(load + self.z_th(w))
 
-    def anywhere(
-        self, load: Complex[Array, " frequency"], frequency: Float[Array, " frequency"]
-    ) -> Complex[Array, " frequency"]:
-        """1 / (Z_L + Z_th) at W₀ [S]."""
-        return reciprocal(load + self.source.response(frequency))
-
 
 class Seen(eqx.Module):
     """The records at some parameters.
@@ -111,14 +105,12 @@ class LoadWithCurrent(eqx.Module):
         current: Gain from X to I.
         i: Harmonics of the current [A].
         variance_i: E|noise|² of each of them [A²].
-        passed_i: The part of the aliases of X in `i`, as `Spectrum.passed` [S²]; None if not known.
     """
 
     load: Load
     current: Gain
     i: Complex[Array, " harmonic"]
     variance_i: Float[Array, " harmonic"]
-    passed_i: Float[Array, " harmonic"] | None = None
 
     @classmethod
     def behind(
@@ -126,7 +118,7 @@ class LoadWithCurrent(eqx.Module):
         driver: GivenDriver,
         circuit: AbstractCircuit,
         spectrum: Spectrum,
-        current: tuple[Array, ...],
+        current: tuple[Complex[Array, " harmonic"], Float[Array, " harmonic"]],
         sample_rate: Float[Array, ""],
         prior: ElementPrior | None = None,
     ) -> "LoadWithCurrent":
@@ -162,16 +154,8 @@ class LoadWithCurrent(eqx.Module):
         of_y, of_i = self.each(q)
         g, first = self.load.predicted(of_y)
         learned = informed(first, [first], [g])
-        second = dataclasses.replace(
-            learned, y=self.i, variance_y=self.variance_i, passed=self.passed_i
-        )
+        second = dataclasses.replace(learned, y=self.i, variance_y=self.variance_i)
         return Seen(jnp.stack([g, self.current(of_i)]), first, second)
-
-    def before(self, q: Float[Array, " q"]) -> "LoadWithCurrent":
-        """The same with the parts of the aliases in Y and I, for the gains at these parameters."""
-        of_y, of_i = self.each(q)
-        passed_i = self.current.before(self.load.spectrum, of_i).passed
-        return dataclasses.replace(self, load=self.load.before(of_y), passed_i=passed_i)
 
     def __call__(self, q: Float[Array, " q"]) -> Float[Array, " term"]:
         """Terms of the records and the priors."""
@@ -282,7 +266,6 @@ def fit_circuit(
     # First with Z_th fixed: from a distant start, a joint fit would distort Z_th.
     start = best_start(of, jnp.pad(starts, ((0, 0), (0, 2))))
     alone = refined(of, start, ROUGHLY).value
-    of = of.before(alone)
     well = dataclasses.replace(WELL, rtol=min(WELL.rtol, SETTLED / math.sqrt(4 * spectrum.x.size)))
     solution = refined(of, jnp.concatenate([alone, driver.mean]), well)
     q = solution.value

@@ -17,7 +17,6 @@ from etid.estimators.estimator import (
 from etid.estimators.judgement import SUCCESSFUL, judged, unless
 from etid.estimators.lanes import Harmonics
 from etid.estimators.maximum_likelihood.estimator import AbstractByMaximumLikelihood
-from etid.estimators.maximum_likelihood.terms import delayed_gain
 from etid.estimators.non_parametric.fit import fit_circuit
 from etid.estimators.score_tests.other_circuit import NO_OTHER_CIRCUIT, NO_OTHER_GAIN
 from etid.estimators.score_tests.unloaded import UnloadedShape
@@ -60,9 +59,6 @@ class NonParametric(AbstractByMaximumLikelihood):
         """Refine from the best of several starts."""
         spectrum, rate = lane.spectrum, jnp.asarray(lane.sample_rate)
         starts = harmonic_starts(spectrum, rate, driver.response(spectrum.frequency), circuit)
-        likeliest, late = starts.log_elements[-1], starts.delay_samples[-1]
-        load = circuit.with_log_values(likeliest).impedance()
-        spectrum = spectrum.behind(lambda f: delayed_gain(driver.source, load, f, late, rate), rate)
         estimate, bias, other = fit_circuit(circuit, driver, spectrum, rate, starts)
         # It needs only the harmonics of the driver, so the driver's verdict does not matter.
         fit = judged(estimate, circuit, SUCCESSFUL, str(self))

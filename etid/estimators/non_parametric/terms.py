@@ -85,7 +85,7 @@ class Model(eqx.Module):
             inverse_y = reciprocal(y)
             slope = as_complex(r) * inverse_y
             one = slope * s.x - as_complex(r)
-            variance = power(slope * s.x * inverse_y) * s.error_y
+            variance = power(slope * s.x * inverse_y) * s.variance_y
             z.append(one)
             by_x.append(slope)
             by_y.append(variance)
@@ -111,7 +111,7 @@ class Model(eqx.Module):
         """Variance of e, and the part that only the load has; `y` is Y without the delay."""
         spectrum = records[-1]
         load = self.load(q, spectrum.frequency)
-        own = power(load + of.z) * spectrum.error_y
+        own = power(load + of.z) * spectrum.variance_y
         rest = power(y) * of.by_y
         together, shared = -load, jnp.zeros((), dtype=bool)
         for slope, s in zip(of.by_x, records[:-1], strict=True):

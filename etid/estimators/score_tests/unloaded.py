@@ -74,7 +74,7 @@ class UnloadedShape(NamedTuple):
         angle = angle + late / jnp.sum(number**2 * power(known))
         aligned = found * turns(-angle / (2 * jnp.pi), known.size)
         amplitude = jnp.sum((aligned * jnp.conj(known)).real) / total
-        variance = spectrum.error_x + amplitude**2 * self.variance
+        variance = spectrum.variance_x + amplitude**2 * self.variance
         scale = jnp.sqrt(2 / jnp.max(jnp.where(known != 0, variance, 0.0)))
         rest = (aligned - as_complex(amplitude) * known) * as_complex(scale)
         part = jnp.concatenate([rest.real, rest.imag])
@@ -117,7 +117,7 @@ def shape(spectrum: Spectrum, drift: Float[Array | np.ndarray, ""] | None = None
     share = jnp.where(used, spectrum.variance_x / jnp.where(used, power(x), 1.0), 0.0)
     bias = directions @ (jnp.concatenate([x.real, x.imag]) * jnp.tile(share, 2))
     least = jnp.asarray(SIZE) + DRIFT * (0.0 if drift is None else drift)
-    return UnloadedShape(f, x, spectrum.error_x, directions, bias, least)
+    return UnloadedShape(f, x, spectrum.variance_x, directions, bias, least)
 
 
 def shape_of(driver: Driver, frequency: Float[Array, " harmonic"]) -> UnloadedShape | None:
