@@ -7,6 +7,7 @@ from etid.estimators.estimator import Description
 from etid.estimators.judgement import MISFIT_CHI2, MISFIT_RRSE, SUCCESSFUL
 from etid.estimators.maximum_likelihood.given_driver import GivenDriver
 from etid.estimators.registry import register_description
+from etid.estimators.score_tests.other_circuit import MOVED
 from etid.estimators.unknowns import LoadUnknowns
 from etid.online.gain_test import SEEN_GAIN
 from etid.online.pulse_fit import DELAYS, GainModel, Pulse
@@ -38,8 +39,8 @@ register_description(
             f"{MISFIT_CHI2:g} or of what noise exceeds once in ten million pulses, or an "
             f"unexplained part of at most {100 * MISFIT_RRSE:g} % of the signal)",
             "a score test, summed over the pulses since the electrode began anew, finds no "
-            "difference between the gains of the two records (at most "
-            f"{SEEN_GAIN:g} standard deviations)",
+            "difference between the gains of the two records that moves an element by "
+            f"{100 * MOVED:g} % (at most {SEEN_GAIN:g} standard deviations)",
             f"its trigger delay is at most {DELAYS[-1]:g} samples",
             "no change of the driver was seen since the calibrations",
             "every relative standard error is below 1",
