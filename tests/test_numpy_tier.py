@@ -14,7 +14,7 @@ from hypothesis.extra.numpy import arrays
 from jax import lax
 
 from etid.numpy_tier import UntranslatableError, translated
-from etid.numpy_tier.text import written
+from etid.numpy_tier.translator import written
 
 EPSILON = {"f": 8, "c": 16}  # roundings of both results; complex products add two of them
 SHAPES = ((), (3,), (0,), (2, 3), (1, 3))  # few, so that XLA compiles few programs
@@ -158,7 +158,6 @@ def test_clamped_selected_and_rounded_numbers(dtype, data, shape):
     check(lambda x: lax.round(x, lax.RoundingMethod.TO_NEAREST_EVEN), x)
     check(lax.select, filled(data, bool, shape), x, high)
     check(lax.select, filled(data, bool, ()), x, high)
-    check(lambda which, *of: lax.select_n(which, *of), np.full(shape, 2, np.int32), low, x, high)
 
 
 @pytest.mark.parametrize(
@@ -187,9 +186,6 @@ def test_numbers_of_another_type(old, new, data, shape):
         (jnp.argmax, (*REAL, np.int32)),
         (jnp.argmin, REAL),
         (jnp.cumsum, (*REAL, np.int32)),
-        (jnp.cumprod, REAL),
-        (lax.cummax, REAL),
-        (lax.cummin, REAL),
         (lambda x, axis: lax.cumsum(x, axis, reverse=True), REAL),
         (jnp.sort, (*NUMBERS, np.bool_)),
         (jnp.argsort, NUMBERS),
@@ -202,8 +198,8 @@ def test_a_function_along_an_axis(function, dtypes, data, shape, axis):
     along = functools.partial(function, axis=axis)
     for dtype in dtypes:
         check(along, filled(data, dtype, shape, finite=True), rounding=8)
-    if function is not jnp.cumprod:  # of which 0 times infinity depends on the order
-        check(along, np.where(filled(data, bool, shape), np.nan, 1.0).astype(dtypes[0]))
+    for dtype in dtypes[:1]:
+        check(along, np.where(filled(data, bool, shape), np.nan, 1.0).astype(dtype))
 
 
 def test_reductions_of_nothing():
@@ -211,8 +207,6 @@ def test_reductions_of_nothing():
     for function in (jnp.sum, jnp.prod, jnp.cumsum, jnp.sort):
         check(lambda x, of=function: of(x, axis=1), empty)
         check(lambda x, of=function: of(x, axis=0), empty)
-    check(lambda x: lax.reduce_max_p.bind(x, axes=(1,), out_sharding=None), empty)
-    check(lambda x: lax.reduce_min_p.bind(x, axes=(1,), out_sharding=None), empty)
 
 
 def test_several_arrays_sorted_by_the_first_ones():
@@ -242,7 +236,6 @@ SHAPED = {
     "unstack": lambda x: list(x),
     "dynamic slice": lambda x: lax.dynamic_slice(x, (jnp.argmax(x[:, 0, 0]), 3, 9), (2, 2, 2)),
     "dynamic index": lambda x: x[jnp.argmax(x[:, 0, 0])],
-    "dynamic update": lambda x: lax.dynamic_update_slice(x, x[:2, :2, :2], (2, 1, -1)),
     "window sum": lambda x: lax.reduce_window(x, 0.0, lax.add, (1, 3, 2), (1, 2, 1), "SAME"),
 }
 
@@ -271,7 +264,6 @@ LOOKED_UP = {
     "a diagonal": lambda x, at: jnp.diagonal(x, axis1=0, axis2=2),
     "set": lambda x, at: x.at[at[:, 0], :, at[:, 1]].set(0.5),
     "added": lambda x, at: x.at[at].add(x[:1] * 2),
-    "multiplied": lambda x, at: x.at[at % 2].multiply(3.0),
     "set, clipped": lambda x, at: x.at[at[:1, 1]].set(-1.0, mode="clip"),
     "set in windows": lambda x, at: x.at[:, 1:3, 2].set(jnp.arange(2.0)),
     "each set": lambda x, at: jax.vmap(lambda x, i: x.at[i].set(0.0))(x, at[:, 1]),

@@ -5,17 +5,16 @@ once or a few times on small arrays is therefore done sooner without XLA. `trans
 jaxpr into the source of one Python function that calls NumPy and SciPy.
 
 - `tiers` decides who runs a function; `waiting` tells a person who waits for XLA.
-- `text` makes the function of a jaxpr.
-- `translator` walks over its equations. It inlines calls, folds constants, merges equal statements
-  and moves what does not change out of loops.
-- `elementwise`, `arrays` and `algebra` have one rule for each primitive.
+- `translator` makes the function of a jaxpr. It inlines calls, folds constants, merges equal
+  statements and moves what does not change out of loops.
+- `primitives` has the text of each primitive.
 - `functions` and `indexing` are what the text calls.
 - `source` drops dead statements and writes the others.
 
 This package knows nothing of etid's models.
 """
 
-from etid.numpy_tier.text import translated
-from etid.numpy_tier.translator import UntranslatableError
+from etid.numpy_tier.primitives import UntranslatableError
+from etid.numpy_tier.translator import translated
 
 __all__ = ["UntranslatableError", "translated"]

@@ -8,7 +8,6 @@ from scipy.linalg import blas, lapack
 
 __all__ = [
     "cholesky",
-    "complex_number",
     "complex_of",
     "eigenvalues",
     "eigh",
@@ -33,16 +32,14 @@ SOLVE = {of: getattr(blas, f"{name}trsm") for of, name in zip("fdFD", "sdcz", st
 # --- Elements -------------------------------------------------------------------------------------
 
 
-def complex_of(real: Any, imag: Any, shape: tuple[int, ...], dtype: str) -> Any:
+def complex_of(real: Any, imag: Any) -> Any:
     """Complex numbers; `real + 1j * imag` would turn infinities into NaN."""
-    found = np.empty(shape, dtype)
+    dtype = np.result_type(real, np.complex64)
+    if not np.ndim(real) and not np.ndim(imag):
+        return dtype.type(complex(real, imag))
+    found = np.empty(np.broadcast_shapes(np.shape(real), np.shape(imag)), dtype)
     found.real, found.imag = real, imag
     return found
-
-
-def complex_number(real: Any, imag: Any) -> Any:
-    """One complex number."""
-    return np.result_type(real, np.complex64).type(complex(real, imag))
 
 
 def whole(of: Any, dtype: str) -> Any:

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-__all__ = ["places", "scattered", "taken_or", "updated", "window"]
+__all__ = ["places", "scattered", "taken_or", "window"]
 
 
 def places(
@@ -94,17 +94,10 @@ def scattered(of: Any, flat: Any, new: Any, how: Any) -> Any:
     return found.reshape(np.shape(of))
 
 
-def window(shape: Sequence[int], starts: Sequence[Any], sizes: Sequence[int]) -> tuple[slice, ...]:
+def window(shape: Sequence[int], sizes: Sequence[int], of: Any, *starts: Any) -> Any:
     """The window of an array that begins at some place, moved into the array if it leaves it."""
     firsts = [
         min(max(int(start), 0), length - size)
         for start, size, length in zip(starts, sizes, shape, strict=True)
     ]
-    return tuple(slice(first, first + size) for first, size in zip(firsts, sizes, strict=True))
-
-
-def updated(of: Any, new: Any, at: tuple[slice, ...]) -> Any:
-    """An array with new elements in a window."""
-    found = of.copy()
-    found[at] = new
-    return found
+    return of[tuple(slice(first, first + size) for first, size in zip(firsts, sizes, strict=True))]

@@ -17,8 +17,8 @@ import equinox as eqx
 import jax
 import jax.core
 
-from etid.numpy_tier.text import translated
-from etid.numpy_tier.translator import UntranslatableError
+from etid.numpy_tier.primitives import UntranslatableError
+from etid.numpy_tier.translator import translated
 from etid.numpy_tier.waiting import announced_later
 
 Parameters = ParamSpec("Parameters")

@@ -1,25 +1,49 @@
-"""From the equations of a jaxpr to statements of NumPy.
-
-The values of a program are arrays of known shape. A broadcast is not carried out until something
-needs all its elements: the array of a value may lack leading axes, and may have length 1 where the
-value is longer. NumPy's own broadcasting then gives the same elements.
-"""
+"""From a jaxpr to a function of NumPy arrays."""
 
 import dataclasses
-import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
 import numpy as np
-from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
+from jax.extend.core import ClosedJaxpr, Literal
 
 from etid.numpy_tier import functions, indexing
-from etid.numpy_tier.source import Append, Assign, Carry, Choice, Leave, Loop, Statement
+from etid.numpy_tier.primitives import PLACES, TEXTS, UntranslatableError
+from etid.numpy_tier.source import Statement, lines, living
+
+Program = Callable[[Sequence[Any]], list[Any]]
 
 
-class UntranslatableError(Exception):
-    """A program has a primitive, or a use of it, that has no rule."""
+def translated(program: ClosedJaxpr) -> Program:
+    """The function that a jaxpr computes, from its operands to its results.
+
+    The results have the shapes and the types that the jaxpr states, and equal those of XLA but for
+    rounding. Ctrl-C ends the function at once.
+
+    Raises:
+        UntranslatableError: The program has a primitive without a rule.
+    """
+    text, names = written(program)
+    exec(compile(text, "<a jaxpr in NumPy>", "exec"), names)
+
+    def run(operands: Sequence[Any]) -> list[Any]:
+        # A scalar of NumPy takes a third of the time of an array without axes.
+        own = [of if of.ndim else of[()] for of in map(np.asarray, operands)]
+        with np.errstate(all="ignore"):
+            return names["program"](*own)
+
+    return run
+
+
+def written(program: ClosedJaxpr) -> tuple[str, dict[str, Any]]:
+    """Text of a function `program`, and the names that it needs; errors as in `translated`."""
+    t = Translator()
+    operands = [t.variable(aval, 0, "a") for aval in program.in_avals]
+    names = [of.name for of in t.inline(program, operands)]
+    body, _ = living(t.blocks[0].body, set(names))
+    head = f"def program({','.join(of.name for of in operands)}):"
+    return "\n".join([head, *lines(body, 1), f" return [{','.join(names)}]"]), t.names
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -28,7 +52,7 @@ class Value:
 
     Attributes:
         name: Its name in the text.
-        shape: Shape of its array, which broadcasts to the shape of the value.
+        shape: Its shape.
         dtype: Type of its elements.
         depth: Number of loops around its statement; -1 for a constant.
         constant: The array of a constant.
@@ -51,26 +75,7 @@ class Block:
 
 
 Equation = Any  # a `JaxprEqn`, whose values are arrays
-Rule = Callable[..., Value | Sequence[Value]]
-RULES: dict[str, tuple[Rule, bool]] = {}
-
-
-def rule(*names: str, broadcast: bool = True) -> Callable[[Rule], Rule]:
-    """Register the rule of primitives.
-
-    Its arguments are the translator, the equation and one value for each operand, and it returns
-    the results.
-
-    Args:
-        *names: Names of the primitives.
-        broadcast: Whether the rule needs arrays with all elements.
-    """
-
-    def register(function: Rule) -> Rule:
-        RULES.update(dict.fromkeys(names, (function, broadcast)))
-        return function
-
-    return register
+AVAL = jax.ShapeDtypeStruct((), np.int64)  # of `places`, whose shape no text needs
 
 
 class Translator:
@@ -137,28 +142,15 @@ class Translator:
                 return place.known[text]
         values = [self.variable(aval, depth) for aval in avals]
         names, uses = [of.name for of in values], [of.name for of in operands]
-        places[-1].body.append(Assign(names, text, uses))
+        places[-1].body.append(Statement(f"{','.join(names)}={text}", names, uses))
         places[-1].known[text] = values
         return values
-
-    def full(self, of: Value, shape: Sequence[int]) -> Value:
-        """The value as an array with all its elements."""
-        shape = tuple(shape)
-        if of.shape == shape:
-            return of
-        if of.shape == ():
-            text = f"np.full({shape},{of.name})"
-        elif math.prod(of.shape) == math.prod(shape):
-            text = f"{of.name}.reshape({shape})"
-        else:
-            text = f"np.broadcast_to({of.name},{shape})"
-        return self.emit(text, [of], jax.ShapeDtypeStruct(shape, of.dtype))[0]
 
     # --- Equations --------------------------------------------------------------------------------
 
     def inline(self, of: ClosedJaxpr, operands: Sequence[Value]) -> list[Value]:
         """Results of a program that is part of this one."""
-        jaxpr: Jaxpr = of.jaxpr
+        jaxpr: Any = of.jaxpr
         values: dict[Any, Value] = dict(zip(jaxpr.invars, operands, strict=True))
         values |= zip(jaxpr.constvars, map(self.constant, of.consts), strict=True)
 
@@ -180,13 +172,24 @@ class Translator:
             UntranslatableError: There is no rule for it.
         """
         name = equation.primitive.name
-        if name not in RULES:
+        if name in RULES:
+            return RULES[name](self, equation, *operands)
+        if name not in TEXTS:
             return self.implementation(equation, operands)
-        function, broadcast = RULES[name]
-        if broadcast:
-            operands = self.all_full(operands, (var.aval for var in equation.invars))
-        found = function(self, equation, *operands)
-        return [found] if isinstance(found, Value) else found
+        params, avals = equation.params, [var.aval for var in equation.outvars]
+        if name in PLACES:  # numbers of elements, once for all loops
+            at = PLACES[name](params, operands).format(operands[1].name)
+            operands = [operands[0], *self.emit(at, operands[1:2], AVAL), *operands[2:]]
+        text = TEXTS[name]
+        if not isinstance(text, str):
+            text = text(params, operands, avals)
+        if text == "{}":
+            return operands
+        names = [of.name for of in operands]
+        text = text.format(*names, all=",".join(names))
+        if len(avals) == 1 and equation.primitive.multiple_results:
+            text = f"({text})[0]"
+        return self.emit(text, operands, *avals)
 
     def implementation(self, equation: Equation, operands: Sequence[Value]) -> list[Value]:
         """Results of a primitive of another package: its implementation is made of JAX's own.
@@ -212,10 +215,6 @@ class Translator:
         self._inside.remove(primitive)
         return found
 
-    def all_full(self, values: Iterable[Value], avals: Iterable[Any]) -> list[Value]:
-        """`full` for several values."""
-        return [self.full(of, aval.shape) for of, aval in zip(values, avals, strict=True)]
-
     # --- Control flow -----------------------------------------------------------------------------
 
     def choice(
@@ -226,21 +225,17 @@ class Translator:
         operands: Sequence[Value],
     ) -> list[Value]:
         """Results of one of two programs."""
-        avals, here = true.out_avals, self.blocks[-1]
+        here = self.blocks[-1]
         bodies, results = [], []
         for branch in (true, false):
             self.blocks.append(Block(here.depth))
-            results.append(self.all_full(self.inline(branch, operands), avals))
+            results.append(self.inline(branch, operands))
             bodies.append(self.blocks.pop().body)
-        values = []
-        for one, other, aval in zip(*results, avals, strict=True):
-            if one is other:
-                values.append(one)
-                continue
-            values.append(self.variable(aval, here.depth))
-            for body, of in zip(bodies, (one, other), strict=True):
-                body.append(Assign([values[-1].name], of.name, [of.name]))
-        here.body.append(Choice(condition.name, bodies[0], bodies[1], [of.name for of in values]))
+        values = [self.variable(aval, here.depth) for aval in true.out_avals]
+        for body, found in zip(bodies, results, strict=True):
+            body += [_assigned(new, old) for new, old in zip(values, found, strict=True)]
+        names = [of.name for of in values]
+        here.body.append(Statement(f"if {condition.name}:", names, [condition.name], bodies))
         return values
 
     def repeated(
@@ -261,33 +256,38 @@ class Translator:
         """
         here = self.blocks[-1]
         carried = [self.variable(aval, here.depth + 1, "w") for aval in avals]
-        names = [of.name for of in carried]
-        start = self.all_full(start, avals)
         self.blocks.append(Block(here.depth + 1))
         body = self.blocks[-1].body
         after, made = step(carried, here.depth + 1)
-        after = self.all_full(after, avals)
         lists = [self.name("l") for _ in made]
-        body += [Append(to, of.name) for to, of in zip(lists, made, strict=True)]
-        body.append(Carry(names, [of.name for of in after]))
+        for to, of in zip(lists, made, strict=True):
+            body.append(Statement(f"{to}.append({of.name})", [to], [to, of.name]))
+        # A carried value that becomes another one is kept until all are assigned.
+        after = [
+            self.emit(of.name, [of], jax.ShapeDtypeStruct(of.shape, of.dtype))[0]
+            if of in carried and of is not own
+            else of
+            for own, of in zip(carried, after, strict=True)
+        ]
+        pairs = zip(carried, after, strict=True)
+        body += [_assigned(own, of) for own, of in pairs if of is not own]
         self.blocks.pop()
-        here.body.append(Carry(names, [of.name for of in start]))
-        here.body += [Assign([to], "[]", []) for to in lists]
-        here.body.append(Loop(head, body, names + lists))
+        here.body += [_assigned(own, of) for own, of in zip(carried, start, strict=True)]
+        here.body += [Statement(f"{to}=[]", [to], []) for to in lists]
+        names = [of.name for of in carried] + lists
+        here.body.append(Statement(head, names, [], [body]))
         return [dataclasses.replace(of, depth=here.depth) for of in carried], lists
 
 
-@rule("jit", "pjit", "closed_call", "core_call", "remat", "checkpoint", broadcast=False)
-@rule("custom_jvp_call", "custom_vjp_call", "custom_vjp_call_jaxpr", broadcast=False)
+def _assigned(new: Value, old: Value) -> Statement:
+    return Statement(f"{new.name}={old.name}", [new.name], [old.name])
+
+
 def _call(t: Translator, equation: Equation, *operands: Value) -> list[Value]:
     params = equation.params
-    names = ("jaxpr", "call_jaxpr", "fun_jaxpr")
-    inner = next(params[name] for name in names if name in params)
-    closed = inner if isinstance(inner, ClosedJaxpr) else ClosedJaxpr(inner, ())
-    return t.inline(closed, operands)
+    return t.inline(params["jaxpr"] if "jaxpr" in params else params["call_jaxpr"], operands)
 
 
-@rule("custom_linear_solve", broadcast=False)
 def _solve(t: Translator, equation: Equation, *operands: Value) -> list[Value]:
     lengths, programs = equation.params["const_lengths"], equation.params["jaxprs"]
     first = lengths.matvec + lengths.vecmat
@@ -295,7 +295,6 @@ def _solve(t: Translator, equation: Equation, *operands: Value) -> list[Value]:
     return t.inline(programs.solve, [*own, *operands[sum(lengths) :]])
 
 
-@rule("cond", broadcast=False)
 def _cond(t: Translator, equation: Equation, index: Value, *operands: Value) -> list[Value]:
     branches = equation.params["branches"]
     if index.constant is not None:
@@ -305,7 +304,6 @@ def _cond(t: Translator, equation: Equation, index: Value, *operands: Value) -> 
     return t.choice(index, branches[1], branches[0], operands)
 
 
-@rule("while", broadcast=False)
 def _while(t: Translator, equation: Equation, *operands: Value) -> list[Value]:
     params = equation.params
     first = params["cond_nconsts"]
@@ -314,7 +312,8 @@ def _while(t: Translator, equation: Equation, *operands: Value) -> list[Value]:
     def step(carried: list[Value], _: int) -> tuple[list[Value], list[Value]]:
         (goes_on,) = t.inline(params["cond_jaxpr"], [*operands[:first], *carried])
         one = t.emit(f"{goes_on.name}.any()", [goes_on], scalar)[0] if lanes.shape else goes_on
-        t.blocks[-1].body.append(Leave(one.name))
+        leave = Statement(f"if not {one.name}: break", (), [one.name])
+        t.blocks[-1].body.append(leave)
         after = t.inline(params["body_jaxpr"], [*operands[first:second], *carried])
         if lanes.shape:  # those that have ended keep their values
             after = [_lanes(t, goes_on, *of) for of in zip(after, carried, strict=True)]
@@ -323,7 +322,7 @@ def _while(t: Translator, equation: Equation, *operands: Value) -> list[Value]:
     avals = [var.aval for var in equation.outvars]
     (lanes,) = params["cond_jaxpr"].out_avals
     scalar = jax.ShapeDtypeStruct((), bool)
-    return t.repeated("while True", operands[second:], avals, step)[0]
+    return t.repeated("while True:", operands[second:], avals, step)[0]
 
 
 def _lanes(t: Translator, which: Value, new: Value, old: Value) -> Value:
@@ -333,14 +332,13 @@ def _lanes(t: Translator, which: Value, new: Value, old: Value) -> Value:
     return t.emit(text, [which, new, old], jax.ShapeDtypeStruct(old.shape, old.dtype))[0]
 
 
-@rule("scan", broadcast=False)
 def _scan(t: Translator, equation: Equation, *operands: Value) -> list[Value]:
     params = equation.params
     first = params["num_consts"]
     second = first + params["num_carry"]
     avals = [var.aval for var in equation.outvars]
     of_steps = avals[params["num_carry"] :]
-    rows = t.all_full(operands[second:], (var.aval for var in equation.invars[second:]))
+    rows = operands[second:]
     number, length = t.name("i"), params["length"]
     steps = f"range({length - 1},-1,-1)" if params["reverse"] else f"range({length})"
 
@@ -349,18 +347,29 @@ def _scan(t: Translator, equation: Equation, *operands: Value) -> list[Value]:
         for of in rows:
             aval = jax.ShapeDtypeStruct(of.shape[1:], of.dtype)
             own.append(t.variable(aval, depth))
-            text = Assign([own[-1].name], f"{of.name}[{number}]", [of.name])
-            t.blocks[-1].body.append(text)
+            row = Statement(f"{own[-1].name}={of.name}[{number}]", [own[-1].name], [of.name])
+            t.blocks[-1].body.append(row)
         found = t.inline(params["jaxpr"], [*operands[:first], *carried, *own])
-        made, inner = found[params["num_carry"] :], params["jaxpr"].out_avals[params["num_carry"] :]
-        return found[: params["num_carry"]], t.all_full(made, inner)
+        return found[: params["num_carry"]], found[params["num_carry"] :]
 
-    head = f"for {number} in {steps}"
+    head = f"for {number} in {steps}:"
     carried, lists = t.repeated(head, operands[first:second], avals[: params["num_carry"]], step)
     order = "[::-1]" if params["reverse"] else ""
     stacked = []
     for name, aval in zip(lists, of_steps, strict=True):
         stacked.append(t.variable(aval, t.blocks[-1].depth))
-        text = f"np.array({name}{order},'{aval.dtype}').reshape({aval.shape})"
-        t.blocks[-1].body.append(Assign([stacked[-1].name], text, [name]))
+        text = f"{stacked[-1].name}=np.array({name}{order},'{aval.dtype}').reshape({aval.shape})"
+        t.blocks[-1].body.append(Statement(text, [stacked[-1].name], [name]))
     return [*carried, *stacked]
+
+
+RULES = {
+    "cond": _cond,
+    "custom_jvp_call": _call,
+    "custom_linear_solve": _solve,
+    "custom_vjp_call": _call,
+    "jit": _call,
+    "pjit": _call,
+    "scan": _scan,
+    "while": _while,
+}
