@@ -2,7 +2,7 @@
 
 All loads share Z_th and the delays of the calibrations, `common`. The elements and the delays of a
 load, `own`, appear only in the terms of this load. A load whose current was measured has two
-equations for each harmonic (`etid.estimators.maximum_likelihood.with_current`).
+outputs.
 """
 
 import dataclasses
@@ -21,7 +21,6 @@ from etid.estimators.element_prior import ElementPrior
 from etid.estimators.maximum_likelihood.driver import Calibrations
 from etid.estimators.maximum_likelihood.given_driver import GivenDriver, around
 from etid.estimators.maximum_likelihood.load import Load
-from etid.estimators.maximum_likelihood.with_current import LoadWithCurrent
 from etid.estimators.unknowns import LoadUnknowns, LoadWithCurrentUnknowns
 from etid.signals.harmonics import Spectrum
 from etid.solvers.arrowhead import join, split
@@ -66,12 +65,9 @@ class Joint(eqx.Module):
         spectrum: Spectrum,
         sample_rate: Float[Array, ""],
         current: Current | None,
-    ) -> Load | LoadWithCurrent:
+    ) -> Load:
         """One load behind this driver."""
-        of = driver, self.circuit, spectrum
-        if current is None:
-            return Load.behind(*of, sample_rate, self.prior)
-        return LoadWithCurrent.behind(*of, current, sample_rate, self.prior)
+        return Load.behind(driver, self.circuit, spectrum, sample_rate, self.prior, current)
 
     def before(
         self,
@@ -84,11 +80,9 @@ class Joint(eqx.Module):
         """The records with the parts of the aliases in V_out and the current, for this load."""
         if spectrum.alias is None:
             return spectrum, current
-        lane = self.lane(driver, spectrum, sample_rate, current).before(own.vector())
-        if isinstance(lane, Load):
-            return dataclasses.replace(spectrum, passed=lane.spectrum.passed), None
-        known = dataclasses.replace(spectrum, passed=lane.load.spectrum.passed)
-        return known, (lane.i, lane.variance_i, lane.passed_i)
+        passed = self.lane(driver, spectrum, sample_rate, current).gains.passed(own.vector())
+        known = dataclasses.replace(spectrum, passed=passed[0])
+        return known, None if current is None else (*current[:2], passed[1])
 
 
 class Loads(eqx.Module):
@@ -134,7 +128,7 @@ class DriverStudy(eqx.Module):
     model: Joint
     groups: list[Loads]
 
-    def lane(self, driver: GivenDriver, load: Loads) -> Load | LoadWithCurrent:
+    def lane(self, driver: GivenDriver, load: Loads) -> Load:
         """One load behind this driver."""
         return self.model.lane(driver, load.spectrum, load.sample_rate, load.current)
 

@@ -80,16 +80,16 @@ class AbstractGiven(eqx.Module):
     delay_width: eqx.AbstractVar[Float[Array, ""]]
 
     @abc.abstractmethod
-    def gain(
-        self, load: Complex[Array, " harmonic"], w: Complex[Array, " harmonic"]
-    ) -> Complex[Array, " harmonic"]:
-        """V_out per input at W₀ + w."""
+    def transfer(
+        self, load: Complex[Array, " harmonic"], w: Complex[Array, " harmonic"], outputs: int
+    ) -> Complex[Array, "output harmonic"]:
+        """V_out per input at W₀ + w, and the current per input if there are two outputs."""
 
     @abc.abstractmethod
     def anywhere(
-        self, load: Complex[Array, " frequency"], frequency: Float[Array, " frequency"]
-    ) -> Complex[Array, " frequency"]:
-        """V_out per input at W₀ and other frequencies [Hz]."""
+        self, load: Complex[Array, "_"], frequency: Float[Array, "_"], outputs: int
+    ) -> Complex[Array, "output _"]:
+        """The same at W₀ and other frequencies [Hz]."""
 
     @abc.abstractmethod
     def at_knots(self, knots: Knots) -> "AbstractGiven":
@@ -132,19 +132,19 @@ class GivenCurrent(AbstractGiven):
             delay_width=width,
         )
 
-    def gain(
-        self, load: Complex[Array, " harmonic"], w: Complex[Array, " harmonic"]
-    ) -> Complex[Array, " harmonic"]:
+    def transfer(
+        self, load: Complex[Array, " harmonic"], w: Complex[Array, " harmonic"], outputs: int
+    ) -> Complex[Array, "output harmonic"]:
         """Z_L."""
-        del w
-        return load
+        del w, outputs
+        return load[None, :]
 
     def anywhere(
-        self, load: Complex[Array, " frequency"], frequency: Float[Array, " frequency"]
-    ) -> Complex[Array, " frequency"]:
+        self, load: Complex[Array, "_"], frequency: Float[Array, "_"], outputs: int
+    ) -> Complex[Array, "output _"]:
         """Z_L."""
-        del frequency
-        return load
+        del frequency, outputs
+        return load[None, :]
 
     def at_knots(self, knots: Knots) -> "GivenCurrent":
         """The same at the knots of the harmonics."""
@@ -208,17 +208,19 @@ class GivenDriver(AbstractGiven):
             self.resistance
         )
 
-    def gain(
-        self, load: Complex[Array, " harmonic"], w: Complex[Array, " harmonic"]
-    ) -> Complex[Array, " harmonic"]:
-        """Z_L / (Z_L + Z_th) at W₀ + w."""
-        return load * reciprocal(load + self.z_th(w))
+    def transfer(
+        self, load: Complex[Array, " harmonic"], w: Complex[Array, " harmonic"], outputs: int
+    ) -> Complex[Array, "output harmonic"]:
+        """Z_L / (Z_L + Z_th) and 1 / (Z_L + Z_th) [S] at W₀ + w."""
+        loop = reciprocal(load + self.z_th(w))
+        return jnp.stack([load * loop, loop][:outputs])
 
     def anywhere(
-        self, load: Complex[Array, " frequency"], frequency: Float[Array, " frequency"]
-    ) -> Complex[Array, " frequency"]:
-        """Z_L / (Z_L + Z_th) at W₀."""
-        return load * reciprocal(load + self.source.response(frequency))
+        self, load: Complex[Array, "_"], frequency: Float[Array, "_"], outputs: int
+    ) -> Complex[Array, "output _"]:
+        """The same at W₀ and other frequencies [Hz]."""
+        loop = reciprocal(load + self.source.response(frequency))
+        return jnp.stack([load * loop, loop][:outputs])
 
     def starts(
         self, spectrum: Spectrum, sample_rate: Float[Array, ""], circuit: AbstractCircuit
