@@ -59,17 +59,17 @@ class Condensed(eqx.Module):
         factors = jnp.stack(root[::-1]), jnp.stack(target[::-1])
         return cls(every.at(profile.gains), *factors, size)
 
-    def rows(self, change: Complex[Array, "*row output knot"]) -> Float[Array, "*row part"]:
+    def rows(self, changes: Complex[Array, "row output knot"]) -> Float[Array, "row part"]:
         """Changes of the terms by changes of the gains."""
         found = [
-            sum(self.root[i, j] * change[..., j, :] for j in range(i + 1))
+            sum(self.root[i, j][None, :] * changes[:, j] for j in range(i + 1))
             for i in range(self.root.shape[0])
         ]
         return -real_parts(jnp.concatenate(found, axis=-1))
 
     def terms(self, gains: Complex[Array, "output knot"]) -> Float[Array, " part"]:
         """The terms at gains near G₀."""
-        return self.rows(gains - self.gains) + self.part
+        return self.rows((gains - self.gains)[None])[0] + self.part
 
     @property
     def part(self) -> Float[Array, " part"]:

@@ -152,7 +152,7 @@ class Gains(eqx.Module):
         alone = as_complex(jnp.eye(self.outputs))[:, :, None]
         rows = [
             by_element[:, None] * by_load[None],
-            alone * (-s * as_complex(1 / self.sample_rate) * value)[None],
+            alone * ((-s * as_complex(1 / self.sample_rate))[None, :] * value)[None],
             self.driver.slope[:, None] * by_w[None],
         ]
         return Slopes(z_load, value, by_load, jnp.concatenate(rows))

@@ -106,11 +106,8 @@ class Load(eqx.Module):
     @property
     def terms(self) -> Float[Array, ""]:
         """Number of terms of the records."""
-        return (
-            2
-            * self.gains.outputs
-            * jnp.sum(self.records.selected, dtype=self.records.variance_x.dtype)
-        )
+        used = jnp.sum(self.records.selected, dtype=self.records.variance_x.dtype)
+        return 2 * self.records.y.shape[0] * used
 
     def before(self, q: Float[Array, " q"]) -> "Load":
         """The same with the part of the aliases in the outputs, for the gains at `q`."""

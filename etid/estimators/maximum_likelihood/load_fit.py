@@ -254,7 +254,9 @@ def fit_circuit(
     others = linear.told(rows[of_gain][None])[0] @ information
     slopes = near.by_unknown(near.slopes)
     made = combined(others, slopes.reshape(q.size, -1)).reshape(slopes.shape[1:])
-    explained = as_complex(-found.size[of_gain]) * profile.x * every.between(tested[of_gain] - made)
+    explained = (as_complex(-found.size[of_gain]) * profile.x)[None, :] * every.between(
+        tested[of_gain] - made
+    )
     wrong_gain = (jnp.abs(found.z[of_gain]) > NO_HUM) & ~profile.shows_hum(
         records, profile.whitened(explained)
     )

@@ -124,25 +124,26 @@ class Profile(eqx.Module):
         return cls(gains, *parts, weight, jnp.stack(innovations), x)
 
     def whitened(
-        self, change: Complex[Array, "*row output harmonic"]
-    ) -> Complex[Array, "*row output harmonic"]:
-        """Innovations, not scaled, of changes of the outputs."""
-        x, found = jnp.zeros_like(change[..., 0, :]), []
-        for number in range(self.gains.shape[0]):
-            found.append(change[..., number, :] - self.gains[number] * x)
-            x = x + self.towards[number] * found[-1]
-        return jnp.stack(found, axis=-2)
+        self, change: Complex[Array, "output harmonic"]
+    ) -> Complex[Array, "output harmonic"]:
+        """Innovations, not scaled, of a change of the outputs."""
+        x, found = jnp.zeros_like(self.x), []
+        for of, g, towards in zip(change, self.gains, self.towards, strict=True):
+            found.append(of - g * x)
+            x = x + towards * found[-1]
+        return jnp.stack(found)
 
     def weighted(
-        self, innovations: Complex[Array, "*row output harmonic"]
-    ) -> Complex[Array, "*row output harmonic"]:
-        """2 Σ⁻¹ times changes of the outputs, from their innovations."""
+        self, innovations: Complex[Array, "output harmonic"]
+    ) -> Complex[Array, "output harmonic"]:
+        """2 Σ⁻¹ times a change of the outputs, from its innovations."""
         scaled = innovations * as_complex(self.weight)
-        back, found = jnp.zeros_like(scaled[..., 0, :]), []
-        for number in reversed(range(self.gains.shape[0])):
-            found.append(scaled[..., number, :] + jnp.conj(self.towards[number]) * back)
-            back = back - jnp.conj(self.gains[number]) * found[-1]
-        return jnp.stack(found[::-1], axis=-2)
+        back, found = jnp.zeros_like(self.x), []
+        each = list(zip(scaled, self.gains, self.towards, strict=True))
+        for of, g, towards in reversed(each):
+            found.append(of + jnp.conj(towards) * back)
+            back = back - jnp.conj(g) * found[-1]
+        return jnp.stack(found[::-1])
 
     @property
     def pull(self) -> Complex[Array, "output harmonic"]:
@@ -158,9 +159,9 @@ class Profile(eqx.Module):
     def information(self) -> Complex[Array, "output output harmonic"]:
         """P."""
         outputs, harmonics = self.gains.shape
-        unit = as_complex(jnp.eye(outputs))[:, :, None]
-        each = self.weighted(self.whitened(jnp.tile(unit, (1, 1, harmonics))))
-        return jnp.swapaxes(each, 0, 1) * as_complex(power(self.x))
+        unit = jnp.tile(as_complex(jnp.eye(outputs))[:, :, None], (1, 1, harmonics))
+        columns = jnp.stack([self.weighted(self.whitened(one)) for one in unit], axis=1)
+        return columns * as_complex(power(self.x))[None, None, :]
 
     @property
     def terms(self) -> Float[Array, "output part"]:

@@ -119,12 +119,12 @@ def score(
     rows = slopes.reshape(slopes.shape[0], -1)
     others = (rows.real @ parts.real - rows.imag @ parts.imag) @ covariance
     made = jax.lax.complex(others @ rows.real, others @ rows.imag).reshape(slopes.shape[1:])
-    direction = added - profile.x * knots.between(made)
+    direction = added - profile.x[None, :] * knots.between(made)
     total = jnp.sum((jnp.conj(direction) * profile.pull).real) + jnp.dot(others, rest)
     of_priors = others @ spread @ others
     squares = profile.weight * power(profile.whitened(direction))
     variance = jnp.sum(squares * noise) + of_priors
-    curvature = jnp.sum(squares * share) + of_priors
+    curvature = jnp.sum(squares * share[None, :]) + of_priors
     return Falling(
         total / jnp.sqrt(variance),
         jnp.abs(total) / curvature * jnp.max(jnp.abs(others[:elements])),
