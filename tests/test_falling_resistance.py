@@ -73,11 +73,12 @@ def test_what_counts_is_what_the_parameters_cannot_do():
     rows, row, residual = (np.asarray(of) for of in (rows, real_parts(added), real_parts(error)))
     rest = row - np.linalg.lstsq(rows.T, row, rcond=None)[0] @ rows
     ones, none = jnp.ones((1, HARMONICS)), jnp.zeros((3, 3))
+    still = jnp.zeros((1, HARMONICS), complex)
     covariance = jnp.asarray(np.linalg.inv(rows @ rows.T))
     found = jax.jit(
         lambda added, error: score(
             added[None],
-            Profile(0j * ones, 0j * ones, ones, ones, error[None], x),
+            Profile(still, still, ones, ones, error[None], x),
             ones[0],
             ones,
             slopes[:, None],
