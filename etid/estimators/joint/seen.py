@@ -10,6 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Complex, Float
 
 from etid.estimators.joint.terms import DriverStudy, Loads, Own
+from etid.estimators.maximum_likelihood.condensed import means
 from etid.estimators.maximum_likelihood.given_driver import GivenDriver
 from etid.estimators.maximum_likelihood.load import Load, changes
 from etid.estimators.sandwich import Linear
@@ -58,8 +59,8 @@ def seen_at(
     profile, condensed = near.profile, near.condensed
     noise = profile.excess(records)
     share = jnp.broadcast_to(signal_share(profile.x, records.variance_x), noise.shape)
-    means = condensed.mean(profile, lane.knots, jnp.stack([share, noise]))
-    linear = _linear(lane, q, o, near.jacobian, means)
+    of_noise = means(profile, lane.knots, jnp.stack([share, noise]))
+    linear = _linear(lane, q, o, near.jacobian, of_noise)
     rows = _padded(condensed.rows(changes(lane, near)), o)
     seen = Seen(
         chi2=2 * profile.objective / (lane.terms - o),

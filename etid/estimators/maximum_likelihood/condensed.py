@@ -31,13 +31,11 @@ class Condensed(eqx.Module):
         gains: G₀.
         root: C.
         target: t.
-        power: Sums of the diagonal of P.
     """
 
     gains: Complex[Array, "output knot"]
     root: Complex[Array, "output output knot"]
     target: Complex[Array, "output knot"]
-    power: Float[Array, "output knot"]
 
     @classmethod
     def of(cls, profile: Profile, every: Knots) -> "Condensed":
@@ -47,7 +45,6 @@ class Condensed(eqx.Module):
         real, imaginary = every.summed(jnp.stack([rows.real, rows.imag]))
         sums = jax.lax.complex(real, imaginary)
         p, score = sums[: outputs**2].reshape(outputs, outputs, -1), sums[outputs**2 :]
-        size = jnp.stack([p[number, number].real for number in range(outputs)])
         root, target = [], []
         for number in reversed(range(outputs)):  # Cholesky's factors, the last output first
             left = p[number, number].real
@@ -56,8 +53,7 @@ class Condensed(eqx.Module):
             target.append(score[number] * scale)
             p = p - jnp.conj(root[-1])[:, None] * root[-1][None]
             score = score - jnp.conj(root[-1]) * target[-1][None]
-        factors = jnp.stack(root[::-1]), jnp.stack(target[::-1])
-        return cls(every.at(profile.gains), *factors, size)
+        return cls(every.at(profile.gains), jnp.stack(root[::-1]), jnp.stack(target[::-1]))
 
     def rows(self, changes: Complex[Array, "row output knot"]) -> Float[Array, "row part"]:
         """Changes of the terms by changes of the gains."""
@@ -76,12 +72,12 @@ class Condensed(eqx.Module):
         """The terms at G₀."""
         return real_parts(self.target.reshape(-1))
 
-    def mean(
-        self, profile: Profile, every: Knots, values: Float[Array, "row output harmonic"]
-    ) -> Float[Array, "row part"]:
-        """Means of `values` around the knots, weighted with the diagonal of P."""
-        p = profile.information
-        own = jnp.stack([p[number, number].real for number in range(p.shape[0])])
-        sums = every.summed(values * own[None])
-        means = sums / jnp.where(self.power > 0, self.power, 1.0)[None]
-        return jnp.tile(means.reshape(values.shape[0], -1), (1, 2))
+
+def means(
+    profile: Profile, every: Knots, values: Float[Array, "row output harmonic"]
+) -> Float[Array, "row part"]:
+    """Means of `values` of the innovations for each condensed term, weighted by information."""
+    size = profile.size
+    total, sums = jnp.split(every.summed(jnp.concatenate([size[None], values * size[None]])), (1,))
+    found = sums / jnp.where(total > 0, total, 1.0)
+    return jnp.tile(found.reshape(values.shape[0], -1), (1, 2))

@@ -154,10 +154,10 @@ class Load(eqx.Module):
         condensed = apart(lambda _: Condensed.of(profile, every), q)
         slopes, by_x = apart(self.gains.at(every).slopes, q), None
         if self.unloaded is not None:
-            weight = profile.information[0, 0] * reciprocal(profile.x)
-            sums = every.summed(weight[None, :] * self.unloaded.x)
-            total = condensed.power[0]
-            by_x = sums * as_complex(1 / jnp.where(total > 0, total, 1.0))[None, :]
+            relative = self.unloaded.x * reciprocal(profile.x)[None, :]
+            size, total = profile.size[0], every.summed(profile.size[0])
+            by_x = every.summed(as_complex(size)[None, :] * relative)
+            by_x = by_x * as_complex(1 / jnp.where(total > 0, total, 1.0))[None, :]
         return Near(q, profile, condensed, slopes, by_x)
 
     def by_x(self, near: Near) -> Float[Array, "z harmonic"]:

@@ -17,6 +17,7 @@ from jaxtyping import Array, Bool, Float
 from etid.circuits.circuit import AbstractCircuit
 from etid.estimators.element_prior import ElementPrior
 from etid.estimators.estimate import MAX_STEPS, SOLVER, Estimate
+from etid.estimators.maximum_likelihood.condensed import means
 from etid.estimators.maximum_likelihood.given_driver import AbstractGiven, combined
 from etid.estimators.maximum_likelihood.load import AtKnots, Load, Near, by_falling, changes
 from etid.estimators.sandwich import Linear
@@ -215,8 +216,8 @@ def fit_circuit(
         1.0,
     )
     share = signal_share(profile.x, records.variance_x)
-    means = jnp.stack([jnp.broadcast_to(share, noise.shape), noise, private * noise])
-    mean_share, mean_noise, own_noise = condensed.mean(profile, every, means)
+    values = jnp.stack([jnp.broadcast_to(share, noise.shape), noise, private * noise])
+    mean_share, mean_noise, own_noise = means(profile, every, values)
     linear = Linear(jacobian, mean_share, mean_noise, jnp.diag(prior))
     information = linear.bread()
     elements = information[:count]

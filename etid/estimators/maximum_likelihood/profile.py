@@ -164,6 +164,11 @@ class Profile(eqx.Module):
         return columns * as_complex(power(self.x))[None, None, :]
 
     @property
+    def size(self) -> Float[Array, "output harmonic"]:
+        """Information of each innovation about its gain."""
+        return self.weight * power(self.x)[None, :]
+
+    @property
     def terms(self) -> Float[Array, "output part"]:
         """Innovations, scaled to unit variance; Σ of their squares is D."""
         return real_parts(self.innovations * as_complex(jnp.sqrt(self.weight)))
