@@ -190,6 +190,8 @@ def fit_circuit(
     # First at the knots of one point, and with Z_th fixed: from a distant start, a joint fit would
     # distort Z_th.
     start = _chosen(load, starts)
+    if current is not None:  # its starts have no delay
+        start = refined(load, start, ROUGHLY).value
     rtol = min(WELL.rtol, SETTLED / math.sqrt(2 * load.records.y.size))
     well = dataclasses.replace(WELL, rtol=rtol, damping=SLIGHT)
     whole = dataclasses.replace(
