@@ -1,13 +1,16 @@
 """Score test of a resistance that falls with its current: statistics, false alarms, power."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import etid
+from benchmarks.laboratory import SCALE, Record
 from benchmarks.perturbation_list import PERTURBATIONS
-from benchmarks.perturbed_study import undisturbed
+from benchmarks.perturbed_study import nonlinear, undisturbed
 from etid.estimators.score_tests.falling_resistance import SEEN, added_voltage, score
 from etid.recordings.remarks import Remark
 from etid.signals.harmonics import real_parts
@@ -92,6 +95,32 @@ def test_skin_that_loses_a_fifth_of_its_resistance_is_a_misfit_at_40_db():
     assert fits.counts() == {"misfit": 6}
     assert fallen(fits).all()
     assert "depend" in str(fits[0])
+
+
+def with_current(of: Record, seed: int) -> etid.Recording:
+    """The recording with its current, (V_th − V_out) / Z_th with noise at 40 dB."""
+
+    def current(driver, sampler):
+        v_th = sampler.pulse_rate * driver.v_th_spectrum(sampler.f)
+        return (v_th - of.out.voltage(driver, sampler)) / driver.z_th(sampler.f)
+
+    rng = np.random.default_rng([seed, 17])
+    measured = dataclasses.replace(of.out, voltage=current)
+    i = measured.volts(of.sample_rate, of.samples, rng) / SCALE
+    noise = 1e-2 * np.sqrt(np.mean(i**2)) * rng.standard_normal(i.size)
+    return of.recording(seed).replace(current=i + noise)
+
+
+@pytest.mark.parametrize("snr_db", [40.0, 60.0])
+def test_skin_that_loses_a_twentieth_is_seen_with_a_driver_and_a_current(snr_db):
+    """χ² is 1.0 to 1.1 at 40 dB; without this score all were `successful`."""
+    study = nonlinear(0.05)(undisturbed(1, snr_db))
+    driver = etid.identify_driver([of.recording(1) for of in study.calibrations])
+    records = [with_current(of, 1000 + seed) for of in study.trials for seed in range(3)]
+    fits = etid.identify_skins(records, driver)
+    assert fits.counts().keys() <= {"misfit", "inconsistent"}
+    if snr_db == 40.0:
+        assert fallen(fits).any()  # where it explains most of the misfit
 
 
 @pytest.mark.slow

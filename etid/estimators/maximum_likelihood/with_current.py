@@ -292,7 +292,8 @@ def fit_circuit(
 
     squares, terms = jnp.sum(part**2), 4 * jnp.sum(spectrum.selected, dtype=q.dtype)
     chi2 = squares / (terms - count - 2)
-    falling = falling_resistance.Falling(falls.z, falls.moved, falls.z**2 * jnp.maximum(chi2, 1.0))
+    # The rows are changes of measured minus predicted records: a fall has a negative score there.
+    falling = falling_resistance.Falling(-falls.z, falls.moved, falls.z**2 * jnp.maximum(chi2, 1.0))
 
     elements = information[:count]
     by_term = elements @ rows
