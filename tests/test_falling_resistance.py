@@ -102,7 +102,8 @@ def with_current(of: Record, seed: int) -> etid.Recording:
 
     def current(driver, sampler):
         v_th = sampler.pulse_rate * driver.v_th_spectrum(sampler.f)
-        return (v_th - of.out.voltage(driver, sampler)) / driver.z_th(sampler.f)
+        v_out = of.out.coefficients(of.out.loads[-1], sampler)
+        return (v_th - v_out) / driver.z_th(sampler.f)
 
     rng = np.random.default_rng([seed, 17])
     measured = dataclasses.replace(of.out, voltage=current)
