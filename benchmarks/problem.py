@@ -9,9 +9,10 @@ from jaxtyping import Array, Float
 import etid
 from etid.circuits.circuit import SkinRC
 from etid.estimators.lanes import Harmonics, stacked
-from etid.estimators.maximum_likelihood.gain import Gain
+from etid.estimators.maximum_likelihood.gains import Gains
 from etid.estimators.maximum_likelihood.given_driver import GivenDriver
 from etid.estimators.maximum_likelihood.load import Load
+from etid.estimators.maximum_likelihood.profile import Records
 from etid.estimators.registry import MAXIMUM_LIKELIHOOD
 from etid.identify.one import known_of
 from etid.recordings.preflight import Inspected
@@ -51,8 +52,8 @@ class Problem(NamedTuple):
     def load(self, one: Any) -> Load:
         """A lane with Z_th as it is; calling it gives the terms of elements and delay."""
         rate = jnp.asarray(one.sample_rate)
-        spectrum = one.spectrum
-        return Load(Gain(self.known, SkinRC(), spectrum.frequency, rate), spectrum, None)
+        gains = Gains(self.known, SkinRC(), one.spectrum.frequency, rate)
+        return Load(gains, Records.of(one.spectrum), None)
 
 
 def terms(own: Float[Array, " own"], load: Load) -> Float[Array, " term"]:
@@ -96,17 +97,17 @@ class ByNumPy:
     """
 
     def __init__(self, load: Load):
-        spectrum = load.spectrum
+        spectrum = load.records
         used = np.asarray(spectrum.selected)
-        self.x, self.y = np.asarray(spectrum.x)[used], np.asarray(spectrum.y)[used]
+        self.x, self.y = np.asarray(spectrum.x)[used], np.asarray(spectrum.y[0])[used]
         self.of_x = np.asarray(spectrum.variance_x)[used]
-        self.of_y = np.asarray(spectrum.variance_y)[used]
+        self.of_y = np.asarray(spectrum.variance_y[0])[used]
         self.s = 2j * np.pi * np.asarray(spectrum.frequency)[used]
-        driver = load.gain.driver
+        driver = load.gains.driver
         assert isinstance(driver, GivenDriver)
-        self.z_th = np.asarray(driver.z_th(load.gain.w(driver.mean)))[used]
-        self.rate = float(load.gain.sample_rate)
-        self.width = float(load.gain.widths(jnp.zeros(4))[-1])
+        self.z_th = np.asarray(driver.z_th(load.gains.w(driver.mean)))[used]
+        self.rate = float(load.gains.sample_rate)
+        self.width = float(load.gains.widths(jnp.zeros(4))[-1])
 
     def _parts(self, q: np.ndarray):
         r_s, r_p, c_p = np.exp(q[:3])

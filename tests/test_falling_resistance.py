@@ -11,6 +11,7 @@ import etid
 from benchmarks.laboratory import SCALE, Record
 from benchmarks.perturbation_list import PERTURBATIONS
 from benchmarks.perturbed_study import nonlinear, undisturbed
+from etid.estimators.maximum_likelihood.profile import Profile
 from etid.estimators.score_tests.falling_resistance import SEEN, added_voltage, score
 from etid.recordings.remarks import Remark
 from etid.signals.harmonics import real_parts
@@ -52,9 +53,11 @@ def test_what_is_added_is_what_a_falling_resistance_adds():
     every = knots(HARMONICS)
     z = SKIN.response(jnp.asarray(f[1 : HARMONICS + 1]))
     added = jax.jit(
-        lambda z, i: added_voltage(z * i, every.at(z), jnp.ones_like(every.at(z)), every)
+        lambda z, i: added_voltage(
+            z * i, every.at(z), jnp.ones((1, every.index.size), complex), every
+        )
     )
-    found = np.asarray(added(z, current[1 : HARMONICS + 1])) / r_p
+    found = np.asarray(added(z, current[1 : HARMONICS + 1]))[0] / r_p
     # 2 %: straight lines between the knots, and Z at the last harmonic in the place of R_s.
     assert np.linalg.norm(found - expected) < 0.02 * np.linalg.norm(expected)
 
@@ -72,11 +75,21 @@ def test_what_counts_is_what_the_parameters_cannot_do():
     rows = jax.jit(lambda x, slopes: real_parts(x[None, :] * every.between(slopes)))(x, slopes)
     rows, row, residual = (np.asarray(of) for of in (rows, real_parts(added), real_parts(error)))
     rest = row - np.linalg.lstsq(rows.T, row, rcond=None)[0] @ rows
-    ones, none = jnp.ones(HARMONICS), jnp.zeros((3, 3))
+    ones, none = jnp.ones((1, HARMONICS)), jnp.zeros((3, 3))
+    still = jnp.zeros((1, HARMONICS), complex)
     covariance = jnp.asarray(np.linalg.inv(rows @ rows.T))
     found = jax.jit(
         lambda added, error: score(
-            added, error, ones, ones, ones, x, slopes, every, jnp.zeros(3), none, covariance, 3
+            added[None],
+            Profile(still, still, ones, ones, error[None], x),
+            ones[0],
+            ones,
+            slopes[:, None],
+            every,
+            jnp.zeros(3),
+            none,
+            covariance,
+            3,
         )
     )(added, error)
     expected = rest @ residual / np.linalg.norm(rest)
@@ -87,7 +100,9 @@ def test_what_counts_is_what_the_parameters_cannot_do():
 def test_a_resistor_alone_has_no_such_voltage():
     every = knots(200)
     z = jnp.full(every.index.size, 1e5 + 0j)
-    assert not np.any(jax.jit(lambda v: added_voltage(v, z, z, every))(jnp.ones(200, complex)))
+    assert not np.any(
+        jax.jit(lambda v: added_voltage(v, z, z[None], every))(jnp.ones(200, complex))
+    )
 
 
 def test_skin_that_loses_a_fifth_of_its_resistance_is_a_misfit_at_40_db():

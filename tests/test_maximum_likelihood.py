@@ -18,6 +18,7 @@ from etid.estimators.lanes import Harmonics
 from etid.estimators.maximum_likelihood import load, load_fit
 from etid.estimators.maximum_likelihood import terms as likelihood
 from etid.estimators.maximum_likelihood.load import Load
+from etid.estimators.maximum_likelihood.profile import Records
 from etid.estimators.registry import MAXIMUM_LIKELIHOOD
 from etid.identify import arguments, batches, one
 from etid.identify.one import known_at, known_of, skin_lane
@@ -131,8 +132,8 @@ def test_the_likeliest_start_is_taken_unless_it_is_bad(monkeypatch, starts, best
     of = object.__new__(load.Load)
     line = jnp.ones(8)
     wave = line.astype(complex)
-    spectrum = Spectrum(line, wave, wave, line, line, jnp.arange(8) < 5)
-    for name, value in {"gain": None, "spectrum": spectrum, "unloaded": None}.items():
+    records = Records.of(Spectrum(line, wave, wave, line, line, jnp.arange(8) < 5))
+    for name, value in {"gains": None, "records": records, "unloaded": None}.items():
         object.__setattr__(of, name, value)
     assert float(load_fit._chosen(of, jnp.array(starts)[:, None])[0]) == best
 

@@ -33,12 +33,10 @@ from etid.circuits.circuit import AbstractCircuit, Circuit
 from etid.estimators.element_limits import Limits, of_circuit
 from etid.estimators.element_prior import ElementPrior
 from etid.estimators.lanes import Harmonics, HarmonicsWithCurrent
-from etid.estimators.maximum_likelihood import with_current
 from etid.estimators.maximum_likelihood.estimator import MaximumLikelihood
 from etid.estimators.maximum_likelihood.given_driver import AbstractGiven, GivenDriver
 from etid.estimators.maximum_likelihood.load import Load
 from etid.estimators.maximum_likelihood.load_fit import refined
-from etid.estimators.maximum_likelihood.with_current import LoadWithCurrent
 from etid.estimators.registry import MAXIMUM_LIKELIHOOD, named
 from etid.identify.arguments import fed, require
 from etid.identify.compiled import stored_jit
@@ -78,7 +76,7 @@ class Minimum(eqx.Module):
         cov: H⁻¹.
     """
 
-    terms: Load | LoadWithCurrent
+    terms: Load
     q: Float[Array, " q"]
     cov: Float[Array, "q q"]
 
@@ -86,24 +84,21 @@ class Minimum(eqx.Module):
     def of(cls, lane: Harmonics, known: Known, circuit: AbstractCircuit) -> "Minimum":
         """The minimum near a fitted circuit."""
         terms = terms_of(lane, known, circuit)
-        alone = isinstance(terms, Load)
-        delays = jnp.zeros(1 if alone else 2)
+        delays = jnp.zeros(terms.gains.outputs)
         start = jnp.concatenate([circuit.log_values(), delays, known.driver.mean])
-        q = (refined(terms, start) if alone else with_current.refined(terms, start)).value
+        q = refined(terms, start).value
         return cls(terms, q, inverse(jax.hessian(lambda q: cost(terms, q))(q)))
 
 
-def terms_of(lane: Harmonics, known: Known, circuit: AbstractCircuit) -> Load | LoadWithCurrent:
+def terms_of(lane: Harmonics, known: Known, circuit: AbstractCircuit) -> Load:
     """The residuals of a recording."""
-    rate = jnp.asarray(lane.sample_rate)
+    rate, current = jnp.asarray(lane.sample_rate), None
     if isinstance(lane, HarmonicsWithCurrent) and isinstance(known.driver, GivenDriver):
         current = jnp.asarray(lane.i), jnp.asarray(lane.variance_i)
-        of = lane.spectrum, current, rate, known.elements
-        return LoadWithCurrent.behind(known.driver, circuit, *of)
-    return Load.behind(known.driver, circuit, lane.spectrum, rate, known.elements)
+    return Load.behind(known.driver, circuit, lane.spectrum, rate, known.elements, current)
 
 
-def cost(terms: Load | LoadWithCurrent, q: Float[Array, " q"]) -> Float[Array, ""]:
+def cost(terms: Load, q: Float[Array, " q"]) -> Float[Array, ""]:
     """F(q)."""
     return 0.5 * jnp.sum(terms(q) ** 2)
 

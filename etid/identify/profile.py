@@ -15,7 +15,6 @@ from etid.circuits.circuit import AbstractCircuit
 from etid.estimators.element_prior import FIXED, require_element
 from etid.estimators.lanes import Harmonics
 from etid.estimators.maximum_likelihood.load import Load
-from etid.estimators.maximum_likelihood.with_current import LoadWithCurrent
 from etid.identify.compiled import stored_jit
 from etid.identify.posterior import Known, Minimum, cost, given
 from etid.recordings.recording import Recording
@@ -51,7 +50,7 @@ class _Walls(eqx.Module):
 
 
 def _least(
-    terms: Load | LoadWithCurrent,
+    terms: Load,
     walls: _Walls,
     start: Float[Array, " q"],
     free: Float[Array, "q free"],

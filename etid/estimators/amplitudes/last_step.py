@@ -129,7 +129,7 @@ def _likeliest(
     change = around.back(around.solved(rest))
     count = spectrum.x.size
     x = spectrum.x + jax.lax.complex(change[:count], change[count:])
-    total = variance(spectrum, of.gain(spectrum)(own))
+    total = variance(spectrum, of.gain(spectrum)(own)[0])
     return x, signal_share(x, spectrum.variance_x * spectrum.variance_y / total)
 
 

@@ -70,7 +70,7 @@ def _added(
         element = eqx.tree_at(lambda e: e.r, at.element, at.element.r * (1 + change))
         voltage, current = steady_state(element.current, slope, *at.source)
         outside = at.outwards(Signals(voltage, current)).voltage[1 : spectrum.frequency.size + 1]
-        return of.gain(spectrum).turned(own, outside), to_time(current, points)
+        return of.turned(own, outside, spectrum), to_time(current, points)
 
     _, along, current = jax.linearize(predicted, jnp.zeros(points), has_aux=True)
     level = jnp.abs(current) / jnp.asarray(at.element.i_0)

@@ -31,13 +31,13 @@ LINES = 200
 
 
 def likeliest(of: Amplitudes) -> Float[Array, "record own"]:
-    """The likeliest linear load for each record alone, in the order of `Gain`."""
+    """The likeliest linear load for each record alone, in the order of `Gains`."""
 
     def one(spectrum: Spectrum) -> Float[Array, " own"]:
         gain = of.gain(spectrum)
         starts = of.given.starts(spectrum, of.sample_rate, of.circuit).log_elements
         each = jax.vmap(lambda logs: LoadUnknowns(logs, jnp.zeros(())).vector())(starts)
-        return best_start(lambda own: residual(spectrum, gain(own)), each)
+        return best_start(lambda own: residual(spectrum, gain(own)[0]), each)
 
     return jax.lax.map(one, of.spectra)
 

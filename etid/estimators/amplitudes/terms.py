@@ -24,7 +24,7 @@ from jaxtyping import Array, Bool, Complex, Float
 from etid.circuits.circuit import AbstractCircuit
 from etid.circuits.current_dependent import Norton, Port, Signals, current_dependent, port
 from etid.estimators.element_prior import ElementPrior
-from etid.estimators.maximum_likelihood.gain import Gain
+from etid.estimators.maximum_likelihood.gains import Gains
 from etid.estimators.maximum_likelihood.given_driver import AbstractGiven, GivenDriver
 from etid.estimators.maximum_likelihood.terms import variance
 from etid.estimators.unknowns import LoadUnknowns
@@ -71,7 +71,7 @@ class Amplitudes(eqx.Module):
         """
 
         def one(own: Float[Array, " own"], spectrum: Spectrum) -> Float[Array, " harmonic"]:
-            return variance(spectrum, self.gain(spectrum).undelayed(own))
+            return variance(spectrum, self.gain(spectrum).undelayed(own)[0])
 
         return dataclasses.replace(self, expected=jax.vmap(one)(own, self.spectra))
 
@@ -112,7 +112,7 @@ class Amplitudes(eqx.Module):
         return jnp.concatenate([own, delays, rest])
 
     def own(self, q: Float[Array, " q"]) -> Float[Array, "record own"]:
-        """The unknowns of each record, in the order of `Gain`."""
+        """The unknowns of each record, in the order of `Gains`."""
         log_elements, late, z = self.split(q)
 
         def one(late: Float[Array, ""]) -> Float[Array, " own"]:
@@ -120,9 +120,9 @@ class Amplitudes(eqx.Module):
 
         return jax.vmap(one)(late)
 
-    def gain(self, spectrum: Spectrum) -> Gain:
+    def gain(self, spectrum: Spectrum) -> Gains:
         """Linear gain of a record at small currents."""
-        return Gain(self.given, self.circuit, spectrum.frequency, self.sample_rate)
+        return Gains(self.given, self.circuit, spectrum.frequency, self.sample_rate)
 
     def source(
         self, own: Float[Array, " own"], spectrum: Spectrum, frequency: Float[Array, " wide"]
@@ -134,7 +134,7 @@ class Amplitudes(eqx.Module):
         if not isinstance(self.given, GivenDriver) or isinstance(self.feed, MeasuredCurrent):
             return Norton(x, jnp.zeros_like(x))
         gain = self.gain(spectrum)
-        near = self.given.z_th(gain.w(gain.split(own)[1]))
+        near = self.given.z_th(gain.w(gain.split(own)[2]))
         admittance = reciprocal(self.feed.response(frequency).at[1 : known + 1].set(near))
         return Norton(x * admittance, admittance)
 
@@ -157,17 +157,26 @@ class Amplitudes(eqx.Module):
         """Fourier coefficients of V_out [V], without delay."""
         gain = self.gain(spectrum)
         if current_dependent(gain.impedance(own)) is None:
-            return gain.undelayed(own) * spectrum.x
+            return gain.undelayed(own)[0] * spectrum.x
         at, size = self.port(own, spectrum)
         slope = at.element.typical_slope(2 * size)
         signals = Signals(*steady_state(at.element.current, slope, *at.source))
         return at.outwards(signals).voltage[1 : spectrum.frequency.size + 1]
 
+    def turned(
+        self,
+        own: Float[Array, " own"],
+        values: Complex[Array, " harmonic"],
+        spectrum: Spectrum,
+    ) -> Complex[Array, " harmonic"]:
+        """`values` with the delay of a record."""
+        return self.gain(spectrum).turned(own, values[None], spectrum.frequency)[0]
+
     def predicted(
         self, own: Float[Array, " own"], spectrum: Spectrum
     ) -> Complex[Array, " harmonic"]:
         """Fourier coefficients of V_out [V] of a record."""
-        return self.gain(spectrum).turned(own, self.loaded(own, spectrum))
+        return self.turned(own, self.loaded(own, spectrum), spectrum)
 
     @property
     def weight(self) -> Float[Array, "record harmonic"]:

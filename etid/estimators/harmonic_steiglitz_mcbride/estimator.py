@@ -118,7 +118,7 @@ class HarmonicSteiglitzMcBride(AbstractByMaximumLikelihood):
             ),
             steps=best.iteration,
             method=str(self),
-            remarks=remarks(stands_out(square, spectrum)),
+            remarks=remarks(stands_out(square, spectrum.frequency, spectrum.selected)),
         )
 
     def describe(self) -> Description:

@@ -22,7 +22,6 @@ from jaxtyping import Array, Bool, Float
 from etid.estimators.estimate import Estimate
 from etid.estimators.joint.seen import Seen, seen_at
 from etid.estimators.joint.terms import DriverStudy, Loads, Own, in_turn
-from etid.estimators.maximum_likelihood.with_current import disagrees
 from etid.estimators.sandwich import Curvature
 from etid.estimators.score_tests import other_circuit
 from etid.solvers.matrices import inverse
@@ -237,7 +236,7 @@ def _contradictions(
         found, of_current = (
             jax.tree.map(lambda leaf, part=part: leaf[part], found) for part in (slice(-1), -1)
         )
-        scale = disagrees(of_current)
+        scale = of_current.contradicts()
     other = other_circuit.Scores.of(found, gain=True)
     # A load that takes no part has its own verdict.
     return Contradictions((other.seen() | other.has_other_gain()) & load.used, scale & load.used)

@@ -20,13 +20,10 @@ from etid.estimators.joint.errors import Found, estimates
 from etid.estimators.joint.near import approached
 from etid.estimators.joint.terms import Current, DriverStudy, Joint, Loads, Own, in_turn
 from etid.estimators.maximum_likelihood import driver as calibrations
-from etid.estimators.maximum_likelihood import load_fit, with_current
+from etid.estimators.maximum_likelihood import load_fit
 from etid.estimators.maximum_likelihood.given_driver import GivenDriver
 from etid.estimators.maximum_likelihood.load_fit import SLIGHT
-from etid.estimators.maximum_likelihood.terms import shows_hum
-from etid.estimators.maximum_likelihood.with_current import LoadWithCurrent
 from etid.estimators.unknowns import LoadUnknowns, LoadWithCurrentUnknowns
-from etid.results.fit import complex_rrse
 from etid.signals.harmonics import Spectrum
 from etid.solvers.arrowhead import Arrowhead, ArrowheadEquations, EliminationDescent, join
 from etid.solvers.levenberg_marquardt import (
@@ -51,8 +48,8 @@ def _equations(_, y: Float[Array, " parameter"], study: DriverStudy) -> Arrowhea
             lane = study.lane(driver, load)
             q = own.vector()
             alone = lane.equations(jnp.concatenate([q, driver.mean]))
-            prior = 1 / lane.widths(q)
-            rest, others = prior * (q - lane.centre(q)), (0, driver.mean.size)
+            prior = 1 / lane.gains.widths(q)
+            rest, others = lane.rest(q), (0, driver.mean.size)
             found = NormalEquations(
                 alone.objective + 0.5 * jnp.dot(rest, rest),
                 alone.gradient + jnp.pad(prior * rest, others),
@@ -186,10 +183,7 @@ def _refitted(
 
     def one(load: Loads, own: Own) -> tuple[Own, optx.RESULTS]:
         lane, start = study.lane(driver, load), own.vector()
-        if isinstance(lane, LoadWithCurrent):
-            solution = with_current.refined(lane, start)
-        else:
-            solution = load_fit.refined(lane, start)
+        solution = load_fit.refined(lane, start)
         return type(own).of(solution.value), solution.result
 
     return in_turn(one, loads, owns)
@@ -224,18 +218,13 @@ def fit_alone(
     if model.prior is not None:
         placed = model.prior.placed(candidates.log_elements)
         candidates = LoadUnknowns(placed, candidates.delay_samples)
-    terms = 2 * jnp.sum(spectrum.selected, dtype=candidates.log_elements.dtype)
-    if isinstance(lane, LoadWithCurrent):
-        start = best_start(lane, jnp.pad(candidates.vector(), ((0, 0), (0, 1))))
-        start = with_current.refined(lane, start, with_current.ROUGHLY).value
-        solution = with_current.refined(lane, jnp.concatenate([start, driver.mean]))
-        own = LoadWithCurrentUnknowns.of(solution.value[: start.size])
-        seen = lane.seen(solution.value)
-        terms, error, hum = 2 * terms, lane.rrse(seen), seen.shows_hum()
-    else:
-        solution = load_fit.refined(lane, best_start(lane, candidates.vector()))
-        own, (g, known) = LoadUnknowns.of(solution.value), lane.predicted(solution.value)
-        error = complex_rrse(g * spectrum.x, spectrum.y, spectrum.selected)
-        hum = shows_hum(known, g)
-    squares = 2 * solution.stats["normal_equations"].objective
-    return own, solution.result, squares / (terms - own.vector().size), error, hum
+    outputs = lane.gains.outputs
+    start = best_start(lane, jnp.pad(candidates.vector(), ((0, 0), (0, outputs - 1))))
+    if current is not None:  # first with Z_th fixed, which a distant start would distort
+        start = load_fit.refined(lane, start, load_fit.ROUGHLY).value
+    solution = load_fit.refined(lane, jnp.concatenate([start, driver.mean]))
+    kind = LoadUnknowns if current is None else LoadWithCurrentUnknowns
+    records, profile = lane.known(solution.value), lane.profile(solution.value)
+    chi2 = 2 * solution.stats["normal_equations"].objective / (lane.terms - start.size)
+    error, hum = profile.rrse(records, spectrum.x), profile.shows_hum(records)
+    return kind.of(solution.value[: start.size]), solution.result, chi2, error, hum

@@ -28,15 +28,12 @@ from etid.estimators.estimate import MAX_STEPS
 from etid.estimators.joint.terms import DriverStudy, Loads, Own, in_turn
 from etid.estimators.maximum_likelihood.driver import Calibrations
 from etid.estimators.maximum_likelihood.given_driver import GivenDriver
-from etid.estimators.maximum_likelihood.load import Around
 from etid.estimators.maximum_likelihood.terms import (
     apart,
     by_gains,
     denoised,
-    residual,
     residuals,
 )
-from etid.estimators.maximum_likelihood.with_current import LoadWithCurrent
 from etid.signals.knots import Knots, knots
 from etid.signals.transfer import as_complex, reciprocal
 from etid.solvers.arrowhead import join
@@ -222,31 +219,21 @@ def _of_group(
     def one(load: Loads, own: Own) -> tuple[_Part, Float[Array, "own own"]]:
         lane = study.lane(driver, load)
         q = jnp.concatenate([own.vector(), driver.mean])
-        prior = 1 / lane.widths(own.vector())
-        rest, of_x = prior * (own.vector() - lane.centre(own.vector())), None
-        if isinstance(lane, LoadWithCurrent):  # at all harmonics
-            seen = apart(lane.seen, q)
-            x, part = seen.true_x().x, seen.parts().reshape(4, -1)
-            squares = jnp.sum(part**2)
-            jacobian = apart(lambda q: seen.scaled(lane.slopes(q, x)), q).reshape(q.size, 4, -1)
-        else:
-            at = apart(lane.predicted, q)
-            around, squares = Around.of(lane, q, at, every), jnp.sum(residual(at[1], at[0]) ** 2)
-            part, jacobian = around.part.reshape(2, -1), around.jacobian.reshape(q.size, 2, -1)
-            if lane.unloaded is not None:  # X is not smooth in frequency
-                of_x = apart(lambda _: lane.by_unloaded(at), q)
+        prior, rest = 1 / lane.gains.widths(own.vector()), lane.rest(own.vector())
+        near, size = lane.near(q, every), every.index.size
+        part = near.condensed.part.reshape(-1, size)
+        jacobian = near.jacobian.reshape(q.size, -1, size)
         by_own, by_signal = jacobian[:o], jacobian[o:]
         told = jnp.einsum("ock,pck->op", by_own, by_own)
         root = inverse_root(told + jnp.diag(prior**2))
         pull = jnp.einsum("sck,ck->sk", by_signal, part)
         curvature = jnp.einsum("sck,tck->stk", by_signal, by_signal)
         following = jnp.einsum("po,pck,sck->osk", root, by_own, by_signal)
-        if isinstance(lane, LoadWithCurrent):
-            pull, curvature, following = map(every.summed, (pull, curvature, following))
-        elif of_x is not None:
+        if lane.unloaded is not None:  # X is not smooth in frequency
+            of_x = apart(lambda _: lane.by_x(near), q)
             pull = jnp.concatenate([pull[:W], every.summed(of_x[W:])])
         found = _Part(
-            objective=0.5 * (squares + jnp.dot(rest, rest)),
+            objective=near.profile.objective + 0.5 * jnp.dot(rest, rest),
             pull=pull,
             curvature=curvature,
             following=following,

@@ -1,25 +1,20 @@
 """A load of a joint fit at its minimum: what standard errors and tests need of its records.
 
-Terms are linear in (common, own); the last terms are the priors of the own parameters. Those of
-V_th and V_out are taken at the knots (`etid.signals.knots`), those with a current at all harmonics.
+Terms are linear in (common, own); the last terms are the priors of the own parameters. Those of the
+records are condensed (`etid.estimators.maximum_likelihood.condensed`).
 """
 
 from typing import NamedTuple
 
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Complex, Float
 
 from etid.estimators.joint.terms import DriverStudy, Loads, Own
-from etid.estimators.maximum_likelihood import with_current
+from etid.estimators.maximum_likelihood.condensed import means
 from etid.estimators.maximum_likelihood.given_driver import GivenDriver
-from etid.estimators.maximum_likelihood.load import Around, Load
-from etid.estimators.maximum_likelihood.terms import apart, excess, residual, variance
-from etid.estimators.maximum_likelihood.with_current import LoadWithCurrent
+from etid.estimators.maximum_likelihood.load import Load, changes
 from etid.estimators.sandwich import Linear
-from etid.results.fit import complex_rrse
-from etid.signals.harmonics import Spectrum, signal_share
-from etid.signals.knots import knots
+from etid.signals.harmonics import signal_share
 from etid.signals.transfer import as_complex
 
 
@@ -50,8 +45,8 @@ def seen_at(
 ) -> tuple[Seen, Float[Array, "x parameter"]]:
     """A load at its minimum, and the effect of unit noise in its X on the gradient.
 
-    The noise has two numbers at each knot, or at each harmonic. A caller that does not use its
-    effect does not compute it.
+    The noise has two numbers at each knot. A caller that does not use its effect does not compute
+    it.
 
     Args:
         study: All data of the fit.
@@ -60,77 +55,24 @@ def seen_at(
         own: Unknowns of the load.
     """
     lane, q = study.lane(driver, load), jnp.concatenate([own.vector(), driver.mean])
-    if isinstance(lane, LoadWithCurrent):
-        return _with_current(lane, driver, q)
-    return _voltages(lane, load.spectrum, q)
-
-
-def _voltages(
-    lane: Load, spectrum: Spectrum, q: Float[Array, " q"]
-) -> tuple[Seen, Float[Array, "x parameter"]]:
-    """A load whose V_th and V_out were recorded."""
-    o = lane.gain.owned
-    g, known = apart(lane.predicted, q)
-    part = residual(known, g)
-    around = Around.of(lane, q, (g, known))
-    noise = excess(part, known.selected)[: g.size]
-    means = around.mean(jnp.stack([signal_share(around.x, known.variance_x), noise]))
-    linear = _linear(lane, q, o, around.jacobian, means)
-    chi2, rrse = _misfit(spectrum, g, part, o)
+    near, records, o = lane.near(q), lane.known(q), lane.gains.owned
+    profile, condensed = near.profile, near.condensed
+    noise = profile.excess(records)
+    share = jnp.broadcast_to(signal_share(profile.x, records.variance_x), noise.shape)
+    of_noise = means(profile, lane.knots, jnp.stack([share, noise]))
+    linear = _linear(lane, q, o, near.jacobian, of_noise)
+    rows = _padded(condensed.rows(changes(lane, near)), o)
     seen = Seen(
-        chi2,
-        rrse,
-        terms=jnp.concatenate([around.part, _rest(lane, q[:o])]),
+        chi2=2 * profile.objective / (lane.terms - o),
+        rrse=profile.rrse(records, load.spectrum.x),
+        terms=jnp.concatenate([condensed.part, lane.rest(q[:o])]),
         linear=linear,
-        changes=_padded(around.at.rows(around.by_changes()), o),
-        by_scale=jnp.zeros_like(q),
+        changes=rows,
+        by_scale=linear.told(rows[-1:])[0] if lane.gains.outputs > 1 else jnp.zeros_like(q),
     )
-    size = knots(g.size).at(jnp.sqrt(known.variance_x / variance(known, g)))
-    return seen, _by_noise(linear, 0, around.slopes.gain * as_complex(size))
-
-
-def _with_current(
-    lane: LoadWithCurrent, driver: GivenDriver, q: Float[Array, " q"]
-) -> tuple[Seen, Float[Array, "x parameter"]]:
-    """A load whose current was recorded too."""
-    seen, o = apart(lane.seen, q), lane.elements + 2
-    true, (g, h), part = seen.true_x(), seen.gains, seen.parts()
-    jacobian = apart(lambda q: seen.scaled(lane.slopes(q, true.x)), q)
-    share = jnp.tile(signal_share(true.x, true.variance_x), 4)
-    selected = jnp.stack([seen.first.selected, seen.second.selected])
-    noise = jax.vmap(excess)(part, selected).ravel()
-    linear = _linear(lane, q, o, jacobian, jnp.stack([share, noise]))
-    changes = seen.scaled(with_current.changes(lane, driver, q, seen, true.x))[:-1]
-    changes = _padded(changes, o)
-    # Where Y tells more of X than X itself, the noise of X hardly affects the term of the current.
-    first, of_y = seen.first, variance(seen.first, g)
-    by_y = g * as_complex(jnp.sqrt(first.variance_x / of_y))
-    left = first.variance_y / of_y * jnp.sqrt(first.variance_x / variance(seen.second, h))
-    by_x = _by_noise(linear, 0, by_y) + _by_noise(linear, 2 * g.size, h * as_complex(left))
-    squares = jnp.sum(part**2)
-    found = Seen(
-        chi2=squares / (4 * jnp.sum(first.selected, dtype=squares.dtype) - o),
-        rrse=lane.rrse(seen),
-        terms=jnp.concatenate([part.ravel(), _rest(lane, q[:o])]),
-        linear=linear,
-        changes=changes,
-        by_scale=linear.told(changes[-1:])[0],
-    )
-    return found, by_x
-
-
-def _misfit(
-    spectrum: Spectrum, gain: Complex[Array, " harmonic"], part: Float[Array, " part"], owned: int
-) -> tuple[Float[Array, ""], Float[Array, ""]]:
-    """χ² and RRSE of a load, from its gain and the terms of its recording."""
-    squares = jnp.sum(part**2)
-    freedom = 2 * jnp.sum(spectrum.selected, dtype=squares.dtype) - owned
-    return squares / freedom, complex_rrse(gain * spectrum.x, spectrum.y, spectrum.selected)
-
-
-def _rest(lane: Load | LoadWithCurrent, own: Float[Array, " own"]) -> Float[Array, " own"]:
-    """Terms of the priors of the own parameters."""
-    return (own - lane.centre(own)) / lane.widths(own)
+    brought = profile.whitened(profile.gains * as_complex(jnp.sqrt(records.variance_x))[None, :])
+    brought = brought * as_complex(1 / jnp.sqrt(profile.expected))
+    return seen, _by_noise(linear, lane.knots.at(brought))
 
 
 def _padded(rows: Float[Array, "change part"], owned: int) -> Float[Array, "change term"]:
@@ -139,25 +81,25 @@ def _padded(rows: Float[Array, "change part"], owned: int) -> Float[Array, "chan
 
 
 def _linear(
-    lane: Load | LoadWithCurrent,
+    lane: Load,
     q: Float[Array, " q"],
     owned: int,
     jacobian: Float[Array, "q part"],
     of_noise: Float[Array, "2 part"],
 ) -> Linear:
     """Terms, linear in (common, own), from their derivatives in (own, common)."""
-    of_own = jnp.diag(1 / lane.widths(q[:owned]))
+    of_own = jnp.diag(1 / lane.gains.widths(q[:owned]))
     of_priors = jnp.concatenate([jnp.zeros((q.size - owned, owned)), of_own])
     jacobian = jnp.concatenate([jacobian[owned:], jacobian[:owned]])
     jacobian = jnp.concatenate([jacobian, of_priors], axis=1)
     return Linear(jacobian, *jnp.concatenate([of_noise, jnp.ones((2, owned))], axis=1))
 
 
-def _by_noise(
-    linear: Linear, first: int, gain: Complex[Array, " x"]
-) -> Float[Array, "both parameter"]:
-    """Effect of unit noise on the gradient, if `gain` brings it into the terms from `first` on."""
-    jacobian = linear.jacobian.T[first : first + 2 * gain.size]
-    real, imaginary = jacobian[: gain.size], jacobian[gain.size :]
-    re, im = gain.real[:, None], gain.imag[:, None]
-    return jnp.concatenate([re * real + im * imaginary, re * imaginary - im * real])
+def _by_noise(linear: Linear, gains: Complex[Array, "output x"]) -> Float[Array, "both parameter"]:
+    """Effect of unit noise on the gradient, if `gains` bring it into the terms of each output."""
+    outputs, size = gains.shape
+    jacobian = linear.jacobian[:, : 2 * gains.size].reshape(-1, 2, outputs, size)
+    real, imaginary = jacobian[:, 0], jacobian[:, 1]
+    re, im = gains.real[None], gains.imag[None]
+    both = re * real + im * imaginary, re * imaginary - im * real
+    return jnp.concatenate([of.sum(1).T for of in both])

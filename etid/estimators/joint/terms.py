@@ -2,7 +2,7 @@
 
 All loads share Z_th and the delays of the calibrations, `common`. The elements and the delays of a
 load, `own`, appear only in the terms of this load. A load whose current was measured has two
-equations for each harmonic (`etid.estimators.maximum_likelihood.with_current`).
+outputs.
 """
 
 import itertools
@@ -20,7 +20,6 @@ from etid.estimators.element_prior import ElementPrior
 from etid.estimators.maximum_likelihood.driver import Calibrations
 from etid.estimators.maximum_likelihood.given_driver import GivenDriver, around
 from etid.estimators.maximum_likelihood.load import Load
-from etid.estimators.maximum_likelihood.with_current import LoadWithCurrent
 from etid.estimators.unknowns import LoadUnknowns, LoadWithCurrentUnknowns
 from etid.signals.harmonics import Spectrum
 from etid.solvers.arrowhead import join, split
@@ -65,12 +64,9 @@ class Joint(eqx.Module):
         spectrum: Spectrum,
         sample_rate: Float[Array, ""],
         current: Current | None,
-    ) -> Load | LoadWithCurrent:
+    ) -> Load:
         """One load behind this driver."""
-        of = driver, self.circuit, spectrum
-        if current is None:
-            return Load.behind(*of, sample_rate, self.prior)
-        return LoadWithCurrent.behind(*of, current, sample_rate, self.prior)
+        return Load.behind(driver, self.circuit, spectrum, sample_rate, self.prior, current)
 
 
 class Loads(eqx.Module):
@@ -115,7 +111,7 @@ class DriverStudy(eqx.Module):
     model: Joint
     groups: list[Loads]
 
-    def lane(self, driver: GivenDriver, load: Loads) -> Load | LoadWithCurrent:
+    def lane(self, driver: GivenDriver, load: Loads) -> Load:
         """One load behind this driver."""
         return self.model.lane(driver, load.spectrum, load.sample_rate, load.current)
 

@@ -18,7 +18,7 @@ from etid.estimators.estimator import (
 )
 from etid.estimators.judgement import STRAINED, judged, unless
 from etid.estimators.lanes import Harmonics, HarmonicsWithCurrent
-from etid.estimators.maximum_likelihood import given_driver, load_fit, with_current
+from etid.estimators.maximum_likelihood import given_driver, load_fit
 from etid.estimators.maximum_likelihood.given_driver import AbstractGiven, GivenCurrent, GivenDriver
 from etid.estimators.refined_driver import from_harmonics
 from etid.estimators.score_tests import missing_pole
@@ -126,20 +126,19 @@ class MaximumLikelihood(AbstractEstimator):
         """Refine from the best of several starts, jointly with the uncertain part of the driver."""
         spectrum, rate = lane.spectrum, jnp.asarray(lane.sample_rate)
         prior = ElementPrior.of(self.known_elements, circuit) if self.known_elements else None
+        current = None
         if isinstance(lane, HarmonicsWithCurrent) and isinstance(known, GivenDriver):
             current = jnp.asarray(lane.i), jnp.asarray(lane.variance_i)
-            found = with_current.fit_circuit(known, circuit, spectrum, current, rate, prior)
-            estimate, far, other, disagrees = found
-            fit = judged(estimate, circuit, driver.result, str(self), self.bounds)
-            fit = unless(fit, disagrees, RESULTS.inconsistent)
+            by_current = dataclasses.replace(spectrum, x=current[0], variance_x=current[1])
+            starts = GivenCurrent.at(known.frequency).starts(by_current, rate, circuit)
         else:
             starts = known.starts(spectrum, rate, circuit)
-            found = load_fit.fit_circuit(known, circuit, spectrum, rate, starts, prior)
-            estimate, far, other = found
-            fit = judged(estimate, circuit, driver.result, str(self), self.bounds)
+        found = load_fit.fit_circuit(known, circuit, spectrum, rate, starts, prior, current)
+        fit = judged(found.estimate, circuit, driver.result, str(self), self.bounds)
+        fit = unless(fit, found.scale, RESULTS.inconsistent)
         if known.shape is not None:
             fit = unless(fit, known.shape.differs(spectrum), RESULTS.inconsistent)
-        return unless(unless(fit, far, RESULTS.driver_unclear), other, RESULTS.misfit)
+        return unless(unless(fit, found.far, RESULTS.driver_unclear), found.other, RESULTS.misfit)
 
     def describe(self) -> Description:
         """The text for a methods section."""

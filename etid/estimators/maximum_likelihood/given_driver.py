@@ -80,10 +80,10 @@ class AbstractGiven(eqx.Module):
     delay_width: eqx.AbstractVar[Float[Array, ""]]
 
     @abc.abstractmethod
-    def gain(
-        self, load: Complex[Array, " harmonic"], w: Complex[Array, " harmonic"]
-    ) -> Complex[Array, " harmonic"]:
-        """V_out per input at W₀ + w."""
+    def transfer(
+        self, load: Complex[Array, " harmonic"], w: Complex[Array, " harmonic"], outputs: int
+    ) -> Complex[Array, "output harmonic"]:
+        """V_out per input at W₀ + w, and the current per input if there are two outputs."""
 
     @abc.abstractmethod
     def at_knots(self, knots: Knots) -> "AbstractGiven":
@@ -126,12 +126,12 @@ class GivenCurrent(AbstractGiven):
             delay_width=width,
         )
 
-    def gain(
-        self, load: Complex[Array, " harmonic"], w: Complex[Array, " harmonic"]
-    ) -> Complex[Array, " harmonic"]:
+    def transfer(
+        self, load: Complex[Array, " harmonic"], w: Complex[Array, " harmonic"], outputs: int
+    ) -> Complex[Array, "output harmonic"]:
         """Z_L."""
-        del w
-        return load
+        del w, outputs
+        return load[None, :]
 
     def at_knots(self, knots: Knots) -> "GivenCurrent":
         """The same at the knots of the harmonics."""
@@ -193,11 +193,12 @@ class GivenDriver(AbstractGiven):
             self.resistance
         )
 
-    def gain(
-        self, load: Complex[Array, " harmonic"], w: Complex[Array, " harmonic"]
-    ) -> Complex[Array, " harmonic"]:
-        """Z_L / (Z_L + Z_th) at W₀ + w."""
-        return load * reciprocal(load + self.z_th(w))
+    def transfer(
+        self, load: Complex[Array, " harmonic"], w: Complex[Array, " harmonic"], outputs: int
+    ) -> Complex[Array, "output harmonic"]:
+        """Z_L / (Z_L + Z_th) and 1 / (Z_L + Z_th) [S] at W₀ + w."""
+        loop = reciprocal(load + self.z_th(w))
+        return jnp.stack([load * loop, loop][:outputs])
 
     def starts(
         self, spectrum: Spectrum, sample_rate: Float[Array, ""], circuit: AbstractCircuit

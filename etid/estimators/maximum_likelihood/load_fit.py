@@ -1,11 +1,12 @@
 """The fit of one load, given the calibrations of its driver, and its standard errors and tests.
 
-`etid.estimators.maximum_likelihood.load` has the terms and their derivatives. A fit goes to the
-minimum at the knots first, and from there with the objective and gradient of all harmonics.
+`etid.estimators.maximum_likelihood.load` has the likelihood. A fit goes to the minimum at the knots
+first, and from there with the objective and gradient of all harmonics.
 """
 
 import dataclasses
 import math
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -16,62 +17,29 @@ from jaxtyping import Array, Bool, Float
 from etid.circuits.circuit import AbstractCircuit
 from etid.estimators.element_prior import ElementPrior
 from etid.estimators.estimate import MAX_STEPS, SOLVER, Estimate
-from etid.estimators.maximum_likelihood.gain import Gain
+from etid.estimators.maximum_likelihood.condensed import means
 from etid.estimators.maximum_likelihood.given_driver import AbstractGiven, combined
-from etid.estimators.maximum_likelihood.load import Around, AtKnots, Load
-from etid.estimators.maximum_likelihood.terms import (
-    LOW,
-    excess,
-    residual,
-    shows_hum,
-    stands_out,
-    variance,
-)
+from etid.estimators.maximum_likelihood.load import AtKnots, Load, Near, by_falling, changes
 from etid.estimators.sandwich import Linear
 from etid.estimators.score_tests import falling_resistance, other_circuit
 from etid.estimators.unknowns import LoadUnknowns
-from etid.results.fit import Support, complex_rrse
+from etid.results.fit import Support
 from etid.signals.harmonics import Spectrum, signal_share
 from etid.signals.transfer import as_complex, power
 from etid.solvers.levenberg_marquardt import LevenbergMarquardt, NormalEquations
 from etid.solvers.matrices import inverse_root
 
 
-class _Some(eqx.Module):
-    """Terms at the knots of which some parameters are fixed.
-
-    Attributes:
-        terms: The terms.
-        free: Which parameters are not fixed.
-    """
-
-    terms: AtKnots
-    free: Bool[Array, " q"]
-
-    @property
-    def gain(self) -> Gain:
-        """The gain at the knots."""
-        return self.terms.gain
-
-    def __call__(self, q: Float[Array, " q"]) -> Float[Array, " term"]:
-        """Terms at `q` and the priors."""
-        return self.terms(q)
-
-    def equations(self, q: Float[Array, " q"]) -> NormalEquations:
-        """Normal equations of the recording alone."""
-        of, free = self.terms.equations(q), self.free
-        matrix = jnp.where(free[:, None] & free[None, :], of.matrix, 0.0)
-        return NormalEquations(of.objective, jnp.where(free, of.gradient, 0.0), matrix)
-
-
-def _equations(_, q: Float[Array, " q"], problem: Load | AtKnots | _Some) -> NormalEquations:
+def _equations(_, q: Float[Array, " q"], problem: Load | AtKnots) -> NormalEquations:
     """Normal equations of a load, with the priors."""
-    return _with_priors(problem.equations(q), q, problem.gain)
+    return _with_priors(problem.equations(q), q, problem)
 
 
-def _with_priors(found: NormalEquations, q: Float[Array, " q"], of: Gain) -> NormalEquations:
-    prior = 1 / of.widths(q)
-    rest = prior * (q - of.centre(q))
+def _with_priors(
+    found: NormalEquations, q: Float[Array, " q"], of: Load | AtKnots
+) -> NormalEquations:
+    prior = 1 / of.gains.widths(q)
+    rest = prior * (q - of.gains.centre(q))
     return NormalEquations(
         found.objective + 0.5 * jnp.dot(rest, rest),
         found.gradient + prior * rest,
@@ -80,23 +48,19 @@ def _with_priors(found: NormalEquations, q: Float[Array, " q"], of: Gain) -> Nor
 
 
 class _Evaluated(NormalEquations):
-    """Normal equations with what the standard errors and tests need at the same point.
+    """Normal equations with the load near the same point, for standard errors and tests.
 
     The last point of a fit then need not be evaluated again.
-
-    Attributes:
-        around: The terms, without constants and ρ.
     """
 
-    around: Around
+    near: Near
 
     @classmethod
     def at(cls, _, q: Float[Array, " q"], load: Load) -> "_Evaluated":
         """Evaluate a load with the priors."""
-        found, around = load.evaluated(q)
-        of = _with_priors(found, q, load.gain)
-        around = eqx.tree_at(lambda a: (a.at.gain, a.score), around, (None, None))
-        return cls(of.objective, of.gradient, of.matrix, around)
+        found, near = load.evaluated(q)
+        of = _with_priors(found, q, load)
+        return cls(of.objective, of.gradient, of.matrix, near)
 
     @classmethod
     def empty(cls, q: Float[Array, " q"], load: Load) -> "_Evaluated":
@@ -121,7 +85,7 @@ SLIGHT = 1e-9
 
 
 def refined(
-    load: Load | AtKnots | _Some,
+    load: Load | AtKnots,
     start: Float[Array, " q"],
     solver: LevenbergMarquardt | None = None,
 ) -> optx.Solution:
@@ -142,7 +106,7 @@ def _chosen(load: Load, starts: Float[Array, "start q"]) -> Float[Array, " q"]:
     """
     # The minimum does not depend on its start, and a loop of unknown length has no gradient.
     load, starts = jax.lax.stop_gradient((load, starts))
-    limit = NEAR * 2 * jnp.sum(load.spectrum.selected, dtype=starts.dtype)
+    limit = NEAR * load.terms
     likeliest = starts.shape[0] - 1
 
     def goes_on(state: tuple[Array, Array, Array]) -> Bool[Array, ""]:
@@ -163,8 +127,8 @@ def _chosen(load: Load, starts: Float[Array, "start q"]) -> Float[Array, " q"]:
 def _near(load: Load, start: Float[Array, " own"], well: LevenbergMarquardt) -> Float[Array, " q"]:
     """The minimum at the knots of `start`: first over the own parameters, then over all."""
     load, start = jax.lax.stop_gradient((load, start))
-    terms, owned = Around.of(load, start).at, start.size
-    q = jnp.concatenate([start, load.gain.driver.mean])
+    q, gains = jnp.concatenate([start, load.gains.driver.mean]), load.gains.at(load.knots)
+    near = load.near(q)
     # One loop for both, because each loop compiles for half a second.
     fields = [jnp.array([of.rtol, of.ftol, of.damping]) for of in (ROUGHLY, well)]
 
@@ -173,10 +137,27 @@ def _near(load: Load, start: Float[Array, " own"], well: LevenbergMarquardt) -> 
     ) -> tuple[Float[Array, " q"], None]:
         (rtol, ftol, damping), free = of
         solver = dataclasses.replace(well, rtol=rtol, ftol=ftol, damping=damping)
-        return refined(_Some(terms, free), q, solver).value, None
+        return refined(AtKnots(gains, near, free), q, solver).value, None
 
-    free = jnp.stack([jnp.arange(q.size) < owned, jnp.ones(q.size, bool)])
+    free = jnp.stack([jnp.arange(q.size) < start.size, jnp.ones(q.size, bool)])
     return jax.lax.scan(stage, q, (jnp.stack(fields), free))[0]
+
+
+class Found(NamedTuple):
+    """An estimate of a load, and what its data contradict.
+
+    Attributes:
+        estimate: The estimate; its parameters are the logarithms of the elements.
+        far: Whether W is too far from W₀ for its linear distribution.
+        other: Whether the data show another circuit, another gain of V_out, or a resistance that
+            falls with its current.
+        scale: Whether the scale of the current contradicts the driver.
+    """
+
+    estimate: Estimate
+    far: Bool[Array, ""]
+    other: Bool[Array, ""]
+    scale: Bool[Array, ""]
 
 
 def fit_circuit(
@@ -186,7 +167,8 @@ def fit_circuit(
     sample_rate: Float[Array, ""],
     candidates: LoadUnknowns,
     element_prior: ElementPrior | None = None,
-) -> tuple[Estimate, Bool[Array, ""], Bool[Array, ""]]:
+    current: tuple[Array, ...] | None = None,
+) -> Found:
     """Identify the load of one recording.
 
     Args:
@@ -197,23 +179,21 @@ def fit_circuit(
         candidates: Starts, stacked; the likeliest is the last. The start that predicts best is
             refined.
         element_prior: Prior of the elements; None without one.
-
-    Returns:
-        The estimate, whose parameters are the logarithms of the elements. Whether W is too far from
-        W₀ for its linear distribution. Whether the data show another circuit, another gain of
-        V_out, or a resistance that falls with its current.
+        current: Harmonics of a current that was measured beside V_th [A], and their variances [A²].
     """
-    load = Load.behind(driver, circuit, spectrum, sample_rate, element_prior)
+    load = Load.behind(driver, circuit, spectrum, sample_rate, element_prior, current)
     if element_prior is not None:
         placed = element_prior.placed(candidates.log_elements)
         candidates = LoadUnknowns(placed, candidates.delay_samples)
+    starts = jnp.pad(candidates.vector(), ((0, 0), (0, load.gains.outputs - 1)))
 
     # First at the knots of one point, and with Z_th fixed: from a distant start, a joint fit would
     # distort Z_th.
-    start = _chosen(load, candidates.vector())
-    well = dataclasses.replace(
-        WELL, rtol=min(WELL.rtol, SETTLED / math.sqrt(2 * spectrum.x.size)), damping=SLIGHT
-    )
+    start = _chosen(load, starts)
+    if current is not None:  # its starts have no delay
+        start = refined(load, start, ROUGHLY).value
+    rtol = min(WELL.rtol, SETTLED / math.sqrt(2 * load.records.y.size))
+    well = dataclasses.replace(WELL, rtol=rtol, damping=SLIGHT)
     whole = dataclasses.replace(
         well,
         rtol=BEFORE / SETTLED * well.rtol,
@@ -222,89 +202,95 @@ def fit_circuit(
     )
     solution = refined(load, _near(load, start, well), whole)
     q, last = solution.value, solution.stats["normal_equations"]
-    around = eqx.tree_at(
-        lambda a: a.at.gain, last.around, load.at_knots(load.knots), is_leaf=lambda a: a is None
-    )
-    g, known = around.gain, load.known(q)
-    part = residual(known, g)
-    jacobian = around.jacobian
-    prior = 1 / load.gain.widths(q) ** 2
-    noise = excess(part, spectrum.selected)[: g.size]
-    # Part of the noise that only this trial has: all, or that of V_out if V_th is shared.
+    near, records, every = last.near, load.known(q), load.knots
+    profile, condensed = near.profile, near.condensed
+    count, owned = load.gains.elements, load.gains.owned
+
+    jacobian, part = near.jacobian, condensed.part
+    prior = 1 / load.gains.widths(q) ** 2
+    noise = profile.excess(records)
+    # Part of the noise that only this trial has: all, or that of the outputs if V_th is shared.
     private = jnp.where(
-        jnp.any(known.variance_x != spectrum.variance_x),
-        spectrum.variance_y / variance(known, g),
+        jnp.any(records.variance_x != spectrum.variance_x),
+        records.variance_y / profile.expected,
         1.0,
     )
-    share = signal_share(around.x, known.variance_x)
-    mean_share, mean_noise, own_noise = around.mean(jnp.stack([share, noise, private * noise]))
+    share = signal_share(profile.x, records.variance_x)
+    values = jnp.stack([jnp.broadcast_to(share, noise.shape), noise, private * noise])
+    mean_share, mean_noise, own_noise = means(profile, every, values)
     linear = Linear(jacobian, mean_share, mean_noise, jnp.diag(prior))
-    information, count = linear.bread(), load.gain.owned - 1
+    information = linear.bread()
     elements = information[:count]
     # Standard errors and tests are those of the last point; they do not change in a short step.
     step = jax.lax.stop_gradient(information @ last.gradient)
     gained = jnp.dot(step, last.gradient)
     step, gained = (jnp.where(gained < LAST**2, of, 0.0) for of in (step, gained))
-    own, z = load.gain.split(q - step)
-    used = spectrum.selected[load.knots.index]
-    moved = jnp.sqrt(jnp.max(jnp.where(used, power(around.at.gain.w(z)), 0.0)))
-    by_term = elements @ jacobian
-    changes = around.by_changes()
-    rows = around.at.rows(changes)
-    rest = prior * (q - load.gain.centre(q))
-    spread = jax.scipy.linalg.block_diag(jnp.diag(prior[: load.gain.owned]), driver.cov)
-    found = other_circuit.scores(rows, linear, around.part, rest, spread, information, slice(count))
-    other = other_circuit.Scores.of(found, gain=True)
-    weight = jnp.where(known.selected, 2 / variance(known, g), 0.0)
+    logs, late, z = load.gains.split(q - step)
+    used = spectrum.selected[every.index]
+    moved = jnp.sqrt(jnp.max(jnp.where(used, power(load.gains.at(every).w(z)), 0.0)))
+    rest = prior * (q - load.gains.centre(q))
+    spread = jax.scipy.linalg.block_diag(jnp.diag(prior[:owned]), driver.cov)
+    tested = changes(load, near)
+    rows = condensed.rows(tested)
+    found = other_circuit.scores(rows, linear, part, rest, spread, information, slice(count))
+    of_circuit, of_scales = (
+        jax.tree.map(lambda leaf, which=which: leaf[which], found)
+        for which in (slice(1 - load.gains.outputs or None), slice(-load.gains.outputs, None))
+    )
+    other = other_circuit.Scores.of(of_circuit, gain=True)
     falling = falling_resistance.score(
-        around.by_falling(),
-        known.y - g * known.x,
-        weight,
+        by_falling(load, near),
+        profile,
         share,
         noise,
-        around.x,
-        around.at.by_unknown(around.slopes),
-        load.knots,
+        near.by_unknown(near.slopes),
+        every,
         rest,
         spread,
         information,
         count,
     )
     # If a wrong gain explains the excess of the low harmonics, the excess is no hum.
-    others = linear.told(rows[-1:])[0] @ information
-    gain = changes[-1] - combined(others, around.at.by_unknown(around.slopes))
-    explained = as_complex(found.size[-1]) * around.x * load.knots.between(gain)
-    unexplained = (0.5 * weight * power(known.y - g * known.x + explained))[:LOW]
-    wrong_gain = (jnp.abs(found.z[-1]) > NO_HUM) & ~stands_out(unexplained, known)
-    by_own, by_z = load.gain.split(elements)
-    of_delay = jnp.outer(by_own.delay_samples, by_own.delay_samples) / driver.delay_width**2
-    beside = jnp.zeros(())  # Σ r² of the priors of elements, which a choice of circuits must weigh
-    if element_prior is not None:
-        beside = jnp.sum(((own.log_elements - element_prior.centre) / element_prior.width) ** 2)
-        weighed = by_own.log_elements * element_prior.precision[None, :]
-        of_delay = of_delay + weighed @ by_own.log_elements.T
-    of_driver = by_z @ driver.cov @ by_z.T
+    of_gain = -load.gains.outputs
+    others = linear.told(rows[of_gain][None])[0] @ information
+    slopes = near.by_unknown(near.slopes)
+    made = combined(others, slopes.reshape(q.size, -1)).reshape(slopes.shape[1:])
+    explained = (as_complex(-found.size[of_gain]) * profile.x)[None, :] * every.between(
+        tested[of_gain] - made
+    )
+    wrong_gain = (jnp.abs(found.z[of_gain]) > NO_HUM) & ~profile.shows_hum(
+        records, profile.whitened(explained)
+    )
+    of_own = (elements[:, :owned] * prior[None, :owned]) @ elements[:, :owned].T
+    of_driver = elements[:, owned:] @ driver.cov @ elements[:, owned:].T
+    by_term = elements @ jacobian
     shared = of_driver + (by_term * (linear.noise - own_noise)[None, :]) @ by_term.T
     # For an element without any effect the matrix product contains only rounding errors.
     unknown = jnp.diagonal(elements)
     unknown = jnp.diag(jnp.where(unknown > 1, unknown, 0.0))
-    change = load.gain.split(q)[1] - driver.mean
+    change = load.gains.split(q)[2] - driver.mean
     # Increase of the Σ r² of the calibrations.
     strain = jnp.sum((change @ inverse_root(driver.cov)) ** 2)
-    squares, terms = jnp.sum(part**2), 2 * jnp.sum(spectrum.selected, dtype=q.dtype)
-    freedom, deviance = terms - load.gain.owned, squares + strain + beside - gained
+    # Σ r² of the priors of elements, which a choice of circuits must weigh.
+    beside = jnp.zeros(())
+    if element_prior is not None:
+        beside = jnp.sum(((logs - element_prior.centre) / element_prior.width) ** 2)
+    squares, terms = 2 * profile.objective, load.terms
     estimate = Estimate(
-        parameters=own.log_elements,
-        delay_samples=own.delay_samples[None],
-        cov=(by_term * own_noise[None, :]) @ by_term.T + of_delay + shared + unknown,
+        parameters=logs,
+        delay_samples=late,
+        cov=(by_term * own_noise[None, :]) @ by_term.T + of_own + shared + unknown,
         shared_cov=shared,
-        chi2=squares / freedom,
-        rrse=complex_rrse(g * spectrum.x, spectrum.y, spectrum.selected),
+        chi2=squares / (terms - owned),
+        rrse=profile.rrse(records, spectrum.x),
         result=solution.result,
         steps=solution.stats["num_steps"],
         strain=strain,
-        hum=shows_hum(known, g) & ~wrong_gain,
+        hum=profile.shows_hum(records) & ~wrong_gain,
         falls=falling.causes(squares, terms, other.relevant()),
-        support=Support(deviance, terms, other.relevant(), *other.spread.possible()),
+        support=Support(
+            squares + strain + beside - gained, terms, other.relevant(), *other.spread.possible()
+        ),
     )
-    return estimate, moved > FAR, other.seen() | other.has_other_gain() | falling.seen()
+    wrong = other.seen() | other.has_other_gain() | falling.seen()
+    return Found(estimate, moved > FAR, wrong, of_scales.contradicts()[1:].any())

@@ -72,13 +72,17 @@ def shows_hum(spectrum: Spectrum, g: Complex[Array, " harmonic"]) -> Bool[Array,
     Harmonics that are not selected are tested too.
     """
     squares = power(spectrum.y - g * spectrum.x) / variance(spectrum, g)
-    return stands_out(squares, spectrum)
+    return stands_out(squares, spectrum.frequency, spectrum.selected)
 
 
-def stands_out(squares: Float[Array, " harmonic"], spectrum: Spectrum) -> Bool[Array, ""]:
-    """Whether `squares` show mains hum; without hum their mean is 1."""
-    squares, suspect = squares[:LOW], lines(spectrum.frequency[:LOW])
-    others = spectrum.selected[:LOW] & ~suspect
+def stands_out(
+    squares: Float[Array, " harmonic"],
+    frequency: Float[Array, " harmonic"],
+    selected: Bool[Array, " harmonic"],
+) -> Bool[Array, ""]:
+    """Whether `squares` at the harmonics show mains hum; without hum their mean is 1."""
+    squares, suspect = squares[:LOW], lines(frequency[:LOW])
+    others = selected[:LOW] & ~suspect
     count = jnp.maximum(jnp.sum(others, dtype=squares.dtype), 1.0)
     around = jnp.sum(jnp.where(others, squares, 0.0)) / count
     return jnp.max(jnp.where(suspect, squares, 0.0)) > HUM * jnp.maximum(around, 1.0)

@@ -113,7 +113,7 @@ def fit_circuit(
         ),
         result=solution.result,
         steps=solution.stats["num_steps"],
-        hum=stands_out(model.squares(q, records), records[-1]),
+        hum=stands_out(model.squares(q, records), records[-1].frequency, records[-1].selected),
     )
     return estimate, bias[:elements], _scores(model, q, records, driver.source, noise, drift)
 

@@ -15,6 +15,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Complex, Float
 
+from etid.estimators.maximum_likelihood.profile import Profile
 from etid.estimators.score_tests.other_circuit import MOVED
 from etid.signals.knots import Knots
 from etid.signals.transfer import as_complex, power, reciprocal
@@ -66,15 +67,15 @@ class Falling(NamedTuple):
 def added_voltage(
     v_out: Complex[Array, " harmonic"],
     z: Complex[Array, " knot"],
-    sensitivity: Complex[Array, " knot"],
+    sensitivity: Complex[Array, "output knot"],
     knots: Knots,
-) -> Complex[Array, " harmonic"]:
-    """What a falling resistance adds to V_out, for 1 / (R I_0) = 1 / V.
+) -> Complex[Array, "output harmonic"]:
+    """What a falling resistance adds to the outputs, for 1 / (R I_0) = 1 / V.
 
     Args:
         v_out: V_out [V] at the harmonics.
         z: Z_L [Ω] at the knots.
-        sensitivity: ∂ ln H / ∂ ln Z_L at the knots, H = V_out per input.
+        sensitivity: Change of each output at the knots, for a voltage of Z_L that is larger by 1 V.
         knots: The knots of the harmonics.
     """
     relaxing = z - as_complex(z[-1].real)  # without the series resistor
@@ -83,49 +84,47 @@ def added_voltage(
     # There is no direct voltage behind a transformer, or with charge-balanced pulses.
     points = jnp.fft.irfft(jnp.pad(u, (1, 0)), 2 * FINE * count, norm="forward")
     added = jnp.fft.rfft(-jnp.abs(points) * points, norm="forward")[1 : count + 1]
-    return jnp.pad(added, (0, v_out.size - count)) * knots.between(sensitivity * relaxing)
+    added = jnp.pad(added, (0, v_out.size - count))
+    return added[None, :] * knots.between(sensitivity * relaxing[None, :])
 
 
 def score(
-    added: Complex[Array, " harmonic"],
-    error: Complex[Array, " harmonic"],
-    weight: Float[Array, " harmonic"],
+    added: Complex[Array, "output harmonic"],
+    profile: Profile,
     share: Float[Array, " harmonic"],
-    noise: Float[Array, " harmonic"],
-    x: Complex[Array, " harmonic"],
-    slopes: Complex[Array, "q knot"],
+    noise: Float[Array, "output harmonic"],
+    slopes: Complex[Array, "q output knot"],
     knots: Knots,
     rest: Float[Array, " q"],
     spread: Float[Array, "q q"],
     covariance: Float[Array, "q q"],
     elements: int,
 ) -> Falling:
-    """Score of a change of V_out.
+    """Score of a change of the outputs.
 
     Args:
-        added: ∂V_out/∂ε [V].
-        error: Y − G X [V].
-        weight: 1/σ² of each of its two parts; 0 where a harmonic is not used [1/V²].
+        added: Derivatives of the outputs with respect to ε.
+        profile: The likelihood of the records.
         share: Share of signal in the power of X.
-        noise: Variance of the residual relative to σ².
-        x: X without noise [V].
-        slopes: Derivatives of G with respect to the parameters at the knots.
+        noise: Variances of the innovations relative to those expected.
+        slopes: Derivatives of the gains with respect to the parameters at the knots.
         knots: The knots of the harmonics.
         rest: Gradient of the priors.
         spread: Covariance of this gradient.
         covariance: Inverse of the information.
         elements: Number of elements, which are the first parameters.
     """
-    product = jnp.conj(added) * x * as_complex(weight * share)
-    parts = knots.summed(jnp.stack([product.real, product.imag]))
-    others = (slopes.real @ parts[0] - slopes.imag @ parts[1]) @ covariance
-    made = jax.lax.complex(others @ slopes.real, others @ slopes.imag)
-    direction = added - x * knots.between(made)
-    total = jnp.dot(weight, (jnp.conj(direction) * error).real) + jnp.dot(others, rest)
+    weighted = profile.weighted(profile.whitened(added))
+    parts = knots.summed(jnp.conj(weighted) * (profile.x * as_complex(share))[None, :]).ravel()
+    rows = slopes.reshape(slopes.shape[0], -1)
+    others = (rows.real @ parts.real - rows.imag @ parts.imag) @ covariance
+    made = jax.lax.complex(others @ rows.real, others @ rows.imag).reshape(slopes.shape[1:])
+    direction = added - profile.x[None, :] * knots.between(made)
+    total = jnp.sum((jnp.conj(direction) * profile.pull).real) + jnp.dot(others, rest)
     of_priors = others @ spread @ others
-    squares = weight * power(direction)
-    variance = jnp.dot(squares, noise) + of_priors
-    curvature = jnp.dot(squares, share) + of_priors
+    squares = profile.weight * power(profile.whitened(direction))
+    variance = jnp.sum(squares * noise) + of_priors
+    curvature = jnp.sum(squares * share[None, :]) + of_priors
     return Falling(
         total / jnp.sqrt(variance),
         jnp.abs(total) / curvature * jnp.max(jnp.abs(others[:elements])),

@@ -55,6 +55,10 @@ NO_OTHER_GAIN = (
     "a score test finds no difference between the gains of the two records (at most "
     f"{SEEN_GAIN:g} standard deviations)"
 )
+# Standard deviations and relative change of an element, from which on the scale of a current
+# measured beside V_th is wrong. By chance one fit in 16 000 exceeds the first; a driver of too low
+# order can imitate less than the second.
+DISAGREES, SCALE = 4.0, 1e-3
 GRID = 7  # time constants, two per decade; a relaxation is wider than that
 BEYOND = 2.0  # factor by which they exceed the band
 NOTHING = 1e-9  # of the power of a change; rounding leaves less of one that the circuit can make
@@ -114,6 +118,10 @@ class Score(NamedTuple):
         tested = jnp.isfinite(self.z) & jnp.isfinite(self.stderr)
         stderr = jnp.where(tested, self.stderr, 0.0)
         return stderr, jnp.where(tested[..., None], self.slope, 0.0)
+
+    def contradicts(self) -> Bool[Array, "*change"]:
+        """Whether the scale of a measured current is wrong; all changes must be such scales."""
+        return (jnp.abs(self.z) > DISAGREES) & (self.moved > SCALE)
 
     def relaxes(self) -> Bool[Array, ""]:
         """Whether one more relaxation is seen; all changes must be relaxations."""

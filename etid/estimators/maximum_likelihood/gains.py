@@ -1,0 +1,146 @@
+"""The gains of a load: V_out per input, and the current per input if it is measured beside V_th.
+
+All parameters act on a frequency through Z_L, the phase factors of the delays, and W. The code
+computes the derivatives with respect to these and applies the chain rule.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Complex, Float
+
+from etid.circuits.circuit import AbstractCircuit
+from etid.circuits.impedance import AbstractImpedance
+from etid.estimators.element_prior import ElementPrior
+from etid.estimators.estimate import DELAY_WIDTH
+from etid.estimators.maximum_likelihood.given_driver import AbstractGiven, combined
+from etid.signals.knots import Knots
+from etid.signals.transfer import as_complex, delayed, frequency_variable
+
+
+class Slopes(eqx.Module):
+    """The gains and their derivatives at each frequency.
+
+    Attributes:
+        load: Z_L.
+        gains: The gains.
+        by_load: Derivatives with respect to Z_L.
+        by_unknown: Derivatives with respect to the parameters and z.
+    """
+
+    load: Complex[Array, " frequency"]
+    gains: Complex[Array, "output frequency"]
+    by_load: Complex[Array, "output frequency"]
+    by_unknown: Complex[Array, "q output frequency"]
+
+
+class Gains(eqx.Module):
+    """The gains of a load, as functions of the parameters of a fit.
+
+    The parameters `q` of the solver are the logarithms of the elements, the delay of each output
+    [samples], and z unless z = z₀.
+
+    Attributes:
+        driver: Distribution of Z_th at the frequencies, or the measured current.
+        circuit: Structure of the load.
+        frequency: The frequencies [Hz]. They may differ from those of the driver by a small common
+            factor.
+        sample_rate: Sampling rate [Hz].
+        prior: Prior of the elements; None without one.
+        outputs: 1 for V_out, 2 for V_out and the current.
+    """
+
+    driver: AbstractGiven
+    circuit: AbstractCircuit
+    frequency: Float[Array, " frequency"]
+    sample_rate: Float[Array, ""]
+    prior: ElementPrior | None = None
+    outputs: int = eqx.field(static=True, default=1)
+
+    @property
+    def elements(self) -> int:
+        """Number of elements."""
+        return len(self.circuit.names())
+
+    @property
+    def owned(self) -> int:
+        """Number of own parameters: elements and delays."""
+        return self.elements + self.outputs
+
+    def split(
+        self, q: Float[Array, "*row q"]
+    ) -> tuple[Float[Array, "*row element"], Float[Array, "*row output"], Float[Array, "*row z"]]:
+        """Logarithms of the elements, delays and z; or other numbers in the same order."""
+        logs, delays, z = jnp.split(q, (self.elements, self.owned), axis=-1)
+        return logs, delays, z if z.shape[-1] == self.driver.mean.size else self.driver.mean
+
+    def centre(self, q: Float[Array, " q"]) -> Float[Array, " q"]:
+        """Prior means of the parameters."""
+        own = jnp.zeros(self.elements) if self.prior is None else self.prior.centre
+        return jnp.concatenate([own, jnp.zeros(self.outputs), self.driver.mean])[: q.size]
+
+    def widths(self, q: Float[Array, " q"]) -> Float[Array, " q"]:
+        """Prior standard deviations of the parameters."""
+        own = jnp.full(self.elements, jnp.inf) if self.prior is None else self.prior.width
+        # How little the delays of V_out scatter tells nothing about those of the current.
+        delays = jnp.full(self.outputs, DELAY_WIDTH).at[0].set(self.driver.delay_width)
+        return jnp.concatenate([own, delays, jnp.ones_like(self.driver.mean)])[: q.size]
+
+    def at(self, every: Knots) -> "Gains":
+        """The same at the knots of the harmonics."""
+        driver, frequency = self.driver.at_knots(every), every.at(self.frequency)
+        return Gains(driver, self.circuit, frequency, self.sample_rate, self.prior, self.outputs)
+
+    def impedance(self, q: Float[Array, " q"]) -> AbstractImpedance:
+        """The impedance of the load."""
+        return self.circuit.with_log_values(self.split(q)[0]).impedance()
+
+    def w(self, z: Float[Array, " z"]) -> Complex[Array, " frequency"]:
+        """W − W₀."""
+        off = jnp.log(self.frequency[0] / self.driver.frequency[0])
+        return as_complex(off) * self.driver.w_slope + combined(z, self.driver.slope)
+
+    def undelayed(self, q: Float[Array, " q"]) -> Complex[Array, "output frequency"]:
+        """The gains without their delays."""
+        load = self.impedance(q)(frequency_variable(self.frequency))
+        return self.driver.transfer(load, self.w(self.split(q)[2]), self.outputs)
+
+    def __call__(self, q: Float[Array, " q"]) -> Complex[Array, "output frequency"]:
+        """The gains."""
+        return self.turned(q, self.undelayed(q), self.frequency)
+
+    def turned(
+        self,
+        q: Float[Array, " q"],
+        values: Complex[Array, "output _"],
+        frequency: Float[Array, "_"],
+    ) -> Complex[Array, "output _"]:
+        """`values` · e^(−jωτ) of each output."""
+        each = zip(values, self.split(q)[1], strict=True)
+        return jnp.stack([delayed(of, frequency, late, self.sample_rate) for of, late in each])
+
+    def slopes(self, q: Float[Array, " q"]) -> Slopes:
+        """The gains and their derivatives."""
+        logs, _, z = self.split(q)
+        s, w = frequency_variable(self.frequency), self.w(z)
+
+        def load(logs: Float[Array, " element"]) -> Complex[Array, " frequency"]:
+            return self.circuit.with_log_values(logs).impedance()(s)
+
+        def gains(
+            load: Complex[Array, " frequency"], w: Complex[Array, " frequency"]
+        ) -> Complex[Array, "output frequency"]:
+            return self.driver.transfer(load, w, self.outputs)
+
+        z_load, one = load(logs), jnp.ones_like(s)
+        by_element = jax.vmap(lambda way: jax.jvp(load, (logs,), (way,))[1])(jnp.eye(logs.size))
+        value, by_load = jax.jvp(lambda at: gains(at, w), (z_load,), (one,))
+        by_w = jax.jvp(lambda at: gains(z_load, at), (w,), (one,))[1]
+        value, by_load, by_w = (self.turned(q, of, self.frequency) for of in (value, by_load, by_w))
+        alone = as_complex(jnp.eye(self.outputs))[:, :, None]
+        rows = [
+            by_element[:, None] * by_load[None],
+            alone * ((-s * as_complex(1 / self.sample_rate))[None, :] * value)[None],
+            self.driver.slope[:, None] * by_w[None],
+        ]
+        return Slopes(z_load, value, by_load, jnp.concatenate(rows))

@@ -1,0 +1,188 @@
+"""The likelihood of records of one unknown input, at given gains.
+
+At every harmonic each output Y_m is a gain times the input X, and all records have noise,
+
+    Y_m = G_m X + noise,      x = X + noise.
+
+With X at its maximum-likelihood estimate X̂, −2 ln likelihood is a quadratic form of e = Y − G x
+(Pintelon and Schoukens, System Identification, 2012, ch. 9),
+
+    D = 2 eᴴ Σ⁻¹ e,      Σ = diag(σ_y²) + σ_x² G Gᴴ,      X̂ = x + σ_x² Gᴴ Σ⁻¹ e,
+
+    ρ_m = 2 conj(X̂) (Σ⁻¹ e)_m,      P = 2 |X̂|² Σ⁻¹.
+
+ρ is −½ ∂D/∂ conj(G) times 2, and P is the information about the gains. The *innovations* of e are
+independent: each is what an output shows beyond x and the outputs before it. σ² are the variances
+of one coefficient, at every harmonic.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Complex, Float
+
+from etid.estimators.maximum_likelihood.terms import excess, stands_out
+from etid.results.fit import complex_rrse
+from etid.signals.harmonics import Spectrum, real_parts
+from etid.signals.transfer import as_complex, power
+
+
+class Records(eqx.Module):
+    """An input and its outputs at the harmonics.
+
+    Attributes:
+        frequency: The harmonics [Hz].
+        x: Coefficients of the input.
+        variance_x: E|noise|² of each of them.
+        y: Coefficients of the outputs.
+        variance_y: E|noise|² of each of them.
+        selected: Harmonics that are used.
+    """
+
+    frequency: Float[Array, " harmonic"]
+    x: Complex[Array, " harmonic"]
+    variance_x: Float[Array, " harmonic"]
+    y: Complex[Array, "output harmonic"]
+    variance_y: Float[Array, "output harmonic"]
+    selected: Bool[Array, " harmonic"]
+
+    @classmethod
+    def of(cls, spectrum: Spectrum, current: tuple[Array, ...] | None = None) -> "Records":
+        """V_th and V_out, and the current if there is one.
+
+        Args:
+            spectrum: Harmonics of the voltages.
+            current: Those of the current [A], and their variances [A²].
+        """
+        each = [(spectrum.y, spectrum.variance_y), *([] if current is None else [current])]
+        y, variance_y = (jnp.stack(of) for of in zip(*each, strict=True))
+        s = spectrum
+        return cls(s.frequency, s.x, s.variance_x, y, variance_y, s.selected)
+
+
+class Profile(eqx.Module):
+    """The likelihood of records at some gains.
+
+    Attributes:
+        gains: The gains.
+        towards: Derivatives of the estimate of X with respect to the innovations.
+        expected: Variances of the innovations.
+        weight: 1/σ² of both parts of each innovation; 0 where a harmonic is not used.
+        innovations: The innovations of Y − G x.
+        x: X̂.
+    """
+
+    gains: Complex[Array, "output harmonic"]
+    towards: Complex[Array, "output harmonic"]
+    expected: Float[Array, "output harmonic"]
+    weight: Float[Array, "output harmonic"]
+    innovations: Complex[Array, "output harmonic"]
+    x: Complex[Array, " harmonic"]
+
+    @classmethod
+    def of(cls, records: Records, gains: Complex[Array, "output harmonic"]) -> "Profile":
+        """The records at these gains."""
+        left, x, selected = records.variance_x, records.x, records.selected
+        towards, expected, innovations = [], [], []
+        for g, y, of_y in zip(gains, records.y, records.variance_y, strict=True):
+            total = of_y + power(g) * left
+            share = jnp.where(selected, left / total, 0.0)
+            expected.append(total)
+            towards.append(jnp.conj(g) * as_complex(share))
+            innovations.append(y - g * x)
+            x = x + towards[-1] * innovations[-1]
+            left = jnp.where(selected, share * of_y, left)
+        weight = jnp.where(selected[None, :], 2 / jnp.stack(expected), 0.0)
+        parts = map(jnp.stack, (towards, expected))
+        return cls(gains, *parts, weight, jnp.stack(innovations), x)
+
+    def whitened(
+        self, change: Complex[Array, "output harmonic"]
+    ) -> Complex[Array, "output harmonic"]:
+        """Innovations, not scaled, of a change of the outputs."""
+        x, found = jnp.zeros_like(self.x), []
+        for of, g, towards in zip(change, self.gains, self.towards, strict=True):
+            found.append(of - g * x)
+            x = x + towards * found[-1]
+        return jnp.stack(found)
+
+    def weighted(
+        self, innovations: Complex[Array, "output harmonic"]
+    ) -> Complex[Array, "output harmonic"]:
+        """2 Σ⁻¹ times a change of the outputs, from its innovations."""
+        scaled = innovations * as_complex(self.weight)
+        back, found = jnp.zeros_like(self.x), []
+        each = list(zip(scaled, self.gains, self.towards, strict=True))
+        for of, g, towards in reversed(each):
+            found.append(of + jnp.conj(towards) * back)
+            back = back - jnp.conj(g) * found[-1]
+        return jnp.stack(found[::-1])
+
+    @property
+    def pull(self) -> Complex[Array, "output harmonic"]:
+        """2 Σ⁻¹ (Y − G x)."""
+        return self.weighted(self.innovations)
+
+    @property
+    def score(self) -> Complex[Array, "output harmonic"]:
+        """ρ."""
+        return jnp.conj(self.x)[None, :] * self.pull
+
+    @property
+    def information(self) -> Complex[Array, "output output harmonic"]:
+        """P."""
+        outputs, harmonics = self.gains.shape
+        unit = jnp.tile(as_complex(jnp.eye(outputs))[:, :, None], (1, 1, harmonics))
+        columns = jnp.stack([self.weighted(self.whitened(one)) for one in unit], axis=1)
+        return columns * as_complex(power(self.x))[None, None, :]
+
+    @property
+    def size(self) -> Float[Array, "output harmonic"]:
+        """Information of each innovation about its gain."""
+        return self.weight * power(self.x)[None, :]
+
+    @property
+    def terms(self) -> Float[Array, "output part"]:
+        """Innovations, scaled to unit variance; Σ of their squares is D."""
+        return real_parts(self.innovations * as_complex(jnp.sqrt(self.weight)))
+
+    @property
+    def objective(self) -> Float[Array, ""]:
+        """½ D."""
+        return 0.5 * jnp.sum(self.weight * power(self.innovations))
+
+    def by_x(
+        self,
+        records: Records,
+        x: Complex[Array, "z harmonic"],
+        log_variance: Float[Array, "z harmonic"],
+    ) -> Float[Array, "z harmonic"]:
+        """Derivatives of ½ D at each harmonic, from those of `x` and of ln `variance_x`."""
+        towards = jnp.sum(jnp.conj(self.pull) * self.gains, axis=0)  # 2 conj(X̂ − x) / σ_x²
+        moved = 0.25 * power(towards) * records.variance_x
+        return -(towards[None, :] * x).real - moved[None, :] * log_variance
+
+    def excess(self, records: Records) -> Float[Array, "output harmonic"]:
+        """`excess` of the innovations of each output."""
+        each = jax.vmap(excess, (0, None))(self.terms, records.selected)
+        return each[:, : self.x.size]
+
+    def shows_hum(
+        self, records: Records, without: Complex[Array, "output harmonic"] | None = None
+    ) -> Bool[Array, ""]:
+        """Whether the innovations of an output show mains hum, as `stands_out` has it.
+
+        Args:
+            records: The records.
+            without: Part of the innovations that is no hum; None for none.
+        """
+        left = self.innovations if without is None else self.innovations - without
+        squares = power(left) / self.expected
+        return jnp.stack(
+            [stands_out(of, records.frequency, records.selected) for of in squares]
+        ).any()
+
+    def rrse(self, records: Records, x: Complex[Array, " harmonic"]) -> Float[Array, ""]:
+        """RRSE of the output that is predicted worst from this input."""
+        each = zip(self.gains, records.y, strict=True)
+        return jnp.stack([complex_rrse(g * x, y, records.selected) for g, y in each]).max()
