@@ -144,7 +144,9 @@ class Profile(eqx.Module):
     @property
     def terms(self) -> Float[Array, "output part"]:
         """Innovations, scaled to unit variance; Σ of their squares is D."""
-        return real_parts(self.innovations * as_complex(jnp.sqrt(self.weight)))
+        # The root of the weight itself would have no derivative where a harmonic is not used.
+        scale = jnp.where(self.weight > 0, jnp.sqrt(2 / self.expected), 0.0)
+        return real_parts(self.innovations * as_complex(scale))
 
     @property
     def objective(self) -> Float[Array, ""]:
