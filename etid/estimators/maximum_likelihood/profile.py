@@ -93,8 +93,8 @@ class Profile(eqx.Module):
             x = x + towards[-1] * innovations[-1]
             left = jnp.where(selected, share * of_y, left)
         weight = jnp.where(selected[None, :], 2 / jnp.stack(expected), 0.0)
-        parts = map(jnp.stack, (towards, expected))
-        return cls(gains, *parts, weight, jnp.stack(innovations), x)
+        towards, innovations = jnp.stack(towards), jnp.stack(innovations)
+        return cls(gains, towards, jnp.stack(expected), weight, innovations, x)
 
     def whitened(
         self, change: Complex[Array, "output harmonic"]
