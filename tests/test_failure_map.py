@@ -226,9 +226,7 @@ def cells_of(chart):
 
 @pytest.mark.slow
 def test_a_quick_map_is_drawn_and_met(tmp_path, monkeypatch):
-    few = dict.fromkeys(
-        ("default", "harmonic_steiglitz_mcbride", "steiglitz_mcbride"), Effort(1, 2)
-    )
+    few = dict.fromkeys(("default", "steiglitz_mcbride"), Effort(1, 2))
     monkeypatch.setattr(failure_map, "QUICK", few)
     assert failure_map.run(True, tmp_path, 1)
     with (tmp_path / "failures.csv").open() as file:
