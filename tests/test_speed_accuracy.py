@@ -1,7 +1,5 @@
 """Error against time: what counts as wrong, what is on the front, what is complained of."""
 
-import csv
-
 import numpy as np
 import pytest
 
@@ -127,15 +125,6 @@ def test_the_ladder_differs_from_its_middle_in_one_thing_each():
     np.testing.assert_array_equal(
         study[TRIAL].v_out, scenes["dry, 1 period"].simulate(seed=3)[TRIAL].v_out
     )
-
-
-@pytest.mark.slow
-def test_the_quick_run_ends_well(tmp_path, monkeypatch):
-    monkeypatch.setattr(speed_accuracy, "pin", lambda: None)  # it would be for all tests to come
-    assert speed_accuracy.run(["dry, 60 dB"], "simulated", 4, tmp_path, quick=True)
-    with (tmp_path / "speed_accuracy.csv").open() as file:
-        rows = list(csv.DictReader(file))
-    assert {r["mode"] for r in rows} == {"alone"}
 
 
 def test_the_first_that_is_good_is_to_be_used_or_what_is_as_good_in_half_its_time():
