@@ -54,7 +54,7 @@ FEW = {
     ("SNR and skin that is not one RC", "60 dB", "Cole, 0.9"),
 }
 # What is right at least as often as what follows it.
-RANKING = (DEFAULT, "harmonic_steiglitz_mcbride", "steiglitz_mcbride")
+RANKING = (DEFAULT, "steiglitz_mcbride")
 
 
 def usual(drivers: int) -> dict[str, Effort]:

@@ -22,7 +22,7 @@ import etid
 from benchmarks.problem import SAMPLES, START, ByNumPy, Problem, harmonics, problem, terms
 from benchmarks.timing import first_and_warm
 from etid.estimators.estimate import MAX_STEPS
-from etid.estimators.harmonic_steiglitz_mcbride.iteration import fit_skin
+from etid.estimators.harmonic_start import start_of_skin
 from etid.estimators.maximum_likelihood.load_fit import WELL
 from etid.estimators.steiglitz_mcbride.iteration import in_time, iterate
 from etid.identify.batches import each
@@ -165,12 +165,12 @@ def _steiglitz_mcbride(ten_periods: Problem) -> Stage:
 
 
 def harmonic_steiglitz_mcbride(ten_periods: Problem, iterations: int) -> Run:
-    """Our Steiglitz-McBride on the harmonics."""
+    """Our Steiglitz-McBride on the harmonics, a start of fits."""
     known = ten_periods.known
     z_th = known.z_th(jnp.zeros_like(known.loaded))
 
     def ours(one):
-        return fit_skin(one.spectrum, z_th, one.sample_rate, iterations).circuit.values()
+        return start_of_skin(one.spectrum, z_th, one.sample_rate, iterations)[0].values()
 
     return _each(ours, ten_periods.lanes)
 

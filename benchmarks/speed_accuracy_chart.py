@@ -18,7 +18,6 @@ LETTERS = {
     "maximum_likelihood": "ML",
     "non_parametric": "NP",
     "output_error": "OE",
-    "harmonic_steiglitz_mcbride": "HSM",
     "steiglitz_mcbride": "SM",
     "equation_error": "EE",
     "SciPy least_squares, harmonics": "SciPy",

@@ -15,7 +15,6 @@ from etid.circuits.impedance import parallel, series
 from etid.circuits.netlist import circuit_string, netlist
 from etid.circuits.written import circuit
 from etid.estimators.estimator import AbstractEstimator
-from etid.estimators.harmonic_steiglitz_mcbride.estimator import HarmonicSteiglitzMcBride
 from etid.estimators.maximum_likelihood.estimator import MaximumLikelihood
 from etid.estimators.non_parametric.estimator import NonParametric
 from etid.estimators.output_error.estimator import OutputError
@@ -65,7 +64,6 @@ __all__ = [
     "EquationError",
     "Fit",
     "Fits",
-    "HarmonicSteiglitzMcBride",
     "IdentificationError",
     "KramersKronig",
     "MaximumLikelihood",

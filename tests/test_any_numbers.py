@@ -66,8 +66,7 @@ def assert_equal(written, read):
 
 # Method of the driver, and how many of 10 000 fits; output error takes a hundred times as long.
 METHODS = {
-    "maximum_likelihood": ("maximum_likelihood", 4800),
-    "harmonic_steiglitz_mcbride": ("maximum_likelihood", 2000),
+    "maximum_likelihood": ("maximum_likelihood", 6800),
     "steiglitz_mcbride": ("steiglitz_mcbride", 1600),
     "equation_error": ("steiglitz_mcbride", 1000),
     "non_parametric": ("maximum_likelihood", 500),

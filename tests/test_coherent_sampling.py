@@ -281,8 +281,7 @@ def test_100_khz_are_too_slow_for_edges_that_ring_at_60_khz(snr_db):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("method", ["non_parametric", "harmonic_steiglitz_mcbride"])
-def test_methods_that_take_aliases_for_noise_say_that_they_are_biased(method):
-    errors, others = drawn(10, method, rate=240e3, pulses=60.0)
+def test_a_method_that_takes_aliases_for_noise_says_that_it_is_biased():
+    errors, others = drawn(10, "non_parametric", rate=240e3, pulses=60.0)
     assert others.count("biased") > len(errors)
     assert not errors.size or np.abs(errors).max() < SIGMAS

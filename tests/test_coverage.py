@@ -62,8 +62,6 @@ def limits(draws):
         ("maximum_likelihood", 60.0, 10_000, True, REPETITIONS),
         ("non_parametric", 60.0, 10_000, False, REPETITIONS),
         ("non_parametric", 60.0, 10_000, True, REPETITIONS),
-        ("harmonic_steiglitz_mcbride", 60.0, 10_000, False, REPETITIONS),
-        ("harmonic_steiglitz_mcbride", 40.0, 10_000, False, REPETITIONS),
         ("joint", 60.0, 10_000, False, DEAR),
         ("joint", 60.0, 10_000, True, DEAR),
         ("output_error", 60.0, 10_000, False, DEAR),

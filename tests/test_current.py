@@ -416,9 +416,7 @@ def test_a_recording_needs_what_it_is_identified_from(skin):
         skin.replace(v_out=None)
 
 
-@pytest.mark.parametrize(
-    "method", ["steiglitz_mcbride", "non_parametric", "harmonic_steiglitz_mcbride"]
-)
+@pytest.mark.parametrize("method", ["steiglitz_mcbride", "non_parametric"])
 def test_an_estimator_that_needs_a_driver_says_so(skin, method):
     with pytest.raises(ValueError, match=f"{method}.*from a measured current"):
         etid.identify_skin(skin, method=method)

@@ -222,17 +222,3 @@ def test_one_map_anew_keeps_the_others(tmp_path):
 
 def cells_of(chart):
     return [cell for cell in cells() if cell.chart == chart]
-
-
-@pytest.mark.slow
-def test_a_quick_map_is_drawn_and_met(tmp_path, monkeypatch):
-    few = dict.fromkeys(
-        ("default", "harmonic_steiglitz_mcbride", "steiglitz_mcbride"), Effort(1, 2)
-    )
-    monkeypatch.setattr(failure_map, "QUICK", few)
-    assert failure_map.run(True, tmp_path, 1)
-    with (tmp_path / "failures.csv").open() as file:
-        rows = list(csv.DictReader(file))
-    assert len(rows) == len(few) * len(failure_map.FEW)
-    assert all(row["commit"] for row in rows)
-    assert (tmp_path / "failures_4.svg").read_text().startswith("<?xml")

@@ -13,7 +13,6 @@ from etid.simulation import scenes
 DRIVERS = {
     "maximum_likelihood": "maximum_likelihood",
     "non_parametric": "maximum_likelihood",
-    "harmonic_steiglitz_mcbride": "maximum_likelihood",
     "output_error": "output_error",
     "steiglitz_mcbride": "steiglitz_mcbride",
     "equation_error": "steiglitz_mcbride",

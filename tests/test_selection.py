@@ -438,7 +438,6 @@ def test_circuits_with_equal_impedances_are_refused(study, driver):
         etid.select_circuit(study["dry"], driver, candidates=[etid.SkinRC(), Series()])
 
 
-@pytest.mark.parametrize("method", ["harmonic_steiglitz_mcbride", "non_parametric"])
-def test_methods_without_a_likelihood_cannot_choose(study, driver, method):
+def test_a_method_without_a_likelihood_cannot_choose(study, driver):
     with pytest.raises(ValueError, match="computes no likelihood"):
-        etid.identify_skin(study["dry"], driver, circuit="auto", method=method)
+        etid.identify_skin(study["dry"], driver, circuit="auto", method="non_parametric")

@@ -513,7 +513,6 @@ TESTS = {  # score tests that a successful fit has passed
     "amplitudes": set(),
     "non_parametric": {"spread over time constants", "further relaxation", "gains"},
     "joint": {"spread over time constants", "further relaxation", "gains"},
-    "harmonic_steiglitz_mcbride": {"spread over time constants", "further relaxation"},
 }
 
 

@@ -101,11 +101,7 @@ def driver():
 
 @pytest.mark.parametrize(
     "method",
-    [
-        "maximum_likelihood",
-        "harmonic_steiglitz_mcbride",
-        pytest.param("non_parametric", marks=pytest.mark.slow),
-    ],
+    ["maximum_likelihood", pytest.param("non_parametric", marks=pytest.mark.slow)],
 )
 def test_a_skin_behind_a_changed_driver_is_inconsistent(driver, method):
     """R_p was 63 of its standard errors off, at chi2 1."""

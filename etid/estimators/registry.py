@@ -5,7 +5,6 @@ import dataclasses
 import math
 
 from etid.estimators.estimator import AbstractEstimator, Description
-from etid.estimators.harmonic_steiglitz_mcbride.estimator import HarmonicSteiglitzMcBride
 from etid.estimators.maximum_likelihood.estimator import MaximumLikelihood
 from etid.estimators.non_parametric.estimator import NonParametric
 from etid.estimators.output_error.estimator import OutputError
@@ -34,7 +33,6 @@ for _estimator in (
     MAXIMUM_LIKELIHOOD,
     NonParametric(),
     OUTPUT_ERROR,
-    HarmonicSteiglitzMcBride(),
     SteiglitzMcBride(),
     EquationError(),
 ):

@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Array, Complex, Float
 
 from etid.circuits.circuit import AbstractCircuit, SkinRC
-from etid.estimators.harmonic_steiglitz_mcbride import iteration
+from etid.estimators.harmonic_start import start_of_skin
 from etid.estimators.unknowns import LoadUnknowns
 from etid.results.driver import SourceImpedance
 from etid.signals.harmonics import Spectrum, signal_share
@@ -102,7 +102,7 @@ def harmonic_starts(
         z_th: Source impedance at its harmonics [Ω].
         circuit: Structure and typical values.
     """
-    skin, delay = iteration.start_of_skin(spectrum, z_th, sample_rate, START_STEPS)
+    skin, delay = start_of_skin(spectrum, z_th, sample_rate, START_STEPS)
     starts = circuit_starts(circuit, skin)
     return LoadUnknowns(starts, jnp.zeros(starts.shape[0]).at[-1].set(delay))
 

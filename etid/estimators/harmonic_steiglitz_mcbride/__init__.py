@@ -1,1 +1,0 @@
-"""Steiglitz-McBride on the harmonics, without bias by noise: iteration and estimator."""
