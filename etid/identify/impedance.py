@@ -29,8 +29,8 @@ from jaxtyping import Array, Complex, Float
 
 from etid.circuits.circuit import AbstractCircuit
 from etid.identify.arguments import circuit_of, require_float64
-from etid.identify.compiled import stored_jit
 from etid.identify.kramers_kronig import EXACT, FAIL, MISFIT_CHI2, kramers_kronig
+from etid.numpy_tier.tiers import program
 from etid.recordings.remarks import Remark, texts
 from etid.results.data import MeasuredImpedance, with_data
 from etid.results.fit import CHANGES, Fit, IdentificationError, Support, complex_rrse
@@ -60,7 +60,7 @@ class PassiveFit(NamedTuple):
     most: float | Float[Array, ""]
 
 
-@stored_jit
+@program
 def _fit(
     frequency: Float[Array, " frequency"],
     z: Complex[Array, " frequency"],

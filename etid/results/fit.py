@@ -248,8 +248,8 @@ class Fit(Judged, WithData[Circuit]):
             f"{name} {quantity(float(value), unit, float(error))}"
             for (name, unit), value, error in zip(
                 self.circuit.units().items(),
-                self.circuit.values(),
-                self.stderr.values(),
+                np.asarray(self.circuit.values()),
+                np.asarray(self.stderr.values()),
                 strict=True,
             )
         )

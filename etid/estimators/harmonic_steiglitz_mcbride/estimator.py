@@ -55,7 +55,6 @@ class HarmonicSteiglitzMcBride(AbstractByMaximumLikelihood):
     lane = Harmonics
     driver = ContinuousDriver
     any_circuit = False
-    brief = True
 
     iterations: int = iteration.ITERATIONS
 

@@ -3,15 +3,10 @@
 import sys
 import threading
 
-import jax
 from tqdm import tqdm
 
 PATIENCE = 1.0  # [s] waiting time without a word
 COMPILING = "etid: JAX compiles the fit, once in each process."
-KEEP = (
-    " To keep compiled programs for later processes, set JAX_COMPILATION_CACHE_DIR to a folder and "
-    "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS to 0."
-)
 
 _told = threading.Event()
 
@@ -28,5 +23,4 @@ def _tell() -> None:
     person = sys.stderr is not None and (sys.stderr.isatty() or "ipykernel" in sys.modules)
     if person and not _told.is_set():
         _told.set()
-        kept = jax.config.jax_compilation_cache_dir  # pyright: ignore[reportAttributeAccessIssue]
-        tqdm.write(COMPILING + ("" if kept else KEEP), file=sys.stderr)  # not into a progress bar
+        tqdm.write(COMPILING, file=sys.stderr)  # not into a progress bar
