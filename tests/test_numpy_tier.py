@@ -316,6 +316,27 @@ def test_a_product(text, dtype):
         check(lambda a, b: jnp.einsum(text, a, b), a, b, rounding=40)
 
 
+@pytest.mark.parametrize(
+    "shapes",
+    [((7, 5000), (5000,)), ((5000, 7), (7,)), ((20, 2500), (2500, 20)), ((9, 9), (9, 4000))],
+)
+def test_a_product_of_large_matrices_is_made_of_parts(shapes):
+    rng = np.random.default_rng(3)
+    a, b = map(rng.normal, (0.0, 0.0), (1.0, 1.0), shapes)
+    size = np.linalg.norm(a) * np.linalg.norm(b)
+    (found,) = translated(jax.make_jaxpr(jnp.matmul)(a, b))([a, b])
+    np.testing.assert_allclose(found, a @ b, atol=1e-15 * size)
+
+
+def test_factors_of_a_long_matrix_are_made_of_those_of_its_parts():
+    a = np.random.default_rng(3).normal(size=(3456, 11))
+    q, r = translated(jax.make_jaxpr(jnp.linalg.qr)(a))([a])
+    size = np.linalg.norm(a)
+    np.testing.assert_allclose(q @ r, a, atol=1e-15 * size)
+    np.testing.assert_allclose(q.T @ q, np.eye(11), atol=1e-14)
+    np.testing.assert_allclose(abs(r), abs(np.linalg.qr(a)[1]), atol=1e-15 * size)
+
+
 # Condition numbers stay below 100, and each of some ten operations rounds.
 ALGEBRA = {
     "cholesky": jnp.linalg.cholesky,
@@ -355,6 +376,16 @@ def test_matrices_without_a_result(name):
     for matrix in (np.zeros((3, 3)), np.full((3, 3), np.nan), np.diag([1.0, 0.0, 2.0])):
         check(ALGEBRA[name], matrix)
     check(ALGEBRA["cholesky"], np.diag([1.0, -1.0, 2.0]))
+
+
+@pytest.mark.parametrize("name", ALGEBRA)
+def test_a_matrix_without_a_result_leaves_the_others_alone(name):
+    good = np.diag([1.0, 2.0, 3.0, 4.0]) + 0.1
+    both = np.stack([np.full((4, 4), np.nan), good])
+    program = translated(jax.make_jaxpr(ALGEBRA[name])(both))
+    alone = translated(jax.make_jaxpr(ALGEBRA[name])(good[None]))
+    for one, other in zip(program([both]), alone([good[None]]), strict=True):
+        np.testing.assert_array_equal(one[1], other[0])
 
 
 def test_algebra_of_nothing():

@@ -4,6 +4,7 @@ import math
 
 import numpy as np
 
+from etid.numpy_tier import functions
 from etid.numpy_tier.translator import Equation, Translator, UntranslatableError, Value, rule
 
 TRANSFORMS = ("fft", "ifft", "rfft", "irfft")  # in the order of `jax.lax.FftType`
@@ -19,7 +20,9 @@ def _product(t: Translator, equation: Equation, a: Value, b: Value) -> list[Valu
     aval = equation.outvars[0].aval
     if a.dtype != aval.dtype or b.dtype != aval.dtype:
         raise UntranslatableError("product of different types")
-    if not batch_a and len(a.shape) <= 2 and len(b.shape) <= 2 and len(of_a) == 1:
+    size = math.prod(aval.shape) * math.prod(a.shape[axis] for axis in of_a)
+    simple = not batch_a and len(a.shape) <= 2 and len(b.shape) <= 2 and len(of_a) == 1
+    if simple and size <= functions.SMALL[0]:
         left = f"{a.name}.T" if len(a.shape) == 2 and of_a[0] == 0 else a.name
         right = f"{b.name}.T" if len(b.shape) == 2 and of_b[0] == 1 else b.name
         return _all(t, f"{left}.dot({right})", equation, a, b)
@@ -31,7 +34,7 @@ def _product(t: Translator, equation: Equation, a: Value, b: Value) -> list[Valu
     columns = math.prod(b.shape[axis] for axis in rest_b)
     left = f"{_moved(a, (*batch_a, *rest_a, *of_a))}.reshape({(*batch, rows, inner)})"
     right = f"{_moved(b, (*batch_b, *of_b, *rest_b))}.reshape({(*batch, inner, columns)})"
-    return _all(t, f"np.matmul({left},{right}).reshape({tuple(aval.shape)})", equation, a, b)
+    return _all(t, f"product({left},{right}).reshape({tuple(aval.shape)})", equation, a, b)
 
 
 def _moved(of: Value, axes: tuple[int, ...]) -> str:
@@ -63,8 +66,7 @@ def _qr(t: Translator, equation: Equation, of: Value) -> list[Value]:
     params = equation.params
     if params.get("pivoting") or not np.prod(of.shape):
         raise UntranslatableError("qr with pivots, or of an empty matrix")
-    mode = "complete" if params["full_matrices"] else "reduced"
-    return _all(t, f"np.linalg.qr({of.name},'{mode}')", equation, of)
+    return _all(t, f"qr({of.name},{bool(params['full_matrices'])})", equation, of)
 
 
 @rule("eigh")

@@ -15,6 +15,8 @@ __all__ = [
     "integer_power",
     "lu",
     "padded",
+    "product",
+    "qr",
     "quotient",
     "remainder",
     "rounded",
@@ -129,6 +131,27 @@ def sorted_by(arrays: Sequence[Any], axis: int, keys: int) -> list[Any]:
 
 # --- Linear algebra -------------------------------------------------------------------------------
 
+# OpenBLAS computes products of fewer multiplications than these in one thread: of a vector (also a
+# complex one), and of matrices. Its other threads wait for the next product in a busy loop, which
+# took three quarters of the CPU time of a driver.
+SMALL = 2**12, 2**17
+
+
+def product(a: Any, b: Any) -> Any:
+    """Product of matrices; of large ones in parts, which BLAS computes without threads."""
+    sizes = a.shape[-2], a.shape[-1], b.shape[-1]
+    rows, inner, columns = sizes
+    if rows * inner * columns <= SMALL[min(rows, columns) > 1]:
+        return np.matmul(a, b)
+    half = max(sizes) // 2
+    if rows == max(sizes):
+        parts = product(a[..., :half, :], b), product(a[..., half:, :], b)
+        return np.concatenate(parts, -2)
+    if columns == max(sizes):
+        parts = product(a, b[..., :half]), product(a, b[..., half:])
+        return np.concatenate(parts, -1)
+    return product(a[..., :half], b[..., :half, :]) + product(a[..., half:], b[..., half:, :])
+
 
 def _each(function: Any, *arrays: Any) -> list[Any]:
     """Results of a function of matrices, for each of several."""
@@ -136,6 +159,19 @@ def _each(function: Any, *arrays: Any) -> list[Any]:
     rows = [of.reshape(-1, *of.shape[-2:]) for of in arrays]
     found = [function(*of) for of in zip(*rows, strict=True)]
     return [np.array(of).reshape(*batch, *of[0].shape) for of in zip(*found, strict=True)]
+
+
+def qr(of: Any, full: bool) -> Any:
+    """Orthogonal and triangular factor; of a long matrix from those of its parts, as `product`."""
+    rows, columns = of.shape[-2:]
+    if full or rows * columns <= 2 * SMALL[0] or rows < 4 * columns:
+        return np.linalg.qr(of, "complete" if full else "reduced")
+    half = rows // 2
+    first, upper = qr(of[..., :half, :], False)
+    second, lower = qr(of[..., half:, :], False)
+    of_both, found = np.linalg.qr(np.concatenate((upper, lower), -2))
+    parts = product(first, of_both[..., :columns, :]), product(second, of_both[..., columns:, :])
+    return np.concatenate(parts, -2), found
 
 
 def cholesky(of: Any) -> Any:
@@ -177,11 +213,13 @@ def lu(of: Any) -> list[Any]:
     return [found, pivots.astype(np.int32), order]
 
 
-def eigh(of: Any, lower: bool) -> tuple[Any, Any]:
+def eigh(of: Any, lower: bool) -> Any:
     """Eigenvectors and eigenvalues of a symmetric matrix; NaN if they are not found."""
     try:
         values, vectors = np.linalg.eigh(of, "L" if lower else "U")
     except np.linalg.LinAlgError:
+        if of.ndim > 2:  # one of several fails
+            return _each(lambda one: eigh(one, lower), of)
         return np.full_like(of, np.nan), np.full(of.shape[:-1], np.nan, of.real.dtype)
     return vectors, values
 
@@ -192,6 +230,8 @@ def eigenvalues(of: Any) -> Any:
     try:
         return np.linalg.eigvals(of).astype(dtype)
     except np.linalg.LinAlgError:
+        if of.ndim > 2:
+            return _each(lambda one: (eigenvalues(one),), of)[0]
         return np.full(of.shape[:-1], complex(np.nan, np.nan), dtype)
 
 
@@ -200,6 +240,8 @@ def svd(of: Any, vectors: bool, full: bool) -> list[Any]:
     try:
         found: Any = np.linalg.svd(of, full, vectors)
     except np.linalg.LinAlgError:
+        if of.ndim > 2:
+            return _each(lambda one: svd(one, vectors, full), of)
         found = np.linalg.svd(np.zeros_like(of), full, vectors)
         found = [one * np.nan for one in found] if vectors else found * np.nan
     return [found[1], found[0], found[2]] if vectors else [found]
