@@ -8,6 +8,7 @@ data, the data do not determine the parameters.
 import dataclasses
 
 import jax.numpy as jnp
+import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int
 
 from etid.circuits.circuit import AbstractCircuit
@@ -92,7 +93,7 @@ def judged(
     at_bound = 0
     if outside is not None:
         at_bound = jnp.where(jnp.any(outside != 0), int(Remark.at_bound), 0)
-    settled = RESULTS.promote(estimate.result) == RESULTS.successful
+    settled = estimate.result == optx.RESULTS.successful
     return Fit(
         circuit=fitted,
         cov=cov,

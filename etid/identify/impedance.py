@@ -107,7 +107,7 @@ def _fit(
         misfit, remark = excess > FAIL, jnp.where(excess > EXACT, int(Remark.not_noise), 0)
     fitted = circuit.with_log_values(q)
     values = fitted.values()
-    settled = RESULTS.promote(solution.result) == verdict("successful")
+    settled = solution.result == optx.RESULTS.successful
     return Fit(
         circuit=fitted,
         cov=cov * jnp.outer(values, values),

@@ -15,6 +15,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int
 from tqdm import tqdm
 
@@ -130,7 +131,7 @@ def _alone(lanes: Any, count: Int[Array, ""], model: Joint, driver: HarmonicDriv
             current = jnp.asarray(lane.i), jnp.asarray(lane.variance_i)
         found = fit_alone(model, given, spectrum, sample_rate, starts, current)
         own, result, chi2, error, hum = found
-        settled = RESULTS.promote(result) == RESULTS.successful
+        settled = result == optx.RESULTS.successful
         good = settled & jnp.isfinite(chi2) & ~judgement.misses(chi2, error)
         changed = jnp.array(False) if known is None else known.differs(spectrum)
         loads = Loads(spectrum, sample_rate, own, good & ~changed, jnp.array(-1), current)

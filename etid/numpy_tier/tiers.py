@@ -6,9 +6,7 @@ traced programs (`etid.numpy_tier`) in a fifth of a second and in 10 ms, and not
 
 import contextlib
 import functools
-import gc
 import logging
-import threading
 import weakref
 from collections.abc import Callable, Iterator
 from typing import Any, ParamSpec, TypeVar
@@ -17,6 +15,7 @@ import equinox as eqx
 import jax
 import jax.core
 
+from etid.garbage import unsearched
 from etid.numpy_tier.text import translated
 from etid.numpy_tier.translator import UntranslatableError
 from etid.numpy_tier.waiting import announced_later
@@ -112,7 +111,7 @@ def program(
                         jax.tree.structure(traced.out_info), jax.device_put(small(leaves))
                     )
                     return eqx.combine(found[0], found[1].of)
-            with _quietly(announced=True):
+            with _announced():
                 found, others = run(static, arrays)
         return eqx.combine(found, others.of)
 
@@ -132,7 +131,7 @@ def _by_numpy() -> bool:
 
 
 def _traced(run: Any, static: _Static, arrays: Any) -> Any:
-    with _quietly():
+    with unsearched():
         return run.trace(static, arrays)
 
 
@@ -144,7 +143,7 @@ def _in_numpy(traced: Any, name: str) -> Any:
     jaxpr = traced.jaxpr.jaxpr  # the same object each time, because JAX keeps its traces
     if jaxpr not in _programs:
         try:
-            with _quietly():
+            with unsearched():
                 _programs[jaxpr] = translated(traced.jaxpr)
         except UntranslatableError as error:
             _log.info("XLA compiles %s: NumPy cannot run %s", name, error)
@@ -153,24 +152,14 @@ def _in_numpy(traced: Any, name: str) -> Any:
 
 
 @contextlib.contextmanager
-def _quietly(announced: bool = False) -> Iterator[None]:
-    """While a function is traced or compiled: no search for garbage.
-
-    A trace makes a million objects that live on. To search them for garbage again and again takes a
-    sixth of its time.
-
-    Args:
-        announced: Whether a line tells a person who waits.
-    """
-    timer = announced_later() if announced else threading.Timer(0, int)
-    collects = gc.isenabled()
-    gc.disable()
+def _announced() -> Iterator[None]:
+    """While a function is compiled: a line tells a person who waits."""
+    timer = announced_later()
     try:
-        yield
+        with unsearched():
+            yield
     finally:
         timer.cancel()
-        if collects:
-            gc.enable()
 
 
 def _at_once() -> contextlib.AbstractContextManager[None]:
