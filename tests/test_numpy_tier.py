@@ -460,6 +460,7 @@ PROGRAMS = {
     "own derivative": lambda x: jax.nn.relu(x) + jax.nn.softplus(x),
     "complex": lambda x: jnp.exp(lax.complex(x, -x)).real * jnp.conj(lax.complex(x, x)).imag,
     "constants": lambda x: jnp.arange(12.0).reshape(3, 4) * 2 + jnp.ones((3, 4)),
+    "placed": lambda x: jax.device_put(2 * x) + jax.device_put(np.float64(1.0)),
     "nothing but its operand": lambda x: (x, x),
 }
 

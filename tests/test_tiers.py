@@ -1,5 +1,6 @@
 """NumPy and XLA run the same programs: equal verdicts and numbers, and nothing is compiled."""
 
+import json
 import os
 import signal
 import subprocess
@@ -75,37 +76,46 @@ def test_drivers_and_skins_are_those_of_xla(studies, by_xla):
         same_fit(skin(), by_xla(skin))
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    "options",
-    [
-        {"circuit": etid.SkinLayers()},
-        {"circuit": etid.ParallelRC()},
-        {"circuit": etid.SkinCole()},
-        {"circuit": etid.Resistor()},
-        {"prior": {"r_s": (3e4, 1e3)}},
-        {"fixed": {"r_s": 3.3e4}},
-        {"bounds": {"r_s": (1e3, 3.3e4)}},
-        {"method": "harmonic_steiglitz_mcbride"},
-        {"method": "steiglitz_mcbride"},
-        {"method": "equation_error"},
-        {"method": "output_error"},
-        {"method": "non_parametric"},
-    ],
-    ids=str,
+OPTIONS = (
+    {},
+    {"circuit": etid.SkinLayers()},
+    {"circuit": etid.ParallelRC()},
+    {"circuit": etid.SkinCole()},
+    {"circuit": etid.Resistor()},
+    {"prior": {"r_s": (3e4, 1e3)}},
+    {"fixed": {"r_s": 3.3e4}},
+    {"bounds": {"r_s": (1e3, 3.3e4)}},
+    {"method": "harmonic_steiglitz_mcbride"},
+    {"method": "steiglitz_mcbride"},
+    {"method": "equation_error"},
+    {"method": "output_error"},
+    {"method": "non_parametric"},
 )
-def test_all_methods_and_circuits_are_those_of_xla(options, studies, by_xla):
+DRAWN = 16  # for each of the options
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("options", OPTIONS, ids=str)
+def test_drawn_recordings_by_all_methods_and_circuits_are_those_of_xla(options, by_xla):
+    """Dry and damp skin, 20 to 80 dB, with and without delays; several recordings of a driver."""
+    rng = np.random.default_rng(OPTIONS.index(options))
     method = options.get("method")
-    for study in studies.values():
+    in_time = method in ("steiglitz_mcbride", "equation_error", "output_error")
+    for scene in (etid.scenes.paper_dry, etid.scenes.paper_damp):
+        study = scene(
+            snr_db=rng.uniform(20.0, 80.0),
+            trigger_jitter_rms=rng.choice([0.0, 100e-9]),
+            samples=3334 if method == "output_error" else 10_000,
+        ).simulate(seed=int(rng.integers(1000)))
         calibration = next(one for path, one in study.items() if "calibration" in path)
-        loaded = next(iter(study.loaded.recordings()))
-        of = method if method in ("steiglitz_mcbride", "equation_error", "output_error") else None
-        driver = etid.identify_driver(calibration, method=of, throw=False)
+        by = method if in_time else None
+        driver = etid.identify_driver(calibration, method=by, throw=False)
+        for loaded in list(study.loaded.recordings())[: DRAWN // 2]:
 
-        def skin(loaded=loaded, driver=driver):
-            return etid.identify_skin(loaded, driver, throw=False, **options)
+            def skin(loaded=loaded, driver=driver):
+                return etid.identify_skin(loaded, driver, throw=False, **options)
 
-        same_fit(skin(), by_xla(skin))
+            same_fit(skin(), by_xla(skin))
 
 
 @pytest.mark.slow
@@ -124,10 +134,12 @@ def test_joint_fits_are_those_of_xla(studies, by_xla):
         assert (abs(values - others) <= OF_ERRORS * errors).all()
 
 
-README = """
+COUNTED = """
+import json, pathlib, sys, tempfile
 import jax
 jax.config.update("jax_enable_x64", True)
 import jax.monitoring
+import numpy as np
 compiled = []
 
 def listen(event, seconds, **of):
@@ -136,21 +148,89 @@ def listen(event, seconds, **of):
 
 jax.monitoring.register_event_duration_secs_listener(listen)
 import etid
+from etid import cli
+
+def ran(name, *results):
+    print("compiled", json.dumps([name, compiled]))
+    compiled.clear()
+
 study = etid.scenes.paper_dry(snr_db=60.0).simulate(seed=0)
 driver = etid.identify_driver(study["calibration/98k8"], order=5)
 fit = etid.identify_skin(study["typical/dry/01"], driver)
 print(driver, fit)
-print(sorted(set(compiled)))
+ran("the example of the README")
+"""
+
+COMMANDS = """
+with tempfile.TemporaryDirectory() as folder:
+    at = pathlib.Path(folder)
+    for command, *files in (
+        ("simulate", "paper_dry", "-o", at / "study.h5"),
+        ("fit", at / "study.h5", "-o", at / "fits.h5"),
+        ("report", at / "fits.h5", "-o", at / "report.html"),
+    ):
+        assert cli.main([command, *map(str, files)]) == 0
+        ran("etid " + command)
+"""
+
+OTHERS = """
+import matplotlib
+matplotlib.use("agg")
+from etid.estimators.registry import names
+calibration, one = study["calibration/98k8"], study["typical/dry/01"]
+ran("posterior", fit.posterior(one, driver))
+ran("profile", fit.profile("r_s", one, driver))
+ran("predict", etid.predict(one, driver, fit.circuit))
+ran("pictures", etid.plot(fit, one, driver), etid.plot(driver, calibration))
+ran("joint", etid.identify_jointly(study))
+ran("choice of a circuit", etid.select_circuit(one, driver))
+for method in set(names()) - {"maximum_likelihood", "output_error"}:
+    ran(method, etid.identify_skin(one, driver, method=method, throw=False))
+for circuit in (etid.SkinLayers(), etid.SkinCole(), etid.ParallelRC(), etid.Resistor()):
+    ran(type(circuit).__name__, etid.identify_skin(one, driver, circuit=circuit, throw=False))
+for name, value in {"fixed": 3.3e4, "prior": (3e4, 1e3), "bounds": (1e3, 3.3e4)}.items():
+    ran(name, etid.identify_skin(one, driver, throw=False, **{name: {"r_s": value}}))
+frequency = np.geomspace(1e2, 1e5, 40)
+z = np.asarray(fit.circuit.response(frequency)) * (1 + 1e-3 * np.sin(frequency))
+ran("impedance", etid.identify_impedance(frequency, z, throw=False))
+study = etid.scenes.paper_dry(current_snr_db=60.0, samples=3334).simulate(seed=0)
+calibration, one = study["calibration/98k8"], study["typical/dry/01"]
+ran("current", etid.identify_skin(one, throw=False))
+ran("current behind a driver", etid.identify_skin(one, driver, throw=False))
+in_time = etid.identify_driver(calibration, method="output_error", throw=False)
+ran("output error", etid.identify_skin(one, in_time, method="output_error", throw=False))
+ran("amplitudes", etid.identify_amplitudes([one, study["typical/dry/02"]], throw=False))
 """
 
 
-def test_the_example_of_the_readme_compiles_nothing():
-    """But single values of the enumerations of equinox, which it computes at once."""
+def compiled(code, folder):
+    """What a new process compiles, by what it does; nothing is cached."""
     done = subprocess.run(
-        [sys.executable, "-c", README], capture_output=True, text=True, check=True, env=os.environ
+        [sys.executable, "-c", COUNTED + code],
+        capture_output=True,
+        text=True,
+        check=False,
+        env={
+            **{name: of for name, of in os.environ.items() if not name.startswith("JAX_")},
+            "XDG_CACHE_HOME": str(folder),
+        },
     )
-    compiled = done.stdout.splitlines()[-1]
-    assert set(eval(compiled)) <= {"jit(convert_element_type)", "jit(stage)"}
+    assert done.returncode == 0, done.stderr
+    lines = [line for line in done.stdout.splitlines() if line.startswith("compiled ")]
+    return dict(json.loads(line.removeprefix("compiled ")) for line in lines)
+
+
+def test_the_example_of_the_readme_and_ten_recordings_with_their_report_compile_nothing(tmp_path):
+    found = compiled(COMMANDS, tmp_path)
+    parts = ("the example of the README", "etid simulate", "etid fit", "etid report")
+    assert found == dict.fromkeys(parts, [])
+
+
+@pytest.mark.slow
+def test_no_small_work_compiles_anything(tmp_path):
+    found = compiled(OTHERS, tmp_path)
+    assert len(found) == 22
+    assert not any(found.values()), found
 
 
 def test_a_fit_does_not_depend_on_what_ran_before(studies):

@@ -112,7 +112,8 @@ def judged(
             # An error of 0 also fails: the element has no effect. So does a value of 0, exp() of a
             # far parameter: files of fits hold positive elements where a fit is successful.
             (~jnp.all((errors > 0) & (errors < 1) & (values > 0)), RESULTS.insensitive),
-            (driver_result != SUCCESSFUL, RESULTS.driver_failed),
+            # With `!=`, equinox would compile a program for two known verdicts.
+            (driver_result._value != SUCCESSFUL._value, RESULTS.driver_failed),
         ),
         steps=estimate.steps,
         method=method,

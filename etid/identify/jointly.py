@@ -412,7 +412,7 @@ def identify_jointly(
         found, delays, cov = jax.device_get((found, delays, cov))
         width = _narrower(groups, found, delays, cov, float(driver.sample_rate))
         if width is not None and better.verdict == "successful":
-            again = dataclasses.replace(Calibrations.of(better), delay_width=jnp.array(width))
+            again = dataclasses.replace(Calibrations.of(better), delay_width=jax.device_put(width))
             model = dataclasses.replace(model, calibrations=again)
             others, better, *_ = together(model, groups, several, better, tolerance)
             for number, (group, other) in enumerate(

@@ -287,6 +287,11 @@ def _call(t: Translator, equation: Equation, *operands: Value) -> list[Value]:
     return t.inline(closed, operands)
 
 
+@rule("device_put", broadcast=False)
+def _put(_: Translator, __: Equation, *operands: Value) -> Sequence[Value]:
+    return operands  # the results of a program are put on the device, not what it makes between
+
+
 @rule("custom_linear_solve", broadcast=False)
 def _solve(t: Translator, equation: Equation, *operands: Value) -> list[Value]:
     lengths, programs = equation.params["const_lengths"], equation.params["jaxprs"]
