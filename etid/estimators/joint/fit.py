@@ -28,7 +28,7 @@ from etid.estimators.maximum_likelihood.with_current import LoadWithCurrent
 from etid.estimators.unknowns import LoadUnknowns, LoadWithCurrentUnknowns
 from etid.results.fit import complex_rrse
 from etid.signals.harmonics import Spectrum
-from etid.solvers.arrowhead import Arrowhead, ArrowheadEquations, EliminationDescent, join
+from etid.solvers.arrowhead import Arrowhead, ArrowheadEquations, join
 from etid.solvers.levenberg_marquardt import (
     DIFFERENCE,
     LevenbergMarquardt,
@@ -158,7 +158,6 @@ def fit_together(
         ftol=ftol,
         damping=SLIGHT,
         geodesic=True,
-        descent=EliminationDescent(),
         equations=_equations,
         second_order=_second_order,
         empty=_empty,
