@@ -242,8 +242,8 @@ def identify_impedance(
     noise = (
         _passive_fit(f[rising], z[rising], len(circuit.names())) if sigma is None else sigma[rising]
     )
-    frequency, impedance, noise = jax.device_put((f[rising], z[rising], noise))
-    fit = _fit(frequency, impedance, noise, circuit)
+    put = jax.device_put
+    fit = _fit(put(f[rising]), put(z[rising]), put(noise), circuit)
     if fit.verdict != "successful":
         fit = eqx.tree_at(lambda one: one.remarks, fit, fit.remarks | int(_remarks(z)))
     fit = with_data(fit, MeasuredImpedance(f, z, sigma))
