@@ -45,7 +45,17 @@ def in_python():
     import jax
 
     jax.config.update("jax_enable_x64", True)
+    import jax.monitoring
+
     import etid
+
+    compiled = []
+
+    def listen(event, _, **of):
+        if "backend_compile" in event:
+            compiled.append(of.get("fun_name"))
+
+    jax.monitoring.register_event_duration_secs_listener(listen)
 
     assert "site-packages" in etid.__file__, f"{etid.__file__} is not the installed one"
     assert importlib.metadata.version("etid") == etid.__version__
@@ -53,6 +63,7 @@ def in_python():
     study = etid.scenes.paper_dry(snr_db=60.0).simulate(seed=0)
     driver = etid.identify_driver(study["calibration/98k8"], order=5)
     fit = etid.identify_skin(study["typical/dry/01"], driver)
+    assert not compiled, f"the example of the README compiles {compiled}"
     assert fit.verdict == "successful"
     for name, true in TRUTH.items():
         error = abs(float(getattr(fit.circuit, name)) - true)

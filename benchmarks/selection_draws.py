@@ -98,7 +98,12 @@ def scene(snr_db: float, driver: int) -> Scene:
 def choices(records: Sequence[etid.Recording], driver: etid.Driver) -> list[Selection]:
     """What etid chooses for each recording alone, as `select_circuit` does, in batches."""
     found, _ = batches.choices(
-        len(records), lambda row: fed(records[row], driver), usual_circuits(), Asked(), False
+        len(records),
+        lambda row: fed(records[row], driver),
+        usual_circuits(),
+        Asked(),
+        progress=False,
+        total=len(records),
     )
     return found
 

@@ -9,7 +9,6 @@ import math
 import pathlib
 import subprocess
 import sys
-import tempfile
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
@@ -30,7 +29,7 @@ from etid.signals.noise import noise_std
 from etid.solvers.levenberg_marquardt import normal_equations
 
 TRUTH = dataclasses.astuple(LOAD)
-WARM = 3  # processes that find what another one has compiled
+PROCESSES = 3  # whose median counts
 
 
 class Line(NamedTuple):
@@ -199,17 +198,16 @@ def _limits(ten_periods: Problem, repeats: int) -> str:
     return ", ".join(f"{name} {1e3 * time:.2f} ms" for name, time in times.items())
 
 
-_WARM = """
+_FIRST = """
 import time
-start = time.perf_counter()
 import jax
 jax.config.update("jax_enable_x64", True)
 import etid
 study = etid.scenes.paper_dry(snr_db=60.0).simulate(seed=0)
 driver = etid.identify_driver(study["calibration/98k8"])
-begin = time.perf_counter()
+begin = time.process_time()
 etid.identify_skin(study["typical/dry/01"], driver)
-print(time.perf_counter() - begin, time.perf_counter() - start)
+print(time.process_time() - begin, time.process_time())
 """
 
 
@@ -223,24 +221,18 @@ def _imports() -> Line:
 
 
 def _first_fits() -> list[Line]:
-    """First driver and skin of a process, without programs on disk and with them."""
-    with tempfile.TemporaryDirectory() as cache:
-        environment = interpreter() | {
-            "JAX_COMPILATION_CACHE_DIR": cache,
-            "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
-        }
-        runs = [
-            subprocess.run(
-                [sys.executable, "-c", _WARM], env=environment, capture_output=True, check=True
-            )
-            for _ in range(1 + WARM)
-        ]
-    (_, cold), *several = (tuple(map(float, run.stdout.split())) for run in runs)
+    """CPU time of a process that identifies a driver and a skin, and of the skin in it."""
+    runs = [
+        subprocess.run(
+            [sys.executable, "-c", _FIRST], env=interpreter(), capture_output=True, check=True
+        )
+        for _ in range(PROCESSES)
+    ]
+    several = (tuple(map(float, run.stdout.split())) for run in runs)
     skin, both = (float(np.median(times)) for times in zip(*several, strict=True))
     return [
-        Line("first driver and skin, nothing cached [s]", cold, math.nan, cold, 8.0, False),
-        Line("the same with a warm cache [s]", both, cold, both, 1.5, False),
-        Line("first skin with a warm cache [s]", skin, math.nan, skin, 0.3, False),
+        Line("first driver and skin, with imports [CPU s]", both, math.nan, both, 2.2, False),
+        Line("of these, the skin [CPU s]", skin, math.nan, skin, 0.75, False),
     ]
 
 

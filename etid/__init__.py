@@ -12,7 +12,10 @@ print(fit)
 """
 
 import importlib
+import sys
 from typing import TYPE_CHECKING, Any
+
+from etid.garbage import unsearched
 
 if TYPE_CHECKING:
     from etid.files.exporting import export_circuit as export_circuit
@@ -55,4 +58,7 @@ def __dir__() -> list[str]:
 
 
 def _public() -> Any:
-    return importlib.import_module("etid.public")
+    if "etid.public" not in sys.modules:
+        with unsearched():
+            importlib.import_module("etid.public")
+    return sys.modules["etid.public"]

@@ -19,11 +19,12 @@ def main() -> int:
     usual = signal.getsignal(signal.SIGINT)
     if usual is signal.default_int_handler:  # a program in the background ignores the signal
         signal.signal(signal.SIGINT, _end)
-    from etid import cli
+    from etid.cli import parser_for, run  # `from etid import cli` would import all layers
 
+    commands = parser_for(sys.argv[1:])
     try:
         signal.signal(signal.SIGINT, usual)
-        return cli.main()
+        return run(commands, sys.argv[1:])
     except KeyboardInterrupt:  # before or after the command itself
         print("etid: interrupted", file=sys.stderr)
         return _INTERRUPTED

@@ -13,42 +13,39 @@ whole file is faulty. JSON has no infinity and no NaN: such a number is null.
 """
 
 import argparse
+import importlib
+import importlib.metadata
 import json
 import math
 import os
 import pathlib
+import platform
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 
-import etid.public
-from etid.commands import (
-    DONE,
-    INTERRUPTED,
-    WRONG_DATA,
-    Outcome,
-    check,
-    exporting,
-    fit,
-    importing,
-    merging,
-    report,
-    simulate,
-)
-from etid.commands.outputs import check_outputs
+import etid
+from etid.commands import DONE, INTERRUPTED, WRONG_DATA, Outcome
 
-COMMANDS: dict[str, Any] = {
-    "simulate": simulate,
-    "import": importing,
-    "merge": merging,
-    "check": check,
-    "fit": fit,
-    "report": report,
-    "export": exporting,
+# Names of the commands, their modules and what they do. The modules import JAX, which takes most of
+# a second: only that of the command which is asked for is imported.
+COMMANDS = {
+    "simulate": ("simulate", "simulate recordings of an experiment"),
+    "import": (
+        "importing",
+        "convert laboratory files (.csv, .mat, .tdms, .abf, .npz, .wav, .lvm, .xlsx) to an etid "
+        "file",
+    ),
+    "merge": (
+        "merging",
+        "write the recordings of several files into one file, each in a group of its own",
+    ),
+    "check": ("check", "list the faults of a file of recordings, field by field"),
+    "fit": ("fit", "identify the drivers and the loads of a file of recordings"),
+    "report": ("report", "write a report about a file of fits: one HTML page"),
+    "export": ("exporting", "convert fits or recordings into files for other programs"),
 }
 SHELLS = ("bash", "zsh", "fish", "tcsh", "powershell")  # the shells that shtab supports
 
@@ -62,18 +59,41 @@ def main(argv: Sequence[str] | None = None) -> int:
     Returns:
         Exit status.
     """
-    jax.config.update("jax_enable_x64", True)
-    _keep_programs()
-    commands = parser()
-    arguments = commands.parse_args(argv)
+    words = sys.argv[1:] if argv is None else argv
+    return run(parser_for(words), words)
+
+
+def parser_for(words: Sequence[str]) -> argparse.ArgumentParser:
+    """Parser of these arguments, after all imports and settings that their command needs."""
+    if "--completion" in " ".join(words):
+        return parser()
+    command = next((word for word in words if not word.startswith("-")), "")
+    return parser([command] if command in COMMANDS else [])
+
+
+def run(commands: argparse.ArgumentParser, words: Sequence[str]) -> int:
+    """Run one command.
+
+    Args:
+        commands: `parser_for(words)`.
+        words: Arguments.
+
+    Returns:
+        Exit status.
+    """
+    arguments = commands.parse_args(words)
     source = getattr(arguments, "source", [])
     if any(_same_file(one, arguments.target) for one in np.ravel([source])):
         commands.error(f"{arguments.target} is the file to read; name another file to write")
+    from etid.commands.outputs import check_outputs
+    from etid.recordings.errors import RecordingError
+    from etid.results.fit import IdentificationError
+
     try:
         if "force" in arguments:
-            check_outputs(COMMANDS[arguments.command].outputs(arguments), force=arguments.force)
-        outcome = arguments.run(arguments)
-    except (etid.RecordingError, etid.IdentificationError, ValueError, OSError) as error:
+            check_outputs(arguments.module.outputs(arguments), force=arguments.force)
+        outcome = arguments.module.run(arguments)
+    except (RecordingError, IdentificationError, ValueError, OSError) as error:
         text = " ".join(str(error).split())
         print(f"etid: error: {text}", file=sys.stderr)
         outcome = Outcome(data={"error": text}, status=WRONG_DATA)
@@ -89,20 +109,24 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _after_interrupt(arguments: argparse.Namespace) -> str:
     """Message after Ctrl-C; a result is written completely or not at all."""
-    if arguments.run is fit.run:
-        return fit.after_interrupt(arguments)
+    if arguments.command == "fit":
+        return arguments.module.after_interrupt(arguments)
     target = getattr(arguments, "target", getattr(arguments, "page", None))
     return "nothing was changed" if target is None else f"{target} was not written"
 
 
-def parser() -> argparse.ArgumentParser:
-    """Parser of all commands; the reference in the docs and the shell completion also use it."""
+def parser(wanted: Iterable[str] = COMMANDS) -> argparse.ArgumentParser:
+    """Parser of all commands; the reference in the docs and the shell completion also use it.
+
+    Args:
+        wanted: Commands whose arguments it knows; of the others it knows the names only.
+    """
     parser = argparse.ArgumentParser(
         prog="etid",
         description="Identify circuits from electro-tactile stimulation recordings.",
         epilog="Exit status: 0 done, 1 faulty data, 2 wrong usage, 130 interrupted.",
     )
-    parser.add_argument("--version", action=_Version, help="print versions, backend and precision")
+    parser.add_argument("--version", action=_Version, help="print versions")
     parser.add_argument(
         "--completion",
         action=_Completion,
@@ -110,9 +134,11 @@ def parser() -> argparse.ArgumentParser:
         help="print the completion script of this shell (etid[completion])",
     )
     commands = parser.add_subparsers(required=True, metavar="COMMAND", dest="command")
-    for name, module in COMMANDS.items():
-        text = (module.__doc__ or "").splitlines()[0]
-        summary = text[0].lower() + text[1:].rstrip(".")
+    for name, (module_name, summary) in COMMANDS.items():
+        if name not in wanted:
+            commands.add_parser(name, help=summary)
+            continue
+        module = _module(module_name)
         command = commands.add_parser(name, help=summary, description=module.__doc__)
         module.add_arguments(command)
         if hasattr(module, "outputs"):
@@ -120,8 +146,18 @@ def parser() -> argparse.ArgumentParser:
         command.add_argument(
             "--json", action="store_true", help="print one JSON object instead of text"
         )
-        command.set_defaults(run=module.run)
+        command.set_defaults(module=module)
     return parser
+
+
+def _module(name: str) -> Any:
+    """The module of a command, in a process that is set up for it."""
+    import jax
+
+    jax.config.update("jax_enable_x64", True)
+    _keep_programs(jax.config)
+    importlib.import_module("etid.public")  # some classes get methods from the layers above them
+    return importlib.import_module(f"etid.commands.{name}")
 
 
 class _Version(argparse.Action):
@@ -131,8 +167,9 @@ class _Version(argparse.Action):
         super().__init__(nargs=0, **options)
 
     def __call__(self, parser: argparse.ArgumentParser, *_: Any) -> None:
-        backend, precision = jax.default_backend(), jnp.zeros(()).dtype
-        print(f"etid {etid.__version__}, JAX {jax.__version__}, {backend}, {precision}")
+        of = importlib.metadata.version
+        versions = f"etid {etid.__version__}, JAX {of('jax')}, NumPy {np.__version__}"
+        print(f"{versions}, Python {platform.python_version()}, {platform.machine()}")
         parser.exit()
 
 
@@ -178,13 +215,12 @@ def _print(text: str) -> int:
     return DONE
 
 
-def _keep_programs() -> None:
+def _keep_programs(config: Any) -> None:
     """Let JAX keep compiled programs on disk, so that only the first fit waits for compilation.
 
     The folder is `JAX_COMPILATION_CACHE_DIR` if the user has set it, else `etid` in the user's
     cache folder.
     """
-    config: Any = jax.config  # JAX defines its attributes at run time
     if config.jax_compilation_cache_dir is not None:
         return
     home = os.environ.get("XDG_CACHE_HOME") or pathlib.Path.home() / ".cache"
@@ -194,8 +230,8 @@ def _keep_programs() -> None:
     except OSError:
         return  # without a folder, each process compiles again
     if os.access(folder, os.W_OK):
-        jax.config.update("jax_compilation_cache_dir", str(folder))
-        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+        config.update("jax_compilation_cache_dir", str(folder))
+        config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
 
 
 def _same_file(source: pathlib.Path, target: pathlib.Path) -> bool:
@@ -208,7 +244,7 @@ def _plain(value: Any) -> Any:
         return {str(key): _plain(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
         return [_plain(item) for item in value]
-    if isinstance(value, np.ndarray | np.generic | jax.Array):
+    if hasattr(value, "__array__"):
         return _plain(np.asarray(value).tolist())
     if isinstance(value, float) and not math.isfinite(value):
         return None

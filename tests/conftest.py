@@ -68,9 +68,9 @@ def _programs_at_once(request):
     """Compile etid's programs without passes of LLVM: half the time, and most run once or twice."""
     with pytest.MonkeyPatch.context() as patch:
         if _is_ordinary(request.config):
-            from etid.identify import compiled  # here, for the type checker wraps what it imports
+            from etid.numpy_tier import tiers  # here, for the type checker wraps what it imports
 
-            patch.setattr(compiled, "QUICKLY", compiled.AT_ONCE)
+            patch.setattr(tiers, "QUICKLY", tiers.AT_ONCE)
         yield
 
 

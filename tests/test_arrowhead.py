@@ -6,7 +6,7 @@ import numpy as np
 import optimistix as optx
 import pytest
 
-from etid.solvers.arrowhead import Arrowhead, ArrowheadEquations, EliminationDescent, join, split
+from etid.solvers.arrowhead import Arrowhead, ArrowheadEquations, join, split
 from etid.solvers.levenberg_marquardt import LevenbergMarquardt, NormalEquations, normal_equations
 
 PROBLEMS, OWN, COMMON = 5, 2, 3
@@ -100,7 +100,6 @@ def test_the_minimum_is_that_of_the_whole_problem(start):
     whole = LevenbergMarquardt(rtol=1e-9)
     parts = LevenbergMarquardt(
         rtol=1e-9,
-        descent=EliminationDescent(),
         equations=structured,
         empty=lambda y, _: jax.tree.map(
             lambda leaf: jnp.zeros(leaf.shape), jax.eval_shape(structured, None, y, None)

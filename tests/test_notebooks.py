@@ -12,7 +12,7 @@ import warnings
 import nbformat
 import pytest
 
-from etid.identify.waiting import COMPILING
+from etid.numpy_tier.waiting import COMPILING
 from tests.conftest import REFERENCE_DATA
 
 ROOT = pathlib.Path(__file__).parents[1]

@@ -9,8 +9,8 @@ import jax.numpy as jnp
 import pytest
 from tqdm import tqdm
 
-from etid.identify import waiting
-from etid.identify.compiled import stored_jit
+from etid.numpy_tier import waiting
+from etid.numpy_tier.tiers import program
 
 
 class Screen(io.StringIO):
@@ -40,7 +40,7 @@ def slowly_traced():
         time.sleep(0.5)  # tracing and compiling
         return x + 1
 
-    return stored_jit(function)
+    return program(function, batch=True)
 
 
 def test_a_long_compilation_is_announced_once(said):

@@ -28,6 +28,7 @@ from etid.circuits.elements import (
 )
 from etid.circuits.impedance import AbstractImpedance, Quantity, parallel, series
 from etid.circuits.overview import Overview, Overviewed, element_rows
+from etid.numpy_tier.tiers import program
 from etid.signals.transfer import frequency_variable
 
 _Same = TypeVar("_Same", bound="AbstractCircuit")
@@ -63,8 +64,16 @@ def parameter(unit: str, *, typical: float) -> Any:
     if unit not in DISPLAY:
         raise ValueError(f"unit {unit!r} is not known; use one of {sorted(DISPLAY)}")
     return eqx.field(
-        default=typical, converter=jnp.asarray, metadata={"unit": unit, "typical": typical}
+        default=typical, converter=_numbers, metadata={"unit": unit, "typical": typical}
     )
+
+
+def _numbers(value: Any) -> Any:
+    """The value of a parameter as an array; `jnp.asarray` of a number would compile a program."""
+    if isinstance(value, jax.Array):
+        return value
+    numbers = np.asarray(value)
+    return jax.device_put(numbers.astype(float) if numbers.dtype.kind in "biu" else numbers)
 
 
 class AbstractCircuit(Overviewed, eqx.Module):
@@ -95,6 +104,7 @@ class AbstractCircuit(Overviewed, eqx.Module):
         """Powers of impedance and of time scale to which each parameter is proportional."""
         return jnp.array([SCALING[unit] for unit in cls.units().values()]).T
 
+    @program
     def response(self, frequency: Float[Array, "..."]) -> Complex[Array, "..."]:
         """Impedance Z(j 2π f).
 
@@ -106,6 +116,7 @@ class AbstractCircuit(Overviewed, eqx.Module):
         """
         return self.impedance()(frequency_variable(jnp.asarray(frequency)))
 
+    @program
     def values(self) -> Float[Array, "*lane parameter"]:
         """Parameters in SI units."""
         return jnp.stack([getattr(self, name) for name in self.names()], axis=-1)

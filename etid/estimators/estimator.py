@@ -112,8 +112,6 @@ class AbstractEstimator(abc.ABC):
         current: Whether the estimator identifies loads from a measured current, without a driver.
         any_circuit: Whether the estimator identifies circuits other than `SkinRC`.
         chooses: Whether its fits have a `support`, by which circuits can be compared.
-        brief: Whether a single load takes only milliseconds, so that its compilation matters more.
-            Such a fit is compiled without optimisation. Batches are optimised always.
     """
 
     name: ClassVar[str]
@@ -122,7 +120,6 @@ class AbstractEstimator(abc.ABC):
     current: ClassVar[bool] = False
     any_circuit: ClassVar[bool] = True
     chooses: ClassVar[bool] = False
-    brief: ClassVar[bool] = False
 
     @abc.abstractmethod
     def fit_driver(

@@ -8,6 +8,7 @@ data, the data do not determine the parameters.
 import dataclasses
 
 import jax.numpy as jnp
+import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int
 
 from etid.circuits.circuit import AbstractCircuit
@@ -92,7 +93,7 @@ def judged(
     at_bound = 0
     if outside is not None:
         at_bound = jnp.where(jnp.any(outside != 0), int(Remark.at_bound), 0)
-    settled = RESULTS.promote(estimate.result) == RESULTS.successful
+    settled = estimate.result == optx.RESULTS.successful
     return Fit(
         circuit=fitted,
         cov=cov,
@@ -111,7 +112,8 @@ def judged(
             # An error of 0 also fails: the element has no effect. So does a value of 0, exp() of a
             # far parameter: files of fits hold positive elements where a fit is successful.
             (~jnp.all((errors > 0) & (errors < 1) & (values > 0)), RESULTS.insensitive),
-            (driver_result != SUCCESSFUL, RESULTS.driver_failed),
+            # With `!=`, equinox would compile a program for two known verdicts.
+            (driver_result._value != SUCCESSFUL._value, RESULTS.driver_failed),
         ),
         steps=estimate.steps,
         method=method,

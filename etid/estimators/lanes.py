@@ -286,7 +286,7 @@ class HarmonicsWithCurrent(Harmonics):
     def late_by(self, circuit: AbstractCircuit, driver: AbstractFeed) -> Lags:
         """Whole samples by which `v_out` and the current are later than with this load."""
         gain = _gain(circuit, driver, self.frequency)
-        flowing = gain / np.asarray(circuit.response(jnp.asarray(self.frequency)))  # I / V_th
+        flowing = gain / np.asarray(circuit.response(jax.device_put(self.frequency)))  # I / V_th
         of_current = self._behind(flowing, self.i, self.variance_i)
         return Lags.of(self._behind(gain, self.y, self.variance_y), of_current)
 
@@ -423,7 +423,7 @@ def _gain(
     frequency: Float[Array | np.ndarray, " frequency"],
 ) -> Complex[np.ndarray, " frequency"]:
     """V_out per input at these frequencies [Hz]."""
-    at = jnp.asarray(frequency)
+    at = jax.device_put(frequency)
     return np.asarray(driver.gain(circuit.response(at), at))
 
 

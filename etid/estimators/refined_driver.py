@@ -5,6 +5,7 @@ import dataclasses
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optimistix as optx
 from jaxtyping import Array, Bool, Float
 
 from etid.estimators.estimate import Estimate
@@ -115,7 +116,7 @@ def from_samples(
     # Starts that converged to a passive circuit come first. Among them log s + chi2 decides. With a
     # noisy record, a spurious resonance can lower chi2 alone; but it raises s.
     log_s = jnp.log(estimates.rrse**2 / estimates.chi2)
-    settled = RESULTS.promote(estimates.result) == RESULTS.successful
+    settled = estimates.result == optx.RESULTS.successful
     cost = estimates.chi2 + log_s + jnp.where(settled, 0.0, UNWANTED)
     chosen = jnp.argmin(_cost(sources, cost, passive))
     source, estimate, calibration = jax.tree.map(lambda leaf: leaf[chosen], found)
@@ -162,7 +163,7 @@ def _faults(
     terms: Float[Array, ""],
 ) -> list[tuple[Bool[Array, ""], RESULTS]]:
     """What is wrong with a driver, the worst first."""
-    settled = RESULTS.promote(estimate.result) == RESULTS.successful
+    settled = estimate.result == optx.RESULTS.successful
     wrong = jnp.array(False)
     if calibration.mismatch is not None:
         wrong = resistors.disagree(calibration.mismatch, estimate.chi2, terms)

@@ -33,9 +33,9 @@ from etid.identify.arguments import (
     require_float64,
 )
 from etid.identify.arguments import recordings as list_of
-from etid.identify.compiled import stored_jit
 from etid.identify.one import known_of, remarks_on, successful
 from etid.identify.unfitted import failed_fit
+from etid.numpy_tier.tiers import program
 from etid.recordings.preflight import Inspected
 from etid.recordings.recording import Recording, RecordingError
 from etid.results.driver import Driver, HarmonicDriver
@@ -68,7 +68,7 @@ def leaves_much(chi2: Float[Array, ""], rrse: Float[Array, ""]) -> Bool[Array, "
     return (chi2 > UNEXPLAINED) | (rrse > LEFT)
 
 
-@stored_jit
+@program
 def _fit(
     lanes: Harmonics,
     known: AbstractGiven,

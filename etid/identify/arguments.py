@@ -12,6 +12,7 @@ import reprlib
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, Literal, NamedTuple
 
+import equinox as eqx
 import jax
 
 from etid.circuits.circuit import AbstractCircuit, SkinRC
@@ -162,7 +163,8 @@ def candidates_of(value: Circuit) -> tuple[AbstractCircuit, ...]:
 @functools.cache
 def _depends_on_current(kind: type[AbstractCircuit]) -> bool:
     """Whether circuits of a class are not linear; kept, because every fit asks."""
-    return current_dependent(kind().impedance()) is not None
+    impedance = eqx.filter_eval_shape(lambda: kind().impedance())  # computes nothing
+    return current_dependent(impedance) is not None
 
 
 def circuit_of(value: AbstractCircuit | None) -> AbstractCircuit:

@@ -1,4 +1,4 @@
-"""Fits of many recordings in batches, each by one call of a compiled function.
+"""Fits of many recordings: few by NumPy one after the other, many by a compiled function.
 
 Recordings of one length share one compiled function. It takes up to `LANES` recordings, so that
 memory is bounded. A CPU fits them one after the other: side by side (`vmap`) they take twice the
@@ -26,7 +26,6 @@ from etid.estimators.estimator import AbstractEstimator
 from etid.estimators.lanes import AbstractLane, stacked, taken, unstacked
 from etid.estimators.registry import MAXIMUM_LIKELIHOOD
 from etid.identify.arguments import Asked, check_default
-from etid.identify.compiled import stored_jit
 from etid.identify.one import (
     Tried,
     is_shared,
@@ -35,11 +34,13 @@ from etid.identify.one import (
     note,
     notes_of,
     refined,
+    skin,
     skin_lane,
 )
 from etid.identify.planning import FEWEST, Planned, Refusal, calls, planned
 from etid.identify.prefetch import prefetch
 from etid.identify.unfitted import failed_fit
+from etid.numpy_tier.tiers import program, worth_compiling
 from etid.recordings.preflight import Inspected
 from etid.recordings.recording import Recording
 from etid.results.feed import AbstractFeed
@@ -53,7 +54,7 @@ HELD = 2**21  # samples of waiting recordings; above, a call has fewer lanes, bu
 AHEAD = 2  # chunks that are read and inspected in advance
 
 
-@functools.partial(stored_jit, batch=True)
+@functools.partial(program, batch=True)
 def _chunk(
     lanes: Any,
     count: Int[Array, ""],
@@ -148,11 +149,13 @@ class _Queue:
         known: Any,
         candidates: Sequence[AbstractCircuit],
         estimator: AbstractEstimator,
+        total: int,
     ) -> None:
         self.driver = driver
         self.known = known
         self.candidates = candidates
         self.estimator = estimator
+        self.total = total  # recordings of all queues and calls
         self.rows: list[int] = []
         self.lanes: list[AbstractLane] = []
         self.seen: list[Inspected] = []
@@ -179,6 +182,8 @@ class _Queue:
 
     def _fits(self, lanes: Sequence[AbstractLane], circuit: AbstractCircuit) -> Fit:
         of = self.driver, self.known, circuit, self.estimator
+        if not worth_compiling(self.total * lanes[0].size):
+            return stacked(jax.device_get([skin(lane, *of) for lane in lanes]))
         fits = jax.device_get(_chunk(filled(lanes), jnp.asarray(len(lanes)), *of))
         return taken(fits, np.arange(len(lanes)))  # without the padding
 
@@ -197,6 +202,7 @@ def _parts(
     candidates: Sequence[AbstractCircuit],
     asked: Asked,
     progress: bool,
+    total: int,
 ) -> Iterator[_Part]:
     """Fits of all recordings, in parts; arguments as in `choices`."""
     otherwise = str(asked.estimator or MAXIMUM_LIKELIHOOD)
@@ -221,7 +227,7 @@ def _parts(
             if key not in queues:
                 _, driver, estimator = prepared.planned
                 known = known_of(prepared.lane, driver, prepared.shared, estimator)
-                queues[key] = _Queue(driver, known, candidates, estimator)
+                queues[key] = _Queue(driver, known, candidates, estimator, total)
             queue = queues[key]
             queue.add(row, prepared.lane, prepared.planned.seen)
             if queue.full:
@@ -239,6 +245,7 @@ def choices(
     candidates: Sequence[AbstractCircuit],
     asked: Asked,
     progress: bool,
+    total: int,
 ) -> tuple[list[Selection], list[str]]:
     """A choice for each recording alone, and notes.
 
@@ -248,10 +255,11 @@ def choices(
         candidates: Circuits to choose from.
         asked: The requested estimator.
         progress: Show a progress bar.
+        total: Number of recordings that are fitted in this way, here and in other calls.
     """
     found: dict[int, Selection] = {}
     notes = [""] * count
-    for part in _parts(count, load, candidates, asked, progress):
+    for part in _parts(count, load, candidates, asked, progress, total):
         for number, row in enumerate(part.rows):
             found[row] = Selection.of(part.found[number], part.found.chosen(number), candidates)
             notes[row] = part.note or note(found[row].fit)
@@ -264,9 +272,10 @@ def _fits(
     circuit: AbstractCircuit,
     asked: Asked,
     progress: bool,
+    total: int,
 ) -> tuple[Fit, list[str]]:
     """The fit of one circuit to each recording, stacked, and notes; arguments as in `choices`."""
-    parts = list(_parts(count, load, [circuit], asked, progress))
+    parts = list(_parts(count, load, [circuit], asked, progress, total))
     of_parts = [[part.note] if part.note else notes_of(part.found.only) for part in parts]
     order = np.argsort([row for part in parts for row in part.rows])
     fits = taken(concatenated([part.found.only for part in parts]), order)
@@ -280,6 +289,7 @@ def of_one_circuit(
     candidates: Sequence[AbstractCircuit],
     asked: Asked,
     progress: bool,
+    total: int,
     fixed: int | None = None,
 ) -> tuple[Fit, list[str]]:
     """Fits, stacked, and notes of recordings, all with the same circuit.
@@ -290,17 +300,18 @@ def of_one_circuit(
         candidates: Circuits to choose from, by joint evidence.
         asked: What the caller asks for.
         progress: Show a progress bar.
+        total: As in `choices`.
         fixed: Number of the circuit, if it is chosen already. The other candidates then serve to
             find the recordings that deserve another circuit.
     """
     if len(candidates) == 1:
-        return _fits(count, load, candidates[0], asked, progress)
-    found, notes = choices(count, load, candidates, asked, progress)
+        return _fits(count, load, candidates[0], asked, progress, total)
+    found, notes = choices(count, load, candidates, asked, progress, total)
     chosen = common(found, candidates) if fixed is None else fixed
     others = [row for row, one in enumerate(found) if one.chosen != chosen]
     if others:
         again, texts = _fits(
-            len(others), lambda i: load(others[i]), candidates[chosen], asked, False
+            len(others), lambda i: load(others[i]), candidates[chosen], asked, False, total
         )
         for row, one, text in zip(others, unstacked(again), texts, strict=True):
             found[row], notes[row] = _otherwise(found[row], one, text, chosen, candidates)

@@ -31,7 +31,7 @@ import scipy
 from jaxtyping import Array, Bool, Complex, Float
 
 from etid.circuits.circuit import AbstractCircuit
-from etid.identify.compiled import stored_jit
+from etid.numpy_tier.tiers import program
 from etid.recordings.repeats import ALIGNED, Repeats
 from etid.results.driver import Driver
 from etid.results.feed import AbstractFeed
@@ -77,7 +77,7 @@ def unknown(*shape: int) -> Change:
     return Change(nothing, nothing.copy(), np.zeros(lanes, bool))
 
 
-@stored_jit
+@program
 def log_slopes(
     circuits: AbstractCircuit, driver: AbstractFeed, frequency: Float[Array, " band"]
 ) -> Complex[Array, "lane element band"]:

@@ -22,9 +22,9 @@ from etid.identify.arguments import (
     order_of,
     recordings,
 )
-from etid.identify.compiled import stored_jit
 from etid.identify.one import checksum, needs_another, of_both
 from etid.identify.unfitted import explained
+from etid.numpy_tier.tiers import program
 from etid.recordings.preflight import Inspected, preflight
 from etid.recordings.recording import Recording
 from etid.recordings.repeats import repeats
@@ -219,7 +219,7 @@ def _aligned(seen: Sequence[Inspected], order: int, estimator: AbstractEstimator
     return driver
 
 
-@functools.partial(stored_jit, rare=True)
+@program
 def _response(
     driver: Driver, frequency: Float[Array, " frequency"]
 ) -> Complex[Array, " frequency"]:
@@ -227,7 +227,7 @@ def _response(
     return driver.response(frequency)
 
 
-@stored_jit
+@program
 def _identified(
     lanes: AlignedSamples | Harmonics,
     r_load: Float[Array, " record"],

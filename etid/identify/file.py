@@ -90,7 +90,7 @@ def _fit(
     """
     study, paths, drivers = opened
     part = paths[number * size : (number + 1) * size]
-    fits = identify_part(study, part, drivers, candidates, asked)
+    fits = identify_part(study, part, drivers, candidates, asked, len(paths))
     used = set()
     for path in part:
         with contextlib.suppress(RecordingError):

@@ -29,8 +29,8 @@ from jaxtyping import Array, Complex, Float
 
 from etid.circuits.circuit import AbstractCircuit
 from etid.identify.arguments import circuit_of, require_float64
-from etid.identify.compiled import stored_jit
 from etid.identify.kramers_kronig import EXACT, FAIL, MISFIT_CHI2, kramers_kronig
+from etid.numpy_tier.tiers import program
 from etid.recordings.remarks import Remark, texts
 from etid.results.data import MeasuredImpedance, with_data
 from etid.results.fit import CHANGES, Fit, IdentificationError, Support, complex_rrse
@@ -60,7 +60,7 @@ class PassiveFit(NamedTuple):
     most: float | Float[Array, ""]
 
 
-@stored_jit
+@program
 def _fit(
     frequency: Float[Array, " frequency"],
     z: Complex[Array, " frequency"],
@@ -107,7 +107,7 @@ def _fit(
         misfit, remark = excess > FAIL, jnp.where(excess > EXACT, int(Remark.not_noise), 0)
     fitted = circuit.with_log_values(q)
     values = fitted.values()
-    settled = RESULTS.promote(solution.result) == verdict("successful")
+    settled = solution.result == optx.RESULTS.successful
     return Fit(
         circuit=fitted,
         cov=cov * jnp.outer(values, values),
@@ -242,8 +242,8 @@ def identify_impedance(
     noise = (
         _passive_fit(f[rising], z[rising], len(circuit.names())) if sigma is None else sigma[rising]
     )
-    noise = jax.tree.map(jnp.asarray, noise)
-    fit = _fit(jnp.asarray(f[rising]), jnp.asarray(z[rising]), noise, circuit)
+    put = jax.device_put
+    fit = _fit(put(f[rising]), put(z[rising]), put(noise), circuit)
     if fit.verdict != "successful":
         fit = eqx.tree_at(lambda one: one.remarks, fit, fit.remarks | int(_remarks(z)))
     fit = with_data(fit, MeasuredImpedance(f, z, sigma))

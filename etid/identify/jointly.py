@@ -6,7 +6,6 @@ standard errors separate the own error of a trial from the error that all trials
 """
 
 import dataclasses
-import functools
 import itertools
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -16,6 +15,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int
 from tqdm import tqdm
 
@@ -54,7 +54,6 @@ from etid.identify.arguments import (
     require_float64,
 )
 from etid.identify.batches import LANES, each, filled
-from etid.identify.compiled import stored_jit
 from etid.identify.many import common_first, identify_part, table, to_identify
 from etid.identify.one import (
     checksum,
@@ -67,6 +66,7 @@ from etid.identify.one import (
 from etid.identify.planning import Refusal, calls, planned
 from etid.identify.study_drivers import Drivers
 from etid.identify.unfitted import failed_fit
+from etid.numpy_tier.tiers import program, worth_compiling
 from etid.recordings.preflight import Inspected
 from etid.recordings.recording import Recording
 from etid.recordings.remarks import Remark
@@ -115,7 +115,6 @@ class _Start(NamedTuple):
     changed: Bool[Array | np.ndarray, "*lane"]
 
 
-@functools.partial(stored_jit, batch=True)
 def _alone(lanes: Any, count: Int[Array, ""], model: Joint, driver: HarmonicDriver) -> _Start:
     frequency = jnp.asarray(lanes.frequency)[0]
     known = shape_of(driver, frequency)
@@ -132,7 +131,7 @@ def _alone(lanes: Any, count: Int[Array, ""], model: Joint, driver: HarmonicDriv
             current = jnp.asarray(lane.i), jnp.asarray(lane.variance_i)
         found = fit_alone(model, given, spectrum, sample_rate, starts, current)
         own, result, chi2, error, hum = found
-        settled = RESULTS.promote(result) == RESULTS.successful
+        settled = result == optx.RESULTS.successful
         good = settled & jnp.isfinite(chi2) & ~judgement.misses(chi2, error)
         changed = jnp.array(False) if known is None else known.differs(spectrum)
         loads = Loads(spectrum, sample_rate, own, good & ~changed, jnp.array(-1), current)
@@ -141,7 +140,6 @@ def _alone(lanes: Any, count: Int[Array, ""], model: Joint, driver: HarmonicDriv
     return each(one, lanes, count)
 
 
-@functools.partial(stored_jit, batch=True)
 def _together(
     model: Joint,
     groups: list[Loads],
@@ -184,6 +182,11 @@ def _together(
     )
     fits = [jax.vmap(fit)(of_group) for of_group in found]
     return fits, better, [of.delay for of in found], cov
+
+
+# By whether they are compiled.
+_ALONE = {batch: program(_alone, batch=batch) for batch in (False, True)}
+_TOGETHER = {batch: program(_together, batch=batch) for batch in (False, True)}
 
 
 def _narrower(
@@ -230,7 +233,10 @@ def _replaced(fits: Fit, others: Fit, where: Bool[np.ndarray, " lane"]) -> Fit:
 class _Waiting:
     """Recordings of one driver with the same number of harmonics, fitted by one estimator."""
 
-    def __init__(self, model: Joint, driver: HarmonicDriver, estimator: AbstractEstimator) -> None:
+    def __init__(
+        self, model: Joint, driver: HarmonicDriver, estimator: AbstractEstimator, total: int
+    ) -> None:
+        self.total = total  # recordings of the study
         self.model = model
         self.driver = driver
         self.estimator = estimator
@@ -261,8 +267,9 @@ class _Waiting:
         self.seen = []
 
     def _alone(self, lanes: Sequence[AbstractLane]) -> list[_Start]:
-        of = self.model, self.driver
-        found = jax.device_get(_alone(filled(lanes), jnp.asarray(len(lanes)), *of))
+        fit = _ALONE[worth_compiling(self.total * lanes[0].size)]
+        several = filled(lanes), jax.device_put(len(lanes))
+        found = jax.device_get(fit(*several, self.model, self.driver))
         return unstacked(found)[: len(lanes)]
 
     @property
@@ -390,22 +397,24 @@ def identify_jointly(
         key = seen.v_th.size, shared, *rates, estimator
         if key not in lengths:
             model = _model(circuit, driver, shared, known, asked.bounds)
-            lengths[key] = _Waiting(model, driver, estimator)
+            lengths[key] = _Waiting(model, driver, estimator, len(paths))
         lengths[key].add(row, seen)
     for names, lengths in tqdm(waiting.items(), unit="driver", disable=not progress):
         driver = next(iter(lengths.values())).driver
         groups = [group.loads() for group in lengths.values()]
         several = tuple(len(group.several()) for group in lengths.values())
         shared = any(group.model.shared for group in lengths.values())
-        tolerance = jnp.asarray(r_load_tolerance, dtype=float)
+        tolerance = jax.device_put(float(r_load_tolerance))
+        numbers = sum(of.spectrum.x.size for of in groups)
+        together = _TOGETHER[worth_compiling(numbers)]
         model = _model(circuit, driver, shared, known, asked.bounds)
-        found, better, delays, cov = _together(model, groups, several, driver, tolerance)
+        found, better, delays, cov = together(model, groups, several, driver, tolerance)
         found, delays, cov = jax.device_get((found, delays, cov))
         width = _narrower(groups, found, delays, cov, float(driver.sample_rate))
         if width is not None and better.verdict == "successful":
-            again = dataclasses.replace(Calibrations.of(better), delay_width=jnp.array(width))
+            again = dataclasses.replace(Calibrations.of(better), delay_width=jax.device_put(width))
             model = dataclasses.replace(model, calibrations=again)
-            others, better, *_ = _together(model, groups, several, better, tolerance)
+            others, better, *_ = together(model, groups, several, better, tolerance)
             for number, (group, other) in enumerate(
                 zip(lengths.values(), jax.device_get(others), strict=True)
             ):
@@ -430,7 +439,7 @@ def identify_jointly(
     if by_current:
         own = [paths[row] for row in by_current]
         of_each = Asked(MAXIMUM_LIKELIHOOD, asked.known, asked.bounds)
-        alone = identify_part(study, own, drivers, [circuit], of_each)
+        alone = identify_part(study, own, drivers, [circuit], of_each, len(own))
         as_joint = unstacked(dataclasses.replace(alone.fit, method=METHOD))
         for row, fit, text in zip(by_current, as_joint, alone.notes, strict=True):
             fits[row], notes[row] = fit, str(text)

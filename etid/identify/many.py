@@ -132,7 +132,7 @@ def identify_skins(
 
     if not known:
         raise ValueError("there is no recording to identify")
-    fit, notes = of_one_circuit(len(known), load, candidates, asked, progress)
+    fit, notes = of_one_circuit(len(known), load, candidates, asked, progress, len(known))
     return Fits(fit, described(known), np.array(notes, dtype=str))
 
 
@@ -178,7 +178,7 @@ def identify_study(
     drivers = Drivers(study, order, asked.estimator, driver_drift)
     paths = to_identify(study)
     candidates = common_first(study, paths, drivers, candidates, asked)
-    fits = identify_part(study, paths, drivers, candidates, asked, progress)
+    fits = identify_part(study, paths, drivers, candidates, asked, len(paths), progress)
     settings = Settings.of(
         study,
         len(paths),
@@ -210,7 +210,7 @@ def common_first(
     step = -(-len(paths) // SAMPLE)
     sample = paths[::step]
     load = _loader(study, sample, drivers)
-    found, _ = choices(len(sample), load, candidates, asked, progress=False)
+    found, _ = choices(len(sample), load, candidates, asked, False, len(paths))
     chosen = common(found, candidates)
     return candidates[chosen], *(one for n, one in enumerate(candidates) if n != chosen)
 
@@ -221,13 +221,14 @@ def identify_part(
     drivers: Drivers,
     candidates: Sequence[AbstractCircuit],
     asked: Asked,
+    total: int,
     progress: bool = False,
 ) -> Fits:
-    """Fits of some recordings of a study, with its drivers and the first of the candidates."""
+    """Fits of some of `total` recordings of a study, with the first of the candidates."""
     if not paths:
         raise ValueError("the study has no loaded recording")
     load = _loader(study, paths, drivers)
-    fit, notes = of_one_circuit(len(paths), load, candidates, asked, progress, fixed=0)
+    fit, notes = of_one_circuit(len(paths), load, candidates, asked, progress, total, fixed=0)
     return table(study, paths, fit, notes)
 
 

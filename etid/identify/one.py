@@ -35,8 +35,8 @@ from etid.identify.arguments import (
     fed,
     plan,
 )
-from etid.identify.compiled import stored_jit
 from etid.identify.unfitted import EXPLAINED, explained, failed_fit
+from etid.numpy_tier.tiers import program
 from etid.recordings.preflight import Inspected
 from etid.recordings.recording import Recording
 from etid.recordings.remarks import Remark
@@ -207,8 +207,7 @@ def skin_lane(
     return estimator.fit_load(lane, driver, known, circuit)
 
 
-_brief_skin = stored_jit(skin_lane, rare=True)
-_skin = stored_jit(skin_lane)
+_skin = program(skin_lane)
 
 
 def skin(
@@ -219,11 +218,10 @@ def skin(
     estimator: AbstractEstimator,
 ) -> Fit:
     """`skin_lane`, compiled. In a notebook, compilation takes longer than all fits."""
-    fit = _brief_skin if estimator.brief else _skin
-    return fit(lane, driver, known, circuit, estimator)
+    return _skin(lane, driver, known, circuit, estimator)
 
 
-@functools.partial(stored_jit, rare=True)  # once for each driver
+@program  # once for each driver
 def known_at(
     frequency: Float[Array, " harmonic"],
     driver: AbstractFeed,

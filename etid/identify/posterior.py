@@ -39,8 +39,8 @@ from etid.estimators.maximum_likelihood.load import Load
 from etid.estimators.maximum_likelihood.load_fit import refined
 from etid.estimators.registry import MAXIMUM_LIKELIHOOD, named
 from etid.identify.arguments import fed, require
-from etid.identify.compiled import stored_jit
 from etid.identify.one import is_shared, known_of, skin
+from etid.numpy_tier.tiers import program
 from etid.recordings.preflight import Inspected
 from etid.recordings.recording import Recording
 from etid.recordings.remarks import Remark
@@ -103,7 +103,7 @@ def cost(terms: Load, q: Float[Array, " q"]) -> Float[Array, ""]:
     return 0.5 * jnp.sum(terms(q) ** 2)
 
 
-@stored_jit
+@program
 def minimum(
     lane: Harmonics, known: Known, circuit: AbstractCircuit
 ) -> tuple[Float[Array, " q"], Float[Array, "q q"]]:
@@ -112,7 +112,7 @@ def minimum(
     return least.q, least.cov
 
 
-@stored_jit
+@program
 def _costs(
     lane: Harmonics, known: Known, circuit: AbstractCircuit, q: Float[Array, "draw q"]
 ) -> Float[Array, " draw"]:
@@ -186,7 +186,7 @@ def posterior(
     names = fit.circuit.names()
 
     def costs(q: Float[np.ndarray, "draw q"]) -> Float[np.ndarray, " draw"]:
-        found = np.array(_costs(lane, known, fit.circuit, jnp.asarray(q)))
+        found = np.array(_costs(lane, known, fit.circuit, jax.device_put(q)))
         elements = np.exp(stretched(q, least, own, cov))
         for name, low, high in known.bounds:
             value = elements[:, names.index(name)]

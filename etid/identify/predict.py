@@ -12,8 +12,8 @@ from etid.estimators.output_error import fit as output_error
 from etid.estimators.output_error import prediction
 from etid.estimators.registry import OUTPUT_ERROR
 from etid.identify.arguments import circuit_of, fed, require_float64
-from etid.identify.compiled import stored_jit
 from etid.identify.steady_state import periodic_voltage
+from etid.numpy_tier.tiers import program
 from etid.recordings.preflight import Inspected
 from etid.recordings.recording import Recording
 from etid.results.driver import ContinuousDriver, Driver
@@ -21,7 +21,7 @@ from etid.results.feed import MeasuredCurrent
 from etid.signals.filtering import TAPS
 
 
-@stored_jit
+@program
 def _fitted(
     samples: AlignedSamples, driver: ContinuousDriver | MeasuredCurrent, circuit: AbstractCircuit
 ) -> Float[Array, " interval"]:
@@ -68,7 +68,7 @@ def predict(
             return _predict_periods(recording, feed, circuit)
         OUTPUT_ERROR.check_circuit(circuit)
     seen.kept = None  # disturbed periods are predicted too
-    inner = np.asarray(_fitted(jax.tree.map(jnp.asarray, AlignedSamples.of(seen)), feed, circuit))
+    inner = np.asarray(_fitted(jax.device_put(AlignedSamples.of(seen)), feed, circuit))
     predicted = np.full(recording.v_out.size, np.nan)
     first = TAPS - 1 + max(seen.lag, 0)
     predicted[first : first + inner.size] = inner

@@ -15,8 +15,8 @@ from etid.circuits.circuit import AbstractCircuit
 from etid.estimators.element_prior import FIXED, require_element
 from etid.estimators.lanes import Harmonics
 from etid.estimators.maximum_likelihood.load import Load
-from etid.identify.compiled import stored_jit
 from etid.identify.posterior import Known, Minimum, cost, given
+from etid.numpy_tier.tiers import program
 from etid.recordings.recording import Recording
 from etid.results.driver import Driver
 from etid.results.fit import Fit
@@ -73,7 +73,7 @@ def _least(
     return start + free @ found.value
 
 
-@stored_jit
+@program
 def _profile(
     lane: Harmonics,
     known: Known,
@@ -126,7 +126,7 @@ def profile(fit: Fit, recording: Recording | None, driver: Driver | None, name: 
     number = names.index(name)
     if known.elements is not None and known.elements.width[number] <= FIXED:
         raise ValueError(f"{name} is fixed, so it has no profile; take another element")
-    wanted = jnp.asarray(number), jnp.sqrt(jnp.diagonal(jnp.asarray(cov)))
+    wanted = jax.device_put((np.asarray(number), np.sqrt(np.diagonal(cov))))
     logs, deviance = map(np.asarray, _profile(lane, known, fit.circuit, *wanted))
     ends = {one: (low, high) for one, low, high in known.bounds}
     return Profile(

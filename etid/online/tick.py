@@ -28,7 +28,7 @@ STEADY = 0.1  # relative change of amplitude up to which the mean of a window is
 FLAT = 4.0  # power relative to that of noise alone; below this, the pulse is `flat`
 
 
-@jax.jit  # `stored_jit` and `equinox.filter_jit` would cost a tenth of a tick at every call
+@jax.jit  # `program` and `equinox.filter_jit` would cost a tenth of a tick at every call
 def updated(
     model: GainModel,
     change: Float[Array, ""],

@@ -50,9 +50,9 @@ from etid.estimators.estimator import serving
 from etid.estimators.maximum_likelihood.given_driver import GivenDriver
 from etid.estimators.registry import MAXIMUM_LIKELIHOOD
 from etid.identify.arguments import circuit_of, number_of, require, require_float64
-from etid.identify.compiled import stored_jit
 from etid.identify.one import known_at
 from etid.identify.unfitted import explained
+from etid.numpy_tier.tiers import program
 from etid.online import changes
 from etid.online.changes import Change
 from etid.online.gain_bands import cut, unloaded_bands
@@ -366,7 +366,7 @@ class Tracker(Overviewed):
         return changes.bad_electrodes(state, np.abs(np.asarray(z)))
 
 
-@stored_jit
+@program
 def _judged(
     model: GainModel, known: GivenDriver, driver_result: RESULTS, state: TrackerState
 ) -> Fit:

@@ -17,7 +17,6 @@ free, and the parameters of Z_th move within their covariance.
 import dataclasses
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Complex, Float
@@ -25,7 +24,7 @@ from jaxtyping import Array, Complex, Float
 from etid.circuits.circuit import AbstractCircuit
 from etid.estimators.estimate import DELAY_WIDTH
 from etid.estimators.lanes import Harmonics
-from etid.identify.compiled import stored_jit
+from etid.numpy_tier.tiers import program
 from etid.results.driver import ContinuousDriver, SourceImpedance
 from etid.results.feed import MeasuredCurrent
 
@@ -83,7 +82,7 @@ def bands(
 
     centre = np.exp(mean(weight * np.log(frequency)))
     off = mean(np.real(score)) + 1j * mean(np.imag(score))
-    z = np.asarray(circuit.response(jnp.asarray(centre)))
+    z = np.asarray(circuit.response(jax.device_put(centre)))
     if z_th is None:
         impedance = z * (1 + off)
     else:
@@ -100,7 +99,7 @@ def bands(
     )
 
 
-@stored_jit
+@program
 def _source(
     source: SourceImpedance, frequency: Float[Array, " harmonic"]
 ) -> tuple[Complex[Array, " harmonic"], Complex[Array, "parameter harmonic"]]:
@@ -135,7 +134,7 @@ class _Terms:
     def of(
         cls, lane: Harmonics, feed: ContinuousDriver | MeasuredCurrent, circuit: AbstractCircuit
     ) -> "_Terms":
-        frequency = jnp.asarray(lane.frequency)
+        frequency = jax.device_put(lane.frequency)
         z = np.asarray(circuit.response(frequency))
         if isinstance(feed, MeasuredCurrent):
             return cls(lane, z, None, np.zeros((0, z.size), complex))

@@ -2,12 +2,13 @@
 
 from collections.abc import Mapping
 
-import jax.numpy as jnp
+import jax
 import numpy as np
 from jaxtyping import Array, Complex, Float
 from matplotlib.axes import Axes
 
 from etid.circuits.circuit import AbstractCircuit
+from etid.numpy_tier.tiers import program
 from etid.plotting.style import COLOURS, DASHES, Canvas, plain_ticks, titled
 from etid.results.driver import Driver, SourceImpedance
 from etid.results.fit import Fit
@@ -24,7 +25,7 @@ def draw_bode(
 ) -> np.ndarray:
     """Magnitude and phase of impedances (the paper's figure 9), with bands."""
     magnitude, phase = axes = canvas(2, 1, (6.0, 5.0), sharex=True).ravel()
-    frequency = jnp.geomspace(LOWEST, HIGHEST, POINTS)
+    frequency = jax.device_put(np.geomspace(LOWEST, HIGHEST, POINTS))
     kilohertz = np.asarray(frequency) / 1e3
     sizes, banded, failed = [], False, []
     for i, (label, thing) in enumerate(things.items()):
@@ -81,16 +82,25 @@ def impedance(
 def stderr(
     thing: Driver | Fit | AbstractCircuit | SourceImpedance,
     frequency: Float[Array, " frequency"],
-) -> Float[Array, "2 frequency"]:
+) -> Float[Array | np.ndarray, "2 frequency"]:
     """Standard errors of ln |Z| and of the phase [rad]; NaN where there is no covariance."""
     if isinstance(thing, Driver):
         return thing.log_response_stderr(frequency)
     if isinstance(thing, Fit):
-        kind, names = type(thing.circuit), thing.circuit.names()
+        return _of_circuit(thing.circuit, jax.device_put(thing.cov), frequency)
+    return np.full((2, frequency.size), np.nan)
 
-        def response(values: Float[Array, " parameter"]) -> Complex[Array, " frequency"]:
-            circuit = kind(**{name: values[i] for i, name in enumerate(names)})
-            return circuit.response(frequency)
 
-        return log_stderr(response, thing.circuit.values(), jnp.asarray(thing.cov))
-    return jnp.full((2, frequency.size), jnp.nan)
+@program
+def _of_circuit(
+    circuit: AbstractCircuit,
+    cov: Float[Array, "parameter parameter"],
+    frequency: Float[Array, " frequency"],
+) -> Float[Array, "2 frequency"]:
+    """`stderr` of a circuit with the covariance of its parameters."""
+    kind, names = type(circuit), circuit.names()
+
+    def response(values: Float[Array, " parameter"]) -> Complex[Array, " frequency"]:
+        return kind(**{name: values[i] for i, name in enumerate(names)}).response(frequency)
+
+    return log_stderr(response, circuit.values(), cov)

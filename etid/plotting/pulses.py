@@ -1,6 +1,6 @@
 """Pictures over time: a record, one pulse, and the residual of a predicted pulse."""
 
-import jax.numpy as jnp
+import jax
 import numpy as np
 from matplotlib.axes import Axes
 
@@ -166,7 +166,7 @@ def residual_std(recording: Recording, driver: Driver | None, circuit: AbstractC
         σ² = σ_out² + σ_th² mean |G|²,    the mean from 0 to half the sample rate (Parseval).
     """
     half = recording.sample_rate / 2
-    frequency = jnp.asarray((np.arange(FREQUENCIES) + 0.5) * half / FREQUENCIES)
+    frequency = jax.device_put((np.arange(FREQUENCIES) + 0.5) * half / FREQUENCIES)
     recording, feed = fed(recording, driver)
     size = np.abs(np.asarray(feed.gain(circuit.response(frequency), frequency)))
     gain = np.mean(size**2)

@@ -9,7 +9,7 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-import jax.numpy as jnp
+import jax
 import numpy as np
 
 from etid.circuits.display import heading, plus_minus, scaled
@@ -98,7 +98,7 @@ def _calibrations(paths: Sequence[str]) -> str:
 
 
 def _at_1_khz(driver: Driver) -> tuple[complex, float]:
-    frequency = jnp.array([1e3])
+    frequency = jax.device_put(np.array([1e3]))
     z = complex(np.asarray(driver.response(frequency))[0])
     return z, float(np.asarray(driver.response_stderr(frequency))[0])
 

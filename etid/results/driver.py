@@ -23,6 +23,7 @@ from jaxtyping import Array, Complex, Float, Int
 from etid.circuits.display import plus_minus, several
 from etid.circuits.impedance import realise
 from etid.circuits.overview import Overview
+from etid.numpy_tier.tiers import program
 from etid.recordings.remarks import texts
 from etid.results.feed import AbstractFeed, CurrentSource
 from etid.results.tried_orders import TriedOrders
@@ -63,6 +64,7 @@ class SourceImpedance(eqx.Module):
         """Number of poles."""
         return 2 * self.log_omega.shape[0] + self.log_omega_real.shape[0]
 
+    @program
     def response(self, frequency: Float[Array, "..."]) -> Complex[Array, "..."]:
         """Impedance [Ω] at real frequencies [Hz]."""
         # In real arithmetic, which takes half the time to compile and to run.
@@ -214,6 +216,7 @@ class Driver(AbstractFeed):
         """Number of poles."""
         return self.a.shape[0] - 1
 
+    @program
     def gain(
         self, load: Complex[Array, "*lane frequency"], frequency: Float[Array, " frequency"]
     ) -> Complex[Array, "*lane frequency"]:
@@ -241,6 +244,7 @@ class Driver(AbstractFeed):
     ) -> Float[Array, "2 frequency"]:
         """Standard errors of ln |Z_th| and of the phase [rad]; NaN if there is no covariance."""
 
+    @program
     def response_stderr(self, frequency: Float[Array, " frequency"]) -> Float[Array, " frequency"]:
         """Standard error of |Z_th|, from the derivatives of |Z_th| by its parameters.
 
@@ -253,8 +257,9 @@ class Driver(AbstractFeed):
         return jnp.abs(self.response(frequency)) * self.log_response_stderr(frequency)[0]
 
     def _overview(self) -> Overview:
-        verdict, (at, errors) = self.verdict, _at(self, jnp.array([SHOWN]))
-        z, (of_size, of_phase) = complex(at[0]), map(float, errors[:, 0])
+        at, verdict = jax.device_put(np.array([SHOWN])), self.verdict
+        z = complex(np.asarray(self.response(at))[0])
+        of_size, of_phase = np.asarray(self.log_response_stderr(at))[:, 0].tolist()
         rows = [
             (
                 f"|Z_th| at {SHOWN / 1e3:g} kHz",
@@ -276,22 +281,16 @@ class Driver(AbstractFeed):
         return []
 
 
-@eqx.filter_jit  # one by one, its many operations compile ten times as long
-def _at(
-    driver: Driver, frequency: Float[Array, " frequency"]
-) -> tuple[Complex[Array, " frequency"], Float[Array, "2 frequency"]]:
-    """Z_th [Ω], and the standard errors of ln |Z_th| and of the phase [rad]."""
-    return driver.response(frequency), driver.log_response_stderr(frequency)
-
-
 class DiscreteDriver(Driver):
     """A driver from Steiglitz-McBride: Z_th is the discrete filter `b`, `a` (paper, eq. 4)."""
 
+    @program
     def response(self, frequency: Float[Array, "..."]) -> Complex[Array, "..."]:
         """Source impedance Z_th [Ω] of the discrete filter at real frequencies [Hz]."""
         z = delay_variable(jnp.asarray(frequency), self.sample_rate)
         return Rational(self.b, self.a)(z)
 
+    @program
     def log_response_stderr(
         self, frequency: Float[Array, " frequency"]
     ) -> Float[Array, "2 frequency"]:
@@ -340,10 +339,12 @@ class ContinuousDriver(Driver):
         """Standard deviation of the delay of the calibrations [samples at this rate, in Hz]."""
         return self.calibration.delay_std_samples * (sample_rate / self.sample_rate)
 
+    @program
     def response(self, frequency: Float[Array, "..."]) -> Complex[Array, "..."]:
         """Source impedance Z_th [Ω] in continuous time at real frequencies [Hz]."""
         return self.source.response(frequency)
 
+    @program
     def log_response_stderr(
         self, frequency: Float[Array, " frequency"]
     ) -> Float[Array, "2 frequency"]:

@@ -6,6 +6,7 @@ from typing import Any
 
 import equinox as eqx
 import jax
+import jax.core
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Complex, Float, Int
@@ -126,12 +127,16 @@ class Fit(Judged, WithData[Circuit]):
     @property
     def stderr(self) -> Circuit:
         """Standard errors of the elements, as a circuit of the same kind."""
-        # The fits of `identify_skin` hold NumPy arrays. With `jnp`, six programs would compile.
-        xp = self.cov.__array_namespace__()
-        variance = xp.diagonal(self.cov, axis1=-2, axis2=-1)
+        # With `jnp`, six programs would compile.
+        xp: Any = jnp if isinstance(self.cov, jax.core.Tracer) else np
+        cov = xp.asarray(self.cov)
+        variance = xp.diagonal(cov, axis1=-2, axis2=-1)
         values = xp.sqrt(xp.where(variance >= 0, variance, xp.nan))
-        names = self.circuit.names()
-        return type(self.circuit)(**{name: values[..., i] for i, name in enumerate(names)})
+        if isinstance(self.cov, jax.Array):
+            values = [jax.device_put(values[..., i]) for i in range(values.shape[-1])]
+        else:
+            values = np.moveaxis(values, -1, 0)
+        return type(self.circuit)(**dict(zip(self.circuit.names(), values, strict=True)))
 
     @property
     @np.errstate(all="ignore")  # a fit that failed may hold any number
@@ -248,8 +253,8 @@ class Fit(Judged, WithData[Circuit]):
             f"{name} {quantity(float(value), unit, float(error))}"
             for (name, unit), value, error in zip(
                 self.circuit.units().items(),
-                self.circuit.values(),
-                self.stderr.values(),
+                np.asarray(self.circuit.values()),
+                np.asarray(self.stderr.values()),
                 strict=True,
             )
         )

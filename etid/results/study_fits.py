@@ -16,7 +16,6 @@ from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
@@ -233,7 +232,7 @@ def _from_json(stored: Mapping[str, Any]) -> Driver:
         rrse=_numbers(stored, "rrse", 0),
         chi2=_numbers(stored, "chi2", 0),
         result=verdicts_of(np.asarray(stored["verdict"])),
-        steps=_numbers(stored, "steps", 0).astype(int),
+        steps=jax.device_put(np.asarray(_numbers(stored, "steps", 0)).astype(int)),
         method=stored["method"],
         remarks=np.asarray(remarks_of(stored.get("remarks", ""))),
     )
@@ -289,4 +288,4 @@ def _numbers(
         raise TypeError(f"{name} is {reprlib.repr(stored[name])}")
     if shape is not None and found.shape != shape:
         raise ValueError(f"{name} has shape {found.shape}, must be {shape}")
-    return jnp.asarray(found, dtype=float)
+    return jax.device_put(found.astype(float))

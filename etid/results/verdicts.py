@@ -152,11 +152,14 @@ def verdict(name: str) -> RESULTS:
     return RESULTS._name_to_item[name]
 
 
-def first_verdict(*conditions: tuple[Bool[Array, ""], RESULTS]) -> RESULTS:
+def first_verdict(*conditions: tuple[Bool[Array, ""] | np.bool_, RESULTS]) -> RESULTS:
     """The first verdict whose condition is true, else `successful`."""
     result = verdict("successful")
     for condition, item in reversed(conditions):
-        result = RESULTS.where(condition, item, result)
+        if isinstance(condition, np.bool_):  # known while a program is traced
+            result = item if condition else result
+        else:
+            result = RESULTS.where(condition, item, result)
     return result
 
 

@@ -14,13 +14,9 @@ proportional to its square and time proportional to its cube. All parameters for
 common parameters, then the own parameters of each problem.
 """
 
-from typing import Any
-
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import lineax as lx
-import optimistix as optx
 from jaxtyping import Array, Float
 
 from etid.solvers.levenberg_marquardt import AbstractNormalEquations
@@ -134,29 +130,10 @@ class ArrowheadEquations(AbstractNormalEquations):
         """The normal equations in the parameters z = `by` · y."""
         return ArrowheadEquations(self.objective, self.gradient / by, self.matrix.scaled(by))
 
+    def step(self, damping: Float[Array, ""]) -> Float[Array, " parameter"]:
+        """−(JᵀJ + damping · I)⁻¹ Jᵀr."""
+        return -self.matrix.solve(self.gradient, damping)
+
     def hessian(self) -> Arrowhead:
         """JᵀJ as an operator."""
         return self.matrix
-
-
-class _Descent(eqx.Module):
-    info: Any  # optimistix.FunctionInfo.EvalGradHessian
-
-
-class EliminationDescent(optx.AbstractDescent):
-    """`optimistix.DampedNewtonDescent` for arrowheads."""
-
-    def init(self, y: Array, f_info_struct: Any) -> _Descent:
-        """State before the first query."""
-        del y
-        return _Descent(f_info_struct)
-
-    def query(self, y: Array, f_info: Any, state: _Descent) -> _Descent:
-        """State with the normal equations of a new point."""
-        del y, state
-        return _Descent(f_info)
-
-    def step(self, step_size: Float[Array, ""], state: _Descent) -> tuple[Array, optx.RESULTS]:
-        """−(JᵀJ + I / step_size)⁻¹ Jᵀr."""
-        matrix: Any = state.info.hessian
-        return -matrix.solve(state.info.grad, 1 / step_size), optx.RESULTS.successful

@@ -3,9 +3,9 @@
 `optimistix.LevenbergMarquardt` carries the residual and its Jacobian in the solver's state. Under
 `vmap`, a step of one lane selects between two copies of this state for all lanes. With thousands of
 samples, that costs about twelve times as much as the step itself. Here the state holds only the
-objective, its gradient and the p×p Gauss-Newton matrix. `optimistix.DampedNewtonDescent` solves
-the damped step; `optimistix.ClassicalTrustRegion` accepts it and sets the damping. A matrix with a
-useful structure brings its own equations and descent (`etid.solvers.arrowhead`).
+objective, its gradient and the p×p Gauss-Newton matrix. These solve the damped step;
+`optimistix.ClassicalTrustRegion` accepts it and sets the damping. A matrix with a useful structure
+brings its own equations (`etid.solvers.arrowhead`).
 
 Three properties make the method independent of the scale of parameters and residual:
 
@@ -29,6 +29,7 @@ import jax
 import jax.numpy as jnp
 import lineax as lx
 import optimistix as optx
+from jax.scipy.linalg import cho_factor, cho_solve
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
 RIDGE = 1e-13  # of the scaled matrix, for directions that double precision cannot resolve
@@ -57,8 +58,12 @@ class AbstractNormalEquations(eqx.Module):
         """The normal equations in the parameters z = `by` · y."""
 
     @abc.abstractmethod
+    def step(self, damping: Float[Array, ""]) -> Float[Array, " parameter"]:
+        """−(JᵀJ + damping · I)⁻¹ Jᵀr; not finite if this matrix is not positive definite."""
+
+    @abc.abstractmethod
     def hessian(self) -> lx.AbstractLinearOperator:
-        """JᵀJ as an operator, for the descent and the search of optimistix."""
+        """JᵀJ as an operator, for the search of optimistix."""
 
 
 class NormalEquations(AbstractNormalEquations):
@@ -84,6 +89,11 @@ class NormalEquations(AbstractNormalEquations):
         """
         finite = jnp.isfinite(self.objective) & jnp.isfinite(self.gradient).all()
         return dataclasses.replace(self, objective=jnp.where(finite, self.objective, jnp.inf))
+
+    def step(self, damping: Float[Array, ""]) -> Float[Array, " parameter"]:
+        """−(JᵀJ + damping · I)⁻¹ Jᵀr."""
+        damped = self.matrix + damping * jnp.eye(self.gradient.size)
+        return -cho_solve(cho_factor(damped), self.gradient)
 
     def hessian(self) -> lx.AbstractLinearOperator:
         """JᵀJ as an operator."""
@@ -185,10 +195,9 @@ class LevenbergMarquardt(optx.AbstractLeastSquaresSolver):
         geodesic: Bend each step along the curvature of the model, by its second derivative
             (Transtrum and Sethna 2012, arXiv:1201.5885). In curved valleys this takes a fraction of
             the steps. Each step costs a third more.
-        descent: Solves the damped step.
         search: Accepts or rejects the step and sets the damping.
-        equations: Evaluates the normal equations of `fn(y, args)`. Own equations together with a
-            matching `descent` keep the structure of a problem with many parameters.
+        equations: Evaluates the normal equations of `fn(y, args)`. Own equations keep the
+            structure of a problem with many parameters.
         second_order: Evaluates Jᵀ r″ of `fn(y, args)`.
         empty: Returns normal equations of zeros for given parameters and `args`.
     """
@@ -198,7 +207,6 @@ class LevenbergMarquardt(optx.AbstractLeastSquaresSolver):
     ftol: float | Float[Array, ""] = 1e-8
     damping: float | Float[Array, ""] = 1e-2
     norm: Callable[[PyTree], Array] = optx.two_norm
-    descent: optx.AbstractDescent = optx.DampedNewtonDescent(linear_solver=lx.Cholesky())
     # MINPACK's threshold, and two constants that are not powers of each other. With 10 and 1/10 the
     # damping returns again and again to the value just rejected; a curved valley then takes three
     # times as many steps.
@@ -274,15 +282,15 @@ class LevenbergMarquardt(optx.AbstractLeastSquaresSolver):
         scale = jnp.maximum(state.scale, diagonal)
         safe = jnp.where(scale > 0, scale, 1.0)
 
-        # The step is solved in z = D y. The descent takes the damping as 1 / step_size.
+        # The step is solved in z = D y.
         scaled = accepted.scaled(safe)
-        info = self._info(scaled)
-        descent_state = self.descent.query(y, info, self.descent.init(y, info))
+        size, limits = step_size / self.damping, jnp.finfo(y.dtype)
+        damping = jnp.where(size > limits.eps, 1 / size, limits.max)
         # If the factorisation fails, the proposed step is not finite. The next trial rejects it and
         # raises the damping.
         # The step without damping, of which the tests below ask, is solved at once with it.
-        sizes = jnp.stack([step_size / self.damping, jnp.asarray(1 / RIDGE, y.dtype)])
-        proposed, newton = jax.vmap(lambda size: self.descent.step(size, descent_state)[0])(sizes)
+        both = jnp.stack([damping, jnp.asarray(RIDGE, y.dtype)])
+        proposed, newton = jax.vmap(scaled.step)(both)
         size = self.norm(safe * y)
         offset = -jnp.dot(newton, scaled.gradient)  # |Q₁ᵀ r|²
         squares = 2 * accepted.objective
@@ -305,10 +313,7 @@ class LevenbergMarquardt(optx.AbstractLeastSquaresSolver):
             def bend() -> Array:
                 bent = self.second_order(_value(fn), y, proposed / safe, args) / safe
                 bent = eqx.tree_at(lambda e: e.gradient, scaled, bent)
-                turned, _ = self.descent.step(
-                    step_size / self.damping,
-                    self.descent.query(y, self._info(bent), descent_state),
-                )
+                turned = bent.step(damping)
                 small = 2 * self.norm(turned) <= ACCELERATION * self.norm(proposed)
                 return proposed + jnp.where(small, 0.5 * turned, 0.0)
 

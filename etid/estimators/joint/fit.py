@@ -25,7 +25,7 @@ from etid.estimators.maximum_likelihood.given_driver import GivenDriver
 from etid.estimators.maximum_likelihood.load_fit import SLIGHT
 from etid.estimators.unknowns import LoadUnknowns, LoadWithCurrentUnknowns
 from etid.signals.harmonics import Spectrum
-from etid.solvers.arrowhead import Arrowhead, ArrowheadEquations, EliminationDescent, join
+from etid.solvers.arrowhead import Arrowhead, ArrowheadEquations, join
 from etid.solvers.levenberg_marquardt import (
     DIFFERENCE,
     LevenbergMarquardt,
@@ -155,7 +155,6 @@ def fit_together(
         ftol=ftol,
         damping=SLIGHT,
         geodesic=True,
-        descent=EliminationDescent(),
         equations=_equations,
         second_order=_second_order,
         empty=_empty,

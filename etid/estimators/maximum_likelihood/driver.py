@@ -242,7 +242,7 @@ class Calibrations(eqx.Module):
     calibration: Calibration
     spectra: Spectrum
     rate: Float[Array, ""]
-    delay_width: Float[Array, ""] = eqx.field(default_factory=lambda: jnp.array(DELAY_WIDTH))
+    delay_width: Float[Array, ""] = eqx.field(default_factory=lambda: jax.device_put(DELAY_WIDTH))
 
     @classmethod
     def of(cls, driver: HarmonicDriver) -> "Calibrations":

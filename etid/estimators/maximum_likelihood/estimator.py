@@ -90,7 +90,6 @@ class MaximumLikelihood(AbstractEstimator):
     driver = HarmonicDriver
     current = True
     chooses = True
-    brief = True
 
     def __post_init__(self) -> None:
         if self.with_current:

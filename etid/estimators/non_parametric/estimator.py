@@ -42,7 +42,8 @@ class NonParametric(AbstractByMaximumLikelihood):
     def check_driver(self, driver: AbstractFeed, sample_rate: float, pulse_rate: float) -> None:
         """Raise ValueError unless a driver knows Z_th at the harmonics of the recording."""
         super().check_driver(driver, sample_rate, pulse_rate)
-        known = float(serving(driver, HarmonicDriver, str(self)).spectra.frequency[0, 0])
+        frequency = np.asarray(serving(driver, HarmonicDriver, str(self)).spectra.frequency)
+        known = float(frequency[0, 0])
         if not np.isclose(pulse_rate, known, rtol=SAME_PULSE_RATE):
             raise ValueError(
                 f"{self} knows Z_th at harmonics of {known:.6g} Hz only, but the recording has "

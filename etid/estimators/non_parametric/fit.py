@@ -19,8 +19,9 @@ from collections.abc import Callable
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 import optimistix as optx
-from jaxtyping import Array, Complex, Float, PRNGKeyArray
+from jaxtyping import Array, Complex, Float
 
 from etid.circuits.circuit import AbstractCircuit
 from etid.estimators.estimate import MAX_STEPS, SOLVER, Estimate
@@ -157,23 +158,23 @@ def _bias(
     It is the mean of the changes by added noise and by its negative, which has no part of first
     order (simulation and extrapolation, Cook and Stefanski 1994, with antithetic draws).
     """
+    # Constants of the program, by pair, record, X or Y, real or imaginary part, and harmonic.
+    shape = PAIRS, len(records), 2, 2, records[-1].x.size
+    draws = np.random.default_rng(SEED).normal(size=shape)
 
-    def drawn(
-        key: PRNGKeyArray, variance: Float[Array, " harmonic"]
+    def noise(
+        of: Float[Array, "2 harmonic"], variance: Float[Array, " harmonic"]
     ) -> Complex[Array, " harmonic"]:
-        parts = jax.random.normal(key, (2, variance.size), variance.dtype)
-        noise = parts * jnp.sqrt(variance / 2)[None, :]
-        return jax.lax.complex(noise[0], noise[1])
+        real, imag = of * jnp.sqrt(variance / 2)[None, :]
+        return jax.lax.complex(real, imag)
 
-    def mean_of_pair(key: PRNGKeyArray) -> Float[Array, " number"]:
+    def mean_of_pair(own: Float[Array, "record 2 2 harmonic"]) -> Float[Array, " number"]:
         noises = []
-        last = jax.random.fold_in(key, 0)
-        for i, s in enumerate(records):
-            own = jax.random.fold_in(key, i + 1)
+        for s, (of_x, of_y) in zip(records, own, strict=True):
             same = same_unloaded(s, records[-1])
             # Recordings with the same unloaded record have the same noise of X.
-            of_x = jnp.where(same, drawn(last, s.variance_x), drawn(own, s.variance_x))
-            noises.append((of_x, drawn(jax.random.fold_in(own, 1), s.variance_y)))
+            of_x = jnp.where(same, own[-1, 0], of_x)
+            noises.append((noise(of_x, s.variance_x), noise(of_y, s.variance_y)))
 
         def refitted(sign: Complex[Array, ""]) -> Float[Array, " number"]:
             return change(
@@ -185,4 +186,4 @@ def _bias(
 
         return (refitted(as_complex(jnp.ones(()))) + refitted(as_complex(-jnp.ones(())))) / 2
 
-    return jax.lax.map(mean_of_pair, jax.random.split(jax.random.key(SEED), PAIRS)).mean(0)
+    return jax.lax.map(mean_of_pair, jnp.asarray(draws)).mean(0)

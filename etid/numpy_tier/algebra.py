@@ -1,0 +1,145 @@
+"""Linear algebra and Fourier transforms by NumPy and LAPACK, with the results of XLA."""
+
+import math
+import operator
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import Any
+
+import numpy as np
+from scipy.linalg import blas, lapack
+
+from etid.numpy_tier.source import UntranslatableError, Value
+
+# By the letter of the type; `get_lapack_funcs` would take longer than the work itself.
+CHOLESKY = {of: getattr(lapack, f"{name}potrf") for of, name in zip("fdFD", "sdcz", strict=True)}
+LU = {of: getattr(lapack, f"{name}getrf") for of, name in zip("fdFD", "sdcz", strict=True)}
+SOLVE = {of: getattr(blas, f"{name}trsm") for of, name in zip("fdFD", "sdcz", strict=True)}
+
+
+def product(p: Any, operands: Sequence[Value], results: Sequence[Any]) -> Callable[[Any, Any], Any]:
+    """The function that multiplies two arrays and sums over axes."""
+    ((of_a, of_b), (batch_a, batch_b)), (a, b) = p["dimension_numbers"], operands
+    if a.dtype != b.dtype or a.dtype != results[0].dtype:
+        raise UntranslatableError("product of different types")
+    if not batch_a and len(a.shape) <= 2 and len(b.shape) <= 2 and len(of_a) == 1:
+        left = len(a.shape) == 2 and of_a[0] == 0
+        right = len(b.shape) == 2 and of_b[0] == 1
+        return lambda a, b: np.dot(a.T if left else a, b.T if right else b)
+    rest_a = [axis for axis in range(len(a.shape)) if axis not in (*of_a, *batch_a)]
+    rest_b = [axis for axis in range(len(b.shape)) if axis not in (*of_b, *batch_b)]
+    axes_a, axes_b = (*batch_a, *rest_a, *of_a), (*batch_b, *of_b, *rest_b)
+    batch = [a.shape[axis] for axis in batch_a]
+    inner = math.prod(a.shape[axis] for axis in of_a)
+    rows = math.prod(a.shape[axis] for axis in rest_a)
+    columns = math.prod(b.shape[axis] for axis in rest_b)
+
+    def multiply(a: Any, b: Any) -> Any:
+        a = a.transpose(axes_a).reshape(*batch, rows, inner)
+        b = b.transpose(axes_b).reshape(*batch, inner, columns)
+        return np.matmul(a, b).reshape(results[0].shape)[()]
+
+    return multiply
+
+
+def each(function: Callable[..., Sequence[Any]], *arrays: Any) -> list[Any]:
+    """Results of a function of matrices, for each of several."""
+    batch = arrays[0].shape[:-2]
+    rows = [of.reshape(-1, *of.shape[-2:]) for of in arrays]
+    found = [function(*of) for of in zip(*rows, strict=True)]
+    return [np.array(of).reshape(*batch, *of[0].shape) for of in zip(*found, strict=True)]
+
+
+def cholesky(of: Any) -> Any:
+    """Lower factor; NaN for a matrix that is not positive definite."""
+    if not of.size:
+        return of.copy()
+    if of.ndim > 2:
+        return each(lambda one: [cholesky(one)], of)[0]
+    found, failed = CHOLESKY[of.dtype.char](of, lower=1, clean=1)
+    return np.full_like(of, np.nan) if failed else found
+
+
+def triangular_solve(
+    a: Any,
+    b: Any,
+    left_side: bool,
+    lower: bool,
+    transpose_a: bool,
+    conjugate_a: bool,
+    unit_diagonal: bool,
+) -> Any:
+    """X of op(A) X = B, or of X op(A) = B; a singular A gives infinities."""
+    if not b.size:
+        return b.copy()
+    options: dict[str, int] = {"side": not left_side, "lower": lower, "diag": unit_diagonal}
+    options["trans_a"] = transpose_a * (1 + conjugate_a)
+    if b.ndim > 2:
+        return each(lambda a, b: [SOLVE[a.dtype.char](1.0, a, b, **options)], a, b)[0]
+    return SOLVE[a.dtype.char](1.0, a, b, **options)
+
+
+def lu(of: Any) -> list[Any]:
+    """Both factors in one matrix, the exchanged rows, and their order."""
+    if of.ndim > 2:
+        return each(lu, of)
+    found, pivots, _ = LU[of.dtype.char](of)
+    order = np.arange(of.shape[0], dtype=np.int32)
+    for row, other in enumerate(pivots):
+        order[[row, other]] = order[[other, row]]
+    return [found, pivots.astype(np.int32), order]
+
+
+def or_nan(function: Callable[..., Any], of: Any) -> Any:
+    """Results of a function of matrices; NaN if they are not found."""
+    try:
+        return function(of)
+    except np.linalg.LinAlgError:
+        if of.ndim > 2:  # one of several
+            found = each(lambda one: _as_tuple(or_nan(function, one)), of)
+            return tuple(found) if len(found) > 1 else found[0]
+        found = function(np.zeros_like(of))
+        return tuple(one * np.nan for one in found) if isinstance(found, tuple) else found * np.nan
+
+
+def _as_tuple(found: Any) -> tuple[Any, ...]:
+    return found if isinstance(found, tuple) else (found,)
+
+
+def qr(p: Any, operands: Sequence[Value], _: Any) -> Any:
+    """The rule of orthogonal and triangular factors."""
+    if p.get("pivoting") or 0 in operands[0].shape:
+        raise UntranslatableError("qr with pivots, or of an empty matrix")
+    return partial(np.linalg.qr, mode="complete" if p["full_matrices"] else "reduced")
+
+
+def eigh(p: Any, operands: Sequence[Value], _: Any) -> Any:
+    """The rule of eigenvectors and eigenvalues of symmetric matrices."""
+    if p.get("subset_by_index") not in (None, (0, operands[0].shape[-1])):
+        raise UntranslatableError("some eigenvalues")
+    function = partial(np.linalg.eigh, UPLO="L" if p["lower"] else "U")
+    return lambda of: or_nan(function, of)[::-1]
+
+
+def eig(_: Any, __: Any, results: Sequence[Any]) -> Any:
+    """The rule of eigenvalues, which are complex numbers also if all are real."""
+    if len(results) > 1:
+        raise UntranslatableError("eigenvectors of a matrix without symmetry")
+    return lambda of: [or_nan(np.linalg.eigvals, of).astype(results[0].dtype)]
+
+
+def svd(p: Any, operands: Sequence[Value], _: Any) -> Any:
+    """The rule of singular values, and of the vectors on their left and right."""
+    if p.get("subset_by_index") is not None or 0 in operands[0].shape:
+        raise UntranslatableError("some singular values, or those of an empty matrix")
+    both = p["compute_uv"]
+    function = partial(np.linalg.svd, full_matrices=p["full_matrices"], compute_uv=both)
+    order = operator.itemgetter(1, 0, 2) if both else lambda values: [values]
+    return lambda of: order(or_nan(function, of))
+
+
+def fft(p: Any, _: Any, __: Any) -> Any:
+    """The rule of Fourier transforms over the last axes."""
+    functions = np.fft.fftn, np.fft.ifftn, np.fft.rfftn, np.fft.irfftn
+    lengths = p["fft_lengths"]
+    return partial(functions[int(p["fft_type"])], s=lengths, axes=range(-len(lengths), 0))

@@ -1,0 +1,152 @@
+"""Who runs the traced functions of etid: NumPy where that is sooner, else XLA.
+
+XLA compiles a first driver and skin for 7 s, for fits that run in 50 and 10 ms. NumPy runs the same
+traced programs in a fifth of a second and in 10 ms, and nothing is compiled.
+"""
+
+import contextlib
+import functools
+import logging
+import weakref
+from collections.abc import Callable
+from typing import Any, ParamSpec, TypeVar
+
+import equinox as eqx
+import jax
+import jax.core
+
+from etid.garbage import unsearched
+from etid.numpy_tier.source import UntranslatableError
+from etid.numpy_tier.translator import translated
+from etid.numpy_tier.waiting import announced
+
+Parameters = ParamSpec("Parameters")
+Result = TypeVar("Result")
+
+# For a batch: XLA compiles for a processor in 55 % of the time with other code for fusions, fewer
+# passes of LLVM, and one kernel for each sum, not a tree of three. The programs are as fast.
+QUICKLY = {
+    "xla_cpu_use_fusion_emitters": False,
+    "xla_backend_optimization_level": 1,
+    "xla_disable_hlo_passes": "tree_reduction_rewriter",
+}
+# For what runs once: in less than half of that without passes, and with vectors of two numbers. The
+# programs take two to three times their time.
+AT_ONCE = {
+    **QUICKLY,
+    "xla_backend_optimization_level": 0,
+    "xla_cpu_prefer_vector_width": 128,
+}
+
+# XLA compiles a batch for some 5 s. NumPy takes 5 to 10 ms longer for each skin of 1728 harmonics,
+# and longer in proportion for samples: from about 400 such skins on, XLA is sooner.
+WORTH_COMPILING = 400 * 1728
+
+_log = logging.getLogger(__name__)
+_programs: weakref.WeakKeyDictionary[Any, Any] = weakref.WeakKeyDictionary()
+
+
+@jax.tree_util.register_static
+class _Static:
+    """What a function takes or returns beside arrays; part of a structure, not a leaf."""
+
+    def __init__(self, of: Any) -> None:
+        leaves, structure = jax.tree.flatten(of)
+        self.of = of
+        self.key = structure, tuple((type(leaf), leaf) for leaf in leaves)
+
+    def __hash__(self) -> int:
+        return hash(self.key)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _Static) and self.key == other.key
+
+
+def program(
+    function: Callable[Parameters, Result], *, batch: bool = False
+) -> Callable[Parameters, Result]:
+    """A function that NumPy or XLA runs as a whole.
+
+    NumPy runs it on a processor. XLA compiles it in these cases:
+
+    - It is part of a transformation (`jax.grad`, `jax.vmap`, `jax.jit`).
+    - A setting of JAX looks into it (`jax_disable_jit`, `jax_debug_nans`, `jax_debug_infs`).
+    - The default device is no processor.
+    - It is a batch.
+    - It has a primitive that NumPy cannot run, as your own circuit may have.
+
+    Args:
+        function: Function of arrays and of anything else that can be hashed.
+        batch: Whether it runs for so many recordings that its run time matters more than its
+            compilation.
+    """
+    inner = eqx.filter_jit(function)  # part of another function, which decides how it is compiled
+
+    @functools.cache
+    def compiled(processor: bool) -> Any:
+        def flat(static: _Static, arrays: Any) -> tuple[Any, _Static]:
+            args, kwargs = eqx.combine(arrays, static.of)
+            of: Any = function
+            found, others = eqx.partition(of(*args, **kwargs), eqx.is_array)
+            return found, _Static(others)
+
+        flat.__name__ = flat.__qualname__ = function.__name__
+        options = None if not processor else QUICKLY if batch else AT_ONCE
+        return jax.jit(flat, static_argnums=0, compiler_options=options)
+
+    @functools.wraps(function)
+    def call(*args: Parameters.args, **kwargs: Parameters.kwargs) -> Result:
+        arrays, others = eqx.partition((args, kwargs), eqx.is_array)
+        if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(arrays)):
+            return inner(*args, **kwargs)
+        static, run = _Static(others), compiled(jax.default_backend() == "cpu")
+        with _at_once():
+            small = None if batch or not _by_numpy() else _in_numpy(run, static, arrays)
+            if small is not None:
+                found, others = small(arrays)
+            else:
+                with announced(), unsearched():
+                    found, others = run(static, arrays)
+        return eqx.combine(found, others.of)
+
+    return call
+
+
+def worth_compiling(numbers: int) -> bool:
+    """Whether fits of arrays with so many numbers in all are sooner done if they are compiled."""
+    return numbers >= WORTH_COMPILING or not _by_numpy()
+
+
+def _by_numpy() -> bool:
+    """Whether NumPy may run programs: on a processor, and no setting of JAX looks into them."""
+    config: Any = jax.config  # its attributes are made at run time
+    looks = config.jax_disable_jit or config.jax_debug_nans or config.jax_debug_infs
+    return jax.default_backend() == "cpu" and not looks
+
+
+def _in_numpy(run: Any, static: _Static, arrays: Any) -> Any:
+    """The compiled function as one of NumPy; None if it has a primitive that NumPy cannot run."""
+    with unsearched():
+        traced = run.trace(static, arrays)
+        jaxpr = traced.jaxpr.jaxpr  # the same object each time, because JAX keeps its traces
+        if jaxpr not in _programs:
+            try:
+                _programs[jaxpr] = translated(traced.jaxpr)
+            except UntranslatableError as error:
+                _log.info("XLA compiles %s: NumPy cannot run %s", traced.fun_name, error)
+                _programs[jaxpr] = None
+    small, structure = _programs[jaxpr], jax.tree.structure(traced.out_info)
+    if small is None:
+        return None
+    return lambda of: jax.tree.unflatten(structure, jax.device_put(small(jax.tree.leaves(of))))
+
+
+def _at_once() -> contextlib.AbstractContextManager[None]:
+    """Within someone's trace, a context that computes what is constant there at once.
+
+    Elsewhere it does nothing: in this context, each constant of a program to trace would be
+    compiled as a program of its own. A driver and a skin have three hundred, which take 14 s.
+    """
+    # `jnp.asarray` would compile a program of its own.
+    tracing = isinstance(jax.device_put(0.0), jax.core.Tracer)
+    return jax.ensure_compile_time_eval() if tracing else contextlib.nullcontext()

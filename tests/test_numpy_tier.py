@@ -1,0 +1,533 @@
+"""NumPy runs a jaxpr with the results of XLA: each primitive alone, and programs of several."""
+
+import functools
+import itertools
+import tracemalloc
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+from jax import lax
+
+from etid.numpy_tier import UntranslatableError, translated
+from etid.numpy_tier.primitives import RULES
+from etid.numpy_tier.translator import written
+
+EPSILON = {"f": 8, "c": 16}  # roundings of both results; complex products add two of them
+SHAPES = ((), (3,), (0,), (2, 3), (1, 3))  # few, so that XLA compiles few programs
+REAL = (np.float64, np.float32)
+NUMBERS = (*REAL, np.int64, np.int32)
+SPECIAL = (0.0, -0.0, 0.5, -0.5, 1.0, -1.0, 1.5, -2.5, 3.0, 1e-3, 7e4, np.nan, np.inf, -np.inf)
+MODERATE = tuple(x for x in SPECIAL if np.isfinite(x))
+
+
+def values(dtype, finite=False):
+    """Numbers of a type, with NaN and infinities unless they must be finite."""
+    kind = np.dtype(dtype).kind
+    if kind == "b":
+        return st.booleans()
+    if kind == "i":
+        return st.integers(-9, 9)
+    real = st.sampled_from(MODERATE if finite or kind == "c" else SPECIAL)
+    # XLA takes numbers below the smallest normal one for 0.
+    drawn = real | st.floats(-20, 20, width=32, allow_subnormal=False)
+    return st.builds(complex, drawn, drawn) if kind == "c" else drawn
+
+
+def filled(data, dtype, shape, finite=False):
+    return data.draw(arrays(dtype, shape, elements=values(dtype, finite)))
+
+
+def check(function, *operands, rounding=1.0):
+    """The results of both, of which the types and shapes must be equal too."""
+    program = translated(jax.make_jaxpr(function)(*operands))
+    found = program(jax.tree.leaves(operands))
+    expected = jax.tree.leaves(jitted(function)(*operands))
+    assert len(found) == len(expected)
+    for one, other in zip(found, map(np.asarray, expected), strict=True):
+        assert np.asarray(one).dtype == other.dtype
+        assert np.shape(one) == other.shape
+        if other.dtype.kind in "fc":
+            tolerance = rounding * EPSILON[other.dtype.kind] * np.finfo(other.dtype).eps
+            finite = np.abs(other[np.isfinite(other)])
+            size = finite.max() if finite.size else 0.0
+            np.testing.assert_allclose(one, other, rtol=tolerance, atol=tolerance * min(size, 1))
+        else:
+            np.testing.assert_array_equal(one, other)
+
+
+jitted = functools.cache(jax.jit)
+
+ONE = {
+    lax.abs: (*NUMBERS, np.complex128),
+    lax.acos: REAL,
+    lax.acosh: REAL,
+    lax.asin: REAL,
+    lax.asinh: REAL,
+    lax.atan: REAL,
+    lax.atanh: REAL,
+    lax.bitwise_not: (np.bool_, np.int32),
+    lax.cbrt: REAL,
+    lax.ceil: REAL,
+    lax.conj: (np.complex128,),
+    lax.cos: (*REAL, np.complex128),
+    lax.cosh: REAL,
+    lax.erf: REAL,
+    lax.erfc: REAL,
+    lax.exp: (*REAL, np.complex128),
+    lax.exp2: REAL,
+    lax.expm1: REAL,
+    lax.floor: REAL,
+    lax.imag: (np.complex128,),
+    lax.is_finite: REAL,
+    lax.log: (*REAL, np.complex128),
+    lax.log1p: REAL,
+    lax.logistic: REAL,
+    lax.neg: (*NUMBERS, np.complex128),
+    lax.real: (np.complex128,),
+    lax.round: REAL,
+    lax.sign: NUMBERS,
+    lax.sin: (*REAL, np.complex128),
+    lax.sinh: REAL,
+    lax.sqrt: (*REAL, np.complex128),
+    lax.square: (*NUMBERS, np.complex128),
+    lax.tan: REAL,
+    lax.tanh: REAL,
+}
+TWO = {
+    lax.add: (*NUMBERS, np.complex128),
+    lax.atan2: REAL,
+    lax.bitwise_and: (np.bool_, np.int32),
+    lax.bitwise_or: (np.bool_, np.int32),
+    lax.bitwise_xor: (np.bool_, np.int32),
+    lax.complex: REAL,
+    lax.div: (*NUMBERS, np.complex128),
+    lax.eq: (*NUMBERS, np.bool_, np.complex128),
+    lax.ge: NUMBERS,
+    lax.gt: NUMBERS,
+    lax.le: NUMBERS,
+    lax.lt: NUMBERS,
+    lax.max: NUMBERS,
+    lax.min: NUMBERS,
+    lax.mul: (*NUMBERS, np.complex128),
+    lax.ne: (*NUMBERS, np.bool_, np.complex128),
+    lax.pow: REAL,
+    lax.rem: NUMBERS,
+    lax.sub: (*NUMBERS, np.complex128),
+}
+# Functions that both compute from polynomials of their own, to some units in the last place.
+APPROXIMATE = {lax.exp2, lax.pow, lax.sinh, lax.cosh, lax.tan, lax.tanh}
+
+
+def _pairs(table):
+    return [
+        pytest.param(function, dtype, id=f"{function.__name__}-{np.dtype(dtype).name}")
+        for function, dtypes in table.items()
+        for dtype in dtypes
+    ]
+
+
+@pytest.mark.parametrize(("function", "dtype"), _pairs(ONE))
+@given(data=st.data(), shape=st.sampled_from(SHAPES))
+@settings(max_examples=10)
+def test_a_function_of_one_number(function, dtype, data, shape):
+    check(function, filled(data, dtype, shape), rounding=40 if function in APPROXIMATE else 4)
+
+
+@pytest.mark.parametrize(("function", "dtype"), _pairs(TWO))
+@given(data=st.data(), shape=st.sampled_from(SHAPES))
+@settings(max_examples=10)
+def test_a_function_of_two_numbers(function, dtype, data, shape):
+    a, b = filled(data, dtype, shape), filled(data, dtype, shape)
+    if np.dtype(dtype).kind == "c" and function is lax.div:
+        b = b + (b == 0)
+    check(function, a, b, rounding=100 if function in APPROXIMATE else 4)
+
+
+@pytest.mark.parametrize("dtype", REAL)
+@given(data=st.data())
+@settings(max_examples=4)
+def test_a_power_of_another_type(dtype, data):
+    x, y = filled(data, dtype, (3,)), filled(data, np.int32, (3,))
+    check(lax.pow, x, y, rounding=100)
+
+
+@pytest.mark.parametrize("power", [-3, -1, 0, 1, 2, 3, 7])
+@pytest.mark.parametrize("dtype", [*REAL, np.complex128])
+@given(data=st.data())
+@settings(max_examples=4)
+def test_a_whole_power(power, dtype, data):
+    x = filled(data, dtype, (3,))
+    check(lambda x: lax.integer_pow(x, power), x if dtype in REAL else x + (x == 0), rounding=8)
+
+
+@pytest.mark.parametrize("dtype", REAL)
+@given(data=st.data(), shape=st.sampled_from(SHAPES))
+@settings(max_examples=10)
+def test_clamped_selected_and_rounded_numbers(dtype, data, shape):
+    low, x, high = (filled(data, dtype, shape) for _ in range(3))
+    check(lax.clamp, low, x, high)
+    check(lambda x: lax.round(x, lax.RoundingMethod.TO_NEAREST_EVEN), x)
+    check(lax.select, filled(data, bool, shape), x, high)
+    check(lax.select, filled(data, bool, ()), x, high)
+    check(lambda which, *of: lax.select_n(which, *of), np.full(shape, 2, np.int32), low, x, high)
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        *itertools.product((*REAL, np.int64, np.bool_), (*REAL, np.int64, np.int32, np.bool_)),
+        (np.float64, np.complex128),
+        (np.complex128, np.complex64),
+    ],
+)
+@given(data=st.data(), shape=st.sampled_from(SHAPES))
+@settings(max_examples=6)
+def test_numbers_of_another_type(old, new, data, shape):
+    check(lambda x: lax.convert_element_type(x, new), filled(data, old, shape))
+
+
+@pytest.mark.parametrize(
+    ("function", "dtypes"),
+    [
+        (jnp.sum, (*REAL, np.int32, np.complex128)),
+        (jnp.prod, (*REAL, np.int32)),
+        (jnp.max, (*REAL, np.int32)),
+        (jnp.min, (*REAL, np.int32)),
+        (jnp.any, (np.bool_,)),
+        (jnp.all, (np.bool_,)),
+        (jnp.argmax, (*REAL, np.int32)),
+        (jnp.argmin, REAL),
+        (jnp.cumsum, (*REAL, np.int32)),
+        (jnp.cumprod, REAL),
+        (lax.cummax, REAL),
+        (lax.cummin, REAL),
+        (lambda x, axis: lax.cumsum(x, axis, reverse=True), REAL),
+        (jnp.sort, (*NUMBERS, np.bool_)),
+        (jnp.argsort, NUMBERS),
+    ],
+)
+@given(data=st.data(), shape=st.sampled_from([(4,), (2, 3), (3, 1, 2)]), axis=st.integers(0, 2))
+@settings(max_examples=10)
+def test_a_function_along_an_axis(function, dtypes, data, shape, axis):
+    axis = min(axis, len(shape) - 1)
+    along = functools.partial(function, axis=axis)
+    for dtype in dtypes:
+        check(along, filled(data, dtype, shape, finite=True), rounding=8)
+    if function is not jnp.cumprod:  # of which 0 times infinity depends on the order
+        check(along, np.where(filled(data, bool, shape), np.nan, 1.0).astype(dtypes[0]))
+
+
+def test_reductions_of_nothing():
+    empty = np.zeros((2, 0))
+    for function in (jnp.sum, jnp.prod, jnp.cumsum, jnp.sort):
+        check(lambda x, of=function: of(x, axis=1), empty)
+        check(lambda x, of=function: of(x, axis=0), empty)
+    check(lambda x: lax.reduce_max_p.bind(x, axes=(1,), out_sharding=None), empty)
+    check(lambda x: lax.reduce_min_p.bind(x, axes=(1,), out_sharding=None), empty)
+
+
+def test_several_arrays_sorted_by_the_first_ones():
+    rng = np.random.default_rng(1)
+    keys = rng.integers(0, 3, (2, 20)), rng.integers(0, 3, (2, 20)), rng.normal(size=(2, 20))
+    for count in (1, 2, 3):
+        check(lambda *of, n=count: lax.sort(of, dimension=1, num_keys=n), *keys)
+        check(lambda *of, n=count: lax.sort(of, dimension=0, num_keys=n), *keys)
+
+
+X = np.random.default_rng(0).normal(size=(3, 4, 5))
+SHAPED = {
+    "broadcast": lambda x: jnp.broadcast_to(x[:, None, :, :1], (3, 2, 4, 5)) + 1.0,
+    "broadcast scalar": lambda x: jnp.full((2, 3), x[0, 0, 0]).reshape(3, 2).T @ jnp.ones((3, 4)),
+    "concatenate": lambda x: jnp.concatenate([x, x[:, :0], x[:, :1]], axis=1),
+    "expand and squeeze": lambda x: jnp.expand_dims(x, (0, 3)).squeeze(0),
+    "flip": lambda x: jnp.flip(x, (0, 2)),
+    "iota": lambda x: lax.broadcasted_iota(jnp.float64, (3, 4, 5), 1) * x,
+    "pad": lambda x: lax.pad(x, 1.5, ((1, 2, 0), (0, 0, 2), (3, 0, 1))),
+    "pad with less": lambda x: lax.pad(x, 1.5, ((-1, 0, 0), (-2, -3, 2), (2, -4, 1))),
+    "reshape": lambda x: x.reshape(2, 30).reshape(5, 12),
+    "slice": lambda x: x[1:, ::2, 1:4],
+    "split": lambda x: jnp.split(x, [1, 3], axis=1),
+    "stack": lambda x: jnp.stack([x, -x], axis=2),
+    "tile": lambda x: jnp.tile(x, (2, 1, 3)),
+    "transpose": lambda x: x.transpose(2, 0, 1),
+    "unstack": lambda x: list(x),
+    "dynamic slice": lambda x: lax.dynamic_slice(x, (jnp.argmax(x[:, 0, 0]), 3, 9), (2, 2, 2)),
+    "dynamic index": lambda x: x[jnp.argmax(x[:, 0, 0])],
+    "dynamic update": lambda x: lax.dynamic_update_slice(x, x[:2, :2, :2], (2, 1, -1)),
+    "window sum": lambda x: lax.reduce_window(x, 0.0, lax.add, (1, 3, 2), (1, 2, 1), "SAME"),
+}
+
+
+@pytest.mark.parametrize("name", SHAPED)
+def test_an_array_of_another_shape(name):
+    check(SHAPED[name], X)
+    check(SHAPED[name], np.where(X > 1, np.nan, X))
+
+
+AT = np.array([[0, 2], [5, -1], [1, -7]])
+LOOKED_UP = {
+    "rows": lambda x, at: x[at],
+    "elements": lambda x, at: x[at[:, 0], at[:, 1]],
+    "elements, clipped": lambda x, at: x.at[at[:, 0], :, at[:, 1]].get(mode="clip"),
+    "elements, filled": lambda x, at: x.at[at[:, 0], :, at[:, 1]].get(mode="fill"),
+    "whole numbers, filled": lambda x, at: jnp.round(x).astype(int).at[at].get(mode="fill"),
+    "elements, 7 elsewhere": lambda x, at: x.at[at].get(mode="fill", fill_value=7.0),
+    "along an axis": lambda x, at: jnp.take_along_axis(x, at[:, :, None] % 4, axis=1),
+    "windows": lambda x, at: jax.vmap(lambda i: lax.dynamic_slice(x, (i, 1, i), (2, 2, 3)))(
+        at[:, 0]
+    ),
+    "each its own": lambda x, at: jax.vmap(lambda x, i: x[i])(x, at[:, 1]),
+    "each its own window": lambda x, at: jax.vmap(
+        lambda x, i: lax.dynamic_slice(x, (i, 0), (2, 3))
+    )(x, at[:, 1]),
+    "a diagonal": lambda x, at: jnp.diagonal(x, axis1=0, axis2=2),
+    "set": lambda x, at: x.at[at[:, 0], :, at[:, 1]].set(0.5),
+    "added": lambda x, at: x.at[at].add(x[:1] * 2),
+    "multiplied": lambda x, at: x.at[at % 2].multiply(3.0),
+    "set, clipped": lambda x, at: x.at[at[:1, 1]].set(-1.0, mode="clip"),
+    "set in windows": lambda x, at: x.at[:, 1:3, 2].set(jnp.arange(2.0)),
+    "each set": lambda x, at: jax.vmap(lambda x, i: x.at[i].set(0.0))(x, at[:, 1]),
+}
+
+
+@pytest.mark.parametrize("name", LOOKED_UP)
+def test_elements_are_looked_up(name):
+    check(LOOKED_UP[name], X, AT)
+    check(lambda x: LOOKED_UP[name](x, AT), X)  # at places that are known
+    check(lambda at: LOOKED_UP[name](jnp.asarray(X), at), AT)
+
+
+def test_nothing_is_looked_up():
+    check(lambda x, at: x[at], X, AT[:0])
+    check(lambda x, at: x.at[at].set(1.0), X, AT[:0])
+
+
+EINSUMS = (
+    "i,i->",
+    "ij,j->i",
+    "ji,kj->ik",
+    "ij,kl->ijkl",
+    "bij,bjk->bik",
+    "ijb,kbj->bk",
+    "bi,bi->b",
+)
+
+
+@pytest.mark.parametrize("dtype", [*REAL, np.complex128])
+@pytest.mark.parametrize("text", EINSUMS)
+def test_a_product(text, dtype):
+    rng = np.random.default_rng(3)
+    for sizes in ({}, {"j": 0}, {"i": 1}):
+        a, b = (
+            (rng.normal(size=shape) + (1j if dtype is np.complex128 else 0)).astype(dtype)
+            for shape in (
+                [sizes.get(axis, 2 + "ijklb".index(axis)) for axis in part]
+                for part in text.partition("->")[0].split(",")
+            )
+        )
+        check(lambda a, b: jnp.einsum(text, a, b), a, b, rounding=40)
+
+
+# Condition numbers stay below 100, and each of some ten operations rounds.
+ALGEBRA = {
+    "cholesky": jnp.linalg.cholesky,
+    "lu": lambda a: lax.linalg.lu(a),
+    "solve": lambda a: jnp.linalg.solve(a, a[..., :1]),
+    "inverse": jnp.linalg.inv,
+    "eigenvalues": lambda a: jnp.linalg.eigh(a)[0],
+    "projections": lambda a: jnp.linalg.eigh(a)[1] ** 2,
+    "roots": lambda a: jnp.sort(jnp.linalg.eigvals(a).real),
+    "qr": lambda a: abs(jnp.linalg.qr(a)[1]),
+    "singular values": lambda a: jnp.linalg.svd(a, compute_uv=False),
+    "singular vectors": lambda a: [abs(of) for of in jnp.linalg.svd(a[..., :3])],
+    "pseudo-inverse": jnp.linalg.pinv,
+    "lower": lambda a: lax.linalg.triangular_solve(a, a, left_side=True, lower=True),
+    "right": lambda a: lax.linalg.triangular_solve(a, a, lower=False),
+    "transposed": lambda a: lax.linalg.triangular_solve(
+        a, a, left_side=True, lower=True, transpose_a=True
+    ),
+    "unit": lambda a: lax.linalg.triangular_solve(
+        a, a, left_side=True, lower=True, unit_diagonal=True
+    ),
+}
+
+
+@pytest.mark.parametrize("batch", [(), (2,), (2, 3)])
+@pytest.mark.parametrize("name", ALGEBRA)
+def test_linear_algebra(name, batch):
+    root = np.random.default_rng(4).normal(size=(*batch, 4, 4))
+    check(ALGEBRA[name], root @ root.swapaxes(-1, -2) + 2 * np.eye(4), rounding=1e4)
+
+
+@pytest.mark.parametrize(
+    "name", ["cholesky", "inverse", "lower", "eigenvalues", "roots", "singular values"]
+)
+def test_matrices_without_a_result(name):
+    """They give the NaN and the infinities of XLA, never a number and never an error."""
+    for matrix in (np.zeros((3, 3)), np.full((3, 3), np.nan), np.diag([1.0, 0.0, 2.0])):
+        check(ALGEBRA[name], matrix)
+    check(ALGEBRA["cholesky"], np.diag([1.0, -1.0, 2.0]))
+
+
+@pytest.mark.parametrize("name", ALGEBRA)
+def test_a_matrix_without_a_result_leaves_the_others_alone(name):
+    good = np.diag([1.0, 2.0, 3.0, 4.0]) + 0.1
+    both = np.stack([np.full((4, 4), np.nan), good])
+    program = translated(jax.make_jaxpr(ALGEBRA[name])(both))
+    alone = translated(jax.make_jaxpr(ALGEBRA[name])(good[None]))
+    for one, other in zip(program([both]), alone([good[None]]), strict=True):
+        np.testing.assert_array_equal(one[1], other[0])
+
+
+def test_algebra_of_nothing():
+    check(jnp.linalg.cholesky, np.zeros((0, 0)))
+    check(ALGEBRA["lower"], np.zeros((0, 0)))
+
+
+@pytest.mark.parametrize("size", [8, 9, 5])
+def test_a_fourier_transform(size):
+    for function in (jnp.fft.rfft, jnp.fft.fft, jnp.fft.ifft):
+        check(lambda x, of=function: of(x, n=size), X, rounding=20)
+    check(lambda x: jnp.fft.irfft(x, n=size), X + 1j * X[::-1], rounding=20)
+    check(lambda x: jnp.fft.rfft2(x, s=(size, 4)), X, rounding=20)
+
+
+# --- Programs -------------------------------------------------------------------------------------
+
+
+def root(x):
+    """Square roots by Newton's method, with a loop of unknown length."""
+
+    def wrong(state):
+        return (state[1] > 1e-12) & (state[2] < 30)
+
+    def step(state):
+        y, _, count = state
+        new = 0.5 * (y + x / y)
+        return new, jnp.abs(new - y).max(), count + 1
+
+    return lax.while_loop(wrong, step, (x, jnp.inf, 0))
+
+
+def recursion(x):
+    def step(carry, row):
+        scale = jnp.exp(-x[0, 0])  # does not change in the loop
+        carry = jnp.where(row > 0, carry * scale + row, carry)
+        return carry, (carry.sum(), row * scale)
+
+    return lax.scan(step, jnp.zeros(x.shape[1:]), x)
+
+
+def backwards(x):
+    return lax.scan(
+        lambda total, row: (total + row, total), jnp.zeros(x.shape[1:]), x, reverse=True
+    )
+
+
+def either(x):
+    return lax.cond(x[0, 0] > 0, lambda x: (jnp.sin(x), x), lambda x: (x, x * 2), x)
+
+
+def nested(x):
+    def step(i, y):
+        return lax.cond(i % 2 == 0, lambda y: y + recursion(x)[0], lambda y: y * 0.5, y)
+
+    return lax.fori_loop(0, 5, step, x[0])
+
+
+PROGRAMS = {
+    "while": lambda x: root(jnp.abs(x) + 0.1),
+    "no step": lambda x: lax.while_loop(lambda y: y[0, 0] > 1e9, lambda y: y * 0, x),
+    "scan": recursion,
+    "one step": lambda x: recursion(x[:1])[1],
+    "backwards": backwards,
+    "cond": either,
+    "nested": nested,
+    "lanes": jax.vmap(lambda x: root(jnp.abs(x) + 0.1)),
+    "lanes of scalars": jax.vmap(jax.vmap(lambda x: root(jnp.abs(x) + 0.1)[2])),
+    "gradient": jax.grad(lambda x: recursion(x)[0].sum()),
+    "jacobian": jax.jacfwd(lambda x: jnp.linalg.solve(jnp.eye(3) + x @ x.T, x)[0]),
+    "map": lambda x: lax.map(lambda row: jnp.sort(row) - row.mean(), x),
+    "cases": lambda x: lax.switch(jnp.argmax(x[0]), [jnp.sin, jnp.cos, jnp.tan], x),
+    "switch": lambda x: lax.switch(1, [jnp.sin, jnp.cos, jnp.tan], x),
+    "own derivative": lambda x: jax.nn.relu(x) + jax.nn.softplus(x),
+    "complex": lambda x: jnp.exp(lax.complex(x, -x)).real * jnp.conj(lax.complex(x, x)).imag,
+    "constants": lambda x: jnp.arange(12.0).reshape(3, 4) * 2 + jnp.ones((3, 4)),
+    "placed": lambda x: jax.device_put(2 * x) + jax.device_put(np.float64(1.0)),
+    "nothing but its operand": lambda x: (x, x),
+}
+
+
+@pytest.mark.parametrize("name", PROGRAMS)
+@pytest.mark.parametrize("seed", [1, 2])
+def test_a_program(name, seed):
+    check(PROGRAMS[name], np.random.default_rng(seed).normal(size=(3, 4)), rounding=400)
+
+
+def test_nan_and_infinities_go_the_same_way():
+    x = np.array([[np.nan, 1.0], [np.inf, -np.inf]])
+    for name in ("while", "scan", "cond", "own derivative", "map"):
+        check(PROGRAMS[name], x, rounding=40)
+
+
+def test_a_loop_without_steps_leaves_what_it_began_with():
+    check(lambda x: backwards(x[:0]), X)
+    check(lambda x: lax.fori_loop(3, 3, lambda i, y: y + i, x), X)
+
+
+def test_what_does_not_change_is_computed_before_the_loop():
+    text, _ = written(jax.make_jaxpr(recursion)(X[0]))
+    inside = [line for line in text.splitlines() if line.startswith("  ")]  # of the step
+    assert "=exp" in text
+    assert inside
+    assert not any("=exp" in line for line in inside)
+
+
+@pytest.mark.parametrize(
+    "function",
+    [
+        lambda x: jax.pure_callback(np.sin, jax.ShapeDtypeStruct(x.shape, x.dtype), x),
+        lambda x: jax.random.normal(jax.random.key(0), x.shape),
+        lambda x: lax.conv(x, x[:, :, :1], (1,), "SAME"),
+        lambda x: lax.reduce_window(
+            x, 0.0, lax.add, (1, 2, 1), (1, 1, 1), "VALID", window_dilation=(1, 2, 1)
+        ),
+        lambda x: jnp.linalg.eig(x[:, :3, :3]),
+        lambda x: jnp.linalg.svd(x[:, :0]),
+    ],
+)
+def test_what_has_no_rule_is_refused(function):
+    with pytest.raises(UntranslatableError):
+        translated(jax.make_jaxpr(function)(X))
+
+
+def test_a_parameter_that_nobody_here_knows_is_refused():
+    assert callable(RULES["rev"]({"dimensions": (0,)}, [], []))
+    with pytest.raises(UntranslatableError):
+        RULES["rev"]({"dimensions": (0,), "of_a_later_version": 1}, [], [])
+
+
+def test_memory_does_not_grow_with_the_length_of_a_program():
+    def chain(x):
+        for _ in range(30):
+            x = jnp.sin(x)
+        return x
+
+    x = np.ones(100_000)
+    run = translated(jax.make_jaxpr(chain)(x))
+    tracemalloc.start()
+    run([x])
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert peak < 4 * x.nbytes
+
+
+def test_a_program_does_not_change_its_operands():
+    x = X.copy()
+    translated(jax.make_jaxpr(lambda x: x.at[0].set(0.0).at[:, 1].add(1.0))(x))([x])
+    np.testing.assert_array_equal(x, X)
