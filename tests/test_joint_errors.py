@@ -4,8 +4,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from etid.estimators.joint import errors, seen
+from etid.estimators.joint import errors
 from etid.estimators.joint.terms import Loads
+from etid.estimators.maximum_likelihood.profile import Profile, Records
 from etid.estimators.unknowns import LoadUnknowns
 from etid.signals.harmonics import Spectrum
 from etid.signals.knots import knots
@@ -39,12 +40,12 @@ def test_the_sum_over_a_shared_record_adds_what_its_loads_have_in_common():
     np.testing.assert_array_equal(none, np.zeros((COMMON, COMMON)))
 
 
-def test_the_misfit_of_a_load_knows_its_own_unknowns():
-    """χ² is Σ r² over two numbers for each harmonic that is used, less the unknowns."""
-    part = jnp.array([3.0, 1.0, 0.0, 2.0, 0.0, 1.0])
+def test_the_misfit_of_a_load_is_that_of_the_harmonics_that_are_used():
+    """e = Y − G x has the variance 1 + 1.5², and counts twice: real and imaginary part."""
     line, wave = jnp.ones(3), jnp.ones(3, complex)
     used = jnp.array([True, True, False])
     spectrum = Spectrum(line, wave, 2.0 * wave, line, line, used)
-    chi2, rrse = seen._misfit(spectrum, 1.5 * wave, part, 3)
-    assert float(chi2) == 15.0 / (2 * 2 - 3)
-    np.testing.assert_allclose(rrse, 0.5 / 2.0)
+    records = Records.of(spectrum)
+    profile = Profile.of(records, 1.5 * wave[None, :])
+    np.testing.assert_allclose(2 * profile.objective, 2 * 2 * 0.5**2 / (1 + 1.5**2))
+    np.testing.assert_allclose(profile.rrse(records, wave), 0.5 / 2.0)
