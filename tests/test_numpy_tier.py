@@ -322,8 +322,8 @@ def test_a_product(text, dtype):
 )
 def test_a_product_of_large_matrices_is_made_of_parts(shapes):
     rng = np.random.default_rng(3)
-    a, b = map(rng.normal, (0.0, 0.0), (1.0, 1.0), shapes)
-    size = np.linalg.norm(a) * np.linalg.norm(b)
+    a, b = (rng.normal(size=shape) for shape in shapes)
+    size = float(np.linalg.norm(a) * np.linalg.norm(b))
     (found,) = translated(jax.make_jaxpr(jnp.matmul)(a, b))([a, b])
     np.testing.assert_allclose(found, a @ b, atol=1e-15 * size)
 
@@ -331,7 +331,7 @@ def test_a_product_of_large_matrices_is_made_of_parts(shapes):
 def test_factors_of_a_long_matrix_are_made_of_those_of_its_parts():
     a = np.random.default_rng(3).normal(size=(3456, 11))
     q, r = translated(jax.make_jaxpr(jnp.linalg.qr)(a))([a])
-    size = np.linalg.norm(a)
+    size = float(np.linalg.norm(a))
     np.testing.assert_allclose(q @ r, a, atol=1e-15 * size)
     np.testing.assert_allclose(q.T @ q, np.eye(11), atol=1e-14)
     np.testing.assert_allclose(abs(r), abs(np.linalg.qr(a)[1]), atol=1e-15 * size)

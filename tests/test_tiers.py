@@ -53,8 +53,9 @@ def same_fit(one, other):
     if one.verdict == "successful":  # else an element may be 1e-290: nothing but rounding
         np.testing.assert_allclose(values[0][~known], values[1][~known], rtol=1e-6)
     known &= stderr < abs(values[1])  # of the others, even the size of the error is by chance
-    size = np.outer(stderr, stderr)[np.ix_(known, known)]
-    change = (np.asarray(one.cov) - np.asarray(other.cov))[np.ix_(known, known)]
+    of = np.ix_(known, known)
+    size = np.outer(stderr[known], stderr[known])
+    change = np.asarray(one.cov)[of] - np.asarray(other.cov)[of]
     assert (abs(change) <= 1e-5 * size).all()
     np.testing.assert_allclose(one.chi2, other.chi2, rtol=1e-7)
 
