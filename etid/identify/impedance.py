@@ -242,8 +242,8 @@ def identify_impedance(
     noise = (
         _passive_fit(f[rising], z[rising], len(circuit.names())) if sigma is None else sigma[rising]
     )
-    noise = jax.device_put(noise)
-    fit = _fit(*jax.device_put((f[rising], z[rising])), noise, circuit)
+    of = jax.device_put((f[rising], z[rising], noise))
+    fit = _fit(of[0], of[1], of[2], circuit)
     if fit.verdict != "successful":
         fit = eqx.tree_at(lambda one: one.remarks, fit, fit.remarks | int(_remarks(z)))
     fit = with_data(fit, MeasuredImpedance(f, z, sigma))
