@@ -14,8 +14,8 @@ from functools import partial
 from typing import Any
 
 import numpy as np
+import scipy
 from jax.lax import GatherScatterMode, RoundingMethod
-from scipy import special
 
 from etid.numpy_tier import algebra
 from etid.numpy_tier.source import UntranslatableError, Value
@@ -133,11 +133,12 @@ FUNCTIONS: dict[str, Callable[..., Any]] = {
     "add_any": operator.add,
     "and": operator.and_,
     "clamp": lambda low, of, high: np.minimum(np.maximum(of, low), high),
-    "erf": special.erf,
-    "erfc": special.erfc,
+    # `scipy.special` is loaded when one of them is used.
+    "erf": lambda of: scipy.special.erf(of),
+    "erfc": lambda of: scipy.special.erfc(of),
     "imag": operator.attrgetter("imag"),
     "is_finite": np.isfinite,
-    "logistic": special.expit,
+    "logistic": lambda of: scipy.special.expit(of),
     "max": np.maximum,
     "min": np.minimum,
     "not": operator.invert,
