@@ -64,13 +64,19 @@ def pytest_xdist_auto_num_workers():
 
 
 @pytest.fixture(autouse=True, scope="session")
-def _programs_at_once(request):
-    """Compile etid's programs without passes of LLVM: half the time, and most run once or twice."""
+def _who_runs_programs(request):
+    """Ordinary tests run a program once or twice, slow ones hundreds of times.
+
+    So the ordinary ones have small programs run by NumPy, and batches compiled without passes of
+    LLVM, in half the time. Slow tests have everything compiled.
+    """
+    from etid.numpy_tier import tiers  # here, for the type checker wraps what it imports
+
     with pytest.MonkeyPatch.context() as patch:
         if _is_ordinary(request.config):
-            from etid.numpy_tier import tiers  # here, for the type checker wraps what it imports
-
             patch.setattr(tiers, "QUICKLY", tiers.AT_ONCE)
+        else:
+            patch.setattr(tiers, "_by_numpy", lambda: False)
         yield
 
 
