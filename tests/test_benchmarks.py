@@ -119,7 +119,7 @@ def test_scipy_and_we_do_the_same_before_the_fit(short_problem):
 def test_numpy_writes_the_same_terms(short_problem):
     load = short_problem.load(jax.tree.map(lambda leaf: leaf[0], short_problem.lanes))
     by, q = ByNumPy(load), START + 0.01
-    used = np.concatenate([np.tile(np.asarray(load.spectrum.selected), 2), [False] * 3, [True]])
+    used = np.concatenate([np.tile(np.asarray(load.records.selected), 2), [False] * 3, [True]])
     np.testing.assert_allclose(
         by.terms(q), np.asarray(load(jax.numpy.asarray(q)))[used], rtol=1e-6, atol=1e-9
     )
