@@ -28,7 +28,7 @@ from etid.signals.transfer import as_complex, power
 
 
 class Records(eqx.Module):
-    """An input and its outputs at the harmonics.
+    """An input and its outputs at the harmonics; several can be stacked.
 
     Attributes:
         frequency: The harmonics [Hz].
@@ -36,15 +36,15 @@ class Records(eqx.Module):
         variance_x: E|noise|² of each of them.
         y: Coefficients of the outputs.
         variance_y: E|noise|² of each of them.
-        selected: Harmonics that are used.
+        selected: Harmonics of each output that are used.
     """
 
-    frequency: Float[Array, " harmonic"]
-    x: Complex[Array, " harmonic"]
-    variance_x: Float[Array, " harmonic"]
-    y: Complex[Array, "output harmonic"]
-    variance_y: Float[Array, "output harmonic"]
-    selected: Bool[Array, " harmonic"]
+    frequency: Float[Array, "*input harmonic"]
+    x: Complex[Array, "*input harmonic"]
+    variance_x: Float[Array, "*input harmonic"]
+    y: Complex[Array, "*input output harmonic"]
+    variance_y: Float[Array, "*input output harmonic"]
+    selected: Bool[Array, "*input output harmonic"]
 
     @classmethod
     def of(cls, spectrum: Spectrum, current: tuple[Array, ...] | None = None) -> "Records":
@@ -56,8 +56,9 @@ class Records(eqx.Module):
         """
         each = [(spectrum.y, spectrum.variance_y), *([] if current is None else [current])]
         y, variance_y = (jnp.stack(of) for of in zip(*each, strict=True))
-        s = spectrum
-        return cls(s.frequency, s.x, s.variance_x, y, variance_y, s.selected)
+        s, outputs = spectrum, len(each)
+        selected = jnp.tile(s.selected, (outputs, 1))
+        return cls(s.frequency, s.x, s.variance_x, y, variance_y, selected)
 
 
 class Profile(eqx.Module):
@@ -70,6 +71,7 @@ class Profile(eqx.Module):
         weight: 1/σ² of both parts of each innovation; 0 where a harmonic is not used.
         innovations: The innovations of Y − G x.
         x: X̂.
+        variance_x: Variance of X̂.
     """
 
     gains: Complex[Array, "output harmonic"]
@@ -78,13 +80,15 @@ class Profile(eqx.Module):
     weight: Float[Array, "output harmonic"]
     innovations: Complex[Array, "output harmonic"]
     x: Complex[Array, " harmonic"]
+    variance_x: Float[Array, " harmonic"]
 
     @classmethod
     def of(cls, records: Records, gains: Complex[Array, "output harmonic"]) -> "Profile":
         """The records at these gains."""
-        left, x, selected = records.variance_x, records.x, records.selected
+        left, x = records.variance_x, records.x
         towards, expected, innovations = [], [], []
-        for g, y, of_y in zip(gains, records.y, records.variance_y, strict=True):
+        each = gains, records.y, records.variance_y, records.selected
+        for g, y, of_y, selected in zip(*each, strict=True):
             total = of_y + power(g) * left
             share = jnp.where(selected, left / total, 0.0)
             expected.append(total)
@@ -92,9 +96,9 @@ class Profile(eqx.Module):
             innovations.append(y - g * x)
             x = x + towards[-1] * innovations[-1]
             left = jnp.where(selected, share * of_y, left)
-        weight = jnp.where(selected[None, :], 2 / jnp.stack(expected), 0.0)
-        parts = map(jnp.stack, (towards, expected))
-        return cls(gains, *parts, weight, jnp.stack(innovations), x)
+        weight = jnp.where(records.selected, 2 / jnp.stack(expected), 0.0)
+        towards, innovations = jnp.stack(towards), jnp.stack(innovations)
+        return cls(gains, towards, jnp.stack(expected), weight, innovations, x, left)
 
     def whitened(
         self, change: Complex[Array, "output harmonic"]
@@ -166,7 +170,7 @@ class Profile(eqx.Module):
 
     def excess(self, records: Records) -> Float[Array, "output harmonic"]:
         """`excess` of the innovations of each output."""
-        each = jax.vmap(excess, (0, None))(self.terms, records.selected)
+        each = jax.vmap(excess)(self.terms, records.selected)
         return each[:, : self.x.size]
 
     def shows_hum(
@@ -180,11 +184,10 @@ class Profile(eqx.Module):
         """
         left = self.innovations if without is None else self.innovations - without
         squares = power(left) / self.expected
-        return jnp.stack(
-            [stands_out(of, records.frequency, records.selected) for of in squares]
-        ).any()
+        each = zip(squares, records.selected, strict=True)
+        return jnp.stack([stands_out(of, records.frequency, used) for of, used in each]).any()
 
     def rrse(self, records: Records, x: Complex[Array, " harmonic"]) -> Float[Array, ""]:
         """RRSE of the output that is predicted worst from this input."""
-        each = zip(self.gains, records.y, strict=True)
-        return jnp.stack([complex_rrse(g * x, y, records.selected) for g, y in each]).max()
+        each = zip(self.gains, records.y, records.selected, strict=True)
+        return jnp.stack([complex_rrse(g * x, y, used) for g, y, used in each]).max()

@@ -7,24 +7,19 @@ maximum-likelihood cost is (Pintelon and Schoukens, System Identification, 2012,
     Σ_k |Y_k − G_k e^(−jω_k τ) X_k|² / (σ_y² + |G_k|² σ_x²),      G = Z_L / (Z_L + Z_th),
 
 The unknown true X is eliminated. σ² are the variances of one coefficient.
-
-**One unloaded record for several loaded records** has the same noise in all of them, and all give
-information about the same X. For each record, X and σ_x² are then replaced by their estimates from
-the earlier records with the same X (`_learn`, one step of a Kalman filter). The result is the
-likelihood of all records, in independent terms.
+`etid.estimators.maximum_likelihood.profile` has the likelihood of several records of one X.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Complex, Float
 
 from etid.circuits.impedance import AbstractImpedance
 from etid.results.driver import SourceImpedance
-from etid.signals.harmonics import Spectrum, local_sum, signal_share
+from etid.signals.harmonics import Spectrum, local_sum
 from etid.signals.mains import lines
 from etid.signals.transfer import as_complex, delayed, frequency_variable, power, reciprocal
 
@@ -88,21 +83,6 @@ def stands_out(
     return jnp.max(jnp.where(suspect, squares, 0.0)) > HUM * jnp.maximum(around, 1.0)
 
 
-def _learn(
-    spectrum: Spectrum,
-    other: Spectrum,
-    g: Complex[Array, " harmonic"],
-    same: Bool[Array, ""] | bool,
-) -> Spectrum:
-    """`spectrum` with X updated by Y = `g` X of another record, if both have the same X."""
-    total = other.variance_y + power(g) * spectrum.variance_x
-    used = other.selected & same
-    share = jnp.where(used, spectrum.variance_x / total, 0.0)
-    x = spectrum.x + jnp.conj(g) * as_complex(share) * (other.y - g * spectrum.x)
-    variance = jnp.where(used, share * other.variance_y, spectrum.variance_x)
-    return eqx.tree_at(lambda s: (s.x, s.variance_x), spectrum, (x, variance))
-
-
 def same_unloaded(one: Spectrum, other: Spectrum) -> Bool[Array, ""] | bool:
     """Whether two recordings have the same unloaded record."""
     if one is other:
@@ -115,47 +95,6 @@ def same_unloaded(one: Spectrum, other: Spectrum) -> Bool[Array, ""] | bool:
 def as_list(spectra: Spectrum) -> list[Spectrum]:
     """A list of recordings, from recordings stacked along a leading axis."""
     return [jax.tree.map(lambda leaf, i=i: leaf[i], spectra) for i in range(spectra.x.shape[0])]
-
-
-def informed(
-    spectrum: Spectrum,
-    others: Sequence[Spectrum],
-    gains: Sequence[Complex[Array, " harmonic"]],
-) -> Spectrum:
-    """A recording with X updated by other recordings with the same unloaded record."""
-    known = spectrum
-    for other, g in zip(others, gains, strict=True):
-        same = same_unloaded(spectrum, other)
-        if same is not False:
-            known = _learn(known, other, g, same)
-    return known
-
-
-def denoised(
-    spectra: Sequence[Spectrum], gains: Sequence[Complex[Array, " harmonic"]]
-) -> tuple[list[Spectrum], list[Float[Array, " part"]]]:
-    """Recordings with the maximum-likelihood estimate of X from all of them, and Y = G X.
-
-    The Jacobian J of these recordings does not contain the noise of the residual, which would count
-    as information. The remaining noise of X makes the score noisier. It is no information either,
-    so
-
-        cov = H⁻¹ (Jᵀ J) H⁻¹,      H = Jᵀ W J.
-
-    W is the share of signal in the power of X; it is returned for each residual.
-    """
-    found, shares = [], []
-    for one, g in zip(spectra, gains, strict=True):
-        known = informed(one, spectra, gains)
-        found.append(eqx.tree_at(lambda s: (s.x, s.y), one, (known.x, g * known.x)))
-        shares.append(jnp.tile(signal_share(known.x, known.variance_x), 2))
-    return found, shares
-
-
-def weights(shares: Sequence[Float[Array, "_"]], terms: int) -> Float[Array, " term"]:
-    """W of `denoised` for all terms: `shares` for the first terms, 1 for the priors after them."""
-    weight = jnp.concatenate(list(shares))
-    return jnp.pad(weight, (0, terms - weight.size), constant_values=1.0)
 
 
 def excess(
@@ -176,47 +115,6 @@ def excess(
     local = local_sum(power) / freedom
     sure = local > overall * (1 + SURE * jnp.sqrt(2 / freedom))
     return jnp.tile(jnp.where(sure, local, overall), 2)
-
-
-def residuals(
-    spectra: Sequence[Spectrum], gains: Sequence[Complex[Array, " harmonic"]]
-) -> list[Float[Array, " part"]]:
-    """`residual` of each recording, given the recordings before it; all are independent."""
-    return [
-        residual(informed(one, spectra[:i], gains[:i]), g)
-        for i, (one, g) in enumerate(zip(spectra, gains, strict=True))
-    ]
-
-
-def by_gains(
-    spectra: Sequence[Spectrum], gains: Sequence[Complex[Array, " harmonic"]]
-) -> Float[Array, "record 2 term"]:
-    """Derivatives of `residuals` with respect to both parts of the gain of each record.
-
-    A residual depends on the gains at its own harmonic only.
-    """
-    stacked = jnp.stack(gains)
-    real = jnp.eye(len(gains), dtype=stacked.real.dtype)
-    directions = jnp.stack([as_complex(real), jax.lax.complex(jnp.zeros_like(real), real)], axis=1)
-
-    def along(direction: Complex[Array, " record"]) -> Float[Array, " term"]:
-        towards = jnp.broadcast_to(direction[:, None], stacked.shape)
-        return jax.jvp(
-            lambda g: jnp.concatenate(residuals(spectra, list(g))), (stacked,), (towards,)
-        )[1]
-
-    return jax.vmap(jax.vmap(along))(directions)
-
-
-def chained(
-    slopes: Sequence[Complex[Array, "row harmonic"]], by_gain: Float[Array, "record 2 term"]
-) -> Float[Array, "row term"]:
-    """Derivatives of residuals: `slopes` are those of each gain, `by_gain` is from `by_gains`."""
-    each = by_gain.reshape(*by_gain.shape[:2], -1, slopes[0].shape[-1])
-    rows = jnp.zeros((slopes[0].shape[0], *each.shape[2:]), by_gain.dtype)
-    for slope, (real, imaginary) in zip(slopes, each, strict=True):
-        rows = rows + slope.real[:, None] * real[None] + slope.imag[:, None] * imaginary[None]
-    return rows.reshape(rows.shape[0], -1)
 
 
 def apart(evaluate: Callable[[Array], Any], q: Float[Array, " q"]) -> Any:
