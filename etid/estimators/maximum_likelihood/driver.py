@@ -282,7 +282,8 @@ class Calibrations(eqx.Module):
 
     def at_knots(self) -> "Calibrations":
         """The same with the harmonics at the knots alone, for gains and their derivatives."""
-        return dataclasses.replace(self, spectra=jax.tree.map(self.knots.at, self.spectra))
+        spectra = jax.tree.map(lambda leaf: leaf[..., self.knots.index], self.spectra)
+        return dataclasses.replace(self, spectra=spectra)
 
     @property
     def records(self) -> Records:
