@@ -26,12 +26,7 @@ from etid.estimators.judgement import (
 )
 from etid.estimators.lanes import Harmonics
 from etid.estimators.maximum_likelihood.estimator import AbstractByMaximumLikelihood
-from etid.estimators.maximum_likelihood.terms import (
-    delayed_gain,
-    excess,
-    residual,
-    stands_out,
-)
+from etid.estimators.maximum_likelihood.profile import Profile, excess, stands_out
 from etid.estimators.score_tests import other_circuit, other_on_harmonics
 from etid.estimators.score_tests.unloaded import UnloadedShape
 from etid.estimators.steiglitz_mcbride.iteration import check_iterations
@@ -40,6 +35,7 @@ from etid.results.driver import ContinuousDriver
 from etid.results.fit import Fit
 from etid.results.verdicts import RESULTS, first_verdict
 from etid.signals.harmonics import Spectrum
+from etid.signals.transfer import delayed
 from etid.solvers.levenberg_marquardt import normal_equations
 
 
@@ -82,7 +78,8 @@ class HarmonicSteiglitzMcBride(AbstractByMaximumLikelihood):
         def terms(q: Float[Array, " q"], spectrum: Spectrum) -> Float[Array, " part"]:
             of, f = LoadUnknowns.of(q), spectrum.frequency
             load = best.circuit.with_log_values(of.log_elements).impedance()
-            return residual(spectrum, delayed_gain(source, load, f, of.delay_samples, sample_rate))
+            gain = delayed(source.voltage_ratio(load, f), f, of.delay_samples, sample_rate)
+            return Profile.of_output(spectrum, gain).terms[0]
 
         own = LoadUnknowns(jnp.log(elements), late)
         at = own.vector()

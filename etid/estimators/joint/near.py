@@ -26,9 +26,9 @@ from jaxtyping import Array, Bool, Complex, Float, Int
 
 from etid.estimators.estimate import MAX_STEPS
 from etid.estimators.joint.terms import DriverStudy, Loads, Own, in_turn
+from etid.estimators.maximum_likelihood.condensed import apart
 from etid.estimators.maximum_likelihood.driver import DENSE, Calibrations
 from etid.estimators.maximum_likelihood.given_driver import GivenDriver
-from etid.estimators.maximum_likelihood.terms import apart
 from etid.signals.knots import knots
 from etid.signals.transfer import as_complex, reciprocal
 from etid.solvers.arrowhead import join

@@ -13,6 +13,9 @@ before it, like its innovation. The terms are a residual for any solver, at a fe
 cost of all harmonics.
 """
 
+from collections.abc import Callable
+from typing import Any
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -93,3 +96,19 @@ def means(
     total, sums = jnp.split(every.summed(jnp.concatenate([size[None], values * size[None]])), (1,))
     found = sums / jnp.where(total > 0, total, 1.0)
     return jnp.tile(found.reshape(values.shape[0], -1), (1, 2))
+
+
+def apart(evaluate: Callable[[Array], Any], q: Float[Array, " q"]) -> Any:
+    """`evaluate(q)`, computed once; NaN if `q` is not finite.
+
+    XLA repeats a computation in every loop that reads its result, here a dozen times. It computes
+    the result of a branch only once.
+    """
+    # JAX remembers the trace of this function, so that branches within branches are traced once.
+    once = jax.jit(lambda q: evaluate(q))
+    shapes = jax.eval_shape(once, q)
+
+    def nothing(_) -> Any:
+        return jax.tree.map(lambda of: jnp.full(of.shape, jnp.nan, of.dtype), shapes)
+
+    return jax.lax.cond(jnp.isfinite(q).all(), once, nothing, q)

@@ -26,24 +26,14 @@ from etid.estimators.estimate import (
     delay_std,
     prior,
 )
-from etid.estimators.maximum_likelihood.condensed import Condensed, means
-from etid.estimators.maximum_likelihood.profile import Profile, Records
-from etid.estimators.maximum_likelihood.terms import (
-    apart,
-    as_list,
-    delayed_gain,
-    excess,
-    same_unloaded,
-    shows_hum,
-    variance,
-)
+from etid.estimators.maximum_likelihood.condensed import Condensed, apart, means
+from etid.estimators.maximum_likelihood.profile import Profile, Records, excess
 from etid.estimators.sandwich import Linear
 from etid.estimators.unknowns import DriverUnknowns
 from etid.results.driver import Calibration, HarmonicDriver, SourceImpedance
-from etid.results.fit import complex_rrse
-from etid.signals.harmonics import Spectrum, signal_share
+from etid.signals.harmonics import Spectrum, as_list, same_unloaded, signal_share
 from etid.signals.knots import Knots, knots
-from etid.signals.transfer import as_complex, frequency_variable, reciprocal
+from etid.signals.transfer import as_complex, delayed, frequency_variable, reciprocal
 from etid.solvers.levenberg_marquardt import (
     DIFFERENCE,
     LevenbergMarquardt,
@@ -134,7 +124,7 @@ def rough_source(
     # A spurious resonance fits noise, so that it lowers Σ r²; but it raises the variances.
     every = dataclasses.replace(model, spectra=spectra)
     logs = [
-        jnp.sum(jnp.where(one.selected, jnp.log(variance(one, g)), 0.0))
+        jnp.sum(jnp.where(one.selected, jnp.log(Profile.of_output(one, g).expected[0]), 0.0))
         for one, g in zip(as_list(spectra), every.gains(q), strict=True)
     ]
     terms = jnp.sum(spectra.selected, dtype=q.dtype)
@@ -209,8 +199,11 @@ def fit_source(
     linear = model.linear(q)
     cov = linear.covariance()[:kept, :kept]
     freedom = 2 * jnp.sum(spectra.selected, dtype=q.dtype) - q.size
-    seen = list(zip(as_list(spectra), model.gains(q), strict=True))
-    errors = jnp.stack([complex_rrse(g * s.x, s.y, s.selected) for s, g in seen])
+    seen = [
+        (Records.of(s), Profile.of_output(s, g))
+        for s, g in zip(as_list(spectra), model.gains(q), strict=True)
+    ]
+    errors = jnp.stack([profile.rrse(records, records.x) for records, profile in seen])
     estimate = Estimate(
         parameters=found.source,
         delay_samples=found.delay_samples,
@@ -222,7 +215,7 @@ def fit_source(
             tried.settled, optx.RESULTS.successful, optx.RESULTS.nonlinear_max_steps_reached
         ),
         steps=tried.steps,
-        hum=jnp.stack([shows_hum(s, g) for s, g in seen]).any(),
+        hum=jnp.stack([profile.shows_hum(records) for records, profile in seen]).any(),
     )
     calibration = dataclasses.replace(calibration, delay_samples=found.delay_samples)
     return model.z_th(q), estimate, calibration, linear
@@ -322,7 +315,8 @@ class Calibrations(eqx.Module):
             r_load: Float[Array, ""],
             delay_samples: Float[Array, ""],
         ) -> Complex[Array, " harmonic"]:
-            return delayed_gain(source, resistor(r_load), frequency, delay_samples, self.rate)
+            ratio = source.voltage_ratio(resistor(r_load), frequency)
+            return delayed(ratio, frequency, delay_samples, self.rate)
 
         late = self.named(common).delay_samples
         return jax.vmap(one)(self.spectra.frequency, self.calibration.r_load, late)

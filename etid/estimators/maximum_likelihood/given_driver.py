@@ -33,12 +33,11 @@ from etid.circuits.circuit import AbstractCircuit
 from etid.estimators.estimate import DELAY_WIDTH
 from etid.estimators.maximum_likelihood.driver import Calibrations
 from etid.estimators.maximum_likelihood.profile import Profile, Records
-from etid.estimators.maximum_likelihood.terms import as_list, same_unloaded
 from etid.estimators.score_tests.unloaded import UnloadedShape, shape_of
 from etid.estimators.starts import current_starts, harmonic_starts
 from etid.estimators.unknowns import LoadUnknowns
 from etid.results.driver import HarmonicDriver
-from etid.signals.harmonics import Spectrum
+from etid.signals.harmonics import Spectrum, as_list, same_unloaded
 from etid.signals.knots import Knots
 from etid.signals.transfer import as_complex, combined, reciprocal
 from etid.solvers.matrices import inverse_root

@@ -21,10 +21,14 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Complex, Float
 
-from etid.estimators.maximum_likelihood.terms import excess, stands_out
 from etid.results.fit import complex_rrse
-from etid.signals.harmonics import Spectrum, real_parts
+from etid.signals.harmonics import Spectrum, local_sum, real_parts
+from etid.signals.mains import lines
 from etid.signals.transfer import as_complex, power
+
+SURE = 4.0  # standard deviations by which a local variance must exceed the mean
+LOW = 128  # number of first harmonics that are tested for mains hum
+HUM = 14.4  # times the mean; an exponential exceeds it as rarely as a normal number exceeds five σ
 
 
 class Records(eqx.Module):
@@ -99,6 +103,11 @@ class Profile(eqx.Module):
         weight = jnp.where(records.selected, 2 / jnp.stack(expected), 0.0)
         towards, innovations = jnp.stack(towards), jnp.stack(innovations)
         return cls(gains, towards, jnp.stack(expected), weight, innovations, x, left)
+
+    @classmethod
+    def of_output(cls, spectrum: Spectrum, gain: Complex[Array, " harmonic"]) -> "Profile":
+        """One recording at the gain of its V_out."""
+        return cls.of(Records.of(spectrum), gain[None])
 
     def whitened(
         self, change: Complex[Array, "output harmonic"]
@@ -191,3 +200,36 @@ class Profile(eqx.Module):
         """RRSE of the output that is predicted worst from this input."""
         each = zip(self.gains, records.y, records.selected, strict=True)
         return jnp.stack([complex_rrse(g * x, y, used) for g, y, used in each]).max()
+
+
+def excess(
+    part: Float[Array, " part"], selected: Bool[Array, " harmonic"]
+) -> Float[Array, " part"]:
+    """Variance of a residual around each harmonic, relative to the expected variance; at least 1.
+
+    The weights assume white noise, but noise may be coloured, and no model is exact. The covariance
+    (Jᵀ C J in place of Jᵀ J, White 1980) therefore uses the variance of the residual. It is the
+    mean over `harmonics.WINDOW` harmonics where this surely exceeds the mean over all harmonics,
+    and otherwise the mean over all.
+    """
+    count = selected.size
+    power = part[:count] ** 2 + part[count:] ** 2
+    of = jnp.where(selected, 2.0, 0.0)
+    overall = jnp.maximum(jnp.sum(power) / jnp.maximum(jnp.sum(of), 1.0), 1.0)
+    freedom = jnp.maximum(local_sum(of), 1.0)
+    local = local_sum(power) / freedom
+    sure = local > overall * (1 + SURE * jnp.sqrt(2 / freedom))
+    return jnp.tile(jnp.where(sure, local, overall), 2)
+
+
+def stands_out(
+    squares: Float[Array, " harmonic"],
+    frequency: Float[Array, " harmonic"],
+    selected: Bool[Array, " harmonic"],
+) -> Bool[Array, ""]:
+    """Whether `squares` at the harmonics show mains hum; without hum their mean is 1."""
+    squares, suspect = squares[:LOW], lines(frequency[:LOW])
+    others = selected[:LOW] & ~suspect
+    count = jnp.maximum(jnp.sum(others, dtype=squares.dtype), 1.0)
+    around = jnp.sum(jnp.where(others, squares, 0.0)) / count
+    return jnp.max(jnp.where(suspect, squares, 0.0)) > HUM * jnp.maximum(around, 1.0)

@@ -13,8 +13,8 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Complex, Float
 
 from etid.circuits.circuit import AbstractCircuit
-from etid.estimators.maximum_likelihood.profile import Profile, Records
-from etid.estimators.maximum_likelihood.terms import apart, excess, residual
+from etid.estimators.maximum_likelihood.condensed import apart
+from etid.estimators.maximum_likelihood.profile import Profile, excess
 from etid.estimators.sandwich import Linear
 from etid.estimators.score_tests import other_circuit
 from etid.estimators.unknowns import LoadUnknowns
@@ -74,7 +74,7 @@ def scores(
 
     def of_residual(_) -> tuple[Float[Array, "slope part"], Float[Array, " part"]]:
         # At the X estimated from both records: the noise of one record is in the residual too.
-        profile = Profile.of(Records.of(spectrum), g[None])
+        profile = Profile.of_output(spectrum, g)
         rows = slopes * (-profile.x * as_complex(jnp.sqrt(profile.weight[0])))[None, :]
         share = signal_share(profile.x, profile.variance_x)
         return real_parts(rows), jnp.tile(share, 2)
@@ -82,7 +82,7 @@ def scores(
     rows, share = apart(of_residual, own.vector())
     count = elements + 1 + vector.size
     prior = jnp.diag(jnp.pad(jnp.ones(vector.size), (elements + 1, 0)))
-    part = residual(spectrum, g)
+    part = Profile.of_output(spectrum, g).terms[0]
     linear = Linear(rows[:count], share, excess(part, spectrum.selected), prior)
     found = other_circuit.scores(
         rows[count:],
