@@ -12,9 +12,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from etid.circuits.circuit import Resistor, SkinRC
-from etid.results.driver import SourceImpedance, loaded
+from etid.results.driver import loaded
 from etid.signals import filtering
 from etid.signals.filtering import BLOCK, CUTOFF, TAPS, StateSpace, band_limited, hold, simulate
+from tests.test_driver import SOURCE
 
 lfilter = jax.jit(filtering.lfilter)
 run = jax.jit(simulate)
@@ -139,17 +140,6 @@ def test_second_derivatives_agree_with_differences_of_the_first(getkey):
     numeric = (slope(p + step) - slope(p - step)) / (2 * step)
     for second in (jax.jacfwd(jax.grad(loss)), jax.grad(lambda p: jax.jacfwd(loss)(p)[0])):
         np.testing.assert_allclose(jax.jit(second)(p).ravel(), numeric, rtol=1e-7)
-
-
-SOURCE = SourceImpedance(
-    log_resistance=jnp.log(600.0),
-    log_omega=jnp.log(jnp.array([3.0e5, 1.5e6])),
-    log_zeta=jnp.log(jnp.array([0.25, 1.2])),
-    gain=jnp.array([9e3, 2e3]),
-    slope=jnp.array([1.2e4, 500.0]),
-    log_omega_real=jnp.log(jnp.array([300.0])),
-    gain_real=jnp.array([-5e3]),
-)
 
 
 # A Kaiser window with β = 10 attenuates by 10 / 0.1102 + 8.7 dB (Kaiser 1974), in its pass band as

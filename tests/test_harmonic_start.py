@@ -10,9 +10,9 @@ import pytest
 from etid.circuits.circuit import SkinRC
 from etid.estimators.harmonic_start import start_of_skin
 from etid.estimators.starts import START_STEPS
-from etid.results.driver import SourceImpedance
 from etid.signals.harmonics import Spectrum
 from etid.signals.transfer import delayed
+from tests.test_driver import SOURCE
 
 SKINS = {
     "dry": SkinRC(*map(jnp.asarray, (33.4e3, 186e3, 0.12e-9))),
@@ -20,15 +20,6 @@ SKINS = {
 }
 SETTLED = 20  # iterations
 SUMS = 1e-2  # straight lines between the knots; one step of a fit corrects a hundredth
-SOURCE = SourceImpedance(
-    log_resistance=jnp.log(600.0),
-    log_omega=jnp.log(jnp.array([3.0e5, 1.5e6])),
-    log_zeta=jnp.log(jnp.array([0.25, 1.2])),
-    gain=jnp.array([9e3, 2e3]),
-    slope=jnp.array([1.2e4, 500.0]),
-    log_omega_real=jnp.log(jnp.array([300.0])),
-    gain_real=jnp.array([-5e3]),
-)
 FREQUENCY = 60.0 * jnp.arange(1.0, 1667.0)
 Z_TH = SOURCE.response(FREQUENCY)
 RATE = jnp.asarray(200e3)
