@@ -72,11 +72,22 @@ def _who_runs_programs(request):
     """
     from etid.numpy_tier import tiers  # here, for the type checker wraps what it imports
 
+    by_numpy = tiers._by_numpy
     with pytest.MonkeyPatch.context() as patch:
         if _is_ordinary(request.config):
             patch.setattr(tiers, "QUICKLY", tiers.AT_ONCE)
         else:
             patch.setattr(tiers, "_by_numpy", lambda: False)
+        yield by_numpy
+
+
+@pytest.fixture(scope="module")
+def run_as_for_users(_who_runs_programs):
+    """Slow tests are compiled; in this module they are run as in a process of a user."""
+    from etid.numpy_tier import tiers
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(tiers, "_by_numpy", _who_runs_programs)
         yield
 
 

@@ -2,11 +2,10 @@
 
 import contextlib
 
-import jax
-import jax.export
 import pytest
 
 import etid
+from etid.numpy_tier import tiers
 from etid.simulation import scenes
 
 # The estimators of batches, and those that identify their drivers.
@@ -17,14 +16,6 @@ DRIVERS = {
     "steiglitz_mcbride": "steiglitz_mcbride",
     "equation_error": "steiglitz_mcbride",
 }
-
-
-# JAX has eigenvalues on GPUs, but does not promise that their files stay readable.
-UNSTABLE = [jax.export.DisabledSafetyCheck.custom_call("cuhybrid_eig_real")]
-
-
-class _Missing(BaseException):
-    """An operation of a program is not there."""
 
 
 class _Lowered(BaseException):
@@ -47,22 +38,15 @@ def drivers(study):
 
 
 @pytest.fixture
-def lowered(tmp_path, monkeypatch):
+def lowered(monkeypatch):
     """Runs code until it has lowered a program with this name, for CUDA."""
-    for_here, awaited = jax.export.export, []
+    compiled, awaited = tiers._by_xla, []
 
-    def export(function, **options):
-        def on(*shapes):
-            if function.__name__ in awaited:
-                lower = for_here(function, platforms=("cuda",), disabled_checks=UNSTABLE)
-                try:
-                    lower(*shapes)
-                except Exception as error:  # the store would go on without a file
-                    raise _Missing(str(error)) from error
-                raise _Lowered
-            return for_here(function, **options)(*shapes)
-
-        return on
+    def by_xla(run, *args):
+        if run.__name__ in awaited:
+            run.trace(*args).lower(lowering_platforms=("cuda",))
+            raise _Lowered
+        return compiled(run, *args)
 
     @contextlib.contextmanager
     def until(name):
@@ -70,12 +54,8 @@ def lowered(tmp_path, monkeypatch):
         with pytest.raises(_Lowered):
             yield
 
-    monkeypatch.setattr(jax.export, "export", export)  # by which the store of programs makes files
-    before = getattr(jax.config, "jax_compilation_cache_dir")  # noqa: B009 - made at run time
-    jax.config.update("jax_compilation_cache_dir", str(tmp_path))
-    jax.clear_caches()
-    yield until
-    jax.config.update("jax_compilation_cache_dir", before)
+    monkeypatch.setattr(tiers, "_by_xla", by_xla)
+    return until
 
 
 @pytest.mark.slow

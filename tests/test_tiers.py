@@ -21,15 +21,7 @@ from etid.numpy_tier.tiers import program
 OF_ERRORS = 1e-4
 
 
-BY_NUMPY = tiers._by_numpy
-
-
-@pytest.fixture(autouse=True, scope="module")
-def _both():
-    """Slow tests are compiled; not these."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(tiers, "_by_numpy", BY_NUMPY)
-        yield
+pytestmark = pytest.mark.usefixtures("run_as_for_users")
 
 
 @pytest.fixture

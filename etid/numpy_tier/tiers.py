@@ -102,11 +102,7 @@ def program(
         static, run = _Static(others), compiled(jax.default_backend() == "cpu")
         with _at_once():
             small = None if batch or not _by_numpy() else _in_numpy(run, static, arrays)
-            if small is not None:
-                found, others = small(arrays)
-            else:
-                with announced(), unsearched():
-                    found, others = run(static, arrays)
+            found, others = small(arrays) if small else _by_xla(run, static, arrays)
         return eqx.combine(found, others.of)
 
     return call
@@ -122,6 +118,12 @@ def _by_numpy() -> bool:
     config: Any = jax.config  # its attributes are made at run time
     looks = config.jax_disable_jit or config.jax_debug_nans or config.jax_debug_infs
     return jax.default_backend() == "cpu" and not looks
+
+
+def _by_xla(run: Any, static: _Static, arrays: Any) -> Any:
+    """What XLA computes, once it has compiled the function."""
+    with announced(), unsearched():
+        return run(static, arrays)
 
 
 def _in_numpy(run: Any, static: _Static, arrays: Any) -> Any:
