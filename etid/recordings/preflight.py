@@ -10,20 +10,13 @@ from etid.recordings.group import STEP, Group, covariance_of, is_periodic, limit
 from etid.recordings.recording import Recording
 from etid.recordings.remarks import Remark
 from etid.signals.aliases import aliases
-from etid.signals.clipping import HELD, is_clipped
+from etid.signals.clipping import is_clipped, is_command
 from etid.signals.disturbances import Joint, Shifts
 from etid.signals.filtering import TAPS
 from etid.signals.harmonics import ALIASED, filled, harmonics, joins_aliases
 from etid.signals.mains import Hum
 from etid.signals.noise import RIPPLE, noise_std
-from etid.signals.pulse_train import (
-    CLOCK,
-    PulseTrain,
-    lags_of,
-    rise_time,
-    shifted,
-    whole_lag,
-)
+from etid.signals.pulse_train import PulseTrain, lags_of, rise_time, shifted, whole_lag
 
 SHORTEST = 4 * TAPS + 104  # [samples] edges of the interpolation, and 104 samples for the fit
 # [standard deviations] peak-to-peak value that noise alone hardly exceeds; a signal must exceed it
@@ -222,7 +215,8 @@ class Inspected:
         """Remarks on how the recording is changed before a fit."""
         hum = self.hum_th is not None or self.hum_out is not None
         coarse = self.coarse_th > 0 or self.coarse_out > 0
-        off = abs(self.train.counted / self.recording.pulse_rate - 1) > CLOCK
+        # A clock is not more than 300 ppm wrong.
+        off = abs(self.train.counted / self.recording.pulse_rate - 1) > 3e-4
         found = Remark.mains_hum if hum else Remark(0)
         fewer = self.periods[0] < self.whole_periods[0]
         found |= Remark.periods_left_out if fewer else Remark(0)
@@ -344,7 +338,7 @@ def preflight(seen: Inspected, *, periodic: bool = False) -> str | None:
     # A current source holds its current, so a flat top of the current is no fault without noise.
     th, out = seen.recorded_limits
     volts = None if seen.has_current else of.adc_range
-    held = seen.has_current and seen.sigma_th <= max(seen.step_th, HELD * seen.spans[0])
+    held = seen.has_current and is_command(float(seen.sigma_th), seen.step_th, seen.spans[0])
     if not held and _is_saturated(seen.recorded_th, th, seen.step_th, volts):
         return "saturated"
     if _is_saturated(seen.recorded_out, out, seen.step_out, of.adc_range):

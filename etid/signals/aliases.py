@@ -25,13 +25,7 @@ from etid.signals.harmonics import ALIASED, namespace
 
 # All are relative to the sample rate.
 LOWER, UPPER = (0.33, 0.38), (0.40, 0.45)  # bands that show how the spectrum falls
-COHERENT = 0.05
-SURE = 3.0  # [standard errors] the power of the upper band must exceed its noise by this
-# Least p of a spectrum that may be continued beyond half the sample rate, 30 dB per octave. Drivers
-# whose parts differ by 10 % have 11.5 to 14.8 behind an anti-alias filter of fourth order at 0.4 of
-# 200 to 500 kHz, and without one 7.3 to 12.8, half of them less than 9. There the elements were up
-# to six standard errors off, because the spectrum falls more slowly where nothing is measured.
-SLOWEST = 11.0
+COHERENT = 0.05  # width over which aliases have nearly the same relative error
 
 
 class Aliases(NamedTuple):
@@ -55,10 +49,15 @@ class Aliases(NamedTuple):
     def are_unknown(self, variance: Float[np.ndarray, " harmonic"]) -> bool:
         """Whether A exceeds noise of this variance, and its size does not follow from the record.
 
-        A is compared at the highest harmonic of a fit, where it is largest.
+        A is compared at the highest harmonic of a fit, where it is largest. A spectrum may be
+        continued beyond half the sample rate if it falls by 30 dB per octave there. Drivers whose
+        parts differ by 10 % have p of 11.5 to 14.8 behind an anti-alias filter of fourth order at
+        0.4 of 200 to 500 kHz, and without one 7.3 to 12.8, half of them less than 9. Without one
+        the elements were up to six standard errors off, because the spectrum falls more slowly
+        where nothing is measured.
         """
         last = int(ALIASED * self.harmonics / COHERENT) - 1
-        return bool(self.variance[last] > variance[last] and self.fall < SLOWEST)
+        return bool(self.variance[last] > variance[last] and self.fall < 11.0)
 
 
 def aliases(
@@ -75,21 +74,22 @@ def aliases(
         periods: Number of periods from `etid.signals.harmonics.whole_periods`.
         samples: Number of samples from `etid.signals.harmonics.whole_periods`.
     """
-    of = namespace(variance)
+    xp = namespace(variance)
     position = np.arange(1.0, variance.size + 1) * (periods / samples)
-    squares = of.real(coefficients) ** 2 + of.imag(coefficients) ** 2
+    squares = xp.real(coefficients) ** 2 + xp.imag(coefficients) ** 2
     signals, errors = [], []
     for low, high in (LOWER, UPPER):
         inside = (position >= low) & (position < high)
         count = max(np.count_nonzero(inside), 1)
-        noise = of.sum(of.where(inside, variance, 0.0)) / count
-        signals.append(of.sum(of.where(inside, squares, 0.0)) / count - noise)
+        noise = xp.sum(xp.where(inside, variance, 0.0)) / count
+        signals.append(xp.sum(xp.where(inside, squares, 0.0)) / count - noise)
         errors.append(noise / np.sqrt(count))
-    shown = (signals[1] > SURE * errors[1]) & (signals[0] > signals[1])
-    lower, upper = (of.where(shown, one, 1.0) for one in signals)
+    exceeds_noise = signals[1] > 3.0 * errors[1]
+    falls = exceeds_noise & (signals[0] > signals[1])
+    lower, upper = (xp.where(falls, signal, 1.0) for signal in signals)
     middle = sum(UPPER) / 2
-    fall = of.log(lower / upper) / np.log(middle * 2 / sum(LOWER))
-    level = of.where(signals[1] > SURE * errors[1], signals[1], 0.0)
+    fall = xp.log(lower / upper) / np.log(middle * 2 / sum(LOWER))
+    level = xp.where(exceeds_noise, signals[1], 0.0)
     # Padded harmonics lie above half the sample rate; they have no aliases.
     mirrored = np.maximum(1 - position, 0.5) / middle
     return Aliases(level * mirrored**-fall, fall, COHERENT * samples / periods)

@@ -1,7 +1,7 @@
 """Harmonics summed over bands, for fits that need not be exact.
 
-A band is a few neighbouring harmonics, at most a sixteenth of their frequency wide. The gain G
-hardly changes over a band. The harmonics of a band therefore act like one harmonic,
+A band is a few neighbouring harmonics: at most 16, and at most a sixteenth of their frequency wide.
+The gain G hardly changes over a band. The harmonics of a band therefore act like one harmonic,
 
     X = √P,    Y = Σ X̄_k Y_k / √P,    P = Σ (|X_k|² − σ_x²)    at    f = Σ |X_k|² f_k / Σ |X_k|².
 
@@ -19,19 +19,15 @@ from jaxtyping import Array, Float, Int
 from etid.signals.harmonics import ABSENT, Spectrum
 from etid.signals.transfer import as_complex, power
 
-RELATIVE = 16  # frequency of a band over its width
-WIDEST = 16  # [harmonics] largest width of a band
-PRESENT = 0.5  # smallest part of a band's |X|² that must be signal
-
 
 @functools.lru_cache(maxsize=64)
 def _bands(harmonics: int) -> Int[np.ndarray, " harmonic"]:
     """Number of the band of each harmonic."""
-    found: list[int] = []
-    while (first := len(found)) < harmonics:
-        width = min(max((first + 1) // RELATIVE, 1), WIDEST)
-        found += [found[-1] + 1 if found else 0] * width
-    return np.asarray(found[:harmonics])
+    band: list[int] = []
+    while (first := len(band)) < harmonics:
+        width = min(max((first + 1) // 16, 1), 16)
+        band += [band[-1] + 1 if band else 0] * width
+    return np.asarray(band[:harmonics])
 
 
 def banded(spectrum: Spectrum) -> Spectrum:
@@ -44,15 +40,17 @@ def banded(spectrum: Spectrum) -> Spectrum:
 
     count, size = summed(jnp.ones_like(spectrum.variance_x)), summed(power(spectrum.x))
     signal = size - summed(spectrum.variance_x)
-    present = signal > PRESENT * size  # False where no harmonic is selected
-    signal, size = (jnp.where(present, of, 1.0) for of in (signal, size))
+    present = signal > size / 2  # half of |X|² is signal; False where no harmonic is selected
+    signal, size = (jnp.where(present, sums, 1.0) for sums in (signal, size))
     level, product = jnp.sqrt(signal), jnp.conj(spectrum.x) * spectrum.y
 
-    def filled(of: Float[Array, "*lane band"], absent: Array | float) -> Float[Array, "*lane band"]:
-        return jnp.where(present, of, absent)
+    def filled(
+        values: Float[Array, "*lane band"], absent: Array | float
+    ) -> Float[Array, "*lane band"]:
+        return jnp.where(present, values, absent)
 
-    def variance(of: Float[Array, "*lane harmonic"]) -> Float[Array, "*lane band"]:
-        return filled(summed(of) / jnp.maximum(count, 1.0) * size / signal, ABSENT)
+    def variance(values: Float[Array, "*lane harmonic"]) -> Float[Array, "*lane band"]:
+        return filled(summed(values) / jnp.maximum(count, 1.0) * size / signal, ABSENT)
 
     # Every band needs a frequency, and these grow.
     anyhow = spectrum.frequency[..., np.flatnonzero(np.diff(band, prepend=-1))]

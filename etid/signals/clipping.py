@@ -6,20 +6,14 @@ peak has at most 2.4 times as many samples at its extreme value, because it is a
 that droops has no more of them than at the next value. A signal that settles at a level approaches
 it in small steps.
 
-A generator's command rests at exact levels too, its baseline included. It has no noise.
+A generator's command rests at exact levels too, its baseline included. It has no noise
+(`is_command`).
 """
 
 import numpy as np
 from jaxtyping import Bool, Float
 
 from etid.signals.noise import noise_std
-
-RAIL = 3  # equal extreme samples in a row
-NEAR = 8  # values beside the extreme one
-MORE = 4.0  # times the samples of each of these values; a peak of fourth order has 5 at most
-JUMP = 8.0  # [converter steps] a clipped signal reaches its rail in a larger jump
-FINEST = 2.0**-16  # of the span: step of a converter that is not known
-HELD = 1e-5  # noise over the span of a record, below which it may be a command
 
 
 def is_clipped(v: Float[np.ndarray, " time"], step: float) -> bool:
@@ -29,29 +23,42 @@ def is_clipped(v: Float[np.ndarray, " time"], step: float) -> bool:
         v: The record, in any unit.
         step: Step of the converter in this unit; 0 if it is unknown.
     """
-    rails = [extreme for extreme in (v.min(), v.max()) if _stays(v == extreme)]
+    rails = [extreme for extreme in (v.min(), v.max()) if _has_run(v == extreme)]
     if not rails:  # nearly all records
         return False
     values, counts = np.unique(v, return_counts=True)
-    # A record of rounded volts shows its step.
-    floor = max(step, np.diff(values).min(), FINEST * (values[-1] - values[0]))
-    jumps = JUMP * floor
+    # A record of rounded volts shows its step; an unknown converter has at most 16 bits.
+    span = values[-1] - values[0]
+    step = max(step, np.diff(values).min(), span * 2.0**-16)
+    jump = 8 * step  # a clipped signal reaches its rail in a larger jump
     rest = values[np.argmax(counts)]
-    if 2 * counts.max() >= v.size and _arrivals(v, rest).min(initial=np.inf) > jumps:
+    if 2 * counts.max() >= v.size and _arrivals(v, rest).min(initial=np.inf) > jump:
         # Noise in the pulses is that of a record whose baseline is at the rail.
         others = v[v != rest]
-        if noise_std(others) <= max(floor, HELD * (values[-1] - values[0])):
+        if is_command(float(noise_std(others)), step, span):
             return False
     for rail in rails:
-        total, *beside = (counts if rail == values[0] else counts[::-1])[: NEAR + 1]
-        if total > MORE * max(beside) and _arrivals(v, rail).max(initial=0.0) > jumps:
+        # A peak of fourth order has at most 5 times the samples of the next of these values.
+        total, *beside = (counts if rail == values[0] else counts[::-1])[:9]
+        if total > 4 * max(beside) and _arrivals(v, rail).max(initial=0.0) > jump:
             return True
     return False
 
 
-def _stays(at: Bool[np.ndarray, " time"]) -> bool:
-    """Whether `RAIL` samples in a row are true."""
-    return bool(np.count_nonzero(at) >= RAIL and (at[:-2] & at[1:-1] & at[2:]).any())
+def is_command(noise: float, step: float, span: float) -> bool:
+    """Whether a record may be a generator's command: it has almost no noise.
+
+    Args:
+        noise: Standard deviation of its noise, in its unit.
+        step: Step of its converter; 0 if it is unknown.
+        span: Its peak-to-peak value.
+    """
+    return bool(noise <= max(step, 1e-5 * span))
+
+
+def _has_run(at: Bool[np.ndarray, " time"]) -> bool:
+    """Whether three samples in a row are true."""
+    return bool(np.count_nonzero(at) >= 3 and (at[:-2] & at[1:-1] & at[2:]).any())
 
 
 def _arrivals(v: Float[np.ndarray, " time"], level: float) -> Float[np.ndarray, " arrival"]:

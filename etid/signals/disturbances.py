@@ -2,10 +2,10 @@
 
 A movement of the hand can spoil one of several periods, and with it the average of all periods.
 Each period is compared with the median of all periods, after averaging over `MERGED` samples. A
-period is *disturbed* if it differs by more than `PART` of the largest value and by more than
-`SHARE` of the value at the same place. A load that changes by less than a factor of two does not
-exceed these limits. Edges between samples and noise do not exceed them either. If a disturbance
-lasts to the end of its period or from its start, the period beside it is disturbed too.
+period is *disturbed* if it differs by more than `allowed_deviation`. A load that changes by less
+than a factor of two does not exceed it. Edges between samples and noise do not exceed it either. If
+a disturbance lasts to the end of its period or from its start, the period beside it is disturbed
+too.
 
 A converter that loses a sample, or writes one twice, moves all later samples of its record by one.
 The edges of each period are compared with those of the first period. Where the lag of V_out changes
@@ -20,14 +20,10 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from etid.signals.pulse_train import highest, rises
-from etid.signals.quick_looks import MERGED, NOISE, PART, SHARE, highest_beside, period_means
+from etid.signals.quick_looks import allowed_deviation, highest_beside, noise_limit, period_means
 
-STEEP = 0.3  # of the steepest rise of a pulse
-BESIDE = 10  # times the samples over which edges rise, in which there is one edge
-FARTHEST = 8  # [samples] largest shift that is searched
-WHOLE = 0.3  # [samples] a shift is this near a whole number of samples
-SURE = 0.1  # [samples] standard error of a shift that is believed
-ALIKE = 0.5  # fraction of the power of an edge in which it may differ from the same edge elsewhere
+STEEP = 0.3  # an edge rises by more than this part of the steepest rise of a pulse
+EDGE = 10  # times the samples over which edges rise, in which there is one edge
 
 
 def disturbed(
@@ -50,12 +46,11 @@ def disturbed(
         spacing: Length of a period [samples].
         periods: Number of whole periods in each record.
     """
-    means, noise = period_means(records, spacing, periods), NOISE / MERGED**0.5 * sigma
+    means, noise = period_means(records, spacing, periods), noise_limit(sigma)
     usual = np.median(means, axis=2)
-    floor = np.maximum(PART * np.abs(usual).max(2), noise) + step
     # The first and the last mean lie between pulses.
     high, low = highest_beside(usual), -highest_beside(-usual)
-    allowed = SHARE * np.maximum(high, -low) + (high - low) + floor[..., None]
+    allowed = allowed_deviation(low, high, np.abs(usual).max(2), sigma, step)
     off = np.abs(means - usual[:, :, None])[..., 1:-1]
     unlike = np.any(off > allowed[:, :, None], axis=3)
     bad = unlike.any(axis=1) & ~unlike.all(axis=1)
@@ -93,7 +88,7 @@ def of_source(
     # Steep samples next to each other are one edge.
     count = np.array(
         [
-            np.count_nonzero(np.diff(np.flatnonzero(part > steep), prepend=-np.inf) > BESIDE * rise)
+            np.count_nonzero(np.diff(np.flatnonzero(part > steep), prepend=-np.inf) > EDGE * rise)
             for part in parts
         ]
     )
@@ -131,8 +126,10 @@ def shifts(
         periods: Number of whole periods.
         rise: Samples over which edges rise.
     """
-    known = zip(records, sigma, strict=True)
-    lags = [_lags_of_edges(v, float(of), spacing, periods, rise) for v, of in known]
+    lags = [
+        _lags_of_edges(v, float(noise), spacing, periods, rise)
+        for v, noise in zip(records, sigma, strict=True)
+    ]
     if lags[0] is None or lags[1] is None:
         return None
     lag = lags[1] - lags[0]
@@ -140,7 +137,7 @@ def shifts(
     usual = np.angle(np.exp(2j * np.pi * lag).mean(0)) / (2 * np.pi)
     whole = np.rint(lag - usual).astype(int)
     within = whole[:, 1] - whole[:, 0]
-    between = (np.abs(lag - usual - whole) > WHOLE).any(1)
+    between = (np.abs(lag - usual - whole) > 0.3).any(1)
     if np.count_nonzero(between) > 1:  # no lost sample, but pulses at any time
         return None
     bad = (within != _most(within)) | between
@@ -164,26 +161,27 @@ def _lags_of_edges(
     None if an edge does not look alike in all periods, or if noise hides its place.
     """
     at = np.rint(np.arange(periods) * spacing).astype(int)
-    slope, width = rises(v, rise), BESIDE * rise
-    room = min(int(spacing), slope.size - at[-1]) - width - FARTHEST
+    slope, width = rises(v, rise), EDGE * rise
+    farthest = 8  # [samples] largest lag that is searched
+    room = min(int(spacing), slope.size - at[-1]) - width - farthest
     mean = np.abs(sum(slope[first : first + max(room, 0)] for first in at))
     steep = np.flatnonzero(mean > STEEP * mean.max(initial=0.0))
     if not steep.size:
         return None
-    found = np.zeros((periods, 2))
+    lags = np.zeros((periods, 2))
     for number, edge in enumerate(steep[[0, -1]]):
         first = max(edge - width, 0)
         template = slope[first : edge + width]
-        begin = at[1:, None] + first + np.arange(-FARTHEST, FARTHEST + 1)
+        begin = at[1:, None] + first + np.arange(-farthest, farthest + 1)
         parts = np.lib.stride_tricks.sliding_window_view(slope, template.size)[begin]
         rest = np.square(parts - template).sum(-1)
         # Noise has 2 σ² in the differences of a template and 6 σ² in theirs.
         bend = np.square(np.diff(template)).sum() - 6 * sigma**2 * template.size
-        unsure = 4 * sigma**2 > SURE**2 * bend
-        if unsure or (rest.min(1) > ALIKE * (template @ template)).any():
+        unsure = 4 * sigma**2 > 0.1**2 * bend  # standard error of a lag: 0.1 samples
+        if unsure or (rest.min(1) > (template @ template) / 2).any():
             return None
-        found[1:, number] = highest(-rest) - FARTHEST
-    return found
+        lags[1:, number] = highest(-rest) - farthest
+    return lags
 
 
 class Joint(NamedTuple):

@@ -29,7 +29,6 @@ Values = TypeVar("Values", Array, np.ndarray)
 WINDOW = 25  # harmonics over which power is averaged
 ALIASED = 0.35  # of the sample rate; above, aliases matter unless they fall between the harmonics
 DRIFT_DEGREE = 3  # degree of the polynomial that describes the drift of the mean
-ROOM = 64  # harmonic counts are padded to a multiple of this, so that compiled programs are shared
 ABSENT = 1e-6  # [standard deviations] coefficient and noise of a padded harmonic
 
 
@@ -85,17 +84,17 @@ def harmonics(
     # Only bins that are multiples of `parts` are needed. They are the bins of the sum of so many
     # equal parts of the record, which is shorter.
     parts = math.gcd(periods, samples)
-    of, v = namespace(v), v[..., :samples]
+    xp, v = namespace(v), v[..., :samples]
     folded = v.reshape(*v.shape[:-1], parts, -1).sum(-2) / samples
     # SciPy transforms several records side by side; one transform takes as long as with NumPy.
-    transform = np.asarray(scipy.fft.rfft(folded)) if of is np else jnp.fft.rfft(folded)
+    transform = np.asarray(scipy.fft.rfft(folded)) if xp is np else jnp.fft.rfft(folded)
     basis, fit = _drift(periods, samples)
     # The transform is linear: the drift needs only the transforms of the powers of time.
-    drift = of.einsum("dp,...p->...d", fit, _sums(v, periods))
+    drift = xp.einsum("dp,...p->...d", fit, _sums(v, periods))
     step = periods // parts
     at_harmonics = transform[..., step : (folded.shape[-1] + 1) // 2 : step]
     # `@` would start BLAS threads for each recording, and these threads wait for each other.
-    if of is np:  # real and imaginary parts are real products
+    if xp is np:  # real and imaginary parts are real products
         return at_harmonics - np.einsum("...d,dh->...h", drift, basis.view(float)).view(complex)
     return at_harmonics - jnp.einsum("...d,dh->...h", drift.astype(basis.dtype), basis)
 
@@ -107,17 +106,17 @@ def namespace(v: Array | np.ndarray) -> ModuleType:
 
 def real_parts(values: Values) -> Values:
     """Real parts, then imaginary parts, along the last axis."""
-    of = namespace(values)
-    return of.concatenate([of.real(values), of.imag(values)], axis=-1)
+    xp = namespace(values)
+    return xp.concatenate([xp.real(values), xp.imag(values)], axis=-1)
 
 
 def _sums(v: Array | np.ndarray, periods: int) -> Array | np.ndarray:
     """Sum over each period along the last axis; a period may end between two samples."""
-    of, samples = namespace(v), v.shape[-1]
+    xp, samples = namespace(v), v.shape[-1]
     ends = np.arange(periods + 1) * (samples / periods)
     whole = np.minimum(ends.astype(int), samples - 1)
-    between = of.add.reduceat(v, whole, axis=-1)[..., :-1]
-    return between + of.diff(of.einsum("p,...p->...p", ends - whole, v[..., whole]), axis=-1)
+    between = xp.add.reduceat(v, whole, axis=-1)[..., :-1]
+    return between + xp.diff(xp.einsum("p,...p->...p", ends - whole, v[..., whole]), axis=-1)
 
 
 @functools.lru_cache(maxsize=64)
@@ -186,18 +185,19 @@ def filled(
 
     Harmonics below the noise stay selected: the likelihood weights them correctly. To drop weak
     harmonics would lose more information at 24 to 40 dB than they disturb. Padded harmonics follow
-    the last harmonic. They are not selected and almost zero; they give records of most lengths the
-    same number of harmonics. Other arguments as in `spectrum`; several recordings of equal length
-    share `frequency` and `selected`.
+    the last harmonic, up to a multiple of 64. They are not selected and almost zero; they give
+    records of most lengths the same number of harmonics, so that compiled programs are shared.
+    Other arguments as in `spectrum`; several recordings of equal length share `frequency` and
+    `selected`.
     """
-    of, count = namespace(coefficients), coefficients.shape[-1]
-    number = np.arange(1.0, count + -count % ROOM + 1)
+    xp, count = namespace(coefficients), coefficients.shape[-1]
+    number = np.arange(1.0, count + -count % 64 + 1)
     frequency = number * (periods * sample_rate / samples)
     noise = sigma[..., None] / math.sqrt(samples)
-    scale = of.where(number <= count, noise, ABSENT * noise)
+    scale = xp.where(number <= count, noise, ABSENT * noise)
     absent = scale[..., count:].astype(coefficients.dtype)
-    padded, variance = of.concatenate([coefficients, absent], axis=-1), scale**2
-    (x, y), (variance_x, variance_y) = (of.moveaxis(both, -2, 0) for both in (padded, variance))
+    padded, variance = xp.concatenate([coefficients, absent], axis=-1), scale**2
+    (x, y), (variance_x, variance_y) = (xp.moveaxis(both, -2, 0) for both in (padded, variance))
     highest = 0.5 if separates_aliases(periods, samples) else ALIASED
     selected = (frequency < highest * sample_rate) & (number <= count)
     return frequency, x, y, variance_x, variance_y, selected

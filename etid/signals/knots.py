@@ -16,8 +16,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Inexact, Int
 
-RELATIVE = 16  # number of a harmonic over the distance of the knots around it
-
 
 @dataclasses.dataclass(frozen=True)
 class _Group:
@@ -51,10 +49,10 @@ class Knots:
     def summed(self, values: Inexact[Array, "*row harmonic"]) -> Inexact[Array, "*row knot"]:
         """Σ_k φ_b(k) v_k for each knot b."""
         before, after = [], []
-        for of in self.groups:
-            part = values[..., of.first : of.end]
-            part = part.reshape(*part.shape[:-1], of.count, of.width)
-            share = _shares(of, part)
+        for group in self.groups:
+            part = values[..., group.first : group.end]
+            part = part.reshape(*part.shape[:-1], group.count, group.width)
+            share = _shares(group, part)
             after.append((part * share).sum(-1))
             before.append((part * (1 - share)).sum(-1))
         last, none = values[..., -1:], jnp.zeros_like(values[..., :1])
@@ -63,23 +61,23 @@ class Knots:
     def between(self, values: Inexact[Array, "*row knot"]) -> Inexact[Array, "*row harmonic"]:
         """Values at all harmonics, on straight lines between the knots."""
         parts, knot = [], 0
-        for of in self.groups:
-            ends = values[..., knot : knot + of.count + 1, None]
+        for group in self.groups:
+            ends = values[..., knot : knot + group.count + 1, None]
             left, right = ends[..., :-1, :], ends[..., 1:, :]
-            line = left + (right - left) * _shares(of, left)
+            line = left + (right - left) * _shares(group, left)
             parts.append(line.reshape(*line.shape[:-2], -1))
-            knot += of.count
+            knot += group.count
         return jnp.concatenate([*parts, values[..., -1:]], -1)
 
 
-def _shares(of: _Group, values: Inexact[Array, "*row interval _"]) -> Inexact[Array, "..."]:
+def _shares(group: _Group, values: Inexact[Array, "*row interval _"]) -> Inexact[Array, "..."]:
     """Share of the right knot in each harmonic of the intervals."""
-    share = jnp.asarray(np.arange(of.width) / of.width, values.dtype)
-    return jnp.broadcast_to(share, (*values.shape[:-1], of.width))
+    share = jnp.asarray(np.arange(group.width) / group.width, values.dtype)
+    return jnp.broadcast_to(share, (*values.shape[:-1], group.width))
 
 
 @functools.lru_cache(maxsize=16)
-def knots(harmonics: int, relative: int = RELATIVE) -> Knots:
+def knots(harmonics: int, relative: int = 16) -> Knots:
     """Knots of so many harmonics, the first of which is the pulse rate.
 
     Args:
@@ -97,5 +95,5 @@ def knots(harmonics: int, relative: int = RELATIVE) -> Knots:
         width *= 2
     if first < last:
         groups.append(_Group(first, last - first, 1))
-    index = [np.arange(of.first, of.end, of.width) for of in groups]
+    index = [np.arange(group.first, group.end, group.width) for group in groups]
     return Knots(tuple(groups), np.concatenate([*index, [last]]).astype(int))

@@ -21,17 +21,10 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Array, Bool, Complex, Float, Int
 
-from etid.signals.harmonics import namespace
+from etid.signals.harmonics import DRIFT_DEGREE, namespace
 
 MAINS = (50.0, 60.0)  # [Hz]
 MULTIPLES = 7  # higher multiples are a thousandth of the first in most laboratories
-NEAR = 0.02  # largest distance of a harmonic from a multiple, relative to the mains frequency
-OFF = 2e-3  # largest relative error of the mains frequency
-BESIDE = 20  # bins on both sides of a multiple that the sinusoids must explain
-DRIFT = 3  # degree of the polynomial that describes the drift
-SURE = 80.0  # required fall of χ²; noise and 15 parameters exceed it once in 10⁹
-MISSED = 0.05  # fraction of the leakage of pulses that `_pulses` may fail to describe
-LEFT = 0.1  # largest fraction of the excess over noise that sinusoids may leave
 
 
 class Hum(NamedTuple):
@@ -74,18 +67,18 @@ class Hum(NamedTuple):
 def lines(
     frequency: Float[Array | np.ndarray, "*lane harmonic"],
 ) -> Bool[Array | np.ndarray, "*lane harmonic"]:
-    """Whether mains hum may fall on each harmonic.
+    """Whether mains hum may fall on each harmonic: within 2 % of the mains frequency.
 
     Args:
         frequency: Harmonics [Hz].
     """
-    of = namespace(frequency)
-    found = of.zeros(frequency.shape, bool)
+    xp = namespace(frequency)
+    on_line = xp.zeros(frequency.shape, bool)
     for mains in MAINS:
-        multiple = of.round(frequency / mains)
-        near = of.abs(frequency - multiple * mains) < NEAR * mains
-        found = found | (near & (multiple > 0) & (multiple <= MULTIPLES))
-    return found
+        multiple = xp.round(frequency / mains)
+        near = xp.abs(frequency - multiple * mains) < 0.02 * mains
+        on_line = on_line | (near & (multiple > 0) & (multiple <= MULTIPLES))
+    return on_line
 
 
 def separated(
@@ -103,7 +96,7 @@ def separated(
         samples: Number of samples from `etid.signals.harmonics.whole_periods`.
     """
     v = v[:samples]
-    return _found(v, sigma, sample_rate, periods) if np.isfinite(v).all() else None
+    return _fit(v, sigma, sample_rate, periods) if np.isfinite(v).all() else None
 
 
 def between(bins: Int[np.ndarray, " bin"], periods: int) -> Int[np.ndarray, " between"]:
@@ -123,16 +116,20 @@ def _near(
 ) -> tuple[Int[np.ndarray, " bin"], Complex[np.ndarray, "bin degree"]]:
     """Bins near multiples of the mains, without harmonics, and the powers of time in these bins."""
     around = np.round(multiples(samples / sample_rate)).astype(int).ravel()
-    near = around[:, None] + np.arange(-BESIDE, BESIDE + 1)[None, :]
+    near = around[:, None] + np.arange(-20, 21)[None, :]
     bins = between(near[near < samples // 2 - periods], periods)
-    powers = np.linspace(-1, 1, samples)[:, None] ** np.arange(1, DRIFT + 1)[None, :]
+    powers = np.linspace(-1, 1, samples)[:, None] ** np.arange(1, DRIFT_DEGREE + 1)[None, :]
     return bins, np.fft.rfft(powers, axis=0)[bins]
 
 
-def _found(
+def _fit(
     v: Float[np.ndarray, " time"], sigma: float, sample_rate: float, periods: int
 ) -> Hum | None:
-    """Hum by least squares; None if the sinusoids explain too little of the bins."""
+    """Hum by least squares; None if the sinusoids explain too little of the bins.
+
+    χ² must fall by 80, which noise and 15 parameters exceed once in 10⁹. `_pulses` may fail to
+    describe 5 % of the leakage of pulses. Sinusoids may leave a tenth of the excess over noise.
+    """
     seconds = v.size / sample_rate
     bins, drifts = _near(sample_rate, periods, v.size)
     unit = sigma / math.sqrt(2 * v.size)  # standard deviation of the real part of a bin
@@ -140,50 +137,51 @@ def _found(
     others = np.concatenate([drifts, _pulses(v, transform, bins, periods)], axis=1)
     others = np.concatenate([np.real(others), np.imag(others)])
     others /= np.sqrt(np.sum(others**2, axis=0, keepdims=True))
-    seen = np.concatenate([np.real(transform[bins]), np.imag(transform[bins])])
-    drifting, before = (_rest(others[:, :count], seen) for count in (DRIFT, DRIFT + 2))
-    if before - seen.size < max(SURE, MISSED * (drifting - before)):
+    measured = np.concatenate([np.real(transform[bins]), np.imag(transform[bins])])
+    drifting, before = _rest(others[:, :DRIFT_DEGREE], measured), _rest(others, measured)
+    significant = 80.0
+    if before - measured.size < max(significant, 0.05 * (drifting - before)):
         return None
     # Width of a weak prior: bins between the harmonics do not determine hum on a harmonic.
     weak = np.ptp(v) / unit
-    seen = np.concatenate([seen, np.zeros(2 * MULTIPLES)])
+    measured = np.concatenate([measured, np.zeros(2 * MULTIPLES)])
     prior = np.eye(2 * MULTIPLES, 2 * MULTIPLES + others.shape[1])
     import scipy.optimize  # takes a third of a second, which only recordings with hum need
 
     def fitted(frequency: float) -> tuple[float, Complex[np.ndarray, " multiple"]]:
         places = frequency * seconds * np.arange(1, MULTIPLES + 1)[None, :]
-        of, back = (_wave(at - bins[:, None], v.size) for at in (places, -places))
-        waves = np.concatenate([of + back, 1j * (of - back)], axis=1) * (weak / 2)
+        forward, back = (_wave(at - bins[:, None], v.size) for at in (places, -places))
+        waves = np.concatenate([forward + back, 1j * (forward - back)], axis=1) * (weak / 2)
         design = np.concatenate([np.real(waves), np.imag(waves)])
         design = np.concatenate([np.concatenate([design, others], axis=1), prior])
-        q = np.linalg.lstsq(design, seen)[0]
+        q = np.linalg.lstsq(design, measured)[0]
         z = q[:MULTIPLES] + 1j * q[MULTIPLES : 2 * MULTIPLES]
-        return float(np.sum((seen - design @ q) ** 2)), z * (weak * unit)
+        return float(np.sum((measured - design @ q) ** 2)), z * (weak * unit)
 
     def best(mains: float) -> tuple[float, float]:
-        reach = OFF * mains
+        reach = 2e-3 * mains
         # The grid moves the highest multiple by a quarter of a bin.
         count = 2 * math.ceil(4 * MULTIPLES * seconds * reach) + 3
         grid = mains + np.linspace(-reach, reach, count)
         at = int(np.clip(np.argmin([fitted(f)[0] for f in grid]), 1, count - 2))
-        found = scipy.optimize.minimize_scalar(
+        minimum = scipy.optimize.minimize_scalar(
             lambda f: fitted(f)[0],
             bounds=(grid[at - 1], grid[at + 1]),
             method="bounded",
             options={"xatol": 1e-9 * mains},
         )
-        return float(found.fun), float(found.x)
+        return float(minimum.fun), float(minimum.x)
 
     after, frequency = min(map(best, MAINS))
-    noise = seen.size + 4 * math.sqrt(2 * seen.size)
-    if before - after < SURE or after - noise > LEFT * (before - seen.size):
+    noise = measured.size + 4 * math.sqrt(2 * measured.size)
+    if before - after < significant or after - noise > 0.1 * (before - measured.size):
         return None
     return Hum(frequency, fitted(frequency)[1])
 
 
-def _rest(columns: Float[np.ndarray, "row column"], seen: Float[np.ndarray, " row"]) -> float:
-    """Sum of squares of `seen` after a least-squares fit of the columns."""
-    return float(np.sum((seen - columns @ np.linalg.lstsq(columns, seen)[0]) ** 2))
+def _rest(columns: Float[np.ndarray, "row column"], measured: Float[np.ndarray, " row"]) -> float:
+    """Sum of squares of `measured` after a least-squares fit of the columns."""
+    return float(np.sum((measured - columns @ np.linalg.lstsq(columns, measured)[0]) ** 2))
 
 
 def _pulses(
@@ -199,15 +197,14 @@ def _pulses(
     w = e^(−j 2π m/P). The first column multiplies it by the transform of one pulse, interpolated
     between the harmonics. The second column, times m, describes the error of the interpolation.
     """
-    one = v.size // periods
-    late = int(np.argmax(np.abs(v[:one])))
-    known = np.arange(0, bins.max() + periods + 1, periods)
-    turned = transform[known] * np.exp(2j * np.pi * known * late / v.size)
+    late = int(np.argmax(np.abs(v[: v.size // periods])))
+    of_pulses = np.arange(0, bins.max() + periods + 1, periods)
+    turned = transform[of_pulses] * np.exp(2j * np.pi * of_pulses * late / v.size)
     turned[0] = 0.0  # a transformer passes no direct voltage
-    pulse = np.interp(bins, known, turned.real) + 1j * np.interp(bins, known, turned.imag)
+    pulse = np.interp(bins, of_pulses, turned.real) + 1j * np.interp(bins, of_pulses, turned.imag)
     pulse = pulse * np.exp(-2j * np.pi * bins * late / v.size)
-    left = -1j * bins * pulse / (np.exp(-2j * np.pi * bins / periods) - 1)
-    return np.stack([left, left * bins], axis=1)
+    leaked = -1j * bins * pulse / (np.exp(-2j * np.pi * bins / periods) - 1)
+    return np.stack([leaked, leaked * bins], axis=1)
 
 
 def _wave(

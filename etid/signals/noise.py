@@ -43,25 +43,11 @@ from etid.signals.harmonics import DRIFT_DEGREE, WINDOW, harmonics, namespace
 # to them.
 ORDER = 6
 DIFFERENCE = np.array([(-1.0) ** k * math.comb(ORDER, k) for k in range(ORDER + 1)])
-GAIN = math.sqrt(np.sum(DIFFERENCE**2))  # noise of a difference over noise of a sample
-LONG = 30_000  # samples from which on every second difference suffices
-SPARSE = 16  # every 16th number tells between which limits the median of all is
-BRACKET = 1.5  # half the distance of these limits, in square roots of the number of ranks
-# Bisection to 1e-12 of the largest difference, which is at most 1e5 times the noise (at an edge).
-HALVINGS = 40
-MEDIAN_TO_SIGMA = 1.482602218505602  # standard deviation over median |x|, for a normal x
+# Noise of a sample over the median size of a difference; a normal x has σ = 1.4826 · median |x|.
+PER_MEDIAN = 1.482602218505602 / math.sqrt(np.sum(DIFFERENCE**2))
 RIPPLE = 1e-5  # error of the interpolation relative to the signal: a lower limit of the noise
 COARSE = 2.0  # step over noise; at this ratio 0.7 % of the saw-tooth is left
 VISIBLE = 1e-3  # of the signal; other errors hide the saw-tooth of a smaller step
-FLICKER = 2 / math.sqrt(math.pi)  # fraction of samples that change the code, times step over noise
-FEW = 256  # a converter without noise shows few values in so many samples
-EQUAL = 1e-3  # tolerance for equal steps, relative to a step
-LIFTS = 16  # number of offsets within a step
-SEED = 1948
-HARMONICS = 60  # number of lowest harmonics whose neighbours show 1/f noise
-# Logarithm of the ratio of likelihoods from which on noise is not white. Neighbouring differences
-# have common bins, so that it counts two thirds more than it proves.
-SURE = 16.0
 CORNERS = np.geomspace(10.0, 1e6, 101)[:, None, None]  # [Hz]
 # Mean of sample rate / f over the band of sixth differences: they see 1/f noise too.
 BY_DIFFERENCES = 2.37
@@ -83,8 +69,9 @@ def _median(x: Float[Array, " sample"]) -> Float[Array, ""]:
         below = jnp.sum(fixed <= middle, dtype=x.dtype) < half
         return jnp.where(below, middle, low), jnp.where(below, high, middle)
 
+    # To 1e-12 of the largest difference, which is at most 1e5 times the noise (at an edge).
     bounds = jnp.zeros((), x.dtype), jnp.max(fixed)
-    low, high = jax.lax.fori_loop(0, HALVINGS, halve, bounds)
+    low, high = jax.lax.fori_loop(0, 40, halve, bounds)
     return x[jnp.argmin(jnp.abs(fixed - (low + high) / 2))]
 
 
@@ -94,7 +81,7 @@ def noise_std(
 ) -> Float[Array | np.ndarray, "*record"]:
     """Standard deviation of the white noise in `v`, in the unit of `v`.
 
-    In records of more than `LONG` samples it comes from every second difference, in half of the
+    In records of more than 30 000 samples it comes from every second difference, in half of the
     time. Neighbouring differences share most of their samples, so the standard error grows from
     0.94 to 1.02 % only (33 330 samples). It is a weight, and enters standard errors and limits of
     tests in proportion.
@@ -106,28 +93,27 @@ def noise_std(
     floor = resolution / math.sqrt(12.0)
     if isinstance(v, np.ndarray):  # nothing is compiled
         middle = np.reshape(
-            [_middle(_sizes(one)) for one in v.reshape(-1, v.shape[-1])], v.shape[:-1]
+            [_middle(_sizes(record)) for record in v.reshape(-1, v.shape[-1])], v.shape[:-1]
         )
-        return np.asarray(np.maximum(MEDIAN_TO_SIGMA / GAIN * middle, floor))
+        return np.asarray(np.maximum(PER_MEDIAN * middle, floor))
     size = jnp.abs(jnp.diff(v, ORDER)[:: _every(v.shape[0])])
-    return jnp.maximum(MEDIAN_TO_SIGMA / GAIN * _median(size), floor)
+    return jnp.maximum(PER_MEDIAN * _median(size), floor)
 
 
 def _sizes(v: Float[np.ndarray, " time"]) -> Float[np.ndarray, " difference"]:
     """Size of all differences of the order `ORDER`, or of every second one."""
-    found = np.convolve(v, DIFFERENCE)[ORDER : v.size : _every(v.size)]
-    return np.abs(found)
+    return np.abs(np.convolve(v, DIFFERENCE)[ORDER : v.size : _every(v.size)])
 
 
 def _middle(sizes: Float[np.ndarray, " difference"]) -> float:
     """The median, one of the numbers.
 
-    Only the numbers between two limits are sorted, those around the median of a sample. This takes
-    less than half of the time of a partition of all numbers.
+    Only the numbers between two limits are sorted, those around the median of every 16th number.
+    This takes less than half of the time of a partition of all numbers.
     """
     half = sizes.size // 2
-    sample = np.sort(sizes[::SPARSE])
-    reach = round(BRACKET * math.sqrt(sample.size))
+    sample = np.sort(sizes[::16])
+    reach = round(1.5 * math.sqrt(sample.size))
     low = sample[max(sample.size // 2 - reach, 0)]
     high = sample[min(sample.size // 2 + reach, sample.size - 1)]
     between = np.compress((sizes >= low) & (sizes <= high), sizes)
@@ -140,7 +126,7 @@ def _middle(sizes: Float[np.ndarray, " difference"]) -> float:
 
 def _every(samples: int) -> int:
     """Step from one difference to the next."""
-    return 2 if samples > LONG else 1
+    return 2 if samples > 30_000 else 1
 
 
 class Measurement(eqx.Module):
@@ -184,31 +170,31 @@ def trusted(
     v: Float[Array | np.ndarray, " time"], sigma: Float[Array | np.ndarray, ""]
 ) -> Float[Array | np.ndarray, ""]:
     """Noise of a record, at least as large as the error of the interpolation."""
-    of = namespace(v)
-    return of.asarray(of.maximum(sigma, RIPPLE * of.ptp(v)))
+    xp = namespace(v)
+    return xp.asarray(xp.maximum(sigma, RIPPLE * xp.ptp(v)))
 
 
 # --- Coarse converters ---------------------------------------------------------------------------
 
 
 def shows_few(v: Float[np.ndarray, "*record time"]) -> Bool[np.ndarray, "*record"]:
-    """Whether the first samples have few values, as those of a converter without noise."""
-    first = np.sort(v[..., :FEW], axis=-1)
-    return np.asarray(np.count_nonzero(first[..., 1:] != first[..., :-1], axis=-1) < FEW // 2)
+    """Whether the first 256 samples have few values, as those of a converter without noise."""
+    first = np.sort(v[..., :256], axis=-1)
+    return np.asarray(np.count_nonzero(first[..., 1:] != first[..., :-1], axis=-1) < 128)
 
 
 def step_of(v: Float[np.ndarray, " time"]) -> float:
     """Step of the converter; 0 if the values are not multiples of one step."""
     if not shows_few(v):
         return 0.0
-    values = np.unique(v)
+    values, equal = np.unique(v), 1e-3
     steps = np.diff(values)
-    steps = steps[steps > EQUAL * EQUAL * np.ptp(v)]
+    steps = steps[steps > equal * equal * np.ptp(v)]
     if steps.size == 0 or values.size > v.size // 4:
         return 0.0
     step = float(steps.min())
     count = steps / step
-    return step if np.abs(count - np.round(count)).max() < EQUAL * count.max() else 0.0
+    return step if np.abs(count - np.round(count)).max() < equal * count.max() else 0.0
 
 
 def noise_before(v: Float[np.ndarray, " time"], step: float) -> float:
@@ -220,7 +206,8 @@ def noise_before(v: Float[np.ndarray, " time"], step: float) -> float:
     jumps = np.diff(v)
     jumps = jumps[np.abs(jumps) > step / 2]
     back = (jumps[1:] * jumps[:-1] < 0) & (np.abs(jumps[1:]) < 1.5 * step)
-    of_codes = step / FLICKER * np.count_nonzero(back) / v.size
+    # Noise of σ makes a fraction of 2 σ / (√π step) of all samples go back.
+    of_codes = step / (2 / math.sqrt(math.pi)) * np.count_nonzero(back) / v.size
     of_differences = math.sqrt(max(float(noise_std(v)) ** 2 - step**2 / 12, 0.0))
     return max(float(of_codes), of_differences)
 
@@ -234,16 +221,16 @@ def rounding_variance(
     v: Float[np.ndarray, " time"], step: float, periods: int, samples: int
 ) -> Float[np.ndarray, " harmonic"]:
     """E|error|² of the harmonics of a record [V²], from rounding and noise together."""
-    rng = np.random.default_rng(SEED)
-    noise = noise_before(v, step)
+    rng = np.random.default_rng(1948)
+    noise, offsets = noise_before(v, step), 16
     errors = []
-    for lift in (np.arange(LIFTS) + 0.5) / LIFTS * step:
+    for lift in (np.arange(offsets) + 0.5) / offsets * step:
         lifted = _before(v, step, rng.random()) + lift
         rounded = np.round((lifted + noise * rng.standard_normal(v.size)) / step) * step
         errors.append(np.asarray(harmonics(rounded - lifted, periods, samples)))
-    found = np.asarray(errors)
-    square = np.mean(np.abs(found) ** 2, axis=0)
-    variance = square * _together(found, square, np.asarray(harmonics(v, periods, samples)))
+    transforms = np.asarray(errors)
+    square = np.mean(np.abs(transforms) ** 2, axis=0)
+    variance = square * _together(transforms, square, np.asarray(harmonics(v, periods, samples)))
     # The edges determine the elements, and there the rounding errors of samples are independent.
     # So the variance is at least that of white noise of this size, common to all periods.
     return np.maximum(variance, (periods * step**2 / 12 + noise**2) / samples)
@@ -264,10 +251,10 @@ def _together(
     return np.maximum(2 * np.maximum(*together) / _around(square), 1.0)
 
 
-def _around(of: Float[np.ndarray, "*lift harmonic"]) -> Float[np.ndarray, "*lift harmonic"]:
+def _around(values: Float[np.ndarray, "*lift harmonic"]) -> Float[np.ndarray, "*lift harmonic"]:
     """Sums over `WINDOW` neighbouring harmonics."""
-    total = np.cumsum(np.pad(of, [(0, 0)] * (of.ndim - 1) + [(1, 0)]), axis=-1)
-    number = np.arange(of.shape[-1])
+    total = np.cumsum(np.pad(values, [(0, 0)] * (values.ndim - 1) + [(1, 0)]), axis=-1)
+    number = np.arange(values.shape[-1])
     first = np.maximum(number - WINDOW // 2, 0)
     return total[..., np.minimum(number + WINDOW // 2 + 1, number.size)] - total[..., first]
 
@@ -333,13 +320,15 @@ def corner(
     late = int(np.argmax(np.abs(v[: samples // periods])))
     means = v[: samples // periods * periods].reshape(periods, -1).mean(1)
     transform = np.asarray(scipy.fft.rfft(v))[bins] - _drifts(periods, samples) @ means
-    found = transform * (bins**2 * np.exp(2j * np.pi * bins * late / samples))
-    bend = found[:-2] - 2 * found[1:-1] + found[2:]
+    smooth = transform * (bins**2 * np.exp(2j * np.pi * bins * late / samples))
+    bend = smooth[:-2] - 2 * smooth[1:-1] + smooth[2:]
     ratio = (np.square(np.real(bend)) + np.square(np.imag(bend))) / (white * samples * sigma**2)
     weight, log_mean = _means(periods, samples, sample_rate)
     gained = np.einsum("chb,hb->c", weight, ratio) - log_mean  # not `@`, which starts BLAS threads
     best = int(np.argmax(gained))
-    return float(CORNERS[best, 0, 0]) if gained[best] > SURE else 0.0
+    # A logarithm of a ratio of likelihoods. Neighbouring differences have common bins, so that it
+    # counts two thirds more than it proves.
+    return float(CORNERS[best, 0, 0]) if gained[best] > 16 else 0.0
 
 
 @functools.lru_cache(maxsize=8)
@@ -355,8 +344,8 @@ def _drifts(periods: int, samples: int) -> Complex[np.ndarray, "harmonic between
 def _bins(
     periods: int, samples: int
 ) -> tuple[Int[np.ndarray, "harmonic between"], Float[np.ndarray, "difference between"]]:
-    """Bins k P + r, and the mean of |b|² for white noise."""
-    count = min(HARMONICS, samples // 2 // periods)
+    """Bins k P + r of the 60 lowest harmonics, and the mean of |b|² for white noise."""
+    count = min(60, samples // 2 // periods)
     bins = periods * np.arange(count)[:, None] + np.arange(1, periods)[None, :]
     return bins, _of_differences(bins**4.0)
 

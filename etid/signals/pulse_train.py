@@ -15,23 +15,8 @@ from jaxtyping import Bool, Complex, Float, Int
 
 from etid.signals.harmonics import fast_length
 
-COARSE = 512  # samples per period after averaging; enough to find the pulses
-HALF = 0.5  # a pulse begins and ends at this fraction of the highest sample
-RINGING = 0.02  # of a period; a shorter gap does not split a pulse in two
 EVEN = 0.05  # relative range of the spacings up to which the pulses have one rate
 RATE = 2e-3  # relative error of pulse_rate; a larger one is a wrong number, not an inexact clock
-CLOCK = 3e-4  # relative error of a clock; a larger one is reported
-# [samples] The rate is counted if the last pulse is farther from its nominal place than this. At
-# 20 dB noise moves it by 0.2. At 60 dB and dry skin, one sample would let aliases leak into the
-# harmonics, by two standard errors.
-SHIFTED = 0.5
-EDGE = 5e-6  # [s] time over which the rise of edges is measured, at any sample rate
-LAGS = 400  # [samples] largest lag, late or early
-PART = 1 / 4  # largest lag as a fraction of the period
-AROUND = 1 / 8  # fraction of a period before and after an edge that is correlated
-DELAYED = 1.0  # [samples] a fit takes smaller lags as they are: it fits delays, and skin delays too
-NEAR = 16  # [samples] largest lag that an aligned record may still have
-FINE = 0.5  # [samples] grid of the search for that lag
 
 
 @dataclasses.dataclass(frozen=True)
@@ -57,7 +42,8 @@ class PulseTrain:
         """Pulse rate [Hz] as measured by the clock of the converter.
 
         A clock error of 50 ppm moves the last of 30 periods by five samples. Averaging would then
-        remove the harmonics above the 600th.
+        remove the harmonics above the 600th. At 20 dB noise moves it by 0.2 samples. At 60 dB and
+        dry skin, one sample would let aliases leak into the harmonics, by two standard errors.
 
         Returns:
             The nominal rate of the recording if the last pulse is less than half a sample from its
@@ -66,7 +52,7 @@ class PulseTrain:
         nominal = self.sample_rate / self.pulse_rate
         if self.spacing is None or abs(self.spacing / nominal - 1) > RATE:
             return self.pulse_rate
-        if abs(self.spacing - nominal) * (self.edges.size - 1) < SHIFTED:
+        if abs(self.spacing - nominal) * (self.edges.size - 1) < 0.5:
             return self.pulse_rate
         return self.sample_rate / self.spacing
 
@@ -86,13 +72,13 @@ class PulseTrain:
             )
         if self.edges.size != 1:
             return ""
-        apart = max(self.edges[0], self.size - self.edges[0])
-        if apart <= (1 + EVEN) * nominal:
+        rest = max(self.edges[0], self.size - self.edges[0])
+        if rest <= (1 + EVEN) * nominal:
             return ""
         return (
-            f"There is one pulse and none in the {apart} samples beside it, but {said}. That would "
-            f"be right with sample_rate > {_counted(pulse_rate * apart)} Hz, or with "
-            f"pulse_rate < {_counted(rate / apart)} Hz."
+            f"There is one pulse and none in the {rest} samples beside it, but {said}. That would "
+            f"be right with sample_rate > {_counted(pulse_rate * rest)} Hz, or with "
+            f"pulse_rate < {_counted(rate / rest)} Hz."
         )
 
 
@@ -103,8 +89,8 @@ def _counted(rate: float) -> str:
 
 def find_pulses(v: Float[np.ndarray, " time"], sample_rate: float, pulse_rate: float) -> PulseTrain:
     """The pulses of an unloaded record, as `pulse_trains` finds them."""
-    (found,) = pulse_trains(v[None], sample_rate, pulse_rate)
-    return found
+    (train,) = pulse_trains(v[None], sample_rate, pulse_rate)
+    return train
 
 
 @np.errstate(over="ignore", invalid="ignore")  # of a damaged file
@@ -123,19 +109,19 @@ def pulse_trains(
         pulse_rate: Pulses per second [Hz]; may be wrong by an order of magnitude.
     """
     size, period = records.shape[1], sample_rate / pulse_rate
-    step = max(1, int(period / COARSE))
+    step = max(1, int(period / 512))
     number = size // step
     coarse = records[:, : number * step].reshape(len(records), number, step)
     coarse = np.einsum("rps->rp", coarse) / step
     nothing = PulseTrain(np.zeros(0, int), None, size, sample_rate, pulse_rate)
-    found = [nothing] * len(records)
+    trains = [nothing] * len(records)
     usable = np.isfinite(coarse).all(1) & (number > 0)
     if not usable.any():
-        return found
+        return trains
     coarse = coarse[usable]
     coarse = coarse - coarse.mean(1, keepdims=True)
     top = np.take_along_axis(coarse, np.argmax(np.abs(coarse), axis=1)[:, None], axis=1)
-    above = coarse / np.where(top != 0, top, 1.0) > np.where(top != 0, HALF, np.inf)
+    above = coarse / np.where(top != 0, top, 1.0) > np.where(top != 0, 0.5, np.inf)
     # The pulses of most records begin at the same places. These records are processed together.
     alike: dict[bytes, list[int]] = {}
     for row, key in enumerate(np.packbits(above, axis=1)):
@@ -149,17 +135,17 @@ def pulse_trains(
         spacings = _spacings(records, several, edges, step, sample_rate) if even else None
         for number, row in enumerate(several):
             spacing = None if spacings is None else float(spacings[number])
-            found[row] = PulseTrain(edges, spacing, size, sample_rate, pulse_rate)
-    return found
+            trains[row] = PulseTrain(edges, spacing, size, sample_rate, pulse_rate)
+    return trains
 
 
 def _edges_of(above: Bool[np.ndarray, " place"], period: float) -> Int[np.ndarray, " pulse"]:
     """Starts of the pulses, or their ends if there are more ends; none without a whole pulse."""
     turns = np.flatnonzero(np.diff(above)) + 1
     begins, ends = turns[above[turns]], turns[~above[turns]]
-    apart = max(1.0, RINGING * period)
-    begins = begins[np.diff(begins, prepend=-np.inf) > apart]
-    ends = ends[np.diff(ends, append=np.inf) > apart]
+    gap = max(1.0, 0.02 * period)  # a shorter gap is ringing
+    begins = begins[np.diff(begins, prepend=-np.inf) > gap]
+    ends = ends[np.diff(ends, append=np.inf) > gap]
     if not begins.size or not ends.size:
         return begins[:0]
     # A pulse that is cut by an end of the record has only one edge.
@@ -196,8 +182,8 @@ def _spacings(
 
 
 def rise_time(sample_rate: float) -> int:
-    """Number of samples over which the rise of edges is measured."""
-    return max(1, round(EDGE * sample_rate))
+    """Number of samples over which the rise of edges is measured, 5 µs at any sample rate."""
+    return max(1, round(5e-6 * sample_rate))
 
 
 def rises(v: Float[np.ndarray, "*record time"], rise: int) -> Float[np.ndarray, "*record sample"]:
@@ -232,8 +218,8 @@ def lags_of(
         trains: The pulses of each `v_th`.
 
     Returns:
-        The lags [samples]; None if both records have opposite polarity, are too far apart, or are
-        shorter than an edge.
+        The lags [samples]; None if both records have opposite polarity, are more than 400 samples
+        or a quarter of a period apart, or are shorter than an edge.
     """
     lags: list[float | None] = [None] * len(records)
     if not trains or records.shape[2] <= rise_time(trains[0].sample_rate):
@@ -243,7 +229,7 @@ def lags_of(
         alike.setdefault(_window(records[row, 0], train), []).append(row)
     for window, rows in alike.items():
         for row, lag in zip(rows, _lags(records, rows, window), strict=True):
-            lags[row] = float(lag) if abs(lag) <= min(LAGS, PART * _period(trains[row])) else None
+            lags[row] = float(lag) if abs(lag) <= min(400, _period(trains[row]) / 4) else None
     return lags
 
 
@@ -268,38 +254,39 @@ def _period(train: PulseTrain) -> float:
 
 
 def _window(v_th: Float[np.ndarray, " time"], train: PulseTrain) -> _Window:
-    """The samples around an edge of `v_th`, and half a period on both sides."""
+    """An eighth of a period around an edge of `v_th`, and half a period on both sides."""
     period = _period(train)
     rise, edges = rise_time(train.sample_rate), train.edges[train.edges < v_th.size]
     edge = int(edges[edges.size // 2] if edges.size else np.argmax(np.abs(rises(v_th, rise))))
-    around = int(AROUND * period)
+    around = int(period / 8)
     first, last = max(0, edge - around), min(edge + around + rise, v_th.size)
     return _Window(first, last, int(period / 2), rise)
 
 
 def _lags(
-    records: Float[np.ndarray, "recording 2 time"], rows: Sequence[int], of: _Window
+    records: Float[np.ndarray, "recording 2 time"], rows: Sequence[int], window: _Window
 ) -> Float[np.ndarray, " row"]:
     """The lags with the highest correlation; infinite if the polarity is wrong."""
-    template = rises(records[rows, 0, of.first : of.last], of.rise)
-    begin = of.first - of.reach
+    first, last, reach, rise = window
+    template = rises(records[rows, 0, first:last], rise)
+    begin = first - reach
     start = max(0, begin)
-    found = rises(records[rows, 1, start : of.last + of.reach], of.rise)
-    size = fast_length(template.shape[1] + 2 * of.reach)
+    searched = rises(records[rows, 1, start : last + reach], rise)
+    size = fast_length(template.shape[1] + 2 * reach)
     # Single precision suffices, and its transforms take a fourth of the time.
     both = np.zeros((len(rows), 2, size), np.float32)
-    both[:, 0, start - begin : start - begin + found.shape[1]] = found
+    both[:, 0, start - begin : start - begin + searched.shape[1]] = searched
     both[:, 1, : template.shape[1]] = template
     transforms = np.asarray(scipy.fft.rfft(both))
     products = scipy.fft.irfft(transforms[:, 0] * np.conj(transforms[:, 1]), size)
-    correlation = np.asarray(products)[:, : 2 * of.reach + 1]
-    lag = highest(correlation) - of.reach
+    correlation = np.asarray(products)[:, : 2 * reach + 1]
+    lag = highest(correlation) - reach
     return np.where(correlation.max(1) > -correlation.min(1), lag, np.inf)
 
 
 def whole_lag(lag: float) -> int:
-    """Lag to be removed [samples]; 0 if a fit takes the lag as it is."""
-    return 0 if abs(lag) <= DELAYED else round(lag)
+    """Lag to be removed [samples]; 0 up to one sample: a fit finds it, and skin delays too."""
+    return 0 if abs(lag) <= 1 else round(lag)
 
 
 def shifted(
@@ -317,7 +304,7 @@ def rest(
     weight: Float[np.ndarray, " frequency"],
     turn: Float[np.ndarray, " frequency"],
 ) -> float:
-    """Lag of a record behind its prediction [samples], between −`NEAR` and `NEAR`.
+    """Lag of an aligned record behind its prediction [samples], between −16 and 16.
 
     Args:
         predicted: Fourier coefficients of the prediction.
@@ -325,9 +312,10 @@ def rest(
         weight: Weight of each coefficient, such as the reciprocal of its variance.
         turn: Phase by which a delay of one sample turns each coefficient [rad].
     """
-    turned = np.conj(predicted) * measured * weight * np.exp(-1j * NEAR * turn)
-    step, correlation = np.exp(1j * FINE * turn), []
-    for _ in range(round(2 * NEAR / FINE) + 1):
+    largest, grid = 16, 0.5
+    turned = np.conj(predicted) * measured * weight * np.exp(-1j * largest * turn)
+    step, correlation = np.exp(1j * grid * turn), []
+    for _ in range(round(2 * largest / grid) + 1):
         correlation.append(turned.sum().real)
         turned = turned * step
-    return FINE * float(highest(np.array(correlation))) - NEAR
+    return grid * float(highest(np.array(correlation))) - largest

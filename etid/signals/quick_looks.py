@@ -13,22 +13,8 @@ from jaxtyping import Bool, Float, Int
 
 from etid.signals.mains import between, multiples
 
-HUM = 6.0  # standard deviations of a probe above which sinusoids are fitted
-LOWEST = 12  # bins of a look for 1/f noise
-FLICKER = 2.5  # standard deviations of such a probe: 5 % of all white records exceed it
 PROBED = 200_000  # [samples] longer records are not looked at: the probes would fill the memory
-USED = 1024  # samples of one product with the probes
 MERGED = 16  # samples that are averaged to compare periods
-FEWEST = 3  # periods that are needed to recognise a disturbed one
-# Limits relative to the largest value, of the unloaded and of the loaded voltage: 0.0125 and 0.05 V
-# at the converter in records of 2.5 V. A load cannot change the unloaded voltage.
-PART = np.array([0.005, 0.02])
-SHARE = 0.5  # limit relative to the value at the same place
-NOISE = 8.0  # limit relative to the standard deviation of a mean
-# [samples] In these means, cuts between samples seem to move periods by up to 0.09. A sample that
-# is lost between pulses moves them by 0.67 or more, one in the last pulse by 0.27.
-MOVED = 0.18
-MOVED_NOISE = 3.0  # the same relative to its standard deviation
 
 
 def humming(
@@ -53,15 +39,15 @@ def humming(
         return np.zeros(sigma.shape, bool)
     if samples > PROBED:
         return sigma > 0
-    probes, left = _hum_probes(sample_rate, periods, samples)
-    found = np.abs(_products(records, probes)).max(-1)
+    probes, response = _hum_probes(sample_rate, periods, samples)
+    size, limit = np.abs(_products(records, probes)).max(-1), 6 * sigma
     # A record that is not finite is refused later.
-    seen = (sigma > 0) & (found >= HUM * sigma) & (found < np.inf)
+    suspect = (sigma > 0) & (size >= limit) & (size < np.inf)
     rest = min(abs(periods * sample_rate / pulse_rate - samples), 0.5)
-    if rest > 0 and seen.any():
-        leaked = rest * left * np.abs(records[seen, :samples]).mean(-1)
-        seen[seen] = found[seen] >= HUM * sigma[seen] + leaked
-    return seen
+    if rest > 0 and suspect.any():
+        leaked = rest * response * np.abs(records[suspect, :samples]).mean(-1)
+        suspect[suspect] = size[suspect] >= limit[suspect] + leaked
+    return suspect
 
 
 def flickering(
@@ -70,11 +56,14 @@ def flickering(
     periods: int,
     samples: int,
 ) -> Bool[np.ndarray, "*record"]:
-    """Whether records may have 1/f noise; arguments as in `humming`."""
+    """Whether records may have 1/f noise; arguments as in `humming`.
+
+    Of all records with white noise, 5 % exceed the limit.
+    """
     if periods < 2 or samples > PROBED:
         return (sigma > 0) & (periods > 1)
-    found = np.abs(_products(records, _flicker_probes(periods, samples))).max(-1)
-    return (sigma > 0) & (found > FLICKER * sigma)
+    size = np.abs(_products(records, _flicker_probes(periods, samples))).max(-1)
+    return (sigma > 0) & (size > 2.5 * sigma)
 
 
 def uneven(
@@ -87,19 +76,49 @@ def uneven(
     """Whether recordings may have disturbed or shifted periods; arguments as in `disturbed`.
 
     The median of the periods, to which `disturbed` compares them, lies between the lowest and the
-    highest of them. With fewer than three periods, none is disturbed.
+    highest of them. Of two periods, nobody knows which one is disturbed.
     """
     if periods < 2 or spacing < 3 * MERGED:
         return np.zeros(len(records), bool)
     means = period_means(records, spacing, periods)
     shifted = _moved(records, means, sigma, spacing)
-    if periods < FEWEST:
+    if periods == 2:
         return shifted
     low, high = means.min(2), means.max(2)
-    floor = np.maximum(PART * high.max(2), NOISE / MERGED**0.5 * sigma) + step
     least, most = highest_beside(low), -highest_beside(-high)
-    allowed = SHARE * np.maximum(least, -most) + np.maximum(least - most, 0) + floor[..., None]
+    allowed = allowed_deviation(most, least, high.max(2), sigma, step)
     return ((high - low)[..., 1:-1] > allowed).any((1, 2)) | shifted
+
+
+def noise_limit(sigma: Float[np.ndarray, "recording 2"]) -> Float[np.ndarray, "recording 2"]:
+    """Largest deviation of a mean of `MERGED` samples by noise: eight standard deviations [V]."""
+    return 8.0 / MERGED**0.5 * sigma
+
+
+def allowed_deviation(
+    low: Float[np.ndarray, "recording 2 part"],
+    high: Float[np.ndarray, "recording 2 part"],
+    largest: Float[np.ndarray, "recording 2"],
+    sigma: Float[np.ndarray, "recording 2"],
+    step: Float[np.ndarray, "recording 2"],
+) -> Float[np.ndarray, "recording 2 part"]:
+    """By how much the means of a period may differ from the usual means [V].
+
+    The limit is a part of the largest value, plus half of the value at the same place, plus the
+    range of the means beside it.
+
+    Args:
+        low: Lowest usual mean beside each place [V].
+        high: Highest usual mean beside each place [V].
+        largest: Largest mean of a period [V].
+        sigma: Standard deviation of the noise of a sample of each record [V].
+        step: Step of the converter of each record if it is coarse, else 0 [V].
+    """
+    # 0.0125 and 0.05 V at the converter in records of 2.5 V. A load cannot change the unloaded
+    # voltage, so its limit is lower.
+    part = np.array([0.005, 0.02]) * largest
+    floor = np.maximum(part, noise_limit(sigma)) + step
+    return 0.5 * np.maximum(high, -low) + np.maximum(high - low, 0) + floor[..., None]
 
 
 def _moved(
@@ -123,8 +142,10 @@ def _moved(
     power = np.vecdot(change, change)
     power = np.where(power > 0, power, np.inf)
     lag = np.einsum("rvps,rvs->rvp", means[..., :-1], change) / power[..., None]
-    apart = np.ptp(lag[:, 1] - lag[:, 0], axis=1)
-    return apart > MOVED + MOVED_NOISE * np.sqrt((sigma**2 / power).sum(1) / MERGED)
+    spread = np.ptp(lag[:, 1] - lag[:, 0], axis=1)
+    # [samples] In these means, cuts between samples seem to move periods by up to 0.09. A sample
+    # that is lost between pulses moves them by 0.67 or more, one in the last pulse by 0.27.
+    return spread > 0.18 + 3 * np.sqrt((sigma**2 / power).sum(1) / MERGED)
 
 
 def _cuts(size: int, spacing: float, periods: int) -> tuple[Int[np.ndarray, " period"], int]:
@@ -140,7 +161,7 @@ def period_means(
     at, length = _cuts(records.shape[2], spacing, periods)
     shape = (*records.shape[:2], -1, MERGED)
     cut = [records[:, :, first : first + length].reshape(shape) for first in at]
-    means = np.stack([np.einsum("rvps->rvp", one) for one in cut], axis=2) / MERGED
+    means = np.stack([np.einsum("rvps->rvp", period) for period in cut], axis=2) / MERGED
     half = means.shape[3] // 2
     means -= np.partition(means, half, axis=3)[..., half, None]
     return means
@@ -176,12 +197,12 @@ def _products(
     A matrix product takes a tenth of the time of `einsum`. Its parts are so small that BLAS starts
     no threads.
     """
-    flat = records.reshape(-1, records.shape[-1])
-    found = np.zeros((len(flat), len(probes)))
-    for first in range(0, probes.shape[1], USED):
-        part = probes[:, first : first + USED]
-        found += flat[:, first : first + part.shape[1]] @ part.T
-    return found.reshape(*records.shape[:-1], -1)
+    flat, length = records.reshape(-1, records.shape[-1]), 1024
+    products = np.zeros((len(flat), len(probes)))
+    for first in range(0, probes.shape[1], length):
+        part = probes[:, first : first + length]
+        products += flat[:, first : first + part.shape[1]] @ part.T
+    return products.reshape(*records.shape[:-1], -1)
 
 
 @functools.lru_cache(maxsize=8)
@@ -206,6 +227,6 @@ def _hum_probes(
 
 @functools.lru_cache(maxsize=8)
 def _flicker_probes(periods: int, samples: int) -> Float[np.ndarray, "probe time"]:
-    """`_mixtures` of the lowest bins between the harmonics."""
-    low = [number for number in range(1, 2 * LOWEST) if number % periods][:LOWEST]
+    """`_mixtures` of the twelve lowest bins between the harmonics."""
+    low = [number for number in range(1, 24) if number % periods][:12]
     return _mixtures(np.array(low), np.arange(len(low)) % 2 == 1, samples)
