@@ -191,7 +191,7 @@ def test_what_is_declared_beyond_a_limit_is_refused_before_it_is_read(
     ("change", "message"),
     [
         (lambda f: f.create_group("/".join("g" * (limits.DEPTH + 2))), "groups deep"),
-        (lambda f: [f["s01"].attrs.update({f"x{i}": i}) for i in range(limits.ATTRIBUTES + 1)],
+        (lambda f: [f["s01"].attrs.update({f"x{i}": i}) for i in range(limits.NAMES + 1)],
          "attributes, at most"),
         (lambda f: f.__setitem__("s01/x", h5py.SoftLink("/s01/x")), "in a loop"),
     ],

@@ -16,19 +16,17 @@ DISPLAY = {
 }
 
 
-BASE = {"ohm": "Ω", "farad": "F", "second": "s", "ampere": "A"}  # units that take prefixes
+SYMBOLS = {"ohm": "Ω", "farad": "F", "second": "s", "ampere": "A", "volt": "V", "hertz": "Hz"}
 PREFIXES = {
     -15: "f", -12: "p", -9: "n", -6: "µ", -3: "m", 0: "", 3: "k", 6: "M", 9: "G", 12: "T"
 }  # fmt: skip
-LONG = 1e10  # from here on, a value or its error is shown as a power of ten
-NOTHING = 1e-8  # standard error over value, below which it is shown as 0
-USUAL = (0.01, 1e4)  # values in the unit of `DISPLAY` that are shown in this unit
 
 
 def scaled(unit: str, value: float = np.nan) -> tuple[float, str]:
     """Size [SI] and symbol of the unit in which a value is shown.
 
-    It is that of `DISPLAY`, or one with another prefix if the number would be very small or large.
+    It is that of `DISPLAY`, or one with another prefix if the number would be below 0.01 or above
+    10 000.
 
     Args:
         unit: SI unit, a key of `DISPLAY`.
@@ -36,10 +34,11 @@ def scaled(unit: str, value: float = np.nan) -> tuple[float, str]:
     """
     size = abs(value)
     shown = size / DISPLAY[unit][0]
-    if unit not in BASE or not (np.isfinite(shown) and shown > 0) or USUAL[0] <= shown < USUAL[1]:
+    usual = not (np.isfinite(shown) and shown > 0) or 0.01 <= shown < 1e4
+    if usual or unit not in SYMBOLS:
         return DISPLAY[unit]
     power = int(np.clip(3 * np.floor(np.log10(size) / 3), min(PREFIXES), max(PREFIXES)))
-    return 10.0**power, PREFIXES[power] + BASE[unit]
+    return 10.0**power, PREFIXES[power] + SYMBOLS[unit]
 
 
 def heading(name: str, unit: str, value: float = np.nan) -> str:
@@ -52,13 +51,14 @@ def plus_minus(value: float, error: float) -> str:
     """A value with its standard error, padded for a column.
 
     Both are rounded to two significant digits of the error. Without an error, the value has four
-    significant digits. The error of a fixed element, 1e-9 of it, is shown as 0.
+    significant digits. The error of a fixed element, 1e-9 of it, is shown as 0. From 1e10 on, both
+    are powers of ten.
     """
     if not np.isfinite(error) or error <= 0:
         return f"{value:10.4g}            "
-    if error < NOTHING * abs(value):
+    if error < 1e-8 * abs(value):
         return f"{value:10.7g} ± {0:<9}"
-    if max(abs(value), error) >= LONG:
+    if max(abs(value), error) >= 1e10:
         return f"{value:10.4g} ± {error:<9.2g}"
     digits = int(np.clip(1 - np.floor(np.log10(error)), 0, 9))
     return f"{value:10.{digits}f} ± {error:<9.{digits}f}"

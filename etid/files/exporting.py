@@ -70,7 +70,7 @@ def _columns(table: Table) -> dict[str, h5py.Dataset]:
     """The columns of `Fits.table()` as HDF5 datasets that are not read yet."""
     parameters = table.attribute("parameters")
     names = parameters if isinstance(parameters, list) else [parameters]
-    if not all(isinstance(name, str) for name in names) or len(names) > limits.COLUMNS:
+    if not all(isinstance(name, str) for name in names) or len(names) > limits.NAMES:
         raise RecordingError(
             f"is {parameters!r}, must be names", file=table.name, field="parameters",
             remedy="Fit the recordings again",

@@ -8,7 +8,7 @@ from etid.circuits.circuit import AbstractCircuit
 from etid.estimators.element_limits import Limits, limited, of_circuit
 from etid.identify import changes
 from etid.recordings.causes import why_implausible, why_misaligned
-from etid.recordings.preflight import FLAT, Inspected, preflight
+from etid.recordings.preflight import Inspected, preflight
 from etid.results.fit import Fit, Support
 from etid.results.verdicts import message, verdict
 
@@ -34,9 +34,9 @@ def explained(seen: Inspected, name: str) -> str:
 
 def _faulty(seen: Inspected, name: str) -> list[str]:
     """Names of the records that are flat, or that hold numbers that are not finite."""
-    records = {seen.recording.cause: seen.sigma_th, "v_out": seen.sigma_out}
+    records = seen.recording.cause, "v_out"
     if name == "flat":
-        faults = (seen.spans <= FLAT * np.array([*records.values()])) | (seen.spans == 0)
+        faults = seen.is_flat
     else:
         faults = [not np.isfinite(seen.recording.samples[one].values).all() for one in records]
     return [one for one, fault in zip(records, faults, strict=True) if fault]

@@ -35,10 +35,7 @@ from etid.recordings.untrusted import (
 )
 from etid.signals.pulse_train import find_pulses
 
-_DIGITS = 1000  # most digits of a number in a name; Python does not convert much longer numbers
 OPEN = 8  # most datasets of stacks that stay open
-
-_NAMES = {field.name for field in schema.FIELDS}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -299,8 +296,9 @@ class Scan:
 
     def _near_misses(self, names: list[str], known: dict[str, Field], path: str, of: str) -> None:
         absent = [name for name in known if name not in names]
+        other = {field.name for field in schema.FIELDS}
         for name in names:
-            near = None if name in _NAMES else near_miss(name, absent)
+            near = None if name in other else near_miss(name, absent)
             if near:
                 message = f"is not in the schema, did you mean {near}?"
                 self._report(path, f"{of}{name}", message, "Rename it")
@@ -420,5 +418,6 @@ class Scan:
 def _natural(name: str) -> list[tuple[int, str]]:
     """Sorting key that orders digits by their number: 2 before 10."""
     parts = re.split(r"([0-9]+)", name)
-    numbers = (part.isdecimal() and len(part) < _DIGITS for part in parts)
+    # Python does not convert numbers of more than 4300 digits.
+    numbers = (part.isdecimal() and len(part) < 1000 for part in parts)
     return [(int(p), "") if whole else (-1, p) for p, whole in zip(parts, numbers, strict=True)]

@@ -7,7 +7,7 @@ from typing import TypeVar
 import numpy as np
 from jaxtyping import Bool, Float
 
-from etid.recordings.recording import QUIETLY, Recording, Samples
+from etid.recordings.recording import Recording, Samples, quietly
 from etid.signals.disturbances import (
     Joint,
     Shifts,
@@ -25,9 +25,7 @@ from etid.signals.quick_looks import flickering, humming, uneven
 
 _Key = TypeVar("_Key", bound=Hashable)
 SEAM = 3  # samples on each side of the joint between two periods
-USED = 8192  # samples of one product
-JITTER = 0.2  # [samples] cuts between samples are known this well from samples beside them
-STEP = 4.0  # [standard deviations] largest difference that noise makes, there and elsewhere
+BY_CHANCE = 4.0  # [standard deviations] largest difference that noise makes
 
 
 class Group:
@@ -52,7 +50,7 @@ class Group:
         """Voltages of all periods as they were recorded [V]."""
         size = self.recordings[0].samples["v_out"].stored.size
         whole = np.empty((len(self.recordings), 2, size))
-        with QUIETLY():
+        with quietly():
             for records, one in zip(whole, self.recordings, strict=True):
                 for v, record in zip(records, _records(one), strict=True):
                     record.write_to(v)
@@ -67,14 +65,14 @@ class Group:
     @functools.cached_property
     def noise(self) -> Float[np.ndarray, "recording 2"]:
         """Standard deviations of the noise of a sample of `whole` [V]."""
-        with QUIETLY():
+        with quietly():
             return np.asarray(noise_std(self.whole, self.step))
 
     @functools.cached_property
     def coarse(self) -> Float[np.ndarray, "recording 2"]:
         """Converter steps [V] that exceed the noise, else 0."""
         found = np.zeros(self.step.shape)
-        with QUIETLY():
+        with quietly():
             spans = np.ptp(self.recorded_limits, axis=-1)
             visible = (self.step > VISIBLE * spans) | ((self.step == 0) & shows_few(self.whole))
         for row, which in np.argwhere(visible):
@@ -100,7 +98,7 @@ class Group:
         found: list[list[Hum | None]] = [[None, None] for _ in self.recordings]
         rates = self.sample_rate, self.pulse_rate
         for of, rows in _alike(self.whole_periods).items():
-            with QUIETLY():
+            with quietly():
                 suspect = humming(_part(self.whole, rows), self.noise[rows], *rates, *of)
             for number, which in np.argwhere(suspect):
                 row = rows[number]
@@ -159,7 +157,7 @@ class Group:
             counted, periods = key
             of = _part(self.quiet, rows), self.noise[rows], self.coarse[rows]
             spacing = self.sample_rate / counted
-            with QUIETLY():
+            with quietly():
                 suspect = np.flatnonzero(uneven(*of, spacing, periods))
                 for row in suspect:
                     records, sigma, step = (part[[row]] for part in of)
@@ -174,7 +172,7 @@ class Group:
         lags: list[float | None] = [None] * len(self.recordings)
         rows = [row for row, train in enumerate(self.trains) if not train.mismatch]
         trains = [self.trains[row] for row in rows]
-        with QUIETLY():
+        with quietly():
             found = lags_of(_part(self.quiet, rows), trains) if rows else []
         for row, lag in zip(rows, found, strict=True):
             lags[row] = lag
@@ -194,7 +192,7 @@ class Group:
                 counted = np.array([self.trains[row].counted for row in rows])
                 rest = np.abs(periods * self.sample_rate / counted - samples)
                 records, sigma = _part(self.quiet, rows), self.trusted[rows]
-                with QUIETLY():
+                with quietly():
                     found[rows] = is_periodic(records, sigma, rest, samples)
                     on_edge = ~is_periodic(records, sigma, np.ones(len(rows)), samples)
                 # Jitter of the last pulse looks like another pulse rate.
@@ -209,14 +207,14 @@ class Group:
         """Whether each record in `quiet` may have 1/f noise, by a quick look."""
         found = np.zeros(self.noise.shape, bool)
         for of, rows in _alike(self.whole_periods).items():
-            with QUIETLY():
+            with quietly():
                 found[rows] = flickering(_part(self.quiet, rows), self.trusted[rows], *of)
         return found
 
     def spectra(self, periods: int, samples: int) -> tuple[np.ndarray, ...]:
         """`etid.signals.harmonics.filled` for `quiet` and numbers from `whole_periods`."""
         if (periods, samples) not in self._spectra:
-            with QUIETLY():
+            with quietly():
                 found = np.asarray(harmonics(self.quiet, periods, samples))
                 fields = filled(found, self.trusted, self.sample_rate, periods, samples)
             self._spectra[periods, samples] = tuple(map(np.asarray, fields))
@@ -251,9 +249,9 @@ def limits_of(v: Float[np.ndarray, "*record time"]) -> Float[np.ndarray, "*recor
 def covariance_of(v: Float[np.ndarray, "*recording 2 time"]) -> Float[np.ndarray, "*recording 2 2"]:
     """Covariance of both voltages of each recording."""
     mean, square = v.mean(-1), np.zeros((*v.shape[:-1], 2))
-    with QUIETLY():
-        for first in range(0, v.shape[-1], USED):  # longer products start BLAS threads
-            part = v[..., first : first + USED]
+    with quietly():
+        for first in range(0, v.shape[-1], 8192):  # longer products start BLAS threads
+            part = v[..., first : first + 8192]
             square += np.vecdot(part[..., :, None, :], part[..., None, :, :])
         return square / v.shape[-1] - mean[..., :, None] * mean[..., None, :]
 
@@ -277,7 +275,7 @@ def is_periodic(
     """
     joint = np.concatenate([records[..., samples - SEAM : samples], records[..., :SEAM]], axis=-1)
     step = rest[..., None] * np.abs(np.diff(joint)).max(-1)
-    return np.asarray(~(step > STEP * sigma).any(-1))
+    return np.asarray(~(step > BY_CHANCE * sigma).any(-1))
 
 
 def _repeats(
@@ -300,10 +298,11 @@ def _repeats(
     cuts = np.rint(ends).astype(int)
     around = np.concatenate([np.arange(samples - SEAM, samples), np.arange(SEAM)])
     inside = records[:, cuts[:, None] + np.arange(-SEAM, SEAM)]
-    apart = np.abs(inside - records[:, None, around]).max(-1)
+    difference = np.abs(inside - records[:, None, around]).max(-1)
     step = np.abs(np.diff(inside)).max(-1)  # of a jitter of one sample
-    allowed = (np.abs(cuts - ends) + JITTER) * step + STEP * sigma[:, None]
-    return bool((apart <= allowed).all())
+    # The samples beside a cut say within 0.2 samples what lies between samples.
+    allowed = (np.abs(cuts - ends) + 0.2) * step + BY_CHANCE * sigma[:, None]
+    return bool((difference <= allowed).all())
 
 
 def _kept(

@@ -13,10 +13,10 @@ FREE_TRIALS = 10_000  # trials that may be declared without this check
 # Declared bytes per stored byte, above FREE. Compression shrinks converter codes by a factor below
 # 10. Deflate reaches its maximum of 1032 only if all samples are equal.
 COMPRESSION = 100
-DEPTH = 50  # nested groups, or tables and lists of a mapping; Python allows 1000 nested calls
-LINKS = 20  # soft links in a chain
-ATTRIBUTES = 1000  # attributes of one group or dataset; the schema has 13
+# Nested groups, soft links in a chain, or nested tables and lists of a mapping; Python allows 1000
+# nested calls.
+DEPTH = 50
+NAMES = 1000  # attributes of one group or dataset (the schema has 13), columns of a table
 ATTRIBUTE = 1 << 24  # [bytes] size of one attribute: the labels of TRIALS trials
-COLUMNS = 1000  # columns of a table
 MAPPING = 1 << 22  # [bytes] size of a mapping file
 FITS = 1 << 24  # rows of a file of fits

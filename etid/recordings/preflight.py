@@ -6,7 +6,7 @@ import math
 import numpy as np
 from jaxtyping import Bool, Float
 
-from etid.recordings.group import STEP, Group, covariance_of, is_periodic, limits_of
+from etid.recordings.group import BY_CHANCE, Group, covariance_of, is_periodic, limits_of
 from etid.recordings.recording import Recording
 from etid.recordings.remarks import Remark
 from etid.signals.aliases import aliases
@@ -19,17 +19,6 @@ from etid.signals.noise import RIPPLE, noise_std
 from etid.signals.pulse_train import PulseTrain, lags_of, rise_time, shifted, whole_lag
 
 SHORTEST = 4 * TAPS + 104  # [samples] edges of the interpolation, and 104 samples for the fit
-# [standard deviations] peak-to-peak value that noise alone hardly exceeds; a signal must exceed it
-FLAT = 8.0
-POWER = 1.01  # largest variance of v_out relative to v_th: a passive load takes power
-# [A] peak-to-peak; stimulators of nerves and skin stay below 0.1 A in each direction
-STRONGEST = 0.25
-# [Ω] ratio of the spans of v_out and current; electrodes in saline have 100 Ω, patches of membrane
-# in a pipette have 10 GΩ
-LEAST, GREATEST = 1.0, 1e12
-EQUAL = 1e-3  # largest relative difference of the amplitudes if no load is connected
-SAME = 1.5  # largest variance of their difference then, relative to the noise
-LATE = 5e-3  # fraction of the signal that a delay of 0.1 sample may leave at the edges
 
 
 class Inspected:
@@ -188,6 +177,12 @@ class Inspected:
         """Peak-to-peak values of `v_th` and of `v_out` [V]."""
         return self.limits[:, 1] - self.limits[:, 0]
 
+    @property
+    def is_flat(self) -> Bool[np.ndarray, "2"]:
+        """Whether `v_th` and `v_out` carry no signal: eight standard deviations span them."""
+        noise = 8 * np.array([self.sigma_th, self.sigma_out])
+        return (self.spans <= noise) | (self.spans == 0)
+
     @functools.cached_property
     def covariance(self) -> Float[np.ndarray, "2 2"]:
         """Covariance of `v_th` and `v_out` [V²]."""
@@ -316,55 +311,61 @@ class Inspected:
         return bool(is_periodic(self._quiet, sigma, np.asarray(1.0), self.periods[1]))
 
 
-def preflight(seen: Inspected, *, periodic: bool = False) -> str | None:
+def preflight(inspected: Inspected, *, periodic: bool = False) -> str | None:
     """Name of the verdict that forbids a fit; None if a fit is allowed.
 
     Verdicts: `too_short`, `nonfinite_samples`, `flat`, `saturated`, `wrong_unit`, `unconnected`,
     `rate_mismatch`, `misaligned`, `not_periodic`.
 
     Args:
-        seen: The recording with its properties.
+        inspected: The recording with its properties.
         periodic: Whether the fit needs whole pulse periods.
     """
-    of = seen.recording
+    of = inspected.recording
     shortest = max(SHORTEST, rise_time(of.sample_rate) + 1)
-    if of.samples["v_out"].stored.size < shortest or seen.v_th.size < shortest:
+    if of.samples["v_out"].stored.size < shortest or inspected.v_th.size < shortest:
         return "too_short"
-    if not np.isfinite(seen.limits).all():
+    if not np.isfinite(inspected.limits).all():
         return "nonfinite_samples"
-    noise = FLAT * np.array([seen.sigma_th, seen.sigma_out])
-    if ((seen.spans <= noise) | (seen.spans == 0)).any():
+    if inspected.is_flat.any():
         return "flat"
     # A current source holds its current, so a flat top of the current is no fault without noise.
-    th, out = seen.recorded_limits
-    volts = None if seen.has_current else of.adc_range
-    held = seen.has_current and is_command(float(seen.sigma_th), seen.step_th, seen.spans[0])
-    if not held and _is_saturated(seen.recorded_th, th, seen.step_th, volts):
+    th, out = inspected.recorded_limits
+    volts = None if inspected.has_current else of.adc_range
+    held = inspected.has_current and is_command(
+        float(inspected.sigma_th), inspected.step_th, inspected.spans[0]
+    )
+    if not held and _is_saturated(inspected.recorded_th, th, inspected.step_th, volts):
         return "saturated"
-    if _is_saturated(seen.recorded_out, out, seen.step_out, of.adc_range):
+    if _is_saturated(inspected.recorded_out, out, inspected.step_out, of.adc_range):
         return "saturated"
-    if seen.has_current and not is_plausible(seen.spans[1], seen.spans[0]):
+    if inspected.has_current and not is_plausible(inspected.spans[1], inspected.spans[0]):
         return "wrong_unit"
-    if not seen.has_current and _is_unconnected(seen):
+    if not inspected.has_current and _is_unconnected(inspected):
         return "unconnected"
-    if seen.train.mismatch:
+    if inspected.train.mismatch:
         return "rate_mismatch"
-    if _is_misaligned(seen) or (seen.shifts is not None and seen.kept is None):
+    if _is_misaligned(inspected) or (inspected.shifts is not None and inspected.kept is None):
         return "misaligned"
-    if periodic and not seen.is_periodic:
+    if periodic and not inspected.is_periodic:
         return "not_periodic"
     return None
 
 
 def is_plausible(voltage: float, current: float) -> bool:
-    """Whether the peak-to-peak v_out [V] and current [A] are those of a load at an electrode."""
-    return bool(current <= STRONGEST and LEAST <= voltage / current <= GREATEST)
+    """Whether the peak-to-peak v_out [V] and current [A] are those of a load at an electrode.
+
+    Stimulators of nerves and skin stay below 0.1 A in each direction. Electrodes in saline have
+    100 Ω, patches of membrane in a pipette 10 GΩ.
+    """
+    return bool(current <= 0.25 and 1.0 <= voltage / current <= 1e12)
 
 
-def _is_misaligned(seen: Inspected) -> bool:
-    if seen.has_current:  # a passive load takes power
-        return bool(seen.covariance[0, 1] <= 0)
-    return bool(seen.covariance[1, 1] > POWER * seen.covariance[0, 0] or seen.correlated is None)
+def _is_misaligned(inspected: Inspected) -> bool:
+    if inspected.has_current:  # a passive load takes power
+        return bool(inspected.covariance[0, 1] <= 0)
+    covariance = inspected.covariance
+    return bool(covariance[1, 1] > 1.01 * covariance[0, 0] or inspected.correlated is None)
 
 
 def _is_saturated(
@@ -380,19 +381,22 @@ def _is_saturated(
     return is_clipped(v, step)
 
 
-def _is_unconnected(seen: Inspected) -> bool:
+def _is_unconnected(inspected: Inspected) -> bool:
     """Whether v_out equals v_th, except for noise, an offset and a delay below one sample."""
-    covariance = covariance_of(np.stack(seen.aligned)) if seen.lag else seen.covariance
-    variance = seen.sigma_th**2 + seen.sigma_out**2
-    power = covariance[0, 0] - seen.sigma_th**2
+    covariance = (
+        covariance_of(np.stack(inspected.aligned)) if inspected.lag else inspected.covariance
+    )
+    variance = inspected.sigma_th**2 + inspected.sigma_out**2
+    power = covariance[0, 0] - inspected.sigma_th**2
     if power <= 0:  # nothing but noise; or squares that are too small for a number
         return False
-    size = seen.aligned[0].size
-    limit = EQUAL + STEP * math.sqrt(variance / (size * power))
+    size = inspected.aligned[0].size
+    limit = 1e-3 + BY_CHANCE * math.sqrt(variance / (size * power))
     if abs(covariance[0, 1] / power - 1) > limit:
         return False
-    x, y = (v - v.mean() for v in seen.aligned)
-    late = np.gradient(x)
+    x, y = (v - v.mean() for v in inspected.aligned)
+    slope = np.gradient(x)
     rest = y - x
-    rest = rest - late * ((late @ rest) / (late @ late))
-    return bool(rest @ rest <= size * (SAME * variance + LATE**2 * power))
+    rest = rest - slope * ((slope @ rest) / (slope @ slope))
+    # A delay of 0.1 sample leaves up to 0.5 % of the signal at the edges.
+    return bool(rest @ rest <= size * (1.5 * variance + 5e-3**2 * power))

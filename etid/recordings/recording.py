@@ -18,6 +18,7 @@ import numpy as np
 import numpy.typing as npt
 from jaxtyping import Float
 
+from etid.circuits.display import SYMBOLS
 from etid.circuits.overview import Overview, Overviewed
 from etid.recordings.errors import RecordingError as RecordingError
 from etid.recordings.errors import located, not_recorded
@@ -34,8 +35,7 @@ from etid.recordings.splitting import by_pauses, by_trigger
 from etid.recordings.values import real
 
 # Infinite samples get a verdict; neighbours of a damaged recording are not concerned.
-QUIETLY = functools.partial(np.errstate, invalid="ignore", over="ignore")
-SYMBOLS = {"hertz": "Hz", "ohm": "Ω", "volt": "V"}
+quietly = functools.partial(np.errstate, invalid="ignore", over="ignore")
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -81,7 +81,7 @@ class Samples:
         if self.conversion == 1 and self.offset == 0 and self.stored.dtype == np.float64:
             return self.stored
         values = np.empty(self.stored.shape)
-        with QUIETLY():
+        with quietly():
             self.write_to(values)
         values.flags.writeable = False
         return values
@@ -89,7 +89,7 @@ class Samples:
     def write_to(self, values: Float[np.ndarray, "..."]) -> None:
         """Write the samples in SI units [V or A] into an array of their shape.
 
-        The caller decides on warnings of infinite samples; `QUIETLY` for each record takes longer
+        The caller decides on warnings of infinite samples; `quietly` for each record takes longer
         than short records do.
         """
         values[...] = self.stored

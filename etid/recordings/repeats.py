@@ -34,22 +34,11 @@ from etid.recordings.preflight import Inspected
 from etid.signals.harmonics import fast_length
 from etid.signals.pulse_train import RATE
 
-BAND = 0.4  # largest frequency relative to the sample rate
 # Relative to the sample rate. Below it, bands share one estimate of their noise. Above it, aliases
 # can exceed the noise; each band then has its own.
 PLAIN = 0.25
-DEGREE = 6  # degree of the polynomial: it describes 0.994 of the 0.83 turns of 50 Hz hum
-SINGLE = 12  # number of lowest harmonics that each form a band
-RATIO = 1.08  # ratio of the edges of the bands above these harmonics
 ALIGNED = 1e-3  # [samples] a smaller delay changes the gain in proportion
-PASSES = 5  # iterations to align periods; a clock error of 200 ppm needs three
-# The same for V_th, of which only the amplitude is wanted. Without the samples between, the aliases
-# of its edges would look like another amplitude in each period: 1e-3 if every fourth remains.
-UNLOADED = 1 / 32
 TINY = 1e-30  # replaces the power of a record of zeros
-# Because cuts fall between samples, the amplitude of V_th differs by this number divided by the
-# square of the pulse width in samples: by 1e-4 for 133 samples, by 0.03 for 8 samples.
-CUT = 2.0
 SURE = 5.0  # [standard deviations] the noise of a band must exceed that of all bands by this
 
 
@@ -107,28 +96,28 @@ class Bands(NamedTuple):
 def bands(sample_rate: float, pulse_rate: float, band: float) -> Bands:
     """Bands for a nominal pulse rate, up to `band` times the sample rate.
 
+    Each of the twelve lowest harmonics is a band. Above them the edges of the bands have a ratio of
+    1.08. The polynomials have a degree of 6, which describes 0.994 of the 0.83 turns of 50 Hz hum.
     The measured pulse rate may differ from the nominal one.
     """
     length = int((1 - RATE) * sample_rate / pulse_rate)
     size = fast_length(length)
     count = int(band * size)
-    edges = [*range(min(SINGLE, count))]
-    while edges and edges[-1] * RATIO + 1 < count:
-        edges.append(int(np.ceil(edges[-1] * RATIO + 1e-9)))
+    edges, ratio = [*range(min(12, count))], 1.08
+    while edges and edges[-1] * ratio + 1 < count:
+        edges.append(int(np.ceil(edges[-1] * ratio + 1e-9)))
     edges = np.array(edges)
     number = np.diff([*edges, count])
     middle = 2 * np.pi * (edges + 1 + (number - 1) / 2) / size
     time = np.linspace(-1, 1, length)
-    transforms = np.fft.rfft(np.polynomial.legendre.legvander(time, DEGREE), size, axis=0)[
-        1 : count + 1
-    ]
+    transforms = np.fft.rfft(np.polynomial.legendre.legvander(time, 6), size, axis=0)[1 : count + 1]
     joined = np.linalg.qr(np.concatenate([transforms.real, transforms.imag]))[0].T
     polynomials = joined[:, :count] + 1j * joined[:, count:]
     polynomials = polynomials.astype(np.complex64, order="C")
     return Bands(length, size, edges, number, middle, polynomials)
 
 
-def repeats(seen: Sequence[Inspected]) -> list[Repeats | None]:
+def repeats(inspected: Sequence[Inspected]) -> list[Repeats | None]:
     """Deviations of the periods of each recording.
 
     The result is None for a recording with fewer than two periods or with a coarse converter: the
@@ -142,16 +131,16 @@ def repeats(seen: Sequence[Inspected]) -> list[Repeats | None]:
     differ after the subtraction of hum, hum was not the reason. Then the periods are compared as
     they were recorded.
     """
-    found: list[Repeats | None] = [None] * len(seen)
+    deviations: list[Repeats | None] = [None] * len(inspected)
     alike: dict[tuple, list[int]] = {}
-    for number, one in enumerate(seen):
+    for number, one in enumerate(inspected):
         coarse = one.coarse_th > 0 or one.coarse_out > 0
         if one.periods[0] > 1 and one.is_periodic and not coarse:
-            of = one.recording
-            key = one.has_current, one.periods[0], of.sample_rate, of.pulse_rate
+            recording = one.recording
+            key = one.has_current, one.periods[0], recording.sample_rate, recording.pulse_rate
             alike.setdefault(key, []).append(number)
     for numbers in alike.values():
-        group = [seen[number] for number in numbers]
+        group = [inspected[number] for number in numbers]
         records = [(one.v_th, one.v_out) for one in group]
         of_group = _of_equal_periods(group, records)
         for row, one in enumerate(group):
@@ -159,9 +148,9 @@ def repeats(seen: Sequence[Inspected]) -> list[Repeats | None]:
             if hum and _differ(of_group[row]):
                 recorded = [(one.recorded_th, one.recorded_out)]
                 (of_group[row],) = _of_equal_periods([one], recorded)
-        for number, of in zip(numbers, of_group, strict=True):
-            found[number] = of
-    return found
+        for number, of_one in zip(numbers, of_group, strict=True):
+            deviations[number] = of_one
+    return deviations
 
 
 def _differ(of: Repeats) -> bool:
@@ -176,39 +165,44 @@ def _of_equal_periods(
     group: Sequence[Inspected], records: Sequence[tuple[np.ndarray, np.ndarray]]
 ) -> list[Repeats]:
     """Deviations of recordings with equal rates and numbers of periods, from these voltages."""
-    of, (periods, _) = group[0].recording, group[0].periods
+    recording, (periods, _) = group[0].recording, group[0].periods
+    sample_rate, pulse_rate = recording.sample_rate, recording.pulse_rate
     at = np.stack([one.begins for one in group])
-    known = bands(of.sample_rate, of.pulse_rate, BAND)
+    layout = bands(sample_rate, pulse_rate, 0.4)
     sigma = np.array([one.trusted_out for one in group])
     # Without this shift, a late record would be cut within its pulses.
     loaded = [_turned(v, one) for one, (_, v) in zip(group, records, strict=True)]
-    own = _deviations(loaded, at, known, sigma)
+    own = _deviations(loaded, at, layout, sigma)
     sigma = np.array([one.trusted_th for one in group])
     if group[0].has_current:
         currents = [current for current, _ in records]
-        return _of_currents(group[0], known, loaded, currents, own, sigma, at)
-    low = bands(of.sample_rate, of.pulse_rate, UNLOADED)
+        return _of_currents(group[0], layout, loaded, currents, own, sigma, at)
+    # Of V_th only the amplitude is wanted. If some of the samples were left out, the aliases of its
+    # edges would look like another amplitude in each period: by 1e-3 if every fourth remains.
+    low = bands(sample_rate, pulse_rate, 1 / 32)
     unloaded = _deviations([v_th for v_th, _ in records], at, low, sigma)
     weight, smooth = 1 / unloaded.variance, _smooth(unloaded.mean, low)
     # Effect of an amplitude change by 1 after the projection of the polynomials.
     unit = 1 - (np.real(smooth.sum(2))[:, :, None] * smooth).sum(1) / unloaded.power
     total = (weight * _power(unit)).sum(1)
     along = np.real(unloaded.gain * (weight * np.conj(unit))[:, None, :]).sum(2)
-    amplitude, smooth = along / total[:, None], _smooth(own.mean, known)
+    amplitude, smooth = along / total[:, None], _smooth(own.mean, layout)
     # Coloured noise does not look like an amplitude change: the rest measures its size.
     rest = unloaded.gain - amplitude[:, :, None] * unit[:, None, :]
     freedom = (2 * low.middle.size - 1) * (periods - 1)
     noise = np.maximum(1.0, (weight[:, None, :] * _power(rest)).sum((1, 2)) / freedom)
     pulses = zip(group, records, strict=True)
     width = [_phase(v, *one.limits[0]) / periods for one, (v, _) in pulses]
-    variance = noise / total + (CUT / np.square(width)) ** 2
+    # Because cuts fall between samples, the amplitude differs by 1e-4 for 133 samples of a pulse,
+    # by 0.03 for 8 samples.
+    variance = noise / total + (2 / np.square(width)) ** 2
     parts = own.gain, own.power, smooth, own.variance, _turn(own.late), amplitude, variance
-    return _rows(of.sample_rate, known, parts)
+    return _rows(sample_rate, layout, parts)
 
 
-def _rows(sample_rate: float, known: Bands, parts: tuple[np.ndarray, ...]) -> list[Repeats]:
+def _rows(sample_rate: float, layout: Bands, parts: tuple[np.ndarray, ...]) -> list[Repeats]:
     """The rows of the fields after `sample_rate`."""
-    frequency = known.middle * (sample_rate / (2 * np.pi))
+    frequency = layout.middle * (sample_rate / (2 * np.pi))
     rate = np.asarray(sample_rate)
     return [Repeats(frequency, rate, *of_row) for of_row in zip(*parts, strict=True)]
 
@@ -223,7 +217,7 @@ def _turn(late: Float[np.ndarray, "lane period"]) -> Complex[np.ndarray, "lane p
 
 def _of_currents(
     first: Inspected,
-    known: Bands,
+    layout: Bands,
     loaded: Sequence[Float[np.ndarray, "_"]],
     currents: Sequence[Float[np.ndarray, "_"]],
     own: "_Deviations",
@@ -234,39 +228,39 @@ def _of_currents(
 
     Args:
         first: One of the recordings; all have equal rates.
-        known: The bands.
+        layout: The bands.
         loaded: Voltages.
         currents: Currents.
         own: Deviations of the voltages.
         sigma: Noise of the currents.
         at: Start of each period [samples].
     """
-    other = _deviations(currents, at, known, sigma)
+    other = _deviations(currents, at, layout, sigma)
     pairs = []
     for records, of in ((loaded, own), (currents, other)):
-        raw = _transforms(records, _starts(records, at, known), known)
+        raw = _transforms(records, _starts(records, at, layout), layout)
         unit = np.sqrt(of.power.sum(1))  # squares of small currents would underflow
-        turned = raw * _turns(own.late * (2 * np.pi / known.size), raw.shape[2])  # one clock
+        turned = raw * _turns(own.late * (2 * np.pi / layout.size), raw.shape[2])  # one clock
         turned = turned / unit[:, None, None]
-        noise = np.repeat(of.variance * of.power / unit[:, None] ** 2, known.number, axis=1)
+        noise = np.repeat(of.variance * of.power / unit[:, None] ** 2, layout.number, axis=1)
         pairs.append((turned, turned.mean(1), noise))
     (y, y_mean, y_noise), (x, x_mean, x_noise) = pairs
     white = 1 / np.sqrt(_power(x_mean) * y_noise + _power(y_mean) * x_noise)
     mean, by_y, by_x = white * x_mean * y_mean, white * x_mean, white * y_mean
     deviation = by_y[:, None] * y - by_x[:, None] * x
-    power = np.maximum(np.add.reduceat(_power(mean), known.edges, axis=1), TINY)
+    power = np.maximum(np.add.reduceat(_power(mean), layout.edges, axis=1), TINY)
     smooth, gain = [], []
     # A drift of either channel is a polynomial times the mean of the other one.
     for row in range(len(mean)):
-        drifts = np.concatenate([by_y[row] * known.polynomials, by_x[row] * known.polynomials])
+        drifts = np.concatenate([by_y[row] * layout.polynomials, by_x[row] * layout.polynomials])
         stacked = np.linalg.qr(np.concatenate([np.real(drifts), np.imag(drifts)], axis=1).T)[0].T
         basis = stacked[:, : mean.shape[1]] + 1j * stacked[:, mean.shape[1] :]
         rest = deviation[row] - np.real(deviation[row] @ basis.conj().T) @ basis
-        gain.append(np.add.reduceat(rest * mean[row].conj(), known.edges, axis=1) / power[row])
-        smooth.append(np.add.reduceat(mean[row].conj() * basis, known.edges, axis=1))
+        gain.append(np.add.reduceat(rest * mean[row].conj(), layout.edges, axis=1) / power[row])
+        smooth.append(np.add.reduceat(mean[row].conj() * basis, layout.edges, axis=1))
     none = np.zeros(at.shape)  # an amplitude that changes in both records does no harm
     parts = np.stack(gain), power, np.stack(smooth), 1 / power, _turn(own.late)
-    return _rows(first.recording.sample_rate, known, (*parts, none, np.ones(len(none))))
+    return _rows(first.recording.sample_rate, layout, (*parts, none, np.ones(len(none))))
 
 
 def _phase(v: Float[np.ndarray, " time"], low: float, high: float) -> int:
@@ -283,10 +277,10 @@ def _phase(v: Float[np.ndarray, " time"], low: float, high: float) -> int:
     return min(above, below) or max(above, below)
 
 
-def _smooth(mean: np.ndarray, known: Bands) -> np.ndarray:
+def _smooth(mean: np.ndarray, layout: Bands) -> np.ndarray:
     """Σ conj(Y) times each polynomial, for each recording and band."""
-    products = np.conj(mean)[:, None, :] * known.polynomials
-    return np.add.reduceat(products, known.edges, axis=2)
+    products = np.conj(mean)[:, None, :] * layout.polynomials
+    return np.add.reduceat(products, layout.edges, axis=2)
 
 
 def _turned(v_out: Float[np.ndarray, " time"], of: Inspected) -> Float[np.ndarray, " time"]:
@@ -307,38 +301,38 @@ class _Deviations(NamedTuple):
 def _deviations(
     records: Sequence[Float[np.ndarray, "_"]],
     at: Float[np.ndarray, "lane period"],
-    known: Bands,
+    layout: Bands,
     sigma: Float[np.ndarray, " lane"],
 ) -> "_Deviations":
     """Deviations of the periods with the starts `at` [samples]."""
     periods = at.shape[1]
-    starts = _starts(records, at, known)
+    starts = _starts(records, at, layout)
     late = starts - at
-    raw = _transforms(records, starts, known)
-    power, mean, weight, gain = _compared(raw, late, known)
-    for _ in range(PASSES):
+    raw = _transforms(records, starts, layout)
+    power, mean, weight, gain = _compared(raw, late, layout)
+    for _ in range(5):  # a clock error of 200 ppm needs three
         # Least-squares estimate of a delay, η = jωτ; it is approximate if the gain changes too.
-        of_delay = known.middle * weight
-        total = (known.middle * of_delay).sum(1)
+        of_delay = layout.middle * weight
+        total = (layout.middle * of_delay).sum(1)
         more = (np.imag(gain) * of_delay[:, None, :]).sum(2) / total[:, None]
-        surely = np.maximum(ALIGNED, SURE * sigma * np.sqrt(known.length / total))
+        surely = np.maximum(ALIGNED, SURE * sigma * np.sqrt(layout.length / total))
         moved = np.abs(more).max(1) > surely
         if not moved.any():
             break
         late = late + np.where(moved[:, None], more, 0.0)
-        again = _compared(raw[moved], late[moved], known)
+        again = _compared(raw[moved], late[moved], layout)
         for whole, part in zip((power, mean, weight, gain), again, strict=True):
             whole[moved] = part
     # The part that no change of the gain explains is noise.
-    rest = np.add.reduceat(power, known.edges, axis=1) - weight * _power(gain).sum(1)
-    freedom = 2 * (known.number - 1) * (periods - 1)
-    plain = known.middle < 2 * np.pi * PLAIN
+    rest = np.add.reduceat(power, layout.edges, axis=1) - weight * _power(gain).sum(1)
+    freedom = 2 * (layout.number - 1) * (periods - 1)
+    plain = layout.middle < 2 * np.pi * PLAIN
     overall = rest[:, plain].sum(1) / max(freedom[plain].sum(), 1)
-    overall = np.maximum(overall, sigma**2 * known.length / 2)[:, None]
+    overall = np.maximum(overall, sigma**2 * layout.length / 2)[:, None]
     freedom = np.maximum(freedom, 1)
     sure = rest > overall * (freedom + SURE * np.sqrt(2 * freedom))
-    noise = np.where(sure & (known.number > 1), rest / freedom, overall)
-    single = np.count_nonzero(known.number == 1)
+    noise = np.where(sure & (layout.number > 1), rest / freedom, overall)
+    single = np.count_nonzero(layout.number == 1)
     if single > 2:
         low = _noise_of_single(gain[:, :, :single], weight[:, :single])
         sure = low > overall[:, 0] * (1 + SURE * math.sqrt(2 / ((single - 2) * (periods - 1))))
@@ -347,10 +341,10 @@ def _deviations(
 
 
 def _starts(
-    records: Sequence[Float[np.ndarray, "_"]], at: Float[np.ndarray, "lane period"], known: Bands
+    records: Sequence[Float[np.ndarray, "_"]], at: Float[np.ndarray, "lane period"], layout: Bands
 ) -> Int[np.ndarray, "lane period"]:
     """The sample at which each period is cut."""
-    last = np.array([v.size - known.length for v in records])
+    last = np.array([v.size - layout.length for v in records])
     return np.minimum(np.rint(at), last[:, None]).astype(int)
 
 
@@ -370,35 +364,35 @@ def _power(values: np.ndarray) -> np.ndarray:
 
 
 def _transforms(
-    records: Sequence[Float[np.ndarray, "_"]], starts: Int[np.ndarray, "lane period"], known: Bands
+    records: Sequence[Float[np.ndarray, "_"]], starts: Int[np.ndarray, "lane period"], layout: Bands
 ) -> np.ndarray:
     """Harmonics of each period, without the mean of the record."""
-    cut = np.zeros((*starts.shape, known.size), np.float32)
-    used = cut[..., : known.length]  # the zeros after it make the transform fast
+    cut = np.zeros((*starts.shape, layout.size), np.float32)
+    used = cut[..., : layout.length]  # the zeros after it make the transform fast
     for v, own, places in zip(records, used, starts.tolist(), strict=True):
         for period, start in zip(own, places, strict=True):
-            period[:] = v[start : start + known.length]
+            period[:] = v[start : start + layout.length]
     used -= used.mean((1, 2), keepdims=True)
     # In single precision, this is four times as fast as the transform of NumPy.
     transform = np.asarray(scipy.fft.rfft(cut))
-    return transform[:, :, 1 : known.polynomials.shape[1] + 1]
+    return transform[:, :, 1 : layout.polynomials.shape[1] + 1]
 
 
 def _compared(
-    raw: np.ndarray, late: Float[np.ndarray, "lane period"], known: Bands
+    raw: np.ndarray, late: Float[np.ndarray, "lane period"], layout: Bands
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Power of the deviations, mean, its power, and `gain`, for periods with these delays."""
     # Most recordings of a batch are cut alike.
     alike = late[:1] if (late == late[0]).all() else late
-    deviation = raw * _turns(alike * (2 * np.pi / known.size), raw.shape[2])
+    deviation = raw * _turns(alike * (2 * np.pi / layout.size), raw.shape[2])
     mean = np.einsum("lpk->lk", deviation) / raw.shape[1]  # faster than `mean`
     deviation -= mean[:, None, :]
-    deviation = _without(deviation, known.polynomials)
-    weight = np.maximum(np.add.reduceat(_power(mean), known.edges, axis=1).astype(float), TINY)
+    deviation = _without(deviation, layout.polynomials)
+    weight = np.maximum(np.add.reduceat(_power(mean), layout.edges, axis=1).astype(float), TINY)
     parts = deviation.view(np.float32)
     square = np.einsum("lpk,lpk->lk", parts, parts)
     deviation *= np.conj(mean)[:, None, :]
-    sums = np.add.reduceat(deviation, known.edges, axis=2)
+    sums = np.add.reduceat(deviation, layout.edges, axis=2)
     return square[:, ::2] + square[:, 1::2], mean, weight, sums / weight[:, None, :]
 
 

@@ -13,12 +13,6 @@ from etid.recordings.errors import RecordingError
 
 HDF5 = (".h5", ".hdf5", ".hdf")
 
-# Endings of the formats that etid reads or writes, and of formats that people expect of it.
-_FORMATS = {
-    *(*HDF5, ".csv", ".txt", ".json", ".toml", ".parquet", ".nwb", ".cir", ".html", ".htm", ".pdf"),
-    *(".mat", ".tdms", ".abf", ".npz", ".npy", ".wav", ".lvm", ".xls", ".xlsx", ".png", ".svg"),
-}
-
 
 def check_ending(path: str | os.PathLike[str], endings: tuple[str, ...] = HDF5) -> None:
     """Raise an error if the name of a file says another format.
@@ -32,7 +26,13 @@ def check_ending(path: str | os.PathLike[str], endings: tuple[str, ...] = HDF5) 
     """
     file = pathlib.Path(path)
     suffix = file.suffix.lower()
-    if suffix in _FORMATS and suffix not in endings:
+    # Formats that etid reads or writes, and formats that people expect of it.
+    formats = {
+        *(*HDF5, ".csv", ".txt", ".json", ".toml", ".parquet", ".nwb", ".cir", ".html", ".htm"),
+        *(".mat", ".tdms", ".abf", ".npz", ".npy", ".wav", ".lvm", ".xls", ".xlsx"),
+        *(".pdf", ".png", ".svg"),
+    }
+    if suffix in formats and suffix not in endings:
         name = file.with_suffix(endings[0]).name
         raise RecordingError(f"the file is not written as {suffix}; name it {name}", file=str(file))
 

@@ -6,10 +6,6 @@ from jaxtyping import Float, Int
 from etid.recordings.errors import RecordingError
 from etid.signals.pulse_train import find_pulses
 
-PAUSE = 1.5  # [pulse periods] from one pulse to the next; a longer distance is a pause
-BEFORE = 0.2  # [pulse periods] rest that a part has before its first pulse
-EARLY = 0.1  # [pulse periods] by which a pulse may precede the trigger that starts it
-
 
 def by_pauses(
     v_th: Float[np.ndarray, " time"], sample_rate: float, pulse_rate: float
@@ -45,7 +41,8 @@ def by_trigger(
     """The parts of a record that begin at the rising edges of a trigger, each with whole periods.
 
     An edge is where the trigger rises through the middle of its range. A part has the pulses from
-    one edge to the next, up to the first pause.
+    one edge to the next, up to the first pause. A pulse may precede its trigger by a tenth of a
+    period.
 
     Args:
         trigger: Voltage of the trigger, in any unit.
@@ -65,7 +62,7 @@ def by_trigger(
         raise RecordingError("has no rising edge", field="trigger", remedy="Name another channel")
     period = sample_rate / pulse_rate
     edges = find_pulses(cause, sample_rate, pulse_rate).edges
-    _, *between = np.split(edges, np.searchsorted(edges, starts - EARLY * period))
+    _, *between = np.split(edges, np.searchsorted(edges, starts - period / 10))
     trains = [_trains(some, period)[0] for some in between if some.size]
     if not trains:
         raise RecordingError(
@@ -75,13 +72,16 @@ def by_trigger(
 
 
 def _trains(edges: Int[np.ndarray, " edge"], period: float) -> list[Int[np.ndarray, " _"]]:
-    """Pulses without a pause between them, from the places where pulses begin."""
-    return np.split(edges, np.flatnonzero(np.diff(edges) > PAUSE * period) + 1)
+    """Pulses without a pause of one and a half periods, from the places where pulses begin."""
+    return np.split(edges, np.flatnonzero(np.diff(edges) > 1.5 * period) + 1)
 
 
 def _parts(trains: list[Int[np.ndarray, " _"]], period: float, samples: int) -> list[slice]:
-    """Whole periods around trains of pulses; without those that an end of the record cuts."""
-    starts = [int(train[0] - round(BEFORE * period)) for train in trains]
+    """Whole periods around trains of pulses; without those that an end of the record cuts.
+
+    A fifth of the first period lies before its pulse.
+    """
+    starts = [int(train[0] - round(0.2 * period)) for train in trains]
     stops = [at + round(len(train) * period) for at, train in zip(starts, trains, strict=True)]
     both = zip(starts, stops, strict=True)
     return [slice(start, stop) for start, stop in both if start >= 0 and stop <= samples]

@@ -33,20 +33,12 @@ from etid.recordings.errors import RecordingError, located
 DAMAGED = "The file is damaged or was not closed: copy or record it again"
 
 _HEAP = b"GCOL\x01\0\0\0"
-_HEAP_HEAD = 16  # [bytes] signature, version, size of the collection
 _OBJECT = struct.Struct("<HH4xQ")  # index, reference count, size
 _TEXT = struct.Struct("<IQI")  # length, address of the heap, index of the object
-_DESCRIPTORS = np.dtype([("length", "<u4"), ("address", "<u8"), ("index", "<u4")])  # many of them
-# Message of an attribute: version, flags, sizes of its name, type and shape.
-_MESSAGE = struct.Struct("<BxHHH")
-_VERSION = re.compile(rb"(?=[\x01-\x03][\x00-\x03])")
 # Start of the type of a text of variable length: version and class, kind, and the size of `_TEXT`.
 _VARIABLE = re.compile(
     rb"[\x19\x29\x39\x49\x59][%b]..\x10\0\0\0" % bytes(range(1, 256, 16)), re.DOTALL
 )
-_DESCRIBED = 1 << 21  # [bytes] larger reads are samples
-_SIZES = {0: 13, 1: 13, 2: 9, 3: 9}  # offset of the sizes of numbers, by version of the superblock
-
 
 # For a block that reads an HDF5 file: all its errors become a RecordingError of this place.
 translated = functools.partial(
@@ -65,22 +57,22 @@ class Guarded(io.FileIO):
         start = self.tell()
         before = min(start, _TEXT.size)  # a signature or text may begin in the previous read
         self.seek(start - before)
-        seen = self.read(before + len(buffer) + _TEXT.size)
-        if len(seen) <= _DESCRIBED and _VARIABLE.search(seen):
-            self._check_texts(seen)
-        place = seen.find(_HEAP)
+        part = self.read(before + len(buffer) + _TEXT.size)
+        if len(part) <= 1 << 21 and _VARIABLE.search(part):  # larger reads are samples
+            self._check_texts(part)
+        place = part.find(_HEAP)
         while place >= 0:
             self._follow(start - before + place)
-            place = seen.find(_HEAP, place + 1)
-        part = seen[before : before + len(buffer)]
+            place = part.find(_HEAP, place + 1)
+        part = part[before : before + len(buffer)]
         buffer[: len(part)] = part
         self.seek(start + len(part))
         return len(part)
 
-    def _check_texts(self, seen: bytes) -> None:
+    def _check_texts(self, part: bytes) -> None:
         """Raise OSError if an attribute in these bytes has a text that is too long."""
         size = os.fstat(self.fileno()).st_size
-        longest = max(_lengths(seen), default=0)
+        longest = max(_lengths(part), default=0)
         if longest > min(size, limits.ATTRIBUTE):
             raise OSError(f"it has a text of {longest} bytes")
 
@@ -91,7 +83,7 @@ class Guarded(io.FileIO):
         damaged = OSError(f"the heap of texts at byte {heap} is damaged")
         if end > os.fstat(self.fileno()).st_size:  # the library would allocate its declared size
             raise damaged
-        place = heap + _HEAP_HEAD
+        place = heap + len(_HEAP) + 8
         while place <= end - _OBJECT.size:
             self.seek(place)
             index, _, length = _OBJECT.unpack(self.read(_OBJECT.size))
@@ -101,22 +93,24 @@ class Guarded(io.FileIO):
             place += step
 
 
-def _lengths(seen: bytes) -> Iterator[int]:
+def _lengths(part: bytes) -> Iterator[int]:
     """Lengths of the texts of variable length in messages of attributes."""
-    for match in _VERSION.finditer(seen, 0, max(len(seen) - _MESSAGE.size, 0)):
-        version, name, kind, space = _MESSAGE.unpack_from(seen, match.start())
+    message = struct.Struct("<BxHHH")  # version, flags, sizes of its name, type and shape
+    start = re.compile(rb"(?=[\x01-\x03][\x00-\x03])")
+    for match in start.finditer(part, 0, max(len(part) - message.size, 0)):
+        version, name, kind, space = message.unpack_from(part, match.start())
         unit = 8 if version == 1 else 1  # to which the parts are padded
-        name, kind, space = (-(-part // unit) * unit for part in (name, kind, space))
-        of_type = match.start() + _MESSAGE.size + (version == 3) + name
+        name, kind, space = (-(-size // unit) * unit for size in (name, kind, space))
+        of_type = match.start() + message.size + (version == 3) + name
         first = of_type + kind + space
-        if not _VARIABLE.match(seen, of_type):
+        if not _VARIABLE.match(part, of_type):
             continue
-        sides = seen[of_type + kind : first]
+        sides = part[of_type + kind : first]
         rank, begin = sides[1] if len(sides) > 1 else 0, 8 if sides[:1] == bytes([1]) else 4
         shape = sides[begin:][: 8 * rank]
         shape = struct.unpack_from(f"<{len(shape) // 8}Q", shape)
-        for at in range(first, len(seen) - _TEXT.size + 1, _TEXT.size)[: math.prod(shape)]:
-            yield _TEXT.unpack_from(seen, at)[0]
+        for at in range(first, len(part) - _TEXT.size + 1, _TEXT.size)[: math.prod(shape)]:
+            yield _TEXT.unpack_from(part, at)[0]
 
 
 @contextlib.contextmanager
@@ -160,8 +154,9 @@ def _check_numbers(raw: io.FileIO) -> None:
         raw.seek(place)
         head = raw.read(16)
         if head.startswith(b"\x89HDF\r\n\x1a\n"):
-            at = _SIZES.get(head[8])
-            if at is None or head[at : at + 2] != b"\x08\x08":
+            version = head[8]  # of the superblock
+            at = 13 if version < 2 else 9
+            if version > 3 or head[at : at + 2] != b"\x08\x08":
                 raise OSError("its addresses do not have 8 bytes")
             break
     raw.seek(0)
@@ -174,9 +169,9 @@ def attribute_names(owner: h5py.HLObject) -> list[str]:
         RecordingError: There are too many attributes.
     """
     names = list(owner.attrs)
-    if len(names) > limits.ATTRIBUTES:
+    if len(names) > limits.NAMES:
         raise RecordingError(
-            f"has {len(names)} attributes, at most {limits.ATTRIBUTES} are read",
+            f"has {len(names)} attributes, at most {limits.NAMES} are read",
             remedy="Remove attributes that are not in the schema",
         )
     return names
@@ -202,7 +197,7 @@ def attribute(owner: h5py.HLObject, name: str) -> Any:
     if isinstance(value, str):
         return _clean(value)
     if isinstance(value, np.ndarray) and value.dtype.hasobject:
-        items = [_clean(one) if isinstance(one, str) else one for one in value.ravel()]
+        items = [_clean(item) if isinstance(item, str) else item for item in value.ravel()]
         return np.array(items, object).reshape(value.shape)
     return value
 
@@ -259,7 +254,8 @@ def check_texts(dataset: h5py.Dataset, path: str) -> None:
     start = dataset.id.get_offset()
     if start is None or start + rows * _TEXT.size > size:
         raise RecordingError("its texts are not stored in one block of the file", remedy=DAMAGED)
-    texts = np.memmap(path, _DESCRIPTORS, "r", start, (rows,))
+    descriptor = np.dtype([("length", "<u4"), ("address", "<u8"), ("index", "<u4")])
+    texts = np.memmap(path, descriptor, "r", start, (rows,))
     declared = int(texts["length"].sum(dtype=np.uint64))
     if declared > size:  # each text has its own bytes in the file
         raise RecordingError(
@@ -297,7 +293,7 @@ def _check_soft(group: h5py.Group, path: str) -> None:
             )
         if isinstance(link, h5py.SoftLink):
             links += 1
-            if links > limits.LINKS:
+            if links > limits.DEPTH:
                 raise RecordingError("is a soft link in a loop", remedy="Remove the link")
             place = place.file if link.path.startswith("/") else place
             left += link.path.split("/")[::-1]
