@@ -9,11 +9,11 @@ from etid.circuits.circuit import (
     SkinRC,
     parameter,
 )
+from etid.circuits.circuit_string import circuit
 from etid.circuits.current_dependent import SkinCurrent, current_dependent_resistor
 from etid.circuits.elements import capacitor, cole, constant_phase, resistor
 from etid.circuits.impedance import parallel, series
 from etid.circuits.netlist import circuit_string, netlist
-from etid.circuits.written import circuit
 from etid.estimators.estimator import AbstractEstimator
 from etid.estimators.maximum_likelihood.estimator import MaximumLikelihood
 from etid.estimators.non_parametric.estimator import NonParametric
@@ -39,7 +39,7 @@ from etid.plotting import plot
 from etid.recordings.hdf5 import check, read
 from etid.recordings.recording import Recording, RecordingError, Samples
 from etid.recordings.study import Study
-from etid.results.data import provide as _provide
+from etid.results.data import attach_methods as _attach_methods
 from etid.results.driver import Driver
 from etid.results.fit import Fit, IdentificationError
 from etid.results.fits import Fits
@@ -50,7 +50,7 @@ from etid.selection.selection import Candidate, Selection
 from etid.simulation import scenes
 from etid.simulation.bound import Bound, Bounds, bound
 
-_provide(plot=plot, posterior=_posterior.posterior, profile=_profile.profile)
+_attach_methods(plot=plot, posterior=_posterior.posterior, profile=_profile.profile)
 
 __all__ = [
     "RESULTS",

@@ -101,8 +101,8 @@ def test_the_circuits_of_etid_are_public():
     ]
     for name, kind in lookup.built_in().items():
         assert getattr(etid, name) is kind
-        assert lookup.qualified(kind) == f"etid:{name}"
-        assert lookup.remembered(f"etid:{name}") is kind
+        assert lookup.class_path(kind) == f"etid:{name}"
+        assert lookup.circuit_class(f"etid:{name}") is kind
 
 
 def test_typical_layers_are_the_published_time_constants():

@@ -11,11 +11,12 @@ import pytest
 import etid
 from benchmarks import ngspice
 from benchmarks.ladder import CALIBRATION, rung
-from etid.circuits.elements import LADDER_ERROR, Exponent, Farad, Ohm, ladder
-from etid.circuits.netlist import BAND
+from etid.circuits.elements import Exponent, Farad, Ohm, ladder
 from etid.simulation.scenes import Trial
 
 SPREAD = etid.SkinCole(33.4e3, 186e3, 22e-6, 0.85)
+BAND = (1.0, 10e6)  # [Hz] default of `netlist`
+LADDER_ERROR = 1e-4  # its docstring states it
 FREQUENCY = np.geomspace(*BAND, 300)
 
 

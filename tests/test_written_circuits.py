@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import etid
-from etid.circuits.lookup import imported, qualified, remembered
+from etid.circuits.lookup import circuit_class, class_path, imported
 
 F = jnp.geomspace(10.0, 1e5, 40)
 
@@ -47,10 +47,10 @@ def test_an_element_occurs_once():
 
 def test_a_written_circuit_is_found_by_its_name_and_copied():
     one = etid.circuit("R0-p(R1,C1)")
-    assert qualified(type(one)) == "etid:R0-p(R1,C1)"
-    assert remembered("etid:R0-p(R1,C1)") is type(one) is imported("R0-p(R1,C1)")
+    assert class_path(type(one)) == "etid:R0-p(R1,C1)"
+    assert circuit_class("etid:R0-p(R1,C1)") is type(one) is imported("R0-p(R1,C1)")
     with pytest.raises(LookupError, match="is no circuit"):
-        remembered("etid:R0-p(R1,C1")
+        circuit_class("etid:R0-p(R1,C1")
     for again in (pickle.loads(pickle.dumps(one)), copy.deepcopy(one)):
         assert type(again) is type(one)
         np.testing.assert_array_equal(again.values(), one.values())

@@ -32,19 +32,6 @@ from etid.numpy_tier.tiers import program
 from etid.signals.transfer import frequency_variable
 
 _Same = TypeVar("_Same", bound="AbstractCircuit")
-# A parameter is proportional to these powers of the impedance and the time scale of its circuit.
-SCALING = {
-    "ohm": (1.0, 0.0),
-    "farad": (-1.0, 1.0),
-    "second": (0.0, 1.0),
-    "ampere": (-1.0, 0.0),
-    "siemens second^alpha": (-1.0, 0.8),  # for a typical α; used only for the start of a fit
-    "1": (0.0, 0.0),
-}
-# Number of standard errors by which a fitted exponent may exceed 1. If the true exponent is 1,
-# noise makes the fitted exponent exceed 1 in every second fit, mostly by less than one standard
-# error. It exceeds 1 by more than four standard errors in one of 30 000 fits.
-ABOVE_ONE = 4.0
 
 
 def parameter(unit: str, *, typical: float) -> Any:
@@ -102,7 +89,15 @@ class AbstractCircuit(Overviewed, eqx.Module):
     @classmethod
     def scaling(cls) -> Float[Array, "2 parameter"]:
         """Powers of impedance and of time scale to which each parameter is proportional."""
-        return jnp.array([SCALING[unit] for unit in cls.units().values()]).T
+        powers = {
+            "ohm": (1.0, 0.0),
+            "farad": (-1.0, 1.0),
+            "second": (0.0, 1.0),
+            "ampere": (-1.0, 0.0),
+            "siemens second^alpha": (-1.0, 0.8),  # for a typical α; used only for starts of a fit
+            "1": (0.0, 0.0),
+        }
+        return jnp.array([powers[unit] for unit in cls.units().values()]).T
 
     @program
     def response(self, frequency: Float[Array, "..."]) -> Complex[Array, "..."]:
@@ -147,23 +142,25 @@ class AbstractCircuit(Overviewed, eqx.Module):
         return self.impedance().exponents() if _has_exponents(type(self)) else ()
 
     def is_too_steep(self, cov: Float[Array, "parameter parameter"]) -> Bool[Array, ""]:
-        """Whether an exponent α exceeds 1 by more than `ABOVE_ONE` standard errors.
+        """Whether an exponent α exceeds 1 by more than four standard errors.
 
-        The impedance of a passive element cannot fall faster than that of a capacitor (α = 1).
+        The impedance of a passive element cannot fall faster than that of a capacitor (α = 1). If
+        the true α is 1, noise makes the fitted α exceed 1 in every second fit, mostly by less than
+        one standard error, and by more than four in one of 30 000 fits.
 
         Args:
             cov: Covariance of `log_values`.
         """
 
         def alphas(log_values: Float[Array, " parameter"]) -> Float[Array, " exponent"]:
-            found = self.with_log_values(log_values).exponents()
-            return jnp.stack([jnp.asarray(alpha) for alpha in found])
+            exponents = self.with_log_values(log_values).exponents()
+            return jnp.stack([jnp.asarray(alpha) for alpha in exponents])
 
         if not self.exponents():
             return jnp.array(False)
         slope = jax.jacfwd(alphas)(self.log_values())
         error = jnp.sqrt(jnp.diagonal(slope @ cov @ slope.T))
-        return jnp.any(alphas(self.log_values()) - 1 > ABOVE_ONE * error)
+        return jnp.any(alphas(self.log_values()) - 1 > 4 * error)
 
     def _overview(self) -> Overview:
         kind, values = type(self).__name__, np.asarray(self.values())

@@ -16,9 +16,6 @@ from etid.circuits.elements import capacitor, constant_phase, resistor
 from etid.circuits.impedance import AbstractImpedance, parallel, series
 
 MODULE = "circuit strings"  # of the classes: compiled programs of such a class are not stored
-_TOKEN = re.compile(r"\s*(?:(p)\(|(CPE|R|C)(\d+)|([-,)]))")
-# Typical values of skin, as those of `SkinRC`. Later capacitances are larger, as in `SkinLayers`.
-_SERIES, _PARALLEL, _CAPACITANCE, _LARGER = 20e3, 100e3, 0.3e-9, 10.0
 
 _Tree = tuple[str, Any]  # kind of a part, and its parts or the number of an element
 
@@ -36,15 +33,15 @@ def circuit(string: str) -> AbstractCircuit:
     Raises:
         ValueError: The string is not a circuit, or an element occurs twice.
     """
-    return kind_of(string)()
+    return class_of(string)()
 
 
-def is_written(name: str) -> bool:
+def is_circuit_string(name: str) -> bool:
     """Whether a text can only be a circuit string."""
     return bool(re.fullmatch(r"[RCPEp(),-]*\d[RCPEp(),\d-]*", name))
 
 
-def kind_of(string: str) -> type[AbstractCircuit]:
+def class_of(string: str) -> type[AbstractCircuit]:
     """The class of the circuits of a string.
 
     Raises:
@@ -82,7 +79,7 @@ def _kind(string: str) -> type[AbstractCircuit]:
 
 
 def _restored(string: str, values: dict[str, Any]) -> AbstractCircuit:
-    return kind_of(string)(**values)
+    return class_of(string)(**values)
 
 
 def _refuse(string: str, at: int) -> NoReturn:
@@ -95,8 +92,8 @@ def _refuse(string: str, at: int) -> NoReturn:
 def _series(string: str, at: int) -> tuple[_Tree, int]:
     parts = []
     while True:
-        token = _TOKEN.match(string, at)
-        if token is None or token[4]:
+        token = re.compile(r"(p)\(|(CPE|R|C)(\d+)").match(string, at)
+        if token is None:
             _refuse(string, at)
         if token[1]:
             branches, at = _branches(string, token.end())
@@ -110,36 +107,37 @@ def _series(string: str, at: int) -> tuple[_Tree, int]:
 
 
 def _branches(string: str, at: int) -> tuple[list[_Tree], int]:
-    found = []
+    branches = []
     while True:
         branch, at = _series(string, at)
-        found.append(branch)
-        if string[at : at + 1] == ")" and len(found) > 1:
-            return found, at + 1
+        branches.append(branch)
+        if string[at : at + 1] == ")" and len(branches) > 1:
+            return branches, at + 1
         if string[at : at + 1] != ",":
             _refuse(string, at)
         at += 1
 
 
 def _declare(string: str, tree: _Tree, fields: dict[str, Any], *, within: bool) -> None:
-    """Add the parameters of all elements to `fields`."""
+    """Add the parameters of all elements to `fields`.
+
+    Their typical values are those of skin, as in `SkinRC`. Later capacitances are larger, as in
+    `SkinLayers`.
+    """
     kind, rest = tree
     if kind in ("-", "p"):
         for part in rest:
             _declare(string, part, fields, within=within or kind == "p")
         return
-    capacitances = sum(name[0] in "cq" for name in fields)
+    larger = 10.0 ** sum(name[0] in "cq" for name in fields)
     own: dict[str, Any]
     if kind == "R":
-        typical = _PARALLEL if within else _SERIES
-        own = {f"r_{rest}": parameter("ohm", typical=typical)}
+        own = {f"r_{rest}": parameter("ohm", typical=100e3 if within else 20e3)}
     elif kind == "C":
-        typical = _CAPACITANCE * _LARGER**capacitances
-        own = {f"c_{rest}": parameter("farad", typical=typical)}
+        own = {f"c_{rest}": parameter("farad", typical=0.3e-9 * larger)}
     else:
-        typical = 2e-9 * _LARGER**capacitances
         own = {
-            f"q_{rest}": parameter("siemens second^alpha", typical=typical),
+            f"q_{rest}": parameter("siemens second^alpha", typical=2e-9 * larger),
             f"alpha_{rest}": parameter("1", typical=0.8),
         }
     if own.keys() & fields.keys():
@@ -147,15 +145,15 @@ def _declare(string: str, tree: _Tree, fields: dict[str, Any], *, within: bool) 
     fields |= own
 
 
-def _built(of: AbstractCircuit, tree: _Tree) -> AbstractImpedance:
+def _built(circuit: AbstractCircuit, tree: _Tree) -> AbstractImpedance:
     kind, rest = tree
     if kind in ("-", "p"):
-        parts = [_built(of, part) for part in rest]
+        parts = [_built(circuit, part) for part in rest]
         if len(parts) == 1:
             return parts[0]
         return series(*parts) if kind == "-" else parallel(*parts)
     if kind == "R":
-        return resistor(getattr(of, f"r_{rest}"))
+        return resistor(getattr(circuit, f"r_{rest}"))
     if kind == "C":
-        return capacitor(getattr(of, f"c_{rest}"))
-    return constant_phase(getattr(of, f"q_{rest}"), getattr(of, f"alpha_{rest}"))
+        return capacitor(getattr(circuit, f"c_{rest}"))
+    return constant_phase(getattr(circuit, f"q_{rest}"), getattr(circuit, f"alpha_{rest}"))

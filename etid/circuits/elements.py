@@ -45,7 +45,6 @@ PseudoCapacitance = Quantity
 
 # A ladder in time is exact from SLOWEST/N to FASTEST, times the sample rate, for N samples [rad].
 SLOWEST, FASTEST = 0.3, 10.0
-LADDER_ERROR = 1e-4  # largest relative error of the impedance in the band
 STEP = 0.95  # step h of ln x; the relative error of the trapezoidal rule is then 6e-5
 BEYOND = np.log(600.0)  # margin of ln x beyond the band: the ends are exact to first order only
 
@@ -149,8 +148,7 @@ class ConstantPhase(AbstractIrrational):
         """Write the ladder that replaces the element into the netlist."""
         low, high = netlist.band
         netlist.remarks.add(
-            f"constant-phase element as RC pairs, error below {100 * LADDER_ERROR:g} % "
-            f"from {low:g} Hz to {high:g} Hz"
+            f"constant-phase element as RC pairs, error below 0.01 % from {low:g} Hz to {high:g} Hz"
         )
         ladder(float(self.q), float(self.alpha), netlist.band).connect(netlist, plus, minus)
 

@@ -11,16 +11,14 @@ import reprlib
 from collections.abc import Iterable, Iterator
 
 from etid.circuits import circuit as circuits
-from etid.circuits import written
+from etid.circuits import circuit_string
 from etid.circuits.circuit import AbstractCircuit
 from etid.circuits.current_dependent import SkinCurrent
 
-_NAME = re.compile(r"([A-Za-z_]\w*(?:\.\w+)*):(?:[\w<>]+\.)*(\w+)", flags=re.ASCII)
 
-
-def qualified(kind: type[AbstractCircuit]) -> str:
+def class_path(kind: type[AbstractCircuit]) -> str:
     """Name of a circuit in a file of fits, such as `etid:SkinRC`."""
-    own = kind.__module__ in (circuits.__name__, written.MODULE)
+    own = kind.__module__ in (circuits.__name__, circuit_string.MODULE)
     module = "etid" if own else kind.__module__
     return f"{module}:{kind.__qualname__}"
 
@@ -30,7 +28,7 @@ def built_in() -> dict[str, type[AbstractCircuit]]:
     return {kind.__name__: kind for kind in _defined() if kind.__module__ == circuits.__name__}
 
 
-def remembered(stored: str, given: type[AbstractCircuit] | None = None) -> type[AbstractCircuit]:
+def circuit_class(stored: str, given: type[AbstractCircuit] | None = None) -> type[AbstractCircuit]:
     """Circuit class of a file of fits.
 
     Args:
@@ -42,23 +40,23 @@ def remembered(stored: str, given: type[AbstractCircuit] | None = None) -> type[
             to do.
     """
     string = stored.removeprefix("etid:")
-    if given is None and written.is_written(string):
+    if given is None and circuit_string.is_circuit_string(string):
         try:
-            return written.kind_of(string)
+            return circuit_string.class_of(string)
         except ValueError as error:
             raise LookupError(str(error)) from None
-    found = _NAME.fullmatch(stored)
-    if found is None and given is not None and qualified(given) == stored:
+    if given is not None and class_path(given) == stored:
         return given
-    if found is None:
+    names = re.fullmatch(r"([A-Za-z_]\w*(?:\.\w+)*):(?:[\w<>]+\.)*(\w+)", stored, re.ASCII)
+    if names is None:
         raise LookupError("This is not a name of a circuit: fit the recordings again")
-    module, name = found.groups()
+    module, name = names.groups()
     if given is not None:
         if given.__name__ != name:
             raise LookupError(f"The circuit that was passed is {given.__name__}: pass {name}")
         return given
     for kind in _defined():
-        if qualified(kind) == stored:
+        if class_path(kind) == stored:
             return kind
     if module == "etid":
         raise LookupError(
@@ -86,8 +84,8 @@ def imported(name: str) -> type[AbstractCircuit]:
     Raises:
         ValueError: The module cannot be imported or has no such circuit, or the string is none.
     """
-    if written.is_written(name):
-        return written.kind_of(name)
+    if circuit_string.is_circuit_string(name):
+        return circuit_string.class_of(name)
     module, _, attribute = name.rpartition(":")
     if not module:
         known = built_in()

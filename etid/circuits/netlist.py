@@ -8,16 +8,14 @@ import numpy as np
 from etid.circuits.circuit import AbstractCircuit
 from etid.circuits.impedance import Netlist, Notation
 
-BAND = (1.0, 10e6)  # [Hz] band in which a ladder replaces an element that SPICE does not have
-
 
 def netlist(
-    circuit: AbstractCircuit, *, name: str = "load", band: tuple[float, float] = BAND
+    circuit: AbstractCircuit, *, name: str = "load", band: tuple[float, float] = (1.0, 10e6)
 ) -> str:
     """SPICE subcircuit of resistors and capacitors between the nodes `plus` and `minus`.
 
     A chain of RC pairs replaces a constant-phase element. Its relative error in `band` is at most
-    `LADDER_ERROR`. A line such as `X1 out 0 load` connects the subcircuit.
+    1e-4. A line such as `X1 out 0 load` connects the subcircuit.
 
     Args:
         circuit: One circuit, such as `fit.circuit`.

@@ -30,15 +30,14 @@ import jax
 from tqdm import tqdm
 
 from etid.circuits.circuit import AbstractCircuit
-from etid.circuits.lookup import qualified
+from etid.circuits.lookup import class_path
 from etid.estimators.registry import Method
 from etid.identify.arguments import Asked, Circuit, Interval, asked_of, candidates_of, order_of
 from etid.identify.many import common_first, identify_part, to_identify
 from etid.identify.study_drivers import Drivers
-from etid.recordings.claiming import claimed
 from etid.recordings.hdf5 import read
 from etid.recordings.recording import RecordingError
-from etid.recordings.replacing import replace_text
+from etid.recordings.replacing import claimed, replace_text
 from etid.recordings.study import Study
 from etid.results.provenance import Settings
 from etid.results.study_fits import StudyFits
@@ -252,7 +251,7 @@ def fit_file(
             "source date": stamp,
             "circuit": hashlib.sha256(
                 " ".join(
-                    f"{qualified(type(one))} {eqx.tree_pformat(one)}" for one in candidates
+                    f"{class_path(type(one))} {eqx.tree_pformat(one)}" for one in candidates
                 ).encode()
             ).hexdigest(),
             "size of a part": PART,

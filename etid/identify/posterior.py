@@ -211,7 +211,7 @@ def given(
         ValueError: As in `Fit.posterior`.
     """
     require("fit", fit, Fit)
-    recording, driver = fit.made_from(recording, driver)
+    recording, driver = fit.source_or_own(recording, driver)
     if recording is None and fit.measured is not None:
         raise ValueError("a fit to a measured impedance has no draws and no profiles")
     if recording is None:

@@ -149,7 +149,7 @@ def _draw(
             f"show is {show!r}; it is for fits, and one of {', '.join(map(repr, get_args(Shown)))}"
         )
     if isinstance(x, Fit):
-        recording, driver = x.made_from(recording, driver)
+        recording, driver = x.source_or_own(recording, driver)
         if recording is None and x.measured is not None and show == "residual":
             raise ValueError("a fit to a measured impedance has no residual in time")
     with_current = recording is not None and "current" in recording.samples

@@ -1,7 +1,7 @@
 """What a fit was made from, and what can be done with it.
 
 Pictures, draws and profiles belong to higher layers, which this one must not import. `etid.public`,
-above all layers, hands their functions over with `provide`, so that a fit has them as methods.
+above all layers, hands them over with `attach_methods`, so that a fit has them as methods.
 """
 
 import dataclasses
@@ -22,19 +22,19 @@ if TYPE_CHECKING:
 
 Shown = Literal["pulse", "impedance", "residual"]
 AnyAxes = np.ndarray | Sequence["matplotlib.axes.Axes"] | None
-_Kind = TypeVar("_Kind", bound="WithData")
-_PROVIDED: dict[str, Callable[..., Any]] = {}
+_Kind = TypeVar("_Kind", bound="HasSource")
+_attached: dict[str, Callable[..., Any]] = {}
 
 
-def provide(**functions: Callable[..., Any]) -> None:
+def attach_methods(**functions: Callable[..., Any]) -> None:
     """Make functions the methods of these names; their first argument is the fit."""
-    _PROVIDED.update(functions)
+    _attached.update(functions)
 
 
-def _provided(name: str) -> Callable[..., Any]:
-    if name not in _PROVIDED:  # only modules of etid were imported so far, not its public names
+def _attached_method(name: str) -> Callable[..., Any]:
+    if name not in _attached:  # only modules of etid were imported so far, not its public names
         importlib.import_module("etid.public")
-    return _PROVIDED[name]
+    return _attached[name]
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -52,7 +52,7 @@ class MeasuredImpedance:
     stderr: Float[np.ndarray, " frequency"] | None
 
 
-class WithData(Generic[Circuit]):
+class HasSource(Generic[Circuit]):
     """A result that may know its recording and its driver, or its measured impedance.
 
     They are no fields, so JAX does not see them. A result that JAX or `dataclasses.replace` makes
@@ -86,7 +86,7 @@ class WithData(Generic[Circuit]):
         self.__dict__.update(fields)
         object.__setattr__(self, "_data", data)
 
-    def made_from(
+    def source_or_own(
         self, recording: Recording | None, driver: Driver | None
     ) -> tuple[Recording | None, Driver | None]:
         """The arguments if there is a recording among them, else what the result knows."""
@@ -116,7 +116,7 @@ class WithData(Generic[Circuit]):
         Raises:
             TypeError: The recording is not known.
         """
-        return _provided("plot")(self, recording, driver, show=show, axes=axes)
+        return _attached_method("plot")(self, recording, driver, show=show, axes=axes)
 
     def posterior(
         self,
@@ -146,7 +146,7 @@ class WithData(Generic[Circuit]):
             ValueError: The recording is not known, or the fit is a batch, or comes from another
                 method than maximum likelihood, or its data do not determine all elements.
         """
-        return _provided("posterior")(self, recording, driver, draws=draws, seed=seed)
+        return _attached_method("posterior")(self, recording, driver, draws=draws, seed=seed)
 
     def profile(
         self, name: str, recording: Recording | None = None, driver: Driver | None = None
@@ -164,7 +164,7 @@ class WithData(Generic[Circuit]):
         Raises:
             ValueError: The circuit has no such element, or as in `posterior`.
         """
-        return _provided("profile")(self, recording, driver, name)
+        return _attached_method("profile")(self, recording, driver, name)
 
 
 def with_data(

@@ -26,7 +26,7 @@ from etid.circuits.overview import Overview
 from etid.numpy_tier.tiers import program
 from etid.recordings.remarks import texts
 from etid.results.feed import AbstractFeed, CurrentSource
-from etid.results.tried_orders import TriedOrders
+from etid.results.tried_orders import OrderEvidence
 from etid.results.verdicts import RESULTS, message
 from etid.signals.filtering import StateSpace
 from etid.signals.harmonics import Spectrum
@@ -36,8 +36,6 @@ from etid.signals.transfer import (
     delay_variable,
     reciprocal,
 )
-
-SHOWN = 1e3  # [Hz] frequency of the Z_th that `print` shows
 
 
 class SourceImpedance(eqx.Module):
@@ -257,15 +255,11 @@ class Driver(AbstractFeed):
         return jnp.abs(self.response(frequency)) * self.log_response_stderr(frequency)[0]
 
     def _overview(self) -> Overview:
-        at, verdict = jax.device_put(np.array([SHOWN])), self.verdict
+        at, verdict = jax.device_put(np.array([1e3])), self.verdict
         z = complex(np.asarray(self.response(at))[0])
         of_size, of_phase = np.asarray(self.log_response_stderr(at))[:, 0].tolist()
         rows = [
-            (
-                f"|Z_th| at {SHOWN / 1e3:g} kHz",
-                plus_minus(abs(z) / 1e3, of_size * abs(z) / 1e3),
-                "kΩ",
-            ),
+            ("|Z_th| at 1 kHz", plus_minus(abs(z) / 1e3, of_size * abs(z) / 1e3), "kΩ"),
             ("its phase", plus_minus(*np.degrees((np.angle(z), of_phase)).tolist()), "°"),
         ]
         notes = [*self._findings(), *([message(verdict)] if verdict != "successful" else [])]
@@ -316,7 +310,7 @@ class ContinuousDriver(Driver):
     cov: Float[Array, "parameter parameter"]
     calibration: Calibration
     drift: Float[Array | np.ndarray, ""] | None = None
-    tried: TriedOrders = eqx.field(default_factory=TriedOrders.none)
+    tried: OrderEvidence = eqx.field(default_factory=OrderEvidence.none)
 
     def drift_std(self) -> Float[Array, " parameter"]:
         """Standard deviations of the parameters of `source` that come from `drift` alone."""

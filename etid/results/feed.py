@@ -18,8 +18,6 @@ from etid.circuits.overview import Overview
 from etid.results.verdicts import RESULTS, Judged, verdict
 from etid.signals.filtering import StateSpace
 
-NEVER = 1e-9  # [samples] standard deviation of a delay that is known
-
 
 class AbstractFeed(Judged):
     """What feeds a load.
@@ -104,8 +102,8 @@ class MeasuredCurrent(AbstractFeed):
         return jnp.zeros((0, 0))
 
     def late_std(self, sample_rate: Float[Array, ""]) -> Float[Array, ""]:
-        """Standard deviation of the delay of the calibration [samples]; none can be late."""
-        return jnp.full_like(sample_rate, NEVER)
+        """Standard deviation of the delay of the calibration [samples]: almost 0, it is known."""
+        return jnp.full_like(sample_rate, 1e-9)
 
     def _overview(self) -> Overview:
         return Overview("Measured current", [])

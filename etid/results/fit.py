@@ -15,7 +15,7 @@ from etid.circuits.circuit import Circuit
 from etid.circuits.display import quantity, several
 from etid.circuits.overview import Overview, element_rows
 from etid.recordings.remarks import texts, words
-from etid.results.data import WithData
+from etid.results.data import HasSource
 from etid.results.fits_columns import described
 from etid.results.limited import Limited
 from etid.results.verdicts import RESULTS, Judged, counted, message
@@ -84,7 +84,7 @@ class Support(eqx.Module):
         return cls(*(np.full((*lane, *size), np.nan) for size in sizes))
 
 
-class Fit(Judged, WithData[Circuit]):
+class Fit(Judged, HasSource[Circuit]):
     """One identified circuit, or a batch of them along a leading axis.
 
     Attributes:

@@ -1,4 +1,4 @@
-"""A table of many fits, its labels, and its file."""
+"""A table of many fits, its labels, its file, and medians, spreads and errors of its groups."""
 
 import dataclasses
 import importlib.metadata
@@ -12,13 +12,12 @@ import numpy as np
 
 from etid.circuits.circuit import AbstractCircuit, Circuit
 from etid.circuits.display import heading
-from etid.circuits.lookup import qualified
+from etid.circuits.lookup import class_path
 from etid.circuits.overview import Overview, Overviewed, element_rows
 from etid.recordings.fields import DESCRIBING, Label, wanted_labels
 from etid.results.fit import Fit
 from etid.results.fits_columns import DESCRIBED, LABELS, LIMITS, SCHEMA, columns_of
 from etid.results.hdf5_table import Table, opened_table, write_table
-from etid.results.summary import summary
 from etid.results.verdicts import counted, counts
 
 AND = " + "  # between the names of estimators
@@ -165,7 +164,7 @@ class Fits(Overviewed, Generic[Circuit]):
             A row for each group, sorted by the labels. Numbers are in SI units; they are NaN if the
             group has no successful fit.
         """
-        return summary(self, by)
+        return _summary(self, by)
 
     def _overview(self) -> Overview:
         rows, units = [], self.circuit.units()
@@ -196,7 +195,7 @@ class Fits(Overviewed, Generic[Circuit]):
             "schema": SCHEMA,
             "schema_version": "1.4",
             "etid_version": importlib.metadata.version("etid"),
-            "circuit": qualified(type(self.circuit)),
+            "circuit": class_path(type(self.circuit)),
             "parameters": list(self.circuit.names()),
             "method": self.fit.method,
         }
@@ -234,3 +233,41 @@ class Fits(Overviewed, Generic[Circuit]):
         kind, fields, labels, notes = columns_of(table, circuit)
         numbers = {name: fields.pop(name) for name in kind.names()}
         return Fits(Fit(circuit=kind(**numbers), **fields), labels, notes)
+
+
+@np.errstate(over="ignore", invalid="ignore")  # of a damaged file
+def _summary(fits: Fits, by: Sequence[str]) -> list[dict[str, Any]]:
+    """The rows of `Fits.summary`."""
+    columns = [map(str, fits.labels[name].tolist()) for name in by]
+    keys = list(zip(*columns, strict=True)) if by else [()] * len(fits)
+    groups = sorted(set(keys))
+    number = {key: i for i, key in enumerate(groups)}
+    place = np.array([number[key] for key in keys], int)
+    good = fits.successful()
+    place_good = place[fits.verdicts == "successful"]
+    order = np.argsort(place_good, kind="stable")
+    ends = np.searchsorted(place_good[order], np.arange(len(groups) + 1))
+    rows: list[dict[str, Any]] = [
+        dict(zip(by, key, strict=True)) | {"fits": int(count), "successful": int(size)}
+        for key, count, size in zip(
+            groups, np.bincount(place, minlength=len(groups)), np.diff(ends), strict=True
+        )
+    ]
+    for i, name in enumerate(fits.circuit.names()):
+        total, common = good.cov[:, i, i], good.fit.shared_cov[:, i, i]
+        parts = {
+            "": np.asarray(getattr(good.circuit, name)),
+            "_stderr": np.asarray(getattr(good.stderr, name)),
+            "_own": np.sqrt(np.maximum(total - common, 0.0)),
+            "_shared": np.sqrt(np.where(common >= 0, common, np.nan)),
+        }
+        for row, start, end in zip(rows, ends[:-1], ends[1:], strict=True):
+            chosen = order[start:end]
+            for part, values in parts.items():
+                row[name + part] = float(np.median(values[chosen])) if end > start else np.nan
+            several, values = chosen.size > 1, parts[""][chosen]
+            row[f"{name}_spread"] = float(np.std(values, ddof=1)) if several else np.nan
+            noise = float(np.mean(parts["_own"][chosen] ** 2)) if several else np.nan
+            excess = np.square(row[f"{name}_spread"]) - noise
+            row[f"{name}_between"] = float(np.sqrt(np.maximum(excess, 0.0)))
+    return rows

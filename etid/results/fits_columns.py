@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from etid.circuits.circuit import AbstractCircuit
-from etid.circuits.lookup import remembered
+from etid.circuits.lookup import circuit_class
 from etid.recordings.fields import DESCRIBING
 from etid.recordings.recording import RecordingError
 from etid.recordings.remarks import remarks_of
@@ -98,7 +98,7 @@ def _circuit(table: Table, given: type[AbstractCircuit] | None) -> type[Abstract
     """The class of the circuits in a file. The file cannot make etid import a module."""
     stored = table.text("circuit")
     try:
-        kind = remembered(stored, given)
+        kind = circuit_class(stored, given)
     except LookupError as error:
         raise RecordingError(
             f"is {reprlib.repr(stored)}",

@@ -20,6 +20,8 @@ from etid.recordings.untrusted import (
     translated,
 )
 
+REMEDY = "Fit the recordings again"
+
 
 def write_table(
     path: str | os.PathLike[str],
@@ -61,9 +63,6 @@ class Table:
         self.file = file
         self.name = name
 
-    def _error(self, field: str, message: str) -> RecordingError:
-        return RecordingError(message, file=self.name, field=field, remedy=_REMEDY)
-
     def text(self, name: str) -> str:
         """An attribute that is text.
 
@@ -72,7 +71,9 @@ class Table:
         """
         value = self.attribute(name)
         if not isinstance(value, str):
-            raise self._error(name, f"is {value!r}, must be text")
+            raise RecordingError(
+                f"is {value!r}, must be text", file=self.name, field=name, remedy=REMEDY
+            )
         return value
 
     def attribute(self, name: str) -> Any:
@@ -83,16 +84,16 @@ class Table:
         """
         with translated(self.name, field=name):
             if name not in self.file.attrs:
-                raise RecordingError("is missing", remedy=_REMEDY)
+                raise RecordingError("is missing", remedy=REMEDY)
             value = np.asarray(attribute(self.file, name))
             if value.dtype.kind not in "biufSUO":
-                raise RecordingError(f"has dtype {value.dtype}", remedy=_REMEDY)
+                raise RecordingError(f"has dtype {value.dtype}", remedy=REMEDY)
             plain = value.tolist()
             items = plain if isinstance(plain, list) else [plain]
-            found = [item.decode("utf-8") if isinstance(item, bytes) else item for item in items]
-            if not all(isinstance(item, str | int | float) for item in found):
-                raise RecordingError(f"is {plain!r}, must be numbers or texts", remedy=_REMEDY)
-        return found if isinstance(plain, list) else found[0]
+            items = [item.decode("utf-8") if isinstance(item, bytes) else item for item in items]
+            if not all(isinstance(item, str | int | float) for item in items):
+                raise RecordingError(f"is {plain!r}, must be numbers or texts", remedy=REMEDY)
+        return items if isinstance(plain, list) else items[0]
 
     @property
     def attributes(self) -> set[str]:
@@ -117,16 +118,14 @@ class Table:
         """
         with translated(self.name, field=name):
             if name not in self.file:
-                raise RecordingError("the column is missing", remedy=_REMEDY)
+                raise RecordingError("the column is missing", remedy=REMEDY)
             local_link(self.file, name)
             column = self.file[name]
             if not isinstance(column, h5py.Dataset):
-                raise RecordingError("is not a column", remedy=_REMEDY)
+                raise RecordingError("is not a column", remedy=REMEDY)
             if column.shape is None or column.ndim != 1 + len(shape) or column.shape[1:] != shape:
                 wanted = ", ".join(["fit", *map(str, shape)])
-                raise RecordingError(
-                    f"has shape {column.shape}, must be ({wanted})", remedy=_REMEDY
-                )
+                raise RecordingError(f"has shape {column.shape}, must be ({wanted})", remedy=REMEDY)
             if column.shape[0] > limits.FITS:
                 raise RecordingError(f"has {column.shape[0]} rows, at most {limits.FITS} are read")
             text = h5py.check_string_dtype(column.dtype)
@@ -137,7 +136,7 @@ class Table:
             }
             if not fits[kind]:
                 what = f"of type {column.dtype}" if text is None else "text"
-                raise RecordingError(f"is {what}, must be {kind}", remedy=_REMEDY)
+                raise RecordingError(f"is {what}, must be {kind}", remedy=REMEDY)
             check_size(column)
             if text is not None and text.length is None:
                 check_texts(column, self.name)
@@ -157,9 +156,6 @@ class Table:
             return np.asarray(column[rows])
 
 
-_REMEDY = "Fit the recordings again"
-
-
 @contextlib.contextmanager
 def opened_table(path: str | os.PathLike[str], kind: str) -> Iterator[Table]:
     """Open a file of columns.
@@ -174,11 +170,11 @@ def opened_table(path: str | os.PathLike[str], kind: str) -> Iterator[Table]:
     name = os.fspath(path)
     with guarded(name) as file:
         table = Table(file, name)
-        found = table.attribute("schema") if "schema" in table.attributes else None
-        if found != kind:
-            recordings = found == "etid/recording"
+        schema = table.attribute("schema") if "schema" in table.attributes else None
+        if schema != kind:
+            recordings = schema == "etid/recording"
             raise RecordingError(
-                f"is {found!r}, not {kind!r}",
+                f"is {schema!r}, not {kind!r}",
                 file=name,
                 field="schema",
                 remedy="This is a file of recordings: run etid fit first, and name the file of fits"
@@ -202,6 +198,6 @@ def same_length(table: Table, columns: Mapping[str, np.ndarray | h5py.Dataset]) 
                 f"has {size} rows, {next(iter(sizes))} has {first}",
                 file=table.name,
                 field=name,
-                remedy=_REMEDY,
+                remedy=REMEDY,
             )
     return first

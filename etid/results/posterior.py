@@ -13,7 +13,6 @@ from etid.circuits.overview import Overview, Overviewed
 from etid.solvers.importance_sampling import effective
 
 Circuit = TypeVar("Circuit", bound=AbstractCircuit)
-FEW = 100.0  # effective draws; with fewer, the ends of an interval are not worth two digits
 
 
 def tails(level: float) -> tuple[float, float]:
@@ -79,7 +78,7 @@ class Posterior(Overviewed, Generic[Circuit]):
             fitted = quantity(float(getattr(self.circuit, name)), unit, float(error))
             rows.append((name, middle, between(*ends[name], unit), fitted))
         notes = []
-        if self.effective < FEW:
+        if self.effective < 100:  # then the ends of an interval are not worth two digits
             notes.append(
                 "The draws represent the distribution badly; draw more, as in draws=10_000."
             )

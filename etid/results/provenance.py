@@ -14,8 +14,6 @@ from etid.circuits.circuit import AbstractCircuit
 from etid.recordings.study import Study
 from etid.results.tried_orders import AUTO, Order
 
-PACKAGES = ("etid", "jax", "jaxlib", "optimistix", "equinox", "numpy")
-
 
 @dataclasses.dataclass(frozen=True)
 class Settings:
@@ -116,4 +114,5 @@ class Settings:
 @functools.cache
 def _versions() -> tuple[str, ...]:
     """Packages and their versions; to look them up on disk takes as long as three skins."""
-    return tuple(f"{name} {importlib.metadata.version(name)}" for name in PACKAGES)
+    packages = ("etid", "jax", "jaxlib", "optimistix", "equinox", "numpy")
+    return tuple(f"{name} {importlib.metadata.version(name)}" for name in packages)

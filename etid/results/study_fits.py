@@ -32,12 +32,10 @@ from etid.results.driver import (
     SourceImpedance,
 )
 from etid.results.fits import SCHEMA, Fits
-from etid.results.hdf5_table import Table, opened_table, write_table
+from etid.results.hdf5_table import REMEDY, Table, opened_table, write_table
 from etid.results.provenance import Settings
-from etid.results.tried_orders import TriedOrders
+from etid.results.tried_orders import OrderEvidence
 from etid.results.verdicts import verdicts_of
-
-_SETTINGS = {field.name: field.type for field in dataclasses.fields(Settings)}
 
 
 @dataclasses.dataclass(frozen=True, eq=False, repr=False)
@@ -67,11 +65,11 @@ class StudyFits(Overviewed):
     @classmethod
     def concatenate(cls, parts: Iterable["StudyFits"]) -> "StudyFits":
         """One result from the parts of a study. All parts must have equal settings."""
-        found = list(parts)
-        drivers = {paths: driver for part in found for paths, driver in part.drivers.items()}
-        failures = {paths: text for part in found for paths, text in part.failures.items()}
-        fits = Fits.concatenate([part.fits for part in found])
-        return cls(fits, drivers, failures, found[0].settings)
+        parts = list(parts)
+        drivers = {paths: driver for part in parts for paths, driver in part.drivers.items()}
+        failures = {paths: text for part in parts for paths, text in part.failures.items()}
+        fits = Fits.concatenate([part.fits for part in parts])
+        return cls(fits, drivers, failures, parts[0].settings)
 
     def _overview(self) -> Overview:
         rows = [
@@ -134,7 +132,7 @@ class StudyFits(Overviewed):
                     f"holds a driver that cannot be read ({type(error).__name__}: {error})",
                     file=os.fspath(path),
                     field=f"drivers[{number}]",
-                    remedy="Fit the recordings again",
+                    remedy=REMEDY,
                 ) from error
             if isinstance(found, Driver):
                 drivers[paths] = found
@@ -144,21 +142,22 @@ class StudyFits(Overviewed):
 
 
 def _settings(table: Table) -> Settings | None:
-    if not table.attributes >= _SETTINGS.keys():
+    kinds = {field.name: field.type for field in dataclasses.fields(Settings)}
+    if not table.attributes >= kinds.keys():
         return None
     values: dict[str, Any] = {}
-    for name, kind in _SETTINGS.items():
+    for name, kind in kinds.items():
         value = table.attribute(name)
         several = typing.get_args(kind)  # only tuples; the file stores them as a list or one item
         items = value if several and isinstance(value, list) else [value]
-        wanted: Any = several[0] if several else kind
-        known = (int, float) if wanted is float else wanted
-        if not all(isinstance(item, known) and not isinstance(item, bool) for item in items):
+        item_kind: Any = several[0] if several else kind
+        allowed = (int, float) if item_kind is float else item_kind
+        if not all(isinstance(item, allowed) and not isinstance(item, bool) for item in items):
             raise RecordingError(
                 f"is {value!r}, must be {kind}",
                 file=table.name,
                 field=name,
-                remedy="Fit the recordings again",
+                remedy=REMEDY,
             )
         values[name] = tuple(items) if several else value
     return Settings(**values)
@@ -259,24 +258,24 @@ def _continuous(stored: Mapping[str, Any]) -> Callable[..., ContinuousDriver]:
         cov=_numbers(stored, "cov", 2, (size, size)),
         calibration=Calibration(r_load, delay, _numbers(stored, "delay_std_samples", 0)),
         drift=None if stored.get("drift") is None else _numbers(stored, "drift", 0),
-        tried=_tried(stored["tried"]) if "tried" in stored else TriedOrders.none(),
+        tried=_tried(stored["tried"]) if "tried" in stored else OrderEvidence.none(),
     )
 
 
-def _tried(stored: Mapping[str, Any]) -> TriedOrders:
+def _tried(stored: Mapping[str, Any]) -> OrderEvidence:
     """The orders that were tried.
 
     Raises:
         ValueError, TypeError, KeyError, OverflowError: The line is damaged.
     """
-    shape = TriedOrders.none().bic.shape
+    shape = OrderEvidence.none().bic.shape
     bic, missing_pole = (
         np.asarray(_numbers(stored, name, 1, shape)) for name in ("bic", "missing_pole")
     )
     adequate = np.asarray(stored["adequate"])
     if adequate.dtype.kind != "b" or adequate.shape != shape:
         raise TypeError(f"adequate is {reprlib.repr(stored['adequate'])}")
-    return TriedOrders(bic, missing_pole, adequate)
+    return OrderEvidence(bic, missing_pole, adequate)
 
 
 def _numbers(

@@ -15,7 +15,7 @@ AUTO: Literal["auto"] = "auto"
 LEAST, LARGEST = 4, 8
 
 
-class TriedOrders(eqx.Module):
+class OrderEvidence(eqx.Module):
     """Evidence of the calibrations for each order that `order="auto"` tried.
 
     The arrays have one place for each order from `LEAST` to `LARGEST`. Drivers therefore share
@@ -32,7 +32,7 @@ class TriedOrders(eqx.Module):
     adequate: Bool[Array | np.ndarray, " order"]
 
     @classmethod
-    def none(cls) -> "TriedOrders":
+    def none(cls) -> "OrderEvidence":
         """No order was tried, because the user chose it."""
         empty = np.full(LARGEST - LEAST + 1, np.nan)
         return cls(empty, empty, np.zeros(empty.shape, bool))

@@ -137,13 +137,6 @@ class RESULTS(optx.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]  # equi
     )
 
 
-# The text of lineax recommends an argument that etid does not have.
-_MESSAGES = {
-    "max_steps_reached": (
-        "The iteration did not converge; the fit reports the best iterate. "
-        "Average more periods, or use method='output_error'."
-    ),
-}
 _NAMES = {int(item._value): name for name, item in RESULTS._name_to_item.items()}
 
 
@@ -215,4 +208,9 @@ def own_part(verdict: str, note: str) -> str:
 @functools.cache
 def message(name: str) -> str:
     """Meaning and remedy of a verdict; empty for `successful`."""
-    return _MESSAGES.get(name, RESULTS[RESULTS._name_to_item[name]])
+    if name == "max_steps_reached":  # lineax recommends an argument that etid does not have
+        return (
+            "The iteration did not converge; the fit reports the best iterate. "
+            "Average more periods, or use method='output_error'."
+        )
+    return RESULTS[RESULTS._name_to_item[name]]

@@ -17,7 +17,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from etid.results.tried_orders import LARGEST, LEAST, TriedOrders
+from etid.results.tried_orders import LARGEST, LEAST, OrderEvidence
 
 PER_POLE = 2  # unknowns of one more pole: its rate and its gain
 
@@ -82,11 +82,11 @@ def next_order(tried: Sequence[TriedOrder]) -> int | None:
     return last.order + 1
 
 
-def evidence(tried: Sequence[TriedOrder]) -> TriedOrders:
+def evidence(tried: Sequence[TriedOrder]) -> OrderEvidence:
     """The evidence for all orders, as a driver keeps it."""
-    found = TriedOrders.none()
+    found = OrderEvidence.none()
     bic, missing_pole, adequate = map(np.array, (found.bic, found.missing_pole, found.adequate))
     for one in tried:
         place = one.order - LEAST
         bic[place], missing_pole[place], adequate[place] = one.bic, one.missing_pole, one.adequate
-    return TriedOrders(bic, missing_pole, adequate)
+    return OrderEvidence(bic, missing_pole, adequate)
