@@ -12,8 +12,8 @@ import etid
 from benchmarks.specimens import study_fits
 from etid import cli
 from etid.identify import file as streaming
-from etid.recordings import claiming
-from etid.recordings.claiming import claimed
+from etid.recordings import replacing
+from etid.recordings.replacing import claimed
 from etid.simulation.scenes import Scene, Trial
 from etid.simulation.transformer import ResistorLoad, SkinLoad
 
@@ -24,7 +24,7 @@ def contents(folder):
 
 HOLDS = """
 import sys, time
-from etid.recordings.claiming import claimed
+from etid.recordings.replacing import claimed
 with claimed(sys.argv[1]):
     print("holding", flush=True)
     time.sleep(600)
@@ -43,7 +43,7 @@ def command(tmp_path, monkeypatch):
     return ["fit", str(tmp_path / "study.h5"), "-o", str(tmp_path / "fits.h5")]
 
 
-@pytest.mark.skipif(claiming.fcntl is None, reason="this system has no locks of files")
+@pytest.mark.skipif(replacing.fcntl is None, reason="this system has no locks of files")
 def test_the_second_fit_says_who_writes_until_the_first_is_killed(command, tmp_path, capsys):
     parts = tmp_path / "fits.h5.parts"
     parts.mkdir()
@@ -82,14 +82,14 @@ def test_other_files_of_a_folder_are_free(tmp_path):
 
 def test_a_lock_that_is_removed_while_it_is_opened_is_made_anew(tmp_path, monkeypatch):
     """The first process ends between the moments when the second opens and locks its file."""
-    flock, stale = claiming.fcntl.flock, []
+    flock, stale = replacing.fcntl.flock, []
 
     def late(held, how):
         if not stale:
             stale.append(os.unlink(tmp_path / "fits.h5.lock"))
         flock(held, how)
 
-    monkeypatch.setattr(claiming.fcntl, "flock", late)
+    monkeypatch.setattr(replacing.fcntl, "flock", late)
     with claimed(tmp_path / "fits.h5"):
         assert (tmp_path / "fits.h5.lock").read_text() == (
             f"process {os.getpid()} on {platform.node()}"
@@ -101,7 +101,7 @@ def test_a_file_system_without_locks_refuses_nobody(tmp_path, monkeypatch):
     def missing(*_):
         raise OSError(38, "Function not implemented")
 
-    monkeypatch.setattr(claiming.fcntl, "flock", missing)
+    monkeypatch.setattr(replacing.fcntl, "flock", missing)
     with claimed(tmp_path / "fits.h5"), claimed(tmp_path / "fits.h5"):
         pass
 

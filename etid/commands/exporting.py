@@ -12,8 +12,6 @@ from etid.commands import Outcome
 from etid.commands.circuits import add_circuit
 from etid.files.exporting import CIRCUITS, TABLES, export_circuit, export_fits, export_study
 
-_FORMATS = (*TABLES, *CIRCUITS, ".nwb")
-
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments: the files, the recording, the start of the session, and the circuit."""
@@ -47,7 +45,7 @@ def moment(text: str) -> datetime.datetime:
 
 def outputs(arguments: argparse.Namespace) -> dict[pathlib.Path, tuple[str, ...]]:
     """The target; its ending chooses the format."""
-    return {arguments.target: _FORMATS}
+    return {arguments.target: (*TABLES, *CIRCUITS, ".nwb")}
 
 
 def run(arguments: argparse.Namespace) -> Outcome:

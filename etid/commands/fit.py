@@ -19,15 +19,12 @@ from etid.identify.arguments import order_of
 from etid.identify.file import fit_file, kept, processes
 from etid.identify.jointly import identify_jointly
 from etid.recordings import hdf5
-from etid.recordings.claiming import claimed
 from etid.recordings.errors import RecordingError
-from etid.recordings.replacing import HDF5
+from etid.recordings.replacing import HDF5, claimed
 from etid.report.html import Table
 from etid.results.study_fits import StudyFits
 from etid.results.tried_orders import Order
 from etid.results.verdicts import message, own_part
-
-_SHOWN = 20  # most unsuccessful recordings to list
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -252,14 +249,14 @@ def _summary(outcome: StudyFits) -> str:
     failed = np.flatnonzero(fits.verdicts != "successful")
     if failed.size:
         lines += ["", f"without success: {several(failed.size, 'recording')}"]
-    for verdict in dict.fromkeys(fits.verdicts[failed[:_SHOWN]].tolist()):
-        same = [i for i in failed[:_SHOWN] if fits.verdicts[i] == verdict]
+    listed = failed[:20]
+    for verdict in dict.fromkeys(fits.verdicts[listed].tolist()):
+        same = [i for i in listed if fits.verdicts[i] == verdict]
         paths, notes = fits.labels["path"][same].tolist(), fits.notes[same].tolist()
         lines += _explained(verdict, paths, notes)
-    if failed.size > _SHOWN:
-        lines.append(
-            f"and {failed.size - _SHOWN} more; the file of fits contains a note for each fit"
-        )
+    if failed.size > listed.size:
+        more = failed.size - listed.size
+        lines.append(f"and {more} more; the file of fits contains a note for each fit")
     return "\n".join(lines)
 
 

@@ -20,9 +20,6 @@ from etid.recordings.fields import SIGNALS, Metadata, metadata_from
 from etid.recordings.recording import AbstractSource, Layout, Recording, RecordingError, Samples
 from etid.recordings.splitting import by_pauses, by_trigger
 
-# [pulse periods] A matrix with more trials than samples and with shorter trials must be transposed.
-_SHORTEST_STACKED = 0.1
-
 
 @dataclasses.dataclass(frozen=True)
 class Used:
@@ -167,7 +164,7 @@ def sources_of(
     trials = rows["v_out"]
     stacked = len(channels["v_out"].shape) == 2 and not isinstance(plan.signals["v_out"].rows, int)
     periods = length * common.pulse_rate / rate
-    if stacked and len(trials) > length and periods < _SHORTEST_STACKED:
+    if stacked and len(trials) > length and periods < 0.1:  # it must be transposed
         raise RecordingError(
             f"{plan.signals['v_out'].channel!r} would be {len(trials)} trials of {length} samples, "
             f"{periods:.2g} pulse periods each",
@@ -235,23 +232,23 @@ def _parts(
             field="split",
             remedy="Name the channel of a trigger",
         )
-    asked = channels["v_th"] if by_pulses else channel(plan.split)
-    for one in (*channels.values(), asked):
-        if len(one.shape) != 1:
+    separating = channels["v_th"] if by_pulses else channel(plan.split)
+    for own in (*channels.values(), separating):
+        if len(own.shape) != 1:
             raise RecordingError(
-                f"channel {one.name!r} has shape {one.shape}; only a channel of shape (time,) can "
+                f"channel {own.name!r} has shape {own.shape}; only a channel of shape (time,) can "
                 "be split",
                 field="split",
             )
 
-    def samples(one: Channel) -> np.ndarray:
-        return np.concatenate(list(one.blocks())).astype(float)
+    def samples(own: Channel) -> np.ndarray:
+        return np.concatenate(list(own.blocks())).astype(float)
 
     rates = common.sample_rate, common.pulse_rate
     if by_pulses:
-        return by_pauses(samples(asked), *rates)
+        return by_pauses(samples(separating), *rates)
     cause = channels["v_th"] if "v_th" in channels else channels["current"]
-    return by_trigger(samples(asked), samples(cause), *rates)
+    return by_trigger(samples(separating), samples(cause), *rates)
 
 
 def _unit(name: str, signal: Signal, said: str) -> tuple[Unit, str]:
@@ -272,7 +269,7 @@ def _unit(name: str, signal: Signal, said: str) -> tuple[Unit, str]:
 
 def _rows(signals: Mapping[str, Signal], channels: Mapping[str, Channel]) -> dict[str, list[int]]:
     """Rows of each signal, one per trial of `v_out`; `v_th` may have one row for all trials."""
-    found: dict[str, list[int]] = {}
+    rows_of: dict[str, list[int]] = {}
     for name in SIGNALS:
         if name not in channels:
             continue
@@ -285,27 +282,27 @@ def _rows(signals: Mapping[str, Signal], channels: Mapping[str, Channel]) -> dic
                 "rows, counted from 0",
                 field=f"{name}.rows",
             )
-        found[name] = list(every)
-    trials = len(found["v_out"])
+        rows_of[name] = list(every)
+    trials = len(rows_of["v_out"])
     length = channels["v_out"].length
     fits = all(
         len(channels[name].shape) in (1, 2)
         and channels[name].length == length
         and (len(rows) == trials or (name == "v_th" and len(rows) == 1))
-        for name, rows in found.items()
+        for name, rows in rows_of.items()
     )
     if not fits:
         shapes = ", ".join(
             f"{signals[name].channel} {channels[name].shape}"
             + f" rows {rows}" * (signals[name].rows is not None)
-            for name, rows in found.items()
+            for name, rows in rows_of.items()
         )
         raise RecordingError(
             f"shapes do not fit each other: {shapes}",
             remedy="All shapes must be (time,) or (trial, time); only v_th may be (time,), or one "
             "row, if v_out is a stack",
         )
-    return found
+    return rows_of
 
 
 def _labels(said: Any, trials: list[int], stacked: bool) -> list[Any]:

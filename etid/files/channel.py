@@ -2,7 +2,9 @@
 
 import dataclasses
 import functools
+import importlib
 from collections.abc import Callable, Iterable, Iterator
+from typing import Any, BinaryIO
 
 import numpy as np
 
@@ -11,7 +13,6 @@ from etid.recordings import errors
 from etid.recordings.recording import RecordingError
 
 BLOCK = 1 << 20  # [samples] size of a block in memory, 8 MB of real numbers
-LISTED = 30  # most names in an error message
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -109,10 +110,10 @@ class Contents:
 
 
 def listed(names: Iterable[str]) -> str:
-    """Text of names for an error message."""
+    """Text of at most 30 names for an error message."""
     every = list(names)
-    more = f" and {len(every) - LISTED} more" if len(every) > LISTED else ""
-    return (", ".join(map(repr, every[:LISTED])) or "none") + more
+    more = f" and {len(every) - 30} more" if len(every) > 30 else ""
+    return (", ".join(map(repr, every[:30])) or "none") + more
 
 
 def chosen(names: Iterable[str], name: str, field: str) -> None:
@@ -140,6 +141,26 @@ def real(name: str, dtype: np.dtype, shape: tuple[int, ...]) -> None:
         raise RecordingError(f"{name!r} is empty, of shape {shape}")
 
 
+def array_channel(name: str, array: np.ndarray) -> Channel:
+    """The channel of an array in memory, (time,) or (trial, time)."""
+    real(name, array.dtype, array.shape)
+
+    def read(trial: int, start: int, stop: int) -> np.ndarray:
+        return (array if array.ndim == 1 else array[trial])[start:stop]
+
+    return Channel(name, array.shape, array.dtype, read)
+
+
+def spooled_channel(name: str, file: BinaryIO, count: int, **fields: Any) -> Channel:
+    """The channel of real numbers in a temporary file; `fields` are others of `Channel`."""
+
+    def read(_: int, start: int, stop: int) -> np.ndarray:
+        file.seek(8 * start)
+        return np.frombuffer(file.read(8 * (stop - start)))
+
+    return Channel(name, (count,), np.dtype(np.float64), read, **fields)
+
+
 def rate_of(interval: float, precision: float, unit: str = "s") -> float | None:
     """Sample rate [Hz] from an interval; a whole number if the precision allows it.
 
@@ -151,8 +172,8 @@ def rate_of(interval: float, precision: float, unit: str = "s") -> float | None:
     Raises:
         RecordingError: The unit is not one of time, as in the file of a spectrum.
     """
-    known = parse_unit(unit)
-    if known is None or known.si != "second":
+    time = parse_unit(unit)
+    if time is None or time.si != "second":
         raise RecordingError(
             f"has a sample every {interval:g} {unit!r}, which is not a time",
             field="sample_rate",
@@ -160,7 +181,7 @@ def rate_of(interval: float, precision: float, unit: str = "s") -> float | None:
         )
     if not interval > 0:
         return None
-    rate = 1 / (interval * known.factor)
+    rate = 1 / (interval * time.factor)
     return float(round(rate)) if abs(rate - round(rate)) <= precision * rate else rate
 
 
@@ -168,8 +189,23 @@ def rate_of(interval: float, precision: float, unit: str = "s") -> float | None:
 located = functools.partial(errors.located, foreign=Exception)
 
 
-def needs(package: str, extra: str, file: str) -> RecordingError:
-    """Error of a file that needs a package that is not installed."""
-    return RecordingError(
-        f"needs the package {package}", file=file, remedy=f"Run pip install 'etid[{extra}]'"
-    )
+def optional(module: str, extra: str, file: str, package: str = "") -> Any:
+    """A module of a package that only users of one format need.
+
+    Args:
+        module: Name of the module.
+        extra: Extra of etid that installs the package.
+        file: The file that needs it.
+        package: Name of the package if it is not that of the module.
+
+    Raises:
+        RecordingError: The package is not installed.
+    """
+    try:
+        return importlib.import_module(module)
+    except ImportError as error:
+        raise RecordingError(
+            f"needs the package {package or module}",
+            file=file,
+            remedy=f"Run pip install 'etid[{extra}]'",
+        ) from error

@@ -11,15 +11,7 @@ from etid.recordings.fields import Metadata
 from etid.recordings.recording import RecordingError
 from etid.signals.pulse_train import find_pulses
 
-# Largest distance of a time stamp from a uniform grid, in sample periods. The rounding of a printed
-# time must pass; a missing or repeated sample (a distance of 1) must not pass.
-_TIME_TOLERANCE = 0.25
-
-# Largest relative error of a quartz clock, so of a measured rate relative to the nominal rate.
-_CLOCK_TOLERANCE = 1e-4
-
-# Channels of one clock have equal rates, except for rounding errors of the reciprocal.
-_ROUNDING = 1e-9
+QUARTZ = 1e-4  # largest relative error of a quartz clock, so of a measured rate
 
 
 def sample_rate(
@@ -42,7 +34,8 @@ def sample_rate(
         for name, channel in channels.items()
         if channel.sample_rate is not None
     }
-    if said and not _agree(_ROUNDING, *said.values()):
+    # Channels of one clock have equal rates, except for rounding errors of the reciprocal.
+    if said and not _agree(1e-9, *said.values()):
         raise RecordingError(
             "differs between the channels: "
             + ", ".join(f"{name!r} {rate:.9g} Hz" for name, rate in said.items()),
@@ -66,7 +59,7 @@ def sample_rate(
         return theirs, "file"
     if theirs is None:
         return ours, by
-    if not _agree(_CLOCK_TOLERANCE, ours, theirs):
+    if not _agree(QUARTZ, ours, theirs):
         raise RecordingError(
             f"is {ours:.9g} Hz from the {by}, but {theirs:.9g} Hz from the file",
             field="sample_rate",
@@ -124,7 +117,8 @@ def _clock(time: Channel, factor: float, length: int) -> float:
     for block in stamps():
         distance = np.abs(block - (first + step * np.arange(start, start + block.size))) / step
         worst = int(np.argmax(distance))  # argmax returns the first NaN, if there is one
-        if not distance[worst] <= _TIME_TOLERANCE:
+        # The rounding of a printed time must pass, a missing or repeated sample (1) must not.
+        if not distance[worst] <= 0.25:
             raise RecordingError(
                 f"is not uniform: sample {start + worst} is wrong by {distance[worst]:.2g} sample "
                 "periods",

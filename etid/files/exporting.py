@@ -14,25 +14,17 @@ import numpy as np
 
 from etid.circuits.circuit import AbstractCircuit
 from etid.circuits.netlist import circuit_string, netlist
-from etid.files.channel import listed, needs
+from etid.files.channel import listed, optional
 from etid.recordings import limits
 from etid.recordings.recording import RecordingError
 from etid.recordings.replacing import replace_text, replacing
 from etid.recordings.untrusted import attribute, translated
 from etid.results.fit import Fit
 from etid.results.fits import DESCRIBED, SCHEMA, Fits
-from etid.results.hdf5_table import Table, opened_table, same_length
+from etid.results.hdf5_table import REMEDY, Table, opened_table, same_length
 
 ROWS = 1 << 16  # fits in memory at a time
-
-TABLES = (".csv", ".parquet")
 CIRCUITS = (".cir", ".json")
-
-# First characters of a formula. A program for spreadsheets would compute such a text, or run it.
-_FORMULA = ("=", "+", "-", "@", "\t", "\r")
-
-_QUALITY = {"rrse": "number", "chi2": "number", "steps": "integer", "verdict": "text",
-            "remarks": "text", "note": "text"}  # fmt: skip
 
 
 def export_fits(source: str | os.PathLike[str], target: str | os.PathLike[str]) -> None:
@@ -56,14 +48,14 @@ def export_fits(source: str | os.PathLike[str], target: str | os.PathLike[str]) 
         RecordingError: pyarrow is not installed.
     """
     suffix = pathlib.Path(target).suffix.lower()
-    if suffix not in _WRITERS:
+    if suffix not in TABLES:
         raise ValueError(
-            f"{os.fspath(target)}: fits are exported as {' or '.join(_WRITERS)}, not {suffix!r}"
+            f"{os.fspath(target)}: fits are exported as {' or '.join(TABLES)}, not {suffix!r}"
         )
     with opened_table(source, SCHEMA) as table, replacing(target) as partial:
         columns = _columns(table)
         about = {name: table.text(name) for name in ("circuit", "method", "etid_version")}
-        _WRITERS[suffix](table, columns, about, partial)
+        TABLES[suffix](table, columns, about, partial)
 
 
 def _columns(table: Table) -> dict[str, h5py.Dataset]:
@@ -73,14 +65,16 @@ def _columns(table: Table) -> dict[str, h5py.Dataset]:
     if not all(isinstance(name, str) for name in names) or len(names) > limits.NAMES:
         raise RecordingError(
             f"is {parameters!r}, must be names", file=table.name, field="parameters",
-            remedy="Fit the recordings again",
+            remedy=REMEDY,
         )  # fmt: skip
     elements = [name + ending for name in names for ending in ("", "_stderr")]
     changes = (f"{name}_change" for name in (*names, "amplitude"))
     elements += [
         name for name in changes if name in table
     ]  # files before schema version 1.2 lack them
-    kinds = DESCRIBED | dict.fromkeys(elements, "number") | _QUALITY
+    quality = {"rrse": "number", "chi2": "number", "steps": "integer", "verdict": "text",
+               "remarks": "text", "note": "text"}  # fmt: skip
+    kinds = DESCRIBED | dict.fromkeys(elements, "number") | quality
     columns = {name: table.column(name, kind) for name, kind in kinds.items()}
     same_length(table, columns)
     return columns
@@ -91,7 +85,7 @@ def _units(column: h5py.Dataset, table: Table) -> str | None:
     with translated(table.name, field=str(column.name).strip("/")):
         unit = attribute(column, "unit") if "unit" in column.attrs else None
         if not isinstance(unit, str | None):
-            raise RecordingError(f"has the unit {unit!r}", remedy="Fit the recordings again")
+            raise RecordingError(f"has the unit {unit!r}", remedy=REMEDY)
     return unit
 
 
@@ -118,18 +112,19 @@ def _csv(
 
 
 def _cell(value: str | float | int) -> str | float | int:
-    """Value of a cell; a text that begins as a formula is marked as text."""
-    return f"'{value}" if isinstance(value, str) and value.startswith(_FORMULA) else value
+    """Value of a cell; a text that begins as a formula is marked as text.
+
+    A program for spreadsheets would compute a formula, or run it.
+    """
+    formula = ("=", "+", "-", "@", "\t", "\r")
+    return f"'{value}" if isinstance(value, str) and value.startswith(formula) else value
 
 
 def _parquet(
     table: Table, columns: dict[str, h5py.Dataset], about: dict[str, str], path: pathlib.Path
 ) -> None:
-    try:
-        import pyarrow
-        from pyarrow import parquet
-    except ImportError as error:
-        raise needs("pyarrow", "parquet", str(path)) from error
+    pyarrow = optional("pyarrow", "parquet", str(path))
+    parquet = optional("pyarrow.parquet", "parquet", str(path), "pyarrow")
     fields = []
     for name, column in columns.items():
         text = h5py.check_string_dtype(column.dtype)
@@ -142,7 +137,7 @@ def _parquet(
             writer.write_table(pyarrow.table(part, schema=schema))
 
 
-_WRITERS = dict(zip(TABLES, (_csv, _parquet), strict=True))
+TABLES = {".csv": _csv, ".parquet": _parquet}  # writers of tables by suffix
 
 
 def export_circuit(
@@ -246,8 +241,5 @@ def export_study(
             field="session_start",
             remedy="Give the start of the session, such as 2026-01-31T09:30:00+01:00",
         )
-    try:
-        from etid.files.nwb import write_nwb
-    except ImportError as error:
-        raise needs("pynwb", "nwb", os.fspath(target)) from error
-    write_nwb(source, target, session_start)
+    nwb = optional("etid.files.nwb", "nwb", os.fspath(target), "pynwb")
+    nwb.write_nwb(source, target, session_start)

@@ -17,6 +17,7 @@ from etid.files.clock import check_spacing
 from etid.files.mapping import CHANNELS, of_files, plans, read_mapping
 from etid.files.others import with_others
 from etid.files.readers import abf, delimited, excel, lvm, matlab, npz, tdms, wav
+from etid.recordings.errors import require_file
 from etid.recordings.fields import LABELS
 from etid.recordings.recording import AbstractSource, RecordingError
 from etid.recordings.study import Study, refuse_nested
@@ -31,7 +32,6 @@ READERS = {
     ".lvm": lvm.opened,
     ".xlsx": excel.opened,
 }
-_IMPLIED = {"v_th": "V", "v_out": "V", "current": "A", "time": "s"}
 
 
 def import_file(
@@ -96,8 +96,7 @@ def import_file(
     paths = [*known, *(path for path in paths if path not in known)]  # loaded ones name the others
     folder = pathlib.Path(os.fspath(target)).parent
     for path in paths:
-        if not path.is_file():
-            raise RecordingError("there is no such file", file=str(path), remedy="Check the path")
+        require_file(str(path))
     if not folder.is_dir():
         raise RecordingError("the folder of this file does not exist", file=os.fspath(target))
     given = {name: value for name, value in given.items() if value is not None}
@@ -116,7 +115,8 @@ def import_file(
         }
         whole = {name: value for name, value in common.items() if name != "split"}
         said = [whole | {"r_load": known[path]} if path in known else common for path in paths]
-        by, place, implied = "command", "", _IMPLIED
+        by, place = "command", ""
+        implied = {"v_th": "V", "v_out": "V", "current": "A", "time": "s"}
     else:
         more = {"calibrations": known} if known else {}
         _refuse(given | more, str(paths[0]), "cannot be an argument together with a mapping")

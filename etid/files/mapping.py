@@ -22,7 +22,6 @@ from etid.recordings.recording import RecordingError
 CHANNELS = (*SIGNALS, "time")
 FIELDS = (*DECLARED, "scale", "split")
 PAUSES = "pulses"  # a record that is split at the pauses between its pulses
-KEYS = ("channel", "unit", "scale", "rows")  # keys of a signal
 KINDS = ("loaded", "calibration")  # default paths of recordings without a path
 _KEY = "key of a mapping"
 
@@ -243,7 +242,7 @@ def _signal(name: str, said: Any, common: Any, implied: str) -> Signal:
         raise RecordingError(
             "names no channel", field=name, remedy=f'Write {name} = {{channel = "…", unit = "…"}}'
         )
-    check_names(said, KEYS, _KEY, f"{name}.")
+    check_names(said, ("channel", "unit", "scale", "rows"), _KEY, f"{name}.")
     unit = said.get("unit", "")
     if "unit" in said and (not isinstance(unit, str) or parse_unit(unit) is None):
         raise RecordingError(

@@ -1,20 +1,14 @@
 """Measured impedances from files of potentiostats; the readers are those of impedance.py."""
 
-import importlib
 import os
 import pathlib
 
 import numpy as np
 from jaxtyping import Complex, Float
 
-from etid.files.channel import needs
-from etid.recordings.errors import located
+from etid.files.channel import optional
+from etid.recordings.errors import located, require_file
 from etid.recordings.recording import RecordingError
-
-INSTRUMENTS = (
-    "gamry", "autolab", "parstat", "zplot", "versastudio", "powersuite", "biologic",
-    "chinstruments",
-)  # fmt: skip
 
 
 def read_impedance(
@@ -24,28 +18,29 @@ def read_impedance(
 
     Args:
         path: The file.
-        instrument: Program that wrote it: one of `INSTRUMENTS`. If not given, the file is a table
-            of frequency, real and imaginary part with commas, without a header.
+        instrument: Program that wrote it: `gamry`, `autolab`, `parstat`, `zplot`, `versastudio`,
+            `powersuite`, `biologic` or `chinstruments`. If not given, the file is a table of
+            frequency, real and imaginary part with commas, without a header.
 
     Raises:
         RecordingError: The file cannot be read, the instrument is not known, or the package
             impedance is not installed.
     """
     file = pathlib.Path(path)
-    if instrument is not None and instrument not in INSTRUMENTS:
+    instruments = (
+        "gamry", "autolab", "parstat", "zplot", "versastudio", "powersuite", "biologic",
+        "chinstruments",
+    )  # fmt: skip
+    if instrument is not None and instrument not in instruments:
         raise RecordingError(
-            f"is {instrument!r}", field="instrument", remedy=f"Use one of {', '.join(INSTRUMENTS)}"
+            f"is {instrument!r}", field="instrument", remedy=f"Use one of {', '.join(instruments)}"
         )
-    if not file.is_file():
-        raise RecordingError("there is no such file", file=str(file), remedy="Check the path")
-    try:
-        readers = importlib.import_module("impedance.preprocessing")
-    except ImportError:
-        raise needs("impedance", "eis", str(file)) from None
+    require_file(str(file))
+    readers = optional("impedance.preprocessing", "eis", str(file), "impedance")
     # The readers raise any error for a file of another instrument, even UnboundLocalError.
     with located(str(file), foreign=Exception, remedy="Name its instrument"):
         frequency, impedance = readers.readFile(str(file), instrument)
-        found = np.asarray(frequency, float), np.asarray(impedance, complex)
-        if found[0].size == 0 or found[0].shape != found[1].shape:
+        frequency, z = np.asarray(frequency, float), np.asarray(impedance, complex)
+        if frequency.size == 0 or frequency.shape != z.shape:
             raise RecordingError("holds no impedances", remedy="Name the instrument")
-    return found
+    return frequency, z

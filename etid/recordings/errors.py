@@ -2,6 +2,7 @@
 
 import contextlib
 import difflib
+import os
 from collections.abc import Iterable, Iterator
 
 
@@ -47,6 +48,12 @@ class RecordingError(ValueError):
             field=self.field or field,
             remedy=self.remedy,
         )
+
+
+def require_file(path: str) -> None:
+    """Raise an error if a path is not a file; pipes and devices are not opened."""
+    if not os.path.isfile(path):
+        raise RecordingError("there is no such file", file=path, remedy="Check the path")
 
 
 def not_recorded(path: str, field: str, remedy: str) -> RecordingError:

@@ -28,7 +28,7 @@ import h5py
 import numpy as np
 
 from etid.recordings import limits
-from etid.recordings.errors import RecordingError, located
+from etid.recordings.errors import RecordingError, located, require_file
 
 DAMAGED = "The file is damaged or was not closed: copy or record it again"
 
@@ -138,8 +138,7 @@ def check_file(path: str) -> None:
     Raises:
         RecordingError: The file is missing or not HDF5.
     """
-    if not os.path.isfile(path):
-        raise RecordingError("there is no such file", file=path, remedy="Check the path")
+    require_file(path)
     if not h5py.is_hdf5(path):
         raise RecordingError(
             "is not an HDF5 file, or its header is damaged",

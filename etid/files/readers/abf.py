@@ -9,30 +9,20 @@ import contextlib
 import pathlib
 import struct
 from collections.abc import Iterator
-from typing import Any
 
 import numpy as np
 
-from etid.files.channel import Channel, Contents, needs, rate_of
+from etid.files.channel import Channel, Contents, optional, rate_of
 from etid.recordings.recording import RecordingError
-
-_PRECISION = 1e-6  # relative precision of a sample interval in float32
-# [byte] where the header of each version has numbers of entries, 32 bits each: of tags, and of the
-# sections of version 2
-_COUNTS = {b"ABF ": (48,), b"ABF2": tuple(range(84, 368, 16))}
 
 
 @contextlib.contextmanager
 def opened(path: pathlib.Path, folder: pathlib.Path) -> Iterator[Contents]:
     """Channels of an ABF file."""
     del folder
-    try:
-        import pyabf  # optional: only users of Axon instruments need it
-    except ImportError:
-        raise needs("pyabf", "abf", str(path)) from None
-
+    pyabf = optional("pyabf", "abf", str(path))
     _check_counts(path)
-    abf: Any = pyabf.ABF(path, loadData=False)
+    abf = pyabf.ABF(path, loadData=False)
     dtype = np.dtype(abf._dtype).newbyteorder("<")
     sweeps, length, count = abf.sweepCount, abf.sweepPointCount, abf.channelCount
     if hasattr(abf, "_synchArraySection") and len(set(abf._synchArraySection.lLength)) > 1:
@@ -57,7 +47,7 @@ def opened(path: pathlib.Path, folder: pathlib.Path) -> Iterator[Contents]:
         interval = abf._headerV1.fADCSampleInterval * count
     else:
         interval = abf._protocolSection.fADCSequenceInterval
-    rate = rate_of(1e-6 * interval, _PRECISION)
+    rate = rate_of(1e-6 * interval, 1e-6)  # the precision of float32
 
     def channel(name: str) -> Channel:
         index = names.index(name)
@@ -85,7 +75,9 @@ def _check_counts(path: pathlib.Path) -> None:
     size = path.stat().st_size
     with path.open("rb") as file:
         header = file.read(512)
-    for place in _COUNTS.get(header[:4], ()):
+    # Numbers of 32 bits: of tags in version 1, of each section in version 2.
+    places = {b"ABF ": (48,), b"ABF2": tuple(range(84, 368, 16))}
+    for place in places.get(header[:4], ()):
         if place + 4 > len(header):
             break
         (count,) = struct.unpack_from("<i", header, place)

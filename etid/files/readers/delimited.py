@@ -20,23 +20,12 @@ import tempfile
 from collections.abc import Iterable, Iterator
 from typing import Any, BinaryIO, TextIO
 
-import numpy as np
-
-from etid.files.channel import Channel, Contents, rate_of
+from etid.files.channel import Channel, Contents, rate_of, spooled_channel
 from etid.files.readers.rows import Dialect, spool
 from etid.files.units import one_unit, parse_unit, with_unit
 from etid.recordings.recording import RecordingError
 
-_SEEN = 1 << 16  # [bytes] start of a table that is looked at before it is read
-_LINES = 200  # lines in which the first row of numbers is searched
-_BESIDE = 3  # rows in which numbers beside a preamble are searched
-_DIALECTS = (",.", ";.", ";,", "\t.", "\t,")  # delimiters and decimal signs that are tried
-
-# How the first cell of a line names the number of samples and their interval in preambles of
-# oscilloscopes; the value is in the second cell.
-_LENGTHS = {"record length", "memory length", "number of samples", "points"}
-_INTERVALS = {"sample interval", "sampling period"}
-
+LINES = 200  # lines in which a header ends
 DIALECT = tuple(field.name for field in dataclasses.fields(Dialect))
 
 
@@ -75,12 +64,8 @@ def opened(path: pathlib.Path, folder: pathlib.Path, **told: Any) -> Iterator[Co
                 notice = f"the table has {count} rows, its preamble declares {length:g} samples"
 
         def channel(name: str) -> Channel:
-            def read(_: int, start: int, stop: int) -> np.ndarray:
-                columns[name].seek(8 * start)
-                return np.frombuffer(columns[name].read(8 * (stop - start)))
-
-            unit = units[names.index(name)]
-            return Channel(name, (count,), np.dtype(np.float64), read, unit, rate, notice=notice)
+            about = {"unit": units[names.index(name)], "sample_rate": rate, "notice": notice}
+            return spooled_channel(name, columns[name], count, **about)
 
         yield Contents(names, channel, prepare)
 
@@ -88,17 +73,17 @@ def opened(path: pathlib.Path, folder: pathlib.Path, **told: Any) -> Iterator[Co
 def _refuse_another(path: pathlib.Path) -> None:
     """Raise an error that says what to confirm if a table looks different from the default."""
     with path.open("rb") as file:
-        start = file.read(_SEEN)
+        start = file.read(1 << 16)
     encoding = Dialect.encoding
     try:
         codecs.getincrementaldecoder(encoding)().decode(start)
     except UnicodeDecodeError:
         encoding = "utf-16" if start[:2] in (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE) else "cp1252"
-    lines = start.decode(encoding, "replace").splitlines()[:_LINES]
-    found = _guessed(lines, encoding)
-    if found is None or found == Dialect():
+    lines = start.decode(encoding, "replace").splitlines()[:LINES]
+    likely = _guessed(lines, encoding)
+    if likely is None or likely == Dialect():
         return
-    options = {name: value for name, value in dataclasses.asdict(found).items()
+    options = {name: value for name, value in dataclasses.asdict(likely).items()
                if value != getattr(Dialect, name)}  # fmt: skip
     flags = " ".join(
         f"--{name.replace('_', '-')} {value if isinstance(value, int) else repr(value)}"
@@ -107,7 +92,7 @@ def _refuse_another(path: pathlib.Path) -> None:
     raise RecordingError(
         "seems to be written with "
         + ", ".join(f"{name} {value!r}" for name, value in options.items())
-        + f" and the columns {', '.join(_names(found, lines[max(found.header_line - 1, 0)]))}",
+        + f" and the columns {', '.join(_names(likely, lines[max(likely.header_line - 1, 0)]))}",
         remedy=f"Nothing is guessed: if this is right, add {flags}",
     )
 
@@ -115,7 +100,8 @@ def _refuse_another(path: pathlib.Path) -> None:
 def _guessed(lines: list[str], encoding: str) -> Dialect | None:
     """The dialect in which a table has rows of numbers; None if no dialect has them."""
     filled = [number for number, line in enumerate(lines, 1) if line.strip()]
-    for delimiter, decimal in _DIALECTS:
+    signs = (",.", ";.", ";,", "\t.", "\t,")  # delimiters and decimal signs
+    for delimiter, decimal in signs:
         dialect = Dialect(delimiter, decimal, encoding=encoding)
         cells = [dialect.cells(lines[number - 1]) for number in filled]
         for row in range(1, len(cells) - 1):
@@ -128,11 +114,11 @@ def _guessed(lines: list[str], encoding: str) -> Dialect | None:
             header = max(0, row - 1 - units)
             named = not dialect.are_numbers(cells[header])
             return dataclasses.replace(dialect, header_line=filled[header] if named else 0)
-    for delimiter, decimal in _DIALECTS:
+    for delimiter, decimal in signs:  # columns of numbers beside a preamble
         dialect = Dialect(delimiter, decimal, 0, encoding)
-        rows = [dialect.cells(line) for line in lines[:_BESIDE]]
+        rows = [dialect.cells(line) for line in lines[:3]]
         columns = [all(map(dialect.is_number, column)) for column in zip(*rows, strict=False)]
-        if len(rows) == _BESIDE and sum(columns) > 1:
+        if len(rows) == 3 and sum(columns) > 1:
             return dialect
     return None
 
@@ -165,16 +151,19 @@ def _header(text: TextIO, dialect: Dialect) -> tuple[tuple[str, ...], tuple[str,
 
 
 def _preamble(path: pathlib.Path, dialect: Dialect) -> tuple[float, float | None]:
-    """Number of samples and sample rate [Hz] in a preamble; 0 and None if it names none."""
+    """Number of samples and sample rate [Hz] in a preamble; 0 and None if it names none.
+
+    The name is in the first cell of a line, the value in the second.
+    """
     length, rate = 0.0, None
     with path.open(newline="", encoding=dialect.encoding) as text:
-        for line in itertools.islice(text, _LINES):
+        for line in itertools.islice(text, LINES):
             cell, value, unit, *_ = (*dialect.cells(line), "", "", "")
             if not dialect.is_number(value):
                 continue
             number, name = float(value.replace(dialect.decimal, ".")), cell.strip(":").lower()
-            if name in _LENGTHS:
+            if name in ("record length", "memory length", "number of samples", "points"):
                 length = number
-            elif name in _INTERVALS:
+            elif name in ("sample interval", "sampling period"):
                 rate = rate_of(number, 1e-6, unit if parse_unit(unit) else "s")
     return length, rate

@@ -12,7 +12,7 @@ from typing import Any, BinaryIO
 
 import numpy as np
 
-from etid.files.channel import Channel, Contents, needs
+from etid.files.channel import Channel, Contents, optional, spooled_channel
 from etid.files.readers.rows import ROWS
 from etid.files.units import with_unit
 from etid.recordings.recording import RecordingError
@@ -21,10 +21,7 @@ from etid.recordings.recording import RecordingError
 @contextlib.contextmanager
 def opened(path: pathlib.Path, folder: pathlib.Path) -> Iterator[Contents]:
     """Columns of a workbook; `prepare` copies the needed ones to temporary binary files."""
-    try:
-        import openpyxl  # optional: only users of Excel need it
-    except ImportError:
-        raise needs("openpyxl", "excel", str(path)) from None
+    openpyxl = optional("openpyxl", "excel", str(path))
     with contextlib.ExitStack() as stack:
         book = openpyxl.load_workbook(
             stack.enter_context(path.open("rb")), read_only=True, data_only=True
@@ -48,11 +45,7 @@ def opened(path: pathlib.Path, folder: pathlib.Path) -> Iterator[Contents]:
                 counts[name] = _spool(*places[name][:2], files[name])
 
         def channel(name: str) -> Channel:
-            def read(_: int, start: int, stop: int) -> np.ndarray:
-                files[name].seek(8 * start)
-                return np.frombuffer(files[name].read(8 * (stop - start)))
-
-            return Channel(name, (counts[name],), np.dtype(np.float64), read, places[name][2])
+            return spooled_channel(name, files[name], counts[name], unit=places[name][2])
 
         yield Contents(tuple(names), channel, prepare)
 

@@ -14,31 +14,30 @@ from typing import BinaryIO
 
 import numpy as np
 
-from etid.files.channel import Channel, Contents, rate_of
+from etid.files.channel import Channel, Contents, rate_of, spooled_channel
+from etid.files.clock import QUARTZ
+from etid.files.readers.delimited import LINES
 from etid.files.readers.rows import Dialect, spool
 from etid.recordings.recording import RecordingError
-
-_LINES = 200  # of a header
-_END = "***End_of_Header***"
-_CLOCK = 1e-4  # largest relative error of a quartz clock
-_SEPARATORS = {"Tab": "\t", "Comma": ",", "Semicolon": ";"}
 
 
 @contextlib.contextmanager
 def opened(path: pathlib.Path, folder: pathlib.Path) -> Iterator[Contents]:
     """Channels of an lvm file; `prepare` copies the needed ones to temporary binary files."""
     with path.open(encoding="utf-8-sig", errors="replace") as text:
-        lines = [line.rstrip("\r\n") for line in itertools.islice(text, _LINES)]
+        lines = [line.rstrip("\r\n") for line in itertools.islice(text, LINES)]
     if not lines or not lines[0].startswith("LabVIEW Measurement"):
         raise RecordingError("is not a LabVIEW measurement file: its first line says nothing of it")
-    ends = [number for number, line in enumerate(lines) if line.strip().startswith(_END)]
+    end = "***End_of_Header***"
+    ends = [number for number, line in enumerate(lines) if line.strip().startswith(end)]
     if len(ends) < 2 or ends[1] + 2 >= len(lines):
         raise RecordingError(
-            f"has no two headers that end with {_END}, and numbers below",
+            f"has no two headers that end with {end}, and numbers below",
             remedy="Write the file with one header per segment",
         )
     said = {key: rest for key, *rest in (line.split("\t") for line in lines[: ends[0]])}
-    separator = _SEPARATORS.get(_first(said, "Separator", "Tab"))
+    separators = {"Tab": "\t", "Comma": ",", "Semicolon": ";"}
+    separator = separators.get(_first(said, "Separator", "Tab"))
     decimal = _first(said, "Decimal_Separator", ".")
     if separator is None or decimal not in (".", ","):
         raise RecordingError("its header names no separator that etid knows", field="Separator")
@@ -75,20 +74,15 @@ def opened(path: pathlib.Path, folder: pathlib.Path) -> Iterator[Contents]:
             columns = {names.index(name): files[name] for name in files}
             count, notice = spool(path, dialect, ends[1] + 2, len(names) + 1, columns)
             if timed and rate:
-                _check_times(stored(names[0], 0, count), rate)
-
-        def stored(name: str, start: int, stop: int) -> np.ndarray:
-            files[name].seek(8 * start)
-            return np.frombuffer(files[name].read(8 * (stop - start)))
+                _check_times(channel(names[0]).read(0, 0, count), rate)
 
         def channel(name: str) -> Channel:
-            return Channel(
+            return spooled_channel(
                 name,
-                (count,),
-                np.dtype(np.float64),
-                lambda _, start, stop: stored(name, start, stop),
-                units.get(name, "").strip(),
-                rate,
+                files[name],
+                count,
+                unit=units.get(name, "").strip(),
+                sample_rate=rate,
                 declared=int(lengths.get(name, "").strip() or 0),
                 notice=notice,
             )
@@ -105,7 +99,7 @@ def _check_times(times: np.ndarray, rate: float) -> None:
     steps = np.diff(times)
     steps = steps[steps >= 0]
     rounding = 2 * np.min(steps, initial=np.inf, where=steps > 0)
-    if abs(steps.sum() - steps.size / rate) > max(rounding, _CLOCK * steps.sum(), 2 / rate):
+    if abs(steps.sum() - steps.size / rate) > max(rounding, QUARTZ * steps.sum(), 2 / rate):
         raise RecordingError(
             f"is {1 / rate:g} s, but the column of times has steps of {steps.mean():g} s",
             field="Delta_X",

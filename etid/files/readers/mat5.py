@@ -15,14 +15,8 @@ import zlib
 from etid.recordings import limits
 from etid.recordings.errors import RecordingError
 
-_HEAD = 128  # [bytes]
 _MATRIX, _COMPRESSED = 14, 15
 _NUMBERS = {1, 2, 3, 4, 5, 6, 7, 9, 12, 13, 16, 17, 18}  # types of elements: integers, reals, texts
-_MADE_WHOLE = {1, 2, 3}  # cells, structures, objects: SciPy makes arrays of Python objects
-_NAMED = 3  # elements of a matrix before its numbers: flags, shape, name
-_COMPLEX = set(range(5, 16))  # classes that may have an imaginary part: sparse, real and integer
-_IS_COMPLEX = 0x800
-_NUMBERS_OF = {4: 1, 5: 3, **dict.fromkeys(range(6, 16), 1)}  # elements of numbers by class
 
 
 def check(path: pathlib.Path) -> None:
@@ -33,12 +27,12 @@ def check(path: pathlib.Path) -> None:
             deep, or declares more data than it contains.
     """
     data = path.read_bytes()
-    order = {b"IM": "<", b"MI": ">"}.get(data[126:_HEAD])
+    order = {b"IM": "<", b"MI": ">"}.get(data[126:128])
     if 0 in data[:4]:
         return  # version 4
     if order is None:
         raise _error("is not a MATLAB file of version 5 or 7.3")
-    _walk(memoryview(data)[_HEAD:], order, 0)
+    _walk(memoryview(data)[128:], order, 0)
 
 
 def _error(message: str) -> RecordingError:
@@ -49,7 +43,7 @@ def _walk(data: memoryview, order: str, depth: int) -> list[tuple[int, memoryvie
     """List the elements of one level, and check the elements inside them."""
     if depth > limits.DEPTH:
         raise _error(f"has variables nested more than {limits.DEPTH} deep")
-    found: list[tuple[int, memoryview]] = []
+    elements: list[tuple[int, memoryview]] = []
     place = 0
     while place < len(data):
         if len(data) - place < 8:
@@ -71,9 +65,9 @@ def _walk(data: memoryview, order: str, depth: int) -> list[tuple[int, memoryvie
             _check_matrix(_walk(body, order, depth + 1), order, size)
         elif kind not in _NUMBERS:
             raise _error(f"has an element of type {kind}, which does not exist")
-        found.append((kind, body))
+        elements.append((kind, body))
         place = after
-    return found
+    return elements
 
 
 def _unpacked(body: memoryview) -> memoryview:
@@ -92,15 +86,16 @@ def _check_matrix(parts: list[tuple[int, memoryview]], order: str, size: int) ->
     if len(parts[0][1]) < 8:
         raise _error("has an array without a class")
     (flags,) = struct.unpack_from(f"{order}I", parts[0][1])
-    kind = flags & 0xFF
-    numbers = _NUMBERS_OF.get(kind, 0)
-    if kind in _COMPLEX and flags & _IS_COMPLEX:
+    kind = flags & 0xFF  # 1 to 3: cells, structures, objects; 4: texts; 5: sparse; 6 to 15: numbers
+    numbers = {4: 1, 5: 3, **dict.fromkeys(range(6, 16), 1)}.get(kind, 0)  # elements of numbers
+    if 5 <= kind <= 15 and flags & 0x800:  # complex
         numbers += 1
-    values = parts[_NAMED : _NAMED + numbers]
+    named = 3  # elements before the numbers: flags, shape, name
+    values = parts[named : named + numbers]
     if len(values) < numbers or any(one not in _NUMBERS for one, _ in values):
         raise _error("has an array without its numbers")
-    if kind not in _MADE_WHOLE or len(parts) < _NAMED:
-        return
+    if kind not in (1, 2, 3) or len(parts) < named:
+        return  # only of the others SciPy makes arrays of Python objects
     count = len(parts[1][1]) // 4
     shape = struct.unpack_from(f"{order}{count}i", parts[1][1])
     if min(shape, default=0) < 0 or math.prod(shape) > max(1, size):

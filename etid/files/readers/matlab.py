@@ -14,13 +14,11 @@ import h5py
 import numpy as np
 from h5py import h5o  # type: ignore[attr-defined]  # compiled, without stubs
 
-from etid.files.channel import Channel, Contents, needs, real
+from etid.files.channel import Channel, Contents, array_channel, optional, real
 from etid.files.readers import mat5
 from etid.recordings import limits
 from etid.recordings.recording import RecordingError
 from etid.recordings.untrusted import attribute, check_size, guarded, local_link
-
-_CACHE = 1 << 25  # [bytes] a chunk holds several trials, which are read one by one
 
 
 @contextlib.contextmanager
@@ -28,7 +26,8 @@ def opened(path: pathlib.Path, folder: pathlib.Path) -> Iterator[Contents]:
     """Channels of a MATLAB file of any version."""
     del folder
     if h5py.is_hdf5(path):
-        with guarded(str(path), rdcc_nbytes=_CACHE) as file:
+        # A chunk holds several trials, which are read one by one.
+        with guarded(str(path), rdcc_nbytes=1 << 25) as file:
             yield _hdf5(file)
     else:
         yield _whole(path)
@@ -36,14 +35,14 @@ def opened(path: pathlib.Path, folder: pathlib.Path) -> Iterator[Contents]:
 
 def _hdf5(file: h5py.File) -> Contents:
     """Channels of version 7.3: HDF5 with reversed axes; names with `#` are internal to MATLAB."""
-    found: dict[str, h5py.Dataset] = {}
-    seen: set[int] = set()  # addresses, because links may form a loop
+    datasets: dict[str, h5py.Dataset] = {}
+    walked: set[int] = set()  # addresses, because links may form a loop
 
     def walk(group: h5py.Group, prefix: str) -> None:
         address = h5o.get_info(group.id).addr
-        if address in seen:
+        if address in walked:
             return
-        seen.add(address)
+        walked.add(address)
         if prefix.count(".") > limits.DEPTH:
             raise RecordingError(f"has structures nested more than {limits.DEPTH} deep")
         names: Any = list(group)
@@ -55,12 +54,12 @@ def _hdf5(file: h5py.File) -> Contents:
             if isinstance(member, h5py.Group):
                 walk(member, f"{prefix}{name}.")
             elif isinstance(member, h5py.Dataset):
-                found[f"{prefix}{name}"] = member
+                datasets[f"{prefix}{name}"] = member
 
     walk(file, "")
 
     def channel(name: str) -> Channel:
-        data = found[name]
+        data = datasets[name]
         kind = attribute(data, "MATLAB_class") if "MATLAB_class" in data.attrs else b""
         kind = kind.decode() if isinstance(kind, bytes) else str(kind)
         if kind in ("char", "logical", "cell"):
@@ -81,15 +80,12 @@ def _hdf5(file: h5py.File) -> Contents:
 
         return Channel(name, shape, data.dtype, read)
 
-    return Contents(tuple(found), channel)
+    return Contents(tuple(datasets), channel)
 
 
 def _whole(path: pathlib.Path) -> Contents:
     """Channels of version 5 and older."""
-    try:
-        import pymatreader  # optional: only users of MATLAB need it
-    except ImportError:
-        raise needs("pymatreader", "matlab", str(path)) from None
+    pymatreader = optional("pymatreader", "matlab", str(path))
     from scipy.io.matlab import MatReadError
 
     mat5.check(path)
@@ -111,12 +107,7 @@ def _whole(path: pathlib.Path) -> Contents:
         if not isinstance(array, np.ndarray):
             kind = type(array).__name__
             raise RecordingError(f"{name!r} is a {kind}, must be an array of real numbers")
-        real(name, array.dtype, array.shape)
-
-        def read(trial: int, start: int, stop: int) -> np.ndarray:
-            return (array if array.ndim == 1 else array[trial])[start:stop]
-
-        return Channel(name, array.shape, array.dtype, read)
+        return array_channel(name, array)
 
     return Contents(tuple(content), channel)
 

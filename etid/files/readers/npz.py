@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from etid.files.channel import Channel, Contents, chosen, real
+from etid.files.channel import Channel, Contents, array_channel, chosen
 from etid.recordings import limits
 from etid.recordings.recording import Recording, RecordingError, Samples
 
@@ -20,14 +20,14 @@ KEYS = ("adc_th", "adc_out", "adc_ref", "R_ref", "fs", "f0", "lsb", "scale")
 @contextlib.contextmanager
 def _archive(path: pathlib.Path) -> Iterator[Any]:
     """The archive; `np.load` would leave a damaged file open."""
+    if not zipfile.is_zipfile(path):
+        raise RecordingError("is not an npz file")
     with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
         yield archive
 
 
 def is_complete(path: pathlib.Path) -> bool:
     """Whether an archive has all fields of its recordings, under the names of `recordings`."""
-    if not zipfile.is_zipfile(path):
-        raise RecordingError("is not an npz file")
     with _archive(path) as archive:
         return all(key in archive.files for key in KEYS[:2])
 
@@ -36,19 +36,11 @@ def is_complete(path: pathlib.Path) -> bool:
 def opened(path: pathlib.Path, folder: pathlib.Path) -> Iterator[Contents]:
     """Arrays of any other archive; each is a channel of shape (time,) or (trial, time)."""
     del folder
-    if not zipfile.is_zipfile(path):
-        raise RecordingError("is not an npz file")
     with _archive(path) as archive:
 
         def channel(name: str) -> Channel:
             _check_size(archive, name)
-            array = np.atleast_1d(archive[name])
-            real(name, array.dtype, array.shape)
-
-            def read(trial: int, start: int, stop: int) -> np.ndarray:
-                return (array if array.ndim == 1 else array[trial])[start:stop]
-
-            return Channel(name, array.shape, array.dtype, read)
+            return array_channel(name, np.atleast_1d(archive[name]))
 
         yield Contents(tuple(archive.files), channel)
 
@@ -66,11 +58,11 @@ def recordings(path: pathlib.Path, labels: Mapping[str, Any]) -> list[Recording]
             chosen(archive.files, key, key)
             _check_size(archive, key)
         held = {key: archive[key] for key in KEYS}
-    th, out, ref, known = (held[key] for key in ("adc_th", "adc_out", "adc_ref", "R_ref"))
-    if th.ndim != 2 or th.shape != out.shape or ref.ndim != 2 or known.shape != ref.shape[:1]:
-        found = ", ".join(f"{key} {held[key].shape}" for key in KEYS[:4])
+    th, out, ref, r_ref = (held[key] for key in ("adc_th", "adc_out", "adc_ref", "R_ref"))
+    if th.ndim != 2 or th.shape != out.shape or ref.ndim != 2 or r_ref.shape != ref.shape[:1]:
+        shapes = ", ".join(f"{key} {held[key].shape}" for key in KEYS[:4])
         raise RecordingError(
-            f"shapes do not fit each other: {found}",
+            f"shapes do not fit each other: {shapes}",
             remedy="adc_th and adc_out are (trial, time), adc_ref (resistor, time), "
             "R_ref (resistor,)",
         )
@@ -84,23 +76,23 @@ def recordings(path: pathlib.Path, labels: Mapping[str, Any]) -> list[Recording]
     if scale == 0:
         raise RecordingError("is 0", field="scale")
     conversion = step / scale
-    limits = np.iinfo(th.dtype)
+    codes = np.iinfo(th.dtype)
     common: dict[str, Any] = {
         "sample_rate": rate,
         "pulse_rate": pulses,
         **labels,
-        "adc_range": (limits.min * conversion, limits.max * conversion),
+        "adc_range": (codes.min * conversion, codes.max * conversion),
     }
     first = Samples(th[0], conversion)
     calibrations = [
         Recording(
             first,
-            Samples(codes, conversion),
-            r_load=known[index],
+            Samples(record, conversion),
+            r_load=r_ref[index],
             path=f"calibration/{index}",
             **common,
         )
-        for index, codes in enumerate(ref)
+        for index, record in enumerate(ref)
     ]
     paths = tuple(recording.path for recording in calibrations)
     loaded = [

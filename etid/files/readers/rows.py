@@ -14,7 +14,6 @@ from etid.files.units import parse_unit
 from etid.recordings.recording import RecordingError
 
 ROWS = 1 << 16  # rows of text in memory at a time
-_RECENT = 100  # rows with which the last one is compared
 
 
 @dataclasses.dataclass(frozen=True)
@@ -89,7 +88,7 @@ def spool(
         RecordingError: A row has too many or too few cells, or a cell is not a number.
     """
     rows = 0
-    recent: collections.deque[str] = collections.deque(maxlen=_RECENT)
+    recent: collections.deque[str] = collections.deque(maxlen=100)
     with path.open(newline="", encoding=dialect.encoding) as text:
         lines = _rows(text, dialect, skipped, width, columns, recent)
         while part := list(itertools.islice(lines, ROWS)):

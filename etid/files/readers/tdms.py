@@ -14,27 +14,18 @@ from typing import Any
 
 import numpy as np
 
-from etid.files.channel import Channel, Contents, needs, rate_of, real
+from etid.files.channel import Channel, Contents, optional, rate_of, real
 from etid.files.units import one_unit
 from etid.recordings.recording import RecordingError
-
-# Scalings that turn a voltage into a voltage. For an unknown scaling npTDMS returns raw codes.
-_SCALINGS = {"Linear", "Polynomial", "Table", "Add", "Subtract", "AdvancedAPI"}
-_UNITS = ("unit_string", "NI_UnitDescription")
-_LEAD_IN = struct.Struct("<4slLQQ")  # tag, contents, version, length, length of the metadata
 
 
 @contextlib.contextmanager
 def opened(path: pathlib.Path, folder: pathlib.Path) -> Iterator[Contents]:
     """Channels of a TDMS file."""
     del folder
-    try:
-        import nptdms.log  # optional: only users of NI instruments need it
-    except ImportError:
-        raise needs("npTDMS", "tdms", str(path)) from None
-
+    nptdms, log = (optional(name, "tdms", str(path), "npTDMS") for name in ("nptdms", "nptdms.log"))
     _check_length(path)
-    console = nptdms.log.log_manager.console_handler
+    console = log.log_manager.console_handler
     with contextlib.ExitStack() as stack:
         # Silence npTDMS on stderr: it reports errors, which are raised here, and text that is not
         # UTF-8, which is visible anyway.
@@ -76,18 +67,19 @@ def _silent(_: logging.LogRecord) -> bool:
 def _check_length(path: pathlib.Path) -> None:
     """Raise an error if a file ends inside a segment; npTDMS would read the part that exists."""
     size, position = path.stat().st_size, 0
+    head = struct.Struct("<4slLQQ")  # tag, contents, version, length, length of the metadata
     with path.open("rb") as file:
         while position < size:
             file.seek(position)
-            lead = file.read(_LEAD_IN.size)
+            lead = file.read(head.size)
             tag, contents, _, length, _ = (
-                _LEAD_IN.unpack(lead) if len(lead) == _LEAD_IN.size else (lead[:4], 0, 0, size, 0)
+                head.unpack(lead) if len(lead) == head.size else (lead[:4], 0, 0, size, 0)
             )
             if tag != b"TDSm":
                 raise RecordingError(f"is not a TDMS file: no segment begins at byte {position}")
             if contents & (1 << 6):  # the segment is big-endian
                 length = int.from_bytes(lead[12:20], "big")
-            position += _LEAD_IN.size + length
+            position += head.size + length
     if position != size or size == 0:
         raise RecordingError(
             f"is truncated: the last segment ends at byte {position}, the file at byte {size}",
@@ -98,10 +90,12 @@ def _check_length(path: pathlib.Path) -> None:
 def _channel(name: str, channel: Any) -> Channel:
     own = channel.properties
     kinds = {value for key, value in own.items() if key.endswith("_Scale_Type")}
-    if not kinds <= _SCALINGS:
-        found = ", ".join(sorted(kinds - _SCALINGS))
+    # These turn a voltage into a voltage. For an unknown scaling npTDMS returns raw codes.
+    kinds -= {"Linear", "Polynomial", "Table", "Add", "Subtract", "AdvancedAPI"}
+    if kinds:
         raise RecordingError(
-            f"{name!r} has the scaling {found}, which gives neither volts nor amperes"
+            f"{name!r} has the scaling {', '.join(sorted(kinds))}, which gives neither volts nor "
+            "amperes"
         )
     real(name, channel.dtype, (len(channel),))
     raw = np.dtype(getattr(channel.data_type, "nptype", None) or "V8")
@@ -116,7 +110,9 @@ def _channel(name: str, channel: Any) -> Channel:
         (len(channel),),
         channel.dtype if scaled else raw,
         read,
-        unit=one_unit(name, *(str(own.get(key, "")) for key in _UNITS)),
+        unit=one_unit(
+            name, *(str(own.get(key, "")) for key in ("unit_string", "NI_UnitDescription"))
+        ),
         sample_rate=rate_of(own.get("wf_increment", 0.0), 1e-12, own.get("wf_xunit_string") or "s"),
         conversion=slope,
         offset=intercept,
