@@ -13,8 +13,7 @@ from matplotlib.testing.compare import compare_images
 import etid
 from etid.estimators.lanes import Harmonics
 from etid.plotting import figure_of
-from etid.plotting.bands import bands
-from etid.plotting.candidates import PALE
+from etid.plotting.bands import CLEAR, bands
 from etid.plotting.pulses import pulse, residual_std
 from etid.plotting.style import RED, new_figure, save
 from etid.recordings.preflight import Inspected
@@ -180,7 +179,7 @@ def test_a_selection_shows_what_is_measured_and_each_candidate(driver, found):
     points = magnitude.lines[0]
     lines = [line for line in magnitude.lines if not str(line.get_label()).startswith("_")]
     np.testing.assert_allclose(
-        np.asarray(points.get_ydata()), np.abs(found[0].z[found[0].stderr <= PALE]) / 1e3
+        np.asarray(points.get_ydata()), np.abs(found[0].z[found[0].stderr <= CLEAR]) / 1e3
     )
     kilohertz, size = (np.asarray(of, float) for of in lines[0].get_data())
     z = np.asarray(pictures.SPREAD.response(jnp.asarray(1e3 * kilohertz)))

@@ -20,7 +20,7 @@ import etid
 from etid import cli
 from etid.estimators import registry
 from etid.files import exporting
-from etid.report import citations, figures, tables, worst_fits
+from etid.report import figures, methods, tables, worst_fits
 from etid.report import methods as methods_section
 from etid.report.html import Table
 from etid.report.recordings import Recordings
@@ -364,7 +364,7 @@ def test_large_studies_are_condensed_and_say_so(tmp_path):
     page = _Read(tmp_path / "page.html")
     groups = len(fits.summary("subject", "condition"))
     assert f"{tables.ROWS} of {groups} groups are shown" in page.text
-    assert f"The first {tables.BRIEF} are listed" in page.text
+    assert f"The first {tables.ROWS} are listed" in page.text
     assert f"Of {count // 5} subjects {figures.CROWD} are drawn" in page.text
     assert page.elements.count("tr") < 5 * tables.ROWS + tables.SINGLE
     assert f"{tables.SINGLE} of {count} recordings are shown" in page.text
@@ -526,15 +526,15 @@ def test_methods_name_the_score_tests(method):
 
 
 def test_every_entry_is_whole_bibtex():
-    everything = citations.bibtex(citations.entries())
+    everything = methods.bibtex(methods.entries())
     entries = everything.split("\n\n")
-    assert len(entries) == len(citations.entries())
+    assert len(entries) == len(methods.entries())
     for entry in entries:
         assert entry.count("{") == entry.count("}")
         assert re.fullmatch(r"@\w+\{\w+,\n(.+\n)+\}", entry), entry
     assert f"version = {{{etid.__version__}}}" in everything
     with pytest.raises(KeyError, match="unknown"):
-        citations.bibtex(["unknown"])
+        methods.bibtex(["unknown"])
 
 
 # --- command and browser --------------------------------------------------------------------------

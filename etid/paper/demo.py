@@ -40,15 +40,6 @@ from etid.recordings.replacing import replace_text
 from etid.report.html import Picture, Section, Table, number, write_page
 from etid.simulation.published import FINGERTIPS, RRSE, TABLE_1, TABLE_4
 
-_SEED = 0
-_READING = (
-    "Rows and columns named paper are measurements of the paper. All other numbers come from "
-    "simulated recordings, whose true elements are known. Quiet records have a signal-to-noise "
-    "ratio of 60 dB and no trigger delay. Noisy records have 40 dB and 200 ns; the errors of the "
-    "paper's method then have about the published size. The tables include every estimate, "
-    "whatever its verdict; `successful` counts the successful fits."
-)
-
 
 def _successes(fits: etid.Fits) -> str:
     return f"{len(fits.successful())}/{len(fits)}"
@@ -206,7 +197,7 @@ def main(argv: Sequence[str] | None = None) -> None:
         place = folder if laboratory == "quiet" else folder / laboratory
         place.mkdir(parents=True, exist_ok=True)
         scene = etid.scenes.paper(**settings)
-        scene.simulate(_SEED).write(place / "study.h5")
+        scene.simulate(seed=0).write(place / "study.h5")
         with etid.read(place / "study.h5") as study:
             for method in METHODS:
                 print(f"{laboratory}: {len(study)} recordings by {method} …", file=sys.stderr)
@@ -250,12 +241,19 @@ def main(argv: Sequence[str] | None = None) -> None:
             (table_verdicts(outcomes, truth),),
         ),
     ]
-    print(f"\n{textwrap.fill(_READING, 100)}")
+    about = (
+        "Rows and columns named paper are measurements of the paper. All other numbers come from "
+        "simulated recordings, whose true elements are known. Quiet records have a signal-to-noise "
+        "ratio of 60 dB and no trigger delay. Noisy records have 40 dB and 200 ns; the errors of "
+        "the paper's method then have about the published size. The tables include every estimate, "
+        "whatever its verdict; `successful` counts the successful fits."
+    )
+    print(f"\n{textwrap.fill(about, 100)}")
     for section in sections:
         print(f"\n{section}")
     page = folder / "index.html"
     sections.append(Section("Figures", "Quiet records, by maximum likelihood.", pictures=drawn))
-    write_page(page, "The paper's experiments, simulated and identified", _READING, sections)
+    write_page(page, "The paper's experiments, simulated and identified", about, sections)
     print(f"\nTables and figures: {page.resolve()}")
 
 

@@ -28,9 +28,7 @@ from etid.numpy_tier.tiers import program
 from etid.results.driver import ContinuousDriver, SourceImpedance
 from etid.results.feed import MeasuredCurrent
 
-PER_DECADE = 6  # bands
-ITERATIONS = 6  # of Gauss and Newton; the terms are almost linear
-PARTS = (1.0, 0.3, 0.1, 0.03, 0.0)  # of a step, for circuits that are far from the data
+CLEAR = 0.3  # relative standard error up to which the impedance of a band is drawn as a clear point
 
 
 @dataclasses.dataclass(frozen=True)
@@ -64,21 +62,21 @@ def bands(
     p = terms.fitted()
     gain, turned, z_th = terms.at(p)
     var = lane.variance_y + np.abs(turned) ** 2 * lane.variance_x
-    known = (lane.variance_y * lane.x + lane.variance_x * np.conj(turned) * lane.y) / var
+    x = (lane.variance_y * lane.x + lane.variance_x * np.conj(turned) * lane.y) / var
     by_load = np.ones_like(gain) if z_th is None else 1 - gain  # ∂ ln G/∂ ln Z
-    slope = turned * known * by_load
+    slope = turned * x * by_load
     weight = np.where(lane.selected, 2 * np.abs(slope) ** 2 / var, 0.0)
     rest = lane.y - turned * lane.x
     score = np.where(lane.selected, 2 * rest * np.conj(slope) / var, 0.0)
 
     frequency = np.asarray(lane.frequency)
-    number = np.round(PER_DECADE * np.log10(frequency / frequency[0])).astype(int)
+    number = np.round(6 * np.log10(frequency / frequency[0])).astype(int)  # six bands a decade
     total = np.bincount(number, weight)
     kept = total > 0
     total = total[kept]
 
-    def mean(of: Float[np.ndarray, " harmonic"]) -> Float[np.ndarray, " band"]:
-        return np.bincount(number, of)[kept] / total
+    def mean(values: Float[np.ndarray, " harmonic"]) -> Float[np.ndarray, " band"]:
+        return np.bincount(number, values)[kept] / total
 
     centre = np.exp(mean(weight * np.log(frequency)))
     off = mean(np.real(score)) + 1j * mean(np.imag(score))
@@ -181,8 +179,9 @@ class _Terms:
             return float(np.sum(self._residual(p)[0] ** 2))
 
         p = np.zeros(len(self.slopes) + 1)
-        for _ in range(ITERATIONS):
+        for _ in range(6):  # the terms are almost linear
             terms, slopes = self._residual(p)
             step = -np.linalg.lstsq(slopes.T, terms)[0]
-            p = min((p + part * step for part in PARTS), key=cost)
+            # Parts of a step, for circuits that are far from the data.
+            p = min((p + part * step for part in (1.0, 0.3, 0.1, 0.03, 0.0)), key=cost)
         return p

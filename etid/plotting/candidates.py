@@ -8,7 +8,7 @@ from matplotlib.axes import Axes
 from matplotlib.ticker import FixedLocator, NullLocator
 
 from etid.estimators.lanes import Harmonics
-from etid.plotting.bands import Bands, bands
+from etid.plotting.bands import CLEAR, Bands, bands
 from etid.plotting.impedances import POINTS, frame
 from etid.plotting.judging import in_bands
 from etid.plotting.pulses import headline
@@ -19,18 +19,13 @@ from etid.recordings.remarks import Remark
 from etid.results.driver import Driver
 from etid.selection.selection import Candidate, Selection
 
-LAYOUT: dict[str, Any] = {"sharex": True, "gridspec_kw": {"height_ratios": [3, 1.6]}}
-PALE = 0.3  # relative standard error above which a point is pale
-NOTHING = 1.0  # relative standard error above which there is no point
-PLAIN = 4.0  # [standard errors] deviations up to here are drawn to scale, others by logarithm
-TICKS = (2.0, 10.0, 100.0, 1000.0, 10000.0)  # of the deviations, with both signs
-
 
 def draw_selection(
     canvas: Canvas, selection: Selection, recording: Recording, driver: Driver | None
 ) -> np.ndarray:
     """Magnitude and phase with all candidates, and below them the deviation of each candidate."""
-    axes = canvas(2, 2, (9.0, 5.2), **LAYOUT).ravel()
+    ratios = {"height_ratios": [3, 1.6]}
+    axes = canvas(2, 2, (9.0, 5.2), sharex=True, gridspec_kw=ratios).ravel()
     chosen = selection.candidates[0]
     good = chosen.fit.verdict == "successful"
     lines = [
@@ -69,12 +64,12 @@ def _look(number: int) -> dict[str, Any]:
 
 
 def _points(magnitude: Axes, phase: Axes, measured: Bands) -> None:
-    """The measured impedance with two standard errors."""
+    """The measured impedance with two standard errors; uncertain points are pale."""
     kilohertz, degrees = measured.frequency / 1e3, np.degrees(np.angle(measured.z))
     kilohms = np.abs(measured.z) / 1e3
     for some, alpha in (
-        (measured.stderr <= PALE, 1.0),
-        ((measured.stderr > PALE) & (measured.stderr <= NOTHING), 0.3),
+        (measured.stderr <= CLEAR, 1.0),
+        ((measured.stderr > CLEAR) & (measured.stderr <= 1.0), 0.3),
     ):
         look = {"color": INK, "fmt": "o", "ms": 3.5, "lw": 0.9, "capsize": 2.0, "alpha": alpha}
         error = 2 * measured.stderr[some]
@@ -97,8 +92,8 @@ def _lines(magnitude: Axes, phase: Axes, fitted: list[Candidate], measured: Band
         phase.plot(kilohertz, np.degrees(np.angle(z)), **look)
     magnitude.set(ylabel="|Z| [kΩ]", xscale="log", yscale="log")
     phase.set(ylabel="phase [deg]")
-    near = measured.stderr <= PALE
-    frame(magnitude, phase, np.concatenate([*sizes, np.abs(measured.z[near]) / 1e3]))
+    clear = measured.stderr <= CLEAR
+    frame(magnitude, phase, np.concatenate([*sizes, np.abs(measured.z[clear]) / 1e3]))
     magnitude.legend(frameon=False, fontsize=8, loc="lower left")
 
 
@@ -110,8 +105,9 @@ def _label(number: int, one: Candidate) -> str:
 
 
 def _deviations(magnitude: Axes, phase: Axes, found: list[Bands]) -> None:
-    """Measured minus fitted, in standard errors."""
-    largest = max(np.abs(of.deviation).max() for of in found)
+    """Measured minus fitted, in standard errors: up to 4 to scale, beyond by logarithm."""
+    plain = 4.0
+    largest = max(plain, *(np.abs(of.deviation).max() for of in found))
     for part, (axis, name) in enumerate(((magnitude, "ln |Z|"), (phase, "phase"))):
         axis.axhspan(-2.0, 2.0, color="0.85", lw=0)
         axis.axhline(0.0, color="0.6", lw=0.6)
@@ -119,10 +115,10 @@ def _deviations(magnitude: Axes, phase: Axes, found: list[Bands]) -> None:
             mark = {"marker": MARKS[number % len(MARKS)], "ms": 3.0}
             axis.plot(of.frequency / 1e3, of.deviation[part], **_look(number), **mark)
         axis.set(xlabel="frequency [kHz]", ylabel=f"measured - fitted\n{name} [stderr]")
-        axis.set_yscale("symlog", linthresh=PLAIN, linscale=1.0)
-        ticks = [tick for tick in TICKS if tick <= max(largest, PLAIN)]
+        axis.set_yscale("symlog", linthresh=plain, linscale=1.0)
+        ticks = [tick for tick in (2.0, 10.0, 100.0, 1000.0, 10000.0) if tick <= largest]
         axis.yaxis.set_major_locator(FixedLocator([*(-t for t in ticks), 0.0, *ticks]))
         axis.yaxis.set_minor_locator(NullLocator())
         axis.yaxis.set_major_formatter("{x:g}")
-        axis.set_ylim(-1.4 * max(largest, PLAIN), 1.4 * max(largest, PLAIN))
+        axis.set_ylim(-1.4 * largest, 1.4 * largest)
         axis.xaxis.set_major_formatter("{x:g}")

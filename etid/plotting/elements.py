@@ -21,10 +21,6 @@ from etid.plotting.style import (
 from etid.results.fits import Fits
 from etid.simulation.bound import Bound
 
-NAMED = 40  # largest number of fits whose trials are written beside them
-CROWDED = 60  # letters below an axis; longer rows of labels are turned
-UNDETERMINED = 1.0  # relative standard error (see Bound.undetermined)
-
 
 def draw_fits(canvas: Canvas, fits: Fits) -> np.ndarray:
     """Elements of all fits by subject, with standard errors; fits without success are hollow."""
@@ -57,7 +53,7 @@ def draw_fits(canvas: Canvas, fits: Fits) -> np.ndarray:
                 0.995, 0.97, f"{(~shown).sum()} without success outside", color=RED, fontsize=8,
                 transform=axis.transAxes, ha="right", va="top",
             )  # fmt: skip
-        if len(fits) <= NAMED:
+        if len(fits) <= 40:  # there is room for the names of the trials
             for row in np.flatnonzero(shown):
                 axis.annotate(
                     str(fits.labels["trial"][row]), (x[row], values[row]), xytext=(4, 3),
@@ -65,7 +61,7 @@ def draw_fits(canvas: Canvas, fits: Fits) -> np.ndarray:
                 )  # fmt: skip
         axis.set_ylabel(symbol(name, unit))
     names = [str(subject) or "-" for subject in subjects]
-    turned = sum(map(len, names)) > CROWDED
+    turned = sum(map(len, names)) > 60
     axes[-1].set_xticks(range(len(names)), names, rotation=90 if turned else 0)
     axes[-1].set_xlabel("subject")
     _legend(axes[0], conditions, "" if good.all() else "without success")
@@ -131,7 +127,7 @@ def draw_bounds(canvas: Canvas, bounds: Sequence[Bound]) -> np.ndarray:
     (axis,) = axes = canvas(1, 1, (7.5, height)).ravel()
     names = list(dict.fromkeys(name for one in bounds for name in one.circuit.names()))
     known = [e for one in bounds for e in one.relative.values() if np.isfinite(e)]
-    edge = 100 * max([UNDETERMINED, *known])  # place of bounds that are not finite
+    edge = 100 * max([1.0, *known])  # place of bounds that are not finite
     undetermined = []
     for i, name in enumerate(names):
         of = [(row, one) for row, one in enumerate(bounds) if name in one.relative]
@@ -147,7 +143,7 @@ def draw_bounds(canvas: Canvas, bounds: Sequence[Bound]) -> np.ndarray:
                          if is_hollow]  # fmt: skip
     axis.set_xscale("log")
     if undetermined:
-        axis.axvline(100 * UNDETERMINED, color=RED, lw=0.9, ls="--")
+        axis.axvline(100, color=RED, lw=0.9, ls="--")  # see `Bound.undetermined`
     plain_ticks(axis.xaxis)
     axis.set_xlabel("smallest relative standard error [%]")
     axis.set_yticks(range(len(bounds)), [one.path or "-" for one in bounds])

@@ -16,8 +16,6 @@ from etid.solvers.propagation import log_stderr
 
 LOWEST, HIGHEST = 60.0, 100e3  # [Hz] the paper's pulse rate and half its sample rate
 POINTS = 300
-ROOM = 1.5  # factor between the curves and the frame
-BEYOND = 50.0  # limit of a logarithm: outside of every axis, but its exponential is finite
 
 
 def draw_bode(
@@ -45,7 +43,7 @@ def draw_bode(
         if known:
             banded = True
             band = {"color": colour, "alpha": 0.25, "linewidth": 0}
-            factor = np.exp(np.minimum(2 * errors[0], BEYOND))
+            factor = np.exp(np.minimum(2 * errors[0], 50))  # it is finite beyond every axis
             magnitude.fill_between(kilohertz, sizes[-1] / factor, sizes[-1] * factor, **band)
             turn = 2 * errors[1]
             phase.fill_between(kilohertz, *np.degrees([angle - turn, angle + turn]), **band)
@@ -61,7 +59,7 @@ def frame(magnitude: Axes, phase: Axes, sizes: Float[np.ndarray, " value"]) -> N
     """Set limits that show the curves even if the bands are wide, and ticks at 1, 2 and 5."""
     sizes = sizes[np.isfinite(sizes)]
     if sizes.size:
-        magnitude.set_ylim(sizes.min() / ROOM, sizes.max() * ROOM)
+        magnitude.set_ylim(sizes.min() / 1.5, sizes.max() * 1.5)
     low, high = phase.get_ylim()
     phase.set_ylim(max(low, -180.0), min(high, 180.0))
     plain_ticks(magnitude.yaxis)

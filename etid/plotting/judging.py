@@ -10,7 +10,7 @@ from etid.estimators.lanes import Harmonics
 from etid.estimators.registry import MAXIMUM_LIKELIHOOD
 from etid.identify.arguments import fed
 from etid.identify.predict import predict
-from etid.plotting.bands import bands
+from etid.plotting.bands import CLEAR, bands
 from etid.plotting.impedances import POINTS, frame
 from etid.plotting.pulses import headline
 from etid.plotting.style import BLUE, INK, RED, Canvas, titled
@@ -21,10 +21,6 @@ from etid.results.driver import ContinuousDriver, Driver
 from etid.results.feed import MeasuredCurrent
 from etid.results.fit import Fit
 
-SURE = 0.3  # relative standard error of a point; others are not drawn
-LAGS = 60  # samples in the diagrams of correlation
-BAND = 2.58  # standard deviations of a correlation that 99 % of white noise does not exceed
-
 
 def draw_impedance(
     canvas: Canvas, fit: Fit, recording: Recording, driver: Driver | None
@@ -32,8 +28,8 @@ def draw_impedance(
     """Nyquist and Bode diagrams: the impedance that the recording measures, and the fit."""
     recording, known = in_bands(recording, driver)
     measured = bands(Harmonics.of(Inspected(recording)), known, fit.circuit)
-    sure = measured.stderr <= SURE
-    points = measured.frequency[sure], measured.z[sure], measured.stderr[sure]
+    clear = measured.stderr <= CLEAR
+    points = measured.frequency[clear], measured.z[clear], measured.stderr[clear]
     return _diagrams(canvas, fit, headline(recording.path, fit), *points)
 
 
@@ -122,16 +118,19 @@ def draw_residual(
 def _correlation(
     axis: Axes, one: Float[np.ndarray, " time"], other: Float[np.ndarray, " time"], label: str
 ) -> None:
-    """Correlation coefficients of `one` with `other` at earlier times, over the lag."""
+    """Correlation coefficients of `one` with `other` at earlier times, over the lag.
+
+    99 % of white noise does not exceed 2.58 standard deviations.
+    """
     one, other = one - one.mean(), other - other.mean()
-    lags = np.arange(-LAGS, LAGS + 1)
+    lags = np.arange(-60, 61)
     norm = np.sqrt(np.sum(one**2) * np.sum(other**2))
     size = one.size
-    found = [
+    products = [
         np.dot(one[max(lag, 0) : size + min(lag, 0)], other[max(-lag, 0) : size - max(lag, 0)])
         for lag in lags
     ]
-    band = BAND / np.sqrt(size)
+    band = 2.58 / np.sqrt(size)
     axis.axhspan(-band, band, color="0.85", lw=0)
-    axis.vlines(lags, 0.0, np.array(found) / norm, color=INK, lw=0.9)
+    axis.vlines(lags, 0.0, np.array(products) / norm, color=INK, lw=0.9)
     axis.set(xlabel="lag [samples]", ylabel=label)

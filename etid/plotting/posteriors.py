@@ -10,10 +10,7 @@ from etid.circuits.display import DISPLAY
 from etid.plotting.style import BLUE, INK, RED, Canvas, symbol, titled
 from etid.results.posterior import Posterior, Profile
 
-SHOWN = 2000  # points in a diagram of two elements
-BINS = 30
 LEVEL = 0.95
-ROUND = np.linspace(0.0, 2 * np.pi, 200)
 
 
 def draw_posterior(canvas: Canvas, posterior: Posterior) -> np.ndarray:
@@ -28,7 +25,7 @@ def draw_posterior(canvas: Canvas, posterior: Posterior) -> np.ndarray:
     centre = np.asarray(posterior.circuit.values()) / scales
     cov = posterior.cov / np.outer(scales, scales)
     random = np.random.default_rng(0)
-    some = random.choice(posterior.weights.size, SHOWN, p=posterior.weights)
+    some = random.choice(posterior.weights.size, 2000, p=posterior.weights)
     ranges = [_range(values[some]) for values in draws]
     intervals = list(posterior.intervals(LEVEL).values())
     for row, (name, unit) in enumerate(units.items()):
@@ -79,7 +76,7 @@ def _histogram(
 ) -> None:
     """The histogram of one element, its interval, and the normal distribution of the fit."""
     low, high = axis.get_xlim()
-    bins = np.linspace(low, high, BINS).tolist()
+    bins = np.linspace(low, high, 30).tolist()
     axis.hist(values, bins=bins, weights=weights, density=True, color=BLUE, alpha=0.7)
     x = np.linspace(low, high, 200)
     normal = np.exp(-((x - centre) ** 2) / (2 * variance)) / np.sqrt(2 * np.pi * variance)
@@ -93,7 +90,8 @@ def _ellipse(
 ) -> Float[np.ndarray, "2 point"]:
     """The ellipse that holds 95 % of a normal distribution of two elements."""
     radius = np.sqrt(-2 * np.log(1 - LEVEL))
-    circle = np.stack([np.cos(ROUND), np.sin(ROUND)])
+    angle = np.linspace(0.0, 2 * np.pi, 200)
+    circle = np.stack([np.cos(angle), np.sin(angle)])
     return centre[:, None] + radius * np.linalg.cholesky(cov) @ circle
 
 

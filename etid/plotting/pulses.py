@@ -15,19 +15,18 @@ from etid.results.driver import Driver
 from etid.results.fit import Fit
 from etid.signals.noise import noise
 
-BEFORE, AFTER = 0.15e-3, 1.2e-3  # [s] time shown before and after the first edge of a pulse
-EDGE = 0.3  # of the largest step; the edges of a biphasic pulse are half of that between its phases
-FREQUENCIES = 2048  # for the mean of |G|²; features of G are wider than 1/1000 of the band
-PAIR = {"sharex": True, "gridspec_kw": {"height_ratios": [3, 1.2]}}  # axes of pulse and residual
-
 
 def pulse(recording: Recording) -> slice:
-    """Samples of one pulse: around its first edge, if both are far enough from both ends."""
+    """Samples of one pulse: from 0.15 ms before its first edge to 1.2 ms after it.
+
+    The pulse is one that is far enough from both ends of the record, if there is one.
+    """
     cause = recording.samples[recording.cause].values
     step, size = np.nan_to_num(np.diff(cause)), cause.size  # a missing sample must not hide an edge
-    before = int(BEFORE * recording.sample_rate)
-    after = int(AFTER * recording.sample_rate)
-    edges = np.flatnonzero(np.abs(step) > EDGE * np.abs(step).max(initial=0.0))
+    before = int(0.15e-3 * recording.sample_rate)
+    after = int(1.2e-3 * recording.sample_rate)
+    # The edges of a biphasic pulse are half of that between its phases.
+    edges = np.flatnonzero(np.abs(step) > 0.3 * np.abs(step).max(initial=0.0))
     # The rest before a pulse is longer than its phases. A record may begin in a pulse.
     rest = np.diff(edges, prepend=0)
     first = edges[rest > 0.5 * rest.max(initial=0)]
@@ -72,7 +71,7 @@ def draw_fit(canvas: Canvas, fit: Fit, recording: Recording, driver: Driver | No
             f"this is a batch of {np.shape(fit.rrse)} fits; draw one fit, fits[i], or all of "
             "them, plot(fits)"
         )
-    axes = canvas(2, 1, (6.0, 4.8), **PAIR).ravel()
+    axes = _pulse_and_residual(canvas)
     good = fit.verdict == "successful"
     if not np.isfinite(np.asarray(fit.circuit.values())).all():
         _unpredicted(axes[0], axes[1], recording)
@@ -90,12 +89,17 @@ def draw_calibration(canvas: Canvas, driver: Driver, recording: Recording) -> np
             "a driver is drawn with a calibration, but this recording has no r_load; draw the "
             "fit of this recording, plot(fit, recording, driver)"
         )
-    axes = canvas(2, 1, (6.0, 4.8), **PAIR).ravel()
+    axes = _pulse_and_residual(canvas)
     draw_pulse(axes[0], axes[1], recording, driver, Resistor(recording.r_load))
     lines = [headline(recording.path, driver), f"driver of order {driver.order}, "]
     lines[1] += f"known load {recording.r_load / 1e3:g} kΩ"
     titled(axes[0], lines, good=driver.verdict == "successful")
     return axes
+
+
+def _pulse_and_residual(canvas: Canvas) -> np.ndarray:
+    ratios = {"height_ratios": [3, 1.2]}
+    return canvas(2, 1, (6.0, 4.8), sharex=True, gridspec_kw=ratios).ravel()
 
 
 def headline(path: str, found: Fit | Driver) -> str:
@@ -166,7 +170,8 @@ def residual_std(recording: Recording, driver: Driver | None, circuit: AbstractC
         σ² = σ_out² + σ_th² mean |G|²,    the mean from 0 to half the sample rate (Parseval).
     """
     half = recording.sample_rate / 2
-    frequency = jax.device_put((np.arange(FREQUENCIES) + 0.5) * half / FREQUENCIES)
+    # Features of G are wider than a thousandth of the band.
+    frequency = jax.device_put((np.arange(2048) + 0.5) * half / 2048)
     recording, feed = fed(recording, driver)
     size = np.abs(np.asarray(feed.gain(circuit.response(frequency), frequency)))
     gain = np.mean(size**2)

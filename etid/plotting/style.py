@@ -27,7 +27,6 @@ RED = "#c0392b"
 COLOURS = (BLUE, RED, "#2e7d32", INK)
 DASHES = ("-", "--", "-.", ":", (0, (5, 1, 1, 1, 1, 1)), (0, (1, 3)))
 MARKS = ("o", "s", "^", "D", "v", "P", "X", "<", ">", "p", "h", "*")
-GREEK = ("alpha", "beta", "tau")  # names of elements
 PAPER: Any = {
     "figure.facecolor": "white",
     "axes.facecolor": "white",
@@ -114,7 +113,7 @@ def symbol(name: str, unit: str) -> str:
     `r_s` becomes an R with the subscript s; a word such as `alpha` becomes a Greek letter.
     """
     letter, _, index = name.partition("_")
-    if letter in GREEK:
+    if letter in ("alpha", "beta", "tau"):
         letter = rf"\{letter}"
     elif len(letter) > 1:
         return heading(name, unit)

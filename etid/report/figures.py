@@ -23,14 +23,9 @@ from etid.report.tables import Components, frequent
 from etid.results.driver import Driver
 from etid.results.fits import Fits
 
-POINTS = 300  # largest number of points of a curve
-BINS = 40  # largest number of bin edges of a histogram
-FAR = 1e6  # ratio of the ends of an axis; above, the labels are powers of ten
 NARROW = 3.0  # ratio of the largest to the smallest value; above, an axis is logarithmic
-NAMED = 30  # largest number of subjects with names below the axis
 CROWD = 120  # largest number of subjects in a figure
 SERIES = 4  # largest number of conditions in a figure
-QUARTILES, MOST = (0.25, 0.75), (0.05, 0.95)
 
 
 def svg(figure: Figure) -> bytes:
@@ -48,8 +43,8 @@ def _drawable(values: np.ndarray) -> Float[np.ndarray, " value"]:
 
 
 def _steps(axis: Axes, values: np.ndarray, series: int, label: str) -> None:
-    """Draw an empirical distribution function with at most `POINTS` + 1 points."""
-    p = np.linspace(0.0, 1.0, min(POINTS, values.size) + 1)
+    """Draw an empirical distribution function with at most 301 points."""
+    p = np.linspace(0.0, 1.0, min(300, values.size) + 1)
     axis.step(
         np.quantile(values, p, method="inverted_cdf"), 100 * p, ls=DASHES[series],
         where="post", color=COLOURS[series], lw=1.3, label=label,
@@ -80,14 +75,17 @@ def distributions(fits: Fits) -> bytes:
 
 
 def _plain(axis: Axes, which: str) -> None:
-    """Label a logarithmic axis with plain numbers: 10, 20, 50 if it is short, else 0.1, 1, 10."""
-    of = axis.xaxis if which == "x" else axis.yaxis
-    low, high = sorted(of.get_view_interval())
-    if 0 < low and high < FAR * low:
-        few = high < FAR**0.5 * low
-        of.set_major_locator(matplotlib.ticker.LogLocator(subs=(1.0, 2.0, 5.0) if few else (1.0,)))
-        of.set_major_formatter(matplotlib.ticker.FormatStrFormatter("%g"))
-        of.set_minor_formatter(matplotlib.ticker.NullFormatter())
+    """Label a logarithmic axis with plain numbers: 10, 20, 50 if it is short, else 0.1, 1, 10.
+
+    An axis of more than six decades keeps its powers of ten.
+    """
+    ticks = axis.xaxis if which == "x" else axis.yaxis
+    low, high = sorted(ticks.get_view_interval())
+    if 0 < low and high < 1e6 * low:
+        subs = (1.0, 2.0, 5.0) if high < 1e3 * low else (1.0,)
+        ticks.set_major_locator(matplotlib.ticker.LogLocator(subs=subs))
+        ticks.set_major_formatter(matplotlib.ticker.FormatStrFormatter("%g"))
+        ticks.set_minor_formatter(matplotlib.ticker.NullFormatter())
 
 
 def quality(chi2: Float[np.ndarray, " fit"], stderr: Float[np.ndarray, " fit"]) -> bytes:
@@ -102,7 +100,7 @@ def quality(chi2: Float[np.ndarray, " fit"], stderr: Float[np.ndarray, " fit"]) 
         if known.size:
             wide = known.max() > NARROW * known.min()
             space = np.geomspace if wide else np.linspace
-            count = min(BINS, 4 + 2 * round(np.sqrt(known.size)))
+            count = min(40, 4 + 2 * round(np.sqrt(known.size)))
             bins = space(0.99 * known.min(), 1.01 * known.max(), count).tolist()
             axis.yaxis.set_major_locator(matplotlib.ticker.MaxNLocator("auto", integer=True))
             axis.hist(known, bins=bins, color=COLOURS[0], edgecolor="white", lw=0.3)
@@ -120,25 +118,25 @@ def by_subject(fits: Fits) -> bytes:
     """
     good, units = fits.successful(), fits.circuit.units()
     subjects, place = np.unique(good.labels["subject"].astype(str), return_inverse=True)
-    named = subjects.size <= NAMED
+    named = subjects.size <= 30
     conditions = frequent(fits, SERIES)
     width = min(14.0, max(10.0, 0.35 * subjects.size))
     figure, axes = new_figure(len(units), 1, (width, 2.2 * len(units)), sharex=True)
-    thin = 1.0 if subjects.size <= 2 * NAMED else 0.5
+    thin = 1.0 if subjects.size <= 60 else 0.5
     for axis, (name, unit) in zip(axes[:, 0], units.items(), strict=True):
         scale = DISPLAY[unit][0]
         values = np.asarray(getattr(good.circuit, name)) / scale
         for series, condition in enumerate(conditions):
             chosen = good.labels["condition"] == condition
-            where, found = _quantiles(place[chosen], values[chosen])
+            where, quantiles = _quantiles(place[chosen], values[chosen])
             if subjects.size > CROWD:
-                where, found = _thinned(found)
+                where, quantiles = _thinned(quantiles)
             where = where + (series + 0.5) / len(conditions) * 0.8 - 0.4
             colour = COLOURS[series]
-            axis.vlines(where, found[0], found[4], color=colour, lw=0.8 * thin)
-            axis.vlines(where, found[1], found[3], color=colour, lw=2.6 * thin)
+            axis.vlines(where, quantiles[0], quantiles[4], color=colour, lw=0.8 * thin)
+            axis.vlines(where, quantiles[1], quantiles[3], color=colour, lw=2.6 * thin)
             axis.plot(
-                where, found[2], MARKS[series], color=colour, ms=4.5 * thin,
+                where, quantiles[2], MARKS[series], color=colour, ms=4.5 * thin,
                 markerfacecolor="white", label=_short(condition) or "all",
             )  # fmt: skip
         axis.set(yscale="log", ylabel=symbol(name, unit))
@@ -155,11 +153,11 @@ def by_subject(fits: Fits) -> bytes:
     return svg(figure)
 
 
-def _thinned(found: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _thinned(quantiles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Positions and quantiles of at most `CROWD` subjects, in the order of their medians."""
-    order = np.argsort(found[2], kind="stable")
+    order = np.argsort(quantiles[2], kind="stable")
     chosen = order[np.linspace(0, order.size - 1, min(CROWD, order.size)).round().astype(int)]
-    return np.linspace(0.0, CROWD - 1.0, chosen.size), found[:, chosen]
+    return np.linspace(0.0, CROWD - 1.0, chosen.size), quantiles[:, chosen]
 
 
 def plain(name: str) -> str:
@@ -172,12 +170,15 @@ def _short(name: str, length: int = 16) -> str:
 
 
 def _quantiles(place: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The places that occur, and five quantiles of the values at each place."""
+    """The places that occur, and quantiles of the values at each place.
+
+    They are those of the middle 90 % and 50 %, and the median.
+    """
     order = np.argsort(place, kind="stable")
     where, starts = np.unique(place[order], return_index=True)
-    levels = (MOST[0], QUARTILES[0], 0.5, QUARTILES[1], MOST[1])
-    found = [np.quantile(part, levels) for part in np.split(values[order], starts[1:])]
-    return where.astype(float), np.array(found).reshape(where.size, 5).T
+    levels = (0.05, 0.25, 0.5, 0.75, 0.95)
+    quantiles = [np.quantile(part, levels) for part in np.split(values[order], starts[1:])]
+    return where.astype(float), np.array(quantiles).reshape(where.size, 5).T
 
 
 def components(found: Sequence[Components], conditions: Sequence[str]) -> bytes:

@@ -19,9 +19,6 @@ import numpy as np
 
 from etid.recordings.replacing import replace_text
 
-LONG = 60  # characters; a longer cell is broken into lines
-MANY = 12  # rows; a longer table is below the pictures
-
 
 @dataclasses.dataclass(frozen=True)
 class Table:
@@ -164,7 +161,7 @@ def write_page(
         sections=sections,
         script=text_of_script,
         allowed=f"sha256-{digest}",
-        LONG=LONG,
-        MANY=MANY,
+        LONG=60,  # characters; a longer cell is broken into lines
+        MANY=12,  # rows; a longer table is below the pictures
     )
     replace_text(path, page.lstrip())

@@ -1,11 +1,15 @@
 """The methods section of a paper, written from the settings of the fits.
 
 Each estimator describes itself. The numbers and thresholds in the text are those that the estimator
-uses.
+uses. The entries to cite come from `citations.bib` and are printed unchanged, except for the
+version of etid.
 """
 
+import importlib.metadata
+import importlib.resources
 import pathlib
-from collections.abc import Sequence
+import re
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 
@@ -13,19 +17,12 @@ from etid.circuits.display import quantity
 from etid.estimators.estimate import MAX_STEPS
 from etid.estimators.estimator import Description
 from etid.estimators.registry import MAXIMUM_LIKELIHOOD, OUTPUT_ERROR, described
-from etid.report import citations
 from etid.report.html import Section, Table
 from etid.results.driver import ContinuousDriver
 from etid.results.fits import AND, joined
 from etid.results.provenance import Settings
 from etid.results.study_fits import StudyFits
 from etid.selection.common import LIMIT
-
-REFINED = (
-    "Minima were found by Levenberg-Marquardt, composed of the parts of optimistix (Rader et al., "
-    f"2024), in at most {MAX_STEPS} steps, from several starts around the typical elements and, "
-    "for Z_th and the load alike, from the estimate of Steiglitz and McBride (1965)."
-)
 
 
 def methods_section(found: StudyFits) -> Section:
@@ -66,7 +63,7 @@ def methods_section(found: StudyFits) -> Section:
         "\n\n".join(filter(None, paragraphs)),
         () if settings is None else (_table(found, settings),),
         warning=" ".join(warnings),
-        code=citations.bibtex(cited),
+        code=bibtex(cited),
     )
 
 
@@ -153,7 +150,12 @@ def _estimator(found: StudyFits, used: Sequence[Description]) -> str:
         text += "Both occurred. " if method == automatic else f"Here it was {words(method)}. "
     parts = [one.text for one in used]
     if any(one.refined for one in used):
-        parts.append(REFINED)
+        parts.append(
+            "Minima were found by Levenberg-Marquardt, composed of the parts of optimistix (Rader "
+            f"et al., 2024), in at most {MAX_STEPS} steps, from several starts around the typical "
+            "elements and, for Z_th and the load alike, from the estimate of Steiglitz and McBride "
+            "(1965)."
+        )
     parts += dict.fromkeys(one.noise for one in used)
     return text + " ".join(parts)
 
@@ -229,3 +231,23 @@ def _table(found: StudyFits, settings: Settings) -> Table:
         del rows["Z_th"], rows["R_L"]
     shown = tuple(rows.items())
     return Table(("setting", "value"), shown, caption="Settings")
+
+
+def entries() -> dict[str, str]:
+    """All entries of the file by key, in the order of the file."""
+    text = (importlib.resources.files("etid.report") / "citations.bib").read_text("utf-8")
+    return {key: entry for entry, key in re.findall(r"(?ms)^(@\w+\{(\w+),$.*?^\})", text)}
+
+
+def bibtex(keys: Iterable[str]) -> str:
+    """The BibTeX entries with these keys, in the order of the file.
+
+    Raises:
+        KeyError: The file has no entry with one of the keys.
+    """
+    known, wanted = entries(), set(keys)
+    unknown = wanted - known.keys()
+    if unknown:
+        raise KeyError(f"citations.bib has no entry {', '.join(sorted(unknown))}")
+    text = "\n\n".join(entry for key, entry in known.items() if key in wanted)
+    return text.replace("{VERSION}", f"{{{importlib.metadata.version('etid')}}}")

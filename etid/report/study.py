@@ -22,10 +22,6 @@ from etid.results.fits import Fits
 from etid.results.study_fits import StudyFits
 from etid.results.verdicts import message, own_part
 
-EACH = 24  # largest number of recordings whose waveforms are all drawn
-FEW = 300  # largest number of fits that are drawn one by one
-DRIVERS = 4  # largest number of drivers in one diagram
-
 
 @np.errstate(all="ignore")  # a fit that failed may hold any number
 def write_report(
@@ -143,12 +139,13 @@ def _drivers(found: StudyFits) -> Section:
     if count > study_tables.ROWS:
         text += f" {study_tables.ROWS} of {count} are shown, those without success first."
     shown = {", ".join(paths): driver for paths, driver in found.drivers.items()}
-    shown = dict(sorted(shown.items())[:DRIVERS])
+    most = 4  # drivers in one diagram
+    shown = dict(sorted(shown.items())[:most])
     pictures = ()
     if shown:
         caption = "Source impedance"
-        if len(found.drivers) > DRIVERS:
-            caption += f" of the first {DRIVERS} of {len(found.drivers)} drivers"
+        if len(found.drivers) > most:
+            caption += f" of the first {most} of {len(found.drivers)} drivers"
         caption += ", with bands of two standard errors where the method has one."
         alt = f"Bode diagram of Z_th of {', '.join(shown)}."
         pictures = (Picture(caption, figures.drivers(shown), alt),)
@@ -209,7 +206,7 @@ def _subjects(fits: Fits, groups: Sequence[Mapping[str, Any]]) -> Section:
         "median: the variation between the recordings, their own error and their shared error."
     )
     pictures = ()
-    if len(good) > FEW:
+    if len(good) > 300:
         caption = (
             "Each subject's median, the middle half of the successful fits (thick) and nine tenths "
             "of them (thin)."
@@ -270,8 +267,8 @@ def _quality(fits: Fits, stderr: np.ndarray) -> Section:
         pictures = (Picture(caption, drawn, alt, whole=True),)
     failed = int((~good).sum())
     text = f"{failed} fits are without success." if failed else "All fits are successful."
-    if failed > study_tables.BRIEF:
-        text += f" The first {study_tables.BRIEF} are listed; the file of fits has all."
+    if failed > study_tables.ROWS:
+        text += f" The first {study_tables.ROWS} are listed; the file of fits has all."
     tables = (study_tables.failures(fits),) if failed else ()
     return Section("Quality", text, tables, pictures)
 
@@ -305,23 +302,22 @@ def _recordings(fits: Fits, waveforms: Section) -> Section:
     return Section("Recordings", text, (study_tables.recordings(fits, links),))
 
 
-NOISE = (
-    "If the model is right, the residual is noise. At the edges of a pulse it also contains "
-    "frequencies near half the sample rate, which are aliased and not fitted."
-)
-
-
 def _waveforms(fits: Fits, place: Any) -> Section:
     text = (
         "First fits without success: for each verdict those with the largest χ². Then successful "
-        f"fits with the largest χ² and with the largest standard error. One pulse of each. {NOISE}"
+        "fits with the largest χ² and with the largest standard error. One pulse of each."
     )
     chosen = {one.row: one.reason for one in choose(fits)}
-    if len(fits) <= EACH:
+    all_drawn = len(fits) <= 24
+    if all_drawn:
         chosen |= {row: "" for row in range(len(fits)) if row not in chosen}
     if len(fits) == 1:
-        text = f"One pulse. {NOISE}"
+        text = "One pulse."
         chosen = {0: ""}
+    text += (
+        " If the model is right, the residual is noise. At the edges of a pulse it also contains "
+        "frequencies near half the sample rate, which are aliased and not fitted."
+    )
     pictures, missing = [], []
     for row, reason in chosen.items():
         path = str(fits.labels["path"][row])
@@ -332,5 +328,5 @@ def _waveforms(fits: Fits, place: Any) -> Section:
             pictures.append(picture)
     if missing:
         text += f"\n\nThese recordings cannot be read and have no waveform: {', '.join(missing)}."
-    heading = "Worst fits" if len(fits) > EACH else "Waveforms"
+    heading = "Waveforms" if all_drawn else "Worst fits"
     return Section(heading, text, (), tuple(pictures), warning=place.problem)

@@ -22,8 +22,6 @@ from etid.results.verdicts import message, own_part
 ROWS = 100  # largest number of rows of a table
 CONDITIONS = 30  # largest number of conditions in a table
 SINGLE = 3000  # largest number of rows of the table of recordings
-BRIEF = 50  # largest number of rows of a table of single recordings
-PARTS = ("between", "own", "shared")  # keys of `Fits.summary`
 
 
 def significant(value: float, digits: int = 2) -> str:
@@ -232,6 +230,7 @@ def groups(rows: Sequence[Mapping[str, Any]], by: Sequence[str], units: Mapping[
         worst = np.argsort([row["successful"] / row["fits"] for row in shown], kind="stable")
         shown = [shown[i] for i in sorted(worst[:ROWS])]
     usual = {name: _typical(np.array([row[name] for row in shown], float)) for name in units}
+    parts = ("between", "own", "shared")  # keys of `Fits.summary`
     cells = []
     for row in shown:
         line = [str(row[name]) or "-" for name in by]
@@ -240,12 +239,12 @@ def groups(rows: Sequence[Mapping[str, Any]], by: Sequence[str], units: Mapping[
             median = row[name]
             scale = scaled(unit, usual[name])[0]
             line.append(element(median, row[f"{name}_stderr"], scale).partition(" ±")[0])
-            line += [significant(100 * row[f"{name}_{k}"] / median) for k in PARTS]
+            line += [significant(100 * row[f"{name}_{part}"] / median) for part in parts]
         cells.append(tuple(line))
     heads = [*by, "successful"]
     for name, unit in units.items():
-        heads += [heading("median", unit, usual[name]), *(f"{part} [%]" for part in PARTS)]
-    over = [(name, 1 + len(PARTS)) for name in units]
+        heads += [heading("median", unit, usual[name]), *(f"{part} [%]" for part in parts)]
+    over = [(name, 1 + len(parts)) for name in units]
     return Table(tuple(heads), tuple(cells), (("", len(by) + 1), *over))
 
 
@@ -312,8 +311,8 @@ def shown_rows(fits: Fits) -> np.ndarray:
 
 
 def failures(fits: Fits) -> Table:
-    """The first recordings without success; at most `BRIEF`."""
-    chosen = np.flatnonzero(fits.verdicts != "successful")[:BRIEF]
+    """The first recordings without success; at most `ROWS`."""
+    chosen = np.flatnonzero(fits.verdicts != "successful")[:ROWS]
     some = fits.take(chosen)
     rows = []
     for i, verdict in enumerate(some.verdicts):
