@@ -112,7 +112,7 @@ def test_elements_are_those_without_the_delay(driver):
     # The prediction is that of the record as it is: to its noise, 10 mV, and that of V_th.
     circuit = etid.SkinRC(*map(float, np.asarray(fits.circuit.values())[0]))
     off = etid.predict(records[0], driver, circuit) - records[0].v_out
-    assert np.nanstd(off) < 2 * np.sqrt(2) * float(Inspected(records[0]).sigma_out)
+    assert np.nanstd(off) < 2 * np.sqrt(2) * float(Inspected(records[0]).sigma[1])
 
 
 def test_a_calibration_that_is_late_serves_as_well():

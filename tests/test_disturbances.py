@@ -85,7 +85,7 @@ def test_both_voltages_and_what_is_known_of_them_are_of_the_same_periods():
     )
     noisy = Inspected(recording.replace(v_out=loud))
     assert noisy.kept is not None
-    np.testing.assert_allclose(noisy.sigma_out, seen.sigma_out)  # the same two periods
+    np.testing.assert_allclose(noisy.sigma, seen.sigma)  # the same two periods
 
 
 @pytest.mark.parametrize("spacing", [3333.3, 3333.5, 4000.0, 166.7])

@@ -77,7 +77,7 @@ def test_hum_between_the_harmonics_is_subtracted(frequency, samples):
     periods, length = seen.periods
     left = np.fft.rfft((seen.v_out - clean.v_out)[:length]) / length
     frequencies = np.arange(left.size) / length * clean.sample_rate
-    noise = float(seen.sigma_out) / np.sqrt(length)
+    noise = float(seen.sigma[1]) / np.sqrt(length)
     # What is subtracted is as uncertain as noise beside the hum, and less farther away.
     far = np.abs(frequencies[:, None] - frequency * np.arange(1, 8)).min(1)
     far = (far > clean.sample_rate / length) & (np.arange(left.size) % periods == 0)

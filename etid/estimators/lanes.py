@@ -155,15 +155,13 @@ class Harmonics(AbstractLane):
     def _fields(seen: Inspected) -> tuple[np.ndarray, ...]:
         """The fields of a lane, in their order."""
         rate = np.asarray(seen.recording.sample_rate)
-        sigmas = seen.trusted_th, seen.trusted_out
         frequency, x, y, *variances, selected = seen.spectrum
-        of_th = seen.v_th, seen.recorded_th, sigmas[0], seen.coarse_th
-        of_out = seen.v_out, seen.recorded_out, sigmas[1], seen.coarse_out
-        for number, ((v, recorded, sigma, step), flickers) in enumerate(
-            zip((of_th, of_out), seen.flickers, strict=True)
-        ):
+        known = zip(
+            seen.quiet, seen.recorded, seen.trusted, seen.coarse, seen.flickers, strict=True
+        )
+        for number, (v, recorded, sigma, step, flickers) in enumerate(known):
             if step > 0:
-                rounded = rounding_variance(recorded, step, *seen.periods)
+                rounded = rounding_variance(recorded, float(step), *seen.periods)
                 variances[number] = np.append(rounded, variances[number][rounded.size :])
             elif flickers:
                 of = v, float(sigma), frequency, float(rate)
@@ -320,8 +318,8 @@ class PaddedSamples(AbstractLane):
         one = cls(
             v_th=np.pad(seen.v_th, (0, room)),
             v_out=np.pad(seen.v_out, (0, room)),
-            sigma_th=seen.trusted_th,
-            sigma_out=seen.trusted_out,
+            sigma_th=np.asarray(seen.trusted[0]),
+            sigma_out=np.asarray(seen.trusted[1]),
             sample_rate=np.asarray(seen.recording.sample_rate),
             samples=np.asarray(size),
         )
@@ -395,7 +393,7 @@ class AlignedSamples(AbstractLane):
     @classmethod
     def of(cls, seen: Inspected) -> "AlignedSamples":
         """The aligned records of a recording."""
-        steps = np.asarray(seen.step_th), np.asarray(seen.step_out)
+        steps = map(np.asarray, seen.step)
         return cls(*seen.aligned, *steps, np.asarray(seen.recording.sample_rate))
 
     @classmethod

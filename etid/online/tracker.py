@@ -159,14 +159,14 @@ class Tracker(Overviewed):
         rate = unloaded.sample_rate
         period = rate / seen.train.counted
         try:
-            bands, projection = unloaded_bands(seen.v_th, float(seen.sigma_th), rate, period)
+            bands, projection = unloaded_bands(seen.v_th, float(seen.sigma[0]), rate, period)
         except ValueError as error:
             raise IdentificationError(
                 f"unloaded recording {unloaded.path!r}: {error}", None
             ) from None
         known = known_at(bands.frequency, driver, False, MAXIMUM_LIKELIHOOD)
         low, high = unloaded.adc_range or (-np.inf, np.inf)
-        half = seen.step_th / 2
+        half = seen.step[0] / 2
         model = GainModel.of(
             circuit_of(circuit),
             bands,

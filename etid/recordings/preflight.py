@@ -24,6 +24,9 @@ SHORTEST = 4 * TAPS + 104  # [samples] edges of the interpolation, and 104 sampl
 class Inspected:
     """A recording and its properties that need no model; each is computed once, when it is used.
 
+    An axis of length 2 holds `v_th` and `v_out`, as in `Group`. In a recording of a measured
+    current, the current is in the place of `v_th`.
+
     Args:
         recording: The recording.
         group: Recordings that are inspected together with this one; only this one if not given.
@@ -58,25 +61,15 @@ class Inspected:
             return False
         return self.periods == other.periods
 
-    @functools.cached_property
+    @property
     def v_th(self) -> Float[np.ndarray, " time"]:
         """Unloaded voltage [V] of the periods in use, without hum between the harmonics."""
-        return self._quiet[0]
+        return self.quiet[0]
 
-    @functools.cached_property
+    @property
     def v_out(self) -> Float[np.ndarray, " time"]:
         """Loaded voltage [V] of the periods in use, without hum between the harmonics."""
-        return self._quiet[1]
-
-    @functools.cached_property
-    def recorded_th(self) -> Float[np.ndarray, " time"]:
-        """Unloaded voltage of the periods in use as it was recorded [V]."""
-        return self._recorded[0]
-
-    @functools.cached_property
-    def recorded_out(self) -> Float[np.ndarray, " time"]:
-        """Loaded voltage of the periods in use as it was recorded [V]."""
-        return self._recorded[1]
+        return self.quiet[1]
 
     @functools.cached_property
     def kept(self) -> Joint | None:
@@ -89,12 +82,14 @@ class Inspected:
         return self._group.shifts[self._row]
 
     @functools.cached_property
-    def _quiet(self) -> Float[np.ndarray, "2 time"]:
+    def quiet(self) -> Float[np.ndarray, "2 time"]:
+        """Voltages [V] of the periods in use, without hum between the harmonics."""
         quiet = self._group.quiet[self._row]
         return quiet if self.kept is None else self.kept(quiet)
 
     @functools.cached_property
-    def _recorded(self) -> Float[np.ndarray, "2 time"]:
+    def recorded(self) -> Float[np.ndarray, "2 time"]:
+        """Voltages [V] of the periods in use as they were recorded."""
         whole = self._group.whole[self._row]
         return whole if self.kept is None else self.kept(whole)
 
@@ -104,24 +99,19 @@ class Inspected:
         return self.spacing * np.arange(self.periods[0]) if self.kept is None else self.kept.begins
 
     @property
-    def coarse_th(self) -> float:
-        """Converter step [V] of `v_th` if it exceeds the noise, else 0."""
-        return self._group.coarse[self._row, 0]
+    def coarse(self) -> Float[np.ndarray, "2"]:
+        """Converter steps [V] that exceed the noise, else 0."""
+        return self._group.coarse[self._row]
 
     @property
-    def coarse_out(self) -> float:
-        """Converter step [V] of `v_out` if it exceeds the noise, else 0."""
-        return self._group.coarse[self._row, 1]
+    def hum(self) -> list[Hum | None]:
+        """Hum that is subtracted from each voltage; None if there is none."""
+        return self._group.hum[self._row]
 
     @property
-    def hum_th(self) -> Hum | None:
-        """Hum that is subtracted from `v_th`; None if there is none."""
-        return self._group.hum[self._row][0]
-
-    @property
-    def hum_out(self) -> Hum | None:
-        """Hum that is subtracted from `v_out`; None if there is none."""
-        return self._group.hum[self._row][1]
+    def hums(self) -> bool:
+        """Whether hum is subtracted from one of the voltages."""
+        return any(hum is not None for hum in self.hum)
 
     def covered(self, frequency: Float[np.ndarray, " harmonic"]) -> Bool[np.ndarray, " harmonic"]:
         """Whether each harmonic is unusable because of hum or aliases.
@@ -131,46 +121,35 @@ class Inspected:
         the aliases of a single period.
         """
         aliased = self.kept is not None or self.periods[0] == 2
-        none = aliased & (frequency > ALIASED * self.recording.sample_rate)
-        found = [hum for hum in (self.hum_th, self.hum_out) if hum is not None]
-        return sum((hum.covers(frequency, self.whole_periods[0]) for hum in found), start=none)
+        covered = aliased & (frequency > ALIASED * self.recording.sample_rate)
+        for hum in self.hum:
+            if hum is not None:
+                covered = covered | hum.covers(frequency, self.whole_periods[0])
+        return covered
 
     @property
-    def step_th(self) -> float:
-        """Converter step [V] of `v_th`; 0 if it is unknown."""
-        return self._group.step[self._row, 0]
-
-    @property
-    def step_out(self) -> float:
-        """Converter step [V] of `v_out`; 0 if it is unknown."""
-        return self._group.step[self._row, 1]
+    def step(self) -> Float[np.ndarray, "2"]:
+        """Converter steps [V]; 0 if unknown."""
+        return self._group.step[self._row]
 
     @functools.cached_property
-    def sigma_th(self) -> Float[np.ndarray, ""]:
-        """Standard deviation of the noise of a sample of `v_th` [V]."""
-        return self._sigma(0, self.recorded_th)
-
-    @functools.cached_property
-    def sigma_out(self) -> Float[np.ndarray, ""]:
-        """Standard deviation of the noise of a sample of `v_out` [V]."""
-        return self._sigma(1, self.recorded_out)
-
-    def _sigma(self, which: int, recorded: Float[np.ndarray, " time"]) -> Float[np.ndarray, ""]:
+    def sigma(self) -> Float[np.ndarray, "2"]:
+        """Standard deviations of the noise of a sample [V]."""
         if self.kept is None:
-            return np.asarray(self._group.noise[self._row, which])
-        return np.asarray(noise_std(recorded, self._group.step[self._row, which]))
+            return self._group.noise[self._row]
+        return np.asarray(noise_std(self.recorded, self.step))
 
     @property
     def recorded_limits(self) -> Float[np.ndarray, "2 limit"]:
         """Smallest and largest sample of each voltage as it was recorded [V]."""
         if self.kept is None:
             return self._group.recorded_limits[self._row]
-        return limits_of(self._recorded)
+        return limits_of(self.recorded)
 
     @functools.cached_property
     def limits(self) -> Float[np.ndarray, "2 limit"]:
         """Smallest and largest sample of `v_th` and of `v_out` [V]."""
-        return self._group.limits[self._row] if self.kept is None else limits_of(self._quiet)
+        return self._group.limits[self._row] if self.kept is None else limits_of(self.quiet)
 
     @property
     def spans(self) -> Float[np.ndarray, "2"]:
@@ -180,25 +159,17 @@ class Inspected:
     @property
     def is_flat(self) -> Bool[np.ndarray, "2"]:
         """Whether `v_th` and `v_out` carry no signal: eight standard deviations span them."""
-        noise = 8 * np.array([self.sigma_th, self.sigma_out])
-        return (self.spans <= noise) | (self.spans == 0)
+        return (self.spans <= 8 * self.sigma) | (self.spans == 0)
 
     @functools.cached_property
     def covariance(self) -> Float[np.ndarray, "2 2"]:
         """Covariance of `v_th` and `v_out` [V²]."""
-        return (
-            self._group.covariance[self._row] if self.kept is None else covariance_of(self._quiet)
-        )
+        return self._group.covariance[self._row] if self.kept is None else covariance_of(self.quiet)
 
     @functools.cached_property
-    def trusted_th(self) -> Float[np.ndarray, ""]:
-        """`sigma_th` as far as estimators trust it: not below the error of the interpolation."""
-        return np.asarray(np.maximum(self.sigma_th, RIPPLE * self.spans[0]))
-
-    @functools.cached_property
-    def trusted_out(self) -> Float[np.ndarray, ""]:
-        """`sigma_out` as far as estimators trust it: not below the error of the interpolation."""
-        return np.asarray(np.maximum(self.sigma_out, RIPPLE * self.spans[1]))
+    def trusted(self) -> Float[np.ndarray, "2"]:
+        """`sigma` as far as estimators trust it: not below the error of the interpolation."""
+        return np.maximum(self.sigma, RIPPLE * self.spans)
 
     @property
     def flickers(self) -> Bool[np.ndarray, "2"]:
@@ -208,15 +179,13 @@ class Inspected:
     @property
     def remarks(self) -> Remark:
         """Remarks on how the recording is changed before a fit."""
-        hum = self.hum_th is not None or self.hum_out is not None
-        coarse = self.coarse_th > 0 or self.coarse_out > 0
         # A clock is not more than 300 ppm wrong.
         off = abs(self.train.counted / self.recording.pulse_rate - 1) > 3e-4
-        found = Remark.mains_hum if hum else Remark(0)
+        found = Remark.mains_hum if self.hums else Remark(0)
         fewer = self.periods[0] < self.whole_periods[0]
         found |= Remark.periods_left_out if fewer else Remark(0)
         found |= Remark.periods_shifted if self.shifts is not None else Remark(0)
-        found |= Remark.coarse_converter if coarse else Remark(0)
+        found |= Remark.coarse_converter if self.coarse.any() else Remark(0)
         found |= Remark.aligned if self.lag or self.current_lag else Remark(0)
         return found | (Remark.pulse_rate_counted if off else Remark(0))
 
@@ -225,7 +194,7 @@ class Inspected:
         """Lag of `v_out` [samples]; the load may add up to one sample. None if misaligned."""
         if self.kept is None:
             return self._group.lags[self._row]
-        return lags_of(self._quiet[None], [self.train])[0]
+        return lags_of(self.quiet[None], [self.train])[0]
 
     @functools.cached_property
     def lag(self) -> int:
@@ -287,8 +256,8 @@ class Inspected:
         if self.kept is None:
             frequency, *of_rows, selected = self._group.spectra(*self.periods)
             return frequency, *(field[self._row] for field in of_rows), selected
-        sigma = np.stack([self.trusted_th, self.trusted_out])
-        fields = filled(harmonics(self._quiet, *self.periods), sigma, rate, *self.periods)
+        found = np.asarray(harmonics(self.quiet, *self.periods))
+        fields = filled(found, self.trusted, rate, *self.periods)
         return tuple(map(np.asarray, fields))
 
     @property
@@ -307,8 +276,7 @@ class Inspected:
         """
         if self.kept is None:
             return bool(self._group.periodic[self._row])
-        sigma = np.stack([self.trusted_th, self.trusted_out])
-        return bool(is_periodic(self._quiet, sigma, np.asarray(1.0), self.periods[1]))
+        return bool(is_periodic(self.quiet, self.trusted, np.asarray(1.0), self.periods[1]))
 
 
 def preflight(inspected: Inspected, *, periodic: bool = False) -> str | None:
@@ -330,15 +298,15 @@ def preflight(inspected: Inspected, *, periodic: bool = False) -> str | None:
     if inspected.is_flat.any():
         return "flat"
     # A current source holds its current, so a flat top of the current is no fault without noise.
-    th, out = inspected.recorded_limits
-    volts = None if inspected.has_current else of.adc_range
     held = inspected.has_current and is_command(
-        float(inspected.sigma_th), inspected.step_th, inspected.spans[0]
+        float(inspected.sigma[0]), float(inspected.step[0]), float(inspected.spans[0])
     )
-    if not held and _is_saturated(inspected.recorded_th, th, inspected.step_th, volts):
-        return "saturated"
-    if _is_saturated(inspected.recorded_out, out, inspected.step_out, of.adc_range):
-        return "saturated"
+    may_clip = not held, True
+    volts = None if inspected.has_current else of.adc_range, of.adc_range
+    records = inspected.recorded, inspected.recorded_limits, inspected.step
+    for checked, *record in zip(may_clip, *records, volts, strict=True):
+        if checked and _is_saturated(*record):
+            return "saturated"
     if inspected.has_current and not is_plausible(inspected.spans[1], inspected.spans[0]):
         return "wrong_unit"
     if not inspected.has_current and _is_unconnected(inspected):
@@ -386,8 +354,8 @@ def _is_unconnected(inspected: Inspected) -> bool:
     covariance = (
         covariance_of(np.stack(inspected.aligned)) if inspected.lag else inspected.covariance
     )
-    variance = inspected.sigma_th**2 + inspected.sigma_out**2
-    power = covariance[0, 0] - inspected.sigma_th**2
+    squares = inspected.sigma**2
+    variance, power = squares.sum(), covariance[0, 0] - squares[0]
     if power <= 0:  # nothing but noise; or squares that are too small for a number
         return False
     size = inspected.aligned[0].size

@@ -85,19 +85,15 @@ _TEXTS = {
 }
 
 
+@functools.cache  # files hold few combinations, 10^5 times each
 def words(remarks: int | np.integer) -> str:
     """Names of the remarks, separated by spaces; empty if there is none."""
-    return _words(int(remarks))
-
-
-@functools.cache  # files hold few combinations, 10^5 times each
-def _words(remarks: int) -> str:
-    return " ".join(str(one.name) for one in Remark if one & remarks)
+    return " ".join(str(remark.name) for remark in Remark if remark & int(remarks))
 
 
 def texts(remarks: int | np.integer) -> list[str]:
     """One sentence for each remark."""
-    return [_TEXTS[one] for one in Remark if one & int(remarks)]
+    return [_TEXTS[remark] for remark in Remark if remark & int(remarks)]
 
 
 @functools.cache
@@ -107,8 +103,8 @@ def remarks_of(text: str) -> int:
     Raises:
         ValueError: A word is not a remark.
     """
-    known = {str(one.name): one for one in Remark}
-    unknown = sorted(set(text.split()) - known.keys())
+    remarks = {str(remark.name): remark for remark in Remark}
+    unknown = sorted(set(text.split()) - remarks.keys())
     if unknown:
-        raise ValueError(f"{unknown} are not remarks; the remarks are {', '.join(known)}")
-    return int(sum(known[word] for word in set(text.split())))
+        raise ValueError(f"{unknown} are not remarks; the remarks are {', '.join(remarks)}")
+    return int(sum(remarks[word] for word in set(text.split())))

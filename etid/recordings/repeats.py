@@ -134,20 +134,16 @@ def repeats(inspected: Sequence[Inspected]) -> list[Repeats | None]:
     deviations: list[Repeats | None] = [None] * len(inspected)
     alike: dict[tuple, list[int]] = {}
     for number, one in enumerate(inspected):
-        coarse = one.coarse_th > 0 or one.coarse_out > 0
-        if one.periods[0] > 1 and one.is_periodic and not coarse:
+        if one.periods[0] > 1 and one.is_periodic and not one.coarse.any():
             recording = one.recording
             key = one.has_current, one.periods[0], recording.sample_rate, recording.pulse_rate
             alike.setdefault(key, []).append(number)
     for numbers in alike.values():
         group = [inspected[number] for number in numbers]
-        records = [(one.v_th, one.v_out) for one in group]
-        of_group = _of_equal_periods(group, records)
+        of_group = _of_equal_periods(group, [one.quiet for one in group])
         for row, one in enumerate(group):
-            hum = one.hum_th is not None or one.hum_out is not None
-            if hum and _differ(of_group[row]):
-                recorded = [(one.recorded_th, one.recorded_out)]
-                (of_group[row],) = _of_equal_periods([one], recorded)
+            if one.hums and _differ(of_group[row]):
+                (of_group[row],) = _of_equal_periods([one], [one.recorded])
         for number, of_one in zip(numbers, of_group, strict=True):
             deviations[number] = of_one
     return deviations
@@ -162,25 +158,24 @@ def _differ(of: Repeats) -> bool:
 
 
 def _of_equal_periods(
-    group: Sequence[Inspected], records: Sequence[tuple[np.ndarray, np.ndarray]]
+    group: Sequence[Inspected], records: Sequence[Float[np.ndarray, "2 _"]]
 ) -> list[Repeats]:
     """Deviations of recordings with equal rates and numbers of periods, from these voltages."""
     recording, (periods, _) = group[0].recording, group[0].periods
     sample_rate, pulse_rate = recording.sample_rate, recording.pulse_rate
     at = np.stack([one.begins for one in group])
     layout = bands(sample_rate, pulse_rate, 0.4)
-    sigma = np.array([one.trusted_out for one in group])
+    sigma_th, sigma = np.array([one.trusted for one in group]).T
     # Without this shift, a late record would be cut within its pulses.
     loaded = [_turned(v, one) for one, (_, v) in zip(group, records, strict=True)]
     own = _deviations(loaded, at, layout, sigma)
-    sigma = np.array([one.trusted_th for one in group])
     if group[0].has_current:
         currents = [current for current, _ in records]
-        return _of_currents(group[0], layout, loaded, currents, own, sigma, at)
+        return _of_currents(group[0], layout, loaded, currents, own, sigma_th, at)
     # Of V_th only the amplitude is wanted. If some of the samples were left out, the aliases of its
     # edges would look like another amplitude in each period: by 1e-3 if every fourth remains.
     low = bands(sample_rate, pulse_rate, 1 / 32)
-    unloaded = _deviations([v_th for v_th, _ in records], at, low, sigma)
+    unloaded = _deviations([v_th for v_th, _ in records], at, low, sigma_th)
     weight, smooth = 1 / unloaded.variance, _smooth(unloaded.mean, low)
     # Effect of an amplitude change by 1 after the projection of the polynomials.
     unit = 1 - (np.real(smooth.sum(2))[:, :, None] * smooth).sum(1) / unloaded.power

@@ -93,24 +93,20 @@ def noise_std(
     floor = resolution / math.sqrt(12.0)
     if isinstance(v, np.ndarray):  # nothing is compiled
         middle = np.reshape(
-            [_middle(_sizes(record)) for record in v.reshape(-1, v.shape[-1])], v.shape[:-1]
+            [_middle(record) for record in v.reshape(-1, v.shape[-1])], v.shape[:-1]
         )
         return np.asarray(np.maximum(PER_MEDIAN * middle, floor))
     size = jnp.abs(jnp.diff(v, ORDER)[:: _every(v.shape[0])])
     return jnp.maximum(PER_MEDIAN * _median(size), floor)
 
 
-def _sizes(v: Float[np.ndarray, " time"]) -> Float[np.ndarray, " difference"]:
-    """Size of all differences of the order `ORDER`, or of every second one."""
-    return np.abs(np.convolve(v, DIFFERENCE)[ORDER : v.size : _every(v.size)])
+def _middle(v: Float[np.ndarray, " time"]) -> float:
+    """The median size of the differences, one of them.
 
-
-def _middle(sizes: Float[np.ndarray, " difference"]) -> float:
-    """The median, one of the numbers.
-
-    Only the numbers between two limits are sorted, those around the median of every 16th number.
-    This takes less than half of the time of a partition of all numbers.
+    Only the sizes between two limits are sorted, those around the median of every 16th size. This
+    takes less than half of the time of a partition of all sizes.
     """
+    sizes = np.abs(np.convolve(v, DIFFERENCE)[ORDER : v.size : _every(v.size)])
     half = sizes.size // 2
     sample = np.sort(sizes[::16])
     reach = round(1.5 * math.sqrt(sample.size))
