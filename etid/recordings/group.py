@@ -37,10 +37,12 @@ class Group:
 
     Args:
         recordings: The recordings.
+        cut: Largest error of the places at which their periods begin [samples].
     """
 
-    def __init__(self, recordings: Sequence[Recording]) -> None:
+    def __init__(self, recordings: Sequence[Recording], cut: float = 0.0) -> None:
         self.recordings = recordings
+        self._cut = cut
         self.sample_rate = recordings[0].sample_rate
         self.pulse_rate = recordings[0].pulse_rate
         self._spectra: dict[tuple[int, int], tuple[np.ndarray, ...]] = {}
@@ -56,6 +58,17 @@ class Group:
                     record.write_to(v)
         whole.flags.writeable = False
         return whole
+
+    def joined(self, row: int, plan: Joint) -> "Group":
+        """One of the recordings with the periods of a plan, as a group of its own."""
+        joined = Group([self.recordings[row]], cut=1.0)  # each period begins at a whole sample
+        whole = plan(self.whole[row])[None]
+        quiet = whole if self.quiet is self.whole else plan(self.quiet[row])[None]
+        periods = plan.first.size, whole.shape[2]
+        vars(joined).update(
+            whole=whole, quiet=quiet, trains=[self.trains[row]], whole_periods=[periods]
+        )
+        return joined
 
     @functools.cached_property
     def step(self) -> Float[np.ndarray, "recording 2"]:
@@ -191,6 +204,7 @@ class Group:
             if periods > 0:
                 counted = np.array([self.trains[row].counted for row in rows])
                 rest = np.abs(periods * self.sample_rate / counted - samples)
+                rest = np.maximum(rest, self._cut)
                 records, sigma = _part(self.quiet, rows), self.trusted[rows]
                 with quietly():
                     found[rows] = is_periodic(records, sigma, rest, samples)
@@ -204,8 +218,13 @@ class Group:
 
     @functools.cached_property
     def flickers(self) -> Bool[np.ndarray, "recording 2"]:
-        """Whether each record in `quiet` may have 1/f noise, by a quick look."""
+        """Whether each record in `quiet` may have 1/f noise, by a quick look.
+
+        Joints between periods look like it, so that those of joined periods have none.
+        """
         found = np.zeros(self.noise.shape, bool)
+        if self._cut > 0:
+            return found
         for of, rows in _alike(self.whole_periods).items():
             with quietly():
                 found[rows] = flickering(_part(self.quiet, rows), self.trusted[rows], *of)

@@ -6,17 +6,16 @@ import math
 import numpy as np
 from jaxtyping import Bool, Float
 
-from etid.recordings.group import BY_CHANCE, Group, covariance_of, is_periodic, limits_of
+from etid.recordings.group import BY_CHANCE, Group, covariance_of
 from etid.recordings.recording import Recording
 from etid.recordings.remarks import Remark
 from etid.signals.aliases import aliases
 from etid.signals.clipping import is_clipped, is_command
 from etid.signals.disturbances import Joint, Shifts
 from etid.signals.filtering import TAPS
-from etid.signals.harmonics import ALIASED, filled, harmonics, joins_aliases
+from etid.signals.harmonics import ALIASED, joins_aliases
 from etid.signals.mains import Hum
-from etid.signals.noise import RIPPLE, noise_std
-from etid.signals.pulse_train import PulseTrain, lags_of, rise_time, shifted, whole_lag
+from etid.signals.pulse_train import PulseTrain, rise_time, shifted, whole_lag
 
 SHORTEST = 4 * TAPS + 104  # [samples] edges of the interpolation, and 104 samples for the fit
 
@@ -82,16 +81,24 @@ class Inspected:
         return self._group.shifts[self._row]
 
     @functools.cached_property
+    def _used(self) -> Group:
+        """A group with the periods in use."""
+        return self._group if self.kept is None else self._group.joined(self._row, self.kept)
+
+    @property
+    def _place(self) -> int:
+        """Number of the recording in `_used`."""
+        return self._row if self.kept is None else 0
+
+    @property
     def quiet(self) -> Float[np.ndarray, "2 time"]:
         """Voltages [V] of the periods in use, without hum between the harmonics."""
-        quiet = self._group.quiet[self._row]
-        return quiet if self.kept is None else self.kept(quiet)
+        return self._used.quiet[self._place]
 
-    @functools.cached_property
+    @property
     def recorded(self) -> Float[np.ndarray, "2 time"]:
         """Voltages [V] of the periods in use as they were recorded."""
-        whole = self._group.whole[self._row]
-        return whole if self.kept is None else self.kept(whole)
+        return self._used.whole[self._place]
 
     @property
     def begins(self) -> Float[np.ndarray, " period"]:
@@ -132,24 +139,20 @@ class Inspected:
         """Converter steps [V]; 0 if unknown."""
         return self._group.step[self._row]
 
-    @functools.cached_property
+    @property
     def sigma(self) -> Float[np.ndarray, "2"]:
         """Standard deviations of the noise of a sample [V]."""
-        if self.kept is None:
-            return self._group.noise[self._row]
-        return np.asarray(noise_std(self.recorded, self.step))
+        return self._used.noise[self._place]
 
     @property
     def recorded_limits(self) -> Float[np.ndarray, "2 limit"]:
         """Smallest and largest sample of each voltage as it was recorded [V]."""
-        if self.kept is None:
-            return self._group.recorded_limits[self._row]
-        return limits_of(self.recorded)
+        return self._used.recorded_limits[self._place]
 
-    @functools.cached_property
+    @property
     def limits(self) -> Float[np.ndarray, "2 limit"]:
         """Smallest and largest sample of `v_th` and of `v_out` [V]."""
-        return self._group.limits[self._row] if self.kept is None else limits_of(self.quiet)
+        return self._used.limits[self._place]
 
     @property
     def spans(self) -> Float[np.ndarray, "2"]:
@@ -161,20 +164,20 @@ class Inspected:
         """Whether `v_th` and `v_out` carry no signal: eight standard deviations span them."""
         return (self.spans <= 8 * self.sigma) | (self.spans == 0)
 
-    @functools.cached_property
+    @property
     def covariance(self) -> Float[np.ndarray, "2 2"]:
         """Covariance of `v_th` and `v_out` [V²]."""
-        return self._group.covariance[self._row] if self.kept is None else covariance_of(self.quiet)
+        return self._used.covariance[self._place]
 
-    @functools.cached_property
+    @property
     def trusted(self) -> Float[np.ndarray, "2"]:
         """`sigma` as far as estimators trust it: not below the error of the interpolation."""
-        return np.maximum(self.sigma, RIPPLE * self.spans)
+        return self._used.trusted[self._place]
 
     @property
     def flickers(self) -> Bool[np.ndarray, "2"]:
-        """Whether `v_th` and `v_out` may have 1/f noise; joints between periods look like it."""
-        return np.zeros(2, bool) if self.kept is not None else self._group.flickers[self._row]
+        """Whether `v_th` and `v_out` may have 1/f noise."""
+        return self._used.flickers[self._place]
 
     @property
     def remarks(self) -> Remark:
@@ -189,12 +192,10 @@ class Inspected:
         found |= Remark.aligned if self.lag or self.current_lag else Remark(0)
         return found | (Remark.pulse_rate_counted if off else Remark(0))
 
-    @functools.cached_property
+    @property
     def correlated(self) -> float | None:
         """Lag of `v_out` [samples]; the load may add up to one sample. None if misaligned."""
-        if self.kept is None:
-            return self._group.lags[self._row]
-        return lags_of(self.quiet[None], [self.train])[0]
+        return self._used.lags[self._place]
 
     @functools.cached_property
     def lag(self) -> int:
@@ -247,18 +248,13 @@ class Inspected:
     @property
     def periods(self) -> tuple[int, int]:
         """Number of periods in use, and their number of samples."""
-        return self.whole_periods if self.kept is None else (self.kept.first.size, self.v_out.size)
+        return self._used.whole_periods[self._place]
 
     @property
     def spectrum(self) -> tuple[np.ndarray, ...]:
         """The fields of an `etid.signals.harmonics.Spectrum` of both voltages; white noise."""
-        rate = self.recording.sample_rate
-        if self.kept is None:
-            frequency, *of_rows, selected = self._group.spectra(*self.periods)
-            return frequency, *(field[self._row] for field in of_rows), selected
-        found = np.asarray(harmonics(self.quiet, *self.periods))
-        fields = filled(found, self.trusted, rate, *self.periods)
-        return tuple(map(np.asarray, fields))
+        frequency, *of_rows, selected = self._used.spectra(*self.periods)
+        return frequency, *(field[self._place] for field in of_rows), selected
 
     @property
     def is_aliased(self) -> bool:
@@ -268,15 +264,13 @@ class Inspected:
         _, x, _, variance, *_ = self.spectrum
         return aliases(x, variance, *self.periods).are_unknown(variance)
 
-    @functools.cached_property
+    @property
     def is_periodic(self) -> bool:
         """Whether the record holds whole pulse periods, without a step from its end to its start.
 
         If periods are left out, each begins at a whole sample, up to one sample from its place.
         """
-        if self.kept is None:
-            return bool(self._group.periodic[self._row])
-        return bool(is_periodic(self.quiet, self.trusted, np.asarray(1.0), self.periods[1]))
+        return bool(self._used.periodic[self._place])
 
 
 def preflight(inspected: Inspected, *, periodic: bool = False) -> str | None:
