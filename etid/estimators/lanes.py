@@ -393,8 +393,8 @@ class AlignedSamples(AbstractLane):
     @classmethod
     def of(cls, seen: Inspected) -> "AlignedSamples":
         """The aligned records of a recording."""
-        steps = map(np.asarray, seen.step)
-        return cls(*seen.aligned, *steps, np.asarray(seen.recording.sample_rate))
+        of_th, of_out = map(np.asarray, seen.step)
+        return cls(*seen.aligned, of_th, of_out, np.asarray(seen.recording.sample_rate))
 
     @classmethod
     def of_samples(

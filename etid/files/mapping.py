@@ -110,32 +110,39 @@ def of_files(mapping: Mapping[str, Any], files: Sequence[pathlib.Path]) -> list[
         RecordingError: A recording names no file although there are several, or a file that is not
             imported; or a file has no recording.
     """
-    tables = mapping.get("recording", [])
-    if len(files) == 1 and not (isinstance(tables, list) and any("file" in one for one in tables)):
+    tables = _tables(mapping)
+    if len(files) == 1 and not any("file" in table for table in tables):
         return [mapping]
     common = {key: value for key, value in mapping.items() if key != "recording"}
-    if not isinstance(tables, list) or not all(isinstance(one, Mapping) for one in tables):
-        raise RecordingError(
-            "must be a list of tables", field="recording", remedy="Write [[recording]]"
-        )
     named = [file.name for file in files]
     for name in {name for name in named if named.count(name) > 1}:
         raise RecordingError(f"two files have the name {name!r}", field="file")
-    found: dict[str, list[dict[str, Any]]] = {name: [] for name in named}
+    tables_of: dict[str, list[dict[str, Any]]] = {name: [] for name in named}
     for table in tables:
-        if table.get("file") not in found:
+        if table.get("file") not in tables_of:
             raise RecordingError(
                 f"is {table.get('file')!r}; the files are {listed(named)}",
                 field="file",
                 remedy="Give each [[recording]] the name of one of these files",
             )
-        found[table["file"]].append({key: table[key] for key in table if key != "file"})
+        tables_of[table["file"]].append({key: table[key] for key in table if key != "file"})
     for name in named:
-        if not found[name]:
+        if not tables_of[name]:
             raise RecordingError(
                 f"no recording is in {name!r}", field="file", remedy="Leave the file out"
             )
-    return [{**common, "recording": found[name]} for name in named]
+    return [{**common, "recording": tables_of[name]} for name in named]
+
+
+def _tables(mapping: Mapping[str, Any]) -> list[Mapping[str, Any]]:
+    """The recordings of a mapping; empty if its keys are those of one recording."""
+    tables = mapping.get("recording", [])
+    tables = [tables] if isinstance(tables, Mapping) else tables
+    if not isinstance(tables, list) or not all(isinstance(table, Mapping) for table in tables):
+        raise RecordingError(
+            "must be a list of tables", field="recording", remedy="Write [[recording]]"
+        )
+    return tables
 
 
 def plans(
@@ -155,15 +162,10 @@ def plans(
     Raises:
         RecordingError: A key is missing, unknown, or of the wrong type.
     """
-    tables = mapping.get("recording", [])
-    tables = [tables] if isinstance(tables, Mapping) else tables
-    if not isinstance(tables, list) or not all(isinstance(table, Mapping) for table in tables):
-        raise RecordingError(
-            "must be a list of tables", field="recording", remedy="Write [[recording]]"
-        )
+    tables = _tables(mapping)
     common = {key: value for key, value in mapping.items() if key != "recording"}
     check_names(common, (*CHANNELS, *FIELDS, "recording" if tables else "path"), _KEY)
-    found: list[Plan] = []
+    planned: list[Plan] = []
     for table in tables or [{}]:
         said = {**common, **table}
         check_names(said, (*CHANNELS, *FIELDS, "path"), _KEY)
@@ -173,13 +175,13 @@ def plans(
                 "is not given", field="path", remedy="Give each [[recording]] a path of its own"
             )
         path = path or tidy_path(f"{KINDS[said.get('r_load') is not None]}/{name}")
-        if any(plan.path == path for plan in found):
+        if any(plan.path == path for plan in planned):
             raise RecordingError("two recordings have this path", path=path)
         try:
-            found.append(_plan(path, said, names, implied))
+            planned.append(_plan(path, said, names, implied))
         except RecordingError as error:
             raise error.located(path=path if len(tables) > 1 else "") from None
-    return found
+    return planned
 
 
 def _plan(

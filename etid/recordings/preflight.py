@@ -298,8 +298,8 @@ def preflight(inspected: Inspected, *, periodic: bool = False) -> str | None:
     may_clip = not held, True
     volts = None if inspected.has_current else of.adc_range, of.adc_range
     records = inspected.recorded, inspected.recorded_limits, inspected.step
-    for checked, *record in zip(may_clip, *records, volts, strict=True):
-        if checked and _is_saturated(*record):
+    for checked, v, limits, step, adc_range in zip(may_clip, *records, volts, strict=True):
+        if checked and _is_saturated(v, limits, step, adc_range):
             return "saturated"
     if inspected.has_current and not is_plausible(inspected.spans[1], inspected.spans[0]):
         return "wrong_unit"
