@@ -41,6 +41,7 @@ from etid.estimators.registry import MAXIMUM_LIKELIHOOD, named
 from etid.identify.arguments import fed, require
 from etid.identify.one import is_shared, known_of, skin
 from etid.numpy_tier.tiers import program
+from etid.precision import in_float64
 from etid.recordings.preflight import Inspected
 from etid.recordings.recording import Recording
 from etid.recordings.remarks import Remark
@@ -167,6 +168,7 @@ def _inside(
     return mean + slope @ moved, cov - slope @ less @ slope.T
 
 
+@in_float64
 def posterior(
     fit: Fit[Circuit],
     recording: Recording | None,
@@ -180,7 +182,7 @@ def posterior(
         raise ValueError(f"draws is {draws}; it must be at least 1, as in 1000")
     lane, known, cov = given(fit, recording, driver)
     least, own = map(np.asarray, minimum(lane, known, fit.circuit))
-    if not np.isfinite(own).all():
+    if not _is_covariance(own):
         raise ValueError(f"the recording does not determine all elements of {fit}")
 
     names = fit.circuit.names()
@@ -254,6 +256,10 @@ def _determined(fit: Fit) -> Float[np.ndarray, "element element"]:
     """
     values = np.asarray(fit.circuit.values())
     cov = np.asarray(fit.cov) / np.outer(values, values)
-    if not (np.isfinite(cov).all() and (np.linalg.eigvalsh(cov) > 0).all()):
+    if not _is_covariance(cov):
         raise ValueError(f"the recording does not determine all elements of {fit}")
     return cov
+
+
+def _is_covariance(matrix: Float[np.ndarray, "q q"]) -> bool:
+    return bool(np.isfinite(matrix).all() and (np.linalg.eigvalsh(matrix) > 0).all())
