@@ -77,7 +77,9 @@ def test_a_trace_in_float32_is_refused_with_the_line_to_add(transform):
         return fit.circuit.r_s
 
     study = Scene((), (Trial("c", ResistorLoad(98.8e3)),), sample_rate=RATE, samples=2000)
-    driver = etid.identify_driver(study.simulate(seed=1)["c"], order=2, method="equation_error", throw=False)
+    driver = etid.identify_driver(
+        study.simulate(seed=1)["c"], order=2, method="equation_error", throw=False
+    )
     with (
         jax.enable_x64(False),
         pytest.raises(RuntimeError, match=r'jax.config.update\("jax_enable_x64", True\)'),

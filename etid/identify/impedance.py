@@ -16,9 +16,9 @@ one.
 Without standard errors the residual alone says whether the circuit is right; `_judged` does.
 """
 
+import dataclasses
 from typing import NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -245,7 +245,7 @@ def identify_impedance(
     )
     fit = jax.device_get(_fit(f[rising], z[rising], noise, circuit))
     if fit.verdict != "successful":
-        fit = eqx.tree_at(lambda one: one.remarks, fit, fit.remarks | int(_remarks(z)))
+        fit = dataclasses.replace(fit, remarks=np.asarray(fit.remarks | int(_remarks(z))))
     fit = with_data(fit, MeasuredImpedance(f, z, sigma))
     if throw and fit.verdict != "successful":
         causes = " ".join([message(fit.verdict), *texts(int(fit.remarks))])

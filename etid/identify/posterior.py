@@ -262,4 +262,8 @@ def _determined(fit: Fit) -> Float[np.ndarray, "element element"]:
 
 
 def _is_covariance(matrix: Float[np.ndarray, "q q"]) -> bool:
-    return bool(np.isfinite(matrix).all() and (np.linalg.eigvalsh(matrix) > 0).all())
+    try:
+        np.linalg.cholesky(matrix)
+    except np.linalg.LinAlgError:
+        return False
+    return bool(np.isfinite(matrix).all())
