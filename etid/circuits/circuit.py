@@ -105,7 +105,7 @@ class AbstractCircuit(Overviewed, eqx.Module):
         return jnp.array([SCALING[unit] for unit in cls.units().values()]).T
 
     @program
-    def response(self, frequency: Float[Array, "..."]) -> Complex[Array, "..."]:
+    def response(self, frequency: Float[Array | np.ndarray, "..."]) -> Complex[Array, "..."]:
         """Impedance Z(j 2π f).
 
         Args:

@@ -243,7 +243,8 @@ def identify_impedance(
     noise = (
         _passive_fit(f[rising], z[rising], len(circuit.names())) if sigma is None else sigma[rising]
     )
-    fit = jax.device_get(_fit(f[rising], z[rising], noise, circuit))
+    put = jax.device_put
+    fit = jax.device_get(_fit(put(f[rising]), put(z[rising]), put(noise), circuit))
     if fit.verdict != "successful":
         fit = dataclasses.replace(fit, remarks=np.asarray(fit.remarks | int(_remarks(z))))
     fit = with_data(fit, MeasuredImpedance(f, z, sigma))
