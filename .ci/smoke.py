@@ -42,9 +42,6 @@ def command(*arguments, status=0):
 
 def in_python():
     """Simulate, fit, and compare with the truth."""
-    import jax
-
-    jax.config.update("jax_enable_x64", True)
     import jax.monitoring
 
     import etid

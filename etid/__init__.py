@@ -1,8 +1,6 @@
 """Circuit identification from electro-tactile stimulation recordings.
 
 ```python
-import jax
-jax.config.update("jax_enable_x64", True)
 import etid
 
 driver = etid.identify_driver(calibration)          # a known resistor in place of the skin

@@ -25,12 +25,9 @@ import time
 from collections.abc import Iterable, Iterator
 
 import h5py
-import jax
 import numpy as np
 
-jax.config.update("jax_enable_x64", True)  # before the first array: etid needs float64
-
-import etid  # noqa: E402 (float64 comes first)
+import etid
 
 BLOCK = 500  # samples of a block that is played back
 COLUMNS = 14  # electrodes in a row of the view

@@ -22,10 +22,6 @@
 import pathlib
 import tempfile
 
-import jax
-
-jax.config.update("jax_enable_x64", True)  # before the first array: etid needs float64
-
 import matplotlib.pyplot as plt
 import numpy as np
 import scipy.stats

@@ -20,10 +20,6 @@
 
 # %%
 # %matplotlib inline
-import jax
-
-jax.config.update("jax_enable_x64", True)  # before the first array: etid needs float64
-
 
 import etid
 from etid.circuits.elements import Exponent, Farad, Ohm, Second

@@ -22,10 +22,6 @@
 # %matplotlib inline
 import dataclasses
 
-import jax
-
-jax.config.update("jax_enable_x64", True)  # before the first array: etid needs float64
-
 import matplotlib.pyplot as plt
 import numpy as np
 

@@ -19,10 +19,6 @@
 
 # %%
 # %matplotlib inline
-import jax
-
-jax.config.update("jax_enable_x64", True)  # before the first array: etid needs float64
-
 import os
 import pathlib
 

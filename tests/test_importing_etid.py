@@ -30,19 +30,6 @@ assert not slow & set(sys.modules), "scipy loads its parts when they are used: i
     assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
 
 
-def test_float32_is_refused_with_the_line_to_add():
-    code = """
-import numpy as np, etid
-v = np.ones(1000)
-cal = etid.Recording(v, v, sample_rate=2e5, pulse_rate=60.0, r_load=1e5)
-etid.identify_driver(cal)
-"""
-    done = run(code)
-    assert done.returncode == 1
-    assert 'jax.config.update("jax_enable_x64", True)' in done.stderr
-    assert done.stderr.strip().splitlines()[-1].startswith("or set the environment variable")
-
-
 def test_dir_shows_the_public_names_and_no_module():
     shown = dir(etid)
     assert shown == sorted(etid.__all__)

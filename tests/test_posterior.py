@@ -12,6 +12,8 @@ import pytest
 
 import etid
 from etid.results.posterior import Profile
+from etid.simulation.scenes import Scene, Trial
+from etid.simulation.transformer import ResistorLoad, SkinLoad
 from etid.solvers.importance_sampling import drawn, effective
 
 TRUTH = etid.SkinRC(33.4e3, 186e3, 0.12e-9)
@@ -105,6 +107,18 @@ def test_what_has_no_likelihood_is_refused(clear):
     unknown = dataclasses.replace(fit, cov=jnp.full((3, 3), jnp.nan))
     with pytest.raises(ValueError, match="does not determine"):
         unknown.posterior(recording, driver)
+
+
+def test_few_draws_of_a_skewed_likelihood_do_not_fail():
+    """Below 20 kHz R_s is known to a half only; of 20 draws one has nearly all weight."""
+    skin = SkinLoad(r_s=33.4e3, r_p=186e3, c_p=0.12e-9)
+    known = (Trial("c", ResistorLoad(98.8e3)),)
+    scene = Scene((Trial("a", skin),), known, sample_rate=40e3, samples=3334)
+    study = scene.simulate(seed=1)
+    fit = etid.identify_skin(study["a"], etid.identify_driver(study["c"]))
+    few = fit.posterior(draws=20)
+    assert few.effective < 20
+    assert "draw more" in str(few)
 
 
 def test_a_fit_knows_its_recording_and_what_is_made_from_it_does_not(clear):

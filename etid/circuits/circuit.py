@@ -56,11 +56,11 @@ def parameter(unit: str, *, typical: float) -> Any:
 
 
 def _numbers(value: Any) -> Any:
-    """The value of a parameter as an array; `jnp.asarray` of a number would compile a program."""
+    """The value of a parameter as an array of NumPy, which has float64 in every process."""
     if isinstance(value, jax.Array):
         return value
     numbers = np.asarray(value)
-    return jax.device_put(numbers.astype(float) if numbers.dtype.kind in "biu" else numbers)
+    return numbers.astype(float) if numbers.dtype.kind in "biu" else numbers
 
 
 class AbstractCircuit(Overviewed, eqx.Module):
@@ -100,7 +100,7 @@ class AbstractCircuit(Overviewed, eqx.Module):
         return jnp.array([powers[unit] for unit in cls.units().values()]).T
 
     @program
-    def response(self, frequency: Float[Array, "..."]) -> Complex[Array, "..."]:
+    def response(self, frequency: Float[Array | np.ndarray, "..."]) -> Complex[Array, "..."]:
         """Impedance Z(j 2π f).
 
         Args:
@@ -116,6 +116,7 @@ class AbstractCircuit(Overviewed, eqx.Module):
         """Parameters in SI units."""
         return jnp.stack([getattr(self, name) for name in self.names()], axis=-1)
 
+    @program
     def log_values(self) -> Float[Array, "*lane parameter"]:
         """Natural logarithms of the parameters in SI units."""
         return jnp.log(self.values())
@@ -204,6 +205,7 @@ class SkinRC(AbstractCircuit):
         return series(resistor(self.r_s), parallel(resistor(self.r_p), capacitor(self.c_p)))
 
     @property
+    @program
     def f_c(self) -> Float[Array, "..."]:
         """Corner frequency 1 / (2π R_p C_p) [Hz]."""
         return 1 / (2 * jnp.pi * jnp.asarray(self.r_p * self.c_p))

@@ -15,6 +15,7 @@ import numpy as np
 from etid.circuits.circuit import AbstractCircuit
 from etid.circuits.netlist import circuit_string, netlist
 from etid.files.channel import listed, optional
+from etid.precision import in_float64
 from etid.recordings import limits
 from etid.recordings.recording import RecordingError
 from etid.recordings.replacing import replace_text, replacing
@@ -140,6 +141,7 @@ def _parquet(
 TABLES = {".csv": _csv, ".parquet": _parquet}  # writers of tables by suffix
 
 
+@in_float64
 def export_circuit(
     source: str | os.PathLike[str],
     target: str | os.PathLike[str],

@@ -30,12 +30,12 @@ from etid.identify.arguments import (
     driver_of,
     fed,
     plan,
-    require_float64,
 )
 from etid.identify.arguments import recordings as list_of
 from etid.identify.one import known_of, remarks_on, successful
 from etid.identify.unfitted import failed_fit
 from etid.numpy_tier.tiers import program
+from etid.precision import in_float64
 from etid.recordings.preflight import Inspected
 from etid.recordings.recording import Recording, RecordingError
 from etid.results.driver import Driver, HarmonicDriver
@@ -86,6 +86,7 @@ def _fit(
     return judgement.unless(fit, jnp.any(unsure & currents(circuit)), RESULTS.insensitive)
 
 
+@in_float64
 def identify_amplitudes(
     recordings: Iterable[Recording],
     driver: Driver | None = None,
@@ -129,7 +130,6 @@ def identify_amplitudes(
             resistors that depend on their current.
         IdentificationError: The verdict is not successful and `throw` is set.
     """
-    require_float64()
     driver = driver_of(driver)
     circuit = SkinCurrent() if circuit is None else circuit_of(circuit)
     current_dependent(circuit.impedance())

@@ -13,7 +13,6 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, Literal, NamedTuple
 
 import equinox as eqx
-import jax
 
 from etid.circuits.circuit import AbstractCircuit, SkinRC
 from etid.circuits.current_dependent import current_dependent
@@ -49,20 +48,6 @@ _REMEDIES: dict[type, str] = {
     AbstractCircuit: "Pass a circuit, as in etid.SkinRC() or etid.circuit('R0-p(R1,C1)'), or "
     "circuit='auto'",
 }
-
-
-def require_float64() -> None:
-    """Raise unless JAX runs in float64.
-
-    Raises:
-        RuntimeError: JAX runs in float32. The filters would lose 4 to 9 digits without a warning.
-    """
-    if not jax.config.read("jax_enable_x64"):
-        raise RuntimeError(
-            "etid needs float64, and JAX is running in float32. Before making JAX arrays, call\n"
-            '    jax.config.update("jax_enable_x64", True)\n'
-            "or set the environment variable JAX_ENABLE_X64=1."
-        )
 
 
 def require(field: str, value: object, kind: type, remedy: str = "") -> None:
@@ -253,7 +238,6 @@ def estimator_of(
         ValueError: No estimator has this name, or the estimator cannot identify these circuits, or
             cannot choose between them.
     """
-    require_float64()
     if method is None:
         return None
     estimator = method if isinstance(method, AbstractEstimator) else named(str(method))

@@ -41,6 +41,7 @@ from etid.identify.planning import FEWEST, Planned, Refusal, calls, planned
 from etid.identify.prefetch import prefetch
 from etid.identify.unfitted import failed_fit
 from etid.numpy_tier.tiers import program, worth_compiling
+from etid.precision import in_float64
 from etid.recordings.preflight import Inspected
 from etid.recordings.recording import Recording
 from etid.results.feed import AbstractFeed
@@ -209,9 +210,9 @@ def _parts(
     queues: dict[tuple, _Queue] = {}
     rows = iter(range(count))
 
+    @in_float64  # the setting belongs to a thread, and this runs in another one
     def read(_: int) -> list[tuple[int, _Prepared | Refusal]]:
-        with jax.enable_x64(True):  # the setting belongs to a thread, and this runs in another one
-            return _prepared(planned(load, rows, asked), candidates)
+        return _prepared(planned(load, rows, asked), candidates)
 
     with (
         tqdm(total=count, unit="fit", disable=not progress) as bar,

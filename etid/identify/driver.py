@@ -25,6 +25,7 @@ from etid.identify.arguments import (
 from etid.identify.one import checksum, needs_another, of_both
 from etid.identify.unfitted import explained
 from etid.numpy_tier.tiers import program
+from etid.precision import in_float64
 from etid.recordings.preflight import Inspected, preflight
 from etid.recordings.recording import Recording
 from etid.recordings.repeats import repeats
@@ -39,6 +40,7 @@ from etid.signals import mains
 PLAUSIBLE = (300.0, 300e3)
 
 
+@in_float64
 def identify_driver(
     calibrations: Recording | Sequence[Recording],
     *,

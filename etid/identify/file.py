@@ -26,7 +26,6 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import equinox as eqx
-import jax
 from tqdm import tqdm
 
 from etid.circuits.circuit import AbstractCircuit
@@ -35,6 +34,7 @@ from etid.estimators.registry import Method
 from etid.identify.arguments import Asked, Circuit, Interval, asked_of, candidates_of, order_of
 from etid.identify.many import common_first, identify_part, to_identify
 from etid.identify.study_drivers import Drivers
+from etid.precision import in_float64
 from etid.recordings.hdf5 import read
 from etid.recordings.recording import RecordingError
 from etid.recordings.replacing import claimed, replace_text
@@ -99,6 +99,7 @@ def _fit(
     return StudyFits(fits, found, failures)
 
 
+@in_float64
 def _fit_elsewhere(
     source: str,
     stamp: int,
@@ -110,10 +111,8 @@ def _fit_elsewhere(
     number: int,
 ) -> StudyFits:
     """The fits of one part, in any process that can read the file."""
-    with jax.enable_x64(True):  # a worker does not have the setting of its caller
-        return _fit(
-            _kept_open(source, stamp, order, asked, driver_drift), candidates, asked, size, number
-        )
+    study = _kept_open(source, stamp, order, asked, driver_drift)
+    return _fit(study, candidates, asked, size, number)
 
 
 def _pin(cores: Any) -> None:
@@ -181,6 +180,7 @@ def _folder(target: pathlib.Path) -> pathlib.Path:
     return target.with_name(target.name + ".parts")
 
 
+@in_float64
 def fit_file(
     source: str | os.PathLike[str],
     target: str | os.PathLike[str],

@@ -16,9 +16,9 @@ one.
 Without standard errors the residual alone says whether the circuit is right; `_judged` does.
 """
 
+import dataclasses
 from typing import NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -28,9 +28,10 @@ import scipy
 from jaxtyping import Array, Complex, Float
 
 from etid.circuits.circuit import AbstractCircuit
-from etid.identify.arguments import circuit_of, require_float64
+from etid.identify.arguments import circuit_of
 from etid.identify.kramers_kronig import EXACT, FAIL, MISFIT_CHI2, kramers_kronig
 from etid.numpy_tier.tiers import program
+from etid.precision import in_float64
 from etid.recordings.remarks import Remark, texts
 from etid.results.data import MeasuredImpedance, with_data
 from etid.results.fit import CHANGES, Fit, IdentificationError, Support, complex_rrse
@@ -193,6 +194,7 @@ def _support(deviance: Float[Array, ""], values: int, elements: int) -> Support:
     )
 
 
+@in_float64
 def identify_impedance(
     frequency: npt.ArrayLike,
     impedance: npt.ArrayLike,
@@ -221,7 +223,6 @@ def identify_impedance(
             or a number is not finite or not positive where it must be.
         IdentificationError: The verdict is not successful and `throw` is set.
     """
-    require_float64()
     circuit = circuit_of(circuit)
     f, z = np.asarray(frequency, float), np.asarray(impedance, complex)
     sigma = None if stderr is None else np.broadcast_to(np.asarray(stderr, float), f.shape)
@@ -243,9 +244,9 @@ def identify_impedance(
         _passive_fit(f[rising], z[rising], len(circuit.names())) if sigma is None else sigma[rising]
     )
     put = jax.device_put
-    fit = _fit(put(f[rising]), put(z[rising]), put(noise), circuit)
+    fit = jax.device_get(_fit(put(f[rising]), put(z[rising]), put(noise), circuit))
     if fit.verdict != "successful":
-        fit = eqx.tree_at(lambda one: one.remarks, fit, fit.remarks | int(_remarks(z)))
+        fit = dataclasses.replace(fit, remarks=np.asarray(fit.remarks | int(_remarks(z))))
     fit = with_data(fit, MeasuredImpedance(f, z, sigma))
     if throw and fit.verdict != "successful":
         causes = " ".join([message(fit.verdict), *texts(int(fit.remarks))])

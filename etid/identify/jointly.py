@@ -51,7 +51,6 @@ from etid.identify.arguments import (
     check_new,
     order_of,
     require,
-    require_float64,
 )
 from etid.identify.batches import LANES, each, filled
 from etid.identify.many import common_first, identify_part, table, to_identify
@@ -67,6 +66,7 @@ from etid.identify.planning import Refusal, calls, planned
 from etid.identify.study_drivers import Drivers
 from etid.identify.unfitted import failed_fit
 from etid.numpy_tier.tiers import program, worth_compiling
+from etid.precision import in_float64
 from etid.recordings.preflight import Inspected
 from etid.recordings.recording import Recording
 from etid.recordings.remarks import Remark
@@ -310,6 +310,7 @@ def _of_both(first: _Start, second: _Start) -> _Start:
     return first._replace(hum=np.asarray(False))
 
 
+@in_float64
 def identify_jointly(
     study: Study,
     *,
@@ -352,7 +353,6 @@ def identify_jointly(
         ValueError: The study has no loaded recording.
         RecordingError: Two recordings with a driver have the same samples of `v_out`.
     """
-    require_float64()
     require("study", study, Study)
     order = order_of(order)
     candidates = candidates_of(circuit)

@@ -21,6 +21,7 @@ import scipy
 from jaxtyping import Complex, Float
 
 from etid.circuits.overview import Overview, Overviewed
+from etid.precision import in_float64
 
 MISFIT_CHI2 = 1.5  # a standard error of a measured impedance is seldom known to better than 20 %
 NEAR = 1.2  # times the least mean square; no data tell such models apart
@@ -87,6 +88,7 @@ class KramersKronig(Overviewed):
         return Overview(f"Kramers-Kronig test: {verdict}", rows, notes=(noise,))
 
 
+@in_float64
 def kramers_kronig(
     frequency: npt.ArrayLike,
     impedance: npt.ArrayLike,

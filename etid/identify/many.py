@@ -21,6 +21,7 @@ from etid.identify.arguments import (
 from etid.identify.arguments import recordings as several
 from etid.identify.batches import choices, of_one_circuit
 from etid.identify.study_drivers import Drivers
+from etid.precision import in_float64
 from etid.recordings.recording import Recording, RecordingError
 from etid.recordings.study import Study
 from etid.results.driver import Driver
@@ -79,6 +80,7 @@ def identify_skins(
 ) -> Fits[AbstractCircuit]: ...
 
 
+@in_float64
 def identify_skins(
     recordings: Iterable[Recording] | Study,
     driver: Driver | None = None,
@@ -136,6 +138,7 @@ def identify_skins(
     return Fits(fit, described(known), np.array(notes, dtype=str))
 
 
+@in_float64
 def identify_study(
     study: Study,
     *,

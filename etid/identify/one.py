@@ -37,6 +37,7 @@ from etid.identify.arguments import (
 )
 from etid.identify.unfitted import EXPLAINED, explained, failed_fit
 from etid.numpy_tier.tiers import program
+from etid.precision import in_float64
 from etid.recordings.preflight import Inspected
 from etid.recordings.recording import Recording
 from etid.recordings.remarks import Remark
@@ -99,6 +100,7 @@ def identify_skin(
 ) -> Fit[AbstractCircuit]: ...
 
 
+@in_float64
 def identify_skin(
     recording: Recording,
     driver: Driver | None = None,

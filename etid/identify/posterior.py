@@ -41,6 +41,7 @@ from etid.estimators.registry import MAXIMUM_LIKELIHOOD, named
 from etid.identify.arguments import fed, require
 from etid.identify.one import is_shared, known_of, skin
 from etid.numpy_tier.tiers import program
+from etid.precision import in_float64
 from etid.recordings.preflight import Inspected
 from etid.recordings.recording import Recording
 from etid.recordings.remarks import Remark
@@ -167,6 +168,7 @@ def _inside(
     return mean + slope @ moved, cov - slope @ less @ slope.T
 
 
+@in_float64
 def posterior(
     fit: Fit[Circuit],
     recording: Recording | None,

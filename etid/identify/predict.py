@@ -11,9 +11,10 @@ from etid.estimators.lanes import AlignedSamples
 from etid.estimators.output_error import fit as output_error
 from etid.estimators.output_error import prediction
 from etid.estimators.registry import OUTPUT_ERROR
-from etid.identify.arguments import circuit_of, fed, require_float64
+from etid.identify.arguments import circuit_of, fed
 from etid.identify.steady_state import periodic_voltage
 from etid.numpy_tier.tiers import program
+from etid.precision import in_float64
 from etid.recordings.preflight import Inspected
 from etid.recordings.recording import Recording
 from etid.results.driver import ContinuousDriver, Driver
@@ -30,6 +31,7 @@ def _fitted(
     return output_error.fitted_voltage(records, driver.source, driver.r_known, load)
 
 
+@in_float64
 def predict(
     recording: Recording, driver: Driver | None = None, circuit: AbstractCircuit | None = None
 ) -> Float[np.ndarray, " time"]:
@@ -52,7 +54,6 @@ def predict(
         ValueError: There is no circuit, or the driver has no continuous source impedance, or the
             response of the circuit in time is not known and the record holds no whole period.
     """
-    require_float64()
     recording, feed = fed(recording, driver)
     if circuit is not None:
         circuit = circuit_of(circuit)

@@ -17,6 +17,7 @@ from etid.estimators.lanes import Harmonics
 from etid.estimators.maximum_likelihood.load import Load
 from etid.identify.posterior import Known, Minimum, cost, given
 from etid.numpy_tier.tiers import program
+from etid.precision import in_float64
 from etid.recordings.recording import Recording
 from etid.results.driver import Driver
 from etid.results.fit import Fit
@@ -118,6 +119,7 @@ def _profile(
     return least.q[number] + stretched[number] * steps, found - 2 * cost(least.terms, best)
 
 
+@in_float64
 def profile(fit: Fit, recording: Recording | None, driver: Driver | None, name: str) -> Profile:
     """`Fit.profile`."""
     names = fit.circuit.names()

@@ -16,12 +16,14 @@ from etid.identify.arguments import (
     require,
 )
 from etid.identify.one import skin_lane
+from etid.precision import in_float64
 from etid.recordings.remarks import Remark
 from etid.results.driver import Driver
 from etid.results.fit import Fit
 from etid.signals.harmonics import whole_periods
 
 
+@in_float64
 def identify_samples(
     v_th: Float[Array, " time"],
     v_out: Float[Array, " time"],
@@ -66,8 +68,9 @@ def identify_samples(
         estimator = for_samples(driver, periods)
         check_default(estimator, [circuit])
     estimator.check_driver(driver, sample_rate, pulse_rate)
-    step = jnp.asarray(resolution, dtype=v_out.dtype)
-    rate = jnp.asarray(sample_rate, dtype=v_out.dtype)
+    v_th, v_out, step, rate = (
+        jnp.asarray(value, float) for value in (v_th, v_out, resolution, sample_rate)
+    )
     lane = estimator.lane.of_samples(v_th, v_out, step, rate, periods)
     known = (
         estimator.known(driver, jnp.asarray(lane.frequency), True)

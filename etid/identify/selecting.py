@@ -12,6 +12,7 @@ from etid.estimators.registry import Method
 from etid.identify.arguments import Interval, asked_of, require
 from etid.identify.impedance import identify_impedance
 from etid.identify.one import candidate_fits, successful
+from etid.precision import in_float64
 from etid.recordings.recording import Recording, RecordingError
 from etid.results.driver import Driver
 from etid.selection.search import usual_circuits
@@ -21,6 +22,7 @@ FREQUENCY = np.geomspace(1.0, 1e7, 57)  # [Hz], where two impedances are compare
 EQUAL = 1e-6  # relative difference of two impedances that are equal; a fit reaches 1e-9
 
 
+@in_float64
 def select_circuit(
     recording: Recording,
     driver: Driver | None = None,

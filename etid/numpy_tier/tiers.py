@@ -19,6 +19,7 @@ from etid.garbage import unsearched
 from etid.numpy_tier.source import UntranslatableError
 from etid.numpy_tier.translator import translated
 from etid.numpy_tier.waiting import announced
+from etid.precision import in_float64, is_traced
 
 Parameters = ParamSpec("Parameters")
 Result = TypeVar("Result")
@@ -95,6 +96,7 @@ def program(
         return jax.jit(flat, static_argnums=0, compiler_options=options)
 
     @functools.wraps(function)
+    @in_float64
     def call(*args: Parameters.args, **kwargs: Parameters.kwargs) -> Result:
         arrays, others = eqx.partition((args, kwargs), eqx.is_array)
         if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(arrays)):
@@ -149,6 +151,4 @@ def _at_once() -> contextlib.AbstractContextManager[None]:
     Elsewhere it does nothing: in this context, each constant of a program to trace would be
     compiled as a program of its own. A driver and a skin have three hundred, which take 14 s.
     """
-    # `jnp.asarray` would compile a program of its own.
-    tracing = isinstance(jax.device_put(0.0), jax.core.Tracer)
-    return jax.ensure_compile_time_eval() if tracing else contextlib.nullcontext()
+    return jax.ensure_compile_time_eval() if is_traced(()) else contextlib.nullcontext()

@@ -59,6 +59,7 @@ from etid.identify.arguments import number_of, require
 from etid.online.current import Current, CurrentModel
 from etid.online.state import ElectrodeState, TrackerState
 from etid.online.tracker import Tracker
+from etid.precision import in_float64
 from etid.results.verdicts import counts
 from etid.solvers.matrices import inverse_of_few
 
@@ -151,6 +152,7 @@ class Controller(Overviewed):
     short: float
 
     @classmethod
+    @in_float64
     def of(
         cls,
         tracker: Tracker,
@@ -251,6 +253,7 @@ class Controller(Overviewed):
         ]
         return Overview(f"Controller of {self.tracker.electrodes} electrodes", rows)
 
+    @in_float64
     def command(
         self,
         state: TrackerState,

@@ -49,7 +49,7 @@ from etid.circuits.overview import Overview, Overviewed
 from etid.estimators.estimator import serving
 from etid.estimators.maximum_likelihood.given_driver import GivenDriver
 from etid.estimators.registry import MAXIMUM_LIKELIHOOD
-from etid.identify.arguments import circuit_of, number_of, require, require_float64
+from etid.identify.arguments import circuit_of, number_of, require
 from etid.identify.one import known_at
 from etid.identify.unfitted import explained
 from etid.numpy_tier.tiers import program
@@ -61,6 +61,7 @@ from etid.online.pulse_fit import GainModel
 from etid.online.reading import fit_of
 from etid.online.state import ElectrodeState, TrackerState
 from etid.online.tick import updated
+from etid.precision import in_float64
 from etid.recordings.errors import not_recorded
 from etid.recordings.preflight import Inspected, preflight
 from etid.recordings.recording import Recording, RecordingError
@@ -109,6 +110,7 @@ class Tracker(Overviewed):
     period: float
 
     @classmethod
+    @in_float64
     def of(
         cls,
         driver: Driver,
@@ -138,7 +140,6 @@ class Tracker(Overviewed):
             ValueError: The driver has no harmonics of its calibrations, or a number is too small.
             IdentificationError: The recording cannot be used; the message says why.
         """
-        require_float64()
         require("driver", driver, Driver)
         require("unloaded", unloaded, Recording)
         if unloaded.cause != driver.recorded:
@@ -195,6 +196,7 @@ class Tracker(Overviewed):
         ]
         return Overview(f"Tracker of {kind}, driver {of_driver}", rows)
 
+    @in_float64
     def start(self, *, at_rest: bool = False) -> TrackerState:
         """The state before the first pulse, without information.
 
@@ -262,6 +264,7 @@ class Tracker(Overviewed):
         """
         return cut(np.asarray(v_out), self.period)
 
+    @in_float64
     def update(
         self,
         state: TrackerState,
@@ -313,6 +316,7 @@ class Tracker(Overviewed):
         found = self.projection.seen(v_out.astype(float, copy=False), self.adc_range)
         return updated(self.model, self.change, self.limit, state, found, relative)
 
+    @in_float64
     def read(self, state: TrackerState) -> Fits:
         """Elements, standard errors, χ² of the last pulse and verdict of every electrode.
 
@@ -339,6 +343,7 @@ class Tracker(Overviewed):
         notes = np.array([NOTES.get(name) or message(name) for name in fit.verdict])
         return Fits(fit, described(electrodes), notes)
 
+    @in_float64
     def changes(self, state: TrackerState) -> list[Change]:
         """The changes that the last pulse has shown; see `etid.online.changes`.
 
@@ -351,6 +356,7 @@ class Tracker(Overviewed):
         """
         return changes.changes(state, self.model.circuit.names())
 
+    @in_float64
     def bad_electrodes(self, state: TrackerState) -> dict[int, str]:
         """Electrodes that cannot be used, by number, and why.
 

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, get_args, overload
 import numpy as np
 
 from etid.circuits.circuit import AbstractCircuit
+from etid.precision import in_float64
 from etid.recordings.recording import Recording
 from etid.results.data import AnyAxes, MeasuredImpedance, Shown
 from etid.results.driver import Driver, SourceImpedance
@@ -57,6 +58,7 @@ def plot(
     *,
     axes: AnyAxes = None,
 ) -> np.ndarray: ...
+@in_float64
 def plot(
     x: Any,
     recording: Recording | None = None,

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from etid.circuits.circuit import AbstractCircuit
-from etid.identify.arguments import require_float64
+from etid.precision import in_float64
 from etid.recordings.fields import DESCRIBING
 from etid.recordings.study import Study
 from etid.report import tables as study_tables
@@ -24,6 +24,7 @@ from etid.results.verdicts import message, own_part
 
 
 @np.errstate(all="ignore")  # a fit that failed may hold any number
+@in_float64
 def write_report(
     fits: str | os.PathLike[str] | StudyFits | Fits,
     page: str | os.PathLike[str],
@@ -52,7 +53,6 @@ def write_report(
     """
     from etid.report.recordings import Recordings  # matplotlib is imported by the first picture
 
-    require_float64()
     file = None if isinstance(fits, StudyFits | Fits) else pathlib.Path(fits)
     if isinstance(fits, StudyFits):
         found = fits

@@ -63,7 +63,7 @@ class SourceImpedance(eqx.Module):
         return 2 * self.log_omega.shape[0] + self.log_omega_real.shape[0]
 
     @program
-    def response(self, frequency: Float[Array, "..."]) -> Complex[Array, "..."]:
+    def response(self, frequency: Float[Array | np.ndarray, "..."]) -> Complex[Array, "..."]:
         """Impedance [Ω] at real frequencies [Hz]."""
         # In real arithmetic, which takes half the time to compile and to run.
         omega = 2 * jnp.pi * jnp.asarray(frequency)
@@ -229,7 +229,7 @@ class Driver(AbstractFeed):
         return z_th * reciprocal(load + z_th)
 
     @abc.abstractmethod
-    def response(self, frequency: Float[Array, "..."]) -> Complex[Array, "..."]:
+    def response(self, frequency: Float[Array | np.ndarray, "..."]) -> Complex[Array, "..."]:
         """Source impedance Z_th(j 2π f) [Ω], in continuous time if the method gives it.
 
         Args:
@@ -238,12 +238,14 @@ class Driver(AbstractFeed):
 
     @abc.abstractmethod
     def log_response_stderr(
-        self, frequency: Float[Array, " frequency"]
+        self, frequency: Float[Array | np.ndarray, " frequency"]
     ) -> Float[Array, "2 frequency"]:
         """Standard errors of ln |Z_th| and of the phase [rad]; NaN if there is no covariance."""
 
     @program
-    def response_stderr(self, frequency: Float[Array, " frequency"]) -> Float[Array, " frequency"]:
+    def response_stderr(
+        self, frequency: Float[Array | np.ndarray, " frequency"]
+    ) -> Float[Array, " frequency"]:
         """Standard error of |Z_th|, from the derivatives of |Z_th| by its parameters.
 
         Args:
@@ -279,14 +281,14 @@ class DiscreteDriver(Driver):
     """A driver from Steiglitz-McBride: Z_th is the discrete filter `b`, `a` (paper, eq. 4)."""
 
     @program
-    def response(self, frequency: Float[Array, "..."]) -> Complex[Array, "..."]:
+    def response(self, frequency: Float[Array | np.ndarray, "..."]) -> Complex[Array, "..."]:
         """Source impedance Z_th [Ω] of the discrete filter at real frequencies [Hz]."""
         z = delay_variable(jnp.asarray(frequency), self.sample_rate)
         return Rational(self.b, self.a)(z)
 
     @program
     def log_response_stderr(
-        self, frequency: Float[Array, " frequency"]
+        self, frequency: Float[Array | np.ndarray, " frequency"]
     ) -> Float[Array, "2 frequency"]:
         """NaN: Steiglitz-McBride gives no covariance."""
         return jnp.full((2, frequency.size), jnp.nan)
@@ -334,19 +336,22 @@ class ContinuousDriver(Driver):
         return self.calibration.delay_std_samples * (sample_rate / self.sample_rate)
 
     @program
-    def response(self, frequency: Float[Array, "..."]) -> Complex[Array, "..."]:
+    def response(self, frequency: Float[Array | np.ndarray, "..."]) -> Complex[Array, "..."]:
         """Source impedance Z_th [Ω] in continuous time at real frequencies [Hz]."""
         return self.source.response(frequency)
 
     @program
     def log_response_stderr(
-        self, frequency: Float[Array, " frequency"]
+        self, frequency: Float[Array | np.ndarray, " frequency"]
     ) -> Float[Array, "2 frequency"]:
         """Standard errors of ln |Z_th| and of its phase [rad] at real frequencies [Hz].
 
         var = J cov Jᵀ,    J = ∂(ln |Z_th|, arg Z_th) / ∂parameters
         """
-        relative = self.source.slopes(frequency) * reciprocal(self.response(frequency))[None, :]
+        relative = (
+            self.source.slopes(jnp.asarray(frequency))
+            * reciprocal(self.response(frequency))[None, :]
+        )
         parts = jnp.stack([relative.real, relative.imag])
         return jnp.sqrt(jnp.einsum("cif,ij,cjf->cf", parts, self.cov, parts))
 

@@ -132,10 +132,7 @@ class Fit(Judged, HasSource[Circuit]):
         cov = xp.asarray(self.cov)
         variance = xp.diagonal(cov, axis1=-2, axis2=-1)
         values = xp.sqrt(xp.where(variance >= 0, variance, xp.nan))
-        if isinstance(self.cov, jax.Array):
-            values = [jax.device_put(values[..., i]) for i in range(values.shape[-1])]
-        else:
-            values = np.moveaxis(values, -1, 0)
+        values = xp.moveaxis(values, -1, 0)
         return type(self.circuit)(**dict(zip(self.circuit.names(), values, strict=True)))
 
     @property

@@ -62,7 +62,7 @@ class Fits(Overviewed, Generic[Circuit]):
         return len(self.notes)
 
     def __getitem__(self, index: int) -> Fit[Circuit]:
-        return jax.tree.map(lambda leaf: jax.device_put(np.asarray(leaf)[index]), self.fit)
+        return jax.tree.map(lambda leaf: np.asarray(leaf)[index], self.fit)
 
     def take(self, index: np.ndarray) -> "Fits[Circuit]":
         """The fits selected by an array.

@@ -22,6 +22,7 @@ from jaxtyping import Array
 from etid.circuits.circuit import AbstractCircuit
 from etid.circuits.display import several
 from etid.circuits.overview import ROWS, Overview, Overviewed
+from etid.precision import in_float64
 from etid.recordings.recording import RecordingError
 from etid.recordings.remarks import remarks_of, words
 from etid.results.driver import (
@@ -212,6 +213,7 @@ def _to_json(paths: tuple[str, ...], driver: Driver) -> str:
     return json.dumps(stored)
 
 
+@in_float64
 def _from_json(stored: Mapping[str, Any]) -> Driver:
     """A driver from the result of `_to_json`, which does not hold harmonics of calibrations.
 

@@ -26,7 +26,8 @@ from jaxtyping import Complex, Float
 
 from etid.circuits.circuit import AbstractCircuit, Resistor, SkinRC
 from etid.circuits.overview import Overview, Overviewed, element_rows
-from etid.identify.arguments import require, require_float64
+from etid.identify.arguments import require
+from etid.precision import in_float64
 from etid.signals.harmonics import whole_periods
 from etid.signals.noise import COARSE, is_coarse, rounding_variance
 from etid.simulation.scenes import Scene, Trial, Waveform
@@ -95,6 +96,7 @@ class Bounds(Overviewed, dict[str, Bound]):
         return Overview("Smallest standard errors of each trial:", rows)
 
 
+@in_float64
 def bound(scene: Scene, *, delays: bool = True, known_driver: bool = False) -> Bounds:
     """Predict the smallest standard errors of each trial of a scene before it is recorded.
 
@@ -115,7 +117,6 @@ def bound(scene: Scene, *, delays: bool = True, known_driver: bool = False) -> B
         ValueError: The load of a trial has no elements. Or the scene has neither noise nor a
             converter. Or it has neither a calibration nor a current, and the driver is not known.
     """
-    require_float64()
     require(
         "scene", scene, Scene, "Make one with etid.scenes.Scene, or use a preset of etid.scenes"
     )

@@ -30,7 +30,7 @@ import numpy as np
 from jaxtyping import Complex, Float
 
 from etid.circuits.circuit import AbstractCircuit
-from etid.identify.arguments import require_float64
+from etid.precision import in_float64
 from etid.recordings.fields import tidy_path
 from etid.recordings.recording import Recording, Samples
 from etid.recordings.study import Study
@@ -174,6 +174,7 @@ class Scene:
         """Elements of every load by path [SI]; empty for an open circuit or a plain function."""
         return {trial.path: _elements(trial.load) for trial in self.calibration + self.trials}
 
+    @in_float64
     def simulate(self, seed: int) -> Study:
         """Make the recordings.
 
@@ -189,6 +190,7 @@ class Scene:
         _, v_th, z_th, _ = self._exact()
         return self.record(seed, lambda trial, f: v_th * loading(_impedance(trial, f), z_th))
 
+    @in_float64
     def record(
         self,
         seed: int,
@@ -329,7 +331,6 @@ def _elements(load: Impedance | AbstractCircuit) -> dict[str, float]:
 def _impedance(trial: Trial, f: Float[np.ndarray, " f"]) -> Complex[np.ndarray, " f"]:
     """Impedance of the load; checked, because the load may be any function."""
     if isinstance(trial.load, AbstractCircuit):
-        require_float64()
         z = np.asarray(trial.load.response(jnp.asarray(f)))
     else:
         z = np.asarray(trial.load(f), complex)

@@ -58,6 +58,8 @@ def drawn(
         flat = _flattened(log_weight, min(SEVERAL * mean.size, ENOUGH * draws))
         mean = flat @ q
         cov = np.cov(q, rowvar=False, aweights=flat)
+        if np.linalg.matrix_rank(cov) < mean.size:  # of fewer draws than parameters
+            break
     return best
 
 
