@@ -18,6 +18,10 @@ DEPENDENCIES ?= newest
 # What notebooks compile is kept where the tests keep it.
 COMPILED := JAX_COMPILATION_CACHE_DIR=$(CURDIR)/.pytest_cache/d/xla JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS=0
 
+# Tests with their assertions and etid with its checks of types are kept as bytecode: a third of the
+# time of a collection.
+unexport PYTHONDONTWRITEBYTECODE
+
 .PHONY: demo test test-portable slow ranking notebooks docs wheel-test lint types clean
 
 demo: .venv/package

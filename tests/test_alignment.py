@@ -13,6 +13,8 @@ from etid.signals.pulse_train import find_pulses, lags_of, whole_lag
 from etid.simulation.scenes import Scene, Trial
 from etid.simulation.transformer import ResistorLoad, SkinLoad
 
+pytestmark = pytest.mark.usefixtures("run_as_for_users")
+
 PULSE = 60.0
 LOADS = {
     "dry": SkinLoad(r_s=33.4e3, r_p=186e3, c_p=0.12e-9),

@@ -12,6 +12,8 @@ from etid.recordings.study import Study
 from etid.signals.disturbances import joint
 from tests.test_changes import falling, recorded
 
+pytestmark = pytest.mark.usefixtures("run_as_for_users")
+
 PERIOD = 1 / 60.0
 LEFT_OUT = int(Remark.periods_left_out)
 

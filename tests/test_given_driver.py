@@ -18,6 +18,8 @@ from etid.signals.noise import noise
 from etid.simulation.scenes import Scene, Trial
 from etid.simulation.transformer import ResistorLoad
 
+pytestmark = pytest.mark.usefixtures("run_as_for_users")
+
 R_LOAD = 98.8e3
 KNOWN = (Trial("c", ResistorLoad(R_LOAD)),)
 STEP = 1e-5  # of a parameter, relative: differences of numbers of order 1 in double precision

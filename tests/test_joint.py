@@ -28,6 +28,8 @@ from etid.simulation.scenes import Scene, Trial
 from etid.simulation.transformer import ResistorLoad, SkinLoad, TransformerDriver
 from tests import kept_numbers
 
+pytestmark = pytest.mark.usefixtures("run_as_for_users")
+
 DRY = SkinLoad(r_s=33.4e3, r_p=186e3, c_p=0.12e-9)
 TRUTH = np.array(dataclasses.astuple(DRY))
 KNOWN = (Trial("calibration/0", ResistorLoad(98.8e3)),)

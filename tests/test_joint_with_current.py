@@ -21,7 +21,7 @@ from tests.test_driver_and_current import (
     scene,
 )
 
-pytestmark = pytest.mark.slow  # the program of a joint fit with currents compiles for a minute
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("run_as_for_users")]
 
 
 def jointly(recordings, **options):
@@ -176,25 +176,22 @@ def test_the_bound_of_one_trial_is_that_of_etid(drawn):
     np.testing.assert_allclose(joint_bound(one)[0], bound_of(one), rtol=1e-4)
 
 
-@pytest.mark.parametrize("shared_v_th", [False, True])
-@pytest.mark.parametrize(("circuit", "current_snr_db"), [(SKIN, 40.0), (DAMP, 30.0)])
-def test_joint_estimates_are_efficient_and_their_intervals_true(
-    circuit, current_snr_db, shared_v_th
-):
-    of = scene(circuit, current_snr_db=current_snr_db, shared_v_th=shared_v_th)
-    bound = joint_bound(of)
-    squares, covered = [], []
-    for seed in range(100):
-        fits = etid.identify_jointly(of.simulate(seed + 2000)).fits
-        assert set(fits.verdicts) <= {"successful", "inconsistent", "changed"}, seed
-        if (fits.verdicts == "successful").all():
-            error = np.stack([values(fit) for fit in map(fits.__getitem__, range(2))])
-            error = error / np.asarray(circuit.values()) - 1
-            squares.append((error / bound) ** 2)
-            covered.append(
-                np.abs(error) < 1.96 * np.stack([relative(fits[row]) for row in range(2)])
-            )
-    assert len(squares) >= 97
+def test_joint_estimates_are_efficient_and_their_intervals_true():
+    """Dry and damp skin, each with an unloaded record for each recording and with one for all."""
+    squares, covered, draws = [], [], 25
+    for circuit, current_snr_db in ((SKIN, 40.0), (DAMP, 30.0)):
+        for shared_v_th in (False, True):
+            of = scene(circuit, current_snr_db=current_snr_db, shared_v_th=shared_v_th)
+            bound = joint_bound(of)
+            for seed in range(draws):
+                fits = etid.identify_jointly(of.simulate(seed + 2000)).fits
+                assert set(fits.verdicts) <= {"successful", "inconsistent", "changed"}, seed
+                if (fits.verdicts == "successful").all():
+                    both = fits[0], fits[1]
+                    error = np.stack([values(fit) for fit in both]) / np.asarray(circuit.values())
+                    squares.append(((error - 1) / bound) ** 2)
+                    covered.append(np.abs(error - 1) < 1.96 * np.stack([*map(relative, both)]))
+    assert len(squares) >= 4 * draws - 3
     # 200 squares of normal errors have a mean that is known to 10 %.
     assert (np.mean(squares, axis=(0, 1)) < 1.35).all(), np.mean(squares, axis=(0, 1))
     assert 0.92 < np.mean(covered) < 0.98

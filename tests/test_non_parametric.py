@@ -20,6 +20,8 @@ from etid.signals.harmonics import Spectrum
 from etid.signals.transfer import as_complex
 from tests import kept_numbers
 
+pytestmark = pytest.mark.usefixtures("run_as_for_users")
+
 RESISTORS = (98.8e3, 21.62e3)
 SIGMAS = 5.0  # one in 2 million for a normal error
 

@@ -15,6 +15,8 @@ import pytest
 from etid.numpy_tier.waiting import COMPILING
 from tests.conftest import REFERENCE_DATA
 
+pytestmark = pytest.mark.usefixtures("run_as_for_users")
+
 ROOT = pathlib.Path(__file__).parents[1]
 CONCLUSIONS = ROOT / "tests" / "conclusions"  # what must hold after each notebook
 NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.py"))

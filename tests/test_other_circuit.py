@@ -16,6 +16,8 @@ from etid.estimators.score_tests import other_circuit
 from etid.estimators.score_tests.other_circuit import Scores
 from etid.simulation.scenes import Trial
 
+pytestmark = pytest.mark.usefixtures("run_as_for_users")
+
 
 def test_the_slope_is_that_of_a_constant_phase():
     """Against a central difference of (jω)^α in the place of jω."""

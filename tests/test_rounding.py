@@ -13,6 +13,8 @@ from etid.signals.harmonics import harmonics
 from etid.simulation import scenes
 from etid.simulation.scenes import Scene
 
+pytestmark = pytest.mark.usefixtures("run_as_for_users")
+
 DRY = scenes.paper_dry()
 
 

@@ -24,6 +24,8 @@ from etid.selection.unseen import WIDTH, hidden, posterior, unseen
 from etid.simulation.scenes import Scene, Trial
 from etid.simulation.transformer import ResistorLoad
 
+pytestmark = pytest.mark.usefixtures("run_as_for_users")
+
 CANDIDATES = usual_circuits()
 
 TERMS = 1000.0
