@@ -193,6 +193,15 @@ def test_numbers_of_another_type(old, new, data, shape):
     check(lambda x: lax.convert_element_type(x, new), filled(data, old, shape))
 
 
+@given(data=st.data(), shape=st.sampled_from(SHAPES))
+@settings(max_examples=6)
+def test_the_slope_by_a_number_that_is_made_complex_is_real(data, shape):
+    def slope(towards):
+        return jax.linear_transpose(lambda x: x.astype(complex), towards.real)(towards)[0]
+
+    check(slope, filled(data, np.complex128, shape))
+
+
 @pytest.mark.parametrize(
     ("function", "dtypes"),
     [

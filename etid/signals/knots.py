@@ -72,10 +72,10 @@ class Knots:
         return jnp.concatenate([*parts, values[..., -1:]], -1)
 
 
-def _shares(of: _Group, values: Inexact[Array, "*row interval _"]) -> Inexact[Array, "..."]:
-    """Share of the right knot in each harmonic of the intervals."""
-    share = jnp.asarray(np.arange(of.width) / of.width, values.dtype)
-    return jnp.broadcast_to(share, (*values.shape[:-1], of.width))
+def _shares(of: _Group, values: Inexact[Array, "*row interval _"]) -> Inexact[np.ndarray, "..."]:
+    """Share of the right knot in each harmonic of the intervals, with the axes of `values`."""
+    share = np.arange(of.width, dtype=values.dtype) / of.width
+    return share.reshape((1,) * (values.ndim - 1) + share.shape)
 
 
 @functools.lru_cache(maxsize=16)
