@@ -14,6 +14,7 @@ import matplotlib.ticker
 import numpy as np
 from jaxtyping import Float
 from matplotlib.axes import Axes
+from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
 
 from etid.circuits.display import DISPLAY
@@ -23,6 +24,11 @@ from etid.report.tables import Components, frequent
 from etid.results.driver import Driver
 from etid.results.fits import Fits
 
+SVG = {
+    "svg.hashsalt": "etid",
+    "figure.autolayout": False,
+    "figure.constrained_layout.use": False,
+}
 POINTS = 300  # largest number of points of a curve
 BINS = 40  # largest number of bin edges of a histogram
 FAR = 1e6  # ratio of the ends of an axis; above, the labels are powers of ten
@@ -35,10 +41,16 @@ QUARTILES, MOST = (0.25, 0.75), (0.05, 0.95)
 
 def svg(figure: Figure) -> bytes:
     """A figure as SVG without dates and random names, so that equal figures give equal files."""
-    buffer = io.BytesIO()
-    with matplotlib.rc_context({"svg.hashsalt": "etid"}), warnings.catch_warnings():
+    buffer, dpi = io.BytesIO(), figure.dpi
+    with matplotlib.rc_context(SVG), warnings.catch_warnings():
         # The tables show the label as it is.
         warnings.filterwarnings("ignore", "Glyph .* missing from font")
+        # `savefig` would draw a figure twice, the first time for its layout alone.
+        FigureCanvasSVG(figure)
+        if (layout := figure.get_layout_engine()) is not None:
+            layout.execute(figure)
+            figure.set_layout_engine(None)
+        figure.set_dpi(dpi)  # the layout was made with the dots of an SVG
         figure.savefig(buffer, format="svg", metadata={"Date": None})
     return buffer.getvalue()
 
