@@ -84,6 +84,10 @@ def triangular_solve(
 
 def lu(of: Any) -> list[Any]:
     """Both factors in one matrix, the exchanged rows, and their order."""
+    if not of.size:  # LAPACK would write a complaint to the terminal
+        *batch, rows, columns = of.shape
+        order = np.broadcast_to(np.arange(rows, dtype=np.int32), (*batch, rows))
+        return [of.copy(), np.zeros((*batch, min(rows, columns)), np.int32), order]
     if of.ndim > 2:
         return each(lu, of)
     found, pivots, _ = LU[of.dtype.char](of)
