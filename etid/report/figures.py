@@ -8,6 +8,7 @@ import dataclasses
 import io
 import warnings
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import matplotlib
 import matplotlib.ticker
@@ -24,7 +25,7 @@ from etid.report.tables import Components, frequent
 from etid.results.driver import Driver
 from etid.results.fits import Fits
 
-SVG = {
+SVG: Any = {
     "svg.hashsalt": "etid",
     "figure.autolayout": False,
     "figure.constrained_layout.use": False,

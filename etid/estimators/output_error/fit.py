@@ -100,7 +100,9 @@ def fit_source(
     def residual(q: Float[Array, " q"], of: Any) -> Float[Array, " term"]:
         (records, r_load, regularise), (parameters, vectors) = of, named(q)
         nuisance = Nuisance.of(vectors)
-        parts = _each(lambda *of: one(*of, parameters), records, r_load, nuisance)
+        parts = _each(
+            lambda record, r, late: one(record, r, late, parameters), records, r_load, nuisance
+        )
         late = nuisance.delay_samples / DELAY_WIDTH
         return jnp.concatenate([parts.reshape(-1), regularise(parameters), late])
 
