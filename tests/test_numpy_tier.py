@@ -193,6 +193,15 @@ def test_numbers_of_another_type(old, new, data, shape):
     check(lambda x: lax.convert_element_type(x, new), filled(data, old, shape))
 
 
+@given(data=st.data(), shape=st.sampled_from(SHAPES))
+@settings(max_examples=6)
+def test_the_slope_by_a_number_that_is_made_complex_is_real(data, shape):
+    def slope(towards):
+        return jax.linear_transpose(lambda x: x.astype(complex), towards.real)(towards)[0]
+
+    check(slope, filled(data, np.complex128, shape))
+
+
 @pytest.mark.parametrize(
     ("function", "dtypes"),
     [
@@ -366,6 +375,20 @@ def test_linear_algebra(name, batch):
     check(ALGEBRA[name], root @ root.swapaxes(-1, -2) + 2 * np.eye(4), rounding=1e4)
 
 
+def test_factors_of_an_empty_matrix_are_found_without_a_word(capfd):
+    for shape in ((0, 0), (2, 0, 0)):
+        check(ALGEBRA["lu"], np.zeros(shape))
+    assert capfd.readouterr() == ("", "")
+
+
+def test_a_function_of_python_gets_and_gives_arrays():
+    def sines(x):
+        return jax.pure_callback(np.sin, jax.ShapeDtypeStruct(x.shape, x.dtype), x)
+
+    check(sines, X)
+    check(sines, np.float64(0.5))
+
+
 @pytest.mark.parametrize(
     "name", ["cholesky", "inverse", "lower", "eigenvalues", "roots", "singular values"]
 )
@@ -493,7 +516,7 @@ def test_what_does_not_change_is_computed_before_the_loop():
 @pytest.mark.parametrize(
     "function",
     [
-        lambda x: jax.pure_callback(np.sin, jax.ShapeDtypeStruct(x.shape, x.dtype), x),
+        jax.scipy.special.erfinv,
         lambda x: jax.random.normal(jax.random.key(0), x.shape),
         lambda x: lax.conv(x, x[:, :, :1], (1,), "SAME"),
         lambda x: lax.reduce_window(

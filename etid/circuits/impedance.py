@@ -336,8 +336,8 @@ def realise(impedance: Rational, rate: float | Float[Array, ""]) -> StateSpace:
     den = impedance.den * scale
     num, den = num / den[-1], den / den[-1]
     direct = num[-1]
-    A = jnp.eye(order, k=1).at[order - 1 :, :].set(-den[:-1]) if order else jnp.zeros((0, 0))
-    B = jnp.eye(order, 1, k=1 - order) if order else jnp.zeros((0, 1))
+    A = jnp.concatenate([np.eye(order, k=1)[:-1], -den[None, :-1]])[:order]
+    B = jnp.asarray(np.eye(order, 1, k=1 - order))
     return StateSpace(rate * A, rate * B, num[:-1] - direct * den[:-1], direct[None])
 
 

@@ -54,10 +54,12 @@ def cholesky(of: Any) -> Any:
     """Lower factor; NaN for a matrix that is not positive definite."""
     if not of.size:
         return of.copy()
-    if of.ndim > 2:
-        return each(lambda one: [cholesky(one)], of)[0]
-    found, failed = CHOLESKY[of.dtype.char](of, lower=1, clean=1)
-    return np.full_like(of, np.nan) if failed else found
+    factor, found = CHOLESKY[of.dtype.char], np.empty_like(of)
+    for place in np.ndindex(of.shape[:-2]):
+        found[place], failed = factor(of[place], lower=1, clean=1)
+        if failed:
+            found[place] = np.nan
+    return found
 
 
 def triangular_solve(
@@ -74,13 +76,18 @@ def triangular_solve(
         return b.copy()
     options: dict[str, int] = {"side": not left_side, "lower": lower, "diag": unit_diagonal}
     options["trans_a"] = transpose_a * (1 + conjugate_a)
-    if b.ndim > 2:
-        return each(lambda a, b: [SOLVE[a.dtype.char](1.0, a, b, **options)], a, b)[0]
-    return SOLVE[a.dtype.char](1.0, a, b, **options)
+    solve, found = SOLVE[a.dtype.char], np.empty_like(b)
+    for place in np.ndindex(b.shape[:-2]):
+        found[place] = solve(1.0, a[place], b[place], **options)
+    return found
 
 
 def lu(of: Any) -> list[Any]:
     """Both factors in one matrix, the exchanged rows, and their order."""
+    if not of.size:  # LAPACK would write a complaint to the terminal
+        *batch, rows, columns = of.shape
+        order = np.broadcast_to(np.arange(rows, dtype=np.int32), (*batch, rows))
+        return [of.copy(), np.zeros((*batch, min(rows, columns)), np.int32), order]
     if of.ndim > 2:
         return each(lu, of)
     found, pivots, _ = LU[of.dtype.char](of)

@@ -60,8 +60,10 @@ def converted(p: Any, operands: Sequence[Value], _: Any) -> Any:
     old, new = operands[0].dtype, np.dtype(p["new_dtype"])
     if old == new:
         return 0
-    if old.kind == "c" and new.kind in "fiu":
-        raise UntranslatableError("a complex number as a real one")
+    if old.kind == "c" and new.kind == "f":
+        return lambda of: of.real.astype(new)
+    if old.kind == "c" and new.kind in "iu":
+        raise UntranslatableError("a complex number as an integer")
     whole_now = old.kind == "f" and new.kind in "iu"
     return partial(whole, new) if whole_now else operator.methodcaller("astype", new)
 
@@ -96,6 +98,8 @@ def integer_pow(of: Any, y: int) -> Any:
     """Power by repeated squaring, as XLA does it."""
     if y == 2:  # by far the most frequent
         return of * of
+    if y == -1:
+        return 1 / of
     if y == 0:
         return np.ones_like(of)
     left, square, found = abs(y), of, 1
@@ -195,20 +199,26 @@ def stack(*of: Any, axis: int) -> Any:
     return np.moveaxis(found, 0, axis) if axis else found
 
 
-def pad(of: Any, fill: Any, padding_config: Sequence[Sequence[Any]]) -> Any:
-    """An array with so many elements before it, after it and between its elements, for each axis.
+def pad(lengths: Sequence[int], limits: Sequence[Sequence[Any]]) -> Callable[[Any, Any], Any]:
+    """The function that puts elements before, after and between those of each axis of an array.
 
     Fewer than none before or after it: some are cut off.
     """
     shape, inside, kept = [], [], []
-    for length, (low, high, between) in zip(of.shape, padding_config, strict=True):
+    for length, (low, high, between) in zip(lengths, limits, strict=True):
         stop = max(low, 0) + max(length + (length - 1) * between, 0)
         shape.append(stop + max(high, 0))
         inside.append(slice(max(low, 0), stop, between + 1))
         kept.append(slice(max(-low, 0), shape[-1] - max(-high, 0)))
-    found = np.full(shape, fill, of.dtype)
-    found[tuple(inside)] = of
-    return found[tuple(kept)]
+    places, cut = tuple(inside), tuple(kept)
+
+    def padded(of: Any, fill: Any) -> Any:
+        found = np.empty(shape, of.dtype)
+        found.fill(fill)  # `np.full` takes three times as long
+        found[places] = of
+        return found[cut]
+
+    return padded
 
 
 # --- Reductions and orders ------------------------------------------------------------------------
@@ -232,15 +242,16 @@ def running(function: Any, of: Any, axis: int, reverse: bool) -> Any:
     return function.accumulate(of[order], axis, of.dtype)[order]
 
 
-def window_sum(p: Any, _: Any, __: Any) -> Any:
+def window_sum(p: Any, operands: Sequence[Value], _: Any) -> Any:
     """The rule of sums over windows that move over an array with zeros around it."""
     if any(step != 1 for name in p if "dilation" in name for step in p[name]):
         raise UntranslatableError("windows with gaps")
-    limits = [(low, high, 0) for low, high in p["padding"]]
+    (of,) = operands
+    around = pad(of.shape, [(low, high, 0) for low, high in p["padding"]])
     steps = tuple(slice(None, None, step) for step in p["window_strides"])
     windows = partial(np.lib.stride_tricks.sliding_window_view, window_shape=p["window_dimensions"])
-    axes = tuple(range(len(limits), 2 * len(limits)))
-    return lambda of: windows(pad(of, 0, limits))[steps].sum(axes, of.dtype)
+    axes = tuple(range(len(of.shape), 2 * len(of.shape)))
+    return lambda of: windows(around(of, 0))[steps].sum(axes, of.dtype)
 
 
 def sort(*of: Any, dimension: int, num_keys: int, **_: Any) -> list[Any]:
@@ -329,6 +340,16 @@ def dynamic_update_slice(of: Any, new: Any, *starts: Any) -> Any:
     return found
 
 
+def called(p: Any, _: Any, results: Sequence[Any]) -> Any:
+    """The rule of a function of Python, which gets and gives arrays."""
+
+    def call(*of: Any) -> list[Any]:
+        found = p["callback"](*map(np.asarray, of))
+        return [np.asarray(one, aval.dtype) for one, aval in zip(found, results, strict=True)]
+
+    return call
+
+
 # --- All of them ----------------------------------------------------------------------------------
 
 RULES: dict[str, Rule] = {
@@ -355,10 +376,11 @@ RULES: dict[str, Rule] = {
     "gather": gather,
     "iota": lambda p, _, out: lambda *_: np.indices(out[0].shape, out[0].dtype)[p["dimension"]],
     "lu": always(algebra.lu),
-    "pad": by_keywords(pad),
+    "pad": lambda p, operands, _: pad(operands[0].shape, p["padding_config"]),
     "platform_index": by_keywords(
         lambda platforms: np.int32([not names or "cpu" in names for names in platforms].index(True))
     ),
+    "pure_callback": called,
     "qr": algebra.qr,
     "reduce_and": partial(reduction, np.bitwise_and),
     "reduce_max": partial(reduction, np.maximum),

@@ -70,7 +70,8 @@ class Body:
             results = _listed(statement.results) + "," * statement.several
             backwards.append(f" {results}={statement.function}({operands})")
             backwards += [f" {line}" for text, _ in inner for line in reversed(text)]
-            needed = (needed - _names(statement.results)) | uses
+            needed -= _names(statement.results)
+            needed |= uses
         backwards.append(f"def {self.name}({_listed(self.arguments)}):")
         return backwards[::-1], needed - own
 

@@ -81,17 +81,18 @@ def program(
         batch: Whether it runs for so many recordings that its run time matters more than its
             compilation.
     """
-    inner = eqx.filter_jit(function)  # part of another function, which decides how it is compiled
+
+    def flat(static: _Static, arrays: Any) -> tuple[Any, _Static]:
+        args, kwargs = eqx.combine(arrays, static.of)
+        of: Any = function
+        found, others = eqx.partition(of(*args, **kwargs), eqx.is_array)
+        return found, _Static(others)
+
+    flat.__name__ = flat.__qualname__ = function.__name__
+    part = jax.jit(flat, static_argnums=0)  # of another function, which decides who runs it
 
     @functools.cache
     def compiled(processor: bool) -> Any:
-        def flat(static: _Static, arrays: Any) -> tuple[Any, _Static]:
-            args, kwargs = eqx.combine(arrays, static.of)
-            of: Any = function
-            found, others = eqx.partition(of(*args, **kwargs), eqx.is_array)
-            return found, _Static(others)
-
-        flat.__name__ = flat.__qualname__ = function.__name__
         options = None if not processor else QUICKLY if batch else AT_ONCE
         return jax.jit(flat, static_argnums=0, compiler_options=options)
 
@@ -99,9 +100,11 @@ def program(
     @in_float64
     def call(*args: Parameters.args, **kwargs: Parameters.kwargs) -> Result:
         arrays, others = eqx.partition((args, kwargs), eqx.is_array)
+        static = _Static(others)
         if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(arrays)):
-            return inner(*args, **kwargs)
-        static, run = _Static(others), compiled(jax.default_backend() == "cpu")
+            found, others = part(static, arrays)
+            return eqx.combine(found, others.of)
+        run = compiled(jax.default_backend() == "cpu")
         with _at_once():
             small = None if batch or not _by_numpy() else _in_numpy(run, static, arrays)
             found, others = small(arrays) if small else _by_xla(run, static, arrays)

@@ -8,12 +8,14 @@ import dataclasses
 import io
 import warnings
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import matplotlib
 import matplotlib.ticker
 import numpy as np
 from jaxtyping import Float
 from matplotlib.axes import Axes
+from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
 
 from etid.circuits.display import DISPLAY
@@ -23,6 +25,11 @@ from etid.report.tables import Components, frequent
 from etid.results.driver import Driver
 from etid.results.fits import Fits
 
+SVG: Any = {
+    "svg.hashsalt": "etid",
+    "figure.autolayout": False,
+    "figure.constrained_layout.use": False,
+}
 NARROW = 3.0  # ratio of the largest to the smallest value; above, an axis is logarithmic
 CROWD = 120  # largest number of subjects in a figure
 SERIES = 4  # largest number of conditions in a figure
@@ -30,10 +37,16 @@ SERIES = 4  # largest number of conditions in a figure
 
 def svg(figure: Figure) -> bytes:
     """A figure as SVG without dates and random names, so that equal figures give equal files."""
-    buffer = io.BytesIO()
-    with matplotlib.rc_context({"svg.hashsalt": "etid"}), warnings.catch_warnings():
+    buffer, dpi = io.BytesIO(), figure.dpi
+    with matplotlib.rc_context(SVG), warnings.catch_warnings():
         # The tables show the label as it is.
         warnings.filterwarnings("ignore", "Glyph .* missing from font")
+        # `savefig` would draw a figure twice, the first time for its layout alone.
+        FigureCanvasSVG(figure)
+        if (layout := figure.get_layout_engine()) is not None:
+            layout.execute(figure)
+            figure.set_layout_engine(None)
+        figure.set_dpi(dpi)  # the layout was made with the dots of an SVG
         figure.savefig(buffer, format="svg", metadata={"Date": None})
     return buffer.getvalue()
 

@@ -120,17 +120,19 @@ class SourceImpedance(eqx.Module):
         order = self.order
         pairs = self.log_omega.shape[0]
         omega, zeta = jnp.exp(self.log_omega), jnp.exp(self.log_zeta)
-        A = jnp.zeros((order, order), omega.dtype)
-        i = jnp.arange(pairs) * 2
-        A = A.at[i, i + 1].set(omega).at[i + 1, i].set(-omega)
-        A = A.at[i + 1, i + 1].set(-2 * zeta * omega)
-        rate = jnp.exp(self.log_omega_real)
-        j = jnp.arange(2 * pairs, order)
-        A = A.at[j, j].set(-rate)
-        B = jnp.zeros((order, 1), omega.dtype).at[i + 1, 0].set(omega).at[j, 0].set(rate)
-        C = jnp.zeros(order, omega.dtype).at[i].set(self.gain).at[i + 1].set(self.slope)
-        C = C.at[j].set(self.gain_real)
-        return StateSpace(A, B, C, jnp.exp(self.log_resistance)[None])
+        rate, zero = jnp.exp(self.log_omega_real), jnp.zeros(1, omega.dtype)
+        # The elements of A, and where they are: several changes of a matrix of zeros are slower.
+        values = jnp.concatenate([zero, omega, -omega, -2 * zeta * omega, -rate])
+        place, i, j = np.zeros((order, order), int), np.arange(pairs), np.arange(2 * pairs, order)
+        place[2 * i, 2 * i + 1], place[2 * i + 1, 2 * i] = 1 + i, 1 + pairs + i
+        place[2 * i + 1, 2 * i + 1], place[j, j] = 1 + 2 * pairs + i, 1 + pairs + j
+        A = jnp.take(values, place, mode="clip")
+        none = jnp.zeros_like(omega)
+        B = jnp.concatenate([jnp.stack([none, omega], axis=1).reshape(-1), rate])
+        C = jnp.concatenate(
+            [jnp.stack([self.gain, self.slope], axis=1).reshape(-1), self.gain_real]
+        )
+        return StateSpace(A, B[:, None], C, jnp.exp(self.log_resistance)[None])
 
     def connected(self, load: StateSpace) -> StateSpace:
         """The system V_th → V_out with a load, from current [A] to voltage [V], at the terminal.
@@ -143,7 +145,7 @@ class SourceImpedance(eqx.Module):
         drop = jnp.concatenate([z1.C, z2.C])
         B = jnp.concatenate([z1.B, z2.B]) / total
         n1, n2 = z1.C.shape[0], z2.C.shape[0]
-        A = jnp.block([[z1.A, jnp.zeros((n1, n2))], [jnp.zeros((n2, n1)), z2.A]])
+        A = jnp.concatenate([jnp.pad(z1.A, ((0, 0), (0, n2))), jnp.pad(z2.A, ((0, 0), (n1, 0)))])
         share = z2.D[0] / total
         C = jnp.concatenate([jnp.zeros(n1), z2.C]) - share * drop
         return StateSpace(A - B * drop[None, :], B, C, share[None])

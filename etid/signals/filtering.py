@@ -77,7 +77,8 @@ def simulate(
     observed = jnp.einsum("s,ksr->kr", C, powers)  # C A^k
     impulse = jnp.concatenate([D[None], observed[:-1] @ B])  # h[0] = D, h[k] = C A^{k-1} B
     lag = np.arange(BLOCK)[:, None] - np.arange(BLOCK)[None, :]
-    toeplitz = jnp.where((lag >= 0)[..., None], impulse[np.maximum(lag, 0)], 0.0)
+    impulse = jnp.pad(impulse, ((0, 1), (0, 0)))  # h[BLOCK] stands for h[k] with k < 0
+    toeplitz = jnp.take(impulse, np.where(lag >= 0, lag, BLOCK), axis=0, mode="clip")
     reach = jnp.einsum("ksr,ri->ksi", powers[::-1], B)  # A^{BLOCK-1-k} B
 
     whole = u[: blocks * BLOCK].reshape(blocks, BLOCK, inputs)
@@ -234,7 +235,10 @@ def _expm(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
         return small @ (unit + total) / k, None
 
     def square(total: Float[Array, "n n"], k: Float[Array, ""]) -> tuple[Float[Array, "n n"], None]:
-        return jnp.where(k < squarings, 2 * total + total @ total, total), None
+        def squared(total: Float[Array, "n n"]) -> Float[Array, "n n"]:
+            return 2 * total + total @ total
+
+        return jax.lax.cond(k < squarings, squared, lambda total: total, total), None
 
     orders = jnp.arange(10, 0, -1, dtype=matrix.dtype)
     total, _ = jax.lax.scan(term, jnp.zeros_like(matrix), orders)
@@ -253,15 +257,11 @@ def hold(system: StateSpace, sample_rate: float | Float[Array, ""]) -> StateSpac
         Discrete system. Its inputs are the polynomial coefficients of one interval.
     """
     states = system.A.shape[0]
-    size = states + DEGREE + 1
-    augmented = jnp.zeros((size, size), system.A.dtype)
-    augmented = augmented.at[:states, :states].set(system.A / sample_rate)
-    augmented = augmented.at[:states, states].set(system.B[:, 0] / sample_rate)
-    chain = np.arange(states, size - 1)
-    augmented = augmented.at[chain, chain + 1].set(1.0)
-    exponential = _expm(augmented)
+    both = jnp.concatenate([system.A, system.B], axis=1) / sample_rate
+    chain = jnp.eye(DEGREE + 1, states + DEGREE + 1, k=states + 1, dtype=both.dtype)
+    exponential = _expm(jnp.concatenate([jnp.pad(both, ((0, 0), (0, DEGREE))), chain]))
     factorials = jnp.array([math.factorial(k) for k in range(DEGREE + 1)], system.A.dtype)
-    feedthrough = jnp.zeros(DEGREE + 1, system.A.dtype).at[0].set(system.D[0])
+    feedthrough = jnp.pad(system.D, (0, DEGREE))
     return StateSpace(
         A=exponential[:states, :states],
         B=exponential[:states, states:] * factorials[None, :],

@@ -70,10 +70,10 @@ class Knots:
         return jnp.concatenate([*parts, values[..., -1:]], -1)
 
 
-def _shares(group: _Group, values: Inexact[Array, "*row interval _"]) -> Inexact[Array, "..."]:
-    """Share of the right knot in each harmonic of the intervals."""
-    share = jnp.asarray(np.arange(group.width) / group.width, values.dtype)
-    return jnp.broadcast_to(share, (*values.shape[:-1], group.width))
+def _shares(group: _Group, values: Inexact[Array, "*row interval _"]) -> Inexact[np.ndarray, "..."]:
+    """Share of the right knot in each harmonic of the intervals, with the axes of `values`."""
+    share = np.arange(group.width, dtype=values.dtype) / group.width
+    return share.reshape((1,) * (values.ndim - 1) + share.shape)
 
 
 @functools.lru_cache(maxsize=16)

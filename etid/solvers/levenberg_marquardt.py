@@ -117,14 +117,6 @@ def normal_equations(
     return NormalEquations(0.5 * jnp.dot(r, r), jacobian.T @ r, jacobian.T @ jacobian).finite()
 
 
-def empty(y: Float[Array, " parameter"], args: Any = None) -> NormalEquations:
-    """Normal equations of zeros."""
-    del args
-    return NormalEquations(
-        jnp.zeros((), y.dtype), jnp.zeros_like(y), jnp.zeros((y.size, y.size), y.dtype)
-    )
-
-
 def best_start(
     residual: Callable[[Float[Array, " parameter"]], Float[Array, " sample"]],
     starts: Float[Array, "start parameter"],
@@ -155,7 +147,9 @@ Residual = Callable[[Array, Any], tuple[Array, Any]]
 """A residual function of optimistix: (y, args) to the residual and an auxiliary output."""
 
 
-class _State(eqx.Module):
+class State(eqx.Module):
+    """What a step needs of those before it."""
+
     first_step: Bool[Array, ""]
     y_eval: Float[Array, " parameter"]
     accepted: AbstractNormalEquations
@@ -199,7 +193,6 @@ class LevenbergMarquardt(optx.AbstractLeastSquaresSolver):
         equations: Evaluates the normal equations of `fn(y, args)`. Own equations keep the
             structure of a problem with many parameters.
         second_order: Evaluates Jᵀ r″ of `fn(y, args)`.
-        empty: Returns normal equations of zeros for given parameters and `args`.
     """
 
     rtol: float | Float[Array, ""] = 1e-6  # pyright: ignore[reportIncompatibleVariableOverride]
@@ -216,7 +209,6 @@ class LevenbergMarquardt(optx.AbstractLeastSquaresSolver):
     geodesic: bool = False
     equations: Callable[[Callable, Array, Any], AbstractNormalEquations] = normal_equations
     second_order: Callable[[Callable, Array, Array, Any], Array] = second_order
-    empty: Callable[[Array, Any], AbstractNormalEquations] = empty
 
     def init(
         self,
@@ -227,11 +219,15 @@ class LevenbergMarquardt(optx.AbstractLeastSquaresSolver):
         f_struct: PyTree[jax.ShapeDtypeStruct],
         aux_struct: PyTree[jax.ShapeDtypeStruct],
         tags: frozenset[object],
-    ) -> _State:
-        """An empty state; the first step evaluates `y` itself."""
-        del fn, options, f_struct, aux_struct, tags
-        zero = self.empty(y, args)
-        return _State(
+    ) -> State:
+        """The state before the first step, for normal equations with one matrix."""
+        del fn, args, options, f_struct, aux_struct, tags
+        matrix = jnp.zeros((y.size, y.size), y.dtype)
+        return self.started(y, NormalEquations(jnp.zeros((), y.dtype), jnp.zeros_like(y), matrix))
+
+    def started(self, y: Array, zero: AbstractNormalEquations) -> State:
+        """The state before the first step, which evaluates `y` itself; `zero` is of zeros."""
+        return State(
             first_step=jnp.array(True),
             y_eval=y,
             accepted=zero,
@@ -254,9 +250,9 @@ class LevenbergMarquardt(optx.AbstractLeastSquaresSolver):
         y: Array,
         args: PyTree,
         options: dict[str, Any],
-        state: _State,
+        state: State,
         tags: frozenset[object],
-    ) -> tuple[Array, _State, None]:
+    ) -> tuple[Array, State, None]:
         """Evaluate the trial point, accept or reject it, and propose the next trial point."""
         del options, tags
         trial = self.equations(_value(fn), state.y_eval, args)
@@ -318,7 +314,7 @@ class LevenbergMarquardt(optx.AbstractLeastSquaresSolver):
                 return proposed + jnp.where(small, 0.5 * turned, 0.0)
 
             proposed = jax.lax.cond(terminate, lambda: proposed, bend)
-        state = _State(
+        state = State(
             first_step=jnp.array(False),
             y_eval=y + proposed / safe,
             accepted=accepted,
@@ -337,7 +333,7 @@ class LevenbergMarquardt(optx.AbstractLeastSquaresSolver):
         y: Array,
         args: PyTree,
         options: dict[str, Any],
-        state: _State,
+        state: State,
         tags: frozenset[object],
     ) -> tuple[Bool[Array, ""], optx.RESULTS]:
         """Whether to stop, and the verdict so far."""
@@ -351,7 +347,7 @@ class LevenbergMarquardt(optx.AbstractLeastSquaresSolver):
         aux: Any,
         args: PyTree,
         options: dict[str, Any],
-        state: _State,
+        state: State,
         tags: frozenset[object],
         result: optx.RESULTS,
     ) -> tuple[Array, Any, dict[str, Any]]:

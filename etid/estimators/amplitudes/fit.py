@@ -15,6 +15,7 @@ from etid.estimators.estimate import MAX_STEPS, SOLVER, Estimate
 from etid.results.fit import complex_rrse
 from etid.signals.harmonics import real_parts
 from etid.signals.transfer import as_complex
+from etid.solvers.least_squares import least_squares
 from etid.solvers.levenberg_marquardt import LevenbergMarquardt, NormalEquations, best_start
 
 
@@ -46,9 +47,7 @@ def fit_amplitudes(of: Amplitudes) -> Estimate:
     def refined(
         of: Amplitudes, start: Float[Array, " q"], solver: LevenbergMarquardt
     ) -> optx.Solution:
-        return optx.least_squares(
-            lambda q, of: of(q), solver, start, args=of, max_steps=MAX_STEPS, throw=False
-        )
+        return least_squares(lambda q, of: of(q), solver, start, of, MAX_STEPS)
 
     alone = likeliest(of)
     of = of.weighted(alone)

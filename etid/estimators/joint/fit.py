@@ -26,6 +26,7 @@ from etid.estimators.maximum_likelihood.load_fit import SLIGHT
 from etid.estimators.unknowns import LoadUnknowns, LoadWithCurrentUnknowns
 from etid.signals.harmonics import Spectrum
 from etid.solvers.arrowhead import Arrowhead, ArrowheadEquations, join
+from etid.solvers.least_squares import least_squares
 from etid.solvers.levenberg_marquardt import (
     DIFFERENCE,
     LevenbergMarquardt,
@@ -82,12 +83,6 @@ def _with_room(found: NormalEquations, own: int, room: int) -> NormalEquations:
     at = np.full(room - own, own)
     matrix = jnp.insert(jnp.insert(found.matrix, at, 0.0, axis=0), at, 0.0, axis=1)
     return NormalEquations(found.objective, jnp.insert(found.gradient, at, 0.0), matrix)
-
-
-def _empty(y: Float[Array, " parameter"], study: DriverStudy) -> ArrowheadEquations:
-    """Normal equations of the same shapes with zeros."""
-    shapes = jax.eval_shape(lambda: _equations(None, y, study))
-    return jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
 
 
 def _second_order(
@@ -157,15 +152,13 @@ def fit_together(
         geodesic=True,
         equations=_equations,
         second_order=_second_order,
-        empty=_empty,
     )
-    solution = optx.least_squares(
+    solution = least_squares(
         lambda y, _: y,  # not evaluated: the solver takes the equations
         solver,
         approached(study, study.start(), inner),
         study,
-        max_steps=MAX_STEPS,
-        throw=False,
+        MAX_STEPS,
     )
     common, parts = study.split(solution.value)
     # The loads that take no part are fitted now, with the final Z_th.

@@ -21,7 +21,6 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import optimistix as optx
 from jaxtyping import Array, Bool, Complex, Float, Int
 
 from etid.estimators.estimate import MAX_STEPS
@@ -37,6 +36,7 @@ from etid.estimators.maximum_likelihood.terms import (
 from etid.signals.knots import Knots, knots
 from etid.signals.transfer import as_complex, reciprocal
 from etid.solvers.arrowhead import join
+from etid.solvers.least_squares import least_squares
 from etid.solvers.levenberg_marquardt import DIFFERENCE, LevenbergMarquardt, NormalEquations
 from etid.solvers.matrices import inverse_root
 
@@ -313,13 +313,12 @@ def _next(
         [knots(g.spectrum.x.shape[-1], DENSE).at(g.frequency[0]) for g in study.groups],
         [known, *(part for part, _ in groups)],
     )
-    solution = optx.least_squares(
+    solution = least_squares(
         lambda y, _: y,  # not evaluated: the solver takes the equations
         solver,
         common,
         near,
-        max_steps=MAX_STEPS,
-        throw=False,
+        MAX_STEPS,
     )
     changes, own = near.changes(solution.value)[1:], []
     for (part, root), change, before in zip(groups, changes, parts, strict=True):

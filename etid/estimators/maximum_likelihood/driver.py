@@ -43,6 +43,7 @@ from etid.results.driver import Calibration, HarmonicDriver, SourceImpedance
 from etid.results.fit import complex_rrse
 from etid.signals.harmonics import Spectrum
 from etid.signals.transfer import as_complex, frequency_variable, reciprocal
+from etid.solvers.least_squares import least_squares
 from etid.solvers.levenberg_marquardt import (
     DIFFERENCE,
     LevenbergMarquardt,
@@ -79,13 +80,8 @@ def refined(
     model: "Calibrations", start: Float[Array, " common"], solver: LevenbergMarquardt
 ) -> optx.Solution:
     """The minimum of the likelihood."""
-    return optx.least_squares(
-        lambda q, model: model.terms(q, model.records),
-        solver,
-        start,
-        model,
-        max_steps=MAX_STEPS,
-        throw=False,
+    return least_squares(
+        lambda q, model: model.terms(q, model.records), solver, start, model, MAX_STEPS
     )
 
 

@@ -8,7 +8,6 @@ import dataclasses
 import math
 from typing import NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import optimistix as optx
@@ -26,6 +25,7 @@ from etid.estimators.unknowns import LoadUnknowns
 from etid.results.fit import Support
 from etid.signals.harmonics import Spectrum, signal_share
 from etid.signals.transfer import as_complex, power
+from etid.solvers.least_squares import least_squares
 from etid.solvers.levenberg_marquardt import LevenbergMarquardt, NormalEquations
 from etid.solvers.matrices import inverse_root
 
@@ -62,12 +62,6 @@ class _Evaluated(NormalEquations):
         of = _with_priors(found, q, load)
         return cls(of.objective, of.gradient, of.matrix, near)
 
-    @classmethod
-    def empty(cls, q: Float[Array, " q"], load: Load) -> "_Evaluated":
-        """Zeros of the same shapes."""
-        shapes = eqx.filter_eval_shape(lambda q: cls.at(None, q, load), q)
-        return jax.tree.map(lambda of: jnp.zeros(of.shape, of.dtype), shapes)
-
 
 # Largest change of W, which is uncertain by 0.1 at 40 dB. At 24 dB one fit of 30 exceeds it. Two of
 # 200 fits were wrong by five standard errors; both exceed it.
@@ -94,9 +88,7 @@ def refined(
     The default is looked up here, so that a test of derivatives can ask for more digits.
     """
     with_solver = solver or WELL
-    return optx.least_squares(
-        lambda q, load: load(q), with_solver, start, args=load, max_steps=MAX_STEPS, throw=False
-    )
+    return least_squares(lambda q, load: load(q), with_solver, start, load, MAX_STEPS)
 
 
 def _chosen(load: Load, starts: Float[Array, "start q"]) -> Float[Array, " q"]:
@@ -198,7 +190,6 @@ def fit_circuit(
         well,
         rtol=BEFORE / SETTLED * well.rtol,
         equations=_Evaluated.at,
-        empty=_Evaluated.empty,
     )
     solution = refined(load, _near(load, start, well), whole)
     q, last = solution.value, solution.stats["normal_equations"]

@@ -15,6 +15,8 @@ delay of 10 ns changes C_p by 3 %. The record of a skin does show τ, through th
 
 import dataclasses
 import math
+from collections.abc import Callable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -38,11 +40,11 @@ from etid.estimators.output_error.prediction import (
     IMPULSE,
     Change,
     Records,
-    impulse_response,
     late_calibration,
     loaded_filter,
     measured,
     predict,
+    residual_and_response,
     scaled,
     scaled_back,
     scaled_residual,
@@ -57,10 +59,11 @@ from etid.results.feed import CurrentSource, MeasuredCurrent
 from etid.results.fit import CHANGES, Support, rrse
 from etid.signals.filtering import CUTOFF, StateSpace
 from etid.signals.transfer import Rational
+from etid.solvers.least_squares import least_squares
 from etid.solvers.levenberg_marquardt import best_start
 from etid.solvers.matrices import inverse
 
-PASSES = 3  # passes of the fit of a skin
+PASSES = 3  # passes of the fit of a skin, and of that of a voltage
 
 
 def fit_source(
@@ -85,8 +88,8 @@ def fit_source(
     def one(
         record: Records,
         r: Float[Array, ""],
-        parameters: Float[Array, " parameter"],
         nuisance: Nuisance,
+        parameters: Float[Array, " parameter"],
     ) -> Float[Array, " interval"]:
         return scaled_residual(record, unflatten(parameters), resistor(r).rational(), nuisance)
 
@@ -94,14 +97,16 @@ def fit_source(
 
     q0, named = ravel_pytree((start_vector, jnp.zeros((count, start.order + 2))))
 
-    def residual(q: Float[Array, " q"], _) -> Float[Array, " term"]:
-        parameters, vectors = named(q)
+    def residual(q: Float[Array, " q"], of: Any) -> Float[Array, " term"]:
+        (records, r_load, regularise), (parameters, vectors) = of, named(q)
         nuisance = Nuisance.of(vectors)
-        parts = jax.vmap(one, in_axes=(0, 0, None, 0))(records, r_load, parameters, nuisance)
+        parts = _each(
+            lambda record, r, late: one(record, r, late, parameters), records, r_load, nuisance
+        )
         late = nuisance.delay_samples / DELAY_WIDTH
         return jnp.concatenate([parts.reshape(-1), regularise(parameters), late])
 
-    solution = optx.least_squares(residual, SOLVER, q0, max_steps=MAX_STEPS, throw=False)
+    solution = least_squares(residual, SOLVER, q0, (records, r_load, regularise), MAX_STEPS)
     parameters, vectors = named(solution.value)
     nuisance, source = Nuisance.of(vectors), unflatten(parameters)
     weak = jax.jacfwd(regularise)(parameters)
@@ -121,23 +126,19 @@ def fit_source(
         open_delay = dataclasses.replace(nothing, delay_samples=jnp.asarray(1 / DELAY_WIDTH**2))
         precision, _ = ravel_pytree((jnp.zeros_like(parameters), jnp.zeros(()), open_delay))
 
-        def residual(p: Float[Array, " p"]) -> Float[Array, " interval"]:
+        def both(p: Float[Array, " p"]) -> tuple[Float[Array, " interval"], Float[Array, " lag"]]:
             parameters, log_r, nuisance = named(p)
-            return one(record, r * jnp.exp(log_r), parameters, nuisance)
-
-        def response(p: Float[Array, " p"]) -> Float[Array, " lag"]:
-            parameters, log_r, _ = named(p)
             load = resistor(r * jnp.exp(log_r)).rational()
-            return impulse_response(loaded_filter(unflatten(parameters), load, record.sample_rate))
+            return residual_and_response(record, unflatten(parameters), load, nuisance)
 
-        value, slope = jax.jvp(residual, (at,), (towards,))
-        return curvature(record, slopes(residual, response, at), precision), jnp.vdot(slope, value)
+        found = slopes(both, at)
+        return curvature(record, found, precision), found.residual @ (found.jacobian @ towards)
 
     def error(record: Records, r: Float[Array, ""], nuisance: Nuisance) -> Float[Array, ""]:
         system = loaded_filter(source, resistor(r).rational(), record.sample_rate)
         return rrse(predict(system, record, nuisance), measured(record, nuisance.delay_samples))
 
-    parts, by_resistor = jax.vmap(at_minimum)(records, r_load, nuisance)
+    parts, by_resistor = _each(at_minimum, records, r_load, nuisance)
     parts = jax.vmap(lambda part: part.eliminate(kept + 1))(parts)
     whole = Curvature(
         _arrow(parts.expected, weak.T @ weak), _arrow(parts.score, jnp.zeros((kept, kept)))
@@ -157,7 +158,7 @@ def fit_source(
         cov=cov,
         shared_cov=jnp.zeros_like(cov),
         chi2=chi2,
-        rrse=jax.vmap(error)(records, r_load, nuisance).max(),
+        rrse=_each(error, records, r_load, nuisance).max(),
         result=solution.result,
         steps=solution.stats["num_steps"],
     )
@@ -166,6 +167,14 @@ def fit_source(
         estimate,
         Calibration(r_load, nuisance.delay_samples, delay_std(r_load), mismatch),
     )
+
+
+def _each(evaluate: Callable[..., Any], *records: Any) -> Any:
+    """`jax.vmap`; a single record is no batch, because conditions of a batch compute both cases."""
+    if jax.tree.leaves(records)[0].shape[0] > 1:
+        return jax.vmap(evaluate)(*records)
+    found = evaluate(*jax.tree.map(lambda leaf: leaf[0], records))
+    return jax.tree.map(lambda leaf: leaf[None], found)
 
 
 def _arrow(
@@ -274,16 +283,12 @@ def fit_circuit(
         (log_elements, late_samples, source_vector, scaled(nuisance, scale))
     )
 
-    def of_all(p: Float[Array, " p"]) -> Float[Array, " interval"]:
+    def of_all(p: Float[Array, " p"]) -> tuple[Float[Array, " interval"], Float[Array, " lag"]]:
         log_elements, late_samples, vector, nuisance = named_all(p)
         nuisance = scaled_back(nuisance, scale)
         change = jax.tree.map(lambda leaf: late_samples * leaf, late)
-        return scaled_residual(records, unflatten(vector), load(log_elements), nuisance, change)
-
-    def response(p: Float[Array, " p"]) -> Float[Array, " lag"]:
-        log_elements, late_samples, vector, _ = named_all(p)
-        system = loaded_filter(unflatten(vector), load(log_elements), records.sample_rate)
-        return impulse_response(system) + late_samples * late.h
+        behind, circuit = unflatten(vector), load(log_elements)
+        return residual_and_response(records, behind, circuit, nuisance, change)
 
     of_state = jnp.zeros_like(nuisance.state) if scale is None else scale.known
     open_delay = Nuisance(of_state, zero, jnp.asarray(1 / DELAY_WIDTH**2))
@@ -293,7 +298,7 @@ def fit_circuit(
     precision, _ = ravel_pytree(priors)
     centre = free if element_prior is None else element_prior.centre
     rest = precision * (at - jnp.pad(centre, (0, at.size - kept)))
-    derivatives = slopes(of_all, response, at)
+    derivatives = slopes(of_all, at)
     full = curvature(records, derivatives, precision).eliminate(both)
     change = relaxed(records, source, fitted.impedance(), nuisance)
     behind_current = isinstance(source, CurrentSource)
@@ -371,9 +376,11 @@ def fitted_voltage(
     # The residual is linear except in the delay, which is a small fraction of a sample, and in the
     # state in `late`. `late` uses the state of the previous step: with a free state that decays
     # within a sample, times the delay of the calibration, the first sample could be any voltage.
-    late = jnp.zeros_like(records.v_out[:, 0])
-    for _ in range(3):
+    def again(_: Any, state: tuple[Array, Array]) -> tuple[Array, Array]:
+        q, _ = state
         late = late_calibration(records, source, load, r_load, named(q)[0].state).v_out
         basis = jax.jacfwd(residual)(q, late)
-        q = q - jnp.linalg.lstsq(basis, residual(q, late))[0]
+        return q - jnp.linalg.lstsq(basis, residual(q, late))[0], late
+
+    q, late = jax.lax.fori_loop(0, PASSES, again, (q, jnp.zeros_like(records.v_out[:, 0])))
     return residual(q, late) + records.v_out[:, 0]

@@ -46,12 +46,19 @@ class Slopes(eqx.Module):
 
 
 def slopes(
-    residual: Callable[[Float[Array, " n"]], Float[Array, " interval"]],
-    response: Callable[[Float[Array, " n"]], Float[Array, " lag"]],
+    evaluate: Callable[
+        [Float[Array, " n"]], tuple[Float[Array, " interval"], Float[Array, " lag"]]
+    ],
     q: Float[Array, " n"],
 ) -> Slopes:
     """Evaluate a scaled residual, an impulse response, and their Jacobians at q."""
-    return Slopes(residual(q), jax.jacfwd(residual)(q), response(q), jax.jacfwd(response)(q))
+
+    def twice(q: Float[Array, " n"]) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
+        both = evaluate(q)
+        return both, both
+
+    (jacobian, slope), (residual, h) = jax.jacfwd(twice, has_aux=True)(q)
+    return Slopes(residual, jacobian, h, slope)
 
 
 def padded_size(rows: int) -> int:

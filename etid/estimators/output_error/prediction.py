@@ -198,12 +198,23 @@ def scaled_residual(
     change: Change | None = None,
 ) -> Float[Array, " interval"]:
     """(Predicted − measured) / √s; `change` is added to the prediction."""
+    return residual_and_response(records, source, load, nuisance, change)[0]
+
+
+def residual_and_response(
+    records: Records,
+    source: SourceImpedance | CurrentSource,
+    load: Rational | StateSpace,
+    nuisance: Nuisance,
+    change: Change | None = None,
+) -> tuple[Float[Array, " interval"], Float[Array, " lag"]]:
+    """`scaled_residual` and the impulse response."""
     system = loaded_filter(source, load, records.sample_rate)
     predicted, h = predict(system, records, nuisance), impulse_response(system)
     if change is not None:
         predicted, h = predicted + change.v_out, h + change.h
     scale = records.used / jnp.sqrt(residual_variance(records, h))
-    return (predicted - measured(records, nuisance.delay_samples)) * scale
+    return (predicted - measured(records, nuisance.delay_samples)) * scale, h
 
 
 def late_calibration(
