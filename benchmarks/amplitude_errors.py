@@ -17,7 +17,7 @@ from scipy.special import erf
 from scipy.stats import binom, chi2
 
 import etid
-from benchmarks.timing import pin
+from benchmarks.runner import option
 
 SLOWER = 8
 PULSE_RATE, SAMPLE_RATE, SAMPLES = 60.0, 20e3, 1000  # Hz, Hz; three periods
@@ -165,14 +165,12 @@ def _parts(signals: np.ndarray) -> np.ndarray:
     return np.concatenate([of.real, of.imag])
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """How many fits."""
-    parser.add_argument("--draws", type=int, default=200, help="of each scene")
+PINNED = True
+OPTIONS = (option("--draws", default=200, help="of each scene"),)
 
 
 def main(arguments: argparse.Namespace) -> bool:
     """Print the table; whether every interval and error is right."""
-    pin()
     met = True
     for amplitudes, snr_db in SCENES:
         found = draws(amplitudes, snr_db, arguments.draws)

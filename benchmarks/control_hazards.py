@@ -22,8 +22,9 @@ from tqdm import tqdm
 
 import etid
 from benchmarks.control_display import OLDER, Display, Load
-from etid.simulation.published import REFERENCE, TYPICAL
-from etid.simulation.scenes import Scene, Trial
+from benchmarks.ladder import TWO
+from etid.simulation.published import TYPICAL
+from etid.simulation.scenes import Scene
 from etid.simulation.transformer import OpenLoad, ResistorLoad, SkinLoad
 
 CAP = 120e-9  # [C]
@@ -182,9 +183,7 @@ class Hazards:
     """
 
     def __init__(self, snr: float, seed: int, samples: int = 40_000) -> None:
-        resistors = enumerate((REFERENCE, 21.62e3))
-        calibration = tuple(Trial(f"calibration/{i}", ResistorLoad(r)) for i, r in resistors)
-        scene = Scene((), calibration, samples=samples, snr_db=snr, trigger_jitter_rms=100e-9)
+        scene = Scene((), TWO, samples=samples, snr_db=snr, trigger_jitter_rms=100e-9)
         self.records = list(scene.simulate(seed=seed).calibrations.recordings())
         self.driver = etid.identify_driver(self.records)
         self.rng = np.random.default_rng(seed)

@@ -21,6 +21,7 @@ from benchmarks import charts, peers, scale
 from benchmarks.large_file import large_file
 from benchmarks.problem import START, Problem, harmonics, problem, problem_of, terms
 from benchmarks.provenance import write_csv
+from benchmarks.runner import QUICK, option
 from benchmarks.timing import first_and_warm, pin
 from etid.estimators.maximum_likelihood.load_fit import WELL
 from etid.signals.filtering import lfilter
@@ -195,12 +196,7 @@ def run(quick: bool, folder: pathlib.Path) -> None:
     draw(table, folder / "curves.svg")
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Size of the run."""
-    parser.add_argument("--quick", action="store_true", help="small numbers only")
-    parser.add_argument(
-        "--folder", type=pathlib.Path, default=pathlib.Path(), help="of curves.csv and curves.svg"
-    )
+OPTIONS = (QUICK, option("--folder", default=pathlib.Path(), type=pathlib.Path))
 
 
 def main(arguments: argparse.Namespace) -> bool:

@@ -64,6 +64,11 @@ class Cell:
     circuit: AbstractCircuit | None = None
 
     @property
+    def place(self) -> dict[str, str]:
+        """Its labels, as tables have them."""
+        return {"map": self.chart, "row": self.row, "column": self.column}
+
+    @property
     def shape(self) -> tuple[float, ...]:
         """What determines the programs that are compiled for it."""
         return self.scene.samples, self.scene.sample_rate, self.order

@@ -21,10 +21,11 @@ import time
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
-from benchmarks.failure_counts import clopper_pearson
 from benchmarks.mutant_tests import Runner
 from benchmarks.mutants import Mutant, drawn, mutants
 from benchmarks.provenance import ROOT, write_csv
+from benchmarks.rates import clopper_pearson
+from benchmarks.runner import option
 
 TARGET = 0.1  # part of the mutants that may survive
 COPIED = (
@@ -192,15 +193,13 @@ def show(rows: Sequence[Mapping[str, Any]]) -> float:
     return share
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Size of the run."""
-    parser.add_argument("--mutants", type=int, default=40, help="how many to draw")
-    parser.add_argument("--modules", nargs="+", choices=TESTS, default=list(TESTS))
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--limit", type=float, default=LIMIT, help="time of a mutant [s]")
-    parser.add_argument(
-        "--output", type=pathlib.Path, default=pathlib.Path("mutation.jsonl"), help="what is done"
-    )
+OPTIONS = (
+    option("--mutants", default=40, help="how many to draw"),
+    option("--modules", nargs="+", choices=TESTS, default=list(TESTS), type=str),
+    option("--seed", default=0),
+    option("--limit", default=LIMIT, help="time of a mutant [s]"),
+    option("--output", default=pathlib.Path("mutation.jsonl"), type=pathlib.Path),
+)
 
 
 def main(arguments: argparse.Namespace) -> bool:

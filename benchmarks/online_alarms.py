@@ -20,9 +20,9 @@ from jaxtyping import Float
 from tqdm import tqdm
 
 import etid
-from etid.simulation.published import REFERENCE, TYPICAL
+from benchmarks.ladder import TWO
+from etid.simulation.published import TYPICAL
 from etid.simulation.scenes import Scene, Trial
-from etid.simulation.transformer import ResistorLoad
 
 LOADS = tuple(TYPICAL.values())
 JITTER = 50e-9  # [s]
@@ -70,9 +70,7 @@ class Fingertip:
     """
 
     def __init__(self, electrodes: int, snr_db: float) -> None:
-        resistors = enumerate((REFERENCE, 21.62e3))
-        calibration = tuple(Trial(f"calibration/{i}", ResistorLoad(r)) for i, r in resistors)
-        noisy = Scene((), calibration, snr_db=snr_db, trigger_jitter_rms=JITTER, samples=UNLOADED)
+        noisy = Scene((), TWO, snr_db=snr_db, trigger_jitter_rms=JITTER, samples=UNLOADED)
         calibrations = list(noisy.simulate(seed=0).calibrations.recordings())
         driver = etid.identify_driver(calibrations)
         self.tracker = etid.Tracker.of(driver, calibrations[0], electrodes=electrodes)
@@ -113,7 +111,7 @@ def alarms(electrodes: int, snr_db: float, hours: float) -> Alarms:
     hourly = 3600 * tracker.model.bands.sample_rate / tracker.period
     pulses = SETTLING + int(np.ceil(hours * hourly / electrodes))
     state, false, driver, settled = tracker.start(), 0, 0, None
-    for number, v_out in enumerate(tqdm(display.pulses(loads, pulses), total=pulses)):
+    for number, v_out in enumerate(tqdm(display.pulses(loads, pulses), total=pulses, disable=None)):
         state = tracker.update(state, v_out)
         if number < SETTLING:
             settled = state

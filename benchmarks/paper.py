@@ -23,6 +23,7 @@ from benchmarks import paper_figures, paper_tables
 from benchmarks.ladder import SOURCES
 from benchmarks.paper_tables import Groups, Row
 from benchmarks.provenance import write_csv
+from benchmarks.runner import QUICK, option
 from etid.paper.tables import LABORATORIES as ENDS
 from etid.paper.tables import METHODS, Outcome, identify
 from etid.report.html import Section
@@ -160,11 +161,11 @@ def cause(fourth: Sequence[Row]) -> str:
     )
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Where the waveforms come from, where the tables go, size of the run."""
-    parser.add_argument("--source", choices=SOURCES, default="simulated")
-    parser.add_argument("--folder", type=pathlib.Path, default=pathlib.Path("results/paper"))
-    parser.add_argument("--quick", action="store_true", help="one study with few trials")
+OPTIONS = (
+    QUICK,
+    option("--source", default="simulated", choices=SOURCES),
+    option("--folder", default=pathlib.Path("results/paper"), type=pathlib.Path),
+)
 
 
 def main(arguments: argparse.Namespace) -> bool:

@@ -25,6 +25,7 @@ import numpy as np
 
 from benchmarks.large_file import LAYOUTS, large_file
 from benchmarks.provenance import ROOT, write_csv
+from benchmarks.runner import QUICK, option
 from benchmarks.timing import cores
 from etid.estimators.registry import names
 from etid.identify import file as streaming
@@ -247,19 +248,14 @@ def _targets(table: Sequence[dict[str, Any]]) -> Iterable[tuple[str, bool]]:
     yield f"peak memory {most:.0f} MB <= {MEMORY / 1e6:.0f}", most <= MEMORY / 1e6
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Size of the file, and how it is fitted."""
-    parser.add_argument("--quick", action="store_true", help="400 recordings, the fastest method")
-    parser.add_argument("--recordings", type=int, default=100_000)
-    parser.add_argument("--folder", type=pathlib.Path, default=FILES, help="of the files it makes")
-    parser.add_argument(
-        "--method",
-        nargs="+",
-        choices=("default", *names()),
-        default=["default", "equation_error"],
-        help="the last is run in all layouts, and killed",
-    )
-    parser.add_argument("-o", "--output", type=pathlib.Path, default=None, help="CSV to write")
+OPTIONS = (
+    QUICK,
+    option("--recordings", default=100_000),
+    option("--folder", default=FILES, type=pathlib.Path, help="of the files it makes"),
+    option("--method", nargs="+", type=str, choices=("default", *names()),
+           default=["default", "equation_error"], help="the last: in all layouts, and killed"),
+    option("-o", "--output", type=pathlib.Path, help="CSV to write"),
+)  # fmt: skip
 
 
 def main(arguments: argparse.Namespace) -> bool:

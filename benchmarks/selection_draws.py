@@ -83,6 +83,16 @@ class Drawn:
         """The chosen circuit."""
         return type(self.selection.fit.circuit)
 
+    @property
+    def is_right(self) -> bool:
+        """Whether the true circuit was chosen."""
+        return self.chosen is type(TRUTHS[self.truth])
+
+    @property
+    def is_richer(self) -> bool:
+        """Whether a circuit with more elements than the truth was chosen."""
+        return len(self.chosen.names()) > len(TRUTHS[self.truth].names())
+
 
 def scene(snr_db: float, driver: int) -> Scene:
     """A calibration and one recording of each truth behind a driver of its own."""

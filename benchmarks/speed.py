@@ -22,7 +22,8 @@ from benchmarks import online, peers
 from benchmarks.peers import A, B
 from benchmarks.problem import LOAD, SAMPLES, Problem, harmonics, problem
 from benchmarks.provenance import write_csv
-from benchmarks.timing import first_and_warm, import_time, interpreter, pin
+from benchmarks.runner import QUICK, option
+from benchmarks.timing import first_and_warm, import_time, interpreter
 from etid.estimators.steiglitz_mcbride.iteration import ITERATIONS
 from etid.signals.filtering import lfilter
 from etid.signals.noise import noise_std
@@ -274,16 +275,20 @@ def run(quick: bool, asked: Sequence[int], output: pathlib.Path | None) -> bool:
     return all(line.met for line in lines)
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Size of the run."""
-    parser.add_argument("--quick", action="store_true", help="few lanes, few repetitions")
-    parser.add_argument(
-        "--lanes", type=int, nargs="+", default=[], help="of the table of peers; no cell left out"
-    )
-    parser.add_argument("-o", "--output", type=pathlib.Path, help="CSV of that table")
+PINNED = True
+OPTIONS = (
+    QUICK,
+    option(
+        "--lanes",
+        nargs="+",
+        type=int,
+        default=[],
+        help="of the table of peers",
+    ),
+    option("-o", "--output", type=pathlib.Path, help="CSV of that table"),
+)
 
 
 def main(arguments: argparse.Namespace) -> bool:
     """Run the command; whether every target is met."""
-    pin()
     return run(arguments.quick, arguments.lanes, arguments.output)

@@ -14,6 +14,7 @@ import jax
 import numpy as np
 
 import etid
+from benchmarks.runner import option
 from etid.estimators.registry import names
 
 REPEATS = 7
@@ -97,9 +98,7 @@ def run(lanes: int) -> None:
         print(f"  batch of {lanes:<21} first {first:8.2f} s   warm {each:.1f} ms per fit")
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Lanes of the batch."""
-    parser.add_argument("--lanes", type=int, default=98)
+OPTIONS = (option("--lanes", default=98),)
 
 
 def main(arguments: argparse.Namespace) -> bool:
