@@ -19,11 +19,11 @@ Rows = Sequence[Mapping[str, Any]]
 
 def _panel(axes: Axes, rows: Rows, down: list[str], across: list[str], title: str) -> None:
     """One method: failures in grey and in numbers, silent ones with a mark; or the bounds."""
-    shades = np.full((len(down), len(across)), np.nan)
+    shades = np.full((len(down), len(across)), 0.0 if title == BOUND else np.nan)
     for row in rows:
         i, j = down.index(row["row"]), across.index(row["column"])
         if title == BOUND:
-            shades[i, j], texts = 0.0, [(0.0, f"{100 * row['largest_bound']:.2g}", 7, "normal")]
+            texts = [(0.0, f"{100 * row['largest_bound']:.2g}", 7, "normal")]
         else:
             shades[i, j] = failed = row["wrong"] + row["refused"]
             silent = row["silent"] > 0
