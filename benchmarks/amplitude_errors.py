@@ -37,17 +37,11 @@ CHANCE = 1e-3
 
 
 class Draws(NamedTuple):
-    """Fits of one skin with different noise; one row for each, errors relative to the truth.
+    """Fits of one skin with different noise; one row for each, errors relative to the truth."""
 
-    Attributes:
-        successful: Number of fits with that verdict.
-        error: Errors of the elements.
-        stderr: Their standard errors, as the fits state them.
-    """
-
-    successful: int
-    error: np.ndarray
-    stderr: np.ndarray
+    successful: int  # number of fits with that verdict
+    error: np.ndarray  # errors of the elements
+    stderr: np.ndarray  # their standard errors, as the fits state them
 
     @property
     def right(self) -> np.ndarray:

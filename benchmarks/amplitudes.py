@@ -44,19 +44,13 @@ REPEATS = 7
 
 
 class Case(NamedTuple):
-    """One skin with its feed.
+    """One skin with its feed."""
 
-    Attributes:
-        name: As the table shows it.
-        skin: The skin.
-        v_th: Fourier coefficients of V_th from c₀ on [V]; None under a current source.
-        samples: Number of samples of a period.
-    """
-
-    name: str
-    skin: etid.SkinCurrent
+    name: str  # as the table shows it
+    skin: etid.SkinCurrent  # the skin
+    # fourier coefficients of V_th from c₀ on [V]; None under a current source
     v_th: np.ndarray | None
-    samples: int
+    samples: int  # number of samples of a period
 
     @property
     def t(self) -> np.ndarray:
@@ -153,12 +147,7 @@ def reference(case: Case) -> np.ndarray:
 def balanced(
     case: Case, finer: int
 ) -> Callable[[Float[Array, " element"]], Float[Array, " sample"]]:
-    """The same by harmonic balance, as a function of the logarithms of the elements.
-
-    Args:
-        case: Skin and feed.
-        finer: Points per sample.
-    """
+    """The same by harmonic balance, as a function of the logarithms of the elements."""
     points = finer * case.samples
     t = np.arange(points) / points / PULSE_RATE
     frequency = jnp.arange(points // 2 + 1.0).at[0].set(1e-6) * PULSE_RATE

@@ -126,12 +126,7 @@ def hazards(arguments: argparse.Namespace) -> bool:
 
 
 class Fingertip:
-    """The skin at each electrode and pulse.
-
-    Args:
-        electrodes: Number of electrodes.
-        pulses: Number of pulses.
-    """
+    """The skin at each electrode and pulse."""
 
     def __init__(self, electrodes: int, pulses: int) -> None:
         rng = np.random.default_rng(0)
@@ -168,19 +163,12 @@ class Fingertip:
 
 
 class Run(NamedTuple):
-    """What a controller has delivered; all are (pulse, electrode).
+    """What a controller has delivered; all are (pulse, electrode)."""
 
-    Attributes:
-        charge: Charge in the phase [C].
-        peak: Largest current [A].
-        fallback: Whether the amplitude was the fallback.
-        allowed: Probability that noise alone misses the target.
-    """
-
-    charge: np.ndarray
-    peak: np.ndarray
-    fallback: np.ndarray
-    allowed: np.ndarray
+    charge: np.ndarray  # charge in the phase [C]
+    peak: np.ndarray  # largest current [A]
+    fallback: np.ndarray  # whether the amplitude was the fallback
+    allowed: np.ndarray  # probability that noise alone misses the target
 
     def errors(self, counts: np.ndarray) -> np.ndarray:
         """Relative errors of the charge of the pulses that count."""

@@ -68,15 +68,7 @@ def _held(values: np.ndarray, new: Bool[np.ndarray, "pulse lane"]) -> np.ndarray
 
 
 class Cell:
-    """What happens to the electrodes of a cell, and what becomes of their records.
-
-    Args:
-        name: One of `CELLS`.
-        rng: Random numbers.
-        pulses: Number of pulses.
-        lanes: Number of electrodes.
-        kinds: Number of loads.
-    """
+    """What happens to the electrodes of a cell, and what becomes of their records."""
 
     def __init__(
         self, name: str, rng: np.random.Generator, pulses: int, lanes: int, kinds: int
@@ -147,21 +139,14 @@ class Cell:
 
 @dataclasses.dataclass(frozen=True)
 class Given:
-    """What the electrodes of a cell were given (pulse, lane).
+    """What the electrodes of a cell were given (pulse, lane)."""
 
-    Attributes:
-        charge: Charge [C].
-        before: Charge of the same pulse with the load of the pulse before [C].
-        earlier: The same with the load one more pulse before [C].
-        worst: Largest charge that the command stated [C].
-        reason: What determined the amplitude.
-    """
-
-    charge: Float[np.ndarray, "pulse lane"]
+    charge: Float[np.ndarray, "pulse lane"]  # charge [C]
+    # charge of the same pulse with the load of the pulse before [C]
     before: Float[np.ndarray, "pulse lane"]
-    earlier: Float[np.ndarray, "pulse lane"]
-    worst: Float[np.ndarray, "pulse lane"]
-    reason: np.ndarray
+    earlier: Float[np.ndarray, "pulse lane"]  # the same with the load one more pulse before [C]
+    worst: Float[np.ndarray, "pulse lane"]  # largest charge that the command stated [C]
+    reason: np.ndarray  # what determined the amplitude
 
     def above(self) -> Bool[np.ndarray, "pulse lane"]:
         """Whether the charge exceeds the cap."""

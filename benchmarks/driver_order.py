@@ -51,17 +51,11 @@ OPTIONS = (
 
 
 class Draw(NamedTuple):
-    """The fits behind one driver of a drawn scene.
+    """The fits behind one driver of a drawn scene."""
 
-    Attributes:
-        order: Poles of this driver.
-        error: Errors of the elements in units of their bounds.
-        z: The same in units of the standard errors.
-    """
-
-    order: int
-    error: Float[np.ndarray, "trial element"]
-    z: Float[np.ndarray, "trial element"]
+    order: int  # poles of this driver
+    error: Float[np.ndarray, "trial element"]  # errors of the elements in units of their bounds
+    z: Float[np.ndarray, "trial element"]  # the same in units of the standard errors
 
 
 def draw(seed: int, snr_db: float, orders: Sequence[Order], samples: int) -> dict[Order, Draw]:

@@ -39,37 +39,22 @@ Elements = Float[np.ndarray, " element"]
 
 @dataclasses.dataclass(frozen=True)
 class Answer:
-    """One method's answer to one recording; arrays are (element,), relative to the true elements.
+    """A method's answer to one recording; arrays are (element,), relative to the true elements."""
 
-    Attributes:
-        method: Its name, or `default`.
-        seed: Of the scene or number of the driver; answers of one seed share a driver.
-        path: Of the trial.
-        verdict: Name of the verdict.
-        error: Estimate / truth − 1; NaN without an answer, or where there is no truth.
-        stderr: Standard error, NaN where there is none.
-        bound: Cramer-Rao bound, NaN where the element is not determined at all.
-        chi2: Of the fit.
-        unstable: Whether the driver or the fit is unstable.
-        unsettled: Whether the iteration for the driver or the skin did not converge.
-        exact: Whether the fitted circuit is the true one: else elements are a matter of words.
-        perturbation: What was done to the recording.
-        snr_db: Of the noise [dB].
-    """
-
-    method: str
-    seed: int
-    path: str
-    verdict: str
-    error: Elements
-    stderr: Elements
-    bound: Elements
-    chi2: float = np.nan
-    unstable: bool = False
-    unsettled: bool = False
+    method: str  # its name, or `default`
+    seed: int  # of the scene or number of the driver; answers of one seed share a driver
+    path: str  # of the trial
+    verdict: str  # name of the verdict
+    error: Elements  # estimate / truth − 1; NaN without an answer, or where there is no truth
+    stderr: Elements  # standard error, NaN where there is none
+    bound: Elements  # cramer-Rao bound, NaN where the element is not determined at all
+    chi2: float = np.nan  # of the fit
+    unstable: bool = False  # whether the driver or the fit is unstable
+    unsettled: bool = False  # whether the iteration for the driver or the skin did not converge
+    # whether the fitted circuit is the true one: else elements are a matter of words
     exact: bool = True
-    perturbation: str = ""
-    snr_db: float = np.nan
+    perturbation: str = ""  # what was done to the recording
+    snr_db: float = np.nan  # of the noise [dB]
 
     @property
     def successful(self) -> bool:
@@ -119,11 +104,7 @@ class Answer:
 
 
 class Drivers:
-    """Drivers from calibrations; each is identified once for all methods that use the same.
-
-    Args:
-        order: Number of poles.
-    """
+    """Drivers from calibrations; each is identified once for all methods that use the same."""
 
     def __init__(self, order: int = 5):
         self.order = order

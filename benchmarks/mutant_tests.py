@@ -32,15 +32,10 @@ PRELOADED = (
 
 
 class Outcome(NamedTuple):
-    """What the tests said.
+    """What the tests said."""
 
-    Attributes:
-        passed: Whether all passed; None if they took too long.
-        killer: The test that failed; empty if none did, or if they could not be collected.
-    """
-
-    passed: bool | None
-    killer: str
+    passed: bool | None  # whether all passed; None if they took too long
+    killer: str  # the test that failed; empty if none did, or if they could not be collected
 
 
 class _Order:

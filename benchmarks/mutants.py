@@ -46,23 +46,14 @@ TINY = 1e-12
 
 @dataclasses.dataclass(frozen=True)
 class Mutant:
-    """One change of one module.
+    """One change of one module."""
 
-    Attributes:
-        path: Of the module, below the root.
-        line: Where it is.
-        kind: What was done.
-        before: The code there.
-        after: What takes its place.
-        span: First and last byte of it.
-    """
-
-    path: str
-    line: int
-    kind: str
-    before: str
-    after: str
-    span: tuple[int, int]
+    path: str  # of the module, below the root
+    line: int  # where it is
+    kind: str  # what was done
+    before: str  # the code there
+    after: str  # what takes its place
+    span: tuple[int, int]  # first and last byte of it
 
     @property
     def key(self) -> str:
@@ -137,12 +128,7 @@ def _is_silent(node: ast.AST) -> bool:
 
 
 def mutants(path: str, source: str) -> list[Mutant]:
-    """All mutants of a module, in its order.
-
-    Args:
-        path: Of the module, below the root.
-        source: Its text.
-    """
+    """All mutants of a module, in its order."""
     text = source.encode()
     starts = [0]
     for line in text.splitlines(keepends=True):

@@ -32,15 +32,10 @@ HUM = 0.01  # [V at the converter]
 
 @dataclasses.dataclass(frozen=True)
 class Flicker:
-    """Noise of the power σ² f_c/f, which equals that of white noise at the corner frequency f_c.
+    """Noise of the power σ² f_c/f, which equals that of white noise at the corner frequency f_c."""
 
-    Args:
-        sigma: Standard deviation of a sample of the white noise [V at the converter].
-        corner: f_c [Hz].
-    """
-
-    sigma: float
-    corner: float
+    sigma: float  # standard deviation of a sample of the white noise [V at the converter]
+    corner: float  # f_c [Hz]
 
     def __call__(
         self, time: Float[np.ndarray, " time"], rng: np.random.Generator
@@ -54,13 +49,9 @@ class Flicker:
 
 @dataclasses.dataclass(frozen=True)
 class White:
-    """More white noise.
+    """More white noise."""
 
-    Args:
-        sigma: Standard deviation of a sample [V at the converter].
-    """
-
-    sigma: float
+    sigma: float  # standard deviation of a sample [V at the converter]
 
     def __call__(
         self, time: Float[np.ndarray, " time"], rng: np.random.Generator
@@ -88,23 +79,14 @@ OPTIONS = (
 
 
 class Found(NamedTuple):
-    """Fits with one kind of noise.
+    """Fits with one kind of noise."""
 
-    Attributes:
-        verdicts: How often each occurs; `driver_failed` where there is no driver.
-        chi2: Of all fits.
-        z: Errors of the successful fits in standard errors, (fit, element).
-        stderr: Their relative standard errors, (fit, element).
-        dry: Whether each successful fit is of dry skin.
-        driver: Number of its driver.
-    """
-
-    verdicts: Mapping[str, int]
-    chi2: np.ndarray
-    z: np.ndarray
-    stderr: np.ndarray
-    dry: np.ndarray
-    driver: np.ndarray
+    verdicts: Mapping[str, int]  # how often each occurs; `driver_failed` where there is no driver
+    chi2: np.ndarray  # of all fits
+    z: np.ndarray  # errors of the successful fits in standard errors, (fit, element)
+    stderr: np.ndarray  # their relative standard errors, (fit, element)
+    dry: np.ndarray  # whether each successful fit is of dry skin
+    driver: np.ndarray  # number of its driver
 
 
 def found(change: Callable[[Record], Record], snr_db: float, drivers: int) -> Found:

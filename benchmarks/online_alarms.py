@@ -36,21 +36,13 @@ SOON = 2  # pulses within which the change must be found
 
 @dataclasses.dataclass(frozen=True)
 class Alarms:
-    """What the tests for changes have shown.
+    """What the tests for changes have shown."""
 
-    Attributes:
-        hours: Electrode hours without a change.
-        false: Changes of electrodes found in them.
-        driver: Changes of the driver found in them.
-        changes: Electrodes that have become wet.
-        found: How many of them were found within `SOON` pulses.
-    """
-
-    hours: float
-    false: int
-    driver: int
-    changes: int
-    found: int
+    hours: float  # electrode hours without a change
+    false: int  # changes of electrodes found in them
+    driver: int  # changes of the driver found in them
+    changes: int  # electrodes that have become wet
+    found: int  # how many of them were found within `SOON` pulses
 
     def hourly(self) -> float:
         """Largest rate of false alarms per electrode and hour that 95 % confidence allows."""

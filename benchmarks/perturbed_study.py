@@ -30,20 +30,15 @@ PULSE_RATE = 60.0  # [Hz]
 
 @dataclasses.dataclass(frozen=True)
 class Truth:
-    """What is right to say of a skin; arrays are (element,), in SI.
+    """What is right to say of a skin; arrays are (element,), in SI."""
 
-    Attributes:
-        low: Smallest value of each element in the record.
-        high: Largest.
-        moves: Whether it went from the one to the other: an answer that does not say so claims that
-            the elements were what it gives all the time.
-        words: Whether the elements are a matter of words, as of skin that is not one RC: they are
-            wrong by 20 % only.
-    """
-
-    low: Float[np.ndarray, " element"]
-    high: Float[np.ndarray, " element"]
+    low: Float[np.ndarray, " element"]  # smallest value of each element in the record
+    high: Float[np.ndarray, " element"]  # largest
+    # whether it went from the one to the other: an answer that does not say so claims that the
+    # elements were what it gives all the time
     moves: bool = False
+    # whether the elements are a matter of words, as of skin that is not one RC: they are wrong by
+    # 20 % only
     words: bool = False
 
     @classmethod
@@ -55,19 +50,12 @@ class Truth:
 
 @dataclasses.dataclass(frozen=True)
 class Study:
-    """The records of a driver.
+    """The records of a driver."""
 
-    Attributes:
-        number: Of the driver.
-        calibrations: With known resistors.
-        trials: With skin.
-        truths: Of the trials, by path.
-    """
-
-    number: int
-    calibrations: tuple[Record, ...]
-    trials: tuple[Record, ...]
-    truths: Mapping[str, Truth]
+    number: int  # of the driver
+    calibrations: tuple[Record, ...]  # with known resistors
+    trials: tuple[Record, ...]  # with skin
+    truths: Mapping[str, Truth]  # of the trials, by path
 
 
 Change = Callable[[Study], Study]

@@ -63,12 +63,7 @@ def rate(events: Sequence[bool] | np.ndarray, drivers: Iterable[int]) -> Rate:
 
 
 def covered(z: np.ndarray, drivers: Sequence[int] | np.ndarray) -> Rate:
-    """Part of the 95 % intervals that contain the truth.
-
-    Args:
-        z: Errors in standard errors, (fit, ...).
-        drivers: Number of the driver of each fit.
-    """
+    """Part of the 95 % intervals that contain the truth."""
     inside = np.abs(z) < NORMAL_95
     return rate(inside.ravel(), np.repeat(drivers, inside[0].size if inside.size else 1))
 

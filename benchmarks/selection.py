@@ -29,7 +29,7 @@ from benchmarks.provenance import write_csv
 from benchmarks.rates import COVERED, Rate, clopper_pearson, rate
 from benchmarks.runner import FOLDER, QUICK, WORKERS, Target, each, option, report
 from benchmarks.selection_draws import SNR_DB, TRUTHS, Drawn, draws, scene
-from benchmarks.timing import first_and_warm
+from benchmarks.timing import median_time
 from etid.selection.search import USUAL
 from etid.simulation import scenes
 
@@ -170,7 +170,7 @@ def select_time(number: int) -> float:
     study = scene(60.0, number).simulate(number)
     driver = etid.identify_driver(study["calibration"], throw=False)
     choose = functools.partial(etid.select_circuit, driver=driver, throw=False)
-    times = [first_and_warm(functools.partial(choose, study[name]), 1)[1] for name in TRUTHS]
+    times = [median_time(functools.partial(choose, study[name]), 1) for name in TRUTHS]
     return float(np.median(times))
 
 

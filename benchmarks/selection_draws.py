@@ -62,21 +62,13 @@ with jax.enable_x64(True):  # of a worker process
 
 @dataclasses.dataclass(frozen=True)
 class Drawn:
-    """One recording.
+    """One recording."""
 
-    Attributes:
-        truth: Which of `TRUTHS`.
-        snr_db: Of every record [dB].
-        driver: Number of the driver.
-        selection: What etid chose.
-        fits: Fits of every candidate, by number.
-    """
-
-    truth: str
-    snr_db: float
-    driver: int
-    selection: Selection
-    fits: Mapping[int, Fit]
+    truth: str  # which of `TRUTHS`
+    snr_db: float  # of every record [dB]
+    driver: int  # number of the driver
+    selection: Selection  # what etid chose
+    fits: Mapping[int, Fit]  # fits of every candidate, by number
 
     @property
     def chosen(self) -> type[AbstractCircuit]:

@@ -77,13 +77,7 @@ def answer(cell: Cell, seed: int, path: str, fit: Fit, bound: np.ndarray) -> Ans
 
 
 def answers(cell: Cell, drivers: int, trials: int) -> list[Answer]:
-    """All answers in a cell.
-
-    Args:
-        cell: Of the map.
-        drivers: Number of calibrations.
-        trials: Number of trials behind each.
-    """
+    """All answers in a cell."""
     with jax.enable_x64(True):  # of a worker process
         bound, found = bounds(cell.scene), list[Answer]()
         for seed in seeds(cell, drivers):

@@ -36,19 +36,12 @@ NAMES = np.array([kind.__name__ for kind in USUAL])
 
 
 class Spectra(NamedTuple):
-    """One impedance spectrum for each truth.
+    """One impedance spectrum for each truth."""
 
-    Attributes:
-        f: Frequencies [Hz].
-        z: Noisy impedances [ohm].
-        sigma: Their noise √E|·|² [ohm].
-        used: Harmonics that stand out of the noise.
-    """
-
-    f: Float[np.ndarray, " harmonic"]
-    z: Complex[np.ndarray, "truth harmonic"]
-    sigma: Float[np.ndarray, "truth harmonic"]
-    used: Bool[np.ndarray, "truth harmonic"]
+    f: Float[np.ndarray, " harmonic"]  # frequencies [Hz]
+    z: Complex[np.ndarray, "truth harmonic"]  # noisy impedances [ohm]
+    sigma: Float[np.ndarray, "truth harmonic"]  # their noise √E|·|² [ohm]
+    used: Bool[np.ndarray, "truth harmonic"]  # harmonics that stand out of the noise
 
 
 class Chosen(NamedTuple):

@@ -35,19 +35,13 @@ LAYERS = ("r_1", "c_1", "c_2", "r_2")  # the other way round are those of the ot
 
 @dataclasses.dataclass(frozen=True)
 class Spectrum:
-    """A drawn spectrum.
+    """A drawn spectrum."""
 
-    Attributes:
-        frequency: From high to low, as instruments sweep [Hz].
-        z: With noise [Ω].
-        circuit: What is fitted.
-        truth: Smallest and largest right value of each element that has one; empty if there is no
-            right answer.
-    """
-
-    frequency: Float[np.ndarray, " frequency"]
-    z: Complex[np.ndarray, " frequency"]
-    circuit: etid.AbstractCircuit
+    frequency: Float[np.ndarray, " frequency"]  # from high to low, as instruments sweep [Hz]
+    z: Complex[np.ndarray, " frequency"]  # with noise [Ω]
+    circuit: etid.AbstractCircuit  # what is fitted
+    # smallest and largest right value of each element that has one; empty if there is no right
+    # answer
     truth: Mapping[str, tuple[float, float]]
 
 
@@ -200,19 +194,13 @@ FAULTS: Mapping[str, Callable[[np.random.Generator], Spectrum]] = {
 
 
 class Answer(NamedTuple):
-    """What a fit says of a spectrum.
+    """What a fit says of a spectrum."""
 
-    Attributes:
-        verdict: Of the fit.
-        z: Errors of the elements that have right values, in standard errors.
-        silent: Whether the fit is called successful, and is wrong.
-        rrse: Of the fit.
-    """
-
-    verdict: str
+    verdict: str  # of the fit
+    # errors of the elements that have right values, in standard errors
     z: Float[np.ndarray, " element"]
-    silent: bool
-    rrse: float
+    silent: bool  # whether the fit is called successful, and is wrong
+    rrse: float  # of the fit
 
 
 def answer(of: Spectrum) -> Answer:

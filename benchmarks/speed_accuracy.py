@@ -68,25 +68,15 @@ def draw(scene: Scene, repetitions: int, source: Callable[[Scene, int], etid.Stu
 
 
 class Result(NamedTuple):
-    """What an estimator made of all draws of a scene.
+    """What an estimator made of all draws of a scene."""
 
-    Attributes:
-        estimator: Its name.
-        mode: `alone`, one recording a call; `batched`; or `rival`.
-        answers: One for each draw.
-        seconds: Of one skin, its driver known: median, compilation apart.
-        first_seconds: Of the first call.
-        driver_seconds: Of one driver, median.
-        missing: Why there is nothing, if so.
-    """
-
-    estimator: str
-    mode: str
-    answers: Sequence[Answer]
-    seconds: float = np.nan
-    first_seconds: float = np.nan
-    driver_seconds: float = np.nan
-    missing: str = ""
+    estimator: str  # its name
+    mode: str  # `alone`, one recording a call; `batched`; or `rival`
+    answers: Sequence[Answer]  # one for each draw
+    seconds: float = np.nan  # of one skin, its driver known: median, compilation apart
+    first_seconds: float = np.nan  # of the first call
+    driver_seconds: float = np.nan  # of one driver, median
+    missing: str = ""  # why there is nothing, if so
 
     @property
     def each(self) -> np.ndarray:

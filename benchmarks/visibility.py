@@ -35,19 +35,12 @@ Gain = Complex[np.ndarray, " f"]
 
 
 class Records(NamedTuple):
-    """What both loaded records hold at the harmonics.
+    """What both loaded records hold at the harmonics."""
 
-    Attributes:
-        f: Harmonics [Hz].
-        skin: Impedance of the skin [ohm].
-        z_th: Source impedance [ohm].
-        gains: V_out / V_th with the skin and with the resistor.
-    """
-
-    f: Float[np.ndarray, " f"]
-    skin: Gain
-    z_th: Gain
-    gains: tuple[Gain, Gain]
+    f: Float[np.ndarray, " f"]  # harmonics [Hz]
+    skin: Gain  # impedance of the skin [ohm]
+    z_th: Gain  # source impedance [ohm]
+    gains: tuple[Gain, Gain]  # V_out / V_th with the skin and with the resistor
 
 
 Change = Callable[[Records], tuple[Gain | float, Gain | float]]

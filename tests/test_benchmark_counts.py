@@ -282,18 +282,6 @@ def test_what_does_not_hold_of_the_ranking_is_said():
     assert len([*ranked([row("default", error=1.5), worse[0], row("equation_error")])]) == 1
 
 
-def test_a_chart_shows_every_scene_and_who_has_no_answer(tmp_path):
-    rows = [
-        row("default", on_front=True),
-        row("default", mode="alone", ms=3.0),
-        row("SciPy", mode="rival", ms=30.0, error=5e3),
-        row("equation_error", error=np.inf),
-        row("steiglitz_mcbride", scene="t", said=1.0),
-    ]
-    speed_accuracy.chart(rows, tmp_path / "deep" / "chart.svg")
-    assert "etid" in (tmp_path / "deep" / "chart.svg").read_text()
-
-
 def test_the_first_that_is_good_is_to_be_used_or_what_is_as_good_in_half_its_time():
     rows = [
         row("maximum_likelihood", ms=3.0),

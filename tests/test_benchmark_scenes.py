@@ -11,10 +11,10 @@ from benchmarks import amplitudes, failure_axes, failure_map
 from benchmarks.disturbances import Hum, Leaky, Nonlinear, Pink, Spike
 from benchmarks.failure_axes import Clipped, Cole, Coloured, TwoLayers, scene
 from benchmarks.laboratory import CORNER, SCALE, Output
-from benchmarks.ladder import CALIBRATION, LOADS, TRIAL, ladder
+from benchmarks.ladder import LOADS
 from benchmarks.large_file import LAYOUTS, SAMPLES, large_file
 from benchmarks.perturbation_list import INVISIBLE, PERTURBATIONS, UNDISTURBED
-from benchmarks.perturbed_study import drawn_driver, undisturbed
+from benchmarks.perturbed_study import undisturbed
 from etid.simulation.scenes import Scene, Trial
 from etid.simulation.transformer import Sampler, SkinLoad, TransformerDriver
 
@@ -34,13 +34,6 @@ def volts(output: Output, samples: int = 10_000) -> np.ndarray:
 @pytest.fixture(scope="module")
 def dry():
     return study("base_no_delay").trials[0]
-
-
-def test_the_ladder_has_a_trial_and_a_calibration_on_each_rung():
-    assert len(ladder()) == 18
-    for of in ladder().values():
-        assert [trial.path for trial in of.trials] == [TRIAL]
-        assert [trial.path for trial in of.calibration] == [CALIBRATION]
 
 
 def test_an_undisturbed_recording_is_that_of_a_scene(dry):
@@ -63,15 +56,6 @@ def test_every_perturbation_changes_what_is_recorded_or_told():
         assert set(after.truths) == {of.path for of in after.trials} == set(LOADS), name
         same = (after.calibrations, after.trials) == (before.calibrations, before.trials)
         assert same == (name == "base"), name
-
-
-def test_drivers_have_parts_of_their_own_and_one_pulse():
-    usual = TransformerDriver()
-    drawn = [drawn_driver(number, 0.03, usual) for number in range(50)]
-    assert drawn[7] == drawn_driver(7, 0.03, usual)
-    leakage = np.log([of.l_secondary / usual.l_secondary for of in drawn])
-    assert leakage.std() == pytest.approx(0.03, rel=0.3)  # three standard deviations of 50 draws
-    assert {of.turns for of in drawn} == {usual.turns}
 
 
 def test_an_element_falls_from_pulse_to_pulse_and_noise_and_calibrations_stay():
@@ -125,16 +109,6 @@ def test_hum_spikes_and_noise_of_1_f_have_their_sizes():
     power = np.abs(np.fft.rfft(pink)) ** 2
     # ten harmonics: exponential draws
     assert power[1:11].mean() / power[1001:1011].mean() == pytest.approx(200, rel=0.8)
-
-
-def test_jittered_samples_are_the_voltage_at_other_times(dry):
-    """A Taylor series of three terms: what is left of half a volt is its fourth."""
-    jittered = dataclasses.replace(dry.out, sampling_jitter=100e-9)
-    early = 100e-9 * np.random.default_rng(4).standard_normal(200)
-    found = jittered.volts(RATE, 200, np.random.default_rng(4))
-    exact = [volts(dataclasses.replace(dry.out, delay=d), 200)[i] for i, d in enumerate(early)]
-    np.testing.assert_allclose(found, exact, atol=2e-3 * np.ptp(exact))
-    assert np.std(found - volts(dry.out, 200)) > 1e-4 * np.ptp(exact)
 
 
 def test_converters_round_and_files_may_say_what_is_not_true():

@@ -2,11 +2,10 @@
 
 import ast
 import csv
-import types
 
 import pytest
 
-from benchmarks import mutant_tests, mutation
+from benchmarks import mutation
 from benchmarks.__main__ import asked
 from benchmarks.mutant_tests import Outcome
 from benchmarks.mutants import drawn, mutants
@@ -108,17 +107,6 @@ def test_tests_that_killed_a_mutant_nearby_come_first():
     rows = [{"module": "a", "place": f"etid/a.py:{n}", "killer": name} for n, name in kills]
     rows.append({"module": "b", "place": "etid/b.py:10", "killer": "other"})
     assert mutation.nearest(rows, "a", 10) == ["near", "between", "far"]
-
-
-def test_files_whose_tests_come_first_stay_together():
-    names = ("a::1", "a::2", "b::1", "b::2", "c::1")
-    items = [types.SimpleNamespace(nodeid=name, path=name[0]) for name in names]
-    order = mutant_tests._Order(["b::2", "c::1"])
-    order.pytest_collection_modifyitems(items)
-    assert [item.nodeid for item in items] == ["b::2", "b::1", "c::1", "a::1", "a::2"]
-    for name, failed in (("a::1", False), ("a::2", True)):
-        order.pytest_runtest_logreport(types.SimpleNamespace(nodeid=name, failed=failed))
-    assert order.failed == "a::2"
 
 
 def test_survivors_are_shown_and_the_table_tells_seed_and_commit(tmp_path, monkeypatch, capsys):

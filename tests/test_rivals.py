@@ -66,62 +66,6 @@ def test_harmonics_are_those_that_a_record_was_made_of(f, spectra):
     np.testing.assert_allclose(of.y[: f.size], y, atol=ROUNDING)
 
 
-@pytest.mark.parametrize("length", [SAMPLES, SAMPLES // PERIODS + 1])
-def test_noise_is_seen_between_the_harmonics_or_above_the_band(f, length):
-    """White noise of σ is σ / √M in a coefficient of M samples."""
-    rng = np.random.default_rng(1)
-    low = np.where(f < 10e3, pulses(f), 0)
-    v_th, v_out = (
-        samples_of(part * low)[:length] + rng.normal(0, 0.1, length) for part in (1.0, 0.5)
-    )
-    of = records.harmonics(v_th, v_out, FS, F0)
-    _, used = records.whole_periods(length, FS, F0)
-    # The median of some 160 exponential variables at least, whose square root it is: 5 %.
-    assert of.sigma == pytest.approx(0.1 / np.sqrt(used), rel=0.2)
-    assert not of.visible[of.f > 12e3].mean() > 0.01
-    assert of.visible[of.f < 1e3].all()
-
-
-def test_impedances_follow_from_a_calibration(f, spectra):
-    x, y, reference = spectra
-    calibration = records.Harmonics(f, x, reference, 1e-12)
-    z_th = records.driver_impedance(calibration, 98.8e3)
-    seen = calibration.visible
-    np.testing.assert_allclose(z_th[seen], source(f)[seen], rtol=1e-6)  # x − y loses digits
-    assert np.isnan(z_th[~seen]).all()
-    at, z, spread = records.load_impedance(records.Harmonics(f, x, y, 1e-12), z_th)
-    np.testing.assert_allclose(z, load(at), rtol=1e-6)
-    assert (spread > 0).all()
-
-
-def test_spread_of_an_impedance_is_that_of_noisy_records(f, spectra):
-    x, y, _ = spectra
-    rng = np.random.default_rng(2)
-    draws, sigma = 400, 1e-4
-    near = slice(0, 20)
-
-    def noise():
-        return sigma / np.sqrt(2) * (rng.normal(size=20) + 1j * rng.normal(size=20))
-
-    found, claimed = [], []
-    for _ in range(draws):
-        of = records.Harmonics(f[near], x[near] + noise(), y[near] + noise(), sigma)
-        _, z, spread = records.load_impedance(of, source(f[near]))
-        found.append(z)
-        claimed.append(spread)
-    ratio = np.std(found, axis=0) / np.median(claimed, axis=0)
-    np.testing.assert_allclose(ratio, 1, atol=0.2)  # 1/√800 is 3.5 %; the largest of 20, and bias
-
-
-def test_a_period_of_current_and_voltage_obeys_the_load(f, spectra):
-    x, y, _ = spectra
-    of = records.current_and_voltage(records.Harmonics(f, x, y, 1e-12), source(f))
-    assert of.fs >= records.RATE
-    assert np.abs(of.current).max() == np.abs(of.voltage).max() == 1
-    current, voltage = (np.fft.rfft(v)[1 : f.size + 1] for v in (of.current, of.voltage))
-    np.testing.assert_allclose((of.unit * voltage / current)[:20], load(f)[:20], rtol=1e-6)
-
-
 def test_residuals_vanish_at_the_truth_and_count_standard_errors(f, spectra):
     x, y, _ = spectra
     late = y * np.exp(-2j * np.pi * f * 0.3e-6)
@@ -133,17 +77,6 @@ def test_residuals_vanish_at_the_truth_and_count_standard_errors(f, spectra):
     noisy = x + noise[0] + 1j * noise[1], late + noise[2] + 1j * noise[3]
     squares = harmonic_fit.skin_misfit(q, f, *noisy, 1e-3, source(f)) ** 2
     assert 2 * squares.mean() == pytest.approx(1, rel=5 / np.sqrt(f.size))
-
-
-def test_starts_of_a_driver_are_generic_and_explain_a_calibration_roughly(f, spectra):
-    x, _, reference = spectra
-    of = records.Harmonics(f, x, reference, 1e-3)
-    nothing = np.sum(np.abs(x - reference) ** 2)
-    for q in harmonic_fit.driver_starts(of):
-        gain = 1 / (1 + harmonic_fit.source_impedance(q, f))
-        assert np.sum(np.abs(reference - gain * x) ** 2) < 0.01 * nothing
-        misfit = harmonic_fit.driver_misfit(q, *of)
-        assert misfit.shape == (2 * f.size + 3,)
 
 
 Q = np.array(

@@ -41,27 +41,20 @@ class RivalError(RuntimeError):
 
 @dataclasses.dataclass(frozen=True)
 class Outcome:
-    """What a rival found, one row per draw, or why it found nothing.
+    """What a rival found, one row per draw, or why it found nothing."""
 
-    Attributes:
-        elements: R_s [ohm], R_p [ohm], C_p [F]; NaN where a draw failed.
-        ok: What the package says of its success.
-        seconds: Of the skin's fit from its records, warm.
-        driver_seconds: Of the driver's fit.
-        first_seconds: Of the first fit of a skin, with what it compiles.
-        versions: By package.
-        errors: Message of each draw, mostly empty.
-        missing: One line that says why there is nothing; empty if there is.
-    """
-
+    # R_s [ohm], R_p [ohm], C_p [F]; NaN where a draw failed
     elements: np.ndarray = dataclasses.field(default_factory=lambda: np.empty((0, 3)))
+    # what the package says of its success
     ok: np.ndarray = dataclasses.field(default_factory=lambda: np.empty(0, bool))
+    # of the skin's fit from its records, warm
     seconds: np.ndarray = dataclasses.field(default_factory=lambda: np.empty(0))
+    # of the driver's fit
     driver_seconds: np.ndarray = dataclasses.field(default_factory=lambda: np.empty(0))
-    first_seconds: float = np.nan
-    versions: Mapping[str, str] = dataclasses.field(default_factory=dict)
-    errors: Sequence[str] = ()
-    missing: str = ""
+    first_seconds: float = np.nan  # of the first fit of a skin, with what it compiles
+    versions: Mapping[str, str] = dataclasses.field(default_factory=dict)  # by package
+    errors: Sequence[str] = ()  # message of each draw, mostly empty
+    missing: str = ""  # one line that says why there is nothing; empty if there is
 
 
 def python_of(environment: str) -> pathlib.Path:

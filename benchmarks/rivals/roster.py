@@ -11,23 +11,15 @@ LATE, EXACT = SCENES
 
 
 class Rival(NamedTuple):
-    """One estimator of another package.
+    """One estimator of another package."""
 
-    Attributes:
-        name: As tables and charts show it.
-        package: Whose version is shown.
-        setting: How it is set, in a line.
-        works: A scene in which it should work, of `SCENES`.
-        environment: Of `.rivals/`, made from the requirements of that name beside this file.
-        program: What must be on the path besides, by its Debian packages.
-    """
-
-    name: str
-    package: str
-    setting: str
-    works: str = EXACT
+    name: str  # as tables and charts show it
+    package: str  # whose version is shown
+    setting: str  # how it is set, in a line
+    works: str = EXACT  # a scene in which it should work, of `SCENES`
+    # of `.rivals/`, made from the requirements of that name beside this file
     environment: str = "common"
-    program: Mapping[str, str] = {}
+    program: Mapping[str, str] = {}  # what must be on the path besides, by its Debian packages
 
 
 def _by_octave(name: str, setting: str) -> Rival:
