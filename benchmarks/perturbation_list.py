@@ -39,7 +39,6 @@ from benchmarks.perturbed_study import (
     pulses,
     record,
     second_resistor,
-    skin_for_resistor,
     skin_is,
     th,
     trials,
@@ -198,7 +197,7 @@ CALIBRATIONS: Mapping[str, Change] = {
     "says_1Tohm": calibrations(record(told={"r_load": 1e12})),
     "calibration_v_out_is_v_th": calibrations(record(copied=True)),
     "calibration_unloaded": calibrations(out(loads=(ResistorLoad(1e15),))),
-    "calibration_is_skin": skin_for_resistor,
+    "calibration_is_skin": calibrations(out(loads=(LOADS["dry"],))),
 }
 
 PERTURBATIONS: Mapping[str, Change] = {
