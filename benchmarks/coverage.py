@@ -124,11 +124,12 @@ def monte_carlo(
         method: As in `identify_skin`, or `joint`.
         parts: Standard deviation of the logarithm of every part of the drivers.
     """
-    truth = {p: list(of.values()) for p, of in scene.truth().items() if not p.startswith(MORE)}
+    counted = [trial.path for trial in scene.trials if not trial.path.startswith(MORE)]
+    truth = {path: list(scene.truth()[path].values()) for path in counted}
     rows: dict[str, list] = {path: [] for path in truth}
     for seed in tqdm(range(repetitions), disable=None):
         study = with_driver(scene, seed, parts).simulate(seed=seed)
-        fits = _identify(study, list(truth), method)
+        fits = _identify(study, counted, method)
         for path, of in rows.items():
             of.append(compared(fits.get(path), truth[path]))
     columns = {path: zip(*of, strict=True) for path, of in rows.items()}
