@@ -51,7 +51,6 @@ from etid.simulation.scenes import Scene
 from etid.simulation.transformer import ResistorLoad, SkinLoad
 from etid.solvers.matrices import inverse_of_few
 
-DRY, DAMP = TYPICAL["dry"], TYPICAL["damp"]
 WANTED = 80e-9  # [C] per phase
 CAP = 5e-3  # [A]
 FALLBACK = 0.3  # of the amplitude of the unloaded record
@@ -129,37 +128,28 @@ class Fingertip:
     """The skin at each electrode and pulse."""
 
     def __init__(self, electrodes: int, pulses: int) -> None:
-        rng = np.random.default_rng(0)
-        spots = np.exp(SPREAD * rng.standard_normal((SPOTS, 3)))
-        self.kinds = ["dry", "wetting", "sweating"]
-        self.kind = [self.kinds[at % 3] for at in range(electrodes)]
-        self.kind[-1] = "lifted"
-        dry, damp = (np.array(dataclasses.astuple(one)) for one in (DRY, DAMP))
-        self.loads: list[list[SkinLoad | ResistorLoad]] = []
-        changed = np.zeros((pulses, electrodes), bool)
-        changed[0] = True
-        begin = 30 + 3 * (np.arange(electrodes) // 3 % 4)
-        for pulse in range(pulses):
-            row: list[SkinLoad | ResistorLoad] = []
-            for at, kind in enumerate(self.kind):
-                # Fewer places sweat: each pulse of them is another run of ngspice.
-                spot, wet = spots[at // 3 % (2 if kind == "sweating" else SPOTS)], 0.0
-                if kind == "wetting":
-                    wet = np.clip((pulse - begin[at] + 1) / WETTING, 0, 1)
-                    changed[pulse, at] |= begin[at] <= pulse < begin[at] + WETTING
-                if kind == "sweating":  # a third of the way to damp skin
-                    wet = pulse / pulses / 3
-                values = spot * dry ** (1 - wet) * damp**wet
-                lifted = kind == "lifted" and LIFTED <= pulse < BACK
-                row.append(OPEN if lifted else SkinLoad(*map(float, values)))
-                if kind == "lifted":
-                    changed[pulse, at] |= LIFTED <= pulse <= BACK
-            self.loads.append(row)
+        spots = np.exp(SPREAD * np.random.default_rng(0).standard_normal((SPOTS, 3)))
+        dry, damp = (np.array(dataclasses.astuple(TYPICAL[name])) for name in ("dry", "damp"))
+        pulse, at = np.arange(pulses)[:, None], np.arange(electrodes)
+        kind = np.array(list(TITLES))[at % 3]
+        kind[-1] = "lifted"
+        self.kind = kind.tolist()
+        begin, wetting, sweating = 30 + 3 * (at // 3 % 4), kind == "wetting", kind == "sweating"
+        wet = np.where(wetting, np.clip((pulse - begin + 1) / WETTING, 0, 1), 0.0)
+        wet = np.where(sweating, pulse / pulses / 3, wet)[..., None]  # a third of the way to damp
+        # Fewer places sweat: each pulse of them is another run of ngspice.
+        values = spots[at // 3 % np.where(sweating, 2, SPOTS)] * dry ** (1 - wet) * damp**wet
+        lifted = (kind == "lifted") & (pulse >= LIFTED)
+        self.loads: list[list[SkinLoad | ResistorLoad]] = [
+            [OPEN if up else SkinLoad(*map(float, of)) for up, of in zip(*row, strict=True)]
+            for row in zip(lifted & (pulse < BACK), values, strict=True)
+        ]
         # Pulses that count: neither a change nor one of the two pulses that follow it.
-        after = changed.copy()
+        changed = (pulse == 0) | (wetting & (begin <= pulse) & (pulse < begin + WETTING))
+        changed |= lifted & (pulse <= BACK)
+        self.counts = ~changed
         for later in range(1, SETTLED + 1):
-            after[later:] |= changed[:-later]
-        self.counts = ~after
+            self.counts[later:] &= ~changed[:-later]
 
 
 class Run(NamedTuple):
@@ -211,7 +201,7 @@ class Loop:
         self.fingertip, self.known = fingertip, known
         self.scene = Scene((), TWO, samples=40_000, snr_db=snr, trigger_jitter_rms=100e-9)
         self.lanes = len(fingertip.kind)
-        self.typical = Plant(self.scene, 0, known).response(DRY)
+        self.typical = Plant(self.scene, 0, known).response(TYPICAL["dry"])
 
     def etid(self) -> Run:
         """The tracker and the controller."""
