@@ -35,18 +35,9 @@ TROUBLE, LASTS = 60, 10  # pulses between two faults, and of one fault, on the a
 SHORT, OPEN, FIRST, PATH = 0, 1, 2, 40  # numbers of loads; steps from dry to very wet skin
 FACTORS = np.array([0.5, 0.8, 0.9, 1.1, 1.25, 2.0])  # of a wrong amplitude
 CELLS = (
-    "constant",
-    "steps",
-    "wetting",
-    "contact",
-    "more than the cap wanted",
-    "clipped, range known",
-    "clipped, range unknown",
-    "frozen",
-    "swapped",
-    "not a number",
-    "wrong amplitude",
-    "amplitude of the pulse before",
+    *("constant", "steps", "wetting", "contact", "more than the cap wanted"),
+    *("clipped, range known", "clipped, range unknown", "frozen", "swapped", "not a number"),
+    *("wrong amplitude", "amplitude of the pulse before"),
 )
 
 

@@ -14,20 +14,9 @@ from multiprocessing.connection import Connection
 from typing import Any, NamedTuple
 
 PRELOADED = (
-    "jax.export",
-    "equinox",
-    "optimistix",
-    "lineax",
-    "scipy.optimize",
-    "scipy.signal",
-    "scipy.stats",
-    "h5py",
-    "jinja2",
-    "matplotlib.pyplot",
-    "hypothesis",
-    "beartype",
-    "jaxtyping",
-    "pytest",
+    *("jax.export", "equinox", "optimistix", "lineax", "scipy.optimize", "scipy.signal"),
+    *("scipy.stats", "h5py", "jinja2", "matplotlib.pyplot", "hypothesis", "beartype"),
+    *("jaxtyping", "pytest"),
 )
 
 

@@ -34,30 +34,18 @@ COPIED = (
 )
 LIMIT = 600.0  # [s] of a mutant; one that takes longer counts as a survivor
 # The tests of each module, the cheapest first.
+_WELL = ("maximum_likelihood", "own_circuits", "current", "other_circuit", "mains")
+_OVERVIEW = ("overview", "fit", "exporting", "recording", "identification")
 TESTS: Mapping[str, Sequence[str]] = {
     "estimators.joint.errors": ("joint_errors", "joint"),
     "estimators.joint.fit": ("joint",),
     "estimators.joint.terms": ("joint",),
     "estimators.judgement": ("judging",),
     "estimators.maximum_likelihood.given_driver": (
-        "given_driver",
-        "maximum_likelihood",
-        "current",
+        *("given_driver", "maximum_likelihood", "current"),
     ),
-    "estimators.maximum_likelihood.load": (
-        "maximum_likelihood",
-        "own_circuits",
-        "current",
-        "other_circuit",
-        "mains",
-    ),
-    "estimators.maximum_likelihood.load_fit": (
-        "maximum_likelihood",
-        "own_circuits",
-        "current",
-        "other_circuit",
-        "mains",
-    ),
+    "estimators.maximum_likelihood.load": _WELL,
+    "estimators.maximum_likelihood.load_fit": _WELL,
     "estimators.maximum_likelihood.terms": ("maximum_likelihood", "mains"),
     "estimators.non_parametric.fit": ("non_parametric",),
     "estimators.output_error.fit": ("output_error", "current", "identification"),
@@ -72,8 +60,8 @@ TESTS: Mapping[str, Sequence[str]] = {
     "online.tick": ("electrode", "online"),
     "online.tracker": ("electrode", "online"),
     "results.driver": ("driver", "overview", "given_driver"),
-    "results.fit": ("overview", "fit", "exporting", "recording", "identification"),
-    "results.fits": ("overview", "fit", "exporting", "recording", "identification"),
+    "results.fit": _OVERVIEW,
+    "results.fits": _OVERVIEW,
     "results.hdf5_table": ("tables", "exporting", "cli"),
     "results.summary": ("overview", "batch"),
     "results.verdicts": ("judging", "verdicts"),

@@ -26,25 +26,11 @@ BOUND = "crb_rel_with_delays"  # the trigger delays being unknown, as they are t
 ELEMENTS = {"r_s": "Rs", "r_p": "Rp", "c_p": "Cp", "r": "R"}
 # Names of the transformer's parts in `truth.json`.
 PARTS = {
-    "Vp": "amplitude",
-    "tr": "edge",
-    "td": "lead_in",
-    "Rsrc": "r_source",
-    "Cpri": "c_primary",
-    "Rpw": "r_primary",
-    "Llp": "l_primary",
-    "Lm": "l_magnetising",
-    "Rcore": "r_core",
-    "n": "turns",
-    "Rsw": "r_secondary",
-    "Lls": "l_secondary",
-    "Csec": "c_secondary",
-    "Cww": "c_winding",
-    "Rprot": "r_protection",
-    "Ccab": "c_cable",
-    "Rmeas": "r_divider",
-    "Cmeas": "c_divider",
-}
+    "Vp": "amplitude", "tr": "edge", "td": "lead_in", "Rsrc": "r_source", "Cpri": "c_primary",
+    "Rpw": "r_primary", "Llp": "l_primary", "Lm": "l_magnetising", "Rcore": "r_core", "n": "turns",
+    "Rsw": "r_secondary", "Lls": "l_secondary", "Csec": "c_secondary", "Cww": "c_winding",
+    "Rprot": "r_protection", "Ccab": "c_cable", "Rmeas": "r_divider", "Cmeas": "c_divider",
+}  # fmt: skip
 
 
 def scene_of(truth: dict) -> Scene:
