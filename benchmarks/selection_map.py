@@ -11,7 +11,9 @@ from collections.abc import Sequence
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array
 
 from benchmarks.estimators import DEFAULT, NOTHING, Answer, Drivers
 from benchmarks.failure_axes import Cell, cells
@@ -41,27 +43,17 @@ def chosen_cells() -> list[Cell]:
 def limits(circuit: AbstractCircuit) -> tuple[np.ndarray, np.ndarray]:
     """R_s, R_p and C_p of a circuit, and their slopes (limit, element); NaN for a missing C_p."""
     names = circuit.names()
-    values = dict(zip(names, np.asarray(circuit.values(), float), strict=True))
-    slopes = np.zeros((3, len(names)))
-    found = np.array([0.0, 0.0, np.nan])
 
-    def add(limit: int, name: str, slope: float = 1.0) -> None:
-        slopes[limit, names.index(name)] = slope
+    def found(values: Array) -> Array:
+        of, nothing = dict(zip(names, values, strict=True)), jnp.zeros(())
+        parallel = [of[name] for name in ("r_p", "r_1", "r_2") if name in of]
+        elastances = [1 / of[name] for name in names if name.startswith("c_")]
+        capacitance = 1 / sum(elastances, nothing) if elastances else nothing + jnp.nan
+        series = of.get("r_s", of.get("r", nothing))
+        return jnp.stack([series, sum(parallel, nothing), capacitance])
 
-    if "r_s" in values or "r" in values:
-        series = "r_s" if "r_s" in values else "r"
-        found[0] = values[series]
-        add(0, series)
-    parallel = [name for name in ("r_p", "r_1", "r_2") if name in values]
-    found[1] = sum(values[name] for name in parallel)
-    for name in parallel:
-        add(1, name)
-    capacitors = [name for name in names if name.startswith("c_")]
-    if capacitors:
-        found[2] = 1 / sum(1 / values[name] for name in capacitors)
-        for name in capacitors:
-            add(2, name, float((found[2] / values[name]) ** 2))
-    return found, slopes
+    values = jnp.asarray(circuit.values())
+    return np.asarray(found(values)), np.asarray(jax.jacfwd(found)(values))
 
 
 def answer(cell: Cell, seed: int, path: str, fit: Fit, bound: np.ndarray) -> Answer:

@@ -48,26 +48,20 @@ def drawn(deviances, driver=0, off=1.0, truth=TRUTH):
     return Drawn(truth, 40.0, driver, Selection.of(fits, best(fits), CANDIDATES), fits)
 
 
-@pytest.mark.parametrize("name", TRUTHS)
-def test_slopes_of_quantities_and_limits(name):
-    circuit = TRUTHS[name]
-    values, step = np.asarray(circuit.values()), 1e-6
-
-    def moved(i, by):
-        factors = np.where(np.arange(values.size) == i, 1 + by, 1.0)
-        return circuit.with_log_values(jnp.log(jnp.asarray(values * factors)))
-
-    for i in range(values.size):
-        up, down = moved(i, step), moved(i, -step)
-        for of, found in quantities(circuit).items():
-            slope = (quantities(up)[of].value - quantities(down)[of].value) / (2 * step * values[i])
-            np.testing.assert_allclose(found.slope[i], slope, rtol=1e-5, atol=1e-9 * abs(slope))
-        slopes = (selection_map.limits(up)[0] - selection_map.limits(down)[0]) / (
-            2 * step * values[i]
-        )
-        known = np.isfinite(slopes)
-        found = selection_map.limits(circuit)[1][:, i]
-        np.testing.assert_allclose(found[known], slopes[known], rtol=1e-5, atol=1e-9)
+def test_two_circuits_have_the_same_resistance_corner_and_limits():
+    skin, cole, layers = (
+        quantities(TRUTHS[name]) for name in (TRUTH, "Cole 0.9, dry", "layers 0.3, 10, dry")
+    )
+    for name in ("R_s", "Z(0)", "corner"):
+        assert skin[name].value == pytest.approx(cole[name].value)
+    assert layers["Z(0)"].value == pytest.approx(skin["Z(0)"].value)
+    assert "corner" not in layers
+    np.testing.assert_allclose(skin["Z(0)"].slope, [1, 1, 0])
+    values = np.asarray(TRUTHS[TRUTH].values())
+    np.testing.assert_allclose(skin["corner"].slope, [0, -1 / values[1], -1 / values[2]])
+    found, slopes = selection_map.limits(TRUTHS["R, dry"])
+    np.testing.assert_allclose(found, [216.6e3, 0, np.nan])
+    np.testing.assert_allclose(slopes, [[1], [0], [0]])
 
 
 def test_bic_of_the_benchmark_chooses_as_etid_does():
