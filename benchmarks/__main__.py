@@ -8,6 +8,7 @@ from collections.abc import Sequence
 import jax
 
 from benchmarks.ngspice import NgspiceError
+from benchmarks.rivals import RivalError
 from benchmarks.timing import pin
 
 NAMES = (
@@ -41,7 +42,7 @@ def main() -> None:
         pin()
     try:
         sys.exit(0 if arguments.module.main(arguments) else 1)
-    except NgspiceError as error:
+    except (NgspiceError, RivalError) as error:
         sys.exit(str(error))
 
 

@@ -9,7 +9,6 @@ import pytest
 import scipy.stats
 
 from benchmarks import (
-    curves,
     driver_order,
     failure_map,
     perturbations,
@@ -78,20 +77,6 @@ def test_a_number_that_could_not_be_had_misses_its_target(capsys):
     for one in missed:
         assert not report([*met, one])
     assert capsys.readouterr().out.count("missed") == 2
-
-
-def test_slopes_are_those_between_neighbours_of_a_curve():
-    times = {"line": (1.0, 10.0, 100.0), "bend": (1.0, 1.0, 10.0)}
-    rows = [
-        {"against": "samples", "what": what, "number": 10**power, "seconds": seconds[power]}
-        for power in range(3)
-        for what, seconds in times.items()
-    ]
-    found = list(curves.with_slopes(rows))
-    for what, slopes in {"line": [np.nan, 1.0, 1.0], "bend": [np.nan, 0.0, 1.0]}.items():
-        of = [row["slope"] for row in found if row["what"] == what]
-        np.testing.assert_allclose(of, slopes, atol=1e-12)
-    assert [row["what"] for row in found if row["bent"]] == ["bend"]
 
 
 # --- answers --------------------------------------------------------------------------------------

@@ -8,7 +8,7 @@ import pytest
 
 import etid
 from benchmarks import amplitudes, failure_axes, failure_map
-from benchmarks.disturbances import Leaky, Nonlinear, Pink, Spike
+from benchmarks.disturbances import Leaky, Nonlinear
 from benchmarks.failure_axes import Clipped, Cole, Coloured, TwoLayers, scene
 from benchmarks.laboratory import CORNER, SCALE, Output
 from benchmarks.ladder import LOADS
@@ -92,30 +92,6 @@ def test_pulses_are_missing_double_late_or_at_their_usual_times(dry):
     # Two periods of 60.6 Hz are 66 samples shorter than two of 60 Hz.
     edges = [np.argmax(np.abs(np.diff(v[6000:]))) for v in (usual, off)]
     assert edges[0] - edges[1] == pytest.approx(66, abs=1)
-
-
-def test_spikes_and_noise_of_1_f_have_their_sizes():
-    time, rng = np.arange(20_000) / RATE, np.random.default_rng(0)
-    spike, pink = Spike(0.5, 5e-3)(time, rng), Pink(0.01)(time, rng)
-    assert spike.max() == pytest.approx(0.5, rel=1e-3)
-    assert np.count_nonzero(spike) == pytest.approx(1000, abs=2)
-    assert np.std(pink) == pytest.approx(0.01)
-    power = np.abs(np.fft.rfft(pink)) ** 2
-    # ten harmonics: exponential draws
-    assert power[1:11].mean() / power[1001:1011].mean() == pytest.approx(200, rel=0.8)
-
-
-def test_converters_round_and_files_may_say_what_is_not_true():
-    coarse, plain = (study(f"bits8_4V{of}").trials[0].recording(0) for of in ("", "_float"))
-    assert coarse.samples["v_out"].resolution == pytest.approx(8 / 256 / SCALE)
-    assert plain.samples["v_out"].resolution is None
-    np.testing.assert_allclose(plain.v_out, coarse.v_out, rtol=1e-12)
-    said, true = (study(of).trials[0].recording(0) for of in ("says_100kHz", "base"))
-    assert (said.sample_rate, true.sample_rate) == (100e3, 200e3)
-    np.testing.assert_array_equal(said.v_out, true.v_out)
-    assert study("says_98.8ohm").calibrations[0].recording(0).r_load == pytest.approx(98.8)
-    swapped = study("swapped").trials[0].recording(0)
-    np.testing.assert_array_equal(swapped.v_th, true.v_out)
 
 
 @pytest.mark.parametrize("name", LOADS)

@@ -102,13 +102,6 @@ def test_modules_and_their_tests_are_where_the_benchmark_looks_for_them():
             assert (ROOT / "tests" / f"test_{test}.py").exists()
 
 
-def test_tests_that_killed_a_mutant_nearby_come_first():
-    kills = ((7, "near"), (90, "far"), (90, "near"), (5, ""), (41, "between"))
-    rows = [{"module": "a", "place": f"etid/a.py:{n}", "killer": name} for n, name in kills]
-    rows.append({"module": "b", "place": "etid/b.py:10", "killer": "other"})
-    assert mutation.nearest(rows, "a", 10) == ["near", "between", "far"]
-
-
 def test_survivors_are_shown_and_the_table_tells_seed_and_commit(tmp_path, monkeypatch, capsys):
     row = {
         "key": "k", "module": "a", "place": "etid/a.py:7", "kind": "sign", "before": "-\\\n x",

@@ -94,27 +94,6 @@ def test_netlist_is_the_circuit_of_the_driver(load):
         np.testing.assert_allclose(response(text, frequency), expected[0], rtol=1e-9)
 
 
-def test_netlist_pulses_once_per_period_and_stops_at_the_end_of_one():
-    text = ngspice.netlist(TransformerDriver(), OpenLoad(), RATE)
-    _, _, pulse = text.splitlines()[1].partition("PULSE(")
-    low, high, delay, rise, fall, top, period = map(float, pulse.rstrip(")").split())
-    driver = TransformerDriver()
-    assert (low, high, delay, rise, fall) == (0, 4.2, driver.lead_in, driver.edge, driver.edge)
-    assert top + driver.edge == pytest.approx(driver.width, rel=1e-12)
-    assert period == 1 / RATE
-    run = next(line for line in text.splitlines() if line.startswith(".tran"))
-    _, stop, begin, _ = map(float, run.split()[1:])
-    assert stop * RATE == pytest.approx(round(stop * RATE), rel=1e-12)
-    assert (stop - begin) * RATE >= 2  # two periods to compare
-    assert begin > 0.09
-
-
-@pytest.mark.parametrize("edge", [0.0, 1e-3])
-def test_a_pulse_that_ngspice_would_change_is_refused(edge):
-    with pytest.raises(ValueError, match="0 < edge < width"):
-        ngspice.netlist(TransformerDriver(edge=edge), OpenLoad(), RATE)
-
-
 # --- what is done with its answer, without it -----------------------------------------------------
 
 
@@ -122,12 +101,6 @@ def raw_file(time, v):
     points = np.stack([time, v], axis=1)
     head = f"Title: x\nNo. Variables: 2\nNo. Points: {len(points)}\nVariables:\n\t0 time time\n"
     return head.encode() + b"\t1 v(o) voltage\nBinary:\n" + points.tobytes()
-
-
-@pytest.mark.parametrize("raw", [b"", b"Binary:\n", raw_file(np.arange(5.0), np.ones(5))[:-8]])
-def test_a_raw_file_that_is_not_whole_is_refused(raw):
-    with pytest.raises(ngspice.NgspiceError, match="time and at least one"):
-        ngspice.waveform(raw)
 
 
 @pytest.mark.parametrize("growth", [0.0, 1e-3])
@@ -146,29 +119,6 @@ def test_harmonics_of_uneven_steps_are_those_of_the_waveform(monkeypatch, growth
     expected = np.array([c.get(k, 0.0) for k in range(1, 11)])
     # spline through steps of 2 us: the seventh harmonic turns by 0.005 a step, to the fourth power
     np.testing.assert_allclose(found, expected, atol=1e-9)
-
-
-def test_the_recorder_is_that_of_the_scene(monkeypatch):
-    """From exact waveforms both sources make the same codes, with noise, delays and offsets."""
-    scene = ladder.rung("dry", samples=3_000, offset_rms=0.01)
-
-    def exact(netlist, pulse_rate, count):
-        f = pulse_rate * np.arange(1, count + 1)
-        load = {"98.8": ResistorLoad(98.8e3), "skin": ladder.LOADS["dry"]}.get(
-            "98.8" if "R o 0" in netlist else "skin" if "Cp x" in netlist else "", OpenLoad()
-        )
-        unloaded = pulse_rate * scene.driver.v_th_spectrum(f)
-        return unloaded * loading(load(f), scene.driver.z_th(f))
-
-    monkeypatch.setattr(ngspice, "harmonics", exact)
-    ours, theirs = ngspice.record(scene, 7), scene.simulate(7)
-    assert list(ours) == list(theirs)
-    for path in theirs:
-        assert ours[path].metadata == theirs[path].metadata
-        for name in ("v_th", "v_out"):
-            np.testing.assert_array_equal(
-                ours[path].samples[name].stored, theirs[path].samples[name].stored
-            )
 
 
 def test_ngspice_runs_once_per_circuit_and_load(monkeypatch):
