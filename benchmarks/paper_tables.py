@@ -98,8 +98,8 @@ def table_4(groups: Groups, truth: Truth) -> list[Row]:
         for i, name in enumerate(etid.SkinRC.names()):
             found = [experiments.errors(fits, truth)[name] for fits in some]
             means = np.array([errors.mean() for errors in found])
-            row = {"laboratory": laboratory, "method": method, "element": name}
-            row |= zip(("paper_error", "paper_scatter"), published.TABLE_4[name], strict=True)
+            row: Row = {"laboratory": laboratory, "method": method, "element": name}
+            row["paper_error"], row["paper_scatter"] = published.TABLE_4[name]
             row |= {"error": _mean(means), "between": _sd(means)}
             row["scatter"] = float(np.sqrt(_mean(errors.var(ddof=1) for errors in found)))
             row["stderr"] = _mean(_stderr_of_mean(fits, truth, i) for fits in some)
@@ -162,7 +162,9 @@ def show_fingertips(rows: Sequence[Row]) -> Table:
 def show_4(rows: Sequence[Row]) -> Table:
     """Table IV for the terminal: mean error / scatter within a study, and between studies."""
     paper = (f"±{error:g} / {scatter:g}" for error, scatter in published.TABLE_4.values())
-    lines = [("paper", "", *paper, "{} to {}".format(*published.RRSE), "", "")]
+    lines: list[tuple[str, ...]] = [
+        ("paper", "", *paper, "{} to {}".format(*published.RRSE), "", "")
+    ]
     for name, several in _by_group(rows).items():
         of = {row["element"]: row for row in several}
         cells = (

@@ -53,7 +53,7 @@ def test_harmonics_are_those_that_a_record_was_made_of_and_give_its_impedance():
 def test_elements_are_those_that_tustin_made_discrete():
     of = records.Period(np.ones(2), np.ones(2), 1e4, 1e6)
     b, a = scipy.signal.bilinear([R_S * R_P * C_P, R_S + R_P], [R_P * C_P, 1.0], of.fs)
-    found = records.elements(b[0] / of.unit, b[1] / of.unit, a[1], of)
+    found = records.elements(*(float(z) for z in (b[0] / of.unit, b[1] / of.unit, a[1])), of)
     np.testing.assert_allclose(found, TRUTH, rtol=ROUNDING)
 
 
@@ -101,7 +101,7 @@ def test_a_rival_recovers_a_skin_and_a_draw_that_fails_costs_itself_alone(easy):
 
 
 def test_a_rival_that_cannot_run_says_why(easy, tmp_path, monkeypatch):
-    def missing(name, of=easy, timeout=60.0, python=HERE):
+    def missing(name, of=easy, timeout=60.0, python: pathlib.Path | None = HERE):
         return rivals.run(name, of, 1, timeout, python=python).missing
 
     assert "not done after 0.01 s" in missing("scipy_lfilter", timeout=0.01)
