@@ -53,8 +53,8 @@ def test_harmonics_are_those_that_a_record_was_made_of_and_give_its_impedance():
 def test_elements_are_those_that_tustin_made_discrete():
     of = records.Period(np.ones(2), np.ones(2), 1e4, 1e6)
     b, a = scipy.signal.bilinear([R_S * R_P * C_P, R_S + R_P], [R_P * C_P, 1.0], of.fs)
-    found = records.elements(*(float(z) for z in (b[0] / of.unit, b[1] / of.unit, a[1])), of)
-    np.testing.assert_allclose(found, TRUTH, rtol=ROUNDING)
+    b_0, b_1, a_1 = (float(z) for z in (b[0] / of.unit, b[1] / of.unit, a[1]))
+    np.testing.assert_allclose(records.elements(b_0, b_1, a_1, of), TRUTH, rtol=ROUNDING)
 
 
 def test_residuals_vanish_at_the_truth_and_count_standard_errors():
