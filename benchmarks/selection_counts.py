@@ -61,7 +61,7 @@ def _laplace(fit: Fit, number: int) -> float:
         for one in (fit.circuit, USUAL[number]())
     )
     uniform = np.array([unit == "1" for unit in fit.circuit.units().values()])
-    if not (values > 0).all():
+    if not ((values > 0) & np.isfinite(values)).all():
         return math.inf
     sign, volume = np.linalg.slogdet(np.asarray(fit.cov) / np.outer(values, values))
     if not sign > 0:
