@@ -3,59 +3,46 @@
 import argparse
 import importlib
 import sys
+from collections.abc import Sequence
 
 import jax
 
 from benchmarks.ngspice import NgspiceError
+from benchmarks.rivals import RivalError
+from benchmarks.timing import pin
 
 NAMES = (
-    "spice",
-    "coverage",
-    "driver_order",
-    "delays",
-    "noise",
-    "selection",
-    "design",
-    "timing",
-    "speed",
-    "curves",
-    "scale",
-    "amplitudes",
-    "amplitude_errors",
-    "online",
-    "control",
-    "speed_accuracy",
-    "which",
-    "paper",
-    "failure_map",
-    "perturbations",
-    "spectra",
-    "rivals",
-    "referee",
-    "fuzz",
-    "mutation",
+    *("spice", "coverage", "driver_order", "delays", "noise", "selection", "design", "timing"),
+    *("speed", "curves", "scale", "amplitudes", "amplitude_errors", "online", "control"),
+    *("speed_accuracy", "which", "paper", "failure_map", "perturbations", "spectra", "rivals"),
+    *("referee", "fuzz", "mutation"),
 )
+PLACES = {"rivals": "rivals.table"}  # modules of other names
 
 
-def main() -> None:
-    """Run one benchmark; the exit status is 1 where it misses a target.
-
-    Each is a module with `add_arguments(parser)` and `main(arguments)`, which returns whether every
-    target is met; the first line of its docstring is its help.
-    """
-    jax.config.update("jax_enable_x64", True)
+def asked(argv: Sequence[str] | None = None) -> argparse.Namespace:
+    """The arguments of a command line; `module` is the benchmark that it names."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks", description=__doc__)
     commands = parser.add_subparsers(required=True)
     for name in NAMES:
-        module = importlib.import_module(f"benchmarks.{name}")
+        module = importlib.import_module(f"benchmarks.{PLACES.get(name, name)}")
         summary = (module.__doc__ or "").splitlines()[0]
         command = commands.add_parser(name, help=summary, description=module.__doc__)
-        module.add_arguments(command)
-        command.set_defaults(main=module.main)
-    arguments = parser.parse_args()
+        for add in module.OPTIONS:
+            add(command)
+        command.set_defaults(module=module)
+    return parser.parse_args(argv)
+
+
+def main() -> None:
+    """Run one benchmark; the exit status is 1 where it misses a target."""
+    jax.config.update("jax_enable_x64", True)
+    arguments = asked()
+    if getattr(arguments.module, "PINNED", False):
+        pin()
     try:
-        sys.exit(0 if arguments.main(arguments) else 1)
-    except NgspiceError as error:
+        sys.exit(0 if arguments.module.main(arguments) else 1)
+    except (NgspiceError, RivalError) as error:
         sys.exit(str(error))
 
 

@@ -17,7 +17,7 @@ from scipy.special import erf
 from scipy.stats import binom, chi2
 
 import etid
-from benchmarks.timing import pin
+from benchmarks.runner import option
 
 SLOWER = 8
 PULSE_RATE, SAMPLE_RATE, SAMPLES = 60.0, 20e3, 1000  # Hz, Hz; three periods
@@ -37,17 +37,11 @@ CHANCE = 1e-3
 
 
 class Draws(NamedTuple):
-    """Fits of one skin with different noise; one row for each, errors relative to the truth.
+    """Fits of one skin with different noise; one row for each, errors relative to the truth."""
 
-    Attributes:
-        successful: Number of fits with that verdict.
-        error: Errors of the elements.
-        stderr: Their standard errors, as the fits state them.
-    """
-
-    successful: int
-    error: np.ndarray
-    stderr: np.ndarray
+    successful: int  # number of fits with that verdict
+    error: np.ndarray  # errors of the elements
+    stderr: np.ndarray  # their standard errors, as the fits state them
 
     @property
     def right(self) -> np.ndarray:
@@ -165,14 +159,12 @@ def _parts(signals: np.ndarray) -> np.ndarray:
     return np.concatenate([of.real, of.imag])
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """How many fits."""
-    parser.add_argument("--draws", type=int, default=200, help="of each scene")
+PINNED = True
+OPTIONS = (option("--draws", default=200, help="of each scene"),)
 
 
 def main(arguments: argparse.Namespace) -> bool:
     """Print the table; whether every interval and error is right."""
-    pin()
     met = True
     for amplitudes, snr_db in SCENES:
         found = draws(amplitudes, snr_db, arguments.draws)

@@ -8,10 +8,6 @@ environment of its own (`.rivals`).
 """
 
 import argparse
-import os
-import pathlib
-import subprocess
-import tempfile
 import time
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -25,8 +21,8 @@ from scipy.interpolate import CubicSpline
 from scipy.special import erf
 
 import etid
-from benchmarks.rivals import ONE_THREAD, ROOT, make, python_of
-from benchmarks.timing import pin
+from benchmarks.rivals import exchange, make
+from benchmarks.runner import option
 from etid.circuits.current_dependent import Norton, Signals, port
 from etid.signals.transfer import as_complex, frequency_variable
 from etid.solvers.harmonic_balance import steady_state, to_harmonics, to_time
@@ -48,19 +44,13 @@ REPEATS = 7
 
 
 class Case(NamedTuple):
-    """One skin with its feed.
+    """One skin with its feed."""
 
-    Attributes:
-        name: As the table shows it.
-        skin: The skin.
-        v_th: Fourier coefficients of V_th from c₀ on [V]; None under a current source.
-        samples: Number of samples of a period.
-    """
-
-    name: str
-    skin: etid.SkinCurrent
+    name: str  # as the table shows it
+    skin: etid.SkinCurrent  # the skin
+    # fourier coefficients of V_th from c₀ on [V]; None under a current source
     v_th: np.ndarray | None
-    samples: int
+    samples: int  # number of samples of a period
 
     @property
     def t(self) -> np.ndarray:
@@ -157,12 +147,7 @@ def reference(case: Case) -> np.ndarray:
 def balanced(
     case: Case, finer: int
 ) -> Callable[[Float[Array, " element"]], Float[Array, " sample"]]:
-    """The same by harmonic balance, as a function of the logarithms of the elements.
-
-    Args:
-        case: Skin and feed.
-        finer: Points per sample.
-    """
+    """The same by harmonic balance, as a function of the logarithms of the elements."""
     points = finer * case.samples
     t = np.arange(points) / points / PULSE_RATE
     frequency = jnp.arange(points // 2 + 1.0).at[0].set(1e-6) * PULSE_RATE
@@ -188,10 +173,9 @@ def balanced(
 
 def by_balance(case: Case, truth: np.ndarray, finer: int) -> Line:
     """Harmonic balance, timed."""
-    logs = case.skin.log_values()
+    logs, function = case.skin.log_values(), jax.jit(balanced(case, finer))
     first, seconds = 0.0, list[float]()
-    function = balanced(case, finer)
-    for call in (jax.jit(function), jax.jit(jax.jacfwd(function))):
+    for call in (function, jax.jit(jax.jacfwd(function))):
         begin = time.perf_counter()
         jax.block_until_ready(call(logs))
         first += time.perf_counter() - begin
@@ -201,16 +185,13 @@ def by_balance(case: Case, truth: np.ndarray, finer: int) -> Line:
             jax.block_until_ready(call(logs))
             runs.append(time.process_time() - begin)
         seconds.append(float(np.median(runs)))
-    error = _error(np.asarray(jax.jit(function)(logs)), truth)
+    error = _error(np.asarray(function(logs)), truth)
     alone, with_slopes = seconds
     return Line(f"harmonic balance, {finer} points per sample", error, alone, with_slopes, first)
 
 
 def by_diffrax(
-    case: Case,
-    truth: np.ndarray,
-    python: pathlib.Path,
-    settings: tuple[tuple[str, float], ...] = SETTINGS,
+    case: Case, truth: np.ndarray, settings: tuple[tuple[str, float], ...] = SETTINGS
 ) -> list[Line]:
     """The same by diffrax with each setting, timed in a process of its own."""
     given: dict[str, Any] = {
@@ -225,16 +206,7 @@ def by_diffrax(
     else:
         given |= {"periods": 2, "v_th": case.fine(KNOWN)}
         given |= {"resistance": RESISTANCE, "inductance": INDUCTANCE}
-    # Compilation counts, so that no cache may serve it.
-    environment = {**os.environ, **ONE_THREAD, "JAX_ENABLE_COMPILATION_CACHE": "0"}
-    with tempfile.TemporaryDirectory() as folder:
-        problem, result = pathlib.Path(folder, "problem.npz"), pathlib.Path(folder, "result.npz")
-        np.savez(problem, **given)
-        subprocess.run(
-            [python, "-m", WORKER, problem, result], cwd=ROOT, env=environment, check=True
-        )
-        with np.load(result) as file:
-            found = {name: file[name] for name in file.files}
+    found = exchange(ENVIRONMENT, WORKER, **given)
     return [
         Line(f"diffrax, {method}, {tolerance:g}", _error(voltage, truth), *map(float, times))
         for (method, tolerance), voltage, *times in zip(
@@ -250,14 +222,12 @@ def _error(voltage: np.ndarray, truth: np.ndarray) -> float:
     return float(np.abs(voltage - truth).max() / np.abs(truth).max())
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """How finely a period is sampled."""
-    parser.add_argument("--samples", type=int, default=SAMPLES, help="of a period of 1/60 s")
+PINNED = True
+OPTIONS = (option("--samples", default=SAMPLES, help="of a period of 1/60 s"),)
 
 
 def main(arguments: argparse.Namespace) -> bool:
     """Print both tables; whether diffrax could be run."""
-    pin()
     jax.config.update("jax_enable_compilation_cache", False)
     missing = make(ENVIRONMENT)
     print(f"{'':<40}error / peak  alone ms  with derivatives ms  compilation s")
@@ -265,9 +235,7 @@ def main(arguments: argparse.Namespace) -> bool:
         print(case.name)
         truth = reference(case)
         lines = [by_balance(case, truth, finer) for finer in FINER]
-        if not missing:
-            lines += by_diffrax(case, truth, python_of(ENVIRONMENT))
-        for one in lines:
+        for one in lines + ([] if missing else by_diffrax(case, truth)):
             print(
                 f"  {one.solver:<38}{one.error:<14.1e}{1e3 * one.seconds:<10.3g}"
                 f"{1e3 * one.with_slopes:<21.3g}{one.compilation:.1f}",

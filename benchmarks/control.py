@@ -27,6 +27,7 @@ import argparse
 import dataclasses
 import pathlib
 from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -39,16 +40,17 @@ import etid
 from benchmarks import control_hazards, ngspice
 from benchmarks.charts import INK, new_figure, save
 from benchmarks.control_plant import OPEN, Plant, Response
+from benchmarks.ladder import TWO
 from benchmarks.provenance import RESULTS, write_csv
+from benchmarks.runner import option
 from etid.estimators.unknowns import LoadUnknowns
 from etid.online.state import ElectrodeState, TrackerState
 from etid.plotting.style import BLUE, RED
-from etid.simulation.published import REFERENCE, TYPICAL
-from etid.simulation.scenes import Scene, Trial
+from etid.simulation.published import TYPICAL
+from etid.simulation.scenes import Scene
 from etid.simulation.transformer import ResistorLoad, SkinLoad
 from etid.solvers.matrices import inverse_of_few
 
-DRY, DAMP = TYPICAL["dry"], TYPICAL["damp"]
 WANTED = 80e-9  # [C] per phase
 CAP = 5e-3  # [A]
 FALLBACK = 0.3  # of the amplitude of the unloaded record
@@ -68,26 +70,32 @@ STYLES = {
     "integral": (":", INK),
     "model reference": ((0, (4, 1)), "#8e44ad"),
 }
+TITLES = {
+    "dry": "dry",
+    "wetting": "wetting within 100 ms",
+    "sweating": "sweating slowly",
+    "lifted": "lifted off and put back",
+}
 NOISIER = "#f39c12"  # of etid with more noise
 
 Command = Callable[[int, np.ndarray, np.ndarray, np.ndarray], np.ndarray]
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Size, noise, where the picture goes."""
-    parser.add_argument("--electrodes", type=int, default=98)
-    parser.add_argument("--pulses", type=int, default=120)
-    parser.add_argument("--snr", type=float, nargs="+", default=[60.0, 40.0], help="dB")
-    parser.add_argument("--hazard-electrodes", type=int, default=96)
-    parser.add_argument("--hazard-pulses", type=int, default=5210)
-    parser.add_argument("-o", "--output", type=pathlib.Path, default=RESULTS / "control.svg")
+OPTIONS = (
+    option("--electrodes", default=98),
+    option("--pulses", default=120),
+    option("--snr", default=(60.0, 40.0), help="dB"),
+    option("--hazard-electrodes", default=96),
+    option("--hazard-pulses", default=5210),
+    option("-o", "--output", type=pathlib.Path, default=RESULTS / "control.svg"),
+)
 
 
 def main(arguments: argparse.Namespace) -> bool:
     """Print the errors of all controllers and draw them; whether etid meets the targets."""
     met = hazards(arguments)
     fingertip = Fingertip(arguments.electrodes, arguments.pulses)
-    runs = {}
+    runs: dict[str, Run] = {}
     known: dict[SkinLoad | ResistorLoad, Response] = {}
     for snr in arguments.snr:
         loop = Loop(fingertip, snr, known)
@@ -95,8 +103,8 @@ def main(arguments: argparse.Namespace) -> bool:
         if not runs:
             found |= {name: loop.blind(one) for name, one in rivals(loop).items()}
         for name, run in found.items():
-            print(f"{snr:g} dB  {name:<20}{report(run, fingertip)}", flush=True)
-        met &= good(found["etid"], fingertip)
+            print(f"{snr:g} dB  {name:<20}{run.text(fingertip.counts)}", flush=True)
+        met &= found["etid"].met(fingertip.counts)
         runs |= {f"{name}, {snr:g} dB": run for name, run in found.items()}
     draw(runs, fingertip, arguments.output)
     return met
@@ -117,62 +125,62 @@ def hazards(arguments: argparse.Namespace) -> bool:
 
 
 class Fingertip:
-    """The skin at each electrode and pulse.
-
-    Args:
-        electrodes: Number of electrodes.
-        pulses: Number of pulses.
-    """
+    """The skin at each electrode and pulse."""
 
     def __init__(self, electrodes: int, pulses: int) -> None:
-        rng = np.random.default_rng(0)
-        spots = np.exp(SPREAD * rng.standard_normal((SPOTS, 3)))
-        self.kinds = ["dry", "wetting", "sweating"]
-        self.kind = [self.kinds[at % 3] for at in range(electrodes)]
-        self.kind[-1] = "lifted"
-        dry, damp = (np.array(dataclasses.astuple(one)) for one in (DRY, DAMP))
-        self.loads: list[list[SkinLoad | ResistorLoad]] = []
-        changed = np.zeros((pulses, electrodes), bool)
-        changed[0] = True
-        begin = 30 + 3 * (np.arange(electrodes) // 3 % 4)
-        for pulse in range(pulses):
-            row: list[SkinLoad | ResistorLoad] = []
-            for at, kind in enumerate(self.kind):
-                # Fewer places sweat: each pulse of them is another run of ngspice.
-                spot, wet = spots[at // 3 % (2 if kind == "sweating" else SPOTS)], 0.0
-                if kind == "wetting":
-                    wet = np.clip((pulse - begin[at] + 1) / WETTING, 0, 1)
-                    changed[pulse, at] |= begin[at] <= pulse < begin[at] + WETTING
-                if kind == "sweating":  # a third of the way to damp skin
-                    wet = pulse / pulses / 3
-                values = spot * dry ** (1 - wet) * damp**wet
-                lifted = kind == "lifted" and LIFTED <= pulse < BACK
-                row.append(OPEN if lifted else SkinLoad(*map(float, values)))
-                if kind == "lifted":
-                    changed[pulse, at] |= LIFTED <= pulse <= BACK
-            self.loads.append(row)
+        spots = np.exp(SPREAD * np.random.default_rng(0).standard_normal((SPOTS, 3)))
+        dry, damp = (np.array(dataclasses.astuple(TYPICAL[name])) for name in ("dry", "damp"))
+        pulse, at = np.arange(pulses)[:, None], np.arange(electrodes)
+        kind = np.array(list(TITLES))[at % 3]
+        kind[-1] = "lifted"
+        self.kind = kind.tolist()
+        begin, wetting, sweating = 30 + 3 * (at // 3 % 4), kind == "wetting", kind == "sweating"
+        wet = np.where(wetting, np.clip((pulse - begin + 1) / WETTING, 0, 1), 0.0)
+        wet = np.where(sweating, pulse / pulses / 3, wet)[..., None]  # a third of the way to damp
+        # Fewer places sweat: each pulse of them is another run of ngspice.
+        values = spots[at // 3 % np.where(sweating, 2, SPOTS)] * dry ** (1 - wet) * damp**wet
+        lifted = (kind == "lifted") & (pulse >= LIFTED)
+        self.loads: list[list[SkinLoad | ResistorLoad]] = [
+            [OPEN if up else SkinLoad(*map(float, of)) for up, of in zip(*row, strict=True)]
+            for row in zip(lifted & (pulse < BACK), values, strict=True)
+        ]
         # Pulses that count: neither a change nor one of the two pulses that follow it.
-        after = changed.copy()
+        changed = (pulse == 0) | (wetting & (begin <= pulse) & (pulse < begin + WETTING))
+        changed |= lifted & (pulse <= BACK)
+        self.counts = ~changed
         for later in range(1, SETTLED + 1):
-            after[later:] |= changed[:-later]
-        self.counts = ~after
+            self.counts[later:] &= ~changed[:-later]
 
 
-@dataclasses.dataclass(frozen=True)
-class Run:
-    """What a controller has delivered (pulse, electrode).
+class Run(NamedTuple):
+    """What a controller has delivered; all are (pulse, electrode)."""
 
-    Attributes:
-        charge: Charge in the phase [C].
-        peak: Largest current [A].
-        fallback: Whether the amplitude was the fallback.
-        allowed: Probability that noise alone misses the target.
-    """
+    charge: np.ndarray  # charge in the phase [C]
+    peak: np.ndarray  # largest current [A]
+    fallback: np.ndarray  # whether the amplitude was the fallback
+    allowed: np.ndarray  # probability that noise alone misses the target
 
-    charge: Float[np.ndarray, "pulse lane"]
-    peak: Float[np.ndarray, "pulse lane"]
-    fallback: Float[np.ndarray, "pulse lane"]
-    allowed: Float[np.ndarray, "pulse lane"]
+    def errors(self, counts: np.ndarray) -> np.ndarray:
+        """Relative errors of the charge of the pulses that count."""
+        return np.abs(self.charge / WANTED - 1)[counts]
+
+    def text(self, counts: np.ndarray) -> str:
+        """One line: errors, the largest current, commands from a failed fit."""
+        error = self.errors(counts)
+        return (
+            f"median {np.median(error):7.2%}  p99 {np.percentile(error, 99):7.2%}  worst "
+            f"{error.max():7.2%}  within {TARGET:.0%}: {np.mean(error <= TARGET):6.1%}  missed "
+            f"{np.sum(error > TARGET)} of {error.size} (noise alone "
+            f"{self.allowed[counts].sum():.1f})  largest charge "
+            f"{self.charge.max() / WANTED:.1f} times the wanted, current "
+            f"{1e3 * self.peak.max():.2f} mA  fallback {np.mean(self.fallback & counts):.2%}"
+        )
+
+    def met(self, counts: np.ndarray) -> bool:
+        """Whether the charge misses the target no more often than by noise, and the cap holds."""
+        missed, allowed = np.sum(self.errors(counts) > TARGET), self.allowed[counts].sum()
+        # Three standard deviations of the number of rare independent events.
+        return bool(missed <= allowed + 3 * np.sqrt(allowed) and self.peak.max() <= CAP)
 
 
 class Loop:
@@ -191,11 +199,9 @@ class Loop:
         known: dict[SkinLoad | ResistorLoad, Response],
     ) -> None:
         self.fingertip, self.known = fingertip, known
-        resistors = enumerate((REFERENCE, 21.62e3))
-        calibration = tuple(Trial(f"calibration/{i}", ResistorLoad(r)) for i, r in resistors)
-        self.scene = Scene((), calibration, samples=40_000, snr_db=snr, trigger_jitter_rms=100e-9)
+        self.scene = Scene((), TWO, samples=40_000, snr_db=snr, trigger_jitter_rms=100e-9)
         self.lanes = len(fingertip.kind)
-        self.typical = Plant(self.scene, 0, known).response(DRY)
+        self.typical = Plant(self.scene, 0, known).response(TYPICAL["dry"])
 
     def etid(self) -> Run:
         """The tracker and the controller."""
@@ -236,22 +242,16 @@ def rivals(loop: Loop) -> dict[str, Command]:
     held = loop.typical.mean * nominal
     gain, model = np.full(loop.lanes, nominal / WANTED), np.zeros(loop.lanes)
 
-    def voltage(pulse: int, amplitude: np.ndarray, charge: np.ndarray, v: np.ndarray) -> np.ndarray:
+    def voltage(_: int, amplitude: np.ndarray, charge: np.ndarray, v: np.ndarray) -> np.ndarray:
         return amplitude * held / v
 
-    def constant(
-        pulse: int, amplitude: np.ndarray, charge: np.ndarray, v: np.ndarray
-    ) -> np.ndarray:
+    def constant(pulse: int, amplitude: np.ndarray, charge: np.ndarray, _: Any) -> np.ndarray:
         return amplitude * WANTED / charge if pulse == 9 else amplitude
 
-    def integral(
-        pulse: int, amplitude: np.ndarray, charge: np.ndarray, v: np.ndarray
-    ) -> np.ndarray:
+    def integral(_: int, amplitude: np.ndarray, charge: np.ndarray, v: Any) -> np.ndarray:
         return np.maximum(amplitude + GAIN * (WANTED - charge) / loop.typical.charge[0], 0.0)
 
-    def adaptive(
-        pulse: int, amplitude: np.ndarray, charge: np.ndarray, v: np.ndarray
-    ) -> np.ndarray:
+    def adaptive(_: int, amplitude: np.ndarray, charge: np.ndarray, v: Any) -> np.ndarray:
         model[:] = REFERENCE_POLE * model + (1 - REFERENCE_POLE) * WANTED
         normal = ADAPTATION * model / (WANTED**2 + charge**2)
         gain[:] = np.maximum(gain - normal * (charge - model) * nominal / WANTED, 0.0)
@@ -287,43 +287,11 @@ def missing(
     return np.nan_to_num(sum(scipy.special.ndtr(tail) for tail in tails))
 
 
-def errors(run: Run, fingertip: Fingertip) -> Float[np.ndarray, " counted"]:
-    """Relative errors of the charge from the third pulse after a change on."""
-    return np.abs(run.charge / WANTED - 1)[fingertip.counts]
-
-
-def report(run: Run, fingertip: Fingertip) -> str:
-    """One line: errors, the largest current, commands from a failed fit."""
-    error = errors(run, fingertip)
-    return (
-        f"median {np.median(error):7.2%}  p99 {np.percentile(error, 99):7.2%}  worst "
-        f"{error.max():7.2%}  within {TARGET:.0%}: {np.mean(error <= TARGET):6.1%}  missed "
-        f"{np.sum(error > TARGET)} of {error.size} (noise alone "
-        f"{run.allowed[fingertip.counts].sum():.1f})  largest charge "
-        f"{run.charge.max() / WANTED:.1f} times the wanted, current {1e3 * run.peak.max():.2f} mA  "
-        f"fallback {np.mean(run.fallback & fingertip.counts):.2%}"
-    )
-
-
-def good(run: Run, fingertip: Fingertip) -> bool:
-    """Whether the charge misses the target no more often than by noise, and the cap holds."""
-    missed = np.sum(errors(run, fingertip) > TARGET)
-    allowed = run.allowed[fingertip.counts].sum()
-    # Three standard deviations of the number of rare independent events.
-    return bool(missed <= allowed + 3 * np.sqrt(allowed) and run.peak.max() <= CAP)
-
-
 def draw(runs: dict[str, Run], fingertip: Fingertip, path: pathlib.Path) -> None:
     """Charge against pulse: one panel for each kind of skin, one line for each controller."""
-    kinds = {
-        "dry": "dry",
-        "wetting": "wetting within 100 ms",
-        "sweating": "sweating slowly",
-        "lifted": "lifted off and put back",
-    }
-    figure, grid = new_figure(len(kinds), 1, (7.2, 8.0), sharex=True)
+    figure, grid = new_figure(len(TITLES), 1, (7.2, 8.0), sharex=True)
     panels = grid[:, 0]
-    for panel, (kind, title) in zip(panels, kinds.items(), strict=True):
+    for panel, (kind, title) in zip(panels, TITLES.items(), strict=True):
         at = fingertip.kind.index(kind)
         for name, run in runs.items():
             plain = name.split(",", maxsplit=1)[0]

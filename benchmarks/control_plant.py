@@ -26,19 +26,13 @@ CORNER = 0.4  # of the sample rate, of the 4th-order Butterworth anti-alias filt
 
 @dataclasses.dataclass(frozen=True)
 class Response:
-    """One skin, a pulse of unit amplitude: this period, and what it leaves to the next.
+    """One skin, a pulse of unit amplitude: this period, and what it leaves to the next."""
 
-    Attributes:
-        voltage: Terminal voltage after the anti-alias filter [V] by time from the start [s].
-        charge: Charge in the phase, of the pulse and of the pulse before [C].
-        peak: Largest current of either sign [A].
-        mean: Mean terminal voltage in the phase [V].
-    """
-
+    # terminal voltage after the anti-alias filter [V] by time from the start [s]
     voltage: scipy.interpolate.CubicSpline
-    charge: Float[np.ndarray, " 2"]
-    peak: float
-    mean: float
+    charge: Float[np.ndarray, " 2"]  # charge in the phase, of the pulse and of the pulse before [C]
+    peak: float  # largest current of either sign [A]
+    mean: float  # mean terminal voltage in the phase [V]
 
 
 class Plant:
@@ -102,13 +96,7 @@ class Plant:
         amplitude: Float[np.ndarray, " lane"],
         before: Float[np.ndarray, " lane"],
     ) -> tuple[Float[np.ndarray, " lane"], Float[np.ndarray, " lane"], Float[np.ndarray, " lane"]]:
-        """True charge [C], largest current [A] and mean voltage in the phase [V] of a pulse.
-
-        Args:
-            loads: The skin at each electrode.
-            amplitude: Relative amplitudes of this pulse.
-            before: Those of the pulse before.
-        """
+        """True charge [C], largest current [A] and mean voltage in the phase [V] of a pulse."""
         found = [self.response(load) for load in loads]
         charge = np.array([one.charge for one in found])
         q = charge[:, 0] * amplitude + charge[:, 1] * before

@@ -8,7 +8,7 @@ import argparse
 import functools
 import pathlib
 import tempfile
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any
 
 import jax
@@ -21,11 +21,13 @@ from benchmarks import charts, peers, scale
 from benchmarks.large_file import large_file
 from benchmarks.problem import START, Problem, harmonics, problem, problem_of, terms
 from benchmarks.provenance import write_csv
-from benchmarks.timing import first_and_warm, pin
+from benchmarks.runner import QUICK, option
+from benchmarks.timing import median_time, pin
 from etid.estimators.maximum_likelihood.load_fit import WELL
 from etid.signals.filtering import lfilter
 from etid.solvers.levenberg_marquardt import normal_equations
 
+OPTIONS = (QUICK, option("--folder", default=pathlib.Path(), type=pathlib.Path))
 SAMPLES = (1_000, 3_000, 10_000, 30_000, 100_000, 300_000, 1_000_000)
 LANES = (1, 4, 16, 64, 256, 1_024, 10_000, 100_000)
 WORKERS = (1, 2)
@@ -36,20 +38,30 @@ PULSE_RATE = 60.0  # [Hz]
 NOISE = 1e-3  # of the effective value
 BENT = 0.25  # change of slope that is marked in the table
 RECORDINGS = 2_000  # for the workers
+AXES = {
+    "samples": ("samples of a record", "seconds per record"),
+    "lanes": ("recordings in a batch", "seconds per recording"),
+    "workers": ("worker processes", "seconds per recording of a file"),
+}
+
+Row = dict[str, Any]
+
+
+def _row(against: str, what: str, number: int, seconds: float) -> Row:
+    return {"against": against, "what": what, "number": number, "seconds": seconds}
 
 
 def seconds(call: Callable[[], Any]) -> float:
     """Median time of a call after a first one, of as many as need not take long."""
-    once = first_and_warm(call, 1)[1]
+    once = median_time(call, 1)
     repeats = int(min(20, ENOUGH / max(once, 1e-9)))
-    return first_and_warm(call, repeats)[1] if repeats > 1 else once
+    return median_time(call, repeats) if repeats > 1 else once
 
 
 def calls(one: Problem) -> dict[str, Callable[[], Any]]:
     """What is measured against the number of samples, of a single record."""
     first = jax.tree.map(lambda leaf: leaf[0], one.lanes)
-    v = jnp.asarray(one.records[0].v_th)
-    b, a, start = jnp.asarray(peers.B), jnp.asarray(peers.A), jnp.asarray(START)
+    b, a, start, v = map(jnp.asarray, (peers.B, peers.A, START, one.records[0].v_th))
     forward = jax.jit(lambda b, v: lfilter(b, a, v)[0])
     gradient = jax.jit(jax.grad(lambda b, v: jnp.sum(lfilter(b, a, v)[0] ** 2)))
 
@@ -84,54 +96,45 @@ def stretched(one: Problem, size: int) -> Problem:
     return problem_of(etid.Study.from_recordings([record]), one.driver)
 
 
-def against_samples(sizes: Sequence[int]) -> Iterable[dict[str, Any]]:
+def against_samples(sizes: Sequence[int]) -> Iterator[Row]:
     """Seconds per record; the records hold three pulse periods, at ever higher rates."""
     base = problem(10_000, 1)
     for size in sizes:
         for name, call in calls(stretched(base, size)).items():
-            yield {"against": "samples", "what": name, "number": size, "seconds": seconds(call)}
+            yield _row("samples", name, size, seconds(call))
 
 
-def against_lanes(counts: Sequence[int]) -> Iterable[dict[str, Any]]:
+def against_lanes(counts: Sequence[int]) -> Iterator[Row]:
     """Seconds per lane of a batch, from recordings in memory to fits."""
-    records = problem(5_000, 16, 100e3)
-    loaded, given = records.records, records.driver
-    drivers: dict[str, etid.Driver] = {
-        "maximum_likelihood": given,
-        "equation_error": etid.identify_driver(
-            records.study["calibration/0"], method="equation_error", throw=False
-        ),
-    }
-    for method, driver in drivers.items():
+    of, method = problem(5_000, 16, 100e3), "equation_error"
+    quick = etid.identify_driver(of.study["calibration/0"], method=method, throw=False)
+    for name, driver in {"maximum_likelihood": of.driver, method: quick}.items():
         each = 0.0
         for count in counts:
             if each * count > LIMIT:
                 break
-            many = (loaded * (count // len(loaded) + 1))[:count]
-            fit = functools.partial(etid.identify_skins, many, driver, method=method)
+            many = (of.records * (count // len(of.records) + 1))[:count]
+            fit = functools.partial(etid.identify_skins, many, driver, method=name)
             each = seconds(lambda fit=fit: fit().chi2) / count
-            yield {"against": "lanes", "what": method, "number": count, "seconds": each}
+            yield _row("lanes", name, count, each)
 
 
-def against_workers(folder: pathlib.Path, recordings: int) -> Iterable[dict[str, Any]]:
+def against_workers(folder: pathlib.Path, recordings: int) -> Iterator[Row]:
     """Seconds per recording of a file, by processes with a core each."""
-    part = max(1, recordings // 16)
-    plan = scale.Plan(folder, recordings, part, (), None)
+    plan = scale.Plan(folder, recordings, max(1, recordings // 16), (), None)
     large_file(folder, recordings, "contiguous")
     for method in (None, "equation_error"):
         for workers in WORKERS:
             found = scale.measured(folder, scale.fit_job(plan, "contiguous", method, workers))
-            name = method or "maximum_likelihood"
             each = found["seconds"] / recordings
-            yield {"against": "workers", "what": name, "number": workers, "seconds": each}
+            yield _row("workers", method or "maximum_likelihood", workers, each)
 
 
-def with_slopes(rows: Iterable[dict[str, Any]]) -> Iterable[dict[str, Any]]:
+def with_slopes(rows: Iterable[Row]) -> Iterator[Row]:
     """The same with the slope from the row before of the same curve, NaN at its begin."""
-    before: dict[tuple[str, str], dict[str, Any]] = {}
+    before: dict[tuple[str, str], Row] = {}
     for row in rows:
-        last = before.get((row["against"], row["what"]))
-        slope, bent = np.nan, False
+        last, slope, bent = before.get((row["against"], row["what"])), np.nan, False
         if last is not None:
             run = np.log(row["number"] / last["number"])
             slope = float(np.log(row["seconds"] / last["seconds"]) / run)
@@ -140,28 +143,17 @@ def with_slopes(rows: Iterable[dict[str, Any]]) -> Iterable[dict[str, Any]]:
         yield row
 
 
-def draw(rows: Sequence[dict[str, Any]], path: pathlib.Path) -> None:
+def draw(rows: Sequence[Row], path: pathlib.Path) -> None:
     """One panel per number, legible without colours."""
-    titles = {
-        "samples": ("samples of a record", "seconds per record"),
-        "lanes": ("recordings in a batch", "seconds per recording"),
-        "workers": ("worker processes", "seconds per recording of a file"),
-    }
     figure, panels = charts.new_figure(1, 3, (11.0, 4.2))
-    for axes, (against, (across, up)) in zip(panels[0], titles.items(), strict=True):
+    for axes, (against, (across, up)) in zip(panels[0], AXES.items(), strict=True):
         of = [row for row in rows if row["against"] == against]
         for style, name in enumerate(dict.fromkeys(row["what"] for row in of)):
-            curve = [row for row in of if row["what"] == name]
+            curve = [(row["number"], row["seconds"]) for row in of if row["what"] == name]
             axes.loglog(
-                [row["number"] for row in curve],
-                [row["seconds"] for row in curve],
-                color=charts.INK,
-                linestyle=charts.DASHES[style],
-                marker=charts.MARKS[style],
-                markersize=4,
-                linewidth=1,
-                label=name,
-            )
+                *zip(*curve, strict=True), color=charts.INK, linestyle=charts.DASHES[style],
+                marker=charts.MARKS[style], markersize=4, linewidth=1, label=name,
+            )  # fmt: skip
         if against == "workers":
             axes.set_xticks(WORKERS, labels=map(str, WORKERS), minor=False)
             axes.minorticks_off()
@@ -170,7 +162,7 @@ def draw(rows: Sequence[dict[str, Any]], path: pathlib.Path) -> None:
     charts.save(figure, path)
 
 
-def _all(quick: bool) -> Iterable[dict[str, Any]]:
+def _all(quick: bool) -> Iterator[Row]:
     # Workers come first: once this process has a core, its children have no other.
     with tempfile.TemporaryDirectory() as files:
         yield from against_workers(pathlib.Path(files), 64 if quick else RECORDINGS)
@@ -179,31 +171,16 @@ def _all(quick: bool) -> Iterable[dict[str, Any]]:
     yield from against_lanes(LANES[:3] if quick else LANES)
 
 
-def run(quick: bool, folder: pathlib.Path) -> None:
-    """Measure, print, and write `curves.csv` and `curves.svg` into `folder`."""
-    print(f"{'against':<9}{'what':<36}{'number':>9}{'ms each':>12}{'slope':>8}")
+def main(arguments: argparse.Namespace) -> bool:
+    """Measure, print, and write `curves.csv` and `curves.svg`."""
     table = []
-    for row in with_slopes(_all(quick)):
+    for row in with_slopes(_all(arguments.quick)):
         table.append(row)
-        bends = "  bends" if row["bent"] else ""
         print(
-            f"{row['against']:<9}{row['what']:<36}{row['number']:>9}"
-            f"{1e3 * row['seconds']:12.4f}{row['slope']:8.2f}{bends}",
+            f"{row['against']:<9}{row['what']:<36}{row['number']:>9}{1e3 * row['seconds']:12.4f} ms"
+            f"  slope {row['slope']:.2f}{'  bends' if row['bent'] else ''}",
             flush=True,
         )
-    write_csv(folder / "curves.csv", table)
-    draw(table, folder / "curves.svg")
-
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Size of the run."""
-    parser.add_argument("--quick", action="store_true", help="small numbers only")
-    parser.add_argument(
-        "--folder", type=pathlib.Path, default=pathlib.Path(), help="of curves.csv and curves.svg"
-    )
-
-
-def main(arguments: argparse.Namespace) -> bool:
-    """Run the command."""
-    run(arguments.quick, arguments.folder)
+    write_csv(arguments.folder / "curves.csv", table)
+    draw(table, arguments.folder / "curves.svg")
     return True

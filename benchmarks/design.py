@@ -17,14 +17,15 @@ from etid.simulation.published import REFERENCE
 from etid.simulation.scenes import Scene, Trial
 from etid.simulation.transformer import ResistorLoad, TransformerDriver
 
+OPTIONS = ()
 DUTY = 0.04  # the paper's
 DURATION = 0.05  # [s] of a record
 RATES = (20.0, 40.0, 60.0, 100.0, 200.0, 400.0, 1000.0, 2000.0)  # [Hz]
 NOISE = 10e-3  # [V] at the terminal, 60 dB below the paper's pulse
 
 
-def scene(pulse_rate: float, load: str) -> Scene:
-    """One trial with a pulse of the same peak and charge per second."""
+def error(pulse_rate: float, load: str) -> dict[str, float]:
+    """Relative bounds of the elements, by a pulse of the same peak and charge per second."""
     pulse = dataclasses.replace(
         TransformerDriver(), width=DUTY / pulse_rate, lead_in=min(120e-6, 0.2 / pulse_rate)
     )
@@ -37,23 +38,18 @@ def scene(pulse_rate: float, load: str) -> Scene:
         bits=None,
     )
     # The same noise in volts for all: signal-to-noise is relative to the effective value.
-    wave = made.waveform()
-    effective = np.sqrt(2 * np.sum(np.abs(wave.v_th) ** 2))
-    return dataclasses.replace(made, snr_db=float(20 * np.log10(effective / NOISE)))
+    effective = np.sqrt(2 * np.sum(np.abs(made.waveform().v_th) ** 2))
+    made = dataclasses.replace(made, snr_db=float(20 * np.log10(effective / NOISE)))
+    return etid.bound(made)[load].relative
 
 
-def error(pulse_rate: float, load: str) -> dict[str, float]:
-    """Relative bounds of the elements."""
-    return etid.bound(scene(pulse_rate, load))[load].relative
-
-
-def run() -> None:
+def main(arguments: argparse.Namespace) -> bool:
     """Print the bounds over the rate, and the rate that is best for R_s."""
+    del arguments
     for load in LOADS:
         print(f"{load}: bounds in % of r_s, r_p, c_p")
         for rate in RATES:
-            found = error(rate, load)
-            text = "".join(f"{100 * value:9.3f}" for value in found.values())
+            text = "".join(f"{100 * value:9.3f}" for value in error(rate, load).values())
             print(f"  {rate:6.0f} Hz, {1e6 * DUTY / rate:7.1f} us{text}")
         # SciPy has no types: what is inferred for its result depends on what else is checked.
         best: Any = scipy.optimize.minimize_scalar(
@@ -62,21 +58,9 @@ def run() -> None:
             method="bounded",
             options={"xatol": 1e-2},
         )
-        rate = float(np.exp(best.x))
-        gain = error(60.0, load)["r_s"] / best.fun
+        rate, gain = float(np.exp(best.x)), error(60.0, load)["r_s"] / best.fun
         print(
             f"  best for r_s: {rate:.0f} Hz, {1e6 * DUTY / rate:.0f} us: {100 * best.fun:.3f} %, "
             f"{gain:.2f} times better than 60 Hz"
         )
-
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """None."""
-    del parser
-
-
-def main(arguments: argparse.Namespace) -> bool:
-    """Run the command."""
-    del arguments
-    run()
     return True

@@ -14,19 +14,12 @@ ROUNDS = 60  # of a fixed point that gains a factor of 1.5 at least
 
 @dataclasses.dataclass(frozen=True)
 class Hum:
-    """A sine, and its harmonics at a third of its amplitude each.
+    """A sine, and its harmonics at a third of its amplitude each."""
 
-    Args:
-        frequency: Of the sine [Hz].
-        amplitude: At the converter [V].
-        harmonics: Multiples of the frequency that come with it.
-        phase: In turns; drawn for each record if it is None.
-    """
-
-    frequency: float
-    amplitude: float
-    harmonics: tuple[int, ...] = ()
-    phase: float | None = None
+    frequency: float  # of the sine [Hz]
+    amplitude: float  # at the converter [V]
+    harmonics: tuple[int, ...] = ()  # multiples of the frequency that come with it
+    phase: float | None = None  # in turns; drawn for each record if it is None
 
     def __call__(self, time: Volts, rng: np.random.Generator) -> Volts:
         """Volts at these times [s]."""
@@ -40,13 +33,9 @@ class Hum:
 
 @dataclasses.dataclass(frozen=True)
 class Offset:
-    """A constant voltage.
+    """A constant voltage."""
 
-    Args:
-        volts: At the converter [V].
-    """
-
-    volts: float
+    volts: float  # at the converter [V]
 
     def __call__(self, time: Volts, rng: np.random.Generator) -> Volts:
         """Volts at these times [s]."""
@@ -55,15 +44,10 @@ class Offset:
 
 @dataclasses.dataclass(frozen=True)
 class Spike:
-    """Half a sine at a random place in one of the periods, as when a hand moves.
+    """Half a sine at a random place in one of the periods, as when a hand moves."""
 
-    Args:
-        height: At the converter [V].
-        width: From its begin to its end [s].
-    """
-
-    height: float
-    width: float
+    height: float  # at the converter [V]
+    width: float  # from its begin to its end [s]
 
     def __call__(self, time: Volts, rng: np.random.Generator) -> Volts:
         """Volts at these times [s]."""
@@ -75,13 +59,9 @@ class Spike:
 
 @dataclasses.dataclass(frozen=True)
 class Pink:
-    """Noise with a power of 1/f above the first frequency of the record.
+    """Noise with a power of 1/f above the first frequency of the record."""
 
-    Args:
-        rms: Effective value at the converter [V].
-    """
-
-    rms: float
+    rms: float  # effective value at the converter [V]
 
     def __call__(self, time: Volts, rng: np.random.Generator) -> Volts:
         """Volts at these times [s]."""
@@ -94,15 +74,10 @@ class Pink:
 
 @dataclasses.dataclass(frozen=True)
 class Leaky:
-    """A load with a resistor across it.
+    """A load with a resistor across it."""
 
-    Args:
-        load: The load.
-        r: The resistor [ohm].
-    """
-
-    load: Impedance
-    r: float
+    load: Impedance  # the load
+    r: float  # the resistor [ohm]
 
     def __call__(self, f: Float[np.ndarray, " f"]) -> Complex[np.ndarray, " f"]:
         """Impedance [ohm] at frequencies f [Hz]."""
@@ -119,14 +94,10 @@ class Nonlinear:
     of
 
         V_p = Z_p (I − I_excess),   I = (V_th + Z_p I_excess) / (Z_th + R_s + Z_p).
-
-    Args:
-        skin: Its elements at small voltages.
-        fall: Part of R_p that is lost at the peak.
     """
 
-    skin: SkinLoad
-    fall: float
+    skin: SkinLoad  # its elements at small voltages
+    fall: float  # part of R_p that is lost at the peak
 
     def __call__(self, driver: TransformerDriver, sampler: Sampler) -> Complex[np.ndarray, " f"]:
         """Fourier coefficients [V] of the terminal voltage."""

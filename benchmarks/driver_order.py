@@ -15,54 +15,51 @@ four poles at 60 dB, and five without noise.
 
 import argparse
 import collections
-import dataclasses
 import pathlib
 import tempfile
 from collections.abc import Iterable, Sequence
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 from tqdm import tqdm
 
 import etid
-from benchmarks.coverage import NORMAL_95, scene
-from benchmarks.perturbed_study import PARTS, drawn_driver
-from benchmarks.spice import FOLDER, add_data
+from benchmarks.coverage import compared, scene, with_driver
+from benchmarks.perturbed_study import PARTS
+from benchmarks.rates import NORMAL_95
+from benchmarks.runner import Target, option, report
+from benchmarks.spice import DATA, FOLDER
 from etid.results.tried_orders import AUTO, Order
 
-ORDERS = (3, 4, 5, 6)
-SNR_DB = (40.0, 60.0, 80.0)
 AS_GOOD = 1.1  # of 20 drivers with two skins, a root mean square is known to about 10 %
 NEAR = 0.5  # bounds
 RIGHT = 0.98  # part of the choices that must be right
 # Orders that a driver of these SPICE recordings shows.
 VISIBLE = {
-    "lab_dry": (3, 4),
-    "lab_damp": (3, 4),
-    "jitter_dry": (3, 4),
-    "jitter_damp": (3, 4),
-    "clean_dry": (5, 5),
-    "clean_damp": (5, 5),
+    **dict.fromkeys(("lab_dry", "lab_damp", "jitter_dry", "jitter_damp"), (3, 4)),
+    **dict.fromkeys(("clean_dry", "clean_damp"), (5, 5)),
 }
 
+OPTIONS = (
+    DATA,
+    option("--snr-db", default=(40.0, 60.0, 80.0)),
+    option("--orders", default=(3, 4, 5, 6)),
+    option("--drivers", default=20, help="drawn for each SNR"),
+    option("--samples", default=10_000),
+)
 
-@dataclasses.dataclass(frozen=True)
-class Draw:
-    """The fits behind one driver of a drawn scene.
 
-    Attributes:
-        order: Poles of this driver.
-        error: Relative errors of the elements, in units of their bounds.
-        z: The same in units of the standard errors.
-    """
+class Draw(NamedTuple):
+    """The fits behind one driver of a drawn scene."""
 
-    order: int
-    error: Float[np.ndarray, "trial element"]
-    z: Float[np.ndarray, "trial element"]
+    order: int  # poles of this driver
+    error: Float[np.ndarray, "trial element"]  # errors of the elements in units of their bounds
+    z: Float[np.ndarray, "trial element"]  # the same in units of the standard errors
 
 
 def draw(seed: int, snr_db: float, orders: Sequence[Order], samples: int) -> dict[Order, Draw]:
-    """Fits of one drawn scene by orders; nothing for an order without a driver.
+    """Fits of one drawn scene by orders of the driver.
 
     Args:
         seed: Of driver, noise and delays.
@@ -70,20 +67,16 @@ def draw(seed: int, snr_db: float, orders: Sequence[Order], samples: int) -> dic
         orders: Orders to identify the driver with.
         samples: Length of a record [samples].
     """
-    drawn = scene(snr_db, samples)
-    drawn = dataclasses.replace(drawn, driver=drawn_driver(seed, PARTS, drawn.driver))
-    study, bounds = drawn.simulate(seed), etid.bound(drawn)
-    found = {}
+    drawn = with_driver(scene(snr_db, samples), seed, PARTS)
+    study, bounds, truth, found = drawn.simulate(seed), etid.bound(drawn), drawn.truth(), {}
     for order in orders:
         calibrations = list(study.calibrations.recordings())
-        driver = etid.identify_driver(calibrations, order=order, throw=False)
-        errors, zs = [], []
-        for path, truth in ((trial.path, drawn.truth()[trial.path]) for trial in drawn.trials):
+        driver, rows = etid.identify_driver(calibrations, order=order, throw=False), []
+        for path in (trial.path for trial in drawn.trials):
             fit = etid.identify_skin(study[path], driver, throw=False)
-            error = np.asarray(fit.circuit.values()) - np.array(list(truth.values()))
-            errors.append(error / np.array(list(bounds[path].stderr.values())))
-            zs.append(error / np.asarray(fit.stderr.values()))
-        found[order] = Draw(driver.order, np.array(errors), np.array(zs))
+            error, stderr, _ = compared(fit, list(truth[path].values()))
+            rows.append((error / list(bounds[path].relative.values()), error / stderr))
+        found[order] = Draw(driver.order, *map(np.array, zip(*rows, strict=True)))
     return found
 
 
@@ -115,21 +108,9 @@ def spice_orders(folder: pathlib.Path, names: Iterable[str]) -> dict[str, int]:
     return found
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """How much is drawn, and where the SPICE recordings are."""
-    add_data(parser)
-    parser.add_argument("--snr-db", type=float, nargs="+", default=SNR_DB)
-    parser.add_argument("--orders", type=int, nargs="+", default=ORDERS)
-    parser.add_argument("--drivers", type=int, default=20, help="drawn for each SNR")
-    parser.add_argument("--samples", type=int, default=10_000)
-
-
 def main(arguments: argparse.Namespace) -> bool:
     """Print the table; whether enough choices are right."""
-    orders = tuple(arguments.orders)
-    heads = "".join(f"{f'order {order}':>10}" for order in orders)
-    print(f"{'SNR':>6}{'auto':>8}{heads}{'covered':>10}{'right':>8}  chosen")
-    verdicts: list[bool] = []
+    orders, verdicts = tuple(arguments.orders), list[bool]()
     for snr_db in arguments.snr_db:
         draws = [
             draw(seed, snr_db, (AUTO, *orders), arguments.samples)
@@ -137,21 +118,21 @@ def main(arguments: argparse.Namespace) -> bool:
         ]
         good = right(draws, orders)
         covered = np.mean([np.abs(one[AUTO].z) < NORMAL_95 for one in draws])
-        fixed = "".join(f"{rms(draws, order):10.2f}" for order in orders)
+        errors = ", ".join(f"{order} {rms(draws, order):.2f}" for order in (AUTO, *orders))
         chosen = collections.Counter(one[AUTO].order for one in draws)
         counts = ", ".join(f"{count} of order {order}" for order, count in sorted(chosen.items()))
         print(
-            f"{snr_db:6.0f}{rms(draws, AUTO):8.2f}{fixed}{100 * covered:9.1f}%"
-            f"{100 * np.mean(good):7.0f}%  {counts}",
+            f"{snr_db:g} dB: error in bounds: {errors}; {100 * covered:.1f} % covered, "
+            f"{100 * np.mean(good):.0f} % right, {counts}",
             flush=True,
         )
         verdicts += good
+    targets = [Target("right choices", float(np.mean(verdicts)), least=RIGHT)]
     folder = arguments.data / FOLDER
     if not folder.exists():
         print(f"no SPICE recordings at {folder}; pass their parent folder with --data")
-        return bool(np.mean(verdicts) >= RIGHT)
+        return report(targets)
     found = spice_orders(folder, VISIBLE)
-    for name, order in found.items():
-        print(f"{name}: order {order}, {VISIBLE[name][0]} to {VISIBLE[name][1]} are visible")
-    inside = all(low <= found[name] <= high for name, (low, high) in VISIBLE.items())
-    return inside and bool(np.mean(verdicts) >= RIGHT)
+    return report(
+        [*targets, *(Target(f"order, {name}", found[name], *of) for name, of in VISIBLE.items())]
+    )

@@ -43,25 +43,20 @@ Change = Callable[[Recording, np.random.Generator], Recording]
 
 @dataclasses.dataclass(frozen=True)
 class Cell:
-    """One cell of one map.
+    """One cell of one map."""
 
-    Attributes:
-        chart: Which map.
-        row: Label of its row.
-        column: Label of its column.
-        scene: What is simulated.
-        order: Poles that are given to the driver.
-        change: What is done to the records afterwards, if anything.
-        circuit: What is fitted; `SkinRC` if not given.
-    """
+    chart: str  # which map
+    row: str  # label of its row
+    column: str  # label of its column
+    scene: Scene  # what is simulated
+    order: int = 5  # poles that are given to the driver
+    change: Change | None = None  # what is done to the records afterwards, if anything
+    circuit: AbstractCircuit | None = None  # what is fitted; `SkinRC` if not given
 
-    chart: str
-    row: str
-    column: str
-    scene: Scene
-    order: int = 5
-    change: Change | None = None
-    circuit: AbstractCircuit | None = None
+    @property
+    def place(self) -> dict[str, str]:
+        """Its labels, as tables have them."""
+        return {"map": self.chart, "row": self.row, "column": self.column}
 
     @property
     def shape(self) -> tuple[float, ...]:
@@ -71,15 +66,10 @@ class Cell:
 
 @dataclasses.dataclass(frozen=True)
 class TwoLayers:
-    """Skin of two relaxations, R_s + R_1 ‖ C_1 + R_2 ‖ C_2, the second ten times as slow.
+    """Skin of two relaxations, R_s + R_1 ‖ C_1 + R_2 ‖ C_2, the second ten times as slow."""
 
-    Args:
-        skin: R_s, R_p = R_1 + R_2, and R_p C_p, the time constant of the first.
-        share: R_2 / R_p.
-    """
-
-    skin: SkinLoad
-    share: float
+    skin: SkinLoad  # R_s, R_p = R_1 + R_2, and R_p C_p, the time constant of the first
+    share: float  # R_2 / R_p
 
     def __call__(self, f: Float[np.ndarray, " f"]) -> Complex[np.ndarray, " f"]:
         """Impedance [ohm] at frequencies f [Hz]."""
@@ -102,15 +92,10 @@ class TwoLayers:
 
 @dataclasses.dataclass(frozen=True)
 class Cole:
-    """Skin with a constant-phase element, R_s + R_p / (1 + (jωR_p C_p)^α)   (Cole 1940).
+    """Skin with a constant-phase element, R_s + R_p / (1 + (jωR_p C_p)^α)   (Cole 1940)."""
 
-    Args:
-        skin: R_s, R_p and C_p.
-        alpha: 1 is a capacitor.
-    """
-
-    skin: SkinLoad
-    alpha: float
+    skin: SkinLoad  # R_s, R_p and C_p
+    alpha: float  # 1 is a capacitor
 
     def __call__(self, f: Float[np.ndarray, " f"]) -> Complex[np.ndarray, " f"]:
         """Impedance [ohm] at frequencies f [Hz]."""
@@ -143,16 +128,11 @@ def _changed(recording: Recording, change: Callable[[np.ndarray], np.ndarray]) -
 
 @dataclasses.dataclass(frozen=True)
 class Clipped:
-    """Both records limited to the voltage that a part of the samples of v_th exceeds.
+    """Both records limited to the voltage that a part of the samples of v_th exceeds."""
 
-    Args:
-        part: Of the samples of v_th.
-        known: Whether the recording says where its converter saturates.
-        sigma: Noise after the limit [V], as where an amplifier before the converter saturates.
-    """
-
-    part: float
-    known: bool = False
+    part: float  # of the samples of v_th
+    known: bool = False  # whether the recording says where its converter saturates
+    # noise after the limit [V], as where an amplifier before the converter saturates
     sigma: float = 0.0
 
     def __call__(self, recording: Recording, rng: np.random.Generator) -> Recording:
@@ -176,15 +156,10 @@ CLIPPERS = {
 
 @dataclasses.dataclass(frozen=True)
 class Coloured:
-    """Noise of a band added to both records, to each its own.
+    """Noise of a band added to both records, to each its own."""
 
-    Args:
-        band: Lowest and highest frequency [Hz]; equal for a tone of random phase.
-        rms: Its effective value [V].
-    """
-
-    band: tuple[float, float]
-    rms: float
+    band: tuple[float, float]  # lowest and highest frequency [Hz]; equal for a tone of random phase
+    rms: float  # its effective value [V]
 
     def __call__(self, recording: Recording, rng: np.random.Generator) -> Recording:
         """The recording, with more noise."""

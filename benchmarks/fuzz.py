@@ -30,6 +30,7 @@ import numpy as np
 
 import etid
 from benchmarks import specimens
+from benchmarks.runner import option
 
 MEMORY = 1 << 30  # bytes that a process may have in memory
 SAFETY = 4 << 30  # bytes of addresses beside those after the imports, for the sake of this machine
@@ -40,15 +41,13 @@ SHARES = {"recordings": 8, "fits": 5, "mapping": 2, "csv": 1, "npz": 1, "matlab"
 FINE = ("read", "refused")
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """How many files, of which kind, from which seed on."""
-    parser.add_argument("--files", type=int, default=2000)
-    parser.add_argument("--first", type=int, default=0, help="first seed")
-    parser.add_argument("--kind", choices=SHARES, help="default: all, by turns")
-    parser.add_argument(
-        "--limit", type=float, default=5.0, help="seconds of the processor for one file"
-    )
-    parser.add_argument("--output", type=pathlib.Path, help="JSON file")
+OPTIONS = (
+    option("--files", default=2000),
+    option("--first", default=0, help="first seed"),
+    option("--kind", choices=SHARES, help="default: all, by turns"),
+    option("--limit", default=5.0, help="seconds of the processor for one file"),
+    option("--output", type=pathlib.Path, help="JSON file"),
+)
 
 
 def main(arguments: argparse.Namespace) -> bool:

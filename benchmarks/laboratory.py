@@ -34,39 +34,28 @@ Added = Callable[[Float[np.ndarray, " time"], np.random.Generator], Float[np.nda
 
 @dataclasses.dataclass(frozen=True)
 class Output:
-    """What one input of the converter sees.
+    """What one input of the converter sees."""
 
-    Args:
-        driver: What drives it.
-        loads: What is connected during each pulse; the last stays for all pulses that follow.
-        pulse_rate: True pulses per second [Hz].
-        pulses: Times of the pulses in a record of `over` periods and their heights relative to the
-            usual, if they are not one in each period.
-        over: Periods after which `pulses` repeat.
-        delay: Of this record [s]; positive samples late.
-        gain: Of the amplifier.
-        lowpass: Corner of a further filter of first order before the converter [Hz], if any.
-        antialias: Corner of the anti-alias filter, relative to the sample rate.
-        sampling_jitter: Standard deviation of the time of every single sample [s].
-        added: Voltages that are added at the converter.
-        voltage: Coefficients of the terminal voltage by sampler, where the load is not linear.
-        lost: Number of a sample that the recorder loses; all later ones are one early.
-        doubled: Number of a sample that it stores twice; all later ones are one late.
-    """
-
-    driver: TransformerDriver
+    driver: TransformerDriver  # what drives it
+    # what is connected during each pulse; the last stays for all pulses that follow
     loads: tuple[Impedance, ...] = (OpenLoad(),)
-    pulse_rate: float = 60.0
+    pulse_rate: float = 60.0  # true pulses per second [Hz]
+    # times of the pulses in a record of `over` periods and their heights relative to the usual, if
+    # they are not one in each period
     pulses: tuple[tuple[float, float], ...] = ()
-    over: int = 1
-    delay: float = 0.0
-    gain: float = 1.0
+    over: int = 1  # periods after which `pulses` repeat
+    delay: float = 0.0  # of this record [s]; positive samples late
+    gain: float = 1.0  # of the amplifier
+    # corner of a further filter of first order before the converter [Hz], if any
     lowpass: float | None = None
-    antialias: float = CORNER
-    sampling_jitter: float = 0.0
-    added: tuple[Added, ...] = ()
+    antialias: float = CORNER  # corner of the anti-alias filter, relative to the sample rate
+    sampling_jitter: float = 0.0  # standard deviation of the time of every single sample [s]
+    added: tuple[Added, ...] = ()  # voltages that are added at the converter
+    # coefficients of the terminal voltage by sampler, where the load is not linear
     voltage: Callable[[TransformerDriver, Sampler], Complex[np.ndarray, " f"]] | None = None
+    # number of a sample that the recorder loses; all later ones are one early
     lost: int | None = None
+    # number of a sample that it stores twice; all later ones are one late
     doubled: int | None = None
 
     def sampler(self, sample_rate: float) -> Sampler:
@@ -118,19 +107,12 @@ class Output:
 
 @dataclasses.dataclass(frozen=True)
 class Crosstalk:
-    """A part of another voltage, as through the capacitance between two channels.
+    """A part of another voltage, as through the capacitance between two channels."""
 
-    Args:
-        output: The other voltage.
-        part: Of it that is seen.
-        later: By how much its pulse is later [s].
-        sample_rate: Of the converter [Hz].
-    """
-
-    output: Output
-    part: float
-    later: float = 0.0
-    sample_rate: float = 200e3
+    output: Output  # the other voltage
+    part: float  # of it that is seen
+    later: float = 0.0  # by how much its pulse is later [s]
+    sample_rate: float = 200e3  # of the converter [Hz]
 
     def __call__(
         self, time: Float[np.ndarray, " time"], rng: np.random.Generator
@@ -142,37 +124,22 @@ class Crosstalk:
 
 @dataclasses.dataclass(frozen=True)
 class Record:
-    """One recording to be made.
+    """One recording to be made."""
 
-    Args:
-        path: Its name in the study.
-        th: The unloaded voltage.
-        out: The loaded one.
-        sigma: Standard deviation of the noise of a sample [V at the converter].
-        r_load: Resistor of a calibration [ohm], as the file tells it.
-        sample_rate: True samples per second [Hz].
-        samples: Length of the record.
-        full_scale: The converter clips at ± this voltage [V at the converter].
-        bits: Resolution of the converter.
-        codes: Whether the file holds codes; else it holds volts, rounded as they are.
-        told: What the file says in place of the truth, such as its sample rate.
-        swapped: Whether the file has the two voltages in each other's place.
-        copied: Whether the file has the loaded voltage in both places.
-    """
-
-    path: str
-    th: Output
-    out: Output
-    sigma: float
-    r_load: float | None = None
-    sample_rate: float = 200e3
-    samples: int = 10_000
-    full_scale: float = 10.0
-    bits: int = 16
-    codes: bool = True
+    path: str  # its name in the study
+    th: Output  # the unloaded voltage
+    out: Output  # the loaded one
+    sigma: float  # standard deviation of the noise of a sample [V at the converter]
+    r_load: float | None = None  # resistor of a calibration [ohm], as the file tells it
+    sample_rate: float = 200e3  # true samples per second [Hz]
+    samples: int = 10_000  # length of the record
+    full_scale: float = 10.0  # the converter clips at ± this voltage [V at the converter]
+    bits: int = 16  # resolution of the converter
+    codes: bool = True  # whether the file holds codes; else it holds volts, rounded as they are
+    # what the file says in place of the truth, such as its sample rate
     told: Mapping[str, Any] = dataclasses.field(default_factory=dict)
-    swapped: bool = False
-    copied: bool = False
+    swapped: bool = False  # whether the file has the two voltages in each other's place
+    copied: bool = False  # whether the file has the loaded voltage in both places
 
     def recording(self, seed: int) -> Recording:
         """The recording; its random numbers depend on the seed and its path only."""

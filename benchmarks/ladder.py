@@ -17,6 +17,7 @@ LOADS = TYPICAL
 START = (20e3, 100e3, 0.3e-9)  # elements, in SI, of no fingertip in particular
 TRIAL = "skin/01"
 CALIBRATION = "calibration/98k8"
+TWO = tuple(Trial(f"calibration/{i}", ResistorLoad(r)) for i, r in enumerate((REFERENCE, 21.62e3)))
 SNR_DB = (80, 60, 40, 30, 20)
 PERIODS = {1: 3_334, 10: 33_334, 30: 100_000}  # samples at 200 kHz
 SAMPLE_RATES = {"100 kHz": 100e3, "500 kHz": 500e3, "1 MHz": 1e6}

@@ -30,13 +30,7 @@ SIGNALS = ("v_th", "v_out")
 
 
 def large_file(folder: pathlib.Path, recordings: int, layout: str) -> pathlib.Path:
-    """The file, made unless it is there.
-
-    Args:
-        folder: Where it lies or is to lie.
-        recordings: How many.
-        layout: One of `LAYOUTS`.
-    """
+    """The file, made unless it is there."""
     path = folder / f"{layout}-{recordings}.h5"
     if path.exists():
         return path

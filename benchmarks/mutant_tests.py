@@ -14,33 +14,17 @@ from multiprocessing.connection import Connection
 from typing import Any, NamedTuple
 
 PRELOADED = (
-    "jax.export",
-    "equinox",
-    "optimistix",
-    "lineax",
-    "scipy.optimize",
-    "scipy.signal",
-    "scipy.stats",
-    "h5py",
-    "jinja2",
-    "matplotlib.pyplot",
-    "hypothesis",
-    "beartype",
-    "jaxtyping",
-    "pytest",
+    *("jax.export", "equinox", "optimistix", "lineax", "scipy.optimize", "scipy.signal"),
+    *("scipy.stats", "h5py", "jinja2", "matplotlib.pyplot", "hypothesis", "beartype"),
+    *("jaxtyping", "pytest"),
 )
 
 
 class Outcome(NamedTuple):
-    """What the tests said.
+    """What the tests said."""
 
-    Attributes:
-        passed: Whether all passed; None if they took too long.
-        killer: The test that failed; empty if none did, or if they could not be collected.
-    """
-
-    passed: bool | None
-    killer: str
+    passed: bool | None  # whether all passed; None if they took too long
+    killer: str  # the test that failed; empty if none did, or if they could not be collected
 
 
 class _Order:

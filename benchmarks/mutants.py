@@ -16,29 +16,14 @@ import random
 from collections.abc import Iterator
 
 ARITHMETIC: dict[type[ast.operator], type[ast.operator]] = {
-    ast.Add: ast.Sub,
-    ast.Sub: ast.Add,
-    ast.Mult: ast.Div,
-    ast.Div: ast.Mult,
-    ast.MatMult: ast.Mult,
-    ast.Pow: ast.Mult,
-    ast.FloorDiv: ast.Mult,
-    ast.Mod: ast.FloorDiv,
-    ast.BitAnd: ast.BitOr,
-    ast.BitOr: ast.BitAnd,
-}
+    ast.Add: ast.Sub, ast.Sub: ast.Add, ast.Mult: ast.Div, ast.Div: ast.Mult,
+    ast.MatMult: ast.Mult, ast.Pow: ast.Mult, ast.FloorDiv: ast.Mult, ast.Mod: ast.FloorDiv,
+    ast.BitAnd: ast.BitOr, ast.BitOr: ast.BitAnd,
+}  # fmt: skip
 COMPARISONS: dict[type[ast.cmpop], type[ast.cmpop]] = {
-    ast.Lt: ast.GtE,
-    ast.LtE: ast.Gt,
-    ast.Gt: ast.LtE,
-    ast.GtE: ast.Lt,
-    ast.Eq: ast.NotEq,
-    ast.NotEq: ast.Eq,
-    ast.Is: ast.IsNot,
-    ast.IsNot: ast.Is,
-    ast.In: ast.NotIn,
-    ast.NotIn: ast.In,
-}
+    ast.Lt: ast.GtE, ast.LtE: ast.Gt, ast.Gt: ast.LtE, ast.GtE: ast.Lt, ast.Eq: ast.NotEq,
+    ast.NotEq: ast.Eq, ast.Is: ast.IsNot, ast.IsNot: ast.Is, ast.In: ast.NotIn, ast.NotIn: ast.In,
+}  # fmt: skip
 # Functions that do not know the order of their arguments.
 SYMMETRIC = {"array_equal", "gcd", "hypot", "lcm", "logaddexp", "max", "maximum", "min", "minimum"}
 TINY = 1e-12
@@ -46,23 +31,14 @@ TINY = 1e-12
 
 @dataclasses.dataclass(frozen=True)
 class Mutant:
-    """One change of one module.
+    """One change of one module."""
 
-    Attributes:
-        path: Of the module, below the root.
-        line: Where it is.
-        kind: What was done.
-        before: The code there.
-        after: What takes its place.
-        span: First and last byte of it.
-    """
-
-    path: str
-    line: int
-    kind: str
-    before: str
-    after: str
-    span: tuple[int, int]
+    path: str  # of the module, below the root
+    line: int  # where it is
+    kind: str  # what was done
+    before: str  # the code there
+    after: str  # what takes its place
+    span: tuple[int, int]  # first and last byte of it
 
     @property
     def key(self) -> str:
@@ -137,12 +113,7 @@ def _is_silent(node: ast.AST) -> bool:
 
 
 def mutants(path: str, source: str) -> list[Mutant]:
-    """All mutants of a module, in its order.
-
-    Args:
-        path: Of the module, below the root.
-        source: Its text.
-    """
+    """All mutants of a module, in its order."""
     text = source.encode()
     starts = [0]
     for line in text.splitlines(keepends=True):

@@ -21,10 +21,11 @@ import time
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
-from benchmarks.failure_counts import clopper_pearson
 from benchmarks.mutant_tests import Runner
 from benchmarks.mutants import Mutant, drawn, mutants
 from benchmarks.provenance import ROOT, write_csv
+from benchmarks.rates import clopper_pearson
+from benchmarks.runner import option
 
 TARGET = 0.1  # part of the mutants that may survive
 COPIED = (
@@ -33,30 +34,18 @@ COPIED = (
 )
 LIMIT = 600.0  # [s] of a mutant; one that takes longer counts as a survivor
 # The tests of each module, the cheapest first.
+_WELL = ("maximum_likelihood", "own_circuits", "current", "other_circuit", "mains")
+_OVERVIEW = ("overview", "fit", "exporting", "recording", "identification")
 TESTS: Mapping[str, Sequence[str]] = {
     "estimators.joint.errors": ("joint_errors", "joint"),
     "estimators.joint.fit": ("joint",),
     "estimators.joint.terms": ("joint",),
     "estimators.judgement": ("judging",),
     "estimators.maximum_likelihood.given_driver": (
-        "given_driver",
-        "maximum_likelihood",
-        "current",
+        *("given_driver", "maximum_likelihood", "current"),
     ),
-    "estimators.maximum_likelihood.load": (
-        "maximum_likelihood",
-        "own_circuits",
-        "current",
-        "other_circuit",
-        "mains",
-    ),
-    "estimators.maximum_likelihood.load_fit": (
-        "maximum_likelihood",
-        "own_circuits",
-        "current",
-        "other_circuit",
-        "mains",
-    ),
+    "estimators.maximum_likelihood.load": _WELL,
+    "estimators.maximum_likelihood.load_fit": _WELL,
     "estimators.maximum_likelihood.terms": ("maximum_likelihood", "mains"),
     "estimators.non_parametric.fit": ("non_parametric",),
     "estimators.output_error.fit": ("output_error", "current", "identification"),
@@ -71,8 +60,8 @@ TESTS: Mapping[str, Sequence[str]] = {
     "online.tick": ("electrode", "online"),
     "online.tracker": ("electrode", "online"),
     "results.driver": ("driver", "overview", "given_driver"),
-    "results.fit": ("overview", "fit", "exporting", "recording", "identification"),
-    "results.fits": ("overview", "batch", "fit", "exporting", "recording", "identification"),
+    "results.fit": _OVERVIEW,
+    "results.fits": (*_OVERVIEW, "batch"),
     "results.hdf5_table": ("tables", "exporting", "cli"),
     "results.verdicts": ("judging", "verdicts"),
     "signals.harmonics": ("spectra",),
@@ -191,15 +180,13 @@ def show(rows: Sequence[Mapping[str, Any]]) -> float:
     return share
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Size of the run."""
-    parser.add_argument("--mutants", type=int, default=40, help="how many to draw")
-    parser.add_argument("--modules", nargs="+", choices=TESTS, default=list(TESTS))
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--limit", type=float, default=LIMIT, help="time of a mutant [s]")
-    parser.add_argument(
-        "--output", type=pathlib.Path, default=pathlib.Path("mutation.jsonl"), help="what is done"
-    )
+OPTIONS = (
+    option("--mutants", default=40, help="how many to draw"),
+    option("--modules", nargs="+", choices=TESTS, default=list(TESTS), type=str),
+    option("--seed", default=0),
+    option("--limit", default=LIMIT, help="time of a mutant [s]"),
+    option("--output", default=pathlib.Path("mutation.jsonl"), type=pathlib.Path),
+)
 
 
 def main(arguments: argparse.Namespace) -> bool:

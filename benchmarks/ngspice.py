@@ -37,14 +37,9 @@ from benchmarks.provenance import ROOT
 from benchmarks.spice import PARTS
 from etid.circuits.circuit import AbstractCircuit
 from etid.recordings.replacing import replacing
+from etid.simulation import transformer
 from etid.simulation.scenes import Scene, Trial
-from etid.simulation.transformer import (
-    Impedance,
-    OpenLoad,
-    ResistorLoad,
-    SkinLoad,
-    TransformerDriver,
-)
+from etid.simulation.transformer import Impedance, TransformerDriver
 
 CACHE = ROOT / "results" / "ngspice"
 RELTOL = 1e-8
@@ -57,21 +52,10 @@ OPTIONS = f".options method=trap trtol=1 reltol={RELTOL!r} abstol=1e-12 vntol=1e
 
 # Parts by their name in `PARTS`, from the source to the terminal o, with the nodes they connect.
 NODES = {
-    "Rsrc": "source p",
-    "Cpri": "p 0",
-    "Rpw": "p a",
-    "Llp": "a m",
-    "Lm": "m 0",
-    "Rcore": "m 0",
-    "Rsw": "w b",
-    "Lls": "b s",
-    "Csec": "s 0",
-    "Cww": "p s",
-    "Rprot": "s o",
-    "Ccab": "o 0",
-    "Rmeas": "o 0",
-    "Cmeas": "o 0",
-}
+    "Rsrc": "source p", "Cpri": "p 0", "Rpw": "p a", "Llp": "a m", "Lm": "m 0", "Rcore": "m 0",
+    "Rsw": "w b", "Lls": "b s", "Csec": "s 0", "Cww": "p s",
+    "Rprot": "s o", "Ccab": "o 0", "Rmeas": "o 0", "Cmeas": "o 0",
+}  # fmt: skip
 
 
 class NgspiceError(RuntimeError):
@@ -99,15 +83,8 @@ def netlist(driver: TransformerDriver, load: Impedance | AbstractCircuit, pulse_
     period = 1 / pulse_rate
     settled = math.ceil(SETTLING * pulse_rate) * period
     run = (LONGEST_STEP, settled + 2 * period, settled - 2 * LONGEST_STEP, LONGEST_STEP)
-    lines = [
-        *_circuit(driver, period),
-        *_load(load),
-        OPTIONS,
-        ".save v(o)",
-        f".tran {_text(*run)}",
-        ".end",
-    ]
-    return "\n".join(lines) + "\n"
+    lines = [*_circuit(driver, period), *_load(load), OPTIONS, ".save v(o)"]
+    return "\n".join([*lines, f".tran {_text(*run)}", ".end", ""])
 
 
 def single_pulse(driver: TransformerDriver, load: Impedance, duration: float) -> str:
@@ -118,16 +95,10 @@ def single_pulse(driver: TransformerDriver, load: Impedance, duration: float) ->
         load: A resistor or skin.
         duration: Time that is solved [s].
     """
-    lines = [
-        *_circuit(driver, 10 * duration),
-        "Vload o load 0",
-        *(line.replace(" o ", " load ", 1) for line in _load(load)),
-        OPTIONS,
-        ".save v(o) i(Vload)",
-        f".tran {_text(LONGEST_STEP, duration, 0.0, LONGEST_STEP)}",
-        ".end",
-    ]
-    return "\n".join(lines) + "\n"
+    behind = (line.replace(" o ", " load ", 1) for line in _load(load))
+    lines = [*_circuit(driver, 10 * duration), "Vload o load 0", *behind, OPTIONS]
+    run = _text(LONGEST_STEP, duration, 0.0, LONGEST_STEP)
+    return "\n".join([*lines, ".save v(o) i(Vload)", f".tran {run}", ".end", ""])
 
 
 def _circuit(driver: TransformerDriver, period: float) -> list[str]:
@@ -145,11 +116,11 @@ def _circuit(driver: TransformerDriver, period: float) -> list[str]:
 
 
 def _load(load: Impedance | AbstractCircuit) -> list[str]:
-    if isinstance(load, OpenLoad):
+    if isinstance(load, transformer.OpenLoad):
         return ["* no load"]
-    if isinstance(load, ResistorLoad):
+    if isinstance(load, transformer.ResistorLoad):
         return ["* known resistor", f"R o 0 {_text(load.r)}"]
-    if isinstance(load, SkinLoad):
+    if isinstance(load, transformer.SkinLoad):
         parts = (f"Rs o x {_text(load.r_s)}", f"Rp x 0 {_text(load.r_p)}")
         return ["* skin", *parts, f"Cp x 0 {_text(load.c_p)}"]
     if isinstance(load, AbstractCircuit):

@@ -12,33 +12,30 @@ import argparse
 import collections
 import dataclasses
 from collections.abc import Callable, Mapping
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
 import etid
-from benchmarks.coverage import NORMAL_95
+from benchmarks.coverage import compared
 from benchmarks.disturbances import Hum
-from benchmarks.failure_counts import rate
+from benchmarks.estimators import driver_of
 from benchmarks.laboratory import Record
 from benchmarks.perturbed_study import all_records, both, out, undisturbed
+from benchmarks.rates import covered
+from benchmarks.runner import option
 
 FIRST = 2000  # number of the first driver
-COVERED = (0.93, 0.97)  # part of the 95 % intervals that is to contain the truth
 HUM = 0.01  # [V at the converter]
 
 
 @dataclasses.dataclass(frozen=True)
 class Flicker:
-    """Noise of the power σ² f_c/f, which equals that of white noise at the corner frequency f_c.
+    """Noise of the power σ² f_c/f, which equals that of white noise at the corner frequency f_c."""
 
-    Args:
-        sigma: Standard deviation of a sample of the white noise [V at the converter].
-        corner: f_c [Hz].
-    """
-
-    sigma: float
-    corner: float
+    sigma: float  # standard deviation of a sample of the white noise [V at the converter]
+    corner: float  # f_c [Hz]
 
     def __call__(
         self, time: Float[np.ndarray, " time"], rng: np.random.Generator
@@ -52,13 +49,9 @@ class Flicker:
 
 @dataclasses.dataclass(frozen=True)
 class White:
-    """More white noise.
+    """More white noise."""
 
-    Args:
-        sigma: Standard deviation of a sample [V at the converter].
-    """
-
-    sigma: float
+    sigma: float  # standard deviation of a sample [V at the converter]
 
     def __call__(
         self, time: Float[np.ndarray, " time"], rng: np.random.Generator
@@ -78,25 +71,22 @@ KINDS: Mapping[str, Callable[[Record], Record]] = {
 }
 
 
-@dataclasses.dataclass(frozen=True)
-class Found:
-    """Fits with one kind of noise.
+OPTIONS = (
+    option("--snr-db", default=(40.0, 60.0)),
+    option("--drivers", default=30),
+    option("--only", nargs="+", choices=KINDS, help="kinds of noise"),
+)
 
-    Attributes:
-        verdicts: How often each occurs; `driver_failed` where there is no driver.
-        chi2: Of all fits.
-        z: Errors of the successful fits in standard errors, (fit, element).
-        stderr: Their relative standard errors, (fit, element).
-        dry: Whether each successful fit is of dry skin.
-        driver: Number of its driver.
-    """
 
-    verdicts: Mapping[str, int]
-    chi2: np.ndarray
-    z: np.ndarray
-    stderr: np.ndarray
-    dry: np.ndarray
-    driver: np.ndarray
+class Found(NamedTuple):
+    """Fits with one kind of noise."""
+
+    verdicts: Mapping[str, int]  # how often each occurs; `driver_failed` where there is no driver
+    chi2: np.ndarray  # of all fits
+    z: np.ndarray  # errors of the successful fits in standard errors, (fit, element)
+    stderr: np.ndarray  # their relative standard errors, (fit, element)
+    dry: np.ndarray  # whether each successful fit is of dry skin
+    driver: np.ndarray  # number of its driver
 
 
 def found(change: Callable[[Record], Record], snr_db: float, drivers: int) -> Found:
@@ -105,30 +95,18 @@ def found(change: Callable[[Record], Record], snr_db: float, drivers: int) -> Fo
     rows, chi2 = [], []
     for number in range(FIRST, FIRST + drivers):
         study = all_records(change)(undisturbed(number, snr_db))
-        calibrations = [one.recording(number) for one in study.calibrations]
-        try:
-            driver = etid.identify_driver(calibrations, throw=False)
-        except etid.IdentificationError:
+        driver = driver_of([one.recording(number) for one in study.calibrations], None)
+        if driver is None:
             verdicts["driver_failed"] += len(study.trials)
             continue
         fits = etid.identify_skins([one.recording(number) for one in study.trials], driver)
-        verdicts.update(map(str, fits.verdicts))
-        for one, fit in zip(study.trials, (fits[i] for i in range(len(fits))), strict=True):
-            chi2.append(float(fit.chi2))
-            if fit.verdict == "successful":
-                truth = study.truths[one.path].low
-                error = np.asarray(fit.stderr.values())
-                z = (np.asarray(fit.circuit.values()) - truth) / error
-                rows.append((z, error / truth, one.path == "dry", number))
-    columns = [np.array(column) for column in zip(*rows, strict=True)]
-    return Found(verdicts, np.array(chi2), *columns)
-
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """How much is drawn."""
-    parser.add_argument("--snr-db", type=float, nargs="+", default=(40.0, 60.0))
-    parser.add_argument("--drivers", type=int, default=30)
-    parser.add_argument("--only", nargs="+", choices=KINDS, help="kinds of noise")
+        for i, one in enumerate(study.trials):
+            error, stderr, verdict = compared(fits[i], study.truths[one.path].low.tolist())
+            verdicts[verdict] += 1
+            chi2.append(float(fits[i].chi2))
+            if verdict == "successful":
+                rows.append((error / stderr, stderr, one.path == "dry", number))
+    return Found(verdicts, np.array(chi2), *map(np.array, zip(*rows, strict=True)))
 
 
 def main(arguments: argparse.Namespace) -> bool:
@@ -138,9 +116,8 @@ def main(arguments: argparse.Namespace) -> bool:
         usual = None
         for name in arguments.only or KINDS:
             one = found(KINDS[name], snr_db, arguments.drivers)
-            inside = np.abs(one.z) < NORMAL_95
-            of = rate(inside.ravel().tolist(), np.repeat(one.driver, inside.shape[1]))
-            good &= of.low <= COVERED[1] and of.high >= COVERED[0]
+            of = covered(one.z, one.driver)
+            good &= of.is_right_coverage
             errors = [np.median(one.stderr[one.dry == dry], axis=0) for dry in (True, False)]
             usual = errors if usual is None else usual
             wider = "; ".join(
@@ -149,9 +126,8 @@ def main(arguments: argparse.Namespace) -> bool:
             )
             said = ", ".join(f"{count} {verdict}" for verdict, count in one.verdicts.items())
             print(
-                f"{snr_db:g} dB, {name}: covered {100 * of.rate:.1f} % ({100 * of.low:.1f} to "
-                f"{100 * of.high:.1f}), chi2 {np.nanmedian(one.chi2):.3f}, standard errors dry; "
-                f"damp {wider}; {said}",
+                f"{snr_db:g} dB, {name}: covered {of}, chi2 {np.nanmedian(one.chi2):.3f}, "
+                f"standard errors dry; damp {wider}; {said}",
                 flush=True,
             )
-    return bool(good)
+    return good

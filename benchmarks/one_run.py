@@ -9,6 +9,7 @@ import pathlib
 import resource
 import sys
 import time
+from collections.abc import Callable
 from typing import Any
 
 import h5py
@@ -18,30 +19,32 @@ import etid
 from etid.identify import file as streaming
 
 
-def by_h5py(file: str, whole_stacks: bool) -> int:
+def by_h5py(file: str, whole_stacks: bool) -> None:
     """Read all samples with h5py alone, one recording after the other or a stack at once."""
-    count = 0
+
+    def visit(_: str, item: Any) -> None:
+        if isinstance(item, h5py.Dataset) and (item.ndim == 1 or whole_stacks):
+            item[()]
+        elif isinstance(item, h5py.Dataset):
+            for row in range(item.shape[0]):
+                item[row]
+
     with h5py.File(file) as opened:
-
-        def visit(_: str, item: Any) -> None:
-            nonlocal count
-            if not isinstance(item, h5py.Dataset):
-                return
-            if item.ndim == 1 or whole_stacks:
-                item[()]
-            else:
-                for row in range(item.shape[0]):
-                    item[row]
-            count += len(item) if item.ndim == 2 else 1
-
         opened.visititems(visit)
-    return count // 2
 
 
-def by_etid(file: str) -> int:
+def by_etid(file: str) -> None:
     """Load all recordings."""
     with etid.read(file) as study:
-        return sum(1 for _ in study.recordings())
+        for _ in study.recordings():
+            pass
+
+
+READERS: dict[str, Callable[[str], None]] = {
+    "h5py": lambda file: by_h5py(file, False),
+    "h5py, whole stacks": lambda file: by_h5py(file, True),
+    "etid": by_etid,
+}
 
 
 def fit(job: dict[str, Any]) -> dict[str, Any]:
@@ -54,16 +57,15 @@ def fit(job: dict[str, Any]) -> dict[str, Any]:
         if job["warm"]:
             target = pathlib.Path(job["target"]).with_suffix(".warm.h5")
             streaming.PART = job["warm_part"]
-            _, start = _timed(lambda: streaming.fit_file(job["warm"], target, **arguments))
+            start = _timed(lambda: streaming.fit_file(job["warm"], target, **arguments))[1]
             target.unlink()
         streaming.PART = job["part"]
         if job["log"]:
             _log_parts(job["log"])
-        call = lambda: streaming.fit_file(  # noqa: E731 - used once, below
-            job["file"], job["target"], resume=job["resume"], **arguments
+        arguments["resume"], before = job["resume"], time.process_time()
+        outcome, seconds = _timed(
+            lambda: streaming.fit_file(job["file"], job["target"], **arguments)
         )
-        before = time.process_time()
-        outcome, seconds = _timed(call)
         cpu = time.process_time() - before
     # Of workers, which have ended here, it contains their start.
     workers = resource.getrusage(resource.RUSAGE_CHILDREN)
@@ -83,23 +85,18 @@ def _log_parts(log: str) -> None:
     streaming.identify_part = logged
 
 
-def _timed(call: Any) -> tuple[Any, float]:
+def _timed(call: Callable[[], Any]) -> tuple[Any, float]:
     begin = time.perf_counter()
     found = call()
     return found, time.perf_counter() - begin
 
 
 def main(job: dict[str, Any]) -> dict[str, Any]:
-    """Do the job; seconds, and peak memory [B] of this process and of the largest child."""
+    """Do a job; seconds, and peak memory of this process and of its largest child [B]."""
     if job["what"] == "fit":
         found = fit(job)
     else:
-        call = {
-            "h5py": lambda: by_h5py(job["file"], False),
-            "h5py, whole stacks": lambda: by_h5py(job["file"], True),
-            "etid": lambda: by_etid(job["file"]),
-        }[job["what"]]
-        found = {"seconds": _timed(call)[1]}
+        found = {"seconds": _timed(lambda: READERS[job["what"]](job["file"]))[1]}
     own, children = (
         1024 * resource.getrusage(who).ru_maxrss
         for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)

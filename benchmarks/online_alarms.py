@@ -20,9 +20,9 @@ from jaxtyping import Float
 from tqdm import tqdm
 
 import etid
-from etid.simulation.published import REFERENCE, TYPICAL
+from benchmarks.ladder import TWO
+from etid.simulation.published import TYPICAL
 from etid.simulation.scenes import Scene, Trial
-from etid.simulation.transformer import ResistorLoad
 
 LOADS = tuple(TYPICAL.values())
 JITTER = 50e-9  # [s]
@@ -36,21 +36,13 @@ SOON = 2  # pulses within which the change must be found
 
 @dataclasses.dataclass(frozen=True)
 class Alarms:
-    """What the tests for changes have shown.
+    """What the tests for changes have shown."""
 
-    Attributes:
-        hours: Electrode hours without a change.
-        false: Changes of electrodes found in them.
-        driver: Changes of the driver found in them.
-        changes: Electrodes that have become wet.
-        found: How many of them were found within `SOON` pulses.
-    """
-
-    hours: float
-    false: int
-    driver: int
-    changes: int
-    found: int
+    hours: float  # electrode hours without a change
+    false: int  # changes of electrodes found in them
+    driver: int  # changes of the driver found in them
+    changes: int  # electrodes that have become wet
+    found: int  # how many of them were found within `SOON` pulses
 
     def hourly(self) -> float:
         """Largest rate of false alarms per electrode and hour that 95 % confidence allows."""
@@ -70,9 +62,7 @@ class Fingertip:
     """
 
     def __init__(self, electrodes: int, snr_db: float) -> None:
-        resistors = enumerate((REFERENCE, 21.62e3))
-        calibration = tuple(Trial(f"calibration/{i}", ResistorLoad(r)) for i, r in resistors)
-        noisy = Scene((), calibration, snr_db=snr_db, trigger_jitter_rms=JITTER, samples=UNLOADED)
+        noisy = Scene((), TWO, snr_db=snr_db, trigger_jitter_rms=JITTER, samples=UNLOADED)
         calibrations = list(noisy.simulate(seed=0).calibrations.recordings())
         driver = etid.identify_driver(calibrations)
         self.tracker = etid.Tracker.of(driver, calibrations[0], electrodes=electrodes)
@@ -113,7 +103,7 @@ def alarms(electrodes: int, snr_db: float, hours: float) -> Alarms:
     hourly = 3600 * tracker.model.bands.sample_rate / tracker.period
     pulses = SETTLING + int(np.ceil(hours * hourly / electrodes))
     state, false, driver, settled = tracker.start(), 0, 0, None
-    for number, v_out in enumerate(tqdm(display.pulses(loads, pulses), total=pulses)):
+    for number, v_out in enumerate(tqdm(display.pulses(loads, pulses), total=pulses, disable=None)):
         state = tracker.update(state, v_out)
         if number < SETTLING:
             settled = state

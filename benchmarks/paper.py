@@ -19,10 +19,12 @@ from collections.abc import Mapping, Sequence
 from tqdm import tqdm
 
 import etid
-from benchmarks import paper_figures, paper_tables
+from benchmarks import paper_figures
+from benchmarks import paper_tables as tables
 from benchmarks.ladder import SOURCES
-from benchmarks.paper_tables import Groups, Row
+from benchmarks.paper_tables import Row
 from benchmarks.provenance import write_csv
+from benchmarks.runner import QUICK, option
 from etid.paper.tables import LABORATORIES as ENDS
 from etid.paper.tables import METHODS, Outcome, identify
 from etid.report.html import Section
@@ -41,14 +43,29 @@ FEW = {"01", "02", "03"}  # trials of a quick run, and the last digits of its su
 RESISTOR_LIMIT = 0.1  # [%]
 STANDARD_ERRORS = 2.0
 OWN_NOISE = "noise 30 dB"  # what the paper's RRSE of 4 to 13 % amounts to
+SPREADS = "Mean over the studies ± standard deviation between them."
+FINGERTIPS = (
+    "Typical fingertip: median, its error [%], spread between trials [%]. Subjects: range of "
+    "their medians; median and largest absolute error [%]. Means over the studies in which "
+    "every subject has a circuit."
+)
+SCATTER = (
+    "Mean error / scatter between the trials of a study (standard deviation between the "
+    "means of the studies, each with its own calibration). The paper tells no sign."
+)
+
+OPTIONS = (
+    QUICK,
+    option("--source", default="simulated", choices=SOURCES),
+    option("--folder", default=pathlib.Path("results/paper"), type=pathlib.Path),
+)
 
 
 def scene_of(laboratory: str, quick: bool) -> Scene:
     """All experiments of the paper in one laboratory; a few trials and subjects if quick."""
     whole = etid.scenes.paper(**LABORATORIES[laboratory])
-    if not quick:
-        return whole
-    return dataclasses.replace(whole, trials=tuple(filter(_is_among_few, whole.trials)))
+    few = tuple(filter(_is_among_few, whole.trials))
+    return dataclasses.replace(whole, trials=few) if quick else whole
 
 
 def _is_among_few(trial: Trial) -> bool:
@@ -60,84 +77,17 @@ def _is_among_few(trial: Trial) -> bool:
 
 def check(first: Sequence[Row], fourth: Sequence[Row]) -> list[tuple[str, bool]]:
     """What must hold of the default method, in words, and whether it does."""
-    worst = max(
-        (row for row in first if (row["laboratory"], row["method"]) == ("good", DEFAULT)),
-        key=lambda row: row["rms"],
-    )
+    good = [row for row in first if (row["laboratory"], row["method"]) == ("good", DEFAULT)]
+    worst = max(good, key=lambda row: row["rms"])
     text = f"Table I at 60 dB: {worst['r'] / 1e3:g} kΩ has {worst['rms']:.3f} % rms"
     found = [(f"{text}, at most {RESISTOR_LIMIT} %", bool(worst["rms"] <= RESISTOR_LIMIT))]
     for row in fourth:
         if (row["laboratory"], row["method"]) == (OWN_NOISE, DEFAULT):
-            stderr = row["stderr"] / row["studies"] ** 0.5
+            limit = STANDARD_ERRORS * row["stderr"] / row["studies"] ** 0.5
             text = f"Table IV at 30 dB: {row['element']} is off by {row['error']:.2f} %"
-            met = abs(row["error"]) <= STANDARD_ERRORS * stderr
-            found.append(
-                (
-                    f"{text}, {STANDARD_ERRORS:g} standard errors are "
-                    f"{STANDARD_ERRORS * stderr:.2f} %",
-                    bool(met),
-                )
-            )
+            text += f", {STANDARD_ERRORS:g} standard errors are {limit:.2f} %"
+            found.append((text, bool(abs(row["error"]) <= limit)))
     return found
-
-
-def run(folder: pathlib.Path, source: str, quick: bool) -> bool:
-    """Make, identify, print, write tables and figures; whether all of `check` holds."""
-    truth = etid.scenes.paper().truth()
-    seeds = range(1 if quick else STUDIES)
-    groups: dict[tuple[str, str], list[Outcome]] = {}
-    shown: dict[str, etid.Study] = {}
-    jobs = [(laboratory, seed) for laboratory in LABORATORIES for seed in seeds]
-    for laboratory, seed in tqdm(jobs, desc="studies"):
-        study = SOURCES[source](scene_of(laboratory, quick), seed)
-        shown.setdefault(laboratory, study)
-        for method in METHODS:
-            groups.setdefault((laboratory, method), []).append(identify(laboratory, study, method))
-    return report(folder, source, groups, truth, shown)
-
-
-def report(
-    folder: pathlib.Path,
-    source: str,
-    groups: Groups,
-    truth: Mapping[str, Mapping[str, float]],
-    shown: Mapping[str, etid.Study],
-) -> bool:
-    """Print and write what was identified; whether all of `check` holds."""
-    first, fourth = paper_tables.table_1(groups), paper_tables.table_4(groups, truth)
-    second, third = (
-        paper_tables.table_fingertips(groups, truth, condition) for condition in ("dry", "damp")
-    )
-    for name, rows in {"1": first, "2": second, "3": third, "4": fourth}.items():
-        write_csv(folder / f"table_{name}.csv", [{"source": source, **row} for row in rows])
-    fingertips = (
-        "Typical fingertip: median, its error [%], spread between trials [%]. Subjects: range of "
-        "their medians; median and largest absolute error [%]. Means over the studies in which "
-        "every subject has a circuit."
-    )
-    for section in (
-        Section(
-            "Table I: errors of five resistors [%]",
-            "Mean over the studies ± standard deviation between them.",
-            (paper_tables.show_1(first),),
-        ),
-        Section("Table II: dry fingertips", fingertips, (paper_tables.show_fingertips(second),)),
-        Section("Table III: damp fingertips", fingertips, (paper_tables.show_fingertips(third),)),
-        Section(
-            "Table IV: the built circuit",
-            "Mean error / scatter between the trials of a study (standard deviation between the "
-            "means of the studies, each with its own calibration). The paper tells no sign.",
-            (paper_tables.show_4(fourth),),
-        ),
-    ):
-        print(f"\n{section}")
-    print(f"\n{textwrap.fill(cause(fourth), 100)}\n")
-    paper_figures.draw(folder, groups, truth, shown, fourth)
-    found = check(first, fourth)
-    for text, met in found:
-        print(f"{text}: {'met' if met else 'MISSED'}")
-    print(f"Tables and figures: {folder.resolve()}")
-    return all(met for _, met in found)
 
 
 def cause(fourth: Sequence[Row]) -> str:
@@ -160,13 +110,35 @@ def cause(fourth: Sequence[Row]) -> str:
     )
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Where the waveforms come from, where the tables go, size of the run."""
-    parser.add_argument("--source", choices=SOURCES, default="simulated")
-    parser.add_argument("--folder", type=pathlib.Path, default=pathlib.Path("results/paper"))
-    parser.add_argument("--quick", action="store_true", help="one study with few trials")
-
-
 def main(arguments: argparse.Namespace) -> bool:
-    """Run the command."""
-    return run(arguments.folder, arguments.source, arguments.quick)
+    """Make, identify, print, write tables and figures; whether all of `check` holds."""
+    folder, source, quick = arguments.folder, arguments.source, arguments.quick
+    truth = etid.scenes.paper().truth()
+    groups: dict[tuple[str, str], list[Outcome]] = {}
+    shown: dict[str, etid.Study] = {}
+    jobs = [(name, seed) for name in LABORATORIES for seed in range(1 if quick else STUDIES)]
+    for laboratory, seed in tqdm(jobs, desc="studies", disable=None):
+        study = SOURCES[source](scene_of(laboratory, quick), seed)
+        shown.setdefault(laboratory, study)
+        for method in METHODS:
+            groups.setdefault((laboratory, method), []).append(identify(laboratory, study, method))
+    first, fourth = tables.table_1(groups), tables.table_4(groups, truth)
+    second, third = (tables.table_fingertips(groups, truth, of) for of in ("dry", "damp"))
+    for number, (title, text, show, rows) in enumerate(
+        (
+            ("Table I: errors of five resistors [%]", SPREADS, tables.show_1, first),
+            ("Table II: dry fingertips", FINGERTIPS, tables.show_fingertips, second),
+            ("Table III: damp fingertips", FINGERTIPS, tables.show_fingertips, third),
+            ("Table IV: the built circuit", SCATTER, tables.show_4, fourth),
+        ),
+        1,
+    ):
+        write_csv(folder / f"table_{number}.csv", [{"source": source, **row} for row in rows])
+        print(f"\n{Section(title, text, (show(rows),))}")
+    print(f"\n{textwrap.fill(cause(fourth), 100)}\n")
+    paper_figures.draw(folder, groups, truth, shown, fourth)
+    found = check(first, fourth)
+    for text, met in found:
+        print(f"{text}: {'met' if met else 'MISSED'}")
+    print(f"Tables and figures: {folder.resolve()}")
+    return all(met for _, met in found)

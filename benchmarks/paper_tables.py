@@ -36,6 +36,14 @@ def _mean(values: Iterable[float]) -> float:
     return float(np.mean(finite)) if finite else np.nan
 
 
+def _counts(every: Sequence[etid.Fits]) -> Row:
+    return {
+        "successful": sum(len(fits.successful()) for fits in every),
+        "circuits": sum(len(with_circuit(fits)) for fits in every),
+        "fits": sum(map(len, every)),
+    }
+
+
 def table_1(groups: Groups) -> list[Row]:
     """Errors of five known resistors, over the studies."""
     rows = []
@@ -44,19 +52,10 @@ def table_1(groups: Groups) -> list[Row]:
         for r, paper in published.TABLE_1.items():
             every = np.array([of[r] for of in found])
             some = every[np.isfinite(every)]
-            rows.append(
-                {
-                    "laboratory": laboratory,
-                    "method": method,
-                    "r": r,
-                    "paper_error": paper,
-                    "error": _mean(some),
-                    "spread": _sd(some),
-                    "rms": float(np.sqrt(_mean(some**2))),
-                    "circuits": some.size,
-                    "fits": every.size,
-                }
-            )
+            row = {"laboratory": laboratory, "method": method, "r": r, "paper_error": paper}
+            row |= {"error": _mean(some), "spread": _sd(some)}
+            row |= {"rms": float(np.sqrt(_mean(some**2)))}
+            rows.append({**row, "circuits": some.size, "fits": every.size})
     return rows
 
 
@@ -67,23 +66,14 @@ def table_fingertips(groups: Groups, truth: Truth, condition: str) -> list[Row]:
         every = [outcome.skins.where(condition=condition) for outcome in outcomes]
         some = [fits for fits in map(with_circuit, every) if _is_complete(fits, every[0])]
         for name in ORDER:
-            typical, lowest, highest = published.FINGERTIPS[condition][name]
+            paper = published.FINGERTIPS[condition][name]
             found = [vars(experiments.fingertips(fits, truth, name)) for fits in some]
-            fields = experiments.Fingertips.__dataclass_fields__
-            rows.append(
-                {
-                    "laboratory": laboratory,
-                    "method": method,
-                    "element": name,
-                    "paper_typical": typical,
-                    "paper_lowest": lowest,
-                    "paper_highest": highest,
-                    **{field: _mean(of[field] for of in found) for field in fields},
-                    "successful": sum(len(fits.successful()) for fits in every),
-                    "circuits": sum(len(with_circuit(fits)) for fits in every),
-                    "fits": sum(map(len, every)),
-                }
-            )
+            row = {"laboratory": laboratory, "method": method, "element": name}
+            ends = zip(("typical", "lowest", "highest"), paper, strict=True)
+            row |= {f"paper_{end}": value for end, value in ends}
+            for field in experiments.Fingertips.__dataclass_fields__:
+                row[field] = _mean(of[field] for of in found)
+            rows.append(row | _counts(every))
     return rows
 
 
@@ -108,25 +98,13 @@ def table_4(groups: Groups, truth: Truth) -> list[Row]:
         for i, name in enumerate(etid.SkinRC.names()):
             found = [experiments.errors(fits, truth)[name] for fits in some]
             means = np.array([errors.mean() for errors in found])
-            paper_error, paper_scatter = published.TABLE_4[name]
-            rows.append(
-                {
-                    "laboratory": laboratory,
-                    "method": method,
-                    "element": name,
-                    "paper_error": paper_error,
-                    "paper_scatter": paper_scatter,
-                    "error": _mean(means),
-                    "between": _sd(means),
-                    "scatter": float(np.sqrt(_mean(errors.var(ddof=1) for errors in found))),
-                    "stderr": _mean(_stderr_of_mean(fits, truth, i) for fits in some),
-                    "rrse": 100 * float(np.median([np.median(fits.rrse) for fits in every])),
-                    "successful": sum(len(fits.successful()) for fits in every),
-                    "circuits": sum(len(with_circuit(fits)) for fits in every),
-                    "fits": sum(map(len, every)),
-                    "studies": len(some),
-                }
-            )
+            row: Row = {"laboratory": laboratory, "method": method, "element": name}
+            row["paper_error"], row["paper_scatter"] = published.TABLE_4[name]
+            row |= {"error": _mean(means), "between": _sd(means)}
+            row["scatter"] = float(np.sqrt(_mean(errors.var(ddof=1) for errors in found)))
+            row["stderr"] = _mean(_stderr_of_mean(fits, truth, i) for fits in some)
+            row["rrse"] = 100 * float(np.median([np.median(fits.rrse) for fits in every]))
+            rows.append({**row, **_counts(every), "studies": len(some)})
     return sorted(rows, key=lambda row: ORDER.index(row["element"]))
 
 
@@ -137,42 +115,39 @@ def _stderr_of_mean(fits: etid.Fits, truth: Truth, i: int) -> float:
     return float(100 / known * np.sqrt(shared + (total - shared) / len(fits)))
 
 
+def _by_group(rows: Sequence[Row]) -> dict[tuple[str, str], list[Row]]:
+    """Rows of each laboratory and method."""
+    names = dict.fromkeys((row["laboratory"], row["method"]) for row in rows)
+    return {of: [row for row in rows if (row["laboratory"], row["method"]) == of] for of in names}
+
+
 def show_1(rows: Sequence[Row]) -> Table:
     """Table I for the terminal: mean error ± spread between studies."""
-    names = list(dict.fromkeys((row["laboratory"], row["method"]) for row in rows))
-    resistances = published.TABLE_1
-    lines: list[tuple[str, ...]] = [
-        ("paper", "", *(f"{error:g}" for error in resistances.values()), "")
-    ]
-    for name in names:
-        of = [row for row in rows if (row["laboratory"], row["method"]) == name]
+    lines = [("paper", "", *(f"{error:g}" for error in published.TABLE_1.values()), "")]
+    for name, of in _by_group(rows).items():
         cells = (
             number(row["error"]) + (f" ± {number(row['spread'])}" if row["circuits"] > 1 else "")
             for row in of
         )
         circuits, fits = (sum(row[key] for row in of) for key in ("circuits", "fits"))
         lines.append((*name, *cells, f"{circuits}/{fits}"))
-    heads = (f"{r / 1e3:g} kΩ" for r in resistances)
+    heads = (f"{r / 1e3:g} kΩ" for r in published.TABLE_1)
     return Table(("records", "method", *heads, "circuits"), tuple(lines))
 
 
 def show_fingertips(rows: Sequence[Row]) -> Table:
     """Table II or III for the terminal."""
     lines: list[tuple[str, ...]] = []
+    span = "{:.3g} to {:.3g}".format
     for name in ORDER:
         of = [row for row in rows if row["element"] == name]
         scale, symbol = DISPLAY[etid.SkinRC.units()[name]]
-        span = "{:.3g} to {:.3g}".format
-        paper = (of[0][f"paper_{key}"] / scale for key in ("typical", "lowest", "highest"))
-        first, *limits = paper
+        first, *limits = (of[0][f"paper_{key}"] / scale for key in ("typical", "lowest", "highest"))
         label = f"{name} [{symbol}]"
         lines.append((label, "paper", "", f"{first:.3g}", "", "", span(*limits), "", "", "", ""))
         lines += [
             (
-                label,
-                row["laboratory"],
-                row["method"],
-                f"{row['typical'] / scale:.4g}",
+                *(label, row["laboratory"], row["method"], f"{row['typical'] / scale:.4g}"),
                 *(number(row[key]) for key in ("error", "spread")),
                 span(row["lowest"] / scale, row["highest"] / scale),
                 *(number(row[key]) for key in ("subject_error", "worst")),
@@ -186,13 +161,12 @@ def show_fingertips(rows: Sequence[Row]) -> Table:
 
 def show_4(rows: Sequence[Row]) -> Table:
     """Table IV for the terminal: mean error / scatter within a study, and between studies."""
-    names = list(dict.fromkeys((row["laboratory"], row["method"]) for row in rows))
     paper = (f"±{error:g} / {scatter:g}" for error, scatter in published.TABLE_4.values())
     lines: list[tuple[str, ...]] = [
         ("paper", "", *paper, "{} to {}".format(*published.RRSE), "", "")
     ]
-    for name in names:
-        of = {row["element"]: row for row in rows if (row["laboratory"], row["method"]) == name}
+    for name, several in _by_group(rows).items():
+        of = {row["element"]: row for row in several}
         cells = (
             f"{number(of[e]['error'])} / {number(of[e]['scatter'])}"
             + (f" ({number(of[e]['between'])})" if of[e]["studies"] > 1 else "")

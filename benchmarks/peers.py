@@ -7,7 +7,7 @@ residual and Jacobian in NumPy, and is measured on a few of them.
 
 import importlib
 import warnings
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple, cast
 
 import jax
@@ -16,11 +16,10 @@ import numpy as np
 import optimistix as optx
 import scipy.optimize
 import scipy.signal
-from jaxtyping import Array, Float
 
 import etid
 from benchmarks.problem import SAMPLES, START, ByNumPy, Problem, harmonics, problem, terms
-from benchmarks.timing import first_and_warm
+from benchmarks.timing import median_time
 from etid.estimators.estimate import MAX_STEPS
 from etid.estimators.harmonic_start import start_of_skin
 from etid.estimators.maximum_likelihood.load_fit import WELL
@@ -72,53 +71,67 @@ def _vmapped(one: Callable[[Any], Any], data: Any) -> Run:
 
 def _looped(one: Callable[[Any], Any], data: Any) -> Run:
     """Lanes in a Python loop, those few that SciPy is measured on."""
-
-    def lane(i):
-        return one(jax.tree.map(lambda leaf: leaf[i], data))
-
-    return lambda index: [lane(i) for i in index[:BY_SCIPY]]
-
-
-def stages(ten_periods: Problem) -> list[Stage]:
-    """All stages of a problem."""
-    return [
-        _filter(ten_periods),
-        _equations(ten_periods),
-        _steiglitz_mcbride(ten_periods),
-        Stage("SM iteration on harmonics", {"ours": harmonic_steiglitz_mcbride(ten_periods, 1)}),
-        Stage("LM fit", solvers(ten_periods)),
-        samples_to_fit(ten_periods),
-        Stage("samples to judged joint fit", {"ours": judged(ten_periods)}),
+    return lambda index: [
+        one(jax.tree.map(lambda leaf, i=i: leaf[i], data)) for i in index[:BY_SCIPY]
     ]
 
 
-def _filter(ten_periods: Problem) -> Stage:
-    x, b, a = jnp.asarray(ten_periods.samples()[0]), jnp.asarray(B), jnp.asarray(A)
-    return Stage(
+def stages(of: Problem) -> list[Stage]:
+    """All stages of a problem."""
+    return [
+        *_on_samples(of),
+        Stage("SM iteration on harmonics", {"ours": harmonic_steiglitz_mcbride(of, 1)}),
+        Stage("LM fit", solvers(of)),
+        samples_to_fit(of),
+        Stage("samples to judged joint fit", {"ours": judged(of)}),
+    ]
+
+
+def _on_samples(of: Problem) -> Iterator[Stage]:
+    """Filter of order 6, its normal equations, and the first iteration of Steiglitz-McBride.
+
+    That is without what ours does to judge it.
+    """
+    v_th, v_out = of.samples()
+    x, b, a = map(jnp.asarray, (v_th, B, A))
+    yield Stage(
         "filter of order 6",
         {
             "ours": _each(lambda v: lfilter(b, a, v)[0][-1], x),
-            "scipy": _looped(lambda v: scipy.signal.lfilter(B, A, v), np.asarray(x)),
+            "scipy": _looped(lambda v: scipy.signal.lfilter(B, A, v), v_th),
         },
     )
 
+    def equations(v):
+        three = normal_equations(lambda q, _: lfilter(b, a.at[1:4].add(q), v)[0], jnp.zeros(3))
+        return three.matrix
 
-def _equations(ten_periods: Problem) -> Stage:
-    x, b, a = jnp.asarray(ten_periods.samples()[0]), jnp.asarray(B), jnp.asarray(A)
-
-    def ours(v):
-        of = normal_equations(lambda q, _: lfilter(b, a.at[1:4].add(q), v)[0], jnp.zeros(3))
-        return of.matrix
-
-    def by_scipy(v):
+    def equations_by_scipy(v):
         y = scipy.signal.lfilter(B, A, v)
         slope = -np.asarray(scipy.signal.lfilter([1.0], A, y))  # dy/da_k = −z⁻ᵏ y / A
         columns = np.stack([np.r_[np.zeros(k), slope[:-k]] for k in (1, 2, 3)], axis=1)
         return columns.T @ columns
 
-    return Stage(
-        "normal equations of 3", {"ours": _each(ours, x), "scipy": _looped(by_scipy, np.asarray(x))}
-    )
+    by = {"ours": _each(equations, x), "scipy": _looped(equations_by_scipy, v_th)}
+    yield Stage("normal equations of 3", by)
+    z_th = Rational(of.driver.b, of.driver.a)
+    num, den = np.asarray(of.driver.b), np.asarray(of.driver.a)
+
+    def iteration(records):
+        w = lfilter(z_th.num, z_th.den, records[1])[0]
+        x = records[0] - records[1]
+
+        def unjudged(_):
+            return jnp.zeros(()), jnp.array(True)
+
+        return iterate(in_time(x[None], w[None], 1, 1), 1, 1, unjudged, 1).filter.num
+
+    def iteration_by_scipy(records):
+        return numpy_steiglitz_mcbride(records[0], records[1], num, den, 1)[0]
+
+    both = x, jnp.asarray(v_out)
+    by = {"ours": _each(iteration, both), "scipy": _looped(iteration_by_scipy, (v_th, v_out))}
+    yield Stage("Steiglitz-McBride iteration", by)
 
 
 def numpy_steiglitz_mcbride(
@@ -136,46 +149,17 @@ def numpy_steiglitz_mcbride(
     return num, den
 
 
-def _steiglitz_mcbride(ten_periods: Problem) -> Stage:
-    """The first iteration, without what ours does to judge it; on harmonics at the side."""
-    v_th, v_out = ten_periods.samples()
-    driver = ten_periods.driver
-    z_th = Rational(driver.b, driver.a)
-    b, a = np.asarray(driver.b), np.asarray(driver.a)
-
-    def ours(records):
-        w = lfilter(z_th.num, z_th.den, records[1])[0]
-        x = records[0] - records[1]
-
-        def unjudged(_):
-            return jnp.zeros(()), jnp.array(True)
-
-        return iterate(in_time(x[None], w[None], 1, 1), 1, 1, unjudged, 1).filter.num
-
-    def by_scipy(records):
-        return numpy_steiglitz_mcbride(records[0], records[1], b, a, 1)[0]
-
-    return Stage(
-        "Steiglitz-McBride iteration",
-        {
-            "ours": _each(ours, (jnp.asarray(v_th), jnp.asarray(v_out))),
-            "scipy": _looped(by_scipy, (v_th, v_out)),
-        },
-    )
-
-
-def harmonic_steiglitz_mcbride(ten_periods: Problem, iterations: int) -> Run:
+def harmonic_steiglitz_mcbride(of: Problem, iterations: int) -> Run:
     """Our Steiglitz-McBride on the harmonics, a start of fits."""
-    known = ten_periods.known
-    z_th = known.z_th(jnp.zeros_like(known.loaded))
+    z_th = of.known.z_th(jnp.zeros_like(of.known.loaded))
 
     def ours(one):
         return start_of_skin(one.spectrum, z_th, one.sample_rate, iterations)[0].values()
 
-    return _each(ours, ten_periods.lanes)
+    return _each(ours, of.lanes)
 
 
-def one_fit(ten_periods: Problem) -> dict[str, Callable[[Any], Float[Array, " own"]]]:
+def one_fit(of: Problem) -> dict[str, Callable[[Any], Any]]:
     """Elements and delay of one lane, by each solver in JAX."""
     start = jnp.asarray(START)
     with warnings.catch_warnings():
@@ -183,15 +167,9 @@ def one_fit(ten_periods: Problem) -> dict[str, Callable[[Any], Float[Array, " ow
         jaxopt = importlib.import_module("jaxopt")
 
     def by(solver):
+        settings = {"max_steps": MAX_STEPS, "throw": False}
         return lambda one: (
-            optx.least_squares(
-                terms,
-                solver,
-                start,
-                args=ten_periods.load(one),
-                max_steps=MAX_STEPS,
-                throw=False,
-            ).value
+            optx.least_squares(terms, solver, start, args=of.load(one), **settings).value
         )
 
     rival = jaxopt.LevenbergMarquardt(
@@ -206,58 +184,52 @@ def one_fit(ten_periods: Problem) -> dict[str, Callable[[Any], Float[Array, " ow
     return {
         "ours": by(WELL),
         "optimistix": by(optx.LevenbergMarquardt(rtol=1e-8, atol=1e-8)),
-        "jaxopt": lambda one: rival.run(start, ten_periods.load(one)).params,
+        "jaxopt": lambda one: rival.run(start, of.load(one)).params,
     }
 
 
-def minpack(value: Callable, slope: Any) -> np.ndarray:
-    """The same by MINPACK."""
+def _minpack(value: Callable, slope: Any) -> np.ndarray:
     return scipy.optimize.least_squares(value, START, jac=slope, method="lm", x_scale="jac").x
 
 
-def _scipy_fit(ten_periods: Problem) -> Callable[[Any], np.ndarray]:
+def _scipy_fit(of: Problem) -> Callable[[Any], np.ndarray]:
     def fit(one):
-        by = ByNumPy(ten_periods.load(one))
-        slope: Any = by.jacobian
-        return minpack(by.terms, slope)
+        by = ByNumPy(of.load(one))
+        return _minpack(by.terms, by.jacobian)
 
     return fit
 
 
-def compiled_scipy_fit(ten_periods: Problem) -> Callable[[Any], np.ndarray]:
+def compiled_scipy_fit(of: Problem) -> Callable[[Any], np.ndarray]:
     """By MINPACK with our compiled terms, and a Jacobian by forward differentiation."""
     value, slope = jax.jit(terms), jax.jit(jax.jacfwd(terms))
 
     def fit(one):
-        load = ten_periods.load(one)
-        return minpack(
-            lambda q: np.asarray(value(q, load)),
-            lambda q: np.asarray(slope(q, load)),
-        )
+        load = of.load(one)
+        return _minpack(lambda q: np.asarray(value(q, load)), lambda q: np.asarray(slope(q, load)))
 
     return fit
 
 
-def solvers(ten_periods: Problem) -> dict[str, Run]:
+def solvers(of: Problem) -> dict[str, Run]:
     """One fit per lane, Z_th known, by every solver."""
-    by, lanes = one_fit(ten_periods), ten_periods.lanes
+    by, lanes = one_fit(of), of.lanes
     return {
         "ours": _each(by["ours"], lanes),
-        "scipy": _looped(_scipy_fit(ten_periods), lanes),
+        "scipy": _looped(_scipy_fit(of), lanes),
         "optimistix": _vmapped(by["optimistix"], lanes),
         "jaxopt": _vmapped(by["jaxopt"], lanes),
     }
 
 
-def samples_to_fit(ten_periods: Problem) -> Stage:
+def samples_to_fit(of: Problem) -> Stage:
     """The same from the samples on, whose harmonics are made alike for all."""
-    found = solvers(ten_periods)
+    found = solvers(of)
 
     def after_harmonics(name: str) -> Run:
         def run(index):
-            done = index[:BY_SCIPY] if name == "scipy" else index
-            for i in done:
-                harmonics(ten_periods.records[i])
+            for i in index[:BY_SCIPY] if name == "scipy" else index:
+                harmonics(of.records[i])
             return found[name](index)
 
         return run
@@ -265,26 +237,17 @@ def samples_to_fit(ten_periods: Problem) -> Stage:
     return Stage("samples to fit", {name: after_harmonics(name) for name in found})
 
 
-def judged(ten_periods: Problem) -> Run:
+def judged(of: Problem) -> Run:
     """What etid does by default: jointly with the calibration, with errors and a verdict."""
-
-    def run(index):
-        records = [ten_periods.records[i] for i in index]
-        return etid.identify_skins(records, ten_periods.driver).fit.chi2
-
-    return run
+    return lambda index: etid.identify_skins([of.records[i] for i in index], of.driver).fit.chi2
 
 
 def rows(
     distinct: int, lanes: Sequence[int], repeats: int, limit: float
-) -> Iterable[dict[str, Any]]:
+) -> Iterator[dict[str, Any]]:
     """Milliseconds per lane, one row per stage and number of lanes; more lanes repeat the distinct.
 
-    Args:
-        distinct: How many lanes differ.
-        lanes: Numbers of lanes.
-        repeats: Of each measurement, after a first call.
-        limit: Longest call [s] that is made.
+    No call is made that will take longer than `limit` [s].
     """
     for stage in stages(problem(SAMPLES, distinct)):
         known: dict[str, float] = {}
@@ -292,13 +255,12 @@ def rows(
             index = np.arange(count) % distinct
             row: dict[str, Any] = {"stage": stage.name, "lanes": count}
             for name in NAMES:
-                run = stage.by.get(name)
-                done = min(count, BY_SCIPY) if name == "scipy" else count
+                run, done = stage.by.get(name), min(count, BY_SCIPY) if name == "scipy" else count
                 if run is None or known.get(name, 0.0) * done > limit:
                     row[name] = None
                     continue
-                times = first_and_warm(lambda run=run, index=index: run(index), repeats)
-                known[name] = times[1] / done
+                time = median_time(lambda run=run, index=index: run(index), repeats)
+                known[name] = time / done
                 row[name] = 1e3 * known[name]
             yield row
 

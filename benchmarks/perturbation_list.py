@@ -39,7 +39,6 @@ from benchmarks.perturbed_study import (
     pulses,
     record,
     second_resistor,
-    skin_for_resistor,
     skin_is,
     th,
     trials,
@@ -198,7 +197,7 @@ CALIBRATIONS: Mapping[str, Change] = {
     "says_1Tohm": calibrations(record(told={"r_load": 1e12})),
     "calibration_v_out_is_v_th": calibrations(record(copied=True)),
     "calibration_unloaded": calibrations(out(loads=(ResistorLoad(1e15),))),
-    "calibration_is_skin": skin_for_resistor,
+    "calibration_is_skin": calibrations(out(loads=(LOADS["dry"],))),
 }
 
 PERTURBATIONS: Mapping[str, Change] = {
@@ -214,18 +213,13 @@ PERTURBATIONS: Mapping[str, Change] = {
 
 @dataclasses.dataclass(frozen=True)
 class Invisible:
-    """Why a perturbation is not seen.
+    """Why a perturbation is not seen."""
 
-    Attributes:
-        why: By how much the elements are wrong, and the reason.
-        change: Of the records. As many silent answers are excused as the best test would miss; None
-            if no test can see it at all.
-        snr_db: Largest at which it is so [dB].
-    """
-
-    why: str
+    why: str  # by how much the elements are wrong, and the reason
+    # of the records. As many silent answers are excused as the best test would miss; None if no
+    # test can see it at all
     change: visibility.Change | None = None
-    snr_db: float = math.inf
+    snr_db: float = math.inf  # largest at which it is so [dB]
 
     def excuses(self, path: str, snr_db: float, silent: int, answers: int) -> bool:
         """Whether so many silent answers are as many as the best test would give, or less.

@@ -19,135 +19,225 @@ most 2 % of the undisturbed recordings refused.
 """
 
 import argparse
-import concurrent.futures
-import itertools
-import pathlib
+import collections
+import functools
 from collections.abc import Iterator, Sequence
+from typing import Any
 
-from tqdm import tqdm
+import jax
+import numpy as np
 
+import etid
 from benchmarks import perturbation_chart
-from benchmarks.estimators import DEFAULT, OURS
-from benchmarks.perturbation_draws import Answer, draw, table
+from benchmarks.estimators import (
+    DEFAULT,
+    DETERMINED,
+    ELEMENTS,
+    FAR,
+    NOTHING,
+    OFF,
+    OURS,
+    Answer,
+    Drivers,
+    method_of,
+)
+from benchmarks.laboratory import Record
+from benchmarks.ladder import LOADS
+from benchmarks.mappings import make_room
+from benchmarks.perturbation_chart import KINDS
 from benchmarks.perturbation_list import INVISIBLE, PERTURBATIONS, UNDISTURBED
-from benchmarks.provenance import RESULTS, write_csv
-from etid.identify import file as streaming
+from benchmarks.perturbed_study import REFERENCE, Truth, undisturbed
+from benchmarks.provenance import write_csv
+from benchmarks.runner import FOLDER, QUICK, WORKERS, Target, each, option, report
+from etid.simulation.scenes import Scene, Trial
+from etid.simulation.transformer import ResistorLoad
 
-DRIVERS = 10
-SNR_DB = (40.0, 60.0)
 REFUSED = 0.02  # of undisturbed recordings, at most
-QUICK = ("base", "polarity_out", "rp_linear_0.2", "driver_Rload_wrong_5%")
+FEW = ("base", "polarity_out", "rp_linear_0.2", "driver_Rload_wrong_5%")
+
+OPTIONS = (
+    QUICK,
+    WORKERS,
+    FOLDER,
+    option("--only", nargs="+", choices=PERTURBATIONS, metavar="NAME", help="these perturbations"),
+    option("--drivers", default=10),
+    option("--snr-db", default=(40.0, 60.0), metavar="DB"),
+    option("--method", default=(DEFAULT,), choices=OURS),
+)
 
 
-def draws(
-    names: Sequence[str],
-    drivers: int,
-    snr_db: Sequence[float],
-    methods: Sequence[str],
-    workers: int,
-) -> Iterator[list[Answer]]:
-    """All answers, driver by driver."""
-    tasks = list(itertools.product(range(drivers), snr_db))
-    if workers == 1:
-        yield from (draw(names, number, snr, methods) for number, snr in tasks)
-        return
-    with streaming.processes(workers) as executor:
-        futures = [executor.submit(draw, names, number, snr, methods) for number, snr in tasks]
-        yield from (future.result() for future in concurrent.futures.as_completed(futures))
+def in_stderrs(of: Answer) -> np.ndarray:
+    """Errors in standard errors; in bounds, where the method gives no standard error.
+
+    An infinite element is infinitely far off, although its standard error is infinite, too.
+    """
+    far = np.abs(of.error)
+    size = np.where(of.stderr > 0, of.stderr, of.bound)
+    return np.divide(far, size, out=far.copy(), where=np.isfinite(far))
+
+
+def kind(of: Answer) -> str:
+    """What an answer is, of `KINDS`."""
+    far = (in_stderrs(of) > FAR) & of.exact
+    far |= (np.abs(of.error) > OFF) & (of.bound <= DETERMINED)
+    wrong = bool(far.any() or np.isnan(of.error).any())
+    if of.successful:
+        return "silent" if wrong else "right"
+    return "said" if wrong else "refused"
+
+
+def error_of(values: np.ndarray, truth: Truth, remarked: bool) -> np.ndarray:
+    """Relative errors of an answer; 0 where the truth has no such element.
+
+    Args:
+        values: The elements that are said.
+        truth: What is right.
+        remarked: Whether the answer says that something was wrong with the recording.
+    """
+    to_low, to_high = values / truth.low - 1, values / truth.high - 1
+    inside = (to_low >= 0) & (to_high <= 0)
+    low_is_near = np.abs(to_low) < np.abs(to_high)
+    if truth.moves and not remarked:
+        error = np.where(low_is_near, to_high, to_low)
+    else:
+        error = np.where(inside, 0.0, np.where(low_is_near, to_low, to_high))
+    return np.where(np.isnan(truth.low), 0.0, error)
+
+
+def said(
+    records: Sequence[etid.Recording], driver: etid.Driver | None, name: str
+) -> list[tuple[str, np.ndarray, np.ndarray, bool]]:
+    """Verdict, elements, standard errors, and whether there is a remark, for each recording."""
+    if driver is None:
+        return [("driver_failed", NOTHING, NOTHING, False)] * len(records)
+    fits = etid.identify_skins(records, driver, method=method_of(name))
+    remarks = np.broadcast_to(np.asarray(getattr(fits.fit, "remarks", 0)), len(fits))
+    values, errors = (
+        np.stack([np.asarray(getattr(of, element)) for element in ELEMENTS], -1)
+        for of in (fits.circuit, fits.stderr)
+    )
+    return list(zip(map(str, fits.verdicts), values, errors, map(bool, remarks), strict=True))
+
+
+@functools.cache
+def _bounds(snr_db: float, samples: int, bits: int, full_scale: float) -> dict[str, np.ndarray]:
+    """Bounds of the undisturbed scene with this noise and converter, by path."""
+    scene = Scene(
+        tuple(Trial(name, skin) for name, skin in LOADS.items()),
+        (Trial("calibration", ResistorLoad(REFERENCE)),),
+        snr_db=snr_db,
+        samples=samples,
+        bits=bits,
+        full_scale=full_scale,
+    )
+    return {path: np.array(list(of.relative.values())) for path, of in etid.bound(scene).items()}
+
+
+def draw(names: Sequence[str], number: int, snr_db: float, methods: Sequence[str]) -> list[Answer]:
+    """All answers behind one driver with one noise; perturbations that share a driver together."""
+    with jax.enable_x64(True):  # of a worker process
+        drivers, found = Drivers(), list[Answer]()
+        studies = {name: PERTURBATIONS[name](undisturbed(number, snr_db)) for name in names}
+        calibrations = {n: [of.recording(number) for of in s.calibrations]
+                        for n, s in studies.items()}  # fmt: skip
+        together: dict[tuple, list[tuple[str, Record, Truth]]] = {}
+        behind = [(method, name) for method in methods for name in names]
+        known = {place: drivers.of(calibrations[place[1]], place[0]) for place in behind}
+        for method, name in behind:
+            trials = [(name, of, studies[name].truths[of.path]) for of in studies[name].trials]
+            together.setdefault((method, id(known[method, name])), []).extend(trials)
+        for (method, _), trials in together.items():
+            driver = known[method, trials[0][0]]
+            answers = said([of.recording(number) for _, of, _ in trials], driver, method)
+            for (name, of, truth), (verdict, values, stderr, remarked) in zip(
+                trials, answers, strict=True
+            ):
+                one = Answer(
+                    *(method, number, of.path, verdict),
+                    error=error_of(values, truth, remarked),
+                    stderr=stderr / ((truth.low + truth.high) / 2),
+                    bound=_bounds(snr_db, of.samples, of.bits, of.full_scale)[of.path],
+                    exact=not truth.words,
+                    perturbation=name,
+                    snr_db=snr_db,
+                )
+                found.append(one)
+        make_room()
+        return found
+
+
+def table(answers: Sequence[Answer], by: Sequence[str]) -> list[dict[str, Any]]:
+    """Counts for each group of answers with the same attributes `by`, in their order."""
+    groups: dict[tuple, list[Answer]] = {}
+    for answer in answers:
+        groups.setdefault(tuple(getattr(answer, name) for name in by), []).append(answer)
+    rows = []
+    for key, of in groups.items():
+        counts = collections.Counter(map(kind, of))
+        row = {**dict(zip(by, key, strict=True)), "answers": len(of)}
+        row |= {name: counts[name] for name in KINDS}
+        row |= _worst([answer for answer in of if kind(answer) == "silent"])
+        verdicts = collections.Counter(answer.verdict for answer in of).most_common()
+        row["verdicts"] = ", ".join(f"{count} {verdict}" for verdict, count in verdicts)
+        rows.append(row)
+    return rows
+
+
+def _worst(silent: Sequence[Answer]) -> dict[str, Any]:
+    """The element of silent answers that is farthest off in standard errors."""
+    found: tuple[Any, ...] = ("",) * 4
+    if silent:
+        worst = max(silent, key=lambda answer: np.nanmax(in_stderrs(answer)))
+        off = in_stderrs(worst)
+        i = int(np.nanargmax(off))
+        found = worst.path, ELEMENTS[i], float(off[i]), float(worst.error[i])
+    return dict(zip(("worst_path", "worst_element", "worst_stderrs", "worst_error"), found,
+                    strict=True))  # fmt: skip
 
 
 def summary(answers: Sequence[Answer]) -> Iterator[str]:
     """Lines of a table: one for each perturbation, noise and method."""
-    yield f"{'perturbation':<36}{'SNR':>4}  right refused  said silent   worst silent error"
+    yield f"{'perturbation':<36}{'SNR':>4}" + "".join(f"{name:>8}" for name in KINDS)
     for row in table(answers, ("perturbation", "snr_db", "method")):
-        worst = ""
+        worst = "" if row["method"] == DEFAULT else f"{row['method']}  "
         if row["silent"]:
-            worst = (
+            worst += (
                 f"{row['worst_element']} {row['worst_stderrs']:.1f} standard errors, "
-                f"{100 * row['worst_error']:.1f} %, {row['worst_path']}"
+                f"{100 * row['worst_error']:.1f} %, {row['worst_path']}  "
             )
-        method = "" if row["method"] == DEFAULT else f"{row['method']}  "
-        yield (
-            f"{row['perturbation']:<36}{row['snr_db']:>4.0f}{row['right']:>7}{row['refused']:>8}"
-            f"{row['said']:>6}{row['silent']:>7}   {method}{worst}  {row['verdicts']}"
-        )
+        counts = "".join(f"{row[name]:>8}" for name in KINDS)
+        yield f"{row['perturbation']:<36}{row['snr_db']:>4.0f}{counts}   {worst}{row['verdicts']}"
 
 
-def met(answers: Sequence[Answer]) -> bool:
-    """Whether the targets are met by the default method; else says where not."""
-    holds = True
+def targets(answers: Sequence[Answer]) -> Iterator[Target]:
+    """What the default method misses."""
     of_default = [a for a in answers if a.method == DEFAULT]
     for row in table(of_default, ("perturbation", "snr_db", "path")):
-        name, place = row["perturbation"], (row["path"], row["snr_db"])
-        count = row["silent"], row["answers"]
-        if row["silent"] and not (name in INVISIBLE and INVISIBLE[name].excuses(*place, *count)):
-            print(f"silent: {name}, {place[0]} at {place[1]:g} dB, {count[0]} of {count[1]}")
-            holds = False
+        name, place, silent = row["perturbation"], (row["path"], row["snr_db"]), row["silent"]
+        known = INVISIBLE.get(name)
+        if silent and not (known and known.excuses(*place, silent, row["answers"])):
+            where = f"silent: {name}, {place[0]} at {place[1]:g} dB"
+            yield Target(where, silent, most=0, text=f"{silent} of {row['answers']}")
     for row in table(of_default, ("perturbation",)):
-        name = row["perturbation"]
-        if name in UNDISTURBED and row["refused"] + row["said"] > REFUSED * row["answers"]:
-            print(f"refused: {name}, {row['refused'] + row['said']} of {row['answers']}")
-            holds = False
-    return holds
-
-
-def write(answers: Sequence[Answer], method: str, folder: pathlib.Path) -> None:
-    """Write the table, and the figure of one method, into `folder`."""
-    rows = table(answers, ("perturbation", "snr_db", "path", "method"))
-    write_csv(folder / "perturbations.csv", rows)
-    of_one = [row for row in rows if row["method"] == method]
-    perturbation_chart.draw(of_one, folder / "perturbations.svg")
-
-
-def run(
-    names: Sequence[str],
-    drivers: int,
-    snr_db: Sequence[float],
-    methods: Sequence[str],
-    folder: pathlib.Path,
-    workers: int,
-) -> bool:
-    """Draw, count and print; write the table and the figure with every driver that is done."""
-    answers: list[Answer] = []
-    place = {name: number for number, name in enumerate(names)}
-    with tqdm(total=drivers * len(snr_db), unit="driver") as bar:
-        for found in draws(names, drivers, snr_db, methods, workers):
-            answers += found
-            answers.sort(
-                key=lambda a: (a.snr_db, place[a.perturbation], a.path, a.method, a.number)
-            )
-            write(answers, methods[0], folder)  # nothing that is done is lost
-            bar.update()
-    print("\n".join(summary(answers)))
-    return met(answers)
-
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Size of the run."""
-    parser.add_argument("--only", nargs="+", metavar="NAME", help="these perturbations")
-    parser.add_argument("--quick", action="store_true", help="few perturbations and drivers")
-    parser.add_argument("--drivers", type=int, default=DRIVERS)
-    parser.add_argument("--snr-db", type=float, nargs="+", default=list(SNR_DB), metavar="DB")
-    parser.add_argument("--method", nargs="+", choices=OURS, default=[DEFAULT])
-    parser.add_argument("--workers", type=int, default=2, help="processes, each on a core")
-    parser.add_argument(
-        "--folder", type=pathlib.Path, default=RESULTS, help="of the table and the figure"
-    )
+        if row["perturbation"] in UNDISTURBED:
+            share = (row["refused"] + row["said"]) / row["answers"]
+            yield Target(f"refused: {row['perturbation']}", share, most=REFUSED)
 
 
 def main(arguments: argparse.Namespace) -> bool:
-    """Run the command."""
-    names = list(QUICK) if arguments.quick else arguments.only or list(PERTURBATIONS)
-    unknown = sorted(set(names) - set(PERTURBATIONS))
-    if unknown:
-        raise SystemExit(
-            f"no perturbation {', '.join(unknown)}; there are {', '.join(PERTURBATIONS)}"
-        )
-    return run(
-        names,
-        2 if arguments.quick else arguments.drivers,
-        arguments.snr_db,
-        arguments.method,
-        arguments.folder,
-        1 if arguments.quick else arguments.workers,
-    )
+    """Draw, count and print; write table and picture with every driver that is done."""
+    quick, methods, folder = arguments.quick, arguments.method, arguments.folder
+    names = list(FEW) if quick else arguments.only or list(PERTURBATIONS)
+    place = {name: number for number, name in enumerate(names)}
+    numbers = range(2 if quick else arguments.drivers)
+    tasks = [(names, number, snr, methods) for number in numbers for snr in arguments.snr_db]
+    answers: list[Answer] = []
+    for _, found in each(draw, tasks, 1 if quick else arguments.workers, "driver"):
+        answers += found
+        answers.sort(key=lambda a: (a.snr_db, place[a.perturbation], a.path, a.method, a.seed))
+        rows = table(answers, ("perturbation", "snr_db", "path", "method"))
+        write_csv(folder / "perturbations.csv", rows)
+        of_one = [row for row in rows if row["method"] == methods[0]]
+        perturbation_chart.draw(of_one, folder / "perturbations.svg")
+    print("\n".join(summary(answers)))
+    return report(targets(answers))

@@ -30,20 +30,15 @@ PULSE_RATE = 60.0  # [Hz]
 
 @dataclasses.dataclass(frozen=True)
 class Truth:
-    """What is right to say of a skin; arrays are (element,), in SI.
+    """What is right to say of a skin; arrays are (element,), in SI."""
 
-    Attributes:
-        low: Smallest value of each element in the record.
-        high: Largest.
-        moves: Whether it went from the one to the other: an answer that does not say so claims that
-            the elements were what it gives all the time.
-        words: Whether the elements are a matter of words, as of skin that is not one RC: they are
-            wrong by 20 % only.
-    """
-
-    low: Float[np.ndarray, " element"]
-    high: Float[np.ndarray, " element"]
+    low: Float[np.ndarray, " element"]  # smallest value of each element in the record
+    high: Float[np.ndarray, " element"]  # largest
+    # whether it went from the one to the other: an answer that does not say so claims that the
+    # elements were what it gives all the time
     moves: bool = False
+    # whether the elements are a matter of words, as of skin that is not one RC: they are wrong by
+    # 20 % only
     words: bool = False
 
     @classmethod
@@ -55,19 +50,12 @@ class Truth:
 
 @dataclasses.dataclass(frozen=True)
 class Study:
-    """The records of a driver.
+    """The records of a driver."""
 
-    Attributes:
-        number: Of the driver.
-        calibrations: With known resistors.
-        trials: With skin.
-        truths: Of the trials, by path.
-    """
-
-    number: int
-    calibrations: tuple[Record, ...]
-    trials: tuple[Record, ...]
-    truths: Mapping[str, Truth]
+    number: int  # of the driver
+    calibrations: tuple[Record, ...]  # with known resistors
+    trials: tuple[Record, ...]  # with skin
+    truths: Mapping[str, Truth]  # of the trials, by path
 
 
 Change = Callable[[Study], Study]
@@ -115,30 +103,34 @@ def undisturbed(number: int, snr_db: float) -> Study:
     )
 
 
-def all_records(change: Callable[[Record], Record]) -> Change:
-    """Change calibrations and trials."""
+def _to(*groups: str) -> Callable[[Callable[[Record], Record]], Change]:
+    """Change the records of some groups."""
 
-    def changed(study: Study) -> Study:
-        calibrations = tuple(map(change, study.calibrations))
-        return dataclasses.replace(study, calibrations=calibrations, **_trials(study, change))
+    def changing(change: Callable[[Record], Record]) -> Change:
+        return lambda study: dataclasses.replace(
+            study, **{group: tuple(map(change, getattr(study, group))) for group in groups}
+        )
 
-    return changed
-
-
-def calibrations(change: Callable[[Record], Record]) -> Change:
-    """Change the calibrations only."""
-    return lambda study: dataclasses.replace(
-        study, calibrations=tuple(map(change, study.calibrations))
-    )
+    return changing
 
 
-def trials(change: Callable[[Record], Record]) -> Change:
-    """Change the records of skin only."""
-    return lambda study: dataclasses.replace(study, **_trials(study, change))
+def _fields(*names: str) -> Callable[..., Callable[[Record], Record]]:
+    """Change fields of some voltages of a record."""
+
+    def changing(**fields: Any) -> Callable[[Record], Record]:
+        return lambda of: dataclasses.replace(
+            of, **{name: dataclasses.replace(getattr(of, name), **fields) for name in names}
+        )
+
+    return changing
 
 
-def _trials(study: Study, change: Callable[[Record], Record]) -> dict[str, Any]:
-    return {"trials": tuple(map(change, study.trials))}
+all_records, calibrations, trials = (
+    _to("calibrations", "trials"),
+    _to("calibrations"),
+    _to("trials"),
+)
+both, out, th = _fields("th", "out"), _fields("out"), _fields("th")
 
 
 def record(**fields: Any) -> Callable[[Record], Record]:
@@ -146,47 +138,25 @@ def record(**fields: Any) -> Callable[[Record], Record]:
     return lambda of: dataclasses.replace(of, **fields)
 
 
-def both(**fields: Any) -> Callable[[Record], Record]:
-    """Change fields of both voltages."""
-    return lambda of: dataclasses.replace(
-        of, th=dataclasses.replace(of.th, **fields), out=dataclasses.replace(of.out, **fields)
-    )
-
-
-def out(**fields: Any) -> Callable[[Record], Record]:
-    """Change fields of the loaded voltage."""
-    return lambda of: dataclasses.replace(of, out=dataclasses.replace(of.out, **fields))
-
-
-def th(**fields: Any) -> Callable[[Record], Record]:
-    """Change fields of the unloaded voltage."""
-    return lambda of: dataclasses.replace(of, th=dataclasses.replace(of.th, **fields))
-
-
 def late(samples: float) -> Callable[[Record], Record]:
     """Record the loaded voltage later than the unloaded one."""
     return lambda of: out(delay=of.out.delay + samples * SAMPLE)(of)
 
 
+def scaled(driver: TransformerDriver, **factors: float) -> TransformerDriver:
+    """A driver with some parts multiplied."""
+    new = {name: getattr(driver, name) * factor for name, factor in factors.items()}
+    return dataclasses.replace(driver, **new)
+
+
 def parts(**factors: float) -> Callable[[Record], Record]:
     """Multiply parts of the driver behind both voltages."""
-
-    def change(of: Record) -> Record:
-        known = of.out.driver
-        new = {name: getattr(known, name) * factor for name, factor in factors.items()}
-        return both(driver=dataclasses.replace(known, **new))(of)
-
-    return change
+    return lambda of: both(driver=scaled(of.out.driver, **factors))(of)
 
 
 def louder(factor: float) -> Callable[[Record], Record]:
     """Multiply the amplitude of the driver behind the loaded voltage."""
-
-    def change(of: Record) -> Record:
-        driver = of.out.driver
-        return out(driver=dataclasses.replace(driver, amplitude=factor * driver.amplitude))(of)
-
-    return change
+    return lambda of: out(driver=scaled(of.out.driver, amplitude=factor))(of)
 
 
 def crosstalk(later: float) -> Callable[[Record], Record]:
@@ -194,52 +164,45 @@ def crosstalk(later: float) -> Callable[[Record], Record]:
     return lambda of: out(added=(Crosstalk(of.th, 0.01, later),))(of)
 
 
+def _other(change: Callable[[Record], Record], truth: Callable[[str], Truth]) -> Change:
+    """Change the records of skin, and what is true of it, by path."""
+    return lambda study: dataclasses.replace(
+        trials(change)(study), truths={path: truth(path) for path in study.truths}
+    )
+
+
 def skin_is(make: Callable[[SkinLoad], Impedance], **more: bool) -> Change:
     """Replace the skin by something with the same limits."""
-
-    def change(study: Study) -> Study:
-        def replaced(of: Record) -> Record:
-            return out(loads=(make(LOADS[of.path]),))(of)
-
-        truths = {
-            path: Truth.of(getattr(make(LOADS[path]), "elements", LOADS[path]), **more)
-            for path in study.truths
-        }
-        return dataclasses.replace(trials(replaced)(study), truths=truths)
-
-    return change
+    loads = {path: make(skin) for path, skin in LOADS.items()}
+    return _other(
+        lambda of: out(loads=(loads[of.path],))(of),
+        lambda path: Truth.of(getattr(loads[path], "elements", LOADS[path]), **more),
+    )
 
 
 def changing(element: str, fall: float, steps: bool, periods: int = PERIODS) -> Change:
     """Let an element fall from pulse to pulse, or in one step after the first half."""
     place = np.arange(periods) / (periods - 1)
-    lost = fall * (np.where(place >= 0.5, 1.0, 0.0) if steps else place)
+    kept = 1 - fall * (np.where(place >= 0.5, 1.0, 0.0) if steps else place)
 
-    def skins(path: str) -> list[SkinLoad]:
-        at_first = LOADS[path]
-        value = getattr(at_first, element)
-        return [dataclasses.replace(at_first, **{element: value * (1 - part)}) for part in lost]
+    def skins(path: str) -> tuple[SkinLoad, ...]:
+        value = getattr(LOADS[path], element)
+        return tuple(dataclasses.replace(LOADS[path], **{element: value * part}) for part in kept)
 
-    def change(study: Study) -> Study:
-        found = trials(lambda of: out(loads=tuple(skins(of.path)))(of))(study)
-        truths = {path: Truth.of(*skins(path), moves=True) for path in study.truths}
-        return dataclasses.replace(found, truths=truths)
-
-    return change
+    return _other(
+        lambda of: out(loads=skins(of.path))(of),
+        lambda path: Truth.of(*skins(path), moves=True),
+    )
 
 
 def nonlinear(fall: float) -> Change:
     """Let R_p fall with the voltage; any R_p between the two is right."""
 
-    def change(study: Study) -> Study:
-        found = trials(lambda of: out(voltage=Nonlinear(LOADS[of.path], fall))(of))(study)
-        truths = {
-            path: Truth.of(skin, dataclasses.replace(skin, r_p=(1 - fall) * skin.r_p))
-            for path, skin in LOADS.items()
-        }
-        return dataclasses.replace(found, truths=truths)
+    def truth(path: str) -> Truth:
+        skin = LOADS[path]
+        return Truth.of(skin, dataclasses.replace(skin, r_p=(1 - fall) * skin.r_p))
 
-    return change
+    return _other(lambda of: out(voltage=Nonlinear(LOADS[of.path], fall))(of), truth)
 
 
 def pulses(*places: tuple[float, float]) -> dict[str, Any]:
@@ -247,17 +210,19 @@ def pulses(*places: tuple[float, float]) -> dict[str, Any]:
     return {"pulses": places, "over": PERIODS}
 
 
+def _later(of: Record, by: float, **fields: Any) -> Record:
+    """The record with both voltages later by so much [s], and with other fields."""
+    for name in ("th", "out"):
+        new = {"delay": getattr(of, name).delay + by, **fields}
+        of = _fields(name)(**new)(of)
+    return of
+
+
 def on_edge(of: Record) -> Record:
     """Begin both records on an edge, and let the last pulse of three come one sample late."""
     driver, late = of.th.driver, PULSE_RATE * SAMPLE
-    earlier = driver.lead_in + driver.edge / 2
-    moved = (
-        dataclasses.replace(
-            one, delay=one.delay + earlier, **pulses((0, 1.0), (1, 1.0), (2 + late, 1.0))
-        )
-        for one in (of.th, of.out)
-    )
-    return record(**dict(zip(("th", "out"), moved, strict=True)))(of)
+    places = (0, 1.0), (1, 1.0), (2 + late, 1.0)
+    return _later(of, driver.lead_in + driver.edge / 2, **pulses(*places))
 
 
 def second_resistor(factor: float) -> Change:
@@ -266,25 +231,13 @@ def second_resistor(factor: float) -> Change:
     def change(study: Study) -> Study:
         [first] = study.calibrations
         rng = np.random.default_rng([study.number, *b"second resistor"])
-        second = dataclasses.replace(
-            first,
-            path="calibration/21k62",
-            th=dataclasses.replace(first.th, delay=DELAY * rng.standard_normal()),
-            out=dataclasses.replace(
-                first.out,
-                loads=(ResistorLoad(factor * SECOND),),
-                delay=DELAY * rng.standard_normal(),
-            ),
-            r_load=SECOND,
-        )
+        delays = DELAY * rng.standard_normal(2)
+        second = record(path="calibration/21k62", r_load=SECOND)(first)
+        second = th(delay=delays[0])(second)
+        second = out(delay=delays[1], loads=(ResistorLoad(factor * SECOND),))(second)
         return dataclasses.replace(study, calibrations=(first, second))
 
     return change
-
-
-def skin_for_resistor(study: Study) -> Study:
-    """Calibrate with dry skin in the resistor's place."""
-    return calibrations(out(loads=(LOADS["dry"],)))(study)
 
 
 def longer(change: Change = lambda study: study) -> Change:
@@ -295,23 +248,14 @@ def longer(change: Change = lambda study: study) -> Change:
 def coherent(antialias: float = CORNER) -> Change:
     """Record with a whole number of samples in each period, 240 kHz at 60 Hz.
 
-    Args:
-        antialias: Corner of the anti-alias filter, relative to the sample rate.
+    `antialias` is the corner of the anti-alias filter, relative to the sample rate.
     """
+    rate = {"sample_rate": COHERENT_RATE, "samples": round(PERIODS * COHERENT_RATE / 60)}
 
     def change(study: Study) -> Study:
         # Where between two samples the pulses begin is the phase of the aliases.
         start = np.random.default_rng([study.number, *b"start"]).uniform() / COHERENT_RATE
-
-        def changed(of: Record) -> Record:
-            th, out = (
-                dataclasses.replace(one, delay=one.delay + start, antialias=antialias)
-                for one in (of.th, of.out)
-            )
-            rate = {"sample_rate": COHERENT_RATE, "samples": round(PERIODS * COHERENT_RATE / 60)}
-            return dataclasses.replace(of, th=th, out=out, **rate)
-
-        return all_records(changed)(study)
+        return all_records(lambda of: record(**rate)(_later(of, start, antialias=antialias)))(study)
 
     return change
 

@@ -27,21 +27,13 @@ START = np.append(np.log([20e3, 100e3, 0.3e-9]), 0.0)
 
 
 class Problem(NamedTuple):
-    """Trials of one load with their driver.
+    """Trials of one load with their driver."""
 
-    Attributes:
-        study: All recordings.
-        driver: As identified from the calibration.
-        records: The trials.
-        lanes: Their harmonics, stacked.
-        known: What the calibration tells at these.
-    """
-
-    study: etid.Study
-    driver: etid.Driver
-    records: list[etid.Recording]
-    lanes: Harmonics
-    known: GivenDriver
+    study: etid.Study  # all recordings
+    driver: etid.Driver  # as identified from the calibration
+    records: list[etid.Recording]  # the trials
+    lanes: Harmonics  # their harmonics, stacked
+    known: GivenDriver  # what the calibration tells at these
 
     def samples(self) -> tuple[np.ndarray, np.ndarray]:
         """Both voltages of all trials, stacked."""

@@ -7,14 +7,11 @@ the fit; such fits are counted and not compared.
 """
 
 import argparse
-import os
-import pathlib
-import subprocess
-import tempfile
 
 import numpy as np
 
-from benchmarks.rivals import ONE_THREAD, ROOT, make, python_of
+from benchmarks.rivals import exchange, make
+from benchmarks.runner import option
 
 ENVIRONMENT = "numpyro"
 WORKER = "benchmarks.rivals.posterior_by_numpyro"
@@ -23,11 +20,10 @@ ENDED = 400.0  # effective draws of a chain that stayed at the fit; others have 
 MEAN = 0.1  # [standard deviations] largest difference of the means
 DEVIATION = 0.05  # largest relative difference of the standard deviations
 
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """How many fits of which recordings."""
-    parser.add_argument("--snr", type=float, nargs="+", default=[60.0, 40.0, 20.0], metavar="DB")
-    parser.add_argument("--fits", type=int, default=8, help="at each ratio")
+OPTIONS = (
+    option("--snr", default=(60.0, 40.0, 20.0), metavar="DB"),
+    option("--fits", default=8, help="at each ratio"),
+)
 
 
 def main(arguments: argparse.Namespace) -> bool:
@@ -57,13 +53,4 @@ def main(arguments: argparse.Namespace) -> bool:
 
 def compared(snr_db: float, fits: int) -> dict[str, np.ndarray]:
     """What the worker found at one signal-to-noise ratio."""
-    with tempfile.TemporaryDirectory() as folder:
-        path = pathlib.Path(folder, "result.npz")
-        subprocess.run(
-            [python_of(ENVIRONMENT), "-m", WORKER, path, str(snr_db), str(fits)],
-            cwd=ROOT,
-            env={**os.environ, **ONE_THREAD},
-            check=True,
-        )
-        with np.load(path) as file:
-            return {name: file[name] for name in file.files}
+    return exchange(ENVIRONMENT, WORKER, snr_db=snr_db, fits=fits)

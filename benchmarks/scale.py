@@ -8,7 +8,6 @@ machine.
 
 import argparse
 import collections
-import contextlib
 import json
 import os
 import pathlib
@@ -17,14 +16,16 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
 import h5py
 import numpy as np
 
 from benchmarks.large_file import LAYOUTS, large_file
+from benchmarks.one_run import READERS
 from benchmarks.provenance import ROOT, write_csv
+from benchmarks.runner import QUICK, Target, option, report
 from benchmarks.timing import cores
 from etid.estimators.registry import names
 from etid.identify import file as streaming
@@ -39,53 +40,44 @@ WORKERS = (1, 2)  # 1 is the process itself
 WARM = 8  # recordings that make every process compile
 PATIENCE = 0.002  # [s] between two looks at a run that is to be killed
 
+METHODS = ["default", "equation_error"]
+OPTIONS = (
+    QUICK,
+    option("--recordings", default=100_000),
+    option("--folder", default=FILES, type=pathlib.Path, help="of the files it makes"),
+    option("--method", nargs="+", type=str, choices=("default", *names()), default=METHODS),
+    option("-o", "--output", type=pathlib.Path, help="CSV to write"),
+)
+
 
 class Plan(NamedTuple):
-    """What to measure.
+    """What to measure."""
 
-    Attributes:
-        folder: Where the files are or will be.
-        recordings: How many in a file.
-        part: How many are written at once.
-        methods: Estimators; None is the default one.
-        killed: Estimator of the run that is killed.
-    """
-
-    folder: pathlib.Path
-    recordings: int
-    part: int
+    folder: pathlib.Path  # where the files are or will be
+    recordings: int  # how many in a file
+    part: int  # how many are written at once
+    # estimators; None is the default one. The last is run in all layouts
     methods: Sequence[str | None]
-    killed: str | None
+    killed: str | None  # estimator of the run that is killed
 
 
-def plan(folder: pathlib.Path, recordings: int, methods: Sequence[str], quick: bool) -> Plan:
-    """The plan of the command line."""
-    if quick:
-        return Plan(folder, min(recordings, 400), 32, ("equation_error",), "equation_error")
-    chosen = [None if name == "default" else name for name in methods]
-    return Plan(folder, recordings, streaming.PART, chosen, chosen[-1])
-
-
-def _command(job: dict[str, Any]) -> list[str]:
-    return [sys.executable, "-m", "benchmarks.one_run", json.dumps(job)]
-
-
-def _environment(folder: pathlib.Path) -> dict[str, str]:
-    """Compilations are shared, or each worker would need half a minute more."""
+def _start(folder: pathlib.Path, job: dict[str, Any]) -> subprocess.Popen[bytes]:
+    """A process that does a job; compilations are shared, or each would need half a minute more."""
     cache = {
         "JAX_COMPILATION_CACHE_DIR": str(folder.absolute() / "xla"),
         "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
     }
-    return os.environ | cache
+    command = [sys.executable, "-m", "benchmarks.one_run", json.dumps(job)]
+    return subprocess.Popen(command, cwd=ROOT, env=os.environ | cache, stdout=subprocess.PIPE)
 
 
 def measured(folder: pathlib.Path, job: dict[str, Any]) -> dict[str, Any]:
     """Do one job in a process of its own."""
-    with cores(job.get("workers", 1)):
-        done = subprocess.run(
-            _command(job), cwd=ROOT, env=_environment(folder), stdout=subprocess.PIPE, check=True
-        )
-    return json.loads(done.stdout)
+    with cores(job.get("workers", 1)), _start(folder, job) as process:
+        said, _ = process.communicate()
+    if process.returncode:
+        raise subprocess.CalledProcessError(process.returncode, process.args)
+    return json.loads(said)
 
 
 def fit_job(plan: Plan, layout: str, method: str | None, workers: int) -> dict[str, Any]:
@@ -105,7 +97,6 @@ def fit_job(plan: Plan, layout: str, method: str | None, workers: int) -> dict[s
 
 
 def _row(plan: Plan, name: str, layout: str, workers: int, found: dict[str, Any]) -> dict[str, Any]:
-    verdicts = found.get("verdicts", {})
     return {
         "what": name,
         "layout": layout,
@@ -117,39 +108,32 @@ def _row(plan: Plan, name: str, layout: str, workers: int, found: dict[str, Any]
         "start_seconds": found.get("start", 0.0),
         "memory_mb": found["memory"] / 1e6,
         "worker_memory_mb": found["worker_memory"] / 1e6 if workers > 1 else 0.0,
-        "successful": verdicts.get("successful", 0),
+        "successful": found.get("verdicts", {}).get("successful", 0),
     }
 
 
-def rows(plan: Plan) -> Iterable[dict[str, Any]]:
+def rows(plan: Plan) -> Iterator[dict[str, Any]]:
     """Reading in all layouts, fitting by all methods; one row each."""
     for layout in LAYOUTS:
         file = str(large_file(plan.folder, plan.recordings, layout).absolute())
-        for what in ("h5py", "h5py, whole stacks", "etid"):
+        for what in READERS:
             found = measured(plan.folder, {"what": what, "file": file})
             yield _row(plan, f"read: {what}", layout, 1, found)
-        for method in plan.methods if layout == "contiguous" else plan.methods[-1:]:
-            for workers in WORKERS if layout == "contiguous" else (1,):
+        usual = layout == "contiguous"
+        for method in plan.methods if usual else plan.methods[-1:]:
+            for workers in WORKERS if usual else (1,):
                 found = measured(plan.folder, fit_job(plan, layout, method, workers))
                 yield _row(plan, f"fit: {method or 'default'}", layout, workers, found)
 
 
 class Resumed(NamedTuple):
-    """What became of a run that was killed.
+    """What became of a run that was killed."""
 
-    Attributes:
-        same: Whether its file is bit for bit that of a run that was not.
-        parts: How many parts the file has.
-        killed_at: How many parts were there at each kill.
-        begun: How many parts were begun in all.
-        only_the_last: Whether none was begun anew but those that a kill interrupted.
-    """
-
-    same: bool
-    parts: int
-    killed_at: list[int]
-    begun: int
-    only_the_last: bool
+    same: bool  # whether its file is bit for bit that of a run that was not
+    parts: int  # how many parts the file has
+    killed_at: list[int]  # how many parts were there at each kill
+    begun: int  # how many parts were begun in all
+    only_the_last: bool  # whether none was begun anew but those that a kill interrupted
 
     @property
     def passed(self) -> bool:
@@ -173,9 +157,7 @@ def resume(plan: Plan) -> Resumed:
     folder = target.with_name(target.name + ".parts")
     killed_at, interrupted = [], []
     for moment, delay in zip(moments, delays, strict=True):
-        with subprocess.Popen(
-            _command(again), cwd=ROOT, env=_environment(plan.folder), stdout=subprocess.PIPE
-        ) as process:
+        with _start(plan.folder, again) as process:
             while len(list(folder.glob("*.h5"))) < moment and process.poll() is None:
                 time.sleep(PATIENCE)
             time.sleep(delay)
@@ -204,24 +186,30 @@ def _bits(column: np.ndarray) -> Any:
     return column.tolist() if column.dtype.hasobject else column.tobytes()
 
 
-def run(plan: Plan, output: pathlib.Path | None) -> bool:
+def targets(table: Sequence[dict[str, Any]]) -> Iterator[Target]:
+    """What is wanted of the last method in contiguous datasets."""
+    fits = [row for row in table if row["what"].startswith("fit")]
+    alone, two = [row for row in fits if row["layout"] == "contiguous"][-len(WORKERS) :]
+    yield Target("microseconds a recording", alone["us_per_recording"], most=1e6 * EACH)
+    yield Target("two workers, times as fast", alone["seconds"] / two["seconds"], TWICE)
+    yield Target("peak memory [MB]", max(row["memory_mb"] for row in fits), most=MEMORY / 1e6)
+
+
+def main(arguments: argparse.Namespace) -> bool:
     """Print the table, write it as CSV; whether every target is met."""
-    print(f"{plan.recordings} recordings in {plan.folder}, parts of {plan.part}")
-    heads = ("CPU s", "us each", "of reading", "start s", "MB", "MB/worker", "successful")
-    print(f"{'':<30}{'layout':<12}{'workers':>7}{'s':>9}" + "".join(f"{h:>11}" for h in heads))
+    chosen = [None if name == "default" else name for name in arguments.method]
+    plan = Plan(arguments.folder, arguments.recordings, streaming.PART, chosen, chosen[-1])
+    if arguments.quick:
+        quick = "equation_error"
+        plan = Plan(arguments.folder, min(arguments.recordings, 400), 32, (quick,), quick)
     table: list[dict[str, Any]] = []
     for row in rows(plan):
         table.append(row)
         alone = next(r for r in table if r["layout"] == row["layout"])  # the first reads by h5py
         row["of_reading"] = row["seconds"] / alone["seconds"]
-        print(
-            f"{row['what']:<30}{row['layout']:<12}{row['workers']:>7}{row['seconds']:9.2f}"
-            f"{row['cpu_seconds']:11.1f}{row['us_per_recording']:11.1f}{row['of_reading']:11.1f}{row['start_seconds']:11.1f}"
-            f"{row['memory_mb']:11.0f}{row['worker_memory_mb']:11.0f}{row['successful']:11}",
-            flush=True,
-        )
-    with contextlib.suppress(FileNotFoundError):
-        (plan.folder / "fits.h5").unlink()
+        numbers = (f"{name} {of:.4g}" for name, of in row.items() if isinstance(of, float | int))
+        print(f"{row['what']:<26}{row['layout']:<11}", ", ".join(numbers), flush=True)
+    (plan.folder / "fits.h5").unlink(missing_ok=True)
     resumed = resume(plan)
     print(
         f"resume: killed with {', '.join(map(str, resumed.killed_at))} of {resumed.parts} parts "
@@ -229,40 +217,6 @@ def run(plan: Plan, output: pathlib.Path | None) -> bool:
         f"{'no' if resumed.only_the_last else 'SOME'} finished part a second time; "
         f"the file is {'the same' if resumed.same else 'ANOTHER'}, bit for bit"
     )
-    if output is not None:
-        write_csv(output, table)
-    for text, met in _targets(table):
-        print(f"{text}: {'met' if met else 'missed'}")
-    return all(met for _, met in _targets(table)) and resumed.passed
-
-
-def _targets(table: Sequence[dict[str, Any]]) -> Iterable[tuple[str, bool]]:
-    """What is wanted of the last method in contiguous datasets, and whether it is so."""
-    fits = [row for row in table if row["what"].startswith("fit")]
-    alone, two = [row for row in fits if row["layout"] == "contiguous"][-len(WORKERS) :]
-    each, gain = alone["us_per_recording"], alone["seconds"] / two["seconds"]
-    most = max(row["memory_mb"] for row in fits)
-    yield f"{each:.0f} us a recording <= {1e6 * EACH:.0f}", each <= 1e6 * EACH
-    yield f"two workers {gain:.2f} times as fast >= {TWICE}", gain >= TWICE
-    yield f"peak memory {most:.0f} MB <= {MEMORY / 1e6:.0f}", most <= MEMORY / 1e6
-
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Size of the file, and how it is fitted."""
-    parser.add_argument("--quick", action="store_true", help="400 recordings, the fastest method")
-    parser.add_argument("--recordings", type=int, default=100_000)
-    parser.add_argument("--folder", type=pathlib.Path, default=FILES, help="of the files it makes")
-    parser.add_argument(
-        "--method",
-        nargs="+",
-        choices=("default", *names()),
-        default=["default", "equation_error"],
-        help="the last is run in all layouts, and killed",
-    )
-    parser.add_argument("-o", "--output", type=pathlib.Path, default=None, help="CSV to write")
-
-
-def main(arguments: argparse.Namespace) -> bool:
-    """Run the command; whether every target is met."""
-    chosen = plan(arguments.folder, arguments.recordings, arguments.method, arguments.quick)
-    return run(chosen, arguments.output)
+    if arguments.output is not None:
+        write_csv(arguments.output, table)
+    return report(targets(table)) and resumed.passed

@@ -9,7 +9,6 @@ from matplotlib.patches import Patch, Rectangle
 
 from benchmarks import charts
 from etid.circuits.circuit import AbstractCircuit
-from etid.selection.search import USUAL
 
 # Letters and colours of the circuits, from the simplest to the richest.
 KEY = {
@@ -19,6 +18,7 @@ KEY = {
     "SkinCole": ("C", "C: Cole", "#f2b263"),
     "SkinLayers": ("L", "L: two layers", "#c9564a"),
 }
+TITLES = {"chose": "etid", "rival": "impedance.py and BIC, from spectra of the same recordings"}
 HEIGHT = 0.8  # of a cell's bar
 LEAST = 0.12  # share of a cell that has room for a letter
 
@@ -37,15 +37,9 @@ def draw(
         path: SVG or PNG to write.
         rival: Why there are no choices of the rival; empty if there are.
     """
-    both = not rival
-    figure, axes = charts.new_figure(
-        1, 2 if both else 1, (12.5 if both else 7.0, 0.36 * len(truths) + 1.6), sharey=True
-    )
-    titles = {
-        "chose": "etid",
-        "rival": "impedance.py and BIC, from spectra of the same recordings",
-    }
-    for panel, (name, title) in zip(axes.flat, titles.items(), strict=False):
+    size = (7.0 if rival else 12.5), 0.36 * len(truths) + 1.6
+    figure, axes = charts.new_figure(1, 1 if rival else 2, size, sharey=True)
+    for panel, (name, title) in zip(axes.flat, TITLES.items(), strict=False):
         drawn = [row for row in rows if any(int(row[f"{name}_{key}"]) for key in KEY)]
         columns = sorted({row["snr_db"] for row in drawn})
         for row in drawn:
@@ -63,37 +57,25 @@ def draw(
         panel.tick_params(length=0, labelsize=8)
     handles = [Patch(color=colour, label=label) for _, label, colour in KEY.values()]
     figure.legend(handles=handles, loc="outside lower center", ncols=len(KEY), fontsize=8)
-    figure.suptitle(
-        "Chosen circuits, and % right (?: below 30 dB, or the evidence is not decisive)",
-        fontsize=11,
-    )
+    title = "Chosen circuits, and % right (?: below 30 dB, or the evidence is not decisive)"
+    figure.suptitle(title, fontsize=11)
     charts.save(figure, path)
 
 
 def _cell(panel: Axes, at: tuple[int, int], counts: Mapping[str, int], right: str) -> None:
     """A bar of the shares of the chosen circuits, and the share of the right one."""
-    assert {*counts} == {kind.__name__ for kind in USUAL}
-    total, (column, row) = sum(counts.values()), at
-    if not total:
-        return
-    left, width = column - 0.46, 0.84
+    total, left, row = sum(counts.values()), at[0] - 0.46, at[1]
     for name, count in counts.items():
         part = count / total
         if not part:
             continue
         letter, _, colour = KEY[name]
+        width = 0.84 * part
         corner = (left, row - HEIGHT / 2)
-        panel.add_patch(Rectangle(corner, width * part, HEIGHT, color=colour, linewidth=0))
+        panel.add_patch(Rectangle(corner, width, HEIGHT, color=colour, linewidth=0))
         if part >= LEAST:
             text = f"{letter} {100 * part:.0f}" if name == right and part > 0.3 else letter
             weight = "bold" if name == right else "normal"
-            panel.text(
-                left + width * part / 2,
-                row,
-                text,
-                ha="center",
-                va="center",
-                fontsize=7.5,
-                weight=weight,
-            )
-        left += width * part
+            panel.text(left + width / 2, row, text, ha="center", va="center", fontsize=7.5,
+                       weight=weight)  # fmt: skip
+        left += width

@@ -16,8 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.coverage import NORMAL_95
-from benchmarks.failure_counts import Rate, rate
+from benchmarks.rates import NORMAL_95, rate
 from benchmarks.selection_draws import TRUTHS, Drawn, errors
 from etid.results.fit import Fit
 from etid.selection.evidence import best, bic, elements
@@ -62,7 +61,7 @@ def _laplace(fit: Fit, number: int) -> float:
         for one in (fit.circuit, USUAL[number]())
     )
     uniform = np.array([unit == "1" for unit in fit.circuit.units().values()])
-    if not (values > 0).all():
+    if not ((values > 0) & np.isfinite(values)).all():
         return math.inf
     sign, volume = np.linalg.slogdet(np.asarray(fit.cov) / np.outer(values, values))
     if not sign > 0:
@@ -95,40 +94,23 @@ def gained(drawn: Drawn) -> float:
 
 
 def cell(drawn: Sequence[Drawn]) -> dict[str, Any]:
-    """One row of the table.
-
-    Args:
-        drawn: Recordings of one truth at one SNR.
-    """
-    first = drawn[0]
-    truth = type(TRUTHS[first.truth])
+    """One row of the table, of recordings of one truth at one SNR."""
+    first, truth = drawn[0], type(TRUTHS[drawn[0].truth])
     expected = float(np.mean([gained(one) for one in drawn]))
     decisive = first.snr_db >= DECISIVE_SNR and expected >= DECISIVE
     row: dict[str, Any] = {"truth": first.truth, "snr_db": first.snr_db, "drawn": len(drawn)}
     row |= {"expected_evidence": round(expected, 1), "decisive": decisive}
-    for kind in USUAL:
-        row[f"chose_{kind.__name__}"] = sum(one.chosen is kind for one in drawn)
-    row["richer"] = sum(is_richer(one) for one in drawn)
+    row |= {f"chose_{kind.__name__}": sum(one.chosen is kind for one in drawn) for kind in USUAL}
+    row["richer"] = sum(one.is_richer for one in drawn)
     row["fits"] = float(np.mean([len(one.selection.fits) for one in drawn]))
     for name, criterion in CRITERIA.items():
         found = [USUAL[choose(one.fits, criterion)] for one in drawn]
         row[f"{name}_right"] = sum(one is truth for one in found)
         row[f"{name}_richer"] = sum(len(one.names()) > len(truth.names()) for one in found)
     for name in QUANTITIES:
-        inside, drivers = covered(drawn, name)
-        row[f"{name}_intervals"] = len(inside)
-        row[f"{name}_covered"] = rate(inside, drivers).rate
+        of = rate(*covered(drawn, name))
+        row |= {f"{name}_intervals": of.trials, f"{name}_covered": of.rate}
     return row
-
-
-def is_right(drawn: Drawn) -> bool:
-    """Whether the true circuit was chosen."""
-    return drawn.chosen is type(TRUTHS[drawn.truth])
-
-
-def is_richer(drawn: Drawn) -> bool:
-    """Whether a circuit with more elements than the truth was chosen."""
-    return len(drawn.chosen.names()) > len(TRUTHS[drawn.truth].names())
 
 
 def covered(drawn: Sequence[Drawn], *names: str) -> tuple[list[bool], list[int]]:
@@ -143,8 +125,3 @@ def covered(drawn: Sequence[Drawn], *names: str) -> tuple[list[bool], list[int]]
                 inside.append(abs(found[name]) < NORMAL_95)
                 drivers.append(one.driver)
     return inside, drivers
-
-
-def of_all(events: Sequence[bool], drawn: Sequence[Drawn]) -> Rate:
-    """Rate of events with its interval; recordings behind one driver are not independent."""
-    return rate(events, [one.driver for one in drawn])

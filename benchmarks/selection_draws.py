@@ -5,8 +5,9 @@ from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Array, Float
 
 import etid
 from benchmarks.ladder import LOADS
@@ -62,26 +63,28 @@ with jax.enable_x64(True):  # of a worker process
 
 @dataclasses.dataclass(frozen=True)
 class Drawn:
-    """One recording.
+    """One recording."""
 
-    Attributes:
-        truth: Which of `TRUTHS`.
-        snr_db: Of every record [dB].
-        driver: Number of the driver.
-        selection: What etid chose.
-        fits: Fits of every candidate, by number.
-    """
-
-    truth: str
-    snr_db: float
-    driver: int
-    selection: Selection
-    fits: Mapping[int, Fit]
+    truth: str  # which of `TRUTHS`
+    snr_db: float  # of every record [dB]
+    driver: int  # number of the driver
+    selection: Selection  # what etid chose
+    fits: Mapping[int, Fit]  # fits of every candidate, by number
 
     @property
     def chosen(self) -> type[AbstractCircuit]:
         """The chosen circuit."""
         return type(self.selection.fit.circuit)
+
+    @property
+    def is_right(self) -> bool:
+        """Whether the true circuit was chosen."""
+        return self.chosen is type(TRUTHS[self.truth])
+
+    @property
+    def is_richer(self) -> bool:
+        """Whether a circuit with more elements than the truth was chosen."""
+        return len(self.chosen.names()) > len(TRUTHS[self.truth].names())
 
 
 def scene(snr_db: float, driver: int) -> Scene:
@@ -143,23 +146,21 @@ class Quantity(NamedTuple):
 
 def quantities(circuit: AbstractCircuit) -> dict[str, Quantity]:
     """R_s and Z(0) [ohm], and the logarithm of the corner frequency, where a circuit has them."""
-    names = circuit.names()
-    values = np.array([float(np.asarray(getattr(circuit, name))) for name in names])
+    names, units = circuit.names(), circuit.units()
 
-    def picked(*wanted: str) -> np.ndarray:
-        return np.array([float(name in wanted) for name in names])
+    def found(values: Array) -> dict[str, Array]:
+        of = dict(zip(names, values, strict=True))
+        total = jnp.stack([of[name] for name in names if units[name] == "ohm"]).sum()
+        wanted = {"Z(0)": total} | ({"R_s": of["r_s"]} if "r_s" in of else {})
+        for elements in (("r_p", "c_p"), ("tau",)):
+            if {*elements} <= {*names}:
+                tau = jnp.stack([of[name] for name in elements]).prod()
+                wanted["corner"] = -jnp.log(2 * np.pi * tau)
+        return wanted
 
-    units = circuit.units()
-    resistances = picked(*(name for name in names if units[name] == "ohm"))
-    found = {"Z(0)": Quantity(float(resistances @ values), resistances)}
-    if "r_s" in names:
-        found["R_s"] = Quantity(float(picked("r_s") @ values), picked("r_s"))
-    for elements in (("r_p", "c_p"), ("tau",)):
-        if {*elements} <= {*names}:
-            which = picked(*elements)
-            corner = -float(which @ np.log(values)) - np.log(2 * np.pi)
-            found["corner"] = Quantity(corner, -which / values)
-    return found
+    values = jnp.asarray(circuit.values())
+    slopes = jax.jacfwd(found)(values)
+    return {of: Quantity(float(v), np.asarray(slopes[of])) for of, v in found(values).items()}
 
 
 def errors(drawn: Drawn) -> dict[str, float]:

@@ -7,17 +7,19 @@ R_p is 0. An answer is *right* if it is successful and no element is wrong.
 """
 
 import dataclasses
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Array
 
+from benchmarks.estimators import DEFAULT, NOTHING, Answer, Drivers
 from benchmarks.failure_axes import Cell, cells
-from benchmarks.failure_counts import rate
-from benchmarks.failure_draws import DETERMINED, ELEMENTS, Answer, Draw, bounds, elements, seeds
+from benchmarks.failure_map import bounds, elements, recordings, seeds
 from benchmarks.mappings import make_room
+from benchmarks.rates import Rate, rate
 from benchmarks.selection_draws import choices
 from etid.circuits.circuit import AbstractCircuit, SkinRC
 from etid.results.fit import Fit
@@ -41,27 +43,17 @@ def chosen_cells() -> list[Cell]:
 def limits(circuit: AbstractCircuit) -> tuple[np.ndarray, np.ndarray]:
     """R_s, R_p and C_p of a circuit, and their slopes (limit, element); NaN for a missing C_p."""
     names = circuit.names()
-    values = dict(zip(names, np.asarray(circuit.values(), float), strict=True))
-    slopes = np.zeros((3, len(names)))
-    found = np.array([0.0, 0.0, np.nan])
 
-    def add(limit: int, name: str, slope: float = 1.0) -> None:
-        slopes[limit, names.index(name)] = slope
+    def found(values: Array) -> Array:
+        of, nothing = dict(zip(names, values, strict=True)), jnp.zeros(())
+        parallel = [of[name] for name in ("r_p", "r_1", "r_2") if name in of]
+        elastances = [1 / of[name] for name in names if name.startswith("c_")]
+        capacitance = 1 / sum(elastances, nothing) if elastances else nothing + jnp.nan
+        series = of.get("r_s", of.get("r", nothing))
+        return jnp.stack([series, sum(parallel, nothing), capacitance])
 
-    if "r_s" in values or "r" in values:
-        series = "r_s" if "r_s" in values else "r"
-        found[0] = values[series]
-        add(0, series)
-    parallel = [name for name in ("r_p", "r_1", "r_2") if name in values]
-    found[1] = sum(values[name] for name in parallel)
-    for name in parallel:
-        add(1, name)
-    capacitors = [name for name in names if name.startswith("c_")]
-    if capacitors:
-        found[2] = 1 / sum(1 / values[name] for name in capacitors)
-        for name in capacitors:
-            add(2, name, float((found[2] / values[name]) ** 2))
-    return found, slopes
+    values = jnp.asarray(circuit.values())
+    return np.asarray(found(values)), np.asarray(jax.jacfwd(found)(values))
 
 
 def answer(cell: Cell, seed: int, path: str, fit: Fit, bound: np.ndarray) -> Answer:
@@ -71,38 +63,24 @@ def answer(cell: Cell, seed: int, path: str, fit: Fit, bound: np.ndarray) -> Ans
     found, slopes = limits(fit.circuit)
     error = np.sqrt(np.diagonal(slopes @ np.asarray(fit.cov) @ slopes.T))
     exact = isinstance(load, SkinLoad) and isinstance(fit.circuit, SkinRC)
-    off = found / truth - 1
-    refused = not np.isfinite(np.asarray(fit.circuit.values())).all()
-    off = np.full(3, np.nan) if refused else off
+    finite = np.isfinite(np.asarray(fit.circuit.values())).all()
+    off = found / truth - 1 if finite else NOTHING
     return Answer(AUTO, seed, path, fit.verdict, off, error / truth, bound, exact=exact)
 
 
-def _refusal(seed: int, path: str, name: str, bound: Float[np.ndarray, " element"]) -> Answer:
-    nothing = np.full(len(ELEMENTS), np.nan)
-    return Answer(AUTO, seed, path, name, nothing, nothing, bound)
-
-
 def answers(cell: Cell, drivers: int, trials: int) -> list[Answer]:
-    """All answers in a cell.
-
-    Args:
-        cell: Of the map.
-        drivers: Number of calibrations.
-        trials: Number of trials behind each.
-    """
+    """All answers in a cell."""
     with jax.enable_x64(True):  # of a worker process
-        bound = bounds(cell.scene)
-        found = []
+        bound, found = bounds(cell.scene), list[Answer]()
         for seed in seeds(cell, drivers):
-            draw = Draw(cell, seed)
-            driver, records = draw.driver(None), draw.trials[:trials]
+            calibrations, records = recordings(cell, seed)
+            driver, records = Drivers(cell.order).of(calibrations, DEFAULT), records[:trials]
             if driver is None:
-                paths = (record.path for record in records)
-                found += [_refusal(seed, path, "driver_failed", bound[path]) for path in paths]
+                nothing = "driver_failed", NOTHING, NOTHING
+                found += [Answer(AUTO, seed, r.path, *nothing, bound[r.path]) for r in records]
                 continue
             for record, one in zip(records, choices(records, driver), strict=True):
-                path = record.path
-                found.append(answer(cell, seed, path, one.fit, bound[path]))
+                found.append(answer(cell, seed, record.path, one.fit, bound[record.path]))
         make_room()
         return found
 
@@ -114,19 +92,18 @@ def is_right(one: Answer) -> bool:
 
 def missed_elements(answers: Sequence[Answer]) -> tuple[int, int]:
     """Elements determined to 10 % that are silently wrong, and number of all such elements."""
-    determined = [one.bound <= DETERMINED for one in answers]
-    missed = [one.silent_elements & of for one, of in zip(answers, determined, strict=True)]
-    return int(np.sum(missed)), int(np.sum(determined))
+    missed = [one.silent_elements & one.determined for one in answers]
+    return int(np.sum(missed)), int(np.sum([one.determined for one in answers]))
 
 
 def row(cell: Cell, found: Sequence[Answer]) -> dict[str, Any]:
     """One row of the table."""
     asked = [one for one in found if one.target]
-    drivers = len({one.seed for one in found})
-    place = {"map": cell.chart, "row": cell.row, "column": cell.column, "drivers": drivers}
-    return place | {
+    return {
+        **cell.place,
+        "drivers": len({one.seed for one in found}),
         "trials": len(found),
-        "right": rate([is_right(a) for a in found], [a.seed for a in found]).rate,
+        "right": float(np.mean([is_right(one) for one in found])),
         "successful": sum(one.successful for one in found),
         "silent": sum(one.silent for one in found),
         "determined": len(asked),
@@ -135,10 +112,12 @@ def row(cell: Cell, found: Sequence[Answer]) -> dict[str, Any]:
     }
 
 
-def right_from_40_db(
-    every: Sequence[Cell], found: Sequence[Sequence[Answer]]
-) -> Iterator[tuple[bool, int]]:
-    """Whether each answer for skin that is not one RC is right, from 40 dB on; and its seed."""
-    for cell, answered in zip(every, found, strict=True):
-        if cell.chart == OTHER_SKIN and cell.row in RIGHT_SNR:
-            yield from ((is_right(one), one.seed) for one in answered)
+def right_from_40_db(every: Sequence[Cell], found: Sequence[Sequence[Answer]]) -> Rate:
+    """Right answers for skin that is not one RC, from 40 dB on."""
+    asked = [
+        one
+        for cell, answered in zip(every, found, strict=True)
+        for one in answered
+        if cell.chart == OTHER_SKIN and cell.row in RIGHT_SNR
+    ]
+    return rate([is_right(one) for one in asked], [one.seed for one in asked])

@@ -12,12 +12,7 @@ Two kinds of spectra are given to it:
   which no recording gives. etid's `identify_impedance` and its rule choose for these, too.
 """
 
-import dataclasses
 import math
-import os
-import pathlib
-import subprocess
-import tempfile
 import time
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -27,7 +22,7 @@ import numpy as np
 from jaxtyping import Bool, Complex, Float
 
 import etid
-from benchmarks.rivals import ONE_THREAD, ROOT, install, python_of
+from benchmarks.rivals import exchange, install
 from benchmarks.rivals.records import ALIASED
 from benchmarks.selection_draws import TRUTHS, scene
 from etid.estimators.lanes import Harmonics
@@ -41,32 +36,25 @@ NAMES = np.array([kind.__name__ for kind in USUAL])
 
 
 class Spectra(NamedTuple):
-    """One impedance spectrum for each truth.
+    """One impedance spectrum for each truth."""
 
-    Attributes:
-        f: Frequencies [Hz].
-        z: Noisy impedances [ohm].
-        sigma: Their noise √E|·|² [ohm].
-        used: Harmonics that stand out of the noise.
-    """
-
-    f: Float[np.ndarray, " harmonic"]
-    z: Complex[np.ndarray, "truth harmonic"]
-    sigma: Float[np.ndarray, "truth harmonic"]
-    used: Bool[np.ndarray, "truth harmonic"]
+    f: Float[np.ndarray, " harmonic"]  # frequencies [Hz]
+    z: Complex[np.ndarray, "truth harmonic"]  # noisy impedances [ohm]
+    sigma: Float[np.ndarray, "truth harmonic"]  # their noise √E|·|² [ohm]
+    used: Bool[np.ndarray, "truth harmonic"]  # harmonics that stand out of the noise
 
 
-@dataclasses.dataclass(frozen=True)
-class Chosen:
-    """What was chosen for some spectra.
-
-    Attributes:
-        names: Names of the chosen circuits, (truth, spectra).
-        seconds: Of each choice, (truth, spectra).
-    """
+class Chosen(NamedTuple):
+    """Names of the circuits that were chosen, (truth, spectra), and the time of each choice [s]."""
 
     names: np.ndarray
     seconds: np.ndarray
+
+    @property
+    def right(self) -> np.ndarray:
+        """Whether each is the true one, (truth, spectra)."""
+        true = np.array([type(load).__name__ for load in TRUTHS.values()])
+        return self.names == true[:, None]
 
 
 def exact(snr_db: float, number: int) -> Spectra:
@@ -133,24 +121,9 @@ def missing() -> str:
 
 def by_impedance_py(every: Sequence[Spectra]) -> Chosen:
     """What the rival chooses."""
-    with tempfile.TemporaryDirectory() as folder:
-        given, found = pathlib.Path(folder, "problem.npz"), pathlib.Path(folder, "result.npz")
-        z, sigma, used = (np.concatenate([one[i] for one in every]) for i in (1, 2, 3))
-        np.savez(given, f=every[0].f, z=z, sigma=sigma, used=used)
-        subprocess.run(
-            [python_of("common"), "-m", WORKER, given, found],
-            cwd=ROOT,
-            env={**os.environ, **ONE_THREAD},
-            check=True,
-        )
-        with np.load(found) as file:
-            return by_truth(NAMES[np.argmin(file["bic"], axis=1)], file["seconds"])
-
-
-def right(chosen: Chosen) -> np.ndarray:
-    """Whether each chosen circuit is the true one, (truth, spectra)."""
-    true = np.array([type(load).__name__ for load in TRUTHS.values()])
-    return chosen.names == true[:, None]
+    z, sigma, used = (np.concatenate([one[i] for one in every]) for i in (1, 2, 3))
+    found = exchange("common", WORKER, f=every[0].f, z=z, sigma=sigma, used=used)
+    return by_truth(NAMES[np.argmin(found["bic"], axis=1)], found["seconds"])
 
 
 def by_truth(names: Sequence[str] | np.ndarray, seconds: Sequence[float] | np.ndarray) -> Chosen:

@@ -43,18 +43,12 @@ trial = "0"
 
 @dataclasses.dataclass(frozen=True)
 class Kind:
-    """A kind of file.
+    """A kind of file."""
 
-    Attributes:
-        suffix: Of its name.
-        good: The bytes of good files.
-        damage: Change the file at a path.
-        use: Read it in every way there is; what is raised is for the caller to judge.
-    """
-
-    suffix: str
-    good: tuple[bytes, ...]
-    damage: Callable[[pathlib.Path, Rng], None]
+    suffix: str  # of its name
+    good: tuple[bytes, ...]  # the bytes of good files
+    damage: Callable[[pathlib.Path, Rng], None]  # change the file at a path
+    # read it in every way there is; what is raised is for the caller to judge
     use: Callable[[pathlib.Path, int], None]
 
 

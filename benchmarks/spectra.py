@@ -12,21 +12,22 @@ frequencies; printed are the refused ones and the part of the 95 % intervals tha
 
 import argparse
 import dataclasses
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Complex, Float
 
 import etid
-from benchmarks.coverage import NORMAL_95, SILENT, expected_covered
+from benchmarks.coverage import SILENT
+from benchmarks.rates import COVERED, NORMAL_95, expected_covered
+from benchmarks.runner import Target, option, report
 from etid.results.verdicts import counted
 
 POINTS = 61  # one shape for all faults: a program is compiled for each
 GOOD_POINTS = (20, POINTS, 100)
 NOISE = (1e-3, 3e-2)  # of |Z|, in the real and in the imaginary part
 NOTICED = 0.02  # relative error of an element that counts
-COVERED = (0.93, 0.97)
 REFUSED = 1e-3  # largest part of the good spectra
 ACCEPTED = ("successful", "insensitive")  # layers that noise hides are not determined
 LAYERS = ("r_1", "c_1", "c_2", "r_2")  # the other way round are those of the other one
@@ -34,19 +35,13 @@ LAYERS = ("r_1", "c_1", "c_2", "r_2")  # the other way round are those of the ot
 
 @dataclasses.dataclass(frozen=True)
 class Spectrum:
-    """A drawn spectrum.
+    """A drawn spectrum."""
 
-    Attributes:
-        frequency: From high to low, as instruments sweep [Hz].
-        z: With noise [Ω].
-        circuit: What is fitted.
-        truth: Smallest and largest right value of each element that has one; empty if there is no
-            right answer.
-    """
-
-    frequency: Float[np.ndarray, " frequency"]
-    z: Complex[np.ndarray, " frequency"]
-    circuit: etid.AbstractCircuit
+    frequency: Float[np.ndarray, " frequency"]  # from high to low, as instruments sweep [Hz]
+    z: Complex[np.ndarray, " frequency"]  # with noise [Ω]
+    circuit: etid.AbstractCircuit  # what is fitted
+    # smallest and largest right value of each element that has one; empty if there is no right
+    # answer
     truth: Mapping[str, tuple[float, float]]
 
 
@@ -199,19 +194,13 @@ FAULTS: Mapping[str, Callable[[np.random.Generator], Spectrum]] = {
 
 
 class Answer(NamedTuple):
-    """What a fit says of a spectrum.
+    """What a fit says of a spectrum."""
 
-    Attributes:
-        verdict: Of the fit.
-        z: Errors of the elements that have right values, in standard errors.
-        silent: Whether the fit is called successful, and is wrong.
-        rrse: Of the fit.
-    """
-
-    verdict: str
+    verdict: str  # of the fit
+    # errors of the elements that have right values, in standard errors
     z: Float[np.ndarray, " element"]
-    silent: bool
-    rrse: float
+    silent: bool  # whether the fit is called successful, and is wrong
+    rrse: float  # of the fit
 
 
 def answer(of: Spectrum) -> Answer:
@@ -230,37 +219,45 @@ def answer(of: Spectrum) -> Answer:
     return Answer(fit.verdict, z, fit.verdict == "successful" and bool(wrong), float(fit.rrse))
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Size of the run."""
-    parser.add_argument("--spectra", type=int, default=300, help="of each fault")
-    parser.add_argument("--good", type=int, default=1000, help="of each number of frequencies")
-    parser.add_argument("--seed", type=int, default=0)
+OPTIONS = (
+    option("--spectra", default=300, help="of each fault"),
+    option("--good", default=1000, help="of each number of frequencies"),
+    option("--seed", default=0),
+)
+
+
+def with_fault(seed: int, spectra: int) -> Iterator[Target]:
+    """Silent answers to spectra of each fault."""
+    for fault, (name, draw) in enumerate(FAULTS.items()):
+        seeds = [(seed, fault, number) for number in range(spectra)]
+        answers = [answer(draw(np.random.default_rng(one))) for one in seeds]
+        wrong = [one for one, said in zip(seeds, answers, strict=True) if said.silent]
+        counts = counted(np.array([one.verdict for one in answers]))
+        text = f"{len(wrong)} silent {wrong or ''}; {counts}"
+        yield Target(name, len(wrong), most=0, text=text)
+
+
+def without_fault(seed: int, spectra: int) -> Iterator[Target]:
+    """Refused good spectra, and the coverage of the intervals."""
+    for points in GOOD_POINTS:
+        seeds = [(seed, points, number) for number in range(spectra)]
+        answers = [answer(good(np.random.default_rng(one), points)) for one in seeds]
+        verdicts = np.array([one.verdict for one in answers])
+        z = np.concatenate([one.z for one in answers if one.verdict == "successful"])
+        refused, silent = (~np.isin(verdicts, ACCEPTED)).sum(), sum(one.silent for one in answers)
+        low, high = expected_covered(z.size)  # few draws scatter more
+        name, most = f"good, {points} frequencies: ", max(REFUSED * len(answers), 1)
+        yield Target(f"{name}refused", refused, most=most, text=f"{refused}; {counted(verdicts)}")
+        yield Target(f"{name}silent", silent, most=0)
+        covered, limits = (
+            np.mean(np.abs(z) < NORMAL_95),
+            (min(COVERED[0], low), max(COVERED[1], high)),
+        )
+        text = f"{covered:.4f}, rms z {np.sqrt(np.mean(z**2)):.3f}, max |z| {np.abs(z).max():.1f}"
+        yield Target(f"{name}covered", float(covered), *limits, text)
 
 
 def main(arguments: argparse.Namespace) -> bool:
     """Print verdicts and coverage; whether nothing is silent, and good spectra are accepted."""
-    silent, met = 0, True
-    for fault, (name, draw) in enumerate(FAULTS.items()):
-        seeds = [(arguments.seed, fault, number) for number in range(arguments.spectra)]
-        answers = [answer(draw(np.random.default_rng(seed))) for seed in seeds]
-        wrong = [seed for seed, one in zip(seeds, answers, strict=True) if one.silent]
-        silent += len(wrong)
-        counts = counted(np.array([one.verdict for one in answers]))
-        print(f"{name:<15}{counts}; silent: {len(wrong)} {wrong or ''}", flush=True)
-    for points in GOOD_POINTS:
-        seeds = [(arguments.seed, points, number) for number in range(arguments.good)]
-        answers = [answer(good(np.random.default_rng(seed), points)) for seed in seeds]
-        verdicts = np.array([one.verdict for one in answers])
-        z = np.concatenate([one.z for one in answers if one.verdict == "successful"])
-        refused = int((~np.isin(verdicts, ACCEPTED)).sum())
-        covered, rms = np.mean(np.abs(z) < NORMAL_95), np.sqrt(np.mean(z**2))
-        met &= refused <= max(REFUSED * len(answers), 1)
-        low, high = expected_covered(z.size)  # few draws scatter more
-        met &= min(COVERED[0], low) <= covered <= max(COVERED[1], high)
-        silent += sum(one.silent for one in answers)
-        print(
-            f"good, {points:>3}      {counted(verdicts)}; refused: {refused}; "
-            f"covered {covered:.4f}, rms z {rms:.3f}, max |z| {np.abs(z).max():.1f}",
-            flush=True,
-        )
-    return bool(met and not silent)
+    of = arguments
+    return report([*with_fault(of.seed, of.spectra), *without_fault(of.seed, of.good)])

@@ -8,64 +8,210 @@ apart, on one core. Before everything else rivals have their own environments
 
 import argparse
 import itertools
-import pathlib
-from collections.abc import Iterable, Mapping, Sequence
-from typing import Any
+import time
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from typing import Any, NamedTuple
 
+import jax
 import numpy as np
 from tqdm import tqdm
 
-from benchmarks.estimators import DEFAULT, OURS, Drivers, Result, Score, draw, ours, score, theirs
-from benchmarks.ladder import SOURCES, ladder
+import etid
+from benchmarks import rivals
+from benchmarks.estimators import DEFAULT, ELEMENTS, NOTHING, OURS, Answer, Drivers, method_of
+from benchmarks.ladder import CALIBRATION, SOURCES, START, TRIAL, ladder
 from benchmarks.mappings import make_room
-from benchmarks.provenance import RESULTS, write_csv
+from benchmarks.provenance import write_csv
+from benchmarks.runner import FOLDER, QUICK, Target, option, report
 from benchmarks.speed_accuracy_chart import chart
-from benchmarks.timing import pin
-from etid.circuits.circuit import SkinRC
+from etid.simulation.scenes import Scene
 
+PINNED = True
 FILE = "speed_accuracy.csv"
-REPETITIONS = 24
 BUDGET = 6.0  # [s] for one estimator in one scene
+BATCH = 32  # recordings of a timed batch
+PATIENCE = 30  # budgets that a rival may take for all it has begun
+FEWEST = 4  # draws, however long they take
 SHOWN = ("dry, 80 dB", "dry, 60 dB", "dry, 30 dB", "damp, 60 dB", "damp, 40 dB", "dry, 1 MHz")
-QUICK = ("dry, 60 dB", "damp, 40 dB")
-QUICK_REPETITIONS = 5
+FEW, FEW_REPETITIONS = ("dry, 60 dB", "damp, 40 dB"), 5
 SIGNIFICANT = 2.0  # standard errors of a paired difference
 NEAR = 2.0  # bounds, within which the default is to stay
+
+OPTIONS = (
+    QUICK,
+    FOLDER,
+    option("--scene", action="append", choices=list(ladder()), help="repeatable"),
+    option("--source", default="simulated", choices=SOURCES),
+    option("--repetitions", default=24),
+)
+
+
+class Draws(NamedTuple):
+    """One scene, drawn several times, each with a calibration of its own; elements in SI."""
+
+    studies: list[etid.Study]
+    truth: np.ndarray
+    bound: np.ndarray
+
+    def answer(self, name: str, seed: int, verdict: str, value: Any, stderr: Any) -> Answer:
+        """What an estimator says of a draw."""
+        error, own = (np.asarray(of, float) / self.truth for of in (value, stderr))
+        return Answer(name, seed, TRIAL, verdict, error - 1, own, self.bound)
+
+
+def draw(scene: Scene, repetitions: int, source: Callable[[Scene, int], etid.Study]) -> Draws:
+    """Record a scene with one seed after the other, from 0 on."""
+    bound = list(etid.bound(scene)[TRIAL].relative.values())
+    truth = list(scene.truth()[TRIAL].values())
+    studies = [source(scene, seed) for seed in range(repetitions)]
+    return Draws(studies, np.array(truth), np.array(bound))
+
+
+class Result(NamedTuple):
+    """What an estimator made of all draws of a scene."""
+
+    estimator: str  # its name
+    mode: str  # `alone`, one recording a call; `batched`; or `rival`
+    answers: Sequence[Answer]  # one for each draw
+    seconds: float = np.nan  # of one skin, its driver known: median, compilation apart
+    first_seconds: float = np.nan  # of the first call
+    driver_seconds: float = np.nan  # of one driver, median
+    missing: str = ""  # why there is nothing, if so
+
+    @property
+    def each(self) -> np.ndarray:
+        """Root mean square over the elements of the errors in bounds; infinite without an answer.
+
+        Its median for an efficient estimator of three elements is 0.89.
+        """
+        return np.sqrt(np.mean(self._in_bounds() ** 2, axis=1))
+
+    def _in_bounds(self) -> np.ndarray:
+        sizes = np.array([np.abs(of.error / of.bound) for of in self.answers])
+        return np.where(np.isfinite(sizes).all(1, keepdims=True), sizes, np.inf)
+
+    def row(self) -> dict[str, Any]:
+        """Medians of the errors, and parts of the draws, as a table has them."""
+        answered = np.isfinite(self.each)
+        good = np.array([of.successful for of in self.answers])
+        with np.errstate(invalid="ignore"):
+            medians = np.median(self._in_bounds(), axis=0)
+        return {
+            "error": float(np.median(self.each)),
+            **{f"error_{name}": float(of) for name, of in zip(ELEMENTS, medians, strict=True)},
+            "none": float(np.mean(~answered)),
+            "said": float(np.mean(answered & ~good)),
+            "wrong": float(np.mean(answered & [of.wrong for of in self.answers])),
+            "silent": float(np.mean(answered & [of.silent for of in self.answers])),
+        }
+
+
+def ours(draws: Draws, drivers: Drivers, name: str, budget: float) -> Iterator[Result]:
+    """One of our estimators, alone and batched.
+
+    Args:
+        draws: The recordings.
+        drivers: Their drivers.
+        name: Of the estimator.
+        budget: Time [s] after which the other draws are left out, but for `FEWEST`.
+    """
+    method, begin = method_of(name), np.inf
+    answers, usable, times = [], [], []
+    for seed, study in enumerate(draws.studies):
+        if len(answers) >= FEWEST and time.perf_counter() - begin > budget:
+            break
+        driver = drivers.of([study[CALIBRATION]], name)
+        if driver is None:
+            answers.append(draws.answer(name, seed, "driver_failed", NOTHING, NOTHING))
+            continue
+        usable.append((study[TRIAL], driver))
+
+        def identify(record: etid.Recording = study[TRIAL], driver: etid.Driver = driver):
+            return etid.identify_skin(record, driver, method=method, throw=False)
+
+        if not times:
+            times.append(_timed(identify)[0])  # it compiles
+        seconds, fit = _timed(identify)
+        times.append(seconds)
+        said = fit.circuit.values(), fit.stderr.values()
+        answers.append(draws.answer(name, seed, fit.verdict, *said))
+        begin = min(begin, time.perf_counter())
+    first, seconds = (times[0], float(np.median(times[1:]))) if times else (np.nan, np.nan)
+    own = drivers.times.get(drivers.kind([draws.studies[0][CALIBRATION]], name), [])[1:]
+    driver_seconds = float(np.median(own)) if own else np.nan
+    alone = Result(name, "alone", answers, seconds, first, driver_seconds)
+    yield alone
+    if usable:
+        # One driver for all: it is the time that is measured.
+        known = usable[0][1]
+        count = max(1, min(BATCH, round(budget / 3 / seconds)))
+        batch = [usable[i % len(usable)][0] for i in range(count)]
+        several = [
+            _timed(lambda: etid.identify_skins(batch, known, method=method))[0] for _ in range(3)
+        ]
+        each = float(np.median(several[1:])) / count
+        yield alone._replace(mode="batched", seconds=each, first_seconds=several[0])
+
+
+def _timed(call: Callable[[], Any]) -> tuple[float, Any]:
+    begin = time.perf_counter()
+    found = jax.block_until_ready(call())
+    return time.perf_counter() - begin, found
+
+
+def theirs(draws: Draws, budget: float) -> Iterator[Result]:
+    """All rivals, each in its environment; what is missing is a result that says why."""
+    given = rivals.problem([(study[TRIAL], study[CALIBRATION]) for study in draws.studies], START)
+    for module, rival in rivals.RIVALS.items():
+        outcome, name = rivals.run(module, given, 1, PATIENCE * budget, budget), rival.name
+        if outcome.missing:
+            none = draws.answer(name, 0, "missing", NOTHING, NOTHING)
+            yield Result(name, "rival", [none], missing=outcome.missing)
+            continue
+        times = outcome.seconds[np.isfinite(outcome.seconds)]
+        yield Result(
+            name,
+            "rival",
+            [
+                draws.answer(name, i, "successful" if ok else "refused", value, NOTHING)
+                for i, (value, ok) in enumerate(zip(outcome.elements, outcome.ok, strict=True))
+            ],
+            float(np.median(times)) if times.size else np.nan,
+            outcome.first_seconds,
+            float(np.nanmedian(outcome.driver_seconds)),
+            "" if times.size else next(filter(None, outcome.errors), "no answer"),
+        )
 
 
 def rows_of(name: str, source: str, repetitions: int, quick: bool) -> list[dict[str, Any]]:
     """One row for each estimator and mode in one scene; `quick` leaves out batches and rivals."""
-    draws = draw(name, ladder()[name], repetitions, SOURCES[source])
-    drivers = Drivers(draws)
-    each = 1 if quick else None
+    draws, drivers = draw(ladder()[name], repetitions, SOURCES[source]), Drivers()
+    modes = 1 if quick else None
     results = [
-        result for of in OURS for result in itertools.islice(ours(draws, drivers, of, BUDGET), each)
+        result
+        for of in OURS
+        for result in itertools.islice(ours(draws, drivers, of, BUDGET), modes)
     ]
     results += [] if quick else theirs(draws, BUDGET)
-    scores = [score(draws, result) for result in results]
-    on_front = front([r.seconds for r in results], [s.error for s in scores])
-    beaten_by = dominators(results, scores)
+    scored = [result.row() for result in results]
+    on_front = front([of.seconds for of in results], [of["error"] for of in scored])
+    beaten_by = "; ".join(dominators(results))
     return [
         {
             "scene": name,
             "source": source,
-            "estimator": result.estimator,
-            "mode": result.mode,
-            "draws": len(result.elements),
-            "error": scored.error,
-            **{f"error_{e}": v for e, v in zip(SkinRC.names(), scored.error_of, strict=True)},
-            "none": scored.none,
-            "said": scored.said,
-            "wrong": scored.wrong,
-            "silent": scored.silent,
-            "ms": 1e3 * result.seconds,
-            "first_s": result.first_seconds,
-            "driver_ms": 1e3 * result.driver_seconds,
+            "estimator": of.estimator,
+            "mode": of.mode,
+            "draws": len(of.answers),
+            **numbers,
+            "ms": 1e3 * of.seconds,
+            "first_s": of.first_seconds,
+            "driver_ms": 1e3 * of.driver_seconds,
             "on_front": first,
-            "beaten_by": "; ".join(beaten_by) if result.estimator == DEFAULT else "",
-            "missing": result.missing,
+            "beaten_by": beaten_by if of.estimator == DEFAULT else "",
+            "missing": of.missing,
         }
-        for result, scored, first in zip(results, scores, on_front, strict=True)
+        for of, numbers, first in zip(results, scored, on_front, strict=True)
     ]
 
 
@@ -79,74 +225,66 @@ def front(times: Sequence[float], errors: Sequence[float]) -> list[bool]:
     ]
 
 
-def dominators(results: Sequence[Result], scores: Sequence[Score]) -> list[str]:
+def dominators(results: Sequence[Result]) -> list[str]:
     """What is faster than our default and more accurate, beyond chance, on the same draws.
 
     Its batch is what counts, the last of its rows: a lab has many recordings. Errors are compared
     by the mean difference of their logarithms, draw by draw.
     """
-    mine = [i for i, result in enumerate(results) if result.estimator == DEFAULT]
+    mine = [of for of in results if of.estimator == DEFAULT]
     if not mine:
         return ["anything: the default has no answer"]
     own, found = mine[-1], []
-    for result, scored in zip(results, scores, strict=True):
-        size = min(len(scored.each), len(scores[own].each))
-        a, b = scored.each[:size], scores[own].each[:size]
-        if not result.seconds < results[own].seconds or not np.isfinite(a).all():
+    for of in results:
+        size = min(len(of.answers), len(own.answers))
+        a, b = of.each[:size], own.each[:size]
+        if not of.seconds < own.seconds or not np.isfinite(a).all():
             continue
         gain = np.log(b) - np.log(a)
         if np.mean(gain) > SIGNIFICANT * np.std(gain, ddof=1) / np.sqrt(size):
-            found.append(result.estimator)
+            found.append(of.estimator)
     return found
 
 
-def ranked(rows: Sequence[Mapping[str, Any]]) -> list[str]:
-    """What does not hold of the ranking of methods, in words."""
-    wrong = []
+def ranked(rows: Sequence[dict[str, Any]]) -> Iterator[Target]:
+    """What does not hold of the ranking of methods."""
     for name in dict.fromkeys(row["scene"] for row in rows):
         of = {row["estimator"]: row for row in rows if row["scene"] == name}
-        default = of[DEFAULT]
-        if default["beaten_by"]:
-            wrong.append(
-                f"{name}: {default['beaten_by']}: faster and more accurate than the default"
-            )
-        if default["silent"] > 0:
-            wrong.append(f"{name}: the default is wrong silently in {100 * default['silent']:g} %")
-        if not default["error"] < NEAR:
-            wrong.append(f"{name}: the default is off by {default['error']:.3g} bounds")
+        default, own = of[DEFAULT], f"{name}: the default"
+        beaten = default["beaten_by"]
+        found = [
+            Target(f"{own} is beaten by", len(beaten), most=0, text=beaten),
+            Target(f"{own} is wrong silently", default["silent"], most=0),
+            Target(f"{own}, error in bounds", default["error"], most=np.nextafter(NEAR, 0)),
+        ]
         for worse in ("steiglitz_mcbride", "equation_error"):
-            if not of[worse]["error"] > default["error"]:
-                wrong.append(f"{name}: {worse} is more accurate than the default")
-    return wrong
+            least, error = np.nextafter(default["error"], np.inf), of[worse]["error"]
+            found.append(Target(f"{name}: error of {worse}", error, least))
+        yield from (target for target in found if not target.met)
 
 
-def _print(rows: Iterable[Mapping[str, Any]]) -> None:
+def _print(rows: Iterable[dict[str, Any]]) -> None:
     for row in rows:
-        head = f"{row['scene']:<22}{row['estimator']:<32}{row['mode']:<9}"
-        if row["missing"]:
-            tqdm.write(f"{head}{row['missing']}")
-            continue
-        tqdm.write(
-            f"{head}{row['draws']:>5}{row['error']:10.2f}"
-            + "".join(f"{100 * row[of]:8.0f}" for of in ("none", "said", "wrong", "silent"))
-            + f"{row['ms']:10.2f}{row['first_s']:9.2f}{row['driver_ms']:10.0f}"
-            + ("  front" if row["on_front"] else "")
-        )
+        head = f"{row['scene']:<20}{row['estimator']:<31}{row['mode']:<8}"
+        numbers = "".join(
+            f"{unit * row[key]:9.{digits}f} {name}"
+            for key, unit, digits, name in (
+                ("error", 1, 2, "x bound"), ("none", 100, 0, "% none"), ("said", 100, 0, "% said"),
+                ("wrong", 100, 0, "% wrong"), ("silent", 100, 0, "% silent"), ("ms", 1, 2, "ms"),
+                ("first_s", 1, 2, "s first"), ("driver_ms", 1, 0, "ms driver"),
+            )
+        )  # fmt: skip
+        said = row["missing"] or numbers + "  front" * row["on_front"]
+        tqdm.write(f"{head}{row['draws']:>4}{said}")
 
 
-def run(
-    names: Sequence[str], source: str, repetitions: int, folder: pathlib.Path, quick: bool
-) -> bool:
-    """Print and write the table and the charts; whether the ranking holds."""
-    heads = ("none %", "said %", "wrong %", "silent %")
-    print(
-        f"{'scene':<22}{'estimator':<32}{'mode':<9}draws  x bound"
-        + "".join(f"{head:>8}" for head in heads)
-        + f"{'ms':>10}{'first s':>9}{'driver ms':>10}"
-    )
+def main(arguments: argparse.Namespace) -> bool:
+    """Print and write the table and the charts; whether the ranking of methods holds."""
+    quick, folder = arguments.quick, arguments.folder
+    repetitions = FEW_REPETITIONS if quick else arguments.repetitions
     table: list[dict[str, Any]] = []
-    for name in tqdm(names, unit="scene"):
-        rows = rows_of(name, source, repetitions, quick)
+    for name in tqdm(arguments.scene or list(FEW if quick else ladder()), unit="scene"):
+        rows = rows_of(name, arguments.source, repetitions, quick)
         _print(rows)
         table += rows
         write_csv(folder / FILE, table)  # each scene is kept as it comes
@@ -155,23 +293,4 @@ def run(
     shown = [row for row in table if row["scene"] in SHOWN]
     if shown:
         chart(shown, folder / "speed_accuracy.svg")
-    complaints = ranked(table)
-    print("\n".join(complaints) or "the default is on the front of every scene")
-    return not complaints
-
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Size of the run."""
-    parser.add_argument("--quick", action="store_true", help="two scenes, few draws, no rivals")
-    parser.add_argument("--scene", action="append", choices=list(ladder()), help="repeatable")
-    parser.add_argument("--source", choices=SOURCES, default="simulated")
-    parser.add_argument("--repetitions", type=int, default=REPETITIONS)
-    parser.add_argument("--folder", type=pathlib.Path, default=RESULTS, help="of table and charts")
-
-
-def main(arguments: argparse.Namespace) -> bool:
-    """Run the command; whether the ranking of methods holds."""
-    pin()
-    names = arguments.scene or list(QUICK if arguments.quick else ladder())
-    repetitions = QUICK_REPETITIONS if arguments.quick else arguments.repetitions
-    return run(names, arguments.source, repetitions, arguments.folder, arguments.quick)
+    return report(ranked(table))

@@ -6,7 +6,6 @@ that the method itself reports.
 """
 
 import argparse
-import csv
 import json
 import pathlib
 import tempfile
@@ -15,6 +14,8 @@ from collections import Counter
 import numpy as np
 
 import etid
+from benchmarks.provenance import write_csv
+from benchmarks.runner import option
 from etid.circuits.circuit import AbstractCircuit
 from etid.estimators.registry import named, names
 from etid.simulation.scenes import Scene, Trial
@@ -25,25 +26,11 @@ BOUND = "crb_rel_with_delays"  # the trigger delays being unknown, as they are t
 ELEMENTS = {"r_s": "Rs", "r_p": "Rp", "c_p": "Cp", "r": "R"}
 # Names of the transformer's parts in `truth.json`.
 PARTS = {
-    "Vp": "amplitude",
-    "tr": "edge",
-    "td": "lead_in",
-    "Rsrc": "r_source",
-    "Cpri": "c_primary",
-    "Rpw": "r_primary",
-    "Llp": "l_primary",
-    "Lm": "l_magnetising",
-    "Rcore": "r_core",
-    "n": "turns",
-    "Rsw": "r_secondary",
-    "Lls": "l_secondary",
-    "Csec": "c_secondary",
-    "Cww": "c_winding",
-    "Rprot": "r_protection",
-    "Ccab": "c_cable",
-    "Rmeas": "r_divider",
-    "Cmeas": "c_divider",
-}
+    "Vp": "amplitude", "tr": "edge", "td": "lead_in", "Rsrc": "r_source", "Cpri": "c_primary",
+    "Rpw": "r_primary", "Llp": "l_primary", "Lm": "l_magnetising", "Rcore": "r_core", "n": "turns",
+    "Rsw": "r_secondary", "Lls": "l_secondary", "Csec": "c_secondary", "Cww": "c_winding",
+    "Rprot": "r_protection", "Ccab": "c_cable", "Rmeas": "r_divider", "Cmeas": "c_divider",
+}  # fmt: skip
 
 
 def scene_of(truth: dict) -> Scene:
@@ -74,6 +61,21 @@ JOINT = "joint"
 ESTIMATORS: tuple[str, ...] = (*names(), JOINT)
 
 
+DATA = option(
+    "--data",
+    default=pathlib.Path("../shared/data"),
+    type=pathlib.Path,
+    help=f"folder that has {FOLDER}/, recordings with known truth",
+)
+OPTIONS = (
+    DATA,
+    option("--scene", action="append", help="only this scene; may be repeated"),
+    option("--method", action="append", choices=ESTIMATORS, help="only this; repeatable"),
+    option("-o", "--output", type=pathlib.Path, help="CSV to write"),
+)
+NUMBERS = ("bias", "spread", "rms", "bound", "sd", "chi2")
+
+
 def fit_scene(source: pathlib.Path, truth: dict, method: str) -> list[dict]:
     """One row per element: bias, spread, bound, reported standard error, all relative, in %."""
     trials = truth["trials"]
@@ -90,11 +92,9 @@ def fit_scene(source: pathlib.Path, truth: dict, method: str) -> list[dict]:
             else:
                 result = etid.identify_study(study, circuit=circuit, method=method)
     fits = result.fits
-    order = np.argsort([int(path.rsplit("/", 1)[1]) for path in fits.labels["path"]])
-    fits = fits.take(order)
+    fits = fits.take(np.argsort([int(path.rsplit("/", 1)[1]) for path in fits.labels["path"]]))
     driver = next(iter(result.drivers.values()), None)
-    verdicts = Counter(fits.verdicts.tolist())
-    rows = []
+    verdicts, rows = Counter(fits.verdicts.tolist()), []
     for i, name in enumerate(circuit.names()):
         true = np.array([trial["elements"][ELEMENTS[name]] for trial in trials])
         error = 100 * (np.asarray(getattr(fits.circuit, name)) / true - 1)
@@ -102,6 +102,7 @@ def fit_scene(source: pathlib.Path, truth: dict, method: str) -> list[dict]:
         bounds = [100 * trial[BOUND][i] for trial in trials if BOUND in trial]
         bound = float(np.median(bounds)) if bounds else np.nan
         finite = error[np.isfinite(error)]
+        own = np.fmax(np.nan_to_num(stderr), np.nan_to_num(bound))
         rows.append(
             {
                 "scene": source.stem,
@@ -119,72 +120,27 @@ def fit_scene(source: pathlib.Path, truth: dict, method: str) -> list[dict]:
                 "bound": bound,
                 "sd": float(np.nanmedian(stderr)) if np.isfinite(stderr).any() else np.nan,
                 # Called successful, and wrong by more than 5 bounds and 5 of its own errors.
-                "silent": int(
-                    np.sum(
-                        (fits.verdicts == "successful")
-                        & (np.abs(error) > 5 * np.fmax(np.nan_to_num(stderr), np.nan_to_num(bound)))
-                    )
-                ),
+                "silent": int(np.sum((fits.verdicts == "successful") & (np.abs(error) > 5 * own))),
             }
         )
     return rows
 
 
-def add_data(parser: argparse.ArgumentParser) -> None:
-    """Where recordings with known truth are."""
-    parser.add_argument(
-        "--data",
-        type=pathlib.Path,
-        default=pathlib.Path("../shared/data"),
-        help=f"folder that has {FOLDER}/",
-    )
-
-
-def run(
-    folder: pathlib.Path,
-    scenes: list[str] | None,
-    methods: list[str] | None,
-    output: pathlib.Path | None,
-) -> None:
+def main(arguments: argparse.Namespace) -> bool:
     """Fit the scenes, print the table, write it as CSV."""
+    folder = arguments.data / FOLDER
     if not folder.exists():
         raise SystemExit(f"no SPICE recordings at {folder}; pass their parent folder with --data")
     truth = json.loads((folder / "truth.json").read_text())["scenes"]
     table: list[dict] = []
-    head = f"{'scene':<19}{'method':<28}{'element':<8}{'bias %':>9}{'spread %':>9}{'rms %':>9}"
-    head += f"{'bound %':>9}{'sd %':>9}{'chi2':>9}  silent  driver; verdicts"
-    print(head)
-    for name in scenes or truth:
-        for method in methods or ESTIMATORS:
+    for name in arguments.scene or truth:
+        for method in arguments.method or ESTIMATORS:
             for row in fit_scene(folder / f"{name}.npz", truth[name], method):
                 table.append(row)
-                numbers = "".join(
-                    f"{row[key]:9.3g}" for key in ("bias", "spread", "rms", "bound", "sd", "chi2")
-                )
-                print(
-                    f"{row['scene']:<19}{row['method']:<28}{row['element']:<8}{numbers}"
-                    f"{row['silent']:>8}  {row['driver']}; {row['verdicts']}",
-                    flush=True,
-                )
-    if output is not None and table:
-        output.parent.mkdir(parents=True, exist_ok=True)
-        with output.open("w", newline="") as file:
-            writer = csv.DictWriter(file, fieldnames=list(table[0]))
-            writer.writeheader()
-            writer.writerows(table)
-
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Scenes, methods, where the recordings are."""
-    add_data(parser)
-    parser.add_argument("--scene", action="append", help="only this scene; may be repeated")
-    parser.add_argument(
-        "--method", action="append", choices=ESTIMATORS, help="only this; repeatable"
-    )
-    parser.add_argument("-o", "--output", type=pathlib.Path, default=None, help="CSV to write")
-
-
-def main(arguments: argparse.Namespace) -> bool:
-    """Run the command."""
-    run(arguments.data / FOLDER, arguments.scene, arguments.method, arguments.output)
+                numbers = ", ".join(f"{key} {row[key]:.3g}" for key in NUMBERS)
+                head = f"{row['scene']:<19}{row['method']:<20}{row['element']:<5}"
+                said = f"silent {row['silent']}; driver {row['driver']}; {row['verdicts']}"
+                print(f"{head}{numbers}, {said}", flush=True)
+    if arguments.output is not None and table:
+        write_csv(arguments.output, table)
     return True

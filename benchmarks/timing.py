@@ -14,8 +14,10 @@ import jax
 import numpy as np
 
 import etid
+from benchmarks.runner import option
 from etid.estimators.registry import names
 
+OPTIONS = (option("--lanes", default=98, help="of the batch"),)
 REPEATS = 7
 
 
@@ -47,19 +49,12 @@ def interpreter() -> dict[str, str]:
 def import_time(module: str) -> float:
     """Wall time [s] of importing a module in a fresh interpreter, median of 3 after a first one."""
     code = f"import time; t = time.perf_counter(); {module}; print(time.perf_counter() - t)"
+    command = [sys.executable, "-c", code]
     runs = [
-        float(
-            subprocess.run(
-                [sys.executable, "-c", code],
-                env=interpreter(),
-                capture_output=True,
-                check=True,
-                text=True,
-            ).stdout
-        )
+        subprocess.run(command, env=interpreter(), capture_output=True, check=True).stdout
         for _ in range(4)
     ]
-    return float(np.median(runs[1:]))
+    return float(np.median(np.array(runs[1:], float)))
 
 
 def first_and_warm(call: Callable[[], Any], repeats: int) -> tuple[float, float]:
@@ -72,12 +67,16 @@ def first_and_warm(call: Callable[[], Any], repeats: int) -> tuple[float, float]
     return runs[0], float(np.median(runs[1:]))
 
 
-def run(lanes: int) -> None:
+def median_time(call: Callable[[], Any], repeats: int) -> float:
+    """Median wall time [s] after a first call."""
+    return first_and_warm(call, repeats)[1]
+
+
+def main(arguments: argparse.Namespace) -> bool:
     """Print the table."""
-    base = import_time("import jax, optimistix")
-    own = import_time("import etid")
-    print(f"import jax + optimistix      {base:8.2f} s")
-    print(f"import etid                  {own:8.2f} s   ratio {own / base:.2f}")
+    lanes = arguments.lanes
+    base, own = import_time("import jax, optimistix"), import_time("import etid")
+    print(f"import jax + optimistix {base:.2f} s, import etid {own:.2f} s, ratio {own / base:.2f}")
     study = etid.scenes.paper_dry().simulate(seed=0)
     calibration = next(iter(study.calibrations.recordings()))
     recordings = list(study.loaded.recordings())
@@ -86,23 +85,12 @@ def run(lanes: int) -> None:
     print(f"driver, first call           {first:8.2f} s   warm {warm:.3f} s")
     driver = etid.identify_driver(calibration, throw=False)
     for method in names():
-        fit = functools.partial(
-            etid.identify_skin, recordings[0], driver, method=method, throw=False
-        )
+        given: dict[str, Any] = {"driver": driver, "method": method}
+        fit = functools.partial(etid.identify_skin, recordings[0], throw=False, **given)
         first, warm = first_and_warm(fit, REPEATS)
         print(f"skin {method:<27} first {first:8.2f} s   warm {1e3 * warm:.1f} ms")
-        fits = functools.partial(etid.identify_skins, many, driver, method=method)
+        fits = functools.partial(etid.identify_skins, many, **given)
         first, warm = first_and_warm(lambda fits=fits: fits().chi2, 3)
         each = 1e3 * warm / lanes
         print(f"  batch of {lanes:<21} first {first:8.2f} s   warm {each:.1f} ms per fit")
-
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Lanes of the batch."""
-    parser.add_argument("--lanes", type=int, default=98)
-
-
-def main(arguments: argparse.Namespace) -> bool:
-    """Run the command."""
-    run(arguments.lanes)
     return True

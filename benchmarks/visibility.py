@@ -12,9 +12,9 @@ of this change is the most powerful one with its rate of false alarms. `missed` 
 that it does not refuse.
 """
 
-import dataclasses
 import math
 from collections.abc import Callable
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -34,24 +34,16 @@ LIMIT = SEEN_GAIN  # standard deviations from which on etid refuses a gain; its 
 Gain = Complex[np.ndarray, " f"]
 
 
-@dataclasses.dataclass(frozen=True)
-class Records:
-    """What both loaded records hold at the harmonics.
+class Records(NamedTuple):
+    """What both loaded records hold at the harmonics."""
 
-    Attributes:
-        f: Harmonics [Hz].
-        skin: Impedance of the skin [ohm].
-        z_th: Source impedance [ohm].
-        gains: V_out / V_th with the skin and with the resistor.
-    """
-
-    f: Float[np.ndarray, " f"]
-    skin: Gain
-    z_th: Gain
-    gains: tuple[Gain, Gain]
+    f: Float[np.ndarray, " f"]  # harmonics [Hz]
+    skin: Gain  # impedance of the skin [ohm]
+    z_th: Gain  # source impedance [ohm]
+    gains: tuple[Gain, Gain]  # V_out / V_th with the skin and with the resistor
 
 
-Change = Callable[[Records], tuple[Gain, Gain]]
+Change = Callable[[Records], tuple[Gain | float, Gain | float]]
 """Changes of both gains, with the skin and with the resistor."""
 
 
@@ -62,68 +54,62 @@ def gain(part: float, calibration: bool) -> Change:
 
 def crosstalk(part: float) -> Change:
     """V_out sees this part of V_th, with the skin only."""
-    return lambda of: (np.full_like(of.gains[0], part), np.zeros_like(of.gains[1]))
+    return lambda of: (part, 0.0)
 
 
 def lowpass(corner: float) -> Change:
     """A filter of first order before V_out [Hz], with the skin only."""
-    return lambda of: (
-        -of.gains[0] * np.log(1 + 1j * of.f / corner),
-        np.zeros_like(of.gains[1]),
-    )
+    return lambda of: (-of.gains[0] * np.log(1 + 1j * of.f / corner), 0.0)
 
 
 def series(r: float) -> Change:
     """A resistor in series with the source [ohm], with the skin only."""
-    return lambda of: (-of.gains[0] * r / (of.skin + of.z_th), np.zeros_like(of.gains[1]))
+    return lambda of: (-of.gains[0] * r / (of.skin + of.z_th), 0.0)
 
 
-def deviations(load: SkinLoad, snr_db: float, change: Change) -> float:
-    """Standard deviations at which the best test sees a change.
+def information(
+    load: SkinLoad, snr_db: float, band: float, *changes: Change
+) -> Float[np.ndarray, "q q"]:
+    """Fisher information of the elements' logarithms, both delays [µs], and the sizes of changes.
 
     Args:
         load: The skin.
         snr_db: Of every record [dB].
-        change: What is added.
+        band: Highest frequency, relative to the sample rate.
+        changes: What is added.
     """
     scene = rung("dry", snr_db=snr_db)
-    waveform = scene.waveform()
-    inside = waveform.f < BAND * scene.sample_rate
-    f, z_th = waveform.f[inside], waveform.z_th[inside]
-    x = waveform.v_th[inside] * math.sqrt(scene.samples) / waveform.sigma
-    circuit = SkinRC(load.r_s, load.r_p, load.c_p)
-    frequency = jnp.asarray(f)
-    slope = np.asarray(
-        jax.jacfwd(lambda logs: circuit.with_log_values(logs).response(frequency))(
-            circuit.log_values()
-        )
-    )
+    wave = scene.waveform()
+    inside = wave.f < band * scene.sample_rate
+    f, z_th = wave.f[inside], wave.z_th[inside]
+    x = wave.v_th[inside] * math.sqrt(scene.samples) / wave.sigma
+    circuit, at = SkinRC(load.r_s, load.r_p, load.c_p), jnp.asarray(f)
+    logs = circuit.log_values()
+    slope = np.asarray(jax.jacfwd(lambda logs: circuit.with_log_values(logs).response(at))(logs))
     loads = load(f), np.full(f.size, complex(REFERENCE))
     gains = loading(loads[0], z_th), loading(loads[1], z_th)
-    changed = change(Records(f, loads[0], z_th, gains))
+    changed = [change(Records(f, loads[0], z_th, gains)) for change in changes]
     # Rows: V_out with the skin and the resistor, then both V_th. Columns of b: both X, and Z_th.
-    own = slope.shape[1]
-    a = np.zeros((f.size, 4, own + 3), complex)
+    a = np.zeros((f.size, 4, 5 + len(changes)), complex)
     b = np.zeros((f.size, 4, 3), complex)
     for i in range(2):
         b[:, i, i], b[:, 2 + i, i] = gains[i], 1
         b[:, i, 2] = -gains[i] * x / (loads[i] + z_th)
-        a[:, i, own + i] = -2j * np.pi * f * 1e-6 * gains[i] * x  # delays in microseconds
-        a[:, i, -1] = changed[i] * x
-    a[:, 0, :own] = (x * z_th / (loads[0] + z_th) ** 2)[:, None] * slope
+        a[:, i, 3 + i] = -2e-6j * np.pi * f * gains[i] * x
+        for column, pair in enumerate(changed):
+            a[:, i, 5 + column] = pair[i] * x
+    a[:, 0, :3] = (x * z_th / (loads[0] + z_th) ** 2)[:, None] * slope
     q, _ = np.linalg.qr(b)
-    rest = (a - q @ (np.conj(np.swapaxes(q, 1, 2)) @ a)).reshape(-1, own + 3)
-    information = 2 * np.real(np.conj(rest.T) @ rest)
-    return float(1 / np.sqrt(np.linalg.inv(information)[-1, -1]))
+    rest = (a - q @ (np.conj(np.swapaxes(q, 1, 2)) @ a)).reshape(-1, a.shape[-1])
+    return 2 * np.real(np.conj(rest.T) @ rest)
+
+
+def deviations(load: SkinLoad, snr_db: float, change: Change) -> float:
+    """Standard deviations at which the best test sees a change behind a skin."""
+    return float(1 / np.sqrt(np.linalg.inv(information(load, snr_db, BAND, change))[-1, -1]))
 
 
 def missed(load: SkinLoad, snr_db: float, change: Change) -> float:
-    """Probability that the best test misses a change.
-
-    Args:
-        load: The skin.
-        snr_db: Of every record [dB].
-        change: What is added.
-    """
+    """Probability that the best test misses a change behind a skin."""
     at = deviations(load, snr_db, change)
     return float(scipy.stats.norm.cdf(LIMIT - at) - scipy.stats.norm.cdf(-LIMIT - at))

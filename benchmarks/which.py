@@ -10,6 +10,7 @@ import numpy as np
 
 from benchmarks.estimators import OURS
 from benchmarks.provenance import RESULTS, ROOT
+from benchmarks.runner import option
 from benchmarks.speed_accuracy import FILE
 from etid.estimators.registry import names
 
@@ -19,39 +20,45 @@ AS_GOOD = 1.25  # times the smallest error, that an estimator may have to be use
 WORTH = 0.5  # of the time that the first of them takes, from which on that is a reason
 TRUSTED = 0.5  # part of the draws that have an answer which the estimator itself stands by
 
+OPTIONS = (
+    option("--results", type=pathlib.Path, default=RESULTS / FILE),
+    option("--readme", type=pathlib.Path, default=README),
+)
+Row = Mapping[str, Any]
+
 
 def read(path: pathlib.Path) -> list[dict[str, Any]]:
-    """Rows of our estimators in batches, with numbers as numbers."""
+    """Rows of our estimators, with numbers as numbers."""
     with path.open() as file:
         rows = [row for row in csv.DictReader(file) if row["mode"] != "rival"]
     numbers = ("error", "none", "said", "wrong", "silent", "ms")
     return [{**row, **{name: float(row[name]) for name in numbers}} for row in rows]
 
 
-def table(rows: Sequence[Mapping[str, Any]]) -> str:
+def table(rows: Sequence[Row]) -> str:
     """Markdown: a row for each scene with the error of each estimator, and which to use."""
-    methods = [method for method in names() if any(r["estimator"] == method for r in rows)]
-    lines = [
-        "| recording | " + " | ".join(name.replace("_", " ") for name in methods) + " | use |",
-        "|---" * (len(methods) + 2) + "|",
-    ]
+    of_method = {name: [row for row in rows if row["estimator"] == name] for name in names()}
+    methods = [name for name, of in of_method.items() if of]
+    heads = ["recording", *(name.replace("_", " ") for name in methods), "use"]
+    lines = ["| " + " | ".join(heads) + " |", "|---" * len(heads) + "|"]
     for scene in dict.fromkeys(row["scene"] for row in rows):
         of = {row["estimator"]: row for row in rows if row["scene"] == scene}
         use = best(list(of.values()))
         cells = [_cell(of.get(method), method == use) for method in methods]
         name = use.replace("_", " ") if use else "none of them"
         lines.append(f"| {scene} | " + " | ".join(cells) + f" | {name} |")
-    times = [_median_ms([r for r in rows if r["estimator"] == method]) for method in methods]
+    times = [_median_ms(of_method[name]) for name in methods]
     lines.append("| *ms, in a batch* | " + " | ".join(times) + " | |")
     return "\n".join(lines) + "\n"
 
 
-def best(rows: Sequence[Mapping[str, Any]]) -> str | None:
+def best(rows: Sequence[Row]) -> str | None:
     """The first that is trusted and as good as the best, or one such that takes half its time."""
     trusted = [
         row
         for row in sorted(rows, key=lambda row: OURS.index(row["estimator"]))
-        if row["estimator"] in names() and _trusted(row) and np.isfinite(row["error"])
+        if row["estimator"] in names() and row["silent"] == 0 and np.isfinite(row["error"])
+        if _is_trusted(row)
     ]
     if not trusted:
         return None
@@ -61,20 +68,20 @@ def best(rows: Sequence[Mapping[str, Any]]) -> str | None:
     return (fastest if fastest["ms"] <= WORTH * good[0]["ms"] else good[0])["estimator"]
 
 
-def _trusted(row: Mapping[str, Any]) -> bool:
-    return row["none"] + row["said"] <= 1 - TRUSTED and row["silent"] == 0
+def _is_trusted(row: Row) -> bool:
+    return row["none"] + row["said"] <= 1 - TRUSTED
 
 
-def _cell(row: Mapping[str, Any] | None, used: bool) -> str:
+def _cell(row: Row | None, used: bool) -> str:
     if row is None or not np.isfinite(row["error"]):
         return "-"
     text = f"{row['error']:.2g}" if row["error"] < 100 else f"{row['error']:.0f}"
-    text = f"({text})" if row["none"] + row["said"] > 1 - TRUSTED else text
+    text = text if _is_trusted(row) else f"({text})"
     text += " silent" if row["silent"] > 0 else ""
     return f"**{text}**" if used else text
 
 
-def _median_ms(rows: Sequence[Mapping[str, Any]]) -> str:
+def _median_ms(rows: Sequence[Row]) -> str:
     found = [row["ms"] for row in rows if row["mode"] == "batched" and np.isfinite(row["ms"])]
     return f"{np.median(found):.3g}" if found else "-"
 
@@ -90,12 +97,6 @@ def inserted(text: str, made: str) -> str:
     if not (begin and end):
         raise ValueError(f"no {BEGIN.strip()!r} … {END.strip()!r} to put the table between")
     return head + begin + made + end + tail
-
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Where results and page are."""
-    parser.add_argument("--results", type=pathlib.Path, default=RESULTS / FILE)
-    parser.add_argument("--readme", type=pathlib.Path, default=README)
 
 
 def main(arguments: argparse.Namespace) -> bool:

@@ -1,13 +1,12 @@
 """Bugs that are put in: each is one, no test sees what cannot matter, and none is done twice."""
 
-import argparse
 import ast
 import csv
-import types
 
 import pytest
 
-from benchmarks import mutant_tests, mutation
+from benchmarks import mutation
+from benchmarks.__main__ import asked
 from benchmarks.mutant_tests import Outcome
 from benchmarks.mutants import drawn, mutants
 from benchmarks.provenance import ROOT
@@ -62,10 +61,8 @@ def test_what_changes_nothing_by_construction_is_no_mutant():
 
 def test_draws_are_seeded_and_larger_ones_hold_the_smaller():
     found = mutants("small.py", SOURCE)
-    few, many = drawn(found, 4, 1), drawn(found, 9, 1)
-    assert drawn(found, 4, 1) == few
-    assert many[:4] == few  # what is done of an interrupted run is a draw, too
-    assert drawn(found, 9, 2) != many
+    assert drawn(found, 9, 1)[:4] == drawn(found, 4, 1)  # an interrupted run is a draw, too
+    assert drawn(found, 9, 2) != drawn(found, 9, 1)
 
 
 @pytest.fixture
@@ -105,58 +102,22 @@ def test_modules_and_their_tests_are_where_the_benchmark_looks_for_them():
             assert (ROOT / "tests" / f"test_{test}.py").exists()
 
 
-def test_the_copy_that_is_broken_has_every_module(tmp_path):
-    folder = tmp_path / "tree"
-    folder.mkdir()
-    mutation.copied(ROOT, folder)
-    for path in (ROOT / "etid").rglob("*.py"):
-        assert (folder / path.relative_to(ROOT)).exists()
-
-
-ROW = {
-    "key": "k", "module": "a", "place": "etid/a.py:7", "kind": "sign", "before": "-\\\n x",
-    "after": "(x)", "killer": "", "seconds": 1.0,
-}  # fmt: skip
-
-
-def test_survivors_are_shown_with_their_place(capsys):
-    row = {**ROW, "before": "-x"}
-    share = mutation.show([{**row, "outcome": "survived"}, {**row, "outcome": "killed"}])
-    assert share == 0.5
+def test_survivors_are_shown_and_the_table_tells_seed_and_commit(tmp_path, monkeypatch, capsys):
+    row = {
+        "key": "k", "module": "a", "place": "etid/a.py:7", "kind": "sign", "before": "-\\\n x",
+        "after": "(x)", "killer": "", "seconds": 1.0,
+    }  # fmt: skip
+    rows = [{**row, "outcome": outcome} for outcome in ("survived", "killed")]
+    monkeypatch.setattr(mutation, "outcomes", lambda *_: rows)
+    kept = tmp_path / "mutation.jsonl"
+    of = asked(["mutation", "--modules", "results.verdicts", "--seed", "3", "--output", str(kept)])
+    assert not of.module.main(of)
     text = capsys.readouterr().out
     assert "1 of 2 survive, 50%" in text
-    assert "etid/a.py:7: sign: -x  ->  (x)" in text
-
-
-def test_tests_that_killed_a_mutant_nearby_come_first():
-    kills = ((7, "near"), (90, "far"), (90, "near"), (5, ""), (41, "between"))
-    rows = [{"module": "a", "place": f"etid/a.py:{n}", "killer": name} for n, name in kills]
-    rows.append({"module": "b", "place": "etid/b.py:10", "killer": "other"})
-    assert mutation.nearest(rows, "a", 10) == ["near", "between", "far"]
-
-
-def test_files_whose_tests_come_first_stay_together():
-    names = ("a::1", "a::2", "b::1", "b::2", "c::1")
-    items = [types.SimpleNamespace(nodeid=name, path=name[0]) for name in names]
-    order = mutant_tests._Order(["b::2", "c::1"])
-    order.pytest_collection_modifyitems(items)
-    assert [item.nodeid for item in items] == ["b::2", "b::1", "c::1", "a::1", "a::2"]
-    for name, failed in (("a::1", False), ("a::2", True)):
-        order.pytest_runtest_logreport(types.SimpleNamespace(nodeid=name, failed=failed))
-    assert order.failed == "a::2"
-
-
-def test_the_table_of_mutants_tells_seed_and_commit(tmp_path, monkeypatch):
-    row = {**ROW, "outcome": "killed"}
-    monkeypatch.setattr(mutation, "outcomes", lambda *_: [row])
-    kept = tmp_path / "mutation.jsonl"
-    arguments = argparse.ArgumentParser()
-    mutation.add_arguments(arguments)
-    options = ["--modules", "results.verdicts", "--seed", "3", "--output", str(kept)]
-    assert mutation.main(arguments.parse_args(options))
+    assert "etid/a.py:7: sign: -\\ x  ->  (x)" in text
     with kept.with_suffix(".csv").open() as file:
-        [found] = csv.DictReader(file)
-    assert (found["seed"], found["outcome"], found["before"]) == ("3", "killed", "-\\ x")
+        found = next(csv.DictReader(file))
+    assert (found["seed"], found["outcome"], found["before"]) == ("3", "survived", "-\\ x")
     assert found["commit"]
 
 

@@ -8,7 +8,6 @@ import pytest
 
 import etid
 from benchmarks import ladder, ngspice
-from benchmarks.spice import PARTS
 from etid.simulation.scenes import Scene, Trial
 from etid.simulation.transformer import OpenLoad, ResistorLoad, SkinLoad, TransformerDriver, loading
 
@@ -95,49 +94,6 @@ def test_netlist_is_the_circuit_of_the_driver(load):
         np.testing.assert_allclose(response(text, frequency), expected[0], rtol=1e-9)
 
 
-def test_netlist_has_every_part_with_its_value():
-    values = {
-        field.name: np.float64(i + 1.5) * getattr(TransformerDriver(), field.name)
-        for i, field in enumerate(dataclasses.fields(TransformerDriver))
-        if field.name not in ("width", "edge", "lead_in")
-    }
-    driver = dataclasses.replace(TransformerDriver(), **values)
-    parts = lines_of(ngspice.netlist(driver, DRY, RATE))
-    for name, (*_, value) in parts.items():
-        if name in ngspice.NODES:
-            assert float(value) == values[PARTS[name]], name
-    assert ngspice.NODES.keys() <= parts.keys()
-    assert {name: float(parts[name][2]) for name in ("Rs", "Rp", "Cp")} == {
-        "Rs": 33.4e3, "Rp": 186e3, "Cp": 0.12e-9,
-    }  # fmt: skip
-
-
-def test_netlist_pulses_once_per_period_and_stops_at_the_end_of_one():
-    text = ngspice.netlist(TransformerDriver(), OpenLoad(), RATE)
-    _, _, pulse = text.splitlines()[1].partition("PULSE(")
-    low, high, delay, rise, fall, top, period = map(float, pulse.rstrip(")").split())
-    driver = TransformerDriver()
-    assert (low, high, delay, rise, fall) == (0, 4.2, driver.lead_in, driver.edge, driver.edge)
-    assert top + driver.edge == pytest.approx(driver.width, rel=1e-12)
-    assert period == 1 / RATE
-    run = next(line for line in text.splitlines() if line.startswith(".tran"))
-    _, stop, begin, _ = map(float, run.split()[1:])
-    assert stop * RATE == pytest.approx(round(stop * RATE), rel=1e-12)
-    assert (stop - begin) * RATE >= 2  # two periods to compare
-    assert begin > 0.09
-
-
-@pytest.mark.parametrize("edge", [0.0, 1e-3])
-def test_a_pulse_that_ngspice_would_change_is_refused(edge):
-    with pytest.raises(ValueError, match="0 < edge < width"):
-        ngspice.netlist(TransformerDriver(edge=edge), OpenLoad(), RATE)
-
-
-def test_a_load_without_a_netlist_is_refused():
-    with pytest.raises(ValueError, match="OpenLoad, ResistorLoad, SkinLoad or a circuit"):
-        ngspice.netlist(TransformerDriver(), lambda f: f + 0j, RATE)
-
-
 # --- what is done with its answer, without it -----------------------------------------------------
 
 
@@ -145,18 +101,6 @@ def raw_file(time, v):
     points = np.stack([time, v], axis=1)
     head = f"Title: x\nNo. Variables: 2\nNo. Points: {len(points)}\nVariables:\n\t0 time time\n"
     return head.encode() + b"\t1 v(o) voltage\nBinary:\n" + points.tobytes()
-
-
-def test_a_raw_file_is_read():
-    time, v = np.arange(5.0), np.linspace(0, 1, 5)
-    found = ngspice.waveform(raw_file(time, v))
-    np.testing.assert_array_equal(found, [time, v])
-
-
-@pytest.mark.parametrize("raw", [b"", b"Binary:\n", raw_file(np.arange(5.0), np.ones(5))[:-8]])
-def test_a_raw_file_that_is_not_whole_is_refused(raw):
-    with pytest.raises(ngspice.NgspiceError, match="time and at least one"):
-        ngspice.waveform(raw)
 
 
 @pytest.mark.parametrize("growth", [0.0, 1e-3])
@@ -177,29 +121,6 @@ def test_harmonics_of_uneven_steps_are_those_of_the_waveform(monkeypatch, growth
     np.testing.assert_allclose(found, expected, atol=1e-9)
 
 
-def test_the_recorder_is_that_of_the_scene(monkeypatch):
-    """From exact waveforms both sources make the same codes, with noise, delays and offsets."""
-    scene = ladder.rung("dry", samples=3_000, offset_rms=0.01)
-
-    def exact(netlist, pulse_rate, count):
-        f = pulse_rate * np.arange(1, count + 1)
-        load = {"98.8": ResistorLoad(98.8e3), "skin": ladder.LOADS["dry"]}.get(
-            "98.8" if "R o 0" in netlist else "skin" if "Cp x" in netlist else "", OpenLoad()
-        )
-        unloaded = pulse_rate * scene.driver.v_th_spectrum(f)
-        return unloaded * loading(load(f), scene.driver.z_th(f))
-
-    monkeypatch.setattr(ngspice, "harmonics", exact)
-    ours, theirs = ngspice.record(scene, 7), scene.simulate(7)
-    assert list(ours) == list(theirs)
-    for path in theirs:
-        assert ours[path].metadata == theirs[path].metadata
-        for name in ("v_th", "v_out"):
-            np.testing.assert_array_equal(
-                ours[path].samples[name].stored, theirs[path].samples[name].stored
-            )
-
-
 def test_ngspice_runs_once_per_circuit_and_load(monkeypatch):
     runs = []
 
@@ -216,12 +137,6 @@ def test_ngspice_runs_once_per_circuit_and_load(monkeypatch):
     for text in ("one", "one", "other", "one"):
         np.testing.assert_array_equal(ngspice.solve(text)[1], np.arange(3.0))
     assert len(runs) == 2
-
-
-def test_a_missing_ngspice_is_one_error_with_its_remedy(monkeypatch):
-    monkeypatch.setattr(shutil, "which", lambda name: None)
-    with pytest.raises(ngspice.NgspiceError, match="apt-get install ngspice"):
-        ngspice.record(ladder.rung("dry"), 0)
 
 
 # --- with it --------------------------------------------------------------------------------------
@@ -259,10 +174,3 @@ def test_skin_is_identified_from_ngspice_as_from_the_scene(load):
     truth = np.array(list(scene.truth()[ladder.TRIAL].values()))
     assert np.all(np.abs(ours - truth) < SIGMAS * np.asarray(found[0].stderr.values()))
     np.testing.assert_allclose(ours, exact, rtol=ELEMENTS)
-
-
-@needs_ngspice
-@pytest.mark.slow
-def test_what_ngspice_cannot_solve_is_an_error():
-    with pytest.raises(ngspice.NgspiceError, match="ngspice"):
-        ngspice.solve("a title\nR1 a\n.end\n")

@@ -1,6 +1,5 @@
 """Tables and pages, and the arithmetic of the demo's tables."""
 
-import argparse
 import csv
 import dataclasses
 import html.parser
@@ -12,6 +11,7 @@ import pytest
 
 import etid
 from benchmarks import paper, paper_tables
+from benchmarks.__main__ import asked
 from etid.paper import demo, tables
 from etid.report import html as report
 from etid.results.driver import DiscreteDriver
@@ -241,9 +241,7 @@ def test_what_is_missed_is_said(groups):
 
 @pytest.mark.slow
 def test_the_papers_tables_and_figures_are_made(tmp_path, capsys):
-    parser = argparse.ArgumentParser()
-    paper.add_arguments(parser)
-    assert paper.main(parser.parse_args(["--quick", "--folder", str(tmp_path)]))
+    assert paper.main(asked(["paper", "--quick", "--folder", str(tmp_path)]))
     for number in (1, 2, 3, 4):
         with (tmp_path / f"table_{number}.csv").open() as file:
             rows = list(csv.DictReader(file))

@@ -2,15 +2,11 @@
 
 Each rival is a module beside this one, written as a user of its package would write it, and run by
 `worker` in an environment of its own, of which as many are made as pins clash. A rival that cannot
-be installed or run is a row that says why.
-
-    python -m benchmarks rivals              installs all, and runs each where it should work
-    python -m benchmarks rivals scipy_harmonics jaxopt_lm
+be installed or run is a row that says why (`benchmarks.rivals.table`).
 
 Nothing but the standard library and NumPy is imported here: those environments have no etid.
 """
 
-import argparse
 import dataclasses
 import json
 import math
@@ -22,7 +18,7 @@ import subprocess
 import sys
 import tempfile
 import venv
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -32,35 +28,33 @@ from benchmarks.rivals.roster import RIVALS
 ROOT = pathlib.Path(__file__).parents[2]
 ENVIRONMENTS = ROOT / ".rivals"
 REQUIREMENTS = pathlib.Path(__file__).parent
-ONE_THREAD = {
-    name: "1"
-    for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
+# One thread; and compilation counts, so that no cache may serve it.
+SETTINGS = {
+    **{f"{of}_NUM_THREADS": "1" for of in ("OMP", "OPENBLAS", "MKL", "NUMBA")},
+    "JAX_ENABLE_COMPILATION_CACHE": "0",
 }
+
+
+class RivalError(RuntimeError):
+    """A rival could not be run; says why in a line."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Outcome:
-    """What a rival found, one row per draw, or why it found nothing.
+    """What a rival found, one row per draw, or why it found nothing."""
 
-    Attributes:
-        elements: R_s [ohm], R_p [ohm], C_p [F]; NaN where a draw failed.
-        ok: What the package says of its success.
-        seconds: Of the skin's fit from its records, warm.
-        driver_seconds: Of the driver's fit.
-        first_seconds: Of the first fit of a skin, with what it compiles.
-        versions: By package.
-        errors: Message of each draw, mostly empty.
-        missing: One line that says why there is nothing; empty if there is.
-    """
-
+    # R_s [ohm], R_p [ohm], C_p [F]; NaN where a draw failed
     elements: np.ndarray = dataclasses.field(default_factory=lambda: np.empty((0, 3)))
+    # what the package says of its success
     ok: np.ndarray = dataclasses.field(default_factory=lambda: np.empty(0, bool))
+    # of the skin's fit from its records, warm
     seconds: np.ndarray = dataclasses.field(default_factory=lambda: np.empty(0))
+    # of the driver's fit
     driver_seconds: np.ndarray = dataclasses.field(default_factory=lambda: np.empty(0))
-    first_seconds: float = np.nan
-    versions: Mapping[str, str] = dataclasses.field(default_factory=dict)
-    errors: tuple[str, ...] = ()
-    missing: str = ""
+    first_seconds: float = np.nan  # of the first fit of a skin, with what it compiles
+    versions: Mapping[str, str] = dataclasses.field(default_factory=dict)  # by package
+    errors: Sequence[str] = ()  # message of each draw, mostly empty
+    missing: str = ""  # one line that says why there is nothing; empty if there is
 
 
 def python_of(environment: str) -> pathlib.Path:
@@ -81,15 +75,9 @@ def _requirements(environment: str) -> tuple[pathlib.Path, pathlib.Path]:
 
 
 def install(names: Iterable[str]) -> dict[str, str]:
-    """Make the environments of some rivals.
+    """Make the environments of some rivals of `RIVALS`; by environment why one could not be made.
 
     An environment whose requirements have not changed since is left as it is.
-
-    Args:
-        names: Modules of `RIVALS`.
-
-    Returns:
-        By environment why it could not be made; empty where it could.
     """
     made = {name: make(name) for name in dict.fromkeys(RIVALS[one].environment for one in names)}
     return {environment: why for environment, why in made.items() if why}
@@ -107,6 +95,59 @@ def make(environment: str) -> str:
         return f"failed to install: {_last_error(done.stderr)}"
     shutil.copy(wanted, made)
     return ""
+
+
+def exchange(
+    environment: str,
+    module: str,
+    python: pathlib.Path | None = None,
+    timeout: float | None = None,
+    **problem: Any,
+) -> dict[str, np.ndarray]:
+    """What a module that calls `serve` makes of a problem, in a process of its own.
+
+    Args:
+        environment: In which it runs.
+        module: Its full name.
+        python: The interpreter; that of the environment if not given.
+        timeout: Longest time [s].
+        problem: Arrays.
+
+    Raises:
+        RivalError: It failed, or took too long.
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        given, found = pathlib.Path(folder, "problem.npz"), pathlib.Path(folder, "result.npz")
+        np.savez(given, **problem)
+        process = subprocess.Popen(
+            [python or python_of(environment), "-m", module, given, found],
+            cwd=ROOT,
+            env={**os.environ, **SETTINGS},
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.PIPE,
+            text=True,
+            start_new_session=True,
+        )
+        try:
+            _, complaint = process.communicate(timeout=timeout)
+        except subprocess.TimeoutExpired:
+            raise RivalError(f"not done after {timeout:g} s") from None
+        finally:
+            if process.poll() is None:
+                os.killpg(process.pid, signal.SIGKILL)  # with the Octave that it may have started
+                process.communicate()
+        if process.returncode != 0:
+            raise RivalError(f"failed: {_last_error(complaint)}")
+        with np.load(found) as file:
+            return dict(file)
+
+
+def serve(solve: Callable[[dict[str, np.ndarray]], Mapping[Any, Any]]) -> None:
+    """The other end of `exchange`: solve the problem of this process."""
+    given, found = sys.argv[1:]
+    with np.load(given) as file:
+        problem = dict(file)
+    np.savez(found, **solve(problem))
 
 
 def run(
@@ -133,37 +174,13 @@ def run(
     for program, packages in rival.program.items():
         if shutil.which(program) is None:
             return Outcome(missing=f"{program} not found: apt-get install {packages}")
-    with tempfile.TemporaryDirectory() as folder:
-        given, found = pathlib.Path(folder, "problem.npz"), pathlib.Path(folder, "result.npz")
-        np.savez(given, **problem)
-        worker = [python or python_of(rival.environment), "-m", "benchmarks.rivals.worker"]
-        process = subprocess.Popen(
-            [*worker, name, given, found, str(repeats), str(budget)],
-            cwd=ROOT,
-            env={**os.environ, **ONE_THREAD},
-            stdout=subprocess.DEVNULL,
-            stderr=subprocess.PIPE,
-            text=True,
-            start_new_session=True,
-        )
-        try:
-            _, complaint = process.communicate(timeout=timeout)
-        except subprocess.TimeoutExpired:
-            return Outcome(missing=f"not done after {timeout:g} s")
-        finally:
-            if process.poll() is None:
-                os.killpg(process.pid, signal.SIGKILL)  # with the Octave that it may have started
-                process.communicate()
-        if process.returncode != 0:
-            return Outcome(missing=f"failed: {_last_error(complaint)}")
-        with np.load(found) as file:
-            result = {key: file[key] for key in file.files}
-    return Outcome(
-        **{key: result[key] for key in ("elements", "ok", "seconds", "driver_seconds")},
-        first_seconds=float(result["first_seconds"]),
-        versions=json.loads(str(result["versions"])),
-        errors=tuple(json.loads(str(result["errors"]))),
-    )
+    asked = {"name": name, "repeats": repeats, "budget": budget, **problem}
+    try:
+        found = exchange(rival.environment, "benchmarks.rivals.worker", python, timeout, **asked)
+    except RivalError as error:
+        return Outcome(missing=str(error))
+    said = {key: json.loads(str(found.pop(key))) for key in ("versions", "errors")}
+    return Outcome(**found, **said)  # pyright: ignore[reportArgumentType]  # `worker` names them
 
 
 def _last_error(text: str) -> str:
@@ -191,22 +208,3 @@ def problem(pairs: Sequence[tuple[Any, Any]], start: Any) -> dict[str, Any]:
         "fs": trials[0].sample_rate,
         "f0": trials[0].pulse_rate,
     }
-
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Which rivals, and how long they may take."""
-    parser.add_argument("rivals", nargs="*", metavar="RIVAL", help=f"of {', '.join(RIVALS)}")
-    parser.add_argument("--draws", type=int, default=3)
-    parser.add_argument("--repeats", type=int, default=5, help="fits of each draw")
-    parser.add_argument("--timeout", type=float, default=600.0, help="for each rival [s]")
-
-
-def main(arguments: argparse.Namespace) -> bool:
-    """Install, run each rival where it should work, print; whether none is missing or wrong."""
-    from benchmarks.rivals import table  # imports etid
-
-    names = arguments.rivals or list(RIVALS)
-    unknown = sorted({*names} - {*RIVALS})
-    if unknown:
-        sys.exit(f"no rivals {', '.join(unknown)}; there are {', '.join(RIVALS)}")
-    return table.show(names, install(names), arguments)

@@ -7,7 +7,6 @@ MHz, kΩ and nF; the fits start at the typical values of etid. With the package'
 1e-13, and 1e5 steps, the criteria are the same and a spectrum takes two to three times as long.
 """
 
-import sys
 import time
 import warnings
 
@@ -15,6 +14,8 @@ import numpy as np
 from impedance.models.circuits import (  # pyright: ignore[reportMissingImports]  # see lmfit_leastsq
     CustomCircuit,
 )
+
+from benchmarks.rivals import serve
 
 MEGA, KILO = 1e6, 1e3
 R_S, R_P, C_P, ALPHA = 20.0, 100.0, 0.3, 0.8  # [kohm, kohm, nF, 1]
@@ -43,21 +44,19 @@ def criterion(name, f, z, sigma):
     return 2 * np.sum(residual**2) + len(start) * np.log(2 * z.size)
 
 
-def main(problem_path, result_path):
-    """Fit all circuits to all spectra and write what was found."""
-    with np.load(problem_path) as file:
-        f, z, sigma = file["f"] / MEGA, file["z"] / KILO, file["sigma"] / KILO
-        used = file["used"]
+def solved(problem):
+    """Fit all circuits to all spectra."""
+    f, z, sigma = problem["f"] / MEGA, problem["z"] / KILO, problem["sigma"] / KILO
     found, seconds = np.full((len(z), len(CIRCUITS)), np.inf), np.zeros(len(z))
     criterion("Resistor", f, z[0], sigma[0])  # what a first call costs is not counted
-    for row, (one, spread, of) in enumerate(zip(z, sigma, used, strict=True)):
+    for row, (one, spread, of) in enumerate(zip(z, sigma, problem["used"], strict=True)):
         begin = time.perf_counter()
         for column, name in enumerate(CIRCUITS):
             found[row, column] = criterion(name, f[of], one[of], spread[of])
         seconds[row] = time.perf_counter() - begin
-    np.savez(result_path, bic=found, seconds=seconds)
+    return {"bic": found, "seconds": seconds}
 
 
 if __name__ == "__main__":
     warnings.simplefilter("ignore")  # of trial steps; what comes of them is judged
-    main(*sys.argv[1:])
+    serve(solved)

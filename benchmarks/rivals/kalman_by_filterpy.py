@@ -10,13 +10,14 @@ the bands, the standard deviation of the random walk, and logarithms of the elem
 RESULT gets the processor time of each pulse and the last logarithms.
 """
 
-import sys
 import time
 
 import numpy as np
 from filterpy.kalman import (  # pyright: ignore[reportMissingImports]  # see lmfit_leastsq
     ExtendedKalmanFilter,
 )
+
+from benchmarks.rivals import serve
 
 DELAY = 0.1  # [samples] standard deviation of a pulse's delay besides its sampling phase
 
@@ -73,18 +74,15 @@ def parts(values):
     return np.concatenate([np.real(values), np.imag(values)])
 
 
-def main():
-    """Track the pulses of a file."""
-    problem, result = sys.argv[1:]
-    with np.load(problem) as file:
-        given = {name: file[name] for name in file.files}
-    display, seconds = Display(given), []
-    for pulse in zip(given["gains"], given["variances"], given["delays"], strict=True):
+def solved(problem):
+    """Track the pulses of a problem."""
+    display, seconds = Display(problem), []
+    for pulse in zip(problem["gains"], problem["variances"], problem["delays"], strict=True):
         begin = time.process_time()
         display.update(*pulse)
         seconds.append(time.process_time() - begin)
-    np.savez(result, seconds=seconds, logs=[one.x[:3] for one in display.filters])
+    return {"seconds": seconds, "logs": [one.x[:3] for one in display.filters]}
 
 
 if __name__ == "__main__":
-    main()
+    serve(solved)

@@ -1,12 +1,12 @@
-"""numpyro's NUTS draws from the posterior of etid: `python -m ... RESULT SNR_DB FITS`.
+"""numpyro's NUTS draws from the posterior of etid: `python -m ... PROBLEM RESULT`.
 
 NUTS gets F of `etid.identify.posterior` as its potential function, so there is no second copy of
-the likelihood. Both samples of the elements are stretched in the same way. RESULT gets, for each
+the likelihood. Both samples of the elements are stretched in the same way. PROBLEM holds `snr_db`
+and the number of `fits`. RESULT gets, for each
 fit and element, the difference of the means in standard deviations, the ratio of the standard
 deviations, and the effective draws of NUTS; and the seconds of each.
 """
 
-import sys
 import time
 
 import jax
@@ -18,6 +18,7 @@ from numpyro.diagnostics import (  # pyright: ignore[reportMissingImports]  # se
 from numpyro.infer import MCMC, NUTS  # pyright: ignore[reportMissingImports]  # see lmfit_leastsq
 
 import etid
+from benchmarks.rivals import serve
 from etid.identify import posterior
 
 DRAWS = 4000
@@ -67,13 +68,13 @@ def compared(snr_db, seed):
     ]
 
 
-def main(path, snr_db, fits):
-    """Compare some fits and write what was found."""
+def solved(problem):
+    """Compare some fits."""
     jax.config.update("jax_enable_x64", True)
-    rows = [row for seed in range(fits) if (row := compared(snr_db, seed)) is not None]
-    shift, ratio, worth, seconds = (np.stack(of) for of in zip(*rows, strict=True))
-    np.savez(path, shift=shift, ratio=ratio, worth=worth, seconds=seconds)
+    rows = [compared(float(problem["snr_db"]), seed) for seed in range(int(problem["fits"]))]
+    columns = zip(*(row for row in rows if row is not None), strict=True)
+    return dict(zip(("shift", "ratio", "worth", "seconds"), map(np.stack, columns), strict=True))
 
 
 if __name__ == "__main__":
-    main(sys.argv[1], float(sys.argv[2]), int(sys.argv[3]))
+    serve(solved)

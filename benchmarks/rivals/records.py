@@ -19,19 +19,12 @@ RATE = 1e6
 
 
 class Harmonics(NamedTuple):
-    """Coefficients at the multiples of the pulse rate.
+    """Coefficients at the multiples of the pulse rate."""
 
-    Attributes:
-        f: Frequencies [Hz].
-        x: Coefficients of V_th [V].
-        y: Coefficients of V_out [V].
-        sigma: Standard deviation √E|noise|² of a coefficient [V], taken to be that of both.
-    """
-
-    f: np.ndarray
-    x: np.ndarray
-    y: np.ndarray
-    sigma: float
+    f: np.ndarray  # frequencies [Hz]
+    x: np.ndarray  # coefficients of V_th [V]
+    y: np.ndarray  # coefficients of V_out [V]
+    sigma: float  # standard deviation √E|noise|² of a coefficient [V], taken to be that of both
 
     @property
     def visible(self) -> np.ndarray:
@@ -96,19 +89,12 @@ def load_impedance(of: Harmonics, z_th: np.ndarray) -> tuple[np.ndarray, np.ndar
 
 
 class Period(NamedTuple):
-    """One averaged period of what the skin sees, for packages that take an input and an output.
+    """One averaged period of what the skin sees, for packages that take an input and an output."""
 
-    Attributes:
-        current: Over its largest value.
-        voltage: Over its largest value.
-        unit: Ratio of these two values, the impedance that is 1 then [ohm].
-        fs: Samples per second [Hz].
-    """
-
-    current: np.ndarray
-    voltage: np.ndarray
-    unit: float
-    fs: float
+    current: np.ndarray  # over its largest value
+    voltage: np.ndarray  # over its largest value
+    unit: float  # ratio of these two values, the impedance that is 1 then [ohm]
+    fs: float  # samples per second [Hz]
 
 
 def current_and_voltage(of: Harmonics, z_th: np.ndarray, delay: float = 0.0) -> Period:

@@ -14,7 +14,6 @@ RESULT gets for each method the voltage [V], the processor times of it alone and
 derivatives with respect to the logarithms, and the wall time of both first calls [s].
 """
 
-import sys
 import time
 
 import diffrax  # pyright: ignore[reportMissingImports]  # see lmfit_leastsq
@@ -22,6 +21,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from scipy.interpolate import CubicSpline
+
+from benchmarks.rivals import serve
 
 REPEATS = 7
 LONGEST = 1 / 80  # step, of a period: a longer one would step over a pulse
@@ -111,21 +112,18 @@ def timed(function, logs):
     return value, first, float(np.median(runs))
 
 
-def main():
-    """Solve the problem of a file with all methods and tolerances."""
-    problem, result = sys.argv[1:]
+def solved(given):
+    """Solve a problem with all methods and tolerances."""
     jax.config.update("jax_enable_x64", True)
-    with np.load(problem) as file:
-        given = {name: file[name] for name in file.files}
     logs, rows = jnp.asarray(given["logs"]), []
     for method, tolerance in zip(given["methods"], given["tolerances"], strict=True):
         alone = response(given, str(method), float(tolerance))
         value, first, seconds = timed(jax.jit(alone), logs)
         _, also, slopes = timed(jax.jit(jax.jacfwd(alone)), logs)
         rows.append((value, seconds, slopes, first + also))
-    voltage, seconds, slopes, first = map(np.asarray, zip(*rows, strict=True))
-    np.savez(result, voltage=voltage, seconds=seconds, slopes=slopes, first=first)
+    return dict(zip(("voltage", "seconds", "slopes", "first"), zip(*rows, strict=True),
+                    strict=True))  # fmt: skip
 
 
 if __name__ == "__main__":
-    main()
+    serve(solved)

@@ -1,11 +1,11 @@
-"""Runs one rival: `python -m benchmarks.rivals.worker NAME PROBLEM RESULT REPEATS BUDGET`.
+"""Runs one rival: `python -m benchmarks.rivals.worker PROBLEM RESULT`.
 
-NAME is a module beside this one, run by the Python of its own environment. It has `driver` and
-`skin` for one record, or `batch` for all of a problem at once. PROBLEM holds `v_th`, `v_out`,
-`ref_th`, `ref_out` (draw, sample) [V], `r_ref` (draw,) [ohm], `start` (3,) in SI, `fs`, `f0` [Hz].
-RESULT gets `elements` (draw, 3) in SI, `ok`, `seconds` and `driver_seconds` (draw,),
-`first_seconds`, and as JSON `versions` by package and `errors`, one message per draw. After BUDGET
-seconds no further draw is begun, but for the second; a first fit that took as long is the only one.
+PROBLEM holds `name`, a module beside this one, run by the Python of its own environment. It has
+`driver` and `skin` for one record, or `batch` for all of a problem at once. Besides: `v_th`,
+`v_out`, `ref_th`, `ref_out` (draw, sample) [V], `r_ref` (draw,) [ohm], `start` (3,) in SI, `fs`,
+`f0` [Hz], `repeats`, and `budget` [s], after which no further draw is begun, but for the second; a
+first fit that took as long is the only one. RESULT gets the fields of `rivals.Outcome`, `versions`
+and `errors` as JSON.
 """
 
 import importlib
@@ -17,6 +17,8 @@ import time
 import warnings
 
 import numpy as np
+
+from benchmarks.rivals import serve
 
 FEWEST = 2  # draws
 
@@ -64,13 +66,12 @@ def _timed(call, arguments):
     return time.perf_counter() - begin, found
 
 
-def main(name, problem_path, result_path, repeats, budget):
-    """Run a rival on one core and write what it found."""
+def solved(problem):
+    """Run a rival on one core."""
     if hasattr(os, "sched_setaffinity"):
         os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
-    rival = importlib.import_module(f"benchmarks.rivals.{name}")
-    with np.load(problem_path) as file:
-        problem = dict(file)
+    repeats, budget = int(problem.pop("repeats")), float(problem.pop("budget"))
+    rival = importlib.import_module(f"benchmarks.rivals.{problem.pop('name')}")
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of trial steps; what comes of them is judged
         batch = getattr(rival, "batch", None)  # of which the time is short
@@ -78,9 +79,8 @@ def main(name, problem_path, result_path, repeats, budget):
     owners = importlib.metadata.packages_distributions()
     imported = sorted({owner for module in {*sys.modules} & {*owners} for owner in owners[module]})
     versions = {package: importlib.metadata.version(package) for package in imported}
-    np.savez(result_path, **{"versions": json.dumps(versions), **found})
+    return {"versions": json.dumps(versions), **found}
 
 
 if __name__ == "__main__":
-    _, rival_name, problem_file, result_file, count, limit = sys.argv
-    main(rival_name, problem_file, result_file, int(count), float(limit))
+    serve(solved)
