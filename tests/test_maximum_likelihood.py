@@ -16,7 +16,6 @@ from etid.circuits.elements import resistor
 from etid.estimators import registry
 from etid.estimators.lanes import Harmonics
 from etid.estimators.maximum_likelihood import load, load_fit
-from etid.estimators.maximum_likelihood import terms as likelihood
 from etid.estimators.maximum_likelihood.load import Load
 from etid.estimators.maximum_likelihood.profile import Records
 from etid.estimators.registry import MAXIMUM_LIKELIHOOD
@@ -143,7 +142,7 @@ def test_the_likeliest_start_is_taken_unless_it_is_bad(monkeypatch, starts, best
 
 def test_the_gain_is_that_of_the_divider(driver):
     frequency = jnp.array([60.0, 5e3, 60e3])
-    g = likelihood.gain(driver.source, resistor(jnp.asarray(98.8e3)), frequency)
+    g = driver.source.voltage_ratio(resistor(jnp.asarray(98.8e3)), frequency)
     expected = 98.8e3 / (98.8e3 + np.asarray(driver.response(frequency)))
     np.testing.assert_allclose(g, expected, rtol=1e-12)
 

@@ -31,6 +31,7 @@ ALIASED = 0.35  # of the sample rate; above, aliases matter unless they fall bet
 DRIFT_DEGREE = 3  # degree of the polynomial that describes the drift of the mean
 ROOM = 64  # harmonic counts are padded to a multiple of this, so that compiled programs are shared
 ABSENT = 1e-6  # [standard deviations] coefficient and noise of a padded harmonic
+ROUNDING = 1e-12  # relative difference of two transforms of the same samples
 
 
 class Spectrum(eqx.Module):
@@ -51,6 +52,20 @@ class Spectrum(eqx.Module):
     variance_x: Float[Array, "*lane harmonic"]
     variance_y: Float[Array, "*lane harmonic"]
     selected: Bool[Array, "*lane harmonic"]
+
+
+def same_unloaded(one: Spectrum, other: Spectrum) -> Bool[Array, ""] | bool:
+    """Whether two recordings have the same unloaded record."""
+    if one is other:
+        return True
+    if one.x.shape != other.x.shape:
+        return False
+    return jnp.sum(power(one.x - other.x)) <= ROUNDING**2 * jnp.sum(power(other.x))
+
+
+def as_list(spectra: Spectrum) -> list[Spectrum]:
+    """A list of recordings, from recordings stacked along a leading axis."""
+    return [jax.tree.map(lambda leaf, i=i: leaf[i], spectra) for i in range(spectra.x.shape[0])]
 
 
 def whole_periods(samples: int, sample_rate: float, pulse_rate: float) -> tuple[int, int]:

@@ -2,8 +2,8 @@
 
     cov = H⁻¹ (Jᵀ C J) H⁻¹
 
-is that of `etid.estimators.maximum_likelihood.terms`. For `common` the own parameters of the loads
-are eliminated. A load inherits K cov Kᵀ with its slope K = −A⁻¹ B.
+is that of `etid.estimators.sandwich`. For `common` the own parameters of the loads are eliminated.
+A load inherits K cov Kᵀ with its slope K = −A⁻¹ B.
 
 **One unloaded record in several loads** has the same noise of X in all of them. The fit takes the
 loads as independent, but the standard errors do not. The effect of unit noise in X on the terms of

@@ -1,10 +1,12 @@
 """Maximum likelihood on the harmonics of the pulse rate: the driver, from its calibrations.
 
-`etid.estimators.maximum_likelihood.terms` gives the terms.
+The likelihood is that of `etid.estimators.maximum_likelihood.profile`. Calibrations that share an
+unloaded record are outputs of one input, so that all of them tell of the same X; the others have
+inputs of their own. As in a fit of a load, the objective and its gradient are those of all
+harmonics, and curvature, covariance and score tests are condensed.
 """
 
 import dataclasses
-from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -24,25 +26,14 @@ from etid.estimators.estimate import (
     delay_std,
     prior,
 )
-from etid.estimators.maximum_likelihood.terms import (
-    apart,
-    as_list,
-    by_gains,
-    chained,
-    delayed_gain,
-    denoised,
-    excess,
-    residuals,
-    shows_hum,
-    variance,
-    weights,
-)
+from etid.estimators.maximum_likelihood.condensed import Condensed, apart, means
+from etid.estimators.maximum_likelihood.profile import Profile, Records, excess
 from etid.estimators.sandwich import Linear
 from etid.estimators.unknowns import DriverUnknowns
 from etid.results.driver import Calibration, HarmonicDriver, SourceImpedance
-from etid.results.fit import complex_rrse
-from etid.signals.harmonics import Spectrum
-from etid.signals.transfer import as_complex, frequency_variable, reciprocal
+from etid.signals.harmonics import Spectrum, as_list, same_unloaded, signal_share
+from etid.signals.knots import Knots, knots
+from etid.signals.transfer import as_complex, delayed, frequency_variable, reciprocal
 from etid.solvers.levenberg_marquardt import (
     DIFFERENCE,
     LevenbergMarquardt,
@@ -53,25 +44,28 @@ from etid.solvers.matrices import inverse
 
 def equations(_: Any, q: Float[Array, " common"], model: "Calibrations") -> NormalEquations:
     """Normal equations of the calibrations."""
-    terms, jacobian = model.terms_and_slopes(q, model.records)
-    return NormalEquations(
-        0.5 * jnp.dot(terms, terms), jacobian @ terms, jacobian @ jacobian.T
-    ).finite()
+    return model.equations(q)
 
 
 def second_order(
     _: Any, q: Float[Array, " common"], step: Float[Array, " common"], model: "Calibrations"
 ) -> Float[Array, " common"]:
     """Jᵀ r″ of the calibrations; r″ as in `levenberg_marquardt.second_order`."""
-    ends = [model.terms(q + h * step, model.records) for h in (DIFFERENCE, -DIFFERENCE)]
-    terms, jacobian = model.terms_and_slopes(q, model.records)
-    return jacobian @ (ends[0] + ends[1] - 2 * terms) / DIFFERENCE**2
+    condensed, small = model.likelihood(q).condensed, model.at_knots()
+    ends = [small.gains(q + h * step) for h in (DIFFERENCE, -DIFFERENCE)]
+    [bent] = condensed.rows((ends[0] + ends[1] - 2 * condensed.gains)[None])
+    priors = [model.weak(q + h * step)[0] for h in (DIFFERENCE, -DIFFERENCE)]
+    weak, by_common = model.weak(q)
+    found = condensed.rows(small.gain_slopes(q)) @ bent
+    return (found + by_common @ (priors[0] + priors[1] - 2 * weak)) / DIFFERENCE**2
 
 
+DENSE = 32  # density of the knots: the floor of the driver's valley is flat
 # A first fit with bands, whose steps take a fifth of the time, and a fit with all harmonics from
-# its minimum. Z_th and a delay form a curved valley. Near its floor, steps with the usual damping
+# its minimum. From a distant start, the derivatives of the terms themselves find deeper minima than
+# those with X̂. Z_th and a delay form a curved valley. Near its floor, steps with the usual damping
 # are so short that they seem to make no progress.
-ROUGHLY = LevenbergMarquardt(rtol=1e-3, ftol=1e-6, equations=equations)
+ROUGHLY = LevenbergMarquardt(rtol=1e-3, ftol=1e-6)
 WELL = LevenbergMarquardt(rtol=SOLVER.rtol, ftol=3e-7, damping=1e-6, equations=equations)
 
 
@@ -80,7 +74,7 @@ def refined(
 ) -> optx.Solution:
     """The minimum of the likelihood."""
     return optx.least_squares(
-        lambda q, model: model.terms(q, model.records),
+        lambda q, model: model.residual(q),
         solver,
         start,
         model,
@@ -131,8 +125,8 @@ def rough_source(
     # A spurious resonance fits noise, so that it lowers Σ r²; but it raises the variances.
     every = dataclasses.replace(model, spectra=spectra)
     logs = [
-        jnp.sum(jnp.where(one.selected, jnp.log(variance(one, g)), 0.0))
-        for one, g in zip(every.records, every.gains(q), strict=True)
+        jnp.sum(jnp.where(one.selected, jnp.log(Profile.of_output(one, g).expected[0]), 0.0))
+        for one, g in zip(as_list(spectra), every.gains(q), strict=True)
     ]
     terms = jnp.sum(spectra.selected, dtype=q.dtype)
     return Rough(
@@ -206,8 +200,11 @@ def fit_source(
     linear = model.linear(q)
     cov = linear.covariance()[:kept, :kept]
     freedom = 2 * jnp.sum(spectra.selected, dtype=q.dtype) - q.size
-    seen = list(zip(model.records, model.gains(q), strict=True))
-    errors = jnp.stack([complex_rrse(g * s.x, s.y, s.selected) for s, g in seen])
+    seen = [
+        (Records.of(s), Profile.of_output(s, g))
+        for s, g in zip(as_list(spectra), model.gains(q), strict=True)
+    ]
+    errors = jnp.stack([profile.rrse(records, records.x) for records, profile in seen])
     estimate = Estimate(
         parameters=found.source,
         delay_samples=found.delay_samples,
@@ -219,10 +216,30 @@ def fit_source(
             tried.settled, optx.RESULTS.successful, optx.RESULTS.nonlinear_max_steps_reached
         ),
         steps=tried.steps,
-        hum=jnp.stack([shows_hum(s, g) for s, g in seen]).any(),
+        hum=jnp.stack([profile.shows_hum(records) for records, profile in seen]).any(),
     )
     calibration = dataclasses.replace(calibration, delay_samples=found.delay_samples)
     return model.z_th(q), estimate, calibration, linear
+
+
+class Likelihood(eqx.Module):
+    """The likelihood of calibrations at some gains.
+
+    Attributes:
+        objective: ½ D.
+        terms: Innovations, scaled to unit variance; Σ of their squares is D.
+        score: ρ of each gain.
+        condensed: The likelihood near the gains.
+        size: Information of each innovation about its gain.
+        share: Share of signal in the power of X̂, for each calibration.
+    """
+
+    objective: Float[Array, ""]
+    terms: Float[Array, "record part"]
+    score: Complex[Array, "record harmonic"]
+    condensed: Condensed
+    size: Float[Array, "record harmonic"]
+    share: Float[Array, "record harmonic"]
 
 
 class Calibrations(eqx.Module):
@@ -251,9 +268,29 @@ class Calibrations(eqx.Module):
         return cls(driver.source, driver.calibration, driver.spectra, rate)
 
     @property
-    def records(self) -> list[Spectrum]:
-        """The harmonics of each calibration."""
-        return as_list(self.spectra)
+    def knots(self) -> Knots:
+        """Knots of the harmonics."""
+        return knots(self.spectra.x.shape[-1], DENSE)
+
+    def at_knots(self) -> "Calibrations":
+        """The same with the harmonics at the knots alone, for gains and their derivatives."""
+        spectra = jax.tree.map(lambda leaf: leaf[..., self.knots.index], self.spectra)
+        return dataclasses.replace(self, spectra=spectra)
+
+    @property
+    def records(self) -> Records:
+        """The unloaded records as inputs, stacked, each with the outputs of all calibrations.
+
+        An output is used with the first input that is its own unloaded record.
+        """
+        s, each = self.spectra, as_list(self.spectra)
+        same = jnp.stack(
+            [jnp.stack([jnp.asarray(same_unloaded(a, b)) for b in each]) for a in each]
+        )
+        used = jnp.argmax(same, axis=0)[None, :] == jnp.arange(len(each))[:, None]
+        y, variance_y = (jnp.tile(of, (len(each), 1, 1)) for of in (s.y, s.variance_y))
+        selected = used[:, :, None] & s.selected[None]
+        return Records(s.frequency, s.x, s.variance_x, y, variance_y, selected)
 
     def start(self) -> Float[Array, " common"]:
         """The common parameters identified from the calibrations alone."""
@@ -268,7 +305,7 @@ class Calibrations(eqx.Module):
         """Z_th with these common parameters."""
         return ravel_pytree(self.source)[1](self.named(common).source)
 
-    def gains(self, common: Float[Array, " common"]) -> list[Complex[Array, " harmonic"]]:
+    def gains(self, common: Float[Array, " common"]) -> Complex[Array, "record harmonic"]:
         """Gains with the known resistors."""
         source = self.z_th(common)
 
@@ -277,19 +314,54 @@ class Calibrations(eqx.Module):
             r_load: Float[Array, ""],
             delay_samples: Float[Array, ""],
         ) -> Complex[Array, " harmonic"]:
-            return delayed_gain(source, resistor(r_load), frequency, delay_samples, self.rate)
+            ratio = source.voltage_ratio(resistor(r_load), frequency)
+            return delayed(ratio, frequency, delay_samples, self.rate)
 
         late = self.named(common).delay_samples
-        return list(jax.vmap(one)(self.spectra.frequency, self.calibration.r_load, late))
+        return jax.vmap(one)(self.spectra.frequency, self.calibration.r_load, late)
 
-    def terms(
-        self, common: Float[Array, " common"], records: Sequence[Spectrum]
-    ) -> Float[Array, " term"]:
+    def likelihood(
+        self,
+        common: Float[Array, " common"],
+        change: Complex[Array, "record harmonic"] | None = None,
+    ) -> Likelihood:
+        """The likelihood of all calibrations, with a change of their gains if there is one."""
+        records = self.records
+
+        def of_gains(common: Float[Array, " common"]) -> tuple[Array, ...]:
+            gains = self.gains(common) if change is None else self.gains(common) + change
+
+            def one(of: Profile) -> tuple[Array, ...]:
+                share = signal_share(of.x, of.variance_x)
+                share = jnp.where(of.weight > 0, share[None, :], 0.0)
+                return of.objective, of.terms, of.score, of.information, of.size, share
+
+            sums = jax.vmap(lambda of: one(Profile.of(of, gains)))(records)
+            return *(of.sum(0) for of in sums), gains
+
+        objective, terms, score, information, size, share, gains = apart(of_gains, common)
+        condensed = apart(lambda _: Condensed.of(gains, information, score, self.knots), common)
+        return Likelihood(objective, terms, score, condensed, size, share)
+
+    def equations(self, common: Float[Array, " common"]) -> NormalEquations:
+        """Normal equations of the calibrations and of the weak priors."""
+        found = self.likelihood(common)
+        towards = -jnp.conj(found.score)
+        (gradient,) = apart(lambda c: jax.vjp(self.gains, c)[1](towards), common)
+        rows = found.condensed.rows(apart(self.at_knots().gain_slopes, common))
+        weak, by_common = self.weak(common)
+        rows = jnp.concatenate([rows, by_common], axis=1)
+        return NormalEquations(
+            found.objective + 0.5 * jnp.dot(weak, weak),
+            gradient + by_common @ weak,
+            rows @ rows.T,
+        ).finite()
+
+    def residual(self, common: Float[Array, " common"]) -> Float[Array, " term"]:
         """Terms of the calibrations and of the weak priors."""
-        parts = residuals(records, self.gains(common))
-        of = self.named(common)
-        weak = [self._prior()(of.source), of.delay_samples / self.delay_width]
-        return jnp.concatenate(parts + weak)
+        records, gains = self.records, self.gains(common)
+        each = jax.vmap(lambda of: Profile.of(of, gains).terms)(records)
+        return jnp.concatenate([each.sum(0).ravel(), self.weak(common)[0]])
 
     def weak(
         self, common: Float[Array, " common"]
@@ -304,66 +376,44 @@ class Calibrations(eqx.Module):
     def _prior(self) -> Prior:
         return prior(self.source, self.rate, self.calibration.r_load.mean())
 
-    def linear(self, common: Float[Array, " common"]) -> Linear:
-        """The terms, linear around their minimum."""
-        records, gains = self.records, self.gains(common)
-        clean, shares = denoised(records, gains)
-        _, jacobian = self.terms_and_slopes(common, clean)
-        parts = residuals(records, gains)
-        noise = [excess(r, s.selected) for r, s in zip(parts, records, strict=True)]
-        count = jacobian.shape[1]
-        return Linear(jacobian, weights(shares, count), weights(noise, count))
+    def noise(self, found: Likelihood) -> Float[Array, "record harmonic"]:
+        """`excess` of the terms of each calibration."""
+        each = jax.vmap(excess)(found.terms, self.spectra.selected)
+        return each[:, : self.spectra.x.shape[-1]]
 
-    def by_z(
-        self, common: Float[Array, " common"], gains: Sequence[Complex[Array, " harmonic"]]
-    ) -> list[Complex[Array, " harmonic"]]:
+    def linear(self, common: Float[Array, " common"]) -> Linear:
+        """The condensed terms, linear around their minimum."""
+        found = self.likelihood(common)
+        jacobian = found.condensed.rows(self.at_knots().gain_slopes(common))
+        values = jnp.stack([found.share, self.noise(found)])
+        share, noise = means(found.size, self.knots, values)
+        _, by_common = self.weak(common)
+        ones = jnp.ones(by_common.shape[1])
+        return Linear(
+            jnp.concatenate([jacobian, by_common], axis=1),
+            jnp.concatenate([share, ones]),
+            jnp.concatenate([noise, ones]),
+        )
+
+    def terms(self, common: Float[Array, " common"]) -> Float[Array, " term"]:
+        """The condensed terms and those of the weak priors, as `linear` has them."""
+        return jnp.concatenate([self.likelihood(common).condensed.part, self.weak(common)[0]])
+
+    def by_z(self, common: Float[Array, " common"]) -> Complex[Array, "record harmonic"]:
         """∂G/∂Z_th = −G/(R + Z_th)."""
-        source = self.z_th(common)
-        each = zip(gains, self.calibration.r_load, self.spectra.frequency, strict=True)
-        return [-g * reciprocal(as_complex(r) + source.response(f)) for g, r, f in each]
+        z_th = jax.vmap(self.z_th(common).response)(self.spectra.frequency)
+        total = as_complex(self.calibration.r_load)[:, None] + z_th
+        return -self.gains(common) * reciprocal(total)
 
     def gain_slopes(
-        self,
-        common: Float[Array, " common"],
-        gains: Sequence[Complex[Array, " harmonic"]],
-        by_z: Sequence[Complex[Array, " harmonic"]],
-    ) -> list[Complex[Array, "common harmonic"]]:
+        self, common: Float[Array, " common"]
+    ) -> Complex[Array, "common record harmonic"]:
         """Derivatives of the gains."""
-        source, alone = self.z_th(common), jnp.eye(len(gains))
-        found = []
-        for number, (g, of_z) in enumerate(zip(gains, by_z, strict=True)):
-            frequency = self.spectra.frequency[number]
-            of_delay = -g * frequency_variable(frequency / self.rate)
-            by_source = source.slopes(frequency) * of_z[None, :]
-            by_delay = as_complex(alone[number])[:, None] * of_delay[None, :]
-            found.append(jnp.concatenate([by_source, by_delay]))
-        return found
-
-    def terms_and_slopes(
-        self, common: Float[Array, " common"], records: Sequence[Spectrum]
-    ) -> tuple[Float[Array, " term"], Float[Array, "common term"]]:
-        """The terms and their derivatives."""
-
-        def of_gains(_: Float[Array, " common"]) -> tuple[Array, Array, list[Array]]:
-            parts = jnp.concatenate(residuals(records, gains))
-            return parts, by_gains(records, gains), self.by_z(common, gains)
-
-        gains = apart(self.gains, common)
-        terms, by_gain, by_z = apart(of_gains, common)
-        by_common = apart(lambda c: self.gain_slopes(c, gains, by_z), common)
-        rows = chained(by_common, by_gain)
-        weak, by_common = self.weak(common)
-        return jnp.concatenate([terms, weak]), jnp.concatenate([rows, by_common], axis=1)
-
-    def by_gains(
-        self, common: Float[Array, " common"], slopes: Sequence[Complex[Array, "row harmonic"]]
-    ) -> Float[Array, "row term"]:
-        """Derivatives of the denoised terms; `slopes` are those of the gain of each record."""
-        gains = self.gains(common)
-        clean, _ = denoised(self.records, gains)
-        rows = chained(slopes, by_gains(clean, gains))
-        priors = self.terms(common, self.records).size - rows.shape[1]
-        return jnp.pad(rows, ((0, 0), (0, priors)))
+        frequency = self.spectra.frequency
+        by_source = jnp.moveaxis(jax.vmap(self.z_th(common).slopes)(frequency), 0, 1)
+        by_delay = -self.gains(common) * frequency_variable(frequency / self.rate)
+        alone = as_complex(jnp.eye(frequency.shape[0]))[:, :, None]
+        return jnp.concatenate([by_source * self.by_z(common)[None], alone * by_delay[None]])
 
     def strain(self, common: Float[Array, " common"]) -> Float[Array, ""]:
         """Increase of the Σ r² of the calibrations over its value at their own minimum.
@@ -372,5 +422,7 @@ class Calibrations(eqx.Module):
         agree, the increase is about the number of common parameters.
         """
         start = self.start()
-        alone, now = (self.terms(c, self.records) for c in (start, common))
-        return jnp.sum((now**2 - alone**2) / self.linear(start).noise)
+        noise = jnp.tile(self.noise(self.likelihood(start)), (1, 2)).ravel()
+        alone, now = (self.residual(c) for c in (start, common))
+        ones = jnp.ones(now.size - noise.size)
+        return jnp.sum((now**2 - alone**2) / jnp.concatenate([noise, ones]))

@@ -13,9 +13,9 @@ from etid.circuits.circuit import AbstractCircuit
 from etid.circuits.impedance import AbstractImpedance
 from etid.estimators.element_prior import ElementPrior
 from etid.estimators.estimate import DELAY_WIDTH
-from etid.estimators.maximum_likelihood.given_driver import AbstractGiven, combined
+from etid.estimators.maximum_likelihood.given_driver import AbstractGiven
 from etid.signals.knots import Knots
-from etid.signals.transfer import as_complex, delayed, frequency_variable
+from etid.signals.transfer import as_complex, combined, delayed, frequency_variable
 
 
 class Slopes(eqx.Module):

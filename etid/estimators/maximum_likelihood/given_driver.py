@@ -32,17 +32,14 @@ from jaxtyping import Array, Complex, Float
 from etid.circuits.circuit import AbstractCircuit
 from etid.estimators.estimate import DELAY_WIDTH
 from etid.estimators.maximum_likelihood.driver import Calibrations
-from etid.estimators.maximum_likelihood.terms import (
-    as_list,
-    informed,
-)
+from etid.estimators.maximum_likelihood.profile import Profile, Records
 from etid.estimators.score_tests.unloaded import UnloadedShape, shape_of
 from etid.estimators.starts import current_starts, harmonic_starts
 from etid.estimators.unknowns import LoadUnknowns
 from etid.results.driver import HarmonicDriver
-from etid.signals.harmonics import Spectrum
+from etid.signals.harmonics import Spectrum, as_list, same_unloaded
 from etid.signals.knots import Knots
-from etid.signals.transfer import as_complex, reciprocal
+from etid.signals.transfer import as_complex, combined, reciprocal
 from etid.solvers.matrices import inverse_root
 
 
@@ -225,20 +222,26 @@ class GivenDriver(AbstractGiven):
         """A recording with X estimated by the calibrations at z = 0, and derivatives of X."""
         if self.records is None or self.gains is None or self.gain_slopes is None:
             return spectrum, None
-        records = as_list(self.records)
+        s, of = spectrum, self.records
+        if s.x.size != of.x.shape[-1]:  # a record of another length is another unloaded record
+            return spectrum, None
+        same = jnp.stack([jnp.asarray(same_unloaded(s, one)) for one in as_list(of)])
+        used = of.selected & same[:, None]
+        records = Records(s.frequency, s.x, s.variance_x, of.y, of.variance_y, used)
 
         def unloaded(
             gains: Complex[Array, "record harmonic"],
         ) -> tuple[Complex[Array, " harmonic"], Float[Array, " harmonic"]]:
-            known = informed(spectrum, records, list(gains))
-            return known.x, jnp.log(known.variance_x)
+            profile = Profile.of(records, gains)
+            return profile.x, jnp.log(profile.variance_x)
 
         def slope(
             direction: Complex[Array, "record harmonic"],
         ) -> tuple[Complex[Array, " harmonic"], Float[Array, " harmonic"]]:
             return jax.jvp(unloaded, (self.gains,), (direction,))[1]
 
-        found = informed(spectrum, records, list(self.gains))
+        profile = Profile.of(records, self.gains)
+        found = dataclasses.replace(s, x=profile.x, variance_x=profile.variance_x)
         return found, UnloadedSlopes(*jax.vmap(slope)(self.gain_slopes))
 
 
@@ -256,8 +259,8 @@ def given(
     c = calibrations.start()
     linear = calibrations.linear(c)
     root = inverse_root(linear.curvature().expected)
-    terms, slopes = calibrations.terms_and_slopes(c, calibrations.records)
-    mean, cov = -root.T @ (slopes @ terms), linear.along(root).curvature().score
+    gradient = calibrations.equations(c).gradient
+    mean, cov = -root.T @ gradient, linear.along(root).curvature().score
     if driver.drift is None:
         found = around(calibrations, c, root, frequency, shared, mean, cov)
     else:
@@ -291,8 +294,8 @@ def around(
     by_source = source.slopes(frequency) * reciprocal(loaded)[None, :]
     known = None
     if shared:
-        slopes = calibrations.gain_slopes(c, gains, calibrations.by_z(c, gains))
-        known = jnp.stack([combined(directions.T, of) for of in slopes], axis=1)
+        slopes = calibrations.gain_slopes(c)
+        known = combined(directions.T, slopes.reshape(c.size, -1)).reshape(-1, *gains.shape)
     return GivenDriver(
         frequency=frequency,
         loaded=loaded,
@@ -302,14 +305,7 @@ def around(
         mean=mean,
         cov=cov,
         records=calibrations.spectra if shared else None,
-        gains=jnp.stack(gains) if shared else None,
+        gains=gains if shared else None,
         gain_slopes=known,
         delay_width=calibrations.delay_width,
     )
-
-
-def combined(
-    z: Float[Array, "*row z"], slope: Complex[Array, "z harmonic"]
-) -> Complex[Array, "*row harmonic"]:
-    """Σ z ∂/∂z, in real arithmetic, because complex matrix products take ten times as long."""
-    return jax.lax.complex(z @ slope.real, z @ slope.imag)

@@ -16,15 +16,14 @@ from jaxtyping import Array, Bool, Complex, Float
 
 from etid.circuits.circuit import AbstractCircuit
 from etid.estimators.element_prior import ElementPrior
-from etid.estimators.maximum_likelihood.condensed import Condensed
+from etid.estimators.maximum_likelihood.condensed import Condensed, apart
 from etid.estimators.maximum_likelihood.gains import Gains, Slopes
-from etid.estimators.maximum_likelihood.given_driver import AbstractGiven, UnloadedSlopes, combined
+from etid.estimators.maximum_likelihood.given_driver import AbstractGiven, UnloadedSlopes
 from etid.estimators.maximum_likelihood.profile import Profile, Records
-from etid.estimators.maximum_likelihood.terms import apart
 from etid.estimators.score_tests import falling_resistance, other_circuit
 from etid.signals.harmonics import Spectrum
 from etid.signals.knots import Knots, knots
-from etid.signals.transfer import as_complex, reciprocal, turns
+from etid.signals.transfer import as_complex, combined, reciprocal, turns
 from etid.solvers.levenberg_marquardt import NormalEquations
 
 
@@ -106,8 +105,7 @@ class Load(eqx.Module):
     @property
     def terms(self) -> Float[Array, ""]:
         """Number of terms of the records."""
-        used = jnp.sum(self.records.selected, dtype=self.records.variance_x.dtype)
-        return 2 * self.records.y.shape[0] * used
+        return 2 * jnp.sum(self.records.selected, dtype=self.records.variance_x.dtype)
 
     def rest(self, q: Float[Array, " q"]) -> Float[Array, " q"]:
         """Terms of the priors."""
@@ -144,7 +142,8 @@ class Load(eqx.Module):
     def near(self, q: Float[Array, " q"], every: Knots | None = None) -> Near:
         """The load near `q`, at these knots or its own."""
         every, profile = every or self.knots, self.profile(q)
-        condensed = apart(lambda _: Condensed.of(profile, every), q)
+        sums = profile.gains, profile.information, profile.score
+        condensed = apart(lambda _: Condensed.of(*sums, every), q)
         slopes, by_x = apart(self.gains.at(every).slopes, q), None
         if self.unloaded is not None:
             relative = self.unloaded.x * reciprocal(profile.x)[None, :]

@@ -18,14 +18,14 @@ from etid.circuits.circuit import AbstractCircuit
 from etid.estimators.element_prior import ElementPrior
 from etid.estimators.estimate import MAX_STEPS, SOLVER, Estimate
 from etid.estimators.maximum_likelihood.condensed import means
-from etid.estimators.maximum_likelihood.given_driver import AbstractGiven, combined
+from etid.estimators.maximum_likelihood.given_driver import AbstractGiven
 from etid.estimators.maximum_likelihood.load import AtKnots, Load, Near, by_falling, changes
 from etid.estimators.sandwich import Linear
 from etid.estimators.score_tests import falling_resistance, other_circuit
 from etid.estimators.unknowns import LoadUnknowns
 from etid.results.fit import Support
 from etid.signals.harmonics import Spectrum, signal_share
-from etid.signals.transfer import as_complex, power
+from etid.signals.transfer import as_complex, combined, power
 from etid.solvers.levenberg_marquardt import LevenbergMarquardt, NormalEquations
 from etid.solvers.matrices import inverse_root
 
@@ -217,7 +217,7 @@ def fit_circuit(
     )
     share = signal_share(profile.x, records.variance_x)
     values = jnp.stack([jnp.broadcast_to(share, noise.shape), noise, private * noise])
-    mean_share, mean_noise, own_noise = means(profile, every, values)
+    mean_share, mean_noise, own_noise = means(profile.size, every, values)
     linear = Linear(jacobian, mean_share, mean_noise, jnp.diag(prior))
     information = linear.bread()
     elements = information[:count]

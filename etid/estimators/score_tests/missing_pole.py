@@ -20,8 +20,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Complex, Float
 
+from etid.estimators.maximum_likelihood.condensed import apart
 from etid.estimators.maximum_likelihood.driver import Calibrations
-from etid.estimators.maximum_likelihood.terms import apart, by_gains, denoised
 from etid.estimators.sandwich import Linear
 
 SEEN = 36.0  # χ² of two degrees of freedom; by chance one of about 100 sections has it once in 10⁶
@@ -31,13 +31,13 @@ BEYOND = 3.0  # factor by which the grid exceeds the band; poles beyond the band
 
 
 class Sections(eqx.Module):
-    """1 / (1 + 2ζx + x²) of all sections at the harmonics of the calibrations.
+    """1 / (1 + 2ζx + x²) of all sections at the knots of the calibrations.
 
     With D for it, ∂Z_th/∂g = D and ∂Z_th/∂h = D s/ω. The derivatives of the terms with respect to g
     and h are not computed, because they are large. Only their products are.
 
     Attributes:
-        frequency: The harmonics [Hz].
+        frequency: The knots [Hz].
         omega: ω of each section / 2π [Hz].
         real: Re D.
         imaginary: Im D.
@@ -113,8 +113,8 @@ def squares(calibrations: Calibrations, linear: Linear) -> Float[Array, " sectio
         linear: Their terms.
     """
     c, jacobian = calibrations.start(), linear.jacobian
-    sections, used = apart(lambda _: _sections(calibrations), c), 2 * calibrations.spectra.x.size
-    terms = calibrations.terms(c, calibrations.records)
+    sections, terms = apart(lambda _: _sections(calibrations), c), calibrations.terms(c)
+    used = sections.effect.size
     # With D = rows − fitted J, the scores are D r and their covariance is D C Dᵀ, where `rows` are
     # the derivatives of the terms.
     count, noisy = jacobian.shape[0], jacobian * linear.noise[None, :]
@@ -133,15 +133,13 @@ def squares(calibrations: Calibrations, linear: Linear) -> Float[Array, " sectio
 
 
 def _sections(calibrations: Calibrations) -> Sections:
-    """The sections, and their effect on the denoised terms."""
+    """The sections, and their effect on the condensed terms."""
     c, spectra = calibrations.start(), calibrations.spectra
-    gains = calibrations.gains(c)
-    clean, _ = denoised(calibrations.records, gains)
-    real, imaginary = jnp.moveaxis(by_gains(clean, gains), 1, 0)
+    condensed, small = calibrations.likelihood(c).condensed, calibrations.at_knots()
+    by_z = small.by_z(c)
+    rows = condensed.rows(jnp.stack([by_z, 1j * by_z]))
+    effect = jax.lax.complex(rows[0], -rows[1]).reshape(-1, by_z.shape[-1])
     # The harmonics of the records differ so little that the sections are equal.
-    frequency = spectra.frequency[0]
-    by_z = jnp.stack(calibrations.by_z(c, gains))[:, None, :]
-    shape = len(gains), -1, frequency.size
-    effect = jax.lax.complex(real, -imaginary).reshape(shape) * by_z
+    frequency = small.spectra.frequency[0]
     highest = jnp.max(jnp.where(spectra.selected, spectra.frequency, frequency[0]))
-    return Sections.of(frequency, (frequency[0], highest), effect.sum(0))
+    return Sections.of(frequency, (frequency[0], highest), effect)

@@ -13,12 +13,13 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Complex, Float
 
 from etid.circuits.circuit import AbstractCircuit
-from etid.estimators.maximum_likelihood.terms import apart, denoised, excess, residual, variance
+from etid.estimators.maximum_likelihood.condensed import apart
+from etid.estimators.maximum_likelihood.profile import Profile, excess
 from etid.estimators.sandwich import Linear
 from etid.estimators.score_tests import other_circuit
 from etid.estimators.unknowns import LoadUnknowns
 from etid.results.driver import ContinuousDriver
-from etid.signals.harmonics import Spectrum, real_parts
+from etid.signals.harmonics import Spectrum, real_parts, signal_share
 from etid.signals.transfer import as_complex, frequency_variable, reciprocal, turns
 from etid.solvers.matrices import root
 
@@ -73,15 +74,15 @@ def scores(
 
     def of_residual(_) -> tuple[Float[Array, "slope part"], Float[Array, " part"]]:
         # At the X estimated from both records: the noise of one record is in the residual too.
-        [clean], [share] = denoised([spectrum], [g])
-        weight = jnp.where(spectrum.selected, jnp.sqrt(2 / variance(spectrum, g)), 0.0)
-        rows = slopes * (-clean.x * as_complex(weight))[None, :]
-        return real_parts(rows), share
+        profile = Profile.of_output(spectrum, g)
+        rows = slopes * (-profile.x * as_complex(jnp.sqrt(profile.weight[0])))[None, :]
+        share = signal_share(profile.x, profile.variance_x)
+        return real_parts(rows), jnp.tile(share, 2)
 
     rows, share = apart(of_residual, own.vector())
     count = elements + 1 + vector.size
     prior = jnp.diag(jnp.pad(jnp.ones(vector.size), (elements + 1, 0)))
-    part = residual(spectrum, g)
+    part = Profile.of_output(spectrum, g).terms[0]
     linear = Linear(rows[:count], share, excess(part, spectrum.selected), prior)
     found = other_circuit.scores(
         rows[count:],

@@ -9,14 +9,15 @@ test estimates how far its value differs from the value that the others show, wi
 Z_th and all delays are free.
 """
 
+import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Complex, Float
+from jaxtyping import Array, Bool, Float
 
+from etid.estimators.maximum_likelihood.condensed import means
 from etid.estimators.maximum_likelihood.driver import Calibrations
-from etid.estimators.maximum_likelihood.terms import excess, weights
 from etid.estimators.sandwich import Linear
 from etid.recordings.preflight import Inspected
-from etid.signals.transfer import as_complex
+from etid.signals.transfer import as_complex, combined
 
 # Standard errors; by chance one calibration in two million exceeds this.
 SEEN = 5.0
@@ -38,35 +39,27 @@ def mismatch(calibrations: Calibrations, linear: Linear) -> Float[Array, "2 reco
         calibrations: Two or more calibrations at the minimum of their likelihood.
         linear: Their terms.
     """
-    c, records = calibrations.start(), calibrations.records
-    value = calibrations.terms(c, records)
-    z_th, alone = calibrations.z_th(c).response, jnp.eye(len(records))
-    slopes = [
-        as_complex(alone[i])[:, None] * _slope(g, r, z_th(s.frequency))[None, :]
-        for i, (g, r, s) in enumerate(
-            zip(calibrations.gains(c), calibrations.calibration.r_load, records, strict=True)
-        )
-    ]
-    rows = calibrations.by_gains(c, slopes)
-    directions = rows - linear.told(rows) @ linear.bread() @ linear.jacobian
+    c, value = calibrations.start(), calibrations.terms(calibrations.start())
+    small, found = calibrations.at_knots(), calibrations.likelihood(c)
+    z_th = jax.vmap(small.z_th(c).response)(small.spectra.frequency)
+    alone = as_complex(jnp.eye(z_th.shape[0]))[:, :, None]
+    by_resistor = alone * (-z_th * small.by_z(c))[None]
+    rows = found.condensed.rows(by_resistor)
+    rows = jnp.pad(rows, ((0, 0), (0, value.size - rows.shape[1])))
+    others = linear.told(rows) @ linear.bread()
+    directions = rows - others @ linear.jacobian
     own = jnp.sum(rows * linear.share[None, :] * directions, axis=1)
     score = directions @ value
     # Estimate the noise after the resistor that explains most: its error must not count as noise.
     best = jnp.argmax(score**2 / own)
-    rest = value - directions[best] * (score / own)[best]
-    size = records[0].x.size
-    of_noise = [
-        excess(rest[2 * i * size : 2 * (i + 1) * size], s.selected) for i, s in enumerate(records)
-    ]
-    error = jnp.sqrt(jnp.sum(weights(of_noise, value.size)[None, :] * directions**2, axis=1)) / own
+    slopes = small.gain_slopes(c)
+    made = combined(others[best], slopes.reshape(c.size, -1)).reshape(slopes.shape[1:])
+    change = (made - by_resistor[best]) * as_complex((score / own)[best])
+    noise = calibrations.noise(calibrations.likelihood(c, calibrations.knots.between(change)))
+    [noise] = means(found.size, calibrations.knots, noise[None])
+    noise = jnp.pad(noise, (0, value.size - noise.size), constant_values=1.0)
+    error = jnp.sqrt(jnp.sum(noise[None, :] * directions**2, axis=1)) / own
     return jnp.stack([score / own, error])
-
-
-def _slope(
-    g: Complex[Array, " harmonic"], r: Float[Array, ""], z_th: Complex[Array, " harmonic"]
-) -> Complex[Array, " harmonic"]:
-    """∂G/∂ log R."""
-    return g * z_th / (as_complex(r) + z_th)
 
 
 def disagree(
