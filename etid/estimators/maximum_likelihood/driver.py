@@ -47,6 +47,14 @@ def equations(_: Any, q: Float[Array, " common"], model: "Calibrations") -> Norm
     return model.equations(q)
 
 
+def _rough_equations(_: Any, q: Float[Array, " common"], model: "Calibrations") -> NormalEquations:
+    """The same with the derivatives of the terms themselves, which contain their noise."""
+    terms, jacobian = model.terms_and_slopes(q)
+    return NormalEquations(
+        0.5 * jnp.dot(terms, terms), jacobian @ terms, jacobian @ jacobian.T
+    ).finite()
+
+
 def second_order(
     _: Any, q: Float[Array, " common"], step: Float[Array, " common"], model: "Calibrations"
 ) -> Float[Array, " common"]:
@@ -65,7 +73,7 @@ DENSE = 32  # density of the knots: the floor of the driver's valley is flat
 # its minimum. From a distant start, the derivatives of the terms themselves find deeper minima than
 # those with X̂. Z_th and a delay form a curved valley. Near its floor, steps with the usual damping
 # are so short that they seem to make no progress.
-ROUGHLY = LevenbergMarquardt(rtol=1e-3, ftol=1e-6)
+ROUGHLY = LevenbergMarquardt(rtol=1e-3, ftol=1e-6, equations=_rough_equations)
 WELL = LevenbergMarquardt(rtol=SOLVER.rtol, ftol=3e-7, damping=1e-6, equations=equations)
 
 
@@ -359,9 +367,35 @@ class Calibrations(eqx.Module):
 
     def residual(self, common: Float[Array, " common"]) -> Float[Array, " term"]:
         """Terms of the calibrations and of the weak priors."""
-        records, gains = self.records, self.gains(common)
-        each = jax.vmap(lambda of: Profile.of(of, gains).terms)(records)
-        return jnp.concatenate([each.sum(0).ravel(), self.weak(common)[0]])
+        return jnp.concatenate([self._of_records(self.gains(common)), self.weak(common)[0]])
+
+    def _of_records(self, gains: Complex[Array, "record harmonic"]) -> Float[Array, " part"]:
+        return jax.vmap(lambda of: Profile.of(of, gains).terms)(self.records).sum(0).ravel()
+
+    def terms_and_slopes(
+        self, common: Float[Array, " common"]
+    ) -> tuple[Float[Array, " term"], Float[Array, "common term"]]:
+        """`residual` and its derivatives."""
+
+        def of_gains(common: Float[Array, " common"]) -> tuple[Array, Array]:
+            gains, unit = self.gains(common), jnp.array([[1.0], [1.0j]])
+            ways = as_complex(jnp.eye(gains.shape[0]))[:, None, :, None] * unit[None, :, None]
+
+            def along(way: Complex[Array, "record 1"]) -> Float[Array, " part"]:
+                return jax.jvp(self._of_records, (gains,), (jnp.broadcast_to(way, gains.shape),))[1]
+
+            return self._of_records(gains), jax.vmap(jax.vmap(along))(ways)
+
+        # A term depends on the gains at its own harmonic only.
+        terms, by_gain = apart(of_gains, common)
+        slopes, rows = apart(self.gain_slopes, common), jnp.zeros(())
+        by_gain = by_gain.reshape(*by_gain.shape[:2], -1, slopes.shape[-1])
+        for number, (real, imaginary) in enumerate(by_gain):
+            of = slopes[:, number, None]
+            rows = rows + of.real * real[None] + of.imag * imaginary[None]
+        weak, by_common = self.weak(common)
+        rows = rows.reshape(common.size, -1)
+        return jnp.concatenate([terms, weak]), jnp.concatenate([rows, by_common], axis=1)
 
     def weak(
         self, common: Float[Array, " common"]
