@@ -8,7 +8,7 @@ import pytest
 import etid
 from benchmarks.failure_axes import transformer
 from benchmarks.ladder import CALIBRATION, rung
-from etid.estimators.maximum_likelihood.driver import Calibrations
+from etid.estimators.maximum_likelihood.calibrations import Calibrations
 from etid.estimators.score_tests import missing_pole
 from etid.results.driver import SourceImpedance
 
@@ -69,7 +69,8 @@ def test_an_order_that_is_high_enough_shows_noise_only(identified):
 
     @jax.jit
     def squares_of(calibrations):
-        return missing_pole.squares(calibrations, calibrations.linear(calibrations.start()))
+        near = calibrations.near(calibrations.start())
+        return missing_pole.squares(calibrations, near, calibrations.linear(near))
 
     squares = []
     for seed in range(8):

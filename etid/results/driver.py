@@ -21,7 +21,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Complex, Float, Int
 
 from etid.circuits.display import plus_minus, several
-from etid.circuits.impedance import AbstractImpedance, realise
+from etid.circuits.impedance import realise
 from etid.circuits.overview import Overview
 from etid.numpy_tier.tiers import program
 from etid.recordings.remarks import texts
@@ -34,7 +34,6 @@ from etid.signals.transfer import (
     Rational,
     as_complex,
     delay_variable,
-    frequency_variable,
     reciprocal,
 )
 
@@ -84,13 +83,6 @@ class SourceImpedance(eqx.Module):
             gain = self.gain_real[j] / (1 + turn * turn)
             real, imaginary = real + gain, imaginary - gain * turn
         return jax.lax.complex(real, imaginary)
-
-    def voltage_ratio(
-        self, load: AbstractImpedance, frequency: Float[Array, " frequency"]
-    ) -> Complex[Array, " frequency"]:
-        """G = Z_L / (Z_L + Z_th), the ratio of the loaded to the unloaded voltage."""
-        z_load = load(frequency_variable(frequency))
-        return z_load * reciprocal(z_load + self.response(frequency))
 
     def slopes(
         self, frequency: Float[Array, " frequency"]

@@ -114,7 +114,8 @@ def estimates(
         _of_group(study, loads, common, own, several=count > 0)
         for loads, own, count in zip(groups, owns, several, strict=True)
     ]
-    total, pull = model.calibrations.linear(common).curvature(), jnp.zeros_like(common)
+    of, pull = model.calibrations, jnp.zeros_like(common)
+    total = of.linear(of.near(common)).curvature()
     for loads, (eliminated, *_) in zip(groups, found, strict=True):
         used = jax.tree.map(
             lambda leaf, loads=loads: jnp.where(loads.used[:, None, None], leaf, 0.0).sum(0),

@@ -26,9 +26,10 @@ from jaxtyping import Array, Bool, Complex, Float, Int
 
 from etid.estimators.estimate import MAX_STEPS
 from etid.estimators.joint.terms import DriverStudy, Loads, Own, in_turn
+from etid.estimators.maximum_likelihood.calibrations import DENSE, Calibrations
 from etid.estimators.maximum_likelihood.condensed import apart
-from etid.estimators.maximum_likelihood.driver import DENSE, Calibrations
 from etid.estimators.maximum_likelihood.given_driver import GivenDriver
+from etid.estimators.maximum_likelihood.profile import total
 from etid.signals.knots import knots
 from etid.signals.transfer import as_complex, reciprocal
 from etid.solvers.arrowhead import join
@@ -73,7 +74,7 @@ class _Near(eqx.Module):
     """A study near one point.
 
     Attributes:
-        calibrations: The calibrations at their knots.
+        calibrations: The calibrations.
         centre: Common parameters of the point.
         frequency: Frequencies of the knots of each group [Hz].
         parts: The calibrations, then each group of loads.
@@ -96,18 +97,18 @@ class _Near(eqx.Module):
         self, common: Float[Array, " common"], frequency: Float[Array, " knot"]
     ) -> Complex[Array, " knot"]:
         resistance = as_complex(self.calibrations.calibration.r_load.mean())
-        return self.calibrations.z_th(common).response(frequency) + resistance
+        return self.calibrations.source_of(common).response(frequency) + resistance
 
     def signals(self, common: Float[Array, " common"]) -> list[Float[Array, "signal knot"]]:
         """The signals of each part."""
-        known = self.calibrations.gains(common)
+        known = self.calibrations.gains(common, self.calibrations.knots)
         of_w = [jnp.log(self._loaded(common, f))[None] for f in self.frequency]
         return self._of_each(_parts(known), list(map(_parts, of_w)), 0)
 
     def slopes(self, common: Float[Array, " common"]) -> list[Float[Array, "common signal knot"]]:
         """Derivatives of the signals."""
-        source = self.calibrations.z_th(common)
-        known = self.calibrations.gain_slopes(common)
+        source = self.calibrations.source_of(common)
+        known = self.calibrations.slopes(common, self.calibrations.knots).by_common
         of_w = []
         for f in self.frequency:
             rows = source.slopes(f) * reciprocal(self._loaded(common, f))[None, :]
@@ -160,17 +161,18 @@ def _second_order(
 
 def _of_calibrations(calibrations: Calibrations, common: Float[Array, " common"]) -> _Part:
     """The calibrations as a function of their gains."""
-    found = calibrations.likelihood(common)
-    records, size = found.condensed.gains.shape
+    near = calibrations.near(common)
+    records, size = near.condensed.gains.shape
     unit = jnp.array([1.0, 1.0j])
     alone = as_complex(jnp.eye(records))[:, None, :] * unit[None, :, None]
-    alone = alone.reshape(2 * records, records, 1)
-    rows = found.condensed.rows(jnp.tile(alone, (1, 1, size))).reshape(2 * records, -1, size)
-    part = found.condensed.part.reshape(-1, size)
+    alone = jnp.tile(alone.reshape(2 * records, records, 1), (1, 1, size))
+    rows = near.condensed.rows(alone).reshape(2 * records, -1, size)
+    part = near.condensed.part.reshape(-1, size)
     pull = jnp.einsum("stk,tk->sk", rows, part)
     curvature = jnp.einsum("stk,utk->suk", rows, rows)
+    objective = total([of.objective for of in near.profiles])
     none = jnp.zeros((0, 2 * records, size))
-    return _Part(found.objective, pull, curvature, none, jnp.zeros(0))
+    return _Part(objective, pull, curvature, none, jnp.zeros(0))
 
 
 def _by_signals(driver: GivenDriver, shared: bool) -> GivenDriver:
@@ -291,7 +293,7 @@ def _next(
     known = _of_calibrations(study.model.calibrations, common)
     groups = [_of_group(study, common, *group) for group in zip(study.groups, parts, strict=True)]
     near = _Near(
-        study.model.calibrations.at_knots(),
+        study.model.calibrations,
         common,
         [knots(g.spectrum.x.shape[-1], DENSE).at(g.frequency[0]) for g in study.groups],
         [known, *(part for part, _ in groups)],

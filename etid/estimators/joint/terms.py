@@ -17,7 +17,7 @@ from jaxtyping import Array, Bool, Complex, Float, Int
 from etid.circuits.circuit import AbstractCircuit
 from etid.estimators.element_limits import Limits
 from etid.estimators.element_prior import ElementPrior
-from etid.estimators.maximum_likelihood.driver import Calibrations
+from etid.estimators.maximum_likelihood.calibrations import Calibrations
 from etid.estimators.maximum_likelihood.given_driver import GivenDriver, around
 from etid.estimators.maximum_likelihood.load import Load
 from etid.estimators.unknowns import LoadUnknowns, LoadWithCurrentUnknowns

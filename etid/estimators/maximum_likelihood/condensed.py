@@ -13,7 +13,7 @@ before it, like its innovation. The terms are a residual for any solver, at a fe
 cost of all harmonics.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import equinox as eqx
@@ -21,6 +21,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Complex, Float
 
+from etid.estimators.maximum_likelihood.profile import Profile, total
 from etid.signals.harmonics import real_parts
 from etid.signals.knots import Knots
 from etid.signals.transfer import as_complex
@@ -40,15 +41,10 @@ class Condensed(eqx.Module):
     target: Complex[Array, "output knot"]
 
     @classmethod
-    def of(
-        cls,
-        gains: Complex[Array, "output harmonic"],
-        information: Complex[Array, "output output harmonic"],
-        score: Complex[Array, "output harmonic"],
-        every: Knots,
-    ) -> "Condensed":
-        """The likelihood near these gains, from its P and ρ."""
-        outputs = gains.shape[0]
+    def of(cls, profiles: Sequence[Profile], every: Knots) -> "Condensed":
+        """The likelihood near the gains of `profiles`, one for each input."""
+        information = total([of.information for of in profiles])
+        score, outputs = total([of.score for of in profiles]), information.shape[0]
         rows = jnp.concatenate([information.reshape(outputs**2, -1), score])
         real, imaginary = every.summed(jnp.stack([rows.real, rows.imag]))
         sums = jax.lax.complex(real, imaginary)
@@ -61,7 +57,7 @@ class Condensed(eqx.Module):
             target.append(score[number] * scale)
             p = p - jnp.conj(root[-1])[:, None] * root[-1][None]
             score = score - jnp.conj(root[-1]) * target[-1][None]
-        return cls(every.at(gains), jnp.stack(root[::-1]), jnp.stack(target[::-1]))
+        return cls(every.at(profiles[0].gains), jnp.stack(root[::-1]), jnp.stack(target[::-1]))
 
     def rows(self, changes: Complex[Array, "row output knot"]) -> Float[Array, "row part"]:
         """Changes of the terms by changes of the gains."""
@@ -82,19 +78,12 @@ class Condensed(eqx.Module):
 
 
 def means(
-    size: Float[Array, "output harmonic"],
-    every: Knots,
-    values: Float[Array, "row output harmonic"],
+    profiles: Sequence[Profile], every: Knots, values: Float[Array, "row output harmonic"]
 ) -> Float[Array, "row part"]:
-    """Means of `values` of the innovations for each condensed term, weighted by information.
-
-    Args:
-        size: Information of each innovation about its gain.
-        every: The knots of the harmonics.
-        values: The values.
-    """
-    total, sums = jnp.split(every.summed(jnp.concatenate([size[None], values * size[None]])), (1,))
-    found = sums / jnp.where(total > 0, total, 1.0)
+    """Means of `values` of the innovations for each condensed term, weighted by information."""
+    size = total([of.size for of in profiles])
+    whole, sums = jnp.split(every.summed(jnp.concatenate([size[None], values * size[None]])), (1,))
+    found = sums / jnp.where(whole > 0, whole, 1.0)
     return jnp.tile(found.reshape(values.shape[0], -1), (1, 2))
 
 

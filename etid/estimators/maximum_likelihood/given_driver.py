@@ -31,7 +31,7 @@ from jaxtyping import Array, Complex, Float
 
 from etid.circuits.circuit import AbstractCircuit
 from etid.estimators.estimate import DELAY_WIDTH
-from etid.estimators.maximum_likelihood.driver import Calibrations
+from etid.estimators.maximum_likelihood.calibrations import Calibrations
 from etid.estimators.maximum_likelihood.profile import Profile, Records
 from etid.estimators.score_tests.unloaded import UnloadedShape, shape_of
 from etid.estimators.starts import current_starts, harmonic_starts
@@ -257,10 +257,10 @@ def given(
     """
     calibrations = Calibrations.of(driver)
     c = calibrations.start()
-    linear = calibrations.linear(c)
+    near = calibrations.near(c)
+    linear = calibrations.linear(near)
     root = inverse_root(linear.curvature().expected)
-    gradient = calibrations.equations(c).gradient
-    mean, cov = -root.T @ gradient, linear.along(root).curvature().score
+    mean, cov = -root.T @ (near.jacobian @ near.terms), linear.along(root).curvature().score
     if driver.drift is None:
         found = around(calibrations, c, root, frequency, shared, mean, cov)
     else:
@@ -288,14 +288,15 @@ def around(
 ) -> GivenDriver:
     """A driver around the common parameters c, with z along `directions`; like `given`."""
     resistance = calibrations.calibration.r_load.mean()
-    source, gains = calibrations.z_th(c), calibrations.gains(c)
+    source, gains = calibrations.source_of(c), None
     loaded = source.response(frequency) + as_complex(resistance)
     _, by_frequency = jax.jvp(source.response, (frequency,), (frequency,))
     by_source = source.slopes(frequency) * reciprocal(loaded)[None, :]
     known = None
     if shared:
-        slopes = calibrations.gain_slopes(c)
-        known = combined(directions.T, slopes.reshape(c.size, -1)).reshape(-1, *gains.shape)
+        of = calibrations.slopes(c)
+        gains, known = of.gains, combined(directions.T, of.by_common.reshape(c.size, -1))
+        known = known.reshape(-1, *gains.shape)
     return GivenDriver(
         frequency=frequency,
         loaded=loaded,
@@ -305,7 +306,7 @@ def around(
         mean=mean,
         cov=cov,
         records=calibrations.spectra if shared else None,
-        gains=gains if shared else None,
+        gains=gains,
         gain_slopes=known,
         delay_width=calibrations.delay_width,
     )

@@ -142,8 +142,7 @@ class Load(eqx.Module):
     def near(self, q: Float[Array, " q"], every: Knots | None = None) -> Near:
         """The load near `q`, at these knots or its own."""
         every, profile = every or self.knots, self.profile(q)
-        sums = profile.gains, profile.information, profile.score
-        condensed = apart(lambda _: Condensed.of(*sums, every), q)
+        condensed = apart(lambda _: Condensed.of([profile], every), q)
         slopes, by_x = apart(self.gains.at(every).slopes, q), None
         if self.unloaded is not None:
             relative = self.unloaded.x * reciprocal(profile.x)[None, :]

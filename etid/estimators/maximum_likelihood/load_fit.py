@@ -217,7 +217,7 @@ def fit_circuit(
     )
     share = signal_share(profile.x, records.variance_x)
     values = jnp.stack([jnp.broadcast_to(share, noise.shape), noise, private * noise])
-    mean_share, mean_noise, own_noise = means(profile.size, every, values)
+    mean_share, mean_noise, own_noise = means([profile], every, values)
     linear = Linear(jacobian, mean_share, mean_noise, jnp.diag(prior))
     information = linear.bread()
     elements = information[:count]

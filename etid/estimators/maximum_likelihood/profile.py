@@ -16,13 +16,16 @@ independent: each is what an output shows beyond x and the outputs before it. σ
 of one coefficient, at every harmonic.
 """
 
+import functools
+from collections.abc import Sequence
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Complex, Float
 
 from etid.results.fit import complex_rrse
-from etid.signals.harmonics import Spectrum, local_sum, real_parts
+from etid.signals.harmonics import Spectrum, local_sum, real_parts, signal_share
 from etid.signals.mains import lines
 from etid.signals.transfer import as_complex, power
 
@@ -32,7 +35,7 @@ HUM = 14.4  # times the mean; an exponential exceeds it as rarely as a normal nu
 
 
 class Records(eqx.Module):
-    """An input and its outputs at the harmonics; several can be stacked.
+    """An input and its outputs at the harmonics.
 
     Attributes:
         frequency: The harmonics [Hz].
@@ -43,12 +46,12 @@ class Records(eqx.Module):
         selected: Harmonics of each output that are used.
     """
 
-    frequency: Float[Array, "*input harmonic"]
-    x: Complex[Array, "*input harmonic"]
-    variance_x: Float[Array, "*input harmonic"]
-    y: Complex[Array, "*input output harmonic"]
-    variance_y: Float[Array, "*input output harmonic"]
-    selected: Bool[Array, "*input output harmonic"]
+    frequency: Float[Array, " harmonic"]
+    x: Complex[Array, " harmonic"]
+    variance_x: Float[Array, " harmonic"]
+    y: Complex[Array, "output harmonic"]
+    variance_y: Float[Array, "output harmonic"]
+    selected: Bool[Array, "output harmonic"]
 
     @classmethod
     def of(cls, spectrum: Spectrum, current: tuple[Array, ...] | None = None) -> "Records":
@@ -155,6 +158,11 @@ class Profile(eqx.Module):
         return self.weight * power(self.x)[None, :]
 
     @property
+    def share(self) -> Float[Array, " harmonic"]:
+        """Share of signal in the power of X̂."""
+        return signal_share(self.x, self.variance_x)
+
+    @property
     def terms(self) -> Float[Array, "output part"]:
         """Innovations, scaled to unit variance; Σ of their squares is D."""
         # The root of the weight itself would have no derivative where a harmonic is not used.
@@ -200,6 +208,11 @@ class Profile(eqx.Module):
         """RRSE of the output that is predicted worst from this input."""
         each = zip(self.gains, records.y, records.selected, strict=True)
         return jnp.stack([complex_rrse(g * x, y, used) for g, y, used in each]).max()
+
+
+def total(values: Sequence[Array]) -> Array:
+    """Sum of arrays, such as those of the records of each input."""
+    return functools.reduce(jnp.add, values)
 
 
 def excess(

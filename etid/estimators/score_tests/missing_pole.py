@@ -20,8 +20,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Complex, Float
 
+from etid.estimators.maximum_likelihood.calibrations import Calibrations, NearCalibrations
 from etid.estimators.maximum_likelihood.condensed import apart
-from etid.estimators.maximum_likelihood.driver import Calibrations
 from etid.estimators.sandwich import Linear
 
 SEEN = 36.0  # χ² of two degrees of freedom; by chance one of about 100 sections has it once in 10⁶
@@ -94,26 +94,30 @@ def _parts(z: Complex[Array, "*_"]) -> tuple[Float[Array, "*_"], Float[Array, "*
     return z.real, z.imag
 
 
-def largest(calibrations: Calibrations, linear: Linear) -> Float[Array, ""]:
+def largest(calibrations: Calibrations, near: NearCalibrations, linear: Linear) -> Float[Array, ""]:
     """Largest score statistic of all sections; the calibrations show one more if above `SEEN`.
 
     Args:
-        calibrations: Calibrations at the minimum of their likelihood.
-        linear: Their terms.
+        calibrations: Calibrations.
+        near: The calibrations at the minimum of their likelihood.
+        linear: Their terms there.
     """
-    found = squares(calibrations, linear)
+    found = squares(calibrations, near, linear)
     return jnp.nanmax(found)  # NaN if a section has no effect
 
 
-def squares(calibrations: Calibrations, linear: Linear) -> Float[Array, " section"]:
+def squares(
+    calibrations: Calibrations, near: NearCalibrations, linear: Linear
+) -> Float[Array, " section"]:
     """Score statistic of each section: χ² with two degrees of freedom if the section is absent.
 
     Args:
-        calibrations: Calibrations at the minimum of their likelihood.
-        linear: Their terms.
+        calibrations: Calibrations.
+        near: The calibrations at the minimum of their likelihood.
+        linear: Their terms there.
     """
-    c, jacobian = calibrations.start(), linear.jacobian
-    sections, terms = apart(lambda _: _sections(calibrations), c), calibrations.terms(c)
+    jacobian, terms = near.jacobian, near.terms
+    sections = apart(lambda _: _sections(calibrations, near), terms)
     used = sections.effect.size
     # With D = rows − fitted J, the scores are D r and their covariance is D C Dᵀ, where `rows` are
     # the derivatives of the terms.
@@ -132,14 +136,12 @@ def squares(calibrations: Calibrations, linear: Linear) -> Float[Array, " sectio
     return (s * s * bb - 2 * s * t * ab + t * t * aa) / (aa * bb - ab * ab)
 
 
-def _sections(calibrations: Calibrations) -> Sections:
+def _sections(calibrations: Calibrations, near: NearCalibrations) -> Sections:
     """The sections, and their effect on the condensed terms."""
-    c, spectra = calibrations.start(), calibrations.spectra
-    condensed, small = calibrations.likelihood(c).condensed, calibrations.at_knots()
-    by_z = small.by_z(c)
-    rows = condensed.rows(jnp.stack([by_z, 1j * by_z]))
+    spectra, by_z = calibrations.spectra, near.slopes.by_z
+    rows = near.condensed.rows(jnp.stack([by_z, 1j * by_z]))
     effect = jax.lax.complex(rows[0], -rows[1]).reshape(-1, by_z.shape[-1])
     # The harmonics of the records differ so little that the sections are equal.
-    frequency = small.spectra.frequency[0]
+    frequency = calibrations.knots.at(spectra.frequency[0])
     highest = jnp.max(jnp.where(spectra.selected, spectra.frequency, frequency[0]))
     return Sections.of(frequency, (frequency[0], highest), effect)

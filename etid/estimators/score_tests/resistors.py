@@ -9,12 +9,11 @@ test estimates how far its value differs from the value that the others show, wi
 Z_th and all delays are free.
 """
 
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from etid.estimators.maximum_likelihood.calibrations import Calibrations, NearCalibrations
 from etid.estimators.maximum_likelihood.condensed import means
-from etid.estimators.maximum_likelihood.driver import Calibrations
 from etid.estimators.sandwich import Linear
 from etid.recordings.preflight import Inspected
 from etid.signals.transfer import as_complex, combined
@@ -32,33 +31,31 @@ EXPLAINED = 0.5
 ROUGHLY = 3.0
 
 
-def mismatch(calibrations: Calibrations, linear: Linear) -> Float[Array, "2 record"]:
+def mismatch(
+    calibrations: Calibrations, near: NearCalibrations, linear: Linear
+) -> Float[Array, "2 record"]:
     """Excess of each log R over the value that the other calibrations show, and its standard error.
 
     Args:
-        calibrations: Two or more calibrations at the minimum of their likelihood.
-        linear: Their terms.
+        calibrations: Two or more calibrations.
+        near: The calibrations at the minimum of their likelihood.
+        linear: Their terms there.
     """
-    c, value = calibrations.start(), calibrations.terms(calibrations.start())
-    small, found = calibrations.at_knots(), calibrations.likelihood(c)
-    z_th = jax.vmap(small.z_th(c).response)(small.spectra.frequency)
-    alone = as_complex(jnp.eye(z_th.shape[0]))[:, :, None]
-    by_resistor = alone * (-z_th * small.by_z(c))[None]
-    rows = found.condensed.rows(by_resistor)
-    rows = jnp.pad(rows, ((0, 0), (0, value.size - rows.shape[1])))
+    slopes, every = near.slopes, calibrations.knots
+    alone = as_complex(jnp.eye(slopes.gains.shape[0]))[:, :, None]
+    by_resistor = alone * (-slopes.z_th * slopes.by_z)[None]
+    rows = near.rows(by_resistor)
     others = linear.told(rows) @ linear.bread()
     directions = rows - others @ linear.jacobian
     own = jnp.sum(rows * linear.share[None, :] * directions, axis=1)
-    score = directions @ value
+    score = directions @ near.terms
     # Estimate the noise after the resistor that explains most: its error must not count as noise.
     best = jnp.argmax(score**2 / own)
-    slopes = small.gain_slopes(c)
-    made = combined(others[best], slopes.reshape(c.size, -1)).reshape(slopes.shape[1:])
-    change = (made - by_resistor[best]) * as_complex((score / own)[best])
-    noise = calibrations.noise(calibrations.likelihood(c, calibrations.knots.between(change)))
-    [noise] = means(found.size, calibrations.knots, noise[None])
-    noise = jnp.pad(noise, (0, value.size - noise.size), constant_values=1.0)
-    error = jnp.sqrt(jnp.sum(noise[None, :] * directions**2, axis=1)) / own
+    made = combined(others[best], slopes.by_common.reshape(linear.jacobian.shape[0], -1))
+    change = (made.reshape(slopes.gains.shape) - by_resistor[best]) * as_complex(score / own)[best]
+    part = calibrations.terms(near.profiles[0].gains + every.between(change))
+    noise = near.padded(means(near.profiles, every, calibrations.noise(part)[None]), 1.0)
+    error = jnp.sqrt(jnp.sum(noise * directions**2, axis=1)) / own
     return jnp.stack([score / own, error])
 
 
