@@ -249,7 +249,7 @@ def test_the_gradient_of_a_load_is_that_of_its_sum_of_squares(study, driver, sha
 
     @jax.jit
     def both(q, lane):
-        of = Load.behind(known, SkinRC(), lane.spectrum, lane.sample_rate)
+        of = Load.behind(known, SkinRC(), Records.of(lane.spectrum), lane.sample_rate)
         by_jax = jax.value_and_grad(lambda q: 0.5 * jnp.sum(of.residual(q) ** 2))(q)
         found = of.equations(q)
         return by_jax, (found.objective, found.gradient)

@@ -54,13 +54,15 @@ class Spectrum(eqx.Module):
     selected: Bool[Array, "*lane harmonic"]
 
 
-def same_unloaded(one: Spectrum, other: Spectrum) -> Bool[Array, ""] | bool:
-    """Whether two recordings have the same unloaded record."""
+def same_unloaded(
+    one: Complex[Array, " harmonic"], other: Complex[Array, " _"]
+) -> Bool[Array, ""] | bool:
+    """Whether the X of two recordings are transforms of the same unloaded record."""
     if one is other:
         return True
-    if one.x.shape != other.x.shape:
+    if one.shape != other.shape:
         return False
-    return jnp.sum(power(one.x - other.x)) <= ROUNDING**2 * jnp.sum(power(other.x))
+    return jnp.sum(power(one - other)) <= ROUNDING**2 * jnp.sum(power(other))
 
 
 def as_list(spectra: Spectrum) -> list[Spectrum]:

@@ -18,7 +18,7 @@ from etid.estimators.maximum_likelihood.profile import Profile, Records, excess,
 from etid.estimators.sandwich import Linear
 from etid.estimators.unknowns import DriverUnknowns
 from etid.results.driver import Calibration, HarmonicDriver, SourceImpedance
-from etid.signals.harmonics import Spectrum, as_list, same_unloaded
+from etid.signals.harmonics import Spectrum, same_unloaded
 from etid.signals.knots import Knots, knots
 from etid.signals.transfer import as_complex, delayed, frequency_variable, reciprocal
 from etid.solvers.levenberg_marquardt import DIFFERENCE, NormalEquations
@@ -113,12 +113,13 @@ class Calibrations(eqx.Module):
 
         An output is used with the first input that is its own unloaded record.
         """
-        s, each = self.spectra, as_list(self.spectra)
-        found, free = [], jnp.ones(len(each), bool)
-        for one in each:
-            mine = jnp.stack([jnp.asarray(same_unloaded(one, other)) for other in each]) & free
+        s, found = self.spectra, []
+        free = jnp.ones(s.x.shape[0], bool)
+        for number, x in enumerate(s.x):
+            mine = jnp.stack([jnp.asarray(same_unloaded(x, other)) for other in s.x]) & free
             free, used = free & ~mine, s.selected & mine[:, None]
-            found.append(Records(one.frequency, one.x, one.variance_x, s.y, s.variance_y, used))
+            of_x = s.frequency[number], x, s.variance_x[number]
+            found.append(Records(*of_x, s.y, s.variance_y, used))
         return found
 
     def profiles(self, gains: Complex[Array, "record harmonic"]) -> list[Profile]:

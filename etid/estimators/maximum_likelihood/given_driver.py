@@ -37,22 +37,26 @@ from etid.estimators.score_tests.unloaded import UnloadedShape, shape_of
 from etid.estimators.starts import current_starts, harmonic_starts
 from etid.estimators.unknowns import LoadUnknowns
 from etid.results.driver import HarmonicDriver
-from etid.signals.harmonics import Spectrum, as_list, same_unloaded
+from etid.signals.harmonics import Spectrum, same_unloaded
 from etid.signals.knots import Knots
 from etid.signals.transfer import as_complex, combined, reciprocal
 from etid.solvers.matrices import inverse_root
 
 
-class UnloadedSlopes(NamedTuple):
-    """Derivatives with respect to z of the X of a load that the calibrations estimate.
+class UnloadedEstimate(NamedTuple):
+    """The X of a load that the calibrations estimate, as a function of z.
 
     Attributes:
-        x: Derivatives of X.
-        log_variance: Derivatives of the logarithm of the variance of X.
+        x: X at z = 0.
+        variance: Its variance there.
+        x_by_z: Derivatives of X.
+        log_variance_by_z: Derivatives of the logarithm of the variance.
     """
 
-    x: Complex[Array, "z harmonic"]
-    log_variance: Float[Array, "z harmonic"]
+    x: Complex[Array, " harmonic"]
+    variance: Float[Array, " harmonic"]
+    x_by_z: Complex[Array, "z harmonic"]
+    log_variance_by_z: Float[Array, "z harmonic"]
 
 
 class AbstractGiven(eqx.Module):
@@ -77,18 +81,18 @@ class AbstractGiven(eqx.Module):
     delay_width: eqx.AbstractVar[Float[Array, ""]]
 
     @abc.abstractmethod
-    def transfer(
-        self, load: Complex[Array, " harmonic"], w: Complex[Array, " harmonic"], outputs: int
-    ) -> Complex[Array, "output harmonic"]:
-        """V_out per input at W₀ + w, and the current per input if there are two outputs."""
+    def current(
+        self, total: Complex[Array, " harmonic"], w: Complex[Array, " harmonic"]
+    ) -> Complex[Array, " harmonic"]:
+        """Current per input through this impedance [Ω] at W₀ + w."""
 
     @abc.abstractmethod
     def at_knots(self, knots: Knots) -> "AbstractGiven":
         """The same at the knots of the harmonics, without an estimate of X."""
 
     @abc.abstractmethod
-    def informed(self, spectrum: Spectrum) -> tuple[Spectrum, UnloadedSlopes | None]:
-        """A recording with X estimated by the calibrations at z = 0, and derivatives of X."""
+    def unloaded(self, records: Records) -> UnloadedEstimate | None:
+        """The X of a recording that the calibrations estimate; None if they share none with it."""
 
     @abc.abstractmethod
     def starts(
@@ -123,20 +127,20 @@ class GivenCurrent(AbstractGiven):
             delay_width=width,
         )
 
-    def transfer(
-        self, load: Complex[Array, " harmonic"], w: Complex[Array, " harmonic"], outputs: int
-    ) -> Complex[Array, "output harmonic"]:
-        """Z_L."""
-        del w, outputs
-        return load[None, :]
+    def current(
+        self, total: Complex[Array, " harmonic"], w: Complex[Array, " harmonic"]
+    ) -> Complex[Array, " harmonic"]:
+        """1: the input is the current."""
+        del w
+        return jnp.ones_like(total)
 
     def at_knots(self, knots: Knots) -> "GivenCurrent":
         """The same at the knots of the harmonics."""
         return GivenCurrent.at(knots.at(self.frequency))
 
-    def informed(self, spectrum: Spectrum) -> tuple[Spectrum, None]:
-        """The recording itself."""
-        return spectrum, None
+    def unloaded(self, records: Records) -> None:
+        """None: there are no calibrations."""
+        del records
 
     def starts(
         self, spectrum: Spectrum, sample_rate: Float[Array, ""], circuit: AbstractCircuit
@@ -190,12 +194,11 @@ class GivenDriver(AbstractGiven):
             self.resistance
         )
 
-    def transfer(
-        self, load: Complex[Array, " harmonic"], w: Complex[Array, " harmonic"], outputs: int
-    ) -> Complex[Array, "output harmonic"]:
-        """Z_L / (Z_L + Z_th) and 1 / (Z_L + Z_th) [S] at W₀ + w."""
-        loop = reciprocal(load + self.z_th(w))
-        return jnp.stack([load * loop, loop][:outputs])
+    def current(
+        self, total: Complex[Array, " harmonic"], w: Complex[Array, " harmonic"]
+    ) -> Complex[Array, " harmonic"]:
+        """1 / (Z + Z_th) [S] at W₀ + w."""
+        return reciprocal(total + self.z_th(w))
 
     def starts(
         self, spectrum: Spectrum, sample_rate: Float[Array, ""], circuit: AbstractCircuit
@@ -218,31 +221,28 @@ class GivenDriver(AbstractGiven):
             shape=None,
         )
 
-    def informed(self, spectrum: Spectrum) -> tuple[Spectrum, UnloadedSlopes | None]:
-        """A recording with X estimated by the calibrations at z = 0, and derivatives of X."""
-        if self.records is None or self.gains is None or self.gain_slopes is None:
-            return spectrum, None
-        s, of = spectrum, self.records
-        if s.x.size != of.x.shape[-1]:  # a record of another length is another unloaded record
-            return spectrum, None
-        same = jnp.stack([jnp.asarray(same_unloaded(s, one)) for one in as_list(of)])
+    def unloaded(self, records: Records) -> UnloadedEstimate | None:
+        """The X of a recording that the calibrations estimate; None if they share none with it."""
+        x, of, gains, slopes = records.x, self.records, self.gains, self.gain_slopes
+        if of is None or gains is None or slopes is None or x.size != of.x.shape[-1]:
+            return None  # a record of another length is another unloaded record
+        same = jnp.stack([jnp.asarray(same_unloaded(x, one)) for one in of.x])
         used = of.selected & same[:, None]
-        records = Records(s.frequency, s.x, s.variance_x, of.y, of.variance_y, used)
+        outputs = dataclasses.replace(records, y=of.y, variance_y=of.variance_y, selected=used)
 
-        def unloaded(
+        def estimate(
             gains: Complex[Array, "record harmonic"],
         ) -> tuple[Complex[Array, " harmonic"], Float[Array, " harmonic"]]:
-            profile = Profile.of(records, gains)
+            profile = Profile.of(outputs, gains)
             return profile.x, jnp.log(profile.variance_x)
 
         def slope(
             direction: Complex[Array, "record harmonic"],
         ) -> tuple[Complex[Array, " harmonic"], Float[Array, " harmonic"]]:
-            return jax.jvp(unloaded, (self.gains,), (direction,))[1]
+            return jax.jvp(estimate, (gains,), (direction,))[1]
 
-        profile = Profile.of(records, self.gains)
-        found = dataclasses.replace(s, x=profile.x, variance_x=profile.variance_x)
-        return found, UnloadedSlopes(*jax.vmap(slope)(self.gain_slopes))
+        profile = Profile.of(outputs, gains)
+        return UnloadedEstimate(profile.x, profile.variance_x, *jax.vmap(slope)(slopes))
 
 
 def given(

@@ -54,17 +54,16 @@ class Records(eqx.Module):
     selected: Bool[Array, "output harmonic"]
 
     @classmethod
-    def of(cls, spectrum: Spectrum, current: tuple[Array, ...] | None = None) -> "Records":
-        """V_th and V_out, and the current if there is one.
+    def of(cls, spectrum: Spectrum, *others: tuple[Array, Array]) -> "Records":
+        """V_th and V_out, and further outputs.
 
         Args:
             spectrum: Harmonics of the voltages.
-            current: Those of the current [A], and their variances [A²].
+            others: Coefficients of each further output, and their variances.
         """
-        each = [(spectrum.y, spectrum.variance_y), *([] if current is None else [current])]
+        each = [(spectrum.y, spectrum.variance_y), *others]
         y, variance_y = (jnp.stack(of) for of in zip(*each, strict=True))
-        s, outputs = spectrum, len(each)
-        selected = jnp.tile(s.selected, (outputs, 1))
+        s, selected = spectrum, jnp.tile(spectrum.selected, (len(each), 1))
         return cls(s.frequency, s.x, s.variance_x, y, variance_y, selected)
 
 

@@ -171,7 +171,7 @@ def _bias(
     def mean_of_pair(own: Float[Array, "record 2 2 harmonic"]) -> Float[Array, " number"]:
         noises = []
         for s, (of_x, of_y) in zip(records, own, strict=True):
-            same = same_unloaded(s, records[-1])
+            same = same_unloaded(s.x, records[-1].x)
             # Recordings with the same unloaded record have the same noise of X.
             of_x = jnp.where(same, own[-1, 0], of_x)
             noises.append((noise(of_x, s.variance_x), noise(of_y, s.variance_y)))

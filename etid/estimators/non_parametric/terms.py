@@ -115,7 +115,7 @@ class Model(eqx.Module):
         rest = power(y) * of.by_y
         together, shared = -load, jnp.zeros((), dtype=bool)
         for slope, s in zip(of.by_x, records[:-1], strict=True):
-            same = same_unloaded(spectrum, s)
+            same = same_unloaded(spectrum.x, s.x)
             shared = shared | same
             rest = rest + jnp.where(same, 0.0, power(y * slope) * s.variance_x)
             together = together + jnp.where(same, y * slope, 0.0)
