@@ -15,10 +15,10 @@ import jax.numpy as jnp
 from jaxtyping import Array, Complex, Float
 
 import etid
+from etid.estimators.maximum_likelihood.gains import AbstractOutputs, Current
 from etid.estimators.maximum_likelihood.given_driver import GivenDriver
 from etid.estimators.maximum_likelihood.load import Load
 from etid.estimators.maximum_likelihood.load_fit import fit_circuit
-from etid.estimators.maximum_likelihood.outputs import AbstractOutputs, Current
 from etid.estimators.maximum_likelihood.profile import Records
 from etid.results.verdicts import verdict
 from etid.signals.harmonics import Spectrum

@@ -14,6 +14,7 @@ from etid.estimators.maximum_likelihood.given_driver import given
 from etid.estimators.maximum_likelihood.load import Load
 from etid.estimators.maximum_likelihood.profile import Records
 from etid.recordings.preflight import Inspected
+from etid.results.driver import HarmonicDriver
 from etid.simulation.scenes import Scene, Trial
 from etid.simulation.transformer import ResistorLoad
 from etid.solvers.matrices import root
@@ -35,10 +36,12 @@ def scene():
     known = (Trial("c", ResistorLoad(98.8e3)),)
     study = Scene((Trial("a", SKIN),), known, samples=10_000, snr_db=60.0).simulate(seed=3)
     lane = jax.tree.map(jnp.asarray, Harmonics.of(Inspected(study["a"])))
-    return lane, given(etid.identify_driver(study["c"]), lane.frequency, False)
+    driver = etid.identify_driver(study["c"])
+    assert isinstance(driver, HarmonicDriver)
+    return lane, given(driver, lane.frequency, False)
 
 
-def fit(scene, kind, seed, circuit=SKIN, gains=(1.0, 1.0, 1.0), last=1.0):
+def fit(scene, kind, seed, circuit: etid.AbstractCircuit = SKIN, gains=(1.0, 1.0, 1.0), last=1.0):
     """A fit with noise, Z_th and delays that are drawn.
 
     `gains` are those of the recorders, `last` is a factor of the noise of the last one.

@@ -1,8 +1,14 @@
 """The gains of a load: each output per input, with its delay.
 
+Another kind of data is another class of outputs, which may be anywhere: `Load.behind` takes it.
+
 All parameters act on a frequency through Z_L, the phase factors of the delays, and W. The code
 computes the derivatives with respect to these and applies the chain rule.
 """
+
+import abc
+from collections.abc import Callable
+from typing import ClassVar
 
 import equinox as eqx
 import jax
@@ -14,9 +20,53 @@ from etid.circuits.impedance import AbstractImpedance
 from etid.estimators.element_prior import ElementPrior
 from etid.estimators.estimate import DELAY_WIDTH
 from etid.estimators.maximum_likelihood.given_driver import AbstractGiven
-from etid.estimators.maximum_likelihood.outputs import AbstractOutputs, Voltage
 from etid.signals.knots import Knots
 from etid.signals.transfer import as_complex, combined, delayed, frequency_variable
+
+Current = Callable[[Complex[Array, " frequency"]], Complex[Array, " frequency"]]
+"""Current per input of all that is connected to the source, from its impedance [Ω]."""
+
+
+class AbstractOutputs(eqx.Module):
+    """The outputs as functions of the impedance of the load.
+
+    Attributes:
+        count: Number of outputs. Each has a delay, and a gain that is tested. The first is V_out;
+            the scales of the others are tested against the driver.
+    """
+
+    count: ClassVar[int]
+
+    @abc.abstractmethod
+    def __call__(
+        self, z_load: Complex[Array, " frequency"], current: Current
+    ) -> Complex[Array, "output frequency"]:
+        """The outputs per input."""
+
+
+class Voltage(AbstractOutputs):
+    """V_out."""
+
+    count: ClassVar[int] = 1
+
+    def __call__(
+        self, z_load: Complex[Array, " frequency"], current: Current
+    ) -> Complex[Array, "1 frequency"]:
+        """Z_L I."""
+        return (z_load * current(z_load))[None, :]
+
+
+class VoltageAndCurrent(AbstractOutputs):
+    """V_out and the current through the load."""
+
+    count: ClassVar[int] = 2
+
+    def __call__(
+        self, z_load: Complex[Array, " frequency"], current: Current
+    ) -> Complex[Array, "2 frequency"]:
+        """Z_L I and I."""
+        i = current(z_load)
+        return jnp.stack([z_load * i, i])
 
 
 class Slopes(eqx.Module):

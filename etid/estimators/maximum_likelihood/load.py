@@ -17,13 +17,14 @@ from jaxtyping import Array, Bool, Complex, Float
 from etid.circuits.circuit import AbstractCircuit
 from etid.estimators.element_prior import ElementPrior
 from etid.estimators.maximum_likelihood.condensed import Condensed, apart
-from etid.estimators.maximum_likelihood.gains import Gains, Slopes
-from etid.estimators.maximum_likelihood.given_driver import AbstractGiven, UnloadedEstimate
-from etid.estimators.maximum_likelihood.outputs import (
+from etid.estimators.maximum_likelihood.gains import (
     AbstractOutputs,
+    Gains,
+    Slopes,
     Voltage,
     VoltageAndCurrent,
 )
+from etid.estimators.maximum_likelihood.given_driver import AbstractGiven, UnloadedEstimate
 from etid.estimators.maximum_likelihood.profile import Profile, Records
 from etid.estimators.score_tests import falling_resistance, other_circuit
 from etid.signals.knots import Knots, knots
