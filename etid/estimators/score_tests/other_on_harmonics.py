@@ -49,7 +49,8 @@ def scores(
     profile, elements = near.profile, own.log_elements.size
     values = jnp.stack([profile.share[None], profile.excess(load.records)])
     prior = jnp.diag(jnp.pad(jnp.ones(count), (elements + 1, 0)))
-    linear = Linear(near.jacobian, *means([profile], load.knots, values), prior)
+    share, noise = means([profile], load.knots, values)
+    linear = Linear(near.jacobian, share, noise, prior)
     found = other_circuit.scores(
         near.condensed.rows(changes(load, near)),
         linear,
