@@ -46,7 +46,7 @@ TESTS: Mapping[str, Sequence[str]] = {
     ),
     "estimators.maximum_likelihood.load": _WELL,
     "estimators.maximum_likelihood.load_fit": _WELL,
-    "estimators.maximum_likelihood.terms": ("maximum_likelihood", "mains"),
+    "estimators.maximum_likelihood.profile": ("maximum_likelihood", "mains"),
     "estimators.non_parametric.fit": ("non_parametric",),
     "estimators.output_error.fit": ("output_error", "current", "identification"),
     "estimators.output_error.information": ("output_error", "identification"),

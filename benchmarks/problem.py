@@ -45,7 +45,7 @@ class Problem(NamedTuple):
         """A lane with Z_th as it is; calling it gives the terms of elements and delay."""
         rate = jnp.asarray(one.sample_rate)
         gains = Gains(self.known, SkinRC(), one.spectrum.frequency, rate)
-        return Load(gains, Records.of(one.spectrum), None)
+        return Load(gains, Records.of(one.spectrum))
 
 
 def terms(own: Float[Array, " own"], load: Load) -> Float[Array, " term"]:

@@ -81,7 +81,7 @@ def test_what_counts_is_what_the_parameters_cannot_do():
     found = jax.jit(
         lambda added, error: score(
             added[None],
-            Profile(still, still, ones, ones, error[None], x),
+            Profile(still, still, ones, ones, error[None], x, ones[0]),
             ones[0],
             ones,
             slopes[:, None],

@@ -16,7 +16,7 @@ from etid.estimators.joint import near
 from etid.estimators.joint.fit import fit_alone
 from etid.estimators.joint.terms import DriverStudy, Joint, Loads
 from etid.estimators.lanes import Harmonics
-from etid.estimators.maximum_likelihood.driver import Calibrations
+from etid.estimators.maximum_likelihood.calibrations import Calibrations
 from etid.estimators.maximum_likelihood.given_driver import GivenDriver
 from etid.estimators.starts import harmonic_starts
 from etid.estimators.unknowns import LoadUnknowns

@@ -12,11 +12,10 @@ import scipy.signal
 
 import etid
 from etid.circuits.circuit import SkinRC
-from etid.circuits.elements import resistor
 from etid.estimators import registry
 from etid.estimators.lanes import Harmonics
 from etid.estimators.maximum_likelihood import load, load_fit
-from etid.estimators.maximum_likelihood import terms as likelihood
+from etid.estimators.maximum_likelihood.calibrations import Calibrations
 from etid.estimators.maximum_likelihood.load import Load
 from etid.estimators.maximum_likelihood.profile import Records
 from etid.estimators.registry import MAXIMUM_LIKELIHOOD
@@ -142,10 +141,12 @@ def test_the_likeliest_start_is_taken_unless_it_is_bad(monkeypatch, starts, best
 
 
 def test_the_gain_is_that_of_the_divider(driver):
-    frequency = jnp.array([60.0, 5e3, 60e3])
-    g = likelihood.gain(driver.source, resistor(jnp.asarray(98.8e3)), frequency)
-    expected = 98.8e3 / (98.8e3 + np.asarray(driver.response(frequency)))
-    np.testing.assert_allclose(g, expected, rtol=1e-12)
+    of = Calibrations.of(driver)
+    f = np.asarray(of.spectra.frequency[0])
+    r, late = float(driver.calibration.r_load[0]), float(driver.calibration.delay_samples[0])
+    expected = r / (r + np.asarray(driver.response(f)))
+    expected = expected * np.exp(-2j * np.pi * f * late / float(driver.sample_rate))
+    np.testing.assert_allclose(of.gains(of.start())[0], expected, rtol=1e-12)
 
 
 @pytest.mark.slow
@@ -248,7 +249,7 @@ def test_the_gradient_of_a_load_is_that_of_its_sum_of_squares(study, driver, sha
 
     @jax.jit
     def both(q, lane):
-        of = Load.behind(known, SkinRC(), lane.spectrum, lane.sample_rate)
+        of = Load.behind(known, SkinRC(), Records.of(lane.spectrum), lane.sample_rate)
         by_jax = jax.value_and_grad(lambda q: 0.5 * jnp.sum(of.residual(q) ** 2))(q)
         found = of.equations(q)
         return by_jax, (found.objective, found.gradient)

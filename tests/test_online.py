@@ -16,7 +16,7 @@ from etid.estimators.joint.fit import fit_alone
 from etid.estimators.joint.terms import Joint
 from etid.estimators.lanes import Harmonics
 from etid.estimators.maximum_likelihood import given_driver
-from etid.estimators.maximum_likelihood.driver import Calibrations
+from etid.estimators.maximum_likelihood.calibrations import Calibrations
 from etid.estimators.starts import harmonic_starts
 from etid.online import changes, electrode, gain_bands
 from etid.online.tracker import Tracker

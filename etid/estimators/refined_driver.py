@@ -63,14 +63,14 @@ def from_harmonics(
     found = jax.lax.map(fit, starts)
     passive = jax.vmap(_is_passive, (0, 0, None))(found.source, found.cov, rate)
     ranked = jnp.argsort(_cost(found.source, found.cost, passive))
-    near = jax.tree.map(lambda leaf: leaf[ranked], found)
-    source, estimate, calibration, linear = maximum_likelihood.fit_source(
-        spectra, r_load, rate, near
+    candidates = jax.tree.map(lambda leaf: leaf[ranked], found)
+    calibrations, estimate, near, linear = maximum_likelihood.fit_source(
+        spectra, r_load, rate, candidates
     )
-    calibrations = maximum_likelihood.Calibrations(source, calibration, spectra, rate)
-    statistic = missing_pole.largest(calibrations, linear)
+    source, calibration = calibrations.source, calibrations.calibration
+    statistic = missing_pole.largest(calibrations, near, linear)
     if r_load.size > 1:
-        off = resistors.mismatch(calibrations, linear)
+        off = resistors.mismatch(calibrations, near, linear)
         calibration = dataclasses.replace(calibration, mismatch=off)
     terms = 2 * jnp.sum(spectra.selected, dtype=rate.dtype)
     passive = _is_passive(source, estimate.cov, rate)

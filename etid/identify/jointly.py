@@ -37,7 +37,7 @@ from etid.estimators.lanes import (
     unstacked,
 )
 from etid.estimators.maximum_likelihood import given_driver
-from etid.estimators.maximum_likelihood.driver import Calibrations
+from etid.estimators.maximum_likelihood.calibrations import Calibrations
 from etid.estimators.maximum_likelihood.estimator import description
 from etid.estimators.registry import MAXIMUM_LIKELIHOOD, register_description
 from etid.estimators.score_tests.other_circuit import NO_OTHER_CIRCUIT, NO_OTHER_GAIN
@@ -170,7 +170,7 @@ def _together(
         lambda d: (d.source, d.cov, d.calibration.delay_samples, d.result),
         driver,
         (
-            model.calibrations.z_th(common),
+            model.calibrations.source_of(common),
             cov[:kept, :kept],
             of_driver.delay_samples,
             RESULTS.where(

@@ -37,6 +37,7 @@ from etid.estimators.maximum_likelihood.estimator import MaximumLikelihood
 from etid.estimators.maximum_likelihood.given_driver import AbstractGiven, GivenDriver
 from etid.estimators.maximum_likelihood.load import Load
 from etid.estimators.maximum_likelihood.load_fit import refined
+from etid.estimators.maximum_likelihood.profile import Records
 from etid.estimators.registry import MAXIMUM_LIKELIHOOD, named
 from etid.identify.arguments import fed, require
 from etid.identify.one import is_shared, known_of, skin
@@ -93,10 +94,10 @@ class Minimum(eqx.Module):
 
 def terms_of(lane: Harmonics, known: Known, circuit: AbstractCircuit) -> Load:
     """The residuals of a recording."""
-    rate, current = jnp.asarray(lane.sample_rate), None
+    rate, records = jnp.asarray(lane.sample_rate), Records.of(lane.spectrum)
     if isinstance(lane, HarmonicsWithCurrent) and isinstance(known.driver, GivenDriver):
-        current = jnp.asarray(lane.i), jnp.asarray(lane.variance_i)
-    return Load.behind(known.driver, circuit, lane.spectrum, rate, known.elements, current)
+        records = Records.of(lane.spectrum, (jnp.asarray(lane.i), jnp.asarray(lane.variance_i)))
+    return Load.behind(known.driver, circuit, records, rate, known.elements)
 
 
 def cost(terms: Load, q: Float[Array, " q"]) -> Float[Array, ""]:

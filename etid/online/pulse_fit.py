@@ -18,11 +18,11 @@ from jaxtyping import Array, Bool, Complex, Float, Int
 
 from etid.circuits.circuit import AbstractCircuit
 from etid.estimators.estimate import DELAY_WIDTH
-from etid.estimators.maximum_likelihood.given_driver import GivenDriver, combined
+from etid.estimators.maximum_likelihood.given_driver import GivenDriver
 from etid.estimators.unknowns import LoadUnknowns
 from etid.online.gain_bands import Bands
 from etid.signals.harmonics import real_parts
-from etid.signals.transfer import as_complex, power, reciprocal
+from etid.signals.transfer import as_complex, combined, power, reciprocal
 from etid.solvers.matrices import inverse_of_few, root
 
 STEP = 0.1  # [samples] spacing of the grid of delays

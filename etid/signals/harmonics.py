@@ -30,6 +30,7 @@ WINDOW = 25  # harmonics over which power is averaged
 ALIASED = 0.35  # of the sample rate; above, aliases matter unless they fall between the harmonics
 DRIFT_DEGREE = 3  # degree of the polynomial that describes the drift of the mean
 ABSENT = 1e-6  # [standard deviations] coefficient and noise of a padded harmonic
+ROUNDING = 1e-12  # relative difference of two transforms of the same samples
 
 
 class Spectrum(eqx.Module):
@@ -50,6 +51,22 @@ class Spectrum(eqx.Module):
     variance_x: Float[Array, "*lane harmonic"]
     variance_y: Float[Array, "*lane harmonic"]
     selected: Bool[Array, "*lane harmonic"]
+
+
+def same_unloaded(
+    one: Complex[Array, " harmonic"], other: Complex[Array, " _"]
+) -> Bool[Array, ""] | bool:
+    """Whether the X of two recordings are transforms of the same unloaded record."""
+    if one is other:
+        return True
+    if one.shape != other.shape:
+        return False
+    return jnp.sum(power(one - other)) <= ROUNDING**2 * jnp.sum(power(other))
+
+
+def as_list(spectra: Spectrum) -> list[Spectrum]:
+    """A list of recordings, from recordings stacked along a leading axis."""
+    return [jax.tree.map(lambda leaf, i=i: leaf[i], spectra) for i in range(spectra.x.shape[0])]
 
 
 def whole_periods(samples: int, sample_rate: float, pulse_rate: float) -> tuple[int, int]:

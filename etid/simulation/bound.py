@@ -1,19 +1,19 @@
 """The Cramer-Rao bound of a scene: the smallest standard errors of any unbiased estimator.
 
-At every harmonic k the records are X_k and Y_k = G_k e^(−jω_k τ) X_k with G = Z_L / (Z_L + Z_th),
-and the same for each calibration. All records have white noise. The rounding error of a coarse
-converter is noise that is not white (`etid.signals.noise`): where the signal is slow, it is the
-same in each period. X_k and Z_th(f_k) are unknown complex numbers at every harmonic, so the bound
-holds for every kind of driver. A recorded current I_k = X_k / (Z_L + Z_th), with a delay of its
-own, is one more record. Without a calibration V_th tells nothing about the load, and the bound is
-that of Y_k = Z_L e^(−jω_k τ) I_k. To project the unknown numbers out leaves the Fisher information
-of the elements and the trigger delays,
+At every harmonic the records are an input X and outputs G_m e^(−jωτ_m) X: V_out of the trial with
+G = Z_L / (Z_L + Z_th), the current with 1 / (Z_L + Z_th) if it is recorded, and V_out of each
+calibration. All records have white noise. The rounding error of a coarse converter is noise that is
+not white (`etid.signals.noise`): where the signal is slow, it is the same in each period. X and
+Z_th are unknown complex numbers at every harmonic, so the bound holds for every kind of driver.
+Without a calibration V_th tells nothing about the load, and the bound is that of the input I and
+the output Z_L e^(−jωτ) I. The information about the gains is (Pintelon and Schoukens, System
+Identification, 2012, ch. 9 and 16; `etid.estimators.maximum_likelihood.profile`)
 
-    F = 2 Re Σ_k A_kᴴ (I − B_k B_k⁺) A_k.
+    P = 2 |X|² (diag(w) − (w G)(w G)ᴴ / τ),      τ = w_x + Σ w |G|²,      w = 1/σ²,
 
-A holds the derivatives with respect to elements and delays, B those with respect to X_k and
-Z_th(f_k). Both are divided by the standard deviation of a coefficient (Pintelon and Schoukens,
-System Identification, 2012, ch. 9 and 16).
+and that about the elements and the delays, with Z_th projected out,
+
+    F = Re Σ_k (Aᴴ P A − Aᴴ P B Bᴴ P A / Bᴴ P B),      A = ∂G/∂q,      B = ∂G/∂Z_th.
 """
 
 import dataclasses
@@ -215,43 +215,42 @@ def _covariance(
     `x` is in standard deviations of a coefficient with white noise; `noise` is from `_noise`, and
     `current` from `_current_noise`.
     """
-    loads = [circuit, *known]
-    frequency = jnp.asarray(f)
+    frequency, loads = jnp.asarray(f), [circuit, *known]
     z = [np.asarray(load.response(frequency)) for load in loads]
-    gains = [loading(z_load, z_th) for z_load in z]
     slope = jax.jacfwd(lambda log: circuit.with_log_values(log).response(frequency))(
         circuit.log_values()
     )
-    elements, records = slope.shape[1], len(loads)
-    uses_v_th = known_driver or bool(known)
+    of_v_out, of_v_th = noise[: len(loads)], noise[len(loads) :]
+    if known_driver or known:
+        loop = 1 / (z[0] + z_th)
+        outputs = [(z[0] * loop, z_th * loop**2, of_v_out[0])]
+        if current is not None:
+            outputs.append((loop, -(loop**2), np.full(f.size, current)))
+        gains, by_load, of_y = (np.stack(of) for of in zip(*outputs, strict=True))
+        record = np.append(np.zeros(len(outputs), int), np.arange(1, len(loads)))
+        total = np.stack([*[z[0]] * len(outputs), *z[1:]]) + z_th
+        gains = np.stack([*gains, *(loading(of, z_th) for of in z[1:])])
+        of_y, by_z_th = np.stack([*of_y, *of_v_out[1:]]), -gains / total
+        record, of_x = (0 * record, of_v_th[:1]) if shared_v_th else (record, of_v_th)
+    else:
+        x, gains, by_load, by_z_th = x / (z[0] + z_th), np.stack(z[:1]), np.ones((1, f.size)), None
+        of_y, record, of_x = of_v_out[:1], np.zeros(1), np.full((1, f.size), current)
+    count, elements = gains.shape[0], slope.shape[1]
+    a = np.zeros((count, elements + count, f.size), complex)
+    a[: len(by_load), :elements] = by_load[:, None] * np.asarray(slope).T
     turn = 2j * np.pi * f * 1e-6  # delays in microseconds
-    # Rows: the loaded records, the unloaded ones, and the current.
-    unloaded = [0] * records if shared_v_th else list(range(records))
-    rows = records + max(unloaded) + 1
-    a = np.zeros((f.size, rows + 1, elements + records + 1), complex)
-    b = np.zeros((f.size, rows + 1, rows - records + 1), complex)
-    for i, (z_load, g) in enumerate(zip(z, gains, strict=True)):
-        b[:, i, unloaded[i]] = g
-        b[:, records + unloaded[i], unloaded[i]] = 1
-        b[:, i, -1] = -g * x / (z_load + z_th)
-        a[:, i, elements + i] = -turn * g * x
-    a[:, 0, :elements] = (x * z_th / (z[0] + z_th) ** 2)[:, None] * np.asarray(slope)
-    weight = np.zeros((f.size, rows + 1, 1))
-    weight[:, :rows, 0] = 1 / noise[:rows].T
-    if current is not None:
-        flowing = 1 / (z[0] + z_th)
-        b[:, rows, 0], b[:, rows, -1] = flowing, -(flowing**2) * x
-        a[:, rows, :elements] = (-(flowing**2) * x)[:, None] * np.asarray(slope)
-        a[:, rows, -1] = -turn * flowing * x
-        weight[:, rows] = 1 / current
-    if not uses_v_th:
-        weight[:, records:rows] = 0
-    # Without V_th only the delay between V_out and the current matters.
-    timed = elements + records + (current is not None and uses_v_th)
-    a = weight * a[:, :, : timed if delays else elements]
-    b = weight * (b[:, :, :-1] if known_driver or not uses_v_th else b)
-    q, _ = np.linalg.qr(b)
-    rest = a - q @ (np.conj(np.swapaxes(q, 1, 2)) @ a)
-    flat = rest.reshape(-1, a.shape[2])
-    information = 2 * np.real(np.conj(flat.T) @ flat)
+    a[range(count), range(elements, elements + count)] = -turn * gains
+    a = a if delays else a[:, :elements]
+    p = np.zeros((count, count, f.size), complex)
+    for number, deviation in enumerate(of_x):
+        w = (record == number)[:, None] / of_y**2
+        tau = 1 / deviation**2 + np.sum(w * np.abs(gains) ** 2, axis=0)
+        p += np.eye(count)[:, :, None] * w - (w * gains)[:, None] * np.conj(w * gains) / tau
+    p *= 2 * np.abs(x) ** 2
+    by_p = np.einsum("mnk,nqk->mqk", p, a)
+    information = np.einsum("mpk,mqk->pq", np.conj(a), by_p).real
+    if by_z_th is not None and not known_driver:
+        cross = np.einsum("mk,mqk->qk", np.conj(by_z_th), by_p)
+        of_z_th = np.einsum("mk,mnk,nk->k", np.conj(by_z_th), p, by_z_th).real
+        information -= np.einsum("pk,qk->pq", np.conj(cross), cross / of_z_th).real
     return np.asarray(inverse(jnp.asarray(information)))[:elements, :elements]

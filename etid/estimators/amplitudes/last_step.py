@@ -28,7 +28,7 @@ from jax.scipy.sparse.linalg import cg
 from jaxtyping import Array, Complex, Float
 
 from etid.estimators.amplitudes.terms import Amplitudes
-from etid.estimators.maximum_likelihood.terms import excess, variance
+from etid.estimators.maximum_likelihood.profile import Profile, excess
 from etid.estimators.sandwich import Curvature
 from etid.signals.harmonics import ALIASED, Spectrum, real_parts, signal_share
 from etid.signals.transfer import as_complex, power
@@ -129,7 +129,7 @@ def _likeliest(
     change = around.back(around.solved(rest))
     count = spectrum.x.size
     x = spectrum.x + jax.lax.complex(change[:count], change[count:])
-    total = variance(spectrum, of.gain(spectrum)(own)[0])
+    total = Profile.of_output(spectrum, of.gain(spectrum)(own)[0]).expected[0]
     return x, signal_share(x, spectrum.variance_x * spectrum.variance_y / total)
 
 

@@ -16,7 +16,7 @@ from jaxtyping import Array, Float
 
 from etid.circuits.current_dependent import current_dependent
 from etid.estimators.amplitudes.terms import STILL, Amplitudes
-from etid.estimators.maximum_likelihood.terms import residual
+from etid.estimators.maximum_likelihood.profile import Profile
 from etid.estimators.unknowns import LoadUnknowns
 from etid.signals.harmonics import Spectrum
 from etid.signals.transfer import power
@@ -37,7 +37,7 @@ def likeliest(of: Amplitudes) -> Float[Array, "record own"]:
         gain = of.gain(spectrum)
         starts = of.given.starts(spectrum, of.sample_rate, of.circuit).log_elements
         each = jax.vmap(lambda logs: LoadUnknowns(logs, jnp.zeros(())).vector())(starts)
-        return best_start(lambda own: residual(spectrum, gain(own)[0]), each)
+        return best_start(lambda own: Profile.of_output(spectrum, gain(own)[0]).terms[0], each)
 
     return jax.lax.map(one, of.spectra)
 

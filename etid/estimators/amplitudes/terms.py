@@ -1,7 +1,7 @@
 """The terms of one load that was recorded at several amplitudes, and their derivatives.
 
 All records have the same elements and the same driver; each has its own trigger delay. The terms
-are those of `etid.estimators.maximum_likelihood.terms`, but the load need not be linear:
+are those of `etid.estimators.maximum_likelihood.profile`, but the load need not be linear:
 
     Y_k − V_k(X) e^(−jω_k τ),      V_k(X) = Z_L / (Z_L + Z_th) X_k for a linear load.
 
@@ -26,7 +26,7 @@ from etid.circuits.current_dependent import Norton, Port, Signals, current_depen
 from etid.estimators.element_prior import ElementPrior
 from etid.estimators.maximum_likelihood.gains import Gains
 from etid.estimators.maximum_likelihood.given_driver import AbstractGiven, GivenDriver
-from etid.estimators.maximum_likelihood.terms import variance
+from etid.estimators.maximum_likelihood.profile import Profile
 from etid.estimators.unknowns import LoadUnknowns
 from etid.results.driver import HarmonicDriver
 from etid.results.feed import MeasuredCurrent
@@ -71,7 +71,7 @@ class Amplitudes(eqx.Module):
         """
 
         def one(own: Float[Array, " own"], spectrum: Spectrum) -> Float[Array, " harmonic"]:
-            return variance(spectrum, self.gain(spectrum).undelayed(own)[0])
+            return Profile.of_output(spectrum, self.gain(spectrum).undelayed(own)[0]).expected[0]
 
         return dataclasses.replace(self, expected=jax.vmap(one)(own, self.spectra))
 

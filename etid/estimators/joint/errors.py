@@ -2,8 +2,8 @@
 
     cov = H⁻¹ (Jᵀ C J) H⁻¹
 
-is that of `etid.estimators.maximum_likelihood.terms`. For `common` the own parameters of the loads
-are eliminated. A load inherits K cov Kᵀ with its slope K = −A⁻¹ B.
+is that of `etid.estimators.sandwich`. For `common` the own parameters of the loads are eliminated.
+A load inherits K cov Kᵀ with its slope K = −A⁻¹ B.
 
 **One unloaded record in several loads** has the same noise of X in all of them. The fit takes the
 loads as independent, but the standard errors do not. The effect of unit noise in X on the terms of
@@ -114,7 +114,8 @@ def estimates(
         _of_group(study, loads, common, own, several=count > 0)
         for loads, own, count in zip(groups, owns, several, strict=True)
     ]
-    total, pull = model.calibrations.linear(common).curvature(), jnp.zeros_like(common)
+    of, pull = model.calibrations, jnp.zeros_like(common)
+    total = of.linear(of.near(common)).curvature()
     for loads, (eliminated, *_) in zip(groups, found, strict=True):
         used = jax.tree.map(
             lambda leaf, loads=loads: jnp.where(loads.used[:, None, None], leaf, 0.0).sum(0),

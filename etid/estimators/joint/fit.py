@@ -19,7 +19,6 @@ from etid.estimators.estimate import MAX_STEPS, SOLVER
 from etid.estimators.joint.errors import Found, estimates
 from etid.estimators.joint.near import approached
 from etid.estimators.joint.terms import Current, DriverStudy, Joint, Loads, Own, in_turn
-from etid.estimators.maximum_likelihood import driver as calibrations
 from etid.estimators.maximum_likelihood import load_fit
 from etid.estimators.maximum_likelihood.given_driver import GivenDriver
 from etid.estimators.maximum_likelihood.load_fit import SLIGHT
@@ -63,7 +62,7 @@ def _equations(_, y: Float[Array, " parameter"], study: DriverStudy) -> Arrowhea
 
     found = [of_group(*group) for group in zip(study.groups, parts, strict=True)]
     loads = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *found)
-    known = calibrations.equations(None, common, study.model.calibrations)
+    known = study.model.calibrations.near(common).equations()
     o = study.owned
     return ArrowheadEquations(
         known.objective + loads.objective.sum(),
@@ -112,7 +111,7 @@ def _second_order(
 
     found = [of_group(*group) for group in zip(study.groups, parts, steps, strict=True)]
     loads, o = jnp.concatenate(found), study.owned
-    known = calibrations.second_order(None, common, towards, study.model.calibrations)
+    known = study.model.calibrations.second_order(common, towards)
     return join(known + loads[:, o:].sum(0), loads[:, :o])
 
 

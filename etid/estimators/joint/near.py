@@ -25,22 +25,17 @@ from jaxtyping import Array, Bool, Complex, Float, Int
 
 from etid.estimators.estimate import MAX_STEPS
 from etid.estimators.joint.terms import DriverStudy, Loads, Own, in_turn
-from etid.estimators.maximum_likelihood.driver import Calibrations
+from etid.estimators.maximum_likelihood.calibrations import DENSE, Calibrations
+from etid.estimators.maximum_likelihood.condensed import apart
 from etid.estimators.maximum_likelihood.given_driver import GivenDriver
-from etid.estimators.maximum_likelihood.terms import (
-    apart,
-    by_gains,
-    denoised,
-    residuals,
-)
-from etid.signals.knots import Knots, knots
+from etid.estimators.maximum_likelihood.profile import total
+from etid.signals.knots import knots
 from etid.signals.transfer import as_complex, reciprocal
 from etid.solvers.arrowhead import join
 from etid.solvers.least_squares import least_squares
 from etid.solvers.levenberg_marquardt import DIFFERENCE, LevenbergMarquardt, NormalEquations
 from etid.solvers.matrices import inverse_root
 
-DENSE = 32  # density of the knots: the floor of the driver's valley is flat
 ROUNDS = 10  # largest number of points; from 40 dB on, two or three are enough
 ENOUGH = 0.02  # reduction of ½ Σ r² below which the next point is the minimum
 W = 2  # number of signals of W: real and imaginary part
@@ -79,7 +74,7 @@ class _Near(eqx.Module):
     """A study near one point.
 
     Attributes:
-        calibrations: The calibrations at their knots.
+        calibrations: The calibrations.
         centre: Common parameters of the point.
         frequency: Frequencies of the knots of each group [Hz].
         parts: The calibrations, then each group of loads.
@@ -102,19 +97,18 @@ class _Near(eqx.Module):
         self, common: Float[Array, " common"], frequency: Float[Array, " knot"]
     ) -> Complex[Array, " knot"]:
         resistance = as_complex(self.calibrations.calibration.r_load.mean())
-        return self.calibrations.z_th(common).response(frequency) + resistance
+        return self.calibrations.source_of(common).response(frequency) + resistance
 
     def signals(self, common: Float[Array, " common"]) -> list[Float[Array, "signal knot"]]:
         """The signals of each part."""
-        known = jnp.stack(self.calibrations.gains(common))
+        known = self.calibrations.gains(common, self.calibrations.knots)
         of_w = [jnp.log(self._loaded(common, f))[None] for f in self.frequency]
         return self._of_each(_parts(known), list(map(_parts, of_w)), 0)
 
     def slopes(self, common: Float[Array, " common"]) -> list[Float[Array, "common signal knot"]]:
         """Derivatives of the signals."""
-        of, source = self.calibrations, self.calibrations.z_th(common)
-        gains = of.gains(common)
-        known = jnp.stack(of.gain_slopes(common, gains, of.by_z(common, gains)), axis=1)
+        source = self.calibrations.source_of(common)
+        known = self.calibrations.slopes(common, self.calibrations.knots).by_common
         of_w = []
         for f in self.frequency:
             rows = source.slopes(f) * reciprocal(self._loaded(common, f))[None, :]
@@ -165,25 +159,20 @@ def _second_order(
     return found
 
 
-def _of_calibrations(
-    calibrations: Calibrations, common: Float[Array, " common"], every: Knots
-) -> _Part:
+def _of_calibrations(calibrations: Calibrations, common: Float[Array, " common"]) -> _Part:
     """The calibrations as a function of their gains."""
-    records, gains = calibrations.records, calibrations.gains(common)
-    signals = 2 * len(records)
-
-    def of_gains(_: Float[Array, " common"]) -> tuple[Array, Array, Array]:
-        terms = jnp.concatenate(residuals(records, gains))
-        noisy, clean = (
-            by_gains(of, gains).reshape(signals, signals, -1)
-            for of in (records, denoised(records, gains)[0])
-        )
-        pull = jnp.einsum("stk,tk->sk", noisy, terms.reshape(signals, -1))
-        return 0.5 * jnp.dot(terms, terms), pull, jnp.einsum("stk,utk->suk", clean, clean)
-
-    value, pull, curvature = apart(of_gains, common)
-    none = jnp.zeros((0, signals, every.index.size))
-    return _Part(value, every.summed(pull), every.summed(curvature), none, jnp.zeros(0))
+    near = calibrations.near(common)
+    records, size = near.condensed.gains.shape
+    unit = jnp.array([1.0, 1.0j])
+    alone = as_complex(jnp.eye(records))[:, None, :] * unit[None, :, None]
+    alone = jnp.tile(alone.reshape(2 * records, records, 1), (1, 1, size))
+    rows = near.condensed.rows(alone).reshape(2 * records, -1, size)
+    part = near.condensed.part.reshape(-1, size)
+    pull = jnp.einsum("stk,tk->sk", rows, part)
+    curvature = jnp.einsum("stk,utk->suk", rows, rows)
+    objective = total([of.objective for of in near.profiles])
+    none = jnp.zeros((0, 2 * records, size))
+    return _Part(objective, pull, curvature, none, jnp.zeros(0))
 
 
 def _by_signals(driver: GivenDriver, shared: bool) -> GivenDriver:
@@ -301,14 +290,10 @@ def _next(
 ) -> tuple[Float[Array, " parameter"], Float[Array, ""], Float[Array, ""]]:
     """The minimum of a study as it looks from `y`, ½ Σ r² at `y`, and its expected reduction."""
     common, parts = study.split(y)
-    of = study.model.calibrations
-    every = knots(of.spectra.x.shape[-1], DENSE)
-    known = _of_calibrations(of, common, every)
+    known = _of_calibrations(study.model.calibrations, common)
     groups = [_of_group(study, common, *group) for group in zip(study.groups, parts, strict=True)]
     near = _Near(
-        dataclasses.replace(
-            of, spectra=jax.tree.map(lambda leaf: leaf[..., every.index], of.spectra)
-        ),
+        study.model.calibrations,
         common,
         [knots(g.spectrum.x.shape[-1], DENSE).at(g.frequency[0]) for g in study.groups],
         [known, *(part for part, _ in groups)],

@@ -59,7 +59,7 @@ def seen_at(
     profile, condensed = near.profile, near.condensed
     noise = profile.excess(records)
     share = jnp.broadcast_to(signal_share(profile.x, records.variance_x), noise.shape)
-    of_noise = means(profile, lane.knots, jnp.stack([share, noise]))
+    of_noise = means([profile], lane.knots, jnp.stack([share, noise]))
     linear = _linear(lane, q, o, near.jacobian, of_noise)
     rows = _padded(condensed.rows(changes(lane, near)), o)
     seen = Seen(

@@ -17,9 +17,10 @@ from jaxtyping import Array, Bool, Complex, Float, Int
 from etid.circuits.circuit import AbstractCircuit
 from etid.estimators.element_limits import Limits
 from etid.estimators.element_prior import ElementPrior
-from etid.estimators.maximum_likelihood.driver import Calibrations
+from etid.estimators.maximum_likelihood.calibrations import Calibrations
 from etid.estimators.maximum_likelihood.given_driver import GivenDriver, around
 from etid.estimators.maximum_likelihood.load import Load
+from etid.estimators.maximum_likelihood.profile import Records
 from etid.estimators.unknowns import LoadUnknowns, LoadWithCurrentUnknowns
 from etid.signals.harmonics import Spectrum
 from etid.solvers.arrowhead import join, split
@@ -66,7 +67,8 @@ class Joint(eqx.Module):
         current: Current | None,
     ) -> Load:
         """One load behind this driver."""
-        return Load.behind(driver, self.circuit, spectrum, sample_rate, self.prior, current)
+        records = Records.of(spectrum, *([] if current is None else [current]))
+        return Load.behind(driver, self.circuit, records, sample_rate, self.prior)
 
 
 class Loads(eqx.Module):

@@ -13,12 +13,15 @@ before it, like its innovation. The terms are a residual for any solver, at a fe
 cost of all harmonics.
 """
 
+from collections.abc import Callable, Sequence
+from typing import Any
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Complex, Float
 
-from etid.estimators.maximum_likelihood.profile import Profile
+from etid.estimators.maximum_likelihood.profile import Profile, total
 from etid.signals.harmonics import real_parts
 from etid.signals.knots import Knots
 from etid.signals.transfer import as_complex
@@ -38,10 +41,11 @@ class Condensed(eqx.Module):
     target: Complex[Array, "output knot"]
 
     @classmethod
-    def of(cls, profile: Profile, every: Knots) -> "Condensed":
-        """The likelihood near the gains of `profile`."""
-        information, outputs = profile.information, profile.gains.shape[0]
-        rows = jnp.concatenate([information.reshape(outputs**2, -1), profile.score])
+    def of(cls, profiles: Sequence[Profile], every: Knots) -> "Condensed":
+        """The likelihood near the gains of `profiles`, one for each input."""
+        information = total([of.information for of in profiles])
+        score, outputs = total([of.score for of in profiles]), information.shape[0]
+        rows = jnp.concatenate([information.reshape(outputs**2, -1), score])
         real, imaginary = every.summed(jnp.stack([rows.real, rows.imag]))
         sums = jax.lax.complex(real, imaginary)
         p, score = sums[: outputs**2].reshape(outputs, outputs, -1), sums[outputs**2 :]
@@ -53,7 +57,7 @@ class Condensed(eqx.Module):
             target.append(score[number] * scale)
             p = p - jnp.conj(root[-1])[:, None] * root[-1][None]
             score = score - jnp.conj(root[-1]) * target[-1][None]
-        return cls(every.at(profile.gains), jnp.stack(root[::-1]), jnp.stack(target[::-1]))
+        return cls(every.at(profiles[0].gains), jnp.stack(root[::-1]), jnp.stack(target[::-1]))
 
     def rows(self, changes: Complex[Array, "row output knot"]) -> Float[Array, "row part"]:
         """Changes of the terms by changes of the gains."""
@@ -74,10 +78,26 @@ class Condensed(eqx.Module):
 
 
 def means(
-    profile: Profile, every: Knots, values: Float[Array, "row output harmonic"]
+    profiles: Sequence[Profile], every: Knots, values: Float[Array, "row output harmonic"]
 ) -> Float[Array, "row part"]:
     """Means of `values` of the innovations for each condensed term, weighted by information."""
-    size = profile.size
-    total, sums = jnp.split(every.summed(jnp.concatenate([size[None], values * size[None]])), (1,))
-    found = sums / jnp.where(total > 0, total, 1.0)
+    size = total([of.size for of in profiles])
+    whole, sums = jnp.split(every.summed(jnp.concatenate([size[None], values * size[None]])), (1,))
+    found = sums / jnp.where(whole > 0, whole, 1.0)
     return jnp.tile(found.reshape(values.shape[0], -1), (1, 2))
+
+
+def apart(evaluate: Callable[[Array], Any], q: Float[Array, " q"]) -> Any:
+    """`evaluate(q)`, computed once; NaN if `q` is not finite.
+
+    XLA repeats a computation in every loop that reads its result, here a dozen times. It computes
+    the result of a branch only once.
+    """
+    # JAX remembers the trace of this function, so that branches within branches are traced once.
+    once = jax.jit(lambda q: evaluate(q))
+    shapes = jax.eval_shape(once, q)
+
+    def nothing(_) -> Any:
+        return jax.tree.map(lambda of: jnp.full(of.shape, jnp.nan, of.dtype), shapes)
+
+    return jax.lax.cond(jnp.isfinite(q).all(), once, nothing, q)

@@ -16,10 +16,12 @@ from etid.estimators.estimator import (
     AbstractEstimator,
     Description,
 )
-from etid.estimators.judgement import STRAINED, judged, unless
+from etid.estimators.judgement import STRAINED
 from etid.estimators.lanes import Harmonics, HarmonicsWithCurrent
 from etid.estimators.maximum_likelihood import given_driver, load_fit
 from etid.estimators.maximum_likelihood.given_driver import AbstractGiven, GivenCurrent, GivenDriver
+from etid.estimators.maximum_likelihood.load import Load
+from etid.estimators.maximum_likelihood.profile import Records
 from etid.estimators.refined_driver import from_harmonics
 from etid.estimators.score_tests import missing_pole
 from etid.estimators.score_tests.falling_resistance import NO_FALL
@@ -28,7 +30,6 @@ from etid.estimators.score_tests.unloaded import UnloadedShape, shape_of
 from etid.results.driver import Driver, HarmonicDriver
 from etid.results.feed import MeasuredCurrent
 from etid.results.fit import Fit
-from etid.results.verdicts import RESULTS
 
 
 def description(words: str, estimated: str, unknowns: str, tests: tuple[str, ...]) -> Description:
@@ -125,19 +126,19 @@ class MaximumLikelihood(AbstractEstimator):
         """Refine from the best of several starts, jointly with the uncertain part of the driver."""
         spectrum, rate = lane.spectrum, jnp.asarray(lane.sample_rate)
         prior = ElementPrior.of(self.known_elements, circuit) if self.known_elements else None
-        current = None
+        records = Records.of(spectrum)
         if isinstance(lane, HarmonicsWithCurrent) and isinstance(known, GivenDriver):
             current = jnp.asarray(lane.i), jnp.asarray(lane.variance_i)
+            records = Records.of(spectrum, current)
             by_current = dataclasses.replace(spectrum, x=current[0], variance_x=current[1])
             starts = GivenCurrent.at(known.frequency).starts(by_current, rate, circuit)
         else:
             starts = known.starts(spectrum, rate, circuit)
-        found = load_fit.fit_circuit(known, circuit, spectrum, rate, starts, prior, current)
-        fit = judged(found.estimate, circuit, driver.result, str(self), self.bounds)
-        fit = unless(fit, found.scale, RESULTS.inconsistent)
+        load = Load.behind(known, circuit, records, rate, prior)
+        found = load_fit.fit_circuit(load, starts)
         if known.shape is not None:
-            fit = unless(fit, known.shape.differs(spectrum), RESULTS.inconsistent)
-        return unless(unless(fit, found.far, RESULTS.driver_unclear), found.other, RESULTS.misfit)
+            found = found._replace(inconsistent=found.inconsistent | known.shape.differs(spectrum))
+        return found.judged(circuit, driver.result, str(self), self.bounds)
 
     def describe(self) -> Description:
         """The text for a methods section."""

@@ -1,8 +1,14 @@
-"""The gains of a load: V_out per input, and the current per input if it is measured beside V_th.
+"""The gains of a load: each output per input, with its delay.
+
+Another kind of data is another class of outputs, which may be anywhere: `Load.behind` takes it.
 
 All parameters act on a frequency through Z_L, the phase factors of the delays, and W. The code
 computes the derivatives with respect to these and applies the chain rule.
 """
+
+import abc
+from collections.abc import Callable
+from typing import ClassVar
 
 import equinox as eqx
 import jax
@@ -13,9 +19,54 @@ from etid.circuits.circuit import AbstractCircuit
 from etid.circuits.impedance import AbstractImpedance
 from etid.estimators.element_prior import ElementPrior
 from etid.estimators.estimate import DELAY_WIDTH
-from etid.estimators.maximum_likelihood.given_driver import AbstractGiven, combined
+from etid.estimators.maximum_likelihood.given_driver import AbstractGiven
 from etid.signals.knots import Knots
-from etid.signals.transfer import as_complex, delayed, frequency_variable
+from etid.signals.transfer import as_complex, combined, delayed, frequency_variable
+
+Current = Callable[[Complex[Array, " frequency"]], Complex[Array, " frequency"]]
+"""Current per input of all that is connected to the source, from its impedance [Ω]."""
+
+
+class AbstractOutputs(eqx.Module):
+    """The outputs as functions of the impedance of the load.
+
+    Attributes:
+        count: Number of outputs. Each has a delay, and a gain that is tested. The first is V_out;
+            the scales of the others are tested against the driver.
+    """
+
+    count: ClassVar[int]
+
+    @abc.abstractmethod
+    def __call__(
+        self, z_load: Complex[Array, " frequency"], current: Current
+    ) -> Complex[Array, "output frequency"]:
+        """The outputs per input."""
+
+
+class Voltage(AbstractOutputs):
+    """V_out."""
+
+    count: ClassVar[int] = 1
+
+    def __call__(
+        self, z_load: Complex[Array, " frequency"], current: Current
+    ) -> Complex[Array, "1 frequency"]:
+        """Z_L I."""
+        return (z_load * current(z_load))[None, :]
+
+
+class VoltageAndCurrent(AbstractOutputs):
+    """V_out and the current through the load."""
+
+    count: ClassVar[int] = 2
+
+    def __call__(
+        self, z_load: Complex[Array, " frequency"], current: Current
+    ) -> Complex[Array, "2 frequency"]:
+        """Z_L I and I."""
+        i = current(z_load)
+        return jnp.stack([z_load * i, i])
 
 
 class Slopes(eqx.Module):
@@ -47,7 +98,7 @@ class Gains(eqx.Module):
             factor.
         sample_rate: Sampling rate [Hz].
         prior: Prior of the elements; None without one.
-        outputs: 1 for V_out, 2 for V_out and the current.
+        measured: The outputs.
     """
 
     driver: AbstractGiven
@@ -55,7 +106,12 @@ class Gains(eqx.Module):
     frequency: Float[Array, " frequency"]
     sample_rate: Float[Array, ""]
     prior: ElementPrior | None = None
-    outputs: int = eqx.field(static=True, default=1)
+    measured: AbstractOutputs = Voltage()
+
+    @property
+    def outputs(self) -> int:
+        """Number of outputs."""
+        return self.measured.count
 
     @property
     def elements(self) -> int:
@@ -89,7 +145,7 @@ class Gains(eqx.Module):
     def at(self, every: Knots) -> "Gains":
         """The same at the knots of the harmonics."""
         driver, frequency = self.driver.at_knots(every), every.at(self.frequency)
-        return Gains(driver, self.circuit, frequency, self.sample_rate, self.prior, self.outputs)
+        return Gains(driver, self.circuit, frequency, self.sample_rate, self.prior, self.measured)
 
     def impedance(self, q: Float[Array, " q"]) -> AbstractImpedance:
         """The impedance of the load."""
@@ -103,7 +159,12 @@ class Gains(eqx.Module):
     def undelayed(self, q: Float[Array, " q"]) -> Complex[Array, "output frequency"]:
         """The gains without their delays."""
         load = self.impedance(q)(frequency_variable(self.frequency))
-        return self.driver.transfer(load, self.w(self.split(q)[2]), self.outputs)
+        return self._undelayed(load, self.w(self.split(q)[2]))
+
+    def _undelayed(
+        self, z_load: Complex[Array, " frequency"], w: Complex[Array, " frequency"]
+    ) -> Complex[Array, "output frequency"]:
+        return self.measured(z_load, lambda total: self.driver.current(total, w))
 
     def __call__(self, q: Float[Array, " q"]) -> Complex[Array, "output frequency"]:
         """The gains."""
@@ -127,15 +188,10 @@ class Gains(eqx.Module):
         def load(logs: Float[Array, " element"]) -> Complex[Array, " frequency"]:
             return self.circuit.with_log_values(logs).impedance()(s)
 
-        def gains(
-            load: Complex[Array, " frequency"], w: Complex[Array, " frequency"]
-        ) -> Complex[Array, "output frequency"]:
-            return self.driver.transfer(load, w, self.outputs)
-
         z_load, one = load(logs), jnp.ones_like(s)
         by_element = jax.vmap(lambda way: jax.jvp(load, (logs,), (way,))[1])(jnp.eye(logs.size))
-        value, by_load = jax.jvp(lambda at: gains(at, w), (z_load,), (one,))
-        by_w = jax.jvp(lambda at: gains(z_load, at), (w,), (one,))[1]
+        value, by_load = jax.jvp(lambda at: self._undelayed(at, w), (z_load,), (one,))
+        by_w = jax.jvp(lambda at: self._undelayed(z_load, at), (w,), (one,))[1]
         value, by_load, by_w = (self.turned(q, of, self.frequency) for of in (value, by_load, by_w))
         alone = as_complex(jnp.eye(self.outputs))[:, :, None]
         rows = [

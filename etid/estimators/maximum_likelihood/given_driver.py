@@ -31,31 +31,32 @@ from jaxtyping import Array, Complex, Float
 
 from etid.circuits.circuit import AbstractCircuit
 from etid.estimators.estimate import DELAY_WIDTH
-from etid.estimators.maximum_likelihood.driver import Calibrations
-from etid.estimators.maximum_likelihood.terms import (
-    as_list,
-    informed,
-)
+from etid.estimators.maximum_likelihood.calibrations import Calibrations
+from etid.estimators.maximum_likelihood.profile import Profile, Records
 from etid.estimators.score_tests.unloaded import UnloadedShape, shape_of
 from etid.estimators.starts import current_starts, harmonic_starts
 from etid.estimators.unknowns import LoadUnknowns
 from etid.results.driver import HarmonicDriver
-from etid.signals.harmonics import Spectrum
+from etid.signals.harmonics import Spectrum, same_unloaded
 from etid.signals.knots import Knots
-from etid.signals.transfer import as_complex, reciprocal
+from etid.signals.transfer import as_complex, combined, reciprocal
 from etid.solvers.matrices import inverse_root
 
 
-class UnloadedSlopes(NamedTuple):
-    """Derivatives with respect to z of the X of a load that the calibrations estimate.
+class UnloadedEstimate(NamedTuple):
+    """The X of a load that the calibrations estimate, as a function of z.
 
     Attributes:
-        x: Derivatives of X.
-        log_variance: Derivatives of the logarithm of the variance of X.
+        x: X at z = 0.
+        variance: Its variance there.
+        x_by_z: Derivatives of X.
+        log_variance_by_z: Derivatives of the logarithm of the variance.
     """
 
-    x: Complex[Array, "z harmonic"]
-    log_variance: Float[Array, "z harmonic"]
+    x: Complex[Array, " harmonic"]
+    variance: Float[Array, " harmonic"]
+    x_by_z: Complex[Array, "z harmonic"]
+    log_variance_by_z: Float[Array, "z harmonic"]
 
 
 class AbstractGiven(eqx.Module):
@@ -80,18 +81,18 @@ class AbstractGiven(eqx.Module):
     delay_width: eqx.AbstractVar[Float[Array, ""]]
 
     @abc.abstractmethod
-    def transfer(
-        self, load: Complex[Array, " harmonic"], w: Complex[Array, " harmonic"], outputs: int
-    ) -> Complex[Array, "output harmonic"]:
-        """V_out per input at W₀ + w, and the current per input if there are two outputs."""
+    def current(
+        self, total: Complex[Array, " harmonic"], w: Complex[Array, " harmonic"]
+    ) -> Complex[Array, " harmonic"]:
+        """Current per input through this impedance [Ω] at W₀ + w."""
 
     @abc.abstractmethod
     def at_knots(self, knots: Knots) -> "AbstractGiven":
         """The same at the knots of the harmonics, without an estimate of X."""
 
     @abc.abstractmethod
-    def informed(self, spectrum: Spectrum) -> tuple[Spectrum, UnloadedSlopes | None]:
-        """A recording with X estimated by the calibrations at z = 0, and derivatives of X."""
+    def unloaded(self, records: Records) -> UnloadedEstimate | None:
+        """The X of a recording that the calibrations estimate; None if they share none with it."""
 
     @abc.abstractmethod
     def starts(
@@ -126,20 +127,20 @@ class GivenCurrent(AbstractGiven):
             delay_width=width,
         )
 
-    def transfer(
-        self, load: Complex[Array, " harmonic"], w: Complex[Array, " harmonic"], outputs: int
-    ) -> Complex[Array, "output harmonic"]:
-        """Z_L."""
-        del w, outputs
-        return load[None, :]
+    def current(
+        self, total: Complex[Array, " harmonic"], w: Complex[Array, " harmonic"]
+    ) -> Complex[Array, " harmonic"]:
+        """1: the input is the current."""
+        del w
+        return jnp.ones_like(total)
 
     def at_knots(self, knots: Knots) -> "GivenCurrent":
         """The same at the knots of the harmonics."""
         return GivenCurrent.at(knots.at(self.frequency))
 
-    def informed(self, spectrum: Spectrum) -> tuple[Spectrum, None]:
-        """The recording itself."""
-        return spectrum, None
+    def unloaded(self, records: Records) -> None:
+        """None: there are no calibrations."""
+        del records
 
     def starts(
         self, spectrum: Spectrum, sample_rate: Float[Array, ""], circuit: AbstractCircuit
@@ -193,12 +194,11 @@ class GivenDriver(AbstractGiven):
             self.resistance
         )
 
-    def transfer(
-        self, load: Complex[Array, " harmonic"], w: Complex[Array, " harmonic"], outputs: int
-    ) -> Complex[Array, "output harmonic"]:
-        """Z_L / (Z_L + Z_th) and 1 / (Z_L + Z_th) [S] at W₀ + w."""
-        loop = reciprocal(load + self.z_th(w))
-        return jnp.stack([load * loop, loop][:outputs])
+    def current(
+        self, total: Complex[Array, " harmonic"], w: Complex[Array, " harmonic"]
+    ) -> Complex[Array, " harmonic"]:
+        """1 / (Z + Z_th) [S] at W₀ + w."""
+        return reciprocal(total + self.z_th(w))
 
     def starts(
         self, spectrum: Spectrum, sample_rate: Float[Array, ""], circuit: AbstractCircuit
@@ -221,25 +221,28 @@ class GivenDriver(AbstractGiven):
             shape=None,
         )
 
-    def informed(self, spectrum: Spectrum) -> tuple[Spectrum, UnloadedSlopes | None]:
-        """A recording with X estimated by the calibrations at z = 0, and derivatives of X."""
-        if self.records is None or self.gains is None or self.gain_slopes is None:
-            return spectrum, None
-        records = as_list(self.records)
+    def unloaded(self, records: Records) -> UnloadedEstimate | None:
+        """The X of a recording that the calibrations estimate; None if they share none with it."""
+        x, of, gains, slopes = records.x, self.records, self.gains, self.gain_slopes
+        if of is None or gains is None or slopes is None or x.size != of.x.shape[-1]:
+            return None  # a record of another length is another unloaded record
+        same = jnp.stack([jnp.asarray(same_unloaded(x, one)) for one in of.x])
+        used = of.selected & same[:, None]
+        outputs = dataclasses.replace(records, y=of.y, variance_y=of.variance_y, selected=used)
 
-        def unloaded(
+        def estimate(
             gains: Complex[Array, "record harmonic"],
         ) -> tuple[Complex[Array, " harmonic"], Float[Array, " harmonic"]]:
-            known = informed(spectrum, records, list(gains))
-            return known.x, jnp.log(known.variance_x)
+            profile = Profile.of(outputs, gains)
+            return profile.x, jnp.log(profile.variance_x)
 
         def slope(
             direction: Complex[Array, "record harmonic"],
         ) -> tuple[Complex[Array, " harmonic"], Float[Array, " harmonic"]]:
-            return jax.jvp(unloaded, (self.gains,), (direction,))[1]
+            return jax.jvp(estimate, (gains,), (direction,))[1]
 
-        found = informed(spectrum, records, list(self.gains))
-        return found, UnloadedSlopes(*jax.vmap(slope)(self.gain_slopes))
+        profile = Profile.of(outputs, gains)
+        return UnloadedEstimate(profile.x, profile.variance_x, *jax.vmap(slope)(slopes))
 
 
 def given(
@@ -254,10 +257,10 @@ def given(
     """
     calibrations = Calibrations.of(driver)
     c = calibrations.start()
-    linear = calibrations.linear(c)
+    near = calibrations.near(c)
+    linear = calibrations.linear(near)
     root = inverse_root(linear.curvature().expected)
-    terms, slopes = calibrations.terms_and_slopes(c, calibrations.records)
-    mean, cov = -root.T @ (slopes @ terms), linear.along(root).curvature().score
+    mean, cov = -root.T @ (near.jacobian @ near.terms), linear.along(root).curvature().score
     if driver.drift is None:
         found = around(calibrations, c, root, frequency, shared, mean, cov)
     else:
@@ -285,14 +288,15 @@ def around(
 ) -> GivenDriver:
     """A driver around the common parameters c, with z along `directions`; like `given`."""
     resistance = calibrations.calibration.r_load.mean()
-    source, gains = calibrations.z_th(c), calibrations.gains(c)
+    source, gains = calibrations.source_of(c), None
     loaded = source.response(frequency) + as_complex(resistance)
     _, by_frequency = jax.jvp(source.response, (frequency,), (frequency,))
     by_source = source.slopes(frequency) * reciprocal(loaded)[None, :]
     known = None
     if shared:
-        slopes = calibrations.gain_slopes(c, gains, calibrations.by_z(c, gains))
-        known = jnp.stack([combined(directions.T, of) for of in slopes], axis=1)
+        of = calibrations.slopes(c)
+        gains, known = of.gains, combined(directions.T, of.by_common.reshape(c.size, -1))
+        known = known.reshape(-1, *gains.shape)
     return GivenDriver(
         frequency=frequency,
         loaded=loaded,
@@ -302,14 +306,7 @@ def around(
         mean=mean,
         cov=cov,
         records=calibrations.spectra if shared else None,
-        gains=jnp.stack(gains) if shared else None,
+        gains=gains,
         gain_slopes=known,
         delay_width=calibrations.delay_width,
     )
-
-
-def combined(
-    z: Float[Array, "*row z"], slope: Complex[Array, "z harmonic"]
-) -> Complex[Array, "*row harmonic"]:
-    """Σ z ∂/∂z, in real arithmetic, because complex matrix products take ten times as long."""
-    return jax.lax.complex(z @ slope.real, z @ slope.imag)

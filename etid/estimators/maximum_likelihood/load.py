@@ -16,15 +16,19 @@ from jaxtyping import Array, Bool, Complex, Float
 
 from etid.circuits.circuit import AbstractCircuit
 from etid.estimators.element_prior import ElementPrior
-from etid.estimators.maximum_likelihood.condensed import Condensed
-from etid.estimators.maximum_likelihood.gains import Gains, Slopes
-from etid.estimators.maximum_likelihood.given_driver import AbstractGiven, UnloadedSlopes, combined
+from etid.estimators.maximum_likelihood.condensed import Condensed, apart
+from etid.estimators.maximum_likelihood.gains import (
+    AbstractOutputs,
+    Gains,
+    Slopes,
+    Voltage,
+    VoltageAndCurrent,
+)
+from etid.estimators.maximum_likelihood.given_driver import AbstractGiven, UnloadedEstimate
 from etid.estimators.maximum_likelihood.profile import Profile, Records
-from etid.estimators.maximum_likelihood.terms import apart
 from etid.estimators.score_tests import falling_resistance, other_circuit
-from etid.signals.harmonics import Spectrum
 from etid.signals.knots import Knots, knots
-from etid.signals.transfer import as_complex, reciprocal, turns
+from etid.signals.transfer import as_complex, combined, reciprocal, turns
 from etid.solvers.levenberg_marquardt import NormalEquations
 
 
@@ -66,37 +70,37 @@ class Load(eqx.Module):
     Attributes:
         gains: The gains at all harmonics.
         records: The recording.
-        unloaded: How X depends on z; None if it does not.
+        unloaded: Its X that the calibrations estimate; None if they share none with it.
     """
 
     gains: Gains
     records: Records
-    unloaded: UnloadedSlopes | None
+    unloaded: UnloadedEstimate | None = None
 
     @classmethod
     def behind(
         cls,
         driver: AbstractGiven,
         circuit: AbstractCircuit,
-        spectrum: Spectrum,
+        records: Records,
         sample_rate: Float[Array, ""],
         prior: ElementPrior | None = None,
-        current: tuple[Array, ...] | None = None,
+        measured: AbstractOutputs | None = None,
     ) -> "Load":
         """A recording that was made with `driver`.
 
         Args:
             driver: Distribution of Z_th at its harmonics, or the measured current.
             circuit: Structure of the load.
-            spectrum: The recording.
+            records: The recording.
             sample_rate: Its sampling rate [Hz].
             prior: Prior of the elements; None without one.
-            current: A current that was measured too, as in `Records.of`.
+            measured: Its outputs; None for V_out, and for the current if there are two outputs.
         """
-        known, unloaded = driver.informed(spectrum)
-        outputs = 1 if current is None else 2
-        gains = Gains(driver, circuit, spectrum.frequency, sample_rate, prior, outputs)
-        return cls(gains, Records.of(known, current), unloaded)
+        if measured is None:
+            measured = Voltage() if records.y.shape[0] == 1 else VoltageAndCurrent()
+        gains = Gains(driver, circuit, records.frequency, sample_rate, prior, measured)
+        return cls(gains, records, driver.unloaded(records))
 
     @property
     def knots(self) -> Knots:
@@ -106,8 +110,7 @@ class Load(eqx.Module):
     @property
     def terms(self) -> Float[Array, ""]:
         """Number of terms of the records."""
-        used = jnp.sum(self.records.selected, dtype=self.records.variance_x.dtype)
-        return 2 * self.records.y.shape[0] * used
+        return 2 * jnp.sum(self.records.selected, dtype=self.records.variance_x.dtype)
 
     def rest(self, q: Float[Array, " q"]) -> Float[Array, " q"]:
         """Terms of the priors."""
@@ -122,12 +125,12 @@ class Load(eqx.Module):
 
     def known(self, q: Float[Array, " q"]) -> Records:
         """The records with the X that the calibrations estimate."""
-        if self.unloaded is None:
+        of = self.unloaded
+        if of is None:
             return self.records
         z = self.gains.split(q)[2]
-        x = self.records.x + combined(z, self.unloaded.x)
-        variance = self.records.variance_x * jnp.exp(z @ self.unloaded.log_variance)
-        return dataclasses.replace(self.records, x=x, variance_x=variance)
+        x, growth = of.x + combined(z, of.x_by_z), jnp.exp(z @ of.log_variance_by_z)
+        return dataclasses.replace(self.records, x=x, variance_x=of.variance * growth)
 
     def profile(self, q: Float[Array, " q"]) -> Profile:
         """The likelihood at these parameters."""
@@ -144,10 +147,10 @@ class Load(eqx.Module):
     def near(self, q: Float[Array, " q"], every: Knots | None = None) -> Near:
         """The load near `q`, at these knots or its own."""
         every, profile = every or self.knots, self.profile(q)
-        condensed = apart(lambda _: Condensed.of(profile, every), q)
+        condensed = apart(lambda _: Condensed.of([profile], every), q)
         slopes, by_x = apart(self.gains.at(every).slopes, q), None
         if self.unloaded is not None:
-            relative = self.unloaded.x * reciprocal(profile.x)[None, :]
+            relative = self.unloaded.x_by_z * reciprocal(profile.x)[None, :]
             size, total = profile.size[0], every.summed(profile.size[0])
             by_x = every.summed(as_complex(size)[None, :] * relative)
             by_x = by_x * as_complex(1 / jnp.where(total > 0, total, 1.0))[None, :]
@@ -156,7 +159,7 @@ class Load(eqx.Module):
     def by_x(self, near: Near) -> Float[Array, "z harmonic"]:
         """Derivatives of the objective by the z that X depends on, at each harmonic."""
         assert self.unloaded is not None
-        return near.profile.by_x(self.known(near.q), *self.unloaded)
+        return near.profile.by_x(self.known(near.q), *self.unloaded[2:])
 
     def equations(self, q: Float[Array, " q"]) -> NormalEquations:
         """Normal equations of the records alone; the matrix is their information."""

@@ -14,17 +14,18 @@ import optimistix as optx
 from jaxtyping import Array, Bool, Float
 
 from etid.circuits.circuit import AbstractCircuit
-from etid.estimators.element_prior import ElementPrior
+from etid.estimators.element_limits import Limits
 from etid.estimators.estimate import MAX_STEPS, SOLVER, Estimate
+from etid.estimators.judgement import judged, unless
 from etid.estimators.maximum_likelihood.condensed import means
-from etid.estimators.maximum_likelihood.given_driver import AbstractGiven, combined
 from etid.estimators.maximum_likelihood.load import AtKnots, Load, Near, by_falling, changes
 from etid.estimators.sandwich import Linear
 from etid.estimators.score_tests import falling_resistance, other_circuit
 from etid.estimators.unknowns import LoadUnknowns
-from etid.results.fit import Support
-from etid.signals.harmonics import Spectrum, signal_share
-from etid.signals.transfer import as_complex, power
+from etid.results.fit import Fit, Support
+from etid.results.verdicts import RESULTS
+from etid.signals.harmonics import signal_share
+from etid.signals.transfer import as_complex, combined, power
 from etid.solvers.least_squares import least_squares
 from etid.solvers.levenberg_marquardt import LevenbergMarquardt, NormalEquations
 from etid.solvers.matrices import inverse_root
@@ -143,37 +144,32 @@ class Found(NamedTuple):
         far: Whether W is too far from W₀ for its linear distribution.
         other: Whether the data show another circuit, another gain of V_out, or a resistance that
             falls with its current.
-        scale: Whether the scale of the current contradicts the driver.
+        inconsistent: Whether the scale of an output, such as a current, contradicts the driver.
     """
 
     estimate: Estimate
     far: Bool[Array, ""]
     other: Bool[Array, ""]
-    scale: Bool[Array, ""]
+    inconsistent: Bool[Array, ""]
+
+    def judged(
+        self, circuit: AbstractCircuit, driver_result: RESULTS, method: str, bounds: Limits = ()
+    ) -> Fit:
+        """The fit with its verdict; for the arguments see `judgement.judged`."""
+        fit = judged(self.estimate, circuit, driver_result, method, bounds)
+        fit = unless(fit, self.inconsistent, RESULTS.inconsistent)
+        return unless(unless(fit, self.far, RESULTS.driver_unclear), self.other, RESULTS.misfit)
 
 
-def fit_circuit(
-    driver: AbstractGiven,
-    circuit: AbstractCircuit,
-    spectrum: Spectrum,
-    sample_rate: Float[Array, ""],
-    candidates: LoadUnknowns,
-    element_prior: ElementPrior | None = None,
-    current: tuple[Array, ...] | None = None,
-) -> Found:
+def fit_circuit(load: Load, candidates: LoadUnknowns) -> Found:
     """Identify the load of one recording.
 
     Args:
-        driver: Distribution of Z_th at the harmonics of the recording, or the measured current.
-        circuit: Structure of the load.
-        spectrum: The recording.
-        sample_rate: Its sampling rate [Hz].
+        load: The recording.
         candidates: Starts, stacked; the likeliest is the last. The start that predicts best is
             refined.
-        element_prior: Prior of the elements; None without one.
-        current: Harmonics of a current that was measured beside V_th [A], and their variances [A²].
     """
-    load = Load.behind(driver, circuit, spectrum, sample_rate, element_prior, current)
+    driver, element_prior = load.gains.driver, load.gains.prior
     if element_prior is not None:
         placed = element_prior.placed(candidates.log_elements)
         candidates = LoadUnknowns(placed, candidates.delay_samples)
@@ -182,7 +178,7 @@ def fit_circuit(
     # First at the knots of one point, and with Z_th fixed: from a distant start, a joint fit would
     # distort Z_th.
     start = _chosen(load, starts)
-    if current is not None:  # its starts have no delay
+    if load.gains.outputs > 1:  # their starts have no delay
         start = refined(load, start, ROUGHLY).value
     rtol = min(WELL.rtol, SETTLED / math.sqrt(2 * load.records.y.size))
     well = dataclasses.replace(WELL, rtol=rtol, damping=SLIGHT)
@@ -202,13 +198,13 @@ def fit_circuit(
     noise = profile.excess(records)
     # Part of the noise that only this trial has: all, or that of the outputs if V_th is shared.
     private = jnp.where(
-        jnp.any(records.variance_x != spectrum.variance_x),
+        jnp.any(records.variance_x != load.records.variance_x),
         records.variance_y / profile.expected,
         1.0,
     )
     share = signal_share(profile.x, records.variance_x)
     values = jnp.stack([jnp.broadcast_to(share, noise.shape), noise, private * noise])
-    mean_share, mean_noise, own_noise = means(profile, every, values)
+    mean_share, mean_noise, own_noise = means([profile], every, values)
     linear = Linear(jacobian, mean_share, mean_noise, jnp.diag(prior))
     information = linear.bread()
     elements = information[:count]
@@ -217,7 +213,7 @@ def fit_circuit(
     gained = jnp.dot(step, last.gradient)
     step, gained = (jnp.where(gained < LAST**2, of, 0.0) for of in (step, gained))
     logs, late, z = load.gains.split(q - step)
-    used = spectrum.selected[every.index]
+    used = records.selected[0, every.index]
     moved = jnp.sqrt(jnp.max(jnp.where(used, power(load.gains.at(every).w(z)), 0.0)))
     rest = prior * (q - load.gains.centre(q))
     spread = jax.scipy.linalg.block_diag(jnp.diag(prior[:owned]), driver.cov)
@@ -273,7 +269,7 @@ def fit_circuit(
         cov=(by_term * own_noise[None, :]) @ by_term.T + of_own + shared + unknown,
         shared_cov=shared,
         chi2=squares / (terms - owned),
-        rrse=profile.rrse(records, spectrum.x),
+        rrse=profile.rrse(records, load.records.x),
         result=solution.result,
         steps=solution.stats["num_steps"],
         strain=strain,

@@ -16,15 +16,22 @@ independent: each is what an output shows beyond x and the outputs before it. σ
 of one coefficient, at every harmonic.
 """
 
+import functools
+from collections.abc import Sequence
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Complex, Float
 
-from etid.estimators.maximum_likelihood.terms import excess, stands_out
 from etid.results.fit import complex_rrse
-from etid.signals.harmonics import Spectrum, real_parts
+from etid.signals.harmonics import Spectrum, local_sum, real_parts, signal_share
+from etid.signals.mains import lines
 from etid.signals.transfer import as_complex, power
+
+SURE = 4.0  # standard deviations by which a local variance must exceed the mean
+LOW = 128  # number of first harmonics that are tested for mains hum
+HUM = 14.4  # times the mean; an exponential exceeds it as rarely as a normal number exceeds five σ
 
 
 class Records(eqx.Module):
@@ -36,7 +43,7 @@ class Records(eqx.Module):
         variance_x: E|noise|² of each of them.
         y: Coefficients of the outputs.
         variance_y: E|noise|² of each of them.
-        selected: Harmonics that are used.
+        selected: Harmonics of each output that are used.
     """
 
     frequency: Float[Array, " harmonic"]
@@ -44,20 +51,20 @@ class Records(eqx.Module):
     variance_x: Float[Array, " harmonic"]
     y: Complex[Array, "output harmonic"]
     variance_y: Float[Array, "output harmonic"]
-    selected: Bool[Array, " harmonic"]
+    selected: Bool[Array, "output harmonic"]
 
     @classmethod
-    def of(cls, spectrum: Spectrum, current: tuple[Array, ...] | None = None) -> "Records":
-        """V_th and V_out, and the current if there is one.
+    def of(cls, spectrum: Spectrum, *others: tuple[Array, Array]) -> "Records":
+        """V_th and V_out, and further outputs.
 
         Args:
             spectrum: Harmonics of the voltages.
-            current: Those of the current [A], and their variances [A²].
+            others: Coefficients of each further output, and their variances.
         """
-        each = [(spectrum.y, spectrum.variance_y), *([] if current is None else [current])]
+        each = [(spectrum.y, spectrum.variance_y), *others]
         y, variance_y = (jnp.stack(of) for of in zip(*each, strict=True))
-        s = spectrum
-        return cls(s.frequency, s.x, s.variance_x, y, variance_y, s.selected)
+        s, selected = spectrum, jnp.tile(spectrum.selected, (len(each), 1))
+        return cls(s.frequency, s.x, s.variance_x, y, variance_y, selected)
 
 
 class Profile(eqx.Module):
@@ -70,6 +77,7 @@ class Profile(eqx.Module):
         weight: 1/σ² of both parts of each innovation; 0 where a harmonic is not used.
         innovations: The innovations of Y − G x.
         x: X̂.
+        variance_x: Variance of X̂.
     """
 
     gains: Complex[Array, "output harmonic"]
@@ -78,13 +86,15 @@ class Profile(eqx.Module):
     weight: Float[Array, "output harmonic"]
     innovations: Complex[Array, "output harmonic"]
     x: Complex[Array, " harmonic"]
+    variance_x: Float[Array, " harmonic"]
 
     @classmethod
     def of(cls, records: Records, gains: Complex[Array, "output harmonic"]) -> "Profile":
         """The records at these gains."""
-        left, x, selected = records.variance_x, records.x, records.selected
+        left, x = records.variance_x, records.x
         towards, expected, innovations = [], [], []
-        for g, y, of_y in zip(gains, records.y, records.variance_y, strict=True):
+        each = gains, records.y, records.variance_y, records.selected
+        for g, y, of_y, selected in zip(*each, strict=True):
             total = of_y + power(g) * left
             share = jnp.where(selected, left / total, 0.0)
             expected.append(total)
@@ -92,9 +102,14 @@ class Profile(eqx.Module):
             innovations.append(y - g * x)
             x = x + towards[-1] * innovations[-1]
             left = jnp.where(selected, share * of_y, left)
-        weight = jnp.where(selected[None, :], 2 / jnp.stack(expected), 0.0)
+        weight = jnp.where(records.selected, 2 / jnp.stack(expected), 0.0)
         towards, innovations = jnp.stack(towards), jnp.stack(innovations)
-        return cls(gains, towards, jnp.stack(expected), weight, innovations, x)
+        return cls(gains, towards, jnp.stack(expected), weight, innovations, x, left)
+
+    @classmethod
+    def of_output(cls, spectrum: Spectrum, gain: Complex[Array, " harmonic"]) -> "Profile":
+        """One recording at the gain of its V_out."""
+        return cls.of(Records.of(spectrum), gain[None])
 
     def whitened(
         self, change: Complex[Array, "output harmonic"]
@@ -142,6 +157,11 @@ class Profile(eqx.Module):
         return self.weight * power(self.x)[None, :]
 
     @property
+    def share(self) -> Float[Array, " harmonic"]:
+        """Share of signal in the power of X̂."""
+        return signal_share(self.x, self.variance_x)
+
+    @property
     def terms(self) -> Float[Array, "output part"]:
         """Innovations, scaled to unit variance; Σ of their squares is D."""
         # The root of the weight itself would have no derivative where a harmonic is not used.
@@ -166,7 +186,7 @@ class Profile(eqx.Module):
 
     def excess(self, records: Records) -> Float[Array, "output harmonic"]:
         """`excess` of the innovations of each output."""
-        each = jax.vmap(excess, (0, None))(self.terms, records.selected)
+        each = jax.vmap(excess)(self.terms, records.selected)
         return each[:, : self.x.size]
 
     def shows_hum(
@@ -180,11 +200,48 @@ class Profile(eqx.Module):
         """
         left = self.innovations if without is None else self.innovations - without
         squares = power(left) / self.expected
-        return jnp.stack(
-            [stands_out(of, records.frequency, records.selected) for of in squares]
-        ).any()
+        each = zip(squares, records.selected, strict=True)
+        return jnp.stack([stands_out(of, records.frequency, used) for of, used in each]).any()
 
     def rrse(self, records: Records, x: Complex[Array, " harmonic"]) -> Float[Array, ""]:
         """RRSE of the output that is predicted worst from this input."""
-        each = zip(self.gains, records.y, strict=True)
-        return jnp.stack([complex_rrse(g * x, y, records.selected) for g, y in each]).max()
+        each = zip(self.gains, records.y, records.selected, strict=True)
+        return jnp.stack([complex_rrse(g * x, y, used) for g, y, used in each]).max()
+
+
+def total(values: Sequence[Array]) -> Array:
+    """Sum of arrays, such as those of the records of each input."""
+    return functools.reduce(jnp.add, values)
+
+
+def excess(
+    part: Float[Array, " part"], selected: Bool[Array, " harmonic"]
+) -> Float[Array, " part"]:
+    """Variance of a residual around each harmonic, relative to the expected variance; at least 1.
+
+    The weights assume white noise, but noise may be coloured, and no model is exact. The covariance
+    (Jᵀ C J in place of Jᵀ J, White 1980) therefore uses the variance of the residual. It is the
+    mean over `harmonics.WINDOW` harmonics where this surely exceeds the mean over all harmonics,
+    and otherwise the mean over all.
+    """
+    count = selected.size
+    power = part[:count] ** 2 + part[count:] ** 2
+    of = jnp.where(selected, 2.0, 0.0)
+    overall = jnp.maximum(jnp.sum(power) / jnp.maximum(jnp.sum(of), 1.0), 1.0)
+    freedom = jnp.maximum(local_sum(of), 1.0)
+    local = local_sum(power) / freedom
+    sure = local > overall * (1 + SURE * jnp.sqrt(2 / freedom))
+    return jnp.tile(jnp.where(sure, local, overall), 2)
+
+
+def stands_out(
+    squares: Float[Array, " harmonic"],
+    frequency: Float[Array, " harmonic"],
+    selected: Bool[Array, " harmonic"],
+) -> Bool[Array, ""]:
+    """Whether `squares` at the harmonics show mains hum; without hum their mean is 1."""
+    squares, suspect = squares[:LOW], lines(frequency[:LOW])
+    others = selected[:LOW] & ~suspect
+    count = jnp.maximum(jnp.sum(others, dtype=squares.dtype), 1.0)
+    around = jnp.sum(jnp.where(others, squares, 0.0)) / count
+    return jnp.max(jnp.where(suspect, squares, 0.0)) > HUM * jnp.maximum(around, 1.0)

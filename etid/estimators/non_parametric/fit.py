@@ -25,7 +25,7 @@ from jaxtyping import Array, Complex, Float
 
 from etid.circuits.circuit import AbstractCircuit
 from etid.estimators.estimate import MAX_STEPS, SOLVER, Estimate
-from etid.estimators.maximum_likelihood.terms import as_list, excess, same_unloaded, stands_out
+from etid.estimators.maximum_likelihood.profile import excess, stands_out
 from etid.estimators.non_parametric.terms import Model, clearly_shown
 from etid.estimators.sandwich import Linear
 from etid.estimators.score_tests import other_circuit
@@ -33,7 +33,7 @@ from etid.estimators.score_tests.other_circuit import Scores
 from etid.estimators.unknowns import LoadUnknowns
 from etid.results.driver import HarmonicDriver, SourceImpedance
 from etid.results.fit import complex_rrse
-from etid.signals.harmonics import Spectrum
+from etid.signals.harmonics import Spectrum, as_list, same_unloaded
 from etid.signals.transfer import as_complex
 from etid.solvers.levenberg_marquardt import best_start
 from etid.solvers.matrices import inverse
@@ -171,7 +171,7 @@ def _bias(
     def mean_of_pair(own: Float[Array, "record 2 2 harmonic"]) -> Float[Array, " number"]:
         noises = []
         for s, (of_x, of_y) in zip(records, own, strict=True):
-            same = same_unloaded(s, records[-1])
+            same = same_unloaded(s.x, records[-1].x)
             # Recordings with the same unloaded record have the same noise of X.
             of_x = jnp.where(same, own[-1, 0], of_x)
             noises.append((noise(of_x, s.variance_x), noise(of_y, s.variance_y)))

@@ -11,11 +11,11 @@ from jaxtyping import Array, Bool, Complex, Float
 
 from etid.circuits.circuit import AbstractCircuit
 from etid.estimators.estimate import DELAY_WIDTH
-from etid.estimators.maximum_likelihood.terms import denoised, same_unloaded
+from etid.estimators.maximum_likelihood.profile import Profile
 from etid.estimators.score_tests import other_circuit
 from etid.estimators.unknowns import LoadUnknowns
 from etid.results.driver import HarmonicDriver, SourceImpedance
-from etid.signals.harmonics import Spectrum, signal_share
+from etid.signals.harmonics import Spectrum, same_unloaded, signal_share
 from etid.signals.transfer import as_complex, delayed, frequency_variable, power, reciprocal
 
 CLEAR = 0.97  # smallest share of signal in the power of a calibration's Y, 15 dB
@@ -115,7 +115,7 @@ class Model(eqx.Module):
         rest = power(y) * of.by_y
         together, shared = -load, jnp.zeros((), dtype=bool)
         for slope, s in zip(of.by_x, records[:-1], strict=True):
-            same = same_unloaded(spectrum, s)
+            same = same_unloaded(spectrum.x, s.x)
             shared = shared | same
             rest = rest + jnp.where(same, 0.0, power(y * slope) * s.variance_x)
             together = together + jnp.where(same, y * slope, 0.0)
@@ -178,8 +178,11 @@ class Model(eqx.Module):
             eqx.tree_at(lambda s: s.y, s, g * s.x)
             for s, g in zip(records[:-1], gains[:-1], strict=True)
         ]
-        [spectrum], [share] = denoised(records[-1:], gains[-1:])
-        return [*known, spectrum], share
+        profile = Profile.of_output(records[-1], gains[-1])
+        spectrum = eqx.tree_at(
+            lambda s: (s.x, s.y), records[-1], (profile.x, gains[-1] * profile.x)
+        )
+        return [*known, spectrum], jnp.tile(signal_share(profile.x, profile.variance_x), 2)
 
     def changes(
         self, q: Float[Array, " q"], records: list[Spectrum]

@@ -15,14 +15,13 @@ In the map of failures (`python -m benchmarks failure_map`) it is at most 15 if 
 enough. It is at least 116 if a lower order changes an element by five of its standard errors.
 """
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Complex, Float
 
-from etid.estimators.maximum_likelihood.driver import Calibrations
-from etid.estimators.maximum_likelihood.terms import apart, by_gains, denoised
+from etid.estimators.maximum_likelihood.calibrations import Calibrations, NearCalibrations
 from etid.estimators.sandwich import Linear
+from etid.signals.transfer import reciprocal
 
 SEEN = 36.0  # χ² of two degrees of freedom; by chance one of about 100 sections has it once in 10⁶
 DAMPINGS = (0.1, 0.3, 1.0)
@@ -30,118 +29,53 @@ GRID = 36  # frequencies, eight per decade
 BEYOND = 3.0  # factor by which the grid exceeds the band; poles beyond the band still have effect
 
 
-class Sections(eqx.Module):
-    """1 / (1 + 2ζx + x²) of all sections at the harmonics of the calibrations.
+def sections(
+    frequency: Float[Array, " frequency"], highest: Float[Array, ""]
+) -> Complex[Array, "section 2 frequency"]:
+    """∂Z_th/∂g and ∂Z_th/∂h of all sections.
 
-    With D for it, ∂Z_th/∂g = D and ∂Z_th/∂h = D s/ω. The derivatives of the terms with respect to g
-    and h are not computed, because they are large. Only their products are.
-
-    Attributes:
-        frequency: The harmonics [Hz].
-        omega: ω of each section / 2π [Hz].
-        real: Re D.
-        imaginary: Im D.
-        effect: e; a change of Z_th changes the terms by Re(e ∂Z_th).
+    Args:
+        frequency: Frequencies [Hz].
+        highest: End of the band, which begins with the first frequency [Hz].
     """
-
-    frequency: Float[Array, " harmonic"]
-    omega: Float[Array, " section"]
-    real: Float[Array, "section harmonic"]
-    imaginary: Float[Array, "section harmonic"]
-    effect: Complex[Array, "part harmonic"]
-
-    @classmethod
-    def of(
-        cls,
-        frequency: Float[Array, " harmonic"],
-        ends: tuple[Float[Array, ""], Float[Array, ""]],
-        effect: Complex[Array, "part harmonic"],
-    ) -> "Sections":
-        """The sections for the band between `ends` [Hz]."""
-        grid = jnp.geomspace(ends[0] / BEYOND, ends[1] * BEYOND, GRID)
-        omega, zeta = (of.ravel() for of in jnp.meshgrid(grid, jnp.asarray(DAMPINGS)))
-        x = frequency[None, :] / omega[:, None]
-        real, imaginary = 1 - x * x, 2 * zeta[:, None] * x
-        scale = 1 / (real * real + imaginary * imaginary)
-        return cls(frequency, omega, real * scale, -imaginary * scale, effect)
-
-    def times(self, vectors: Float[Array, "column term"]) -> Float[Array, "2 section column"]:
-        """Products of the derivatives with respect to g and h with vectors of all terms."""
-        parts = vectors.reshape(vectors.shape[0], *self.effect.shape)
-        real, imaginary = (jnp.sum(of[None] * parts, axis=1) for of in _parts(self.effect))
-        f = self.frequency[None, :]
-        by_g = self.real @ real.T - self.imaginary @ imaginary.T
-        by_h = self.real @ (f * imaginary).T + self.imaginary @ (f * real).T
-        return jnp.stack([by_g, -by_h / self.omega[:, None]])
-
-    def squares(self, weight: Float[Array, " term"]) -> list[Float[Array, " section"]]:
-        """Weighted sums, over the terms, of a², a b and b²: the derivatives a by g and b by h."""
-        weight, f, (e, d) = weight.reshape(self.effect.shape), self.frequency, _parts(self.effect)
-        ee, ed, dd = (jnp.sum(weight * of, axis=0) for of in (e * e, e * d, d * d))
-        of_sections = self.real**2, self.real * self.imaginary, self.imaginary**2
-        aa, ab, bb = (
-            sum((one @ of for one, of in zip(of_sections, weights, strict=True)), jnp.zeros(()))
-            for weights in (
-                (ee, -2 * ed, dd),
-                (f * ed, f * (ee - dd), -f * ed),
-                (f * f * dd, 2 * f * f * ed, f * f * ee),
-            )
-        )
-        return [aa, -ab / self.omega, bb / self.omega**2]
+    grid = jnp.geomspace(frequency[0] / BEYOND, highest * BEYOND, GRID)
+    omega, zeta = (of.ravel() for of in jnp.meshgrid(grid, jnp.asarray(DAMPINGS)))
+    x = frequency[None, :] / omega[:, None]
+    by_g = reciprocal(jax.lax.complex(1 - x * x, 2 * zeta[:, None] * x))
+    by_h = jax.lax.complex(-x * by_g.imag, x * by_g.real)
+    return jnp.stack([by_g, by_h], axis=1)
 
 
-def _parts(z: Complex[Array, "*_"]) -> tuple[Float[Array, "*_"], Float[Array, "*_"]]:
-    return z.real, z.imag
-
-
-def largest(calibrations: Calibrations, linear: Linear) -> Float[Array, ""]:
+def largest(calibrations: Calibrations, near: NearCalibrations, linear: Linear) -> Float[Array, ""]:
     """Largest score statistic of all sections; the calibrations show one more if above `SEEN`.
 
     Args:
-        calibrations: Calibrations at the minimum of their likelihood.
-        linear: Their terms.
+        calibrations: Calibrations.
+        near: The calibrations at the minimum of their likelihood.
+        linear: Their terms there.
     """
-    found = squares(calibrations, linear)
+    found = squares(calibrations, near, linear)
     return jnp.nanmax(found)  # NaN if a section has no effect
 
 
-def squares(calibrations: Calibrations, linear: Linear) -> Float[Array, " section"]:
+def squares(
+    calibrations: Calibrations, near: NearCalibrations, linear: Linear
+) -> Float[Array, " section"]:
     """Score statistic of each section: χ² with two degrees of freedom if the section is absent.
 
     Args:
-        calibrations: Calibrations at the minimum of their likelihood.
-        linear: Their terms.
+        calibrations: Calibrations.
+        near: The calibrations at the minimum of their likelihood.
+        linear: Their terms there.
     """
-    c, jacobian = calibrations.start(), linear.jacobian
-    sections, used = apart(lambda _: _sections(calibrations), c), 2 * calibrations.spectra.x.size
-    terms = calibrations.terms(c, calibrations.records)
-    # With D = rows − fitted J, the scores are D r and their covariance is D C Dᵀ, where `rows` are
-    # the derivatives of the terms.
-    count, noisy = jacobian.shape[0], jacobian * linear.noise[None, :]
-    columns = jnp.concatenate([jacobian * linear.share[None, :], noisy, terms[None, :]])
-    products = sections.times(columns[:, :used])  # g and h do not affect the priors
-    fitted, cross = products[:, :, :count] @ linear.bread(), products[:, :, count:-1]
-    s, t = products[:, :, -1] - fitted @ (jacobian @ terms)  # of g and of h
-    between = cross - 0.5 * fitted @ (noisy @ jacobian.T)
-    aa, ab, bb = (
-        own - jnp.sum(fitted[i] * between[j] + fitted[j] * between[i], axis=1)
-        for own, (i, j) in zip(
-            sections.squares(linear.noise[:used]), ((0, 0), (0, 1), (1, 1)), strict=True
-        )
-    )
-    return (s * s * bb - 2 * s * t * ab + t * t * aa) / (aa * bb - ab * ab)
-
-
-def _sections(calibrations: Calibrations) -> Sections:
-    """The sections, and their effect on the denoised terms."""
-    c, spectra = calibrations.start(), calibrations.spectra
-    gains = calibrations.gains(c)
-    clean, _ = denoised(calibrations.records, gains)
-    real, imaginary = jnp.moveaxis(by_gains(clean, gains), 1, 0)
+    spectra = calibrations.spectra
     # The harmonics of the records differ so little that the sections are equal.
-    frequency = spectra.frequency[0]
-    by_z = jnp.stack(calibrations.by_z(c, gains))[:, None, :]
-    shape = len(gains), -1, frequency.size
-    effect = jax.lax.complex(real, -imaginary).reshape(shape) * by_z
+    frequency = calibrations.knots.at(spectra.frequency[0])
     highest = jnp.max(jnp.where(spectra.selected, spectra.frequency, frequency[0]))
-    return Sections.of(frequency, (frequency[0], highest), effect.sum(0))
+    by_z = sections(frequency, highest).reshape(-1, 1, frequency.size)
+    rows = near.rows(by_z * near.slopes.by_z[None])
+    directions = rows - linear.told(rows) @ linear.bread() @ linear.jacobian
+    s, t = (directions @ near.terms).reshape(-1, 2).T  # of g and of h
+    by_g, by_h = jnp.moveaxis(directions.reshape(s.size, 2, -1), 1, 0)
+    aa, ab, bb = (of @ linear.noise for of in (by_g * by_g, by_g * by_h, by_h * by_h))
+    return (s * s * bb - 2 * s * t * ab + t * t * aa) / (aa * bb - ab * ab)

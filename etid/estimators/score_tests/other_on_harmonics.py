@@ -5,21 +5,20 @@ Steiglitz-McBride, or output error in time. Z_th varies within its covariance. T
 be at a minimum, because the part of the residual that they could still explain is projected out.
 """
 
-from collections.abc import Callable
-
-import jax
 import jax.numpy as jnp
-from jax.flatten_util import ravel_pytree
-from jaxtyping import Array, Complex, Float
+from jaxtyping import Array, Float
 
 from etid.circuits.circuit import AbstractCircuit
-from etid.estimators.maximum_likelihood.terms import apart, denoised, excess, residual, variance
+from etid.estimators.maximum_likelihood.calibrations import Calibrations
+from etid.estimators.maximum_likelihood.condensed import means
+from etid.estimators.maximum_likelihood.given_driver import around
+from etid.estimators.maximum_likelihood.load import Load, changes
+from etid.estimators.maximum_likelihood.profile import Records
 from etid.estimators.sandwich import Linear
 from etid.estimators.score_tests import other_circuit
 from etid.estimators.unknowns import LoadUnknowns
-from etid.results.driver import ContinuousDriver
-from etid.signals.harmonics import Spectrum, real_parts
-from etid.signals.transfer import as_complex, frequency_variable, reciprocal, turns
+from etid.results.driver import HarmonicDriver
+from etid.signals.harmonics import Spectrum
 from etid.solvers.matrices import root
 
 
@@ -28,7 +27,7 @@ def scores(
     own: LoadUnknowns,
     sample_rate: Float[Array, ""],
     circuit: AbstractCircuit,
-    driver: ContinuousDriver,
+    driver: HarmonicDriver,
 ) -> other_circuit.Scores:
     """Scores of another circuit.
 
@@ -36,60 +35,29 @@ def scores(
         spectrum: The recording.
         own: Unknowns of the load.
         sample_rate: Its sampling rate [Hz].
-        circuit: The circuit with these elements.
+        circuit: Structure of the circuit.
         driver: Its driver.
     """
-    f, elements = spectrum.frequency, own.log_elements.size
-    s = frequency_variable(f)
-    vector, unflatten = ravel_pytree(driver.source)
-    deviations = root(driver.later_cov()).T
-
-    def along(
-        function: Callable[[Float[Array, " q"]], Complex[Array, " harmonic"]],
-        at: Float[Array, " q"],
-        directions: Float[Array, "direction q"],
-    ) -> Complex[Array, "direction harmonic"]:
-        return jax.vmap(lambda of: jax.jvp(function, (at,), (of,))[1])(directions)
-
-    def load(log_values: Float[Array, " element"]) -> Complex[Array, " harmonic"]:
-        return circuit.with_log_values(log_values).impedance()(s)
-
-    def of_gain(_) -> tuple[Complex[Array, " harmonic"], Complex[Array, "slope harmonic"]]:
-        """The gain, and its derivatives with respect to all parameters and changes."""
-        z_th = unflatten(vector).response(f)
-        z, changes = other_circuit.changes(circuit.impedance(), f)
-        total = reciprocal(z + z_th)
-        g = z * total * turns(-f[0] * own.delay_samples / sample_rate, f.size)
-        by_load = g * z_th * total * reciprocal(z)
-        by_source = along(lambda p: unflatten(p).response(f), vector, deviations)
-        by_own = [
-            by_load[None, :] * along(load, own.log_elements, jnp.eye(elements)),
-            (-g * s * as_complex(1 / sample_rate))[None, :],
-        ]
-        slopes = [*by_own, (-g * total)[None, :] * by_source, by_load[None, :] * changes]
-        return g, jnp.concatenate(slopes)
-
-    g, slopes = apart(of_gain, own.vector())
-
-    def of_residual(_) -> tuple[Float[Array, "slope part"], Float[Array, " part"]]:
-        # At the X estimated from both records: the noise of one record is in the residual too.
-        [clean], [share] = denoised([spectrum], [g])
-        weight = jnp.where(spectrum.selected, jnp.sqrt(2 / variance(spectrum, g)), 0.0)
-        rows = slopes * (-clean.x * as_complex(weight))[None, :]
-        return real_parts(rows), share
-
-    rows, share = apart(of_residual, own.vector())
-    count = elements + 1 + vector.size
-    prior = jnp.diag(jnp.pad(jnp.ones(vector.size), (elements + 1, 0)))
-    part = residual(spectrum, g)
-    linear = Linear(rows[:count], share, excess(part, spectrum.selected), prior)
+    calibrations, deviations = Calibrations.of(driver), root(driver.later_cov())
+    common, count = calibrations.start(), deviations.shape[1]
+    directions = jnp.pad(deviations, ((0, common.size - count), (0, 0)))
+    z, unit = jnp.zeros(count), jnp.eye(count)
+    known = around(calibrations, common, directions, spectrum.frequency, False, z, unit)
+    load = Load.behind(known, circuit, Records.of(spectrum), sample_rate)
+    q = jnp.concatenate([own.vector(), z])
+    near = load.near(q)
+    profile, elements = near.profile, own.log_elements.size
+    values = jnp.stack([profile.share[None], profile.excess(load.records)])
+    prior = jnp.diag(jnp.pad(jnp.ones(count), (elements + 1, 0)))
+    share, noise = means([profile], load.knots, values)
+    linear = Linear(near.jacobian, share, noise, prior)
     found = other_circuit.scores(
-        rows[count:],
+        near.condensed.rows(changes(load, near)),
         linear,
-        part,
-        jnp.zeros(count),
+        near.condensed.part,
+        jnp.zeros_like(q),
         prior,
         linear.bread(),
         slice(elements),
     )
-    return other_circuit.Scores.of(found)
+    return other_circuit.Scores.of(found, gain=True)._replace(gain=None)

@@ -10,13 +10,13 @@ Z_th and all delays are free.
 """
 
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Complex, Float
+from jaxtyping import Array, Bool, Float
 
-from etid.estimators.maximum_likelihood.driver import Calibrations
-from etid.estimators.maximum_likelihood.terms import excess, weights
+from etid.estimators.maximum_likelihood.calibrations import Calibrations, NearCalibrations
+from etid.estimators.maximum_likelihood.condensed import means
 from etid.estimators.sandwich import Linear
 from etid.recordings.preflight import Inspected
-from etid.signals.transfer import as_complex
+from etid.signals.transfer import as_complex, combined
 
 # Standard errors; by chance one calibration in two million exceeds this.
 SEEN = 5.0
@@ -31,42 +31,32 @@ EXPLAINED = 0.5
 ROUGHLY = 3.0
 
 
-def mismatch(calibrations: Calibrations, linear: Linear) -> Float[Array, "2 record"]:
+def mismatch(
+    calibrations: Calibrations, near: NearCalibrations, linear: Linear
+) -> Float[Array, "2 record"]:
     """Excess of each log R over the value that the other calibrations show, and its standard error.
 
     Args:
-        calibrations: Two or more calibrations at the minimum of their likelihood.
-        linear: Their terms.
+        calibrations: Two or more calibrations.
+        near: The calibrations at the minimum of their likelihood.
+        linear: Their terms there.
     """
-    c, records = calibrations.start(), calibrations.records
-    value = calibrations.terms(c, records)
-    z_th, alone = calibrations.z_th(c).response, jnp.eye(len(records))
-    slopes = [
-        as_complex(alone[i])[:, None] * _slope(g, r, z_th(s.frequency))[None, :]
-        for i, (g, r, s) in enumerate(
-            zip(calibrations.gains(c), calibrations.calibration.r_load, records, strict=True)
-        )
-    ]
-    rows = calibrations.by_gains(c, slopes)
-    directions = rows - linear.told(rows) @ linear.bread() @ linear.jacobian
+    slopes, every = near.slopes, calibrations.knots
+    alone = as_complex(jnp.eye(slopes.gains.shape[0]))[:, :, None]
+    by_resistor = alone * (-slopes.z_th * slopes.by_z)[None]
+    rows = near.rows(by_resistor)
+    others = linear.told(rows) @ linear.bread()
+    directions = rows - others @ linear.jacobian
     own = jnp.sum(rows * linear.share[None, :] * directions, axis=1)
-    score = directions @ value
+    score = directions @ near.terms
     # Estimate the noise after the resistor that explains most: its error must not count as noise.
     best = jnp.argmax(score**2 / own)
-    rest = value - directions[best] * (score / own)[best]
-    size = records[0].x.size
-    of_noise = [
-        excess(rest[2 * i * size : 2 * (i + 1) * size], s.selected) for i, s in enumerate(records)
-    ]
-    error = jnp.sqrt(jnp.sum(weights(of_noise, value.size)[None, :] * directions**2, axis=1)) / own
+    made = combined(others[best], slopes.by_common.reshape(linear.jacobian.shape[0], -1))
+    change = (made.reshape(slopes.gains.shape) - by_resistor[best]) * as_complex(score / own)[best]
+    part = calibrations.terms(near.profiles[0].gains + every.between(change))
+    noise = near.padded(means(near.profiles, every, calibrations.noise(part)[None]), 1.0)
+    error = jnp.sqrt(jnp.sum(noise * directions**2, axis=1)) / own
     return jnp.stack([score / own, error])
-
-
-def _slope(
-    g: Complex[Array, " harmonic"], r: Float[Array, ""], z_th: Complex[Array, " harmonic"]
-) -> Complex[Array, " harmonic"]:
-    """∂G/∂ log R."""
-    return g * z_th / (as_complex(r) + z_th)
 
 
 def disagree(

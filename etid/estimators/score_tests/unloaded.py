@@ -20,7 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Complex, Float
 
-from etid.estimators.maximum_likelihood.terms import excess
+from etid.estimators.maximum_likelihood.profile import excess
 from etid.results.driver import Driver, HarmonicDriver
 from etid.signals.harmonics import Spectrum, signal_share
 from etid.signals.transfer import as_complex, power, turns
