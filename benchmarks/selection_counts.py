@@ -61,9 +61,10 @@ def _laplace(fit: Fit, number: int) -> float:
         for one in (fit.circuit, USUAL[number]())
     )
     uniform = np.array([unit == "1" for unit in fit.circuit.units().values()])
-    if not ((values > 0) & np.isfinite(values)).all():
+    if not (values > 0).all():
         return math.inf
-    sign, volume = np.linalg.slogdet(np.asarray(fit.cov) / np.outer(values, values))
+    with np.errstate(invalid="ignore", over="ignore"):  # an element without end has no sign
+        sign, volume = np.linalg.slogdet(np.asarray(fit.cov) / np.outer(values, values))
     if not sign > 0:
         return math.inf
     q = np.log(values / typical) / PRIOR
