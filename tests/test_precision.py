@@ -50,6 +50,7 @@ def _example():
         "predicted": etid.predict(study["a"], driver, fit.circuit),
         "fits": fits.fit,
         "one of them": fits[1],
+        "text": etid.circuit_string(etid.SkinCole(tau=18.9e-6))[1],
         "start": etid.SkinRC(r_s=33333.333333),
     }
 

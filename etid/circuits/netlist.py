@@ -7,8 +7,10 @@ import numpy as np
 
 from etid.circuits.circuit import AbstractCircuit
 from etid.circuits.impedance import Netlist, Notation
+from etid.precision import in_float64
 
 
+@in_float64
 def netlist(
     circuit: AbstractCircuit, *, name: str = "load", band: tuple[float, float] = (1.0, 10e6)
 ) -> str:
@@ -45,6 +47,7 @@ def netlist(
     return "\n".join([*lines, f".subckt {name} plus minus", *written.lines, f".ends {name}", ""])
 
 
+@in_float64
 def circuit_string(circuit: AbstractCircuit) -> tuple[str, list[float]]:
     """A circuit in the notation of impedance.py, such as `R0-p(R1,C1)`, and the element values.
 
