@@ -90,7 +90,7 @@ class ByNumPy:
 
     def __init__(self, load: Load):
         spectrum = load.records
-        used = np.asarray(spectrum.selected)
+        used = np.asarray(spectrum.selected[0])
         self.x, self.y = np.asarray(spectrum.x)[used], np.asarray(spectrum.y[0])[used]
         self.of_x = np.asarray(spectrum.variance_x)[used]
         self.of_y = np.asarray(spectrum.variance_y[0])[used]

@@ -144,7 +144,7 @@ def test_all_peers_solve_the_same_problem(short_problem):
         np.testing.assert_allclose(ours, theirs, rtol=1e-8)  # rounding of a condition of 1e4
     load = short_problem.load(jax.tree.map(lambda leaf: leaf[0], short_problem.lanes))
     by, q = ByNumPy(load), START + 0.01
-    used = np.concatenate([np.tile(np.asarray(load.records.selected), 2), [False] * 3, [True]])
+    used = np.concatenate([np.tile(np.asarray(load.records.selected[0]), 2), [False] * 3, [True]])
     slope = np.asarray(jax.jacfwd(load)(jax.numpy.asarray(q)))[used]
     terms = np.asarray(load(jax.numpy.asarray(q)))[used]
     np.testing.assert_allclose(by.terms(q), terms, rtol=1e-6, atol=1e-9)
