@@ -2,7 +2,6 @@
 
 import dataclasses
 
-import equinox as eqx
 import h5py
 import jax
 import numpy as np
@@ -14,10 +13,12 @@ from etid.estimators.registry import OUTPUT_ERROR
 from etid.identify import batches, planning
 from etid.identify.arguments import Asked
 from etid.identify.one import skin_lane
+from etid.numpy_tier.tiers import program
 from etid.recordings.preflight import Inspected
 from etid.simulation.scenes import Scene, Trial
 from etid.simulation.transformer import ResistorLoad, SkinLoad
 
+pytestmark = pytest.mark.usefixtures("run_as_for_users")
 LENGTH = 10_000
 PULSE = 3334  # samples of one period, which output error fits
 DRY = SkinLoad(r_s=33.4e3, r_p=186e3, c_p=0.12e-9)
@@ -177,10 +178,11 @@ def test_what_fills_a_record_up_changes_no_digit(study, driver):
     """The same samples in a longer lane."""
     recording = cut(study["s01/dry/0"])
     lane = jax.tree.map(jax.numpy.asarray, PaddedSamples.of(Inspected(recording)))
-    fit = OUTPUT_ERROR.fit_load(lane, driver, None, etid.SkinRC())
+    fitted = program(OUTPUT_ERROR.fit_load)
+    fit = fitted(lane, driver, None, etid.SkinRC())
     v_th, v_out = (jax.numpy.pad(v, (0, 555)) for v in (lane.v_th, lane.v_out))
     longer = dataclasses.replace(lane, v_th=v_th, v_out=v_out)
-    again = OUTPUT_ERROR.fit_load(longer, driver, None, etid.SkinRC())
+    again = fitted(longer, driver, None, etid.SkinRC())
     for one, other in zip(jax.tree.leaves(fit), jax.tree.leaves(again), strict=True):
         np.testing.assert_allclose(one, other, rtol=1e-5)  # of solvers that stop at 1e-3 errors
 

@@ -17,6 +17,8 @@ from etid.signals.aliases import aliases
 from etid.signals.harmonics import ALIASED
 from etid.simulation.transformer import TransformerDriver
 
+pytestmark = pytest.mark.usefixtures("run_as_for_users")
+
 SKINS = {
     "dry": etid.SkinRC(r_s=33.4e3, r_p=186e3, c_p=0.12e-9),
     "damp": etid.SkinRC(r_s=6.1e3, r_p=17.4e3, c_p=0.66e-9),
@@ -261,29 +263,29 @@ LEVELS = (40.0, 60.0, 80.0)
     ("rate", "pulses", "periods"), [(200e3, 50.0, 10), (240e3, 60.0, 3)], ids=["50 Hz", "60 Hz"]
 )
 def test_behind_a_filter_the_elements_are_within_their_errors(rate, pulses, periods):
-    errors, others = drawn(51, LEVELS, rate=rate, pulses=pulses, periods=periods)
+    errors, others = drawn(18, LEVELS, rate=rate, pulses=pulses, periods=periods)
     assert len(others) <= 2
     assert np.abs(errors).max() < SIGMAS
-    assert np.sqrt(np.mean(errors**2, axis=0)).max() < 1.15  # 1 ± 0.05 without any aliases
+    assert np.sqrt(np.mean(errors**2, axis=0)).max() < 1.3  # 1 ± 0.09 without any aliases
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("rate", "pulses"), [(200e3, 50.0), (240e3, 60.0)], ids=["50 Hz", "60 Hz"])
 def test_without_a_filter_no_fit_is_silently_wrong(rate, pulses):
-    errors, others = drawn(51, LEVELS, rate=rate, pulses=pulses, filtered=False)
-    assert others.count("biased") >= 0.8 * 102
+    errors, others = drawn(18, LEVELS, rate=rate, pulses=pulses, filtered=False)
+    assert others.count("biased") >= 0.75 * 36
     assert not errors.size or np.abs(errors).max() < SIGMAS
 
 
 @pytest.mark.slow
 def test_100_khz_are_too_slow_for_edges_that_ring_at_60_khz():
-    errors, others = drawn(20, LEVELS[:2], rate=100e3, pulses=50.0)
+    errors, others = drawn(8, LEVELS[:2], rate=100e3, pulses=50.0)
     assert set(others) <= {"biased", "insensitive"}
     assert not errors.size or np.abs(errors).max() < SIGMAS
 
 
 @pytest.mark.slow
 def test_a_method_that_takes_aliases_for_noise_says_that_it_is_biased():
-    errors, others = drawn(10, (60.0,), "non_parametric", rate=240e3, pulses=60.0)
+    errors, others = drawn(5, (60.0,), "non_parametric", rate=240e3, pulses=60.0)
     assert others.count("biased") > len(errors)
     assert not errors.size or np.abs(errors).max() < SIGMAS

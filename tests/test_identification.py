@@ -12,6 +12,8 @@ from etid.simulation.scenes import Scene, Trial
 from etid.simulation.transformer import ResistorLoad, SkinLoad
 from tests import kept_numbers
 
+pytestmark = pytest.mark.usefixtures("run_as_for_users")
+
 LENGTH = 3334
 LOADS = {
     "dry": SkinLoad(r_s=33.4e3, r_p=186e3, c_p=0.12e-9),

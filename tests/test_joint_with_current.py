@@ -177,24 +177,24 @@ def test_the_bound_of_one_trial_is_that_of_etid(drawn):
 
 
 def test_joint_estimates_are_efficient_and_their_intervals_true():
-    """Dry and damp skin, each with an unloaded record for each recording and with one for all."""
-    squares, covered, draws = [], [], 25
-    for circuit, current_snr_db in ((SKIN, 40.0), (DAMP, 30.0)):
-        for shared_v_th in (False, True):
-            of = scene(circuit, current_snr_db=current_snr_db, shared_v_th=shared_v_th)
-            bound = joint_bound(of)
-            for seed in range(draws):
-                fits = etid.identify_jointly(of.simulate(seed + 2000)).fits
-                assert set(fits.verdicts) <= {"successful", "inconsistent", "changed"}, seed
-                if (fits.verdicts == "successful").all():
-                    both = fits[0], fits[1]
-                    error = np.stack([values(fit) for fit in both]) / np.asarray(circuit.values())
-                    squares.append(((error - 1) / bound) ** 2)
-                    covered.append(np.abs(error - 1) < 1.96 * np.stack([*map(relative, both)]))
-    assert len(squares) >= 4 * draws - 3
-    # 200 squares of normal errors have a mean that is known to 10 %.
-    assert (np.mean(squares, axis=(0, 1)) < 1.35).all(), np.mean(squares, axis=(0, 1))
-    assert 0.92 < np.mean(covered) < 0.98
+    """Dry skin with an unloaded record for each recording, and damp skin with one for all."""
+    squares, covered, draws = [], [], 12
+    for circuit, current_snr_db, shared_v_th in ((SKIN, 40.0, False), (DAMP, 30.0, True)):
+        of = scene(circuit, current_snr_db=current_snr_db, shared_v_th=shared_v_th)
+        bound = joint_bound(of)
+        for seed in range(draws):
+            fits = etid.identify_jointly(of.simulate(seed + 2000)).fits
+            assert set(fits.verdicts) <= {"successful", "inconsistent", "changed"}, seed
+            if (fits.verdicts == "successful").all():
+                both = fits[0], fits[1]
+                error = np.stack([values(fit) for fit in both]) / np.asarray(circuit.values())
+                squares.append(((error - 1) / bound) ** 2)
+                covered.append(np.abs(error - 1) < 1.96 * np.stack([*map(relative, both)]))
+    assert len(squares) >= 2 * draws - 2
+    # 48 squares of normal errors have a mean that is known to 20 %, and 144 intervals, of which
+    # a third is independent, hold 95 % to 3.1 %: limits at three of these.
+    assert (np.mean(squares, axis=(0, 1)) < 1.6).all(), np.mean(squares, axis=(0, 1))
+    assert 0.86 < np.mean(covered), np.mean(covered)
 
 
 def test_a_current_helps_the_recordings_without_one(drawn):

@@ -27,6 +27,8 @@ from etid.simulation.scenes import Scene, Trial
 from etid.simulation.transformer import ResistorLoad, SkinLoad
 from tests import kept_numbers
 
+pytestmark = pytest.mark.usefixtures("run_as_for_users")
+
 DRY = SkinLoad(r_s=33.4e3, r_p=186e3, c_p=0.12e-9)
 SAMPLES = 10_000
 SHORT = 3332  # less than a period; filled up like those of a period, which other tests fit

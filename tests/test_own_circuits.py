@@ -14,6 +14,8 @@ from etid.identify.steady_state import periodic_voltage
 from etid.results.verdicts import verdict
 from etid.simulation.scenes import Trial
 
+pytestmark = pytest.mark.usefixtures("run_as_for_users")
+
 LAYERS = etid.SkinLayers(33.4e3, 150e3, 0.12e-9, 36e3, 5e-9)
 SPREAD = etid.SkinCole(33.4e3, 186e3, 22e-6, 0.85)
 DRY = etid.SkinRC(33.4e3, 186e3, 0.12e-9)
@@ -75,8 +77,8 @@ def calibrated(seed):
 @pytest.mark.slow
 @pytest.mark.parametrize("path", ["layers", "spread"])
 def test_intervals_hold_the_truth_as_often_as_they_say(path):
-    """A calibration for each of 100 draws, so that all are independent."""
-    truth, draws = TRIALS[path], 100
+    """A calibration for each of 40 draws, so that all are independent."""
+    truth, draws = TRIALS[path], 40
     inside = []
     for seed in range(draws):
         drawn, known = calibrated(seed)

@@ -11,6 +11,8 @@ from etid.recordings.remarks import Remark
 from tests.test_changes import falling, recorded
 from tests.test_disturbances import off
 
+pytestmark = pytest.mark.usefixtures("run_as_for_users")
+
 PERIOD = 10_000 / 3
 FAULTS = ("lost", "doubled")
 
