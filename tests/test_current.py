@@ -45,7 +45,8 @@ def recorded(circuit, *, periods=3.0, snr_db=60.0, seed=0, delay=0.0, **fields):
     waves = np.fft.irfft(spectra, whole, norm="forward")
     rng = np.random.default_rng(seed)
     current, v_out = (
-        np.resize(v, n) + np.std(v) * 10 ** (-snr_db / 20) * rng.standard_normal(n) for v in waves
+        v + np.std(v) * 10 ** (-snr_db / 20) * rng.standard_normal(n)
+        for v in (np.resize(wave, n) for wave in waves)
     )
     records = {"current": current, "v_out": v_out, "sample_rate": RATE, "pulse_rate": PULSES}
     return etid.Recording(**records | fields)
