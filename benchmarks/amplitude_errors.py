@@ -78,7 +78,7 @@ def voltage(amplitude: float, t: np.ndarray, elements: np.ndarray) -> np.ndarray
 
     # It is at rest long before the end of a period.
     found = solve_ivp(
-        slope, (0, PERIOD), [0.0], method="Radau", rtol=1e-9, atol=1e-10, max_step=4e-6,
+        slope, (0, PERIOD), [0.0], method="LSODA", rtol=1e-11, atol=1e-11, max_step=4e-6,
         dense_output=True,
     )  # fmt: skip
     return found.sol(t % PERIOD)[0] + r_s * amplitude * pulses(t)

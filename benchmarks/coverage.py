@@ -21,6 +21,7 @@ import numpy as np
 from tqdm import tqdm
 
 import etid
+from benchmarks.estimators import DEFAULT, Drivers
 from benchmarks.ladder import LOADS
 from benchmarks.perturbed_study import drawn_driver
 from benchmarks.rates import NORMAL_95, expected_covered, expected_rms
@@ -56,11 +57,20 @@ class Draws(NamedTuple):
     error: np.ndarray
     stderr: np.ndarray
     verdicts: np.ndarray
+    cov: np.ndarray  # of the errors
 
     @property
     def z(self) -> np.ndarray:
         """Errors of the successful fits in standard errors."""
         return (self.error / self.stderr)[self.verdicts == "successful"]
+
+    @property
+    def distance(self) -> np.ndarray:
+        """Squared errors of the successful fits in their covariance: χ² of as many elements."""
+        good = self.verdicts == "successful"
+        return np.einsum(
+            "ni,nij,nj->n", self.error[good], np.linalg.inv(self.cov[good]), self.error[good]
+        )
 
     @property
     def covered(self) -> np.ndarray:
@@ -110,11 +120,18 @@ def compared(fit: etid.Fit | None, truth: Sequence[float]) -> tuple[np.ndarray, 
     return error, np.asarray(fit.stderr.values()) / true, fit.verdict
 
 
+def _cov(fit: etid.Fit | None, truth: Sequence[float]) -> np.ndarray:
+    """Covariance of the relative errors."""
+    size = len(truth)
+    return np.full((size, size), np.nan) if fit is None else fit.cov / np.outer(truth, truth)
+
+
 def monte_carlo(
     scene: Scene,
     repetitions: int,
     method: str | None,
     parts: float = 0.0,
+    drivers: Drivers | None = None,
 ) -> dict[str, Draws]:
     """Identify fresh recordings of each trial of `scene`.
 
@@ -123,34 +140,56 @@ def monte_carlo(
         repetitions: How often.
         method: As in `identify_skin`, or `joint`.
         parts: Standard deviation of the logarithm of every part of the drivers.
+        drivers: Those that other methods have identified from the same draws.
     """
     counted = [trial.path for trial in scene.trials if not trial.path.startswith(MORE)]
     truth = {path: list(scene.truth()[path].values()) for path in counted}
-    rows: dict[str, list] = {path: [] for path in truth}
-    for seed in tqdm(range(repetitions), disable=None):
-        study = with_driver(scene, seed, parts).simulate(seed=seed)
-        fits = _identify(study, counted, method)
-        for path, of in rows.items():
-            of.append(compared(fits.get(path), truth[path]))
-    columns = {path: zip(*of, strict=True) for path, of in rows.items()}
-    return {path: Draws(*map(np.array, of)) for path, of in columns.items()}
-
-
-def _identify(study: etid.Study, paths: Sequence[str], method: str | None) -> dict[str, etid.Fit]:
-    """Fits by path; none if the driver of the calibrations failed."""
+    studies = (
+        with_driver(scene, seed, parts).simulate(seed=seed)
+        for seed in tqdm(range(repetitions), disable=None)
+    )
     if method == JOINT:
-        fits = etid.identify_jointly(study).fits
-        found = list(fits.labels["path"])
-        return {path: fits[found.index(path)] for path in paths}
-    driver, calibrations = None, list(study.calibrations.recordings())
-    try:
-        if calibrations:
-            driver = etid.identify_driver(calibrations, method=method, throw=False)
-    except etid.IdentificationError:
+        rows = [_jointly(study, counted) for study in studies]
+    elif scene.calibration:
+        known = Drivers() if drivers is None else drivers
+        rows = [_behind_driver(study, counted, method, known) for study in studies]
+    else:
+        rows = _from_current(list(studies), counted, method)
+    found = {}
+    for path, true in truth.items():
+        fits = [row.get(path) for row in rows]
+        columns = zip(*(compared(fit, true) for fit in fits), strict=True)
+        found[path] = Draws(*map(np.array, columns), np.array([_cov(fit, true) for fit in fits]))
+    return found
+
+
+def _jointly(study: etid.Study, paths: Sequence[str]) -> dict[str, etid.Fit]:
+    fits = etid.identify_jointly(study).fits
+    found = list(fits.labels["path"])
+    return {path: fits[found.index(path)] for path in paths}
+
+
+def _behind_driver(
+    study: etid.Study, paths: Sequence[str], method: str | None, drivers: Drivers
+) -> dict[str, etid.Fit]:
+    """Fits by path; none if the driver of the calibrations failed."""
+    driver = drivers.of(list(study.calibrations.recordings()), method or DEFAULT)
+    if driver is None:
         return {}
     return {
         path: etid.identify_skin(study[path], driver, method=method, throw=False) for path in paths
     }
+
+
+def _from_current(
+    studies: Sequence[etid.Study], paths: Sequence[str], method: str | None
+) -> list[dict[str, etid.Fit]]:
+    """All draws of a trial as one batch, for no driver differs."""
+    every = {
+        path: etid.identify_skins([study[path] for study in studies], None, method=method)
+        for path in paths
+    }
+    return [{path: fits[i] for path, fits in every.items()} for i in range(len(studies))]
 
 
 def lines(name: str, of: Draws, bounds: dict[str, float]) -> Iterator[str]:

@@ -35,10 +35,10 @@ from etid.simulation import scenes
 
 FIRST = 1000  # number of the first driver; those of other benchmarks are smaller
 MAP = (7, 10)  # drivers of a cell of the map, and trials behind each
-FEW = (1, 4)  # the same of a quick run
 PAIRS = 15  # timed pairs
-SINGLES = 16  # recordings of a pair that are identified one at a time
-FEW_SNR = (20, 60)
+BATCH, SINGLES = 64, 16  # recordings of a pair: at once, and one at a time
+# The same of a quick run, which has every 20th cell of the map.
+FEW, FEW_PAIRS, FEW_DRIVERS, FEW_SNR, STEP = (1, 4), 3, 2, (20, 60), 20
 RIVAL_DRIVERS, RIVAL_SNR = 1, (20, 40, 60)  # ten seconds for each recording
 
 OPTIONS = (QUICK, WORKERS, FOLDER, option("--drivers", default=25, help="of an SNR"))
@@ -111,7 +111,7 @@ def time_ratios(pairs: int) -> Iterator[Target]:
     for snr in (40.0, 60.0):
         study = scenes.paper_subjects(snr_db=snr, trigger_jitter_rms=DELAY).simulate(5)
         driver = etid.identify_driver(list(study.calibrations.recordings())[:1], throw=False)
-        records = list(study.loaded.recordings())[:64]
+        records = list(study.loaded.recordings())[:BATCH]
 
         def in_batch(circuit: Any, records=records, driver=driver) -> None:
             etid.identify_skins(records, driver, circuit=circuit)
@@ -177,7 +177,7 @@ def select_time(number: int) -> float:
 def main(arguments: argparse.Namespace) -> bool:
     """Run the command."""
     quick, workers, folder = arguments.quick, arguments.workers, arguments.folder
-    numbers = range(FIRST, FIRST + (2 if quick else arguments.drivers))
+    numbers = range(FIRST, FIRST + (FEW_DRIVERS if quick else arguments.drivers))
     tasks = [(float(snr), n) for snr in (FEW_SNR if quick else SNR_DB) for n in numbers]
     drawn = [one for _, found in each(draws, tasks, workers, "study") for one in found]
     by_cell = collections.defaultdict(list)
@@ -196,9 +196,9 @@ def main(arguments: argparse.Namespace) -> bool:
     write_csv(folder / "selection.csv", rows)
     selection_chart.draw(rows, TRUTHS, folder / "selection.svg", missing)
     print(f"etid: {1e3 * select_time(FIRST):.0f} ms for a choice (median)")
-    targets += time_ratios(3 if quick else PAIRS)
+    targets += time_ratios(FEW_PAIRS if quick else PAIRS)
 
-    every = selection_map.chosen_cells()[:: 20 if quick else 1]
+    every = selection_map.chosen_cells()[:: STEP if quick else 1]
     of_map = [(cell, *(FEW if quick else MAP)) for cell in every]
     answered = dict(each(selection_map.answers, of_map, workers, "cell"))
     found = [answered[number] for number in range(len(every))]

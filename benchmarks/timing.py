@@ -19,6 +19,7 @@ from etid.estimators.registry import names
 
 OPTIONS = (option("--lanes", default=98, help="of the batch"),)
 REPEATS = 7
+IMPORTS = 3
 
 
 def pin() -> None:
@@ -47,12 +48,12 @@ def interpreter() -> dict[str, str]:
 
 
 def import_time(module: str) -> float:
-    """Wall time [s] of importing a module in a fresh interpreter, median of 3 after a first one."""
+    """Wall time [s] of importing a module in a fresh interpreter, median after a first one."""
     code = f"import time; t = time.perf_counter(); {module}; print(time.perf_counter() - t)"
     command = [sys.executable, "-c", code]
     runs = [
         subprocess.run(command, env=interpreter(), capture_output=True, check=True).stdout
-        for _ in range(4)
+        for _ in range(1 + IMPORTS)
     ]
     return float(np.median(np.array(runs[1:], float)))
 

@@ -9,6 +9,7 @@ import dataclasses
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import scipy.stats
 from scipy.integrate import solve_ivp
 from scipy.special import erf
 
@@ -20,6 +21,7 @@ from etid.estimators.lanes import Harmonics, stacked
 from etid.estimators.registry import MAXIMUM_LIKELIHOOD
 from etid.identify.amplitudes import leaves_much
 from etid.identify.one import known_of
+from etid.numpy_tier import tiers
 from etid.recordings.preflight import Inspected
 from etid.recordings.remarks import Remark
 from etid.results.feed import MEASURED_CURRENT
@@ -28,11 +30,19 @@ from etid.solvers.harmonic_balance import steady_state, to_harmonics, to_time
 
 SAMPLE_RATE, PULSE_RATE = 200e3, 60.0
 # Three periods in which everything is slower: few harmonics, so that a fit is cheap. `AT` is the
-# time of the skin and of its pulses. The lengths are few, too, because each compiles.
+# time of the skin and of its pulses. All have three records, for each number of them compiles.
 SLOW_RATE, SLOWER = 20e3, 8
 AT = np.arange(1000) / SLOW_RATE % (1 / PULSE_RATE) / SLOWER
 SKIN = etid.SkinCurrent(r_s=895.0, r_p=60.1e3, c_p=1e-9, i_0=0.585e-3)  # Kaczmarek and Webster 1989
-LINEAR = etid.SkinCurrent(r_s=895.0, r_p=60.1e3, c_p=1e-9, i_0=1e3)
+
+pytestmark = pytest.mark.usefixtures("run_as_for_users")
+
+
+@pytest.fixture
+def compiled(monkeypatch):
+    """One program for dozens of fits: by all passes of XLA, each takes a sixth of the time."""
+    monkeypatch.setattr(tiers, "_by_numpy", lambda: False)
+    monkeypatch.setattr(tiers, "AT_ONCE", None)
 
 
 def pulses(t: np.ndarray) -> np.ndarray:
@@ -43,9 +53,9 @@ def pulses(t: np.ndarray) -> np.ndarray:
     return first - 2 * second + third
 
 
-def stepped(amplitude: float, t: np.ndarray, skin: etid.SkinCurrent = SKIN) -> np.ndarray:
-    """Voltage across the skin [V] at these times, by Radau's method."""
-    r_s, r_p, c_p, i_0 = skin.values().tolist()
+def stepped(amplitude: float, t: np.ndarray) -> np.ndarray:
+    """Voltage across the skin [V] at these times, by LSODA, which turns to a stiff method."""
+    r_s, r_p, c_p, i_0 = SKIN.values().tolist()
 
     def slope(t: float, u: np.ndarray) -> np.ndarray:
         through = u / (r_p * (1 - np.abs(u) / (r_p * i_0)))
@@ -53,7 +63,7 @@ def stepped(amplitude: float, t: np.ndarray, skin: etid.SkinCurrent = SKIN) -> n
 
     # It is at rest long before the end of a period.
     found = solve_ivp(
-        slope, (0, 2e-3), [0.0], method="Radau", rtol=1e-8, atol=1e-9, max_step=4e-6,
+        slope, (0, 2e-3), [0.0], method="LSODA", rtol=1e-10, atol=1e-11, max_step=4e-6,
         dense_output=True,
     )  # fmt: skip
     at = np.mod(t, 1 / PULSE_RATE)
@@ -72,11 +82,11 @@ def recorded(v_out: np.ndarray, current: np.ndarray, level: float, rng, rate: fl
     )
 
 
-def recording(amplitude: float, seed: int, skin: etid.SkinCurrent = SKIN) -> etid.Recording:
+def recording(amplitude: float, seed: int) -> etid.Recording:
     """Three periods of current and voltage at 60 dB."""
     t = np.arange(10_000) / SAMPLE_RATE
     rng = np.random.default_rng([seed, round(1e6 * amplitude)])
-    v_out, current = stepped(amplitude, t, skin), amplitude * pulses(t)
+    v_out, current = stepped(amplitude, t), amplitude * pulses(t)
     return recorded(v_out, current, 1e-3, rng, SAMPLE_RATE)
 
 
@@ -161,39 +171,25 @@ def test_what_cannot_be_fitted_is_refused_at_once():
 
 
 @pytest.mark.slow
-def test_five_amplitudes_give_the_values_of_kaczmarek_and_webster():
-    amplitudes = (0.1e-3, 0.3e-3, 1e-3, 2.5e-3, 5e-3)
-    fit = etid.identify_amplitudes([recording(one, 3) for one in amplitudes])
-    error = np.asarray(fit.circuit.values()) / np.asarray(SKIN.values()) - 1
-    assert np.abs(error).max() < 0.02, error
-    stderr = np.sqrt(np.diag(fit.cov)) / np.asarray(SKIN.values())
-    assert np.all(np.abs(error) < 4 * stderr), error / stderr  # one of 4 elements in 4 000 fits
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    "amplitudes",
-    [(0.1e-3, 0.3e-3, 1e-3, 2.5e-3, 5e-3), (1e-3, 3e-3, 5e-3), (0.5e-3, 5e-3)],
-)
-def test_elements_and_intervals_are_right_at_any_amplitudes(amplitudes):
+def test_elements_and_errors_are_right_at_any_amplitudes(compiled):
     """At 1, 3 and 5 mA the resistance is far below R_p in every record.
 
-    Before, such fits ended where the noise of the current explained everything.
+    Such fits could end where the noise of the current explains everything.
     """
-    truth, draws = np.array([895.0, 60.1e3, SLOWER * 1e-9, 0.585e-3]), 30
-    both = [(stepped(one, AT), one * pulses(AT)) for one in amplitudes]
-    verdicts, off = [], []
-    for seed in range(draws):
-        rng = np.random.default_rng([seed, 17])
-        of = [recorded(*one, 1e-3, rng) for one in both]
-        fit = etid.identify_amplitudes(of, throw=False)
-        verdicts.append(fit.verdict)
-        error = np.asarray(fit.circuit.values()) - truth
-        assert np.abs(error / truth).max() < 0.02
-        off.append(np.abs(error) / np.sqrt(np.diag(fit.cov)))
-    assert verdicts.count("successful") == draws
-    # Of 120 intervals that depend on each other within a fit, fewer are right once in 1 000 times.
-    assert np.mean(np.array(off) < 1.96) > 0.85
+    truth, draws = np.array([895.0, 60.1e3, SLOWER * 1e-9, 0.585e-3]), 6
+    distance = []
+    for amplitudes in ((0.1e-3, 1e-3, 5e-3), (1e-3, 3e-3, 5e-3), (0.5e-3, 5e-3, 5e-3)):
+        exact = [(stepped(one, AT), one * pulses(AT)) for one in amplitudes]
+        for seed in range(draws):
+            rng = np.random.default_rng([seed, 17])
+            fit = etid.identify_amplitudes([recorded(*one, 1e-3, rng) for one in exact])
+            error = np.asarray(fit.circuit.values()) - truth
+            assert np.abs(error / truth).max() < 0.02
+            distance.append(error @ np.linalg.solve(fit.cov, error))
+    # Chi-squared with four degrees of freedom for each fit, exceeded once in a thousand times. The
+    # upper limit is errors 1.27 times as large as they are said to be.
+    low, high = scipy.stats.chi2.interval(0.998, 4 * len(distance))
+    assert low < np.sum(distance) < high
 
 
 def following(amplitude: float, t: np.ndarray) -> np.ndarray:
@@ -213,53 +209,11 @@ def following(amplitude: float, t: np.ndarray) -> np.ndarray:
 
     at = np.mod(t, 1 / PULSE_RATE)
     grid = np.arange(0, 6e-3, 1e-6)
-    found = solve_ivp(slope, (0, 6e-3), np.zeros(3), rtol=1e-6, max_step=4e-6, t_eval=grid)
+    found = solve_ivp(
+        slope, (0, 6e-3), np.zeros(3), method="LSODA", rtol=1e-8, atol=1e-9, max_step=4e-6,
+        t_eval=grid,
+    )  # fmt: skip
     return np.interp(at, grid, found.y[0], right=0.0) + r_s * amplitude * pulses(t)
-
-
-@pytest.mark.slow
-def test_a_linear_skin_has_no_i_0_and_remarks_on_its_recordings_are_told(monkeypatch):
-    rng = np.random.default_rng(5)
-    volts = {one: stepped(one, AT, LINEAR) for one in (0.1e-3, 0.5e-3)}
-    of = [recorded(v, one * pulses(AT), 1e-3, rng) for one, v in volts.items()]
-    remarks = iter([Remark.coarse_converter, Remark.pulse_rate_counted])
-    monkeypatch.setattr(Inspected, "remarks", property(lambda _: next(remarks)))
-    fit = etid.identify_amplitudes(of, throw=False)
-    assert fit.verdict in ("insensitive", "max_steps_reached")
-    assert int(fit.remarks) == Remark.coarse_converter | Remark.pulse_rate_counted
-
-
-@pytest.mark.slow
-def test_linear_skin_is_called_nonlinear_as_rarely_as_stated():
-    """1 of 2 000 by the limit; of 200, more than 2 would come by chance once in 6 000 times."""
-    f, pulse = np.fft.rfftfreq(1000, 1 / SLOW_RATE), pulses(AT)
-    volts = np.fft.irfft(np.fft.rfft(pulse) * (5e3 + 60e3 / (1 + 2j * np.pi * f * 6e-4)))
-    verdicts = []
-    for seed in range(200):
-        rng = np.random.default_rng([seed, 11])
-        of = [recorded(one * volts, one * pulse, 1e-2, rng) for one in (1e-4, 5e-4)]
-        verdicts.append(etid.identify_amplitudes(of, throw=False).verdict)
-    assert verdicts.count("successful") <= 2
-    assert verdicts.count("insensitive") >= 196
-
-
-@pytest.mark.slow
-def test_skin_that_recovers_slowly_is_a_misfit():
-    """Not an answer: R_p is 12 % and I_0 43 % too small."""
-    t, of = np.arange(10_000) / SAMPLE_RATE, []
-    for one in (0.1e-3, 0.3e-3, 1e-3):
-        rng = np.random.default_rng([9, round(1e6 * one)])
-        of.append(recorded(following(one, t), one * pulses(t), 1e-2, rng, SAMPLE_RATE))
-    fit = etid.identify_amplitudes(of, throw=False)
-    assert fit.verdict == "misfit"
-    assert "recovery after a pulse is slower" in str(fit)
-    wrong = np.asarray(fit.circuit.values()) / np.asarray(SKIN.values()) - 1
-    np.testing.assert_allclose(wrong[[1, 3]], [-0.12, -0.43], atol=0.02)
-
-
-def layered(amplitude: float, t: np.ndarray, skin: etid.SkinCurrent = SKIN) -> np.ndarray:
-    """Voltage [V] with a second layer of 20 kΩ and 200 µs, in closed form for a current source."""
-    return stepped(amplitude, t, skin) + amplitude * filtered(t, lambda s: 20e3 / (1 + 2e-4 * s))
 
 
 def filtered(t: np.ndarray, response) -> np.ndarray:
@@ -270,36 +224,68 @@ def filtered(t: np.ndarray, response) -> np.ndarray:
     return np.interp(np.mod(t, 1 / PULSE_RATE), period, at, period=1 / PULSE_RATE)
 
 
-TRUTHS = {
-    "recovers slowly": following,
-    "follows at once": stepped,
-    "linear": lambda amplitude, t: stepped(amplitude, t, LINEAR),
-    "two layers": layered,
-    "two linear layers": lambda amplitude, t: layered(amplitude, t, LINEAR),
-}
+def linear(amplitude: float, t: np.ndarray) -> np.ndarray:
+    """Voltage [V] of the skin with its largest resistance at any current, in closed form."""
+    r_s, r_p, c_p, _ = SKIN.values().tolist()
+    return amplitude * (r_s * pulses(t) + filtered(t, lambda s: r_p / (1 + s * r_p * c_p)))
+
+
+def second(amplitude: float, t: np.ndarray) -> np.ndarray:
+    """Voltage [V] of a second layer of 20 kΩ and 200 µs under the same current."""
+    return amplitude * filtered(t, lambda s: 20e3 / (1 + 2e-4 * s))
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("snr_db", [40.0, 60.0])
-@pytest.mark.parametrize("name", TRUTHS)
-def test_slow_recovery_is_told_from_other_misfits(name, snr_db):
+def test_linear_skin_is_called_nonlinear_as_rarely_as_stated(compiled, monkeypatch):
+    """1 of 2 000 by the limit; of 100, more than one would come by chance once in 800 times."""
+    amplitudes = (1e-4, 5e-4, 5e-4)
+    exact = [(linear(one, AT), one * pulses(AT)) for one in amplitudes]
+    verdicts = []
+    for seed in range(100):
+        rng = np.random.default_rng([seed, 11])
+        of = [recorded(*one, 1e-2, rng) for one in exact]
+        verdicts.append(etid.identify_amplitudes(of, throw=False).verdict)
+    assert verdicts.count("successful") <= 1
+    assert verdicts.count("insensitive") >= 98
+    told = iter([Remark.coarse_converter, Remark.pulse_rate_counted, Remark(0)])
+    monkeypatch.setattr(Inspected, "remarks", property(lambda _: next(told)))
+    fit = etid.identify_amplitudes(of, throw=False)
+    assert int(fit.remarks) == Remark.coarse_converter | Remark.pulse_rate_counted
+
+
+# What recovers slowly is harder to see in more noise, and other misfits look more like it in less.
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("truth", "snr_db", "fits"),
+    [
+        ((following,), 40.0, False),
+        ((stepped,), 40.0, True),
+        ((stepped,), 60.0, True),
+        ((linear,), 40.0, True),
+        ((stepped, second), 60.0, False),
+        ((linear, second), 60.0, False),
+    ],
+)
+def test_slow_recovery_is_told_from_other_misfits(truth, snr_db, fits, compiled):
     for amplitudes in ((0.1e-3, 0.3e-3, 1e-3), (1e-3, 3e-3, 5e-3)):
         rng, level = np.random.default_rng(round(snr_db)), 10 ** (-snr_db / 20)
-        of = [recorded(TRUTHS[name](one, AT), one * pulses(AT), level, rng) for one in amplitudes]
+        of = [
+            recorded(sum(part(one, AT) for part in truth), one * pulses(AT), level, rng)
+            for one in amplitudes
+        ]
         fit = etid.identify_amplitudes(of, throw=False)
-        late = bool(fit.remarks & Remark.follows_late)
-        assert late == (name == "recovers slowly"), fit
-        if name in ("recovers slowly", "two layers", "two linear layers"):
-            assert fit.verdict != "successful"
+        late = following in truth
+        assert bool(fit.remarks & Remark.follows_late) == late, fit
+        assert ("recovery after a pulse is slower" in str(fit)) == late
+        assert fits or fit.verdict != "successful"
 
 
 @pytest.mark.slow
 def test_skin_that_falls_with_its_current_is_identified_behind_a_driver():
     """Against DOP853 in time, with an anti-alias filter and a whole number of samples per period.
 
-    Before, the harmonics that are not fitted then were not in the source of the skin either: R_s
-    was 25 standard errors too small here, and 3 to 6 with the skin of that case, in successful
-    fits.
+    Without the harmonics that are not fitted then in the source of the skin, R_s was 25 standard
+    errors too small here, and 3 to 6 with the skin of that case, in successful fits.
     """
     _, case = amplitudes_benchmark.cases()
     # The skin of that case is the start of the fit.
@@ -326,7 +312,7 @@ def test_skin_that_falls_with_its_current_is_identified_behind_a_driver():
     ]
     driver = etid.identify_driver(calibrations, order=3, method="maximum_likelihood")
     of = []
-    for amplitude in (0.1, 0.4, 1.0):
+    for amplitude in (0.1, 1.0):
         one = case._replace(v_th=amplitude * case.v_th, samples=4 * samples)
         v_out = np.fft.rfft(amplitudes_benchmark.reference(one), norm="forward")
         of.append(recorded(wave(amplitude * case.v_th), wave(v_out[: f.size - 1])))
@@ -352,19 +338,18 @@ def test_a_linear_fit_of_skin_that_falls_with_its_current_says_so():
 
 
 @pytest.mark.slow
-def test_rounding_of_unknown_steps_is_a_misfit_however_small_it_is():
+def test_rounding_of_unknown_steps_is_a_misfit_however_small_it_is(compiled):
     """It was successful: the rounding is less than a thousandth of the signal, and χ² is 40."""
-    t = np.arange(10_000) / SAMPLE_RATE
     of = []
     for amplitude in (0.1e-3, 0.3e-3, 1e-3):
         rng = np.random.default_rng([1, round(1e6 * amplitude)])
-        current, v_out = amplitude * pulses(t), stepped(amplitude, t)
-        current = current + 1e-4 * np.std(current) * rng.standard_normal(t.size)
-        v_out = v_out + 1e-4 * rng.standard_normal(t.size)
+        current, v_out = amplitude * pulses(AT), stepped(amplitude, AT)
+        current = current + 1e-4 * np.std(current) * rng.standard_normal(AT.size)
+        v_out = v_out + 1e-4 * rng.standard_normal(AT.size)
         one = etid.Recording(
             v_out=np.round(v_out / 0.01) * 0.01,
             current=current,
-            sample_rate=SAMPLE_RATE,
+            sample_rate=SLOW_RATE,
             pulse_rate=PULSE_RATE,
             adc_range=(-400.0, 400.0),
         )

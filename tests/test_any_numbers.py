@@ -64,13 +64,14 @@ def assert_equal(written, read):
         np.testing.assert_array_equal(column, theirs[name], err_msg=name)
 
 
-# Method of the driver, and how many of 10 000 fits; output error takes a hundred times as long.
+# Method of the driver, and how many of a thousand fits. Nonsense takes all steps that a fit may:
+# 45 ms on the harmonics, where a skin takes one, and half a second in time.
 METHODS = {
-    "maximum_likelihood": ("maximum_likelihood", 6800),
-    "steiglitz_mcbride": ("steiglitz_mcbride", 1600),
-    "equation_error": ("steiglitz_mcbride", 1000),
-    "non_parametric": ("maximum_likelihood", 500),
-    "output_error": ("output_error", 100),
+    "maximum_likelihood": ("maximum_likelihood", 550),
+    "steiglitz_mcbride": ("steiglitz_mcbride", 100),
+    "equation_error": ("steiglitz_mcbride", 300),
+    "non_parametric": ("maximum_likelihood", 40),
+    "output_error": ("output_error", 10),
 }
 
 
@@ -110,14 +111,14 @@ def assert_read(calibrations, method, count, path):
         for _ in range(count)
     ]
     fits = etid.identify_skins(recordings, driver, method=method)
-    assert len(fits.counts()) > 3  # nonsense fails in many ways
+    assert len(fits.counts()) >= 3  # nonsense fails in many ways
     fits.write(path)
     assert_equal(fits, etid.Fits.read(path))
 
 
 def test_every_method_fits_nonsense():
     assert set(METHODS) == set(names())
-    assert sum(count for _, count in METHODS.values()) == 10_000
+    assert sum(count for _, count in METHODS.values()) == 1000
 
 
 def test_fits_of_nonsense_are_read(calibrations, tmp_path):
@@ -126,7 +127,7 @@ def test_fits_of_nonsense_are_read(calibrations, tmp_path):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("method", METHODS)
-def test_ten_thousand_fits_of_nonsense_are_read(calibrations, method, tmp_path):
+def test_a_thousand_fits_of_nonsense_are_read(calibrations, method, tmp_path):
     assert_read(calibrations, method, METHODS[method][1], tmp_path / "fits.h5")
 
 

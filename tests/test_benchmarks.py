@@ -9,18 +9,29 @@ import numpy as np
 import pytest
 
 import etid
-from benchmarks import amplitudes, curves, peers, scale, which
+from benchmarks import (
+    amplitudes,
+    curves,
+    online,
+    online_alarms,
+    peers,
+    scale,
+    selection,
+    selection_draws,
+    spectra,
+    timing,
+    which,
+)  # fmt: skip
 from benchmarks.__main__ import NAMES, asked
 from benchmarks.problem import START, ByNumPy, problem
 from benchmarks.provenance import write_csv
 from benchmarks.rivals import installed
 
 # What is run of each benchmark, what it writes into the folder {}, and whether it must meet its
-# targets on so few draws. Those without a line have tests of their own below, or in
-# `test_report.py` (paper) and `test_mutation.py`.
+# targets on so few draws. Those without a line have tests of their own below or in other files, or
+# are run by `make ranking`.
 HAZARDS = "--hazard-electrodes 12 --hazard-pulses 30"
 CASES = {
-    "amplitude_errors": ("--draws 2", "", False),
     "control": (
         f"--electrodes 4 --pulses 4 --snr 60 {HAZARDS} --output {{}}/control.svg",
         "control.svg control.csv", False,
@@ -29,7 +40,6 @@ CASES = {
     "delays": ("--studies 2 --scatter 0 --snr-db 60", "", True),
     "design": ("", "", True),
     "driver_order": ("--drivers 1 --snr-db 60 --orders 4 5 --data {}", "", True),
-    "failure_map": ("--quick --workers 1 --folder {}", "failures.csv failures_4.svg", True),
     "fuzz": ("--files 3 --kind csv --output {}/f.json", "f.json", True),
     "noise": ("--drivers 2 --snr-db 60 --only white", "", True),
     "online": (
@@ -39,18 +49,42 @@ CASES = {
         "--quick --snr-db 60 --folder {}", "perturbations.csv perturbations.svg", True,
     ),
     "selection": (
-        "--quick --drivers 1 --workers 1 --folder {}",
+        "--quick --workers 1 --folder {}",
         "selection.csv selection_map.csv selection.svg", False,
     ),
-    "spectra": ("--spectra 15 --good 15 --seed 1", "", True),
-    "speed_accuracy": (
-        "--quick --folder {}",
-        "speed_accuracy.csv speed_accuracy.svg speed_accuracy_all.svg", True,
-    ),
+    "spectra": ("--spectra 4 --good 6 --seed 1", "", True),
     "timing": ("--lanes 2", "", True),
     "which": ("--readme {}/README.md", "README.md", True),
 }  # fmt: skip
 QUICK = ("design", "fuzz", "which")
+RANKING = {"failure_map", "speed_accuracy"}  # run by `make ranking`
+OWN = {
+    "amplitude_errors", "amplitudes", "curves", "mutation", "paper", "referee", "rivals", "scale",
+    "speed", "spice",
+}  # fmt: skip
+
+# Constants that make a benchmark smaller than its options do.
+SMALLER = {
+    online: {"WARM": 3, "NOISES": (60.0,), "KINDS": 3},
+    online_alarms: {"TIMES": 1},
+    selection: {
+        "FEW": (1, 1), "FEW_PAIRS": 1, "FEW_DRIVERS": 1, "FEW_SNR": (60,), "STEP": 60,
+        "BATCH": 2, "SINGLES": 1,
+    },
+    spectra: {"GOOD_POINTS": (20,)},
+    timing: {"IMPORTS": 1, "REPEATS": 1},
+}  # fmt: skip
+
+# Each program runs a few times, so that compilation would be most of the time.
+pytestmark = pytest.mark.usefixtures("run_as_for_users")
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _compiled_at_once():
+    """What NumPy does not run is compiled in half the time."""
+    jax.config.update("jax_disable_most_optimizations", True)
+    yield
+    jax.config.update("jax_disable_most_optimizations", False)
 
 
 @pytest.fixture(autouse=True)
@@ -63,6 +97,15 @@ def _no_environments(monkeypatch):
     monkeypatch.setattr(curves, "pin", lambda: None)
 
 
+@pytest.fixture
+def _small(monkeypatch):
+    for module, constants in SMALLER.items():
+        for name, value in constants.items():
+            monkeypatch.setattr(module, name, value)
+    for name in [name for name in selection_draws.TRUTHS if "damp" in name]:
+        monkeypatch.delitem(selection_draws.TRUTHS, name)
+
+
 def run(name: str, options: str) -> bool:
     """Whether a benchmark meets its targets."""
     arguments = asked([name, *shlex.split(options)])
@@ -70,6 +113,7 @@ def run(name: str, options: str) -> bool:
         return arguments.module.main(arguments)
 
 
+@pytest.mark.usefixtures("_small")
 @pytest.mark.parametrize(
     "name", [n if n in QUICK else pytest.param(n, marks=pytest.mark.slow) for n in CASES]
 )
@@ -89,8 +133,7 @@ def test_each_benchmark_runs_on_a_small_case_and_writes_what_it_should(name, tmp
 
 
 def test_every_benchmark_has_options_and_a_case_or_a_test_of_its_own():
-    own = {"amplitudes", "curves", "mutation", "paper", "referee", "rivals", "scale", "speed"}
-    assert {*NAMES} == CASES.keys() | own | {"spice"}
+    assert {*NAMES} == CASES.keys() | OWN | RANKING
     for name in NAMES:
         assert asked([name]).module.OPTIONS is not None
 
@@ -121,49 +164,46 @@ def test_a_table_says_where_it_comes_from(tmp_path):
 
 
 @pytest.mark.slow
-def test_scale_measures_everything_and_a_killed_run_loses_nothing(tmp_path):
+def test_scale_measures_everything_and_a_killed_run_loses_nothing(tmp_path, monkeypatch):
+    """One layout and one kill: `test_benchmark_scenes` reads the others, `test_streaming` kills."""
+    monkeypatch.setattr(scale, "LAYOUTS", ("contiguous",))
+    monkeypatch.setattr(scale, "KILLS", 1)
     plan = scale.Plan(tmp_path, 60, 6, ("equation_error",), "equation_error")
     rows = list(scale.rows(plan))
-    assert len(rows) == 3 * 3 + 4  # three ways to read three layouts, fitted by 1, 2, 1, 1 process
+    assert len(rows) == 3 + 2  # three ways to read, fitted by 1 and 2 processes
     assert all(row["seconds"] > 0 and row["memory_mb"] > 0 for row in rows)
     resumed = scale.resume(plan)
     assert resumed.passed
     assert resumed.parts == 10
 
 
-@pytest.fixture(scope="module")
-def short_problem():
-    return problem(2000, 2, sample_rate=40e3)
-
-
 @pytest.mark.slow
-def test_all_peers_solve_the_same_problem(short_problem):
-    every = np.arange(2)
-    for stage in list(peers._on_samples(short_problem))[1:]:
-        ours, theirs = (np.stack(stage.by[name](every)) for name in ("ours", "scipy"))
+def test_all_peers_solve_the_same_problem_and_what_takes_too_long_is_left_out(monkeypatch):
+    of, every = problem(2000, 2, sample_rate=40e3), np.arange(2)
+    stages = peers.stages(of)
+    with jax.numpy_rank_promotion("allow"), jax.numpy_dtype_promotion("standard"):  # jaxopt's
+        found = {
+            one.name: {name: np.stack(run(every)) for name, run in one.by.items()} for one in stages
+        }
+        monkeypatch.setattr(peers, "problem", lambda samples, lanes: of)
+        monkeypatch.setattr(peers, "stages", lambda _: stages)
+        table = peers.show(peers.rows(2, (2,), 1, np.inf))
+    assert len(table) == 7
+    assert all(row["ours"] > 0 for row in table)
+    for one in stages[1:3]:
+        ours, theirs = (found[one.name][name] for name in ("ours", "scipy"))
         np.testing.assert_allclose(ours, theirs, rtol=1e-8)  # rounding of a condition of 1e4
-    load = short_problem.load(jax.tree.map(lambda leaf: leaf[0], short_problem.lanes))
+    for name, elements in found["LM fit"].items():
+        # A fraction of a standard error of the logarithms, which are above 1e-3.
+        np.testing.assert_allclose(elements, found["LM fit"]["ours"], atol=1e-4, err_msg=name)
+    load = of.load(jax.tree.map(lambda leaf: leaf[0], of.lanes))
     by, q = ByNumPy(load), START + 0.01
     used = np.concatenate([np.tile(np.asarray(load.records.selected[0]), 2), [False] * 3, [True]])
     slope = np.asarray(jax.jacfwd(load)(jax.numpy.asarray(q)))[used]
     terms = np.asarray(load(jax.numpy.asarray(q)))[used]
     np.testing.assert_allclose(by.terms(q), terms, rtol=1e-6, atol=1e-9)
     np.testing.assert_allclose(by.jacobian(q), slope, rtol=1e-6, atol=1e-6 * np.abs(slope).max())
-    with jax.numpy_rank_promotion("allow"), jax.numpy_dtype_promotion("standard"):  # jaxopt's
-        found = {name: np.stack(run(every)) for name, run in peers.solvers(short_problem).items()}
-    for name in peers.NAMES[1:]:
-        # A fraction of a standard error of the logarithms, which are above 1e-3.
-        np.testing.assert_allclose(found[name], found["ours"], atol=1e-4, err_msg=name)
-
-
-@pytest.mark.slow
-def test_every_stage_is_timed_and_what_takes_too_long_is_left_out(short_problem, monkeypatch):
-    monkeypatch.setattr(peers, "problem", lambda samples, lanes: short_problem)
-    with jax.numpy_rank_promotion("allow"), jax.numpy_dtype_promotion("standard"):  # jaxopt's
-        table = peers.show(peers.rows(2, (1, 3), 1, np.inf))
-    assert len(table) == 2 * 7
-    assert all(row["ours"] > 0 for row in table)
-    monkeypatch.setattr(peers, "stages", lambda p: list(peers._on_samples(p))[:1])
+    monkeypatch.setattr(peers, "stages", lambda _: stages[:1])
     once, never = peers.rows(2, (1, 3), 1, 0.0)
     assert once["ours"] > 0
     assert never["ours"] is None
