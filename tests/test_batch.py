@@ -2,6 +2,7 @@
 
 import dataclasses
 
+import equinox as eqx
 import h5py
 import jax
 import numpy as np
