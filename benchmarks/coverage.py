@@ -123,7 +123,7 @@ def compared(fit: etid.Fit | None, truth: Sequence[float]) -> tuple[np.ndarray, 
 def _cov(fit: etid.Fit | None, truth: Sequence[float]) -> np.ndarray:
     """Covariance of the relative errors."""
     size = len(truth)
-    return np.full((size, size), np.nan) if fit is None else fit.cov / np.outer(truth, truth)
+    return np.full((size, size), np.nan if fit is None else fit.cov / np.outer(truth, truth))
 
 
 def monte_carlo(
@@ -159,7 +159,9 @@ def monte_carlo(
     for path, true in truth.items():
         fits = [row.get(path) for row in rows]
         columns = zip(*(compared(fit, true) for fit in fits), strict=True)
-        found[path] = Draws(*map(np.array, columns), np.array([_cov(fit, true) for fit in fits]))
+        error, stderr, verdicts = map(np.array, columns)
+        cov = np.array([_cov(fit, true) for fit in fits])
+        found[path] = Draws(error, stderr, verdicts, cov)
     return found
 
 

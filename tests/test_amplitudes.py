@@ -240,7 +240,7 @@ def test_linear_skin_is_called_nonlinear_as_rarely_as_stated(compiled, monkeypat
     """1 of 2 000 by the limit; of 100, more than one would come by chance once in 800 times."""
     amplitudes = (1e-4, 5e-4, 5e-4)
     exact = [(linear(one, AT), one * pulses(AT)) for one in amplitudes]
-    verdicts = []
+    verdicts, of = [], []
     for seed in range(100):
         rng = np.random.default_rng([seed, 11])
         of = [recorded(*one, 1e-2, rng) for one in exact]
@@ -270,7 +270,7 @@ def test_slow_recovery_is_told_from_other_misfits(truth, snr_db, fits, compiled)
     for amplitudes in ((0.1e-3, 0.3e-3, 1e-3), (1e-3, 3e-3, 5e-3)):
         rng, level = np.random.default_rng(round(snr_db)), 10 ** (-snr_db / 20)
         of = [
-            recorded(sum(part(one, AT) for part in truth), one * pulses(AT), level, rng)
+            recorded(np.sum([part(one, AT) for part in truth], 0), one * pulses(AT), level, rng)
             for one in amplitudes
         ]
         fit = etid.identify_amplitudes(of, throw=False)
