@@ -82,9 +82,10 @@ pytestmark = pytest.mark.usefixtures("run_as_for_users")
 @pytest.fixture(autouse=True, scope="module")
 def _compiled_at_once():
     """What NumPy does not run is compiled in half the time."""
+    usual = jax.config.read("jax_disable_most_optimizations")
     jax.config.update("jax_disable_most_optimizations", True)
     yield
-    jax.config.update("jax_disable_most_optimizations", False)
+    jax.config.update("jax_disable_most_optimizations", usual)
 
 
 @pytest.fixture(autouse=True)

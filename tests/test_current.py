@@ -457,7 +457,7 @@ def test_electrodes_on_tissue_have_a_constant_phase_and_a_misfit():
     """
     rate, rest = 24414.0625, 40  # `rest` samples before the pulse replace the pause
     found = scipy.io.loadmat(ECOG, squeeze_me=True, struct_as_record=False)["dataStruct"]
-    for name in found._fieldnames[:2]:  # each length of record is traced and compiled anew
+    for name in found._fieldnames[:2]:  # of five alike, each of which takes seconds
         pair = getattr(found, name)
         mean = pair.stim_data.mean(1)
         start, middle, end = np.sort(np.argsort(np.abs(np.diff(mean)))[-3:]) + 1 + rest
