@@ -23,7 +23,7 @@ from benchmarks.problem import START, Problem, harmonics, problem, problem_of, t
 from benchmarks.provenance import write_csv
 from benchmarks.runner import QUICK, option
 from benchmarks.timing import median_time, pin
-from etid.estimators.maximum_likelihood.load_fit import WELL
+from etid.estimators.maximum_likelihood.search import WELL
 from etid.signals.filtering import lfilter
 from etid.solvers.levenberg_marquardt import normal_equations
 

@@ -65,7 +65,6 @@ TESTS: Mapping[str, Sequence[str]] = {
     "results.hdf5_table": ("tables", "exporting", "cli"),
     "results.verdicts": ("judging", "verdicts"),
     "signals.harmonics": ("spectra",),
-    "solvers.arrowhead": ("arrowhead",),
     "solvers.levenberg_marquardt": ("solver_steps", "levenberg_marquardt"),
 }
 

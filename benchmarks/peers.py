@@ -22,7 +22,7 @@ from benchmarks.problem import SAMPLES, START, ByNumPy, Problem, harmonics, prob
 from benchmarks.timing import median_time
 from etid.estimators.estimate import MAX_STEPS
 from etid.estimators.harmonic_start import start_of_skin
-from etid.estimators.maximum_likelihood.load_fit import WELL
+from etid.estimators.maximum_likelihood.search import WELL
 from etid.estimators.steiglitz_mcbride.iteration import in_time, iterate
 from etid.identify.batches import each
 from etid.signals.filtering import lfilter

@@ -11,16 +11,19 @@ import pytest
 from jaxtyping import Array
 
 import etid
-from etid.estimators.maximum_likelihood import load_fit as single_load
+from etid.estimators.maximum_likelihood import search
 from etid.results.driver import ContinuousDriver
 from etid.simulation.scenes import Scene, Trial
 from etid.simulation.transformer import ResistorLoad, SkinLoad
+from etid.solvers import successive
 
 # Minima to ten digits: a difference of two of them is to be compared.
-EXACT = dataclasses.replace(single_load.WELL, rtol=1e-10, ftol=1e-15)
+EXACT = dataclasses.replace(search.WELL, rtol=1e-10, ftol=1e-15)
 STEP = 1e-3  # of a disturbance that is small itself: the curvature costs its square
 # Differences of minima along the flat direction of the driver repeat to some 1e-9 of an element.
 REPEATED = 1e-8
+# The derivative is that of the minimum of all harmonics, the fit that of the knots.
+BETWEEN_KNOTS = 2e-2
 
 
 class Derivatives(NamedTuple):
@@ -34,7 +37,8 @@ class Derivatives(NamedTuple):
 
 def derivatives(load, circuit, order, monkeypatch):
     """By a disturbance of the data, and by the logarithm of the known resistor."""
-    monkeypatch.setattr(single_load, "WELL", EXACT)
+    monkeypatch.setattr(search, "WELL", EXACT)
+    monkeypatch.setattr(successive, "BEFORE", 1e-6)
     known = (Trial("c", ResistorLoad(98.8e3)),)
     scene = Scene((Trial("a", load),), known, sample_rate=40e3, samples=2000)
     study = scene.simulate(seed=1)
@@ -77,9 +81,11 @@ def test_skin_follows_the_data_and_the_known_resistor_as_differences_say(monkeyp
     minimum with another resistor, along a floor that is flat at 40 kHz."""
     load = SkinLoad(r_s=33.4e3, r_p=186e3, c_p=0.12e-9)
     found = derivatives(load, etid.SkinRC(), 5, monkeypatch)
-    np.testing.assert_allclose(found.data, found.data_numeric, rtol=1e-3, atol=REPEATED / STEP)
     np.testing.assert_allclose(
-        found.resistor, found.resistor_numeric, rtol=1e-3, atol=REPEATED / STEP
+        found.data, found.data_numeric, rtol=BETWEEN_KNOTS, atol=REPEATED / STEP
+    )
+    np.testing.assert_allclose(
+        found.resistor, found.resistor_numeric, rtol=BETWEEN_KNOTS, atol=REPEATED / STEP
     )
     # One step is as good as the floor is straight: C_p is known to two thirds of its value here.
     np.testing.assert_allclose(found.resistor, [1.0, 1.0, -1.0], atol=0.2)

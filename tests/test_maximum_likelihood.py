@@ -18,6 +18,7 @@ from etid.estimators.maximum_likelihood import load, load_fit
 from etid.estimators.maximum_likelihood.calibrations import Calibrations
 from etid.estimators.maximum_likelihood.load import Load
 from etid.estimators.maximum_likelihood.profile import Records
+from etid.estimators.maximum_likelihood.search import minimum
 from etid.estimators.registry import MAXIMUM_LIKELIHOOD
 from etid.identify import arguments, batches, one
 from etid.identify.one import known_at, known_of, skin_lane
@@ -25,6 +26,7 @@ from etid.recordings.preflight import Inspected
 from etid.signals.harmonics import Spectrum
 from etid.simulation.scenes import Scene, Trial
 from etid.simulation.transformer import ResistorLoad, SkinLoad
+from etid.solvers.matrices import inverse_root
 from tests import kept_numbers
 
 pytestmark = pytest.mark.usefixtures("run_as_for_users")
@@ -241,24 +243,22 @@ def test_one_unloaded_record_for_calibration_and_trial_tells_of_its_voltage_twic
 
 
 @pytest.mark.parametrize("shared", [False, True])
-def test_the_gradient_of_a_load_is_that_of_its_sum_of_squares(study, driver, shared):
-    """Far from the minimum, where every part of it counts: elements, delay, z, and X by z."""
+def test_the_search_at_the_knots_ends_at_the_minimum_of_all_harmonics(study, driver, shared):
     lane = Harmonics.of(Inspected(study["loaded/0"]))
     known = known_of(lane, driver, shared, MAXIMUM_LIKELIHOOD)
-    start = jnp.log(jnp.array([30e3, 150e3, 0.2e-9]))
-    z = known.mean + 0.1 * jnp.arange(1.0 * known.mean.size)
-    q = jnp.concatenate([start, jnp.array([0.3]), z])
+    own = jnp.log(jnp.array([30e3, 150e3, 0.2e-9])), jnp.array([0.3])
+    start = jnp.concatenate([*own, known.mean])
 
     @jax.jit
-    def both(q, lane):
+    def distance(start, lane):
         of = Load.behind(known, SkinRC(), Records.of(lane.spectrum), lane.sample_rate)
-        by_jax = jax.value_and_grad(lambda q: 0.5 * jnp.sum(of.residual(q) ** 2))(q)
-        found = of.equations(q)
-        return by_jax, (found.objective, found.gradient)
+        q, _ = minimum(of, start)
+        jacobian = jax.jacfwd(of)(q)
+        return of(q) @ jacobian @ inverse_root(jacobian.T @ jacobian)
 
-    expected, found = both(q, jax.tree.map(jnp.asarray, lane))
-    np.testing.assert_allclose(found[0], expected[0], rtol=1e-10)
-    np.testing.assert_allclose(found[1], expected[1], rtol=1e-8)  # sums of 3456 terms
+    left = distance(start, jax.tree.map(jnp.asarray, lane))
+    # Lines between knots are wrong by a thousandth, and the residual has a standard deviation.
+    assert float(jnp.linalg.norm(left)) < 0.03
 
 
 def test_a_driver_that_is_followed_too_far_is_no_success():

@@ -36,8 +36,8 @@ from etid.estimators.lanes import Harmonics, HarmonicsWithCurrent
 from etid.estimators.maximum_likelihood.estimator import MaximumLikelihood
 from etid.estimators.maximum_likelihood.given_driver import AbstractGiven, GivenDriver
 from etid.estimators.maximum_likelihood.load import Load
-from etid.estimators.maximum_likelihood.load_fit import refined
 from etid.estimators.maximum_likelihood.profile import Records
+from etid.estimators.maximum_likelihood.search import minimum as least
 from etid.estimators.registry import MAXIMUM_LIKELIHOOD, named
 from etid.identify.arguments import fed, require
 from etid.identify.one import is_shared, known_of, skin
@@ -88,7 +88,7 @@ class Minimum(eqx.Module):
         terms = terms_of(lane, known, circuit)
         delays = jnp.zeros(terms.gains.outputs)
         start = jnp.concatenate([circuit.log_values(), delays, known.driver.mean])
-        q = refined(terms, start).value
+        q, _ = least(terms, start)
         return cls(terms, q, inverse(jax.hessian(lambda q: cost(terms, q))(q)))
 
 

@@ -13,6 +13,34 @@ from jaxtyping import Array, Float
 from etid.solvers.levenberg_marquardt import LevenbergMarquardt, State
 
 Terms = Callable[[Float[Array, " parameter"], Any], Float[Array, " term"]]
+Search = Callable[[Float[Array, " parameter"], Any], tuple[Float[Array, " parameter"], Any]]
+
+
+def minimum(
+    terms: Terms, search: Search, start: Float[Array, " parameter"], args: Any
+) -> tuple[Float[Array, " parameter"], Any]:
+    """The minimum of Σ r² over q, and what else the search returns, which has no derivative.
+
+    Args:
+        terms: r(q, args). Only a derivative traces it.
+        search: The minimum from a start and args, and anything else. Both functions hold no arrays.
+        start: First q.
+        args: Arrays of the problem.
+    """
+    inputs = terms, search, start, args
+    # Optimistix wants functions without a wrapper, also where a hook checks types.
+    return optx.ImplicitAdjoint().apply(unwrap(_found), unwrap(_gradient), inputs, frozenset())
+
+
+def _found(inputs: Any) -> Any:
+    _, search, start, args, _ = inputs
+    return search(start, args)
+
+
+def _gradient(q: Array, _: Any, inputs: Any) -> Array:
+    """∂(½ Σ r²)/∂q, which vanishes at the minimum."""
+    terms, _, _, args, *_ = inputs
+    return jax.grad(lambda q: 0.5 * jnp.sum(terms(q, args) ** 2))(q)
 
 
 def least_squares(
@@ -34,17 +62,26 @@ def least_squares(
         args: Arrays of the problem.
         max_steps: Largest number of trial steps.
     """
-    inputs = terms, solver, start, args, max_steps
-    # Optimistix wants functions without a wrapper, also where a hook checks types.
-    found = optx.ImplicitAdjoint().apply(unwrap(_minimum), unwrap(_gradient), inputs, frozenset())
-    value, (steps, result, equations) = found
+
+    def search(start: Array, args: Any) -> tuple[Array, Any]:
+        return stepped(terms, solver, start, args, max_steps)
+
+    value, (steps, result, equations) = minimum(terms, search, start, args)
     stats = {"num_steps": steps, "normal_equations": equations}
     return optx.Solution(value=value, result=result, aux=None, stats=stats, state=None)
 
 
-def _minimum(inputs: Any) -> Any:
-    """The minimum; the number of steps, the verdict, and the normal equations there."""
-    terms, solver, start, args, max_steps, _ = inputs
+def stepped(
+    terms: Terms,
+    solver: LevenbergMarquardt,
+    start: Float[Array, " parameter"],
+    args: Any,
+    max_steps: int,
+) -> tuple[Float[Array, " parameter"], Any]:
+    """The minimum; the number of steps, the verdict, and the normal equations there.
+
+    The arguments are those of `least_squares`; the result has no derivative.
+    """
 
     def fn(q: Array, args: Any) -> tuple[Array, None]:
         return terms(q, args), None
@@ -78,9 +115,3 @@ def _minimum(inputs: Any) -> Any:
         state.result,
     )
     return q, (steps, result, state.accepted)
-
-
-def _gradient(q: Array, _: Any, inputs: Any) -> Array:
-    """∂(½ Σ r²)/∂q, which vanishes at the minimum."""
-    terms, _, _, args, *_ = inputs
-    return jax.grad(lambda q: 0.5 * jnp.sum(terms(q, args) ** 2))(q)

@@ -25,6 +25,7 @@ from etid.estimators.joint.terms import DriverStudy, Loads, Own, in_turn
 from etid.estimators.sandwich import Curvature
 from etid.estimators.score_tests import other_circuit
 from etid.solvers.matrices import inverse
+from etid.solvers.successive import Minimum
 
 _Sums = tuple[Float[Array, "record x common"], Float[Array, "common common"]]
 
@@ -97,7 +98,7 @@ def estimates(
     common: Float[Array, " common"],
     fitted: Sequence[tuple[Own, optx.RESULTS]],
     several: Sequence[int],
-    solution: optx.Solution,
+    least: Minimum,
 ) -> tuple[Float[Array, "common common"], list[Found]]:
     """Covariance of `common`, and the estimates of each group with their covariances.
 
@@ -106,7 +107,7 @@ def estimates(
         common: Common parameters at the minimum.
         fitted: Unknowns of the loads of each group, and the results of their solvers.
         several: Number of unloaded records in each group that several loads share.
-        solution: Solution of the joint solver.
+        least: What the search of the minimum tells.
     """
     groups, model = study.groups, study.model
     owns = [own for own, _ in fitted]
@@ -160,10 +161,8 @@ def estimates(
                 shared_cov=shared[:e, :e],
                 chi2=seen.chi2,
                 rrse=seen.rrse,
-                result=optx.RESULTS.where(
-                    result == optx.RESULTS.successful, solution.result, result
-                ),
-                steps=solution.stats["num_steps"],
+                result=optx.RESULTS.where(result == optx.RESULTS.successful, least.result, result),
+                steps=least.points,
                 strain=strain,
             )
             delay = Delay(own.delay_samples, private[e, e], eliminated.slope[e])

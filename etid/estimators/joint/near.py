@@ -16,28 +16,28 @@ valley. The way through it may take a hundred steps, but none of them evaluates 
 """
 
 import dataclasses
-from typing import NamedTuple
+import math
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Complex, Float, Int
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, Complex, Float
 
-from etid.estimators.estimate import MAX_STEPS
-from etid.estimators.joint.terms import DriverStudy, Loads, Own, in_turn
+from etid.estimators.estimate import MAX_STEPS, SOLVER
+from etid.estimators.joint.terms import DriverStudy, Loads, in_turn
 from etid.estimators.maximum_likelihood.calibrations import DENSE, Calibrations
 from etid.estimators.maximum_likelihood.condensed import apart
 from etid.estimators.maximum_likelihood.given_driver import GivenDriver
 from etid.estimators.maximum_likelihood.profile import total
 from etid.signals.knots import knots
 from etid.signals.transfer import as_complex, reciprocal
-from etid.solvers.arrowhead import join
-from etid.solvers.least_squares import least_squares
+from etid.solvers import successive
+from etid.solvers.least_squares import stepped
 from etid.solvers.levenberg_marquardt import DIFFERENCE, LevenbergMarquardt, NormalEquations
 from etid.solvers.matrices import inverse_root
 
-ROUNDS = 10  # largest number of points; from 40 dB on, two or three are enough
-ENOUGH = 0.02  # reduction of ½ Σ r² below which the next point is the minimum
+WITHIN = 0.01  # [standard errors] from the minimum of an approximation
 W = 2  # number of signals of W: real and imaginary part
 
 
@@ -70,27 +70,37 @@ class _Part(eqx.Module):
         return bent - jnp.tensordot(own, self.following, own.ndim)
 
 
-class _Near(eqx.Module):
-    """A study near one point.
+class _Signals(eqx.Module):
+    """The signals as functions of the common parameters.
 
     Attributes:
         calibrations: The calibrations.
-        centre: Common parameters of the point.
         frequency: Frequencies of the knots of each group [Hz].
-        parts: The calibrations, then each group of loads.
+        of_x: Whether a group of this length estimates its unloaded record from the calibrations.
     """
 
     calibrations: Calibrations
-    centre: Float[Array, " common"]
-    frequency: list[Float[Array, " knot"]]
-    parts: list[_Part]
+    frequency: list[Array]
+    of_x: list[bool] = eqx.field(static=True)
+
+    @classmethod
+    def of(cls, study: DriverStudy) -> "_Signals":
+        """The signals of a study."""
+        sizes = [loads.spectrum.x.shape[-1] for loads in study.groups]
+        return cls(
+            study.model.calibrations,
+            [
+                knots(size, DENSE).at(loads.frequency[0])
+                for size, loads in zip(sizes, study.groups, strict=True)
+            ],
+            [study.model.shares(size) for size in sizes],
+        )
 
     def _of_each(self, known: Array, of_w: list[Array], axis: int) -> list[Array]:
         """The signals of each part, from the gains of the calibrations and from W."""
         found = [known]
-        for w, part in zip(of_w, self.parts[1:], strict=True):
-            signals = [w] if part.pull.shape[0] == W else [w, known]
-            found.append(jnp.concatenate(signals, axis))
+        for w, of_x in zip(of_w, self.of_x, strict=True):
+            found.append(jnp.concatenate([w, known] if of_x else [w], axis))
         return found
 
     def _loaded(
@@ -99,7 +109,7 @@ class _Near(eqx.Module):
         resistance = as_complex(self.calibrations.calibration.r_load.mean())
         return self.calibrations.source_of(common).response(frequency) + resistance
 
-    def signals(self, common: Float[Array, " common"]) -> list[Float[Array, "signal knot"]]:
+    def __call__(self, common: Float[Array, " common"]) -> list[Float[Array, "signal knot"]]:
         """The signals of each part."""
         known = self.calibrations.gains(common, self.calibrations.knots)
         of_w = [jnp.log(self._loaded(common, f))[None] for f in self.frequency]
@@ -115,10 +125,23 @@ class _Near(eqx.Module):
             of_w.append(jnp.pad(rows, ((0, common.size - rows.shape[0]), (0, 0)))[:, None])
         return self._of_each(_parts(known), list(map(_parts, of_w)), 1)
 
-    def changes(self, common: Float[Array, " common"]) -> list[Float[Array, "signal knot"]]:
+
+class _Near(eqx.Module):
+    """A study near one point.
+
+    Attributes:
+        parts: The calibrations, then each group of loads.
+        roots: L of each load of each group, whose loads have other numbers of own parameters.
+        centre: The signals of the point.
+    """
+
+    parts: list[_Part]
+    roots: list[Array]
+    centre: list[Array]
+
+    def changes(self, signals: list[Array]) -> list[Float[Array, "signal knot"]]:
         """Changes of the signals from those of the point."""
-        both = zip(self.signals(common), self.signals(self.centre), strict=True)
-        return [now - before for now, before in both]
+        return [now - before for now, before in zip(signals, self.centre, strict=True)]
 
 
 def _parts(values: Complex[Array, "*row of knot"]) -> Float[Array, "*row signal knot"]:
@@ -127,14 +150,16 @@ def _parts(values: Complex[Array, "*row of knot"]) -> Float[Array, "*row signal 
     return parts.reshape(*values.shape[:-2], -1, values.shape[-1])
 
 
-def _equations(_, common: Float[Array, " common"], near: _Near) -> NormalEquations:
+def _equations(
+    _, common: Float[Array, " common"], study: tuple[_Signals, _Near]
+) -> NormalEquations:
     """Normal equations of the common parameters; the own ones are at their minima."""
-    weak, by_common = near.calibrations.weak(common)
+    signals, near = study
+    weak, by_common = signals.calibrations.weak(common)
     objective, gradient = 0.5 * jnp.dot(weak, weak), by_common @ weak
     matrix = by_common @ by_common.T
-    for part, change, rows in zip(
-        near.parts, near.changes(common), near.slopes(common), strict=True
-    ):
+    changes, slopes = near.changes(signals(common)), signals.slopes(common)
+    for part, change, rows in zip(near.parts, changes, slopes, strict=True):
         own, bent = part.own(change), jnp.einsum("stk,tk->sk", part.curvature, change)
         value = part.objective + jnp.sum(change * (0.5 * bent + part.pull))
         objective = objective + value - 0.5 * jnp.sum(own**2)
@@ -147,12 +172,15 @@ def _equations(_, common: Float[Array, " common"], near: _Near) -> NormalEquatio
 
 
 def _second_order(
-    _, common: Float[Array, " common"], step: Float[Array, " common"], near: _Near
+    _, common: Float[Array, " common"], step: Float[Array, " common"], study: tuple[_Signals, _Near]
 ) -> Float[Array, " common"]:
     """Jᵀ r″ as in `levenberg_marquardt.second_order`; the priors are taken as linear."""
-    ends = [near.signals(common + h * step) for h in (DIFFERENCE, 0.0, -DIFFERENCE)]
+    signals, near = study
+    ends = [signals(common + h * step) for h in (DIFFERENCE, 0.0, -DIFFERENCE)]
     found = jnp.zeros_like(common)
-    for part, rows, after, at, before in zip(near.parts, near.slopes(common), *ends, strict=True):
+    for part, rows, after, at, before in zip(
+        near.parts, signals.slopes(common), *ends, strict=True
+    ):
         bent = (after - 2 * at + before) / DIFFERENCE**2
         slope = part.slope(bent, part.own(bent) - part.rest)
         found = found + jnp.tensordot(rows, slope, 2)
@@ -197,21 +225,24 @@ def _by_signals(driver: GivenDriver, shared: bool) -> GivenDriver:
 
 
 def _of_group(
-    study: DriverStudy, common: Float[Array, " common"], loads: Loads, owns: Own
+    study: DriverStudy,
+    common: Float[Array, " common"],
+    loads: Loads,
+    owns: Float[Array, "load own"],
 ) -> tuple[_Part, Float[Array, "load own own"]]:
     """A group of loads as a function of the signals, and L of each load."""
-    every, o = knots(loads.spectrum.x.shape[-1], DENSE), loads.owned
-    same_size = loads.spectrum.x.shape[-1] == study.model.calibrations.spectra.x.shape[-1]
+    size = loads.spectrum.x.shape[-1]
+    every = knots(size, DENSE)
     driver = study.model.around(common, loads.frequency[0], slopes=False)
-    driver = _by_signals(driver, study.model.shared and same_size)
+    driver = _by_signals(driver, study.model.shares(size))
 
-    def one(load: Loads, own: Own) -> tuple[_Part, Float[Array, "own own"]]:
-        lane = study.lane(driver, load)
-        q = jnp.concatenate([own.vector(), driver.mean])
-        prior, rest = 1 / lane.gains.widths(own.vector()), lane.rest(own.vector())
-        near, size = lane.near(q, every), every.index.size
-        part = near.condensed.part.reshape(-1, size)
-        jacobian = near.jacobian.reshape(q.size, -1, size)
+    def one(load: Loads, own: Float[Array, " own"]) -> tuple[_Part, Float[Array, "own own"]]:
+        lane, o = study.lane(driver, load), own.size
+        q = jnp.concatenate([own, driver.mean])
+        prior, rest = 1 / lane.gains.widths(own), lane.rest(own)
+        near = lane.near(q, every)
+        part = near.condensed.part.reshape(-1, every.index.size)
+        jacobian = near.jacobian.reshape(q.size, *part.shape)
         by_own, by_signal = jacobian[:o], jacobian[o:]
         told = jnp.einsum("ock,pck->op", by_own, by_own)
         root = inverse_root(told + jnp.diag(prior**2))
@@ -237,79 +268,59 @@ def _of_group(
     return _Part(objective, pull, curvature, found.following, found.rest), roots
 
 
-class _State(NamedTuple):
-    """The best point so far, and the point to try next.
+def minimum(
+    study: DriverStudy,
+) -> tuple[Float[Array, " common"], list[Array], successive.Minimum]:
+    """The minimum of a study; it has no derivative.
 
-    Attributes:
-        best: The best point.
-        least: Its ½ Σ r².
-        trial: The next point.
-        promised: Reduction of ½ Σ r² that the next point promises.
-        better: Whether the last point was better than all before.
-        rounds: Number of points.
+    Returns:
+        The common parameters, the unknowns of the loads of each group, and what else is known.
     """
-
-    best: Float[Array, " parameter"]
-    least: Float[Array, ""]
-    trial: Float[Array, " parameter"]
-    promised: Float[Array, ""]
-    better: Bool[Array, ""]
-    rounds: Int[Array, ""]
-
-
-def approached(
-    study: DriverStudy, start: Float[Array, " parameter"], solver: LevenbergMarquardt
-) -> Float[Array, " parameter"]:
-    """A point close to the minimum of a study; with much noise it may be far from it.
-
-    Args:
-        study: Calibrations and loads.
-        start: Start of all parameters.
-        solver: Solver of the common parameters near one point.
-    """
-    solver = dataclasses.replace(solver, equations=_equations, second_order=_second_order)
-
-    def goes_on(state: _State) -> Bool[Array, ""]:
-        return state.better & (state.promised > ENOUGH) & (state.rounds < ROUNDS)
-
-    def again(state: _State) -> _State:
-        following, value, promised = _next(study, state.trial, solver)
-        better = value < state.least
-        best = jnp.where(better, state.trial, state.best)
-        least = jnp.where(better, value, state.least)
-        return _State(best, least, following, promised, better, state.rounds + 1)
-
-    large, number = jnp.array(jnp.inf), jnp.array(0)
-    first = _State(start, large, start, large, jnp.array(True), number)
-    last = jax.lax.while_loop(goes_on, again, first)
-    return jnp.where(last.better & jnp.isfinite(last.trial).all(), last.trial, last.best)
-
-
-def _next(
-    study: DriverStudy, y: Float[Array, " parameter"], solver: LevenbergMarquardt
-) -> tuple[Float[Array, " parameter"], Float[Array, ""], Float[Array, ""]]:
-    """The minimum of a study as it looks from `y`, ½ Σ r² at `y`, and its expected reduction."""
-    common, parts = study.split(y)
-    known = _of_calibrations(study.model.calibrations, common)
-    groups = [_of_group(study, common, *group) for group in zip(study.groups, parts, strict=True)]
-    near = _Near(
-        study.model.calibrations,
-        common,
-        [knots(g.spectrum.x.shape[-1], DENSE).at(g.frequency[0]) for g in study.groups],
-        [known, *(part for part, _ in groups)],
+    signals = _Signals.of(study)
+    # The sum of squares grows with the number of loads; a detectable change of it does not.
+    terms = sum(loads.terms for loads in study.groups)
+    count = sum(loads.used.size for loads in study.groups)
+    solver = LevenbergMarquardt(
+        rtol=WITHIN / math.sqrt(terms),
+        ftol=SOLVER.ftol / (1 + count),
+        geodesic=True,
+        equations=_equations,
+        second_order=_second_order,
     )
-    solution = least_squares(
-        lambda y, _: y,  # not evaluated: the solver takes the equations
-        solver,
-        common,
-        near,
-        MAX_STEPS,
-    )
-    changes, own = near.changes(solution.value)[1:], []
-    for (part, root), change, before in zip(groups, changes, parts, strict=True):
-        found = before.vector() - jnp.einsum("lop,lp->lo", root, part.own(change))
-        own.append(study.widened(found))
-    weak, _ = near.calibrations.weak(common)
-    value = 0.5 * jnp.dot(weak, weak) + sum(part.objective for part in near.parts)
-    promised = value - solution.stats["normal_equations"].objective
-    return join(solution.value, jnp.concatenate(own)), value, promised
+
+    owns = [loads.own.vector() for loads in study.groups]
+    start, named = ravel_pytree((study.model.calibrations.start(), owns))
+
+    def approximate(y: Float[Array, " parameter"]) -> tuple[_Near, Float[Array, ""]]:
+        common, owns = named(y)
+        pairs = zip(study.groups, owns, strict=True)
+        groups = [_of_group(study, common, *pair) for pair in pairs]
+        known = _of_calibrations(study.model.calibrations, common)
+        parts, roots = [known, *(part for part, _ in groups)], [root for _, root in groups]
+        weak, _ = study.model.calibrations.weak(common)
+        value = 0.5 * jnp.dot(weak, weak) + sum(part.objective for part in parts)
+        return _Near(parts, roots, signals(common)), value
+
+    def follow(
+        y: Float[Array, " parameter"], near: _Near
+    ) -> tuple[Float[Array, " parameter"], Float[Array, ""]]:
+        common, owns = named(y)
+        weak, _ = study.model.calibrations.weak(common)
+        before = 0.5 * jnp.dot(weak, weak) + sum(part.objective for part in near.parts)
+        common, (_, _, found) = stepped(
+            lambda y, _: y,  # not evaluated: the solver takes the equations
+            solver,
+            common,
+            (signals, near),
+            MAX_STEPS,
+        )
+        changes = near.changes(signals(common))
+        moved = [part.own(change) for part, change in zip(near.parts, changes, strict=True)][1:]
+        owns = [
+            own - jnp.einsum("lop,lp->lo", root, of)
+            for own, root, of in zip(owns, near.roots, moved, strict=True)
+        ]
+        return ravel_pytree((common, owns))[0], before - found.objective
+
+    y, least = successive.approached(approximate, follow, start, terms)
+    return *named(y), least

@@ -5,7 +5,6 @@ load, `own`, appear only in the terms of this load. A load whose current was mea
 outputs.
 """
 
-import itertools
 from collections.abc import Callable
 from typing import Any
 
@@ -23,7 +22,6 @@ from etid.estimators.maximum_likelihood.load import Load
 from etid.estimators.maximum_likelihood.profile import Records
 from etid.estimators.unknowns import LoadUnknowns, LoadWithCurrentUnknowns
 from etid.signals.harmonics import Spectrum
-from etid.solvers.arrowhead import join, split
 
 SIDE_BY_SIDE = 8  # loads in one vectorised step
 
@@ -47,6 +45,10 @@ class Joint(eqx.Module):
     shared: bool = eqx.field(static=True)
     prior: ElementPrior | None = None
     bounds: Limits = eqx.field(static=True, default=())
+
+    def shares(self, harmonics: int) -> bool:
+        """Whether the unloaded record of a load of this length may be that of a calibration."""
+        return self.shared and harmonics == self.calibrations.spectra.x.shape[-1]
 
     def around(
         self,
@@ -97,9 +99,9 @@ class Loads(eqx.Module):
         return self.spectrum.frequency
 
     @property
-    def owned(self) -> int:
-        """Number of own parameters of each load."""
-        return jax.eval_shape(self.own.vector).shape[-1]
+    def terms(self) -> int:
+        """Number of terms of all recordings."""
+        return 2 * self.spectrum.x.size
 
 
 class DriverStudy(eqx.Module):
@@ -116,30 +118,6 @@ class DriverStudy(eqx.Module):
     def lane(self, driver: GivenDriver, load: Loads) -> Load:
         """One load behind this driver."""
         return self.model.lane(driver, load.spectrum, load.sample_rate, load.current)
-
-    def start(self) -> Float[Array, " parameter"]:
-        """The start: the driver of the calibrations, and each load identified alone."""
-        own = jnp.concatenate([self.widened(loads.own.vector()) for loads in self.groups])
-        return join(self.model.calibrations.start(), own)
-
-    def split(self, y: Float[Array, " parameter"]) -> tuple[Float[Array, " common"], list[Own]]:
-        """The common parameters, and the unknowns of the loads of each group."""
-        counts = [loads.used.size for loads in self.groups]
-        common, own = split(y, sum(counts), self.owned)
-        ends = itertools.accumulate(counts)
-        return common, [
-            type(loads.own).of(own[end - loads.used.size : end, : loads.owned])
-            for end, loads in zip(ends, self.groups, strict=True)
-        ]
-
-    @property
-    def owned(self) -> int:
-        """Largest number of own parameters of a load; all loads take as much room."""
-        return max(loads.owned for loads in self.groups)
-
-    def widened(self, own: Float[Array, "*load own"]) -> Float[Array, "*load room"]:
-        """Own parameters with the room of those that other loads have."""
-        return jnp.pad(own, [(0, 0)] * (own.ndim - 1) + [(0, self.owned - own.shape[-1])])
 
 
 def in_turn(one: Callable, *lanes: Any) -> Any:

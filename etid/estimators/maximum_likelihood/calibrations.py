@@ -21,7 +21,7 @@ from etid.results.driver import Calibration, HarmonicDriver, SourceImpedance
 from etid.signals.harmonics import Spectrum, same_unloaded
 from etid.signals.knots import Knots, knots
 from etid.signals.transfer import as_complex, delayed, frequency_variable, reciprocal
-from etid.solvers.levenberg_marquardt import DIFFERENCE, NormalEquations
+from etid.solvers.levenberg_marquardt import NormalEquations
 
 DENSE = 32  # density of the knots: the floor of the driver's valley is flat
 
@@ -190,17 +190,6 @@ class Calibrations(eqx.Module):
         noise = self.noise(total([of.terms for of in near.profiles]))
         found = means(near.profiles, self.knots, jnp.stack([share, noise]))
         return Linear(near.jacobian, *near.padded(found, 1.0))
-
-    def second_order(
-        self, common: Float[Array, " common"], step: Float[Array, " common"]
-    ) -> Float[Array, " common"]:
-        """Jᵀ r″; r″ as in `levenberg_marquardt.second_order`."""
-        near = self.near(common)
-        ahead, behind = (common + h * step for h in (DIFFERENCE, -DIFFERENCE))
-        bent = self.gains(ahead, self.knots) + self.gains(behind, self.knots)
-        [rows] = near.condensed.rows((bent - 2 * near.slopes.gains)[None])
-        weak = self.weak(ahead)[0] + self.weak(behind)[0] - 2 * self.weak(common)[0]
-        return near.jacobian @ jnp.concatenate([rows, weak]) / DIFFERENCE**2
 
     def weak(
         self, common: Float[Array, " common"]

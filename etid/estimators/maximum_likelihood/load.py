@@ -10,7 +10,6 @@ gradient are those of all harmonics; curvature, covariance and score tests are c
 import dataclasses
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Complex, Float
 
@@ -160,20 +159,6 @@ class Load(eqx.Module):
         """Derivatives of the objective by the z that X depends on, at each harmonic."""
         assert self.unloaded is not None
         return near.profile.by_x(self.known(near.q), *self.unloaded[2:])
-
-    def equations(self, q: Float[Array, " q"]) -> NormalEquations:
-        """Normal equations of the records alone; the matrix is their information."""
-        return self.evaluated(q)[0]
-
-    def evaluated(self, q: Float[Array, " q"]) -> tuple[NormalEquations, Near]:
-        """The same, and the load near `q`."""
-        near = self.near(q)
-        towards = -jnp.conj(near.profile.score)
-        (gradient,) = apart(lambda q: jax.vjp(self.predicted, q)[1](towards), q)
-        if self.unloaded is not None and q.size > self.gains.owned:
-            gradient = gradient + jnp.pad(self.by_x(near).sum(-1), (self.gains.owned, 0))
-        rows = near.jacobian
-        return NormalEquations(near.profile.objective, gradient, rows @ rows.T), near
 
 
 class AtKnots(eqx.Module):
