@@ -14,11 +14,10 @@ import etid
 from etid.circuits.circuit import SkinRC
 from etid.estimators import registry
 from etid.estimators.lanes import Harmonics
-from etid.estimators.maximum_likelihood import load, load_fit
+from etid.estimators.maximum_likelihood import load, search
 from etid.estimators.maximum_likelihood.calibrations import Calibrations
 from etid.estimators.maximum_likelihood.load import Load
 from etid.estimators.maximum_likelihood.profile import Records
-from etid.estimators.maximum_likelihood.search import minimum
 from etid.estimators.registry import MAXIMUM_LIKELIHOOD
 from etid.identify import arguments, batches, one
 from etid.identify.one import known_at, known_of, skin_lane
@@ -141,7 +140,7 @@ def test_the_likeliest_start_is_taken_unless_it_is_bad(monkeypatch, starts, best
     records = Records.of(Spectrum(line, wave, wave, line, line, jnp.arange(8) < 5))
     for name, value in {"gains": None, "records": records, "unloaded": None}.items():
         object.__setattr__(of, name, value)
-    assert float(load_fit._chosen(of, jnp.array(starts)[:, None])[0]) == best
+    assert float(search._best(of, jnp.array(starts)[:, None])[0]) == best
 
 
 def test_the_gain_is_that_of_the_divider(driver):
@@ -252,7 +251,7 @@ def test_the_search_at_the_knots_ends_at_the_minimum_of_all_harmonics(study, dri
     @jax.jit
     def distance(start, lane):
         of = Load.behind(known, SkinRC(), Records.of(lane.spectrum), lane.sample_rate)
-        q, _ = minimum(of, start)
+        q, _ = search.minimum(of, start)
         jacobian = jax.jacfwd(of)(q)
         return of(q) @ jacobian @ inverse_root(jacobian.T @ jacobian)
 

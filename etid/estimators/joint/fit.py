@@ -18,7 +18,6 @@ from etid.estimators.maximum_likelihood import search
 from etid.estimators.maximum_likelihood.given_driver import GivenDriver
 from etid.estimators.unknowns import LoadUnknowns, LoadWithCurrentUnknowns
 from etid.signals.harmonics import Spectrum
-from etid.solvers.levenberg_marquardt import best_start
 
 
 def fit_together(
@@ -91,11 +90,7 @@ def fit_alone(
         hum is seen.
     """
     lane = model.lane(driver, spectrum, sample_rate, current)
-    if model.prior is not None:
-        placed = model.prior.placed(candidates.log_elements)
-        candidates = LoadUnknowns(placed, candidates.delay_samples)
-    outputs = lane.gains.outputs
-    start = best_start(lane, jnp.pad(candidates.vector(), ((0, 0), (0, outputs - 1))))
+    start = search.best_start(lane, candidates)
     q, least = search.minimum(lane, jnp.concatenate([start, driver.mean]))
     kind = LoadUnknowns if current is None else LoadWithCurrentUnknowns
     records, profile = lane.known(q), least.near.profile

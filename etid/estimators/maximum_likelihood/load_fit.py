@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool
 
 from etid.circuits.circuit import AbstractCircuit
 from etid.estimators.element_limits import Limits
@@ -16,7 +16,7 @@ from etid.estimators.estimate import Estimate
 from etid.estimators.judgement import judged, unless
 from etid.estimators.maximum_likelihood.condensed import means
 from etid.estimators.maximum_likelihood.load import Load, by_falling, changes
-from etid.estimators.maximum_likelihood.search import minimum
+from etid.estimators.maximum_likelihood.search import best_start, minimum
 from etid.estimators.sandwich import Linear
 from etid.estimators.score_tests import falling_resistance, other_circuit
 from etid.estimators.unknowns import LoadUnknowns
@@ -30,32 +30,6 @@ from etid.solvers.matrices import inverse_root
 # 200 fits were wrong by five standard errors; both exceed it.
 FAR = 0.5
 NO_HUM = 5.0  # standard deviations of a wrong gain, above which it may pass for hum
-NEAR = 4.0  # χ² of the likeliest start; below this value the other starts are not tried
-
-
-def _chosen(load: Load, starts: Float[Array, "start q"]) -> Float[Array, " q"]:
-    """The likeliest start, which is the last, or the best of all if χ² of the likeliest is large.
-
-    One loop holds the only copy of the terms: each copy compiles for 0.2 s.
-    """
-    # The minimum does not depend on its start, and a loop of unknown length has no gradient.
-    load, starts = jax.lax.stop_gradient((load, starts))
-    limit = NEAR * load.terms
-    likeliest = starts.shape[0] - 1
-
-    def goes_on(state: tuple[Array, Array, Array]) -> Bool[Array, ""]:
-        number, _, least = state
-        return (number >= 0) & ((number != likeliest - 1) | ~(least < limit))
-
-    def tried(state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
-        number, best, least = state
-        squares = jnp.sum(load(starts[number]) ** 2)
-        squares = jnp.where(jnp.isfinite(squares), squares, jnp.inf)
-        better = squares <= least
-        return number - 1, jnp.where(better, number, best), jnp.minimum(squares, least)
-
-    first = jnp.array(likeliest), jnp.array(likeliest), jnp.array(jnp.inf, starts.dtype)
-    return starts[jax.lax.while_loop(goes_on, tried, first)[1]]
 
 
 class Found(NamedTuple):
@@ -92,13 +66,7 @@ def fit_circuit(load: Load, candidates: LoadUnknowns) -> Found:
             refined.
     """
     driver, element_prior = load.gains.driver, load.gains.prior
-    if element_prior is not None:
-        placed = element_prior.placed(candidates.log_elements)
-        candidates = LoadUnknowns(placed, candidates.delay_samples)
-    starts = jnp.pad(candidates.vector(), ((0, 0), (0, load.gains.outputs - 1)))
-
-    start = jnp.concatenate([_chosen(load, starts), driver.mean])
-    q, least = minimum(load, start)
+    q, least = minimum(load, jnp.concatenate([best_start(load, candidates), driver.mean]))
     # Standard errors and tests are those of the last point; they do not change in a short step.
     at, near, every = least.point, least.near, load.knots
     records = load.known(at)

@@ -13,10 +13,12 @@ from jaxtyping import Array, Bool, Float
 
 from etid.estimators.estimate import SOLVER
 from etid.estimators.maximum_likelihood.load import AtKnots, Load, Near
+from etid.estimators.unknowns import LoadUnknowns
 from etid.solvers import least_squares, successive
 from etid.solvers.levenberg_marquardt import LevenbergMarquardt, NormalEquations
 
 STEPS = 50  # largest number of steps at the knots of one point
+NEAR = 4.0  # χ² of the likeliest start; below this value the other starts are not tried
 
 
 def _equations(_, q: Float[Array, " q"], terms: AtKnots) -> NormalEquations:
@@ -33,6 +35,43 @@ def _equations(_, q: Float[Array, " q"], terms: AtKnots) -> NormalEquations:
 ROUGHLY = LevenbergMarquardt(rtol=1e-2, ftol=1e-3)
 # Next to a minimum, damping would only hold back what the data hardly determine.
 WELL = LevenbergMarquardt(rtol=1e-4, ftol=SOLVER.ftol, damping=1e-9)
+
+
+def best_start(load: Load, candidates: LoadUnknowns) -> Float[Array, " own"]:
+    """The candidate that predicts best; `_best` has the rule."""
+    if load.gains.prior is not None:
+        placed = load.gains.prior.placed(candidates.log_elements)
+        candidates = LoadUnknowns(placed, candidates.delay_samples)
+    best = _best(load, jnp.pad(candidates.vector(), ((0, 0), (0, load.gains.outputs - 1))))
+    if load.gains.outputs == 1:
+        return best
+    # These starts have no delays, and an approximation so far from the minimum may lead away.
+    return least_squares.stepped(lambda q, load: load(q), ROUGHLY, best, load, STEPS)[0]
+
+
+def _best(load: Load, starts: Float[Array, "start own"]) -> Float[Array, " own"]:
+    """The likeliest start, which is the last, or the best of all if χ² of the likeliest is large.
+
+    One loop holds the only copy of the terms: each copy compiles for 0.2 s.
+    """
+    # The minimum does not depend on its start, and a loop of unknown length has no gradient.
+    load, starts = jax.lax.stop_gradient((load, starts))
+    limit = NEAR * load.terms
+    likeliest = starts.shape[0] - 1
+
+    def goes_on(state: tuple[Array, Array, Array]) -> Bool[Array, ""]:
+        number, _, least = state
+        return (number >= 0) & ((number != likeliest - 1) | ~(least < limit))
+
+    def tried(state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+        number, best, least = state
+        squares = jnp.sum(load(starts[number]) ** 2)
+        squares = jnp.where(jnp.isfinite(squares), squares, jnp.inf)
+        better = squares <= least
+        return number - 1, jnp.where(better, number, best), jnp.minimum(squares, least)
+
+    first = jnp.array(likeliest), jnp.array(likeliest), jnp.array(jnp.inf, starts.dtype)
+    return starts[jax.lax.while_loop(goes_on, tried, first)[1]]
 
 
 def minimum(load: Load, start: Float[Array, " q"]) -> tuple[Float[Array, " q"], successive.Minimum]:
