@@ -21,7 +21,6 @@ from etid.results.driver import Calibration, HarmonicDriver, SourceImpedance
 from etid.signals.harmonics import Spectrum, same_unloaded
 from etid.signals.knots import Knots, knots
 from etid.signals.transfer import as_complex, delayed, frequency_variable, reciprocal
-from etid.solvers.levenberg_marquardt import NormalEquations
 
 DENSE = 32  # density of the knots: the floor of the driver's valley is flat
 
@@ -68,14 +67,11 @@ class NearCalibrations(eqx.Module):
         room = self.terms.size - rows.shape[1]
         return jnp.pad(rows, ((0, 0), (0, room)), constant_values=fill)
 
-    def equations(self) -> NormalEquations:
-        """Normal equations of all terms."""
+    @property
+    def objective(self) -> Float[Array, ""]:
+        """½ Σ r² of all terms, at all harmonics."""
         priors = self.terms[self.condensed.part.size :]
-        return NormalEquations(
-            total([of.objective for of in self.profiles]) + 0.5 * jnp.dot(priors, priors),
-            self.jacobian @ self.terms,
-            self.jacobian @ self.jacobian.T,
-        ).finite()
+        return total([of.objective for of in self.profiles]) + 0.5 * jnp.dot(priors, priors)
 
 
 class Calibrations(eqx.Module):
@@ -179,10 +175,19 @@ class Calibrations(eqx.Module):
         profiles = apart(lambda c: self.profiles(self.gains(c)), common)
         condensed = apart(lambda _: Condensed.of(profiles, self.knots), common)
         slopes = apart(lambda c: self.slopes(c, self.knots), common)
-        weak, by_common = self.weak(common)
-        jacobian = jnp.concatenate([condensed.rows(slopes.by_common), by_common], axis=1)
-        terms = jnp.concatenate([condensed.part, weak])
+        rows = condensed.rows(slopes.by_common)
+        terms, jacobian = self.with_weak(common, condensed.part, rows)
         return NearCalibrations(profiles, condensed, slopes, jacobian, terms)
+
+    def with_weak(
+        self,
+        common: Float[Array, " common"],
+        part: Float[Array, " part"],
+        rows: Float[Array, "common part"],
+    ) -> tuple[Float[Array, " term"], Float[Array, "common term"]]:
+        """Terms and their derivatives, followed by those of the weak priors."""
+        weak, by_common = self.weak(common)
+        return jnp.concatenate([part, weak]), jnp.concatenate([rows, by_common], axis=1)
 
     def linear(self, near: NearCalibrations) -> Linear:
         """All terms, linear in the common parameters."""

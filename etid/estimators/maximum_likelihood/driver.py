@@ -20,28 +20,20 @@ from etid.estimators.estimate import (
     delay_std,
 )
 from etid.estimators.maximum_likelihood.calibrations import Calibrations, NearCalibrations
-from etid.estimators.maximum_likelihood.condensed import apart
+from etid.estimators.maximum_likelihood.condensed import Condensed, apart
 from etid.estimators.maximum_likelihood.profile import Profile, Records, total
 from etid.estimators.sandwich import Linear
 from etid.estimators.unknowns import DriverUnknowns
 from etid.results.driver import Calibration, SourceImpedance
 from etid.signals.harmonics import Spectrum, as_list
 from etid.signals.transfer import as_complex
-from etid.solvers.least_squares import least_squares
-from etid.solvers.levenberg_marquardt import (
-    LevenbergMarquardt,
-    NormalEquations,
-)
+from etid.solvers import least_squares, successive
+from etid.solvers.levenberg_marquardt import LevenbergMarquardt, NormalEquations
 from etid.solvers.matrices import inverse
 
 
-def _equations(_: Any, q: Float[Array, " common"], model: Calibrations) -> NormalEquations:
-    """Normal equations of the calibrations."""
-    return model.near(q).equations()
-
-
 def _equations_of_terms(_: Any, q: Float[Array, " common"], model: Calibrations) -> NormalEquations:
-    """The same with the derivatives of the terms themselves, which contain their noise."""
+    """Normal equations with the derivatives of the terms themselves, which contain their noise."""
 
     def of_gains(q: Float[Array, " common"]) -> tuple[Array, Array]:
         gains, unit = model.gains(q), jnp.array([[1.0], [1.0j]])
@@ -64,23 +56,56 @@ def _equations_of_terms(_: Any, q: Float[Array, " common"], model: Calibrations)
     return NormalEquations(0.5 * jnp.dot(terms, terms), rows @ terms, rows @ rows.T).finite()
 
 
-# A first fit with bands, whose steps take a fifth of the time, and a fit with all harmonics from
-# its minimum. From a distant start, the derivatives of the terms themselves find deeper minima than
-# those with X̂. Z_th and a delay form a curved valley. Near its floor, steps with the usual damping
-# are so short that they seem to make no progress.
+def _equations_at_knots(
+    _: Any, q: Float[Array, " common"], of: tuple[Calibrations, Condensed]
+) -> NormalEquations:
+    """Normal equations of the condensed terms."""
+    model, condensed = of
+    slopes = apart(lambda q: model.slopes(q, model.knots), q)
+    terms, rows = model.with_weak(
+        q, condensed.terms(slopes.gains), condensed.rows(slopes.by_common)
+    )
+    return NormalEquations(0.5 * jnp.dot(terms, terms), rows @ terms, rows @ rows.T).finite()
+
+
+# A first fit with bands, and a fit with all harmonics from its minimum. From a distant start, the
+# derivatives of the terms themselves find deeper minima than those with X̂. Z_th and a delay form a
+# curved valley. Near its floor, steps with the usual damping are so short that they seem to make no
+# progress.
 ROUGHLY = LevenbergMarquardt(rtol=1e-3, ftol=1e-6, equations=_equations_of_terms)
-WELL = LevenbergMarquardt(rtol=SOLVER.rtol, ftol=3e-7, damping=1e-6, equations=_equations)
+WELL = LevenbergMarquardt(rtol=SOLVER.rtol, ftol=3e-7, damping=1e-6, equations=_equations_at_knots)
 
 
-def refined(
-    model: Calibrations, start: Float[Array, " common"], solver: LevenbergMarquardt
-) -> optx.Solution:
-    """The minimum of the likelihood."""
+def _terms(q: Float[Array, " common"], model: Calibrations) -> Float[Array, " term"]:
+    return jnp.concatenate([model.terms(model.gains(q)).ravel(), model.weak(q)[0]])
 
-    def terms(q: Float[Array, " common"], model: Calibrations) -> Float[Array, " term"]:
-        return jnp.concatenate([model.terms(model.gains(q)).ravel(), model.weak(q)[0]])
 
-    return least_squares(terms, solver, start, model, MAX_STEPS)
+def minimum(
+    model: Calibrations, start: Float[Array, " common"]
+) -> tuple[Float[Array, " common"], successive.Minimum]:
+    """The minimum of the likelihood of all harmonics."""
+    return least_squares.minimum(_terms, _search, start, model)
+
+
+def _search(
+    start: Float[Array, " common"], model: Calibrations
+) -> tuple[Float[Array, " common"], successive.Minimum]:
+    """The minimum, without a derivative."""
+
+    def approximate(q: Float[Array, " common"]) -> tuple[NearCalibrations, Float[Array, ""]]:
+        near = model.near(q)
+        return near, near.objective
+
+    def follow(
+        q: Float[Array, " common"], near: NearCalibrations
+    ) -> tuple[Float[Array, " common"], Float[Array, ""]]:
+        before, of = 0.5 * jnp.dot(near.terms, near.terms), (model, near.condensed)
+        q, (_, result, found) = least_squares.stepped(lambda q, _: q, WELL, q, of, MAX_STEPS)
+        settled = result == optx.RESULTS.successful
+        return q, jnp.where(settled, before - found.objective, jnp.inf)
+
+    terms = 2 * jnp.sum(model.spectra.selected, dtype=start.dtype)
+    return successive.approached(approximate, follow, start, terms)
 
 
 class Rough(NamedTuple):
@@ -119,7 +144,7 @@ def rough_source(
     """
     calibration = Calibration(r_load, jnp.zeros(r_load.shape), delay_std(r_load))
     model = Calibrations(start, calibration, bands, sample_rate)
-    solution = refined(model, model.start(), ROUGHLY)
+    solution = least_squares.least_squares(_terms, ROUGHLY, model.start(), model, MAX_STEPS)
     q, equations = solution.value, solution.stats["normal_equations"]
     kept = model.named(q).source.size
     # A spurious resonance fits noise, so that it lowers Σ r²; but it raises the variances.
@@ -177,13 +202,13 @@ def fit_source(
     def fit(tried: _Tried) -> _Tried:
         start = jax.tree.map(lambda leaf: leaf[tried.count], candidates)
         q = DriverUnknowns(ravel_pytree(start.source)[0], start.delay_samples).vector()
-        solution = refined(model, q, WELL)
+        q, least = minimum(model, q)
         new = _Tried(
             count=tried.count + 1,
-            common=solution.value,
-            squares=2 * solution.stats["normal_equations"].objective,
-            steps=start.steps + solution.stats["num_steps"],
-            settled=solution.result == optx.RESULTS.successful,
+            common=q,
+            squares=2 * least.objective,
+            steps=start.steps + least.points,
+            settled=least.result == optx.RESULTS.successful,
         )
         kept = new.settled | (tried.count == 0)
         old = dataclasses.replace(tried, count=new.count)
