@@ -4,8 +4,7 @@
 `vmap`, a step of one lane selects between two copies of this state for all lanes. With thousands of
 samples, that costs about twelve times as much as the step itself. Here the state holds only the
 objective, its gradient and the p×p Gauss-Newton matrix. These solve the damped step;
-`optimistix.ClassicalTrustRegion` accepts it and sets the damping. A matrix with a useful structure
-brings its own equations (`etid.solvers.arrowhead`).
+`optimistix.ClassicalTrustRegion` accepts it and sets the damping.
 
 Three properties make the method independent of the scale of parameters and residual:
 
@@ -19,7 +18,6 @@ Three properties make the method independent of the scale of parameters and resi
   infinite.
 """
 
-import abc
 import dataclasses
 from collections.abc import Callable
 from typing import Any
@@ -40,42 +38,12 @@ DIFFERENCE = 0.1  # of the step: spacing of the second difference (Transtrum and
 STALLED_STEP = 1e-15  # a relative step that no longer changes the parameters in double precision
 
 
-class AbstractNormalEquations(eqx.Module):
-    """Objective ½|r|², gradient Jᵀr and Gauss-Newton matrix JᵀJ of a residual r.
-
-    Subclasses decide how the matrix is stored.
-    """
-
-    objective: eqx.AbstractVar[Float[Array, ""]]
-    gradient: eqx.AbstractVar[Float[Array, " parameter"]]
-
-    @abc.abstractmethod
-    def diagonal(self) -> Float[Array, " parameter"]:
-        """Diagonal of JᵀJ."""
-
-    @abc.abstractmethod
-    def scaled(self, by: Float[Array, " parameter"]) -> "AbstractNormalEquations":
-        """The normal equations in the parameters z = `by` · y."""
-
-    @abc.abstractmethod
-    def step(self, damping: Float[Array, ""]) -> Float[Array, " parameter"]:
-        """−(JᵀJ + damping · I)⁻¹ Jᵀr; not finite if this matrix is not positive definite."""
-
-    @abc.abstractmethod
-    def hessian(self) -> lx.AbstractLinearOperator:
-        """JᵀJ as an operator, for the search of optimistix."""
-
-
-class NormalEquations(AbstractNormalEquations):
-    """Normal equations with JᵀJ as one matrix."""
+class NormalEquations(eqx.Module):
+    """Objective ½|r|², gradient Jᵀr and Gauss-Newton matrix JᵀJ of a residual r."""
 
     objective: Float[Array, ""]
     gradient: Float[Array, " parameter"]
     matrix: Float[Array, "parameter parameter"]
-
-    def diagonal(self) -> Float[Array, " parameter"]:
-        """Diagonal of JᵀJ."""
-        return jnp.diagonal(self.matrix)
 
     def scaled(self, by: Float[Array, " parameter"]) -> "NormalEquations":
         """The normal equations in the parameters z = `by` · y."""
@@ -91,13 +59,15 @@ class NormalEquations(AbstractNormalEquations):
         return dataclasses.replace(self, objective=jnp.where(finite, self.objective, jnp.inf))
 
     def step(self, damping: Float[Array, ""]) -> Float[Array, " parameter"]:
-        """−(JᵀJ + damping · I)⁻¹ Jᵀr."""
+        """−(JᵀJ + damping · I)⁻¹ Jᵀr; not finite if this matrix is not positive definite."""
         damped = self.matrix + damping * jnp.eye(self.gradient.size)
         return -cho_solve(cho_factor(damped), self.gradient)
 
-    def hessian(self) -> lx.AbstractLinearOperator:
-        """JᵀJ as an operator."""
-        return lx.MatrixLinearOperator(self.matrix, lx.positive_semidefinite_tag)
+    @property
+    def info(self) -> Any:  # FunctionInfo.EvalGradHessian
+        """The same for the search of optimistix."""
+        matrix = lx.MatrixLinearOperator(self.matrix, lx.positive_semidefinite_tag)
+        return optx.FunctionInfo.EvalGradHessian(self.objective, self.gradient, matrix)
 
 
 def normal_equations(
@@ -152,7 +122,7 @@ class State(eqx.Module):
 
     first_step: Bool[Array, ""]
     y_eval: Float[Array, " parameter"]
-    accepted: AbstractNormalEquations
+    accepted: NormalEquations
     scale: Float[Array, " parameter"]
     search_state: Any
     terminate: Bool[Array, ""]
@@ -190,8 +160,7 @@ class LevenbergMarquardt(optx.AbstractLeastSquaresSolver):
             (Transtrum and Sethna 2012, arXiv:1201.5885). In curved valleys this takes a fraction of
             the steps. Each step costs a third more.
         search: Accepts or rejects the step and sets the damping.
-        equations: Evaluates the normal equations of `fn(y, args)`. Own equations keep the
-            structure of a problem with many parameters.
+        equations: Evaluates the normal equations of `fn(y, args)`.
         second_order: Evaluates Jᵀ r″ of `fn(y, args)`.
     """
 
@@ -207,7 +176,7 @@ class LevenbergMarquardt(optx.AbstractLeastSquaresSolver):
         high_cutoff=0.75, high_constant=5.0, low_constant=0.25
     )
     geodesic: bool = False
-    equations: Callable[[Callable, Array, Any], AbstractNormalEquations] = normal_equations
+    equations: Callable[[Callable, Array, Any], NormalEquations] = normal_equations
     second_order: Callable[[Callable, Array, Array, Any], Array] = second_order
 
     def init(
@@ -225,23 +194,18 @@ class LevenbergMarquardt(optx.AbstractLeastSquaresSolver):
         matrix = jnp.zeros((y.size, y.size), y.dtype)
         return self.started(y, NormalEquations(jnp.zeros((), y.dtype), jnp.zeros_like(y), matrix))
 
-    def started(self, y: Array, zero: AbstractNormalEquations) -> State:
+    def started(self, y: Array, zero: NormalEquations) -> State:
         """The state before the first step, which evaluates `y` itself; `zero` is of zeros."""
         return State(
             first_step=jnp.array(True),
             y_eval=y,
             accepted=zero,
             scale=jnp.zeros_like(y),
-            search_state=self.search.init(y, self._info(zero)),
+            search_state=self.search.init(y, zero.info),
             terminate=jnp.array(False),
             result=optx.RESULTS.successful,
             accepted_steps=jnp.array(0),
             idle=jnp.array(0),
-        )
-
-    def _info(self, equations: AbstractNormalEquations) -> Any:  # FunctionInfo.EvalGradHessian
-        return optx.FunctionInfo.EvalGradHessian(
-            equations.objective, equations.gradient, equations.hessian()
         )
 
     def step(
@@ -260,13 +224,13 @@ class LevenbergMarquardt(optx.AbstractLeastSquaresSolver):
             state.first_step,
             y,
             state.y_eval,
-            self._info(state.accepted),
-            self._info(trial),
+            state.accepted.info,
+            trial.info,
             state.search_state,
         )
         accept = accept & jnp.isfinite(trial.objective) | state.first_step
         tried = state.y_eval - y
-        promised = -self.search.predict_reduction(tried, self._info(state.accepted))
+        promised = -self.search.predict_reduction(tried, state.accepted.info)
         reduced = state.accepted.objective - trial.objective
         negligible = jnp.maximum(jnp.abs(reduced), promised) <= self.ftol * trial.objective
         # One such step proves nothing: a step after a rejection is short, so it reduces little.
@@ -274,7 +238,7 @@ class LevenbergMarquardt(optx.AbstractLeastSquaresSolver):
         idle = jnp.where(accept, idle, state.idle)
         accepted = _select(accept, trial, state.accepted)
         y = jnp.where(accept, state.y_eval, y)
-        diagonal = jnp.sqrt(accepted.diagonal())
+        diagonal = jnp.sqrt(jnp.diagonal(accepted.matrix))
         scale = jnp.maximum(state.scale, diagonal)
         safe = jnp.where(scale > 0, scale, 1.0)
 
