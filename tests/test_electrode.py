@@ -35,6 +35,7 @@ from etid.online.state import ElectrodeState, TrackerState
 from etid.results.verdicts import RESULTS, first_verdict, verdict_names, verdicts_of
 
 NUMBER, LIMIT = 77, 10.0
+POWERS = np.array([1.0, -1.0])  # of a resistor and of a capacitor
 OLD, FOUND, FRESH = np.array([1.0, 2.0, 0.1]), np.array([1.1, 2.1, 0.2]), np.array([7.0, 2.2, 0.3])
 BEFORE = np.array([[50.0, 5.0], [5.0, 40.0]])
 TOLD, ALONE = np.array([[30.0, 2.0], [2.0, 20.0]]), np.array([[60.0, 3.0], [3.0, 70.0]])
@@ -121,12 +122,12 @@ def electrode(of: Case) -> tuple[Any, ...]:
     fresh = ATTEMPT(own, ALONE, np.linalg.inv(ALONE), 2.9, 2.01, RESULT[of.fresh], score)
     z = np.array([0.1, 0.2])
     suspected = SUSPICION(of.jump, of.drift, np.array([0.7, 0.8]), 0.02 * BEFORE, 0, z)
-    return state, measured, BEFORE, found, fresh, suspected, LIMIT, NUMBER
+    return state, measured, BEFORE, found, fresh, suspected, LIMIT, NUMBER, POWERS
 
 
 def expected(of: Case) -> dict[str, Any]:
     """The rules, one electrode at a time."""
-    state, measured, before, found, fresh, suspected, limit, number = electrode(of)
+    state, measured, before, found, fresh, suspected, limit, number, powers = electrode(of)
     again = not of.running or of.jump or of.drift
     used = fresh if again else found
     good = of.fresh == "good" if again else of.found
@@ -141,7 +142,9 @@ def expected(of: Case) -> dict[str, Any]:
     lost = of.running and (missed >= PATIENCE or of.off)
     information, pulses = before, state["pulses"]
     if good:
-        information = used.information + (0 if again else before)
+        grown = np.diag(np.exp(powers * factor))
+        summed = grown @ (used.information + before) @ grown
+        information = used.information if again else summed
         pulses = 1 if again else state["pulses"] + 1
     mean, mean_cov = state["mean"], state["mean_cov"]
     if good and not again:

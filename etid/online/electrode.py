@@ -244,6 +244,7 @@ def after_pulse(
     suspected: Suspicion,
     limit: Float[Array, ""],
     number: Int[Array, ""],
+    powers: Float[Array, " element"],
 ) -> ElectrodeState:
     """State of one electrode after one pulse.
 
@@ -256,6 +257,7 @@ def after_pulse(
         suspected: Tests of the pulse.
         limit: Limit of the tests.
         number: Number of the pulse.
+        powers: Powers of the impedance to which the elements are proportional.
     """
     running = state.pulses > 0
     again = ~running | suspected.jump | suspected.drift
@@ -279,7 +281,12 @@ def after_pulse(
     fits = running & good & ~suspected.jump & ~wrong_gain
     reached = jnp.maximum(state.confirmed, measured.amplitude)
     begun = ~running & (used.result == MAX_STEPS_REACHED)
-    gained = jnp.where(restarted, used.information, information + used.information)
+    # An impedance is nearly linear in resistances and in 1/C, less so in their logarithms: what is
+    # known of R in ohm stays, so that what is known of log R grows with R². Otherwise pulses weigh
+    # more where noise made R larger.
+    grown = jnp.exp(powers * factor)
+    summed = (information + used.information) * grown[:, None] * grown[None, :]
+    gained = jnp.where(restarted, used.information, summed)
     followed = good & ~again
     return ElectrodeState(
         own=jnp.where(good | begun, used.own, state.own),

@@ -68,7 +68,8 @@ def updated(
         wanted,
         logs,
     )
-    after = jax.vmap(lambda a, b, c, d, e, f: after_pulse(a, b, c, d, e, f, limit, number))(
+    powers = model.circuit.scaling()[0]
+    after = jax.vmap(lambda a, b, c, d, e, f: after_pulse(a, b, c, d, e, f, limit, number, powers))(
         before, measured, information, found, fresh, suspected
     )
     counts = running & measured.steady & (measured.bad == SUCCESSFUL)
