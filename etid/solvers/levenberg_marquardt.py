@@ -63,6 +63,12 @@ class NormalEquations(eqx.Module):
         damped = self.matrix + damping * jnp.eye(self.gradient.size)
         return -cho_solve(cho_factor(damped), self.gradient)
 
+    def newton(self) -> Float[Array, " parameter"]:
+        """The step without damping; directions without effect take no part."""
+        scale = jnp.sqrt(jnp.diagonal(self.matrix))
+        scale = jnp.where(scale > 0, scale, 1.0)
+        return self.scaled(scale).step(jnp.asarray(RIDGE, scale.dtype)) / scale
+
     @property
     def info(self) -> Any:  # FunctionInfo.EvalGradHessian
         """The same for the search of optimistix."""

@@ -20,7 +20,9 @@ IDLE = 3  # points in a row with a reduction below the rounding errors of ½ Σ 
 ROUNDING = 1e-6  # of ½ Σ r²
 
 Approximate = Callable[[Float[Array, " q"]], tuple[Any, Float[Array, ""]]]
-Follow = Callable[[Float[Array, " q"], Any], tuple[Float[Array, " q"], Float[Array, ""]]]
+Follow = Callable[
+    [Float[Array, " q"], Any, Float[Array, ""]], tuple[Float[Array, " q"], Float[Array, ""]]
+]
 
 
 class Minimum(NamedTuple):
@@ -41,6 +43,13 @@ class Minimum(NamedTuple):
     promised: Float[Array, ""]
     result: optx.RESULTS
     points: Int[Array, ""]
+
+
+def close(
+    promised: Float[Array, ""], objective: Float[Array, ""], terms: Float[Array, ""] | int
+) -> Bool[Array, ""]:
+    """Whether a step that promises this is the last; in units of the residual, whatever χ² is."""
+    return promised <= BEFORE**2 * objective / terms
 
 
 class _State(NamedTuple):
@@ -65,7 +74,8 @@ def approached(
 
     Args:
         approximate: The likelihood near a point, and ½ Σ r² at it.
-        follow: The minimum of an approximation, from its point, and the reduction of ½ Σ r².
+        follow: The minimum of an approximation, from its point, where ½ Σ r² is given, and the
+            reduction of ½ Σ r².
         start: First point.
         terms: Number of terms r; ½ Σ r² is about half of it if the model is right.
     """
@@ -85,14 +95,12 @@ def approached(
             (state.trial, near, objective),
             (state.best, state.near, state.objective),
         )
-        target, promised = follow(best, near)
-        # In units of the residual, also where χ² is not 1.
-        close = promised <= BEFORE**2 * objective / terms
+        target, promised = follow(best, near, objective)
         idle = jnp.maximum(jnp.abs(reduced), promised) <= ROUNDING * objective
         idle = jnp.where(idle, state.idle + 1, 0)
         next_one = jnp.where(better, target, 0.5 * (state.trial + best))
         trial = jnp.where(jnp.isfinite(next_one).all(), next_one, best)
-        settled = close | (idle >= IDLE)
+        settled = close(promised, objective, terms) | (idle >= IDLE)
         points = state.points + 1
         return _State(trial, best, near, objective, target, promised, settled, idle, points)
 

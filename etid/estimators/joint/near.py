@@ -302,7 +302,7 @@ def minimum(
         return _Near(parts, roots, signals(common)), value
 
     def follow(
-        y: Float[Array, " parameter"], near: _Near
+        y: Float[Array, " parameter"], near: _Near, _: Float[Array, ""]
     ) -> tuple[Float[Array, " parameter"], Float[Array, ""]]:
         common, owns = named(y)
         weak, _ = study.model.calibrations.weak(common)

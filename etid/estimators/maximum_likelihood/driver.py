@@ -97,7 +97,7 @@ def _search(
         return near, near.objective
 
     def follow(
-        q: Float[Array, " common"], near: NearCalibrations
+        q: Float[Array, " common"], near: NearCalibrations, _: Float[Array, ""]
     ) -> tuple[Float[Array, " common"], Float[Array, ""]]:
         before, of = 0.5 * jnp.dot(near.terms, near.terms), (model, near.condensed)
         q, (_, result, found) = least_squares.stepped(lambda q, _: q, WELL, q, of, MAX_STEPS)

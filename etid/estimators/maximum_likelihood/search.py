@@ -18,6 +18,7 @@ from etid.solvers import least_squares, successive
 from etid.solvers.levenberg_marquardt import LevenbergMarquardt, NormalEquations
 
 STEPS = 50  # largest number of steps at the knots of one point
+DISTANT = 0.1  # part of ½ Σ r² that a step promises, above which a point is distant
 NEAR = 4.0  # χ² of the likeliest start; below this value the other starts are not tried
 
 
@@ -30,6 +31,14 @@ def _equations(_, q: Float[Array, " q"], terms: AtKnots) -> NormalEquations:
         found.gradient + prior * rest,
         found.matrix + jnp.diag(prior**2),
     ).finite()
+
+
+def _equations_of_load(_, q: Float[Array, " q"], load: Load) -> NormalEquations:
+    """The same with the terms condensed at `q`, and the objective of all harmonics."""
+    near, rest, every = load.near(q), load.rest(q), jnp.ones(q.size, bool)
+    found = _equations(None, q, AtKnots(load.gains.at(load.knots), near, every))
+    objective = near.profile.objective + 0.5 * jnp.dot(rest, rest)
+    return dataclasses.replace(found, objective=objective).finite()
 
 
 ROUGHLY = LevenbergMarquardt(rtol=1e-2, ftol=1e-3)
@@ -46,7 +55,8 @@ def best_start(load: Load, candidates: LoadUnknowns) -> Float[Array, " own"]:
     if load.gains.outputs == 1:
         return best
     # These starts have no delays, and an approximation so far from the minimum may lead away.
-    return least_squares.stepped(lambda q, load: load(q), ROUGHLY, best, load, STEPS)[0]
+    solver = dataclasses.replace(ROUGHLY, equations=_equations_of_load)
+    return least_squares.stepped(lambda q, load: load(q), solver, best, load, STEPS)[0]
 
 
 def _best(load: Load, starts: Float[Array, "start own"]) -> Float[Array, " own"]:
@@ -84,28 +94,44 @@ def _search(start: Float[Array, " q"], load: Load) -> tuple[Float[Array, " q"], 
     gains = load.gains.at(load.knots)
     # From a distant start, a joint fit would distort Z_th: the own parameters go first. One loop
     # holds both fits, because each compiles for half a second.
-    free = jnp.stack([jnp.arange(start.size) < load.gains.owned, jnp.ones(start.size, bool)])
+    every = jnp.ones(start.size, bool)
+    free = jnp.stack([jnp.arange(start.size) < load.gains.owned, every])
     fields = jnp.array([[of.rtol, of.ftol, of.damping] for of in (ROUGHLY, WELL)])
 
     def approximate(q: Float[Array, " q"]) -> tuple[Near, Float[Array, ""]]:
         near, rest = load.near(q), load.rest(q)
         return near, near.profile.objective + 0.5 * jnp.dot(rest, rest)
 
-    def follow(q: Float[Array, " q"], near: Near) -> tuple[Float[Array, " q"], Float[Array, ""]]:
+    def follow(
+        q: Float[Array, " q"], near: Near, objective: Float[Array, ""]
+    ) -> tuple[Float[Array, " q"], Float[Array, ""]]:
+        here = _equations(None, q, AtKnots(gains, near, every))
+        newton = here.newton()
+        promised = -0.5 * jnp.dot(newton, here.gradient)
+        close = successive.close(promised, objective, load.terms)
+        wanted = jnp.stack([~(promised < DISTANT * objective), ~close])
+
         def stage(
-            q: Float[Array, " q"], of: tuple[Float[Array, "3"], Bool[Array, " q"]]
+            q: Float[Array, " q"], of: tuple[Float[Array, "3"], Bool[Array, " q"], Bool[Array, ""]]
         ) -> tuple[Float[Array, " q"], Float[Array, ""]]:
-            (rtol, ftol, damping), free = of
+            (rtol, ftol, damping), free, wanted = of
             solver = dataclasses.replace(
                 WELL, rtol=rtol, ftol=ftol, damping=damping, equations=_equations
             )
             terms = AtKnots(gains, near, free)
-            q, (_, _, found) = least_squares.stepped(lambda q, of: of(q), solver, q, terms, STEPS)
-            return q, found.objective
 
-        rest, part = load.rest(q), near.condensed.part
-        before = 0.5 * (jnp.dot(rest, rest) + jnp.dot(part, part))
-        q, objectives = jax.lax.scan(stage, q, (fields, free))
-        return q, before - objectives[-1]
+            def stepped(q: Float[Array, " q"]) -> tuple[Float[Array, " q"], Float[Array, ""]]:
+                q, (_, _, last) = least_squares.stepped(
+                    lambda q, of: of(q), solver, q, terms, STEPS
+                )
+                return q, last.objective
+
+            return jax.lax.cond(wanted, stepped, lambda q: (q, here.objective), q)
+
+        target, objectives = jax.lax.scan(stage, q, (fields, free, wanted))
+        return (
+            jnp.where(close, q + newton, target),
+            jnp.where(close, promised, here.objective - objectives[-1]),
+        )
 
     return successive.approached(approximate, follow, start, load.terms)
