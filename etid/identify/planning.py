@@ -1,22 +1,143 @@
-"""Reading and inspection of many recordings: which can be fitted, and why the others cannot."""
+"""Which recordings can be fitted, by which estimator, and why the others cannot."""
 
 import itertools
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from typing import NamedTuple
 
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from etid.circuits.circuit import AbstractCircuit
+from etid.estimators.element_limits import limited, of_circuit
 from etid.estimators.estimator import AbstractEstimator
-from etid.identify.arguments import Asked, plan
-from etid.identify.unfitted import explained
-from etid.recordings.preflight import Group, Inspected
+from etid.estimators.maximum_likelihood.estimator import MaximumLikelihood
+from etid.estimators.registry import MAXIMUM_LIKELIHOOD, OUTPUT_ERROR, WITH_CURRENT
+from etid.identify import changes
+from etid.identify.options import Options, check_circuits
+from etid.recordings.causes import why_implausible, why_misaligned
+from etid.recordings.preflight import Group, Inspected, preflight
 from etid.recordings.recording import Recording, RecordingError
-from etid.results.feed import AbstractFeed
-from etid.results.fit import IdentificationError
-from etid.results.verdicts import message
+from etid.results.driver import HarmonicDriver
+from etid.results.feed import AbstractFeed, MeasuredCurrent
+from etid.results.fit import Fit, IdentificationError, Support
+from etid.results.verdicts import message, verdict
 
 TOGETHER = 600_000  # samples that are inspected together; their arrays take tens of MB
 FEWEST = 16  # recordings that are read at once, however long they are
 MOST = 64  # recordings that are read at once if they are short; many more save little time
 ERRORS = (RecordingError, ValueError, IdentificationError)  # that a recording or a driver may raise
+# Verdicts whose message says more of a recording.
+EXPLAINED = ("rate_mismatch", "misaligned", "wrong_unit", "flat", "nonfinite_samples")
+
+
+def for_calibrations(
+    asked: AbstractEstimator | None, recordings: Sequence[Inspected]
+) -> AbstractEstimator:
+    """The requested estimator, or the default estimator of calibrations.
+
+    The default is maximum likelihood if all records hold several periods. Otherwise it is output
+    error: in a single period the aliases are not in the standard errors of maximum likelihood.
+    """
+    if asked is not None:
+        return asked
+    several = all(seen.periods[0] > 1 and seen.is_periodic for seen in recordings)
+    return MAXIMUM_LIKELIHOOD if several else OUTPUT_ERROR
+
+
+def check_default(estimator: AbstractEstimator, circuits: Sequence[AbstractCircuit]) -> None:
+    """Raise ValueError if the default estimator cannot identify these circuits."""
+    try:
+        check_circuits(estimator, circuits)
+    except ValueError as error:
+        raise ValueError(
+            "the record holds less than two whole pulse periods or begins in a pulse, or its "
+            f"driver was identified without harmonics; {str(error).partition(';')[0]}. Record "
+            "three periods or more and identify the driver with method='maximum_likelihood', or "
+            "ask for method='maximum_likelihood', whose standard errors do not include the "
+            "effect of aliases in a single period"
+        ) from error
+
+
+def plan(
+    options: Options, seen: Inspected, driver: AbstractFeed
+) -> tuple[AbstractEstimator, str | None]:
+    """The estimator of a load, and the verdict that excludes a fit; None if it can be fitted.
+
+    Raises:
+        ValueError: The estimator cannot use this driver.
+    """
+    of_caller = options.estimator
+    name = preflight(seen, periodic=of_caller is not None and of_caller.lane.periodic)
+    estimator = of_caller or OUTPUT_ERROR
+    if name is None and isinstance(driver, HarmonicDriver | MeasuredCurrent):
+        estimator = for_calibrations(of_caller, [seen])
+        if of_caller is None and estimator is MAXIMUM_LIKELIHOOD and seen.by_current is not None:
+            name = preflight(seen.by_current, periodic=True)
+            estimator = WITH_CURRENT if name is not None or seen.has_all else estimator
+    if name is None and isinstance(estimator, MaximumLikelihood) and estimator.with_current:
+        if not seen.has_all:
+            raise ValueError(
+                f"recording {seen.recording.path!r}: method {str(estimator)!r} needs a driver and "
+                "a current, and no disturbed periods; use method='maximum_likelihood'"
+            )
+        if seen.by_current is not None and seen.by_current.is_aliased:
+            name = "biased"
+    if name is None and estimator.lane.periodic and seen.is_aliased:
+        name = "biased"
+    estimator.check_driver(driver, seen.recording.sample_rate, seen.recording.pulse_rate)
+    return options.given_to(estimator), name
+
+
+def explained(seen: Inspected, name: str) -> str:
+    """The message of a verdict of `etid.recordings.preflight`, with the numbers found."""
+    found = ""
+    if seen.by_current is not None and name in EXPLAINED and preflight(seen) != name:
+        seen = seen.by_current  # the fault is in the current
+    if name == "rate_mismatch":
+        found = seen.train.mismatch
+    elif name == "misaligned":
+        found = why_misaligned(seen)
+    elif name == "wrong_unit":
+        found = why_implausible(seen.by_current or seen)
+    elif name in ("flat", "nonfinite_samples"):
+        found = f"The fault is in {' and '.join(_faulty(seen, name))}."
+    return f"{found} {message(name)}".strip()
+
+
+def _faulty(seen: Inspected, name: str) -> list[str]:
+    """Names of the records that are flat, or that hold numbers that are not finite."""
+    records = seen.recording.cause, "v_out"
+    if name == "flat":
+        faults = seen.is_flat
+    else:
+        faults = [not np.isfinite(seen.recording.samples[one].values).all() for one in records]
+    return [one for one, fault in zip(records, faults, strict=True) if fault]
+
+
+def failed_fit(name: str, options: Options, method: str) -> Fit:
+    """A fit without numbers, for a recording that was not fitted."""
+    circuit = options.circuit
+    size = len(circuit.names())
+    nan = np.full((size, size), np.nan)
+    empty = circuit.with_log_values(jnp.full(size, jnp.nan))
+    scalar = np.asarray(np.nan)
+    none = changes.unknown(size)
+    fit = Fit(
+        circuit=empty,
+        cov=nan,
+        shared_cov=nan,
+        rrse=scalar,
+        chi2=scalar,
+        result=verdict(name),
+        steps=np.asarray(0),
+        method=method,
+        change=none.size,
+        change_stderr=none.stderr,
+        support=Support.unknown(size),
+        limits=limited(circuit, of_circuit(options.bounds, circuit)),
+    )
+    return jax.tree.map(np.asarray, fit)
 
 
 class Refusal:
@@ -38,7 +159,7 @@ class Planned(NamedTuple):
 def planned(
     load: Callable[[int], tuple[Recording, AbstractFeed]],
     rows: Iterator[int],
-    asked: Asked,
+    options: Options,
 ) -> Iterator[tuple[int, Planned | Refusal]]:
     """Some recordings with their drivers and estimators, or the reason why they cannot be fitted.
 
@@ -48,7 +169,7 @@ def planned(
     Args:
         load: Reads a recording and its driver.
         rows: Numbers of the recordings; the order of the results may differ.
-        asked: What the caller asks for.
+        options: What the caller asks for.
     """
     loaded: dict[tuple[int, str, float, float], list[tuple[int, Recording, AbstractFeed]]] = {}
     held = 0
@@ -69,7 +190,7 @@ def planned(
             part = alike[first : first + together]
             group = Group([of for _, of, _ in part])
             for number, (row, of, driver) in enumerate(part):
-                yield row, _planned(Inspected(of, group, number), driver, asked)
+                yield row, _planned(Inspected(of, group, number), driver, options)
 
 
 def calls(count: int) -> range:
@@ -77,9 +198,9 @@ def calls(count: int) -> range:
     return range(-(-count // FEWEST))
 
 
-def _planned(seen: Inspected, driver: AbstractFeed, asked: Asked) -> Planned | Refusal:
+def _planned(seen: Inspected, driver: AbstractFeed, options: Options) -> Planned | Refusal:
     try:
-        estimator, name = plan(asked, seen, driver)
+        estimator, name = plan(options, seen, driver)
     except ERRORS as error:
         return _refusal(error)
     return (
