@@ -103,7 +103,7 @@ def circuit_of(value: AbstractCircuit | str | None) -> AbstractCircuit:
     return SkinRC() if value is None else given_circuit("circuit", value)
 
 
-def given_circuit(field: str, value: AbstractCircuit | str) -> AbstractCircuit:
+def given_circuit(field: str, value: Any) -> AbstractCircuit:
     """The given circuit, or that of a circuit string.
 
     Raises:

@@ -246,12 +246,12 @@ def order_of(value: Any) -> Order:
     Raises:
         RecordingError: The value is neither a whole number from 2 to `LARGEST_ORDER` nor `"auto"`.
     """
-    if isinstance(value, str) and value == AUTO:
-        return AUTO
     try:
         order = None if isinstance(value, bool) else operator.index(value)
     except TypeError:
         order = None
+    if isinstance(value, str) and value == AUTO:
+        return AUTO
     if order is not None and 2 <= order <= LARGEST_ORDER:
         return order
     raise RecordingError(

@@ -6,6 +6,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from etid.circuits.circuit import AbstractCircuit
+from etid.estimators.estimator import AbstractEstimator
 from etid.estimators.lanes import Harmonics
 from etid.estimators.registry import MAXIMUM_LIKELIHOOD, OUTPUT_ERROR, Method
 from etid.identify.arguments import require
@@ -61,8 +62,7 @@ def identify_samples(
     periods = whole_periods(v_out.shape[0], sample_rate, pulse_rate)
     estimator = options.estimator
     if estimator is None:
-        several = isinstance(driver, HarmonicDriver) and periods[0] > 1
-        estimator = MAXIMUM_LIKELIHOOD if several else OUTPUT_ERROR
+        estimator = _default(driver, periods[0])
         check_default(estimator, options.circuits)
     estimator.check_driver(driver, sample_rate, pulse_rate)
     v_th, v_out, step, rate = (
@@ -77,3 +77,8 @@ def identify_samples(
     fit = skin_lane(lane, driver, known, options.circuit, estimator)
     # No harmonic is left out here, so a remark about hum would be untrue.
     return dataclasses.replace(fit, remarks=fit.remarks & ~int(Remark.mains_hum))
+
+
+def _default(driver: Driver, periods: int) -> AbstractEstimator:
+    several = isinstance(driver, HarmonicDriver) and periods > 1
+    return MAXIMUM_LIKELIHOOD if several else OUTPUT_ERROR
