@@ -25,8 +25,8 @@ from etid.estimators.registry import MAXIMUM_LIKELIHOOD, register_description
 from etid.identify.arguments import check_distinct, circuit_of, driver_of, fed
 from etid.identify.arguments import recordings as list_of
 from etid.identify.one import known_of, remarks_on, successful
-from etid.identify.options import Interval, Options
-from etid.identify.planning import failed_fit, plan
+from etid.identify.options import Interval, Options, plan
+from etid.identify.planning import failed_fit
 from etid.numpy_tier.tiers import program
 from etid.precision import in_float64
 from etid.recordings.preflight import Inspected

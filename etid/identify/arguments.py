@@ -3,7 +3,7 @@
 import hashlib
 import reprlib
 from collections.abc import Iterable, Sequence
-from typing import Any
+from typing import Any, cast
 
 from etid.circuits.circuit import AbstractCircuit, SkinRC
 from etid.circuits.circuit_string import circuit, is_circuit_string
@@ -113,7 +113,7 @@ def given_circuit(field: str, value: Any) -> AbstractCircuit:
     if isinstance(value, str) and is_circuit_string("".join(value.split())):
         return circuit(value)
     require(field, value, AbstractCircuit)
-    return value
+    return cast(AbstractCircuit, value)
 
 
 def number_of(field: str, value: Any) -> float:

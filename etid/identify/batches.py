@@ -38,13 +38,12 @@ from etid.identify.one import (
     skin,
     skin_lane,
 )
-from etid.identify.options import Options
+from etid.identify.options import Options, check_default
 from etid.identify.planning import (
     FEWEST,
     Planned,
     Refusal,
     calls,
-    check_default,
     failed_fit,
     planned,
 )

@@ -16,8 +16,8 @@ from etid.estimators.score_tests import resistors
 from etid.identify import changes
 from etid.identify.arguments import check_distinct, recordings
 from etid.identify.one import checksum, needs_another, of_both
-from etid.identify.options import Options, check_order
-from etid.identify.planning import explained, for_calibrations
+from etid.identify.options import Options, check_order, for_calibrations
+from etid.identify.planning import explained
 from etid.numpy_tier.tiers import program
 from etid.precision import in_float64
 from etid.recordings.preflight import Inspected, preflight

@@ -26,8 +26,16 @@ from etid.estimators.maximum_likelihood.estimator import MaximumLikelihood
 from etid.estimators.registry import Method
 from etid.identify import changes
 from etid.identify.arguments import fed
-from etid.identify.options import Circuit, FitOptions, Interval, Options, candidates_of
-from etid.identify.planning import EXPLAINED, check_default, explained, failed_fit, plan
+from etid.identify.options import (
+    Circuit,
+    FitOptions,
+    Interval,
+    Options,
+    candidates_of,
+    check_default,
+    plan,
+)
+from etid.identify.planning import EXPLAINED, explained, failed_fit
 from etid.numpy_tier.tiers import program
 from etid.precision import in_float64
 from etid.recordings.preflight import Inspected

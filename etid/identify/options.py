@@ -1,4 +1,4 @@
-"""The options of a fit, checked when a public function is called."""
+"""The options of a fit, checked when a public function is called, and the estimator they select."""
 
 import dataclasses
 import functools
@@ -12,18 +12,20 @@ from typing import Any, TypedDict
 import equinox as eqx
 import jax
 
-from etid.circuits.circuit import AbstractCircuit
+from etid.circuits.circuit import AbstractCircuit, SkinRC
 from etid.circuits.current_dependent import current_dependent
 from etid.estimators.element_limits import Limits, checked_limits
 from etid.estimators.element_prior import Known, checked
 from etid.estimators.estimator import AbstractEstimator
 from etid.estimators.maximum_likelihood.estimator import MaximumLikelihood
 from etid.estimators.output_error.estimator import OutputError
-from etid.estimators.registry import Method, named
+from etid.estimators.registry import MAXIMUM_LIKELIHOOD, OUTPUT_ERROR, WITH_CURRENT, Method, named
 from etid.identify.arguments import circuit_of, number_of
+from etid.recordings.preflight import Inspected, preflight
 from etid.recordings.recording import RecordingError
 from etid.recordings.study import Study
 from etid.results.driver import ContinuousDriver, HarmonicDriver
+from etid.results.feed import AbstractFeed, MeasuredCurrent
 from etid.results.provenance import PLAUSIBLE, Settings, versions
 from etid.results.tried_orders import AUTO, Order
 from etid.selection.search import usual_circuits
@@ -203,6 +205,8 @@ def candidates_of(value: Circuit) -> tuple[AbstractCircuit, ...]:
     """
     if isinstance(value, str) and value == AUTO:
         return usual_circuits()
+    if value is None:
+        return _default()
     circuit = circuit_of(value)
     if _depends_on_current(type(circuit)):
         raise RecordingError(
@@ -211,6 +215,12 @@ def candidates_of(value: Circuit) -> tuple[AbstractCircuit, ...]:
             remedy="Use etid.identify_amplitudes",
         )
     return (circuit,)
+
+
+@functools.cache
+def _default() -> tuple[AbstractCircuit, ...]:
+    """`SkinRC`, made once, because most fits ask for it."""
+    return (SkinRC(),)
 
 
 @functools.cache
@@ -238,6 +248,64 @@ def check_order(order: Order, estimator: AbstractEstimator) -> None:
             f'order="auto" needs maximum likelihood, but the method is {str(estimator)!r}; give a '
             "number of poles, as in order=5, or record several whole pulse periods"
         )
+
+
+def for_calibrations(
+    asked: AbstractEstimator | None, recordings: Sequence[Inspected]
+) -> AbstractEstimator:
+    """The requested estimator, or the default estimator of calibrations.
+
+    The default is maximum likelihood if all records hold several periods. Otherwise it is output
+    error: in a single period the aliases are not in the standard errors of maximum likelihood.
+    """
+    if asked is not None:
+        return asked
+    several = all(seen.periods[0] > 1 and seen.is_periodic for seen in recordings)
+    return MAXIMUM_LIKELIHOOD if several else OUTPUT_ERROR
+
+
+def check_default(estimator: AbstractEstimator, circuits: Sequence[AbstractCircuit]) -> None:
+    """Raise ValueError if the default estimator cannot identify these circuits."""
+    try:
+        check_circuits(estimator, circuits)
+    except ValueError as error:
+        raise ValueError(
+            "the record holds less than two whole pulse periods or begins in a pulse, or its "
+            f"driver was identified without harmonics; {str(error).partition(';')[0]}. Record "
+            "three periods or more and identify the driver with method='maximum_likelihood', or "
+            "ask for method='maximum_likelihood', whose standard errors do not include the "
+            "effect of aliases in a single period"
+        ) from error
+
+
+def plan(
+    options: Options, seen: Inspected, driver: AbstractFeed
+) -> tuple[AbstractEstimator, str | None]:
+    """The estimator of a load, and the verdict that excludes a fit; None if it can be fitted.
+
+    Raises:
+        ValueError: The estimator cannot use this driver.
+    """
+    of_caller = options.estimator
+    name = preflight(seen, periodic=of_caller is not None and of_caller.lane.periodic)
+    estimator = of_caller or OUTPUT_ERROR
+    if name is None and isinstance(driver, HarmonicDriver | MeasuredCurrent):
+        estimator = for_calibrations(of_caller, [seen])
+        if of_caller is None and estimator is MAXIMUM_LIKELIHOOD and seen.by_current is not None:
+            name = preflight(seen.by_current, periodic=True)
+            estimator = WITH_CURRENT if name is not None or seen.has_all else estimator
+    if name is None and isinstance(estimator, MaximumLikelihood) and estimator.with_current:
+        if not seen.has_all:
+            raise ValueError(
+                f"recording {seen.recording.path!r}: method {str(estimator)!r} needs a driver and "
+                "a current, and no disturbed periods; use method='maximum_likelihood'"
+            )
+        if seen.by_current is not None and seen.by_current.is_aliased:
+            name = "biased"
+    if name is None and estimator.lane.periodic and seen.is_aliased:
+        name = "biased"
+    estimator.check_driver(driver, seen.recording.sample_rate, seen.recording.pulse_rate)
+    return options.given_to(estimator), name
 
 
 def order_of(value: Any) -> Order:

@@ -1,25 +1,21 @@
-"""Which recordings can be fitted, by which estimator, and why the others cannot."""
+"""Reading and inspection of recordings: which can be fitted, and why the others cannot."""
 
 import itertools
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from etid.circuits.circuit import AbstractCircuit
 from etid.estimators.element_limits import limited, of_circuit
 from etid.estimators.estimator import AbstractEstimator
-from etid.estimators.maximum_likelihood.estimator import MaximumLikelihood
-from etid.estimators.registry import MAXIMUM_LIKELIHOOD, OUTPUT_ERROR, WITH_CURRENT
 from etid.identify import changes
-from etid.identify.options import Options, check_circuits
+from etid.identify.options import Options, plan
 from etid.recordings.causes import why_implausible, why_misaligned
 from etid.recordings.preflight import Group, Inspected, preflight
 from etid.recordings.recording import Recording, RecordingError
-from etid.results.driver import HarmonicDriver
-from etid.results.feed import AbstractFeed, MeasuredCurrent
+from etid.results.feed import AbstractFeed
 from etid.results.fit import Fit, IdentificationError, Support
 from etid.results.verdicts import message, verdict
 
@@ -29,64 +25,6 @@ MOST = 64  # recordings that are read at once if they are short; many more save 
 ERRORS = (RecordingError, ValueError, IdentificationError)  # that a recording or a driver may raise
 # Verdicts whose message says more of a recording.
 EXPLAINED = ("rate_mismatch", "misaligned", "wrong_unit", "flat", "nonfinite_samples")
-
-
-def for_calibrations(
-    asked: AbstractEstimator | None, recordings: Sequence[Inspected]
-) -> AbstractEstimator:
-    """The requested estimator, or the default estimator of calibrations.
-
-    The default is maximum likelihood if all records hold several periods. Otherwise it is output
-    error: in a single period the aliases are not in the standard errors of maximum likelihood.
-    """
-    if asked is not None:
-        return asked
-    several = all(seen.periods[0] > 1 and seen.is_periodic for seen in recordings)
-    return MAXIMUM_LIKELIHOOD if several else OUTPUT_ERROR
-
-
-def check_default(estimator: AbstractEstimator, circuits: Sequence[AbstractCircuit]) -> None:
-    """Raise ValueError if the default estimator cannot identify these circuits."""
-    try:
-        check_circuits(estimator, circuits)
-    except ValueError as error:
-        raise ValueError(
-            "the record holds less than two whole pulse periods or begins in a pulse, or its "
-            f"driver was identified without harmonics; {str(error).partition(';')[0]}. Record "
-            "three periods or more and identify the driver with method='maximum_likelihood', or "
-            "ask for method='maximum_likelihood', whose standard errors do not include the "
-            "effect of aliases in a single period"
-        ) from error
-
-
-def plan(
-    options: Options, seen: Inspected, driver: AbstractFeed
-) -> tuple[AbstractEstimator, str | None]:
-    """The estimator of a load, and the verdict that excludes a fit; None if it can be fitted.
-
-    Raises:
-        ValueError: The estimator cannot use this driver.
-    """
-    of_caller = options.estimator
-    name = preflight(seen, periodic=of_caller is not None and of_caller.lane.periodic)
-    estimator = of_caller or OUTPUT_ERROR
-    if name is None and isinstance(driver, HarmonicDriver | MeasuredCurrent):
-        estimator = for_calibrations(of_caller, [seen])
-        if of_caller is None and estimator is MAXIMUM_LIKELIHOOD and seen.by_current is not None:
-            name = preflight(seen.by_current, periodic=True)
-            estimator = WITH_CURRENT if name is not None or seen.has_all else estimator
-    if name is None and isinstance(estimator, MaximumLikelihood) and estimator.with_current:
-        if not seen.has_all:
-            raise ValueError(
-                f"recording {seen.recording.path!r}: method {str(estimator)!r} needs a driver and "
-                "a current, and no disturbed periods; use method='maximum_likelihood'"
-            )
-        if seen.by_current is not None and seen.by_current.is_aliased:
-            name = "biased"
-    if name is None and estimator.lane.periodic and seen.is_aliased:
-        name = "biased"
-    estimator.check_driver(driver, seen.recording.sample_rate, seen.recording.pulse_rate)
-    return options.given_to(estimator), name
 
 
 def explained(seen: Inspected, name: str) -> str:

@@ -11,8 +11,7 @@ from etid.estimators.lanes import Harmonics
 from etid.estimators.registry import MAXIMUM_LIKELIHOOD, OUTPUT_ERROR, Method
 from etid.identify.arguments import require
 from etid.identify.one import skin_lane
-from etid.identify.options import Options, candidates_of
-from etid.identify.planning import check_default
+from etid.identify.options import Options, candidates_of, check_default
 from etid.precision import in_float64
 from etid.recordings.remarks import Remark
 from etid.results.driver import Driver, HarmonicDriver
