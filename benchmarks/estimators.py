@@ -23,7 +23,7 @@ from jaxtyping import Bool, Float
 import etid
 from etid.circuits.circuit import SkinRC
 from etid.estimators.registry import named, names
-from etid.identify.arguments import for_calibrations
+from etid.identify.options import for_calibrations
 from etid.recordings.preflight import Inspected
 
 DEFAULT = "default"

@@ -77,10 +77,10 @@ def _log_parts(log: str) -> None:
     """Note each part when it is begun."""
     real = streaming.identify_part
 
-    def logged(study, paths, *rest):
+    def logged(drivers, paths, *rest):
         with open(log, "a") as file:
             file.write(f"{paths[0]}\n")
-        return real(study, paths, *rest)
+        return real(drivers, paths, *rest)
 
     streaming.identify_part = logged
 

@@ -22,7 +22,8 @@ from etid.circuits.circuit import (
     SkinRC,
 )
 from etid.identify import batches
-from etid.identify.arguments import Asked, fed
+from etid.identify.arguments import fed
+from etid.identify.options import Options
 from etid.results.fit import Fit
 from etid.selection.search import usual_circuits
 from etid.selection.selection import Selection
@@ -103,8 +104,7 @@ def choices(records: Sequence[etid.Recording], driver: etid.Driver) -> list[Sele
     found, _ = batches.choices(
         len(records),
         lambda row: fed(records[row], driver),
-        usual_circuits(),
-        Asked(),
+        Options(usual_circuits()),
         progress=False,
         total=len(records),
     )

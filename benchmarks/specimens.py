@@ -17,9 +17,9 @@ import etid
 from benchmarks import mutations
 from benchmarks.mutations import Rng
 from etid import cli
+from etid.identify.options import Options
 from etid.recordings.preflight import Inspected, preflight
 from etid.results.driver import Calibration, ContinuousDriver, SourceImpedance
-from etid.results.provenance import Settings
 from etid.results.study_fits import StudyFits
 from etid.results.verdicts import message, verdict, verdicts_of
 from etid.simulation.scenes import Scene, Trial
@@ -175,7 +175,7 @@ def study_fits() -> StudyFits:
         steps=jnp.array(9),
         method="maximum_likelihood",
     )
-    settings = Settings.of(etid.Study.from_recordings([]), 6, 5, "", [etid.SkinRC()])
+    settings = Options((etid.SkinRC(),)).settings(etid.Study.from_recordings([]), 6)
     return StudyFits(fits, {("calibration/0",): driver}, {("calibration/1",): "flat"}, settings)
 
 

@@ -219,7 +219,7 @@ def test_calibrations_must_be_alike(calibration):
 
 @pytest.mark.parametrize("order", [1, 0, -1])
 def test_an_order_below_two_is_refused(calibration, order):
-    with pytest.raises(ValueError, match="at least order 2"):
+    with pytest.raises(ValueError, match="must be a whole number from 2 to 20"):
         etid.identify_driver(calibration, order=order)
 
 

@@ -12,8 +12,8 @@ import etid
 from etid.estimators.lanes import PaddedSamples
 from etid.estimators.registry import OUTPUT_ERROR
 from etid.identify import batches, planning
-from etid.identify.arguments import Asked
 from etid.identify.one import skin_lane
+from etid.identify.options import Options
 from etid.numpy_tier.tiers import program
 from etid.recordings.preflight import Inspected
 from etid.simulation.scenes import Scene, Trial
@@ -88,7 +88,7 @@ def test_many_short_recordings_are_read_at_once_and_few_long_ones(
         monkeypatch.setattr(planning, name, value)
     rows = iter(range(MANY))
     found = [
-        list(planning.planned(lambda row: (records[row], driver), rows, Asked()))
+        list(planning.planned(lambda row: (records[row], driver), rows, Options()))
         for _ in planning.calls(MANY)
     ]
     assert [len(part) for part in found if part] == taken

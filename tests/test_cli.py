@@ -50,6 +50,18 @@ def study_file(tmp_path):
     return path
 
 
+@pytest.fixture(scope="session")
+def without_driver(tmp_path_factory):
+    """A file of 23 recordings whose calibration is flat."""
+    recordings = [
+        one.replace(v_out=np.zeros_like(one.v_out)) if one.r_load else one
+        for one in etid.scenes.paper_built(bits=None).simulate(seed=0).recordings()
+    ]
+    path = tmp_path_factory.mktemp("without_driver") / "study.h5"
+    etid.Study.from_recordings(recordings).write(path)
+    return path
+
+
 def test_simulate_writes_a_study_and_its_truth_and_the_seed_decides(run, tmp_path):
     files = [tmp_path / name for name in ("a.h5", "b.h5", "c.h5")]
     for file, seed in zip(files, (1, 1, 2), strict=True):
@@ -212,18 +224,16 @@ def test_fit_passes_method_and_order_on(run, study_file, tmp_path):
     assert etid.Fits.read(target).fit.method == "equation_error"
 
 
-def test_fit_without_any_success_says_so_and_lists_twenty_at_most(run, tmp_path):
-    study = etid.scenes.paper_built().simulate(seed=0)
-    file, target = tmp_path / "study.h5", tmp_path / "fits.h5"
-    study.write(file)
-    status, printed, _ = run("fit", file, "-o", target, "--order", 1)  # no driver has order 1
+def test_fit_without_any_success_says_so_and_lists_twenty_at_most(run, without_driver, tmp_path):
+    target = tmp_path / "fits.h5"
+    status, printed, _ = run("fit", without_driver, "-o", target)
     assert status == WRONG_DATA
     assert printed[0] == "23 recordings by maximum_likelihood: 23 driver_failed"
-    assert printed[1].startswith("driver calibration/98k8: order is 1")
+    assert printed[1].startswith("driver calibration/98k8: calibration 'calibration/98k8': flat.")
     assert sum(line.startswith("  built/") for line in printed) == 20
     explained = [line for line in printed if line.startswith("driver_failed. ")]
     assert len(explained) == 1  # not once for each recording
-    assert "order is 1" in explained[0]
+    assert "'calibration/98k8': flat." in explained[0]
     assert printed[-1].startswith("and 3 more")
     assert len(etid.Fits.read(target)) == 23
 
@@ -333,16 +343,17 @@ def test_json_of_fit_has_what_the_text_has(run, study_file, tmp_path):
     assert failed["note"]
 
 
-def test_json_of_a_fit_without_success_has_null_for_what_is_no_number(run, tmp_path):
-    study, target = tmp_path / "study.h5", tmp_path / "fits.h5"
-    etid.scenes.paper_built().simulate(seed=0).write(study)
-    status, printed, _ = run("fit", study, "-o", target, "--order", 1, "--json")
+def test_json_of_a_fit_without_success_has_null_for_what_is_no_number(
+    run, without_driver, tmp_path
+):
+    target = tmp_path / "fits.h5"
+    status, printed, _ = run("fit", without_driver, "-o", target, "--json")
     data = as_json(printed)
     assert status == data["status"] == WRONG_DATA
     assert data["verdicts"] == {"driver_failed": 23}
     assert len(data["unsuccessful"]) == 23
     assert data["groups"][0]["r_s"] is None
-    assert data["drivers"][0]["error"].startswith("order is 1")
+    assert data["drivers"][0]["error"].startswith("calibration 'calibration/98k8': flat.")
 
 
 def test_json_of_check_has_a_place_for_every_problem(run, study_file):
@@ -455,6 +466,8 @@ def test_every_command_says_what_its_module_does():
      ("fit", "a.h5", "-o", "b.h5", "--workers", "0"),
      ("fit", "a.h5", "-o", "b.h5", "--workers", "-1"),
      ("fit", "a.h5", "-o", "b.h5", "--order", "50"),
+     ("fit", "a.h5", "-o", "b.h5", "--order", "1"),
+     ("fit", "a.h5", "-o", "b.h5", "--plausible", "300"),
      ("fit", "a.h5", "-o", "b.h5", "--order", "many"),
      ("fit", "--json")],
 )  # fmt: skip
@@ -464,15 +477,13 @@ def test_wrong_usage_ends_with_2(run, arguments):
     assert complaints
 
 
-def test_the_program_starts_in_float64_and_knows_its_version(tmp_path):
+def test_the_program_starts_in_float64_and_knows_its_version(without_driver, tmp_path):
     """In a process of its own: this one has float64 switched on already."""
     command = [sys.executable, "-m", "etid"]
     version = subprocess.run([*command, "--version"], capture_output=True, text=True, check=True)
     told = f"etid {etid.__version__}, JAX {jax.__version__}, NumPy {np.__version__}, Python 3."
     assert version.stdout.startswith(told)
-    study, fits = tmp_path / "study.h5", tmp_path / "fits.h5"
-    etid.scenes.paper_built().simulate(seed=0).write(study)
-    arguments = [*command, "fit", study, "-o", fits, "--order", "1"]
+    arguments = [*command, "fit", without_driver, "-o", tmp_path / "fits.h5"]
     environment = {**os.environ, "XDG_CACHE_HOME": str(tmp_path / "cache")}
     environment.pop("JAX_COMPILATION_CACHE_DIR", None)
     ended = subprocess.run(arguments, capture_output=True, text=True, check=False, env=environment)

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import etid
-from etid.identify import arguments
+from etid.identify.options import for_calibrations
 from etid.recordings.preflight import Inspected
 from etid.signals.aliases import aliases
 from etid.signals.harmonics import ALIASED
@@ -172,7 +172,7 @@ def test_noise_above_the_aliases_needs_no_filter():
     of = {"seed": 3, "rate": 500e3, "pulses": 50.0, "filtered": False}
     noisy, quiet = (Inspected(Bench(snr_db=snr, **of).calibration()) for snr in (40.0, 80.0))
     assert not noisy.is_aliased
-    assert str(arguments.for_calibrations(None, [noisy])) == "maximum_likelihood"
+    assert str(for_calibrations(None, [noisy])) == "maximum_likelihood"
     assert quiet.is_aliased
 
 

@@ -13,7 +13,7 @@ from etid.circuits.circuit import Resistor
 from etid.estimators import registry
 from etid.estimators.estimator import AbstractEstimator, Description
 from etid.estimators.lanes import AlignedSamples, Harmonics
-from etid.identify import arguments
+from etid.identify.options import Options
 from etid.report.methods import methods_section
 from etid.results.driver import DiscreteDriver, Driver
 from etid.results.fit import Fit
@@ -149,7 +149,7 @@ def test_a_driver_on_harmonics_is_compiled_once_for_records_of_all_lengths():
 
 
 def test_the_instance_of_a_name_is_the_same_method(study):
-    assert arguments.estimator_of("equation_error") == etid.EquationError()
+    assert Options.of(method="equation_error").estimator == etid.EquationError()
     driver = etid.identify_driver(study["calibration/0"], method=etid.EquationError(), throw=False)
     assert driver.method == "equation_error"
     records = [study[path] for path in study.loaded]
@@ -182,7 +182,7 @@ def test_what_no_module_has_registered_is_not_described(study):
 )
 def test_what_is_no_estimator_is_refused(method, says):
     with pytest.raises(ValueError, match=re.escape(says)):
-        arguments.estimator_of(method)
+        Options.of(method=method)
 
 
 def test_two_estimators_of_one_name_are_refused():

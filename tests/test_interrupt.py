@@ -22,7 +22,7 @@ def wait(*_):
     print("waiting", flush=True)
     time.sleep(600)
 
-def fit(opened, circuit, method, size, number):
+def fit(opened, options, size, number):
     return study_fits() if number == 0 else wait()
 """
 FIT = f"""{WAITS}

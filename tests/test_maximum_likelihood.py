@@ -19,8 +19,9 @@ from etid.estimators.maximum_likelihood.calibrations import Calibrations
 from etid.estimators.maximum_likelihood.load import Load
 from etid.estimators.maximum_likelihood.profile import Records
 from etid.estimators.registry import MAXIMUM_LIKELIHOOD
-from etid.identify import arguments, batches, one
+from etid.identify import batches, one
 from etid.identify.one import known_at, known_of, skin_lane
+from etid.identify.options import Options, plan
 from etid.recordings.preflight import Inspected
 from etid.signals.harmonics import Spectrum
 from etid.simulation.scenes import Scene, Trial
@@ -190,7 +191,7 @@ def short(study):
 def test_a_record_without_a_whole_period_is_told_so_or_goes_to_output_error(short, driver):
     with pytest.raises(etid.IdentificationError, match="not_periodic"):
         etid.identify_skin(short, driver, method="maximum_likelihood")
-    assert arguments.plan(arguments.Asked(), Inspected(short), driver) == (
+    assert plan(Options(), Inspected(short), driver) == (
         registry.OUTPUT_ERROR,
         None,
     )

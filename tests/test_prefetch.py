@@ -6,7 +6,8 @@ import pytest
 
 import etid
 from etid.identify import study_drivers
-from etid.identify.prefetch import prefetch
+from etid.identify.batches import prefetch
+from etid.identify.options import Options
 from etid.simulation.scenes import Scene, Trial
 from etid.simulation.transformer import ResistorLoad, SkinLoad
 
@@ -78,14 +79,14 @@ def test_a_driver_is_identified_once_by_threads_that_ask_together(monkeypatch):
     study = scene.simulate(seed=1)
     together, calls = threading.Barrier(2), []
 
-    def slow(records, **_):
+    def slow(records, *_, **__):
         calls.append(records)
         with pytest.raises(threading.BrokenBarrierError):
             together.wait(0.2)  # the other must not come here
         raise etid.IdentificationError("no driver", None)
 
-    monkeypatch.setattr(study_drivers, "identify_driver", slow)
-    drivers = study_drivers.Drivers(study, 5, None)
+    monkeypatch.setattr(study_drivers, "calibrated", slow)
+    drivers = study_drivers.Drivers(study, Options())
     refused = []
 
     def ask():

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import etid
-from etid.identify.unfitted import explained
+from etid.identify.planning import explained
 from etid.recordings.causes import why_misaligned
 from etid.recordings.preflight import SHORTEST, Inspected
 from etid.recordings.preflight import preflight as of_inspected

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import etid
-from etid.identify.unfitted import explained
+from etid.identify.planning import explained
 from etid.recordings.preflight import Inspected, preflight
 from etid.recordings.remarks import Remark
 from etid.signals.pulse_train import find_pulses

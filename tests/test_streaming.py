@@ -102,11 +102,11 @@ def test_an_interrupted_run_goes_on_where_it_was(source, whole, tmp_path, monkey
     target = tmp_path / "fits.h5"
     fitted, real = [], streaming.identify_part
 
-    def interrupted(study, paths, *rest):
+    def interrupted(drivers, paths, *rest):
         fitted.append(paths[0])
         if len(fitted) in (2, 4, 5):
             raise KeyboardInterrupt
-        return real(study, paths, *rest)
+        return real(drivers, paths, *rest)
 
     monkeypatch.setattr(streaming, "identify_part", interrupted)
     for attempt in range(3):

@@ -20,6 +20,7 @@ import etid
 from etid import cli
 from etid.estimators import registry
 from etid.files import exporting
+from etid.identify.options import Options
 from etid.report import figures, methods, tables, worst_fits
 from etid.report import methods as methods_section
 from etid.report.html import Table
@@ -30,7 +31,6 @@ from etid.results.driver import (
     DiscreteDriver,
     SourceImpedance,
 )
-from etid.results.provenance import Settings
 from etid.results.study_fits import StudyFits
 from etid.results.verdicts import message, verdict, verdicts_of
 from etid.selection.driver_order import TriedOrder, evidence
@@ -104,7 +104,7 @@ def found(study_file, driver):
         condition=np.array([r"dry & $\hot$"] * 6),
     )
     with etid.read(study_file) as study:
-        settings = Settings.of(study, 6, 5, "", [etid.SkinRC()])
+        settings = Options((etid.SkinRC(),)).settings(study, 6)
     drivers = {("calibration/0",): driver}
     return StudyFits(fits, drivers, {("calibration/1",): "r_load <b>is</b> missing"}, settings)
 
@@ -469,7 +469,7 @@ TWO = "maximum_likelihood + output_error"
 
 def test_methods_say_that_the_calibrations_chose_the_order(found, study_file):
     with etid.read(study_file) as study:
-        settings = Settings.of(study, 6, "auto", "", [etid.SkinRC()])
+        settings = Options((etid.SkinRC(),), order="auto").settings(study, 6)
     section = methods_section.methods_section(dataclasses.replace(found, settings=settings))
     assert "rational function of order 3, " in section.text
     assert "Schwarz's criterion (1978)" in section.text

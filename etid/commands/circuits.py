@@ -7,7 +7,7 @@ from collections.abc import Callable
 
 from etid.circuits import lookup
 from etid.circuits.circuit import AbstractCircuit
-from etid.identify.arguments import Circuit
+from etid.identify.options import Circuit
 from etid.results.tried_orders import AUTO
 
 

@@ -15,13 +15,14 @@ from etid.circuits.display import DISPLAY, heading, several
 from etid.commands import DONE, WRONG_DATA, Outcome
 from etid.commands.circuits import add_circuit
 from etid.estimators import registry
-from etid.identify.arguments import order_of
 from etid.identify.file import fit_file, kept, processes
 from etid.identify.jointly import identify_jointly
+from etid.identify.options import order_of
 from etid.recordings import hdf5
 from etid.recordings.errors import RecordingError
 from etid.recordings.replacing import HDF5, claimed
 from etid.report.html import Table
+from etid.results.provenance import PLAUSIBLE
 from etid.results.study_fits import StudyFits
 from etid.results.tried_orders import Order
 from etid.results.verdicts import message, own_part
@@ -79,9 +80,24 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="possible relative change of Z_th since its calibration, such as 0.01; default 0",
     )
     parser.add_argument(
+        "--plausible",
+        type=_plausible,
+        default=PLAUSIBLE,
+        metavar="LOWEST:HIGHEST",
+        help="range of |Z_th| at 1 kHz [ohm] that is accepted; default 300:300e3",
+    )
+    parser.add_argument(
         "--joint",
         action="store_true",
         help="fit each driver together with its recordings, by maximum likelihood",
+    )
+    parser.add_argument(
+        "--r-load-tolerance",
+        type=float,
+        default=0.0,
+        metavar="PART",
+        help="relative standard deviation of the known resistors, such as 0.001, for --joint; "
+        "default 0",
     )
     parser.add_argument("--resume", action="store_true", help="continue a run that was killed")
     where = parser.add_mutually_exclusive_group()
@@ -129,6 +145,17 @@ def _bound(text: str) -> tuple[str, list[float | None]]:
     return name, [low, high]
 
 
+def _plausible(text: str) -> tuple[float, float]:
+    """The value of --plausible; the function that gets it checks the range."""
+    try:
+        low, high = map(float, text.split(":"))
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(
+            f"{text!r} is no range of impedances; write --plausible 300:300e3"
+        ) from error
+    return low, high
+
+
 def _several(option: str, known: list[tuple[str, list[Any]]], count: int) -> dict[str, Any]:
     """The known elements of an option by name; each has one number, or value and error."""
     for name, numbers in known:
@@ -159,9 +186,18 @@ def run(arguments: argparse.Namespace) -> Outcome:
         raise ValueError(f"--joint uses maximum_likelihood; remove --method {arguments.method}")
     if arguments.joint and arguments.driver_drift:
         raise ValueError("--joint identifies the driver itself; remove --driver-drift")
-    fixed, prior = _several("--fix", arguments.fix, 1), _several("--prior", arguments.prior, 2)
-    bounds = _several("--bound", arguments.bound, 2)
-    circuit = None if arguments.circuit is None else arguments.circuit()
+    if arguments.r_load_tolerance and not arguments.joint:
+        raise ValueError(
+            "--r-load-tolerance enters the standard errors of joint fits; add --joint, or remove it"
+        )
+    options = {
+        "order": arguments.order,
+        "circuit": None if arguments.circuit is None else arguments.circuit(),
+        "fixed": _several("--fix", arguments.fix, 1),
+        "prior": _several("--prior", arguments.prior, 2),
+        "bounds": _several("--bound", arguments.bound, 2),
+        "plausible": arguments.plausible,
+    }
     progress = sys.stderr.isatty()
     if arguments.joint:
         if arguments.resume or arguments.workers or arguments.dask:
@@ -169,11 +205,8 @@ def run(arguments: argparse.Namespace) -> Outcome:
         with hdf5.read(arguments.source) as study, claimed(arguments.target):
             outcome = identify_jointly(
                 study,
-                order=arguments.order,
-                circuit=circuit,
-                fixed=fixed,
-                prior=prior,
-                bounds=bounds,
+                **options,
+                r_load_tolerance=arguments.r_load_tolerance,
                 progress=progress,
             )
             outcome.write(arguments.target)
@@ -186,12 +219,8 @@ def run(arguments: argparse.Namespace) -> Outcome:
             outcome = fit_file(
                 arguments.source,
                 arguments.target,
-                order=arguments.order,
-                circuit=circuit,
+                **options,
                 method=arguments.method,
-                fixed=fixed,
-                prior=prior,
-                bounds=bounds,
                 driver_drift=arguments.driver_drift,
                 resume=arguments.resume,
                 executor=executor,

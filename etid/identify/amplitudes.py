@@ -22,18 +22,11 @@ from etid.estimators.lanes import Harmonics, stacked
 from etid.estimators.maximum_likelihood.estimator import description
 from etid.estimators.maximum_likelihood.given_driver import AbstractGiven
 from etid.estimators.registry import MAXIMUM_LIKELIHOOD, register_description
-from etid.identify.arguments import (
-    Interval,
-    asked_of,
-    check_distinct,
-    circuit_of,
-    driver_of,
-    fed,
-    plan,
-)
+from etid.identify.arguments import check_distinct, circuit_of, driver_of, fed
 from etid.identify.arguments import recordings as list_of
 from etid.identify.one import known_of, remarks_on, successful
-from etid.identify.unfitted import failed_fit
+from etid.identify.options import Interval, Options, plan
+from etid.identify.planning import failed_fit
 from etid.numpy_tier.tiers import program
 from etid.precision import in_float64
 from etid.recordings.preflight import Inspected
@@ -91,7 +84,7 @@ def identify_amplitudes(
     recordings: Iterable[Recording],
     driver: Driver | None = None,
     *,
-    circuit: AbstractCircuit | None = None,
+    circuit: AbstractCircuit | str | None = None,
     fixed: Mapping[str, float] | None = None,
     prior: Mapping[str, tuple[float, float]] | None = None,
     bounds: Mapping[str, Interval] | None = None,
@@ -131,10 +124,10 @@ def identify_amplitudes(
         IdentificationError: The verdict is not successful and `throw` is set.
     """
     driver = driver_of(driver)
-    circuit = SkinCurrent() if circuit is None else circuit_of(circuit)
-    current_dependent(circuit.impedance())
-    asked = asked_of(MAXIMUM_LIKELIHOOD, [circuit], fixed, prior, bounds)
-    of_elements = ElementPrior.of(asked.known, circuit) if asked.known else None
+    load = SkinCurrent() if circuit is None else circuit_of(circuit)
+    current_dependent(load.impedance())
+    options = Options.of([load], method=MAXIMUM_LIKELIHOOD, fixed=fixed, prior=prior, bounds=bounds)
+    of_elements = ElementPrior.of(options.known, load) if options.known else None
     feed = (
         MEASURED_CURRENT
         if driver is None
@@ -145,13 +138,13 @@ def identify_amplitudes(
     check_distinct("recordings", of)
     seen = [Inspected(one) for one in fed_by]
     for one in seen:
-        _, name = plan(asked, one, feed)
+        _, name = plan(options, one, feed)
         if name is not None:
-            fit = failed_fit(name, circuit, METHOD, asked.bounds)
+            fit = failed_fit(name, options, METHOD)
             return successful(one.recording, fit) if throw else fit
     lanes = [Harmonics.of(one) for one in seen]
     known = known_of(lanes[0], feed, False, MAXIMUM_LIKELIHOOD)
-    fit = jax.device_get(_fit(stacked(lanes), known, feed, circuit, of_elements, asked.bounds))
+    fit = jax.device_get(_fit(stacked(lanes), known, feed, load, of_elements, options.bounds))
     of_records = functools.reduce(
         operator.or_, (remarks_on(one, MAXIMUM_LIKELIHOOD) for one in seen)
     )

@@ -7,13 +7,15 @@ reads the next recordings in chunks. A bad recording gets a verdict and a note; 
 are not affected.
 """
 
+import collections
 import contextlib
 import dataclasses
 import functools
 import itertools
 import math
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -25,7 +27,6 @@ from etid.circuits.circuit import AbstractCircuit
 from etid.estimators.estimator import AbstractEstimator
 from etid.estimators.lanes import AbstractLane, stacked, taken, unstacked
 from etid.estimators.registry import MAXIMUM_LIKELIHOOD
-from etid.identify.arguments import Asked, check_default
 from etid.identify.one import (
     Tried,
     is_shared,
@@ -37,9 +38,15 @@ from etid.identify.one import (
     skin,
     skin_lane,
 )
-from etid.identify.planning import FEWEST, Planned, Refusal, calls, planned
-from etid.identify.prefetch import prefetch
-from etid.identify.unfitted import failed_fit
+from etid.identify.options import Options, check_default
+from etid.identify.planning import (
+    FEWEST,
+    Planned,
+    Refusal,
+    calls,
+    failed_fit,
+    planned,
+)
 from etid.numpy_tier.tiers import program, worth_compiling
 from etid.precision import in_float64
 from etid.recordings.preflight import Inspected
@@ -53,6 +60,7 @@ from etid.selection.selection import Selection
 LANES = 64  # lanes of one call; the last call is padded
 HELD = 2**21  # samples of waiting recordings; above, a call has fewer lanes, but at least `FEWEST`
 AHEAD = 2  # chunks that are read and inspected in advance
+T = TypeVar("T")
 
 
 @functools.partial(program, batch=True)
@@ -189,6 +197,34 @@ class _Queue:
         return taken(fits, np.arange(len(lanes)))  # without the padding
 
 
+def prefetch(
+    load: Callable[[int], T], count: int, ahead: int
+) -> Generator[Callable[[], T], None, None]:
+    """Call `load(0)`, `load(1)`, … in another thread, in this order and one at a time.
+
+    Close the iterator to stop early: the running call finishes, the others do not start.
+
+    Args:
+        load: A function that spends its time outside Python, in file access or numpy.
+        count: Number of calls.
+        ahead: Largest number of calls in advance of the caller.
+
+    Yields:
+        For each call a function that waits for the result and returns it, or raises its error.
+    """
+    with ThreadPoolExecutor(1, thread_name_prefix="prefetch") as thread:
+        waiting = collections.deque(thread.submit(load, row) for row in range(min(ahead, count)))
+        try:
+            for row in range(count):
+                loaded = waiting.popleft()
+                if row + ahead < count:
+                    waiting.append(thread.submit(load, row + ahead))
+                yield loaded.result
+        finally:
+            for future in waiting:
+                future.cancel()
+
+
 class _Part(NamedTuple):
     """Fits of some recordings, and why they were refused if they were."""
 
@@ -200,19 +236,18 @@ class _Part(NamedTuple):
 def _parts(
     count: int,
     load: Callable[[int], tuple[Recording, AbstractFeed]],
-    candidates: Sequence[AbstractCircuit],
-    asked: Asked,
+    options: Options,
     progress: bool,
     total: int,
 ) -> Iterator[_Part]:
     """Fits of all recordings, in parts; arguments as in `choices`."""
-    otherwise = str(asked.estimator or MAXIMUM_LIKELIHOOD)
+    otherwise = str(options.estimator or MAXIMUM_LIKELIHOOD)
     queues: dict[tuple, _Queue] = {}
     rows = iter(range(count))
 
     @in_float64  # the setting belongs to a thread, and this runs in another one
     def read(_: int) -> list[tuple[int, _Prepared | Refusal]]:
-        return _prepared(planned(load, rows, asked), candidates)
+        return _prepared(planned(load, rows, options), options.circuits)
 
     with (
         tqdm(total=count, unit="fit", disable=not progress) as bar,
@@ -220,7 +255,7 @@ def _parts(
     ):
         for row, prepared in itertools.chain.from_iterable(chunk() for chunk in recordings):
             if isinstance(prepared, Refusal):
-                fit = failed_fit(prepared.name, candidates[0], otherwise, asked.bounds)
+                fit = failed_fit(prepared.name, options, otherwise)
                 yield _Part([row], Tried(stacked([fit])), prepared.note)
                 bar.update()
                 continue
@@ -228,7 +263,7 @@ def _parts(
             if key not in queues:
                 _, driver, estimator = prepared.planned
                 known = known_of(prepared.lane, driver, prepared.shared, estimator)
-                queues[key] = _Queue(driver, known, candidates, estimator, total)
+                queues[key] = _Queue(driver, known, options.circuits, estimator, total)
             queue = queues[key]
             queue.add(row, prepared.lane, prepared.planned.seen)
             if queue.full:
@@ -243,8 +278,7 @@ def _parts(
 def choices(
     count: int,
     load: Callable[[int], tuple[Recording, AbstractFeed]],
-    candidates: Sequence[AbstractCircuit],
-    asked: Asked,
+    options: Options,
     progress: bool,
     total: int,
 ) -> tuple[list[Selection], list[str]]:
@@ -253,16 +287,17 @@ def choices(
     Args:
         count: Number of recordings.
         load: Recording and driver of a row. Its error becomes the verdict of this row.
-        candidates: Circuits to choose from.
-        asked: The requested estimator.
+        options: What the caller asks for.
         progress: Show a progress bar.
         total: Number of recordings that are fitted in this way, here and in other calls.
     """
     found: dict[int, Selection] = {}
     notes = [""] * count
-    for part in _parts(count, load, candidates, asked, progress, total):
+    for part in _parts(count, load, options, progress, total):
         for number, row in enumerate(part.rows):
-            found[row] = Selection.of(part.found[number], part.found.chosen(number), candidates)
+            found[row] = Selection.of(
+                part.found[number], part.found.chosen(number), options.circuits
+            )
             notes[row] = part.note or note(found[row].fit)
     return [found[row] for row in range(count)], notes
 
@@ -270,13 +305,12 @@ def choices(
 def _fits(
     count: int,
     load: Callable[[int], tuple[Recording, AbstractFeed]],
-    circuit: AbstractCircuit,
-    asked: Asked,
+    options: Options,
     progress: bool,
     total: int,
 ) -> tuple[Fit, list[str]]:
-    """The fit of one circuit to each recording, stacked, and notes; arguments as in `choices`."""
-    parts = list(_parts(count, load, [circuit], asked, progress, total))
+    """The fit of the only circuit to each recording, stacked, and notes; see `choices`."""
+    parts = list(_parts(count, load, options, progress, total))
     of_parts = [[part.note] if part.note else notes_of(part.found.only) for part in parts]
     order = np.argsort([row for part in parts for row in part.rows])
     fits = taken(concatenated([part.found.only for part in parts]), order)
@@ -287,35 +321,33 @@ def _fits(
 def of_one_circuit(
     count: int,
     load: Callable[[int], tuple[Recording, AbstractFeed]],
-    candidates: Sequence[AbstractCircuit],
-    asked: Asked,
+    options: Options,
     progress: bool,
     total: int,
-    fixed: int | None = None,
+    chosen: int | None = None,
 ) -> tuple[Fit, list[str]]:
     """Fits, stacked, and notes of recordings, all with the same circuit.
 
     Args:
         count: Number of recordings.
         load: Recording and driver of a row.
-        candidates: Circuits to choose from, by joint evidence.
-        asked: What the caller asks for.
+        options: What the caller asks for; joint evidence chooses the circuit.
         progress: Show a progress bar.
         total: As in `choices`.
-        fixed: Number of the circuit, if it is chosen already. The other candidates then serve to
+        chosen: Number of the circuit, if it is chosen already. The other circuits then serve to
             find the recordings that deserve another circuit.
     """
-    if len(candidates) == 1:
-        return _fits(count, load, candidates[0], asked, progress, total)
-    found, notes = choices(count, load, candidates, asked, progress, total)
-    chosen = common(found, candidates) if fixed is None else fixed
+    circuits = options.circuits
+    if len(circuits) == 1:
+        return _fits(count, load, options, progress, total)
+    found, notes = choices(count, load, options, progress, total)
+    chosen = common(found, circuits) if chosen is None else chosen
     others = [row for row, one in enumerate(found) if one.chosen != chosen]
     if others:
-        again, texts = _fits(
-            len(others), lambda i: load(others[i]), candidates[chosen], asked, False, total
-        )
+        single = dataclasses.replace(options, circuits=(circuits[chosen],))
+        again, texts = _fits(len(others), lambda i: load(others[i]), single, False, total)
         for row, one, text in zip(others, unstacked(again), texts, strict=True):
-            found[row], notes[row] = _otherwise(found[row], one, text, chosen, candidates)
+            found[row], notes[row] = _otherwise(found[row], one, text, chosen, circuits)
     return concatenated([stacked([one.fit]) for one in found]), notes
 
 

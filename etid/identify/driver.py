@@ -14,16 +14,10 @@ from etid.estimators.lanes import AlignedSamples, Harmonics, stacked
 from etid.estimators.registry import Method
 from etid.estimators.score_tests import resistors
 from etid.identify import changes
-from etid.identify.arguments import (
-    check_distinct,
-    drift_of,
-    estimator_of,
-    for_calibrations,
-    order_of,
-    recordings,
-)
+from etid.identify.arguments import check_distinct, recordings
 from etid.identify.one import checksum, needs_another, of_both
-from etid.identify.unfitted import explained
+from etid.identify.options import Options, check_order, for_calibrations
+from etid.identify.planning import explained
 from etid.numpy_tier.tiers import program
 from etid.precision import in_float64
 from etid.recordings.preflight import Inspected, preflight
@@ -31,13 +25,11 @@ from etid.recordings.recording import Recording
 from etid.recordings.repeats import repeats
 from etid.results.driver import ContinuousDriver, Driver, HarmonicDriver
 from etid.results.fit import IdentificationError
+from etid.results.provenance import PLAUSIBLE
 from etid.results.tried_orders import AUTO, Order
 from etid.results.verdicts import message, verdict
 from etid.selection.driver_order import TriedOrder, best, evidence, next_order
 from etid.signals import mains
-
-# |Z_th| [Ω] at 1 kHz: from the transformer of a microphone to the transformer of a tube.
-PLAUSIBLE = (300.0, 300e3)
 
 
 @in_float64
@@ -78,8 +70,15 @@ def identify_driver(
             likelihood that could choose the order.
         IdentificationError: The verdict is not successful and `throw` is set.
     """
-    asked = estimator_of(method)
-    order = order_of(order)
+    options = Options.of(order=order, method=method, plausible=plausible, driver_drift=driver_drift)
+    return calibrated(calibrations, options, throw)
+
+
+def calibrated(
+    calibrations: Recording | Sequence[Recording], options: Options, throw: bool
+) -> Driver:
+    """`identify_driver` with options that are checked."""
+    asked = options.estimator
     single = isinstance(calibrations, Recording)
     records = recordings("calibrations", [calibrations] if single else calibrations)
     if not records:
@@ -94,9 +93,6 @@ def identify_driver(
                 "The calibrations of a study are study.calibrations"
             )
         resistances.append(record.r_load)
-    drift = drift_of(driver_drift, asked)
-    if order != AUTO and order < 2:
-        raise ValueError(f"order is {order}; a source impedance needs at least order 2")
     sizes = {(record.v_th.size, record.sample_rate, record.pulse_rate) for record in records}
     if len(sizes) > 1:
         raise ValueError(
@@ -117,17 +113,18 @@ def identify_driver(
     estimator = for_calibrations(asked, seen)
     for one in seen:
         _refused(one, "biased" if estimator.lane.periodic and one.is_aliased else None)
-    if order == AUTO:
+    check_order(options.order, estimator)
+    if options.order == AUTO:
         driver = _of_least_order(seen, estimator)
     else:
-        driver = _driver(seen, order, estimator)
+        driver = _driver(seen, options.order, estimator)
     remarks = functools.reduce(operator.or_, (one.remarks for one in seen))
     driver = dataclasses.replace(driver, remarks=np.asarray(int(remarks) | int(driver.remarks)))
     if isinstance(driver, HarmonicDriver):
         unloaded = np.array([checksum(one) for one in seen])
         driver = dataclasses.replace(driver, unloaded=unloaded)
-    if drift and isinstance(driver, ContinuousDriver):
-        driver = dataclasses.replace(driver, drift=np.asarray(drift, float))
+    if options.driver_drift and isinstance(driver, ContinuousDriver):
+        driver = dataclasses.replace(driver, drift=np.asarray(options.driver_drift))
     periods = repeats(seen)
     at = np.append(changes.bands(periods), 1e3)
     *z_th, at_1_khz = np.asarray(_response(driver, jax.device_put(at)))
@@ -135,7 +132,7 @@ def identify_driver(
         driver, np.asarray(resistances), periods, np.array(z_th, complex)
     )
     size = abs(at_1_khz)
-    if np.isfinite(size) and not plausible[0] <= size <= plausible[1]:
+    if np.isfinite(size) and not options.plausible[0] <= size <= options.plausible[1]:
         driver = dataclasses.replace(driver, result=verdict("implausible"))
     if throw and driver.verdict != "successful":
         found = f"{driver.verdict}, |Z_th| is {size:.3g} ohm at 1 kHz"
@@ -151,16 +148,7 @@ def _refused(seen: Inspected, name: str | None) -> None:
 
 
 def _of_least_order(seen: Sequence[Inspected], estimator: AbstractEstimator) -> Driver:
-    """The driver of the least order that the calibrations support.
-
-    Raises:
-        ValueError: The estimator does not keep the harmonics of the calibrations.
-    """
-    if not issubclass(estimator.driver, HarmonicDriver):
-        raise ValueError(
-            f'order="auto" needs maximum likelihood, but the method is {str(estimator)!r}; give a '
-            "number of poles, as in order=5, or record several whole pulse periods"
-        )
+    """The driver of the least order that the calibrations support."""
     drivers: dict[int, HarmonicDriver] = {}
     tried: list[TriedOrder] = []
     while (order := next_order(tried)) is not None:

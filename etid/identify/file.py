@@ -28,18 +28,16 @@ from typing import Any, NamedTuple
 import equinox as eqx
 from tqdm import tqdm
 
-from etid.circuits.circuit import AbstractCircuit
 from etid.circuits.lookup import class_path
 from etid.estimators.registry import Method
-from etid.identify.arguments import Asked, Circuit, Interval, asked_of, candidates_of, order_of
 from etid.identify.many import common_first, identify_part, to_identify
+from etid.identify.options import Circuit, Interval, Options, candidates_of
 from etid.identify.study_drivers import Drivers
 from etid.precision import in_float64
 from etid.recordings.hdf5 import read
 from etid.recordings.recording import RecordingError
 from etid.recordings.replacing import claimed, replace_text
-from etid.recordings.study import Study
-from etid.results.provenance import Settings
+from etid.results.provenance import PLAUSIBLE
 from etid.results.study_fits import StudyFits
 from etid.results.tried_orders import Order
 
@@ -54,65 +52,47 @@ class _Opened(NamedTuple):
     """A file in use.
 
     Attributes:
-        study: The recordings of the file.
+        drivers: The study of the file, and its drivers that were needed so far.
         paths: Paths of the recordings to identify, in order.
-        drivers: The drivers that were needed so far.
     """
 
-    study: Study
-    paths: list[str]
     drivers: Drivers
+    paths: list[str]
 
 
-def _open(source: str, order: Order, asked: Asked, driver_drift: float) -> _Opened:
+def _open(source: str, options: Options) -> _Opened:
     study = read(source)
-    return _Opened(study, to_identify(study), Drivers(study, order, asked.estimator, driver_drift))
+    return _Opened(Drivers(study, options), to_identify(study))
 
 
 @functools.cache
-def _kept_open(source: str, stamp: int, order: Order, asked: Asked, driver_drift: float) -> _Opened:
+def _kept_open(source: str, stamp: int, options: Options) -> _Opened:
     """`_open`, kept for the lifetime of the process: a worker gets its parts one by one."""
     del stamp
-    return _open(source, order, asked, driver_drift)
+    return _open(source, options)
 
 
-def _fit(
-    opened: _Opened,
-    candidates: Sequence[AbstractCircuit],
-    asked: Asked,
-    size: int,
-    number: int,
-) -> StudyFits:
+def _fit(opened: _Opened, options: Options, size: int, number: int) -> StudyFits:
     """The fits of one part, with the drivers of this part only.
 
     This process may have identified the drivers of other parts before.
     """
-    study, paths, drivers = opened
+    drivers, paths = opened
     part = paths[number * size : (number + 1) * size]
-    fits = identify_part(study, part, drivers, candidates, asked, len(paths))
+    fits = identify_part(drivers, part, options, len(paths))
     used = set()
     for path in part:
         with contextlib.suppress(RecordingError):
-            used.add(study.metadata(path).calibration or drivers.calibrations)
+            used.add(drivers.study.metadata(path).calibration or drivers.calibrations)
     found = {names: driver for names, driver in drivers.found.items() if names in used}
     failures = {names: text for names, text in drivers.failures.items() if names in used}
     return StudyFits(fits, found, failures)
 
 
 @in_float64
-def _fit_elsewhere(
-    source: str,
-    stamp: int,
-    order: Order,
-    asked: Asked,
-    driver_drift: float,
-    candidates: Sequence[AbstractCircuit],
-    size: int,
-    number: int,
-) -> StudyFits:
+def _fit_elsewhere(source: str, stamp: int, options: Options, size: int, number: int) -> StudyFits:
     """The fits of one part, in any process that can read the file."""
-    study = _kept_open(source, stamp, order, asked, driver_drift)
-    return _fit(study, candidates, asked, size, number)
+    return _fit(_kept_open(source, stamp, options), options, size, number)
 
 
 def _pin(cores: Any) -> None:
@@ -192,6 +172,7 @@ def fit_file(
     prior: Mapping[str, tuple[float, float]] | None = None,
     bounds: Mapping[str, Interval] | None = None,
     driver_drift: float = 0.0,
+    plausible: tuple[float, float] = PLAUSIBLE,
     resume: bool = False,
     executor: concurrent.futures.Executor | None = None,
     progress: bool = False,
@@ -208,6 +189,7 @@ def fit_file(
         prior: As in `identify_skin`, for all recordings.
         bounds: As in `identify_skin`, for all recordings.
         driver_drift: As in `identify_driver`.
+        plausible: As in `identify_driver`.
         resume: Keep the parts of an earlier run that did not finish.
         executor: Executor that fits the parts. If not given, this process fits them.
         progress: Show a progress bar.
@@ -223,46 +205,43 @@ def fit_file(
             process is writing the target.
         ValueError: The source has no loaded recording.
     """
-    order = order_of(order)
-    candidates = candidates_of(circuit)
-    asked = asked_of(method, candidates, fixed, prior, bounds)
+    options = Options.of(
+        candidates_of(circuit),
+        method=method,
+        fixed=fixed,
+        prior=prior,
+        bounds=bounds,
+        order=order,
+        driver_drift=driver_drift,
+        plausible=plausible,
+    )
     source, target = os.path.abspath(source), pathlib.Path(target)
-    opened = _open(source, order, asked, driver_drift)
-    with opened.study, claimed(target):
+    opened = _open(source, options)
+    study = opened.drivers.study
+    with study, claimed(target):
         count = len(opened.paths)
         if not count:
             raise ValueError("the study has no loaded recording")
         numbers = range((count + PART - 1) // PART)
         stamp = os.stat(source).st_mtime_ns
-        candidates = common_first(opened.study, opened.paths, opened.drivers, candidates, asked)
-        settings = Settings.of(
-            opened.study,
-            count,
-            order,
-            str(asked.estimator or ""),
-            candidates,
-            driver_drift=driver_drift,
-            known=asked.known,
-            bounds=asked.bounds,
-        )
+        options = common_first(opened.drivers, opened.paths, options)
+        settings = options.settings(study, count)
         described = json.loads(json.dumps(dataclasses.asdict(settings)))  # tuples become lists
         run = {
             **{name.replace("_", " "): value for name, value in described.items()},
             "source date": stamp,
             "circuit": hashlib.sha256(
                 " ".join(
-                    f"{class_path(type(one))} {eqx.tree_pformat(one)}" for one in candidates
+                    f"{class_path(type(one))} {eqx.tree_pformat(one)}" for one in options.circuits
                 ).encode()
             ).hexdigest(),
             "size of a part": PART,
         }
         parts = _Parts(target, run, resume)
         left = [number for number in numbers if not parts.path(number).exists()]
-        task = functools.partial(_fit, opened, candidates, asked, PART)
+        task = functools.partial(_fit, opened, options, PART)
         if executor is not None:
-            task = functools.partial(
-                _fit_elsewhere, source, stamp, order, asked, driver_drift, candidates, PART
-            )
+            task = functools.partial(_fit_elsewhere, source, stamp, options, PART)
         drivers = {}
         done = min(count, (len(numbers) - len(left)) * PART)
         with tqdm(total=count, initial=done, unit="fit", disable=not progress) as bar:
@@ -271,7 +250,7 @@ def fit_file(
                 drivers |= found.drivers
                 bar.update(len(found.fits))
         whole = StudyFits.concatenate(
-            StudyFits.read(parts.path(number), type(candidates[0])) for number in numbers
+            StudyFits.read(parts.path(number), type(options.circuit)) for number in numbers
         )
         whole.write(target)
         shutil.rmtree(parts.folder)

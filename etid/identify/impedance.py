@@ -200,7 +200,7 @@ def identify_impedance(
     impedance: npt.ArrayLike,
     *,
     stderr: float | npt.ArrayLike | None = None,
-    circuit: AbstractCircuit | None = None,
+    circuit: AbstractCircuit | str | None = None,
     throw: bool = True,
 ) -> Fit:
     """Identify a circuit from its impedance.
@@ -212,7 +212,8 @@ def identify_impedance(
             each frequency. If not given, the noise is taken to be a part of |Z|, which the residual
             shows. χ² is then NaN. A residual that is not noise is a `misfit` where it exceeds 1 %
             of |Z|, and else widens the standard errors, with the remark `not_noise`.
-        circuit: Structure of the circuit; `SkinRC` if not given. Its values matter little.
+        circuit: Structure of the circuit, or a circuit string; `SkinRC` if not given. Its values
+            matter little.
         throw: Raise an error if the verdict is not successful.
 
     Returns:
@@ -223,15 +224,15 @@ def identify_impedance(
             or a number is not finite or not positive where it must be.
         IdentificationError: The verdict is not successful and `throw` is set.
     """
-    circuit = circuit_of(circuit)
+    structure = circuit_of(circuit)
     f, z = np.asarray(frequency, float), np.asarray(impedance, complex)
     sigma = None if stderr is None else np.broadcast_to(np.asarray(stderr, float), f.shape)
     if f.ndim != 1 or z.shape != f.shape:
         raise ValueError(
             f"frequency has shape {f.shape} and impedance {z.shape}; both must be (n,)"
         )
-    if 2 * f.size <= len(circuit.names()):
-        raise ValueError(f"{f.size} impedances cannot determine {len(circuit.names())} elements")
+    if 2 * f.size <= len(structure.names()):
+        raise ValueError(f"{f.size} impedances cannot determine {len(structure.names())} elements")
     for name, values in {"frequency": f, "stderr": sigma}.items():
         if values is not None and not (np.isfinite(values).all() and (values > 0).all()):
             raise ValueError(f"{name} must be finite and > 0 everywhere")
@@ -241,10 +242,12 @@ def identify_impedance(
         raise ValueError("impedance is 0 somewhere; leave it out, or give stderr")
     rising = np.argsort(f, kind="stable")  # neighbours are compared
     noise = (
-        _passive_fit(f[rising], z[rising], len(circuit.names())) if sigma is None else sigma[rising]
+        _passive_fit(f[rising], z[rising], len(structure.names()))
+        if sigma is None
+        else sigma[rising]
     )
     put = jax.device_put
-    fit = jax.device_get(_fit(put(f[rising]), put(z[rising]), put(noise), circuit))
+    fit = jax.device_get(_fit(put(f[rising]), put(z[rising]), put(noise), structure))
     if fit.verdict != "successful":
         fit = dataclasses.replace(fit, remarks=np.asarray(fit.remarks | int(_remarks(z))))
     fit = with_data(fit, MeasuredImpedance(f, z, sigma))

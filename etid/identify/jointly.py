@@ -19,9 +19,7 @@ import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int
 from tqdm import tqdm
 
-from etid.circuits.circuit import AbstractCircuit
 from etid.estimators import judgement
-from etid.estimators.element_limits import Limits
 from etid.estimators.element_prior import ElementPrior
 from etid.estimators.estimate import DELAY_WIDTH
 from etid.estimators.estimator import AbstractEstimator, serving
@@ -42,16 +40,7 @@ from etid.estimators.maximum_likelihood.estimator import description
 from etid.estimators.registry import MAXIMUM_LIKELIHOOD, register_description
 from etid.estimators.score_tests.other_circuit import NO_OTHER_CIRCUIT, NO_OTHER_GAIN
 from etid.estimators.score_tests.unloaded import shape_of
-from etid.identify.arguments import (
-    Asked,
-    Circuit,
-    Interval,
-    asked_of,
-    candidates_of,
-    check_new,
-    order_of,
-    require,
-)
+from etid.identify.arguments import check_new, require
 from etid.identify.batches import LANES, each, filled
 from etid.identify.many import common_first, identify_part, table, to_identify
 from etid.identify.one import (
@@ -62,9 +51,9 @@ from etid.identify.one import (
     remarks_on,
     repeated,
 )
-from etid.identify.planning import Refusal, calls, planned
+from etid.identify.options import Circuit, Interval, Options, candidates_of
+from etid.identify.planning import Refusal, calls, failed_fit, planned
 from etid.identify.study_drivers import Drivers
-from etid.identify.unfitted import failed_fit
 from etid.numpy_tier.tiers import program, worth_compiling
 from etid.precision import in_float64
 from etid.recordings.preflight import Inspected
@@ -75,7 +64,7 @@ from etid.recordings.study import Study
 from etid.results.driver import HarmonicDriver
 from etid.results.feed import AbstractFeed, MeasuredCurrent
 from etid.results.fit import Fit
-from etid.results.provenance import Settings
+from etid.results.provenance import PLAUSIBLE
 from etid.results.study_fits import StudyFits
 from etid.results.tried_orders import Order
 from etid.results.verdicts import RESULTS, verdict, verdict_names, verdicts_of
@@ -320,6 +309,7 @@ def identify_jointly(
     prior: Mapping[str, tuple[float, float]] | None = None,
     bounds: Mapping[str, Interval] | None = None,
     r_load_tolerance: float = 0.0,
+    plausible: tuple[float, float] = PLAUSIBLE,
     progress: bool = False,
 ) -> StudyFits:
     """Identify every driver of a study together with all recordings made with it.
@@ -342,6 +332,7 @@ def identify_jointly(
         bounds: As in `identify_skin`, for all recordings.
         r_load_tolerance: Relative standard deviation of the known resistors. No record shows this
             error. It passes 1:1 into every resistance and inversely into every capacitance.
+        plausible: As in `identify_driver`.
         progress: Show a progress bar.
 
     Returns:
@@ -354,16 +345,20 @@ def identify_jointly(
         RecordingError: Two recordings with a driver have the same samples of `v_out`.
     """
     require("study", study, Study)
-    order = order_of(order)
-    candidates = candidates_of(circuit)
-    asked = asked_of(None, candidates, fixed, prior, bounds)
-    drivers = Drivers(study, order, None)
+    options = Options.of(
+        candidates_of(circuit),
+        fixed=fixed,
+        prior=prior,
+        bounds=bounds,
+        order=order,
+        r_load_tolerance=r_load_tolerance,
+        plausible=plausible,
+    )
+    drivers = Drivers(study, options)
     paths = to_identify(study)
     if not paths:
         raise ValueError("the study has no loaded recording")
-    candidates = common_first(study, paths, drivers, candidates, asked)
-    circuit = candidates[0]
-    known = ElementPrior.of(asked.known, circuit) if asked.known else None
+    options = common_first(drivers, paths, options)
     fits: dict[int, Fit] = {}
     notes = [""] * len(paths)
     waiting: dict[tuple[str, ...], dict[Any, _Waiting]] = {}
@@ -376,13 +371,13 @@ def identify_jointly(
 
     rows = iter(range(len(paths)))
     inspected = itertools.chain.from_iterable(
-        planned(load, rows, Asked()) for _ in calls(len(paths))
+        planned(load, rows, options) for _ in calls(len(paths))
     )
     for row, of in tqdm(inspected, "", len(paths), unit="recording", disable=not progress):
         if not isinstance(of, Refusal) and not of.estimator.lane.periodic:
             of = Refusal("not_periodic", SINGLE)
         if isinstance(of, Refusal):
-            fits[row] = failed_fit(of.name, circuit, METHOD, asked.bounds)
+            fits[row] = failed_fit(of.name, options, METHOD)
             notes[row] = of.note
             continue
         seen, found, estimator = of
@@ -396,7 +391,7 @@ def identify_jointly(
         rates = seen.recording.sample_rate, seen.recording.pulse_rate
         key = seen.v_th.size, shared, *rates, estimator
         if key not in lengths:
-            model = _model(circuit, driver, shared, known, asked.bounds)
+            model = _model(options, driver, shared)
             lengths[key] = _Waiting(model, driver, estimator, len(paths))
         lengths[key].add(row, seen)
     for names, lengths in tqdm(waiting.items(), unit="driver", disable=not progress):
@@ -404,10 +399,10 @@ def identify_jointly(
         groups = [group.loads() for group in lengths.values()]
         several = tuple(len(group.several()) for group in lengths.values())
         shared = any(group.model.shared for group in lengths.values())
-        tolerance = jax.device_put(float(r_load_tolerance))
+        tolerance = jax.device_put(options.r_load_tolerance)
         numbers = sum(of.spectrum.x.size for of in groups)
         together = _TOGETHER[worth_compiling(numbers)]
-        model = _model(circuit, driver, shared, known, asked.bounds)
+        model = _model(options, driver, shared)
         found, better, delays, cov = together(model, groups, several, driver, tolerance)
         found, delays, cov = jax.device_get((found, delays, cov))
         width = _narrower(groups, found, delays, cov, float(driver.sample_rate))
@@ -438,23 +433,16 @@ def identify_jointly(
                 fits[row], notes[row] = one, text
     if by_current:
         own = [paths[row] for row in by_current]
-        of_each = Asked(MAXIMUM_LIKELIHOOD, asked.known, asked.bounds)
-        alone = identify_part(study, own, drivers, [circuit], of_each, len(own))
+        of_each = dataclasses.replace(
+            options, circuits=(options.circuit,), estimator=MAXIMUM_LIKELIHOOD
+        )
+        alone = identify_part(drivers, own, of_each, len(own))
         as_joint = unstacked(dataclasses.replace(alone.fit, method=METHOD))
         for row, fit, text in zip(by_current, as_joint, alone.notes, strict=True):
             fits[row], notes[row] = fit, str(text)
     ordered = stacked([fits[row] for row in range(len(paths))])
     outcome = table(study, paths, ordered, notes)
-    settings = Settings.of(
-        study,
-        len(paths),
-        order,
-        METHOD,
-        candidates,
-        r_load_tolerance,
-        known=asked.known,
-        bounds=asked.bounds,
-    )
+    settings = options.settings(study, len(paths), METHOD)
     return StudyFits(outcome, drivers.found, drivers.failures, settings)
 
 
@@ -467,11 +455,7 @@ def _alone_judged(fits: Fit, changed: Sequence[bool]) -> Fit:
     return dataclasses.replace(fits, remarks=fits.remarks & int(Remark.at_bound), result=result)
 
 
-def _model(
-    circuit: AbstractCircuit,
-    driver: HarmonicDriver,
-    shared: bool,
-    prior: ElementPrior | None,
-    bounds: Limits,
-) -> Joint:
-    return Joint(circuit, Calibrations.of(driver), shared, prior, bounds)
+def _model(options: Options, driver: HarmonicDriver, shared: bool) -> Joint:
+    circuit, known = options.circuit, options.known
+    prior = ElementPrior.of(known, circuit) if known else None
+    return Joint(circuit, Calibrations.of(driver), shared, prior, options.bounds)

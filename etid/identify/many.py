@@ -1,25 +1,17 @@
 """Identification of many recordings behind one driver, and of whole studies."""
 
+import dataclasses
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from typing import Any, Literal, TypeVar, overload
+from typing import Any, TypeVar, Unpack, overload
 
 import numpy as np
 
 from etid.circuits.circuit import AbstractCircuit, SkinRC
 from etid.estimators.registry import Method
-from etid.identify.arguments import (
-    Asked,
-    Circuit,
-    Interval,
-    asked_of,
-    candidates_of,
-    driver_of,
-    fed,
-    order_of,
-    require,
-)
+from etid.identify.arguments import driver_of, fed, require
 from etid.identify.arguments import recordings as several
 from etid.identify.batches import choices, of_one_circuit
+from etid.identify.options import Circuit, FitOptions, Interval, Options, candidates_of
 from etid.identify.study_drivers import Drivers
 from etid.precision import in_float64
 from etid.recordings.recording import Recording, RecordingError
@@ -29,7 +21,7 @@ from etid.results.feed import AbstractFeed
 from etid.results.fit import Fit
 from etid.results.fits import Fits
 from etid.results.fits_columns import described
-from etid.results.provenance import Settings
+from etid.results.provenance import PLAUSIBLE
 from etid.results.study_fits import StudyFits
 from etid.results.tried_orders import Order
 from etid.selection.common import common
@@ -44,11 +36,8 @@ def identify_skins(
     driver: Driver | None = None,
     *,
     circuit: None = None,
-    method: Method | None = None,
-    fixed: Mapping[str, float] | None = None,
-    prior: Mapping[str, tuple[float, float]] | None = None,
-    bounds: Mapping[str, Interval] | None = None,
     progress: bool = False,
+    **options: Unpack[FitOptions],
 ) -> Fits[SkinRC]: ...
 
 
@@ -58,11 +47,8 @@ def identify_skins(
     driver: Driver | None = None,
     *,
     circuit: _Kind,
-    method: Method | None = None,
-    fixed: Mapping[str, float] | None = None,
-    prior: Mapping[str, tuple[float, float]] | None = None,
-    bounds: Mapping[str, Interval] | None = None,
     progress: bool = False,
+    **options: Unpack[FitOptions],
 ) -> Fits[_Kind]: ...
 
 
@@ -71,12 +57,9 @@ def identify_skins(
     recordings: Iterable[Recording] | Study,
     driver: Driver | None = None,
     *,
-    circuit: Literal["auto"],
-    method: Method | None = None,
-    fixed: Mapping[str, float] | None = None,
-    prior: Mapping[str, tuple[float, float]] | None = None,
-    bounds: Mapping[str, Interval] | None = None,
+    circuit: str,
     progress: bool = False,
+    **options: Unpack[FitOptions],
 ) -> Fits[AbstractCircuit]: ...
 
 
@@ -115,8 +98,9 @@ def identify_skins(
         ValueError: There is no recording, or the method cannot use this circuit.
     """
     driver = driver_of(driver)
-    candidates = candidates_of(circuit)
-    asked = asked_of(method, candidates, fixed, prior, bounds)
+    options = Options.of(
+        candidates_of(circuit), method=method, fixed=fixed, prior=prior, bounds=bounds
+    )
     if isinstance(recordings, Study):
         study, paths = recordings, [*recordings, *recordings.problems]
         known = [_known(study, path) for path in paths]
@@ -134,7 +118,7 @@ def identify_skins(
 
     if not known:
         raise ValueError("there is no recording to identify")
-    fit, notes = of_one_circuit(len(known), load, candidates, asked, progress, len(known))
+    fit, notes = of_one_circuit(len(known), load, options, progress, len(known))
     return Fits(fit, described(known), np.array(notes, dtype=str))
 
 
@@ -149,6 +133,7 @@ def identify_study(
     prior: Mapping[str, tuple[float, float]] | None = None,
     bounds: Mapping[str, Interval] | None = None,
     driver_drift: float = 0.0,
+    plausible: tuple[float, float] = PLAUSIBLE,
     progress: bool = False,
 ) -> StudyFits:
     """Identify every driver of a study from its calibrations, then every loaded recording.
@@ -166,6 +151,7 @@ def identify_study(
         prior: As in `identify_skin`, for all recordings.
         bounds: As in `identify_skin`, for all recordings.
         driver_drift: As in `identify_driver`.
+        plausible: As in `identify_driver`.
         progress: Show a progress bar.
 
     Returns:
@@ -175,24 +161,21 @@ def identify_study(
         ValueError: There is no loaded recording, or the method cannot use this circuit.
     """
     require("study", study, Study)
-    order = order_of(order)
-    candidates = candidates_of(circuit)
-    asked = asked_of(method, candidates, fixed, prior, bounds)
-    drivers = Drivers(study, order, asked.estimator, driver_drift)
-    paths = to_identify(study)
-    candidates = common_first(study, paths, drivers, candidates, asked)
-    fits = identify_part(study, paths, drivers, candidates, asked, len(paths), progress)
-    settings = Settings.of(
-        study,
-        len(paths),
-        order,
-        str(asked.estimator or ""),
-        candidates,
+    options = Options.of(
+        candidates_of(circuit),
+        method=method,
+        fixed=fixed,
+        prior=prior,
+        bounds=bounds,
+        order=order,
         driver_drift=driver_drift,
-        known=asked.known,
-        bounds=asked.bounds,
+        plausible=plausible,
     )
-    return StudyFits(fits, drivers.found, drivers.failures, settings)
+    drivers = Drivers(study, options)
+    paths = to_identify(study)
+    options = common_first(drivers, paths, options)
+    fits = identify_part(drivers, paths, options, len(paths), progress)
+    return StudyFits(fits, drivers.found, drivers.failures, options.settings(study, len(paths)))
 
 
 def to_identify(study: Study) -> list[str]:
@@ -200,48 +183,34 @@ def to_identify(study: Study) -> list[str]:
     return [*study.loaded, *study.problems]
 
 
-def common_first(
-    study: Study,
-    paths: Sequence[str],
-    drivers: Drivers,
-    candidates: Sequence[AbstractCircuit],
-    asked: Asked,
-) -> tuple[AbstractCircuit, ...]:
-    """The candidates; the first one is the common circuit of a sample of the recordings."""
-    if len(candidates) == 1 or not paths:
-        return tuple(candidates)
+def common_first(drivers: Drivers, paths: Sequence[str], options: Options) -> Options:
+    """The options; the first circuit is the common one of a sample of the recordings."""
+    circuits = options.circuits
+    if len(circuits) == 1 or not paths:
+        return options
     step = -(-len(paths) // SAMPLE)
     sample = paths[::step]
-    load = _loader(study, sample, drivers)
-    found, _ = choices(len(sample), load, candidates, asked, False, len(paths))
-    chosen = common(found, candidates)
-    return candidates[chosen], *(one for n, one in enumerate(candidates) if n != chosen)
+    found, _ = choices(len(sample), _loader(drivers, sample), options, False, len(paths))
+    first = circuits[common(found, circuits)]
+    others = (one for one in circuits if one is not first)
+    return dataclasses.replace(options, circuits=(first, *others))
 
 
 def identify_part(
-    study: Study,
-    paths: Sequence[str],
-    drivers: Drivers,
-    candidates: Sequence[AbstractCircuit],
-    asked: Asked,
-    total: int,
-    progress: bool = False,
+    drivers: Drivers, paths: Sequence[str], options: Options, total: int, progress: bool = False
 ) -> Fits:
-    """Fits of some of `total` recordings of a study, with the first of the candidates."""
+    """Fits of some of `total` recordings of a study, with the first of the circuits."""
     if not paths:
         raise ValueError("the study has no loaded recording")
-    load = _loader(study, paths, drivers)
-    fit, notes = of_one_circuit(len(paths), load, candidates, asked, progress, total, fixed=0)
-    return table(study, paths, fit, notes)
+    load = _loader(drivers, paths)
+    fit, notes = of_one_circuit(len(paths), load, options, progress, total, chosen=0)
+    return table(drivers.study, paths, fit, notes)
 
 
 def _loader(
-    study: Study, paths: Sequence[str], drivers: Drivers
+    drivers: Drivers, paths: Sequence[str]
 ) -> Callable[[int], tuple[Recording, AbstractFeed]]:
-    def load(row: int) -> tuple[Recording, AbstractFeed]:
-        return drivers.fed(study[paths[row]])
-
-    return load
+    return lambda row: drivers.fed(drivers.study[paths[row]])
 
 
 def table(study: Study, paths: Sequence[str], fit: Fit, notes: Sequence[str]) -> Fits:

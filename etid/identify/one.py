@@ -4,7 +4,7 @@ import dataclasses
 import functools
 import zlib
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from typing import Any, Literal, TypeVar, overload
+from typing import Any, TypeVar, Unpack, overload
 
 import jax
 import numpy as np
@@ -25,17 +25,17 @@ from etid.estimators.lanes import (
 from etid.estimators.maximum_likelihood.estimator import MaximumLikelihood
 from etid.estimators.registry import Method
 from etid.identify import changes
-from etid.identify.arguments import (
-    Asked,
+from etid.identify.arguments import fed
+from etid.identify.options import (
     Circuit,
+    FitOptions,
     Interval,
-    asked_of,
+    Options,
     candidates_of,
     check_default,
-    fed,
     plan,
 )
-from etid.identify.unfitted import EXPLAINED, explained, failed_fit
+from etid.identify.planning import EXPLAINED, explained, failed_fit
 from etid.numpy_tier.tiers import program
 from etid.precision import in_float64
 from etid.recordings.preflight import Inspected
@@ -64,11 +64,8 @@ def identify_skin(
     driver: Driver | None = None,
     *,
     circuit: None = None,
-    method: Method | None = None,
-    fixed: Mapping[str, float] | None = None,
-    prior: Mapping[str, tuple[float, float]] | None = None,
-    bounds: Mapping[str, Interval] | None = None,
     throw: bool = True,
+    **options: Unpack[FitOptions],
 ) -> Fit[SkinRC]: ...
 
 
@@ -78,11 +75,8 @@ def identify_skin(
     driver: Driver | None = None,
     *,
     circuit: _Kind,
-    method: Method | None = None,
-    fixed: Mapping[str, float] | None = None,
-    prior: Mapping[str, tuple[float, float]] | None = None,
-    bounds: Mapping[str, Interval] | None = None,
     throw: bool = True,
+    **options: Unpack[FitOptions],
 ) -> Fit[_Kind]: ...
 
 
@@ -91,12 +85,9 @@ def identify_skin(
     recording: Recording,
     driver: Driver | None = None,
     *,
-    circuit: Literal["auto"],
-    method: Method | None = None,
-    fixed: Mapping[str, float] | None = None,
-    prior: Mapping[str, tuple[float, float]] | None = None,
-    bounds: Mapping[str, Interval] | None = None,
+    circuit: str,
     throw: bool = True,
+    **options: Unpack[FitOptions],
 ) -> Fit[AbstractCircuit]: ...
 
 
@@ -118,9 +109,9 @@ def identify_skin(
         recording: Unloaded and loaded voltage.
         driver: Identified driver. Without a driver the load is identified from the current that the
             recording measured. With a driver, the default method uses a measured current too.
-        circuit: Structure of the load and its typical values; `SkinRC` if not given. With
-            `"auto"` it is the simplest circuit that the recording supports; `select_circuit` shows
-            the choice.
+        circuit: Structure of the load and its typical values, or a circuit string such as
+            `"R0-p(R1,C1)"`; `SkinRC` if not given. With `"auto"` it is the simplest circuit that
+            the recording supports; `select_circuit` shows the choice.
         method: A method of `identify_driver`, or `"non_parametric"`, which uses the drivers of
             maximum likelihood, or any registered name.
         fixed: Known values of elements by name [SI], as in `{"r_s": 500.0}`. Their standard errors
@@ -143,32 +134,30 @@ def identify_skin(
         ValueError: The method cannot use this driver or this circuit.
         IdentificationError: The verdict is not successful and `throw` is set.
     """
-    candidates = candidates_of(circuit)
-    asked = asked_of(method, candidates, fixed, prior, bounds)
-    fits, chosen = candidate_fits(recording, driver, candidates, asked)
-    single = len(candidates) == 1
-    fit = fits[chosen] if single else Selection.of(fits, chosen, candidates).fit
+    options = Options.of(
+        candidates_of(circuit), method=method, fixed=fixed, prior=prior, bounds=bounds
+    )
+    fits, chosen = candidate_fits(recording, driver, options)
+    single = len(options.circuits) == 1
+    fit = fits[chosen] if single else Selection.of(fits, chosen, options.circuits).fit
     fit = with_data(fit, recording, driver)
     return successful(recording, fit) if throw else fit
 
 
 def candidate_fits(
-    recording: Recording,
-    driver: Driver | None,
-    candidates: Sequence[AbstractCircuit],
-    asked: Asked,
+    recording: Recording, driver: Driver | None, options: Options
 ) -> tuple[dict[int, Fit], int]:
-    """Fits of the candidates that a recording asks for, and the number of the chosen one.
+    """Fits of the circuits that a recording asks for, and the number of the chosen one.
 
     Raises:
         ValueError: The method cannot use this driver.
     """
     recording, feed = fed(recording, driver)
     seen = Inspected(recording)
-    estimator, name = plan(asked, seen, feed)
+    estimator, name = plan(options, seen, feed)
     if name is not None:
-        return {0: failed_fit(name, candidates[0], str(estimator), asked.bounds)}, 0
-    check_default(estimator, candidates)
+        return {0: failed_fit(name, options, str(estimator))}, 0
+    check_default(estimator, options.circuits)
     lane = estimator.lane.of(seen)
     known = known_of(lane, feed, is_shared(seen, feed), estimator)
 
@@ -176,7 +165,7 @@ def candidate_fits(
         found = [skin(lane, feed, known, circuit, estimator) for lane in lanes]
         return stacked(jax.device_get(found))
 
-    found = refined([lane], [seen], fit, feed, candidates)
+    found = refined([lane], [seen], fit, feed, options.circuits)
     found = judged(found, feed, [seen], estimator)
     return found[0], found.chosen(0)
 

@@ -1,22 +1,81 @@
-"""Reading and inspection of many recordings: which can be fitted, and why the others cannot."""
+"""Reading and inspection of recordings: which can be fitted, and why the others cannot."""
 
 import itertools
 from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from etid.estimators.element_limits import limited, of_circuit
 from etid.estimators.estimator import AbstractEstimator
-from etid.identify.arguments import Asked, plan
-from etid.identify.unfitted import explained
-from etid.recordings.preflight import Group, Inspected
+from etid.identify import changes
+from etid.identify.options import Options, plan
+from etid.recordings.causes import why_implausible, why_misaligned
+from etid.recordings.preflight import Group, Inspected, preflight
 from etid.recordings.recording import Recording, RecordingError
 from etid.results.feed import AbstractFeed
-from etid.results.fit import IdentificationError
-from etid.results.verdicts import message
+from etid.results.fit import Fit, IdentificationError, Support
+from etid.results.verdicts import message, verdict
 
 TOGETHER = 600_000  # samples that are inspected together; their arrays take tens of MB
 FEWEST = 16  # recordings that are read at once, however long they are
 MOST = 64  # recordings that are read at once if they are short; many more save little time
 ERRORS = (RecordingError, ValueError, IdentificationError)  # that a recording or a driver may raise
+# Verdicts whose message says more of a recording.
+EXPLAINED = ("rate_mismatch", "misaligned", "wrong_unit", "flat", "nonfinite_samples")
+
+
+def explained(seen: Inspected, name: str) -> str:
+    """The message of a verdict of `etid.recordings.preflight`, with the numbers found."""
+    found = ""
+    if seen.by_current is not None and name in EXPLAINED and preflight(seen) != name:
+        seen = seen.by_current  # the fault is in the current
+    if name == "rate_mismatch":
+        found = seen.train.mismatch
+    elif name == "misaligned":
+        found = why_misaligned(seen)
+    elif name == "wrong_unit":
+        found = why_implausible(seen.by_current or seen)
+    elif name in ("flat", "nonfinite_samples"):
+        found = f"The fault is in {' and '.join(_faulty(seen, name))}."
+    return f"{found} {message(name)}".strip()
+
+
+def _faulty(seen: Inspected, name: str) -> list[str]:
+    """Names of the records that are flat, or that hold numbers that are not finite."""
+    records = seen.recording.cause, "v_out"
+    if name == "flat":
+        faults = seen.is_flat
+    else:
+        faults = [not np.isfinite(seen.recording.samples[one].values).all() for one in records]
+    return [one for one, fault in zip(records, faults, strict=True) if fault]
+
+
+def failed_fit(name: str, options: Options, method: str) -> Fit:
+    """A fit without numbers, for a recording that was not fitted."""
+    circuit = options.circuit
+    size = len(circuit.names())
+    nan = np.full((size, size), np.nan)
+    empty = circuit.with_log_values(jnp.full(size, jnp.nan))
+    scalar = np.asarray(np.nan)
+    none = changes.unknown(size)
+    fit = Fit(
+        circuit=empty,
+        cov=nan,
+        shared_cov=nan,
+        rrse=scalar,
+        chi2=scalar,
+        result=verdict(name),
+        steps=np.asarray(0),
+        method=method,
+        change=none.size,
+        change_stderr=none.stderr,
+        support=Support.unknown(size),
+        limits=limited(circuit, of_circuit(options.bounds, circuit)),
+    )
+    return jax.tree.map(np.asarray, fit)
 
 
 class Refusal:
@@ -38,7 +97,7 @@ class Planned(NamedTuple):
 def planned(
     load: Callable[[int], tuple[Recording, AbstractFeed]],
     rows: Iterator[int],
-    asked: Asked,
+    options: Options,
 ) -> Iterator[tuple[int, Planned | Refusal]]:
     """Some recordings with their drivers and estimators, or the reason why they cannot be fitted.
 
@@ -48,7 +107,7 @@ def planned(
     Args:
         load: Reads a recording and its driver.
         rows: Numbers of the recordings; the order of the results may differ.
-        asked: What the caller asks for.
+        options: What the caller asks for.
     """
     loaded: dict[tuple[int, str, float, float], list[tuple[int, Recording, AbstractFeed]]] = {}
     held = 0
@@ -69,7 +128,7 @@ def planned(
             part = alike[first : first + together]
             group = Group([of for _, of, _ in part])
             for number, (row, of, driver) in enumerate(part):
-                yield row, _planned(Inspected(of, group, number), driver, asked)
+                yield row, _planned(Inspected(of, group, number), driver, options)
 
 
 def calls(count: int) -> range:
@@ -77,9 +136,9 @@ def calls(count: int) -> range:
     return range(-(-count // FEWEST))
 
 
-def _planned(seen: Inspected, driver: AbstractFeed, asked: Asked) -> Planned | Refusal:
+def _planned(seen: Inspected, driver: AbstractFeed, options: Options) -> Planned | Refusal:
     try:
-        estimator, name = plan(asked, seen, driver)
+        estimator, name = plan(options, seen, driver)
     except ERRORS as error:
         return _refusal(error)
     return (

@@ -11,7 +11,7 @@ from etid.estimators.lanes import AlignedSamples
 from etid.estimators.output_error import fit as output_error
 from etid.estimators.output_error import prediction
 from etid.estimators.registry import OUTPUT_ERROR
-from etid.identify.arguments import circuit_of, fed
+from etid.identify.arguments import fed, given_circuit
 from etid.identify.steady_state import periodic_voltage
 from etid.numpy_tier.tiers import program
 from etid.precision import in_float64
@@ -33,7 +33,7 @@ def _fitted(
 
 @in_float64
 def predict(
-    recording: Recording, driver: Driver | None = None, circuit: AbstractCircuit | None = None
+    recording: Recording, driver: Driver | None = None, circuit: AbstractCircuit | str | None = None
 ) -> Float[np.ndarray, " time"]:
     """Predict the terminal voltage [V] of a recording, for plots and residuals.
 
@@ -43,7 +43,8 @@ def predict(
         recording: Unloaded and loaded voltage.
         driver: Driver with a continuous source impedance. Without a driver the voltage is predicted
             from the measured current.
-        circuit: The load. If not given, it is the known resistor of the calibration.
+        circuit: The load, or a circuit string. If not given, it is the known resistor of the
+            calibration.
 
     Returns:
         Predicted voltage [V]. It is NaN at both edges, where the interpolation lacks neighbours.
@@ -56,20 +57,20 @@ def predict(
     """
     recording, feed = fed(recording, driver)
     if circuit is not None:
-        circuit = circuit_of(circuit)
+        load = given_circuit("circuit", circuit)
+    elif recording.r_load is not None:
+        load = Resistor(recording.r_load)
     else:
-        if recording.r_load is None:
-            raise ValueError("give the circuit: this recording has no known resistor")
-        circuit = Resistor(recording.r_load)
+        raise ValueError("give the circuit: this recording has no known resistor")
     if not isinstance(feed, MeasuredCurrent):
         feed = serving(feed, ContinuousDriver, str(OUTPUT_ERROR))
-    seen, simulated = Inspected(recording), circuit.impedance().has_response
-    if not circuit.is_rational and (seen.whole_periods[0] > 0 or not simulated):
+    seen, simulated = Inspected(recording), load.impedance().has_response
+    if not load.is_rational and (seen.whole_periods[0] > 0 or not simulated):
         if isinstance(feed, ContinuousDriver):
-            return _predict_periods(recording, feed, circuit)
-        OUTPUT_ERROR.check_circuit(circuit)
+            return _predict_periods(recording, feed, load)
+        OUTPUT_ERROR.check_circuit(load)
     seen.kept = None  # disturbed periods are predicted too
-    inner = np.asarray(_fitted(jax.device_put(AlignedSamples.of(seen)), feed, circuit))
+    inner = np.asarray(_fitted(jax.device_put(AlignedSamples.of(seen)), feed, load))
     predicted = np.full(recording.v_out.size, np.nan)
     first = TAPS - 1 + max(seen.lag, 0)
     predicted[first : first + inner.size] = inner

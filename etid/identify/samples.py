@@ -6,19 +6,15 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from etid.circuits.circuit import AbstractCircuit
+from etid.estimators.estimator import AbstractEstimator
 from etid.estimators.lanes import Harmonics
-from etid.estimators.registry import Method
-from etid.identify.arguments import (
-    candidates_of,
-    check_default,
-    estimator_of,
-    for_samples,
-    require,
-)
+from etid.estimators.registry import MAXIMUM_LIKELIHOOD, OUTPUT_ERROR, Method
+from etid.identify.arguments import require
 from etid.identify.one import skin_lane
+from etid.identify.options import Options, candidates_of, check_default
 from etid.precision import in_float64
 from etid.recordings.remarks import Remark
-from etid.results.driver import Driver
+from etid.results.driver import Driver, HarmonicDriver
 from etid.results.fit import Fit
 from etid.signals.harmonics import whole_periods
 
@@ -32,7 +28,7 @@ def identify_samples(
     sample_rate: float,
     pulse_rate: float,
     resolution: float = 0.0,
-    circuit: AbstractCircuit | None = None,
+    circuit: AbstractCircuit | str | None = None,
     method: Method | None = None,
 ) -> Fit:
     """`identify_skin` for plain arrays; `jax.grad`, `jax.jit` and `jax.vmap` can transform it.
@@ -61,12 +57,12 @@ def identify_samples(
         ValueError: The method cannot use this driver or this circuit.
     """
     require("driver", driver, Driver)
-    [circuit] = candidates_of(circuit)
-    estimator = estimator_of(method, [circuit])
+    options = Options.of(candidates_of(circuit), method=method)
     periods = whole_periods(v_out.shape[0], sample_rate, pulse_rate)
+    estimator = options.estimator
     if estimator is None:
-        estimator = for_samples(driver, periods)
-        check_default(estimator, [circuit])
+        estimator = _default(driver, periods[0])
+        check_default(estimator, options.circuits)
     estimator.check_driver(driver, sample_rate, pulse_rate)
     v_th, v_out, step, rate = (
         jnp.asarray(value, float) for value in (v_th, v_out, resolution, sample_rate)
@@ -77,6 +73,11 @@ def identify_samples(
         if isinstance(lane, Harmonics)
         else None
     )
-    fit = skin_lane(lane, driver, known, circuit, estimator)
+    fit = skin_lane(lane, driver, known, options.circuit, estimator)
     # No harmonic is left out here, so a remark about hum would be untrue.
     return dataclasses.replace(fit, remarks=fit.remarks & ~int(Remark.mains_hum))
+
+
+def _default(driver: Driver, periods: int) -> AbstractEstimator:
+    several = isinstance(driver, HarmonicDriver) and periods > 1
+    return MAXIMUM_LIKELIHOOD if several else OUTPUT_ERROR

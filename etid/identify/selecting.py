@@ -9,9 +9,10 @@ import numpy as np
 
 from etid.circuits.circuit import AbstractCircuit
 from etid.estimators.registry import Method
-from etid.identify.arguments import Interval, asked_of, require
+from etid.identify.arguments import given_circuit
 from etid.identify.impedance import identify_impedance
 from etid.identify.one import candidate_fits, successful
+from etid.identify.options import Interval, Options
 from etid.precision import in_float64
 from etid.recordings.recording import Recording, RecordingError
 from etid.results.driver import Driver
@@ -27,7 +28,7 @@ def select_circuit(
     recording: Recording,
     driver: Driver | None = None,
     *,
-    candidates: Sequence[AbstractCircuit] | None = None,
+    candidates: Sequence[AbstractCircuit | str] | None = None,
     method: Method | None = None,
     fixed: Mapping[str, float] | None = None,
     prior: Mapping[str, tuple[float, float]] | None = None,
@@ -46,7 +47,7 @@ def select_circuit(
     Args:
         recording: Unloaded and loaded voltage.
         driver: As in `identify_skin`.
-        candidates: Circuits to choose from, the most usual one first. If None: `SkinRC`,
+        candidates: Circuits or circuit strings, the most usual one first. If None: `SkinRC`,
             `ParallelRC`, `Resistor`, `SkinCole`, `SkinLayers`.
         method: An estimator that computes a likelihood, `"maximum_likelihood"`; the default for
             records of several whole periods.
@@ -66,16 +67,16 @@ def select_circuit(
             element is no element of a candidate.
         IdentificationError: The verdict is not successful and `throw` is set.
     """
-    candidates = usual_circuits() if candidates is None else checked(candidates)
-    asked = asked_of(method, candidates, fixed, prior, bounds)
-    fits, chosen = candidate_fits(recording, driver, candidates, asked)
-    selection = Selection.of(fits, chosen, candidates)
+    circuits = usual_circuits() if candidates is None else checked(candidates)
+    options = Options.of(circuits, method=method, fixed=fixed, prior=prior, bounds=bounds)
+    fits, chosen = candidate_fits(recording, driver, options)
+    selection = Selection.of(fits, chosen, circuits)
     if throw:
         successful(recording, selection.fit)
     return selection
 
 
-def checked(candidates: Iterable[AbstractCircuit]) -> tuple[AbstractCircuit, ...]:
+def checked(candidates: Iterable[AbstractCircuit | str]) -> tuple[AbstractCircuit, ...]:
     """The candidates.
 
     Raises:
@@ -88,13 +89,13 @@ def checked(candidates: Iterable[AbstractCircuit]) -> tuple[AbstractCircuit, ...
             field="candidates",
             remedy="Pass a list, as in [etid.SkinRC(), etid.SkinCole()]",
         )
-    found = tuple(candidates)
+    found = tuple(
+        given_circuit(f"candidates[{number}]", one) for number, one in enumerate(candidates)
+    )
     if not found:
         raise RecordingError(
             "is empty", field="candidates", remedy="Pass a list, as in [etid.SkinRC()]"
         )
-    for number, one in enumerate(found):
-        require(f"candidates[{number}]", one, AbstractCircuit)
     for one, other in itertools.combinations(found, 2):
         if _are_equal(one, other):
             raise RecordingError(

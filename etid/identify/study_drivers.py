@@ -2,15 +2,13 @@
 
 import threading
 
-from etid.estimators.estimator import AbstractEstimator
-from etid.identify.arguments import drift_of
-from etid.identify.driver import identify_driver
+from etid.identify.driver import calibrated
+from etid.identify.options import Options
 from etid.recordings.recording import Recording, RecordingError
 from etid.recordings.study import Study
 from etid.results.driver import Driver
 from etid.results.feed import MEASURED_CURRENT, AbstractFeed
 from etid.results.fit import IdentificationError
-from etid.results.tried_orders import Order
 
 
 class Drivers:
@@ -22,17 +20,9 @@ class Drivers:
             calibrations.
     """
 
-    def __init__(
-        self,
-        study: Study,
-        order: Order,
-        asked: AbstractEstimator | None,
-        driver_drift: float = 0.0,
-    ) -> None:
+    def __init__(self, study: Study, options: Options) -> None:
         self.study = study
-        self.driver_drift = drift_of(driver_drift, asked)
-        self.order: Order = order
-        self.asked = asked
+        self.options = options
         self.calibrations = tuple(study.calibrations)
         self.found: dict[tuple[str, ...], Driver] = {}
         self.failures: dict[tuple[str, ...], str] = {}
@@ -78,12 +68,6 @@ class Drivers:
     def _identify(self, names: tuple[str, ...]) -> None:
         try:
             records = [self.study[name] for name in names]
-            self.found[names] = identify_driver(
-                records,
-                order=self.order,
-                method=self.asked,
-                driver_drift=self.driver_drift,
-                throw=False,
-            )
+            self.found[names] = calibrated(records, self.options, throw=False)
         except (IdentificationError, ValueError, KeyError) as error:
             self.failures[names] = str(error)

@@ -51,7 +51,7 @@ from etid.estimators.maximum_likelihood.given_driver import GivenDriver
 from etid.estimators.registry import MAXIMUM_LIKELIHOOD
 from etid.identify.arguments import circuit_of, number_of, require
 from etid.identify.one import known_at
-from etid.identify.unfitted import explained
+from etid.identify.planning import explained
 from etid.numpy_tier.tiers import program
 from etid.online import changes
 from etid.online.changes import Change
@@ -117,7 +117,7 @@ class Tracker(Overviewed):
         unloaded: Recording,
         *,
         electrodes: int,
-        circuit: AbstractCircuit | None = None,
+        circuit: AbstractCircuit | str | None = None,
         change: float = 0.0,
     ) -> "Tracker":
         """A tracker for one driver.
@@ -128,7 +128,7 @@ class Tracker(Overviewed):
                 several periods: they determine the aliases. The pulses must have its sample rate
                 and pulse rate.
             electrodes: Number of electrodes.
-            circuit: Structure of the load and its typical values; `SkinRC` if not given.
+            circuit: As in `identify_skin`, without `"auto"`.
             change: Standard deviation of the change of the elements' logarithms from pulse to pulse
                 (a random walk) [1/√pulse]; 0 for elements that do not change.
 

@@ -217,11 +217,13 @@ def _table(found: StudyFits, settings: Settings) -> Table:
     circuit = type(found.fits.circuit).__name__
     if settings.candidates:
         circuit += f", chosen among {', '.join(sorted(settings.candidates))}"
+    low, high = settings.plausible
     rows = {
         "recordings": source,
         "method": f"asked for {settings.asked_method or 'none'}, used {found.fits.fit.method}",
         "circuit": circuit,
-        "Z_th": f"order {settings.order or 'auto'}, drift of {100 * settings.driver_drift:g} %",
+        "Z_th": f"order {settings.order or 'auto'}, drift of {100 * settings.driver_drift:g} %, "
+        f"accepted from {low:g} to {high:g} ohm at 1 kHz",
         "R_L": f"standard deviation of {100 * settings.r_load_tolerance:g} %",
         "known elements": ", ".join(settings.fixed + settings.prior + settings.bounds) or "none",
         "computed": f"in {settings.precision} on {settings.backend}",

@@ -3,16 +3,9 @@
 import dataclasses
 import functools
 import importlib.metadata
-import math
-import os
-from collections.abc import Sequence
 
-import jax
-import numpy as np
-
-from etid.circuits.circuit import AbstractCircuit
-from etid.recordings.study import Study
-from etid.results.tried_orders import AUTO, Order
+# |Z_th| [Ω] at 1 kHz: from the transformer of a microphone to the transformer of a tube.
+PLAUSIBLE = (300.0, 300e3)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -40,6 +33,7 @@ class Settings:
         precision: Floating-point type of the computation.
         backend: Backend of JAX, such as `"cpu"`.
         versions: Packages and their versions, such as `"jax 0.10.2"`.
+        plausible: As in `identify_driver`. Files of earlier versions do not store it.
     """
 
     source: str
@@ -57,62 +51,11 @@ class Settings:
     precision: str
     backend: str
     versions: tuple[str, ...]
-
-    @classmethod
-    def of(
-        cls,
-        study: Study,
-        count: int,
-        order: Order,
-        method: str,
-        candidates: Sequence[AbstractCircuit],
-        r_load_tolerance: float = 0.0,
-        driver_drift: float = 0.0,
-        known: Sequence[tuple[str, float, float]] = (),
-        bounds: Sequence[tuple[str, float, float]] = (),
-    ) -> "Settings":
-        """The settings of a run in this process.
-
-        Args:
-            study: The recordings.
-            count: Number of recordings to identify.
-            order: As in `identify_driver`.
-            method: Name of the estimator that the user chose; empty if none.
-            candidates: The circuit of the fits, then the others from which it was chosen.
-            r_load_tolerance: As in `identify_jointly`.
-            driver_drift: As in `identify_driver`.
-            known: Names, values and standard deviations of known elements [SI]; the standard
-                deviation of a fixed element is 0.
-            bounds: Names, lower and upper bounds of elements [SI]; infinity for no upper
-                bound.
-        """
-        source = os.path.abspath(study.file) if study.file else ""
-        return cls(
-            source=source,
-            source_size=os.path.getsize(source) if source else 0,
-            recordings=count,
-            asked_method=method,
-            order=0 if order == AUTO else order,
-            start=tuple(np.asarray(candidates[0].values()).tolist()),
-            candidates=tuple(type(one).__name__ for one in candidates)
-            if len(candidates) > 1
-            else (),
-            r_load_tolerance=float(r_load_tolerance),
-            driver_drift=float(driver_drift),
-            fixed=tuple(f"{name} {value!r}" for name, value, error in known if not error),
-            prior=tuple(f"{name} {value!r} ± {error!r}" for name, value, error in known if error),
-            bounds=tuple(
-                f"{name} above {low!r}" if high == math.inf else f"{name} {low!r} to {high!r}"
-                for name, low, high in bounds
-            ),
-            precision="float64",
-            backend=jax.default_backend(),
-            versions=_versions(),
-        )
+    plausible: tuple[float, ...] = PLAUSIBLE
 
 
 @functools.cache
-def _versions() -> tuple[str, ...]:
+def versions() -> tuple[str, ...]:
     """Packages and their versions; to look them up on disk takes as long as three skins."""
     packages = ("etid", "jax", "jaxlib", "optimistix", "equinox", "numpy")
     return tuple(f"{name} {importlib.metadata.version(name)}" for name in packages)

@@ -143,9 +143,11 @@ class StudyFits(Overviewed):
 
 
 def _settings(table: Table) -> Settings | None:
-    kinds = {field.name: field.type for field in dataclasses.fields(Settings)}
-    if not table.attributes >= kinds.keys():
+    fields = dataclasses.fields(Settings)
+    required = {field.name for field in fields if field.default is dataclasses.MISSING}
+    if not table.attributes >= required:
         return None
+    kinds = {field.name: field.type for field in fields if field.name in table.attributes}
     values: dict[str, Any] = {}
     for name, kind in kinds.items():
         value = table.attribute(name)

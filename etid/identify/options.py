@@ -1,0 +1,406 @@
+"""The options of a fit, checked when a public function is called, and the estimator they select."""
+
+import dataclasses
+import functools
+import math
+import operator
+import os
+import reprlib
+from collections.abc import Mapping, Sequence
+from typing import Any, TypedDict
+
+import equinox as eqx
+import jax
+
+from etid.circuits.circuit import AbstractCircuit, SkinRC
+from etid.circuits.current_dependent import current_dependent
+from etid.estimators.element_limits import Limits, checked_limits
+from etid.estimators.element_prior import Known, checked
+from etid.estimators.estimator import AbstractEstimator
+from etid.estimators.maximum_likelihood.estimator import MaximumLikelihood
+from etid.estimators.output_error.estimator import OutputError
+from etid.estimators.registry import MAXIMUM_LIKELIHOOD, OUTPUT_ERROR, WITH_CURRENT, Method, named
+from etid.identify.arguments import circuit_of, number_of
+from etid.recordings.preflight import Inspected, preflight
+from etid.recordings.recording import RecordingError
+from etid.recordings.study import Study
+from etid.results.driver import ContinuousDriver, HarmonicDriver
+from etid.results.feed import AbstractFeed, MeasuredCurrent
+from etid.results.provenance import PLAUSIBLE, Settings, versions
+from etid.results.tried_orders import AUTO, Order
+from etid.selection.search import usual_circuits
+
+# Four times the order of the paper. Calibrations determine no more poles; with 50 poles an
+# identification takes minutes and does not converge.
+LARGEST_ORDER = 20
+
+Circuit = AbstractCircuit | str | None
+"""A circuit or a circuit string; `"auto"` for the simplest circuit that the data support; None for
+`SkinRC`."""
+
+Interval = tuple[float | None, float | None]
+"""Lower and upper bound of an element [SI]; None if there is none."""
+
+
+class FitOptions(TypedDict, total=False):
+    """The options that overloads of one function share, for type checkers."""
+
+    method: Method | None
+    fixed: Mapping[str, float] | None
+    prior: Mapping[str, tuple[float, float]] | None
+    bounds: Mapping[str, Interval] | None
+
+
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """What a caller asks for. Each public function makes it once, by `Options.of`.
+
+    Attributes:
+        circuits: Circuits to choose from. They are not compared: their numbers may be arrays, and
+            no driver depends on them.
+        estimator: The requested estimator; None for the default of each recording.
+        known: Elements that are known.
+        bounds: Elements with bounds.
+        order: Number of poles of Z_th.
+        driver_drift: As in `identify_driver`.
+        r_load_tolerance: As in `identify_jointly`.
+        plausible: As in `identify_driver`.
+    """
+
+    circuits: tuple[AbstractCircuit, ...] = dataclasses.field(default=(), compare=False)
+    estimator: AbstractEstimator | None = None
+    known: Known = ()
+    bounds: Limits = ()
+    order: Order = 5
+    driver_drift: float = 0.0
+    r_load_tolerance: float = 0.0
+    plausible: tuple[float, float] = PLAUSIBLE
+
+    @classmethod
+    def of(
+        cls,
+        circuits: Sequence[AbstractCircuit] = (),
+        *,
+        method: Method | None = None,
+        fixed: Mapping[str, float] | None = None,
+        prior: Mapping[str, tuple[float, float]] | None = None,
+        bounds: Mapping[str, Interval] | None = None,
+        order: Order = 5,
+        driver_drift: float = 0.0,
+        r_load_tolerance: float = 0.0,
+        plausible: tuple[float, float] = PLAUSIBLE,
+    ) -> "Options":
+        """The options, from the keywords of a public function.
+
+        Raises:
+            RecordingError: A value has a wrong type, the order is not from 2 to `LARGEST_ORDER`,
+                or `plausible` is no range.
+            ValueError: No estimator has this name, or the estimator cannot identify these circuits,
+                cannot choose between them, or has no use for another option. A known element is no
+                element of a circuit, bounds are impossible, or a relative standard deviation is not
+                in 0 ≤ value < 1.
+        """
+        estimator = None
+        if method is not None:
+            estimator = method if isinstance(method, AbstractEstimator) else named(str(method))
+            check_circuits(estimator, circuits)
+        options = cls(
+            circuits=tuple(circuits),
+            estimator=estimator,
+            known=_informed(fixed, prior),
+            bounds=_bounded(bounds),
+            order=order_of(order),
+            driver_drift=_part("driver_drift", driver_drift),
+            r_load_tolerance=_part("r_load_tolerance", r_load_tolerance),
+            plausible=_range("plausible", plausible),
+        )
+        if estimator is not None:
+            options.given_to(estimator)
+            check_order(options.order, estimator)
+            if options.driver_drift and not issubclass(estimator.driver, ContinuousDriver):
+                raise ValueError(
+                    f"driver_drift enters standard errors, and method {str(estimator)!r} gives "
+                    "none; leave driver_drift out, or use method='maximum_likelihood' or "
+                    "method='output_error'"
+                )
+        options._check_elements()
+        return options
+
+    @property
+    def circuit(self) -> AbstractCircuit:
+        """The first circuit: the only one, or that of all recordings once it is chosen."""
+        return self.circuits[0]
+
+    def given_to(self, estimator: AbstractEstimator) -> AbstractEstimator:
+        """The estimator with the known elements and the bounds.
+
+        Raises:
+            ValueError: It takes none.
+        """
+        if not self.known and not self.bounds:
+            return estimator
+        if not isinstance(estimator, MaximumLikelihood | OutputError):
+            raise ValueError(
+                f"method {str(estimator)!r} takes no known elements and no bounds; use "
+                "method='maximum_likelihood' or 'output_error'"
+            )
+        return dataclasses.replace(estimator, known_elements=self.known, bounds=self.bounds)
+
+    def settings(self, study: Study, count: int, method: str = "") -> Settings:
+        """The settings of a run in this process.
+
+        Args:
+            study: The recordings.
+            count: Number of recordings to identify.
+            method: Name of the method; that of the requested estimator if not given.
+        """
+        source = os.path.abspath(study.file) if study.file else ""
+        several = len(self.circuits) > 1
+        return Settings(
+            source=source,
+            source_size=os.path.getsize(source) if source else 0,
+            recordings=count,
+            asked_method=method or str(self.estimator or ""),
+            order=0 if self.order == AUTO else self.order,
+            start=tuple(self.circuit.values().tolist()),
+            candidates=tuple(type(one).__name__ for one in self.circuits if several),
+            r_load_tolerance=self.r_load_tolerance,
+            driver_drift=self.driver_drift,
+            plausible=self.plausible,
+            fixed=tuple(f"{name} {value!r}" for name, value, error in self.known if not error),
+            prior=tuple(
+                f"{name} {value!r} ± {error!r}" for name, value, error in self.known if error
+            ),
+            bounds=tuple(
+                f"{name} above {low!r}" if high == math.inf else f"{name} {low!r} to {high!r}"
+                for name, low, high in self.bounds
+            ),
+            precision="float64",
+            backend=jax.default_backend(),
+            versions=versions(),
+        )
+
+    def _check_elements(self) -> None:
+        """Raise ValueError unless the circuits have the known elements, with possible values."""
+        for name, *_ in self.known if len(self.circuits) > 1 else ():
+            without = [type(one).__name__ for one in self.circuits if name not in one.names()]
+            if without:
+                raise ValueError(
+                    f"{name} is known, but {' and '.join(without)} have no such element, so the "
+                    "choice would compare circuits with different knowledge; pass one circuit, or "
+                    "call select_circuit with candidates that all have it"
+                )
+        for circuit in self.circuits if self.known else ():
+            checked(self.known, circuit)
+        if self.bounds:
+            checked_limits(self.bounds, self.known, self.circuits)
+
+
+def candidates_of(value: Circuit) -> tuple[AbstractCircuit, ...]:
+    """The circuits to choose from: `usual_circuits` for `"auto"`, else one.
+
+    Raises:
+        RecordingError: The value is neither a linear circuit nor `"auto"`.
+        ValueError: The circuit string cannot be read.
+    """
+    if isinstance(value, str) and value == AUTO:
+        return usual_circuits()
+    if value is None:
+        return _default()
+    circuit = circuit_of(value)
+    if _depends_on_current(type(circuit)):
+        raise RecordingError(
+            f"is {type(circuit).__name__}, which is not linear: it depends on its current",
+            field="circuit",
+            remedy="Use etid.identify_amplitudes",
+        )
+    return (circuit,)
+
+
+@functools.cache
+def _default() -> tuple[AbstractCircuit, ...]:
+    """`SkinRC`, made once, because most fits ask for it."""
+    return (SkinRC(),)
+
+
+@functools.cache
+def _depends_on_current(kind: type[AbstractCircuit]) -> bool:
+    """Whether circuits of a class are not linear; kept, because every fit asks."""
+    impedance = eqx.filter_eval_shape(lambda: kind().impedance())  # computes nothing
+    return current_dependent(impedance) is not None
+
+
+def check_circuits(estimator: AbstractEstimator, circuits: Sequence[AbstractCircuit]) -> None:
+    """Raise ValueError unless an estimator can identify these circuits and choose between them."""
+    if len(circuits) > 1 and not estimator.chooses:
+        raise ValueError(
+            f"method {str(estimator)!r} computes no likelihood, which the choice of a circuit "
+            "needs; use method='maximum_likelihood'"
+        )
+    for circuit in circuits:
+        estimator.check_circuit(circuit)
+
+
+def check_order(order: Order, estimator: AbstractEstimator) -> None:
+    """Raise ValueError if an estimator cannot choose the order that it is asked to choose."""
+    if order == AUTO and not issubclass(estimator.driver, HarmonicDriver):
+        raise ValueError(
+            f'order="auto" needs maximum likelihood, but the method is {str(estimator)!r}; give a '
+            "number of poles, as in order=5, or record several whole pulse periods"
+        )
+
+
+def for_calibrations(
+    asked: AbstractEstimator | None, recordings: Sequence[Inspected]
+) -> AbstractEstimator:
+    """The requested estimator, or the default estimator of calibrations.
+
+    The default is maximum likelihood if all records hold several periods. Otherwise it is output
+    error: in a single period the aliases are not in the standard errors of maximum likelihood.
+    """
+    if asked is not None:
+        return asked
+    several = all(seen.periods[0] > 1 and seen.is_periodic for seen in recordings)
+    return MAXIMUM_LIKELIHOOD if several else OUTPUT_ERROR
+
+
+def check_default(estimator: AbstractEstimator, circuits: Sequence[AbstractCircuit]) -> None:
+    """Raise ValueError if the default estimator cannot identify these circuits."""
+    try:
+        check_circuits(estimator, circuits)
+    except ValueError as error:
+        raise ValueError(
+            "the record holds less than two whole pulse periods or begins in a pulse, or its "
+            f"driver was identified without harmonics; {str(error).partition(';')[0]}. Record "
+            "three periods or more and identify the driver with method='maximum_likelihood', or "
+            "ask for method='maximum_likelihood', whose standard errors do not include the "
+            "effect of aliases in a single period"
+        ) from error
+
+
+def plan(
+    options: Options, seen: Inspected, driver: AbstractFeed
+) -> tuple[AbstractEstimator, str | None]:
+    """The estimator of a load, and the verdict that excludes a fit; None if it can be fitted.
+
+    Raises:
+        ValueError: The estimator cannot use this driver.
+    """
+    of_caller = options.estimator
+    name = preflight(seen, periodic=of_caller is not None and of_caller.lane.periodic)
+    estimator = of_caller or OUTPUT_ERROR
+    if name is None and isinstance(driver, HarmonicDriver | MeasuredCurrent):
+        estimator = for_calibrations(of_caller, [seen])
+        if of_caller is None and estimator is MAXIMUM_LIKELIHOOD and seen.by_current is not None:
+            name = preflight(seen.by_current, periodic=True)
+            estimator = WITH_CURRENT if name is not None or seen.has_all else estimator
+    if name is None and isinstance(estimator, MaximumLikelihood) and estimator.with_current:
+        if not seen.has_all:
+            raise ValueError(
+                f"recording {seen.recording.path!r}: method {str(estimator)!r} needs a driver and "
+                "a current, and no disturbed periods; use method='maximum_likelihood'"
+            )
+        if seen.by_current is not None and seen.by_current.is_aliased:
+            name = "biased"
+    if name is None and estimator.lane.periodic and seen.is_aliased:
+        name = "biased"
+    estimator.check_driver(driver, seen.recording.sample_rate, seen.recording.pulse_rate)
+    return options.given_to(estimator), name
+
+
+def order_of(value: Any) -> Order:
+    """The number of poles of a driver, or `"auto"`.
+
+    Raises:
+        RecordingError: The value is neither a whole number from 2 to `LARGEST_ORDER` nor `"auto"`.
+    """
+    try:
+        order = None if isinstance(value, bool) else operator.index(value)
+    except TypeError:
+        order = None
+    if isinstance(value, str) and value == AUTO:
+        return AUTO
+    if order is not None and 2 <= order <= LARGEST_ORDER:
+        return order
+    raise RecordingError(
+        f"is {reprlib.repr(value)}, must be a whole number from 2 to {LARGEST_ORDER}, or 'auto'",
+        field="order",
+        remedy='Pass a number of poles, as in order=5, or order="auto"',
+    )
+
+
+def _part(field: str, value: Any) -> float:
+    """A relative standard deviation."""
+    if not 0 <= (part := number_of(field, value)) < 1:
+        raise ValueError(f"{field} is {value}; it must be at least 0 and below 1")
+    return part
+
+
+def _range(field: str, value: Any) -> tuple[float, float]:
+    """A range of impedances [Ω].
+
+    Raises:
+        RecordingError: It is no pair of numbers, or it is empty.
+    """
+    try:
+        low, high = map(float, value)
+    except (TypeError, ValueError):
+        low = high = math.nan
+    if 0 <= low < high:
+        return low, high
+    raise RecordingError(
+        f"is {reprlib.repr(value)}, must be the lowest and the highest impedance [ohm]",
+        field=field,
+        remedy=f"Pass a pair, as in {field}={PLAUSIBLE}",
+    )
+
+
+def _informed(
+    fixed: Mapping[str, float] | None, prior: Mapping[str, tuple[float, float]] | None
+) -> Known:
+    """The elements that are known before a fit, from the arguments of a caller.
+
+    Raises:
+        RecordingError: An argument is no mapping, an element is both fixed and has a prior, or a
+            value is no number.
+    """
+    for field, value in (("fixed", fixed), ("prior", prior)):
+        if not isinstance(value, Mapping | None):
+            raise RecordingError(
+                f"is {reprlib.repr(value)}, must name the elements",
+                field=field,
+                remedy='Pass fixed={"r_s": 500.0} or prior={"r_s": (500.0, 50.0)}',
+            )
+    fixed, prior = dict(fixed or {}), dict(prior or {})
+    for name in fixed.keys() & prior.keys():
+        raise RecordingError(f"{name} is fixed and has a prior", field="prior", remedy="Remove one")
+    try:
+        known = [(str(name), float(value), 0.0) for name, value in fixed.items()]
+        known += [(str(name), float(mean), float(std)) for name, (mean, std) in prior.items()]
+    except (TypeError, ValueError):
+        raise RecordingError(
+            "must be numbers [SI]",
+            field="prior" if prior else "fixed",
+            remedy='Pass fixed={"r_s": 500.0} or prior={"r_s": (500.0, 50.0)}',
+        ) from None
+    return tuple(known)
+
+
+def _bounded(bounds: Mapping[str, Interval] | None) -> Limits:
+    """The bounds of elements, from the argument of a caller. Elements are positive.
+
+    Raises:
+        RecordingError: A bound is no number.
+    """
+    try:
+        ends = [(str(name), low, high) for name, (low, high) in dict(bounds or {}).items()]
+        return tuple(
+            (name, float(low or 0.0), math.inf if high is None else float(high))
+            for name, low, high in ends
+        )
+    except (TypeError, ValueError):
+        raise RecordingError(
+            "must be pairs of numbers [SI] or None",
+            field="bounds",
+            remedy='Pass bounds={"r_s": (100.0, 2e3)}, or (100.0, None) without an upper bound',
+        ) from None

@@ -1,0 +1,193 @@
+"""Options of a fit: the same at every public function, checked at the call, kept in files."""
+
+import dataclasses
+import re
+from typing import Any
+
+import h5py
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import etid
+from benchmarks.specimens import study_fits
+from etid import cli
+from etid.identify import file as files
+from etid.identify.options import Options
+from etid.results.provenance import PLAUSIBLE
+from etid.results.study_fits import StudyFits
+from etid.simulation.scenes import Scene, Trial
+from etid.simulation.transformer import ResistorLoad, SkinLoad
+
+STRING = "R0-p(R1,C1)"
+DRY = SkinLoad(r_s=33.4e3, r_p=186e3, c_p=0.12e-9)
+KNOWN: dict[str, Any] = {
+    "fixed": {"r_0": 33.4},
+    "prior": {"c_1": (0.12e-6, 0.02e-6)},
+    "bounds": {"r_1": (100.0, None)},
+}
+OF_STUDY: dict[str, Any] = {"order": 4, "circuit": STRING, "plausible": (0.0, np.inf), **KNOWN}
+ON_COMMAND_LINE = (
+    *("--order", "4", "--circuit", STRING, "--plausible", "0:inf"),
+    *("--fix", "r_0=33.4", "--prior", "c_1=1.2e-7,2e-8", "--bound", "r_1=100:"),
+)
+REFUSED: dict[str, str] = {
+    "etid.identify_driver(calibration, order=1)": "order: is 1, must be a whole number from 2 to",
+    "etid.identify_study(study, order=1)": "order: is 1, must be",
+    "etid.identify_jointly(study, order=21)": "order: is 21, must be",
+    "etid.fit_file('absent.h5', 'fits.h5', order=1)": "order: is 1, must be",
+    "etid.identify_study(study, order='auto', method='output_error')": "needs maximum likelihood",
+    "etid.identify_driver(calibration, plausible=(3e5, 3e2))": "plausible: is (300000.0, 300.0),",
+    "etid.identify_study(study, plausible=(-1.0, 3e2))": "plausible: is (-1.0, 300.0), must be",
+    "etid.identify_jointly(study, plausible=(1.0, np.nan))": "plausible: is (1.0, nan), must be",
+    "etid.fit_file('absent.h5', 'fits.h5', plausible=(1.0, 1.0))": "plausible: is (1.0, 1.0), must",
+    "etid.identify_study(study, driver_drift=-0.1)": "driver_drift is -0.1; it must be at least 0",
+    "etid.fit_file('absent.h5', 'fits.h5', driver_drift=1.0)": "driver_drift is 1.0; it must be",
+    "etid.identify_study(study, method='equation_error', driver_drift=0.1)": "gives none",
+    "etid.identify_jointly(study, r_load_tolerance=-0.1)": "r_load_tolerance is -0.1; it must be",
+    "etid.identify_jointly(study, r_load_tolerance=np.nan)": "r_load_tolerance is nan; it must be",
+    "etid.identify_study(study, method='guess')": "method 'guess' is not known",
+    "etid.identify_study(study, method='equation_error', fixed={'r_s': 1.0})": "no known elements",
+    "etid.identify_study(study, fixed={'r_9': 1.0})": "'r_9' is no element of SkinRC",
+    "etid.identify_study(study, bounds={'r_s': (2.0, 1.0)})": "the bounds of r_s are 2 and 1",
+    "etid.identify_study(study, circuit='R0-p(R1')": "'R0-p(R1' is no circuit: cannot read",
+    "etid.identify_skin(recording, circuit='R0-R0')": "has R0 twice",
+    "etid.identify_skins([recording], circuit='SkinRC')": "circuit: is str 'SkinRC', must be",
+    "etid.identify_impedance([1.0], [1j], circuit='auto')": "circuit: is str 'auto', must be",
+    "etid.identify_samples(*records, driver, **rates, circuit='R0-')": "'R0-' is no circuit",
+    "etid.select_circuit(recording, candidates=['R0', 'R1'])": "holds R0 and R1, which have the",
+}
+
+
+@pytest.fixture(scope="module")
+def study():
+    """Two recordings of skin, and a calibration whose resistor is given in kΩ."""
+    trials = tuple(Trial(f"loaded/{number}", DRY) for number in range(2))
+    scene = Scene(trials, (Trial("calibration", ResistorLoad(98.8e3)),), samples=10_000)
+    recordings = [
+        one.replace(r_load=98.8) if one.r_load else one
+        for one in scene.simulate(seed=4).recordings()
+    ]
+    return etid.Study.from_recordings(recordings)
+
+
+@pytest.fixture(scope="module")
+def source(study, tmp_path_factory):
+    path = tmp_path_factory.mktemp("options") / "study.h5"
+    study.write(path)
+    return path
+
+
+@pytest.fixture(scope="module")
+def fitted(source):
+    target = source.with_name("fits.h5")
+    etid.fit_file(source, target, method="maximum_likelihood", **OF_STUDY)
+    return target
+
+
+def stored(path):
+    """The settings in a file of fits."""
+    settings = StudyFits.read(path).settings
+    assert settings is not None
+    return settings
+
+
+@pytest.mark.parametrize("call", REFUSED)
+def test_options_that_cannot_be_are_refused_at_the_call(study, call):
+    names = {
+        "records": (jnp.ones(1000), jnp.ones(1000)),
+        "rates": {"sample_rate": 2e5, "pulse_rate": 60.0},
+        "driver": study_fits().drivers["calibration/0",],
+        "study": study,
+        "calibration": study["calibration"],
+        "recording": study["loaded/0"],
+    }
+    with pytest.raises(ValueError, match=re.escape(REFUSED[call])):
+        eval(call, {"etid": etid, "np": np, **names})
+
+
+def test_all_functions_of_skin_take_the_same_options(study):
+    """The circuit is that of the string, and each option reaches the fit."""
+    driver = etid.identify_driver(study["calibration"], plausible=(0.0, np.inf))
+    recording = study["loaded/0"]
+    options = {"method": "maximum_likelihood", **KNOWN}
+    fit = etid.identify_skin(recording, driver, circuit=STRING, **options)
+    many = etid.identify_skins([recording], driver, circuit=STRING, **options)[0]
+    chosen = etid.select_circuit(recording, driver, candidates=[STRING], **options).fit
+    several = etid.identify_amplitudes([recording], driver, circuit=STRING, **KNOWN)
+    for one in (fit, many, chosen, several):
+        assert type(one.circuit) is type(etid.circuit(STRING))
+        assert one.circuit.values()[0] == pytest.approx(33.4, rel=1e-6)
+        assert one.limits is not None
+    np.testing.assert_array_equal(many.circuit.values(), fit.circuit.values())
+    np.testing.assert_array_equal(chosen.circuit.values(), fit.circuit.values())
+    free = etid.identify_skin(recording, driver, circuit=STRING)
+    assert (fit.stderr.values() < free.stderr.values()).all()
+
+
+def test_a_circuit_string_is_its_circuit_wherever_a_circuit_is_taken(study):
+    driver = etid.identify_driver(study["calibration"], plausible=(0.0, np.inf))
+    recording, circuit = study["loaded/0"], etid.circuit(STRING)
+    frequency = np.geomspace(1e2, 1e5, 20)
+    z = np.asarray(circuit.response(jnp.asarray(frequency)))
+    for of in (
+        lambda one: etid.identify_impedance(frequency, z, circuit=one).circuit.values(),
+        lambda one: etid.predict(recording, driver, one),
+    ):
+        np.testing.assert_array_equal(of("R0 - p(R1, C1)"), of(circuit))
+
+
+def test_all_functions_of_studies_take_the_same_options(study, source, fitted):
+    """By default no driver is accepted; each function stores what it was asked for."""
+    asked = vars(stored(fitted)) | {"source": "", "source_size": 0}
+    for found, method in (
+        (etid.identify_study(study, method="maximum_likelihood", **OF_STUDY), "maximum_likelihood"),
+        (etid.identify_jointly(study, **OF_STUDY), "joint"),
+    ):
+        assert vars(found.settings) == {**asked, "asked_method": method}
+        assert found.drivers["calibration",].verdict == "successful"
+    other = source.with_name("joint.h5")
+    command = ["fit", str(source), "-o", str(other), "--joint", "--r-load-tolerance", "0.01"]
+    assert cli.main([*command, *ON_COMMAND_LINE]) == 0
+    changed = {"asked_method": "joint", "r_load_tolerance": 0.01}
+    assert vars(stored(other)) == vars(stored(fitted)) | changed
+    assert not etid.identify_study(study, order=4).fits.counts().get("successful")
+
+
+def test_a_tolerance_that_no_fit_would_contain_is_refused(source, tmp_path, capsys):
+    target = tmp_path / "fits.h5"
+    assert cli.main(["fit", str(source), "-o", str(target), "--r-load-tolerance", "0.01"]) == 1
+    assert "add --joint, or remove it" in capsys.readouterr().err
+    assert not target.exists()
+
+
+def test_files_of_fits_store_the_options_and_older_files_are_read(fitted, tmp_path):
+    settings = stored(fitted)
+    assert settings.plausible == (0.0, np.inf)
+    assert (settings.fixed, settings.bounds) == (("r_0 33.4",), ("r_1 above 100.0",))
+    older = tmp_path / "older.h5"
+    older.write_bytes(fitted.read_bytes())
+    with h5py.File(older, "r+") as content:
+        del content.attrs["plausible"]
+    assert stored(older) == dataclasses.replace(settings, plausible=PLAUSIBLE)
+
+
+def test_a_run_of_another_range_of_drivers_is_not_resumed(source, tmp_path, monkeypatch):
+    def interrupted(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(files, "identify_part", interrupted)
+    target = tmp_path / "fits.h5"
+    with pytest.raises(KeyboardInterrupt):
+        etid.fit_file(source, target, plausible=(0.0, np.inf))
+    with pytest.raises(files.ResumeError, match="another plausible;"):
+        etid.fit_file(source, target, resume=True)
+    with pytest.raises(KeyboardInterrupt):
+        etid.fit_file(source, target, plausible=(0.0, np.inf), resume=True)
+
+
+def test_equal_options_are_one_key_whatever_numbers_the_circuit_has():
+    """A worker keeps its drivers by them; a circuit of arrays has no hash."""
+    arrays = Options.of([etid.SkinRC(r_s=np.asarray(1e3))], order=4)
+    assert {arrays: "kept"}[Options.of([etid.SkinRC()], order=4)] == "kept"
+    assert arrays != Options.of([etid.SkinRC()], order=5)
