@@ -18,18 +18,26 @@ from etid.solvers import least_squares, successive
 from etid.solvers.levenberg_marquardt import LevenbergMarquardt, NormalEquations
 
 STEPS = 50  # largest number of steps at the knots of one point
+# Scale of a step in the logarithm of an element, and in a delay [samples].
+FARTHEST = 3.0
 DISTANT = 0.1  # part of ½ Σ r² that a step promises, above which a point is distant
 NEAR = 4.0  # χ² of the likeliest start; below this value the other starts are not tried
 
 
 def _equations(_, q: Float[Array, " q"], terms: AtKnots) -> NormalEquations:
-    """Normal equations of the condensed terms and of the priors."""
-    found, prior = terms.equations(q), 1 / terms.gains.widths(q)
+    """Normal equations of the condensed terms, of the priors, and of the distance from the point.
+
+    The distance keeps a step where the approximation holds (the proximal point algorithm of
+    Rockafellar 1976). At the minimum it has no effect.
+    """
+    found, prior, at = terms.equations(q), 1 / terms.gains.widths(q), terms.near.q
     rest = prior * (q - terms.gains.centre(q))
+    near = jnp.where(jnp.arange(q.size) < terms.gains.owned, 1 / FARTHEST, 0.0)
+    off = near * (q - at)
     return NormalEquations(
-        found.objective + 0.5 * jnp.dot(rest, rest),
-        found.gradient + prior * rest,
-        found.matrix + jnp.diag(prior**2),
+        found.objective + 0.5 * (jnp.dot(rest, rest) + jnp.dot(off, off)),
+        found.gradient + prior * rest + near * off,
+        found.matrix + jnp.diag(prior**2 + near**2),
     ).finite()
 
 
