@@ -1,4 +1,4 @@
-"""Which estimator when: the table of the README, made from the results of `speed_accuracy`."""
+"""Which estimator when: the table of benchmarks/README.md, made from the results of `speed_accuracy`."""
 
 import argparse
 import csv
@@ -14,7 +14,7 @@ from benchmarks.runner import option
 from benchmarks.speed_accuracy import FILE
 from etid.estimators.registry import names
 
-README = ROOT / "README.md"
+README = ROOT / "benchmarks" / "README.md"
 BEGIN, END = "<!-- python -m benchmarks which -->\n", "<!-- end -->\n"
 AS_GOOD = 1.25  # times the smallest error, that an estimator may have to be used for its speed
 WORTH = 0.5  # of the time that the first of them takes, from which on that is a reason
