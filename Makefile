@@ -4,7 +4,7 @@
 #   make test-portable  the tests that compare with stored numbers, with the instructions of an old processor
 #   make slow    the other tests: statistics, and what compiles long
 #   make ranking the benchmarks in short: which estimator is better, and is any wrong silently
-#   make notebooks  executes the notebooks: notebooks/*.ipynb, with their figures
+#   make notebooks  executes the notebooks: notebooks/executed/*.ipynb, with their figures
 #   make docs    the site: site/index.html; the notebooks are its gallery
 #   make wheel-test  the wheel in empty environments: PYTHONS="python3.11 python3.13" DEPENDENCIES=oldest
 #   make lint    style;  make types    static types;  make clean    remove what was made

@@ -1,4 +1,4 @@
-"""Which estimator when: the table of benchmarks/README.md, made from the results of `speed_accuracy`."""
+"""Which estimator when: a table of the benchmarks' README, from results of `speed_accuracy`."""
 
 import argparse
 import csv

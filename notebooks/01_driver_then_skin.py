@@ -1,9 +1,12 @@
 # ---
 # jupyter:
 #   jupytext:
+#     formats: ipynb,py:percent
 #     text_representation:
 #       extension: .py
 #       format_name: percent
+#       format_version: '1.3'
+#       jupytext_version: 1.19.6
 #   kernelspec:
 #     display_name: Python 3
 #     language: python
@@ -17,6 +20,8 @@
 # impedance of the driver, and then R_s, R_p and C_p of a fingertip with standard errors. It shows
 # how to judge the results. It also shows why the Steiglitz-McBride method of the paper gives only a
 # start for a better method.
+#
+# It needs etid and Jupyter (`pip install . jupyterlab`), and takes less than a minute.
 
 # %%
 # %matplotlib inline

@@ -1,9 +1,12 @@
 # ---
 # jupyter:
 #   jupytext:
+#     formats: ipynb,py:percent
 #     text_representation:
 #       extension: .py
 #       format_name: percent
+#       format_version: '1.3'
+#       jupytext_version: 1.19.6
 #   kernelspec:
 #     display_name: Python 3
 #     language: python
@@ -16,6 +19,8 @@
 # This notebook makes a table of fits from a file with subjects, conditions and trials. Then it
 # separates three parts of the spread: differences between people, differences between the trials of
 # one person, and measurement noise. A fourth part, the error of the driver, is in no spread.
+#
+# It needs etid and Jupyter (`pip install . jupyterlab`), and takes some seconds.
 
 # %%
 # %matplotlib inline

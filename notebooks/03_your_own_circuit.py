@@ -1,9 +1,12 @@
 # ---
 # jupyter:
 #   jupytext:
+#     formats: ipynb,py:percent
 #     text_representation:
 #       extension: .py
 #       format_name: percent
+#       format_version: '1.3'
+#       jupytext_version: 1.19.6
 #   kernelspec:
 #     display_name: Python 3
 #     language: python
@@ -17,6 +20,8 @@
 # to a SPICE netlist: skin of two layers, and skin with Cole's relaxation, a constant-phase element.
 # etid has both, as `etid.SkinLayers` and `etid.SkinCole`; this is how they are made. You will also
 # know how to see that a circuit is too small, or too large.
+#
+# It needs etid and Jupyter (`pip install . jupyterlab`), and takes less than a minute.
 
 # %%
 # %matplotlib inline

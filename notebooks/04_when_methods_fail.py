@@ -1,9 +1,12 @@
 # ---
 # jupyter:
 #   jupytext:
+#     formats: ipynb,py:percent
 #     text_representation:
 #       extension: .py
 #       format_name: percent
+#       format_version: '1.3'
+#       jupytext_version: 1.19.6
 #   kernelspec:
 #     display_name: Python 3
 #     language: python
@@ -16,6 +19,8 @@
 # This notebook shows seven ways to get a wrong answer, and the verdict of etid for each. Some of
 # the wrong fits look perfect. A residual does not show a wrong circuit, and a small RRSE does not
 # show a right one. Compare the residual with the noise of the record, and read the verdict.
+#
+# It needs etid and Jupyter (`pip install . jupyterlab`), and takes half a minute.
 
 # %%
 # %matplotlib inline

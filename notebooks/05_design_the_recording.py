@@ -1,9 +1,12 @@
 # ---
 # jupyter:
 #   jupytext:
+#     formats: ipynb,py:percent
 #     text_representation:
 #       extension: .py
 #       format_name: percent
+#       format_version: '1.3'
+#       jupytext_version: 1.19.6
 #   kernelspec:
 #     display_name: Python 3
 #     language: python
@@ -17,6 +20,8 @@
 # Cramér-Rao bound predicts the error before anything is recorded. From it follow the number of
 # pulses, their width, height and rate, the sample rate, and the calibration. At the end a
 # simulation shows that the bound is right.
+#
+# It needs etid and Jupyter (`pip install . jupyterlab`), and takes a minute.
 
 # %%
 # %matplotlib inline

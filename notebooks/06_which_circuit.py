@@ -1,9 +1,12 @@
 # ---
 # jupyter:
 #   jupytext:
+#     formats: ipynb,py:percent
 #     text_representation:
 #       extension: .py
 #       format_name: percent
+#       format_version: '1.3'
+#       jupytext_version: 1.19.6
 #   kernelspec:
 #     display_name: Python 3
 #     language: python
@@ -16,6 +19,8 @@
 # This notebook shows how etid chooses between one R_p ‖ C_p, a relaxation that is spread over time
 # constants (Cole), and two layers: for one recording, for a study, and for real data whose circuit
 # is known.
+#
+# It needs etid and Jupyter (`pip install . jupyterlab`), and takes about two minutes.
 
 # %%
 # %matplotlib inline

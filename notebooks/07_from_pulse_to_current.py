@@ -1,9 +1,12 @@
 # ---
 # jupyter:
 #   jupytext:
+#     formats: ipynb,py:percent
 #     text_representation:
 #       extension: .py
 #       format_name: percent
+#       format_version: '1.3'
+#       jupytext_version: 1.19.6
 #   kernelspec:
 #     display_name: Python 3
 #     language: python
@@ -15,6 +18,8 @@
 #
 # This notebook closes the loop: pulses are recorded, the skin is identified after each of them, and
 # the amplitude of the next pulse is chosen for a wanted charge. A finger becomes wet meanwhile.
+#
+# It needs etid and Jupyter (`pip install . jupyterlab`), and takes half a minute.
 
 # %%
 # %matplotlib inline

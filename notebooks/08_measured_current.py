@@ -1,9 +1,12 @@
 # ---
 # jupyter:
 #   jupytext:
+#     formats: ipynb,py:percent
 #     text_representation:
 #       extension: .py
 #       format_name: percent
+#       format_version: '1.3'
+#       jupytext_version: 1.19.6
 #   kernelspec:
 #     display_name: Python 3
 #     language: python
@@ -16,6 +19,8 @@
 # A stimulator that measures its current needs no driver and no calibration. At the end you will
 # know how precise such recordings are, and what real ones need before they can be believed: the
 # right edges, the same filter in both channels, and a circuit that the data support.
+#
+# It needs etid and Jupyter (`pip install . jupyterlab`), and takes a minute.
 
 # %%
 # %matplotlib inline

@@ -54,6 +54,18 @@ def test_there_is_a_notebook():
     assert NOTEBOOKS
 
 
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
+def test_notebook_opens_in_jupyter_as_it_is(path):
+    """Its file for Jupyter has the cells of the script, without outputs: `jupytext --sync`."""
+    with jupyter_warnings_allowed():
+        import jupytext
+    script, notebook = jupytext.read(path), nbformat.read(path.with_suffix(".ipynb"), as_version=4)
+    nbformat.validate(notebook)
+    cells = [[(cell.cell_type, cell.source) for cell in of.cells] for of in (script, notebook)]
+    assert cells[0] == cells[1]
+    assert not any(cell.get("outputs") for cell in notebook.cells)
+
+
 @pytest.mark.notebook
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
 def test_notebook_runs_from_top_to_bottom_and_shows_its_figures(path, tmp_path, running_kernel):
@@ -82,7 +94,9 @@ def test_notebook_runs_from_top_to_bottom_and_shows_its_figures(path, tmp_path, 
     assert len(pictures) == len(wanted) > 0
     warned = [output.text for output in outputs if output.get("name") == "stderr"]
     assert all(text.startswith(COMPILING) for text in warned)
-    nbformat.write(notebook, path.with_suffix(".ipynb"))  # for readers, and for the site
+    executed = path.parent / "executed"  # for readers, and for the site
+    executed.mkdir(exist_ok=True)
+    nbformat.write(notebook, executed / f"{path.stem}.ipynb")
 
 
 def blocks_of(path):

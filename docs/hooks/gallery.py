@@ -27,7 +27,7 @@ log = get_plugin_logger("gallery")
 
 def executed(path):
     """Markdown of an executed notebook, its figures by name, and its run time [s]."""
-    made = path.with_suffix(".ipynb")
+    made = path.parent / "executed" / f"{path.stem}.ipynb"
     if made.exists() and made.stat().st_mtime > path.stat().st_mtime:
         notebook = nbformat.read(made, as_version=4)
         taken = notebook.metadata["etid"]["seconds"]

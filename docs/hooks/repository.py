@@ -54,7 +54,7 @@ def on_page_markdown(markdown, page, config, files):
         target = posixpath.normpath(posixpath.join(source, link[1]))
         target = target.removeprefix("docs/")
         if target.startswith("notebooks/"):
-            target = target.removesuffix(".py") + ".md"
+            target = posixpath.splitext(target)[0] + ".md"
         return posixpath.relpath(target, here or ".")
 
     return LINK.sub(moved, markdown)
