@@ -22,8 +22,8 @@ PREFIXES = {
 }  # fmt: skip
 
 
-def scaled(unit: str, value: float = np.nan) -> tuple[float, str]:
-    """Size [SI] and symbol of the unit in which a value is shown.
+def scaled(unit: str, value: float = np.nan, error: float = np.nan) -> tuple[float, str]:
+    """Size [SI] and symbol of the unit in which a value is shown, or its error if this is larger.
 
     It is that of `DISPLAY`, or one with another prefix if the number would be below 0.01 or above
     10 000.
@@ -31,8 +31,9 @@ def scaled(unit: str, value: float = np.nan) -> tuple[float, str]:
     Args:
         unit: SI unit, a key of `DISPLAY`.
         value: The value in the SI unit.
+        error: Its standard error in the SI unit; NaN if there is none.
     """
-    size = abs(value)
+    size = max(abs(value), error) if np.isfinite(error) else abs(value)
     shown = size / DISPLAY[unit][0]
     usual = not (np.isfinite(shown) and shown > 0) or 0.01 <= shown < 1e4
     if usual or unit not in SYMBOLS:
@@ -90,5 +91,5 @@ def quantity(value: float, unit: str, error: float = np.nan) -> str:
         unit: SI unit, a key of `DISPLAY`.
         error: Standard error in the SI unit; NaN if there is none.
     """
-    scale, symbol = scaled(unit, value)
+    scale, symbol = scaled(unit, value, error)
     return " ".join([*plus_minus(value / scale, error / scale).split(), symbol]).rstrip()

@@ -137,14 +137,13 @@ def element_rows(
     """
     rows = []
     for i, (name, unit) in enumerate(units.items()):
-        usual = float(values[i]) if values.ndim == 1 else np.nan
-        scale, symbol = scaled(unit, usual)
-        value = values[..., i] / scale
         if values.ndim == 1:
-            error = np.nan if errors is None else float(errors[i]) / scale
-            text = plus_minus(float(value), error)
+            value, error = float(values[i]), np.nan if errors is None else float(errors[i])
+            scale, symbol = scaled(unit, value, error)
+            text = plus_minus(value / scale, error / scale)
         else:
-            finite = value[np.isfinite(value)]
+            scale, symbol = scaled(unit)
+            finite = values[..., i][np.isfinite(values[..., i])] / scale
             text = f"{finite.min():.4g} … {finite.max():.4g}" if finite.size else "nan"
         rows.append((name, text, symbol))
     return rows
