@@ -145,13 +145,10 @@ def estimates(
             result: optx.RESULTS,
             sums_of: Float[Array, "record x common"] = sums_of,
         ) -> Found:
-            shared = eliminated.slope @ cov @ eliminated.slope.T
-            private = eliminated.cov
+            private, shared = eliminated.cov, eliminated.slope @ cov @ eliminated.slope.T
             if by_x is not None:
-                of_x, cross = _by_x(load, by_x, sums_of)
-                cross = cross @ bread @ eliminated.slope.T
-                shared = shared + of_x + cross + cross.T
-                private = private - of_x
+                of_x, more = _by_x(load, by_x, sums_of, eliminated.slope @ bread)
+                private, shared = private - of_x, shared + more
             whole = private + shared
             e = own.log_elements.size
             estimate = Estimate(
@@ -280,16 +277,17 @@ def _sums(loads: Loads, by_x: _ByX | None, records: int, common: int) -> _Sums:
 
 
 def _by_x(
-    load: Loads, by_x: _ByX, sums: Float[Array, "record x common"]
-) -> tuple[Float[Array, "own own"], Float[Array, "own common"]]:
+    load: Loads,
+    by_x: _ByX,
+    sums: Float[Array, "record x common"],
+    follows: Float[Array, "own common"],
+) -> tuple[Float[Array, "own own"], Float[Array, "own own"]]:
     """Covariance of the own parameters of a load by the noise of a shared X.
 
-    The second result is their covariance with the effect of this noise on the score of `common`
-    through the other loads.
+    The second result contains also their covariance with what they follow of `common`, which this
+    noise moves through the other loads. `follows` is their change by the score of `common`.
     """
     others = sums[load.unloaded] - jnp.where(load.used, by_x.of_common, 0.0)
+    of_x, cross = by_x.of_own.T @ by_x.of_own, by_x.of_own.T @ others @ follows.T
     several = load.unloaded >= 0
-    return (
-        jnp.where(several, by_x.of_own.T @ by_x.of_own, 0.0),
-        jnp.where(several, by_x.of_own.T @ others, 0.0),
-    )
+    return jnp.where(several, of_x, 0.0), jnp.where(several, of_x + cross + cross.T, 0.0)
