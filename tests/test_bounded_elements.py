@@ -171,6 +171,24 @@ def test_profiles_keep_to_the_bounds(free, beyond):
     np.testing.assert_allclose(ends, [middle, middle + 1.96 * error], rtol=0, atol=0.4 * error)
 
 
+def test_profiles_of_other_elements_keep_to_an_upper_bound(noisy, free):
+    """R_s may not be above its bound, so R_p, which has its sum with R_s, may hardly be below."""
+    bound = above(free, -1.0)
+    profile = etid.identify_skin(noisy, bounds={"r_s": (None, bound)}).profile("r_p")
+    cov = np.asarray(free.cov)
+    middle = float(free.circuit.r_p) + cov[0, 1] / cov[0, 0] * (bound - float(free.circuit.r_s))
+    error = np.sqrt(cov[1, 1] - cov[0, 1] ** 2 / cov[0, 0])
+    # That of a normal distribution of R_p at the bound of R_s, up to the skew at 20 dB.
+    low = profile.interval()[0]
+    np.testing.assert_allclose(low, middle - 1.96 * error, rtol=0, atol=0.4 * error)
+
+
+def test_an_element_that_the_data_hardly_know_has_the_error_of_its_prior(noisy, free):
+    width = 0.01 * float(free.stderr.r_s)
+    fit = etid.identify_skin(noisy, prior={"r_s": (float(free.circuit.r_s), width)})
+    np.testing.assert_allclose(fit.stderr.r_s, width, rtol=1e-3)
+
+
 def test_bounds_far_away_leave_intervals_and_profiles_as_they_are(noisy, free):
     fit = etid.identify_skin(noisy, bounds={"r_s": (1.0, 1e9)})
     for name, ends in fit.intervals().items():

@@ -93,6 +93,29 @@ def test_standard_errors_hold_what_the_parts_of_the_driver_drift_by(driver, name
     assert (covered > 0.90).all(), covered
 
 
+def test_every_parameter_of_the_driver_drifts_by_the_same_part(driver):
+    """Gains are in their units, frequencies, dampings and R are logarithms."""
+    std = ravel_pytree(driver.source)[1](driver.drift_std())
+    gains = {"gain", "slope", "gain_real"}
+    for name in vars(driver.source):
+        value = np.asarray(getattr(driver.source, name))
+        expected = np.abs(value) if name in gains else np.ones(value.shape)
+        np.testing.assert_allclose(getattr(std, name), DRIFT * expected, rtol=1e-12, err_msg=name)
+
+
+def test_what_the_driver_drifts_by_is_in_the_shared_part_without_a_model_of_it(driver):
+    record = Scene((Trial("a", DRY),), trigger_jitter_rms=50e-9).simulate(seed=2)["a"]
+    steady = dataclasses.replace(driver, drift=None)
+    with_it, without = (
+        etid.identify_skin(record, of, method="non_parametric") for of in (driver, steady)
+    )
+    np.testing.assert_allclose(
+        with_it.cov - with_it.shared_cov, without.cov - without.shared_cov, rtol=1e-9
+    )
+    grown = np.diagonal(with_it.shared_cov) / np.diagonal(without.shared_cov)
+    assert (grown > 4).all(), grown
+
+
 @pytest.mark.parametrize("drift", [-0.01, 1.0, np.nan])
 def test_a_drift_is_a_part(drift):
     with pytest.raises(ValueError, match="driver_drift"):

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 import etid
+from etid.identify.posterior import stretched
 from etid.results.posterior import Profile
 from etid.simulation.scenes import Scene, Trial
 from etid.simulation.transformer import ResistorLoad, SkinLoad
@@ -50,6 +51,15 @@ def test_at_60_db_the_draws_have_the_errors_of_the_fit(clear, posterior):
     assert np.abs((mean - np.log(values)) / errors).max() < 0.15
     np.testing.assert_allclose(np.sqrt(np.diag(cov)), errors, rtol=0.1)
     assert np.abs(cov / np.outer(errors, errors) - fit.correlation).max() < 0.15
+
+
+def test_draws_are_stretched_to_the_covariance_of_the_fit():
+    draws = np.random.default_rng(3)
+    cov, wanted = (a @ a.T for a in draws.standard_normal((2, 3, 3)))
+    mean = draws.standard_normal(3)
+    q = mean + np.sqrt(3) * np.linalg.cholesky(cov).T  # three draws with this covariance exactly
+    moved = stretched(q, mean, cov, wanted) - mean
+    np.testing.assert_allclose(moved.T @ moved / 3, wanted, rtol=1e-9)
 
 
 def test_equal_seeds_give_equal_draws(clear, posterior):
