@@ -83,6 +83,15 @@ def test_another_pulse_of_the_same_driver_is_no_change(name, driver):
     assert not is_changed(driver), name
 
 
+@pytest.mark.parametrize("part", [{"c_cable": 1.3}, {"l_primary": 1.2, "l_secondary": 1.2}])
+def test_a_pulse_of_a_tenth_shows_what_has_changed_as_well(part):
+    """The noise of the calibration is that of a tenth of it."""
+    calibration = of_calibration(spectrum(study(snr_db=40.0)["calibration/0"]))
+    for amplitude in (1.0, 0.1):
+        later = study(changed(amplitude=amplitude, **part), 1, snr_db=60.0)["loaded/0"]
+        assert bool(differs(calibration, spectrum(later)))
+
+
 def test_other_pulse_rates_are_not_compared():
     assert not is_changed(changed(l_magnetising=1.2), pulse_rate=60.01)
 
