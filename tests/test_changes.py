@@ -44,6 +44,10 @@ def prepared_change(recording, scene, load):
     """Changes for the largest that do not matter, with the true driver and load, without a fit."""
     [of] = repeats([Inspected(recording)])
     assert of is not None
+    return prepared_of(of, scene, load)
+
+
+def prepared_of(of, scene, load):
     z_th = scene.driver.z_th(of.frequency)
     z = load(of.frequency)
     by = []
@@ -204,6 +208,24 @@ def test_r_s_that_falls_by_a_fifth_is_seen_at_40_db(seed):
     """R_s acts at high frequencies; from two of these records, bands up to 0.25 had too little."""
     scene, skin = rung("dry", snr_db=40.0), LOADS["dry"]
     assert change_of(recorded(scene, falling(skin, "r_s", 0.2), seed), scene, skin).seen
+
+
+def test_noise_that_is_larger_between_periods_than_within_is_no_change():
+    """Coloured noise: three times the scatter between periods makes three times the error."""
+    scene, skin = rung("dry", samples=16_667), LOADS["dry"]
+    [of] = repeats([Inspected(recorded(scene, [skin] * 5))])
+    assert of is not None
+    middle = of.gain.mean(0)
+    found = [
+        prepared_of(of._replace(gain=middle + size * (of.gain - middle)), scene, skin)(
+            np.zeros((1, 3))
+        )
+        for size in (2.0, 6.0)
+    ]
+    assert not found[0].seen[0]
+    assert not found[1].seen[0]
+    relative = [of.stderr / (1 + of.size) for of in found]  # of the logarithm
+    np.testing.assert_allclose(relative[1], 3 * relative[0], rtol=1e-6)
 
 
 def test_aliases_of_high_bands_are_no_noise_of_the_low_ones():
