@@ -77,7 +77,8 @@ def test_a_profile_and_the_draws_give_one_interval_where_the_likelihood_is_skewe
     """They share the likelihood and nothing else: one refits, the other integrates."""
     fit, *_ = identified(20.0, 0)
     profile = fit.profile("c_p")
-    assert profile.deviance.min() == pytest.approx(0.0, abs=1e-3)
+    # A search ends within 0.05 standard errors of the minimum: 0.0025.
+    assert profile.deviance.min() == pytest.approx(0.0, abs=3e-3)
     low, high = profile.interval()
     drawn = fit.posterior(draws=4000).intervals()["c_p"]
     error = float(fit.stderr.c_p)

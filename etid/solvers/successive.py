@@ -55,6 +55,14 @@ def close(
     return promised <= BEFORE**2 * objective / terms
 
 
+def promised(reduction: Float[Array, ""], result: optx.RESULTS) -> Float[Array, ""]:
+    """The reduction of ½ Σ r² by a fit of an approximation; infinite if the fit did not settle.
+
+    A solver that cannot move reduces nothing, but it is at no minimum.
+    """
+    return jnp.where(result == optx.RESULTS.successful, reduction, jnp.inf)
+
+
 class _State(NamedTuple):
     trial: Float[Array, " q"]
     best: Float[Array, " q"]

@@ -307,7 +307,7 @@ def minimum(
         common, owns = named(y)
         weak, _ = study.model.calibrations.weak(common)
         before = 0.5 * jnp.dot(weak, weak) + sum(part.objective for part in near.parts)
-        common, (_, _, found) = stepped(
+        common, (_, result, found) = stepped(
             lambda y, _: y,  # not evaluated: the solver takes the equations
             solver,
             common,
@@ -320,7 +320,9 @@ def minimum(
             own - jnp.einsum("lop,lp->lo", root, of)
             for own, root, of in zip(owns, near.roots, moved, strict=True)
         ]
-        return ravel_pytree((common, owns))[0], before - found.objective
+        return ravel_pytree((common, owns))[0], successive.promised(
+            before - found.objective, result
+        )
 
     y, least = successive.approached(approximate, follow, start, terms)
     return *named(y), least

@@ -101,8 +101,7 @@ def _search(
     ) -> tuple[Float[Array, " common"], Float[Array, ""]]:
         before, of = 0.5 * jnp.dot(near.terms, near.terms), (model, near.condensed)
         q, (_, result, found) = least_squares.stepped(lambda q, _: q, WELL, q, of, MAX_STEPS)
-        settled = result == optx.RESULTS.successful
-        return q, jnp.where(settled, before - found.objective, jnp.inf)
+        return q, successive.promised(before - found.objective, result)
 
     terms = 2 * jnp.sum(model.spectra.selected, dtype=start.dtype)
     return successive.approached(approximate, follow, start, terms)

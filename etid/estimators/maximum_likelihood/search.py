@@ -129,17 +129,15 @@ def _search(start: Float[Array, " q"], load: Load) -> tuple[Float[Array, " q"], 
             terms = AtKnots(gains, near, free)
 
             def stepped(q: Float[Array, " q"]) -> tuple[Float[Array, " q"], Float[Array, ""]]:
-                q, (_, _, last) = least_squares.stepped(
+                q, (_, result, last) = least_squares.stepped(
                     lambda q, of: of(q), solver, q, terms, STEPS
                 )
-                return q, last.objective
+                return q, successive.promised(here.objective - last.objective, result)
 
-            return jax.lax.cond(wanted, stepped, lambda q: (q, here.objective), q)
+            return jax.lax.cond(wanted, stepped, lambda q: (q, jnp.zeros(())), q)
 
-        target, objectives = jax.lax.scan(stage, q, (fields, free, wanted))
-        return (
-            jnp.where(close, q + newton, target),
-            jnp.where(close, promised, here.objective - objectives[-1]),
-        )
+        target, reduced = jax.lax.scan(stage, q, (fields, free, wanted))
+        target = jnp.where(close, q + newton, target)
+        return target, jnp.where(close, promised, reduced[-1])
 
     return successive.approached(approximate, follow, start, load.terms)
