@@ -20,27 +20,6 @@ def repeated(one, count):
     return jax.tree.map(lambda leaf: jnp.stack([leaf] * count), one)
 
 
-def test_the_sum_over_a_shared_record_adds_what_its_loads_have_in_common():
-    """Σ_i Σ_j≠i m_iᵀ m_j: of a load alone nothing is added, and bad loads do not take part."""
-    effects = np.random.default_rng(0).standard_normal((6, ROWS, COMMON))
-    line, wave = jnp.ones(HARMONICS), jnp.ones(HARMONICS, complex)
-    spectrum = Spectrum(line, wave, wave, line, line, line > 0)
-    loads = Loads(
-        spectrum=repeated(spectrum, 6),
-        sample_rate=jnp.arange(6.0),
-        own=repeated(LoadUnknowns(jnp.zeros(2), jnp.zeros(())), 6),
-        used=jnp.array([True, True, True, True, False, True]),
-        unloaded=jnp.array([0, 1, 0, -1, 0, 2]),
-    )
-    by_x = errors._ByX(jnp.asarray(effects), jnp.zeros((6, ROWS, 3)))
-    sums, added = errors._sums(loads, by_x, 3, COMMON)
-    np.testing.assert_allclose(sums, [effects[0] + effects[2], effects[1], effects[5]])
-    expected = effects[0].T @ effects[2] + effects[2].T @ effects[0]
-    np.testing.assert_allclose(added, expected, atol=1e-12)
-    _, none = errors._sums(loads, None, 0, COMMON)
-    np.testing.assert_array_equal(none, np.zeros((COMMON, COMMON)))
-
-
 def loads_with(unloaded, used):
     line, wave = jnp.ones(HARMONICS), jnp.ones(HARMONICS, complex)
     count = len(unloaded)
@@ -51,6 +30,19 @@ def loads_with(unloaded, used):
         used=jnp.array(used),
         unloaded=jnp.array(unloaded),
     )
+
+
+def test_the_sum_over_a_shared_record_adds_what_its_loads_have_in_common():
+    """Σ_i Σ_j≠i m_iᵀ m_j: of a load alone nothing is added, and bad loads do not take part."""
+    effects = np.random.default_rng(0).standard_normal((6, ROWS, COMMON))
+    loads = loads_with([0, 1, 0, -1, 0, 2], [True, True, True, True, False, True])
+    by_x = errors._ByX(jnp.asarray(effects), jnp.zeros((6, ROWS, 3)))
+    sums, added = errors._sums(loads, by_x, 3, COMMON)
+    np.testing.assert_allclose(sums, [effects[0] + effects[2], effects[1], effects[5]])
+    expected = effects[0].T @ effects[2] + effects[2].T @ effects[0]
+    np.testing.assert_allclose(added, expected, atol=1e-12)
+    _, none = errors._sums(loads, None, 0, COMMON)
+    np.testing.assert_array_equal(none, np.zeros((COMMON, COMMON)))
 
 
 def test_the_covariance_with_a_shared_record_is_that_of_all_parameters_at_once():

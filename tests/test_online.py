@@ -683,7 +683,7 @@ def test_an_electrode_whose_search_diverged_is_identified_by_the_next_pulse():
 
 
 def test_weak_pulses_do_not_add_up_to_a_wrong_answer():
-    """A twentieth of the amplitude at 40 dB: one pulse knows R_s of damp skin to 40 %.
+    """A fifteenth of the amplitude at 40 dB: one pulse knows R_s of damp skin to 40 %.
 
     Information about logarithms that was added up as it came gave 65 of 240 electrodes more than
     four standard errors off; what is known of R_s in ohm gives 10.

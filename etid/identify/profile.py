@@ -64,8 +64,7 @@ def _least(
 
     def equations(_, r: Float[Array, " free"], __) -> NormalEquations:
         value, jacobian = residual(r, None), jax.jacfwd(residual)(r, None)
-        matrix = jacobian.T @ jacobian
-        return NormalEquations(0.5 * value @ value, jacobian.T @ value, matrix).finite()
+        return NormalEquations.of(value, jacobian.T)
 
     solver = LevenbergMarquardt(rtol=1e-6, ftol=1e-8, equations=equations)
     found = optx.least_squares(

@@ -45,6 +45,13 @@ class NormalEquations(eqx.Module):
     gradient: Float[Array, " parameter"]
     matrix: Float[Array, "parameter parameter"]
 
+    @classmethod
+    def of(
+        cls, terms: Float[Array, " term"], rows: Float[Array, "parameter term"]
+    ) -> "NormalEquations":
+        """Those of terms r whose derivatives with respect to each parameter are `rows`, Jᵀ."""
+        return cls(0.5 * jnp.dot(terms, terms), rows @ terms, rows @ rows.T).finite()
+
     def scaled(self, by: Float[Array, " parameter"]) -> "NormalEquations":
         """The normal equations in the parameters z = `by` · y."""
         matrix = self.matrix / by[:, None] / by[None, :]
@@ -90,7 +97,7 @@ def normal_equations(
         return r, r
 
     jacobian, r = jax.jacfwd(twice, has_aux=True)(y)
-    return NormalEquations(0.5 * jnp.dot(r, r), jacobian.T @ r, jacobian.T @ jacobian).finite()
+    return NormalEquations.of(r, jacobian.T)
 
 
 def best_start(

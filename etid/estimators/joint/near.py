@@ -302,11 +302,9 @@ def minimum(
         return _Near(parts, roots, signals(common)), value
 
     def follow(
-        y: Float[Array, " parameter"], near: _Near, _: Float[Array, ""]
+        y: Float[Array, " parameter"], near: _Near, objective: Float[Array, ""]
     ) -> tuple[Float[Array, " parameter"], Float[Array, ""]]:
         common, owns = named(y)
-        weak, _ = study.model.calibrations.weak(common)
-        before = 0.5 * jnp.dot(weak, weak) + sum(part.objective for part in near.parts)
         common, (_, result, found) = stepped(
             lambda y, _: y,  # not evaluated: the solver takes the equations
             solver,
@@ -320,9 +318,8 @@ def minimum(
             own - jnp.einsum("lop,lp->lo", root, of)
             for own, root, of in zip(owns, near.roots, moved, strict=True)
         ]
-        return ravel_pytree((common, owns))[0], successive.promised(
-            before - found.objective, result
-        )
+        promised = successive.promised(objective - found.objective, result)
+        return ravel_pytree((common, owns))[0], promised
 
     y, least = successive.approached(approximate, follow, start, terms)
     return *named(y), least

@@ -53,7 +53,7 @@ def _equations_of_terms(_: Any, q: Float[Array, " common"], model: Calibrations)
     weak, by_weak = model.weak(q)
     terms = jnp.concatenate([terms.ravel(), weak])
     rows = jnp.concatenate([total(rows).reshape(q.size, -1), by_weak], axis=1)
-    return NormalEquations(0.5 * jnp.dot(terms, terms), rows @ terms, rows @ rows.T).finite()
+    return NormalEquations.of(terms, rows)
 
 
 def _equations_at_knots(
@@ -65,7 +65,7 @@ def _equations_at_knots(
     terms, rows = model.with_weak(
         q, condensed.terms(slopes.gains), condensed.rows(slopes.by_common)
     )
-    return NormalEquations(0.5 * jnp.dot(terms, terms), rows @ terms, rows @ rows.T).finite()
+    return NormalEquations.of(terms, rows)
 
 
 # A first fit with bands, and a fit with all harmonics from its minimum. From a distant start, the

@@ -2,9 +2,9 @@
 
 The likelihood is that of `etid.estimators.maximum_likelihood.profile` at the gains of
 `etid.estimators.maximum_likelihood.gains`, with the z of
-`etid.estimators.maximum_likelihood.given_driver` as parameters of Z_th. Near a
-point it is condensed (`etid.estimators.maximum_likelihood.condensed`): the search, covariance and
-score tests see only its knots.
+`etid.estimators.maximum_likelihood.given_driver` as parameters of Z_th. Near a point it is
+condensed (`etid.estimators.maximum_likelihood.condensed`): the search, covariance and score tests
+see only its knots.
 """
 
 import dataclasses

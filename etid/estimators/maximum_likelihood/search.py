@@ -43,10 +43,15 @@ def _equations(_, q: Float[Array, " q"], terms: AtKnots) -> NormalEquations:
 
 def _equations_of_load(_, q: Float[Array, " q"], load: Load) -> NormalEquations:
     """The same with the terms condensed at `q`, and the objective of all harmonics."""
-    near, rest, every = load.near(q), load.rest(q), jnp.ones(q.size, bool)
-    found = _equations(None, q, AtKnots(load.gains.at(load.knots), near, every))
-    objective = near.profile.objective + 0.5 * jnp.dot(rest, rest)
-    return dataclasses.replace(found, objective=objective).finite()
+    near, objective = _approximate(load, q)
+    terms = AtKnots(load.gains.at(load.knots), near, jnp.ones(q.size, bool))
+    return dataclasses.replace(_equations(None, q, terms), objective=objective).finite()
+
+
+def _approximate(load: Load, q: Float[Array, " q"]) -> tuple[Near, Float[Array, ""]]:
+    """The load near `q`, and ½ Σ r² of all harmonics there."""
+    near, rest = load.near(q), load.rest(q)
+    return near, near.profile.objective + 0.5 * jnp.dot(rest, rest)
 
 
 ROUGHLY = LevenbergMarquardt(rtol=1e-2, ftol=1e-3)
@@ -106,10 +111,6 @@ def _search(start: Float[Array, " q"], load: Load) -> tuple[Float[Array, " q"], 
     free = jnp.stack([jnp.arange(start.size) < load.gains.owned, every])
     fields = jnp.array([[of.rtol, of.ftol, of.damping] for of in (ROUGHLY, WELL)])
 
-    def approximate(q: Float[Array, " q"]) -> tuple[Near, Float[Array, ""]]:
-        near, rest = load.near(q), load.rest(q)
-        return near, near.profile.objective + 0.5 * jnp.dot(rest, rest)
-
     def follow(
         q: Float[Array, " q"], near: Near, objective: Float[Array, ""]
     ) -> tuple[Float[Array, " q"], Float[Array, ""]]:
@@ -140,4 +141,4 @@ def _search(start: Float[Array, " q"], load: Load) -> tuple[Float[Array, " q"], 
         target = jnp.where(close, q + newton, target)
         return target, jnp.where(close, promised, reduced[-1])
 
-    return successive.approached(approximate, follow, start, load.terms)
+    return successive.approached(lambda q: _approximate(load, q), follow, start, load.terms)
