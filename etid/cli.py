@@ -156,7 +156,6 @@ def _module(name: str) -> Any:
 
     jax.config.update("jax_enable_x64", True)
     _keep_programs(jax.config)
-    importlib.import_module("etid.public")  # some classes get methods from the layers above them
     return importlib.import_module(f"etid.commands.{name}")
 
 

@@ -1,7 +1,7 @@
 """What a fit was made from, and what can be done with it.
 
-Pictures, draws and profiles belong to higher layers, which this one must not import. `etid.public`,
-above all layers, hands them over with `attach_methods`, so that a fit has them as methods.
+Pictures, draws and profiles belong to higher layers. A fit has them as methods, which import them
+when they are called.
 """
 
 import dataclasses
@@ -23,18 +23,10 @@ if TYPE_CHECKING:
 Shown = Literal["pulse", "impedance", "residual"]
 AnyAxes = np.ndarray | Sequence["matplotlib.axes.Axes"] | None
 _Kind = TypeVar("_Kind", bound="HasSource")
-_attached: dict[str, Callable[..., Any]] = {}
 
 
-def attach_methods(**functions: Callable[..., Any]) -> None:
-    """Make functions the methods of these names; their first argument is the fit."""
-    _attached.update(functions)
-
-
-def _attached_method(name: str) -> Callable[..., Any]:
-    if name not in _attached:  # only modules of etid were imported so far, not its public names
-        importlib.import_module("etid.public")
-    return _attached[name]
+def _of_higher_layer(module: str, name: str) -> Callable[..., Any]:
+    return getattr(importlib.import_module(module), name)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -116,7 +108,8 @@ class HasSource(Generic[Circuit]):
         Raises:
             TypeError: The recording is not known.
         """
-        return _attached_method("plot")(self, recording, driver, show=show, axes=axes)
+        drawn = _of_higher_layer("etid.plotting", "plot")
+        return drawn(self, recording, driver, show=show, axes=axes)
 
     def posterior(
         self,
@@ -146,7 +139,8 @@ class HasSource(Generic[Circuit]):
             ValueError: The recording is not known, or the fit is a batch, or comes from another
                 method than maximum likelihood, or its data do not determine all elements.
         """
-        return _attached_method("posterior")(self, recording, driver, draws=draws, seed=seed)
+        drawn = _of_higher_layer("etid.identify.posterior", "posterior")
+        return drawn(self, recording, driver, draws=draws, seed=seed)
 
     def profile(
         self, name: str, recording: Recording | None = None, driver: Driver | None = None
@@ -164,7 +158,7 @@ class HasSource(Generic[Circuit]):
         Raises:
             ValueError: The circuit has no such element, or as in `posterior`.
         """
-        return _attached_method("profile")(self, recording, driver, name)
+        return _of_higher_layer("etid.identify.profile", "profile")(self, recording, driver, name)
 
 
 def with_data(

@@ -82,6 +82,7 @@ class SourceImpedance(eqx.Module):
             real, imaginary = real + gain, imaginary - gain * turn
         return jax.lax.complex(real, imaginary)
 
+    @jax.jit  # JAX remembers its trace
     def slopes(
         self, frequency: Float[Array, " frequency"]
     ) -> Complex[Array, "parameter frequency"]:

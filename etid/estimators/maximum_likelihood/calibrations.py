@@ -170,6 +170,7 @@ class Calibrations(eqx.Module):
         rows = [by_source * by_z[None], alone * by_delay[None]]
         return GainSlopes(z_th, gains, by_z, jnp.concatenate(rows))
 
+    @jax.jit  # JAX remembers its trace
     def near(self, common: Float[Array, " common"]) -> NearCalibrations:
         """The calibrations near these common parameters."""
         profiles = apart(lambda c: self.profiles(self.gains(c)), common)
@@ -196,6 +197,7 @@ class Calibrations(eqx.Module):
         found = means(near.profiles, self.knots, jnp.stack([share, noise]))
         return Linear(near.jacobian, *near.padded(found, 1.0))
 
+    @jax.jit  # JAX remembers its trace
     def weak(
         self, common: Float[Array, " common"]
     ) -> tuple[Float[Array, " term"], Float[Array, "common term"]]:

@@ -71,8 +71,9 @@ def _equations_at_knots(
 # A first fit with bands, and a fit with all harmonics from its minimum. From a distant start, the
 # derivatives of the terms themselves find deeper minima than those with X̂. Z_th and a delay form a
 # curved valley. Near its floor, steps with the usual damping are so short that they seem to make no
-# progress.
-ROUGHLY = LevenbergMarquardt(rtol=1e-3, ftol=1e-6, equations=_equations_of_terms)
+# progress. A start that still creeps along the valley after `ROUGH_STEPS` is compared as it is.
+ROUGHLY = LevenbergMarquardt(rtol=1e-3, ftol=1e-5, equations=_equations_of_terms)
+ROUGH_STEPS = 100
 WELL = LevenbergMarquardt(rtol=SOLVER.rtol, ftol=3e-7, damping=1e-6, equations=_equations_at_knots)
 
 
@@ -143,7 +144,7 @@ def rough_source(
     """
     calibration = Calibration(r_load, jnp.zeros(r_load.shape), delay_std(r_load))
     model = Calibrations(start, calibration, bands, sample_rate)
-    solution = least_squares.least_squares(_terms, ROUGHLY, model.start(), model, MAX_STEPS)
+    solution = least_squares.least_squares(_terms, ROUGHLY, model.start(), model, ROUGH_STEPS)
     q, equations = solution.value, solution.stats["normal_equations"]
     kept = model.named(q).source.size
     # A spurious resonance fits noise, so that it lowers Σ r²; but it raises the variances.

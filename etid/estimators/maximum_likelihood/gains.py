@@ -180,6 +180,7 @@ class Gains(eqx.Module):
         each = zip(values, self.split(q)[1], strict=True)
         return jnp.stack([delayed(of, frequency, late, self.sample_rate) for of, late in each])
 
+    @jax.jit  # JAX remembers its trace
     def slopes(self, q: Float[Array, " q"]) -> Slopes:
         """The gains and their derivatives."""
         logs, _, z = self.split(q)
