@@ -57,6 +57,7 @@ from .results.driver import Driver as Driver
 from .results.fit import Fit as Fit
 from .results.fit import IdentificationError as IdentificationError
 from .results.fits import Fits as Fits
+from .results.instrument import Instrument as Instrument
 from .results.posterior import Posterior as Posterior
 from .results.posterior import Profile as Profile
 from .results.study_fits import StudyFits as StudyFits

@@ -3,6 +3,7 @@
 import argparse
 import concurrent.futures
 import contextlib
+import dataclasses
 import math
 import pathlib
 import sys
@@ -22,6 +23,7 @@ from etid.recordings import hdf5
 from etid.recordings.errors import RecordingError
 from etid.recordings.replacing import HDF5, claimed
 from etid.report.html import Table
+from etid.results.instrument import Instrument
 from etid.results.provenance import PLAUSIBLE
 from etid.results.study_fits import StudyFits
 from etid.results.tried_orders import Order
@@ -78,6 +80,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         default=0.0,
         metavar="PART",
         help="possible relative change of Z_th since its calibration, such as 0.01; default 0",
+    )
+    parser.add_argument(
+        "--tolerance",
+        type=_known,
+        action="append",
+        default=[],
+        metavar="NAME=VALUE",
+        help="standard deviation of an error of the instrument: gain, r_load or crosstalk "
+        "[relative], or capacitance [F], such as gain=1e-3; may be repeated",
     )
     parser.add_argument(
         "--plausible",
@@ -168,6 +179,15 @@ def _several(option: str, known: list[tuple[str, list[Any]]], count: int) -> dic
     return {name: numbers[0] if count == 1 else tuple(numbers) for name, numbers in known}
 
 
+def _instrument(told: list[tuple[str, list[Any]]]) -> Instrument | None:
+    """The tolerances of --tolerance."""
+    names = [field.name for field in dataclasses.fields(Instrument)]
+    for name, _ in told:
+        if name not in names:
+            raise ValueError(f"--tolerance knows no {name!r}; write {', '.join(names)}")
+    return Instrument(**_several("--tolerance", told, 1)) if told else None
+
+
 def _workers(text: str) -> int:
     """The value of --workers."""
     if not text.isdecimal() or not int(text):
@@ -186,6 +206,10 @@ def run(arguments: argparse.Namespace) -> Outcome:
         raise ValueError(f"--joint uses maximum_likelihood; remove --method {arguments.method}")
     if arguments.joint and arguments.driver_drift:
         raise ValueError("--joint identifies the driver itself; remove --driver-drift")
+    if arguments.joint and arguments.tolerance:
+        raise ValueError(
+            "--joint has no tolerances but --r-load-tolerance; remove --tolerance, or --joint"
+        )
     if arguments.r_load_tolerance and not arguments.joint:
         raise ValueError(
             "--r-load-tolerance enters the standard errors of joint fits; add --joint, or remove it"
@@ -222,6 +246,7 @@ def run(arguments: argparse.Namespace) -> Outcome:
                 **options,
                 method=arguments.method,
                 driver_drift=arguments.driver_drift,
+                instrument=_instrument(arguments.tolerance),
                 resume=arguments.resume,
                 executor=executor,
                 progress=progress,

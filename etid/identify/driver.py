@@ -16,7 +16,7 @@ from etid.estimators.score_tests import resistors
 from etid.identify import changes
 from etid.identify.arguments import check_distinct, recordings
 from etid.identify.one import checksum, needs_another, of_both
-from etid.identify.options import Options, check_order, for_calibrations
+from etid.identify.options import NO_INSTRUMENT, Options, check_order, for_calibrations
 from etid.identify.planning import explained
 from etid.numpy_tier.tiers import program
 from etid.precision import in_float64
@@ -25,6 +25,7 @@ from etid.recordings.recording import Recording
 from etid.recordings.repeats import repeats
 from etid.results.driver import ContinuousDriver, Driver, HarmonicDriver
 from etid.results.fit import IdentificationError
+from etid.results.instrument import Instrument
 from etid.results.provenance import PLAUSIBLE
 from etid.results.tried_orders import AUTO, Order
 from etid.results.verdicts import message, verdict
@@ -40,6 +41,7 @@ def identify_driver(
     method: Method | None = None,
     plausible: tuple[float, float] = PLAUSIBLE,
     driver_drift: float = 0.0,
+    instrument: Instrument | None = None,
     throw: bool = True,
 ) -> Driver:
     """Identify the source impedance Z_th from one or several records with known resistors.
@@ -58,6 +60,8 @@ def identify_driver(
         driver_drift: Relative standard deviation of the change of each parameter of Z_th between
             the calibration and the recording of a skin. It enters the standard errors of the
             skins, as part of `shared_cov`.
+        instrument: Tolerances of the instrument, as in `etid.Instrument(gain=1e-3)`. They enter the
+            standard errors of the skins, by maximum likelihood, as part of `shared_cov`.
         throw: Raise an error if the verdict is not successful.
 
     Returns:
@@ -70,7 +74,13 @@ def identify_driver(
             likelihood that could choose the order.
         IdentificationError: The verdict is not successful and `throw` is set.
     """
-    options = Options.of(order=order, method=method, plausible=plausible, driver_drift=driver_drift)
+    options = Options.of(
+        order=order,
+        method=method,
+        plausible=plausible,
+        driver_drift=driver_drift,
+        instrument=instrument,
+    )
     return calibrated(calibrations, options, throw)
 
 
@@ -125,6 +135,10 @@ def calibrated(
         driver = dataclasses.replace(driver, unloaded=unloaded)
     if options.driver_drift and isinstance(driver, ContinuousDriver):
         driver = dataclasses.replace(driver, drift=np.asarray(options.driver_drift))
+    if options.instrument is not None:
+        if not isinstance(driver, HarmonicDriver):
+            raise ValueError(NO_INSTRUMENT % driver.method)
+        driver = dataclasses.replace(driver, instrument=options.instrument.as_arrays())
     periods = repeats(seen)
     at = np.append(changes.bands(periods), 1e3)
     *z_th, at_1_khz = np.asarray(_response(driver, jax.device_put(at)))

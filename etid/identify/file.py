@@ -37,6 +37,7 @@ from etid.precision import in_float64
 from etid.recordings.hdf5 import read
 from etid.recordings.recording import RecordingError
 from etid.recordings.replacing import claimed, replace_text
+from etid.results.instrument import Instrument
 from etid.results.provenance import PLAUSIBLE
 from etid.results.study_fits import StudyFits
 from etid.results.tried_orders import Order
@@ -172,6 +173,7 @@ def fit_file(
     prior: Mapping[str, tuple[float, float]] | None = None,
     bounds: Mapping[str, Interval] | None = None,
     driver_drift: float = 0.0,
+    instrument: Instrument | None = None,
     plausible: tuple[float, float] = PLAUSIBLE,
     resume: bool = False,
     executor: concurrent.futures.Executor | None = None,
@@ -189,6 +191,7 @@ def fit_file(
         prior: As in `identify_skin`, for all recordings.
         bounds: As in `identify_skin`, for all recordings.
         driver_drift: As in `identify_driver`.
+        instrument: As in `identify_driver`.
         plausible: As in `identify_driver`.
         resume: Keep the parts of an earlier run that did not finish.
         executor: Executor that fits the parts. If not given, this process fits them.
@@ -213,6 +216,7 @@ def fit_file(
         bounds=bounds,
         order=order,
         driver_drift=driver_drift,
+        instrument=instrument,
         plausible=plausible,
     )
     source, target = os.path.abspath(source), pathlib.Path(target)

@@ -21,6 +21,7 @@ from etid.results.feed import AbstractFeed
 from etid.results.fit import Fit
 from etid.results.fits import Fits
 from etid.results.fits_columns import described
+from etid.results.instrument import Instrument
 from etid.results.provenance import PLAUSIBLE
 from etid.results.study_fits import StudyFits
 from etid.results.tried_orders import Order
@@ -133,6 +134,7 @@ def identify_study(
     prior: Mapping[str, tuple[float, float]] | None = None,
     bounds: Mapping[str, Interval] | None = None,
     driver_drift: float = 0.0,
+    instrument: Instrument | None = None,
     plausible: tuple[float, float] = PLAUSIBLE,
     progress: bool = False,
 ) -> StudyFits:
@@ -151,6 +153,7 @@ def identify_study(
         prior: As in `identify_skin`, for all recordings.
         bounds: As in `identify_skin`, for all recordings.
         driver_drift: As in `identify_driver`.
+        instrument: As in `identify_driver`.
         plausible: As in `identify_driver`.
         progress: Show a progress bar.
 
@@ -169,6 +172,7 @@ def identify_study(
         bounds=bounds,
         order=order,
         driver_drift=driver_drift,
+        instrument=instrument,
         plausible=plausible,
     )
     drivers = Drivers(study, options)

@@ -20,12 +20,13 @@ from etid.estimators.estimator import AbstractEstimator
 from etid.estimators.maximum_likelihood.estimator import MaximumLikelihood
 from etid.estimators.output_error.estimator import OutputError
 from etid.estimators.registry import MAXIMUM_LIKELIHOOD, OUTPUT_ERROR, WITH_CURRENT, Method, named
-from etid.identify.arguments import circuit_of, number_of
+from etid.identify.arguments import circuit_of, number_of, require
 from etid.recordings.preflight import Inspected, preflight
 from etid.recordings.recording import RecordingError
 from etid.recordings.study import Study
 from etid.results.driver import ContinuousDriver, HarmonicDriver
 from etid.results.feed import AbstractFeed, MeasuredCurrent
+from etid.results.instrument import Instrument
 from etid.results.provenance import PLAUSIBLE, Settings, versions
 from etid.results.tried_orders import AUTO, Order
 from etid.selection.search import usual_circuits
@@ -51,6 +52,12 @@ class FitOptions(TypedDict, total=False):
     bounds: Mapping[str, Interval] | None
 
 
+NO_INSTRUMENT = (
+    "the tolerances of an instrument are parameters of maximum likelihood, and the method is %r; "
+    "record three pulse periods or more, or identify the driver without instrument="
+)
+
+
 @dataclasses.dataclass(frozen=True)
 class Options:
     """What a caller asks for. Each public function makes it once, by `Options.of`.
@@ -63,6 +70,7 @@ class Options:
         bounds: Elements with bounds.
         order: Number of poles of Z_th.
         driver_drift: As in `identify_driver`.
+        instrument: As in `identify_driver`.
         r_load_tolerance: As in `identify_jointly`.
         plausible: As in `identify_driver`.
     """
@@ -73,6 +81,7 @@ class Options:
     bounds: Limits = ()
     order: Order = 5
     driver_drift: float = 0.0
+    instrument: Instrument | None = None
     r_load_tolerance: float = 0.0
     plausible: tuple[float, float] = PLAUSIBLE
 
@@ -87,6 +96,7 @@ class Options:
         bounds: Mapping[str, Interval] | None = None,
         order: Order = 5,
         driver_drift: float = 0.0,
+        instrument: Instrument | None = None,
         r_load_tolerance: float = 0.0,
         plausible: tuple[float, float] = PLAUSIBLE,
     ) -> "Options":
@@ -100,6 +110,8 @@ class Options:
                 element of a circuit, bounds are impossible, or a relative standard deviation is not
                 in 0 ≤ value < 1.
         """
+        if instrument is not None:
+            require("instrument", instrument, Instrument)
         estimator = None
         if method is not None:
             estimator = method if isinstance(method, AbstractEstimator) else named(str(method))
@@ -111,6 +123,7 @@ class Options:
             bounds=_bounded(bounds),
             order=order_of(order),
             driver_drift=_part("driver_drift", driver_drift),
+            instrument=instrument,
             r_load_tolerance=_part("r_load_tolerance", r_load_tolerance),
             plausible=_range("plausible", plausible),
         )
@@ -123,6 +136,8 @@ class Options:
                     "none; leave driver_drift out, or use method='maximum_likelihood' or "
                     "method='output_error'"
                 )
+            if instrument is not None and not isinstance(estimator, MaximumLikelihood):
+                raise ValueError(NO_INSTRUMENT % str(estimator))
         options._check_elements()
         return options
 
@@ -166,6 +181,11 @@ class Options:
             candidates=tuple(type(one).__name__ for one in self.circuits if several),
             r_load_tolerance=self.r_load_tolerance,
             driver_drift=self.driver_drift,
+            instrument=tuple(
+                f"{name} {value!r}"
+                for name, value in (self.instrument.stored() if self.instrument else {}).items()
+                if value
+            ),
             plausible=self.plausible,
             fixed=tuple(f"{name} {value!r}" for name, value, error in self.known if not error),
             prior=tuple(
@@ -305,6 +325,9 @@ def plan(
     if name is None and estimator.lane.periodic and seen.is_aliased:
         name = "biased"
     estimator.check_driver(driver, seen.recording.sample_rate, seen.recording.pulse_rate)
+    tolerant = isinstance(driver, ContinuousDriver) and driver.instrument is not None
+    if tolerant and not isinstance(estimator, MaximumLikelihood):
+        raise ValueError(NO_INSTRUMENT % str(estimator))
     return options.given_to(estimator), name
 
 

@@ -152,6 +152,11 @@ class Tracker(Overviewed):
         if not (np.isfinite(change) and change >= 0):
             raise ValueError(f"change is {change}; it must be finite and not negative")
         driver = serving(driver, HarmonicDriver, str(MAXIMUM_LIKELIHOOD))
+        if driver.instrument is not None:
+            raise ValueError(
+                "a tracker does not carry the tolerances of an instrument; identify the driver "
+                "without instrument="
+            )
         seen = Inspected(unloaded)
         name = preflight(seen, periodic=True) or ("biased" if seen.is_aliased else None)
         if name is not None:

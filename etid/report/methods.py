@@ -13,6 +13,9 @@ from collections.abc import Iterable, Sequence
 
 import numpy as np
 
+import etid.identify.amplitudes
+import etid.identify.jointly
+import etid.online.reading  # they register their descriptions
 from etid.circuits.display import quantity
 from etid.estimators.estimate import MAX_STEPS
 from etid.estimators.estimator import Description
@@ -225,6 +228,7 @@ def _table(found: StudyFits, settings: Settings) -> Table:
         "Z_th": f"order {settings.order or 'auto'}, drift of {100 * settings.driver_drift:g} %, "
         f"accepted from {low:g} to {high:g} ohm at 1 kHz",
         "R_L": f"standard deviation of {100 * settings.r_load_tolerance:g} %",
+        "tolerances of the instrument": ", ".join(settings.instrument) or "none",
         "known elements": ", ".join(settings.fixed + settings.prior + settings.bounds) or "none",
         "computed": f"in {settings.precision} on {settings.backend}",
         "versions": ", ".join(settings.versions),

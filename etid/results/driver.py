@@ -26,6 +26,7 @@ from etid.circuits.overview import Overview
 from etid.numpy_tier.tiers import program
 from etid.recordings.remarks import texts
 from etid.results.feed import AbstractFeed, CurrentSource
+from etid.results.instrument import Instrument
 from etid.results.tried_orders import OrderEvidence
 from etid.results.verdicts import RESULTS, message
 from etid.signals.filtering import StateSpace
@@ -307,6 +308,7 @@ class ContinuousDriver(Driver):
         drift: Relative standard deviation of the change of each parameter of `source` between the
             calibration and the recording of a skin; None if there is no change. `cov` does not
             contain it.
+        instrument: Tolerances of the instrument; None if it has none. `cov` does not contain them.
         tried: Orders that `order="auto"` tried; none if the user chose the order.
     """
 
@@ -315,6 +317,7 @@ class ContinuousDriver(Driver):
     cov: Float[Array, "parameter parameter"]
     calibration: Calibration
     drift: Float[Array | np.ndarray, ""] | None = None
+    instrument: Instrument | None = None
     tried: OrderEvidence = eqx.field(default_factory=OrderEvidence.none)
 
     def drift_std(self) -> Float[Array, " parameter"]:

@@ -34,6 +34,8 @@ class Settings:
         backend: Backend of JAX, such as `"cpu"`.
         versions: Packages and their versions, such as `"jax 0.10.2"`.
         plausible: As in `identify_driver`. Files of earlier versions do not store it.
+        instrument: Tolerances of the instrument that are not 0 [SI], such as `"gain 0.001"`. Files
+            of earlier versions do not store them.
     """
 
     source: str
@@ -52,6 +54,7 @@ class Settings:
     backend: str
     versions: tuple[str, ...]
     plausible: tuple[float, ...] = PLAUSIBLE
+    instrument: tuple[str, ...] = ()
 
 
 @functools.cache

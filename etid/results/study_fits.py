@@ -34,6 +34,7 @@ from etid.results.driver import (
 )
 from etid.results.fits import SCHEMA, Fits
 from etid.results.hdf5_table import REMEDY, Table, opened_table, write_table
+from etid.results.instrument import Instrument
 from etid.results.provenance import Settings
 from etid.results.tried_orders import OrderEvidence
 from etid.results.verdicts import verdicts_of
@@ -205,6 +206,7 @@ def _to_json(paths: tuple[str, ...], driver: Driver) -> str:
     if isinstance(driver, ContinuousDriver):
         stored |= {
             "drift": None if driver.drift is None else float(driver.drift),
+            "instrument": None if driver.instrument is None else driver.instrument.stored(),
             "source": _lists(driver.source),
             "cov": np.asarray(driver.cov).tolist(),
             "r_load": np.asarray(driver.calibration.r_load).tolist(),
@@ -262,8 +264,21 @@ def _continuous(stored: Mapping[str, Any]) -> Callable[..., ContinuousDriver]:
         cov=_numbers(stored, "cov", 2, (size, size)),
         calibration=Calibration(r_load, delay, _numbers(stored, "delay_std_samples", 0)),
         drift=None if stored.get("drift") is None else _numbers(stored, "drift", 0),
+        instrument=_instrument(stored.get("instrument")),
         tried=_tried(stored["tried"]) if "tried" in stored else OrderEvidence.none(),
     )
+
+
+def _instrument(stored: Mapping[str, Any] | None) -> Instrument | None:
+    """The tolerances of the instrument; files of earlier versions have none.
+
+    Raises:
+        ValueError, TypeError, KeyError, OverflowError: The line is damaged.
+    """
+    if stored is None:
+        return None
+    names = [field.name for field in dataclasses.fields(Instrument)]
+    return Instrument(**{name: float(_numbers(stored, name, 0)) for name in names}).as_arrays()
 
 
 def _tried(stored: Mapping[str, Any]) -> OrderEvidence:

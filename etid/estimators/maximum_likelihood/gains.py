@@ -19,6 +19,7 @@ from etid.circuits.circuit import AbstractCircuit
 from etid.circuits.impedance import AbstractImpedance
 from etid.estimators.element_prior import ElementPrior
 from etid.estimators.estimate import DELAY_WIDTH
+from etid.estimators.maximum_likelihood.faults import disturbed, seen_through
 from etid.estimators.maximum_likelihood.given_driver import AbstractGiven
 from etid.signals.knots import Knots
 from etid.signals.transfer import as_complex, combined, delayed, frequency_variable
@@ -159,12 +160,26 @@ class Gains(eqx.Module):
     def undelayed(self, q: Float[Array, " q"]) -> Complex[Array, "output frequency"]:
         """The gains without their delays."""
         load = self.impedance(q)(frequency_variable(self.frequency))
-        return self._undelayed(load, self.w(self.split(q)[2]))
+        z = self.split(q)[2]
+        return self._undelayed(load, self.w(z), self.faults(z))
+
+    def faults(self, z: Float[Array, " z"]) -> Float[Array, "3"] | None:
+        """Gain, crosstalk and capacitance; None if the instrument has no tolerances."""
+        return None if self.driver.faults is None else z @ self.driver.faults
 
     def _undelayed(
-        self, z_load: Complex[Array, " frequency"], w: Complex[Array, " frequency"]
+        self,
+        z_load: Complex[Array, " frequency"],
+        w: Complex[Array, " frequency"],
+        faults: Float[Array, "3"] | None,
     ) -> Complex[Array, "output frequency"]:
-        return self.measured(z_load, lambda total: self.driver.current(total, w))
+        def current(total: Complex[Array, " frequency"]) -> Complex[Array, " frequency"]:
+            return self.driver.current(total, w)
+
+        if faults is None:
+            return self.measured(z_load, current)
+        seen = seen_through(faults, z_load, frequency_variable(self.frequency))
+        return disturbed(faults, self.measured(seen, current))
 
     def __call__(self, q: Float[Array, " q"]) -> Complex[Array, "output frequency"]:
         """The gains."""
@@ -184,15 +199,15 @@ class Gains(eqx.Module):
     def slopes(self, q: Float[Array, " q"]) -> Slopes:
         """The gains and their derivatives."""
         logs, _, z = self.split(q)
-        s, w = frequency_variable(self.frequency), self.w(z)
+        s, w, faults = frequency_variable(self.frequency), self.w(z), self.faults(z)
 
         def load(logs: Float[Array, " element"]) -> Complex[Array, " frequency"]:
             return self.circuit.with_log_values(logs).impedance()(s)
 
         z_load, one = load(logs), jnp.ones_like(s)
         by_element = jax.vmap(lambda way: jax.jvp(load, (logs,), (way,))[1])(jnp.eye(logs.size))
-        value, by_load = jax.jvp(lambda at: self._undelayed(at, w), (z_load,), (one,))
-        by_w = jax.jvp(lambda at: self._undelayed(z_load, at), (w,), (one,))[1]
+        value, by_load = jax.jvp(lambda at: self._undelayed(at, w, faults), (z_load,), (one,))
+        by_w = jax.jvp(lambda at: self._undelayed(z_load, at, faults), (w,), (one,))[1]
         value, by_load, by_w = (self.turned(q, of, self.frequency) for of in (value, by_load, by_w))
         alone = as_complex(jnp.eye(self.outputs))[:, :, None]
         rows = [
@@ -200,4 +215,9 @@ class Gains(eqx.Module):
             alone * ((-s * as_complex(1 / self.sample_rate))[None, :] * value)[None],
             self.driver.slope[:, None] * by_w[None],
         ]
+        if faults is not None and self.driver.faults is not None:
+            by_fault = jax.jacfwd(lambda at: self._undelayed(z_load, w, at))(faults)
+            each = jnp.moveaxis(by_fault, -1, 0)
+            by_fault = jnp.stack([self.turned(q, of, self.frequency) for of in each])
+            rows[-1] = rows[-1] + jnp.tensordot(as_complex(self.driver.faults), by_fault, 1)
         return Slopes(z_load, value, by_load, jnp.concatenate(rows))

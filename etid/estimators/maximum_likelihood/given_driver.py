@@ -31,6 +31,7 @@ from jaxtyping import Array, Complex, Float
 
 from etid.circuits.circuit import AbstractCircuit
 from etid.estimators.estimate import DELAY_WIDTH
+from etid.estimators.maximum_likelihood import faults
 from etid.estimators.maximum_likelihood.calibrations import Calibrations
 from etid.estimators.maximum_likelihood.profile import Profile, Records
 from etid.estimators.score_tests.unloaded import UnloadedShape, shape_of
@@ -70,6 +71,7 @@ class AbstractGiven(eqx.Module):
         cov: Covariance of z.
         shape: Unloaded voltage of the first calibration; None if it cannot be compared.
         delay_width: Prior standard deviation of the trigger delay of a load [samples].
+        faults: Gain, crosstalk and capacitance by z; None if the instrument has no tolerances.
     """
 
     frequency: eqx.AbstractVar[Float[Array, " harmonic"]]
@@ -79,6 +81,7 @@ class AbstractGiven(eqx.Module):
     cov: eqx.AbstractVar[Float[Array, "z z"]]
     shape: eqx.AbstractVar[UnloadedShape | None]
     delay_width: eqx.AbstractVar[Float[Array, ""]]
+    faults: eqx.AbstractVar[Float[Array, "z 3"] | None]
 
     @abc.abstractmethod
     def current(
@@ -111,6 +114,7 @@ class GivenCurrent(AbstractGiven):
     cov: Float[Array, "0 0"]
     delay_width: Float[Array, ""]
     shape: UnloadedShape | None = None
+    faults: Float[Array, "z 3"] | None = None
 
     @classmethod
     def at(cls, frequency: Float[Array, " harmonic"]) -> "GivenCurrent":
@@ -170,6 +174,7 @@ class GivenDriver(AbstractGiven):
         gain_slopes: Derivatives of these gains with respect to z.
         shape: Unloaded voltage of the first calibration; None if loads have other harmonics.
         delay_width: Prior standard deviation of the trigger delay of a load [samples].
+        faults: Gain, crosstalk and capacitance by z; None if the instrument has no tolerances.
     """
 
     frequency: Float[Array, " harmonic"]
@@ -184,6 +189,7 @@ class GivenDriver(AbstractGiven):
     gain_slopes: Complex[Array, "z calibration known"] | None
     shape: UnloadedShape | None = None
     delay_width: Float[Array, ""] = eqx.field(default_factory=lambda: jnp.array(DELAY_WIDTH))
+    faults: Float[Array, "z 3"] | None = None
 
     def z_th(self, w: Complex[Array, " harmonic"]) -> Complex[Array, " harmonic"]:
         """Z_th [Ω] at W₀ + w."""
@@ -261,19 +267,30 @@ def given(
     linear = calibrations.linear(near)
     root = inverse_root(linear.curvature().expected)
     mean, cov = -root.T @ (near.jacobian @ near.terms), linear.along(root).curvature().score
-    if driver.drift is None:
-        found = around(calibrations, c, root, frequency, shared, mean, cov)
-    else:
-        # Later changes of the driver are further z. The calibrations tell nothing about them.
+    # Later changes of the driver and errors of the instrument are further z.
+    later, instrument = jnp.zeros((c.size, 0)), driver.instrument
+    if driver.drift is not None:
         std = driver.drift_std()
-        changes = jnp.pad(jnp.diag(std), ((0, c.size - std.size), (0, 0)))
-        directions = jnp.concatenate([root, changes], axis=1)
-        mean = jnp.pad(mean, (0, std.size))
-        cov = jax.scipy.linalg.block_diag(cov, jnp.eye(std.size))
-        found = around(calibrations, c, directions, frequency, shared, mean, cov)
-        if found.gain_slopes is not None:
-            gain_slopes = found.gain_slopes.at[c.size :].set(0.0)
-            found = dataclasses.replace(found, gain_slopes=gain_slopes)
+        later = jnp.pad(jnp.diag(std), ((0, c.size - std.size), (0, 0)))
+    shown = jnp.zeros((c.size, 0))
+    if instrument is not None:
+        shown = faults.moved(instrument, calibrations, near, linear)
+    directions = jnp.concatenate([root, later, shown], axis=1)
+    more = later.shape[1] + shown.shape[1]
+    mean = jnp.pad(mean, (0, more))
+    cov = jax.scipy.linalg.block_diag(cov, jnp.eye(more))
+    found = around(calibrations, c, directions, frequency, shared, mean, cov)
+    if found.gain_slopes is not None and more:  # the calibrations tell nothing about later changes
+        gain_slopes = found.gain_slopes.at[c.size : directions.shape[1] - shown.shape[1]].set(0.0)
+        if instrument is not None:
+            at = calibrations.slopes(c)
+            direct = faults.of_calibrations(instrument, calibrations, at)
+            gain_slopes = gain_slopes.at[-direct.shape[0] :].add(direct)
+        found = dataclasses.replace(found, gain_slopes=gain_slopes)
+    if instrument is not None:
+        by_z = faults.by_z(instrument, calibrations)
+        by_z = jnp.pad(by_z, ((directions.shape[1] - by_z.shape[0], 0), (0, 0)))
+        found = dataclasses.replace(found, faults=by_z)
     return dataclasses.replace(found, shape=shape_of(driver, frequency))
 
 
