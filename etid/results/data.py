@@ -14,6 +14,7 @@ from jaxtyping import Complex, Float
 
 from etid.circuits.circuit import Circuit
 from etid.recordings.recording import Recording
+from etid.results.budget import Budget
 from etid.results.driver import Driver
 from etid.results.posterior import Posterior, Profile
 
@@ -159,6 +160,24 @@ class HasSource(Generic[Circuit]):
             ValueError: The circuit has no such element, or as in `posterior`.
         """
         return _of_higher_layer("etid.identify.profile", "profile")(self, recording, driver, name)
+
+    def budget(self, recording: Recording | None = None, driver: Driver | None = None) -> Budget:
+        """What each source of error adds to the standard errors: noise, driver, instrument.
+
+        It also shows what errors of the instrument would do that nobody stated, as in
+        `etid.Instrument`.
+
+        Args:
+            recording: As in `plot`.
+            driver: As in `plot`.
+
+        Returns:
+            The budget; `print` shows a table.
+
+        Raises:
+            ValueError: As in `posterior`, or the driver has no harmonics of its calibrations.
+        """
+        return _of_higher_layer("etid.identify.budget", "budget")(self, recording, driver)
 
 
 def with_data(

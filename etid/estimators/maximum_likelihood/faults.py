@@ -56,7 +56,7 @@ def of_calibrations(
     """Changes of the gains of the calibrations by each z, at constant Z_th."""
     r_load = as_complex(calibrations.calibration.r_load)[:, None]
     turned = at.gains * (r_load + at.z_th) / r_load
-    each = jnp.eye(r_load.shape[0])[:, :, None] * (-at.by_z * at.z_th)[None]
+    each = as_complex(jnp.eye(r_load.shape[0]))[:, :, None] * (-at.by_z * at.z_th)[None]
     of = as_complex(instrument.of_loads())[:, None, None]
     together = jnp.stack([at.gains, turned, jnp.zeros_like(turned)]) * of
     return jnp.concatenate([together, each * as_complex(jnp.asarray(instrument.r_load))])

@@ -1,0 +1,176 @@
+"""Tolerances of the instrument: in the standard errors, in a budget, and in files."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.stats
+
+import etid
+from etid.circuits.circuit import AbstractCircuit, Farad, Ohm, SkinRC, parameter
+from etid.circuits.elements import capacitor, resistor
+from etid.circuits.impedance import parallel, series
+from etid.estimators.maximum_likelihood.gains import Gains
+from etid.estimators.maximum_likelihood.given_driver import given
+from etid.results.budget import EXAMPLES
+from etid.simulation.scenes import Scene, Trial
+from etid.simulation.transformer import ResistorLoad
+
+R_LOAD = 98.8e3
+DRY = SkinRC(r_s=33.4e3, r_p=186e3, c_p=0.12e-9)
+DAMP = SkinRC(r_s=6.1e3, r_p=17.4e3, c_p=0.66e-9)
+GAIN = etid.Instrument(gain=1e-3)
+ALL = etid.Instrument(gain=2e-3, r_load=2e-3, crosstalk=2e-3, capacitance=2e-12)
+DRAWS = 40
+
+
+class BesideCable(AbstractCircuit):
+    """Skin with the capacitance of a cable across it."""
+
+    formula = "(R_s + R_p / (1 + s R_p C_p)) ‖ C"
+    r_s: Ohm = parameter("ohm", typical=20e3)
+    r_p: Ohm = parameter("ohm", typical=100e3)
+    c_p: Farad = parameter("farad", typical=0.3e-9)
+    cable: Farad = parameter("farad", typical=1e-12)
+
+    def impedance(self):
+        skin = series(resistor(self.r_s), parallel(resistor(self.r_p), capacitor(self.c_p)))
+        return parallel(skin, capacitor(self.cable))
+
+
+def records(skin=DRY, *, gain=0.0, r_load=0.0, crosstalk=0.0, capacitance=0.0, seed=0, snr_db=60.0):
+    """A calibration and a skin, recorded with an instrument that has these errors."""
+    if capacitance:
+        skin = BesideCable(skin.r_s, skin.r_p, skin.c_p, capacitance)
+    calibration = Trial("calibration", ResistorLoad(R_LOAD))
+    scene = Scene((Trial("skin", skin),), (calibration,), samples=20_000, snr_db=snr_db)
+    of = scene.simulate(seed=seed)
+    calibration, skin = (
+        one.replace(v_out=(1 + gain) * one.v_out + crosstalk * one.v_th)
+        for one in (of["calibration"], of["skin"])
+    )
+    return calibration.replace(r_load=R_LOAD / (1 + r_load)), skin
+
+
+def fitted(calibration, skin, instrument=None):
+    driver = etid.identify_driver(calibration, instrument=instrument)
+    return etid.identify_skin(skin, driver, throw=False)
+
+
+def errors(fit, skin):
+    """Errors of the elements in standard errors."""
+    off = np.asarray(fit.circuit.values()) - np.asarray(skin.values())
+    return off / np.sqrt(np.diagonal(np.asarray(fit.cov)))
+
+
+@pytest.mark.parametrize("skin", [DRY, DAMP], ids=["dry", "damp"])
+def test_an_error_within_its_tolerance_is_in_the_standard_errors(skin):
+    disturbed = records(skin, gain=1e-3)
+    assert np.abs(errors(fitted(*disturbed), skin)).max() > 8
+    fit = fitted(*disturbed, GAIN)
+    assert fit.verdict == "successful"
+    assert np.abs(errors(fit, skin)).max() < 4
+
+
+def test_an_error_far_beyond_its_tolerance_is_inconsistent():
+    # A record of dry skin shows a gain to 0.025 %: 0.2 % are eight standard errors.
+    assert fitted(*records(gain=-2e-3), etid.Instrument(gain=2e-4)).verdict == "inconsistent"
+    assert fitted(*records(gain=-2e-3), etid.Instrument(gain=2e-3)).verdict == "successful"
+
+
+@pytest.mark.parametrize("source", EXAMPLES)
+def test_a_budget_says_what_an_error_that_nobody_stated_does(source):
+    size = EXAMPLES[source]
+    right, wrong = fitted(*records()), fitted(*records(**{source: size}))
+    before, after = (np.log(np.asarray(fit.circuit.values())) for fit in (right, wrong))
+    told = right.budget().unstated[source]
+    # Both fits have the same noise; what is left is the curvature of the model and, for a
+    # capacitance, that its simulation goes through other filters.
+    np.testing.assert_allclose(np.abs(after - before), told, rtol=0.1, atol=0.05 * told.max())
+
+
+def test_the_parts_of_a_budget_are_the_variances_of_the_fit():
+    fit = fitted(*records(), ALL)
+    budget = fit.budget()
+    values = np.asarray(fit.circuit.values())
+    relative = np.sqrt(np.diagonal(np.asarray(fit.cov))) / values
+    np.testing.assert_allclose(budget.together, relative, rtol=1e-6)
+    assert {"recording", "driver", *EXAMPLES} == set(budget.parts)
+    # Of a known resistor nothing is seen: its tolerance passes 1:1.
+    np.testing.assert_allclose(budget.parts["r_load"], 2e-3, rtol=0.05)
+    text = str(budget)
+    assert "gain 0.2 %" in text
+    assert "capacitance 2 pF" in text
+    assert "together" in text
+
+
+def test_the_derivatives_of_the_gains_by_the_errors_are_those_of_jax():
+    calibration, skin = records()
+    driver = etid.identify_driver(calibration, instrument=ALL)
+    frequency = driver.spectra.frequency[0]
+    with jax.enable_x64(True):
+        gains = Gains(
+            given(driver, frequency, False), DRY, frequency, jnp.asarray(skin.sample_rate)
+        )
+        at = 0.1 * jnp.arange(1.0, 1 + gains.owned + gains.driver.mean.size) / gains.owned
+        q = at.at[: gains.elements].set(DRY.log_values())
+        found = jnp.moveaxis(gains.slopes(q).by_unknown, 0, -1)
+        wanted = jax.jacfwd(gains)(q)
+        # Z_th is a Padé approximant of an exponential, whose derivative the slopes take instead.
+        np.testing.assert_allclose(found, wanted, rtol=1e-9, atol=1e-9 * np.abs(wanted).max())
+
+
+def test_tolerances_are_kept_in_files_of_fits(tmp_path):
+    calibration, skin = records()
+    study = etid.Study.from_recordings([calibration, skin])
+    fits = etid.identify_study(study, instrument=ALL)
+    fits.write(tmp_path / "fits.h5")
+    again = etid.StudyFits.read(tmp_path / "fits.h5")
+    assert again.settings == fits.settings
+    assert "crosstalk 0.002" in again.settings.instrument
+    (driver,) = again.drivers.values()
+    assert driver.instrument.stored() == ALL.stored()
+
+
+REFUSED = {
+    "etid.Instrument(gain=-1e-3)": "gain",
+    "etid.Instrument(capacitance=5.0)": r"\[F\]",
+    "etid.Instrument(r_load=5.0)": "relative",
+    "etid.identify_driver(calibration, instrument=1e-3)": "instrument",
+    "etid.identify_driver(calibration, instrument=ALL, method='output_error')": "output_error",
+    "etid.identify_skin(skin, driver, method='output_error')": "output_error",
+    "etid.Tracker.of(driver, skin, electrodes=2)": "tracker",
+}
+
+
+@pytest.mark.parametrize("call", REFUSED)
+def test_tolerances_are_refused_where_they_would_not_be_used(call, recorded):
+    calibration, skin, driver = recorded
+    names = {"etid": etid, "ALL": ALL, "calibration": calibration, "skin": skin, "driver": driver}
+    with pytest.raises((ValueError, TypeError), match=REFUSED[call]):
+        eval(call, names)
+
+
+@pytest.fixture(scope="module")
+def recorded():
+    calibration, skin = records()
+    return calibration, skin, etid.identify_driver(calibration, instrument=ALL)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("skin", [DRY, DAMP], ids=["dry", "damp"])
+@pytest.mark.parametrize("source", [*EXAMPLES, "all"])
+def test_intervals_hold_errors_that_are_drawn_from_their_tolerances(source, skin):
+    told = {name: size for name, size in ALL.stored().items() if source in (name, "all")}
+    instrument, inside, refused = etid.Instrument(**told), 0, 0
+    for number in range(DRAWS):
+        draw = np.random.default_rng([number, 5])
+        drawn = {name: size * draw.standard_normal() for name, size in told.items()}
+        drawn |= {name: abs(of) for name, of in drawn.items() if name == "capacitance"}
+        fit = fitted(*records(skin, seed=number, **drawn), instrument)
+        refused += fit.verdict != "successful"
+        inside += int(np.sum(np.abs(errors(fit, skin)) < scipy.stats.norm.ppf(0.975)))
+    assert refused <= 1  # of 40: one of a thousand is refused by chance
+    # Three elements of a fit are not independent, so that the count is one of 40 in the worst case.
+    low, high = scipy.stats.binom.interval(0.999, DRAWS, 0.95)
+    assert low <= inside / 3 <= high
