@@ -479,7 +479,8 @@ def test_methods_say_that_the_calibrations_chose_the_order(found, study_file):
 @pytest.mark.parametrize("method", [*registry.names(), "joint", "online", TWO])
 def test_methods_cite_what_they_name_and_say_the_settings(found, method):
     fit = dataclasses.replace(found.fits.fit, method=method)
-    settings = dataclasses.replace(found.settings, order=4, r_load_tolerance=0.001)
+    told = {"order": 4, "r_load_tolerance": 0.001, "instrument": ("gain 0.001",)}
+    settings = dataclasses.replace(found.settings, **told)
     by = method.partition(" + ")[0]
     drivers = {
         paths: dataclasses.replace(driver, method=by) for paths, driver in found.drivers.items()
@@ -500,6 +501,7 @@ def test_methods_cite_what_they_name_and_say_the_settings(found, method):
         assert version in section.text
     without_errors = method in ("steiglitz_mcbride", "equation_error")
     assert ("tolerance of 0.1 %" in section.text) != without_errors
+    assert ("gain 0.001" in section.text) != without_errors
     assert ("gives no standard errors" in section.text) == without_errors
 
 

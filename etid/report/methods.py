@@ -177,13 +177,19 @@ def _errors(used: Sequence[Description], settings: Settings | None) -> str:
         "the driver. All recordings with one driver share this error, so the spread between them "
         "does not show it."
     )
+    instrument = settings.instrument if settings is not None else ()
+    if instrument:
+        text += (
+            " The shared part contains errors of the instrument, as parameters with these standard "
+            f"deviations: {', '.join(instrument)} (relative; capacitance in farad)."
+        )
     tolerance = settings.r_load_tolerance if settings is not None else 0.0
     if tolerance > 0:
         text += (
             f" The shared part contains a tolerance of {100 * tolerance:.3g} % (standard "
             "deviation) of the known resistors."
         )
-    else:
+    elif not any(one.startswith("r_load") for one in instrument):
         text += (
             " They do not contain the tolerance of the known resistors. This tolerance passes 1:1 "
             "into every resistance and inversely into every capacitance."
