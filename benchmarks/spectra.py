@@ -20,7 +20,7 @@ from jaxtyping import Complex, Float
 
 import etid
 from benchmarks.coverage import SILENT
-from benchmarks.rates import COVERED, NORMAL_95, expected_covered
+from benchmarks.rates import COVERED, NORMAL_95, clopper_pearson
 from benchmarks.runner import Target, option, report
 from etid.results.verdicts import counted
 
@@ -245,16 +245,13 @@ def without_fault(seed: int, spectra: int) -> Iterator[Target]:
         verdicts = np.array([one.verdict for one in answers])
         z = np.concatenate([one.z for one in answers if one.verdict == "successful"])
         refused, silent = (~np.isin(verdicts, ACCEPTED)).sum(), sum(one.silent for one in answers)
-        low, high = expected_covered(z.size)  # few draws scatter more
         name, most = f"good, {points} frequencies: ", max(REFUSED * len(answers), 1)
         yield Target(f"{name}refused", refused, most=most, text=f"{refused}; {counted(verdicts)}")
         yield Target(f"{name}silent", silent, most=0)
-        covered, limits = (
-            np.mean(np.abs(z) < NORMAL_95),
-            (min(COVERED[0], low), max(COVERED[1], high)),
-        )
+        inside = clopper_pearson(np.sum(np.abs(z) < NORMAL_95), z.size)
+        covered = np.mean(np.abs(z) < NORMAL_95)
         text = f"{covered:.4f}, rms z {np.sqrt(np.mean(z**2)):.3f}, max |z| {np.abs(z).max():.1f}"
-        yield Target(f"{name}covered", float(covered), *limits, text)
+        yield Target(f"{name}covered", float(covered), *COVERED, text, inside)
 
 
 def main(arguments: argparse.Namespace) -> bool:

@@ -137,7 +137,7 @@ def tick(electrodes: int, ticks: int) -> Target:
     period = tracker.period / tracker.model.bands.sample_rate
     ratio = float(np.percentile(online.timed(tracker, pulses, ticks)[1], 99))
     name = f"tick of {electrodes} electrodes, p99 / period"
-    return costs(name, ratio * period, period, online.TARGET)
+    return costs(name, ratio * period, period, online.TICK)
 
 
 def limits(of: Problem, repeats: int) -> str:
