@@ -13,14 +13,15 @@ compared.
 import argparse
 import collections
 import functools
+import pathlib
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
 import etid
-from benchmarks import selection_chart, selection_map, selection_rival
+from benchmarks import charts, selection_map, selection_rival
 from benchmarks import selection_counts as counts
 from benchmarks.estimators import Answer
 from benchmarks.failure_axes import Cell
@@ -62,6 +63,14 @@ TARGETS = {
     "silent over the failure map": at_most(2e-4),
     "right, not one RC, from 40 dB": at_least(0.95),
     "time, auto / plain fit, one RC": at_most(1.3),
+}
+# Circuits from the simplest to the richest, with their colours, hatches and labels in the picture.
+FACES = {
+    "Resistor": ("#d9d9d9", "", "resistor"),
+    "ParallelRC": ("#b3cde3", "...", "R‖C"),
+    "SkinRC": ("#4f9bd0", "", "R_s + R‖C"),
+    "SkinCole": ("#f2b263", "///", "Cole"),
+    "SkinLayers": ("#c9564a", "xxx", "two layers"),
 }
 
 
@@ -192,6 +201,23 @@ def select_time(number: int) -> float:
     return float(np.median(times))
 
 
+def draw(rows: Sequence[Mapping[str, Any]], path: pathlib.Path) -> None:
+    """Chosen circuits: a bar for each truth, a panel for each SNR; etid, then the rival if any."""
+    panels, texts = {}, {}
+    for of, who in (("chose", "etid"), ("rival", "impedance.py")):
+        for row in rows:
+            counts = {kind: int(row.get(f"{of}_{kind}", 0)) for kind in FACES}
+            if not sum(counts.values()):
+                continue
+            panel, truth = f"{who}, {row['snr_db']:g} dB", row["truth"]
+            panels.setdefault(panel, {})[truth] = counts
+            right = counts[type(TRUTHS[truth]).__name__] / sum(counts.values())
+            doubt = "" if of == "rival" or row["decisive"] else " ?"
+            texts[panel, truth] = f"{100 * right:.0f} % right{doubt}"
+    title = "Chosen circuits (?: below 30 dB, or the evidence is not decisive)"
+    charts.shares(panels, FACES, path, title=title, texts=texts)
+
+
 def main(arguments: argparse.Namespace) -> bool:
     """Run the command."""
     quick, workers, folder = arguments.quick, arguments.workers, arguments.folder
@@ -213,7 +239,7 @@ def main(arguments: argparse.Namespace) -> bool:
         few = numbers[:RIVAL_DRIVERS]
         targets += rival(rows, [d for d in drawn if d.driver in few and d.snr_db in RIVAL_SNR])
     write_csv(folder / "selection.csv", rows)
-    selection_chart.draw(rows, TRUTHS, folder / "selection.svg", missing)
+    draw(rows, folder / "selection.svg")
     print(f"etid: {1e3 * select_time(FIRST):.0f} ms for a choice (median)")
     targets += time_ratios(FEW_PAIRS if quick else PAIRS)
 

@@ -20,7 +20,6 @@ from benchmarks.estimators import NOTHING, Answer
 from benchmarks.failure_axes import MOST, cells
 from benchmarks.ladder import LOADS
 from benchmarks.online_alarms import Alarms
-from benchmarks.perturbation_chart import KINDS
 from benchmarks.perturbed_study import Truth
 from benchmarks.provenance import RESULTS
 from benchmarks.rates import clopper_pearson, expected_covered, expected_rms, rate
@@ -165,7 +164,7 @@ def test_an_element_that_moves_is_wrong_unless_the_answer_says_so():
 def test_a_table_counts_and_names_the_worst_silent_answer():
     every = [answer((0.04, 0, 0)), answer((0, 0.08, 0)), answer(FAR)]
     [row] = perturbations.table(every, ("perturbation", "snr_db"))
-    assert [row[kind] for kind in KINDS] == [1, 0, 0, 2]
+    assert [row[kind] for kind in perturbations.KINDS] == [1, 0, 0, 2]
     assert (row["worst_element"], row["worst_error"]) == ("r_p", 0.08)
     assert row["worst_stderrs"] == pytest.approx(8)
     assert row["verdicts"] == "3 successful"

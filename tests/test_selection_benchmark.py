@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 import etid
-from benchmarks import selection, selection_chart, selection_map, selection_rival
+from benchmarks import selection, selection_map, selection_rival
 from benchmarks.selection_counts import CRITERIA, cell, choose, covered
 from benchmarks.selection_draws import TRUTHS, Drawn, quantities
 from etid.results.fit import CHANGES, Fit, Support
@@ -85,7 +85,7 @@ def test_a_row_counts_choices_and_intervals(tmp_path):
     right = next(selection.chosen([row], [good, wide, rich]))
     assert right.value == pytest.approx(2 / 3)
     assert not right.met
-    selection_chart.draw([row], TRUTHS, tmp_path / "chart.svg", "not installed")
+    selection.draw([row], tmp_path / "chart.svg")
     assert "one RC, dry" in (tmp_path / "chart.svg").read_text()
 
 
