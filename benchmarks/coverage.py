@@ -18,7 +18,7 @@ import argparse
 import dataclasses
 import json
 from collections.abc import Iterator, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from tqdm import tqdm
@@ -40,6 +40,9 @@ TARGETS = {
     "covered": COVERED,
     f"successful and wrong by {SILENT:g} sd": at_most(0),
 }
+HEADS = (
+    "load      element   bias %  spread %      sd %   bound %  efficiency  covered  rms z  max |z|"
+)
 MORE = "more"  # trials that take part in a joint fit, but share its errors and are not counted
 
 OPTIONS = (
@@ -65,6 +68,11 @@ class Draws(NamedTuple):
     stderr: np.ndarray
     verdicts: np.ndarray
     cov: np.ndarray  # of the errors
+
+    @classmethod
+    def of(cls, rows: Sequence[tuple]) -> "Draws":
+        """Several of `draw`."""
+        return cls(*map(np.array, zip(*rows, strict=True)))
 
     @property
     def z(self) -> np.ndarray:
@@ -127,10 +135,11 @@ def compared(fit: etid.Fit | None, truth: Sequence[float]) -> tuple[np.ndarray, 
     return error, np.asarray(fit.stderr.values()) / true, fit.verdict
 
 
-def _cov(fit: etid.Fit | None, truth: Sequence[float]) -> np.ndarray:
-    """Covariance of the relative errors."""
+def draw(fit: etid.Fit | None, truth: Sequence[float]) -> tuple[np.ndarray, np.ndarray, str, Any]:
+    """The same, and the covariance of the relative errors."""
     size = len(truth)
-    return np.full((size, size), np.nan if fit is None else fit.cov / np.outer(truth, truth))
+    cov = np.full((size, size), np.nan if fit is None else fit.cov / np.outer(truth, truth))
+    return *compared(fit, truth), cov
 
 
 def monte_carlo(
@@ -162,14 +171,9 @@ def monte_carlo(
         rows = [_behind_driver(study, counted, method, known) for study in studies]
     else:
         rows = _from_current(list(studies), counted, method)
-    found = {}
-    for path, true in truth.items():
-        fits = [row.get(path) for row in rows]
-        columns = zip(*(compared(fit, true) for fit in fits), strict=True)
-        error, stderr, verdicts = map(np.array, columns)
-        cov = np.array([_cov(fit, true) for fit in fits])
-        found[path] = Draws(error, stderr, verdicts, cov)
-    return found
+    return {
+        path: Draws.of([draw(row.get(path), true) for row in rows]) for path, true in truth.items()
+    }
 
 
 def _jointly(study: etid.Study, paths: Sequence[str]) -> dict[str, etid.Fit]:
@@ -248,8 +252,7 @@ def main(arguments: argparse.Namespace) -> bool:
             arguments.current_snr_db,
         )
     bounds, drivers, asked = etid.bound(drawn), Drivers(), list[Target]()
-    heads = "load      element   bias %  spread %      sd %   bound %  efficiency  covered  rms z"
-    print(f"{heads}  max |z|")
+    print(HEADS)
     for method in arguments.method or [None]:
         found = monte_carlo(drawn, arguments.repetitions, method, arguments.parts, drivers)
         for name, of in found.items():

@@ -25,6 +25,7 @@ from benchmarks import charts, selection_map, selection_rival
 from benchmarks import selection_counts as counts
 from benchmarks.estimators import Answer
 from benchmarks.failure_axes import Cell
+from benchmarks.failure_draws import AUTO, Effort
 from benchmarks.perturbed_study import DELAY
 from benchmarks.provenance import write_csv
 from benchmarks.rates import COVERED, Rate, clopper_pearson, rate
@@ -46,11 +47,11 @@ from etid.selection.search import USUAL
 from etid.simulation import scenes
 
 FIRST = 1000  # number of the first driver; those of other benchmarks are smaller
-MAP = (7, 10)  # drivers of a cell of the map, and trials behind each
+MAP = Effort(7, 10)  # of a cell of the map
 PAIRS = 15  # timed pairs
 BATCH, SINGLES = 64, 16  # recordings of a pair: at once, and one at a time
 # The same of a quick run, which has every 20th cell of the map.
-FEW, FEW_PAIRS, FEW_DRIVERS, FEW_SNR, STEP = (1, 4), 3, 2, (20, 60), 20
+FEW, FEW_PAIRS, FEW_DRIVERS, FEW_SNR, STEP = Effort(1, 4), 3, 2, (20, 60), 20
 RIVAL_DRIVERS, RIVAL_SNR = 1, (20, 40, 60)  # ten seconds for each recording
 
 OPTIONS = (QUICK, WORKERS, FOLDER, option("--drivers", default=25, help="of an SNR"))
@@ -244,13 +245,13 @@ def main(arguments: argparse.Namespace) -> bool:
     targets += time_ratios(FEW_PAIRS if quick else PAIRS)
 
     every = selection_map.chosen_cells()[:: STEP if quick else 1]
-    of_map = [(cell, *(FEW if quick else MAP)) for cell in every]
+    of_map = [(cell, {AUTO: FEW if quick else MAP}) for cell in every]
 
     def rows_of_map(done: dict[int, list[Answer]]) -> list[dict[str, Any]]:
         return [selection_map.row(every[number], found) for number, found in done.items()]
 
     answered = tabled(
-        folder / "selection_map.csv", rows_of_map, selection_map.answers, of_map,
+        folder / "selection_map.csv", rows_of_map, answers, of_map,
         workers=workers, unit="cell", keep="selection_map",
     )  # fmt: skip
     return report([*targets, *failures(every, answered)])

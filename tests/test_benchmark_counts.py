@@ -10,6 +10,7 @@ import scipy.stats
 
 from benchmarks import (
     driver_order,
+    failure_draws,
     failure_map,
     perturbations,
     speed_accuracy,
@@ -21,7 +22,7 @@ from benchmarks.failure_axes import MOST, cells
 from benchmarks.ladder import LOADS
 from benchmarks.online_alarms import Alarms
 from benchmarks.perturbed_study import Truth
-from benchmarks.provenance import RESULTS
+from benchmarks.provenance import RESULTS, write_csv
 from benchmarks.rates import clopper_pearson, expected_covered, expected_rms, rate
 from benchmarks.runner import Target, report
 from benchmarks.speed_accuracy import Result, dominators, front, ranked
@@ -139,11 +140,11 @@ def test_rates_of_a_map_count_what_they_say_and_name_every_silent_failure():
 def test_cells_have_seeds_of_their_own_and_are_done_once_with_others_of_their_shape():
     every = list(cells())
     assert failure_map.FEW < {tuple(cell.place.values()) for cell in every}
-    used = [s for cell in every for s in failure_map.seeds(cell, failure_map.DRIVERS)]
+    used = [s for cell in every for s in failure_draws.seeds(cell, failure_map.DRIVERS)]
     assert len({*used}) == len(used)
     tasks = failure_map.tasks(every)
-    assert sorted(i for of in tasks for i in of) == list(range(len(every)))
-    assert all(len({every[i].shape for i in of}) == 1 for of in tasks)
+    assert sorted(id(cell) for of in tasks for cell in of) == sorted(map(id, every))
+    assert all(len({cell.shape for cell in of}) == 1 for of in tasks)
     dense = next(cell for cell in every if cell.scene.sample_rate == 1e6)
     assert failure_map.effort(dense, False, 6)["default"] == (1, 2 * MOST)
     assert failure_map.effort(every[0], False, 6)["default"] == (6, 2 * MOST)
@@ -303,12 +304,10 @@ def test_one_map_anew_keeps_the_others_with_the_commit_of_their_run(tmp_path):
     every = {cell.chart: cell for cell in cells()}
     old, new = every["SNR and periods"], every["SNR and sample rate"]
     path, of = tmp_path / failure_map.RATES, [answer(FAR)]
-    failure_map.write(path, failure_map.table(old, of))
-    with path.open() as file:
-        commit = next(csv.DictReader(file))["commit"]
-    path.write_text(path.read_text().replace(commit, "earlier"))
+    write_csv(path, [{**row, "commit": "earlier"} for row in failure_map.table(old, of)])
     kept = failure_map.earlier(path, [new.chart])
-    failure_map.write(path, [*kept, *failure_map.table(new, of)])
+    write_csv(path, failure_map.in_order([*kept, *failure_map.table(new, of)]))
     with path.open() as file:
-        rows = [(row["map"], row["commit"]) for row in csv.DictReader(file)]
-    assert rows == [(new.chart, commit), (old.chart, "earlier")]
+        rows = list(csv.DictReader(file))
+    assert [row["map"] for row in rows] == [new.chart, old.chart]
+    assert rows[0]["commit"] != rows[1]["commit"] == "earlier"
