@@ -28,7 +28,6 @@ number of those that did. They excuse none. σ comes from the information of the
 """
 
 import argparse
-import dataclasses
 import pathlib
 from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
@@ -43,7 +42,7 @@ from tqdm import tqdm
 import etid
 from benchmarks import control_hazards, ngspice
 from benchmarks.charts import INK, new_figure, save
-from benchmarks.control_plant import OPEN, Plant, Response
+from benchmarks.control_plant import KINDS, Fingertip, Plant, Response
 from benchmarks.ladder import TWO
 from benchmarks.provenance import RESULTS, write_csv
 from benchmarks.runner import Target, at_most, option, report
@@ -59,10 +58,6 @@ WANTED = 80e-9  # [C] per phase
 CAP = 5e-3  # [A]
 FALLBACK = 0.3  # of the amplitude of the unloaded record
 CHANGE = 6e-3  # random walk that the tracker expects [1/√pulse], about as fast as sweating
-SPOTS, SPREAD = 7, 0.3  # different places of the fingertip, and the spread of their elements
-WETTING = 6  # pulses from dry to damp
-LIFTED, BACK = 70, 90  # pulses between which the last electrode touches nothing
-SETTLED = 2  # pulses after a change that do not count: the target begins with the third
 NEAR = 0.02  # relative error of a charge that meets the target
 TARGETS = {
     f"pulses that miss the charge by more than {NEAR:.0%}": at_most(0),
@@ -79,12 +74,6 @@ STYLES = {
     "constant amplitude": ("-.", "#2e7d32"),
     "integral": (":", INK),
     "model reference": ((0, (4, 1)), "#8e44ad"),
-}
-TITLES = {
-    "dry": "dry",
-    "wetting": "wetting within 100 ms",
-    "sweating": "sweating slowly",
-    "lifted": "lifted off and put back",
 }
 NOISIER = "#f39c12"  # of etid with more noise
 
@@ -134,34 +123,6 @@ def hazards(arguments: argparse.Namespace) -> Iterator[Target]:
     names = list(TARGETS)[2:]
     for name, column in zip(names, ("above_otherwise", "above_stated_worst"), strict=True):
         yield Target(name, sum(row[column] for row in rows), *TARGETS[name])
-
-
-class Fingertip:
-    """The skin at each electrode and pulse."""
-
-    def __init__(self, electrodes: int, pulses: int) -> None:
-        spots = np.exp(SPREAD * np.random.default_rng(0).standard_normal((SPOTS, 3)))
-        dry, damp = (np.array(dataclasses.astuple(TYPICAL[name])) for name in ("dry", "damp"))
-        pulse, at = np.arange(pulses)[:, None], np.arange(electrodes)
-        kind = np.array(list(TITLES))[at % 3]
-        kind[-1] = "lifted"
-        self.kind = kind.tolist()
-        begin, wetting, sweating = 30 + 3 * (at // 3 % 4), kind == "wetting", kind == "sweating"
-        wet = np.where(wetting, np.clip((pulse - begin + 1) / WETTING, 0, 1), 0.0)
-        wet = np.where(sweating, pulse / pulses / 3, wet)[..., None]  # a third of the way to damp
-        # Fewer places sweat: each pulse of them is another run of ngspice.
-        values = spots[at // 3 % np.where(sweating, 2, SPOTS)] * dry ** (1 - wet) * damp**wet
-        lifted = (kind == "lifted") & (pulse >= LIFTED)
-        self.loads: list[list[SkinLoad | ResistorLoad]] = [
-            [OPEN if up else SkinLoad(*map(float, of)) for up, of in zip(*row, strict=True)]
-            for row in zip(lifted & (pulse < BACK), values, strict=True)
-        ]
-        # Pulses that count: neither a change nor one of the two pulses that follow it.
-        changed = (pulse == 0) | (wetting & (begin <= pulse) & (pulse < begin + WETTING))
-        changed |= lifted & (pulse <= BACK)
-        self.counts = ~changed
-        for later in range(1, SETTLED + 1):
-            self.counts[later:] &= ~changed[:-later]
 
 
 class Run(NamedTuple):
@@ -303,9 +264,9 @@ def missing(
 
 def draw(runs: dict[str, Run], fingertip: Fingertip, path: pathlib.Path) -> None:
     """Charge against pulse: one panel for each kind of skin, one line for each controller."""
-    figure, grid = new_figure(len(TITLES), 1, (7.2, 8.0), sharex=True)
+    figure, grid = new_figure(len(KINDS), 1, (7.2, 8.0), sharex=True)
     panels = grid[:, 0]
-    for panel, (kind, title) in zip(panels, TITLES.items(), strict=True):
+    for panel, (kind, title) in zip(panels, KINDS.items(), strict=True):
         at = fingertip.kind.index(kind)
         for name, run in runs.items():
             plain = name.split(",", maxsplit=1)[0]

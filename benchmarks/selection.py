@@ -25,7 +25,7 @@ from benchmarks import charts, selection_map, selection_rival
 from benchmarks import selection_counts as counts
 from benchmarks.estimators import Answer
 from benchmarks.failure_axes import Cell
-from benchmarks.failure_draws import AUTO, Effort
+from benchmarks.failure_draws import AUTO, Effort, answers
 from benchmarks.perturbed_study import DELAY
 from benchmarks.provenance import write_csv
 from benchmarks.rates import COVERED, Rate, clopper_pearson, rate

@@ -16,6 +16,7 @@ import numpy as np
 import etid
 from benchmarks import damage
 from benchmarks.damage import Rng
+from benchmarks.damage_hdf5 import restructure
 from etid import cli
 from etid.identify.options import Options
 from etid.recordings.preflight import Inspected, preflight
@@ -86,7 +87,7 @@ _bytes = _by(damage.damaged)
 
 def _either(path: pathlib.Path, rng: Rng) -> None:
     if rng.random() < 0.5:
-        damage.restructure(path, rng)
+        restructure(path, rng)
         if rng.random() < 0.8:
             return
     _bytes(path, rng)

@@ -9,10 +9,13 @@ import pytest
 import scipy.stats
 
 from benchmarks import (
-    driver_order,
+    control,
+    coverage,
     failure_draws,
     failure_map,
+    online,
     perturbations,
+    runner,
     speed_accuracy,
     visibility,
     which,
@@ -77,6 +80,68 @@ def test_a_number_that_could_not_be_had_misses_its_target(capsys):
     for one in missed:
         assert not report([*met, one])
     assert capsys.readouterr().out.count("missed") == 2
+
+
+def test_a_coverage_outside_the_target_is_missed_though_its_interval_touches_it(capsys):
+    def fits(right, count=100):
+        error = np.where(np.arange(count) < right, 0.0, 3.0)[:, None]
+        one = np.ones((count, 1))
+        return coverage.Draws(error, one, np.full(count, "successful"), one[:, None])
+
+    for right, met in ((92, False), (93, True), (97, True), (98, False), (60, False)):
+        [covered, silent] = coverage.targets("dry", fits(right))
+        assert (covered.met, silent.met) == (met, True)
+        assert covered.value == pytest.approx(right / 100)
+    assert not report(coverage.targets("dry", fits(98)))
+    assert not report(coverage.targets("dry", fits(60)))
+    text = capsys.readouterr().out
+    assert text.count(", missed within scatter") == 1
+    assert text.count(", missed") == 2
+
+
+def test_charges_that_noise_explains_are_missed_and_a_slow_tick_is():
+    charge = control.WANTED * np.array([[1.0, 1.03], [0.99, 1.5]])
+    peak = np.full((2, 2), 1e-3)
+    run = control.Run(charge, peak, np.zeros((2, 2), bool), np.full((2, 2), 0.9))
+    near, largest = run.targets(np.array([[True, True], [True, False]]), "")
+    assert (near.value, near.met, largest.met) == (1, False, True)
+    assert "1 of 3 (2.7 by noise alone)" in str(near)
+    slow = online.named("p99 of the tick / pulse period", 0.09, "wall: ")
+    assert not slow.met
+    assert online.named("median of the tick / pulse period", 0.09).met
+
+
+def test_tasks_that_were_done_at_this_commit_are_not_done_again(tmp_path, monkeypatch):
+    source = {"commit": "0123456789ab"}
+    monkeypatch.setattr(runner, "KEPT", tmp_path / "kept")
+    monkeypatch.setattr(runner, "provenance", lambda: source)
+    asked, path = [], tmp_path / "table.csv"
+
+    def square(number):
+        asked.append(number)
+        if number > 5:
+            raise KeyboardInterrupt
+        return number**2
+
+    def rows(done):
+        return [{"task": task, "square": found} for task, found in done.items()]
+
+    def done(*tasks):
+        return runner.tabled(path, rows, square, [(of,) for of in tasks], keep="squares")
+
+    with pytest.raises(KeyboardInterrupt):
+        done(3, 4, 6)
+    assert done(5, 4, 3) == [25, 16, 9]
+    assert asked == [3, 4, 6, 5]
+    with path.open() as file:
+        assert [row["square"] for row in csv.DictReader(file)] == ["25", "16", "9"]
+    source["commit"] = "another"
+    assert done(3) == [9]
+    assert asked == [3, 4, 6, 5, 3]
+    assert len([*runner.KEPT.iterdir()]) == 1
+    source["commit"] = "another+"  # the working tree is not that of the commit
+    assert done(3) == [9]
+    assert asked[-2:] == [3, 3]
 
 
 # --- answers --------------------------------------------------------------------------------------
@@ -287,17 +352,6 @@ def test_the_first_that_is_good_is_to_be_used_or_what_is_as_good_in_half_its_tim
 def test_the_readme_has_the_table_of_the_last_results():
     made, page = which.table(which.read(RESULTS / speed_accuracy.FILE)), which.README.read_text()
     assert which.inserted(page, made) == page, "run python -m benchmarks which"
-
-
-def test_a_choice_of_order_is_right_if_its_error_is_near_the_best():
-    def drawn(order, error):
-        return driver_order.Draw(order, np.full((2, 3), error), np.zeros((2, 3)))
-
-    draws = [
-        {4: drawn(4, 1.05), 5: drawn(5, 1.0), 6: drawn(6, 2.0), "auto": drawn(order, error)}
-        for order, error in ((4, 1.05), (5, 1.0), (6, 2.0), (6, 1.4))
-    ]
-    assert driver_order.right(draws, (4, 5, 6)) == [True, True, False, True]
 
 
 def test_one_map_anew_keeps_the_others_with_the_commit_of_their_run(tmp_path):
