@@ -23,6 +23,7 @@ from benchmarks import (
     which,
 )  # fmt: skip
 from benchmarks.__main__ import NAMES, asked
+from benchmarks.failure_draws import Effort
 from benchmarks.problem import START, ByNumPy, problem
 from benchmarks.rivals import installed
 
@@ -76,7 +77,7 @@ SMALLER = {
     online: {"WARM": 3, "NOISES": (60.0,), "KINDS": 3},
     online_alarms: {"TIMES": 1},
     selection: {
-        "FEW": (1, 1), "FEW_PAIRS": 1, "FEW_DRIVERS": 1, "FEW_SNR": (60,), "STEP": 60,
+        "FEW": Effort(1, 1), "FEW_PAIRS": 1, "FEW_DRIVERS": 1, "FEW_SNR": (60,), "STEP": 60,
         "BATCH": 2, "SINGLES": 1,
     },
     spectra: {"GOOD_POINTS": (20,)},
