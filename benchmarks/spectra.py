@@ -257,8 +257,8 @@ def without_fault(seed: int, spectra: int) -> Iterator[Target]:
             (refused / len(answers), f"{refused} of {len(answers)}; {counted(verdicts)}", None),
             (float(inside.mean()), f"{inside.mean():.4f}, {rms}", interval),
         )
-        for (name, limits), (value, *rest) in zip(TARGETS.items(), values, strict=True):
-            yield Target(f"good, {points} frequencies: {name}", value, *limits, *rest)
+        for (name, limits), (value, text, scatter) in zip(TARGETS.items(), values, strict=True):
+            yield Target(f"good, {points} frequencies: {name}", value, *limits, text, scatter)
 
 
 def main(arguments: argparse.Namespace) -> bool:
