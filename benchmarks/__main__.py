@@ -12,7 +12,7 @@ from benchmarks.rivals import RivalError
 from benchmarks.timing import pin
 
 NAMES = (
-    *("spice", "coverage", "driver_order", "delays", "noise", "selection", "design", "timing"),
+    *("spice", "coverage", "driver_order", "delays", "noise", "selection", "design"),
     *("speed", "curves", "scale", "amplitudes", "amplitude_errors", "online", "control"),
     *("speed_accuracy", "which", "paper", "failure_map", "perturbations", "spectra", "rivals"),
     *("referee", "fuzz", "mutation"),

@@ -3,28 +3,26 @@
 The skin is that of Kaczmarek and Webster (1989) under a current source, eight times slower, so that
 a record has few harmonics and a fit takes a second. Current and voltage have white noise. SciPy
 solves the differential equation of the skin. The smallest errors (Cramér and Rao) come from the
-same equation, without etid. The target is missed where a fit is not successful, or where chance
-gives such a coverage or such a ratio of errors once in a thousand times.
+same equation, without etid. The targets of each scene are those of `benchmarks.coverage`.
 """
 
 import argparse
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import numpy as np
 from scipy.integrate import solve_ivp
 from scipy.special import erf
-from scipy.stats import binom, chi2
 
 import etid
-from benchmarks.runner import option
+from benchmarks.amplitudes import EDGES, PULSE_RATE, WIDTH
+from benchmarks.coverage import HEADS, Draws, draw, lines, targets
+from benchmarks.runner import Target, option, report
 
 SLOWER = 8
-PULSE_RATE, SAMPLE_RATE, SAMPLES = 60.0, 20e3, 1000  # Hz, Hz; three periods
+SAMPLE_RATE, SAMPLES = 20e3, 1000  # Hz; three periods
 PERIOD = 1 / PULSE_RATE / SLOWER  # s, of the skin as it is
 R_S, R_P, C_P, I_0 = 895.0, 60.1e3, 1e-9, 0.585e-3
 TRUTH = np.array([R_S, R_P, SLOWER * C_P, I_0])
-EDGES, WIDTH = (0.4e-3, 0.7e-3, 1e-3), 40e-6  # s
 SCENES = (
     ((0.5e-3, 1e-3, 2e-3, 5e-3), 60.0),
     ((1e-3, 3e-3, 5e-3), 60.0),
@@ -33,34 +31,6 @@ SCENES = (
 )
 HARMONICS = int(SAMPLE_RATE / 2 / PULSE_RATE)
 POINTS = 2**13  # of the bound, per period: 0.25 µs, and the skin takes 0.7 µs at 5 mA
-CHANCE = 1e-3
-
-
-class Draws(NamedTuple):
-    """Fits of one skin with different noise; one row for each, errors relative to the truth."""
-
-    successful: int  # number of fits with that verdict
-    error: np.ndarray  # errors of the elements
-    stderr: np.ndarray  # their standard errors, as the fits state them
-
-    @property
-    def right(self) -> np.ndarray:
-        """Number of right 95 % intervals of each element."""
-        return np.sum(np.abs(self.error) < 1.96 * self.stderr, axis=0)
-
-    @property
-    def ratio(self) -> np.ndarray:
-        """RMS error in stated standard errors, of each element."""
-        return np.sqrt(np.mean((self.error / self.stderr) ** 2, axis=0))
-
-    def met(self) -> bool:
-        """Whether all fits are successful, and intervals and ratios are within chance."""
-        count, half = len(self.error), CHANCE / 2
-        least, most = binom.ppf([half, 1 - half], count, 0.95)
-        small, large = np.sqrt(chi2.ppf([half, 1 - half], count) / count)
-        inside = (self.right >= least) & (self.right <= most)
-        alike = (self.ratio >= small) & (self.ratio <= large)
-        return self.successful == count and bool(np.all(inside & alike))
 
 
 def pulses(t: np.ndarray) -> np.ndarray:
@@ -89,7 +59,7 @@ def draws(amplitudes: Sequence[float], snr_db: float, count: int) -> Draws:
     t, level = np.arange(SAMPLES) / SAMPLE_RATE, 10 ** (-snr_db / 20)
     elements = np.array([R_S, R_P, C_P, I_0])
     clean = [(voltage(one, t / SLOWER, elements), one * pulses(t / SLOWER)) for one in amplitudes]
-    successful, errors, stderrs = 0, [], []
+    rows = []
     for seed in range(count):
         rng = np.random.default_rng([seed, round(snr_db), len(amplitudes)])
         of = []
@@ -103,10 +73,8 @@ def draws(amplitudes: Sequence[float], snr_db: float, count: int) -> Draws:
             )
             of.append(one)
         fit = etid.identify_amplitudes(of, throw=False)
-        successful += fit.verdict == "successful"
-        errors.append(np.asarray(fit.circuit.values()) / TRUTH - 1)
-        stderrs.append(np.sqrt(np.diag(fit.cov)) / TRUTH)
-    return Draws(successful, np.array(errors), np.array(stderrs))
+        rows.append(draw(fit, TRUTH.tolist()))
+    return Draws.of(rows)
 
 
 def smallest_errors(amplitudes: Sequence[float], snr_db: float) -> np.ndarray:
@@ -164,21 +132,15 @@ OPTIONS = (option("--draws", default=200, help="of each scene"),)
 
 
 def main(arguments: argparse.Namespace) -> bool:
-    """Print the table; whether every interval and error is right."""
-    met = True
-    for amplitudes, snr_db in SCENES:
+    """Print the table; whether the targets are met."""
+    asked, names = list[Target](), etid.SkinCurrent.names()
+    print(HEADS)
+    for number, (amplitudes, snr_db) in enumerate(SCENES):
+        print(
+            f"scene {number}: {', '.join(f'{1e3 * of:g}' for of in amplitudes)} mA, {snr_db:g} dB"
+        )
         found = draws(amplitudes, snr_db, arguments.draws)
-        least = smallest_errors(amplitudes, snr_db)
-        met &= found.met()
-        said = ", ".join(f"{1e3 * one:g}" for one in amplitudes)
-        print(f"{said} mA, {snr_db:g} dB: {found.successful} of {arguments.draws} successful")
-        rms = np.sqrt(np.mean(found.error**2, axis=0))
-        stated = np.median(found.stderr, axis=0)
-        for k, name in enumerate(etid.SkinCurrent.names()):
-            print(
-                f"  {name}: right {100 * found.right[k] / arguments.draws:.1f} %, "
-                f"bound {100 * least[k]:.4f} %, in bounds: stated {stated[k] / least[k]:.2f}, "
-                f"RMS {rms[k] / least[k]:.2f}; RMS / stated {found.ratio[k]:.2f}",
-                flush=True,
-            )
-    return met
+        least = dict(zip(names, smallest_errors(amplitudes, snr_db).tolist(), strict=True))
+        print("\n".join(lines(f"scene {number}", found, least)), flush=True)
+        asked += targets(f"scene {number}", found)
+    return report(asked)

@@ -1,6 +1,7 @@
 """What all charts have in common: the look of the package's pictures, and where they come from."""
 
 import pathlib
+from collections.abc import Mapping
 
 import matplotlib as mpl
 from matplotlib.figure import Figure
@@ -12,6 +13,8 @@ from etid.plotting.style import INK as INK
 from etid.plotting.style import MARKS as MARKS
 from etid.plotting.style import new_figure as new_figure
 
+PANEL, LINE = 2.6, 0.15  # [inch] width of a panel of shares, height of a bar
+
 
 def save(figure: Figure, path: pathlib.Path) -> None:
     """Write SVG or PNG; SVG has the provenance, and is the same file for the same numbers."""
@@ -22,3 +25,56 @@ def save(figure: Figure, path: pathlib.Path) -> None:
     source = "; ".join(f"{name} {value}" for name, value in provenance().items())
     with mpl.rc_context({"svg.hashsalt": "etid"}):
         figure.savefig(path, metadata={"Date": None, "Description": source})
+
+
+Counts = Mapping[str, Mapping[str, int]]
+"""Counts of each kind by row of a panel."""
+
+
+def shares(
+    panels: Mapping[str, Counts],
+    faces: Mapping[str, tuple[str, str, str]],
+    path: pathlib.Path,
+    *,
+    title: str = "",
+    texts: Mapping[tuple[str, str], str] | None = None,
+) -> None:
+    """Draw bars of the shares of each kind: a bar for each row, a panel for each column.
+
+    Args:
+        panels: The counts, by title of the panel.
+        faces: Colour, hatch and label of each kind, in the order of the bars: hatches tell them
+            apart in black and white.
+        path: SVG or PNG to write.
+        title: Of the figure.
+        texts: What is written beside a bar, by panel and row.
+    """
+    rows = list(dict.fromkeys(row for of in panels.values() for row in of))
+    size = 2.6 + PANEL * len(panels), 1.4 + LINE * len(rows)
+    figure, axes = new_figure(1, len(panels), size, sharey=True)
+    for axis, (name, of) in zip(axes.flat, panels.items(), strict=True):
+        left = [0.0] * len(rows)
+        for kind, (colour, hatch, label) in faces.items():
+            width = [
+                100 * of[row][kind] / sum(of[row].values()) if row in of else 0 for row in rows
+            ]
+            axis.barh(
+                range(len(rows)), width, left=left, color=colour, hatch=hatch, height=0.85,
+                edgecolor="white", linewidth=0.3, label=label,
+            )  # fmt: skip
+            left = [begin + more for begin, more in zip(left, width, strict=True)]
+        for place, row in enumerate(rows):
+            text = (texts or {}).get((name, row), "")
+            axis.text(1, place, text, va="center", fontsize=6.5)
+        axis.set_xlim(0, 100)
+        axis.set_title(name, fontsize=9)
+        axis.grid(False)
+        axis.tick_params(labelsize=7, length=0)
+        axis.set_xlabel("%", fontsize=8)
+    axes.flat[0].set_yticks(range(len(rows)), rows)
+    axes.flat[0].set_ylim(len(rows) - 0.5, -0.5)
+    labels = axes.flat[0].get_legend_handles_labels()
+    figure.legend(*labels, loc="outside lower center", ncols=len(faces), fontsize=8)
+    if title:
+        figure.suptitle(title, fontsize=11)
+    save(figure, path)

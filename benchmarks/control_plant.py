@@ -16,12 +16,52 @@ import scipy.interpolate
 from jaxtyping import Float
 
 from benchmarks import ngspice
+from etid.simulation.published import TYPICAL
 from etid.simulation.scenes import Scene
 from etid.simulation.transformer import ResistorLoad, SkinLoad
 
 OPEN = ResistorLoad(1e12)
 FINE = 16  # points per sample of the waveform that is sampled
+# What happens to the skin at an electrode.
+KINDS = {
+    "dry": "dry",
+    "wetting": "wetting within 100 ms",
+    "sweating": "sweating slowly",
+    "lifted": "lifted off and put back",
+}
+SPOTS, SPREAD = 7, 0.3  # different places of the fingertip, and the spread of their elements
+WETTING = 6  # pulses from dry to damp
+LIFTED, BACK = 70, 90  # pulses between which the last electrode touches nothing
+SETTLED = 2  # pulses after a change that do not count: the target begins with the third
 CORNER = 0.4  # of the sample rate, of the 4th-order Butterworth anti-alias filter
+
+
+class Fingertip:
+    """The skin at each electrode and pulse."""
+
+    def __init__(self, electrodes: int, pulses: int) -> None:
+        spots = np.exp(SPREAD * np.random.default_rng(0).standard_normal((SPOTS, 3)))
+        dry, damp = (np.array(dataclasses.astuple(TYPICAL[name])) for name in ("dry", "damp"))
+        pulse, at = np.arange(pulses)[:, None], np.arange(electrodes)
+        kind = np.array(list(KINDS))[at % 3]
+        kind[-1] = "lifted"
+        self.kind = kind.tolist()
+        begin, wetting, sweating = 30 + 3 * (at // 3 % 4), kind == "wetting", kind == "sweating"
+        wet = np.where(wetting, np.clip((pulse - begin + 1) / WETTING, 0, 1), 0.0)
+        wet = np.where(sweating, pulse / pulses / 3, wet)[..., None]  # a third of the way to damp
+        # Fewer places sweat: each pulse of them is another run of ngspice.
+        values = spots[at // 3 % np.where(sweating, 2, SPOTS)] * dry ** (1 - wet) * damp**wet
+        lifted = (kind == "lifted") & (pulse >= LIFTED)
+        self.loads: list[list[SkinLoad | ResistorLoad]] = [
+            [OPEN if up else SkinLoad(*map(float, of)) for up, of in zip(*row, strict=True)]
+            for row in zip(lifted & (pulse < BACK), values, strict=True)
+        ]
+        # Pulses that count: neither a change nor one of the two pulses that follow it.
+        changed = (pulse == 0) | (wetting & (begin <= pulse) & (pulse < begin + WETTING))
+        changed |= lifted & (pulse <= BACK)
+        self.counts = ~changed
+        for later in range(1, SETTLED + 1):
+            self.counts[later:] &= ~changed[:-later]
 
 
 @dataclasses.dataclass(frozen=True)

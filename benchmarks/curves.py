@@ -5,7 +5,6 @@ between two neighbours on logarithmic axes: 1 where cost is in proportion, 0 whe
 """
 
 import argparse
-import functools
 import pathlib
 import tempfile
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -105,17 +104,30 @@ def against_samples(sizes: Sequence[int]) -> Iterator[Row]:
 
 
 def against_lanes(counts: Sequence[int]) -> Iterator[Row]:
-    """Seconds per lane of a batch, from recordings in memory to fits."""
+    """Seconds per lane of a batch, from recordings in memory to fits; then solvers alone."""
     of, method = problem(5_000, 16, 100e3), "equation_error"
     quick = etid.identify_driver(of.study["calibration/0"], method=method, throw=False)
-    for name, driver in {"maximum_likelihood": of.driver, method: quick}.items():
+
+    def fits(name: str, driver: etid.Driver) -> Callable[[np.ndarray], Any]:
+        def run(index: np.ndarray) -> Any:
+            many = [of.records[i] for i in index]
+            return etid.identify_skins(many, driver, method=name).chi2
+
+        return run
+
+    runs = {
+        "maximum_likelihood": fits("maximum_likelihood", of.driver),
+        method: fits(method, quick),
+    }
+    runs |= {f"LM fit, {name}": run for name, run in peers.solvers(of).items()}
+    for name, run in runs.items():
         each = 0.0
         for count in counts:
-            if each * count > LIMIT:
+            done = min(count, peers.BY_SCIPY) if name.endswith("scipy") else count
+            if each * done > LIMIT:
                 break
-            many = (of.records * (count // len(of.records) + 1))[:count]
-            fit = functools.partial(etid.identify_skins, many, driver, method=name)
-            each = seconds(lambda fit=fit: fit().chi2) / count
+            index = np.arange(count) % len(of.records)
+            each = seconds(lambda run=run, index=index: run(index)) / done
             yield _row("lanes", name, count, each)
 
 

@@ -39,11 +39,7 @@ class Mutant:
     before: str  # the code there
     after: str  # what takes its place
     span: tuple[int, int]  # first and last byte of it
-
-    @property
-    def key(self) -> str:
-        """What tells it from others, also after lines above it have changed."""
-        return f"{self.path}:{self.kind}:{self.before}:{self.after}:{self.line}"
+    inside: bool  # whether a call runs it; else it is run when the module is imported
 
     def applied(self, source: str) -> str:
         """The module with it."""
@@ -89,15 +85,16 @@ def _changed(node: ast.AST) -> Iterator[tuple[str, ast.AST]]:
             pass
 
 
-def _parts(node: ast.AST) -> Iterator[ast.AST]:
-    """Nodes whose change a test should see, from outside in."""
-    yield node
+def _parts(node: ast.AST, inside: bool = False) -> Iterator[tuple[ast.AST, bool]]:
+    """Nodes whose change a test should see, from outside in; and whether a function has them."""
+    yield node, inside
     for name, value in ast.iter_fields(node):
         if name in ("annotation", "returns", "decorator_list", "type_params"):
             continue
+        within = inside or (name == "body" and isinstance(node, ast.FunctionDef | ast.Lambda))
         for part in value if isinstance(value, list) else [value]:
             if isinstance(part, ast.AST) and not _is_silent(part):
-                yield from _parts(part)
+                yield from _parts(part, within)
 
 
 def _is_silent(node: ast.AST) -> bool:
@@ -119,7 +116,7 @@ def mutants(path: str, source: str) -> list[Mutant]:
     for line in text.splitlines(keepends=True):
         starts.append(starts[-1] + len(line))
     found = []
-    for node in _parts(ast.parse(source)):
+    for node, inside in _parts(ast.parse(source)):
         place = node.test if isinstance(node, ast.If) else node
         for kind, other in _changed(node):
             assert isinstance(place, ast.expr | ast.stmt)  # all that is changed has a place
@@ -131,7 +128,8 @@ def mutants(path: str, source: str) -> list[Mutant]:
             if isinstance(other, ast.expr):
                 after = f"({after})"
             before = text[begin:end].decode()
-            found.append(Mutant(path, place.lineno, kind, before, after, (begin, end)))
+            span = begin, end
+            found.append(Mutant(path, place.lineno, kind, before, after, span, inside))
     return [one for one in found if _compiles(one.applied(source))]
 
 

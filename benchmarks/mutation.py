@@ -1,206 +1,264 @@
-"""Would the tests tell? Bugs are put in, one at a time, and the tests of the files concerned run.
+"""Would the tests tell? Bugs are put in, one at a time, and the tests that execute them run.
 
     python -m benchmarks mutation --mutants 40 --modules estimators.judgement signals.harmonics
 
-A mutant that all tests let pass has survived. Some are no bug at all: another start of an
-iteration, a tolerance that nothing depends on; they are counted all the same. Mutants are drawn by
-a seed from a copy of the working tree. Tests that killed a mutant of the same module come first,
-those of the nearest lines before the others. Each outcome is kept at once in `mutation.jsonl`: the
-same command goes on where it was interrupted, and as the mutants are done in the order in which
-they were drawn, what is done is a fair sample. The table is `mutation.csv`.
+Mutants (`benchmarks.mutants`) are drawn by a seed from all modules of etid, in a copy of the
+working tree. First every file of the ordinary tests runs once, in a process of its own, and its
+executed lines are noted. A mutant is then judged by all files that execute its line; one outside of
+functions, by all files that execute any function of the module. Tests that killed a mutant of the
+module come first, then the fastest files. A mutant that all of them let pass has survived, and so
+has one that no test executes. Some are no bug at all: another start of an iteration, a tolerance
+that nothing depends on; they are counted all the same.
+
+Outcomes are kept as long as the commit is the same, and mutants are done in the order in which they
+were drawn: what is done is a fair sample. The table is `mutation.csv`.
+
+The tools mutmut and cosmic-ray are no substitute: mutmut wraps every function, which compiled code
+and checks of types see, and cosmic-ray starts Python and JAX anew for each mutant and runs the same
+tests for all.
 """
 
 import argparse
 import collections
-import json
+import contextlib
+import multiprocessing
 import os
 import pathlib
 import shutil
+import sys
 import tempfile
 import time
-from collections.abc import Iterator, Mapping, Sequence
-from typing import Any
+from collections.abc import Mapping, Sequence
+from multiprocessing.connection import Connection
+from typing import Any, NamedTuple
 
-from benchmarks.mutant_tests import Runner
 from benchmarks.mutants import Mutant, drawn, mutants
-from benchmarks.provenance import ROOT, write_csv
+from benchmarks.provenance import ROOT
 from benchmarks.rates import clopper_pearson
-from benchmarks.runner import option
+from benchmarks.runner import Target, at_most, each, option, report, tabled
 
-TARGET = 0.1  # part of the mutants that may survive
+TARGETS = {"mutants that survive": at_most(0.1)}
 COPIED = (
-    *("etid", "tests", "benchmarks", "data_schema", "docs", "notebooks", ".ci"),
+    *("etid", "tests", "benchmarks", "data_schema", "docs", "notebooks", "examples", ".ci"),
     ".pytest_cache",  # what was compiled for tests without a mutant
 )
 LIMIT = 600.0  # [s] of a mutant; one that takes longer counts as a survivor
-# The tests of each module, the cheapest first.
-_WELL = ("maximum_likelihood", "own_circuits", "current", "other_circuit", "mains")
-_OVERVIEW = ("overview", "fit", "exporting", "recording", "identification")
-TESTS: Mapping[str, Sequence[str]] = {
-    "estimators.joint.errors": ("joint_errors", "joint"),
-    "estimators.joint.fit": ("joint",),
-    "estimators.joint.terms": ("joint",),
-    "estimators.judgement": ("judging",),
-    "estimators.maximum_likelihood.given_driver": (
-        *("given_driver", "maximum_likelihood", "current"),
-    ),
-    "estimators.maximum_likelihood.load": _WELL,
-    "estimators.maximum_likelihood.load_fit": _WELL,
-    "estimators.maximum_likelihood.profile": ("maximum_likelihood", "mains"),
-    "estimators.non_parametric.fit": ("non_parametric",),
-    "estimators.output_error.fit": ("output_error", "current", "identification"),
-    "estimators.output_error.information": ("output_error", "identification"),
-    "estimators.output_error.prediction": ("output_error", "identification"),
-    "identify.changes": ("other_in_time", "changes"),
-    "identify.file": ("streaming", "interrupt", "current"),
-    "online.changes": ("electrode", "online"),
-    "online.electrode": ("electrode", "online"),
-    "online.gain_bands": ("gain_bands", "online"),
-    "online.projection": ("gain_bands", "online"),
-    "online.tick": ("electrode", "online"),
-    "online.tracker": ("electrode", "online"),
-    "results.driver": ("driver", "overview", "given_driver"),
-    "results.fit": _OVERVIEW,
-    "results.fits": (*_OVERVIEW, "batch"),
-    "results.hdf5_table": ("tables", "exporting", "cli"),
-    "results.verdicts": ("judging", "verdicts"),
-    "signals.harmonics": ("spectra",),
-    "solvers.levenberg_marquardt": ("solver_steps", "levenberg_marquardt"),
-}
+# To load these takes longer than most mutants live: a process that has loaded them is forked.
+PRELOADED = (
+    *("jax.export", "equinox", "optimistix", "lineax", "scipy.optimize", "scipy.signal"),
+    *("scipy.stats", "h5py", "jinja2", "matplotlib.pyplot", "hypothesis", "beartype"),
+    *("jaxtyping", "pytest", "coverage"),
+)
 
 
-def copied(root: pathlib.Path, folder: pathlib.Path) -> None:
-    """A working tree to break, with the reference data beside it if there are any."""
-    for path in root.iterdir():
-        if path.is_file() and not path.name.startswith("."):
-            shutil.copy2(path, folder)
-        elif path.name in COPIED:
-            ignored = shutil.ignore_patterns("__pycache__")
-            shutil.copytree(path, folder / path.name, ignore=ignored)
-    shared = root.parent / "shared"
-    if shared.exists():
-        (folder.parent / "shared").symlink_to(shared.resolve())
+class Judged(NamedTuple):
+    """What some tests said of the copy."""
+
+    passed: bool | None  # whether all passed; None if they took too long
+    killer: str  # the test that failed; empty if none did, or if they could not be collected
+    lines: Mapping[str, Sequence[int]]  # executed lines by module, if they were noted
 
 
-def nearest(rows: Sequence[Mapping[str, Any]], module: str, line: int) -> list[str]:
-    """Tests that killed a mutant of this module, those of the nearest lines first."""
-    distance = {}
-    for row in rows:
-        if row["module"] == module and row["killer"]:
-            far = abs(int(row["place"].rpartition(":")[2]) - line)
-            distance[row["killer"]] = min(far, distance.get(row["killer"], far))
-    return sorted(distance, key=lambda killer: distance[killer])
+class _Failed:
+    """Plugin of pytest: the name of the test that failed."""
+
+    name = ""
+
+    def pytest_runtest_logreport(self, report: Any) -> None:
+        """Keep it."""
+        if report.failed:
+            self.name = report.nodeid
 
 
-def outcomes(
-    root: pathlib.Path,
-    tests: Mapping[str, Sequence[str]],
-    chosen: Sequence[Mutant],
-    kept: pathlib.Path,
-    limit: float,
-) -> Iterator[dict[str, Any]]:
-    """One row for each mutant, as they are done; those that are kept already come as they were.
+def _run(folder: str, tests: Sequence[str], module: str, answer: Connection) -> None:
+    """Run tests in the copy; this process has not loaded etid."""
+    for name in [name for name in sys.modules if name.partition(".")[0] in ("benchmarks", "etid")]:
+        del sys.modules[name]
+    beside = pathlib.Path(folder).parent
+    os.chdir(folder)
+    sys.path.insert(0, folder)
+    sys.pycache_prefix, sys.dont_write_bytecode = str(beside / "bytecode"), False
+    os.environ.update(PYTHONPATH=folder, XDG_CACHE_HOME=str(beside / "cache"))
+    # Also what libraries write there without Python.
+    with open(beside / "log", "w") as log:
+        os.dup2(log.fileno(), 1)
+        os.dup2(log.fileno(), 2)
+    import coverage
+    import pytest
+
+    failed, noted = _Failed(), coverage.Coverage(data_file=None, source=[f"{folder}/etid"])
+    options = [
+        *("-q", "-x"),
+        # Modules of plugins are loaded already, and their assertions are not rewritten.
+        *("-W", "ignore::pytest.PytestAssertRewriteWarning"),
+    ]
+    if module:  # to check the types of all modules takes longer than to load them
+        options.append(f"--jaxtyping-packages={module},beartype.beartype")
+    with contextlib.nullcontext() if module else noted.collect():
+        status = pytest.main([*options, *tests], plugins=[failed])
+    data = noted.get_data()
+    lines = {os.path.relpath(path, folder): data.lines(path) for path in data.measured_files()}
+    # A file whose tests are all slow, or need what is not there, has nothing against it.
+    fine = pytest.ExitCode.OK, pytest.ExitCode.NO_TESTS_COLLECTED
+    answer.send((status in fine, failed.name, lines))
+
+
+class Tree:
+    """A copy of a project, whose tests run each time in a new process.
 
     Args:
         root: The working tree.
-        tests: Test files of each module.
-        chosen: The mutants.
-        kept: File of what was done before.
-        limit: Time of a mutant [s].
-
-    Raises:
-        SystemExit: The tests fail without any mutant.
+        beside: An empty folder. Bytecode, caches and the log of the last tests lie in it too.
     """
-    before = {}
-    if kept.exists():
-        lines = kept.read_text("utf-8").splitlines()
-        before = {row["key"]: row for row in map(json.loads, lines)}
-    with tempfile.TemporaryDirectory() as place:
-        folder = pathlib.Path(place, "tree")
-        folder.mkdir()
-        copied(root, folder)
-        run = Runner(folder)
-        sound: set[str] = set()
-        for index, mutant in enumerate(chosen):
-            if mutant.key in before:
-                yield before[mutant.key]
-                continue
-            name = mutant.path.removeprefix("etid/").removesuffix(".py").replace("/", ".")
-            for test in set(tests[name]) - sound:
-                if run([test], f"etid.{name}", 10 * limit).passed is not True:
-                    raise SystemExit(f"tests/test_{test}.py fails without any mutant")
-                sound.add(test)
-            path = folder / mutant.path
-            source = path.read_text("utf-8")
-            path.write_text(mutant.applied(source), "utf-8")
-            # Python takes bytecode for that of a source of the same length and time.
-            os.utime(path, (index, index))
-            begun = time.perf_counter()
-            first = nearest(list(before.values()), name, mutant.line)
-            passed, killer = run(tests[name], f"etid.{name}", limit, first)
-            path.write_text(source, "utf-8")
-            row = {
-                "key": mutant.key,
-                "module": name,
-                "place": f"{mutant.path}:{mutant.line}",
-                "kind": mutant.kind,
-                "before": mutant.before,
-                "after": mutant.after,
-                "outcome": {True: "survived", False: "killed", None: "too long"}[passed],
-                "killer": killer,
-                "seconds": round(time.perf_counter() - begun, 1),
-            }
-            before[mutant.key] = row
-            with kept.open("a", encoding="utf-8") as file:
-                file.write(json.dumps(row) + "\n")
-            yield row
+
+    def __init__(self, root: pathlib.Path, beside: pathlib.Path) -> None:
+        self.folder = beside / "tree"
+        self.folder.mkdir()
+        for path in root.iterdir():
+            if path.is_file() and not path.name.startswith("."):
+                shutil.copy2(path, self.folder)
+            elif path.name in COPIED:
+                ignored = shutil.ignore_patterns("__pycache__")
+                shutil.copytree(path, self.folder / path.name, ignore=ignored)
+        if (root.parent / "shared").exists():  # reference data
+            (beside / "shared").symlink_to((root.parent / "shared").resolve())
+        self.context = multiprocessing.get_context("forkserver")
+        self.context.set_forkserver_preload(list(PRELOADED))
+        self.times = 0
+
+    def judged(self, tests: Sequence[str], module: str, limit: float) -> Judged:
+        """What tests say; without a module whose types are checked, executed lines are noted."""
+        ours, theirs = self.context.Pipe(duplex=False)
+        process = self.context.Process(target=_run, args=(str(self.folder), tests, module, theirs))
+        process.start()
+        theirs.close()
+        late = not ours.poll(limit)
+        try:
+            return Judged(None, "", {}) if late else Judged(*ours.recv())
+        except EOFError:  # a process that died has not answered
+            return Judged(False, "", {})
+        finally:
+            process.kill()
+            process.join()
+
+    def executed(self, test: str) -> tuple[float, Mapping[str, Sequence[int]]]:
+        """How long a file of tests takes [s], and the lines of etid that it executes.
+
+        Raises:
+            SystemExit: The tests fail without any mutant.
+        """
+        begun = time.perf_counter()
+        found = self.judged([test], "", 10 * LIMIT)
+        if not found.passed:
+            raise SystemExit(f"{test} fails without any mutant: {found.killer}")
+        return time.perf_counter() - begun, found.lines
+
+    def outcome(self, mutant: Mutant, tests: Sequence[str], limit: float) -> dict[str, Any]:
+        """The row of a mutant."""
+        path, begun = self.folder / mutant.path, time.perf_counter()
+        source, module = path.read_text("utf-8"), mutant.path.removesuffix(".py").replace("/", ".")
+        path.write_text(mutant.applied(source), "utf-8")
+        self.times += 1
+        # Python takes bytecode for that of a source of the same length and time.
+        os.utime(path, (self.times, self.times))
+        passed, killer, _ = self.judged(tests, module, limit) if tests else Judged(True, "", {})
+        path.write_text(source, "utf-8")
+        return {
+            "module": module.removeprefix("etid."),
+            "place": f"{mutant.path}:{mutant.line}",
+            "kind": mutant.kind,
+            "before": " ".join(mutant.before.split()),
+            "after": " ".join(mutant.after.split()),
+            "outcome": {True: "survived", False: "killed", None: "too long"}[passed],
+            "killer": killer,
+            "seconds": round(time.perf_counter() - begun, 1),
+        }
 
 
-def _on_one_line(row: Mapping[str, Any]) -> dict[str, Any]:
-    code = {name: " ".join(row[name].split()) for name in ("before", "after")}
-    return {name: value for name, value in row.items() if name != "key"} | code
+def judges(
+    mutant: Mutant,
+    executed: Mapping[str, tuple[float, Mapping[str, Sequence[int]]]],
+    calls: set[int],
+) -> list[str]:
+    """Files of tests that execute a mutant, the fastest first.
+
+    Args:
+        mutant: The change.
+        executed: Time and executed lines of each file.
+        calls: Lines of the module that calls run.
+    """
+    lines = {mutant.line} if mutant.inside else calls
+    of = {
+        test: seconds
+        for test, (seconds, by) in executed.items()
+        if lines & {*by.get(mutant.path, ())}
+    }
+    return sorted(of, key=lambda test: of[test])
 
 
-def show(rows: Sequence[Mapping[str, Any]]) -> float:
-    """Print what survived, and return the part of all that it is."""
-    modules = collections.defaultdict(list)
-    for row in rows:
-        modules[row["module"]].append(row["outcome"] != "killed")
-    print(f"{'module':<44}{'mutants':>8}{'survived':>10}")
-    for name, survived in sorted(modules.items()):
-        print(f"{name:<44}{len(survived):>8}{sum(survived):>10}")
+def show(rows: Sequence[Mapping[str, Any]]) -> Target:
+    """Print what survived; the part of all that it is."""
+    counts = collections.Counter(row["module"] for row in rows)
     left = [row for row in rows if row["outcome"] != "killed"]
-    low, high = clopper_pearson(len(left), len(rows))
-    share = len(left) / len(rows)
-    print(f"{len(left)} of {len(rows)} survive, {share:.0%} (95 %: {low:.0%} to {high:.0%})")
+    survived = collections.Counter(row["module"] for row in left)
+    print(f"{'module':<44}{'mutants':>8}{'survived':>10}")
+    for name, count in sorted(counts.items()):
+        print(f"{name:<44}{count:>8}{survived[name]:>10}")
     for row in left:
-        code = " ".join(row["before"].split())[:70], " ".join(row["after"].split())[:70]
-        print(f"  {row['place']}: {row['kind']}: {code[0]}  ->  {code[1]}")
-    return share
+        print(f"  {row['place']}: {row['kind']}: {row['before'][:70]}  ->  {row['after'][:70]}")
+    [(name, limits)] = TARGETS.items()
+    share, interval = len(left) / len(rows), clopper_pearson(len(left), len(rows))
+    low, high = interval
+    text = f"{len(left)} of {len(rows)}, {share:.0%} (95 %: {low:.0%} to {high:.0%})"
+    return Target(name, share, *limits, text, interval)
+
+
+def module_names(root: pathlib.Path) -> list[str]:
+    """All modules of etid, by their names below it."""
+    found = sorted((root / "etid").rglob("*.py"))
+    return [".".join(path.relative_to(root / "etid").with_suffix("").parts) for path in found]
 
 
 OPTIONS = (
     option("--mutants", default=40, help="how many to draw"),
-    option("--modules", nargs="+", choices=TESTS, default=list(TESTS), type=str),
+    option("--modules", nargs="+", type=str, default=[], metavar="MODULE", help="of etid; all"),
     option("--seed", default=0),
     option("--limit", default=LIMIT, help="time of a mutant [s]"),
-    option("--output", default=pathlib.Path("mutation.jsonl"), type=pathlib.Path),
+    option("--output", default=pathlib.Path("mutation.csv"), type=pathlib.Path),
 )
 
 
-def main(arguments: argparse.Namespace) -> bool:
-    """Run the command."""
-    every = []
-    for name in arguments.modules:
+def main(arguments: argparse.Namespace, root: pathlib.Path = ROOT) -> bool:
+    """Draw, judge, print and write; whether few enough mutants survive."""
+    names, every, calls = arguments.modules or module_names(root), list[Mutant](), {}
+    for name in names:
         path = f"etid/{name.replace('.', '/')}.py"
-        every += mutants(path, (ROOT / path).read_text("utf-8"))
+        of = mutants(path, (root / path).read_text("utf-8"))
+        calls[path] = {one.line for one in of if one.inside}
+        every += of
     chosen = drawn(every, arguments.mutants, arguments.seed)
-    print(f"{len(chosen)} of {len(every)} mutants of {len(arguments.modules)} modules")
-    rows = []
-    for row in outcomes(ROOT, TESTS, chosen, arguments.output, arguments.limit):
-        rows.append(row)
-        what = f"{row['place']:<52}{row['kind']:<20}{row['outcome']:<10}"
-        print(f"{what}{row['seconds']:6.1f} s", flush=True)
-    table = [{"seed": arguments.seed, **row} for row in rows]
-    write_csv(arguments.output.with_suffix(".csv"), [_on_one_line(row) for row in table])
-    return show(rows) <= TARGET
+    print(f"{len(chosen)} of {len(every)} mutants of {len(names)} modules")
+    with tempfile.TemporaryDirectory() as place:
+        tree = Tree(root, pathlib.Path(place))
+        tests = [f"tests/{path.name}" for path in sorted((root / "tests").glob("test_*.py"))]
+        noted = dict(each(tree.executed, [(one,) for one in tests], 1, "file", "tests"))
+        executed = {tests[number]: found for number, found in noted.items()}
+        killers = collections.defaultdict(list)
+
+        def outcome(mutant: Mutant) -> dict[str, Any]:
+            by = judges(mutant, executed, calls[mutant.path])
+            row = tree.outcome(mutant, [*killers[mutant.path], *by], arguments.limit)
+            if row["killer"] and row["killer"] not in killers[mutant.path]:
+                killers[mutant.path].append(row["killer"])
+            print(
+                f"{row['place']:<52}{row['kind']:<20}{row['outcome']:<10}{row['seconds']:6.1f} s",
+                flush=True,
+            )
+            return row
+
+        def table(done: dict[int, dict[str, Any]]) -> list[dict[str, Any]]:
+            return [{"seed": arguments.seed, **row} for row in done.values()]
+
+        tasks = [(mutant,) for mutant in chosen]
+        rows = tabled(arguments.output, table, outcome, tasks, unit="mutant", keep="mutation")
+    return report([show(rows)])

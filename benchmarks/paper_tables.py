@@ -17,6 +17,7 @@ from etid.report.html import Table, number
 from etid.simulation import published
 
 Row = dict[str, Any]
+_IN_SI = ("typical", "lowest", "highest", "paper_typical", "paper_lowest", "paper_highest")
 Groups = Mapping[tuple[str, str], Sequence[Outcome]]
 """The studies of each laboratory and method."""
 
@@ -115,65 +116,18 @@ def _stderr_of_mean(fits: etid.Fits, truth: Truth, i: int) -> float:
     return float(100 / known * np.sqrt(shared + (total - shared) / len(fits)))
 
 
-def _by_group(rows: Sequence[Row]) -> dict[tuple[str, str], list[Row]]:
-    """Rows of each laboratory and method."""
-    names = dict.fromkeys((row["laboratory"], row["method"]) for row in rows)
-    return {of: [row for row in rows if (row["laboratory"], row["method"]) == of] for of in names}
+def show(rows: Sequence[Row], columns: Sequence[str]) -> Table:
+    """A table for the terminal: the laboratory, the method, and these columns of the rows."""
+    heads = ("laboratory", "method", *columns)
+    return Table(heads, tuple(tuple(_cell(name, row) for name in heads) for row in rows))
 
 
-def show_1(rows: Sequence[Row]) -> Table:
-    """Table I for the terminal: mean error ± spread between studies."""
-    lines = [("paper", "", *(f"{error:g}" for error in published.TABLE_1.values()), "")]
-    for name, of in _by_group(rows).items():
-        cells = (
-            number(row["error"]) + (f" ± {number(row['spread'])}" if row["circuits"] > 1 else "")
-            for row in of
-        )
-        circuits, fits = (sum(row[key] for row in of) for key in ("circuits", "fits"))
-        lines.append((*name, *cells, f"{circuits}/{fits}"))
-    heads = (f"{r / 1e3:g} kΩ" for r in published.TABLE_1)
-    return Table(("records", "method", *heads, "circuits"), tuple(lines))
-
-
-def show_fingertips(rows: Sequence[Row]) -> Table:
-    """Table II or III for the terminal."""
-    lines: list[tuple[str, ...]] = []
-    span = "{:.3g} to {:.3g}".format
-    for name in ORDER:
-        of = [row for row in rows if row["element"] == name]
-        scale, symbol = DISPLAY[etid.SkinRC.units()[name]]
-        first, *limits = (of[0][f"paper_{key}"] / scale for key in ("typical", "lowest", "highest"))
-        label = f"{name} [{symbol}]"
-        lines.append((label, "paper", "", f"{first:.3g}", "", "", span(*limits), "", "", "", ""))
-        lines += [
-            (
-                *(label, row["laboratory"], row["method"], f"{row['typical'] / scale:.4g}"),
-                *(number(row[key]) for key in ("error", "spread")),
-                span(row["lowest"] / scale, row["highest"] / scale),
-                *(number(row[key]) for key in ("subject_error", "worst")),
-                *(f"{row[key]}/{row['fits']}" for key in ("circuits", "successful")),
-            )
-            for row in of
-        ]
-    heads = ("element", "records", "method", "typical", "error", "spread", "subjects", "error")
-    return Table((*heads, "worst", "circuits", "successful"), tuple(lines))
-
-
-def show_4(rows: Sequence[Row]) -> Table:
-    """Table IV for the terminal: mean error / scatter within a study, and between studies."""
-    paper = (f"±{error:g} / {scatter:g}" for error, scatter in published.TABLE_4.values())
-    lines: list[tuple[str, ...]] = [
-        ("paper", "", *paper, "{} to {}".format(*published.RRSE), "", "")
-    ]
-    for name, several in _by_group(rows).items():
-        of = {row["element"]: row for row in several}
-        cells = (
-            f"{number(of[e]['error'])} / {number(of[e]['scatter'])}"
-            + (f" ({number(of[e]['between'])})" if of[e]["studies"] > 1 else "")
-            for e in ORDER
-        )
-        row = of[ORDER[0]]
-        counts = (f"{row[key]}/{row['fits']}" for key in ("circuits", "successful"))
-        lines.append((*name, *cells, number(row["rrse"]), *counts))
-    heads = (f"{name} [%]" for name in ORDER)
-    return Table(("records", "method", *heads, "RRSE [%]", "circuits", "successful"), tuple(lines))
+def _cell(name: str, row: Row) -> str:
+    """One cell; resistances and elements in the units in which circuits are printed."""
+    value = row[name]
+    if not isinstance(value, float):
+        return str(value)
+    if name in ("r", *_IN_SI):
+        scale, symbol = DISPLAY[etid.SkinRC.units().get(row.get("element", ""), "ohm")]
+        return f"{value / scale:.4g} {symbol}"
+    return number(value)

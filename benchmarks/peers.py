@@ -1,4 +1,4 @@
-"""Every stage of a fit, and what others take for it: SciPy, stock optimistix, jaxopt.
+"""What others take for a fit: SciPy, stock optimistix, jaxopt.
 
 All get the same residual and the same start. The two solvers in JAX, which have no filters, run as
 their users run them, `vmap` over lanes, `SIDE_BY_SIDE` at a time. SciPy goes from lane to lane with
@@ -7,8 +7,8 @@ residual and Jacobian in NumPy, and is measured on a few of them.
 
 import importlib
 import warnings
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from typing import Any, NamedTuple, cast
+from collections.abc import Callable
+from typing import Any, cast
 
 import jax
 import jax.numpy as jnp
@@ -18,32 +18,17 @@ import scipy.optimize
 import scipy.signal
 
 import etid
-from benchmarks.problem import SAMPLES, START, ByNumPy, Problem, harmonics, problem, terms
-from benchmarks.timing import median_time
+from benchmarks.problem import START, ByNumPy, Problem, harmonics, terms
 from etid.estimators.estimate import MAX_STEPS
 from etid.estimators.harmonic_start import start_of_skin
 from etid.estimators.maximum_likelihood.search import WELL
-from etid.estimators.steiglitz_mcbride.iteration import in_time, iterate
 from etid.identify.batches import each
-from etid.signals.filtering import lfilter
-from etid.signals.transfer import Rational
-from etid.solvers.levenberg_marquardt import normal_equations
 
-LANES = (1, 98, 1024, 10_000)
 SIDE_BY_SIDE = 98
 BY_SCIPY = 8  # lanes
-LIMIT = 20.0  # [s] of one call; what will take longer is left out unless asked for
-NAMES = ("ours", "scipy", "optimistix", "jaxopt")
 B, A = cast(tuple[np.ndarray, np.ndarray], scipy.signal.butter(6, 0.3))
 
 Run = Callable[[np.ndarray], Any]  # lanes by their numbers
-
-
-class Stage(NamedTuple):
-    """One stage, by whom it can be done."""
-
-    name: str
-    by: Mapping[str, Run]
 
 
 def _each(one: Callable[[Any], Any], data: Any) -> Run:
@@ -74,64 +59,6 @@ def _looped(one: Callable[[Any], Any], data: Any) -> Run:
     return lambda index: [
         one(jax.tree.map(lambda leaf, i=i: leaf[i], data)) for i in index[:BY_SCIPY]
     ]
-
-
-def stages(of: Problem) -> list[Stage]:
-    """All stages of a problem."""
-    return [
-        *_on_samples(of),
-        Stage("SM iteration on harmonics", {"ours": harmonic_steiglitz_mcbride(of, 1)}),
-        Stage("LM fit", solvers(of)),
-        samples_to_fit(of),
-        Stage("samples to judged joint fit", {"ours": judged(of)}),
-    ]
-
-
-def _on_samples(of: Problem) -> Iterator[Stage]:
-    """Filter of order 6, its normal equations, and the first iteration of Steiglitz-McBride.
-
-    That is without what ours does to judge it.
-    """
-    v_th, v_out = of.samples()
-    x, b, a = map(jnp.asarray, (v_th, B, A))
-    yield Stage(
-        "filter of order 6",
-        {
-            "ours": _each(lambda v: lfilter(b, a, v)[0][-1], x),
-            "scipy": _looped(lambda v: scipy.signal.lfilter(B, A, v), v_th),
-        },
-    )
-
-    def equations(v):
-        three = normal_equations(lambda q, _: lfilter(b, a.at[1:4].add(q), v)[0], jnp.zeros(3))
-        return three.matrix
-
-    def equations_by_scipy(v):
-        y = scipy.signal.lfilter(B, A, v)
-        slope = -np.asarray(scipy.signal.lfilter([1.0], A, y))  # dy/da_k = −z⁻ᵏ y / A
-        columns = np.stack([np.r_[np.zeros(k), slope[:-k]] for k in (1, 2, 3)], axis=1)
-        return columns.T @ columns
-
-    by = {"ours": _each(equations, x), "scipy": _looped(equations_by_scipy, v_th)}
-    yield Stage("normal equations of 3", by)
-    z_th = Rational(of.driver.b, of.driver.a)
-    num, den = np.asarray(of.driver.b), np.asarray(of.driver.a)
-
-    def iteration(records):
-        w = lfilter(z_th.num, z_th.den, records[1])[0]
-        x = records[0] - records[1]
-
-        def unjudged(_):
-            return jnp.zeros(()), jnp.array(True)
-
-        return iterate(in_time(x[None], w[None], 1, 1), 1, 1, unjudged, 1).filter.num
-
-    def iteration_by_scipy(records):
-        return numpy_steiglitz_mcbride(records[0], records[1], num, den, 1)[0]
-
-    both = x, jnp.asarray(v_out)
-    by = {"ours": _each(iteration, both), "scipy": _looped(iteration_by_scipy, (v_th, v_out))}
-    yield Stage("Steiglitz-McBride iteration", by)
 
 
 def numpy_steiglitz_mcbride(
@@ -222,55 +149,17 @@ def solvers(of: Problem) -> dict[str, Run]:
     }
 
 
-def samples_to_fit(of: Problem) -> Stage:
-    """The same from the samples on, whose harmonics are made alike for all."""
-    found = solvers(of)
+def from_samples_by_scipy(of: Problem) -> Run:
+    """SciPy's fits from the samples on, with our harmonics."""
+    fit = _scipy_fit(of)
 
-    def after_harmonics(name: str) -> Run:
-        def run(index):
-            for i in index[:BY_SCIPY] if name == "scipy" else index:
-                harmonics(of.records[i])
-            return found[name](index)
+    def one(i: int) -> np.ndarray:
+        harmonics(of.records[i])
+        return fit(jax.tree.map(lambda leaf: leaf[i], of.lanes))
 
-        return run
-
-    return Stage("samples to fit", {name: after_harmonics(name) for name in found})
+    return lambda index: [one(i) for i in index[:BY_SCIPY]]
 
 
 def judged(of: Problem) -> Run:
     """What etid does by default: jointly with the calibration, with errors and a verdict."""
     return lambda index: etid.identify_skins([of.records[i] for i in index], of.driver).fit.chi2
-
-
-def rows(
-    distinct: int, lanes: Sequence[int], repeats: int, limit: float
-) -> Iterator[dict[str, Any]]:
-    """Milliseconds per lane, one row per stage and number of lanes; more lanes repeat the distinct.
-
-    No call is made that will take longer than `limit` [s].
-    """
-    for stage in stages(problem(SAMPLES, distinct)):
-        known: dict[str, float] = {}
-        for count in lanes:
-            index = np.arange(count) % distinct
-            row: dict[str, Any] = {"stage": stage.name, "lanes": count}
-            for name in NAMES:
-                run, done = stage.by.get(name), min(count, BY_SCIPY) if name == "scipy" else count
-                if run is None or known.get(name, 0.0) * done > limit:
-                    row[name] = None
-                    continue
-                time = median_time(lambda run=run, index=index: run(index), repeats)
-                known[name] = time / done
-                row[name] = 1e3 * known[name]
-            yield row
-
-
-def show(table: Iterable[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Print rows as they come."""
-    print(f"{'ms per lane':<30}{'lanes':>7}" + "".join(f"{name:>12}" for name in NAMES))
-    shown = []
-    for row in table:
-        cells = (f"{row[name]:12.3f}" if row[name] is not None else f"{'-':>12}" for name in NAMES)
-        print(f"{row['stage']:<30}{row['lanes']:>7}" + "".join(cells), flush=True)
-        shown.append(row)
-    return shown

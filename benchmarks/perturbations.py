@@ -21,14 +21,16 @@ most 2 % of the undisturbed recordings refused.
 import argparse
 import collections
 import functools
-from collections.abc import Iterator, Sequence
+import math
+import pathlib
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 import jax
 import numpy as np
 
 import etid
-from benchmarks import perturbation_chart
+from benchmarks import charts
 from benchmarks.estimators import (
     DEFAULT,
     DETERMINED,
@@ -44,15 +46,24 @@ from benchmarks.estimators import (
 from benchmarks.laboratory import Record
 from benchmarks.ladder import LOADS
 from benchmarks.mappings import make_room
-from benchmarks.perturbation_chart import KINDS
 from benchmarks.perturbation_list import INVISIBLE, PERTURBATIONS, UNDISTURBED
 from benchmarks.perturbed_study import REFERENCE, Truth, undisturbed
-from benchmarks.provenance import write_csv
-from benchmarks.runner import FOLDER, QUICK, WORKERS, Target, each, option, report
+from benchmarks.runner import FOLDER, QUICK, WORKERS, Target, at_most, option, report, tabled
 from etid.simulation.scenes import Scene, Trial
 from etid.simulation.transformer import ResistorLoad
 
-REFUSED = 0.02  # of undisturbed recordings, at most
+TARGETS = {
+    "silent": at_most(0),  # but for what no test can see
+    "undisturbed recordings refused": at_most(0.02),
+}
+# Kinds of answers, with their colours, hatches and labels in the picture.
+FACES = {
+    "right": ("#8fc79a", "", "right"),
+    "refused": ("#f6d55c", "...", "right, but refused"),
+    "said": ("#f0a35e", "///", "wrong or no answer, and says so"),
+    "silent": ("#b3261e", "xxx", "wrong, called successful"),
+}
+KINDS = tuple(FACES)
 FEW = ("base", "polarity_out", "rp_linear_0.2", "driver_Rload_wrong_5%")
 
 OPTIONS = (
@@ -133,7 +144,9 @@ def _bounds(snr_db: float, samples: int, bits: int, full_scale: float) -> dict[s
     return {path: np.array(list(of.relative.values())) for path, of in etid.bound(scene).items()}
 
 
-def draw(names: Sequence[str], number: int, snr_db: float, methods: Sequence[str]) -> list[Answer]:
+def answers_of(
+    names: Sequence[str], number: int, snr_db: float, methods: Sequence[str]
+) -> list[Answer]:
     """All answers behind one driver with one noise; perturbations that share a driver together."""
     with jax.enable_x64(True):  # of a worker process
         drivers, found = Drivers(), list[Answer]()
@@ -212,32 +225,61 @@ def summary(answers: Sequence[Answer]) -> Iterator[str]:
 def targets(answers: Sequence[Answer]) -> Iterator[Target]:
     """What the default method misses."""
     of_default = [a for a in answers if a.method == DEFAULT]
+    silent, refused = TARGETS
     for row in table(of_default, ("perturbation", "snr_db", "path")):
-        name, place, silent = row["perturbation"], (row["path"], row["snr_db"]), row["silent"]
+        name, place, count = row["perturbation"], (row["path"], row["snr_db"]), row[silent]
         known = INVISIBLE.get(name)
-        if silent and not (known and known.excuses(*place, silent, row["answers"])):
-            where = f"silent: {name}, {place[0]} at {place[1]:g} dB"
-            yield Target(where, silent, most=0, text=f"{silent} of {row['answers']}")
+        if count and not (known and known.excuses(*place, count, row["answers"])):
+            where = f"{silent}: {name}, {place[0]} at {place[1]:g} dB"
+            yield Target(where, count, *TARGETS[silent], f"{count} of {row['answers']}")
     for row in table(of_default, ("perturbation",)):
         if row["perturbation"] in UNDISTURBED:
             share = (row["refused"] + row["said"]) / row["answers"]
-            yield Target(f"refused: {row['perturbation']}", share, most=REFUSED)
+            yield Target(f"{refused}: {row['perturbation']}", share, *TARGETS[refused])
+
+
+def draw(rows: Sequence[Mapping[str, Any]], path: pathlib.Path) -> None:
+    """Draw rows of one method: a bar for each perturbation, a panel for each skin and noise."""
+    panels: dict[str, dict[str, dict[str, int]]] = {}
+    for row in sorted(rows, key=lambda row: (row["path"], row["snr_db"]), reverse=True):
+        panel = panels.setdefault(f"{row['path']}, {row['snr_db']:g} dB", {})
+        panel[_label(row["perturbation"])] = {kind: row[kind] for kind in KINDS}
+    order = list(dict.fromkeys(_label(row["perturbation"]) for row in rows))
+    sorted_panels = {
+        name: {row: of[row] for row in order if row in of} for name, of in panels.items()
+    }
+    charts.shares(sorted_panels, FACES, path)
+
+
+def _label(name: str) -> str:
+    """A perturbation, and what is said of one that nothing shows."""
+    if name not in INVISIBLE:
+        return name
+    snr = INVISIBLE[name].snr_db
+    return f"{name} (invisible{'' if math.isinf(snr) else f' up to {snr:g} dB'})"
 
 
 def main(arguments: argparse.Namespace) -> bool:
-    """Draw, count and print; write table and picture with every driver that is done."""
+    """Draw, count and print; write the table with every driver that is done, and the picture."""
     quick, methods, folder = arguments.quick, arguments.method, arguments.folder
     names = list(FEW) if quick else arguments.only or list(PERTURBATIONS)
-    place = {name: number for number, name in enumerate(names)}
     numbers = range(2 if quick else arguments.drivers)
     tasks = [(names, number, snr, methods) for number in numbers for snr in arguments.snr_db]
-    answers: list[Answer] = []
-    for _, found in each(draw, tasks, 1 if quick else arguments.workers, "driver"):
-        answers += found
-        answers.sort(key=lambda a: (a.snr_db, place[a.perturbation], a.path, a.method, a.seed))
-        rows = table(answers, ("perturbation", "snr_db", "path", "method"))
-        write_csv(folder / "perturbations.csv", rows)
-        of_one = [row for row in rows if row["method"] == methods[0]]
-        perturbation_chart.draw(of_one, folder / "perturbations.svg")
+    place = {name: number for number, name in enumerate(names)}
+
+    def ordered(done: Iterable[Sequence[Answer]]) -> list[Answer]:
+        every = [answer for found in done for answer in found]
+        return sorted(
+            every, key=lambda a: (a.snr_db, place[a.perturbation], a.path, a.method, a.seed)
+        )
+
+    def rows(done: Mapping[int, Sequence[Answer]]) -> list[dict[str, Any]]:
+        return table(ordered(done.values()), ("perturbation", "snr_db", "path", "method"))
+
+    workers = 1 if quick else arguments.workers
+    settings = {"workers": workers, "unit": "driver", "keep": "perturbations"}
+    answers = ordered(tabled(folder / "perturbations.csv", rows, answers_of, tasks, **settings))
+    of_one = [one for one in answers if one.method == methods[0]]
+    draw(table(of_one, ("perturbation", "snr_db", "path", "method")), folder / "perturbations.svg")
     print("\n".join(summary(answers)))
     return report(targets(answers))

@@ -47,10 +47,13 @@ def _processor() -> str:
 
 
 def write_csv(path: pathlib.Path, rows: Sequence[Mapping[str, Any]]) -> None:
-    """Write rows, each with `provenance` unless it has one of an earlier run."""
+    """Write rows, each with `provenance` unless it has one of an earlier run; no file if none."""
+    if not rows:
+        return path.unlink(missing_ok=True)
     path.parent.mkdir(parents=True, exist_ok=True)
     source = provenance()
     with path.open("w", newline="") as file:
         writer = csv.DictWriter(file, fieldnames=list(dict.fromkeys([*rows[0], *source])))
         writer.writeheader()
         writer.writerows({**source, **row} for row in rows)
+    return None

@@ -35,11 +35,6 @@ class Rate(NamedTuple):
         low, high = 100 * self.low, 100 * self.high
         return f"{100 * self.rate:.2f} % ({low:.2f} to {high:.2f}) of {self.trials}"
 
-    @property
-    def is_right_coverage(self) -> bool:
-        """Whether the interval does not exclude all of `COVERED`."""
-        return self.low <= COVERED[1] and self.high >= COVERED[0]
-
 
 def clopper_pearson(events: float, trials: float) -> tuple[float, float]:
     """Interval of a binomial rate; the numbers need not be whole ones."""

@@ -13,49 +13,75 @@ compared.
 import argparse
 import collections
 import functools
+import pathlib
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
 import etid
-from benchmarks import selection_chart, selection_map, selection_rival
+from benchmarks import charts, selection_map, selection_rival
 from benchmarks import selection_counts as counts
 from benchmarks.estimators import Answer
 from benchmarks.failure_axes import Cell
+from benchmarks.failure_draws import AUTO, Effort, answers
 from benchmarks.perturbed_study import DELAY
 from benchmarks.provenance import write_csv
 from benchmarks.rates import COVERED, Rate, clopper_pearson, rate
-from benchmarks.runner import FOLDER, QUICK, WORKERS, Target, each, option, report
+from benchmarks.runner import (
+    FOLDER,
+    QUICK,
+    WORKERS,
+    Target,
+    at_least,
+    at_most,
+    each,
+    option,
+    report,
+    tabled,
+)
 from benchmarks.selection_draws import SNR_DB, TRUTHS, Drawn, draws, scene
 from benchmarks.timing import median_time
 from etid.selection.search import USUAL
 from etid.simulation import scenes
 
 FIRST = 1000  # number of the first driver; those of other benchmarks are smaller
-MAP = (7, 10)  # drivers of a cell of the map, and trials behind each
+MAP = Effort(7, 10)  # of a cell of the map
 PAIRS = 15  # timed pairs
 BATCH, SINGLES = 64, 16  # recordings of a pair: at once, and one at a time
 # The same of a quick run, which has every 20th cell of the map.
-FEW, FEW_PAIRS, FEW_DRIVERS, FEW_SNR, STEP = (1, 4), 3, 2, (20, 60), 20
+FEW, FEW_PAIRS, FEW_DRIVERS, FEW_SNR, STEP = Effort(1, 4), 3, 2, (20, 60), 20
 RIVAL_DRIVERS, RIVAL_SNR = 1, (20, 40, 60)  # ten seconds for each recording
 
 OPTIONS = (QUICK, WORKERS, FOLDER, option("--drivers", default=25, help="of an SNR"))
 
 
-def _share(name: str, of: Rate, least: float = np.nan, most: float = np.nan) -> Target:
-    return Target(name, of.rate, least, most, str(of))
+TARGETS = {
+    "right circuit where decisive, from 30 dB": at_least(0.99),
+    "spurious element, from 20 dB": at_most(0.005),
+    "coverage": COVERED,
+    "silent over the failure map": at_most(2e-4),
+    "right, not one RC, from 40 dB": at_least(0.95),
+    "time, auto / plain fit, one RC": at_most(1.3),
+}
+# Circuits from the simplest to the richest, with their colours, hatches and labels in the picture.
+FACES = {
+    "Resistor": ("#d9d9d9", "", "resistor"),
+    "ParallelRC": ("#b3cde3", "...", "R‖C"),
+    "SkinRC": ("#4f9bd0", "", "R_s + R‖C"),
+    "SkinCole": ("#f2b263", "///", "Cole"),
+    "SkinLayers": ("#c9564a", "xxx", "two layers"),
+}
+
+
+def _rate(name: str, of: Rate) -> Target:
+    return Target.of(name, of, TARGETS[name])
 
 
 def _coverage(name: str, drawn: Sequence[Drawn], *quantities: str) -> Target:
-    """Coverage; it misses its target if its interval lies outside.
-
-    The records behind a driver share its error: those of 25 drivers scatter by 2 %.
-    """
     of = rate(*counts.covered(drawn, *quantities))
-    nearest = float(np.clip(np.mean(COVERED), of.low, of.high))
-    return Target(f"coverage, {name}", nearest, *COVERED, str(of))
+    return Target.of(f"coverage, {name}", of, TARGETS["coverage"])
 
 
 def chosen(rows: Sequence[dict[str, Any]], drawn: Sequence[Drawn]) -> Iterator[Target]:
@@ -64,8 +90,8 @@ def chosen(rows: Sequence[dict[str, Any]], drawn: Sequence[Drawn]) -> Iterator[T
     asked = [one for one in drawn if (one.truth, one.snr_db) in decisive]
     right = rate([one.is_right for one in asked], [one.driver for one in asked])
     richer = rate([one.is_richer for one in drawn], [one.driver for one in drawn])
-    yield _share("right circuit where decisive, from 30 dB", right, least=0.99)
-    yield _share("spurious element, from 20 dB", richer, most=0.005)
+    yield _rate("right circuit where decisive, from 30 dB", right)
+    yield _rate("spurious element, from 20 dB", richer)
     yield _coverage("all SNRs: all", drawn, *counts.QUANTITIES)
     for name in counts.QUANTITIES:
         yield _coverage(f"all SNRs: {name}", drawn, name)
@@ -90,7 +116,8 @@ def failures(every: Sequence[Cell], found: Sequence[Sequence[Answer]]) -> Iterat
     silent, elements = selection_map.missed_elements(asked)
     low, high = clopper_pearson(silent, elements)
     text = f"{silent} of {elements} elements ({100 * low:.3f} to {100 * high:.3f} %)"
-    yield Target("silent over the failure map", silent / max(elements, 1), most=2e-4, text=text)
+    name = "silent over the failure map"
+    yield Target(name, silent / max(elements, 1), *TARGETS[name], text, (low, high))
     drivers = len({one.seed for one in asked})
     print(f"determined elements: {elements} in {len(asked)} answers behind {drivers} drivers")
     for cell, answered in zip(every, found, strict=True):
@@ -99,7 +126,7 @@ def failures(every: Sequence[Cell], found: Sequence[Sequence[Answer]]) -> Iterat
                 print(f"silent: {', '.join(cell.place.values())}: {one.path}, {one.seed}")
     right = selection_map.right_from_40_db(every, found)
     if right.trials:
-        yield _share("right, not one RC, from 40 dB", right, least=0.95)
+        yield _rate("right, not one RC, from 40 dB", right)
 
 
 def time_ratios(pairs: int) -> Iterator[Target]:
@@ -132,7 +159,8 @@ def time_ratios(pairs: int) -> Iterator[Target]:
     for name, of in ratios.items():
         low, middle, high = np.quantile(of, (0.25, 0.5, 0.75))
         text = f"{middle:.2f} (quartiles {low:.2f} to {high:.2f}) of {len(of)} pairs"
-        yield Target(f"time, auto / plain fit, one RC, {name}", float(middle), most=1.3, text=text)
+        ratio = "time, auto / plain fit, one RC"
+        yield Target(f"{ratio}, {name}", float(middle), *TARGETS[ratio], text)
 
 
 def rival(rows: list[dict[str, Any]], drawn: Sequence[Drawn]) -> Iterator[Target]:
@@ -174,12 +202,30 @@ def select_time(number: int) -> float:
     return float(np.median(times))
 
 
+def draw(rows: Sequence[Mapping[str, Any]], path: pathlib.Path) -> None:
+    """Chosen circuits: a bar for each truth, a panel for each SNR; etid, then the rival if any."""
+    panels, texts = {}, {}
+    for of, who in (("chose", "etid"), ("rival", "impedance.py")):
+        for row in rows:
+            counts = {kind: int(row.get(f"{of}_{kind}", 0)) for kind in FACES}
+            if not sum(counts.values()):
+                continue
+            panel, truth = f"{who}, {row['snr_db']:g} dB", row["truth"]
+            panels.setdefault(panel, {})[truth] = counts
+            right = counts[type(TRUTHS[truth]).__name__] / sum(counts.values())
+            doubt = "" if of == "rival" or row["decisive"] else " ?"
+            texts[panel, truth] = f"{100 * right:.0f} % right{doubt}"
+    title = "Chosen circuits (?: below 30 dB, or the evidence is not decisive)"
+    charts.shares(panels, FACES, path, title=title, texts=texts)
+
+
 def main(arguments: argparse.Namespace) -> bool:
     """Run the command."""
     quick, workers, folder = arguments.quick, arguments.workers, arguments.folder
     numbers = range(FIRST, FIRST + (FEW_DRIVERS if quick else arguments.drivers))
     tasks = [(float(snr), n) for snr in (FEW_SNR if quick else SNR_DB) for n in numbers]
-    drawn = [one for _, found in each(draws, tasks, workers, "study") for one in found]
+    found = dict(each(draws, tasks, workers, "study", "selection"))
+    drawn = [one for number in sorted(found) for one in found[number]]
     by_cell = collections.defaultdict(list)
     for one in drawn:
         by_cell[list(TRUTHS).index(one.truth), one.snr_db].append(one)
@@ -194,14 +240,18 @@ def main(arguments: argparse.Namespace) -> bool:
         few = numbers[:RIVAL_DRIVERS]
         targets += rival(rows, [d for d in drawn if d.driver in few and d.snr_db in RIVAL_SNR])
     write_csv(folder / "selection.csv", rows)
-    selection_chart.draw(rows, TRUTHS, folder / "selection.svg", missing)
+    draw(rows, folder / "selection.svg")
     print(f"etid: {1e3 * select_time(FIRST):.0f} ms for a choice (median)")
     targets += time_ratios(FEW_PAIRS if quick else PAIRS)
 
     every = selection_map.chosen_cells()[:: STEP if quick else 1]
-    of_map = [(cell, *(FEW if quick else MAP)) for cell in every]
-    answered = dict(each(selection_map.answers, of_map, workers, "cell"))
-    found = [answered[number] for number in range(len(every))]
-    table = [selection_map.row(*one) for one in zip(every, found, strict=True)]
-    write_csv(folder / "selection_map.csv", table)
-    return report([*targets, *failures(every, found)])
+    of_map = [(cell, {AUTO: FEW if quick else MAP}) for cell in every]
+
+    def rows_of_map(done: dict[int, list[Answer]]) -> list[dict[str, Any]]:
+        return [selection_map.row(every[number], found) for number, found in done.items()]
+
+    answered = tabled(
+        folder / "selection_map.csv", rows_of_map, answers, of_map,
+        workers=workers, unit="cell", keep="selection_map",
+    )  # fmt: skip
+    return report([*targets, *failures(every, answered)])

@@ -14,8 +14,9 @@ import jax.numpy as jnp
 import numpy as np
 
 import etid
-from benchmarks import mutations
-from benchmarks.mutations import Rng
+from benchmarks import damage
+from benchmarks.damage import Rng
+from benchmarks.damage_hdf5 import restructure
 from etid import cli
 from etid.identify.options import Options
 from etid.recordings.preflight import Inspected, preflight
@@ -60,9 +61,9 @@ def kinds() -> dict[str, Kind]:
         found = {
             "recordings": Kind(".h5", stored, _either, _use_recordings),
             "fits": Kind(".h5", _fits(place), _either, _use_fits),
-            "mapping": Kind(".toml", (MAPPING,), _by(mutations.damaged_toml), _use_mapping),
-            "csv": Kind(".csv", (_table(),), _by(mutations.damaged_text), _use_import),
-            "npz": Kind(".npz", (_archive(),), _by(mutations.damaged_npz), _use_import),
+            "mapping": Kind(".toml", (MAPPING,), _by(damage.damaged_toml), _use_mapping),
+            "csv": Kind(".csv", (_table(),), _by(damage.damaged_text), _use_import),
+            "npz": Kind(".npz", (_archive(),), _by(damage.damaged_npz), _use_import),
             "matlab": Kind(".mat", (_matlab73(place),), _either, _use_import),
         }
         with contextlib.suppress(ImportError):
@@ -75,18 +76,18 @@ def kinds() -> dict[str, Kind]:
 
 
 def _by(change: Callable[[bytes, Rng], bytes]) -> Callable[[pathlib.Path, Rng], None]:
-    def damage(path: pathlib.Path, rng: Rng) -> None:
+    def write(path: pathlib.Path, rng: Rng) -> None:
         path.write_bytes(change(path.read_bytes(), rng))
 
-    return damage
+    return write
 
 
-_bytes = _by(mutations.damaged)
+_bytes = _by(damage.damaged)
 
 
 def _either(path: pathlib.Path, rng: Rng) -> None:
     if rng.random() < 0.5:
-        mutations.restructure(path, rng)
+        restructure(path, rng)
         if rng.random() < 0.8:
             return
     _bytes(path, rng)

@@ -20,15 +20,19 @@ from jaxtyping import Complex, Float
 
 import etid
 from benchmarks.coverage import SILENT
-from benchmarks.rates import COVERED, NORMAL_95, expected_covered
-from benchmarks.runner import Target, option, report
+from benchmarks.rates import COVERED, NORMAL_95, clopper_pearson
+from benchmarks.runner import Target, at_most, option, report
 from etid.results.verdicts import counted
 
 POINTS = 61  # one shape for all faults: a program is compiled for each
 GOOD_POINTS = (20, POINTS, 100)
 NOISE = (1e-3, 3e-2)  # of |Z|, in the real and in the imaginary part
 NOTICED = 0.02  # relative error of an element that counts
-REFUSED = 1e-3  # largest part of the good spectra
+TARGETS = {
+    "silent": at_most(0),  # of spectra with and without a fault
+    "refused, part of the good ones": at_most(1e-3),
+    "covered": COVERED,
+}
 ACCEPTED = ("successful", "insensitive")  # layers that noise hides are not determined
 LAYERS = ("r_1", "c_1", "c_2", "r_2")  # the other way round are those of the other one
 
@@ -234,7 +238,7 @@ def with_fault(seed: int, spectra: int) -> Iterator[Target]:
         wrong = [one for one, said in zip(seeds, answers, strict=True) if said.silent]
         counts = counted(np.array([one.verdict for one in answers]))
         text = f"{len(wrong)} silent {wrong or ''}; {counts}"
-        yield Target(name, len(wrong), most=0, text=text)
+        yield Target(f"{name}: silent", len(wrong), *TARGETS["silent"], text)
 
 
 def without_fault(seed: int, spectra: int) -> Iterator[Target]:
@@ -245,16 +249,16 @@ def without_fault(seed: int, spectra: int) -> Iterator[Target]:
         verdicts = np.array([one.verdict for one in answers])
         z = np.concatenate([one.z for one in answers if one.verdict == "successful"])
         refused, silent = (~np.isin(verdicts, ACCEPTED)).sum(), sum(one.silent for one in answers)
-        low, high = expected_covered(z.size)  # few draws scatter more
-        name, most = f"good, {points} frequencies: ", max(REFUSED * len(answers), 1)
-        yield Target(f"{name}refused", refused, most=most, text=f"{refused}; {counted(verdicts)}")
-        yield Target(f"{name}silent", silent, most=0)
-        covered, limits = (
-            np.mean(np.abs(z) < NORMAL_95),
-            (min(COVERED[0], low), max(COVERED[1], high)),
+        inside = np.abs(z) < NORMAL_95
+        interval = clopper_pearson(int(inside.sum()), z.size)
+        rms = f"rms z {np.sqrt(np.mean(z**2)):.3f}, max |z| {np.abs(z).max():.1f}"
+        values = (
+            (silent, str(silent), None),
+            (refused / len(answers), f"{refused} of {len(answers)}; {counted(verdicts)}", None),
+            (float(inside.mean()), f"{inside.mean():.4f}, {rms}", interval),
         )
-        text = f"{covered:.4f}, rms z {np.sqrt(np.mean(z**2)):.3f}, max |z| {np.abs(z).max():.1f}"
-        yield Target(f"{name}covered", float(covered), *limits, text)
+        for (name, limits), (value, text, scatter) in zip(TARGETS.items(), values, strict=True):
+            yield Target(f"good, {points} frequencies: {name}", value, *limits, text, scatter)
 
 
 def main(arguments: argparse.Namespace) -> bool:

@@ -5,8 +5,6 @@ Each line is a ratio of medians with its target; a missed target makes the comma
 
 import argparse
 import dataclasses
-import math
-import pathlib
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -20,8 +18,7 @@ import etid
 from benchmarks import online, peers
 from benchmarks.peers import A, B
 from benchmarks.problem import LOAD, SAMPLES, Problem, harmonics, problem
-from benchmarks.provenance import write_csv
-from benchmarks.runner import QUICK, Target, option, report
+from benchmarks.runner import QUICK, Target, report
 from benchmarks.timing import import_time, interpreter, median_time
 from etid.estimators.steiglitz_mcbride.iteration import ITERATIONS
 from etid.signals.filtering import lfilter
@@ -30,11 +27,7 @@ from etid.solvers.levenberg_marquardt import normal_equations
 
 PINNED = True
 PROCESSES = 3  # whose median counts
-OPTIONS = (
-    QUICK,
-    option("--lanes", nargs="+", type=int, default=[], help="of the table of peers"),
-    option("-o", "--output", type=pathlib.Path, help="CSV of that table"),
-)
+OPTIONS = (QUICK,)
 
 
 def _times(ours: float, theirs: float, ratio: float) -> str:
@@ -124,7 +117,7 @@ def fits(of: Problem, repeats: int) -> Iterator[Target]:
     yield Target("driver, warm [ms]", 1e3 * found, most=50.0)
     three, of_file = problem(10_000, lanes), problem(5_000, lanes, sample_rate=100e3)
     ours = median_time(lambda: peers.judged(three)(every), repeats) / lanes
-    by_scipy = peers.samples_to_fit(three).by["scipy"]
+    by_scipy = peers.from_samples_by_scipy(three)
     theirs = median_time(lambda: by_scipy(every[:1]), repeats)
     yield gains("SciPy on harmonics / skin, 10 000 samples", ours, theirs, 12.0)
     stored = median_time(lambda: peers.judged(of_file)(every), repeats) / lanes
@@ -137,7 +130,7 @@ def tick(electrodes: int, ticks: int) -> Target:
     period = tracker.period / tracker.model.bands.sample_rate
     ratio = float(np.percentile(online.timed(tracker, pulses, ticks)[1], 99))
     name = f"tick of {electrodes} electrodes, p99 / period"
-    return costs(name, ratio * period, period, online.TARGET)
+    return costs(name, ratio * period, period, online.TICK)
 
 
 def limits(of: Problem, repeats: int) -> str:
@@ -182,8 +175,8 @@ def in_new_processes() -> Iterator[Target]:
 
 
 def main(arguments: argparse.Namespace) -> bool:
-    """Print all lines and the table of peers; whether every target is met."""
-    quick, asked = arguments.quick, arguments.lanes
+    """Print all lines; whether every target is met."""
+    quick = arguments.quick
     lanes, repeats = (8, 3) if quick else (98, 7)
     targets = [*in_new_processes(), *filters(5 * repeats)]
     ten_periods = problem(SAMPLES, lanes)
@@ -191,10 +184,5 @@ def main(arguments: argparse.Namespace) -> bool:
         targets += of(ten_periods, repeats)
     targets.append(tick(lanes, 20 * repeats if quick else 2000))
     met = report(targets)
-    print(f"limits: {limits(ten_periods, repeats)}\n")
-    several = asked or ((1, lanes) if quick else peers.LANES)
-    most = math.inf if asked else peers.LIMIT
-    table = peers.show(peers.rows(lanes, several, 1 if quick else 3, most))
-    if arguments.output is not None:
-        write_csv(arguments.output, table)
+    print(f"limits: {limits(ten_periods, repeats)}")
     return met

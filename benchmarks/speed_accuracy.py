@@ -22,7 +22,7 @@ from benchmarks.estimators import DEFAULT, ELEMENTS, NOTHING, OURS, Answer, Driv
 from benchmarks.ladder import CALIBRATION, SOURCES, START, TRIAL, ladder
 from benchmarks.mappings import make_room
 from benchmarks.provenance import write_csv
-from benchmarks.runner import FOLDER, QUICK, Target, option, report
+from benchmarks.runner import FOLDER, QUICK, Target, at_most, option, report
 from benchmarks.speed_accuracy_chart import chart
 from etid.simulation.scenes import Scene
 
@@ -35,7 +35,12 @@ FEWEST = 4  # draws, however long they take
 SHOWN = ("dry, 80 dB", "dry, 60 dB", "dry, 30 dB", "damp, 60 dB", "damp, 40 dB", "dry, 1 MHz")
 FEW, FEW_REPETITIONS = ("dry, 60 dB", "damp, 40 dB"), 5
 SIGNIFICANT = 2.0  # standard errors of a paired difference
-NEAR = 2.0  # bounds, within which the default is to stay
+TARGETS = {
+    "estimators that beat the default": at_most(0),
+    "part of the draws in which the default is wrong silently": at_most(0),
+    "error of the default, in bounds": at_most(np.nextafter(2.0, 0)),
+}
+WORSE = ("steiglitz_mcbride", "equation_error")  # their errors must be larger than the default's
 
 OPTIONS = (
     QUICK,
@@ -247,19 +252,19 @@ def dominators(results: Sequence[Result]) -> list[str]:
 
 
 def ranked(rows: Sequence[dict[str, Any]]) -> Iterator[Target]:
-    """What does not hold of the ranking of methods."""
-    for name in dict.fromkeys(row["scene"] for row in rows):
-        of = {row["estimator"]: row for row in rows if row["scene"] == name}
-        default, own = of[DEFAULT], f"{name}: the default"
-        beaten = default["beaten_by"]
+    """What does not hold of the ranking of methods, scene by scene."""
+    for scene in dict.fromkeys(row["scene"] for row in rows):
+        of = {row["estimator"]: row for row in rows if row["scene"] == scene}
+        default = of[DEFAULT]
+        values = (len(default["beaten_by"]), default["silent"], default["error"])
         found = [
-            Target(f"{own} is beaten by", len(beaten), most=0, text=beaten),
-            Target(f"{own} is wrong silently", default["silent"], most=0),
-            Target(f"{own}, error in bounds", default["error"], most=np.nextafter(NEAR, 0)),
+            Target(f"{scene}: {name}", value, *limits)
+            for (name, limits), value in zip(TARGETS.items(), values, strict=True)
         ]
-        for worse in ("steiglitz_mcbride", "equation_error"):
+        found[0] = found[0]._replace(text=default["beaten_by"])
+        for worse in WORSE:
             least, error = np.nextafter(default["error"], np.inf), of[worse]["error"]
-            found.append(Target(f"{name}: error of {worse}", error, least))
+            found.append(Target(f"{scene}: error of {worse}", error, least))
         yield from (target for target in found if not target.met)
 
 

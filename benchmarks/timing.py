@@ -1,8 +1,6 @@
-"""Import, first call and warm time of one fit and of a batch: medians, compilation apart."""
+"""How times are measured: on one core, medians, compilation apart."""
 
-import argparse
 import contextlib
-import functools
 import os
 import subprocess
 import sys
@@ -13,12 +11,6 @@ from typing import Any
 import jax
 import numpy as np
 
-import etid
-from benchmarks.runner import option
-from etid.estimators.registry import names
-
-OPTIONS = (option("--lanes", default=98, help="of the batch"),)
-REPEATS = 7
 IMPORTS = 3
 
 
@@ -58,40 +50,11 @@ def import_time(module: str) -> float:
     return float(np.median(np.array(runs[1:], float)))
 
 
-def first_and_warm(call: Callable[[], Any], repeats: int) -> tuple[float, float]:
-    """Wall time [s] of the first call and the median of the next ones."""
+def median_time(call: Callable[[], Any], repeats: int) -> float:
+    """Median wall time [s] after a first call."""
     runs = []
     for _ in range(repeats + 1):
         start = time.perf_counter()
         jax.block_until_ready(call())
         runs.append(time.perf_counter() - start)
-    return runs[0], float(np.median(runs[1:]))
-
-
-def median_time(call: Callable[[], Any], repeats: int) -> float:
-    """Median wall time [s] after a first call."""
-    return first_and_warm(call, repeats)[1]
-
-
-def main(arguments: argparse.Namespace) -> bool:
-    """Print the table."""
-    lanes = arguments.lanes
-    base, own = import_time("import jax, optimistix"), import_time("import etid")
-    print(f"import jax + optimistix {base:.2f} s, import etid {own:.2f} s, ratio {own / base:.2f}")
-    study = etid.scenes.paper_dry().simulate(seed=0)
-    calibration = next(iter(study.calibrations.recordings()))
-    recordings = list(study.loaded.recordings())
-    many = (recordings * (lanes // len(recordings) + 1))[:lanes]
-    first, warm = first_and_warm(lambda: etid.identify_driver(calibration, throw=False), 3)
-    print(f"driver, first call           {first:8.2f} s   warm {warm:.3f} s")
-    driver = etid.identify_driver(calibration, throw=False)
-    for method in names():
-        given: dict[str, Any] = {"driver": driver, "method": method}
-        fit = functools.partial(etid.identify_skin, recordings[0], throw=False, **given)
-        first, warm = first_and_warm(fit, REPEATS)
-        print(f"skin {method:<27} first {first:8.2f} s   warm {1e3 * warm:.1f} ms")
-        fits = functools.partial(etid.identify_skins, many, **given)
-        first, warm = first_and_warm(lambda fits=fits: fits().chi2, 3)
-        each = 1e3 * warm / lanes
-        print(f"  batch of {lanes:<21} first {first:8.2f} s   warm {each:.1f} ms per fit")
-    return True
+    return float(np.median(runs[1:]))

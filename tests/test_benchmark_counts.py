@@ -9,9 +9,13 @@ import pytest
 import scipy.stats
 
 from benchmarks import (
-    driver_order,
+    control,
+    coverage,
+    failure_draws,
     failure_map,
+    online,
     perturbations,
+    runner,
     speed_accuracy,
     visibility,
     which,
@@ -20,9 +24,8 @@ from benchmarks.estimators import NOTHING, Answer
 from benchmarks.failure_axes import MOST, cells
 from benchmarks.ladder import LOADS
 from benchmarks.online_alarms import Alarms
-from benchmarks.perturbation_chart import KINDS
 from benchmarks.perturbed_study import Truth
-from benchmarks.provenance import RESULTS
+from benchmarks.provenance import RESULTS, write_csv
 from benchmarks.rates import clopper_pearson, expected_covered, expected_rms, rate
 from benchmarks.runner import Target, report
 from benchmarks.speed_accuracy import Result, dominators, front, ranked
@@ -77,6 +80,68 @@ def test_a_number_that_could_not_be_had_misses_its_target(capsys):
     for one in missed:
         assert not report([*met, one])
     assert capsys.readouterr().out.count("missed") == 2
+
+
+def test_a_coverage_outside_the_target_is_missed_though_its_interval_touches_it(capsys):
+    def fits(right, count=100):
+        error = np.where(np.arange(count) < right, 0.0, 3.0)[:, None]
+        one = np.ones((count, 1))
+        return coverage.Draws(error, one, np.full(count, "successful"), one[:, None])
+
+    for right, met in ((92, False), (93, True), (97, True), (98, False), (60, False)):
+        [covered, silent] = coverage.targets("dry", fits(right))
+        assert (covered.met, silent.met) == (met, True)
+        assert covered.value == pytest.approx(right / 100)
+    assert not report(coverage.targets("dry", fits(98)))
+    assert not report(coverage.targets("dry", fits(60)))
+    text = capsys.readouterr().out
+    assert text.count(", missed within scatter") == 1
+    assert text.count(", missed") == 2
+
+
+def test_charges_that_noise_explains_are_missed_and_a_slow_tick_is():
+    charge = control.WANTED * np.array([[1.0, 1.03], [0.99, 1.5]])
+    peak = np.full((2, 2), 1e-3)
+    run = control.Run(charge, peak, np.zeros((2, 2), bool), np.full((2, 2), 0.9))
+    near, largest = run.targets(np.array([[True, True], [True, False]]), "")
+    assert (near.value, near.met, largest.met) == (1, False, True)
+    assert "1 of 3 (2.7 by noise alone)" in str(near)
+    slow = online.named("p99 of the tick / pulse period", 0.09, "wall: ")
+    assert not slow.met
+    assert online.named("median of the tick / pulse period", 0.09).met
+
+
+def test_tasks_that_were_done_at_this_commit_are_not_done_again(tmp_path, monkeypatch):
+    source = {"commit": "0123456789ab"}
+    monkeypatch.setattr(runner, "KEPT", tmp_path / "kept")
+    monkeypatch.setattr(runner, "provenance", lambda: source)
+    asked, path = [], tmp_path / "table.csv"
+
+    def square(number):
+        asked.append(number)
+        if number > 5:
+            raise KeyboardInterrupt
+        return number**2
+
+    def rows(done):
+        return [{"task": task, "square": found} for task, found in done.items()]
+
+    def done(*tasks):
+        return runner.tabled(path, rows, square, [(of,) for of in tasks], keep="squares")
+
+    with pytest.raises(KeyboardInterrupt):
+        done(3, 4, 6)
+    assert done(5, 4, 3) == [25, 16, 9]
+    assert asked == [3, 4, 6, 5]
+    with path.open() as file:
+        assert [row["square"] for row in csv.DictReader(file)] == ["25", "16", "9"]
+    source["commit"] = "another"
+    assert done(3) == [9]
+    assert asked == [3, 4, 6, 5, 3]
+    assert len([*runner.KEPT.iterdir()]) == 1
+    source["commit"] = "another+"  # the working tree is not that of the commit
+    assert done(3) == [9]
+    assert asked[-2:] == [3, 3]
 
 
 # --- answers --------------------------------------------------------------------------------------
@@ -140,11 +205,11 @@ def test_rates_of_a_map_count_what_they_say_and_name_every_silent_failure():
 def test_cells_have_seeds_of_their_own_and_are_done_once_with_others_of_their_shape():
     every = list(cells())
     assert failure_map.FEW < {tuple(cell.place.values()) for cell in every}
-    used = [s for cell in every for s in failure_map.seeds(cell, failure_map.DRIVERS)]
+    used = [s for cell in every for s in failure_draws.seeds(cell, failure_map.DRIVERS)]
     assert len({*used}) == len(used)
     tasks = failure_map.tasks(every)
-    assert sorted(i for of in tasks for i in of) == list(range(len(every)))
-    assert all(len({every[i].shape for i in of}) == 1 for of in tasks)
+    assert sorted(id(cell) for of in tasks for cell in of) == sorted(map(id, every))
+    assert all(len({cell.shape for cell in of}) == 1 for of in tasks)
     dense = next(cell for cell in every if cell.scene.sample_rate == 1e6)
     assert failure_map.effort(dense, False, 6)["default"] == (1, 2 * MOST)
     assert failure_map.effort(every[0], False, 6)["default"] == (6, 2 * MOST)
@@ -165,7 +230,7 @@ def test_an_element_that_moves_is_wrong_unless_the_answer_says_so():
 def test_a_table_counts_and_names_the_worst_silent_answer():
     every = [answer((0.04, 0, 0)), answer((0, 0.08, 0)), answer(FAR)]
     [row] = perturbations.table(every, ("perturbation", "snr_db"))
-    assert [row[kind] for kind in KINDS] == [1, 0, 0, 2]
+    assert [row[kind] for kind in perturbations.KINDS] == [1, 0, 0, 2]
     assert (row["worst_element"], row["worst_error"]) == ("r_p", 0.08)
     assert row["worst_stderrs"] == pytest.approx(8)
     assert row["verdicts"] == "3 successful"
@@ -289,27 +354,14 @@ def test_the_readme_has_the_table_of_the_last_results():
     assert which.inserted(page, made) == page, "run python -m benchmarks which"
 
 
-def test_a_choice_of_order_is_right_if_its_error_is_near_the_best():
-    def drawn(order, error):
-        return driver_order.Draw(order, np.full((2, 3), error), np.zeros((2, 3)))
-
-    draws = [
-        {4: drawn(4, 1.05), 5: drawn(5, 1.0), 6: drawn(6, 2.0), "auto": drawn(order, error)}
-        for order, error in ((4, 1.05), (5, 1.0), (6, 2.0), (6, 1.4))
-    ]
-    assert driver_order.right(draws, (4, 5, 6)) == [True, True, False, True]
-
-
 def test_one_map_anew_keeps_the_others_with_the_commit_of_their_run(tmp_path):
     every = {cell.chart: cell for cell in cells()}
     old, new = every["SNR and periods"], every["SNR and sample rate"]
     path, of = tmp_path / failure_map.RATES, [answer(FAR)]
-    failure_map.write(path, failure_map.table(old, of))
-    with path.open() as file:
-        commit = next(csv.DictReader(file))["commit"]
-    path.write_text(path.read_text().replace(commit, "earlier"))
+    write_csv(path, [{**row, "commit": "earlier"} for row in failure_map.table(old, of)])
     kept = failure_map.earlier(path, [new.chart])
-    failure_map.write(path, [*kept, *failure_map.table(new, of)])
+    write_csv(path, failure_map.in_order([*kept, *failure_map.table(new, of)]))
     with path.open() as file:
-        rows = [(row["map"], row["commit"]) for row in csv.DictReader(file)]
-    assert rows == [(new.chart, commit), (old.chart, "earlier")]
+        rows = list(csv.DictReader(file))
+    assert [row["map"] for row in rows] == [new.chart, old.chart]
+    assert rows[0]["commit"] != rows[1]["commit"] == "earlier"

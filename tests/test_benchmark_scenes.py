@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import etid
-from benchmarks import amplitudes, failure_axes, failure_map
+from benchmarks import amplitudes, failure_axes, failure_draws
 from benchmarks.disturbances import Leaky, Nonlinear
 from benchmarks.failure_axes import Clipped, Cole, Coloured, TwoLayers, scene
 from benchmarks.laboratory import CORNER, SCALE, Output
@@ -145,7 +145,7 @@ def test_elements_of_skin_that_is_not_one_rc_are_the_limits_of_its_impedance(kin
     np.testing.assert_allclose(z[1].real, load.elements.r_s, rtol=1e-4)
     np.testing.assert_allclose(z[0].real, load.elements.r_s + load.elements.r_p, rtol=1e-4)
     if np.isnan(load.elements.c_p):
-        bound = failure_map.bounds(scene(kind))["dry/00"]
+        bound = failure_draws.bounds(scene(kind))["dry/00"]
         np.testing.assert_array_equal(np.isnan(bound), [False, False, True])
     else:
         reactance = np.abs(load(np.array([1e8])) - load.elements.r_s)

@@ -10,7 +10,7 @@ import etid
 from benchmarks.coverage import monte_carlo, scene
 from benchmarks.estimators import Drivers
 from benchmarks.failure_axes import cells
-from benchmarks.failure_map import Effort, answers
+from benchmarks.failure_draws import Effort, answers
 from benchmarks.ladder import LOADS
 
 SUCCESSFUL = 0.9

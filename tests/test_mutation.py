@@ -1,4 +1,4 @@
-"""Bugs that are put in: each is one, no test sees what cannot matter, and none is done twice."""
+"""Bugs that are put in: each is one, no test sees what cannot matter, and survivors are counted."""
 
 import ast
 import csv
@@ -7,9 +7,7 @@ import pytest
 
 from benchmarks import mutation
 from benchmarks.__main__ import asked
-from benchmarks.mutant_tests import Outcome
 from benchmarks.mutants import drawn, mutants
-from benchmarks.provenance import ROOT
 
 SOURCE = '''"""A module."""
 
@@ -43,6 +41,7 @@ def test_every_mutant_is_another_program_with_one_change():
         assert "a: int" in changed
         line = SOURCE.splitlines()[mutant.line - 1]
         assert mutant.before.splitlines()[0] in line
+        assert mutant.inside == (mutant.line > 7)  # a default is computed at the import
 
 
 def test_a_text_of_several_bytes_a_letter_is_cut_where_it_should():
@@ -65,6 +64,25 @@ def test_draws_are_seeded_and_larger_ones_hold_the_smaller():
     assert drawn(found, 9, 2) != drawn(found, 9, 1)
 
 
+def test_a_mutant_is_judged_by_the_tests_that_execute_it_and_a_constant_by_those_of_its_module():
+    found = mutants("etid/small.py", SOURCE)
+    executed = {
+        "slow": (9.0, {"etid/small.py": [3, 6, 9, 10, 11]}),
+        "fast": (1.0, {"etid/small.py": [3, 6, 11]}),
+        "importing": (0.1, {"etid/small.py": [3, 6]}),
+    }
+    calls = {one.line for one in found if one.inside}
+    by = {one.line: mutation.judges(one, executed, calls) for one in found}
+    assert by == {3: ["fast", "slow"], 6: ["fast", "slow"], 9: ["slow"], 10: ["slow"],
+                  11: ["fast", "slow"], 12: []}  # fmt: skip
+
+
+def test_modules_are_drawn_from_the_whole_of_etid():
+    names = mutation.module_names(mutation.ROOT)
+    assert len(names) == len({*mutation.ROOT.glob("etid/**/*.py")})
+    assert {"__init__", "solvers.levenberg_marquardt", "report.html", "numpy_tier.tiers"} < {*names}
+
+
 @pytest.fixture
 def tree(tmp_path):
     """A package of one module, whose test sees a sum and nothing else."""
@@ -72,57 +90,34 @@ def tree(tmp_path):
     for folder in ("etid", "tests"):
         (root / folder).mkdir(parents=True)
     (root / "etid" / "__init__.py").touch()
-    (root / "etid" / "small.py").write_text("UNUSED = 5\n\n\ndef add(a, b):\n    return a + b\n")
+    (root / "etid" / "small.py").write_text(
+        "def add(a, b):\n    return a + b\n\n\ndef twice(a):\n    return a * 2\n"
+    )
     (root / "tests" / "test_small.py").write_text(
-        "from etid.small import add\n\n\ndef test_nothing():\n    pass\n"
-        "\n\ndef test_sum():\n    assert add(2, 1) == 3\n"
+        "from etid.small import add\n\n\ndef test_sum():\n    assert add(2, 1) == 3\n"
     )
     return root
 
 
 @pytest.mark.slow
-def test_what_no_test_sees_survives_and_what_is_done_is_kept(tree, tmp_path, monkeypatch):
-    path = tree / "etid" / "small.py"
-    chosen = mutants("etid/small.py", path.read_text())
-    assert [mutant.kind for mutant in chosen] == ["constant", "term dropped", "operator"]
-    kept = tmp_path / "kept.jsonl"
-    tests = {"small": ("small",)}
-    rows = list(mutation.outcomes(tree, tests, chosen[:2], kept, 60.0))
-    assert [row["outcome"] for row in rows] == ["survived", "killed"]
-    assert [row["killer"] for row in rows] == ["", "tests/test_small.py::test_sum"]
-    assert path.read_text().startswith("UNUSED = 5")
-    monkeypatch.setattr(mutation, "Runner", lambda _: None)  # nothing that could be called
-    assert list(mutation.outcomes(tree, tests, chosen[:2], kept, 60.0)) == rows
-
-
-def test_modules_and_their_tests_are_where_the_benchmark_looks_for_them():
-    for name, tests in mutation.TESTS.items():
-        assert (ROOT / "etid" / f"{name.replace('.', '/')}.py").exists()
-        for test in tests:
-            assert (ROOT / "tests" / f"test_{test}.py").exists()
-
-
-def test_survivors_are_shown_and_the_table_tells_seed_and_commit(tmp_path, monkeypatch, capsys):
-    row = {
-        "key": "k", "module": "a", "place": "etid/a.py:7", "kind": "sign", "before": "-\\\n x",
-        "after": "(x)", "killer": "", "seconds": 1.0,
-    }  # fmt: skip
-    rows = [{**row, "outcome": outcome} for outcome in ("survived", "killed")]
-    monkeypatch.setattr(mutation, "outcomes", lambda *_: rows)
-    kept = tmp_path / "mutation.jsonl"
-    of = asked(["mutation", "--modules", "results.verdicts", "--seed", "3", "--output", str(kept)])
-    assert not of.module.main(of)
+def test_the_benchmark_counts_what_no_test_sees(tree, tmp_path, capsys):
+    of = asked(["mutation", "--seed", "3", "--output", f"{tmp_path}/found.csv"])
+    assert not mutation.main(of, tree)  # 2 of 4
     text = capsys.readouterr().out
-    assert "1 of 2 survive, 50%" in text
-    assert "etid/a.py:7: sign: -\\ x  ->  (x)" in text
-    with kept.with_suffix(".csv").open() as file:
-        found = next(csv.DictReader(file))
-    assert (found["seed"], found["outcome"], found["before"]) == ("3", "survived", "-\\ x")
-    assert found["commit"]
+    assert "2 of 4, 50% (95 %: 7% to 93%)   target <= 0.1, missed" in text
+    with (tmp_path / "found.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    outcomes = {(row["place"], row["outcome"], row["killer"]) for row in rows}
+    assert outcomes == {
+        ("etid/small.py:2", "killed", "tests/test_small.py::test_sum"),
+        ("etid/small.py:6", "survived", ""),
+    }
+    assert {row["seed"] for row in rows} == {"3"}
+    assert (tree / "etid" / "small.py").read_text().startswith("def add(a, b):\n    return a + b\n")
 
 
-def test_tests_that_fail_by_themselves_are_no_judge(tree, tmp_path, monkeypatch):
-    monkeypatch.setattr(mutation, "Runner", lambda _: lambda *_: Outcome(False, ""))
-    chosen = mutants("etid/small.py", (tree / "etid" / "small.py").read_text())
-    with pytest.raises(SystemExit, match="fails without any mutant"):
-        next(mutation.outcomes(tree, {"small": ("small",)}, chosen, tmp_path / "k.jsonl", 60.0))
+@pytest.mark.slow
+def test_tests_that_fail_by_themselves_are_no_judge(tree, tmp_path):
+    (tree / "tests" / "test_small.py").write_text("def test_sum():\n    assert False\n")
+    with pytest.raises(SystemExit, match="without any mutant: tests/test_small"):
+        mutation.main(asked(["mutation", "--output", f"{tmp_path}/found.csv"]), tree)

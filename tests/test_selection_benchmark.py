@@ -5,7 +5,8 @@ import numpy as np
 import pytest
 
 import etid
-from benchmarks import selection, selection_chart, selection_map, selection_rival
+from benchmarks import selection, selection_map, selection_rival
+from benchmarks.failure_draws import AUTO, judged, limits
 from benchmarks.selection_counts import CRITERIA, cell, choose, covered
 from benchmarks.selection_draws import TRUTHS, Drawn, quantities
 from etid.results.fit import CHANGES, Fit, Support
@@ -59,9 +60,9 @@ def test_two_circuits_have_the_same_resistance_corner_and_limits():
     np.testing.assert_allclose(skin["Z(0)"].slope, [1, 1, 0])
     values = np.asarray(TRUTHS[TRUTH].values())
     np.testing.assert_allclose(skin["corner"].slope, [0, -1 / values[1], -1 / values[2]])
-    found, slopes = selection_map.limits(TRUTHS["R, dry"])
+    found, stderr = limits(made(TRUTHS["R, dry"], 1000.0))
     np.testing.assert_allclose(found, [216.6e3, 0, np.nan])
-    np.testing.assert_allclose(slopes, [[1], [0], [0]])
+    np.testing.assert_allclose(stderr, [2166, 0, 0])
 
 
 def test_bic_of_the_benchmark_chooses_as_etid_does():
@@ -85,7 +86,7 @@ def test_a_row_counts_choices_and_intervals(tmp_path):
     right = next(selection.chosen([row], [good, wide, rich]))
     assert right.value == pytest.approx(2 / 3)
     assert not right.met
-    selection_chart.draw([row], TRUTHS, tmp_path / "chart.svg", "not installed")
+    selection.draw([row], tmp_path / "chart.svg")
     assert "one RC, dry" in (tmp_path / "chart.svg").read_text()
 
 
@@ -97,11 +98,11 @@ def test_a_circuit_without_a_series_resistor_claims_that_it_is_zero():
     ]
     path, bound = cell_of.scene.trials[0].path, np.array([0.01, 0.01, np.nan])
     fit = made(etid.ParallelRC(186e3, 0.12e-9), 1000.0)
-    said = selection_map.answer(cell_of, 0, path, fit, bound)
+    said = judged(cell_of, AUTO, 0, path, fit, bound)
     assert said.error[0] == -1
     assert said.missed
     cole = made(etid.SkinCole(33.4e3, 186e3, 22e-6, 0.9), 1000.0)
-    assert selection_map.is_right(selection_map.answer(cell_of, 0, path, cole, bound))
+    assert selection_map.is_right(judged(cell_of, AUTO, 0, path, cole, bound))
 
 
 def test_the_noise_of_exact_spectra_is_what_the_rival_is_told_and_choices_are_counted_by_truth():
