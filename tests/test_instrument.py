@@ -1,5 +1,7 @@
 """Tolerances of the instrument: in the standard errors, in a budget, and in files."""
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -13,6 +15,7 @@ from etid.circuits.impedance import parallel, series
 from etid.estimators.maximum_likelihood.gains import Gains
 from etid.estimators.maximum_likelihood.given_driver import given
 from etid.results.budget import EXAMPLES
+from etid.results.driver import ContinuousDriver, HarmonicDriver
 from etid.simulation.scenes import Scene, Trial
 from etid.simulation.transformer import ResistorLoad
 
@@ -81,7 +84,8 @@ def test_an_error_far_beyond_its_tolerance_is_inconsistent():
 @pytest.mark.parametrize("source", EXAMPLES)
 def test_a_budget_says_what_an_error_that_nobody_stated_does(source):
     size = EXAMPLES[source]
-    right, wrong = fitted(*records()), fitted(*records(**{source: size}))
+    errors: dict[str, Any] = {source: size}
+    right, wrong = fitted(*records()), fitted(*records(**errors))
     before, after = (np.log(np.asarray(fit.circuit.values())) for fit in (right, wrong))
     told = right.budget().unstated[source]
     # Both fits have the same noise; what is left is the curvature of the model and, for a
@@ -107,6 +111,7 @@ def test_the_parts_of_a_budget_are_the_variances_of_the_fit():
 def test_the_derivatives_of_the_gains_by_the_errors_are_those_of_jax():
     calibration, skin = records()
     driver = etid.identify_driver(calibration, instrument=ALL)
+    assert isinstance(driver, HarmonicDriver)
     frequency = driver.spectra.frequency[0]
     with jax.enable_x64(True):
         gains = Gains(
@@ -127,8 +132,11 @@ def test_tolerances_are_kept_in_files_of_fits(tmp_path):
     fits.write(tmp_path / "fits.h5")
     again = etid.StudyFits.read(tmp_path / "fits.h5")
     assert again.settings == fits.settings
+    assert again.settings is not None
     assert "crosstalk 0.002" in again.settings.instrument
     (driver,) = again.drivers.values()
+    assert isinstance(driver, ContinuousDriver)
+    assert driver.instrument is not None
     assert driver.instrument.stored() == ALL.stored()
 
 
