@@ -10,10 +10,8 @@ import scipy.io
 
 import etid
 from etid import cli
-from etid.estimators.lanes import Harmonics
 from etid.identify import file as fit_file
 from etid.plotting import figure_of
-from etid.plotting.bands import bands
 from etid.recordings.causes import why_misaligned
 from etid.recordings.preflight import Inspected, preflight
 from etid.results.feed import MEASURED_CURRENT
@@ -106,19 +104,6 @@ def test_a_prior_is_one_more_measurement(skin):
     kept_numbers.check("current_with_prior", kept_numbers.of_fit(told))
 
 
-@pytest.mark.parametrize(
-    ("known", "words"),
-    [
-        ({"fixed": {"r_x": 1.0}}, "'r_x' is no element of SkinRC; its elements are r_s, r_p, c_p"),
-        ({"fixed": {"r_s": -1.0}}, "must be positive"),
-        ({"prior": {"r_s": (5e2, 5e1)}, "fixed": {"r_s": 5e2}}, "r_s is fixed and has a prior"),
-    ],
-)
-def test_a_wrong_known_element_is_refused(skin, known, words):
-    with pytest.raises(ValueError, match=words):
-        etid.identify_skin(skin, **known)
-
-
 def test_a_single_pulse_is_identified_in_time():
     fit = etid.identify_skin(recorded(SKIN, periods=1.1, delay=5e-7))
     assert fit.method == "output_error"
@@ -186,16 +171,6 @@ def test_a_fit_from_a_current_is_drawn(skin, show):
     assert all(axes.has_data() for axes in figure.axes)
 
 
-def test_the_bands_of_a_current_have_the_impedance_of_the_load(skin):
-    lane = Harmonics.of(Inspected(skin))
-    found = bands(lane, MEASURED_CURRENT, etid.identify_skin(skin).circuit)
-    truth = np.asarray(SKIN.response(jnp.asarray(found.frequency)))
-    sure = found.stderr < 0.1
-    assert sure.sum() > 10
-    off = np.abs(np.log(np.abs(found.z[sure] / truth[sure]))) / found.stderr[sure]
-    assert off.max() < WITHIN
-
-
 def test_draws_and_profile_of_a_fit_from_a_current_have_its_errors(skin):
     fit = etid.identify_skin(skin)
     draws = fit.posterior()
@@ -218,14 +193,6 @@ def test_the_report_of_a_study_of_currents_speaks_of_no_driver(skin, tmp_path):
     assert "do not say with which driver" not in page
 
 
-def test_a_batch_gives_the_fits_of_single_recordings(skin):
-    fits = etid.identify_skins([skin, recorded(SKIN, seed=1)])
-    np.testing.assert_allclose(
-        np.asarray(fits.circuit.r_p)[0], etid.identify_skin(skin).circuit.r_p, rtol=1e-9
-    )
-    assert (fits.verdicts == "successful").all()
-
-
 KNOWN: dict[str, Any] = {"fixed": {"r_s": 33e3}, "prior": {"c_p": (0.12e-9, 1e-13)}}
 
 
@@ -236,11 +203,6 @@ def test_a_batch_takes_known_elements(skin):
     assert np.abs(off(fits[0], SKIN))[1:].max() < WITHIN
     assert fits.verdicts == ["successful"]
     assert "known_elements" in fits.fit.method
-
-
-def test_a_wrong_known_element_of_a_batch_is_refused(skin):
-    with pytest.raises(ValueError, match="'r_x' is no element of SkinRC"):
-        etid.identify_skins([skin], fixed={"r_x": 1.0})
 
 
 @pytest.mark.slow
@@ -265,12 +227,6 @@ def test_a_choice_among_circuits_takes_elements_that_all_of_them_have(skin):
     few = [etid.SkinRC(), etid.SkinCole()]
     selection = etid.select_circuit(skin, candidates=few, fixed={"r_s": 33e3})
     np.testing.assert_allclose(selection.fit.circuit.r_s, 33e3, rtol=1e-8)
-    for choose in (
-        lambda: etid.identify_skin(skin, circuit="auto", fixed={"r_s": 33e3}),
-        lambda: etid.select_circuit(skin, fixed={"r_s": 33e3}),
-    ):
-        with pytest.raises(ValueError, match="r_s is known, but ParallelRC and Resistor have no"):
-            choose()
 
 
 def test_a_run_with_other_known_elements_is_not_resumed(skin, tmp_path, monkeypatch):
@@ -405,25 +361,6 @@ def test_a_late_capacitor_is_not_mistaken_for_a_wrong_sign(late):
     seen = Inspected(right.replace(v_out=np.roll(right.v_out, late)))
     assert preflight(seen) == "misaligned"
     assert why_misaligned(seen).startswith("The cause is not clear")
-
-
-def test_a_recording_needs_what_it_is_identified_from(skin):
-    with pytest.raises(etid.RecordingError, match="current: was not recorded"):
-        etid.identify_skin(skin.replace(v_th=skin.v_out, current=None))
-    with pytest.raises(etid.RecordingError, match="v_th: was not recorded"):
-        _ = skin.v_th
-    with pytest.raises(etid.RecordingError, match=r"v_th: is not given.*or current"):
-        skin.replace(current=None)
-    with pytest.raises(etid.RecordingError, match="v_th: is not given"):
-        skin.replace(r_load=1e5)
-    with pytest.raises(etid.RecordingError, match="v_out: is not given"):
-        skin.replace(v_out=None)
-
-
-@pytest.mark.parametrize("method", ["steiglitz_mcbride", "non_parametric"])
-def test_an_estimator_that_needs_a_driver_says_so(skin, method):
-    with pytest.raises(ValueError, match=f"{method}.*from a measured current"):
-        etid.identify_skin(skin, method=method)
 
 
 def test_a_measured_current_prints_itself():

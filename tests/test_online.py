@@ -25,7 +25,7 @@ from etid.results.driver import ContinuousDriver
 from etid.signals.harmonics import ALIASED
 from etid.simulation.scenes import Scene, Trial
 from etid.simulation.transformer import ResistorLoad, Sampler, SkinLoad, loading
-from tests import kept_numbers, pictures
+from tests import kept_numbers
 
 DRY = SkinLoad(r_s=33.4e3, r_p=186e3, c_p=0.12e-9)
 DAMP = SkinLoad(r_s=6.1e3, r_p=17.4e3, c_p=0.66e-9)
@@ -484,18 +484,12 @@ def coverage(seeds, electrodes, pulses):
 @pytest.mark.slow
 def test_intervals_of_95_per_cent_contain_the_truth_in_95_per_cent():
     """Noise and driver; the two loads of one driver share its error, drivers are independent."""
-    seeds = 60
+    seeds = 24  # a driver each; the benchmark of on-line identification has hundreds
     z = coverage(seeds, 1, 12)
     assert len(z) > 0.98 * 2 * seeds
     # One deviation as of half as many draws: loads of one driver err alike.
     assert (np.abs(held(z) - 0.95) < 3 * np.sqrt(0.95 * 0.05 / seeds)).all(), held(z)
     assert (np.abs(z) < 5).all()
-
-
-@pytest.mark.slow
-def test_intervals_of_drifting_skin_contain_it_in_95_per_cent():
-    z = np.concatenate([z_of_walk(electrodes=32, pulses=101, seed=seed) for seed in range(3)])
-    assert (np.abs(held(z) - 0.95) < 3 * np.sqrt(0.95 * 0.05 / len(z)) + 0.01).all(), held(z)
 
 
 def test_bands_end_where_aliases_begin():
@@ -580,26 +574,6 @@ def test_codes_of_a_converter_are_not_taken_for_volts(kind, monkeypatch):
         tracker.update(tracker.start(), np.zeros((2, 3333), kind))
 
 
-def test_what_cannot_be_tracked_is_refused_with_a_reason():
-    driver, study = calibrated()
-    unloaded = study["cal/0"]
-    tracker = tracker_of(2)
-    with pytest.raises(ValueError, match=r"shape \(2, 3334\).* \(2, 3333\)"):
-        tracker.update(tracker.start(), np.zeros((2, 3334)))
-    with pytest.raises(ValueError, match="electrodes is 0"):
-        Tracker.of(driver, unloaded, electrodes=0)
-    with pytest.raises(ValueError, match="change is -1"):
-        Tracker.of(driver, unloaded, electrodes=1, change=-1.0)
-    plain = pictures.as_kind(driver, ContinuousDriver)
-    with pytest.raises(ValueError, match="harmonics"):
-        Tracker.of(plain, unloaded, electrodes=1)
-    half = etid.Recording(
-        unloaded.v_th[:1500], unloaded.v_out[:1500], sample_rate=RATE, pulse_rate=PULSES
-    )
-    with pytest.raises(etid.IdentificationError, match="not_periodic"):
-        Tracker.of(driver, half, electrodes=1)
-
-
 # --- changes --------------------------------------------------------------------------------------
 
 
@@ -682,24 +656,32 @@ def test_an_electrode_whose_search_diverged_is_identified_by_the_next_pulse():
     assert set(found.verdicts) == {"successful"}
 
 
+REPEATED = 8  # times ten electrodes
+
+
 def test_weak_pulses_do_not_add_up_to_a_wrong_answer():
     """A fifteenth of the amplitude at 40 dB: one pulse knows R_s of damp skin to 40 %.
 
     Information about logarithms that was added up as it came gave 65 of 240 electrodes more than
     four standard errors off; what is known of R_s in ohm gives 10.
     """
-    electrodes, amplitude = 240, 0.067
-    tracker = tracker_of(electrodes)
+    amplitude, settled, off = 0.067, 0, []
+    tracker, *_ = ten()
     pulses = amplitude * tracker.pulses(loaded(quiet()))[:, 1:]
-    state = tracker.start()
-    for number in range(40):
-        noisy = with_noise(np.repeat(pulses[number % 10], electrodes, 0) / 10, number) * 10
-        state = tracker.update(state, noisy, amplitude)
-    fits = tracker.read(state)
-    settled = fits.successful()
-    assert len(settled) > 0.98 * electrodes
-    off = (np.asarray(settled.circuit.values()) - TRUTH[1]) / np.asarray(settled.stderr.values())
-    assert np.sum(np.abs(off).max(1) > 4) < 30  # 10; by chance 5 more or less
+    for seed in range(REPEATED):
+        state = tracker.start()
+        for number in range(40):
+            clean = np.repeat(pulses[number % 10], TEN, 0)
+            noisy = clean + 10 * (with_noise(clean, 40 * seed + number) - clean)
+            state = tracker.update(state, noisy, amplitude)
+        fits = tracker.read(state).successful()
+        settled += len(fits)
+        off.append(
+            (np.asarray(fits.circuit.values()) - TRUTH[1]) / np.asarray(fits.stderr.values())
+        )
+    assert settled > 0.98 * REPEATED * TEN
+    # 3 of 80, and by chance 2 more or less; of information that is added up, 22 of 80.
+    assert np.sum(np.abs(np.concatenate(off)).max(1) > 4) < 10
 
 
 def test_an_amplitude_that_is_told_is_no_change():
@@ -712,11 +694,6 @@ def test_an_amplitude_that_is_told_is_no_change():
     none = tracker.update(state, with_noise(0 * clean[8], 2), 0.0)
     assert set(tracker.read(none).verdicts) == {"successful"}
     np.testing.assert_array_equal(none.electrodes.own, state.electrodes.own)
-    for wrong in (-1.0, np.nan):
-        with pytest.raises(ValueError, match="finite and not negative"):
-            tracker.update(state, clean[8], wrong)
-    with pytest.raises(ValueError, match=r"shape \(3,\)"):
-        tracker.update(state, clean[8], np.ones(3))
 
 
 def test_a_display_at_rest_is_identified_from_the_second_pulse_on():
