@@ -510,7 +510,7 @@ studies = paths.flatmap(lambda own: st.tuples(*map(fields, ["c", "cc/1", "cc/0",
 
 
 @settings(
-    max_examples=20, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+    max_examples=12, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
 )
 @given(drawn=studies)
 def test_what_is_written_is_read_again(drawn, tmp_path):

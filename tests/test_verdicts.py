@@ -122,7 +122,7 @@ def baselines():
     """The paper's method from quiet to noisy: how often its drivers and skins end how."""
     found = Counter()
     for snr_db in (None, 60.0, 40.0, 30.0):
-        for seed in range(3):
+        for seed in range(1):
             study = simulate(snr_db=snr_db, seed=seed)
             driver = etid.identify_driver(
                 study["calibration/98k8"], method="steiglitz_mcbride", throw=False
@@ -141,7 +141,7 @@ def test_the_papers_method_says_how_it_fails(baselines, name):
 def test_the_papers_method_is_never_successful_here(baselines):
     """Without noise its loop is unstable, with noise its R_s is far off."""
     assert baselines["successful"] == 0
-    assert baselines.total() == 36
+    assert baselines.total() == 12
 
 
 class Wall(etid.AbstractCircuit):
