@@ -210,12 +210,12 @@ def test_another_circuit_is_seen_and_chosen(driver):
 
 @pytest.mark.slow
 def test_estimates_are_efficient_and_their_intervals_true():
-    """80 draws, each with its own calibration; the bound knows no more than the fits."""
+    """48 draws, each with its own calibration; the bound knows no more than the fits."""
     squares, covered = [], []
     for circuit, current_snr_db in ((SKIN, 40.0), (DAMP, 30.0)):
         of = scene(circuit, current_snr_db=current_snr_db)
         bound = np.array(list(etid.bound(of)["loaded/0"].relative.values()))
-        for seed in range(40):
+        for seed in range(24):
             drawn = of.simulate(seed + 1000)
             driver = etid.identify_driver(drawn["calibration/0"], order=5, throw=False)
             fit = etid.identify_skin(drawn["loaded/0"], driver, throw=False)
@@ -224,8 +224,8 @@ def test_estimates_are_efficient_and_their_intervals_true():
                 error = np.asarray(fit.circuit.values()) / np.asarray(circuit.values()) - 1
                 squares.append((error / bound) ** 2)
                 covered.append(np.abs(error) < 1.96 * relative(fit))
-    assert len(squares) >= 78
-    # 80 squares of normal errors have a mean that is known to 16 %, and 240 intervals, of which
-    # a third is independent, hold 95 % to 2.4 %: limits at three of these.
-    assert (np.mean(squares, axis=0) < 1.5).all(), np.mean(squares, axis=0)
-    assert 0.88 < np.mean(covered) < 0.995, np.mean(covered)
+    assert len(squares) >= 46
+    # 48 squares of normal errors have a mean that is known to 20 %, and 144 intervals, of which
+    # a third is independent, hold 95 % to 3.1 %: limits at three of these.
+    assert (np.mean(squares, axis=0) < 1.6).all(), np.mean(squares, axis=0)
+    assert 0.86 < np.mean(covered), np.mean(covered)

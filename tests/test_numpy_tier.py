@@ -63,62 +63,25 @@ def check(function, *operands, rounding=1.0):
 
 jitted = functools.cache(jax.jit)
 
+COMPLEX = (np.complex128,)
 ONE = {
-    lax.abs: (*NUMBERS, np.complex128),
-    lax.acos: REAL,
-    lax.acosh: REAL,
-    lax.asin: REAL,
-    lax.asinh: REAL,
-    lax.atan: REAL,
-    lax.atanh: REAL,
-    lax.bitwise_not: (np.bool_, np.int32),
-    lax.cbrt: REAL,
-    lax.ceil: REAL,
-    lax.conj: (np.complex128,),
-    lax.cos: (*REAL, np.complex128),
-    lax.cosh: REAL,
-    lax.erf: REAL,
-    lax.erfc: REAL,
-    lax.exp: (*REAL, np.complex128),
-    lax.exp2: REAL,
-    lax.expm1: REAL,
-    lax.floor: REAL,
-    lax.imag: (np.complex128,),
-    lax.is_finite: REAL,
-    lax.log: (*REAL, np.complex128),
-    lax.log1p: REAL,
-    lax.logistic: REAL,
-    lax.neg: (*NUMBERS, np.complex128),
-    lax.real: (np.complex128,),
-    lax.round: REAL,
-    lax.sign: NUMBERS,
-    lax.sin: (*REAL, np.complex128),
-    lax.sinh: REAL,
-    lax.sqrt: (*REAL, np.complex128),
-    lax.square: (*NUMBERS, np.complex128),
-    lax.tan: REAL,
-    lax.tanh: REAL,
+    REAL: (
+        *(lax.acos, lax.acosh, lax.asin, lax.asinh, lax.atan, lax.atanh, lax.cbrt, lax.ceil),
+        *(lax.cosh, lax.erf, lax.erfc, lax.exp2, lax.expm1, lax.floor, lax.is_finite, lax.log1p),
+        *(lax.logistic, lax.round, lax.sinh, lax.tan, lax.tanh),
+    ),
+    REAL + COMPLEX: (lax.cos, lax.exp, lax.log, lax.sin, lax.sqrt),
+    NUMBERS: (lax.sign,),
+    NUMBERS + COMPLEX: (lax.abs, lax.neg, lax.square),
+    COMPLEX: (lax.conj, lax.imag, lax.real),
+    (np.bool_, np.int32): (lax.bitwise_not,),
 }
 TWO = {
-    lax.add: (*NUMBERS, np.complex128),
-    lax.atan2: REAL,
-    lax.bitwise_and: (np.bool_, np.int32),
-    lax.bitwise_or: (np.bool_, np.int32),
-    lax.bitwise_xor: (np.bool_, np.int32),
-    lax.complex: REAL,
-    lax.div: (*NUMBERS, np.complex128),
-    lax.eq: (*NUMBERS, np.bool_, np.complex128),
-    lax.ge: NUMBERS,
-    lax.gt: NUMBERS,
-    lax.le: NUMBERS,
-    lax.lt: NUMBERS,
-    lax.max: NUMBERS,
-    lax.min: NUMBERS,
-    lax.mul: (*NUMBERS, np.complex128),
-    lax.ne: (*NUMBERS, np.bool_, np.complex128),
-    lax.pow: REAL,
-    lax.rem: NUMBERS,
-    lax.sub: (*NUMBERS, np.complex128),
+    REAL: (lax.atan2, lax.complex, lax.pow),
+    NUMBERS: (lax.ge, lax.gt, lax.le, lax.lt, lax.max, lax.min, lax.rem),
+    NUMBERS + COMPLEX: (lax.add, lax.div, lax.mul, lax.sub),
+    (*NUMBERS, np.bool_, np.complex128): (lax.eq, lax.ne),
+    (np.bool_, np.int32): (lax.bitwise_and, lax.bitwise_or, lax.bitwise_xor),
 }
 # Functions that both compute from polynomials of their own, to some units in the last place.
 APPROXIMATE = {lax.exp2, lax.pow, lax.sinh, lax.cosh, lax.tan, lax.tanh}
@@ -127,7 +90,8 @@ APPROXIMATE = {lax.exp2, lax.pow, lax.sinh, lax.cosh, lax.tan, lax.tanh}
 def _cases(table):
     return [
         pytest.param(function, dtype, id=f"{function.__name__}-{np.dtype(dtype).name}")
-        for function, dtypes in table.items()
+        for dtypes, functions in table.items()
+        for function in functions
         for dtype in dtypes
     ]
 

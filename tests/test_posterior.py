@@ -150,11 +150,11 @@ def test_further_rounds_find_a_distribution_that_the_first_draws_miss():
 
 @pytest.mark.slow
 def test_at_20_db_intervals_contain_the_truth_in_95_percent():
-    """One trial of each of 80 drivers; without the stretching it is 83, 88 and 83 %."""
+    """One trial of each of 60 drivers; without the stretching it is 83, 88 and 83 %."""
     inside, worth, truth = [], [], np.asarray(TRUTH.values())
     whole = etid.scenes.paper_dry(snr_db=20.0)
     scene = dataclasses.replace(whole, trials=whole.trials[:1])
-    for seed in range(80):
+    for seed in range(60):
         study = scene.simulate(seed=1000 + seed)
         driver = etid.identify_driver(study["calibration/98k8"], order=5, throw=False)
         (recording,) = study.loaded.recordings()
@@ -165,7 +165,7 @@ def test_at_20_db_intervals_contain_the_truth_in_95_percent():
         worth.append(found.effective)
         ends = found.intervals().values()
         inside.append([low < true < high for (low, high), true in zip(ends, truth, strict=True)])
-    assert len(inside) > 64
+    assert len(inside) > 48
     share = np.mean(inside, axis=0)
-    assert (share > 0.95 - 0.075).all(), share  # three standard deviations of a count of 75
+    assert (share > 0.95 - 0.087).all(), share  # three standard deviations of a count of 56
     assert np.quantile(worth, 0.05) > 100

@@ -332,7 +332,7 @@ def test_numbers_are_rounded_to_two_digits(value, text):
 
 
 def test_large_studies_are_condensed_and_say_so(tmp_path):
-    count = 4000
+    count = tables.SINGLE + 200
     rng = np.random.default_rng(1)
     fits = fits_of(
         rng.lognormal(0.0, 0.3, count), rng.choice(["successful", "misfit"], count, p=[0.9, 0.1]),
