@@ -475,6 +475,16 @@ def test_files_that_are_none_are_refused(tmp_path):
             hdf5.read(tmp_path / name)
 
 
+def test_a_truncated_file_is_never_more_than_an_error(path, tmp_path):
+    whole = path.read_bytes()
+    damaged = tmp_path / "damaged.h5"
+    for length in np.linspace(0, len(whole) - 1, 60, dtype=int):
+        damaged.write_bytes(whole[:length])
+        with pytest.raises(RecordingError, match="damaged"):
+            hdf5.read(damaged)
+        assert len(hdf5.check(damaged)) == 1
+
+
 # writing
 
 text = st.text(st.characters(exclude_categories=["Cs"], exclude_characters="\0"), max_size=8)

@@ -1,7 +1,7 @@
 """Calls that are refused, each with the words that name the argument and the remedy.
 
-A row is a call, the error and words of its message. Files have tables of their own, beside what is
-read from them.
+A row is a call and words of its message, below the error that it raises. Files have tables of
+their own, beside what is read from them.
 """
 
 import dataclasses
@@ -65,244 +65,201 @@ def skin(of, **options):
 
 
 ONE_OF = "must be a whole number from 2 to 20"
-IDENTIFICATION = (
-    (
-        lambda of: etid.identify_driver(of.calibration.replace(r_load=None)),
-        ValueError,
-        "has no r_load; a calibration needs its resistor",
-    ),
-    (
-        lambda of: etid.identify_driver(
-            of.calibration.replace(v_th=np.zeros(of.calibration.v_th.size))
+IDENTIFICATION = {
+    ValueError: [
+        (
+            lambda of: etid.identify_driver(of.calibration.replace(r_load=None)),
+            "has no r_load; a calibration needs its resistor",
         ),
-        IdentificationError,
-        "flat",
-    ),
-    (
-        lambda of: etid.identify_driver(of.calibration.replace(v_out=of.calibration.v_th)),
-        IdentificationError,
-        "unconnected",
-    ),
-    (
-        lambda of: etid.identify_driver([of.calibration, cut(of.calibration, 2000)]),
-        ValueError,
-        r"differ in \(samples, sample rate, pulse rate\)",
-    ),
-    (lambda of: etid.identify_driver([]), ValueError, "no calibration given"),
-    (lambda of: etid.identify_driver(of.calibration, order=1), ValueError, ONE_OF),
-    (lambda of: etid.identify_driver(of.calibration, order=0), ValueError, ONE_OF),
-    (lambda of: etid.identify_driver(of.calibration, order=-1), ValueError, ONE_OF),
-    # The type checker of the tests comes first.
-    (lambda of: etid.identify_driver(of.calibration, method=GUESS), Exception, "guess"),
-    (lambda of: etid.identify_skin(of.skin, of.driver, method=GUESS), Exception, "guess"),
-    (lambda of: etid.identify_skins([of.skin], of.driver, method=GUESS), Exception, "guess"),
-    (lambda of: etid.identify_study(of.study, method=GUESS), Exception, "guess"),
-    (lambda of: etid.identify_skins([], of.driver), ValueError, "no recording"),
-    (
-        lambda of: etid.identify_study(etid.Study.from_recordings([of.calibration])),
-        ValueError,
-        "no loaded recording",
-    ),
-    (
-        lambda of: etid.identify_skin(of.skin, of.discrete),
-        ValueError,
-        "no continuous source",
-    ),
-    (
-        lambda of: etid.identify_skin(
-            of.skin.replace(sample_rate=2 * RATE, pulse_rate=120.0),
-            of.driver,
-            method="steiglitz_mcbride",
+        (
+            lambda of: etid.identify_driver([of.calibration, cut(of.calibration, 2000)]),
+            r"differ in \(samples, sample rate, pulse rate\)",
         ),
-        ValueError,
-        "the same sample rate",
-    ),
-    (
-        lambda of: etid.identify_skin(
-            of.skin, of.driver, circuit=etid.Resistor(), method="equation_error"
+        (lambda of: etid.identify_driver([]), "no calibration given"),
+        (lambda of: etid.identify_driver(of.calibration, order=1), ONE_OF),
+        (lambda of: etid.identify_driver(of.calibration, order=0), ONE_OF),
+        (lambda of: etid.identify_driver(of.calibration, order=-1), ONE_OF),
+        (lambda of: etid.identify_skins([], of.driver), "no recording"),
+        (
+            lambda of: etid.identify_study(etid.Study.from_recordings([of.calibration])),
+            "no loaded recording",
         ),
-        ValueError,
-        "identifies SkinRC only",
-    ),
-    (lambda of: etid.predict(of.skin, of.driver), ValueError, "give the circuit"),
-    # A current
-    (lambda of: etid.identify_skin(of.skin), RecordingError, "current: was not recorded"),
-    (lambda of: of.alone.v_th, RecordingError, "v_th: was not recorded"),
-    (lambda of: of.alone.replace(current=None), RecordingError, "v_th: is not given.*or current"),
-    (lambda of: of.alone.replace(r_load=1e5), RecordingError, "v_th: is not given"),
-    (lambda of: of.alone.replace(v_out=None), RecordingError, "v_out: is not given"),
-    (
-        lambda of: skin(of, method="steiglitz_mcbride"),
-        ValueError,
-        "steiglitz_mcbride.*from a measured current",
-    ),
-    (
-        lambda of: skin(of, method="non_parametric"),
-        ValueError,
-        "non_parametric.*from a measured current",
-    ),
-    (
-        lambda of: etid.identify_skin(of.skin, of.driver, method=WITH_CURRENT),
-        ValueError,
-        "needs a driver and a current",
-    ),
-    (
-        lambda of: etid.identify_skin(of.both, method=WITH_CURRENT),
-        ValueError,
-        "needs a driver and a current",
-    ),
-    (
-        lambda of: etid.identify_samples(
-            jnp.asarray(of.skin.v_th),
-            jnp.asarray(of.skin.v_out),
-            of.driver,
-            method=WITH_CURRENT,
-            sample_rate=RATE,
-            pulse_rate=60.0,
+        (lambda of: etid.identify_skin(of.skin, of.discrete), "no continuous source"),
+        (
+            lambda of: etid.identify_skin(
+                of.skin.replace(sample_rate=2 * RATE, pulse_rate=120.0),
+                of.driver,
+                method="steiglitz_mcbride",
+            ),
+            "the same sample rate",
         ),
-        ValueError,
-        "arrays have no current",
-    ),
-    (
-        lambda of: etid.identify_skin(of.both.replace(current=1e3 * of.both.current), of.driver),
-        IdentificationError,
-        r"current .* A, .* ohm",
-    ),
-    # Known elements and bounds
-    (
-        lambda of: skin(of, fixed={"r_x": 1.0}),
-        ValueError,
-        "'r_x' is no element of SkinRC; its elements are r_s, r_p, c_p",
-    ),
-    (
-        lambda of: etid.identify_skins([of.alone], fixed={"r_x": 1.0}),
-        ValueError,
-        "'r_x' is no element of SkinRC",
-    ),
-    (lambda of: skin(of, fixed={"r_s": -1.0}), ValueError, "must be positive"),
-    (
-        lambda of: skin(of, prior={"r_s": (5e2, 5e1)}, fixed={"r_s": 5e2}),
-        ValueError,
-        "r_s is fixed and has a prior",
-    ),
-    (
-        lambda of: etid.identify_skin(of.alone, circuit="auto", fixed={"r_s": 33e3}),
-        ValueError,
-        "r_s is known, but ParallelRC and Resistor have no",
-    ),
-    (
-        lambda of: etid.select_circuit(of.alone, fixed={"r_s": 33e3}),
-        ValueError,
-        "r_s is known, but ParallelRC and Resistor have no",
-    ),
-    (
-        lambda of: skin(of, bounds={"r_s": (2e3, 1e3)}),
-        ValueError,
-        "bounds of r_s are 2000 and 1000",
-    ),
-    (lambda of: skin(of, bounds={"r_s": (1e3, 1e3)}), ValueError, "the upper one must be larger"),
-    (lambda of: skin(of, bounds={"r_s": (-1.0, 1e3)}), ValueError, "must not be negative"),
-    (lambda of: skin(of, bounds={"r_s": (np.nan, 1e3)}), ValueError, "bounds of r_s are nan"),
-    (lambda of: skin(of, bounds={"r_s": (0.0, 0.0)}), ValueError, "bounds of r_s are 0 and 0"),
-    (
-        lambda of: skin(of, bounds={"r_x": (1.0, 2.0)}),
-        ValueError,
-        "'r_x' is no element of SkinRC",
-    ),
-    (
-        lambda of: skin(of, bounds={"r_x": (1.0, 1e3)}, circuit="auto"),
-        ValueError,
-        "'r_x' is no element of SkinRC",
-    ),
-    (
-        lambda of: skin(of, bounds={"r_s": (1.0, 1e3)}, fixed={"r_s": 5.0}),
-        ValueError,
-        "r_s is fixed and has bounds",
-    ),
-    (
-        lambda of: skin(of, bounds={"r_s": (1.0, 1e3)}, method="non_parametric"),
-        ValueError,
-        "'non_parametric' takes no known elements and no bounds",
-    ),
-    # An impedance
-    (lambda of: etid.identify_impedance([1.0, 2.0, 3.0], [1.0, 2.0]), ValueError, "shape"),
-    (
-        lambda of: etid.identify_impedance([0.0, 2.0, 3.0], [1.0, 2.0, 3.0]),
-        ValueError,
-        "frequency must be",
-    ),
-    (
-        lambda of: etid.identify_impedance([1.0, 2.0, 3.0], [1.0, np.nan, 3.0]),
-        ValueError,
-        "1 impedances are not finite",
-    ),
-    (lambda of: etid.identify_impedance([1.0], [1.0]), ValueError, "cannot determine 3 elements"),
-    (
-        lambda of: etid.identify_impedance([1.0, 2.0, 3.0], [1.0, 0.0, 3.0]),
-        ValueError,
-        "impedance is 0",
-    ),
-)
+        (
+            lambda of: etid.identify_skin(
+                of.skin, of.driver, circuit=etid.Resistor(), method="equation_error"
+            ),
+            "identifies SkinRC only",
+        ),
+        (lambda of: etid.predict(of.skin, of.driver), "give the circuit"),
+        (
+            lambda of: skin(of, method="steiglitz_mcbride"),
+            "steiglitz_mcbride.*from a measured current",
+        ),
+        (lambda of: skin(of, method="non_parametric"), "non_parametric.*from a measured current"),
+        (
+            lambda of: etid.identify_skin(of.skin, of.driver, method=WITH_CURRENT),
+            "needs a driver and a current",
+        ),
+        (
+            lambda of: etid.identify_skin(of.both, method=WITH_CURRENT),
+            "needs a driver and a current",
+        ),
+        (
+            lambda of: etid.identify_samples(
+                jnp.asarray(of.skin.v_th),
+                jnp.asarray(of.skin.v_out),
+                of.driver,
+                method=WITH_CURRENT,
+                sample_rate=RATE,
+                pulse_rate=60.0,
+            ),
+            "arrays have no current",
+        ),
+        # Known elements and bounds
+        (
+            lambda of: skin(of, fixed={"r_x": 1.0}),
+            "'r_x' is no element of SkinRC; its elements are r_s, r_p, c_p",
+        ),
+        (
+            lambda of: etid.identify_skins([of.alone], fixed={"r_x": 1.0}),
+            "'r_x' is no element of SkinRC",
+        ),
+        (lambda of: skin(of, fixed={"r_s": -1.0}), "must be positive"),
+        (
+            lambda of: skin(of, prior={"r_s": (5e2, 5e1)}, fixed={"r_s": 5e2}),
+            "r_s is fixed and has a prior",
+        ),
+        (
+            lambda of: etid.identify_skin(of.alone, circuit="auto", fixed={"r_s": 33e3}),
+            "r_s is known, but ParallelRC and Resistor have no",
+        ),
+        (
+            lambda of: etid.select_circuit(of.alone, fixed={"r_s": 33e3}),
+            "r_s is known, but ParallelRC and Resistor have no",
+        ),
+        (lambda of: skin(of, bounds={"r_s": (2e3, 1e3)}), "bounds of r_s are 2000 and 1000"),
+        (lambda of: skin(of, bounds={"r_s": (1e3, 1e3)}), "the upper one must be larger"),
+        (lambda of: skin(of, bounds={"r_s": (-1.0, 1e3)}), "must not be negative"),
+        (lambda of: skin(of, bounds={"r_s": (np.nan, 1e3)}), "bounds of r_s are nan"),
+        (lambda of: skin(of, bounds={"r_s": (0.0, 0.0)}), "bounds of r_s are 0 and 0"),
+        (lambda of: skin(of, bounds={"r_x": (1.0, 2.0)}), "'r_x' is no element of SkinRC"),
+        (
+            lambda of: skin(of, bounds={"r_x": (1.0, 1e3)}, circuit="auto"),
+            "'r_x' is no element of SkinRC",
+        ),
+        (
+            lambda of: skin(of, bounds={"r_s": (1.0, 1e3)}, fixed={"r_s": 5.0}),
+            "r_s is fixed and has bounds",
+        ),
+        (
+            lambda of: skin(of, bounds={"r_s": (1.0, 1e3)}, method="non_parametric"),
+            "'non_parametric' takes no known elements and no bounds",
+        ),
+        # An impedance
+        (lambda of: etid.identify_impedance([1.0, 2.0, 3.0], [1.0, 2.0]), "shape"),
+        (lambda of: etid.identify_impedance([0.0, 2.0, 3.0], [1.0, 2.0, 3.0]), "frequency must be"),
+        (
+            lambda of: etid.identify_impedance([1.0, 2.0, 3.0], [1.0, np.nan, 3.0]),
+            "1 impedances are not finite",
+        ),
+        (lambda of: etid.identify_impedance([1.0], [1.0]), "cannot determine 3 elements"),
+        (lambda of: etid.identify_impedance([1.0, 2.0, 3.0], [1.0, 0.0, 3.0]), "impedance is 0"),
+    ],
+    IdentificationError: [
+        (
+            lambda of: etid.identify_driver(
+                of.calibration.replace(v_th=np.zeros(of.calibration.v_th.size))
+            ),
+            "flat",
+        ),
+        (
+            lambda of: etid.identify_driver(of.calibration.replace(v_out=of.calibration.v_th)),
+            "unconnected",
+        ),
+        (
+            lambda of: etid.identify_skin(
+                of.both.replace(current=1e3 * of.both.current), of.driver
+            ),
+            r"current .* A, .* ohm",
+        ),
+    ],
+    Exception: [
+        # The type checker of the tests comes first.
+        (lambda of: etid.identify_driver(of.calibration, method=GUESS), "guess"),
+        (lambda of: etid.identify_skin(of.skin, of.driver, method=GUESS), "guess"),
+        (lambda of: etid.identify_skins([of.skin], of.driver, method=GUESS), "guess"),
+        (lambda of: etid.identify_study(of.study, method=GUESS), "guess"),
+    ],
+    RecordingError: [
+        # A current
+        (lambda of: etid.identify_skin(of.skin), "current: was not recorded"),
+        (lambda of: of.alone.v_th, "v_th: was not recorded"),
+        (lambda of: of.alone.replace(current=None), "v_th: is not given.*or current"),
+        (lambda of: of.alone.replace(r_load=1e5), "v_th: is not given"),
+        (lambda of: of.alone.replace(v_out=None), "v_out: is not given"),
+    ],
+}
 
-RESULTS = (
-    (
-        lambda of: dataclasses.replace(of.fit, method="output_error").posterior(of.skin, of.driver),
-        ValueError,
-        "method='maximum_likelihood'",
-    ),
-    (lambda of: of.fit.profile("cp"), ValueError, "'cp' is no element of SkinRC"),
-    (lambda of: of.fit.posterior(draws=0), ValueError, "at least 1"),
-    (
-        lambda of: dataclasses.replace(of.fit, cov=jnp.full((3, 3), jnp.nan)).posterior(
-            of.skin, of.driver
+RESULTS = {
+    ValueError: [
+        (
+            lambda of: dataclasses.replace(of.fit, method="output_error").posterior(
+                of.skin, of.driver
+            ),
+            "method='maximum_likelihood'",
         ),
-        ValueError,
-        "does not determine",
-    ),
-    (
-        lambda of: dataclasses.replace(of.fit).posterior(),
-        ValueError,
-        r"fit\.posterior\(recording, driver\)",
-    ),
-    (
-        lambda of: dataclasses.replace(of.fit).plot(),
-        TypeError,
-        r"plot\(fit, recording, driver\)",
-    ),
-    (lambda of: of.fit.intervals(0.0), ValueError, "between 0 and 1"),
-    (lambda of: of.fit.intervals(1.0), ValueError, "between 0 and 1"),
-    (lambda of: of.fit.intervals(95.0), ValueError, "between 0 and 1"),
-    (lambda of: of.fit.intervals(np.nan), ValueError, "between 0 and 1"),
-    (lambda of: of.batch.intervals(), ValueError, "take one of them"),
-    (lambda of: of.batch.write("fit.h5"), ValueError, "take one of them"),
-    (lambda of: etid.Fits.read("missing.h5"), ValueError, "no such file"),
-    (
-        lambda of: realise(Rational(jnp.array([0.0, 1e-3]), jnp.ones(1)), RATE),
-        ValueError,
-        "grows without bound",
-    ),
-    # Pictures
-    (lambda of: figure_of(pictures.fit()), TypeError, r"plot\(fit, recording, driver\)"),
-    (
-        lambda of: figure_of(pictures.selection()),
-        TypeError,
-        r"plot\(selection, recording, driver\)",
-    ),
-    (lambda of: figure_of(of.driver, of.skin), TypeError, "no r_load"),
-    (lambda of: figure_of("recording"), TypeError, "cannot draw str"),
-    (lambda of: figure_of({}), TypeError, "a dictionary of nothing"),
-    (
-        lambda of: figure_of(of.driver, show="residual"),
-        ValueError,
-        "it is for fits, and one of 'pulse', 'impedance'",
-    ),
-    (
-        lambda of: etid.plot(of.driver, axes=new_figure(2, 2, (6.0, 5.0))[1][:1, 0]),
-        ValueError,
-        "1 Axes; this picture takes 2",
-    ),
-    (lambda of: save(figure_of(of.driver), "figure.pdf"), ValueError, r"\.png or \.svg"),
-)
+        (lambda of: of.fit.profile("cp"), "'cp' is no element of SkinRC"),
+        (lambda of: of.fit.posterior(draws=0), "at least 1"),
+        (
+            lambda of: dataclasses.replace(of.fit, cov=jnp.full((3, 3), jnp.nan)).posterior(
+                of.skin, of.driver
+            ),
+            "does not determine",
+        ),
+        (
+            lambda of: dataclasses.replace(of.fit).posterior(),
+            r"fit\.posterior\(recording, driver\)",
+        ),
+        (lambda of: of.fit.intervals(0.0), "between 0 and 1"),
+        (lambda of: of.fit.intervals(1.0), "between 0 and 1"),
+        (lambda of: of.fit.intervals(95.0), "between 0 and 1"),
+        (lambda of: of.fit.intervals(np.nan), "between 0 and 1"),
+        (lambda of: of.batch.intervals(), "take one of them"),
+        (lambda of: of.batch.write("fit.h5"), "take one of them"),
+        (lambda of: etid.Fits.read("missing.h5"), "no such file"),
+        (
+            lambda of: realise(Rational(jnp.array([0.0, 1e-3]), jnp.ones(1)), RATE),
+            "grows without bound",
+        ),
+        (
+            lambda of: figure_of(of.driver, show="residual"),
+            "it is for fits, and one of 'pulse', 'impedance'",
+        ),
+        (
+            lambda of: etid.plot(of.driver, axes=new_figure(2, 2, (6.0, 5.0))[1][:1, 0]),
+            "1 Axes; this picture takes 2",
+        ),
+        (lambda of: save(figure_of(of.driver), "figure.pdf"), r"\.png or \.svg"),
+    ],
+    TypeError: [
+        (lambda of: dataclasses.replace(of.fit).plot(), r"plot\(fit, recording, driver\)"),
+        # Pictures
+        (lambda of: figure_of(pictures.fit()), r"plot\(fit, recording, driver\)"),
+        (lambda of: figure_of(pictures.selection()), r"plot\(selection, recording, driver\)"),
+        (lambda of: figure_of(of.driver, of.skin), "no r_load"),
+        (lambda of: figure_of("recording"), "cannot draw str"),
+        (lambda of: figure_of({}), "a dictionary of nothing"),
+    ],
+}
 
 
 def of_others(of):
@@ -317,90 +274,72 @@ def limited(of, **limits):
 
 OTHER = "1 electrodes of 3 elements, the tracker 2 of 3"
 WANTED = "is wanted; current_cap carries"
-ONLINE = (
-    (
-        lambda of: of.tracker.update(of.state, np.zeros((2, 3334))),
-        ValueError,
-        r"shape \(2, 3334\).* \(2, 3333\)",
-    ),
-    (
-        lambda of: of.tracker.update(of.state, of.window, -1.0),
-        ValueError,
-        "finite and not negative",
-    ),
-    (
-        lambda of: of.tracker.update(of.state, of.window, np.nan),
-        ValueError,
-        "finite and not negative",
-    ),
-    (lambda of: of.tracker.update(of.state, of.window, np.ones(3)), ValueError, r"shape \(3,\)"),
-    (
-        lambda of: etid.Tracker.of(of.driver, of.calibration, electrodes=0),
-        ValueError,
-        "electrodes is 0",
-    ),
-    (
-        lambda of: etid.Tracker.of(of.driver, of.calibration, electrodes=1, change=-1.0),
-        ValueError,
-        "change is -1",
-    ),
-    (
-        lambda of: etid.Tracker.of(
-            pictures.as_kind(of.driver, ContinuousDriver), of.calibration, electrodes=1
+ONLINE = {
+    ValueError: [
+        (
+            lambda of: of.tracker.update(of.state, np.zeros((2, 3334))),
+            r"shape \(2, 3334\).* \(2, 3333\)",
         ),
-        ValueError,
-        "harmonics",
-    ),
-    (
-        lambda of: etid.Tracker.of(of.driver, cut(of.calibration, 1500), electrodes=1),
-        IdentificationError,
-        "not_periodic",
-    ),
-    (lambda of: of.tracker.update(of_others(of), of.window), ValueError, OTHER),
-    (lambda of: of.tracker.read(of_others(of)), ValueError, OTHER),
-    (lambda of: of.controller.command(of_others(of), charge=80e-9), ValueError, OTHER),
-    (lambda of: limited(of, current_cap=0.0), ValueError, "current_cap is 0"),
-    (lambda of: limited(of, charge_cap=0.0), ValueError, "charge_cap is 0"),
-    (lambda of: limited(of, voltage_cap=0.0), ValueError, "voltage_cap is 0"),
-    (lambda of: limited(of, slew=0.0), ValueError, "slew is 0"),
-    (lambda of: limited(of, fallback=0.0), ValueError, "fallback is 0"),
-    (lambda of: limited(of, probability=1.0), ValueError, "probability is 1"),
-    # 5 A in place of 5 mA would raise every limit a thousandfold; 200 C would never act.
-    (lambda of: limited(of, current_cap=5.0), ValueError, "ampere"),
-    (lambda of: limited(of, current_cap=np.inf), ValueError, "ampere"),
-    (lambda of: limited(of, charge_cap=200.0), ValueError, "never act"),
-    (lambda of: limited(of, fallback=np.inf), ValueError, "infinite"),
-    (
-        lambda of: etid.Controller.of(
-            dataclasses.replace(
-                of.tracker, driver_result=jax.tree.map(jnp.asarray, verdict("misfit"))
-            )
+        (lambda of: of.tracker.update(of.state, of.window, -1.0), "finite and not negative"),
+        (lambda of: of.tracker.update(of.state, of.window, np.nan), "finite and not negative"),
+        (lambda of: of.tracker.update(of.state, of.window, np.ones(3)), r"shape \(3,\)"),
+        (lambda of: etid.Tracker.of(of.driver, of.calibration, electrodes=0), "electrodes is 0"),
+        (
+            lambda of: etid.Tracker.of(of.driver, of.calibration, electrodes=1, change=-1.0),
+            "change is -1",
         ),
-        ValueError,
-        "driver of the tracker was not identified",
-    ),
-    (lambda of: of.controller.command(of.state), ValueError, "either charge or current"),
-    (
-        lambda of: of.controller.command(of.state, charge=-1e-9),
-        ValueError,
-        "finite and not negative",
-    ),
-    (
-        lambda of: of.controller.command(of.state, current=np.ones(3)),
-        ValueError,
-        r"shape \(3,\)",
-    ),
-    (lambda of: of.controller.command(of.state, charge=80.0), ValueError, WANTED),
-    (lambda of: of.controller.command(of.state, current=1.0), ValueError, WANTED),
-    (
-        lambda of: of.controller.command(of.state, current=np.array([1e-4, 6e-3])),
-        ValueError,
-        WANTED,
-    ),
-)
+        (
+            lambda of: etid.Tracker.of(
+                pictures.as_kind(of.driver, ContinuousDriver), of.calibration, electrodes=1
+            ),
+            "harmonics",
+        ),
+        (lambda of: of.tracker.update(of_others(of), of.window), OTHER),
+        (lambda of: of.tracker.read(of_others(of)), OTHER),
+        (lambda of: of.controller.command(of_others(of), charge=80e-9), OTHER),
+        (lambda of: limited(of, current_cap=0.0), "current_cap is 0"),
+        (lambda of: limited(of, charge_cap=0.0), "charge_cap is 0"),
+        (lambda of: limited(of, voltage_cap=0.0), "voltage_cap is 0"),
+        (lambda of: limited(of, slew=0.0), "slew is 0"),
+        (lambda of: limited(of, fallback=0.0), "fallback is 0"),
+        (lambda of: limited(of, probability=1.0), "probability is 1"),
+        # 5 A in place of 5 mA would raise every limit a thousandfold; 200 C would never act.
+        (lambda of: limited(of, current_cap=5.0), "ampere"),
+        (lambda of: limited(of, current_cap=np.inf), "ampere"),
+        (lambda of: limited(of, charge_cap=200.0), "never act"),
+        (lambda of: limited(of, fallback=np.inf), "infinite"),
+        (
+            lambda of: etid.Controller.of(
+                dataclasses.replace(
+                    of.tracker, driver_result=jax.tree.map(jnp.asarray, verdict("misfit"))
+                )
+            ),
+            "driver of the tracker was not identified",
+        ),
+        (lambda of: of.controller.command(of.state), "either charge or current"),
+        (lambda of: of.controller.command(of.state, charge=-1e-9), "finite and not negative"),
+        (lambda of: of.controller.command(of.state, current=np.ones(3)), r"shape \(3,\)"),
+        (lambda of: of.controller.command(of.state, charge=80.0), WANTED),
+        (lambda of: of.controller.command(of.state, current=1.0), WANTED),
+        (lambda of: of.controller.command(of.state, current=np.array([1e-4, 6e-3])), WANTED),
+    ],
+    IdentificationError: [
+        (
+            lambda of: etid.Tracker.of(of.driver, cut(of.calibration, 1500), electrodes=1),
+            "not_periodic",
+        ),
+    ],
+}
 
 
-@pytest.mark.parametrize(("call", "error", "words"), IDENTIFICATION + RESULTS + ONLINE)
+def rows():
+    for table in (IDENTIFICATION, RESULTS, ONLINE):
+        for error, refused in table.items():
+            for call, words in refused:
+                yield pytest.param(call, error, words, id=words)
+
+
+@pytest.mark.parametrize(("call", "error", "words"), list(rows()))
 def test_a_call_that_cannot_be_right_is_refused(of, call, error, words, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     with pytest.raises(error, match=words):
