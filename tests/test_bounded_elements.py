@@ -189,14 +189,6 @@ def test_an_element_that_the_data_hardly_know_has_the_error_of_its_prior(noisy, 
     np.testing.assert_allclose(fit.stderr.r_s, width, rtol=1e-3)
 
 
-def test_bounds_far_away_leave_intervals_and_profiles_as_they_are(noisy, free):
-    fit = etid.identify_skin(noisy, bounds={"r_s": (1.0, 1e9)})
-    for name, ends in fit.intervals().items():
-        np.testing.assert_allclose(ends, free.intervals()[name], rtol=1e-6)
-    wide, usual = fit.profile("r_s"), free.profile("r_s")
-    np.testing.assert_allclose(wide.interval(), usual.interval(), rtol=1e-3)
-
-
 def test_a_choice_compares_each_circuit_inside_its_own_bounds(noisy, free):
     """R_p of the true circuit is forbidden; another circuit has no such element."""
     candidates = [etid.SkinRC(), etid.Resistor()]
@@ -251,28 +243,6 @@ def test_an_element_outside_and_its_bound_are_named_wherever_verdicts_are(
     assert fits.verdicts.tolist() == ["out_of_bounds", "flat"]
     assert "r_s would be 4.0" in fits.notes[0]
     assert fits[1].outside == ""
-
-
-@pytest.mark.parametrize(
-    ("options", "words"),
-    [
-        ({"bounds": {"r_s": (2e3, 1e3)}}, "bounds of r_s are 2000 and 1000"),
-        ({"bounds": {"r_s": (1e3, 1e3)}}, "the upper one must be larger"),
-        ({"bounds": {"r_s": (-1.0, 1e3)}}, "must not be negative"),
-        ({"bounds": {"r_s": (np.nan, 1e3)}}, "bounds of r_s are nan"),
-        ({"bounds": {"r_s": (0.0, 0.0)}}, "bounds of r_s are 0 and 0"),
-        ({"bounds": {"r_x": (1.0, 2.0)}}, "'r_x' is no element of SkinRC"),
-        ({"bounds": {"r_s": (1.0, 1e3)}, "fixed": {"r_s": 5.0}}, "r_s is fixed and has bounds"),
-        (
-            {"bounds": {"r_s": (1.0, 1e3)}, "method": "non_parametric"},
-            "'non_parametric' takes no known elements and no bounds",
-        ),
-        ({"bounds": {"r_x": (1.0, 1e3)}, "circuit": "auto"}, "'r_x' is no element of SkinRC"),
-    ],
-)
-def test_impossible_bounds_are_refused(noisy, options, words):
-    with pytest.raises(ValueError, match=words):
-        etid.identify_skin(noisy, **options)
 
 
 def test_bounds_on_the_command_line_in_batches_and_reports(noisy, beyond, free, tmp_path, capsys):

@@ -49,12 +49,6 @@ def test_connections_commute_associate_and_scale(r1, r2, c):
         np.testing.assert_allclose(scaled, 3 * together, rtol=1e-11)
 
 
-@given(ohms, ohms, farads)
-def test_passive_circuits_have_no_negative_resistance(r_s, r_p, c_p):
-    z = np.asarray(SkinRC(r_s, r_p, c_p).response(FREQUENCY))
-    assert (np.real(z) >= -1e-9 * np.abs(z)).all()
-
-
 def test_a_circuit_has_everything():
     circuit = SkinLayers(20e3, 80e3, 0.2e-9, 40e3, 2e-9)
     s = np.asarray(S)
@@ -67,18 +61,6 @@ def test_a_circuit_has_everything():
     batch = circuit.with_log_values(jnp.stack([circuit.log_values()] * 3))
     z = jax.jit(jax.vmap(lambda c: c.response(FREQUENCY)))(batch)
     np.testing.assert_allclose(z[2], expected, rtol=1e-12)
-
-    @jax.jit
-    def magnitude(log_values):
-        return jnp.abs(circuit.with_log_values(log_values).response(FREQUENCY)).sum()
-
-    slope = jax.jit(jax.grad(magnitude))(circuit.log_values())
-    step = 1e-5 * jnp.eye(5)  # central differences: error step², rounding 1e-16/step
-    differences = [magnitude(circuit.log_values() + d) for d in (*step, *-step)]
-    numeric = (jnp.stack(differences[:5]) - jnp.stack(differences[5:])) / 2e-5
-    np.testing.assert_allclose(
-        slope, numeric, rtol=1e-7, atol=1e-7 * float(magnitude(circuit.log_values()))
-    )
 
 
 @pytest.mark.parametrize("kind", lookup.built_in().values())

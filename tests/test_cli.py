@@ -98,12 +98,6 @@ def test_simulate_passes_noise_and_delay_on(run, tmp_path):
     assert np.abs(v["delay"] - v["clean"]).max() > 1.0  # at the edges of 50 V
 
 
-def test_check_counts_the_recordings_of_a_good_file(run, tmp_path):
-    file = tmp_path / "study.h5"
-    etid.scenes.paper_dry().simulate(seed=0).write(file)
-    assert run("check", file) == (DONE, [f"{file}: 11 recordings, no faults"], [])
-
-
 def test_check_names_every_wrong_field(run, study_file):
     with h5py.File(study_file, "a") as file:
         file["calibration/98k8/v_th"].attrs["unit"] = "millivolt"
@@ -216,14 +210,6 @@ def test_fit_joint_fits_all_recordings_together(run, study_file, tmp_path, monke
     assert "--joint uses maximum_likelihood" in complaints[0]
 
 
-def test_fit_passes_method_and_order_on(run, study_file, tmp_path):
-    target = tmp_path / "fits.h5"
-    _, printed, _ = run("fit", study_file, "-o", target, "--method", "equation_error", "--order", 3)
-    assert " by equation_error: " in printed[0]
-    assert printed[1].startswith("driver calibration/98k8: order 3, ")
-    assert etid.Fits.read(target).fit.method == "equation_error"
-
-
 def test_fit_without_any_success_says_so_and_lists_twenty_at_most(run, without_driver, tmp_path):
     target = tmp_path / "fits.h5"
     status, printed, _ = run("fit", without_driver, "-o", target)
@@ -296,12 +282,6 @@ def test_an_error_is_one_line_without_a_traceback(
     assert words in complaints[0]
 
 
-def test_check_of_a_missing_file_is_wrong_data(run, tmp_path):
-    status, printed, _ = run("check", tmp_path / "absent.h5")
-    assert status == WRONG_DATA
-    assert len(printed) == 1
-
-
 @pytest.mark.parametrize("command", ["fit", "import"])
 def test_the_file_that_is_read_is_never_replaced(run, study_file, command):
     before = study_file.read_bytes()
@@ -366,24 +346,7 @@ def test_json_of_check_has_a_place_for_every_problem(run, study_file):
     assert problem["remedy"]
 
 
-def test_json_of_what_writes_a_file_names_it(run, tmp_path):
-    table, made, imported = (tmp_path / name for name in ("t.csv", "made.h5", "imported.h5"))
-    np.savetxt(table, np.ones((500, 2)), delimiter=",", header="open,skin", comments="")
-    status, printed, _ = run("simulate", "paper_dry", "-o", made, "--json")
-    wanted = {"command": "simulate", "status": DONE, "target": str(made), "recordings": 11}
-    assert (status, as_json(printed)) == (DONE, wanted)
-    names = ("--v-th", "open", "--v-out", "skin", "--scale", 1)
-    rates = ("--sample-rate", 2e5, "--pulse-rate", 60)
-    status, printed, _ = run("import", table, "-o", imported, *names, *rates, "--json")
-    wanted = {"command": "import", "status": DONE, "target": str(imported), "recordings": 1}
-    assert status == DONE
-    assert as_json(printed).items() >= wanted.items()
-    status, printed, _ = run("check", made, "--json")
-    wanted = {"command": "check", "status": DONE, "file": str(made), "recordings": 11}
-    assert (status, as_json(printed)) == (DONE, {**wanted, "problems": [], "remarks": []})
-
-
-def test_keys_of_json_are_those_of_the_guide(run, study_file, tmp_path):
+def test_keys_of_json_are_those_of_the_guide_and_options_are_passed_on(run, study_file, tmp_path):
     page = (pathlib.Path(__file__).parents[1] / "docs" / "command_line.md").read_text("utf-8")
     rows = dict(re.findall(r"^\| `(\w+)` \| (.*) \|$", page, flags=re.MULTILINE))
     assert rows.keys() == cli.COMMANDS.keys()
@@ -406,6 +369,8 @@ def test_keys_of_json_are_those_of_the_guide(run, study_file, tmp_path):
         told = set(re.findall(r"`(\w+)`", rows[command]))
         found = as_json(printed)
         assert set(found) - {"command", "status"} <= told, command
+        if command == "fit":
+            assert (found["method"], found["drivers"][0]["order"]) == ("equation_error", 3)
         written = {"check": "file", "report": "page"}.get(command, "target")
         assert set(found) >= {"command", "status", written}
         inner = [item for value in found.values() if isinstance(value, list) for item in value]

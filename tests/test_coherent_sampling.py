@@ -137,6 +137,7 @@ def test_a_joint_fit_takes_such_records():
         assert np.abs(off(fit, name)).max() < SIGMAS
 
 
+@pytest.mark.slow
 def test_a_tracker_takes_the_default_driver():
     """It refused this driver, because output error had identified it."""
     bench = Bench(seed=2, periods=50)

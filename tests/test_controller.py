@@ -14,7 +14,6 @@ from hypothesis import strategies as st
 
 import etid
 from etid.online.controller import RAISE
-from etid.online.current import CurrentModel
 from etid.results.verdicts import verdict
 from etid.simulation.transformer import SkinLoad, TransformerDriver
 from tests.test_online import DAMP, DRY, PULSES, followed, loaded, quiet, tracker_of, with_noise
@@ -273,55 +272,3 @@ def test_limits_hold_whatever_the_estimate_says(
     assert (command.amplitude <= np.minimum(most, np.nan_to_num(before) + 0.5)).all()
     if confirmed == 0 or result != "successful":
         assert (command.amplitude * true_charge(SkinLoad(1e-3, 1e-3, 1e-12)) <= 120e-9).all()
-
-
-def test_what_cannot_be_commanded_is_refused_with_a_reason():
-    controller, state = controlled()
-    for name in ("current_cap", "charge_cap", "voltage_cap", "slew", "fallback"):
-        with pytest.raises(ValueError, match=f"{name} is 0"):
-            etid.Controller.of(controller.tracker, **{name: 0.0})
-    with pytest.raises(ValueError, match="probability is 1"):
-        etid.Controller.of(controller.tracker, probability=1.0)
-    with pytest.raises(ValueError, match="either charge or current"):
-        controller.command(state)
-    with pytest.raises(ValueError, match="finite and not negative"):
-        controller.command(state, charge=-1e-9)
-    with pytest.raises(ValueError, match=r"shape \(3,\)"):
-        controller.command(state, current=np.ones(3))
-    bad = jax.tree.map(jnp.asarray, verdict("misfit"))
-    failed = dataclasses.replace(controller.tracker, driver_result=bad)
-    with pytest.raises(ValueError, match="driver of the tracker was not identified"):
-        etid.Controller.of(failed)
-    assert "guard" in str(controller)
-    assert isinstance(controller.model, CurrentModel)
-
-
-def test_limits_and_wishes_in_other_units_are_refused():
-    """5 A in place of 5 mA would raise every limit a thousandfold; 200 C would never act."""
-    controller, state = controlled()
-    tracker = controller.tracker
-    for limits, text in (
-        ({"current_cap": 5.0}, "ampere"),
-        ({"current_cap": np.inf}, "ampere"),
-        ({"charge_cap": 200.0}, "never act"),
-        ({"fallback": np.inf}, "infinite"),
-    ):
-        with pytest.raises(ValueError, match=text):
-            etid.Controller.of(tracker, **limits)
-    for wanted in ({"charge": 80.0}, {"current": 1.0}, {"current": np.array([1e-4, 6e-3])}):
-        with pytest.raises(ValueError, match="is wanted; current_cap carries"):
-            controller.command(state, **wanted)
-
-
-def test_a_state_of_another_tracker_is_refused():
-    controller, state = controlled()
-    one = jax.tree.map(lambda leaf: leaf[:1], state.electrodes)
-    other = dataclasses.replace(state, electrodes=one)
-    window = np.zeros((2, controller.tracker.model.bands.samples))
-    for call in (
-        lambda state: controller.command(state, charge=80e-9),
-        lambda state: controller.tracker.update(state, window),
-        controller.tracker.read,
-    ):
-        with pytest.raises(ValueError, match="1 electrodes of 3 elements, the tracker 2 of 3"):
-            call(other)

@@ -9,7 +9,7 @@ from jax.flatten_util import ravel_pytree
 from etid import Resistor, SkinRC, capacitor, parallel, resistor, series
 from etid.estimators.refined_driver import is_split
 from etid.results.driver import SourceImpedance, loaded, realise
-from etid.signals.transfer import Rational, frequency_variable
+from etid.signals.transfer import frequency_variable
 
 FREQUENCY = jnp.geomspace(10.0, 1e6, 25)
 S = np.asarray(frequency_variable(FREQUENCY))
@@ -135,29 +135,6 @@ def test_only_ratios_to_the_source_are_observable():
     load = SkinRC(3 * 33.4e3, 3 * 186e3, 0.12e-9 / 3).impedance().rational()
     expected = transfer_of(loaded(SOURCE, LOADS["skin"], RATE))
     np.testing.assert_allclose(transfer_of(loaded(larger, load, RATE)), expected, rtol=SOLVED)
-
-
-def test_the_loaded_system_differentiates_under_vmap():
-    def gain(log_values, s):
-        system = loaded(SOURCE, SkinRC().with_log_values(log_values).impedance().rational(), RATE)
-        a = jnp.linalg.inv(jax.lax.complex(-system.A, jnp.imag(s) * jnp.eye(6)))
-        h = jax.lax.complex(system.C, jnp.zeros(6)) @ a
-        h = h @ jax.lax.complex(system.B[:, 0], jnp.zeros(6))
-        return jnp.abs(h + jax.lax.complex(system.D[0], jnp.zeros(())))
-
-    def formula(log_values, s):
-        z = SkinRC().with_log_values(log_values).impedance()(s)
-        return jnp.abs(z / (z + SOURCE.response(jnp.imag(s) / (2 * jnp.pi))))
-
-    at = (SkinRC(33.4e3, 186e3, 0.12e-9).log_values(), jnp.asarray(S))
-    found = jax.jit(jax.vmap(jax.grad(gain), (None, 0)))(*at)
-    expected = jax.jit(jax.vmap(jax.grad(formula), (None, 0)))(*at)
-    np.testing.assert_allclose(found, expected, atol=1e-8)
-
-
-def test_a_load_without_bound_is_refused():
-    with pytest.raises(ValueError, match="grows without bound"):
-        realise(Rational(jnp.array([0.0, 1e-3]), jnp.ones(1)), RATE)
 
 
 @pytest.mark.parametrize(

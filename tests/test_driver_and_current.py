@@ -2,7 +2,6 @@
 
 import dataclasses
 
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -78,14 +77,6 @@ def test_the_current_is_left_out_on_request(recording, driver, both):
     said = [int(fit.remarks) & Remark.current_unused for fit in (both, alone, without)]
     assert said == [0, Remark.current_unused, 0]
     assert "does not use it" in str(alone)
-    with pytest.raises(ValueError, match="needs a driver and a current"):
-        etid.identify_skin(recording.replace(current=None), driver, method=METHOD)
-    with pytest.raises(ValueError, match="needs a driver and a current"):
-        etid.identify_skin(recording, method=METHOD)
-    v_th, v_out = jnp.asarray(recording.v_th), jnp.asarray(recording.v_out)
-    rates = {"sample_rate": recording.sample_rate, "pulse_rate": recording.pulse_rate}
-    with pytest.raises(ValueError, match="arrays have no current"):
-        etid.identify_samples(v_th, v_out, driver, method=METHOD, **rates)
 
 
 @pytest.mark.parametrize(
@@ -112,11 +103,6 @@ def test_a_current_that_contradicts_the_driver_is_never_averaged(
 ):
     fit = etid.identify_skin(recording.replace(**change(recording)), driver, throw=False)
     assert fit.verdict in verdicts
-
-
-def test_a_wrong_unit_is_told_with_the_numbers_of_the_current(recording, driver):
-    with pytest.raises(etid.IdentificationError, match=r"current .* A, .* ohm"):
-        etid.identify_skin(recording.replace(current=1e3 * recording.current), driver)
 
 
 def test_a_driver_that_has_changed_is_told(driver, both):
@@ -155,10 +141,9 @@ def late_record(name: str, late: float, circuit=SKIN, seed=2, **fields) -> etid.
     return early.replace(**{name: other.samples[name]})
 
 
-@pytest.mark.parametrize("snr_db", [pytest.param(40.0, marks=pytest.mark.slow), 60.0])
-def test_a_lag_of_one_record_is_taken_off(snr_db):
+def test_a_lag_of_one_record_is_taken_off():
     """It was a misfit: v_out and the current were aligned together with v_th, never each alone."""
-    levels = {"snr_db": snr_db, "current_snr_db": snr_db}
+    levels = {"snr_db": 60.0, "current_snr_db": 60.0}
     known = scene(**levels).simulate(seed=7)["calibration/0"]
     driver = etid.identify_driver(known, order=5)
     truths = [circuit for circuit in (SKIN, DAMP) for _ in range(2 * len(LATE))]
@@ -187,18 +172,6 @@ def test_a_single_fit_takes_a_lag_off_as_a_batch_does(driver, name):
     np.testing.assert_allclose(fit.circuit.values(), other.circuit.values(), rtol=1e-6)
 
 
-@pytest.mark.slow
-def test_draws_are_those_of_the_records_in_line(driver):
-    fit = etid.identify_skin(late_record("current", 2.3), driver)
-    draws = fit.posterior()
-    assert draws.effective > 800
-    ends = float(fit.circuit.r_p) + np.array([-1.96, 1.96]) * float(fit.stderr.r_p)
-    # 1000 draws give an end of the interval to a tenth of a standard error.
-    np.testing.assert_allclose(
-        draws.intervals()["r_p"], ends, rtol=0, atol=0.3 * float(fit.stderr.r_p)
-    )
-
-
 def test_a_file_and_its_report_use_both_where_both_were_recorded(study, both, tmp_path):
     of = [study["calibration/0"], study["loaded/0"], study["loaded/1"].replace(current=None)]
     etid.Study.from_recordings(of).write(tmp_path / "study.h5")
@@ -214,13 +187,14 @@ def test_a_file_and_its_report_use_both_where_both_were_recorded(study, both, tm
 
 
 @pytest.mark.slow
-def test_draws_of_a_fit_with_both_have_its_errors(both):
-    draws = both.posterior()
+def test_draws_of_a_fit_with_both_have_its_errors_and_are_those_of_the_records_in_line(driver):
+    fit = etid.identify_skin(late_record("current", 2.3), driver)
+    draws = fit.posterior()
     assert draws.effective > 800  # of 1000: the likelihood is normal at 60 dB
-    error = float(both.stderr.r_p)
-    for interval in (draws.intervals()["r_p"], both.profile("r_p").interval()):
+    error = float(fit.stderr.r_p)
+    for interval in (draws.intervals()["r_p"], fit.profile("r_p").interval()):
         # 1000 draws give an end of the interval to a tenth of a standard error.
-        expected = float(both.circuit.r_p) + np.array([-1.96, 1.96]) * error
+        expected = float(fit.circuit.r_p) + np.array([-1.96, 1.96]) * error
         np.testing.assert_allclose(interval, expected, rtol=0, atol=0.3 * error)
 
 
@@ -236,12 +210,12 @@ def test_another_circuit_is_seen_and_chosen(driver):
 
 @pytest.mark.slow
 def test_estimates_are_efficient_and_their_intervals_true():
-    """80 draws, each with its own calibration; the bound knows no more than the fits."""
+    """48 draws, each with its own calibration; the bound knows no more than the fits."""
     squares, covered = [], []
     for circuit, current_snr_db in ((SKIN, 40.0), (DAMP, 30.0)):
         of = scene(circuit, current_snr_db=current_snr_db)
         bound = np.array(list(etid.bound(of)["loaded/0"].relative.values()))
-        for seed in range(40):
+        for seed in range(24):
             drawn = of.simulate(seed + 1000)
             driver = etid.identify_driver(drawn["calibration/0"], order=5, throw=False)
             fit = etid.identify_skin(drawn["loaded/0"], driver, throw=False)
@@ -250,8 +224,8 @@ def test_estimates_are_efficient_and_their_intervals_true():
                 error = np.asarray(fit.circuit.values()) / np.asarray(circuit.values()) - 1
                 squares.append((error / bound) ** 2)
                 covered.append(np.abs(error) < 1.96 * relative(fit))
-    assert len(squares) >= 78
-    # 80 squares of normal errors have a mean that is known to 16 %, and 240 intervals, of which
-    # a third is independent, hold 95 % to 2.4 %: limits at three of these.
-    assert (np.mean(squares, axis=0) < 1.5).all(), np.mean(squares, axis=0)
-    assert 0.88 < np.mean(covered) < 0.995, np.mean(covered)
+    assert len(squares) >= 46
+    # 48 squares of normal errors have a mean that is known to 20 %, and 144 intervals, of which
+    # a third is independent, hold 95 % to 3.1 %: limits at three of these.
+    assert (np.mean(squares, axis=0) < 1.6).all(), np.mean(squares, axis=0)
+    assert 0.86 < np.mean(covered), np.mean(covered)

@@ -8,8 +8,6 @@ import pytest
 import scipy.integrate
 import scipy.linalg
 import scipy.signal
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from etid.circuits.circuit import Resistor, SkinRC
 from etid.results.driver import loaded
@@ -69,19 +67,6 @@ def test_equals_scipy_with_initial_state(order, time):
     scale = np.abs(expected).max()
     np.testing.assert_allclose(y, expected, atol=ROUNDING * scale)
     np.testing.assert_allclose(zf, final, atol=ROUNDING * scale)
-
-
-@settings(max_examples=20)
-@given(st.integers(0, 10**6))
-def test_linear_in_the_input(seed):
-    b, a, rng = random_filter(seed, 4)
-    x, y = jnp.array(rng.normal(size=(2, 100)))
-
-    def run(v):
-        return lfilter(jnp.array(b), jnp.array(a), v)[0]
-
-    scale = float(jnp.abs(run(x)).max() + jnp.abs(run(y)).max())
-    np.testing.assert_allclose(run(2 * x - y), 2 * run(x) - run(y), atol=ROUNDING * scale)
 
 
 def test_jit_equals_eager_and_vmap_equals_loop(getkey):

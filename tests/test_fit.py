@@ -48,12 +48,6 @@ def test_an_interval_holds_this_part_of_a_normal_distribution(level):
     assert all(type(end) is float for ends in found.values() for end in ends)
 
 
-@pytest.mark.parametrize("level", [0.0, 1.0, 95.0, float("nan")])
-def test_a_level_outside_of_0_to_1_is_refused(level):
-    with pytest.raises(ValueError, match="between 0 and 1"):
-        fit().intervals(level)
-
-
 def test_the_table_of_a_fit_is_its_row_in_the_table_of_fits(tmp_path):
     table = fit("misfit").table()
     assert (table["r_s"], table["verdict"], table["steps"]) == (33.4e3, "misfit", 7)
@@ -66,14 +60,6 @@ def test_the_table_of_a_fit_is_its_row_in_the_table_of_fits(tmp_path):
     whole = fits.table()
     for name, value in table.items():
         np.testing.assert_array_equal(whole[name][0], value)
-
-
-@pytest.mark.parametrize(
-    "call", [lambda one, _: one.intervals(), lambda one, path: one.write(path)]
-)
-def test_a_batch_is_refused_where_one_fit_is_needed(call, tmp_path):
-    with pytest.raises(ValueError, match="take one of them"):
-        call(batch(), tmp_path / "fit.h5")
 
 
 def test_the_error_of_complex_values_counts_those_that_are_used():

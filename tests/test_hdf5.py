@@ -475,21 +475,6 @@ def test_files_that_are_none_are_refused(tmp_path):
             hdf5.read(tmp_path / name)
 
 
-def survives(path):
-    """Reading and checking a damaged file ends in recordings or in our error, nothing else."""
-    assert all(isinstance(problem, RecordingError) for problem in hdf5.check(path))
-    try:
-        study = hdf5.read(path)
-    except RecordingError:
-        return
-    with study:
-        for own in study:
-            try:
-                study[own]
-            except RecordingError:
-                continue
-
-
 def test_a_truncated_file_is_never_more_than_an_error(path, tmp_path):
     whole = path.read_bytes()
     damaged = tmp_path / "damaged.h5"
@@ -498,22 +483,6 @@ def test_a_truncated_file_is_never_more_than_an_error(path, tmp_path):
         with pytest.raises(RecordingError, match="damaged"):
             hdf5.read(damaged)
         assert len(hdf5.check(damaged)) == 1
-
-
-def test_a_written_file_with_flipped_bytes_is_never_more_than_an_error(path, tmp_path):
-    # written by etid, under checksums: the heap of a plain file can hang the HDF5 library itself
-    damaged = tmp_path / "damaged.h5"
-    with hdf5.read(path) as study:
-        study.write(damaged)
-    whole = np.frombuffer(damaged.read_bytes(), "u1")
-    used = np.flatnonzero(whole)
-    rng = np.random.default_rng(20260101)
-    for _ in range(80):
-        bytes_ = whole.copy()
-        where = rng.choice(used, rng.integers(1, 4))
-        bytes_[where] ^= rng.integers(1, 256, where.size, dtype="u1")
-        damaged.write_bytes(bytes_.tobytes())
-        survives(damaged)
 
 
 # writing
@@ -551,7 +520,7 @@ studies = paths.flatmap(lambda own: st.tuples(*map(fields, ["c", "cc/1", "cc/0",
 
 
 @settings(
-    max_examples=20, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+    max_examples=12, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
 )
 @given(drawn=studies)
 def test_what_is_written_is_read_again(drawn, tmp_path):

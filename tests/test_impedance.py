@@ -16,6 +16,7 @@ PUBLISHED = {
     "Circuit1_EIS_1": (29.14, 46.65, 10.43e-6),
     "Circuit2_EIS_1": (150.3, 502.5, 31.13e-9),
 }
+DRAWS = 60  # of fits that take 50 ms; an error of a third too small is seen
 DRY = etid.SkinRC(r_s=33.4e3, r_p=186e3, c_p=0.12e-9)
 
 
@@ -64,15 +65,15 @@ def measured(circuit, sigma, seed):
 
 
 def test_errors_are_those_of_the_noise():
-    """Of 200 draws: 95 % coverage within 3 standard deviations, and χ² of 1."""
+    """95 % coverage within 3 standard deviations, and χ² of 1."""
     inside, chi2 = [], []
-    for seed in range(200):
+    for seed in range(DRAWS):
         fit = etid.identify_impedance(*measured(DRY, 300.0, seed), stderr=300.0)
         error = np.asarray(fit.circuit.values()) - np.asarray(DRY.values())
         inside.append(np.abs(error) < 1.96 * np.asarray(fit.stderr.values()))
         chi2.append(float(fit.chi2))
-    assert (np.abs(np.mean(inside, 0) - 0.95) < 3 * np.sqrt(0.95 * 0.05 / 200)).all()
-    assert abs(np.mean(chi2) - 1) < 3 * np.sqrt(2 / 97 / 200)
+    assert (np.abs(np.mean(inside, 0) - 0.95) < 3 * np.sqrt(0.95 * 0.05 / DRAWS)).all()
+    assert abs(np.mean(chi2) - 1) < 3 * np.sqrt(2 / 97 / DRAWS)
 
 
 @pytest.mark.parametrize("scale", [1e-4, 1.0, 1e3])
@@ -96,20 +97,6 @@ def test_what_the_data_do_not_show_is_insensitive():
     assert fit.verdict == "insensitive"
 
 
-@pytest.mark.parametrize(
-    ("frequency", "z", "text"),
-    [
-        ([1.0, 2.0, 3.0], [1.0, 2.0], "shape"),
-        ([0.0, 2.0, 3.0], [1.0, 2.0, 3.0], "frequency must be"),
-        ([1.0, 2.0, 3.0], [1.0, np.nan, 3.0], "1 impedances are not finite"),
-        ([1.0], [1.0], "cannot determine 3 elements"),
-    ],
-)
-def test_bad_input_is_named(frequency, z, text):
-    with pytest.raises(ValueError, match=text):
-        etid.identify_impedance(frequency, z)
-
-
 def relative(circuit, size, seed):
     """A spectrum with noise that is a part of |Z|."""
     frequency, z = measured(circuit, 0.0, seed)
@@ -126,14 +113,14 @@ def refused(frequency, z, circuit=None):
 
 @pytest.mark.parametrize("size", [1e-3, 3e-2])
 def test_without_given_errors_the_noise_is_a_part_of_z(size):
-    """Of 100 draws: 95 % coverage within 3 standard deviations, and no remark."""
+    """95 % coverage within 3 standard deviations, and no remark."""
     inside = []
-    for seed in range(100):
+    for seed in range(DRAWS):
         fit = etid.identify_impedance(*relative(DRY, size, seed))
         assert int(fit.remarks) == 0
         error = np.asarray(fit.circuit.values()) - np.asarray(DRY.values())
         inside.append(np.abs(error) < 1.96 * np.asarray(fit.stderr.values()))
-    assert (np.abs(np.mean(inside, 0) - 0.95) < 3 * np.sqrt(0.95 * 0.05 / 100)).all()
+    assert (np.abs(np.mean(inside, 0) - 0.95) < 3 * np.sqrt(0.95 * 0.05 / DRAWS)).all()
 
 
 def test_the_wrong_sign_of_the_imaginary_part_is_named():
@@ -217,11 +204,6 @@ def test_exact_impedances_have_no_remark():
         assert int(fit.remarks) == 0
 
 
-def test_an_impedance_of_zero_has_no_relative_noise():
-    with pytest.raises(ValueError, match="impedance is 0"):
-        etid.identify_impedance([1.0, 2.0, 3.0], [1.0, 0.0, 3.0])
-
-
 def test_two_layers_do_not_end_as_one():
     """From the best start alone, this fit ended with an infinite r_2 and χ² 6.9."""
     truth = etid.SkinLayers(6.1e3, 8.7e3, 1.32e-9, 8.7e3, 5.94e-9)
@@ -249,7 +231,3 @@ def test_a_fit_to_an_impedance_is_drawn_with_its_points():
         labels = [text.get_text() for text in magnitude.get_legend().get_texts()]
         assert labels == ["fit", "measured"]  # no standard errors are known
     assert "chi2" not in str(fit)  # there is none
-    with pytest.raises(ValueError, match="a measured impedance has no draws and no profiles"):
-        fit.posterior()
-    with pytest.raises(ValueError, match="no residual in time"):
-        fit.plot(show="residual")

@@ -88,14 +88,12 @@ def test_a_current_that_contradicts_the_driver_is_told(pair, joint, change, verd
     assert found.fits.verdicts.tolist() == [verdict]
 
 
-@pytest.mark.parametrize("name", ["current", "v_out"])
-@pytest.mark.parametrize("late", LATE)
+@pytest.mark.parametrize(("name", "late"), [("current", LATE[1]), ("v_out", LATE[2])])
 def test_a_lag_of_one_record_is_taken_off(pair, name, late):
     fit = jointly([pair[0], late_record(name, late)]).fits[0]
     assert fit.verdict == "successful"
     assert np.abs(off(fit)).max() < WITHIN
-    if late > 1:
-        assert int(fit.remarks) == Remark.aligned
+    assert int(fit.remarks) == Remark.aligned
 
 
 def test_the_tolerance_of_the_known_resistor_is_what_the_current_leaves_of_it(pair, joint):

@@ -61,11 +61,6 @@ def error(fit):
     return np.asarray(fit.circuit.values()) - dataclasses.astuple(DRY)
 
 
-def test_whole_periods_are_identified_by_maximum_likelihood(driver):
-    assert driver.method == "maximum_likelihood"
-    assert driver.verdict == "successful"
-
-
 def test_trigger_delays_of_a_tenth_of_a_sample_leave_every_trial_within_its_error(study, driver):
     fits = etid.identify_skins(study.loaded, driver)
     assert fits.counts() == {"successful": 4}
@@ -151,18 +146,6 @@ def test_the_gain_is_that_of_the_divider(driver):
     expected = r / (r + np.asarray(driver.response(f)))
     expected = expected * np.exp(-2j * np.pi * f * late / float(driver.sample_rate))
     np.testing.assert_allclose(of.gains(of.start())[0], expected, rtol=1e-12)
-
-
-@pytest.mark.slow
-def test_a_single_fit_without_optimisation_equals_its_lane_of_an_optimised_batch(study, driver):
-    """Both take the same steps. 1e-9 is far above rounding, and far below one step of a fit."""
-    fits = etid.identify_skins(study.loaded, driver)
-    for row, path in enumerate(fits.labels["path"]):
-        fit, lane = etid.identify_skin(study[path], driver), fits[row]
-        assert fit.verdict == lane.verdict
-        for one_of, other in ((fit.circuit, lane.circuit), (fit.stderr, lane.stderr)):
-            np.testing.assert_allclose(one_of.values(), other.values(), rtol=1e-9)
-        np.testing.assert_allclose([fit.chi2, fit.rrse], [lane.chi2, lane.rrse], rtol=1e-9)
 
 
 @pytest.mark.slow

@@ -20,7 +20,15 @@ pytestmark = pytest.mark.usefixtures("run_as_for_users")
 ROOT = pathlib.Path(__file__).parents[1]
 CONCLUSIONS = ROOT / "tests" / "conclusions"  # what must hold after each notebook
 NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.py"))
-SLOW = {"circuits", "derivatives", "joint", "online", "selection"}  # compiled for minutes
+SLOW = {  # compiled for minutes, or with a profile and draws
+    "circuits",
+    "derivatives",
+    "joint",
+    "known_elements",
+    "online",
+    "selection",
+    "uncertainties",
+}
 PAGES = [
     pytest.param(path, marks=[pytest.mark.slow] if path.stem in SLOW else [])
     for path in sorted((ROOT / "docs").glob("*.md"))

@@ -2,7 +2,6 @@
 
 import dataclasses
 import functools
-import html
 
 import jax
 import jax.numpy as jnp
@@ -21,11 +20,14 @@ from etid.estimators.starts import harmonic_starts
 from etid.online import changes, electrode, gain_bands
 from etid.online.tracker import Tracker
 from etid.recordings.preflight import Inspected
+from etid.report.methods import methods_section
+from etid.report.study import summary
 from etid.results.driver import ContinuousDriver
+from etid.results.study_fits import StudyFits
 from etid.signals.harmonics import ALIASED
 from etid.simulation.scenes import Scene, Trial
 from etid.simulation.transformer import ResistorLoad, Sampler, SkinLoad, loading
-from tests import kept_numbers, pictures
+from tests import kept_numbers
 
 DRY = SkinLoad(r_s=33.4e3, r_p=186e3, c_p=0.12e-9)
 DAMP = SkinLoad(r_s=6.1e3, r_p=17.4e3, c_p=0.66e-9)
@@ -135,17 +137,16 @@ def test_a_tracker_and_its_state_are_printed_without_arrays():
     assert "State of 2 electrodes after 0 pulses, last pulse: 2 too_short" in repr(tracker.start())
 
 
-def test_the_tracker_describes_itself_in_a_report(tmp_path):
+def test_the_tracker_describes_itself_in_a_report():
     """And not as the default of other identifications, which it is not."""
     tracker = tracker_of(2)
     fits = tracker.read(followed(tracker, tracker.pulses(loaded(scene(4).simulate(seed=5)))))
-    etid.write_report(fits, tmp_path / "page.html")
-    page = html.unescape((tmp_path / "page.html").read_text("utf-8"))
-    methods = page[page.index(">Methods<") :]
+    told = StudyFits(fits, {}, {})
+    methods = methods_section(told).text
+    assert "by on-line tracking" in summary(told)
     assert "iterated at each pulse (Bell and Cathey, 1993)" in methods
-    assert "by on-line tracking" in page
     for wrong in ("aximum likelihood", "utput error", "Both occurred", "Levenberg"):
-        assert wrong not in page
+        assert wrong not in methods + summary(told)
 
 
 FACTOR = 3.0  # of every element from the values where the tracker starts
@@ -484,7 +485,7 @@ def coverage(seeds, electrodes, pulses):
 @pytest.mark.slow
 def test_intervals_of_95_per_cent_contain_the_truth_in_95_per_cent():
     """Noise and driver; the two loads of one driver share its error, drivers are independent."""
-    seeds = 60
+    seeds = 40
     z = coverage(seeds, 1, 12)
     assert len(z) > 0.98 * 2 * seeds
     # One deviation as of half as many draws: loads of one driver err alike.
@@ -492,38 +493,11 @@ def test_intervals_of_95_per_cent_contain_the_truth_in_95_per_cent():
     assert (np.abs(z) < 5).all()
 
 
-@pytest.mark.slow
-def test_intervals_of_drifting_skin_contain_it_in_95_per_cent():
-    z = np.concatenate([z_of_walk(electrodes=32, pulses=101, seed=seed) for seed in range(3)])
-    assert (np.abs(held(z) - 0.95) < 3 * np.sqrt(0.95 * 0.05 / len(z)) + 0.01).all(), held(z)
-
-
-def test_bands_end_where_aliases_begin():
-    of = tracker_of(2).model.bands
-    last = of.x.size / of.samples  # of the sample rate
-    assert ALIASED - 1 / of.samples < last <= ALIASED
-    middle = ALIASED - gain_bands.LAST_BAND / 2 / of.samples
-    assert abs(float(of.frequency[-1]) / RATE - middle) < 2 / of.samples
-
-
-@functools.cache
-def noise_alone():
-    tracker = tracker_of(2)
-    noise = NOISE * np.random.default_rng(9).standard_normal((4000, 3333))
-    return tracker, tracker.projection.seen(noise, np.array([-np.inf, np.inf]))
-
-
-def test_noise_of_a_pulse_is_that_of_its_samples():
-    """Its mean, and its scatter: about a thousand numbers, as the tests for changes assume."""
-    tracker, seen = noise_alone()
-    relative = np.asarray(seen.variance) / tracker.model.bands.samples / NOISE**2
-    assert abs(relative.mean() - 1) < 4 * relative.std() / np.sqrt(relative.size)
-    assert 1000 < 2 / relative.var() < 1200
-
-
 def test_weights_are_those_of_the_noise_in_the_bands():
     """And slopes that are alike in neighbouring bands have the stated information."""
-    tracker, seen = noise_alone()
+    tracker = tracker_of(2)
+    noise = NOISE * np.random.default_rng(9).standard_normal((4000, 3333))
+    seen = tracker.projection.seen(noise, np.array([-np.inf, np.inf]))
     bands = tracker.model.bands
     gain = np.stack([np.real(seen.gain()), np.imag(seen.gain())])
     weight = np.asarray(bands.weight) / (bands.samples * NOISE**2)
@@ -537,22 +511,6 @@ def test_weights_are_those_of_the_noise_in_the_bands():
         sums = (gain[:, :, of] * weight[of]).sum(axis=2)
         told = (sums**2).mean() / weight[of].sum()
         assert abs(told - 1) < 0.08, (first, told)  # five standard errors of 8000 draws
-
-
-def test_bands_of_a_pulse_are_those_of_its_transform():
-    """Σ X̄ Y / Σ |X|², where means of blocks have replaced the samples between the pulses."""
-    tracker = tracker_of(2)
-    bands = tracker.model.bands
-    pulses = tracker.pulses(loaded(quiet()))[0]
-    seen = tracker.projection.seen(pulses, np.array([-np.inf, np.inf]))
-    edges = gain_bands._edges(bands.x.size)
-    y, x = np.fft.rfft(pulses)[:, 1 : bands.x.size + 1], np.asarray(bands.x)
-    power = np.add.reduceat(np.abs(x) ** 2, edges[:-1] - 1)
-    power -= np.diff(edges) * float(bands.variance_x)
-    expected = np.add.reduceat(x.conj() * y, edges[:-1] - 1, axis=1) / power
-    error = np.abs(np.asarray(seen.gain()) - expected)
-    one = np.sqrt(2 * bands.samples * NOISE**2 / np.asarray(bands.weight))  # of a pulse at 60 dB
-    assert (error < 0.1 * one).all(), (error / one).max()
 
 
 def test_windows_are_those_next_to_each_period():
@@ -578,26 +536,6 @@ def test_codes_of_a_converter_are_not_taken_for_volts(kind, monkeypatch):
     tracker = tracker_of(2)
     with pytest.raises(etid.RecordingError, match=r"v_out: has dtype .*by volts per code"):
         tracker.update(tracker.start(), np.zeros((2, 3333), kind))
-
-
-def test_what_cannot_be_tracked_is_refused_with_a_reason():
-    driver, study = calibrated()
-    unloaded = study["cal/0"]
-    tracker = tracker_of(2)
-    with pytest.raises(ValueError, match=r"shape \(2, 3334\).* \(2, 3333\)"):
-        tracker.update(tracker.start(), np.zeros((2, 3334)))
-    with pytest.raises(ValueError, match="electrodes is 0"):
-        Tracker.of(driver, unloaded, electrodes=0)
-    with pytest.raises(ValueError, match="change is -1"):
-        Tracker.of(driver, unloaded, electrodes=1, change=-1.0)
-    plain = pictures.as_kind(driver, ContinuousDriver)
-    with pytest.raises(ValueError, match="harmonics"):
-        Tracker.of(plain, unloaded, electrodes=1)
-    half = etid.Recording(
-        unloaded.v_th[:1500], unloaded.v_out[:1500], sample_rate=RATE, pulse_rate=PULSES
-    )
-    with pytest.raises(etid.IdentificationError, match="not_periodic"):
-        Tracker.of(driver, half, electrodes=1)
 
 
 # --- changes --------------------------------------------------------------------------------------
@@ -682,24 +620,32 @@ def test_an_electrode_whose_search_diverged_is_identified_by_the_next_pulse():
     assert set(found.verdicts) == {"successful"}
 
 
+REPEATED = 8  # times ten electrodes
+
+
 def test_weak_pulses_do_not_add_up_to_a_wrong_answer():
     """A fifteenth of the amplitude at 40 dB: one pulse knows R_s of damp skin to 40 %.
 
     Information about logarithms that was added up as it came gave 65 of 240 electrodes more than
     four standard errors off; what is known of R_s in ohm gives 10.
     """
-    electrodes, amplitude = 240, 0.067
-    tracker = tracker_of(electrodes)
+    amplitude, settled, off = 0.067, 0, []
+    tracker, *_ = ten()
     pulses = amplitude * tracker.pulses(loaded(quiet()))[:, 1:]
-    state = tracker.start()
-    for number in range(40):
-        noisy = with_noise(np.repeat(pulses[number % 10], electrodes, 0) / 10, number) * 10
-        state = tracker.update(state, noisy, amplitude)
-    fits = tracker.read(state)
-    settled = fits.successful()
-    assert len(settled) > 0.98 * electrodes
-    off = (np.asarray(settled.circuit.values()) - TRUTH[1]) / np.asarray(settled.stderr.values())
-    assert np.sum(np.abs(off).max(1) > 4) < 30  # 10; by chance 5 more or less
+    for seed in range(REPEATED):
+        state = tracker.start()
+        for number in range(40):
+            clean = np.repeat(pulses[number % 10], TEN, 0)
+            noisy = clean + 10 * (with_noise(clean, 40 * seed + number) - clean)
+            state = tracker.update(state, noisy, amplitude)
+        fits = tracker.read(state).successful()
+        settled += len(fits)
+        off.append(
+            (np.asarray(fits.circuit.values()) - TRUTH[1]) / np.asarray(fits.stderr.values())
+        )
+    assert settled > 0.98 * REPEATED * TEN
+    # 3 of 80, and by chance 2 more or less; of information that is added up, 22 of 80.
+    assert np.sum(np.abs(np.concatenate(off)).max(1) > 4) < 10
 
 
 def test_an_amplitude_that_is_told_is_no_change():
@@ -712,11 +658,6 @@ def test_an_amplitude_that_is_told_is_no_change():
     none = tracker.update(state, with_noise(0 * clean[8], 2), 0.0)
     assert set(tracker.read(none).verdicts) == {"successful"}
     np.testing.assert_array_equal(none.electrodes.own, state.electrodes.own)
-    for wrong in (-1.0, np.nan):
-        with pytest.raises(ValueError, match="finite and not negative"):
-            tracker.update(state, clean[8], wrong)
-    with pytest.raises(ValueError, match=r"shape \(3,\)"):
-        tracker.update(state, clean[8], np.ones(3))
 
 
 def test_a_display_at_rest_is_identified_from_the_second_pulse_on():

@@ -15,7 +15,7 @@ import pytest
 import scipy.signal
 
 import etid
-from etid.circuits.circuit import ParallelRC, SkinLayers, SkinRC
+from etid.circuits.circuit import SkinRC
 from etid.results.driver import realise
 from etid.signals.filtering import StateSpace, hold, simulate
 from etid.signals.transfer import Rational, multiply_polynomials
@@ -127,25 +127,3 @@ def test_a_recording_of_its_current_is_identified(recorded):
     assert abs(float(fit.circuit.c_p) / 33e-12 - 1) < 0.10
     assert fit.verdict == "misfit"
     assert fit.rrse < 0.002  # the corner is 5 % off its nominal value
-
-
-@pytest.mark.slow
-def test_its_circuit_is_chosen(recorded):
-    """BIC of circuits with a rational impedance; the fit in time cannot have Cole's."""
-    measured, steps, _ = recorded
-    _, *others = START
-    bic = {}
-    for circuit in (
-        SkinRC(30e6, 150e6, 100e-12),
-        ParallelRC(150e6, 100e-12),
-        SkinLayers(30e6, 100e6, 100e-12, 50e6, 300e-12),
-    ):
-        corner, delay, holding = others
-        start = jnp.array([*circuit.log_values(), jnp.log(corner), delay, holding])
-        solution = fit(circuit, jnp.asarray(measured), tuple(int(k) for k in steps), start)
-        squares = 2 * float(solution.stats["normal_equations"].objective)
-        count = measured.size
-        bic[type(circuit)] = count * np.log(squares / count) + start.size * np.log(count)
-    assert min(bic, key=bic.__getitem__) is SkinRC
-    assert bic[SkinLayers] - bic[SkinRC] > 10
-    assert bic[ParallelRC] - bic[SkinRC] > 1000

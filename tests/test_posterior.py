@@ -5,7 +5,6 @@ import dataclasses
 import pickle
 
 import jax
-import jax.numpy as jnp
 import matplotlib.pyplot as plt
 import numpy as np
 import pytest
@@ -13,8 +12,6 @@ import pytest
 import etid
 from etid.identify.posterior import stretched
 from etid.results.posterior import Profile
-from etid.simulation.scenes import Scene, Trial
-from etid.simulation.transformer import ResistorLoad, SkinLoad
 from etid.solvers.importance_sampling import drawn, effective
 
 TRUTH = etid.SkinRC(33.4e3, 186e3, 0.12e-9)
@@ -106,28 +103,8 @@ def test_few_effective_draws_are_mentioned(posterior):
     assert "r_s" in posterior._repr_html_()
 
 
-def test_what_has_no_likelihood_is_refused(clear):
-    fit, recording, driver = clear
-    other = dataclasses.replace(fit, method="output_error")
-    with pytest.raises(ValueError, match="method='maximum_likelihood'"):
-        other.posterior(recording, driver)
-    with pytest.raises(ValueError, match="'cp' is no element of SkinRC"):
-        fit.profile("cp")
-    with pytest.raises(ValueError, match="at least 1"):
-        fit.posterior(draws=0)
-    unknown = dataclasses.replace(fit, cov=jnp.full((3, 3), jnp.nan))
-    with pytest.raises(ValueError, match="does not determine"):
-        unknown.posterior(recording, driver)
-
-
 def test_few_draws_of_a_skewed_likelihood_do_not_fail():
-    """Below 20 kHz R_s is known to a half only; of 20 draws one has nearly all weight."""
-    skin = SkinLoad(r_s=33.4e3, r_p=186e3, c_p=0.12e-9)
-    known = (Trial("c", ResistorLoad(98.8e3)),)
-    scene = Scene((Trial("a", skin),), known, sample_rate=40e3, samples=3334)
-    study = scene.simulate(seed=1)
-    fit = etid.identify_skin(study["a"], etid.identify_driver(study["c"]))
-    few = fit.posterior(draws=20)
+    few = identified(20.0, 0)[0].posterior(draws=20)
     assert few.effective < 20
     assert "draw more" in str(few)
 
@@ -141,10 +118,6 @@ def test_a_fit_knows_its_recording_and_what_is_made_from_it_does_not(clear):
     assert jax.tree.structure(fit) == jax.tree.structure(dataclasses.replace(fit))
     other = dataclasses.replace(fit)
     assert other.recording is None
-    with pytest.raises(ValueError, match=r"fit\.posterior\(recording, driver\)"):
-        other.posterior()
-    with pytest.raises(TypeError, match=r"plot\(fit, recording, driver\)"):
-        other.plot()
     lines = [
         [line.get_ydata() for line in axes[0].lines]
         for axes in (fit.plot(), etid.plot(fit), other.plot(recording, driver))
@@ -177,11 +150,11 @@ def test_further_rounds_find_a_distribution_that_the_first_draws_miss():
 
 @pytest.mark.slow
 def test_at_20_db_intervals_contain_the_truth_in_95_percent():
-    """One trial of each of 80 drivers; without the stretching it is 83, 88 and 83 %."""
+    """One trial of each of 60 drivers; without the stretching it is 83, 88 and 83 %."""
     inside, worth, truth = [], [], np.asarray(TRUTH.values())
     whole = etid.scenes.paper_dry(snr_db=20.0)
     scene = dataclasses.replace(whole, trials=whole.trials[:1])
-    for seed in range(80):
+    for seed in range(60):
         study = scene.simulate(seed=1000 + seed)
         driver = etid.identify_driver(study["calibration/98k8"], order=5, throw=False)
         (recording,) = study.loaded.recordings()
@@ -192,7 +165,7 @@ def test_at_20_db_intervals_contain_the_truth_in_95_percent():
         worth.append(found.effective)
         ends = found.intervals().values()
         inside.append([low < true < high for (low, high), true in zip(ends, truth, strict=True)])
-    assert len(inside) > 64
+    assert len(inside) > 48
     share = np.mean(inside, axis=0)
-    assert (share > 0.95 - 0.075).all(), share  # three standard deviations of a count of 75
+    assert (share > 0.95 - 0.087).all(), share  # three standard deviations of a count of 56
     assert np.quantile(worth, 0.05) > 100

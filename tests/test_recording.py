@@ -69,23 +69,11 @@ def test_times_of_a_recording():
     assert one.time.shape == one.v_th.shape == one.v_out.shape
 
 
-def test_optional_current():
-    assert recording().current is None
-    np.testing.assert_array_equal(recording(current=np.ones(100)).current, np.ones(100))
-
-
 def test_labels_become_text_and_one_calibration_a_tuple():
     one = recording(trial=np.int64(3), subject=7, calibration="/calibration/98k8")
     assert (one.trial, one.subject, one.calibration) == ("3", "7", ("calibration/98k8",))
     assert not one.is_calibration
     assert recording(r_load=98.8e3).is_calibration
-
-
-def test_recordings_are_equal_only_to_themselves():
-    one = recording()
-    assert one == one
-    assert one != recording()
-    assert len({one, recording()}) == 2
 
 
 def test_replace_changes_what_is_named_and_keeps_the_samples():
@@ -223,11 +211,6 @@ def test_where_selects_by_labels_and_keeps_the_order():
     assert list(study().where(condition="damp", electrode="E17")) == ["s02/damp"]
     assert list(study().where(subject="s03")) == []
     assert list(study().where()) == list(study())
-
-
-def test_calibrations_and_loaded_part_a_study():
-    assert list(study().calibrations) == ["calibration/98k8"]
-    assert list(study().loaded) == ["s01/dry/0", "s01/dry/1", "s02/damp"]
 
 
 def test_a_group_of_trials_is_no_recording_and_the_error_says_what_is():

@@ -220,14 +220,6 @@ def test_single_harmonics_obey_the_voltage_divider(load):
     np.testing.assert_allclose(ratio, expected, rtol=1e-5)
 
 
-def test_skin_is_eq_7():
-    f = np.geomspace(1, 1e6, 50)
-    s = 2j * np.pi * f
-    r_s, r_p, c_p = dataclasses.astuple(DRY)
-    eq_7 = ((r_s + r_p) + r_s * r_p * c_p * s) / (1 + r_p * c_p * s)
-    np.testing.assert_allclose(DRY(f), eq_7, rtol=1e-13)
-
-
 def test_any_function_of_frequency_is_a_load():
     r_s, r_p, c_p = dataclasses.astuple(DRY)
     custom = one(lambda f: r_s + 1 / (1 / r_p + 2j * np.pi * f * c_p), **CLEAN)

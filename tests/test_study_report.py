@@ -282,26 +282,6 @@ def test_an_infinite_element_of_a_damaged_file_tells_no_spread():
         assert np.isnan(one.between_subjects)
 
 
-def test_summary_is_that_of_each_group_by_itself():
-    rng = np.random.default_rng(0)
-    verdicts = rng.choice(["successful", "misfit"], 200, p=[0.8, 0.2])
-    labels = {name: rng.choice(list("ab"), 200) for name in ("subject", "condition")}
-    fits = fits_of(rng.lognormal(0.0, 0.3, 200), verdicts, **labels)
-    rows = fits.summary("subject", "condition")
-    assert [(row["subject"], row["condition"]) for row in rows] == sorted(
-        {(str(a), str(b)) for a, b in zip(labels["subject"], labels["condition"], strict=True)}
-    )
-    for row in rows:
-        group = fits.where(subject=row["subject"], condition=row["condition"])
-        (alone,) = group.summary()
-        assert {key: row[key] for key in alone} == alone
-        good = np.asarray(group.circuit.r_p)[group.verdicts == "successful"]
-        assert (row["fits"], row["successful"]) == (len(group), good.size)
-        assert row["r_p"] == np.median(good)
-        assert row["r_p_spread"] == pytest.approx(np.std(good, ddof=1))
-        assert row["r_p_own"] == pytest.approx(OWN * np.median(good))
-
-
 def test_the_worst_are_of_every_verdict_and_of_every_reason():
     verdicts = ["successful"] * 20 + ["flat"] * 9 + ["misfit"] * 3 + ["saturated"]
     fits = fits_of(np.linspace(1.0, 2.0, 33), verdicts)
@@ -352,7 +332,7 @@ def test_numbers_are_rounded_to_two_digits(value, text):
 
 
 def test_large_studies_are_condensed_and_say_so(tmp_path):
-    count = 4000
+    count = tables.SINGLE + 200
     rng = np.random.default_rng(1)
     fits = fits_of(
         rng.lognormal(0.0, 0.3, count), rng.choice(["successful", "misfit"], count, p=[0.9, 0.1]),

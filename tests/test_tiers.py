@@ -100,7 +100,7 @@ OPTIONS = (
     {"method": "output_error"},
     {"method": "non_parametric"},
 )
-DRAWN = 16  # for each of the options
+DRAWN = 8  # for each of the options
 
 
 @pytest.mark.slow

@@ -51,43 +51,28 @@ def test_successful(study, driver):
     assert message("successful") == ""
 
 
-def test_flat(study, driver):
+def part(recording, size):
+    return {"v_th": recording.v_th[:size], "v_out": recording.v_out[:size]}
+
+
+@pytest.mark.parametrize(
+    ("change", "verdict"),
+    [
+        (lambda one: {"v_out": np.zeros(LENGTH)}, "flat"),
+        (lambda one: {"v_out": np.minimum(one.v_out, 40.0), "adc_range": None}, "saturated"),
+        (lambda one: {"v_th": np.append(one.v_th[1:], np.inf)}, "nonfinite_samples"),
+        (lambda one: part(one, 150), "too_short"),
+        (lambda one: {"v_th": one.v_out, "v_out": one.v_th}, "misaligned"),
+    ],
+)
+def test_samples_that_are_broken(study, driver, change, verdict):
+    """What else breaks them is in `test_preflight`."""
     recording = study["loaded/0"]
-    flat = recording.replace(v_out=np.zeros(LENGTH))
-    assert verdict_of(flat, driver) == "flat"
-    noise = np.random.default_rng(0).normal(size=LENGTH)
-    assert verdict_of(recording.replace(v_out=noise), driver) == "flat"
+    assert verdict_of(recording.replace(**change(recording)), driver) == verdict
 
 
-def test_saturated(study, driver):
-    clipped = simulate(full_scale=2.6)["loaded/0"]
-    assert verdict_of(clipped, driver) == "saturated"
-    # The same without knowledge of the converter's range: the flat top itself tells.
-    unknown = study["loaded/0"].replace(
-        v_out=np.minimum(study["loaded/0"].v_out, 40.0), adc_range=None
-    )
-    assert verdict_of(unknown, driver) == "saturated"
-
-
-def test_nonfinite_samples(study, driver):
-    for bad in (np.nan, np.inf):
-        v = study["loaded/0"].v_th.copy()
-        v[7] = bad
-        assert verdict_of(study["loaded/0"].replace(v_th=v), driver) == "nonfinite_samples"
-
-
-def test_too_short(study, driver):
-    recording = study["loaded/0"]
-    short = recording.replace(v_th=recording.v_th[:150], v_out=recording.v_out[:150])
-    assert verdict_of(short, driver) == "too_short"
-
-
-def test_misaligned(study, driver):
-    recording = study["loaded/0"]
-    swapped = recording.replace(v_th=recording.v_out, v_out=recording.v_th)
-    assert verdict_of(swapped, driver) == "misaligned"
-    shifted = recording.replace(v_out=np.roll(recording.v_out, 600))
-    assert verdict_of(shifted, driver) == "misaligned"
+def test_saturated_at_the_end_of_the_range_of_the_converter(driver):
+    assert verdict_of(simulate(full_scale=2.6)["loaded/0"], driver) == "saturated"
 
 
 def test_insensitive(driver):
@@ -120,20 +105,6 @@ def test_nonphysical_and_driver_failed(study):
     assert verdict_of(study["loaded/0"], driver) in ("driver_failed", "inconsistent", "misfit")
 
 
-def test_driver_failed_when_the_calibration_is_refused(study):
-    broken = etid.Study.from_recordings(
-        [
-            study["calibration/98k8"].replace(v_out=np.zeros(LENGTH)),
-            study["loaded/0"],
-        ]
-    )
-    result = etid.identify_study(broken)
-    assert result.fits.counts() == {"driver_failed": 1}
-    assert "flat" in result.fits.notes[0]
-    assert not result.drivers
-    assert list(result.failures) == [("calibration/98k8",)]
-
-
 def test_unreadable_without_a_calibration(study):
     other = study["calibration/98k8"].replace(path="calibration/other")
     lost = study["loaded/0"].replace(calibration=())
@@ -151,7 +122,7 @@ def baselines():
     """The paper's method from quiet to noisy: how often its drivers and skins end how."""
     found = Counter()
     for snr_db in (None, 60.0, 40.0, 30.0):
-        for seed in range(3):
+        for seed in range(1):
             study = simulate(snr_db=snr_db, seed=seed)
             driver = etid.identify_driver(
                 study["calibration/98k8"], method="steiglitz_mcbride", throw=False
@@ -170,7 +141,7 @@ def test_the_papers_method_says_how_it_fails(baselines, name):
 def test_the_papers_method_is_never_successful_here(baselines):
     """Without noise its loop is unstable, with noise its R_s is far off."""
     assert baselines["successful"] == 0
-    assert baselines.total() == 36
+    assert baselines.total() == 12
 
 
 class Wall(etid.AbstractCircuit):
