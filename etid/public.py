@@ -7,11 +7,12 @@ from etid.circuits.circuit import (
     SkinCole,
     SkinLayers,
     SkinRC,
+    SkinWarburg,
     parameter,
 )
 from etid.circuits.circuit_string import circuit
 from etid.circuits.current_dependent import SkinCurrent, current_dependent_resistor
-from etid.circuits.elements import capacitor, cole, constant_phase, resistor
+from etid.circuits.elements import capacitor, cole, constant_phase, inductor, resistor
 from etid.circuits.impedance import parallel, series
 from etid.circuits.netlist import circuit_string, netlist
 from etid.estimators.estimator import AbstractEstimator
@@ -81,6 +82,7 @@ __all__ = [
     "SkinCurrent",
     "SkinLayers",
     "SkinRC",
+    "SkinWarburg",
     "SteiglitzMcBride",
     "Study",
     "StudyFits",
@@ -102,6 +104,7 @@ __all__ = [
     "identify_skin",
     "identify_skins",
     "identify_study",
+    "inductor",
     "kramers_kronig",
     "netlist",
     "parallel",

@@ -1,12 +1,12 @@
 """Search among candidate circuits: from the usual one to where the data ask to go.
 
-The first candidate is fitted to all recordings. A richer one is fitted if the score tests of the
-fit, which cost no further fit, show a change that its circuit cannot make; first only those with
-the fewest elements. A simpler one is fitted if an element is hardly determined. An ordinary
-recording thus needs one fit.
+The first candidate is fitted to all recordings. If the score tests of the fit, which cost no
+further fit, show a change that its circuit cannot make, all candidates with as many or more
+elements are fitted: the weight of a circuit means nothing while a likelier one may be missing. The
+simpler ones are fitted if an element is hardly determined. An ordinary recording thus needs one
+fit.
 """
 
-import math
 from collections.abc import Callable, Sequence
 
 import numpy as np
@@ -18,15 +18,23 @@ from etid.circuits.circuit import (
     SkinCole,
     SkinLayers,
     SkinRC,
+    SkinWarburg,
 )
 from etid.results.fit import Fit
 from etid.selection.evidence import best, rank, values_of
 
 # From the usual circuit to the unusual ones. Classes, because the elements of a circuit are arrays:
 # to make one starts JAX, which no import may do.
-USUAL: tuple[type[AbstractCircuit], ...] = (SkinRC, ParallelRC, Resistor, SkinCole, SkinLayers)
-# Standard deviations of a score that asks for one more element, times √m for m more. The evidence
-# needs 2.8 √m; the score is not the ratio of likelihoods exactly.
+USUAL: tuple[type[AbstractCircuit], ...] = (
+    SkinRC,
+    ParallelRC,
+    Resistor,
+    SkinCole,
+    SkinLayers,
+    SkinWarburg,
+)
+# Standard deviations of a score that asks for another circuit. The evidence needs 2.8 for one more
+# element; the score is not the ratio of likelihoods exactly.
 ASKS = 2.5
 # Relative standard error of an element that asks for a simpler circuit: an element of seven
 # standard errors has the evidence 49, more than its penalty by far.
@@ -75,10 +83,8 @@ def _asked(fits: dict[int, Fit], size: Sequence[int]) -> list[int]:
     fit, own = fits[number], size[number]
     accepted = rank(fit)
     asked = []
-    least = min((size[number] for number in left if size[number] >= own), default=0)
-    more = max(least - own, 1)
-    if least and (accepted == 2 or _lacks(fit) > ASKS * math.sqrt(more)):
-        asked += [number for number in left if size[number] == least]
+    if accepted == 2 or _lacks(fit) > ASKS:
+        asked += [number for number in left if size[number] >= own]
     if accepted == 1 or _is_doubtful(fit):
         asked += [number for number in left if size[number] < own]
     return asked

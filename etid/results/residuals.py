@@ -1,31 +1,26 @@
 """What the residual of a fit looks like, from the scores of the changes that it lacks."""
 
 import numpy as np
-
-from etid.recordings.remarks import Remark
-from etid.results.fit import Fit
+from jaxtyping import Float
 
 SEEN = 3.0  # standard deviations; below, the residual does not look like any of the changes
+# Above it, another circuit is seen by the score tests, whatever else is the matter.
+SURE = 5.0
 _SLOW, _FAST = 2, 3  # number of relaxations at either end of the band
 
 
-def looks_like(fit: Fit) -> str:
+def looks_like(z: Float[np.ndarray, " change"], least: float = SEEN) -> str:
     """A sentence on the largest score; empty if the residual looks like none of the changes.
 
     Args:
-        fit: One fit.
+        z: `Support.z` of one fit.
+        least: Least score of a sentence.
     """
-    if fit.verdict == "changed":
-        return fit.changes
-    if int(fit.remarks) & Remark.mains_hum:
-        return "The residual looks like mains hum."
-    if fit.support is None:
-        return ""
-    z = np.nan_to_num(np.asarray(fit.support.z, float))
+    z = np.nan_to_num(np.asarray(z, float))
     # A negative relaxation, or a spread above that of a capacitor, is not passive. A gain has no
     # sign that it must have.
     z = np.append(np.maximum(z[:-1], 0.0), np.abs(z[-1]))
-    if z.max() < SEEN:
+    if z.max() < least:
         return ""
     worst, last = int(np.argmax(z)), z.size - 1
     if worst == 0:
