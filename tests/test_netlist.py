@@ -35,7 +35,8 @@ class Nested(etid.AbstractCircuit):
 
 
 DIFFUSION = etid.SkinWarburg(10e3, 186e3, 0.2e-6)
-INDUCTIVE = type(etid.circuit("L0-p(L1,R1)-R0-p(R2,C2)"))(1.0, 2.0)  # [H], 6 ohm at 1 Hz at least
+# [H], 6 ohm at 1 Hz at least
+INDUCTIVE = type(etid.circuit("L0-p(L1,R1)-R0-p(R2,C2)"))(**{"l_0": 1.0, "l_1": 2.0})
 CIRCUITS = [etid.Resistor(98.8e3), etid.SkinRC(), etid.SkinLayers(), INDUCTIVE]
 CIRCUITS += [SPREAD, Nested(), DIFFUSION]
 rational = pytest.mark.parametrize("circuit", CIRCUITS[:4], ids=lambda c: type(c).__name__)

@@ -220,7 +220,7 @@ class Diffusion(AbstractIrrational):
         )
         x = (np.arange(count) + 0.5) ** 2 * np.pi**2
         pairs = [parallel(resistor(2 * r / one), capacitor(tau / (2 * r))) for one in x]
-        series(resistor(r - np.sum(2 * r / x)), *pairs).connect(netlist, plus, minus)
+        series(resistor(r - float(np.sum(2 * r / x))), *pairs).connect(netlist, plus, minus)
 
 
 def ladder(q: float, alpha: float, band: tuple[float, float]) -> AbstractImpedance:

@@ -18,7 +18,7 @@ from etid.recordings.remarks import texts, words
 from etid.results.data import HasSource
 from etid.results.fits_columns import described
 from etid.results.limited import Limited
-from etid.results.residuals import SURE, looks_like
+from etid.results.residuals import is_of_circuit, looks_like
 from etid.results.verdicts import RESULTS, Judged, counted, message
 from etid.signals.transfer import power
 
@@ -274,10 +274,10 @@ class Fit(Judged, HasSource[Circuit]):
         """A sentence if another circuit is a likelier cause of `inconsistent` than the driver."""
         if self.verdict != "inconsistent" or self.support is None:
             return ""
-        looks = looks_like(np.append(np.asarray(self.support.z)[:-1], 0.0), SURE)
-        if not looks:
+        z = np.asarray(self.support.z)
+        if not is_of_circuit(z):
             return ""
-        return f"{looks} Another circuit is the likelier cause: try circuit='auto' first."
+        return f"{looks_like(z)} Another circuit is the likelier cause: try circuit='auto' first."
 
     def _overview(self) -> Overview:
         kind, verdict = type(self.circuit).__name__, self.verdict

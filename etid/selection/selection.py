@@ -123,7 +123,7 @@ class Selection(Overviewed):
             return fit.changes
         if int(fit.remarks) & Remark.mains_hum:
             return "The residual looks like mains hum."
-        return "" if fit.support is None else looks_like(fit.support.z)
+        return "" if fit.support is None else looks_like(np.asarray(fit.support.z))
 
     def _overview(self) -> Overview:
         total = len(self.candidates) + len(self.unasked)
