@@ -4,10 +4,11 @@ The first candidate is fitted to all recordings. If the score tests of the fit, 
 further fit, show a change that its circuit cannot make, all candidates with as many or more
 elements are fitted: the weight of a circuit means nothing while a likelier one may be missing. The
 simpler ones are fitted if an element is hardly determined. An ordinary recording thus needs one
-fit.
+fit. Records of millions of samples end the search after `PATIENCE`, with what was found so far.
 """
 
-from collections.abc import Callable, Sequence
+import time
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
@@ -39,6 +40,7 @@ ASKS = 2.5
 # Relative standard error of an element that asks for a simpler circuit: an element of seven
 # standard errors has the evidence 49, more than its penalty by far.
 DOUBTFUL = 1 / 7
+PATIENCE = 60.0  # [s] for each recording, after which no further candidate is fitted
 FitRows = Callable[[int, Sequence[int]], Sequence[Fit]]
 
 
@@ -55,39 +57,43 @@ def search(count: int, candidates: Sequence[AbstractCircuit], fit: FitRows) -> l
         candidates: Circuits; the search starts at the first one.
         fit: Fits the candidate of a number to some recordings.
     """
-    size = [len(circuit.names()) for circuit in candidates]
+    begin, patience = time.monotonic(), PATIENCE * count
     found = [{0: one} for one in fit(0, range(count))]
     while True:
         wanted: dict[int, list[int]] = {}
         for row, fits in enumerate(found):
-            for number in _asked(fits, size):
+            for number in asked(fits, candidates):
                 wanted.setdefault(number, []).append(row)
         if not wanted:
             return found
         for number, rows in wanted.items():
+            if time.monotonic() - begin > patience:
+                return found
             for row, one in zip(rows, fit(number, rows), strict=True):
                 found[row][number] = one
 
 
-def _asked(fits: dict[int, Fit], size: Sequence[int]) -> list[int]:
+def asked(fits: Mapping[int, Fit], candidates: Sequence[AbstractCircuit]) -> list[int]:
     """Numbers of the candidates to fit next; none if the search ends.
 
     Args:
         fits: The fits so far, by number of the candidate.
-        size: Number of elements of each candidate.
+        candidates: The circuits by number.
     """
+    size = [len(circuit.names()) for circuit in candidates]
     left = [number for number in range(len(size)) if number not in fits]
+    left.sort(key=lambda number: size[number])  # time may end the search, so simple ones first
     if not left:
         return []
     number = best(fits)
     fit, own = fits[number], size[number]
     accepted = rank(fit)
-    asked = []
+    more = []
     if accepted == 2 or _lacks(fit) > ASKS:
-        asked += [number for number in left if size[number] >= own]
+        more += [number for number in left if size[number] >= own]
     if accepted == 1 or _is_doubtful(fit):
-        asked += [number for number in left if size[number] < own]
-    return asked
+        more += [number for number in left if size[number] < own]
+    return more
 
 
 def _lacks(fit: Fit) -> float:

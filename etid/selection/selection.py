@@ -14,6 +14,7 @@ from etid.results.fit import Fit
 from etid.results.residuals import looks_like
 from etid.results.verdicts import message
 from etid.selection.evidence import bic, elements, rank, weights, with_close
+from etid.selection.search import PATIENCE, asked
 from etid.selection.unseen import hidden, unseen
 
 HEADS = ("circuit", "2 log evidence", "weight", "chi2", "verdict", "elements")
@@ -70,6 +71,7 @@ class Selection(Overviewed):
         fit: The fit of the chosen circuit. Its covariance contains the differences to other likely
             circuits, and what changes of the circuit may do that the data cannot show.
         unasked: Names of the circuits that were not fitted, because the data did not ask for them.
+        late: Names of those that the data ask for, and that were not fitted for lack of time.
         weighed: Whether all candidates were fitted, except simpler ones that lack an element which
             is surely there.
         chosen: Number of the chosen candidate.
@@ -78,6 +80,7 @@ class Selection(Overviewed):
 
     fit: Fit
     unasked: tuple[str, ...]
+    late: tuple[str, ...]
     weighed: bool
     chosen: int
     fits: Mapping[int, Fit]
@@ -93,11 +96,13 @@ class Selection(Overviewed):
             chosen: Number of the chosen candidate.
             circuits: All candidates.
         """
-        unasked = [one for number, one in enumerate(circuits) if number not in fits]
-        weighed = all(len(one.names()) < elements(fits[chosen]) for one in unasked)
-        names = tuple(type(one).__name__ for one in unasked)
+        left = [number for number in range(len(circuits)) if number not in fits]
+        late = set(asked(fits, circuits)) if len(fits) > 1 else set()
+        weighed = all(len(circuits[number].names()) < elements(fits[chosen]) for number in left)
+        names = [type(one).__name__ for one in circuits]
+        unasked = tuple(names[number] for number in left if number not in late)
         fit = _concluded(fits, chosen) if len(circuits) > 1 else fits[chosen]
-        return cls(fit, names, weighed, chosen, dict(fits))
+        return cls(fit, unasked, tuple(names[one] for one in late), weighed, chosen, dict(fits))
 
     @functools.cached_property
     def candidates(self) -> tuple[Candidate, ...]:
@@ -126,10 +131,12 @@ class Selection(Overviewed):
         return "" if fit.support is None else looks_like(np.asarray(fit.support.z))
 
     def _overview(self) -> Overview:
-        total = len(self.candidates) + len(self.unasked)
+        total = len(self.candidates) + len(self.unasked) + len(self.late)
         notes = []
         if self.unasked:
             notes.append(f"not fitted, the data did not ask for it: {', '.join(self.unasked)}")
+        if self.late:
+            notes.append(f"not fitted, {PATIENCE:g} s had passed: {', '.join(self.late)}")
         if self.fit.verdict != "successful":
             notes.append(message(self.fit.verdict))
         if self.residual:
