@@ -442,7 +442,8 @@ def test_skin_that_is_not_one_rc_does_not_ask_for_a_calibration_first(name):
         assert plain.verdict == "misfit" or plain.other_circuit
         chosen = etid.identify_skin(study["a"], driver, circuit="auto")
         # A normal error exceeds 3.5 standard errors once in 2 000.
-        assert abs(float(chosen.circuit.r_s) - 33.4e3) < 3.5 * float(chosen.stderr.r_s)
+        error = float(chosen.circuit.values()[0]) - 33.4e3
+        assert abs(error) < 3.5 * float(np.sqrt(chosen.cov[0, 0]))
 
 
 @pytest.mark.slow
@@ -460,7 +461,8 @@ def test_skin_through_which_charge_diffuses_is_found():
         found = etid.select_circuit(study["a"], driver)
         assert type(found.fit.circuit) is etid.SkinWarburg
         assert found.weighed
-        assert abs(float(found.fit.circuit.r_s) - 31e3) < 3.5 * float(found.fit.stderr.r_s)
+        error = float(found.fit.circuit.values()[0]) - 31e3
+        assert abs(error) < 3.5 * float(np.sqrt(found.fit.cov[0, 0]))
 
 
 @pytest.mark.slow
