@@ -220,8 +220,8 @@ def test_an_ordinary_recording_costs_one_fit():
     [
         ((3.0, *[0.0] * 8), [0, 5, 3, 4]),  # a spread: all that may have it
         ((-3.0, *[0.0] * 8), [0]),  # a spread above a capacitor is not passive
-        ((0.0, 2.4, *[0.0] * 7), [0]),
-        ((0.0, 2.6, *[0.0] * 7), [0, 5, 3, 4]),
+        ((0.0, 2.7, *[0.0] * 7), [0]),
+        ((0.0, 2.9, *[0.0] * 7), [0, 5, 3, 4]),
         ((*[0.0] * 8, 9.0), [0]),  # a gain is no circuit
     ],
 )

@@ -36,7 +36,7 @@ USUAL: tuple[type[AbstractCircuit], ...] = (
 )
 # Standard deviations of a score that asks for another circuit. The evidence needs 2.8 for one more
 # element; the score is not the ratio of likelihoods exactly.
-ASKS = 2.5
+ASKS = 2.8
 # Relative standard error of an element that asks for a simpler circuit: an element of seven
 # standard errors has the evidence 49, more than its penalty by far.
 DOUBTFUL = 1 / 7
