@@ -6,6 +6,7 @@ from .circuits.circuit import Resistor as Resistor
 from .circuits.circuit import SkinCole as SkinCole
 from .circuits.circuit import SkinLayers as SkinLayers
 from .circuits.circuit import SkinRC as SkinRC
+from .circuits.circuit import SkinWarburg as SkinWarburg
 from .circuits.circuit import parameter as parameter
 from .circuits.circuit_string import circuit as circuit
 from .circuits.current_dependent import SkinCurrent as SkinCurrent
@@ -13,6 +14,7 @@ from .circuits.current_dependent import current_dependent_resistor as current_de
 from .circuits.elements import capacitor as capacitor
 from .circuits.elements import cole as cole
 from .circuits.elements import constant_phase as constant_phase
+from .circuits.elements import inductor as inductor
 from .circuits.elements import resistor as resistor
 from .circuits.impedance import parallel as parallel
 from .circuits.impedance import series as series

@@ -34,8 +34,12 @@ class Nested(etid.AbstractCircuit):
         return etid.series(etid.parallel(inner, r), r)
 
 
-CIRCUITS = [etid.Resistor(98.8e3), etid.SkinRC(), etid.SkinLayers(), SPREAD, Nested()]
-rational = pytest.mark.parametrize("circuit", CIRCUITS[:3], ids=lambda c: type(c).__name__)
+DIFFUSION = etid.SkinWarburg(10e3, 186e3, 0.2e-6)
+# [H], 6 ohm at 1 Hz at least
+INDUCTIVE = type(etid.circuit("L0-p(L1,R1)-R0-p(R2,C2)"))(**{"l_0": 1.0, "l_1": 2.0})
+CIRCUITS = [etid.Resistor(98.8e3), etid.SkinRC(), etid.SkinLayers(), INDUCTIVE]
+CIRCUITS += [SPREAD, Nested(), DIFFUSION]
+rational = pytest.mark.parametrize("circuit", CIRCUITS[:4], ids=lambda c: type(c).__name__)
 every = pytest.mark.parametrize("circuit", CIRCUITS, ids=lambda c: type(c).__name__)
 
 
@@ -50,7 +54,8 @@ def impedance_of(text, f):
     index = {node: i for i, node in enumerate(nodes)}
     matrix = np.zeros((f.size, len(index), len(index)), complex)
     for name, plus, minus, value in parts:
-        y = 1 / float(value) if name[0] == "R" else 2j * np.pi * f * float(value)
+        s, x = 2j * np.pi * f, float(value)
+        y = {"R": 1 / x, "C": s * x, "L": 1 / (s * x)}[name[0]]
         for one, other in ((plus, minus), (minus, plus)):
             if one in index:
                 matrix[:, index[one], index[one]] += y
@@ -100,10 +105,12 @@ def evaluated(string, values, f):
     kinds = {
         "R": lambda r: r + 0 * s,
         "C": lambda c: 1 / (s * c),
+        "L": lambda inductance: s * inductance,
         "CPE": lambda q, alpha: 1 / (q * s**alpha),
+        "Ws": lambda r, tau: r * np.tanh(np.sqrt(s * tau)) / np.sqrt(s * tau),
     }
     elements = {}
-    for name in re.findall(r"[A-Z]+\d+", string):
+    for name in re.findall(r"[A-Z]+s?\d+", string):
         assert name not in elements
         kind = kinds[name.rstrip("0123456789")]
         elements[name] = kind(*(next(left) for _ in range(kind.__code__.co_argcount)))

@@ -32,8 +32,38 @@ def test_strings_nest_and_know_constant_phases():
     np.testing.assert_allclose(nested.response(F), whole, rtol=1e-10)
 
 
+def test_an_inductor_is_s_l_and_is_fitted():
+    """A cable of 5 µH before an electrode, up to 10 MHz: half of |Z| at the end."""
+    frequency = np.geomspace(100.0, 10e6, 60)
+    written = etid.circuit("L0-R0-p(R1,C1)")
+    assert written.units()["l_0"] == "henry"
+    truth = dict(zip(written.names(), (5e-6, 200.0, 2e3, 20e-9), strict=True))
+    s = 2j * np.pi * frequency
+    z = s * 5e-6 + 200.0 + 2e3 / (1 + s * 2e3 * 20e-9)
+    exact = type(written)(**truth)
+    np.testing.assert_allclose(exact.response(frequency), z, rtol=1e-12)
+    np.testing.assert_allclose(1 / exact.impedance().admittance(jnp.asarray(s)), z, rtol=1e-12)
+    rng = np.random.default_rng(3)
+    noise = rng.normal(size=60) + 1j * rng.normal(size=60)
+    fit = etid.identify_impedance(
+        frequency, z + 0.01 * abs(z) * noise, stderr=0.01 * abs(z), circuit=written
+    )
+    error = np.asarray(fit.circuit.values()) - np.array(list(truth.values()))
+    assert (np.abs(error) < 4 * np.sqrt(np.diagonal(fit.cov))).all()  # 1 of 4 000 seeds exceeds it
+    assert "µH" in str(fit)
+
+
+def test_an_inductor_in_series_has_no_response_in_time_and_one_with_a_resistor_across_has():
+    with pytest.raises(ValueError, match="an inductor in series"):
+        etid.circuit("L0-R0").impedance().state_space(1e5, 100)
+    rational = etid.circuit("p(L0,R1)-R2").impedance().rational()
+    s = 2j * np.pi * np.asarray(F)
+    z = s * 1e-3 * 100e3 / (s * 1e-3 + 100e3) + 20e3
+    np.testing.assert_allclose(rational(jnp.asarray(s)), z, rtol=1e-9)
+
+
 @pytest.mark.parametrize(
-    "string", ["", "R0-", "R0--C1", "p(R1)", "p(R1,C1", "R0-p(R1,C1))", "L0", "R", "R0 C1", "R0+C1"]
+    "string", ["", "R0-", "R0--C1", "p(R1)", "p(R1,C1", "R0-p(R1,C1))", "W0", "R", "R0 C1", "R0+C1"]
 )
 def test_what_is_no_circuit_is_refused(string):
     with pytest.raises(ValueError, match="is no circuit: cannot read"):

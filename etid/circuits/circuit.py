@@ -1,8 +1,9 @@
 """Circuits: parameters with names, units and typical values; and the circuits of etid.
 
 A circuit is a frozen module with named parameters and one method, `impedance()`. This method builds
-the impedance from `resistor`, `capacitor`, `constant_phase`, `cole`, `series` and `parallel`. etid
-derives everything else from the circuit: filter, fit, covariance, text with units, and netlist.
+the impedance from `resistor`, `capacitor`, `inductor`, `constant_phase`, `cole`, `series` and
+`parallel`. etid derives everything else from the circuit: filter, fit, covariance, text with units,
+and netlist.
 """
 
 import abc
@@ -24,6 +25,7 @@ from etid.circuits.elements import (
     Second,
     capacitor,
     cole,
+    diffusion,
     resistor,
 )
 from etid.circuits.impedance import AbstractImpedance, Quantity, parallel, series
@@ -38,8 +40,8 @@ def parameter(unit: str, *, typical: float) -> Any:
     """Declare a positive circuit parameter.
 
     Args:
-        unit: `"ohm"`, `"farad"`, `"second"`, `"ampere"`, `"siemens second^alpha"` for the Q of a
-            constant-phase element, or `"1"` for its exponent.
+        unit: `"ohm"`, `"farad"`, `"henry"`, `"second"`, `"ampere"`, `"siemens second^alpha"` for
+            the Q of a constant-phase element, or `"1"` for its exponent.
         typical: Expected magnitude in the SI unit; a fit may start at this value.
 
     Returns:
@@ -92,6 +94,7 @@ class AbstractCircuit(Overviewed, eqx.Module):
         powers = {
             "ohm": (1.0, 0.0),
             "farad": (-1.0, 1.0),
+            "henry": (1.0, 1.0),
             "second": (0.0, 1.0),
             "ampere": (-1.0, 0.0),
             "siemens second^alpha": (-1.0, 0.8),  # for a typical α; used only for starts of a fit
@@ -251,6 +254,24 @@ class SkinLayers(AbstractCircuit):
         first = parallel(resistor(self.r_1), capacitor(self.c_1))
         second = parallel(resistor(self.r_2), capacitor(self.c_2))
         return series(resistor(self.r_s), first, second)
+
+
+class SkinWarburg(AbstractCircuit):
+    """Skin as a layer through which charge diffuses, Z = R_s + R_p tanh √(s τ) / √(s τ).
+
+    It is a line of many equal resistors and capacitors, such as ducts and cells in a layer (finite
+    Warburg element). The typical resistances are those of `SkinRC`. τ is three times the mean time
+    constant, which is that of `SkinRC`.
+    """
+
+    formula: ClassVar[str] = "R_s + R_p tanh(sqrt(s tau_d)) / sqrt(s tau_d)"
+    r_s: Ohm = parameter("ohm", typical=20e3)
+    r_p: Ohm = parameter("ohm", typical=100e3)
+    tau_d: Second = parameter("second", typical=90e-6)
+
+    def impedance(self) -> AbstractImpedance:
+        """Impedance of the series resistor and the layer."""
+        return series(resistor(self.r_s), diffusion(self.r_p, self.tau_d))
 
 
 class ParallelRC(AbstractCircuit):

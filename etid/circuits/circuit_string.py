@@ -2,9 +2,9 @@
 
     circuit = part {"-" part}                    series
     part    = element | "p(" circuit {"," circuit} ")"     parallel
-    element = "R" number | "C" number | "CPE" number
+    element = "R" number | "C" number | "L" number | "CPE" number
 
-The parameters are `r_0`, `c_1`, and `q_2` and `alpha_2` of `CPE2`.
+The parameters are `r_0`, `c_1`, `l_3`, and `q_2` and `alpha_2` of `CPE2`.
 """
 
 import functools
@@ -12,7 +12,7 @@ import re
 from typing import Any, ClassVar, NoReturn
 
 from etid.circuits.circuit import AbstractCircuit, parameter
-from etid.circuits.elements import capacitor, constant_phase, resistor
+from etid.circuits.elements import capacitor, constant_phase, inductor, resistor
 from etid.circuits.impedance import AbstractImpedance, parallel, series
 
 MODULE = "circuit strings"  # of the classes: compiled programs of such a class are not stored
@@ -24,11 +24,12 @@ def circuit(string: str) -> AbstractCircuit:
     """A circuit from a string in the notation of impedance.py, such as `R0-p(R1,C1)`.
 
     Args:
-        string: Elements `R0`, `C1` and `CPE2`, joined by `-` in series and by `p(…,…)` in parallel.
+        string: Elements `R0`, `C1`, `L3` and `CPE2`, joined by `-` in series and by `p(…,…)` in
+            parallel.
 
     Returns:
-        The circuit with typical values. Its parameters are `r_0`, `c_1`, and `q_2` and `alpha_2`
-        of `CPE2`. Equal strings give circuits of one class.
+        The circuit with typical values. Its parameters are `r_0`, `c_1`, `l_3`, and `q_2` and
+        `alpha_2` of `CPE2`. Equal strings give circuits of one class.
 
     Raises:
         ValueError: The string is not a circuit, or an element occurs twice.
@@ -38,7 +39,7 @@ def circuit(string: str) -> AbstractCircuit:
 
 def is_circuit_string(name: str) -> bool:
     """Whether a text can only be a circuit string."""
-    return bool(re.fullmatch(r"[RCPEp(),-]*\d[RCPEp(),\d-]*", name))
+    return bool(re.fullmatch(r"[RCLPEp(),-]*\d[RCLPEp(),\d-]*", name))
 
 
 def class_of(string: str) -> type[AbstractCircuit]:
@@ -84,15 +85,15 @@ def _restored(string: str, values: dict[str, Any]) -> AbstractCircuit:
 
 def _refuse(string: str, at: int) -> NoReturn:
     raise ValueError(
-        f"{string!r} is no circuit: cannot read {string[at:] or 'its end'!r}; write R, C or CPE "
-        "with a number, '-' for series and 'p(…,…)' for parallel, as in 'R0-p(R1,C1)'"
+        f"{string!r} is no circuit: cannot read {string[at:] or 'its end'!r}; write R, C, L or "
+        "CPE with a number, '-' for series and 'p(…,…)' for parallel, as in 'R0-p(R1,C1)'"
     )
 
 
 def _series(string: str, at: int) -> tuple[_Tree, int]:
     parts = []
     while True:
-        token = re.compile(r"(p)\(|(CPE|R|C)(\d+)").match(string, at)
+        token = re.compile(r"(p)\(|(CPE|R|C|L)(\d+)").match(string, at)
         if token is None:
             _refuse(string, at)
         if token[1]:
@@ -135,6 +136,8 @@ def _declare(string: str, tree: _Tree, fields: dict[str, Any], *, within: bool) 
         own = {f"r_{rest}": parameter("ohm", typical=100e3 if within else 20e3)}
     elif kind == "C":
         own = {f"c_{rest}": parameter("farad", typical=0.3e-9 * larger)}
+    elif kind == "L":
+        own = {f"l_{rest}": parameter("henry", typical=1e-3)}
     else:
         own = {
             f"q_{rest}": parameter("siemens second^alpha", typical=2e-9 * larger),
@@ -156,4 +159,6 @@ def _built(circuit: AbstractCircuit, tree: _Tree) -> AbstractImpedance:
         return resistor(getattr(circuit, f"r_{rest}"))
     if kind == "C":
         return capacitor(getattr(circuit, f"c_{rest}"))
+    if kind == "L":
+        return inductor(getattr(circuit, f"l_{rest}"))
     return constant_phase(getattr(circuit, f"q_{rest}"), getattr(circuit, f"alpha_{rest}"))

@@ -9,6 +9,7 @@ import numpy as np
 DISPLAY = {
     "ohm": (1e3, "kΩ"),
     "farad": (1e-9, "nF"),
+    "henry": (1e-3, "mH"),
     "ampere": (1e-3, "mA"),
     "second": (1e-6, "µs"),
     "siemens second^alpha": (1e-9, "nS·s^alpha"),
@@ -16,7 +17,15 @@ DISPLAY = {
 }
 
 
-SYMBOLS = {"ohm": "Ω", "farad": "F", "second": "s", "ampere": "A", "volt": "V", "hertz": "Hz"}
+SYMBOLS = {
+    "ohm": "Ω",
+    "farad": "F",
+    "henry": "H",
+    "second": "s",
+    "ampere": "A",
+    "volt": "V",
+    "hertz": "Hz",
+}
 PREFIXES = {
     -15: "f", -12: "p", -9: "n", -6: "µ", -3: "m", 0: "", 3: "k", 6: "M", 9: "G", 12: "T"
 }  # fmt: skip

@@ -1,4 +1,4 @@
-"""The elements: resistor, capacitor and constant-phase element.
+"""The elements: resistor, capacitor, inductor, constant-phase element and diffusion.
 
 SPICE has no constant-phase element. Its impedance is an integral over relaxations with all corner
 frequencies x [rad/s] (substitute x = s y to verify):
@@ -39,6 +39,7 @@ from etid.signals.transfer import Rational, as_complex, reciprocal
 
 Ohm = Quantity
 Farad = Quantity
+Henry = Quantity
 Second = Quantity
 Exponent = Quantity
 PseudoCapacitance = Quantity
@@ -46,6 +47,9 @@ PseudoCapacitance = Quantity
 # A ladder in time is exact from SLOWEST/N to FASTEST, times the sample rate, for N samples [rad].
 SLOWEST, FASTEST = 0.3, 10.0
 STEP = 0.95  # step h of ln x; the relative error of the trapezoidal rule is then 6e-5
+# s τ of a diffusion that stands for 0, and relaxations of its netlist for each √(ωτ): the resistor
+# of the others then misses 5e-5 of |Z|.
+LEAST, NEGLECTED = 1e-10, 5.2
 BEYOND = np.log(600.0)  # margin of ln x beyond the band: the ends are exact to first order only
 
 
@@ -94,6 +98,30 @@ class Capacitance(AbstractRational):
     def connect(self, netlist: Netlist, plus: str, minus: str) -> None:
         """Write the capacitor into the netlist."""
         netlist.part("C", self.c, plus, minus)
+
+
+class Inductance(AbstractRational):
+    """An inductor, Z = s L."""
+
+    symbol: ClassVar[str] = "L"
+    inductance: Henry
+
+    def __call__(self, s: Complex[Array, "..."]) -> Complex[Array, "..."]:
+        """Impedance [Ω]."""
+        return s * as_complex(jnp.asarray(self.inductance))
+
+    def admittance(self, s: Complex[Array, "..."]) -> Complex[Array, "..."]:
+        """Admittance 1/Z [S]."""
+        return reciprocal(self(s))
+
+    def rational(self) -> Rational:
+        """Impedance [Ω] as a ratio of polynomials in s."""
+        inductance = jnp.asarray(self.inductance)
+        return Rational(jnp.stack([jnp.zeros_like(inductance), inductance]), jnp.ones(1))
+
+    def connect(self, netlist: Netlist, plus: str, minus: str) -> None:
+        """Write the inductor into the netlist."""
+        netlist.part("L", self.inductance, plus, minus)
 
 
 class ConstantPhase(AbstractIrrational):
@@ -153,6 +181,48 @@ class ConstantPhase(AbstractIrrational):
         ladder(float(self.q), float(self.alpha), netlist.band).connect(netlist, plus, minus)
 
 
+class Diffusion(AbstractIrrational):
+    """Diffusion through a layer (finite Warburg), Z = R tanh √(sτ) / √(sτ).
+
+    Its relaxations are, with the poles of the hyperbolic tangent (Mittag-Leffler),
+
+        Z = Σ R_k / (1 + s τ / x_k),   R_k = 2 R / x_k,   x_k = (k − ½)² π²,   k = 1, 2, …
+    """
+
+    symbol: ClassVar[str] = "Ws"
+    r: Ohm
+    tau: Second
+
+    def __call__(self, s: Complex[Array, "..."]) -> Complex[Array, "..."]:
+        """Impedance [Ω]."""
+        r, tau = jnp.asarray(self.r), jnp.asarray(self.tau)
+        x = s * as_complex(tau)
+        x = jnp.where(x == 0, as_complex(jnp.full_like(tau, LEAST)), x)
+        root = jnp.exp(as_complex(jnp.asarray(0.5)) * jnp.log(x))  # its real part is positive
+        gone = jnp.exp(as_complex(jnp.asarray(-2.0)) * root)
+        one = as_complex(jnp.ones(()))
+        return as_complex(r) * (one - gone) * reciprocal(root * (one + gone))
+
+    def admittance(self, s: Complex[Array, "..."]) -> Complex[Array, "..."]:
+        """Admittance 1/Z [S]."""
+        return reciprocal(self(s))
+
+    def exponents(self) -> tuple[Exponent, ...]:
+        """Empty: no exponent of it can exceed that of a passive element."""
+        return ()
+
+    def connect(self, netlist: Netlist, plus: str, minus: str) -> None:
+        """Write its relaxations up to those that are far above the band, and the rest's sum."""
+        r, tau, high = float(self.r), float(self.tau), 2 * np.pi * netlist.band[1]
+        count = int(np.ceil(NEGLECTED * np.sqrt(1 + high * tau)))
+        netlist.remarks.add(
+            f"diffusion as RC pairs, error below 0.01 % up to {netlist.band[1]:g} Hz"
+        )
+        x = (np.arange(count) + 0.5) ** 2 * np.pi**2
+        pairs = [parallel(resistor(2 * r / one), capacitor(tau / (2 * r))) for one in x]
+        series(resistor(r - float(np.sum(2 * r / x))), *pairs).connect(netlist, plus, minus)
+
+
 def ladder(q: float, alpha: float, band: tuple[float, float]) -> AbstractImpedance:
     """Resistors and capacitors that approximate a constant-phase element in a frequency band.
 
@@ -207,6 +277,21 @@ def capacitor(c: Farad) -> Capacitance:
     return Capacitance(c)
 
 
+def inductor(inductance: Henry) -> Inductance:
+    """Impedance of an inductor, Z = s L [Ω].
+
+    In series it makes the impedance grow with the frequency. Such a load has no response in time;
+    maximum likelihood, `"non_parametric"` and `identify_impedance` need none.
+
+    Args:
+        inductance: L [H].
+
+    Returns:
+        An impedance, to be connected with others.
+    """
+    return Inductance(inductance)
+
+
 def constant_phase(q: PseudoCapacitance, alpha: Exponent) -> ConstantPhase:
     """Impedance of a constant-phase element, Z = 1 / (Q s^α) [Ω]; impedance.py calls it `CPE`.
 
@@ -218,6 +303,21 @@ def constant_phase(q: PseudoCapacitance, alpha: Exponent) -> ConstantPhase:
         An impedance, to be connected with others.
     """
     return ConstantPhase(q, alpha)
+
+
+def diffusion(r: Ohm, tau: Second) -> Diffusion:
+    """Impedance of diffusion through a layer, Z = R tanh √(sτ) / √(sτ) [Ω]; a finite Warburg.
+
+    impedance.py calls it `Ws`.
+
+    Args:
+        r: R [Ω], the impedance at low frequency.
+        tau: τ [s]; far above 1/(2πτ) the phase is −45°.
+
+    Returns:
+        An impedance, to be connected with others.
+    """
+    return Diffusion(r, tau)
 
 
 def cole(r: Ohm, tau: Second, alpha: Exponent) -> Parallel:

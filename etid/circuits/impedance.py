@@ -42,7 +42,7 @@ class Names:
 
 
 class Netlist:
-    """Resistors and capacitors between numbered nodes, one per line.
+    """Resistors, capacitors and inductors between numbered nodes, one per line.
 
     Attributes:
         band: Lowest and highest frequency [Hz] at which a ladder must be accurate.
@@ -63,7 +63,7 @@ class Netlist:
         return f"n{self.nodes}"
 
     def part(self, prefix: str, value: Quantity, plus: str, minus: str) -> None:
-        """Connect one resistor (`R`) or capacitor (`C`) between two nodes."""
+        """Connect one resistor (`R`), capacitor (`C`) or inductor (`L`) between two nodes."""
         self.lines.append(f"{self.names.next(prefix)} {plus} {minus} {float(value)!r}")
 
 

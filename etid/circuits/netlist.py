@@ -14,7 +14,7 @@ from etid.precision import in_float64
 def netlist(
     circuit: AbstractCircuit, *, name: str = "load", band: tuple[float, float] = (1.0, 10e6)
 ) -> str:
-    """SPICE subcircuit of resistors and capacitors between the nodes `plus` and `minus`.
+    """SPICE subcircuit of resistors, capacitors and inductors between the nodes `plus` and `minus`.
 
     A chain of RC pairs replaces a constant-phase element. Its relative error in `band` is at most
     1e-4. A line such as `X1 out 0 load` connects the subcircuit.

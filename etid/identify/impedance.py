@@ -81,8 +81,8 @@ def _fit(
     # C/(g t).
     typical, (of_level, of_time) = circuit.log_values(), circuit.scaling()
     size = jnp.log(jnp.median(jnp.abs(z)) / jnp.median(jnp.abs(circuit.response(frequency))))
-    slow = of_time > 0
-    resistance = typical[jnp.argmax(of_level)]
+    slow = (of_time > 0) & (of_level <= 0)  # an inductor's time constant is not that of a corner
+    resistance = typical[jnp.argmax(jnp.where(of_time > 0, -jnp.inf, of_level))]
     times = (typical - of_level * resistance) / jnp.where(slow, of_time, 1.0)
     shortest = jnp.where(slow, times, jnp.inf).min()
     corner = jnp.where(slow.any(), 1 / (2 * jnp.pi * jnp.exp(shortest)), 1.0)  # [Hz], roughly

@@ -51,7 +51,7 @@ from etid.selection.evidence import best
 from etid.selection.search import search
 from etid.selection.selection import Selection
 
-NOTED = ("changed", "out_of_bounds")  # verdicts to which `note` adds numbers
+NOTED = ("changed", "out_of_bounds", "inconsistent")  # verdicts to which `note` adds numbers
 SPARSE = 16  # every 16th sample enters a checksum
 KEPT = 4  # drivers, for which `known_of` is kept
 _Kind = TypeVar("_Kind", bound=AbstractCircuit)
@@ -481,9 +481,9 @@ def concluded(
 
 
 def note(fit: Fit) -> str:
-    """The message of the verdict of a fit; for `changed` also the changes, and elements outside."""
+    """The message of the verdict of a fit; also the changes, elements outside, another circuit."""
     own = {"changed": fit.changes, "out_of_bounds": fit.outside}.get(fit.verdict, "")
-    return f"{message(fit.verdict)} {own}".strip()
+    return " ".join(filter(None, (fit.other_circuit, message(fit.verdict), own)))
 
 
 def notes_of(fits: Fit) -> list[str]:

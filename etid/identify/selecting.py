@@ -37,18 +37,18 @@ def select_circuit(
 ) -> Selection:
     """The simplest circuit that a recording supports.
 
-    The search fits the first candidate. It goes on to a richer one if score tests show a change
-    that the circuit cannot make, and to a simpler one if an element is hardly determined. The
-    evidence is −BIC = 2 log L − p ln n, for p elements and n real numbers in the data (Schwarz
+    The search fits the first candidate. It goes on to all that are not simpler if score tests show
+    a change that the circuit cannot make, and to simpler ones if an element is hardly determined.
+    The evidence is −BIC = 2 log L − p ln n, for p elements and n real numbers in the data (Schwarz
     1978). A candidate that is contradicted by the data, or that has elements which the data do not
     determine, is chosen only if there is no other. Differences below 2 do not count; then the
-    circuit with the fewest elements is chosen.
+    circuit with the fewest elements is chosen, of those the first.
 
     Args:
         recording: Unloaded and loaded voltage.
         driver: As in `identify_skin`.
         candidates: Circuits or circuit strings, the most usual one first. If None: `SkinRC`,
-            `ParallelRC`, `Resistor`, `SkinCole`, `SkinLayers`.
+            `ParallelRC`, `Resistor`, `SkinCole`, `SkinLayers`, `SkinWarburg`.
         method: An estimator that computes a likelihood, `"maximum_likelihood"`; the default for
             records of several whole periods.
         fixed: As in `identify_skin`; every candidate must have these elements.

@@ -18,6 +18,7 @@ from etid.recordings.remarks import texts, words
 from etid.results.data import HasSource
 from etid.results.fits_columns import described
 from etid.results.limited import Limited
+from etid.results.residuals import is_of_circuit, looks_like
 from etid.results.verdicts import RESULTS, Judged, counted, message
 from etid.signals.transfer import power
 
@@ -268,6 +269,16 @@ class Fit(Judged, HasSource[Circuit]):
             )
         )
 
+    @property
+    def other_circuit(self) -> str:
+        """A sentence if another circuit is a likelier cause of `inconsistent` than the driver."""
+        if self.verdict != "inconsistent" or self.support is None:
+            return ""
+        z = np.asarray(self.support.z)
+        if not is_of_circuit(z):
+            return ""
+        return f"{looks_like(z)} Another circuit is the likelier cause: try circuit='auto' first."
+
     def _overview(self) -> Overview:
         kind, verdict = type(self.circuit).__name__, self.verdict
         values, errors = np.asarray(self.circuit.values()), np.asarray(self.stderr.values())
@@ -281,5 +292,6 @@ class Fit(Judged, HasSource[Circuit]):
             title += f", chi2 {float(self.chi2):.3g}"  # without standard errors there is none
         notes = [message(verdict)] if verdict != "successful" else []
         notes += [self.changes] if verdict == "changed" else []
+        notes = [self.other_circuit, *notes] if self.other_circuit else notes
         notes += [self.outside] if self.outside else []
         return Overview(title, rows, notes=[*notes, *texts(int(self.remarks))])

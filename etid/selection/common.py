@@ -24,17 +24,18 @@ def common(found: Sequence[Selection], candidates: Sequence[AbstractCircuit]) ->
     """
     if all(len(selection.fits) == 1 for selection in found):
         return 0  # no recording asked for another circuit than the first
+    known = [one for one in found if math.isfinite(bic(one.fits)[one.chosen])]
+    # Recordings that no circuit explains count only if no circuit explains any.
+    explained = [one for one in known if rank(one.fits[one.chosen]) < 2]
     total = [0.0] * len(candidates)
-    for selection in found:
-        if rank(selection.fits[selection.chosen]) == 2:
-            continue  # no circuit explains this recording
+    for selection in explained or known:
         for number, lost in enumerate(_losses(selection, candidates)):
             total[number] -= min(lost, LIMIT)
     return max(range(len(candidates)), key=lambda number: (total[number], -number))
 
 
 def _losses(selection: Selection, candidates: Sequence[AbstractCircuit]) -> list[float]:
-    """2 log evidence that each candidate loses against the chosen one, which is not contradicted.
+    """2 log evidence that each candidate loses against the chosen one.
 
     A richer circuit that was not fitted is not likelier than the chosen one: it loses the penalty
     of its elements. A simpler one that was not fitted lacks an element that is surely there.
@@ -46,7 +47,7 @@ def _losses(selection: Selection, candidates: Sequence[AbstractCircuit]) -> list
     for number, circuit in enumerate(candidates):
         more = len(circuit.names()) - own
         if number in fits:
-            contradicted = number != selection.chosen and rank(fits[number]) == 2
+            contradicted = rank(fits[number]) > max(rank(mine), 1)
             lost.append(math.inf if contradicted else criterion[number] - least)
         elif more > 0 and mine.support is not None:
             lost.append(more * math.log(float(mine.support.terms)))

@@ -81,8 +81,9 @@ def best(fits: Mapping[int, Fit], criterion: Mapping[int, float] | None = None) 
     """Number of the candidate to choose.
 
     It is the simplest of those whose evidence is largest, up to `MENTION`, among the candidates of
-    the best rank. A candidate with less evidence than a simpler one is not chosen, whatever their
-    ranks: it is no remedy for what the simpler one lacks.
+    the best rank; of equally simple ones the first, which is the most usual. A candidate with less
+    evidence than a simpler one is not chosen, whatever their ranks: it is no remedy for what the
+    simpler one lacks.
 
     Args:
         fits: Fits of the same data, by number of the candidate.
@@ -104,7 +105,7 @@ def best(fits: Mapping[int, Fit], criterion: Mapping[int, float] | None = None) 
     good = [number for number in left if ranks[number] == min(ranks[one] for one in left)]
     least = min(criterion[number] for number in good)
     near = [number for number in good if criterion[number] <= least + MENTION]
-    return min(near, key=lambda number: (size[number], criterion[number]))
+    return min(near, key=lambda number: (size[number], number))
 
 
 def weights(fits: Mapping[int, Fit]) -> dict[int, float]:

@@ -1,13 +1,14 @@
 """Search among candidate circuits: from the usual one to where the data ask to go.
 
-The first candidate is fitted to all recordings. A richer one is fitted if the score tests of the
-fit, which cost no further fit, show a change that its circuit cannot make; first only those with
-the fewest elements. A simpler one is fitted if an element is hardly determined. An ordinary
-recording thus needs one fit.
+The first candidate is fitted to all recordings. If the score tests of the fit, which cost no
+further fit, show a change that its circuit cannot make, all candidates with as many or more
+elements are fitted: the weight of a circuit means nothing while a likelier one may be missing. The
+simpler ones are fitted if an element is hardly determined. An ordinary recording thus needs one
+fit. Records of millions of samples end the search after `PATIENCE`, with what was found so far.
 """
 
-import math
-from collections.abc import Callable, Sequence
+import time
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
@@ -18,19 +19,28 @@ from etid.circuits.circuit import (
     SkinCole,
     SkinLayers,
     SkinRC,
+    SkinWarburg,
 )
 from etid.results.fit import Fit
 from etid.selection.evidence import best, rank, values_of
 
 # From the usual circuit to the unusual ones. Classes, because the elements of a circuit are arrays:
 # to make one starts JAX, which no import may do.
-USUAL: tuple[type[AbstractCircuit], ...] = (SkinRC, ParallelRC, Resistor, SkinCole, SkinLayers)
-# Standard deviations of a score that asks for one more element, times √m for m more. The evidence
-# needs 2.8 √m; the score is not the ratio of likelihoods exactly.
-ASKS = 2.5
+USUAL: tuple[type[AbstractCircuit], ...] = (
+    SkinRC,
+    ParallelRC,
+    Resistor,
+    SkinCole,
+    SkinLayers,
+    SkinWarburg,
+)
+# Standard deviations of a score that asks for another circuit. The evidence needs 2.8 for one more
+# element; the score is not the ratio of likelihoods exactly.
+ASKS = 2.8
 # Relative standard error of an element that asks for a simpler circuit: an element of seven
 # standard errors has the evidence 49, more than its penalty by far.
 DOUBTFUL = 1 / 7
+PATIENCE = 60.0  # [s] for each recording, after which no further candidate is fitted
 FitRows = Callable[[int, Sequence[int]], Sequence[Fit]]
 
 
@@ -47,41 +57,43 @@ def search(count: int, candidates: Sequence[AbstractCircuit], fit: FitRows) -> l
         candidates: Circuits; the search starts at the first one.
         fit: Fits the candidate of a number to some recordings.
     """
-    size = [len(circuit.names()) for circuit in candidates]
+    begin, patience = time.monotonic(), PATIENCE * count
     found = [{0: one} for one in fit(0, range(count))]
     while True:
         wanted: dict[int, list[int]] = {}
         for row, fits in enumerate(found):
-            for number in _asked(fits, size):
+            for number in asked(fits, candidates):
                 wanted.setdefault(number, []).append(row)
         if not wanted:
             return found
         for number, rows in wanted.items():
+            if time.monotonic() - begin > patience:
+                return found
             for row, one in zip(rows, fit(number, rows), strict=True):
                 found[row][number] = one
 
 
-def _asked(fits: dict[int, Fit], size: Sequence[int]) -> list[int]:
+def asked(fits: Mapping[int, Fit], candidates: Sequence[AbstractCircuit]) -> list[int]:
     """Numbers of the candidates to fit next; none if the search ends.
 
     Args:
         fits: The fits so far, by number of the candidate.
-        size: Number of elements of each candidate.
+        candidates: The circuits by number.
     """
+    size = [len(circuit.names()) for circuit in candidates]
     left = [number for number in range(len(size)) if number not in fits]
+    left.sort(key=lambda number: size[number])  # time may end the search, so simple ones first
     if not left:
         return []
     number = best(fits)
     fit, own = fits[number], size[number]
     accepted = rank(fit)
-    asked = []
-    least = min((size[number] for number in left if size[number] >= own), default=0)
-    more = max(least - own, 1)
-    if least and (accepted == 2 or _lacks(fit) > ASKS * math.sqrt(more)):
-        asked += [number for number in left if size[number] == least]
+    more = []
+    if accepted == 2 or _lacks(fit) > ASKS:
+        more += [number for number in left if size[number] >= own]
     if accepted == 1 or _is_doubtful(fit):
-        asked += [number for number in left if size[number] < own]
-    return asked
+        more += [number for number in left if size[number] < own]
+    return more
 
 
 def _lacks(fit: Fit) -> float:

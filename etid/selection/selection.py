@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import math
 from collections.abc import Mapping, Sequence
 
 import numpy as np
@@ -10,9 +11,10 @@ from etid.circuits.circuit import AbstractCircuit
 from etid.circuits.overview import Overview, Overviewed
 from etid.recordings.remarks import Remark
 from etid.results.fit import Fit
+from etid.results.residuals import looks_like
 from etid.results.verdicts import message
-from etid.selection.evidence import bic, rank, weights, with_close
-from etid.selection.residuals import looks_like
+from etid.selection.evidence import bic, elements, rank, weights, with_close
+from etid.selection.search import PATIENCE, asked
 from etid.selection.unseen import hidden, unseen
 
 HEADS = ("circuit", "2 log evidence", "weight", "chi2", "verdict", "elements")
@@ -27,7 +29,8 @@ class Candidate(Overviewed):
         fit: Its fit.
         evidence: 2 log p(data | circuit), minus that of the chosen circuit.
         weight: Probability of the circuit, if all candidates are equally probable before the data
-            are known.
+            are known. NaN if a candidate with as many elements as the chosen one was not fitted:
+            there is no weight then, since the data did not ask for another circuit.
     """
 
     fit: Fit
@@ -50,7 +53,7 @@ class Candidate(Overviewed):
         return (
             self.name,
             f"{self.evidence:.1f}",
-            f"{100 * self.weight:.1f} %",
+            f"{100 * self.weight:.1f} %" if math.isfinite(self.weight) else "-",
             f"{float(self.fit.chi2):.3f}",
             str(self.fit.verdict),
             ", ".join(self.fit.elements),
@@ -68,12 +71,17 @@ class Selection(Overviewed):
         fit: The fit of the chosen circuit. Its covariance contains the differences to other likely
             circuits, and what changes of the circuit may do that the data cannot show.
         unasked: Names of the circuits that were not fitted, because the data did not ask for them.
+        late: Names of those that the data ask for, and that were not fitted for lack of time.
+        weighed: Whether all candidates were fitted, except simpler ones that lack an element which
+            is surely there.
         chosen: Number of the chosen candidate.
         fits: The fits by number of the candidate.
     """
 
     fit: Fit
     unasked: tuple[str, ...]
+    late: tuple[str, ...]
+    weighed: bool
     chosen: int
     fits: Mapping[int, Fit]
 
@@ -88,9 +96,13 @@ class Selection(Overviewed):
             chosen: Number of the chosen candidate.
             circuits: All candidates.
         """
-        unasked = [type(one).__name__ for n, one in enumerate(circuits) if n not in fits]
+        left = [number for number in range(len(circuits)) if number not in fits]
+        late = set(asked(fits, circuits)) if len(fits) > 1 else set()
+        weighed = all(len(circuits[number].names()) < elements(fits[chosen]) for number in left)
+        names = [type(one).__name__ for one in circuits]
+        unasked = tuple(names[number] for number in left if number not in late)
         fit = _concluded(fits, chosen) if len(circuits) > 1 else fits[chosen]
-        return cls(fit, tuple(unasked), chosen, dict(fits))
+        return cls(fit, unasked, tuple(names[one] for one in late), weighed, chosen, dict(fits))
 
     @functools.cached_property
     def candidates(self) -> tuple[Candidate, ...]:
@@ -101,7 +113,7 @@ class Selection(Overviewed):
             Candidate(
                 self.fits[number],
                 float(criterion[self.chosen] - criterion[number]),
-                share[number],
+                share[number] if self.weighed else math.nan,
             )
             for number in order
         )
@@ -109,13 +121,22 @@ class Selection(Overviewed):
     @property
     def residual(self) -> str:
         """What the residual looks like if no candidate is adequate; otherwise empty."""
-        return "" if self.candidates[0].adequate else looks_like(self.candidates[0].fit)
+        fit = self.candidates[0].fit
+        if rank(fit) == 0:
+            return ""
+        if fit.verdict == "changed":
+            return fit.changes
+        if int(fit.remarks) & Remark.mains_hum:
+            return "The residual looks like mains hum."
+        return "" if fit.support is None else looks_like(np.asarray(fit.support.z))
 
     def _overview(self) -> Overview:
-        total = len(self.candidates) + len(self.unasked)
+        total = len(self.candidates) + len(self.unasked) + len(self.late)
         notes = []
         if self.unasked:
             notes.append(f"not fitted, the data did not ask for it: {', '.join(self.unasked)}")
+        if self.late:
+            notes.append(f"not fitted, {PATIENCE:g} s had passed: {', '.join(self.late)}")
         if self.fit.verdict != "successful":
             notes.append(message(self.fit.verdict))
         if self.residual:
