@@ -72,4 +72,5 @@ from .simulation.bound import Bound as Bound
 from .simulation.bound import Bounds as Bounds
 from .simulation.bound import bound as bound
 
+__all__: list[str]
 __version__: str
