@@ -1,6 +1,7 @@
 """Loads identified from V_th, V_out and the current at once, with a driver."""
 
 import dataclasses
+from typing import Any
 
 import numpy as np
 import pytest
@@ -143,7 +144,7 @@ def late_record(name: str, late: float, circuit=SKIN, seed=2, **fields) -> etid.
 
 def test_a_lag_of_one_record_is_taken_off():
     """It was a misfit: v_out and the current were aligned together with v_th, never each alone."""
-    levels = {"snr_db": 60.0, "current_snr_db": 60.0}
+    levels: dict[str, Any] = {"snr_db": 60.0, "current_snr_db": 60.0}
     known = scene(**levels).simulate(seed=7)["calibration/0"]
     driver = etid.identify_driver(known, order=5)
     truths = [circuit for circuit in (SKIN, DAMP) for _ in range(2 * len(LATE))]
