@@ -146,6 +146,19 @@ def test_the_ladder_of_a_constant_phase_has_its_impedance(alpha, samples):
     np.testing.assert_allclose(np.array(z) + np.asarray(system.D)[0], expected, rtol=1e-4)
 
 
+@pytest.mark.parametrize("samples", [300, 30_000])
+def test_the_relaxations_of_a_diffusion_have_its_impedance(samples):
+    """For time constants from a few samples to the length of the record."""
+    f = np.geomspace(1 / samples, 0.5, 100) * RATE
+    for tau in np.geomspace(3, samples, 5) / RATE:
+        circuit = etid.SkinWarburg(2e3, 27e3, tau)
+        system = circuit.impedance().state_space(RATE, samples)
+        a, b, c = np.asarray(system.A), np.asarray(system.B)[:, 0], np.asarray(system.C)
+        z = [c @ np.linalg.solve(2j * np.pi * one * np.eye(b.size) - a, b) for one in f]
+        expected = np.asarray(circuit.response(jnp.asarray(f)))
+        np.testing.assert_allclose(np.array(z) + np.asarray(system.D)[0], expected, rtol=1e-4)
+
+
 def test_capacitors_and_resistors_in_parallel_have_their_impedance_in_time():
     skin = SKIN.impedance()
     exact, system = skin.rational(), skin.state_space(RATE, 1000)

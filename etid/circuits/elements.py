@@ -50,6 +50,7 @@ STEP = 0.95  # step h of ln x; the relative error of the trapezoidal rule is the
 # s τ of a diffusion that stands for 0, and relaxations of its netlist for each √(ωτ): the resistor
 # of the others then misses 5e-5 of |Z|.
 LEAST, NEGLECTED = 1e-10, 5.2
+EXACT, GROUP = 12, 0.7  # slow relaxations of a diffusion that are exact; of ln x for the others
 BEYOND = np.log(600.0)  # margin of ln x beyond the band: the ends are exact to first order only
 
 
@@ -211,6 +212,28 @@ class Diffusion(AbstractIrrational):
         """Empty: no exponent of it can exceed that of a passive element."""
         return ()
 
+    @property
+    def has_response(self) -> bool:
+        """True: its relaxations are known."""
+        return True
+
+    def state_space(self, rate: float | Float[Array, ""], samples: int) -> StateSpace:
+        """Its relaxations, for every τ up to the length of the record.
+
+        Their states are scaled as in `ConstantPhase`. The slow ones are exact. Of the others, two
+        stand for each `GROUP` of ln x.
+        """
+        x, weight = _relaxations(samples)
+        r, tau = jnp.asarray(self.r), jnp.asarray(self.tau)
+        unit = r / (rate * jnp.sqrt(rate * tau))  # |Z| at the sample rate, divided by it [Ω s]
+        rises = r * jnp.asarray(weight * x) / tau
+        return StateSpace(
+            jnp.diag(-jnp.asarray(x) / tau),
+            jnp.sqrt(rises / unit)[:, None],
+            jnp.sqrt(rises * unit),
+            (r * (1 - weight.sum()))[None],
+        )
+
     def connect(self, netlist: Netlist, plus: str, minus: str) -> None:
         """Write its relaxations up to those that are far above the band, and the rest's sum."""
         r, tau, high = float(self.r), float(self.tau), 2 * np.pi * netlist.band[1]
@@ -221,6 +244,32 @@ class Diffusion(AbstractIrrational):
         x = (np.arange(count) + 0.5) ** 2 * np.pi**2
         pairs = [parallel(resistor(2 * r / one), capacitor(tau / (2 * r))) for one in x]
         series(resistor(r - float(np.sum(2 * r / x))), *pairs).connect(netlist, plus, minus)
+
+
+def _relaxations(samples: int) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
+    """Frequencies x and shares of R of relaxations that replace a diffusion in a record."""
+    count = int(np.ceil(NEGLECTED * np.sqrt(1 + FASTEST * samples)))
+    x = (np.arange(count) + 0.5) ** 2 * np.pi**2
+    share = 2 / x
+    found = [(x[:EXACT], share[:EXACT])]
+    edges = np.exp(np.arange(np.log(x[EXACT]), np.log(x[-1]) + GROUP, GROUP))
+    for low, high in zip(edges, np.append(edges[1:], np.inf), strict=True):
+        part = (x >= low) & (x < high)
+        if not part.any():
+            continue
+        # Gauss' rule with two nodes, for the sum over these relaxations as a function of ln x.
+        w, u = share[part], np.log(x[part])
+        whole, mean = w.sum(), np.average(u, weights=w)
+        spread = np.average((u - mean) ** 2, weights=w)
+        if spread == 0:
+            found.append((x[part][:1], w[:1]))
+            continue
+        skew = np.average((u - mean) ** 3, weights=w) / spread
+        root = np.sqrt(skew**2 + 4 * spread)
+        nodes = np.array([skew - root, skew + root]) / 2
+        found.append((np.exp(mean + nodes), whole * np.array([nodes[1], -nodes[0]]) / root))
+    places, shares = zip(*found, strict=True)
+    return np.concatenate(places), np.concatenate(shares)
 
 
 def ladder(q: float, alpha: float, band: tuple[float, float]) -> AbstractImpedance:
