@@ -241,7 +241,9 @@ def main(arguments: argparse.Namespace, root: pathlib.Path = ROOT) -> bool:
     with tempfile.TemporaryDirectory() as place:
         tree = Tree(root, pathlib.Path(place))
         tests = [f"tests/{path.name}" for path in sorted((root / "tests").glob("test_*.py"))]
-        noted = dict(each(tree.executed, [(one,) for one in tests], 1, "file", "tests"))
+        kept = root == ROOT  # what another tree has done is not known by this one's commit
+        files = [(one,) for one in tests]
+        noted = dict(each(tree.executed, files, unit="file", keep="tests" if kept else ""))
         executed = {tests[number]: found for number, found in noted.items()}
         killers = collections.defaultdict(list)
 
@@ -260,5 +262,6 @@ def main(arguments: argparse.Namespace, root: pathlib.Path = ROOT) -> bool:
             return [{"seed": arguments.seed, **row} for row in done.values()]
 
         tasks = [(mutant,) for mutant in chosen]
-        rows = tabled(arguments.output, table, outcome, tasks, unit="mutant", keep="mutation")
+        keep = "mutation" if kept else ""
+        rows = tabled(arguments.output, table, outcome, tasks, unit="mutant", keep=keep)
     return report([show(rows)])
