@@ -237,19 +237,23 @@ class Diffusion(AbstractIrrational):
     def connect(self, netlist: Netlist, plus: str, minus: str) -> None:
         """Write its relaxations up to those that are far above the band, and the rest's sum."""
         r, tau, high = float(self.r), float(self.tau), 2 * np.pi * netlist.band[1]
-        count = int(np.ceil(NEGLECTED * np.sqrt(1 + high * tau)))
         netlist.remarks.add(
             f"diffusion as RC pairs, error below 0.01 % up to {netlist.band[1]:g} Hz"
         )
-        x = (np.arange(count) + 0.5) ** 2 * np.pi**2
+        x = _poles(high * tau)
         pairs = [parallel(resistor(2 * r / one), capacitor(tau / (2 * r))) for one in x]
         series(resistor(r - float(np.sum(2 * r / x))), *pairs).connect(netlist, plus, minus)
 
 
+def _poles(highest: float) -> Float[np.ndarray, " n"]:
+    """x_k of the relaxations that count up to this ωτ."""
+    count = int(np.ceil(NEGLECTED * np.sqrt(1 + highest)))
+    return (np.arange(count) + 0.5) ** 2 * np.pi**2
+
+
 def _relaxations(samples: int) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
     """Frequencies x and shares of R of relaxations that replace a diffusion in a record."""
-    count = int(np.ceil(NEGLECTED * np.sqrt(1 + FASTEST * samples)))
-    x = (np.arange(count) + 0.5) ** 2 * np.pi**2
+    x = _poles(FASTEST * samples)
     share = 2 / x
     found = [(x[:EXACT], share[:EXACT])]
     edges = np.exp(np.arange(np.log(x[EXACT]), np.log(x[-1]) + GROUP, GROUP))

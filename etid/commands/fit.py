@@ -3,7 +3,6 @@
 import argparse
 import concurrent.futures
 import contextlib
-import dataclasses
 import math
 import pathlib
 import sys
@@ -23,7 +22,7 @@ from etid.recordings import hdf5
 from etid.recordings.errors import RecordingError
 from etid.recordings.replacing import HDF5, claimed
 from etid.report.html import Table
-from etid.results.instrument import Instrument
+from etid.results.instrument import LARGEST, Instrument
 from etid.results.provenance import PLAUSIBLE
 from etid.results.study_fits import StudyFits
 from etid.results.tried_orders import Order
@@ -181,10 +180,9 @@ def _several(option: str, known: list[tuple[str, list[Any]]], count: int) -> dic
 
 def _instrument(told: list[tuple[str, list[Any]]]) -> Instrument | None:
     """The tolerances of --tolerance."""
-    names = [field.name for field in dataclasses.fields(Instrument)]
     for name, _ in told:
-        if name not in names:
-            raise ValueError(f"--tolerance knows no {name!r}; write {', '.join(names)}")
+        if name not in LARGEST:
+            raise ValueError(f"--tolerance knows no {name!r}; write {', '.join(LARGEST)}")
     return Instrument(**_several("--tolerance", told, 1)) if told else None
 
 

@@ -16,7 +16,7 @@ from etid.estimators.score_tests import resistors
 from etid.identify import changes
 from etid.identify.arguments import check_distinct, recordings
 from etid.identify.one import checksum, needs_another, of_both
-from etid.identify.options import NO_INSTRUMENT, Options, check_order, for_calibrations
+from etid.identify.options import Options, check_instrument, check_order, for_calibrations
 from etid.identify.planning import explained
 from etid.numpy_tier.tiers import program
 from etid.precision import in_float64
@@ -124,6 +124,7 @@ def calibrated(
     for one in seen:
         _refused(one, "biased" if estimator.lane.periodic and one.is_aliased else None)
     check_order(options.order, estimator)
+    check_instrument(options.instrument, estimator)
     if options.order == AUTO:
         driver = _of_least_order(seen, estimator)
     else:
@@ -136,8 +137,7 @@ def calibrated(
     if options.driver_drift and isinstance(driver, ContinuousDriver):
         driver = dataclasses.replace(driver, drift=np.asarray(options.driver_drift))
     if options.instrument is not None:
-        if not isinstance(driver, HarmonicDriver):
-            raise ValueError(NO_INSTRUMENT % driver.method)
+        assert isinstance(driver, HarmonicDriver)
         driver = dataclasses.replace(driver, instrument=options.instrument.as_arrays())
     periods = repeats(seen)
     at = np.append(changes.bands(periods), 1e3)

@@ -52,12 +52,6 @@ class FitOptions(TypedDict, total=False):
     bounds: Mapping[str, Interval] | None
 
 
-NO_INSTRUMENT = (
-    "the tolerances of an instrument are parameters of maximum likelihood, and the method is %r; "
-    "record three pulse periods or more, or identify the driver without instrument="
-)
-
-
 @dataclasses.dataclass(frozen=True)
 class Options:
     """What a caller asks for. Each public function makes it once, by `Options.of`.
@@ -136,8 +130,7 @@ class Options:
                     "none; leave driver_drift out, or use method='maximum_likelihood' or "
                     "method='output_error'"
                 )
-            if instrument is not None and not isinstance(estimator, MaximumLikelihood):
-                raise ValueError(NO_INSTRUMENT % str(estimator))
+            check_instrument(instrument, estimator)
         options._check_elements()
         return options
 
@@ -261,6 +254,16 @@ def check_circuits(estimator: AbstractEstimator, circuits: Sequence[AbstractCirc
         estimator.check_circuit(circuit)
 
 
+def check_instrument(instrument: Instrument | None, estimator: AbstractEstimator) -> None:
+    """Raise ValueError if an estimator has no parameters for the tolerances of an instrument."""
+    if instrument is not None and not isinstance(estimator, MaximumLikelihood):
+        raise ValueError(
+            "the tolerances of an instrument are parameters of maximum likelihood, and the method "
+            f"is {str(estimator)!r}; record three pulse periods or more, or identify the driver "
+            "without instrument="
+        )
+
+
 def check_order(order: Order, estimator: AbstractEstimator) -> None:
     """Raise ValueError if an estimator cannot choose the order that it is asked to choose."""
     if order == AUTO and not issubclass(estimator.driver, HarmonicDriver):
@@ -325,9 +328,8 @@ def plan(
     if name is None and estimator.lane.periodic and seen.is_aliased:
         name = "biased"
     estimator.check_driver(driver, seen.recording.sample_rate, seen.recording.pulse_rate)
-    tolerant = isinstance(driver, ContinuousDriver) and driver.instrument is not None
-    if tolerant and not isinstance(estimator, MaximumLikelihood):
-        raise ValueError(NO_INSTRUMENT % str(estimator))
+    if isinstance(driver, ContinuousDriver):
+        check_instrument(driver.instrument, estimator)
     return options.given_to(estimator), name
 
 

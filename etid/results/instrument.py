@@ -1,6 +1,5 @@
 """What an instrument may do that no recording shows: a budget of stated tolerances."""
 
-import dataclasses
 from typing import TypeVar
 
 import equinox as eqx
@@ -51,8 +50,7 @@ class Instrument(eqx.Module):
 
     def stored(self) -> dict[str, float]:
         """The numbers by name."""
-        names = [field.name for field in dataclasses.fields(self)]
-        return {name: float(getattr(self, name)) for name in names}
+        return {name: float(getattr(self, name)) for name in LARGEST}
 
     def as_arrays(self: _Kind) -> _Kind:
         """The same with arrays, which a traced program takes as operands."""

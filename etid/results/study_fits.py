@@ -34,7 +34,7 @@ from etid.results.driver import (
 )
 from etid.results.fits import SCHEMA, Fits
 from etid.results.hdf5_table import REMEDY, Table, opened_table, write_table
-from etid.results.instrument import Instrument
+from etid.results.instrument import LARGEST, Instrument
 from etid.results.provenance import Settings
 from etid.results.tried_orders import OrderEvidence
 from etid.results.verdicts import verdicts_of
@@ -277,8 +277,7 @@ def _instrument(stored: Mapping[str, Any] | None) -> Instrument | None:
     """
     if stored is None:
         return None
-    names = [field.name for field in dataclasses.fields(Instrument)]
-    return Instrument(**{name: float(_numbers(stored, name, 0)) for name in names}).as_arrays()
+    return Instrument(**{name: float(_numbers(stored, name, 0)) for name in LARGEST}).as_arrays()
 
 
 def _tried(stored: Mapping[str, Any]) -> OrderEvidence:

@@ -39,15 +39,10 @@ def disturbed(
     return outputs.at[0].set(outputs[0] * (1 + gain) + crosstalk)
 
 
-def count(calibrations: Calibrations) -> int:
-    """Number of z: gain, crosstalk, capacitance, and each known resistor."""
-    return 3 + calibrations.calibration.r_load.size
-
-
-def by_z(instrument: Instrument, calibrations: Calibrations) -> Float[Array, "z 3"]:
-    """Gain, crosstalk and capacitance by z."""
-    rest = count(calibrations) - 3
-    return jnp.pad(jnp.diag(instrument.of_loads()), ((0, rest), (0, 0)))
+def by_z(instrument: Instrument, calibrations: Calibrations, others: int) -> Float[Array, "z 3"]:
+    """Gain, crosstalk and capacitance by z: other ones first, and those of the resistors last."""
+    resistors = calibrations.calibration.r_load.size
+    return jnp.pad(jnp.diag(instrument.of_loads()), ((others, resistors), (0, 0)))
 
 
 def of_calibrations(
@@ -63,8 +58,12 @@ def of_calibrations(
 
 
 def moved(
-    instrument: Instrument, calibrations: Calibrations, near: NearCalibrations, linear: Linear
+    instrument: Instrument,
+    calibrations: Calibrations,
+    near: NearCalibrations,
+    linear: Linear,
+    root: Float[Array, "common common"],
 ) -> Float[Array, "common z"]:
-    """Changes of the minimum of the calibrations by each z."""
+    """Changes of the minimum of the calibrations by each z; `root` is L, L Lᵀ = H⁻¹."""
     changes = of_calibrations(instrument, calibrations, near.slopes)
-    return -linear.bread() @ linear.told(near.rows(changes)).T
+    return -root @ (root.T @ linear.told(near.rows(changes)).T)

@@ -274,7 +274,7 @@ def given(
         later = jnp.pad(jnp.diag(std), ((0, c.size - std.size), (0, 0)))
     shown = jnp.zeros((c.size, 0))
     if instrument is not None:
-        shown = faults.moved(instrument, calibrations, near, linear)
+        shown = faults.moved(instrument, calibrations, near, linear, root)
     directions = jnp.concatenate([root, later, shown], axis=1)
     more = later.shape[1] + shown.shape[1]
     mean = jnp.pad(mean, (0, more))
@@ -288,8 +288,7 @@ def given(
             gain_slopes = gain_slopes.at[-direct.shape[0] :].add(direct)
         found = dataclasses.replace(found, gain_slopes=gain_slopes)
     if instrument is not None:
-        by_z = faults.by_z(instrument, calibrations)
-        by_z = jnp.pad(by_z, ((directions.shape[1] - by_z.shape[0], 0), (0, 0)))
+        by_z = faults.by_z(instrument, calibrations, root.shape[1] + later.shape[1])
         found = dataclasses.replace(found, faults=by_z)
     return dataclasses.replace(found, shape=shape_of(driver, frequency))
 
