@@ -72,6 +72,7 @@ FACES = {
     "SkinRC": ("#4f9bd0", "", "R_s + R‖C"),
     "SkinCole": ("#f2b263", "///", "Cole"),
     "SkinLayers": ("#c9564a", "xxx", "two layers"),
+    "SkinWarburg": ("#8e6bb0", "\\\\\\", "Warburg"),
 }
 
 

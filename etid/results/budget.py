@@ -44,13 +44,12 @@ class Budget(Overviewed):
         return np.sqrt(sum(part**2 for part in self.parts.values()))
 
     def _overview(self) -> Overview:
-        rows = []
+        shown = dict[str, Float[np.ndarray, " element"]]()
         for source, part in self.parts.items():
             size = self.tolerances.get(source)
-            shown = source if size is None else _named(source, size)
-            rows.append((shown, *(f"± {100 * of:.2g} %" for of in part)))
-        rows.append(("together", *(f"± {100 * of:.2g} %" for of in self.together)))
+            shown[source if size is None else _named(source, size)] = part
+        shown["together"] = self.together
         for source, change in self.unstated.items():
-            shown = f"if {_named(source, EXAMPLES[source])}"
-            rows.append((shown, *(f"± {100 * of:.2g} %" for of in change)))
+            shown[f"if {_named(source, EXAMPLES[source])}"] = change
+        rows = [(name, *(f"± {100 * of:.2g} %" for of in part)) for name, part in shown.items()]
         return Overview("Budget of the standard errors", rows, ("", *self.names))
