@@ -58,6 +58,35 @@ class Spike:
 
 
 @dataclasses.dataclass(frozen=True)
+class Jump:
+    """A constant voltage for some time, at a random place."""
+
+    height: float  # at the converter [V]
+    width: float  # from its begin to its end [s]
+
+    def __call__(self, time: Volts, rng: np.random.Generator) -> Volts:
+        """Volts at these times [s]."""
+        begin = rng.uniform(0.0, time[-1] - self.width)
+        return self.height * ((time >= begin) & (time < begin + self.width))
+
+
+@dataclasses.dataclass(frozen=True)
+class Tail:
+    """An exponential tail after every pulse, as dielectric absorption leaves it."""
+
+    height: float  # at the end of a pulse [V at the converter]
+    time_constant: float  # [s]
+    end: float  # of the first pulse [s]
+    period: float  # [s]
+
+    def __call__(self, time: Volts, rng: np.random.Generator) -> Volts:
+        """Volts at these times [s]."""
+        since = np.mod(time - self.end, self.period)
+        before = 1 - np.exp(-self.period / self.time_constant)  # what is left of earlier tails
+        return self.height * np.exp(-since / self.time_constant) / before
+
+
+@dataclasses.dataclass(frozen=True)
 class Pink:
     """Noise with a power of 1/f above the first frequency of the record."""
 
@@ -83,6 +112,19 @@ class Leaky:
         """Impedance [ohm] at frequencies f [Hz]."""
         z = self.load(f)
         return z * self.r / (z + self.r)
+
+
+@dataclasses.dataclass(frozen=True)
+class Shunted:
+    """A load with a capacitor across it."""
+
+    load: Impedance  # the load
+    c: float  # the capacitor [F]
+
+    def __call__(self, f: Float[np.ndarray, " f"]) -> Complex[np.ndarray, " f"]:
+        """Impedance [ohm] at frequencies f [Hz]."""
+        z = self.load(f)
+        return z / (1 + 2j * np.pi * f * self.c * z)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -136,6 +136,7 @@ class Record:
     full_scale: float = 10.0  # the converter clips at ± this voltage [V at the converter]
     bits: int = 16  # resolution of the converter
     codes: bool = True  # whether the file holds codes; else it holds volts, rounded as they are
+    digits: int | None = None  # significant digits of volts in the file; None for all
     # what the file says in place of the truth, such as its sample rate
     told: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     swapped: bool = False  # whether the file has the two voltages in each other's place
@@ -167,6 +168,10 @@ class Record:
         half = 2 ** (self.bits - 1)
         step = self.full_scale / half
         codes = np.clip(np.rint(volts / step), -half, half - 1)
+        if self.digits is not None:
+            return Samples(
+                np.array([float(f"{one:.{self.digits}g}") for one in codes * step / SCALE])
+            )
         if not self.codes:
             return Samples(codes * step / SCALE)
         return Samples(codes.astype(np.int16), step / SCALE)

@@ -15,7 +15,7 @@ from collections.abc import Mapping
 import scipy.stats
 
 from benchmarks import visibility
-from benchmarks.disturbances import Hum, Offset, Spike
+from benchmarks.disturbances import Hum, Jump, Offset, Spike
 from benchmarks.failure_axes import Cole, TwoLayers
 from benchmarks.ladder import LOADS
 from benchmarks.perturbed_study import (
@@ -39,7 +39,10 @@ from benchmarks.perturbed_study import (
     pulses,
     record,
     second_resistor,
+    shunted,
+    single,
     skin_is,
+    tail,
     th,
     trials,
 )
@@ -80,6 +83,10 @@ NUISANCES: Mapping[str, Change] = {
     "spike_1V_0.1ms_out": trials(out(added=(Spike(1.0, 1e-4),))),
     "spike_1V_5ms_out_six_periods": longer(trials(out(added=(Spike(1.0, 5e-3),)))),
     "spike_0.1V_5ms_th_six_periods": longer(trials(th(added=(Spike(0.1, 5e-3),)))),
+    "jump_0.5V_5ms_out": trials(out(added=(Jump(0.5, 5e-3),))),
+    "jump_1V_5ms_out": trials(out(added=(Jump(1.0, 5e-3),))),
+    "tail_5mV_5ms": all_records(tail(5e-3, 5e-3)),
+    "tail_5mV_5ms_skin": trials(tail(5e-3, 5e-3)),
     "crosstalk_1%_neighbour": trials(crosstalk(4e-3)),
     "crosstalk_1%_unloaded": trials(crosstalk(0.0)),
     "coloured_noise_1/f": all_records(pink),
@@ -98,6 +105,11 @@ CONVERTERS: Mapping[str, Change] = {
         )
         for bits in (12, 14)
     },
+    "three_digits": all_records(record(digits=3, told={"adc_range": None})),
+    "out_a_tenth_skin_only": trials(out(gain=0.1)),
+    "lowpass_80kHz_skin": trials(out(lowpass=80e3)),
+    "lowpass_80kHz_skin_one_period": single(trials(out(lowpass=80e3))),
+    "capacitance_5pF_skin": trials(shunted(5e-12)),
     "adc_jitter_500ns": all_records(both(sampling_jitter=500e-9)),
     "slow_adc_filter_out": all_records(out(lowpass=30e3)),
     "slow_adc_filter_out_skin_only": trials(out(lowpass=30e3)),
@@ -127,6 +139,8 @@ CLOCKS: Mapping[str, Change] = {
     "lost_sample_in_pulse_out": trials(out(lost=3420)),
     "lost_sample_out_six_periods": longer(trials(out(lost=12_000))),
     "edge_at_the_joint_pulses_jitter": trials(on_edge),
+    "clock_out_20ppm": all_records(out(pulse_rate=60.0012)),
+    "clock_out_20ppm_skin": trials(out(pulse_rate=60.0012)),
     "rate_0.1%_all": all_records(both(pulse_rate=60.06)),
     "rate_100ppm_all": all_records(both(pulse_rate=60.006)),
     "rate_0.1%_skin_only": trials(both(pulse_rate=60.06)),
@@ -147,6 +161,7 @@ CLOCKS: Mapping[str, Change] = {
         f"says_{rate}Hz": all_records(record(told={"pulse_rate": float(rate)}))
         for rate in (20, 30, 50, 90, 120, 180)
     },
+    "says_1/60Hz": all_records(record(told={"pulse_rate": 1 / 60})),
 }
 
 SKINS: Mapping[str, Change] = {
@@ -276,6 +291,15 @@ INVISIBLE: Mapping[str, Invisible] = {
     },
     "slow_adc_filter_out_skin_only": Invisible(
         _BEST % ("R_s up to 80 %", 4.3, 0.8), visibility.lowpass(30e3)
+    ),
+    **{
+        f"lowpass_80kHz_skin{periods}": Invisible(
+            _BEST % ("R_s up to 40 %", 3.7, 0.3), visibility.lowpass(80e3)
+        )
+        for periods in ("", "_one_period")
+    },
+    "capacitance_5pF_skin": Invisible(
+        _BEST % ("R_s of dry skin up to 6 %", 0.2, 0.0), visibility.shunt(5e-12)
     ),
     "driver_Rprot_x1.05": Invisible(
         _BEST % ("R_p up to 4 %", 0.6, 1.3),

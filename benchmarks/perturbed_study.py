@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from benchmarks.disturbances import Leaky, Nonlinear, Pink
-from benchmarks.laboratory import CORNER, Crosstalk, Output, Record, noise
+from benchmarks.disturbances import Leaky, Nonlinear, Pink, Shunted, Tail
+from benchmarks.laboratory import CORNER, SCALE, Crosstalk, Output, Record, noise
 from benchmarks.ladder import LOADS
 from etid.simulation.published import REFERENCE
 from etid.simulation.transformer import Impedance, ResistorLoad, SkinLoad, TransformerDriver
@@ -263,6 +263,27 @@ def coherent(antialias: float = CORNER) -> Change:
 def pink(of: Record) -> Record:
     """Both voltages with 1/f noise of three times the effective value of the white noise."""
     return both(added=(Pink(3 * of.sigma),))(of)
+
+
+def tail(height: float, time_constant: float) -> Callable[[Record], Record]:
+    """Let every loaded pulse leave a tail [V at the terminal, s]."""
+
+    def change(of: Record) -> Record:
+        driver = of.out.driver
+        end = driver.lead_in + driver.width
+        return out(added=(Tail(SCALE * height, time_constant, end, 1 / PULSE_RATE),))(of)
+
+    return change
+
+
+def shunted(c: float) -> Callable[[Record], Record]:
+    """Put a capacitor [F] across every load."""
+    return lambda of: out(loads=tuple(Shunted(load, c) for load in of.out.loads))(of)
+
+
+def single(change: Change) -> Change:
+    """Record one period and a little more."""
+    return lambda study: change(all_records(record(samples=3_400))(study))
 
 
 def leaking(skin: SkinLoad) -> Leaky:
