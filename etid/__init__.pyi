@@ -30,6 +30,7 @@ from .estimators.steiglitz_mcbride.estimator import SteiglitzMcBride as Steiglit
 from .files.exporting import export_circuit as export_circuit
 from .files.exporting import export_fits as export_fits
 from .files.exporting import export_study as export_study
+from .files.folder import import_folder as import_folder
 from .files.importing import import_file as import_file
 from .files.measured_impedance import read_impedance as read_impedance
 from .identify.amplitudes import identify_amplitudes as identify_amplitudes

@@ -4,12 +4,15 @@ import argparse
 import dataclasses
 import os
 import pathlib
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from typing import Any
 
 from etid.commands import Outcome
+from etid.files.folder import import_folder
 from etid.files.importing import import_file
 from etid.files.mapping import CHANNELS, FIELDS
 from etid.files.readers.delimited import DIALECT
+from etid.recordings.errors import RecordingError
 from etid.recordings.fields import DECLARED, SIGNALS
 from etid.recordings.replacing import HDF5
 
@@ -17,7 +20,11 @@ from etid.recordings.replacing import HDF5
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments: the files, the mapping, the channels, and the fields."""
     parser.add_argument(
-        "source", type=pathlib.Path, nargs="+", metavar="FILE", help="files to import into one file"
+        "source",
+        type=pathlib.Path,
+        nargs="+",
+        metavar="FILE",
+        help="files to import into one file, or a folder of them",
     )
     parser.add_argument("-o", dest="target", type=pathlib.Path, required=True, metavar="STUDY")
     parser.add_argument(
@@ -28,6 +35,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         default=[],
         metavar=("FILE", "OHM"),
         help="file recorded with a known resistor, and its resistance; may be given several times",
+    )
+    parser.add_argument(
+        "--labels",
+        action="append",
+        metavar="PATTERN",
+        help="for a folder: labels in the names of its files, as in "
+        "'{subject}_{session}_{condition}_{trial}.csv', and 'calibration_{r_load}.csv'; may be "
+        "given several times, the first that matches counts",
     )
     parser.add_argument(
         "--mapping",
@@ -84,6 +99,9 @@ def run(arguments: argparse.Namespace) -> Outcome:
         for name, value in vars(arguments).items()
         if name in (*CHANNELS, *FIELDS, *DIALECT)
     }
+    folder = arguments.source[0].is_dir() and arguments.mapping is None
+    if folder or arguments.labels:
+        return _folder(arguments, given)
     calibrations: dict[str | os.PathLike[str], float] = {
         pathlib.Path(file): _ohm(file, text) for file, text in arguments.calibrations
     }
@@ -97,6 +115,25 @@ def run(arguments: argparse.Namespace) -> Outcome:
         "imported": [dataclasses.asdict(each) for each in used],
     }
     return Outcome("\n".join(map(str, used)), data)
+
+
+def _folder(arguments: argparse.Namespace, given: Mapping[str, Any]) -> Outcome:
+    """Import a folder, and return what became of each file."""
+    folder, *more = arguments.source
+    if not arguments.labels or more or arguments.calibrations or arguments.mapping:
+        raise RecordingError(
+            "a folder is imported alone, with --labels in place of --calibration and --mapping",
+            file=str(folder),
+            remedy="Name the labels of its files, as in --labels '{subject}_{trial}.csv'",
+        )
+    found = import_folder(folder, arguments.target, arguments.labels, **given)
+    data = {
+        "source": [folder],
+        "target": arguments.target,
+        "recordings": sum(len(each.paths) for each in found.imported.values()),
+        **dataclasses.asdict(found),
+    }
+    return Outcome(str(found), data)
 
 
 def _delimiter(text: str) -> str:

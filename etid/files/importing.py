@@ -9,12 +9,20 @@ import contextlib
 import os
 import pathlib
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, Literal
 
 from etid.files.assemble import Imported, Used, sources_of
 from etid.files.channel import Contents, located
 from etid.files.clock import check_spacing
-from etid.files.mapping import CHANNELS, of_files, plans, read_mapping
+from etid.files.mapping import (
+    CHANNELS,
+    KINDS,
+    each_channel,
+    files_of,
+    of_files,
+    plans,
+    read_mapping,
+)
 from etid.files.others import with_others
 from etid.files.readers import abf, delimited, excel, lvm, matlab, npz, tdms, wav
 from etid.recordings.errors import require_file
@@ -64,6 +72,9 @@ def import_file(
     A channel may be in another file, as when V_th was recorded once for all trials: `FILE:NAME` is
     channel `NAME` of `FILE`, a path from the current folder.
 
+    A channel may be a pattern, as in `v_out="CH{electrode}"`: each channel that matches becomes a
+    recording with this label. So a file with a channel for each electrode of an array is imported.
+
     A mapping assigns channels to signals; data_schema/README.md lists its keys. For one recording,
     arguments with the same names can replace the mapping. With arguments, a channel without a unit
     in the file is in volt, ampere or second. The trials of a recording without a path become
@@ -75,7 +86,8 @@ def import_file(
     `.npz`, and records that are split.
 
     Args:
-        source: File or files to import; the suffix of a file gives its format.
+        source: File or files to import; the suffix of a file gives its format. With a mapping it
+            may be a folder, which contains the files that the mapping names.
         target: etid file to write. An existing file is replaced.
         mapping: TOML file, or its content as a mapping. It replaces all other arguments.
         calibrations: More files to import, each with its known resistor, `r_load` [ohm]. All other
@@ -94,11 +106,6 @@ def import_file(
     paths = [pathlib.Path(os.fspath(one)) for one in ([source] if single else source)]
     known = {pathlib.Path(os.fspath(one)): r for one, r in (calibrations or {}).items()}
     paths = [*known, *(path for path in paths if path not in known)]  # loaded ones name the others
-    folder = pathlib.Path(os.fspath(target)).parent
-    for path in paths:
-        require_file(str(path))
-    if not folder.is_dir():
-        raise RecordingError("the folder of this file does not exist", file=os.fspath(target))
     given = {name: value for name, value in given.items() if value is not None}
     if len(paths) == 1 and _is_complete(paths[0]):
         own = {name for name in LABELS if name in given and name != "trial"}
@@ -106,37 +113,78 @@ def import_file(
         _refuse(given | ({} if mapping is None else {"mapping": mapping}), str(paths[0]),
                 "is not an argument for npz files, which contain it")  # fmt: skip
         return _import_npz(paths[0], target, {"condition": paths[0].stem} | labels)
-    for path in paths:
-        _check_suffix(path)
-    said: list[Mapping[str, Any]]
     if mapping is None:
-        common = {
-            name: {"channel": value} if name in CHANNELS else value for name, value in given.items()
-        }
+        common = channels_of(given)
         whole = {name: value for name, value in common.items() if name != "split"}
-        said = [whole | {"r_load": known[path]} if path in known else common for path in paths]
-        by, place = "command", ""
-        implied = {"v_th": "V", "v_out": "V", "current": "A", "time": "s"}
-    else:
-        more = {"calibrations": known} if known else {}
-        _refuse(given | more, str(paths[0]), "cannot be an argument together with a mapping")
-        inside = isinstance(mapping, Mapping)
-        place = "" if inside else f"{os.fspath(mapping)} of "
-        with located(place + str(paths[0])):
-            said = of_files(mapping if inside else read_mapping(mapping), paths)
-        by, implied = "mapping", {}
+        named = {"calibration": [f"{KINDS[1]}/{path.stem}" for path in known]} if known else {}
+        said = {
+            path: whole | {"r_load": known[path]} if path in known else common | named
+            for path in paths
+        }
+        return converted(said, target)
+    more = {"calibrations": known} if known else {}
+    _refuse(given | more, str(paths[0]), "cannot be an argument together with a mapping")
+    inside = isinstance(mapping, Mapping)
+    place = "" if inside else f"{os.fspath(mapping)} of "
+    with located(place + str(paths[0])):
+        content = mapping if inside else read_mapping(mapping)
+        if len(paths) == 1 and paths[0].is_dir():
+            names = files_of(content)
+            paths = [paths[0] / name for name in names]
+        else:
+            names = [path.name for path in paths]
+        tables = of_files(content, names)
+    return converted(dict(zip(paths, tables, strict=True)), target, place=place, by="mapping")
+
+
+def channels_of(given: Mapping[str, Any]) -> dict[str, Any]:
+    """The keys of a mapping from the arguments of a call."""
+    return {
+        name: {"channel": value} if name in CHANNELS else value for name, value in given.items()
+    }
+
+
+def converted(
+    said: Mapping[pathlib.Path, Mapping[str, Any]],
+    target: str | os.PathLike[str],
+    *,
+    place: str = "",
+    by: Literal["command", "mapping"] = "command",
+) -> list[Imported]:
+    """Convert files, each with a mapping of its own, into one etid file.
+
+    Args:
+        said: The mapping of each file; calibrations come before the recordings that name them.
+        target: etid file to write.
+        place: Text before the name of a file in errors.
+        by: Source of the mappings. Channels that a command names without a unit are in volt,
+            ampere or second.
+
+    Returns:
+        Sources of each recording or stack of trials.
+
+    Raises:
+        RecordingError: As `import_file`.
+    """
+    implied = {"v_th": "V", "v_out": "V", "current": "A", "time": "s"} if by == "command" else {}
+    folder = pathlib.Path(os.fspath(target)).parent
+    if not folder.is_dir():
+        raise RecordingError("the folder of this file does not exist", file=os.fspath(target))
+    for path in said:
+        require_file(str(path))
+        _check_suffix(path)
     sources: dict[str, AbstractSource] = {}
     used: list[Imported] = []
-    calibrated: list[str] = []
+    stacks: dict[str, list[str]] = {}  # recordings of each planned path
     with contextlib.ExitStack() as files:
-        for path, told in zip(paths, said, strict=True):
+        for path, table in said.items():
             file = str(path)
-            written = {name: told[name] for name in delimited.DIALECT if name in told}
-            told = {name: value for name, value in told.items() if name not in written}
+            written = {name: table[name] for name in delimited.DIALECT if name in table}
+            told = {name: value for name, value in table.items() if name not in written}
             if path.suffix.lower() != ".csv":
                 _refuse(written, file, "is only for CSV tables")
-            if calibrated and path not in known:
-                told = {**told, "calibration": calibrated}
+            if isinstance(names := told.get("calibration"), list):
+                told["calibration"] = [one for name in names for one in stacks.get(name, [name])]
             with located(file):
 
                 def opened(one: pathlib.Path, written: Mapping[str, Any] = written) -> Contents:
@@ -146,8 +194,10 @@ def import_file(
 
                 contents = with_others(opened(path), told, opened)
                 with located(place + file):
-                    name = path.stem if len(paths) > 1 else ""
-                    planned = plans(told, contents.names, implied, name)
+                    name = path.stem if len(said) > 1 else ""
+                    planned = plans(
+                        each_channel(told, contents.names), contents.names, implied, name
+                    )
                 contents.prepare({name for plan in planned for name in plan.channels})
                 for plan in planned:
                     with located(file, path=plan.path if len(planned) > 1 else ""):
@@ -164,9 +214,9 @@ def import_file(
                             remedy="Rename the file, or give each recording a path in a mapping",
                         )
                     sources |= found
-                    calibrated += found if path in known else []
+                    stacks[plan.path] = list(found)
                     used.append(made_of)
-        with located(str(paths[0])):
+        with located(str(next(iter(said)))):
             refuse_nested(sources)
             Study(sources).write(target)
     return used

@@ -14,9 +14,10 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from etid.files.channel import chosen, listed
+from etid.files.pattern import Pattern
 from etid.files.units import UNITS, Unit, parse_unit
 from etid.recordings import limits
-from etid.recordings.fields import DECLARED, SIGNALS, check_names, tidy_path
+from etid.recordings.fields import DECLARED, LABELS, SIGNALS, check_names, tidy_path
 from etid.recordings.recording import RecordingError
 
 CHANNELS = (*SIGNALS, "time")
@@ -99,39 +100,52 @@ def read_mapping(path: str | os.PathLike[str]) -> dict[str, Any]:
         raise RecordingError(f"is not TOML ({error})", file=str(file)) from error
 
 
-def of_files(mapping: Mapping[str, Any], files: Sequence[pathlib.Path]) -> list[Mapping[str, Any]]:
+def files_of(mapping: Mapping[str, Any]) -> list[str]:
+    """The files of a mapping, in its order.
+
+    Raises:
+        RecordingError: A recording names no file.
+    """
+    names = [table.get("file") for table in _tables(mapping)]
+    if not names or not all(isinstance(name, str) for name in names):
+        raise RecordingError(
+            "is not given for each recording", field="file", remedy="The source is a folder"
+        )
+    return list(dict.fromkeys(map(str, names)))
+
+
+def of_files(mapping: Mapping[str, Any], names: Sequence[str]) -> list[Mapping[str, Any]]:
     """The part of a mapping for each file: the recordings whose key `file` has its name.
 
     Args:
         mapping: Content of a mapping, from `read_mapping`.
-        files: The files to import.
+        names: Names of the files to import.
 
     Raises:
         RecordingError: A recording names no file although there are several, or a file that is not
             imported; or a file has no recording.
     """
     tables = _tables(mapping)
-    if len(files) == 1 and not any("file" in table for table in tables):
+    if len(names) == 1 and not any("file" in table for table in tables):
         return [mapping]
     common = {key: value for key, value in mapping.items() if key != "recording"}
-    named = [file.name for file in files]
-    for name in {name for name in named if named.count(name) > 1}:
+    for name in {name for name in names if names.count(name) > 1}:
         raise RecordingError(f"two files have the name {name!r}", field="file")
-    tables_of: dict[str, list[dict[str, Any]]] = {name: [] for name in named}
+    tables_of: dict[str, list[dict[str, Any]]] = {name: [] for name in names}
     for table in tables:
         if table.get("file") not in tables_of:
             raise RecordingError(
-                f"is {table.get('file')!r}; the files are {listed(named)}",
+                f"is {table.get('file')!r}; the files are {listed(names)}",
                 field="file",
                 remedy="Give each [[recording]] the name of one of these files",
             )
         tables_of[table["file"]].append({key: table[key] for key in table if key != "file"})
-    for name in named:
+    for name in names:
         if not tables_of[name]:
             raise RecordingError(
                 f"no recording is in {name!r}", field="file", remedy="Leave the file out"
             )
-    return [{**common, "recording": tables_of[name]} for name in named]
+    return [{**common, "recording": tables_of[name]} for name in names]
 
 
 def _tables(mapping: Mapping[str, Any]) -> list[Mapping[str, Any]]:
@@ -182,6 +196,48 @@ def plans(
         except RecordingError as error:
             raise error.located(path=path if len(tables) > 1 else "") from None
     return planned
+
+
+def each_channel(mapping: Mapping[str, Any], names: Sequence[str]) -> Mapping[str, Any]:
+    """A mapping with a recording for each channel that a pattern such as `CH{electrode}` matches.
+
+    Args:
+        mapping: Content of a mapping, from `read_mapping`.
+        names: Names of the channels of the file.
+
+    Raises:
+        RecordingError: No channel matches, or a second pattern has no channel for a label.
+    """
+    common = {key: value for key, value in mapping.items() if key != "recording"}
+    tables: list[Mapping[str, Any]] = []
+    for table in _tables(mapping) or [{}]:
+        said = {**common, **table}
+        patterns = {
+            name: said[name]["channel"]
+            for name in CHANNELS
+            if isinstance(said.get(name), Mapping)
+            and any(f"{{{label}}}" in str(said[name].get("channel")) for label in LABELS)
+        }
+        if "v_out" not in patterns:
+            tables.append(table)
+            continue
+        by = Pattern(patterns["v_out"])
+        matches = [labels for name in names if (labels := by.labels(name)) is not None]
+        if not matches:
+            raise RecordingError(
+                f"no channel matches {by.text!r}; the channels are {listed(names)}", field="v_out"
+            )
+        base = tidy_path(said.get("path", "")) or KINDS[0]
+        for labels in matches:
+            channels = {
+                name: {**said[name], "channel": text.format(**labels)}
+                for name, text in patterns.items()
+            }
+            path = "/".join([base, *labels.values()])
+            tables.append({**table, **labels, **channels, "path": path})
+    if not any(isinstance(table.get("v_out"), Mapping) for table in tables):
+        return mapping
+    return {**common, "recording": tables}
 
 
 def _plan(

@@ -207,6 +207,10 @@ class AbstractFields:
         example=98800.0,
     )
     subject: str = _field("label", description="Person whose skin was recorded.", example="s01")
+    session: str = _field(
+        "label", description="Session or day of the measurement.", example="2026-03-02"
+    )
+    site: str = _field("label", description="Finger and hand, or place on it.", example="index")
     condition: str = _field(
         "label", description="State of the skin, or name of the circuit.", example="dry"
     )
@@ -263,6 +267,8 @@ class Given(TypedDict, total=False):
     pulse_rate: Required[Number]
     r_load: Number | None
     subject: Label | None
+    session: Label | None
+    site: Label | None
     condition: Label | None
     electrode: Label | None
     trial: Label | None

@@ -1,0 +1,232 @@
+"""A folder of files whose names contain the labels of their recordings.
+
+A pattern such as `{subject}_{session}_{condition}_{trial}.csv` says which part of a name is which
+label. `{r_load}` is a known resistor [ohm]: 98800, 98k8 or 98.8k. A file has the labels of the
+first pattern that its name matches. What the pattern cannot tell is not guessed: a label contains
+none of the characters that separate the labels, and files that match no pattern are left out and
+listed.
+
+The table `calibrations.csv` of a folder, with the columns `file` and `ohm`, names resistors too.
+"""
+
+import csv
+import dataclasses
+import os
+import pathlib
+import re
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import tomli_w
+
+from etid.files.assemble import Imported
+from etid.files.channel import located
+from etid.files.importing import channels_of, converted
+from etid.files.pattern import Pattern
+from etid.recordings.errors import RecordingError
+from etid.recordings.fields import LABELS
+from etid.recordings.replacing import replacing
+from etid.recordings.values import real
+
+TABLE = "calibrations.csv"
+_RESISTANCE = re.compile(r"(\d+)([RkM])(\d*)|(\d+(?:\.\d+)?)([RkM]?)")
+_FACTORS = {"": 1.0, "R": 1.0, "k": 1e3, "M": 1e6}
+
+
+@dataclasses.dataclass(frozen=True)
+class ImportedFolder:
+    """What became of the files of a folder.
+
+    Attributes:
+        imported: Sources of the recordings of each file, by its path from the folder.
+        labels: Labels of each file, and its `r_load` [ohm].
+        unmatched: Files that match no pattern.
+        mapping: The mapping that imports the same files again.
+    """
+
+    imported: Mapping[str, Imported]
+    labels: Mapping[str, Mapping[str, Any]]
+    unmatched: Sequence[str]
+    mapping: pathlib.Path
+
+    def __str__(self) -> str:
+        lines = []
+        for file, labels in self.labels.items():
+            of = self.imported[file]
+            said = [f"{n} {labels[n]}" for n in labels if n != "r_load"]
+            said += [f"{labels[n] / 1e3:g} kΩ" for n in labels if n == "r_load"]
+            where = of.paths[0] + (f" … {of.paths[-1]}" if len(of.paths) > 1 else "")
+            lines.append(f"{file} → {where}: {', '.join(said)}; {of.samples} samples")
+        # All files have the same options, so the channels of the first are those of all.
+        _, *channels = str(next(iter(self.imported.values()))).splitlines()
+        known = sum("r_load" in of for of in self.labels.values())
+        lines += [*channels, f"{len(self.labels)} files, {known} of them with a known resistor"]
+        if self.unmatched:
+            lines.append(f"left out, matches no pattern: {', '.join(self.unmatched)}")
+        return "\n".join([*lines, f"mapping: {self.mapping}"])
+
+
+def import_folder(
+    folder: str | os.PathLike[str],
+    target: str | os.PathLike[str],
+    labels: str | Sequence[str],
+    **given: Any,
+) -> ImportedFolder:
+    """Convert the files of a folder into one etid file, with labels from their names.
+
+    A recording names the calibrations whose labels do not contradict its own as its calibrations:
+    with `{session}` in both patterns, those of its session. Beside the target, the mapping
+    `TARGET.toml` is written: `import_file(FOLDER, target, mapping)` imports the same files again.
+
+    Args:
+        folder: Folder of the files; files of folders in it match patterns with a `/`.
+        target: etid file to write. An existing file is replaced.
+        labels: One or several patterns of names with `{subject}`, `{session}`, `{site}`,
+            `{condition}`, `{electrode}`, `{trial}` and `{r_load}`. The first that matches counts.
+        **given: Channels, rates and the dialect of tables, as for `import_file`; they apply to all
+            files.
+
+    Returns:
+        The labels and sources of each file, and the files that were left out.
+
+    Raises:
+        RecordingError: A pattern is wrong, no file matches, a calibration is missing, or a file
+            cannot be read.
+    """
+    root = pathlib.Path(os.fspath(folder))
+    found, unmatched = labelled(root, [labels] if isinstance(labels, str) else labels)
+    common = channels_of({name: value for name, value in given.items() if value is not None})
+    tables = {file: {**of, "path": _path(of)} for file, of in found.items()}
+    for file, of in tables.items():
+        names = _calibrations(file, of, tables)
+        if names:
+            of["calibration"] = names
+    said = {root / file: {**common, **of} for file, of in tables.items()}
+    imported = converted(said, target)
+    mapping = pathlib.Path(os.fspath(target)).with_suffix(".toml")
+    for name, used in imported[0].signals.items():
+        if used.unit_by == "command":  # a mapping implies no units
+            common[name]["unit"] = used.unit
+    content = {**common, "recording": [{"file": file, **of} for file, of in tables.items()]}
+    with replacing(mapping) as partial:
+        partial.write_text(tomli_w.dumps(content), "utf-8")
+    return ImportedFolder(dict(zip(tables, imported, strict=True)), found, unmatched, mapping)
+
+
+def labelled(
+    root: pathlib.Path, patterns: Sequence[str]
+) -> tuple[dict[str, dict[str, Any]], list[str]]:
+    """Labels of each file of a folder that matches a pattern, and the other files.
+
+    Raises:
+        RecordingError: As `import_folder`.
+    """
+    if not root.is_dir():
+        raise RecordingError("there is no such folder", file=str(root), remedy="Check the path")
+    compiled = [Pattern(pattern, ("r_load",)) for pattern in patterns]
+    known = _table(root)
+    depth = max(pattern.count("/") for pattern in patterns)
+    files = sorted(
+        path.relative_to(root).as_posix()
+        for path in root.glob("**/*" if depth else "*")
+        if path.is_file() and path.name != TABLE
+    )
+    found: dict[str, dict[str, Any]] = {}
+    for file in files:
+        matches = (pattern.labels(file) for pattern in compiled)
+        match = next((one for one in matches if one is not None), None)
+        if match is None and file not in known:
+            continue
+        of: dict[str, Any] = {} if match is None else {**match}
+        if "r_load" in of:
+            of["r_load"] = resistance(of["r_load"], str(root / file))
+        if file in known:
+            of["r_load"] = known[file]
+        found[file] = of
+    for missing in known.keys() - found.keys():
+        raise RecordingError(
+            f"names {missing!r}, which is not in the folder", file=str(root / TABLE), field="file"
+        )
+    if not found:
+        raise RecordingError(
+            f"none of its {len(files)} files matches {' or '.join(map(repr, patterns))}",
+            file=str(root),
+            field="labels",
+            remedy="Write the names as they are, with labels in braces" + _example(files),
+        )
+    calibrations_first = dict(sorted(found.items(), key=lambda one: "r_load" not in one[1]))
+    return calibrations_first, [file for file in files if file not in found]
+
+
+def _example(files: Sequence[str]) -> str:
+    return f"; the first file is {files[0]!r}" if files else ""
+
+
+def resistance(text: str, file: str) -> float:
+    """Resistance [ohm] of a text such as 98800, 98k8 (IEC 60062) or 98.8k.
+
+    Raises:
+        RecordingError: The text is no resistance.
+    """
+    match = _RESISTANCE.fullmatch(text.removesuffix("ohm"))
+    if match is None:
+        raise RecordingError(
+            f"is {text!r}, which is no resistance",
+            file=file,
+            field="r_load",
+            remedy=f"Write it as 98800, 98k8 or 98.8k, or list the file in {TABLE}",
+        )
+    whole, middle, rest, number, last = match.groups()
+    if number is not None:
+        return float(number) * _FACTORS[last]
+    return float(f"{whole}.{rest or 0}") * _FACTORS[middle]
+
+
+def _table(root: pathlib.Path) -> dict[str, float]:
+    """Resistors [ohm] of the files that `calibrations.csv` lists; none without this file."""
+    table = root / TABLE
+    if not table.is_file():
+        return {}
+    with located(str(table)), table.open(encoding="utf-8-sig", newline="") as lines:
+        rows = list(csv.DictReader(lines, skipinitialspace=True))
+        if not rows or not {"file", "ohm"} <= rows[0].keys():
+            raise RecordingError("must have the columns file and ohm, and a row for each file")
+        found = {}
+        for row in rows:
+            file, ohm = str(row["file"]).strip(), str(row["ohm"]).strip()
+            try:
+                found[file] = real("ohm", float(ohm))
+            except ValueError:
+                found[file] = resistance(ohm, str(table))
+        return found
+
+
+def _path(of: Mapping[str, Any]) -> str:
+    """HDF5 path of a recording: its labels, and the resistor of a calibration."""
+    parts = [str(value) for name, value in of.items() if name != "r_load"]
+    if "r_load" in of:
+        return "/".join(["calibration", *parts, f"{of['r_load']:.9g}"])
+    return "/".join(parts if len(parts) > 1 else ["loaded", *parts])
+
+
+def _calibrations(file: str, of: Mapping[str, Any], tables: Mapping[str, Any]) -> list[str]:
+    """Paths of the calibrations of a recording; none for a calibration.
+
+    Raises:
+        RecordingError: There are calibrations, but none of this recording.
+    """
+    known = {name: one for name, one in tables.items() if "r_load" in one}
+    if "r_load" in of or not known:
+        return []
+
+    def fits(one: Mapping[str, Any]) -> bool:
+        return all(of.get(name, one[name]) == one[name] for name in LABELS if name in one)
+
+    found = [str(one["path"]) for one in known.values() if fits(one)]
+    if not found:
+        raise RecordingError(
+            f"no calibration has its labels {', '.join(str(of[n]) for n in LABELS if n in of)}",
+            file=file,
+            remedy="Label the calibrations by fewer labels, or add the one that is missing",
+        )
+    return found

@@ -1,0 +1,117 @@
+import numpy as np
+import pytest
+
+import etid
+from etid.files.folder import import_folder, labelled, resistance
+from etid.files.importing import import_file
+from etid.files.pattern import Pattern
+from etid.recordings.recording import RecordingError
+
+OPTIONS = {"v_th": "open", "v_out": "skin", "time": "t", "scale": 0.5, "pulse_rate": 60.0}
+PATTERNS = ("{session}_cal_{r_load}.csv", "{subject}_{session}_{trial}.csv")
+
+
+def pulses(size):
+    return np.where(np.arange(1000) % 300 < 100, size, 0.0)
+
+
+@pytest.fixture
+def folder(tmp_path):
+    """Two days with a calibration each, a recording each, and a file that is something else."""
+    root = tmp_path / "folder"
+    root.mkdir()
+    for number, day in enumerate(("d1", "d2")):
+        for name, part in ((f"{day}_cal_98k8", 0.5), (f"s01_{day}_07", 0.3 + 0.1 * number)):
+            table = np.column_stack([np.arange(1000) / 18e3, pulses(1.0), pulses(part)])
+            np.savetxt(root / f"{name}.csv", table, delimiter=",", header="t,open,skin", comments="")
+    (root / "notes.txt").write_text("cold hands", "utf-8")
+    return root
+
+
+def test_names_become_labels_and_each_day_has_its_own_calibration(folder, tmp_path):
+    target = tmp_path / "study.h5"
+    found = import_folder(folder, target, PATTERNS, **OPTIONS)
+    assert found.unmatched == ["notes.txt"]
+    assert "4 files, 2 of them with a known resistor" in str(found)
+    assert "s01_d2_07.csv → s01/d2/07: subject s01, session d2, trial 07" in str(found)
+    with etid.read(target) as study:
+        assert [one.r_load for one in study.calibrations.recordings()] == [98.8e3] * 2
+        second = study["s01/d2/07"]
+        assert (second.subject, second.session, second.trial) == ("s01", "d2", "07")
+        assert second.calibration == ("calibration/d2/98800",)
+        np.testing.assert_allclose(second.v_out, 2 * pulses(0.4))
+
+
+def test_the_mapping_beside_the_file_imports_the_same_again(folder, tmp_path):
+    first, again = tmp_path / "first.h5", tmp_path / "again.h5"
+    mapping = import_folder(folder, first, PATTERNS, **OPTIONS).mapping
+    import_file(folder, again, mapping)
+    assert first.read_bytes() == again.read_bytes()
+
+
+def test_a_table_names_resistors_of_files_whose_names_do_not(folder):
+    (folder / "calibrations.csv").write_text("file, ohm\nd1_cal_98k8.csv, 21k62\n", "utf-8")
+    found, unmatched = labelled(folder, ["{subject}_{session}_{trial}.csv"])
+    assert found["d1_cal_98k8.csv"]["r_load"] == 21.62e3
+    assert unmatched == ["notes.txt"]
+
+
+def test_folders_in_the_folder_are_labels_too(folder):
+    (folder / "s02").mkdir()
+    (folder / "s01_d1_07.csv").rename(folder / "s02" / "d1.csv")
+    found, _ = labelled(folder, ["{subject}/{session}.csv"])
+    assert found == {"s02/d1.csv": {"subject": "s02", "session": "d1"}}
+
+
+@pytest.mark.parametrize(
+    ("name", "labels"),
+    [
+        ("s01_dry_3.csv", {"subject": "s01", "condition": "dry", "trial": "3"}),
+        ("s01_dry_wet_3.csv", None),  # which of them is the condition?
+        ("s01_dry_3.1.csv", None),
+        ("x/s01_dry_3.csv", None),
+        ("s01_dry_3.csv.bak", None),
+        ("s01__3.csv", None),
+    ],
+)
+def test_a_name_that_could_be_read_in_two_ways_does_not_match(name, labels):
+    assert Pattern("{subject}_{condition}_{trial}.csv").labels(name) == labels
+
+
+@pytest.mark.parametrize(
+    ("text", "ohm"),
+    [("98800", 98.8e3), ("98k8", 98.8e3), ("98.8k", 98.8e3), ("4R7", 4.7), ("1M", 1e6)],
+)
+def test_resistances_are_written_as_in_electronics(text, ohm):
+    assert resistance(text, "file") == pytest.approx(ohm)
+
+
+@pytest.mark.parametrize(
+    ("patterns", "message"),
+    [
+        (["{subjekt}_{trial}.csv"], "subjekt: is no label, did you mean subject"),
+        (["{subject}{trial}.csv"], "no text between two labels"),
+        (["{trial}_{trial}.csv"], "a label twice"),
+        (["all.csv"], "has no label"),
+        (["{subject}.mat"], r"none of its 6 files matches '{subject}.mat'.*'d1_cal_98k8.csv'"),
+        (["{subject}_{r_load}_{trial}.csv"], "r_load: is 'cal', which is no resistance"),
+        (["s01_{session}_{trial}.csv", "d1_{session}_{r_load}.csv"], "no calibration has its"),
+    ],
+)
+def test_refusals_of_a_folder(folder, tmp_path, patterns, message):
+    (folder / "other.txt").write_text("", "utf-8")
+    with pytest.raises(RecordingError, match=message):
+        import_folder(folder, tmp_path / "study.h5", patterns, **OPTIONS)
+
+
+def test_each_channel_of_an_array_becomes_the_recording_of_an_electrode(tmp_path):
+    table = np.column_stack([pulses(1.0), *(pulses(0.1 * n) for n in (1, 2, 3))])
+    source, target = tmp_path / "array.csv", tmp_path / "study.h5"
+    np.savetxt(source, table, delimiter=",", header="open,CH1,CH2,CH3", comments="")
+    given = {"v_th": "open", "scale": 1.0, "sample_rate": 18e3, "pulse_rate": 60.0}
+    import_file(source, target, v_out="CH{electrode}", subject="s01", **given)
+    with etid.read(target) as study:
+        assert [one.electrode for one in study.recordings()] == ["1", "2", "3"]
+        np.testing.assert_allclose(study["loaded/3"].v_out, pulses(0.3))
+    with pytest.raises(RecordingError, match="no channel matches 'E{electrode}'"):
+        import_file(source, target, v_out="E{electrode}", **given)
