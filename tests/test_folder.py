@@ -23,7 +23,9 @@ def folder(tmp_path):
     for number, day in enumerate(("d1", "d2")):
         for name, part in ((f"{day}_cal_98k8", 0.5), (f"s01_{day}_07", 0.3 + 0.1 * number)):
             table = np.column_stack([np.arange(1000) / 18e3, pulses(1.0), pulses(part)])
-            np.savetxt(root / f"{name}.csv", table, delimiter=",", header="t,open,skin", comments="")
+            np.savetxt(
+                root / f"{name}.csv", table, delimiter=",", header="t,open,skin", comments=""
+            )
     (root / "notes.txt").write_text("cold hands", "utf-8")
     return root
 
@@ -113,5 +115,5 @@ def test_each_channel_of_an_array_becomes_the_recording_of_an_electrode(tmp_path
     with etid.read(target) as study:
         assert [one.electrode for one in study.recordings()] == ["1", "2", "3"]
         np.testing.assert_allclose(study["loaded/3"].v_out, pulses(0.3))
-    with pytest.raises(RecordingError, match="no channel matches 'E{electrode}'"):
+    with pytest.raises(RecordingError, match=r"no channel matches 'E\{electrode\}'"):
         import_file(source, target, v_out="E{electrode}", **given)

@@ -1,0 +1,117 @@
+"""Where the electrodes of a display are."""
+
+import csv
+import dataclasses
+import json
+import os
+import pathlib
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Float
+
+from etid.recordings.errors import RecordingError, located, require_file
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Layout:
+    """Places of electrodes.
+
+    Attributes:
+        electrodes: Names, as in the label `electrode` of recordings.
+        x: Places along the width of the display [m].
+        y: Places along its length, towards the tip of the finger [m].
+    """
+
+    electrodes: Sequence[str]
+    x: Float[np.ndarray, " electrode"]
+    y: Float[np.ndarray, " electrode"]
+
+    def __post_init__(self) -> None:
+        names = [str(one) for one in self.electrodes]
+        twice = sorted({name for name in names if names.count(name) > 1})
+        if twice:
+            raise RecordingError(f"a layout has these electrodes twice: {', '.join(twice)}")
+        x, y = (np.asarray(of, float) for of in (self.x, self.y))
+        if not x.shape == y.shape == (len(names),) or not np.isfinite([x, y]).all():
+            raise RecordingError(
+                f"a layout needs a finite place for each electrode; {len(names)} electrodes have x "
+                f"of shape {x.shape} and y of shape {y.shape}"
+            )
+        for name, value in (("electrodes", tuple(names)), ("x", x), ("y", y)):
+            object.__setattr__(self, name, value)
+
+    @classmethod
+    def grid(cls, rows: int, columns: int, pitch: float, first: str = "E1") -> "Layout":
+        """Electrodes in a rectangle, numbered along the rows from the tip of the finger.
+
+        Args:
+            rows: Number of rows.
+            columns: Number of electrodes in a row.
+            pitch: Distance of neighbours [m].
+            first: Name of the first electrode: a text that ends with a number.
+        """
+        start = first.rstrip("0123456789")
+        number = int(first[len(start) :])
+        row, column = np.divmod(np.arange(rows * columns), columns)
+        names = [f"{start}{number + one}" for one in range(rows * columns)]
+        return cls(names, pitch * column, pitch * (rows - 1 - row))
+
+    def place(self, names: np.ndarray) -> np.ndarray:
+        """Row of the layout of each name.
+
+        Raises:
+            ValueError: An electrode is not in the layout.
+        """
+        rows = {name: row for row, name in enumerate(self.electrodes)}
+        for name in names:
+            if str(name) not in rows:
+                raise ValueError(
+                    f"electrode {str(name)!r} is not in the layout, which has "
+                    f"{self.electrodes[0]} to {self.electrodes[-1]}; give a layout with the names "
+                    "of your recordings: etid.plot(fits, map=…, layout=…)"
+                )
+        return np.array([rows[str(name)] for name in names], int)
+
+
+FINGERTIP = Layout.grid(14, 7, 2e-3)
+"""The paper's display: 98 electrodes, 2 mm apart, on 26 x 12 mm²."""
+
+_MICROMETRE = 1e-6
+
+
+def read_layout(path: str | os.PathLike[str]) -> Layout:
+    """Places of electrodes from a table or a probe file.
+
+    Args:
+        path: A CSV table with the columns `electrode`, `x` and `y` [m], or a file of
+            probeinterface (`.json`) with one probe; its contacts are electrodes by their
+            `contact_ids`.
+
+    Raises:
+        RecordingError: The file is missing, or is neither of both.
+    """
+    require_file(os.fspath(path))
+    file = pathlib.Path(path)
+    with located(str(file), foreign=(ValueError, KeyError, UnicodeDecodeError)):
+        if file.suffix.lower() == ".json":
+            return _of_probe(json.loads(file.read_text("utf-8")))
+        with file.open(encoding="utf-8-sig", newline="") as lines:
+            rows = list(csv.DictReader(lines, skipinitialspace=True))
+        if not rows or not {"electrode", "x", "y"} <= rows[0].keys():
+            raise RecordingError("must have the columns electrode, x and y, and a row for each")
+        x, y = ([float(row[name]) for row in rows] for name in ("x", "y"))
+        return Layout([row["electrode"] for row in rows], np.array(x), np.array(y))
+
+
+def _of_probe(content: object) -> Layout:
+    """The layout of the one probe of a probeinterface file (specification 0.2)."""
+    probes = content.get("probes") if isinstance(content, dict) else None
+    if not isinstance(probes, list) or len(probes) != 1:
+        raise RecordingError("must hold one probe of probeinterface")
+    [probe] = probes
+    places = np.asarray(probe["contact_positions"], float)
+    unit = {"um": _MICROMETRE, "mm": 1e-3, "m": 1.0}.get(probe.get("si_units", "um"))
+    if unit is None or places.ndim != 2 or places.shape[1] != 2:
+        raise RecordingError("must have two-dimensional contact_positions in um, mm or m")
+    return Layout(probe["contact_ids"], unit * places[:, 0], unit * places[:, 1])

@@ -1,0 +1,124 @@
+"""Maps of a display: the value of an element at each electrode."""
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.cm import ScalarMappable
+from matplotlib.collections import EllipseCollection
+from matplotlib.colors import LogNorm
+from matplotlib.lines import Line2D
+
+from etid.circuits.display import DISPLAY
+from etid.plotting.layout import Layout
+from etid.plotting.style import INK, MARKS, Canvas, drawable, plain_ticks, symbol, titled
+from etid.results.fits import Fits
+
+COLOURS = "cividis"  # readers with and without red-green blindness see it alike
+BY = ("subject", "session", "site", "condition")  # a map for each combination
+ROW = 4  # maps side by side
+DOT = 0.9  # diameter of an electrode, relative to the distance of neighbours
+
+
+def draw_map(canvas: Canvas, fits: Fits, element: str, layout: Layout) -> np.ndarray:
+    """An element at each electrode, a map for each subject, session, site and condition.
+
+    The colour is the median of the successful trials of an electrode, on one logarithmic scale for
+    all maps. An electrode without a successful trial has a mark of its own for each verdict.
+
+    Raises:
+        ValueError: There is no such element, there are no fits, or an electrode has no place.
+    """
+    units = fits.circuit.units()
+    if element not in units:
+        raise ValueError(f"map is {element!r}, must be one of {', '.join(map(repr, units))}")
+    if not len(fits):
+        raise ValueError("there are no fits to draw")
+    place = layout.place(fits.labels["electrode"])
+    keys = list(zip(*(fits.labels[name].astype(str) for name in BY), strict=True))
+    groups = sorted(set(keys))
+    values = np.asarray(getattr(fits.circuit, element)) / DISPLAY[units[element]][0]
+    good = (fits.verdicts == "successful") & drawable(values)
+    norm = LogNorm(*(_round(values[good]) if good.any() else (1.0, 10.0)))
+    bad = sorted({str(verdict) for verdict in fits.verdicts[~good]} - {"successful"})
+    marks: dict[str, str] = dict(zip(bad, (*MARKS[1:], *MARKS[1:]), strict=False))
+    columns = min(ROW, len(groups))
+    rows = -(-len(groups) // columns)
+    width, height = np.ptp(layout.x), np.ptp(layout.y)
+    tall = 1.7 * min(max(height / max(width, 1e-9), 0.5), 4.0)
+    size = (2.0 * columns + 1.4, (tall + 0.9) * rows + 0.4)
+    axes = canvas(rows, columns, size, sharex=True, sharey=True)
+    for axis, group in zip(axes.flat, groups, strict=False):
+        chosen = np.array([key == group for key in keys])
+        _electrodes(axis, layout, place[chosen], values[chosen], good[chosen], norm)
+        _failed(axis, layout, place[chosen], fits.verdicts[chosen], good[chosen], marks)
+        names = [name for name in group if name]
+        count = len({*place[chosen & good]})
+        titled(axis, [", ".join(names), f"{count} of {len({*place[chosen]})} electrodes"])
+    for axis in axes.flat[len(groups) :]:
+        axis.set_axis_off()
+    for axis in axes[-1]:
+        axis.set_xlabel("x [mm]")
+    for axis in axes[:, 0]:
+        axis.set_ylabel("y [mm]")
+    figure = axes.flat[0].figure
+    bar = figure.colorbar(ScalarMappable(norm, COLOURS), ax=axes, shrink=0.6, pad=0.02)
+    bar.set_label(symbol(element, units[element]))
+    plain_ticks(bar.ax.yaxis)
+    if marks:
+        handles = [
+            Line2D([], [], ls="", marker=mark, ms=6, color=INK, mfc="white", label=name)
+            for name, mark in marks.items()
+        ]
+        figure.legend(
+            handles=handles, loc="outside lower center", ncols=4, frameon=False, fontsize=8
+        )
+    return axes.ravel()
+
+
+def _round(values: np.ndarray) -> tuple[float, float]:
+    """Limits of a scale: at least a factor of 1.2 apart."""
+    middle = np.sqrt(values.min() * values.max())
+    return min(values.min(), middle / 1.1), max(values.max(), middle * 1.1)
+
+
+def _electrodes(
+    axis: Axes,
+    layout: Layout,
+    place: np.ndarray,
+    values: np.ndarray,
+    good: np.ndarray,
+    norm: LogNorm,
+) -> None:
+    """Draw electrodes with a value; places that were not recorded are dots."""
+    x, y = 1e3 * layout.x, 1e3 * layout.y
+    apart = np.hypot(x[:, None] - x, y[:, None] - y)
+    pitch = np.min(apart + np.where(apart > 0, 0.0, np.inf), initial=10.0)
+    axis.set(xlim=(x.min() - pitch, x.max() + pitch), ylim=(y.min() - pitch, y.max() + pitch))
+    axis.set_aspect("equal")
+    axis.grid(False)
+    axis.plot(x, y, ".", ms=2, color="0.75", zorder=1)
+    shown = np.unique(place[good])
+    medians = np.array([np.median(values[good & (place == one)]) for one in shown])
+    size = np.full(shown.size, DOT * pitch)
+    dots = EllipseCollection(
+        size, size, np.zeros(shown.size), units="x", cmap=COLOURS, norm=norm, array=medians,
+        offsets=np.column_stack([x[shown], y[shown]]), offset_transform=axis.transData,
+        zorder=2,
+    )  # fmt: skip
+    axis.add_collection(dots)
+
+
+def _failed(
+    axis: Axes,
+    layout: Layout,
+    place: np.ndarray,
+    verdicts: np.ndarray,
+    good: np.ndarray,
+    marks: dict[str, str],
+) -> None:
+    """Mark the electrodes without a successful trial by the verdict of their first one."""
+    for one in np.setdiff1d(place, place[good]):
+        verdict = str(verdicts[place == one][0])
+        axis.plot(
+            1e3 * layout.x[one], 1e3 * layout.y[one], marks.get(verdict, "x"), ms=6, color=INK,
+            mfc="white",
+        )  # fmt: skip

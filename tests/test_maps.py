@@ -1,0 +1,96 @@
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+from matplotlib.collections import EllipseCollection
+
+import etid
+from etid.plotting import style
+from etid.plotting.layout import FINGERTIP, Layout, read_layout
+from etid.plotting.maps import draw_map
+from etid.recordings.errors import RecordingError
+
+
+@pytest.fixture(scope="module")
+def display():
+    """Fits of three trials, each at two electrodes; the last is no success."""
+    study = etid.scenes.paper_dry(snr_db=60.0).simulate(seed=0)
+    driver = etid.identify_driver(study["calibration/98k8"], order=5)
+    records = [study[path] for path in list(study.loaded)[:3]]
+    hummed = records[2].v_out + 20 * np.sin(np.arange(records[2].v_out.size) / 7)
+    records[2] = records[2].replace(v_out=hummed)
+    fits = etid.identify_skins(records * 2, driver)
+    names = np.array(["E1", "E8", "E98", "E1", "E9", "E98"], object)
+    days = np.array(["d1"] * 3 + ["d2"] * 3, object)
+    return dataclasses.replace(fits, labels={**fits.labels, "electrode": names, "session": days})
+
+
+def canvas(*layout, **options):
+    return style.new_figure(*layout, **options)[1]
+
+
+def test_the_display_of_the_paper_has_98_places_two_millimetres_apart():
+    assert len(FINGERTIP.electrodes) == 98
+    apart = np.hypot(FINGERTIP.x[:, None] - FINGERTIP.x, FINGERTIP.y[:, None] - FINGERTIP.y)
+    np.testing.assert_allclose(np.sort(apart, axis=1)[:, 1], 2e-3)
+    assert (np.ptp(FINGERTIP.x), np.ptp(FINGERTIP.y)) == pytest.approx((12e-3, 26e-3))
+
+
+def test_each_day_has_a_map_and_values_lie_at_their_electrodes(display):
+    axes = draw_map(canvas, display, "r_p", FINGERTIP)
+    for day, axis in enumerate(axes):
+        [dots] = [one for one in axis.collections if isinstance(one, EllipseCollection)]
+        rows = [3 * day, 3 * day + 1]
+        places = FINGERTIP.place(display.labels["electrode"][rows])
+        expected = 1e3 * np.column_stack([FINGERTIP.x[places], FINGERTIP.y[places]])
+        np.testing.assert_allclose(dots.get_offsets(), expected)
+        np.testing.assert_allclose(dots.get_array(), 1e-3 * display.circuit.r_p[rows])
+        assert f"d{day + 1}" in axis.get_title(loc="left")
+        assert "2 of 3 electrodes" in axis.get_title(loc="left")
+        failed = axis.lines[-1]
+        assert failed.get_marker() != "o"
+        assert (failed.get_xdata()[0], failed.get_ydata()[0]) == pytest.approx((12.0, 0.0))
+    scales = {tuple(axis.collections[0].get_clim()) for axis in axes}
+    assert len(scales) == 1
+
+
+@pytest.mark.parametrize(
+    ("element", "layout", "message"),
+    [
+        ("r_q", FINGERTIP, "map is 'r_q', must be one of 'r_s', 'r_p', 'c_p'"),
+        ("r_p", Layout.grid(2, 2, 1e-3, "A1"), "electrode 'E1' is not in the layout"),
+    ],
+)
+def test_refusals_of_a_map(display, element, layout, message):
+    with pytest.raises(ValueError, match=message):
+        draw_map(canvas, display, element, layout)
+
+
+def test_a_layout_is_read_from_a_table_or_a_probe_file(tmp_path):
+    table, probe = tmp_path / "display.csv", tmp_path / "display.json"
+    table.write_text("electrode, x, y\nA, 0, 0.001\nB, 0.002, 0\n", "utf-8")
+    content = {"contact_positions": [[0, 1], [2, 0]], "contact_ids": ["A", "B"], "si_units": "mm"}
+    probe.write_text(json.dumps({"probes": [content]}), "utf-8")
+    for path in (table, probe):
+        layout = read_layout(path)
+        assert layout.electrodes == ("A", "B")
+        np.testing.assert_allclose([layout.x, layout.y], [[0, 2e-3], [1e-3, 0]])
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "message"),
+    [
+        ("a.csv", "electrode,x\nA,1\n", "must have the columns electrode, x and y"),
+        ("a.csv", "electrode,x,y\nA,1,1\nA,2,2\n", "these electrodes twice: A"),
+        ("a.csv", "electrode,x,y\nA,1,far\n", "cannot be read .*far"),
+        ("a.csv", "electrode,x,y\nA,1,nan\n", "needs a finite place"),
+        ("a.json", "{}", "one probe of probeinterface"),
+        ("a.json", "{", "cannot be read"),
+    ],
+)
+def test_refusals_of_a_layout(tmp_path, name, text, message):
+    path = tmp_path / name
+    path.write_text(text, "utf-8")
+    with pytest.raises(RecordingError, match=message):
+        read_layout(path)
