@@ -49,6 +49,8 @@ from .identify.selecting import select_circuit as select_circuit
 from .online.controller import Controller as Controller
 from .online.tracker import Tracker as Tracker
 from .plotting import plot as plot
+from .plotting.layout import Layout as Layout
+from .plotting.layout import read_layout as read_layout
 from .recordings.hdf5 import check as check
 from .recordings.hdf5 import read as read
 from .recordings.recording import Recording as Recording
@@ -72,6 +74,9 @@ from .simulation import scenes as scenes
 from .simulation.bound import Bound as Bound
 from .simulation.bound import Bounds as Bounds
 from .simulation.bound import bound as bound
+from .simulation.calibration import CheckedCalibration as CheckedCalibration
+from .simulation.calibration import calibrate as calibrate
+from .simulation.calibration import read_driver as read_driver
 
 __all__: list[str]
 __version__: str

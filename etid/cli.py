@@ -32,20 +32,21 @@ from etid.commands import DONE, INTERRUPTED, WRONG_DATA, Outcome
 # Names of the commands, their modules and what they do. The modules import JAX, which takes most of
 # a second: only that of the command which is asked for is imported.
 COMMANDS = {
-    "simulate": ("simulate", "simulate recordings of an experiment"),
     "import": (
         "importing",
-        "convert laboratory files (.csv, .mat, .tdms, .abf, .npz, .wav, .lvm, .xlsx) to an etid "
-        "file",
+        "convert laboratory files (.csv, .mat, .tdms, .abf, .npz, .wav, .lvm, .xlsx), or a folder "
+        "of them, to an etid file",
     ),
-    "merge": (
-        "merging",
-        "write the recordings of several files into one file, each in a group of its own",
-    ),
+    "calibrate": ("calibrate", "identify a driver, and say what it is worth"),
     "check": ("check", "list the faults of a file of recordings, field by field"),
     "fit": ("fit", "identify the drivers and the loads of a file of recordings"),
     "report": ("report", "write a report about a file of fits: one HTML page"),
     "export": ("exporting", "convert fits or recordings into files for other programs"),
+    "merge": (
+        "merging",
+        "write the recordings of several files into one file, each in a group of its own",
+    ),
+    "simulate": ("simulate", "simulate recordings of an experiment"),
 }
 SHELLS = ("bash", "zsh", "fish", "tcsh", "powershell")  # the shells that shtab supports
 

@@ -1,0 +1,72 @@
+"""Identify a driver while its resistor is still connected, and say what it is worth."""
+
+import argparse
+import pathlib
+
+from etid.commands import Outcome
+from etid.plotting import figure_of
+from etid.plotting.style import save
+from etid.recordings.errors import RecordingError
+from etid.recordings.hdf5 import read
+from etid.recordings.recording import Recording
+from etid.recordings.replacing import HDF5
+from etid.results.driver import Driver
+from etid.simulation.calibration import calibrate, read_driver
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments: the files of calibrations, the driver's file, and a former one."""
+    parser.add_argument(
+        "source", type=pathlib.Path, nargs="+", metavar="FILE", help="files with calibrations"
+    )
+    parser.add_argument("-o", dest="target", type=pathlib.Path, required=True, metavar="DRIVER")
+    parser.add_argument(
+        "--former",
+        type=pathlib.Path,
+        metavar="DRIVER",
+        help="driver of a former day, to which this one is compared",
+    )
+    parser.add_argument(
+        "--picture",
+        type=pathlib.Path,
+        metavar="FILE",
+        help="also draw |Z_th| beside the former one, as .png or .svg",
+    )
+
+
+def outputs(arguments: argparse.Namespace) -> dict[pathlib.Path, tuple[str, ...]]:
+    """The file of the driver, and the picture."""
+    picture = {} if arguments.picture is None else {arguments.picture: (".png", ".svg")}
+    return {arguments.target: HDF5, **picture}
+
+
+def run(arguments: argparse.Namespace) -> Outcome:
+    """Identify the driver, write its calibrations, and return what it is worth."""
+    records: list[Recording] = []
+    for path in arguments.source:
+        with read(path) as study:
+            records += [study[name] for name in study.calibrations]
+    if not records:
+        raise RecordingError(
+            "holds no recording with a known resistor",
+            file=str(arguments.source[0]),
+            remedy="Import it with its resistor: etid import FILE --r-load OHM",
+        )
+    former = None if arguments.former is None else read_driver(arguments.former)
+    found = calibrate(records, former=former)
+    found.write(arguments.target)
+    if arguments.picture is not None:
+        drivers: dict[str, Driver] = {arguments.target.stem: found.driver}
+        drivers |= {} if former is None else {arguments.former.stem: former}
+        save(figure_of(drivers), arguments.picture)
+    data = {
+        "source": arguments.source,
+        "target": arguments.target,
+        "verdict": found.driver.verdict,
+        "order": found.driver.order,
+        "expected": found.expected,
+        "moved": found.moved,
+        "shifts": found.shifts,
+        "r_load": found.r_load,
+    }
+    return Outcome(str(found), data)
