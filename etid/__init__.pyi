@@ -67,6 +67,8 @@ from .results.instrument import Instrument as Instrument
 from .results.posterior import Posterior as Posterior
 from .results.posterior import Profile as Profile
 from .results.study_fits import StudyFits as StudyFits
+from .results.variation import Variation as Variation
+from .results.variation import variation as variation
 from .results.verdicts import RESULTS as RESULTS
 from .selection.selection import Candidate as Candidate
 from .selection.selection import Selection as Selection

@@ -1,0 +1,104 @@
+import dataclasses
+
+import numpy as np
+import pytest
+
+import etid
+from etid.recordings.errors import RecordingError
+from etid.results.variation import REST, _levels, _Model
+
+SUBJECTS, SESSIONS, TRIALS = 10, 3, 5
+SUBJECT = np.repeat(np.arange(SUBJECTS), SESSIONS * TRIALS)
+SESSION = np.tile(np.repeat(np.arange(SESSIONS), TRIALS), SUBJECTS)
+
+
+def drawn(seed, stds, s):
+    """Logarithms of an element that varies between subjects, sessions and trials."""
+    normal = np.random.default_rng(seed).standard_normal
+    parts = normal(SUBJECTS)[SUBJECT], normal((SUBJECTS, SESSIONS))[SUBJECT, SESSION]
+    parts = *parts, normal(SUBJECT.size)
+    return sum(std * part for std, part in zip(stds, parts, strict=True)) + s * normal(SUBJECT.size)
+
+
+def model_of(y, s):
+    columns = SUBJECT.astype(str), SESSION.astype(str)
+    levels = _levels(columns, ("subject", "session"), y.size)
+    assert list(levels) == ["subject", "session", REST]
+    return _Model.of(y, s, list(levels.values()))
+
+
+def test_the_restricted_likelihood_is_that_of_all_contrasts():
+    s = np.full(SUBJECT.size, 0.02)
+    y = drawn(0, (0.3, 0.1, 0.05), s)
+    model = model_of(y, s)
+    same_session = (SUBJECT[:, None] == SUBJECT) & (SESSION[:, None] == SESSION)
+    first, *others = ((0.3, 0.1, 0.05), (0.2, 0.2, 0.02), (0.0, 0.1, 0.3))
+    # ln L of the contrasts y_i − y_1, which do not depend on the mean, but for a constant.
+    contrasts = np.eye(y.size)[1:] - np.eye(y.size)[0]
+
+    def deviance(std):
+        v = std[0] ** 2 * (SUBJECT[:, None] == SUBJECT) + std[1] ** 2 * same_session
+        v = contrasts @ (v + np.diag(s**2 + std[2] ** 2)) @ contrasts.T
+        rest = contrasts @ y
+        return np.linalg.slogdet(v)[1] + rest @ np.linalg.solve(v, rest)
+
+    for other in others:
+        ours = model.deviance(np.array(other)) - model.deviance(np.array(first))
+        assert ours == pytest.approx(deviance(other) - deviance(first), rel=1e-6)
+
+
+@pytest.mark.slow
+def test_intervals_contain_the_truth_in_95_per_cent_of_studies():
+    truth, studies = np.array([0.3, 0.1, 0.05]), 60
+    inside = np.zeros(3)
+    for seed in range(studies):
+        s = np.full(SUBJECT.size, 0.02)
+        model = model_of(drawn(seed, truth, s), s)
+        best, _, _ = model.fitted()
+        for row in range(3):
+            low, high = model.interval(row, best)
+            inside[row] += low <= truth[row] <= high
+    # Of 60 studies, fewer than 52 are inside once in 500 times at 95 %.
+    assert (inside >= 52).all(), inside
+
+
+@pytest.fixture(scope="module")
+def fits():
+    """Fits of one recording, moved by a known factor for each subject and session."""
+    study = etid.scenes.paper_dry(snr_db=60.0).simulate(seed=1)
+    driver = etid.identify_driver(study["calibration/98k8"], order=5)
+    few = etid.identify_skins([study[path] for path in list(study.loaded)[:4]], driver)
+    rows = np.arange(24) % 4
+    found = few.take(rows)
+    subject, session = np.arange(24) // 8, np.arange(24) // 4 % 2
+    factor = np.exp(np.array([-0.5, 0.0, 0.5])[subject])
+    circuit = dataclasses.replace(found.circuit, r_p=factor * np.asarray(found.circuit.r_p))
+    labels = {**found.labels, "subject": subject.astype(str), "session": session.astype(str)}
+    return dataclasses.replace(
+        found, fit=dataclasses.replace(found.fit, circuit=circuit), labels=labels
+    )
+
+
+def test_a_variation_that_is_there_is_found_and_one_that_is_not_is_zero(fits):
+    found = etid.variation(fits, "r_p")
+    assert list(found.between) == ["subject", "session", REST]
+    subjects, sessions, recordings = found.between.values()
+    assert subjects.low < 0.5 < subjects.high
+    assert subjects.std == pytest.approx(0.5, rel=0.05)
+    assert sessions.low == recordings.low == 0.0
+    assert sessions.high < 0.01
+    assert "between subjects" in str(found)
+
+
+@pytest.mark.parametrize(
+    ("element", "by", "error", "message"),
+    [
+        ("r_q", ("subject",), ValueError, "must be one of r_s, r_p, c_p"),
+        ("r_p", ("subjekt",), RecordingError, "did you mean subject"),
+        ("r_p", ("site",), ValueError, "show no variation by site"),
+    ],
+)
+def test_refusals_of_a_variation(fits, element, by, error, message):
+    one = fits.take(np.arange(1)) if by == ("site",) else fits
+    with pytest.raises(error, match=message):
+        etid.variation(one, element, by)
