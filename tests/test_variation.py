@@ -85,8 +85,8 @@ def test_a_variation_that_is_there_is_found_and_one_that_is_not_is_zero(fits):
     subjects, sessions, recordings = found.between.values()
     assert subjects.low < 0.5 < subjects.high
     assert subjects.std == pytest.approx(0.5, rel=0.05)
-    assert sessions.low == recordings.low == 0.0
-    assert sessions.high < 0.01
+    assert sessions.low == 0.0
+    assert max(sessions.high, recordings.high) < 0.002  # the error of a fit is 0.0005
     assert "between subjects" in str(found)
 
 

@@ -10,7 +10,6 @@ the fits, whose standard deviations s are known:
 """
 
 import dataclasses
-import itertools
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
@@ -25,6 +24,8 @@ from etid.results.fits import Fits
 
 REST = "recordings"  # the last level: recordings with equal labels
 INTERVAL = 3.84  # increase of −2 ln L at the ends of a 95 % interval
+STEPS, SETTLED = 60, 1e-5  # of the search; the change of −2 ln L where it ends
+RIDGE = 1e-6  # added to the matrix, for deviations that are 0
 END = 0.01  # relative error of the ends of an interval
 FINE = 1e-6  # of the spread of the logarithms; smaller deviations are 0
 
@@ -132,84 +133,104 @@ def _levels(
 
 @dataclasses.dataclass(frozen=True)
 class _Model:
-    """The restricted likelihood. Groups of the first level are independent blocks.
+    """The restricted likelihood of logarithms.
 
     Attributes:
-        blocks: Logarithms, squared errors, and whether two fits share a group, for each level.
+        y: Logarithms.
+        noise: Their squared errors.
+        levels: Group of each logarithm, by level, numbered from 0.
         spread: Standard deviation of the logarithms.
-        levels: Number of levels.
     """
 
-    blocks: Sequence[tuple[np.ndarray, np.ndarray, np.ndarray]]
+    y: np.ndarray
+    noise: np.ndarray
+    levels: Sequence[np.ndarray]
     spread: float
-    levels: int
 
     @classmethod
     def of(cls, y: np.ndarray, s: np.ndarray, levels: Sequence[np.ndarray]) -> "_Model":
-        blocks = []
-        for group in np.unique(levels[0]):
-            rows = levels[0] == group
-            same = np.stack([of[rows][:, None] == of[rows] for of in levels])
-            blocks.append((y[rows], s[rows] ** 2, same.astype(float)))
-        return cls(blocks, float(np.std(y)) or 1.0, len(levels))
-
-    def sums(self, std: np.ndarray) -> tuple[float, float, float, float]:
-        """ln |V|, and 1ᵀV⁻¹1, 1ᵀV⁻¹y and yᵀV⁻¹y."""
-        total = np.zeros(4)
-        for y, noise, same in self.blocks:
-            v = np.einsum("r,rij->ij", std**2, same) + np.diag(noise + (FINE * self.spread) ** 2)
-            factor = np.linalg.cholesky(v)
-            ones, own = np.linalg.solve(factor, np.column_stack([np.ones(y.size), y])).T
-            total += 2 * np.log(np.diagonal(factor)).sum(), ones @ ones, ones @ own, own @ own
-        return tuple(total)
+        spread = float(np.std(y)) or 1.0
+        return cls(y, s**2 + (FINE * spread) ** 2, levels, spread)
 
     def deviance(self, std: np.ndarray) -> float:
         """−2 ln of the restricted likelihood."""
-        logs, ones, cross, squares = self.sums(std)
-        return logs + float(np.log(ones)) + squares - cross**2 / ones
+        return self._parts(std)[0]
 
-    def smallest(self, start: np.ndarray, fixed: Mapping[int, float]) -> tuple[np.ndarray, float]:
-        """Standard deviations with the smallest deviance, some of them fixed."""
-        free = [row for row in range(self.levels) if row not in fixed]
+    def _parts(self, std: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
+        """The deviance, P = V⁻¹ − V⁻¹1 1ᵀV⁻¹ / 1ᵀV⁻¹1, and V⁻¹1."""
+        inverse, logs = np.zeros((self.y.size, self.y.size)), 0.0
+        for group in range(self.levels[0].max() + 1):  # the groups are independent
+            rows = np.flatnonzero(self.levels[0] == group)
+            v = np.diag(self.noise[rows])
+            for one, of in zip(std, self.levels, strict=True):
+                v += one**2 * (of[rows][:, None] == of[rows])
+            logs += float(np.linalg.slogdet(v)[1])
+            inverse[np.ix_(rows, rows)] = np.linalg.inv(v)
+        ones = inverse.sum(0)
+        p = inverse - np.outer(ones, ones) / ones.sum()
+        return logs + float(np.log(ones.sum()) + self.y @ p @ self.y), p, ones
 
-        def full(x: np.ndarray) -> np.ndarray:
-            std = np.array(start)
-            std[free] = self.spread * x
-            for row, value in fixed.items():
-                std[row] = value
-            return std
+    def smallest(self, start: np.ndarray, fixed: int | None = None) -> tuple[np.ndarray, float]:
+        """Standard deviations with the smallest deviance, by Fisher's scoring of their logarithms.
 
-        if not free:
-            return full(np.zeros(0)), self.deviance(full(np.zeros(0)))
-        found = scipy.optimize.minimize(
-            lambda x: self.deviance(full(x)),
-            start[free] / self.spread,
-            bounds=[(0.0, None)] * len(free),
-            options={"ftol": 1e-6},
-        )
-        return full(found.x), float(found.fun)
+        Args:
+            start: Where to begin.
+            fixed: Level whose standard deviation stays as it is.
+        """
+        std = np.maximum(start, 0.05 * self.spread)
+        free = np.arange(std.size) != fixed
+        if fixed is not None:
+            std[fixed] = start[fixed]
+        for _ in range(STEPS):
+            slope, matrix = self._derivatives(std)
+            slope, matrix = slope[free], matrix[np.ix_(free, free)]
+            step = np.linalg.solve(matrix + RIDGE * np.eye(slope.size), -slope)
+            std[free] = np.maximum(std[free] * np.exp(np.clip(step, -2, 2)), FINE * self.spread)
+            if np.abs(step @ slope) < SETTLED:
+                break
+        return std, self.deviance(std)
+
+    def _derivatives(self, std: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Slope of the deviance by the ln σ_r, and the expected matrix of its second derivatives.
+
+        By σ_r² they are tr(P M_r) − yᵀP M_r P y and tr(P M_r P M_s), M_r = Z_r Z_rᵀ.
+        """
+        _, p, _ = self._parts(std)
+        columns, along = [_summed(p, of) for of in self.levels], self.y @ p
+        slope = [
+            np.trace(_summed(part.T, of)) - np.sum(np.bincount(of, along) ** 2)
+            for part, of in zip(columns, self.levels, strict=True)
+        ]
+        matrix = [[np.sum(_summed(part.T, of) ** 2) for of in self.levels] for part in columns]
+        scale = 2 * std**2
+        return scale * np.array(slope), scale[:, None] * np.array(matrix) * scale
 
     def fitted(self) -> tuple[Float[np.ndarray, " level"], float, float]:
         """The standard deviations, the mean and its standard error."""
-        best, _ = self.smallest(np.full(self.levels, 0.3 * self.spread), {})
-        _, ones, cross, _ = self.sums(best)
-        return best, float(cross / ones), float(1 / np.sqrt(ones))
+        best, _ = self.smallest(np.full(len(self.levels), 0.3 * self.spread))
+        _, _, ones = self._parts(best)
+        return best, float(ones @ self.y / ones.sum()), float(1 / np.sqrt(ones.sum()))
 
     def interval(self, row: int, best: np.ndarray) -> tuple[float, float]:
         """The ends of the 95 % interval of one standard deviation."""
         least = self.deviance(best)
 
         def beyond(std: float) -> float:
-            return self.smallest(best, {row: std})[1] - least - INTERVAL
+            start = best.copy()
+            start[row] = std
+            return self.smallest(start, row)[1] - least - INTERVAL
 
-        at = float(best[row])
-        low = (
-            scipy.optimize.brentq(beyond, 0.0, at, xtol=FINE, rtol=END) if beyond(0.0) > 0 else 0.0
-        )
-        outside = (
-            end
-            for end in (max(at, FINE * self.spread) * 2.0**n for n in itertools.count(1))
-            if beyond(end) > 0
-        )
-        high = scipy.optimize.brentq(beyond, at, next(outside), xtol=FINE, rtol=END)
-        return float(low), float(high)
+        at, low = float(best[row]), 0.0
+        if beyond(0.0) > 0:
+            low = float(scipy.optimize.brentq(beyond, 0.0, at, rtol=END))
+        high = max(at, 1e3 * FINE * self.spread)
+        while beyond(high) < 0:
+            high *= 2
+        return low, float(scipy.optimize.brentq(beyond, at, high, rtol=END))
+
+
+def _summed(matrix: np.ndarray, groups: np.ndarray) -> np.ndarray:
+    """Sums of the columns of each group."""
+    order = np.argsort(groups, kind="stable")
+    starts = np.flatnonzero(np.diff(groups[order], prepend=-1))
+    return np.add.reduceat(matrix[:, order], starts, axis=1)
