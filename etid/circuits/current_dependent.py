@@ -9,7 +9,7 @@ fall of the resistance to a thirtieth up to 25 mA:
 
 from collections.abc import Callable
 from functools import reduce
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import jax.numpy as jnp
 from jaxtyping import Array, Complex, Float
@@ -19,7 +19,6 @@ from etid.circuits.elements import Farad, Ohm, Resistance, capacitor, resistor
 from etid.circuits.impedance import (
     AbstractImpedance,
     Netlist,
-    Notation,
     Parallel,
     Quantity,
     Series,
@@ -34,6 +33,7 @@ Ampere = Quantity
 class CurrentDependentResistance(Resistance):
     """A resistor R / (1 + |i| / I_0); its impedance is that at small currents, R."""
 
+    symbol: ClassVar[str] = ""
     i_0: Ampere
 
     def current(
@@ -61,10 +61,6 @@ class CurrentDependentResistance(Resistance):
         raise ValueError(
             "a resistor that depends on its current cannot be written as resistors and capacitors"
         )
-
-    def text(self, notation: Notation) -> str:
-        """Raise ValueError: impedance.py has no such element."""
-        raise ValueError("impedance.py has no element for a resistor that depends on its current")
 
 
 def current_dependent_resistor(r: Ohm, i_0: Ampere) -> CurrentDependentResistance:
@@ -148,10 +144,7 @@ def current_dependent(impedance: AbstractImpedance) -> CurrentDependentResistanc
     Raises:
         ValueError: There are several.
     """
-    if isinstance(impedance, CurrentDependentResistance):
-        return impedance
-    parts = impedance.parts if isinstance(impedance, Series | Parallel) else ()
-    found = [one for one in map(current_dependent, parts) if one is not None]
+    found = [one for one in impedance.elements() if isinstance(one, CurrentDependentResistance)]
     if len(found) > 1:
         raise ValueError(
             f"a circuit has {len(found)} resistors that depend on their current; use one"
