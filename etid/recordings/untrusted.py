@@ -186,12 +186,16 @@ def attribute(owner: h5py.HLObject, name: str) -> Any:
         Exception: The value cannot be read or is too large.
     """
     stored = owner.attrs.get_id(name)
-    dtype = stored.dtype
+    dtype, shape = stored.dtype, stored.shape
     if dtype.hasobject and not (h5py.check_string_dtype(dtype) or h5py.check_ref_dtype(dtype)):
         raise TypeError("it is a sequence of variable length")
-    size = math.prod(stored.shape or ()) * dtype.itemsize
+    size = math.prod(shape or ()) * dtype.itemsize
     if size > limits.ATTRIBUTE:
         raise ValueError(f"it has {size} bytes, at most {limits.ATTRIBUTE} are read")
+    if shape is not None and dtype.kind in "iufS":  # as h5py does, which opens it once more
+        numbers = np.empty(shape, dtype)
+        stored.read(numbers)
+        return numbers[()]
     value = owner.attrs[name]
     if isinstance(value, str):
         return _clean(value)
