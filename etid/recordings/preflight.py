@@ -223,6 +223,7 @@ class Inspected:
         return bool(self._used.periodic[self._place])
 
 
+@quietly()
 def preflight(inspected: Inspected, *, periodic: bool = False) -> str | None:
     """Name of the verdict that forbids a fit; None if a fit is allowed.
 

@@ -33,6 +33,7 @@ from etid.recordings.fields import (
 )
 from etid.recordings.splitting import by_pauses, by_trigger
 from etid.recordings.values import real
+from etid.signals.noise import printed_step
 
 # Infinite samples get a verdict; neighbours of a damaged recording are not concerned.
 quietly = functools.partial(np.errstate, invalid="ignore", over="ignore")
@@ -100,8 +101,12 @@ class Samples:
 
     @property
     def resolution(self) -> float | None:
-        """Size of one converter step in SI units [V or A]; None for samples that are not codes."""
-        return abs(self.conversion) if self.stored.dtype.kind in "iu" else None
+        """Size of one converter step in SI units [V or A]; None if the samples show no step.
+
+        Real numbers of three digits, as a coarse table has them, have the step of the largest.
+        """
+        step = 1.0 if self.stored.dtype.kind in "iu" else printed_step(self.stored)
+        return abs(self.conversion) * step or None
 
     def __reduce__(self) -> tuple:
         # By default a copy would hold an array that can be written.

@@ -34,6 +34,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import numpy.typing as npt
 import scipy
 from jaxtyping import Array, Bool, Complex, Float, Int
 
@@ -191,6 +192,23 @@ def step_of(v: Float[np.ndarray, " time"]) -> float:
     step = float(steps.min())
     count = steps / step
     return step if np.abs(count - np.round(count)).max() < equal * count.max() else 0.0
+
+
+def printed_step(v: npt.NDArray) -> float:
+    """Rounding of the largest values of a record whose values all have at most three digits.
+
+    0 if they have more digits, or if all of them are multiples of this step, as those of a
+    converter and of a generator's levels are.
+    """
+    for value in v[:: max(1, v.size // 64)]:  # most records end at the first one
+        if v.dtype.type(f"{value:.3g}") != value:
+            return 0.0
+    largest = float(np.max(np.abs(v)))
+    if not 0 < largest < np.inf:
+        return 0.0
+    step = 10.0 ** (math.floor(math.log10(largest)) - 2)
+    count = v[:: max(1, v.size // 1024)] / step
+    return 0.0 if np.abs(count - np.round(count)).max() < 1e-3 else step
 
 
 def noise_before(v: Float[np.ndarray, " time"], step: float) -> float:

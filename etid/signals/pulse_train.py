@@ -65,10 +65,12 @@ class PulseTrain:
         if self.spacing is not None:
             if abs(self.spacing / nominal - 1) <= RATE:
                 return ""
+            is_period = abs(pulse_rate * rate / self.spacing - 1) <= RATE
+            slip = " pulse_rate is a period in seconds; give pulses per second." * is_period
             return (
                 f"The pulses are {self.spacing:.6g} samples apart, but {said}. That would be right "
                 f"with sample_rate = {_counted(pulse_rate * self.spacing)} Hz, or with "
-                f"pulse_rate = {_counted(rate / self.spacing)} Hz."
+                f"pulse_rate = {_counted(rate / self.spacing)} Hz.{slip}"
             )
         if self.edges.size != 1:
             return ""
@@ -109,6 +111,8 @@ def pulse_trains(
         pulse_rate: Pulses per second [Hz]; may be wrong by an order of magnitude.
     """
     size, period = records.shape[1], sample_rate / pulse_rate
+    if period > size:
+        period = min(period, sample_rate * pulse_rate)  # pulse_rate may be a period
     step = max(1, int(period / 512))
     number = size // step
     coarse = records[:, : number * step].reshape(len(records), number, step)
