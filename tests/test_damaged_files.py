@@ -11,7 +11,7 @@ import pytest
 import etid
 from benchmarks import fuzz, specimens
 from benchmarks.ladder import TRIAL, rung
-from etid.files.readers import mat5
+from etid.files.readers import matlab
 from etid.recordings import hdf5, limits, untrusted
 from etid.recordings.preflight import Inspected, preflight
 from etid.report import figures
@@ -334,7 +334,7 @@ def test_matlab_5_of_an_unknown_type_is_refused_before_scipy_ends_the_process(ki
     data[176] = 8
     path.write_bytes(data)
     with pytest.raises(etid.RecordingError, match="of type 8, which does not exist"):
-        mat5.check(path)
+        matlab.check(path)
 
 
 @pytest.mark.parametrize(
@@ -350,10 +350,10 @@ def test_matlab_5_without_its_numbers_is_refused_before_scipy_ends_the_process(
     path = tmp_path / "rig.mat"
     data = bytearray(kinds["matlab5"].good[0])
     assert data[144:146] == b"\x06\x00"  # a real double
-    mat5.check(_written(path, data))
+    matlab.check(_written(path, data))
     data[place] = value
     with pytest.raises(etid.RecordingError, match="without its numbers"):
-        mat5.check(_written(path, data))
+        matlab.check(_written(path, data))
 
 
 def _written(path, data):

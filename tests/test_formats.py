@@ -12,8 +12,8 @@ from nptdms import ChannelObject, TdmsWriter
 
 import etid
 from etid.files import channel as channels
-from etid.files.readers import rows as text_rows
-from etid.files.units import UNITS, parse_unit
+from etid.files.channel import UNITS, parse_unit
+from etid.files.readers import delimited as text_rows
 from etid.recordings import hdf5
 from etid.recordings.recording import RecordingError
 from tests.lab_files import abf, matlab, tdms

@@ -222,7 +222,7 @@ PROBLEMS = {
     "zero rate": (set_attribute(DAMP, "sample_rate", 0.0), "sample_rate: is 0 hertz, must be > 0"),
     "text rate": (
         set_attribute(DAMP, "sample_rate", "200k"),
-        "sample_rate: is text '200k', must be",
+        "sample_rate: is '200k', must be",
     ),
     "NaN rate": (set_attribute(DAMP, "pulse_rate", np.nan), "pulse_rate: is nan"),
     "aliased": (set_attribute(DAMP, "pulse_rate", 1e5), "pulse_rate: is 100000 Hz, must be below"),

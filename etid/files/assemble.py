@@ -11,10 +11,9 @@ from typing import Any
 
 import numpy as np
 
-from etid.files.channel import Channel, located
+from etid.files.channel import Channel, Unit, located
 from etid.files.clock import sample_rate
 from etid.files.mapping import KINDS, PAUSES, Plan, Signal, unit_of
-from etid.files.units import Unit
 from etid.recordings import limits
 from etid.recordings.fields import SIGNALS, Metadata, metadata_from
 from etid.recordings.recording import AbstractSource, Layout, Recording, RecordingError, Samples

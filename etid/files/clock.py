@@ -4,9 +4,8 @@ from collections.abc import Iterator, Mapping
 
 import numpy as np
 
-from etid.files.channel import Channel, located
+from etid.files.channel import Channel, Unit, located
 from etid.files.mapping import Plan
-from etid.files.units import Unit
 from etid.recordings.fields import Metadata
 from etid.recordings.recording import RecordingError
 from etid.signals.pulse_train import find_pulses

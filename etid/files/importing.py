@@ -6,16 +6,16 @@ channels. The recordings are written while they are read.
 """
 
 import contextlib
+import dataclasses
 import os
 import pathlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 from etid.files.assemble import Imported, Used, sources_of
-from etid.files.channel import Contents, located
+from etid.files.channel import Channel, Contents, located
 from etid.files.clock import check_spacing
 from etid.files.mapping import CHANNELS, of_files, plans, read_mapping
-from etid.files.others import with_others
 from etid.files.readers import abf, delimited, excel, lvm, matlab, npz, tdms, wav
 from etid.recordings.errors import require_file
 from etid.recordings.fields import LABELS
@@ -222,3 +222,59 @@ def _import_npz(
                 )
             )
     return used
+
+
+# --- Channels of other files ----------------------------------------------------------------------
+
+
+def with_others(
+    contents: Contents, mapping: Mapping[str, Any], opened: Callable[[pathlib.Path], Contents]
+) -> Contents:
+    """The contents of a file, together with the channels of other files that a mapping names.
+
+    A mapping names such a channel `FILE:NAME`: channel `NAME` of the file with this path, from the
+    current folder. So V_th may be recorded once for all trials.
+
+    Args:
+        contents: Contents of the file.
+        mapping: Content of a mapping, from `etid.files.mapping.read_mapping`.
+        opened: Function that opens a file.
+
+    Raises:
+        RecordingError: Another file cannot be read.
+    """
+    others: dict[str, Contents] = {}
+    for name in _named(mapping):
+        file = name.rpartition(":")[0]
+        if name not in contents.names and file not in others and pathlib.Path(file).is_file():
+            with located(file):
+                others[file] = opened(pathlib.Path(file))
+    if not others:
+        return contents
+
+    def channel(name: str) -> Channel:
+        if name in contents.names:
+            return contents.channel(name)
+        file, _, own = name.rpartition(":")
+        with located(file):
+            return dataclasses.replace(others[file].channel(own), name=name)
+
+    def prepare(names: Iterable[str]) -> None:
+        wanted = set(names)
+        contents.prepare(wanted.intersection(contents.names))
+        for file, other in others.items():
+            with located(file):
+                other.prepare({one for one in other.names if f"{file}:{one}" in wanted})
+
+    foreign = (f"{file}:{name}" for file, other in others.items() for name in other.names)
+    return Contents((*contents.names, *foreign), channel, prepare)
+
+
+def _named(mapping: Mapping[str, Any]) -> Iterator[str]:
+    """The names of channels in a mapping; `plans` checks its form."""
+    tables = mapping.get("recording", [])
+    for table in [mapping, *(tables if isinstance(tables, list) else [tables])]:
+        for signal in CHANNELS:
+            said = table.get(signal) if isinstance(table, Mapping) else None
+            if isinstance(said, Mapping) and isinstance(said.get("channel"), str):
+                yield said["channel"]

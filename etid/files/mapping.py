@@ -13,8 +13,7 @@ import tomllib
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from etid.files.channel import chosen, listed
-from etid.files.units import UNITS, Unit, parse_unit
+from etid.files.channel import UNITS, Unit, chosen, listed, parse_unit
 from etid.recordings import limits
 from etid.recordings.fields import DECLARED, SIGNALS, check_names, tidy_path
 from etid.recordings.recording import RecordingError

@@ -305,14 +305,12 @@ class Scan:
                 continue
             try:
                 found[name] = known[name].parse(value)
-            except ValueError as error:
-                remedy = f"The schema requires {known[name].expects}"
-                self._report(path, f"{of}{name}", str(error), remedy)
+            except RecordingError as error:
+                remedy = error.remedy or f"The schema requires {known[name].expects}"
+                self._report(path, f"{of}{name}", error.message, remedy)
         return found
 
-    def _header(
-        self, group: h5py.Group, field: Field, path: str
-    ) -> tuple[tuple[int, ...], Layout]:
+    def _header(self, group: h5py.Group, field: Field, path: str) -> tuple[tuple[int, ...], Layout]:
         """Shape and description of a dataset; its samples must be in this file."""
         link = local_link(group, field.name)
         try:

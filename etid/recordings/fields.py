@@ -7,6 +7,7 @@ change.
 """
 
 import dataclasses
+import math
 from collections.abc import Mapping, Sequence
 from typing import Any, Literal, Required, TypedDict
 
@@ -14,7 +15,51 @@ import numpy as np
 
 from etid.recordings import limits
 from etid.recordings.errors import RecordingError, near_miss
-from etid.recordings.values import Type, real, several, stored, text
+
+Type = Literal["text", "paths", "label", "number", "range", "samples"]
+
+
+def text(field: str, value: object) -> str:
+    """A label as text; integers become their decimal digits."""
+    if isinstance(value, int | np.integer) and not isinstance(value, bool):
+        value = int(value)
+    elif not isinstance(value, str):
+        raise RecordingError(f"is {value!r}, must be text or an integer", field=field)
+    label = str(value)
+    if "\0" in label or any("\ud800" <= character <= "\udfff" for character in label):
+        raise RecordingError(f"{label!r} cannot be stored as UTF-8 text", field=field)
+    return label
+
+
+def real(field: str, value: object) -> float:
+    """A finite real number; text and booleans are an error."""
+    number = isinstance(value, int | float | np.integer | np.floating) or (
+        getattr(value, "shape", None) == () and getattr(value, "dtype", np.dtype("O")).kind in "iuf"
+    )
+    if not number or isinstance(value, bool) or not math.isfinite(float(value)):  # type: ignore[arg-type]  # checked on this line
+        raise RecordingError(f"is {value!r}, must be a finite real number", field=field)
+    return float(value)  # type: ignore[arg-type]  # checked above
+
+
+def several(field: str, value: object) -> list[Any]:
+    """The items of a sequence; a text is one item."""
+    if isinstance(value, str):
+        return [value]
+    try:
+        return list(value)  # type: ignore[call-overload]  # other types raise TypeError
+    except TypeError:
+        raise RecordingError(f"is {value!r}, must be a sequence", field=field) from None
+
+
+def plain(item: Any) -> Any:
+    """One element of an attribute of a file as a Python object; bytes become text."""
+    if isinstance(item, bytes):
+        try:
+            return item.decode("utf-8")
+        except UnicodeDecodeError:
+            raise RecordingError(f"is {item!r}, which is not UTF-8 text") from None
+    return item.item() if isinstance(item, np.generic) else item
+
 
 KINDS = ("calibration", "loaded")
 
@@ -67,27 +112,28 @@ class Field:
         return {"label": "", "paths": ()}.get(self.type)
 
     def parse(self, value: Any) -> Any:
-        """Value of an attribute of a file as a Python str, a float, or a tuple of them.
+        """Value of an attribute of a file, as `checked`; labels of a stack become a tuple.
 
         Raises:
-            ValueError: The value does not follow the schema; the text describes the value.
+            RecordingError: The value does not follow the schema.
         """
         array = np.asarray(value)
         if array.size == 0 or "Empty" in type(value).__name__:
-            raise ValueError("is empty")
+            raise RecordingError("is empty")
         if array.dtype.names is not None:
-            raise ValueError("is a compound value")
+            raise RecordingError("is a compound value")
         if array.dtype.hasobject and any(type(x).__module__.startswith("h5py") for x in array.flat):
-            raise ValueError("is an HDF5 reference; write the path as text")
-        items = [stored(item, self.type) for item in array.flat]
-        if self.values and items[0] not in self.values:
-            raise ValueError(f"is {items[0]!r}")
+            raise RecordingError("is an HDF5 reference; write the path as text")
+        items = [plain(item) for item in array.flat]
         many = self.type in ("paths", "range") or ("(trial,)" in self.shape and array.ndim == 1)
         if array.ndim > 1 or (len(items) > 1 and not many):
-            raise ValueError(f"has shape {array.shape}")
-        if self.type == "range" and len(items) != 2:
-            raise ValueError(f"has {len(items)} elements, must have 2")
-        return tuple(items) if many else items[0]
+            raise RecordingError(f"has shape {array.shape}")
+        if many and self.type == "label":
+            return tuple(map(self.checked, items))
+        found = self.checked(items if many else items[0])
+        if self.values and found not in self.values:
+            raise RecordingError(f"is {found!r}")
+        return found
 
     def checked(self, value: Any) -> Any:
         """Value that a caller gives, as Python types.
@@ -97,7 +143,9 @@ class Field:
         """
         if value is None:
             return self.empty
-        if self.type == "label":
+        if self.type == "text" and not isinstance(value, str):
+            raise RecordingError(f"is {value!r}, must be text", field=self.name)
+        if self.type in ("text", "label"):
             return text(self.name, value)
         if self.type == "paths":
             return tuple(tidy_path(path) for path in several(self.name, value))

@@ -98,8 +98,8 @@ def _check_root(file: h5py.File, name: str) -> None:
                 raise RecordingError(f"is missing{hint}", remedy=remedy)
             try:
                 found[field.name] = field.parse(attribute(file, field.name))
-            except ValueError as error:
-                raise RecordingError(str(error), remedy=remedy) from None
+            except RecordingError as error:
+                raise RecordingError(error.message, remedy=remedy) from None
     problem = schema.version_problem(found["schema_version"])
     if problem:
         raise RecordingError(

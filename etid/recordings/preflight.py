@@ -12,11 +12,10 @@ from jaxtyping import Bool, Float
 from etid.recordings.group import BY_CHANCE, Group, covariance_of
 from etid.recordings.recording import Recording, quietly
 from etid.recordings.remarks import Remark
-from etid.signals.aliases import aliases
 from etid.signals.clipping import is_clipped, is_command
 from etid.signals.disturbances import Joint, Shifts
 from etid.signals.filtering import TAPS
-from etid.signals.harmonics import ALIASED, joins_aliases
+from etid.signals.harmonics import ALIASED, aliases, joins_aliases
 from etid.signals.mains import Hum
 from etid.signals.pulse_train import PulseTrain, rise_time, shifted, whole_lag
 

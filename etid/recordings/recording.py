@@ -30,9 +30,9 @@ from etid.recordings.fields import (
     Given,
     Metadata,
     metadata_from,
+    real,
 )
 from etid.recordings.splitting import by_pauses, by_trigger
-from etid.recordings.values import real
 from etid.signals.noise import printed_step
 
 # Infinite samples get a verdict; neighbours of a damaged recording are not concerned.

@@ -31,7 +31,6 @@ import scipy
 from jaxtyping import Complex, Float, Int
 
 from etid.recordings.preflight import Inspected
-from etid.signals.harmonics import fast_length
 from etid.signals.pulse_train import RATE
 
 # Relative to the sample rate. Below it, bands share one estimate of their noise. Above it, aliases
@@ -101,7 +100,7 @@ def bands(sample_rate: float, pulse_rate: float, band: float) -> Bands:
     The measured pulse rate may differ from the nominal one.
     """
     length = int((1 - RATE) * sample_rate / pulse_rate)
-    size = fast_length(length)
+    size = scipy.fft.next_fast_len(length, real=True)
     count = int(band * size)
     edges, ratio = [*range(min(12, count))], 1.08
     while edges and edges[-1] * ratio + 1 < count:

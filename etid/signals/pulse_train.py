@@ -13,8 +13,6 @@ import numpy as np
 import scipy
 from jaxtyping import Bool, Complex, Float, Int
 
-from etid.signals.harmonics import fast_length
-
 EVEN = 0.05  # relative range of the spacings up to which the pulses have one rate
 RATE = 2e-3  # relative error of pulse_rate; a larger one is a wrong number, not an inexact clock
 
@@ -276,7 +274,7 @@ def _lags(
     begin = first - reach
     start = max(0, begin)
     searched = rises(records[rows, 1, start : last + reach], rise)
-    size = fast_length(template.shape[1] + 2 * reach)
+    size = scipy.fft.next_fast_len(template.shape[1] + 2 * reach, real=True)
     # Single precision suffices, and its transforms take a fourth of the time.
     both = np.zeros((len(rows), 2, size), np.float32)
     both[:, 0, start - begin : start - begin + searched.shape[1]] = searched
