@@ -39,12 +39,7 @@ class CurrentDependentResistance(Resistance):
     def current(
         self, wave: Float[Array, " time"], resistance: Float[Array, ""]
     ) -> Float[Array, " time"]:
-        """The current i [A] at which u(i) + R′ i is the given wave, with the voltage u(i) [V].
-
-        Args:
-            wave: u + R′ i [V].
-            resistance: R′ [Ω].
-        """
+        """The current i [A] at which u(i) + R′ i is the given wave, with the voltage u(i) [V]."""
         size, r, i_0 = jnp.abs(wave), jnp.asarray(self.r), jnp.asarray(self.i_0)
         half = r + resistance - size / i_0
         root = jnp.sqrt(half**2 + 4 * resistance * size / i_0)
@@ -139,11 +134,7 @@ class Port(NamedTuple):
 
 
 def current_dependent(impedance: AbstractImpedance) -> CurrentDependentResistance | None:
-    """The resistor of a circuit that depends on its current; None if there is none.
-
-    Raises:
-        ValueError: There are several.
-    """
+    """The resistor of a circuit that depends on its current; None if there is none."""
     found = [one for one in impedance.elements() if isinstance(one, CurrentDependentResistance)]
     if len(found) > 1:
         raise ValueError(
@@ -153,13 +144,7 @@ def current_dependent(impedance: AbstractImpedance) -> CurrentDependentResistanc
 
 
 def port(impedance: AbstractImpedance, source: Norton, s: Complex[Array, " frequency"]) -> Port:
-    """The source behind everything between it and the resistor that depends on its current.
-
-    Args:
-        impedance: The circuit, with one such resistor.
-        source: The source at its terminals.
-        s: Frequency variable [rad/s].
-    """
+    """The source behind everything between it and the resistor that depends on its current."""
     if isinstance(impedance, CurrentDependentResistance):
         return Port(impedance, source, lambda signals: signals)
     assert isinstance(impedance, Series | Parallel)

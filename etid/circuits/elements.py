@@ -279,9 +279,6 @@ def ladder(q: float, alpha: float, band: tuple[float, float]) -> AbstractImpedan
         q: Q [S s^α].
         alpha: α.
         band: Lowest and highest frequency [Hz].
-
-    Raises:
-        ValueError: α is above 1.
     """
     if alpha > 1:
         raise ValueError(

@@ -101,18 +101,11 @@ class AbstractImpedance(eqx.Module):
         Args:
             rate: Sampling rate of the record [Hz].
             samples: Length of the record.
-
-        Raises:
-            ValueError: An element has no known ladder.
         """
 
     @abc.abstractmethod
     def connect(self, netlist: Netlist, plus: str, minus: str) -> None:
-        """Write the network between two nodes, exactly or as a ladder that is accurate in the band.
-
-        Raises:
-            ValueError: No passive network has these values.
-        """
+        """Write the network between two nodes, exactly or as a ladder for the band."""
 
     @abc.abstractmethod
     def text(self, notation: Notation) -> str:
@@ -276,12 +269,7 @@ class Parallel(AbstractConnection):
 
 
 def realise(impedance: Rational, rate: float | Float[Array, ""]) -> StateSpace:
-    """State space of a load impedance, from current [A] to voltage [V].
-
-    Args:
-        impedance: Proper rational function of s [rad/s].
-        rate: Typical rate [1/s] that scales the states. It does not change the impedance.
-    """
+    """State space of a load impedance, from current [A] to voltage [V]."""
     order = impedance.den.shape[0] - 1
     if impedance.num.shape[0] > order + 1:
         raise ValueError(

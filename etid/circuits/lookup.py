@@ -54,10 +54,6 @@ def circuit_class(stored: str, given: type[AbstractCircuit] | None = None) -> ty
     Args:
         stored: Qualified name of the circuit in the file.
         given: Class that the caller expects. If it is None, the class is searched by name.
-
-    Raises:
-        LookupError: No class has this name, or `given` has a different name. The message says what
-            to do.
     """
     string = stored.removeprefix("etid:")
     if given is None and is_circuit_string(string):
@@ -100,9 +96,6 @@ def imported(name: str) -> type[AbstractCircuit]:
 
     Args:
         name: `Class` for a circuit of etid, a circuit string, or `module:Class`.
-
-    Raises:
-        ValueError: The module cannot be imported or has no such circuit, or the string is none.
     """
     if is_circuit_string(name):
         return class_of(name)

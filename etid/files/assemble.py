@@ -138,9 +138,6 @@ def sources_of(
         channel: Function that returns the channel of a name.
         file: Path of the file, for errors.
         by: Source of the plan, for errors: `mapping` or `command`.
-
-    Raises:
-        RecordingError: The file and the plan do not describe valid recordings.
     """
     channels: dict[str, Channel] = {}
     units: dict[str, tuple[Unit, str]] = {}

@@ -63,11 +63,7 @@ class Channel:
         return self.shape[-1]
 
     def blocks(self, trial: int = 0) -> Iterator[np.ndarray]:
-        """The stored samples of a trial, in blocks of `BLOCK` samples.
-
-        Raises:
-            RecordingError: The file ends before the last sample.
-        """
+        """The stored samples of a trial, in blocks of `BLOCK` samples."""
         for start in range(0, self.length, BLOCK):
             stop = min(start + BLOCK, self.length)
             block = self.read(trial, start, stop)
@@ -168,9 +164,6 @@ def rate_of(interval: float, precision: float, unit: str = "s") -> float | None:
         interval: Time between two samples, in the unit; None is returned if it is not positive.
         precision: Relative precision of the interval.
         unit: Unit of the interval in the spelling of the file.
-
-    Raises:
-        RecordingError: The unit is not one of time, as in the file of a spectrum.
     """
     time = parse_unit(unit)
     if time is None or time.si != "second":
@@ -197,9 +190,6 @@ def optional(module: str, extra: str, file: str, package: str = "") -> Any:
         extra: Extra of etid that installs the package.
         file: The file that needs it.
         package: Name of the package if it is not that of the module.
-
-    Raises:
-        RecordingError: The package is not installed.
     """
     try:
         return importlib.import_module(module)
@@ -267,11 +257,7 @@ def with_unit(name: str) -> tuple[str, str]:
 
 
 def one_unit(name: str, *said: str) -> str:
-    """The unit of a channel that a file names in several places; empty if it names none.
-
-    Raises:
-        RecordingError: The places disagree.
-    """
+    """The unit of a channel that a file names in several places; empty if it names none."""
     found = {parse_unit(unit) or unit.strip(): unit.strip() for unit in said if unit.strip()}
     if len(found) > 1:
         raise RecordingError(

@@ -234,14 +234,6 @@ def with_others(
 
     A mapping names such a channel `FILE:NAME`: channel `NAME` of the file with this path, from the
     current folder. So V_th may be recorded once for all trials.
-
-    Args:
-        contents: Contents of the file.
-        mapping: Content of a mapping, from `etid.files.mapping.read_mapping`.
-        opened: Function that opens a file.
-
-    Raises:
-        RecordingError: Another file cannot be read.
     """
     others: dict[str, Contents] = {}
     for name in _named(mapping):

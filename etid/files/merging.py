@@ -56,10 +56,6 @@ def merge_files(
 
     Returns:
         Number of recordings of each group.
-
-    Raises:
-        RecordingError: Two files have the same name, or a file or one of its recordings cannot be
-            read.
     """
     paths = [pathlib.Path(os.fspath(source)) for source in sources]
     merged: dict[str, AbstractSource] = {}

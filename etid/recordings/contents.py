@@ -144,25 +144,28 @@ class Scan:
         return {row.metadata.path: row for block in self.blocks.values() for row in block.sources()}
 
     def check_samples(self) -> None:
-        """Read all samples, and report unreadable and infinite samples and wrong rates."""
+        """Read all samples, and report what no fit can use of them."""
         for path, source in self.sources().items():
             with self._reported(path):
-                recording = source.load()
-                for name, record in recording.samples.items():
-                    count = int(np.sum(~np.isfinite(record.stored)))
-                    if count:
-                        self._report(
-                            path,
-                            name,
-                            f"{count} of {record.stored.size} samples are not finite",
-                            "Record again; a fit of this recording only gives a verdict",
-                        )
-                cause = recording.samples[recording.cause].values
-                with np.errstate(over="ignore", invalid="ignore"):  # of samples like 1e308
-                    train = find_pulses(cause, recording.sample_rate, recording.pulse_rate)
-                if train.mismatch:
-                    remedy = "Correct sample_rate or pulse_rate"
-                    self._report(path, "pulse_rate", train.mismatch.removesuffix("."), remedy)
+                self._check(path, source.load())
+
+    def _check(self, path: str, recording: Recording) -> None:
+        before = len(self.problems)
+        for name, record in recording.samples.items():
+            count = int(np.sum(~np.isfinite(record.stored)))
+            if count:
+                message = f"{count} of {record.stored.size} samples are not finite"
+                remedy = "Record again; a fit of this recording only gives a verdict"
+                self._report(path, name, message, remedy)
+        cause = recording.samples[recording.cause].values
+        train = find_pulses(cause, recording.sample_rate, recording.pulse_rate)
+        if train.mismatch:
+            remedy = "Correct sample_rate or pulse_rate"
+            self._report(path, "pulse_rate", train.mismatch.removesuffix("."), remedy)
+        current = recording.current
+        if len(self.problems) == before and current is not None and np.ptp(current) == 0:
+            remedy = "Record the current of the pulses, or remove the dataset"
+            self._report(path, "current", f"is constant, {current[0]:g} A", remedy)
 
     def _report(self, path: str, field: str, message: str, remedy: str = "") -> None:
         self.problems.append(

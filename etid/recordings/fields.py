@@ -112,11 +112,7 @@ class Field:
         return {"label": "", "paths": ()}.get(self.type)
 
     def parse(self, value: Any) -> Any:
-        """Value of an attribute of a file, as `checked`; labels of a stack become a tuple.
-
-        Raises:
-            RecordingError: The value does not follow the schema.
-        """
+        """Value of an attribute of a file, as `checked`; labels of a stack become a tuple."""
         array = np.asarray(value)
         if array.size == 0 or "Empty" in type(value).__name__:
             raise RecordingError("is empty")
@@ -136,11 +132,7 @@ class Field:
         return found
 
     def checked(self, value: Any) -> Any:
-        """Value that a caller gives, as Python types.
-
-        Raises:
-            RecordingError: The value does not follow the schema.
-        """
+        """Value that a caller gives, as Python types."""
         if value is None:
             return self.empty
         if self.type == "text" and not isinstance(value, str):
@@ -354,11 +346,7 @@ class Metadata(AbstractFields):
 
 
 def metadata_from(*, path: str = "", **fields: Any) -> Metadata:
-    """Metadata from unchecked values; only this function checks and converts their types.
-
-    Raises:
-        RecordingError: A value does not follow the schema, or a field is unknown or missing.
-    """
+    """Metadata from unchecked values; only this function checks and converts their types."""
     check_names(fields, tuple(DECLARED), "field of a recording")
     for name, field in DECLARED.items():
         if field.required == "always" and fields.get(name) is None:
@@ -375,9 +363,6 @@ def check_names(given: Mapping[str, Any], known: Sequence[str], what: str, of: s
         known: Known names.
         what: Word for these names in the error, such as "label".
         of: Text before the name in the error, such as "v_th.".
-
-    Raises:
-        RecordingError: A name is not known; the error suggests a similar known name.
     """
     for name in given:
         if name not in known:
@@ -390,10 +375,6 @@ def check_names(given: Mapping[str, Any], known: Sequence[str], what: str, of: s
 
 
 def wanted_labels(given: Mapping[str, Any], known: Sequence[str]) -> dict[str, str]:
-    """Labels for a choice of recordings or fits, as text; labels that are None are ignored.
-
-    Raises:
-        RecordingError: The name of a label is unknown, or a value is neither text nor an integer.
-    """
+    """Labels for a choice of recordings or fits, as text; labels that are None are ignored."""
     check_names(given, known, "label")
     return {name: text(name, value) for name, value in given.items() if value is not None}

@@ -101,11 +101,7 @@ def texts(remarks: int | np.integer) -> list[str]:
 
 @functools.cache
 def remarks_of(text: str) -> int:
-    """Remarks from a text of `words`.
-
-    Raises:
-        ValueError: A word is not a remark.
-    """
+    """Remarks from a text of `words`."""
     remarks = {str(remark.name): remark for remark in Remark}
     unknown = sorted(set(text.split()) - remarks.keys())
     if unknown:

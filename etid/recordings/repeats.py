@@ -218,17 +218,7 @@ def _of_currents(
     sigma: Float[np.ndarray, " lane"],
     at: Float[np.ndarray, "lane period"],
 ) -> list[Repeats]:
-    """Deviations of the quotients of voltage and current.
-
-    Args:
-        first: One of the recordings; all have equal rates.
-        layout: The bands.
-        loaded: Voltages.
-        currents: Currents.
-        own: Deviations of the voltages.
-        sigma: Noise of the currents.
-        at: Start of each period [samples].
-    """
+    """Deviations of the quotients of voltage and current."""
     other = _deviations(currents, at, layout, sigma)
     pairs = []
     for records, of in ((loaded, own), (currents, other)):
@@ -258,13 +248,7 @@ def _of_currents(
 
 
 def _phase(v: Float[np.ndarray, " time"], low: float, high: float) -> int:
-    """Number of samples in all pulses; of biphasic pulses, those in the shorter phase.
-
-    Args:
-        v: Unloaded voltage [V].
-        low: Its smallest sample.
-        high: Its largest sample.
-    """
+    """Number of samples in all pulses; of biphasic pulses, those in the shorter phase."""
     half = max(-low, high) / 2
     above = int(np.count_nonzero(v > half)) if high > half else 0
     below = int(np.count_nonzero(v < -half)) if low < -half else 0

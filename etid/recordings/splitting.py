@@ -10,16 +10,7 @@ from etid.signals.pulse_train import find_pulses
 def by_pauses(
     v_th: Float[np.ndarray, " time"], sample_rate: float, pulse_rate: float
 ) -> list[slice]:
-    """The parts of a record between pauses, each with whole pulse periods.
-
-    Args:
-        v_th: Unloaded voltage, in any unit.
-        sample_rate: Samples per second [Hz].
-        pulse_rate: Pulses per second [Hz].
-
-    Raises:
-        RecordingError: The record has no pulses, or no pause.
-    """
+    """The parts of a record between pauses, each with whole pulse periods."""
     period = sample_rate / pulse_rate
     edges = find_pulses(v_th, sample_rate, pulse_rate).edges
     trains = _trains(edges, period)
@@ -43,15 +34,6 @@ def by_trigger(
     An edge is where the trigger rises through the middle of its range. A part has the pulses from
     one edge to the next, up to the first pause. A pulse may precede its trigger by a tenth of a
     period.
-
-    Args:
-        trigger: Voltage of the trigger, in any unit.
-        cause: Unloaded voltage, or the current if there is none, in any unit.
-        sample_rate: Samples per second [Hz].
-        pulse_rate: Pulses per second [Hz].
-
-    Raises:
-        RecordingError: The trigger has no edge, or another length, or no pulse follows it.
     """
     if trigger.shape != cause.shape:
         raise RecordingError(f"has shape {trigger.shape}, must be {cause.shape}", field="trigger")

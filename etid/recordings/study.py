@@ -14,7 +14,6 @@ from etid.circuits.display import several
 from etid.circuits.overview import ROWS, Overview, Overviewed
 from etid.recordings.fields import LABELS, Given, Label, Metadata, wanted_labels
 from etid.recordings.recording import AbstractSource, Layout, Recording, RecordingError, Samples
-from etid.recordings.writing import write
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -263,6 +262,8 @@ class Study(Overviewed, Mapping[str, Recording]):
                 file=self.file,
                 remedy="Remove them with Study.from_recordings(study.recordings())",
             )
+        from etid.recordings.hdf5 import write  # it imports this module
+
         write(self._sources, path)
 
     def __reduce__(self) -> tuple:

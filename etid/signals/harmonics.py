@@ -281,14 +281,7 @@ def aliases(
     periods: int,
     samples: int,
 ) -> Aliases:
-    """The aliases on the harmonics of a record.
-
-    Args:
-        coefficients: Fourier coefficients of the harmonics 1, 2, … [V].
-        variance: E|noise|² of each of them [V²].
-        periods: Number of periods from `etid.signals.harmonics.whole_periods`.
-        samples: Number of samples from `etid.signals.harmonics.whole_periods`.
-    """
+    """The aliases on the harmonics of a record."""
     xp = namespace(variance)
     position = np.arange(1.0, variance.size + 1) * (periods / samples)
     squares = xp.real(coefficients) ** 2 + xp.imag(coefficients) ** 2

@@ -306,16 +306,7 @@ def coloured(
     periods: int,
     samples: int,
 ) -> Float[np.ndarray, " harmonic"]:
-    """Power of the noise at each harmonic, relative to white noise that has `sigma`.
-
-    Args:
-        v: Voltage of the record [V].
-        sigma: Standard deviation of the noise of a sample [V], as `noise_std` estimates it.
-        frequency: Harmonics [Hz].
-        sample_rate: Sampling rate [Hz].
-        periods: Number of periods from `etid.signals.harmonics.whole_periods`.
-        samples: Number of samples from `etid.signals.harmonics.whole_periods`.
-    """
+    """Power of the noise at each harmonic, relative to white noise that has `sigma`."""
     f_c = corner(v, sigma, sample_rate, periods, samples)
     return (1 + f_c / frequency) / (1 + f_c * BY_DIFFERENCES / sample_rate)
 

@@ -102,11 +102,6 @@ def pulse_trains(
     Each record is averaged over a five-hundredth of a period. A pulse begins and ends where the
     average crosses half of its highest value, such as 25 V of 50 V. Noise at 20 dB (1 V), hum and
     drift do not reach this level.
-
-    Args:
-        records: Unloaded voltages [V].
-        sample_rate: Samples per second [Hz].
-        pulse_rate: Pulses per second [Hz]; may be wrong by an order of magnitude.
     """
     size, period = records.shape[1], sample_rate / pulse_rate
     if period > size:

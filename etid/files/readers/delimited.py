@@ -96,18 +96,8 @@ def spool(
 ) -> tuple[int, str]:
     """Write columns to files as real numbers.
 
-    Args:
-        path: The table.
-        dialect: How it is written.
-        skipped: Number of lines above the numbers.
-        width: Number of columns that have a name.
-        columns: File for each column to be written.
-
     Returns:
         Number of rows, and a notice if the last row looks as if it was cut off.
-
-    Raises:
-        RecordingError: A row has too many or too few cells, or a cell is not a number.
     """
     rows = 0
     recent: collections.deque[str] = collections.deque(maxlen=100)
@@ -203,10 +193,6 @@ def opened(path: pathlib.Path, folder: pathlib.Path, **told: Any) -> Iterator[Co
         path: The table.
         folder: Folder of the temporary files.
         **told: Fields of `Dialect` that the user has given.
-
-    Raises:
-        RecordingError: The table is damaged, or nothing was told and it looks different from a
-            default table.
     """
     dialect = Dialect(**told)
     if not told:
