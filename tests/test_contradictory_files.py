@@ -256,15 +256,15 @@ def test_a_scaling_that_leaves_no_samples_is_refused(kind, tmp_path):
     np.testing.assert_allclose(one.v_out, 0.5 + 2e-3 * np.arange(COUNT), rtol=1e-15)
 
 
-@pytest.mark.parametrize("kind", ["f4", "f8"])
-def test_a_scaling_of_real_numbers_is_applied(kind, tmp_path):
+@pytest.mark.parametrize("kind", ["i2", "f4", "f8"])
+def test_a_scaling_that_is_no_line_is_applied(kind, tmp_path):
     square = {"NI_Number_Of_Scales": 1, "NI_Scale[0]_Scale_Type": "Polynomial",
               "NI_Scale[0]_Polynomial_Coefficients_Size": 3,
               **{f"NI_Scale[0]_Polynomial_Coefficients[{i}]": c
                  for i, c in enumerate((0.5, 2e-3, 1e-7))}}  # fmt: skip
     one, _ = imported(rig(tmp_path, np.arange(COUNT).astype(kind), **square), **RIG)
     n = np.arange(COUNT)
-    np.testing.assert_allclose(one.v_out, 0.5 + 2e-3 * n + 1e-7 * n**2, rtol=1e-15)
+    np.testing.assert_allclose(one.v_out, 0.5 + 2e-3 * n + 1e-7 * n**2, rtol=1e-14)
 
 
 def test_two_units_of_a_tdms_channel_are_not_chosen_from(tmp_path):

@@ -12,7 +12,7 @@ import pathlib
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
-from etid.files.assemble import Imported, Used, sources_of
+from etid.files.assemble import Imported, sources_of
 from etid.files.channel import Channel, Contents, located
 from etid.files.clock import check_spacing
 from etid.files.mapping import CHANNELS, of_files, plans, read_mapping
@@ -50,7 +50,7 @@ def import_file(
     - `.tdms`: channels `group/channel` of NI files. They need `pip install etid[tdms]`.
     - `.abf`: ADC channels of Axon files; sweeps become trials. They need `pip install etid[abf]`.
     - `.npz`: arrays of shape (time,) or (trial, time). If the arrays are those of
-      `etid.files.readers.npz.recordings`, the file contains all fields: only labels can be given,
+      `etid.files.readers.npz.own_mapping`, the file contains all fields: only labels can be given,
       without `trial`, and the default condition is the name of the file.
     - `.wav`: channels `1`, `2`, …, as fractions of full scale.
     - `.lvm`: channels of a LabVIEW measurement file.
@@ -100,16 +100,24 @@ def import_file(
     if not folder.is_dir():
         raise RecordingError("the folder of this file does not exist", file=os.fspath(target))
     given = {name: value for name, value in given.items() if value is not None}
-    if len(paths) == 1 and _is_complete(paths[0]):
-        own = {name for name in LABELS if name in given and name != "trial"}
-        labels = {name: given.pop(name) for name in own}
-        _refuse(given | ({} if mapping is None else {"mapping": mapping}), str(paths[0]),
-                "is not an argument for npz files, which contain it")  # fmt: skip
-        return _import_npz(paths[0], target, {"condition": paths[0].stem} | labels)
     for path in paths:
         _check_suffix(path)
     said: list[Mapping[str, Any]]
-    if mapping is None:
+    complete = None
+    if len(paths) == 1 and paths[0].suffix.lower() == ".npz":
+        with located(str(paths[0])):
+            complete = npz.own_mapping(paths[0])
+    if complete is not None:
+        labels = {name: given.pop(name) for name in LABELS if name in given and name != "trial"}
+        _refuse(given | ({} if mapping is None else {"mapping": mapping}), str(paths[0]),
+                "is not an argument for npz files, which contain it")  # fmt: skip
+        said, by, place, implied = (
+            [complete | {"condition": paths[0].stem} | labels],
+            "file",
+            "",
+            {},
+        )
+    elif mapping is None:
         common = {
             name: {"channel": value} if name in CHANNELS else value for name, value in given.items()
         }
@@ -182,46 +190,9 @@ def _check_suffix(path: pathlib.Path) -> None:
         )
 
 
-def _is_complete(path: pathlib.Path) -> bool:
-    """Whether a file is an npz archive that contains all fields of its recordings."""
-    if path.suffix.lower() != ".npz":
-        return False
-    with located(str(path)):
-        return npz.is_complete(path)
-
-
 def _refuse(given: Mapping[str, Any], file: str, reason: str) -> None:
     for name in given:
         raise RecordingError(reason, file=file, field=name, remedy="Remove the argument")
-
-
-def _import_npz(
-    path: pathlib.Path, target: str | os.PathLike[str], labels: Mapping[str, Any]
-) -> list[Imported]:
-    with located(str(path)):
-        recordings = npz.recordings(path, labels)
-        study = Study.from_recordings(recordings)
-        for recording in study.recordings():
-            check_spacing(recording.samples[recording.cause].values, recording.metadata)
-        study.write(target)
-    used = []
-    for part, channel in (study.calibrations, "adc_ref"), (study.loaded, "adc_out"):
-        first = next(part.recordings(), None)
-        if first is not None:
-            samples = first.samples["v_out"]
-            unit = f"codes of {samples.conversion:.6g} volt"
-            signals = {"v_th": "adc_th", "v_out": channel}
-            used.append(
-                Imported(
-                    tuple(part),
-                    samples.stored.size,
-                    first.sample_rate,
-                    "file",
-                    first.pulse_rate,
-                    {name: Used(key, unit, "file", 1.0) for name, key in signals.items()},
-                )
-            )
-    return used
 
 
 # --- Channels of other files ----------------------------------------------------------------------
