@@ -14,33 +14,14 @@ import etid
 from etid.files import channel as channels
 from etid.files.channel import UNITS, parse_unit
 from etid.files.readers import delimited as text_rows
-from etid.recordings import hdf5
 from etid.recordings.recording import RecordingError
-from tests.lab_files import abf, matlab, tdms
+from tests.lab_files import LINE, abf, imported, matlab, refused, rig, tdms
 
 README = pathlib.Path(__file__).parents[1] / "data_schema" / "README.md"
 RNG = np.random.default_rng(6)
 V_TH, V_OUT = RNG.normal(size=(2, 1000))
 CODES = RNG.integers(-3000, 3000, size=1000).astype("i2")
-LINE = {"NI_Number_Of_Scales": 1, "NI_Scale[0]_Scale_Type": "Linear",
-        "NI_Scale[0]_Linear_Slope": 2e-3, "NI_Scale[0]_Linear_Y_Intercept": 0.5}  # fmt: skip
 GIVEN: dict[str, Any] = {"pulse_rate": 60.0, "scale": 0.0535}
-
-
-def imported(source, mapping):
-    target = source.with_suffix(".h5")
-    used = etid.import_file(source, target, mapping)
-    assert hdf5.check(target) == []
-    with hdf5.read(target) as study:
-        return {path: study[path] for path in study}, used
-
-
-def refused(source, mapping, message):
-    target = source.with_suffix(".h5")
-    with pytest.raises(RecordingError, match=message) as caught:
-        etid.import_file(source, target, mapping)
-    assert source.name in caught.value.file
-    assert [path for path in source.parent.iterdir() if path.suffix in (".h5", ".partial")] == []
 
 
 def pair(v_th="rig/open", v_out="rig/skin", **more):
@@ -58,11 +39,6 @@ def sweep(number):
 
 
 SWEEPS = {**GIVEN, "v_th": sweep(0), "v_out": sweep(1)}  # both records in one channel
-
-
-def rig(path, unit="V", interval=5e-6, v_out=V_OUT, **own):
-    signals = {"rig/open": (V_TH, {}), "rig/skin": (v_out, own)}
-    return tdms(path / "rig.tdms", signals, unit_string=unit, wf_increment=interval)
 
 
 # What the README of the schema shows
@@ -135,7 +111,7 @@ def test_the_abf_file_of_the_readme_is_imported_by_its_mapping(tmp_path):
 
 
 def test_codes_with_a_linear_scaling_stay_codes(tmp_path):
-    recordings, _ = imported(rig(tmp_path, v_out=CODES, **LINE), pair())
+    recordings, _ = imported(rig(tmp_path, V_TH, CODES, **LINE), pair())
     record = recordings["loaded/0"].samples["v_out"]
     np.testing.assert_array_equal(record.stored, CODES)
     assert record.stored.dtype == np.int16
@@ -144,13 +120,13 @@ def test_codes_with_a_linear_scaling_stay_codes(tmp_path):
 
 
 def test_data_that_were_scaled_before_they_were_written_are_not_scaled_again(tmp_path):
-    path = rig(tmp_path, **LINE, NI_Scaling_Status="scaled")
+    path = rig(tmp_path, V_TH, V_OUT, **LINE, NI_Scaling_Status="scaled")
     np.testing.assert_allclose(imported(path, pair())[0]["loaded/0"].v_out, V_OUT / 0.0535)
 
 
 def test_a_temperature_is_no_voltage(tmp_path):
     own = {**LINE, "NI_Scale[0]_Scale_Type": "Thermocouple"}
-    refused(rig(tmp_path, v_out=CODES, **own), pair(), r"'rig/skin' has the scaling Thermocoup")
+    refused(rig(tmp_path, V_TH, CODES, **own), pair(), r"'rig/skin' has the scaling Thermocoup")
 
 
 def test_a_name_that_two_channels_have_is_not_chosen_from(tmp_path):
@@ -163,7 +139,7 @@ def test_a_name_that_two_channels_have_is_not_chosen_from(tmp_path):
 
 
 def test_text_of_old_instruments_that_is_not_utf_8_is_no_obstacle(tmp_path, capfd):
-    path = rig(tmp_path, comment="Gr????e")
+    path = rig(tmp_path, V_TH, V_OUT, comment="Gr????e")
     path.write_bytes(path.read_bytes().replace(b"Gr????e", b"Gr\xf6\xdfenx"))
     assert imported(path, pair())[0]["loaded/0"].sample_rate == 200e3
     assert capfd.readouterr() == ("", "")
@@ -172,12 +148,12 @@ def test_text_of_old_instruments_that_is_not_utf_8_is_no_obstacle(tmp_path, capf
 def test_text_and_empty_channels_cannot_be_records(tmp_path):
     for data, message in ((["a", "b"], "must be an array of real numbers"), ([], "is empty")):
         values = np.array(data, "O") if data else np.zeros(0)
-        refused(rig(tmp_path, v_out=values), pair(), rf"v_out: 'rig/skin' .*{message}")
+        refused(rig(tmp_path, V_TH, values), pair(), rf"v_out: 'rig/skin' .*{message}")
 
 
 @pytest.mark.parametrize("cut", [1, 500, 15_900, 16_200])
 def test_a_tdms_file_that_was_cut_off_is_refused_wherever_it_was(cut, tmp_path):
-    path = rig(tmp_path)
+    path = rig(tmp_path, V_TH, V_OUT)
     path.write_bytes(path.read_bytes()[:-cut])
     refused(path, pair(), "is truncated: the last segment ends at byte")
 
@@ -340,7 +316,7 @@ def test_what_is_read_in_parts_is_what_is_read_at_once(format, small_parts, tmp_
         path = matlab(tmp_path / "a.mat", 7.3, open=V_TH, skin=np.stack([V_TH, V_OUT]))
         said["v_out"]["rows"] = 1
     elif format == "tdms":
-        path, said = rig(tmp_path), pair()
+        path, said = rig(tmp_path, V_TH, V_OUT), pair()
     else:
         path = abf(tmp_path / "a.abf", np.stack([V_TH, V_OUT]))
         said = pair()
@@ -400,7 +376,7 @@ def test_a_damaged_file_is_an_error_of_that_file(name, content, tmp_path):
 def test_nan_samples_are_kept_for_a_verdict(tmp_path):
     holes = np.where(np.arange(1000) == 5, np.nan, V_OUT)
     target = tmp_path / "rig.h5"
-    etid.import_file(rig(tmp_path, v_out=holes), target, pair())
+    etid.import_file(rig(tmp_path, V_TH, holes), target, pair())
     with etid.read(target) as study:
         assert np.isnan(study["loaded/0"].v_out).sum() == 1
     assert [problem.field for problem in etid.check(target)] == ["v_out"]

@@ -7,6 +7,7 @@ import scipy.io
 from etid.files.importing import import_file
 from etid.recordings import hdf5
 from etid.recordings.recording import RecordingError
+from tests import lab_files
 from tests.lab_files import matlab
 
 TABLE = {"v_th": "th", "v_out": "out", "sample_rate": 200e3, "pulse_rate": 60.0, "scale": 0.0535}
@@ -14,11 +15,7 @@ TH = np.array([0.0, 0.25, 2.5, 2.25, 0.0])
 
 
 def imported(source, **arguments):
-    target = source.with_suffix(".h5")
-    import_file(source, target, **arguments)
-    assert hdf5.check(target) == []
-    with hdf5.read(target) as study:
-        return {path: study[path] for path in study}
+    return lab_files.imported(source, **arguments)[0]
 
 
 @pytest.fixture

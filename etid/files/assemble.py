@@ -17,7 +17,7 @@ from etid.files.mapping import KINDS, PAUSES, Plan, Signal, unit_of
 from etid.recordings import limits
 from etid.recordings.fields import SIGNALS, Metadata, metadata_from
 from etid.recordings.recording import AbstractSource, Layout, Recording, RecordingError, Samples
-from etid.recordings.splitting import by_pauses, by_trigger
+from etid.recordings.splitting import split
 
 
 @dataclasses.dataclass(frozen=True)
@@ -240,11 +240,9 @@ def _parts(
     def samples(own: Channel) -> np.ndarray:
         return np.concatenate(list(own.blocks())).astype(float)
 
-    rates = common.sample_rate, common.pulse_rate
-    if by_pulses:
-        return by_pauses(samples(separating), *rates)
     cause = channels["v_th"] if "v_th" in channels else channels["current"]
-    return by_trigger(samples(separating), samples(cause), *rates)
+    trigger = None if by_pulses else samples(separating)
+    return split(samples(cause), common.sample_rate, common.pulse_rate, trigger)
 
 
 def _unit(name: str, signal: Signal, said: str) -> tuple[Unit, str]:

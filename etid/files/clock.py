@@ -6,9 +6,7 @@ import numpy as np
 
 from etid.files.channel import Channel, Unit, located
 from etid.files.mapping import Plan
-from etid.recordings.fields import Metadata
 from etid.recordings.recording import RecordingError
-from etid.signals.pulse_train import find_pulses
 
 QUARTZ = 1e-4  # largest relative error of a quartz clock, so of a measured rate
 
@@ -54,20 +52,6 @@ def sample_rate(
             remedy="Correct the one that is wrong",
         )
     return ours, f"{by}; file {theirs:.9g} Hz"
-
-
-def check_spacing(v_th: np.ndarray, metadata: Metadata) -> None:
-    """Check the distance between the pulses against the sample rate and the pulse rate."""
-    if not np.isfinite(v_th).all():
-        return
-    train = find_pulses(v_th, metadata.sample_rate, metadata.pulse_rate)
-    if train.mismatch:
-        raise RecordingError(
-            train.mismatch.removesuffix("."),
-            path=metadata.path,
-            field="pulse_rate",
-            remedy="Correct sample_rate or pulse_rate",
-        )
 
 
 def _agree(tolerance: float, *rates: float) -> bool:

@@ -14,12 +14,11 @@ from typing import Any
 
 from etid.files.assemble import Imported, sources_of
 from etid.files.channel import Channel, Contents, located
-from etid.files.clock import check_spacing
 from etid.files.mapping import CHANNELS, of_files, plans, read_mapping
 from etid.files.readers import abf, delimited, excel, lvm, matlab, npz, tdms, wav
 from etid.recordings.errors import require_file
 from etid.recordings.fields import LABELS
-from etid.recordings.recording import AbstractSource, RecordingError
+from etid.recordings.recording import AbstractSource, RecordingError, check_rates
 from etid.recordings.study import Study, refuse_nested
 
 READERS = {
@@ -164,7 +163,7 @@ def import_file(
                         with located(file):
                             names = {record.name for record in each.layout}
                             cause = "v_th" if "v_th" in names else "current"
-                            check_spacing(next(each.blocks(cause)).astype(float), each.metadata)
+                            check_rates(next(each.blocks(cause)), each.metadata)
                     for twice in sources.keys() & found.keys():
                         raise RecordingError(
                             "another recording has this path",

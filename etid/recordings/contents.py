@@ -24,6 +24,7 @@ from etid.recordings.recording import (
     Recording,
     RecordingError,
     Samples,
+    check_rates,
     of_checked,
 )
 from etid.recordings.untrusted import (
@@ -33,7 +34,6 @@ from etid.recordings.untrusted import (
     local_link,
     translated,
 )
-from etid.signals.pulse_train import find_pulses
 
 OPEN = 8  # most datasets of stacks that stay open
 
@@ -157,11 +157,8 @@ class Scan:
                 message = f"{count} of {record.stored.size} samples are not finite"
                 remedy = "Record again; a fit of this recording only gives a verdict"
                 self._report(path, name, message, remedy)
-        cause = recording.samples[recording.cause].values
-        train = find_pulses(cause, recording.sample_rate, recording.pulse_rate)
-        if train.mismatch:
-            remedy = "Correct sample_rate or pulse_rate"
-            self._report(path, "pulse_rate", train.mismatch.removesuffix("."), remedy)
+        with self._reported(path):
+            check_rates(recording.samples[recording.cause].values, recording.metadata)
         current = recording.current
         if len(self.problems) == before and current is not None and np.ptp(current) == 0:
             remedy = "Record the current of the pulses, or remove the dataset"

@@ -57,7 +57,7 @@ def require_file(path: str) -> None:
 
 
 def not_recorded(path: str, field: str, remedy: str) -> RecordingError:
-    """The error for a record that a recording does not have."""
+    """The error for a record that the recording at a path does not have."""
     return RecordingError("was not recorded", path=path, field=field, remedy=remedy)
 
 

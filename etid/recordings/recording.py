@@ -32,8 +32,9 @@ from etid.recordings.fields import (
     metadata_from,
     real,
 )
-from etid.recordings.splitting import by_pauses, by_trigger
+from etid.recordings.splitting import split
 from etid.signals.noise import printed_step
+from etid.signals.pulse_train import find_pulses
 
 # Infinite samples get a verdict; neighbours of a damaged recording are not concerned.
 quietly = functools.partial(np.errstate, invalid="ignore", over="ignore")
@@ -169,7 +170,8 @@ class Recording(Overviewed, AbstractFields):
             RecordingError: It was not recorded.
         """
         if "v_th" not in self.samples:
-            raise not_recorded(self.path, "v_th", "Use `current`, which this recording has")
+            remedy = "Use `current`, which this recording has"
+            raise not_recorded(self.path, "v_th", remedy)
         return self.samples["v_th"].values
 
     @property
@@ -246,12 +248,9 @@ class Recording(Overviewed, AbstractFields):
                 length.
         """
         with located(path=self.path):
-            if trigger is None:
-                parts = by_pauses(self.v_th, self.sample_rate, self.pulse_rate)
-            else:
-                cause = self.samples[self.cause].values
-                given = np.asarray(trigger, float)
-                parts = by_trigger(given, cause, self.sample_rate, self.pulse_rate)
+            cause = self.v_th if trigger is None else self.samples[self.cause].values
+            given = None if trigger is None else np.asarray(trigger, float)
+            parts = split(cause, self.sample_rate, self.pulse_rate, given)
         whole = self.path or self.metadata.kind
         return [
             self.replace(
@@ -291,6 +290,23 @@ class Recording(Overviewed, AbstractFields):
         return (
             f"<Recording {self.path!r}: {load}, {size} samples at {self.sample_rate:g} Hz, "
             f"{self.periods:.4g} periods of {self.pulse_rate:g} Hz{', ' if labels else ''}{labels}>"
+        )
+
+
+def check_rates(cause: npt.NDArray, metadata: Metadata) -> None:
+    """Raise an error if the distance between the pulses contradicts the two rates.
+
+    Args:
+        cause: `v_th` or the current, or its first part, in any unit.
+        metadata: Fields of the recording.
+    """
+    train = find_pulses(cause.astype(float), metadata.sample_rate, metadata.pulse_rate)
+    if train.mismatch:
+        raise RecordingError(
+            train.mismatch.removesuffix("."),
+            path=metadata.path,
+            field="pulse_rate",
+            remedy="Correct sample_rate or pulse_rate",
         )
 
 

@@ -159,16 +159,9 @@ def measure(
 def noise(
     v: Float[Array | np.ndarray, " time"], resolution: Float[Array | np.ndarray, ""]
 ) -> Float[Array | np.ndarray, ""]:
-    """Standard deviation of the noise of a record, in its unit and limited by `trusted`."""
-    return trusted(v, noise_std(v, resolution))
-
-
-def trusted(
-    v: Float[Array | np.ndarray, " time"], sigma: Float[Array | np.ndarray, ""]
-) -> Float[Array | np.ndarray, ""]:
-    """Noise of a record, at least as large as the error of the interpolation."""
+    """Noise of a record, in its unit and at least as large as the error of the interpolation."""
     xp = namespace(v)
-    return xp.asarray(xp.maximum(sigma, RIPPLE * xp.ptp(v)))
+    return xp.asarray(xp.maximum(noise_std(v, resolution), RIPPLE * xp.ptp(v)))
 
 
 # --- Coarse converters ---------------------------------------------------------------------------
