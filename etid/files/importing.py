@@ -101,7 +101,7 @@ def import_file(
     given = {name: value for name, value in given.items() if value is not None}
     for path in paths:
         _check_suffix(path)
-    said: list[Mapping[str, Any]]
+    said: Sequence[Mapping[str, Any]]
     complete = None
     if len(paths) == 1 and paths[0].suffix.lower() == ".npz":
         with located(str(paths[0])):

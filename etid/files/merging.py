@@ -4,13 +4,13 @@ import contextlib
 import dataclasses
 import os
 import pathlib
-from collections.abc import Hashable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
 from etid.recordings import hdf5
 from etid.recordings.fields import Metadata
-from etid.recordings.recording import AbstractSource, Layout, Recording, RecordingError
+from etid.recordings.recording import AbstractSource, RecordingError
 from etid.recordings.study import Study
 
 
@@ -25,20 +25,8 @@ class _Moved(AbstractSource):
     def metadata(self) -> Metadata:
         return self.moved
 
-    @property
-    def layout(self) -> tuple[Layout, ...]:
-        return self.source.layout
-
-    @property
-    def unloaded(self) -> Hashable:
-        return self.source.unloaded
-
     def blocks(self, name: str) -> Iterator[np.ndarray]:
         return self.source.blocks(name)
-
-    def load(self) -> Recording:
-        moved = self.moved
-        return self.source.load().replace(path=moved.path, calibration=moved.calibration)
 
 
 def merge_files(
@@ -91,5 +79,5 @@ def _moved(study: Study, group: str) -> dict[str, AbstractSource]:
             path=f"{group}/{path}",
             calibration=tuple(f"{group}/{name}" for name in names),
         )
-        found[moved.path] = _Moved(source, moved)
+        found[moved.path] = _Moved(source.layout, source.unloaded, source, moved)
     return found

@@ -8,7 +8,7 @@ import dataclasses
 import functools
 import re
 import weakref
-from collections.abc import Callable, Hashable, Iterator
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import h5py
@@ -56,7 +56,10 @@ class _Block:
     shared: Callable[[], Samples | None] = lambda: None
 
     def sources(self) -> "Iterator[_Row]":
-        return (_Row(self, row) for row in ([None] if self.rows is None else range(self.rows)))
+        recorded = any(record.name == "v_th" for record in self.layout)
+        common, own = recorded and "v_th" not in self.stacked, id(self)
+        for row in [None] if self.rows is None else range(self.rows):
+            yield _Row(self.layout, (own, None if common else row), self, row)
 
     def samples(self, record: Layout, row: int | None) -> Samples:
         name, stacked = record.name, record.name in self.stacked
@@ -78,7 +81,7 @@ class _Block:
         return samples
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
+@dataclasses.dataclass(frozen=True, eq=False, slots=True)
 class _Row(AbstractSource):
     """One recording of a file; `row` is None if the group is not a stack."""
 
@@ -92,17 +95,6 @@ class _Row(AbstractSource):
             return common
         trial = self.block.trials[self.row] if self.block.trials else ""
         return common.of_trial(f"{common.path}/{self.row}", trial)
-
-    @property
-    def layout(self) -> tuple[Layout, ...]:
-        return self.block.layout
-
-    @property
-    def unloaded(self) -> Hashable:
-        common = "v_th" not in self.block.stacked and any(
-            record.name == "v_th" for record in self.layout
-        )
-        return (id(self.block), None if common else self.row)
 
     def blocks(self, name: str) -> Iterator[np.ndarray]:
         (record,) = (record for record in self.layout if record.name == name)

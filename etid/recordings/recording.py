@@ -377,31 +377,32 @@ class Layout(NamedTuple):
     offset: float
 
 
+@dataclasses.dataclass(frozen=True, eq=False, slots=True)  # a file may have millions
 class AbstractSource(abc.ABC):
-    """Source of one recording in a study: it gives metadata at once, and samples on request."""
+    """Source of one recording in a study: it gives metadata at once, and samples on request.
+
+    Attributes:
+        layout: Its records. Recordings of equal layout can form one stack.
+        unloaded: Identity of `v_th`; it is equal for recordings that share one unloaded record. A
+            recording without `v_th` shares none, and its identity is its own.
+    """
+
+    layout: tuple[Layout, ...]
+    unloaded: Hashable
 
     @property
     @abc.abstractmethod
     def metadata(self) -> Metadata:
         """All fields except the samples."""
 
-    @property
-    @abc.abstractmethod
-    def layout(self) -> tuple[Layout, ...]:
-        """Names, dtypes, lengths and scales. Recordings of equal layout can form one stack."""
-
-    @property
-    @abc.abstractmethod
-    def unloaded(self) -> Hashable:
-        """Identity of `v_th`; it is equal for recordings that share one unloaded record.
-
-        A recording without `v_th` shares none, and its identity is its own.
-        """
-
     @abc.abstractmethod
     def blocks(self, name: str) -> Iterator[npt.NDArray]:
         """The stored samples of one record, in order, in blocks that fit into memory."""
 
-    @abc.abstractmethod
     def load(self) -> Recording:
         """The recording with its samples."""
+        records = {
+            one.name: Samples(np.concatenate([*self.blocks(one.name)]), one.conversion, one.offset)
+            for one in self.layout
+        }
+        return of_checked(records, self.metadata)
