@@ -8,7 +8,6 @@ from .circuits.circuit import SkinLayers as SkinLayers
 from .circuits.circuit import SkinRC as SkinRC
 from .circuits.circuit import SkinWarburg as SkinWarburg
 from .circuits.circuit import parameter as parameter
-from .circuits.circuit_string import circuit as circuit
 from .circuits.current_dependent import SkinCurrent as SkinCurrent
 from .circuits.current_dependent import current_dependent_resistor as current_dependent_resistor
 from .circuits.elements import capacitor as capacitor
@@ -18,6 +17,7 @@ from .circuits.elements import inductor as inductor
 from .circuits.elements import resistor as resistor
 from .circuits.impedance import parallel as parallel
 from .circuits.impedance import series as series
+from .circuits.lookup import circuit as circuit
 from .circuits.netlist import circuit_string as circuit_string
 from .circuits.netlist import netlist as netlist
 from .estimators.estimator import AbstractEstimator as AbstractEstimator
@@ -32,7 +32,7 @@ from .files.exporting import export_fits as export_fits
 from .files.exporting import export_study as export_study
 from .files.folder import import_folder as import_folder
 from .files.importing import import_file as import_file
-from .files.measured_impedance import read_impedance as read_impedance
+from .files.importing import read_impedance as read_impedance
 from .identify.amplitudes import identify_amplitudes as identify_amplitudes
 from .identify.driver import identify_driver as identify_driver
 from .identify.file import fit_file as fit_file

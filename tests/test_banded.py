@@ -6,8 +6,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from etid.signals.bands import banded
 from etid.signals.harmonics import Spectrum
+from etid.signals.knots import banded
 
 COUNT, RATE = 1700, 60.0
 NOISE = 1e-4  # [V] of a coefficient

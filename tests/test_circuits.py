@@ -141,26 +141,6 @@ def test_a_constant_phase_is_no_ratio_of_polynomials():
         SkinCole().impedance().rational()
 
 
-@pytest.mark.parametrize("alpha", [0.3, 1.0])
-def test_slopes_of_a_constant_phase_are_finite_and_right(alpha):
-    """By the parameters and by s: what a fit, its standard errors and its score test need."""
-    circuit = SkinCole(33e3, 186e3, 22e-6, alpha)
-    logs = circuit.log_values()
-
-    @jax.jit
-    def of_parameters(logs):
-        return circuit.with_log_values(logs).response(FREQUENCY)
-
-    slope = np.asarray(jax.jacfwd(of_parameters)(logs))
-    steps = 1e-5 * jnp.eye(4)
-    numeric = [(of_parameters(logs + d) - of_parameters(logs - d)) / 2e-5 for d in steps]
-    np.testing.assert_allclose(slope, np.stack(numeric, axis=1), rtol=1e-6, atol=1e-4)
-    tree = circuit.impedance()
-    found = np.asarray(jax.jvp(tree, (S,), (S,))[1])
-    scale = 1e-5 * S
-    np.testing.assert_allclose(found, (tree(S + scale) - tree(S - scale)) / 2e-5, rtol=1e-7)
-
-
 def test_an_exponent_is_too_steep_if_its_error_does_not_explain_it():
     cov = jnp.diag(jnp.array([1e-6, 1e-6, 1e-6, 0.01**2]))
     for alpha, expected in ((0.9, False), (1.03, False), (1.05, True)):

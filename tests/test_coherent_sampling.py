@@ -13,8 +13,7 @@ import pytest
 import etid
 from etid.identify.options import for_calibrations
 from etid.recordings.preflight import Inspected
-from etid.signals.aliases import aliases
-from etid.signals.harmonics import ALIASED
+from etid.signals.harmonics import ALIASED, aliases
 from etid.simulation.transformer import TransformerDriver
 
 pytestmark = pytest.mark.usefixtures("run_as_for_users")

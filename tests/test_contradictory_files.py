@@ -8,9 +8,8 @@ import pytest
 import scipy.io.wavfile
 
 import etid
-from etid import RecordingError
-from etid.recordings import hdf5
-from tests.lab_files import tdms
+from tests import lab_files
+from tests.lab_files import LINE, rig
 
 COUNT = 30
 V_TH = np.round(np.random.default_rng(8).normal(size=COUNT), 3)
@@ -21,19 +20,12 @@ RATE = {"sample_rate": 200e3}
 
 def imported(path, **given):
     """The recording of a file, and the notices."""
-    target = path.with_suffix(".h5")
-    [used] = etid.import_file(path, target, **{**GIVEN, **given})
-    with hdf5.read(target) as study:
-        assert study.problems == {}
-        return next(study.recordings()), used.notices
+    recordings, [used] = lab_files.imported(path, **{**GIVEN, **given})
+    return next(iter(recordings.values())), used.notices
 
 
 def refused(path, message, **given):
-    with pytest.raises(RecordingError, match=message) as caught:
-        etid.import_file(path, path.with_suffix(".h5"), **{**GIVEN, **given})
-    assert caught.value.file == str(path)
-    assert caught.value.remedy
-    assert not path.with_suffix(".h5").exists()
+    assert lab_files.refused(path, None, message, **{**GIVEN, **given}).remedy
 
 
 def table(path, text):
@@ -156,28 +148,9 @@ def test_two_units_of_one_column_are_not_chosen_from(tmp_path):
 # Other formats
 
 
-LVM = """\
-LabVIEW Measurement\t
-Separator\tTab
-Decimal_Separator\t.
-X_Columns\tOne
-***End_of_Header***\t
-\t
-Channels\t2\t\t
-Samples\t{count}\t{count}\t
-Y_Unit_Label\tVolts\tVolts\t
-Delta_X\t{step}\t{step}\t
-***End_of_Header***\t\t\t
-X_Value\t{name}\tskin\tComment
-"""
-
-
-def labview(path, count=COUNT, step=5e-6, name="open", times=None):
+def labview(path, step=5e-6, times=None, **said):
     times = [f"{i * 5e-6:.6f}" for i in range(COUNT)] if times is None else times
-    lines = (f"{t}\t{a:.3f}\t{b:.4f}\t\n" for t, a, b in zip(times, V_TH, V_OUT, strict=True))
-    path = path / "a.lvm"
-    path.write_text(LVM.format(count=count, step=step, name=name) + "".join(lines))
-    return path
+    return lab_files.labview(path / "a.lvm", times, V_TH, V_OUT, step=step, **said)
 
 
 def test_a_labview_file_that_ends_early_is_refused(tmp_path):
@@ -236,45 +209,42 @@ def test_a_wav_file_that_was_cut_off_is_refused_wherever_it_was(kind, tmp_path):
     assert imported(path, **given)[0].sample_rate == 200e3
 
 
-def rig(path, v_out=V_OUT, **own):
-    signals = {"rig/open": (V_TH, {}), "rig/skin": (v_out, own)}
-    return tdms(path / "rig.tdms", signals, unit_string="V", wf_increment=5e-6)
-
-
 RIG = {"v_th": "rig/open", "v_out": "rig/skin"}
-LINE = {"NI_Number_Of_Scales": 1, "NI_Scale[0]_Scale_Type": "Linear",
-        "NI_Scale[0]_Linear_Slope": 2e-3, "NI_Scale[0]_Linear_Y_Intercept": 0.5}  # fmt: skip
 
 
 @pytest.mark.parametrize("kind", ["i2", "f4", "f8"])
 def test_a_scaling_that_leaves_no_samples_is_refused(kind, tmp_path):
     codes = np.arange(COUNT).astype(kind)
     for name, value in (("Slope", 0.0), ("Slope", np.nan), ("Y_Intercept", np.inf)):
-        path = rig(tmp_path, codes, **LINE | {f"NI_Scale[0]_Linear_{name}": value})
+        path = rig(tmp_path, V_TH, codes, **LINE | {f"NI_Scale[0]_Linear_{name}": value})
         refused(path, "v_out: channel 'rig/skin' is scaled with slope", **RIG)
-    one, _ = imported(rig(tmp_path, codes, **LINE), **RIG)
+    one, _ = imported(rig(tmp_path, V_TH, codes, **LINE), **RIG)
     np.testing.assert_allclose(one.v_out, 0.5 + 2e-3 * np.arange(COUNT), rtol=1e-15)
 
 
-@pytest.mark.parametrize("kind", ["f4", "f8"])
-def test_a_scaling_of_real_numbers_is_applied(kind, tmp_path):
+@pytest.mark.parametrize("kind", ["i2", "f4", "f8"])
+def test_a_scaling_that_is_no_line_is_applied(kind, tmp_path):
     square = {"NI_Number_Of_Scales": 1, "NI_Scale[0]_Scale_Type": "Polynomial",
               "NI_Scale[0]_Polynomial_Coefficients_Size": 3,
               **{f"NI_Scale[0]_Polynomial_Coefficients[{i}]": c
                  for i, c in enumerate((0.5, 2e-3, 1e-7))}}  # fmt: skip
-    one, _ = imported(rig(tmp_path, np.arange(COUNT).astype(kind), **square), **RIG)
+    one, _ = imported(rig(tmp_path, V_TH, np.arange(COUNT).astype(kind), **square), **RIG)
     n = np.arange(COUNT)
-    np.testing.assert_allclose(one.v_out, 0.5 + 2e-3 * n + 1e-7 * n**2, rtol=1e-15)
+    np.testing.assert_allclose(one.v_out, 0.5 + 2e-3 * n + 1e-7 * n**2, rtol=1e-14)
 
 
 def test_two_units_of_a_tdms_channel_are_not_chosen_from(tmp_path):
     said = "v_out: the file says 'V' and 'mV' of channel 'rig/skin'"
-    refused(rig(tmp_path, NI_UnitDescription="mV"), said, **RIG)
-    one, _ = imported(rig(tmp_path, NI_UnitDescription="Volts"), **RIG)
+    refused(rig(tmp_path, V_TH, V_OUT, NI_UnitDescription="mV"), said, **RIG)
+    one, _ = imported(rig(tmp_path, V_TH, V_OUT, NI_UnitDescription="Volts"), **RIG)
     np.testing.assert_array_equal(one.v_out, V_OUT)
 
 
 def test_the_steps_of_a_tdms_channel_have_a_unit(tmp_path):
-    refused(rig(tmp_path, wf_xunit_string="Hz"), "a sample every 5e-06 'Hz', which is not a", **RIG)
-    path = rig(tmp_path, wf_increment=5.0, wf_xunit_string="us")
+    refused(
+        rig(tmp_path, V_TH, V_OUT, wf_xunit_string="Hz"),
+        "a sample every 5e-06 'Hz', which is not a",
+        **RIG,
+    )
+    path = rig(tmp_path, V_TH, V_OUT, wf_increment=5.0, wf_xunit_string="us")
     assert imported(path, **RIG)[0].sample_rate == pytest.approx(200e3, rel=1e-12)

@@ -11,7 +11,7 @@ import pytest
 import etid
 from benchmarks import fuzz, specimens
 from benchmarks.ladder import TRIAL, rung
-from etid.files.readers import mat5
+from etid.files.readers import matlab
 from etid.recordings import hdf5, limits, untrusted
 from etid.recordings.preflight import Inspected, preflight
 from etid.report import figures
@@ -327,33 +327,24 @@ def test_matlab_that_declares_a_huge_shape_is_refused_at_once(kinds, tmp_path):
         kinds["matlab"].use(path, 0)
 
 
-def test_matlab_5_of_an_unknown_type_is_refused_before_scipy_ends_the_process(kinds, tmp_path):
-    path = tmp_path / "rig.mat"
-    data = bytearray(kinds["matlab5"].good[0])
-    assert data[176] == 9  # a double
-    data[176] = 8
-    path.write_bytes(data)
-    with pytest.raises(etid.RecordingError, match="of type 8, which does not exist"):
-        mat5.check(path)
-
-
 @pytest.mark.parametrize(
-    ("place", "value"),
+    ("place", "value", "message"),
     [
-        (145, 0x08),  # says that it is complex: what follows would be its imaginary part
-        (144, 5),  # says that it is sparse: the same
+        (145, 0x08, "without its numbers"),  # says that it is complex: of what follows
+        (144, 5, "without its numbers"),  # says that it is sparse: the same
+        (176, 8, "of type 8, which does not exist"),
     ],
 )
-def test_matlab_5_without_its_numbers_is_refused_before_scipy_ends_the_process(
-    kinds, place, value, tmp_path
+def test_a_damaged_matlab_5_is_refused_before_scipy_ends_the_process(
+    kinds, place, value, message, tmp_path
 ):
     path = tmp_path / "rig.mat"
     data = bytearray(kinds["matlab5"].good[0])
-    assert data[144:146] == b"\x06\x00"  # a real double
-    mat5.check(_written(path, data))
+    assert (data[144:146], data[176]) == (b"\x06\x00", 9)  # a real double, and its numbers
+    matlab.check(_written(path, data))
     data[place] = value
-    with pytest.raises(etid.RecordingError, match="without its numbers"):
-        mat5.check(_written(path, data))
+    with pytest.raises(etid.RecordingError, match=message):
+        matlab.check(_written(path, data))
 
 
 def _written(path, data):

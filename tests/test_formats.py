@@ -12,35 +12,16 @@ from nptdms import ChannelObject, TdmsWriter
 
 import etid
 from etid.files import channel as channels
-from etid.files.readers import rows as text_rows
-from etid.files.units import UNITS, parse_unit
-from etid.recordings import hdf5
+from etid.files.channel import UNITS, parse_unit
+from etid.files.readers import delimited as text_rows
 from etid.recordings.recording import RecordingError
-from tests.lab_files import abf, matlab, tdms
+from tests.lab_files import LINE, abf, imported, matlab, refused, rig, tdms
 
 README = pathlib.Path(__file__).parents[1] / "data_schema" / "README.md"
 RNG = np.random.default_rng(6)
 V_TH, V_OUT = RNG.normal(size=(2, 1000))
 CODES = RNG.integers(-3000, 3000, size=1000).astype("i2")
-LINE = {"NI_Number_Of_Scales": 1, "NI_Scale[0]_Scale_Type": "Linear",
-        "NI_Scale[0]_Linear_Slope": 2e-3, "NI_Scale[0]_Linear_Y_Intercept": 0.5}  # fmt: skip
 GIVEN: dict[str, Any] = {"pulse_rate": 60.0, "scale": 0.0535}
-
-
-def imported(source, mapping):
-    target = source.with_suffix(".h5")
-    used = etid.import_file(source, target, mapping)
-    assert hdf5.check(target) == []
-    with hdf5.read(target) as study:
-        return {path: study[path] for path in study}, used
-
-
-def refused(source, mapping, message):
-    target = source.with_suffix(".h5")
-    with pytest.raises(RecordingError, match=message) as caught:
-        etid.import_file(source, target, mapping)
-    assert source.name in caught.value.file
-    assert [path for path in source.parent.iterdir() if path.suffix in (".h5", ".partial")] == []
 
 
 def pair(v_th="rig/open", v_out="rig/skin", **more):
@@ -58,11 +39,6 @@ def sweep(number):
 
 
 SWEEPS = {**GIVEN, "v_th": sweep(0), "v_out": sweep(1)}  # both records in one channel
-
-
-def rig(path, unit="V", interval=5e-6, v_out=V_OUT, **own):
-    signals = {"rig/open": (V_TH, {}), "rig/skin": (v_out, own)}
-    return tdms(path / "rig.tdms", signals, unit_string=unit, wf_increment=interval)
 
 
 # What the README of the schema shows
@@ -135,7 +111,7 @@ def test_the_abf_file_of_the_readme_is_imported_by_its_mapping(tmp_path):
 
 
 def test_codes_with_a_linear_scaling_stay_codes(tmp_path):
-    recordings, _ = imported(rig(tmp_path, v_out=CODES, **LINE), pair())
+    recordings, _ = imported(rig(tmp_path, V_TH, CODES, **LINE), pair())
     record = recordings["loaded/0"].samples["v_out"]
     np.testing.assert_array_equal(record.stored, CODES)
     assert record.stored.dtype == np.int16
@@ -143,24 +119,14 @@ def test_codes_with_a_linear_scaling_stay_codes(tmp_path):
     np.testing.assert_allclose(record.values, volts, rtol=0, atol=1e-13)  # of terms of up to 112
 
 
-def test_another_scaling_is_that_of_the_reader(tmp_path):
-    cubic = {"NI_Number_Of_Scales": 1, "NI_Scale[0]_Scale_Type": "Polynomial",
-             "NI_Scale[0]_Polynomial_Coefficients_Size": 3,
-             **{f"NI_Scale[0]_Polynomial_Coefficients[{i}]": c
-                for i, c in enumerate((0.5, 2e-3, 1e-7))}}  # fmt: skip
-    recordings, _ = imported(rig(tmp_path, v_out=CODES, **cubic), pair())
-    volts = 0.5 + 2e-3 * CODES + 1e-7 * CODES.astype(float) ** 2
-    np.testing.assert_allclose(recordings["loaded/0"].v_out, volts / 0.0535, rtol=1e-13)
-
-
 def test_data_that_were_scaled_before_they_were_written_are_not_scaled_again(tmp_path):
-    path = rig(tmp_path, **LINE, NI_Scaling_Status="scaled")
+    path = rig(tmp_path, V_TH, V_OUT, **LINE, NI_Scaling_Status="scaled")
     np.testing.assert_allclose(imported(path, pair())[0]["loaded/0"].v_out, V_OUT / 0.0535)
 
 
 def test_a_temperature_is_no_voltage(tmp_path):
     own = {**LINE, "NI_Scale[0]_Scale_Type": "Thermocouple"}
-    refused(rig(tmp_path, v_out=CODES, **own), pair(), r"'rig/skin' has the scaling Thermocoup")
+    refused(rig(tmp_path, V_TH, CODES, **own), pair(), r"'rig/skin' has the scaling Thermocoup")
 
 
 def test_a_name_that_two_channels_have_is_not_chosen_from(tmp_path):
@@ -173,7 +139,7 @@ def test_a_name_that_two_channels_have_is_not_chosen_from(tmp_path):
 
 
 def test_text_of_old_instruments_that_is_not_utf_8_is_no_obstacle(tmp_path, capfd):
-    path = rig(tmp_path, comment="Gr????e")
+    path = rig(tmp_path, V_TH, V_OUT, comment="Gr????e")
     path.write_bytes(path.read_bytes().replace(b"Gr????e", b"Gr\xf6\xdfenx"))
     assert imported(path, pair())[0]["loaded/0"].sample_rate == 200e3
     assert capfd.readouterr() == ("", "")
@@ -182,12 +148,12 @@ def test_text_of_old_instruments_that_is_not_utf_8_is_no_obstacle(tmp_path, capf
 def test_text_and_empty_channels_cannot_be_records(tmp_path):
     for data, message in ((["a", "b"], "must be an array of real numbers"), ([], "is empty")):
         values = np.array(data, "O") if data else np.zeros(0)
-        refused(rig(tmp_path, v_out=values), pair(), rf"v_out: 'rig/skin' .*{message}")
+        refused(rig(tmp_path, V_TH, values), pair(), rf"v_out: 'rig/skin' .*{message}")
 
 
 @pytest.mark.parametrize("cut", [1, 500, 15_900, 16_200])
 def test_a_tdms_file_that_was_cut_off_is_refused_wherever_it_was(cut, tmp_path):
-    path = rig(tmp_path)
+    path = rig(tmp_path, V_TH, V_OUT)
     path.write_bytes(path.read_bytes()[:-cut])
     refused(path, pair(), "is truncated: the last segment ends at byte")
 
@@ -202,18 +168,6 @@ def test_matlab_variables_that_are_no_real_arrays_are_refused_in_both_versions(t
         for name in ("skin", "name"):
             said = {**GIVEN, **units, "v_out": {"channel": name, "unit": "V"}}
             refused(path, said, rf"v_out: '{name}' is .*must be an array of real numbers")
-
-
-def test_matlab_says_no_unit_and_no_rate(tmp_path):
-    path = matlab(tmp_path / "m.mat", 7.3, open=V_TH, skin=V_OUT)
-    refused(
-        path, pair("open", "skin", sample_rate=2e5), r"v_th.unit: is not given of channel 'open"
-    )
-    volts = {name: {"channel": channel, "unit": "V"}
-             for name, channel in (("v_th", "open"), ("v_out", "skin"))}  # fmt: skip
-    refused(path, {**GIVEN, **volts}, "sample_rate: is not given.*not guessed")
-    refused(path, {**GIVEN, **volts, "sample_rate": 2e5, "v_out": {"channel": "scin"}},
-            "there is no 'scin'; the names are 'open', 'skin'")  # fmt: skip
 
 
 def test_matlab_7_3_needs_no_package_and_cells_and_references_are_no_channels(
@@ -277,12 +231,6 @@ def test_a_bracket_that_holds_no_unit_belongs_to_the_name(tmp_path):
     path = tmp_path / "t.csv"
     path.write_text("V (left),V (right)\n1,2\n3,4\n", encoding="utf-8")
     refused(path, pair("V", "V", sample_rate=2e5), r"there is no 'V'; .* 'V \(left\)', 'V \(right")
-
-
-def test_a_table_without_names_is_refused(tmp_path):
-    path = tmp_path / "t.csv"
-    path.write_text("1,2\n3,4\n", encoding="utf-8")
-    refused(path, pair("1", "2", sample_rate=2e5), "line 1 holds numbers, .* add --header-line 0")
 
 
 def test_a_table_without_names_has_numbered_columns(tmp_path):
@@ -368,7 +316,7 @@ def test_what_is_read_in_parts_is_what_is_read_at_once(format, small_parts, tmp_
         path = matlab(tmp_path / "a.mat", 7.3, open=V_TH, skin=np.stack([V_TH, V_OUT]))
         said["v_out"]["rows"] = 1
     elif format == "tdms":
-        path, said = rig(tmp_path), pair()
+        path, said = rig(tmp_path, V_TH, V_OUT), pair()
     else:
         path = abf(tmp_path / "a.abf", np.stack([V_TH, V_OUT]))
         said = pair()
@@ -414,8 +362,12 @@ def test_without_its_reader_a_file_names_what_to_install(name, package, tmp_path
     refused(tmp_path / name, pair(), rf"needs the package {package}.*'etid\[{extra}\]'")
 
 
-@pytest.mark.parametrize("name", ["a.tdms", "a.abf"])
-@pytest.mark.parametrize("content", [b"", b"ABF ", b"ABF2" + bytes(9000), b"TDSm" + bytes(40)])
+@pytest.mark.parametrize("name", ["a.tdms", "a.abf", "a.npz", "a.csv", "a.mat"])
+@pytest.mark.parametrize(
+    "content",
+    [b"", b"ABF ", b"ABF2" + bytes(9000), b"TDSm" + bytes(40), b"PK\x03\x04 not a zip",
+     bytes(range(256)) * 4],
+)  # fmt: skip
 def test_a_damaged_file_is_an_error_of_that_file(name, content, tmp_path):
     (tmp_path / name).write_bytes(content)
     refused(tmp_path / name, pair(), re.escape(name))
@@ -424,14 +376,10 @@ def test_a_damaged_file_is_an_error_of_that_file(name, content, tmp_path):
 def test_nan_samples_are_kept_for_a_verdict(tmp_path):
     holes = np.where(np.arange(1000) == 5, np.nan, V_OUT)
     target = tmp_path / "rig.h5"
-    etid.import_file(rig(tmp_path, v_out=holes), target, pair())
+    etid.import_file(rig(tmp_path, V_TH, holes), target, pair())
     with etid.read(target) as study:
         assert np.isnan(study["loaded/0"].v_out).sum() == 1
     assert [problem.field for problem in etid.check(target)] == ["v_out"]
-
-
-def test_records_of_other_lengths_are_refused(tmp_path):
-    refused(rig(tmp_path, v_out=V_OUT[:-1]), pair(), r"rig/open \(1000,\), rig/skin \(999,\)")
 
 
 def test_units_are_those_of_the_si_and_their_names():

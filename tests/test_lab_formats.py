@@ -6,7 +6,8 @@ import scipy.io.wavfile
 
 import etid
 from etid import RecordingError
-from etid.recordings import hdf5
+from tests import lab_files
+from tests.lab_files import labview
 
 RATE, PULSES = 20e3, 60.0
 PERIOD = RATE / PULSES
@@ -29,11 +30,8 @@ def long_record():
 
 
 def imported(path, **given):
-    target = path.with_suffix(".h5")
-    used = etid.import_file(path, target, **{**FIELDS, **given})
-    with hdf5.read(target) as study:
-        assert study.problems == {}
-        return list(study.recordings()), used
+    recordings, used = lab_files.imported(path, **{**FIELDS, **given})
+    return list(recordings.values()), used
 
 
 @pytest.mark.parametrize("kind", [np.int16, np.int32, np.uint8, np.float32])
@@ -50,44 +48,22 @@ def test_a_wav_file_holds_fractions_of_full_scale(kind, tmp_path):
     np.testing.assert_allclose(recording.v_out, out, atol=100 / full if full > 1 else 1e-5)
 
 
-LVM = """\
-LabVIEW Measurement\t
-Writer_Version\t2
-Separator\t{name}
-Decimal_Separator\t{decimal}
-Multi_Headings\tNo
-X_Columns\t{columns}
-***End_of_Header***\t
-\t
-Channels{s}2{s}{s}
-Samples{s}{count}{s}{count}{s}
-Y_Unit_Label{s}Volts{s}mV{s}
-X0{s}0{s}0{s}
-Delta_X{s}{step}{s}{step}{s}
-***End_of_Header***{s}{s}{s}
-X_Value{s}open{s}finger{s}Comment
-"""
-
-
 @pytest.mark.parametrize(
-    ("name", "s", "decimal", "columns"),
-    [("Tab", "\t", ".", "One"), ("Tab", "\t", ",", "No"), ("Comma", ",", ".", "One")],
+    ("separator", "decimal", "columns"),
+    [("Tab", ".", "One"), ("Tab", ",", "No"), ("Comma", ".", "One")],
 )
-def test_a_labview_file_says_how_it_is_written(name, s, decimal, columns, tmp_path):
+def test_a_labview_file_says_how_it_is_written(separator, decimal, columns, tmp_path):
     th, out = pulses()
-    step = f"{1 / RATE:.6E}".replace(".", decimal)
-    text = LVM.format(name=name, s=s, decimal=decimal, columns=columns, count=th.size, step=step)
-    rows = (
-        s.join(["" if columns == "No" else f"{i / RATE:.6f}", f"{a:.6f}", f"{1e3 * b:.6f}"])
-        for i, (a, b) in enumerate(zip(th, out, strict=True))
-    )
-    text += "\n".join(row.replace(".", decimal) for row in rows) + "\n"
-    (tmp_path / "a.lvm").write_text(text)
-    [recording], [used] = imported(tmp_path / "a.lvm", v_th="open", v_out="finger")
+    times = ["" if columns == "No" else f"{i / RATE:.6f}" for i in range(th.size)]
+    path = labview(
+        tmp_path / "a.lvm", times, th, 1e3 * out, step=f"{1 / RATE:.6E}", separator=separator,
+        decimal=decimal, columns=columns, unit="mV",
+    )  # fmt: skip
+    [recording], [used] = imported(path, v_th="open", v_out="skin")
     np.testing.assert_allclose(recording.v_out, out, atol=1e-6)
     np.testing.assert_allclose(recording.v_th, th, atol=1e-6)
     assert recording.sample_rate == RATE
-    assert str(used.signals["v_out"]) == "'finger' in mV (file)"
+    assert str(used.signals["v_out"]) == "'skin' in mV (file)"
 
 
 def test_a_file_that_is_not_of_labview_is_refused(tmp_path):

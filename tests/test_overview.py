@@ -230,7 +230,7 @@ def test_a_notebook_shows_the_words_of_the_terminal_as_a_table(make):
     one = make()
     page = one._repr_html_()
     words = re.sub(r"<[^>]*>", " ", page).split()
-    escaped = str(one).replace("<", "&lt;").replace(">", "&gt;").replace("'", "&#39;")
+    escaped = str(one).replace("<", "&lt;").replace(">", "&gt;").replace("'", "&#x27;")
     assert sorted(words) == sorted(escaped.split())
     assert "<table>" in page
 

@@ -101,6 +101,12 @@ def test_what_is_broken_is_named(recording, which, change, name):
     assert preflight(broken) == name
 
 
+def test_numbers_whose_differences_overflow_are_not_finite(recording):
+    """And no warning is raised."""
+    huge = np.where(np.arange(LENGTH) % 2, 1e308, -1e308)
+    assert preflight(recording.replace(v_th=huge, v_out=huge)) == "nonfinite_samples"
+
+
 def test_a_single_sample_at_the_known_rail_is_saturated(recording):
     v = recording.v_out
     assert preflight(recording.replace(v_out=v, adc_range=(-200.0, v.max()))) == "saturated"

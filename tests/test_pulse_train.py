@@ -63,6 +63,12 @@ def test_a_wrong_rate_is_a_mismatch(noisy, periods, factor):
         np.testing.assert_allclose(found, right[::-1], rtol=2 * PULSE / rate)
 
 
+def test_a_period_that_is_given_as_a_rate_is_named(noisy):
+    wrong = Inspected(noisy.replace(pulse_rate=1 / PULSE))
+    assert preflight(wrong, periodic=True) == "rate_mismatch"
+    assert "pulse_rate is a period in seconds" in explained(wrong, "rate_mismatch")
+
+
 def test_a_second_pulse_that_is_missing_or_too_many_is_a_mismatch():
     one = simulate(periods=1.0)
     assert "one pulse" in find_pulses(one.v_th, 100e3, PULSE).mismatch

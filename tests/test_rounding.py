@@ -49,6 +49,19 @@ def test_a_fine_converter_is_not_coarse(snr_db, bits):
         assert Inspected(as_float(recording)).remarks == Remark(0)
 
 
+@pytest.mark.parametrize(("digits", "coarse"), [(3, True), (4, False)])
+def test_values_of_three_digits_are_those_of_a_coarse_converter(digits, coarse):
+    """Each value has its own step, as in a table that was printed with `%.3g`."""
+    recording = study_of(bits=None)["calibration/98k8"]
+    records = {
+        name: [float(f"{v:.{digits}g}") for v in getattr(recording, name)]
+        for name in ("v_th", "v_out")
+    }
+    seen = Inspected(recording.replace(adc_range=None, **records))
+    assert seen.remarks == (Remark.coarse_converter if coarse else Remark(0))
+    np.testing.assert_allclose(seen.step, 0.1 * coarse)  # of 63.6 V
+
+
 def test_noise_of_any_size_is_seen_through_the_steps():
     rng = np.random.default_rng(1)
     ramp, step = np.linspace(0.0, 7.0, 20_000), 1.0

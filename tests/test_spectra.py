@@ -189,12 +189,6 @@ def test_real_parts_come_before_imaginary_parts():
     np.testing.assert_array_equal(spectra.real_parts(jnp.asarray(values)), expected)
 
 
-@pytest.mark.parametrize("length", [1, 2, 7, 13, 97, 3334, 9999])
-def test_a_fast_length_is_the_next_one_of_small_factors(length):
-    small = {2**a * 3**b * 5**c for a in range(15) for b in range(10) for c in range(7)}
-    assert spectra.fast_length(length) == min(size for size in small if size >= length)
-
-
 def test_a_cubic_drift_is_not_in_the_harmonics():
     """Of six periods; a polynomial of the fourth degree is no drift, and stays."""
     periods, samples = 6, 20_000

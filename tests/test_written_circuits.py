@@ -87,13 +87,6 @@ def test_a_written_circuit_is_found_by_its_name_and_copied():
     assert "r_0" in str(one)
 
 
-def test_a_written_circuit_is_fitted():
-    truth = etid.SkinRC(33.4e3, 186e3, 0.12e-9)
-    z = np.asarray(truth.response(F))
-    fit = etid.identify_impedance(F, z, stderr=100.0, circuit=etid.circuit("R0-p(R1,C1)"))
-    np.testing.assert_allclose(fit.circuit.values(), truth.values(), rtol=1e-4)
-
-
 def test_passive_circuits_pass_kramers_and_kronig_and_a_drift_does_not():
     for circuit in (etid.SkinRC(33.4e3, 186e3, 0.12e-9), etid.SkinCole(), etid.SkinLayers()):
         z = np.asarray(circuit.response(F))

@@ -151,9 +151,6 @@ class AbstractCircuit(Overviewed, eqx.Module):
         The impedance of a passive element cannot fall faster than that of a capacitor (α = 1). If
         the true α is 1, noise makes the fitted α exceed 1 in every second fit, mostly by less than
         one standard error, and by more than four in one of 30 000 fits.
-
-        Args:
-            cov: Covariance of `log_values`.
         """
 
         def alphas(log_values: Float[Array, " parameter"]) -> Float[Array, " exponent"]:

@@ -9,7 +9,7 @@ fall of the resistance to a thirtieth up to 25 mA:
 
 from collections.abc import Callable
 from functools import reduce
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import jax.numpy as jnp
 from jaxtyping import Array, Complex, Float
@@ -19,7 +19,6 @@ from etid.circuits.elements import Farad, Ohm, Resistance, capacitor, resistor
 from etid.circuits.impedance import (
     AbstractImpedance,
     Netlist,
-    Notation,
     Parallel,
     Quantity,
     Series,
@@ -34,17 +33,13 @@ Ampere = Quantity
 class CurrentDependentResistance(Resistance):
     """A resistor R / (1 + |i| / I_0); its impedance is that at small currents, R."""
 
+    symbol: ClassVar[str] = ""
     i_0: Ampere
 
     def current(
         self, wave: Float[Array, " time"], resistance: Float[Array, ""]
     ) -> Float[Array, " time"]:
-        """The current i [A] at which u(i) + R′ i is the given wave, with the voltage u(i) [V].
-
-        Args:
-            wave: u + R′ i [V].
-            resistance: R′ [Ω].
-        """
+        """The current i [A] at which u(i) + R′ i is the given wave, with the voltage u(i) [V]."""
         size, r, i_0 = jnp.abs(wave), jnp.asarray(self.r), jnp.asarray(self.i_0)
         half = r + resistance - size / i_0
         root = jnp.sqrt(half**2 + 4 * resistance * size / i_0)
@@ -61,10 +56,6 @@ class CurrentDependentResistance(Resistance):
         raise ValueError(
             "a resistor that depends on its current cannot be written as resistors and capacitors"
         )
-
-    def text(self, notation: Notation) -> str:
-        """Raise ValueError: impedance.py has no such element."""
-        raise ValueError("impedance.py has no element for a resistor that depends on its current")
 
 
 def current_dependent_resistor(r: Ohm, i_0: Ampere) -> CurrentDependentResistance:
@@ -143,15 +134,8 @@ class Port(NamedTuple):
 
 
 def current_dependent(impedance: AbstractImpedance) -> CurrentDependentResistance | None:
-    """The resistor of a circuit that depends on its current; None if there is none.
-
-    Raises:
-        ValueError: There are several.
-    """
-    if isinstance(impedance, CurrentDependentResistance):
-        return impedance
-    parts = impedance.parts if isinstance(impedance, Series | Parallel) else ()
-    found = [one for one in map(current_dependent, parts) if one is not None]
+    """The resistor of a circuit that depends on its current; None if there is none."""
+    found = [one for one in impedance.elements() if isinstance(one, CurrentDependentResistance)]
     if len(found) > 1:
         raise ValueError(
             f"a circuit has {len(found)} resistors that depend on their current; use one"
@@ -160,13 +144,7 @@ def current_dependent(impedance: AbstractImpedance) -> CurrentDependentResistanc
 
 
 def port(impedance: AbstractImpedance, source: Norton, s: Complex[Array, " frequency"]) -> Port:
-    """The source behind everything between it and the resistor that depends on its current.
-
-    Args:
-        impedance: The circuit, with one such resistor.
-        source: The source at its terminals.
-        s: Frequency variable [rad/s].
-    """
+    """The source behind everything between it and the resistor that depends on its current."""
     if isinstance(impedance, CurrentDependentResistance):
         return Port(impedance, source, lambda signals: signals)
     assert isinstance(impedance, Series | Parallel)

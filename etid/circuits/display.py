@@ -93,12 +93,6 @@ def several(count: int, noun: str) -> str:
 
 
 def quantity(value: float, unit: str, error: float = np.nan) -> str:
-    """A parameter in its scaled unit, such as `33.40 ± 0.10 kΩ`, or `33.4 kΩ` without an error.
-
-    Args:
-        value: Value in the SI unit.
-        unit: SI unit, a key of `DISPLAY`.
-        error: Standard error in the SI unit; NaN if there is none.
-    """
+    """A parameter in its scaled unit, such as `33.40 ± 0.10 kΩ`, or `33.4 kΩ` without an error."""
     scale, symbol = scaled(unit, value, error)
     return " ".join([*plus_minus(value / scale, error / scale).split(), symbol]).rstrip()

@@ -111,10 +111,6 @@ class Inductance(AbstractRational):
         """Impedance [Ω]."""
         return s * as_complex(jnp.asarray(self.inductance))
 
-    def admittance(self, s: Complex[Array, "..."]) -> Complex[Array, "..."]:
-        """Admittance 1/Z [S]."""
-        return reciprocal(self(s))
-
     def rational(self) -> Rational:
         """Impedance [Ω] as a ratio of polynomials in s."""
         inductance = jnp.asarray(self.inductance)
@@ -146,23 +142,15 @@ class ConstantPhase(AbstractIrrational):
         """Exponent α."""
         return (self.alpha,)
 
-    @property
-    def has_response(self) -> bool:
-        """True: its ladder of relaxations is known."""
-        return True
-
     def state_space(self, rate: float | Float[Array, ""], samples: int) -> StateSpace:
         """The ladder of relaxations from below the slowest to above the fastest time of a record.
 
         R_k and C_k of the pairs cover eight decades. The states are scaled so that the system stays
         nearly symmetric in a loop with a source; its matrix exponential loses no digits then.
         """
-        low, high = np.log(SLOWEST / samples) - BEYOND, np.log(FASTEST) + BEYOND
-        x = jnp.asarray(np.exp(np.arange(low, high + STEP, STEP))) * rate
+        x = jnp.asarray(_corners(SLOWEST / samples, FASTEST)) * rate
         alpha, q = jnp.asarray(self.alpha), jnp.asarray(self.q)
-        level = jnp.sinc(1 - alpha) * STEP / q  # sin(πα) h / (πQ), without the factor 1 − α
-        slower = level * x[0] ** (1 - alpha) * (1 - alpha) / jnp.expm1(STEP * (1 - alpha))
-        faster = level * x[-1] ** -alpha * (1 - alpha) / jnp.expm1(STEP * alpha)
+        level, slower, faster = _ladder(q, alpha, x)
         rises = jnp.append(level * x ** (1 - alpha), slower)  # R_k x_k and 1/C [Ω/s]
         unit = 1 / (q * rate ** (1 + alpha))  # |Z| at the sample rate, divided by it [Ω s]
         share = jnp.append(jnp.full(x.shape, 1 - alpha), 1.0)
@@ -204,18 +192,9 @@ class Diffusion(AbstractIrrational):
         one = as_complex(jnp.ones(()))
         return as_complex(r) * (one - gone) * reciprocal(root * (one + gone))
 
-    def admittance(self, s: Complex[Array, "..."]) -> Complex[Array, "..."]:
-        """Admittance 1/Z [S]."""
-        return reciprocal(self(s))
-
     def exponents(self) -> tuple[Exponent, ...]:
         """Empty: no exponent of it can exceed that of a passive element."""
         return ()
-
-    @property
-    def has_response(self) -> bool:
-        """True: its relaxations are known."""
-        return True
 
     def state_space(self, rate: float | Float[Array, ""], samples: int) -> StateSpace:
         """Its relaxations, for every τ up to the length of the record.
@@ -276,6 +255,21 @@ def _relaxations(samples: int) -> tuple[Float[np.ndarray, " n"], Float[np.ndarra
     return np.concatenate(places), np.concatenate(shares)
 
 
+def _corners(low: float, high: float) -> Float[np.ndarray, " n"]:
+    """x_k from far below `low` to far above `high` [rad/s]."""
+    return np.exp(np.arange(np.log(low) - BEYOND, np.log(high) + BEYOND + STEP, STEP))
+
+
+def _ladder(
+    q: Quantity, alpha: Quantity, x: Float[Array | np.ndarray, " n"]
+) -> tuple[Array, Array, Array]:
+    """sin(πα) h / (πQ) without the factor 1 − α, 1/C of all slower and R of all faster pairs."""
+    level = jnp.sinc(1 - alpha) * STEP / q
+    slower = level * x[0] ** (1 - alpha) * (1 - alpha) / jnp.expm1(STEP * (1 - alpha))
+    faster = level * x[-1] ** -alpha * (1 - alpha) / jnp.expm1(STEP * alpha)
+    return level, slower, faster
+
+
 def ladder(q: float, alpha: float, band: tuple[float, float]) -> AbstractImpedance:
     """Resistors and capacitors that approximate a constant-phase element in a frequency band.
 
@@ -285,9 +279,6 @@ def ladder(q: float, alpha: float, band: tuple[float, float]) -> AbstractImpedan
         q: Q [S s^α].
         alpha: α.
         band: Lowest and highest frequency [Hz].
-
-    Raises:
-        ValueError: α is above 1.
     """
     if alpha > 1:
         raise ValueError(
@@ -296,98 +287,63 @@ def ladder(q: float, alpha: float, band: tuple[float, float]) -> AbstractImpedan
         )
     if alpha == 1:
         return capacitor(q)
-    low, high = np.log(2 * np.pi * np.array(band)) + np.array([-BEYOND, BEYOND])
-    x = np.exp(np.arange(low, high + STEP, STEP))
-    level = (1 - alpha) * np.sinc(1 - alpha) * STEP / q  # sin(πα) h / (πQ)
-    r = level * x**-alpha
-    slower = level * x[0] ** (1 - alpha) / np.expm1(STEP * (1 - alpha))
-    faster = level * x[-1] ** -alpha / np.expm1(STEP * alpha)
+    x = _corners(2 * np.pi * band[0], 2 * np.pi * band[1])
+    level, slower, faster = map(float, _ladder(q, alpha, x))
+    r = level * (1 - alpha) * x**-alpha
     pairs = [parallel(resistor(a), capacitor(1 / (a * b))) for a, b in zip(r, x, strict=True)]
     return series(resistor(faster), *pairs, capacitor(1 / slower))
 
 
 def resistor(r: Ohm) -> Resistance:
-    """Impedance of a resistor, Z = R [Ω].
-
-    Args:
-        r: R [Ω].
-
-    Returns:
-        An impedance, to be connected with others.
-    """
+    """A resistor, Z = R, from R [Ω]."""
     return Resistance(r)
 
 
 def capacitor(c: Farad) -> Capacitance:
-    """Impedance of a capacitor, Z = 1 / (s C) [Ω].
-
-    Args:
-        c: C [F].
-
-    Returns:
-        An impedance, to be connected with others.
-    """
+    """A capacitor, Z = 1 / (s C), from C [F]."""
     return Capacitance(c)
 
 
 def inductor(inductance: Henry) -> Inductance:
-    """Impedance of an inductor, Z = s L [Ω].
+    """An inductor, Z = s L, from L [H].
 
     In series it makes the impedance grow with the frequency. Such a load has no response in time;
     maximum likelihood, `"non_parametric"` and `identify_impedance` need none.
-
-    Args:
-        inductance: L [H].
-
-    Returns:
-        An impedance, to be connected with others.
     """
     return Inductance(inductance)
 
 
 def constant_phase(q: PseudoCapacitance, alpha: Exponent) -> ConstantPhase:
-    """Impedance of a constant-phase element, Z = 1 / (Q s^α) [Ω]; impedance.py calls it `CPE`.
+    """A constant-phase element, Z = 1 / (Q s^α); impedance.py calls it `CPE`.
 
     Args:
         q: Q [S s^α]; it is a capacitance [F] if α = 1.
         alpha: α, above 0 and at most 1.
-
-    Returns:
-        An impedance, to be connected with others.
     """
     return ConstantPhase(q, alpha)
 
 
 def diffusion(r: Ohm, tau: Second) -> Diffusion:
-    """Impedance of diffusion through a layer, Z = R tanh √(sτ) / √(sτ) [Ω]; a finite Warburg.
-
-    impedance.py calls it `Ws`.
+    """Diffusion through a layer, Z = R tanh √(sτ) / √(sτ); impedance.py calls it `Ws`.
 
     Args:
         r: R [Ω], the impedance at low frequency.
         tau: τ [s]; far above 1/(2πτ) the phase is −45°.
-
-    Returns:
-        An impedance, to be connected with others.
     """
     return Diffusion(r, tau)
 
 
 def cole(r: Ohm, tau: Second, alpha: Exponent) -> Parallel:
-    """Impedance of a relaxation with a distribution of time constants, Z = R / (1 + (s τ)^α) [Ω].
+    """A relaxation with a distribution of time constants, Z = R / (1 + (s τ)^α).
 
-    Source: K. S. Cole, Permeability and impermeability of cell membranes for ions, 1940. The
-    element is R in parallel with a constant-phase element of Q = τ^α / R. The parameters are τ and
-    α instead of Q and α for two reasons: the errors of τ and α are almost uncorrelated, and the
-    unit of τ does not depend on α.
+    Source: K. S. Cole, Permeability and impermeability of cell membranes for ions, 1940. It is R in
+    parallel with a constant-phase element of Q = τ^α / R. Unlike those of Q and α, the errors of τ
+    and α are almost uncorrelated, and the unit of τ does not depend on α.
 
     Args:
         r: R [Ω].
         tau: τ [s].
         alpha: α, above 0 and at most 1. With α = 1 it is a resistor parallel to a capacitor.
-
-    Returns:
-        An impedance, to be connected with others.
     """
     r, tau, alpha = map(jnp.asarray, (r, tau, alpha))
     return parallel(resistor(r), constant_phase(tau**alpha / r, alpha))

@@ -26,10 +26,7 @@ Quantity = Float[Array, "..."] | Float[np.ndarray, "..."] | float
 
 
 class Names:
-    """Names of the parts of a netlist, such as R1 and C1.
-
-    Each prefix has its own counter. Neighbouring parts of different kinds get the same number.
-    """
+    """Names of parts, such as R1 and C1: neighbours of different kinds get the same number."""
 
     def __init__(self) -> None:
         self.used: dict[str, int] = {}
@@ -41,7 +38,7 @@ class Names:
         return f"{prefix}{number}"
 
 
-class Netlist:
+class Netlist(Names):
     """Resistors, capacitors and inductors between numbered nodes, one per line.
 
     Attributes:
@@ -51,10 +48,10 @@ class Netlist:
     """
 
     def __init__(self, band: tuple[float, float]) -> None:
+        super().__init__()
         self.band = band
         self.lines: list[str] = []
         self.remarks: set[str] = set()
-        self.names = Names()
         self.nodes = 0
 
     def node(self) -> str:
@@ -64,18 +61,14 @@ class Netlist:
 
     def part(self, prefix: str, value: Quantity, plus: str, minus: str) -> None:
         """Connect one resistor (`R`), capacitor (`C`) or inductor (`L`) between two nodes."""
-        self.lines.append(f"{self.names.next(prefix)} {plus} {minus} {float(value)!r}")
+        self.lines.append(f"{self.next(prefix)} {plus} {minus} {float(value)!r}")
 
 
-class Notation:
-    """An impedance in the notation of impedance.py, such as `R0-p(R1,C1)`.
-
-    Attributes:
-        values: Values of the elements, in their order in the text.
-    """
+class Notation(Names):
+    """An impedance in the notation of impedance.py; `values` are in the order of the text."""
 
     def __init__(self) -> None:
-        self.names = Names()
+        super().__init__()
         self.values: list[float] = []
 
 
@@ -86,52 +79,17 @@ class AbstractImpedance(eqx.Module):
     def __call__(self, s: Complex[Array, "..."]) -> Complex[Array, "..."]:
         """Impedance [Ω]."""
 
-    @abc.abstractmethod
     def admittance(self, s: Complex[Array, "..."]) -> Complex[Array, "..."]:
         """Admittance 1/Z [S]."""
+        return reciprocal(self(s))
 
-    @property
     @abc.abstractmethod
-    def is_rational(self) -> bool:
-        """Whether the impedance is a ratio of polynomials in s."""
-
-    @property
-    @abc.abstractmethod
-    def has_response(self) -> bool:
-        """Whether the response in time is known, exactly or by a ladder of relaxations."""
+    def elements(self) -> "tuple[AbstractElement, ...]":
+        """The elements of the network."""
 
     @abc.abstractmethod
     def rational(self) -> Rational:
-        """Impedance [Ω] as a ratio of polynomials in s.
-
-        Raises:
-            ValueError: The impedance is not a ratio of polynomials.
-        """
-
-    @abc.abstractmethod
-    def exponents(self) -> tuple[Quantity, ...]:
-        """Exponents of the powers of s. In a passive network each exponent is at most 1."""
-
-    @abc.abstractmethod
-    def connect(self, netlist: Netlist, plus: str, minus: str) -> None:
-        """Write the network between two nodes, exactly or as a ladder that is accurate in the band.
-
-        Args:
-            netlist: The netlist to extend.
-            plus: Name of the first node.
-            minus: Name of the second node.
-
-        Raises:
-            ValueError: No passive network has these values.
-        """
-
-    @abc.abstractmethod
-    def text(self, notation: Notation) -> str:
-        """The network in the notation of impedance.py.
-
-        Raises:
-            ValueError: impedance.py has no such element.
-        """
+        """Impedance [Ω] as a ratio of polynomials in s; ValueError if it is none."""
 
     @abc.abstractmethod
     def state_space(self, rate: float | Float[Array, ""], samples: int) -> StateSpace:
@@ -143,10 +101,30 @@ class AbstractImpedance(eqx.Module):
         Args:
             rate: Sampling rate of the record [Hz].
             samples: Length of the record.
-
-        Raises:
-            ValueError: An element has no known ladder.
         """
+
+    @abc.abstractmethod
+    def connect(self, netlist: Netlist, plus: str, minus: str) -> None:
+        """Write the network between two nodes, exactly or as a ladder for the band."""
+
+    @abc.abstractmethod
+    def text(self, notation: Notation) -> str:
+        """The network in the notation of impedance.py; ValueError if it lacks an element."""
+
+    @property
+    def is_rational(self) -> bool:
+        """Whether the impedance is a ratio of polynomials in s."""
+        return all(isinstance(one, AbstractRational) for one in self.elements())
+
+    @property
+    def has_response(self) -> bool:
+        """Whether the response in time is known, exactly or by a ladder of relaxations."""
+        unknown = AbstractIrrational.state_space
+        return all(type(one).state_space is not unknown for one in self.elements())
+
+    def exponents(self) -> tuple[Quantity, ...]:
+        """Exponents of the powers of s. In a passive network each exponent is at most 1."""
+        return sum((one.exponents() for one in self.elements()), start=())
 
     def in_time(self, rate: float | Float[Array, ""], samples: int) -> Rational | StateSpace:
         """The impedance for a simulation: as a ratio of polynomials if it is one."""
@@ -163,26 +141,24 @@ class AbstractElement(AbstractImpedance):
 
     symbol: ClassVar[str] = ""
 
+    def elements(self) -> "tuple[AbstractElement, ...]":
+        """The element itself."""
+        return (self,)
+
+    @abc.abstractmethod
+    def exponents(self) -> tuple[Quantity, ...]:
+        """Exponents of the powers of s."""
+
     def text(self, notation: Notation) -> str:
         """The element in the notation of impedance.py."""
         if not self.symbol:
             raise ValueError(f"impedance.py has no element for {type(self).__name__}")
         notation.values += [float(getattr(self, f.name)) for f in dataclasses.fields(self)]
-        return notation.names.next(self.symbol)
+        return notation.next(self.symbol)
 
 
 class AbstractRational(AbstractElement):
     """An element whose impedance is a ratio of polynomials in s."""
-
-    @property
-    def is_rational(self) -> bool:
-        """True."""
-        return True
-
-    @property
-    def has_response(self) -> bool:
-        """True."""
-        return True
 
     def exponents(self) -> tuple[Quantity, ...]:
         """Empty: a ratio of polynomials has no other exponents."""
@@ -196,16 +172,6 @@ class AbstractRational(AbstractElement):
 
 class AbstractIrrational(AbstractElement):
     """An element whose impedance is not a ratio of polynomials in s."""
-
-    @property
-    def is_rational(self) -> bool:
-        """False."""
-        return False
-
-    @property
-    def has_response(self) -> bool:
-        """False, unless a class has a ladder of relaxations."""
-        return False
 
     def rational(self) -> Rational:
         """Raise ValueError: the impedance is not a ratio of polynomials."""
@@ -235,19 +201,9 @@ class AbstractConnection(AbstractImpedance):
                 f"{type(self).__name__.lower()}() has no arguments; give it at least one impedance"
             )
 
-    @property
-    def is_rational(self) -> bool:
-        """Whether all parts are ratios of polynomials in s."""
-        return all(part.is_rational for part in self.parts)
-
-    @property
-    def has_response(self) -> bool:
-        """Whether the responses of all parts are known."""
-        return all(part.has_response for part in self.parts)
-
-    def exponents(self) -> tuple[Quantity, ...]:
-        """Exponents of all parts."""
-        return sum((part.exponents() for part in self.parts), start=())
+    def elements(self) -> tuple[AbstractElement, ...]:
+        """The elements of all parts."""
+        return sum((part.elements() for part in self.parts), start=())
 
 
 class Series(AbstractConnection):
@@ -259,18 +215,13 @@ class Series(AbstractConnection):
         """Impedance [Ω]."""
         return reduce(jnp.add, [part(s) for part in self.parts])
 
-    def admittance(self, s: Complex[Array, "..."]) -> Complex[Array, "..."]:
-        """Admittance 1/Z [S]."""
-        return reciprocal(self(s))
-
     def rational(self) -> Rational:
         """Impedance [Ω] as a ratio of polynomials in s."""
         return reduce(Rational.add, [part.rational() for part in self.parts])
 
     def state_space(self, rate: float | Float[Array, ""], samples: int) -> StateSpace:
         """Systems of the parts, driven by the same current."""
-        parts = [part.state_space(rate, samples) for part in self.parts]
-        return reduce(_in_series, parts)
+        return reduce(_in_series, [part.state_space(rate, samples) for part in self.parts])
 
     def connect(self, netlist: Netlist, plus: str, minus: str) -> None:
         """Write the parts one after the other, with a new node between neighbours."""
@@ -305,8 +256,7 @@ class Parallel(AbstractConnection):
 
     def state_space(self, rate: float | Float[Array, ""], samples: int) -> StateSpace:
         """Systems of the parts, which share the current so that their voltages are equal."""
-        parts = [part.state_space(rate, samples) for part in self.parts]
-        return reduce(_in_parallel, parts)
+        return reduce(_in_parallel, [part.state_space(rate, samples) for part in self.parts])
 
     def connect(self, netlist: Netlist, plus: str, minus: str) -> None:
         """Write all parts between the same nodes."""
@@ -319,12 +269,7 @@ class Parallel(AbstractConnection):
 
 
 def realise(impedance: Rational, rate: float | Float[Array, ""]) -> StateSpace:
-    """State space of a load impedance, from current [A] to voltage [V].
-
-    Args:
-        impedance: Proper rational function of s [rad/s].
-        rate: Typical rate [1/s] that scales the states. It does not change the impedance.
-    """
+    """State space of a load impedance, from current [A] to voltage [V]."""
     order = impedance.den.shape[0] - 1
     if impedance.num.shape[0] > order + 1:
         raise ValueError(
@@ -366,30 +311,10 @@ def _in_parallel(one: StateSpace, other: StateSpace) -> StateSpace:
 
 
 def series(*impedances: AbstractImpedance) -> Series:
-    """Series connection, Z = Z₁ + Z₂ + ….
-
-    Args:
-        *impedances: Impedances to connect, at least one.
-
-    Returns:
-        Impedance of the connection.
-
-    Raises:
-        ValueError: No impedance is given.
-    """
+    """Series connection of at least one impedance, Z = Z₁ + Z₂ + …."""
     return Series(impedances)
 
 
 def parallel(*impedances: AbstractImpedance) -> Parallel:
-    """Parallel connection, 1/Z = 1/Z₁ + 1/Z₂ + ….
-
-    Args:
-        *impedances: Impedances to connect, at least one.
-
-    Returns:
-        Impedance of the connection.
-
-    Raises:
-        ValueError: No impedance is given.
-    """
+    """Parallel connection of at least one impedance, 1/Z = 1/Z₁ + 1/Z₂ + …."""
     return Parallel(impedances)

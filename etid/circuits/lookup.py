@@ -1,24 +1,44 @@
 """Circuit classes by name, for files of fits and for the option `--circuit`.
 
 The name is `module:Class`, and `etid:Class` for the circuits of etid. A name from a file never
-causes an import: etid searches for it only among the classes that are already defined.
+causes an import: etid searches for it only among the classes that are already defined. A circuit
+may also be named by a string in the notation of impedance.py, such as `R0-p(R1,C1)`:
+
+    circuit = part {"-" part}                    series
+    part    = element | "p(" circuit {"," circuit} ")"     parallel
+    element = "R" number | "C" number | "L" number | "CPE" number
+
+The parameters are `r_0`, `c_1`, `l_3`, and `q_2` and `alpha_2` of `CPE2`.
 """
 
 import difflib
+import functools
 import importlib
 import re
 import reprlib
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
+from typing import Any, ClassVar, NoReturn
 
 from etid.circuits import circuit as circuits
-from etid.circuits import circuit_string
-from etid.circuits.circuit import AbstractCircuit
+from etid.circuits.circuit import AbstractCircuit, parameter
 from etid.circuits.current_dependent import SkinCurrent
+from etid.circuits.elements import capacitor, constant_phase, inductor, resistor
+from etid.circuits.impedance import AbstractImpedance, parallel, series
+
+STRINGS = "circuit strings"  # module of their classes, whose compiled programs are not stored
+_ELEMENTS: dict[str, tuple[Callable[..., AbstractImpedance], dict[str, str]]] = {
+    "R": (resistor, {"r": "ohm"}),
+    "C": (capacitor, {"c": "farad"}),
+    "L": (inductor, {"l": "henry"}),
+    "CPE": (constant_phase, {"q": "siemens second^alpha", "alpha": "1"}),
+}
+# An element of a string, from its kind, its number, and whether it is in a parallel connection.
+_Element = Callable[[str, str, bool], AbstractImpedance]
 
 
 def class_path(kind: type[AbstractCircuit]) -> str:
     """Name of a circuit in a file of fits, such as `etid:SkinRC`."""
-    own = kind.__module__ in (circuits.__name__, circuit_string.MODULE)
+    own = kind.__module__ in (circuits.__name__, STRINGS)
     module = "etid" if own else kind.__module__
     return f"{module}:{kind.__qualname__}"
 
@@ -34,15 +54,11 @@ def circuit_class(stored: str, given: type[AbstractCircuit] | None = None) -> ty
     Args:
         stored: Qualified name of the circuit in the file.
         given: Class that the caller expects. If it is None, the class is searched by name.
-
-    Raises:
-        LookupError: No class has this name, or `given` has a different name. The message says what
-            to do.
     """
     string = stored.removeprefix("etid:")
-    if given is None and circuit_string.is_circuit_string(string):
+    if given is None and is_circuit_string(string):
         try:
-            return circuit_string.class_of(string)
+            return class_of(string)
         except ValueError as error:
             raise LookupError(str(error)) from None
     if given is not None and class_path(given) == stored:
@@ -80,12 +96,9 @@ def imported(name: str) -> type[AbstractCircuit]:
 
     Args:
         name: `Class` for a circuit of etid, a circuit string, or `module:Class`.
-
-    Raises:
-        ValueError: The module cannot be imported or has no such circuit, or the string is none.
     """
-    if circuit_string.is_circuit_string(name):
-        return circuit_string.class_of(name)
+    if is_circuit_string(name):
+        return class_of(name)
     module, _, attribute = name.rpartition(":")
     if not module:
         known = built_in()
@@ -125,3 +138,123 @@ def _defined(of: type[AbstractCircuit] = AbstractCircuit) -> Iterator[type[Abstr
     for kind in reversed(of.__subclasses__()):
         yield kind
         yield from _defined(kind)
+
+
+# --- Circuit strings ------------------------------------------------------------------------------
+
+
+def circuit(string: str) -> AbstractCircuit:
+    """A circuit from a string in the notation of impedance.py, such as `R0-p(R1,C1)`.
+
+    Args:
+        string: Elements `R0`, `C1`, `L3` and `CPE2`, joined by `-` in series and by `p(…,…)` in
+            parallel.
+
+    Returns:
+        The circuit with typical values. Its parameters are `r_0`, `c_1`, `l_3`, and `q_2` and
+        `alpha_2` of `CPE2`. Equal strings give circuits of one class.
+
+    Raises:
+        ValueError: The string is not a circuit, or an element occurs twice.
+    """
+    return class_of(string)()
+
+
+def is_circuit_string(name: str) -> bool:
+    """Whether a text can only be a circuit string."""
+    return bool(re.fullmatch(r"[RCLPEp(),-]*\d[RCLPEp(),\d-]*", name))
+
+
+def class_of(string: str) -> type[AbstractCircuit]:
+    """The class of the circuits of a string; ValueError as `circuit`."""
+    return _class_of("".join(string.split()))
+
+
+@functools.cache
+def _class_of(string: str) -> type[AbstractCircuit]:
+    fields: dict[str, Any] = {}
+
+    def declared(kind: str, number: str, within: bool) -> AbstractImpedance:
+        """Add the parameters of an element; their typical values are those of `SkinRC`."""
+        make, units = _ELEMENTS[kind]
+        if f"{next(iter(units))}_{number}" in fields:
+            raise ValueError(
+                f"{string!r} has {kind}{number} twice; give each element its own number"
+            )
+        # Later capacitances are larger, as in `SkinLayers`.
+        larger = 10.0 ** sum(name[0] in "cq" for name in fields)
+        typical = {"r": 100e3 if within else 20e3, "c": 0.3e-9 * larger, "l": 1e-3,
+                   "q": 2e-9 * larger, "alpha": 0.8}  # fmt: skip
+        for name, unit in units.items():
+            fields[f"{name}_{number}"] = parameter(unit, typical=typical[name])
+        return make(*(typical[name] for name in units))
+
+    _, end = _series(string, 0, declared)
+    if end != len(string):
+        _refuse(string, end)
+
+    def impedance(self: AbstractCircuit) -> AbstractImpedance:
+        """Impedance of the string."""
+
+        def element(kind: str, number: str, _: bool) -> AbstractImpedance:
+            make, units = _ELEMENTS[kind]
+            return make(*(getattr(self, f"{name}_{number}") for name in units))
+
+        return _series(string, 0, element)[0]
+
+    def restored(self: AbstractCircuit) -> tuple:
+        return _restored, (string, {name: getattr(self, name) for name in fields})
+
+    body = {
+        "__module__": STRINGS,
+        "__doc__": f"The circuit {string}.",
+        "__annotations__": {"formula": ClassVar[str]} | dict.fromkeys(fields, Any),
+        "formula": string,
+        "impedance": impedance,
+        "__reduce__": restored,
+        **fields,
+    }
+    kind: Any = type(AbstractCircuit)
+    return kind(string, (AbstractCircuit,), body)
+
+
+def _restored(string: str, values: dict[str, Any]) -> AbstractCircuit:
+    return class_of(string)(**values)
+
+
+def _refuse(string: str, at: int) -> NoReturn:
+    raise ValueError(
+        f"{string!r} is no circuit: cannot read {string[at:] or 'its end'!r}; write R, C, L or "
+        "CPE with a number, '-' for series and 'p(…,…)' for parallel, as in 'R0-p(R1,C1)'"
+    )
+
+
+def _series(
+    string: str, at: int, element: _Element, *, within: bool = False
+) -> tuple[AbstractImpedance, int]:
+    """Impedance of the parts from this place on, and the place after them."""
+    parts = []
+    while True:
+        token = re.compile(r"(p)\(|(CPE|R|C|L)(\d+)").match(string, at)
+        if token is None:
+            _refuse(string, at)
+        if token[1]:
+            part, at = _branches(string, token.end(), element)
+        else:
+            part, at = element(token[2], token[3], within), token.end()
+        parts.append(part)
+        if string[at : at + 1] != "-":
+            return series(*parts) if len(parts) > 1 else part, at
+        at += 1
+
+
+def _branches(string: str, at: int, element: _Element) -> tuple[AbstractImpedance, int]:
+    branches = []
+    while True:
+        branch, at = _series(string, at, element, within=True)
+        branches.append(branch)
+        if string[at : at + 1] == ")" and len(branches) > 1:
+            return parallel(*branches), at + 1
+        if string[at : at + 1] != ",":
+            _refuse(string, at)
+        at += 1

@@ -4,7 +4,7 @@ import argparse
 import pathlib
 
 from etid.commands import Outcome
-from etid.files.merging import merge_files
+from etid.recordings.hdf5 import merge_files
 from etid.recordings.replacing import HDF5
 
 

@@ -21,8 +21,7 @@ from etid.circuits.circuit import AbstractCircuit
 from etid.recordings.preflight import Inspected
 from etid.results.feed import AbstractFeed
 from etid.signals import mains
-from etid.signals.aliases import aliases
-from etid.signals.harmonics import ALIASED, Spectrum, joins_aliases, spectrum
+from etid.signals.harmonics import ALIASED, Spectrum, aliases, joins_aliases, spectrum
 from etid.signals.noise import Measurement, coloured, measure, noise, rounding_variance
 from etid.signals.pulse_train import rest, shifted
 

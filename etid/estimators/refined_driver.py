@@ -19,7 +19,7 @@ from etid.estimators.starts import source_starts
 from etid.estimators.steiglitz_mcbride import iteration, periodic
 from etid.results.driver import Calibration, ContinuousDriver, HarmonicDriver, SourceImpedance
 from etid.results.verdicts import RESULTS, first_verdict
-from etid.signals.bands import banded
+from etid.signals.knots import banded
 from etid.signals.noise import Measurement
 
 PASSIVE = 2.0  # standard errors by which Re Z_th may be negative

@@ -6,19 +6,18 @@ an error if the file and the mapping disagree.
 
 import dataclasses
 import math
-from collections.abc import Callable, Hashable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 import numpy as np
 
-from etid.files.channel import Channel, located
+from etid.files.channel import Channel, Unit, located
 from etid.files.clock import sample_rate
 from etid.files.mapping import KINDS, PAUSES, Plan, Signal, unit_of
-from etid.files.units import Unit
 from etid.recordings import limits
 from etid.recordings.fields import SIGNALS, Metadata, metadata_from
-from etid.recordings.recording import AbstractSource, Layout, Recording, RecordingError, Samples
-from etid.recordings.splitting import by_pauses, by_trigger
+from etid.recordings.recording import AbstractSource, Layout, RecordingError
+from etid.recordings.splitting import split
 
 
 @dataclasses.dataclass(frozen=True)
@@ -75,58 +74,21 @@ class Imported:
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class _Record:
-    """One trial of a channel, with the conversion of its stored samples to SI units."""
-
-    channel: Channel
-    trial: int
-    conversion: float
-    offset: float
-
-
-@dataclasses.dataclass(frozen=True, eq=False)
 class _Source(AbstractSource):
-    """A recording in a file of another format."""
+    """A recording in a file of another format; `records` are channels and their trials."""
 
     file: str
     described: Metadata
-    records: Mapping[str, _Record]
+    records: Mapping[str, tuple[Channel, int]]
 
     @property
     def metadata(self) -> Metadata:
         return self.described
 
-    @property
-    def layout(self) -> tuple[Layout, ...]:
-        return tuple(
-            Layout(
-                name,
-                record.channel.dtype.newbyteorder("=").str,
-                record.channel.length,
-                record.conversion,
-                record.offset,
-            )
-            for name, record in self.records.items()
-        )
-
-    @property
-    def unloaded(self) -> Hashable:
-        record = self.records.get("v_th")
-        if record is None:
-            return id(self)
-        return self.file, record.channel.name, record.trial
-
     def blocks(self, name: str) -> Iterator[np.ndarray]:
-        record = self.records[name]
+        channel, trial = self.records[name]
         with located(self.file, self.metadata.path, name):
-            yield from record.channel.blocks(record.trial)
-
-    def load(self) -> Recording:
-        records: dict[str, Any] = {
-            name: Samples(np.concatenate(list(self.blocks(name))), record.conversion, record.offset)
-            for name, record in self.records.items()
-        }
-        return Recording(**records, **vars(self.metadata))
+            yield from channel.blocks(trial)
 
 
 def sources_of(
@@ -139,9 +101,6 @@ def sources_of(
         channel: Function that returns the channel of a name.
         file: Path of the file, for errors.
         by: Source of the plan, for errors: `mapping` or `command`.
-
-    Raises:
-        RecordingError: The file and the plan do not describe valid recordings.
     """
     channels: dict[str, Channel] = {}
     units: dict[str, tuple[Unit, str]] = {}
@@ -177,17 +136,21 @@ def sources_of(
     labels = _labels(plan.fields.get("trial"), trials, several)
     sources: dict[str, AbstractSource] = {}
     for index, label in enumerate(labels):
-        records = {}
+        records: dict[str, tuple[Channel, int]] = {}
+        layout: list[Layout] = []
         for name in SIGNALS:
             if name in channels:
                 factor = units[name][0].factor / (plan.signals[name].scale or 1.0)
                 own = channels[name].part(parts[index]) if parts else channels[name]
                 trial = rows[name][index if len(rows[name]) > 1 else 0]
                 with located("", field=name):
-                    records[name] = _record(own, trial, factor)
+                    layout.append(_layout(name, own, factor))
+                records[name] = own, trial
         path = f"{plan.path}/{index}" if several or plan.path in KINDS else plan.path
         metadata = metadata_from(**{**vars(common), "trial": label, "path": path})
-        sources[path] = _Source(file, metadata, records)
+        th = records.get("v_th")
+        unloaded = (file, path) if th is None else (file, th[0].name, th[1])
+        sources[path] = _Source(tuple(layout), unloaded, file, metadata, records)
     used = {
         name: Used(
             signal.channel,
@@ -204,8 +167,8 @@ def sources_of(
     )
 
 
-def _record(channel: Channel, trial: int, factor: float) -> _Record:
-    """A trial in SI units; an error if the file scales its samples to nothing."""
+def _layout(name: str, channel: Channel, factor: float) -> Layout:
+    """A record in SI units; an error if the file scales its samples to nothing."""
     conversion, offset = channel.conversion * factor, channel.offset * factor
     if not math.isfinite(conversion) or conversion == 0 or not math.isfinite(offset):
         raise RecordingError(
@@ -213,7 +176,8 @@ def _record(channel: Channel, trial: int, factor: float) -> _Record:
             f"{channel.offset:g}, from which no samples follow",
             remedy="Correct the scaling in the file, or the scale",
         )
-    return _Record(channel, trial, conversion, offset)
+    dtype = channel.dtype.newbyteorder("=").str
+    return Layout(name, dtype, channel.length, conversion, offset)
 
 
 def _parts(
@@ -244,11 +208,9 @@ def _parts(
     def samples(own: Channel) -> np.ndarray:
         return np.concatenate(list(own.blocks())).astype(float)
 
-    rates = common.sample_rate, common.pulse_rate
-    if by_pulses:
-        return by_pauses(samples(separating), *rates)
     cause = channels["v_th"] if "v_th" in channels else channels["current"]
-    return by_trigger(samples(separating), samples(cause), *rates)
+    trigger = None if by_pulses else samples(separating)
+    return split(samples(cause), common.sample_rate, common.pulse_rate, trigger)
 
 
 def _unit(name: str, signal: Signal, said: str) -> tuple[Unit, str]:

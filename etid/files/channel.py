@@ -3,14 +3,14 @@
 import dataclasses
 import functools
 import importlib
+import re
 from collections.abc import Callable, Iterable, Iterator
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, NamedTuple
 
 import numpy as np
 
-from etid.files.units import one_unit, parse_unit, with_unit
 from etid.recordings import errors
-from etid.recordings.recording import RecordingError
+from etid.recordings.errors import RecordingError
 
 BLOCK = 1 << 20  # [samples] size of a block in memory, 8 MB of real numbers
 
@@ -63,11 +63,7 @@ class Channel:
         return self.shape[-1]
 
     def blocks(self, trial: int = 0) -> Iterator[np.ndarray]:
-        """The stored samples of a trial, in blocks of `BLOCK` samples.
-
-        Raises:
-            RecordingError: The file ends before the last sample.
-        """
+        """The stored samples of a trial, in blocks of `BLOCK` samples."""
         for start in range(0, self.length, BLOCK):
             stop = min(start + BLOCK, self.length)
             block = self.read(trial, start, stop)
@@ -168,9 +164,6 @@ def rate_of(interval: float, precision: float, unit: str = "s") -> float | None:
         interval: Time between two samples, in the unit; None is returned if it is not positive.
         precision: Relative precision of the interval.
         unit: Unit of the interval in the spelling of the file.
-
-    Raises:
-        RecordingError: The unit is not one of time, as in the file of a spectrum.
     """
     time = parse_unit(unit)
     if time is None or time.si != "second":
@@ -197,9 +190,6 @@ def optional(module: str, extra: str, file: str, package: str = "") -> Any:
         extra: Extra of etid that installs the package.
         file: The file that needs it.
         package: Name of the package if it is not that of the module.
-
-    Raises:
-        RecordingError: The package is not installed.
     """
     try:
         return importlib.import_module(module)
@@ -209,3 +199,69 @@ def optional(module: str, extra: str, file: str, package: str = "") -> Any:
             file=file,
             remedy=f"Run pip install 'etid[{extra}]'",
         ) from error
+
+
+# --- Units in the spellings of instrument files ---------------------------------------------------
+
+
+class Unit(NamedTuple):
+    """A unit of the values in a file.
+
+    Attributes:
+        factor: Size of the unit in its SI unit.
+        si: SI unit: `volt`, `ampere` or `second`.
+    """
+
+    factor: float
+    si: str
+
+
+def _units() -> dict[str, Unit]:
+    """All units by their spelling: symbols with short prefixes, words with long ones."""
+    micro = "u", "\N{MICRO SIGN}", "\N{GREEK SMALL LETTER MU}"
+    # "M" is missing, because "MV" can be a millivolt in capital letters or a megavolt.
+    short = {"": 1.0, "k": 1e3, "m": 1e-3, **dict.fromkeys(micro, 1e-6), "n": 1e-9, "p": 1e-12}
+    long = {"": 1.0, "kilo": 1e3, "milli": 1e-3, "micro": 1e-6, "nano": 1e-9, "pico": 1e-12}
+    spellings = {
+        "volt": ("V", "volt", "volts"),
+        "ampere": ("A", "ampere", "amperes", "amp", "amps"),
+        "second": ("s", "second", "seconds", "sec"),
+    }
+    return {
+        prefix + name: Unit(factor, unit)
+        for unit, (symbol, *words) in spellings.items()
+        for names, prefixes in (([symbol], short), (words, long))
+        for name in names
+        for prefix, factor in prefixes.items()
+    }
+
+
+UNITS = _units()
+
+
+def parse_unit(text: str) -> Unit | None:
+    """Unit of a text such as `mV` or `millivolts`; None if the text is not a known unit.
+
+    Symbols are case-sensitive; words are not.
+    """
+    name = text.strip()
+    return UNITS.get(name) or UNITS.get(name.lower() if len(name) > 2 else name)
+
+
+def with_unit(name: str) -> tuple[str, str]:
+    """Name and unit of a channel, from `name [unit]` or `name (unit)`; the unit may be empty."""
+    match = re.fullmatch(r"(?P<name>.*\S)\s*[\[(](?P<unit>[^\[\]()]+)[\])]", name)
+    if match is None or not parse_unit(match["unit"]):
+        return name, ""
+    return match["name"], match["unit"].strip()
+
+
+def one_unit(name: str, *said: str) -> str:
+    """The unit of a channel that a file names in several places; empty if it names none."""
+    found = {parse_unit(unit) or unit.strip(): unit.strip() for unit in said if unit.strip()}
+    if len(found) > 1:
+        raise RecordingError(
+            f"the file says {' and '.join(map(repr, found.values()))} of channel {name!r}",
+            remedy="Correct the one that is wrong in the file",
+        )
+    return next(iter(found.values()), "")

@@ -4,12 +4,9 @@ from collections.abc import Iterator, Mapping
 
 import numpy as np
 
-from etid.files.channel import Channel, located
+from etid.files.channel import Channel, Unit, located
 from etid.files.mapping import Plan
-from etid.files.units import Unit
-from etid.recordings.fields import Metadata
 from etid.recordings.recording import RecordingError
-from etid.signals.pulse_train import find_pulses
 
 QUARTZ = 1e-4  # largest relative error of a quartz clock, so of a measured rate
 
@@ -17,18 +14,7 @@ QUARTZ = 1e-4  # largest relative error of a quartz clock, so of a measured rate
 def sample_rate(
     plan: Plan, channels: Mapping[str, Channel], units: Mapping[str, tuple[Unit, str]], by: str
 ) -> tuple[float, str]:
-    """Sample rate [Hz] of a recording, and the source of this rate.
-
-    Args:
-        plan: Plan of the recording, from a mapping.
-        channels: Channel of each signal.
-        units: Unit of each signal, and its source.
-        by: Source of the plan: `mapping` or `command`.
-
-    Raises:
-        RecordingError: The rate is missing, two sources disagree, or the time stamps are not
-            uniform.
-    """
+    """Sample rate [Hz] of a recording, and the source of this rate."""
     said = {
         plan.signals[name].channel: channel.sample_rate
         for name, channel in channels.items()
@@ -66,28 +52,6 @@ def sample_rate(
             remedy="Correct the one that is wrong",
         )
     return ours, f"{by}; file {theirs:.9g} Hz"
-
-
-def check_spacing(v_th: np.ndarray, metadata: Metadata) -> None:
-    """Check the distance between the pulses against the sample rate and the pulse rate.
-
-    Args:
-        v_th: Unloaded record or its first part, in any unit.
-        metadata: Fields of the recording.
-
-    Raises:
-        RecordingError: The distance between the pulses does not match the two rates.
-    """
-    if not np.isfinite(v_th).all():
-        return
-    train = find_pulses(v_th, metadata.sample_rate, metadata.pulse_rate)
-    if train.mismatch:
-        raise RecordingError(
-            train.mismatch.removesuffix("."),
-            path=metadata.path,
-            field="pulse_rate",
-            remedy="Correct sample_rate or pulse_rate",
-        )
 
 
 def _agree(tolerance: float, *rates: float) -> bool:

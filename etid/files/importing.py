@@ -1,4 +1,4 @@
-"""Import of files of other formats into files of recordings.
+"""Import of files of other formats into files of recordings, and of measured impedances.
 
 A reader for each format (`etid.files.readers`) lists the channels of a file. A mapping
 (`etid.files.mapping`) assigns channels to signals. `etid.files.assemble` makes recordings from the
@@ -6,14 +6,17 @@ channels. The recordings are written while they are read.
 """
 
 import contextlib
+import dataclasses
 import os
 import pathlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any, Literal
 
-from etid.files.assemble import Imported, Used, sources_of
-from etid.files.channel import Contents, located
-from etid.files.clock import check_spacing
+import numpy as np
+from jaxtyping import Complex, Float
+
+from etid.files.assemble import Imported, sources_of
+from etid.files.channel import Channel, Contents, located, optional
 from etid.files.mapping import (
     CHANNELS,
     KINDS,
@@ -23,11 +26,10 @@ from etid.files.mapping import (
     plans,
     read_mapping,
 )
-from etid.files.others import with_others
 from etid.files.readers import abf, delimited, excel, lvm, matlab, npz, tdms, wav
 from etid.recordings.errors import require_file
 from etid.recordings.fields import LABELS
-from etid.recordings.recording import AbstractSource, RecordingError
+from etid.recordings.recording import AbstractSource, RecordingError, check_rates
 from etid.recordings.study import Study, refuse_nested
 
 READERS = {
@@ -58,7 +60,7 @@ def import_file(
     - `.tdms`: channels `group/channel` of NI files. They need `pip install etid[tdms]`.
     - `.abf`: ADC channels of Axon files; sweeps become trials. They need `pip install etid[abf]`.
     - `.npz`: arrays of shape (time,) or (trial, time). If the arrays are those of
-      `etid.files.readers.npz.recordings`, the file contains all fields: only labels can be given,
+      `etid.files.readers.npz.own_mapping`, the file contains all fields: only labels can be given,
       without `trial`, and the default condition is the name of the file.
     - `.wav`: channels `1`, `2`, …, as fractions of full scale.
     - `.lvm`: channels of a LabVIEW measurement file.
@@ -107,12 +109,17 @@ def import_file(
     known = {pathlib.Path(os.fspath(one)): r for one, r in (calibrations or {}).items()}
     paths = [*known, *(path for path in paths if path not in known)]  # loaded ones name the others
     given = {name: value for name, value in given.items() if value is not None}
-    if len(paths) == 1 and _is_complete(paths[0]):
-        own = {name for name in LABELS if name in given and name != "trial"}
-        labels = {name: given.pop(name) for name in own}
+    complete = None
+    if len(paths) == 1 and paths[0].suffix.lower() == ".npz":
+        require_file(str(paths[0]))
+        with located(str(paths[0])):
+            complete = npz.own_mapping(paths[0])
+    if complete is not None:
+        labels = {name: given.pop(name) for name in LABELS if name in given and name != "trial"}
         _refuse(given | ({} if mapping is None else {"mapping": mapping}), str(paths[0]),
                 "is not an argument for npz files, which contain it")  # fmt: skip
-        return _import_npz(paths[0], target, {"condition": paths[0].stem} | labels)
+        own = complete | {"condition": paths[0].stem} | labels
+        return converted({paths[0]: own}, target, by="file")
     if mapping is None:
         common = channels_of(given)
         whole = {name: value for name, value in common.items() if name != "split"}
@@ -149,7 +156,7 @@ def converted(
     target: str | os.PathLike[str],
     *,
     place: str = "",
-    by: Literal["command", "mapping"] = "command",
+    by: Literal["command", "mapping", "file"] = "command",
 ) -> list[Imported]:
     """Convert files, each with a mapping of its own, into one etid file.
 
@@ -206,7 +213,7 @@ def converted(
                         with located(file):
                             names = {record.name for record in each.layout}
                             cause = "v_th" if "v_th" in names else "current"
-                            check_spacing(next(each.blocks(cause)).astype(float), each.metadata)
+                            check_rates(next(each.blocks(cause)), each.metadata)
                     for twice in sources.keys() & found.keys():
                         raise RecordingError(
                             "another recording has this path",
@@ -232,43 +239,92 @@ def _check_suffix(path: pathlib.Path) -> None:
         )
 
 
-def _is_complete(path: pathlib.Path) -> bool:
-    """Whether a file is an npz archive that contains all fields of its recordings."""
-    if path.suffix.lower() != ".npz":
-        return False
-    with located(str(path)):
-        return npz.is_complete(path)
-
-
 def _refuse(given: Mapping[str, Any], file: str, reason: str) -> None:
     for name in given:
         raise RecordingError(reason, file=file, field=name, remedy="Remove the argument")
 
 
-def _import_npz(
-    path: pathlib.Path, target: str | os.PathLike[str], labels: Mapping[str, Any]
-) -> list[Imported]:
-    with located(str(path)):
-        recordings = npz.recordings(path, labels)
-        study = Study.from_recordings(recordings)
-        for recording in study.recordings():
-            check_spacing(recording.samples[recording.cause].values, recording.metadata)
-        study.write(target)
-    used = []
-    for part, channel in (study.calibrations, "adc_ref"), (study.loaded, "adc_out"):
-        first = next(part.recordings(), None)
-        if first is not None:
-            samples = first.samples["v_out"]
-            unit = f"codes of {samples.conversion:.6g} volt"
-            signals = {"v_th": "adc_th", "v_out": channel}
-            used.append(
-                Imported(
-                    tuple(part),
-                    samples.stored.size,
-                    first.sample_rate,
-                    "file",
-                    first.pulse_rate,
-                    {name: Used(key, unit, "file", 1.0) for name, key in signals.items()},
-                )
-            )
-    return used
+# --- Channels of other files ----------------------------------------------------------------------
+
+
+def with_others(
+    contents: Contents, mapping: Mapping[str, Any], opened: Callable[[pathlib.Path], Contents]
+) -> Contents:
+    """The contents of a file, together with the channels of other files that a mapping names.
+
+    A mapping names such a channel `FILE:NAME`: channel `NAME` of the file with this path, from the
+    current folder. So V_th may be recorded once for all trials.
+    """
+    others: dict[str, Contents] = {}
+    for name in _named(mapping):
+        file = name.rpartition(":")[0]
+        if name not in contents.names and file not in others and pathlib.Path(file).is_file():
+            with located(file):
+                others[file] = opened(pathlib.Path(file))
+    if not others:
+        return contents
+
+    def channel(name: str) -> Channel:
+        if name in contents.names:
+            return contents.channel(name)
+        file, _, own = name.rpartition(":")
+        with located(file):
+            return dataclasses.replace(others[file].channel(own), name=name)
+
+    def prepare(names: Iterable[str]) -> None:
+        wanted = set(names)
+        contents.prepare(wanted.intersection(contents.names))
+        for file, other in others.items():
+            with located(file):
+                other.prepare({one for one in other.names if f"{file}:{one}" in wanted})
+
+    foreign = (f"{file}:{name}" for file, other in others.items() for name in other.names)
+    return Contents((*contents.names, *foreign), channel, prepare)
+
+
+def _named(mapping: Mapping[str, Any]) -> Iterator[str]:
+    """The names of channels in a mapping; `plans` checks its form."""
+    tables = mapping.get("recording", [])
+    for table in [mapping, *(tables if isinstance(tables, list) else [tables])]:
+        for signal in CHANNELS:
+            said = table.get(signal) if isinstance(table, Mapping) else None
+            if isinstance(said, Mapping) and isinstance(said.get("channel"), str):
+                yield said["channel"]
+
+
+# --- Measured impedances --------------------------------------------------------------------------
+
+
+def read_impedance(
+    path: str | os.PathLike[str], instrument: str | None = None
+) -> tuple[Float[np.ndarray, " frequency"], Complex[np.ndarray, " frequency"]]:
+    """Frequencies [Hz] and impedance [Ω] of a file, for `identify_impedance`.
+
+    Args:
+        path: The file.
+        instrument: Program that wrote it: `gamry`, `autolab`, `parstat`, `zplot`, `versastudio`,
+            `powersuite`, `biologic` or `chinstruments`. If not given, the file is a table of
+            frequency, real and imaginary part with commas, without a header.
+
+    Raises:
+        RecordingError: The file cannot be read, the instrument is not known, or the package
+            impedance is not installed.
+    """
+    file = pathlib.Path(path)
+    instruments = (
+        "gamry", "autolab", "parstat", "zplot", "versastudio", "powersuite", "biologic",
+        "chinstruments",
+    )  # fmt: skip
+    if instrument is not None and instrument not in instruments:
+        raise RecordingError(
+            f"is {instrument!r}", field="instrument", remedy=f"Use one of {', '.join(instruments)}"
+        )
+    require_file(str(file))
+    readers = optional("impedance.preprocessing", "eis", str(file), "impedance")
+    # The readers raise any error for a file of another instrument, even UnboundLocalError.
+    with located(str(file), remedy="Name its instrument"):
+        frequency, impedance = readers.readFile(str(file), instrument)
+        frequency, z = np.asarray(frequency, float), np.asarray(impedance, complex)
+        if frequency.size == 0 or frequency.shape != z.shape:
+            raise RecordingError("holds no impedances", remedy="Name the instrument")
+    return frequency, z

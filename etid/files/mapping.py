@@ -13,9 +13,8 @@ import tomllib
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from etid.files.channel import chosen, listed
+from etid.files.channel import UNITS, Unit, chosen, listed, parse_unit
 from etid.files.pattern import Pattern
-from etid.files.units import UNITS, Unit, parse_unit
 from etid.recordings import limits
 from etid.recordings.fields import DECLARED, LABELS, SIGNALS, check_names, tidy_path
 from etid.recordings.recording import RecordingError
@@ -73,11 +72,7 @@ class Plan:
 
 
 def read_mapping(path: str | os.PathLike[str]) -> dict[str, Any]:
-    """Content of a mapping file, not checked yet.
-
-    Raises:
-        RecordingError: The file is missing or is not TOML.
-    """
+    """Content of a mapping file, not checked yet."""
     file = pathlib.Path(path)
     if not file.is_file():
         raise RecordingError(
@@ -101,11 +96,7 @@ def read_mapping(path: str | os.PathLike[str]) -> dict[str, Any]:
 
 
 def files_of(mapping: Mapping[str, Any]) -> list[str]:
-    """The files of a mapping, in its order.
-
-    Raises:
-        RecordingError: A recording names no file.
-    """
+    """The files of a mapping, in its order."""
     names = [table.get("file") for table in _tables(mapping)]
     if not names or not all(isinstance(name, str) for name in names):
         raise RecordingError(
@@ -115,16 +106,7 @@ def files_of(mapping: Mapping[str, Any]) -> list[str]:
 
 
 def of_files(mapping: Mapping[str, Any], names: Sequence[str]) -> list[Mapping[str, Any]]:
-    """The part of a mapping for each file: the recordings whose key `file` has its name.
-
-    Args:
-        mapping: Content of a mapping, from `read_mapping`.
-        names: Names of the files to import.
-
-    Raises:
-        RecordingError: A recording names no file although there are several, or a file that is not
-            imported; or a file has no recording.
-    """
+    """The part of a mapping for each file: the recordings whose key `file` has its name."""
     tables = _tables(mapping)
     if len(names) == 1 and not any("file" in table for table in tables):
         return [mapping]
@@ -172,9 +154,6 @@ def plans(
         names: Names of the channels of the file; the mapping may use only these.
         implied: Unit of each signal if neither the mapping nor the file names one.
         name: Name below `loaded` or `calibration` of a recording without a path.
-
-    Raises:
-        RecordingError: A key is missing, unknown, or of the wrong type.
     """
     tables = _tables(mapping)
     common = {key: value for key, value in mapping.items() if key != "recording"}
@@ -340,16 +319,7 @@ def _number(field: str, value: Any) -> float | None:
 
 
 def unit_of(name: str, signal: Signal, said: str) -> tuple[Unit, str]:
-    """Unit of a channel's values, and the source of this unit.
-
-    Args:
-        name: Name of the signal.
-        signal: The signal in the mapping.
-        said: Unit in the file; empty if the file does not name it.
-
-    Raises:
-        RecordingError: The unit is missing, or the file and the mapping disagree.
-    """
+    """Unit of a channel's values, and the source of this unit."""
     field = f"{name}.unit"
     ours, theirs = parse_unit(signal.unit), parse_unit(said)
     where = f"of channel {signal.channel!r}"

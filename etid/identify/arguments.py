@@ -6,7 +6,7 @@ from collections.abc import Iterable, Sequence
 from typing import Any, cast
 
 from etid.circuits.circuit import AbstractCircuit, SkinRC
-from etid.circuits.circuit_string import circuit, is_circuit_string
+from etid.circuits.lookup import circuit, is_circuit_string
 from etid.recordings.errors import not_recorded
 from etid.recordings.recording import Recording, RecordingError
 from etid.recordings.study import Study

@@ -8,7 +8,7 @@ import dataclasses
 import functools
 import re
 import weakref
-from collections.abc import Callable, Hashable, Iterator
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import h5py
@@ -24,6 +24,7 @@ from etid.recordings.recording import (
     Recording,
     RecordingError,
     Samples,
+    check_rates,
     of_checked,
 )
 from etid.recordings.untrusted import (
@@ -33,48 +34,36 @@ from etid.recordings.untrusted import (
     local_link,
     translated,
 )
-from etid.signals.pulse_train import find_pulses
 
 OPEN = 8  # most datasets of stacks that stay open
 
 
-@dataclasses.dataclass(frozen=True)
-class _Header:
-    """Shape, dtype and scale of a dataset, read without its samples."""
-
-    shape: tuple[int, ...]
-    dtype: np.dtype
-    conversion: float
-    offset: float
-
-    @property
-    def length(self) -> int:
-        return self.shape[-1]
-
-    @property
-    def stacked(self) -> bool:
-        return len(self.shape) == 2
-
-
 @dataclasses.dataclass(eq=False)
 class _Block:
-    """A recording group of the file: one recording, or a stack of trials."""
+    """A recording group of the file: one recording, or a stack of trials.
+
+    `stacked` are the names of the records with one row for each trial.
+    """
 
     file: h5py.File
     opened: Callable[[str], Any]
     name: str
     metadata: Metadata
     trials: tuple[str, ...] | None
-    headers: dict[str, _Header]
+    layout: tuple[Layout, ...]
+    rows: int | None
+    stacked: frozenset[str]
     shared: Callable[[], Samples | None] = lambda: None
 
-    def rows(self) -> "Iterator[_Row]":
-        count = self.headers["v_out"].shape[0] if self.headers["v_out"].stacked else None
-        return (_Row(self, row) for row in ([None] if count is None else range(count)))
+    def sources(self) -> "Iterator[_Row]":
+        recorded = any(record.name == "v_th" for record in self.layout)
+        common, own = recorded and "v_th" not in self.stacked, id(self)
+        for row in [None] if self.rows is None else range(self.rows):
+            yield _Row(self.layout, (own, None if common else row), self, row)
 
-    def samples(self, name: str, row: int | None) -> Samples:
-        header = self.headers[name]
-        common = row is not None and not header.stacked
+    def samples(self, record: Layout, row: int | None) -> Samples:
+        name, stacked = record.name, record.name in self.stacked
+        common = row is not None and not stacked
         kept = self.shared() if common else None
         if kept is not None:
             return kept
@@ -82,17 +71,17 @@ class _Block:
             if not self.file:
                 raise RecordingError("the file is closed", remedy="Read it again, or use `with`")
             path = f"{self.metadata.path}/{name}"
-            dataset = self.opened(path) if header.stacked else self.file[path]
+            dataset = self.opened(path) if stacked else self.file[path]
             assert isinstance(dataset, h5py.Dataset)  # the scan has checked this
-            stored = dataset[row] if header.stacked else dataset[()]
+            stored = dataset[row] if stacked else dataset[()]
             stored.flags.writeable = False
-            samples = Samples(stored, header.conversion, header.offset)
+            samples = Samples(stored, record.conversion, record.offset)
         if common:  # shared as long as a recording of the stack is in use
             self.shared = weakref.ref(samples)
         return samples
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
+@dataclasses.dataclass(frozen=True, eq=False, slots=True)
 class _Row(AbstractSource):
     """One recording of a file; `row` is None if the group is not a stack."""
 
@@ -107,24 +96,12 @@ class _Row(AbstractSource):
         trial = self.block.trials[self.row] if self.block.trials else ""
         return common.of_trial(f"{common.path}/{self.row}", trial)
 
-    @property
-    def layout(self) -> tuple[Layout, ...]:
-        return tuple(
-            Layout(name, header.dtype.str, header.length, header.conversion, header.offset)
-            for name, header in self.block.headers.items()
-        )
-
-    @property
-    def unloaded(self) -> Hashable:
-        unloaded = self.block.headers.get("v_th")
-        common = unloaded is not None and not unloaded.stacked
-        return (id(self.block), None if common else self.row)
-
     def blocks(self, name: str) -> Iterator[np.ndarray]:
-        yield self.block.samples(name, self.row).stored
+        (record,) = (record for record in self.layout if record.name == name)
+        yield self.block.samples(record, self.row).stored
 
     def load(self) -> Recording:
-        samples = {name: self.block.samples(name, self.row) for name in self.block.headers}
+        samples = {record.name: self.block.samples(record, self.row) for record in self.layout}
         return of_checked(samples, self.metadata)
 
 
@@ -156,28 +133,28 @@ class Scan:
 
     def sources(self) -> dict[str, AbstractSource]:
         """The readable recordings, by path."""
-        return {row.metadata.path: row for block in self.blocks.values() for row in block.rows()}
+        return {row.metadata.path: row for block in self.blocks.values() for row in block.sources()}
 
     def check_samples(self) -> None:
-        """Read all samples, and report unreadable and infinite samples and wrong rates."""
+        """Read all samples, and report what no fit can use of them."""
         for path, source in self.sources().items():
             with self._reported(path):
-                recording = source.load()
-                for name, record in recording.samples.items():
-                    count = int(np.sum(~np.isfinite(record.stored)))
-                    if count:
-                        self._report(
-                            path,
-                            name,
-                            f"{count} of {record.stored.size} samples are not finite",
-                            "Record again; a fit of this recording only gives a verdict",
-                        )
-                cause = recording.samples[recording.cause].values
-                with np.errstate(over="ignore", invalid="ignore"):  # of samples like 1e308
-                    train = find_pulses(cause, recording.sample_rate, recording.pulse_rate)
-                if train.mismatch:
-                    remedy = "Correct sample_rate or pulse_rate"
-                    self._report(path, "pulse_rate", train.mismatch.removesuffix("."), remedy)
+                self._check(path, source.load())
+
+    def _check(self, path: str, recording: Recording) -> None:
+        before = len(self.problems)
+        for name, record in recording.samples.items():
+            count = int(np.sum(~np.isfinite(record.stored)))
+            if count:
+                message = f"{count} of {record.stored.size} samples are not finite"
+                remedy = "Record again; a fit of this recording only gives a verdict"
+                self._report(path, name, message, remedy)
+        with self._reported(path):
+            check_rates(recording.samples[recording.cause].values, recording.metadata)
+        current = recording.current
+        if len(self.problems) == before and current is not None and np.ptp(current) == 0:
+            remedy = "Record the current of the pulses, or remove the dataset"
+            self._report(path, "current", f"is constant, {current[0]:g} A", remedy)
 
     def _report(self, path: str, field: str, message: str, remedy: str = "") -> None:
         self.problems.append(
@@ -268,11 +245,13 @@ class Scan:
             if not kind or field.forbidden != kind
         }
         self._near_misses(present, allowed, path, "")
-        headers: dict[str, _Header] = {}
+        shapes: dict[str, tuple[int, ...]] = {}
+        layout: list[Layout] = []
         for field in schema.at("dataset").values():
             with self._reported(path, field.name):
                 if field.name in names:
-                    headers[field.name] = self._header(group, field, path)
+                    shapes[field.name], record = self._header(group, field, path)
+                    layout.append(record)
                 elif field.required in ("always", kind) or (
                     field.name == "v_th" and "current" not in names
                 ):
@@ -288,7 +267,7 @@ class Scan:
                     )
         if len(self.problems) == before:
             with self._reported(path):
-                self.blocks[path] = self._block(path, found, headers)
+                self.blocks[path] = self._block(path, found, shapes, layout)
         return None
 
     def _missing(self, path: str, field: Field) -> None:
@@ -318,31 +297,29 @@ class Scan:
                 continue
             try:
                 found[name] = known[name].parse(value)
-            except ValueError as error:
-                remedy = f"The schema requires {known[name].expects}"
-                self._report(path, f"{of}{name}", str(error), remedy)
+            except RecordingError as error:
+                remedy = error.remedy or f"The schema requires {known[name].expects}"
+                self._report(path, f"{of}{name}", error.message, remedy)
         return found
 
-    def _header(self, group: h5py.Group, field: Field, path: str) -> _Header:
-        """Shape, dtype and scale of a dataset; its samples must be in this file."""
+    def _header(self, group: h5py.Group, field: Field, path: str) -> tuple[tuple[int, ...], Layout]:
+        """Shape and description of a dataset; its samples must be in this file."""
         link = local_link(group, field.name)
-        remedy = "Copy the samples into the file"
-        dataset = group.get(field.name)
-        if dataset is None:
+        try:
+            dataset = group[field.name]
+        except KeyError:
             target = getattr(link, "path", "")
-            raise RecordingError(f"is a dangling link to {target!r}", remedy="Repair the link")
+            raise RecordingError(
+                f"is a dangling link to {target!r}", remedy="Repair the link"
+            ) from None
         if not isinstance(dataset, h5py.Dataset):
             what = "group" if isinstance(dataset, h5py.Group) else "datatype"
             raise RecordingError(f"is a {what}", remedy=f"Add {field.expects} as a dataset")
-        here = h5o.get_info(group.id).fileno
-        if h5o.get_info(dataset.id).fileno != here or dataset.external or dataset.is_virtual:
-            raise RecordingError("its samples are in another file", remedy=remedy)
-        if dataset.dtype.kind not in "iuf" or dataset.dtype.itemsize > 8:
+        dtype, shape = dataset.dtype, dataset.shape
+        if dtype.kind not in "iuf" or dtype.itemsize > 8:
             raise RecordingError(
-                f"has dtype {dataset.dtype}",
-                remedy="Store integers or real numbers of at most 64 bits",
+                f"has dtype {dtype}", remedy="Store integers or real numbers of at most 64 bits"
             )
-        shape = dataset.shape
         if shape is None or len(shape) not in (1, 2) or 0 in shape:
             what = "is empty" if shape is None or 0 in shape else f"has shape {shape}"
             raise RecordingError(what, remedy=f"The schema requires {field.expects}")
@@ -365,14 +342,19 @@ class Scan:
             )
         scale = found.get("conversion", 1.0), found.get("offset", 0.0)
         try:
-            Samples(np.zeros(1, dataset.dtype), *scale)
+            Samples(np.zeros(1, dtype), *scale)
         except RecordingError as error:
             raise RecordingError(error.message, field=f"{of}{error.field}") from None
-        return _Header(shape, dataset.dtype, *scale)
+        return shape, Layout(field.name, dtype.str, shape[-1], *scale)
 
-    def _block(self, path: str, found: dict[str, Any], headers: dict[str, _Header]) -> _Block:
+    def _block(
+        self,
+        path: str,
+        found: dict[str, Any],
+        shapes: dict[str, tuple[int, ...]],
+        layout: list[Layout],
+    ) -> _Block:
         """Block of a group whose fields are valid; checks that the fields match each other."""
-        shapes = {name: header.shape for name, header in headers.items()}
         out = shapes["v_out"]
         once = [name for name, shape in shapes.items() if shape != out]
         if once and (once != ["v_th"] or shapes["v_th"] != out[-1:]):
@@ -403,7 +385,14 @@ class Scan:
         for trial in trials or ():
             metadata_from(**{**found, "trial": trial})  # checks the text of the label
         return _Block(
-            self.file, self.opened, self.name, metadata, trials if stacked else None, headers
+            self.file,
+            self.opened,
+            self.name,
+            metadata,
+            trials if stacked else None,
+            tuple(layout),
+            out[0] if stacked else None,
+            frozenset(name for name, shape in shapes.items() if len(shape) == 2),
         )
 
     def _check_calibration(self, path: str, calibration: str) -> None:

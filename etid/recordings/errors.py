@@ -57,13 +57,7 @@ def require_file(path: str) -> None:
 
 
 def not_recorded(path: str, field: str, remedy: str) -> RecordingError:
-    """The error for a record that a recording does not have.
-
-    Args:
-        path: HDF5 path of the recording.
-        field: Name of the record.
-        remedy: What the user can do.
-    """
+    """The error for a record that the recording at a path does not have."""
     return RecordingError("was not recorded", path=path, field=field, remedy=remedy)
 
 
@@ -90,9 +84,6 @@ def located(
         foreign: Types of a library's errors.
         message: Message for a library's error; the error's own text follows in brackets.
         remedy: Remedy for a library's error.
-
-    Raises:
-        RecordingError: The block raised a `RecordingError` or an error of `foreign`.
     """
     try:
         yield

@@ -7,6 +7,7 @@ change.
 """
 
 import dataclasses
+import math
 from collections.abc import Mapping, Sequence
 from typing import Any, Literal, Required, TypedDict
 
@@ -14,7 +15,51 @@ import numpy as np
 
 from etid.recordings import limits
 from etid.recordings.errors import RecordingError, near_miss
-from etid.recordings.values import Type, real, several, stored, text
+
+Type = Literal["text", "paths", "label", "number", "range", "samples"]
+
+
+def text(field: str, value: object) -> str:
+    """A label as text; integers become their decimal digits."""
+    if isinstance(value, int | np.integer) and not isinstance(value, bool):
+        value = int(value)
+    elif not isinstance(value, str):
+        raise RecordingError(f"is {value!r}, must be text or an integer", field=field)
+    label = str(value)
+    if "\0" in label or any("\ud800" <= character <= "\udfff" for character in label):
+        raise RecordingError(f"{label!r} cannot be stored as UTF-8 text", field=field)
+    return label
+
+
+def real(field: str, value: object) -> float:
+    """A finite real number; text and booleans are an error."""
+    number = isinstance(value, int | float | np.integer | np.floating) or (
+        getattr(value, "shape", None) == () and getattr(value, "dtype", np.dtype("O")).kind in "iuf"
+    )
+    if not number or isinstance(value, bool) or not math.isfinite(float(value)):  # type: ignore[arg-type]  # checked on this line
+        raise RecordingError(f"is {value!r}, must be a finite real number", field=field)
+    return float(value)  # type: ignore[arg-type]  # checked above
+
+
+def several(field: str, value: object) -> list[Any]:
+    """The items of a sequence; a text is one item."""
+    if isinstance(value, str):
+        return [value]
+    try:
+        return list(value)  # type: ignore[call-overload]  # other types raise TypeError
+    except TypeError:
+        raise RecordingError(f"is {value!r}, must be a sequence", field=field) from None
+
+
+def plain(item: Any) -> Any:
+    """One element of an attribute of a file as a Python object; bytes become text."""
+    if isinstance(item, bytes):
+        try:
+            return item.decode("utf-8")
+        except UnicodeDecodeError:
+            raise RecordingError(f"is {item!r}, which is not UTF-8 text") from None
+    return item.item() if isinstance(item, np.generic) else item
+
 
 KINDS = ("calibration", "loaded")
 
@@ -67,37 +112,32 @@ class Field:
         return {"label": "", "paths": ()}.get(self.type)
 
     def parse(self, value: Any) -> Any:
-        """Value of an attribute of a file as a Python str, a float, or a tuple of them.
-
-        Raises:
-            ValueError: The value does not follow the schema; the text describes the value.
-        """
+        """Value of an attribute of a file, as `checked`; labels of a stack become a tuple."""
         array = np.asarray(value)
         if array.size == 0 or "Empty" in type(value).__name__:
-            raise ValueError("is empty")
+            raise RecordingError("is empty")
         if array.dtype.names is not None:
-            raise ValueError("is a compound value")
+            raise RecordingError("is a compound value")
         if array.dtype.hasobject and any(type(x).__module__.startswith("h5py") for x in array.flat):
-            raise ValueError("is an HDF5 reference; write the path as text")
-        items = [stored(item, self.type) for item in array.flat]
-        if self.values and items[0] not in self.values:
-            raise ValueError(f"is {items[0]!r}")
+            raise RecordingError("is an HDF5 reference; write the path as text")
+        items = [plain(item) for item in array.flat]
         many = self.type in ("paths", "range") or ("(trial,)" in self.shape and array.ndim == 1)
         if array.ndim > 1 or (len(items) > 1 and not many):
-            raise ValueError(f"has shape {array.shape}")
-        if self.type == "range" and len(items) != 2:
-            raise ValueError(f"has {len(items)} elements, must have 2")
-        return tuple(items) if many else items[0]
+            raise RecordingError(f"has shape {array.shape}")
+        if many and self.type == "label":
+            return tuple(map(self.checked, items))
+        found = self.checked(items if many else items[0])
+        if self.values and found not in self.values:
+            raise RecordingError(f"is {found!r}")
+        return found
 
     def checked(self, value: Any) -> Any:
-        """Value that a caller gives, as Python types.
-
-        Raises:
-            RecordingError: The value does not follow the schema.
-        """
+        """Value that a caller gives, as Python types."""
         if value is None:
             return self.empty
-        if self.type == "label":
+        if self.type == "text" and not isinstance(value, str):
+            raise RecordingError(f"is {value!r}, must be text", field=self.name)
+        if self.type in ("text", "label"):
             return text(self.name, value)
         if self.type == "paths":
             return tuple(tidy_path(path) for path in several(self.name, value))
@@ -312,11 +352,7 @@ class Metadata(AbstractFields):
 
 
 def metadata_from(*, path: str = "", **fields: Any) -> Metadata:
-    """Metadata from unchecked values; only this function checks and converts their types.
-
-    Raises:
-        RecordingError: A value does not follow the schema, or a field is unknown or missing.
-    """
+    """Metadata from unchecked values; only this function checks and converts their types."""
     check_names(fields, tuple(DECLARED), "field of a recording")
     for name, field in DECLARED.items():
         if field.required == "always" and fields.get(name) is None:
@@ -333,9 +369,6 @@ def check_names(given: Mapping[str, Any], known: Sequence[str], what: str, of: s
         known: Known names.
         what: Word for these names in the error, such as "label".
         of: Text before the name in the error, such as "v_th.".
-
-    Raises:
-        RecordingError: A name is not known; the error suggests a similar known name.
     """
     for name in given:
         if name not in known:
@@ -348,10 +381,6 @@ def check_names(given: Mapping[str, Any], known: Sequence[str], what: str, of: s
 
 
 def wanted_labels(given: Mapping[str, Any], known: Sequence[str]) -> dict[str, str]:
-    """Labels for a choice of recordings or fits, as text; labels that are None are ignored.
-
-    Raises:
-        RecordingError: The name of a label is unknown, or a value is neither text nor an integer.
-    """
+    """Labels for a choice of recordings or fits, as text; labels that are None are ignored."""
     check_names(given, known, "label")
     return {name: text(name, value) for name, value in given.items() if value is not None}

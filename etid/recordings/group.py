@@ -48,14 +48,14 @@ class Group:
         self._spectra: dict[tuple[int, int], tuple[np.ndarray, ...]] = {}
 
     @functools.cached_property
+    @quietly()
     def whole(self) -> Float[np.ndarray, "recording 2 time"]:
         """Voltages of all periods as they were recorded [V]."""
         size = self.recordings[0].samples["v_out"].stored.size
         whole = np.empty((len(self.recordings), 2, size))
-        with quietly():
-            for records, one in zip(whole, self.recordings, strict=True):
-                for v, record in zip(records, _records(one), strict=True):
-                    record.write_to(v)
+        for records, one in zip(whole, self.recordings, strict=True):
+            for v, record in zip(records, _records(one), strict=True):
+                record.write_to(v)
         whole.flags.writeable = False
         return whole
 
@@ -76,18 +76,18 @@ class Group:
         return np.array([[v.resolution or 0.0 for v in _records(one)] for one in self.recordings])
 
     @functools.cached_property
+    @quietly()
     def noise(self) -> Float[np.ndarray, "recording 2"]:
         """Standard deviations of the noise of a sample of `whole` [V]."""
-        with quietly():
-            return np.asarray(noise_std(self.whole, self.step))
+        return np.asarray(noise_std(self.whole, self.step))
 
     @functools.cached_property
+    @quietly()
     def coarse(self) -> Float[np.ndarray, "recording 2"]:
         """Converter steps [V] that exceed the noise, else 0."""
         found = np.zeros(self.step.shape)
-        with quietly():
-            spans = np.ptp(self.recorded_limits, axis=-1)
-            visible = (self.step > VISIBLE * spans) | ((self.step == 0) & shows_few(self.whole))
+        spans = np.ptp(self.recorded_limits, axis=-1)
+        visible = (self.step > VISIBLE * spans) | ((self.step == 0) & shows_few(self.whole))
         for row, which in np.argwhere(visible):
             v = self.whole[row, which]
             step = float(self.step[row, which]) or step_of(v)
@@ -106,13 +106,13 @@ class Group:
         return [whole_periods(size, self.sample_rate, train.counted) for train in self.trains]
 
     @functools.cached_property
+    @quietly()
     def hum(self) -> list[list[Hum | None]]:
         """Hum that is subtracted from each record; None if there is none."""
         found: list[list[Hum | None]] = [[None, None] for _ in self.recordings]
         rates = self.sample_rate, self.pulse_rate
         for of, rows in _alike(self.whole_periods).items():
-            with quietly():
-                suspect = humming(_part(self.whole, rows), self.noise[rows], *rates, *of)
+            suspect = humming(_part(self.whole, rows), self.noise[rows], *rates, *of)
             for number, which in np.argwhere(suspect):
                 row = rows[number]
                 known = self.whole[row, which], float(self.noise[row, which]), self.sample_rate
@@ -121,7 +121,7 @@ class Group:
 
     @functools.cached_property
     def quiet(self) -> Float[np.ndarray, "recording 2 time"]:
-        """Voltages of all periods without hum [V]."""
+        """Voltages of all periods without hum between the harmonics [V]."""
         if all(hum is None for both in self.hum for hum in both):
             return self.whole
         quiet = self.whole.copy()
@@ -134,12 +134,12 @@ class Group:
     @functools.cached_property
     def recorded_limits(self) -> Float[np.ndarray, "recording 2 limit"]:
         """Smallest and largest sample of each record in `whole` [V]."""
-        return limits_of(self.whole)
+        return _limits(self.whole)
 
     @functools.cached_property
     def limits(self) -> Float[np.ndarray, "recording 2 limit"]:
         """Smallest and largest sample of each record in `quiet` [V]."""
-        return self.recorded_limits if self.quiet is self.whole else limits_of(self.quiet)
+        return self.recorded_limits if self.quiet is self.whole else _limits(self.quiet)
 
     @functools.cached_property
     def covariance(self) -> Float[np.ndarray, "recording 2 2"]:
@@ -157,6 +157,7 @@ class Group:
         return [found for _, found in self._periods]
 
     @functools.cached_property
+    @quietly()
     def _periods(self) -> list[tuple[Joint | None, Shifts | None]]:
         """`kept` and `shifts`."""
         found: list[tuple[Joint | None, Shifts | None]] = [(None, None)] * len(self.recordings)
@@ -170,25 +171,22 @@ class Group:
             counted, periods = key
             of = _part(self.quiet, rows), self.noise[rows], self.coarse[rows]
             spacing = self.sample_rate / counted
-            with quietly():
-                suspect = np.flatnonzero(uneven(*of, spacing, periods))
-                for row in suspect:
-                    records, sigma, step = (part[[row]] for part in of)
-                    (bad,) = disturbed(records, sigma, step, spacing, periods)
-                    known = records[0], sigma[0], bad, spacing, self.sample_rate
-                    found[rows[row]] = _kept(*known)
+            for row in np.flatnonzero(uneven(*of, spacing, periods)):
+                records, sigma, step = (part[[row]] for part in of)
+                (bad,) = disturbed(records, sigma, step, spacing, periods)
+                found[rows[row]] = _kept(records[0], sigma[0], bad, spacing, self.sample_rate)
         return found
 
     @functools.cached_property
+    @quietly()
     def lags(self) -> list[float | None]:
         """Lags of `v_out` in `quiet` [samples]; None if misaligned or if the rates are wrong."""
         lags: list[float | None] = [None] * len(self.recordings)
         rows = [row for row, train in enumerate(self.trains) if not train.mismatch]
-        trains = [self.trains[row] for row in rows]
-        with quietly():
-            found = lags_of(_part(self.quiet, rows), trains) if rows else []
-        for row, lag in zip(rows, found, strict=True):
-            lags[row] = lag
+        if rows:
+            found = lags_of(_part(self.quiet, rows), [self.trains[row] for row in rows])
+            for row, lag in zip(rows, found, strict=True):
+                lags[row] = lag
         return lags
 
     @functools.cached_property
@@ -197,26 +195,28 @@ class Group:
         return np.maximum(self.noise, RIPPLE * np.ptp(self.limits, axis=-1))
 
     @functools.cached_property
+    @quietly()
     def periodic(self) -> Bool[np.ndarray, " recording"]:
         """`is_periodic` of each recording in `quiet`, with all its periods."""
         found = np.zeros(len(self.recordings), bool)
         for (periods, samples), rows in _alike(self.whole_periods).items():
-            if periods > 0:
-                counted = np.array([self.trains[row].counted for row in rows])
-                rest = np.abs(periods * self.sample_rate / counted - samples)
-                rest = np.maximum(rest, self._cut)
-                records, sigma = _part(self.quiet, rows), self.trusted[rows]
-                with quietly():
-                    found[rows] = is_periodic(records, sigma, rest, samples)
-                    on_edge = ~is_periodic(records, sigma, np.ones(len(rows)), samples)
-                # Jitter of the last pulse looks like another pulse rate.
-                on_edge &= found[rows] & (counted != self.pulse_rate)
-                for row in np.flatnonzero(on_edge):
-                    spacing = self.sample_rate / counted[row]
-                    found[rows[row]] = _repeats(records[row], sigma[row], spacing, samples)
+            if periods == 0:
+                continue
+            counted = np.array([self.trains[row].counted for row in rows])
+            rest = np.abs(periods * self.sample_rate / counted - samples)
+            rest = np.maximum(rest, self._cut)
+            records, sigma = _part(self.quiet, rows), self.trusted[rows]
+            found[rows] = is_periodic(records, sigma, rest, samples)
+            on_edge = ~is_periodic(records, sigma, np.ones(len(rows)), samples)
+            # Jitter of the last pulse looks like another pulse rate.
+            on_edge &= found[rows] & (counted != self.pulse_rate)
+            for row in np.flatnonzero(on_edge):
+                spacing = self.sample_rate / counted[row]
+                found[rows[row]] = _repeats(records[row], sigma[row], spacing, samples)
         return found
 
     @functools.cached_property
+    @quietly()
     def flickers(self) -> Bool[np.ndarray, "recording 2"]:
         """Whether each record in `quiet` may have 1/f noise, by a quick look.
 
@@ -226,16 +226,15 @@ class Group:
         if self._cut > 0:
             return found
         for of, rows in _alike(self.whole_periods).items():
-            with quietly():
-                found[rows] = flickering(_part(self.quiet, rows), self.trusted[rows], *of)
+            found[rows] = flickering(_part(self.quiet, rows), self.trusted[rows], *of)
         return found
 
+    @quietly()
     def spectra(self, periods: int, samples: int) -> tuple[np.ndarray, ...]:
         """`etid.signals.harmonics.filled` for `quiet` and numbers from `whole_periods`."""
         if (periods, samples) not in self._spectra:
-            with quietly():
-                found = np.asarray(harmonics(self.quiet, periods, samples))
-                fields = filled(found, self.trusted, self.sample_rate, periods, samples)
+            found = np.asarray(harmonics(self.quiet, periods, samples))
+            fields = filled(found, self.trusted, self.sample_rate, periods, samples)
             self._spectra[periods, samples] = tuple(map(np.asarray, fields))
         return self._spectra[periods, samples]
 
@@ -260,19 +259,18 @@ def _part(
     return records if len(rows) == len(records) else records[np.asarray(rows)]
 
 
-def limits_of(v: Float[np.ndarray, "*record time"]) -> Float[np.ndarray, "*record limit"]:
-    """Smallest and largest sample of each record."""
+def _limits(v: Float[np.ndarray, "*record time"]) -> Float[np.ndarray, "*record limit"]:
     return np.stack([v.min(-1), v.max(-1)], axis=-1)
 
 
+@quietly()
 def covariance_of(v: Float[np.ndarray, "*recording 2 time"]) -> Float[np.ndarray, "*recording 2 2"]:
     """Covariance of both voltages of each recording."""
     mean, square = v.mean(-1), np.zeros((*v.shape[:-1], 2))
-    with quietly():
-        for first in range(0, v.shape[-1], 8192):  # longer products start BLAS threads
-            part = v[..., first : first + 8192]
-            square += np.vecdot(part[..., :, None, :], part[..., None, :, :])
-        return square / v.shape[-1] - mean[..., :, None] * mean[..., None, :]
+    for first in range(0, v.shape[-1], 8192):  # longer products start BLAS threads
+        part = v[..., first : first + 8192]
+        square += np.vecdot(part[..., :, None, :], part[..., None, :, :])
+    return square / v.shape[-1] - mean[..., :, None] * mean[..., None, :]
 
 
 def is_periodic(
@@ -283,14 +281,8 @@ def is_periodic(
 ) -> Bool[np.ndarray, "*recording"]:
     """Whether whole periods have no step from their end to their start.
 
-    The length of the periods differs from whole samples by up to half a sample. This makes a step
-    if the signal is steep at the joint.
-
-    Args:
-        records: Voltages [V].
-        sigma: Standard deviation of the noise of a sample of each record [V].
-        rest: Difference between the length of the periods and `samples` [samples].
-        samples: Number of samples of the periods.
+    Their length differs by `rest` from `samples`, up to half a sample. This makes a step if the
+    signal is steep at the joint.
     """
     joint = np.concatenate([records[..., samples - SEAM : samples], records[..., :SEAM]], axis=-1)
     step = rest[..., None] * np.abs(np.diff(joint)).max(-1)
@@ -306,12 +298,6 @@ def _repeats(
     """Whether a record that begins on an edge has the same edge at the end of all its periods.
 
     If the clock of the pulses jitters, the end of the record does not continue at its start.
-
-    Args:
-        records: Voltages [V].
-        sigma: Standard deviation of the noise of a sample of each record [V].
-        spacing: Length of a period [samples].
-        samples: Number of samples of the periods.
     """
     ends = np.arange(1, round(samples / spacing)) * spacing
     cuts = np.rint(ends).astype(int)

@@ -1,12 +1,16 @@
-"""Studies in HDF5 files: `read` opens a file, `check` lists all faults of a file.
+"""Studies in HDF5 files: `read` opens a file, `check` lists its faults, `write` writes one.
 
 The layout is that of `etid.recordings.schema`. `read` reads only attributes and the headers of
 datasets; samples are read when a recording is accessed. A fault of the whole file is raised. A
 fault of one recording is stored in `Study.problems`.
 """
 
+import contextlib
+import dataclasses
 import os
-from collections.abc import Iterator
+import pathlib
+from collections.abc import Hashable, Iterator, Mapping, Sequence
+from typing import Any
 
 import h5py
 import numpy as np
@@ -14,7 +18,9 @@ import numpy as np
 from etid.recordings import schema
 from etid.recordings.contents import Scan
 from etid.recordings.errors import near_miss
-from etid.recordings.recording import RecordingError
+from etid.recordings.fields import Metadata
+from etid.recordings.recording import AbstractSource, RecordingError
+from etid.recordings.replacing import check_ending, replacing_hdf5
 from etid.recordings.study import Study
 from etid.recordings.untrusted import attribute, attribute_names, guarded, translated
 
@@ -64,27 +70,9 @@ def check(path: str | os.PathLike[str]) -> list[RecordingError]:
             _check_root(metadata, name)
             scan = Scan(metadata, file, name)
             scan.check_samples()
-            constant = [*_constant_currents(scan, name)]
     except RecordingError as problem:
         return [problem]
-    return scan.problems + constant
-
-
-def _constant_currents(scan: Scan, name: str) -> Iterator[RecordingError]:
-    """The fault of each recording whose current has no pulses."""
-    broken = {problem.path for problem in scan.problems}
-    for path, source in scan.sources().items():
-        if path in broken or all(of.name != "current" for of in source.layout):
-            continue
-        current = source.load().samples["current"].values
-        if np.ptp(current) == 0:
-            yield RecordingError(
-                f"is constant, {current[0]:g} A",
-                file=name,
-                path=path,
-                field="current",
-                remedy="Record the current of the pulses, or remove the dataset",
-            )
+    return scan.problems
 
 
 def _check_root(file: h5py.File, name: str) -> None:
@@ -98,10 +86,184 @@ def _check_root(file: h5py.File, name: str) -> None:
                 raise RecordingError(f"is missing{hint}", remedy=remedy)
             try:
                 found[field.name] = field.parse(attribute(file, field.name))
-            except ValueError as error:
-                raise RecordingError(str(error), remedy=remedy) from None
+            except RecordingError as error:
+                raise RecordingError(error.message, remedy=remedy) from None
     problem = schema.version_problem(found["schema_version"])
     if problem:
         raise RecordingError(
             problem, file=name, field="schema_version", remedy="Use the etid that wrote the file"
         )
+
+
+# --- Writing --------------------------------------------------------------------------------------
+
+
+def write(sources: Mapping[str, AbstractSource], path: str | os.PathLike[str]) -> None:
+    """Write recordings to a file; see `Study.write`.
+
+    Only one block of a recording is in memory at a time; its source chooses the size of a block.
+    """
+    check_ending(path)
+    for own, source in sources.items():
+        for calibration in source.metadata.calibration:
+            if calibration not in sources or sources[calibration].metadata.kind != "calibration":
+                raise RecordingError(
+                    f"{calibration!r} is not a calibration of the study",
+                    path=own,
+                    field="calibration",
+                    remedy="Add that calibration, or remove its path with recording.replace",
+                )
+    # v108 has checksums for everything except samples, and allows the labels of large stacks
+    libver = ("v108", "latest")
+    with replacing_hdf5(path, libver=libver) as file:
+        _write_attribute(file, "schema", schema.NAME)
+        _write_attribute(file, "schema_version", schema.VERSION)
+        for group, members in _stacks(sources).items():
+            _write_group(file, group, [sources[member] for member in members])
+
+
+def _stacks(sources: Mapping[str, AbstractSource]) -> dict[str, list[str]]:
+    """Paths of the recordings of each group of the file."""
+    below: dict[str, int] = {}  # number of recordings below each path
+    children: dict[str, list[str]] = {}
+    for path in sources:
+        children.setdefault(path.rpartition("/")[0], []).append(path)
+        outer = path
+        while outer := outer.rpartition("/")[0]:
+            below[outer] = below.get(outer, 0) + 1
+    groups: dict[str, list[str]] = {}
+    for parent, paths in children.items():
+        rows = [f"{parent}/{row}" for row in range(len(paths))]
+        whole = parent and len(paths) > 1 and below[parent] == len(paths)
+        if whole and set(rows) == set(paths) and _alike([sources[row] for row in rows]):
+            groups[parent] = rows
+        else:
+            groups.update({path: [path] for path in paths})
+    return groups
+
+
+def _alike(sources: list[AbstractSource]) -> bool:
+    def common(source: AbstractSource) -> Hashable:
+        return dataclasses.replace(source.metadata, path="", trial=""), source.layout
+
+    first = common(sources[0])
+    loaded = sources[0].metadata.kind == "loaded"
+    return loaded and all(common(source) == first for source in sources[1:])
+
+
+def _write_group(file: h5py.File, path: str, sources: list[AbstractSource]) -> None:
+    stacked = len(sources) > 1
+    once = stacked and len({source.unloaded for source in sources}) == 1
+    group = file.create_group(path)
+    labels = vars(sources[0].metadata) | {"kind": sources[0].metadata.kind}
+    labels["trial"] = [source.metadata.trial for source in sources] if stacked else labels["trial"]
+    for name in schema.at("group attribute"):
+        value = labels[name]
+        if value not in (None, "", ()) and any(item != "" for item in np.ravel(value)):
+            _write_attribute(group, name, value)
+    datasets: dict[str, h5py.Dataset] = {}
+    for row, source in enumerate(sources):
+        for record in source.layout:
+            single = not stacked or (once and record.name == "v_th")
+            if row == 0:
+                shape = (record.length,) if single else (len(sources), record.length)
+                dataset = group.create_dataset(record.name, shape, record.dtype)
+                unit = schema.at("dataset")[record.name].unit
+                scale = {"conversion": record.conversion, "offset": record.offset}
+                for attribute, value in {"unit": unit, **scale}.items():
+                    _write_attribute(dataset, attribute, value)
+                datasets[record.name] = dataset
+            if row == 0 or not single:
+                start = 0
+                for block in source.blocks(record.name):
+                    part = slice(start, start + block.size)
+                    datasets[record.name][part if single else (row, part)] = block
+                    start += block.size
+
+
+def _write_attribute(owner: h5py.Group | h5py.Dataset, name: str, value: Any) -> None:
+    """Write a number or text, or a list of them, as an attribute.
+
+    Text has a fixed length. The library would store text of variable length in a heap without a
+    checksum, and read it through pointers; one damaged byte could then crash the process.
+    """
+    items = np.ravel(value)
+    if not isinstance(items[0], str):
+        owner.attrs[name] = value
+        return
+    encoded = [item.encode("utf-8") for item in items]
+    dtype = h5py.string_dtype("utf-8", max(1, *map(len, encoded)))
+    data = np.array(encoded, dtype)
+    owner.attrs.create(name, data[0] if isinstance(value, str) else data, dtype=dtype)
+
+
+# --- Merging --------------------------------------------------------------------------------------
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class _Moved(AbstractSource):
+    """A recording of another file, below a group of this file."""
+
+    source: AbstractSource
+    moved: Metadata
+
+    @property
+    def metadata(self) -> Metadata:
+        return self.moved
+
+    def blocks(self, name: str) -> Iterator[np.ndarray]:
+        return self.source.blocks(name)
+
+
+def merge_files(
+    sources: Sequence[str | os.PathLike[str]], target: str | os.PathLike[str]
+) -> dict[str, int]:
+    """Write the recordings of several files into one file.
+
+    The recordings of `s01.h5` come into the group `s01`: `loaded/0` becomes `s01/loaded/0`. They
+    keep their calibrations. A recording that names none gets the only calibration of its own file.
+    Samples are copied in blocks.
+
+    Args:
+        sources: Files of recordings; their names without the ending must differ.
+        target: File to write. An existing file is replaced at the end.
+
+    Returns:
+        Number of recordings of each group.
+    """
+    paths = [pathlib.Path(os.fspath(source)) for source in sources]
+    merged: dict[str, AbstractSource] = {}
+    counts: dict[str, int] = {}
+    with contextlib.ExitStack() as files:
+        for path in paths:
+            if path.stem in counts:
+                raise RecordingError(
+                    f"another file has the name {path.stem!r}, which becomes the name of its group",
+                    file=str(path),
+                    remedy="Rename one of the files",
+                )
+            study = files.enter_context(read(path))
+            for problem in study.problems.values():
+                raise problem
+            counts[path.stem] = len(study)
+            merged |= _moved(study, path.stem)
+        Study(merged).write(target)
+    return counts
+
+
+def _moved(study: Study, group: str) -> dict[str, AbstractSource]:
+    """Sources of a study below a group, by their new paths."""
+    known = tuple(study.calibrations)
+    found: dict[str, AbstractSource] = {}
+    for path in study:
+        source = study.source(path)
+        names = source.metadata.calibration
+        if not names and source.metadata.kind == "loaded" and len(known) == 1:
+            names = known
+        moved = dataclasses.replace(
+            source.metadata,
+            path=f"{group}/{path}",
+            calibration=tuple(f"{group}/{name}" for name in names),
+        )
+        found[moved.path] = _Moved(source.layout, source.unloaded, source, moved)
+    return found

@@ -2,26 +2,38 @@
 
 import functools
 import math
+import operator
+from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float
 
 from etid.recordings.group import BY_CHANCE, Group, covariance_of
-from etid.recordings.recording import Recording
+from etid.recordings.recording import Recording, quietly
 from etid.recordings.remarks import Remark
-from etid.signals.aliases import aliases
 from etid.signals.clipping import is_clipped, is_command
 from etid.signals.disturbances import Joint, Shifts
 from etid.signals.filtering import TAPS
-from etid.signals.harmonics import ALIASED, joins_aliases
+from etid.signals.harmonics import ALIASED, aliases, joins_aliases
 from etid.signals.mains import Hum
 from etid.signals.pulse_train import PulseTrain, rise_time, shifted, whole_lag
 
 SHORTEST = 4 * TAPS + 104  # [samples] edges of the interpolation, and 104 samples for the fit
 
 
+def _recorded(name: str) -> Any:
+    """Property of `Group` for this recording, from its whole record."""
+    return property(lambda self: getattr(self._group, name)[self._row])
+
+
+def _in_use(name: str) -> Any:
+    """Property of `Group` for this recording, from the periods in use."""
+    return property(lambda self: getattr(self._used, name)[self._place])
+
+
 class Inspected:
-    """A recording and its properties that need no model; each is computed once, when it is used.
+    """One recording of a `Group`: its row of the group's properties, and what needs only it.
 
     An axis of length 2 holds `v_th` and `v_out`, as in `Group`. In a recording of a measured
     current, the current is in the place of `v_th`.
@@ -30,15 +42,45 @@ class Inspected:
         recording: The recording.
         group: Recordings that are inspected together with this one; only this one if not given.
         row: Number of the recording in the group.
-
-    Attributes:
-        recording: The recording.
     """
+
+    train: PulseTrain = _recorded("trains")
+    step: Float[np.ndarray, "2"] = _recorded("step")
+    coarse: Float[np.ndarray, "2"] = _recorded("coarse")
+    hum: list[Hum | None] = _recorded("hum")
+    shifts: Shifts | None = _recorded("shifts")
+    whole_periods: tuple[int, int] = _recorded("whole_periods")
+    # From here on, of the periods in use, if some are left out or aligned.
+    recorded: Float[np.ndarray, "2 time"] = _in_use("whole")
+    quiet: Float[np.ndarray, "2 time"] = _in_use("quiet")
+    sigma: Float[np.ndarray, "2"] = _in_use("noise")
+    trusted: Float[np.ndarray, "2"] = _in_use("trusted")
+    recorded_limits: Float[np.ndarray, "2 limit"] = _in_use("recorded_limits")
+    limits: Float[np.ndarray, "2 limit"] = _in_use("limits")
+    covariance: Float[np.ndarray, "2 2"] = _in_use("covariance")
+    flickers: Bool[np.ndarray, "2"] = _in_use("flickers")
+    correlated: float | None = _in_use("lags")
+    periods: tuple[int, int] = _in_use("whole_periods")
 
     def __init__(self, recording: Recording, group: Group | None = None, row: int = 0) -> None:
         self.recording = recording
         self._group = group or Group([recording])
         self._row = row
+
+    @functools.cached_property
+    def kept(self) -> Joint | None:
+        """The pulse periods in use if some are left out or aligned; None if all are used."""
+        return self._group.kept[self._row]
+
+    @functools.cached_property
+    def _used(self) -> Group:
+        """A group with the periods in use."""
+        return self._group if self.kept is None else self._group.joined(self._row, self.kept)
+
+    @property
+    def _place(self) -> int:
+        """Number of the recording in `_used`."""
+        return self._row if self.kept is None else 0
 
     @property
     def has_current(self) -> bool:
@@ -70,50 +112,10 @@ class Inspected:
         """Loaded voltage [V] of the periods in use, without hum between the harmonics."""
         return self.quiet[1]
 
-    @functools.cached_property
-    def kept(self) -> Joint | None:
-        """The pulse periods in use if some are left out or aligned; None if all are used."""
-        return self._group.kept[self._row]
-
-    @property
-    def shifts(self) -> Shifts | None:
-        """The shifts of the periods of `v_out` against those of `v_th`; None if there are none."""
-        return self._group.shifts[self._row]
-
-    @functools.cached_property
-    def _used(self) -> Group:
-        """A group with the periods in use."""
-        return self._group if self.kept is None else self._group.joined(self._row, self.kept)
-
-    @property
-    def _place(self) -> int:
-        """Number of the recording in `_used`."""
-        return self._row if self.kept is None else 0
-
-    @property
-    def quiet(self) -> Float[np.ndarray, "2 time"]:
-        """Voltages [V] of the periods in use, without hum between the harmonics."""
-        return self._used.quiet[self._place]
-
-    @property
-    def recorded(self) -> Float[np.ndarray, "2 time"]:
-        """Voltages [V] of the periods in use as they were recorded."""
-        return self._used.whole[self._place]
-
     @property
     def begins(self) -> Float[np.ndarray, " period"]:
         """Start of each period of `v_th` [samples]."""
         return self.spacing * np.arange(self.periods[0]) if self.kept is None else self.kept.begins
-
-    @property
-    def coarse(self) -> Float[np.ndarray, "2"]:
-        """Converter steps [V] that exceed the noise, else 0."""
-        return self._group.coarse[self._row]
-
-    @property
-    def hum(self) -> list[Hum | None]:
-        """Hum that is subtracted from each voltage; None if there is none."""
-        return self._group.hum[self._row]
 
     @property
     def hums(self) -> bool:
@@ -135,29 +137,10 @@ class Inspected:
         return covered
 
     @property
-    def step(self) -> Float[np.ndarray, "2"]:
-        """Converter steps [V]; 0 if unknown."""
-        return self._group.step[self._row]
-
-    @property
-    def sigma(self) -> Float[np.ndarray, "2"]:
-        """Standard deviations of the noise of a sample [V]."""
-        return self._used.noise[self._place]
-
-    @property
-    def recorded_limits(self) -> Float[np.ndarray, "2 limit"]:
-        """Smallest and largest sample of each voltage as it was recorded [V]."""
-        return self._used.recorded_limits[self._place]
-
-    @property
-    def limits(self) -> Float[np.ndarray, "2 limit"]:
-        """Smallest and largest sample of `v_th` and of `v_out` [V]."""
-        return self._used.limits[self._place]
-
-    @property
     def spans(self) -> Float[np.ndarray, "2"]:
-        """Peak-to-peak values of `v_th` and of `v_out` [V]."""
-        return self.limits[:, 1] - self.limits[:, 0]
+        """Peak-to-peak values of `v_th` and of `v_out` [V]; infinite if they overflow."""
+        with quietly():
+            return self.limits[:, 1] - self.limits[:, 0]
 
     @property
     def is_flat(self) -> Bool[np.ndarray, "2"]:
@@ -165,37 +148,18 @@ class Inspected:
         return (self.spans <= 8 * self.sigma) | (self.spans == 0)
 
     @property
-    def covariance(self) -> Float[np.ndarray, "2 2"]:
-        """Covariance of `v_th` and `v_out` [V²]."""
-        return self._used.covariance[self._place]
-
-    @property
-    def trusted(self) -> Float[np.ndarray, "2"]:
-        """`sigma` as far as estimators trust it: not below the error of the interpolation."""
-        return self._used.trusted[self._place]
-
-    @property
-    def flickers(self) -> Bool[np.ndarray, "2"]:
-        """Whether `v_th` and `v_out` may have 1/f noise."""
-        return self._used.flickers[self._place]
-
-    @property
     def remarks(self) -> Remark:
         """Remarks on how the recording is changed before a fit."""
-        # A clock is not more than 300 ppm wrong.
-        off = abs(self.train.counted / self.recording.pulse_rate - 1) > 3e-4
-        found = Remark.mains_hum if self.hums else Remark(0)
-        fewer = self.periods[0] < self.whole_periods[0]
-        found |= Remark.periods_left_out if fewer else Remark(0)
-        found |= Remark.periods_shifted if self.shifts is not None else Remark(0)
-        found |= Remark.coarse_converter if self.coarse.any() else Remark(0)
-        found |= Remark.aligned if self.lag or self.current_lag else Remark(0)
-        return found | (Remark.pulse_rate_counted if off else Remark(0))
-
-    @property
-    def correlated(self) -> float | None:
-        """Lag of `v_out` [samples]; the load may add up to one sample. None if misaligned."""
-        return self._used.lags[self._place]
+        counted = abs(self.train.counted / self.recording.pulse_rate - 1)
+        found = {
+            Remark.mains_hum: self.hums,
+            Remark.periods_left_out: self.periods[0] < self.whole_periods[0],
+            Remark.periods_shifted: self.shifts is not None,
+            Remark.coarse_converter: self.coarse.any(),
+            Remark.aligned: self.lag or self.current_lag,
+            Remark.pulse_rate_counted: counted > 3e-4,  # a clock is not more than 300 ppm wrong
+        }
+        return functools.reduce(operator.or_, (r for r, holds in found.items() if holds), Remark(0))
 
     @functools.cached_property
     def lag(self) -> int:
@@ -225,11 +189,6 @@ class Inspected:
         """Both voltages [V] in their overlap after the shift by `lag`."""
         return shifted(self.v_th, self.v_out, self.lag)
 
-    @property
-    def train(self) -> PulseTrain:
-        """Pulse train of `v_th`."""
-        return self._group.trains[self._row]
-
     @functools.cached_property
     def pulse_rate(self) -> float:
         """Pulse rate [Hz], measured with the clock of the recording."""
@@ -239,16 +198,6 @@ class Inspected:
     def spacing(self) -> float:
         """Length of a pulse period [samples], from the measured pulse rate."""
         return self.recording.sample_rate / self.pulse_rate
-
-    @property
-    def whole_periods(self) -> tuple[int, int]:
-        """Number of whole periods in the record, and their number of samples."""
-        return self._group.whole_periods[self._row]
-
-    @property
-    def periods(self) -> tuple[int, int]:
-        """Number of periods in use, and their number of samples."""
-        return self._used.whole_periods[self._place]
 
     @property
     def spectrum(self) -> tuple[np.ndarray, ...]:
@@ -273,45 +222,28 @@ class Inspected:
         return bool(self._used.periodic[self._place])
 
 
+@quietly()
 def preflight(inspected: Inspected, *, periodic: bool = False) -> str | None:
     """Name of the verdict that forbids a fit; None if a fit is allowed.
-
-    Verdicts: `too_short`, `nonfinite_samples`, `flat`, `saturated`, `wrong_unit`, `unconnected`,
-    `rate_mismatch`, `misaligned`, `not_periodic`.
 
     Args:
         inspected: The recording with its properties.
         periodic: Whether the fit needs whole pulse periods.
     """
+    for verdict, applies in _VERDICTS.items():
+        if (periodic or verdict != "not_periodic") and applies(inspected):
+            return verdict
+    return None
+
+
+def _is_too_short(inspected: Inspected) -> bool:
     of = inspected.recording
     shortest = max(SHORTEST, rise_time(of.sample_rate) + 1)
-    if of.samples["v_out"].stored.size < shortest or inspected.v_th.size < shortest:
-        return "too_short"
-    if not np.isfinite(inspected.limits).all():
-        return "nonfinite_samples"
-    if inspected.is_flat.any():
-        return "flat"
-    # A current source holds its current, so a flat top of the current is no fault without noise.
-    held = inspected.has_current and is_command(
-        float(inspected.sigma[0]), float(inspected.step[0]), float(inspected.spans[0])
-    )
-    may_clip = not held, True
-    volts = None if inspected.has_current else of.adc_range, of.adc_range
-    records = inspected.recorded, inspected.recorded_limits, inspected.step
-    for checked, v, limits, step, adc_range in zip(may_clip, *records, volts, strict=True):
-        if checked and _is_saturated(v, limits, step, adc_range):
-            return "saturated"
-    if inspected.has_current and not is_plausible(inspected.spans[1], inspected.spans[0]):
-        return "wrong_unit"
-    if not inspected.has_current and _is_unconnected(inspected):
-        return "unconnected"
-    if inspected.train.mismatch:
-        return "rate_mismatch"
-    if _is_misaligned(inspected) or (inspected.shifts is not None and inspected.kept is None):
-        return "misaligned"
-    if periodic and not inspected.is_periodic:
-        return "not_periodic"
-    return None
+    return of.samples["v_out"].stored.size < shortest or inspected.v_th.size < shortest
+
+
+def _is_implausible(inspected: Inspected) -> bool:
+    return inspected.has_current and not is_plausible(inspected.spans[1], inspected.spans[0])
 
 
 def is_plausible(voltage: float, current: float) -> bool:
@@ -324,27 +256,40 @@ def is_plausible(voltage: float, current: float) -> bool:
 
 
 def _is_misaligned(inspected: Inspected) -> bool:
-    if inspected.has_current:  # a passive load takes power
-        return bool(inspected.covariance[0, 1] <= 0)
+    if inspected.shifts is not None and inspected.kept is None:
+        return True
     covariance = inspected.covariance
+    if inspected.has_current:  # a passive load takes power
+        return bool(covariance[0, 1] <= 0)
     return bool(covariance[1, 1] > 1.01 * covariance[0, 0] or inspected.correlated is None)
 
 
-def _is_saturated(
-    v: Float[np.ndarray, " time"],
-    limits: Float[np.ndarray, " limit"],
-    step: float,
-    adc_range: tuple[float, float] | None,
-) -> bool:
+def _is_saturated(inspected: Inspected) -> bool:
     """Whether samples are at a limit of the converter, or at a rail if its range is unknown."""
-    if adc_range is not None:
-        low, high = adc_range
-        return bool(limits[0] <= low + step / 2 or limits[1] >= high - step / 2)
-    return is_clipped(v, step)
+    # A current source holds its current, so a flat top of the current is no fault without noise.
+    held = inspected.has_current and is_command(
+        float(inspected.sigma[0]), float(inspected.step[0]), float(inspected.spans[0])
+    )
+    for which, (v, (lowest, highest), step) in enumerate(
+        zip(inspected.recorded, inspected.recorded_limits, inspected.step, strict=True)
+    ):
+        adc_range = inspected.recording.adc_range
+        if which == 0 and inspected.has_current:
+            adc_range = None  # it is one of volts
+        if which == 0 and held:
+            continue
+        if adc_range is None:
+            if is_clipped(v, step):
+                return True
+        elif lowest <= adc_range[0] + step / 2 or highest >= adc_range[1] - step / 2:
+            return True
+    return False
 
 
 def _is_unconnected(inspected: Inspected) -> bool:
     """Whether v_out equals v_th, except for noise, an offset and a delay below one sample."""
+    if inspected.has_current:
+        return False
     covariance = (
         covariance_of(np.stack(inspected.aligned)) if inspected.lag else inspected.covariance
     )
@@ -362,3 +307,17 @@ def _is_unconnected(inspected: Inspected) -> bool:
     rest = rest - slope * ((slope @ rest) / (slope @ slope))
     # A delay of 0.1 sample leaves up to 0.5 % of the signal at the edges.
     return bool(rest @ rest <= size * (1.5 * variance + 5e-3**2 * power))
+
+
+# The first that applies is given.
+_VERDICTS: dict[str, Callable[[Inspected], bool]] = {
+    "too_short": _is_too_short,
+    "nonfinite_samples": lambda of: not np.isfinite([*of.limits, of.spans]).all(),
+    "flat": lambda of: bool(of.is_flat.any()),
+    "saturated": _is_saturated,
+    "wrong_unit": _is_implausible,
+    "unconnected": _is_unconnected,
+    "rate_mismatch": lambda of: of.train.mismatch != "",
+    "misaligned": _is_misaligned,
+    "not_periodic": lambda of: not of.is_periodic,
+}

@@ -30,9 +30,11 @@ from etid.recordings.fields import (
     Given,
     Metadata,
     metadata_from,
+    real,
 )
-from etid.recordings.splitting import by_pauses, by_trigger
-from etid.recordings.values import real
+from etid.recordings.splitting import split
+from etid.signals.noise import printed_step
+from etid.signals.pulse_train import find_pulses
 
 # Infinite samples get a verdict; neighbours of a damaged recording are not concerned.
 quietly = functools.partial(np.errstate, invalid="ignore", over="ignore")
@@ -100,8 +102,12 @@ class Samples:
 
     @property
     def resolution(self) -> float | None:
-        """Size of one converter step in SI units [V or A]; None for samples that are not codes."""
-        return abs(self.conversion) if self.stored.dtype.kind in "iu" else None
+        """Size of one converter step in SI units [V or A]; None if the samples show no step.
+
+        Real numbers of three digits, as a coarse table has them, have the step of the largest.
+        """
+        step = 1.0 if self.stored.dtype.kind in "iu" else printed_step(self.stored)
+        return abs(self.conversion) * step or None
 
     def __reduce__(self) -> tuple:
         # By default a copy would hold an array that can be written.
@@ -164,7 +170,8 @@ class Recording(Overviewed, AbstractFields):
             RecordingError: It was not recorded.
         """
         if "v_th" not in self.samples:
-            raise not_recorded(self.path, "v_th", "Use `current`, which this recording has")
+            remedy = "Use `current`, which this recording has"
+            raise not_recorded(self.path, "v_th", remedy)
         return self.samples["v_th"].values
 
     @property
@@ -241,12 +248,9 @@ class Recording(Overviewed, AbstractFields):
                 length.
         """
         with located(path=self.path):
-            if trigger is None:
-                parts = by_pauses(self.v_th, self.sample_rate, self.pulse_rate)
-            else:
-                cause = self.samples[self.cause].values
-                given = np.asarray(trigger, float)
-                parts = by_trigger(given, cause, self.sample_rate, self.pulse_rate)
+            cause = self.v_th if trigger is None else self.samples[self.cause].values
+            given = None if trigger is None else np.asarray(trigger, float)
+            parts = split(cause, self.sample_rate, self.pulse_rate, given)
         whole = self.path or self.metadata.kind
         return [
             self.replace(
@@ -286,6 +290,23 @@ class Recording(Overviewed, AbstractFields):
         return (
             f"<Recording {self.path!r}: {load}, {size} samples at {self.sample_rate:g} Hz, "
             f"{self.periods:.4g} periods of {self.pulse_rate:g} Hz{', ' if labels else ''}{labels}>"
+        )
+
+
+def check_rates(cause: npt.NDArray, metadata: Metadata) -> None:
+    """Raise an error if the distance between the pulses contradicts the two rates.
+
+    Args:
+        cause: `v_th` or the current, or its first part, in any unit.
+        metadata: Fields of the recording.
+    """
+    train = find_pulses(cause.astype(float), metadata.sample_rate, metadata.pulse_rate)
+    if train.mismatch:
+        raise RecordingError(
+            train.mismatch.removesuffix("."),
+            path=metadata.path,
+            field="pulse_rate",
+            remedy="Correct sample_rate or pulse_rate",
         )
 
 
@@ -356,31 +377,32 @@ class Layout(NamedTuple):
     offset: float
 
 
+@dataclasses.dataclass(frozen=True, eq=False, slots=True)  # a file may have millions
 class AbstractSource(abc.ABC):
-    """Source of one recording in a study: it gives metadata at once, and samples on request."""
+    """Source of one recording in a study: it gives metadata at once, and samples on request.
+
+    Attributes:
+        layout: Its records. Recordings of equal layout can form one stack.
+        unloaded: Identity of `v_th`; it is equal for recordings that share one unloaded record. A
+            recording without `v_th` shares none, and its identity is its own.
+    """
+
+    layout: tuple[Layout, ...]
+    unloaded: Hashable
 
     @property
     @abc.abstractmethod
     def metadata(self) -> Metadata:
         """All fields except the samples."""
 
-    @property
-    @abc.abstractmethod
-    def layout(self) -> tuple[Layout, ...]:
-        """Names, dtypes, lengths and scales. Recordings of equal layout can form one stack."""
-
-    @property
-    @abc.abstractmethod
-    def unloaded(self) -> Hashable:
-        """Identity of `v_th`; it is equal for recordings that share one unloaded record.
-
-        A recording without `v_th` shares none, and its identity is its own.
-        """
-
     @abc.abstractmethod
     def blocks(self, name: str) -> Iterator[npt.NDArray]:
         """The stored samples of one record, in order, in blocks that fit into memory."""
 
-    @abc.abstractmethod
     def load(self) -> Recording:
         """The recording with its samples."""
+        records = {
+            one.name: Samples(np.concatenate([*self.blocks(one.name)]), one.conversion, one.offset)
+            for one in self.layout
+        }
+        return of_checked(records, self.metadata)

@@ -32,7 +32,10 @@ class Remark(enum.IntFlag):
 
 
 _TEXTS = {
-    Remark.mains_hum: "Mains hum was found; its harmonics were left out.",
+    Remark.mains_hum: (
+        "Mains hum was found. Between the harmonics of the pulses it was subtracted; the harmonics "
+        "that it covers were left out."
+    ),
     Remark.periods_left_out: "A disturbed pulse period was found; it was left out.",
     Remark.aligned: (
         "v_out or the current was more than one sample late or early; the records were aligned."
@@ -98,11 +101,7 @@ def texts(remarks: int | np.integer) -> list[str]:
 
 @functools.cache
 def remarks_of(text: str) -> int:
-    """Remarks from a text of `words`.
-
-    Raises:
-        ValueError: A word is not a remark.
-    """
+    """Remarks from a text of `words`."""
     remarks = {str(remark.name): remark for remark in Remark}
     unknown = sorted(set(text.split()) - remarks.keys())
     if unknown:

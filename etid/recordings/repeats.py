@@ -31,7 +31,6 @@ import scipy
 from jaxtyping import Complex, Float, Int
 
 from etid.recordings.preflight import Inspected
-from etid.signals.harmonics import fast_length
 from etid.signals.pulse_train import RATE
 
 # Relative to the sample rate. Below it, bands share one estimate of their noise. Above it, aliases
@@ -101,7 +100,7 @@ def bands(sample_rate: float, pulse_rate: float, band: float) -> Bands:
     The measured pulse rate may differ from the nominal one.
     """
     length = int((1 - RATE) * sample_rate / pulse_rate)
-    size = fast_length(length)
+    size = scipy.fft.next_fast_len(length, real=True)
     count = int(band * size)
     edges, ratio = [*range(min(12, count))], 1.08
     while edges and edges[-1] * ratio + 1 < count:
@@ -219,17 +218,7 @@ def _of_currents(
     sigma: Float[np.ndarray, " lane"],
     at: Float[np.ndarray, "lane period"],
 ) -> list[Repeats]:
-    """Deviations of the quotients of voltage and current.
-
-    Args:
-        first: One of the recordings; all have equal rates.
-        layout: The bands.
-        loaded: Voltages.
-        currents: Currents.
-        own: Deviations of the voltages.
-        sigma: Noise of the currents.
-        at: Start of each period [samples].
-    """
+    """Deviations of the quotients of voltage and current."""
     other = _deviations(currents, at, layout, sigma)
     pairs = []
     for records, of in ((loaded, own), (currents, other)):
@@ -259,13 +248,7 @@ def _of_currents(
 
 
 def _phase(v: Float[np.ndarray, " time"], low: float, high: float) -> int:
-    """Number of samples in all pulses; of biphasic pulses, those in the shorter phase.
-
-    Args:
-        v: Unloaded voltage [V].
-        low: Its smallest sample.
-        high: Its largest sample.
-    """
+    """Number of samples in all pulses; of biphasic pulses, those in the shorter phase."""
     half = max(-low, high) / 2
     above = int(np.count_nonzero(v > half)) if high > half else 0
     below = int(np.count_nonzero(v < -half)) if low < -half else 0

@@ -21,15 +21,7 @@ HDF5 = (".h5", ".hdf5", ".hdf")
 
 
 def check_ending(path: str | os.PathLike[str], endings: tuple[str, ...] = HDF5) -> None:
-    """Raise an error if the name of a file says another format.
-
-    Args:
-        path: File to write. A name without the ending of a known format is always right.
-        endings: Endings that the name may have.
-
-    Raises:
-        RecordingError: The ending says another format.
-    """
+    """Raise an error if the name of a file says another format."""
     file = pathlib.Path(path)
     suffix = file.suffix.lower()
     # Formats that etid reads or writes, and formats that people expect of it.
@@ -59,12 +51,6 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[pathlib.Path]:
     The temporary file is in the folder of the target. Its name is new in each call, because several
     processes may write the same file. It has the suffix of the target, because some writers choose
     the format by the suffix.
-
-    Args:
-        path: Path of the target. An existing file is replaced at the end.
-
-    Raises:
-        RecordingError: The block or the renaming raised an OSError.
     """
     name = os.fspath(path)
     target = pathlib.Path(name)
@@ -87,13 +73,6 @@ def replacing_hdf5(path: str | os.PathLike[str], **options: Any) -> Iterator[h5p
 
     The library writes through a file of Python. If a write to a file of its own fails, it cannot
     close that file any more, and ends the process with a segmentation fault.
-
-    Args:
-        path: Path of the target. An existing file is replaced at the end.
-        **options: Options of `h5py.File`.
-
-    Raises:
-        RecordingError: As `replacing`.
     """
     with (
         replacing(path) as partial,
@@ -104,11 +83,7 @@ def replacing_hdf5(path: str | os.PathLike[str], **options: Any) -> Iterator[h5p
 
 
 def replace_text(path: str | os.PathLike[str], text: str) -> None:
-    """Write a text as a file; an existing file is replaced at the end.
-
-    Raises:
-        RecordingError: As `replacing`.
-    """
+    """Write a text as a file; an existing file is replaced at the end."""
     with replacing(path) as partial:
         partial.write_text(text, encoding="utf-8")
 
@@ -120,12 +95,6 @@ def claimed(path: str | os.PathLike[str]) -> Iterator[None]:
     The operating system locks `path.lock` during the block. It ends the lock with the process, so a
     file that a killed process has left locks nothing. Where there are no locks, as on some network
     file systems, no process is refused.
-
-    Args:
-        path: File that the block computes.
-
-    Raises:
-        RecordingError: Another process computes the file, or its folder cannot be written.
     """
     target = pathlib.Path(path)
     lock = target.with_name(f"{target.name}.lock")
@@ -141,11 +110,7 @@ def claimed(path: str | os.PathLike[str]) -> Iterator[None]:
 
 
 def _locked(lock: pathlib.Path, target: pathlib.Path) -> int:
-    """Descriptor of the lock file, locked.
-
-    Raises:
-        RecordingError: As `claimed`.
-    """
+    """Descriptor of the lock file, locked."""
     while True:
         try:
             held = os.open(lock, os.O_RDWR | os.O_CREAT, 0o666)

@@ -4,7 +4,7 @@ import dataclasses
 import difflib
 import itertools
 import os
-from collections.abc import Callable, Collection, Hashable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from typing import Any, Unpack
 
 import numpy as np
@@ -14,7 +14,6 @@ from etid.circuits.display import several
 from etid.circuits.overview import ROWS, Overview, Overviewed
 from etid.recordings.fields import LABELS, Given, Label, Metadata, wanted_labels
 from etid.recordings.recording import AbstractSource, Layout, Recording, RecordingError, Samples
-from etid.recordings.writing import write
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -27,24 +26,19 @@ class _InMemory(AbstractSource):
     def metadata(self) -> Metadata:
         return self.recording.metadata
 
-    @property
-    def layout(self) -> tuple[Layout, ...]:
-        return tuple(
-            Layout(
-                name, record.stored.dtype.str, record.stored.size, record.conversion, record.offset
-            )
-            for name, record in self.recording.samples.items()
-        )
-
-    @property
-    def unloaded(self) -> Hashable:
-        return id(self.recording.samples.get("v_th", self.recording))
-
     def blocks(self, name: str) -> Iterator[npt.NDArray]:
         yield self.recording.samples[name].stored
 
     def load(self) -> Recording:
         return self.recording
+
+
+def _in_memory(recording: Recording) -> _InMemory:
+    layout = tuple(
+        Layout(name, record.stored.dtype.str, record.stored.size, record.conversion, record.offset)
+        for name, record in recording.samples.items()
+    )
+    return _InMemory(layout, id(recording.samples.get("v_th", recording)), recording)
 
 
 def refuse_nested(paths: Collection[str]) -> None:
@@ -112,7 +106,7 @@ class Study(Overviewed, Mapping[str, Recording]):
                     path=recording.path,
                     remedy="Give each recording a path of its own",
                 )
-            sources[recording.path] = _InMemory(recording)
+            sources[recording.path] = _in_memory(recording)
         refuse_nested(sources)
         return cls(sources)
 
@@ -263,6 +257,8 @@ class Study(Overviewed, Mapping[str, Recording]):
                 file=self.file,
                 remedy="Remove them with Study.from_recordings(study.recordings())",
             )
+        from etid.recordings.hdf5 import write  # it imports this module
+
         write(self._sources, path)
 
     def __reduce__(self) -> tuple:

@@ -115,29 +115,7 @@ def _lengths(part: bytes) -> Iterator[int]:
 
 @contextlib.contextmanager
 def guarded(path: str, **options: Any) -> Iterator[h5py.File]:
-    """An HDF5 file that is read through `Guarded`.
-
-    Args:
-        path: Path of the file.
-        **options: Options of `h5py.File`.
-
-    Raises:
-        RecordingError: The file is missing, not HDF5, or damaged.
-    """
-    check_file(path)
-    with translated(path), contextlib.ExitStack() as stack:
-        raw = stack.enter_context(Guarded(path, "rb"))
-        _check_numbers(raw)
-        file = stack.enter_context(h5py.File(raw, "r", **options))
-        yield file
-
-
-def check_file(path: str) -> None:
-    """Raise an error if a path is not an HDF5 file; pipes and devices are not opened.
-
-    Raises:
-        RecordingError: The file is missing or not HDF5.
-    """
+    """An HDF5 file that is read through `Guarded`."""
     require_file(path)
     if not h5py.is_hdf5(path):
         raise RecordingError(
@@ -145,6 +123,11 @@ def check_file(path: str) -> None:
             file=path,
             remedy="If it has another format, convert it with `etid import`",
         )
+    with translated(path), contextlib.ExitStack() as stack:
+        raw = stack.enter_context(Guarded(path, "rb"))
+        _check_numbers(raw)
+        file = stack.enter_context(h5py.File(raw, "r", **options))
+        yield file
 
 
 def _check_numbers(raw: io.FileIO) -> None:
@@ -162,11 +145,7 @@ def _check_numbers(raw: io.FileIO) -> None:
 
 
 def attribute_names(owner: h5py.HLObject) -> list[str]:
-    """Names of the attributes of a group or dataset.
-
-    Raises:
-        RecordingError: There are too many attributes.
-    """
+    """Names of the attributes of a group or dataset, if they are not too many."""
     names = list(owner.attrs)
     if len(names) > limits.NAMES:
         raise RecordingError(
@@ -181,17 +160,18 @@ def attribute(owner: h5py.HLObject, name: str) -> Any:
 
     Of the types of variable length only text and references are read. No schema contains another,
     and a damaged text may look like one, for which the library would crash.
-
-    Raises:
-        Exception: The value cannot be read or is too large.
     """
     stored = owner.attrs.get_id(name)
-    dtype = stored.dtype
+    dtype, shape = stored.dtype, stored.shape
     if dtype.hasobject and not (h5py.check_string_dtype(dtype) or h5py.check_ref_dtype(dtype)):
         raise TypeError("it is a sequence of variable length")
-    size = math.prod(stored.shape or ()) * dtype.itemsize
+    size = math.prod(shape or ()) * dtype.itemsize
     if size > limits.ATTRIBUTE:
         raise ValueError(f"it has {size} bytes, at most {limits.ATTRIBUTE} are read")
+    if shape is not None and dtype.kind in "iufS":  # as h5py does, which opens it once more
+        numbers = np.empty(shape, dtype)
+        stored.read(numbers)
+        return numbers[()]
     value = owner.attrs[name]
     if isinstance(value, str):
         return _clean(value)
@@ -207,12 +187,7 @@ def _clean(text: str) -> str:
 
 
 def check_size(dataset: h5py.Dataset) -> None:
-    """Raise an error if a dataset declares too much data, before memory is allocated.
-
-    Raises:
-        RecordingError: The dataset exceeds a limit of `etid.recordings.limits`, or is larger than
-            its file allows.
-    """
+    """Raise an error if a dataset declares too much data, before memory is allocated."""
     if dataset.external or dataset.is_virtual:
         raise RecordingError(
             "its samples are in another file", remedy="Copy the samples into the file"
@@ -238,15 +213,7 @@ def check_size(dataset: h5py.Dataset) -> None:
 
 
 def check_texts(dataset: h5py.Dataset, path: str) -> None:
-    """Raise an error if the texts of a dataset are longer than its file, before they are read.
-
-    Args:
-        dataset: Texts of variable length.
-        path: Path of its file.
-
-    Raises:
-        RecordingError: The descriptors are not stored in one block, or declare too many bytes.
-    """
+    """Raise an error if the texts of a dataset are longer than its file, before they are read."""
     rows, size = int(dataset.size or 0), os.path.getsize(path)
     if rows == 0:
         return
@@ -263,40 +230,31 @@ def check_texts(dataset: h5py.Dataset, path: str) -> None:
 
 
 def local_link(group: h5py.Group, name: str) -> h5py.HardLink | h5py.SoftLink:
-    """Link of a member of a group, which stays in the file.
-
-    Raises:
-        RecordingError: The link leads to another file, or is a loop of soft links.
-    """
-    remedy = "Copy the data into the file"
+    """Link of a member of a group; an error if it leads to another file or is a loop."""
     link: Any = group.get(name, getlink=True)
-    if isinstance(link, h5py.ExternalLink):
-        raise RecordingError(f"is a link to another file, {link.filename!r}", remedy=remedy)
-    if isinstance(link, h5py.SoftLink):
-        _check_soft(group, link.path)
-    return link
-
-
-def _check_soft(group: h5py.Group, path: str) -> None:
-    """Raise an error if a soft link leaves the file or is a loop; a dangling link passes."""
-    place: Any = group.file if path.startswith("/") else group
-    left = path.split("/")[::-1]
-    links = 0
+    if isinstance(link, h5py.HardLink):
+        return link
+    soft = "soft " * isinstance(link, h5py.SoftLink)
+    place: Any = group
+    left, links = [name], 0
     while left:
         part = left.pop()
-        link = place.get(part, getlink=True) if part and isinstance(place, h5py.Group) else None
-        if isinstance(link, h5py.ExternalLink):
+        if not part or not isinstance(place, h5py.Group):
+            continue
+        next_link: Any = place.get(part, getlink=True)
+        if next_link is None:  # a dangling link
+            break
+        if isinstance(next_link, h5py.ExternalLink):
             raise RecordingError(
-                f"is a soft link to another file, {link.filename!r}",
+                f"is a {soft}link to another file, {next_link.filename!r}",
                 remedy="Copy the data into the file",
             )
-        if isinstance(link, h5py.SoftLink):
+        if isinstance(next_link, h5py.SoftLink):
             links += 1
             if links > limits.DEPTH:
                 raise RecordingError("is a soft link in a loop", remedy="Remove the link")
-            place = place.file if link.path.startswith("/") else place
-            left += link.path.split("/")[::-1]
-        elif link is not None:
+            place = place.file if next_link.path.startswith("/") else place
+            left += next_link.path.split("/")[::-1]
+        elif left:
             place = place[part]
-        elif part:
-            return
+    return link

@@ -17,12 +17,7 @@ from etid.signals.noise import noise_std
 
 
 def is_clipped(v: Float[np.ndarray, " time"], step: float) -> bool:
-    """Whether many samples in a row are at a rail.
-
-    Args:
-        v: The record, in any unit.
-        step: Step of the converter in this unit; 0 if it is unknown.
-    """
+    """Whether many samples in a row are at a rail."""
     rails = [extreme for extreme in (v.min(), v.max()) if _has_run(v == extreme)]
     if not rails:  # nearly all records
         return False

@@ -73,12 +73,6 @@ def of_source(
     """Whether a disturbed period lacks a pulse or has a second one, by the number of its edges.
 
     The period that follows is disturbed too, by what a transformer keeps of its history.
-
-    Args:
-        v: A record [V].
-        bad: The disturbed periods.
-        spacing: Length of a period [samples].
-        rise: Samples over which edges rise.
     """
     slope = np.abs(v[rise:] - v[:-rise])
     ends = np.rint(np.arange(bad.size + 1) * spacing).astype(int)
@@ -118,13 +112,6 @@ def shifts(
     """The shifts of `v_out` against `v_th` from period to period; None if there are none.
 
     What shifts both records alike, as the pulses do when their clock jitters, does no harm.
-
-    Args:
-        records: Both voltages [V].
-        sigma: Standard deviation of the noise of a sample of each record [V].
-        spacing: Length of a period [samples].
-        periods: Number of whole periods.
-        rise: Samples over which edges rise.
     """
     lags = [
         _lags_of_edges(v, float(noise), spacing, periods, rise)
@@ -222,14 +209,7 @@ def joint(
     spacing: float,
     size: int,
 ) -> Joint:
-    """The plan to join the periods that are kept.
-
-    Args:
-        kept: Whether each period is kept.
-        late: By how much `v_out` is later than usual in each period [samples].
-        spacing: Length of a period [samples].
-        size: Number of samples of the record.
-    """
+    """The plan to join the periods that are kept."""
     number, late = np.flatnonzero(kept), late[kept]
     ends = np.rint(np.arange(number.size + 1) * spacing).astype(int)
     before = (number - np.arange(number.size)) * spacing  # samples that are left out

@@ -54,16 +54,7 @@ class StateSpace(eqx.Module):
 def simulate(
     system: StateSpace, u: Float[Array, "time input"], x0: Float[Array, " state"]
 ) -> tuple[Float[Array, " time"], Float[Array, " state"]]:
-    """Run the discrete recursion x[n+1] = A x[n] + B u[n], y[n] = C x[n] + D u[n].
-
-    Args:
-        system: Discrete-time system.
-        u: Inputs.
-        x0: State before the first sample.
-
-    Returns:
-        The output and the state after the last sample.
-    """
+    """Run the discrete recursion x[n+1] = A x[n] + B u[n], y[n] = C x[n] + D u[n]."""
     time, inputs = u.shape
     states = x0.shape[0]
     blocks, rest = divmod(time, BLOCK)
@@ -247,15 +238,7 @@ def _expm(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
 
 
 def hold(system: StateSpace, sample_rate: float | Float[Array, ""]) -> StateSpace:
-    """Discretise a single-input continuous system for inputs given by `band_limited`.
-
-    Args:
-        system: Continuous-time system with one input.
-        sample_rate: Sampling rate [Hz].
-
-    Returns:
-        Discrete system. Its inputs are the polynomial coefficients of one interval.
-    """
+    """Discretise a single-input continuous system for inputs given by `band_limited`."""
     states = system.A.shape[0]
     both = jnp.concatenate([system.A, system.B], axis=1) / sample_rate
     chain = jnp.eye(DEGREE + 1, states + DEGREE + 1, k=states + 1, dtype=both.dtype)

@@ -54,10 +54,6 @@ class Hum(NamedTuple):
 
         There the fitted sinusoid is as uncertain as the hum itself, so it cannot correct the
         harmonic.
-
-        Args:
-            frequency: Harmonics [Hz].
-            periods: Number of periods of the record.
         """
         bin_width = frequency[0] / periods
         multiple = np.clip(np.round(frequency / self.frequency), 1, MULTIPLES)
@@ -67,11 +63,7 @@ class Hum(NamedTuple):
 def lines(
     frequency: Float[Array | np.ndarray, "*lane harmonic"],
 ) -> Bool[Array | np.ndarray, "*lane harmonic"]:
-    """Whether mains hum may fall on each harmonic: within 2 % of the mains frequency.
-
-    Args:
-        frequency: Harmonics [Hz].
-    """
+    """Whether mains hum may fall on each harmonic: within 2 % of the mains frequency."""
     xp = namespace(frequency)
     on_line = xp.zeros(frequency.shape, bool)
     for mains in MAINS:
@@ -87,13 +79,6 @@ def separated(
     """Hum in the bins between the harmonics; None if there is none.
 
     A drift or changing pulses also fill these bins, but not in the pattern of sinusoids.
-
-    Args:
-        v: Voltage of the record [V].
-        sigma: Standard deviation of the noise of a sample [V].
-        sample_rate: Sampling rate [Hz].
-        periods: Number of periods from `etid.signals.harmonics.whole_periods`, at least 2.
-        samples: Number of samples from `etid.signals.harmonics.whole_periods`.
     """
     v = v[:samples]
     return _fit(v, sigma, sample_rate, periods) if np.isfinite(v).all() else None

@@ -34,6 +34,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import numpy.typing as npt
 import scipy
 from jaxtyping import Array, Bool, Complex, Float, Int
 
@@ -158,16 +159,9 @@ def measure(
 def noise(
     v: Float[Array | np.ndarray, " time"], resolution: Float[Array | np.ndarray, ""]
 ) -> Float[Array | np.ndarray, ""]:
-    """Standard deviation of the noise of a record, in its unit and limited by `trusted`."""
-    return trusted(v, noise_std(v, resolution))
-
-
-def trusted(
-    v: Float[Array | np.ndarray, " time"], sigma: Float[Array | np.ndarray, ""]
-) -> Float[Array | np.ndarray, ""]:
-    """Noise of a record, at least as large as the error of the interpolation."""
+    """Noise of a record, in its unit and at least as large as the error of the interpolation."""
     xp = namespace(v)
-    return xp.asarray(xp.maximum(sigma, RIPPLE * xp.ptp(v)))
+    return xp.asarray(xp.maximum(noise_std(v, resolution), RIPPLE * xp.ptp(v)))
 
 
 # --- Coarse converters ---------------------------------------------------------------------------
@@ -191,6 +185,23 @@ def step_of(v: Float[np.ndarray, " time"]) -> float:
     step = float(steps.min())
     count = steps / step
     return step if np.abs(count - np.round(count)).max() < equal * count.max() else 0.0
+
+
+def printed_step(v: npt.NDArray) -> float:
+    """Rounding of the largest values of a record whose values all have at most three digits.
+
+    0 if they have more digits, or if all of them are multiples of this step, as those of a
+    converter and of a generator's levels are.
+    """
+    for value in v[:: max(1, v.size // 64)]:  # most records end at the first one
+        if v.dtype.type(f"{value:.3g}") != value:
+            return 0.0
+    largest = float(np.max(np.abs(v)))
+    if not 0 < largest < np.inf:
+        return 0.0
+    step = 10.0 ** (math.floor(math.log10(largest)) - 2)
+    count = v[:: max(1, v.size // 1024)] / step
+    return 0.0 if np.abs(count - np.round(count)).max() < 1e-3 else step
 
 
 def noise_before(v: Float[np.ndarray, " time"], step: float) -> float:
@@ -288,16 +299,7 @@ def coloured(
     periods: int,
     samples: int,
 ) -> Float[np.ndarray, " harmonic"]:
-    """Power of the noise at each harmonic, relative to white noise that has `sigma`.
-
-    Args:
-        v: Voltage of the record [V].
-        sigma: Standard deviation of the noise of a sample [V], as `noise_std` estimates it.
-        frequency: Harmonics [Hz].
-        sample_rate: Sampling rate [Hz].
-        periods: Number of periods from `etid.signals.harmonics.whole_periods`.
-        samples: Number of samples from `etid.signals.harmonics.whole_periods`.
-    """
+    """Power of the noise at each harmonic, relative to white noise that has `sigma`."""
     f_c = corner(v, sigma, sample_rate, periods, samples)
     return (1 + f_c / frequency) / (1 + f_c * BY_DIFFERENCES / sample_rate)
 

@@ -13,8 +13,6 @@ import numpy as np
 import scipy
 from jaxtyping import Bool, Complex, Float, Int
 
-from etid.signals.harmonics import fast_length
-
 EVEN = 0.05  # relative range of the spacings up to which the pulses have one rate
 RATE = 2e-3  # relative error of pulse_rate; a larger one is a wrong number, not an inexact clock
 
@@ -65,10 +63,12 @@ class PulseTrain:
         if self.spacing is not None:
             if abs(self.spacing / nominal - 1) <= RATE:
                 return ""
+            is_period = abs(pulse_rate * rate / self.spacing - 1) <= RATE
+            slip = " pulse_rate is a period in seconds; give pulses per second." * is_period
             return (
                 f"The pulses are {self.spacing:.6g} samples apart, but {said}. That would be right "
                 f"with sample_rate = {_counted(pulse_rate * self.spacing)} Hz, or with "
-                f"pulse_rate = {_counted(rate / self.spacing)} Hz."
+                f"pulse_rate = {_counted(rate / self.spacing)} Hz.{slip}"
             )
         if self.edges.size != 1:
             return ""
@@ -102,13 +102,10 @@ def pulse_trains(
     Each record is averaged over a five-hundredth of a period. A pulse begins and ends where the
     average crosses half of its highest value, such as 25 V of 50 V. Noise at 20 dB (1 V), hum and
     drift do not reach this level.
-
-    Args:
-        records: Unloaded voltages [V].
-        sample_rate: Samples per second [Hz].
-        pulse_rate: Pulses per second [Hz]; may be wrong by an order of magnitude.
     """
     size, period = records.shape[1], sample_rate / pulse_rate
+    if period > size:
+        period = min(period, sample_rate * pulse_rate)  # pulse_rate may be a period
     step = max(1, int(period / 512))
     number = size // step
     coarse = records[:, : number * step].reshape(len(records), number, step)
@@ -272,7 +269,7 @@ def _lags(
     begin = first - reach
     start = max(0, begin)
     searched = rises(records[rows, 1, start : last + reach], rise)
-    size = fast_length(template.shape[1] + 2 * reach)
+    size = scipy.fft.next_fast_len(template.shape[1] + 2 * reach, real=True)
     # Single precision suffices, and its transforms take a fourth of the time.
     both = np.zeros((len(rows), 2, size), np.float32)
     both[:, 0, start - begin : start - begin + searched.shape[1]] = searched

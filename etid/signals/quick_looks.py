@@ -106,13 +106,6 @@ def allowed_deviation(
 
     The limit is a part of the largest value, plus half of the value at the same place, plus the
     range of the means beside it.
-
-    Args:
-        low: Lowest usual mean beside each place [V].
-        high: Highest usual mean beside each place [V].
-        largest: Largest mean of a period [V].
-        sigma: Standard deviation of the noise of a sample of each record [V].
-        step: Step of the converter of each record if it is coarse, else 0 [V].
     """
     # 0.0125 and 0.05 V at the converter in records of 2.5 V. A load cannot change the unloaded
     # voltage, so its limit is lower.
@@ -127,14 +120,7 @@ def _moved(
     sigma: Float[np.ndarray, "recording 2"],
     spacing: float,
 ) -> Bool[np.ndarray, " recording"]:
-    """Whether periods of `v_out` may be shifted against those of `v_th`.
-
-    Args:
-        records: Both voltages of each recording [V].
-        means: Their `period_means`.
-        sigma: Standard deviation of the noise of a sample of each record [V].
-        spacing: Length of a period [samples].
-    """
+    """Whether periods of `v_out` may be shifted against those of `v_th`."""
     # Least-squares lag of each period. A shift by one sample changes a mean by a difference.
     at, length = _cuts(records.shape[2], spacing, means.shape[2])
     ends = sum(records[:, :, first : first + length : MERGED] for first in at) / len(at)

@@ -109,7 +109,7 @@ def _search(
 
 
 class Rough(NamedTuple):
-    """The minimum with bands of harmonics (`etid.signals.bands`), near that with all harmonics.
+    """The minimum with bands of harmonics (`etid.signals.knots`), near that with all harmonics.
 
     Attributes:
         source: Z_th.

@@ -12,9 +12,8 @@ from typing import Any, BinaryIO
 
 import numpy as np
 
-from etid.files.channel import Channel, Contents, optional, spooled_channel
-from etid.files.readers.rows import ROWS
-from etid.files.units import with_unit
+from etid.files.channel import Channel, Contents, optional, spooled_channel, with_unit
+from etid.files.readers.delimited import ROWS
 from etid.recordings.recording import RecordingError
 
 

@@ -16,8 +16,7 @@ import numpy as np
 
 from etid.files.channel import Channel, Contents, rate_of, spooled_channel
 from etid.files.clock import QUARTZ
-from etid.files.readers.delimited import LINES
-from etid.files.readers.rows import Dialect, spool
+from etid.files.readers.delimited import LINES, Dialect, spool
 from etid.recordings.recording import RecordingError
 
 

@@ -1,10 +1,11 @@
 """Reader for NumPy archives: named arrays, or converter codes with all fields of the recordings."""
 
 import contextlib
+import dataclasses
 import math
 import pathlib
 import zipfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -12,9 +13,10 @@ import numpy.typing as npt
 
 from etid.files.channel import Channel, Contents, array_channel, chosen
 from etid.recordings import limits
-from etid.recordings.recording import Recording, RecordingError, Samples
+from etid.recordings.recording import RecordingError
 
-KEYS = ("adc_th", "adc_out", "adc_ref", "R_ref", "fs", "f0", "lsb", "scale")
+CODES = ("adc_th", "adc_out", "adc_ref")
+KEYS = (*CODES, "R_ref", "fs", "f0", "lsb", "scale")
 
 
 @contextlib.contextmanager
@@ -26,27 +28,24 @@ def _archive(path: pathlib.Path) -> Iterator[Any]:
         yield archive
 
 
-def is_complete(path: pathlib.Path) -> bool:
-    """Whether an archive has all fields of its recordings, under the names of `recordings`."""
-    with _archive(path) as archive:
-        return all(key in archive.files for key in KEYS[:2])
-
-
 @contextlib.contextmanager
 def opened(path: pathlib.Path, folder: pathlib.Path) -> Iterator[Contents]:
-    """Arrays of any other archive; each is a channel of shape (time,) or (trial, time)."""
+    """Arrays of an archive; each is a channel of shape (time,) or (trial, time)."""
     del folder
     with _archive(path) as archive:
 
         def channel(name: str) -> Channel:
             _check_size(archive, name)
-            return array_channel(name, np.atleast_1d(archive[name]))
+            own = array_channel(name, np.atleast_1d(archive[name]))
+            if name in CODES and _is_complete(archive):
+                return dataclasses.replace(own, conversion=_volts(archive), unit="V")
+            return own
 
         yield Contents(tuple(archive.files), channel)
 
 
-def recordings(path: pathlib.Path, labels: Mapping[str, Any]) -> list[Recording]:
-    """All recordings of an archive, with these labels.
+def own_mapping(path: pathlib.Path) -> dict[str, Any] | None:
+    """Mapping for an archive that contains all fields of its recordings; None for another one.
 
     `adc_th`, `adc_out` (trial, time) and `adc_ref` (resistor, time) are converter codes. `R_ref`
     has the resistance of each resistor. `fs`, `f0`, `lsb` and `scale` are numbers. The recordings
@@ -54,59 +53,59 @@ def recordings(path: pathlib.Path, labels: Mapping[str, Any]) -> list[Recording]
     calibrations, so all calibrations share `adc_th[0]`.
     """
     with _archive(path) as archive:
+        if not _is_complete(archive):
+            return None
         for key in KEYS:
             chosen(archive.files, key, key)
             _check_size(archive, key)
-        held = {key: archive[key] for key in KEYS}
-    th, out, ref, r_ref = (held[key] for key in ("adc_th", "adc_out", "adc_ref", "R_ref"))
+        th, out, ref, r_ref = (archive[key] for key in KEYS[:4])
+        rate, pulses = (_number(archive[key], key) for key in ("fs", "f0"))
+        volts = _volts(archive)
     if th.ndim != 2 or th.shape != out.shape or ref.ndim != 2 or r_ref.shape != ref.shape[:1]:
-        shapes = ", ".join(f"{key} {held[key].shape}" for key in KEYS[:4])
+        shapes = ", ".join(
+            f"{key} {array.shape}" for key, array in zip(KEYS, (th, out, ref, r_ref), strict=False)
+        )
         raise RecordingError(
             f"shapes do not fit each other: {shapes}",
             remedy="adc_th and adc_out are (trial, time), adc_ref (resistor, time), "
             "R_ref (resistor,)",
         )
-    for key in ("adc_th", "adc_out", "adc_ref"):
-        if held[key].dtype.kind not in "iu" or held[key].dtype != th.dtype:
+    for key, codes in zip(CODES, (th, out, ref), strict=True):
+        if codes.dtype.kind not in "iu" or codes.dtype != th.dtype:
             raise RecordingError(
-                f"has dtype {held[key].dtype}; all codes must have the same integer dtype",
-                field=key,
+                f"has dtype {codes.dtype}; all codes must have the same integer dtype", field=key
             )
-    rate, pulses, step, scale = (_number(held[key], key) for key in KEYS[4:])
-    if scale == 0:
-        raise RecordingError("is 0", field="scale")
-    conversion = step / scale
-    codes = np.iinfo(th.dtype)
-    common: dict[str, Any] = {
+    range_of = np.iinfo(th.dtype)
+    paths = [f"calibration/{number}" for number in range(len(ref))]
+    calibrations = [
+        {
+            "path": path,
+            "r_load": r_ref[number],
+            "v_th": {"channel": "adc_th", "rows": 0},
+            "v_out": {"channel": "adc_ref", "rows": number},
+        }
+        for number, path in enumerate(paths)
+    ]
+    both = {"v_th": {"channel": "adc_th"}, "v_out": {"channel": "adc_out"}}
+    return {
         "sample_rate": rate,
         "pulse_rate": pulses,
-        **labels,
-        "adc_range": (codes.min * conversion, codes.max * conversion),
+        "scale": 1.0,  # that of the archive is in its channels
+        "adc_range": (range_of.min * volts, range_of.max * volts),
+        "recording": [*calibrations, {"path": "loaded", "calibration": paths, **both}],
     }
-    first = Samples(th[0], conversion)
-    calibrations = [
-        Recording(
-            first,
-            Samples(record, conversion),
-            r_load=r_ref[index],
-            path=f"calibration/{index}",
-            **common,
-        )
-        for index, record in enumerate(ref)
-    ]
-    paths = tuple(recording.path for recording in calibrations)
-    loaded = [
-        Recording(
-            Samples(th[trial], conversion),
-            Samples(out[trial], conversion),
-            trial=trial,
-            calibration=paths,
-            path=f"loaded/{trial}",
-            **common,
-        )
-        for trial in range(len(out))
-    ]
-    return calibrations + loaded
+
+
+def _is_complete(archive: Any) -> bool:
+    return all(key in archive.files for key in CODES[:2])
+
+
+def _volts(archive: Any) -> float:
+    """Volts at the terminal per code."""
+    step, scale = (_number(archive[key], key) for key in ("lsb", "scale"))
+    if scale == 0:
+        raise RecordingError("is 0", field="scale")
+    return step / scale
 
 
 def _check_size(archive: Any, key: str) -> None:

@@ -14,8 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from etid.files.channel import Channel, Contents, optional, rate_of, real
-from etid.files.units import one_unit
+from etid.files.channel import Channel, Contents, one_unit, optional, rate_of, real
 from etid.recordings.recording import RecordingError
 
 
