@@ -24,9 +24,8 @@ from etid.files.channel import located
 from etid.files.importing import channels_of, converted
 from etid.files.pattern import Pattern
 from etid.recordings.errors import RecordingError
-from etid.recordings.fields import LABELS
+from etid.recordings.fields import LABELS, real
 from etid.recordings.replacing import replacing
-from etid.recordings.values import real
 
 TABLE = "calibrations.csv"
 _RESISTANCE = re.compile(r"(\d+)([RkM])(\d*)|(\d+(?:\.\d+)?)([RkM]?)")
