@@ -118,7 +118,7 @@ class _Signals(eqx.Module):
     def slopes(self, common: Float[Array, " common"]) -> list[Float[Array, "common signal knot"]]:
         """Derivatives of the signals."""
         source = self.calibrations.source_of(common)
-        known = self.calibrations.slopes(common, self.calibrations.knots).by_common
+        known = self.calibrations.slopes(common, self.calibrations.knots).by_unknown
         of_w = []
         for f in self.frequency:
             rows = source.slopes(f) * reciprocal(self._loaded(common, f))[None, :]

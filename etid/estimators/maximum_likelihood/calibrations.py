@@ -13,7 +13,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Complex, Float
 
 from etid.estimators.estimate import DELAY_WIDTH, Prior, prior
-from etid.estimators.maximum_likelihood.condensed import Condensed, apart, means
+from etid.estimators.maximum_likelihood.condensed import Condensed, Slopes, apart, means
 from etid.estimators.maximum_likelihood.profile import Profile, Records, excess, total
 from etid.estimators.sandwich import Linear
 from etid.estimators.unknowns import DriverUnknowns
@@ -23,22 +23,6 @@ from etid.signals.knots import Knots, knots
 from etid.signals.transfer import as_complex, delayed, frequency_variable, reciprocal
 
 DENSE = 32  # density of the knots: the floor of the driver's valley is flat
-
-
-class GainSlopes(eqx.Module):
-    """The gains of calibrations and their derivatives at each frequency.
-
-    Attributes:
-        z_th: Z_th [Ω].
-        gains: The gains.
-        by_z: Derivatives with respect to Z_th.
-        by_common: Derivatives with respect to the common parameters.
-    """
-
-    z_th: Complex[Array, "record frequency"]
-    gains: Complex[Array, "record frequency"]
-    by_z: Complex[Array, "record frequency"]
-    by_common: Complex[Array, "common record frequency"]
 
 
 class NearCalibrations(eqx.Module):
@@ -54,7 +38,7 @@ class NearCalibrations(eqx.Module):
 
     profiles: list[Profile]
     condensed: Condensed
-    slopes: GainSlopes
+    slopes: Slopes
     jacobian: Float[Array, "common term"]
     terms: Float[Array, " term"]
 
@@ -160,7 +144,7 @@ class Calibrations(eqx.Module):
         gains = jax.vmap(delayed, (0, 0, 0, None))(resistance * loop, f, late, self.rate)
         return z_th, gains, -gains * loop
 
-    def slopes(self, common: Float[Array, " common"], every: Knots | None = None) -> GainSlopes:
+    def slopes(self, common: Float[Array, " common"], every: Knots | None = None) -> Slopes:
         """The gains and their derivatives, at all harmonics or at knots."""
         f = self.spectra.frequency if every is None else every.at(self.spectra.frequency)
         z_th, gains, by_z = self._gains(common, every)
@@ -168,7 +152,7 @@ class Calibrations(eqx.Module):
         by_delay = -gains * frequency_variable(f / self.rate)
         alone = as_complex(jnp.eye(f.shape[0]))[:, :, None]
         rows = [by_source * by_z[None], alone * by_delay[None]]
-        return GainSlopes(z_th, gains, by_z, jnp.concatenate(rows))
+        return Slopes(z_th, gains, by_z, jnp.concatenate(rows))
 
     @jax.jit  # JAX remembers its trace
     def near(self, common: Float[Array, " common"]) -> NearCalibrations:
@@ -176,7 +160,7 @@ class Calibrations(eqx.Module):
         profiles = apart(lambda c: self.profiles(self.gains(c)), common)
         condensed = apart(lambda _: Condensed.of(profiles, self.knots), common)
         slopes = apart(lambda c: self.slopes(c, self.knots), common)
-        rows = condensed.rows(slopes.by_common)
+        rows = condensed.rows(slopes.by_unknown)
         terms, jacobian = self.with_weak(common, condensed.part, rows)
         return NearCalibrations(profiles, condensed, slopes, jacobian, terms)
 

@@ -27,6 +27,22 @@ from etid.signals.knots import Knots
 from etid.signals.transfer import as_complex
 
 
+class Slopes(eqx.Module):
+    """Gains and their derivatives at each frequency.
+
+    Attributes:
+        z: The impedance that acts on them [Ω]: Z_L of a load, Z_th of each calibration.
+        gains: The gains.
+        by_z: Derivatives with respect to this impedance.
+        by_unknown: Derivatives with respect to the unknowns of a fit.
+    """
+
+    z: Complex[Array, "*output frequency"]
+    gains: Complex[Array, "output frequency"]
+    by_z: Complex[Array, "output frequency"]
+    by_unknown: Complex[Array, "q output frequency"]
+
+
 class Condensed(eqx.Module):
     """A likelihood as a function of the gains at the knots.
 

@@ -46,7 +46,7 @@ def _equations_of_terms(_: Any, q: Float[Array, " common"], model: Calibrations)
 
     # A term depends on the gains at its own harmonic only.
     terms, by_gain = apart(of_gains, q)
-    by_common, rows = apart(lambda q: model.slopes(q).by_common, q), []
+    by_common, rows = apart(lambda q: model.slopes(q).by_unknown, q), []
     by_gain = by_gain.reshape(*by_gain.shape[:2], -1, by_common.shape[-1])
     for slope, (real, imaginary) in zip(jnp.moveaxis(by_common, 1, 0), by_gain, strict=True):
         rows.append(slope.real[:, None] * real[None] + slope.imag[:, None] * imaginary[None])
@@ -63,7 +63,7 @@ def _equations_at_knots(
     model, condensed = of
     slopes = apart(lambda q: model.slopes(q, model.knots), q)
     terms, rows = model.with_weak(
-        q, condensed.terms(slopes.gains), condensed.rows(slopes.by_common)
+        q, condensed.terms(slopes.gains), condensed.rows(slopes.by_unknown)
     )
     return NormalEquations.of(terms, rows)
 

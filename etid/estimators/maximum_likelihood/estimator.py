@@ -19,7 +19,7 @@ from etid.estimators.estimator import (
 from etid.estimators.judgement import STRAINED
 from etid.estimators.lanes import Harmonics, HarmonicsWithCurrent
 from etid.estimators.maximum_likelihood import given_driver, load_fit
-from etid.estimators.maximum_likelihood.given_driver import AbstractGiven, GivenCurrent, GivenDriver
+from etid.estimators.maximum_likelihood.given_driver import GivenDriver
 from etid.estimators.maximum_likelihood.load import Load
 from etid.estimators.maximum_likelihood.profile import Records
 from etid.estimators.refined_driver import from_harmonics
@@ -110,28 +110,28 @@ class MaximumLikelihood(AbstractEstimator):
         driver: HarmonicDriver | MeasuredCurrent,
         frequency: Float[Array, " harmonic"],
         shared: bool,
-    ) -> AbstractGiven:
+    ) -> GivenDriver:
         """The distribution of Z_th at the harmonics, given the calibrations; or the current."""
         if isinstance(driver, MeasuredCurrent):
-            return GivenCurrent.at(frequency)
+            return GivenDriver.measured(frequency)
         return given_driver.given(driver, frequency, shared)
 
     def fit_load(
         self,
         lane: Harmonics,
         driver: HarmonicDriver | MeasuredCurrent,
-        known: AbstractGiven,
+        known: GivenDriver,
         circuit: AbstractCircuit,
     ) -> Fit:
         """Refine from the best of several starts, jointly with the uncertain part of the driver."""
         spectrum, rate = lane.spectrum, jnp.asarray(lane.sample_rate)
         prior = ElementPrior.of(self.known_elements, circuit) if self.known_elements else None
         records = Records.of(spectrum)
-        if isinstance(lane, HarmonicsWithCurrent) and isinstance(known, GivenDriver):
+        if isinstance(lane, HarmonicsWithCurrent) and not known.by_current:
             current = jnp.asarray(lane.i), jnp.asarray(lane.variance_i)
             records = Records.of(spectrum, current)
             by_current = dataclasses.replace(spectrum, x=current[0], variance_x=current[1])
-            starts = GivenCurrent.at(known.frequency).starts(by_current, rate, circuit)
+            starts = GivenDriver.measured(known.frequency).starts(by_current, rate, circuit)
         else:
             starts = known.starts(spectrum, rate, circuit)
         load = Load.behind(known, circuit, records, rate, prior)

@@ -15,15 +15,14 @@ from jaxtyping import Array, Bool, Complex, Float
 
 from etid.circuits.circuit import AbstractCircuit
 from etid.estimators.element_prior import ElementPrior
-from etid.estimators.maximum_likelihood.condensed import Condensed, apart
+from etid.estimators.maximum_likelihood.condensed import Condensed, Slopes, apart
 from etid.estimators.maximum_likelihood.gains import (
     AbstractOutputs,
     Gains,
-    Slopes,
     Voltage,
     VoltageAndCurrent,
 )
-from etid.estimators.maximum_likelihood.given_driver import AbstractGiven, UnloadedEstimate
+from etid.estimators.maximum_likelihood.given_driver import GivenDriver, UnloadedEstimate
 from etid.estimators.maximum_likelihood.profile import Profile, Records
 from etid.estimators.score_tests import falling_resistance, other_circuit
 from etid.signals.knots import Knots, knots
@@ -79,7 +78,7 @@ class Load(eqx.Module):
     @classmethod
     def behind(
         cls,
-        driver: AbstractGiven,
+        driver: GivenDriver,
         circuit: AbstractCircuit,
         records: Records,
         sample_rate: Float[Array, ""],
@@ -207,12 +206,12 @@ def changes(load: Load, near: Near) -> Complex[Array, "change output knot"]:
     _, circuits = other_circuit.changes(load.gains.impedance(near.q), frequency)
     alone = as_complex(jnp.eye(load.gains.outputs))[:, :, None]
     scales = alone * near.slopes.gains[None]
-    return jnp.concatenate([circuits[:, None] * near.slopes.by_load[None], scales])
+    return jnp.concatenate([circuits[:, None] * near.slopes.by_z[None], scales])
 
 
 def by_falling(load: Load, near: Near) -> Complex[Array, "output harmonic"]:
     """What a resistance that falls with its current adds to the outputs [V²]."""
     slopes, every = near.slopes, load.knots
-    sensitivity = slopes.by_load * (slopes.load * reciprocal(slopes.gains[0]))[None, :]
+    sensitivity = slopes.by_z * (slopes.z * reciprocal(slopes.gains[0]))[None, :]
     v_out = every.between(slopes.gains[0]) * near.profile.x
-    return falling_resistance.added_voltage(v_out, slopes.load, sensitivity, every)
+    return falling_resistance.added_voltage(v_out, slopes.z, sensitivity, every)

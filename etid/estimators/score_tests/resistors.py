@@ -43,7 +43,7 @@ def mismatch(
     """
     slopes, every = near.slopes, calibrations.knots
     alone = as_complex(jnp.eye(slopes.gains.shape[0]))[:, :, None]
-    by_resistor = alone * (-slopes.z_th * slopes.by_z)[None]
+    by_resistor = alone * (-slopes.z * slopes.by_z)[None]
     rows = near.rows(by_resistor)
     others = linear.told(rows) @ linear.bread()
     directions = rows - others @ linear.jacobian
@@ -51,7 +51,7 @@ def mismatch(
     score = directions @ near.terms
     # Estimate the noise after the resistor that explains most: its error must not count as noise.
     best = jnp.argmax(score**2 / own)
-    made = combined(others[best], slopes.by_common.reshape(linear.jacobian.shape[0], -1))
+    made = combined(others[best], slopes.by_unknown.reshape(linear.jacobian.shape[0], -1))
     change = (made.reshape(slopes.gains.shape) - by_resistor[best]) * as_complex(score / own)[best]
     part = calibrations.terms(near.profiles[0].gains + every.between(change))
     noise = near.padded(means(near.profiles, every, calibrations.noise(part)[None]), 1.0)
