@@ -78,6 +78,16 @@ class Linear(eqx.Module):
         """R W Jᵀ: products of other derivatives R of the terms with those of the parameters."""
         return (rows * self.share[None, :]) @ self.jacobian.T
 
+    def projected(
+        self, rows: Float[Array, "row term"], covariance: Float[Array, "q q"] | None = None
+    ) -> tuple[Float[Array, "row term"], Float[Array, "row q"]]:
+        """Other derivatives R without what the parameters can do of them, and what these do then.
+
+        `covariance` is the inverse of the information if other terms contribute to it.
+        """
+        others = self.told(rows) @ (self.bread() if covariance is None else covariance)
+        return rows - others @ self.jacobian, others
+
     def along(self, directions: Float[Array, "q z"]) -> "Linear":
         """The terms with coordinates along these directions as parameters, without a prior."""
         return dataclasses.replace(self, jacobian=directions.T @ self.jacobian, prior=None)

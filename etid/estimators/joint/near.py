@@ -306,7 +306,7 @@ def minimum(
     ) -> tuple[Float[Array, " parameter"], Float[Array, ""]]:
         common, owns = named(y)
         common, (_, result, found) = stepped(
-            lambda y, _: y,  # not evaluated: the solver takes the equations
+            None,
             solver,
             common,
             (signals, near),

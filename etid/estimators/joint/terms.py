@@ -20,13 +20,12 @@ from etid.estimators.maximum_likelihood.calibrations import Calibrations
 from etid.estimators.maximum_likelihood.given_driver import GivenDriver, around
 from etid.estimators.maximum_likelihood.load import Load
 from etid.estimators.maximum_likelihood.profile import Records
-from etid.estimators.unknowns import LoadUnknowns, LoadWithCurrentUnknowns
+from etid.estimators.unknowns import LoadUnknowns
 from etid.signals.harmonics import Spectrum
 
 SIDE_BY_SIDE = 8  # loads in one vectorised step
 
 Current = tuple[Complex[Array, "*load harmonic"], Float[Array, "*load harmonic"]]
-Own = LoadUnknowns | LoadWithCurrentUnknowns
 
 
 class Joint(eqx.Module):
@@ -88,7 +87,7 @@ class Loads(eqx.Module):
 
     spectrum: Spectrum
     sample_rate: Float[Array, "*load"]
-    own: Own
+    own: LoadUnknowns
     used: Bool[Array, "*load"]
     unloaded: Int[Array, "*load"]
     current: Current | None = None

@@ -101,7 +101,7 @@ def _search(
         q: Float[Array, " common"], near: NearCalibrations, _: Float[Array, ""]
     ) -> tuple[Float[Array, " common"], Float[Array, ""]]:
         before, of = 0.5 * jnp.dot(near.terms, near.terms), (model, near.condensed)
-        q, (_, result, found) = least_squares.stepped(lambda q, _: q, WELL, q, of, MAX_STEPS)
+        q, (_, result, found) = least_squares.stepped(None, WELL, q, of, MAX_STEPS)
         return q, successive.promised(before - found.objective, result)
 
     terms = 2 * jnp.sum(model.spectra.selected, dtype=start.dtype)
@@ -133,15 +133,7 @@ def rough_source(
     sample_rate: Float[Array, ""],
     start: SourceImpedance,
 ) -> Rough:
-    """Identify Z_th from bands of harmonics.
-
-    Args:
-        spectra: Harmonics of the records, stacked along a leading axis.
-        bands: Their bands.
-        r_load: Resistor of each record [Ω].
-        sample_rate: Sampling rate [Hz].
-        start: Initial Z_th; its structure is the order.
-    """
+    """Identify Z_th from bands of the harmonics; the structure of `start` is the order."""
     calibration = Calibration(r_load, jnp.zeros(r_load.shape), delay_std(r_load))
     model = Calibrations(start, calibration, bands, sample_rate)
     solution = least_squares.least_squares(_terms, ROUGHLY, model.start(), model, ROUGH_STEPS)
@@ -182,14 +174,9 @@ def fit_source(
     sample_rate: Float[Array, ""],
     candidates: Rough,
 ) -> tuple[Calibrations, Estimate, NearCalibrations, Linear]:
-    """Identify Z_th from one or several records with known resistors.
+    """Identify Z_th from one or several records with known resistors, stacked.
 
-    Args:
-        spectra: Harmonics of the records, stacked along a leading axis.
-        r_load: Resistor of each record [Ω].
-        sample_rate: Sampling rate [Hz].
-        candidates: Starts, stacked, the best first. The others are tried only if it does not
-            converge.
+    The best start is the first; the others are tried only if it does not converge.
 
     Returns:
         The calibrations with Z_th and their delays; the estimate, with parameters in the order of

@@ -23,8 +23,8 @@ from etid.estimators.maximum_likelihood.given_driver import GivenDriver
 from etid.estimators.maximum_likelihood.load import Load
 from etid.estimators.maximum_likelihood.profile import Records
 from etid.estimators.refined_driver import from_harmonics
-from etid.estimators.score_tests import missing_pole
 from etid.estimators.score_tests.falling_resistance import NO_FALL
+from etid.estimators.score_tests.of_calibrations import MISSING_POLE
 from etid.estimators.score_tests.other_circuit import NO_OTHER_CIRCUIT, NO_OTHER_GAIN
 from etid.estimators.score_tests.unloaded import UnloadedShape, shape_of
 from etid.results.driver import Driver, HarmonicDriver
@@ -57,7 +57,7 @@ def description(words: str, estimated: str, unknowns: str, tests: tuple[str, ...
         of_driver=(
             "it has to be passive",
             "its calibrations must not show one more section of Z_th (score test, χ² of at most "
-            f"{missing_pole.SEEN:g} with two degrees of freedom)",
+            f"{MISSING_POLE:g} with two degrees of freedom)",
         ),
         errors=BY_RESIDUALS,
         refined=True,

@@ -195,12 +195,9 @@ class GivenDriver(eqx.Module):
 def given(
     driver: HarmonicDriver, frequency: Float[Array, " harmonic"], shared: bool
 ) -> GivenDriver:
-    """The distribution of Z_th given the calibrations; it is the same for all loads.
+    """The distribution of Z_th given the calibrations, at the harmonics of the loads [Hz].
 
-    Args:
-        driver: The driver.
-        frequency: Harmonics of the loads [Hz].
-        shared: Whether the unloaded record of a load may be that of a calibration.
+    `shared` says whether the unloaded record of a load may be that of a calibration.
     """
     calibrations = Calibrations.of(driver)
     c = calibrations.start()

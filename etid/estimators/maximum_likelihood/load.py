@@ -11,7 +11,7 @@ import dataclasses
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Complex, Float
+from jaxtyping import Array, Complex, Float
 
 from etid.circuits.circuit import AbstractCircuit
 from etid.estimators.element_prior import ElementPrior
@@ -27,7 +27,6 @@ from etid.estimators.maximum_likelihood.profile import Profile, Records
 from etid.estimators.score_tests import falling_resistance, other_circuit
 from etid.signals.knots import Knots, knots
 from etid.signals.transfer import as_complex, combined, reciprocal, turns
-from etid.solvers.levenberg_marquardt import NormalEquations
 
 
 class Near(eqx.Module):
@@ -87,13 +86,7 @@ class Load(eqx.Module):
     ) -> "Load":
         """A recording that was made with `driver`.
 
-        Args:
-            driver: Distribution of Z_th at its harmonics, or the measured current.
-            circuit: Structure of the load.
-            records: The recording.
-            sample_rate: Its sampling rate [Hz].
-            prior: Prior of the elements; None without one.
-            measured: Its outputs; None for V_out, and for the current if there are two outputs.
+        Its outputs are V_out, and the current if there are two, unless `measured` says otherwise.
         """
         if measured is None:
             measured = Voltage() if records.y.shape[0] == 1 else VoltageAndCurrent()
@@ -158,42 +151,6 @@ class Load(eqx.Module):
         """Derivatives of the objective by the z that X depends on, at each harmonic."""
         assert self.unloaded is not None
         return near.profile.by_x(self.known(near.q), *self.unloaded[2:])
-
-
-class AtKnots(eqx.Module):
-    """The condensed terms of a load near one point, of which some parameters are fixed.
-
-    Attributes:
-        gains: The gains at the knots.
-        near: The load near the point.
-        free: Which parameters are not fixed.
-    """
-
-    gains: Gains
-    near: Near
-    free: Bool[Array, " q"]
-
-    def __call__(self, q: Float[Array, " q"]) -> Float[Array, " term"]:
-        """Terms at `q` and the priors."""
-        rest = (q - self.gains.centre(q)) / self.gains.widths(q)
-        return jnp.concatenate([self._terms(q, self.gains(q)), rest])
-
-    def _terms(
-        self, q: Float[Array, " q"], gains: Complex[Array, "output knot"]
-    ) -> Float[Array, " part"]:
-        if self.near.by_x is not None:
-            moved = self.gains.split(q)[2] - self.gains.split(self.near.q)[2]
-            gains = gains + gains * combined(moved, self.near.by_x)[None, :]
-        return self.near.condensed.terms(gains)
-
-    def equations(self, q: Float[Array, " q"]) -> NormalEquations:
-        """Normal equations of the records alone."""
-        slopes = apart(self.gains.slopes, q)
-        rows = self.near.condensed.rows(self.near.by_unknown(slopes))
-        rows = jnp.where(self.free[:, None], rows, 0.0)
-        rows = jnp.concatenate([rows, self._terms(q, slopes.gains)[None, :]])
-        products = rows @ rows.T  # one matrix product gives all sums
-        return NormalEquations(0.5 * products[-1, -1], products[:-1, -1], products[:-1, :-1])
 
 
 def changes(load: Load, near: Near) -> Complex[Array, "change output knot"]:

@@ -51,8 +51,7 @@ from etid.estimators.output_error.prediction import (
     state_scale,
 )
 from etid.estimators.sandwich import Curvature
-from etid.estimators.score_tests.bends_in_time import bends
-from etid.estimators.score_tests.other_in_time import EXACT, Shown, relaxed, score
+from etid.estimators.score_tests.other_in_time import EXACT, Shown, bends, relaxed, score
 from etid.estimators.unknowns import Nuisance
 from etid.results.driver import Calibration, ContinuousDriver, SourceImpedance, loaded
 from etid.results.feed import CurrentSource, MeasuredCurrent
@@ -71,12 +70,9 @@ def fit_source(
     r_load: Float[Array, " record"],
     start: SourceImpedance,
 ) -> tuple[SourceImpedance, Estimate, Calibration]:
-    """Identify Z_th from one or several records with known resistors.
+    """Identify Z_th from one or several records with known resistors, stacked.
 
-    Args:
-        records: Records, stacked along a leading axis.
-        r_load: Resistor of each record [Ω].
-        start: Initial Z_th; its structure is the order.
+    The structure of `start` is the order.
 
     Returns:
         Z_th; the estimate, with parameters in the order of the flattened `start`; and the data of
@@ -195,14 +191,7 @@ def fit_circuit(
     starts: AbstractCircuit,
     element_prior: ElementPrior | None = None,
 ) -> tuple[AbstractCircuit, Estimate, Bool[Array, ""]]:
-    """Identify the load of one recording.
-
-    Args:
-        records: One recording.
-        driver: Its driver, or the measured current.
-        starts: Candidate starts, stacked along a leading axis; the one that predicts best is
-            refined.
-        element_prior: Prior of the elements; None without one.
+    """Identify the load of one recording from the best of several starts, stacked.
 
     Returns:
         The circuit; the estimate, whose parameters are the logarithms of the elements; and whether

@@ -59,10 +59,7 @@ def prepare(
 ) -> Records:
     """The interpolated V_th of a recording, without the edges, where samples are missing.
 
-    Args:
-        m: One recording.
-        cutoff: As in `filtering.band_limited`.
-        samples: Number of samples before the padding; None if there is no padding.
+    `cutoff` is that of `filtering.band_limited`. Padding follows after `samples`, if given.
     """
     held, delayed = band_limited(m.v_th, cutoff), shiftable(m.v_out, cutoff)
     rows = jnp.arange(held.shape[0])
@@ -233,14 +230,7 @@ def late_calibration(
 
     The first part is a delay, which the skin's own delay absorbs. The second is an excess
     impedance; this function returns the derivatives with respect to it. They are 0 for a measured
-    current, which has no calibration.
-
-    Args:
-        records: One recording.
-        source: Z_th, or the source of a measured current.
-        load: The load.
-        r_load: Resistor of the calibration [Ω].
-        x0: State of the loaded driver at the start of the record.
+    current, which has no calibration. `x0` is the state of the loaded driver at the start.
     """
     if isinstance(source, CurrentSource):
         return Change(jnp.zeros_like(records.v_out[:, 0]), jnp.zeros(IMPULSE + 1))
