@@ -1,6 +1,7 @@
 """Refined Z_th: fits from several starts; the best result is kept and judged."""
 
 import dataclasses
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -21,6 +22,7 @@ from etid.results.driver import Calibration, ContinuousDriver, HarmonicDriver, S
 from etid.results.verdicts import RESULTS, first_verdict
 from etid.signals.bands import banded
 from etid.signals.noise import Measurement
+from etid.signals.transfer import Rational
 
 PASSIVE = 2.0  # standard errors by which Re Z_th may be negative
 BAND = np.linspace(0.0003, 0.4, 400)  # of the sample rate; the source must be passive there
@@ -69,20 +71,13 @@ def from_harmonics(
     terms = 2 * jnp.sum(spectra.selected, dtype=rate.dtype)
     passive = _is_passive(source, estimate.cov, rate)
     return HarmonicDriver(
-        b=baseline.filter.num,
-        a=baseline.filter.den,
-        sample_rate=rate,
+        **_fields(baseline.filter, estimate, rate),
         source=source,
-        cov=estimate.cov,
         calibration=calibration,
-        rrse=estimate.rrse,
-        chi2=estimate.chi2,
         result=first_verdict(
             *_faults(estimate, calibration, passive, terms),
             (statistic > of_calibrations.MISSING_POLE, RESULTS.order_too_low),
         ),
-        steps=estimate.steps,
-        remarks=remarks(estimate.hum),
         method=method,
         spectra=spectra,
         missing_pole=statistic,
@@ -109,19 +104,26 @@ def from_samples(
     source, estimate, calibration = jax.tree.map(lambda leaf: leaf[chosen], found)
     terms = jnp.asarray(m.v_out.size, m.v_out.dtype)
     return ContinuousDriver(
-        b=baseline.num,
-        a=baseline.den,
-        sample_rate=rate,
+        **_fields(baseline, estimate, rate),
         source=source,
-        cov=estimate.cov,
         calibration=calibration,
-        rrse=estimate.rrse,
-        chi2=estimate.chi2,
         result=first_verdict(*_faults(estimate, calibration, passive[chosen], terms)),
-        steps=estimate.steps,
-        remarks=remarks(estimate.hum),
         method=method,
     )
+
+
+def _fields(baseline: Rational, estimate: Estimate, rate: Float[Array, ""]) -> dict[str, Any]:
+    """What the drivers of both methods have from their baseline and their estimate."""
+    return {
+        "b": baseline.num,
+        "a": baseline.den,
+        "sample_rate": rate,
+        "cov": estimate.cov,
+        "rrse": estimate.rrse,
+        "chi2": estimate.chi2,
+        "steps": estimate.steps,
+        "remarks": remarks(estimate.hum),
+    }
 
 
 def _is_passive(

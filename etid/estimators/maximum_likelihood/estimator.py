@@ -26,7 +26,6 @@ from etid.estimators.refined_driver import from_harmonics
 from etid.estimators.score_tests.falling_resistance import NO_FALL
 from etid.estimators.score_tests.of_calibrations import MISSING_POLE
 from etid.estimators.score_tests.other_circuit import NO_OTHER_CIRCUIT, NO_OTHER_GAIN
-from etid.estimators.score_tests.unloaded import UnloadedShape, shape_of
 from etid.results.driver import Driver, HarmonicDriver
 from etid.results.feed import MeasuredCurrent
 from etid.results.fit import Fit
@@ -151,24 +150,3 @@ class MaximumLikelihood(AbstractEstimator):
             f"{stated_limits(self.bounds)}",
             (NO_OTHER_CIRCUIT, NO_OTHER_GAIN, NO_FALL),
         )
-
-
-@dataclasses.dataclass(frozen=True)
-class AbstractByMaximumLikelihood(AbstractEstimator):
-    """An estimator of loads behind drivers of maximum likelihood, which keep their harmonics."""
-
-    def fit_driver(
-        self,
-        records: Harmonics,
-        r_load: Float[Array, " record"],
-        order: int,
-    ) -> Driver:
-        """Identify a driver by maximum likelihood."""
-        return MaximumLikelihood().fit_driver(records, r_load, order)
-
-    def known(
-        self, driver: Driver, frequency: Float[Array, " harmonic"], shared: bool
-    ) -> UnloadedShape | None:
-        """The unloaded voltage of the calibrations, if it can be compared."""
-        del shared
-        return shape_of(driver, frequency)
