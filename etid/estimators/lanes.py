@@ -311,9 +311,10 @@ class AlignedSamples(AbstractLane):
     @classmethod
     def of(cls, seen: Inspected) -> "AlignedSamples":
         """The aligned records of a recording."""
-        (v_th, v_out), sigmas = seen.aligned, map(np.asarray, seen.trusted)
+        v_th, v_out = seen.aligned
+        of_th, of_out = map(np.asarray, seen.trusted)
         rate = np.asarray(seen.recording.sample_rate)
-        return cls(v_th, v_out, *sigmas, rate, np.asarray(v_th.size))
+        return cls(v_th, v_out, of_th, of_out, rate, np.asarray(v_th.size))
 
     @classmethod
     def of_samples(

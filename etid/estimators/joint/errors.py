@@ -3,8 +3,7 @@
     cov = H⁻¹ (Jᵀ C J) H⁻¹
 
 is that of `etid.estimators.sandwich`. For `common` the own parameters of the loads are eliminated.
-A load inherits K cov Kᵀ with its slope K = −A⁻¹ B. The terms of a load are those of its records,
-condensed, and then the priors of its own parameters.
+A load inherits K cov Kᵀ with its slope K = −A⁻¹ B.
 
 **One unloaded record in several loads** has the same noise of X in all of them. The fit takes the
 loads as independent, but the standard errors do not. The effect of unit noise in X on the terms of
@@ -42,7 +41,7 @@ class _AtMinimum(NamedTuple):
     Attributes:
         chi2: χ² per degree of freedom.
         rrse: RRSE; with a current that of the record that is predicted worse.
-        terms: Terms of the records, and the priors of the own parameters.
+        terms: Condensed terms of the records.
         linear: The same, linear in the parameters.
         changes: Derivatives of the terms with respect to changes of the circuit, to a gain of
             V_out, and to a gain of the current if there is one.
@@ -226,25 +225,17 @@ def _at_minimum(
     lane, q = study.lane(driver, load), jnp.concatenate([own.vector(), driver.mean])
     near, records, owned = lane.near(q), lane.known(q), lane.gains.owned
     profile, condensed = near.profile, near.condensed
-
-    def of_all(rows: Float[Array, "row part"], priors: Float[Array, "row own"] | float) -> Array:
-        """Derivatives of all terms, from those of the records and of the priors."""
-        shape = (rows.shape[0], owned)
-        return jnp.concatenate([rows, jnp.broadcast_to(jnp.asarray(priors), shape)], axis=1)
-
-    def common_first(rows: Float[Array, "q term"]) -> Float[Array, "q term"]:
-        return jnp.concatenate([rows[owned:], rows[:owned]])
-
     noise = profile.excess(records)
     share = jnp.broadcast_to(signal_share(profile.x, records.variance_x), noise.shape)
-    weights = of_all(means([profile], lane.knots, jnp.stack([share, noise])), 1.0)
-    precision = jnp.eye(q.size, owned) / lane.gains.widths(q[:owned])[None]
-    linear = Linear(common_first(of_all(near.jacobian, precision)), *weights)
-    rows = of_all(condensed.rows(changes(lane, near)), 0.0)
+    weights = means([profile], lane.knots, jnp.stack([share, noise]))
+    priors = jnp.eye(q.size, owned, owned - q.size) / lane.gains.widths(q[:owned])[None]
+    jacobian = jnp.concatenate([near.jacobian[owned:], near.jacobian[:owned]])
+    linear = Linear(jacobian, *weights, priors=priors)
+    rows = condensed.rows(changes(lane, near))
     at = _AtMinimum(
         chi2=2 * profile.objective / (lane.terms - owned),
         rrse=profile.rrse(records, load.spectrum.x),
-        terms=jnp.concatenate([condensed.part, lane.rest(q[:owned])]),
+        terms=condensed.part,
         linear=linear,
         changes=rows,
         by_scale=linear.told(rows[-1:])[0] if lane.gains.outputs > 1 else jnp.zeros_like(q),
@@ -257,7 +248,7 @@ def _at_minimum(
 def _by_noise(linear: Linear, gains: Complex[Array, "output x"]) -> Float[Array, "both parameter"]:
     """Effect of unit noise on the gradient, if `gains` bring it into the terms of each output."""
     outputs, size = gains.shape
-    jacobian = linear.jacobian[:, : 2 * gains.size].reshape(-1, 2, outputs, size)
+    jacobian = linear.jacobian.reshape(-1, 2, outputs, size)
     real, imaginary = jacobian[:, 0], jacobian[:, 1]
     re, im = gains.real[None], gains.imag[None]
     both = re * real + im * imaginary, re * imaginary - im * real
@@ -290,7 +281,7 @@ def _contradictions(
         at.terms,
         # At the minimum the other terms have the opposite gradient.
         -linear.jacobian @ at.terms,
-        spread.set(score - eliminated.rest.score),
+        spread.set(score - eliminated.rest.score) + linear.precision,
         covariance,
         slice(bread.shape[0], bread.shape[0] + own.log_elements.size),
     )

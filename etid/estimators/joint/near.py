@@ -29,7 +29,6 @@ from etid.estimators.joint.terms import DriverStudy, Loads, in_turn
 from etid.estimators.maximum_likelihood.calibrations import DENSE, Calibrations
 from etid.estimators.maximum_likelihood.condensed import apart
 from etid.estimators.maximum_likelihood.given_driver import GivenDriver
-from etid.estimators.maximum_likelihood.profile import total
 from etid.signals.knots import knots
 from etid.signals.transfer import as_complex, reciprocal
 from etid.solvers import successive
@@ -198,7 +197,7 @@ def _of_calibrations(calibrations: Calibrations, common: Float[Array, " common"]
     part = near.condensed.part.reshape(-1, size)
     pull = jnp.einsum("stk,tk->sk", rows, part)
     curvature = jnp.einsum("stk,utk->suk", rows, rows)
-    objective = total([of.objective for of in near.profiles])
+    objective = near.objective
     none = jnp.zeros((0, 2 * records, size))
     return _Part(objective, pull, curvature, none, jnp.zeros(0))
 
@@ -253,7 +252,7 @@ def _of_group(
             of_x = apart(lambda _: lane.by_x(near), q)
             pull = jnp.concatenate([pull[:W], every.summed(of_x[W:])])
         found = _Part(
-            objective=near.profile.objective + 0.5 * jnp.dot(rest, rest),
+            objective=near.objective + 0.5 * jnp.dot(rest, rest),
             pull=pull,
             curvature=curvature,
             following=following,

@@ -19,8 +19,8 @@ from etid.estimators.estimate import (
     Estimate,
     delay_std,
 )
-from etid.estimators.maximum_likelihood.calibrations import Calibrations, NearCalibrations
-from etid.estimators.maximum_likelihood.condensed import Condensed, apart
+from etid.estimators.maximum_likelihood.calibrations import Calibrations
+from etid.estimators.maximum_likelihood.condensed import Condensed, Near, apart
 from etid.estimators.maximum_likelihood.profile import Profile, Records, total
 from etid.estimators.sandwich import Linear
 from etid.estimators.unknowns import DriverUnknowns
@@ -62,9 +62,9 @@ def _equations_at_knots(
     """Normal equations of the condensed terms."""
     model, condensed = of
     slopes = apart(lambda q: model.slopes(q, model.knots), q)
-    terms, rows = model.with_weak(
-        q, condensed.terms(slopes.gains), condensed.rows(slopes.by_unknown)
-    )
+    weak, by_weak = model.weak(q)
+    terms = jnp.concatenate([condensed.terms(slopes.gains), weak])
+    rows = jnp.concatenate([condensed.rows(slopes.by_unknown), by_weak], axis=1)
     return NormalEquations.of(terms, rows)
 
 
@@ -93,14 +93,15 @@ def _search(
 ) -> tuple[Float[Array, " common"], successive.Minimum]:
     """The minimum, without a derivative."""
 
-    def approximate(q: Float[Array, " common"]) -> tuple[NearCalibrations, Float[Array, ""]]:
-        near = model.near(q)
-        return near, near.objective
+    def approximate(q: Float[Array, " common"]) -> tuple[Near, Float[Array, ""]]:
+        near, (weak, _) = model.near(q), model.weak(q)
+        return near, near.objective + 0.5 * jnp.dot(weak, weak)
 
     def follow(
-        q: Float[Array, " common"], near: NearCalibrations, _: Float[Array, ""]
+        q: Float[Array, " common"], near: Near, _: Float[Array, ""]
     ) -> tuple[Float[Array, " common"], Float[Array, ""]]:
-        before, of = 0.5 * jnp.dot(near.terms, near.terms), (model, near.condensed)
+        part, of = jnp.concatenate([near.condensed.part, model.weak(q)[0]]), (model, near.condensed)
+        before = 0.5 * jnp.dot(part, part)
         q, (_, result, found) = least_squares.stepped(None, WELL, q, of, MAX_STEPS)
         return q, successive.promised(before - found.objective, result)
 
@@ -173,7 +174,7 @@ def fit_source(
     r_load: Float[Array, " record"],
     sample_rate: Float[Array, ""],
     candidates: Rough,
-) -> tuple[Calibrations, Estimate, NearCalibrations, Linear]:
+) -> tuple[Calibrations, Estimate, Near, Linear]:
     """Identify Z_th from one or several records with known resistors, stacked.
 
     The best start is the first; the others are tried only if it does not converge.

@@ -204,7 +204,8 @@ def given(
     near = calibrations.near(c)
     linear = calibrations.linear(near)
     root = inverse_root(linear.curvature().expected)
-    mean, cov = -root.T @ (near.jacobian @ near.terms), linear.along(root).curvature().score
+    mean = -root.T @ calibrations.gradient(near, linear)
+    cov = linear.along(root).curvature().score
     # Later changes of the driver and errors of the instrument are further z.
     later, instrument = jnp.zeros((c.size, 0)), driver.instrument
     if driver.drift is not None:
@@ -212,7 +213,7 @@ def given(
         later = jnp.pad(jnp.diag(std), ((0, c.size - std.size), (0, 0)))
     shown = jnp.zeros((c.size, 0))
     if instrument is not None:
-        changes = near.rows(_by_instrument(instrument, calibrations, near.slopes))
+        changes = near.condensed.rows(_by_instrument(instrument, calibrations, near.slopes))
         shown = -root @ (root.T @ linear.told(changes).T)
     directions = jnp.concatenate([root, later, shown], axis=1)
     others = c.size + later.shape[1]

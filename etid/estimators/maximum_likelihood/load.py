@@ -15,7 +15,7 @@ from jaxtyping import Array, Complex, Float
 
 from etid.circuits.circuit import AbstractCircuit
 from etid.estimators.element_prior import ElementPrior
-from etid.estimators.maximum_likelihood.condensed import Condensed, Slopes, apart
+from etid.estimators.maximum_likelihood.condensed import Condensed, Near, apart
 from etid.estimators.maximum_likelihood.gains import (
     AbstractOutputs,
     Gains,
@@ -27,38 +27,6 @@ from etid.estimators.maximum_likelihood.profile import Profile, Records
 from etid.estimators.score_tests import falling_resistance, other_circuit
 from etid.signals.knots import Knots, knots
 from etid.signals.transfer import as_complex, combined, reciprocal, turns
-
-
-class Near(eqx.Module):
-    """A load near the parameters q₀.
-
-    Attributes:
-        q: q₀.
-        profile: The likelihood at all harmonics.
-        condensed: The same at the knots.
-        slopes: The gains and their derivatives at the knots.
-        by_x: Relative derivatives of X with respect to z at the knots; None if X does not depend
-            on z.
-    """
-
-    q: Float[Array, " q"]
-    profile: Profile
-    condensed: Condensed
-    slopes: Slopes
-    by_x: Complex[Array, "z knot"] | None
-
-    def by_unknown(self, slopes: Slopes) -> Complex[Array, "q output knot"]:
-        """Derivatives of G X/X̂ with respect to the parameters."""
-        found = slopes.by_unknown
-        if self.by_x is not None:
-            z = self.by_x[:, None] * slopes.gains[None]
-            found = found.at[found.shape[0] - z.shape[0] :].add(z)
-        return found[: self.q.size]
-
-    @property
-    def jacobian(self) -> Float[Array, "q part"]:
-        """Transposed Jacobian of the condensed terms."""
-        return self.condensed.rows(self.by_unknown(self.slopes))
 
 
 class Load(eqx.Module):
@@ -145,7 +113,7 @@ class Load(eqx.Module):
             size, total = profile.size[0], every.summed(profile.size[0])
             by_x = every.summed(as_complex(size)[None, :] * relative)
             by_x = by_x * as_complex(1 / jnp.where(total > 0, total, 1.0))[None, :]
-        return Near(q, profile, condensed, slopes, by_x)
+        return Near(q, [profile], condensed, slopes, by_x)
 
     def by_x(self, near: Near) -> Float[Array, "z harmonic"]:
         """Derivatives of the objective by the z that X depends on, at each harmonic."""

@@ -15,9 +15,9 @@ from etid.estimators.element_limits import Limits
 from etid.estimators.estimate import Estimate
 from etid.estimators.judgement import judged, unless
 from etid.estimators.maximum_likelihood.calibrations import Calibrations
-from etid.estimators.maximum_likelihood.condensed import means
+from etid.estimators.maximum_likelihood.condensed import Near, means
 from etid.estimators.maximum_likelihood.given_driver import around
-from etid.estimators.maximum_likelihood.load import Load, Near, by_falling, changes
+from etid.estimators.maximum_likelihood.load import Load, by_falling, changes
 from etid.estimators.maximum_likelihood.profile import Records
 from etid.estimators.maximum_likelihood.search import best_start, minimum
 from etid.estimators.sandwich import Linear
@@ -219,5 +219,5 @@ def _linear(
     share = jnp.broadcast_to(signal_share(profile.x, records.variance_x), noise.shape)
     values = jnp.stack([share, noise, private * noise])
     mean_share, mean_noise, own_noise = means([profile], load.knots, values)
-    prior = jnp.diag(1 / load.gains.widths(near.q) ** 2)
-    return Linear(near.jacobian, mean_share, mean_noise, prior), own_noise
+    priors = jnp.diag(1 / load.gains.widths(near.q))
+    return Linear(near.jacobian, mean_share, mean_noise, priors), own_noise

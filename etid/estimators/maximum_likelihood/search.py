@@ -13,9 +13,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from etid.estimators.estimate import SOLVER
-from etid.estimators.maximum_likelihood.condensed import apart
+from etid.estimators.maximum_likelihood.condensed import Near, apart
 from etid.estimators.maximum_likelihood.gains import Gains
-from etid.estimators.maximum_likelihood.load import Load, Near
+from etid.estimators.maximum_likelihood.load import Load
 from etid.estimators.unknowns import LoadUnknowns
 from etid.signals.transfer import combined
 from etid.solvers import least_squares, successive
@@ -72,7 +72,7 @@ def _equations_of_load(_, q: Float[Array, " q"], load: Load) -> NormalEquations:
 def _approximate(load: Load, q: Float[Array, " q"]) -> tuple[Near, Float[Array, ""]]:
     """The load near `q`, and ½ Σ r² of all harmonics there."""
     near, rest = load.near(q), load.rest(q)
-    return near, near.profile.objective + 0.5 * jnp.dot(rest, rest)
+    return near, near.objective + 0.5 * jnp.dot(rest, rest)
 
 
 ROUGHLY = LevenbergMarquardt(rtol=1e-2, ftol=1e-3)

@@ -27,8 +27,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Complex, Float
 
-from etid.estimators.maximum_likelihood.calibrations import Calibrations, NearCalibrations
-from etid.estimators.maximum_likelihood.condensed import means
+from etid.estimators.maximum_likelihood.calibrations import Calibrations
+from etid.estimators.maximum_likelihood.condensed import Near, means
 from etid.estimators.sandwich import Linear
 from etid.recordings.preflight import Inspected
 from etid.signals.transfer import as_complex, combined, reciprocal
@@ -70,7 +70,7 @@ def sections(
 
 
 def missing_pole(
-    calibrations: Calibrations, near: NearCalibrations, linear: Linear
+    calibrations: Calibrations, near: Near, linear: Linear
 ) -> Float[Array, " section"]:
     """Score statistic of each section: χ² with two degrees of freedom if the section is absent.
 
@@ -81,17 +81,20 @@ def missing_pole(
     frequency = calibrations.knots.at(spectra.frequency[0])
     highest = jnp.max(jnp.where(spectra.selected, spectra.frequency, frequency[0]))
     by_z = sections(frequency, highest).reshape(-1, 1, frequency.size)
-    rows = near.rows(by_z * near.slopes.by_z[None])
-    directions, _ = linear.projected(rows)
-    s, t = (directions @ near.terms).reshape(-1, 2).T  # of g and of h
+    directions, others = linear.projected(near.condensed.rows(by_z * near.slopes.by_z[None]))
+    score = directions @ near.condensed.part - others @ calibrations.rest(near.q)
+    s, t = score.reshape(-1, 2).T  # of g and of h
     by_g, by_h = jnp.moveaxis(directions.reshape(s.size, 2, -1), 1, 0)
     aa, ab, bb = (of @ linear.noise for of in (by_g * by_g, by_g * by_h, by_h * by_h))
+    of_priors = (others @ linear.precision).reshape(s.size, 2, -1)
+    (more_aa, more_ab), (_, more_bb) = jnp.einsum(
+        "sic,sjc->ijs", of_priors, others.reshape(s.size, 2, -1)
+    )
+    aa, ab, bb = aa + more_aa, ab + more_ab, bb + more_bb
     return (s * s * bb - 2 * s * t * ab + t * t * aa) / (aa * bb - ab * ab)
 
 
-def mismatch(
-    calibrations: Calibrations, near: NearCalibrations, linear: Linear
-) -> Float[Array, "2 record"]:
+def mismatch(calibrations: Calibrations, near: Near, linear: Linear) -> Float[Array, "2 record"]:
     """Excess of each log R over the value that the other calibrations show, and its standard error.
 
     `near` and `linear` are those of the minimum.
@@ -99,17 +102,18 @@ def mismatch(
     slopes, every = near.slopes, calibrations.knots
     alone = as_complex(jnp.eye(slopes.gains.shape[0]))[:, :, None]
     by_resistor = alone * (-slopes.z * slopes.by_z)[None]
-    rows = near.rows(by_resistor)
+    rows = near.condensed.rows(by_resistor)
     directions, others = linear.projected(rows)
     own = jnp.sum(rows * linear.share[None, :] * directions, axis=1)
-    score = directions @ near.terms
+    score = directions @ near.condensed.part - others @ calibrations.rest(near.q)
     # Estimate the noise after the resistor that explains most: its error must not count as noise.
     best = jnp.argmax(score**2 / own)
     made = combined(others[best], slopes.by_unknown.reshape(linear.jacobian.shape[0], -1))
     change = (made.reshape(slopes.gains.shape) - by_resistor[best]) * as_complex(score / own)[best]
     part = calibrations.terms(near.profiles[0].gains + every.between(change))
-    noise = near.padded(means(near.profiles, every, calibrations.noise(part)[None]), 1.0)
-    error = jnp.sqrt(jnp.sum(noise * directions**2, axis=1)) / own
+    noise = means(near.profiles, every, calibrations.noise(part)[None])
+    of_priors = jnp.sum((others @ linear.precision) * others, axis=1)
+    error = jnp.sqrt(jnp.sum(noise * directions**2, axis=1) + of_priors) / own
     return jnp.stack([score / own, error])
 
 

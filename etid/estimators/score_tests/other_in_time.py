@@ -43,7 +43,7 @@ from etid.estimators.score_tests.other_circuit import Score, relaxations, scores
 from etid.estimators.unknowns import Nuisance
 from etid.results.driver import SourceImpedance
 from etid.results.feed import CurrentSource
-from etid.signals.filtering import CUTOFF, StateSpace, hold
+from etid.signals.filtering import CUTOFF, StateSpace, hold, simulate
 from etid.signals.transfer import as_complex
 from etid.solvers.matrices import inverse
 
@@ -226,7 +226,7 @@ def score(
     scaled = terms(rows)
     by_change, by_parameter = scaled[:count], scaled[count:]
     ones = jnp.ones(scaled.shape[1])
-    linear = Linear(by_parameter, ones, ones, jnp.diag(known))
+    linear = Linear(by_parameter, ones, ones, jnp.diag(jnp.sqrt(known)))
     return scores(
         by_change,
         linear,
