@@ -23,7 +23,7 @@ from etid.results.feed import AbstractFeed
 from etid.signals import mains
 from etid.signals.aliases import aliases
 from etid.signals.harmonics import ALIASED, Spectrum, joins_aliases, spectrum
-from etid.signals.noise import Measurement, coloured, noise, rounding_variance
+from etid.signals.noise import Measurement, coloured, rounding_variance
 from etid.signals.pulse_train import rest, shifted
 
 LEFT = 0.75  # samples; a larger delay needs a second fit. The prior of a delay is 0.5 wide
@@ -71,23 +71,8 @@ class AbstractLane(eqx.Module):
 
     @classmethod
     @abc.abstractmethod
-    def of_samples(
-        cls,
-        v_th: Float[Array, " time"],
-        v_out: Float[Array, " time"],
-        resolution: Float[Array, ""],
-        sample_rate: Float[Array, ""],
-        periods: tuple[int, int],
-    ) -> "AbstractLane":
-        """The lane of bare arrays; JAX can trace this function.
-
-        Args:
-            v_th: Unloaded voltage [V].
-            v_out: Loaded voltage [V].
-            resolution: Step of the converter [V], 0 if not known.
-            sample_rate: Sampling rate [Hz].
-            periods: Numbers of periods and samples from `whole_periods`.
-        """
+    def of_samples(cls, m: Measurement, periods: tuple[int, int]) -> "AbstractLane":
+        """The lane of bare arrays, `periods` from `whole_periods`; JAX can trace this function."""
 
     @property
     def size(self) -> int:
@@ -174,28 +159,21 @@ class Harmonics(AbstractLane):
         return frequency, x, y, *variances, selected, rate
 
     @classmethod
-    def of_samples(
-        cls,
-        v_th: Float[Array, " time"],
-        v_out: Float[Array, " time"],
-        resolution: Float[Array, ""],
-        sample_rate: Float[Array, ""],
-        periods: tuple[int, int],
-    ) -> "Harmonics":
+    def of_samples(cls, m: Measurement, periods: tuple[int, int]) -> "Harmonics":
         """The harmonics of bare arrays.
 
         Raises:
             ValueError: The arrays hold no whole period.
         """
         if periods[0] == 0:
-            raise ValueError(f"{v_out.shape[0]} samples hold no whole pulse period")
-        sigmas = noise(v_th, resolution), noise(v_out, resolution)
-        fields = map(jnp.asarray, spectrum(v_th, v_out, *sigmas, sample_rate, *periods))
+            raise ValueError(f"{m.v_out.shape[0]} samples hold no whole pulse period")
+        records = m.v_th, m.v_out, m.sigma_th, m.sigma_out, m.sample_rate
+        fields = map(jnp.asarray, spectrum(*records, *periods))
         frequency, x, y, of_x, of_y, selected = fields
         if joins_aliases(*periods):
             of_x = of_x + aliases(x, of_x, *periods).variance
             of_y = of_y + aliases(y, of_y, *periods).variance
-        return cls(frequency, x, y, of_x, of_y, selected, sample_rate)
+        return cls(frequency, x, y, of_x, of_y, selected, m.sample_rate)
 
     @property
     def spectrum(self) -> Spectrum:
@@ -260,14 +238,7 @@ class HarmonicsWithCurrent(Harmonics):
         return *of_voltages, selected & usable, rate, turned, variance_i
 
     @classmethod
-    def of_samples(
-        cls,
-        v_th: Float[Array, " time"],
-        v_out: Float[Array, " time"],
-        resolution: Float[Array, ""],
-        sample_rate: Float[Array, ""],
-        periods: tuple[int, int],
-    ) -> "HarmonicsWithCurrent":
+    def of_samples(cls, m: Measurement, periods: tuple[int, int]) -> "HarmonicsWithCurrent":
         """Refused: bare arrays have no current."""
         raise ValueError("arrays have no current; use method='maximum_likelihood'")
 
@@ -317,18 +288,11 @@ class AlignedSamples(AbstractLane):
         return cls(v_th, v_out, of_th, of_out, rate, np.asarray(v_th.size))
 
     @classmethod
-    def of_samples(
-        cls,
-        v_th: Float[Array, " time"],
-        v_out: Float[Array, " time"],
-        resolution: Float[Array, ""],
-        sample_rate: Float[Array, ""],
-        periods: tuple[int, int],
-    ) -> "AlignedSamples":
+    def of_samples(cls, m: Measurement, periods: tuple[int, int]) -> "AlignedSamples":
         """The lane of bare arrays."""
         del periods
-        sigmas = jnp.asarray(noise(v_th, resolution)), jnp.asarray(noise(v_out, resolution))
-        return cls(v_th, v_out, *sigmas, sample_rate, jnp.asarray(v_out.shape[0]))
+        known = m.sigma_th, m.sigma_out, m.sample_rate
+        return cls(m.v_th, m.v_out, *known, jnp.asarray(m.v_out.shape[0]))
 
     def measure(self) -> Measurement:
         """Both records and their noise, as arrays of JAX."""

@@ -58,11 +58,6 @@ class Nuisance(eqx.Module):
         """The unknowns from the vector of a solver."""
         return cls(vector[..., :-2], vector[..., -2], vector[..., -1])
 
-    def vector(self) -> Float[Array, "*lane nuisance"]:
-        """The vector for a solver."""
-        last = jnp.stack([self.offset, self.delay_samples], axis=-1)
-        return jnp.concatenate([self.state, last], axis=-1)
-
 
 class DriverUnknowns(eqx.Module):
     """Unknowns of a driver and its calibrations.

@@ -45,8 +45,6 @@ from etid.estimators.output_error.prediction import (
     measured,
     predict,
     residual_and_response,
-    scaled,
-    scaled_back,
     scaled_residual,
     state_scale,
 )
@@ -223,7 +221,7 @@ def fit_circuit(
 
     def named(q: Float[Array, " q"]) -> tuple[Float[Array, " element"], Nuisance, Float[Array, ""]]:
         log_elements, nuisance, late_samples = named_scaled(q)
-        return log_elements, scaled_back(nuisance, start_scale), late_samples
+        return log_elements, start_scale.state_of(nuisance), late_samples
 
     def residual(q: Float[Array, " q"], late: Change) -> Float[Array, " term"]:
         log_elements, nuisance, late_samples = named(q)
@@ -234,9 +232,7 @@ def fit_circuit(
         if element_prior is not None:
             rest = (log_elements - element_prior.centre) / element_prior.width
             priors = jnp.concatenate([priors, rest])
-        if start_scale is not None:
-            priors = jnp.concatenate([priors, start_scale.known * named_scaled(q)[1].state])
-        return jnp.concatenate([terms, priors])
+        return jnp.concatenate([terms, priors, start_scale.known * named_scaled(q)[1].state])
 
     def refine(
         carry: tuple[Float[Array, " q"], Change], late_counts: Float[Array, ""]
@@ -269,18 +265,17 @@ def fit_circuit(
     # The directions of the state are orthogonal at these elements, not at those of the start.
     scale = state_scale(records, source, load(log_elements))
     at, named_all = ravel_pytree(
-        (log_elements, late_samples, source_vector, scaled(nuisance, scale))
+        (log_elements, late_samples, source_vector, scale.eta_of(nuisance))
     )
 
     def of_all(p: Float[Array, " p"]) -> tuple[Float[Array, " interval"], Float[Array, " lag"]]:
         log_elements, late_samples, vector, nuisance = named_all(p)
-        nuisance = scaled_back(nuisance, scale)
+        nuisance = scale.state_of(nuisance)
         change = jax.tree.map(lambda leaf: late_samples * leaf, late)
         behind, circuit = unflatten(vector), load(log_elements)
         return residual_and_response(records, behind, circuit, nuisance, change)
 
-    of_state = jnp.zeros_like(nuisance.state) if scale is None else scale.known
-    open_delay = Nuisance(of_state, zero, jnp.asarray(1 / DELAY_WIDTH**2))
+    open_delay = Nuisance(scale.known, zero, jnp.asarray(1 / DELAY_WIDTH**2))
     free = jnp.zeros(kept)
     known = free if element_prior is None else element_prior.precision
     priors = (known, 1 / late_std**2, jnp.zeros(sources), open_delay)

@@ -110,14 +110,24 @@ class StateScale(eqx.Module):
     directions: Float[Array, "state state"]
     known: Float[Array, " state"]
 
+    def state_of(self, nuisance: Nuisance) -> Nuisance:
+        """The nuisances with the state, from those with η."""
+        return eqx.tree_at(lambda one: one.state, nuisance, self.directions @ nuisance.state)
+
+    def eta_of(self, nuisance: Nuisance) -> Nuisance:
+        """The inverse of `state_of`."""
+        state = jnp.linalg.solve(self.directions, nuisance.state)
+        return eqx.tree_at(lambda one: one.state, nuisance, state)
+
 
 def state_scale(
     records: Records, source: SourceImpedance | CurrentSource, load: Rational | StateSpace
-) -> StateScale | None:
-    """The unknowns for the state of a loaded ladder; None for a ratio of polynomials."""
+) -> StateScale:
+    """The unknowns of a loaded ladder; for a ratio of polynomials they are the state itself."""
+    system = loaded(source, load, records.sample_rate)
     if isinstance(load, Rational):
-        return None
-    system, count = loaded(source, load, records.sample_rate), load.C.size
+        return StateScale(jnp.eye(system.C.size), jnp.zeros(system.C.size))
+    count = load.C.size
     first, zero = system.C.size - count, jnp.zeros(())
     largest = jnp.max(jnp.abs(records.hold[:, 0]) * records.used)
     least = records.sample_rate / records.intervals
@@ -132,21 +142,6 @@ def state_scale(
     turned = jnp.linalg.svd(jnp.linalg.qr(effects)[1])[2].T
     directions = jax.scipy.linalg.block_diag(jnp.eye(first), width[:, None] * turned)
     return StateScale(directions, (jnp.arange(system.C.size) >= first).astype(width.dtype))
-
-
-def scaled_back(nuisance: Nuisance, scale: StateScale | None) -> Nuisance:
-    """The nuisances with the state that η stands for."""
-    if scale is None:
-        return nuisance
-    return eqx.tree_at(lambda one: one.state, nuisance, scale.directions @ nuisance.state)
-
-
-def scaled(nuisance: Nuisance, scale: StateScale | None) -> Nuisance:
-    """The inverse of `scaled_back`."""
-    if scale is None:
-        return nuisance
-    state = jnp.linalg.solve(scale.directions, nuisance.state)
-    return eqx.tree_at(lambda one: one.state, nuisance, state)
 
 
 def impulse_response(system: StateSpace) -> Float[Array, " lag"]:
