@@ -15,7 +15,16 @@ records is V_th − σ_th² G* r / P, where r is the residual; its noise does no
 Behind a measured current the relaxations reach to the end of the band: one more pole in either
 channel, or a capacitance parallel to the load, is a fast relaxation, once delay and elements are
 fitted. Their scores have 0.85 to 1.0 of the standard deviations that the best test of each of these
-faults has. Together with `etid.estimators.score_tests.bends_in_time` the tests ask for ten changes.
+faults has.
+
+Three more changes behind a measured current are not linear: two faults of a record and one of the
+load, to first order in 1/U, where U is a voltage or current.
+
+- The current amplifier compresses its peaks: it shows i (1 − |i|/U), and V_out lacks Z_L |i| i / U.
+- The voltage amplifier compresses its peaks: it shows v (1 − |v|/U).
+- A resistance falls with its current. Like on harmonics
+  (`etid.estimators.score_tests.falling_resistance`), it adds −|u| u / U to the voltage u of the
+  relaxations, filtered by them: they are the load without its series resistance.
 """
 
 import dataclasses
